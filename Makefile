@@ -1,0 +1,35 @@
+# make demo: a team of robots for half a minute.   make test: format, lint, types, layers, tests.
+PYTHON ?= python3
+VENV ?= .venv
+BIN = $(VENV)/bin
+
+.PHONY: setup demo test check unit test-long clean
+
+setup: $(VENV)/ready
+
+$(VENV)/ready: pyproject.toml
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or later is needed: make PYTHON=python3.12 ...")'
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev]'
+	@touch $@
+
+demo: setup
+	$(BIN)/cpcbl-team up
+
+test: check unit
+
+check: setup
+	$(BIN)/ruff format --check
+	$(BIN)/ruff check
+	$(BIN)/mypy
+	PYTHONPATH=.:agents:transport:launch $(BIN)/lint-imports --no-cache
+
+unit: setup
+	$(BIN)/pytest -n 2 -m "not long and not log"
+
+# Minutes long; with CPCBL_MRCLAM=folder also on real logs.
+test-long: setup
+	$(BIN)/pytest -m "$(if $(CPCBL_MRCLAM),long or log,long)"
+
+clean:
+	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache .hypothesis

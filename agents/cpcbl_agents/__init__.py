@@ -1,0 +1,1 @@
+"""The three agents of a robot (sensing, filter, collaboration) and the process that runs them."""

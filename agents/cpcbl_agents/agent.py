@@ -1,0 +1,37 @@
+"""What an agent is, and what the agents of one robot say to each other.
+
+An agent is an object with `handle(message, now_ns) -> messages`. It sees neither bus nor clock, so
+the same object runs live, in one process with others, and in replay.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple, Protocol
+
+from cpcbl_team.estimate import Estimate
+from cpcbl_team.inputs import Sightings, Told
+from cpcbl_transport.messages import Message
+
+
+class Tick(NamedTuple):
+    """Time has passed."""
+
+
+class Located(NamedTuple):
+    """The filter's belief at a time. With `frame`: at the time of that frame, for fixes."""
+
+    stamp_ns: int
+    estimate: Estimate
+    lost: str
+    speed_m_s: float
+    turn_rate_rad_s: float
+    frame: Sightings | None = None
+
+
+Anything = Message | Tick | Located | Told
+
+
+class Agent(Protocol):
+    """One of the three agents of a robot."""
+
+    def handle(self, message: Anything, now_ns: int) -> Sequence[Anything]:
+        """What this message makes the agent say."""

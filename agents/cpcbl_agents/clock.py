@@ -1,0 +1,35 @@
+"""Robot time: the wall clock, or for simulations and logs a clock that runs at a set speed."""
+
+import time
+from typing import NamedTuple
+
+
+class Clock(NamedTuple):
+    """Stands at `epoch_ns` until the machine's monotonic clock shows `from_ns`, then runs."""
+
+    epoch_ns: int
+    from_ns: int
+    speed: float
+
+    def now_ns(self) -> int:
+        elapsed = max(0, time.monotonic_ns() - self.from_ns)
+        return self.epoch_ns + int(elapsed * self.speed)
+
+    def seconds_until(self, stamp_ns: int) -> float:
+        """Real seconds until robot time reaches a stamp; 0 if it has."""
+        ahead = (stamp_ns - self.epoch_ns) / self.speed
+        return max(0.0, (self.from_ns + ahead - time.monotonic_ns()) * 1e-9)
+
+    def __str__(self) -> str:
+        return f"{self.epoch_ns}:{self.from_ns}:{self.speed}"
+
+    @staticmethod
+    def parse(text: str) -> "Clock":
+        """What `str` wrote. Raises ValueError."""
+        epoch_ns, from_ns, speed = text.split(":")
+        return Clock(int(epoch_ns), int(from_ns), float(speed))
+
+    @staticmethod
+    def wall() -> "Clock":
+        """Unix time at its own speed."""
+        return Clock(time.time_ns(), time.monotonic_ns(), 1.0)

@@ -1,0 +1,99 @@
+"""The filter agent: inputs in any order in, beliefs out."""
+
+from collections import Counter, deque
+from collections.abc import Sequence
+
+from cpcbl_agents.agent import Anything, Located, Tick
+from cpcbl_team.config import Field, LocalizationSettings
+from cpcbl_team.inputs import Belief, Fix, Odometry, Sightings, Told
+from cpcbl_team.localizer import Localizer
+from cpcbl_team.state import State
+from cpcbl_team.timeline import Timeline
+
+LOCATE_NS = 100_000_000
+PATIENCE_NS = 200_000_000  # how long a frame waits for the odometry that covers it
+
+
+class FilterAgent:
+    """Runs one localizer on its timeline. Reports where it is at 10 Hz and for each frame."""
+
+    def __init__(
+        self,
+        settings: LocalizationSettings,
+        field: Field,
+        teammates: frozenset[str],
+        start_ns: int,
+    ) -> None:
+        localizer = Localizer(settings, field)
+        self.timeline = Timeline(localizer, localizer.start(start_ns))
+        self.counts: Counter[str] = Counter()
+        self._known = frozenset(field.landmarks) | frozenset(field.walls) | teammates
+        self._moves = settings.odometry.moves
+        self._waiting: deque[Sightings] = deque()
+        self._located_ns = start_ns
+        self._odometry: Odometry | None = None
+        self._covered_ns = start_ns
+
+    @property
+    def next_ns(self) -> int:
+        """When the next regular report is due."""
+        return self._located_ns + LOCATE_NS
+
+    @property
+    def all_counts(self) -> Counter[str]:
+        """What was refused here, what was used and gated by the localizer."""
+        return self.counts + Counter(self.timeline.state.memory.counts)
+
+    def handle(self, message: Anything, now_ns: int) -> Sequence[Anything]:
+        match message:
+            case Odometry():
+                self._take(message)
+                if self._odometry is None or message.stamp_ns > self._odometry.stamp_ns:
+                    self._odometry = message
+                    self._covered_ns = message.stamp_ns
+                return self._frames_located(now_ns)
+            case Sightings():
+                for sighting in message.sightings:
+                    if sighting.id not in self._known:
+                        self.counts["unknown_object"] += 1
+                self._take(message)
+                self._waiting.append(message)
+                return self._frames_located(now_ns)
+            case Belief() | Fix() | Told():
+                self._take(message)
+            case Tick() if now_ns >= self.next_ns:
+                return [*self._frames_located(now_ns), *self._regularly(now_ns)]
+        return ()
+
+    def _take(self, item: Odometry | Sightings | Belief | Fix | Told) -> None:
+        refused = self.timeline.add(item)
+        if refused:
+            self.counts[refused] += 1
+
+    def _regularly(self, now_ns: int) -> Sequence[Located]:
+        self._located_ns = now_ns
+        state = self.timeline.latest(now_ns)
+        return [self._located(state)]
+
+    def _frames_located(self, now_ns: int) -> Sequence[Located]:
+        """The belief at each frame whose time is covered by odometry (or that waited in vain)."""
+        ready = []
+        while self._waiting:
+            stamp_ns = self._waiting[0].stamp_ns
+            covered = not self._moves or self._covered_ns >= stamp_ns
+            if not covered and now_ns - stamp_ns < PATIENCE_NS:
+                break
+            frame = self._waiting.popleft()
+            state = self.timeline.at(stamp_ns)
+            if state is not None:
+                ready.append(self._located(state, frame))
+        return ready
+
+    def _located(self, state: State, frame: Sightings | None = None) -> Located:
+        speed = turn_rate = 0.0
+        o = self._odometry
+        if o is not None and state.stamp_ns - o.stamp_ns < PATIENCE_NS:
+            seconds = (o.stamp_ns - o.from_ns) * 1e-9
+            speed, turn_rate = o.distance_m / seconds, o.turn_rad / seconds
+        stamp_ns = state.stamp_ns if frame is None else frame.stamp_ns
+        return Located(stamp_ns, state.estimate, state.memory.lost, speed, turn_rate, frame)

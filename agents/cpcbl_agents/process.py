@@ -1,0 +1,66 @@
+"""One robot as one process: the loop around a node, ended by SIGINT or SIGTERM."""
+
+import os
+import signal
+import threading
+from collections.abc import Callable, Sequence
+from types import FrameType
+
+import msgspec
+
+from cpcbl_agents.clock import Clock
+from cpcbl_agents.node import Node
+from cpcbl_agents.robot import Robot
+from cpcbl_team.config import Team
+from cpcbl_transport.zenoh_bus import open_bus
+
+LONGEST_WAIT_S = 0.2
+LATE_NS = 1_000_000_000
+
+
+class Stop:
+    """Set by SIGINT and SIGTERM, and when the process that started this one is gone."""
+
+    def __init__(self, parent: int | None = None) -> None:
+        self._event = threading.Event()
+        self._parent = parent
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, self._on_signal)
+
+    def _on_signal(self, number: int, frame: FrameType | None) -> None:
+        self._event.set()
+
+    def __call__(self) -> bool:
+        orphaned = self._parent is not None and os.getppid() != self._parent
+        return orphaned or self._event.is_set()
+
+
+def run_robot(
+    name: str,
+    team: Team,
+    connect: Sequence[str],
+    clock: Clock,
+    stop: Callable[[], bool],
+    restarted: bool = False,
+) -> None:
+    """Runs a robot until `stop()`. One that is restarted, or late, does not know where it is.
+
+    Raises BusError when stopped before a router answered, LogError for an unreadable log.
+    """
+    wake = threading.Event()
+    with open_bus(team.name, connect, give_up=stop) as bus:
+        start_ns = clock.now_ns()
+        if restarted or start_ns > clock.epoch_ns + LATE_NS * max(1.0, clock.speed):
+            team = _not_knowing_its_start(name, team)
+        incarnation = f"{os.getpid():x}"
+        node = Node(Robot(name, team, start_ns), team, bus, start_ns, incarnation, wake.set)
+        while not stop():
+            wake.clear()
+            node.step(clock.now_ns())
+            if not node.waiting:
+                wake.wait(min(clock.seconds_until(node.next_ns), LONGEST_WAIT_S))
+
+
+def _not_knowing_its_start(name: str, team: Team) -> Team:
+    robot = msgspec.structs.replace(team.robots[name], start=None)
+    return msgspec.structs.replace(team, robots={**team.robots, name: robot})

@@ -1,0 +1,62 @@
+"""One robot: three agents and the way of messages between them. No bus, no clock."""
+
+from collections import Counter
+from pathlib import Path
+
+from cpcbl_agents.agent import Anything, Tick
+from cpcbl_agents.collaboration import CollaborationAgent
+from cpcbl_agents.driving import Pilot
+from cpcbl_agents.filtering import FilterAgent
+from cpcbl_agents.sensing import SensingAgent
+from cpcbl_agents.sources import Silent, Source
+from cpcbl_agents.sources.mrclam import MrclamSource
+from cpcbl_team.config import Team
+from cpcbl_team.inputs import Belief, Fix, Odometry, Sightings, Told
+from cpcbl_transport.messages import Drive, Message, Track
+
+_OUTGOING = (Belief, Fix, Track, Drive)
+
+
+class Robot:
+    """The agents of one robot of a team. Raises LogError for a log that cannot be read."""
+
+    def __init__(self, name: str, team: Team, start_ns: int) -> None:
+        settings = team.robots[name]
+        teammates = frozenset(team.robots) - {name}
+        pilot = None
+        if settings.source == "simulated":
+            pilot = Pilot(name, settings.waypoints_m, settings.speed_m_s)
+        source: Source = Silent()
+        if settings.source == "mrclam":
+            source = MrclamSource(Path(team.data), name)
+            start_ns = max(start_ns, source.first_ns)
+            source.skip_to(start_ns)
+        self.name = name
+        self.sensing = SensingAgent(settings, source, teammates, pilot)
+        self.filter = FilterAgent(settings, team.map, teammates, start_ns)
+        self.collaboration = CollaborationAgent(name, settings, teammates, start_ns)
+
+    def handle(self, message: Message | Tick | Told, now_ns: int) -> list[Message]:
+        """Everything that one message (from the bus, or a tick) makes this robot say to others.
+
+        sensing -> filter -> collaboration; what the filter locates goes to the pilot as well.
+        """
+        raw = isinstance(message, (Odometry, Sightings))
+        inputs: list[Anything] = [] if raw else [message]
+        inputs += self.sensing.handle(message, now_ns)
+        located = [out for m in inputs for out in self.filter.handle(m, now_ns)]
+        said = [out for m in located for out in self.collaboration.handle(m, now_ns)]
+        said += [out for m in located for out in self.sensing.handle(m, now_ns)]
+        return [m for m in said if isinstance(m, _OUTGOING)]
+
+    @property
+    def next_ns(self) -> int:
+        """When the next tick is worth it."""
+        source_ns = self.sensing.next_ns
+        due_ns = self.filter.next_ns
+        return due_ns if source_ns is None else min(due_ns, source_ns)
+
+    @property
+    def counts(self) -> Counter[str]:
+        """What was used and what was refused so far, by reason."""
+        return self.sensing.counts + self.filter.all_counts

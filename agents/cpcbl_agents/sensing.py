@@ -1,0 +1,58 @@
+"""The sensing agent: from any source to corrected odometry and sightings."""
+
+from collections import Counter
+from collections.abc import Sequence
+
+from cpcbl_agents.agent import Anything, Located, Tick
+from cpcbl_agents.driving import Pilot
+from cpcbl_agents.sources import Source
+from cpcbl_team.config import LocalizationSettings
+from cpcbl_team.inputs import Odometry, Sightings
+
+
+class SensingAgent:
+    """Polls the source, takes a driver's messages, corrects delays, blinds what is blind."""
+
+    def __init__(
+        self,
+        settings: LocalizationSettings,
+        source: Source,
+        teammates: frozenset[str],
+        pilot: Pilot | None = None,
+    ) -> None:
+        self._sensor, self._odometry = settings.sensor, settings.odometry
+        self._odometry_delay_ns = int(settings.odometry.delay_s * 1e9)
+        self._sensor_delay_ns = int(settings.sensor.delay_s * 1e9)
+        self._source, self._teammates, self._pilot = source, teammates, pilot
+        self.counts: Counter[str] = Counter()
+
+    @property
+    def next_ns(self) -> int | None:
+        return self._source.next_ns
+
+    def handle(self, message: Anything, now_ns: int) -> Sequence[Anything]:
+        match message:
+            case Tick():
+                return [self._corrected(item) for item in self._source.poll(now_ns)]
+            case Odometry() | Sightings():
+                return [self._corrected(message)]
+            case Located() if self._pilot is not None and message.frame is None:
+                return self._pilot.command(message)
+        return ()
+
+    def _corrected(self, item: Odometry | Sightings) -> Odometry | Sightings:
+        self.counts[type(item).__name__.lower()] += 1
+        if isinstance(item, Odometry):
+            delay = self._odometry_delay_ns
+            if not delay:
+                return item
+            return Odometry(
+                item.from_ns + delay, item.stamp_ns + delay, item.distance_m, item.turn_rad
+            )
+        kept = tuple(s for s in item.sightings if self._sees(s.id))
+        return Sightings(item.stamp_ns - self._sensor_delay_ns, kept)
+
+    def _sees(self, name: str) -> bool:
+        if name in self._teammates:
+            return self._sensor.sees_robots
+        return self._sensor.sees_landmarks

@@ -1,0 +1,29 @@
+"""Where odometry and sightings come from: a driver on the bus, the simulated field, a real log.
+
+(A camera will be one more.)
+"""
+
+from collections.abc import Sequence
+from typing import Protocol
+
+from cpcbl_team.inputs import Odometry, Sightings
+
+
+class Source(Protocol):
+    """Yields a robot's inputs as time passes."""
+
+    @property
+    def next_ns(self) -> int | None:
+        """When there will be something; None: not known or nothing any more."""
+
+    def poll(self, now_ns: int) -> Sequence[Odometry | Sightings]:
+        """Everything up to now that was not polled yet."""
+
+
+class Silent:
+    """For robots whose inputs arrive on the bus: from their own driver or the simulated field."""
+
+    next_ns: int | None = None
+
+    def poll(self, now_ns: int) -> Sequence[Odometry | Sightings]:
+        return ()

@@ -1,0 +1,137 @@
+"""Logs of the UTIAS multi-robot cooperative localization and mapping dataset (MRCLAM).
+
+K. Y. K. Leung, Y. Halpern, T. D. Barfoot, H. H. T. Liu, IJRR 30(8), 2011. Text files, `#` starts a
+comment, Unix seconds, metres, radians. A sighting names a barcode; subjects 1-5 are the robots.
+"""
+
+import warnings
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cpcbl_team.config import Landmark
+from cpcbl_team.inputs import Odometry, Sighting, Sightings
+
+LONGEST_PIECE_NS = 100_000_000
+WHERE = "asrl.utias.utoronto.ca/datasets/mrclam"
+ROBOTS = ("1", "2", "3", "4", "5")
+
+
+class LogError(Exception):
+    """A log that is not there or cannot be read; says which file and why."""
+
+
+def read_table(path: Path, columns: int) -> NDArray[np.float64]:
+    """The rows of a log file, sorted by their first column. Raises LogError."""
+    if not path.is_file():
+        raise LogError(f"{path}: not found (get the data at {WHERE})")
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")  # numpy only warns of an empty file
+            table = np.loadtxt(path, ndmin=2)
+    except (ValueError, UserWarning, OSError) as error:
+        raise LogError(f"{path}: {error}") from error
+    if table.shape[1] != columns:
+        raise LogError(f"{path}: {table.shape[1]} columns where {columns} are due")
+    return table[np.argsort(table[:, 0], kind="stable")]
+
+
+def robots_in(folder: Path) -> list[str]:
+    """The robots of a log of which all files are there (truth included). Raises LogError."""
+    if not (folder / "Barcodes.dat").is_file():
+        raise LogError(f"{folder}: no MRCLAM log here (get the data at {WHERE})")
+    return [r for r in ROBOTS if not missing_files(folder, r)]
+
+
+def missing_files(folder: Path, robot: str) -> list[str]:
+    """The names of the files of a robot that a log lacks."""
+    names = [f"Robot{robot}_{kind}.dat" for kind in ("Odometry", "Measurement")]
+    missing = [name for name in names if not (folder / name).is_file()]
+    return missing if _truth_file(folder, robot) else [*missing, f"Robot{robot}_Groundtruth.dat"]
+
+
+def read_landmarks(folder: Path) -> dict[str, Landmark]:
+    """The map: landmarks by subject number."""
+    table = read_table(folder / "Landmark_Groundtruth.dat", 5)
+    return {str(int(subject)): Landmark(x_m=x, y_m=y) for subject, x, y, _, _ in table.tolist()}
+
+
+def read_truth(folder: Path, robot: str) -> NDArray[np.float64]:
+    """Ground truth, shape (n, 4): seconds, x, y, heading. Recovered where there is no original."""
+    path = _truth_file(folder, robot)
+    return read_table(path or folder / f"Robot{robot}_Groundtruth.dat", 4)
+
+
+def _truth_file(folder: Path, robot: str) -> Path | None:
+    names = (f"Robot{robot}_Groundtruth.dat", f"Robot{robot}_Groundtruth_recovered.dat")
+    return next((folder / name for name in names if (folder / name).is_file()), None)
+
+
+def odometry_span_ns(folder: Path, robot: str) -> tuple[int, int]:
+    """(first, last) stamp of a robot's odometry."""
+    table = read_table(folder / f"Robot{robot}_Odometry.dat", 3)
+    return _ns(table[0, 0]), _ns(table[-1, 0])
+
+
+def _ns(seconds: float) -> int:
+    return round(seconds * 1e3) * 1_000_000  # the files have whole milliseconds
+
+
+def odometry_pieces(table: NDArray[np.float64]) -> Iterator[Odometry]:
+    """A command holds until the next one; equal commands in a row make one piece of up to 0.1 s."""
+    rows = [(_ns(t), v, w) for t, v, w in table.tolist()]
+    from_ns, speed, turn_rate = rows[0]
+    for stamp_ns, next_speed, next_turn_rate in rows[1:]:
+        same = next_speed == speed and next_turn_rate == turn_rate
+        if stamp_ns <= from_ns or (same and stamp_ns - from_ns < LONGEST_PIECE_NS):
+            continue
+        seconds = (stamp_ns - from_ns) * 1e-9
+        yield Odometry(from_ns, stamp_ns, speed * seconds, turn_rate * seconds)
+        from_ns, speed, turn_rate = stamp_ns, next_speed, next_turn_rate
+
+
+def frames(table: NDArray[np.float64], names: dict[int, str], robot: str) -> Iterator[Sightings]:
+    """The sightings of each time; a barcode that nobody carries keeps its number."""
+    seen: list[Sighting] = []
+    at_ns = 0
+    for t, barcode, range_m, bearing in table.tolist():
+        if _ns(t) != at_ns and seen:
+            yield Sightings(at_ns, tuple(seen))
+            seen = []
+        at_ns = _ns(t)
+        name = names.get(int(barcode), f"barcode-{int(barcode)}")
+        if name != robot:
+            seen.append(Sighting(name, range_m, bearing))
+    if seen:
+        yield Sightings(at_ns, tuple(seen))
+
+
+class MrclamSource:
+    """Replays one robot's log in the log's own time. Raises LogError."""
+
+    def __init__(self, folder: Path, robot: str) -> None:
+        barcodes = read_table(folder / "Barcodes.dat", 2)
+        names = {int(barcode): str(int(subject)) for subject, barcode in barcodes.tolist()}
+        odometry = odometry_pieces(read_table(folder / f"Robot{robot}_Odometry.dat", 3))
+        seen = frames(read_table(folder / f"Robot{robot}_Measurement.dat", 4), names, robot)
+        items: list[Odometry | Sightings] = [*odometry, *seen]
+        items.sort(key=lambda item: item.stamp_ns)
+        self.first_ns = next((i.from_ns for i in items if isinstance(i, Odometry)), 0)
+        self._items = [i for i in items if i.stamp_ns >= self.first_ns]
+        self._next = 0
+
+    @property
+    def next_ns(self) -> int | None:
+        return self._items[self._next].stamp_ns if self._next < len(self._items) else None
+
+    def poll(self, now_ns: int) -> Sequence[Odometry | Sightings]:
+        first = self._next
+        while self._next < len(self._items) and self._items[self._next].stamp_ns <= now_ns:
+            self._next += 1
+        return self._items[first : self._next]
+
+    def skip_to(self, now_ns: int) -> None:
+        """Leaves out what was before: for a robot that starts late."""
+        self.poll(now_ns)

@@ -1,0 +1,1 @@
+"""The mathematics of CPCBL: pure functions and immutable data; no bus, clock, thread or file."""

@@ -1,0 +1,223 @@
+"""A robot's and a field's settings: typed, defaulted, with the unit in the name.
+
+These are the tables of a team file; unknown keys are refused where the file is read.
+"""
+
+import math
+from typing import Annotated, Literal
+
+import msgspec
+
+Positive = Annotated[float, msgspec.Meta(gt=0.0)]
+NotNegative = Annotated[float, msgspec.Meta(ge=0.0)]
+Share = Annotated[float, msgspec.Meta(ge=0.0, le=1.0)]
+
+Variant = Literal["joint", "oval", "circular", "weighted"]
+Fusion = Literal["split-ci", "naive"]
+Direction = Literal["one-way", "both-ways"]
+Gives = Literal["both", "range", "bearing", "none"]
+Source = Literal["simulated", "mrclam", "external"]
+
+
+class Table(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """A table of the team file."""
+
+
+class OdometryNoise(Table, frozen=True, kw_only=True):
+    """How odometry errs: white noise whose variance grows with the way and the turn."""
+
+    distance_sigma_m_per_sqrt_m: NotNegative = 0.05
+    turn_sigma_rad_per_sqrt_rad: NotNegative = 0.05
+    turn_sigma_rad_per_sqrt_m: NotNegative = 0.05
+
+
+class OdometrySettings(OdometryNoise, frozen=True, kw_only=True):
+    """Odometry of one robot: correction first (`true = scale x reported`), then its noise."""
+
+    distance_scale: Positive = 1.0
+    turn_scale: Positive = 1.0
+    delay_s: NotNegative = 0.0
+    rate_hz: Positive = 20.0
+    moves: bool = True
+    """False for a robot that stands still and reports no odometry."""
+    timeout_s: Positive = 0.5
+    """Without odometry for longer, the position may have changed by `gap_speed_m_s`."""
+    gap_speed_m_s: NotNegative = 0.3
+
+
+class SensorSettings(Table, frozen=True, kw_only=True):
+    """What a robot's landmark and teammate sensor can do, and how it errs."""
+
+    range_share: NotNegative = 0.03
+    """Standard deviation of a range as a share of it."""
+    range_floor_m: NotNegative = 0.01
+    bearing_sigma_deg: NotNegative = 2.0
+    field_of_view_deg: Annotated[float, msgspec.Meta(gt=0.0, le=360.0)] = 100.0
+    max_range_m: Positive = 8.0
+    """Nothing is seen beyond."""
+    max_range_for_range_m: Positive = 1000.0
+    """Beyond, only the bearing of an object is good enough to be used."""
+    rate_hz: Positive = 10.0
+    delay_s: float = 0.0
+    sees_landmarks: bool = True
+    sees_robots: bool = True
+
+    def range_sigma_m(self, range_m: float) -> float:
+        return math.hypot(self.range_share * range_m, self.range_floor_m)
+
+    @property
+    def bearing_sigma_rad(self) -> float:
+        return math.radians(self.bearing_sigma_deg)
+
+
+class Weights(Table, frozen=True, kw_only=True):
+    """Static weights of sensor against estimate for `weighted` (paper, section 3)."""
+
+    position: Share = 0.2
+    heading: Share = 0.2
+    nominal_sigma_m: Positive = 0.15
+    """Quality that a `weighted` robot claims just after an update; it has no estimate of it."""
+    nominal_heading_sigma_deg: Positive = 4.0
+
+
+class LocalizerSettings(Table, frozen=True, kw_only=True):
+    """How evidence becomes a pose."""
+
+    variant: Variant = "joint"
+    alternate: bool | None = None
+    """One update a cycle, heading or position in turn. Default: all variants but `joint`."""
+    minimum_interval_s: NotNegative = 0.0
+    """Least time between two updates of the same type (paper, section 3)."""
+    object_interval_s: NotNegative = 0.0
+    """Least time between two uses of the same object: its errors are correlated."""
+    bearing_for_position: bool = True
+    paper_uncertainty: bool = False
+    """As printed: without the heading's share in a position's uncertainty (resolution a)."""
+    weights: Weights = Weights()
+    gate_probability: Annotated[float, msgspec.Meta(gt=0.5, lt=1.0)] = 0.999
+    lost_position_sigma_m: Positive = 2.0
+    lost_heading_sigma_deg: Positive = 60.0
+    lost_window: Annotated[int, msgspec.Meta(ge=4)] = 20
+    """Lost when more than `lost_share` of the last so many innovations were rejected."""
+    lost_share: Share = 0.6
+
+    @property
+    def alternates(self) -> bool:
+        return self.variant != "joint" if self.alternate is None else self.alternate
+
+
+class CollaborationSettings(Table, frozen=True, kw_only=True):
+    """Who helps whom, and how much is believed."""
+
+    passive: bool = True
+    active: bool = True
+    fusion: Fusion = "split-ci"
+    direction: Direction = "one-way"
+    tier_width: Annotated[float, msgspec.Meta(gt=1.0)] = math.sqrt(2.0)
+    """Ratio of position sigma from one tier to the next."""
+    tier_hysteresis: Annotated[float, msgspec.Meta(ge=1.0)] = 1.1
+    """A tier is left only when sigma is beyond its edge by this factor."""
+    belief_rate_hz: Positive = 5.0
+    fix_interval_s: NotNegative = 0.0
+    """Least time between two fixes for the same teammate."""
+    max_age_s: Positive = 1.0
+    """A teammate's belief older than this is not used."""
+    after_s: NotNegative = 0.0
+    """Collaboration begins so long after the start: for showing what it is worth."""
+
+
+class Start(Table, frozen=True, kw_only=True):
+    """Where a robot starts, in the field's frame. Without one it finds itself."""
+
+    known: bool = True
+    """False: only the simulated field knows it, the robot finds itself."""
+    x_m: float
+    y_m: float
+    heading_deg: float = 0.0
+    sigma_m: NotNegative = 0.05
+    heading_sigma_deg: NotNegative = 3.0
+
+
+class Landmark(Table, frozen=True, kw_only=True):
+    """A point that is known beforehand."""
+
+    x_m: float
+    y_m: float
+    gives: Gives = "both"
+
+
+class Wall(Table, frozen=True, kw_only=True):
+    """A straight surface from one point to another."""
+
+    from_m: tuple[float, float]
+    to_m: tuple[float, float]
+    gives: Gives = "both"
+
+    @property
+    def direction_rad(self) -> float:
+        return math.atan2(self.to_m[1] - self.from_m[1], self.to_m[0] - self.from_m[0])
+
+
+class Field(Table, frozen=True, kw_only=True):
+    """Everything that is known of the field before the robots start."""
+
+    landmarks: dict[str, Landmark] = {}
+    walls: dict[str, Wall] = {}
+
+    def bounds(self) -> tuple[float, float, float, float]:
+        """(least x, least y, greatest x, greatest y) of what is on the map; zeros if empty."""
+        points = [(p.x_m, p.y_m) for p in self.landmarks.values()]
+        points += [end for wall in self.walls.values() for end in (wall.from_m, wall.to_m)]
+        if not points:
+            return 0.0, 0.0, 0.0, 0.0
+        xs, ys = [p[0] for p in points], [p[1] for p in points]
+        return min(xs), min(ys), max(xs), max(ys)
+
+
+class LocalizationSettings(Table, frozen=True, kw_only=True):
+    """All that one robot's mathematics needs."""
+
+    localizer: LocalizerSettings = LocalizerSettings()
+    sensor: SensorSettings = SensorSettings()
+    odometry: OdometrySettings = OdometrySettings()
+    collaboration: CollaborationSettings = CollaborationSettings()
+    start: Start | None = None
+
+
+class RobotSettings(LocalizationSettings, frozen=True, kw_only=True):
+    """One robot of a team: a robot type's keys and its own, over the team's defaults."""
+
+    source: Source = "simulated"
+    waypoints_m: tuple[tuple[float, float], ...] = ()
+    """Simulated robots drive loops through these by their own estimates."""
+    speed_m_s: NotNegative = 0.5
+
+
+class TransportSettings(Table, frozen=True, kw_only=True):
+    """Where the team's Zenoh router is."""
+
+    listen: tuple[str, ...] = ()
+    """Endpoints at which `up` opens its router; default: a free port of 127.0.0.1."""
+    connect: tuple[str, ...] = ("tcp/127.0.0.1:7447",)
+    """Endpoints at which a robot looks for the router."""
+
+
+class SimulationSettings(Table, frozen=True, kw_only=True):
+    """The simulated field."""
+
+    step_rate_hz: Positive = 50.0
+    noise: NotNegative = 1.0
+    """True noise as a multiple of what the robots assume; 0 for none."""
+    bump_radius_m: NotNegative = 0.15
+
+
+class Team(Table, frozen=True, kw_only=True):
+    """A team file with its layers merged."""
+
+    name: Annotated[str, msgspec.Meta(pattern=r"^[A-Za-z0-9_.-]{1,32}$")]
+    robots: dict[str, RobotSettings]
+    map: Field = Field()
+    transport: TransportSettings = TransportSettings()
+    simulation: SimulationSettings = SimulationSettings()
+    data: str = ""
+    """Folder of the log, for robots whose source is `mrclam`."""

@@ -1,0 +1,46 @@
+"""Angles, points and poses in the plane. Metres, radians, counter-clockwise positive.
+
+A pose is written `a_from_b`: it maps coordinates of frame b into frame a. A robot's pose is
+`field_from_robot`; what the robot sees is given in the robot's frame (x forward, y left).
+"""
+
+import math
+from typing import NamedTuple
+
+
+def wrap_angle(angle: float) -> float:
+    """The same angle within [-pi, pi]."""
+    return math.remainder(angle, math.tau)
+
+
+class Pose2(NamedTuple):
+    """A place and a heading: the rigid transform `a_from_b`."""
+
+    x: float
+    y: float
+    heading: float
+
+    def __matmul__(self, b_from_c: "Pose2") -> "Pose2":
+        """`a_from_b @ b_from_c` is `a_from_c`."""
+        x, y = self.transform(b_from_c.x, b_from_c.y)
+        return Pose2(x, y, wrap_angle(self.heading + b_from_c.heading))
+
+    def transform(self, x: float, y: float) -> tuple[float, float]:
+        """The point (x, y) of frame b, in frame a."""
+        c, s = math.cos(self.heading), math.sin(self.heading)
+        return self.x + c * x - s * y, self.y + s * x + c * y
+
+    def inverse(self) -> "Pose2":
+        """`b_from_a`."""
+        c, s = math.cos(self.heading), math.sin(self.heading)
+        return Pose2(-c * self.x - s * self.y, s * self.x - c * self.y, wrap_angle(-self.heading))
+
+
+def step(pose: Pose2, distance: float, turn: float) -> Pose2:
+    """The pose after driving an arc of length `distance` that turns by `turn` (second order)."""
+    direction = pose.heading + 0.5 * turn
+    return Pose2(
+        pose.x + distance * math.cos(direction),
+        pose.y + distance * math.sin(direction),
+        wrap_angle(pose.heading + turn),
+    )

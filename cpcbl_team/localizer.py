@@ -1,0 +1,398 @@
+"""Collaborative probabilistic constraint-based landmark localization (Stroupe & Balch).
+
+`Localizer` holds the settings of one robot; each of its methods maps a `State` to the next one.
+"""
+
+import math
+from collections.abc import Iterable
+from statistics import NormalDist
+
+from cpcbl_team import constraints as curves
+from cpcbl_team import recovery
+from cpcbl_team.config import Field, LocalizationSettings
+from cpcbl_team.constraints import Constraint
+from cpcbl_team.estimate import (
+    Covariance3,
+    Estimate,
+    Information,
+    Observation,
+    Scope,
+    circular,
+    merge,
+    merge_naive,
+    merge_split,
+    told,
+    with_all_shared,
+)
+from cpcbl_team.gaussian import Covariance2
+from cpcbl_team.geometry import Pose2, step, wrap_angle
+from cpcbl_team.inputs import Belief, Fix, Odometry, Sightings, Told
+from cpcbl_team.motion import move
+from cpcbl_team.sensors import sighting_fault
+from cpcbl_team.sightings import Measured, measured
+from cpcbl_team.state import Evidence, Memory, State
+
+_FIX = "fix:"  # marks the source of an active fix, apart from seeing that teammate
+
+
+class Localizer:
+    """The localizer of one robot on one field."""
+
+    def __init__(self, settings: LocalizationSettings, field: Field) -> None:
+        self.settings = settings
+        self.field = field
+        self._rules = settings.localizer
+        self._weighted = self._rules.variant == "weighted"
+        p = self._rules.gate_probability
+        self._gates = (NormalDist().inv_cdf(0.5 + 0.5 * p) ** 2, -2.0 * math.log(1.0 - p))
+        split = settings.collaboration.fusion == "split-ci"
+        self._merge_teammate = merge_split if split else merge_naive
+
+    def cycle(self, state: State, frame: Sightings) -> State:
+        """One cycle: the five steps of the paper (sections 3 and 4) for one frame of sightings."""
+        state = self.moved(state, frame.stamp_ns)  # 1. differential motion
+        state, seen = self._measure(state, frame)  # 2. measurements, with their sigmas
+        scope = self._turn(state, seen)
+        if scope is None:
+            return self._judged(state)
+        prior = state.estimate
+        found = [(m, self._constraints(prior.pose, m, scope)) for m in seen]  # 3. constraints
+        accepted, rejected = self._gated(prior, [(m, cs) for m, cs in found if cs])
+        landmarks = [c for m, cs in accepted for c in cs if not m.teammate or self._weighted]
+        teammates = [(m, cs) for m, cs in accepted if m.teammate and not self._weighted]
+        if self._weighted:
+            estimate = self._weighed(prior, landmarks)
+        else:
+            evidence = _combined(landmarks)  # 4. their closest points, combined
+            estimate = merge(prior, evidence, scope)  # 5. combined with the estimate
+            for m, cs in teammates:
+                estimate = self._merge_teammate(
+                    estimate, _observation(prior, m, cs, estimate), scope
+                )
+        sources = [m.source for m, _ in accepted]
+        state = state._replace(estimate=self._reduced(estimate))
+        return self._judged(self._updated(state, scope, sources, rejected))
+
+    # Step 1 -----------------------------------------------------------------------------------
+
+    def drive(self, state: State, odometry: Odometry) -> State:
+        """Takes the next piece of odometry; it is driven along as later inputs ask for it."""
+        state = self.moved(state, odometry.from_ns)
+        odometry_ns = max(state.odometry_ns, odometry.stamp_ns)
+        return state._replace(motion=odometry, odometry_ns=odometry_ns)
+
+    def moved(self, state: State, until_ns: int) -> State:
+        """The state at `until_ns`, driven on along the known odometry."""
+        stamp_ns, estimate, reckoned, motion, odometry_ns, memory = state
+        if until_ns <= stamp_ns:
+            return state
+        if motion is not None:
+            end_ns = min(motion.stamp_ns, until_ns)
+            whole_ns = motion.stamp_ns - motion.from_ns
+            share = max(0, end_ns - max(stamp_ns, motion.from_ns)) / whole_ns
+            s = self.settings.odometry
+            distance = share * motion.distance_m * s.distance_scale
+            turn = share * motion.turn_rad * s.turn_scale
+            if distance != 0.0 or turn != 0.0:
+                reckoned = step(reckoned, distance, turn)
+                estimate = self._reduced(move(estimate, distance, turn, s))
+            if end_ns == motion.stamp_ns:
+                motion = None
+        return State(
+            until_ns,
+            self._unknown_motion(estimate, stamp_ns, until_ns, odometry_ns),
+            reckoned,
+            motion,
+            odometry_ns,
+            memory,
+        )
+
+    def _unknown_motion(
+        self, estimate: Estimate, from_ns: int, until_ns: int, odometry_ns: int
+    ) -> Estimate:
+        """The growth of uncertainty while odometry is missing (a second of it: gap_speed)."""
+        s = self.settings.odometry
+        silent_ns = until_ns - max(from_ns, odometry_ns + int(s.timeout_s * 1e9))
+        if silent_ns <= 0 or not s.moves:
+            return estimate
+        p = s.gap_speed_m_s**2 * silent_ns * 1e-9
+        doubt = Covariance3(p, 0.0, p, 0.0, 0.0, p)
+        return estimate._replace(covariance=estimate.covariance.plus(doubt))
+
+    # Step 2 -----------------------------------------------------------------------------------
+
+    def _measure(self, state: State, frame: Sightings) -> tuple[State, list[Measured]]:
+        """The usable sightings of a frame. Faulty ones are counted by reason; those of an object
+        that was used too short a time ago are left out: its errors are correlated."""
+        memory = state.memory
+        seen, faults = [], []
+        for sighting in frame.sightings:
+            fault = sighting_fault(sighting)
+            if fault:
+                faults.append(fault)
+                continue
+            m = measured(sighting, frame.stamp_ns, self.field, memory.teammates, self.settings)
+            if m is not None:
+                seen.append(m)
+        pieces = [_sighting_evidence(state, m) for m in seen if m.wall is None]
+        memory = recovery.remembered(memory, pieces).counted(*faults)
+        least = self._rules.object_interval_s * 1e9
+        fresh = [m for m in seen if _passed(memory.objects_ns.get(m.source), frame.stamp_ns, least)]
+        return state._replace(memory=memory), fresh
+
+    def _turn(self, state: State, seen: list[Measured]) -> Scope | None:
+        """Heading or position, the one that waits longer; one timer a type. None: neither."""
+        if not self._steerable(state):
+            return None
+        memory, now, rules = state.memory, state.stamp_ns, self._rules
+        least = rules.minimum_interval_s * 1e9
+        by_bearing = rules.bearing_for_position and any(m.gives_point_bearing for m in seen)
+        position = by_bearing or any(m.range_m is not None for m in seen)
+        position = position and _passed(memory.position_ns, now, least)
+        heading = any(m.bearing is not None for m in seen)
+        heading = heading and _passed(memory.heading_ns, now, least)
+        if not rules.alternates:
+            return Scope.POSE if position or heading else None
+        if position and heading:
+            return Scope.POSITION if memory.heading_is_latest else Scope.HEADING
+        return Scope.POSITION if position else Scope.HEADING if heading else None
+
+    # Step 3 -----------------------------------------------------------------------------------
+
+    def _constraints(self, pose: Pose2, m: Measured, scope: Scope) -> list[Constraint]:
+        """What one object says about position or heading; about both, each reading once."""
+        x, y, _ = m.place
+        found: list[Constraint | None] = []
+        if m.range_m is not None and scope is not Scope.HEADING:
+            if m.wall is None:
+                found.append(curves.range_circle(pose, x, y, m.range_m, m.range_sigma))
+            else:
+                direction = m.wall.direction_rad
+                found.append(curves.wall_line(pose, x, y, direction, m.range_m, m.range_sigma))
+        if m.bearing is not None and scope is not Scope.POSITION:
+            if m.wall is None:
+                found.append(curves.bearing_heading(pose, x, y, m.bearing, m.bearing_sigma))
+            else:
+                direction = m.wall.direction_rad
+                found.append(curves.wall_heading(pose, x, y, direction, m.bearing, m.bearing_sigma))
+        if scope is Scope.POSITION and m.gives_point_bearing and self._rules.bearing_for_position:
+            assert m.bearing is not None
+            found.append(curves.bearing_ray(pose, x, y, m.bearing, m.bearing_sigma))
+        plain = self._rules.paper_uncertainty or self._weighted
+        return [c.uncoupled() if plain else c for c in found if c is not None]
+
+    # Steps 4 and 5 ----------------------------------------------------------------------------
+
+    def _gated(
+        self, prior: Estimate, found: list[tuple[Measured, list[Constraint]]]
+    ) -> tuple[list[tuple[Measured, list[Constraint]]], int]:
+        """The objects whose innovation the prior's chi-square bound accepts; the others' number."""
+        accepted = []
+        for m, cs in found:
+            seen = _observation(prior, m, cs, prior)
+            surprise = seen.normalized_innovation_squared(prior.covariance)
+            if surprise <= self._gates[len(cs) - 1]:
+                accepted.append((m, cs))
+        return accepted, len(found) - len(accepted)
+
+    def _weighed(self, prior: Estimate, accepted: list[Constraint]) -> Estimate:
+        """Steps 4 and 5 without probabilities: inverse-distance weights among the readings."""
+        if not accepted:
+            return prior
+        total = sum(1.0 / c.distance_m for c in accepted)
+        x, y, h = (
+            sum(c.residual * c.row[i] / c.distance_m for c in accepted) / total for i in range(3)
+        )
+        return self._averaged(prior, (x, y), h if accepted[0].on_heading else None)
+
+    def _averaged(
+        self, prior: Estimate, offset: tuple[float, float], heading: float | None
+    ) -> Estimate:
+        """The static weighted average of estimate and sensor, with a nominal covariance."""
+        w, (x, y, h), c = self._rules.weights, prior.pose, prior.covariance
+        if heading is not None:
+            variance = math.radians(w.nominal_heading_sigma_deg) ** 2
+            pose = Pose2(x, y, wrap_angle(h + w.heading * heading))
+            return Estimate(pose, Covariance3(c.xx, 0.0, c.yy, 0.0, 0.0, variance))
+        p = w.nominal_sigma_m**2
+        pose = Pose2(x + w.position * offset[0], y + w.position * offset[1], h)
+        return Estimate(pose, Covariance3(p, 0.0, p, 0.0, 0.0, c.hh))
+
+    def _reduced(self, estimate: Estimate) -> Estimate:
+        """The estimate in the form that the variant keeps."""
+        if self._rules.paper_uncertainty:
+            estimate = estimate._replace(covariance=estimate.covariance._replace(xh=0.0, yh=0.0))
+        if self._rules.variant == "joint":
+            return estimate
+        return with_all_shared(estimate if self._rules.variant == "oval" else circular(estimate))
+
+    # Teammates --------------------------------------------------------------------------------
+
+    def fix(self, state: State, fix: Fix) -> State:
+        """Active collaboration: a teammate tells where it sees this robot. Position only."""
+        state = self.moved(state, fix.stamp_ns)
+        memory = recovery.remembered(state.memory, [_fix_evidence(state, fix)])
+        state = state._replace(memory=memory)
+        source, prior = _FIX + fix.observer, state.estimate
+        least = self._rules.object_interval_s * 1e9
+        if not self._steerable(state):
+            return self._judged(state)
+        if not _passed(memory.objects_ns.get(source), fix.stamp_ns, least):
+            return state
+        dx, dy = fix.x_m - prior.pose.x, fix.y_m - prior.pose.y
+        seen = Observation(
+            ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0)),
+            (dx, dy),
+            Covariance2(*fix.sensor_covariance),
+            Covariance2(*fix.observer_covariance),
+        )
+        if seen.normalized_innovation_squared(prior.covariance) > self._gates[1]:
+            return self._judged(self._updated(state, Scope.POSE, [], 1))
+        scope = Scope.POSE if self._rules.variant == "joint" else Scope.POSITION
+        if self._weighted:
+            estimate = self._averaged(prior, (dx, dy), None)
+        else:
+            estimate = self._merge_teammate(prior, seen, scope)
+        state = state._replace(estimate=self._reduced(estimate))
+        return self._judged(self._updated(state, None, [source], 0))
+
+    def hear(self, state: State, belief: Belief) -> State:
+        """Passive collaboration: keeps a teammate's belief, to use it when the teammate is seen."""
+        state = self.moved(state, belief.stamp_ns)
+        teammates = {**state.memory.teammates, belief.robot: belief}
+        return state._replace(memory=state.memory._replace(teammates=teammates))
+
+    def tell(self, state: State, event: Told) -> State:
+        """This robot's belief goes to a teammate: it may come back."""
+        state = self.moved(state, event.stamp_ns)
+        return state._replace(estimate=told(state.estimate))
+
+    # The start, being lost, the way back --------------------------------------------------------
+
+    def start(self, stamp_ns: int) -> State:
+        """The state at the start: at the configured pose, or lost somewhere on the field."""
+        s = self.settings.start
+        if s is not None and s.known:
+            p, h = s.sigma_m**2, math.radians(s.heading_sigma_deg) ** 2
+            pose = Pose2(s.x_m, s.y_m, wrap_angle(math.radians(s.heading_deg)))
+            estimate = Estimate(pose, Covariance3(p, 0.0, p, 0.0, 0.0, h))
+            return State(stamp_ns, estimate, odometry_ns=stamp_ns)
+        x0, y0, x1, y1 = self.field.bounds()
+        p = max(0.25 * (x1 - x0) ** 2, 0.25 * (y1 - y0) ** 2, 4.0)
+        anywhere = Covariance3(p, 0.0, p, 0.0, 0.0, math.pi**2)
+        estimate = Estimate(Pose2(0.5 * (x0 + x1), 0.5 * (y0 + y1), 0.0), anywhere)
+        memory = Memory(lost="start pose unknown", widened_ns=stamp_ns)
+        return State(stamp_ns, estimate, odometry_ns=stamp_ns, memory=memory)
+
+    def _steerable(self, state: State) -> bool:
+        """False while the heading is too uncertain for a constraint linearized at it."""
+        limit = math.radians(self._rules.lost_heading_sigma_deg)
+        return not state.memory.lost or state.estimate.heading_sigma_rad <= limit
+
+    def _updated(
+        self, state: State, scope: Scope | None, sources: Iterable[str], rejected: int
+    ) -> State:
+        """Timers, windows and counts after an update of `scope` by these sources."""
+        memory, now = state.memory, state.stamp_ns
+        used = dict.fromkeys(sources, now)
+        window = memory.innovations + (True,) * len(used) + (False,) * rejected
+        counts = ["accepted"] * len(used) + ["gated"] * rejected
+        memory = memory.counted(*counts)._replace(
+            objects_ns={**memory.objects_ns, **used},
+            innovations=window[-self._rules.lost_window :],
+        )
+        if used and scope in (Scope.POSITION, Scope.POSE):
+            memory = memory._replace(position_ns=now, heading_is_latest=False)
+        if used and scope in (Scope.HEADING, Scope.POSE):
+            memory = memory._replace(heading_ns=now, heading_is_latest=True)
+        return state._replace(memory=memory)
+
+    def _judged(self, state: State) -> State:
+        """Lost or not. If lost: found again from recent evidence, else in more and more doubt."""
+        memory, now = state.memory, state.stamp_ns
+        reason = recovery.lost_reason(state.estimate, memory, self._rules)
+        if not reason:
+            return state._replace(memory=memory._replace(lost="")) if memory.lost else state
+        if not memory.lost:
+            memory = memory._replace(lost=reason, widened_ns=now).counted("lost")
+        found = recovery.relocalized(memory.evidence, state.odometry_from_robot, self.field)
+        if found is not None:
+            memory = memory._replace(lost="", innovations=()).counted("found_again")
+            return state._replace(estimate=self._reduced(found), memory=memory)
+        estimate = state.estimate
+        refusing = memory.innovations[-1:] == (False,)
+        if refusing and now - memory.widened_ns >= recovery.WIDEN_NS:
+            estimate = recovery.widened(estimate, self._rules)
+            memory = memory._replace(widened_ns=now)
+        return state._replace(estimate=estimate, memory=memory)
+
+
+def _combined(accepted: list[Constraint]) -> Information:
+    """Step 4: the Gaussians at the closest points of all constraints, as one."""
+    evidence = Information.none()
+    for c in accepted:
+        evidence = evidence.add(c.row, c.residual, c.sigma * c.sigma)
+    return evidence
+
+
+def _observation(prior: Estimate, m: Measured, cs: list[Constraint], now: Estimate) -> Observation:
+    """The constraints of one object, about the estimate `now` though linearized at the prior.
+
+    A teammate's pose covariance is compounded with the sensor's (row 39), as the dependent part.
+    """
+    dx, dy = now.pose.x - prior.pose.x, now.pose.y - prior.pose.y
+    dh = wrap_angle(now.pose.heading - prior.pose.heading)
+    rows = tuple(c.row for c in cs)
+    residuals = tuple(c.residual - c.row[0] * dx - c.row[1] * dy - c.row[2] * dh for c in cs)
+    sensor = [c.sigma * c.sigma for c in cs]
+    place = m.place.covariance
+    (ax, ay, _), (bx, by, _) = rows[0], rows[-1]
+    return Observation(
+        rows,
+        residuals,
+        Covariance2(sensor[0], 0.0, sensor[-1]),
+        Covariance2(
+            place.along(ax, ay),
+            place.xx * ax * bx + place.xy * (ax * by + ay * bx) + place.yy * ay * by,
+            place.along(bx, by),
+        ),
+    )
+
+
+def _passed(last_ns: int | None, now_ns: int, least_ns: float) -> bool:
+    return last_ns is None or now_ns - last_ns >= least_ns
+
+
+def _sighting_evidence(state: State, m: Measured) -> Evidence:
+    x, y, covariance = m.place
+    sigma = math.sqrt(0.5 * (covariance.xx + covariance.yy))
+    return Evidence(
+        state.stamp_ns,
+        state.odometry_from_robot,
+        m.source,
+        x,
+        y,
+        m.range_m,
+        m.bearing,
+        m.range_sigma,
+        m.bearing_sigma,
+        sigma,
+    )
+
+
+def _fix_evidence(state: State, fix: Fix) -> Evidence:
+    covariance = Covariance2(*fix.sensor_covariance) + Covariance2(*fix.observer_covariance)
+    sigma = math.sqrt(0.5 * (covariance.xx + covariance.yy))
+    source = _FIX + fix.observer
+    return Evidence(
+        state.stamp_ns,
+        state.odometry_from_robot,
+        source,
+        fix.x_m,
+        fix.y_m,
+        None,
+        None,
+        0.0,
+        0.0,
+        sigma,
+    )

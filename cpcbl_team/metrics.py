@@ -1,0 +1,101 @@
+"""How good an estimate was: errors, the share inside 3 sigma, NEES."""
+
+import math
+from typing import NamedTuple
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+
+class Score(msgspec.Struct, frozen=True, kw_only=True):
+    """One robot's figures over the samples that could be compared with truth."""
+
+    samples: int
+    position_rmse_m: float | None
+    position_mean_m: float | None
+    position_max_m: float | None
+    heading_rmse_deg: float | None
+    inside_3_sigma: float | None
+    """Share of samples with a Mahalanobis distance of the position of at most 3 (98.9 % due)."""
+    nees: float | None
+    """Mean normalized estimation error squared of the position (2 is consistent)."""
+
+
+class Samples(NamedTuple):
+    """Estimates and truths at the same times. Shapes (n, 3): x m, y m, heading rad; (n, 6)."""
+
+    estimate: Floats
+    truth: Floats
+    covariance: Floats | None  # xx, xy, yy, xh, yh, hh; None: the variant has none
+
+
+def position_errors(samples: Samples) -> Floats:
+    """Distances in metres, shape (n,)."""
+    offset = samples.estimate[:, :2] - samples.truth[:, :2]
+    return np.asarray(np.hypot(offset[:, 0], offset[:, 1]))
+
+
+def heading_errors(samples: Samples) -> Floats:
+    """Signed, radians, within [-pi, pi], shape (n,)."""
+    turn = samples.estimate[:, 2] - samples.truth[:, 2]
+    return np.asarray((turn + math.pi) % math.tau - math.pi)
+
+
+def position_nees(samples: Samples) -> Floats | None:
+    """Squared Mahalanobis distances of the position, shape (n,); None without covariance."""
+    if samples.covariance is None:
+        return None
+    offset = samples.truth[:, :2] - samples.estimate[:, :2]
+    dx, dy = offset[:, 0], offset[:, 1]
+    xx, xy, yy = (np.maximum(samples.covariance[:, i], -1.0) for i in range(3))
+    floor = 1e-12  # (1 um)^2: a noise-free run has no covariance to divide by
+    det = np.maximum((xx + floor) * (yy + floor) - xy * xy, floor * floor)
+    top = (yy + floor) * dx * dx - 2.0 * xy * dx * dy + (xx + floor) * dy * dy
+    return np.asarray(top / det)
+
+
+def score(samples: Samples) -> Score:
+    """The figures of one robot; None where there was nothing to compare."""
+    n = len(samples.estimate)
+    if n == 0:
+        return Score(
+            samples=0,
+            position_rmse_m=None,
+            position_mean_m=None,
+            position_max_m=None,
+            heading_rmse_deg=None,
+            inside_3_sigma=None,
+            nees=None,
+        )
+    errors = position_errors(samples)
+    nees = position_nees(samples)
+    return Score(
+        samples=n,
+        position_rmse_m=_rms(errors),
+        position_mean_m=float(errors.mean()),
+        position_max_m=float(errors.max()),
+        heading_rmse_deg=math.degrees(_rms(heading_errors(samples))),
+        inside_3_sigma=None if nees is None else float(np.mean(nees <= 9.0)),
+        nees=None if nees is None else float(nees.mean()),
+    )
+
+
+def _rms(values: Floats) -> float:
+    return float(np.sqrt(np.mean(values * values)))
+
+
+def truth_at(
+    times_s: Floats, truth: Floats, nearest_s: float = 2.5
+) -> tuple[Floats, NDArray[np.bool_]]:
+    """Truth (rows: s, x, y, heading) interpolated at times, shape (n, 3), and where it counts:
+    within `nearest_s` of a row."""
+    stamps = truth[:, 0]
+    heading = np.unwrap(truth[:, 3])
+    columns = [np.interp(times_s, stamps, c) for c in (truth[:, 1], truth[:, 2], heading)]
+    after = np.clip(np.searchsorted(stamps, times_s), 1, max(len(stamps) - 1, 1))
+    last = np.minimum(after, len(stamps) - 1)
+    gap = np.minimum(np.abs(times_s - stamps[after - 1]), np.abs(times_s - stamps[last]))
+    return np.stack(columns, axis=1), gap <= nearest_s

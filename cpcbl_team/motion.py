@@ -1,0 +1,79 @@
+"""Differential odometry: the pose moves, its uncertainty is compounded as J C J^T (paper, sec. 4).
+
+C is the joint covariance of the estimate and of the differential motion; J is the Jacobian of the
+compounding with respect to both. Motion noise is white, so its variance grows with the way.
+"""
+
+import math
+
+from cpcbl_team.config import OdometryNoise
+from cpcbl_team.estimate import ZERO3, Covariance3, Estimate, Matrix3
+from cpcbl_team.geometry import step
+
+
+def motion_jacobian(heading: float, distance: float, turn: float) -> Matrix3:
+    """d(pose after) / d(pose before)."""
+    direction = heading + 0.5 * turn
+    return (
+        1.0,
+        0.0,
+        -distance * math.sin(direction),
+        0.0,
+        1.0,
+        distance * math.cos(direction),
+        0.0,
+        0.0,
+        1.0,
+    )
+
+
+def motion_noise(heading: float, distance: float, turn: float, noise: OdometryNoise) -> Covariance3:
+    """The differential motion's covariance, rotated into the field's frame."""
+    direction = heading + 0.5 * turn
+    c, s = math.cos(direction), math.sin(direction)
+    way = abs(distance)
+    along = noise.distance_sigma_m_per_sqrt_m**2 * way
+    around = (
+        noise.turn_sigma_rad_per_sqrt_rad**2 * abs(turn) + noise.turn_sigma_rad_per_sqrt_m**2 * way
+    )
+    lx, ly = -0.5 * distance * s, 0.5 * distance * c  # where a turn error leads
+    return Covariance3(
+        along * c * c + around * lx * lx,
+        along * c * s + around * lx * ly,
+        along * s * s + around * ly * ly,
+        around * lx,
+        around * ly,
+        around,
+    )
+
+
+def move(estimate: Estimate, distance: float, turn: float, noise: OdometryNoise) -> Estimate:
+    """The estimate after the wheels report an arc of `distance` metres that turns by `turn`."""
+    pose, covariance, shared = estimate
+    lx, ly = _lever(pose.heading, distance, turn)
+    q = motion_noise(pose.heading, distance, turn, noise)
+    moved = _sheared(covariance, lx, ly)
+    return Estimate(
+        step(pose, distance, turn),
+        moved.plus(q),
+        shared if shared is ZERO3 else _sheared(shared, lx, ly),
+    )
+
+
+def _lever(heading: float, distance: float, turn: float) -> tuple[float, float]:
+    """Where a heading error of one radian leads, in metres: the last column of the Jacobian."""
+    direction = heading + 0.5 * turn
+    return -distance * math.sin(direction), distance * math.cos(direction)
+
+
+def _sheared(p: Covariance3, lx: float, ly: float) -> Covariance3:
+    """F P F^T for F = [1 0 lx; 0 1 ly; 0 0 1], written out: it runs for every odometry step."""
+    xx, xy, yy, xh, yh, hh = p
+    return Covariance3(
+        xx + lx * (2.0 * xh + lx * hh),
+        xy + lx * yh + ly * xh + lx * ly * hh,
+        yy + ly * (2.0 * yh + ly * hh),
+        xh + lx * hh,
+        yh + ly * hh,
+        hh,
+    )

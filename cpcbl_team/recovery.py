@@ -1,0 +1,226 @@
+"""Knowing that one is lost, and finding oneself again.
+
+Lost is a sigma over its limit, or a window of innovations most of which were rejected. The way
+back is triangulation from what was seen and told within the last seconds, each piece carried to
+the present by dead reckoning: a closed-form alignment where ranges are known, else many starts.
+An ambiguous answer is no answer.
+"""
+
+import math
+from collections.abc import Iterable, Iterator
+
+from cpcbl_team.config import Field, LocalizerSettings
+from cpcbl_team.constraints import Constraint, bearing_heading, range_circle
+from cpcbl_team.estimate import ZERO3, Covariance3, Estimate, Information, merge
+from cpcbl_team.geometry import Pose2
+from cpcbl_team.state import Evidence, Memory
+
+WINDOW_NS = 10_000_000_000
+SPACING_NS = 500_000_000  # one piece of evidence an object and so long
+MOST_PIECES = 30
+DRIFT_SHARE = 0.1  # of the way: how far dead reckoning errs within the window
+WIDEN_NS = 1_000_000_000
+_OPEN = Covariance3(1e6, 0.0, 1e6, 0.0, 0.0, 1e3)
+_ENOUGH_POSITION_SIGMA_M = 0.7
+_ENOUGH_HEADING_SIGMA_RAD = 0.35
+
+
+def remembered(memory: Memory, pieces: Iterable[Evidence]) -> Memory:
+    """The memory with new evidence, without what is too old or too alike."""
+    kept = list(memory.evidence)
+    for piece in pieces:
+        latest = next((e.stamp_ns for e in reversed(kept) if e.source == piece.source), None)
+        if latest is None or piece.stamp_ns - latest >= SPACING_NS:
+            kept.append(piece)
+    if len(kept) == len(memory.evidence):
+        return memory
+    kept = [e for e in kept if kept[-1].stamp_ns - e.stamp_ns <= WINDOW_NS]
+    return memory._replace(evidence=tuple(kept[-MOST_PIECES:]))
+
+
+def lost_reason(estimate: Estimate, memory: Memory, settings: LocalizerSettings) -> str:
+    """Why the robot is lost; empty if it is not. Being lost ends at half of each limit."""
+    slack = 0.5 if memory.lost else 1.0
+    position = estimate.position_sigma_m
+    if position > slack * settings.lost_position_sigma_m:
+        return f"position sigma {position:.2f} m"
+    heading = math.degrees(estimate.heading_sigma_rad)
+    if heading > slack * settings.lost_heading_sigma_deg:
+        return f"heading sigma {heading:.0f} deg"
+    window = memory.innovations[-settings.lost_window :]
+    rejected = window.count(False)
+    if len(window) >= settings.lost_window // 2 and (
+        rejected > slack * settings.lost_share * settings.lost_window
+    ):
+        return f"{rejected} of the last {len(window)} innovations rejected"
+    return ""
+
+
+def widened(estimate: Estimate, settings: LocalizerSettings) -> Estimate:
+    """For a robot that rejects what it sees: doubt itself more, until its gates open.
+
+    Sigma doubles, from 0.1 m and 0.1 rad at least to the limits of being lost at most.
+    """
+    c = estimate.covariance
+    position = 0.5 * (c.xx + c.yy)
+    position_goal = min(max(4.0 * position, 0.01), settings.lost_position_sigma_m**2)
+    heading_limit = 0.9 * math.radians(settings.lost_heading_sigma_deg)
+    heading_goal = min(max(4.0 * c.hh, 0.01), heading_limit**2)
+    p, h = max(position_goal - position, 0.0), max(heading_goal - c.hh, 0.0)
+    doubt = Covariance3(p, 0.0, p, 0.0, 0.0, h)
+    return estimate._replace(covariance=c.plus(doubt))
+
+
+def relocalized(
+    evidence: tuple[Evidence, ...], odometry_from_robot: Pose2, field: Field
+) -> Estimate | None:
+    """The pose from recent evidence alone, or None where it does not determine one.
+
+    Needs one residual more than unknowns, a fit that the chi-square bound accepts, and no second
+    pose that fits nearly as well.
+    """
+    pieces = [_Carried(e, odometry_from_robot) for e in evidence]
+    if sum(p.residual_count for p in pieces) < 4:
+        return None
+    fits = [_refined(start, pieces) for start in _starts(pieces, field)]
+    found = sorted((f for f in fits if f is not None), key=lambda f: f[0])
+    if not found:
+        return None
+    cost, estimate, freedom = found[0]
+    if freedom < 1 or not _certain(estimate) or cost > _chi_square_bound(freedom):
+        return None
+    if any(f[0] < cost + 6.0 and _apart(f[1].pose, estimate.pose) for f in found[1:]):
+        return None
+    covariance = estimate.covariance.scaled(max(1.0, cost / freedom))
+    told = any(e.place_sigma_m > 0.0 for e in evidence)
+    return Estimate(estimate.pose, covariance, covariance if told else ZERO3)
+
+
+class _Carried:
+    """A piece of evidence, carried to the present by dead reckoning."""
+
+    def __init__(self, evidence: Evidence, odometry_from_robot: Pose2) -> None:
+        self.e = evidence
+        self.now_from_then = odometry_from_robot.inverse() @ evidence.odometry_from_robot
+        way = math.hypot(self.now_from_then.x, self.now_from_then.y)
+        self.drift = DRIFT_SHARE * (way + 0.3 * abs(self.now_from_then.heading))
+        self.is_fix = evidence.range_m is None and evidence.bearing_rad is None
+
+    @property
+    def residual_count(self) -> int:
+        e = self.e
+        return 2 if self.is_fix else (e.range_m is not None) + (e.bearing_rad is not None)
+
+    @property
+    def sigma_m(self) -> float:
+        return math.hypot(self.e.place_sigma_m, self.drift)
+
+    def point(self) -> tuple[float, float] | None:
+        """The object (or the robot then) in the present robot's frame, if its range is known."""
+        if self.is_fix:
+            return self.now_from_then.x, self.now_from_then.y
+        r, a = self.e.range_m, self.e.bearing_rad
+        if r is None or a is None:
+            return None
+        return self.now_from_then.transform(r * math.cos(a), r * math.sin(a))
+
+    def rows(self, pose: Pose2) -> Iterator[tuple[tuple[float, float, float], float, float]]:
+        """(row, residual, variance) about the present pose."""
+        then = pose @ self.now_from_then
+        e = self.e
+        hx, hy = pose.y - then.y, then.x - pose.x  # d(place then) / d(heading now)
+        if self.is_fix:
+            variance = self.sigma_m**2
+            yield (1.0, 0.0, hx), e.x - then.x, variance
+            yield (0.0, 1.0, hy), e.y - then.y, variance
+            return
+        seen: list[Constraint | None] = []
+        if e.range_m is not None:
+            seen.append(range_circle(then, e.x, e.y, e.range_m, e.range_sigma_m))
+        if e.bearing_rad is not None:
+            seen.append(bearing_heading(then, e.x, e.y, e.bearing_rad, e.bearing_sigma_rad))
+        for c in seen:
+            if c is not None:
+                x, y, a = c.row
+                spread = self.sigma_m / c.distance_m if c.on_heading else self.sigma_m
+                yield (x, y, a + x * hx + y * hy), c.residual, c.sigma**2 + spread**2
+
+
+def _starts(pieces: list[_Carried], field: Field) -> Iterator[Pose2]:
+    aligned = _aligned(pieces)
+    if aligned is not None:
+        yield aligned
+        return
+    x0, y0, x1, y1 = field.bounds()
+    for i in range(5):
+        for j in range(4):
+            for k in range(8):
+                x, y = x0 + (x1 - x0) * (i + 0.5) / 5, y0 + (y1 - y0) * (j + 0.5) / 4
+                yield Pose2(x, y, math.tau * k / 8)
+
+
+def _aligned(pieces: list[_Carried]) -> Pose2 | None:
+    """Weighted rigid alignment of points in the robot's frame to points in the field."""
+    pairs = []
+    for piece in pieces:
+        point = piece.point()
+        if point is not None:
+            sigma = math.hypot(piece.sigma_m, 0.0 if piece.is_fix else piece.e.range_sigma_m)
+            pairs.append((1.0 / (sigma * sigma + 1e-6), *point, piece.e.x, piece.e.y))
+    total = sum(p[0] for p in pairs)
+    if len(pairs) < 2:
+        return None
+    ax, ay, bx, by = (sum(p[0] * p[i] for p in pairs) / total for i in range(1, 5))
+    dot = sum(w * ((px - ax) * (qx - bx) + (py - ay) * (qy - by)) for w, px, py, qx, qy in pairs)
+    cross = sum(w * ((px - ax) * (qy - by) - (py - ay) * (qx - bx)) for w, px, py, qx, qy in pairs)
+    if math.hypot(dot, cross) < 1e-9:
+        return None
+    heading = math.atan2(cross, dot)
+    c, s = math.cos(heading), math.sin(heading)
+    return Pose2(bx - c * ax + s * ay, by - s * ax - c * ay, heading)
+
+
+def _refined(start: Pose2, pieces: list[_Carried]) -> tuple[float, Estimate, int] | None:
+    """(chi-square, estimate, degrees of freedom) by Gauss-Newton with the worst pieces left out."""
+    used = list(pieces)
+    while True:
+        estimate = Estimate(start, _OPEN)
+        for _ in range(10):
+            evidence = Information.none()
+            for piece in used:
+                for row, residual, variance in piece.rows(estimate.pose):
+                    evidence = evidence.add(row, residual, variance)
+            if evidence.matrix.hh <= 0.0:
+                return None
+            before = estimate.pose
+            estimate = merge(Estimate(before, _OPEN), evidence)
+            change = math.hypot(estimate.pose.x - before.x, estimate.pose.y - before.y)
+            if change < 1e-4 and abs(estimate.pose.heading - before.heading) < 1e-4:
+                break
+        costs = [sum(e * e / v for _, e, v in piece.rows(estimate.pose)) for piece in used]
+        freedom = sum(p.residual_count for p in used) - 3
+        worst = max(range(len(used)), key=costs.__getitem__)
+        if costs[worst] < 14.0 or len(used) - 1 < max(2, 0.75 * len(pieces)):
+            return sum(costs), estimate, freedom
+        del used[worst]
+        start = estimate.pose
+
+
+def _certain(estimate: Estimate) -> bool:
+    return (
+        estimate.position_sigma_m < _ENOUGH_POSITION_SIGMA_M
+        and estimate.heading_sigma_rad < _ENOUGH_HEADING_SIGMA_RAD
+    )
+
+
+def _apart(a: Pose2, b: Pose2) -> bool:
+    return (
+        math.hypot(a.x - b.x, a.y - b.y) > 0.5
+        or abs(math.remainder(a.heading - b.heading, math.tau)) > 0.5
+    )
+
+
+def _chi_square_bound(freedom: int) -> float:
+    """About the 99.9 % quantile (Wilson & Hilferty 1931)."""
+    k = max(freedom, 1)
+    return k * (1.0 - 2.0 / (9.0 * k) + 3.09 * math.sqrt(2.0 / (9.0 * k))) ** 3

@@ -1,0 +1,36 @@
+"""What a sighting is worth: its faults, its sigmas."""
+
+import math
+
+from cpcbl_team.config import SensorSettings
+from cpcbl_team.inputs import Sighting
+
+
+def sighting_fault(sighting: Sighting) -> str:
+    """Why a sighting must not be used (resolution i); empty if it may."""
+    numbers = (
+        sighting.range_m,
+        sighting.bearing_rad,
+        sighting.range_sigma_m,
+        sighting.bearing_sigma_rad,
+    )
+    given = [n for n in numbers if n is not None]
+    if not all(math.isfinite(n) for n in given):
+        return "not_finite"
+    if sighting.range_m is None and sighting.bearing_rad is None:
+        return "empty_sighting"
+    if sighting.range_m is not None and sighting.range_m <= 0.0:
+        return "range_not_positive"
+    if sighting.bearing_rad is not None and abs(sighting.bearing_rad) > math.pi + 1e-9:
+        return "bearing_out_of_range"
+    if any(n is not None and n <= 0.0 for n in numbers[2:]):
+        return "sigma_not_positive"
+    return ""
+
+
+def sighting_sigmas(sighting: Sighting, sensor: SensorSettings) -> tuple[float, float]:
+    """(range sigma in m, bearing sigma in rad): the sighting's own, else the sensor model's."""
+    range_sigma, bearing_sigma = sighting.range_sigma_m, sighting.bearing_sigma_rad
+    if range_sigma is None:
+        range_sigma = sensor.range_sigma_m(sighting.range_m or 0.0)
+    return range_sigma, sensor.bearing_sigma_rad if bearing_sigma is None else bearing_sigma

@@ -1,0 +1,60 @@
+"""All that a localizer knows at one time. Immutable: a copy is a checkpoint."""
+
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
+from cpcbl_team.estimate import Estimate
+from cpcbl_team.geometry import Pose2
+from cpcbl_team.inputs import Belief, Odometry
+
+_NONE: Mapping[str, Any] = MappingProxyType({})
+
+
+class Evidence(NamedTuple):
+    """One thing seen (or told) lately, kept for finding the robot again when it is lost."""
+
+    stamp_ns: int
+    odometry_from_robot: Pose2  # dead reckoning at that time
+    source: str
+    x: float  # of the object in the field; of the robot itself, for a fix
+    y: float
+    range_m: float | None
+    bearing_rad: float | None
+    range_sigma_m: float
+    bearing_sigma_rad: float
+    place_sigma_m: float  # of (x, y); zero for what is on the map
+
+
+class Memory(NamedTuple):
+    """What only changes when something is seen or told."""
+
+    position_ns: int | None = None  # last update of the type
+    heading_ns: int | None = None
+    heading_is_latest: bool = False
+    objects_ns: Mapping[str, int] = _NONE  # last use of each object
+    teammates: Mapping[str, Belief] = _NONE
+    innovations: tuple[bool, ...] = ()  # accepted or not, the latest last
+    evidence: tuple[Evidence, ...] = ()
+    lost: str = ""  # the reason, empty when the robot knows where it is
+    widened_ns: int = 0
+    counts: Mapping[str, int] = _NONE
+
+    def counted(self, *reasons: str) -> "Memory":
+        if not reasons:
+            return self
+        counts = dict(self.counts)
+        for reason in reasons:
+            counts[reason] = counts.get(reason, 0) + 1
+        return self._replace(counts=counts)
+
+
+class State(NamedTuple):
+    """The localizer's state at `stamp_ns`."""
+
+    stamp_ns: int
+    estimate: Estimate
+    odometry_from_robot: Pose2 = Pose2(0.0, 0.0, 0.0)
+    motion: Odometry | None = None  # the piece of odometry that is being driven
+    odometry_ns: int = 0  # until when odometry is known
+    memory: Memory = Memory()

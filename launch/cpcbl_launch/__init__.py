@@ -1,0 +1,1 @@
+"""Command line, supervisor, simulated field and evaluation."""

@@ -1,0 +1,3 @@
+from cpcbl_launch.cli import main
+
+main()

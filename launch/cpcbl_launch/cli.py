@@ -1,0 +1,233 @@
+"""The command line `cpcbl-team`."""
+
+import logging
+import sys
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated, Optional
+
+import typer
+
+app = typer.Typer(
+    help="A team of robots that find out where they are, together.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+evaluate_app = typer.Typer(help="Real logs in one process: deterministic and fast.")
+app.add_typer(evaluate_app, name="evaluate")
+
+TeamFile = Annotated[Path, typer.Option("--team", help="Team file (TOML).")]
+Blind = Annotated[str, typer.Option(help="Robots that shall not see landmarks, e.g. 3,4,5.")]
+AsJson = Annotated[bool, typer.Option("--json", help="Print the report as JSON.")]
+Connect = Annotated[
+    Optional[list[str]],
+    typer.Option(help="Endpoint of the router, e.g. tcp/192.168.1.10:7447; default: the file's."),
+]
+ClockText = Annotated[str, typer.Option("--clock", hidden=True)]
+Parent = Annotated[Optional[int], typer.Option(hidden=True)]
+
+
+class VariantName(StrEnum):
+    joint = "joint"
+    oval = "oval"
+    circular = "circular"
+    weighted = "weighted"
+
+
+class Kinds(StrEnum):
+    none = "none"
+    passive = "passive"
+    active = "active"
+    both = "both"
+
+
+class FusionName(StrEnum):
+    naive = "naive"
+    split_ci = "split-ci"
+
+
+class DirectionName(StrEnum):
+    one_way = "one-way"
+    both_ways = "both-ways"
+
+
+@app.command()
+def check(
+    file: Annotated[Path, typer.Argument(help="Team file (TOML).")],
+) -> None:
+    """Validate a team file without starting anything."""
+    from cpcbl_launch.team_file import load_team
+
+    team = load_team(file)
+    marks, walls = len(team.map.landmarks), len(team.map.walls)
+    typer.echo(
+        f"{file}: good: team {team.name!r}, {len(team.robots)} robots"
+        f" ({', '.join(team.robots)}), {marks} landmarks, {walls} walls"
+    )
+
+
+@app.command()
+def up(
+    file: Annotated[
+        Optional[Path], typer.Argument(help="Team file; without one: the demonstration.")
+    ] = None,
+    duration: Annotated[
+        Optional[float],
+        typer.Option(help="Seconds of robot time; default: 30 simulated, or the whole log."),
+    ] = None,
+    speed: Annotated[float, typer.Option(min=0.05, help="Times real time.")] = 1.0,
+    seed: Annotated[int, typer.Option(help="Of the simulated noise.")] = 1,
+    data: Annotated[
+        Optional[Path], typer.Option(help="Folder of an MRCLAM log, for source mrclam.")
+    ] = None,
+    blind: Blind = "",
+    robots: Annotated[
+        str, typer.Option(help="Robots to start on this machine; default: all.")
+    ] = "",
+    report: Annotated[
+        Optional[Path], typer.Option(help="Write the report to this file (JSON).")
+    ] = None,
+    logs: Annotated[
+        Optional[Path], typer.Option(help="Keep the processes' logs in this folder.")
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Start a team: the field, a process per robot, a live table, a report at the end."""
+    import msgspec
+    from rich.console import Console
+
+    from cpcbl_agents.process import Stop
+    from cpcbl_launch import logs as real_logs
+    from cpcbl_launch.show import LiveTable, print_report
+    from cpcbl_launch.team_file import builtin, load_team
+    from cpcbl_launch.up import Run, run_team
+
+    team = load_team(file or builtin("demo"))
+    run = Run(team, duration, speed, seed, folder=logs)
+    if any(robot.source == "mrclam" for robot in team.robots.values()):
+        logged = real_logs.on_log(team, Path(data or team.data or "."))
+        run = run._replace(
+            team=logged.team,
+            truth=logged.truth,
+            left_out=logged.left_out,
+            epoch_ns=logged.start_ns,
+            duration_s=min(duration or 1e9, (logged.end_ns - logged.start_ns) * 1e-9),
+        )
+    elif duration is None:
+        run = run._replace(duration_s=30.0)
+    run = run._replace(team=real_logs.blinded(run.team, _names(blind)))
+    if robots:
+        run = run._replace(here=_names(robots))
+    console = Console(stderr=as_json)
+    title = f"team {team.name}, {len(run.team.robots)} robots, {speed:g} x real time"
+    with LiveTable(title, console, quiet=as_json) as table:
+        result = run_team(run, table, Stop())
+    encoded = msgspec.json.format(msgspec.json.encode(result), indent=2)
+    if report is not None:
+        report.write_bytes(encoded)
+    if as_json:
+        sys.stdout.write(encoded.decode() + "\n")
+    else:
+        print_report(result, console)
+
+
+@app.command()
+def robot(
+    name: Annotated[str, typer.Argument(help="The robot's name in the team file.")],
+    team_file: TeamFile,
+    connect: Connect = None,
+    clock: ClockText = "",
+    parent: Parent = None,
+    restarted: Annotated[
+        bool, typer.Option(help="It does not know where it is: find the pose first.")
+    ] = False,
+) -> None:
+    """Run one robot, on any machine, until SIGINT or SIGTERM."""
+    from cpcbl_agents.clock import Clock
+    from cpcbl_agents.process import Stop, run_robot
+    from cpcbl_launch.team_file import TeamFileError, load_team
+
+    team = load_team(team_file)
+    if name not in team.robots:
+        raise TeamFileError(
+            f"{team_file}: robots.{name}: not in the file; it has: {', '.join(team.robots)}"
+        )
+    when = Clock.parse(clock) if clock else Clock.wall()
+    run_robot(name, team, connect or team.transport.connect, when, Stop(parent), restarted)
+
+
+@app.command()
+def field(
+    team_file: TeamFile,
+    seed: Annotated[int, typer.Option(help="Of the noise.")] = 1,
+    connect: Connect = None,
+    clock: ClockText = "",
+    parent: Parent = None,
+) -> None:
+    """Run the simulated field until SIGINT or SIGTERM."""
+    from cpcbl_agents.clock import Clock
+    from cpcbl_agents.process import Stop
+    from cpcbl_launch.field import run_field
+    from cpcbl_launch.team_file import load_team
+    from cpcbl_transport.zenoh_bus import open_bus
+
+    team = load_team(team_file)
+    stop = Stop(parent)
+    with open_bus(team.name, connect or team.transport.connect, stop) as bus:
+        run_field(team, seed, bus, Clock.parse(clock) if clock else Clock.wall(), stop)
+
+
+@evaluate_app.command("mrclam")
+def evaluate_mrclam(
+    data: Annotated[Path, typer.Argument(help="Folder of one data set, e.g. MRCLAM6.")],
+    team_file: Annotated[
+        Optional[Path], typer.Option("--team", help="Team file; default: the built-in one.")
+    ] = None,
+    blind: Blind = "",
+    variant: Annotated[Optional[VariantName], typer.Option(help="For all robots.")] = None,
+    collaboration: Annotated[Optional[Kinds], typer.Option(help="For all robots.")] = None,
+    fusion: Annotated[Optional[FusionName], typer.Option(help="For all robots.")] = None,
+    direction: Annotated[Optional[DirectionName], typer.Option(help="For all robots.")] = None,
+    duration: Annotated[
+        Optional[float], typer.Option(help="Seconds of the log; default: all.")
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Five robots of a real log (UTIAS MRCLAM) against its ground truth."""
+    import msgspec
+    from rich.console import Console
+
+    from cpcbl_launch import logs as real_logs
+    from cpcbl_launch.evaluation import Choice, chosen, evaluate_log
+    from cpcbl_launch.show import print_report, progress_bar
+    from cpcbl_launch.team_file import builtin, load_team
+
+    team = load_team(team_file or builtin("mrclam"))
+    choice = Choice(variant, collaboration, fusion, direction)
+    logged = real_logs.on_log(chosen(team, choice), data)
+    logged = logged._replace(team=real_logs.blinded(logged.team, _names(blind)))
+    with progress_bar(f"{data.name}", quiet=as_json) as progress:
+        result = evaluate_log(logged, duration, progress)
+    if as_json:
+        typer.echo(msgspec.json.format(msgspec.json.encode(result), indent=2).decode())
+    else:
+        print_report(result, Console())
+
+
+def _names(text: str) -> list[str]:
+    return [name.strip() for name in text.split(",") if name.strip()]
+
+
+def main() -> None:
+    """Runs the command line; what the user can mend is one line and exit code 2."""
+    from cpcbl_agents.sources.mrclam import LogError
+    from cpcbl_launch.team_file import TeamFileError
+    from cpcbl_transport.zenoh_bus import BusError
+
+    logging.basicConfig(format="%(asctime)s %(levelname)s %(message)s", level=logging.INFO)
+    try:
+        app()
+    except (TeamFileError, LogError, BusError, ValueError) as error:
+        typer.secho(f"cpcbl-team: {error}", fg="red", err=True)
+        sys.exit(2)

@@ -1,0 +1,113 @@
+"""A team in one process over the bus in memory: deterministic, as fast as the machine is."""
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple, Protocol
+
+import msgspec
+
+from cpcbl_agents.node import Node
+from cpcbl_agents.robot import Robot
+from cpcbl_launch.field import FieldNode, SimulatedField
+from cpcbl_launch.logs import LoggedTeam
+from cpcbl_launch.recorder import Recorder, Report
+from cpcbl_team.config import Team
+from cpcbl_transport.bus import MemoryHub
+
+Progress = Callable[[float], None]
+
+
+class Choice(NamedTuple):
+    """What a command line sets for all robots; None leaves the team file's value."""
+
+    variant: str | None = None
+    collaboration: str | None = None  # none, passive, active, both
+    fusion: str | None = None
+    direction: str | None = None
+
+
+def chosen(team: Team, choice: Choice) -> Team:
+    """The team with these choices made for all its robots."""
+    rules: dict[str, object] = {}
+    if choice.collaboration is not None:
+        rules["passive"] = choice.collaboration in ("passive", "both")
+        rules["active"] = choice.collaboration in ("active", "both")
+    for name in ("fusion", "direction"):
+        if getattr(choice, name) is not None:
+            rules[name] = str(getattr(choice, name))
+    local = {} if choice.variant is None else {"variant": str(choice.variant)}
+    replace = msgspec.structs.replace
+    robots = {
+        name: replace(
+            robot,
+            localizer=replace(robot.localizer, **local),
+            collaboration=replace(robot.collaboration, **rules),
+        )
+        for name, robot in team.robots.items()
+    }
+    return replace(team, robots=robots)
+
+
+def evaluate_log(
+    logged: LoggedTeam, duration_s: float | None = None, progress: Progress | None = None
+) -> Report:
+    """All robots of a log, scored against its truth."""
+    team, start_ns, end_ns = logged.team, logged.start_ns, logged.end_ns
+    if duration_s is not None:
+        end_ns = min(end_ns, start_ns + int(duration_s * 1e9))
+    hub = MemoryHub()
+    recorder = Recorder(hub.session())
+    run_nodes(_robots(team, hub, start_ns), start_ns, end_ns, progress)
+    variants = {name: robot.localizer.variant for name, robot in team.robots.items()}
+    report = recorder.report(variants, logged.truth)
+    return msgspec.structs.replace(
+        report, left_out=logged.left_out, duration_s=(end_ns - start_ns) * 1e-9
+    )
+
+
+def simulate(team: Team, seed: int, duration_s: float) -> tuple[Report, Recorder]:
+    """A simulated team, field and robots in one process."""
+    hub, end_ns = MemoryHub(), int(duration_s * 1e9)
+    recorder = Recorder(hub.session())
+    field = FieldNode(SimulatedField(team, seed, 0), hub.session())
+    run_nodes([field, *_robots(team, hub, 0)], 0, end_ns)
+    variants = {name: robot.localizer.variant for name, robot in team.robots.items()}
+    return recorder.report(variants, recorder.simulated_truth()), recorder
+
+
+def _robots(team: Team, hub: MemoryHub, start_ns: int) -> list["Stepped"]:
+    return [
+        Node(Robot(name, team, start_ns), team, hub.session(), start_ns, "0")
+        for name in team.robots
+    ]
+
+
+class Stepped(Protocol):
+    """A robot's or the field's node."""
+
+    @property
+    def next_ns(self) -> int: ...
+
+    @property
+    def waiting(self) -> bool: ...
+
+    def step(self, now_ns: int) -> None: ...
+
+
+def run_nodes(
+    nodes: Sequence[Stepped], start_ns: int, end_ns: int, progress: Progress | None = None
+) -> None:
+    """Steps nodes in the order of their times; what one says the others hear at once."""
+    now_ns, shown = start_ns, 0.0
+    while now_ns < end_ns:
+        now_ns = max(now_ns, min(node.next_ns for node in nodes))
+        for node in nodes:
+            if node.next_ns <= now_ns or node.waiting:
+                node.step(now_ns)
+        while any(node.waiting for node in nodes):
+            for node in nodes:
+                if node.waiting:
+                    node.step(now_ns)
+        done = (now_ns - start_ns) / (end_ns - start_ns)
+        if progress is not None and done >= shown + 0.01:
+            shown = done
+            progress(min(done, 1.0))

@@ -1,0 +1,81 @@
+"""A team on a real log: its map, where its robots start, what truth there is."""
+
+import math
+from collections.abc import Collection
+from pathlib import Path
+from typing import NamedTuple
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from cpcbl_agents.sources import mrclam
+from cpcbl_team.config import Field, Start, Team
+from cpcbl_team.metrics import truth_at
+
+
+class LoggedTeam(NamedTuple):
+    """A team whose robots have logs, and what the logs say besides."""
+
+    team: Team
+    truth: dict[str, NDArray[np.float64]]
+    left_out: dict[str, str]
+    start_ns: int
+    end_ns: int
+
+
+def on_log(team: Team, folder: Path) -> LoggedTeam:
+    """The team on the MRCLAM log in `folder`: robots start at the log's first true pose.
+
+    A robot whose files are missing is left out. Raises LogError.
+    """
+    there = set(mrclam.robots_in(folder))
+    left_out = {
+        name: "no " + ", ".join(mrclam.missing_files(folder, name))
+        for name in team.robots
+        if name not in there
+    }
+    names = [name for name in team.robots if name in there]
+    if not names:
+        raise mrclam.LogError(f"{folder}: has files for none of the robots {', '.join(left_out)}")
+    truth = {name: mrclam.read_truth(folder, name) for name in names}
+    spans = {name: mrclam.odometry_span_ns(folder, name) for name in names}
+    robots = {
+        name: msgspec.structs.replace(team.robots[name], start=_start(spans[name][0], truth[name]))
+        for name in names
+    }
+    ready = msgspec.structs.replace(
+        team,
+        robots=robots,
+        map=Field(landmarks=mrclam.read_landmarks(folder)),
+        data=str(folder.resolve()),
+    )
+    start_ns = min(first for first, _ in spans.values())
+    return LoggedTeam(ready, truth, left_out, start_ns, max(last for _, last in spans.values()))
+
+
+def _start(at_ns: int, truth: NDArray[np.float64]) -> Start | None:
+    """The true pose at a time; None where there is no truth near it."""
+    pose, counts = truth_at(np.array([at_ns * 1e-9]), truth)
+    if not counts[0]:
+        return None
+    x, y, heading = pose[0].tolist()
+    return Start(x_m=x, y_m=y, heading_deg=math.degrees(heading))
+
+
+def blinded(team: Team, blind: Collection[str]) -> Team:
+    """The team with some robots blind to landmarks. Raises ValueError for an unknown name."""
+    unknown = sorted(set(blind) - set(team.robots))
+    if unknown:
+        raise ValueError(
+            f"no robot {', '.join(unknown)} to blind; there are {', '.join(team.robots)}"
+        )
+    robots = {
+        name: msgspec.structs.replace(
+            robot, sensor=msgspec.structs.replace(robot.sensor, sees_landmarks=False)
+        )
+        if name in blind
+        else robot
+        for name, robot in team.robots.items()
+    }
+    return msgspec.structs.replace(team, robots=robots)

@@ -1,0 +1,173 @@
+"""Listens to what robots say of themselves, and turns it into a report against the truth."""
+
+import threading
+from collections.abc import Mapping
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from cpcbl_team.metrics import Samples, Score, score, truth_at
+from cpcbl_transport import topics
+from cpcbl_transport.bus import Bus
+from cpcbl_transport.messages import Status, Track, Truth, Truths, decode
+
+
+class RobotReport(Score, frozen=True, kw_only=True):
+    """One robot's figures; messages and payload bytes are those of beliefs and fixes."""
+
+    variant: str
+    lost_share: float
+    lost_at_end: str
+    bumps: int
+    messages_sent: int
+    bytes_sent: int
+    messages_received: int
+    bytes_received: int
+    counts: dict[str, int]
+
+
+class TeamReport(msgspec.Struct, frozen=True, kw_only=True):
+    """Means over the robots that could be scored; sums for messages and bytes."""
+
+    position_rmse_m: float | None
+    position_mean_m: float | None
+    position_max_m: float | None
+    heading_rmse_deg: float | None
+    inside_3_sigma: float | None
+    nees: float | None
+    messages_sent: int
+    bytes_sent: int
+
+
+class Report(msgspec.Struct, frozen=True, kw_only=True):
+    """What `up --report`, `up --json` and `evaluate --json` write."""
+
+    robots: dict[str, RobotReport]
+    team: TeamReport
+    left_out: dict[str, str] = {}
+    """Robots that could not take part, with the reason."""
+    duration_s: float = 0.0
+    restarts: dict[str, int] = {}
+    alone: dict[str, Score] = {}
+    """Before collaboration began, where it began late."""
+
+
+class Recorder:
+    """Subscribes to tracks, status and simulated truth on a bus."""
+
+    def __init__(self, bus: Bus) -> None:
+        self._lock = threading.Lock()
+        self.tracks: dict[str, list[Track]] = {}
+        self.status: dict[str, Status] = {}
+        self.truths: list[Truths] = []
+        self.unreadable = 0
+        self._done: dict[str, list[Status]] = {}
+        for topic in (topics.TRACK, topics.STATUS, topics.TRUTH):
+            bus.subscribe(topic.at(), self._arrived)
+
+    def _arrived(self, key: str, payload: bytes) -> None:
+        message = decode(payload)
+        with self._lock:
+            match message:
+                case Track():
+                    self.tracks.setdefault(message.robot, []).append(message)
+                case Status():
+                    before = self.status.get(message.robot)
+                    if before is not None and before.incarnation != message.incarnation:
+                        self._done.setdefault(message.robot, []).append(before)
+                    self.status[message.robot] = message
+                case Truths():
+                    self.truths.append(message)
+                case _:
+                    self.unreadable += 1
+
+    def latest(self) -> tuple[dict[str, Track], dict[str, Status], dict[str, Truth]]:
+        """The newest track, status and simulated truth of every robot."""
+        with self._lock:
+            truth = {t.robot: t for t in self.truths[-1].robots} if self.truths else {}
+            tracks = {name: t[-1] for name, t in self.tracks.items()}
+            return tracks, dict(self.status), truth
+
+    def simulated_truth(self) -> dict[str, NDArray[np.float64]]:
+        """Rows of seconds, x, y, heading for every robot of the simulated field."""
+        with self._lock:
+            rows: dict[str, list[tuple[float, float, float, float]]] = {}
+            for truths in self.truths:
+                for t in truths.robots:
+                    row = (truths.stamp_ns * 1e-9, t.x_m, t.y_m, t.heading_rad)
+                    rows.setdefault(t.robot, []).append(row)
+        return {name: np.array(r) for name, r in rows.items()}
+
+    def samples(
+        self, robot: str, truth: NDArray[np.float64] | None, from_s: float, until_s: float
+    ) -> Samples:
+        """A robot's estimates within [from_s, until_s), beside the truth, where there is one."""
+        with self._lock:
+            tracks = list(self.tracks.get(robot, ()))
+        tracks = [t for t in tracks if from_s <= t.stamp_ns * 1e-9 < until_s]
+        estimate = np.array([(t.x_m, t.y_m, t.heading_rad) for t in tracks]).reshape(-1, 3)
+        covariances = [t.covariance for t in tracks if t.covariance is not None]
+        if truth is None or len(truth) == 0 or not tracks:
+            return Samples(estimate[:0], estimate[:0], None)
+        times = np.array([t.stamp_ns * 1e-9 for t in tracks])
+        at, counts = truth_at(times, truth)
+        covariance = np.array(covariances) if len(covariances) == len(tracks) else None
+        return Samples(
+            estimate[counts], at[counts], None if covariance is None else covariance[counts]
+        )
+
+    def report(
+        self,
+        variants: Mapping[str, str],
+        truth: Mapping[str, NDArray[np.float64]],
+        from_s: float = -np.inf,
+    ) -> Report:
+        """The figures of all robots from `from_s` on."""
+        _, _, last_truth = self.latest()
+        robots = {}
+        for name, variant in variants.items():
+            figures = score(self.samples(name, truth.get(name), from_s, np.inf))
+            tracks = self.tracks.get(name, [])
+            statuses = [
+                *self._done.get(name, ()),
+                *([self.status[name]] if name in self.status else []),
+            ]
+            robots[name] = RobotReport(
+                **msgspec.structs.asdict(figures),
+                variant=variant,
+                lost_share=sum(bool(t.lost) for t in tracks) / max(len(tracks), 1),
+                lost_at_end=tracks[-1].lost if tracks else "never heard of",
+                bumps=last_truth[name].bumps if name in last_truth else 0,
+                messages_sent=sum(s.messages_sent for s in statuses),
+                bytes_sent=sum(s.bytes_sent for s in statuses),
+                messages_received=sum(s.messages_received for s in statuses),
+                bytes_received=sum(s.bytes_received for s in statuses),
+                counts=_added(statuses),
+            )
+        return Report(robots=robots, team=_team(robots))
+
+
+def _added(statuses: list[Status]) -> dict[str, int]:
+    total: dict[str, int] = {}
+    for status in statuses:
+        for reason, n in status.counts.items():
+            total[reason] = total.get(reason, 0) + n
+    return dict(sorted(total.items()))
+
+
+def _team(robots: Mapping[str, RobotReport]) -> TeamReport:
+    def mean(name: str) -> float | None:
+        values = [v for r in robots.values() if (v := getattr(r, name)) is not None]
+        return float(np.mean(values)) if values else None
+
+    return TeamReport(
+        position_rmse_m=mean("position_rmse_m"),
+        position_mean_m=mean("position_mean_m"),
+        position_max_m=mean("position_max_m"),
+        heading_rmse_deg=mean("heading_rmse_deg"),
+        inside_3_sigma=mean("inside_3_sigma"),
+        nees=mean("nees"),
+        messages_sent=sum(r.messages_sent for r in robots.values()),
+        bytes_sent=sum(r.bytes_sent for r in robots.values()),
+    )

@@ -1,0 +1,201 @@
+"""Team files: TOML in layers (defaults, then robot types, then robots), typed and checked.
+
+Whatever is wrong is one `TeamFileError` that names the file, the key and the fix.
+"""
+
+import difflib
+import math
+import re
+import tomllib
+from collections.abc import Iterator, Mapping
+from importlib import resources
+from pathlib import Path
+from typing import Any, get_args, get_type_hints
+
+import msgspec
+
+from cpcbl_team.config import (
+    Field,
+    RobotSettings,
+    SimulationSettings,
+    Table,
+    Team,
+    TransportSettings,
+)
+from cpcbl_team.inputs import Name
+
+Layer = dict[str, Any]
+
+
+class TeamFileError(Exception):
+    """A team file that cannot be used; the text names file, key and fix."""
+
+
+class _File(Table, frozen=True, kw_only=True):
+    """The file's own tables; robots are still layers."""
+
+    name: Name
+    robots: dict[Name, Layer]
+    map: Field = Field()
+    transport: TransportSettings = TransportSettings()
+    simulation: SimulationSettings = SimulationSettings()
+    data: str = ""
+    defaults: Layer = msgspec.field(default_factory=dict)
+    types: dict[Name, Layer] = msgspec.field(default_factory=dict)
+
+
+def builtin(name: str) -> Path:
+    """The path of a team file that comes with the package."""
+    return Path(str(resources.files("cpcbl_launch") / "teams" / f"{name}.toml"))
+
+
+def load_team(path: Path) -> Team:
+    """The team in a TOML file, or in a JSON file that `save_resolved` wrote.
+
+    Raises TeamFileError.
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise TeamFileError(f"{path}: no such file") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise TeamFileError(f"{path}: cannot be read: {error}") from error
+    if path.suffix == ".json":
+        try:
+            return msgspec.json.decode(text, type=Team)
+        except msgspec.MsgspecError as error:
+            raise TeamFileError(f"{path}: {error}") from error
+    return parse_team(text, str(path))
+
+
+def save_resolved(team: Team, path: Path) -> None:
+    """Writes a team with its layers merged, for the processes of one run."""
+    path.write_bytes(msgspec.json.format(msgspec.json.encode(team), indent=1))
+
+
+def parse_team(text: str, name: str = "team file") -> Team:
+    """The team in a TOML text; `name` is what errors call it. Raises TeamFileError."""
+    try:
+        raw = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise TeamFileError(f"{name}: not TOML: {error}") from error
+    for key in _not_finite(raw):
+        raise TeamFileError(f"{name}: {key}: not a finite number; write a finite one")
+    file = _converted(raw, _File, "", name)
+    _converted(file.defaults, RobotSettings, "defaults", name)
+    for kind, layer in file.types.items():
+        _converted(layer, RobotSettings, f"types.{kind}", name)
+    robots = {}
+    for robot, layer in file.robots.items():
+        kind = layer.pop("type", None)
+        if kind is not None and kind not in file.types:
+            known = ", ".join(file.types) or "none"
+            raise TeamFileError(
+                f"{name}: robots.{robot}.type: no type {kind!r}; define [types.{kind}] or use one"
+                f" of: {known}"
+            )
+        _converted(layer, RobotSettings, f"robots.{robot}", name)
+        merged = _merged(file.defaults, file.types.get(kind, {}) if kind else {}, layer)
+        robots[robot] = _converted(merged, RobotSettings, f"robots.{robot}", name)
+    team = Team(
+        name=file.name,
+        robots=robots,
+        map=file.map,
+        transport=file.transport,
+        simulation=file.simulation,
+        data=file.data,
+    )
+    for problem in problems(team):
+        raise TeamFileError(f"{name}: {problem}")
+    return team
+
+
+def problems(team: Team) -> Iterator[str]:
+    """What no single key is to blame for: `key: problem; fix`."""
+    if not team.robots:
+        yield "robots: there is none; add a table [robots.r1]"
+    names = [*team.map.landmarks, *team.map.walls]
+    for twice in sorted({n for n in names if names.count(n) > 1 or n in team.robots}):
+        yield f"map: {twice!r} names two things; rename one of them"
+    for name, wall in team.map.walls.items():
+        if wall.from_m == wall.to_m:
+            yield f"map.walls.{name}: has no length; move to_m away from from_m"
+    for name, robot in team.robots.items():
+        if robot.source == "simulated" and robot.start is None:
+            yield f"robots.{name}.start: a simulated robot needs one; add x_m, y_m, heading_deg"
+        if robot.localizer.variant == "joint" and robot.localizer.paper_uncertainty:
+            yield (
+                f"robots.{name}.localizer.paper_uncertainty: the joint variant cannot do"
+                " without the covariance; use variant circular or oval"
+            )
+        if robot.localizer.alternate is False and robot.localizer.variant != "joint":
+            yield (
+                f"robots.{name}.localizer.alternate: only the joint variant can update both at"
+                " once; remove the key"
+            )
+    if not team.transport.connect:
+        yield "transport.connect: is empty; name an endpoint such as tcp/192.168.1.10:7447"
+    for key in ("listen", "connect"):
+        for endpoint in getattr(team.transport, key):
+            if not re.fullmatch(r"(tcp|tls|quic|udp|ws)/.+:\d{1,5}", endpoint):
+                yield (
+                    f"transport.{key}: {endpoint!r} is no endpoint;"
+                    " write it as tcp/192.168.1.10:7447"
+                )
+
+
+def _merged(*layers: Mapping[str, Any]) -> Layer:
+    result: Layer = {}
+    for layer in layers:
+        for key, value in layer.items():
+            old = result.get(key)
+            deeper = isinstance(old, dict) and isinstance(value, dict)
+            result[key] = _merged(old or {}, value) if deeper else value
+    return result
+
+
+def _converted(raw: Any, kind: type[Any], prefix: str, name: str) -> Any:
+    try:
+        return msgspec.convert(raw, kind)
+    except msgspec.ValidationError as error:
+        raise TeamFileError(f"{name}: {_explained(str(error), kind, prefix)}") from None
+
+
+def _explained(error: str, kind: type[Any], prefix: str) -> str:
+    """msgspec's text as `key: problem; fix`."""
+    problem, _, where = error.partition(" - at `")
+    path = where.rstrip("`").removeprefix("$").lstrip(".")
+    key = ".".join(part for part in (prefix, path) if part)
+    unknown = re.search(r"unknown field `(.+)`", problem)
+    if unknown:
+        field, known = unknown.group(1), _fields_at(kind, path)
+        close = difflib.get_close_matches(field, known, n=1)
+        fix = f"did you mean {close[0]!r}?" if close else f"known here: {', '.join(known)}"
+        return f"{'.'.join(p for p in (key, field) if p)}: unknown key; {fix}"
+    missing = re.search(r"missing required field `(.+)`", problem)
+    if missing:
+        return f"{'.'.join(p for p in (key, missing.group(1)) if p)}: missing; add it"
+    return f"{key}: {problem[:1].lower()}{problem[1:]}; correct the value"
+
+
+def _fields_at(kind: Any, path: str) -> list[str]:
+    """The keys that a table at `path` knows; `[...]` stands for any name."""
+    for part in path.replace("[...]", ".[...]").split("."):
+        if part == "[...]":
+            kind = get_args(kind)[1]
+        elif part:
+            kind = get_type_hints(kind)[part]
+        if type(None) in get_args(kind):
+            kind = get_args(kind)[0]
+    return sorted(getattr(kind, "__struct_fields__", ()))
+
+
+def _not_finite(raw: Any, key: str = "") -> Iterator[str]:
+    if isinstance(raw, float) and not math.isfinite(raw):
+        yield key
+    elif isinstance(raw, dict):
+        for name, value in raw.items():
+            yield from _not_finite(value, f"{key}.{name}" if key else name)
+    elif isinstance(raw, list):
+        for i, value in enumerate(raw):
+            yield from _not_finite(value, f"{key}[{i}]")

@@ -1,0 +1,124 @@
+"""`cpcbl-team up`: router, field and a process per robot; a live table; a report at the end."""
+
+import socket
+import tempfile
+import time
+from collections.abc import Collection, Mapping
+from pathlib import Path
+from types import MappingProxyType
+from typing import NamedTuple, Protocol
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from cpcbl_agents.clock import Clock
+from cpcbl_launch.processes import process_table
+from cpcbl_launch.recorder import Recorder, Report
+from cpcbl_launch.supervisor import Supervisor
+from cpcbl_launch.team_file import save_resolved
+from cpcbl_team.config import Team
+from cpcbl_team.metrics import score
+from cpcbl_transport.zenoh_bus import open_router
+
+LEAD_S = 2.0
+LEAD_S_A_PROCESS = 0.3
+REFRESH_S = 0.25
+
+
+class Run(NamedTuple):
+    """What is to be run."""
+
+    team: Team
+    duration_s: float | None
+    speed: float = 1.0
+    seed: int = 1
+    here: Collection[str] | None = None
+    """The robots to start on this machine; None: all."""
+    truth: Mapping[str, NDArray[np.float64]] = MappingProxyType({})
+    left_out: Mapping[str, str] = MappingProxyType({})
+    epoch_ns: int | None = None
+    """Robot time at the start; None: now."""
+    folder: Path | None = None
+    """Where processes write their logs; None: a temporary folder."""
+
+
+class View(Protocol):
+    """Shows a run to a person."""
+
+    def show(self, recorder: Recorder, supervisor: Supervisor, elapsed_s: float) -> None: ...
+
+
+class Stopping(Protocol):
+    def __call__(self) -> bool: ...
+
+
+def free_endpoint() -> str:
+    """An endpoint of this machine that nobody listens at."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+
+
+def run_team(run: Run, view: View, stop: Stopping) -> Report:
+    """Runs a team until its time is over or `stop()`. Raises BusError without a router."""
+    with tempfile.TemporaryDirectory(prefix="cpcbl-") as temporary:
+        return _run_in(run, view, stop, run.folder or Path(temporary))
+
+
+def _run_in(run: Run, view: View, stop: Stopping, folder: Path) -> Report:
+    team, here = run.team, run.team.robots if run.here is None else run.here
+    folder.mkdir(parents=True, exist_ok=True)
+    team_file = folder / "team.json"
+    save_resolved(team, team_file)
+    listen = team.transport.listen or (free_endpoint(),)
+    lead_s = LEAD_S + LEAD_S_A_PROCESS * len(here)
+    clock = Clock(
+        run.epoch_ns if run.epoch_ns is not None else time.time_ns() + int(lead_s * 1e9),
+        time.monotonic_ns() + int(lead_s * 1e9),
+        run.speed,
+    )
+    table = process_table(team, team_file, _dialled(listen[0]), clock, run.seed, here)
+    with open_router(team.name, listen) as bus:
+        recorder = Recorder(bus)
+        with Supervisor(table, folder) as supervisor:
+            end_ns = None if run.duration_s is None else int(run.duration_s * 1e9)
+            while not stop():
+                elapsed_ns = clock.now_ns() - clock.epoch_ns
+                if end_ns is not None and elapsed_ns >= end_ns:
+                    break
+                supervisor.watch()
+                view.show(recorder, supervisor, elapsed_ns * 1e-9)
+                time.sleep(REFRESH_S)
+            elapsed_s = (clock.now_ns() - clock.epoch_ns) * 1e-9
+            restarts = supervisor.restarts
+    return _report(run, recorder, clock.epoch_ns * 1e-9, elapsed_s, restarts)
+
+
+def _dialled(listen: str) -> str:
+    """The endpoint at which robots of this machine find a router that listens everywhere."""
+    return listen.replace("/0.0.0.0:", "/127.0.0.1:").replace("/[::]:", "/[::1]:")
+
+
+def _report(
+    run: Run, recorder: Recorder, epoch_s: float, elapsed_s: float, restarts: dict[str, int]
+) -> Report:
+    robots = run.team.robots
+    truth = run.truth or recorder.simulated_truth()
+    after_s = max((r.collaboration.after_s for r in robots.values()), default=0.0)
+    helped_from_s = epoch_s + after_s if after_s else -np.inf
+    variants = {name: robot.localizer.variant for name, robot in robots.items()}
+    report = recorder.report(variants, truth, helped_from_s)
+    alone = {}
+    if after_s:
+        alone = {
+            name: score(recorder.samples(name, truth.get(name), -np.inf, helped_from_s))
+            for name in robots
+        }
+    return msgspec.structs.replace(
+        report,
+        left_out=dict(run.left_out),
+        duration_s=elapsed_s,
+        restarts=restarts,
+        alone=alone,
+    )

@@ -1,0 +1,158 @@
+"""The closed union of messages and their wire format: one version byte, then MessagePack.
+
+Structs are written as arrays with their tag first; they grow only by defaulted fields at the end,
+so that old readers skip what they do not know. What cannot be used is a `Refusal` with a reason,
+never an exception.
+"""
+
+import math
+from enum import StrEnum
+
+import msgspec
+
+from cpcbl_team.inputs import Belief, Fix, Name, Odometry, Sightings
+
+VERSION = 1
+FUTURE_NS = 500_000_000
+LONGEST_ODOMETRY_NS = 10_000_000_000
+LARGEST_PAYLOAD = 65_536
+
+
+class Status(msgspec.Struct, frozen=True, array_like=True, tag="status"):
+    """A robot's health, for operators. Metres, radians, counts since its process started."""
+
+    robot: Name
+    incarnation: str
+    stamp_ns: int
+    position_sigma_m: float
+    heading_sigma_rad: float
+    tier: int
+    lost: str
+    counts: dict[str, int]
+    messages_sent: int
+    bytes_sent: int
+    messages_received: int
+    bytes_received: int
+
+
+class Track(msgspec.Struct, frozen=True, array_like=True, tag="track"):
+    """A robot's pose Gaussian for recorders; covariance None where the variant has none."""
+
+    robot: Name
+    stamp_ns: int
+    x_m: float
+    y_m: float
+    heading_rad: float
+    covariance: tuple[float, float, float, float, float, float] | None
+    tier: int
+    lost: str = ""
+
+
+class Drive(msgspec.Struct, frozen=True, array_like=True, tag="drive"):
+    """Command to the simulated wheels."""
+
+    robot: Name
+    stamp_ns: int
+    speed_m_s: float
+    turn_rate_rad_s: float
+
+
+class Truth(msgspec.Struct, frozen=True, array_like=True):
+    """Where the simulated field has a robot; bumps into landmarks so far."""
+
+    robot: Name
+    x_m: float
+    y_m: float
+    heading_rad: float
+    bumps: int = 0
+
+
+class Truths(msgspec.Struct, frozen=True, array_like=True, tag="truth"):
+    """The true poses of all simulated robots at one time."""
+
+    stamp_ns: int
+    robots: tuple[Truth, ...]
+
+
+Message = Odometry | Sightings | Belief | Fix | Status | Track | Drive | Truths
+
+
+class Refusal(StrEnum):
+    """Why a payload was not taken."""
+
+    EMPTY = "empty_payload"
+    TOO_LARGE = "payload_too_large"
+    VERSION = "wrong_version"
+    GARBAGE = "garbage"
+    WRONG_TYPE = "wrong_type"
+    NOT_FINITE = "not_finite"
+    NOT_A_COVARIANCE = "not_a_covariance"
+    FUTURE = "from_the_future"
+    DURATION = "impossible_duration"
+    UNKNOWN_ROBOT = "unknown_robot"
+    NOT_FOR_ME = "not_for_me"
+    OWN = "own_message"
+
+
+_encoder = msgspec.msgpack.Encoder()
+_decoder: msgspec.msgpack.Decoder[Message] = msgspec.msgpack.Decoder(Message)
+_HEAD = bytes([VERSION])
+
+
+def encode(message: Message) -> bytes:
+    """The payload of a message."""
+    return _HEAD + _encoder.encode(message)
+
+
+def decode(payload: bytes) -> Message | Refusal:
+    """The message in a payload, or why there is none."""
+    if not payload:
+        return Refusal.EMPTY
+    if len(payload) > LARGEST_PAYLOAD:
+        return Refusal.TOO_LARGE
+    if payload[0] != VERSION:
+        return Refusal.VERSION
+    try:
+        return _decoder.decode(memoryview(payload)[1:])
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
+        return Refusal.GARBAGE
+
+
+def refusal(message: Message, now_ns: int) -> Refusal | None:
+    """Why a decoded message must not be used, or None: numbers, time, duration."""
+    if not _finite(message):
+        return Refusal.NOT_FINITE
+    if message.stamp_ns > now_ns + FUTURE_NS:
+        return Refusal.FUTURE
+    match message:
+        case Odometry():
+            if not 0 < message.stamp_ns - message.from_ns <= LONGEST_ODOMETRY_NS:
+                return Refusal.DURATION
+        case Fix():
+            parts = (message.sensor_covariance, message.observer_covariance)
+            if not all(_is_covariance(*part) for part in parts):
+                return Refusal.NOT_A_COVARIANCE
+        case Belief():
+            xx, xy, yy, _, _, hh = message.covariance
+            if not _is_covariance(xx, xy, yy) or hh < 0.0:
+                return Refusal.NOT_A_COVARIANCE
+    return None
+
+
+def _is_covariance(xx: float, xy: float, yy: float) -> bool:
+    return xx >= 0.0 and yy >= 0.0 and xy * xy <= xx * yy * (1.0 + 1e-6) + 1e-12
+
+
+def _finite(message: Message) -> bool:
+    """Whether all numbers are finite. Those of sightings are judged one by one by the filter."""
+    if isinstance(message, Sightings):
+        return True
+    for name in message.__struct_fields__:
+        value = getattr(message, name)
+        if isinstance(value, float) and not math.isfinite(value):
+            return False
+        if isinstance(value, tuple) and not all(
+            math.isfinite(v) for v in value if isinstance(v, float)
+        ):
+            return False
+    return True

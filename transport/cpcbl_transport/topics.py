@@ -1,0 +1,93 @@
+"""THE table of topics: every key, what it carries, how often, with which quality of service.
+
+A key stands below the team's namespace `cpcbl/<team>`. The publisher's tier is part of the key and
+a robot subscribes only to tiers better than its own, so that nothing flows uphill: Zenoh itself
+drops it at the sender. This module does not know the bus.
+"""
+
+from enum import Enum
+from typing import NamedTuple
+
+from cpcbl_team.inputs import Belief, Fix, Odometry, Sightings
+from cpcbl_transport.messages import Drive, Message, Status, Track, Truths
+
+
+class Qos(Enum):
+    """(priority, what a full queue does, reliable): how the bus treats a topic."""
+
+    FRESH = ("DATA_HIGH", "DROP", False)
+    COMMAND = ("INTERACTIVE_HIGH", "BLOCK", True)
+    INPUT = ("DATA", "BLOCK", True)
+    TELEMETRY = ("BACKGROUND", "DROP", False)
+
+
+class Topic(NamedTuple):
+    """One row of the table."""
+
+    key: str  # <name> is filled in by `at`, or by `*` for a subscription
+    carries: type[Message] | None
+    rate: str
+    qos: Qos
+    reason: str
+
+    def at(self, **names: object) -> str:
+        """The key with these names; `*` for each that is left out."""
+        chunks = []
+        for chunk in self.key.split("/"):
+            name = chunk.strip("<>")
+            chunks.append(str(names.get(name, "*")) if chunk.startswith("<") else chunk)
+        return "/".join(chunks)
+
+
+ALIVE = Topic(
+    "alive/<tier>/<robot>/<incarnation>",
+    None,
+    "at a change of tier",
+    Qos.COMMAND,
+    "a liveliness token: the bus tells when it comes and goes; presence, not health",
+)
+BELIEF = Topic(
+    "belief/<tier>/<robot>",
+    Belief,
+    "5 Hz while a worse robot listens",
+    Qos.FRESH,
+    "the next one is better than a late one",
+)
+FIX = Topic(
+    "fix/<robot>/<tier>/<observer>",
+    Fix,
+    "each sighting of a worse robot that listens",
+    Qos.FRESH,
+    "the next one is better than a late one",
+)
+STATUS = Topic(
+    "status/<robot>", Status, "1 Hz", Qos.TELEMETRY, "for people; must never delay a fix"
+)
+TRACK = Topic(
+    "track/<robot>",
+    Track,
+    "10 Hz while somebody records",
+    Qos.TELEMETRY,
+    "for reports; costs nothing when nobody listens",
+)
+IN_ODOMETRY = Topic(
+    "in/<robot>/odometry",
+    Odometry,
+    "the driver's",
+    Qos.INPUT,
+    "a lost piece of odometry is a lost piece of the way",
+)
+IN_SIGHTINGS = Topic(
+    "in/<robot>/sightings", Sightings, "the driver's", Qos.INPUT, "inputs are not dropped"
+)
+DRIVE = Topic(
+    "field/drive/<robot>",
+    Drive,
+    "10 Hz, simulation only",
+    Qos.COMMAND,
+    "a late command is a collision",
+)
+TRUTH = Topic("field/truth", Truths, "10 Hz, simulation only", Qos.TELEMETRY, "for reports only")
+
+TOPICS = (ALIVE, BELIEF, FIX, STATUS, TRACK, IN_ODOMETRY, IN_SIGHTINGS, DRIVE, TRUTH)
+COLLABORATION = (Belief, Fix)

@@ -1,0 +1,165 @@
+"""The bus over Zenoh: the only file that imports it. The choices are measured ones.
+
+- One publisher a concrete key: a put without a publisher is uploaded even if nobody listens.
+- No multicast: a client finds its router by the endpoint, which the launcher hands it.
+- `open` is retried here with a short time-out: a blocked open swallows SIGINT.
+- A session that is not closed hangs the interpreter at exit: `with open_bus(...)`.
+"""
+
+import json
+import logging
+import threading
+import time
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import zenoh
+
+from cpcbl_transport.bus import Handle, Publisher, Receive, Watch
+from cpcbl_transport.topics import Qos
+
+log = logging.getLogger(__name__)
+
+DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
+OPEN_TIMEOUT_MS = 2000
+
+
+class BusError(Exception):
+    """The bus could not be opened."""
+
+
+def open_bus(
+    team: str, connect: Sequence[str], give_up: Callable[[], bool] = lambda: False
+) -> "ZenohBus":
+    """A client's session below the team's namespace; waits for a router until `give_up()`.
+
+    Raises BusError when it gave up.
+    """
+    options = {
+        "mode": "client",
+        "connect": {
+            "endpoints": list(connect),
+            "timeout_ms": OPEN_TIMEOUT_MS,
+            "exit_on_failure": True,
+            "retry": {
+                "period_init_ms": 200,
+                "period_max_ms": 1000,
+                "period_increase_factor": 2,
+            },
+        },
+    }
+    reason = "stopped before a router answered"
+    while not give_up():
+        try:
+            return ZenohBus(_open(team, options))
+        except zenoh.ZError as error:
+            reason = str(error)
+            log.info("no router at %s yet", ", ".join(connect))
+            time.sleep(0.2)
+    raise BusError(f"no router at {', '.join(connect)}: {reason}")
+
+
+def open_router(team: str, listen: Sequence[str], connect: Sequence[str] = ()) -> "ZenohBus":
+    """A session that is the team's router. Raises BusError when it cannot listen there."""
+    options = {
+        "mode": "router",
+        "listen": {"endpoints": list(listen), "exit_on_failure": True},
+        "connect": {"endpoints": list(connect), "timeout_ms": -1, "exit_on_failure": False},
+    }
+    try:
+        return ZenohBus(_open(team, options))
+    except zenoh.ZError as error:
+        raise BusError(f"cannot listen on {', '.join(listen)}: {error}") from error
+
+
+def _open(team: str, options: dict[str, Any]) -> "zenoh.Session":
+    config = zenoh.Config()
+    options |= {
+        "namespace": f"cpcbl/{team}",
+        "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
+        "timestamping": {"enabled": False},
+    }
+    for key, value in options.items():
+        config.insert_json5(key, json.dumps(value))
+    config.insert_json5("transport/link/tx/lease", "2000")
+    config.insert_json5("transport/link/tx/keep_alive", "4")
+    return zenoh.open(config)
+
+
+class _Once:
+    """Closes a declaration once, whoever asks."""
+
+    def __init__(self, undeclare: Callable[[], None]) -> None:
+        self._undeclare: Callable[[], None] | None = undeclare
+
+    def close(self) -> None:
+        undeclare, self._undeclare = self._undeclare, None
+        if undeclare is not None:
+            undeclare()
+
+
+class _ZenohPublisher(_Once):
+    def __init__(self, publisher: "zenoh.Publisher") -> None:
+        super().__init__(publisher.undeclare)
+        self._publisher = publisher
+
+    @property
+    def matching(self) -> bool:
+        if self._undeclare is None:
+            return False
+        status: Any = self._publisher.matching_status  # the stubs call it a bool
+        return bool(status.matching)
+
+    def put(self, payload: bytes) -> None:
+        if self._undeclare is not None:
+            self._publisher.put(payload)
+
+
+class ZenohBus:
+    """One Zenoh session."""
+
+    def __init__(self, session: "zenoh.Session") -> None:
+        self._session = session
+        self._closed = threading.Event()
+
+    def publisher(self, key: str, qos: Qos) -> Publisher:
+        priority, congestion, reliable = qos.value
+        return _ZenohPublisher(
+            self._session.declare_publisher(
+                key,
+                allowed_destination=zenoh.Locality.REMOTE,
+                priority=getattr(zenoh.Priority, priority),
+                congestion_control=getattr(zenoh.CongestionControl, congestion),
+                reliability=zenoh.Reliability.RELIABLE
+                if reliable
+                else zenoh.Reliability.BEST_EFFORT,
+            )
+        )
+
+    def subscribe(self, keys: str, receive: Receive) -> Handle:
+        def on_sample(sample: "zenoh.Sample") -> None:
+            if sample.kind == zenoh.SampleKind.PUT:
+                receive(str(sample.key_expr), sample.payload.to_bytes())
+
+        return _Once(self._session.declare_subscriber(keys, on_sample).undeclare)
+
+    def announce(self, key: str) -> Handle:
+        return _Once(self._session.liveliness().declare_token(key).undeclare)
+
+    def watch(self, keys: str, watch: Watch) -> Handle:
+        def on_sample(sample: "zenoh.Sample") -> None:
+            watch(str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT)
+
+        liveliness = self._session.liveliness()
+        return _Once(liveliness.declare_subscriber(keys, on_sample, history=True).undeclare)
+
+    def close(self) -> None:
+        if not self._closed.is_set():
+            self._closed.set()
+            self._session.close()  # type: ignore[no-untyped-call]
+
+    def __enter__(self) -> "ZenohBus":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
