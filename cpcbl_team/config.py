@@ -73,8 +73,8 @@ class SensorSettings(Table, frozen=True, kw_only=True):
 class Weights(Table, frozen=True, kw_only=True):
     """Static weights of sensor against estimate for `weighted` (paper, section 3)."""
 
-    position: Share = 0.2
-    heading: Share = 0.2
+    position: Share = 0.1
+    heading: Share = 0.5
     nominal_sigma_m: Positive = 0.15
     """Quality that a `weighted` robot claims just after an update; it has no estimate of it."""
     nominal_heading_sigma_deg: Positive = 4.0

@@ -131,7 +131,14 @@ class Localizer:
             if fault:
                 faults.append(fault)
                 continue
-            m = measured(sighting, frame.stamp_ns, self.field, memory.teammates, self.settings)
+            m = measured(
+                sighting,
+                frame.stamp_ns,
+                state.estimate.pose,
+                self.field,
+                memory.teammates,
+                self.settings,
+            )
             if m is not None:
                 seen.append(m)
         pieces = [_sighting_evidence(state, m) for m in seen if m.wall is None]

@@ -28,9 +28,19 @@ def sighting_fault(sighting: Sighting) -> str:
     return ""
 
 
-def sighting_sigmas(sighting: Sighting, sensor: SensorSettings) -> tuple[float, float]:
-    """(range sigma in m, bearing sigma in rad): the sighting's own, else the sensor model's."""
+def sighting_sigmas(
+    sighting: Sighting, sensor: SensorSettings, expected_range_m: float | None = None
+) -> tuple[float, float]:
+    """(range sigma in m, bearing sigma in rad): the sighting's own, else the sensor model's.
+
+    A share of the *measured* range would trust readings that are too short more than those that
+    are too long, and so pull the robot in; a share of the expected range (within a factor of two)
+    does not.
+    """
+    range_m = sighting.range_m or 0.0
+    if expected_range_m is not None:
+        range_m = max(0.5 * range_m, min(2.0 * range_m, expected_range_m))
     range_sigma, bearing_sigma = sighting.range_sigma_m, sighting.bearing_sigma_rad
     if range_sigma is None:
-        range_sigma = sensor.range_sigma_m(sighting.range_m or 0.0)
+        range_sigma = sensor.range_sigma_m(range_m)
     return range_sigma, sensor.bearing_sigma_rad if bearing_sigma is None else bearing_sigma

@@ -1,11 +1,13 @@
 """Step 2 of the cycle: which sightings can be used, for what, and with which sigma."""
 
+import math
 from collections.abc import Mapping
 from typing import NamedTuple
 
 from cpcbl_team.collaboration import Place, placed
 from cpcbl_team.config import Field, LocalizationSettings, Wall
 from cpcbl_team.gaussian import Covariance2
+from cpcbl_team.geometry import Pose2
 from cpcbl_team.inputs import Belief, Sighting
 from cpcbl_team.sensors import sighting_sigmas
 
@@ -32,11 +34,12 @@ class Measured(NamedTuple):
 def measured(
     sighting: Sighting,
     stamp_ns: int,
+    pose: Pose2,
     field: Field,
     teammates: Mapping[str, Belief],
     settings: LocalizationSettings,
 ) -> Measured | None:
-    """The sighting with its object's place, or None when that place is not known."""
+    """The sighting, seen from about `pose`, with its object's place; None if that is not known."""
     wall = field.walls.get(sighting.id)
     landmark = field.landmarks.get(sighting.id)
     gives = "both"
@@ -61,5 +64,13 @@ def measured(
         landmark is None and wall is None,
         range_m,
         sighting.bearing_rad if gives in ("both", "bearing") else None,
-        *sighting_sigmas(sighting, settings.sensor),
+        *sighting_sigmas(sighting, settings.sensor, _expected_range(pose, place, wall)),
     )
+
+
+def _expected_range(pose: Pose2, place: Place, wall: Wall | None) -> float:
+    dx, dy = place.x - pose.x, place.y - pose.y
+    if wall is None:
+        return math.hypot(dx, dy)
+    direction = wall.direction_rad
+    return abs(dy * math.cos(direction) - dx * math.sin(direction))

@@ -65,12 +65,13 @@ class Timeline:
         return ""
 
     def latest(self, now_ns: int) -> State:
-        """The state after all inputs, driven on along the odometry that is known by now.
+        """The newest state whose motion is known.
 
-        It does not run ahead of odometry: where that has ended, so has the belief's time.
+        It does not run ahead of odometry, unless that has fallen silent.
         """
-        state = self.state
-        return self._localizer.moved(state, min(now_ns, state.odometry_ns))
+        s, odometry_ns = self._localizer.settings.odometry, self.state.odometry_ns
+        silent = not s.moves or now_ns - odometry_ns > s.timeout_s * 1e9
+        return self.at(now_ns if silent else min(now_ns, odometry_ns)) or self.state
 
     def at(self, stamp_ns: int) -> State | None:
         """The state at a time (after the inputs stamped with it); None if it is forgotten."""

@@ -40,7 +40,10 @@ class Robot:
         """Everything that one message (from the bus, or a tick) makes this robot say to others.
 
         sensing -> filter -> collaboration; what the filter locates goes to the pilot as well.
+        After the end of its log a robot is silent.
         """
+        if self.sensing.over:
+            return []
         raw = isinstance(message, (Odometry, Sightings))
         inputs: list[Anything] = [] if raw else [message]
         inputs += self.sensing.handle(message, now_ns)

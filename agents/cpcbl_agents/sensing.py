@@ -30,6 +30,10 @@ class SensingAgent:
     def next_ns(self) -> int | None:
         return self._source.next_ns
 
+    @property
+    def over(self) -> bool:
+        return self._source.over
+
     def handle(self, message: Anything, now_ns: int) -> Sequence[Anything]:
         match message:
             case Tick():

@@ -20,7 +20,6 @@ from cpcbl_transport.bus import Bus, Publisher
 from cpcbl_transport.messages import Drive, Truth, Truths, decode, encode
 
 COMMAND_LASTS_NS = 500_000_000
-TRUTH_NS = 50_000_000
 
 
 class SimulatedRobot:
@@ -176,7 +175,6 @@ class FieldNode:
         self._field = field
         self._drives: deque[bytes] = deque(maxlen=10_000)
         self._truth = bus.publisher(topics.TRUTH.at(), topics.TRUTH.qos)
-        self._truth_ns = 0
         self._publishers: dict[tuple[str, type], Publisher] = {}
         for name in field.robots:
             for kind, topic in ((Odometry, topics.IN_ODOMETRY), (Sightings, topics.IN_SIGHTINGS)):
@@ -200,8 +198,7 @@ class FieldNode:
         while self._field.next_ns <= now_ns:
             for name, sensed in self._field.advance():
                 self._publishers[name, type(sensed)].put(encode(sensed))
-            if self._field.now_ns - self._truth_ns >= TRUTH_NS:
-                self._truth_ns = self._field.now_ns
+            if self._truth.matching:
                 self._truth.put(encode(self._field.truth()))
 
 

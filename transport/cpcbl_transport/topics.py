@@ -87,7 +87,9 @@ DRIVE = Topic(
     Qos.COMMAND,
     "a late command is a collision",
 )
-TRUTH = Topic("field/truth", Truths, "10 Hz, simulation only", Qos.TELEMETRY, "for reports only")
+TRUTH = Topic(
+    "field/truth", Truths, "every step, simulation only", Qos.TELEMETRY, "for reports only"
+)
 
 TOPICS = (ALIVE, BELIEF, FIX, STATUS, TRACK, IN_ODOMETRY, IN_SIGHTINGS, DRIVE, TRUTH)
 COLLABORATION = (Belief, Fix)

@@ -16,6 +16,10 @@ class Source(Protocol):
     def next_ns(self) -> int | None:
         """When there will be something; None: not known or nothing any more."""
 
+    @property
+    def over(self) -> bool:
+        """Whether there will never be anything more: the end of a log."""
+
     def poll(self, now_ns: int) -> Sequence[Odometry | Sightings]:
         """Everything up to now that was not polled yet."""
 
@@ -24,6 +28,7 @@ class Silent:
     """For robots whose inputs arrive on the bus: from their own driver or the simulated field."""
 
     next_ns: int | None = None
+    over = False
 
     def poll(self, now_ns: int) -> Sequence[Odometry | Sightings]:
         return ()

@@ -126,6 +126,10 @@ class MrclamSource:
     def next_ns(self) -> int | None:
         return self._items[self._next].stamp_ns if self._next < len(self._items) else None
 
+    @property
+    def over(self) -> bool:
+        return self._next == len(self._items)
+
     def poll(self, now_ns: int) -> Sequence[Odometry | Sightings]:
         first = self._next
         while self._next < len(self._items) and self._items[self._next].stamp_ns <= now_ns:
