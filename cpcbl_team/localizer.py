@@ -32,6 +32,7 @@ from cpcbl_team.sensors import sighting_fault
 from cpcbl_team.sightings import Measured, measured
 from cpcbl_team.state import Evidence, Memory, State
 
+UNSTEERABLE_SIGMA_RAD = math.radians(100.0)  # beyond, no bearing can be linearized
 _FIX = "fix:"  # marks the source of an active fix, apart from seeing that teammate
 
 
@@ -149,7 +150,7 @@ class Localizer:
 
     def _turn(self, state: State, seen: list[Measured]) -> Scope | None:
         """Heading or position, the one that waits longer; one timer a type. None: neither."""
-        if not self._steerable(state):
+        if state.memory.lost and state.estimate.heading_sigma_rad > UNSTEERABLE_SIGMA_RAD:
             return None
         memory, now, rules = state.memory, state.stamp_ns, self._rules
         least = rules.minimum_interval_s * 1e9
@@ -242,8 +243,6 @@ class Localizer:
         state = state._replace(memory=memory)
         source, prior = _FIX + fix.observer, state.estimate
         least = self._rules.object_interval_s * 1e9
-        if not self._steerable(state):
-            return self._judged(state)
         if not _passed(memory.objects_ns.get(source), fix.stamp_ns, least):
             return state
         dx, dy = fix.x_m - prior.pose.x, fix.y_m - prior.pose.y
@@ -290,11 +289,6 @@ class Localizer:
         estimate = Estimate(Pose2(0.5 * (x0 + x1), 0.5 * (y0 + y1), 0.0), anywhere)
         memory = Memory(lost="start pose unknown", widened_ns=stamp_ns)
         return State(stamp_ns, estimate, odometry_ns=stamp_ns, memory=memory)
-
-    def _steerable(self, state: State) -> bool:
-        """False while the heading is too uncertain for a constraint linearized at it."""
-        limit = math.radians(self._rules.lost_heading_sigma_deg)
-        return not state.memory.lost or state.estimate.heading_sigma_rad <= limit
 
     def _updated(
         self, state: State, scope: Scope | None, sources: Iterable[str], rejected: int

@@ -15,7 +15,7 @@ from cpcbl_team.estimate import ZERO3, Covariance3, Estimate, Information, merge
 from cpcbl_team.geometry import Pose2
 from cpcbl_team.state import Evidence, Memory
 
-WINDOW_NS = 10_000_000_000
+WINDOW_NS = 20_000_000_000
 SPACING_NS = 500_000_000  # one piece of evidence an object and so long
 MOST_PIECES = 30
 DRIFT_SHARE = 0.1  # of the way: how far dead reckoning errs within the window

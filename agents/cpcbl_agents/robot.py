@@ -14,6 +14,7 @@ from cpcbl_team.config import Team
 from cpcbl_team.inputs import Belief, Fix, Odometry, Sightings, Told
 from cpcbl_transport.messages import Drive, Message, Track
 
+NEVER_NS = 2**62
 _OUTGOING = (Belief, Fix, Track, Drive)
 
 
@@ -55,6 +56,8 @@ class Robot:
     @property
     def next_ns(self) -> int:
         """When the next tick is worth it."""
+        if self.sensing.over:
+            return NEVER_NS
         source_ns = self.sensing.next_ns
         due_ns = self.filter.next_ns
         return due_ns if source_ns is None else min(due_ns, source_ns)

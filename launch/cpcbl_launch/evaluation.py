@@ -99,7 +99,7 @@ def run_nodes(
     """Steps nodes in the order of their times; what one says the others hear at once."""
     now_ns, shown = start_ns, 0.0
     while now_ns < end_ns:
-        now_ns = max(now_ns, min(node.next_ns for node in nodes))
+        now_ns = max(now_ns, min(end_ns, *(node.next_ns for node in nodes)))
         for node in nodes:
             if node.next_ns <= now_ns or node.waiting:
                 node.step(now_ns)

@@ -137,7 +137,7 @@ class Recorder:
                 **msgspec.structs.asdict(figures),
                 variant=variant,
                 lost_share=sum(bool(t.lost) for t in tracks) / max(len(tracks), 1),
-                lost_at_end=tracks[-1].lost if tracks else "never heard of",
+                lost_at_end=tracks[-1].lost if tracks else "was never heard of",
                 bumps=last_truth[name].bumps if name in last_truth else 0,
                 messages_sent=sum(s.messages_sent for s in statuses),
                 bytes_sent=sum(s.bytes_sent for s in statuses),

@@ -1,11 +1,12 @@
-"""What a person sees: the live table, the report, progress."""
+"""What a person sees: the live table, the report, progress. Fits 80 columns."""
 
 import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 
-from rich.console import Console, Group
+from rich import box
+from rich.console import Console
 from rich.live import Live
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
@@ -14,9 +15,11 @@ from rich.text import Text
 from cpcbl_launch.recorder import Recorder, Report
 from cpcbl_launch.supervisor import Supervisor
 from cpcbl_team.collaboration import LOWEST_TIER
+from cpcbl_transport.messages import Status, Track, Truth
 
 SNAPSHOT_S = 5.0
 ProgressSetter = Callable[[float], None]
+Cell = str | Text
 
 
 class LiveTable:
@@ -25,7 +28,7 @@ class LiveTable:
     def __init__(self, title: str, console: Console, quiet: bool = False) -> None:
         self._title, self._console, self._quiet = title, console, quiet
         self._live = Live(console=console, auto_refresh=False, transient=True)
-        self._shown_s = -math.inf
+        self._next_s = 0.0
 
     def __enter__(self) -> "LiveTable":
         if self._console.is_terminal and not self._quiet:
@@ -36,103 +39,112 @@ class LiveTable:
         self._live.stop()
 
     def show(self, recorder: Recorder, supervisor: Supervisor, elapsed_s: float) -> None:
+        """Called several times a second."""
         if self._quiet:
             return
         if self._console.is_terminal:
             self._live.update(self._table(recorder, supervisor, elapsed_s), refresh=True)
-        elif elapsed_s > 0.0 and time.monotonic() - self._shown_s >= SNAPSHOT_S:
-            self._shown_s = time.monotonic()
+        elif recorder.tracks and time.monotonic() >= self._next_s:
+            self._next_s = time.monotonic() + SNAPSHOT_S
             self._console.print(self._table(recorder, supervisor, elapsed_s))
 
-    def _table(self, recorder: Recorder, supervisor: Supervisor, elapsed_s: float) -> Group:
+    def _table(self, recorder: Recorder, supervisor: Supervisor, elapsed_s: float) -> Table:
         tracks, statuses, truths = recorder.latest()
-        table = Table(title=f"{self._title}   {elapsed_s:6.1f} s", title_justify="left")
-        table.add_column("robot")
-        for column in ("pid", "x m", "y m", "heading deg", "sigma m", "error m", "tier"):
-            table.add_column(column, justify="right")
-        table.add_column("state")
-        for column in ("out msg", "out B", "in msg", "in B"):
-            table.add_column(column, justify="right")
+        table = _table(
+            f"{self._title}, {elapsed_s:.1f} s",
+            ("robot", "state"),
+            ("pid", "x m", "y m", "deg", "σ m", "error m", "tier", "out", "B", "in", "B"),
+        )
         pids, restarts = supervisor.pids, supervisor.restarts
-        names = [n.removeprefix("robot-") for n in {**pids, **restarts} if n != "field"]
-        for name in sorted(set(names) | tracks.keys()):
-            process, track, status = f"robot-{name}", tracks.get(name), statuses.get(name)
-            pid = str(pids.get(process, "down"))
-            row: list[str | Text] = [name, pid]
-            if track is None:
-                table.add_row(*row, *[""] * 5, Text("starting", style="dim"))
-                continue
-            truth = truths.get(name)
-            error = (
-                math.hypot(truth.x_m - track.x_m, truth.y_m - track.y_m)
-                if truth is not None
-                else None
-            )
-            sigma = (
-                None
-                if track.covariance is None
-                else math.sqrt(0.5 * (track.covariance[0] + track.covariance[2]))
-            )
-            state = Text(track.lost, style="bold red") if track.lost else Text("ok", "green")
-            if process not in pids:
-                state = Text("down", style="bold red")
-            if restarts.get(process):
-                state.append(f" (restart {restarts[process]})", style="yellow")
-            row += [
-                f"{track.x_m:.2f}",
-                f"{track.y_m:.2f}",
-                f"{math.degrees(track.heading_rad):.0f}",
-                "-" if sigma is None else f"{sigma:.3f}",
-                _graded(error),
-                "lost" if track.lost else _tier(track.tier),
+        here = [n.removeprefix("robot-") for n in supervisor.names if n != "field"]
+        for name in [*here, *sorted(tracks.keys() - set(here))]:
+            process = f"robot-{name}"
+            pid = str(pids[process]) if process in pids else "down" if name in here else "away"
+            state = _state(tracks.get(name), pid, restarts.get(process, 0))
+            table.add_row(
+                name,
                 state,
-            ]
-            if status is not None:
-                row += [
-                    str(status.messages_sent),
-                    str(status.bytes_sent),
-                    str(status.messages_received),
-                    str(status.bytes_received),
-                ]
-            table.add_row(*row)
-        return Group(table)
+                pid,
+                *_pose_cells(tracks.get(name), truths.get(name)),
+                *_traffic_cells(statuses.get(name)),
+            )
+        return table
+
+
+def _state(track: Track | None, pid: str, restarts: int) -> Text:
+    if pid == "down":
+        state = Text("down", style="bold red")
+    elif track is None:
+        state = Text("starting", style="dim")
+    else:
+        state = Text(f"lost: {track.lost}", "bold red") if track.lost else Text("ok", "green")
+    return state.append(f" (restarted {restarts})", "yellow") if restarts else state
+
+
+def _pose_cells(track: Track | None, truth: Truth | None) -> list[Cell]:
+    if track is None:
+        return [""] * 6
+    c = track.covariance
+    error = None if truth is None else math.hypot(truth.x_m - track.x_m, truth.y_m - track.y_m)
+    tier = Text(str(track.tier), "green" if track.tier < LOWEST_TIER // 2 else "yellow")
+    return [
+        f"{track.x_m:.2f}",
+        f"{track.y_m:.2f}",
+        f"{math.degrees(track.heading_rad):.0f}",
+        "-" if c is None else f"{math.sqrt(0.5 * (c[0] + c[2])):.3f}",
+        _graded(error),
+        tier,
+    ]
+
+
+def _traffic_cells(status: Status | None) -> list[Cell]:
+    if status is None:
+        return []
+    s = status
+    return [
+        _short(n) for n in (s.messages_sent, s.bytes_sent, s.messages_received, s.bytes_received)
+    ]
+
+
+def _short(n: int) -> str:
+    return str(n) if n < 10_000 else f"{n / 1e3:.0f}k" if n < 10_000_000 else f"{n / 1e6:.0f}M"
 
 
 def _graded(error: float | None) -> Text:
     if error is None:
         return Text("-")
-    style = "green" if error < 0.15 else "yellow" if error < 0.5 else "red"
-    return Text(f"{error:.3f}", style=style)
+    return Text(f"{error:.3f}", "green" if error < 0.15 else "yellow" if error < 0.5 else "red")
 
 
-def _tier(tier: int) -> Text:
-    return Text(str(tier), style="green" if tier < LOWEST_TIER // 2 else "yellow")
+def _table(title: str, left: Sequence[str], right: Sequence[str]) -> Table:
+    table = Table(
+        title=title,
+        title_justify="left",
+        title_style="bold",
+        box=box.SIMPLE_HEAD,
+        padding=(0, 1, 0, 0),
+        show_edge=False,
+    )
+    for column in left:
+        table.add_column(column, no_wrap=True, overflow="ellipsis")
+    for column in right:
+        table.add_column(column, justify="right", no_wrap=True)
+    return table
 
 
 def print_report(report: Report, console: Console) -> None:
     """The figures of a run as a table with units."""
-    figures = Table(title="position and heading against the truth", title_justify="left")
-    figures.add_column("robot")
-    if report.alone:
-        figures.add_column("RMSE m before help", justify="right")
-    for column in (
-        "RMSE m",
-        "mean m",
-        "max m",
-        "heading RMSE deg",
-        "inside 3 sigma",
-        "NEES (2 due)",
-        "lost",
-        "bumps",
-        "sent msg",
-        "sent B",
-    ):
-        figures.add_column(column, justify="right")
+    before = ("before m",) if report.alone else ()
+    figures = _table(
+        "errors of position and heading (deg, RMSE)",
+        ("robot",),
+        (*before, "RMSE m", "mean m", "max m", "deg", "in 3 σ", "NEES", "lost", "out", "B"),
+    )
     for name, r in report.robots.items():
         alone = report.alone.get(name)
-        row = [name, *([_number(alone.position_rmse_m)] if alone is not None else [])]
         figures.add_row(
-            *row,
+            name,
+            *([_number(alone.position_rmse_m)] if alone is not None else []),
             _number(r.position_rmse_m),
             _number(r.position_mean_m),
             _number(r.position_max_m),
@@ -140,17 +152,15 @@ def print_report(report: Report, console: Console) -> None:
             _share(r.inside_3_sigma),
             _number(r.nees, 1),
             _share(r.lost_share),
-            str(r.bumps),
             str(r.messages_sent),
             str(r.bytes_sent),
         )
     t = report.team
-    alone_rmse = [a.position_rmse_m for a in report.alone.values() if a.position_rmse_m]
-    mean_alone = sum(alone_rmse) / len(alone_rmse) if alone_rmse else None
+    known = [s.position_rmse_m for s in report.alone.values() if s.position_rmse_m is not None]
     figures.add_section()
     figures.add_row(
         "team",
-        *([_number(mean_alone)] if report.alone else []),
+        *([_number(sum(known) / len(known) if known else None)] if report.alone else []),
         _number(t.position_rmse_m),
         _number(t.position_mean_m),
         _number(t.position_max_m),
@@ -158,19 +168,28 @@ def print_report(report: Report, console: Console) -> None:
         _share(t.inside_3_sigma),
         _number(t.nees, 1),
         "",
-        "",
         str(t.messages_sent),
         str(t.bytes_sent),
         style="bold",
     )
     console.print(figures)
+    for line in _remarks(report):
+        console.print(line, style="yellow", highlight=False)
+
+
+def _remarks(report: Report) -> Iterator[str]:
+    if report.alone:
+        yield "before: RMSE before teammates began to help; the other columns are from then on"
+    yield "consistent: 98.9 % in 3 σ, NEES 2; out, B: beliefs and fixes sent, their payload bytes"
     for name, reason in report.left_out.items():
-        console.print(f"left out: robot {name}: {reason}", style="yellow", highlight=False)
+        yield f"left out: robot {name}: {reason}"
     for name, r in report.robots.items():
+        if r.bumps:
+            yield f"robot {name} bumped into a landmark {r.bumps} times"
         if r.lost_at_end:
-            console.print(f"robot {name} is lost: {r.lost_at_end}", style="red", highlight=False)
+            yield f"robot {name} is lost: {r.lost_at_end}"
     for name, n in report.restarts.items():
-        console.print(f"{name} was restarted {n} times", style="yellow", highlight=False)
+        yield f"{name} was restarted {n} times"
 
 
 def _number(value: float | None, digits: int = 3) -> str:
@@ -178,7 +197,7 @@ def _number(value: float | None, digits: int = 3) -> str:
 
 
 def _share(value: float | None) -> str:
-    return "-" if value is None else f"{100.0 * value:.1f} %"
+    return "-" if value is None else f"{100.0 * value:.1f}%"
 
 
 @contextmanager

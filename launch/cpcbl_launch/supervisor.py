@@ -45,6 +45,10 @@ class _Child:
                 start_new_session=True,  # Ctrl-C reaches the supervisor only
             )
 
+    def _last_line(self) -> str:
+        lines = self._log.read_text(errors="replace").splitlines()
+        return lines[-1] if lines else "it said nothing"
+
     def watch(self) -> None:
         """Restarts the process some time after it ended, longer each time that it ends early."""
         if self.process.poll() is None:
@@ -54,7 +58,10 @@ class _Child:
             if now - self.started_s > HEALTHY_S:
                 self.backoff_s = FIRST_BACKOFF_S
             code = self.process.returncode
-            log.warning("%s ended (%s); again in %.1f s", self.spec.name, code, self.backoff_s)
+            said = f": {self._last_line()}" if code > 0 else ""
+            log.warning(
+                "%s ended (%s)%s; again in %g s", self.spec.name, code, said, self.backoff_s
+            )
             self.due_s = now + self.backoff_s
             self.backoff_s = min(2.0 * self.backoff_s, LONGEST_BACKOFF_S)
         elif now >= self.due_s:
@@ -86,6 +93,11 @@ class Supervisor:
         """To be called several times a second."""
         for child in self._children.values():
             child.watch()
+
+    @property
+    def names(self) -> list[str]:
+        """All processes, in the order of the table."""
+        return list(self._children)
 
     @property
     def pids(self) -> dict[str, int]:

@@ -1,0 +1,412 @@
+"""Team files: layers, what comes built in, and errors that name file, key and fix in one line."""
+
+import math
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+
+from cpcbl_launch.team_file import TeamFileError, builtin, load_team, parse_team, save_resolved
+from cpcbl_team.config import RobotSettings, Team
+
+ROBOT = """
+[robots.r1]
+start = { x_m = 1.0, y_m = 2.0 }
+"""
+
+
+def team(text: str) -> Team:
+    return parse_team(f'name = "t"\n{text}')
+
+
+def robots(text: str) -> dict[str, RobotSettings]:
+    return team(text).robots
+
+
+# Layers -----------------------------------------------------------------------------------------
+
+LAYERS = """
+[defaults]
+speed_m_s = 0.1
+waypoints_m = [[1.0, 1.0], [2.0, 2.0]]
+[defaults.sensor]
+range_share = 0.1
+max_range_m = 11.0
+rate_hz = 5.0
+[defaults.localizer]
+variant = "oval"
+[types.fast]
+speed_m_s = 0.9
+sensor = { max_range_m = 22.0, rate_hz = 6.0 }
+localizer = { weights = { position = 0.3 } }
+[robots.plain]
+start = { x_m = 0.0, y_m = 0.0 }
+[robots.fast]
+type = "fast"
+start = { x_m = 1.0, y_m = 0.0 }
+sensor = { rate_hz = 7.0 }
+localizer = { weights = { heading = 0.4 } }
+waypoints_m = [[3.0, 3.0]]
+"""
+
+
+def test_a_robot_without_a_type_has_the_defaults_of_the_file() -> None:
+    plain = robots(LAYERS)["plain"]
+    assert plain.speed_m_s == 0.1
+    assert plain.localizer.variant == "oval"
+    assert (plain.sensor.range_share, plain.sensor.max_range_m) == (0.1, 11.0)
+    assert plain.sensor.bearing_sigma_deg == RobotSettings().sensor.bearing_sigma_deg
+    assert plain.odometry == RobotSettings().odometry
+
+
+def test_a_type_goes_over_the_defaults_and_the_robot_over_both_at_any_depth() -> None:
+    fast = robots(LAYERS)["fast"]
+    assert fast.speed_m_s == 0.9
+    assert (fast.sensor.range_share, fast.sensor.max_range_m, fast.sensor.rate_hz) == (
+        0.1,
+        22.0,
+        7.0,
+    )
+    assert fast.localizer.variant == "oval"
+    assert (fast.localizer.weights.position, fast.localizer.weights.heading) == (0.3, 0.4)
+
+
+def test_a_list_replaces_a_list() -> None:
+    assert robots(LAYERS)["fast"].waypoints_m == ((3.0, 3.0),)
+    assert robots(LAYERS)["plain"].waypoints_m == ((1.0, 1.0), (2.0, 2.0))
+
+
+def test_layers_of_one_robot_leave_the_others_alone() -> None:
+    alone = LAYERS[: LAYERS.index("[robots.fast]")]
+    assert robots(alone)["plain"] == robots(LAYERS)["plain"]
+
+
+# Built in, and back -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("name", "members", "source"),
+    [
+        ("demo", {"navigator", "observer", "scout", "patrol"}, "simulated"),
+        ("mrclam", {"1", "2", "3", "4", "5"}, "mrclam"),
+    ],
+)
+def test_the_built_in_teams_load(name: str, members: set[str], source: str) -> None:
+    loaded = load_team(builtin(name))
+    assert loaded.name == name
+    assert set(loaded.robots) == members
+    assert {robot.source for robot in loaded.robots.values()} == {source}
+
+
+@pytest.mark.parametrize("name", ["demo", "mrclam"])
+def test_a_resolved_team_comes_back_as_it_was(tmp_path: Path, name: str) -> None:
+    loaded, path = load_team(builtin(name)), tmp_path / "team.json"
+    save_resolved(loaded, path)
+    assert load_team(path) == loaded
+
+
+def test_all_parts_of_a_file_come_back_as_they_were(tmp_path: Path) -> None:
+    whole = team(
+        LAYERS.replace("x_m = 1.0", "known = false, x_m = 1.0")
+        + """
+[map.landmarks]
+oak = { x_m = 1.0, y_m = 2.0, gives = "bearing" }
+[map.walls]
+north = { from_m = [0.0, 5.0], to_m = [9.0, 5.0], gives = "range" }
+[transport]
+listen = ["tcp/0.0.0.0:7447", "quic/[::]:7448"]
+connect = ["tls/router.example:7447"]
+[simulation]
+step_rate_hz = 100
+noise = 0
+"""
+    )
+    path = tmp_path / "team.json"
+    save_resolved(whole, path)
+    assert load_team(path) == whole
+    assert whole.map.walls["north"].gives == "range"
+    assert whole.simulation.noise == 0.0
+
+
+@pytest.mark.parametrize(
+    "content",
+    ["", "{", '{"name": "t"}', '{"name": "t", "robots": {}, "robot": {}}', '{"name": 3}'],
+)
+def test_a_damaged_resolved_team_is_one_line_with_the_files_name(
+    tmp_path: Path, content: str
+) -> None:
+    path = tmp_path / "team.json"
+    path.write_text(content)
+    with pytest.raises(TeamFileError) as caught:
+        load_team(path)
+    assert str(caught.value).startswith(f"{path}: ")
+    assert "\n" not in str(caught.value)
+
+
+# Errors -----------------------------------------------------------------------------------------
+
+
+class Wrong(NamedTuple):
+    """A text with one mistake, and what the one line about it names."""
+
+    what: str
+    text: str
+    key: str
+    fix: str
+
+
+WRONG = [
+    # unknown keys, at each level
+    Wrong("unknown table", "[robot.r1]", "robot", "did you mean 'robots'?"),
+    Wrong("unknown key without a like", "zzz = 1", "zzz", "known here: data, defaults, map"),
+    Wrong("unknown in defaults", "[defaults]\nspeed = 1.0", "defaults.speed", "'speed_m_s'"),
+    Wrong(
+        "unknown in a table of defaults",
+        "[defaults.sensor]\nrange_shar = 1.0",
+        "defaults.sensor.range_shar",
+        "'range_share'",
+    ),
+    Wrong("unknown in a type", "[types.a]\nsenso = {}", "types.a.senso", "'sensor'"),
+    Wrong(
+        "unknown three deep",
+        "[types.a.localizer.weights]\npositon = 0.1",
+        "types.a.localizer.weights.positon",
+        "'position'",
+    ),
+    Wrong("unknown in a robot", "[robots.r2]\nstrat = {}", "robots.r2.strat", "'start'"),
+    Wrong(
+        "unknown in a start",
+        "[robots.r2.start]\nx_m = 0.0\ny_m = 0.0\nheading = 1.0",
+        "robots.r2.start.heading",
+        "'heading_deg'",
+    ),
+    Wrong("unknown in the map", "[map]\nlandmark = {}", "map.landmark", "'landmarks'"),
+    Wrong(
+        "unknown in a landmark",
+        "[map.landmarks.oak]\nx_m = 1.0\ny_m = 1.0\ngive = 'both'",
+        "map.landmarks.oak.give",
+        "'gives'",
+    ),
+    Wrong(
+        "unknown in a wall",
+        "[map.walls.north]\nfrom_m = [0.0, 0.0]\nto = [1.0, 0.0]",
+        "map.walls.north.to",
+        "'to_m'",
+    ),
+    Wrong("unknown in transport", "[transport]\nlisten_at = []", "transport.listen_at", "listen"),
+    Wrong("unknown in simulation", "[simulation]\nnois = 1", "simulation.nois", "'noise'"),
+    # types and ranges
+    Wrong("text for a number", "[simulation]\nnoise = 'x'", "simulation.noise", "float"),
+    Wrong("number for a table", "[defaults]\nsensor = 3", "defaults.sensor", "object"),
+    Wrong("number for a robot", "robots.r2 = 3", "robots.r2", "object"),
+    Wrong("list for a robot", "[[robots.r2]]", "robots.r2", "object"),
+    Wrong("number for a name", "name = 3", "name", "str"),
+    Wrong("text for a list", "[transport]\nlisten = 'x'", "transport.listen", "array"),
+    Wrong(
+        "three numbers for a point",
+        "[defaults]\nwaypoints_m = [[1.0, 2.0, 3.0]]",
+        "defaults.waypoints_m",
+        "length 2",
+    ),
+    Wrong(
+        "text in a landmark",
+        "[map.landmarks.oak]\nx_m = 'west'\ny_m = 1.0",
+        "map.landmarks.oak.x_m",
+        "float",
+    ),
+    Wrong("below the range", "[simulation]\nnoise = -1.0", "simulation.noise", ">= 0.0"),
+    Wrong(
+        "zero for a positive number",
+        "[defaults.sensor]\nrate_hz = 0",
+        "defaults.sensor.rate_hz",
+        "> 0.0",
+    ),
+    Wrong(
+        "above the range",
+        "[types.a.sensor]\nfield_of_view_deg = 361.0",
+        "types.a.sensor.field_of_view_deg",
+        "<= 360.0",
+    ),
+    Wrong(
+        "no such choice",
+        "[defaults.localizer]\nvariant = 'jont'",
+        "defaults.localizer.variant",
+        "'jont'",
+    ),
+    Wrong("NaN", "[simulation]\nnoise = nan", "simulation.noise", "finite"),
+    Wrong("infinite", "[defaults]\nwaypoints_m = [[0.0, inf]]", "defaults.waypoints_m", "finite"),
+    Wrong("too many digits", f"[simulation]\nnoise = 1{'0' * 400}", "simulation.noise", "range"),
+    # what is missing
+    Wrong("a start without y_m", "[robots.r2.start]\nx_m = 1.0", "robots.r2.start.y_m", "missing"),
+    Wrong(
+        "a landmark without y_m",
+        "[map.landmarks.oak]\nx_m = 1.0",
+        "map.landmarks.oak.y_m",
+        "missing",
+    ),
+    Wrong("a simulated robot without a start", "[robots.r2]", "robots.r2.start", "add x_m"),
+    Wrong("no endpoint to connect to", "[transport]\nconnect = []", "transport.connect", "tcp/"),
+    # types of robots
+    Wrong(
+        "an unknown type",
+        "[types.a]\n[robots.r2]\ntype = 'b'",
+        "robots.r2.type",
+        "[types.b] or use one of: a",
+    ),
+    Wrong("a number for a type", "[robots.r2]\ntype = 3", "robots.r2.type", "3"),
+    Wrong("a list for a type", "[robots.r2]\ntype = ['a']", "robots.r2.type", "'a'"),
+    # names
+    Wrong("a robot's name with a space", '[robots."r 2"]', "r 2", "A-Za-z0-9"),
+    Wrong("a type's name with a space", '[types."a b"]', "a b", "A-Za-z0-9"),
+    Wrong("a team's name with a space", 'name = "my team"', "name", "A-Za-z0-9"),
+    Wrong(
+        "a landmark's name with a space",
+        '[map.landmarks."an oak"]\nx_m = 1.0\ny_m = 1.0',
+        "an oak",
+        "A-Za-z0-9",
+    ),
+    Wrong(
+        "a wall's name that is too long",
+        f"[map.walls.{'w' * 33}]\nfrom_m = [0.0, 0.0]\nto_m = [1.0, 0.0]",
+        "w" * 33,
+        "A-Za-z0-9",
+    ),
+    Wrong(
+        "a landmark named like a robot", "[map.landmarks.r1]\nx_m = 1.0\ny_m = 1.0", "r1", "rename"
+    ),
+    Wrong(
+        "a landmark named like a wall",
+        "[map.landmarks.n]\nx_m = 1.0\ny_m = 1.0\n"
+        "[map.walls.n]\nfrom_m = [0.0, 0.0]\nto_m = [1.0, 0.0]",
+        "'n'",
+        "rename",
+    ),
+    # what does not go together
+    Wrong(
+        "a wall without a length",
+        "[map.walls.n]\nfrom_m = [1.0, 1.0]\nto_m = [1.0, 1.0]",
+        "map.walls.n",
+        "move to_m",
+    ),
+    Wrong(
+        "an endpoint without a protocol",
+        "[transport]\nlisten = ['127.0.0.1:7447']",
+        "transport.listen",
+        "tcp/192.168.1.10:7447",
+    ),
+    Wrong(
+        "an endpoint without a port",
+        "[transport]\nconnect = ['tcp/127.0.0.1']",
+        "transport.connect",
+        "tcp/192.168.1.10:7447",
+    ),
+    Wrong(
+        "joint with the paper's uncertainty",
+        "[defaults.localizer]\npaper_uncertainty = true",
+        "robots.r1.localizer.paper_uncertainty",
+        "circular or oval",
+    ),
+    Wrong(
+        "oval that updates both at once",
+        "[defaults.localizer]\nvariant = 'oval'\nalternate = false",
+        "robots.r1.localizer.alternate",
+        "remove",
+    ),
+    Wrong(
+        "a sensor that never errs",
+        "[defaults.sensor]\nrange_share = 0.0\nrange_floor_m = 0.0",
+        "range_floor_m",
+        "0",
+    ),
+    Wrong(
+        "a bearing that never errs",
+        "[defaults.sensor]\nbearing_sigma_deg = 0.0",
+        "bearing_sigma_deg",
+        "0",
+    ),
+]
+
+
+def complaint(path: Path, text: str) -> str:
+    """The one line about a file, without the file's name."""
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(TeamFileError) as caught:
+        load_team(path)
+    said = str(caught.value)
+    assert said.startswith(f"{path}: ")
+    assert "\n" not in said
+    return said.removeprefix(f"{path}: ")
+
+
+@pytest.mark.parametrize("wrong", WRONG, ids=lambda wrong: wrong.what)
+def test_a_mistake_is_one_line_with_key_and_fix(tmp_path: Path, wrong: Wrong) -> None:
+    name = "" if wrong.text.startswith("name") else 'name = "t"\n'
+    top_level = not wrong.text.startswith("[")
+    parts = [name, wrong.text, ROBOT] if top_level else [name, ROBOT, wrong.text]
+    said = complaint(tmp_path / "team.toml", "\n".join(parts))
+    key, _, rest = said.partition(": ")
+    assert wrong.key in (key if wrong.key.split(".")[0] in key else said)
+    assert wrong.fix in rest
+
+
+def test_every_text_with_a_mistake_has_only_that_one() -> None:
+    assert list(robots(ROBOT)) == ["r1"]
+
+
+@pytest.mark.parametrize(
+    ("text", "names"),
+    [
+        (ROBOT, "name: missing"),
+        ('name = "t"', "robots: missing"),
+        ('name = "t"\n[robots]', "robots: there is none; add a table [robots.r1]"),
+        ('name = "t"\n[robots', "not TOML: "),
+        ('name = "t"\nname = "u"', "not TOML: "),
+    ],
+    ids=["no name", "no robots", "empty robots", "not TOML", "a key twice"],
+)
+def test_a_file_that_is_no_team_is_one_line(tmp_path: Path, text: str, names: str) -> None:
+    assert complaint(tmp_path / "team.toml", text).startswith(names)
+
+
+def test_a_file_that_is_not_there_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "nothing.toml"
+    with pytest.raises(TeamFileError, match=f"^{path}: no such file$"):
+        load_team(path)
+
+
+@pytest.mark.parametrize("suffix", ["toml", "json"])
+def test_what_cannot_be_read_is_named(tmp_path: Path, suffix: str) -> None:
+    binary, folder = tmp_path / f"binary.{suffix}", tmp_path / f"folder.{suffix}"
+    binary.write_bytes(b"\xff\xfe\x00")
+    folder.mkdir()
+    for path in (binary, folder):
+        with pytest.raises(TeamFileError, match=f"^{path}: cannot be read: "):
+            load_team(path)
+
+
+# What is no mistake -----------------------------------------------------------------------------
+
+
+def test_a_robot_that_is_not_simulated_needs_no_start() -> None:
+    assert robots('[robots.r1]\nsource = "external"')["r1"].start is None
+
+
+def test_whole_numbers_are_numbers() -> None:
+    start = robots("[robots.r1]\nstart = { x_m = 1, y_m = -2, heading_deg = 90 }")["r1"].start
+    assert start is not None
+    assert (start.x_m, start.y_m, start.heading_deg) == (1.0, -2.0, 90.0)
+
+
+def test_the_map_has_bounds_and_walls_have_directions() -> None:
+    field = team(
+        f"""{ROBOT}
+[map.landmarks.oak]
+x_m = -1.0
+y_m = 2.0
+[map.walls.north]
+from_m = [0.0, 5.0]
+to_m = [9.0, 14.0]
+"""
+    ).map
+    assert field.bounds() == (-1.0, 2.0, 9.0, 14.0)
+    assert field.walls["north"].direction_rad == pytest.approx(math.pi / 4.0)

@@ -1,0 +1,212 @@
+"""Real processes over real Zenoh: a team comes up, loses a robot, gets it back, and ends."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from cpcbl_launch.processes import PROGRAM
+from cpcbl_launch.recorder import Recorder, Report
+from cpcbl_launch.supervisor import Supervisor
+from cpcbl_launch.team_file import builtin, load_team, save_resolved
+from cpcbl_launch.up import Run, free_endpoint, run_team
+from cpcbl_team.config import Team
+from cpcbl_transport import topics
+from cpcbl_transport.zenoh_bus import open_router
+
+ROBOTS = ("navigator", "observer", "scout", "patrol")
+
+
+def demo_team() -> Team:
+    """The demonstration, helping from the start."""
+    team = load_team(builtin("demo"))
+    robots = {
+        name: msgspec.structs.replace(
+            robot, collaboration=msgspec.structs.replace(robot.collaboration, after_s=0.0)
+        )
+        for name, robot in team.robots.items()
+    }
+    return msgspec.structs.replace(team, robots=robots)
+
+
+class Script:
+    """A view that acts: every step waits for its condition, then does something."""
+
+    def __init__(self, *steps: Callable[[Recorder, Supervisor], bool]) -> None:
+        self._steps = list(steps)
+
+    def show(self, recorder: Recorder, supervisor: Supervisor, elapsed_s: float) -> None:
+        if self._steps and self._steps[0](recorder, supervisor):
+            self._steps.pop(0)
+
+    def done(self) -> bool:
+        return not self._steps
+
+
+def run(script: Script, team: Team, folder: Path, limit_s: float = 60.0) -> Report:
+    """Runs a team until its script is done; fails when that takes too long."""
+    until = time.monotonic() + limit_s
+    report = run_team(
+        Run(team, None, seed=3, folder=folder),
+        script,
+        lambda: script.done() or time.monotonic() > until,
+    )
+    logs = "".join(f"\n{p.name}:\n{p.read_text()}" for p in folder.glob("*.log"))
+    assert script.done(), f"the script did not get to its end{logs}"
+    return report
+
+
+def command_of(pid: int) -> str:
+    """The command line of a process, from the system's process list."""
+    return subprocess.run(
+        ["ps", "-o", "args=", "-p", str(pid)], capture_output=True, text=True, check=False
+    ).stdout
+
+
+def test_kills_one_of_four_robot_processes_and_it_localizes_again(tmp_path: Path) -> None:
+    killed: dict[str, int] = {}
+    seen: dict[str, int] = {}
+
+    def all_run(recorder: Recorder, supervisor: Supervisor) -> bool:
+        return recorder.tracks.keys() == set(ROBOTS) and all(
+            len(t) > 20 for t in recorder.tracks.values()
+        )
+
+    def kill_navigator(recorder: Recorder, supervisor: Supervisor) -> bool:
+        seen.update(supervisor.pids)
+        for name in ROBOTS:
+            assert f"robot {name}" in command_of(supervisor.pids[f"robot-{name}"])
+        assert len(set(seen.values())) == len(ROBOTS) + 1
+        killed.update({name: len(t) for name, t in recorder.tracks.items()})
+        os.kill(seen["robot-navigator"], signal.SIGKILL)
+        return True
+
+    def others_go_on(recorder: Recorder, supervisor: Supervisor) -> bool:
+        return all(len(recorder.tracks[n]) > killed[n] + 10 for n in ROBOTS if n != "navigator")
+
+    def it_is_back_and_knows_where_it_is(recorder: Recorder, supervisor: Supervisor) -> bool:
+        tracks, statuses, truths = recorder.latest()
+        new_pid = supervisor.pids.get("robot-navigator")
+        if new_pid in (None, seen["robot-navigator"]):
+            return False
+        if statuses["navigator"].incarnation != f"{new_pid:x}":
+            return False
+        track, truth = tracks["navigator"], truths["navigator"]
+        error = ((track.x_m - truth.x_m) ** 2 + (track.y_m - truth.y_m) ** 2) ** 0.5
+        return not track.lost and error < 0.3
+
+    script = Script(all_run, kill_navigator, others_go_on, it_is_back_and_knows_where_it_is)
+    report = run(script, demo_team(), tmp_path)
+    assert report.restarts == {"robot-navigator": 1}
+    for name, robot in report.robots.items():
+        assert robot.samples > 0, name
+        assert robot.lost_at_end == "", name
+    assert report.robots["observer"].messages_sent > 0
+    assert report.robots["observer"].messages_received == 0
+    assert not [pid for pid in seen.values() if command_of(pid)]
+
+
+def test_a_process_that_keeps_dying_is_restarted_ever_later(tmp_path: Path) -> None:
+    from cpcbl_launch.supervisor import ProcessSpec
+
+    fails = ProcessSpec("fails", (sys.executable, "-c", "raise SystemExit(3)"))
+    with Supervisor([fails], tmp_path) as supervisor:
+        until = time.monotonic() + 20.0
+        while supervisor.restarts.get("fails", 0) < 2 and time.monotonic() < until:
+            supervisor.watch()
+            time.sleep(0.01)
+        assert supervisor.restarts == {"fails": 2}
+        assert supervisor._children["fails"].backoff_s > 1.0
+
+
+def test_a_process_that_ignores_sigint_is_killed(tmp_path: Path) -> None:
+    from cpcbl_launch.supervisor import ProcessSpec
+
+    stubborn = (
+        "import signal, time; signal.signal(signal.SIGINT, signal.SIG_IGN);"
+        "open('ready', 'w').close(); time.sleep(60)"
+    )
+    code = f"import os; os.chdir({str(tmp_path)!r}); {stubborn}"
+    spec = ProcessSpec("stubborn", (sys.executable, "-c", code))
+    with Supervisor([spec], tmp_path) as supervisor:
+        until = time.monotonic() + 20.0
+        while not (tmp_path / "ready").exists() and time.monotonic() < until:
+            time.sleep(0.01)
+        pid = supervisor.pids["stubborn"]
+    assert not command_of(pid)
+
+
+@pytest.fixture
+def lone_robot(tmp_path: Path) -> Iterator[tuple[list[str], str, Team]]:
+    """(command, endpoint, team) of one robot process whose router the test opens."""
+    team = demo_team()
+    path = tmp_path / "team.json"
+    save_resolved(team, path)
+    endpoint = free_endpoint()
+    command = [*PROGRAM, "robot", "observer", "--team", str(path), "--connect", endpoint]
+    yield command, endpoint, team
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_a_robot_within_two_seconds(
+    lone_robot: tuple[list[str], str, Team], number: signal.Signals
+) -> None:
+    command, endpoint, team = lone_robot
+    alive: dict[str, bool] = {}
+    with open_router(team.name, [endpoint]) as bus:
+        bus.watch(topics.ALIVE.at(robot="observer"), alive.__setitem__)
+        with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
+            assert _eventually(lambda: any(alive.values())), process.stderr
+            process.send_signal(number)
+            assert process.wait(timeout=2.0) == 0
+        assert _eventually(lambda: not any(alive.values()))
+
+
+def test_a_robot_waiting_for_its_router_can_be_stopped(
+    lone_robot: tuple[list[str], str, Team],
+) -> None:
+    command, endpoint, _ = lone_robot
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stderr is not None
+        assert "no router" in process.stderr.readline()
+        process.send_signal(signal.SIGINT)
+        assert process.wait(timeout=2.0) == 2
+        assert endpoint in process.stderr.read().splitlines()[-1]
+
+
+def test_a_robot_ends_when_its_launcher_is_gone(
+    lone_robot: tuple[list[str], str, Team],
+) -> None:
+    command, endpoint, team = lone_robot
+    alive: dict[str, bool] = {}
+    launcher = (
+        "import subprocess, sys, os, time;"
+        f"p = subprocess.Popen({command!r} + ['--parent', str(os.getpid())]);"
+        "print(p.pid, flush=True); sys.stdin.read()"
+    )
+    with open_router(team.name, [endpoint]) as bus:
+        bus.watch(topics.ALIVE.at(robot="observer"), alive.__setitem__)
+        with subprocess.Popen(
+            [sys.executable, "-c", launcher],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+        ) as parent:
+            assert _eventually(lambda: any(alive.values()))
+            parent.kill()
+        assert _eventually(lambda: not any(alive.values()))
+
+
+def _eventually(condition: Callable[[], bool], within_s: float = 20.0) -> bool:
+    until = time.monotonic() + within_s
+    while time.monotonic() < until:
+        if condition():
+            return True
+        time.sleep(0.02)
+    return condition()
