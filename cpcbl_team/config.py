@@ -70,6 +70,13 @@ class SensorSettings(Table, frozen=True, kw_only=True):
         return math.radians(self.bearing_sigma_deg)
 
 
+class PositionSensor(Table, frozen=True, kw_only=True):
+    """A sensor that tells the position on the field, such as differential GPS."""
+
+    sigma_m: Positive = 0.02
+    rate_hz: Positive = 5.0
+
+
 class Weights(Table, frozen=True, kw_only=True):
     """Static weights of sensor against estimate for `weighted` (paper, section 3)."""
 
@@ -179,6 +186,7 @@ class LocalizationSettings(Table, frozen=True, kw_only=True):
 
     localizer: LocalizerSettings = LocalizerSettings()
     sensor: SensorSettings = SensorSettings()
+    position_sensor: PositionSensor | None = None
     odometry: OdometrySettings = OdometrySettings()
     collaboration: CollaborationSettings = CollaborationSettings()
     start: Start | None = None

@@ -38,6 +38,18 @@ class Sightings(msgspec.Struct, frozen=True, array_like=True, tag="sightings"):
     sightings: tuple[Sighting, ...]
 
 
+class Position(msgspec.Struct, frozen=True, array_like=True, tag="position"):
+    """What a position sensor says (differential GPS, ultra-wide band), in the field's frame.
+
+    `covariance` is xx, xy, yy in m^2.
+    """
+
+    stamp_ns: int
+    x_m: float
+    y_m: float
+    covariance: tuple[float, float, float]
+
+
 class Belief(msgspec.Struct, frozen=True, array_like=True, tag="belief"):
     """A robot's pose Gaussian in the field's frame, for passive use by teammates.
 
@@ -78,4 +90,4 @@ class Told(msgspec.Struct, frozen=True, array_like=True, tag="told"):
     stamp_ns: int
 
 
-Input = Odometry | Sightings | Belief | Fix | Told
+Input = Odometry | Sightings | Position | Belief | Fix | Told

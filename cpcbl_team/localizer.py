@@ -26,7 +26,7 @@ from cpcbl_team.estimate import (
 )
 from cpcbl_team.gaussian import Covariance2
 from cpcbl_team.geometry import Pose2, step, wrap_angle
-from cpcbl_team.inputs import Belief, Fix, Odometry, Sightings, Told
+from cpcbl_team.inputs import Belief, Fix, Odometry, Position, Sightings, Told
 from cpcbl_team.motion import move
 from cpcbl_team.sensors import sighting_fault
 from cpcbl_team.sightings import Measured, measured
@@ -34,6 +34,8 @@ from cpcbl_team.state import Evidence, Memory, State
 
 UNSTEERABLE_SIGMA_RAD = math.radians(100.0)  # beyond, no bearing can be linearized
 _FIX = "fix:"  # marks the source of an active fix, apart from seeing that teammate
+_OWN = "position sensor"
+_AXES = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
 
 
 class Localizer:
@@ -238,25 +240,42 @@ class Localizer:
 
     def fix(self, state: State, fix: Fix) -> State:
         """Active collaboration: a teammate tells where it sees this robot. Position only."""
-        state = self.moved(state, fix.stamp_ns)
-        memory = recovery.remembered(state.memory, [_fix_evidence(state, fix)])
+        parts = Covariance2(*fix.sensor_covariance), Covariance2(*fix.observer_covariance)
+        return self._placed(state, fix.stamp_ns, _FIX + fix.observer, fix.x_m, fix.y_m, *parts)
+
+    def position(self, state: State, seen: Position) -> State:
+        """A position sensor of the robot itself: like a fix, but nobody else's error is in it."""
+        own = Covariance2(*seen.covariance)
+        return self._placed(state, seen.stamp_ns, _OWN, seen.x_m, seen.y_m, own, None)
+
+    def _placed(
+        self,
+        state: State,
+        stamp_ns: int,
+        source: str,
+        x: float,
+        y: float,
+        sensor: Covariance2,
+        observer: Covariance2 | None,
+    ) -> State:
+        """The robot is said to be at (x, y); `observer` is a teammate's part of the covariance."""
+        state = self.moved(state, stamp_ns)
+        both = sensor if observer is None else sensor + observer
+        piece = _place_evidence(state, source, x, y, both, told=observer is not None)
+        memory, prior = recovery.remembered(state.memory, [piece]), state.estimate
         state = state._replace(memory=memory)
-        source, prior = _FIX + fix.observer, state.estimate
         least = self._rules.object_interval_s * 1e9
-        if not _passed(memory.objects_ns.get(source), fix.stamp_ns, least):
+        if not _passed(memory.objects_ns.get(source), stamp_ns, least):
             return state
-        dx, dy = fix.x_m - prior.pose.x, fix.y_m - prior.pose.y
-        seen = Observation(
-            ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0)),
-            (dx, dy),
-            Covariance2(*fix.sensor_covariance),
-            Covariance2(*fix.observer_covariance),
-        )
+        offset = x - prior.pose.x, y - prior.pose.y
+        seen = Observation(_AXES, offset, sensor, observer or Covariance2(0.0, 0.0, 0.0))
         if seen.normalized_innovation_squared(prior.covariance) > self._gates[1]:
-            return self._judged(self._updated(state, Scope.POSE, [], 1))
+            return self._judged(self._updated(state, None, [], 1))
         scope = Scope.POSE if self._rules.variant == "joint" else Scope.POSITION
         if self._weighted:
-            estimate = self._averaged(prior, (dx, dy), None)
+            estimate = self._averaged(prior, offset, None)
+        elif observer is None:
+            estimate = merge(prior, seen.information(), scope)
         else:
             estimate = self._merge_teammate(prior, seen, scope)
         state = state._replace(estimate=self._reduced(estimate))
@@ -378,22 +397,13 @@ def _sighting_evidence(state: State, m: Measured) -> Evidence:
         m.range_sigma,
         m.bearing_sigma,
         sigma,
+        m.teammate,
     )
 
 
-def _fix_evidence(state: State, fix: Fix) -> Evidence:
-    covariance = Covariance2(*fix.sensor_covariance) + Covariance2(*fix.observer_covariance)
+def _place_evidence(
+    state: State, source: str, x: float, y: float, covariance: Covariance2, told: bool
+) -> Evidence:
     sigma = math.sqrt(0.5 * (covariance.xx + covariance.yy))
-    source = _FIX + fix.observer
-    return Evidence(
-        state.stamp_ns,
-        state.odometry_from_robot,
-        source,
-        fix.x_m,
-        fix.y_m,
-        None,
-        None,
-        0.0,
-        0.0,
-        sigma,
-    )
+    now, pose = state.stamp_ns, state.odometry_from_robot
+    return Evidence(now, pose, source, x, y, None, None, 0.0, 0.0, sigma, told)

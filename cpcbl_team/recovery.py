@@ -92,7 +92,7 @@ def relocalized(
     if any(f[0] < cost + 6.0 and _apart(f[1].pose, estimate.pose) for f in found[1:]):
         return None
     covariance = estimate.covariance.scaled(max(1.0, cost / freedom))
-    told = any(e.place_sigma_m > 0.0 for e in evidence)
+    told = any(e.told for e in evidence)
     return Estimate(estimate.pose, covariance, covariance if told else ZERO3)
 
 

@@ -24,6 +24,7 @@ class Evidence(NamedTuple):
     range_sigma_m: float
     bearing_sigma_rad: float
     place_sigma_m: float  # of (x, y); zero for what is on the map
+    told: bool  # by a teammate
 
 
 class Memory(NamedTuple):

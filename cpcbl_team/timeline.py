@@ -8,7 +8,7 @@ going back costs nothing.
 from bisect import bisect_left, bisect_right
 from collections.abc import Callable
 
-from cpcbl_team.inputs import Belief, Fix, Input, Odometry, Sightings, Told
+from cpcbl_team.inputs import Belief, Fix, Input, Odometry, Position, Sightings, Told
 from cpcbl_team.localizer import Localizer
 from cpcbl_team.state import State
 
@@ -20,6 +20,7 @@ _apply: dict[type, Callable[[Localizer, State, Input], State]] = {
     Odometry: Localizer.drive,  # type: ignore[dict-item]
     Belief: Localizer.hear,  # type: ignore[dict-item]
     Sightings: Localizer.cycle,  # type: ignore[dict-item]
+    Position: Localizer.position,  # type: ignore[dict-item]
     Fix: Localizer.fix,  # type: ignore[dict-item]
     Told: Localizer.tell,  # type: ignore[dict-item]
 }

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 from cpcbl_agents.agent import Anything, Located, Tick
 from cpcbl_team.config import Field, LocalizationSettings
-from cpcbl_team.inputs import Belief, Fix, Odometry, Sightings, Told
+from cpcbl_team.inputs import Belief, Fix, Input, Odometry, Position, Sightings, Told
 from cpcbl_team.localizer import Localizer
 from cpcbl_team.state import State
 from cpcbl_team.timeline import Timeline
@@ -59,13 +59,13 @@ class FilterAgent:
                 self._take(message)
                 self._waiting.append(message)
                 return self._frames_located(now_ns)
-            case Belief() | Fix() | Told():
+            case Position() | Belief() | Fix() | Told():
                 self._take(message)
             case Tick() if now_ns >= self.next_ns:
                 return [*self._frames_located(now_ns), *self._regularly(now_ns)]
         return ()
 
-    def _take(self, item: Odometry | Sightings | Belief | Fix | Told) -> None:
+    def _take(self, item: Input) -> None:
         refused = self.timeline.add(item)
         if refused:
             self.counts[refused] += 1

@@ -8,7 +8,7 @@ from cpcbl_agents.agent import Tick
 from cpcbl_agents.robot import Robot
 from cpcbl_team.collaboration import tiers_heard
 from cpcbl_team.config import Team
-from cpcbl_team.inputs import Belief, Fix, Odometry, Sightings, Told
+from cpcbl_team.inputs import Belief, Fix, Odometry, Position, Sightings, Told
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus, Handle, Publisher
 from cpcbl_transport.messages import (
@@ -56,8 +56,7 @@ class Node:
         self.sent: Counter[str] = Counter()
         self.received: Counter[str] = Counter()
         self._inputs = [
-            bus.subscribe(topic.at(robot=robot.name), self._arrived)
-            for topic in (topics.IN_ODOMETRY, topics.IN_SIGHTINGS)
+            bus.subscribe(topic.at(robot=robot.name), self._arrived) for topic in topics.INPUTS
         ]
         self._watch = bus.watch(topics.ALIVE.at(robot=robot.name), self._seen_alive)
 
@@ -119,7 +118,7 @@ class Node:
             case Fix(observer=sender) if key.startswith("fix/"):
                 if message.robot != self._name:
                     return Refusal.NOT_FOR_ME
-            case Odometry() | Sightings() if key.startswith("in/"):
+            case Odometry() | Sightings() | Position() if key.startswith("in/"):
                 return refusal(message, now_ns)
             case _:
                 return Refusal.WRONG_TYPE

@@ -11,7 +11,7 @@ from cpcbl_agents.sensing import SensingAgent
 from cpcbl_agents.sources import Silent, Source
 from cpcbl_agents.sources.mrclam import MrclamSource
 from cpcbl_team.config import Team
-from cpcbl_team.inputs import Belief, Fix, Odometry, Sightings, Told
+from cpcbl_team.inputs import Belief, Fix, Odometry, Position, Sightings, Told
 from cpcbl_transport.messages import Drive, Message, Track
 
 NEVER_NS = 2**62
@@ -45,7 +45,7 @@ class Robot:
         """
         if self.sensing.over:
             return []
-        raw = isinstance(message, (Odometry, Sightings))
+        raw = isinstance(message, (Odometry, Sightings, Position))
         inputs: list[Anything] = [] if raw else [message]
         inputs += self.sensing.handle(message, now_ns)
         located = [out for m in inputs for out in self.filter.handle(m, now_ns)]

@@ -7,7 +7,9 @@ from cpcbl_agents.agent import Anything, Located, Tick
 from cpcbl_agents.driving import Pilot
 from cpcbl_agents.sources import Source
 from cpcbl_team.config import LocalizationSettings
-from cpcbl_team.inputs import Odometry, Sightings
+from cpcbl_team.inputs import Odometry, Position, Sightings
+
+SensorInput = Odometry | Sightings | Position
 
 
 class SensingAgent:
@@ -38,13 +40,13 @@ class SensingAgent:
         match message:
             case Tick():
                 return [self._corrected(item) for item in self._source.poll(now_ns)]
-            case Odometry() | Sightings():
+            case Odometry() | Sightings() | Position():
                 return [self._corrected(message)]
             case Located() if self._pilot is not None and message.frame is None:
                 return self._pilot.command(message)
         return ()
 
-    def _corrected(self, item: Odometry | Sightings) -> Odometry | Sightings:
+    def _corrected(self, item: SensorInput) -> SensorInput:
         self.counts[type(item).__name__.lower()] += 1
         if isinstance(item, Odometry):
             delay = self._odometry_delay_ns
@@ -53,6 +55,8 @@ class SensingAgent:
             return Odometry(
                 item.from_ns + delay, item.stamp_ns + delay, item.distance_m, item.turn_rad
             )
+        if isinstance(item, Position):
+            return item
         kept = tuple(s for s in item.sightings if self._sees(s.id))
         return Sightings(item.stamp_ns - self._sensor_delay_ns, kept)
 

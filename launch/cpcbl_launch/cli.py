@@ -1,12 +1,16 @@
 """The command line `cpcbl-team`."""
 
+import importlib.util
 import logging
 import sys
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Optional
+from typing import TYPE_CHECKING, Annotated, Optional
 
 import typer
+
+if TYPE_CHECKING:
+    from cpcbl_team.config import Team
 
 app = typer.Typer(
     help="A team of robots that find out where they are, together.",
@@ -57,9 +61,8 @@ def check(
     file: Annotated[Path, typer.Argument(help="Team file (TOML).")],
 ) -> None:
     """Validate a team file without starting anything."""
-    from cpcbl_launch.team_file import load_team
 
-    team = load_team(file)
+    team = _load(file)
     marks, walls = len(team.map.landmarks), len(team.map.walls)
     typer.echo(
         f"{file}: good: team {team.name!r}, {len(team.robots)} robots"
@@ -70,7 +73,7 @@ def check(
 @app.command()
 def up(
     file: Annotated[
-        Optional[Path], typer.Argument(help="Team file; without one: the demonstration.")
+        Optional[Path], typer.Argument(help="Team file, or a built-in one: demo (default), mrclam.")
     ] = None,
     duration: Annotated[
         Optional[float],
@@ -88,6 +91,10 @@ def up(
     report: Annotated[
         Optional[Path], typer.Option(help="Write the report to this file (JSON).")
     ] = None,
+    picture: Annotated[
+        Optional[Path],
+        typer.Option(help="Draw paths and errors into this file (PNG or SVG; extra `plot`)."),
+    ] = None,
     logs: Annotated[
         Optional[Path], typer.Option(help="Keep the processes' logs in this folder.")
     ] = None,
@@ -100,11 +107,12 @@ def up(
     from cpcbl_agents.process import Stop
     from cpcbl_launch import logs as real_logs
     from cpcbl_launch.show import LiveTable, print_report
-    from cpcbl_launch.team_file import builtin, load_team
     from cpcbl_launch.up import Run, run_team
 
-    team = load_team(file or builtin("demo"))
-    run = Run(team, duration, speed, seed, folder=logs)
+    team = _load(file or Path("demo"))
+    if picture is not None and importlib.util.find_spec("matplotlib") is None:
+        raise ValueError("--picture needs matplotlib: pip install 'cpcbl-team[plot]'")
+    run = Run(team, duration, speed, seed, folder=logs, picture=picture)
     if any(robot.source == "mrclam" for robot in team.robots.values()):
         logged = real_logs.on_log(team, Path(data or team.data or "."))
         run = run._replace(
@@ -146,9 +154,9 @@ def robot(
     """Run one robot, on any machine, until SIGINT or SIGTERM."""
     from cpcbl_agents.clock import Clock
     from cpcbl_agents.process import Stop, run_robot
-    from cpcbl_launch.team_file import TeamFileError, load_team
+    from cpcbl_launch.team_file import TeamFileError
 
-    team = load_team(team_file)
+    team = _load(team_file)
     if name not in team.robots:
         raise TeamFileError(
             f"{team_file}: robots.{name}: not in the file; it has: {', '.join(team.robots)}"
@@ -169,10 +177,9 @@ def field(
     from cpcbl_agents.clock import Clock
     from cpcbl_agents.process import Stop
     from cpcbl_launch.field import run_field
-    from cpcbl_launch.team_file import load_team
     from cpcbl_transport.zenoh_bus import open_bus
 
-    team = load_team(team_file)
+    team = _load(team_file)
     stop = Stop(parent)
     with open_bus(team.name, connect or team.transport.connect, stop) as bus:
         run_field(team, seed, bus, Clock.parse(clock) if clock else Clock.wall(), stop)
@@ -182,7 +189,7 @@ def field(
 def evaluate_mrclam(
     data: Annotated[Path, typer.Argument(help="Folder of one data set, e.g. MRCLAM6.")],
     team_file: Annotated[
-        Optional[Path], typer.Option("--team", help="Team file; default: the built-in one.")
+        Optional[Path], typer.Option("--team", help="Team file; default: the built-in mrclam.")
     ] = None,
     blind: Blind = "",
     variant: Annotated[Optional[VariantName], typer.Option(help="For all robots.")] = None,
@@ -201,9 +208,8 @@ def evaluate_mrclam(
     from cpcbl_launch import logs as real_logs
     from cpcbl_launch.evaluation import Choice, chosen, evaluate_log
     from cpcbl_launch.show import print_report, progress_bar
-    from cpcbl_launch.team_file import builtin, load_team
 
-    team = load_team(team_file or builtin("mrclam"))
+    team = _load(team_file or Path("mrclam"))
     choice = Choice(variant, collaboration, fusion, direction)
     logged = real_logs.on_log(chosen(team, choice), data)
     logged = logged._replace(team=real_logs.blinded(logged.team, _names(blind)))
@@ -213,6 +219,16 @@ def evaluate_mrclam(
         typer.echo(msgspec.json.format(msgspec.json.encode(result), indent=2).decode())
     else:
         print_report(result, Console())
+
+
+def _load(path: Path) -> "Team":
+    """The team in a file, or one that comes with the package by its name."""
+    from cpcbl_launch.team_file import builtin, load_team
+
+    own = builtin(path.name)
+    return load_team(
+        own if not path.exists() and path == Path(path.name) and own.exists() else path
+    )
 
 
 def _names(text: str) -> list[str]:

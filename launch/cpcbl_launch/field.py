@@ -12,9 +12,10 @@ from collections.abc import Callable, Iterable, Sequence
 import numpy as np
 
 from cpcbl_agents.clock import Clock
+from cpcbl_agents.sensing import SensorInput
 from cpcbl_team.config import RobotSettings, Team
 from cpcbl_team.geometry import Pose2, step, wrap_angle
-from cpcbl_team.inputs import Odometry, Sighting, Sightings
+from cpcbl_team.inputs import Odometry, Position, Sighting, Sightings
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus, Publisher
 from cpcbl_transport.messages import Drive, Truth, Truths, decode, encode
@@ -39,10 +40,10 @@ class SimulatedRobot:
         self.bumps = 0
         self.touching: frozenset[str] = frozenset()
         self._reported = (0.0, 0.0)
-        self._reported_ns = self._sensed_ns = -1
+        self._reported_ns = self._sensed_ns = self._positioned_ns = -1
 
     def start(self, now_ns: int) -> None:
-        self._reported_ns = self._sensed_ns = now_ns
+        self._reported_ns = self._sensed_ns = self._positioned_ns = now_ns
 
     def move(self, now_ns: int, seconds: float) -> None:
         """Drives on as commanded; the wheels report the command, the ground adds noise."""
@@ -78,6 +79,15 @@ class SimulatedRobot:
             return None
         self._sensed_ns = now_ns
         return Sightings(now_ns, tuple(s for o in objects if (s := self._sighted(*o))))
+
+    def position(self, now_ns: int) -> Position | None:
+        """What the position sensor says, if there is one and it is due."""
+        sensor = self.settings.position_sensor
+        if sensor is None or now_ns - self._positioned_ns < 1e9 / sensor.rate_hz:
+            return None
+        self._positioned_ns = now_ns
+        x, y = (v + self._normal(sensor.sigma_m) for v in self.pose[:2])
+        return Position(now_ns, x, y, (sensor.sigma_m**2, 0.0, sensor.sigma_m**2))
 
     def _sighted(self, name: str, x: float, y: float, gives: str) -> Sighting | None:
         sensor = self.settings.sensor
@@ -126,17 +136,18 @@ class SimulatedField:
         if drive.robot in self.robots:
             self.robots[drive.robot].drive = drive
 
-    def advance(self) -> list[tuple[str, Odometry | Sightings]]:
+    def advance(self) -> list[tuple[str, SensorInput]]:
         """One step; what each robot senses at its end."""
         self.now_ns += self._step_ns
         for robot in self.robots.values():
             robot.move(self.now_ns, self._step_ns * 1e-9)
             self._bump(robot)
-        sensed: list[tuple[str, Odometry | Sightings]] = []
+        sensed: list[tuple[str, SensorInput]] = []
         for name, robot in self.robots.items():
             piece = robot.odometry(self.now_ns)
             frame = robot.sightings(self.now_ns, self._visible(name, robot.pose))
-            sensed += [(name, item) for item in (piece, frame) if item is not None]
+            position = robot.position(self.now_ns)
+            sensed += [(name, item) for item in (piece, frame, position) if item is not None]
         return sensed
 
     def truth(self) -> Truths:
@@ -177,8 +188,10 @@ class FieldNode:
         self._truth = bus.publisher(topics.TRUTH.at(), topics.TRUTH.qos)
         self._publishers: dict[tuple[str, type], Publisher] = {}
         for name in field.robots:
-            for kind, topic in ((Odometry, topics.IN_ODOMETRY), (Sightings, topics.IN_SIGHTINGS)):
-                self._publishers[name, kind] = bus.publisher(topic.at(robot=name), topic.qos)
+            for topic in topics.INPUTS:
+                assert topic.carries is not None
+                publisher = bus.publisher(topic.at(robot=name), topic.qos)
+                self._publishers[name, topic.carries] = publisher
         bus.subscribe(topics.DRIVE.at(), lambda key, payload: self._drives.append(payload))
 
     @property

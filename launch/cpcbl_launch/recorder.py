@@ -5,9 +5,8 @@ from collections.abc import Mapping
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
-from cpcbl_team.metrics import Samples, Score, score, truth_at
+from cpcbl_team.metrics import Floats, Samples, Score, score, truth_at
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus
 from cpcbl_transport.messages import Status, Track, Truth, Truths, decode
@@ -89,7 +88,7 @@ class Recorder:
             tracks = {name: t[-1] for name, t in self.tracks.items()}
             return tracks, dict(self.status), truth
 
-    def simulated_truth(self) -> dict[str, NDArray[np.float64]]:
+    def simulated_truth(self) -> dict[str, Floats]:
         """Rows of seconds, x, y, heading for every robot of the simulated field."""
         with self._lock:
             rows: dict[str, list[tuple[float, float, float, float]]] = {}
@@ -100,34 +99,40 @@ class Recorder:
         return {name: np.array(r) for name, r in rows.items()}
 
     def samples(
-        self, robot: str, truth: NDArray[np.float64] | None, from_s: float, until_s: float
+        self, robot: str, truth: Floats | None, from_s: float = -np.inf, until_s: float = np.inf
     ) -> Samples:
         """A robot's estimates within [from_s, until_s), beside the truth, where there is one."""
+        nothing = np.empty((0, 3))
+        if truth is None or len(truth) == 0:
+            return Samples(nothing, nothing, None)
+        return self.timed_samples(robot, truth, from_s, until_s)[1]
+
+    def timed_samples(
+        self, robot: str, truth: Floats, from_s: float = -np.inf, until_s: float = np.inf
+    ) -> tuple[Floats, Samples]:
+        """The same with its times (s)."""
         with self._lock:
             tracks = list(self.tracks.get(robot, ()))
         tracks = [t for t in tracks if from_s <= t.stamp_ns * 1e-9 < until_s]
-        estimate = np.array([(t.x_m, t.y_m, t.heading_rad) for t in tracks]).reshape(-1, 3)
-        covariances = [t.covariance for t in tracks if t.covariance is not None]
-        if truth is None or len(truth) == 0 or not tracks:
-            return Samples(estimate[:0], estimate[:0], None)
         times = np.array([t.stamp_ns * 1e-9 for t in tracks])
+        estimate = np.array([(t.x_m, t.y_m, t.heading_rad) for t in tracks]).reshape(-1, 3)
         at, counts = truth_at(times, truth)
-        covariance = np.array(covariances) if len(covariances) == len(tracks) else None
-        return Samples(
-            estimate[counts], at[counts], None if covariance is None else covariance[counts]
-        )
+        covariance = None
+        if all(t.covariance is not None for t in tracks):
+            covariance = np.array([t.covariance for t in tracks]).reshape(-1, 6)[counts]
+        return times[counts], Samples(estimate[counts], at[counts], covariance)
 
     def report(
         self,
         variants: Mapping[str, str],
-        truth: Mapping[str, NDArray[np.float64]],
+        truth: Mapping[str, Floats],
         from_s: float = -np.inf,
     ) -> Report:
         """The figures of all robots from `from_s` on."""
         _, _, last_truth = self.latest()
         robots = {}
         for name, variant in variants.items():
-            figures = score(self.samples(name, truth.get(name), from_s, np.inf))
+            figures = score(self.samples(name, truth.get(name), from_s))
             tracks = self.tracks.get(name, [])
             statuses = [
                 *self._done.get(name, ()),

@@ -10,7 +10,6 @@ from typing import NamedTuple, Protocol
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from cpcbl_agents.clock import Clock
 from cpcbl_launch.processes import process_table
@@ -18,7 +17,7 @@ from cpcbl_launch.recorder import Recorder, Report
 from cpcbl_launch.supervisor import Supervisor
 from cpcbl_launch.team_file import save_resolved
 from cpcbl_team.config import Team
-from cpcbl_team.metrics import score
+from cpcbl_team.metrics import Floats, score
 from cpcbl_transport.zenoh_bus import open_router
 
 LEAD_S = 2.0
@@ -35,12 +34,14 @@ class Run(NamedTuple):
     seed: int = 1
     here: Collection[str] | None = None
     """The robots to start on this machine; None: all."""
-    truth: Mapping[str, NDArray[np.float64]] = MappingProxyType({})
+    truth: Mapping[str, Floats] = MappingProxyType({})
     left_out: Mapping[str, str] = MappingProxyType({})
     epoch_ns: int | None = None
     """Robot time at the start; None: now."""
     folder: Path | None = None
     """Where processes write their logs; None: a temporary folder."""
+    picture: Path | None = None
+    """The picture of the run to write (PNG, SVG or PDF)."""
 
 
 class View(Protocol):
@@ -105,14 +106,18 @@ def _report(
 ) -> Report:
     robots = run.team.robots
     truth = run.truth or recorder.simulated_truth()
-    after_s = max((r.collaboration.after_s for r in robots.values()), default=0.0)
-    helped_from_s = epoch_s + after_s if after_s else -np.inf
+    after_s = max(robot.collaboration.after_s for robot in robots.values())
+    helped_from_s = epoch_s + after_s if after_s else None
     variants = {name: robot.localizer.variant for name, robot in robots.items()}
-    report = recorder.report(variants, truth, helped_from_s)
+    if run.picture is not None:
+        from cpcbl_launch.picture import draw_run
+
+        draw_run(recorder, run.team, truth, run.picture, helped_from_s)
+    report = recorder.report(variants, truth, helped_from_s or -np.inf)
     alone = {}
-    if after_s:
+    if helped_from_s is not None:
         alone = {
-            name: score(recorder.samples(name, truth.get(name), -np.inf, helped_from_s))
+            name: score(recorder.samples(name, truth.get(name), until_s=helped_from_s))
             for name in robots
         }
     return msgspec.structs.replace(

@@ -5,15 +5,16 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import msgspec
 import pytest
+from process_helpers import command_of, eventually
 
 from cpcbl_launch.processes import PROGRAM
 from cpcbl_launch.recorder import Recorder, Report
-from cpcbl_launch.supervisor import Supervisor
+from cpcbl_launch.supervisor import ProcessSpec, Supervisor
 from cpcbl_launch.team_file import builtin, load_team, save_resolved
 from cpcbl_launch.up import Run, free_endpoint, run_team
 from cpcbl_team.config import Team
@@ -62,13 +63,6 @@ def run(script: Script, team: Team, folder: Path, limit_s: float = 60.0) -> Repo
     return report
 
 
-def command_of(pid: int) -> str:
-    """The command line of a process, from the system's process list."""
-    return subprocess.run(
-        ["ps", "-o", "args=", "-p", str(pid)], capture_output=True, text=True, check=False
-    ).stdout
-
-
 def test_kills_one_of_four_robot_processes_and_it_localizes_again(tmp_path: Path) -> None:
     killed: dict[str, int] = {}
     seen: dict[str, int] = {}
@@ -113,8 +107,6 @@ def test_kills_one_of_four_robot_processes_and_it_localizes_again(tmp_path: Path
 
 
 def test_a_process_that_keeps_dying_is_restarted_ever_later(tmp_path: Path) -> None:
-    from cpcbl_launch.supervisor import ProcessSpec
-
     fails = ProcessSpec("fails", (sys.executable, "-c", "raise SystemExit(3)"))
     with Supervisor([fails], tmp_path) as supervisor:
         until = time.monotonic() + 20.0
@@ -126,8 +118,6 @@ def test_a_process_that_keeps_dying_is_restarted_ever_later(tmp_path: Path) -> N
 
 
 def test_a_process_that_ignores_sigint_is_killed(tmp_path: Path) -> None:
-    from cpcbl_launch.supervisor import ProcessSpec
-
     stubborn = (
         "import signal, time; signal.signal(signal.SIGINT, signal.SIG_IGN);"
         "open('ready', 'w').close(); time.sleep(60)"
@@ -143,14 +133,14 @@ def test_a_process_that_ignores_sigint_is_killed(tmp_path: Path) -> None:
 
 
 @pytest.fixture
-def lone_robot(tmp_path: Path) -> Iterator[tuple[list[str], str, Team]]:
+def lone_robot(tmp_path: Path) -> tuple[list[str], str, Team]:
     """(command, endpoint, team) of one robot process whose router the test opens."""
     team = demo_team()
     path = tmp_path / "team.json"
     save_resolved(team, path)
     endpoint = free_endpoint()
     command = [*PROGRAM, "robot", "observer", "--team", str(path), "--connect", endpoint]
-    yield command, endpoint, team
+    return command, endpoint, team
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -162,10 +152,10 @@ def test_a_signal_ends_a_robot_within_two_seconds(
     with open_router(team.name, [endpoint]) as bus:
         bus.watch(topics.ALIVE.at(robot="observer"), alive.__setitem__)
         with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
-            assert _eventually(lambda: any(alive.values())), process.stderr
+            assert eventually(lambda: any(alive.values())), process.stderr
             process.send_signal(number)
             assert process.wait(timeout=2.0) == 0
-        assert _eventually(lambda: not any(alive.values()))
+        assert eventually(lambda: not any(alive.values()))
 
 
 def test_a_robot_waiting_for_its_router_can_be_stopped(
@@ -198,15 +188,6 @@ def test_a_robot_ends_when_its_launcher_is_gone(
             stdout=subprocess.PIPE,
             text=True,
         ) as parent:
-            assert _eventually(lambda: any(alive.values()))
+            assert eventually(lambda: any(alive.values()))
             parent.kill()
-        assert _eventually(lambda: not any(alive.values()))
-
-
-def _eventually(condition: Callable[[], bool], within_s: float = 20.0) -> bool:
-    until = time.monotonic() + within_s
-    while time.monotonic() < until:
-        if condition():
-            return True
-        time.sleep(0.02)
-    return condition()
+        assert eventually(lambda: not any(alive.values()))

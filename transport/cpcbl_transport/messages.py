@@ -10,7 +10,7 @@ from enum import StrEnum
 
 import msgspec
 
-from cpcbl_team.inputs import Belief, Fix, Name, Odometry, Sightings
+from cpcbl_team.inputs import Belief, Fix, Name, Odometry, Position, Sightings
 
 VERSION = 1
 FUTURE_NS = 500_000_000
@@ -74,7 +74,7 @@ class Truths(msgspec.Struct, frozen=True, array_like=True, tag="truth"):
     robots: tuple[Truth, ...]
 
 
-Message = Odometry | Sightings | Belief | Fix | Status | Track | Drive | Truths
+Message = Odometry | Sightings | Position | Belief | Fix | Status | Track | Drive | Truths
 
 
 class Refusal(StrEnum):
@@ -131,6 +131,9 @@ def refusal(message: Message, now_ns: int) -> Refusal | None:
         case Fix():
             parts = (message.sensor_covariance, message.observer_covariance)
             if not all(_is_covariance(*part) for part in parts):
+                return Refusal.NOT_A_COVARIANCE
+        case Position():
+            if not _is_covariance(*message.covariance):
                 return Refusal.NOT_A_COVARIANCE
         case Belief():
             xx, xy, yy, _, _, hh = message.covariance

@@ -8,7 +8,7 @@ drops it at the sender. This module does not know the bus.
 from enum import Enum
 from typing import NamedTuple
 
-from cpcbl_team.inputs import Belief, Fix, Odometry, Sightings
+from cpcbl_team.inputs import Belief, Fix, Odometry, Position, Sightings
 from cpcbl_transport.messages import Drive, Message, Status, Track, Truths
 
 
@@ -80,6 +80,9 @@ IN_ODOMETRY = Topic(
 IN_SIGHTINGS = Topic(
     "in/<robot>/sightings", Sightings, "the driver's", Qos.INPUT, "inputs are not dropped"
 )
+IN_POSITION = Topic(
+    "in/<robot>/position", Position, "the driver's", Qos.INPUT, "inputs are not dropped"
+)
 DRIVE = Topic(
     "field/drive/<robot>",
     Drive,
@@ -91,5 +94,6 @@ TRUTH = Topic(
     "field/truth", Truths, "every step, simulation only", Qos.TELEMETRY, "for reports only"
 )
 
-TOPICS = (ALIVE, BELIEF, FIX, STATUS, TRACK, IN_ODOMETRY, IN_SIGHTINGS, DRIVE, TRUTH)
+TOPICS = (ALIVE, BELIEF, FIX, STATUS, TRACK, IN_ODOMETRY, IN_SIGHTINGS, IN_POSITION, DRIVE, TRUTH)
+INPUTS = (IN_ODOMETRY, IN_SIGHTINGS, IN_POSITION)
 COLLABORATION = (Belief, Fix)

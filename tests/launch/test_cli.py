@@ -1,0 +1,175 @@
+"""The command line as a user types it: real processes, real output, real exit codes."""
+
+import json
+import signal
+import subprocess
+from pathlib import Path
+
+import pytest
+from log_helpers import write_log
+from process_helpers import cpcbl_team, eventually, pids_of
+
+from cpcbl_launch.processes import PROGRAM
+from cpcbl_launch.up import free_endpoint
+from cpcbl_transport import topics
+from cpcbl_transport.messages import Status, decode
+from cpcbl_transport.zenoh_bus import open_router
+
+DRIVER = Path(__file__).parents[2] / "docs" / "external_driver.py"
+FIGURES = {
+    "position_rmse_m",
+    "position_mean_m",
+    "position_max_m",
+    "heading_rmse_deg",
+    "inside_3_sigma",
+    "nees",
+    "messages_sent",
+    "bytes_sent",
+}
+PAIR = """
+name = "pair"
+[map.landmarks]
+a = { x_m = 0.0, y_m = 0.0 }
+b = { x_m = 6.0, y_m = 0.0 }
+c = { x_m = 3.0, y_m = 4.0 }
+[robots.driver]
+start = { x_m = 1.0, y_m = 1.0 }
+waypoints_m = [[5.0, 1.0], [3.0, 3.0], [1.0, 1.0]]
+[robots.watcher]
+start = { x_m = 3.0, y_m = 3.5, heading_deg = -90.0 }
+sensor = { range_share = 0.005, bearing_sigma_deg = 0.5, field_of_view_deg = 180.0 }
+odometry = { moves = false }
+"""
+
+
+@pytest.mark.parametrize("command", [[], ["up"], ["robot"], ["field"], ["check"], ["evaluate"]])
+def test_every_command_explains_itself(command: list[str]) -> None:
+    shown = cpcbl_team(*command, "--help")
+    assert shown.returncode == 0
+    assert "Usage" in shown.stdout
+
+
+def test_check_accepts_the_built_in_teams() -> None:
+    for name in ("demo", "mrclam"):
+        checked = cpcbl_team("check", name)
+        assert checked.returncode == 0, checked.stderr
+        assert f"team '{name}'" in checked.stdout
+
+
+def test_check_names_file_key_and_fix_in_one_line(tmp_path: Path) -> None:
+    path = tmp_path / "team.toml"
+    path.write_text(PAIR.replace("range_share", "range_shar"))
+    checked = cpcbl_team("check", path)
+    assert checked.returncode == 2
+    assert checked.stdout == ""
+    (line,) = checked.stderr.splitlines()
+    for part in (str(path), "robots.watcher.sensor.range_shar", "did you mean 'range_share'"):
+        assert part in line
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["up", "nowhere.toml"], "nowhere.toml: no such file"),
+        (["up", "mrclam", "--data", "nowhere"], "asrl.utias.utoronto.ca"),
+        (["up", "demo", "--blind", "nobody"], "no robot nobody to blind"),
+        (["evaluate", "mrclam", "nowhere"], "asrl.utias.utoronto.ca"),
+        (["robot", "nobody", "--team", "demo"], "nobody: not in the file"),
+    ],
+)
+def test_what_the_user_can_mend_is_one_line(arguments: list[str], said: str) -> None:
+    ended = cpcbl_team(*arguments)
+    assert ended.returncode == 2
+    (line,) = ended.stderr.splitlines()
+    assert said in line
+
+
+def test_up_reports_to_file_and_standard_output(tmp_path: Path) -> None:
+    team, written = tmp_path / "team.toml", tmp_path / "report.json"
+    team.write_text(PAIR)
+    ran = cpcbl_team(
+        "up", team, "--duration", 20, "--speed", 4, "--seed", 5, "--json", "--report", written
+    )
+    assert ran.returncode == 0, ran.stderr
+    report = json.loads(ran.stdout)
+    assert report == json.loads(written.read_text())
+    assert report["robots"].keys() == {"driver", "watcher"}
+    for robot in report["robots"].values():
+        assert robot.keys() >= FIGURES
+        assert robot["samples"] > 100
+        assert robot["position_rmse_m"] < 0.3
+    assert report["robots"]["watcher"]["messages_sent"] > 0
+    assert report["robots"]["driver"]["messages_sent"] == 0
+    assert not pids_of([str(team), "robot"])
+
+
+def test_up_shows_a_table_and_draws_a_picture(tmp_path: Path) -> None:
+    team, picture = tmp_path / "team.toml", tmp_path / "run.png"
+    team.write_text(PAIR)
+    ran = cpcbl_team("up", team, "--duration", 3, "--picture", picture)
+    assert ran.returncode == 0, ran.stderr
+    for word in ("driver", "watcher", "error m", "RMSE m", "NEES"):
+        assert word in ran.stdout
+    assert max(map(len, ran.stdout.splitlines())) <= 80
+    assert picture.read_bytes().startswith(b"\x89PNG")
+
+
+def test_up_on_a_log_agrees_with_evaluate(tmp_path: Path) -> None:
+    write_log(tmp_path, ("1", "2"), seconds=40.0)
+    evaluated = cpcbl_team("evaluate", "mrclam", tmp_path, "--blind", "2", "--json")
+    assert evaluated.returncode == 0, evaluated.stderr
+    ran = cpcbl_team("up", "mrclam", "--data", tmp_path, "--blind", "2", "--speed", 5, "--json")
+    assert ran.returncode == 0, ran.stderr
+    alone, together = json.loads(evaluated.stdout), json.loads(ran.stdout)
+    assert together["left_out"].keys() == {"3", "4", "5"}
+    assert together["robots"].keys() == alone["robots"].keys() == {"1", "2"}
+    for name in alone["robots"]:
+        assert together["robots"][name]["samples"] > 200
+        assert together["robots"][name]["position_rmse_m"] < 0.02
+        assert alone["robots"][name]["position_rmse_m"] < 0.02
+
+
+def test_a_team_spreads_over_machines_by_an_endpoint_in_its_file(tmp_path: Path) -> None:
+    endpoint, team = free_endpoint(), tmp_path / "team.toml"
+    team.write_text(f'{PAIR}\n[transport]\nlisten = ["{endpoint}"]\nconnect = ["{endpoint}"]\n')
+    elsewhere = [*PROGRAM, "robot", "watcher", "--team", str(team)]
+    with subprocess.Popen(elsewhere, stderr=subprocess.DEVNULL) as other:
+        ran = cpcbl_team("up", team, "--robots", "driver", "--duration", 8, "--json")
+        other.send_signal(signal.SIGINT)
+        other.wait(timeout=5.0)
+    assert ran.returncode == 0, ran.stderr
+    report = json.loads(ran.stdout)
+    assert report["robots"]["watcher"]["samples"] > 0
+    assert report["robots"]["driver"]["messages_received"] > 0
+
+
+def test_the_documented_driver_feeds_a_robot(tmp_path: Path) -> None:
+    endpoint, team = free_endpoint(), tmp_path / "team.toml"
+    team.write_text(
+        'name = "lab"\n[map.landmarks]\ndoor = { x_m = 2.0, y_m = 0.2 }\n'
+        '[robots.r1]\nsource = "external"\nstart = { x_m = 0.0, y_m = 0.0 }\n'
+    )
+    heard: list[Status] = []
+
+    def hear(key: str, payload: bytes) -> None:
+        status = decode(payload)
+        assert isinstance(status, Status)
+        heard.append(status)
+
+    import sys
+
+    commands = [
+        [*PROGRAM, "robot", "r1", "--team", str(team), "--connect", endpoint],
+        [sys.executable, str(DRIVER), "lab", "r1", endpoint],
+    ]
+    with open_router("lab", [endpoint]) as bus:
+        bus.subscribe(topics.STATUS.at(), hear)
+        processes = [subprocess.Popen(c, stderr=subprocess.DEVNULL) for c in commands]
+        try:
+            assert eventually(lambda: any(s.counts.get("accepted", 0) >= 3 for s in heard))
+        finally:
+            for process in processes:
+                process.send_signal(signal.SIGINT)
+                process.wait(timeout=5.0)
+    assert heard[-1].counts["odometry"] > 0
+    assert heard[-1].lost == ""
