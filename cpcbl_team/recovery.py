@@ -22,7 +22,7 @@ DRIFT_SHARE = 0.1  # of the way: how far dead reckoning errs within the window
 WIDEN_NS = 1_000_000_000
 _OPEN = Covariance3(1e6, 0.0, 1e6, 0.0, 0.0, 1e3)
 _ENOUGH_POSITION_SIGMA_M = 0.7
-_ENOUGH_HEADING_SIGMA_RAD = 0.35
+_ENOUGH_HEADING_SIGMA_RAD = 0.5
 
 
 def remembered(memory: Memory, pieces: Iterable[Evidence]) -> Memory:

@@ -7,18 +7,20 @@ from typing import NamedTuple
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from cpcbl_agents.sources import mrclam
 from cpcbl_team.config import Field, Start, Team
-from cpcbl_team.metrics import truth_at
+from cpcbl_team.geometry import Pose2, step
+from cpcbl_team.metrics import Floats, truth_at
+
+LATEST_TRUTH_NS = 30_000_000_000
 
 
 class LoggedTeam(NamedTuple):
     """A team whose robots have logs, and what the logs say besides."""
 
     team: Team
-    truth: dict[str, NDArray[np.float64]]
+    truth: dict[str, Floats]
     left_out: dict[str, str]
     start_ns: int
     end_ns: int
@@ -41,7 +43,7 @@ def on_log(team: Team, folder: Path) -> LoggedTeam:
     truth = {name: mrclam.read_truth(folder, name) for name in names}
     spans = {name: mrclam.odometry_span_ns(folder, name) for name in names}
     robots = {
-        name: msgspec.structs.replace(team.robots[name], start=_start(spans[name][0], truth[name]))
+        name: msgspec.structs.replace(team.robots[name], start=_start(folder, name, truth[name]))
         for name in names
     }
     ready = msgspec.structs.replace(
@@ -54,13 +56,25 @@ def on_log(team: Team, folder: Path) -> LoggedTeam:
     return LoggedTeam(ready, truth, left_out, start_ns, max(last for _, last in spans.values()))
 
 
-def _start(at_ns: int, truth: NDArray[np.float64]) -> Start | None:
-    """The true pose at a time; None where there is no truth near it."""
-    pose, counts = truth_at(np.array([at_ns * 1e-9]), truth)
-    if not counts[0]:
+def _start(folder: Path, robot: str, truth: Floats) -> Start | None:
+    """The true pose at the start of a robot's odometry, or None where truth begins long after it.
+
+    Where truth begins a little later, its first row is carried back along the odometry, and a
+    tenth of that way is added to sigma.
+    """
+    reckoned, way = Pose2(0.0, 0.0, 0.0), 0.0
+    first_ns, _ = mrclam.odometry_span_ns(folder, robot)
+    first_truth_ns = max(first_ns, int(truth[0, 0] * 1e9))
+    if first_truth_ns - first_ns > LATEST_TRUTH_NS:
         return None
-    x, y, heading = pose[0].tolist()
-    return Start(x_m=x, y_m=y, heading_deg=math.degrees(heading))
+    for piece in mrclam.read_odometry(folder, robot):
+        if piece.stamp_ns > first_truth_ns:
+            break
+        reckoned = step(reckoned, piece.distance_m, piece.turn_rad)
+        way += abs(piece.distance_m)
+    pose, _ = truth_at(np.array([first_truth_ns * 1e-9]), truth)
+    x, y, heading = Pose2(*pose[0].tolist()) @ reckoned.inverse()
+    return Start(x_m=x, y_m=y, heading_deg=math.degrees(heading), sigma_m=0.05 + 0.1 * way)
 
 
 def blinded(team: Team, blind: Collection[str]) -> Team:

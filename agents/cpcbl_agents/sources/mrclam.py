@@ -79,8 +79,9 @@ def _ns(seconds: float) -> int:
     return round(seconds * 1e3) * 1_000_000  # the files have whole milliseconds
 
 
-def odometry_pieces(table: NDArray[np.float64]) -> Iterator[Odometry]:
+def read_odometry(folder: Path, robot: str) -> Iterator[Odometry]:
     """A command holds until the next one; equal commands in a row make one piece of up to 0.1 s."""
+    table = read_table(folder / f"Robot{robot}_Odometry.dat", 3)
     rows = [(_ns(t), v, w) for t, v, w in table.tolist()]
     from_ns, speed, turn_rate = rows[0]
     for stamp_ns, next_speed, next_turn_rate in rows[1:]:
@@ -114,7 +115,7 @@ class MrclamSource:
     def __init__(self, folder: Path, robot: str) -> None:
         barcodes = read_table(folder / "Barcodes.dat", 2)
         names = {int(barcode): str(int(subject)) for subject, barcode in barcodes.tolist()}
-        odometry = odometry_pieces(read_table(folder / f"Robot{robot}_Odometry.dat", 3))
+        odometry = read_odometry(folder, robot)
         seen = frames(read_table(folder / f"Robot{robot}_Measurement.dat", 4), names, robot)
         items: list[Odometry | Sightings] = [*odometry, *seen]
         items.sort(key=lambda item: item.stamp_ns)
