@@ -42,6 +42,8 @@ def fix_for(
     range_m, bearing = sighting.range_m, sighting.bearing_rad
     if range_m is None or bearing is None or sighting_fault(sighting):
         return None
+    if range_m > sensor.max_range_for_range_m:
+        return None
     pose, covariance = estimate.pose, estimate.covariance
     seen = sighting_gaussian(range_m, bearing, *sighting_sigmas(sighting, sensor))
     x, y = pose.transform(seen.x, seen.y)

@@ -25,11 +25,20 @@ class Constraint(NamedTuple):
     sigma: float  # of the sensor, in the residual's unit
     distance_m: float  # robot to object; non-probabilistic weights are its inverse
     on_heading: bool
+    place_row: tuple[float, float]  # how the residual follows an error in the object's place
 
     def uncoupled(self) -> "Constraint":
         """As the paper prints it: heading and position know nothing of each other's error."""
         x, y, h = self.row
         return self._replace(row=(0.0, 0.0, h) if self.on_heading else (x, y, 0.0))
+
+    @staticmethod
+    def of(
+        row: Row, residual: float, sigma: float, distance_m: float, on_heading: bool
+    ) -> "Constraint":
+        """A constraint relative to an object: moving the object moves the curve along with it."""
+        distance_m = max(distance_m, NEAREST_M)
+        return Constraint(row, residual, sigma, distance_m, on_heading, row[:2])
 
     def closest_point(self, pose: Pose2) -> tuple[float, float]:
         """The point of a position constraint that is closest to the estimate (figure 1 c)."""
@@ -45,7 +54,7 @@ def range_circle(
     if distance < NEAREST_M:
         return None
     row = (dx / distance, dy / distance, 0.0)
-    return Constraint(row, range_m - distance, sigma_m, max(range_m, NEAREST_M), False)
+    return Constraint.of(row, range_m - distance, sigma_m, range_m, False)
 
 
 def bearing_ray(pose: Pose2, x: float, y: float, bearing: float, sigma: float) -> Constraint | None:
@@ -61,7 +70,8 @@ def bearing_ray(pose: Pose2, x: float, y: float, bearing: float, sigma: float) -
         return None
     distance = math.hypot(dx, dy)
     residual = ux * dy - uy * dx
-    return Constraint((-uy, ux, ahead), residual, distance * math.sin(sigma), distance, False)
+    width = distance * math.sin(min(sigma, 0.5 * math.pi))
+    return Constraint.of((-uy, ux, ahead), residual, width, distance, False)
 
 
 def bearing_heading(
@@ -74,7 +84,7 @@ def bearing_heading(
         return None
     residual = wrap_angle(math.atan2(dy, dx) - bearing - pose.heading)
     row = (-dy / distance**2, dx / distance**2, 1.0)
-    return Constraint(row, residual, sigma, distance, True)
+    return Constraint.of(row, residual, sigma, distance, True)
 
 
 def wall_line(
@@ -85,7 +95,7 @@ def wall_line(
     offset = nx * (pose.x - x) + ny * (pose.y - y)
     side = 1.0 if offset >= 0.0 else -1.0
     row = (side * nx, side * ny, 0.0)
-    return Constraint(row, distance_m - abs(offset), sigma_m, max(distance_m, NEAREST_M), False)
+    return Constraint.of(row, distance_m - abs(offset), sigma_m, distance_m, False)
 
 
 def wall_heading(
@@ -96,4 +106,4 @@ def wall_heading(
     offset = nx * (pose.x - x) + ny * (pose.y - y)
     towards = wall_direction - math.copysign(0.5 * math.pi, offset)
     residual = wrap_angle(towards - bearing - pose.heading)
-    return Constraint((0.0, 0.0, 1.0), residual, sigma, max(abs(offset), NEAREST_M), True)
+    return Constraint.of((0.0, 0.0, 1.0), residual, sigma, abs(offset), True)

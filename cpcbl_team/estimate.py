@@ -47,6 +47,10 @@ class Covariance3(NamedTuple):
             self.xh * x + self.yh * y + self.hh * a,
         )
 
+    def determinant(self) -> float:
+        a, b, d, c, e, f = self
+        return a * (d * f - e * e) - b * (b * f - e * c) + c * (b * e - d * c)
+
     def transformed(self, m: Matrix3) -> "Covariance3":
         """M C M^T."""
         a, b, c, d, e, f, g, h, i = m
@@ -63,6 +67,7 @@ class Covariance3(NamedTuple):
         )
 
 
+SMALLEST_VARIANCE = 1e-12  # (1 um)^2, (1 urad)^2: what is called exact
 ZERO3 = Covariance3(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 Row = tuple[float, float, float]
 
@@ -105,7 +110,7 @@ class Information(NamedTuple):
     def add(self, h: Row, residual: float, variance: float) -> "Information":
         """With one more scalar measurement: residual = h . offset + noise of this variance."""
         x, y, a = h
-        m, v, w = self.matrix, self.vector, 1.0 / variance
+        m, v, w = self.matrix, self.vector, 1.0 / max(variance, SMALLEST_VARIANCE)
         r = residual * w
         return Information(
             Covariance3(
@@ -203,9 +208,18 @@ class Observation(NamedTuple):
     independent: Covariance2
     dependent: Covariance2
 
+    def noise(self, dependent_factor: float = 1.0) -> Covariance2:
+        """The covariance of the residuals, with the dependent part times `dependent_factor`."""
+        i, d, k = self.independent, self.dependent, dependent_factor
+        return Covariance2(
+            i.xx + k * d.xx + SMALLEST_VARIANCE,
+            i.xy + k * d.xy,
+            i.yy + k * d.yy + SMALLEST_VARIANCE,
+        )
+
     def information(self, dependent_factor: float = 1.0) -> Information:
         """The evidence with the dependent part of its covariance times `dependent_factor`."""
-        r = self.independent + self.dependent.scaled(dependent_factor)
+        r = self.noise(dependent_factor)
         if len(self.rows) == 1:
             return Information.none().add(self.rows[0], self.residuals[0], r.xx)
         # Two correlated scalars become two independent ones (r = L L^T).
@@ -217,7 +231,7 @@ class Observation(NamedTuple):
 
     def normalized_innovation_squared(self, prior: Covariance3) -> float:
         """e^T (H P H^T + R)^-1 e: chi-square with as many degrees of freedom as rows."""
-        r = self.independent + self.dependent
+        r = self.noise()
         first = prior.times(self.rows[0])
         sxx = _dot(self.rows[0], first) + r.xx
         if len(self.rows) == 1:
@@ -242,9 +256,10 @@ _GOLDEN = 0.6180339887498949
 def merge_split(prior: Estimate, seen: Observation, scope: Scope = Scope.POSE) -> Estimate:
     """Split covariance intersection: consistent for any correlation of the dependent parts.
 
-    P1 = P_d / w + P_i, R = R_d / (1 - w) + R_i, w chosen for the smallest trace of the merged
-    position (heading, where the scope is the heading) by golden section. Scopes other than POSE
-    expect a prior of which nothing or all is shared.
+    P1 = P_d / w + P_i, R = R_d / (1 - w) + R_i, w chosen by golden section for the smallest merged
+    determinant (POSE; a trace of the position alone would give the heading away), trace of the
+    position or variance of the heading. Scopes other than POSE expect a prior of which nothing or
+    all is shared.
     """
     low, high = 0.02, 0.98
     left, right = high - _GOLDEN * (high - low), low + _GOLDEN * (high - low)
@@ -271,6 +286,8 @@ def _split(prior: Estimate, seen: Observation, scope: Scope, weight: float) -> t
     widened = _widened(prior, weight)
     evidence = seen.information(1.0 / (1.0 - weight)).matrix
     merged = _product(_gain(widened, evidence), widened)
+    if scope is Scope.POSE:
+        return merged.determinant(), weight
     return (merged.hh if scope is Scope.HEADING else merged.xx + merged.yy), weight
 
 
@@ -293,7 +310,7 @@ def _merge_split_at(prior: Estimate, seen: Observation, scope: Scope, weight: fl
 
 def _sensor_part(seen: Observation, weight: float, merged: Covariance3) -> Covariance3:
     """K R_i K^T with K = P' H^T R^-1: what of the merged covariance is fresh sensor noise."""
-    r = seen.independent + seen.dependent.scaled(1.0 / (1.0 - weight))
+    r = seen.noise(1.0 / (1.0 - weight))
     gains = [merged.times(row) for row in seen.rows]
     if len(gains) == 1:
         k, (gx, gy, gh) = seen.independent.xx / (r.xx * r.xx), gains[0]

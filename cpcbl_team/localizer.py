@@ -55,31 +55,32 @@ class Localizer:
         """One cycle: the five steps of the paper (sections 3 and 4) for one frame of sightings."""
         state = self.moved(state, frame.stamp_ns)  # 1. differential motion
         state, seen = self._measure(state, frame)  # 2. measurements, with their sigmas
-        scope = self._turn(state, seen)
-        if scope is None:
+        turn = self._turn(state, seen)
+        if turn is None:
             return self._judged(state)
         prior = state.estimate
-        found = [(m, self._constraints(prior.pose, m, scope)) for m in seen]  # 3. constraints
-        accepted, rejected = self._gated(prior, [(m, cs) for m, cs in found if cs])
+        found = [(m, self._constraints(prior.pose, m, turn)) for m in seen]  # 3. constraints
+        accepted, rejected = self._gated(prior, found)
         landmarks = [c for m, cs in accepted for c in cs if not m.teammate or self._weighted]
         teammates = [(m, cs) for m, cs in accepted if m.teammate and not self._weighted]
         if self._weighted:
             estimate = self._weighed(prior, landmarks)
         else:
             evidence = _combined(landmarks)  # 4. their closest points, combined
-            estimate = merge(prior, evidence, scope)  # 5. combined with the estimate
+            estimate = merge(prior, evidence, self._scope(turn))  # 5. combined with the estimate
             for m, cs in teammates:
-                estimate = self._merge_teammate(
-                    estimate, _observation(prior, m, cs, estimate), scope
-                )
+                told = _observation(prior, m, cs, estimate)
+                estimate = self._merge_teammate(estimate, told, self._scope(turn))
         sources = [m.source for m, _ in accepted]
         state = state._replace(estimate=self._reduced(estimate))
-        return self._judged(self._updated(state, scope, sources, rejected))
+        return self._judged(self._updated(state, turn, sources, rejected))
 
     # Step 1 -----------------------------------------------------------------------------------
 
     def drive(self, state: State, odometry: Odometry) -> State:
         """Takes the next piece of odometry; it is driven along as later inputs ask for it."""
+        if odometry.stamp_ns <= odometry.from_ns:
+            return state._replace(memory=state.memory.counted("impossible_duration"))
         state = self.moved(state, odometry.from_ns)
         odometry_ns = max(state.odometry_ns, odometry.stamp_ns)
         return state._replace(motion=odometry, odometry_ns=odometry_ns)
@@ -144,7 +145,7 @@ class Localizer:
             )
             if m is not None:
                 seen.append(m)
-        pieces = [_sighting_evidence(state, m) for m in seen if m.wall is None]
+        pieces = [_sighting_evidence(state, m) for m in seen if m.usable and m.wall is None]
         memory = recovery.remembered(memory, pieces).counted(*faults)
         least = self._rules.object_interval_s * 1e9
         fresh = [m for m in seen if _passed(memory.objects_ns.get(m.source), frame.stamp_ns, least)]
@@ -169,23 +170,23 @@ class Localizer:
 
     # Step 3 -----------------------------------------------------------------------------------
 
-    def _constraints(self, pose: Pose2, m: Measured, scope: Scope) -> list[Constraint]:
+    def _constraints(self, pose: Pose2, m: Measured, turn: Scope) -> list[Constraint]:
         """What one object says about position or heading; about both, each reading once."""
         x, y, _ = m.place
         found: list[Constraint | None] = []
-        if m.range_m is not None and scope is not Scope.HEADING:
+        if m.range_m is not None and turn is not Scope.HEADING:
             if m.wall is None:
                 found.append(curves.range_circle(pose, x, y, m.range_m, m.range_sigma))
             else:
                 direction = m.wall.direction_rad
                 found.append(curves.wall_line(pose, x, y, direction, m.range_m, m.range_sigma))
-        if m.bearing is not None and scope is not Scope.POSITION:
+        if m.bearing is not None and turn is not Scope.POSITION:
             if m.wall is None:
                 found.append(curves.bearing_heading(pose, x, y, m.bearing, m.bearing_sigma))
             else:
                 direction = m.wall.direction_rad
                 found.append(curves.wall_heading(pose, x, y, direction, m.bearing, m.bearing_sigma))
-        if scope is Scope.POSITION and m.gives_point_bearing and self._rules.bearing_for_position:
+        if turn is Scope.POSITION and m.gives_point_bearing and self._rules.bearing_for_position:
             assert m.bearing is not None
             found.append(curves.bearing_ray(pose, x, y, m.bearing, m.bearing_sigma))
         plain = self._rules.paper_uncertainty or self._weighted
@@ -197,13 +198,15 @@ class Localizer:
         self, prior: Estimate, found: list[tuple[Measured, list[Constraint]]]
     ) -> tuple[list[tuple[Measured, list[Constraint]]], int]:
         """The objects whose innovation the prior's chi-square bound accepts; the others' number."""
-        accepted = []
-        for m, cs in found:
+        accepted, rejected = [], 0
+        for m, cs in sorted((f for f in found if f[1]), key=lambda f: f[0].source):
             seen = _observation(prior, m, cs, prior)
             surprise = seen.normalized_innovation_squared(prior.covariance)
             if surprise <= self._gates[len(cs) - 1]:
                 accepted.append((m, cs))
-        return accepted, len(found) - len(accepted)
+            else:
+                rejected += 1
+        return accepted, rejected
 
     def _weighed(self, prior: Estimate, accepted: list[Constraint]) -> Estimate:
         """Steps 4 and 5 without probabilities: inverse-distance weights among the readings."""
@@ -221,20 +224,26 @@ class Localizer:
         """The static weighted average of estimate and sensor, with a nominal covariance."""
         w, (x, y, h), c = self._rules.weights, prior.pose, prior.covariance
         if heading is not None:
-            variance = math.radians(w.nominal_heading_sigma_deg) ** 2
+            nominal = math.radians(w.nominal_heading_sigma_deg) ** 2
+            variance = max(nominal, (1.0 - w.heading) ** 2 * c.hh)
             pose = Pose2(x, y, wrap_angle(h + w.heading * heading))
             return Estimate(pose, Covariance3(c.xx, 0.0, c.yy, 0.0, 0.0, variance))
-        p = w.nominal_sigma_m**2
+        p = max(w.nominal_sigma_m**2, (1.0 - w.position) ** 2 * c.xx)
         pose = Pose2(x + w.position * offset[0], y + w.position * offset[1], h)
         return Estimate(pose, Covariance3(p, 0.0, p, 0.0, 0.0, c.hh))
 
     def _reduced(self, estimate: Estimate) -> Estimate:
         """The estimate in the form that the variant keeps."""
-        if self._rules.paper_uncertainty:
-            estimate = estimate._replace(covariance=estimate.covariance._replace(xh=0.0, yh=0.0))
         if self._rules.variant == "joint":
             return estimate
+        if self._rules.paper_uncertainty:
+            covariance = estimate.covariance._replace(xh=0.0, yh=0.0)
+            estimate = estimate._replace(covariance=covariance)
         return with_all_shared(estimate if self._rules.variant == "oval" else circular(estimate))
+
+    def _scope(self, turn: Scope) -> Scope:
+        """What an update may move: in `joint` the whole pose, whatever type it is of."""
+        return Scope.POSE if self._rules.variant == "joint" else turn
 
     # Teammates --------------------------------------------------------------------------------
 
@@ -271,7 +280,7 @@ class Localizer:
         seen = Observation(_AXES, offset, sensor, observer or Covariance2(0.0, 0.0, 0.0))
         if seen.normalized_innovation_squared(prior.covariance) > self._gates[1]:
             return self._judged(self._updated(state, None, [], 1))
-        scope = Scope.POSE if self._rules.variant == "joint" else Scope.POSITION
+        scope = self._scope(Scope.POSITION)
         if self._weighted:
             estimate = self._averaged(prior, offset, None)
         elif observer is None:
@@ -310,9 +319,9 @@ class Localizer:
         return State(stamp_ns, estimate, odometry_ns=stamp_ns, memory=memory)
 
     def _updated(
-        self, state: State, scope: Scope | None, sources: Iterable[str], rejected: int
+        self, state: State, turn: Scope | None, sources: Iterable[str], rejected: int
     ) -> State:
-        """Timers, windows and counts after an update of `scope` by these sources."""
+        """Timers, windows and counts after an update of a type by these sources."""
         memory, now = state.memory, state.stamp_ns
         used = dict.fromkeys(sources, now)
         window = memory.innovations + (True,) * len(used) + (False,) * rejected
@@ -321,10 +330,12 @@ class Localizer:
             objects_ns={**memory.objects_ns, **used},
             innovations=window[-self._rules.lost_window :],
         )
-        if used and scope in (Scope.POSITION, Scope.POSE):
-            memory = memory._replace(position_ns=now, heading_is_latest=False)
-        if used and scope in (Scope.HEADING, Scope.POSE):
-            memory = memory._replace(heading_ns=now, heading_is_latest=True)
+        if turn is not None:  # an attempt passes the turn on, an update starts the type's timer
+            memory = memory._replace(heading_is_latest=turn is Scope.HEADING)
+        if used and turn in (Scope.POSITION, Scope.POSE):
+            memory = memory._replace(position_ns=now)
+        if used and turn in (Scope.HEADING, Scope.POSE):
+            memory = memory._replace(heading_ns=now)
         return state._replace(memory=memory)
 
     def _judged(self, state: State) -> State:
@@ -334,13 +345,20 @@ class Localizer:
         if not reason:
             return state._replace(memory=memory._replace(lost="")) if memory.lost else state
         if not memory.lost:
-            memory = memory._replace(lost=reason, widened_ns=now).counted("lost")
-        found = recovery.relocalized(memory.evidence, state.odometry_from_robot, self.field)
+            memory = memory._replace(widened_ns=now).counted("lost")
+        memory = memory._replace(lost=reason)
+        refusing = memory.innovations[-1:] == (False,)
+        # What was seen before the refusals began may have been seen from elsewhere.
+        since_ns = max(memory.objects_ns.values(), default=0) if refusing else 0
+        evidence = tuple(e for e in memory.evidence if e.stamp_ns > since_ns)
+        found = None
+        if evidence and evidence[-1].stamp_ns > memory.sought_ns:
+            memory = memory._replace(sought_ns=evidence[-1].stamp_ns)
+            found = recovery.relocalized(evidence, state.odometry_from_robot, self.field)
         if found is not None:
             memory = memory._replace(lost="", innovations=()).counted("found_again")
             return state._replace(estimate=self._reduced(found), memory=memory)
         estimate = state.estimate
-        refusing = memory.innovations[-1:] == (False,)
         if refusing and now - memory.widened_ns >= recovery.WIDEN_NS:
             estimate = recovery.widened(estimate, self._rules)
             memory = memory._replace(widened_ns=now)
@@ -366,7 +384,7 @@ def _observation(prior: Estimate, m: Measured, cs: list[Constraint], now: Estima
     residuals = tuple(c.residual - c.row[0] * dx - c.row[1] * dy - c.row[2] * dh for c in cs)
     sensor = [c.sigma * c.sigma for c in cs]
     place = m.place.covariance
-    (ax, ay, _), (bx, by, _) = rows[0], rows[-1]
+    (ax, ay), (bx, by) = cs[0].place_row, cs[-1].place_row
     return Observation(
         rows,
         residuals,

@@ -50,7 +50,7 @@ def position_nees(samples: Samples) -> Floats | None:
         return None
     offset = samples.truth[:, :2] - samples.estimate[:, :2]
     dx, dy = offset[:, 0], offset[:, 1]
-    xx, xy, yy = (np.maximum(samples.covariance[:, i], -1.0) for i in range(3))
+    xx, xy, yy = samples.covariance[:, :3].T
     floor = 1e-12  # (1 um)^2: a noise-free run has no covariance to divide by
     det = np.maximum((xx + floor) * (yy + floor) - xy * xy, floor * floor)
     top = (yy + floor) * dx * dx - 2.0 * xy * dx * dy + (xx + floor) * dy * dy

@@ -19,6 +19,7 @@ WINDOW_NS = 20_000_000_000
 SPACING_NS = 500_000_000  # one piece of evidence an object and so long
 MOST_PIECES = 30
 DRIFT_SHARE = 0.1  # of the way: how far dead reckoning errs within the window
+MOST_STARTS = 16
 WIDEN_NS = 1_000_000_000
 _OPEN = Covariance3(1e6, 0.0, 1e6, 0.0, 0.0, 1e3)
 _ENOUGH_POSITION_SIGMA_M = 0.7
@@ -79,10 +80,13 @@ def relocalized(
     Needs one residual more than unknowns, a fit that the chi-square bound accepts, and no second
     pose that fits nearly as well.
     """
+    if len({(e.x, e.y) for e in evidence}) < 2:
+        return None
     pieces = [_Carried(e, odometry_from_robot) for e in evidence]
     if sum(p.residual_count for p in pieces) < 4:
         return None
-    fits = [_refined(start, pieces) for start in _starts(pieces, field)]
+    starts = sorted(_starts(pieces, field), key=lambda start: _cost(start, pieces))
+    fits = [_refined(start, pieces) for start in starts[:MOST_STARTS]]
     found = sorted((f for f in fits if f is not None), key=lambda f: f[0])
     if not found:
         return None
@@ -146,6 +150,10 @@ class _Carried:
                 yield (x, y, a + x * hx + y * hy), c.residual, c.sigma**2 + spread**2
 
 
+def _cost(pose: Pose2, pieces: list[_Carried]) -> float:
+    return sum(e * e / v for piece in pieces for _, e, v in piece.rows(pose))
+
+
 def _starts(pieces: list[_Carried], field: Field) -> Iterator[Pose2]:
     aligned = _aligned(pieces)
     if aligned is not None:
@@ -197,7 +205,7 @@ def _refined(start: Pose2, pieces: list[_Carried]) -> tuple[float, Estimate, int
             change = math.hypot(estimate.pose.x - before.x, estimate.pose.y - before.y)
             if change < 1e-4 and abs(estimate.pose.heading - before.heading) < 1e-4:
                 break
-        costs = [sum(e * e / v for _, e, v in piece.rows(estimate.pose)) for piece in used]
+        costs = [_cost(estimate.pose, [piece]) for piece in used]
         freedom = sum(p.residual_count for p in used) - 3
         worst = max(range(len(used)), key=costs.__getitem__)
         if costs[worst] < 14.0 or len(used) - 1 < max(2, 0.75 * len(pieces)):

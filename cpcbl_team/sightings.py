@@ -27,6 +27,10 @@ class Measured(NamedTuple):
     bearing_sigma: float
 
     @property
+    def usable(self) -> bool:
+        return self.range_m is not None or self.bearing is not None
+
+    @property
     def gives_point_bearing(self) -> bool:
         return self.bearing is not None and self.wall is None
 

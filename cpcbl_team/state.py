@@ -39,6 +39,7 @@ class Memory(NamedTuple):
     evidence: tuple[Evidence, ...] = ()
     lost: str = ""  # the reason, empty when the robot knows where it is
     widened_ns: int = 0
+    sought_ns: int = -1  # the newest evidence with which it sought itself in vain
     counts: Mapping[str, int] = _NONE
 
     def counted(self, *reasons: str) -> "Memory":

@@ -1,0 +1,161 @@
+"""Whether the claimed uncertainty is the true one, where the noise is exactly the modelled one.
+
+2-D: a Mahalanobis distance of at most 3 is due for 98.9 % of the samples (resolution h), and a mean
+normalized error squared (NEES) of 2. Samples of one run depend on each other, so twenty runs leave
+the mean uncertain by about 0.15.
+"""
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from core_helpers import (
+    CORNERS,
+    LOOP_START,
+    PROBABILISTIC,
+    SECOND,
+    Matrix,
+    covariance2,
+    frame,
+    localizer,
+    loop,
+    matrix3,
+    point_sighting,
+    sensor_noise,
+)
+
+from cpcbl_team.config import (
+    CollaborationSettings,
+    Field,
+    Fusion,
+    OdometrySettings,
+    SensorSettings,
+    Start,
+    Variant,
+)
+from cpcbl_team.estimate import Covariance3
+from cpcbl_team.geometry import Pose2, step, wrap_angle
+from cpcbl_team.inputs import Fix, Odometry, Sightings
+from cpcbl_team.localizer import Localizer
+from cpcbl_team.metrics import Samples, Score, score
+from cpcbl_team.motion import motion_noise
+
+ODOMETRY = OdometrySettings()
+START = Start(x_m=LOOP_START.x, y_m=LOOP_START.y, sigma_m=0.05, heading_sigma_deg=3.0)
+PIECE_NS = SECOND // 10
+
+Perceive = Callable[[np.random.Generator], Callable[[Pose2, int], Sightings | Fix]]
+
+
+def displaced(pose: Pose2, covariance: Covariance3, rng: np.random.Generator) -> Pose2:
+    """The pose with an error drawn from this covariance (of any rank)."""
+    values, vectors = np.linalg.eigh(matrix3(covariance))
+    x, y, h = vectors @ (np.sqrt(np.maximum(values, 0.0)) * rng.normal(size=3))
+    return Pose2(pose.x + x, pose.y + y, wrap_angle(pose.heading + h))
+
+
+def steered(truth: Pose2, planned: Pose2) -> float:
+    """The turn that keeps the robot on its path, whatever its estimate."""
+    ahead = truth.inverse() @ planned
+    return max(-0.3, min(0.3, math.atan2(ahead.y, max(ahead.x, 0.0) + 0.5)))
+
+
+def samples(robot: Localizer, perceive: Perceive, seed: int) -> tuple[Matrix, Matrix, Matrix]:
+    """Two rounds: estimates, truths and covariances after each frame or fix."""
+    rng = np.random.default_rng(seed)
+    look = perceive(rng)
+    state, planned, now = robot.start(0), LOOP_START, 0
+    truth = displaced(state.estimate.pose, state.estimate.covariance, rng)
+    rows: list[tuple[Pose2, Pose2, Covariance3]] = []
+    for distance, turn in loop() * 2:
+        planned = step(planned, distance, turn)
+        turn = steered(truth, planned)
+        noise = motion_noise(truth.heading, distance, turn, ODOMETRY)
+        truth = displaced(step(truth, distance, turn), noise, rng)
+        state = robot.drive(state, Odometry(now, now + PIECE_NS, distance, turn))
+        now += PIECE_NS
+        seen = look(truth, now)
+        state = robot.fix(state, seen) if isinstance(seen, Fix) else robot.cycle(state, seen)
+        rows.append((state.estimate.pose, truth, state.estimate.covariance))
+    estimates, truths, covariances = zip(*rows, strict=True)
+    return np.array(estimates), np.array(truths), np.array(covariances)
+
+
+def scored(robot: Localizer, perceive: Perceive, seeds: int = 20) -> Score:
+    runs = [samples(robot, perceive, seed) for seed in range(seeds)]
+    estimate, truth, covariance = (np.concatenate(parts) for parts in zip(*runs, strict=True))
+    return score(Samples(estimate, truth, covariance))
+
+
+def landmarks(sensor: SensorSettings) -> Perceive:
+    """The corners within the field of view, with the sensor's noise."""
+
+    def perceive(rng: np.random.Generator) -> Callable[[Pose2, int], Sightings]:
+        noise, half = sensor_noise(rng, sensor), math.radians(0.5 * sensor.field_of_view_deg)
+
+        def look(truth: Pose2, now: int) -> Sightings:
+            visible = [
+                name
+                for name, p in CORNERS.landmarks.items()
+                if abs(point_sighting(truth, name, p.x_m, p.y_m).bearing_rad or 0.0) <= half
+            ]
+            return frame(truth, now, names=visible, noise=noise)
+
+        return look
+
+    return perceive
+
+
+def an_observer(sensor_m: float, observer_m: float) -> Perceive:
+    """A teammate whose own pose is off by one sigma, the same way in all fixes of a run."""
+    own, its = sensor_m**2 * np.eye(2), observer_m**2 * np.eye(2)
+
+    def perceive(rng: np.random.Generator) -> Callable[[Pose2, int], Fix]:
+        direction = rng.uniform(-math.pi, math.pi)
+        off = observer_m * np.array([math.cos(direction), math.sin(direction)])
+
+        def look(truth: Pose2, now: int) -> Fix:
+            x, y = off + sensor_m * rng.normal(size=2) + (truth.x, truth.y)
+            return Fix("me", "mate", now, x, y, covariance2(own), covariance2(its), 3.0)
+
+        return look
+
+    return perceive
+
+
+@pytest.mark.parametrize(
+    "sensor",
+    [
+        SensorSettings(range_share=0.05, bearing_sigma_deg=5.0),
+        SensorSettings(range_share=0.03, bearing_sigma_deg=2.0),
+    ],
+    ids=["5 % and 5 deg", "3 % and 2 deg"],
+)
+@pytest.mark.parametrize("variant", PROBABILISTIC)
+def test_landmarks_give_the_error_that_is_claimed(variant: Variant, sensor: SensorSettings) -> None:
+    robot = localizer(variant, start=START, sensor=sensor, odometry=ODOMETRY)
+    found = scored(robot, landmarks(sensor))
+    assert found.inside_3_sigma is not None
+    assert found.nees is not None
+    assert found.inside_3_sigma >= 0.98
+    low, high = (1.7, 2.3) if variant == "joint" else (1.6, 2.6)
+    assert low <= found.nees <= high
+
+
+@pytest.mark.parametrize(("fusion", "honest"), [("split-ci", True), ("naive", False)])
+@pytest.mark.parametrize("variant", PROBABILISTIC)
+def test_an_observer_that_is_off_is_not_believed_more_for_repeating_itself(
+    variant: Variant, fusion: Fusion, honest: bool
+) -> None:
+    """Resolution c; only fixes, no landmarks."""
+    robot = localizer(
+        variant,
+        Field(),
+        start=START,
+        odometry=ODOMETRY,
+        collaboration=CollaborationSettings(fusion=fusion),
+    )
+    found = scored(robot, an_observer(sensor_m=0.05, observer_m=0.1), seeds=10)
+    assert found.inside_3_sigma is not None
+    assert (found.inside_3_sigma >= 0.98) is honest

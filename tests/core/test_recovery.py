@@ -1,0 +1,383 @@
+import math
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+import pytest
+from core_helpers import (
+    CORNERS,
+    LOOP_START,
+    SECOND,
+    VARIANTS,
+    diagonal,
+    driven,
+    fix,
+    followed,
+    frame,
+    heading_error,
+    localizer,
+    loop,
+    placed_at,
+    point_sighting,
+    position_error,
+    sensor_noise,
+    state_at,
+)
+
+from cpcbl_team.config import (
+    Field,
+    Gives,
+    Landmark,
+    LocalizerSettings,
+    OdometrySettings,
+    SensorSettings,
+    Start,
+    Variant,
+)
+from cpcbl_team.estimate import Estimate
+from cpcbl_team.geometry import Pose2, wrap_angle
+from cpcbl_team.inputs import Sighting, Sightings
+from cpcbl_team.recovery import (
+    MOST_PIECES,
+    SPACING_NS,
+    WINDOW_NS,
+    lost_reason,
+    relocalized,
+    remembered,
+    widened,
+)
+from cpcbl_team.state import Evidence, Memory, State
+
+ORIGIN = Pose2(0.0, 0.0, 0.0)
+RULES = LocalizerSettings()
+SENSOR = SensorSettings()
+UNKNOWN = Start(known=False, x_m=0.0, y_m=0.0)
+
+variants = pytest.mark.parametrize("variant", VARIANTS)
+
+
+def giving(gives: Gives, *names: str) -> Field:
+    """The corners (or those that are named), of this kind."""
+    chosen = names or tuple(CORNERS.landmarks)
+    places = {name: CORNERS.landmarks[name] for name in chosen}
+    return Field(
+        landmarks={n: Landmark(x_m=p.x_m, y_m=p.y_m, gives=gives) for n, p in places.items()}
+    )
+
+
+# Being lost ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("sigma_m", "sigma_rad", "reason"),
+    [
+        (0.1, 0.1, ""),
+        (2.1, 0.1, "position sigma 2.10 m"),
+        (0.1, math.radians(61.0), "heading sigma 61 deg"),
+    ],
+)
+def test_a_robot_is_lost_by_its_own_uncertainty(
+    sigma_m: float, sigma_rad: float, reason: str
+) -> None:
+    estimate = Estimate(ORIGIN, diagonal(sigma_m, sigma_rad))  # row 20, resolution f
+    assert lost_reason(estimate, Memory(), RULES) == reason
+
+
+@pytest.mark.parametrize(
+    ("rejected", "accepted", "reason"),
+    [
+        (12, 8, ""),
+        (13, 7, "13 of the last 20 innovations rejected"),
+        (13, 0, "13 of the last 13 innovations rejected"),
+        (9, 0, ""),
+    ],
+)
+def test_a_robot_is_lost_when_most_of_what_it_sees_is_rejected(
+    rejected: int, accepted: int, reason: str
+) -> None:
+    memory = Memory(innovations=(False,) * rejected + (True,) * accepted)
+    assert lost_reason(Estimate(ORIGIN, diagonal(0.1, 0.1)), memory, RULES) == reason
+
+
+@pytest.mark.parametrize(("sigma_m", "still"), [(1.1, True), (0.9, False)])
+def test_being_lost_ends_at_half_the_limit(sigma_m: float, still: bool) -> None:
+    estimate = Estimate(ORIGIN, diagonal(sigma_m, 0.1))
+    assert (lost_reason(estimate, Memory(lost="before"), RULES) != "") is still
+    assert lost_reason(estimate, Memory(), RULES) == ""
+
+
+def test_doubt_doubles_sigma_up_to_the_limits_of_being_lost() -> None:
+    estimate = Estimate(ORIGIN, diagonal(0.02, 0.01))
+    sigmas = []
+    for _ in range(8):
+        estimate = widened(estimate, RULES)
+        sigmas.append(estimate.position_sigma_m)
+    assert sigmas[:4] == pytest.approx([0.1, 0.2, 0.4, 0.8])
+    assert sigmas[-1] == pytest.approx(RULES.lost_position_sigma_m)
+    assert math.degrees(estimate.heading_sigma_rad) < RULES.lost_heading_sigma_deg
+    assert widened(estimate, RULES).covariance == pytest.approx(estimate.covariance)
+
+
+# Evidence -----------------------------------------------------------------------------------------
+
+
+def piece(
+    stamp_ns: int,
+    robot: Pose2,
+    name: str,
+    x: float,
+    y: float,
+    *,
+    gives: Gives = "both",
+) -> Evidence:
+    """An exact sighting; dead reckoning has its origin at the field's."""
+    seen = point_sighting(robot, name, x, y)
+    return Evidence(
+        stamp_ns,
+        robot,
+        name,
+        x,
+        y,
+        seen.range_m if gives in ("both", "range") else None,
+        seen.bearing_rad if gives in ("both", "bearing") else None,
+        0.1,
+        0.03,
+        0.0,
+        False,
+    )
+
+
+def fix_piece(stamp_ns: int, robot: Pose2) -> Evidence:
+    return Evidence(stamp_ns, robot, "fix:mate", robot.x, robot.y, None, None, 0.0, 0.0, 0.1, True)
+
+
+def seen_along(
+    path: Iterable[Pose2], names: Sequence[str], gives: Gives = "both"
+) -> tuple[Evidence, ...]:
+    """What of these corners is known, from each place of a path."""
+    corners = CORNERS.landmarks
+    return tuple(
+        piece(i * SPACING_NS, robot, n, corners[n].x_m, corners[n].y_m, gives=gives)
+        for i, robot in enumerate(path)
+        for n in names
+    )
+
+
+def dead_reckoned(evidence: Iterable[Evidence], field_from_odometry: Pose2) -> tuple[Evidence, ...]:
+    """The same, by a dead reckoning that began elsewhere."""
+    odometry_from_field = field_from_odometry.inverse()
+    return tuple(
+        e._replace(odometry_from_robot=odometry_from_field @ e.odometry_from_robot)
+        for e in evidence
+    )
+
+
+PATH = [Pose2(-1.0, 0.4, 0.3), Pose2(-0.5, 0.6, 0.5), Pose2(0.0, 1.0, 0.9)]
+BEGUN = Pose2(2.0, -3.0, 1.1)
+
+
+def found_at(evidence: Iterable[Evidence], truth: Pose2) -> Estimate | None:
+    found = relocalized(dead_reckoned(evidence, BEGUN), BEGUN.inverse() @ truth, CORNERS)
+    if found is not None:
+        assert position_error(found, truth) < 1e-3
+        assert heading_error(found, truth) < 1e-3
+    return found
+
+
+@pytest.mark.parametrize(
+    "evidence",
+    [
+        pytest.param(seen_along(PATH[-1:], ["ne", "sw"]), id="two ranges and bearings at once"),
+        pytest.param(
+            seen_along(PATH[:1], ["ne"]) + seen_along(PATH[1:2], ["nw"]),
+            id="two ranges and bearings on the way",
+        ),
+        pytest.param(seen_along(PATH, ["ne", "nw", "se"], "bearing"), id="three bearings"),
+        pytest.param(seen_along(PATH, ["ne", "nw", "se"], "range"), id="three ranges on a bend"),
+        pytest.param(
+            tuple(fix_piece(i * SPACING_NS, pose) for i, pose in enumerate(PATH)),
+            id="fixes along the way",
+        ),
+        pytest.param(
+            (fix_piece(0, PATH[0]), *seen_along(PATH[1:], ["ne"])), id="a fix and a landmark"
+        ),
+    ],
+)
+def test_a_robot_is_found_by_triangulation(evidence: tuple[Evidence, ...]) -> None:
+    assert found_at(evidence, PATH[-1]) is not None
+
+
+STRAIGHT = [Pose2(0.1 * i, 0.0, 0.0) for i in range(4)]
+# Two posts on the line that the robot drives along: left of it is as good as right.
+ON_THE_LINE = tuple(
+    piece(i * SPACING_NS, robot, name, x, 0.5, gives="range")
+    for i, robot in enumerate(Pose2(0.4 * i, -0.5, 0.0) for i in range(4))
+    for name, x in (("a", -3.0), ("b", 3.0))
+)
+
+
+@pytest.mark.parametrize(
+    "evidence",
+    [
+        pytest.param((), id="nothing"),
+        pytest.param(seen_along(PATH[-1:], ["ne"]), id="one landmark"),
+        pytest.param(seen_along(PATH, ["ne"]), id="one landmark along the way"),
+        pytest.param(seen_along(PATH[-1:] * 3, ["ne", "nw"], "range"), id="two ranges"),
+        pytest.param(ON_THE_LINE, id="two ranges, the same on either side"),
+        pytest.param(seen_along(STRAIGHT[-1:] * 3, ["ne", "nw"], "bearing"), id="two bearings"),
+        pytest.param(
+            tuple(fix_piece(i * SPACING_NS, PATH[0]) for i in range(4)), id="fixes at one place"
+        ),
+    ],
+)
+def test_what_is_ambiguous_finds_nobody(evidence: tuple[Evidence, ...]) -> None:
+    truth = evidence[-1].odometry_from_robot if evidence else PATH[-1]
+    assert found_at(evidence, truth) is None
+
+
+def test_a_few_wrong_pieces_are_left_out() -> None:
+    evidence = seen_along(PATH, ["ne", "nw", "se"])
+    wrong = evidence[4]._replace(bearing_rad=2.0, range_m=0.5)
+    assert found_at((*evidence[:4], wrong, *evidence[5:]), PATH[-1]) is not None
+
+
+def test_evidence_that_contradicts_itself_finds_nobody() -> None:
+    evidence = seen_along(PATH[-1:], ["ne", "nw"])
+    wrong = [e._replace(range_m=1.0, bearing_rad=0.1 * i) for i, e in enumerate(evidence)]
+    assert relocalized(tuple(wrong), PATH[-1], CORNERS) is None
+
+
+def test_what_a_teammate_told_is_shared_when_one_is_found_by_it() -> None:
+    told = relocalized(tuple(fix_piece(i, pose) for i, pose in enumerate(PATH)), PATH[-1], CORNERS)
+    seen = relocalized(seen_along(PATH, ["ne", "nw"]), PATH[-1], CORNERS)
+    assert told is not None
+    assert seen is not None
+    assert told.shared == told.covariance
+    assert set(seen.shared) == {0.0}
+
+
+def test_memory_keeps_little_of_each_object_and_nothing_old() -> None:
+    memory = Memory()
+    for i in range(200):
+        now = i * SPACING_NS // 5
+        memory = remembered(memory, [piece(now, ORIGIN, n, 1.0, 2.0) for n in ("a", "b")])
+    stamps = [e.stamp_ns for e in memory.evidence if e.source == "a"]
+    assert np.diff(stamps).min() >= SPACING_NS
+    assert len(memory.evidence) <= MOST_PIECES
+    later = stamps[-1] + WINDOW_NS + 1
+    memory = remembered(memory, [piece(later, ORIGIN, "c", 1.0, 2.0)])
+    assert [e.source for e in memory.evidence] == ["c"]
+
+
+@pytest.mark.parametrize("gives", ["none", "bearing"])
+def test_a_reading_that_may_not_be_used_is_no_evidence(gives: Gives) -> None:
+    """It must not be taken for a fix, which has neither range nor bearing."""
+    robot = localizer(field=giving(gives, "ne"))
+    seen = point_sighting(ORIGIN, "ne", 4.5, 2.5)
+    ranged = Sightings(1, (Sighting("ne", seen.range_m),))
+    state = robot.cycle(state_at(ORIGIN, diagonal(0.1, 0.1)), ranged)
+    assert all((e.range_m, e.bearing_rad) != (None, None) for e in state.memory.evidence)
+
+
+# The whole way back -------------------------------------------------------------------------------
+
+
+def test_a_robot_with_an_unknown_start_finds_itself() -> None:
+    robot = localizer(start=UNKNOWN)
+    state = robot.start(0)
+    state = robot.cycle(state, frame(PATH[0], SECOND // 10, names=["ne", "se"]))
+    assert state.memory.lost == ""
+    assert state.memory.counts["found_again"] == 1
+    assert position_error(state.estimate, PATH[0]) < 1e-3
+
+
+def kidnapped(variant: Variant, names: Sequence[str], before_s: float) -> tuple[State, Pose2]:
+    """Carried off 3 m and turned after so long; then 3 s of frames at 10 Hz."""
+    robot, noise = localizer(variant), sensor_noise(np.random.default_rng(7), SENSOR)
+    begin, way = state_at(LOOP_START, diagonal(0.05, 0.05)), loop()[: int(before_s * 10)]
+    before = followed(robot, begin, LOOP_START, way, names=lambda _: names, noise=noise)
+    state, truth = [(begin, LOOP_START), *before][-1]
+    assert not state.memory.counts.get("lost")
+    away = math.copysign(3.0, -truth.x)
+    elsewhere = Pose2(truth.x + away, truth.y, wrap_angle(truth.heading + 1.2))
+    on = [(0.03, 0.02)] * 30
+    *_, end = followed(robot, state, elsewhere, on, names=lambda _: names, noise=noise)
+    return end
+
+
+@pytest.mark.parametrize("before_s", [0.0, 8.0], ids=["at the start", "on the way"])
+@pytest.mark.parametrize("names", [("ne", "nw", "se"), ("ne", "nw", "se", "sw")], ids=["3", "4"])
+@variants
+def test_a_kidnapped_robot_is_back_within_three_seconds(
+    variant: Variant, names: Sequence[str], before_s: float
+) -> None:
+    state, truth = kidnapped(variant, names, before_s)
+    assert state.memory.counts["lost"] >= 1
+    assert state.memory.lost == ""
+    assert position_error(state.estimate, truth) < 0.5
+    assert heading_error(state.estimate, truth) < 0.3
+
+
+@variants
+def test_a_kidnapped_robot_is_not_found_where_it_no_longer_is(variant: Variant) -> None:
+    """Being found at the old place makes it confident, and heard, while it is wrong."""
+    state, _ = kidnapped(variant, tuple(CORNERS.landmarks), 8.0)
+    assert state.memory.counts["found_again"] == 1
+
+
+@variants
+def test_an_overconfident_robot_that_sees_one_landmark_at_a_time_gets_right(
+    variant: Variant,
+) -> None:
+    """In turn for 2 s each: one landmark alone does not say where the robot is."""
+    robot, noise = localizer(variant), sensor_noise(np.random.default_rng(3), SENSOR)
+    wrong, names = state_at(Pose2(0.5, 1.0, -1.0), diagonal(0.02, 0.02)), sorted(CORNERS.landmarks)
+    *_, (state, truth) = followed(
+        robot,
+        wrong,
+        LOOP_START,
+        loop()[:120],
+        names=lambda piece: [names[piece // 20 % 4]],
+        noise=noise,
+    )
+    assert state.memory.lost == ""
+    assert position_error(state.estimate, truth) < 0.5
+    assert heading_error(state.estimate, truth) < 0.3
+
+
+@variants
+def test_an_overconfident_robot_with_one_landmark_does_not_reject_it_for_ever(
+    variant: Variant,
+) -> None:
+    """Within 15 s; where it is on the circle about the landmark cannot be known."""
+    robot = localizer(variant, odometry=OdometrySettings(moves=False))
+    state = state_at(Pose2(0.5, 1.0, -1.0), diagonal(0.02, 0.02))
+    for i in range(1, 46):
+        state = robot.cycle(state, frame(LOOP_START, i * SECOND // 3, names=["ne"]))
+    assert state.memory.innovations[-20:].count(True) >= 10
+
+
+@pytest.mark.parametrize("own", [False, True], ids=["a teammate's fixes", "its own sensor"])
+@variants
+def test_a_lost_robot_is_found_by_its_places_along_the_way(variant: Variant, own: bool) -> None:
+    robot = localizer(variant, Field(), start=UNKNOWN)
+    state, truth = robot.start(0), LOOP_START
+    for odometry, truth in driven(LOOP_START, loop()[:60]):
+        now = odometry.stamp_ns
+        state = robot.drive(state, odometry)
+        if own:
+            state = robot.position(state, placed_at(truth.x, truth.y, now))
+        else:
+            state = robot.fix(state, fix(truth.x, truth.y, now))
+    assert state.memory.lost == ""
+    assert "lost" not in state.memory.counts  # not again
+    assert position_error(state.estimate, truth) < 0.1
+    assert heading_error(state.estimate, truth) < 0.2
+
+
+def test_a_robot_says_why_it_is_lost_now() -> None:
+    """Not why it was at first: the rejections are over, its heading is still unknown."""
+    robot = localizer(rules=LocalizerSettings(variant="joint"))
+    memory = Memory(innovations=(True,) * 20, lost="13 of the last 20 innovations rejected")
+    state = state_at(ORIGIN, diagonal(0.1, 1.0))._replace(memory=memory)
+    state = robot.cycle(state, Sightings(1, ()))
+    assert state.memory.lost == "heading sigma 57 deg"

@@ -1,0 +1,245 @@
+from collections.abc import Iterable
+from random import Random
+
+import numpy as np
+import pytest
+from core_helpers import (
+    LOOP_START,
+    MIXED,
+    SECOND,
+    VARIANTS,
+    belief,
+    diagonal,
+    driven,
+    fix,
+    frame,
+    localizer,
+    loop,
+    placed_at,
+    point_sighting,
+    sensor_noise,
+    state_at,
+)
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from cpcbl_team.config import SensorSettings, Variant
+from cpcbl_team.inputs import Belief, Fix, Input, Odometry, Position, Sightings, Told
+from cpcbl_team.localizer import Localizer
+from cpcbl_team.state import State
+from cpcbl_team.timeline import HORIZON_NS, Timeline
+
+MS = SECOND // 1000
+START = state_at(LOOP_START, diagonal(0.05, 0.05))
+
+variants = pytest.mark.parametrize("variant", VARIANTS)
+
+
+def history(seconds: float, seed: int = 1) -> list[Input]:
+    """Wheels at 20 Hz, frames at 10 Hz within their pieces, a teammate that helps, in order."""
+    rng = np.random.default_rng(seed)
+    noise = sensor_noise(rng, SensorSettings())
+    inputs: list[Input] = []
+    for i, (odometry, truth) in enumerate(driven(LOOP_START, loop(20)[: int(seconds * 20)], 20)):
+        inputs.append(odometry)
+        inside = odometry.from_ns + int(rng.integers(50 * MS))
+        if i % 2 == 0:
+            mate = noise(point_sighting(truth, "mate", 1.0, 0.0))
+            seen = frame(truth, inside, MIXED, noise=noise).sightings
+            inputs.append(Sightings(inside, (*seen, mate)))
+        if i % 3 == 0:
+            x, y = (truth.x, truth.y) + 0.05 * rng.normal(size=2)
+            inputs += [placed_at(x, y, inside, 0.1), fix(x, y, inside)]
+        if i % 4 == 0:
+            inputs.append(belief(1.0, 0.0, odometry.from_ns))
+        if i % 5 == 0:
+            inputs.append(Told(inside))
+    return sorted(inputs, key=time_of)
+
+
+def time_of(item: Input) -> int:
+    return item.from_ns if isinstance(item, Odometry) else item.stamp_ns
+
+
+def by_hand(robot: Localizer, inputs: Iterable[Input]) -> State:
+    """The state after inputs that are in order, without a timeline."""
+    state = START
+    for item in inputs:
+        match item:
+            case Odometry():
+                state = robot.drive(state, item)
+            case Sightings():
+                state = robot.cycle(state, item)
+            case Position():
+                state = robot.position(state, item)
+            case Fix():
+                state = robot.fix(state, item)
+            case Belief():
+                state = robot.hear(state, item)
+            case Told():
+                state = robot.tell(state, item)
+    return state
+
+
+def after(robot: Localizer, inputs: Iterable[Input]) -> Timeline:
+    """The timeline that took them all."""
+    timeline = Timeline(robot, START)
+    refused = [timeline.add(item) for item in inputs]
+    assert not any(refused)
+    return timeline
+
+
+def same(a: State, b: State) -> bool:
+    """To the last bit."""
+    return a == b and repr(a.estimate) == repr(b.estimate)
+
+
+# Order --------------------------------------------------------------------------------------------
+
+
+@variants
+def test_in_order_a_timeline_does_what_the_localizer_does(variant: Variant) -> None:
+    robot, inputs = localizer(variant, MIXED), history(5.0)
+    assert same(after(robot, inputs).state, by_hand(robot, inputs))
+
+
+@variants
+@settings(max_examples=8, deadline=None)
+@given(shuffler=st.randoms(use_true_random=False))
+def test_any_order_within_the_horizon_gives_the_same_bits(
+    variant: Variant, shuffler: Random
+) -> None:
+    robot, inputs = localizer(variant, MIXED), history(1.5)
+    shuffled = list(inputs)
+    shuffler.shuffle(shuffled)
+    late, in_order = after(robot, shuffled), after(robot, inputs)
+    assert same(late.state, in_order.state)
+    for now in (1200 * MS, 1480 * MS, 1500 * MS):
+        assert same(late.latest(now), in_order.latest(now))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_long_run_with_delays_gives_the_same_bits(seed: int) -> None:
+    """Long enough for the timeline to forget; each kind of input has its own delay."""
+    rng, robot, inputs = np.random.default_rng(seed), localizer("joint", MIXED), history(8.0)
+    delay = {Odometry: 20, Sightings: 300, Position: 50, Fix: 900, Belief: 500, Told: 100}
+    arrivals = [time_of(i) + rng.uniform(0.0, delay[type(i)]) * MS for i in inputs]
+    late = after(robot, [inputs[i] for i in np.argsort(arrivals)])
+    assert same(late.state, by_hand(robot, inputs))
+
+
+@pytest.mark.parametrize("late_by_ms", [1, 300, 1000])
+def test_a_fix_that_comes_late_counts_from_when_it_was_measured(late_by_ms: int) -> None:
+    robot, inputs = localizer("joint", MIXED), history(2.0)
+    late_fix = fix(-1.7, -1.0, 500 * MS)
+    timeline = after(robot, [i for i in inputs if time_of(i) <= (500 + late_by_ms) * MS])
+    before = timeline.state
+    assert timeline.add(late_fix) == ""
+    assert timeline.state.estimate != before.estimate
+    for item in inputs:
+        if time_of(item) > (500 + late_by_ms) * MS:
+            timeline.add(item)
+    expected = by_hand(robot, sorted([*inputs, late_fix], key=time_of))
+    assert same(timeline.state, expected)
+
+
+def test_a_frame_inside_an_older_piece_of_odometry_is_seen_from_there() -> None:
+    """Straight on at 1 m/s: 50 ms into the second piece the robot has come 0.15 m."""
+    robot = localizer("joint", MIXED)
+    wheels = [Odometry(i * 100 * MS, (i + 1) * 100 * MS, 0.1, 0.0) for i in range(4)]
+    timeline = after(robot, wheels)
+    there = LOOP_START._replace(x=LOOP_START.x + 0.15)
+    assert timeline.add(frame(there, 150 * MS, MIXED)) == ""
+    state = timeline.latest(400 * MS)
+    assert state.estimate.pose == pytest.approx((LOOP_START.x + 0.4, LOOP_START.y, 0.0))
+    assert state.estimate.position_sigma_m < 0.05
+    assert state.memory.counts == {"accepted": 6}
+
+
+def test_odometry_that_comes_after_its_frame_still_carries_it() -> None:
+    robot = localizer("joint", MIXED)
+    wheels = [Odometry(i * 100 * MS, (i + 1) * 100 * MS, 0.1, 0.0) for i in range(3)]
+    seen = frame(LOOP_START._replace(x=LOOP_START.x + 0.25), 250 * MS, MIXED)
+    early = after(robot, [wheels[0], seen, wheels[2], wheels[1]])
+    assert same(early.latest(300 * MS), after(robot, [*wheels, seen]).latest(300 * MS))
+
+
+# What is refused ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", [Odometry, Sightings, Position, Fix, Belief, Told])
+def test_what_came_already_is_refused(kind: type[Input]) -> None:
+    inputs = history(1.0)
+    timeline = after(localizer("joint", MIXED), inputs)
+    before = timeline.state
+    for item in (i for i in inputs if isinstance(i, kind)):
+        assert timeline.add(item) == "duplicate"
+    assert timeline.state is before
+
+
+def test_two_different_frames_of_one_time_are_both_used() -> None:
+    timeline = Timeline(localizer("joint", MIXED), START)
+    assert timeline.add(frame(LOOP_START, 7, MIXED, ["both"])) == ""
+    assert timeline.add(frame(LOOP_START, 7, MIXED, ["ranged"])) == ""
+    assert timeline.state.memory.counts == {"accepted": 2}
+
+
+def test_what_is_older_than_the_horizon_is_refused() -> None:
+    timeline = after(localizer("joint", MIXED), history(5.0))
+    newest = time_of(history(5.0)[-1])
+    before = timeline.state
+    assert timeline.add(fix(0.0, 0.0, newest - HORIZON_NS - 1)) == "too_late"
+    assert timeline.state is before
+    assert timeline.add(fix(0.0, 0.0, newest - HORIZON_NS + 200 * MS)) == ""
+
+
+def test_what_is_older_than_the_start_is_refused() -> None:
+    robot = localizer("joint", MIXED)
+    timeline = Timeline(robot, state_at(LOOP_START, diagonal(0.1, 0.1), SECOND))
+    assert timeline.add(frame(LOOP_START, SECOND - 1, MIXED)) == "too_late"
+    assert timeline.add(frame(LOOP_START, SECOND, MIXED)) == ""
+
+
+def test_a_timeline_forgets_what_is_older_than_its_horizon() -> None:
+    timeline = after(localizer("joint", MIXED), history(12.0))
+    assert timeline.at(2 * SECOND) is None
+    assert timeline.at(11 * SECOND) is not None
+
+
+# Looking ------------------------------------------------------------------------------------------
+
+
+def test_the_state_at_a_time_knows_nothing_later() -> None:
+    robot, inputs = localizer("joint", MIXED), history(1.8)
+    timeline = after(robot, inputs)
+    for now in (0, 400 * MS, 975 * MS, 1799 * MS):
+        known = robot.moved(by_hand(robot, [i for i in inputs if time_of(i) <= now]), now)
+        found = timeline.at(now)
+        assert found is not None
+        assert same(found, known)
+
+
+def test_looking_changes_nothing() -> None:
+    robot, inputs = localizer("joint", MIXED), history(1.8)
+    looked = Timeline(robot, START)
+    for item in inputs:
+        looked.add(item)
+        looked.latest(time_of(item) + 30 * MS)
+        looked.at(time_of(item) - 30 * MS)
+    assert same(looked.state, after(robot, inputs).state)
+
+
+def test_the_latest_state_does_not_run_ahead_of_odometry() -> None:
+    robot = localizer("joint", MIXED)
+    timeline = after(robot, [Odometry(0, 100 * MS, 0.1, 0.0)])
+    assert timeline.latest(50 * MS).estimate.pose.x == pytest.approx(LOOP_START.x + 0.05)
+    ahead = timeline.latest(300 * MS)
+    assert ahead.stamp_ns == 100 * MS
+    assert ahead.estimate.pose.x == pytest.approx(LOOP_START.x + 0.1)
+
+
+def test_where_odometry_is_silent_the_latest_state_is_in_doubt() -> None:
+    timeline = after(localizer("joint", MIXED), [Odometry(0, 100 * MS, 0.1, 0.0)])
+    silent = timeline.latest(3 * SECOND)
+    assert silent.stamp_ns == 3 * SECOND
+    assert silent.estimate.position_sigma_m > timeline.latest(SECOND // 2).estimate.position_sigma_m
