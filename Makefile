@@ -29,7 +29,7 @@ unit: setup
 
 # Minutes long; with CPCBL_MRCLAM=folder also on real logs.
 test-long: setup
-	$(BIN)/pytest -m "$(if $(CPCBL_MRCLAM),long or log,long)"
+	$(BIN)/pytest -n 2 -m "$(if $(CPCBL_MRCLAM),long or log,long)"
 
 clean:
 	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -8,7 +8,8 @@ from typing import Annotated
 
 import msgspec
 
-Name = Annotated[str, msgspec.Meta(pattern=r"^[A-Za-z0-9_.-]{1,32}$")]
+NAME_PATTERN = r"^[A-Za-z0-9_.-]{1,32}$"
+Name = Annotated[str, msgspec.Meta(pattern=NAME_PATTERN)]
 
 
 class Odometry(msgspec.Struct, frozen=True, array_like=True, tag="odometry"):

@@ -11,7 +11,7 @@ from collections.abc import Iterable, Iterator
 
 from cpcbl_team.config import Field, LocalizerSettings
 from cpcbl_team.constraints import Constraint, bearing_heading, range_circle
-from cpcbl_team.estimate import ZERO3, Covariance3, Estimate, Information, merge
+from cpcbl_team.estimate import SMALLEST_VARIANCE, ZERO3, Covariance3, Estimate, Information, merge
 from cpcbl_team.geometry import Pose2
 from cpcbl_team.state import Evidence, Memory
 
@@ -134,7 +134,7 @@ class _Carried:
         e = self.e
         hx, hy = pose.y - then.y, then.x - pose.x  # d(place then) / d(heading now)
         if self.is_fix:
-            variance = self.sigma_m**2
+            variance = self.sigma_m**2 + SMALLEST_VARIANCE
             yield (1.0, 0.0, hx), e.x - then.x, variance
             yield (0.0, 1.0, hy), e.y - then.y, variance
             return
@@ -147,7 +147,11 @@ class _Carried:
             if c is not None:
                 x, y, a = c.row
                 spread = self.sigma_m / c.distance_m if c.on_heading else self.sigma_m
-                yield (x, y, a + x * hx + y * hy), c.residual, c.sigma**2 + spread**2
+                yield (
+                    (x, y, a + x * hx + y * hy),
+                    c.residual,
+                    c.sigma**2 + spread**2 + SMALLEST_VARIANCE,
+                )
 
 
 def _cost(pose: Pose2, pieces: list[_Carried]) -> float:

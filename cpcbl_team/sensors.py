@@ -5,6 +5,8 @@ import math
 from cpcbl_team.config import SensorSettings
 from cpcbl_team.inputs import Sighting
 
+LARGEST_M = 1e6
+
 
 def sighting_fault(sighting: Sighting) -> str:
     """Why a sighting must not be used (resolution i); empty if it may."""
@@ -17,6 +19,8 @@ def sighting_fault(sighting: Sighting) -> str:
     given = [n for n in numbers if n is not None]
     if not all(math.isfinite(n) for n in given):
         return "not_finite"
+    if any(n > LARGEST_M for n in given):
+        return "implausible_number"
     if sighting.range_m is None and sighting.bearing_rad is None:
         return "empty_sighting"
     if sighting.range_m is not None and sighting.range_m <= 0.0:

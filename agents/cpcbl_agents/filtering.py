@@ -47,8 +47,7 @@ class FilterAgent:
     def handle(self, message: Anything, now_ns: int) -> Sequence[Anything]:
         match message:
             case Odometry():
-                self._take(message)
-                if self._odometry is None or message.stamp_ns > self._odometry.stamp_ns:
+                if self._take(message) and message.stamp_ns > self._covered_ns:
                     self._odometry = message
                     self._covered_ns = message.stamp_ns
                 return self._frames_located(now_ns)
@@ -56,8 +55,8 @@ class FilterAgent:
                 for sighting in message.sightings:
                     if sighting.id not in self._known:
                         self.counts["unknown_object"] += 1
-                self._take(message)
-                self._waiting.append(message)
+                if self._take(message):
+                    self._waiting.append(message)
                 return self._frames_located(now_ns)
             case Position() | Belief() | Fix() | Told():
                 self._take(message)
@@ -65,10 +64,12 @@ class FilterAgent:
                 return [*self._frames_located(now_ns), *self._regularly(now_ns)]
         return ()
 
-    def _take(self, item: Input) -> None:
+    def _take(self, item: Input) -> bool:
+        """Whether the timeline could use it."""
         refused = self.timeline.add(item)
         if refused:
             self.counts[refused] += 1
+        return not refused
 
     def _regularly(self, now_ns: int) -> Sequence[Located]:
         self._located_ns = now_ns

@@ -118,7 +118,7 @@ class Node:
             case Fix(observer=sender) if key.startswith("fix/"):
                 if message.robot != self._name:
                     return Refusal.NOT_FOR_ME
-            case Odometry() | Sightings() | Position() if key.startswith("in/"):
+            case Odometry() | Sightings() | Position() if type(message) is _INPUTS.get(last):
                 return refusal(message, now_ns)
             case _:
                 return Refusal.WRONG_TYPE
@@ -207,3 +207,4 @@ class Node:
 
 
 _HELP = (topics.BELIEF, topics.FIX)
+_INPUTS = {topic.key.rsplit("/", 1)[-1]: topic.carries for topic in topics.INPUTS}

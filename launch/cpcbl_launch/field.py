@@ -18,15 +18,34 @@ from cpcbl_team.geometry import Pose2, step, wrap_angle
 from cpcbl_team.inputs import Odometry, Position, Sighting, Sightings
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus, Publisher
-from cpcbl_transport.messages import Drive, Truth, Truths, decode, encode
+from cpcbl_transport.messages import Drive, Truth, Truths, decode, encode, refusal
 
 COMMAND_LASTS_NS = 500_000_000
+
+
+class Every:
+    """Says when something is due that happens so many times a second."""
+
+    def __init__(self, rate_hz: float) -> None:
+        self._period_ns = int(1e9 / rate_hz)
+        self._due_ns: int | None = None
+
+    def due(self, now_ns: int) -> bool:
+        if self._due_ns is None:
+            self._due_ns = now_ns
+        if now_ns < self._due_ns:
+            return False
+        missed = (now_ns - self._due_ns) // self._period_ns
+        self._due_ns += (missed + 1) * self._period_ns
+        return True
 
 
 class SimulatedRobot:
     """One robot of the field: its true pose and its imperfect senses."""
 
-    def __init__(self, settings: RobotSettings, noise: float, seed: Sequence[int]) -> None:
+    def __init__(
+        self, settings: RobotSettings, noise: float, seed: Sequence[int], start_ns: int
+    ) -> None:
         assert settings.start is not None
         self.settings, self._noise = settings, noise
         self._random = np.random.default_rng(seed)
@@ -39,11 +58,11 @@ class SimulatedRobot:
         self.drive = Drive("", 0, 0.0, 0.0)
         self.bumps = 0
         self.touching: frozenset[str] = frozenset()
-        self._reported = (0.0, 0.0)
-        self._reported_ns = self._sensed_ns = self._positioned_ns = -1
-
-    def start(self, now_ns: int) -> None:
-        self._reported_ns = self._sensed_ns = self._positioned_ns = now_ns
+        self._reported, self._reported_ns = (0.0, 0.0), start_ns
+        self._odometry_timer = Every(settings.odometry.rate_hz)
+        self._frame_timer = Every(settings.sensor.rate_hz)
+        sensor = settings.position_sensor
+        self._position_timer = Every(sensor.rate_hz if sensor is not None else 1.0)
 
     def move(self, now_ns: int, seconds: float) -> None:
         """Drives on as commanded; the wheels report the command, the ground adds noise."""
@@ -64,7 +83,7 @@ class SimulatedRobot:
     def odometry(self, now_ns: int) -> Odometry | None:
         """The piece since the last one, when it is due; as reported, before any correction."""
         o = self.settings.odometry
-        if not o.moves or now_ns - self._reported_ns < 1e9 / o.rate_hz:
+        if not o.moves or not self._odometry_timer.due(now_ns):
             return None
         distance, turn = self._reported
         piece = Odometry(
@@ -75,17 +94,15 @@ class SimulatedRobot:
 
     def sightings(self, now_ns: int, objects: Iterable["Seen"]) -> Sightings | None:
         """What is in view, when a frame is due."""
-        if now_ns - self._sensed_ns < 1e9 / self.settings.sensor.rate_hz:
+        if not self._frame_timer.due(now_ns):
             return None
-        self._sensed_ns = now_ns
         return Sightings(now_ns, tuple(s for o in objects if (s := self._sighted(*o))))
 
     def position(self, now_ns: int) -> Position | None:
         """What the position sensor says, if there is one and it is due."""
         sensor = self.settings.position_sensor
-        if sensor is None or now_ns - self._positioned_ns < 1e9 / sensor.rate_hz:
+        if sensor is None or not self._position_timer.due(now_ns):
             return None
-        self._positioned_ns = now_ns
         x, y = (v + self._normal(sensor.sigma_m) for v in self.pose[:2])
         return Position(now_ns, x, y, (sensor.sigma_m**2, 0.0, sensor.sigma_m**2))
 
@@ -120,12 +137,10 @@ class SimulatedField:
         self._step_ns = int(1e9 / team.simulation.step_rate_hz)
         self.now_ns = start_ns
         self.robots = {
-            name: SimulatedRobot(settings, team.simulation.noise, (seed, i))
+            name: SimulatedRobot(settings, team.simulation.noise, (seed, i), start_ns)
             for i, (name, settings) in enumerate(team.robots.items())
             if settings.source == "simulated"
         }
-        for robot in self.robots.values():
-            robot.start(start_ns)
 
     @property
     def next_ns(self) -> int:
@@ -206,7 +221,7 @@ class FieldNode:
         """Advances the field to `now_ns` and tells the robots what they sense."""
         while self._drives:
             drive = decode(self._drives.popleft())
-            if isinstance(drive, Drive):
+            if isinstance(drive, Drive) and refusal(drive, now_ns) is None:
                 self._field.command(drive)
         while self._field.next_ns <= now_ns:
             for name, sensed in self._field.advance():

@@ -68,10 +68,12 @@ def _start(folder: Path, robot: str, truth: Floats) -> Start | None:
     if first_truth_ns - first_ns > LATEST_TRUTH_NS:
         return None
     for piece in mrclam.read_odometry(folder, robot):
-        if piece.stamp_ns > first_truth_ns:
+        if piece.from_ns >= first_truth_ns:
             break
-        reckoned = step(reckoned, piece.distance_m, piece.turn_rad)
-        way += abs(piece.distance_m)
+        whole_ns = piece.stamp_ns - piece.from_ns
+        share = min(first_truth_ns - piece.from_ns, whole_ns) / whole_ns
+        reckoned = step(reckoned, share * piece.distance_m, share * piece.turn_rad)
+        way += abs(share * piece.distance_m)
     pose, _ = truth_at(np.array([first_truth_ns * 1e-9]), truth)
     x, y, heading = Pose2(*pose[0].tolist()) @ reckoned.inverse()
     return Start(x_m=x, y_m=y, heading_deg=math.degrees(heading), sigma_m=0.05 + 0.1 * way)

@@ -16,13 +16,15 @@ import msgspec
 
 from cpcbl_team.config import (
     Field,
+    Landmark,
     RobotSettings,
     SimulationSettings,
     Table,
     Team,
     TransportSettings,
+    Wall,
 )
-from cpcbl_team.inputs import Name
+from cpcbl_team.inputs import NAME_PATTERN, Name
 
 Layer = dict[str, Any]
 
@@ -31,17 +33,22 @@ class TeamFileError(Exception):
     """A team file that cannot be used; the text names file, key and fix."""
 
 
+class _Map(Table, frozen=True, kw_only=True):
+    landmarks: Layer = msgspec.field(default_factory=dict)
+    walls: Layer = msgspec.field(default_factory=dict)
+
+
 class _File(Table, frozen=True, kw_only=True):
-    """The file's own tables; robots are still layers."""
+    """The file's own tables; what has names of its own is converted name by name."""
 
     name: Name
-    robots: dict[Name, Layer]
-    map: Field = Field()
+    robots: Layer
+    map: _Map = _Map()
     transport: TransportSettings = TransportSettings()
     simulation: SimulationSettings = SimulationSettings()
     data: str = ""
     defaults: Layer = msgspec.field(default_factory=dict)
-    types: dict[Name, Layer] = msgspec.field(default_factory=dict)
+    types: Layer = msgspec.field(default_factory=dict)
 
 
 def builtin(name: str) -> Path:
@@ -83,24 +90,34 @@ def parse_team(text: str, name: str = "team file") -> Team:
         raise TeamFileError(f"{name}: {key}: not a finite number; write a finite one")
     file = _converted(raw, _File, "", name)
     _converted(file.defaults, RobotSettings, "defaults", name)
-    for kind, layer in file.types.items():
+    for kind, layer in _named(file.types, "types", name):
         _converted(layer, RobotSettings, f"types.{kind}", name)
     robots = {}
-    for robot, layer in file.robots.items():
+    for robot, layer in _named(file.robots, "robots", name):
         kind = layer.pop("type", None)
-        if kind is not None and kind not in file.types:
+        if kind is not None and not (isinstance(kind, str) and kind in file.types):
             known = ", ".join(file.types) or "none"
             raise TeamFileError(
-                f"{name}: robots.{robot}.type: no type {kind!r}; define [types.{kind}] or use one"
-                f" of: {known}"
+                f"{name}: robots.{robot}.type: no type {kind!r}; use a type that has its table"
+                f" [types.NAME], here: {known}"
             )
         _converted(layer, RobotSettings, f"robots.{robot}", name)
-        merged = _merged(file.defaults, file.types.get(kind, {}) if kind else {}, layer)
+        merged = _merged(file.defaults, file.types.get(kind, {}), layer)
         robots[robot] = _converted(merged, RobotSettings, f"robots.{robot}", name)
+    field = Field(
+        landmarks={
+            mark: _converted(table, Landmark, f"map.landmarks.{mark}", name)
+            for mark, table in _named(file.map.landmarks, "map.landmarks", name)
+        },
+        walls={
+            wall: _converted(table, Wall, f"map.walls.{wall}", name)
+            for wall, table in _named(file.map.walls, "map.walls", name)
+        },
+    )
     team = Team(
         name=file.name,
         robots=robots,
-        map=file.map,
+        map=field,
         transport=file.transport,
         simulation=file.simulation,
         data=file.data,
@@ -144,6 +161,18 @@ def problems(team: Team) -> Iterator[str]:
                 )
 
 
+def _named(tables: Layer, where: str, name: str) -> Iterator[tuple[str, Layer]]:
+    """The tables with names of the user's own, which become part of keys on the bus."""
+    for own, table in tables.items():
+        if not re.fullmatch(NAME_PATTERN, own):
+            raise TeamFileError(
+                f"{name}: {where}.{own}: a name has 1 to 32 letters, digits, _, . or -; rename it"
+            )
+        if not isinstance(table, dict):
+            raise TeamFileError(f"{name}: {where}.{own}: is no table; write [{where}.{own}]")
+        yield own, table
+
+
 def _merged(*layers: Mapping[str, Any]) -> Layer:
     result: Layer = {}
     for layer in layers:
@@ -179,15 +208,12 @@ def _explained(error: str, kind: type[Any], prefix: str) -> str:
 
 
 def _fields_at(kind: Any, path: str) -> list[str]:
-    """The keys that a table at `path` knows; `[...]` stands for any name."""
-    for part in path.replace("[...]", ".[...]").split("."):
-        if part == "[...]":
-            kind = get_args(kind)[1]
-        elif part:
-            kind = get_type_hints(kind)[part]
+    """The keys that a table at `path` knows."""
+    for part in filter(None, path.split(".")):
+        kind = get_type_hints(kind)[part]
         if type(None) in get_args(kind):
             kind = get_args(kind)[0]
-    return sorted(getattr(kind, "__struct_fields__", ()))
+    return sorted(kind.__struct_fields__)
 
 
 def _not_finite(raw: Any, key: str = "") -> Iterator[str]:

@@ -6,16 +6,19 @@ never an exception.
 """
 
 import math
+from collections.abc import Iterator
 from enum import StrEnum
 
 import msgspec
 
+from cpcbl_team.estimate import Covariance3
 from cpcbl_team.inputs import Belief, Fix, Name, Odometry, Position, Sightings
 
 VERSION = 1
 FUTURE_NS = 500_000_000
 LONGEST_ODOMETRY_NS = 10_000_000_000
 LARGEST_PAYLOAD = 65_536
+LARGEST_NUMBER = 1e6  # metres, radians, or their squares
 
 
 class Status(msgspec.Struct, frozen=True, array_like=True, tag="status"):
@@ -86,6 +89,7 @@ class Refusal(StrEnum):
     GARBAGE = "garbage"
     WRONG_TYPE = "wrong_type"
     NOT_FINITE = "not_finite"
+    IMPLAUSIBLE = "implausible_number"
     NOT_A_COVARIANCE = "not_a_covariance"
     FUTURE = "from_the_future"
     DURATION = "impossible_duration"
@@ -119,9 +123,16 @@ def decode(payload: bytes) -> Message | Refusal:
 
 
 def refusal(message: Message, now_ns: int) -> Refusal | None:
-    """Why a decoded message must not be used, or None: numbers, time, duration."""
-    if not _finite(message):
-        return Refusal.NOT_FINITE
+    """Why a decoded message must not be used, or None: numbers, time, duration.
+
+    The numbers of sightings are judged one by one by the filter.
+    """
+    if not isinstance(message, Sightings):
+        numbers = list(_numbers(message))
+        if not all(map(math.isfinite, numbers)):
+            return Refusal.NOT_FINITE
+        if any(abs(n) > LARGEST_NUMBER for n in numbers):
+            return Refusal.IMPLAUSIBLE
     if message.stamp_ns > now_ns + FUTURE_NS:
         return Refusal.FUTURE
     match message:
@@ -136,8 +147,13 @@ def refusal(message: Message, now_ns: int) -> Refusal | None:
             if not _is_covariance(*message.covariance):
                 return Refusal.NOT_A_COVARIANCE
         case Belief():
-            xx, xy, yy, _, _, hh = message.covariance
-            if not _is_covariance(xx, xy, yy) or hh < 0.0:
+            xx, xy, yy, xh, yh, hh = c = Covariance3(*message.covariance)
+            if not (
+                _is_covariance(xx, xy, yy)
+                and _is_covariance(xx, xh, hh)
+                and _is_covariance(yy, yh, hh)
+                and c.determinant() >= -(1e-6 * xx * yy * hh + 1e-12)
+            ):
                 return Refusal.NOT_A_COVARIANCE
     return None
 
@@ -146,16 +162,13 @@ def _is_covariance(xx: float, xy: float, yy: float) -> bool:
     return xx >= 0.0 and yy >= 0.0 and xy * xy <= xx * yy * (1.0 + 1e-6) + 1e-12
 
 
-def _finite(message: Message) -> bool:
-    """Whether all numbers are finite. Those of sightings are judged one by one by the filter."""
-    if isinstance(message, Sightings):
-        return True
-    for name in message.__struct_fields__:
-        value = getattr(message, name)
-        if isinstance(value, float) and not math.isfinite(value):
-            return False
-        if isinstance(value, tuple) and not all(
-            math.isfinite(v) for v in value if isinstance(v, float)
-        ):
-            return False
-    return True
+def _numbers(value: object) -> Iterator[float]:
+    """All floats in a message, however deep."""
+    if isinstance(value, float):
+        yield value
+    elif isinstance(value, tuple):
+        for part in value:
+            yield from _numbers(part)
+    elif isinstance(value, msgspec.Struct):
+        for name in value.__struct_fields__:
+            yield from _numbers(getattr(value, name))

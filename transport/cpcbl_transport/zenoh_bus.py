@@ -8,7 +8,6 @@
 
 import json
 import logging
-import threading
 import time
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -86,32 +85,37 @@ def _open(team: str, options: dict[str, Any]) -> "zenoh.Session":
     return zenoh.open(config)
 
 
-class _Once:
-    """Closes a declaration once, whoever asks."""
+class _Declared:
+    """Something declared; the bus keeps it until it is closed, as an unused one would end."""
 
-    def __init__(self, undeclare: Callable[[], None]) -> None:
-        self._undeclare: Callable[[], None] | None = undeclare
+    def __init__(self, bus: "ZenohBus", undeclare: Callable[[], None]) -> None:
+        self._bus, self._undeclare = bus, undeclare
+        bus.declared.add(self)
+
+    @property
+    def open(self) -> bool:
+        return self in self._bus.declared
 
     def close(self) -> None:
-        undeclare, self._undeclare = self._undeclare, None
-        if undeclare is not None:
-            undeclare()
+        if self.open:
+            self._bus.declared.discard(self)
+            self._undeclare()
 
 
-class _ZenohPublisher(_Once):
-    def __init__(self, publisher: "zenoh.Publisher") -> None:
-        super().__init__(publisher.undeclare)
+class _ZenohPublisher(_Declared):
+    def __init__(self, bus: "ZenohBus", publisher: "zenoh.Publisher") -> None:
+        super().__init__(bus, publisher.undeclare)
         self._publisher = publisher
 
     @property
     def matching(self) -> bool:
-        if self._undeclare is None:
+        if not self.open:
             return False
         status: Any = self._publisher.matching_status  # the stubs call it a bool
         return bool(status.matching)
 
     def put(self, payload: bytes) -> None:
-        if self._undeclare is not None:
+        if self.open:
             self._publisher.put(payload)
 
 
@@ -120,20 +124,20 @@ class ZenohBus:
 
     def __init__(self, session: "zenoh.Session") -> None:
         self._session = session
-        self._closed = threading.Event()
+        self.declared: set[_Declared] = set()
 
     def publisher(self, key: str, qos: Qos) -> Publisher:
         priority, congestion, reliable = qos.value
+        kind = zenoh.Reliability.RELIABLE if reliable else zenoh.Reliability.BEST_EFFORT
         return _ZenohPublisher(
+            self,
             self._session.declare_publisher(
                 key,
                 allowed_destination=zenoh.Locality.REMOTE,
                 priority=getattr(zenoh.Priority, priority),
                 congestion_control=getattr(zenoh.CongestionControl, congestion),
-                reliability=zenoh.Reliability.RELIABLE
-                if reliable
-                else zenoh.Reliability.BEST_EFFORT,
-            )
+                reliability=kind,
+            ),
         )
 
     def subscribe(self, keys: str, receive: Receive) -> Handle:
@@ -141,21 +145,22 @@ class ZenohBus:
             if sample.kind == zenoh.SampleKind.PUT:
                 receive(str(sample.key_expr), sample.payload.to_bytes())
 
-        return _Once(self._session.declare_subscriber(keys, on_sample).undeclare)
+        return _Declared(self, self._session.declare_subscriber(keys, on_sample).undeclare)
 
     def announce(self, key: str) -> Handle:
-        return _Once(self._session.liveliness().declare_token(key).undeclare)
+        return _Declared(self, self._session.liveliness().declare_token(key).undeclare)
 
     def watch(self, keys: str, watch: Watch) -> Handle:
         def on_sample(sample: "zenoh.Sample") -> None:
             watch(str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT)
 
         liveliness = self._session.liveliness()
-        return _Once(liveliness.declare_subscriber(keys, on_sample, history=True).undeclare)
+        subscriber = liveliness.declare_subscriber(keys, on_sample, history=True)
+        return _Declared(self, subscriber.undeclare)
 
     def close(self) -> None:
-        if not self._closed.is_set():
-            self._closed.set()
+        self.declared.clear()
+        if not self._session.is_closed():
             self._session.close()  # type: ignore[no-untyped-call]
 
     def __enter__(self) -> "ZenohBus":

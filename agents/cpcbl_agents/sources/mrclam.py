@@ -35,6 +35,9 @@ def read_table(path: Path, columns: int) -> NDArray[np.float64]:
         raise LogError(f"{path}: {error}") from error
     if table.shape[1] != columns:
         raise LogError(f"{path}: {table.shape[1]} columns where {columns} are due")
+    if not np.isfinite(table).all():
+        row = int(np.argmin(np.isfinite(table).all(axis=1)))
+        raise LogError(f"{path}: row {row + 1} has a number that is not finite")
     return table[np.argsort(table[:, 0], kind="stable")]
 
 

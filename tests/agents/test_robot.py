@@ -1,0 +1,368 @@
+"""One robot without bus and clock: late inputs, blindness, delays, frames, driving."""
+
+import math
+from collections.abc import Sequence
+
+import pytest
+from bus_helpers import MS, SECOND, robot_at, saw, team_of, with_robot
+
+from cpcbl_agents.agent import Located, Tick
+from cpcbl_agents.driving import COMMAND_NS, MOST_TURN_RAD_S, REACHED_M, Pilot, steer
+from cpcbl_agents.filtering import PATIENCE_NS
+from cpcbl_agents.robot import Robot
+from cpcbl_team.config import CollaborationSettings, OdometrySettings, SensorSettings, Team
+from cpcbl_team.estimate import ZERO3, Covariance3, Estimate
+from cpcbl_team.geometry import Pose2
+from cpcbl_team.geometry import step as stepped
+from cpcbl_team.inputs import Belief, Fix, Odometry, Position, Sighting, Sightings
+from cpcbl_transport.messages import Drive, Message
+
+OAK = Sighting("oak", 4.05, 0.02)
+MATE = Sighting("mate", 1.9, 0.05)
+MATES_BELIEF = Belief("mate", 400 * MS, 2.0, 0.0, 0.0, (0.0004, 0.0, 0.0004, 0.0, 0.0, 0.0001))
+TEAM = team_of(me=robot_at(sigma_m=0.1), mate=robot_at(2.0))
+
+
+def robot(team: Team = TEAM) -> Robot:
+    return Robot("me", team, 0)
+
+
+def belief(robot: Robot) -> Estimate:
+    return robot.filter.timeline.state.estimate
+
+
+def pieces(seconds: float, distance_m: float = 0.05, turn_rad: float = 0.02) -> list[Odometry]:
+    """Odometry at 10 Hz."""
+    return [
+        Odometry(n * 100 * MS, (n + 1) * 100 * MS, distance_m, turn_rad)
+        for n in range(round(10 * seconds))
+    ]
+
+
+def fix(stamp_ns: int, x_m: float) -> Fix:
+    return Fix("me", "mate", stamp_ns, x_m, 0.05, (0.01, 0.0, 0.01), (0.0004, 0.0, 0.0004), 2.0)
+
+
+# Late and out of order --------------------------------------------------------------------------
+
+
+def frame(stamp_ns: int, *names: str) -> Sightings:
+    """What a robot on the way of `pieces` sees, a few centimetres wrong."""
+    pose = Pose2(0.0, 0.0, 0.0)
+    for piece in pieces(stamp_ns / SECOND):
+        pose = stepped(pose, piece.distance_m, piece.turn_rad)
+    places = {"oak": (4.0, 0.0), "mate": (2.0, 0.0)}
+    seen = [(name, *pose.inverse().transform(*places[name])) for name in names]
+    return saw(
+        stamp_ns, *(Sighting(n, math.hypot(x, y) + 0.03, math.atan2(y, x)) for n, x, y in seen)
+    )
+
+
+def told(arrivals: Sequence[tuple[int, Message]]) -> Robot:
+    """A robot that got these messages at these times, with ticks in between."""
+    subject = robot()
+    for now_ns, message in arrivals:
+        subject.handle(message, now_ns)
+        subject.handle(Tick(), now_ns)
+    return subject
+
+
+def time_of(item: Message) -> int:
+    """When an item counts; odometry from where its piece begins."""
+    return item.from_ns if isinstance(item, Odometry) else item.stamp_ns
+
+
+def in_order(items: Sequence[Message]) -> list[tuple[int, Message]]:
+    """Each item arrives when it counts."""
+    return [(time_of(item), item) for item in sorted(items, key=time_of)]
+
+
+@pytest.mark.parametrize(
+    ("late", "by_ns"),
+    [
+        (fix(950 * MS, 0.5), 300 * MS),
+        (fix(950 * MS, 0.5), 1000 * MS),
+        (frame(900 * MS, "oak", "mate"), 300 * MS),
+        (frame(500 * MS, "oak"), 80 * MS),
+        (MATES_BELIEF, 1000 * MS),
+        (Position(950 * MS, 0.5, 0.05, (0.01, 0.0, 0.01)), 300 * MS),
+        (Odometry(900 * MS, 1000 * MS, 0.05, 0.02), 500 * MS),
+    ],
+    ids=[
+        "fix",
+        "late fix",
+        "frame",
+        "frame before the last odometry",
+        "belief",
+        "position",
+        "odometry",
+    ],
+)
+def test_a_late_input_gives_the_belief_of_the_right_order(late: Message, by_ns: int) -> None:
+    usual: list[Message] = [
+        *pieces(2.0),
+        MATES_BELIEF,
+        frame(700 * MS, "oak"),
+        frame(1200 * MS, "oak", "mate"),
+        fix(1300 * MS, 0.65),
+    ]
+    others = [item for item in usual if item != late]
+    arrivals, due_ns = in_order(others), time_of(late) + by_ns
+    place = sum(now_ns <= due_ns for now_ns, _ in arrivals)
+    delayed = told([*arrivals[:place], (due_ns, late), *arrivals[place:]])
+    assert belief(delayed) == belief(told(in_order([*others, late])))
+    assert belief(delayed) != belief(told(arrivals))
+
+
+def test_any_order_of_arrival_gives_the_same_belief() -> None:
+    items: list[Message] = [
+        *pieces(1.5),
+        frame(700 * MS, "oak"),
+        frame(800 * MS, "mate"),
+        MATES_BELIEF,
+        fix(950 * MS, 0.5),
+    ]
+    forwards = [(1500 * MS, item) for item in items]
+    assert belief(told(forwards)) == belief(told(forwards[::-1]))
+    assert belief(told(forwards)) == belief(told(in_order(items)))
+
+
+# A position sensor ------------------------------------------------------------------------------
+
+
+def test_a_position_pulls_the_belief_there_as_far_as_it_is_certain() -> None:
+    prior = robot().filter.timeline.state.estimate
+    for sigma_m, share in ((1e-3, 1.0), (prior.position_sigma_m, 0.5), (10.0, 0.0)):
+        subject = robot()
+        subject.handle(Position(0, 0.1, -0.1, (sigma_m**2, 0.0, sigma_m**2)), 0)
+        pose = belief(subject).pose
+        assert (pose.x, pose.y) == pytest.approx((0.1 * share, -0.1 * share), abs=1e-3)
+        assert belief(subject).shared == ZERO3
+        assert subject.counts["position"] == 1
+
+
+# Blind robots -----------------------------------------------------------------------------------
+
+
+def after_seeing(sensor: SensorSettings, *seen: Sighting) -> Robot:
+    """The robot has heard where its mate is and sees something."""
+    subject = robot(with_robot(TEAM, "me", sensor=sensor))
+    subject.handle(MATES_BELIEF, 0)
+    subject.handle(Odometry(0, SECOND, 0.0, 0.0), SECOND)
+    subject.handle(saw(500 * MS, *seen), SECOND)
+    return subject
+
+
+@pytest.mark.parametrize(
+    ("sensor", "used"),
+    [
+        (SensorSettings(), [OAK, MATE]),
+        (SensorSettings(sees_landmarks=False), [MATE]),
+        (SensorSettings(sees_robots=False), [OAK]),
+        (SensorSettings(sees_landmarks=False, sees_robots=False), []),
+    ],
+    ids=["all", "blind to landmarks", "blind to robots", "blind"],
+)
+def test_what_a_robot_is_blind_to_plays_no_part(
+    sensor: SensorSettings, used: list[Sighting]
+) -> None:
+    subject = after_seeing(sensor, OAK, MATE)
+    assert belief(subject) == belief(after_seeing(SensorSettings(), *used))
+    assert subject.counts["accepted"] == len(used)
+
+
+def test_a_blind_robot_still_helps_the_teammates_that_it_sees() -> None:
+    subject = robot(with_robot(TEAM, "me", sensor=SensorSettings(sees_landmarks=False)))
+    for piece in pieces(0.5, 0.0, 0.0):
+        subject.handle(piece, piece.stamp_ns)
+        subject.handle(Tick(), piece.stamp_ns)
+    said = subject.handle(saw(400 * MS, OAK, MATE), 500 * MS)
+    assert [type(m) for m in said] == [Fix]
+
+
+def test_an_unknown_object_is_counted_and_plays_no_part() -> None:
+    ghost = Sighting("barcode-99", 1.0, 0.0)
+    subject = after_seeing(SensorSettings(), OAK, ghost)
+    assert belief(subject) == belief(after_seeing(SensorSettings(), OAK))
+    assert subject.counts["unknown_object"] == 1
+
+
+# Corrections ------------------------------------------------------------------------------------
+
+
+def test_the_odometry_delay_moves_the_motion_to_when_it_happened() -> None:
+    slow = OdometrySettings(delay_s=0.2)
+    corrected = robot(with_robot(TEAM, "me", odometry=slow))
+    corrected.handle(Odometry(SECOND, 2 * SECOND, 1.0, 0.0), 2 * SECOND)
+    timeline = corrected.filter.timeline
+    for at_ns, expected_m in ((1200 * MS, 0.0), (1700 * MS, 0.5), (2200 * MS, 1.0)):
+        state = timeline.at(at_ns)
+        assert state is not None
+        assert state.estimate.pose.x == pytest.approx(expected_m)
+
+
+def test_the_scales_correct_what_the_wheels_report() -> None:
+    scaled = OdometrySettings(distance_scale=0.9, turn_scale=0.5)
+    subject = robot(with_robot(TEAM, "me", odometry=scaled))
+    subject.handle(Odometry(0, SECOND, 1.0, 0.4), SECOND)
+    pose = subject.filter.timeline.latest(SECOND).estimate.pose
+    assert pose == pytest.approx(stepped(Pose2(0.0, 0.0, 0.0), 0.9, 0.2))
+
+
+@pytest.mark.parametrize("delay_ns", [200 * MS, -30 * MS])
+def test_the_sensor_delay_moves_a_frame_to_when_it_was_seen(delay_ns: int) -> None:
+    late = robot(with_robot(TEAM, "me", sensor=SensorSettings(delay_s=delay_ns * 1e-9)))
+    prompt = robot()
+    for subject, stamp_ns in ((prompt, 500 * MS), (late, 500 * MS + delay_ns)):
+        for piece in pieces(1.0):
+            subject.handle(piece, piece.stamp_ns)
+        subject.handle(saw(stamp_ns, OAK), SECOND)
+    assert belief(late) == belief(prompt)
+
+
+# Frames wait for their odometry -----------------------------------------------------------------
+
+
+def fixes(said: list[Message]) -> list[Fix]:
+    return [m for m in said if isinstance(m, Fix)]
+
+
+def seen_ahead_of_odometry(team: Team = TEAM) -> tuple[Robot, int]:
+    """A robot that has seen its mate 100 ms after its odometry ended; when that was."""
+    subject = robot(team)
+    for piece in pieces(1.0):
+        subject.handle(piece, piece.stamp_ns)
+        subject.handle(Tick(), piece.stamp_ns)
+    stamp_ns = 1100 * MS
+    assert subject.handle(saw(stamp_ns, MATE), stamp_ns) == []
+    return subject, stamp_ns
+
+
+def test_a_frame_waits_for_the_odometry_that_covers_it() -> None:
+    subject, stamp_ns = seen_ahead_of_odometry()
+    before = Odometry(SECOND, stamp_ns - 20 * MS, 0.04, 0.0)
+    assert fixes(subject.handle(before, stamp_ns)) == []
+    after = Odometry(stamp_ns - 20 * MS, stamp_ns + 20 * MS, 0.02, 0.0)
+    (fix,) = fixes(subject.handle(after, stamp_ns + 20 * MS))
+    assert fix.stamp_ns == stamp_ns
+    driven, _ = seen_ahead_of_odometry()
+    driven.handle(Odometry(SECOND, stamp_ns, 0.05, 0.0), stamp_ns)
+    pose = driven.filter.timeline.state.estimate.pose
+    seen = pose.transform(1.9 * math.cos(0.05), 1.9 * math.sin(0.05))
+    assert (fix.x_m, fix.y_m) == pytest.approx(seen, abs=1e-3)
+
+
+def test_a_frame_is_located_without_odometry_when_patience_ends() -> None:
+    subject, stamp_ns = seen_ahead_of_odometry()
+    assert fixes(subject.handle(Tick(), stamp_ns + PATIENCE_NS - 1)) == []
+    (fix,) = fixes(subject.handle(Tick(), stamp_ns + PATIENCE_NS + 100 * MS))
+    assert fix.stamp_ns == stamp_ns
+    assert fixes(subject.handle(Tick(), stamp_ns + 2 * PATIENCE_NS + SECOND)) == []
+
+
+def test_a_late_frames_fixes_are_of_its_own_time() -> None:
+    subject = robot()
+    for piece in pieces(1.0):
+        subject.handle(piece, piece.stamp_ns)
+        subject.handle(Tick(), piece.stamp_ns)
+    (fix,) = fixes(subject.handle(frame(500 * MS, "mate"), SECOND))
+    assert fix.stamp_ns == 500 * MS
+    assert (fix.x_m, fix.y_m) == pytest.approx((2.03, 0.0), abs=0.02)
+
+
+def test_a_robot_that_stands_waits_for_no_odometry() -> None:
+    subject = robot(with_robot(TEAM, "me", odometry=OdometrySettings(moves=False)))
+    subject.handle(saw(100 * MS), 100 * MS)
+    subject.handle(Tick(), 100 * MS)
+    assert len(fixes(subject.handle(saw(200 * MS, MATE), 200 * MS))) == 1
+
+
+def test_fixes_keep_their_least_interval() -> None:
+    rules = CollaborationSettings(fix_interval_s=0.5)
+    subject = robot(with_robot(TEAM, "me", collaboration=rules))
+    stamps = []
+    for piece in pieces(2.0, 0.0, 0.0):
+        subject.handle(piece, piece.stamp_ns)
+        subject.handle(Tick(), piece.stamp_ns)
+        stamps += [
+            f.stamp_ns for f in fixes(subject.handle(saw(piece.stamp_ns, MATE), piece.stamp_ns))
+        ]
+    assert stamps == [(100 + 500 * n) * MS for n in range(4)]
+
+
+# Driving ----------------------------------------------------------------------------------------
+
+HERE = Pose2(1.0, 2.0, math.pi / 2.0)
+
+
+def located(pose: Pose2, stamp_ns: int, lost: str = "") -> Located:
+    estimate = Estimate(pose, Covariance3(0.01, 0.0, 0.01, 0.0, 0.0, 0.01))
+    return Located(stamp_ns, estimate, lost, 0.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("goal", "speed", "turn_rate"),
+    [
+        ((1.0, 5.0), 0.5, 0.0),
+        ((0.0, 2.0), 0.0, MOST_TURN_RAD_S),
+        ((2.0, 2.0), 0.0, -MOST_TURN_RAD_S),
+        ((1.0, 0.0), 0.0, None),
+        ((1.0 - math.sin(0.1), 2.0 + math.cos(0.1)), 0.5 * math.cos(0.1) ** 3, 0.2),
+    ],
+    ids=["ahead", "left", "right", "behind", "a little left"],
+)
+def test_steering_turns_towards_the_goal(
+    goal: tuple[float, float], speed: float, turn_rate: float | None
+) -> None:
+    v, w = steer(HERE, goal, 0.5)
+    assert v == pytest.approx(speed)
+    assert (abs(w) if turn_rate is None else w) == pytest.approx(turn_rate or abs(w))
+    assert abs(w) <= MOST_TURN_RAD_S
+    if turn_rate is None:
+        assert abs(w) == MOST_TURN_RAD_S
+
+
+def drive(pilot: Pilot, pose: Pose2, stamp_ns: int, seconds: float) -> list[Pose2]:
+    """Where a pilot drives in a world without noise, at 10 Hz."""
+    way = [pose]
+    for _ in range(round(10 * seconds)):
+        stamp_ns += COMMAND_NS
+        (command,) = pilot.command(located(pose, stamp_ns))
+        pose = stepped(pose, 0.1 * command.speed_m_s, 0.1 * command.turn_rate_rad_s)
+        way.append(pose)
+    return way
+
+
+def test_a_pilot_visits_its_waypoints_in_order_and_again() -> None:
+    corners = [(2.0, 0.0), (2.0, 2.0), (0.0, 2.0), (0.0, 0.0)]
+    way = drive(Pilot("me", corners, 0.5), Pose2(0.0, 0.0, 0.0), 0, 60.0)
+    visits: list[int] = []
+    for pose in way:
+        for i, (x, y) in enumerate(corners):
+            if math.hypot(x - pose.x, y - pose.y) < REACHED_M and visits[-1:] != [i]:
+                visits.append(i)
+    assert visits[0] == 3  # the start
+    assert visits[1:9] == [0, 1, 2, 3, 0, 1, 2, 3]
+
+
+def test_a_pilot_goes_for_the_next_waypoint_as_soon_as_it_is_near_one() -> None:
+    pilot = Pilot("me", [(1.0, 0.0), (1.0, 9.0)], 0.5)
+    (ahead,) = pilot.command(located(Pose2(0.0, 0.0, 0.0), COMMAND_NS))
+    (aside,) = pilot.command(located(Pose2(1.1 - REACHED_M, 0.0, 0.0), 2 * COMMAND_NS))
+    assert ahead == Drive("me", COMMAND_NS, 0.5, 0.0)
+    assert aside.turn_rate_rad_s == MOST_TURN_RAD_S
+
+
+def test_a_lost_pilot_looks_around_on_the_spot() -> None:
+    pilot = Pilot("me", [(5.0, 0.0)], 0.5)
+    (command,) = pilot.command(located(HERE, COMMAND_NS, lost="for a test"))
+    assert command.speed_m_s == 0.0
+    assert command.turn_rate_rad_s != 0.0
+
+
+def test_commands_come_at_10_hz_at_most_and_only_with_waypoints() -> None:
+    pilot = Pilot("me", [(5.0, 0.0)], 0.5)
+    stamps = range(COMMAND_NS, SECOND + COMMAND_NS, 20 * MS)
+    commands = [c for at in stamps for c in pilot.command(located(HERE, at))]
+    assert [c.stamp_ns for c in commands] == list(range(COMMAND_NS, SECOND + 1, COMMAND_NS))
+    assert Pilot("me", [], 0.5).command(located(HERE, COMMAND_NS)) == []

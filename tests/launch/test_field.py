@@ -1,0 +1,451 @@
+"""The simulated field: exact without noise, and with noise as noisy as it says."""
+
+import math
+from itertools import pairwise
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+from bus_helpers import MS, SECOND, Ear
+
+from cpcbl_agents.clock import Clock
+from cpcbl_agents.sensing import SensorInput
+from cpcbl_launch.evaluation import Choice, chosen, simulate
+from cpcbl_launch.field import COMMAND_LASTS_NS, FieldNode, SimulatedField, run_field
+from cpcbl_launch.team_file import builtin, load_team
+from cpcbl_team.config import (
+    Field,
+    Gives,
+    Landmark,
+    OdometrySettings,
+    PositionSensor,
+    RobotSettings,
+    SensorSettings,
+    SimulationSettings,
+    Start,
+    Team,
+    Wall,
+)
+from cpcbl_team.geometry import Pose2, step
+from cpcbl_team.inputs import Odometry, Position, Sighting, Sightings
+from cpcbl_transport import topics
+from cpcbl_transport.bus import MemoryHub
+from cpcbl_transport.messages import Drive, Truths, encode
+
+STEP_NS = 20 * MS
+MILLIMETRE = 1e-3
+ALL_ROUND = SensorSettings(field_of_view_deg=360.0, rate_hz=50.0)
+EVERY_STEP = OdometrySettings(rate_hz=50.0)
+
+
+def robot(x_m: float = 0.0, y_m: float = 0.0, heading_deg: float = 0.0, **more: Any) -> Any:
+    """A robot of which odometry and frames are due at every step."""
+    start = Start(x_m=x_m, y_m=y_m, heading_deg=heading_deg, sigma_m=0.0, heading_sigma_deg=0.0)
+    return RobotSettings(**{"start": start, "sensor": ALL_ROUND, "odometry": EVERY_STEP, **more})
+
+
+def field(
+    *, noise: float = 0.0, seed: int = 1, on: Field | None = None, **robots: RobotSettings
+) -> SimulatedField:
+    simulation = SimulationSettings(noise=noise)
+    team = Team(name="t", robots=robots, map=on or Field(), simulation=simulation)
+    return SimulatedField(team, seed, 0)
+
+
+def frame(subject: SimulatedField, name: str = "r1") -> dict[str, Sighting]:
+    """What a robot sees at the next step."""
+    sensed = subject.advance()
+    (seen,) = [m for who, m in sensed if who == name and isinstance(m, Sightings)]
+    return {s.id: s for s in seen.sightings}
+
+
+def marks(gives: Gives = "both", /, **places: tuple[float, float]) -> Field:
+    return Field(landmarks={n: Landmark(x_m=x, y_m=y, gives=gives) for n, (x, y) in places.items()})
+
+
+def drive(subject: SimulatedField, steps: int, speed: float, turn_rate: float) -> list[Odometry]:
+    """The odometry of r1 while it is commanded at every step."""
+    pieces = []
+    for _ in range(steps):
+        subject.command(Drive("r1", subject.now_ns, speed, turn_rate))
+        pieces += [m for who, m in subject.advance() if who == "r1" and isinstance(m, Odometry)]
+    return pieces
+
+
+# Without noise ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("distance_scale", "turn_scale"), [(1.0, 1.0), (0.9, 1.25)])
+def test_corrected_odometry_adds_up_to_the_true_way(
+    distance_scale: float, turn_scale: float
+) -> None:
+    odometry = OdometrySettings(rate_hz=50.0, distance_scale=distance_scale, turn_scale=turn_scale)
+    subject = field(r1=robot(1.0, 2.0, 30.0, odometry=odometry))
+    pose, at_ns = subject.robots["r1"].pose, 0
+    for speed, turn_rate in ((0.5, 0.0), (0.5, 1.0), (0.0, -1.5), (-0.2, 0.3)):
+        for piece in drive(subject, 25, speed, turn_rate):
+            assert piece.from_ns == at_ns
+            at_ns = piece.stamp_ns
+            pose = step(pose, piece.distance_m * distance_scale, piece.turn_rad * turn_scale)
+        assert pose == pytest.approx(subject.robots["r1"].pose, abs=1e-9)
+    assert at_ns == subject.now_ns == 2 * SECOND
+    assert math.hypot(pose.x - 1.0, pose.y - 2.0) > 0.2
+
+
+def test_a_robot_that_does_not_move_reports_no_odometry() -> None:
+    subject = field(r1=robot(1.0, 2.0, odometry=OdometrySettings(moves=False, rate_hz=50.0)))
+    assert drive(subject, 20, 0.5, 0.5) == []
+    assert subject.robots["r1"].pose == Pose2(1.0, 2.0, 0.0)
+
+
+@pytest.mark.parametrize("rate_hz", [5.0, 10.0, 15.0, 20.0, 50.0])
+def test_robots_report_at_the_rates_of_their_settings(rate_hz: float) -> None:
+    subject = field(
+        r1=robot(
+            sensor=SensorSettings(rate_hz=rate_hz),
+            odometry=OdometrySettings(rate_hz=rate_hz),
+            position_sensor=PositionSensor(rate_hz=rate_hz),
+        )
+    )
+    sensed = [m for _ in range(200) for _, m in subject.advance()]
+    for kind in (Odometry, Sightings, Position):
+        assert sum(isinstance(m, kind) for m in sensed) == pytest.approx(4.0 * rate_hz, abs=1)
+
+
+def test_sightings_are_exact() -> None:
+    subject = field(
+        on=marks(oak=(4.0, 3.0), elm=(-2.0, 0.5)), r1=robot(1.0, -1.0, 100.0), r2=robot(3.0, 0.0)
+    )
+    for _ in range(20):
+        drive(subject, 5, 0.4, 0.7)
+        seen, pose = frame(subject), subject.robots["r1"].pose
+        places = {"oak": (4.0, 3.0), "elm": (-2.0, 0.5), "r2": (3.0, 0.0)}
+        assert seen.keys() == places.keys()
+        for name, place in places.items():
+            r, a = seen[name].range_m, seen[name].bearing_rad
+            assert r is not None
+            assert a is not None
+            assert pose.transform(r * math.cos(a), r * math.sin(a)) == pytest.approx(place)
+
+
+@pytest.mark.parametrize("view_deg", [60.0, 180.0, 360.0])
+@pytest.mark.parametrize("range_m", [1.5, 3.0])
+def test_only_what_is_in_view_and_in_range_is_seen(view_deg: float, range_m: float) -> None:
+    places = {
+        f"m{r}-{a}": (r * math.cos(math.radians(a + 90)), r * math.sin(math.radians(a + 90)))
+        for r in (1, 2, 4)
+        for a in range(-175, 180, 10)
+    }
+    sensor = SensorSettings(field_of_view_deg=view_deg, max_range_m=range_m, rate_hz=50.0)
+    subject = field(on=marks(**places), r1=robot(heading_deg=90.0, sensor=sensor))
+    due = {
+        f"m{r}-{a}"
+        for r in (1, 2, 4)
+        for a in range(-175, 180, 10)
+        if r <= range_m and abs(a) <= view_deg / 2
+    }
+    assert frame(subject).keys() == due
+
+
+GIVES: list[tuple[Gives, bool, bool]] = [
+    ("both", True, True),
+    ("range", True, False),
+    ("bearing", False, True),
+]
+
+
+@pytest.mark.parametrize(("gives", "has_range", "has_bearing"), GIVES)
+def test_objects_give_what_the_map_says(gives: Gives, has_range: bool, has_bearing: bool) -> None:
+    walls = {"north": Wall(from_m=(-5.0, 2.0), to_m=(5.0, 2.0), gives=gives)}
+    on = msgspec.structs.replace(marks(gives, oak=(2.0, 0.0)), walls=walls)
+    seen = frame(field(on=on, r1=robot()))
+    assert seen.keys() == {"oak", "north"}
+    for sighting in seen.values():
+        assert (sighting.range_m is not None) is has_range
+        assert (sighting.bearing_rad is not None) is has_bearing
+
+
+def test_objects_that_give_nothing_are_not_seen() -> None:
+    walls = {"north": Wall(from_m=(-5.0, 2.0), to_m=(5.0, 2.0), gives="none")}
+    on = msgspec.structs.replace(marks("none", oak=(2.0, 0.0)), walls=walls)
+    assert frame(field(on=on, r1=robot())) == {}
+
+
+@pytest.mark.parametrize(
+    ("from_m", "to_m", "range_m", "bearing_deg"),
+    [
+        ((-5.0, 2.0), (5.0, 2.0), 2.0, 0.0),
+        ((5.0, 2.0), (-5.0, 2.0), 2.0, 0.0),
+        ((-3.0, -5.0), (-3.0, 5.0), 3.0, 90.0),
+        ((0.0, -2.0), (1.0, -2.0), 2.0, 180.0),
+        ((0.0, 2.0), (2.0, 0.0), math.sqrt(2.0), -45.0),
+        ((0.1, 2.0), (5.0, 2.0), None, None),
+        ((-5.0, 9.0), (5.0, 9.0), None, None),
+    ],
+    ids=["north", "other way round", "west", "its end", "oblique", "beside", "too far"],
+)
+def test_walls_are_sensed_along_their_perpendicular(
+    from_m: tuple[float, float],
+    to_m: tuple[float, float],
+    range_m: float | None,
+    bearing_deg: float | None,
+) -> None:
+    on = Field(walls={"wall": Wall(from_m=from_m, to_m=to_m)})
+    seen = frame(field(on=on, r1=robot(heading_deg=90.0)))
+    if range_m is None or bearing_deg is None:
+        assert seen == {}
+        return
+    sighting = seen["wall"]
+    assert sighting.range_m == pytest.approx(range_m)
+    assert sighting.bearing_rad is not None
+    error = sighting.bearing_rad - math.radians(bearing_deg)
+    assert math.remainder(error, math.tau) == pytest.approx(0.0, abs=1e-9)
+
+
+# Noise ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("noise", [1.0, 2.0])
+def test_sightings_have_the_stated_sigma(noise: float) -> None:
+    sensor = SensorSettings(
+        field_of_view_deg=360.0,
+        rate_hz=50.0,
+        range_share=0.03,
+        range_floor_m=0.05,
+        bearing_sigma_deg=2.0,
+    )
+    subject = field(noise=noise, on=marks(oak=(4.0, 0.0)), r1=robot(sensor=sensor))
+    seen = [frame(subject)["oak"] for _ in range(4000)]
+    for values, mean, sigma in (
+        ([s.range_m for s in seen], 4.0, math.hypot(0.12, 0.05)),
+        ([s.bearing_rad for s in seen], 0.0, math.radians(2.0)),
+    ):
+        numbers = np.array(values, dtype=float)
+        assert numbers.std() == pytest.approx(noise * sigma, rel=0.06)
+        assert numbers.mean() == pytest.approx(mean, abs=5.0 * noise * sigma / math.sqrt(4000))
+
+
+@pytest.mark.parametrize(
+    ("speed", "turn_rate", "sigma_along", "sigma_around"),
+    [(1.0, 0.0, 0.1, 0.3), (0.0, 1.0, 0.0, 0.2)],
+    ids=["straight ahead", "on the spot"],
+)
+def test_the_ground_has_the_noise_that_the_settings_state(
+    speed: float, turn_rate: float, sigma_along: float, sigma_around: float
+) -> None:
+    odometry = OdometrySettings(
+        rate_hz=50.0,
+        distance_sigma_m_per_sqrt_m=0.1,
+        turn_sigma_rad_per_sqrt_rad=0.2,
+        turn_sigma_rad_per_sqrt_m=0.3,
+    )
+    subject = field(noise=1.0, r1=robot(odometry=odometry))
+    way, turns = [], []
+    for _ in range(4000):
+        before = subject.robots["r1"].pose
+        (piece,) = drive(subject, 1, speed, turn_rate)
+        after = subject.robots["r1"].pose
+        turn = math.remainder(after.heading - before.heading, math.tau)
+        direction = before.heading + 0.5 * turn
+        x, y = after.x - before.x, after.y - before.y
+        way.append(x * math.cos(direction) + y * math.sin(direction) - piece.distance_m)
+        turns.append(turn - piece.turn_rad)
+        assert (piece.distance_m, piece.turn_rad) == pytest.approx((0.02 * speed, 0.02 * turn_rate))
+    per_step = math.sqrt(0.02)
+    assert np.std(way) == pytest.approx(sigma_along * per_step, rel=0.06)
+    assert np.std(turns) == pytest.approx(sigma_around * per_step, rel=0.06)
+
+
+def test_robots_start_as_far_from_their_stated_pose_as_it_is_uncertain() -> None:
+    start = Start(x_m=1.0, y_m=2.0, heading_deg=30.0, sigma_m=0.2, heading_sigma_deg=5.0)
+    poses = np.array(
+        [
+            field(noise=1.0, seed=seed, r1=robot(start=start)).robots["r1"].pose
+            for seed in range(2000)
+        ]
+    )
+    assert poses.mean(axis=0) == pytest.approx([1.0, 2.0, math.radians(30.0)], abs=0.025)
+    assert poses.std(axis=0) == pytest.approx([0.2, 0.2, math.radians(5.0)], rel=0.08)
+
+
+@pytest.mark.parametrize("noise", [0.0, 1.0])
+def test_a_position_sensor_errs_by_the_sigma_that_it_states(noise: float) -> None:
+    sensor = PositionSensor(sigma_m=0.1, rate_hz=50.0)
+    subject = field(noise=noise, r1=robot(1.0, 2.0, position_sensor=sensor))
+    seen = [m for _ in range(4000) for _, m in subject.advance() if isinstance(m, Position)]
+    places = np.array([(m.x_m, m.y_m) for m in seen])
+    assert places.std(axis=0) == pytest.approx([noise * 0.1] * 2, rel=0.06)
+    assert places.mean(axis=0) == pytest.approx([1.0, 2.0], abs=0.01)
+    assert all(m.covariance == pytest.approx((0.01, 0.0, 0.01)) for m in seen)
+
+
+def sensed(seed: int) -> list[tuple[str, SensorInput]]:
+    subject = field(
+        noise=1.0, seed=seed, on=marks(oak=(3.0, 1.0)), r1=robot(), r2=robot(1.0, 1.0, 90.0)
+    )
+    subject.command(Drive("r1", 0, 0.5, 0.2))
+    return [item for _ in range(50) for item in subject.advance()]
+
+
+def test_the_same_seed_gives_the_same_and_another_seed_another_field() -> None:
+    assert sensed(3) == sensed(3)
+    assert sensed(3) != sensed(4)
+
+
+def test_a_simulation_is_deterministic_for_a_seed() -> None:
+    team = load_team(builtin("demo"))
+    first, again, other = (msgspec.json.encode(simulate(team, seed, 5.0)[0]) for seed in (7, 7, 8))
+    assert first == again
+    assert first != other
+
+
+# Commands and bumps -----------------------------------------------------------------------------
+
+
+def test_a_robot_without_commands_for_half_a_second_stops() -> None:
+    subject = field(r1=robot())
+    subject.command(Drive("r1", 0, 1.0, 0.0))
+    while subject.now_ns < 2 * SECOND:
+        subject.advance()
+    assert subject.robots["r1"].pose.x == pytest.approx(COMMAND_LASTS_NS * 1e-9)
+    drive(subject, 5, 1.0, 0.0)
+    assert subject.robots["r1"].pose.x == pytest.approx(COMMAND_LASTS_NS * 1e-9 + 0.1)
+
+
+def test_commands_reach_only_the_robot_that_they_name() -> None:
+    subject = field(r1=robot(), r2=robot(0.0, 3.0))
+    subject.command(Drive("ghost", 0, 1.0, 0.0))
+    drive(subject, 10, 1.0, 0.0)
+    assert subject.robots["r1"].pose.x == pytest.approx(0.2)
+    assert subject.robots["r2"].pose == Pose2(0.0, 3.0, 0.0)
+
+
+def test_a_bump_is_counted_once_a_touch() -> None:
+    subject = field(on=marks(oak=(1.0, 0.0)), r1=robot())
+    for steps, speed, bumps in (
+        (80, 0.5, 0),  # up to it
+        (20, 0.5, 1),  # into it
+        (20, 0.0, 1),  # it stays there
+        (40, 0.5, 1),  # and leaves it
+        (60, -0.5, 2),  # back through it
+    ):
+        drive(subject, steps, speed, 0.0)
+        assert subject.truth().robots[0].bumps == bumps
+
+
+# On a bus ---------------------------------------------------------------------------------------
+
+
+class OnBus:
+    """A field with one robot on a bus, and a session beside it."""
+
+    def __init__(self) -> None:
+        self.field = field(on=marks(oak=(3.0, 0.0)), r1=robot())
+        hub = MemoryHub()
+        self.node, self.bus = FieldNode(self.field, hub.session()), hub.session()
+
+    def command(self, payload: bytes) -> None:
+        self.bus.publisher(topics.DRIVE.at(robot="r1"), topics.DRIVE.qos).put(payload)
+
+
+def test_the_field_answers_commands_with_what_a_driver_would_say() -> None:
+    on = OnBus()
+    odometry, sightings, truth = (
+        Ear(on.bus, topic.at()) for topic in (topics.IN_ODOMETRY, topics.IN_SIGHTINGS, topics.TRUTH)
+    )
+    on.command(encode(Drive("r1", 0, 0.5, 0.0)))
+    on.node.step(5 * STEP_NS)
+    assert set(odometry.keys) == {topics.IN_ODOMETRY.at(robot="r1")}
+    assert set(sightings.keys) == {topics.IN_SIGHTINGS.at(robot="r1")}
+    pieces = [m for m in odometry.messages if isinstance(m, Odometry)]
+    assert sum(p.distance_m for p in pieces) == pytest.approx(0.05)
+    latest = truth.messages[-1]
+    assert isinstance(latest, Truths)
+    assert latest.stamp_ns == 5 * STEP_NS
+    assert latest.robots[0].x_m == pytest.approx(0.05)
+
+
+@pytest.mark.parametrize(
+    "payload",
+    [
+        b"",
+        b"\x01garbage",
+        encode(Sightings(0, ())),
+        encode(Drive("ghost", 0, 1.0, 1.0)),
+        encode(Drive("r1", 0, math.nan, 0.0)),
+        encode(Drive("r1", 0, 0.0, math.inf)),
+    ],
+    ids=["empty", "garbage", "wrong type", "unknown robot", "NaN", "infinite"],
+)
+def test_a_command_that_makes_no_sense_is_ignored(payload: bytes) -> None:
+    on = OnBus()
+    on.command(encode(Drive("r1", 0, 0.5, 0.0)))
+    on.command(payload)
+    on.node.step(5 * STEP_NS)
+    assert on.field.robots["r1"].pose == pytest.approx(Pose2(0.05, 0.0, 0.0))
+
+
+def test_a_field_runs_until_it_is_stopped() -> None:
+    on, team = OnBus(), load_team(builtin("demo"))
+    ear, clock = Ear(on.bus, topics.TRUTH.at()), Clock.wall()
+    with MemoryHub().session() as apart:
+        run_field(team, 1, apart, clock, lambda: True)
+    assert ear.samples == []
+    hub = MemoryHub()
+    heard = Ear(hub.session(), topics.TRUTH.at())
+    run_field(team, 1, hub.session(), clock, lambda: len(heard.samples) >= 3)
+    assert all(isinstance(m, Truths) for m in heard.messages)
+
+
+# Robots on the field ----------------------------------------------------------------------------
+
+MOVING = ("navigator", "scout", "patrol")
+TURNING_MATE_M = 0.02  # a teammate that turns is believed to drive on until its next belief
+
+
+@pytest.mark.parametrize(
+    ("kinds", "limit_m"),
+    [("none", MILLIMETRE), ("both", TURNING_MATE_M)],
+)
+def test_robots_drive_their_loops_by_their_own_estimates(kinds: str, limit_m: float) -> None:
+    demo = load_team(builtin("demo"))
+    quiet = msgspec.structs.replace(demo, simulation=SimulationSettings(noise=0.0))
+    report, recorder = simulate(chosen(quiet, Choice(collaboration=kinds)), 1, 30.0)
+    for name, figures in report.robots.items():
+        assert figures.samples > 250
+        assert figures.position_max_m is not None
+        assert figures.position_max_m < limit_m
+        assert figures.heading_rmse_deg is not None
+        assert figures.heading_rmse_deg < 0.3
+        assert figures.lost_share == 0.0
+        assert figures.bumps == 0
+        way = recorder.simulated_truth()[name][:, 1:3].tolist()
+        driven = sum(math.dist(a, b) for a, b in pairwise(way))
+        assert driven > 3.0 if name in MOVING else driven == 0.0
+    helped = {name for name, r in report.robots.items() if r.messages_received}
+    assert ("scout" in helped) is (kinds == "both")
+
+
+def test_robots_pass_their_waypoints() -> None:
+    demo = load_team(builtin("demo"))
+    quiet = msgspec.structs.replace(demo, simulation=SimulationSettings(noise=0.0))
+    _, recorder = simulate(quiet, 1, 40.0)
+    for name in MOVING:
+        way = recorder.simulated_truth()[name][:, 1:3].tolist()
+        for waypoint in quiet.robots[name].waypoints_m:
+            assert min(math.dist(waypoint, place) for place in way) < 0.3
+
+
+@pytest.mark.parametrize(
+    "sensor",
+    [{"range_share": 0.0, "range_floor_m": 0.0}, {"bearing_sigma_deg": 0.0}],
+    ids=["range", "bearing"],
+)
+@pytest.mark.parametrize("sigma_m", [0.0, 0.05], ids=["exact start", "usual start"])
+def test_a_sensor_that_never_errs_stops_no_robot(sensor: dict[str, Any], sigma_m: float) -> None:
+    start = Start(x_m=0.0, y_m=0.0, sigma_m=sigma_m)
+    perfect = robot(start=start, sensor=SensorSettings(**sensor))
+    team = Team(name="t", robots={"r1": perfect}, map=marks(oak=(3.0, 0.0), elm=(3.0, 1.0)))
+    report, _ = simulate(team, 1, 2.0)
+    assert report.robots["r1"].samples > 10

@@ -1,0 +1,80 @@
+"""The five robots of real logs (UTIAS MRCLAM). `make test-long CPCBL_MRCLAM=FOLDER`."""
+
+import json
+import os
+from functools import lru_cache
+from pathlib import Path
+
+import pytest
+from process_helpers import cpcbl_team
+
+from cpcbl_launch.evaluation import Choice, chosen, evaluate_log
+from cpcbl_launch.logs import blinded, on_log
+from cpcbl_launch.recorder import Report
+from cpcbl_launch.team_file import builtin, load_team
+
+pytestmark = [pytest.mark.log, pytest.mark.timeout(900)]
+
+BLIND = ("3", "4", "5")
+SETS = ("MRCLAM2", "MRCLAM4", "MRCLAM6")
+
+
+def log_folder(name: str) -> Path:
+    """The folder of one data set; the marker `log` promises that it is there."""
+    return Path(os.environ["CPCBL_MRCLAM"]) / name
+
+
+@lru_cache
+def evaluated(name: str, blind: bool, choice: Choice) -> Report:
+    """The built-in team on a data set; the same run is not done twice."""
+    logged = on_log(chosen(load_team(builtin("mrclam")), choice), log_folder(name))
+    team = blinded(logged.team, BLIND if blind else ())
+    return evaluate_log(logged._replace(team=team))
+
+
+def team_rmse_m(report: Report) -> float:
+    assert report.team.position_rmse_m is not None
+    return report.team.position_rmse_m
+
+
+def test_blind_robots_are_carried_by_their_teammates() -> None:
+    helped = evaluated("MRCLAM6", True, Choice())
+    alone = evaluated("MRCLAM6", True, Choice(collaboration="none"))
+    assert team_rmse_m(helped) <= 0.30
+    assert team_rmse_m(alone) > 1.0
+    for name, robot in helped.robots.items():
+        assert robot.lost_at_end == "", name
+        assert robot.lost_share < 0.02, name
+
+
+def test_processes_over_zenoh_agree_with_one_process() -> None:
+    arguments = ("--data", log_folder("MRCLAM6"), "--blind", ",".join(BLIND), "--speed", "10")
+    ran = cpcbl_team("up", "mrclam", *arguments, "--json", timeout_s=300.0)
+    assert ran.returncode == 0, ran.stderr
+    report = json.loads(ran.stdout)
+    assert report["robots"].keys() == {"1", "2", "3", "4", "5"}
+    expected = team_rmse_m(evaluated("MRCLAM6", True, Choice()))
+    assert report["team"]["position_rmse_m"] == pytest.approx(expected, rel=0.15)
+
+
+@pytest.mark.parametrize("name", SETS)
+@pytest.mark.parametrize("variant", ["joint", "oval", "circular", "weighted"])
+@pytest.mark.parametrize("collaboration", ["none", "passive", "active", "both"])
+@pytest.mark.parametrize("fusion", ["split-ci", "naive"])
+def test_no_divergence_lasts(name: str, variant: str, collaboration: str, fusion: str) -> None:
+    """Robots that see landmarks are never lost for long, blind ones while teammates can help."""
+    if collaboration == "none" and fusion == "naive":
+        fusion = "split-ci"  # nothing is merged: the same run
+    report = evaluated(name, True, Choice(variant, collaboration, fusion))
+    for robot, r in report.robots.items():
+        assert r.position_rmse_m is not None
+        if robot not in BLIND:
+            assert r.lost_share < 0.02, robot
+            assert r.lost_at_end == "", robot
+            assert r.position_rmse_m < 0.5, robot
+        elif collaboration in ("passive", "both"):
+            assert r.lost_share < 0.25, robot
+            assert r.lost_at_end == "", robot
+            assert r.position_rmse_m < 1.5, robot
+        elif collaboration == "active" and r.counts.get("lost"):
+            assert r.counts.get("found_again", 0) >= r.counts["lost"] - 1, robot

@@ -1,0 +1,333 @@
+"""The wire format: round trips, evolution, and what is refused instead of raised."""
+
+import math
+from typing import Any, get_args
+
+import msgspec
+import pytest
+from bus_helpers import SECOND, examples
+from hypothesis import given
+from hypothesis import strategies as st
+
+from cpcbl_team.inputs import Belief, Fix, Odometry, Position, Sighting, Sightings
+from cpcbl_transport.messages import (
+    FUTURE_NS,
+    LARGEST_NUMBER,
+    LARGEST_PAYLOAD,
+    LONGEST_ODOMETRY_NS,
+    VERSION,
+    Drive,
+    Message,
+    Refusal,
+    Status,
+    Track,
+    Truth,
+    Truths,
+    decode,
+    encode,
+    refusal,
+)
+
+NOW = 5 * SECOND
+COVARIANCE = (0.04, 0.01, 0.09, 0.0, 0.0, 0.01)
+
+BELIEF = Belief("r1", NOW, 1.0, 2.0, 0.5, COVARIANCE, 0.3, 0.1)
+FIX = Fix("r2", "r1", NOW, 1.0, 2.0, (0.04, 0.01, 0.09), (0.01, 0.0, 0.01), 3.0)
+ODOMETRY = Odometry(NOW - SECOND, NOW, 0.5, 0.1)
+SIGHTINGS = Sightings(NOW, (Sighting("oak", 2.0, 0.1), Sighting("elm", None, -0.5, None, 0.02)))
+POSITION = Position(NOW, 1.0, 2.0, (0.0004, 0.0, 0.0009))
+STATUS = Status("r1", "a", NOW, 0.1, 0.02, 3, "", {"odometry": 7}, 1, 20, 2, 40)
+TRACK = Track("r1", NOW, 1.0, 2.0, 0.5, COVARIANCE, 3)
+DRIVE = Drive("r1", NOW, 0.5, 0.1)
+TRUTHS = Truths(NOW, (Truth("r1", 1.0, 2.0, 0.5, 1), Truth("r2", 3.0, 4.0, -0.5)))
+VALID = (ODOMETRY, SIGHTINGS, POSITION, BELIEF, FIX, STATUS, TRACK, DRIVE, TRUTHS)
+KINDS = [type(m).__name__ for m in VALID]
+
+NAMES = st.from_regex(r"[A-Za-z0-9_.-]{1,32}", fullmatch=True)
+FLOATS = st.floats(allow_nan=False, allow_infinity=False)
+STAMPS = st.integers(-(2**63), 2**63 - 1)
+COUNTS = st.integers(0, 2**63 - 1)
+TIERS = st.integers(0, 15)
+COVARIANCES_2 = st.tuples(FLOATS, FLOATS, FLOATS)
+COVARIANCES_3 = st.tuples(FLOATS, FLOATS, FLOATS, FLOATS, FLOATS, FLOATS)
+MAYBE = FLOATS | st.none()
+
+MESSAGES: dict[type[Any], st.SearchStrategy[Message]] = {
+    Odometry: st.builds(Odometry, STAMPS, STAMPS, FLOATS, FLOATS),
+    Sightings: st.builds(
+        Sightings,
+        STAMPS,
+        st.lists(st.builds(Sighting, NAMES, MAYBE, MAYBE, MAYBE, MAYBE), max_size=4).map(tuple),
+    ),
+    Position: st.builds(Position, STAMPS, FLOATS, FLOATS, COVARIANCES_2),
+    Belief: st.builds(Belief, NAMES, STAMPS, FLOATS, FLOATS, FLOATS, COVARIANCES_3, FLOATS, FLOATS),
+    Fix: st.builds(Fix, NAMES, NAMES, STAMPS, FLOATS, FLOATS, COVARIANCES_2, COVARIANCES_2, FLOATS),
+    Status: st.builds(
+        Status,
+        NAMES,
+        st.text(),
+        STAMPS,
+        FLOATS,
+        FLOATS,
+        TIERS,
+        st.text(),
+        st.dictionaries(st.text(), COUNTS, max_size=4),
+        *[COUNTS] * 4,
+    ),
+    Track: st.builds(
+        Track,
+        NAMES,
+        STAMPS,
+        FLOATS,
+        FLOATS,
+        FLOATS,
+        COVARIANCES_3 | st.none(),
+        TIERS,
+        st.text(),
+    ),
+    Drive: st.builds(Drive, NAMES, STAMPS, FLOATS, FLOATS),
+    Truths: st.builds(
+        Truths,
+        STAMPS,
+        st.lists(st.builds(Truth, NAMES, FLOATS, FLOATS, FLOATS, COUNTS), max_size=4).map(tuple),
+    ),
+}
+ANY_MESSAGE = st.one_of(*MESSAGES.values())
+per_kind = pytest.mark.parametrize("valid", VALID, ids=KINDS)
+
+
+def wire(*fields: Any) -> bytes:
+    """A payload written by somebody else's program."""
+    return bytes([VERSION]) + msgspec.msgpack.encode(fields)
+
+
+def fields_of(message: Message) -> list[Any]:
+    """Tag and fields as they are on the wire."""
+    fields: list[Any] = msgspec.msgpack.decode(encode(message)[1:])
+    return fields
+
+
+# Round trips and evolution ----------------------------------------------------------------------
+
+
+def test_the_strategies_and_samples_cover_the_whole_union() -> None:
+    assert set(MESSAGES) == {type(m) for m in VALID} == set(get_args(Message))
+
+
+@examples(200)
+@given(ANY_MESSAGE)
+def test_every_message_comes_back_as_it_was(message: Message) -> None:
+    again = decode(encode(message))
+    assert again == message
+    assert type(again) is type(message)
+
+
+@per_kind
+def test_an_old_reader_skips_fields_that_a_newer_program_added(valid: Message) -> None:
+    assert decode(wire(*fields_of(valid), "new", {"and": ["nested"]}, 3.5)) == valid
+
+
+@pytest.mark.parametrize(
+    ("newer", "added"),
+    [
+        (BELIEF, {"speed_m_s": 0.0, "turn_rate_rad_s": 0.0}),
+        (TRACK, {"lost": ""}),
+    ],
+    ids=["Belief", "Track"],
+)
+def test_a_new_reader_fills_in_what_an_older_program_left_out(
+    newer: Message, added: dict[str, Any]
+) -> None:
+    older = decode(wire(*fields_of(newer)[: -len(added)]))
+    assert older == msgspec.structs.replace(newer, **added)
+
+
+def test_nested_fields_evolve_as_well() -> None:
+    older = decode(wire("truth", NOW, [["r1", 1.0, 2.0, 0.5]]))
+    assert older == Truths(NOW, (Truth("r1", 1.0, 2.0, 0.5, bumps=0),))
+    newer = decode(wire("sightings", NOW, [["oak", 2.0, 0.1, None, None, "colour"]]))
+    assert newer == Sightings(NOW, (Sighting("oak", 2.0, 0.1),))
+
+
+@per_kind
+def test_a_required_field_that_is_missing_is_garbage(valid: Message) -> None:
+    required = sum(f.required for f in msgspec.structs.fields(valid))
+    assert decode(wire(*fields_of(valid)[:required])) is Refusal.GARBAGE
+
+
+# What is refused --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("payload", "reason"),
+    [
+        (b"", Refusal.EMPTY),
+        (bytes(LARGEST_PAYLOAD + 1), Refusal.TOO_LARGE),
+        (bytes([VERSION + 1]) + encode(BELIEF)[1:], Refusal.VERSION),
+        (bytes([VERSION]), Refusal.GARBAGE),
+        (bytes([VERSION]) + b"\xc1\xc1", Refusal.GARBAGE),
+        (wire("unheard of", 1, 2), Refusal.GARBAGE),
+        (wire("drive", "r 1", NOW, 0.5, 0.1), Refusal.GARBAGE),
+        (wire("drive", "r" * 33, NOW, 0.5, 0.1), Refusal.GARBAGE),
+        (wire("drive", "r1", "noon", 0.5, 0.1), Refusal.GARBAGE),
+        (wire("drive", b"\xff\xfe", NOW, 0.5, 0.1), Refusal.GARBAGE),
+        (bytes([VERSION]) + b"\x91" * 60_000, Refusal.GARBAGE),
+        (wire("truth", NOW)[:1] + b"\x93\xa5truth\x00\xdd\xff\xff\xff\xff", Refusal.GARBAGE),
+        (encode(BELIEF) + b"\x00", Refusal.GARBAGE),
+    ],
+    ids=[
+        "empty",
+        "too large",
+        "version",
+        "nothing after the version",
+        "never used byte",
+        "unknown type",
+        "space in a name",
+        "long name",
+        "text for a number",
+        "bytes for a name",
+        "nested too deep",
+        "claims four billion entries",
+        "something after the end",
+    ],
+)
+def test_a_payload_that_cannot_be_read_is_refused(payload: bytes, reason: Refusal) -> None:
+    assert decode(payload) is reason
+
+
+def test_the_largest_payload_is_still_read() -> None:
+    fits = encode(STATUS).replace(b"\xa1a", b"\xda" + b"\xff\x00" + b"a" * 0xFF00)
+    assert len(fits) <= LARGEST_PAYLOAD
+    assert isinstance(decode(fits), Status)
+
+
+@per_kind
+def test_a_valid_message_is_not_refused(valid: Message) -> None:
+    assert refusal(valid, NOW) is None
+
+
+def with_number(message: Any, field: str, value: float) -> list[Any]:
+    """The message with each of the numbers of a field (or nested in it) replaced in turn."""
+    replace = msgspec.structs.replace
+    old = getattr(message, field)
+    if isinstance(old, float):
+        return [replace(message, **{field: value})]
+    if not isinstance(old, tuple):
+        return []
+    entries: list[list[Any]] = []
+    for entry in old:
+        if isinstance(entry, float):
+            entries.append([value])
+        else:
+            entries.append(
+                [n for f in entry.__struct_fields__ for n in with_number(entry, f, value)]
+            )
+    return [
+        replace(message, **{field: (*old[:i], new, *old[i + 1 :])})
+        for i, news in enumerate(entries)
+        for new in news
+    ]
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+@pytest.mark.parametrize(
+    ("message", "field"),
+    [
+        (message, field)
+        for message in VALID
+        for field in message.__struct_fields__
+        if not isinstance(message, Sightings) and with_number(message, field, 0.0)
+    ],
+    ids=lambda part: part if isinstance(part, str) else type(part).__name__,
+)
+def test_a_number_that_is_not_finite_is_refused(message: Message, field: str, value: float) -> None:
+    for bad in with_number(message, field, value):
+        assert refusal(bad, NOW) is Refusal.NOT_FINITE, bad
+
+
+def test_numbers_of_sightings_are_left_to_the_filter() -> None:
+    for bad in with_number(SIGHTINGS, "sightings", math.nan):
+        assert refusal(bad, NOW) is None
+
+
+@per_kind
+def test_a_message_from_the_future_is_refused_beyond_the_tolerance(valid: Message) -> None:
+    assert refusal(valid, NOW - FUTURE_NS) is None
+    assert refusal(valid, NOW - FUTURE_NS - 1) is Refusal.FUTURE
+
+
+@pytest.mark.parametrize("duration_ns", [0, -1, -SECOND, LONGEST_ODOMETRY_NS + 1])
+def test_odometry_of_an_impossible_duration_is_refused(duration_ns: int) -> None:
+    assert refusal(Odometry(NOW - duration_ns, NOW, 0.0, 0.0), NOW) is Refusal.DURATION
+
+
+def test_odometry_of_the_longest_and_shortest_duration_is_taken() -> None:
+    for duration_ns in (1, LONGEST_ODOMETRY_NS):
+        assert refusal(Odometry(NOW - duration_ns, NOW, 0.0, 0.0), NOW) is None
+
+
+@pytest.mark.parametrize(
+    "bad", [(-1.0, 0.0, 1.0), (1.0, 0.0, -1.0), (1.0, 2.0, 1.0), (1.0, -2.0, 1.0)]
+)
+def test_what_is_no_covariance_is_refused(bad: tuple[float, float, float]) -> None:
+    replace = msgspec.structs.replace
+    for message in (
+        replace(FIX, sensor_covariance=bad),
+        replace(FIX, observer_covariance=bad),
+        replace(BELIEF, covariance=(*bad, 0.0, 0.0, 1.0)),
+        replace(POSITION, covariance=bad),
+    ):
+        assert refusal(message, NOW) is Refusal.NOT_A_COVARIANCE
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [
+        (0.04, 0.0, 0.04, 0.0, 0.0, -1.0),
+        (0.04, 0.0, 0.04, 1.0, 0.0, 0.0),
+        (0.04, 0.0, 0.04, 0.0, 5.0, 1.0),
+        (1.0, 0.9, 1.0, 0.9, -0.9, 1.0),
+    ],
+    ids=["hh", "xh", "yh", "all three together"],
+)
+def test_a_beliefs_covariance_includes_the_heading(bad: tuple[float, ...]) -> None:
+    assert refusal(msgspec.structs.replace(BELIEF, covariance=bad), NOW) is (
+        Refusal.NOT_A_COVARIANCE
+    )
+
+
+@pytest.mark.parametrize("message", [ODOMETRY, POSITION, BELIEF, FIX, TRACK, DRIVE, TRUTHS])
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_number_larger_than_any_field_is_refused(message: Message, sign: float) -> None:
+    for field in message.__struct_fields__:
+        for bad in with_number(message, field, sign * 2.0 * LARGEST_NUMBER):
+            assert refusal(bad, NOW) is Refusal.IMPLAUSIBLE, bad
+
+
+# Nothing raises ---------------------------------------------------------------------------------
+
+
+@examples(500)
+@given(st.binary(max_size=200))
+def test_random_bytes_never_raise(noise: bytes) -> None:
+    assert isinstance(decode(noise), Refusal | Message)
+    assert isinstance(decode(bytes([VERSION]) + noise), Refusal | Message)
+
+
+@examples(300)
+@given(ANY_MESSAGE, st.data())
+def test_a_truncated_payload_is_refused(message: Message, data: st.DataObject) -> None:
+    payload = encode(message)
+    kept = data.draw(st.integers(0, len(payload) - 1))
+    assert isinstance(decode(payload[:kept]), Refusal)
+
+
+@examples(500)
+@given(ANY_MESSAGE, st.data())
+def test_a_flipped_bit_never_raises(message: Message, data: st.DataObject) -> None:
+    payload = bytearray(encode(message))
+    bit = data.draw(st.integers(0, 8 * len(payload) - 1))
+    payload[bit // 8] ^= 1 << bit % 8
+    read = decode(bytes(payload))
+    if not isinstance(read, Refusal):
+        assert refusal(read, NOW) is None or isinstance(refusal(read, NOW), Refusal)

@@ -1,0 +1,78 @@
+"""The table of topics, and that quality flows downhill only."""
+
+from typing import get_args
+
+import pytest
+
+from cpcbl_team.collaboration import LOWEST_TIER, tiers_heard
+from cpcbl_team.config import CollaborationSettings
+from cpcbl_transport import topics
+from cpcbl_transport.bus import matches
+from cpcbl_transport.messages import Message
+from cpcbl_transport.topics import TOPICS, Topic
+
+TIERS = range(LOWEST_TIER + 1)
+per_topic = pytest.mark.parametrize("topic", TOPICS, ids=lambda t: t.key)
+
+
+def heard(key: str, patterns: list[str]) -> bool:
+    return any(matches(pattern, key) for pattern in patterns)
+
+
+def test_the_table_holds_every_topic_of_the_module() -> None:
+    assert set(TOPICS) == {t for t in vars(topics).values() if isinstance(t, Topic)}
+
+
+def test_no_key_of_one_topic_is_heard_under_another() -> None:
+    for topic in TOPICS:
+        concrete = topic.at(robot="r1", tier=3, observer="r2", incarnation="1")
+        assert [other for other in TOPICS if matches(other.at(), concrete)] == [topic]
+
+
+def test_every_message_is_carried_by_exactly_one_topic() -> None:
+    carried = [t.carries for t in TOPICS if t.carries is not None]
+    assert sorted(carried, key=str) == sorted(get_args(Message), key=str)
+
+
+def test_a_robots_inputs_are_the_topics_below_in() -> None:
+    assert set(topics.INPUTS) == {t for t in TOPICS if t.key.startswith("in/<robot>/")}
+
+
+@per_topic
+def test_every_topic_has_a_rate_and_a_reason(topic: Topic) -> None:
+    assert topic.rate.strip()
+    assert topic.reason.strip()
+
+
+@per_topic
+def test_names_that_are_left_out_become_wildcards(topic: Topic) -> None:
+    names = [c.strip("<>") for c in topic.key.split("/") if c.startswith("<")]
+    filled = topic.at(**{name: f"the-{name}" for name in names})
+    assert filled == topic.key.replace("<", "the-").replace(">", "")
+    assert topic.at().count("*") == len(names)
+    assert matches(topic.at(), filled)
+
+
+def test_worked_examples_of_keys() -> None:
+    assert topics.FIX.at(robot="r2", tier=3, observer="r1") == "fix/r2/3/r1"
+    assert topics.FIX.at(robot="r2", tier=0) == "fix/r2/0/*"
+    assert topics.BELIEF.at(tier=3) == "belief/3/*"
+    assert topics.TRUTH.at() == "field/truth"
+
+
+@pytest.mark.parametrize("own", TIERS)
+def test_only_better_tiers_are_heard(own: int) -> None:
+    tiers = tiers_heard(own, CollaborationSettings())
+    beliefs = [topics.BELIEF.at(tier=t) for t in tiers]
+    fixes = [topics.FIX.at(robot="me", tier=t) for t in tiers]
+    for theirs in TIERS:
+        better = theirs < own
+        assert heard(topics.BELIEF.at(tier=theirs, robot="r1"), beliefs) is better
+        assert heard(topics.FIX.at(robot="me", tier=theirs, observer="r1"), fixes) is better
+        assert not heard(topics.FIX.at(robot="you", tier=theirs, observer="r1"), fixes)
+
+
+def test_all_tiers_are_heard_both_ways() -> None:
+    tiers = tiers_heard(0, CollaborationSettings(direction="both-ways"))
+    patterns = [topics.BELIEF.at(tier=t) for t in tiers]
+    assert all(heard(topics.BELIEF.at(tier=t, robot="r1"), patterns) for t in TIERS)
