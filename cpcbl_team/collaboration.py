@@ -62,7 +62,8 @@ def fix_for(
 def placed(belief: Belief, at_ns: int, settings: CollaborationSettings) -> Place | None:
     """The teammate as a landmark at the time of a sighting; None when its belief is too old.
 
-    It is carried along its speed and turn rate; a tenth of that way is added to its sigma.
+    It is carried along its speed and turn rate; a third of that way is added to its sigma, for it
+    may have stopped or turned.
     """
     age = (at_ns - belief.stamp_ns) * 1e-9
     if not 0.0 <= age <= settings.max_age_s:
@@ -73,7 +74,7 @@ def placed(belief: Belief, at_ns: int, settings: CollaborationSettings) -> Place
     covariance = Covariance3(*belief.covariance)
     lever = (1.0, 0.0, belief.y_m - pose.y, 0.0, 1.0, pose.x - belief.x_m, 0.0, 0.0, 1.0)
     xx, xy, yy, *_ = covariance.transformed(lever)
-    doubt = (0.1 * way) ** 2
+    doubt = (way / 3.0) ** 2
     return Place(pose.x, pose.y, Covariance2(xx + doubt, xy, yy + doubt))
 
 

@@ -67,7 +67,7 @@ class Covariance3(NamedTuple):
         )
 
 
-SMALLEST_VARIANCE = 1e-12  # (1 um)^2, (1 urad)^2: what is called exact
+SMALLEST_VARIANCE = 1e-10  # (10 um)^2, (10 urad)^2: what is called exact
 ZERO3 = Covariance3(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 Row = tuple[float, float, float]
 

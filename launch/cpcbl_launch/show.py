@@ -52,9 +52,10 @@ class LiveTable:
         tracks, statuses, truths = recorder.latest()
         table = _table(
             f"{self._title}, {elapsed_s:.1f} s",
-            ("robot", "state"),
-            ("pid", "x m", "y m", "deg", "σ m", "error m", "tier", "out", "B", "in", "B"),
+            ("robot",),
+            ("pid", "x m", "y m", "deg", "σ m", "err m", "tier", "out", "B", "in", "B"),
         )
+        table.add_column("", overflow="fold")
         pids, restarts = supervisor.pids, supervisor.restarts
         here = [n.removeprefix("robot-") for n in supervisor.names if n != "field"]
         for name in [*here, *sorted(tracks.keys() - set(here))]:
@@ -63,10 +64,10 @@ class LiveTable:
             state = _state(tracks.get(name), pid, restarts.get(process, 0))
             table.add_row(
                 name,
-                state,
                 pid,
                 *_pose_cells(tracks.get(name), truths.get(name)),
                 *_traffic_cells(statuses.get(name)),
+                state,
             )
         return table
 
@@ -99,7 +100,7 @@ def _pose_cells(track: Track | None, truth: Truth | None) -> list[Cell]:
 
 def _traffic_cells(status: Status | None) -> list[Cell]:
     if status is None:
-        return []
+        return [""] * 4
     s = status
     return [
         _short(n) for n in (s.messages_sent, s.bytes_sent, s.messages_received, s.bytes_received)
@@ -107,7 +108,11 @@ def _traffic_cells(status: Status | None) -> list[Cell]:
 
 
 def _short(n: int) -> str:
-    return str(n) if n < 10_000 else f"{n / 1e3:.0f}k" if n < 10_000_000 else f"{n / 1e6:.0f}M"
+    for unit, size in (("", 1.0), ("k", 1e3), ("M", 1e6)):
+        if n < 999.5 * size:
+            digits = 1 if unit and n < 9.95 * size else 0
+            return f"{n / size:.{digits}f}{unit}"
+    return f"{n / 1e9:.1f}G"
 
 
 def _graded(error: float | None) -> Text:
@@ -152,8 +157,8 @@ def print_report(report: Report, console: Console) -> None:
             _share(r.inside_3_sigma),
             _number(r.nees, 1),
             _share(r.lost_share),
-            str(r.messages_sent),
-            str(r.bytes_sent),
+            _short(r.messages_sent),
+            _short(r.bytes_sent),
         )
     t = report.team
     known = [s.position_rmse_m for s in report.alone.values() if s.position_rmse_m is not None]
@@ -168,8 +173,8 @@ def print_report(report: Report, console: Console) -> None:
         _share(t.inside_3_sigma),
         _number(t.nees, 1),
         "",
-        str(t.messages_sent),
-        str(t.bytes_sent),
+        _short(t.messages_sent),
+        _short(t.bytes_sent),
         style="bold",
     )
     console.print(figures)
@@ -180,7 +185,7 @@ def print_report(report: Report, console: Console) -> None:
 def _remarks(report: Report) -> Iterator[str]:
     if report.alone:
         yield "before: RMSE before teammates began to help; the other columns are from then on"
-    yield "consistent: 98.9 % in 3 σ, NEES 2; out, B: beliefs and fixes sent, their payload bytes"
+    yield "consistent: 98.9 % in 3 σ, NEES 2; out, B: help sent, its payload bytes"
     for name, reason in report.left_out.items():
         yield f"left out: robot {name}: {reason}"
     for name, r in report.robots.items():

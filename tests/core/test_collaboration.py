@@ -112,12 +112,13 @@ def test_a_teammate_that_stands_is_where_it_said() -> None:
 
 
 def test_a_teammate_that_drives_is_carried_along() -> None:
-    """Resolution e: 0.5 s at 1 m/s to the north; a tenth of the way is added to its sigma."""
+    """Resolution e: 0.5 s at 1 m/s to the north; a third of the way is added to its sigma."""
     told = belief(1.0, 2.0, heading=0.5 * math.pi, sigma_m=0.2, speed_m_s=1.0)
     place = there(placed(told, SECOND // 2, RULES))
     assert (place.x, place.y) == pytest.approx((1.0, 2.5))
-    sideways = 0.04 + (0.5 * 0.05) ** 2 + 0.05**2  # with its heading's sigma of 0.05
-    assert place.covariance == pytest.approx((sideways, 0.0, 0.04 + 0.05**2))
+    doubt = (0.5 / 3.0) ** 2
+    sideways = 0.04 + (0.5 * 0.05) ** 2 + doubt  # with its heading's sigma of 0.05
+    assert place.covariance == pytest.approx((sideways, 0.0, 0.04 + doubt))
 
 
 def test_a_teammate_that_turns_is_carried_along_its_arc() -> None:

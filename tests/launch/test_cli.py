@@ -108,7 +108,7 @@ def test_up_shows_a_table_and_draws_a_picture(tmp_path: Path) -> None:
     team.write_text(PAIR)
     ran = cpcbl_team("up", team, "--duration", 3, "--picture", picture)
     assert ran.returncode == 0, ran.stderr
-    for word in ("driver", "watcher", "error m", "RMSE m", "NEES"):
+    for word in ("driver", "watcher", "err m", "RMSE m", "NEES"):
         assert word in ran.stdout
     assert max(map(len, ran.stdout.splitlines())) <= 80
     assert picture.read_bytes().startswith(b"\x89PNG")

@@ -18,6 +18,7 @@ from cpcbl_team.config import (
     Field,
     Gives,
     Landmark,
+    LocalizerSettings,
     OdometrySettings,
     PositionSensor,
     RobotSettings,
@@ -25,6 +26,7 @@ from cpcbl_team.config import (
     SimulationSettings,
     Start,
     Team,
+    Variant,
     Wall,
 )
 from cpcbl_team.geometry import Pose2, step
@@ -401,7 +403,7 @@ def test_a_field_runs_until_it_is_stopped() -> None:
 # Robots on the field ----------------------------------------------------------------------------
 
 MOVING = ("navigator", "scout", "patrol")
-TURNING_MATE_M = 0.02  # a teammate that turns is believed to drive on until its next belief
+TURNING_MATE_M = 0.005  # a teammate that turns is believed to drive on until its next belief
 
 
 @pytest.mark.parametrize(
@@ -437,15 +439,41 @@ def test_robots_pass_their_waypoints() -> None:
             assert min(math.dist(waypoint, place) for place in way) < 0.3
 
 
+EXACT_RANGE = {"range_share": 0.0, "range_floor_m": 0.0}
+EXACT_BEARING = {"bearing_sigma_deg": 0.0}
+EXACT_ODOMETRY = OdometrySettings(
+    distance_sigma_m_per_sqrt_m=0.0, turn_sigma_rad_per_sqrt_rad=0.0, turn_sigma_rad_per_sqrt_m=0.0
+)
+
+
 @pytest.mark.parametrize(
     "sensor",
-    [{"range_share": 0.0, "range_floor_m": 0.0}, {"bearing_sigma_deg": 0.0}],
-    ids=["range", "bearing"],
+    [EXACT_RANGE, EXACT_BEARING, EXACT_RANGE | EXACT_BEARING],
+    ids=["range", "bearing", "range and bearing"],
 )
-@pytest.mark.parametrize("sigma_m", [0.0, 0.05], ids=["exact start", "usual start"])
-def test_a_sensor_that_never_errs_stops_no_robot(sensor: dict[str, Any], sigma_m: float) -> None:
-    start = Start(x_m=0.0, y_m=0.0, sigma_m=sigma_m)
-    perfect = robot(start=start, sensor=SensorSettings(**sensor))
-    team = Team(name="t", robots={"r1": perfect}, map=marks(oak=(3.0, 0.0), elm=(3.0, 1.0)))
-    report, _ = simulate(team, 1, 2.0)
-    assert report.robots["r1"].samples > 10
+@pytest.mark.parametrize("odometry", [OdometrySettings(), EXACT_ODOMETRY], ids=["usual", "exact"])
+@pytest.mark.parametrize("variant", ["joint", "oval", "circular", "weighted"])
+def test_a_sensor_that_never_errs_stops_no_robot(
+    sensor: dict[str, Any], odometry: OdometrySettings, variant: Variant
+) -> None:
+    def perfect(x_m: float, *waypoints_m: tuple[float, float]) -> RobotSettings:
+        return RobotSettings(
+            start=Start(x_m=x_m, y_m=1.0),
+            sensor=SensorSettings(**sensor),
+            odometry=odometry,
+            localizer=LocalizerSettings(variant=variant),
+            waypoints_m=waypoints_m,
+        )
+
+    ahead, behind = (4.0, 1.0), (1.0, 4.0)
+    team = Team(
+        name="t",
+        robots={"r1": perfect(1.0, ahead, behind), "r2": perfect(4.0, behind, ahead)},
+        map=marks(oak=(0.0, 0.0), elm=(5.0, 0.0), ash=(5.0, 5.0)),
+        simulation=SimulationSettings(noise=0.0),
+    )
+    report, recorder = simulate(team, 1, 20.0)
+    tracks = [track for tracks in recorder.tracks.values() for track in tracks]
+    variances = [t.covariance[i] for t in tracks if t.covariance is not None for i in (0, 2, 5)]
+    assert min(variances, default=0.0) >= 0.0
+    assert [r.samples > 190 for r in report.robots.values()] == [True, True]

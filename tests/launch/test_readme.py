@@ -1,0 +1,67 @@
+"""What the documents tell a newcomer to type is typed here."""
+
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+from log_helpers import write_log
+from process_helpers import cpcbl_team
+
+from cpcbl_launch.team_file import parse_team
+
+ROOT = Path(__file__).parents[2]
+README = (ROOT / "README.md").read_text()
+TEAM_FILE = (ROOT / "docs" / "team_file.md").read_text()
+TOML = re.findall(r"```toml\n(.*?)```", TEAM_FILE, re.DOTALL)
+
+
+def readme_commands() -> list[str]:
+    """Every `cpcbl-team` command of the README that has no placeholder."""
+    blocks = "\n".join(re.findall(r"```sh\n(.*?)```", README, re.DOTALL))
+    lines = [line.split("#")[0] for line in blocks.splitlines()]
+    inline = re.findall(r"`(cpcbl-team [^`]+)`", README)
+    found = [line.strip() for line in (*lines, *inline) if line.startswith("cpcbl-team")]
+    return [c for c in dict.fromkeys(found) if not re.search(r"\b(FILE|NAME|DIR)\b", c)]
+
+
+def test_the_readme_has_the_commands_that_matter() -> None:
+    said = " ".join(readme_commands())
+    for words in ("up", "check", "robot r2", "evaluate mrclam MRCLAM6", "--blind 3,4,5"):
+        assert words in said
+    for target in ("make demo", "make test"):
+        assert target in README
+
+
+@pytest.mark.parametrize("command", [c for c in readme_commands() if " robot " not in c])
+def test_a_command_of_the_readme_runs(
+    command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In a folder with a short log and the documented team file; `up` for a few seconds only."""
+    write_log(tmp_path / "MRCLAM6", ("1", "2", "3", "4", "5"), seconds=6.0)
+    local = re.sub(r"\[transport\].*?\n\n", "", TOML[0], flags=re.DOTALL)
+    (tmp_path / "team.toml").write_text(local)
+    monkeypatch.chdir(tmp_path)
+    words = shlex.split(command)[1:]
+    if words[0] == "up":
+        words += ["--duration", "2"]
+    ran = cpcbl_team(*words)
+    assert ran.returncode == 0, ran.stderr
+    assert ran.stdout
+
+
+def test_the_documented_team_file_is_good() -> None:
+    (text,) = TOML
+    team = parse_team(text)
+    assert team.robots.keys() == {"r1", "r2", "tripod"}
+    assert team.robots["r2"].start is None
+    assert team.transport.listen == ("tcp/0.0.0.0:7447",)
+
+
+@pytest.mark.parametrize("document", sorted(ROOT.glob("*.md")) + sorted(ROOT.glob("docs/*.md")))
+def test_links_and_paths_of_a_document_lead_somewhere(document: Path) -> None:
+    text = document.read_text()
+    for target in re.findall(r"\]\(([^)#:]+)\)", text):
+        assert (document.parent / target).exists(), target
+    for path in re.findall(r"`((?:cpcbl_team|transport|agents|launch|tests|docs)/[\w/.]+)", text):
+        assert (ROOT / path).exists(), path
