@@ -68,6 +68,7 @@ class Covariance3(NamedTuple):
 
 
 SMALLEST_VARIANCE = 1e-10  # (10 um)^2, (10 urad)^2: what is called exact
+SPREAD_SHARE = 0.25  # of an ellipse's spread that its circle keeps
 ZERO3 = Covariance3(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 Row = tuple[float, float, float]
 
@@ -345,9 +346,13 @@ def with_all_shared(estimate: Estimate) -> Estimate:
 
 
 def circular(estimate: Estimate) -> Estimate:
-    """Position covariance reduced to a circle; never less than what the drift alone explains."""
+    """Position covariance reduced to a circle: the mean variance, and a part of the spread.
+
+    The mean alone claims too much along the major axis (98.0 % inside 3 sigma where 98.9 % are due,
+    99.3 % so). Never less than what the drift alone explains.
+    """
     pose, c, shared = estimate
-    mean = 0.5 * (c.xx + c.yy)
+    variance = 0.5 * (c.xx + c.yy) + SPREAD_SHARE * math.hypot(0.5 * (c.xx - c.yy), c.xy)
     if c.hh > 0.0:
-        mean = max(mean, (c.xh * c.xh + c.yh * c.yh) / c.hh)
-    return Estimate(pose, c._replace(xx=mean, xy=0.0, yy=mean), shared)
+        variance = max(variance, (c.xh * c.xh + c.yh * c.yh) / c.hh)
+    return Estimate(pose, c._replace(xx=variance, xy=0.0, yy=variance), shared)

@@ -42,7 +42,7 @@ from cpcbl_team.config import (
     Weights,
 )
 from cpcbl_team.constraints import range_circle
-from cpcbl_team.estimate import ZERO3, Covariance3
+from cpcbl_team.estimate import SPREAD_SHARE, ZERO3, Covariance3
 from cpcbl_team.gaussian import Covariance2, Gaussian2, merge
 from cpcbl_team.geometry import Pose2, step
 from cpcbl_team.inputs import Fix, Odometry, Sighting, Sightings, Told
@@ -377,7 +377,7 @@ def test_a_teammates_range_is_as_wide_as_sensor_and_place_together(variant: Vari
     seen = Sightings(1, (Sighting("mate", 3.0, None, 0.3),))
     covariance = robot.cycle(state, seen).estimate.covariance
     if variant == "circular":
-        assert covariance.xx == pytest.approx(0.5 * 100.0**2, rel=0.01)
+        assert covariance.xx == pytest.approx(0.5 * (1.0 + SPREAD_SHARE) * 100.0**2, rel=0.01)
     else:
         assert covariance.xx == pytest.approx(0.25, rel=0.03)
 
