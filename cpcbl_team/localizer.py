@@ -7,30 +7,18 @@ import math
 from collections.abc import Iterable
 from statistics import NormalDist
 
-from cpcbl_team import constraints as curves
-from cpcbl_team import recovery
+from cpcbl_team import recovery, weighted
 from cpcbl_team.config import Field, LocalizationSettings
 from cpcbl_team.constraints import Constraint
-from cpcbl_team.estimate import (
-    Covariance3,
-    Estimate,
-    Information,
-    Observation,
-    Scope,
-    circular,
-    merge,
-    merge_naive,
-    merge_split,
-    told,
-    with_all_shared,
-)
+from cpcbl_team.estimate import Covariance3, Estimate, Scope, circular, merge
+from cpcbl_team.fusion import Observation, merge_naive, merge_split, told, with_all_shared
 from cpcbl_team.gaussian import Covariance2
 from cpcbl_team.geometry import Pose2, step, wrap_angle
 from cpcbl_team.inputs import Belief, Fix, Odometry, Position, Sightings, Told
 from cpcbl_team.motion import move
 from cpcbl_team.sensors import sighting_fault
-from cpcbl_team.sightings import Measured, measured
-from cpcbl_team.state import Evidence, Memory, State
+from cpcbl_team.sightings import Measured, combined, constraints_of, measured, observation_of
+from cpcbl_team.state import Memory, State
 
 UNSTEERABLE_SIGMA_RAD = math.radians(100.0)  # beyond, no bearing can be linearized
 _FIX = "fix:"  # marks the source of an active fix, apart from seeing that teammate
@@ -59,17 +47,19 @@ class Localizer:
         if turn is None:
             return self._judged(state)
         prior = state.estimate
-        found = [(m, self._constraints(prior.pose, m, turn)) for m in seen]  # 3. constraints
+        found = [
+            (m, constraints_of(prior.pose, m, turn, self._rules)) for m in seen
+        ]  # 3. constraints
         accepted, rejected = self._gated(prior, found)
         landmarks = [c for m, cs in accepted for c in cs if not m.teammate or self._weighted]
         teammates = [(m, cs) for m, cs in accepted if m.teammate and not self._weighted]
         if self._weighted:
-            estimate = self._weighed(prior, landmarks)
+            estimate = weighted.merged(prior, landmarks, self._rules.weights)
         else:
-            evidence = _combined(landmarks)  # 4. their closest points, combined
+            evidence = combined(landmarks)  # 4. their closest points, combined
             estimate = merge(prior, evidence, self._scope(turn))  # 5. combined with the estimate
             for m, cs in teammates:
-                told = _observation(prior, m, cs, estimate)
+                told = observation_of(prior, m, cs, estimate)
                 estimate = self._merge_teammate(estimate, told, self._scope(turn))
         sources = [m.source for m, _ in accepted]
         state = state._replace(estimate=self._reduced(estimate))
@@ -145,7 +135,7 @@ class Localizer:
             )
             if m is not None:
                 seen.append(m)
-        pieces = [_sighting_evidence(state, m) for m in seen if m.usable and m.wall is None]
+        pieces = [recovery.seen_evidence(state, m) for m in seen if m.usable and m.wall is None]
         memory = recovery.remembered(memory, pieces).counted(*faults)
         least = self._rules.object_interval_s * 1e9
         fresh = [m for m in seen if _passed(memory.objects_ns.get(m.source), frame.stamp_ns, least)]
@@ -168,30 +158,6 @@ class Localizer:
             return Scope.POSITION if memory.heading_is_latest else Scope.HEADING
         return Scope.POSITION if position else Scope.HEADING if heading else None
 
-    # Step 3 -----------------------------------------------------------------------------------
-
-    def _constraints(self, pose: Pose2, m: Measured, turn: Scope) -> list[Constraint]:
-        """What one object says about position or heading; about both, each reading once."""
-        x, y, _ = m.place
-        found: list[Constraint | None] = []
-        if m.range_m is not None and turn is not Scope.HEADING:
-            if m.wall is None:
-                found.append(curves.range_circle(pose, x, y, m.range_m, m.range_sigma))
-            else:
-                direction = m.wall.direction_rad
-                found.append(curves.wall_line(pose, x, y, direction, m.range_m, m.range_sigma))
-        if m.bearing is not None and turn is not Scope.POSITION:
-            if m.wall is None:
-                found.append(curves.bearing_heading(pose, x, y, m.bearing, m.bearing_sigma))
-            else:
-                direction = m.wall.direction_rad
-                found.append(curves.wall_heading(pose, x, y, direction, m.bearing, m.bearing_sigma))
-        if turn is Scope.POSITION and m.gives_point_bearing and self._rules.bearing_for_position:
-            assert m.bearing is not None
-            found.append(curves.bearing_ray(pose, x, y, m.bearing, m.bearing_sigma))
-        plain = self._rules.paper_uncertainty or self._weighted
-        return [c.uncoupled() if plain else c for c in found if c is not None]
-
     # Steps 4 and 5 ----------------------------------------------------------------------------
 
     def _gated(
@@ -200,37 +166,13 @@ class Localizer:
         """The objects whose innovation the prior's chi-square bound accepts; the others' number."""
         accepted, rejected = [], 0
         for m, cs in sorted((f for f in found if f[1]), key=lambda f: f[0].source):
-            seen = _observation(prior, m, cs, prior)
+            seen = observation_of(prior, m, cs, prior)
             surprise = seen.normalized_innovation_squared(prior.covariance)
             if surprise <= self._gates[len(cs) - 1]:
                 accepted.append((m, cs))
             else:
                 rejected += 1
         return accepted, rejected
-
-    def _weighed(self, prior: Estimate, accepted: list[Constraint]) -> Estimate:
-        """Steps 4 and 5 without probabilities: inverse-distance weights among the readings."""
-        if not accepted:
-            return prior
-        total = sum(1.0 / c.distance_m for c in accepted)
-        x, y, h = (
-            sum(c.residual * c.row[i] / c.distance_m for c in accepted) / total for i in range(3)
-        )
-        return self._averaged(prior, (x, y), h if accepted[0].on_heading else None)
-
-    def _averaged(
-        self, prior: Estimate, offset: tuple[float, float], heading: float | None
-    ) -> Estimate:
-        """The static weighted average of estimate and sensor, with a nominal covariance."""
-        w, (x, y, h), c = self._rules.weights, prior.pose, prior.covariance
-        if heading is not None:
-            nominal = math.radians(w.nominal_heading_sigma_deg) ** 2
-            variance = max(nominal, (1.0 - w.heading) ** 2 * c.hh)
-            pose = Pose2(x, y, wrap_angle(h + w.heading * heading))
-            return Estimate(pose, Covariance3(c.xx, 0.0, c.yy, 0.0, 0.0, variance))
-        p = max(w.nominal_sigma_m**2, (1.0 - w.position) ** 2 * c.xx)
-        pose = Pose2(x + w.position * offset[0], y + w.position * offset[1], h)
-        return Estimate(pose, Covariance3(p, 0.0, p, 0.0, 0.0, c.hh))
 
     def _reduced(self, estimate: Estimate) -> Estimate:
         """The estimate in the form that the variant keeps."""
@@ -270,7 +212,7 @@ class Localizer:
         """The robot is said to be at (x, y); `observer` is a teammate's part of the covariance."""
         state = self.moved(state, stamp_ns)
         both = sensor if observer is None else sensor + observer
-        piece = _place_evidence(state, source, x, y, both, told=observer is not None)
+        piece = recovery.told_evidence(state, source, x, y, both, by_teammate=observer is not None)
         memory, prior = recovery.remembered(state.memory, [piece]), state.estimate
         state = state._replace(memory=memory)
         least = self._rules.object_interval_s * 1e9
@@ -282,7 +224,7 @@ class Localizer:
             return self._judged(self._updated(state, None, [], 1))
         scope = self._scope(Scope.POSITION)
         if self._weighted:
-            estimate = self._averaged(prior, offset, None)
+            estimate = weighted.averaged(prior, offset, None, self._rules.weights)
         elif observer is None:
             estimate = merge(prior, seen.information(), scope)
         else:
@@ -365,63 +307,5 @@ class Localizer:
         return state._replace(estimate=estimate, memory=memory)
 
 
-def _combined(accepted: list[Constraint]) -> Information:
-    """Step 4: the Gaussians at the closest points of all constraints, as one."""
-    evidence = Information.none()
-    for c in accepted:
-        evidence = evidence.add(c.row, c.residual, c.sigma * c.sigma)
-    return evidence
-
-
-def _observation(prior: Estimate, m: Measured, cs: list[Constraint], now: Estimate) -> Observation:
-    """The constraints of one object, about the estimate `now` though linearized at the prior.
-
-    A teammate's pose covariance is compounded with the sensor's (row 39), as the dependent part.
-    """
-    dx, dy = now.pose.x - prior.pose.x, now.pose.y - prior.pose.y
-    dh = wrap_angle(now.pose.heading - prior.pose.heading)
-    rows = tuple(c.row for c in cs)
-    residuals = tuple(c.residual - c.row[0] * dx - c.row[1] * dy - c.row[2] * dh for c in cs)
-    sensor = [c.sigma * c.sigma for c in cs]
-    place = m.place.covariance
-    (ax, ay), (bx, by) = cs[0].place_row, cs[-1].place_row
-    return Observation(
-        rows,
-        residuals,
-        Covariance2(sensor[0], 0.0, sensor[-1]),
-        Covariance2(
-            place.along(ax, ay),
-            place.xx * ax * bx + place.xy * (ax * by + ay * bx) + place.yy * ay * by,
-            place.along(bx, by),
-        ),
-    )
-
-
 def _passed(last_ns: int | None, now_ns: int, least_ns: float) -> bool:
     return last_ns is None or now_ns - last_ns >= least_ns
-
-
-def _sighting_evidence(state: State, m: Measured) -> Evidence:
-    x, y, covariance = m.place
-    sigma = math.sqrt(0.5 * (covariance.xx + covariance.yy))
-    return Evidence(
-        state.stamp_ns,
-        state.odometry_from_robot,
-        m.source,
-        x,
-        y,
-        m.range_m,
-        m.bearing,
-        m.range_sigma,
-        m.bearing_sigma,
-        sigma,
-        m.teammate,
-    )
-
-
-def _place_evidence(
-    state: State, source: str, x: float, y: float, covariance: Covariance2, told: bool
-) -> Evidence:
-    sigma = math.sqrt(0.5 * (covariance.xx + covariance.yy))
-    now, pose = state.stamp_ns, state.odometry_from_robot
-    return Evidence(now, pose, source, x, y, None, None, 0.0, 0.0, sigma, told)

@@ -12,8 +12,10 @@ from collections.abc import Iterable, Iterator
 from cpcbl_team.config import Field, LocalizerSettings
 from cpcbl_team.constraints import Constraint, bearing_heading, range_circle
 from cpcbl_team.estimate import SMALLEST_VARIANCE, ZERO3, Covariance3, Estimate, Information, merge
+from cpcbl_team.gaussian import Covariance2
 from cpcbl_team.geometry import Pose2
-from cpcbl_team.state import Evidence, Memory
+from cpcbl_team.sightings import Measured
+from cpcbl_team.state import Evidence, Memory, State
 
 WINDOW_NS = 20_000_000_000
 SPACING_NS = 500_000_000  # one piece of evidence an object and so long
@@ -24,6 +26,34 @@ WIDEN_NS = 1_000_000_000
 _OPEN = Covariance3(1e6, 0.0, 1e6, 0.0, 0.0, 1e3)
 _ENOUGH_POSITION_SIGMA_M = 0.7
 _ENOUGH_HEADING_SIGMA_RAD = 0.5
+
+
+def seen_evidence(state: State, m: Measured) -> Evidence:
+    """A sighting as evidence."""
+    x, y, covariance = m.place
+    sigma = math.sqrt(0.5 * (covariance.xx + covariance.yy))
+    return Evidence(
+        state.stamp_ns,
+        state.odometry_from_robot,
+        m.source,
+        x,
+        y,
+        m.range_m,
+        m.bearing,
+        m.range_sigma,
+        m.bearing_sigma,
+        sigma,
+        m.teammate,
+    )
+
+
+def told_evidence(
+    state: State, source: str, x: float, y: float, covariance: Covariance2, by_teammate: bool
+) -> Evidence:
+    """What a teammate or a position sensor says of the robot's own place, as evidence."""
+    sigma = math.sqrt(0.5 * (covariance.xx + covariance.yy))
+    now, pose = state.stamp_ns, state.odometry_from_robot
+    return Evidence(now, pose, source, x, y, None, None, 0.0, 0.0, sigma, by_teammate)
 
 
 def remembered(memory: Memory, pieces: Iterable[Evidence]) -> Memory:

@@ -1,13 +1,23 @@
-"""Step 2 of the cycle: which sightings can be used, for what, and with which sigma."""
+"""Steps 2 to 4 of the cycle: from sightings to measurements, to constraints, to one evidence."""
 
 import math
 from collections.abc import Mapping
 from typing import NamedTuple
 
 from cpcbl_team.collaboration import Place, placed
-from cpcbl_team.config import Field, LocalizationSettings, Wall
+from cpcbl_team.config import Field, LocalizationSettings, LocalizerSettings, Wall
+from cpcbl_team.constraints import (
+    Constraint,
+    bearing_heading,
+    bearing_ray,
+    range_circle,
+    wall_heading,
+    wall_line,
+)
+from cpcbl_team.estimate import Estimate, Information, Scope
+from cpcbl_team.fusion import Observation
 from cpcbl_team.gaussian import Covariance2
-from cpcbl_team.geometry import Pose2
+from cpcbl_team.geometry import Pose2, wrap_angle
 from cpcbl_team.inputs import Belief, Sighting
 from cpcbl_team.sensors import sighting_sigmas
 
@@ -78,3 +88,62 @@ def _expected_range(pose: Pose2, place: Place, wall: Wall | None) -> float:
         return math.hypot(dx, dy)
     direction = wall.direction_rad
     return abs(dy * math.cos(direction) - dx * math.sin(direction))
+
+
+def constraints_of(
+    pose: Pose2, m: Measured, turn: Scope, rules: LocalizerSettings
+) -> list[Constraint]:
+    """Step 3: what one object says about position or heading; about both, each reading once."""
+    x, y, _ = m.place
+    found: list[Constraint | None] = []
+    if m.range_m is not None and turn is not Scope.HEADING:
+        if m.wall is None:
+            found.append(range_circle(pose, x, y, m.range_m, m.range_sigma))
+        else:
+            direction = m.wall.direction_rad
+            found.append(wall_line(pose, x, y, direction, m.range_m, m.range_sigma))
+    if m.bearing is not None and turn is not Scope.POSITION:
+        if m.wall is None:
+            found.append(bearing_heading(pose, x, y, m.bearing, m.bearing_sigma))
+        else:
+            direction = m.wall.direction_rad
+            found.append(wall_heading(pose, x, y, direction, m.bearing, m.bearing_sigma))
+    across = turn is Scope.POSITION and m.wall is None and rules.bearing_for_position
+    if m.bearing is not None and across:
+        found.append(bearing_ray(pose, x, y, m.bearing, m.bearing_sigma))
+    plain = rules.paper_uncertainty or rules.variant == "weighted"
+    return [c.uncoupled() if plain else c for c in found if c is not None]
+
+
+def combined(accepted: list[Constraint]) -> Information:
+    """Step 4: the Gaussians at the closest points of all constraints, as one."""
+    evidence = Information.none()
+    for c in accepted:
+        evidence = evidence.add(c.row, c.residual, c.sigma * c.sigma)
+    return evidence
+
+
+def observation_of(
+    prior: Estimate, m: Measured, cs: list[Constraint], now: Estimate
+) -> Observation:
+    """The constraints of one object, about the estimate `now` though linearized at the prior.
+
+    A teammate's pose covariance is compounded with the sensor's (row 39), as the dependent part.
+    """
+    dx, dy = now.pose.x - prior.pose.x, now.pose.y - prior.pose.y
+    dh = wrap_angle(now.pose.heading - prior.pose.heading)
+    rows = tuple(c.row for c in cs)
+    residuals = tuple(c.residual - c.row[0] * dx - c.row[1] * dy - c.row[2] * dh for c in cs)
+    sensor = [c.sigma * c.sigma for c in cs]
+    place = m.place.covariance
+    (ax, ay), (bx, by) = cs[0].place_row, cs[-1].place_row
+    return Observation(
+        rows,
+        residuals,
+        Covariance2(sensor[0], 0.0, sensor[-1]),
+        Covariance2(
+            place.along(ax, ay),
+            place.xx * ax * bx + place.xy * (ax * by + ay * bx) + place.yy * ay * by,
+            place.along(bx, by),
+        ),
+    )

@@ -20,16 +20,12 @@ from cpcbl_team.estimate import (
     Covariance3,
     Estimate,
     Information,
-    Observation,
     Row,
     Scope,
     circular,
     merge,
-    merge_naive,
-    merge_split,
-    told,
-    with_all_shared,
 )
+from cpcbl_team.fusion import Observation, merge_naive, merge_split, told, with_all_shared
 from cpcbl_team.gaussian import Covariance2
 from cpcbl_team.geometry import Pose2
 from cpcbl_team.motion import move

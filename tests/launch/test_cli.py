@@ -3,6 +3,7 @@
 import json
 import signal
 import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -114,6 +115,19 @@ def test_up_shows_a_table_and_draws_a_picture(tmp_path: Path) -> None:
     assert picture.read_bytes().startswith(b"\x89PNG")
 
 
+def test_ctrl_c_ends_a_run_with_its_report_and_leaves_no_process(tmp_path: Path) -> None:
+    team = tmp_path / "team.toml"
+    team.write_text(PAIR.replace('"pair"', '"ctrl-c"'))
+    command = [*PROGRAM, "up", str(team), "--logs", str(tmp_path / "logs"), "--json"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        assert eventually(lambda: len(pids_of([str(tmp_path / "logs")])) >= 4)
+        process.send_signal(signal.SIGINT)
+        shown, _ = process.communicate(timeout=10.0)
+        assert process.returncode == 0
+    assert json.loads(shown)["robots"].keys() == {"driver", "watcher"}
+    assert not pids_of([str(tmp_path / "logs")])
+
+
 def test_up_on_a_log_agrees_with_evaluate(tmp_path: Path) -> None:
     write_log(tmp_path, ("1", "2"), seconds=40.0)
     evaluated = cpcbl_team("evaluate", "mrclam", tmp_path, "--blind", "2", "--json")
@@ -155,8 +169,6 @@ def test_the_documented_driver_feeds_a_robot(tmp_path: Path) -> None:
         status = decode(payload)
         assert isinstance(status, Status)
         heard.append(status)
-
-    import sys
 
     commands = [
         [*PROGRAM, "robot", "r1", "--team", str(team), "--connect", endpoint],

@@ -1,0 +1,173 @@
+"""Merging what teammates say: naive, as in the paper, or split covariance intersection.
+
+A teammate's own pose error is the same in everything that it says, and may be in this robot's
+estimate already. Split covariance intersection (Julier & Uhlmann 2001; Li & Nashashibi, ITSC 2012)
+merges such a part without counting it twice, whatever the correlation; the sensor's part of the
+noise is fresh and merged as usual.
+"""
+
+from typing import NamedTuple
+
+from cpcbl_team.estimate import (
+    SMALLEST_VARIANCE,
+    ZERO3,
+    Covariance3,
+    Estimate,
+    Information,
+    Row,
+    Scope,
+    merge,
+    product,
+    scoped,
+    shifted,
+    survival,
+)
+from cpcbl_team.gaussian import Covariance2
+
+
+class Observation(NamedTuple):
+    """One or two scalar measurements with one teammate's pose error in common.
+
+    residuals = rows . offset + noise; the noise has a part of the sensor (independent) and a part
+    of the teammate's pose (dependent: it may already be in the prior).
+    """
+
+    rows: tuple[Row, ...]
+    residuals: tuple[float, ...]
+    independent: Covariance2
+    dependent: Covariance2
+
+    def noise(self, dependent_factor: float = 1.0) -> Covariance2:
+        """The covariance of the residuals, with the dependent part times `dependent_factor`."""
+        i, d, k = self.independent, self.dependent, dependent_factor
+        return Covariance2(
+            i.xx + k * d.xx + SMALLEST_VARIANCE,
+            i.xy + k * d.xy,
+            i.yy + k * d.yy + SMALLEST_VARIANCE,
+        )
+
+    def information(self, dependent_factor: float = 1.0) -> Information:
+        """The evidence with the dependent part of its covariance times `dependent_factor`."""
+        r = self.noise(dependent_factor)
+        if len(self.rows) == 1:
+            return Information.none().add(self.rows[0], self.residuals[0], r.xx)
+        # Two correlated scalars become two independent ones (r = L L^T).
+        (first, second), (e, f) = self.rows, self.residuals
+        k = r.xy / r.xx
+        second = (second[0] - k * first[0], second[1] - k * first[1], second[2] - k * first[2])
+        evidence = Information.none().add(first, e, r.xx)
+        return evidence.add(second, f - k * e, r.yy - k * r.xy)
+
+    def normalized_innovation_squared(self, prior: Covariance3) -> float:
+        """e^T (H P H^T + R)^-1 e: chi-square with as many degrees of freedom as rows."""
+        r = self.noise()
+        first = prior.times(self.rows[0])
+        sxx = _dot(self.rows[0], first) + r.xx
+        if len(self.rows) == 1:
+            return self.residuals[0] ** 2 / sxx
+        sxy = _dot(self.rows[1], first) + r.xy
+        syy = _dot(self.rows[1], prior.times(self.rows[1])) + r.yy
+        return Covariance2(sxx, sxy, syy).mahalanobis_squared(*self.residuals)
+
+
+def _dot(a: Row, b: Row) -> float:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def merge_naive(prior: Estimate, seen: Observation, scope: Scope = Scope.POSE) -> Estimate:
+    """The paper's collaboration: the teammate's error is compounded and taken as fresh noise."""
+    return merge(prior, seen.information(), scope)
+
+
+_GOLDEN = 0.6180339887498949
+
+
+def merge_split(prior: Estimate, seen: Observation, scope: Scope = Scope.POSE) -> Estimate:
+    """Split covariance intersection: consistent for any correlation of the dependent parts.
+
+    P1 = P_d / w + P_i, R = R_d / (1 - w) + R_i, w chosen by golden section for the smallest merged
+    determinant (POSE; a trace of the position alone would give the heading away), trace of the
+    position or variance of the heading. Scopes other than POSE expect a prior of which nothing or
+    all is shared.
+    """
+    low, high = 0.02, 0.98
+    left, right = high - _GOLDEN * (high - low), low + _GOLDEN * (high - low)
+    best_left, best_right = (_split(prior, seen, scope, w) for w in (left, right))
+    for _ in range(6):
+        if best_left[0] <= best_right[0]:
+            high, right, best_right = right, left, best_left
+            left = high - _GOLDEN * (high - low)
+            best_left = _split(prior, seen, scope, left)
+        else:
+            low, left, best_left = left, right, best_right
+            right = low + _GOLDEN * (high - low)
+            best_right = _split(prior, seen, scope, right)
+    _, weight = min(best_left, best_right)
+    return _merge_split_at(prior, seen, scope, weight)
+
+
+def _widened(prior: Estimate, weight: float) -> Covariance3:
+    return prior.covariance.plus(prior.shared, 1.0 / weight - 1.0)
+
+
+def _split(prior: Estimate, seen: Observation, scope: Scope, weight: float) -> tuple[float, float]:
+    """(what is to be small, the weight)."""
+    widened = _widened(prior, weight)
+    evidence = seen.information(1.0 / (1.0 - weight)).matrix
+    merged = product(survival(widened, evidence), widened)
+    if scope is Scope.POSE:
+        return merged.determinant(), weight
+    return (merged.hh if scope is Scope.HEADING else merged.xx + merged.yy), weight
+
+
+def _merge_split_at(prior: Estimate, seen: Observation, scope: Scope, weight: float) -> Estimate:
+    widened = _widened(prior, weight)
+    evidence = seen.information(1.0 / (1.0 - weight))
+    survive = survival(widened, evidence.matrix)
+    merged = product(survive, widened)
+    pose = shifted(prior.pose, merged.times(evidence.vector), scope)
+    if scope is Scope.POSE:
+        own = prior.covariance.plus(prior.shared, -1.0).transformed(survive)
+        fresh = _sensor_part(seen, weight, merged)
+        return Estimate(pose, merged, merged.plus(own, -1.0).plus(fresh, -1.0))
+    _, kept_apart = scoped(survive, prior.covariance, merged, scope)
+    # The part out of scope was not widened after all, so neither is what it has in common.
+    kept = 1.0 if prior.shared is ZERO3 else weight
+    kept_apart = kept_apart._replace(xh=kept * kept_apart.xh, yh=kept * kept_apart.yh)
+    return Estimate(pose, kept_apart, kept_apart)
+
+
+def _sensor_part(seen: Observation, weight: float, merged: Covariance3) -> Covariance3:
+    """K R_i K^T with K = P' H^T R^-1: what of the merged covariance is fresh sensor noise."""
+    r = seen.noise(1.0 / (1.0 - weight))
+    gains = [merged.times(row) for row in seen.rows]
+    if len(gains) == 1:
+        k, (gx, gy, gh) = seen.independent.xx / (r.xx * r.xx), gains[0]
+        return Covariance3(gx * gx, gx * gy, gy * gy, gx * gh, gy * gh, gh * gh).scaled(k)
+    inverse, i = r.inverse(), seen.independent
+    wxx = inverse.xx * i.xx + inverse.xy * i.xy
+    wxy = inverse.xx * i.xy + inverse.xy * i.yy
+    wyx = inverse.xy * i.xx + inverse.yy * i.xy
+    wyy = inverse.xy * i.xy + inverse.yy * i.yy
+    c = Covariance2(
+        wxx * inverse.xx + wxy * inverse.xy,
+        wxx * inverse.xy + wxy * inverse.yy,
+        wyx * inverse.xy + wyy * inverse.yy,
+    )
+    f, g = gains
+
+    def entry(a: int, b: int) -> float:
+        return c.xx * f[a] * f[b] + c.xy * (f[a] * g[b] + g[a] * f[b]) + c.yy * g[a] * g[b]
+
+    return Covariance3(entry(0, 0), entry(0, 1), entry(1, 1), entry(0, 2), entry(1, 2), entry(2, 2))
+
+
+def told(estimate: Estimate) -> Estimate:
+    """After a belief has left the robot: all of it may be in a teammate's pose from now on."""
+    return estimate._replace(shared=estimate.covariance)
+
+
+def with_all_shared(estimate: Estimate) -> Estimate:
+    """For variants that keep heading and position apart: all of the covariance is shared as soon
+    as any of it is (the split of a part that is not updated is not defined)."""
+    return estimate if estimate.shared is ZERO3 else told(estimate)
