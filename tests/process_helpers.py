@@ -21,14 +21,14 @@ def cpcbl_team(*arguments: object, timeout_s: float = 90.0) -> "subprocess.Compl
 def command_of(pid: int) -> str:
     """The command line of a process, from the system's process list; empty if there is none."""
     found = subprocess.run(
-        ["ps", "-o", "args=", "-p", str(pid)], capture_output=True, text=True, check=False
+        ["ps", "-ww", "-o", "args=", "-p", str(pid)], capture_output=True, text=True, check=False
     )
     return found.stdout
 
 
 def pids_of(words: Sequence[str]) -> list[int]:
     """The processes whose command lines hold all these words."""
-    listed = subprocess.run(["ps", "-eo", "pid=,args="], capture_output=True, text=True, check=True)
+    listed = subprocess.run(["ps", "-ww", "-eo", "pid=,args="], capture_output=True, text=True, check=True)
     lines = [line.split(maxsplit=1) for line in listed.stdout.splitlines()]
     return [int(pid) for pid, command in lines if all(word in command for word in words)]
 

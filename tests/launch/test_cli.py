@@ -101,7 +101,7 @@ def test_up_reports_to_file_and_standard_output(tmp_path: Path) -> None:
         assert robot["position_rmse_m"] < 0.3
     assert report["robots"]["watcher"]["messages_sent"] > 0
     assert report["robots"]["driver"]["messages_sent"] == 0
-    assert not pids_of([str(team), "robot"])
+    assert not pids_of(["cpcbl_launch", str(tmp_path)])
 
 
 def test_up_shows_a_table_and_draws_a_picture(tmp_path: Path) -> None:
