@@ -1,6 +1,7 @@
 """The paper's non-probabilistic variant: weighted averages (section 3).
 
 Its covariance is nominal: it has no estimate of its quality, but gates and tiers need a number.
+That is what the last disagreement with a sensor left over, and a configured value at least.
 """
 
 import math
@@ -26,13 +27,14 @@ def averaged(
     prior: Estimate, offset: tuple[float, float], heading: float | None, weights: Weights
 ) -> Estimate:
     """The static weighted average of estimate and sensor: of heading, if one is given, or else of
-    position. The nominal covariance does not shrink faster than the average removes error."""
+    position."""
     (x, y, h), c = prior.pose, prior.covariance
     if heading is not None:
         nominal = math.radians(weights.nominal_heading_sigma_deg) ** 2
-        variance = max(nominal, (1.0 - weights.heading) ** 2 * c.hh)
+        variance = max(nominal, ((1.0 - weights.heading) * heading) ** 2)
         pose = Pose2(x, y, wrap_angle(h + weights.heading * heading))
         return Estimate(pose, Covariance3(c.xx, 0.0, c.yy, 0.0, 0.0, variance))
-    p = max(weights.nominal_sigma_m**2, (1.0 - weights.position) ** 2 * c.xx)
+    left_over = (1.0 - weights.position) * math.hypot(*offset)
+    p = max(weights.nominal_sigma_m, left_over) ** 2
     pose = Pose2(x + weights.position * offset[0], y + weights.position * offset[1], h)
     return Estimate(pose, Covariance3(p, 0.0, p, 0.0, 0.0, c.hh))

@@ -28,7 +28,9 @@ def command_of(pid: int) -> str:
 
 def pids_of(words: Sequence[str]) -> list[int]:
     """The processes whose command lines hold all these words."""
-    listed = subprocess.run(["ps", "-ww", "-eo", "pid=,args="], capture_output=True, text=True, check=True)
+    listed = subprocess.run(
+        ["ps", "-ww", "-eo", "pid=,args="], capture_output=True, text=True, check=True
+    )
     lines = [line.split(maxsplit=1) for line in listed.stdout.splitlines()]
     return [int(pid) for pid, command in lines if all(word in command for word in words)]
 
