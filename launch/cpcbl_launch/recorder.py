@@ -17,6 +17,7 @@ class RobotReport(Score, frozen=True, kw_only=True):
 
     variant: str
     lost_share: float
+    longest_lost_s: float
     lost_at_end: str
     bumps: int
     messages_sent: int
@@ -142,6 +143,7 @@ class Recorder:
                 **msgspec.structs.asdict(figures),
                 variant=variant,
                 lost_share=sum(bool(t.lost) for t in tracks) / max(len(tracks), 1),
+                longest_lost_s=_longest_lost_s(tracks),
                 lost_at_end=tracks[-1].lost if tracks else "was never heard of",
                 bumps=last_truth[name].bumps if name in last_truth else 0,
                 messages_sent=sum(s.messages_sent for s in statuses),
@@ -151,6 +153,17 @@ class Recorder:
                 counts=_added(statuses),
             )
         return Report(robots=robots, team=_team(robots))
+
+
+def _longest_lost_s(tracks: list[Track]) -> float:
+    longest_ns, since_ns = 0, None
+    for track in tracks:
+        if not track.lost:
+            since_ns = None
+            continue
+        since_ns = track.stamp_ns if since_ns is None else since_ns
+        longest_ns = max(longest_ns, track.stamp_ns - since_ns)
+    return longest_ns * 1e-9
 
 
 def _added(statuses: list[Status]) -> dict[str, int]:
