@@ -62,20 +62,20 @@ def test_processes_over_zenoh_agree_with_one_process() -> None:
 @pytest.mark.parametrize("collaboration", ["none", "passive", "active", "both"])
 @pytest.mark.parametrize("fusion", ["split-ci", "naive"])
 def test_no_divergence_lasts(name: str, variant: str, collaboration: str, fusion: str) -> None:
-    """A lost robot recovers: at once where it sees landmarks, soon where it sees teammates, in
-    minutes where it is only told its position from time to time (its heading is then a guess)."""
+    """A lost robot recovers: within 30 s where it sees landmarks, 2 min where it sees teammates now
+    and then, 10 min where it is only told its position (nothing then tells its heading)."""
     if collaboration == "none" and fusion == "naive":
         fusion = "split-ci"  # nothing is merged: the same run
     report = evaluated(name, True, Choice(variant, collaboration, fusion))
     for robot, r in report.robots.items():
         assert r.position_rmse_m is not None
         if robot not in BLIND:
-            assert r.longest_lost_s < 10.0, robot
+            assert r.longest_lost_s < 30.0, robot
             assert r.lost_at_end == "", robot
             assert r.position_rmse_m < 0.6, robot
         elif collaboration in ("passive", "both"):
-            assert r.longest_lost_s < 60.0, robot
+            assert r.longest_lost_s < 120.0, robot
             assert r.position_rmse_m < 1.5, robot
         elif collaboration == "active":
-            assert r.longest_lost_s < 400.0, robot
-            assert r.position_rmse_m < 3.0, robot
+            assert r.longest_lost_s < 600.0, robot
+            assert r.position_rmse_m < 4.0, robot
