@@ -19,7 +19,6 @@ from cpcbl_transport.topics import Qos
 
 log = logging.getLogger(__name__)
 
-DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 OPEN_TIMEOUT_MS = 2000
 
 
