@@ -59,6 +59,16 @@ class SensorSettings(Table, frozen=True, kw_only=True):
     """Beyond, only the bearing of an object is good enough to be used."""
     rate_hz: Positive = 10.0
     delay_s: float = 0.0
+    """Stamps are so much later than the exposure."""
+    range_scale: Positive = 1.0
+    """true range = range_scale x reading - range_bias_m."""
+    range_bias_m: float = 0.0
+    robot_range_bias_m: float = 0.0
+    """For sightings of teammates, instead of `range_bias_m`."""
+    bearing_bias_deg: float = 0.0
+    """true bearing = reading - bearing_bias_deg."""
+    correlation_s: NotNegative = 0.0
+    """Time constant with which errors to the same object fade; 0: each reading errs anew."""
     sees_landmarks: bool = True
     sees_robots: bool = True
 

@@ -1,5 +1,6 @@
 """The sensing agent: from any source to corrected odometry and sightings."""
 
+import math
 from collections import Counter
 from collections.abc import Sequence
 
@@ -7,7 +8,8 @@ from cpcbl_agents.agent import Anything, Located, Tick
 from cpcbl_agents.driving import Pilot
 from cpcbl_agents.sources import Source
 from cpcbl_team.config import LocalizationSettings
-from cpcbl_team.inputs import Odometry, Position, Sightings
+from cpcbl_team.geometry import wrap_angle
+from cpcbl_team.inputs import Odometry, Position, Sighting, Sightings
 
 SensorInput = Odometry | Sightings | Position
 
@@ -25,6 +27,9 @@ class SensingAgent:
         self._sensor, self._odometry = settings.sensor, settings.odometry
         self._odometry_delay_ns = int(settings.odometry.delay_s * 1e9)
         self._sensor_delay_ns = int(settings.sensor.delay_s * 1e9)
+        sensor = settings.sensor
+        biases = sensor.range_bias_m, sensor.robot_range_bias_m, sensor.bearing_bias_deg
+        self._exact = sensor.range_scale == 1.0 and not any(biases)
         self._source, self._teammates, self._pilot = source, teammates, pilot
         self.counts: Counter[str] = Counter()
 
@@ -57,8 +62,20 @@ class SensingAgent:
             )
         if isinstance(item, Position):
             return item
-        kept = tuple(s for s in item.sightings if self._sees(s.id))
+        kept = tuple(self._unbiased(s) for s in item.sightings if self._sees(s.id))
         return Sightings(item.stamp_ns - self._sensor_delay_ns, kept)
+
+    def _unbiased(self, s: Sighting) -> Sighting:
+        if self._exact:
+            return s
+        sensor, range_m, bearing = self._sensor, s.range_m, s.bearing_rad
+        if range_m is not None:
+            teammate = s.id in self._teammates
+            bias = sensor.robot_range_bias_m if teammate else sensor.range_bias_m
+            range_m = sensor.range_scale * range_m - bias
+        if bearing is not None and math.isfinite(bearing):
+            bearing = wrap_angle(bearing - math.radians(sensor.bearing_bias_deg))
+        return Sighting(s.id, range_m, bearing, s.range_sigma_m, s.bearing_sigma_rad)
 
     def _sees(self, name: str) -> bool:
         if name in self._teammates:
