@@ -73,7 +73,7 @@ class SensingAgent:
             teammate = s.id in self._teammates
             bias = sensor.robot_range_bias_m if teammate else sensor.range_bias_m
             range_m = sensor.range_scale * range_m - bias
-        if bearing is not None and math.isfinite(bearing):
+        if bearing is not None and abs(bearing) <= math.pi:  # what is out of range stays so
             bearing = wrap_angle(bearing - math.radians(sensor.bearing_bias_deg))
         return Sighting(s.id, range_m, bearing, s.range_sigma_m, s.bearing_sigma_rad)
 
