@@ -65,8 +65,13 @@ class SensorSettings(Table, frozen=True, kw_only=True):
     range_bias_m: float = 0.0
     robot_range_bias_m: float = 0.0
     """For sightings of teammates, instead of `range_bias_m`."""
+    range_is_depth: bool = False
+    """Readings are depths along the optical axis, as from an object's height in a picture: each is
+    divided by cos(bearing reading - optical_axis_deg) before scale and bias."""
+    optical_axis_deg: float = 0.0
+    bearing_scale: Positive = 1.0
+    """true bearing = bearing_scale x reading - bearing_bias_deg."""
     bearing_bias_deg: float = 0.0
-    """true bearing = reading - bearing_bias_deg."""
     correlation_s: NotNegative = 0.0
     """Time constant with which errors to the same object fade; 0: each reading errs anew."""
     sees_landmarks: bool = True

@@ -11,6 +11,7 @@ from cpcbl_team.config import LocalizationSettings
 from cpcbl_team.geometry import wrap_angle
 from cpcbl_team.inputs import Odometry, Position, Sighting, Sightings
 
+LEAST_COSINE = 0.1  # a depth says nothing of what is seen across the optical axis
 SensorInput = Odometry | Sightings | Position
 
 
@@ -29,7 +30,8 @@ class SensingAgent:
         self._sensor_delay_ns = int(settings.sensor.delay_s * 1e9)
         sensor = settings.sensor
         biases = sensor.range_bias_m, sensor.robot_range_bias_m, sensor.bearing_bias_deg
-        self._exact = sensor.range_scale == 1.0 and not any(biases)
+        scaled = sensor.range_scale != 1.0 or sensor.bearing_scale != 1.0
+        self._exact = not (any(biases) or scaled or sensor.range_is_depth)
         self._source, self._teammates, self._pilot = source, teammates, pilot
         self.counts: Counter[str] = Counter()
 
@@ -69,12 +71,18 @@ class SensingAgent:
         if self._exact:
             return s
         sensor, range_m, bearing = self._sensor, s.range_m, s.bearing_rad
+        if bearing is not None and abs(bearing) > math.pi:
+            return s  # a fault, to be counted as it is
         if range_m is not None:
+            if sensor.range_is_depth and bearing is not None:
+                off_axis = math.cos(bearing - math.radians(sensor.optical_axis_deg))
+                range_m /= max(off_axis, LEAST_COSINE)
             teammate = s.id in self._teammates
             bias = sensor.robot_range_bias_m if teammate else sensor.range_bias_m
             range_m = sensor.range_scale * range_m - bias
-        if bearing is not None and abs(bearing) <= math.pi:  # what is out of range stays so
-            bearing = wrap_angle(bearing - math.radians(sensor.bearing_bias_deg))
+        if bearing is not None:
+            bias = math.radians(sensor.bearing_bias_deg)
+            bearing = wrap_angle(sensor.bearing_scale * bearing - bias)
         return Sighting(s.id, range_m, bearing, s.range_sigma_m, s.bearing_sigma_rad)
 
     def _sees(self, name: str) -> bool:
