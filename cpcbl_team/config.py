@@ -32,11 +32,17 @@ class OdometryNoise(Table, frozen=True, kw_only=True):
 
 
 class OdometrySettings(OdometryNoise, frozen=True, kw_only=True):
-    """Odometry of one robot: correction first (`true = scale x reported`), then its noise."""
+    """Odometry of one robot: how it is corrected, then its noise."""
 
     distance_scale: Positive = 1.0
+    distance_loss_m_per_rad: NotNegative = 0.0
+    """true distance = distance_scale x reported - distance_loss_m_per_rad x |reported turn|, but no
+    less than none: wheels that are told to drive a curve do not reach their speed."""
     turn_scale: Positive = 1.0
+    turn_bias_rad_per_m: float = 0.0
+    """true turn = turn_scale x reported + turn_bias_rad_per_m x true distance."""
     delay_s: NotNegative = 0.0
+    """The motion follows the stamp by so much."""
     rate_hz: Positive = 20.0
     moves: bool = True
     """False for a robot that stands still and reports no odometry."""

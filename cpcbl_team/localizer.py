@@ -85,8 +85,7 @@ class Localizer:
             whole_ns = motion.stamp_ns - motion.from_ns
             share = max(0, end_ns - max(stamp_ns, motion.from_ns)) / whole_ns
             s = self.settings.odometry
-            distance = share * motion.distance_m * s.distance_scale
-            turn = share * motion.turn_rad * s.turn_scale
+            distance, turn = share * motion.distance_m, share * motion.turn_rad
             if distance != 0.0 or turn != 0.0:
                 reckoned = step(reckoned, distance, turn)
                 estimate = self._reduced(move(estimate, distance, turn, s))

@@ -1,11 +1,42 @@
-"""What a sighting is worth: its faults, its sigmas."""
+"""Readings made right by what calibration knows; what a sighting is worth."""
 
 import math
 
-from cpcbl_team.config import SensorSettings
-from cpcbl_team.inputs import Sighting
+import msgspec
+
+from cpcbl_team.config import OdometrySettings, SensorSettings
+from cpcbl_team.geometry import wrap_angle
+from cpcbl_team.inputs import Odometry, Sighting
 
 LARGEST_M = 1e6
+LEAST_COSINE = 0.1  # a depth says nothing of what is seen across the optical axis
+
+
+def corrected_odometry(piece: Odometry, s: OdometrySettings) -> Odometry:
+    """What the wheels really did, and when."""
+    delay_ns = int(s.delay_s * 1e9)
+    way = s.distance_scale * abs(piece.distance_m)
+    way = max(0.0, way - s.distance_loss_m_per_rad * abs(piece.turn_rad))
+    distance = math.copysign(way, piece.distance_m)
+    turn = s.turn_scale * piece.turn_rad + s.turn_bias_rad_per_m * distance
+    return Odometry(piece.from_ns + delay_ns, piece.stamp_ns + delay_ns, distance, turn)
+
+
+def corrected_sighting(sighting: Sighting, sensor: SensorSettings, teammate: bool) -> Sighting:
+    """The sighting without the sensor's systematic errors; a fault stays as it is."""
+    name, range_m, bearing, range_sigma, bearing_sigma = msgspec.structs.astuple(sighting)
+    if bearing is not None and abs(bearing) > math.pi:
+        return sighting
+    if range_m is not None:
+        if sensor.range_is_depth and bearing is not None:
+            off_axis = math.cos(bearing - math.radians(sensor.optical_axis_deg))
+            range_m /= max(off_axis, LEAST_COSINE)
+        bias = sensor.robot_range_bias_m if teammate else sensor.range_bias_m
+        range_m = sensor.range_scale * range_m - bias
+    if bearing is not None:
+        bias = math.radians(sensor.bearing_bias_deg)
+        bearing = wrap_angle(sensor.bearing_scale * bearing - bias)
+    return Sighting(name, range_m, bearing, range_sigma, bearing_sigma)
 
 
 def sighting_fault(sighting: Sighting) -> str:

@@ -44,7 +44,7 @@ from cpcbl_team.config import (
 from cpcbl_team.constraints import range_circle
 from cpcbl_team.estimate import SPREAD_SHARE, ZERO3, Covariance3
 from cpcbl_team.gaussian import Covariance2, Gaussian2, merge
-from cpcbl_team.geometry import Pose2, step
+from cpcbl_team.geometry import Pose2
 from cpcbl_team.inputs import Fix, Odometry, Sighting, Sightings, Told
 from cpcbl_team.localizer import Localizer
 from cpcbl_team.state import State
@@ -607,12 +607,6 @@ def test_odometry_is_driven_as_time_passes(variant: Variant) -> None:
     halves = robot.moved(robot.moved(state, 3), 20)
     assert halves.estimate.pose == pytest.approx((1.0, 0.0, 0.0))
     assert halves.odometry_from_robot == pytest.approx((1.0, 0.0, 0.0))
-
-
-def test_reported_motion_is_corrected_by_its_scales() -> None:
-    robot = localizer(odometry=OdometrySettings(distance_scale=1.1, turn_scale=0.9))
-    state = robot.drive(state_at(ORIGIN, diagonal(0.1, 0.05)), Odometry(0, 10, 1.0, 0.2))
-    assert robot.moved(state, 10).estimate.pose == pytest.approx(step(ORIGIN, 1.1, 0.18))
 
 
 def test_motion_on_the_spot_is_none() -> None:

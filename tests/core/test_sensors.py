@@ -2,9 +2,14 @@ import math
 
 import pytest
 
-from cpcbl_team.config import SensorSettings
-from cpcbl_team.inputs import Sighting
-from cpcbl_team.sensors import sighting_fault, sighting_sigmas
+from cpcbl_team.config import OdometrySettings, SensorSettings
+from cpcbl_team.inputs import Odometry, Sighting
+from cpcbl_team.sensors import (
+    corrected_odometry,
+    corrected_sighting,
+    sighting_fault,
+    sighting_sigmas,
+)
 
 SENSOR = SensorSettings(range_share=0.05, range_floor_m=0.0, bearing_sigma_deg=5.0)
 NAN = math.nan
@@ -67,3 +72,65 @@ def test_the_expected_range_makes_the_sigma_within_a_factor_of_two(
 
 def test_a_sightings_own_sigmas_win() -> None:
     assert sighting_sigmas(Sighting("a", 4.0, 0.0, 0.7, 0.3), SENSOR, 8.0) == (0.7, 0.3)
+
+
+def test_odometry_is_corrected_by_delay_scales_loss_and_bias() -> None:
+    s = OdometrySettings(
+        delay_s=0.2,
+        distance_scale=1.1,
+        distance_loss_m_per_rad=0.1,
+        turn_scale=0.9,
+        turn_bias_rad_per_m=0.05,
+    )
+    way = 1.1 - 0.02
+    assert corrected_odometry(Odometry(0, 10, 1.0, -0.2), s) == Odometry(
+        200_000_000, 200_000_010, pytest.approx(way), pytest.approx(-0.18 + 0.05 * way)
+    )
+    backwards = corrected_odometry(Odometry(0, 10, -1.0, 0.2), s)
+    assert backwards.distance_m == pytest.approx(-way)
+
+
+def test_a_turn_on_the_spot_does_not_drive_backwards() -> None:
+    s = OdometrySettings(distance_loss_m_per_rad=0.1)
+    assert corrected_odometry(Odometry(0, 10, 0.01, 1.0), s).distance_m == 0.0
+
+
+@pytest.mark.parametrize("teammate", [False, True])
+@pytest.mark.parametrize("is_depth", [False, True])
+def test_readings_made_from_the_truth_are_corrected_to_it(teammate: bool, is_depth: bool) -> None:
+    sensor = SensorSettings(
+        range_scale=0.95,
+        range_bias_m=0.04,
+        robot_range_bias_m=0.07,
+        range_is_depth=is_depth,
+        optical_axis_deg=2.0,
+        bearing_scale=0.97,
+        bearing_bias_deg=-1.0,
+    )
+    range_m, bearing = 3.0, 0.4
+    reading = (bearing - math.radians(1.0)) / 0.97
+    axis = math.cos(reading - math.radians(2.0)) if is_depth else 1.0
+    depth = (range_m + (0.07 if teammate else 0.04)) / 0.95 * axis
+    found = corrected_sighting(Sighting("a", depth, reading, 0.1, 0.2), sensor, teammate)
+    assert found.range_m == pytest.approx(range_m)
+    assert found.bearing_rad == pytest.approx(bearing)
+    assert (found.id, found.range_sigma_m, found.bearing_sigma_rad) == ("a", 0.1, 0.2)
+
+
+@pytest.mark.parametrize(
+    "sighting",
+    [Sighting("a", 1.0, None), Sighting("a", None, 0.1), Sighting("a"), Sighting("a", 1.0, 3.2)],
+)
+def test_a_neutral_correction_changes_nothing(sighting: Sighting) -> None:
+    assert corrected_sighting(sighting, SensorSettings(), True) == sighting
+
+
+def test_faulty_readings_stay_faulty() -> None:
+    sensor = SensorSettings(range_is_depth=True, range_bias_m=0.1, bearing_bias_deg=1.0)
+    for sighting, fault in (
+        (Sighting("a", NAN, 0.1), "not_finite"),
+        (Sighting("a", 1.0, NAN), "not_finite"),
+        (Sighting("a", 1.0, 3.2), "bearing_out_of_range"),
+        (Sighting("a", 0.05, 0.1), "range_not_positive"),
+    ):
+        assert sighting_fault(corrected_sighting(sighting, sensor, False)) == fault
