@@ -1,9 +1,10 @@
 # make demo: a team of robots for half a minute.   make test: format, lint, types, layers, tests.
+# make bench: what a cycle costs, beside other filters.
 PYTHON ?= python3
 VENV ?= .venv
 BIN = $(VENV)/bin
 
-.PHONY: setup demo test check unit test-long clean
+.PHONY: setup demo test check unit test-long bench clean
 
 setup: $(VENV)/ready
 
@@ -31,5 +32,14 @@ unit: setup
 test-long: setup
 	$(BIN)/pytest -n 2 -m "$(if $(CPCBL_MRCLAM),long or log,long)"
 
+# Timed, so alone on the machine: the localizer's variants and their peers in the same run.
+bench: setup
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev,bench]'
+	@mkdir -p build
+	$(BIN)/pytest -q --benchmark-json=build/bench_raw.json --benchmark-columns=median \
+	  --benchmark-sort=name --benchmark-warmup=off tests/benchmarks/bench_cycle.py > build/bench.log \
+	  || { cat build/bench.log; exit 1; }
+	PYTHONPATH=.:agents:transport:launch:tests $(BIN)/python -m benchmarks.table build/bench_raw.json build/bench.json
+
 clean:
-	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) build .pytest_cache .mypy_cache .ruff_cache .hypothesis
