@@ -10,6 +10,7 @@ Schmidt 1966) and gives the correlated sideways drift of resolution b.
 """
 
 import math
+from collections.abc import Iterable
 from enum import Enum
 from typing import NamedTuple
 
@@ -33,7 +34,11 @@ class Covariance3(NamedTuple):
         return Covariance2(self.xx, self.xy, self.yy)
 
     def plus(self, other: "Covariance3", factor: float = 1.0) -> "Covariance3":
-        return Covariance3(*(a + factor * b for a, b in zip(self, other, strict=True)))
+        xx, xy, yy, xh, yh, hh = self
+        k, (oxx, oxy, oyy, oxh, oyh, ohh) = factor, other
+        return Covariance3(
+            xx + k * oxx, xy + k * oxy, yy + k * oyy, xh + k * oxh, yh + k * oyh, hh + k * ohh
+        )
 
     def scaled(self, factor: float) -> "Covariance3":
         return Covariance3(*(factor * a for a in self))
@@ -110,29 +115,40 @@ class Information(NamedTuple):
 
     def add(self, h: Row, residual: float, variance: float) -> "Information":
         """With one more scalar measurement: residual = h . offset + noise of this variance."""
-        x, y, a = h
-        m, v, w = self.matrix, self.vector, 1.0 / max(variance, SMALLEST_VARIANCE)
-        r = residual * w
-        return Information(
-            Covariance3(
-                m.xx + w * x * x,
-                m.xy + w * x * y,
-                m.yy + w * y * y,
-                m.xh + w * x * a,
-                m.yh + w * y * a,
-                m.hh + w * a * a,
-            ),
-            (v[0] + r * x, v[1] + r * y, v[2] + r * a),
-        )
+        return self.with_all(((h, residual, variance),))
+
+    def with_all(self, measurements: Iterable[tuple[Row, float, float]]) -> "Information":
+        """With these (row, residual, variance) of scalar measurements."""
+        (xx, xy, yy, xh, yh, hh), (ex, ey, eh) = self
+        for (x, y, a), residual, variance in measurements:
+            w = 1.0 / (variance if variance > SMALLEST_VARIANCE else SMALLEST_VARIANCE)
+            r, wx, wy = residual * w, w * x, w * y
+            xx += wx * x
+            xy += wx * y
+            yy += wy * y
+            xh += wx * a
+            yh += wy * a
+            hh += w * a * a
+            ex += r * x
+            ey += r * y
+            eh += r * a
+        return Information(Covariance3(xx, xy, yy, xh, yh, hh), (ex, ey, eh))
 
 
 def survival(prior: Covariance3, information: Covariance3) -> Matrix3:
     """(I + P A)^-1, the share of the prior's error that survives the evidence A."""
-    a, b, c = prior.times((information.xx, information.xy, information.xh))
-    d, e, f = prior.times((information.xy, information.yy, information.yh))
-    g, h, i = prior.times((information.xh, information.yh, information.hh))
-    # columns of P A are (a b c), (d e f), (g h i)
-    a, e, i = a + 1.0, e + 1.0, i + 1.0
+    xx, xy, yy, xh, yh, hh = prior
+    axx, axy, ayy, axh, ayh, ahh = information
+    # columns of I + P A are (a b c), (d e f), (g h i)
+    a = xx * axx + xy * axy + xh * axh + 1.0
+    b = xy * axx + yy * axy + yh * axh
+    c = xh * axx + yh * axy + hh * axh
+    d = xx * axy + xy * ayy + xh * ayh
+    e = xy * axy + yy * ayy + yh * ayh + 1.0
+    f = xh * axy + yh * ayy + hh * ayh
+    g = xx * axh + xy * ayh + xh * ahh
+    h = xy * axh + yy * ayh + yh * ahh
+    i = xh * axh + yh * ayh + hh * ahh + 1.0
     A, B, C = e * i - h * f, g * f - d * i, d * h - g * e
     det = a * A + b * B + c * C
     k = 1.0 / det
@@ -152,13 +168,14 @@ def survival(prior: Covariance3, information: Covariance3) -> Matrix3:
 def product(m: Matrix3, p: Covariance3) -> Covariance3:
     """M P where it is known to be symmetric."""
     a, b, c, d, e, f, g, h, i = m
+    xx, xy, yy, xh, yh, hh = p
     return Covariance3(
-        a * p.xx + b * p.xy + c * p.xh,
-        d * p.xx + e * p.xy + f * p.xh,
-        d * p.xy + e * p.yy + f * p.yh,
-        g * p.xx + h * p.xy + i * p.xh,
-        g * p.xy + h * p.yy + i * p.yh,
-        g * p.xh + h * p.yh + i * p.hh,
+        a * xx + b * xy + c * xh,
+        d * xx + e * xy + f * xh,
+        d * xy + e * yy + f * yh,
+        g * xx + h * xy + i * xh,
+        g * xy + h * yy + i * yh,
+        g * xh + h * yh + i * hh,
     )
 
 
@@ -169,7 +186,8 @@ def scoped(
     if scope is Scope.POSE:
         return survive, posterior
     if scope is Scope.POSITION:
-        return (*survive[:6], 0.0, 0.0, 1.0), posterior._replace(hh=prior.hh)
+        xx, xy, yy, xh, yh, _ = posterior
+        return (*survive[:6], 0.0, 0.0, 1.0), Covariance3(xx, xy, yy, xh, yh, prior.hh)
     return (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, *survive[6:]), Covariance3(
         prior.xx, prior.xy, prior.yy, posterior.xh, posterior.yh, posterior.hh
     )
@@ -208,4 +226,4 @@ def circular(estimate: Estimate) -> Estimate:
     variance = 0.5 * (c.xx + c.yy) + SPREAD_SHARE * math.hypot(0.5 * (c.xx - c.yy), c.xy)
     if c.hh > 0.0:
         variance = max(variance, (c.xh * c.xh + c.yh * c.yh) / c.hh)
-    return Estimate(pose, c._replace(xx=variance, xy=0.0, yy=variance), shared)
+    return Estimate(pose, Covariance3(variance, 0.0, variance, c.xh, c.yh, c.hh), shared)

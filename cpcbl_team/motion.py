@@ -50,20 +50,14 @@ def motion_noise(heading: float, distance: float, turn: float, noise: OdometryNo
 def move(estimate: Estimate, distance: float, turn: float, noise: OdometryNoise) -> Estimate:
     """The estimate after the wheels report an arc of `distance` metres that turns by `turn`."""
     pose, covariance, shared = estimate
-    lx, ly = _lever(pose.heading, distance, turn)
-    q = motion_noise(pose.heading, distance, turn, noise)
-    moved = _sheared(covariance, lx, ly)
+    direction = pose.heading + 0.5 * turn
+    # where a heading error of one radian leads, in metres: the last column of the Jacobian
+    lx, ly = -distance * math.sin(direction), distance * math.cos(direction)
     return Estimate(
         step(pose, distance, turn),
-        moved.plus(q),
+        _sheared(covariance, lx, ly).plus(motion_noise(pose.heading, distance, turn, noise)),
         shared if shared is ZERO3 else _sheared(shared, lx, ly),
     )
-
-
-def _lever(heading: float, distance: float, turn: float) -> tuple[float, float]:
-    """Where a heading error of one radian leads, in metres: the last column of the Jacobian."""
-    direction = heading + 0.5 * turn
-    return -distance * math.sin(direction), distance * math.cos(direction)
 
 
 def _sheared(p: Covariance3, lx: float, ly: float) -> Covariance3:
