@@ -16,7 +16,7 @@ from cpcbl_team.gaussian import Covariance2
 from cpcbl_team.geometry import Pose2, step, wrap_angle
 from cpcbl_team.inputs import Belief, Fix, Odometry, Position, Sightings, Told
 from cpcbl_team.motion import move
-from cpcbl_team.sensors import sighting_fault
+from cpcbl_team.sensors import repeated_share, sighting_fault
 from cpcbl_team.sightings import Measured, combined, constraints_of, measured, observation_of
 from cpcbl_team.state import Memory, State
 
@@ -34,6 +34,7 @@ class Localizer:
         self.field = field
         self._rules = settings.localizer
         self._weighted = self._rules.variant == "weighted"
+        self._correlated = settings.sensor.correlation_s > 0.0
         p = self._rules.gate_probability
         self._gates = (NormalDist().inv_cdf(0.5 + 0.5 * p) ** 2, -2.0 * math.log(1.0 - p))
         split = settings.collaboration.fusion == "split-ci"
@@ -116,7 +117,8 @@ class Localizer:
 
     def _measure(self, state: State, frame: Sightings) -> tuple[State, list[Measured]]:
         """The usable sightings of a frame. Faulty ones are counted by reason; those of an object
-        that was used too short a time ago are left out: its errors are correlated."""
+        that was used too short a time ago are left out, and those of one that was used not long
+        ago count for less: their errors are correlated."""
         memory = state.memory
         seen, faults = [], []
         for sighting in frame.sightings:
@@ -138,7 +140,15 @@ class Localizer:
         memory = recovery.remembered(memory, pieces).counted(*faults)
         least = self._rules.object_interval_s * 1e9
         fresh = [m for m in seen if _passed(memory.objects_ns.get(m.source), frame.stamp_ns, least)]
+        if self._correlated:
+            fresh = [m.doubted(self._repeated(memory, m.source, frame.stamp_ns)) for m in fresh]
         return state._replace(memory=memory), fresh
+
+    def _repeated(self, memory: Memory, source: str, now_ns: int) -> float:
+        """By how much the variance of what this source says now is to grow."""
+        last_ns = memory.objects_ns.get(source)
+        seconds = None if last_ns is None else (now_ns - last_ns) * 1e-9
+        return repeated_share(seconds, self.settings.sensor.correlation_s)
 
     def _turn(self, state: State, seen: list[Measured]) -> Scope | None:
         """Heading or position, the one that waits longer; one timer a type. None: neither."""
@@ -217,6 +227,8 @@ class Localizer:
         least = self._rules.object_interval_s * 1e9
         if not _passed(memory.objects_ns.get(source), stamp_ns, least):
             return state
+        if self._correlated:
+            sensor = sensor.scaled(self._repeated(memory, source, stamp_ns))
         offset = x - prior.pose.x, y - prior.pose.y
         seen = Observation(_AXES, offset, sensor, observer or Covariance2(0.0, 0.0, 0.0))
         if seen.normalized_innovation_squared(prior.covariance) > self._gates[1]:

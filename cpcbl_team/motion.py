@@ -32,9 +32,12 @@ def motion_noise(heading: float, distance: float, turn: float, noise: OdometryNo
     direction = heading + 0.5 * turn
     c, s = math.cos(direction), math.sin(direction)
     way = abs(distance)
-    along = noise.distance_sigma_m_per_sqrt_m**2 * way
+    turned = abs(turn)
+    along = (
+        noise.distance_sigma_m_per_sqrt_m**2 * way + noise.distance_sigma_m_per_sqrt_rad**2 * turned
+    )
     around = (
-        noise.turn_sigma_rad_per_sqrt_rad**2 * abs(turn) + noise.turn_sigma_rad_per_sqrt_m**2 * way
+        noise.turn_sigma_rad_per_sqrt_rad**2 * turned + noise.turn_sigma_rad_per_sqrt_m**2 * way
     )
     lx, ly = -0.5 * distance * s, 0.5 * distance * c  # where a turn error leads
     return Covariance3(

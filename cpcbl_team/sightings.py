@@ -40,6 +40,11 @@ class Measured(NamedTuple):
     def usable(self) -> bool:
         return self.range_m is not None or self.bearing is not None
 
+    def doubted(self, factor: float) -> "Measured":
+        """With both variances grown by this factor."""
+        k = math.sqrt(factor)
+        return self._replace(range_sigma=k * self.range_sigma, bearing_sigma=k * self.bearing_sigma)
+
     @property
     def gives_point_bearing(self) -> bool:
         return self.bearing is not None and self.wall is None
