@@ -122,6 +122,8 @@ class LocalizerSettings(Table, frozen=True, kw_only=True):
     object_interval_s: NotNegative = 0.0
     """Least time between two uses of the same object: its errors are correlated."""
     bearing_for_position: bool = True
+    self_calibration: bool = False
+    """Learn the scales of odometry and the bearing bias while driving."""
     paper_uncertainty: bool = False
     """As printed: without the heading's share in a position's uncertainty (resolution a)."""
     weights: Weights = Weights()

@@ -16,6 +16,7 @@ from cpcbl_team.gaussian import Covariance2
 from cpcbl_team.geometry import Pose2, step, wrap_angle
 from cpcbl_team.inputs import Belief, Fix, Odometry, Position, Sightings, Told
 from cpcbl_team.motion import move
+from cpcbl_team.self_calibration import Anchor, learned
 from cpcbl_team.sensors import repeated_share, sighting_fault
 from cpcbl_team.sightings import Measured, combined, constraints_of, measured, observation_of
 from cpcbl_team.state import Memory, State
@@ -87,6 +88,9 @@ class Localizer:
             share = max(0, end_ns - max(stamp_ns, motion.from_ns)) / whole_ns
             s = self.settings.odometry
             distance, turn = share * motion.distance_m, share * motion.turn_rad
+            if self._rules.self_calibration:
+                distance *= memory.learned.distance_scale
+                turn *= memory.learned.turn_scale
             if distance != 0.0 or turn != 0.0:
                 reckoned = step(reckoned, distance, turn)
                 estimate = self._reduced(move(estimate, distance, turn, s))
@@ -121,6 +125,7 @@ class Localizer:
         ago count for less: their errors are correlated."""
         memory = state.memory
         seen, faults = [], []
+        bias = memory.learned.bearing_bias_rad if self._rules.self_calibration else 0.0
         for sighting in frame.sightings:
             fault = sighting_fault(sighting)
             if fault:
@@ -135,7 +140,7 @@ class Localizer:
                 self.settings,
             )
             if m is not None:
-                seen.append(m)
+                seen.append(m if bias == 0.0 else m.turned(-bias))
         pieces = [recovery.seen_evidence(state, m) for m in seen if m.usable and m.wall is None]
         memory = recovery.remembered(memory, pieces).counted(*faults)
         least = self._rules.object_interval_s * 1e9
@@ -289,7 +294,17 @@ class Localizer:
             memory = memory._replace(position_ns=now)
         if used and turn in (Scope.HEADING, Scope.POSE):
             memory = memory._replace(heading_ns=now)
+        if used and self._rules.self_calibration:
+            memory = self._taught(state, memory)
         return state._replace(memory=memory)
+
+    def _taught(self, state: State, memory: Memory) -> Memory:
+        """What the robot has learned of its odometry and bearings, from this update too."""
+        here = Anchor(state.stamp_ns, state.estimate, state.odometry_from_robot)
+        if memory.anchor is None or memory.lost:
+            return memory._replace(anchor=None if memory.lost else here)
+        known, anchor = learned(memory.learned, memory.anchor, here, self.settings.odometry)
+        return memory._replace(learned=known, anchor=anchor)
 
     def _judged(self, state: State) -> State:
         """Lost or not. If lost: found again from recent evidence, else in more and more doubt."""
@@ -309,7 +324,7 @@ class Localizer:
             memory = memory._replace(sought_ns=evidence[-1].stamp_ns)
             found = recovery.relocalized(evidence, state.odometry_from_robot, self.field)
         if found is not None:
-            memory = memory._replace(lost="", innovations=()).counted("found_again")
+            memory = memory._replace(lost="", innovations=(), anchor=None).counted("found_again")
             return state._replace(estimate=self._reduced(found), memory=memory)
         estimate = state.estimate
         if refusing and now - memory.widened_ns >= recovery.WIDEN_NS:

@@ -45,6 +45,12 @@ class Measured(NamedTuple):
         k = math.sqrt(factor)
         return self._replace(range_sigma=k * self.range_sigma, bearing_sigma=k * self.bearing_sigma)
 
+    def turned(self, angle: float) -> "Measured":
+        """Seen so much further to the left."""
+        if self.bearing is None:
+            return self
+        return self._replace(bearing=wrap_angle(self.bearing + angle))
+
     @property
     def gives_point_bearing(self) -> bool:
         return self.bearing is not None and self.wall is None
