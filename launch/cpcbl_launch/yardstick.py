@@ -199,8 +199,8 @@ class Ekf:
         after = step(before, distance, turn)
         self.mean[i : i + 3] = after
         lever = np.array([before.y - after.y, after.x - before.x])  # d(x, y) / d(heading)
-        p[i : i + 2] += np.outer(lever, p[i + 2])
-        p[:, i : i + 2] += np.outer(p[:, i + 2], lever)
+        p[i : i + 2] += lever[:, None] * p[i + 2]
+        p[:, i : i + 2] += p[:, i + 2, None] * lever
         self._add(i, motion_noise(before.heading, distance, turn, robot.settings.odometry))
 
     def _doubt_motion(self, robot: _Member, until_ns: int) -> None:
@@ -213,8 +213,8 @@ class Ekf:
 
     def _add(self, first: int, noise: Iterable[float]) -> None:
         """Adds xx, xy, yy, xh, yh, hh to a robot's own block."""
-        block = np.zeros((3, 3))
-        block[_TRIANGLE] = block.T[_TRIANGLE] = tuple(noise)
+        xx, xy, yy, xh, yh, hh = noise
+        block = np.array(((xx, xy, xh), (xy, yy, yh), (xh, yh, hh)))
         self.covariance[first : first + 3, first : first + 3] += block
 
     # Sightings --------------------------------------------------------------------------------

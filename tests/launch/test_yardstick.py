@@ -133,15 +133,29 @@ def test_no_noise_no_error(tmp_path: Path, blind: list[str]) -> None:
             assert robot.inside_3_sigma == 1.0
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_who_knows_more_errs_less(tmp_path: Path, seed: int) -> None:
-    reckoning, solo, centralized = reports_of(noisy(tmp_path, seed)).values()
-    assert figure(centralized) <= figure(solo) <= 0.7 * figure(reckoning)
-    assert figure(centralized) > 0.001
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> list[dict[str, YardstickReport]]:
+    """Five noisy logs."""
+    return [reports_of(noisy(tmp_path_factory.mktemp("log"), seed)) for seed in range(5)]
+
+
+def test_who_knows_more_errs_less(runs: list[dict[str, YardstickReport]]) -> None:
+    for run in runs:
+        reckoning, solo, centralized = (figure(run[kind]) for kind in KINDS)
+        assert 0.001 < centralized <= solo <= 0.7 * reckoning
+
+
+@pytest.mark.parametrize("kind", KINDS[1:])
+def test_filters_are_consistent_on_white_noise(
+    runs: list[dict[str, YardstickReport]], kind: str
+) -> None:
+    """Over thirty other seeds NEES is 2.03 (solo) and 1.92, means of five scatter by 0.11."""
+    assert np.mean([figure(run[kind], "nees") for run in runs]) == pytest.approx(2.0, abs=0.4)
+    assert np.mean([figure(run[kind], "inside_3_sigma") for run in runs]) > 0.97
 
 
 def test_a_blind_robot_has_only_the_centralized_filter(tmp_path: Path) -> None:
-    logged = noisy(tmp_path, 4)
+    logged = noisy(tmp_path, 4, 20.0)
     full = reports_of(logged)
     blind = reports_of(logged._replace(team=blinded(logged.team, ["2"])))
     assert blind["solo_ekf"].robots["2"] == blind["dead_reckoning"].robots["2"]
@@ -162,15 +176,6 @@ def test_without_sightings_of_robots_the_centralized_filter_is_many_solo_filters
         assert alone.covariance is not None
         assert together.covariance is not None
         np.testing.assert_allclose(together.covariance, alone.covariance, atol=1e-9)
-
-
-def test_filters_are_consistent_on_white_noise(tmp_path: Path) -> None:
-    runs = [reports_of(noisy(tmp_path / str(seed), seed)) for seed in range(5)]
-    for kind, least, most in (("solo_ekf", 1.5, 2.5), ("centralized_ekf", 1.5, 2.5)):
-        nees = np.mean([figure(run[kind], "nees") for run in runs])
-        inside = np.mean([figure(run[kind], "inside_3_sigma") for run in runs])
-        assert least < nees < most, kind
-        assert inside > 0.96, kind
 
 
 # Settings ----------------------------------------------------------------------------------------
@@ -211,7 +216,7 @@ def test_an_object_is_used_once_an_interval(tmp_path: Path) -> None:
 
 def test_a_filter_that_refuses_everything_comes_back(tmp_path: Path) -> None:
     """All robots start 1 m off and are sure of it: every gate stays shut until they doubt."""
-    logged = started(noisy(tmp_path, 7), 1.0, -0.5)
+    logged = started(noisy(tmp_path, 7, 25.0), 1.0, -0.5)
     paths = paths_of(logged)
     for kind in KINDS[1:]:
         for name, path in paths[kind].items():
