@@ -7,7 +7,9 @@ a team. Smith, Self, Cheeseman (1990) for the joint state; Roumeliotis & Bekey (
 Inputs come through the robots' own sensing agents, so that delays, scales, biases and blindness are
 those of the team, as are start poses, noise, gates and `object_interval_s`. What belongs to the
 team's method (turns of heading and position, tiers, `minimum_interval_s`) plays no part. Inputs are
-taken in the order of the times they speak of: nothing arrives late.
+taken in the order of the times they speak of: nothing arrives late. A filter that rejects most of
+what it sees doubts itself until its gates open; one that does not know its start begins with a
+Gaussian over the whole field, and no plain EKF is sure to find itself from there.
 """
 
 import math
@@ -151,6 +153,15 @@ class _Member:
         return window.count(False) > rules.lost_share * rules.lost_window
 
 
+class _Measurement(NamedTuple):
+    """Innovation = Jacobian . (error of these columns of the state) + noise of this covariance."""
+
+    columns: list[int]
+    jacobian: Floats
+    innovation: Floats
+    noise: Floats
+
+
 class Ekf:
     """One EKF whose state is the poses (x, y, heading) of some robots, each at its own time.
 
@@ -231,9 +242,10 @@ class Ekf:
             mate = self._robots.get(sighting.id)
             if mate is not None:
                 self.advance(sighting.id, frame.stamp_ns)
-            accepted = self._updated(robot, mate, sighting)
-            if accepted is None:
+            found = self._measured(robot, mate, sighting)
+            if found is None:
                 continue
+            accepted = self._corrected(found, robot.settings.localizer.gate_probability)
             if accepted:
                 robot.used_ns[sighting.id] = frame.stamp_ns
             kind, concerned = ("landmark", [robot]) if mate is None else ("robot", [robot, mate])
@@ -241,8 +253,10 @@ class Ekf:
                 if member.refuses(kind, accepted):
                     self._widen(member)
 
-    def _updated(self, robot: _Member, mate: _Member | None, sighting: Sighting) -> bool | None:
-        """Whether the chi-square gate let a sighting in; None if there was nothing to use."""
+    def _measured(
+        self, robot: _Member, mate: _Member | None, sighting: Sighting
+    ) -> _Measurement | None:
+        """What a sighting of a robot or a landmark says; None if there is nothing to use."""
         landmark = self._field.landmarks.get(sighting.id)
         if mate is not None:
             place, gives = self.mean[mate.columns[:2]], "both"
@@ -250,39 +264,32 @@ class Ekf:
             place, gives = np.array([landmark.x_m, landmark.y_m]), landmark.gives
         else:
             return None
-        pose = self.mean[robot.columns]
-        if math.hypot(*(place - pose[:2])) < NEAREST_M:
-            return None
-        expected, jacobian = expected_sighting(pose, place)
-        sensor = robot.settings.sensor
+        pose, sensor = self.mean[robot.columns], robot.settings.sensor
         far = (sighting.range_m or 0.0) > sensor.max_range_for_range_m
         readings = (
             sighting.range_m if gives in ("both", "range") and not far else None,
             sighting.bearing_rad if gives in ("both", "bearing") else None,
         )
         rows = [row for row in (0, 1) if readings[row] is not None]
-        if not rows:
+        if not rows or math.hypot(*(place - pose[:2])) < NEAREST_M:
             return None
+        expected, jacobian = expected_sighting(pose, place)
         innovation = np.array([readings[row] for row in rows]) - expected[rows]
         if 1 in rows:
             innovation[-1] = wrap_angle(innovation[-1])
         columns = robot.columns + (mate.columns[:2] if mate is not None else [])
-        sigmas = np.array(sighting_sigmas(sighting, sensor, expected[0]))
-        noise = np.diag(sigmas[rows] ** 2 + SMALLEST_VARIANCE)
-        gate = _gate(robot.settings.localizer.gate_probability, len(rows))
-        return self._corrected(columns, jacobian[rows, : len(columns)], innovation, noise, gate)
+        sigmas = np.array(sighting_sigmas(sighting, sensor, expected[0]))[rows]
+        noise = np.diag(sigmas**2 + SMALLEST_VARIANCE)
+        return _Measurement(columns, jacobian[rows, : len(columns)], innovation, noise)
 
-    def _corrected(
-        self, columns: list[int], jacobian: Floats, innovation: Floats, noise: Floats, gate: float
-    ) -> bool:
-        """The Kalman update by a measurement of these columns of the state, if the gate opens."""
-        cross = self.covariance[:, columns] @ jacobian.T
-        expected = jacobian @ cross[columns] + noise
-        weights = np.linalg.inv(expected)
-        if innovation @ weights @ innovation > gate:
+    def _corrected(self, m: _Measurement, gate_probability: float) -> bool:
+        """The Kalman update, if the chi-square gate opens; whether it did."""
+        cross = self.covariance[:, m.columns] @ m.jacobian.T
+        weights = np.linalg.inv(m.jacobian @ cross[m.columns] + m.noise)
+        if m.innovation @ weights @ m.innovation > _gate(gate_probability, len(m.innovation)):
             return False
         gain = cross @ weights
-        self.mean += gain @ innovation
+        self.mean += gain @ m.innovation
         self.mean[2::3] = (self.mean[2::3] + math.pi) % math.tau - math.pi
         self.covariance -= gain @ cross.T
         self.covariance = 0.5 * (self.covariance + self.covariance.T)

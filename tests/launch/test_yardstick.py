@@ -283,6 +283,21 @@ def test_odometry_in_parts_is_odometry_in_one() -> None:
     np.testing.assert_allclose(parts.marginal("r")[1], whole.marginal("r")[1], atol=1e-4)
 
 
+def test_doubt_grows_with_the_way_as_the_settings_say() -> None:
+    ekf = Ekf({"r": told(Pose2(0.0, 0.0, 0.0), Odometry(0, 100, 0.25, 0.0), sigma=0.0)}, Field())
+    ekf.advance("r", 100)
+    gained = np.diag(ekf.covariance)
+    assert gained[0] == pytest.approx(ODOMETRY.distance_sigma_m_per_sqrt_m**2 * 0.25)
+    assert gained[2] == pytest.approx(ODOMETRY.turn_sigma_rad_per_sqrt_m**2 * 0.25)
+
+
+def test_a_bearing_straight_behind_has_no_seam() -> None:
+    ekf = Ekf({"a": told(Pose2(0.0, 0.0, 0.0)), "b": told(Pose2(-2.0, 0.001, 0.0))}, Field())
+    ekf.see("a", Sightings(0, (Sighting("b", 2.0, 0.01 - math.pi),)))
+    assert ekf.mean[2] == pytest.approx(-0.01, abs=0.009)
+    assert ekf.covariance[2, 2] < 0.9 * 0.1**2
+
+
 def test_one_sighting_informs_both_robots_and_ties_them() -> None:
     ekf = Ekf({"a": told(Pose2(0.0, 0.0, 0.0)), "b": told(Pose2(2.0, 0.0, 0.0))}, Field())
     ekf.see("a", Sightings(0, (Sighting("b", 2.1, 0.0),)))
