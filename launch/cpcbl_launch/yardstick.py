@@ -5,11 +5,11 @@ centralized EKF over the poses of all robots, with everything that all of them s
 a team. Smith, Self, Cheeseman (1990) for the joint state; Roumeliotis & Bekey (2002) for the team.
 
 Inputs come through the robots' own sensing agents, so that delays, scales, biases and blindness are
-those of the team, as are start poses, noise, gates and `object_interval_s`. What belongs to the
-team's method (turns of heading and position, tiers, `minimum_interval_s`) plays no part. Inputs are
-taken in the order of the times they speak of: nothing arrives late. A filter that rejects most of
-what it sees doubts itself until its gates open; one that does not know its start begins with a
-Gaussian over the whole field, and no plain EKF is sure to find itself from there.
+those of the team, as are start poses, noise, gates, `object_interval_s` and `correlation_s`. What
+belongs to the team's method (turns of heading and position, tiers, `minimum_interval_s`) plays no
+part. Inputs are taken in the order of the times they speak of: nothing arrives late. A filter that
+rejects most of what it sees doubts itself until its gates open; one that does not know its start
+begins with a Gaussian over the whole field, and no plain EKF is sure to find itself from there.
 """
 
 import math
@@ -30,7 +30,7 @@ from cpcbl_team.geometry import Pose2, step, wrap_angle
 from cpcbl_team.inputs import Odometry, Sighting, Sightings
 from cpcbl_team.metrics import Floats, Trajectory, compared, score
 from cpcbl_team.motion import motion_noise
-from cpcbl_team.sensors import sighting_fault, sighting_sigmas
+from cpcbl_team.sensors import repeated_share, sighting_fault, sighting_sigmas
 
 NEAREST_M = 1e-3  # nearer than this a direction means nothing
 SMALLEST_VARIANCE = 1e-12  # (1 um)^2: exact sensors must not make a matrix singular
@@ -236,7 +236,8 @@ class Ekf:
         least_ns = robot.settings.localizer.object_interval_s * 1e9
         for sighting in frame.sightings:
             last_ns = robot.used_ns.get(sighting.id)
-            fresh = last_ns is None or frame.stamp_ns - last_ns >= least_ns
+            since_ns = None if last_ns is None else frame.stamp_ns - last_ns
+            fresh = since_ns is None or since_ns >= least_ns
             if not fresh or sighting_fault(sighting):
                 continue
             mate = self._robots.get(sighting.id)
@@ -245,6 +246,9 @@ class Ekf:
             found = self._measured(robot, mate, sighting)
             if found is None:
                 continue
+            seconds = None if since_ns is None else since_ns * 1e-9
+            doubt = repeated_share(seconds, robot.settings.sensor.correlation_s)
+            found = found._replace(noise=doubt * found.noise)
             accepted = self._corrected(found, robot.settings.localizer.gate_probability)
             if accepted:
                 robot.used_ns[sighting.id] = frame.stamp_ns

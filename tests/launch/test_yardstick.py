@@ -200,18 +200,21 @@ def test_corrections_of_the_team_are_those_of_the_yardsticks(tmp_path: Path) -> 
         assert figure(corrected[kind]) == pytest.approx(0.0, abs=1e-4)
 
 
-def test_an_object_is_used_once_an_interval(tmp_path: Path) -> None:
-    """Fewer uses leave a wider covariance; one use a frame is what an interval of a frame gives."""
+def test_what_is_seen_again_soon_counts_for_nothing_or_for_less(tmp_path: Path) -> None:
+    """Both leave a wider covariance; an interval of one frame uses every frame."""
     logged = noisy(tmp_path, 6, 10.0)
 
-    def spread(interval_s: float) -> float:
-        team = changed(logged.team, localizer=LocalizerSettings(object_interval_s=interval_s))
+    def spread(interval_s: float = 0.0, correlation_s: float = 0.0) -> float:
+        rules = LocalizerSettings(object_interval_s=interval_s)
+        sensor = msgspec.structs.replace(SENSOR, correlation_s=correlation_s)
+        team = changed(logged.team, localizer=rules, sensor=sensor)
         covariance = paths_of(logged._replace(team=team))["solo_ekf"]["1"].covariance
         assert covariance is not None
         return float(covariance[:, 0].mean())
 
-    assert spread(FRAME_MS * 1e-3) == spread(0.0)
-    assert spread(1.0) > 1.5 * spread(0.0)
+    assert spread(interval_s=FRAME_MS * 1e-3) == spread()
+    assert spread(interval_s=1.0) > 1.5 * spread()
+    assert spread(correlation_s=2.0) > 1.5 * spread()
 
 
 def test_a_filter_that_refuses_everything_comes_back(tmp_path: Path) -> None:
