@@ -10,6 +10,7 @@ from collections.abc import Callable, Sequence
 from itertools import pairwise
 from typing import NamedTuple, TypeVar
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -17,7 +18,7 @@ from cpcbl_team.metrics import Floats
 
 Mask = NDArray[np.bool_]
 Integers = NDArray[np.int64]
-Rows = TypeVar("Rows", "OdometryRows", "SensorRows", "Pairs")
+Rows = TypeVar("Rows", "OdometryRows", "SensorRows", "Pairs", "Fit")
 
 LONGEST_GAP_S = 1.0  # truth is interpolated only between rows as near as this
 STRETCHES = 20  # of a log, left out one by one by the jackknife
@@ -29,12 +30,24 @@ NUDGE_S = 0.01
 HUBER = 2.0
 GROSS = 5.0  # sigmas; beyond, a residual is an outlier
 LEAST_ROWS = 40
+TOLD = 0.3  # a value counts when it is known so much better than its limit
+ODOMETRY = ("distance_scale", "turn_scale", "delay_s")
+ODOMETRY_LIMITS = (0.2, 0.2, 0.2)
+ODOMETRY_NOISE = (
+    "distance_sigma_m_per_sqrt_m",
+    "turn_sigma_rad_per_sqrt_rad",
+    "turn_sigma_rad_per_sqrt_m",
+)
+SENSOR = ("range_scale", "range_bias_m", "robot_range_bias_m", "bearing_bias_deg", "delay_s")
+SLOPES = ("slope", "offset_m", "robot_offset_m", "bearing_bias_rad", "later_s")
+SLOPE_LIMITS = (0.2, 0.3, 0.3, 0.1, 0.1)
+SENSOR_NOISE = ("range_share", "range_floor_m", "bearing_sigma_deg")
 LAGS_S = (0.05, 0.1, 0.2, 0.3, 0.5, 0.8, 1.2, 2.0, 3.0, 5.0, 8.0, 12.0, 20.0)
 TIMES_S = np.geomspace(0.02, 200.0, 400)
 
 
-class Estimate(NamedTuple):
-    """A value with its standard error; without one, what was measured does not tell it."""
+class Estimate(msgspec.Struct, frozen=True):
+    """A value with its standard error."""
 
     value: float
     standard_error: float
@@ -77,6 +90,14 @@ class SensorRows(NamedTuple):
     true_bearing: Floats
     range_rate: Floats
     bearing_rate: Floats
+
+
+class Fit(NamedTuple):
+    """A linear fit of values (n,) by columns (n, k), in units of sigma."""
+
+    stretch: Integers
+    columns: Floats
+    values: Floats
 
 
 # Odometry ---------------------------------------------------------------------------------------
@@ -172,69 +193,65 @@ def odometry_delay_s(logs: Sequence[RobotLog]) -> float:
     return float(DELAYS_S[int(np.argmin(costs))])
 
 
-def odometry_fit(rows: OdometryRows) -> Floats:
-    """(turn scale, distance scale, change of the delay in s) of moving windows."""
+def odometry_fit(rows: OdometryRows) -> Fit:
+    """Moving windows as rows of a fit of `ODOMETRY`, in units of their spread."""
     turns, ways = np.abs(rows.turn) > LEAST_MOTION, np.abs(rows.way) > LEAST_MOTION
-    turn_scale, distance_scale = 1.0, 1.0
-    if turns.any():
-        turn_scale = robust_fit(rows.turn[turns, None], rows.true_turn[turns])[0]
-    if ways.any():
-        distance_scale = robust_fit(rows.way[ways, None], rows.true_way[ways])[0]
-    turn_spread = _spread(rows.true_turn[turns] - turn_scale * rows.turn[turns])
-    way_spread = _spread(rows.true_way[ways] - distance_scale * rows.way[ways])
-    zeros = np.zeros
-    of_turns = np.stack(
-        [rows.turn[turns], zeros(turns.sum()), turn_scale * rows.turn_rate[turns]], axis=1
-    )
-    of_ways = np.stack(
-        [zeros(ways.sum()), rows.way[ways], distance_scale * rows.way_rate[ways]], axis=1
-    )
-    return robust_fit(
-        np.concatenate([of_turns / turn_spread, of_ways / way_spread]),
-        np.concatenate([rows.true_turn[turns] / turn_spread, rows.true_way[ways] / way_spread]),
-    )
+    parts = []
+    for column, moving, reading, rate, true in (
+        (0, ways, rows.way, rows.way_rate, rows.true_way),
+        (1, turns, rows.turn, rows.turn_rate, rows.true_turn),
+    ):
+        reading, true, rate = reading[moving], true[moving], rate[moving]
+        scale = robust_fit(reading[:, None], true)[0] if moving.any() else 1.0
+        columns = np.zeros((len(reading), len(ODOMETRY)))
+        columns[:, column], columns[:, 2] = reading, scale * rate
+        spread = _spread(true - scale * reading)
+        parts.append(Fit(rows.stretch[moving], columns / spread, (true - reading) / spread))
+    return Fit(*map(np.concatenate, zip(*parts, strict=True)))
 
 
 def odometry_noise(windows: Sequence[OdometryRows], turn_scale: float, scale: float) -> Floats:
-    """Sigmas (m per sqrt m, rad per sqrt rad, rad per sqrt m) by how residuals grow."""
+    """Variances by how residuals grow: m^2 per m, rad^2 per rad, rad^2 per m.
+
+    Shape (2, 3) as of `variance_parts`. A constant part is the truth's.
+    """
     path = scale * np.concatenate([w.path for w in windows])
     turned = turn_scale * np.concatenate([w.turned for w in windows])
     ways = np.concatenate([w.true_way - scale * w.way for w in windows])
     turns = np.concatenate([w.true_turn - turn_scale * w.turn for w in windows])
-    one = np.ones_like(path)
     moving = (path > LEAST_MOTION) | (turned > LEAST_MOTION)
+    one = np.ones_like(path)
     of_ways = variance_parts(ways[moving], np.stack([path, one], axis=1)[moving])
     of_turns = variance_parts(turns[moving], np.stack([turned, path, one], axis=1)[moving])
-    return np.sqrt([of_ways[0], of_turns[0], of_turns[1]])
+    return np.concatenate([of_ways[:, :1], of_turns[:, :2]], axis=1)
 
 
 def calibrate_odometry(logs: Sequence[RobotLog]) -> dict[str, Estimate]:
-    """Values by the names of `OdometrySettings`; empty for a robot that does not move."""
+    """Values by the names of `OdometrySettings`; those that the logs do not tell are missing."""
+    logs = [log for log in logs if len(log.odometry)]
+    if not logs:
+        return {}
     delay_s = odometry_delay_s(logs)
     for _ in range(3):
         rows = odometry_rows(logs, delay_s, WINDOW_S)
-        moving = (np.abs(rows.turn) > LEAST_MOTION) | (np.abs(rows.way) > LEAST_MOTION)
-        if moving.sum() < LEAST_ROWS:
+        fit = odometry_fit(rows)
+        if len(fit.values) < LEAST_ROWS:
             return {}
-        delay_s += float(np.clip(odometry_fit(rows)[2], -0.05, 0.05))
-    rows = odometry_rows(logs, delay_s, WINDOW_S)
-    fitted = jackknife(lambda keep: odometry_fit(_kept(rows, keep(rows.stretch))), rows.stretch)
-    turn_scale, distance_scale, _ = (e.value for e in fitted)
+        known = told(fit.columns, ODOMETRY_LIMITS)
+        delay_s += float(np.clip(solved(fit, known)[2], -0.05, 0.05)) if known[2] else -delay_s
+    fit = odometry_fit(odometry_rows(logs, delay_s, WINDOW_S))
+    change = jackknife(lambda keep: solved(_kept(fit, keep(fit.stretch)), known), fit.stretch)
+    neutral = (1.0, 1.0, delay_s)
+    values = [_plus(n, c) for n, c in zip(neutral, change, strict=True)]
+    result = {name: v for name, v, k in zip(ODOMETRY, values, known, strict=True) if k}
     windows = [odometry_rows(logs, delay_s, length_s) for length_s in NOISE_WINDOWS_S]
-    noise = jackknife(
+    noise = sigmas(
         lambda keep: odometry_noise(
-            [_kept(w, keep(w.stretch)) for w in windows], turn_scale, distance_scale
+            [_kept(w, keep(w.stretch)) for w in windows], values[1].value, values[0].value
         ),
-        windows[0].stretch,
+        fit.stretch,
     )
-    return {
-        "distance_scale": fitted[1],
-        "turn_scale": fitted[0],
-        "delay_s": Estimate(delay_s + fitted[2].value, fitted[2].standard_error),
-        "distance_sigma_m_per_sqrt_m": noise[0],
-        "turn_sigma_rad_per_sqrt_rad": noise[1],
-        "turn_sigma_rad_per_sqrt_m": noise[2],
-    }
+    return result | dict(zip(ODOMETRY_NOISE, noise, strict=True))
 
 
 # Sensor -----------------------------------------------------------------------------------------
@@ -285,114 +302,112 @@ def _seen(log: RobotLog, which: Integers, times_s: Floats) -> tuple[Floats, Floa
     return np.hypot(dx, dy), _wrapped(np.arctan2(dy, dx) - heading), good
 
 
-def sensor_fit(rows: SensorRows) -> Floats:
-    """(range scale, bias, bias for robots, bearing bias in rad, change of the delay in s).
+def sensor_fit(rows: SensorRows, range_sigma: Floats, bearing_sigma: float) -> Fit:
+    """Readings minus truth as rows of a fit of `SLOPES`, in units of their sigma.
 
-    Readings are fitted against the truth, not the other way round: it is they that err. NaN where
-    nothing tells.
-    """
-    share, floor = 0.03, 0.03
-    bearing_spread = _spread(_bearing_errors(rows)[np.isfinite(rows.bearing)])
-    line = np.array([1.0, 0.0, 0.0, 0.0, 0.0])
-    for _ in range(3):
-        sigma = np.hypot(share * rows.true_range, floor)
-        line = _joint_fit(rows, sigma, bearing_spread)
-        scale = 1.0 / line[0] if line[0] > 0.1 else 1.0
-        errors = range_errors(rows, scale, line[1] * scale, line[2] * scale)
-        parts = _range_noise(rows, errors)
-        share, floor = parts[0], max(parts[1], 1e-3)
-    scale = 1.0 / line[0] if line[0] > 0.1 else math.nan
-    return np.array([scale, line[1] * scale, line[2] * scale, line[3], line[4]])
-
-
-def _joint_fit(rows: SensorRows, range_sigma: Floats, bearing_sigma: float) -> Floats:
-    """Readings as slope x true range + bias (landmarks | robots) and true bearing + bias.
-
-    A later exposure would have been elsewhere: both share the change of the delay.
+    It is readings that err, so they are fitted against the truth, not the other way round. An
+    exposure at another time would have been elsewhere: ranges and bearings share that change.
     """
     r, b = np.isfinite(rows.range_m), np.isfinite(rows.bearing)
-    columns = (
-        rows.true_range,
-        np.where(rows.teammate, 0.0, 1.0),
-        np.where(rows.teammate, 1.0, 0.0),
-        np.zeros_like(rows.true_range),
-        -rows.range_rate,
-    )
-    of_ranges = (np.stack(columns, axis=1) / range_sigma[:, None])[r]
-    nothing, one = np.zeros(b.sum()), np.ones(b.sum())
-    columns = (nothing, nothing, nothing, one, -rows.bearing_rate[b])
-    of_bearings = np.stack(columns, axis=1) / bearing_sigma
-    return robust_fit(
-        np.concatenate([of_ranges, of_bearings]),
-        np.concatenate([(rows.range_m / range_sigma)[r], _bearing_errors(rows)[b] / bearing_sigma]),
+    of_ranges, of_bearings = np.zeros((r.sum(), 5)), np.zeros((b.sum(), 5))
+    of_ranges[:, 0] = rows.true_range[r]
+    of_ranges[:, 1], of_ranges[:, 2] = ~rows.teammate[r], rows.teammate[r]
+    of_bearings[:, 3] = 1.0
+    of_ranges[:, 4], of_bearings[:, 4] = -rows.range_rate[r], -rows.bearing_rate[b]
+    return Fit(
+        np.concatenate([rows.stretch[r], rows.stretch[b]]),
+        np.concatenate([of_ranges / range_sigma[r, None], of_bearings / bearing_sigma]),
+        np.concatenate(
+            [
+                (rows.range_m - rows.true_range)[r] / range_sigma[r],
+                _bearing_errors(rows)[b] / bearing_sigma,
+            ]
+        ),
     )
 
 
-def range_errors(rows: SensorRows, scale: float, bias_m: float, robot_bias_m: float) -> Floats:
+def _corrections(slopes: Floats) -> Floats:
+    """`SENSOR` (angles in rad) of `SLOPES`: reading = (1 + slope) x true + offset."""
+    slope, offset, robot_offset, bearing_bias, later_s = slopes
+    scale = 1.0 / max(1.0 + slope, 0.1)
+    return np.array([scale, scale * offset, scale * robot_offset, bearing_bias, later_s])
+
+
+def range_errors(rows: SensorRows, corrections: Floats) -> Floats:
     """Corrected minus true range."""
-    landmark_bias, robot_bias = np.nan_to_num(bias_m), np.nan_to_num(robot_bias_m)
-    bias = np.where(rows.teammate, robot_bias, landmark_bias)
+    scale, bias_m, robot_bias_m = corrections[:3]
+    bias = np.where(rows.teammate, robot_bias_m, bias_m)
     return np.asarray(scale * rows.range_m - bias - rows.true_range)
+
+
+def bearing_errors(rows: SensorRows, corrections: Floats) -> Floats:
+    """Corrected minus true bearing."""
+    return _bearing_errors(rows) - corrections[3]
 
 
 def _bearing_errors(rows: SensorRows) -> Floats:
     return _wrapped(rows.bearing - rows.true_bearing)
 
 
-def _range_noise(rows: SensorRows, errors: Floats) -> Floats:
-    """(share, floor in m)."""
-    there = np.isfinite(errors)
-    square = rows.true_range[there] ** 2
-    return np.sqrt(variance_parts(errors[there], np.stack([square, np.ones_like(square)], axis=1)))
+def sensor_noise(rows: SensorRows, corrections: Floats) -> Floats:
+    """Variances of what is left: m^2 per m^2 of range, m^2, rad^2. Shape (2, 3), NaN: no rows."""
+    ranges, bearings = range_errors(rows, corrections), bearing_errors(rows, corrections)
+    r, b = np.isfinite(ranges), np.isfinite(bearings)
+    columns = np.stack([rows.true_range**2, np.ones_like(ranges)], axis=1)
+    return np.concatenate(
+        [
+            variance_parts(ranges[r], columns[r]),
+            variance_parts(bearings[b], np.ones((b.sum(), 1))),
+        ],
+        axis=1,
+    )
 
 
-def sensor_noise(rows: SensorRows, fit: Floats) -> Floats:
-    """(share, floor in m, sigma of the bearing in rad) of errors that `fit` leaves."""
-    share, floor = _range_noise(rows, range_errors(rows, *fit[:3]))
-    bearing = _bearing_errors(rows) - fit[3]
-    bearing = bearing[np.isfinite(bearing)]
-    sigma = math.sqrt(variance_parts(bearing, np.ones((len(bearing), 1)))[0])
-    return np.array([share, floor, sigma])
+def sensor_sigmas(rows: SensorRows, noise: Floats) -> tuple[Floats, float]:
+    """Sigmas of the ranges (n,) in m, and of bearings in rad."""
+    share, floor, bearing = np.nan_to_num(noise[0], nan=1e-4)
+    ranges = np.sqrt(share * rows.true_range**2 + floor)
+    return np.maximum(ranges, 1e-9), max(math.sqrt(bearing), 1e-9)
 
 
-def unit_errors(rows: SensorRows, fit: Floats, noise: Floats) -> tuple[Floats, Floats]:
-    """Errors of ranges and bearings in units of their sigma, gross ones as NaN."""
-    sigma = np.hypot(noise[0] * rows.true_range, noise[1])
-    ranges = range_errors(rows, *fit[:3]) / np.maximum(sigma, 1e-9)
-    bearings = (_bearing_errors(rows) - fit[3]) / max(noise[2], 1e-9)
-    return tuple(np.where(np.abs(e) < GROSS, e, np.nan) for e in (ranges, bearings))  # type: ignore[return-value]
+def _iterated(rows: SensorRows) -> tuple[Fit, Mask, Floats]:
+    """The fit, what it tells, and the slopes, with the noise that they leave as weights."""
+    known, slopes = np.zeros(5, bool), np.zeros(5)
+    for _ in range(3):
+        sigma = sensor_sigmas(rows, sensor_noise(rows, _corrections(slopes)))
+        fit = sensor_fit(rows, *sigma)
+        known = told(fit.columns, SLOPE_LIMITS)
+        slopes = solved(fit, known)
+    return fit, known, slopes
 
 
 def calibrate_sensor(logs: Sequence[RobotLog]) -> dict[str, Estimate]:
-    """Values by the names of `SensorSettings`; empty without enough sightings."""
+    """Values by the names of `SensorSettings`; those that the logs do not tell are missing."""
     delay_s = 0.0
     for _ in range(3):
         rows = sensor_rows(logs, delay_s)
         if len(rows.stamp_s) < LEAST_ROWS:
             return {}
-        delay_s += float(np.clip(np.nan_to_num(sensor_fit(rows)[4]), -0.1, 0.1))
+        fit, known, slopes = _iterated(rows)
+        delay_s += float(np.clip(slopes[4], -0.1, 0.1))
     rows = sensor_rows(logs, delay_s)
-    fitted = jackknife(lambda keep: sensor_fit(_kept(rows, keep(rows.stretch))), rows.stretch)
-    fit = np.array([e.value for e in fitted])
-    noise = jackknife(
-        lambda keep: sensor_noise(_kept(rows, keep(rows.stretch)), fit), rows.stretch
+    fit, known, slopes = _iterated(rows)
+    values = jackknife(
+        lambda keep: _corrections(solved(_kept(fit, keep(fit.stretch)), known)), fit.stretch
     )
-    sigmas = np.array([e.value for e in noise])
-    pairs = lagged_products(rows, unit_errors(rows, fit, sigmas))
-    correlation = jackknife(
-        lambda keep: np.array([correlation_s(pairs, keep(pairs.stretch))]), rows.stretch
+    corrections = _corrections(slopes)
+    values[3], values[4] = _times(math.degrees(1.0), values[3]), _plus(delay_s, values[4])
+    result = {name: v for name, v, k in zip(SENSOR, values, known, strict=True) if k}
+    noise = sigmas(
+        lambda keep: sensor_noise(_kept(rows, keep(rows.stretch)), corrections), rows.stretch
     )
-    return {
-        "range_scale": fitted[0],
-        "range_bias_m": fitted[1],
-        "robot_range_bias_m": fitted[2],
-        "range_share": noise[0],
-        "range_floor_m": noise[1],
-        "bearing_bias_deg": _in_degrees(fitted[3]),
-        "bearing_sigma_deg": _in_degrees(noise[2]),
-        "delay_s": Estimate(delay_s + fitted[4].value, fitted[4].standard_error),
-        "correlation_s": correlation[0],
-    }
+    noise[2] = _times(math.degrees(1.0), noise[2])
+    pairs = lagged_products(rows, corrections)
+    time = jackknife(
+        lambda keep: np.array([correlation_s(_kept(pairs, keep(pairs.stretch)))]), rows.stretch
+    )
+    more = dict(zip((*SENSOR_NOISE, "correlation_s"), (*noise, *time), strict=True))
+    return result | {name: v for name, v in more.items() if math.isfinite(v.value)}
 
 
 # Correlation ------------------------------------------------------------------------------------
@@ -407,10 +422,13 @@ class Pairs(NamedTuple):
     square: Floats  # mean of both
 
 
-def lagged_products(rows: SensorRows, errors: Sequence[Floats]) -> Pairs:
-    """All pairs of one object (and one kind of error) up to the longest lag apart."""
+def lagged_products(rows: SensorRows, corrections: Floats) -> Pairs:
+    """All pairs of one object and one kind, up to the longest lag apart, in units of sigma."""
+    sigmas = sensor_sigmas(rows, sensor_noise(rows, corrections))
+    kinds = range_errors(rows, corrections), bearing_errors(rows, corrections)
     parts = []
-    for error in errors:
+    for kind, sigma in zip(kinds, sigmas, strict=True):
+        error = np.where(np.abs(kind) < GROSS * sigma, kind / sigma, np.nan)
         for name in np.unique(rows.object):
             mine = np.flatnonzero((rows.object == name) & np.isfinite(error))
             mine = mine[np.argsort(rows.stamp_s[mine], kind="stable")]
@@ -428,24 +446,24 @@ def lagged_products(rows: SensorRows, errors: Sequence[Floats]) -> Pairs:
     return Pairs(*map(np.concatenate, zip(*parts, strict=True)))
 
 
-def autocorrelation(pairs: Pairs, keep: Mask) -> tuple[Floats, Floats, Floats]:
+def autocorrelation(pairs: Pairs) -> tuple[Floats, Floats, Floats]:
     """(mean lag in s, correlation, number of pairs) of each bin of lags that has enough."""
-    kept = _kept(pairs, keep)
     result = []
     for low, high in pairwise((0.0, *LAGS_S)):
-        mine = (kept.lag_s > low) & (kept.lag_s <= high)
+        mine = (pairs.lag_s > low) & (pairs.lag_s <= high)
         if (n := int(mine.sum())) >= LEAST_ROWS:
-            ratio = kept.product[mine].sum() / max(kept.square[mine].sum(), 1e-12)
-            result.append((kept.lag_s[mine].mean(), ratio, n))
-    return tuple(np.array(result).reshape(-1, 3).T)  # type: ignore[return-value]
+            ratio = pairs.product[mine].sum() / max(pairs.square[mine].sum(), 1e-12)
+            result.append((pairs.lag_s[mine].mean(), ratio, n))
+    lag, ratios, counts = np.array(result).reshape(-1, 3).T
+    return lag, ratios, counts
 
 
-def correlation_s(pairs: Pairs, keep: Mask) -> float:
+def correlation_s(pairs: Pairs) -> float:
     """The time constant of exp(-lag / time) through the autocorrelation; 0: white; NaN: no pairs.
 
     Short lags count most: there a correlation is known best.
     """
-    lag, ratio, n = autocorrelation(pairs, keep)
+    lag, ratio, n = autocorrelation(pairs)
     if len(lag) == 0:
         return math.nan
     decay = np.exp(-lag / TIMES_S[:, None])
@@ -459,46 +477,70 @@ def correlation_s(pairs: Pairs, keep: Mask) -> float:
 
 
 def robust_fit(columns: Floats, values: Floats) -> Floats:
-    """Coefficients (k,) with values ~ columns (n, k) @ coefficients; NaN for empty columns.
+    """Coefficients (k,) with values ~ columns (n, k) @ coefficients.
 
     Huber's weights, iterated; residuals beyond GROSS sigmas do not count.
     """
-    used = np.abs(columns).max(axis=0, initial=0.0) > 1e-9
-    X = columns[:, used]
-    weight, coefficients = np.ones(len(values)), np.zeros(X.shape[1])
+    weight, coefficients = np.ones(len(values)), np.zeros(columns.shape[1])
     for _ in range(12):
         root = np.sqrt(weight)
-        coefficients = np.linalg.lstsq(X * root[:, None], values * root, rcond=None)[0]
-        size = np.abs(values - X @ coefficients)
-        size /= max(1.4826 * float(np.median(size)), 1e-9)
+        coefficients = np.linalg.lstsq(columns * root[:, None], values * root, rcond=None)[0]
+        size = np.abs(values - columns @ coefficients)
+        size /= _spread(size)
         weight = np.where(size > GROSS, 0.0, np.minimum(1.0, HUBER / np.maximum(size, 1e-9)))
-    result = np.full(columns.shape[1], np.nan)
-    result[used] = coefficients
+    return coefficients
+
+
+def told(columns: Floats, limits: Sequence[float]) -> Mask:
+    """Which coefficients rows (in units of their sigma) tell much better than their limit.
+
+    The worst one is taken out, which keeps its neutral value, until the others are good: a range
+    at one distance, say, tells either the scale or the bias, not both.
+    """
+    known = np.ones(columns.shape[1], bool)
+    while known.any():
+        scaled = (columns * np.asarray(limits))[:, known]
+        error = np.sqrt(np.diag(np.linalg.inv(scaled.T @ scaled + np.eye(known.sum()))))
+        if error.max() < TOLD:
+            break
+        known[np.flatnonzero(known)[int(np.argmax(error))]] = False
+    return known
+
+
+def solved(fit: Fit, known: Mask) -> Floats:
+    """The coefficients of a fit, 0 for those that are not known."""
+    result = np.zeros(len(known))
+    result[known] = robust_fit(fit.columns[:, known], fit.values)
     return result
 
 
 def variance_parts(errors: Floats, columns: Floats) -> Floats:
-    """Not negative parts (k,) with E[error^2] = columns (n, k) @ parts.
+    """Parts with E[error^2] = columns (n, k) @ parts, shape (2, k); NaN with too few errors.
 
-    Maximum likelihood of independent normal errors (Fisher scoring); gross errors left out.
+    First those of maximum likelihood for independent normal errors (Fisher scoring), none of them
+    negative; then those that one more step would give if they might be. Gross errors do not count.
     """
+    if len(errors) < LEAST_ROWS:
+        return np.full((2, columns.shape[1]), np.nan)
     square = errors * errors
-    level = max(float(np.median(square)) / 0.455, 1e-16)
+    level = max(float(np.median(square)) / 0.455, 1e-16)  # the median of a chi-square of 1
     parts = np.zeros(columns.shape[1])
     expected, free = np.full(len(errors), level), np.ones(columns.shape[1], bool)
-    for _ in range(40):
+    for _ in range(20):
         good = square < GROSS**2 * expected
         weight = np.where(good, 1.0 / expected, 0.0)
-        solved = np.linalg.lstsq(
-            columns[:, free] * weight[:, None], np.where(good, square, 0.0) * weight, rcond=None
-        )[0]
-        if (solved < 0.0).any() and free.sum() > 1:
-            free[np.flatnonzero(free)[int(np.argmin(solved))]] = False
-            continue
         parts[:] = 0.0
-        parts[free] = np.maximum(solved, 0.0)
+        parts[free] = _weighted(columns[:, free], square, weight)
+        if (parts < 0.0).any():
+            free[int(np.argmin(parts))] = False
+            continue
         expected = np.maximum(columns @ parts, 1e-4 * level)
-    return parts
+    return np.stack([np.maximum(parts, 0.0), _weighted(columns, square, weight)])
+
+
+def _weighted(columns: Floats, values: Floats, weight: Floats) -> Floats:
+    X = columns * weight[:, None]
+    return np.asarray(np.linalg.lstsq(X, values * weight, rcond=None)[0])
 
 
 Keep = Callable[[Integers], Mask]
@@ -514,6 +556,26 @@ def jackknife(estimate: Callable[[Keep], Floats], stretches: Integers) -> list[E
     each = np.array([estimate(lambda s, n=n: s != n) for n in names])  # type: ignore[misc]
     error = np.sqrt((len(names) - 1) * np.var(each, axis=0))
     return [Estimate(float(v), float(e)) for v, e in zip(whole, error, strict=True)]
+
+
+def sigmas(variances: Callable[[Keep], Floats], stretches: Integers) -> list[Estimate]:
+    """Square roots of variances of shape (2, k), as of `variance_parts`, with standard errors."""
+    parts = jackknife(lambda keep: variances(keep).ravel(), stretches)
+    half = len(parts) // 2
+    result = []
+    for variance, unbounded in zip(parts[:half], parts[half:], strict=True):
+        value = math.sqrt(variance.value)
+        upper = math.sqrt(variance.value + unbounded.standard_error)
+        result.append(Estimate(value, upper - value))
+    return result
+
+
+def _plus(value: float, change: Estimate) -> Estimate:
+    return Estimate(value + change.value, change.standard_error)
+
+
+def _times(factor: float, estimate: Estimate) -> Estimate:
+    return Estimate(factor * estimate.value, factor * estimate.standard_error)
 
 
 def _stretches(times_s: Floats, stamps: Floats, number: int) -> Integers:
@@ -539,9 +601,5 @@ def _wrapped(angles: Floats) -> Floats:
     return np.asarray((angles + math.pi) % math.tau - math.pi)
 
 
-def _in_degrees(estimate: Estimate) -> Estimate:
-    return Estimate(math.degrees(estimate.value), math.degrees(estimate.standard_error))
-
-
 def _kept(rows: Rows, keep: Mask) -> Rows:
-    return type(rows)(*(column[keep] for column in rows))
+    return type(rows)(*(column[keep] for column in rows))  # type: ignore[arg-type]

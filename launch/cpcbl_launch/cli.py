@@ -95,6 +95,10 @@ def up(
         Optional[Path],
         typer.Option(help="Draw paths and errors into this file (PNG or SVG; extra `plot`)."),
     ] = None,
+    record: Annotated[
+        Optional[Path],
+        typer.Option(help="Record inputs, tracks, status and truth into this file (MCAP)."),
+    ] = None,
     logs: Annotated[
         Optional[Path], typer.Option(help="Keep the processes' logs in this folder.")
     ] = None,
@@ -112,7 +116,7 @@ def up(
     team = _load(file or Path("demo"))
     if picture is not None and importlib.util.find_spec("matplotlib") is None:
         raise ValueError("--picture needs matplotlib: pip install 'cpcbl-team[plot]'")
-    run = Run(team, duration, speed, seed, folder=logs, picture=picture)
+    run = Run(team, duration, speed, seed, folder=logs, picture=picture, record=record)
     if any(robot.source == "mrclam" for robot in team.robots.values()):
         logged = real_logs.on_log(team, Path(data or team.data or "."))
         run = run._replace(
