@@ -25,7 +25,7 @@ from cpcbl_launch.calibration import (
 )
 from cpcbl_launch.recording import read_recording
 from cpcbl_launch.team_file import builtin, parse_team
-from cpcbl_team.config import Landmark, Team
+from cpcbl_team.config import Landmark
 from cpcbl_team.inputs import Odometry, Sightings
 from cpcbl_team.metrics import Floats
 
@@ -98,7 +98,9 @@ def _logs(
     frames: Mapping[str, Any],
 ) -> dict[str, RobotLog]:
     """Arrays of what was read, for every robot with truth."""
-    truth = {name: rows[np.unique(rows[:, 0], return_index=True)[1]] for name, rows in truth.items()}
+    truth = {
+        name: rows[np.unique(rows[:, 0], return_index=True)[1]] for name, rows in truth.items()
+    }
     places = {name: np.array([[0.0, mark.x_m, mark.y_m]]) for name, mark in landmarks.items()}
     places |= {name: rows[:, :3] for name, rows in truth.items()}
     number = {name: i for i, name in enumerate(places)}

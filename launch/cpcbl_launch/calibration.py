@@ -21,9 +21,9 @@ Integers = NDArray[np.int64]
 Rows = TypeVar("Rows", "OdometryRows", "SensorRows", "Pairs", "Fit")
 
 LONGEST_GAP_S = 1.0  # truth is interpolated only between rows as near as this
-STRETCHES = 20  # of a log, left out one by one by the jackknife
+STRETCH_S, STRETCHES = 10.0, (8, 20)  # of a log, left out one by one by the jackknife
 WINDOW_S = 2.0
-NOISE_WINDOWS_S = (1.0, 2.0, 5.0, 10.0)
+NOISE_WINDOWS_S = (1.0, 2.0, 4.0, 8.0)
 LEAST_MOTION = 0.02  # m or rad in a window; less tells nothing of scales
 DELAYS_S = np.arange(0.0, 1.001, 0.02)
 NUDGE_S = 0.01
@@ -73,6 +73,7 @@ class OdometryRows(NamedTuple):
     way: Floats  # commanded way along the true headings
     way_rate: Floats
     true_way: Floats  # the part of the true displacement along it
+    along: Floats  # sum of |distance| that errs along it: times cos^2 of the direction between
     path: Floats  # sum of |distance|
     turned: Floats  # sum of |turn|
 
@@ -112,13 +113,13 @@ def odometry_rows(logs: Sequence[RobotLog], delay_s: float, length_s: float) -> 
 def _windows(log: RobotLog, number: int, delay_s: float, length_s: float) -> OdometryRows:
     stamps = log.truth[:, 0]
     x, y, heading = log.truth[:, 1], log.truth[:, 2], np.unwrap(log.truth[:, 3])
-    first, last = _spans(stamps, log.odometry, length_s)
+    first, last = _spans(stamps, log.odometry, delay_s, length_s)
     a, b = stamps[first], stamps[last]
     before, now, after = (
         _driven(log.odometry, stamps, heading, delay_s + nudge, a, b)
         for nudge in (-NUDGE_S, 0.0, NUDGE_S)
     )
-    turn, px, py, path, turned = now.T
+    turn, px, py, path, turned, cos2, sin2 = now.T
     way = np.hypot(px, py)
     still = way < 1e-3
     ux = np.where(still, np.cos(heading[first]), px / np.maximum(way, 1e-9))
@@ -132,18 +133,21 @@ def _windows(log: RobotLog, number: int, delay_s: float, length_s: float) -> Odo
         ux * px + uy * py,
         ux * rate[:, 1] + uy * rate[:, 2],
         ux * (x[last] - x[first]) + uy * (y[last] - y[first]),
+        0.5 * (path + (ux * ux - uy * uy) * cos2 + 2.0 * ux * uy * sin2),
         path,
         turned,
     )
 
 
-def _spans(stamps: Floats, odometry: Floats, length_s: float) -> tuple[Integers, Integers]:
+def _spans(
+    stamps: Floats, odometry: Floats, delay_s: float, length_s: float
+) -> tuple[Integers, Integers]:
     """First and last truth row of each window; windows do not overlap."""
     begin, end = max(stamps[0], odometry[0, 0]) + 1.0, min(stamps[-1], odometry[-1, 1]) - 1.0
     grid = np.arange(begin, end - length_s, length_s)
-    first = np.searchsorted(stamps, grid)
-    last = np.searchsorted(stamps, stamps[first] + length_s)
-    last = np.minimum(last, len(stamps) - 1)
+    ends = odometry[:, 1] + delay_s
+    first = _row_at_end(stamps, ends, grid)
+    last = _row_at_end(stamps, ends, stamps[first] + length_s)
     gaps = np.concatenate(([0], np.cumsum(np.diff(stamps) > LONGEST_GAP_S)))
     seconds = stamps[last] - stamps[first]
     good = (gaps[first] == gaps[last]) & (stamps[first] - grid < 0.5 * length_s)
@@ -151,12 +155,23 @@ def _spans(stamps: Floats, odometry: Floats, length_s: float) -> tuple[Integers,
     return first[good], last[good]
 
 
+def _row_at_end(stamps: Floats, ends: Floats, times_s: Floats) -> Integers:
+    """Of the next rows of truth the one nearest to an end of odometry, within which there is only
+    a mean speed.
+    """
+    rows = np.searchsorted(stamps, times_s)[:, None] + np.arange(6)
+    rows = np.minimum(rows, len(stamps) - 1)
+    after = np.clip(np.searchsorted(ends, stamps[rows]), 1, len(ends) - 1)
+    aside = np.minimum(np.abs(ends[after] - stamps[rows]), np.abs(stamps[rows] - ends[after - 1]))
+    late = stamps[rows] - stamps[rows[:, :1]] > 0.12
+    return np.asarray(rows[np.arange(len(rows)), np.argmin(np.where(late, 9.0, aside), axis=1)])
+
+
 def _driven(
     odometry: Floats, stamps: Floats, heading: Floats, delay_s: float, a: Floats, b: Floats
 ) -> Floats:
-    """What was commanded from a to b: turn, way in x and y along the true headings, |way|, |turn|.
-
-    Shape (n, 5).
+    """What was commanded from a to b: turn, way in x and y along the true headings, |way|, |turn|,
+    |way| times cos and sin of twice the heading. Shape (n, 7).
     """
     from_s, until_s, distance, turn = odometry.T
     direction = np.interp(0.5 * (from_s + until_s) + delay_s, stamps, heading)
@@ -167,6 +182,8 @@ def _driven(
             distance * np.sin(direction),
             np.abs(distance),
             np.abs(turn),
+            np.abs(distance) * np.cos(2.0 * direction),
+            np.abs(distance) * np.sin(2.0 * direction),
         ]
     )
     knots = np.stack([from_s, until_s], axis=1).ravel() + delay_s
@@ -186,44 +203,57 @@ def odometry_delay_s(logs: Sequence[RobotLog]) -> float:
         cost = 0.0
         for reading, true in ((rows.turn, rows.true_turn), (rows.way, rows.true_way)):
             moving = np.abs(reading) > LEAST_MOTION
-            if moving.sum() >= LEAST_ROWS:
-                fit = robust_fit(reading[moving, None], true[moving])
-                cost += moving.sum() * math.log(_spread(true[moving] - reading[moving] * fit[0]))
+            if moving.sum() >= LEAST_ROWS // 2:
+                scale = robust_fit(reading[moving, None], true[moving])[0]
+                error = float(np.abs(true[moving] - scale * reading[moving]).mean())
+                cost += moving.sum() * math.log(max(error, 1e-9))
         costs.append(cost)
     return float(DELAYS_S[int(np.argmin(costs))])
 
 
-def odometry_fit(rows: OdometryRows) -> Fit:
-    """Moving windows as rows of a fit of `ODOMETRY`, in units of their spread."""
-    turns, ways = np.abs(rows.turn) > LEAST_MOTION, np.abs(rows.way) > LEAST_MOTION
-    parts = []
-    for column, moving, reading, rate, true in (
-        (0, ways, rows.way, rows.way_rate, rows.true_way),
-        (1, turns, rows.turn, rows.turn_rate, rows.true_turn),
-    ):
-        reading, true, rate = reading[moving], true[moving], rate[moving]
-        scale = robust_fit(reading[:, None], true)[0] if moving.any() else 1.0
-        columns = np.zeros((len(reading), len(ODOMETRY)))
-        columns[:, column], columns[:, 2] = reading, scale * rate
-        spread = _spread(true - scale * reading)
-        parts.append(Fit(rows.stretch[moving], columns / spread, (true - reading) / spread))
-    return Fit(*map(np.concatenate, zip(*parts, strict=True)))
+def odometry_fit(rows: OdometryRows, scales: Floats, noise: Floats) -> Fit:
+    """Moving windows as rows of a fit of changes of `ODOMETRY`, in units of their sigma.
 
-
-def odometry_noise(windows: Sequence[OdometryRows], turn_scale: float, scale: float) -> Floats:
-    """Variances by how residuals grow: m^2 per m, rad^2 per rad, rad^2 per m.
-
-    Shape (2, 3) as of `variance_parts`. A constant part is the truth's.
+    `scales`: of ways and turns at present; `noise`: see `odometry_noise`.
     """
-    path = scale * np.concatenate([w.path for w in windows])
-    turned = turn_scale * np.concatenate([w.turned for w in windows])
-    ways = np.concatenate([w.true_way - scale * w.way for w in windows])
-    turns = np.concatenate([w.true_turn - turn_scale * w.turn for w in windows])
-    moving = (path > LEAST_MOTION) | (turned > LEAST_MOTION)
+    way_sigma, turn_sigma = odometry_sigmas(rows, scales, noise)
+    ways, turns = np.abs(rows.way) > LEAST_MOTION, np.abs(rows.turn) > LEAST_MOTION
+    of_ways = np.zeros((ways.sum(), 3))
+    of_ways[:, 0], of_ways[:, 2] = rows.way[ways], scales[0] * rows.way_rate[ways]
+    of_turns = np.zeros((turns.sum(), 3))
+    of_turns[:, 1], of_turns[:, 2] = rows.turn[turns], scales[1] * rows.turn_rate[turns]
+    sigma = np.concatenate([way_sigma[ways], turn_sigma[turns]])
+    values = np.concatenate([(rows.true_way - rows.way)[ways], (rows.true_turn - rows.turn)[turns]])
+    return Fit(
+        np.concatenate([rows.stretch[ways], rows.stretch[turns]]),
+        np.concatenate([of_ways, of_turns]) / sigma[:, None],
+        values / sigma,
+    )
+
+
+def odometry_sigmas(rows: OdometryRows, scales: Floats, noise: Floats) -> tuple[Floats, Floats]:
+    """Sigmas (m, rad) of the ways and turns of windows."""
+    path, turned = scales[0] * rows.path, scales[1] * rows.turned
+    way = noise[0] * scales[0] * rows.along + noise[3]
+    turn = noise[1] * turned + noise[2] * path + noise[4]
+    return np.sqrt(np.maximum(way, 1e-12)), np.sqrt(np.maximum(turn, 1e-12))
+
+
+def odometry_noise(windows: Sequence[OdometryRows], scales: Floats) -> Floats:
+    """Variances by how residuals grow, shape (2, 5) as of `variance_parts`: m^2 per m of the way,
+    rad^2 per rad and per m, and what is constant (m^2, rad^2): the truth's own errors.
+    """
+    along = scales[0] * np.concatenate([w.along for w in windows])
+    path = scales[0] * np.concatenate([w.path for w in windows])
+    turned = scales[1] * np.concatenate([w.turned for w in windows])
+    ways = np.concatenate([w.true_way - scales[0] * w.way for w in windows])
+    turns = np.concatenate([w.true_turn - scales[1] * w.turn for w in windows])
     one = np.ones_like(path)
-    of_ways = variance_parts(ways[moving], np.stack([path, one], axis=1)[moving])
+    driven = along > LEAST_MOTION
+    moving = driven | (turned > LEAST_MOTION)
+    of_ways = variance_parts(ways[driven], np.stack([along, one], axis=1)[driven])
     of_turns = variance_parts(turns[moving], np.stack([turned, path, one], axis=1)[moving])
-    return np.concatenate([of_ways[:, :1], of_turns[:, :2]], axis=1)
+    return np.concatenate([of_ways, of_turns], axis=1)[:, [0, 2, 3, 1, 4]]
 
 
 def calibrate_odometry(logs: Sequence[RobotLog]) -> dict[str, Estimate]:
@@ -231,27 +261,27 @@ def calibrate_odometry(logs: Sequence[RobotLog]) -> dict[str, Estimate]:
     logs = [log for log in logs if len(log.odometry)]
     if not logs:
         return {}
-    delay_s = odometry_delay_s(logs)
-    for _ in range(3):
-        rows = odometry_rows(logs, delay_s, WINDOW_S)
-        fit = odometry_fit(rows)
-        if len(fit.values) < LEAST_ROWS:
+    change, values = np.zeros(3), np.array([1.0, 1.0, odometry_delay_s(logs)])
+    for _ in range(4):
+        windows = [odometry_rows(logs, values[2], length_s) for length_s in NOISE_WINDOWS_S]
+        noise = odometry_noise(windows, values[:2])
+        if np.isnan(noise).all():
             return {}
+        noise = np.nan_to_num(noise)
+        rows = odometry_rows(logs, values[2], WINDOW_S)
+        fit = odometry_fit(rows, values[:2], noise[0])
         known = told(fit.columns, ODOMETRY_LIMITS)
-        delay_s += float(np.clip(solved(fit, known)[2], -0.05, 0.05)) if known[2] else -delay_s
-    fit = odometry_fit(odometry_rows(logs, delay_s, WINDOW_S))
-    change = jackknife(lambda keep: solved(_kept(fit, keep(fit.stretch)), known), fit.stretch)
-    neutral = (1.0, 1.0, delay_s)
-    values = [_plus(n, c) for n, c in zip(neutral, change, strict=True)]
-    result = {name: v for name, v, k in zip(ODOMETRY, values, known, strict=True) if k}
-    windows = [odometry_rows(logs, delay_s, length_s) for length_s in NOISE_WINDOWS_S]
-    noise = sigmas(
-        lambda keep: odometry_noise(
-            [_kept(w, keep(w.stretch)) for w in windows], values[1].value, values[0].value
-        ),
-        fit.stretch,
+        change = solved(fit, known)
+        later_s = float(np.clip(change[2], -0.05, 0.05)) if known[2] else -values[2]
+        values = np.array([1.0 + change[0], 1.0 + change[1], values[2] + later_s])
+    changes = jackknife(lambda keep: solved(_kept(fit, keep(fit.stretch)), known), fit.stretch)
+    found = [Estimate(float(v), c.standard_error) for v, c in zip(values, changes, strict=True)]
+    grown = sigmas(
+        lambda keep: odometry_noise([_kept(w, keep(w.stretch)) for w in windows], values[:2]),
+        windows[0].stretch,
     )
-    return result | dict(zip(ODOMETRY_NOISE, noise, strict=True))
+    result = {name: v for name, v, k in zip(ODOMETRY, found, known, strict=True) if k}
+    return result | dict(zip(ODOMETRY_NOISE, grown, strict=False))
 
 
 # Sensor -----------------------------------------------------------------------------------------
@@ -523,9 +553,10 @@ def variance_parts(errors: Floats, columns: Floats) -> Floats:
     if len(errors) < LEAST_ROWS:
         return np.full((2, columns.shape[1]), np.nan)
     square = errors * errors
-    level = max(float(np.median(square)) / 0.455, 1e-16)  # the median of a chi-square of 1
+    shape = (columns / np.maximum(columns.mean(axis=0), 1e-16)).mean(axis=1)
+    level = max(float(np.median(square / shape)) / 0.455, 1e-16)  # the median of a chi-square of 1
     parts = np.zeros(columns.shape[1])
-    expected, free = np.full(len(errors), level), np.ones(columns.shape[1], bool)
+    expected, free = level * shape, np.ones(columns.shape[1], bool)
     for _ in range(20):
         good = square < GROSS**2 * expected
         weight = np.where(good, 1.0 / expected, 0.0)
@@ -579,10 +610,11 @@ def _times(factor: float, estimate: Estimate) -> Estimate:
 
 
 def _stretches(times_s: Floats, stamps: Floats, number: int) -> Integers:
-    share = (times_s - stamps[0]) / max(stamps[-1] - stamps[0], 1e-9)
-    return np.asarray(
-        STRETCHES * number + np.clip(STRETCHES * share, 0, STRETCHES - 1), dtype=np.int64
-    )
+    """Names of the stretches of one log: long enough for errors to be no more alike."""
+    seconds = max(float(stamps[-1] - stamps[0]), 1e-9)
+    count = int(np.clip(seconds / STRETCH_S, *STRETCHES))
+    within = np.clip(count * (times_s - stamps[0]) / seconds, 0, count - 1)
+    return np.asarray(STRETCHES[1] * number + within, dtype=np.int64)
 
 
 def _known(stamps: Floats, times_s: Floats) -> Mask:
