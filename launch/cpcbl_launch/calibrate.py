@@ -24,7 +24,7 @@ from cpcbl_launch.calibration import (
     calibrate_sensor,
 )
 from cpcbl_launch.recording import read_recording
-from cpcbl_launch.team_file import builtin, parse_team
+from cpcbl_launch.team_file import TeamFileError, builtin, parse_team
 from cpcbl_team.config import Landmark
 from cpcbl_team.inputs import Odometry, Sightings
 from cpcbl_team.metrics import Floats
@@ -52,6 +52,9 @@ class Calibration(msgspec.Struct, frozen=True):
 
     logs: tuple[str, ...]
     robots: dict[str, RobotCalibration]
+
+
+RobotLogs = dict[str, list[RobotLog]]
 
 
 # Logs -------------------------------------------------------------------------------------------
@@ -141,22 +144,29 @@ def _sightings(frames: Any, number: Mapping[str, int]) -> Floats:
 # Estimates --------------------------------------------------------------------------------------
 
 
+def read_logs(paths: Sequence[Path]) -> RobotLogs:
+    """By robot its part of every log. Raises LogError."""
+    logs: RobotLogs = {}
+    for path in paths:
+        for name, log in read_log(path).items():
+            logs.setdefault(name, []).append(log)
+    return dict(sorted(logs.items()))
+
+
 def calibrated(
-    paths: Sequence[Path], progress: Callable[[float], None] = lambda done: None
+    logs: RobotLogs, names: Sequence[str], progress: Callable[[float], None] = lambda done: None
 ) -> Calibration:
-    """The robots of all logs, those of one name pooled. Raises LogError, ValueError."""
-    read = [read_log(path) for path in paths]
-    names = sorted({name for log in read for name in log})
+    """All robots of the logs with these names, each over all its logs. Raises ValueError."""
     robots = {}
-    for i, name in enumerate(names):
-        robots[name] = calibrated_robot([log[name] for log in read if name in log])
-        progress((i + 1) / len(names))
+    for i, (robot, parts) in enumerate(logs.items()):
+        robots[robot] = calibrated_robot(parts)
+        progress((i + 1) / len(logs))
     if not any(robot.odometry or robot.sensor for robot in robots.values()):
         raise ValueError(
-            f"{', '.join(map(str, paths))}: nothing to calibrate: no robot drives, and none sees"
-            " landmarks or robots where truth is known"
+            f"{', '.join(names)}: nothing to calibrate: no robot drives, and none sees landmarks or"
+            " robots where the truth is known"
         )
-    return Calibration(tuple(path.name or str(path) for path in paths), robots)
+    return Calibration(tuple(names), robots)
 
 
 def calibrated_robot(logs: Sequence[RobotLog]) -> RobotCalibration:
@@ -180,13 +190,19 @@ def calibrated_robot(logs: Sequence[RobotLog]) -> RobotCalibration:
 # Team file --------------------------------------------------------------------------------------
 
 
-def base_text(paths: Sequence[Path], team_file: Path | None) -> str:
-    """The team file to add types to: the given one, the recorded team, or the built-in mrclam."""
-    if team_file is not None:
-        return team_file.read_text(encoding="utf-8")
-    if paths[0].suffix == ".mcap":
-        return tomlkit.dumps(changed_keys(read_recording(paths[0]).team))
-    return builtin("mrclam").read_text(encoding="utf-8")
+def base_text(logs: Sequence[Path], team_file: Path | None) -> tuple[str, str]:
+    """The team file to add types to, and what to call it: the given one (or a built-in one by its
+    name), the recorded team, or the built-in mrclam. Raises TeamFileError, LogError.
+    """
+    if team_file is None and logs[0].suffix == ".mcap":
+        return tomlkit.dumps(changed_keys(read_recording(logs[0]).team)), str(logs[0])
+    path = team_file or builtin("mrclam")
+    if not path.exists() and builtin(path.name).exists():
+        path = builtin(path.name)
+    try:
+        return path.read_text(encoding="utf-8"), str(path)
+    except (OSError, UnicodeDecodeError) as error:
+        raise TeamFileError(f"{path}: cannot be read: {error}") from error
 
 
 def changed_keys(settings: msgspec.Struct) -> dict[str, Any]:
@@ -214,24 +230,23 @@ def team_text(calibration: Calibration, base: str, name: str = "team file") -> s
     """
     parse_team(base, name)
     document = tomlkit.parse(base)
-    there = [n for n in calibration.robots if n in document["robots"]]  # type: ignore[operator]
+    there = [n for n in calibration.robots if n in document["robots"]]
     if not there:
         raise ValueError(f"{name}: has none of the robots {', '.join(calibration.robots)}")
     for robot in there:
-        _add_type(document, robot, calibration.robots[robot], ", ".join(calibration.logs))
+        _add_type(document, robot, calibration.robots[robot])
     text = f"# Calibrated by `cpcbl-team calibrate` from {', '.join(calibration.logs)}.\n"
     text += tomlkit.dumps(document)
     parse_team(text, name)
     return text
 
 
-def _add_type(document: TOMLDocument, robot: str, found: RobotCalibration, logs: str) -> None:
-    own: Any = document["robots"][robot]  # type: ignore[index]
+def _add_type(document: TOMLDocument, robot: str, found: RobotCalibration) -> None:
+    own: Any = document["robots"][robot]
     types: Any = document.setdefault("types", tomlkit.table(is_super_table=True))
-    former = types.get(own.get("type"), {})
+    former = types.get(own.get("type", ""), {})
     kind = f"robot-{robot}" if len(robot) < 26 else robot
     table = tomlkit.table()
-    table.comment(f"from {logs}")
     for key, value in former.items():
         if key not in ("odometry", "sensor"):
             table.add(key, value)

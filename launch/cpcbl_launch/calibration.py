@@ -6,7 +6,7 @@ because errors are alike for seconds (delete-a-group jackknife, Kott 2001).
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from itertools import pairwise
 from typing import NamedTuple, TypeVar
 
@@ -372,7 +372,7 @@ def range_errors(rows: SensorRows, corrections: Floats) -> Floats:
 
 def bearing_errors(rows: SensorRows, corrections: Floats) -> Floats:
     """Corrected minus true bearing."""
-    return _bearing_errors(rows) - corrections[3]
+    return np.asarray(_bearing_errors(rows) - corrections[3])
 
 
 def _bearing_errors(rows: SensorRows) -> Floats:
@@ -440,6 +440,38 @@ def calibrate_sensor(logs: Sequence[RobotLog]) -> dict[str, Estimate]:
     return result | {name: v for name, v in more.items() if math.isfinite(v.value)}
 
 
+# Pictures ------------------------------------------------------------------------------------
+
+
+class SensorResiduals(NamedTuple):
+    """What a calibrated sensor leaves; see `SensorRows`."""
+
+    true_range: Floats
+    range_m: Floats
+    bearing: Floats
+    pairs: "Pairs"
+
+
+def sensor_residuals(logs: Sequence[RobotLog], found: Mapping[str, Estimate]) -> SensorResiduals:
+    """Corrected minus true readings of a robot whose sensor was calibrated."""
+    neutral = {"range_scale": 1.0}
+    values = [found[name].value if name in found else neutral.get(name, 0.0) for name in SENSOR]
+    corrections = np.array([*values[:3], math.radians(values[3]), 0.0])
+    rows = sensor_rows(logs, values[4])
+    return SensorResiduals(
+        rows.true_range,
+        range_errors(rows, corrections),
+        bearing_errors(rows, corrections),
+        lagged_products(rows, corrections),
+    )
+
+
+def turn_residuals(logs: Sequence[RobotLog], turn_scale: float) -> Floats:
+    """Mean absolute error of the turn in a window, rad, for each of `DELAYS_S`."""
+    windows = [odometry_rows(logs, float(delay_s), WINDOW_S) for delay_s in DELAYS_S]
+    return np.array([np.abs(w.true_turn - turn_scale * w.turn).mean() for w in windows])
+
+
 # Correlation ------------------------------------------------------------------------------------
 
 
@@ -454,11 +486,11 @@ class Pairs(NamedTuple):
 
 def lagged_products(rows: SensorRows, corrections: Floats) -> Pairs:
     """All pairs of one object and one kind, up to the longest lag apart, in units of sigma."""
-    sigmas = sensor_sigmas(rows, sensor_noise(rows, corrections))
-    kinds = range_errors(rows, corrections), bearing_errors(rows, corrections)
+    range_sigma, bearing_sigma = sensor_sigmas(rows, sensor_noise(rows, corrections))
+    units = range_errors(rows, corrections) / range_sigma, bearing_errors(rows, corrections)
     parts = []
-    for kind, sigma in zip(kinds, sigmas, strict=True):
-        error = np.where(np.abs(kind) < GROSS * sigma, kind / sigma, np.nan)
+    for unit in (units[0], units[1] / bearing_sigma):
+        error = np.where(np.abs(unit) < GROSS, unit, np.nan)
         for name in np.unique(rows.object):
             mine = np.flatnonzero((rows.object == name) & np.isfinite(error))
             mine = mine[np.argsort(rows.stamp_s[mine], kind="stable")]
@@ -511,12 +543,13 @@ def robust_fit(columns: Floats, values: Floats) -> Floats:
 
     Huber's weights, iterated; residuals beyond GROSS sigmas do not count.
     """
-    weight, coefficients = np.ones(len(values)), np.zeros(columns.shape[1])
+    weight = np.ones(len(values))
+    coefficients: Floats = np.zeros(columns.shape[1])
     for _ in range(12):
         root = np.sqrt(weight)
         coefficients = np.linalg.lstsq(columns * root[:, None], values * root, rcond=None)[0]
-        size = np.abs(values - columns @ coefficients)
-        size /= _spread(size)
+        errors = np.abs(values - columns @ coefficients)
+        size = errors / _spread(errors)
         weight = np.where(size > GROSS, 0.0, np.minimum(1.0, HUBER / np.maximum(size, 1e-9)))
     return coefficients
 
