@@ -30,7 +30,7 @@ from cpcbl_team.inputs import Odometry, Sightings
 from cpcbl_team.metrics import Floats
 
 LEAST = {  # what is written at least: without any noise a filter would believe without bounds
-    "delay_s": -math.inf,
+    "odometry.delay_s": 0.0,
     "distance_sigma_m_per_sqrt_m": 1e-3,
     "turn_sigma_rad_per_sqrt_rad": 1e-3,
     "turn_sigma_rad_per_sqrt_m": 1e-3,
@@ -253,21 +253,22 @@ def _add_type(document: TOMLDocument, robot: str, found: RobotCalibration) -> No
     for part, values in (("odometry", found.odometry), ("sensor", found.sensor)):
         kept = {k: v for k, v in former.get(part, {}).items() if k not in values}
         if kept or values:
-            table.add(part, _part(kept, values))
+            table.add(part, _part(part, kept, values))
         for key in values:
             own.get(part, {}).pop(key, None)
     types[kind] = table
     own["type"] = kind
 
 
-def _part(kept: Mapping[str, Any], values: Mapping[str, Estimate]) -> Table:
+def _part(part: str, kept: Mapping[str, Any], values: Mapping[str, Estimate]) -> Table:
     table = tomlkit.table()
     for key, value in kept.items():
         table.add(key, value)
     for key, estimate in values.items():
         digits = decimals(estimate.standard_error)
+        least = LEAST.get(key, LEAST.get(f"{part}.{key}", -math.inf))
         number = round(estimate.value, digits)
-        written = tomlkit.item(max(number, LEAST.get(key, -math.inf)) + 0.0)
+        written = tomlkit.item(max(number, least) + 0.0)
         written.comment(f"± {estimate.standard_error:.{digits}f}")
         table.add(key, written)
     return table

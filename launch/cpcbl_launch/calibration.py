@@ -547,7 +547,8 @@ def robust_fit(columns: Floats, values: Floats) -> Floats:
     coefficients: Floats = np.zeros(columns.shape[1])
     for _ in range(12):
         root = np.sqrt(weight)
-        coefficients = np.linalg.lstsq(columns * root[:, None], values * root, rcond=None)[0]
+        solution = np.linalg.lstsq(columns * root[:, None], values * root, rcond=None)[0]
+        coefficients = np.asarray(solution, dtype=np.float64)
         errors = np.abs(values - columns @ coefficients)
         size = errors / _spread(errors)
         weight = np.where(size > GROSS, 0.0, np.minimum(1.0, HUBER / np.maximum(size, 1e-9)))

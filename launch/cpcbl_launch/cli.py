@@ -254,8 +254,8 @@ def calibrate(
         raise ValueError("--picture needs matplotlib: pip install 'cpcbl-team[plot]'")
     base, base_name = calibration.base_text(logs, team_file)
     names = [log.resolve().name for log in logs]
+    robot_logs = calibration.read_logs(logs)
     with progress_bar("calibrating", quiet=as_json) as progress:
-        robot_logs = calibration.read_logs(logs)
         result = calibration.calibrated(robot_logs, names, progress)
     output.write_text(calibration.team_text(result, base, base_name), encoding="utf-8")
     if picture is not None:

@@ -4,6 +4,7 @@ Messages are JSON arrays, as on the wire but readable; the team is the attachmen
 inputs of a robot that replays a log are not on the bus, so not in the file either.
 """
 
+import struct
 import threading
 from collections.abc import Iterable
 from contextlib import AbstractContextManager
@@ -91,7 +92,7 @@ def read_recording(path: Path) -> Recorded:
         team = msgspec.json.decode(attached[0], type=Team)
     except OSError as error:
         raise LogError(f"{path}: cannot be read: {error.strerror}") from error
-    except (McapError, msgspec.MsgspecError) as error:
+    except (McapError, struct.error, msgspec.MsgspecError) as error:
         raise LogError(f"{path}: not a whole recording: {error}") from error
     truths = [message for _, message in messages if isinstance(message, Truths)]
     return Recorded(team, _inputs(messages), truth_rows(truths))
