@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from bus_helpers import SECOND, saw, standing
+from log_helpers import write_log
 from process_helpers import cpcbl_team
 
 from cpcbl_launch.evaluation import simulate
@@ -92,3 +93,24 @@ def test_up_records_its_run(tmp_path: Path) -> None:
     for rows in recorded.truth.values():
         assert len(rows) > 100
         assert (np.diff(rows[:, 0]) > 0.0).all()
+
+
+def test_a_replayed_log_is_not_recorded_and_that_is_said(tmp_path: Path) -> None:
+    write_log(tmp_path, ("1",), seconds=6.0)
+    path = tmp_path / "log.mcap"
+    ran = cpcbl_team(
+        "up",
+        "mrclam",
+        "--data",
+        tmp_path,
+        "--duration",
+        4,
+        "--speed",
+        4,
+        "--record",
+        path,
+        "--json",
+    )
+    assert ran.returncode == 0, ran.stderr
+    assert "without the inputs of 1" in ran.stderr
+    assert read_recording(path).inputs == {}
