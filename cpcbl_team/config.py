@@ -253,5 +253,7 @@ class Team(Table, frozen=True, kw_only=True):
     map: Field = Field()
     transport: TransportSettings = TransportSettings()
     simulation: SimulationSettings = SimulationSettings()
+    calibrated_on: tuple[str, ...] = ()
+    """Logs from which `calibrate` took the robots' types: no measure of their worth."""
     data: str = ""
     """Folder of the log, for robots whose source is `mrclam`."""

@@ -250,6 +250,12 @@ def calibrate(
         ),
     ] = None,
     output: Annotated[Path, typer.Option(help="Team file to write.")] = Path("calibrated.toml"),
+    margin: Annotated[
+        float,
+        typer.Option(
+            min=0.0, help="Share of each bias that may differ on another day: added to the noise."
+        ),
+    ] = 0.3,
     picture: Annotated[
         Optional[Path],
         typer.Option(help="Draw residuals into this file (PNG or SVG; extra `plot`)."),
@@ -260,7 +266,7 @@ def calibrate(
     import msgspec
     from rich.console import Console
 
-    from cpcbl_launch import calibrate as calibration
+    from cpcbl_launch.calibration import robots as calibration
     from cpcbl_launch.show import print_calibration, progress_bar
 
     if picture is not None and importlib.util.find_spec("matplotlib") is None:
@@ -270,9 +276,9 @@ def calibrate(
     robot_logs = calibration.read_logs(logs)
     with progress_bar("calibrating", quiet=as_json) as progress:
         result = calibration.calibrated(robot_logs, names, progress)
-    output.write_text(calibration.team_text(result, base, base_name), encoding="utf-8")
+    output.write_text(calibration.team_text(result, base, base_name, margin), encoding="utf-8")
     if picture is not None:
-        from cpcbl_launch.calibration_picture import draw_residuals
+        from cpcbl_launch.calibration.picture import draw_residuals
 
         draw_residuals(robot_logs, result, picture)
     if as_json:

@@ -14,9 +14,10 @@ import numpy as np
 
 from cpcbl_agents.clock import Clock
 from cpcbl_agents.sensing import SensorInput
-from cpcbl_team.config import RobotSettings, Team
+from cpcbl_team.config import OdometrySettings, RobotSettings, SensorSettings, Team
 from cpcbl_team.geometry import Pose2, step, wrap_angle
 from cpcbl_team.inputs import Odometry, Position, Sighting, Sightings
+from cpcbl_team.sensors import LEAST_COSINE
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus, Publisher
 from cpcbl_transport.messages import Drive, Truth, Truths, decode, encode, refusal
@@ -69,6 +70,27 @@ class Delayed:
         return late * before[0] + soon * now[0], late * before[1] + soon * now[1]
 
 
+def misreported(distance: float, turn: float, o: OdometrySettings) -> tuple[float, float]:
+    """What wheels report of a true motion: the inverse of `corrected_odometry`."""
+    reported_turn = (turn - o.turn_bias_rad_per_m * distance) / o.turn_scale
+    lost = o.distance_loss_m_per_rad * abs(reported_turn) if distance else 0.0
+    way = (abs(distance) + lost) / o.distance_scale
+    return math.copysign(way, distance), reported_turn
+
+
+def misread(
+    range_m: float, bearing: float, sensor: SensorSettings, teammate: bool
+) -> tuple[float, float]:
+    """What a camera reads of a true range and bearing: the inverse of `corrected_sighting`."""
+    reading = (bearing + math.radians(sensor.bearing_bias_deg)) / sensor.bearing_scale
+    bias_m = sensor.robot_range_bias_m if teammate else sensor.range_bias_m
+    reading_m = (range_m + bias_m) / sensor.range_scale
+    if sensor.range_is_depth:
+        off_axis = math.cos(reading - math.radians(sensor.optical_axis_deg))
+        reading_m *= max(off_axis, LEAST_COSINE)
+    return reading_m, wrap_angle(reading)
+
+
 class SimulatedRobot:
     """One robot of the field: its true pose and its imperfect senses."""
 
@@ -111,7 +133,10 @@ class SimulatedRobot:
         self._reported = (self._reported[0] + distance, self._reported[1] + turn)
         distance, turn = self._motion.next((distance, turn))
         o = self.settings.odometry
-        along = o.distance_sigma_m_per_sqrt_m * math.sqrt(abs(distance))
+        along = math.sqrt(
+            o.distance_sigma_m_per_sqrt_m**2 * abs(distance)
+            + o.distance_sigma_m_per_sqrt_rad**2 * abs(turn)
+        )
         around = math.sqrt(
             o.turn_sigma_rad_per_sqrt_rad**2 * abs(turn)
             + o.turn_sigma_rad_per_sqrt_m**2 * abs(distance)
@@ -124,9 +149,7 @@ class SimulatedRobot:
         if not o.moves or not self._odometry_timer.due(now_ns):
             return None
         distance, turn = self._reported
-        piece = Odometry(
-            self._reported_ns, now_ns, distance / o.distance_scale, turn / o.turn_scale
-        )
+        piece = Odometry(self._reported_ns, now_ns, *misreported(distance, turn, o))
         self._reported, self._reported_ns = (0.0, 0.0), now_ns
         return piece
 
@@ -160,14 +183,11 @@ class SimulatedRobot:
             return None
         range_m += self._error(seen.name, "range", sensor.range_sigma_m(range_m), now_ns)
         bearing += self._error(seen.name, "bearing", sensor.bearing_sigma_rad, now_ns)
-        bias_m = sensor.robot_range_bias_m if seen.teammate else sensor.range_bias_m
-        reading_m = (range_m + bias_m) / sensor.range_scale
+        reading_m, reading = misread(range_m, bearing, sensor, seen.teammate)
         return Sighting(
             seen.name,
             max(reading_m, 0.01) if seen.gives in ("both", "range") else None,
-            wrap_angle(bearing + math.radians(sensor.bearing_bias_deg))
-            if seen.gives in ("both", "bearing")
-            else None,
+            reading if seen.gives in ("both", "bearing") else None,
         )
 
     def _error(self, name: str, kind: str, sigma: float, now_ns: int) -> float:

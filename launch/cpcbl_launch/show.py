@@ -12,8 +12,8 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 from rich.text import Text
 
-from cpcbl_launch.calibrate import Calibration, decimals
-from cpcbl_launch.calibration import Estimate
+from cpcbl_launch.calibration.robots import Calibration, decimals
+from cpcbl_launch.calibration.statistics import Estimate
 from cpcbl_launch.recorder import MeanScore, Recorder, Report
 from cpcbl_launch.supervisor import Supervisor
 from cpcbl_team.collaboration import LOWEST_TIER
@@ -247,15 +247,25 @@ def _with_error(estimate: Estimate | None) -> str:
 
 _CALIBRATED = (
     (
-        "odometry, true = scale x reported",
+        "way, true = scale x reported - loss x |turn|",
         "odometry",
-        {"distance_scale": "distance scale", "turn_scale": "turn scale", "delay_s": "delay s"},
+        {
+            "distance_scale": "scale",
+            "distance_loss_m_per_rad": "loss m/rad",
+            "delay_s": "delay s",
+        },
+    ),
+    (
+        "turn, true = scale x reported + bias x way",
+        "odometry",
+        {"turn_scale": "scale", "turn_bias_rad_per_m": "bias rad/m"},
     ),
     (
         "odometry noise, σ by root of way and turn",
         "odometry",
         {
             "distance_sigma_m_per_sqrt_m": "way m/√m",
+            "distance_sigma_m_per_sqrt_rad": "m/√rad",
             "turn_sigma_rad_per_sqrt_rad": "turn rad/√rad",
             "turn_sigma_rad_per_sqrt_m": "turn rad/√m",
         },
@@ -267,6 +277,7 @@ _CALIBRATED = (
             "range_scale": "scale",
             "range_bias_m": "bias m",
             "robot_range_bias_m": "robots' bias m",
+            "optical_axis_deg": "axis deg",
         },
     ),
     (
@@ -275,9 +286,14 @@ _CALIBRATED = (
         {"range_share": "share", "range_floor_m": "floor m", "correlation_s": "fade s"},
     ),
     (
-        "bearings, true = reading - bias; camera",
+        "bearings, true = scale x reading - bias; camera",
         "sensor",
-        {"bearing_bias_deg": "bias deg", "bearing_sigma_deg": "σ deg", "delay_s": "delay s"},
+        {
+            "bearing_scale": "scale",
+            "bearing_bias_deg": "bias deg",
+            "bearing_sigma_deg": "σ deg",
+            "delay_s": "delay s",
+        },
     ),
 )
 

@@ -46,6 +46,7 @@ class _File(Table, frozen=True, kw_only=True):
     map: _Map = _Map()
     transport: TransportSettings = TransportSettings()
     simulation: SimulationSettings = SimulationSettings()
+    calibrated_on: tuple[str, ...] = ()
     data: str = ""
     defaults: Layer = msgspec.field(default_factory=dict)
     types: Layer = msgspec.field(default_factory=dict)
@@ -120,6 +121,7 @@ def parse_team(text: str, name: str = "team file") -> Team:
         map=field,
         transport=file.transport,
         simulation=file.simulation,
+        calibrated_on=file.calibrated_on,
         data=file.data,
     )
     for problem in problems(team):

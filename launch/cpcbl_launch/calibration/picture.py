@@ -5,14 +5,10 @@ from pathlib import Path
 import matplotlib as mpl
 import numpy as np
 
-from cpcbl_launch.calibrate import Calibration, RobotLogs
-from cpcbl_launch.calibration import (
-    DELAYS_S,
-    LAGS_S,
-    autocorrelation,
-    sensor_residuals,
-    turn_residuals,
-)
+from cpcbl_launch.calibration.correlation import LAGS_S, autocorrelation
+from cpcbl_launch.calibration.odometry import DELAYS_S, turn_residuals
+from cpcbl_launch.calibration.robots import Calibration, RobotLogs
+from cpcbl_launch.calibration.sensor import sensor_residuals
 
 mpl.use("Agg")
 
@@ -32,9 +28,9 @@ def draw_residuals(logs: RobotLogs, calibration: Calibration, path: Path) -> Non
             errors = turn_residuals(logs[robot], found.odometry["turn_scale"].value)
             turns.plot(DELAYS_S, errors, color=colour, label=robot)
             turns.axvline(found.odometry["delay_s"].value, color=colour, linewidth=0.6)
-        if not found.sensor:
+        left = sensor_residuals(logs[robot])
+        if left is None:
             continue
-        left = sensor_residuals(logs[robot], found.sensor)
         some = slice(None, None, len(left.range_m) // MOST_DOTS + 1)
         ranges.plot(left.true_range[some], left.range_m[some], ".", markersize=2, color=colour)
         bearings.hist(

@@ -13,24 +13,19 @@ from tomlkit.toml_document import TOMLDocument
 
 from cpcbl_agents.sources import mrclam
 from cpcbl_agents.sources.mrclam import LogError
-from cpcbl_launch.calibration import (
-    ODOMETRY,
-    ODOMETRY_NOISE,
-    SENSOR,
-    SENSOR_NOISE,
-    Estimate,
-    RobotLog,
-    calibrate_odometry,
-    calibrate_sensor,
-)
+from cpcbl_launch.calibration import odometry, sensor
+from cpcbl_launch.calibration.robot_log import RobotLog
+from cpcbl_launch.calibration.statistics import Estimate
 from cpcbl_launch.recording import read_recording
 from cpcbl_launch.team_file import TeamFileError, builtin, parse_team
 from cpcbl_team.config import Landmark
 from cpcbl_team.inputs import Odometry, Sightings
 from cpcbl_team.metrics import Floats
 
+MARGIN = 0.3
 LEAST = {  # what is written at least: without any noise a filter would believe without bounds
     "odometry.delay_s": 0.0,
+    "distance_loss_m_per_rad": 0.0,
     "distance_sigma_m_per_sqrt_m": 1e-3,
     "turn_sigma_rad_per_sqrt_rad": 1e-3,
     "turn_sigma_rad_per_sqrt_m": 1e-3,
@@ -45,6 +40,7 @@ class RobotCalibration(msgspec.Struct, frozen=True):
     odometry: dict[str, Estimate]
     sensor: dict[str, Estimate]
     notes: tuple[str, ...] = ()
+    range_is_depth: bool = False
 
 
 class Calibration(msgspec.Struct, frozen=True):
@@ -171,20 +167,24 @@ def calibrated(
 
 def calibrated_robot(logs: Sequence[RobotLog]) -> RobotCalibration:
     """One robot, from all its logs."""
-    odometry, sensor = calibrate_odometry(logs), calibrate_sensor(logs)
+    driving = odometry.calibrate_odometry(logs)
+    seeing, is_depth = sensor.calibrate_sensor(logs)
     notes = []
-    if not odometry:
+    if not driving:
         notes.append("does not drive: odometry stays as it is")
-    if not sensor:
+    if not seeing:
         notes.append("sees too little where truth is known: the sensor stays as it is")
+    if is_depth:
+        notes.append("ranges are depths along the optical axis")
+    axis = () if is_depth else ("optical_axis_deg",)
     for part, found, names in (
-        ("odometry", odometry, (*ODOMETRY, *ODOMETRY_NOISE)),
-        ("sensor", sensor, (*SENSOR, *SENSOR_NOISE, "correlation_s")),
+        ("odometry", driving, (*odometry.CORRECTIONS, *odometry.NOISE)),
+        ("sensor", seeing, (*sensor.CORRECTIONS, *sensor.NOISE, "correlation_s")),
     ):
-        missing = [name for name in names if name not in found]
+        missing = [name for name in names if name not in found and name not in axis]
         if found and missing:
             notes.append(f"not told by the logs: {part} {', '.join(missing)}")
-    return RobotCalibration(odometry, sensor, tuple(notes))
+    return RobotCalibration(driving, seeing, tuple(notes), is_depth)
 
 
 # Team file --------------------------------------------------------------------------------------
@@ -223,10 +223,14 @@ def _plain(value: Any) -> Any:
     return msgspec.to_builtins(value)
 
 
-def team_text(calibration: Calibration, base: str, name: str = "team file") -> str:
+def team_text(
+    calibration: Calibration, base: str, name: str = "team file", margin: float = MARGIN
+) -> str:
     """The base team file with a type for each calibrated robot. Raises TeamFileError, ValueError.
 
     A robot's former type goes into its new one; keys of its own that were calibrated are taken out.
+    `margin`: the share of each bias that may be another one on another day; it is added to the
+    sensor's noise.
     """
     parse_team(base, name)
     document = tomlkit.parse(base)
@@ -234,14 +238,15 @@ def team_text(calibration: Calibration, base: str, name: str = "team file") -> s
     if not there:
         raise ValueError(f"{name}: has none of the robots {', '.join(calibration.robots)}")
     for robot in there:
-        _add_type(document, robot, calibration.robots[robot])
+        _add_type(document, robot, calibration.robots[robot], margin)
+    document["calibrated_on"] = list(calibration.logs)
     text = f"# Calibrated by `cpcbl-team calibrate` from {', '.join(calibration.logs)}.\n"
     text += tomlkit.dumps(document)
     parse_team(text, name)
     return text
 
 
-def _add_type(document: TOMLDocument, robot: str, found: RobotCalibration) -> None:
+def _add_type(document: TOMLDocument, robot: str, found: RobotCalibration, margin: float) -> None:
     own: Any = document["robots"][robot]
     types: Any = document.setdefault("types", tomlkit.table(is_super_table=True))
     former = types.get(own.get("type", ""), {})
@@ -250,14 +255,31 @@ def _add_type(document: TOMLDocument, robot: str, found: RobotCalibration) -> No
     for key, value in former.items():
         if key not in ("odometry", "sensor"):
             table.add(key, value)
-    for part, values in (("odometry", found.odometry), ("sensor", found.sensor)):
+    sensor_values = _with_margin(found.sensor, margin)
+    for part, values in (("odometry", found.odometry), ("sensor", sensor_values)):
         kept = {k: v for k, v in former.get(part, {}).items() if k not in values}
         if kept or values:
             table.add(part, _part(part, kept, values))
+        if part == "sensor" and values:
+            table[part].add("range_is_depth", found.range_is_depth)
         for key in values:
             own.get(part, {}).pop(key, None)
+    if found.odometry:
+        table.add("localizer", {"self_calibration": False})
     types[kind] = table
     own["type"] = kind
+
+
+def _with_margin(found: Mapping[str, Estimate], margin: float) -> dict[str, Estimate]:
+    values = dict(found)
+    for noise, bias in (
+        ("range_floor_m", "range_bias_m"),
+        ("bearing_sigma_deg", "bearing_bias_deg"),
+    ):
+        if noise in values and bias in values:
+            doubt = math.hypot(values[noise].value, margin * values[bias].value)
+            values[noise] = Estimate(doubt, values[noise].standard_error)
+    return values
 
 
 def _part(part: str, kept: Mapping[str, Any], values: Mapping[str, Estimate]) -> Table:
