@@ -8,7 +8,7 @@ import math
 
 from cpcbl_team.config import OdometryNoise
 from cpcbl_team.estimate import ZERO3, Covariance3, Estimate, Matrix3
-from cpcbl_team.geometry import step
+from cpcbl_team.geometry import Pose2, wrap_angle
 
 
 def motion_jacobian(heading: float, distance: float, turn: float) -> Matrix3:
@@ -30,7 +30,13 @@ def motion_jacobian(heading: float, distance: float, turn: float) -> Matrix3:
 def motion_noise(heading: float, distance: float, turn: float, noise: OdometryNoise) -> Covariance3:
     """The differential motion's covariance, rotated into the field's frame."""
     direction = heading + 0.5 * turn
-    c, s = math.cos(direction), math.sin(direction)
+    return _noise_along(math.cos(direction), math.sin(direction), distance, turn, noise)
+
+
+def _noise_along(
+    c: float, s: float, distance: float, turn: float, noise: OdometryNoise
+) -> Covariance3:
+    """The noise of an arc whose chord has the direction with cosine `c` and sine `s`."""
     way = abs(distance)
     along = noise.distance_sigma_m_per_sqrt_m**2 * way
     around = (
@@ -50,12 +56,14 @@ def motion_noise(heading: float, distance: float, turn: float, noise: OdometryNo
 def move(estimate: Estimate, distance: float, turn: float, noise: OdometryNoise) -> Estimate:
     """The estimate after the wheels report an arc of `distance` metres that turns by `turn`."""
     pose, covariance, shared = estimate
-    direction = pose.heading + 0.5 * turn
+    x, y, heading = pose
+    direction = heading + 0.5 * turn
+    c, s = math.cos(direction), math.sin(direction)
     # where a heading error of one radian leads, in metres: the last column of the Jacobian
-    lx, ly = -distance * math.sin(direction), distance * math.cos(direction)
+    lx, ly = -distance * s, distance * c
     return Estimate(
-        step(pose, distance, turn),
-        _sheared(covariance, lx, ly).plus(motion_noise(pose.heading, distance, turn, noise)),
+        Pose2(x + distance * c, y + distance * s, wrap_angle(heading + turn)),
+        _sheared(covariance, lx, ly).plus(_noise_along(c, s, distance, turn, noise)),
         shared if shared is ZERO3 else _sheared(shared, lx, ly),
     )
 

@@ -69,6 +69,18 @@ def remembered(memory: Memory, pieces: Iterable[Evidence]) -> Memory:
     return memory._replace(evidence=tuple(kept[-MOST_PIECES:]))
 
 
+def with_seen(state: State, seen: Iterable[Measured]) -> Memory:
+    """The memory with those of a frame's sightings that are not too alike to what it holds."""
+    now, memory = state.stamp_ns, state.memory
+    recent = set()
+    for e in reversed(memory.evidence):
+        if now - e.stamp_ns >= SPACING_NS:
+            break
+        recent.add(e.source)
+    new = [m for m in seen if m.source not in recent and m.usable and m.wall is None]
+    return remembered(memory, [seen_evidence(state, m) for m in new]) if new else memory
+
+
 def lost_reason(estimate: Estimate, memory: Memory, settings: LocalizerSettings) -> str:
     """Why the robot is lost; empty if it is not. Being lost ends at half of each limit."""
     slack = 0.5 if memory.lost else 1.0
