@@ -78,7 +78,8 @@ def bearing_heading(
     if distance < NEAREST_M:
         return None
     residual = wrap_angle(math.atan2(dy, dx) - bearing - pose.heading)
-    u, v = -dy / distance**2, dx / distance**2
+    q = distance**2
+    u, v = -dy / q, dx / q
     return Constraint((u, v, 1.0), residual, sigma, distance, True, (u, v))
 
 

@@ -291,7 +291,8 @@ class Localizer:
             innovations=window[-self._rules.lost_window :],
             counts=added(memory.counts, accepted=len(used), gated=rejected),
         )
-        return state._replace(estimate=estimate, memory=memory)
+        _, _, reckoned, motion, odometry_ns, _ = state
+        return State(now, estimate, reckoned, motion, odometry_ns, memory)
 
     def _judged(self, state: State) -> State:
         """Lost or not. If lost: found again from recent evidence, else in more and more doubt."""

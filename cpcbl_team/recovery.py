@@ -59,10 +59,12 @@ def told_evidence(
 def remembered(memory: Memory, pieces: Iterable[Evidence]) -> Memory:
     """The memory with new evidence, without what is too old or too alike."""
     kept = list(memory.evidence)
+    latest_ns = {e.source: e.stamp_ns for e in kept}
     for piece in pieces:
-        latest = next((e.stamp_ns for e in reversed(kept) if e.source == piece.source), None)
+        latest = latest_ns.get(piece.source)
         if latest is None or piece.stamp_ns - latest >= SPACING_NS:
             kept.append(piece)
+            latest_ns[piece.source] = piece.stamp_ns
     if len(kept) == len(memory.evidence):
         return memory
     kept = [e for e in kept if kept[-1].stamp_ns - e.stamp_ns <= WINDOW_NS]
