@@ -27,6 +27,8 @@ class OdometryNoise(Table, frozen=True, kw_only=True):
     """How odometry errs: white noise whose variance grows with the way and the turn."""
 
     distance_sigma_m_per_sqrt_m: NotNegative = 0.05
+    distance_sigma_m_per_sqrt_rad: NotNegative = 0.0
+    """Wheels that turn on the spot slip to and fro."""
     turn_sigma_rad_per_sqrt_rad: NotNegative = 0.05
     turn_sigma_rad_per_sqrt_m: NotNegative = 0.05
 
@@ -79,7 +81,8 @@ class SensorSettings(Table, frozen=True, kw_only=True):
     """true bearing = bearing_scale x reading - bearing_bias_deg."""
     bearing_bias_deg: float = 0.0
     correlation_s: NotNegative = 0.0
-    """Time constant with which errors to the same object fade; 0: each reading errs anew."""
+    """Time constant with which errors to the same object fade; 0: each reading errs anew. What is
+    seen again before that counts for less."""
     sees_landmarks: bool = True
     sees_robots: bool = True
 
@@ -119,6 +122,8 @@ class LocalizerSettings(Table, frozen=True, kw_only=True):
     object_interval_s: NotNegative = 0.0
     """Least time between two uses of the same object: its errors are correlated."""
     bearing_for_position: bool = True
+    self_calibration: bool = False
+    """Learn the scales of odometry and the bearing bias while driving."""
     paper_uncertainty: bool = False
     """As printed: without the heading's share in a position's uncertainty (resolution a)."""
     weights: Weights = Weights()

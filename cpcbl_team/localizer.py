@@ -25,7 +25,8 @@ from cpcbl_team.gaussian import Covariance2
 from cpcbl_team.geometry import Pose2, step, wrap_angle
 from cpcbl_team.inputs import Belief, Fix, Odometry, Position, Sightings, Told
 from cpcbl_team.motion import move
-from cpcbl_team.sensors import sighting_fault
+from cpcbl_team.self_calibration import Anchor, learned
+from cpcbl_team.sensors import repeated_share, sighting_fault
 from cpcbl_team.sightings import (
     Measured,
     combined,
@@ -52,6 +53,7 @@ class Localizer:
         self._rules = settings.localizer
         self._weighted = self._rules.variant == "weighted"
         self._alternates = self._rules.alternates
+        self._correlated = settings.sensor.correlation_s > 0.0
         p = self._rules.gate_probability
         self._gates = (NormalDist().inv_cdf(0.5 + 0.5 * p) ** 2, -2.0 * math.log(1.0 - p))
         split = settings.collaboration.fusion == "split-ci"
@@ -104,6 +106,9 @@ class Localizer:
             share = max(0, end_ns - max(stamp_ns, motion.from_ns)) / whole_ns
             s = self.settings.odometry
             distance, turn = share * motion.distance_m, share * motion.turn_rad
+            if self._rules.self_calibration:
+                distance *= memory.learned.distance_scale
+                turn *= memory.learned.turn_scale
             if distance != 0.0 or turn != 0.0:
                 reckoned = step(reckoned, distance, turn)
                 estimate = self._reduced(move(estimate, distance, turn, s))
@@ -134,22 +139,33 @@ class Localizer:
 
     def _measure(self, state: State, frame: Sightings) -> tuple[State, list[Measured]]:
         """The usable sightings of a frame. Faulty ones are counted by reason; those of an object
-        that was used too short a time ago are left out: its errors are correlated."""
-        now, pose, teammates = frame.stamp_ns, state.estimate.pose, state.memory.teammates
+        that was used too short a time ago are left out, and those of one that was used not long
+        ago count for less: their errors are correlated."""
+        memory, now, pose = state.memory, frame.stamp_ns, state.estimate.pose
         seen, faults = [], []
+        bias = memory.learned.bearing_bias_rad if self._rules.self_calibration else 0.0
         for sighting in frame.sightings:
             fault = sighting_fault(sighting)
             if fault:
                 faults.append(fault)
                 continue
-            m = measured(sighting, now, pose, self.field, teammates, self.settings)
+            m = measured(sighting, now, pose, self.field, memory.teammates, self.settings)
             if m is not None:
-                seen.append(m)
+                seen.append(m if bias == 0.0 else m.turned(-bias))
         memory = recovery.with_seen(state, seen).counted(*faults)
         if memory is not state.memory:
             state = state._replace(memory=memory)
         least, used_ns = self._rules.object_interval_s * 1e9, memory.objects_ns.get
-        return state, [m for m in seen if _passed(used_ns(m.source), now, least)]
+        fresh = [m for m in seen if _passed(used_ns(m.source), now, least)]
+        if self._correlated:
+            fresh = [m.doubted(self._repeated(memory, m.source, now)) for m in fresh]
+        return state, fresh
+
+    def _repeated(self, memory: Memory, source: str, now_ns: int) -> float:
+        """By how much the variance of what this source says now is to grow."""
+        last_ns = memory.objects_ns.get(source)
+        seconds = None if last_ns is None else (now_ns - last_ns) * 1e-9
+        return repeated_share(seconds, self.settings.sensor.correlation_s)
 
     def _turn(self, state: State, seen: list[Measured]) -> Scope | None:
         """Heading or position, the one that waits longer; one timer a type. None: neither."""
@@ -226,6 +242,8 @@ class Localizer:
         least = self._rules.object_interval_s * 1e9
         if not _passed(memory.objects_ns.get(source), stamp_ns, least):
             return state
+        if self._correlated:
+            sensor = sensor.scaled(self._repeated(memory, source, stamp_ns))
         offset = x - prior.pose.x, y - prior.pose.y
         seen = Observation(_AXES, offset, sensor, observer or Covariance2(0.0, 0.0, 0.0))
         if seen.normalized_innovation_squared(prior.covariance) > self._gates[1]:
@@ -292,7 +310,16 @@ class Localizer:
             counts=added(memory.counts, accepted=len(used), gated=rejected),
         )
         _, _, reckoned, motion, odometry_ns, _ = state
+        if used and self._rules.self_calibration:
+            memory = self._taught(Anchor(now, estimate, reckoned), memory)
         return State(now, estimate, reckoned, motion, odometry_ns, memory)
+
+    def _taught(self, here: Anchor, memory: Memory) -> Memory:
+        """What the robot has learned of its odometry and bearings, from this update too."""
+        if memory.anchor is None or memory.lost:
+            return memory._replace(anchor=None if memory.lost else here)
+        known, anchor = learned(memory.learned, memory.anchor, here, self.settings.odometry)
+        return memory._replace(learned=known, anchor=anchor)
 
     def _judged(self, state: State) -> State:
         """Lost or not. If lost: found again from recent evidence, else in more and more doubt."""
@@ -312,7 +339,7 @@ class Localizer:
             memory = memory._replace(sought_ns=evidence[-1].stamp_ns)
             found = recovery.relocalized(evidence, state.odometry_from_robot, self.field)
         if found is not None:
-            memory = memory._replace(lost="", innovations=()).counted("found_again")
+            memory = memory._replace(lost="", innovations=(), anchor=None).counted("found_again")
             return state._replace(estimate=self._reduced(found), memory=memory)
         estimate = state.estimate
         if refusing and now - memory.widened_ns >= recovery.WIDEN_NS:

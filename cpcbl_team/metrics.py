@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
+Stamps = NDArray[np.int64]
 
 
 class Score(msgspec.Struct, frozen=True, kw_only=True):
@@ -24,12 +25,35 @@ class Score(msgspec.Struct, frozen=True, kw_only=True):
     """Mean normalized estimation error squared of the position (2 is consistent)."""
 
 
+class Trajectory(NamedTuple):
+    """Estimates of one robot over time."""
+
+    stamps_ns: Stamps  # shape (n,)
+    estimate: Floats  # shape (n, 3): x m, y m, heading rad
+    covariance: Floats | None  # shape (n, 6): xx, xy, yy, xh, yh, hh; None: there is none
+
+
 class Samples(NamedTuple):
     """Estimates and truths at the same times. Shapes (n, 3): x m, y m, heading rad; (n, 6)."""
 
     estimate: Floats
     truth: Floats
     covariance: Floats | None  # xx, xy, yy, xh, yh, hh; None: the variant has none
+
+
+def seconds(stamps_ns: Stamps) -> Floats:
+    return np.asarray(stamps_ns * 1e-9, dtype=np.float64)
+
+
+def compared(trajectory: Trajectory, truth: Floats | None) -> tuple[Stamps, Samples]:
+    """A trajectory beside the truth (rows: s, x, y, heading), where it counts; with its stamps."""
+    stamps_ns, estimate, covariance = trajectory
+    if truth is None or len(truth) == 0:
+        nothing = np.empty((0, 3))
+        return stamps_ns[:0], Samples(nothing, nothing, None)
+    at, counts = truth_at(seconds(stamps_ns), truth)
+    covariance = None if covariance is None else covariance[counts]
+    return stamps_ns[counts], Samples(estimate[counts], at[counts], covariance)
 
 
 def position_errors(samples: Samples) -> Floats:

@@ -43,9 +43,12 @@ def _noise_along(
 ) -> _Entries:
     """The noise of an arc whose chord has the direction with cosine `c` and sine `s`."""
     way = abs(distance)
-    along = noise.distance_sigma_m_per_sqrt_m**2 * way
+    turned = abs(turn)
+    along = (
+        noise.distance_sigma_m_per_sqrt_m**2 * way + noise.distance_sigma_m_per_sqrt_rad**2 * turned
+    )
     around = (
-        noise.turn_sigma_rad_per_sqrt_rad**2 * abs(turn) + noise.turn_sigma_rad_per_sqrt_m**2 * way
+        noise.turn_sigma_rad_per_sqrt_rad**2 * turned + noise.turn_sigma_rad_per_sqrt_m**2 * way
     )
     lx, ly = -0.5 * distance * s, 0.5 * distance * c  # where a turn error leads
     return (

@@ -10,6 +10,7 @@ from cpcbl_team.inputs import Odometry, Sighting
 
 LARGEST_M = 1e6
 LARGEST_BEARING_RAD = math.pi + 1e-9
+SOONEST_S = 1e-3
 LEAST_COSINE = 0.1  # a depth says nothing of what is seen across the optical axis
 
 
@@ -94,3 +95,15 @@ def sighting_sigmas(
             range_m = min(max(expected_range_m, least), most)
         range_sigma = sensor.range_sigma_m(range_m)
     return range_sigma, sensor.bearing_sigma_rad if bearing_sigma is None else bearing_sigma
+
+
+def repeated_share(seconds: float | None, correlation_s: float) -> float:
+    """By how much the variance of a reading is to grow when the same object was used `seconds` ago.
+
+    Errors with autocorrelation rho from one reading to the next leave of n readings the worth of
+    n (1 - rho) / (1 + rho): the gentle form of the paper's minimum time between updates.
+    """
+    if seconds is None or correlation_s <= 0.0:
+        return 1.0
+    rho = math.exp(-max(seconds, SOONEST_S) / correlation_s)
+    return (1.0 + rho) / (1.0 - rho)

@@ -49,6 +49,18 @@ class Measured(msgspec.Struct, frozen=True, gc=False):
     def usable(self) -> bool:
         return self.range_m is not None or self.bearing is not None
 
+    def doubted(self, factor: float) -> "Measured":
+        """With both variances grown by this factor."""
+        k = math.sqrt(factor)
+        sigmas = {"range_sigma": k * self.range_sigma, "bearing_sigma": k * self.bearing_sigma}
+        return msgspec.structs.replace(self, **sigmas)
+
+    def turned(self, angle: float) -> "Measured":
+        """Seen so much further to the left."""
+        if self.bearing is None:
+            return self
+        return msgspec.structs.replace(self, bearing=wrap_angle(self.bearing + angle))
+
     @property
     def gives_point_bearing(self) -> bool:
         return self.bearing is not None and self.wall is None

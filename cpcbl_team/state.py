@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 from cpcbl_team.estimate import Estimate
 from cpcbl_team.geometry import Pose2
 from cpcbl_team.inputs import Belief, Odometry
+from cpcbl_team.self_calibration import Anchor, Learned
 
 _NONE: Mapping[str, Any] = MappingProxyType({})
 
@@ -48,6 +49,8 @@ class Memory(NamedTuple):
     widened_ns: int = 0
     sought_ns: int = -1  # the newest evidence with which it sought itself in vain
     counts: Mapping[str, int] = _NONE
+    learned: Learned = Learned()
+    anchor: Anchor | None = None
 
     def counted(self, *reasons: str) -> "Memory":
         if not reasons:

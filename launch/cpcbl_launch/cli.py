@@ -199,6 +199,14 @@ def evaluate_mrclam(
     duration: Annotated[
         Optional[float], typer.Option(help="Seconds of the log; default: all.")
     ] = None,
+    yardstick: Annotated[
+        bool,
+        typer.Option(help="Also dead reckoning, a solo EKF a robot, a centralized EKF."),
+    ] = False,
+    export: Annotated[
+        Optional[Path],
+        typer.Option(help="Write estimates and truth into this folder (TUM files, as evo reads)."),
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Five robots of a real log (UTIAS MRCLAM) against its ground truth."""
@@ -206,15 +214,20 @@ def evaluate_mrclam(
     from rich.console import Console
 
     from cpcbl_launch import logs as real_logs
-    from cpcbl_launch.evaluation import Choice, chosen, evaluate_log
+    from cpcbl_launch.evaluation import Choice, chosen, evaluated
     from cpcbl_launch.show import print_report, progress_bar
+    from cpcbl_launch.tum import export_folder, export_tum
 
     team = _load(team_file or Path("mrclam"))
     choice = Choice(variant, collaboration, fusion, direction)
     logged = real_logs.on_log(chosen(team, choice), data)
     logged = logged._replace(team=real_logs.blinded(logged.team, _names(blind)))
+    logged = real_logs.shortened(logged, duration)
+    folder = None if export is None else export_folder(export)
     with progress_bar(f"{data.name}", quiet=as_json) as progress:
-        result = evaluate_log(logged, duration, progress)
+        result, paths = evaluated(logged, progress, with_yardsticks=yardstick)
+    if folder is not None:
+        export_tum(folder, paths, logged.truth)
     if as_json:
         typer.echo(msgspec.json.format(msgspec.json.encode(result), indent=2).decode())
     else:

@@ -8,9 +8,11 @@ import msgspec
 from cpcbl_agents.node import Node
 from cpcbl_agents.robot import Robot
 from cpcbl_launch.field import FieldNode, SimulatedField
-from cpcbl_launch.logs import LoggedTeam
+from cpcbl_launch.logs import LoggedTeam, shortened
 from cpcbl_launch.recorder import Recorder, Report
+from cpcbl_launch.yardstick import inputs_of, scored, yardsticks
 from cpcbl_team.config import Team
+from cpcbl_team.metrics import Trajectory
 from cpcbl_transport.bus import MemoryHub
 
 Progress = Callable[[float], None]
@@ -47,21 +49,49 @@ def chosen(team: Team, choice: Choice) -> Team:
     return replace(team, robots=robots)
 
 
+class Evaluated(NamedTuple):
+    """The figures of a log, and the estimates that they are about."""
+
+    report: Report
+    paths: dict[str, dict[str, Trajectory]]
+    """By filter (`estimate`: the team's, then the yardsticks'), then by robot."""
+
+
 def evaluate_log(
     logged: LoggedTeam, duration_s: float | None = None, progress: Progress | None = None
 ) -> Report:
     """All robots of a log, scored against its truth."""
+    return evaluated(shortened(logged, duration_s), progress).report
+
+
+def evaluated(
+    logged: LoggedTeam, progress: Progress | None = None, *, with_yardsticks: bool = False
+) -> Evaluated:
+    """The same with its paths, and if wished with yardsticks on the same inputs and times."""
+    show, half = progress or (lambda done: None), 0.5 if with_yardsticks else 1.0
+    report, recorder = _run_log(logged, lambda done: show(half * done))
+    own = {name: recorder.trajectory(name) for name in logged.team.robots}
+    if not with_yardsticks:
+        return Evaluated(report, {"estimate": own})
+    stamps_ns = {name: path.stamps_ns.tolist() for name, path in own.items()}
+    inputs, field = inputs_of(logged), logged.team.map
+    others = yardsticks(inputs, field, stamps_ns, lambda done: show(half + half * done))
+    figures = {kind: scored(paths, logged.truth) for kind, paths in others.items()}
+    report = msgspec.structs.replace(report, yardsticks=figures)
+    return Evaluated(report, {"estimate": own, **others})
+
+
+def _run_log(logged: LoggedTeam, progress: Progress) -> tuple[Report, Recorder]:
     team, start_ns, end_ns = logged.team, logged.start_ns, logged.end_ns
-    if duration_s is not None:
-        end_ns = min(end_ns, start_ns + int(duration_s * 1e9))
     hub = MemoryHub()
     recorder = Recorder(hub.session())
     run_nodes(_robots(team, hub, start_ns), start_ns, end_ns, progress)
     variants = {name: robot.localizer.variant for name, robot in team.robots.items()}
     report = recorder.report(variants, logged.truth)
+    duration_s = (end_ns - start_ns) * 1e-9
     return msgspec.structs.replace(
-        report, left_out=logged.left_out, duration_s=(end_ns - start_ns) * 1e-9
-    )
+        report, left_out=logged.left_out, duration_s=duration_s
+    ), recorder
 
 
 def simulate(team: Team, seed: int, duration_s: float) -> tuple[Report, Recorder]:

@@ -56,6 +56,13 @@ def on_log(team: Team, folder: Path) -> LoggedTeam:
     return LoggedTeam(ready, truth, left_out, start_ns, max(last for _, last in spans.values()))
 
 
+def shortened(logged: LoggedTeam, duration_s: float | None) -> LoggedTeam:
+    """The same log, of which only so much is used; None: all of it."""
+    if duration_s is None:
+        return logged
+    return logged._replace(end_ns=min(logged.end_ns, logged.start_ns + int(duration_s * 1e9)))
+
+
 def _start(folder: Path, robot: str, truth: Floats) -> Start | None:
     """The true pose at the start of a robot's odometry, or None where truth begins long after it.
 

@@ -1,12 +1,12 @@
 """Listens to what robots say of themselves, and turns it into a report against the truth."""
 
 import threading
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
 import msgspec
 import numpy as np
 
-from cpcbl_team.metrics import Floats, Samples, Score, score, truth_at
+from cpcbl_team.metrics import Floats, Samples, Score, Trajectory, compared, score, seconds
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus
 from cpcbl_transport.messages import Status, Track, Truth, Truths, decode
@@ -27,8 +27,8 @@ class RobotReport(Score, frozen=True, kw_only=True):
     counts: dict[str, int]
 
 
-class TeamReport(msgspec.Struct, frozen=True, kw_only=True):
-    """Means over the robots that could be scored; sums for messages and bytes."""
+class MeanScore(msgspec.Struct, frozen=True, kw_only=True):
+    """Means over the robots that could be scored."""
 
     position_rmse_m: float | None
     position_mean_m: float | None
@@ -36,8 +36,20 @@ class TeamReport(msgspec.Struct, frozen=True, kw_only=True):
     heading_rmse_deg: float | None
     inside_3_sigma: float | None
     nees: float | None
+
+
+class TeamReport(MeanScore, frozen=True, kw_only=True):
+    """The same, with sums for messages and bytes."""
+
     messages_sent: int
     bytes_sent: int
+
+
+class YardstickReport(msgspec.Struct, frozen=True, kw_only=True):
+    """What another filter makes of the same inputs."""
+
+    robots: dict[str, Score]
+    team: MeanScore
 
 
 class Report(msgspec.Struct, frozen=True, kw_only=True):
@@ -51,6 +63,8 @@ class Report(msgspec.Struct, frozen=True, kw_only=True):
     restarts: dict[str, int] = {}
     alone: dict[str, Score] = {}
     """Before collaboration began, where it began late."""
+    yardsticks: dict[str, YardstickReport] = {}
+    """dead_reckoning, solo_ekf, centralized_ekf, where they were asked for."""
 
 
 class Recorder:
@@ -99,29 +113,34 @@ class Recorder:
                     rows.setdefault(t.robot, []).append(row)
         return {name: np.array(r) for name, r in rows.items()}
 
+    def trajectory(
+        self, robot: str, from_s: float = -np.inf, until_s: float = np.inf
+    ) -> Trajectory:
+        """A robot's estimates within [from_s, until_s)."""
+        with self._lock:
+            tracks = list(self.tracks.get(robot, ()))
+        tracks = [t for t in tracks if from_s <= t.stamp_ns * 1e-9 < until_s]
+        covariance = None
+        if all(t.covariance is not None for t in tracks):
+            covariance = np.array([t.covariance for t in tracks]).reshape(-1, 6)
+        return Trajectory(
+            np.array([t.stamp_ns for t in tracks], dtype=np.int64),
+            np.array([(t.x_m, t.y_m, t.heading_rad) for t in tracks]).reshape(-1, 3),
+            covariance,
+        )
+
     def samples(
         self, robot: str, truth: Floats | None, from_s: float = -np.inf, until_s: float = np.inf
     ) -> Samples:
         """A robot's estimates within [from_s, until_s), beside the truth, where there is one."""
-        nothing = np.empty((0, 3))
-        if truth is None or len(truth) == 0:
-            return Samples(nothing, nothing, None)
-        return self.timed_samples(robot, truth, from_s, until_s)[1]
+        return compared(self.trajectory(robot, from_s, until_s), truth)[1]
 
     def timed_samples(
         self, robot: str, truth: Floats, from_s: float = -np.inf, until_s: float = np.inf
     ) -> tuple[Floats, Samples]:
         """The same with its times (s)."""
-        with self._lock:
-            tracks = list(self.tracks.get(robot, ()))
-        tracks = [t for t in tracks if from_s <= t.stamp_ns * 1e-9 < until_s]
-        times = np.array([t.stamp_ns * 1e-9 for t in tracks])
-        estimate = np.array([(t.x_m, t.y_m, t.heading_rad) for t in tracks]).reshape(-1, 3)
-        at, counts = truth_at(times, truth)
-        covariance = None
-        if all(t.covariance is not None for t in tracks):
-            covariance = np.array([t.covariance for t in tracks]).reshape(-1, 6)[counts]
-        return times[counts], Samples(estimate[counts], at[counts], covariance)
+        stamps_ns, samples = compared(self.trajectory(robot, from_s, until_s), truth)
+        return seconds(stamps_ns), samples
 
     def report(
         self,
@@ -174,18 +193,20 @@ def _added(statuses: list[Status]) -> dict[str, int]:
     return dict(sorted(total.items()))
 
 
-def _team(robots: Mapping[str, RobotReport]) -> TeamReport:
+def mean_score(scores: Iterable[Score]) -> MeanScore:
+    """Figures of a team: the mean of those of its robots."""
+    known = list(scores)
+
     def mean(name: str) -> float | None:
-        values = [v for r in robots.values() if (v := getattr(r, name)) is not None]
+        values = [value for s in known if (value := getattr(s, name)) is not None]
         return float(np.mean(values)) if values else None
 
+    return MeanScore(**{name: mean(name) for name in MeanScore.__struct_fields__})
+
+
+def _team(robots: Mapping[str, RobotReport]) -> TeamReport:
     return TeamReport(
-        position_rmse_m=mean("position_rmse_m"),
-        position_mean_m=mean("position_mean_m"),
-        position_max_m=mean("position_max_m"),
-        heading_rmse_deg=mean("heading_rmse_deg"),
-        inside_3_sigma=mean("inside_3_sigma"),
-        nees=mean("nees"),
+        **msgspec.structs.asdict(mean_score(robots.values())),
         messages_sent=sum(r.messages_sent for r in robots.values()),
         bytes_sent=sum(r.bytes_sent for r in robots.values()),
     )

@@ -12,12 +12,14 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 from rich.text import Text
 
-from cpcbl_launch.recorder import Recorder, Report
+from cpcbl_launch.recorder import MeanScore, Recorder, Report
 from cpcbl_launch.supervisor import Supervisor
 from cpcbl_team.collaboration import LOWEST_TIER
+from cpcbl_team.metrics import Score
 from cpcbl_transport.messages import Status, Track, Truth
 
 SNAPSHOT_S = 5.0
+FIGURES = ("RMSE m", "mean m", "max m", "deg", "in 3 σ", "NEES")
 ProgressSetter = Callable[[float], None]
 Cell = str | Text
 
@@ -143,19 +145,14 @@ def print_report(report: Report, console: Console) -> None:
     figures = _table(
         "errors of position and heading (deg, RMSE)",
         ("robot",),
-        (*before, "RMSE m", "mean m", "max m", "deg", "in 3 σ", "NEES", "lost", "out", "B"),
+        (*before, *FIGURES, "lost", "out", "B"),
     )
     for name, r in report.robots.items():
         alone = report.alone.get(name)
         figures.add_row(
             name,
             *([_number(alone.position_rmse_m)] if alone is not None else []),
-            _number(r.position_rmse_m),
-            _number(r.position_mean_m),
-            _number(r.position_max_m),
-            _number(r.heading_rmse_deg, 1),
-            _share(r.inside_3_sigma),
-            _number(r.nees, 1),
+            *_figures(r),
             _share(r.lost_share),
             _short(r.messages_sent),
             _short(r.bytes_sent),
@@ -166,20 +163,39 @@ def print_report(report: Report, console: Console) -> None:
     figures.add_row(
         "team",
         *([_number(sum(known) / len(known) if known else None)] if report.alone else []),
-        _number(t.position_rmse_m),
-        _number(t.position_mean_m),
-        _number(t.position_max_m),
-        _number(t.heading_rmse_deg, 1),
-        _share(t.inside_3_sigma),
-        _number(t.nees, 1),
+        *_figures(t),
         "",
         _short(t.messages_sent),
         _short(t.bytes_sent),
         style="bold",
     )
     console.print(figures)
+    if report.yardsticks:
+        console.print(_yardsticks(report))
     for line in _remarks(report):
         console.print(line, style="yellow", highlight=False)
+
+
+def _yardsticks(report: Report) -> Table:
+    """Plain filters beside the team: means over the robots."""
+    table = _table("yardsticks: the same data and settings, team means", ("filter",), FIGURES)
+    for name, yardstick in report.yardsticks.items():
+        table.add_row(name.replace("_", " ").replace("ekf", "EKF"), *_figures(yardstick.team))
+    table.add_section()
+    table.add_row("this team", *_figures(report.team), style="bold")
+    return table
+
+
+def _figures(s: Score | MeanScore) -> list[str]:
+    """The cells below FIGURES."""
+    return [
+        _number(s.position_rmse_m),
+        _number(s.position_mean_m),
+        _number(s.position_max_m),
+        _number(s.heading_rmse_deg, 1),
+        _share(s.inside_3_sigma),
+        _number(s.nees, 1),
+    ]
 
 
 def _remarks(report: Report) -> Iterator[str]:

@@ -7,6 +7,7 @@ from cpcbl_team.inputs import Odometry, Sighting
 from cpcbl_team.sensors import (
     corrected_odometry,
     corrected_sighting,
+    repeated_share,
     sighting_fault,
     sighting_sigmas,
 )
@@ -83,9 +84,10 @@ def test_odometry_is_corrected_by_delay_scales_loss_and_bias() -> None:
         turn_bias_rad_per_m=0.05,
     )
     way = 1.1 - 0.02
-    assert corrected_odometry(Odometry(0, 10, 1.0, -0.2), s) == Odometry(
-        200_000_000, 200_000_010, pytest.approx(way), pytest.approx(-0.18 + 0.05 * way)
-    )
+    found = corrected_odometry(Odometry(0, 10, 1.0, -0.2), s)
+    assert (found.from_ns, found.stamp_ns) == (200_000_000, 200_000_010)
+    assert found.distance_m == pytest.approx(way)
+    assert found.turn_rad == pytest.approx(-0.18 + 0.05 * way)
     backwards = corrected_odometry(Odometry(0, 10, -1.0, 0.2), s)
     assert backwards.distance_m == pytest.approx(-way)
 
@@ -134,3 +136,19 @@ def test_faulty_readings_stay_faulty() -> None:
         (Sighting("a", 0.05, 0.1), "range_not_positive"),
     ):
         assert sighting_fault(corrected_sighting(sighting, sensor, False)) == fault
+
+
+def test_what_is_read_again_soon_counts_for_less() -> None:
+    assert repeated_share(None, 3.0) == 1.0
+    assert repeated_share(0.5, 0.0) == 1.0
+    assert repeated_share(100.0, 3.0) == pytest.approx(1.0)
+    assert repeated_share(1.0, 2.0) > repeated_share(2.0, 2.0) > 1.0
+    assert math.isfinite(repeated_share(0.0, 2.0))
+
+
+def test_doubt_makes_the_mean_of_correlated_readings_consistent() -> None:
+    tau, dt, n = 2.0, 0.5, 400
+    rho = math.exp(-dt / tau)
+    lags = range(1, n)
+    variance_of_mean = (n + 2.0 * sum((n - k) * rho**k for k in lags)) / n**2
+    assert repeated_share(dt, tau) / n == pytest.approx(variance_of_mean, rel=0.02)

@@ -9,6 +9,7 @@ import pytest
 from process_helpers import cpcbl_team
 
 from cpcbl_launch.evaluation import Choice, chosen, evaluate_log
+from cpcbl_launch.evaluation import evaluated as evaluated_log
 from cpcbl_launch.logs import blinded, on_log
 from cpcbl_launch.recorder import Report
 from cpcbl_launch.team_file import builtin, load_team
@@ -45,6 +46,17 @@ def test_blind_robots_are_carried_by_their_teammates() -> None:
     for name, robot in helped.robots.items():
         assert robot.lost_at_end == "", name
         assert robot.lost_share < 0.02, name
+
+
+def test_the_yardsticks_are_worth_the_name() -> None:
+    """Start poses and settings are the team's; the centralized filter is the ceiling."""
+    logged = on_log(load_team(builtin("mrclam")), log_folder("MRCLAM6"))
+    report = evaluated_log(logged, with_yardsticks=True).report
+    rmse = {kind: y.team.position_rmse_m or 0.0 for kind, y in report.yardsticks.items()}
+    assert 0.0 < rmse["centralized_ekf"] < 0.15
+    assert rmse["centralized_ekf"] < rmse["solo_ekf"] < 0.22
+    assert 2.0 < rmse["dead_reckoning"] < 3.5
+    assert team_rmse_m(report) < rmse["solo_ekf"]
 
 
 def test_processes_over_zenoh_agree_with_one_process() -> None:
