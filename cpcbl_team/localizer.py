@@ -25,7 +25,7 @@ from cpcbl_team.gaussian import Covariance2
 from cpcbl_team.geometry import Pose2, step, wrap_angle
 from cpcbl_team.inputs import Belief, Fix, Odometry, Position, Sightings, Told
 from cpcbl_team.motion import move
-from cpcbl_team.self_calibration import Anchor, learned
+from cpcbl_team.self_calibration import Anchor, Anchors, learned
 from cpcbl_team.sensors import repeated_share, sighting_fault
 from cpcbl_team.sightings import (
     Measured,
@@ -316,10 +316,10 @@ class Localizer:
 
     def _taught(self, here: Anchor, memory: Memory) -> Memory:
         """What the robot has learned of its odometry and bearings, from this update too."""
-        if memory.anchor is None or memory.lost:
-            return memory._replace(anchor=None if memory.lost else here)
-        known, anchor = learned(memory.learned, memory.anchor, here, self.settings.odometry)
-        return memory._replace(learned=known, anchor=anchor)
+        if memory.anchors is None or memory.lost:
+            return memory._replace(anchors=None if memory.lost else Anchors(here, here))
+        known, anchors = learned(memory.learned, memory.anchors, here, self.settings.odometry)
+        return memory._replace(learned=known, anchors=anchors)
 
     def _judged(self, state: State) -> State:
         """Lost or not. If lost: found again from recent evidence, else in more and more doubt."""
@@ -339,7 +339,7 @@ class Localizer:
             memory = memory._replace(sought_ns=evidence[-1].stamp_ns)
             found = recovery.relocalized(evidence, state.odometry_from_robot, self.field)
         if found is not None:
-            memory = memory._replace(lost="", innovations=(), anchor=None).counted("found_again")
+            memory = memory._replace(lost="", innovations=(), anchors=None).counted("found_again")
             return state._replace(estimate=self._reduced(found), memory=memory)
         estimate = state.estimate
         if refusing and now - memory.widened_ns >= recovery.WIDEN_NS:

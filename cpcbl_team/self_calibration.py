@@ -33,52 +33,79 @@ class Learned(NamedTuple):
 
 
 class Anchor(NamedTuple):
-    """The moment from which the comparison counts."""
+    """A moment at which the robot knew its place."""
 
     stamp_ns: int
     estimate: Estimate
     odometry_from_robot: Pose2
 
 
-def learned(
-    so_far: Learned, anchor: Anchor, now: Anchor, noise: OdometryNoise
-) -> tuple[Learned, Anchor]:
-    """What is known after one more update, and the anchor for the next comparison.
+class Anchors(NamedTuple):
+    """From where turns are compared, from where distances are."""
 
-    The anchor moves on when there was something to compare, or when it is too old to be.
+    turned: Anchor
+    drove: Anchor
+
+
+def learned(
+    so_far: Learned, anchors: Anchors, now: Anchor, noise: OdometryNoise
+) -> tuple[Learned, Anchors]:
+    """What is known after one more update, and the anchors of the next comparisons.
+
+    An anchor moves on when there was something to compare, or when it is too old to be.
     """
-    wheels = anchor.odometry_from_robot.inverse() @ now.odometry_from_robot
-    way, turn = math.hypot(wheels.x, wheels.y), abs(wheels.heading)
-    compares_turn = turn >= LEAST_TURN_RAD
-    compares_way = way >= LEAST_WAY_M and turn <= MOST_TURN_RAD
-    if not (compares_turn or compares_way):
-        return so_far, now if now.stamp_ns - anchor.stamp_ns > LONGEST_NS else anchor
-    around = noise.turn_sigma_rad_per_sqrt_rad**2 * turn + noise.turn_sigma_rad_per_sqrt_m**2 * way
+    turned, drove = anchors
+    wheels = turned.odometry_from_robot.inverse() @ now.odometry_from_robot
+    if abs(wheels.heading) >= LEAST_TURN_RAD:
+        so_far, turned = _turn_compared(so_far, turned, now, wheels, noise), now
+    wheels = drove.odometry_from_robot.inverse() @ now.odometry_from_robot
+    way = math.hypot(wheels.x, wheels.y)
+    if way >= LEAST_WAY_M and abs(wheels.heading) <= MOST_TURN_RAD:
+        so_far, drove = _way_compared(so_far, drove, now, wheels, noise), now
+    turned, drove = (now if now.stamp_ns - a.stamp_ns > LONGEST_NS else a for a in (turned, drove))
+    return so_far, Anchors(turned, drove)
+
+
+def _turn_compared(
+    so_far: Learned, then: Anchor, now: Anchor, wheels: Pose2, noise: OdometryNoise
+) -> Learned:
+    around = _turn_variance(wheels, noise)
+    p, q = then.estimate.covariance.hh, now.estimate.covariance.hh
+    if q > RENEWED_SHARE * (p + around):
+        return so_far
+    turn = wrap_angle(now.estimate.pose.heading - then.estimate.pose.heading)
+    excess = wrap_angle(turn - wheels.heading)
+    change, variance = _updated(so_far.turn_variance, wheels.heading, excess, p + q + around)
+    scale = so_far.turn_scale * (1.0 + change)
+    return so_far._replace(turn_scale=scale, turn_variance=variance)
+
+
+def _way_compared(
+    so_far: Learned, then: Anchor, now: Anchor, wheels: Pose2, noise: OdometryNoise
+) -> Learned:
+    way = math.hypot(wheels.x, wheels.y)
     along = noise.distance_sigma_m_per_sqrt_m**2 * way
-    p, q = anchor.estimate.covariance, now.estimate.covariance
-    found = anchor.estimate.pose.inverse() @ now.estimate.pose
-    headings, places = p.hh + q.hh, 0.5 * (p.xx + p.yy + q.xx + q.yy)
-    sideways = around * way * way / 3.0
-    if q.hh > RENEWED_SHARE * (p.hh + around):
-        compares_turn = False
-    if 0.5 * (q.xx + q.yy) > RENEWED_SHARE * (0.5 * (p.xx + p.yy + p.hh * way * way) + along):
-        compares_way = False
-    if compares_turn:
-        excess = wrap_angle(found.heading - wheels.heading)
-        change, variance = _updated(so_far.turn_variance, wheels.heading, excess, headings + around)
-        scale = so_far.turn_scale * (1.0 + change)
-        so_far = so_far._replace(turn_scale=scale, turn_variance=variance)
-    if compares_way:
-        excess = math.hypot(found.x, found.y) - way
-        change, variance = _updated(so_far.distance_variance, way, excess, places + along)
-        scale = so_far.distance_scale * (1.0 + change)
-        so_far = so_far._replace(distance_scale=scale, distance_variance=variance)
-        aside = wrap_angle(math.atan2(found.y, found.x) - math.atan2(wheels.y, wheels.x))
-        doubt = p.hh + (places + sideways) / (way * way)
-        change, variance = _updated(so_far.bearing_variance, 1.0, aside, doubt)
-        bias = so_far.bearing_bias_rad + change
-        so_far = so_far._replace(bearing_bias_rad=bias, bearing_variance=variance)
-    return so_far, now
+    p, q = then.estimate, now.estimate
+    before, after = p.position_sigma_m**2, q.position_sigma_m**2
+    if after > RENEWED_SHARE * (before + along + p.covariance.hh * way * way):
+        return so_far
+    found = p.pose.inverse() @ q.pose
+    excess = math.hypot(found.x, found.y) - way
+    noise_m2 = before + after + along
+    change, variance = _updated(so_far.distance_variance, way, excess, noise_m2)
+    scale = so_far.distance_scale * (1.0 + change)
+    so_far = so_far._replace(distance_scale=scale, distance_variance=variance)
+    aside = wrap_angle(math.atan2(found.y, found.x) - math.atan2(wheels.y, wheels.x))
+    doubt = p.covariance.hh + (before + after) / (way * way) + _turn_variance(wheels, noise) / 3.0
+    change, variance = _updated(so_far.bearing_variance, 1.0, aside, doubt)
+    bias = so_far.bearing_bias_rad + change
+    return so_far._replace(bearing_bias_rad=bias, bearing_variance=variance)
+
+
+def _turn_variance(wheels: Pose2, noise: OdometryNoise) -> float:
+    return noise.turn_sigma_rad_per_sqrt_rad**2 * abs(
+        wheels.heading
+    ) + noise.turn_sigma_rad_per_sqrt_m**2 * math.hypot(wheels.x, wheels.y)
 
 
 def _updated(variance: float, h: float, excess: float, noise: float) -> tuple[float, float]:

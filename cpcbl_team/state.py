@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 from cpcbl_team.estimate import Estimate
 from cpcbl_team.geometry import Pose2
 from cpcbl_team.inputs import Belief, Odometry
-from cpcbl_team.self_calibration import Anchor, Learned
+from cpcbl_team.self_calibration import Anchors, Learned
 
 _NONE: Mapping[str, Any] = MappingProxyType({})
 
@@ -50,7 +50,7 @@ class Memory(NamedTuple):
     sought_ns: int = -1  # the newest evidence with which it sought itself in vain
     counts: Mapping[str, int] = _NONE
     learned: Learned = Learned()
-    anchor: Anchor | None = None
+    anchors: Anchors | None = None
 
     def counted(self, *reasons: str) -> "Memory":
         if not reasons:

@@ -95,6 +95,10 @@ def up(
         Optional[Path],
         typer.Option(help="Draw paths and errors into this file (PNG or SVG; extra `plot`)."),
     ] = None,
+    record: Annotated[
+        Optional[Path],
+        typer.Option(help="Record inputs, tracks, status and truth into this file (MCAP)."),
+    ] = None,
     logs: Annotated[
         Optional[Path], typer.Option(help="Keep the processes' logs in this folder.")
     ] = None,
@@ -112,7 +116,7 @@ def up(
     team = _load(file or Path("demo"))
     if picture is not None and importlib.util.find_spec("matplotlib") is None:
         raise ValueError("--picture needs matplotlib: pip install 'cpcbl-team[plot]'")
-    run = Run(team, duration, speed, seed, folder=logs, picture=picture)
+    run = Run(team, duration, speed, seed, folder=logs, picture=picture, record=record)
     if any(robot.source == "mrclam" for robot in team.robots.values()):
         logged = real_logs.on_log(team, Path(data or team.data or "."))
         run = run._replace(
@@ -232,6 +236,50 @@ def evaluate_mrclam(
         typer.echo(msgspec.json.format(msgspec.json.encode(result), indent=2).decode())
     else:
         print_report(result, Console())
+
+
+@app.command()
+def calibrate(
+    logs: Annotated[
+        list[Path], typer.Argument(help="MRCLAM folders, or recordings of `up --record` (.mcap).")
+    ],
+    team_file: Annotated[
+        Optional[Path],
+        typer.Option(
+            "--team", help="Team file to add types to; default: the recorded team, or mrclam."
+        ),
+    ] = None,
+    output: Annotated[Path, typer.Option(help="Team file to write.")] = Path("calibrated.toml"),
+    picture: Annotated[
+        Optional[Path],
+        typer.Option(help="Draw residuals into this file (PNG or SVG; extra `plot`)."),
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Estimate odometry and sensor errors from logs with truth, as types of a team file."""
+    import msgspec
+    from rich.console import Console
+
+    from cpcbl_launch import calibrate as calibration
+    from cpcbl_launch.show import print_calibration, progress_bar
+
+    if picture is not None and importlib.util.find_spec("matplotlib") is None:
+        raise ValueError("--picture needs matplotlib: pip install 'cpcbl-team[plot]'")
+    base, base_name = calibration.base_text(logs, team_file)
+    names = [log.resolve().name for log in logs]
+    robot_logs = calibration.read_logs(logs)
+    with progress_bar("calibrating", quiet=as_json) as progress:
+        result = calibration.calibrated(robot_logs, names, progress)
+    output.write_text(calibration.team_text(result, base, base_name), encoding="utf-8")
+    if picture is not None:
+        from cpcbl_launch.calibration_picture import draw_residuals
+
+        draw_residuals(robot_logs, result, picture)
+    if as_json:
+        typer.echo(msgspec.json.format(msgspec.json.encode(result), indent=2).decode())
+    else:
+        print_calibration(result, Console())
+        typer.echo(f"written: {output}")
 
 
 def _load(path: Path) -> "Team":

@@ -1,6 +1,8 @@
 """A team in one process over the bus in memory: deterministic, as fast as the machine is."""
 
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
+from pathlib import Path
 from typing import NamedTuple, Protocol
 
 import msgspec
@@ -10,6 +12,7 @@ from cpcbl_agents.robot import Robot
 from cpcbl_launch.field import FieldNode, SimulatedField
 from cpcbl_launch.logs import LoggedTeam, shortened
 from cpcbl_launch.recorder import Recorder, Report
+from cpcbl_launch.recording import Recording
 from cpcbl_launch.yardstick import inputs_of, scored, yardsticks
 from cpcbl_team.config import Team
 from cpcbl_team.metrics import Trajectory
@@ -94,12 +97,15 @@ def _run_log(logged: LoggedTeam, progress: Progress) -> tuple[Report, Recorder]:
     ), recorder
 
 
-def simulate(team: Team, seed: int, duration_s: float) -> tuple[Report, Recorder]:
-    """A simulated team, field and robots in one process."""
+def simulate(
+    team: Team, seed: int, duration_s: float, record: Path | None = None
+) -> tuple[Report, Recorder]:
+    """A simulated team, field and robots in one process; `record`: the file to record it into."""
     hub, end_ns = MemoryHub(), int(duration_s * 1e9)
     recorder = Recorder(hub.session())
-    field = FieldNode(SimulatedField(team, seed, 0), hub.session())
-    run_nodes([field, *_robots(team, hub, 0)], 0, end_ns)
+    with Recording(record, team, hub.session()) if record is not None else nullcontext():
+        field = FieldNode(SimulatedField(team, seed, 0), hub.session())
+        run_nodes([field, *_robots(team, hub, 0)], 0, end_ns)
     variants = {name: robot.localizer.variant for name, robot in team.robots.items()}
     return recorder.report(variants, recorder.simulated_truth()), recorder
 

@@ -8,6 +8,7 @@ import math
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -40,11 +41,44 @@ class Every:
         return True
 
 
+class Seen(NamedTuple):
+    """Something on the field, at the place that is seen of it."""
+
+    name: str
+    x: float
+    y: float
+    gives: str
+    teammate: bool = False
+
+
+class Delayed:
+    """Steps of a motion that happen `steps` (whole and a fraction) after they were commanded."""
+
+    def __init__(self, steps: float) -> None:
+        whole = math.floor(steps)
+        self._share = steps - whole
+        self._steps: deque[tuple[float, float]] = deque([(0.0, 0.0)] * (whole + 2), whole + 2)
+
+    def next(self, commanded: tuple[float, float]) -> tuple[float, float]:
+        """What happens in this step, of which `commanded` is the command."""
+        self._steps.append(commanded)
+        before, now = self._steps[0], self._steps[1]
+        if not self._share:
+            return now
+        late, soon = self._share, 1.0 - self._share
+        return late * before[0] + soon * now[0], late * before[1] + soon * now[1]
+
+
 class SimulatedRobot:
     """One robot of the field: its true pose and its imperfect senses."""
 
     def __init__(
-        self, settings: RobotSettings, noise: float, seed: Sequence[int], start_ns: int
+        self,
+        settings: RobotSettings,
+        noise: float,
+        seed: Sequence[int],
+        start_ns: int,
+        step_ns: int,
     ) -> None:
         assert settings.start is not None
         self.settings, self._noise = settings, noise
@@ -59,18 +93,23 @@ class SimulatedRobot:
         self.bumps = 0
         self.touching: frozenset[str] = frozenset()
         self._reported, self._reported_ns = (0.0, 0.0), start_ns
+        self._motion = Delayed(settings.odometry.delay_s * 1e9 / step_ns)
+        self._frames: deque[Sightings] = deque()
+        self._errors: dict[tuple[str, str], tuple[int, float]] = {}
         self._odometry_timer = Every(settings.odometry.rate_hz)
         self._frame_timer = Every(settings.sensor.rate_hz)
         sensor = settings.position_sensor
         self._position_timer = Every(sensor.rate_hz if sensor is not None else 1.0)
 
     def move(self, now_ns: int, seconds: float) -> None:
-        """Drives on as commanded; the wheels report the command, the ground adds noise."""
+        """The wheels report what is commanded; the ground does it later and adds noise."""
         if not self.settings.odometry.moves:
             return
         commanded = now_ns - self.drive.stamp_ns <= COMMAND_LASTS_NS
         distance = self.drive.speed_m_s * seconds if commanded else 0.0
         turn = self.drive.turn_rate_rad_s * seconds if commanded else 0.0
+        self._reported = (self._reported[0] + distance, self._reported[1] + turn)
+        distance, turn = self._motion.next((distance, turn))
         o = self.settings.odometry
         along = o.distance_sigma_m_per_sqrt_m * math.sqrt(abs(distance))
         around = math.sqrt(
@@ -78,7 +117,6 @@ class SimulatedRobot:
             + o.turn_sigma_rad_per_sqrt_m**2 * abs(distance)
         )
         self.pose = step(self.pose, distance + self._normal(along), turn + self._normal(around))
-        self._reported = (self._reported[0] + distance, self._reported[1] + turn)
 
     def odometry(self, now_ns: int) -> Odometry | None:
         """The piece since the last one, when it is due; as reported, before any correction."""
@@ -92,11 +130,17 @@ class SimulatedRobot:
         self._reported, self._reported_ns = (0.0, 0.0), now_ns
         return piece
 
-    def sightings(self, now_ns: int, objects: Iterable["Seen"]) -> Sightings | None:
-        """What is in view, when a frame is due."""
-        if not self._frame_timer.due(now_ns):
-            return None
-        return Sightings(now_ns, tuple(s for o in objects if (s := self._sighted(*o))))
+    def sightings(self, now_ns: int, objects: Iterable[Seen]) -> list[Sightings]:
+        """The frames that are out by now. One is exposed when it is due and stamped `delay_s`
+        later; the camera hands it over at its stamp, or at once where the stamp is earlier.
+        """
+        if self._frame_timer.due(now_ns):
+            seen = tuple(s for o in objects if (s := self._sighted(o, now_ns)))
+            self._frames.append(Sightings(now_ns + int(self.settings.sensor.delay_s * 1e9), seen))
+        out = []
+        while self._frames and self._frames[0].stamp_ns <= now_ns:
+            out.append(self._frames.popleft())
+        return out
 
     def position(self, now_ns: int) -> Position | None:
         """What the position sensor says, if there is one and it is due."""
@@ -106,27 +150,41 @@ class SimulatedRobot:
         x, y = (v + self._normal(sensor.sigma_m) for v in self.pose[:2])
         return Position(now_ns, x, y, (sensor.sigma_m**2, 0.0, sensor.sigma_m**2))
 
-    def _sighted(self, name: str, x: float, y: float, gives: str) -> Sighting | None:
+    def _sighted(self, seen: Seen, now_ns: int) -> Sighting | None:
         sensor = self.settings.sensor
-        dx, dy = x - self.pose.x, y - self.pose.y
+        dx, dy = seen.x - self.pose.x, seen.y - self.pose.y
         range_m = math.hypot(dx, dy)
         bearing = wrap_angle(math.atan2(dy, dx) - self.pose.heading)
-        seen = abs(bearing) <= math.radians(sensor.field_of_view_deg) / 2.0
-        if gives == "none" or not seen or not 0.05 <= range_m <= sensor.max_range_m:
+        in_view = abs(bearing) <= math.radians(sensor.field_of_view_deg) / 2.0
+        if seen.gives == "none" or not in_view or not 0.05 <= range_m <= sensor.max_range_m:
             return None
-        range_m += self._normal(sensor.range_sigma_m(range_m))
-        bearing = wrap_angle(bearing + self._normal(sensor.bearing_sigma_rad))
+        range_m += self._error(seen.name, "range", sensor.range_sigma_m(range_m), now_ns)
+        bearing += self._error(seen.name, "bearing", sensor.bearing_sigma_rad, now_ns)
+        bias_m = sensor.robot_range_bias_m if seen.teammate else sensor.range_bias_m
+        reading_m = (range_m + bias_m) / sensor.range_scale
         return Sighting(
-            name,
-            max(range_m, 0.01) if gives in ("both", "range") else None,
-            bearing if gives in ("both", "bearing") else None,
+            seen.name,
+            max(reading_m, 0.01) if seen.gives in ("both", "range") else None,
+            wrap_angle(bearing + math.radians(sensor.bearing_bias_deg))
+            if seen.gives in ("both", "bearing")
+            else None,
         )
+
+    def _error(self, name: str, kind: str, sigma: float, now_ns: int) -> float:
+        """The error of a reading: white, or like the last one of the same object (Gauss-Markov)."""
+        if not self.settings.sensor.correlation_s:
+            return self._normal(sigma)
+        last = self._errors.get((name, kind))
+        if last is None:
+            unit = self._normal(1.0)
+        else:
+            alike = math.exp((last[0] - now_ns) * 1e-9 / self.settings.sensor.correlation_s)
+            unit = alike * last[1] + self._normal(math.sqrt(1.0 - alike * alike))
+        self._errors[name, kind] = now_ns, unit
+        return sigma * unit
 
     def _normal(self, sigma: float) -> float:
         return float(self._random.normal(0.0, sigma)) * self._noise if sigma else 0.0
-
-
-Seen = tuple[str, float, float, str]  # name, the place that is seen, what it gives
 
 
 class SimulatedField:
@@ -137,7 +195,9 @@ class SimulatedField:
         self._step_ns = int(1e9 / team.simulation.step_rate_hz)
         self.now_ns = start_ns
         self.robots = {
-            name: SimulatedRobot(settings, team.simulation.noise, (seed, i), start_ns)
+            name: SimulatedRobot(
+                settings, team.simulation.noise, (seed, i), start_ns, self._step_ns
+            )
             for i, (name, settings) in enumerate(team.robots.items())
             if settings.source == "simulated"
         }
@@ -160,9 +220,10 @@ class SimulatedField:
         sensed: list[tuple[str, SensorInput]] = []
         for name, robot in self.robots.items():
             piece = robot.odometry(self.now_ns)
-            frame = robot.sightings(self.now_ns, self._visible(name, robot.pose))
+            frames = robot.sightings(self.now_ns, self._visible(name, robot.pose))
             position = robot.position(self.now_ns)
-            sensed += [(name, item) for item in (piece, frame, position) if item is not None]
+            items = (piece, *frames, position)
+            sensed += [(name, item) for item in items if item is not None]
         return sensed
 
     def truth(self) -> Truths:
@@ -171,17 +232,17 @@ class SimulatedField:
 
     def _visible(self, viewer: str, pose: Pose2) -> Iterable[Seen]:
         for name, mark in self._team.map.landmarks.items():
-            yield name, mark.x_m, mark.y_m, mark.gives
+            yield Seen(name, mark.x_m, mark.y_m, mark.gives)
         for name, wall in self._team.map.walls.items():
             (ax, ay), (bx, by) = wall.from_m, wall.to_m
             length = math.hypot(bx - ax, by - ay)
             ux, uy = (bx - ax) / length, (by - ay) / length
             along = ux * (pose.x - ax) + uy * (pose.y - ay)
             if 0.0 <= along <= length:
-                yield name, ax + along * ux, ay + along * uy, wall.gives
+                yield Seen(name, ax + along * ux, ay + along * uy, wall.gives)
         for name, other in self.robots.items():
             if name != viewer:
-                yield name, other.pose.x, other.pose.y, "both"
+                yield Seen(name, other.pose.x, other.pose.y, "both", teammate=True)
 
     def _bump(self, robot: SimulatedRobot) -> None:
         radius = self._team.simulation.bump_radius_m

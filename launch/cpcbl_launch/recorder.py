@@ -106,12 +106,7 @@ class Recorder:
     def simulated_truth(self) -> dict[str, Floats]:
         """Rows of seconds, x, y, heading for every robot of the simulated field."""
         with self._lock:
-            rows: dict[str, list[tuple[float, float, float, float]]] = {}
-            for truths in self.truths:
-                for t in truths.robots:
-                    row = (truths.stamp_ns * 1e-9, t.x_m, t.y_m, t.heading_rad)
-                    rows.setdefault(t.robot, []).append(row)
-        return {name: np.array(r) for name, r in rows.items()}
+            return truth_rows(self.truths)
 
     def trajectory(
         self, robot: str, from_s: float = -np.inf, until_s: float = np.inf
@@ -172,6 +167,15 @@ class Recorder:
                 counts=_added(statuses),
             )
         return Report(robots=robots, team=_team(robots))
+
+
+def truth_rows(truths: Iterable[Truths]) -> dict[str, Floats]:
+    """Rows of seconds, x, y, heading by robot."""
+    rows: dict[str, list[tuple[float, float, float, float]]] = {}
+    for at in truths:
+        for t in at.robots:
+            rows.setdefault(t.robot, []).append((at.stamp_ns * 1e-9, t.x_m, t.y_m, t.heading_rad))
+    return {name: np.array(r) for name, r in rows.items()}
 
 
 def _longest_lost_s(tracks: list[Track]) -> float:

@@ -12,6 +12,8 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 from rich.text import Text
 
+from cpcbl_launch.calibrate import Calibration, decimals
+from cpcbl_launch.calibration import Estimate
 from cpcbl_launch.recorder import MeanScore, Recorder, Report
 from cpcbl_launch.supervisor import Supervisor
 from cpcbl_team.collaboration import LOWEST_TIER
@@ -219,6 +221,65 @@ def _number(value: float | None, digits: int = 3) -> str:
 
 def _share(value: float | None) -> str:
     return "-" if value is None else f"{100.0 * value:.1f}%"
+
+
+def print_calibration(calibration: Calibration, console: Console) -> None:
+    """Values ± standard errors, a robot a row, in tables that fit 80 columns."""
+    for title, part, names in _CALIBRATED:
+        table = _table(title, ("robot",), tuple(names.values()))
+        for robot, found in calibration.robots.items():
+            values = getattr(found, part)
+            table.add_row(robot, *(_with_error(values.get(name)) for name in names))
+        console.print(table)
+        console.print()
+    console.print("± standard error; -: the logs do not tell it", style="yellow", highlight=False)
+    for robot, found in calibration.robots.items():
+        for note in found.notes:
+            console.print(f"robot {robot}: {note}", style="yellow", highlight=False)
+
+
+def _with_error(estimate: Estimate | None) -> str:
+    if estimate is None:
+        return "-"
+    digits = decimals(estimate.standard_error)
+    return f"{estimate.value:.{digits}f} ± {estimate.standard_error:.{digits}f}"
+
+
+_CALIBRATED = (
+    (
+        "odometry, true = scale x reported",
+        "odometry",
+        {"distance_scale": "distance scale", "turn_scale": "turn scale", "delay_s": "delay s"},
+    ),
+    (
+        "odometry noise, σ by root of way and turn",
+        "odometry",
+        {
+            "distance_sigma_m_per_sqrt_m": "way m/√m",
+            "turn_sigma_rad_per_sqrt_rad": "turn rad/√rad",
+            "turn_sigma_rad_per_sqrt_m": "turn rad/√m",
+        },
+    ),
+    (
+        "ranges, true = scale x reading - bias",
+        "sensor",
+        {
+            "range_scale": "scale",
+            "range_bias_m": "bias m",
+            "robot_range_bias_m": "robots' bias m",
+        },
+    ),
+    (
+        "range noise, time in which errors fade",
+        "sensor",
+        {"range_share": "share", "range_floor_m": "floor m", "correlation_s": "fade s"},
+    ),
+    (
+        "bearings, true = reading - bias; camera",
+        "sensor",
+        {"bearing_bias_deg": "bias deg", "bearing_sigma_deg": "σ deg", "delay_s": "delay s"},
+    ),
+)
 
 
 @contextmanager

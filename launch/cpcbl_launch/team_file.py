@@ -140,9 +140,6 @@ def problems(team: Team) -> Iterator[str]:
     for name, robot in team.robots.items():
         if robot.source == "simulated" and robot.start is None:
             yield f"robots.{name}.start: a simulated robot needs one; add x_m, y_m, heading_deg"
-        for part in ("odometry", "sensor"):
-            if robot.source == "simulated" and getattr(robot, part).delay_s != 0.0:
-                yield f"robots.{name}.{part}.delay_s: the simulated field has none; remove the key"
         if robot.localizer.variant == "joint" and robot.localizer.paper_uncertainty:
             yield (
                 f"robots.{name}.localizer.paper_uncertainty: the joint variant cannot do"

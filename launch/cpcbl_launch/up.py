@@ -1,9 +1,11 @@
 """`cpcbl-team up`: router, field and a process per robot; a live table; a report at the end."""
 
+import logging
 import socket
 import tempfile
 import time
 from collections.abc import Collection, Mapping
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from types import MappingProxyType
 from typing import NamedTuple, Protocol
@@ -14,11 +16,15 @@ import numpy as np
 from cpcbl_agents.clock import Clock
 from cpcbl_launch.processes import process_table
 from cpcbl_launch.recorder import Recorder, Report
+from cpcbl_launch.recording import Recording
 from cpcbl_launch.supervisor import Supervisor
 from cpcbl_launch.team_file import save_resolved
 from cpcbl_team.config import Team
 from cpcbl_team.metrics import Floats, score
+from cpcbl_transport.bus import Bus
 from cpcbl_transport.zenoh_bus import open_router
+
+log = logging.getLogger(__name__)
 
 LEAD_S = 2.0
 LEAD_S_A_PROCESS = 0.3
@@ -42,6 +48,8 @@ class Run(NamedTuple):
     """Where processes write their logs; None: a temporary folder."""
     picture: Path | None = None
     """The picture of the run to write (PNG, SVG or PDF)."""
+    record: Path | None = None
+    """The recording of the run to write (MCAP)."""
 
 
 class View(Protocol):
@@ -80,7 +88,7 @@ def _run_in(run: Run, view: View, stop: Stopping, folder: Path) -> Report:
         run.speed,
     )
     table = process_table(team, team_file, _dialled(listen[0]), clock, run.seed, here)
-    with open_router(team.name, listen) as bus:
+    with open_router(team.name, listen) as bus, _recording(run, bus):
         recorder = Recorder(bus)
         with Supervisor(table, folder) as supervisor:
             end_ns = None if run.duration_s is None else int(run.duration_s * 1e9)
@@ -94,6 +102,19 @@ def _run_in(run: Run, view: View, stop: Stopping, folder: Path) -> Report:
             elapsed_s = (clock.now_ns() - clock.epoch_ns) * 1e-9
             restarts = supervisor.restarts
     return _report(run, recorder, clock.epoch_ns * 1e-9, elapsed_s, restarts)
+
+
+def _recording(run: Run, bus: Bus) -> AbstractContextManager[object]:
+    if run.record is None:
+        return nullcontext()
+    replayed = [name for name, robot in run.team.robots.items() if robot.source == "mrclam"]
+    if replayed:
+        log.warning(
+            "%s: without the inputs of %s: robots that replay a log do not publish them",
+            run.record,
+            ", ".join(replayed),
+        )
+    return Recording(run.record, run.team, bus)
 
 
 def _dialled(listen: str) -> str:

@@ -43,7 +43,9 @@ odometry = { moves = false }
 """
 
 
-@pytest.mark.parametrize("command", [[], ["up"], ["robot"], ["field"], ["check"], ["evaluate"]])
+@pytest.mark.parametrize(
+    "command", [[], ["up"], ["robot"], ["field"], ["check"], ["evaluate"], ["calibrate"]]
+)
 def test_every_command_explains_itself(command: list[str]) -> None:
     shown = cpcbl_team(*command, "--help")
     assert shown.returncode == 0

@@ -302,6 +302,72 @@ def test_a_simulation_is_deterministic_for_a_seed() -> None:
     assert first != other
 
 
+# Delays, biases, errors that stay alike ---------------------------------------------------------
+
+
+@pytest.mark.parametrize("delay_s", [0.02, 0.21, 0.4])
+def test_the_motion_follows_its_report_by_the_delay(delay_s: float) -> None:
+    late, prompt = (
+        field(r1=robot(odometry=OdometrySettings(rate_hz=50.0, delay_s=d))) for d in (delay_s, 0.0)
+    )
+    turns: dict[str, list[float]] = {"late": [], "prompt": []}
+    for i in range(100):
+        speeds = (0.4, math.sin(0.2 * i))
+        assert drive(late, 1, *speeds) == drive(prompt, 1, *speeds)
+        turns["late"].append(late.robots["r1"].pose.heading)
+        turns["prompt"].append(prompt.robots["r1"].pose.heading)
+    times = 0.02 * np.arange(100)
+    due = np.interp(times - delay_s, times, turns["prompt"], left=0.0)
+    assert turns["late"] == pytest.approx(due, abs=1e-9)
+    assert late.robots["r1"].pose.heading != prompt.robots["r1"].pose.heading
+
+
+@pytest.mark.parametrize("delay_s", [-0.05, 0.03, 0.1])
+def test_stamps_of_the_camera_are_later_than_the_exposure(delay_s: float) -> None:
+    sensor = msgspec.structs.replace(ALL_ROUND, delay_s=delay_s)
+    subject = field(on=marks(oak=(0.0, 3.0)), r1=robot(sensor=sensor))
+    true: dict[int, float] = {}
+    seen: list[tuple[int, Sightings]] = []
+    for _ in range(50):
+        subject.command(Drive("r1", subject.now_ns, 0.5, 0.0))
+        items = subject.advance()
+        true[subject.now_ns] = math.hypot(subject.robots["r1"].pose.x, 3.0)
+        seen += [(subject.now_ns, m) for _, m in items if isinstance(m, Sightings)]
+    assert len(seen) >= 40
+    for heard_ns, frame in seen:
+        exposed_ns = frame.stamp_ns - int(delay_s * 1e9)
+        assert frame.sightings[0].range_m == pytest.approx(true[exposed_ns])
+        assert 0 <= heard_ns - max(frame.stamp_ns, exposed_ns) < STEP_NS
+
+
+def test_readings_are_off_by_scale_and_biases() -> None:
+    sensor = msgspec.structs.replace(
+        ALL_ROUND, range_scale=1.1, range_bias_m=0.2, robot_range_bias_m=-0.3, bearing_bias_deg=4.0
+    )
+    subject = field(on=marks(oak=(4.0, 0.0)), r1=robot(sensor=sensor), r2=robot(0.0, 5.0))
+    seen = frame(subject)
+    for name, bias_m, range_m, bearing_deg in (("oak", 0.2, 4.0, 0.0), ("r2", -0.3, 5.0, 90.0)):
+        reading, bearing = seen[name].range_m, seen[name].bearing_rad
+        assert reading is not None
+        assert bearing is not None
+        assert 1.1 * reading - bias_m == pytest.approx(range_m)
+        assert math.degrees(bearing) - 4.0 == pytest.approx(bearing_deg)
+
+
+def test_errors_to_one_object_fade_as_stated() -> None:
+    sensor = msgspec.structs.replace(
+        ALL_ROUND, correlation_s=0.5, range_share=0.0, range_floor_m=0.1
+    )
+    subject = field(noise=1.0, on=marks(oak=(4.0, 0.0), elm=(0.0, 4.0)), r1=robot(sensor=sensor))
+    frames = [frame(subject) for _ in range(20_000)]
+    oak, elm = (np.array([f[n].range_m for f in frames], dtype=float) - 4.0 for n in ("oak", "elm"))
+    assert oak.std() == pytest.approx(0.1, rel=0.1)
+    for steps in (1, 10, 25, 50):
+        alike = float(np.mean(oak[steps:] * oak[:-steps])) / 0.01
+        assert alike == pytest.approx(math.exp(-0.02 * steps / 0.5), abs=0.12)
+    assert abs(float(np.mean(oak * elm))) / 0.01 < 0.12
+
+
 # Commands and bumps -----------------------------------------------------------------------------
 
 

@@ -1,0 +1,69 @@
+"""What a calibration leaves unexplained, as one picture. Needs extra `plot`."""
+
+from pathlib import Path
+
+import matplotlib as mpl
+import numpy as np
+
+from cpcbl_launch.calibrate import Calibration, RobotLogs
+from cpcbl_launch.calibration import (
+    DELAYS_S,
+    LAGS_S,
+    autocorrelation,
+    sensor_residuals,
+    turn_residuals,
+)
+
+mpl.use("Agg")
+
+from matplotlib import pyplot as plt
+
+MOST_DOTS = 1500
+
+
+def draw_residuals(logs: RobotLogs, calibration: Calibration, path: Path) -> None:
+    """Ranges over range, bearings, turns over the delay, correlation; a colour a robot."""
+    figure, ((ranges, bearings), (turns, correlation)) = plt.subplots(
+        2, 2, figsize=(12, 7.5), layout="constrained"
+    )
+    for number, (robot, found) in enumerate(calibration.robots.items()):
+        colour = f"C{number}"
+        if "turn_scale" in found.odometry:
+            errors = turn_residuals(logs[robot], found.odometry["turn_scale"].value)
+            turns.plot(DELAYS_S, errors, color=colour, label=robot)
+            turns.axvline(found.odometry["delay_s"].value, color=colour, linewidth=0.6)
+        if not found.sensor:
+            continue
+        left = sensor_residuals(logs[robot], found.sensor)
+        some = slice(None, None, len(left.range_m) // MOST_DOTS + 1)
+        ranges.plot(left.true_range[some], left.range_m[some], ".", markersize=2, color=colour)
+        bearings.hist(
+            np.degrees(left.bearing[np.isfinite(left.bearing)]),
+            bins=np.linspace(-5.0, 5.0, 101),
+            histtype="step",
+            density=True,
+            color=colour,
+            label=robot,
+        )
+        lag, ratio, _ = autocorrelation(left.pairs)
+        correlation.plot(lag, ratio, "o", markersize=4, color=colour)
+        if "correlation_s" in found.sensor and found.sensor["correlation_s"].value > 0.0:
+            lags = np.geomspace(LAGS_S[0], LAGS_S[-1], 100)
+            fitted = np.exp(-lags / found.sensor["correlation_s"].value)
+            correlation.plot(lags, fitted, color=colour, linewidth=0.8)
+    ranges.set(xlabel="true range (m)", ylabel="residual (m)", title="ranges", ylim=(-1.0, 1.0))
+    bearings.set(xlabel="residual (deg)", ylabel="density (1/deg)", title="bearings")
+    turns.set(
+        xlabel="delay (s)", ylabel="mean error (rad)", title="turns over 2 s; line: fitted delay"
+    )
+    correlation.set(
+        xlabel="lag (s)", xscale="log", title="correlation of errors of one object; line: fitted"
+    )
+    for axes in (ranges, bearings, turns, correlation):
+        axes.grid(True, alpha=0.3)
+    handles, labels = bearings.get_legend_handles_labels()
+    if not handles:
+        handles, labels = turns.get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper center", ncols=max(len(labels), 1))
+    figure.savefig(path, dpi=110)
+    plt.close(figure)

@@ -1,0 +1,106 @@
+"""A run in one file (MCAP, mcap.dev): what robots sensed and said, the truth, the team.
+
+Messages are JSON arrays, as on the wire but readable; the team is the attachment `team.json`. The
+inputs of a robot that replays a log are not on the bus, so not in the file either.
+"""
+
+import struct
+import threading
+from collections.abc import Iterable
+from contextlib import AbstractContextManager
+from pathlib import Path
+from typing import NamedTuple
+
+import msgspec
+from mcap.exceptions import McapError
+from mcap.reader import make_reader
+from mcap.writer import Writer
+
+from cpcbl_agents.sensing import SensorInput
+from cpcbl_agents.sources.mrclam import LogError
+from cpcbl_launch.recorder import truth_rows
+from cpcbl_team.config import Team
+from cpcbl_team.inputs import Odometry, Position, Sightings
+from cpcbl_team.metrics import Floats
+from cpcbl_transport import topics
+from cpcbl_transport.bus import Bus
+from cpcbl_transport.messages import Message, Refusal, Truths, decode, refusal
+
+RECORDED = (*topics.INPUTS, topics.TRACK, topics.STATUS, topics.TRUTH)
+TEAM = "team.json"
+LAST_NS = 2**63  # what a file can hold
+_decoder: msgspec.json.Decoder[Message] = msgspec.json.Decoder(Message)
+
+
+class Recording(AbstractContextManager["Recording"]):
+    """Writes what is said on a bus into a file, until it is closed. Raises OSError."""
+
+    def __init__(self, path: Path, team: Team, bus: Bus) -> None:
+        self._lock = threading.Lock()
+        self._file = path.open("wb")
+        self._writer: Writer | None = Writer(self._file)
+        self._writer.start(profile="cpcbl", library="cpcbl-team")
+        self._writer.add_attachment(0, 0, TEAM, "application/json", msgspec.json.encode(team))
+        self._channels: dict[str, int] = {}
+        self._handles = [bus.subscribe(topic.at(), self._arrived) for topic in RECORDED]
+
+    def _arrived(self, key: str, payload: bytes) -> None:
+        message = decode(payload)
+        if isinstance(message, Refusal) or refusal(message, message.stamp_ns) is not None:
+            return
+        if not 0 <= message.stamp_ns < LAST_NS:
+            return
+        with self._lock:
+            if self._writer is None:
+                return
+            if key not in self._channels:
+                self._channels[key] = self._writer.register_channel(key, "json", 0)
+            at_ns, data = message.stamp_ns, msgspec.json.encode(message)
+            self._writer.add_message(self._channels[key], at_ns, data, at_ns)
+
+    def __exit__(self, *_: object) -> None:
+        for handle in self._handles:
+            handle.close()
+        with self._lock:
+            if self._writer is not None:
+                self._writer.finish()  # type: ignore[no-untyped-call]
+                self._writer = None
+                self._file.close()
+
+
+class Recorded(NamedTuple):
+    """What a recording says: inputs and truth (rows of s, x, y, heading) by robot."""
+
+    team: Team
+    inputs: dict[str, list[SensorInput]]
+    truth: dict[str, Floats]
+
+
+def read_recording(path: Path) -> Recorded:
+    """What `Recording` wrote. Raises LogError."""
+    try:
+        with path.open("rb") as file:
+            reader = make_reader(file)
+            attached = [a.data for a in reader.iter_attachments() if a.name == TEAM]
+            messages = [
+                (channel.topic, _decoder.decode(message.data))
+                for _, channel, message in reader.iter_messages()
+                if channel.topic.startswith(("in/", topics.TRUTH.key))
+            ]
+        if not attached:
+            raise LogError(f"{path}: holds no team: not a recording of `up --record`")
+        team = msgspec.json.decode(attached[0], type=Team)
+    except OSError as error:
+        raise LogError(f"{path}: cannot be read: {error.strerror}") from error
+    except (McapError, struct.error, msgspec.MsgspecError) as error:
+        raise LogError(f"{path}: not a whole recording: {error}") from error
+    truths = [message for _, message in messages if isinstance(message, Truths)]
+    return Recorded(team, _inputs(messages), truth_rows(truths))
+
+
+def _inputs(messages: Iterable[tuple[str, Message]]) -> dict[str, list[SensorInput]]:
+    inputs: dict[str, list[SensorInput]] = {}
+    for key, message in messages:
+        if isinstance(message, Odometry | Sightings | Position):
+            inputs.setdefault(key.split("/")[1], []).append(message)
+    return inputs
