@@ -9,7 +9,8 @@ so that `row` is the curve's normal with, where the heading matters, its lever (
 """
 
 import math
-from typing import NamedTuple
+
+import msgspec
 
 from cpcbl_team.estimate import Row
 from cpcbl_team.geometry import Pose2, wrap_angle
@@ -17,8 +18,8 @@ from cpcbl_team.geometry import Pose2, wrap_angle
 NEAREST_M = 1e-3  # nearer than this a direction means nothing
 
 
-class Constraint(NamedTuple):
-    """One scalar constraint on a pose."""
+class Constraint(msgspec.Struct, frozen=True, gc=False):
+    """One scalar constraint on a pose, relative to an object: moving that moves the curve."""
 
     row: Row
     residual: float  # metres for a position, radians for a heading
@@ -30,15 +31,8 @@ class Constraint(NamedTuple):
     def uncoupled(self) -> "Constraint":
         """As the paper prints it: heading and position know nothing of each other's error."""
         x, y, h = self.row
-        return self._replace(row=(0.0, 0.0, h) if self.on_heading else (x, y, 0.0))
-
-    @staticmethod
-    def of(
-        row: Row, residual: float, sigma: float, distance_m: float, on_heading: bool
-    ) -> "Constraint":
-        """A constraint relative to an object: moving the object moves the curve along with it."""
-        distance_m = max(distance_m, NEAREST_M)
-        return Constraint(row, residual, sigma, distance_m, on_heading, row[:2])
+        row = (0.0, 0.0, h) if self.on_heading else (x, y, 0.0)
+        return msgspec.structs.replace(self, row=row)
 
     def closest_point(self, pose: Pose2) -> tuple[float, float]:
         """The point of a position constraint that is closest to the estimate (figure 1 c)."""
@@ -53,8 +47,9 @@ def range_circle(
     distance = math.hypot(dx, dy)
     if distance < NEAREST_M:
         return None
-    row = (dx / distance, dy / distance, 0.0)
-    return Constraint.of(row, range_m - distance, sigma_m, range_m, False)
+    u, v = dx / distance, dy / distance
+    weighed = max(range_m, NEAREST_M)
+    return Constraint((u, v, 0.0), range_m - distance, sigma_m, weighed, False, (u, v))
 
 
 def bearing_ray(pose: Pose2, x: float, y: float, bearing: float, sigma: float) -> Constraint | None:
@@ -71,7 +66,7 @@ def bearing_ray(pose: Pose2, x: float, y: float, bearing: float, sigma: float) -
     distance = math.hypot(dx, dy)
     residual = ux * dy - uy * dx
     width = distance * math.sin(min(sigma, 0.5 * math.pi))
-    return Constraint.of((-uy, ux, ahead), residual, width, distance, False)
+    return Constraint((-uy, ux, ahead), residual, width, distance, False, (-uy, ux))
 
 
 def bearing_heading(
@@ -83,8 +78,9 @@ def bearing_heading(
     if distance < NEAREST_M:
         return None
     residual = wrap_angle(math.atan2(dy, dx) - bearing - pose.heading)
-    row = (-dy / distance**2, dx / distance**2, 1.0)
-    return Constraint.of(row, residual, sigma, distance, True)
+    q = distance**2
+    u, v = -dy / q, dx / q
+    return Constraint((u, v, 1.0), residual, sigma, distance, True, (u, v))
 
 
 def wall_line(
@@ -94,8 +90,9 @@ def wall_line(
     nx, ny = -math.sin(wall_direction), math.cos(wall_direction)
     offset = nx * (pose.x - x) + ny * (pose.y - y)
     side = 1.0 if offset >= 0.0 else -1.0
-    row = (side * nx, side * ny, 0.0)
-    return Constraint.of(row, distance_m - abs(offset), sigma_m, distance_m, False)
+    u, v = side * nx, side * ny
+    weighed = max(distance_m, NEAREST_M)
+    return Constraint((u, v, 0.0), distance_m - abs(offset), sigma_m, weighed, False, (u, v))
 
 
 def wall_heading(
@@ -106,4 +103,5 @@ def wall_heading(
     offset = nx * (pose.x - x) + ny * (pose.y - y)
     towards = wall_direction - math.copysign(0.5 * math.pi, offset)
     residual = wrap_angle(towards - bearing - pose.heading)
-    return Constraint.of((0.0, 0.0, 1.0), residual, sigma, abs(offset), True)
+    weighed = max(abs(offset), NEAREST_M)
+    return Constraint((0.0, 0.0, 1.0), residual, sigma, weighed, True, (0.0, 0.0))

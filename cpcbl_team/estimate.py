@@ -103,6 +103,9 @@ class Scope(Enum):
     HEADING = "heading"
 
 
+POSE, POSITION, HEADING = Scope  # a look-up in an enum costs as much as a scalar update
+
+
 class Information(NamedTuple):
     """Evidence about the offset from a prior: sum of h h^T / variance and of h e / variance."""
 
@@ -183,9 +186,9 @@ def scoped(
     survive: Matrix3, prior: Covariance3, posterior: Covariance3, scope: Scope
 ) -> tuple[Matrix3, Covariance3]:
     """The merge restricted to `scope`: the other part keeps its estimate and its variance."""
-    if scope is Scope.POSE:
+    if scope is POSE:
         return survive, posterior
-    if scope is Scope.POSITION:
+    if scope is POSITION:
         xx, xy, yy, xh, yh, _ = posterior
         return (*survive[:6], 0.0, 0.0, 1.0), Covariance3(xx, xy, yy, xh, yh, prior.hh)
     return (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, *survive[6:]), Covariance3(
@@ -196,14 +199,14 @@ def scoped(
 def shifted(pose: Pose2, offset: Row, scope: Scope) -> Pose2:
     """The pose moved by an offset, within `scope`."""
     dx, dy, dh = offset
-    if scope is Scope.POSITION:
+    if scope is POSITION:
         return Pose2(pose.x + dx, pose.y + dy, pose.heading)
-    if scope is Scope.HEADING:
+    if scope is HEADING:
         return Pose2(pose.x, pose.y, wrap_angle(pose.heading + dh))
     return Pose2(pose.x + dx, pose.y + dy, wrap_angle(pose.heading + dh))
 
 
-def merge(prior: Estimate, evidence: Information, scope: Scope = Scope.POSE) -> Estimate:
+def merge(prior: Estimate, evidence: Information, scope: Scope = POSE) -> Estimate:
     """Bayes' product of a prior and independent evidence (equations 3 and 4 in three dimensions).
 
     Works for evidence of any rank: one range says nothing along the tangent of its circle.

@@ -9,6 +9,8 @@ noise is fresh and merged as usual.
 from typing import NamedTuple
 
 from cpcbl_team.estimate import (
+    HEADING,
+    POSE,
     SMALLEST_VARIANCE,
     ZERO3,
     Covariance3,
@@ -60,21 +62,33 @@ class Observation(NamedTuple):
 
     def normalized_innovation_squared(self, prior: Covariance3) -> float:
         """e^T (H P H^T + R)^-1 e: chi-square with as many degrees of freedom as rows."""
-        r = self.noise()
-        first = prior.times(self.rows[0])
-        sxx = _dot(self.rows[0], first) + r.xx
-        if len(self.rows) == 1:
-            return self.residuals[0] ** 2 / sxx
-        sxy = _dot(self.rows[1], first) + r.xy
-        syy = _dot(self.rows[1], prior.times(self.rows[1])) + r.yy
-        return Covariance2(sxx, sxy, syy).mahalanobis_squared(*self.residuals)
+        return chi_square(prior, self.noise(), self.rows, self.residuals)
 
 
-def _dot(a: Row, b: Row) -> float:
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+def chi_square(
+    prior: Covariance3,
+    noise: tuple[float, float, float],
+    rows: tuple[Row, ...],
+    residuals: tuple[float, ...],
+) -> float:
+    """e^T (H P H^T + R)^-1 e of one or two scalar measurements; `noise` is xx, xy, yy of R."""
+    xx, xy, yy, xh, yh, hh = prior
+    rxx, rxy, ryy = noise
+    x, y, a = rows[0]
+    px, py, ph = xx * x + xy * y + xh * a, xy * x + yy * y + yh * a, xh * x + yh * y + hh * a
+    sxx = x * px + y * py + a * ph + rxx
+    e = residuals[0]
+    if len(rows) == 1:
+        return e * e / sxx
+    x, y, a = rows[1]
+    sxy = x * px + y * py + a * ph + rxy
+    px, py, ph = xx * x + xy * y + xh * a, xy * x + yy * y + yh * a, xh * x + yh * y + hh * a
+    syy = x * px + y * py + a * ph + ryy
+    f = residuals[1]
+    return (syy * e * e - 2.0 * sxy * e * f + sxx * f * f) / (sxx * syy - sxy * sxy)
 
 
-def merge_naive(prior: Estimate, seen: Observation, scope: Scope = Scope.POSE) -> Estimate:
+def merge_naive(prior: Estimate, seen: Observation, scope: Scope = POSE) -> Estimate:
     """The paper's collaboration: the teammate's error is compounded and taken as fresh noise."""
     return merge(prior, seen.information(), scope)
 
@@ -82,7 +96,7 @@ def merge_naive(prior: Estimate, seen: Observation, scope: Scope = Scope.POSE) -
 _GOLDEN = 0.6180339887498949
 
 
-def merge_split(prior: Estimate, seen: Observation, scope: Scope = Scope.POSE) -> Estimate:
+def merge_split(prior: Estimate, seen: Observation, scope: Scope = POSE) -> Estimate:
     """Split covariance intersection: consistent for any correlation of the dependent parts.
 
     P1 = P_d / w + P_i, R = R_d / (1 - w) + R_i, w chosen by golden section for the smallest merged
@@ -115,9 +129,9 @@ def _split(prior: Estimate, seen: Observation, scope: Scope, weight: float) -> t
     widened = _widened(prior, weight)
     evidence = seen.information(1.0 / (1.0 - weight)).matrix
     merged = product(survival(widened, evidence), widened)
-    if scope is Scope.POSE:
+    if scope is POSE:
         return merged.determinant(), weight
-    return (merged.hh if scope is Scope.HEADING else merged.xx + merged.yy), weight
+    return (merged.hh if scope is HEADING else merged.xx + merged.yy), weight
 
 
 def _merge_split_at(prior: Estimate, seen: Observation, scope: Scope, weight: float) -> Estimate:
@@ -126,7 +140,7 @@ def _merge_split_at(prior: Estimate, seen: Observation, scope: Scope, weight: fl
     survive = survival(widened, evidence.matrix)
     merged = product(survive, widened)
     pose = shifted(prior.pose, merged.times(evidence.vector), scope)
-    if scope is Scope.POSE:
+    if scope is POSE:
         own = prior.covariance.plus(prior.shared, -1.0).transformed(survive)
         fresh = _sensor_part(seen, weight, merged)
         return Estimate(pose, merged, merged.plus(own, -1.0).plus(fresh, -1.0))

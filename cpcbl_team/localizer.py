@@ -10,7 +10,16 @@ from statistics import NormalDist
 from cpcbl_team import recovery, weighted
 from cpcbl_team.config import Field, LocalizationSettings
 from cpcbl_team.constraints import Constraint
-from cpcbl_team.estimate import Covariance3, Estimate, Scope, circular, merge
+from cpcbl_team.estimate import (
+    HEADING,
+    POSE,
+    POSITION,
+    Covariance3,
+    Estimate,
+    Scope,
+    circular,
+    merge,
+)
 from cpcbl_team.fusion import Observation, merge_naive, merge_split, told, with_all_shared
 from cpcbl_team.gaussian import Covariance2
 from cpcbl_team.geometry import Pose2, step, wrap_angle
@@ -18,12 +27,20 @@ from cpcbl_team.inputs import Belief, Fix, Odometry, Position, Sightings, Told
 from cpcbl_team.motion import move
 from cpcbl_team.self_calibration import Anchor, Anchors, learned
 from cpcbl_team.sensors import repeated_share, sighting_fault
-from cpcbl_team.sightings import Measured, combined, constraints_of, measured, observation_of
-from cpcbl_team.state import Memory, State
+from cpcbl_team.sightings import (
+    Measured,
+    combined,
+    constraints_of,
+    measured,
+    observation_of,
+    surprise,
+)
+from cpcbl_team.state import Memory, State, added
 
 UNSTEERABLE_SIGMA_RAD = math.radians(100.0)  # beyond, no bearing can be linearized
 _FIX = "fix:"  # marks the source of an active fix, apart from seeing that teammate
 _OWN = "position sensor"
+
 _AXES = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
 
 
@@ -35,6 +52,7 @@ class Localizer:
         self.field = field
         self._rules = settings.localizer
         self._weighted = self._rules.variant == "weighted"
+        self._alternates = self._rules.alternates
         self._correlated = settings.sensor.correlation_s > 0.0
         p = self._rules.gate_probability
         self._gates = (NormalDist().inv_cdf(0.5 + 0.5 * p) ** 2, -2.0 * math.log(1.0 - p))
@@ -64,8 +82,8 @@ class Localizer:
                 told = observation_of(prior, m, cs, estimate)
                 estimate = self._merge_teammate(estimate, told, self._scope(turn))
         sources = [m.source for m, _ in accepted]
-        state = state._replace(estimate=self._reduced(estimate))
-        return self._judged(self._updated(state, turn, sources, rejected))
+        estimate = self._reduced(estimate)
+        return self._judged(self._updated(state, estimate, turn, sources, rejected))
 
     # Step 1 -----------------------------------------------------------------------------------
 
@@ -73,15 +91,15 @@ class Localizer:
         """Takes the next piece of odometry; it is driven along as later inputs ask for it."""
         if odometry.stamp_ns <= odometry.from_ns:
             return state._replace(memory=state.memory.counted("impossible_duration"))
-        state = self.moved(state, odometry.from_ns)
-        odometry_ns = max(state.odometry_ns, odometry.stamp_ns)
-        return state._replace(motion=odometry, odometry_ns=odometry_ns)
+        stamp_ns, estimate, reckoned, _, odometry_ns, memory = self.moved(state, odometry.from_ns)
+        odometry_ns = max(odometry_ns, odometry.stamp_ns)
+        return State(stamp_ns, estimate, reckoned, odometry, odometry_ns, memory)
 
     def moved(self, state: State, until_ns: int) -> State:
         """The state at `until_ns`, driven on along the known odometry."""
-        stamp_ns, estimate, reckoned, motion, odometry_ns, memory = state
-        if until_ns <= stamp_ns:
+        if until_ns <= state.stamp_ns:
             return state
+        stamp_ns, estimate, reckoned, motion, odometry_ns, memory = state
         if motion is not None:
             end_ns = min(motion.stamp_ns, until_ns)
             whole_ns = motion.stamp_ns - motion.from_ns
@@ -123,7 +141,7 @@ class Localizer:
         """The usable sightings of a frame. Faulty ones are counted by reason; those of an object
         that was used too short a time ago are left out, and those of one that was used not long
         ago count for less: their errors are correlated."""
-        memory = state.memory
+        memory, now, pose = state.memory, frame.stamp_ns, state.estimate.pose
         seen, faults = [], []
         bias = memory.learned.bearing_bias_rad if self._rules.self_calibration else 0.0
         for sighting in frame.sightings:
@@ -131,23 +149,17 @@ class Localizer:
             if fault:
                 faults.append(fault)
                 continue
-            m = measured(
-                sighting,
-                frame.stamp_ns,
-                state.estimate.pose,
-                self.field,
-                memory.teammates,
-                self.settings,
-            )
+            m = measured(sighting, now, pose, self.field, memory.teammates, self.settings)
             if m is not None:
                 seen.append(m if bias == 0.0 else m.turned(-bias))
-        pieces = [recovery.seen_evidence(state, m) for m in seen if m.usable and m.wall is None]
-        memory = recovery.remembered(memory, pieces).counted(*faults)
-        least = self._rules.object_interval_s * 1e9
-        fresh = [m for m in seen if _passed(memory.objects_ns.get(m.source), frame.stamp_ns, least)]
+        memory = recovery.with_seen(state, seen).counted(*faults)
+        if memory is not state.memory:
+            state = state._replace(memory=memory)
+        least, used_ns = self._rules.object_interval_s * 1e9, memory.objects_ns.get
+        fresh = [m for m in seen if _passed(used_ns(m.source), now, least)]
         if self._correlated:
-            fresh = [m.doubted(self._repeated(memory, m.source, frame.stamp_ns)) for m in fresh]
-        return state._replace(memory=memory), fresh
+            fresh = [m.doubted(self._repeated(memory, m.source, now)) for m in fresh]
+        return state, fresh
 
     def _repeated(self, memory: Memory, source: str, now_ns: int) -> float:
         """By how much the variance of what this source says now is to grow."""
@@ -161,16 +173,16 @@ class Localizer:
             return None
         memory, now, rules = state.memory, state.stamp_ns, self._rules
         least = rules.minimum_interval_s * 1e9
-        by_bearing = rules.bearing_for_position and any(m.gives_point_bearing for m in seen)
-        position = by_bearing or any(m.range_m is not None for m in seen)
-        position = position and _passed(memory.position_ns, now, least)
-        heading = any(m.bearing is not None for m in seen)
-        heading = heading and _passed(memory.heading_ns, now, least)
-        if not rules.alternates:
-            return Scope.POSE if position or heading else None
+        by_range = [m for m in seen if m.range_m is not None]
+        by_bearing = [m for m in seen if m.bearing is not None]
+        rays = rules.bearing_for_position and [m for m in by_bearing if m.gives_point_bearing]
+        position = bool(by_range or rays) and _passed(memory.position_ns, now, least)
+        heading = bool(by_bearing) and _passed(memory.heading_ns, now, least)
+        if not self._alternates:
+            return POSE if position or heading else None
         if position and heading:
-            return Scope.POSITION if memory.heading_is_latest else Scope.HEADING
-        return Scope.POSITION if position else Scope.HEADING if heading else None
+            return POSITION if memory.heading_is_latest else HEADING
+        return POSITION if position else HEADING if heading else None
 
     # Steps 4 and 5 ----------------------------------------------------------------------------
 
@@ -179,10 +191,8 @@ class Localizer:
     ) -> tuple[list[tuple[Measured, list[Constraint]]], int]:
         """The objects whose innovation the prior's chi-square bound accepts; the others' number."""
         accepted, rejected = [], 0
-        for m, cs in sorted((f for f in found if f[1]), key=lambda f: f[0].source):
-            seen = observation_of(prior, m, cs, prior)
-            surprise = seen.normalized_innovation_squared(prior.covariance)
-            if surprise <= self._gates[len(cs) - 1]:
+        for m, cs in sorted([f for f in found if f[1]], key=_source):
+            if surprise(prior, m, cs) <= self._gates[len(cs) - 1]:
                 accepted.append((m, cs))
             else:
                 rejected += 1
@@ -199,7 +209,7 @@ class Localizer:
 
     def _scope(self, turn: Scope) -> Scope:
         """What an update may move: in `joint` the whole pose, whatever type it is of."""
-        return Scope.POSE if self._rules.variant == "joint" else turn
+        return POSE if self._rules.variant == "joint" else turn
 
     # Teammates --------------------------------------------------------------------------------
 
@@ -237,16 +247,16 @@ class Localizer:
         offset = x - prior.pose.x, y - prior.pose.y
         seen = Observation(_AXES, offset, sensor, observer or Covariance2(0.0, 0.0, 0.0))
         if seen.normalized_innovation_squared(prior.covariance) > self._gates[1]:
-            return self._judged(self._updated(state, None, [], 1))
-        scope = self._scope(Scope.POSITION)
+            return self._judged(self._updated(state, prior, None, [], 1))
+        scope = self._scope(POSITION)
         if self._weighted:
             estimate = weighted.averaged(prior, offset, None, self._rules.weights)
         elif observer is None:
             estimate = merge(prior, seen.information(), scope)
         else:
             estimate = self._merge_teammate(prior, seen, scope)
-        state = state._replace(estimate=self._reduced(estimate))
-        return self._judged(self._updated(state, None, [source], 0))
+        estimate = self._reduced(estimate)
+        return self._judged(self._updated(state, estimate, None, [source], 0))
 
     def hear(self, state: State, belief: Belief) -> State:
         """Passive collaboration: keeps a teammate's belief, to use it when the teammate is seen."""
@@ -277,30 +287,35 @@ class Localizer:
         return State(stamp_ns, estimate, odometry_ns=stamp_ns, memory=memory)
 
     def _updated(
-        self, state: State, turn: Scope | None, sources: Iterable[str], rejected: int
+        self,
+        state: State,
+        estimate: Estimate,
+        turn: Scope | None,
+        sources: Iterable[str],
+        rejected: int,
     ) -> State:
-        """Timers, windows and counts after an update of a type by these sources."""
+        """The new estimate, with timers, windows and counts of an update of a type by sources."""
         memory, now = state.memory, state.stamp_ns
         used = dict.fromkeys(sources, now)
         window = memory.innovations + (True,) * len(used) + (False,) * rejected
-        counts = ["accepted"] * len(used) + ["gated"] * rejected
-        memory = memory.counted(*counts)._replace(
+        # An attempt passes the turn on, an update starts the type's timer.
+        position = used and (turn is POSITION or turn is POSE)
+        heading = used and (turn is HEADING or turn is POSE)
+        memory = memory._replace(
+            position_ns=now if position else memory.position_ns,
+            heading_ns=now if heading else memory.heading_ns,
+            heading_is_latest=memory.heading_is_latest if turn is None else turn is HEADING,
             objects_ns={**memory.objects_ns, **used},
             innovations=window[-self._rules.lost_window :],
+            counts=added(memory.counts, accepted=len(used), gated=rejected),
         )
-        if turn is not None:  # an attempt passes the turn on, an update starts the type's timer
-            memory = memory._replace(heading_is_latest=turn is Scope.HEADING)
-        if used and turn in (Scope.POSITION, Scope.POSE):
-            memory = memory._replace(position_ns=now)
-        if used and turn in (Scope.HEADING, Scope.POSE):
-            memory = memory._replace(heading_ns=now)
+        _, _, reckoned, motion, odometry_ns, _ = state
         if used and self._rules.self_calibration:
-            memory = self._taught(state, memory)
-        return state._replace(memory=memory)
+            memory = self._taught(Anchor(now, estimate, reckoned), memory)
+        return State(now, estimate, reckoned, motion, odometry_ns, memory)
 
-    def _taught(self, state: State, memory: Memory) -> Memory:
+    def _taught(self, here: Anchor, memory: Memory) -> Memory:
         """What the robot has learned of its odometry and bearings, from this update too."""
-        here = Anchor(state.stamp_ns, state.estimate, state.odometry_from_robot)
         if memory.anchors is None or memory.lost:
             return memory._replace(anchors=None if memory.lost else Anchors(here, here))
         known, anchors = learned(memory.learned, memory.anchors, here, self.settings.odometry)
@@ -335,3 +350,7 @@ class Localizer:
 
 def _passed(last_ns: int | None, now_ns: int, least_ns: float) -> bool:
     return last_ns is None or now_ns - last_ns >= least_ns
+
+
+def _source(found: tuple[Measured, list[Constraint]]) -> str:
+    return found[0].source

@@ -5,10 +5,13 @@ compounding with respect to both. Motion noise is white, so its variance grows w
 """
 
 import math
+from operator import add
 
 from cpcbl_team.config import OdometryNoise
 from cpcbl_team.estimate import ZERO3, Covariance3, Estimate, Matrix3
-from cpcbl_team.geometry import step
+from cpcbl_team.geometry import Pose2, wrap_angle
+
+_Entries = tuple[float, float, float, float, float, float]  # of a Covariance3
 
 
 def motion_jacobian(heading: float, distance: float, turn: float) -> Matrix3:
@@ -30,7 +33,15 @@ def motion_jacobian(heading: float, distance: float, turn: float) -> Matrix3:
 def motion_noise(heading: float, distance: float, turn: float, noise: OdometryNoise) -> Covariance3:
     """The differential motion's covariance, rotated into the field's frame."""
     direction = heading + 0.5 * turn
-    c, s = math.cos(direction), math.sin(direction)
+    return Covariance3(
+        *_noise_along(math.cos(direction), math.sin(direction), distance, turn, noise)
+    )
+
+
+def _noise_along(
+    c: float, s: float, distance: float, turn: float, noise: OdometryNoise
+) -> _Entries:
+    """The noise of an arc whose chord has the direction with cosine `c` and sine `s`."""
     way = abs(distance)
     turned = abs(turn)
     along = (
@@ -40,7 +51,7 @@ def motion_noise(heading: float, distance: float, turn: float, noise: OdometryNo
         noise.turn_sigma_rad_per_sqrt_rad**2 * turned + noise.turn_sigma_rad_per_sqrt_m**2 * way
     )
     lx, ly = -0.5 * distance * s, 0.5 * distance * c  # where a turn error leads
-    return Covariance3(
+    return (
         along * c * c + around * lx * lx,
         along * c * s + around * lx * ly,
         along * s * s + around * ly * ly,
@@ -53,20 +64,24 @@ def motion_noise(heading: float, distance: float, turn: float, noise: OdometryNo
 def move(estimate: Estimate, distance: float, turn: float, noise: OdometryNoise) -> Estimate:
     """The estimate after the wheels report an arc of `distance` metres that turns by `turn`."""
     pose, covariance, shared = estimate
-    direction = pose.heading + 0.5 * turn
+    x, y, heading = pose
+    direction = heading + 0.5 * turn
+    c, s = math.cos(direction), math.sin(direction)
     # where a heading error of one radian leads, in metres: the last column of the Jacobian
-    lx, ly = -distance * math.sin(direction), distance * math.cos(direction)
+    lx, ly = -distance * s, distance * c
     return Estimate(
-        step(pose, distance, turn),
-        _sheared(covariance, lx, ly).plus(motion_noise(pose.heading, distance, turn, noise)),
-        shared if shared is ZERO3 else _sheared(shared, lx, ly),
+        Pose2(x + distance * c, y + distance * s, wrap_angle(heading + turn)),
+        Covariance3(
+            *map(add, _sheared(covariance, lx, ly), _noise_along(c, s, distance, turn, noise))
+        ),
+        shared if shared is ZERO3 else Covariance3(*_sheared(shared, lx, ly)),
     )
 
 
-def _sheared(p: Covariance3, lx: float, ly: float) -> Covariance3:
+def _sheared(p: Covariance3, lx: float, ly: float) -> _Entries:
     """F P F^T for F = [1 0 lx; 0 1 ly; 0 0 1], written out: it runs for every odometry step."""
     xx, xy, yy, xh, yh, hh = p
-    return Covariance3(
+    return (
         xx + lx * (2.0 * xh + lx * hh),
         xy + lx * yh + ly * xh + lx * ly * hh,
         yy + ly * (2.0 * yh + ly * hh),

@@ -59,14 +59,28 @@ def told_evidence(
 def remembered(memory: Memory, pieces: Iterable[Evidence]) -> Memory:
     """The memory with new evidence, without what is too old or too alike."""
     kept = list(memory.evidence)
+    latest_ns = {e.source: e.stamp_ns for e in kept}
     for piece in pieces:
-        latest = next((e.stamp_ns for e in reversed(kept) if e.source == piece.source), None)
+        latest = latest_ns.get(piece.source)
         if latest is None or piece.stamp_ns - latest >= SPACING_NS:
             kept.append(piece)
+            latest_ns[piece.source] = piece.stamp_ns
     if len(kept) == len(memory.evidence):
         return memory
     kept = [e for e in kept if kept[-1].stamp_ns - e.stamp_ns <= WINDOW_NS]
     return memory._replace(evidence=tuple(kept[-MOST_PIECES:]))
+
+
+def with_seen(state: State, seen: Iterable[Measured]) -> Memory:
+    """The memory with those of a frame's sightings that are not too alike to what it holds."""
+    now, memory = state.stamp_ns, state.memory
+    recent = set()
+    for e in reversed(memory.evidence):
+        if now - e.stamp_ns >= SPACING_NS:
+            break
+        recent.add(e.source)
+    new = [m for m in seen if m.source not in recent and m.usable and m.wall is None]
+    return remembered(memory, [seen_evidence(state, m) for m in new]) if new else memory
 
 
 def lost_reason(estimate: Estimate, memory: Memory, settings: LocalizerSettings) -> str:

@@ -9,6 +9,7 @@ from cpcbl_team.geometry import wrap_angle
 from cpcbl_team.inputs import Odometry, Sighting
 
 LARGEST_M = 1e6
+LARGEST_BEARING_RAD = math.pi + 1e-9
 SOONEST_S = 1e-3
 LEAST_COSINE = 0.1  # a depth says nothing of what is seen across the optical axis
 
@@ -42,6 +43,21 @@ def corrected_sighting(sighting: Sighting, sensor: SensorSettings, teammate: boo
 
 def sighting_fault(sighting: Sighting) -> str:
     """Why a sighting must not be used (resolution i); empty if it may."""
+    r, a = sighting.range_m, sighting.bearing_rad
+    range_sigma, bearing_sigma = sighting.range_sigma_m, sighting.bearing_sigma_rad
+    if (
+        (r is None or 0.0 < r <= LARGEST_M)
+        and (a is None or -LARGEST_BEARING_RAD <= a <= LARGEST_BEARING_RAD)
+        and (range_sigma is None or 0.0 < range_sigma <= LARGEST_M)
+        and (bearing_sigma is None or 0.0 < bearing_sigma <= LARGEST_M)
+        and not (r is None and a is None)
+    ):
+        return ""
+    return _fault(sighting)
+
+
+def _fault(sighting: Sighting) -> str:
+    """What is wrong with a sighting, the gravest first."""
     numbers = (
         sighting.range_m,
         sighting.bearing_rad,
@@ -57,11 +73,9 @@ def sighting_fault(sighting: Sighting) -> str:
         return "empty_sighting"
     if sighting.range_m is not None and sighting.range_m <= 0.0:
         return "range_not_positive"
-    if sighting.bearing_rad is not None and abs(sighting.bearing_rad) > math.pi + 1e-9:
+    if sighting.bearing_rad is not None and abs(sighting.bearing_rad) > LARGEST_BEARING_RAD:
         return "bearing_out_of_range"
-    if any(n is not None and n <= 0.0 for n in numbers[2:]):
-        return "sigma_not_positive"
-    return ""
+    return "sigma_not_positive"
 
 
 def sighting_sigmas(
@@ -73,11 +87,12 @@ def sighting_sigmas(
     are too long, and so pull the robot in; a share of the expected range (within a factor of two)
     does not.
     """
-    range_m = sighting.range_m or 0.0
-    if expected_range_m is not None:
-        range_m = max(0.5 * range_m, min(2.0 * range_m, expected_range_m))
     range_sigma, bearing_sigma = sighting.range_sigma_m, sighting.bearing_sigma_rad
     if range_sigma is None:
+        range_m = sighting.range_m or 0.0
+        if expected_range_m is not None:
+            least, most = 0.5 * range_m, 2.0 * range_m
+            range_m = min(max(expected_range_m, least), most)
         range_sigma = sensor.range_sigma_m(range_m)
     return range_sigma, sensor.bearing_sigma_rad if bearing_sigma is None else bearing_sigma
 

@@ -2,7 +2,9 @@
 
 import math
 from collections.abc import Mapping
-from typing import NamedTuple
+from functools import lru_cache
+
+import msgspec
 
 from cpcbl_team.collaboration import Place, placed
 from cpcbl_team.config import Field, LocalizationSettings, LocalizerSettings, Wall
@@ -14,8 +16,15 @@ from cpcbl_team.constraints import (
     wall_heading,
     wall_line,
 )
-from cpcbl_team.estimate import Estimate, Information, Scope
-from cpcbl_team.fusion import Observation
+from cpcbl_team.estimate import (
+    HEADING,
+    POSITION,
+    SMALLEST_VARIANCE,
+    Estimate,
+    Information,
+    Scope,
+)
+from cpcbl_team.fusion import Observation, chi_square
 from cpcbl_team.gaussian import Covariance2
 from cpcbl_team.geometry import Pose2, wrap_angle
 from cpcbl_team.inputs import Belief, Sighting
@@ -24,7 +33,7 @@ from cpcbl_team.sensors import sighting_sigmas
 _EXACT = Covariance2(0.0, 0.0, 0.0)
 
 
-class Measured(NamedTuple):
+class Measured(msgspec.Struct, frozen=True, gc=False):
     """A sighting of an object whose place is known; a quantity is None where it is not usable."""
 
     source: str
@@ -43,13 +52,14 @@ class Measured(NamedTuple):
     def doubted(self, factor: float) -> "Measured":
         """With both variances grown by this factor."""
         k = math.sqrt(factor)
-        return self._replace(range_sigma=k * self.range_sigma, bearing_sigma=k * self.bearing_sigma)
+        sigmas = {"range_sigma": k * self.range_sigma, "bearing_sigma": k * self.bearing_sigma}
+        return msgspec.structs.replace(self, **sigmas)
 
     def turned(self, angle: float) -> "Measured":
         """Seen so much further to the left."""
         if self.bearing is None:
             return self
-        return self._replace(bearing=wrap_angle(self.bearing + angle))
+        return msgspec.structs.replace(self, bearing=wrap_angle(self.bearing + angle))
 
     @property
     def gives_point_bearing(self) -> bool:
@@ -65,32 +75,33 @@ def measured(
     settings: LocalizationSettings,
 ) -> Measured | None:
     """The sighting, seen from about `pose`, with its object's place; None if that is not known."""
-    wall = field.walls.get(sighting.id)
-    landmark = field.landmarks.get(sighting.id)
-    gives = "both"
+    name = sighting.id
+    wall, landmark, gives = field.walls.get(name), field.landmarks.get(name), "both"
     if landmark is not None:
-        place: Place | None = Place(landmark.x_m, landmark.y_m, _EXACT)
+        place: Place | None = _on_map(landmark.x_m, landmark.y_m)
         gives = landmark.gives
     elif wall is not None:
-        place, gives = Place(*wall.from_m, _EXACT), wall.gives
-    elif sighting.id in teammates and settings.collaboration.passive:
-        place = placed(teammates[sighting.id], stamp_ns, settings.collaboration)
+        place, gives = _on_map(*wall.from_m), wall.gives
+    elif name in teammates and settings.collaboration.passive:
+        place = placed(teammates[name], stamp_ns, settings.collaboration)
     else:
         return None
     if place is None:
         return None
-    range_m = sighting.range_m if gives in ("both", "range") else None
-    if range_m is not None and range_m > settings.sensor.max_range_for_range_m:
+    range_m, bearing, sensor = sighting.range_m, sighting.bearing_rad, settings.sensor
+    if gives == "bearing" or gives == "none" or (range_m or 0.0) > sensor.max_range_for_range_m:
         range_m = None
-    return Measured(
-        sighting.id,
-        place,
-        wall,
-        landmark is None and wall is None,
-        range_m,
-        sighting.bearing_rad if gives in ("both", "bearing") else None,
-        *sighting_sigmas(sighting, settings.sensor, _expected_range(pose, place, wall)),
-    )
+    if gives == "range" or gives == "none":
+        bearing = None
+    expected = _expected_range(pose, place, wall)
+    range_sigma, bearing_sigma = sighting_sigmas(sighting, sensor, expected)
+    teammate = landmark is None and wall is None
+    return Measured(name, place, wall, teammate, range_m, bearing, range_sigma, bearing_sigma)
+
+
+@lru_cache(1024)
+def _on_map(x: float, y: float) -> Place:
+    return Place(x, y, _EXACT)
 
 
 def _expected_range(pose: Pose2, place: Place, wall: Wall | None) -> float:
@@ -106,29 +117,42 @@ def constraints_of(
 ) -> list[Constraint]:
     """Step 3: what one object says about position or heading; about both, each reading once."""
     x, y, _ = m.place
-    found: list[Constraint | None] = []
-    if m.range_m is not None and turn is not Scope.HEADING:
-        if m.wall is None:
-            found.append(range_circle(pose, x, y, m.range_m, m.range_sigma))
+    range_m, bearing, wall = m.range_m, m.bearing, m.wall
+    by_range = by_bearing = None
+    if range_m is not None and turn is not HEADING:
+        if wall is None:
+            by_range = range_circle(pose, x, y, range_m, m.range_sigma)
         else:
-            direction = m.wall.direction_rad
-            found.append(wall_line(pose, x, y, direction, m.range_m, m.range_sigma))
-    if m.bearing is not None and turn is not Scope.POSITION:
-        if m.wall is None:
-            found.append(bearing_heading(pose, x, y, m.bearing, m.bearing_sigma))
+            by_range = wall_line(pose, x, y, wall.direction_rad, range_m, m.range_sigma)
+    if bearing is not None and turn is not POSITION:
+        if wall is None:
+            by_bearing = bearing_heading(pose, x, y, bearing, m.bearing_sigma)
         else:
-            direction = m.wall.direction_rad
-            found.append(wall_heading(pose, x, y, direction, m.bearing, m.bearing_sigma))
-    across = turn is Scope.POSITION and m.wall is None and rules.bearing_for_position
-    if m.bearing is not None and across:
-        found.append(bearing_ray(pose, x, y, m.bearing, m.bearing_sigma))
-    plain = rules.paper_uncertainty or rules.variant == "weighted"
-    return [c.uncoupled() if plain else c for c in found if c is not None]
+            by_bearing = wall_heading(pose, x, y, wall.direction_rad, bearing, m.bearing_sigma)
+    elif bearing is not None and wall is None and rules.bearing_for_position:
+        by_bearing = bearing_ray(pose, x, y, bearing, m.bearing_sigma)
+    found = [c for c in (by_range, by_bearing) if c is not None]
+    if rules.paper_uncertainty or rules.variant == "weighted":
+        return [c.uncoupled() for c in found]
+    return found
 
 
 def combined(accepted: list[Constraint]) -> Information:
     """Step 4: the Gaussians at the closest points of all constraints, as one."""
-    return Information.none().with_all((c.row, c.residual, c.sigma * c.sigma) for c in accepted)
+    return Information.none().with_all([(c.row, c.residual, c.sigma * c.sigma) for c in accepted])
+
+
+def surprise(prior: Estimate, m: Measured, cs: list[Constraint]) -> float:
+    """The normalized innovation squared of one object: chi-square, a degree a constraint."""
+    if m.teammate:
+        return observation_of(prior, m, cs, prior).normalized_innovation_squared(prior.covariance)
+    first, last = cs[0], cs[-1]
+    rxx, ryy = first.sigma * first.sigma, last.sigma * last.sigma
+    noise = rxx + SMALLEST_VARIANCE, 0.0, ryy + SMALLEST_VARIANCE
+    if first is last:
+        return chi_square(prior.covariance, noise, (first.row,), (first.residual,))
+    residuals = first.residual, last.residual
+    return chi_square(prior.covariance, noise, (first.row, last.row), residuals)
 
 
 def observation_of(

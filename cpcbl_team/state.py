@@ -1,5 +1,6 @@
 """All that a localizer knows at one time. Immutable: a copy is a checkpoint."""
 
+from collections import Counter
 from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -10,6 +11,12 @@ from cpcbl_team.inputs import Belief, Odometry
 from cpcbl_team.self_calibration import Anchors, Learned
 
 _NONE: Mapping[str, Any] = MappingProxyType({})
+
+
+def added(counts: Mapping[str, int], **more: int) -> Mapping[str, int]:
+    """The counts with these more of each reason."""
+    total = {reason: counts.get(reason, 0) + n for reason, n in more.items() if n}
+    return {**counts, **total}
 
 
 class Evidence(NamedTuple):
@@ -48,10 +55,7 @@ class Memory(NamedTuple):
     def counted(self, *reasons: str) -> "Memory":
         if not reasons:
             return self
-        counts = dict(self.counts)
-        for reason in reasons:
-            counts[reason] = counts.get(reason, 0) + 1
-        return self._replace(counts=counts)
+        return self._replace(counts=added(self.counts, **Counter(reasons)))
 
 
 class State(NamedTuple):

@@ -23,6 +23,7 @@ from core_helpers import (
     state_at,
 )
 
+from cpcbl_team.collaboration import Place
 from cpcbl_team.config import (
     Field,
     Gives,
@@ -34,6 +35,7 @@ from cpcbl_team.config import (
     Variant,
 )
 from cpcbl_team.estimate import Estimate
+from cpcbl_team.gaussian import Covariance2
 from cpcbl_team.geometry import Pose2, wrap_angle
 from cpcbl_team.inputs import Sighting, Sightings
 from cpcbl_team.recovery import (
@@ -44,7 +46,9 @@ from cpcbl_team.recovery import (
     relocalized,
     remembered,
     widened,
+    with_seen,
 )
+from cpcbl_team.sightings import Measured
 from cpcbl_team.state import Evidence, Memory, State
 
 ORIGIN = Pose2(0.0, 0.0, 0.0)
@@ -266,6 +270,19 @@ def test_memory_keeps_little_of_each_object_and_nothing_old() -> None:
     later = stamps[-1] + WINDOW_NS + 1
     memory = remembered(memory, [piece(later, ORIGIN, "c", 1.0, 2.0)])
     assert [e.source for e in memory.evidence] == ["c"]
+
+
+@pytest.mark.parametrize(("age_ns", "kept"), [(SPACING_NS - 1, ["ne"]), (SPACING_NS, ["ne", "ne"])])
+def test_an_object_that_was_seen_a_short_time_ago_is_no_new_evidence(
+    age_ns: int, kept: list[str]
+) -> None:
+    state = state_at(ORIGIN, diagonal(0.1, 0.1), stamp_ns=SECOND)
+    state = state._replace(
+        memory=Memory(evidence=(piece(SECOND - age_ns, ORIGIN, "ne", 4.5, 2.5),))
+    )
+    place, both = Place(4.5, 2.5, Covariance2(0.0, 0.0, 0.0)), (5.0, 0.5)
+    seen = [Measured(name, place, None, False, *both, 0.1, 0.1) for name in ("ne", "ne")]
+    assert [e.source for e in with_seen(state, seen).evidence] == kept
 
 
 @pytest.mark.parametrize("gives", ["none", "bearing"])

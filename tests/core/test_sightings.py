@@ -2,7 +2,7 @@ import math
 from collections.abc import Mapping
 
 import pytest
-from core_helpers import CORNERS, SECOND, belief
+from core_helpers import CORNERS, SECOND, belief, diagonal, state_at
 
 from cpcbl_team.config import (
     CollaborationSettings,
@@ -10,12 +10,20 @@ from cpcbl_team.config import (
     Gives,
     Landmark,
     LocalizationSettings,
+    LocalizerSettings,
     SensorSettings,
     Wall,
 )
+from cpcbl_team.estimate import Scope
 from cpcbl_team.geometry import Pose2
 from cpcbl_team.inputs import Belief, Sighting
-from cpcbl_team.sightings import Measured, measured
+from cpcbl_team.sightings import (
+    Measured,
+    constraints_of,
+    measured,
+    observation_of,
+    surprise,
+)
 
 HERE = Pose2(0.0, 0.0, 0.0)
 
@@ -110,3 +118,17 @@ def test_a_teammate_whose_belief_is_too_old_is_not_used() -> None:
     told = {"mate": belief(1.0, 2.0)}
     late = Sighting("mate", math.sqrt(5.0), 0.5)
     assert seen_as(late, teammates=told, stamp_ns=2 * SECOND) is None
+
+
+@pytest.mark.parametrize("turn", Scope)
+@pytest.mark.parametrize("name", ["ne", "mate"])
+def test_the_gate_measures_the_innovation_of_the_whole_observation(name: str, turn: Scope) -> None:
+    """For a landmark in a shorter way, for its place is exact."""
+    prior = state_at(HERE, diagonal(0.2, 0.1)).estimate
+    seen = seen_as(Sighting(name, 3.0, 0.7), teammates={"mate": belief(1.0, 2.0, sigma_m=0.3)})
+    assert seen is not None
+    cs = constraints_of(HERE, seen, turn, LocalizerSettings())
+    whole = observation_of(prior, seen, cs, prior)
+    expected = whole.normalized_innovation_squared(prior.covariance)
+    assert expected > 0.0
+    assert surprise(prior, seen, cs) == pytest.approx(expected, rel=1e-12)
