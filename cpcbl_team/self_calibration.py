@@ -52,7 +52,8 @@ def learned(
 ) -> tuple[Learned, Anchors]:
     """What is known after one more update, and the anchors of the next comparisons.
 
-    An anchor moves on when there was something to compare, or when it is too old to be.
+    An anchor moves on when there was something to compare, or when there can be no more: it is too
+    old, or the robot has turned too far since for a chord.
     """
     turned, drove = anchors
     wheels = turned.odometry_from_robot.inverse() @ now.odometry_from_robot
@@ -60,7 +61,9 @@ def learned(
         so_far, turned = _turn_compared(so_far, turned, now, wheels, noise), now
     wheels = drove.odometry_from_robot.inverse() @ now.odometry_from_robot
     way = math.hypot(wheels.x, wheels.y)
-    if way >= LEAST_WAY_M and abs(wheels.heading) <= MOST_TURN_RAD:
+    if abs(wheels.heading) > MOST_TURN_RAD:
+        drove = now
+    elif way >= LEAST_WAY_M:
         so_far, drove = _way_compared(so_far, drove, now, wheels, noise), now
     turned, drove = (now if now.stamp_ns - a.stamp_ns > LONGEST_NS else a for a in (turned, drove))
     return so_far, Anchors(turned, drove)
@@ -90,7 +93,8 @@ def _way_compared(
     if after > RENEWED_SHARE * (before + along + p.covariance.hh * way * way):
         return so_far
     found = p.pose.inverse() @ q.pose
-    excess = math.hypot(found.x, found.y) - way
+    # along the wheels' direction: an error across it would only ever lengthen the way
+    excess = (found.x * wheels.x + found.y * wheels.y) / way - way
     noise_m2 = before + after + along
     change, variance = _updated(so_far.distance_variance, way, excess, noise_m2)
     scale = so_far.distance_scale * (1.0 + change)

@@ -6,7 +6,7 @@ import msgspec
 
 from cpcbl_team.config import OdometrySettings, SensorSettings
 from cpcbl_team.geometry import wrap_angle
-from cpcbl_team.inputs import Odometry, Sighting
+from cpcbl_team.inputs import Odometry, Sighting, Sightings
 
 LARGEST_M = 1e6
 LARGEST_BEARING_RAD = math.pi + 1e-9
@@ -39,6 +39,20 @@ def corrected_sighting(sighting: Sighting, sensor: SensorSettings, teammate: boo
         bias = math.radians(sensor.bearing_bias_deg)
         bearing = wrap_angle(sensor.bearing_scale * bearing - bias)
     return Sighting(name, range_m, bearing, range_sigma, bearing_sigma)
+
+
+def without_bearing_bias(frame: Sightings, bias_rad: float) -> Sightings:
+    """The frame with this bias taken from its bearings; a fault stays as it is."""
+    if bias_rad == 0.0:
+        return frame
+    return Sightings(frame.stamp_ns, tuple(_unbiased(s, bias_rad) for s in frame.sightings))
+
+
+def _unbiased(sighting: Sighting, bias_rad: float) -> Sighting:
+    bearing = sighting.bearing_rad
+    if bearing is None or sighting_fault(sighting):
+        return sighting
+    return msgspec.structs.replace(sighting, bearing_rad=wrap_angle(bearing - bias_rad))
 
 
 def sighting_fault(sighting: Sighting) -> str:

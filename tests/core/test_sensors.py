@@ -1,15 +1,17 @@
 import math
 
+import msgspec
 import pytest
 
 from cpcbl_team.config import OdometrySettings, SensorSettings
-from cpcbl_team.inputs import Odometry, Sighting
+from cpcbl_team.inputs import Odometry, Sighting, Sightings
 from cpcbl_team.sensors import (
     corrected_odometry,
     corrected_sighting,
     repeated_share,
     sighting_fault,
     sighting_sigmas,
+    without_bearing_bias,
 )
 
 SENSOR = SensorSettings(range_share=0.05, range_floor_m=0.0, bearing_sigma_deg=5.0)
@@ -136,6 +138,21 @@ def test_faulty_readings_stay_faulty() -> None:
         (Sighting("a", 0.05, 0.1), "range_not_positive"),
     ):
         assert sighting_fault(corrected_sighting(sighting, sensor, False)) == fault
+
+
+def test_a_bias_is_taken_from_all_bearings_that_are_good() -> None:
+    good = (Sighting("a", 1.0, 0.3, 0.1, 0.2), Sighting("b", None, -3.1), Sighting("c", 1.0))
+    faulty = (Sighting("d", 1.0, NAN), Sighting("e", 1.0, math.inf), Sighting("f", 1.0, 3.2))
+    found = without_bearing_bias(Sightings(7, good + faulty), 0.1)
+    turned = Sighting("a", 1.0, 0.3 - 0.1, 0.1, 0.2), Sighting("b", None, math.tau - 3.2)
+    assert found.stamp_ns == 7
+    assert [s.bearing_rad for s in found.sightings[:2]] == pytest.approx(
+        [s.bearing_rad for s in turned]
+    )
+    assert msgspec.structs.replace(found.sightings[0], bearing_rad=0.3) == good[0]
+    assert found.sightings[2] == good[2]
+    for after, before in zip(found.sightings[3:], faulty, strict=True):
+        assert after is before
 
 
 def test_what_is_read_again_soon_counts_for_less() -> None:

@@ -23,9 +23,10 @@ from core_helpers import (
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cpcbl_team.config import SensorSettings, Variant
+from cpcbl_team.config import LocalizerSettings, SensorSettings, Variant
 from cpcbl_team.inputs import Belief, Fix, Input, Odometry, Position, Sightings, Told
 from cpcbl_team.localizer import Localizer
+from cpcbl_team.self_calibration import Learned
 from cpcbl_team.state import State
 from cpcbl_team.timeline import HORIZON_NS, Timeline
 
@@ -126,6 +127,24 @@ def test_a_long_run_with_delays_gives_the_same_bits(seed: int) -> None:
     arrivals = [time_of(i) + rng.uniform(0.0, delay[type(i)]) * MS for i in inputs]
     late = after(robot, [inputs[i] for i in np.argsort(arrivals)])
     assert same(late.state, by_hand(robot, inputs))
+
+
+def test_a_robot_that_learns_gives_the_same_bits_in_any_order() -> None:
+    """What it learns from an update depends on those before; late ones are put in their place."""
+    robot = localizer(
+        field=MIXED,
+        rules=LocalizerSettings(self_calibration=True),
+        sensor=SensorSettings(correlation_s=0.3),
+    )
+    inputs, delay = history(12.0), {Sightings: 300, Fix: 900, Belief: 500}
+    expected = by_hand(robot, inputs)
+    assert all(a != b for a, b in zip(expected.memory.learned, Learned(), strict=True))
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        arrivals = [time_of(i) + rng.uniform(0.0, delay.get(type(i), 50)) * MS for i in inputs]
+        late = after(robot, [inputs[i] for i in np.argsort(arrivals)])
+        assert same(late.state, expected)
+        assert repr(late.state.memory.learned) == repr(expected.memory.learned)
 
 
 @pytest.mark.parametrize("late_by_ms", [1, 300, 1000])
