@@ -17,7 +17,10 @@ class Tick(NamedTuple):
 
 
 class Located(NamedTuple):
-    """The filter's belief at a time. With `frame`: at the time of that frame, for fixes."""
+    """The filter's belief at a time. With `frame`: at the time of that frame, for fixes.
+
+    Its bearings are without the bias that the robot has learned, as in the belief.
+    """
 
     stamp_ns: int
     estimate: Estimate

@@ -7,6 +7,8 @@ from cpcbl_agents.agent import Anything, Located, Tick
 from cpcbl_team.config import Field, LocalizationSettings
 from cpcbl_team.inputs import Belief, Fix, Input, Odometry, Position, Sightings, Told
 from cpcbl_team.localizer import Localizer
+from cpcbl_team.self_calibration import Learned
+from cpcbl_team.sensors import without_bearing_bias
 from cpcbl_team.state import State
 from cpcbl_team.timeline import Timeline
 
@@ -29,6 +31,7 @@ class FilterAgent:
         self.counts: Counter[str] = Counter()
         self._known = frozenset(field.landmarks) | frozenset(field.walls) | teammates
         self._moves = settings.odometry.moves
+        self._learns = settings.localizer.self_calibration
         self._waiting: deque[Sightings] = deque()
         self._located_ns = start_ns
         self._odometry: Odometry | None = None
@@ -43,6 +46,11 @@ class FilterAgent:
     def all_counts(self) -> Counter[str]:
         """What was refused here, what was used and gated by the localizer."""
         return self.counts + Counter(self.timeline.state.memory.counts)
+
+    @property
+    def learned(self) -> Learned | None:
+        """What the robot has learned of its odometry and bearings; None where it does not learn."""
+        return self.timeline.state.memory.learned if self._learns else None
 
     def handle(self, message: Anything, now_ns: int) -> Sequence[Anything]:
         match message:
@@ -96,5 +104,7 @@ class FilterAgent:
         if o is not None and state.stamp_ns - o.stamp_ns < PATIENCE_NS:
             seconds = (o.stamp_ns - o.from_ns) * 1e-9
             speed, turn_rate = o.distance_m / seconds, o.turn_rad / seconds
+        if frame is not None and self._learns:
+            frame = without_bearing_bias(frame, state.memory.learned.bearing_bias_rad)
         stamp_ns = state.stamp_ns if frame is None else frame.stamp_ns
         return Located(stamp_ns, state.estimate, state.memory.lost, speed, turn_rate, frame)

@@ -10,11 +10,18 @@ from cpcbl_agents.agent import Located, Tick
 from cpcbl_agents.driving import COMMAND_NS, MOST_TURN_RAD_S, REACHED_M, Pilot, steer
 from cpcbl_agents.filtering import PATIENCE_NS
 from cpcbl_agents.robot import Robot
-from cpcbl_team.config import CollaborationSettings, OdometrySettings, SensorSettings, Team
+from cpcbl_team.config import (
+    CollaborationSettings,
+    LocalizerSettings,
+    OdometrySettings,
+    SensorSettings,
+    Team,
+)
 from cpcbl_team.estimate import ZERO3, Covariance3, Estimate
 from cpcbl_team.geometry import Pose2
 from cpcbl_team.geometry import step as stepped
 from cpcbl_team.inputs import Belief, Fix, Odometry, Position, Sighting, Sightings
+from cpcbl_team.self_calibration import Learned
 from cpcbl_transport.messages import Drive, Message
 
 OAK = Sighting("oak", 4.05, 0.02)
@@ -268,6 +275,23 @@ def test_a_late_frames_fixes_are_of_its_own_time() -> None:
     (fix,) = fixes(subject.handle(frame(500 * MS, "mate"), SECOND))
     assert fix.stamp_ns == 500 * MS
     assert (fix.x_m, fix.y_m) == pytest.approx((2.03, 0.0), abs=0.02)
+
+
+@pytest.mark.parametrize("learns", [True, False])
+def test_fixes_are_without_the_bias_that_the_robot_has_learned(learns: bool) -> None:
+    """Bearings are 0.1 rad too large: the mate is 2 m ahead all the same."""
+    rules = LocalizerSettings(self_calibration=learns)
+    subject = robot(with_robot(TEAM, "me", localizer=rules))
+    state = subject.filter.timeline.state
+    known = Learned(bearing_bias_rad=0.1)
+    subject.filter.timeline.state = state._replace(memory=state.memory._replace(learned=known))
+    for piece in pieces(0.5, 0.0, 0.0):
+        subject.handle(piece, piece.stamp_ns)
+        subject.handle(Tick(), piece.stamp_ns)
+    (fix,) = fixes(subject.handle(saw(400 * MS, Sighting("mate", 2.0, 0.1)), 500 * MS))
+    bearing = 0.0 if learns else 0.1
+    expected = 2.0 * math.cos(bearing), 2.0 * math.sin(bearing)
+    assert (fix.x_m, fix.y_m) == pytest.approx(expected, abs=1e-9)
 
 
 def test_a_robot_that_stands_waits_for_no_odometry() -> None:
