@@ -190,6 +190,7 @@ class Node:
     def _status(self, now_ns: int) -> Status:
         located = self._robot.collaboration.located
         assert located is not None
+        learned = self._robot.filter.learned
         return Status(
             self._name,
             self._incarnation,
@@ -203,6 +204,7 @@ class Node:
             self.sent["bytes"],
             self.received["messages"],
             self.received["bytes"],
+            None if learned is None else learned[:3],
         )
 
 

@@ -1,7 +1,8 @@
 """Listens to what robots say of themselves, and turns it into a report against the truth."""
 
+import math
 import threading
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 
 import msgspec
 import numpy as np
@@ -10,6 +11,14 @@ from cpcbl_team.metrics import Floats, Samples, Score, Trajectory, compared, sco
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus
 from cpcbl_transport.messages import Status, Track, Truth, Truths, decode
+
+
+class LearnedReport(msgspec.Struct, frozen=True, kw_only=True):
+    """What self-calibration has found at the end, beyond the team file: its keys, its signs."""
+
+    distance_scale: float
+    turn_scale: float
+    bearing_bias_deg: float
 
 
 class RobotReport(Score, frozen=True, kw_only=True):
@@ -25,6 +34,8 @@ class RobotReport(Score, frozen=True, kw_only=True):
     messages_received: int
     bytes_received: int
     counts: dict[str, int]
+    learned: LearnedReport | None = None
+    """None where self-calibration is off."""
 
 
 class MeanScore(msgspec.Struct, frozen=True, kw_only=True):
@@ -165,6 +176,7 @@ class Recorder:
                 messages_received=sum(s.messages_received for s in statuses),
                 bytes_received=sum(s.bytes_received for s in statuses),
                 counts=_added(statuses),
+                learned=_learned(statuses),
             )
         return Report(robots=robots, team=_team(robots))
 
@@ -195,6 +207,15 @@ def _added(statuses: list[Status]) -> dict[str, int]:
         for reason, n in status.counts.items():
             total[reason] = total.get(reason, 0) + n
     return dict(sorted(total.items()))
+
+
+def _learned(statuses: Sequence[Status]) -> LearnedReport | None:
+    if not statuses or statuses[-1].learned is None:
+        return None
+    distance, turn, bias = statuses[-1].learned
+    return LearnedReport(
+        distance_scale=distance, turn_scale=turn, bearing_bias_deg=math.degrees(bias)
+    )
 
 
 def mean_score(scores: Iterable[Score]) -> MeanScore:

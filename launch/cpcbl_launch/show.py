@@ -14,7 +14,7 @@ from rich.text import Text
 
 from cpcbl_launch.calibration.robots import Calibration, decimals
 from cpcbl_launch.calibration.statistics import Estimate
-from cpcbl_launch.recorder import MeanScore, Recorder, Report
+from cpcbl_launch.recorder import LearnedReport, MeanScore, Recorder, Report
 from cpcbl_launch.supervisor import Supervisor
 from cpcbl_team.collaboration import LOWEST_TIER
 from cpcbl_team.metrics import Score
@@ -211,8 +211,17 @@ def _remarks(report: Report) -> Iterator[str]:
             yield f"robot {name} bumped into a landmark {r.bumps} times"
         if r.lost_at_end:
             yield f"robot {name} is lost: {r.lost_at_end}"
+    for name, r in report.robots.items():
+        if r.learned is not None:
+            yield f"robot {name} learned: {_corrections(r.learned)}"
     for name, n in report.restarts.items():
         yield f"{name} was restarted {n} times"
+
+
+def _corrections(found: LearnedReport) -> str:
+    """What is done to readings: `distance × 0.98, turn × 0.96, bearings -0.6°`."""
+    distance, turn, turned = found.distance_scale, found.turn_scale, -found.bearing_bias_deg
+    return f"distance × {distance:.2f}, turn × {turn:.2f}, bearings {turned:+z.1f}°"
 
 
 def _number(value: float | None, digits: int = 3) -> str:

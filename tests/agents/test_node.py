@@ -14,6 +14,7 @@ from bus_helpers import (
     saw,
     standing,
     team_of,
+    with_robot,
 )
 from hypothesis import given
 from hypothesis import strategies as st
@@ -21,9 +22,10 @@ from hypothesis import strategies as st
 from cpcbl_agents.node import INBOX, Node
 from cpcbl_agents.robot import Robot
 from cpcbl_team.collaboration import LOWEST_TIER, tier_of
-from cpcbl_team.config import Team
+from cpcbl_team.config import LocalizerSettings, Team
 from cpcbl_team.estimate import ZERO3, Estimate
 from cpcbl_team.inputs import Belief, Fix, Odometry, Position, Sighting, Sightings
+from cpcbl_team.self_calibration import Learned
 from cpcbl_team.timeline import HORIZON_NS
 from cpcbl_transport import topics
 from cpcbl_transport.bus import MemoryBus, MemoryHub, Publisher, matches
@@ -546,3 +548,14 @@ def test_arrivals_wake_the_robots_own_loop() -> None:
     assert woken == [True]
     node.step(100 * MS)
     assert not node.waiting
+
+
+def test_the_status_of_a_robot_that_learns_says_what() -> None:
+    learning = LocalizerSettings(self_calibration=True)
+    stand = Stand(with_robot(two_robots(), "me", localizer=learning))
+    for robot in stand.robots.values():
+        timeline = robot.filter.timeline
+        memory = timeline.state.memory._replace(learned=Learned(0.98, 0.96, 0.01))
+        timeline.state = timeline.state._replace(memory=memory)
+    assert stand.status("me").learned == (0.98, 0.96, 0.01)
+    assert stand.status("mate").learned is None

@@ -1,6 +1,8 @@
 """A team on a log, and its evaluation."""
 
 import math
+import re
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
@@ -8,11 +10,20 @@ import msgspec
 import numpy as np
 import pytest
 from log_helpers import EPOCH_MS, LANDMARKS, STARTS, STEP_MS, log_team, write_log
+from rich.console import Console
 
 from cpcbl_agents.sources.mrclam import LogError
 from cpcbl_launch.evaluation import Choice, chosen, evaluate_log
 from cpcbl_launch.logs import LoggedTeam, blinded, on_log
-from cpcbl_team.config import RobotSettings, Start
+from cpcbl_launch.recorder import LearnedReport, Report
+from cpcbl_launch.show import print_report
+from cpcbl_team.config import (
+    LocalizerSettings,
+    OdometrySettings,
+    RobotSettings,
+    SensorSettings,
+    Start,
+)
 
 MILLIMETRE = 1e-3
 TURNING_MATE_M = 0.02  # a teammate that stops is believed to drive on until its next belief
@@ -192,6 +203,54 @@ def test_what_one_robot_sends_another_receives(tmp_path: Path) -> None:
     assert worse["messages_received"] > 20
     assert worse["messages_received"] == pytest.approx(better["messages_sent"], abs=10)
     assert better["bytes_sent"] > 50 * better["messages_sent"]
+
+
+def wrong_about_wheels(on: LoggedTeam, *learners: str) -> LoggedTeam:
+    """The team believes in 5 % more of way and turn than there is; some of its robots learn."""
+    replace = msgspec.structs.replace
+    robots = {
+        name: replace(
+            robot,
+            odometry=OdometrySettings(distance_scale=1.05, turn_scale=1.05),
+            sensor=SensorSettings(range_share=0.005, bearing_sigma_deg=0.5),
+            localizer=LocalizerSettings(self_calibration=name in learners),
+        )
+        for name, robot in on.team.robots.items()
+    }
+    return on._replace(team=replace(on.team, robots=robots))
+
+
+def printed(evaluation: Report) -> list[str]:
+    """The lines of the report for people."""
+    paper = StringIO()
+    print_report(evaluation, Console(file=paper, width=80))
+    return paper.getvalue().splitlines()
+
+
+def test_what_robots_have_learned_is_in_the_report(tmp_path: Path) -> None:
+    on = wrong_about_wheels(logged(tmp_path, seconds=30.0), "1")
+    evaluation = evaluate_log(on)
+    learned = {name: robot.learned for name, robot in evaluation.robots.items()}
+    found = learned["1"]
+    assert learned == {"1": found, "2": None}
+    assert found is not None
+    assert (found.distance_scale, found.turn_scale) == pytest.approx((1 / 1.05, 1 / 1.05), abs=0.01)
+    assert found.bearing_bias_deg == pytest.approx(0.0, abs=0.3)
+    figures = msgspec.json.decode(msgspec.json.encode(evaluation))["robots"]
+    assert figures["1"]["learned"] == msgspec.structs.asdict(found)
+    assert figures["2"]["learned"] is None
+    (line,) = [row for row in printed(evaluation) if "learned" in row]
+    assert re.fullmatch(
+        r"robot 1 learned: distance × 0\.9\d, turn × 0\.9\d, bearings [+-]0\.\d°", line
+    )
+
+
+def test_the_remark_says_what_is_done_to_readings(tmp_path: Path) -> None:
+    evaluation = evaluate_log(logged(tmp_path, seconds=1.0))
+    found = LearnedReport(distance_scale=0.976, turn_scale=0.96, bearing_bias_deg=0.62)
+    robots = {"1": msgspec.structs.replace(evaluation.robots["1"], learned=found)}
+    said = "robot 1 learned: distance × 0.98, turn × 0.96, bearings -0.6°"
+    assert said in printed(msgspec.structs.replace(evaluation, robots=robots))
 
 
 def test_an_evaluation_can_stop_early(tmp_path: Path) -> None:

@@ -36,7 +36,8 @@ FIX = Fix("r2", "r1", NOW, 1.0, 2.0, (0.04, 0.01, 0.09), (0.01, 0.0, 0.01), 3.0)
 ODOMETRY = Odometry(NOW - SECOND, NOW, 0.5, 0.1)
 SIGHTINGS = Sightings(NOW, (Sighting("oak", 2.0, 0.1), Sighting("elm", None, -0.5, None, 0.02)))
 POSITION = Position(NOW, 1.0, 2.0, (0.0004, 0.0, 0.0009))
-STATUS = Status("r1", "a", NOW, 0.1, 0.02, 3, "", {"odometry": 7}, 1, 20, 2, 40)
+LEARNED = (0.98, 0.96, -0.01)
+STATUS = Status("r1", "a", NOW, 0.1, 0.02, 3, "", {"odometry": 7}, 1, 20, 2, 40, LEARNED)
 TRACK = Track("r1", NOW, 1.0, 2.0, 0.5, COVARIANCE, 3)
 DRIVE = Drive("r1", NOW, 0.5, 0.1)
 TRUTHS = Truths(NOW, (Truth("r1", 1.0, 2.0, 0.5, 1), Truth("r2", 3.0, 4.0, -0.5)))
@@ -73,6 +74,7 @@ MESSAGES: dict[type[Any], st.SearchStrategy[Message]] = {
         st.text(),
         st.dictionaries(st.text(), COUNTS, max_size=4),
         *[COUNTS] * 4,
+        st.tuples(FLOATS, FLOATS, FLOATS) | st.none(),
     ),
     Track: st.builds(
         Track,
@@ -132,8 +134,9 @@ def test_an_old_reader_skips_fields_that_a_newer_program_added(valid: Message) -
     [
         (BELIEF, {"speed_m_s": 0.0, "turn_rate_rad_s": 0.0}),
         (TRACK, {"lost": ""}),
+        (STATUS, {"learned": None}),
     ],
-    ids=["Belief", "Track"],
+    ids=["Belief", "Track", "Status"],
 )
 def test_a_new_reader_fills_in_what_an_older_program_left_out(
     newer: Message, added: dict[str, Any]

@@ -36,6 +36,8 @@ class Status(msgspec.Struct, frozen=True, array_like=True, tag="status"):
     bytes_sent: int
     messages_received: int
     bytes_received: int
+    learned: tuple[float, float, float] | None = None
+    """Self-calibration: distance scale, turn scale, bearing bias (rad); None where it is off."""
 
 
 class Track(msgspec.Struct, frozen=True, array_like=True, tag="track"):
