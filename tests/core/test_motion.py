@@ -1,5 +1,6 @@
 import math
 
+import msgspec
 import numpy as np
 import pytest
 from core_helpers import (
@@ -89,6 +90,22 @@ def test_a_heading_error_leads_sideways_in_proportion_to_the_way() -> None:
     for _ in range(60):
         estimate = move(estimate, 0.05, 0.0, SILENT)
     assert estimate.covariance == pytest.approx((0.0, 0.0, 9.0 * 0.01, 0.0, 3.0 * 0.01, 0.01))
+
+
+def test_a_turn_on_the_spot_widens_the_position_along_the_heading() -> None:
+    slipping = msgspec.structs.replace(SILENT, distance_sigma_m_per_sqrt_rad=0.03)
+    whole = cut = Estimate(Pose2(1.0, 2.0, 0.0), ZERO3)
+    for turn in (2.0, -2.0):
+        c = move(whole, 0.0, turn, slipping).covariance
+        ahead, across = 0.5 * turn, 0.5 * turn + 0.5 * math.pi
+        along = c.position().along
+        assert along(math.cos(ahead), math.sin(ahead)) == pytest.approx(0.03**2 * 2.0)
+        assert along(math.cos(across), math.sin(across)) == pytest.approx(0.0, abs=1e-15)
+        assert (c.xh, c.yh, c.hh) == (0.0, 0.0, 0.0)
+    for _ in range(20):
+        cut = move(cut, 0.0, 0.1, slipping)
+    assert 2.0 * cut.position_sigma_m**2 == pytest.approx(0.03**2 * 2.0)
+    assert move(whole, 0.0, 2.0, SILENT).covariance == ZERO3
 
 
 def test_white_noise_grows_with_the_way_however_it_is_cut() -> None:
