@@ -103,6 +103,15 @@ def test_a_way_aside_of_the_heading_is_a_bias_of_bearings_as_worked_by_hand() ->
     assert found.distance_scale == pytest.approx(1.0, abs=1e-3)
 
 
+@pytest.mark.parametrize("across_m", [-0.05, 0.05])
+def test_an_error_across_the_way_does_not_lengthen_it(across_m: float) -> None:
+    """It would on average: there is one at both ends of each way."""
+    now = anchor(Pose2(0.8, across_m, 0.0), Pose2(0.8, 0.0, 0.0))
+    found, _ = learned(Learned(), BEGIN, now, NOISE)
+    assert found.distance_scale == pytest.approx(1.0, abs=1e-12)
+    assert found.bearing_bias_rad * across_m > 0.0
+
+
 def test_backwards_is_no_turn_about() -> None:
     now = anchor(Pose2(-0.95, 0.0, 0.0), Pose2(-1.0, 0.0, 0.0))
     found, _ = learned(Learned(), BEGIN, now, NOISE)
