@@ -252,9 +252,7 @@ def calibrate(
     output: Annotated[Path, typer.Option(help="Team file to write.")] = Path("calibrated.toml"),
     margin: Annotated[
         float,
-        typer.Option(
-            min=0.0, help="Share of each bias that may differ on another day: added to the noise."
-        ),
+        typer.Option(min=0.0, help="Share by which noise is written larger: days differ."),
     ] = 0.3,
     picture: Annotated[
         Optional[Path],
