@@ -11,7 +11,7 @@ from cpcbl_launch.field import FieldNode, SimulatedField
 from cpcbl_launch.logs import LoggedTeam
 from cpcbl_launch.recorder import Recorder, Report
 from cpcbl_team.config import Team
-from cpcbl_transport.bus import MemoryHub
+from cpcbl_transport.bus import Bus, MemoryHub
 
 Progress = Callable[[float], None]
 
@@ -64,12 +64,34 @@ def evaluate_log(
     )
 
 
-def simulate(team: Team, seed: int, duration_s: float) -> tuple[Report, Recorder]:
-    """A simulated team, field and robots in one process."""
+class Referee(Protocol):
+    """Watches a simulated run and says when it is over."""
+
+    @property
+    def over(self) -> bool: ...
+
+    def attach(self, bus: Bus) -> None: ...
+
+
+def simulate(
+    team: Team,
+    seed: int,
+    duration_s: float,
+    truth: Team | None = None,
+    referee: Referee | None = None,
+) -> tuple[Report, Recorder]:
+    """A simulated team, field and robots in one process.
+
+    `truth` is the team as it really is, where that is not what its robots believe; a `referee` may
+    end the run before its time.
+    """
     hub, end_ns = MemoryHub(), int(duration_s * 1e9)
     recorder = Recorder(hub.session())
-    field = FieldNode(SimulatedField(team, seed, 0), hub.session())
-    run_nodes([field, *_robots(team, hub, 0)], 0, end_ns)
+    if referee is not None:
+        referee.attach(hub.session())
+    field = FieldNode(SimulatedField(truth or team, seed, 0), hub.session())
+    over = (lambda: False) if referee is None else (lambda: referee.over)
+    run_nodes([field, *_robots(team, hub, 0)], 0, end_ns, over=over)
     variants = {name: robot.localizer.variant for name, robot in team.robots.items()}
     return recorder.report(variants, recorder.simulated_truth()), recorder
 
@@ -94,11 +116,15 @@ class Stepped(Protocol):
 
 
 def run_nodes(
-    nodes: Sequence[Stepped], start_ns: int, end_ns: int, progress: Progress | None = None
+    nodes: Sequence[Stepped],
+    start_ns: int,
+    end_ns: int,
+    progress: Progress | None = None,
+    over: Callable[[], bool] = lambda: False,
 ) -> None:
     """Steps nodes in the order of their times; what one says the others hear at once."""
     now_ns, shown = start_ns, 0.0
-    while now_ns < end_ns:
+    while now_ns < end_ns and not over():
         now_ns = max(now_ns, min(end_ns, *(node.next_ns for node in nodes)))
         for node in nodes:
             if node.next_ns <= now_ns or node.waiting:
