@@ -29,7 +29,7 @@ from cpcbl_launch.experiments.results import (
 from cpcbl_launch.experiments.runs import Case
 from cpcbl_team.config import RobotSettings, Start, Team
 
-DURATION_S = 40.0
+DURATION_S = 20.0
 SIZES = (2, 5, 10, 20)
 OFFSETS_M = (0.0, 0.1, 0.2)
 CLAIMED_SIGMA_M = 0.1
