@@ -146,9 +146,9 @@ def outcome(results: Results) -> Outcome:
 
 def tables(result: Outcome) -> Iterable[RenderableType]:
     shown = table(
-        f"{DURATION_S:g} s, {result.seeds} seeds; RMSE of those that move (m), in 3 σ, bytes sent",
+        f"robots that move: position RMSE, {DURATION_S:g} s, {result.seeds} seeds",
         ("", "help", "merging"),
-        ("off m", "RMSE", "sighted", "in 3 σ", "blind", "in 3 σ", "B/s a robot"),
+        ("off m", "all m", "sighted m", "in 3 σ", "blind m", "in 3 σ", "B/s"),
     )
     last = None
     for row in result.figures["rows"]:
@@ -169,10 +169,8 @@ def tables(result: Outcome) -> Iterable[RenderableType]:
         )
         last = size
     yield shown
-    yield (
-        f"off: how wrong observers are, who claim a σ of {CLAIMED_SIGMA_M:g} m;"
-        " blind: see no landmark"
-    )
+    yield f"off: how wrong the observers are; they claim a σ of {CLAIMED_SIGMA_M:g} m"
+    yield "blind: sees teammates but no landmark; B/s: help that a robot sent, mean over the team"
 
 
 def draw(result: Outcome, path: Path) -> None:

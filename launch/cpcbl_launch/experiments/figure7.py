@@ -34,6 +34,10 @@ CONFIGURATIONS = {
     "E": "active",
     "F": "both",
 }
+EXPLAINED = (
+    "mean ± σ of the position error, mean heading error; 98.9 % in 3 σ and NEES 2 are due\n"
+    "bump, rest, fail: bumps into landmarks, restarts, runs that failed"
+)
 ABOUT = 0.2  # "about" is within so much of it
 
 
@@ -82,7 +86,7 @@ def tables(result: Outcome) -> Iterable[RenderableType]:
         f"navigator, {result.loops} loops, {result.seeds} runs each",
         {f"{c} {name}": result.figures[c] for c, name in CONFIGURATIONS.items()},
     )
-    yield "mean ± σ of the position error, all samples; a bump restarts the run"
+    yield EXPLAINED
     yield from pattern_lines(result)
 
 
@@ -90,7 +94,7 @@ def accuracy_table(title: str, rows: Mapping[str, Accuracy]) -> RenderableType:
     shown = table(
         title,
         ("",),
-        ("mean m", "± σ m", "max m", "deg", "in 3 σ", "NEES", "bumps", "restarts", "failed"),
+        ("mean m", "± σ m", "max m", "deg", "in 3 σ", "NEES", "bump", "rest", "fail"),
     )
     for name, a in rows.items():
         shown.add_row(

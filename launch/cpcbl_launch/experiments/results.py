@@ -81,7 +81,13 @@ class Accuracy(msgspec.Struct, frozen=True, kw_only=True):
 
 def accuracy(runs: Sequence[Run], robots: Sequence[str] | None = None) -> Accuracy:
     """Pools the runs; `robots`: only these of those that were scored."""
-    good = [e for r in runs if r.finished for n, e in r.robots.items() if not robots or n in robots]
+    good = [
+        errors
+        for r in runs
+        if r.finished
+        for name, errors in r.robots.items()
+        if robots is None or name in robots
+    ]
     offset = np.concatenate([e.offset for e in good]) if good else np.empty((0, 3))
     nees = [e.nees for e in good if e.nees is not None]
     squares = np.concatenate(nees) if nees else np.empty(0)

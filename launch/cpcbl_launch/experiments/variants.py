@@ -10,7 +10,7 @@ from pathlib import Path
 from rich.console import RenderableType
 
 from cpcbl_launch.experiments import cost
-from cpcbl_launch.experiments.figure7 import accuracy_table, team_case
+from cpcbl_launch.experiments.figure7 import EXPLAINED, accuracy_table, team_case
 from cpcbl_launch.experiments.results import (
     Experiment,
     Outcome,
@@ -48,11 +48,12 @@ def tables(result: Outcome) -> Iterable[RenderableType]:
     yield accuracy_table(
         f"navigator, {result.loops} loops, {result.seeds} runs each", result.figures
     )
+    yield EXPLAINED
     costs = table("a cycle, timed on this machine", ("variant",), ("µs", "of joint"))
     for variant, c in result.cost.items():
         costs.add_row(variant, f"{c.us_per_cycle:.0f}", f"{c.ratio_to_joint:.2f} x")
     yield costs
-    yield "a cycle: the odometry since the last frame and the frame, landmarks only; timing varies"
+    yield "a cycle: odometry since the last frame, then the frame (landmarks only); timing varies"
 
 
 def draw(result: Outcome, path: Path) -> None:
