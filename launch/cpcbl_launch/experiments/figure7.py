@@ -35,7 +35,7 @@ CONFIGURATIONS = {
     "F": "both",
 }
 EXPLAINED = (
-    "mean ± σ of the position error, mean heading error; 98.9 % in 3 σ and NEES 2 are due\n"
+    "position error: mean ± σ, max; deg: mean heading error; due: 98.9 % in 3 σ, NEES 2\n"
     "bump, rest, fail: bumps into landmarks, restarts, runs that failed"
 )
 ABOUT = 0.2  # "about" is within so much of it

@@ -23,6 +23,7 @@ from cpcbl_launch.experiments.results import (
     Results,
     Spread,
     new_outcome,
+    pattern_lines,
     spread,
     table,
 )
@@ -156,6 +157,7 @@ def tables(result: Outcome) -> Iterable[RenderableType]:
     yield shown
     yield "* above the paper's figure"
     yield f"{best} (weights of position and heading): best of {_swept(result)} pairs tried"
+    yield from pattern_lines(result)
     for how, count in result.figures["failed"].items():
         if count or result.figures["restarts"][how]:
             restarts, bumps = result.figures["restarts"][how], result.figures["bumps"][how]
