@@ -35,7 +35,7 @@ CONFIGURATIONS = {
     "F": "both",
 }
 EXPLAINED = (
-    "position error: mean ± σ, max; deg: mean heading error; due: 98.9 % in 3 σ, NEES 2\n"
+    "position: mean ± σ, max; heading: mean; due: 98.9 % in 3 σ, NEES 2\n"
     "bump, rest, fail: bumps into landmarks, restarts, runs that failed"
 )
 ABOUT = 0.2  # "about" is within so much of it

@@ -49,11 +49,11 @@ def tables(result: Outcome) -> Iterable[RenderableType]:
         f"navigator, {result.loops} loops, {result.seeds} runs each", result.figures
     )
     yield EXPLAINED
-    costs = table("a cycle, timed on this machine", ("variant",), ("µs", "of joint"))
+    costs = table("cost of a cycle", ("variant",), ("µs", "of joint"))
     for variant, c in result.cost.items():
         costs.add_row(variant, f"{c.us_per_cycle:.0f}", f"{c.ratio_to_joint:.2f} x")
     yield costs
-    yield "a cycle: odometry since the last frame, then the frame (landmarks only); timing varies"
+    yield "a cycle: the odometry since the last frame, then the frame; landmarks only"
 
 
 def draw(result: Outcome, path: Path) -> None:
