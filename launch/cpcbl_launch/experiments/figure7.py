@@ -5,6 +5,7 @@ The navigator has 5 % of range and 5 degrees, and odometry of inflated noise; th
 split covariance intersection. The navigator steers by its own estimate.
 """
 
+import math
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
@@ -69,16 +70,17 @@ def pattern(figures: Mapping[str, Accuracy]) -> dict[str, bool]:
     heading = {c: f.heading_mean_deg for c, f in figures.items()}
     inside = [figures[c].inside_3_sigma for c in "CDEF"]
 
-    def ratio(of: Mapping[str, float | None], a: str, b: str) -> float:
-        return float("nan") if of[a] is None or of[b] is None else of[a] / of[b]  # type: ignore[operator]
-
     return {
-        "D about C (mean position error, 20 %)": abs(ratio(mean, "D", "C") - 1.0) <= ABOUT,
-        "F about E (mean position error, 20 %)": abs(ratio(mean, "F", "E") - 1.0) <= ABOUT,
-        "E at most 0.4 x C (mean position error)": ratio(mean, "E", "C") <= 0.4,
-        "heading of E better than of C": ratio(heading, "E", "C") < 1.0,
+        "D about C (mean position error, 20 %)": abs(_ratio(mean["D"], mean["C"]) - 1.0) <= ABOUT,
+        "F about E (mean position error, 20 %)": abs(_ratio(mean["F"], mean["E"]) - 1.0) <= ABOUT,
+        "E at most 0.4 x C (mean position error)": _ratio(mean["E"], mean["C"]) <= 0.4,
+        "heading of E better than of C": _ratio(heading["E"], heading["C"]) < 1.0,
         "C to F: at least 97 % inside 3 σ": all(i is not None and i >= 0.97 for i in inside),
     }
+
+
+def _ratio(a: float | None, b: float | None) -> float:
+    return math.nan if a is None or b is None else a / b
 
 
 def tables(result: Outcome) -> Iterable[RenderableType]:

@@ -12,7 +12,6 @@ import itertools
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
-import msgspec
 import numpy as np
 from rich.console import RenderableType
 
@@ -28,6 +27,7 @@ from cpcbl_launch.experiments.results import (
     table,
 )
 from cpcbl_launch.experiments.runs import Case, Run
+from cpcbl_team.config import Weights
 from cpcbl_team.metrics import Floats
 
 WHEELS_TURN_SCALE = 1.035  # true turn / reported turn; the robot believes 1
@@ -48,17 +48,14 @@ def cases() -> Mapping[Key, Case]:
     """Every configuration with each variant, and with each pair of weights."""
     merging: dict[str, dict[str, object]] = {v: {"variant": v} for v in PROBABILISTIC}
     for position, heading in itertools.product(POSITION_WEIGHTS, HEADING_WEIGHTS):
-        weights = {"weights": {"position": position, "heading": heading}}
-        merging[f"weighted {position:g} {heading:g}"] = {"variant": "weighted", **weights}
+        weights = Weights(position=position, heading=heading)
+        merging[f"weighted {position:g} {heading:g}"] = {"variant": "weighted", "weights": weights}
     return {(how, c): _case(c, keys) for how, keys in merging.items() for c in "ABC"}
 
 
 def _case(configuration: str, localizer: Mapping[str, object]) -> Case:
     team = circuit(["runner"], beacons=configuration == "C")
     keys = {**localizer, "bearing_for_position": configuration != "A"}
-    if "weights" in keys:
-        weights = team.robots["runner"].localizer.weights
-        keys["weights"] = msgspec.structs.replace(weights, **dict(keys["weights"]))  # type: ignore[call-overload]
     team = with_keys(team, "runner", localizer=keys)
     truth = with_keys(team, "runner", odometry={"turn_scale": WHEELS_TURN_SCALE})
     return loops(team, "runner", truth)
