@@ -156,6 +156,22 @@ def test_observers_stand_where_they_do_not_believe_to_stand() -> None:
         assert off == pytest.approx(0.2 if name.startswith("observer") else 0.0)
 
 
+def test_a_deaf_observer_stays_wrong_and_one_that_listens_does_not() -> None:
+    cases = directions.cases([2])
+    errors = {}
+    for direction in ("deaf", "both-ways"):
+        case = cases[2, direction, "split-ci", 0.2]._replace(scored=("navigator0", "observer0"))
+        errors[direction] = run(case, 2).robots["observer0"].offset[-1]
+    assert np.hypot(*errors["deaf"][:2]) == pytest.approx(0.2, abs=0.01)
+    assert np.hypot(*errors["both-ways"][:2]) < 0.1
+
+
+@pytest.mark.parametrize("sizes", [[], [1], [21], [5, 0]])
+def test_team_sizes_are_checked(sizes: list[int]) -> None:
+    with pytest.raises(ValueError, match="--robots: team sizes from 2 to 20"):
+        directions.of_sizes(sizes)
+
+
 def test_what_is_wrong_is_one_line(tmp_path: Path) -> None:
     taken = tmp_path / "taken"
     taken.write_text("")

@@ -58,12 +58,17 @@ def circular_vs_oval(
 
 @experiment_app.command("one-way-vs-both")
 def one_way_vs_both(
-    seeds: Seeds = 3, jobs: Jobs = None, output: Output = Path(), as_json: AsJson = False
+    seeds: Seeds = 3,
+    jobs: Jobs = None,
+    output: Output = Path(),
+    as_json: AsJson = False,
+    robots: Annotated[str, typer.Option(help="Sizes of the teams.")] = "2,5,10,20",
 ) -> None:
     """Accuracy against bytes in teams of 2 to 20, with observers that are wrong."""
-    from cpcbl_launch.experiments.directions import EXPERIMENT
+    from cpcbl_launch.experiments.directions import of_sizes
 
-    conduct(EXPERIMENT, seeds, jobs, output, as_json)
+    sizes = [int(s) if s.strip().isdecimal() else 0 for s in robots.split(",")]
+    conduct(of_sizes(sizes), seeds, jobs, output, as_json)
 
 
 def conduct(

@@ -4,18 +4,22 @@ Teams of 2 to 20 on a rectangle round the field. One robot in five (at least one
 stationary, blind to landmarks, with good eyes. It says that its position has a sigma of 0.1 m and
 is wrong by 0, 1 or 2 sigma without knowing it, each in another direction. The others see poorly;
 every second of them (scouts) sees teammates, but no landmarks. All by `joint`.
+
+Observers take help too, and are soon corrected by those they help. In teams of two there is also a
+`deaf` observer: it uses no teammate, its teammate does not see it, and so it stays wrong.
 """
 
 import itertools
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 
 import msgspec
 from rich.console import RenderableType
 
 from cpcbl_launch.evaluation import Choice, chosen
-from cpcbl_launch.experiments.circuit import circuit
+from cpcbl_launch.experiments.circuit import circuit, with_keys
 from cpcbl_launch.experiments.results import (
     Experiment,
     Outcome,
@@ -24,6 +28,7 @@ from cpcbl_launch.experiments.results import (
     new_outcome,
     number,
     percent,
+    spread,
     table,
 )
 from cpcbl_launch.experiments.runs import Case
@@ -39,9 +44,10 @@ POSTS = ((4.5, 5.0, -90.0), (4.5, 0.0, 90.0), (0.0, 2.5, 0.0), (9.0, 2.5, 180.0)
 Key = tuple[int, str, str, float]  # size, direction (or "alone"), fusion, offset of the observers
 
 
-def cases() -> Mapping[Key, Case]:
+def cases(sizes: Sequence[int] = SIZES) -> Mapping[Key, Case]:
+    """Teams of these sizes, alone and with every way of help."""
     every: dict[Key, Case] = {}
-    for size in SIZES:
+    for size in sizes:
         team = crowd(size)
         mobile = tuple(n for n, r in team.robots.items() if r.odometry.moves)
         every[size, "alone", "", 0.0] = Case(
@@ -51,6 +57,21 @@ def cases() -> Mapping[Key, Case]:
             helping = chosen(team, Choice(direction=direction, fusion=fusion))
             truth = displaced(helping, offset)
             every[size, direction, fusion, offset] = Case(helping, mobile, DURATION_S, 0, truth)
+        if size == 2:
+            every |= _deaf(team, mobile)
+    return every
+
+
+def _deaf(pair: Team, mobile: tuple[str, ...]) -> dict[Key, Case]:
+    """The robot that moves takes every fix, whatever its tier; nothing goes the other way."""
+    (navigator,), (observer,) = mobile, (n for n in pair.robots if n not in mobile)
+    every: dict[Key, Case] = {}
+    for fusion, offset in itertools.product(("split-ci", "naive"), OFFSETS_M):
+        team = chosen(pair, Choice(direction="both-ways", fusion=fusion))
+        team = with_keys(team, navigator, sensor={"sees_robots": False})
+        team = with_keys(team, observer, collaboration={"passive": False})
+        truth = displaced(team, offset)
+        every[2, "deaf", fusion, offset] = Case(team, mobile, DURATION_S, 0, truth)
     return every
 
 
@@ -131,6 +152,7 @@ def outcome(results: Results) -> Outcome:
                 "fusion": fusion,
                 "observer_off_m": offset,
                 "position_rmse_m": all_of.position_rmse_m,
+                "rmse_of_runs_m": spread([accuracy([r]).position_rmse_m or 0.0 for r in runs]),
                 "navigators_rmse_m": sighted.position_rmse_m,
                 "scouts_rmse_m": blind.position_rmse_m,
                 "inside_3_sigma": all_of.inside_3_sigma,
@@ -139,7 +161,8 @@ def outcome(results: Results) -> Outcome:
                 "bytes_per_s": sum(r.bytes_per_s for r in runs) / len(runs),
             }
         )
-    teams = {str(size): Case(crowd(size), (), DURATION_S) for size in SIZES}
+    sizes = dict.fromkeys(size for size, *_ in results)
+    teams = {str(size): Case(crowd(size), (), DURATION_S) for size in sizes}
     figures = {"duration_s": DURATION_S, "observer_sigma_m": CLAIMED_SIGMA_M, "rows": rows}
     return new_outcome("one-way-vs-both", results, teams, figures=figures)
 
@@ -169,14 +192,23 @@ def tables(result: Outcome) -> Iterable[RenderableType]:
         )
         last = size
     yield shown
+    if any(row["direction"] == "deaf" for row in result.figures["rows"]):
+        yield "deaf: nobody corrects the observer; elsewhere those that it helps do"
     yield f"off: how wrong the observers are; they claim a σ of {CLAIMED_SIGMA_M:g} m"
-    yield "blind: sees teammates but no landmark; B/s: help that a robot sent, mean over the team"
+    yield "blind: sees teammates but no landmark; B/s: help sent, mean over the robots"
 
 
 def draw(result: Outcome, path: Path) -> None:
     from cpcbl_launch.experiments.pictures import draw_directions
 
     draw_directions(result, path)
+
+
+def of_sizes(sizes: Sequence[int]) -> Experiment:
+    """The experiment with teams of these sizes only. Raises ValueError."""
+    if not sizes or any(not 2 <= size <= 20 for size in sizes):
+        raise ValueError("--robots: team sizes from 2 to 20, such as 2,5")
+    return EXPERIMENT._replace(cases=partial(cases, sizes))
 
 
 EXPERIMENT = Experiment("one-way-vs-both", cases, outcome, tables, draw)

@@ -95,7 +95,7 @@ def draw_variants(result: Outcome, path: Path) -> None:
 
 def draw_directions(result: Outcome, path: Path) -> None:
     """RMSE against bytes, a panel for each error of the observers; a line through team sizes."""
-    rows: list[dict[str, Any]] = result.figures["rows"]
+    rows = [row for row in result.figures["rows"] if row["direction"] != "deaf"]
     offsets = sorted({row["observer_off_m"] for row in rows})
     ways = list(dict.fromkeys((r["direction"], r["fusion"]) for r in rows if r["fusion"]))
     figure, panels = plt.subplots(
