@@ -26,7 +26,7 @@ class Pilot:
         self, robot: str, waypoints: Sequence[tuple[float, float]], speed_m_s: float
     ) -> None:
         self._robot, self._waypoints, self._speed = robot, tuple(waypoints), speed_m_s
-        self._goal: int | None = None
+        self._reached = 0
         self._commanded_ns = 0
 
     def command(self, located: Located) -> list[Drive]:
@@ -34,18 +34,17 @@ class Pilot:
             return []
         self._commanded_ns = located.stamp_ns
         if located.lost:  # looks around
-            return [Drive(self._robot, located.stamp_ns, 0.0, 0.5)]
+            return [Drive(self._robot, located.stamp_ns, 0.0, 0.5, self._reached)]
         pose = located.estimate.pose
-        goal = self._waypoints[self._goal_from(pose)]
-        return [Drive(self._robot, located.stamp_ns, *steer(pose, goal, self._speed))]
+        command = steer(pose, self._goal_from(pose), self._speed)
+        return [Drive(self._robot, located.stamp_ns, *command, self._reached)]
 
-    def _goal_from(self, pose: Pose2) -> int:
-        def distance(i: int) -> float:
-            x, y = self._waypoints[i]
-            return math.hypot(x - pose.x, y - pose.y)
-
-        if self._goal is None:
-            self._goal = 0
-        if distance(self._goal) < REACHED_M:
-            self._goal = (self._goal + 1) % len(self._waypoints)
+    def _goal_from(self, pose: Pose2) -> tuple[float, float]:
+        x, y = self._goal
+        if math.hypot(x - pose.x, y - pose.y) < REACHED_M:
+            self._reached += 1
         return self._goal
+
+    @property
+    def _goal(self) -> tuple[float, float]:
+        return self._waypoints[self._reached % len(self._waypoints)]

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Optional
 
 import typer
 
+from cpcbl_launch.experiments.cli import experiment_app
+
 if TYPE_CHECKING:
     from cpcbl_team.config import Team
 
@@ -20,6 +22,7 @@ app = typer.Typer(
 )
 evaluate_app = typer.Typer(help="Real logs in one process: deterministic and fast.")
 app.add_typer(evaluate_app, name="evaluate")
+app.add_typer(experiment_app, name="experiment")
 
 TeamFile = Annotated[Path, typer.Option("--team", help="Team file (TOML).")]
 Blind = Annotated[str, typer.Option(help="Robots that shall not see landmarks, e.g. 3,4,5.")]
@@ -252,9 +255,7 @@ def calibrate(
     output: Annotated[Path, typer.Option(help="Team file to write.")] = Path("calibrated.toml"),
     margin: Annotated[
         float,
-        typer.Option(
-            min=0.0, help="Share of each bias that may differ on another day: added to the noise."
-        ),
+        typer.Option(min=0.0, help="Share by which noise is written larger: days differ."),
     ] = 0.3,
     picture: Annotated[
         Optional[Path],

@@ -16,7 +16,7 @@ from cpcbl_launch.recording import Recording
 from cpcbl_launch.yardstick import inputs_of, scored, yardsticks
 from cpcbl_team.config import Team
 from cpcbl_team.metrics import Trajectory
-from cpcbl_transport.bus import MemoryHub
+from cpcbl_transport.bus import Bus, MemoryHub
 
 Progress = Callable[[float], None]
 
@@ -97,15 +97,36 @@ def _run_log(logged: LoggedTeam, progress: Progress) -> tuple[Report, Recorder]:
     ), recorder
 
 
+class Referee(Protocol):
+    """Watches a simulated run and says when it is over."""
+
+    @property
+    def over(self) -> bool: ...
+
+    def attach(self, bus: Bus) -> None: ...
+
+
 def simulate(
-    team: Team, seed: int, duration_s: float, record: Path | None = None
+    team: Team,
+    seed: int,
+    duration_s: float,
+    truth: Team | None = None,
+    referee: Referee | None = None,
+    record: Path | None = None,
 ) -> tuple[Report, Recorder]:
-    """A simulated team, field and robots in one process; `record`: the file to record it into."""
+    """A simulated team, field and robots in one process.
+
+    `truth` is the team as it really is, where that is not what its robots believe; a `referee` may
+    end the run before its time; `record` is the file to record it into.
+    """
     hub, end_ns = MemoryHub(), int(duration_s * 1e9)
     recorder = Recorder(hub.session())
+    if referee is not None:
+        referee.attach(hub.session())
+    over = (lambda: False) if referee is None else (lambda: referee.over)
     with Recording(record, team, hub.session()) if record is not None else nullcontext():
-        field = FieldNode(SimulatedField(team, seed, 0), hub.session())
-        run_nodes([field, *_robots(team, hub, 0)], 0, end_ns)
+        field = FieldNode(SimulatedField(truth or team, seed, 0), hub.session())
+        run_nodes([field, *_robots(team, hub, 0)], 0, end_ns, over=over)
     variants = {name: robot.localizer.variant for name, robot in team.robots.items()}
     return recorder.report(variants, recorder.simulated_truth()), recorder
 
@@ -130,11 +151,15 @@ class Stepped(Protocol):
 
 
 def run_nodes(
-    nodes: Sequence[Stepped], start_ns: int, end_ns: int, progress: Progress | None = None
+    nodes: Sequence[Stepped],
+    start_ns: int,
+    end_ns: int,
+    progress: Progress | None = None,
+    over: Callable[[], bool] = lambda: False,
 ) -> None:
     """Steps nodes in the order of their times; what one says the others hear at once."""
     now_ns, shown = start_ns, 0.0
-    while now_ns < end_ns:
+    while now_ns < end_ns and not over():
         now_ns = max(now_ns, min(end_ns, *(node.next_ns for node in nodes)))
         for node in nodes:
             if node.next_ns <= now_ns or node.waiting:

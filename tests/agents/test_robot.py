@@ -377,6 +377,16 @@ def test_a_pilot_goes_for_the_next_waypoint_as_soon_as_it_is_near_one() -> None:
     assert aside.turn_rate_rad_s == MOST_TURN_RAD_S
 
 
+def test_a_pilot_says_how_many_waypoints_it_has_reached_over_all_loops() -> None:
+    pilot = Pilot("me", [(1.0, 0.0), (0.0, 0.0)], 0.5)
+    there_and_back = [0.5, 1.0, 0.5, 0.0, 0.5, 1.0]
+    said = [
+        pilot.command(located(Pose2(x, 0.0, 0.0), (i + 1) * COMMAND_NS))[0].reached
+        for i, x in enumerate(there_and_back)
+    ]
+    assert said == [0, 1, 1, 2, 2, 3]
+
+
 def test_a_lost_pilot_looks_around_on_the_spot() -> None:
     pilot = Pilot("me", [(5.0, 0.0)], 0.5)
     (command,) = pilot.command(located(HERE, COMMAND_NS, lost="for a test"))

@@ -129,7 +129,7 @@ SIGMAS = 5.0
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("recorded") / "trio.mcap"
-    simulate(TEAM, 1, SECONDS, path)
+    simulate(TEAM, 1, SECONDS, record=path)
     return path
 
 
@@ -273,7 +273,7 @@ def test_mrclam_logs_are_read_with_all_their_faults(tmp_path: Path) -> None:
 
 def without_truth(path: Path) -> None:
     robots = {"r1": msgspec.structs.replace(WORSE, source="external")}
-    simulate(msgspec.structs.replace(TEAM, robots=robots), 1, 1.0, path)
+    simulate(msgspec.structs.replace(TEAM, robots=robots), 1, 1.0, record=path)
 
 
 def no_recording(path: Path) -> None:
@@ -281,7 +281,7 @@ def no_recording(path: Path) -> None:
 
 
 def cut_short(path: Path) -> None:
-    simulate(TEAM, 1, 2.0, path)
+    simulate(TEAM, 1, 2.0, record=path)
     path.write_bytes(path.read_bytes()[:-300])
 
 
@@ -309,7 +309,7 @@ def test_a_log_that_cannot_be_used_is_one_line(
 def test_a_team_that_sees_and_does_nothing_is_one_line(tmp_path: Path) -> None:
     path = tmp_path / "blind.mcap"
     blind = Team(name="blind", robots={"c": STANDING})
-    simulate(blind, 1, 20.0, path)
+    simulate(blind, 1, 20.0, record=path)
     with pytest.raises(ValueError, match="nothing to calibrate") as raised:
         calibrated(read_logs([path]), ["blind.mcap"])
     assert "\n" not in str(raised.value)

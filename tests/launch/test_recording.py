@@ -72,7 +72,7 @@ def test_nothing_is_written_after_the_end(tmp_path: Path) -> None:
 def test_recording_does_not_change_a_run(tmp_path: Path) -> None:
     team, path = load_team(builtin("demo")), tmp_path / "demo.mcap"
     alone, _ = simulate(team, 3, 4.0)
-    watched, recorder = simulate(team, 3, 4.0, path)
+    watched, recorder = simulate(team, 3, 4.0, record=path)
     assert watched == alone
     recorded = read_recording(path)
     assert recorded.team == team

@@ -60,6 +60,8 @@ class Drive(msgspec.Struct, frozen=True, array_like=True, tag="drive"):
     stamp_ns: int
     speed_m_s: float
     turn_rate_rad_s: float
+    reached: int = 0
+    """Waypoints that the robot believes to have reached so far."""
 
 
 class Truth(msgspec.Struct, frozen=True, array_like=True):

@@ -11,7 +11,6 @@ from cpcbl_launch.calibration.statistics import GROSS, LEAST_ROWS, Integers
 from cpcbl_team.metrics import Floats
 
 LAGS_S = (0.05, 0.1, 0.2, 0.3, 0.5, 0.8, 1.2, 2.0, 3.0, 5.0, 8.0, 12.0, 20.0)
-TIMES_S = np.geomspace(0.02, 200.0, 400)
 
 
 class Pairs(NamedTuple):
@@ -65,15 +64,18 @@ def autocorrelation(pairs: Pairs) -> tuple[Floats, Floats, Floats]:
 
 
 def correlation_s(pairs: Pairs) -> float:
-    """The time constant of exp(-lag / time) through the autocorrelation; 0: white; NaN: no pairs.
+    """The time for which errors stay alike: the integral of the autocorrelation, up to its first
+    zero. 0: white; NaN: no pairs.
 
-    Short lags count most: there a correlation is known best.
+    It is the integral that says what a mean of many readings is worth; for errors that fade as
+    exp(-lag / time) it is that time.
     """
     lag, ratio, n = autocorrelation(pairs)
     if len(lag) == 0:
         return math.nan
-    decay = np.exp(-lag / TIMES_S[:, None])
-    weight = 1.0 / (1.0 - np.clip(ratio, 0.0, 0.98) ** 2 + 1.0 / np.sqrt(n))
-    costs = (weight * (ratio - decay) ** 2).sum(axis=1)
-    best = float(TIMES_S[int(np.argmin(costs))])
-    return best if math.exp(-lag[0] / best) > 0.05 else 0.0
+    significant = ratio > 2.0 / np.sqrt(n)
+    end = len(lag) if significant.all() else int(np.argmin(significant))
+    if end == 0:
+        return 0.0
+    between = 0.5 * (ratio[1:end] + ratio[: end - 1]) * np.diff(lag[:end])
+    return float(lag[0] * ratio[0] + between.sum())

@@ -12,6 +12,7 @@ import numpy as np
 
 from cpcbl_launch.calibration.robot_log import LONGEST_GAP_S, RobotLog
 from cpcbl_launch.calibration.statistics import (
+    GROSS,
     LEAST_ROWS,
     Estimate,
     Fit,
@@ -237,17 +238,25 @@ def odometry_noise(windows: Sequence[OdometryRows], now: Corrections) -> Floats:
     ways = np.concatenate([w.true_way - now.ways(w) for w in windows])
     turns = np.concatenate([w.true_turn - now.turns(w) for w in windows])
     one = np.ones_like(path)
-    counts = np.concatenate(
-        [np.full(len(w.path), len(windows[0].path) / max(len(w.path), 1)) for w in windows]
-    )
+    sizes = [len(w.path) for w in windows]
+    counts = np.concatenate([np.full(n, sizes[0] / max(n, 1)) for n in sizes])
     moving = (path > LEAST_MOTION) | (turned > LEAST_MOTION)
-    of_ways = variance_parts(
-        ways[moving], np.stack([along, turned_along, one], axis=1)[moving], counts[moving]
-    )
-    of_turns = variance_parts(
-        turns[moving], np.stack([turned, path, one], axis=1)[moving], counts[moving]
+    of_ways, of_turns = (
+        _covering(errors[moving], np.stack(columns, axis=1)[moving], counts[moving])
+        for errors, columns in ((ways, (along, turned_along, one)), (turns, (turned, path, one)))
     )
     return np.concatenate([of_ways, of_turns], axis=1)[:, [0, 1, 3, 4, 2, 5]]
+
+
+def _covering(errors: Floats, columns: Floats, counts: Floats) -> Floats:
+    """Variance parts, grown where windows of one length (they share a count) err by more: drift
+    that is alike for seconds grows faster than the root of the way, and tails are heavy."""
+    parts = variance_parts(errors, columns, counts)
+    if np.isnan(parts).any():
+        return parts
+    unit = errors**2 / np.maximum(columns @ parts[0], 1e-12)
+    worst = max(float(np.minimum(unit[counts == c], GROSS**2).mean()) for c in np.unique(counts))
+    return parts * max(1.0, worst)
 
 
 def calibrate_odometry(logs: Sequence[RobotLog]) -> dict[str, Estimate]:

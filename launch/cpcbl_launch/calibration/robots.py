@@ -229,8 +229,8 @@ def team_text(
     """The base team file with a type for each calibrated robot. Raises TeamFileError, ValueError.
 
     A robot's former type goes into its new one; keys of its own that were calibrated are taken out.
-    `margin`: the share of each bias that may be another one on another day; it is added to the
-    sensor's noise.
+    `margin`: all sigmas are written larger by this share, and this share of each correction of the
+    sensor, which may be another one on another day, is added to its noise.
     """
     parse_team(base, name)
     document = tomlkit.parse(base)
@@ -255,8 +255,8 @@ def _add_type(document: TOMLDocument, robot: str, found: RobotCalibration, margi
     for key, value in former.items():
         if key not in ("odometry", "sensor"):
             table.add(key, value)
-    sensor_values = _with_margin(found.sensor, margin)
-    for part, values in (("odometry", found.odometry), ("sensor", sensor_values)):
+    written = _with_margin(found, margin)
+    for part, values in (("odometry", written.odometry), ("sensor", written.sensor)):
         kept = {k: v for k, v in former.get(part, {}).items() if k not in values}
         if kept or values:
             table.add(part, _part(part, kept, values))
@@ -270,16 +270,28 @@ def _add_type(document: TOMLDocument, robot: str, found: RobotCalibration, margi
     own["type"] = kind
 
 
-def _with_margin(found: Mapping[str, Estimate], margin: float) -> dict[str, Estimate]:
-    values = dict(found)
-    for noise, bias in (
-        ("range_floor_m", "range_bias_m"),
-        ("bearing_sigma_deg", "bearing_bias_deg"),
-    ):
-        if noise in values and bias in values:
-            doubt = math.hypot(values[noise].value, margin * values[bias].value)
-            values[noise] = Estimate(doubt, values[noise].standard_error)
-    return values
+def _with_margin(found: RobotCalibration, margin: float) -> RobotCalibration:
+    """With noise as of another day: all sigmas grown, and a share of each correction in them."""
+    odometry_, sensor_ = dict(found.odometry), dict(found.sensor)
+    for values, names in ((odometry_, odometry.NOISE), (sensor_, sensor.NOISE)):
+        for name in names:
+            if name in values:
+                sigma, error = values[name].value, values[name].standard_error
+                doubt = margin * abs(_corrected_by(values, name))
+                values[name] = Estimate(math.hypot((1.0 + margin) * sigma, doubt), error)
+    return msgspec.structs.replace(found, odometry=odometry_, sensor=sensor_)
+
+
+def _corrected_by(values: Mapping[str, Estimate], noise: str) -> float:
+    """How far a reading is corrected, in the unit of this noise."""
+    match noise:
+        case "range_share" if "range_scale" in values:
+            return 1.0 - values["range_scale"].value
+        case "range_floor_m" if "range_bias_m" in values:
+            return values["range_bias_m"].value
+        case "bearing_sigma_deg" if "bearing_bias_deg" in values:
+            return values["bearing_bias_deg"].value
+    return 0.0
 
 
 def _part(part: str, kept: Mapping[str, Any], values: Mapping[str, Estimate]) -> Table:

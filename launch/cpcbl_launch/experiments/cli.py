@@ -1,0 +1,121 @@
+"""`cpcbl-team experiment ...`."""
+
+import importlib.util
+import os
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Optional
+
+import typer
+
+if TYPE_CHECKING:
+    from cpcbl_launch.experiments.results import Experiment
+
+experiment_app = typer.Typer(
+    help="The paper's experiments on a simulated field: a table, NAME.json and NAME.png.",
+    no_args_is_help=True,
+)
+
+Seeds = Annotated[int, typer.Option(min=1, help="Runs of each case, each with its own noise.")]
+Jobs = Annotated[
+    Optional[int], typer.Option(min=1, help="Processes at a time; default: all cores.")
+]
+Output = Annotated[Path, typer.Option(help="Folder for NAME.json and NAME.png.")]
+AsJson = Annotated[bool, typer.Option("--json", help="Print the JSON instead of tables.")]
+
+
+@experiment_app.command("table1")
+def table1(
+    seeds: Seeds = 20, jobs: Jobs = None, output: Output = Path(), as_json: AsJson = False
+) -> None:
+    """One robot, odometry alone and landmarks A, B, C, beside table 1 of the paper."""
+    from cpcbl_launch.experiments.table1 import EXPERIMENT
+
+    conduct(EXPERIMENT, seeds, jobs, output, as_json)
+
+
+@experiment_app.command("figure7")
+def figure7(
+    seeds: Seeds = 5, jobs: Jobs = None, output: Output = Path(), as_json: AsJson = False
+) -> None:
+    """A navigator, alone and helped by an observer, A-F, beside figure 7 of the paper."""
+    from cpcbl_launch.experiments.figure7 import EXPERIMENT
+
+    conduct(EXPERIMENT, seeds, jobs, output, as_json)
+
+
+@experiment_app.command("circular-vs-oval")
+def circular_vs_oval(
+    seeds: Seeds = 10, jobs: Jobs = None, output: Output = Path(), as_json: AsJson = False
+) -> None:
+    """All four variants: accuracy, consistency, cost."""
+    from cpcbl_launch.experiments.variants import EXPERIMENT
+
+    conduct(EXPERIMENT, seeds, jobs, output, as_json)
+
+
+@experiment_app.command("one-way-vs-both")
+def one_way_vs_both(
+    seeds: Seeds = 3,
+    jobs: Jobs = None,
+    output: Output = Path(),
+    as_json: AsJson = False,
+    robots: Annotated[str, typer.Option(help="Sizes of the teams.")] = "2,5,10,20",
+) -> None:
+    """Accuracy against bytes in teams of 2 to 20, with observers that are wrong."""
+    from cpcbl_launch.experiments.directions import of_sizes
+
+    sizes = [int(s) if s.strip().isdecimal() else 0 for s in robots.split(",")]
+    conduct(of_sizes(sizes), seeds, jobs, output, as_json)
+
+
+def conduct(
+    experiment: "Experiment", seeds: int, jobs: int | None, output: Path, as_json: bool
+) -> None:
+    """Runs, writes and shows one experiment. Raises ValueError for what the user can mend."""
+    from rich.console import Console
+
+    from cpcbl_launch.experiments.results import encoded
+    from cpcbl_launch.experiments.runs import run_all
+
+    if importlib.util.find_spec("matplotlib") is None:
+        raise ValueError("experiment: pictures need matplotlib: pip install 'cpcbl-team[plot]'")
+    try:
+        output.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ValueError(f"--output {output}: {error.strerror}; name a folder") from error
+    cases = experiment.cases()
+    with _progress(experiment.name, len(cases) * seeds) as done:
+        results = run_all(cases, range(1, seeds + 1), jobs or os.cpu_count() or 1, done)
+    outcome = experiment.outcome(results)
+    text = encoded(outcome)
+    (output / f"{experiment.name}.json").write_bytes(text)
+    experiment.draw(outcome, output / f"{experiment.name}.png")
+    if as_json:
+        sys.stdout.write(text.decode())
+        return
+    console = Console()
+    for shown in experiment.tables(outcome):
+        console.print(shown, highlight=False)
+    console.print(f"written: {output / experiment.name}.json, .png", highlight=False)
+
+
+@contextmanager
+def _progress(title: str, total: int) -> Iterator[Callable[[], None]]:
+    """Runs done of all, on standard error."""
+    from rich.console import Console
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeRemainingColumn,
+    )
+
+    columns = (TextColumn(title), BarColumn(), MofNCompleteColumn(), TextColumn("runs"))
+    console = Console(stderr=True)
+    with Progress(*columns, TimeRemainingColumn(), console=console, transient=True) as progress:
+        task = progress.add_task(title, total=total)
+        yield lambda: progress.advance(task)

@@ -1,0 +1,157 @@
+"""The experiments as pictures. Needs extra `plot`."""
+
+import math
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+
+from cpcbl_launch.experiments.results import Accuracy, Outcome
+from cpcbl_team.config import RobotSettings, Team
+
+mpl.use("Agg")
+
+from matplotlib import pyplot as plt
+from matplotlib.patches import Wedge
+
+DPI = 90
+
+
+def draw_table1(result: Outcome, path: Path) -> None:
+    """Field, then a panel a quantity: the paper's as bars, ours as points with 10-90 %."""
+    figure = plt.figure(figsize=(13, 7), layout="constrained")
+    panels = figure.subplot_mosaic("FFabc\nFFdef", width_ratios=(1, 1, 1.2, 1.2, 1.2))
+    _field(panels["F"], result.teams["joint C"])
+    for i, quantity in enumerate(result.figures["quantities"]):
+        axes = panels["abcdef"[i]]
+        theirs = [result.paper[c][i] for c in "ABC"]
+        axes.bar(range(3), theirs, color="0.85", label="paper")
+        for k, (how, rows) in enumerate(result.figures["rows"].items()):
+            for x, c in enumerate("ABC"):
+                s = rows[c][i]
+                if s is not None:
+                    bars = [[s.median - s.low], [s.high - s.median]]
+                    at = x - 0.24 + 0.16 * k
+                    label = how if x == 0 else None
+                    axes.errorbar(
+                        at, s.median, bars, fmt="o", ms=4, capsize=2, color=f"C{k}", label=label
+                    )
+        axes.set(title=quantity, xticks=range(3), xticklabels="ABC", ylim=(0, None))
+    figure.legend(*panels["a"].get_legend_handles_labels(), loc="outside lower right", ncols=5)
+    _save(figure, path)
+
+
+def draw_figure7(result: Outcome, path: Path) -> None:
+    """The field, and as figure 7 of the paper: mean position error, bars of one sigma."""
+    figure, (field, errors) = plt.subplots(
+        1, 2, figsize=(12, 4.4), width_ratios=(3, 2), layout="constrained"
+    )
+    _field(field, result.teams["F"])
+    names = list(result.figures)
+    for x, a in enumerate(result.figures.values()):
+        if a.position_mean_m is not None:
+            errors.errorbar(
+                x, a.position_mean_m, a.position_sigma_m, fmt="o", capsize=5, color="C0"
+            )
+            at, text = (x, a.position_mean_m), f"{a.position_mean_m:.3f}"
+            errors.annotate(text, at, (8, 0), textcoords="offset points", annotation_clip=True)
+    errors.set(xticks=range(len(names)), xticklabels=names, ylabel="position error (m)")
+    errors.set(title="mean, and one σ (A is off the scale where cut)")
+    rest = [_top(a) for c, a in result.figures.items() if c != "A"]
+    errors.set_ylim(0.0, 1.6 * max(rest, default=0.0) or 1.0)
+    errors.set_xlim(-0.6, len(names) - 0.2)
+    errors.grid(True, axis="y", alpha=0.3)
+    _save(figure, path)
+
+
+def draw_variants(result: Outcome, path: Path) -> None:
+    """Accuracy, consistency and cost of the variants."""
+    figure, (errors, inside, cost) = plt.subplots(1, 3, figsize=(12, 3.8), layout="constrained")
+    variants = list(result.cost)
+    for k, how in enumerate(("alone", "helped")):
+        for x, variant in enumerate(variants):
+            a = result.figures[f"{variant} {how}"]
+            label, at = how if x == 0 else None, x - 0.1 + 0.2 * k
+            if a.position_mean_m is not None:
+                errors.errorbar(
+                    at, a.position_mean_m, a.position_sigma_m, fmt="o", capsize=4, color=f"C{k}",
+                    label=label,
+                )  # fmt: skip
+            if a.inside_3_sigma is not None:
+                inside.plot(at, 100.0 * a.inside_3_sigma, "o", color=f"C{k}")
+    inside.axhline(98.9, color="0.4", linestyle="--", linewidth=1)
+    cost.bar(range(len(variants)), [c.ratio_to_joint for c in result.cost.values()], color="0.7")
+    errors.set(title="position error (m), mean and one σ", ylim=(0, None))
+    inside.set(title="inside 3 σ (%), 98.9 due", ylim=(None, 100.2))
+    cost.set(title="cost of a cycle, of joint's")
+    for axes in (errors, inside, cost):
+        axes.set(
+            xticks=range(len(variants)), xticklabels=variants, xlim=(-0.5, len(variants) - 0.5)
+        )
+        axes.grid(True, axis="y", alpha=0.3)
+    errors.legend()
+    _save(figure, path)
+
+
+def draw_directions(result: Outcome, path: Path) -> None:
+    """RMSE against bytes, a panel for each error of the observers; a line through team sizes."""
+    rows = [row for row in result.figures["rows"] if row["direction"] != "deaf"]
+    offsets = sorted({row["observer_off_m"] for row in rows})
+    ways = list(dict.fromkeys((r["direction"], r["fusion"]) for r in rows if r["fusion"]))
+    figure, panels = plt.subplots(
+        1, len(offsets), figsize=(12, 4), sharey=True, layout="constrained", squeeze=False
+    )
+    for axes, offset in zip(panels[0], offsets, strict=True):
+        for k, way in enumerate(ways):
+            line = [
+                r
+                for r in rows
+                if (r["direction"], r["fusion"], r["observer_off_m"]) == (*way, offset)
+            ]
+            bytes_, rmse = [r["bytes_per_s"] for r in line], [r["position_rmse_m"] for r in line]
+            style = "o-" if way[0] == "one-way" else "s--"
+            axes.plot(bytes_, rmse, style, ms=4, color=f"C{k}", label=" ".join(way))
+            for r in line:
+                at = r["bytes_per_s"], r["position_rmse_m"]
+                axes.annotate(str(r["robots"]), at, (3, 3), textcoords="offset points", fontsize=7)
+        axes.set(title=f"observers off by {offset:g} m", xlabel="bytes/s a robot", xscale="symlog")
+        axes.set_yscale("log")
+        axes.grid(True, which="both", alpha=0.3)
+    panels[0][0].set(ylabel="position RMSE (m); numbers: robots")
+    handles, labels = panels[0][0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=len(ways))
+    _save(figure, path)
+
+
+def _field(axes: Any, team: Team) -> None:
+    """Landmarks, circuit, and what an observer sees."""
+    for mark in team.map.landmarks.values():
+        both = mark.gives == "both"
+        axes.plot(mark.x_m, mark.y_m, "s" if both else "^", color="0.3" if both else "C1")
+    for robot in team.robots.values():
+        _robot(axes, robot)
+    axes.plot([0, 9, 9, 0, 0], [0, 0, 5, 5, 0], color="0.6", linewidth=0.8)
+    axes.set(xlabel="x (m)", ylabel="y (m)", title="the circuit; ■ landmarks, ▲ bearing only")
+    axes.set_aspect("equal")
+
+
+def _robot(axes: Any, robot: RobotSettings) -> None:
+    start = robot.start
+    assert start is not None
+    if robot.waypoints_m:
+        axes.plot(*zip(*robot.waypoints_m, robot.waypoints_m[0], strict=True), "o-", color="C0")
+    half, heading = 0.5 * robot.sensor.field_of_view_deg, start.heading_deg
+    reach = 1.0 if robot.waypoints_m else 4.0
+    centre = (start.x_m, start.y_m)
+    axes.add_patch(Wedge(centre, reach, heading - half, heading + half, color="C2", alpha=0.15))
+    tip = (math.cos(math.radians(heading)), math.sin(math.radians(heading)))
+    axes.quiver(*centre, *tip, color="C2", scale=18)
+
+
+def _top(a: Accuracy) -> float:
+    return (a.position_mean_m or 0.0) + (a.position_sigma_m or 0.0)
+
+
+def _save(figure: Any, path: Path) -> None:
+    figure.savefig(path, dpi=DPI)
+    plt.close(figure)
