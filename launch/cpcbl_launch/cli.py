@@ -116,6 +116,8 @@ def up(
     from cpcbl_launch.show import LiveTable, print_report
     from cpcbl_launch.up import Run, run_team
 
+    if file == Path("mrclam") and data is not None and not file.exists():
+        file = real_logs.builtin_for(data)
     team = _load(file or Path("demo"))
     if picture is not None and importlib.util.find_spec("matplotlib") is None:
         raise ValueError("--picture needs matplotlib: pip install 'cpcbl-team[plot]'")
@@ -196,7 +198,8 @@ def field(
 def evaluate_mrclam(
     data: Annotated[Path, typer.Argument(help="Folder of one data set, e.g. MRCLAM6.")],
     team_file: Annotated[
-        Optional[Path], typer.Option("--team", help="Team file; default: the built-in mrclam.")
+        Optional[Path],
+        typer.Option("--team", help="Team file; default: the built-in mrclam without this log."),
     ] = None,
     blind: Blind = "",
     variant: Annotated[Optional[VariantName], typer.Option(help="For all robots.")] = None,
@@ -225,7 +228,7 @@ def evaluate_mrclam(
     from cpcbl_launch.show import print_report, progress_bar
     from cpcbl_launch.tum import export_folder, export_tum
 
-    team = _load(team_file or Path("mrclam"))
+    team = _load(team_file or real_logs.builtin_for(data))
     choice = Choice(variant, collaboration, fusion, direction)
     logged = real_logs.on_log(chosen(team, choice), data)
     logged = logged._replace(team=real_logs.blinded(logged.team, _names(blind)))
@@ -256,7 +259,7 @@ def calibrate(
     margin: Annotated[
         float,
         typer.Option(min=0.0, help="Share by which noise is written larger: days differ."),
-    ] = 0.3,
+    ] = 0.5,
     picture: Annotated[
         Optional[Path],
         typer.Option(help="Draw residuals into this file (PNG or SVG; extra `plot`)."),

@@ -10,7 +10,7 @@ import msgspec
 from cpcbl_agents.node import Node
 from cpcbl_agents.robot import Robot
 from cpcbl_launch.field import FieldNode, SimulatedField
-from cpcbl_launch.logs import LoggedTeam, shortened
+from cpcbl_launch.logs import LoggedTeam, seen_before, shortened
 from cpcbl_launch.recorder import Recorder, Report
 from cpcbl_launch.recording import Recording
 from cpcbl_launch.yardstick import inputs_of, scored, yardsticks
@@ -93,7 +93,11 @@ def _run_log(logged: LoggedTeam, progress: Progress) -> tuple[Report, Recorder]:
     report = recorder.report(variants, logged.truth)
     duration_s = (end_ns - start_ns) * 1e-9
     return msgspec.structs.replace(
-        report, left_out=logged.left_out, duration_s=duration_s
+        report,
+        calibrated_on=team.calibrated_on,
+        seen_before=seen_before(team, Path(team.data)),
+        left_out=logged.left_out,
+        duration_s=duration_s,
     ), recorder
 
 

@@ -1,6 +1,7 @@
 """A team on a real log: its map, where its robots start, what truth there is."""
 
 import math
+import re
 from collections.abc import Collection
 from pathlib import Path
 from typing import NamedTuple
@@ -9,6 +10,7 @@ import msgspec
 import numpy as np
 
 from cpcbl_agents.sources import mrclam
+from cpcbl_launch.team_file import builtin
 from cpcbl_team.config import Field, Start, Team
 from cpcbl_team.geometry import Pose2, step
 from cpcbl_team.metrics import Floats, truth_at
@@ -24,6 +26,22 @@ class LoggedTeam(NamedTuple):
     left_out: dict[str, str]
     start_ns: int
     end_ns: int
+
+
+def builtin_for(folder: Path) -> Path:
+    """The built-in team file that was not calibrated on this data set (by the name's number)."""
+    without = builtin(f"mrclam-without-{_number(folder.name)}")
+    return without if without.exists() else builtin("mrclam")
+
+
+def seen_before(team: Team, folder: Path) -> bool:
+    """Whether the team's robots were calibrated on this very data set."""
+    return _number(folder.name) in map(_number, team.calibrated_on)
+
+
+def _number(name: str) -> str:
+    found = re.search(r"\d+$", name)
+    return found.group() if found else name
 
 
 def on_log(team: Team, folder: Path) -> LoggedTeam:

@@ -68,6 +68,10 @@ class Report(msgspec.Struct, frozen=True, kw_only=True):
 
     robots: dict[str, RobotReport]
     team: TeamReport
+    calibrated_on: tuple[str, ...] = ()
+    """The logs from which the robots' types were calibrated."""
+    seen_before: bool = False
+    """Whether this log is one of them: figures flatter."""
     left_out: dict[str, str] = {}
     """Robots that could not take part, with the reason."""
     duration_s: float = 0.0

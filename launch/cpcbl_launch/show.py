@@ -204,6 +204,9 @@ def _remarks(report: Report) -> Iterator[str]:
     if report.alone:
         yield "before: RMSE before teammates began to help; the other columns are from then on"
     yield "consistent: 98.9 % in 3 σ, NEES 2; out, B: help sent, its payload bytes"
+    if report.calibrated_on:
+        flattering = ": this log too, the figures flatter" if report.seen_before else ""
+        yield f"robots calibrated on {', '.join(report.calibrated_on)}{flattering}"
     for name, reason in report.left_out.items():
         yield f"left out: robot {name}: {reason}"
     for name, r in report.robots.items():

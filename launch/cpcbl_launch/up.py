@@ -14,6 +14,7 @@ import msgspec
 import numpy as np
 
 from cpcbl_agents.clock import Clock
+from cpcbl_launch.logs import seen_before
 from cpcbl_launch.processes import process_table
 from cpcbl_launch.recorder import Recorder, Report
 from cpcbl_launch.recording import Recording
@@ -143,6 +144,8 @@ def _report(
         }
     return msgspec.structs.replace(
         report,
+        calibrated_on=run.team.calibrated_on,
+        seen_before=seen_before(run.team, Path(run.team.data)),
         left_out=dict(run.left_out),
         duration_s=elapsed_s,
         restarts=restarts,

@@ -342,7 +342,7 @@ source = "external"
 
 
 def test_types_are_added_to_the_base_team_file() -> None:
-    text = team_text(FOUND, BASE)
+    text = team_text(FOUND, BASE, margin=0.0)
     team, before = parse_team(text), parse_team(BASE)
     assert text.startswith("# Calibrated by `cpcbl-team calibrate` from log.")
     assert "# kept" in text
@@ -353,6 +353,29 @@ def test_types_are_added_to_the_base_team_file() -> None:
     assert r1.speed_m_s == 0.3
     assert team.robots["r2"] == before.robots["r2"]
     assert "[types.robot-1" not in text
+
+
+def test_noise_is_written_as_of_another_day() -> None:
+    sensor = {
+        "range_scale": Estimate(0.9, 0.001),
+        "range_share": Estimate(0.02, 0.001),
+        "range_bias_m": Estimate(0.04, 0.001),
+        "range_floor_m": Estimate(0.0, 0.001),
+        "bearing_sigma_deg": Estimate(1.0, 0.1),
+    }
+    found = Calibration(("log",), {"r1": RobotCalibration({}, sensor, range_is_depth=True)})
+    r1 = parse_team(team_text(found, BASE, margin=0.5)).robots["r1"].sensor
+    assert r1.range_is_depth
+    assert r1.range_share == pytest.approx(math.hypot(0.03, 0.05), abs=5e-4)
+    assert r1.range_floor_m == pytest.approx(0.02, abs=5e-4)
+    assert r1.bearing_sigma_deg == pytest.approx(1.5, abs=0.05)
+
+
+def test_a_calibrated_team_file_can_be_calibrated_again() -> None:
+    once = team_text(FOUND, BASE)
+    twice = team_text(FOUND, once)
+    assert parse_team(twice).robots == parse_team(once).robots
+    assert parse_team(twice).calibrated_on == ("log",)
 
 
 def test_a_base_without_the_robots_is_refused() -> None:

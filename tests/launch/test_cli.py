@@ -27,6 +27,7 @@ FIGURES = {
     "messages_sent",
     "bytes_sent",
 }
+PLAIN = "mrclam-uncalibrated"
 PAIR = """
 name = "pair"
 [map.landmarks]
@@ -53,7 +54,7 @@ def test_every_command_explains_itself(command: list[str]) -> None:
 
 
 def test_check_accepts_the_built_in_teams() -> None:
-    for name in ("demo", "mrclam"):
+    for name in ("demo", "mrclam", PLAIN):
         checked = cpcbl_team("check", name)
         assert checked.returncode == 0, checked.stderr
         assert f"team '{name}'" in checked.stdout
@@ -132,9 +133,11 @@ def test_ctrl_c_ends_a_run_with_its_report_and_leaves_no_process(tmp_path: Path)
 
 def test_up_on_a_log_agrees_with_evaluate(tmp_path: Path) -> None:
     write_log(tmp_path, ("1", "2"), seconds=40.0)
-    evaluated = cpcbl_team("evaluate", "mrclam", tmp_path, "--blind", "2", "--json")
+    evaluated = cpcbl_team(
+        "evaluate", "mrclam", tmp_path, "--team", PLAIN, "--blind", "2", "--json"
+    )
     assert evaluated.returncode == 0, evaluated.stderr
-    ran = cpcbl_team("up", "mrclam", "--data", tmp_path, "--blind", "2", "--speed", 5, "--json")
+    ran = cpcbl_team("up", PLAIN, "--data", tmp_path, "--blind", "2", "--speed", 5, "--json")
     assert ran.returncode == 0, ran.stderr
     alone, together = json.loads(evaluated.stdout), json.loads(ran.stdout)
     assert together["left_out"].keys() == {"3", "4", "5"}

@@ -158,7 +158,9 @@ class Wrong(NamedTuple):
 WRONG = [
     # unknown keys, at each level
     Wrong("unknown table", "[robot.r1]", "robot", "did you mean 'robots'?"),
-    Wrong("unknown key without a like", "zzz = 1", "zzz", "known here: data, defaults, map"),
+    Wrong(
+        "unknown key without a like", "zzz = 1", "zzz", "known here: calibrated_on, data, defaults"
+    ),
     Wrong("unknown in defaults", "[defaults]\nspeed = 1.0", "defaults.speed", "'speed_m_s'"),
     Wrong(
         "unknown in a table of defaults",

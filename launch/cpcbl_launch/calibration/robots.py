@@ -22,7 +22,8 @@ from cpcbl_team.config import Landmark
 from cpcbl_team.inputs import Odometry, Sightings
 from cpcbl_team.metrics import Floats
 
-MARGIN = 0.3
+MARGIN = 0.5
+INTERVAL_S = 0.5  # with correlation_s known, using an object more often tells little
 LEAST = {  # what is written at least: without any noise a filter would believe without bounds
     "odometry.delay_s": 0.0,
     "distance_loss_m_per_rad": 0.0,
@@ -192,11 +193,11 @@ def calibrated_robot(logs: Sequence[RobotLog]) -> RobotCalibration:
 
 def base_text(logs: Sequence[Path], team_file: Path | None) -> tuple[str, str]:
     """The team file to add types to, and what to call it: the given one (or a built-in one by its
-    name), the recorded team, or the built-in mrclam. Raises TeamFileError, LogError.
+    name), the recorded team, or the built-in mrclam-uncalibrated. Raises TeamFileError, LogError.
     """
     if team_file is None and logs[0].suffix == ".mcap":
         return tomlkit.dumps(changed_keys(read_recording(logs[0]).team)), str(logs[0])
-    path = team_file or builtin("mrclam")
+    path = team_file or builtin("mrclam-uncalibrated")
     if not path.exists() and builtin(path.name).exists():
         path = builtin(path.name)
     try:
@@ -249,37 +250,43 @@ def team_text(
 def _add_type(document: TOMLDocument, robot: str, found: RobotCalibration, margin: float) -> None:
     own: Any = document["robots"][robot]
     types: Any = document.setdefault("types", tomlkit.table(is_super_table=True))
-    former = types.get(own.get("type", ""), {})
+    former = dict(types.get(own.get("type", ""), {}))
     kind = f"robot-{robot}" if len(robot) < 26 else robot
     table = tomlkit.table()
+    driving = _with_margin(found.odometry, odometry.NOISE, margin)
+    seeing = _with_margin(found.sensor, sensor.NOISE, margin)
+    rules = dict(former.get("localizer", {}))
+    if seeing:
+        former["sensor"] = {**former.get("sensor", {}), "range_is_depth": found.range_is_depth}
+        rules["object_interval_s"] = INTERVAL_S
+    if driving:
+        rules["self_calibration"] = False
+    if rules:
+        former["localizer"] = rules
     for key, value in former.items():
         if key not in ("odometry", "sensor"):
             table.add(key, value)
-    written = _with_margin(found, margin)
-    for part, values in (("odometry", written.odometry), ("sensor", written.sensor)):
+    for part, values in (("odometry", driving), ("sensor", seeing)):
         kept = {k: v for k, v in former.get(part, {}).items() if k not in values}
         if kept or values:
             table.add(part, _part(part, kept, values))
-        if part == "sensor" and values:
-            table[part].add("range_is_depth", found.range_is_depth)
         for key in values:
             own.get(part, {}).pop(key, None)
-    if found.odometry:
-        table.add("localizer", {"self_calibration": False})
     types[kind] = table
     own["type"] = kind
 
 
-def _with_margin(found: RobotCalibration, margin: float) -> RobotCalibration:
-    """With noise as of another day: all sigmas grown, and a share of each correction in them."""
-    odometry_, sensor_ = dict(found.odometry), dict(found.sensor)
-    for values, names in ((odometry_, odometry.NOISE), (sensor_, sensor.NOISE)):
-        for name in names:
-            if name in values:
-                sigma, error = values[name].value, values[name].standard_error
-                doubt = margin * abs(_corrected_by(values, name))
-                values[name] = Estimate(math.hypot((1.0 + margin) * sigma, doubt), error)
-    return msgspec.structs.replace(found, odometry=odometry_, sensor=sensor_)
+def _with_margin(
+    values: Mapping[str, Estimate], noise: Sequence[str], margin: float
+) -> dict[str, Estimate]:
+    """With noise as of another day: sigmas grown, and a share of each correction in them."""
+    result = dict(values)
+    for name in noise:
+        if name in result:
+            doubt = margin * abs(_corrected_by(values, name))
+            sigma = math.hypot((1.0 + margin) * result[name].value, doubt)
+            result[name] = Estimate(sigma, result[name].standard_error)
+    return result
 
 
 def _corrected_by(values: Mapping[str, Estimate], noise: str) -> float:
