@@ -14,9 +14,10 @@ from rich.console import Console
 
 from cpcbl_agents.sources.mrclam import LogError
 from cpcbl_launch.evaluation import Choice, chosen, evaluate_log
-from cpcbl_launch.logs import LoggedTeam, blinded, on_log
+from cpcbl_launch.logs import LoggedTeam, blinded, builtin_for, on_log, seen_before
 from cpcbl_launch.recorder import LearnedReport, Report
 from cpcbl_launch.show import print_report
+from cpcbl_launch.team_file import builtin, load_team
 from cpcbl_team.config import (
     LocalizerSettings,
     OdometrySettings,
@@ -270,3 +271,12 @@ def test_two_evaluations_give_equal_reports(tmp_path: Path) -> None:
     on = logged(tmp_path, *ALL, seconds=5.0, unknown_barcode=True)
     first, second = (msgspec.json.encode(evaluate_log(on)) for _ in range(2))
     assert first == second
+
+
+@pytest.mark.parametrize("folder", ["MRCLAM2", "MRCLAM_Dataset4", "somewhere/MRCLAM6", "MRCLAM9"])
+def test_a_built_in_team_is_not_judged_on_what_it_was_calibrated_on(folder: str) -> None:
+    number, file = folder[-1], builtin_for(Path(folder))
+    team = load_team(file)
+    assert file.stem == ("mrclam" if number == "9" else f"mrclam-without-{number}")
+    assert not seen_before(team, Path(folder))
+    assert seen_before(load_team(builtin("mrclam")), Path(folder)) == (number != "9")

@@ -3,9 +3,9 @@
 Sensor noise 3 % of range and 2 degrees. Odometry alone is to drift as the paper's did (mean 0.56 m
 and 29.6 degrees over five loops). Two errors do that together: wheels that turn 3.5 % further than
 they report, which the robot does not know (a trailer, uneven wheels), and white noise that grows
-with turning. They were found by trying about a dozen pairs on seeds; white noise alone, scaled until the
-heading drifts so, gives 0.7 m and more. The row `odometry` is dead reckoning along the runs of A, B
-and C, measured like the others; the paper shows the least error of its runs.
+with turning. They were found by trying about a dozen pairs on seeds; white noise alone, scaled
+until the heading drifts so, gives 0.7 m and more. The row `odometry` is dead reckoning along the
+runs of A, B and C, measured like the others; the paper shows the least error of its runs.
 """
 
 import itertools
