@@ -5,11 +5,11 @@ compounding with respect to both. Motion noise is white, so its variance grows w
 """
 
 import math
-from operator import add
+from math import cos, remainder, sin, tau
 
 from cpcbl_team.config import OdometryNoise
-from cpcbl_team.estimate import ZERO3, Covariance3, Estimate, Matrix3
-from cpcbl_team.geometry import Pose2, wrap_angle
+from cpcbl_team.estimate import ZERO3, Covariance3, Estimate, Matrix3, circle_variance, new
+from cpcbl_team.geometry import Pose2
 
 _Entries = tuple[float, float, float, float, float, float]  # of a Covariance3
 
@@ -42,50 +42,49 @@ def _noise_along(
     c: float, s: float, distance: float, turn: float, noise: OdometryNoise
 ) -> _Entries:
     """The noise of an arc whose chord has the direction with cosine `c` and sine `s`."""
-    way = abs(distance)
-    turned = abs(turn)
-    along = (
-        noise.distance_sigma_m_per_sqrt_m**2 * way + noise.distance_sigma_m_per_sqrt_rad**2 * turned
-    )
-    around = (
-        noise.turn_sigma_rad_per_sqrt_rad**2 * turned + noise.turn_sigma_rad_per_sqrt_m**2 * way
-    )
+    way, turned = abs(distance), abs(turn)
+    slip, wobble = noise.distance_sigma_m_per_sqrt_m, noise.distance_sigma_m_per_sqrt_rad
+    along = slip * slip * way + wobble * wobble * turned
+    slip, wobble = noise.turn_sigma_rad_per_sqrt_m, noise.turn_sigma_rad_per_sqrt_rad
+    around = slip * slip * way + wobble * wobble * turned
     lx, ly = -0.5 * distance * s, 0.5 * distance * c  # where a turn error leads
-    return (
-        along * c * c + around * lx * lx,
-        along * c * s + around * lx * ly,
-        along * s * s + around * ly * ly,
-        around * lx,
-        around * ly,
-        around,
-    )
+    ac, ax, ay = along * c, around * lx, around * ly
+    return ac * c + ax * lx, ac * s + ax * ly, along * s * s + ay * ly, ax, ay, around
 
 
-def move(estimate: Estimate, distance: float, turn: float, noise: OdometryNoise) -> Estimate:
-    """The estimate after the wheels report an arc of `distance` metres that turns by `turn`."""
-    pose, covariance, shared = estimate
-    x, y, heading = pose
+def move(
+    estimate: Estimate, distance: float, turn: float, noise: OdometryNoise, as_circle: bool = False
+) -> Estimate:
+    """The estimate after the wheels report an arc of `distance` metres that turns by `turn`.
+
+    `as_circle`: the position's covariance is kept as a circle.
+    """
+    (x, y, heading), covariance, shared = estimate
     direction = heading + 0.5 * turn
-    c, s = math.cos(direction), math.sin(direction)
+    c, s = cos(direction), sin(direction)
     # where a heading error of one radian leads, in metres: the last column of the Jacobian
     lx, ly = -distance * s, distance * c
-    return Estimate(
-        Pose2(x + distance * c, y + distance * s, wrap_angle(heading + turn)),
-        Covariance3(
-            *map(add, _sheared(covariance, lx, ly), _noise_along(c, s, distance, turn, noise))
-        ),
-        shared if shared is ZERO3 else Covariance3(*_sheared(shared, lx, ly)),
-    )
+    pose = new(Pose2, (x + ly, y - lx, remainder(heading + turn, tau)))
+    xx, xy, yy, xh, yh, hh = _sheared(covariance, lx, ly)
+    nxx, nxy, nyy, nxh, nyh, nhh = _noise_along(c, s, distance, turn, noise)
+    xx, xy, yy, xh, yh, hh = xx + nxx, xy + nxy, yy + nyy, xh + nxh, yh + nyh, hh + nhh
+    if as_circle:
+        xx = yy = circle_variance(xx, xy, yy, xh, yh, hh)
+        xy = 0.0
+    if shared is not ZERO3:
+        shared = Covariance3(*_sheared(shared, lx, ly))
+    return new(Estimate, (pose, new(Covariance3, (xx, xy, yy, xh, yh, hh)), shared))
 
 
 def _sheared(p: Covariance3, lx: float, ly: float) -> _Entries:
     """F P F^T for F = [1 0 lx; 0 1 ly; 0 0 1], written out: it runs for every odometry step."""
     xx, xy, yy, xh, yh, hh = p
+    ahx, ahy = xh + lx * hh, yh + ly * hh
     return (
-        xx + lx * (2.0 * xh + lx * hh),
-        xy + lx * yh + ly * xh + lx * ly * hh,
-        yy + ly * (2.0 * yh + ly * hh),
-        xh + lx * hh,
-        yh + ly * hh,
+        xx + lx * (xh + ahx),
+        xy + lx * yh + ly * ahx,
+        yy + ly * (yh + ahy),
+        ahx,
+        ahy,
         hh,
     )

@@ -7,7 +7,7 @@ An ambiguous answer is no answer.
 """
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 
 from cpcbl_team.config import Field, LocalizerSettings
 from cpcbl_team.constraints import Constraint, bearing_heading, range_circle
@@ -56,31 +56,50 @@ def told_evidence(
     return Evidence(now, pose, source, x, y, None, None, 0.0, 0.0, sigma, by_teammate)
 
 
-def remembered(memory: Memory, pieces: Iterable[Evidence]) -> Memory:
-    """The memory with new evidence, without what is too old or too alike."""
-    kept = list(memory.evidence)
-    latest_ns = {e.source: e.stamp_ns for e in kept}
+def remembered(memory: Memory, pieces: Sequence[Evidence]) -> Memory:
+    """The memory with new evidence of one time, without what is too old or too alike."""
+    now = pieces[0].stamp_ns
+    recent = {e.source for e in _recent(memory.evidence, now)}
+    new = []
     for piece in pieces:
-        latest = latest_ns.get(piece.source)
-        if latest is None or piece.stamp_ns - latest >= SPACING_NS:
-            kept.append(piece)
-            latest_ns[piece.source] = piece.stamp_ns
-    if len(kept) == len(memory.evidence):
+        if piece.source not in recent:
+            recent.add(piece.source)
+            new.append(piece)
+    if not new:
         return memory
-    kept = [e for e in kept if kept[-1].stamp_ns - e.stamp_ns <= WINDOW_NS]
-    return memory._replace(evidence=tuple(kept[-MOST_PIECES:]))
+    kept = (*memory.evidence, *new)[-MOST_PIECES:]
+    if now - kept[0].stamp_ns > WINDOW_NS:
+        kept = tuple(e for e in kept if now - e.stamp_ns <= WINDOW_NS)
+    latest = list(_recent(kept, now))
+    return memory._replace(
+        evidence=kept,
+        noted=frozenset(e.source for e in latest),
+        noted_until_ns=latest[-1].stamp_ns + SPACING_NS,
+    )
 
 
-def with_seen(state: State, seen: Iterable[Measured]) -> Memory:
-    """The memory with those of a frame's sightings that are not too alike to what it holds."""
-    now, memory = state.stamp_ns, state.memory
-    recent = set()
-    for e in reversed(memory.evidence):
-        if now - e.stamp_ns >= SPACING_NS:
-            break
-        recent.add(e.source)
+def _recent(evidence: Sequence[Evidence], now_ns: int) -> Iterator[Evidence]:
+    """Of which no more is needed yet, the latest first."""
+    for e in reversed(evidence):
+        if now_ns - e.stamp_ns >= SPACING_NS:
+            return
+        yield e
+
+
+def noted(memory: Memory, now_ns: int) -> frozenset[str]:
+    """The sources of which no more evidence is needed yet."""
+    if now_ns < memory.noted_until_ns:
+        return memory.noted
+    return frozenset(e.source for e in _recent(memory.evidence, now_ns))
+
+
+def with_seen(state: State, seen: Iterable[Measured], pieces: Sequence[Evidence] = ()) -> Memory:
+    """The memory with these pieces and those of a frame's other sightings that are not too alike
+    to what it holds."""
+    recent = noted(state.memory, state.stamp_ns)
     new = [m for m in seen if m.source not in recent and m.usable and m.wall is None]
-    return remembered(memory, [seen_evidence(state, m) for m in new]) if new else memory
+    pieces = [*pieces, *(seen_evidence(state, m) for m in new)]
+    return remembered(state.memory, pieces) if pieces else state.memory
 
 
 def lost_reason(estimate: Estimate, memory: Memory, settings: LocalizerSettings) -> str:
@@ -92,12 +111,10 @@ def lost_reason(estimate: Estimate, memory: Memory, settings: LocalizerSettings)
     heading = math.degrees(estimate.heading_sigma_rad)
     if heading > slack * settings.lost_heading_sigma_deg:
         return f"heading sigma {heading:.0f} deg"
-    window = memory.innovations[-settings.lost_window :]
-    rejected = window.count(False)
-    if len(window) >= settings.lost_window // 2 and (
-        rejected > slack * settings.lost_share * settings.lost_window
-    ):
-        return f"{rejected} of the last {len(window)} innovations rejected"
+    digits, length = memory.innovations.bit_length(), settings.lost_window
+    rejected = digits - memory.innovations.bit_count()
+    if digits > length // 2 and rejected > slack * settings.lost_share * length:
+        return f"{rejected} of the last {digits - 1} innovations rejected"
     return ""
 
 

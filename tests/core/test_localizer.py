@@ -506,7 +506,7 @@ def test_an_outlier_is_rejected_and_counted(variant: Variant) -> None:
     after = robot.cycle(before, Sightings(1, (wrong,)))
     assert after.estimate == before.estimate
     assert after.memory.counts == {"gated": 1}
-    assert after.memory.innovations == (False,)
+    assert after.memory.innovations == 0b10  # one, rejected
     assert (after.memory.position_ns, after.memory.heading_ns) == (None, None)
 
 
