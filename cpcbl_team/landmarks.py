@@ -8,25 +8,27 @@ the two together.
 """
 
 import math
-from collections.abc import Container, Mapping, Sequence
+from collections.abc import Container, Iterable, Mapping, Sequence
 from math import atan2, cos, remainder, sin, sqrt, tau
-from typing import NamedTuple
 
 import msgspec
 
-from cpcbl_team.config import Field, LocalizationSettings
+from cpcbl_team.config import Field, Landmark, LocalizationSettings
 from cpcbl_team.constraints import NEAREST_M
 from cpcbl_team.estimate import (
+    HEADING,
     POSE,
     POSITION,
     SMALLEST_VARIANCE,
     Covariance3,
     Information,
+    Row,
     Scope,
-    new,
 )
+from cpcbl_team.fusion import chi_square
+from cpcbl_team.geometry import new
 from cpcbl_team.inputs import Sighting
-from cpcbl_team.sensors import LARGEST_BEARING_RAD, LARGEST_M, sighting_sigmas
+from cpcbl_team.sensors import LARGEST_BEARING_RAD, LARGEST_M, range_to_expect
 from cpcbl_team.state import Evidence, State
 
 
@@ -41,43 +43,31 @@ class Said(msgspec.Struct, frozen=True, gc=False):
     others: list[Sighting]  # not plain
 
 
-class Landmarks(NamedTuple):
+Places = Mapping[str, tuple[float, float, bool, bool]]  # x, y, by range, by bearing
+
+
+class Landmarks:
     """The plain landmarks of a map, as one robot's sensor and rules use them."""
 
-    places: Mapping[str, tuple[float, float, bool, bool]]  # x, y, gives range, gives bearing
-    settings: LocalizationSettings
-    gates: tuple[float, float]  # chi-square bounds, of one and of two constraints
-    range_share_squared: float
-    range_floor_squared: float
-    bearing_variance: float
-    bearing_sine_squared: float
-    farthest_range_m: float
-
-    @staticmethod
-    def of(field: Field, settings: LocalizationSettings, gates: tuple[float, float]) -> "Landmarks":
-        """None are plain where the rules ask for more than `read` does."""
-        rules, sensor = settings.localizer, settings.sensor
-        plain = not (
-            rules.variant == "weighted"
-            or rules.paper_uncertainty
-            or rules.self_calibration
-            or sensor.correlation_s > 0.0
+    def __init__(
+        self, field: Field, settings: LocalizationSettings, gates: tuple[float, float]
+    ) -> None:
+        """`gates`: chi-square bounds of one and of two constraints. No landmark is plain where the
+        rules ask for more than `read` does."""
+        rules, s = settings.localizer, settings.sensor
+        plain = rules.variant != "weighted" and not (
+            rules.paper_uncertainty or rules.self_calibration or s.correlation_s > 0.0
         )
-        places = {
-            name: (p.x_m, p.y_m, p.gives in ("both", "range"), p.gives in ("both", "bearing"))
-            for name, p in field.landmarks.items()
-            if plain and name not in field.walls
-        }
-        return Landmarks(
-            places,
-            settings,
-            gates,
-            sensor.range_share**2,
-            sensor.range_floor_m**2,
-            sensor.bearing_sigma_rad**2,
-            math.sin(min(sensor.bearing_sigma_rad, 0.5 * math.pi)) ** 2,
-            min(sensor.max_range_for_range_m, LARGEST_M),
-        )
+        marks = field.landmarks if plain else {}
+        self._of_pose = _places(marks, ranges=True, bearings=True)
+        self._of_position = _places(marks, ranges=True, bearings=rules.bearing_for_position)
+        self._of_heading = _places(marks, ranges=False, bearings=True)
+        self._of_nothing = _places(marks, ranges=False, bearings=False)
+        self._gates = gates
+        self._range_model = s.range_share**2, s.range_floor_m**2, s.max_range_for_range_m
+        self._heading_weight = _weight(s.bearing_sigma_rad**2)
+        self._sine_squared = math.sin(min(s.bearing_sigma_rad, 0.5 * math.pi)) ** 2
+        self._bearing_sigma_rad = s.bearing_sigma_rad
 
     def read(
         self,
@@ -91,13 +81,12 @@ class Landmarks(NamedTuple):
 
         All is linearized at the state's estimate. An object that is `resting` is not plain; one
         that is `noted` is no new evidence. A range gives the row (u, v, 0), a bearing the row
-        (m, n, 1): about the heading as it is, about the position as a ray, over the way ahead.
+        (m, n, 1): about the heading as it is, about the position as a ray over the way ahead.
         """
-        places, settings, (gate, gate2), share, floor, narrow, sine2, farthest = self
-        (x, y, h), (xx, xy, yy, xh, yh, hh), _ = state.estimate
-        as_ray = turn is POSITION
-        by_range = as_ray or turn is POSE
-        by_bearing = settings.localizer.bearing_for_position if as_ray else turn is not None
+        places, as_ray = self._places_for(turn), turn is POSITION
+        share, floor, farthest = self._range_model
+        sharp, sine_squared, (gate, _) = self._heading_weight, self._sine_squared, self._gates
+        (x, y, h), covariance, _ = state.estimate
         axx = axy = ayy = axh = ayh = ahh = bx = by = bh = 0.0
         rejected, offered = 0, False
         used: list[str] = []
@@ -108,30 +97,22 @@ class Landmarks(NamedTuple):
             place = places.get(name)
             if (
                 place is None
-                or name in resting
                 or seen.range_sigma_m is not None
                 or seen.bearing_sigma_rad is not None
+                or name in resting
                 or not (range_m is None or 0.0 < range_m <= LARGEST_M)
                 or not (bearing is None or -LARGEST_BEARING_RAD <= bearing <= LARGEST_BEARING_RAD)
                 or (range_m is None and bearing is None)
             ):
                 others.append(seen)
                 continue
-            px, py, gives_range, gives_bearing = place
-            if not gives_range or (range_m is not None and range_m > farthest):
-                range_m = None
-            if not gives_bearing:
-                bearing = None
+            px, py, by_range, by_bearing = place
             dx, dy = px - x, py - y
             q = dx * dx + dy * dy
             d = sqrt(q)
-            if name not in noted and (range_m is not None or bearing is not None):
-                sigmas = sighting_sigmas(seen, settings.sensor, d)
-                now_ns, reckoned = state.stamp_ns, state.odometry_from_robot
-                pieces.append(
-                    Evidence(now_ns, reckoned, name, px, py, range_m, bearing, *sigmas, 0.0, False)
-                )
-            if not by_range:
+            if name not in noted:
+                pieces += self._evidence(state, seen, d)
+            if not by_range or (range_m is not None and range_m > farthest):
                 range_m = None
             if not by_bearing:
                 bearing = None
@@ -140,70 +121,101 @@ class Landmarks(NamedTuple):
             offered = True
             if d < NEAREST_M:
                 continue
-            # the constraints, linearized at the prior
+            # the constraints: rows, residuals and weights, which are zero for none
+            e = f = u = v = w = k = 0.0
             if range_m is not None:
                 u, v, e = -dx / d, -dy / d, range_m - d
-                due = d
-                if not 0.5 * range_m <= d <= 2.0 * range_m:
-                    due = 0.5 * range_m if d < range_m else 2.0 * range_m
-                r = share * due * due + floor
-                s = u * (u * xx + 2.0 * v * xy) + v * v * yy + r + SMALLEST_VARIANCE
-            if bearing is not None:
-                least = SMALLEST_VARIANCE
-                if as_ray:
-                    c, g = cos(h + bearing), sin(h + bearing)
-                    ahead = c * dx + g * dy
-                    if ahead < NEAREST_M:
-                        if range_m is None:
-                            continue
-                        bearing = None
-                    else:
-                        m, n, f = -g / ahead, c / ahead, (c * dy - g * dx) / ahead
-                        k = 1.0 / (ahead * ahead)
-                        z, least = q * sine2 * k, least * k
-                else:
-                    m, n, f, z = (
-                        -dy / q,
-                        dx / q,
-                        remainder(atan2(dy, dx) - bearing - h, tau),
-                        narrow,
-                    )
-            # their gate
+                due = d if 0.5 * range_m <= d <= 2.0 * range_m else range_to_expect(d, range_m)
+                w = share * due * due + floor
+                w = 1.0 / (w if w > SMALLEST_VARIANCE else SMALLEST_VARIANCE)
+            m = n = 0.0
             if bearing is None:
-                surprise, bound = e * e, gate * s
+                pass
+            elif not as_ray:
+                m, n, k = -dy / q, dx / q, sharp
+                f = remainder(atan2(dy, dx) - bearing - h, tau)
             else:
-                tx, ty = xx * m + xy * n + xh, xy * m + yy * n + yh
-                w = m * (tx + xh) + n * (ty + yh) + hh + z + least
-                if range_m is None:
-                    surprise, bound = f * f, gate * w
-                else:
-                    t = u * tx + v * ty
-                    surprise = w * e * e - 2.0 * t * e * f + s * f * f
-                    bound = gate2 * (s * w - t * t)
-            if surprise > bound:
+                c, s = cos(h + bearing), sin(h + bearing)
+                ahead = c * dx + s * dy
+                if ahead >= NEAREST_M:
+                    m, n, f = -s / ahead, c / ahead, (c * dy - s * dx) / ahead
+                    k = ahead * ahead * _weight(q * sine_squared)
+                elif range_m is None:
+                    continue
+            # the gate, which all pass that the sensor's noise alone explains
+            if w * e * e + k * f * f > gate and self._refuses(
+                covariance, ((u, v, 0.0), e, w), ((m, n, 1.0), f, k)
+            ):
                 rejected += 1
                 continue
             used.append(name)
-            # their sum
+            # the sum
             if range_m is not None:
-                w = 1.0 / (r if r > SMALLEST_VARIANCE else SMALLEST_VARIANCE)
                 wu, wv = w * u, w * v
                 axx += wu * u
                 axy += wu * v
                 ayy += wv * v
                 bx += wu * e
                 by += wv * e
-            if bearing is not None:
-                w = 1.0 / (z if z > least else least)
-                wm, wn = w * m, w * n
-                axx += wm * m
-                axy += wm * n
-                ayy += wn * n
-                axh += wm
-                ayh += wn
-                ahh += w
-                bx += wm * f
-                by += wn * f
-                bh += w * f
+            if k:
+                km, kn = k * m, k * n
+                axx += km * m
+                axy += km * n
+                ayy += kn * n
+                axh += km
+                ayh += kn
+                ahh += k
+                bx += km * f
+                by += kn * f
+                bh += k * f
         matrix = new(Covariance3, (axx, axy, ayy, axh, ayh, ahh))
         return Said(Information(matrix, (bx, by, bh)), used, rejected, offered, pieces, others)
+
+    def _places_for(self, turn: Scope | None) -> Places:
+        if turn is POSE:
+            return self._of_pose
+        if turn is POSITION:
+            return self._of_position
+        return self._of_heading if turn is HEADING else self._of_nothing
+
+    def _refuses(self, prior: Covariance3, *constraints: tuple[Row, float, float]) -> bool:
+        """Whether the chi-square bound refuses an object's (row, residual, weight)."""
+        rows, residuals, weights = zip(*(c for c in constraints if c[2]), strict=True)
+        first, last = (1.0 / weights[i] + SMALLEST_VARIANCE for i in (0, -1))
+        surprise = chi_square(prior, (first, 0.0, last), rows, residuals)
+        return surprise > self._gates[len(rows) - 1]
+
+    def _evidence(self, state: State, seen: Sighting, due_m: float) -> Iterable[Evidence]:
+        """The sighting as evidence, if any of it is of use."""
+        name, range_m, bearing = seen.id, seen.range_m, seen.bearing_rad
+        x, y, by_range, by_bearing = self._of_pose[name]
+        share, floor, farthest = self._range_model
+        if not by_range or range_m is None or range_m > farthest:
+            range_m, sigma_m = None, 0.0
+        else:
+            due_m = range_to_expect(due_m, range_m)
+            sigma_m = sqrt(share * due_m * due_m + floor)
+        if not by_bearing:
+            bearing = None
+        if range_m is None and bearing is None:
+            return ()
+        now, pose, sigma_rad = state.stamp_ns, state.odometry_from_robot, self._bearing_sigma_rad
+        piece = now, pose, name, x, y, range_m, bearing, sigma_m, sigma_rad, 0.0, False
+        return (new(Evidence, piece),)
+
+
+def _places(marks: Mapping[str, Landmark], *, ranges: bool, bearings: bool) -> Places:
+    """The landmarks, with what each gives of that which is wanted."""
+    return {
+        name: (
+            p.x_m,
+            p.y_m,
+            ranges and p.gives in ("both", "range"),
+            bearings and p.gives in ("both", "bearing"),
+        )
+        for name, p in marks.items()
+    }
+
+
+def _weight(variance: float) -> float:
+    return 1.0 / (variance if variance > SMALLEST_VARIANCE else SMALLEST_VARIANCE)

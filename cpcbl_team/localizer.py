@@ -19,11 +19,10 @@ from cpcbl_team.estimate import (
     Scope,
     circular,
     merge,
-    new,
 )
 from cpcbl_team.fusion import Observation, merge_naive, merge_split, told, with_all_shared
 from cpcbl_team.gaussian import Covariance2
-from cpcbl_team.geometry import Pose2, step, wrap_angle
+from cpcbl_team.geometry import Pose2, new, step, wrap_angle
 from cpcbl_team.inputs import Belief, Fix, Odometry, Position, Sighting, Sightings, Told
 from cpcbl_team.landmarks import Landmarks, Said
 from cpcbl_team.motion import move
@@ -67,7 +66,7 @@ class Localizer:
         self._timeout_ns = int(settings.odometry.timeout_s * 1e9)
         self._correlated = settings.sensor.correlation_s > 0.0
         self._gates = (NormalDist().inv_cdf(0.5 + 0.5 * p) ** 2, -2.0 * math.log(1.0 - p))
-        self._landmarks = Landmarks.of(field, settings, self._gates)
+        self._landmarks = Landmarks(field, settings, self._gates)
         split = settings.collaboration.fusion == "split-ci"
         self._merge_teammate = merge_split if split else merge_naive
 
@@ -81,8 +80,7 @@ class Localizer:
         if turn is None:
             return self._judged(state)
         prior, scope = state.estimate, POSE if self._joint else turn
-        found = [(m, constraints_of(prior.pose, m, turn, self._rules)) for m in others]  # 3.
-        accepted, rejected = self._gated(prior, found) if found else ([], 0)
+        accepted, rejected = self._gated(prior, others, turn) if others else ([], 0)  # 3.
         if self._weighted:
             estimate = weighted.merged(
                 prior, [c for _, cs in accepted for c in cs], self._rules.weights
@@ -94,7 +92,7 @@ class Localizer:
                 if m.teammate:
                     told = observation_of(prior, m, cs, estimate)
                     estimate = self._merge_teammate(estimate, told, scope)
-        used = said.used + [m.source for m, _ in accepted]
+        used = [*said.used, *(m.source for m, _ in accepted)] if accepted else said.used
         if accepted or self._reduces or estimate.shared is not ZERO3:
             estimate = self._reduced(estimate)
         return self._judged(self._updated(state, estimate, turn, used, said.rejected + rejected))
@@ -105,9 +103,12 @@ class Localizer:
         """Takes the next piece of odometry; it is driven along as later inputs ask for it."""
         if odometry.stamp_ns <= odometry.from_ns:
             return state._replace(memory=state.memory.counted("impossible_duration"))
-        stamp_ns, estimate, reckoned, _, odometry_ns, memory = self.moved(state, odometry.from_ns)
-        odometry_ns = max(odometry_ns, odometry.stamp_ns)
-        return State(stamp_ns, estimate, reckoned, odometry, odometry_ns, memory)
+        if odometry.from_ns > state.stamp_ns:
+            state = self.moved(state, odometry.from_ns)
+        stamp_ns, estimate, reckoned, _, odometry_ns, memory = state
+        if odometry.stamp_ns > odometry_ns:
+            odometry_ns = odometry.stamp_ns
+        return new(State, (stamp_ns, estimate, reckoned, odometry, odometry_ns, memory))
 
     def moved(self, state: State, until_ns: int) -> State:
         """The state at `until_ns`, driven on along the known odometry."""
@@ -220,13 +221,15 @@ class Localizer:
 
     # Steps 4 and 5 ----------------------------------------------------------------------------
 
-    def _gated(self, prior: Estimate, found: list[Found]) -> tuple[list[Found], int]:
-        """The objects whose innovation the prior's chi-square bound accepts; the others' number."""
+    def _gated(self, prior: Estimate, seen: list[Measured], turn: Scope) -> tuple[list[Found], int]:
+        """The constraints of those objects whose innovation the prior's chi-square bound accepts;
+        the others' number."""
         accepted, rejected = [], 0
-        for m, cs in sorted([f for f in found if f[1]], key=_source):
-            if surprise(prior, m, cs) <= self._gates[len(cs) - 1]:
+        for m in sorted(seen, key=_source):
+            cs = constraints_of(prior.pose, m, turn, self._rules)
+            if cs and surprise(prior, m, cs) <= self._gates[len(cs) - 1]:
                 accepted.append((m, cs))
-            else:
+            elif cs:
                 rejected += 1
         return accepted, rejected
 
@@ -324,18 +327,22 @@ class Localizer:
     ) -> State:
         """The new estimate, with timers, windows and counts of an update of a type by sources."""
         now, _, reckoned, motion, odometry_ns, memory = state
+        position_ns, heading_ns, heading_is_latest, objects_ns, innovations, accepted, gated = (
+            memory[:7]
+        )
         used = dict.fromkeys(sources, now)
         n = len(used)
         # An attempt passes the turn on, an update starts the type's timer.
-        memory = memory._replace(
-            position_ns=now if n and (turn is POSITION or turn is POSE) else memory.position_ns,
-            heading_ns=now if n and (turn is HEADING or turn is POSE) else memory.heading_ns,
-            heading_is_latest=memory.heading_is_latest if turn is None else turn is HEADING,
-            objects_ns={**memory.objects_ns, **used},
-            innovations=innovated(memory.innovations, n, rejected, self._rules.lost_window),
-            accepted=memory.accepted + n,
-            gated=memory.gated + rejected,
-        )
+        if turn is not None:
+            heading_is_latest = turn is HEADING
+            if n and turn is not HEADING:
+                position_ns = now
+            if n and turn is not POSITION:
+                heading_ns = now
+        innovations = innovated(innovations, n, rejected, self._rules.lost_window)
+        usage = position_ns, heading_ns, heading_is_latest, {**objects_ns, **used}
+        counts = innovations, accepted + n, gated + rejected
+        memory = new(Memory, (*usage, *counts, *memory[7:]))
         if n and self._rules.self_calibration:
             memory = self._taught(Anchor(now, estimate, reckoned), memory)
         return new(State, (now, estimate, reckoned, motion, odometry_ns, memory))
@@ -378,5 +385,5 @@ def _passed(last_ns: int | None, now_ns: int, least_ns: float) -> bool:
     return last_ns is None or now_ns - last_ns >= least_ns
 
 
-def _source(found: Found) -> str:
-    return found[0].source
+def _source(m: Measured) -> str:
+    return m.source

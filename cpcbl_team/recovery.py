@@ -7,7 +7,7 @@ An ambiguous answer is no answer.
 """
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 
 from cpcbl_team.config import Field, LocalizerSettings
 from cpcbl_team.constraints import Constraint, bearing_heading, range_circle
@@ -59,31 +59,32 @@ def told_evidence(
 def remembered(memory: Memory, pieces: Sequence[Evidence]) -> Memory:
     """The memory with new evidence of one time, without what is too old or too alike."""
     now = pieces[0].stamp_ns
-    recent = {e.source for e in _recent(memory.evidence, now)}
+    recent = _recent(memory.evidence, now)
+    latest = {e.source: e for e in recent}
     new = []
     for piece in pieces:
-        if piece.source not in recent:
-            recent.add(piece.source)
+        if piece.source not in latest:
+            latest[piece.source] = piece
             new.append(piece)
     if not new:
         return memory
     kept = (*memory.evidence, *new)[-MOST_PIECES:]
     if now - kept[0].stamp_ns > WINDOW_NS:
         kept = tuple(e for e in kept if now - e.stamp_ns <= WINDOW_NS)
-    latest = list(_recent(kept, now))
+    oldest_ns = recent[-1].stamp_ns if recent else now
     return memory._replace(
-        evidence=kept,
-        noted=frozenset(e.source for e in latest),
-        noted_until_ns=latest[-1].stamp_ns + SPACING_NS,
+        evidence=kept, noted=frozenset(latest), noted_until_ns=oldest_ns + SPACING_NS
     )
 
 
-def _recent(evidence: Sequence[Evidence], now_ns: int) -> Iterator[Evidence]:
+def _recent(evidence: Sequence[Evidence], now_ns: int) -> list[Evidence]:
     """Of which no more is needed yet, the latest first."""
+    recent = []
     for e in reversed(evidence):
         if now_ns - e.stamp_ns >= SPACING_NS:
-            return
-        yield e
+            break
+        recent.append(e)
+    return recent
 
 
 def noted(memory: Memory, now_ns: int) -> frozenset[str]:
@@ -93,24 +94,28 @@ def noted(memory: Memory, now_ns: int) -> frozenset[str]:
     return frozenset(e.source for e in _recent(memory.evidence, now_ns))
 
 
-def with_seen(state: State, seen: Iterable[Measured], pieces: Sequence[Evidence] = ()) -> Memory:
+def with_seen(state: State, seen: Sequence[Measured], pieces: Sequence[Evidence] = ()) -> Memory:
     """The memory with these pieces and those of a frame's other sightings that are not too alike
     to what it holds."""
-    recent = noted(state.memory, state.stamp_ns)
-    new = [m for m in seen if m.source not in recent and m.usable and m.wall is None]
-    pieces = [*pieces, *(seen_evidence(state, m) for m in new)]
+    if seen:
+        recent = noted(state.memory, state.stamp_ns)
+        new = [m for m in seen if m.source not in recent and m.usable and m.wall is None]
+        pieces = [*pieces, *(seen_evidence(state, m) for m in new)]
     return remembered(state.memory, pieces) if pieces else state.memory
 
 
 def lost_reason(estimate: Estimate, memory: Memory, settings: LocalizerSettings) -> str:
     """Why the robot is lost; empty if it is not. Being lost ends at half of each limit."""
     slack = 0.5 if memory.lost else 1.0
-    position = estimate.position_sigma_m
-    if position > slack * settings.lost_position_sigma_m:
-        return f"position sigma {position:.2f} m"
-    heading = math.degrees(estimate.heading_sigma_rad)
-    if heading > slack * settings.lost_heading_sigma_deg:
-        return f"heading sigma {heading:.0f} deg"
+    most_m, most_deg = (
+        slack * settings.lost_position_sigma_m,
+        slack * settings.lost_heading_sigma_deg,
+    )
+    xx, _, yy, _, _, hh = estimate.covariance
+    if 0.5 * (xx + yy) > most_m * most_m:
+        return f"position sigma {estimate.position_sigma_m:.2f} m"
+    if hh > math.radians(most_deg) ** 2:
+        return f"heading sigma {math.degrees(estimate.heading_sigma_rad):.0f} deg"
     digits, length = memory.innovations.bit_length(), settings.lost_window
     rejected = digits - memory.innovations.bit_count()
     if digits > length // 2 and rejected > slack * settings.lost_share * length:

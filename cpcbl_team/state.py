@@ -46,10 +46,11 @@ class Memory(NamedTuple):
     heading_ns: int | None = None
     heading_is_latest: bool = False
     objects_ns: Mapping[str, int] = _NONE  # last use of each object
-    teammates: Mapping[str, Belief] = _NONE
     innovations: int = 1  # accepted or not; see `innovated`
     accepted: int = 0  # observations since the start
     gated: int = 0
+    # the first seven change with every update
+    teammates: Mapping[str, Belief] = _NONE
     evidence: tuple[Evidence, ...] = ()
     noted: frozenset[str] = (
         frozenset()
