@@ -8,7 +8,7 @@ the two together.
 """
 
 import math
-from collections.abc import Container, Iterable, Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from math import atan2, cos, remainder, sin, sqrt, tau
 
 import msgspec
@@ -111,7 +111,9 @@ class Landmarks:
             q = dx * dx + dy * dy
             d = sqrt(q)
             if name not in noted:
-                pieces += self._evidence(state, seen, d)
+                piece = self._evidence(state, seen, d)
+                if piece:
+                    pieces.append(piece)
             if not by_range or (range_m is not None and range_m > farthest):
                 range_m = None
             if not by_bearing:
@@ -185,7 +187,7 @@ class Landmarks:
         surprise = chi_square(prior, (first, 0.0, last), rows, residuals)
         return surprise > self._gates[len(rows) - 1]
 
-    def _evidence(self, state: State, seen: Sighting, due_m: float) -> Iterable[Evidence]:
+    def _evidence(self, state: State, seen: Sighting, due_m: float) -> Evidence | None:
         """The sighting as evidence, if any of it is of use."""
         name, range_m, bearing = seen.id, seen.range_m, seen.bearing_rad
         x, y, by_range, by_bearing = self._of_pose[name]
@@ -198,10 +200,10 @@ class Landmarks:
         if not by_bearing:
             bearing = None
         if range_m is None and bearing is None:
-            return ()
+            return None
         now, pose, sigma_rad = state.stamp_ns, state.odometry_from_robot, self._bearing_sigma_rad
         piece = now, pose, name, x, y, range_m, bearing, sigma_m, sigma_rad, 0.0, False
-        return (new(Evidence, piece),)
+        return new(Evidence, piece)
 
 
 def _places(marks: Mapping[str, Landmark], *, ranges: bool, bearings: bool) -> Places:

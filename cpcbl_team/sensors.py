@@ -80,7 +80,8 @@ def _fault(sighting: Sighting) -> str:
 
 def range_to_expect(expected_m: float, range_m: float) -> float:
     """The expected range, within a factor of two of the reading."""
-    return min(max(expected_m, 0.5 * range_m), 2.0 * range_m)
+    least, most = 0.5 * range_m, 2.0 * range_m
+    return least if expected_m < least else most if expected_m > most else expected_m
 
 
 def sighting_sigmas(
