@@ -7,6 +7,8 @@ import math
 from collections.abc import Iterable
 from statistics import NormalDist
 
+from msgspec.structs import replace
+
 from cpcbl_team import recovery, weighted
 from cpcbl_team.config import Field, LocalizationSettings
 from cpcbl_team.estimate import (
@@ -22,7 +24,7 @@ from cpcbl_team.estimate import (
 )
 from cpcbl_team.fusion import Observation, merge_naive, merge_split, told, with_all_shared
 from cpcbl_team.gaussian import Covariance2
-from cpcbl_team.geometry import Pose2, new, step, wrap_angle
+from cpcbl_team.geometry import Pose2, step, wrap_angle
 from cpcbl_team.inputs import Belief, Fix, Odometry, Position, Sighting, Sightings, Told
 from cpcbl_team.landmarks import Landmarks, Said
 from cpcbl_team.motion import move
@@ -102,19 +104,24 @@ class Localizer:
     def drive(self, state: State, odometry: Odometry) -> State:
         """Takes the next piece of odometry; it is driven along as later inputs ask for it."""
         if odometry.stamp_ns <= odometry.from_ns:
-            return state._replace(memory=state.memory.counted("impossible_duration"))
+            return replace(state, memory=state.memory.counted("impossible_duration"))
         if odometry.from_ns > state.stamp_ns:
             state = self.moved(state, odometry.from_ns)
-        stamp_ns, estimate, reckoned, _, odometry_ns, memory = state
-        if odometry.stamp_ns > odometry_ns:
-            odometry_ns = odometry.stamp_ns
-        return new(State, (stamp_ns, estimate, reckoned, odometry, odometry_ns, memory))
+        return State(
+            state.stamp_ns,
+            state.estimate,
+            state.odometry_from_robot,
+            odometry,
+            max(state.odometry_ns, odometry.stamp_ns),
+            state.memory,
+        )
 
     def moved(self, state: State, until_ns: int) -> State:
         """The state at `until_ns`, driven on along the known odometry."""
-        stamp_ns, estimate, reckoned, motion, odometry_ns, memory = state
+        stamp_ns, odometry_ns, memory = state.stamp_ns, state.odometry_ns, state.memory
         if until_ns <= stamp_ns:
             return state
+        estimate, reckoned, motion = state.estimate, state.odometry_from_robot, state.motion
         if motion is not None:
             distance, turn = motion.distance_m, motion.turn_rad
             if motion.from_ns != stamp_ns or motion.stamp_ns > until_ns:  # not the whole piece
@@ -135,7 +142,7 @@ class Localizer:
         silent_ns = until_ns - odometry_ns - self._timeout_ns
         if silent_ns > 0:
             estimate = self._unknown_motion(estimate, min(silent_ns, until_ns - stamp_ns))
-        return new(State, (until_ns, estimate, reckoned, motion, odometry_ns, memory))
+        return State(until_ns, estimate, reckoned, motion, odometry_ns, memory)
 
     def _unknown_motion(self, estimate: Estimate, silent_ns: int) -> Estimate:
         """The growth of uncertainty while odometry is missing (a second of it: gap_speed)."""
@@ -164,7 +171,7 @@ class Localizer:
                 break
         if said.pieces or seen or faults:
             memory = recovery.with_seen(state, seen, said.pieces).counted(*faults)
-            state = state._replace(memory=memory)
+            state = replace(state, memory=memory)
         return state, turn, said, fresh
 
     def _turns(self, state: State) -> Turns:
@@ -269,7 +276,7 @@ class Localizer:
         both = sensor if observer is None else sensor + observer
         piece = recovery.told_evidence(state, source, x, y, both, by_teammate=observer is not None)
         memory, prior = recovery.remembered(state.memory, [piece]), state.estimate
-        state = state._replace(memory=memory)
+        state = replace(state, memory=memory)
         least = self._rules.object_interval_s * 1e9
         if not _passed(memory.objects_ns.get(source), stamp_ns, least):
             return state
@@ -293,12 +300,12 @@ class Localizer:
         """Passive collaboration: keeps a teammate's belief, to use it when the teammate is seen."""
         state = self.moved(state, belief.stamp_ns)
         teammates = {**state.memory.teammates, belief.robot: belief}
-        return state._replace(memory=state.memory._replace(teammates=teammates))
+        return replace(state, memory=replace(state.memory, teammates=teammates))
 
     def tell(self, state: State, event: Told) -> State:
         """This robot's belief goes to a teammate: it may come back."""
         state = self.moved(state, event.stamp_ns)
-        return state._replace(estimate=told(state.estimate))
+        return replace(state, estimate=told(state.estimate))
 
     # The start, being lost, the way back --------------------------------------------------------
 
@@ -326,59 +333,58 @@ class Localizer:
         rejected: int,
     ) -> State:
         """The new estimate, with timers, windows and counts of an update of a type by sources."""
-        now, _, reckoned, motion, odometry_ns, memory = state
-        position_ns, heading_ns, heading_is_latest, objects_ns, innovations, accepted, gated = (
-            memory[:7]
-        )
+        now, memory = state.stamp_ns, state.memory
         used = dict.fromkeys(sources, now)
         n = len(used)
         # An attempt passes the turn on, an update starts the type's timer.
-        if turn is not None:
-            heading_is_latest = turn is HEADING
-            if n and turn is not HEADING:
-                position_ns = now
-            if n and turn is not POSITION:
-                heading_ns = now
-        innovations = innovated(innovations, n, rejected, self._rules.lost_window)
-        usage = position_ns, heading_ns, heading_is_latest, {**objects_ns, **used}
-        counts = innovations, accepted + n, gated + rejected
-        memory = new(Memory, (*usage, *counts, *memory[7:]))
+        position = n and (turn is POSITION or turn is POSE)
+        heading = n and (turn is HEADING or turn is POSE)
+        memory = replace(
+            memory,
+            position_ns=now if position else memory.position_ns,
+            heading_ns=now if heading else memory.heading_ns,
+            heading_is_latest=memory.heading_is_latest if turn is None else turn is HEADING,
+            objects_ns={**memory.objects_ns, **used},
+            innovations=innovated(memory.innovations, n, rejected, self._rules.lost_window),
+            accepted=memory.accepted + n,
+            gated=memory.gated + rejected,
+        )
         if n and self._rules.self_calibration:
-            memory = self._taught(Anchor(now, estimate, reckoned), memory)
-        return new(State, (now, estimate, reckoned, motion, odometry_ns, memory))
+            memory = self._taught(Anchor(now, estimate, state.odometry_from_robot), memory)
+        return replace(state, estimate=estimate, memory=memory)
 
     def _taught(self, here: Anchor, memory: Memory) -> Memory:
         """What the robot has learned of its odometry and bearings, from this update too."""
         if memory.anchors is None or memory.lost:
-            return memory._replace(anchors=None if memory.lost else Anchors(here, here))
+            return replace(memory, anchors=None if memory.lost else Anchors(here, here))
         known, anchors = learned(memory.learned, memory.anchors, here, self.settings.odometry)
-        return memory._replace(learned=known, anchors=anchors)
+        return replace(memory, learned=known, anchors=anchors)
 
     def _judged(self, state: State) -> State:
         """Lost or not. If lost: found again from recent evidence, else in more and more doubt."""
         memory, now = state.memory, state.stamp_ns
         reason = recovery.lost_reason(state.estimate, memory, self._rules)
         if not reason:
-            return state._replace(memory=memory._replace(lost="")) if memory.lost else state
+            return replace(state, memory=replace(memory, lost="")) if memory.lost else state
         if not memory.lost:
-            memory = memory._replace(widened_ns=now).counted("lost")
-        memory = memory._replace(lost=reason)
+            memory = replace(memory, widened_ns=now).counted("lost")
+        memory = replace(memory, lost=reason)
         refusing = memory.innovations & 1 == 0
         # What was seen before the refusals began may have been seen from elsewhere.
         since_ns = max(memory.objects_ns.values(), default=0) if refusing else 0
         evidence = tuple(e for e in memory.evidence if e.stamp_ns > since_ns)
         found = None
         if evidence and evidence[-1].stamp_ns > memory.sought_ns:
-            memory = memory._replace(sought_ns=evidence[-1].stamp_ns)
+            memory = replace(memory, sought_ns=evidence[-1].stamp_ns)
             found = recovery.relocalized(evidence, state.odometry_from_robot, self.field)
         if found is not None:
-            memory = memory._replace(lost="", innovations=1, anchors=None).counted("found_again")
-            return state._replace(estimate=self._reduced(found), memory=memory)
+            memory = replace(memory, lost="", innovations=1, anchors=None).counted("found_again")
+            return replace(state, estimate=self._reduced(found), memory=memory)
         estimate = state.estimate
         if refusing and now - memory.widened_ns >= recovery.WIDEN_NS:
             estimate = recovery.widened(estimate, self._rules)
-            memory = memory._replace(widened_ns=now)
-        return state._replace(estimate=estimate, memory=memory)
+            memory = replace(memory, widened_ns=now)
+        return replace(state, estimate=estimate, memory=memory)
 
 
 def _passed(last_ns: int | None, now_ns: int, least_ns: float) -> bool:

@@ -9,6 +9,8 @@ An ambiguous answer is no answer.
 import math
 from collections.abc import Iterator, Sequence
 
+from msgspec.structs import replace
+
 from cpcbl_team.config import Field, LocalizerSettings
 from cpcbl_team.constraints import Constraint, bearing_heading, range_circle
 from cpcbl_team.estimate import SMALLEST_VARIANCE, ZERO3, Covariance3, Estimate, Information, merge
@@ -72,8 +74,8 @@ def remembered(memory: Memory, pieces: Sequence[Evidence]) -> Memory:
     if now - kept[0].stamp_ns > WINDOW_NS:
         kept = tuple(e for e in kept if now - e.stamp_ns <= WINDOW_NS)
     oldest_ns = recent[-1].stamp_ns if recent else now
-    return memory._replace(
-        evidence=kept, noted=frozenset(latest), noted_until_ns=oldest_ns + SPACING_NS
+    return replace(
+        memory, evidence=kept, noted=frozenset(latest), noted_until_ns=oldest_ns + SPACING_NS
     )
 
 

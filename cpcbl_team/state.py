@@ -5,6 +5,9 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
+import msgspec
+from msgspec.structs import replace
+
 from cpcbl_team.estimate import Estimate
 from cpcbl_team.geometry import Pose2
 from cpcbl_team.inputs import Belief, Odometry
@@ -39,7 +42,7 @@ class Evidence(NamedTuple):
     told: bool  # by a teammate
 
 
-class Memory(NamedTuple):
+class Memory(msgspec.Struct, frozen=True, gc=False):
     """What only changes when something is seen or told."""
 
     position_ns: int | None = None  # last update of the type
@@ -49,13 +52,10 @@ class Memory(NamedTuple):
     innovations: int = 1  # accepted or not; see `innovated`
     accepted: int = 0  # observations since the start
     gated: int = 0
-    # the first seven change with every update
     teammates: Mapping[str, Belief] = _NONE
     evidence: tuple[Evidence, ...] = ()
-    noted: frozenset[str] = (
-        frozenset()
-    )  # sources of evidence that need none before `noted_until_ns`
-    noted_until_ns: int = 0
+    noted: frozenset[str] = frozenset()  # the sources of which no more is needed yet,
+    noted_until_ns: int = 0  # until then
     lost: str = ""  # the reason, empty when the robot knows where it is
     widened_ns: int = 0
     sought_ns: int = -1  # the newest evidence with which it sought itself in vain
@@ -64,7 +64,7 @@ class Memory(NamedTuple):
     anchors: Anchors | None = None
 
     def counted(self, *events: str) -> "Memory":
-        return self._replace(events=Counter(self.events) + Counter(events)) if events else self
+        return replace(self, events=Counter(self.events) + Counter(events)) if events else self
 
     @property
     def counts(self) -> Mapping[str, int]:
@@ -73,7 +73,7 @@ class Memory(NamedTuple):
         return {name: n for name, n in {**used, **self.events}.items() if n}
 
 
-class State(NamedTuple):
+class State(msgspec.Struct, frozen=True, gc=False):
     """The localizer's state at `stamp_ns`."""
 
     stamp_ns: int

@@ -22,6 +22,7 @@ from core_helpers import (
     sensor_noise,
     state_at,
 )
+from msgspec.structs import replace
 
 from cpcbl_team.collaboration import Place
 from cpcbl_team.config import (
@@ -277,8 +278,8 @@ def test_an_object_that_was_seen_a_short_time_ago_is_no_new_evidence(
     age_ns: int, kept: list[str]
 ) -> None:
     state = state_at(ORIGIN, diagonal(0.1, 0.1), stamp_ns=SECOND)
-    state = state._replace(
-        memory=Memory(evidence=(piece(SECOND - age_ns, ORIGIN, "ne", 4.5, 2.5),))
+    state = replace(
+        state, memory=Memory(evidence=(piece(SECOND - age_ns, ORIGIN, "ne", 4.5, 2.5),))
     )
     place, both = Place(4.5, 2.5, Covariance2(0.0, 0.0, 0.0)), (5.0, 0.5)
     seen = [Measured(name, place, None, False, *both, 0.1, 0.1) for name in ("ne", "ne")]
@@ -397,6 +398,6 @@ def test_a_robot_says_why_it_is_lost_now() -> None:
     memory = Memory(
         innovations=innovated(1, 20, 0, 20), lost="13 of the last 20 innovations rejected"
     )
-    state = state_at(ORIGIN, diagonal(0.1, 1.0))._replace(memory=memory)
+    state = replace(state_at(ORIGIN, diagonal(0.1, 1.0)), memory=memory)
     state = robot.cycle(state, Sightings(1, ()))
     assert state.memory.lost == "heading sigma 57 deg"
