@@ -65,7 +65,7 @@ class Landmarks:
         self._of_nothing = _places(marks, ranges=False, bearings=False)
         self._gates = gates
         self._range_model = s.range_share**2, s.range_floor_m**2, s.max_range_for_range_m
-        self._heading_weight = _weight(s.bearing_sigma_rad**2)
+        self._heading_weight = 1.0 / max(s.bearing_sigma_rad**2, SMALLEST_VARIANCE)
         self._sine_squared = math.sin(min(s.bearing_sigma_rad, 0.5 * math.pi)) ** 2
         self._bearing_sigma_rad = s.bearing_sigma_rad
 
@@ -124,24 +124,25 @@ class Landmarks:
             if d < NEAREST_M:
                 continue
             # the constraints: rows, residuals and weights, which are zero for none
-            e = f = u = v = w = k = 0.0
-            if range_m is not None:
+            e = f = u = v = m = n = w = k = 0.0
+            if range_m is not None:  # a circle
                 u, v, e = -dx / d, -dy / d, range_m - d
                 due = d if 0.5 * range_m <= d <= 2.0 * range_m else range_to_expect(d, range_m)
                 w = share * due * due + floor
                 w = 1.0 / (w if w > SMALLEST_VARIANCE else SMALLEST_VARIANCE)
-            m = n = 0.0
             if bearing is None:
                 pass
-            elif not as_ray:
+            elif not as_ray:  # a heading
                 m, n, k = -dy / q, dx / q, sharp
                 f = remainder(atan2(dy, dx) - bearing - h, tau)
-            else:
-                c, s = cos(h + bearing), sin(h + bearing)
+            else:  # a ray
+                direction = h + bearing
+                c, s = cos(direction), sin(direction)
                 ahead = c * dx + s * dy
                 if ahead >= NEAREST_M:
                     m, n, f = -s / ahead, c / ahead, (c * dy - s * dx) / ahead
-                    k = ahead * ahead * _weight(q * sine_squared)
+                    k = q * sine_squared  # the ray's width, squared
+                    k = ahead * ahead / (k if k > SMALLEST_VARIANCE else SMALLEST_VARIANCE)
                 elif range_m is None:
                     continue
             # the gate, which all pass that the sensor's noise alone explains
@@ -217,7 +218,3 @@ def _places(marks: Mapping[str, Landmark], *, ranges: bool, bearings: bool) -> P
         )
         for name, p in marks.items()
     }
-
-
-def _weight(variance: float) -> float:
-    return 1.0 / (variance if variance > SMALLEST_VARIANCE else SMALLEST_VARIANCE)
