@@ -12,10 +12,11 @@ Schmidt 1966) and gives the correlated sideways drift of resolution b.
 import math
 from collections.abc import Iterable
 from enum import Enum
+from math import hypot, remainder, tau
 from typing import NamedTuple
 
 from cpcbl_team.gaussian import Covariance2
-from cpcbl_team.geometry import Pose2, wrap_angle
+from cpcbl_team.geometry import Pose2, new, wrap_angle
 
 Matrix3 = tuple[float, float, float, float, float, float, float, float, float]
 
@@ -206,27 +207,57 @@ def shifted(pose: Pose2, offset: Row, scope: Scope) -> Pose2:
     return Pose2(pose.x + dx, pose.y + dy, wrap_angle(pose.heading + dh))
 
 
-def merge(prior: Estimate, evidence: Information, scope: Scope = POSE) -> Estimate:
+def merge(
+    prior: Estimate, evidence: Information, scope: Scope = POSE, as_circle: bool = False
+) -> Estimate:
     """Bayes' product of a prior and independent evidence (equations 3 and 4 in three dimensions).
 
     Works for evidence of any rank: one range says nothing along the tangent of its circle.
+    `as_circle`: the position's covariance is kept as a circle.
     """
-    survive = survival(prior.covariance, evidence.matrix)
-    posterior = product(survive, prior.covariance)
-    pose = shifted(prior.pose, posterior.times(evidence.vector), scope)
-    survive, posterior = scoped(survive, prior.covariance, posterior, scope)
-    shared = prior.shared
-    return Estimate(pose, posterior, shared if shared is ZERO3 else shared.transformed(survive))
+    (x, y, heading), covariance, shared = prior
+    xx, xy, yy, xh, yh, hh = covariance
+    ex, ey, eh = evidence.vector
+    survive = survival(covariance, evidence.matrix)
+    a, b, c, d, e, f, g, h, i = survive
+    # survive times covariance, as in `product`, of it what is in scope
+    xh_after = g * xx + h * xy + i * xh
+    yh_after = g * xy + h * yy + i * yh
+    if scope is not POSITION:
+        hh = g * xh + h * yh + i * hh
+        heading = remainder(heading + xh_after * ex + yh_after * ey + hh * eh, tau)
+    if scope is not HEADING:
+        xx, xy, yy = a * xx + b * xy + c * xh, d * xx + e * xy + f * xh, d * xy + e * yy + f * yh
+        x += xx * ex + xy * ey + xh_after * eh
+        y += xy * ex + yy * ey + yh_after * eh
+    if as_circle:
+        xx = yy = circle_variance(xx, xy, yy, xh_after, yh_after, hh)
+        xy = 0.0
+    if shared is not ZERO3:
+        survive, _ = scoped(survive, covariance, covariance, scope)
+        shared = shared.transformed(survive)
+    posterior = new(Covariance3, (xx, xy, yy, xh_after, yh_after, hh))
+    return new(Estimate, (new(Pose2, (x, y, heading)), posterior, shared))
 
 
-def circular(estimate: Estimate) -> Estimate:
-    """Position covariance reduced to a circle: the mean variance, and a part of the spread.
+def circle_variance(xx: float, xy: float, yy: float, xh: float, yh: float, hh: float) -> float:
+    """The variance of the circle that stands for an ellipse: the mean, and a part of the spread.
 
     The mean alone claims too much along the major axis (98.0 % inside 3 sigma where 98.9 % are due,
     99.3 % so). Never less than what the drift alone explains.
     """
+    variance = 0.5 * (xx + yy)
+    if xy != 0.0 or xx != yy:
+        variance += SPREAD_SHARE * hypot(0.5 * (xx - yy), xy)
+    if hh > 0.0:
+        drift = (xh * xh + yh * yh) / hh
+        if drift > variance:
+            return drift
+    return variance
+
+
+def circular(estimate: Estimate) -> Estimate:
+    """The estimate with its position's covariance reduced to a circle."""
     pose, c, shared = estimate
-    variance = 0.5 * (c.xx + c.yy) + SPREAD_SHARE * math.hypot(0.5 * (c.xx - c.yy), c.xy)
-    if c.hh > 0.0:
-        variance = max(variance, (c.xh * c.xh + c.yh * c.yh) / c.hh)
+    variance = circle_variance(*c)
     return Estimate(pose, Covariance3(variance, 0.0, variance, c.xh, c.yh, c.hh), shared)

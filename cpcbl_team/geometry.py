@@ -5,7 +5,10 @@ A pose is written `a_from_b`: it maps coordinates of frame b into frame a. A rob
 """
 
 import math
+from math import cos, remainder, sin, tau
 from typing import NamedTuple
+
+new = tuple.__new__  # new(Pose2, (x, y, heading)) takes half the time of Pose2(x, y, heading)
 
 
 def wrap_angle(angle: float) -> float:
@@ -38,9 +41,8 @@ class Pose2(NamedTuple):
 
 def step(pose: Pose2, distance: float, turn: float) -> Pose2:
     """The pose after driving an arc of length `distance` that turns by `turn` (second order)."""
-    direction = pose.heading + 0.5 * turn
-    return Pose2(
-        pose.x + distance * math.cos(direction),
-        pose.y + distance * math.sin(direction),
-        wrap_angle(pose.heading + turn),
-    )
+    x, y, heading = pose
+    direction = heading + 0.5 * turn
+    x += distance * cos(direction)
+    y += distance * sin(direction)
+    return new(Pose2, (x, y, remainder(heading + turn, tau)))

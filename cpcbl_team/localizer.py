@@ -7,13 +7,15 @@ import math
 from collections.abc import Iterable
 from statistics import NormalDist
 
+from msgspec.structs import replace
+
 from cpcbl_team import recovery, weighted
 from cpcbl_team.config import Field, LocalizationSettings
-from cpcbl_team.constraints import Constraint
 from cpcbl_team.estimate import (
     HEADING,
     POSE,
     POSITION,
+    ZERO3,
     Covariance3,
     Estimate,
     Scope,
@@ -23,24 +25,28 @@ from cpcbl_team.estimate import (
 from cpcbl_team.fusion import Observation, merge_naive, merge_split, told, with_all_shared
 from cpcbl_team.gaussian import Covariance2
 from cpcbl_team.geometry import Pose2, step, wrap_angle
-from cpcbl_team.inputs import Belief, Fix, Odometry, Position, Sightings, Told
+from cpcbl_team.inputs import Belief, Fix, Odometry, Position, Sighting, Sightings, Told
+from cpcbl_team.landmarks import Landmarks, Said
 from cpcbl_team.motion import move
 from cpcbl_team.self_calibration import Anchor, Anchors, learned
 from cpcbl_team.sensors import repeated_share, sighting_fault
 from cpcbl_team.sightings import (
+    Found,
     Measured,
     combined,
     constraints_of,
     measured,
     observation_of,
+    offers,
     surprise,
 )
-from cpcbl_team.state import Memory, State, added
+from cpcbl_team.state import Memory, State, innovated
 
 UNSTEERABLE_SIGMA_RAD = math.radians(100.0)  # beyond, no bearing can be linearized
 _FIX = "fix:"  # marks the source of an active fix, apart from seeing that teammate
 _OWN = "position sensor"
 
+Turns = tuple[Scope | None, ...]
 _AXES = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
 
 
@@ -51,85 +57,97 @@ class Localizer:
         self.settings = settings
         self.field = field
         self._rules = settings.localizer
-        self._weighted = self._rules.variant == "weighted"
-        self._alternates = self._rules.alternates
+        variant, p = self._rules.variant, self._rules.gate_probability
+        self._weighted, self._joint = variant == "weighted", variant == "joint"
+        self._as_circle = variant == "circular" and not self._rules.paper_uncertainty
+        self._reduces = self._weighted or self._rules.paper_uncertainty
+        self._orders: tuple[Turns, Turns] = ((HEADING, POSITION, None), (POSITION, HEADING, None))
+        if not self._rules.alternates:
+            self._orders = ((POSE, None), (POSE, None))
+        self._rests = self._rules.object_interval_s > 0.0
+        self._timeout_ns = int(settings.odometry.timeout_s * 1e9)
         self._correlated = settings.sensor.correlation_s > 0.0
-        p = self._rules.gate_probability
         self._gates = (NormalDist().inv_cdf(0.5 + 0.5 * p) ** 2, -2.0 * math.log(1.0 - p))
+        self._landmarks = Landmarks(field, settings, self._gates)
         split = settings.collaboration.fusion == "split-ci"
         self._merge_teammate = merge_split if split else merge_naive
 
     def cycle(self, state: State, frame: Sightings) -> State:
-        """One cycle: the five steps of the paper (sections 3 and 4) for one frame of sightings."""
+        """One cycle: the five steps of the paper (sections 3 and 4) for one frame of sightings.
+
+        `said` is steps 2 to 4 of the plain landmarks, nearly all there is; the others follow.
+        """
         state = self.moved(state, frame.stamp_ns)  # 1. differential motion
-        state, seen = self._measure(state, frame)  # 2. measurements, with their sigmas
-        turn = self._turn(state, seen)
+        state, turn, said, others = self._measured(state, frame)  # 2. measurements
         if turn is None:
             return self._judged(state)
-        prior = state.estimate
-        found = [
-            (m, constraints_of(prior.pose, m, turn, self._rules)) for m in seen
-        ]  # 3. constraints
-        accepted, rejected = self._gated(prior, found)
-        landmarks = [c for m, cs in accepted for c in cs if not m.teammate or self._weighted]
-        teammates = [(m, cs) for m, cs in accepted if m.teammate and not self._weighted]
+        prior, scope = state.estimate, POSE if self._joint else turn
+        accepted, rejected = self._gated(prior, others, turn) if others else ([], 0)  # 3.
         if self._weighted:
-            estimate = weighted.merged(prior, landmarks, self._rules.weights)
+            estimate = weighted.merged(
+                prior, [c for _, cs in accepted for c in cs], self._rules.weights
+            )
         else:
-            evidence = combined(landmarks)  # 4. their closest points, combined
-            estimate = merge(prior, evidence, self._scope(turn))  # 5. combined with the estimate
-            for m, cs in teammates:
-                told = observation_of(prior, m, cs, estimate)
-                estimate = self._merge_teammate(estimate, told, self._scope(turn))
-        sources = [m.source for m, _ in accepted]
-        estimate = self._reduced(estimate)
-        return self._judged(self._updated(state, estimate, turn, sources, rejected))
+            evidence = combined(said.evidence, accepted) if accepted else said.evidence  # 4.
+            estimate = merge(prior, evidence, scope, self._as_circle and not accepted)  # 5.
+            for m, cs in accepted:
+                if m.teammate:
+                    told = observation_of(prior, m, cs, estimate)
+                    estimate = self._merge_teammate(estimate, told, scope)
+        used = [*said.used, *(m.source for m, _ in accepted)] if accepted else said.used
+        if accepted or self._reduces or estimate.shared is not ZERO3:
+            estimate = self._reduced(estimate)
+        return self._judged(self._updated(state, estimate, turn, used, said.rejected + rejected))
 
     # Step 1 -----------------------------------------------------------------------------------
 
     def drive(self, state: State, odometry: Odometry) -> State:
         """Takes the next piece of odometry; it is driven along as later inputs ask for it."""
         if odometry.stamp_ns <= odometry.from_ns:
-            return state._replace(memory=state.memory.counted("impossible_duration"))
-        stamp_ns, estimate, reckoned, _, odometry_ns, memory = self.moved(state, odometry.from_ns)
-        odometry_ns = max(odometry_ns, odometry.stamp_ns)
-        return State(stamp_ns, estimate, reckoned, odometry, odometry_ns, memory)
+            return replace(state, memory=state.memory.counted("impossible_duration"))
+        if odometry.from_ns > state.stamp_ns:
+            state = self.moved(state, odometry.from_ns)
+        return State(
+            state.stamp_ns,
+            state.estimate,
+            state.odometry_from_robot,
+            odometry,
+            max(state.odometry_ns, odometry.stamp_ns),
+            state.memory,
+        )
 
     def moved(self, state: State, until_ns: int) -> State:
         """The state at `until_ns`, driven on along the known odometry."""
-        if until_ns <= state.stamp_ns:
+        stamp_ns, odometry_ns, memory = state.stamp_ns, state.odometry_ns, state.memory
+        if until_ns <= stamp_ns:
             return state
-        stamp_ns, estimate, reckoned, motion, odometry_ns, memory = state
+        estimate, reckoned, motion = state.estimate, state.odometry_from_robot, state.motion
         if motion is not None:
-            end_ns = min(motion.stamp_ns, until_ns)
-            whole_ns = motion.stamp_ns - motion.from_ns
-            share = max(0, end_ns - max(stamp_ns, motion.from_ns)) / whole_ns
-            s = self.settings.odometry
-            distance, turn = share * motion.distance_m, share * motion.turn_rad
+            distance, turn = motion.distance_m, motion.turn_rad
+            if motion.from_ns != stamp_ns or motion.stamp_ns > until_ns:  # not the whole piece
+                end_ns = min(motion.stamp_ns, until_ns)
+                driven_ns = max(0, end_ns - max(stamp_ns, motion.from_ns))
+                share = driven_ns / (motion.stamp_ns - motion.from_ns)
+                distance, turn = share * distance, share * turn
             if self._rules.self_calibration:
                 distance *= memory.learned.distance_scale
                 turn *= memory.learned.turn_scale
             if distance != 0.0 or turn != 0.0:
                 reckoned = step(reckoned, distance, turn)
-                estimate = self._reduced(move(estimate, distance, turn, s))
-            if end_ns == motion.stamp_ns:
+                estimate = move(estimate, distance, turn, self.settings.odometry, self._as_circle)
+                if self._reduces or estimate.shared is not ZERO3:
+                    estimate = self._reduced(estimate)
+            if motion.stamp_ns <= until_ns:
                 motion = None
-        return State(
-            until_ns,
-            self._unknown_motion(estimate, stamp_ns, until_ns, odometry_ns),
-            reckoned,
-            motion,
-            odometry_ns,
-            memory,
-        )
+        silent_ns = until_ns - odometry_ns - self._timeout_ns
+        if silent_ns > 0:
+            estimate = self._unknown_motion(estimate, min(silent_ns, until_ns - stamp_ns))
+        return State(until_ns, estimate, reckoned, motion, odometry_ns, memory)
 
-    def _unknown_motion(
-        self, estimate: Estimate, from_ns: int, until_ns: int, odometry_ns: int
-    ) -> Estimate:
+    def _unknown_motion(self, estimate: Estimate, silent_ns: int) -> Estimate:
         """The growth of uncertainty while odometry is missing (a second of it: gap_speed)."""
         s = self.settings.odometry
-        silent_ns = until_ns - max(from_ns, odometry_ns + int(s.timeout_s * 1e9))
-        if silent_ns <= 0 or not s.moves:
+        if not s.moves:
             return estimate
         p = s.gap_speed_m_s**2 * silent_ns * 1e-9
         doubt = Covariance3(p, 0.0, p, 0.0, 0.0, p)
@@ -137,29 +155,70 @@ class Localizer:
 
     # Step 2 -----------------------------------------------------------------------------------
 
-    def _measure(self, state: State, frame: Sightings) -> tuple[State, list[Measured]]:
-        """The usable sightings of a frame. Faulty ones are counted by reason; those of an object
-        that was used too short a time ago are left out, and those of one that was used not long
-        ago count for less: their errors are correlated."""
-        memory, now, pose = state.memory, frame.stamp_ns, state.estimate.pose
+    def _measured(
+        self, state: State, frame: Sightings
+    ) -> tuple[State, Scope | None, Said, list[Measured]]:
+        """What the frame may update (None: nothing), what its plain landmarks say about that, and
+        its other usable sightings. New evidence and faults are in the state's memory then."""
+        memory, now, sightings = state.memory, frame.stamp_ns, frame.sightings
+        noted = recovery.noted(memory, state.stamp_ns)
+        resting = self._resting(memory, now) if self._rests or now < state.stamp_ns else ()
+        for turn in self._turns(state):
+            said = self._landmarks.read(state, sightings, turn, resting, noted)
+            seen, faults = self._others(state, said.others, now) if said.others else ([], [])
+            fresh = self._fresh(memory, seen, now) if seen else seen
+            if said.offered or any(offers(m, turn, self._rules) for m in fresh):
+                break
+        if said.pieces or seen or faults:
+            memory = recovery.with_seen(state, seen, said.pieces).counted(*faults)
+            state = replace(state, memory=memory)
+        return state, turn, said, fresh
+
+    def _turns(self, state: State) -> Turns:
+        """What may be updated: heading or position, first the one that waits longer; one timer a
+        type. The last is None: nothing."""
+        memory, now = state.memory, state.stamp_ns
+        if memory.lost and state.estimate.heading_sigma_rad > UNSTEERABLE_SIGMA_RAD:
+            return (None,)
+        turns = self._orders[memory.heading_is_latest]
+        least = self._rules.minimum_interval_s * 1e9
+        if least > 0.0:
+            position = _passed(memory.position_ns, now, least)
+            heading = _passed(memory.heading_ns, now, least)
+            rests = {POSITION: not position, HEADING: not heading, POSE: not (position or heading)}
+            turns = tuple(turn for turn in turns if turn is None or not rests[turn])
+        return turns
+
+    def _others(
+        self, state: State, sightings: Iterable[Sighting], now_ns: int
+    ) -> tuple[list[Measured], list[str]]:
+        """The usable ones of these sightings, and the faults of those that have one."""
+        memory, pose = state.memory, state.estimate.pose
         seen, faults = [], []
         bias = memory.learned.bearing_bias_rad if self._rules.self_calibration else 0.0
-        for sighting in frame.sightings:
+        for sighting in sightings:
             fault = sighting_fault(sighting)
             if fault:
                 faults.append(fault)
                 continue
-            m = measured(sighting, now, pose, self.field, memory.teammates, self.settings)
+            m = measured(sighting, now_ns, pose, self.field, memory.teammates, self.settings)
             if m is not None:
                 seen.append(m if bias == 0.0 else m.turned(-bias))
-        memory = recovery.with_seen(state, seen).counted(*faults)
-        if memory is not state.memory:
-            state = state._replace(memory=memory)
+        return seen, faults
+
+    def _resting(self, memory: Memory, now_ns: int) -> set[str]:
+        """The objects that were used too short a time ago."""
+        least = self._rules.object_interval_s * 1e9
+        return {name for name, ns in memory.objects_ns.items() if not _passed(ns, now_ns, least)}
+
+    def _fresh(self, memory: Memory, seen: list[Measured], now_ns: int) -> list[Measured]:
+        """Without those of objects that rest; those of one that was used not long ago count for
+        less: their errors are correlated."""
         least, used_ns = self._rules.object_interval_s * 1e9, memory.objects_ns.get
-        fresh = [m for m in seen if _passed(used_ns(m.source), now, least)]
+        fresh = [m for m in seen if _passed(used_ns(m.source), now_ns, least)]
         if self._correlated:
-            fresh = [m.doubted(self._repeated(memory, m.source, now)) for m in fresh]
-        return state, fresh
+            fresh = [m.doubted(self._repeated(memory, m.source, now_ns)) for m in fresh]
+        return fresh
 
     def _repeated(self, memory: Memory, source: str, now_ns: int) -> float:
         """By how much the variance of what this source says now is to grow."""
@@ -167,49 +226,28 @@ class Localizer:
         seconds = None if last_ns is None else (now_ns - last_ns) * 1e-9
         return repeated_share(seconds, self.settings.sensor.correlation_s)
 
-    def _turn(self, state: State, seen: list[Measured]) -> Scope | None:
-        """Heading or position, the one that waits longer; one timer a type. None: neither."""
-        if state.memory.lost and state.estimate.heading_sigma_rad > UNSTEERABLE_SIGMA_RAD:
-            return None
-        memory, now, rules = state.memory, state.stamp_ns, self._rules
-        least = rules.minimum_interval_s * 1e9
-        by_range = [m for m in seen if m.range_m is not None]
-        by_bearing = [m for m in seen if m.bearing is not None]
-        rays = rules.bearing_for_position and [m for m in by_bearing if m.gives_point_bearing]
-        position = bool(by_range or rays) and _passed(memory.position_ns, now, least)
-        heading = bool(by_bearing) and _passed(memory.heading_ns, now, least)
-        if not self._alternates:
-            return POSE if position or heading else None
-        if position and heading:
-            return POSITION if memory.heading_is_latest else HEADING
-        return POSITION if position else HEADING if heading else None
-
     # Steps 4 and 5 ----------------------------------------------------------------------------
 
-    def _gated(
-        self, prior: Estimate, found: list[tuple[Measured, list[Constraint]]]
-    ) -> tuple[list[tuple[Measured, list[Constraint]]], int]:
-        """The objects whose innovation the prior's chi-square bound accepts; the others' number."""
+    def _gated(self, prior: Estimate, seen: list[Measured], turn: Scope) -> tuple[list[Found], int]:
+        """The constraints of those objects whose innovation the prior's chi-square bound accepts;
+        the others' number."""
         accepted, rejected = [], 0
-        for m, cs in sorted([f for f in found if f[1]], key=_source):
-            if surprise(prior, m, cs) <= self._gates[len(cs) - 1]:
+        for m in sorted(seen, key=_source):
+            cs = constraints_of(prior.pose, m, turn, self._rules)
+            if cs and surprise(prior, m, cs) <= self._gates[len(cs) - 1]:
                 accepted.append((m, cs))
-            else:
+            elif cs:
                 rejected += 1
         return accepted, rejected
 
     def _reduced(self, estimate: Estimate) -> Estimate:
         """The estimate in the form that the variant keeps."""
-        if self._rules.variant == "joint":
+        if self._joint:
             return estimate
         if self._rules.paper_uncertainty:
             covariance = estimate.covariance._replace(xh=0.0, yh=0.0)
             estimate = estimate._replace(covariance=covariance)
         return with_all_shared(estimate if self._rules.variant == "oval" else circular(estimate))
-
-    def _scope(self, turn: Scope) -> Scope:
-        """What an update may move: in `joint` the whole pose, whatever type it is of."""
-        return POSE if self._rules.variant == "joint" else turn
 
     # Teammates --------------------------------------------------------------------------------
 
@@ -238,7 +276,7 @@ class Localizer:
         both = sensor if observer is None else sensor + observer
         piece = recovery.told_evidence(state, source, x, y, both, by_teammate=observer is not None)
         memory, prior = recovery.remembered(state.memory, [piece]), state.estimate
-        state = state._replace(memory=memory)
+        state = replace(state, memory=memory)
         least = self._rules.object_interval_s * 1e9
         if not _passed(memory.objects_ns.get(source), stamp_ns, least):
             return state
@@ -248,7 +286,7 @@ class Localizer:
         seen = Observation(_AXES, offset, sensor, observer or Covariance2(0.0, 0.0, 0.0))
         if seen.normalized_innovation_squared(prior.covariance) > self._gates[1]:
             return self._judged(self._updated(state, prior, None, [], 1))
-        scope = self._scope(POSITION)
+        scope = POSE if self._joint else POSITION
         if self._weighted:
             estimate = weighted.averaged(prior, offset, None, self._rules.weights)
         elif observer is None:
@@ -262,12 +300,12 @@ class Localizer:
         """Passive collaboration: keeps a teammate's belief, to use it when the teammate is seen."""
         state = self.moved(state, belief.stamp_ns)
         teammates = {**state.memory.teammates, belief.robot: belief}
-        return state._replace(memory=state.memory._replace(teammates=teammates))
+        return replace(state, memory=replace(state.memory, teammates=teammates))
 
     def tell(self, state: State, event: Told) -> State:
         """This robot's belief goes to a teammate: it may come back."""
         state = self.moved(state, event.stamp_ns)
-        return state._replace(estimate=told(state.estimate))
+        return replace(state, estimate=told(state.estimate))
 
     # The start, being lost, the way back --------------------------------------------------------
 
@@ -295,62 +333,63 @@ class Localizer:
         rejected: int,
     ) -> State:
         """The new estimate, with timers, windows and counts of an update of a type by sources."""
-        memory, now = state.memory, state.stamp_ns
+        now, memory = state.stamp_ns, state.memory
         used = dict.fromkeys(sources, now)
-        window = memory.innovations + (True,) * len(used) + (False,) * rejected
+        n = len(used)
         # An attempt passes the turn on, an update starts the type's timer.
-        position = used and (turn is POSITION or turn is POSE)
-        heading = used and (turn is HEADING or turn is POSE)
-        memory = memory._replace(
+        position = n and (turn is POSITION or turn is POSE)
+        heading = n and (turn is HEADING or turn is POSE)
+        memory = replace(
+            memory,
             position_ns=now if position else memory.position_ns,
             heading_ns=now if heading else memory.heading_ns,
             heading_is_latest=memory.heading_is_latest if turn is None else turn is HEADING,
             objects_ns={**memory.objects_ns, **used},
-            innovations=window[-self._rules.lost_window :],
-            counts=added(memory.counts, accepted=len(used), gated=rejected),
+            innovations=innovated(memory.innovations, n, rejected, self._rules.lost_window),
+            accepted=memory.accepted + n,
+            gated=memory.gated + rejected,
         )
-        _, _, reckoned, motion, odometry_ns, _ = state
-        if used and self._rules.self_calibration:
-            memory = self._taught(Anchor(now, estimate, reckoned), memory)
-        return State(now, estimate, reckoned, motion, odometry_ns, memory)
+        if n and self._rules.self_calibration:
+            memory = self._taught(Anchor(now, estimate, state.odometry_from_robot), memory)
+        return replace(state, estimate=estimate, memory=memory)
 
     def _taught(self, here: Anchor, memory: Memory) -> Memory:
         """What the robot has learned of its odometry and bearings, from this update too."""
         if memory.anchors is None or memory.lost:
-            return memory._replace(anchors=None if memory.lost else Anchors(here, here))
+            return replace(memory, anchors=None if memory.lost else Anchors(here, here))
         known, anchors = learned(memory.learned, memory.anchors, here, self.settings.odometry)
-        return memory._replace(learned=known, anchors=anchors)
+        return replace(memory, learned=known, anchors=anchors)
 
     def _judged(self, state: State) -> State:
         """Lost or not. If lost: found again from recent evidence, else in more and more doubt."""
         memory, now = state.memory, state.stamp_ns
         reason = recovery.lost_reason(state.estimate, memory, self._rules)
         if not reason:
-            return state._replace(memory=memory._replace(lost="")) if memory.lost else state
+            return replace(state, memory=replace(memory, lost="")) if memory.lost else state
         if not memory.lost:
-            memory = memory._replace(widened_ns=now).counted("lost")
-        memory = memory._replace(lost=reason)
-        refusing = memory.innovations[-1:] == (False,)
+            memory = replace(memory, widened_ns=now).counted("lost")
+        memory = replace(memory, lost=reason)
+        refusing = memory.innovations & 1 == 0
         # What was seen before the refusals began may have been seen from elsewhere.
         since_ns = max(memory.objects_ns.values(), default=0) if refusing else 0
         evidence = tuple(e for e in memory.evidence if e.stamp_ns > since_ns)
         found = None
         if evidence and evidence[-1].stamp_ns > memory.sought_ns:
-            memory = memory._replace(sought_ns=evidence[-1].stamp_ns)
+            memory = replace(memory, sought_ns=evidence[-1].stamp_ns)
             found = recovery.relocalized(evidence, state.odometry_from_robot, self.field)
         if found is not None:
-            memory = memory._replace(lost="", innovations=(), anchors=None).counted("found_again")
-            return state._replace(estimate=self._reduced(found), memory=memory)
+            memory = replace(memory, lost="", innovations=1, anchors=None).counted("found_again")
+            return replace(state, estimate=self._reduced(found), memory=memory)
         estimate = state.estimate
         if refusing and now - memory.widened_ns >= recovery.WIDEN_NS:
             estimate = recovery.widened(estimate, self._rules)
-            memory = memory._replace(widened_ns=now)
-        return state._replace(estimate=estimate, memory=memory)
+            memory = replace(memory, widened_ns=now)
+        return replace(state, estimate=estimate, memory=memory)
 
 
 def _passed(last_ns: int | None, now_ns: int, least_ns: float) -> bool:
     return last_ns is None or now_ns - last_ns >= least_ns
 
 
-def _source(found: tuple[Measured, list[Constraint]]) -> str:
-    return found[0].source
+def _source(m: Measured) -> str:
+    return m.source

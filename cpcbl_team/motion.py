@@ -5,13 +5,11 @@ compounding with respect to both. Motion noise is white, so its variance grows w
 """
 
 import math
-from operator import add
+from math import cos, remainder, sin, tau
 
 from cpcbl_team.config import OdometryNoise
-from cpcbl_team.estimate import ZERO3, Covariance3, Estimate, Matrix3
-from cpcbl_team.geometry import Pose2, wrap_angle
-
-_Entries = tuple[float, float, float, float, float, float]  # of a Covariance3
+from cpcbl_team.estimate import ZERO3, Covariance3, Estimate, Matrix3, circle_variance
+from cpcbl_team.geometry import Pose2, new
 
 
 def motion_jacobian(heading: float, distance: float, turn: float) -> Matrix3:
@@ -32,60 +30,39 @@ def motion_jacobian(heading: float, distance: float, turn: float) -> Matrix3:
 
 def motion_noise(heading: float, distance: float, turn: float, noise: OdometryNoise) -> Covariance3:
     """The differential motion's covariance, rotated into the field's frame."""
+    certain = Estimate(Pose2(0.0, 0.0, heading), ZERO3)
+    return move(certain, distance, turn, noise).covariance
+
+
+def move(
+    estimate: Estimate, distance: float, turn: float, noise: OdometryNoise, as_circle: bool = False
+) -> Estimate:
+    """The estimate after the wheels report an arc of `distance` metres that turns by `turn`.
+
+    F P F^T + C is written out, for it runs for every odometry step. `as_circle`: the position's
+    covariance is kept as a circle.
+    """
+    (x, y, heading), (xx, xy, yy, xh, yh, hh), shared = estimate
     direction = heading + 0.5 * turn
-    return Covariance3(
-        *_noise_along(math.cos(direction), math.sin(direction), distance, turn, noise)
-    )
-
-
-def _noise_along(
-    c: float, s: float, distance: float, turn: float, noise: OdometryNoise
-) -> _Entries:
-    """The noise of an arc whose chord has the direction with cosine `c` and sine `s`."""
-    way = abs(distance)
-    turned = abs(turn)
-    along = (
-        noise.distance_sigma_m_per_sqrt_m**2 * way + noise.distance_sigma_m_per_sqrt_rad**2 * turned
-    )
-    around = (
-        noise.turn_sigma_rad_per_sqrt_rad**2 * turned + noise.turn_sigma_rad_per_sqrt_m**2 * way
-    )
-    lx, ly = -0.5 * distance * s, 0.5 * distance * c  # where a turn error leads
-    return (
-        along * c * c + around * lx * lx,
-        along * c * s + around * lx * ly,
-        along * s * s + around * ly * ly,
-        around * lx,
-        around * ly,
-        around,
-    )
-
-
-def move(estimate: Estimate, distance: float, turn: float, noise: OdometryNoise) -> Estimate:
-    """The estimate after the wheels report an arc of `distance` metres that turns by `turn`."""
-    pose, covariance, shared = estimate
-    x, y, heading = pose
-    direction = heading + 0.5 * turn
-    c, s = math.cos(direction), math.sin(direction)
-    # where a heading error of one radian leads, in metres: the last column of the Jacobian
+    c, s = cos(direction), sin(direction)
+    way, turned = abs(distance), abs(turn)
+    per_m, per_rad = noise.distance_sigma_m_per_sqrt_m, noise.distance_sigma_m_per_sqrt_rad
+    along = per_m * per_m * way + per_rad * per_rad * turned
+    per_m, per_rad = noise.turn_sigma_rad_per_sqrt_m, noise.turn_sigma_rad_per_sqrt_rad
+    around = per_m * per_m * way + per_rad * per_rad * turned
+    # where a heading error of one radian leads, in metres: the last column of F
     lx, ly = -distance * s, distance * c
-    return Estimate(
-        Pose2(x + distance * c, y + distance * s, wrap_angle(heading + turn)),
-        Covariance3(
-            *map(add, _sheared(covariance, lx, ly), _noise_along(c, s, distance, turn, noise))
-        ),
-        shared if shared is ZERO3 else Covariance3(*_sheared(shared, lx, ly)),
-    )
-
-
-def _sheared(p: Covariance3, lx: float, ly: float) -> _Entries:
-    """F P F^T for F = [1 0 lx; 0 1 ly; 0 0 1], written out: it runs for every odometry step."""
-    xx, xy, yy, xh, yh, hh = p
-    return (
-        xx + lx * (2.0 * xh + lx * hh),
-        xy + lx * yh + ly * xh + lx * ly * hh,
-        yy + ly * (2.0 * yh + ly * hh),
-        xh + lx * hh,
-        yh + ly * hh,
-        hh,
-    )
+    # where a turn error leads: half of it; and its covariance with the position
+    wx, wy = 0.5 * around * lx, 0.5 * around * ly
+    nxh, nyh = xh + lx * hh, yh + ly * hh
+    xx += lx * (xh + nxh + 0.5 * wx) + along * c * c
+    xy += lx * yh + ly * nxh + 0.5 * lx * wy + along * c * s
+    yy += ly * (yh + nyh + 0.5 * wy) + along * s * s
+    xh, yh, hh = nxh + wx, nyh + wy, hh + around
+    if as_circle:
+        xx = yy = circle_variance(xx, xy, yy, xh, yh, hh)
+        xy = 0.0
+    if shared is not ZERO3:
+        shared = shared.transformed(motion_jacobian(heading, distance, turn))
+    pose = new(Pose2, (x + ly, y - lx, remainder(heading + turn, tau)))
+    return new(Estimate, (pose, new(Covariance3, (xx, xy, yy, xh, yh, hh)), shared))

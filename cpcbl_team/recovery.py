@@ -7,7 +7,9 @@ An ambiguous answer is no answer.
 """
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator, Sequence
+
+from msgspec.structs import replace
 
 from cpcbl_team.config import Field, LocalizerSettings
 from cpcbl_team.constraints import Constraint, bearing_heading, range_circle
@@ -56,48 +58,70 @@ def told_evidence(
     return Evidence(now, pose, source, x, y, None, None, 0.0, 0.0, sigma, by_teammate)
 
 
-def remembered(memory: Memory, pieces: Iterable[Evidence]) -> Memory:
-    """The memory with new evidence, without what is too old or too alike."""
-    kept = list(memory.evidence)
-    latest_ns = {e.source: e.stamp_ns for e in kept}
+def remembered(memory: Memory, pieces: Sequence[Evidence]) -> Memory:
+    """The memory with new evidence of one time, without what is too old or too alike."""
+    now = pieces[0].stamp_ns
+    recent = _recent(memory.evidence, now)
+    latest = {e.source: e for e in recent}
+    new = []
     for piece in pieces:
-        latest = latest_ns.get(piece.source)
-        if latest is None or piece.stamp_ns - latest >= SPACING_NS:
-            kept.append(piece)
-            latest_ns[piece.source] = piece.stamp_ns
-    if len(kept) == len(memory.evidence):
+        if piece.source not in latest:
+            latest[piece.source] = piece
+            new.append(piece)
+    if not new:
         return memory
-    kept = [e for e in kept if kept[-1].stamp_ns - e.stamp_ns <= WINDOW_NS]
-    return memory._replace(evidence=tuple(kept[-MOST_PIECES:]))
+    kept = (*memory.evidence, *new)[-MOST_PIECES:]
+    if now - kept[0].stamp_ns > WINDOW_NS:
+        kept = tuple(e for e in kept if now - e.stamp_ns <= WINDOW_NS)
+    oldest_ns = recent[-1].stamp_ns if recent else now
+    return replace(
+        memory, evidence=kept, noted=frozenset(latest), noted_until_ns=oldest_ns + SPACING_NS
+    )
 
 
-def with_seen(state: State, seen: Iterable[Measured]) -> Memory:
-    """The memory with those of a frame's sightings that are not too alike to what it holds."""
-    now, memory = state.stamp_ns, state.memory
-    recent = set()
-    for e in reversed(memory.evidence):
-        if now - e.stamp_ns >= SPACING_NS:
+def _recent(evidence: Sequence[Evidence], now_ns: int) -> list[Evidence]:
+    """Of which no more is needed yet, the latest first."""
+    recent = []
+    for e in reversed(evidence):
+        if now_ns - e.stamp_ns >= SPACING_NS:
             break
-        recent.add(e.source)
-    new = [m for m in seen if m.source not in recent and m.usable and m.wall is None]
-    return remembered(memory, [seen_evidence(state, m) for m in new]) if new else memory
+        recent.append(e)
+    return recent
+
+
+def noted(memory: Memory, now_ns: int) -> frozenset[str]:
+    """The sources of which no more evidence is needed yet."""
+    if now_ns < memory.noted_until_ns:
+        return memory.noted
+    return frozenset(e.source for e in _recent(memory.evidence, now_ns))
+
+
+def with_seen(state: State, seen: Sequence[Measured], pieces: Sequence[Evidence] = ()) -> Memory:
+    """The memory with these pieces and those of a frame's other sightings that are not too alike
+    to what it holds."""
+    if seen:
+        recent = noted(state.memory, state.stamp_ns)
+        new = [m for m in seen if m.source not in recent and m.usable and m.wall is None]
+        pieces = [*pieces, *(seen_evidence(state, m) for m in new)]
+    return remembered(state.memory, pieces) if pieces else state.memory
 
 
 def lost_reason(estimate: Estimate, memory: Memory, settings: LocalizerSettings) -> str:
     """Why the robot is lost; empty if it is not. Being lost ends at half of each limit."""
     slack = 0.5 if memory.lost else 1.0
-    position = estimate.position_sigma_m
-    if position > slack * settings.lost_position_sigma_m:
-        return f"position sigma {position:.2f} m"
-    heading = math.degrees(estimate.heading_sigma_rad)
-    if heading > slack * settings.lost_heading_sigma_deg:
-        return f"heading sigma {heading:.0f} deg"
-    window = memory.innovations[-settings.lost_window :]
-    rejected = window.count(False)
-    if len(window) >= settings.lost_window // 2 and (
-        rejected > slack * settings.lost_share * settings.lost_window
-    ):
-        return f"{rejected} of the last {len(window)} innovations rejected"
+    most_m, most_deg = (
+        slack * settings.lost_position_sigma_m,
+        slack * settings.lost_heading_sigma_deg,
+    )
+    xx, _, yy, _, _, hh = estimate.covariance
+    if 0.5 * (xx + yy) > most_m * most_m:
+        return f"position sigma {estimate.position_sigma_m:.2f} m"
+    if hh > math.radians(most_deg) ** 2:
+        return f"heading sigma {math.degrees(estimate.heading_sigma_rad):.0f} deg"
+    digits, length = memory.innovations.bit_length(), settings.lost_window
+    rejected = digits - memory.innovations.bit_count()
+    if digits > length // 2 and rejected > slack * settings.lost_share * length:
+        return f"{rejected} of the last {digits - 1} innovations rejected"
     return ""
 
 

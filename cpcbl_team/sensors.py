@@ -92,6 +92,12 @@ def _fault(sighting: Sighting) -> str:
     return "sigma_not_positive"
 
 
+def range_to_expect(expected_m: float, range_m: float) -> float:
+    """The expected range, within a factor of two of the reading."""
+    least, most = 0.5 * range_m, 2.0 * range_m
+    return least if expected_m < least else most if expected_m > most else expected_m
+
+
 def sighting_sigmas(
     sighting: Sighting, sensor: SensorSettings, expected_range_m: float | None = None
 ) -> tuple[float, float]:
@@ -105,8 +111,7 @@ def sighting_sigmas(
     if range_sigma is None:
         range_m = sighting.range_m or 0.0
         if expected_range_m is not None:
-            least, most = 0.5 * range_m, 2.0 * range_m
-            range_m = min(max(expected_range_m, least), most)
+            range_m = range_to_expect(expected_range_m, range_m)
         range_sigma = sensor.range_sigma_m(range_m)
     return range_sigma, sensor.bearing_sigma_rad if bearing_sigma is None else bearing_sigma
 

@@ -1,7 +1,7 @@
 """Steps 2 to 4 of the cycle: from sightings to measurements, to constraints, to one evidence."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from functools import lru_cache
 
 import msgspec
@@ -66,6 +66,9 @@ class Measured(msgspec.Struct, frozen=True, gc=False):
         return self.bearing is not None and self.wall is None
 
 
+Found = tuple[Measured, list[Constraint]]
+
+
 def measured(
     sighting: Sighting,
     stamp_ns: int,
@@ -112,6 +115,15 @@ def _expected_range(pose: Pose2, place: Place, wall: Wall | None) -> float:
     return abs(dy * math.cos(direction) - dx * math.sin(direction))
 
 
+def offers(m: Measured, turn: Scope | None, rules: LocalizerSettings) -> bool:
+    """Whether an object says anything about what is to be updated."""
+    if turn is POSITION:
+        return m.range_m is not None or (rules.bearing_for_position and m.gives_point_bearing)
+    if turn is HEADING:
+        return m.bearing is not None
+    return turn is not None and m.usable
+
+
 def constraints_of(
     pose: Pose2, m: Measured, turn: Scope, rules: LocalizerSettings
 ) -> list[Constraint]:
@@ -137,9 +149,12 @@ def constraints_of(
     return found
 
 
-def combined(accepted: list[Constraint]) -> Information:
-    """Step 4: the Gaussians at the closest points of all constraints, as one."""
-    return Information.none().with_all([(c.row, c.residual, c.sigma * c.sigma) for c in accepted])
+def combined(evidence: Information, accepted: Iterable[Found]) -> Information:
+    """Step 4: the Gaussians at the closest points of all constraints on the map's objects, as one
+    with `evidence`."""
+    return evidence.with_all(
+        (c.row, c.residual, c.sigma * c.sigma) for m, cs in accepted if not m.teammate for c in cs
+    )
 
 
 def surprise(prior: Estimate, m: Measured, cs: list[Constraint]) -> float:

@@ -5,6 +5,9 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
+import msgspec
+from msgspec.structs import replace
+
 from cpcbl_team.estimate import Estimate
 from cpcbl_team.geometry import Pose2
 from cpcbl_team.inputs import Belief, Odometry
@@ -13,10 +16,14 @@ from cpcbl_team.self_calibration import Anchors, Learned
 _NONE: Mapping[str, Any] = MappingProxyType({})
 
 
-def added(counts: Mapping[str, int], **more: int) -> Mapping[str, int]:
-    """The counts with these more of each reason."""
-    total = {reason: counts.get(reason, 0) + n for reason, n in more.items() if n}
-    return {**counts, **total}
+def innovated(window: int, accepted: int, rejected: int, length: int) -> int:
+    """The window of innovations after these more: the last `length`, the latest in the lowest bit.
+
+    A bit each, set for an accepted one, after a leading bit that is always set: 1 is empty.
+    """
+    window = ((window + 1 << accepted) - 1) << rejected
+    full = 1 << length
+    return window if window < full else full | window & full - 1
 
 
 class Evidence(NamedTuple):
@@ -35,30 +42,38 @@ class Evidence(NamedTuple):
     told: bool  # by a teammate
 
 
-class Memory(NamedTuple):
+class Memory(msgspec.Struct, frozen=True, gc=False):
     """What only changes when something is seen or told."""
 
     position_ns: int | None = None  # last update of the type
     heading_ns: int | None = None
     heading_is_latest: bool = False
     objects_ns: Mapping[str, int] = _NONE  # last use of each object
+    innovations: int = 1  # accepted or not; see `innovated`
+    accepted: int = 0  # observations since the start
+    gated: int = 0
     teammates: Mapping[str, Belief] = _NONE
-    innovations: tuple[bool, ...] = ()  # accepted or not, the latest last
     evidence: tuple[Evidence, ...] = ()
+    noted: frozenset[str] = frozenset()  # the sources of which no more is needed yet,
+    noted_until_ns: int = 0  # until then
     lost: str = ""  # the reason, empty when the robot knows where it is
     widened_ns: int = 0
     sought_ns: int = -1  # the newest evidence with which it sought itself in vain
-    counts: Mapping[str, int] = _NONE
+    events: Mapping[str, int] = _NONE  # number of each other thing that is counted
     learned: Learned = Learned()
     anchors: Anchors | None = None
 
-    def counted(self, *reasons: str) -> "Memory":
-        if not reasons:
-            return self
-        return self._replace(counts=added(self.counts, **Counter(reasons)))
+    def counted(self, *events: str) -> "Memory":
+        return replace(self, events=Counter(self.events) + Counter(events)) if events else self
+
+    @property
+    def counts(self) -> Mapping[str, int]:
+        """How often each thing has happened that has happened at all."""
+        used = {"accepted": self.accepted, "gated": self.gated}
+        return {name: n for name, n in {**used, **self.events}.items() if n}
 
 
-class State(NamedTuple):
+class State(msgspec.Struct, frozen=True, gc=False):
     """The localizer's state at `stamp_ns`."""
 
     stamp_ns: int

@@ -22,6 +22,7 @@ from core_helpers import (
     sensor_noise,
     state_at,
 )
+from msgspec.structs import replace
 
 from cpcbl_team.collaboration import Place
 from cpcbl_team.config import (
@@ -49,7 +50,7 @@ from cpcbl_team.recovery import (
     with_seen,
 )
 from cpcbl_team.sightings import Measured
-from cpcbl_team.state import Evidence, Memory, State
+from cpcbl_team.state import Evidence, Memory, State, innovated
 
 ORIGIN = Pose2(0.0, 0.0, 0.0)
 RULES = LocalizerSettings()
@@ -98,7 +99,7 @@ def test_a_robot_is_lost_by_its_own_uncertainty(
 def test_a_robot_is_lost_when_most_of_what_it_sees_is_rejected(
     rejected: int, accepted: int, reason: str
 ) -> None:
-    memory = Memory(innovations=(False,) * rejected + (True,) * accepted)
+    memory = Memory(innovations=innovated(1, accepted, rejected, 20))
     assert lost_reason(Estimate(ORIGIN, diagonal(0.1, 0.1)), memory, RULES) == reason
 
 
@@ -277,8 +278,8 @@ def test_an_object_that_was_seen_a_short_time_ago_is_no_new_evidence(
     age_ns: int, kept: list[str]
 ) -> None:
     state = state_at(ORIGIN, diagonal(0.1, 0.1), stamp_ns=SECOND)
-    state = state._replace(
-        memory=Memory(evidence=(piece(SECOND - age_ns, ORIGIN, "ne", 4.5, 2.5),))
+    state = replace(
+        state, memory=Memory(evidence=(piece(SECOND - age_ns, ORIGIN, "ne", 4.5, 2.5),))
     )
     place, both = Place(4.5, 2.5, Covariance2(0.0, 0.0, 0.0)), (5.0, 0.5)
     seen = [Measured(name, place, None, False, *both, 0.1, 0.1) for name in ("ne", "ne")]
@@ -370,7 +371,7 @@ def test_an_overconfident_robot_with_one_landmark_does_not_reject_it_for_ever(
     state = state_at(Pose2(0.5, 1.0, -1.0), diagonal(0.02, 0.02))
     for i in range(1, 46):
         state = robot.cycle(state, frame(LOOP_START, i * SECOND // 3, names=["ne"]))
-    assert state.memory.innovations[-20:].count(True) >= 10
+    assert state.memory.innovations.bit_count() - 1 >= 10
 
 
 @pytest.mark.parametrize("own", [False, True], ids=["a teammate's fixes", "its own sensor"])
@@ -394,7 +395,9 @@ def test_a_lost_robot_is_found_by_its_places_along_the_way(variant: Variant, own
 def test_a_robot_says_why_it_is_lost_now() -> None:
     """Not why it was at first: the rejections are over, its heading is still unknown."""
     robot = localizer(rules=LocalizerSettings(variant="joint"))
-    memory = Memory(innovations=(True,) * 20, lost="13 of the last 20 innovations rejected")
-    state = state_at(ORIGIN, diagonal(0.1, 1.0))._replace(memory=memory)
+    memory = Memory(
+        innovations=innovated(1, 20, 0, 20), lost="13 of the last 20 innovations rejected"
+    )
+    state = replace(state_at(ORIGIN, diagonal(0.1, 1.0)), memory=memory)
     state = robot.cycle(state, Sightings(1, ()))
     assert state.memory.lost == "heading sigma 57 deg"

@@ -1,0 +1,220 @@
+"""What a frame of plain landmarks says: steps 2 to 4 of the cycle in one loop of plain numbers.
+
+Nearly everything that a robot sees is a point of the map, with the sensor model's own errors. For
+those the constraints of `constraints.py`, their gates and their sum are written out, without an
+object for each: that is what a cycle costs. Everything else (walls, teammates, sightings with a
+sigma of their own, faults) is handed back, for `sightings.py`. `tests/core/test_landmarks.py` holds
+the two together.
+"""
+
+import math
+from collections.abc import Container, Mapping, Sequence
+from math import atan2, cos, remainder, sin, sqrt, tau
+
+import msgspec
+
+from cpcbl_team.config import Field, Landmark, LocalizationSettings
+from cpcbl_team.constraints import NEAREST_M
+from cpcbl_team.estimate import (
+    HEADING,
+    POSE,
+    POSITION,
+    SMALLEST_VARIANCE,
+    Covariance3,
+    Information,
+    Row,
+    Scope,
+)
+from cpcbl_team.fusion import chi_square
+from cpcbl_team.geometry import new
+from cpcbl_team.inputs import Sighting
+from cpcbl_team.sensors import LARGEST_BEARING_RAD, LARGEST_M, range_to_expect
+from cpcbl_team.state import Evidence, State
+
+
+class Said(msgspec.Struct, frozen=True, gc=False):
+    """What the landmarks of a frame say."""
+
+    evidence: Information  # about the offset from the prior
+    used: list[str]
+    rejected: int  # by the gate
+    offered: bool  # anything of the type that was asked for, accepted or not
+    pieces: list[Evidence]  # for finding the robot again
+    others: list[Sighting]  # not plain
+
+
+Places = Mapping[str, tuple[float, float, bool, bool]]  # x, y, by range, by bearing
+
+
+class Landmarks:
+    """The plain landmarks of a map, as one robot's sensor and rules use them."""
+
+    def __init__(
+        self, field: Field, settings: LocalizationSettings, gates: tuple[float, float]
+    ) -> None:
+        """`gates`: chi-square bounds of one and of two constraints. No landmark is plain where the
+        rules ask for more than `read` does."""
+        rules, s = settings.localizer, settings.sensor
+        plain = rules.variant != "weighted" and not (
+            rules.paper_uncertainty or rules.self_calibration or s.correlation_s > 0.0
+        )
+        marks = field.landmarks if plain else {}
+        self._of_pose = _places(marks, ranges=True, bearings=True)
+        self._of_position = _places(marks, ranges=True, bearings=rules.bearing_for_position)
+        self._of_heading = _places(marks, ranges=False, bearings=True)
+        self._of_nothing = _places(marks, ranges=False, bearings=False)
+        self._gates = gates
+        self._range_model = s.range_share**2, s.range_floor_m**2, s.max_range_for_range_m
+        self._heading_weight = 1.0 / max(s.bearing_sigma_rad**2, SMALLEST_VARIANCE)
+        self._sine_squared = math.sin(min(s.bearing_sigma_rad, 0.5 * math.pi)) ** 2
+        self._bearing_sigma_rad = s.bearing_sigma_rad
+
+    def read(
+        self,
+        state: State,
+        sightings: Sequence[Sighting],
+        turn: Scope | None,
+        resting: Container[str],
+        noted: Container[str],
+    ) -> Said:
+        """What the landmarks among `sightings` say about position or heading, or about both.
+
+        All is linearized at the state's estimate. An object that is `resting` is not plain; one
+        that is `noted` is no new evidence. A range gives the row (u, v, 0), a bearing the row
+        (m, n, 1): about the heading as it is, about the position as a ray over the way ahead.
+        """
+        places, as_ray = self._places_for(turn), turn is POSITION
+        share, floor, farthest = self._range_model
+        sharp, sine_squared, (gate, _) = self._heading_weight, self._sine_squared, self._gates
+        (x, y, h), covariance, _ = state.estimate
+        axx = axy = ayy = axh = ayh = ahh = bx = by = bh = 0.0
+        rejected, offered = 0, False
+        used: list[str] = []
+        pieces: list[Evidence] = []
+        others: list[Sighting] = []
+        for seen in sightings:
+            name, range_m, bearing = seen.id, seen.range_m, seen.bearing_rad
+            place = places.get(name)
+            if (
+                place is None
+                or seen.range_sigma_m is not None
+                or seen.bearing_sigma_rad is not None
+                or name in resting
+                or not (range_m is None or 0.0 < range_m <= LARGEST_M)
+                or not (bearing is None or -LARGEST_BEARING_RAD <= bearing <= LARGEST_BEARING_RAD)
+                or (range_m is None and bearing is None)
+            ):
+                others.append(seen)
+                continue
+            px, py, by_range, by_bearing = place
+            dx, dy = px - x, py - y
+            q = dx * dx + dy * dy
+            d = sqrt(q)
+            if name not in noted:
+                piece = self._evidence(state, seen, d)
+                if piece:
+                    pieces.append(piece)
+            if not by_range or (range_m is not None and range_m > farthest):
+                range_m = None
+            if not by_bearing:
+                bearing = None
+            if range_m is None and bearing is None:
+                continue
+            offered = True
+            if d < NEAREST_M:
+                continue
+            # the constraints: rows, residuals and weights, which are zero for none
+            e = f = u = v = m = n = w = k = 0.0
+            if range_m is not None:  # a circle
+                u, v, e = -dx / d, -dy / d, range_m - d
+                due = d if 0.5 * range_m <= d <= 2.0 * range_m else range_to_expect(d, range_m)
+                w = share * due * due + floor
+                w = 1.0 / (w if w > SMALLEST_VARIANCE else SMALLEST_VARIANCE)
+            if bearing is None:
+                pass
+            elif not as_ray:  # a heading
+                m, n, k = -dy / q, dx / q, sharp
+                f = remainder(atan2(dy, dx) - bearing - h, tau)
+            else:  # a ray
+                direction = h + bearing
+                c, s = cos(direction), sin(direction)
+                ahead = c * dx + s * dy
+                if ahead >= NEAREST_M:
+                    m, n, f = -s / ahead, c / ahead, (c * dy - s * dx) / ahead
+                    k = q * sine_squared  # the ray's width, squared
+                    k = ahead * ahead / (k if k > SMALLEST_VARIANCE else SMALLEST_VARIANCE)
+                elif range_m is None:
+                    continue
+            # the gate, which all pass that the sensor's noise alone explains
+            if w * e * e + k * f * f > gate and self._refuses(
+                covariance, ((u, v, 0.0), e, w), ((m, n, 1.0), f, k)
+            ):
+                rejected += 1
+                continue
+            used.append(name)
+            # the sum
+            if range_m is not None:
+                wu, wv = w * u, w * v
+                axx += wu * u
+                axy += wu * v
+                ayy += wv * v
+                bx += wu * e
+                by += wv * e
+            if k:
+                km, kn = k * m, k * n
+                axx += km * m
+                axy += km * n
+                ayy += kn * n
+                axh += km
+                ayh += kn
+                ahh += k
+                bx += km * f
+                by += kn * f
+                bh += k * f
+        matrix = new(Covariance3, (axx, axy, ayy, axh, ayh, ahh))
+        return Said(Information(matrix, (bx, by, bh)), used, rejected, offered, pieces, others)
+
+    def _places_for(self, turn: Scope | None) -> Places:
+        if turn is POSE:
+            return self._of_pose
+        if turn is POSITION:
+            return self._of_position
+        return self._of_heading if turn is HEADING else self._of_nothing
+
+    def _refuses(self, prior: Covariance3, *constraints: tuple[Row, float, float]) -> bool:
+        """Whether the chi-square bound refuses an object's (row, residual, weight)."""
+        rows, residuals, weights = zip(*(c for c in constraints if c[2]), strict=True)
+        first, last = (1.0 / weights[i] + SMALLEST_VARIANCE for i in (0, -1))
+        surprise = chi_square(prior, (first, 0.0, last), rows, residuals)
+        return surprise > self._gates[len(rows) - 1]
+
+    def _evidence(self, state: State, seen: Sighting, due_m: float) -> Evidence | None:
+        """The sighting as evidence, if any of it is of use."""
+        name, range_m, bearing = seen.id, seen.range_m, seen.bearing_rad
+        x, y, by_range, by_bearing = self._of_pose[name]
+        share, floor, farthest = self._range_model
+        if not by_range or range_m is None or range_m > farthest:
+            range_m, sigma_m = None, 0.0
+        else:
+            due_m = range_to_expect(due_m, range_m)
+            sigma_m = sqrt(share * due_m * due_m + floor)
+        if not by_bearing:
+            bearing = None
+        if range_m is None and bearing is None:
+            return None
+        now, pose, sigma_rad = state.stamp_ns, state.odometry_from_robot, self._bearing_sigma_rad
+        piece = now, pose, name, x, y, range_m, bearing, sigma_m, sigma_rad, 0.0, False
+        return new(Evidence, piece)
+
+
+def _places(marks: Mapping[str, Landmark], *, ranges: bool, bearings: bool) -> Places:
+    """The landmarks, with what each gives of that which is wanted."""
+    return {
+        name: (
+            p.x_m,
+            p.y_m,
+            ranges and p.gives in ("both", "range"),
+            bearings and p.gives in ("both", "bearing"),
+        )
+        for name, p in marks.items()
+    }

@@ -1,0 +1,206 @@
+"""The one loop over plain landmarks says what the formulas of each constraint say, composed."""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+from core_helpers import (
+    CORNERS,
+    LOOP_START,
+    PROBABILISTIC,
+    SECOND,
+    covariance3,
+    localizer,
+    point_sighting,
+    random_matrix,
+    state_at,
+)
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from msgspec.structs import replace
+
+from cpcbl_team.config import (
+    Field,
+    Gives,
+    Landmark,
+    LocalizerSettings,
+    SensorSettings,
+    Variant,
+)
+from cpcbl_team.estimate import POSE, Estimate, Information, Scope, circular, merge
+from cpcbl_team.geometry import Pose2, wrap_angle
+from cpcbl_team.inputs import Sighting, Sightings
+from cpcbl_team.localizer import Localizer
+from cpcbl_team.sensors import sighting_fault
+from cpcbl_team.sightings import Measured, constraints_of, measured, offers, surprise
+from cpcbl_team.state import Memory, State
+
+NOW = 5 * SECOND
+NAMES = "abcde"
+gives = st.sampled_from(("both", "both", "both", "range", "bearing", "none"))
+errors = st.one_of(st.floats(-0.2, 0.2), st.sampled_from((0.0, 1.0, -1.0, 2.5)))
+marks = st.builds(Landmark, x_m=st.floats(-5.0, 5.0), y_m=st.floats(-5.0, 5.0), gives=gives)
+fields = st.lists(marks, min_size=1, max_size=len(NAMES)).map(
+    lambda found: Field(landmarks=dict(zip(NAMES, found, strict=False)))
+)
+kinds = st.sampled_from(3 * ("both",) + ("range", "bearing", "none", "nan", "own"))
+readings = st.lists(
+    st.tuples(kinds, errors, errors),
+    min_size=len(NAMES),
+    max_size=len(NAMES),
+)
+sensors = st.builds(
+    SensorSettings,
+    range_share=st.sampled_from((0.03, 0.2)),
+    range_floor_m=st.sampled_from((0.01, 0.0)),
+    bearing_sigma_deg=st.sampled_from((2.0, 20.0)),
+    max_range_for_range_m=st.sampled_from((1000.0, 3.0)),
+    correlation_s=st.sampled_from((0.0, 0.0, 0.0, 0.0, 1.0)),
+)
+rules = st.builds(
+    LocalizerSettings,
+    variant=st.sampled_from(PROBABILISTIC),
+    alternate=st.sampled_from((None, True, False)),
+    minimum_interval_s=st.sampled_from((0.0, 0.25)),
+    object_interval_s=st.sampled_from((0.0, 0.25)),
+    bearing_for_position=st.sampled_from((True, True, False)),
+    paper_uncertainty=st.sampled_from((False, False, False, False, True)),
+    gate_probability=st.sampled_from((0.999, 0.6)),
+)
+
+
+def read_as(exact: Sighting, kind: str, range_error: float, bearing_error: float) -> Sighting:
+    """A reading with these errors, one that lacks something, or one with a fault."""
+    assert exact.range_m is not None
+    assert exact.bearing_rad is not None
+    range_m, bearing = exact.range_m + range_error, wrap_angle(exact.bearing_rad + bearing_error)
+    return {
+        "both": Sighting(exact.id, range_m, bearing),
+        "range": Sighting(exact.id, range_m),
+        "bearing": Sighting(exact.id, None, bearing),
+        "none": Sighting(exact.id),
+        "nan": Sighting(exact.id, math.nan, bearing),
+        "own": Sighting(exact.id, range_m, bearing, 0.3, 0.1),
+    }[kind]
+
+
+def since(last_ns: int | None, seconds: float) -> bool:
+    return last_ns is None or NOW - last_ns >= seconds * 1e9
+
+
+def turn_of(robot: Localizer, memory: Memory, seen: Sequence[Measured]) -> Scope | None:
+    """The type that waits longer, of those that have anything; None: neither."""
+    r = robot.settings.localizer
+    last_ns = {Scope.POSITION: memory.position_ns, Scope.HEADING: memory.heading_ns}
+    ready = [
+        turn
+        for turn in (Scope.POSITION, Scope.HEADING)
+        if since(last_ns[turn], r.minimum_interval_s) and any(offers(m, turn, r) for m in seen)
+    ]
+    if not r.alternates:
+        return POSE if ready else None
+    if len(ready) == 2:
+        return ready[0] if memory.heading_is_latest else ready[1]
+    return ready[0] if ready else None
+
+
+def composed(robot: Localizer, state: State, frame: Sightings) -> tuple[Estimate, dict[str, int]]:
+    """One cycle among landmarks without motion, and its counts, formula by formula."""
+    r, prior, memory = robot.settings.localizer, state.estimate, state.memory
+    good = [s for s in frame.sightings if not sighting_fault(s)]
+    found = (measured(s, NOW, prior.pose, robot.field, {}, robot.settings) for s in good)
+    seen = [m for m in found if m and since(memory.objects_ns.get(m.source), r.object_interval_s)]
+    tau_s = robot.settings.sensor.correlation_s
+    if tau_s:
+        rho = math.exp(-0.1 / tau_s)
+        seen = [
+            m.doubted((1 + rho) / (1 - rho)) if m.source in memory.objects_ns else m for m in seen
+        ]
+    counts = {"accepted": 0, "gated": 0}
+    turn, evidence = turn_of(robot, memory, seen), Information.none()
+    for m in seen if turn else ():
+        assert turn is not None
+        cs = constraints_of(prior.pose, m, turn, r)
+        bound = -2.0 * math.log(1.0 - r.gate_probability)
+        if len(cs) == 1:
+            bound = robot._gates[0]
+        if cs and surprise(prior, m, cs) > bound:
+            counts["gated"] += 1
+        elif cs:
+            counts["accepted"] += 1
+            for c in cs:
+                evidence = evidence.add(c.row, c.residual, c.sigma**2)
+    if turn is None:
+        return prior, counts
+    after = merge(prior, evidence, POSE if r.variant == "joint" else turn)
+    if r.paper_uncertainty and r.variant != "joint":
+        after = after._replace(covariance=after.covariance._replace(xh=0.0, yh=0.0))
+    return circular(after) if r.variant == "circular" else after, counts
+
+
+@settings(max_examples=400)
+@given(fields, readings, sensors, rules, st.integers(0, 2**32 - 1))
+def test_a_frame_says_what_its_constraints_say_one_by_one(
+    field: Field,
+    kinds: list[tuple[str, float, float]],
+    sensor: SensorSettings,
+    rules: LocalizerSettings,
+    seed: int,
+) -> None:
+    rng = np.random.default_rng(seed)
+    robot = localizer(field=field, rules=rules, sensor=sensor)
+    true = Pose2(*rng.uniform(-3.0, 3.0, size=3))
+    covariance = covariance3(10.0 ** rng.uniform(-4.0, -1.0) * random_matrix(rng, 3))
+    if rules.variant == "circular":
+        covariance = circular(Estimate(true, covariance)).covariance
+    before = NOW - SECOND // 10
+    memory = Memory(
+        position_ns=before if rng.random() < 0.5 else None,
+        heading_is_latest=bool(rng.random() < 0.5),
+        objects_ns={name: before for name in NAMES if rng.random() < 0.5},
+    )
+    if not rules.alternates:
+        memory = replace(memory, heading_ns=memory.position_ns)  # there one timer is both
+    state = replace(state_at(true, covariance, NOW), memory=memory)
+    exact = [point_sighting(true, n, p.x_m, p.y_m) for n, p in field.landmarks.items()]
+    seen = [read_as(s, *kind) for s, kind in zip(exact, kinds, strict=False)]
+    frame = Sightings(NOW, tuple(seen))
+
+    expected, counts = composed(robot, state, frame)
+    after = robot.cycle(state, frame)
+    assert after.estimate.pose == pytest.approx(expected.pose, rel=1e-9, abs=1e-9)
+    assert after.estimate.covariance == pytest.approx(expected.covariance, rel=1e-9, abs=1e-9)
+    assert (after.memory.accepted, after.memory.gated) == (counts["accepted"], counts["gated"])
+    assert sum(after.memory.events.get(e, 0) for e in ("not_finite", "empty_sighting")) == sum(
+        kind in ("none", "nan") for kind, *_ in kinds[: len(exact)]
+    )
+
+
+@pytest.mark.parametrize("given", ["both", "range", "bearing"])
+@pytest.mark.parametrize("variant", PROBABILISTIC)
+def test_new_evidence_is_that_of_a_measurement(variant: Variant, given: Gives) -> None:
+    field = Field(landmarks={"post": Landmark(x_m=1.0, y_m=2.0, gives=given)})
+    robot = localizer(variant, field)
+    seen = Sighting("post", 5.0, 0.3)  # farther than it can be
+    state = state_at(LOOP_START, covariance3(0.1 * np.eye(3)), NOW)
+    (piece,) = robot.cycle(state, Sightings(NOW, (seen,))).memory.evidence
+    m = measured(seen, NOW, LOOP_START, field, {}, robot.settings)
+    assert m is not None
+    assert (piece.source, piece.x, piece.y) == ("post", 1.0, 2.0)
+    assert (piece.range_m, piece.bearing_rad) == (m.range_m, m.bearing)
+    assert not piece.told
+    if m.range_m is not None:
+        assert piece.range_sigma_m == pytest.approx(m.range_sigma, rel=1e-12)
+    assert piece.bearing_sigma_rad == pytest.approx(m.bearing_sigma, rel=1e-12)
+
+
+def test_a_plain_landmark_is_not_measured_the_general_way(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Or else the test above would compare the general way with itself."""
+    monkeypatch.setattr("cpcbl_team.localizer.measured", lambda *_: pytest.fail("general"))
+    for variant in PROBABILISTIC:
+        state = state_at(LOOP_START, covariance3(0.1 * np.eye(3)), NOW)
+        robot = localizer(variant)
+        exact = (point_sighting(LOOP_START, n, p.x_m, p.y_m) for n, p in CORNERS.landmarks.items())
+        after = robot.cycle(state, Sightings(NOW, tuple(exact)))
+        assert after.memory.accepted == 4
