@@ -18,6 +18,7 @@ from bus_helpers import (
 )
 from hypothesis import given
 from hypothesis import strategies as st
+from msgspec.structs import replace
 
 from cpcbl_agents.node import INBOX, Node
 from cpcbl_agents.robot import Robot
@@ -555,7 +556,7 @@ def test_the_status_of_a_robot_that_learns_says_what() -> None:
     stand = Stand(with_robot(two_robots(), "me", localizer=learning))
     for robot in stand.robots.values():
         timeline = robot.filter.timeline
-        memory = timeline.state.memory._replace(learned=Learned(0.98, 0.96, 0.01))
-        timeline.state = timeline.state._replace(memory=memory)
+        memory = replace(timeline.state.memory, learned=Learned(0.98, 0.96, 0.01))
+        timeline.state = replace(timeline.state, memory=memory)
     assert stand.status("me").learned == (0.98, 0.96, 0.01)
     assert stand.status("mate").learned is None

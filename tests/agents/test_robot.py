@@ -5,6 +5,7 @@ from collections.abc import Sequence
 
 import pytest
 from bus_helpers import MS, SECOND, robot_at, saw, team_of, with_robot
+from msgspec.structs import replace
 
 from cpcbl_agents.agent import Located, Tick
 from cpcbl_agents.driving import COMMAND_NS, MOST_TURN_RAD_S, REACHED_M, Pilot, steer
@@ -284,7 +285,7 @@ def test_fixes_are_without_the_bias_that_the_robot_has_learned(learns: bool) -> 
     subject = robot(with_robot(TEAM, "me", localizer=rules))
     state = subject.filter.timeline.state
     known = Learned(bearing_bias_rad=0.1)
-    subject.filter.timeline.state = state._replace(memory=state.memory._replace(learned=known))
+    subject.filter.timeline.state = replace(state, memory=replace(state.memory, learned=known))
     for piece in pieces(0.5, 0.0, 0.0):
         subject.handle(piece, piece.stamp_ns)
         subject.handle(Tick(), piece.stamp_ns)
