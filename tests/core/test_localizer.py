@@ -200,13 +200,21 @@ def moved_by(before: State, after: State) -> float:
     return float(np.linalg.norm(np.subtract(after.estimate.pose, before.estimate.pose)))
 
 
+def alike(one: State, other: State) -> bool:
+    """The same belief but for rounding: plain landmarks are summed in another order."""
+    (pose, covariance, _), (other_pose, other_covariance, _) = one.estimate, other.estimate
+    return pose == pytest.approx(other_pose, abs=1e-12) and covariance == pytest.approx(
+        other_covariance, abs=1e-12
+    )
+
+
 @sources
 def test_what_a_source_says_again_soon_counts_for_less(
     hear_of: Callable[[Localizer, State, int], State],
 ) -> None:
     _, once, again = twice(hear_of, 2.0)
     _, fresh, fresh_again = twice(hear_of, 0.0)
-    assert once == fresh
+    assert alike(once, fresh)
     assert moved_by(once, again) < 0.5 * moved_by(fresh, fresh_again)
     less = matrix3(once.estimate.covariance) - matrix3(again.estimate.covariance)
     more = matrix3(fresh.estimate.covariance) - matrix3(fresh_again.estimate.covariance)
@@ -228,7 +236,7 @@ def test_the_later_a_source_speaks_again_the_more_it_counts(
 def test_errors_that_fade_at_once_are_as_good_as_new_ones(
     hear_of: Callable[[Localizer, State, int], State],
 ) -> None:
-    assert twice(hear_of, 1e-4) == twice(hear_of, 0.0)
+    assert all(map(alike, twice(hear_of, 1e-4), twice(hear_of, 0.0)))
 
 
 def test_another_object_counts_in_full_at_any_time() -> None:
@@ -236,7 +244,7 @@ def test_another_object_counts_in_full_at_any_time() -> None:
     plain = standing("joint", sensor=SensorSettings())
     once = looked(robot, state_at(ORIGIN, diagonal(0.3, 0.2)), TENTH)
     other = frame(HERE, 2 * TENTH, names=["nw"])
-    assert robot.cycle(once, other) == plain.cycle(once, other)
+    assert alike(robot.cycle(once, other), plain.cycle(once, other))
 
 
 # One prior ----------------------------------------------------------------------------------------

@@ -47,13 +47,15 @@ def draw_residuals(logs: RobotLogs, calibration: Calibration, path: Path) -> Non
             lags = np.geomspace(LAGS_S[0], LAGS_S[-1], 100)
             fitted = np.exp(-lags / found.sensor["correlation_s"].value)
             correlation.plot(lags, fitted, color=colour, linewidth=0.8)
-    ranges.set(xlabel="true range (m)", ylabel="residual (m)", title="ranges", ylim=(-1.0, 1.0))
+    ranges.set(xlabel="true range (m)", ylabel="residual (m)", title="ranges", ylim=(-0.5, 0.5))
     bearings.set(xlabel="residual (deg)", ylabel="density (1/deg)", title="bearings")
     turns.set(
         xlabel="delay (s)", ylabel="mean error (rad)", title="turns over 2 s; line: fitted delay"
     )
     correlation.set(
-        xlabel="lag (s)", xscale="log", title="correlation of errors of one object; line: fitted"
+        xlabel="lag (s)",
+        xscale="log",
+        title="correlation of errors of one object; line: same integral",
     )
     for axes in (ranges, bearings, turns, correlation):
         axes.grid(True, alpha=0.3)
