@@ -58,6 +58,9 @@ OURS = {
     "joint, alternating": _ours(LocalizerSettings(variant="joint", alternate=True)),
     "oval": _ours(LocalizerSettings(variant="oval")),
     "circular": _ours(LocalizerSettings(variant="circular")),
+    "circular, bearings for heading only": _ours(
+        LocalizerSettings(variant="circular", bearing_for_position=False)
+    ),
     "circular, both at once": _ours(LocalizerSettings(variant="circular", alternate=False)),
     "weighted": _ours(LocalizerSettings(variant="weighted")),
 }
