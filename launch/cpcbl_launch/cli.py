@@ -270,17 +270,19 @@ def calibrate(
     import msgspec
     from rich.console import Console
 
-    from cpcbl_launch.calibration import robots as calibration
+    from cpcbl_launch.calibration.logs import read_logs
+    from cpcbl_launch.calibration.robots import calibrated
+    from cpcbl_launch.calibration.team_text import base_text, team_text
     from cpcbl_launch.show import print_calibration, progress_bar
 
     if picture is not None and importlib.util.find_spec("matplotlib") is None:
         raise ValueError("--picture needs matplotlib: pip install 'cpcbl-team[plot]'")
-    base, base_name = calibration.base_text(logs, team_file)
+    base, base_name = base_text(logs, team_file)
     names = [log.resolve().name for log in logs]
-    robot_logs = calibration.read_logs(logs)
+    robot_logs = read_logs(logs)
     with progress_bar("calibrating", quiet=as_json) as progress:
-        result = calibration.calibrated(robot_logs, names, progress)
-    output.write_text(calibration.team_text(result, base, base_name, margin), encoding="utf-8")
+        result = calibrated(robot_logs, names, progress)
+    output.write_text(team_text(result, base, base_name, margin), encoding="utf-8")
     if picture is not None:
         from cpcbl_launch.calibration.picture import draw_residuals
 

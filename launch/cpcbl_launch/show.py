@@ -12,8 +12,8 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 from rich.text import Text
 
-from cpcbl_launch.calibration.robots import Calibration, decimals
-from cpcbl_launch.calibration.statistics import Estimate
+from cpcbl_launch.calibration.robots import Calibration
+from cpcbl_launch.calibration.statistics import Estimate, decimals
 from cpcbl_launch.recorder import LearnedReport, MeanScore, Recorder, Report
 from cpcbl_launch.supervisor import Supervisor
 from cpcbl_team.collaboration import LOWEST_TIER

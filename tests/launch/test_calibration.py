@@ -13,20 +13,13 @@ from log_helpers import write_log
 from process_helpers import cpcbl_team
 
 from cpcbl_agents.sources.mrclam import LogError
+from cpcbl_launch.calibration.logs import read_log, read_logs
 from cpcbl_launch.calibration.odometry import calibrate_odometry
 from cpcbl_launch.calibration.robot_log import RobotLog
-from cpcbl_launch.calibration.robots import (
-    Calibration,
-    RobotCalibration,
-    calibrated,
-    changed_keys,
-    decimals,
-    read_log,
-    read_logs,
-    team_text,
-)
+from cpcbl_launch.calibration.robots import Calibration, RobotCalibration, calibrated
 from cpcbl_launch.calibration.sensor import calibrate_sensor
-from cpcbl_launch.calibration.statistics import Estimate, robust_fit, told, variance_parts
+from cpcbl_launch.calibration.statistics import Estimate, decimals, robust_fit, told, variance_parts
+from cpcbl_launch.calibration.team_text import changed_keys, team_text
 from cpcbl_launch.evaluation import simulate
 from cpcbl_launch.recording import read_recording
 from cpcbl_launch.team_file import TeamFileError, load_team, parse_team

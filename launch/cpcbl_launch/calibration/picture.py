@@ -6,8 +6,9 @@ import matplotlib as mpl
 import numpy as np
 
 from cpcbl_launch.calibration.correlation import LAGS_S, autocorrelation
+from cpcbl_launch.calibration.logs import RobotLogs
 from cpcbl_launch.calibration.odometry import DELAYS_S, turn_residuals
-from cpcbl_launch.calibration.robots import Calibration, RobotLogs
+from cpcbl_launch.calibration.robots import Calibration
 from cpcbl_launch.calibration.sensor import sensor_residuals
 
 mpl.use("Agg")

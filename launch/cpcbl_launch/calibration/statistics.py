@@ -161,3 +161,10 @@ def spread(errors: Floats) -> float:
 def kept(rows: Rows, keep: Mask) -> Rows:
     """The same struct of columns with some of its rows."""
     return type(rows)(*(column[keep] for column in rows))
+
+
+def decimals(standard_error: float) -> int:
+    """How many decimals a value is worth: rounding adds at most a sixth of the standard error."""
+    if not 0.0 < standard_error < math.inf:
+        return 4
+    return min(max(math.ceil(-math.log10(standard_error / 3.0)), 0), 6)
