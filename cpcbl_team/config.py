@@ -123,7 +123,8 @@ class LocalizerSettings(Table, frozen=True, kw_only=True):
     """Least time between two uses of the same object: its errors are correlated."""
     bearing_for_position: bool = True
     self_calibration: bool = False
-    """Learn the scales of odometry and the bearing bias while driving."""
+    """Learn the scales of odometry and the bearing bias while driving. `weighted` never does: it
+    does not know how well it knows its place."""
     paper_uncertainty: bool = False
     """As printed: without the heading's share in a position's uncertainty (resolution a)."""
     weights: Weights = Weights()
@@ -133,6 +134,10 @@ class LocalizerSettings(Table, frozen=True, kw_only=True):
     lost_window: Annotated[int, msgspec.Meta(ge=4)] = 20
     """Lost when more than `lost_share` of the last so many innovations were rejected."""
     lost_share: Share = 0.6
+
+    @property
+    def learns(self) -> bool:
+        return self.self_calibration and self.variant != "weighted"
 
     @property
     def alternates(self) -> bool:

@@ -56,7 +56,7 @@ class Landmarks:
         rules ask for more than `read` does."""
         rules, s = settings.localizer, settings.sensor
         plain = rules.variant != "weighted" and not (
-            rules.paper_uncertainty or rules.self_calibration or s.correlation_s > 0.0
+            rules.paper_uncertainty or rules.learns or s.correlation_s > 0.0
         )
         marks = field.landmarks if plain else {}
         self._of_pose = _places(marks, ranges=True, bearings=True)

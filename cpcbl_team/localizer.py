@@ -67,6 +67,7 @@ class Localizer:
         self._rests = self._rules.object_interval_s > 0.0
         self._timeout_ns = int(settings.odometry.timeout_s * 1e9)
         self._correlated = settings.sensor.correlation_s > 0.0
+        self._learns = self._rules.learns
         self._gates = (NormalDist().inv_cdf(0.5 + 0.5 * p) ** 2, -2.0 * math.log(1.0 - p))
         self._landmarks = Landmarks(field, settings, self._gates)
         split = settings.collaboration.fusion == "split-ci"
@@ -129,7 +130,7 @@ class Localizer:
                 driven_ns = max(0, end_ns - max(stamp_ns, motion.from_ns))
                 share = driven_ns / (motion.stamp_ns - motion.from_ns)
                 distance, turn = share * distance, share * turn
-            if self._rules.self_calibration:
+            if self._learns:
                 distance *= memory.learned.distance_scale
                 turn *= memory.learned.turn_scale
             if distance != 0.0 or turn != 0.0:
@@ -195,7 +196,7 @@ class Localizer:
         """The usable ones of these sightings, and the faults of those that have one."""
         memory, pose = state.memory, state.estimate.pose
         seen, faults = [], []
-        bias = memory.learned.bearing_bias_rad if self._rules.self_calibration else 0.0
+        bias = memory.learned.bearing_bias_rad if self._learns else 0.0
         for sighting in sightings:
             fault = sighting_fault(sighting)
             if fault:
@@ -349,7 +350,7 @@ class Localizer:
             accepted=memory.accepted + n,
             gated=memory.gated + rejected,
         )
-        if n and self._rules.self_calibration:
+        if n and self._learns:
             memory = self._taught(Anchor(now, estimate, state.odometry_from_robot), memory)
         return replace(state, estimate=estimate, memory=memory)
 

@@ -31,7 +31,7 @@ class FilterAgent:
         self.counts: Counter[str] = Counter()
         self._known = frozenset(field.landmarks) | frozenset(field.walls) | teammates
         self._moves = settings.odometry.moves
-        self._learns = settings.localizer.self_calibration
+        self._learns = settings.localizer.learns
         self._waiting: deque[Sightings] = deque()
         self._located_ns = start_ns
         self._odometry: Odometry | None = None

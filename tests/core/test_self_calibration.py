@@ -346,3 +346,8 @@ def test_while_a_robot_is_lost_it_has_no_anchors() -> None:
     seen = robot.cycle(replace(lost, memory=memory), frame(LOOP_START, SECOND // 10))
     assert seen.memory.counts["accepted"] == len(CORNERS.landmarks)
     assert seen.memory.anchors is None
+
+
+def test_a_robot_without_a_covariance_learns_nothing() -> None:
+    assert LocalizerSettings(self_calibration=True).learns
+    assert driven(robot_that(True, "weighted"), 1) == driven(robot_that(False, "weighted"), 1)
