@@ -6,6 +6,8 @@ merges such a part without counting it twice, whatever the correlation; the sens
 noise is fresh and merged as usual.
 """
 
+import math
+from statistics import NormalDist
 from typing import NamedTuple
 
 from cpcbl_team.estimate import (
@@ -86,6 +88,11 @@ def chi_square(
     syy = x * px + y * py + a * ph + ryy
     f = residuals[1]
     return (syy * e * e - 2.0 * sxy * e * f + sxx * f * f) / (sxx * syy - sxy * sxy)
+
+
+def chi_square_bounds(probability: float) -> tuple[float, float]:
+    """The quantiles of the chi-square distributions of one and of two degrees of freedom."""
+    return NormalDist().inv_cdf(0.5 + 0.5 * probability) ** 2, -2.0 * math.log(1.0 - probability)
 
 
 def merge_naive(prior: Estimate, seen: Observation, scope: Scope = POSE) -> Estimate:

@@ -5,7 +5,6 @@
 
 import math
 from collections.abc import Iterable
-from statistics import NormalDist
 
 from msgspec.structs import replace
 
@@ -22,7 +21,14 @@ from cpcbl_team.estimate import (
     circular,
     merge,
 )
-from cpcbl_team.fusion import Observation, merge_naive, merge_split, told, with_all_shared
+from cpcbl_team.fusion import (
+    Observation,
+    chi_square_bounds,
+    merge_naive,
+    merge_split,
+    told,
+    with_all_shared,
+)
 from cpcbl_team.gaussian import Covariance2
 from cpcbl_team.geometry import Pose2, step, wrap_angle
 from cpcbl_team.inputs import Belief, Fix, Odometry, Position, Sighting, Sightings, Told
@@ -57,7 +63,7 @@ class Localizer:
         self.settings = settings
         self.field = field
         self._rules = settings.localizer
-        variant, p = self._rules.variant, self._rules.gate_probability
+        variant = self._rules.variant
         self._weighted, self._joint = variant == "weighted", variant == "joint"
         self._as_circle = variant == "circular" and not self._rules.paper_uncertainty
         self._reduces = self._weighted or self._rules.paper_uncertainty
@@ -68,7 +74,7 @@ class Localizer:
         self._timeout_ns = int(settings.odometry.timeout_s * 1e9)
         self._correlated = settings.sensor.correlation_s > 0.0
         self._learns = self._rules.learns
-        self._gates = (NormalDist().inv_cdf(0.5 + 0.5 * p) ** 2, -2.0 * math.log(1.0 - p))
+        self._gates = chi_square_bounds(self._rules.gate_probability)
         self._landmarks = Landmarks(field, settings, self._gates)
         split = settings.collaboration.fusion == "split-ci"
         self._merge_teammate = merge_split if split else merge_naive

@@ -1,6 +1,5 @@
 """The command line `cpcbl-team`."""
 
-import importlib.util
 import logging
 import sys
 from enum import StrEnum
@@ -108,19 +107,19 @@ def up(
     as_json: AsJson = False,
 ) -> None:
     """Start a team: the field, a process per robot, a live table, a report at the end."""
-    import msgspec
     from rich.console import Console
 
     from cpcbl_agents.process import Stop
     from cpcbl_launch import logs as real_logs
+    from cpcbl_launch.options import encoded, must_draw
     from cpcbl_launch.show import LiveTable, print_report
     from cpcbl_launch.up import Run, run_team
 
     if file == Path("mrclam") and data is not None and not file.exists():
         file = real_logs.builtin_for(data)
     team = _load(file or Path("demo"))
-    if picture is not None and importlib.util.find_spec("matplotlib") is None:
-        raise ValueError("--picture needs matplotlib: pip install 'cpcbl-team[plot]'")
+    if picture is not None:
+        must_draw("--picture")
     run = Run(team, duration, speed, seed, folder=logs, picture=picture, record=record)
     if any(robot.source == "mrclam" for robot in team.robots.values()):
         logged = real_logs.on_log(team, Path(data or team.data or "."))
@@ -140,11 +139,10 @@ def up(
     title = f"team {team.name}, {len(run.team.robots)} robots, {speed:g} x real time"
     with LiveTable(title, console, quiet=as_json) as table:
         result = run_team(run, table, Stop())
-    encoded = msgspec.json.format(msgspec.json.encode(result), indent=2)
     if report is not None:
-        report.write_bytes(encoded)
+        report.write_text(encoded(result), encoding="utf-8")
     if as_json:
-        sys.stdout.write(encoded.decode() + "\n")
+        sys.stdout.write(encoded(result) + "\n")
     else:
         print_report(result, console)
 
@@ -220,26 +218,26 @@ def evaluate_mrclam(
     as_json: AsJson = False,
 ) -> None:
     """Five robots of a real log (UTIAS MRCLAM) against its ground truth."""
-    import msgspec
     from rich.console import Console
 
     from cpcbl_launch import logs as real_logs
     from cpcbl_launch.evaluation import Choice, chosen, evaluated
+    from cpcbl_launch.options import encoded, folder_for
     from cpcbl_launch.show import print_report, progress_bar
-    from cpcbl_launch.tum import export_folder, export_tum
+    from cpcbl_launch.tum import export_tum
 
     team = _load(team_file or real_logs.builtin_for(data))
     choice = Choice(variant, collaboration, fusion, direction)
     logged = real_logs.on_log(chosen(team, choice), data)
     logged = logged._replace(team=real_logs.blinded(logged.team, _names(blind)))
     logged = real_logs.shortened(logged, duration)
-    folder = None if export is None else export_folder(export)
+    folder = None if export is None else folder_for("--export", export)
     with progress_bar(f"{data.name}", quiet=as_json) as progress:
         result, paths = evaluated(logged, progress, with_yardsticks=yardstick)
     if folder is not None:
         export_tum(folder, paths, logged.truth)
     if as_json:
-        typer.echo(msgspec.json.format(msgspec.json.encode(result), indent=2).decode())
+        typer.echo(encoded(result))
     else:
         print_report(result, Console())
 
@@ -267,16 +265,17 @@ def calibrate(
     as_json: AsJson = False,
 ) -> None:
     """Estimate odometry and sensor errors from logs with truth, as types of a team file."""
-    import msgspec
     from rich.console import Console
 
     from cpcbl_launch.calibration.logs import read_logs
     from cpcbl_launch.calibration.robots import calibrated
+    from cpcbl_launch.calibration.show import print_calibration
     from cpcbl_launch.calibration.team_text import base_text, team_text
-    from cpcbl_launch.show import print_calibration, progress_bar
+    from cpcbl_launch.options import encoded, must_draw
+    from cpcbl_launch.show import progress_bar
 
-    if picture is not None and importlib.util.find_spec("matplotlib") is None:
-        raise ValueError("--picture needs matplotlib: pip install 'cpcbl-team[plot]'")
+    if picture is not None:
+        must_draw("--picture")
     base, base_name = base_text(logs, team_file)
     names = [log.resolve().name for log in logs]
     robot_logs = read_logs(logs)
@@ -288,7 +287,7 @@ def calibrate(
 
         draw_residuals(robot_logs, result, picture)
     if as_json:
-        typer.echo(msgspec.json.format(msgspec.json.encode(result), indent=2).decode())
+        typer.echo(encoded(result))
     else:
         print_calibration(result, Console())
         typer.echo(f"written: {output}")

@@ -2,20 +2,18 @@
 
 import math
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-from rich import box
 from rich.console import Console
 from rich.live import Live
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 from rich.text import Text
 
-from cpcbl_launch.calibration.robots import Calibration
-from cpcbl_launch.calibration.statistics import Estimate, decimals
 from cpcbl_launch.recorder import LearnedReport, MeanScore, Recorder, Report
 from cpcbl_launch.supervisor import Supervisor
+from cpcbl_launch.tables import number, percent, table
 from cpcbl_team.collaboration import LOWEST_TIER
 from cpcbl_team.metrics import Score
 from cpcbl_transport.messages import Status, Track, Truth
@@ -54,26 +52,26 @@ class LiveTable:
 
     def _table(self, recorder: Recorder, supervisor: Supervisor, elapsed_s: float) -> Table:
         tracks, statuses, truths = recorder.latest()
-        table = _table(
+        shown = table(
             f"{self._title}, {elapsed_s:.1f} s",
             ("robot",),
             ("pid", "x m", "y m", "deg", "σ m", "err m", "tier", "out", "B", "in", "B"),
         )
-        table.add_column("", overflow="fold")
+        shown.add_column("", overflow="fold")
         pids, restarts = supervisor.pids, supervisor.restarts
         here = [n.removeprefix("robot-") for n in supervisor.names if n != "field"]
         for name in [*here, *sorted(tracks.keys() - set(here))]:
             process = f"robot-{name}"
             pid = str(pids[process]) if process in pids else "down" if name in here else "away"
             state = _state(tracks.get(name), pid, restarts.get(process, 0))
-            table.add_row(
+            shown.add_row(
                 name,
                 pid,
                 *_pose_cells(tracks.get(name), truths.get(name)),
                 *_traffic_cells(statuses.get(name)),
                 state,
             )
-        return table
+        return shown
 
 
 def _state(track: Track | None, pid: str, restarts: int) -> Text:
@@ -125,26 +123,10 @@ def _graded(error: float | None) -> Text:
     return Text(f"{error:.3f}", "green" if error < 0.15 else "yellow" if error < 0.5 else "red")
 
 
-def _table(title: str, left: Sequence[str], right: Sequence[str]) -> Table:
-    table = Table(
-        title=title,
-        title_justify="left",
-        title_style="bold",
-        box=box.SIMPLE_HEAD,
-        padding=(0, 1, 0, 0),
-        show_edge=False,
-    )
-    for column in left:
-        table.add_column(column, no_wrap=True, overflow="ellipsis")
-    for column in right:
-        table.add_column(column, justify="right", no_wrap=True)
-    return table
-
-
 def print_report(report: Report, console: Console) -> None:
     """The figures of a run as a table with units."""
     before = ("before m",) if report.alone else ()
-    figures = _table(
+    figures = table(
         "errors of position and heading (deg, RMSE)",
         ("robot",),
         (*before, *FIGURES, "lost", "out", "B"),
@@ -153,9 +135,9 @@ def print_report(report: Report, console: Console) -> None:
         alone = report.alone.get(name)
         figures.add_row(
             name,
-            *([_number(alone.position_rmse_m)] if alone is not None else []),
+            *([number(alone.position_rmse_m)] if alone is not None else []),
             *_figures(r),
-            _share(r.lost_share),
+            percent(r.lost_share),
             _short(r.messages_sent),
             _short(r.bytes_sent),
         )
@@ -164,7 +146,7 @@ def print_report(report: Report, console: Console) -> None:
     figures.add_section()
     figures.add_row(
         "team",
-        *([_number(sum(known) / len(known) if known else None)] if report.alone else []),
+        *([number(sum(known) / len(known) if known else None)] if report.alone else []),
         *_figures(t),
         "",
         _short(t.messages_sent),
@@ -180,23 +162,23 @@ def print_report(report: Report, console: Console) -> None:
 
 def _yardsticks(report: Report) -> Table:
     """Plain filters beside the team: means over the robots."""
-    table = _table("yardsticks: the same data and settings, team means", ("filter",), FIGURES)
+    shown = table("yardsticks: the same data and settings, team means", ("filter",), FIGURES)
     for name, yardstick in report.yardsticks.items():
-        table.add_row(name.replace("_", " ").replace("ekf", "EKF"), *_figures(yardstick.team))
-    table.add_section()
-    table.add_row("this team", *_figures(report.team), style="bold")
-    return table
+        shown.add_row(name.replace("_", " ").replace("ekf", "EKF"), *_figures(yardstick.team))
+    shown.add_section()
+    shown.add_row("this team", *_figures(report.team), style="bold")
+    return shown
 
 
 def _figures(s: Score | MeanScore) -> list[str]:
     """The cells below FIGURES."""
     return [
-        _number(s.position_rmse_m),
-        _number(s.position_mean_m),
-        _number(s.position_max_m),
-        _number(s.heading_rmse_deg, 1),
-        _share(s.inside_3_sigma),
-        _number(s.nees, 1),
+        number(s.position_rmse_m),
+        number(s.position_mean_m),
+        number(s.position_max_m),
+        number(s.heading_rmse_deg, 1),
+        percent(s.inside_3_sigma),
+        number(s.nees, 1),
     ]
 
 
@@ -225,89 +207,6 @@ def _corrections(found: LearnedReport) -> str:
     """What is done to readings: `distance × 0.98, turn × 0.96, bearings -0.6°`."""
     distance, turn, turned = found.distance_scale, found.turn_scale, -found.bearing_bias_deg
     return f"distance × {distance:.2f}, turn × {turn:.2f}, bearings {turned:+z.1f}°"
-
-
-def _number(value: float | None, digits: int = 3) -> str:
-    return "-" if value is None else f"{value:.{digits}f}"
-
-
-def _share(value: float | None) -> str:
-    return "-" if value is None else f"{100.0 * value:.1f}%"
-
-
-def print_calibration(calibration: Calibration, console: Console) -> None:
-    """Values ± standard errors, a robot a row, in tables that fit 80 columns."""
-    for title, part, names in _CALIBRATED:
-        table = _table(title, ("robot",), tuple(names.values()))
-        for robot, found in calibration.robots.items():
-            values = getattr(found, part)
-            table.add_row(robot, *(_with_error(values.get(name)) for name in names))
-        console.print(table)
-        console.print()
-    console.print("± standard error; -: the logs do not tell it", style="yellow", highlight=False)
-    for robot, found in calibration.robots.items():
-        for note in found.notes:
-            console.print(f"robot {robot}: {note}", style="yellow", highlight=False)
-
-
-def _with_error(estimate: Estimate | None) -> str:
-    if estimate is None:
-        return "-"
-    digits = decimals(estimate.standard_error)
-    return f"{estimate.value:.{digits}f} ± {estimate.standard_error:.{digits}f}"
-
-
-_CALIBRATED = (
-    (
-        "way, true = scale x reported - loss x |turn|",
-        "odometry",
-        {
-            "distance_scale": "scale",
-            "distance_loss_m_per_rad": "loss m/rad",
-            "delay_s": "delay s",
-        },
-    ),
-    (
-        "turn, true = scale x reported + bias x way",
-        "odometry",
-        {"turn_scale": "scale", "turn_bias_rad_per_m": "bias rad/m"},
-    ),
-    (
-        "odometry noise, σ by root of way and turn",
-        "odometry",
-        {
-            "distance_sigma_m_per_sqrt_m": "way m/√m",
-            "distance_sigma_m_per_sqrt_rad": "m/√rad",
-            "turn_sigma_rad_per_sqrt_rad": "turn rad/√rad",
-            "turn_sigma_rad_per_sqrt_m": "turn rad/√m",
-        },
-    ),
-    (
-        "ranges, true = scale x reading - bias",
-        "sensor",
-        {
-            "range_scale": "scale",
-            "range_bias_m": "bias m",
-            "robot_range_bias_m": "robots' bias m",
-            "optical_axis_deg": "axis deg",
-        },
-    ),
-    (
-        "range noise, time in which errors fade",
-        "sensor",
-        {"range_share": "share", "range_floor_m": "floor m", "correlation_s": "fade s"},
-    ),
-    (
-        "bearings, true = scale x reading - bias; camera",
-        "sensor",
-        {
-            "bearing_scale": "scale",
-            "bearing_bias_deg": "bias deg",
-            "bearing_sigma_deg": "σ deg",
-            "delay_s": "delay s",
-        },
-    ),
-)
 
 
 @contextmanager

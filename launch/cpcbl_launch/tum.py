@@ -7,15 +7,6 @@ from pathlib import Path
 from cpcbl_team.metrics import Floats, Stamps, Trajectory, compared
 
 
-def export_folder(folder: Path) -> Path:
-    """The folder, made if it was not there. Raises ValueError."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ValueError(f"--export {folder}: {error.strerror}; name another folder") from None
-    return folder
-
-
 def export_tum(
     folder: Path, paths: Mapping[str, Mapping[str, Trajectory]], truth: Mapping[str, Floats]
 ) -> None:

@@ -15,7 +15,6 @@ begins with a Gaussian over the whole field, and no plain EKF is sure to find it
 import math
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from statistics import NormalDist
 from typing import NamedTuple
 
 import numpy as np
@@ -25,14 +24,15 @@ from cpcbl_agents.robot import Robot
 from cpcbl_launch.logs import LoggedTeam
 from cpcbl_launch.recorder import YardstickReport, mean_score
 from cpcbl_team.config import Field, LocalizationSettings
+from cpcbl_team.constraints import NEAREST_M
 from cpcbl_team.estimate import Estimate
+from cpcbl_team.fusion import chi_square_bounds
 from cpcbl_team.geometry import Pose2, step, wrap_angle
 from cpcbl_team.inputs import Odometry, Sighting, Sightings
 from cpcbl_team.metrics import Floats, Trajectory, compared, score
 from cpcbl_team.motion import motion_noise
 from cpcbl_team.sensors import repeated_share, sighting_fault, sighting_sigmas
 
-NEAREST_M = 1e-3  # nearer than this a direction means nothing
 SMALLEST_VARIANCE = 1e-12  # (1 um)^2: exact sensors must not make a matrix singular
 _TRIANGLE = ((0, 0, 1, 0, 1, 2), (0, 1, 1, 2, 2, 2))  # xx, xy, yy, xh, yh, hh
 
@@ -136,6 +136,7 @@ class _Member:
         self.now_ns = self.covered_ns = told.start_ns
         self.pieces = deque(sorted(told.odometry, key=lambda piece: piece.from_ns))
         self.used_ns: dict[str, int] = {}
+        self.bounds = chi_square_bounds(told.settings.localizer.gate_probability)
         window = told.settings.localizer.lost_window
         self.innovations = {kind: deque[bool](maxlen=window) for kind in ("landmark", "robot")}
 
@@ -249,7 +250,7 @@ class Ekf:
             seconds = None if since_ns is None else since_ns * 1e-9
             doubt = repeated_share(seconds, robot.settings.sensor.correlation_s)
             found = found._replace(noise=doubt * found.noise)
-            accepted = self._corrected(found, robot.settings.localizer.gate_probability)
+            accepted = self._corrected(found, robot.bounds)
             if accepted:
                 robot.used_ns[sighting.id] = frame.stamp_ns
             kind, concerned = ("landmark", [robot]) if mate is None else ("robot", [robot, mate])
@@ -286,11 +287,11 @@ class Ekf:
         noise = np.diag(sigmas**2 + SMALLEST_VARIANCE)
         return _Measurement(columns, jacobian[rows, : len(columns)], innovation, noise)
 
-    def _corrected(self, m: _Measurement, gate_probability: float) -> bool:
+    def _corrected(self, m: _Measurement, bounds: tuple[float, float]) -> bool:
         """The Kalman update, if the chi-square gate opens; whether it did."""
         cross = self.covariance[:, m.columns] @ m.jacobian.T
         weights = np.linalg.inv(m.jacobian @ cross[m.columns] + m.noise)
-        if m.innovation @ weights @ m.innovation > _gate(gate_probability, len(m.innovation)):
+        if m.innovation @ weights @ m.innovation > bounds[len(m.innovation) - 1]:
             return False
         gain = cross @ weights
         self.mean += gain @ m.innovation
@@ -314,10 +315,3 @@ class Ekf:
 def _doubt(variance: float, most: float) -> float:
     """What to add to a variance so that its sigma doubles, within bounds."""
     return max(min(max(4.0 * variance, 0.01), most) - variance, 0.0)
-
-
-def _gate(probability: float, freedom: int) -> float:
-    """The quantile of the chi-square distribution with one or two degrees of freedom."""
-    if freedom == 1:
-        return NormalDist().inv_cdf(0.5 + 0.5 * probability) ** 2
-    return -2.0 * math.log(1.0 - probability)

@@ -1,6 +1,5 @@
 """`cpcbl-team experiment ...`."""
 
-import importlib.util
 import os
 import sys
 from collections.abc import Callable, Iterator
@@ -77,24 +76,20 @@ def conduct(
     """Runs, writes and shows one experiment. Raises ValueError for what the user can mend."""
     from rich.console import Console
 
-    from cpcbl_launch.experiments.results import encoded
     from cpcbl_launch.experiments.runs import run_all
+    from cpcbl_launch.options import encoded, folder_for, must_draw
 
-    if importlib.util.find_spec("matplotlib") is None:
-        raise ValueError("experiment: pictures need matplotlib: pip install 'cpcbl-team[plot]'")
-    try:
-        output.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ValueError(f"--output {output}: {error.strerror}; name a folder") from error
+    must_draw("experiment")
+    folder_for("--output", output)
     cases = experiment.cases()
     with _progress(experiment.name, len(cases) * seeds) as done:
         results = run_all(cases, range(1, seeds + 1), jobs or os.cpu_count() or 1, done)
     outcome = experiment.outcome(results)
-    text = encoded(outcome)
-    (output / f"{experiment.name}.json").write_bytes(text)
+    text = encoded(outcome) + "\n"
+    (output / f"{experiment.name}.json").write_text(text, encoding="utf-8")
     experiment.draw(outcome, output / f"{experiment.name}.png")
     if as_json:
-        sys.stdout.write(text.decode())
+        sys.stdout.write(text)
         return
     console = Console()
     for shown in experiment.tables(outcome):

@@ -26,12 +26,10 @@ from cpcbl_launch.experiments.results import (
     Results,
     accuracy,
     new_outcome,
-    number,
-    percent,
     spread,
-    table,
 )
 from cpcbl_launch.experiments.runs import Case
+from cpcbl_launch.tables import number, percent, table
 from cpcbl_team.config import RobotSettings, Start, Team
 
 DURATION_S = 20.0

@@ -20,12 +20,10 @@ from cpcbl_launch.experiments.results import (
     Results,
     accuracy,
     new_outcome,
-    number,
     pattern_lines,
-    percent,
-    table,
 )
 from cpcbl_launch.experiments.runs import Case
+from cpcbl_launch.tables import number, percent, table
 
 CONFIGURATIONS = {
     "A": "odometry",

@@ -8,9 +8,7 @@ from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
-from rich import box
 from rich.console import RenderableType
-from rich.table import Table
 
 from cpcbl_launch.experiments.runs import LOOPS, Case, Run
 from cpcbl_team.config import Team
@@ -121,35 +119,6 @@ def new_outcome(name: str, results: Results, cases: Mapping[str, Case], **rest: 
         teams={key: case.team for key, case in cases.items()},
         **rest,
     )
-
-
-def encoded(outcome: Outcome) -> bytes:
-    return msgspec.json.format(msgspec.json.encode(outcome), indent=2) + b"\n"
-
-
-def table(title: str, left: Sequence[str], right: Sequence[str]) -> Table:
-    """Names on the left, figures on the right; at most 80 columns is the caller's duty."""
-    result = Table(
-        title=title,
-        title_justify="left",
-        title_style="bold",
-        box=box.SIMPLE_HEAD,
-        padding=(0, 1, 0, 0),
-        show_edge=False,
-    )
-    for column in left:
-        result.add_column(column, no_wrap=True)
-    for column in right:
-        result.add_column(column, justify="right", no_wrap=True)
-    return result
-
-
-def number(value: float | None, digits: int = 3) -> str:
-    return "-" if value is None else f"{value:.{digits}f}"
-
-
-def percent(value: float | None) -> str:
-    return "-" if value is None else f"{100.0 * value:.1f}%"
 
 
 def pattern_lines(outcome: Outcome) -> Iterable[str]:

@@ -27,6 +27,7 @@ from cpcbl_team.metrics import (
     position_nees,
     truth_at,
 )
+from cpcbl_team.sensors import corrected_odometry
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus
 from cpcbl_transport.messages import Drive, Truths, decode
@@ -97,10 +98,9 @@ class LoopReferee:
                 self.reached_s.append(stamp_ns * 1e-9)
                 self.through = reached >= self._to_reach
             case Odometry() as piece:
-                o = self._odometry
-                distance = piece.distance_m * o.distance_scale
-                self._pose = step(self._pose, distance, piece.turn_rad * o.turn_scale)
-                self.reckoned.append((piece.stamp_ns * 1e-9, *self._pose))
+                done = corrected_odometry(piece, self._odometry)
+                self._pose = step(self._pose, done.distance_m, done.turn_rad)
+                self.reckoned.append((done.stamp_ns * 1e-9, *self._pose))
             case Truths(robots=robots):
                 self.bumped = any(t.bumps for t in robots if t.robot == self._robot)
 

@@ -24,9 +24,9 @@ from cpcbl_launch.experiments.results import (
     new_outcome,
     pattern_lines,
     spread,
-    table,
 )
 from cpcbl_launch.experiments.runs import Case, Run
+from cpcbl_launch.tables import table
 from cpcbl_team.config import Weights
 from cpcbl_team.metrics import Floats
 

@@ -17,9 +17,9 @@ from cpcbl_launch.experiments.results import (
     Results,
     accuracy,
     new_outcome,
-    table,
 )
 from cpcbl_launch.experiments.runs import Case
+from cpcbl_launch.tables import table
 
 VARIANTS = ("joint", "oval", "circular", "weighted")
 HELP = {"alone": "C", "helped": "F"}
