@@ -56,7 +56,7 @@ def fix_for(
     )
     lever = (1.0, 0.0, pose.y - y, 0.0, 1.0, x - pose.x, 0.0, 0.0, 0.0)
     observer_part = covariance.transformed(lever).position()
-    return Fix(robot, observer, stamp_ns, x, y, rotated, observer_part, range_m)
+    return Fix(robot, observer, stamp_ns, x, y, rotated, observer_part)
 
 
 def placed(belief: Belief, at_ns: int, settings: CollaborationSettings) -> Place | None:

@@ -82,7 +82,6 @@ class Fix(msgspec.Struct, frozen=True, array_like=True, tag="fix"):
     y_m: float
     sensor_covariance: tuple[float, float, float]
     observer_covariance: tuple[float, float, float]
-    distance_m: float
 
 
 class Told(msgspec.Struct, frozen=True, array_like=True, tag="told"):

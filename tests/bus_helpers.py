@@ -19,9 +19,10 @@ from cpcbl_team.config import (
     Start,
     Team,
 )
-from cpcbl_team.inputs import Odometry, Sighting, Sightings
+from cpcbl_team.inputs import Belief, Fix, Odometry, Sighting, Sightings
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus, MemoryHub
+from cpcbl_transport.compact import decode_help, encode_help
 from cpcbl_transport.messages import Message, Refusal, Status, decode, encode
 
 MS = 1_000_000
@@ -43,6 +44,11 @@ def wait_until(condition: Callable[[], bool]) -> None:
         time.sleep(0.002)
 
 
+def written(message: Message) -> bytes:
+    """The payload of any message."""
+    return encode_help(message) if isinstance(message, Belief | Fix) else encode(message)
+
+
 class Ear:
     """Everything that a session hears under some keys, in order."""
 
@@ -60,7 +66,10 @@ class Ear:
 
     @property
     def messages(self) -> list[Message | Refusal]:
-        return [decode(payload) for payload in self.payloads]
+        return [
+            decode_help(key, payload) if key.startswith(("belief/", "fix/")) else decode(payload)
+            for key, payload in self.samples
+        ]
 
     def close(self) -> None:
         self._handle.close()
@@ -122,7 +131,7 @@ class Stand:
 
     def put(self, key: str, message: Message | bytes) -> None:
         """What another process would publish."""
-        payload = message if isinstance(message, bytes) else encode(message)
+        payload = message if isinstance(message, bytes) else written(message)
         self.bus.publisher(key, topics.Qos.INPUT).put(payload)
 
     def odometry(self, robot: str, piece: Odometry) -> None:

@@ -249,7 +249,7 @@ def fix(
 ) -> Fix:
     """Where the teammate "mate" sees the robot "me"."""
     sensor, observer = sensor_m**2, observer_m**2
-    return Fix("me", "mate", stamp_ns, x, y, (sensor, 0.0, sensor), (observer, 0.0, observer), 2.0)
+    return Fix("me", "mate", stamp_ns, x, y, (sensor, 0.0, sensor), (observer, 0.0, observer))
 
 
 def placed_at(x: float, y: float, stamp_ns: int = 0, sigma_m: float = 0.05) -> Position:

@@ -11,6 +11,7 @@ from cpcbl_team.config import Team
 from cpcbl_team.inputs import Belief, Fix, Odometry, Position, Sightings, Told
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus, Handle, Publisher
+from cpcbl_transport.compact import decode_help, encode_help
 from cpcbl_transport.messages import (
     Drive,
     Message,
@@ -98,7 +99,8 @@ class Node:
             self._publish(topics.STATUS, topics.STATUS.at(robot=self._name), self._status(now_ns))
 
     def _accepted(self, key: str, payload: bytes, now_ns: int) -> Message | None:
-        message = decode(payload)
+        helps = key.startswith(("belief/", "fix/"))
+        message = decode_help(key, payload) if helps else decode(payload)
         reason = message if isinstance(message, Refusal) else self._refused(key, message, now_ns)
         if reason is not None:
             self.counts[reason] += 1
@@ -113,16 +115,13 @@ class Node:
         """What the key allows, who may say it, then the numbers and the time."""
         last = key.rsplit("/", 1)[-1]
         match message:
-            case Belief(robot=sender) if key.startswith("belief/"):
+            case Belief(robot=sender) | Fix(observer=sender):
                 pass
-            case Fix(observer=sender) if key.startswith("fix/"):
-                if message.robot != self._name:
-                    return Refusal.NOT_FOR_ME
             case Odometry() | Sightings() | Position() if type(message) is _INPUTS.get(last):
                 return refusal(message, now_ns)
             case _:
                 return Refusal.WRONG_TYPE
-        if sender not in self._team or sender != last:
+        if sender not in self._team:
             return Refusal.UNKNOWN_ROBOT
         return Refusal.OWN if sender == self._name else refusal(message, now_ns)
 
@@ -155,7 +154,7 @@ class Node:
             publisher = self._publishers[key] = self._bus.publisher(key, topic.qos)
         if not publisher.matching:
             return False
-        payload = encode(message)
+        payload = encode_help(message) if isinstance(message, Belief | Fix) else encode(message)
         publisher.put(payload)
         if topic in _HELP:
             self.sent["messages"] += 1

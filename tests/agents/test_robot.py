@@ -48,7 +48,7 @@ def pieces(seconds: float, distance_m: float = 0.05, turn_rad: float = 0.02) -> 
 
 
 def fix(stamp_ns: int, x_m: float) -> Fix:
-    return Fix("me", "mate", stamp_ns, x_m, 0.05, (0.01, 0.0, 0.01), (0.0004, 0.0, 0.0004), 2.0)
+    return Fix("me", "mate", stamp_ns, x_m, 0.05, (0.01, 0.0, 0.01), (0.0004, 0.0, 0.0004))
 
 
 # Late and out of order --------------------------------------------------------------------------

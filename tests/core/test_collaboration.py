@@ -69,7 +69,7 @@ def test_a_fix_is_the_sighting_compounded_with_the_observers_pose(seed: int) -> 
 
     sent = observed(Sighting("me", r, a), observer)
     assert sent is not None
-    assert (sent.robot, sent.observer, sent.stamp_ns, sent.distance_m) == ("me", "mate", 7, r)
+    assert (sent.robot, sent.observer, sent.stamp_ns) == ("me", "mate", 7)
     np.testing.assert_allclose((sent.x_m, sent.y_m), place(*v), atol=1e-9)
     own = matrix2(Covariance2(*sent.sensor_covariance))
     np.testing.assert_allclose(own, J[:, 3:] @ sensor @ J[:, 3:].T, atol=1e-6)

@@ -118,7 +118,7 @@ def an_observer(sensor_m: float, observer_m: float) -> Perceive:
 
         def look(truth: Pose2, now: int) -> Fix:
             x, y = off + sensor_m * rng.normal(size=2) + (truth.x, truth.y)
-            return Fix("me", "mate", now, x, y, covariance2(own), covariance2(its), 3.0)
+            return Fix("me", "mate", now, x, y, covariance2(own), covariance2(its))
 
         return look
 

@@ -673,7 +673,7 @@ def test_a_perfect_sensor_that_the_settings_allow_is_no_crash(sensor: SensorSett
 def test_a_singular_fix_that_the_wire_allows_is_no_crash(
     sensor_covariance: tuple[float, float, float],
 ) -> None:
-    sent = Fix("me", "mate", 1, 0.01, 0.01, sensor_covariance, (0.0, 0.0, 0.0), 2.0)
+    sent = Fix("me", "mate", 1, 0.01, 0.01, sensor_covariance, (0.0, 0.0, 0.0))
     state = standing("joint").fix(state_at(ORIGIN, diagonal(0.1, 0.05)), sent)
     assert all(math.isfinite(v) for v in state.estimate.pose)
 

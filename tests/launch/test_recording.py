@@ -15,11 +15,11 @@ from cpcbl_team.config import RobotSettings, Team
 from cpcbl_team.inputs import Odometry, Position, Sighting, Sightings
 from cpcbl_transport import topics
 from cpcbl_transport.bus import MemoryHub
-from cpcbl_transport.messages import Message, Truth, Truths, encode
+from cpcbl_transport.messages import Tagged, Truth, Truths, encode
 
 TEAM = Team(name="one", robots={"r1": RobotSettings(source="external")})
 FRAME = saw(SECOND, Sighting("oak", 2.0, None), Sighting("elm", None, -0.5))
-SAID: list[tuple[str, Message]] = [
+SAID: list[tuple[str, Tagged]] = [
     ("in/r1/odometry", standing(SECOND)),
     ("in/r1/sightings", FRAME),
     ("in/r1/position", Position(SECOND, 1.0, 2.0, (0.01, 0.0, 0.01))),

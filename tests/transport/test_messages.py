@@ -9,7 +9,7 @@ from bus_helpers import SECOND, examples
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cpcbl_team.inputs import Belief, Fix, Odometry, Position, Sighting, Sightings
+from cpcbl_team.inputs import Odometry, Position, Sighting, Sightings
 from cpcbl_transport.messages import (
     FUTURE_NS,
     LARGEST_NUMBER,
@@ -17,9 +17,9 @@ from cpcbl_transport.messages import (
     LONGEST_ODOMETRY_NS,
     VERSION,
     Drive,
-    Message,
     Refusal,
     Status,
+    Tagged,
     Track,
     Truth,
     Truths,
@@ -31,8 +31,6 @@ from cpcbl_transport.messages import (
 NOW = 5 * SECOND
 COVARIANCE = (0.04, 0.01, 0.09, 0.0, 0.0, 0.01)
 
-BELIEF = Belief("r1", NOW, 1.0, 2.0, 0.5, COVARIANCE, 0.3, 0.1)
-FIX = Fix("r2", "r1", NOW, 1.0, 2.0, (0.04, 0.01, 0.09), (0.01, 0.0, 0.01), 3.0)
 ODOMETRY = Odometry(NOW - SECOND, NOW, 0.5, 0.1)
 SIGHTINGS = Sightings(NOW, (Sighting("oak", 2.0, 0.1), Sighting("elm", None, -0.5, None, 0.02)))
 POSITION = Position(NOW, 1.0, 2.0, (0.0004, 0.0, 0.0009))
@@ -41,7 +39,7 @@ STATUS = Status("r1", "a", NOW, 0.1, 0.02, 3, "", {"odometry": 7}, 1, 20, 2, 40,
 TRACK = Track("r1", NOW, 1.0, 2.0, 0.5, COVARIANCE, 3)
 DRIVE = Drive("r1", NOW, 0.5, 0.1)
 TRUTHS = Truths(NOW, (Truth("r1", 1.0, 2.0, 0.5, 1), Truth("r2", 3.0, 4.0, -0.5)))
-VALID = (ODOMETRY, SIGHTINGS, POSITION, BELIEF, FIX, STATUS, TRACK, DRIVE, TRUTHS)
+VALID = (ODOMETRY, SIGHTINGS, POSITION, STATUS, TRACK, DRIVE, TRUTHS)
 KINDS = [type(m).__name__ for m in VALID]
 
 NAMES = st.from_regex(r"[A-Za-z0-9_.-]{1,32}", fullmatch=True)
@@ -53,7 +51,7 @@ COVARIANCES_2 = st.tuples(FLOATS, FLOATS, FLOATS)
 COVARIANCES_3 = st.tuples(FLOATS, FLOATS, FLOATS, FLOATS, FLOATS, FLOATS)
 MAYBE = FLOATS | st.none()
 
-MESSAGES: dict[type[Any], st.SearchStrategy[Message]] = {
+MESSAGES: dict[type[Any], st.SearchStrategy[Tagged]] = {
     Odometry: st.builds(Odometry, STAMPS, STAMPS, FLOATS, FLOATS),
     Sightings: st.builds(
         Sightings,
@@ -61,8 +59,6 @@ MESSAGES: dict[type[Any], st.SearchStrategy[Message]] = {
         st.lists(st.builds(Sighting, NAMES, MAYBE, MAYBE, MAYBE, MAYBE), max_size=4).map(tuple),
     ),
     Position: st.builds(Position, STAMPS, FLOATS, FLOATS, COVARIANCES_2),
-    Belief: st.builds(Belief, NAMES, STAMPS, FLOATS, FLOATS, FLOATS, COVARIANCES_3, FLOATS, FLOATS),
-    Fix: st.builds(Fix, NAMES, NAMES, STAMPS, FLOATS, FLOATS, COVARIANCES_2, COVARIANCES_2, FLOATS),
     Status: st.builds(
         Status,
         NAMES,
@@ -103,7 +99,7 @@ def wire(*fields: Any) -> bytes:
     return bytes([VERSION]) + msgspec.msgpack.encode(fields)
 
 
-def fields_of(message: Message) -> list[Any]:
+def fields_of(message: Tagged) -> list[Any]:
     """Tag and fields as they are on the wire."""
     fields: list[Any] = msgspec.msgpack.decode(encode(message)[1:])
     return fields
@@ -113,33 +109,32 @@ def fields_of(message: Message) -> list[Any]:
 
 
 def test_the_strategies_and_samples_cover_the_whole_union() -> None:
-    assert set(MESSAGES) == {type(m) for m in VALID} == set(get_args(Message))
+    assert set(MESSAGES) == {type(m) for m in VALID} == set(get_args(Tagged))
 
 
 @examples(200)
 @given(ANY_MESSAGE)
-def test_every_message_comes_back_as_it_was(message: Message) -> None:
+def test_every_message_comes_back_as_it_was(message: Tagged) -> None:
     again = decode(encode(message))
     assert again == message
     assert type(again) is type(message)
 
 
 @per_kind
-def test_an_old_reader_skips_fields_that_a_newer_program_added(valid: Message) -> None:
+def test_an_old_reader_skips_fields_that_a_newer_program_added(valid: Tagged) -> None:
     assert decode(wire(*fields_of(valid), "new", {"and": ["nested"]}, 3.5)) == valid
 
 
 @pytest.mark.parametrize(
     ("newer", "added"),
     [
-        (BELIEF, {"speed_m_s": 0.0, "turn_rate_rad_s": 0.0}),
         (TRACK, {"lost": ""}),
         (STATUS, {"learned": None}),
     ],
-    ids=["Belief", "Track", "Status"],
+    ids=["Track", "Status"],
 )
 def test_a_new_reader_fills_in_what_an_older_program_left_out(
-    newer: Message, added: dict[str, Any]
+    newer: Tagged, added: dict[str, Any]
 ) -> None:
     older = decode(wire(*fields_of(newer)[: -len(added)]))
     assert older == msgspec.structs.replace(newer, **added)
@@ -153,7 +148,7 @@ def test_nested_fields_evolve_as_well() -> None:
 
 
 @per_kind
-def test_a_required_field_that_is_missing_is_garbage(valid: Message) -> None:
+def test_a_required_field_that_is_missing_is_garbage(valid: Tagged) -> None:
     required = sum(f.required for f in msgspec.structs.fields(valid))
     assert decode(wire(*fields_of(valid)[:required])) is Refusal.GARBAGE
 
@@ -166,7 +161,7 @@ def test_a_required_field_that_is_missing_is_garbage(valid: Message) -> None:
     [
         (b"", Refusal.EMPTY),
         (bytes(LARGEST_PAYLOAD + 1), Refusal.TOO_LARGE),
-        (bytes([VERSION + 1]) + encode(BELIEF)[1:], Refusal.VERSION),
+        (bytes([VERSION + 1]) + encode(POSITION)[1:], Refusal.VERSION),
         (bytes([VERSION]), Refusal.GARBAGE),
         (bytes([VERSION]) + b"\xc1\xc1", Refusal.GARBAGE),
         (wire("unheard of", 1, 2), Refusal.GARBAGE),
@@ -176,7 +171,7 @@ def test_a_required_field_that_is_missing_is_garbage(valid: Message) -> None:
         (wire("drive", b"\xff\xfe", NOW, 0.5, 0.1), Refusal.GARBAGE),
         (bytes([VERSION]) + b"\x91" * 60_000, Refusal.GARBAGE),
         (wire("truth", NOW)[:1] + b"\x93\xa5truth\x00\xdd\xff\xff\xff\xff", Refusal.GARBAGE),
-        (encode(BELIEF) + b"\x00", Refusal.GARBAGE),
+        (encode(POSITION) + b"\x00", Refusal.GARBAGE),
     ],
     ids=[
         "empty",
@@ -205,7 +200,7 @@ def test_the_largest_payload_is_still_read() -> None:
 
 
 @per_kind
-def test_a_valid_message_is_not_refused(valid: Message) -> None:
+def test_a_valid_message_is_not_refused(valid: Tagged) -> None:
     assert refusal(valid, NOW) is None
 
 
@@ -243,7 +238,7 @@ def with_number(message: Any, field: str, value: float) -> list[Any]:
     ],
     ids=lambda part: part if isinstance(part, str) else type(part).__name__,
 )
-def test_a_number_that_is_not_finite_is_refused(message: Message, field: str, value: float) -> None:
+def test_a_number_that_is_not_finite_is_refused(message: Tagged, field: str, value: float) -> None:
     for bad in with_number(message, field, value):
         assert refusal(bad, NOW) is Refusal.NOT_FINITE, bad
 
@@ -254,7 +249,7 @@ def test_numbers_of_sightings_are_left_to_the_filter() -> None:
 
 
 @per_kind
-def test_a_message_from_the_future_is_refused_beyond_the_tolerance(valid: Message) -> None:
+def test_a_message_from_the_future_is_refused_beyond_the_tolerance(valid: Tagged) -> None:
     assert refusal(valid, NOW - FUTURE_NS) is None
     assert refusal(valid, NOW - FUTURE_NS - 1) is Refusal.FUTURE
 
@@ -273,35 +268,13 @@ def test_odometry_of_the_longest_and_shortest_duration_is_taken() -> None:
     "bad", [(-1.0, 0.0, 1.0), (1.0, 0.0, -1.0), (1.0, 2.0, 1.0), (1.0, -2.0, 1.0)]
 )
 def test_what_is_no_covariance_is_refused(bad: tuple[float, float, float]) -> None:
-    replace = msgspec.structs.replace
-    for message in (
-        replace(FIX, sensor_covariance=bad),
-        replace(FIX, observer_covariance=bad),
-        replace(BELIEF, covariance=(*bad, 0.0, 0.0, 1.0)),
-        replace(POSITION, covariance=bad),
-    ):
-        assert refusal(message, NOW) is Refusal.NOT_A_COVARIANCE
+    message = msgspec.structs.replace(POSITION, covariance=bad)
+    assert refusal(message, NOW) is Refusal.NOT_A_COVARIANCE
 
 
-@pytest.mark.parametrize(
-    "bad",
-    [
-        (0.04, 0.0, 0.04, 0.0, 0.0, -1.0),
-        (0.04, 0.0, 0.04, 1.0, 0.0, 0.0),
-        (0.04, 0.0, 0.04, 0.0, 5.0, 1.0),
-        (1.0, 0.9, 1.0, 0.9, -0.9, 1.0),
-    ],
-    ids=["hh", "xh", "yh", "all three together"],
-)
-def test_a_beliefs_covariance_includes_the_heading(bad: tuple[float, ...]) -> None:
-    assert refusal(msgspec.structs.replace(BELIEF, covariance=bad), NOW) is (
-        Refusal.NOT_A_COVARIANCE
-    )
-
-
-@pytest.mark.parametrize("message", [ODOMETRY, POSITION, BELIEF, FIX, TRACK, DRIVE, TRUTHS])
+@pytest.mark.parametrize("message", [ODOMETRY, POSITION, TRACK, DRIVE, TRUTHS])
 @pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_a_number_larger_than_any_field_is_refused(message: Message, sign: float) -> None:
+def test_a_number_larger_than_any_field_is_refused(message: Tagged, sign: float) -> None:
     for field in message.__struct_fields__:
         for bad in with_number(message, field, sign * 2.0 * LARGEST_NUMBER):
             assert refusal(bad, NOW) is Refusal.IMPLAUSIBLE, bad
@@ -313,13 +286,13 @@ def test_a_number_larger_than_any_field_is_refused(message: Message, sign: float
 @examples(500)
 @given(st.binary(max_size=200))
 def test_random_bytes_never_raise(noise: bytes) -> None:
-    assert isinstance(decode(noise), Refusal | Message)
-    assert isinstance(decode(bytes([VERSION]) + noise), Refusal | Message)
+    assert isinstance(decode(noise), Refusal | Tagged)
+    assert isinstance(decode(bytes([VERSION]) + noise), Refusal | Tagged)
 
 
 @examples(300)
 @given(ANY_MESSAGE, st.data())
-def test_a_truncated_payload_is_refused(message: Message, data: st.DataObject) -> None:
+def test_a_truncated_payload_is_refused(message: Tagged, data: st.DataObject) -> None:
     payload = encode(message)
     kept = data.draw(st.integers(0, len(payload) - 1))
     assert isinstance(decode(payload[:kept]), Refusal)
@@ -327,7 +300,7 @@ def test_a_truncated_payload_is_refused(message: Message, data: st.DataObject) -
 
 @examples(500)
 @given(ANY_MESSAGE, st.data())
-def test_a_flipped_bit_never_raises(message: Message, data: st.DataObject) -> None:
+def test_a_flipped_bit_never_raises(message: Tagged, data: st.DataObject) -> None:
     payload = bytearray(encode(message))
     bit = data.draw(st.integers(0, 8 * len(payload) - 1))
     payload[bit // 8] ^= 1 << bit % 8

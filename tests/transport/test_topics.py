@@ -53,6 +53,17 @@ def test_names_that_are_left_out_become_wildcards(topic: Topic) -> None:
     assert matches(topic.at(), filled)
 
 
+@per_topic
+def test_the_names_in_a_key_are_those_it_was_made_with(topic: Topic) -> None:
+    names = {c.strip("<>"): f"{n}" for n, c in enumerate(topic.key.split("/")) if c[0] == "<"}
+    key = topic.at(**names)
+    assert topic.names(key) == names
+    assert [other.names(key) for other in TOPICS if other is not topic] == [None] * (
+        len(TOPICS) - 1
+    )
+    assert topic.names(key + "/more") is topic.names(key.rpartition("/")[0]) is None
+
+
 def test_worked_examples_of_keys() -> None:
     assert topics.FIX.at(robot="r2", tier=3, observer="r1") == "fix/r2/3/r1"
     assert topics.FIX.at(robot="r2", tier=0) == "fix/r2/0/*"

@@ -1,8 +1,8 @@
-"""The closed union of messages and their wire format: one version byte, then MessagePack.
+"""The closed union of messages, and the wire format of all but help: a version byte, MessagePack.
 
 Structs are written as arrays with their tag first; they grow only by defaulted fields at the end,
-so that old readers skip what they do not know. What cannot be used is a `Refusal` with a reason,
-never an exception.
+so that old readers skip what they do not know. Beliefs and fixes are small: `compact`. What cannot
+be used is a `Refusal` with a reason, never an exception.
 """
 
 import math
@@ -11,10 +11,9 @@ from enum import StrEnum
 
 import msgspec
 
-from cpcbl_team.estimate import Covariance3
 from cpcbl_team.inputs import Belief, Fix, Name, Odometry, Position, Sightings
 
-VERSION = 1
+VERSION = 2
 FUTURE_NS = 500_000_000
 LONGEST_ODOMETRY_NS = 10_000_000_000
 LARGEST_PAYLOAD = 65_536
@@ -81,7 +80,9 @@ class Truths(msgspec.Struct, frozen=True, array_like=True, tag="truth"):
     robots: tuple[Truth, ...]
 
 
-Message = Odometry | Sightings | Position | Belief | Fix | Status | Track | Drive | Truths
+Help = Belief | Fix
+Tagged = Odometry | Sightings | Position | Status | Track | Drive | Truths
+Message = Tagged | Help
 
 
 class Refusal(StrEnum):
@@ -98,41 +99,47 @@ class Refusal(StrEnum):
     FUTURE = "from_the_future"
     DURATION = "impossible_duration"
     UNKNOWN_ROBOT = "unknown_robot"
-    NOT_FOR_ME = "not_for_me"
     OWN = "own_message"
 
 
 _encoder = msgspec.msgpack.Encoder()
-_decoder: msgspec.msgpack.Decoder[Message] = msgspec.msgpack.Decoder(Message)
+_decoder: msgspec.msgpack.Decoder[Tagged] = msgspec.msgpack.Decoder(Tagged)
 _HEAD = bytes([VERSION])
 
 
-def encode(message: Message) -> bytes:
+def encode(message: Tagged) -> bytes:
     """The payload of a message."""
     return _HEAD + _encoder.encode(message)
 
 
-def decode(payload: bytes) -> Message | Refusal:
+def decode(payload: bytes) -> Tagged | Refusal:
     """The message in a payload, or why there is none."""
-    if not payload:
-        return Refusal.EMPTY
-    if len(payload) > LARGEST_PAYLOAD:
-        return Refusal.TOO_LARGE
-    if payload[0] != VERSION:
-        return Refusal.VERSION
+    reason = refused_head(payload)
+    if reason is not None:
+        return reason
     try:
         return _decoder.decode(memoryview(payload)[1:])
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
         return Refusal.GARBAGE
 
 
+def refused_head(payload: bytes) -> Refusal | None:
+    """Why a payload need not be read at all, or None."""
+    if not payload:
+        return Refusal.EMPTY
+    if len(payload) > LARGEST_PAYLOAD:
+        return Refusal.TOO_LARGE
+    return None if payload[0] == VERSION else Refusal.VERSION
+
+
 def refusal(message: Message, now_ns: int) -> Refusal | None:
     """Why a decoded message must not be used, or None: numbers, time, duration.
 
-    The numbers of sightings are judged one by one by the filter.
+    The numbers of sightings are judged one by one by the filter. Help that was read from any bytes
+    is finite and its covariance is one.
     """
     if not isinstance(message, Sightings):
-        numbers = list(_numbers(message))
+        numbers = list(numbers_in(message))
         if not all(map(math.isfinite, numbers)):
             return Refusal.NOT_FINITE
         if any(abs(n) > LARGEST_NUMBER for n in numbers):
@@ -143,21 +150,8 @@ def refusal(message: Message, now_ns: int) -> Refusal | None:
         case Odometry():
             if not 0 < message.stamp_ns - message.from_ns <= LONGEST_ODOMETRY_NS:
                 return Refusal.DURATION
-        case Fix():
-            parts = (message.sensor_covariance, message.observer_covariance)
-            if not all(_is_covariance(*part) for part in parts):
-                return Refusal.NOT_A_COVARIANCE
         case Position():
             if not _is_covariance(*message.covariance):
-                return Refusal.NOT_A_COVARIANCE
-        case Belief():
-            xx, xy, yy, xh, yh, hh = c = Covariance3(*message.covariance)
-            if not (
-                _is_covariance(xx, xy, yy)
-                and _is_covariance(xx, xh, hh)
-                and _is_covariance(yy, yh, hh)
-                and c.determinant() >= -(1e-6 * xx * yy * hh + 1e-12)
-            ):
                 return Refusal.NOT_A_COVARIANCE
     return None
 
@@ -166,13 +160,13 @@ def _is_covariance(xx: float, xy: float, yy: float) -> bool:
     return xx >= 0.0 and yy >= 0.0 and xy * xy <= xx * yy * (1.0 + 1e-6) + 1e-12
 
 
-def _numbers(value: object) -> Iterator[float]:
+def numbers_in(value: object) -> Iterator[float]:
     """All floats in a message, however deep."""
     if isinstance(value, float):
         yield value
     elif isinstance(value, tuple):
         for part in value:
-            yield from _numbers(part)
+            yield from numbers_in(part)
     elif isinstance(value, msgspec.Struct):
         for name in value.__struct_fields__:
-            yield from _numbers(getattr(value, name))
+            yield from numbers_in(getattr(value, name))

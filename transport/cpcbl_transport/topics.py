@@ -38,6 +38,16 @@ class Topic(NamedTuple):
             chunks.append(str(names.get(name, "*")) if chunk.startswith("<") else chunk)
         return "/".join(chunks)
 
+    def names(self, key: str) -> dict[str, str] | None:
+        """The names in a key of this topic, None for any other key: the inverse of `at`."""
+        mine, chunks = self.key.split("/"), key.split("/")
+        if len(mine) != len(chunks):
+            return None
+        pairs = list(zip(mine, chunks, strict=True))
+        if any(own != chunk for own, chunk in pairs if not own.startswith("<")):
+            return None
+        return {own.strip("<>"): chunk for own, chunk in pairs if own.startswith("<")}
+
 
 ALIVE = Topic(
     "alive/<tier>/<robot>/<incarnation>",
