@@ -99,6 +99,11 @@ def next_tier(
     return min(max(present, best), worst)
 
 
+def hears(own: int, other: int, settings: CollaborationSettings) -> bool:
+    """Whether a robot of tier `own` listens to one of tier `other`."""
+    return other < own or settings.direction == "both-ways"
+
+
 def tiers_heard(own: int, settings: CollaborationSettings) -> range:
     """The tiers that a robot listens to: all better than its own, or all there are."""
     return range(LOWEST_TIER + 1 if settings.direction == "both-ways" else own)

@@ -144,6 +144,21 @@ class LocalizerSettings(Table, frozen=True, kw_only=True):
         return self.variant != "joint" if self.alternate is None else self.alternate
 
 
+class BudgetSettings(Table, frozen=True, kw_only=True):
+    """What a robot may spend on fixes and beliefs; 0: as much as it likes."""
+
+    bytes_per_s: NotNegative = 0.0
+    """With Zenoh's own bytes; holds over any 10 s."""
+    messages_per_minute: NotNegative = 0.0
+    """Holds over any minute; 2.5: at most 3 in any 72 s."""
+    messages_in_all: Annotated[int, msgspec.Meta(ge=0)] = 0
+    """For a match, as in RoboCup: of this robot, see `Team.messages_in_all`."""
+    match_s: Positive = 1200.0
+    """Over so long a time `messages_in_all` are spread."""
+    urgent_share: Share = 0.2
+    """The part of every budget that is kept for teammates that are lost."""
+
+
 class CollaborationSettings(Table, frozen=True, kw_only=True):
     """Who helps whom, and how much is believed."""
 
@@ -155,10 +170,19 @@ class CollaborationSettings(Table, frozen=True, kw_only=True):
     """Ratio of position sigma from one tier to the next."""
     tier_hysteresis: Annotated[float, msgspec.Meta(ge=1.0)] = 1.1
     """A tier is left only when sigma is beyond its edge by this factor."""
+    budget: BudgetSettings = BudgetSettings()
+    least_value: NotNegative = 0.05
+    """What a fix or a teammate's belief must be worth (nats): the logarithm of the factor by which
+    the ellipse of the helped robot's position shrinks."""
     belief_rate_hz: Positive = 5.0
+    """At most."""
+    belief_share: NotNegative = 0.5
+    """A belief is sent when what listeners make of the last one is off by this share of sigma."""
+    belief_silence_s: NotNegative = 1.0
+    """The longest silence of a robot whose belief is listened to."""
     fix_interval_s: NotNegative = 0.0
     """Least time between two fixes for the same teammate."""
-    max_age_s: Positive = 1.0
+    max_age_s: Positive = 1.5
     """A teammate's belief older than this is not used."""
     after_s: NotNegative = 0.0
     """Collaboration begins so long after the start: for showing what it is worth."""

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from typing import NamedTuple, Protocol
 
 from cpcbl_team.estimate import Estimate
-from cpcbl_team.inputs import Sightings, Told
+from cpcbl_team.inputs import Belief, Fix, Sightings, Told
 from cpcbl_transport.messages import Message
 
 
@@ -30,7 +30,28 @@ class Located(NamedTuple):
     frame: Sightings | None = None
 
 
-Anything = Message | Tick | Located | Told
+class Presence(NamedTuple):
+    """The bus knows of a teammate: the tier that it announces; None when it is gone."""
+
+    robot: str
+    tier: int | None
+
+
+class Listened(NamedTuple):
+    """Whether any teammate listens to this robot's beliefs at present."""
+
+    by_any: bool
+
+
+class Sent(NamedTuple):
+    """Help that has really left this robot, and its bytes on the wire."""
+
+    message: Belief | Fix
+    size: int
+
+
+FromBus = Presence | Listened | Sent
+Anything = Message | Tick | Located | Told | FromBus
 
 
 class Agent(Protocol):

@@ -3,7 +3,7 @@
 from collections import Counter
 from pathlib import Path
 
-from cpcbl_agents.agent import Anything, Tick
+from cpcbl_agents.agent import Anything, FromBus, Sent, Tick
 from cpcbl_agents.collaboration import CollaborationAgent
 from cpcbl_agents.driving import Pilot
 from cpcbl_agents.filtering import FilterAgent
@@ -33,17 +33,23 @@ class Robot:
             start_ns = max(start_ns, source.first_ns)
             source.skip_to(start_ns)
         self.name = name
+        self._told_ns = start_ns
         self.sensing = SensingAgent(settings, source, teammates, pilot)
         self.filter = FilterAgent(settings, team.map, teammates, start_ns)
         self.collaboration = CollaborationAgent(name, settings, teammates, start_ns)
 
-    def handle(self, message: Message | Tick | Told, now_ns: int) -> list[Message]:
+    def handle(self, message: Message | Tick | FromBus, now_ns: int) -> list[Message]:
         """Everything that one message (from the bus, or a tick) makes this robot say to others.
 
         sensing -> filter -> collaboration; what the filter locates goes to the pilot as well.
         After the end of its log a robot is silent.
         """
         if self.sensing.over:
+            return []
+        if isinstance(message, FromBus):
+            self.collaboration.handle(message, now_ns)
+            if isinstance(message, Sent):
+                self._told(message.message.stamp_ns, now_ns)
             return []
         raw = isinstance(message, (Odometry, Sightings, Position))
         inputs: list[Anything] = [] if raw else [message]
@@ -52,6 +58,12 @@ class Robot:
         said = [out for m in located for out in self.collaboration.handle(m, now_ns)]
         said += [out for m in located for out in self.sensing.handle(m, now_ns)]
         return [m for m in said if isinstance(m, _OUTGOING)]
+
+    def _told(self, stamp_ns: int, now_ns: int) -> None:
+        """From now on what this robot knows may be in what its teammates say."""
+        if stamp_ns > self._told_ns:
+            self._told_ns = stamp_ns
+            self.filter.handle(Told(stamp_ns), now_ns)
 
     @property
     def next_ns(self) -> int:

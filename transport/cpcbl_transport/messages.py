@@ -20,6 +20,26 @@ LARGEST_PAYLOAD = 65_536
 LARGEST_NUMBER = 1e6  # metres, radians, or their squares
 
 
+class Flow(msgspec.Struct, frozen=True, array_like=True):
+    """Help of one kind from or for one teammate, since the process started.
+
+    `topic` is fix, belief or alive; `peer` the teammate, empty where it is for all who listen.
+    """
+
+    topic: str
+    peer: str
+    messages: int = 0
+    bytes: int = 0
+    """On the wire, with Zenoh's own."""
+    over_budget: int = 0
+    """Not sent: the budget did not allow it, or has better use."""
+    worthless: int = 0
+    """Not sent: it would have told the teammate next to nothing."""
+    silent: int = 0
+    """Not sent: listeners can still tell where this robot is."""
+    latest_ns: int = 0
+
+
 class Status(msgspec.Struct, frozen=True, array_like=True, tag="status"):
     """A robot's health, for operators. Metres, radians, counts since its process started."""
 
@@ -37,6 +57,8 @@ class Status(msgspec.Struct, frozen=True, array_like=True, tag="status"):
     bytes_received: int
     learned: tuple[float, float, float] | None = None
     """Self-calibration: distance scale, turn scale, bearing bias (rad); None where it is off."""
+    sent: tuple[Flow, ...] = ()
+    heard: tuple[Flow, ...] = ()
 
 
 class Track(msgspec.Struct, frozen=True, array_like=True, tag="track"):

@@ -1,0 +1,116 @@
+"""What help is worth before it is sent: how much it would shrink a teammate's covariance.
+
+The helper knows of its teammate no more than the tier that it announces, and what it has told it
+before. Worth is in nats: the logarithm of the factor by which the ellipse of the position shrinks,
+half that of the determinants (as in the mutual information of Gaussians).
+"""
+
+import math
+from typing import NamedTuple
+
+from cpcbl_team.collaboration import LOWEST_TIER, TIER_ZERO_SIGMA_M
+from cpcbl_team.config import CollaborationSettings
+from cpcbl_team.estimate import Covariance3, Estimate
+from cpcbl_team.gaussian import Covariance2
+from cpcbl_team.geometry import Pose2, step
+from cpcbl_team.inputs import Belief, Fix
+
+LOST_SIGMA_M = 2.0
+DRIFT_SHARE = 0.1  # of its way: what a teammate's position loses between two fixes
+_WEIGHTS = tuple(0.05 * n for n in range(1, 20))
+
+
+class Helped(NamedTuple):
+    """A teammate after the last fix that it was sent: where it was seen, how well it knew that."""
+
+    x_m: float
+    y_m: float
+    covariance: Covariance2
+
+
+def sigma_range_m(tier: int, settings: CollaborationSettings) -> tuple[float, float]:
+    """The least and the greatest position sigma that a robot of this tier may have."""
+    width, slack = settings.tier_width, settings.tier_hysteresis
+    least = TIER_ZERO_SIGMA_M * width ** (tier - 1) / slack
+    if tier == LOWEST_TIER:
+        return least, max(LOST_SIGMA_M, least)
+    return (0.0 if tier == 0 else least), TIER_ZERO_SIGMA_M * width**tier * slack
+
+
+def expected(
+    tier: int, helped: Helped | None, x_m: float, y_m: float, settings: CollaborationSettings
+) -> Covariance2:
+    """What the position covariance of a teammate at (x, y) is likely to be.
+
+    Its tier bounds it; within these bounds it is what the last fix left and its way has added.
+    """
+    least, most = sigma_range_m(tier, settings)
+    if helped is None:
+        variance = (most if tier == LOWEST_TIER else math.sqrt(max(least, 0.5 * most) * most)) ** 2
+        return Covariance2(variance, 0.0, variance)
+    way = math.hypot(x_m - helped.x_m, y_m - helped.y_m)
+    doubt = (DRIFT_SHARE * way) ** 2
+    xx, xy, yy = helped.covariance
+    grown = Covariance2(xx + doubt, xy, yy + doubt)
+    sigma = math.sqrt(0.5 * (grown.xx + grown.yy))
+    return grown.scaled((min(max(sigma, least), most) / sigma) ** 2)
+
+
+def merged(
+    prior: Covariance2, fresh: Covariance2, dependent: Covariance2, split: bool
+) -> Covariance2:
+    """The covariance after evidence with a fresh and a dependent part.
+
+    `split`: by covariance intersection, all of the prior taken as dependent: what was told once is
+    worth little the second time. Else as if all were independent.
+    """
+    if not split:
+        return _product(prior, fresh + dependent)
+    candidates = (
+        _product(prior.scaled(1.0 / w), fresh + dependent.scaled(1.0 / (1.0 - w))) for w in _WEIGHTS
+    )
+    best = min(candidates, key=Covariance2.determinant)
+    return best if best.determinant() < prior.determinant() else prior
+
+
+def worth(prior: Covariance2, after: Covariance2) -> float:
+    """Nats gained from `prior` to `after`."""
+    return 0.5 * math.log(prior.determinant() / after.determinant())
+
+
+def _product(a: Covariance2, b: Covariance2) -> Covariance2:
+    """(A^-1 + B^-1)^-1."""
+    return (a.inverse() + b.inverse()).inverse()
+
+
+def use_of(fix: Fix, tier: int, estimate: Estimate, settings: CollaborationSettings) -> float:
+    """What the belief of a teammate of this tier is worth to the robot that sees it (nats).
+
+    `fix` is where the robot sees the teammate. The sighting tells of the position and, by its
+    bearing, of the heading; what both tell is counted for the one that gains more.
+    """
+    prior = estimate.covariance.position()
+    sensor, sigma = Covariance2(*fix.sensor_covariance), sum(sigma_range_m(tier, settings)) / 2.0
+    theirs = Covariance2(sigma * sigma, 0.0, sigma * sigma)
+    position = worth(prior, merged(prior, sensor, theirs, settings.fusion == "split-ci"))
+    dx, dy = fix.x_m - estimate.pose.x, fix.y_m - estimate.pose.y
+    across = (sensor + theirs + prior).along(-dy, dx) / (dx * dx + dy * dy) ** 2
+    heading = 0.5 * math.log1p(estimate.covariance.hh / across)
+    return max(position, heading)
+
+
+def staleness(copy: Belief | None, now: Belief) -> float:
+    """By how many sigma listeners err who carry `copy` along to the time of `now`: of the position,
+    or twice the logarithm of the ratio of the sigmas. Infinite without a copy."""
+    if copy is None:
+        return math.inf
+    age = (now.stamp_ns - copy.stamp_ns) * 1e-9
+    pose = Pose2(copy.x_m, copy.y_m, copy.heading_rad)
+    pose = step(pose, copy.speed_m_s * age, copy.turn_rate_rad_s * age)
+    before, after = (
+        Covariance3(*copy.covariance).position(),
+        Covariance3(*now.covariance).position(),
+    )
+    off = math.sqrt(after.mahalanobis_squared(now.x_m - pose.x, now.y_m - pose.y))
+    ratio = 0.5 * math.log(after.determinant() / before.determinant())
+    return max(off, abs(ratio))
