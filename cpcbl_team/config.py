@@ -256,6 +256,20 @@ class RobotSettings(LocalizationSettings, frozen=True, kw_only=True):
     speed_m_s: NotNegative = 0.5
 
 
+class GuardSettings(Table, frozen=True, kw_only=True):
+    """What the router lets in from one robot, so that a faulty one cannot flood the others."""
+
+    enabled: bool = True
+    fix_rate_hz: Positive = 100.0
+    """Fixes for one teammate. What comes sooner than 1 / rate after the last one is dropped, so
+    leave room for messages that come unevenly: twice the frame rate or more."""
+    belief_rate_hz: Positive = 50.0
+    largest_help_bytes: Annotated[int, msgspec.Meta(ge=1)] = 256
+    """Payload of a fix or belief."""
+    largest_bytes: Annotated[int, msgspec.Meta(ge=1)] = 65_536
+    """Payload of anything else; robots refuse what is larger."""
+
+
 class TransportSettings(Table, frozen=True, kw_only=True):
     """Where the team's Zenoh router is."""
 
@@ -263,6 +277,7 @@ class TransportSettings(Table, frozen=True, kw_only=True):
     """Endpoints at which `up` opens its router; default: a free port of 127.0.0.1."""
     connect: tuple[str, ...] = ("tcp/127.0.0.1:7447",)
     """Endpoints at which a robot looks for the router."""
+    guards: GuardSettings = GuardSettings()
 
 
 class SimulationSettings(Table, frozen=True, kw_only=True):

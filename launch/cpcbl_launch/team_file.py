@@ -152,6 +152,7 @@ def problems(team: Team) -> Iterator[str]:
                 f"robots.{name}.localizer.alternate: only the joint variant can update both at"
                 " once; remove the key"
             )
+    yield from _guard_problems(team)
     if not team.transport.connect:
         yield "transport.connect: is empty; name an endpoint such as tcp/192.168.1.10:7447"
     for key in ("listen", "connect"):
@@ -160,6 +161,21 @@ def problems(team: Team) -> Iterator[str]:
                 yield (
                     f"transport.{key}: {endpoint!r} is no endpoint;"
                     " write it as tcp/192.168.1.10:7447"
+                )
+
+
+def _guard_problems(team: Team) -> Iterator[str]:
+    """A guard must not bother a healthy robot, and messages come unevenly."""
+    guards = team.transport.guards
+    for name, robot in team.robots.items() if guards.enabled else ():
+        for key, allowed_hz, own_hz in (
+            ("fix_rate_hz", guards.fix_rate_hz, robot.sensor.rate_hz),
+            ("belief_rate_hz", guards.belief_rate_hz, robot.collaboration.belief_rate_hz),
+        ):
+            if allowed_hz < 2.0 * own_hz:
+                yield (
+                    f"transport.guards.{key}: robots.{name} has {own_hz:g} Hz; raise it to"
+                    f" {2.0 * own_hz:g} or more"
                 )
 
 

@@ -23,6 +23,7 @@ from cpcbl_launch.team_file import save_resolved
 from cpcbl_team.config import Team
 from cpcbl_team.metrics import Floats, score
 from cpcbl_transport.bus import Bus
+from cpcbl_transport.guards import guard_rules
 from cpcbl_transport.zenoh_bus import open_router
 
 log = logging.getLogger(__name__)
@@ -89,7 +90,8 @@ def _run_in(run: Run, view: View, stop: Stopping, folder: Path) -> Report:
         run.speed,
     )
     table = process_table(team, team_file, _dialled(listen[0]), clock, run.seed, here)
-    with open_router(team.name, listen) as bus, _recording(run, bus):
+    guards = guard_rules(team, run.speed)
+    with open_router(team.name, listen, guards=guards) as bus, _recording(run, bus):
         recorder = Recorder(bus)
         with Supervisor(table, folder) as supervisor:
             end_ns = None if run.duration_s is None else int(run.duration_s * 1e9)

@@ -116,6 +116,7 @@ north = { from_m = [0.0, 5.0], to_m = [9.0, 5.0], gives = "range" }
 [transport]
 listen = ["tcp/0.0.0.0:7447", "quic/[::]:7448"]
 connect = ["tls/router.example:7447"]
+guards = { fix_rate_hz = 44.0, largest_help_bytes = 100 }
 [simulation]
 step_rate_hz = 100
 noise = 0
@@ -303,6 +304,24 @@ WRONG = [
         "tcp/192.168.1.10:7447",
     ),
     Wrong(
+        "a guard that drops every second frame of a fast camera",
+        "[transport.guards]\nfix_rate_hz = 90.0\n[defaults.sensor]\nrate_hz = 60.0",
+        "transport.guards.fix_rate_hz",
+        "robots.r1 has 60 Hz; raise it to 120 or more",
+    ),
+    Wrong(
+        "a guard below the rate of beliefs",
+        "[transport.guards]\nbelief_rate_hz = 5.0",
+        "transport.guards.belief_rate_hz",
+        "raise it to 10 or more",
+    ),
+    Wrong(
+        "a guard that lets nothing in",
+        "[transport.guards]\nlargest_help_bytes = 0",
+        "transport.guards.largest_help_bytes",
+        ">= 1",
+    ),
+    Wrong(
         "joint with the paper's uncertainty",
         "[defaults.localizer]\npaper_uncertainty = true",
         "robots.r1.localizer.paper_uncertainty",
@@ -378,6 +397,11 @@ def test_what_cannot_be_read_is_named(tmp_path: Path, suffix: str) -> None:
 
 def test_a_robot_that_is_not_simulated_needs_no_start() -> None:
     assert robots('[robots.r1]\nsource = "external"')["r1"].start is None
+
+
+def test_guards_that_are_off_may_have_any_rate() -> None:
+    off = team(f"[transport.guards]\nenabled = false\nfix_rate_hz = 0.1{ROBOT}")
+    assert not off.transport.guards.enabled
 
 
 def test_whole_numbers_are_numbers() -> None:

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import msgspec
 import pytest
+from bus_helpers import Ear, robot_at, team_of, wait_until
 from process_helpers import command_of, eventually
 
 from cpcbl_launch.processes import PROGRAM
@@ -17,9 +18,10 @@ from cpcbl_launch.recorder import Recorder, Report
 from cpcbl_launch.supervisor import ProcessSpec, Supervisor
 from cpcbl_launch.team_file import builtin, load_team, save_resolved
 from cpcbl_launch.up import Run, free_endpoint, run_team
-from cpcbl_team.config import Team
+from cpcbl_team.config import GuardSettings, Team, TransportSettings
 from cpcbl_transport import topics
-from cpcbl_transport.zenoh_bus import open_router
+from cpcbl_transport.topics import Qos
+from cpcbl_transport.zenoh_bus import open_bus, open_router
 
 ROBOTS = ("navigator", "observer", "scout", "patrol")
 
@@ -191,3 +193,27 @@ def test_a_robot_ends_when_its_launcher_is_gone(
             assert eventually(lambda: any(alive.values()))
             parent.kill()
         assert eventually(lambda: not any(alive.values()))
+
+
+def test_the_router_of_a_run_has_the_teams_guards(tmp_path: Path) -> None:
+    endpoint = free_endpoint()
+    guards = GuardSettings(fix_rate_hz=0.01, largest_help_bytes=100)
+    transport = TransportSettings(listen=(endpoint,), guards=guards)
+    team = msgspec.structs.replace(team_of(me=robot_at()), transport=transport)
+    key = topics.FIX.at(robot="me", tier=0, observer="faulty")
+
+    def flooded(recorder: Recorder, supervisor: Supervisor) -> bool:
+        with open_bus(team.name, [endpoint]) as me, open_bus(team.name, [endpoint]) as faulty:
+            ear, inputs = Ear(me, topics.FIX.at(robot="me")), Ear(me, "in/me/*")
+            fix, last = faulty.publisher(key, Qos.INPUT), faulty.publisher("in/me/last", Qos.INPUT)
+            wait_until(lambda: fix.matching and last.matching)
+            for size in (100, 100, 100, 101):
+                fix.put(bytes(size))
+            last.put(b"last")
+            wait_until(lambda: bool(inputs.samples))
+            assert [len(payload) for payload in ear.payloads] == [100]
+        return True
+
+    script = Script(flooded)
+    run_team(Run(team, None, folder=tmp_path, here=()), script, script.done)
+    assert script.done()

@@ -3,13 +3,14 @@
 from typing import get_args
 
 import pytest
+import zenoh
 
 from cpcbl_team.collaboration import LOWEST_TIER, tiers_heard
 from cpcbl_team.config import CollaborationSettings
 from cpcbl_transport import topics
 from cpcbl_transport.bus import matches
 from cpcbl_transport.messages import Message
-from cpcbl_transport.topics import TOPICS, Topic
+from cpcbl_transport.topics import TOPICS, Qos, Topic
 
 TIERS = range(LOWEST_TIER + 1)
 per_topic = pytest.mark.parametrize("topic", TOPICS, ids=lambda t: t.key)
@@ -42,6 +43,19 @@ def test_a_robots_inputs_are_the_topics_below_in() -> None:
 def test_every_topic_has_a_rate_and_a_reason(topic: Topic) -> None:
     assert topic.rate.strip()
     assert topic.reason.strip()
+
+
+@per_topic
+def test_what_robots_tell_each_other_has_the_priority_that_costs_nothing(topic: Topic) -> None:
+    priority = getattr(zenoh.Priority, topic.qos.value.priority)
+    helps = topic.carries in topics.COLLABORATION
+    assert (priority == zenoh.Priority.DEFAULT) is helps
+
+
+def test_commands_go_before_help_help_before_inputs_and_these_before_reports() -> None:
+    priorities = [getattr(zenoh.Priority, qos.value.priority) for qos in Qos]
+    assert sorted(priorities, key=int) == priorities
+    assert list(Qos) == [Qos.COMMAND, Qos.FRESH, Qos.INPUT, Qos.TELEMETRY]
 
 
 @per_topic

@@ -1,6 +1,6 @@
 """THE table of topics: every key, what it carries, how often, with which quality of service.
 
-A key stands below the team's namespace `cpcbl/<team>`. The publisher's tier is part of the key and
+A key stands below its team's `namespace`. The publisher's tier is part of the key and
 a robot subscribes only to tiers better than its own, so that nothing flows uphill: Zenoh itself
 drops it at the sender. This module does not know the bus.
 """
@@ -12,13 +12,28 @@ from cpcbl_team.inputs import Belief, Fix, Odometry, Position, Sightings
 from cpcbl_transport.messages import Drive, Message, Status, Track, Truths
 
 
-class Qos(Enum):
-    """(priority, what a full queue does, reliable): how the bus treats a topic."""
+class Treatment(NamedTuple):
+    """How the bus treats a message."""
 
-    FRESH = ("DATA_HIGH", "DROP", False)
-    COMMAND = ("INTERACTIVE_HIGH", "BLOCK", True)
-    INPUT = ("DATA", "BLOCK", True)
-    TELEMETRY = ("BACKGROUND", "DROP", False)
+    priority: str  # before or after what else waits for the same link
+    when_full: str  # what a put does when the link's queue is full: DROP or BLOCK
+    reliable: bool  # on links that can lose messages
+    express: bool  # sent without waiting for others to share its batch
+
+
+class Qos(Enum):
+    """The ways to treat a topic. Highest priority first; its row of the table has the reason.
+
+    DATA is what Zenoh assumes: a message of another priority, or that blocks, costs 2 to 4 bytes
+    more. So what robots tell each other is DATA and everything else stands around it. Nothing is
+    express: it costs 2 bytes more, is no faster (batches form only where a link is busy), and on a
+    busy processor messages were lost.
+    """
+
+    COMMAND = Treatment("INTERACTIVE_HIGH", "BLOCK", reliable=True, express=False)
+    FRESH = Treatment("DATA", "DROP", reliable=False, express=False)
+    INPUT = Treatment("DATA_LOW", "BLOCK", reliable=True, express=False)
+    TELEMETRY = Treatment("BACKGROUND", "DROP", reliable=False, express=False)
 
 
 class Topic(NamedTuple):
@@ -47,6 +62,11 @@ class Topic(NamedTuple):
         if any(own != chunk for own, chunk in pairs if not own.startswith("<")):
             return None
         return {own.strip("<>"): chunk for own, chunk in pairs if own.startswith("<")}
+
+
+def namespace(team: str) -> str:
+    """What stands before all keys of a team, by its name."""
+    return f"cpcbl/{team}"
 
 
 ALIVE = Topic(

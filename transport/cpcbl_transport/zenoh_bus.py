@@ -1,6 +1,7 @@
 """The bus over Zenoh: the only file that imports it. The choices are measured ones.
 
 - One publisher a concrete key: a put without a publisher is uploaded even if nobody listens.
+- Sequence numbers of 16 bits: two bytes a message less than Zenoh's 32.
 - No multicast: a client finds its router by the endpoint, which the launcher hands it.
 - `open` is retried here with a short time-out: a blocked open swallows SIGINT.
 - A session that is not closed hangs the interpreter at exit: `with open_bus(...)`.
@@ -9,17 +10,19 @@
 import json
 import logging
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from types import MappingProxyType
 from typing import Any
 
 import zenoh
 
 from cpcbl_transport.bus import Handle, Publisher, Receive, Watch
-from cpcbl_transport.topics import Qos
+from cpcbl_transport.topics import Qos, namespace
 
 log = logging.getLogger(__name__)
 
 OPEN_TIMEOUT_MS = 2000
+NO_GUARDS: Mapping[str, Any] = MappingProxyType({})
 
 
 class BusError(Exception):
@@ -57,12 +60,21 @@ def open_bus(
     raise BusError(f"no router at {', '.join(connect)}: {reason}")
 
 
-def open_router(team: str, listen: Sequence[str], connect: Sequence[str] = ()) -> "ZenohBus":
-    """A session that is the team's router. Raises BusError when it cannot listen there."""
+def open_router(
+    team: str,
+    listen: Sequence[str],
+    connect: Sequence[str] = (),
+    guards: Mapping[str, Any] = NO_GUARDS,
+) -> "ZenohBus":
+    """A session that is the team's router. Raises BusError when it cannot listen there.
+
+    `guards`: what `guard_rules` says; none, and everything is let in.
+    """
     options = {
         "mode": "router",
         "listen": {"endpoints": list(listen), "exit_on_failure": True},
         "connect": {"endpoints": list(connect), "timeout_ms": -1, "exit_on_failure": False},
+        **guards,
     }
     try:
         return ZenohBus(_open(team, options))
@@ -73,12 +85,13 @@ def open_router(team: str, listen: Sequence[str], connect: Sequence[str] = ()) -
 def _open(team: str, options: dict[str, Any]) -> "zenoh.Session":
     config = zenoh.Config()
     options |= {
-        "namespace": f"cpcbl/{team}",
+        "namespace": namespace(team),
         "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
         "timestamping": {"enabled": False},
     }
     for key, value in options.items():
         config.insert_json5(key, json.dumps(value))
+    config.insert_json5("transport/link/tx/sequence_number_resolution", '"16bit"')
     config.insert_json5("transport/link/tx/lease", "2000")
     config.insert_json5("transport/link/tx/keep_alive", "4")
     return zenoh.open(config)
@@ -126,7 +139,7 @@ class ZenohBus:
         self.declared: set[_Declared] = set()
 
     def publisher(self, key: str, qos: Qos) -> Publisher:
-        priority, congestion, reliable = qos.value
+        priority, when_full, reliable, express = qos.value
         kind = zenoh.Reliability.RELIABLE if reliable else zenoh.Reliability.BEST_EFFORT
         return _ZenohPublisher(
             self,
@@ -134,8 +147,9 @@ class ZenohBus:
                 key,
                 allowed_destination=zenoh.Locality.REMOTE,
                 priority=getattr(zenoh.Priority, priority),
-                congestion_control=getattr(zenoh.CongestionControl, congestion),
+                congestion_control=getattr(zenoh.CongestionControl, when_full),
                 reliability=kind,
+                express=express,
             ),
         )
 
