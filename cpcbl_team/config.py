@@ -148,13 +148,12 @@ class BudgetSettings(Table, frozen=True, kw_only=True):
     """What a robot may spend on fixes and beliefs; 0: as much as it likes."""
 
     bytes_per_s: NotNegative = 0.0
-    """With Zenoh's own bytes; holds over any 10 s."""
+    """With Zenoh's own bytes, without those of TCP/IP; holds over any 10 s, below
+    50 B/s over the time in which 500 bytes are earned."""
     messages_per_minute: NotNegative = 0.0
     """Holds over any minute; 2.5: at most 3 in any 72 s."""
-    messages_in_all: Annotated[int, msgspec.Meta(ge=0)] = 0
-    """For a match, as in RoboCup: of this robot, see `Team.messages_in_all`."""
-    match_s: Positive = 1200.0
-    """Over so long a time `messages_in_all` are spread."""
+    match_share: NotNegative = 1.0
+    """Its weight when `match.messages` are divided among the robots."""
     urgent_share: Share = 0.2
     """The part of every budget that is kept for teammates that are lost."""
 
@@ -172,8 +171,10 @@ class CollaborationSettings(Table, frozen=True, kw_only=True):
     """A tier is left only when sigma is beyond its edge by this factor."""
     budget: BudgetSettings = BudgetSettings()
     least_value: NotNegative = 0.05
-    """What a fix or a teammate's belief must be worth (nats): the logarithm of the factor by which
-    the ellipse of the helped robot's position shrinks."""
+    """What a fix must be worth (nats): the logarithm of the factor by which the ellipse of the
+    helped robot's position shrinks. Less is not sent."""
+    least_use: NotNegative = 0.05
+    """The same for the beliefs of a teammate in sight; for less they are not subscribed to."""
     belief_rate_hz: Positive = 5.0
     """At most."""
     belief_share: NotNegative = 0.5
@@ -280,6 +281,15 @@ class TransportSettings(Table, frozen=True, kw_only=True):
     guards: GuardSettings = GuardSettings()
 
 
+class MatchSettings(Table, frozen=True, kw_only=True):
+    """A limit for a whole match, as in RoboCup: 1,200 messages a team."""
+
+    messages: Annotated[int, msgspec.Meta(ge=0)] = 0
+    """Fixes and beliefs of all robots; 0: no limit. Each robot gets its share beforehand."""
+    duration_s: Positive = 1200.0
+    """They are earned evenly over this time."""
+
+
 class SimulationSettings(Table, frozen=True, kw_only=True):
     """The simulated field."""
 
@@ -296,8 +306,17 @@ class Team(Table, frozen=True, kw_only=True):
     robots: dict[str, RobotSettings]
     map: Field = Field()
     transport: TransportSettings = TransportSettings()
+    match: MatchSettings = MatchSettings()
     simulation: SimulationSettings = SimulationSettings()
     calibrated_on: tuple[str, ...] = ()
     """Logs from which `calibrate` took the robots' types: no measure of their worth."""
     data: str = ""
     """Folder of the log, for robots whose source is `mrclam`."""
+
+    def messages_per_s(self, robot: str) -> float | None:
+        """The rate at which a robot earns its share of the match's messages; None: no limit."""
+        if not self.match.messages:
+            return None
+        weights = {name: r.collaboration.budget.match_share for name, r in self.robots.items()}
+        share = weights[robot] / (sum(weights.values()) or 1.0)
+        return share * self.match.messages / self.match.duration_s

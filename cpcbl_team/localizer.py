@@ -76,6 +76,7 @@ class Localizer:
         self._learns = self._rules.learns
         self._gates = chi_square_bounds(self._rules.gate_probability)
         self._landmarks = Landmarks(field, settings, self._gates)
+        self._max_age_ns = int(settings.collaboration.max_age_s * 1e9)
         split = settings.collaboration.fusion == "split-ci"
         self._merge_teammate = merge_split if split else merge_naive
 
@@ -306,7 +307,9 @@ class Localizer:
     def hear(self, state: State, belief: Belief) -> State:
         """Passive collaboration: keeps a teammate's belief, to use it when the teammate is seen."""
         state = self.moved(state, belief.stamp_ns)
-        teammates = {**state.memory.teammates, belief.robot: belief}
+        forgotten_ns = belief.stamp_ns - self._max_age_ns
+        fresh = {n: b for n, b in state.memory.teammates.items() if b.stamp_ns >= forgotten_ns}
+        teammates = {**fresh, belief.robot: belief}
         return replace(state, memory=replace(state.memory, teammates=teammates))
 
     def tell(self, state: State, event: Told) -> State:

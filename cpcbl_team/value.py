@@ -9,7 +9,7 @@ import math
 from typing import NamedTuple
 
 from cpcbl_team.collaboration import LOWEST_TIER, TIER_ZERO_SIGMA_M
-from cpcbl_team.config import CollaborationSettings
+from cpcbl_team.config import CollaborationSettings, Fusion
 from cpcbl_team.estimate import Covariance3, Estimate
 from cpcbl_team.gaussian import Covariance2
 from cpcbl_team.geometry import Pose2, step
@@ -57,14 +57,14 @@ def expected(
 
 
 def merged(
-    prior: Covariance2, fresh: Covariance2, dependent: Covariance2, split: bool
+    prior: Covariance2, fresh: Covariance2, dependent: Covariance2, fusion: Fusion
 ) -> Covariance2:
-    """The covariance after evidence with a fresh and a dependent part.
+    """The covariance after evidence with a fresh and a dependent part, as the teammate merges it.
 
-    `split`: by covariance intersection, all of the prior taken as dependent: what was told once is
-    worth little the second time. Else as if all were independent.
+    By split covariance intersection all of the prior is taken as dependent: what was told once is
+    worth little the second time.
     """
-    if not split:
+    if fusion == "naive":
         return _product(prior, fresh + dependent)
     candidates = (
         _product(prior.scaled(1.0 / w), fresh + dependent.scaled(1.0 / (1.0 - w))) for w in _WEIGHTS
@@ -92,7 +92,7 @@ def use_of(fix: Fix, tier: int, estimate: Estimate, settings: CollaborationSetti
     prior = estimate.covariance.position()
     sensor, sigma = Covariance2(*fix.sensor_covariance), sum(sigma_range_m(tier, settings)) / 2.0
     theirs = Covariance2(sigma * sigma, 0.0, sigma * sigma)
-    position = worth(prior, merged(prior, sensor, theirs, settings.fusion == "split-ci"))
+    position = worth(prior, merged(prior, sensor, theirs, settings.fusion))
     dx, dy = fix.x_m - estimate.pose.x, fix.y_m - estimate.pose.y
     across = (sensor + theirs + prior).along(-dy, dx) / (dx * dx + dy * dy) ** 2
     heading = 0.5 * math.log1p(estimate.covariance.hh / across)

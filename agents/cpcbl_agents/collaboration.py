@@ -1,4 +1,4 @@
-"""The collaboration agent: whom this robot helps with what, and whom it listens to.
+"""The collaboration agent: whom this robot helps, with what, and whom it listens to.
 
 Help is sent where it is worth most for its bytes: a fix for a teammate that it sees and that is
 worse off, a belief when those who listen could no longer tell where it is. What is worth too little
@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from cpcbl_agents.agent import Anything, Listened, Located, Presence, Sent
+from cpcbl_agents.tally import Tallies
 from cpcbl_team.collaboration import LOWEST_TIER, fix_for, hears, next_tier
 from cpcbl_team.config import LocalizationSettings
 from cpcbl_team.gaussian import Covariance2
@@ -17,46 +18,44 @@ from cpcbl_team.value import Helped, expected, merged, staleness, use_of, worth
 from cpcbl_transport.budget import Budget
 from cpcbl_transport.compact import BELIEF_BYTES, FIX_BYTES
 from cpcbl_transport.messages import Track
+from cpcbl_transport.overhead import sent_bytes
 
 NEIGHBOUR_NS = 10_000_000_000  # so long a teammate's tier is followed after it was seen
-NEWS = 0.5
-LISTEN = 1.0
-IN_SIGHT_NS = 2_000_000_000  # so long its beliefs are of use
+IN_SIGHT_NS = 1_000_000_000  # so long its beliefs are of use
+_BELIEF_SIZE, _FIX_SIZE = sent_bytes(BELIEF_BYTES), sent_bytes(FIX_BYTES)
 
 
-class _Seen(NamedTuple):
-    """The last sighting of a teammate, and what its belief would be worth if it were exact."""
+class _Offer(NamedTuple):
+    """A fix that could be sent, its worth, and what its robot will know after it."""
 
-    stamp_ns: int
+    value: float
+    urgent: bool
+    after: Helped
     fix: Fix
-
-
-class Tally:
-    """What was done for one teammate (fixes), or for all (beliefs)."""
-
-    def __init__(self) -> None:
-        self.messages = self.bytes = self.over_budget = self.worthless = self.silent = 0
-        self.latest_ns = 0
 
 
 class CollaborationAgent:
     """Keeps the robot's tier; turns its beliefs and sightings into help for others."""
 
     def __init__(
-        self, robot: str, settings: LocalizationSettings, teammates: frozenset[str], start_ns: int
+        self,
+        robot: str,
+        settings: LocalizationSettings,
+        teammates: frozenset[str],
+        start_ns: int,
+        budget: Budget,
     ) -> None:
         self._robot, self._settings, self._teammates = robot, settings, teammates
-        self._rules = settings.collaboration
+        self._rules, self._budget = settings.collaboration, budget
         self._from_ns = start_ns + int(self._rules.after_s * 1e9)
         self._belief_ns = start_ns
         self._track_ns = -1
-        self._seen: dict[str, _Seen] = {}
+        self._seen: dict[str, Fix] = {}
         self._tiers: dict[str, int] = {}
         self._helped: dict[str, tuple[int, Helped]] = {}
         self._copy: Belief | None = None
         self._listened = False
-        self._budget = Budget(self._rules.budget, self._rules.least_value, start_ns)
-        self.tallies: dict[tuple[str, str], Tally] = {}
+        self.tallies = Tallies()
         self.tier = LOWEST_TIER
         self.located: Located | None = None
         self.neighbours: frozenset[str] = frozenset()
@@ -79,7 +78,6 @@ class CollaborationAgent:
                 self._tiers.pop(name, None)
                 if tier is not None:
                     self._tiers[name] = tier
-                    self._choose_sources()
             case Listened():
                 self._listened, self._copy = message.by_any, None
             case Sent():
@@ -93,54 +91,47 @@ class CollaborationAgent:
         sigma = now.estimate.position_sigma_m
         present = None if first else self.tier
         self.tier = next_tier(present, sigma, bool(now.lost), self._rules)
-        self._choose_sources()
+        self._look_round(now)
         return [self._track(now), *self._beliefs(now)]
 
     # Whom to listen to --------------------------------------------------------------------------
 
-    def _choose_sources(self) -> None:
-        now = self.located
-        if now is None:
-            return
-        at_ns, rules = now.stamp_ns, self._rules
-        self._seen = {n: s for n, s in self._seen.items() if at_ns - s.stamp_ns < NEIGHBOUR_NS}
-        if self._seen.keys() != self.neighbours:
-            self.neighbours = frozenset(self._seen)
-        if not rules.passive:
-            return
-        self.sources = frozenset(
-            (name, tier)
-            for name, seen in self._seen.items()
-            if at_ns - seen.stamp_ns < IN_SIGHT_NS
-            and (tier := self._tiers.get(name)) is not None
-            and hears(self.tier, tier, rules)
-            and (now.lost or use_of(seen.fix, tier, now.estimate, rules) >= LISTEN*rules.least_value)
-        )
+    def _look_round(self, now: Located) -> None:
+        """Chooses the teammates whose tiers are followed, and those whose beliefs are of use."""
+        forgotten_ns = now.stamp_ns - NEIGHBOUR_NS
+        self._seen = {name: fix for name, fix in self._seen.items() if fix.stamp_ns > forgotten_ns}
+        self.neighbours = frozenset(self._seen)
+        if self._rules.passive:
+            self.sources = frozenset(
+                (name, self._tiers[name])
+                for name, fix in self._seen.items()
+                if name in self._tiers and self._is_of_use(fix, self._tiers[name], now)
+            )
+
+    def _is_of_use(self, seen: Fix, tier: int, now: Located) -> bool:
+        rules = self._rules
+        in_sight = now.stamp_ns - seen.stamp_ns < IN_SIGHT_NS
+        if not (in_sight and hears(self.tier, tier, rules)):
+            return False
+        return bool(now.lost) or use_of(seen, tier, now.estimate, rules) >= rules.least_use
 
     # Active help --------------------------------------------------------------------------------
 
     def _framed(self, seen: Located) -> list[Fix]:
-        """The fixes of a frame that are worth it, the best first."""
-        offers: list[tuple[float, bool, Helped, Fix]] = []
+        """The fixes of a frame that are worth sending, the best first."""
+        offers = []
         for fix in self._possible(seen):
-            self._seen[fix.robot] = _Seen(seen.stamp_ns, fix)
+            self._seen[fix.robot] = fix
             tier = self._tiers.get(fix.robot)
-            if tier is None or not self._may_help(seen, fix.robot, tier):
+            if tier is None or seen.lost or not self._may_help(fix, tier):
                 continue
-            value, after = self._worth(fix, tier)
-            if value < self._rules.least_value:
-                self._tally("fix", fix.robot).worthless += 1
+            offer = self._offer(fix, tier)
+            if offer.value >= self._rules.least_value:
+                offers.append(offer)
             else:
-                offers.append((value, tier == LOWEST_TIER, after, fix))
-        offers.sort(key=lambda offer: offer[0], reverse=True)
-        size, chosen = sent_bytes(FIX_BYTES), []
-        for value, urgent, after, fix in offers:
-            if self._affords(seen.stamp_ns, size, value, urgent):
-                self._helped[fix.robot] = seen.stamp_ns, after
-                chosen.append(fix)
-            else:
-                self._tally("fix", fix.robot).over_budget += 1
-        return chosen
+                self.tallies.of("fix", fix.robot).worthless += 1
+        offers.sort(key=lambda offer: (offer.urgent, offer.value), reverse=True)
+        return [offer.fix for offer in offers if self._paid(offer)]
 
     def _possible(self, seen: Located) -> list[Fix]:
         """Where this frame has the robot's teammates."""
@@ -152,41 +143,46 @@ class CollaborationAgent:
         )
         return [fix for fix in fixes if fix is not None]
 
-    def _may_help(self, seen: Located, robot: str, tier: int) -> bool:
+    def _may_help(self, fix: Fix, tier: int) -> bool:
         rules = self._rules
-        last = self._helped.get(robot)
-        rested = last is None or seen.stamp_ns - last[0] >= rules.fix_interval_s * 1e9
-        fresh = last is None or seen.stamp_ns > last[0]
-        willing = rules.active and self.helps and not seen.lost
-        return willing and rested and fresh and hears(tier, self.tier, rules)
+        last_ns, _ = self._helped.get(fix.robot, (None, None))
+        rested = last_ns is None or fix.stamp_ns - last_ns >= max(1, rules.fix_interval_s * 1e9)
+        return rules.active and self.helps and rested and hears(tier, self.tier, rules)
 
-    def _worth(self, fix: Fix, tier: int) -> tuple[float, Helped]:
-        """The fix's worth in nats, and what its robot will know after it."""
+    def _offer(self, fix: Fix, tier: int) -> _Offer:
         _, before = self._helped.get(fix.robot, (0, None))
         prior = expected(tier, before, fix.x_m, fix.y_m, self._rules)
         parts = Covariance2(*fix.sensor_covariance), Covariance2(*fix.observer_covariance)
-        after = merged(prior, *parts, self._rules.fusion == "split-ci")
-        return worth(prior, after), Helped(fix.x_m, fix.y_m, after)
+        after = merged(prior, *parts, self._rules.fusion)
+        told = Helped(fix.x_m, fix.y_m, after)
+        return _Offer(worth(prior, after), tier == LOWEST_TIER, told, fix)
+
+    def _paid(self, offer: _Offer) -> bool:
+        fix = offer.fix
+        if not self._affords(fix.stamp_ns, _FIX_SIZE, offer.value, offer.urgent):
+            self.tallies.of("fix", fix.robot).over_budget += 1
+            return False
+        self._helped[fix.robot] = fix.stamp_ns, offer.after
+        return True
 
     # Passive help -------------------------------------------------------------------------------
 
     def _beliefs(self, now: Located) -> list[Belief]:
         """The belief, when it is due, listened to, and news."""
-        rules = self._rules
+        rules, tally = self._rules, self.tallies.of("belief", "")
         due = now.stamp_ns >= self._belief_ns + int(1e9 / rules.belief_rate_hz)
         if not (due and self.helps and rules.passive and self._listened and not now.lost):
             return []
+        self._belief_ns = now.stamp_ns
         belief = self._belief(now)
         stale = staleness(self._copy, belief)
-        silent_s = 1e9 if self._copy is None else (now.stamp_ns - self._copy.stamp_ns) * 1e-9
-        tally = self._tally("belief", "")
-        self._belief_ns = now.stamp_ns
-        if stale < rules.belief_share and silent_s < rules.belief_silence_s:
+        silence_ns = rules.belief_silence_s * 1e9
+        reported = self._copy is not None and now.stamp_ns - self._copy.stamp_ns < silence_ns
+        if reported and stale < rules.belief_share:
             tally.silent += 1
             return []
-        size = sent_bytes(BELIEF_BYTES)
-        value = max(min(0.5 * stale * stale, NEWS), rules.least_value)
-        if not self._affords(now.stamp_ns, size, value, urgent=False):
+        # The error of a listener's copy in sigmas, as the nats of correcting it
+        if not self._affords(now.stamp_ns, _BELIEF_SIZE, 0.5 * stale * stale, urgent=False):
             tally.over_budget += 1
             return []
         self._copy = belief
@@ -198,27 +194,22 @@ class CollaborationAgent:
             self._robot, now.stamp_ns, *pose, covariance, now.speed_m_s, now.turn_rate_rad_s
         )
 
-    # The budget, and what was really done -------------------------------------------------------
+    # What it costs, and what was really sent ----------------------------------------------------
 
     def _affords(self, now_ns: int, size: int, value: float, urgent: bool) -> bool:
         """Whether help of this value may be sent; it is paid for at once."""
-        budget = self._budget
+        budget, least = self._budget, self._rules.least_value
         wanted = urgent or value >= budget.price(now_ns, size)
         if not (wanted and budget.admits(now_ns, size, urgent)):
             return False
-        budget.spend(now_ns, size)
+        budget.spend(now_ns, size, least)
         return True
 
     def _sent(self, sent: Sent) -> None:
         message = sent.message
-        peer = ("fix", message.robot) if isinstance(message, Fix) else ("belief", "")
-        tally = self._tally(*peer)
-        tally.messages += 1
-        tally.bytes += sent.size
-        tally.latest_ns = message.stamp_ns
-
-    def _tally(self, topic: str, peer: str) -> Tally:
-        return self.tallies.setdefault((topic, peer), Tally())
+        to = message.robot if isinstance(message, Fix) else ""
+        topic = "fix" if isinstance(message, Fix) else "belief"
+        self.tallies.of(topic, to).add(sent.size, message.stamp_ns)
 
     def _track(self, now: Located) -> Track:
         pose, covariance, _ = now.estimate

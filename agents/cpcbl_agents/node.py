@@ -1,22 +1,20 @@
 """A robot on a bus: which keys it hears, what it may send, what it refuses."""
 
 from collections import Counter, deque
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from contextlib import suppress
-from typing import Any
 
 from cpcbl_agents.agent import Listened, Presence, Sent, Tick
-from cpcbl_agents.collaboration import Tally
 from cpcbl_agents.robot import Robot
-from cpcbl_team.collaboration import tiers_heard
+from cpcbl_agents.tally import Tallies
+from cpcbl_agents.wiring import Tokens, Wiring
 from cpcbl_team.config import Team
 from cpcbl_team.inputs import Belief, Fix, Odometry, Position, Sightings
 from cpcbl_transport import topics
-from cpcbl_transport.bus import Bus, Handle, Publisher
+from cpcbl_transport.bus import Bus
 from cpcbl_transport.compact import decode_help, encode_help
 from cpcbl_transport.messages import (
     Drive,
-    Flow,
     Message,
     Refusal,
     Status,
@@ -32,10 +30,6 @@ STATUS_NS = 1_000_000_000
 INBOX = 10_000
 
 
-def _flows(tallies: Mapping[tuple[str, str], Tally]) -> tuple[Flow, ...]:
-    return tuple(Flow(*peer, **vars(tally)) for peer, tally in sorted(tallies.items()))
-
-
 class Node:
     """Runs a `Robot` on a `Bus`. `step` it whenever `next_ns` has come or something arrived."""
 
@@ -48,39 +42,37 @@ class Node:
         incarnation: str,
         on_arrival: Callable[[], None] = lambda: None,
     ) -> None:
-        self._robot, self._bus, self._incarnation = robot, bus, incarnation
+        self._robot, self._incarnation = robot, incarnation
         self._on_arrival = on_arrival
         self._name = robot.name
-        self._settings = team.robots[robot.name]
-        self._rules = self._settings.collaboration
-        self._team = frozenset(team.robots)
-        self._inbox: deque[tuple[str, bytes | bool]] = deque(maxlen=INBOX)
-        self._publishers: dict[str, Publisher] = {}
-        self._hearing: dict[str, Handle] = {}
-        self._watching: dict[str, Handle] = {}
-        self._tokens: dict[str, dict[str, None]] = {}
+        rules = team.robots[robot.name].collaboration
+        self._team, self._passive = frozenset(team.robots), rules.passive
+        self._inbox: deque[tuple[str, bytes]] = deque(maxlen=INBOX)
+        self._news: deque[tuple[str, bool]] = deque(maxlen=INBOX)
+        self._wiring = Wiring(robot.name, incarnation, rules, bus, self._arrived, self._seen_alive)
+        self._tokens = Tokens()
         self._listened = False
-        self._sources: frozenset[tuple[str, int]] = frozenset()
-        self._neighbours: frozenset[str] = frozenset()
-        self._token: Handle | None = None
-        self._tier: int | None = None
         self._status_ns = start_ns
         self.counts: Counter[str] = Counter()
-        self.heard: dict[tuple[str, str], Tally] = {}
+        self._heard = Tallies()
         self._inputs = [
             bus.subscribe(topic.at(robot=robot.name), self._arrived) for topic in topics.INPUTS
         ]
-        self._own_name = bus.watch(topics.ALIVE.at(robot=robot.name), self._seen_alive)
+        self._own_name = bus.watch(topics.ALIVE.at(robot=robot.name), self._seen_my_name)
 
     # On the bus's thread: only put away ---------------------------------------------------------
 
-    def _arrived(self, key: str, payload: bytes | bool) -> None:
+    def _arrived(self, key: str, payload: bytes) -> None:
         if len(self._inbox) == INBOX:
             self.counts["inbox_overflow"] += 1
         self._inbox.append((key, payload))
         self._on_arrival()
 
     def _seen_alive(self, key: str, alive: bool) -> None:
+        self._news.append((key, alive))
+        self._on_arrival()
+
+    def _seen_my_name(self, key: str, alive: bool) -> None:
         if alive and not key.endswith("/" + self._incarnation):
             self.counts["same_name_twice"] += 1
 
@@ -94,25 +86,43 @@ class Node:
     @property
     def waiting(self) -> bool:
         """Whether something has arrived."""
-        return bool(self._inbox)
+        return bool(self._inbox or self._news)
 
     def step(self, now_ns: int) -> None:
         """Takes in what has arrived, lets the robot work, sends what it says."""
+        self._take_news(now_ns)
         with suppress(IndexError):
             while True:
                 message = self._accepted(*self._inbox.popleft(), now_ns)
                 if message is not None:
                     self._send(self._robot.handle(message, now_ns), now_ns)
-        self._ask_for_listeners(now_ns)
         self._send(self._robot.handle(Tick(), now_ns), now_ns)
-        self._retune()
-        if now_ns - self._status_ns >= STATUS_NS and self._tier is not None:
+        for name in self._wiring.follow(self._robot.collaboration):
+            self._tokens.forget(name)
+            self._robot.handle(Presence(name, None), now_ns)
+        if now_ns - self._status_ns >= STATUS_NS and self._wiring.tier is not None:
             self._status_ns = now_ns
             self._publish(topics.STATUS, topics.STATUS.at(robot=self._name), self._status(now_ns))
 
-    def _accepted(self, key: str, payload: bytes | bool, now_ns: int) -> Message | Presence | None:
-        if isinstance(payload, bool):
-            return self._presence(key, payload)
+    def _take_news(self, now_ns: int) -> None:
+        """What the bus knows of teammates: who is there with which tier, whether any listens."""
+        with suppress(IndexError):
+            while True:
+                presence = self._tokens.changed(*self._news.popleft())
+                if presence is None:
+                    self.counts["bad_token"] += 1
+                else:
+                    self._robot.handle(Presence(*presence), now_ns)
+        tier = self._wiring.tier
+        if tier is None or not self._passive:
+            return
+        key = topics.BELIEF.at(tier=tier, robot=self._name)
+        listened = self._wiring.publisher(topics.BELIEF, key).matching
+        if listened != self._listened:
+            self._listened = listened
+            self._robot.handle(Listened(listened), now_ns)
+
+    def _accepted(self, key: str, payload: bytes, now_ns: int) -> Message | None:
         helps = key.startswith(("belief/", "fix/"))
         message = decode_help(key, payload) if helps else decode(payload)
         reason = message if isinstance(message, Refusal) else self._refused(key, message, now_ns)
@@ -120,36 +130,13 @@ class Node:
             self.counts[reason] += 1
             return None
         assert not isinstance(message, Refusal)
-        if isinstance(message, Fix):
-            self._note_heard("fix", message.observer, payload, message.stamp_ns)
-        elif isinstance(message, Belief):
-            self._note_heard("belief", message.robot, payload, message.stamp_ns)
+        size = sent_bytes(len(payload))
+        match message:
+            case Fix():
+                self._heard.of("fix", message.observer).add(size, message.stamp_ns)
+            case Belief():
+                self._heard.of("belief", message.robot).add(size, message.stamp_ns)
         return message
-
-    def _note_heard(self, topic: str, source: str, payload: bytes, stamp_ns: int) -> None:
-        tally = self.heard.setdefault((topic, source), Tally())
-        tally.messages += 1
-        tally.bytes += sent_bytes(len(payload))
-        tally.latest_ns = max(tally.latest_ns, stamp_ns)
-
-    def _presence(self, key: str, alive: bool) -> Presence:
-        """A teammate may have two tokens for a while: the newest counts."""
-        _, tier, robot, _ = key.split("/")
-        tokens = self._tokens.setdefault(robot, {})
-        tokens.pop(key, None)
-        if alive:
-            tokens[key] = None
-        newest = next(reversed(tokens), None)
-        return Presence(robot, None if newest is None else int(newest.split("/")[1]))
-
-    def _ask_for_listeners(self, now_ns: int) -> None:
-        if self._tier is None or not self._rules.passive:
-            return
-        key = topics.BELIEF.at(tier=self._tier, robot=self._name)
-        listened = self._publisher(topics.BELIEF, key).matching
-        if listened != self._listened:
-            self._listened = listened
-            self._robot.handle(Listened(listened), now_ns)
 
     def _refused(self, key: str, message: Message, now_ns: int) -> Refusal | None:
         """What the key allows, who may say it, then the numbers and the time."""
@@ -173,7 +160,7 @@ class Node:
                 self._robot.handle(Sent(message, sent_bytes(size)), now_ns)
 
     def _addressed(self, message: Message) -> tuple[Topic, str]:
-        me, tier = self._name, self._tier
+        me, tier = self._name, self._wiring.tier
         match message:
             case Belief():
                 return topics.BELIEF, topics.BELIEF.at(tier=tier, robot=me)
@@ -186,71 +173,20 @@ class Node:
                 return topics.DRIVE, topics.DRIVE.at(robot=me)
         raise TypeError(f"robots do not send {type(message).__name__}")
 
-    def _publisher(self, topic: Topic, key: str) -> Publisher:
-        publisher = self._publishers.get(key)
-        if publisher is None:
-            publisher = self._publishers[key] = self._bus.publisher(key, topic.qos)
-        return publisher
-
     def _publish(self, topic: Topic, key: str, message: Message) -> int:
         """Sends if anybody listens; the bytes of the payload."""
-        publisher = self._publisher(topic, key)
+        publisher = self._wiring.publisher(topic, key)
         if not publisher.matching:
             return 0
         payload = encode_help(message) if isinstance(message, Belief | Fix) else encode(message)
         publisher.put(payload)
         return len(payload)
 
-    def _retune(self) -> None:
-        """Listens, watches and announces as the collaboration agent wants it now.
-
-        New keys are declared first, then the old ones are taken back.
-        """
-        agent = self._robot.collaboration
-        if agent.located is None:
-            return
-        tier, before, token = agent.tier, self._tier, self._token
-        if tier != before:
-            self._tier = tier
-            key = topics.ALIVE.at(tier=tier, robot=self._name, incarnation=self._incarnation)
-            self._token = self._bus.announce(key)
-        if tier != before or agent.sources != self._sources:
-            self._sources = agent.sources
-            self._declare(self._hearing, self._heard(tier), self._bus.subscribe)
-        if agent.neighbours != self._neighbours:
-            self._neighbours = agent.neighbours
-            alive = {topics.ALIVE.at(robot=name) for name in agent.neighbours}
-            self._declare(self._watching, alive, self._bus.watch)
-        if tier != before:
-            for key in [k for k in self._publishers if k.startswith(("belief/", "fix/"))]:
-                self._publishers.pop(key).close()
-            if token is not None:
-                token.close()
-
-    def _declare(
-        self,
-        declared: dict[str, Handle],
-        wanted: Iterable[str],
-        declare: Callable[[str, Callable[[str, Any], None]], Handle],
-    ) -> None:
-        keys = set(wanted)
-        for key in keys - declared.keys():
-            declared[key] = declare(key, self._arrived)
-        for key in declared.keys() - keys:
-            declared.pop(key).close()
-
-    def _heard(self, tier: int) -> Iterable[str]:
-        if self._rules.active:
-            for better in tiers_heard(tier, self._rules):
-                yield topics.FIX.at(robot=self._name, tier=better)
-        for name, theirs in self._sources:
-            yield topics.BELIEF.at(tier=theirs, robot=name)
-
     def _status(self, now_ns: int) -> Status:
         located = self._robot.collaboration.located
         assert located is not None
         learned = self._robot.filter.learned
-        sent, heard = _flows(self._robot.collaboration.tallies), _flows(self.heard)
+        sent, heard = self._robot.collaboration.tallies.flows(), self._heard.flows()
         return Status(
             self._name,
             self._incarnation,

@@ -53,7 +53,9 @@ def run_robot(
         if restarted or start_ns > clock.epoch_ns + LATE_NS * max(1.0, clock.speed):
             team = _not_knowing_its_start(name, team)
         incarnation = f"{os.getpid():x}"
-        node = Node(Robot(name, team, start_ns), team, bus, start_ns, incarnation, wake.set)
+        node = Node(
+            Robot(name, team, start_ns, restarted), team, bus, start_ns, incarnation, wake.set
+        )
         while not stop():
             wake.clear()
             node.step(clock.now_ns())

@@ -12,6 +12,7 @@ from cpcbl_agents.sources import Silent, Source
 from cpcbl_agents.sources.mrclam import MrclamSource
 from cpcbl_team.config import Team
 from cpcbl_team.inputs import Belief, Fix, Odometry, Position, Sightings, Told
+from cpcbl_transport.budget import Budget
 from cpcbl_transport.messages import Drive, Message, Track
 
 NEVER_NS = 2**62
@@ -19,9 +20,12 @@ _OUTGOING = (Belief, Fix, Track, Drive)
 
 
 class Robot:
-    """The agents of one robot of a team. Raises LogError for a log that cannot be read."""
+    """The agents of one robot of a team. Raises LogError for a log that cannot be read.
 
-    def __init__(self, name: str, team: Team, start_ns: int) -> None:
+    `restarted`: its process ran before, and may have spent its budget then.
+    """
+
+    def __init__(self, name: str, team: Team, start_ns: int, restarted: bool = False) -> None:
         settings = team.robots[name]
         teammates = frozenset(team.robots) - {name}
         pilot = None
@@ -36,7 +40,10 @@ class Robot:
         self._told_ns = start_ns
         self.sensing = SensingAgent(settings, source, teammates, pilot)
         self.filter = FilterAgent(settings, team.map, teammates, start_ns)
-        self.collaboration = CollaborationAgent(name, settings, teammates, start_ns)
+        budget = Budget(
+            settings.collaboration.budget, start_ns, team.messages_per_s(name), renewed=restarted
+        )
+        self.collaboration = CollaborationAgent(name, settings, teammates, start_ns, budget)
 
     def handle(self, message: Message | Tick | FromBus, now_ns: int) -> list[Message]:
         """Everything that one message (from the bus, or a tick) makes this robot say to others.

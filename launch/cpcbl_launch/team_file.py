@@ -17,6 +17,7 @@ import msgspec
 from cpcbl_team.config import (
     Field,
     Landmark,
+    MatchSettings,
     RobotSettings,
     SimulationSettings,
     Table,
@@ -45,6 +46,7 @@ class _File(Table, frozen=True, kw_only=True):
     robots: Layer
     map: _Map = _Map()
     transport: TransportSettings = TransportSettings()
+    match: MatchSettings = MatchSettings()
     simulation: SimulationSettings = SimulationSettings()
     calibrated_on: tuple[str, ...] = ()
     data: str = ""
@@ -120,6 +122,7 @@ def parse_team(text: str, name: str = "team file") -> Team:
         robots=robots,
         map=field,
         transport=file.transport,
+        match=file.match,
         simulation=file.simulation,
         calibrated_on=file.calibrated_on,
         data=file.data,

@@ -1,84 +1,117 @@
 """What a robot may still spend on messages, and what a message must be worth at present.
 
-Limits are windows: what was spent comes back when the window's length has passed, so no window
-ever holds more than is allowed, and nothing is held back for bursts. The price spreads the
-spending: it falls while nothing is sent and rises with each message, and so finds the level at
-which as much is worth sending as may be sent (dual ascent on the budget's constraint).
+A limit is a bucket whose tokens come back one window after they were spent: so no window ever holds
+more than is allowed, and nothing has to be held back for bursts, as in a bucket that fills evenly.
+The price spreads the spending: it falls while nothing is sent, rises with each message, and so
+finds the level at which as much is worth sending as may be sent (dual ascent on the constraint).
 """
 
 import math
 from collections import deque
+from typing import NamedTuple
 
 from cpcbl_team.config import BudgetSettings
 
 BYTES_WINDOW_S = 10.0
-MATCH_WINDOW_S = 1e6  # spent messages of a match do not come back
-MEMORY = 1.0
+LEAST_BYTES = 500.0  # in a window, so that a small budget can be used up by whole messages
+MEMORY = 3.0  # after so many messages' time without one, the price has fallen by a factor of e
+_ROUNDING = 1e-9
 
 
-class Limit:
-    """So much in any window; `pace_s`: the time in which one unit is earned."""
+class Window:
+    """At most `capacity` within any `window_s`, of it `reserve` for what is urgent."""
 
-    def __init__(self, capacity: float, window_s: float, pace_s: float) -> None:
-        self.capacity, self.pace_s = capacity, pace_s
-        self._window_ns = int(window_s * 1e9)
+    def __init__(self, capacity: float, window_s: float, reserve: float) -> None:
+        self.capacity, self.pace_s = capacity, window_s / capacity
+        self._window_ns, self._reserve = int(window_s * 1e9), reserve
         self._spent: deque[tuple[int, float]] = deque()
         self._sum = 0.0
 
-    def left(self, now_ns: int) -> float:
+    def room(self, now_ns: int, urgent: bool) -> float:
         while self._spent and now_ns - self._spent[0][0] >= self._window_ns:
             self._sum -= self._spent.popleft()[1]
-        return self.capacity - self._sum
+        return self.capacity - self._sum - (0.0 if urgent else self._reserve)
 
     def spend(self, now_ns: int, amount: float) -> None:
         self._spent.append((now_ns, amount))
         self._sum += amount
 
 
-class Budget:
-    """One robot's budget. Time is the robot's; sizes are bytes on the wire."""
+class Savings:
+    """What is earned evenly from the start on and never comes back, as a match's messages."""
 
-    def __init__(self, settings: BudgetSettings, least_value: float, start_ns: int) -> None:
+    def __init__(self, start_ns: int, rate_hz: float, urgent_share: float) -> None:
+        self.pace_s = 1.0 / rate_hz if rate_hz else math.inf
+        self._start_ns, self._rate_hz, self._urgent_share = start_ns, rate_hz, urgent_share
+        self._spent = 0.0
+
+    def room(self, now_ns: int, urgent: bool) -> float:
+        earned = self._rate_hz * (now_ns - self._start_ns) * 1e-9
+        return earned * (1.0 if urgent else 1.0 - self._urgent_share) - self._spent
+
+    def spend(self, now_ns: int, amount: float) -> None:
+        self._spent += amount
+
+
+class _Cost(NamedTuple):
+    limit: Window | Savings
+    amount: float
+
+
+class Budget:
+    """One robot's budget. Times are the robot's, sizes are bytes on the wire.
+
+    `match_rate_hz`: at which it earns messages of the match; None without such a limit. `renewed`:
+    of a process that was restarted and cannot know what was spent before: it starts with nothing.
+    """
+
+    def __init__(
+        self,
+        settings: BudgetSettings,
+        start_ns: int,
+        match_rate_hz: float | None = None,
+        renewed: bool = False,
+    ) -> None:
         s = settings
-        self._least_value, self._urgent_share = least_value, s.urgent_share
-        self._price, self._price_ns = 1.0, start_ns
+        self._price, self._price_ns = 0.0, start_ns
         self._bytes = self._messages = self._match = None
         if s.bytes_per_s:
-            self._bytes = Limit(BYTES_WINDOW_S * s.bytes_per_s, BYTES_WINDOW_S, 1.0 / s.bytes_per_s)
+            most = max(BYTES_WINDOW_S * s.bytes_per_s, LEAST_BYTES)
+            self._bytes = Window(most, most / s.bytes_per_s, s.urgent_share * most)
         if s.messages_per_minute:
-            most, pace_s = math.ceil(s.messages_per_minute), 60.0 / s.messages_per_minute
-            self._messages = Limit(most, most * pace_s, pace_s)
-        if s.messages_in_all:
-            pace_s = s.match_s / s.messages_in_all
-            self._match = Limit(s.messages_in_all, MATCH_WINDOW_S, pace_s)
+            most = math.ceil(s.messages_per_minute)
+            window_s = 60.0 * most / s.messages_per_minute
+            self._messages = Window(most, window_s, math.floor(s.urgent_share * most))
+        if match_rate_hz is not None:
+            self._match = Savings(start_ns, match_rate_hz, s.urgent_share)
+        for window in (self._bytes, self._messages):
+            if renewed and window is not None:
+                window.spend(start_ns, window.capacity)
 
     def admits(self, now_ns: int, size: int, urgent: bool) -> bool:
         """Whether every limit has room for a message of this size now."""
-        kept = 0.0 if urgent else self._urgent_share
         return all(
-            limit.left(now_ns) - amount >= kept * limit.capacity - 1e-9
-            for limit, amount in self._limits(size)
+            limit.room(now_ns, urgent) >= amount - _ROUNDING for limit, amount in self._costs(size)
         )
 
     def price(self, now_ns: int, size: int) -> float:
-        """What a message of this size must be worth (nats)."""
+        """What a message of this size should be worth, in the unit of `spend`."""
         memory_s = MEMORY * self._earned_s(size)
         if memory_s == 0.0:
-            return self._least_value
-        passed_s = (now_ns - self._price_ns) * 1e-9
-        return max(self._least_value, self._price * math.exp(-passed_s / memory_s))
+            return 0.0
+        return self._price * math.exp((self._price_ns - now_ns) * 1e-9 / memory_s)
 
-    def spend(self, now_ns: int, size: int) -> None:
-        """A message of this size was sent."""
-        self._price = self.price(now_ns, size) * math.exp(1.0 / MEMORY)
+    def spend(self, now_ns: int, size: int, least: float) -> None:
+        """A message of this size is sent; the price was at least `least`."""
+        self._price = max(self.price(now_ns, size), least) * math.exp(1.0 / MEMORY)
         self._price_ns = now_ns
-        for limit, amount in self._limits(size):
+        for limit, amount in self._costs(size):
             limit.spend(now_ns, amount)
 
     def _earned_s(self, size: int) -> float:
         """The time in which a message of this size is earned."""
-        return max((limit.pace_s * amount for limit, amount in self._limits(size)), default=0.0)
+        return max((limit.pace_s * amount for limit, amount in self._costs(size)), default=0.0)
 
-    def _limits(self, size: int) -> list[tuple[Limit, float]]:
-        amounts = ((self._bytes, float(size)), (self._messages, 1.0), (self._match, 1.0))
-        return [(limit, amount) for limit, amount in amounts if limit is not None]
+    def _costs(self, size: int) -> list[_Cost]:
+        costs = ((self._bytes, float(size)), (self._messages, 1.0), (self._match, 1.0))
+        return [_Cost(limit, amount) for limit, amount in costs if limit is not None]
