@@ -11,9 +11,18 @@ from process_helpers import cpcbl_team
 
 from cpcbl_launch.cli import main
 from cpcbl_launch.evaluation import simulate
-from cpcbl_launch.scale.measure import Size, measured, parsed_sizes
+from cpcbl_launch.scale.measure import Size, measured, measured_team, parsed_sizes
 from cpcbl_launch.scale.swarm import SPACING_M, swarm
 from cpcbl_launch.team_file import builtin, load_team, problems
+from cpcbl_team.config import (
+    Field,
+    Landmark,
+    OdometrySettings,
+    RobotSettings,
+    SensorSettings,
+    Start,
+    Team,
+)
 
 TIMED = ("cpu_ms_per_s", "field_cpu_ms_per_s", "times_real_time")
 PNG = b"\x89PNG\r\n\x1a\n"
@@ -112,9 +121,22 @@ def test_what_is_counted_is_what_the_robots_said() -> None:
         assert figure == pytest.approx(sum(due) / 6)
         assert figure > 0.0
     assert size.position_rmse_m == report.team.position_rmse_m
-    seen = sum(r.counts["sightings"] for r in report.robots.values())
-    assert seen > 6 * 20
-    assert 0.0 < size.in_sight < 5.0
+
+
+@pytest.mark.parametrize(("apart_m", "in_sight"), [(2.0, 1.0), (9.0, 0.0)])
+def test_teammates_are_counted_that_are_in_sight(apart_m: float, in_sight: float) -> None:
+    """Two that stand face to face, each before a landmark."""
+    robots = {
+        name: RobotSettings(
+            start=Start(x_m=x_m, y_m=0.0, heading_deg=heading_deg),
+            sensor=SensorSettings(max_range_m=6.0),
+            odometry=OdometrySettings(moves=False),
+        )
+        for name, x_m, heading_deg in (("west", 0.0, 0.0), ("east", apart_m, 180.0))
+    }
+    marks = {n: Landmark(x_m=x_m, y_m=0.5) for n, x_m in (("w", 1.5), ("e", apart_m - 1.5))}
+    team = Team(name="t", robots=robots, map=Field(landmarks=marks))
+    assert measured_team(team, 1, 2.0).in_sight == in_sight
 
 
 # The command ------------------------------------------------------------------------------------
@@ -183,3 +205,15 @@ def test_what_the_user_can_mend_is_one_line(
     assert ended.value.code == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert said in line
+
+
+def test_its_help_says_what_is_measured(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("sys.argv", ["cpcbl-team", "simulate", "--help"])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    assert ended.value.code == 0
+    shown = capsys.readouterr().out
+    for word in ("Usage", "--robots", "fixes", "beliefs", "CPU"):
+        assert word in shown

@@ -70,7 +70,7 @@ class KeyTree(Generic[Thing]):
                 if "**" in branch.next:
                     yield branch.next["**"]
                 if chunk == "*":
-                    following += (b for c, b in branch.next.items() if c != "**")
+                    following += branch.next.values()
                     continue
                 for name in (chunk, "*"):
                     if name in branch.next:
