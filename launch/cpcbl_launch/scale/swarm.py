@@ -1,9 +1,10 @@
 """Generated teams of any size, at the same density of robots and landmarks.
 
 Homes lie on a square lattice, one robot each; a landmark stands on every second corner between
-them. A robot drives round its home, so that the density stays, and sees up to 6 m ahead: about six
-teammates and three landmarks at a time, where the team is large enough. One robot in five is an
-observer with good sensors; of the others every second one is a scout, blind to landmarks.
+them. A robot drives round its home, so that the density stays, and sees so far all round that a
+small team already fills its neighbourhood: about seven teammates and three landmarks inside, fewer
+at the edge. One robot in five is an observer with good sensors; of the others every second one is
+a scout, blind to landmarks.
 """
 
 import math
@@ -27,7 +28,7 @@ ROUND_M = 0.7  # radius of the way round a home
 STRAY_M = 0.2  # how far a home lies off its place on the lattice, at most
 SPEED_M_S = 0.3
 NAVIGATOR = SensorSettings(
-    range_share=0.05, bearing_sigma_deg=4.0, field_of_view_deg=120.0, max_range_m=6.0
+    range_share=0.05, bearing_sigma_deg=4.0, field_of_view_deg=360.0, max_range_m=3.7
 )
 OBSERVER = replace(NAVIGATOR, range_share=0.01, bearing_sigma_deg=1.0)
 SCOUT = replace(NAVIGATOR, sees_landmarks=False)
