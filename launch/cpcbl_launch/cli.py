@@ -113,7 +113,7 @@ def up(
     from cpcbl_launch import logs as real_logs
     from cpcbl_launch.options import encoded, must_draw
     from cpcbl_launch.show import LiveTable, print_report
-    from cpcbl_launch.up import Run, run_team
+    from cpcbl_launch.up import SIMULATED_S, Run, run_team
 
     if file == Path("mrclam") and data is not None and not file.exists():
         file = real_logs.builtin_for(data)
@@ -131,7 +131,7 @@ def up(
             duration_s=min(duration or 1e9, (logged.end_ns - logged.start_ns) * 1e-9),
         )
     elif duration is None:
-        run = run._replace(duration_s=30.0)
+        run = run._replace(duration_s=SIMULATED_S)
     run = run._replace(team=real_logs.blinded(run.team, _names(blind)))
     if robots:
         run = run._replace(here=_names(robots))
@@ -291,6 +291,70 @@ def calibrate(
     else:
         print_calibration(result, Console())
         typer.echo(f"written: {output}")
+
+
+@app.command()
+def simulate(
+    file: Annotated[
+        Optional[Path], typer.Argument(help="Team file, or a built-in one: demo (default).")
+    ] = None,
+    robots: Annotated[
+        str,
+        typer.Option(help="No FILE: generated teams of these sizes, e.g. 2,10,50,200,1000."),
+    ] = "",
+    duration: Annotated[
+        Optional[float],
+        typer.Option(help="Seconds of robot time; default: 5 with --robots, else 30."),
+    ] = None,
+    seed: Annotated[int, typer.Option(help="Of the noise, and of generated teams.")] = 1,
+    report: Annotated[
+        Optional[Path], typer.Option(help="Write the report to this file (JSON).")
+    ] = None,
+    picture: Annotated[
+        Optional[Path],
+        typer.Option(help="Draw it into this file (PNG or SVG; extra `plot`)."),
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Run a simulated team in one process, without Zenoh: deterministic for a seed.
+
+    With a team file: the report of `up`. With --robots: what a robot costs in
+    teams of each size, on a field that grows with them. Measured are the fixes
+    and beliefs that it sends and receives, and the CPU time of its own steps;
+    simulating the field is apart.
+    """
+    from rich.console import Console
+
+    from cpcbl_launch.options import encoded, file_for, must_draw
+    from cpcbl_launch.recorder import Report
+    from cpcbl_launch.scale.measure import DURATION_S, Scale, measured, parsed_sizes
+    from cpcbl_launch.scale.show import print_scale
+    from cpcbl_launch.show import print_report, progress_bar
+    from cpcbl_launch.up import Run, simulate_run
+
+    if file is not None and robots:
+        raise ValueError("simulate: FILE or --robots, which generates its teams; leave one out")
+    if report is not None:
+        file_for("--report", report)
+    if picture is not None:
+        file_for("--picture", picture)
+        must_draw("--picture", picture)
+    result: Report | Scale
+    with progress_bar("simulating", quiet=as_json) as progress:
+        if robots:
+            duration = DURATION_S if duration is None else duration
+            result = measured(parsed_sizes(robots), seed, duration, progress, picture)
+        else:
+            run = Run(_load(file or Path("demo")), duration, seed=seed, picture=picture)
+            result = simulate_run(run, progress)
+    if report is not None:
+        report.write_text(encoded(result), encoding="utf-8")
+    if as_json:
+        sys.stdout.write(encoded(result) + "\n")
+    elif isinstance(result, Scale):
+        print_scale(result, Console())
+    else:
+        print_report(result, Console())
 
 
 def _load(path: Path) -> "Team":

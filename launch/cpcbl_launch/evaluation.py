@@ -88,7 +88,7 @@ def _run_log(logged: LoggedTeam, progress: Progress) -> tuple[Report, Recorder]:
     team, start_ns, end_ns = logged.team, logged.start_ns, logged.end_ns
     hub = MemoryHub()
     recorder = Recorder(hub.session())
-    run_nodes(_robots(team, hub, start_ns), start_ns, end_ns, progress)
+    run_nodes(robot_nodes(team, hub, start_ns), start_ns, end_ns, progress)
     variants = {name: robot.localizer.variant for name, robot in team.robots.items()}
     report = recorder.report(variants, logged.truth)
     duration_s = (end_ns - start_ns) * 1e-9
@@ -117,6 +117,7 @@ def simulate(
     truth: Team | None = None,
     referee: Referee | None = None,
     record: Path | None = None,
+    progress: Progress | None = None,
 ) -> tuple[Report, Recorder]:
     """A simulated team, field and robots in one process.
 
@@ -130,12 +131,18 @@ def simulate(
     over = (lambda: False) if referee is None else (lambda: referee.over)
     with Recording(record, team, hub.session()) if record is not None else nullcontext():
         field = FieldNode(SimulatedField(truth or team, seed, 0), hub.session())
-        run_nodes([field, *_robots(team, hub, 0)], 0, end_ns, over=over)
+        run_nodes([field, *robot_nodes(team, hub, 0)], 0, end_ns, progress, over)
+    return simulated_report(recorder, team), recorder
+
+
+def simulated_report(recorder: Recorder, team: Team) -> Report:
+    """The figures of a simulated team, from its start on."""
     variants = {name: robot.localizer.variant for name, robot in team.robots.items()}
-    return recorder.report(variants, recorder.simulated_truth()), recorder
+    return recorder.report(variants, recorder.simulated_truth())
 
 
-def _robots(team: Team, hub: MemoryHub, start_ns: int) -> list["Stepped"]:
+def robot_nodes(team: Team, hub: MemoryHub, start_ns: int) -> list["Stepped"]:
+    """A node for each robot, each with a session of its own."""
     return [
         Node(Robot(name, team, start_ns), team, hub.session(), start_ns, "0")
         for name in team.robots

@@ -14,6 +14,7 @@ import numpy as np
 
 from cpcbl_agents.clock import Clock
 from cpcbl_agents.sensing import SensorInput
+from cpcbl_launch.grid import Grid
 from cpcbl_team.config import OdometrySettings, RobotSettings, SensorSettings, Team
 from cpcbl_team.geometry import Pose2, step, wrap_angle
 from cpcbl_team.inputs import Odometry, Position, Sighting, Sightings
@@ -177,9 +178,10 @@ class SimulatedRobot:
         sensor = self.settings.sensor
         dx, dy = seen.x - self.pose.x, seen.y - self.pose.y
         range_m = math.hypot(dx, dy)
+        if seen.gives == "none" or not 0.05 <= range_m <= sensor.max_range_m:
+            return None
         bearing = wrap_angle(math.atan2(dy, dx) - self.pose.heading)
-        in_view = abs(bearing) <= math.radians(sensor.field_of_view_deg) / 2.0
-        if seen.gives == "none" or not in_view or not 0.05 <= range_m <= sensor.max_range_m:
+        if abs(bearing) > math.radians(sensor.field_of_view_deg) / 2.0:
             return None
         range_m += self._error(seen.name, "range", sensor.range_sigma_m(range_m), now_ns)
         bearing += self._error(seen.name, "bearing", sensor.bearing_sigma_rad, now_ns)
@@ -221,6 +223,11 @@ class SimulatedField:
             for i, (name, settings) in enumerate(team.robots.items())
             if settings.source == "simulated"
         }
+        marks = [Seen(n, m.x_m, m.y_m, m.gives) for n, m in team.map.landmarks.items()]
+        ranges_m = [robot.settings.sensor.max_range_m for robot in self.robots.values()]
+        self._reach_m = max(ranges_m, default=0.0)
+        self._marks_to_see = Grid(self._reach_m, marks)
+        self._marks_to_touch = Grid(team.simulation.bump_radius_m, marks)
 
     @property
     def next_ns(self) -> int:
@@ -237,10 +244,14 @@ class SimulatedField:
         for robot in self.robots.values():
             robot.move(self.now_ns, self._step_ns * 1e-9)
             self._bump(robot)
+        mates = Grid(
+            self._reach_m,
+            (Seen(n, r.pose.x, r.pose.y, "both", teammate=True) for n, r in self.robots.items()),
+        )
         sensed: list[tuple[str, SensorInput]] = []
         for name, robot in self.robots.items():
             piece = robot.odometry(self.now_ns)
-            frames = robot.sightings(self.now_ns, self._visible(name, robot.pose))
+            frames = robot.sightings(self.now_ns, self._visible(name, robot.pose, mates))
             position = robot.position(self.now_ns)
             items = (piece, *frames, position)
             sensed += [(name, item) for item in items if item is not None]
@@ -250,9 +261,8 @@ class SimulatedField:
         robots = tuple(Truth(n, *r.pose, r.bumps) for n, r in self.robots.items())
         return Truths(self.now_ns, robots)
 
-    def _visible(self, viewer: str, pose: Pose2) -> Iterable[Seen]:
-        for name, mark in self._team.map.landmarks.items():
-            yield Seen(name, mark.x_m, mark.y_m, mark.gives)
+    def _visible(self, viewer: str, pose: Pose2, mates: Grid[Seen]) -> Iterable[Seen]:
+        yield from self._marks_to_see.near(pose.x, pose.y)
         for name, wall in self._team.map.walls.items():
             (ax, ay), (bx, by) = wall.from_m, wall.to_m
             length = math.hypot(bx - ax, by - ay)
@@ -260,16 +270,14 @@ class SimulatedField:
             along = ux * (pose.x - ax) + uy * (pose.y - ay)
             if 0.0 <= along <= length:
                 yield Seen(name, ax + along * ux, ay + along * uy, wall.gives)
-        for name, other in self.robots.items():
-            if name != viewer:
-                yield Seen(name, other.pose.x, other.pose.y, "both", teammate=True)
+        yield from (mate for mate in mates.near(pose.x, pose.y) if mate.name != viewer)
 
     def _bump(self, robot: SimulatedRobot) -> None:
         radius = self._team.simulation.bump_radius_m
         touching = frozenset(
-            name
-            for name, mark in self._team.map.landmarks.items()
-            if math.hypot(mark.x_m - robot.pose.x, mark.y_m - robot.pose.y) < radius
+            mark.name
+            for mark in self._marks_to_touch.near(robot.pose.x, robot.pose.y)
+            if math.hypot(mark.x - robot.pose.x, mark.y - robot.pose.y) < radius
         )
         robot.bumps += len(touching - robot.touching)
         robot.touching = touching

@@ -1,10 +1,13 @@
 """What the options of several commands have in common."""
 
 import importlib.util
+import math
 from pathlib import Path
 from typing import Any
 
 import msgspec
+
+PICTURES = (".png", ".svg")
 
 
 def encoded(result: Any) -> str:
@@ -21,7 +24,21 @@ def folder_for(option: str, folder: Path) -> Path:
     return folder
 
 
-def must_draw(what: str) -> None:
-    """Raises ValueError where pictures cannot be drawn."""
+def file_for(option: str, path: Path) -> None:
+    """Raises ValueError for a file that could not be written later on."""
+    if not path.parent.is_dir():
+        raise ValueError(f"{option} {path}: no folder {path.parent}; make it first")
+
+
+def check_duration(duration_s: float, least_s: float) -> None:
+    """Raises ValueError for seconds of robot time that are too few, or no number."""
+    if not least_s <= duration_s < math.inf:
+        raise ValueError(f"--duration {duration_s:g}: at least {least_s:g} seconds of robot time")
+
+
+def must_draw(what: str, path: Path | None = None) -> None:
+    """Raises ValueError where pictures, or pictures of this kind, cannot be drawn."""
+    if path is not None and path.suffix.lower() not in PICTURES:
+        raise ValueError(f"{what} {path}: not a picture; end its name in {' or '.join(PICTURES)}")
     if importlib.util.find_spec("matplotlib") is None:
         raise ValueError(f"{what} needs matplotlib: pip install 'cpcbl-team[plot]'")

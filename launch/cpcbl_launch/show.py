@@ -214,6 +214,7 @@ def progress_bar(title: str, quiet: bool) -> Iterator[ProgressSetter]:
     """A bar on standard error; call what it yields with the share that is done."""
     console = Console(stderr=True)
     columns = (TextColumn(title), BarColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=console, transient=True, disable=quiet) as progress:
+    disable = quiet or not console.is_terminal
+    with Progress(*columns, console=console, transient=True, disable=disable) as progress:
         task = progress.add_task(title, total=1.0)
         yield lambda done: progress.update(task, completed=done)

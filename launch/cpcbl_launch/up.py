@@ -14,7 +14,9 @@ import msgspec
 import numpy as np
 
 from cpcbl_agents.clock import Clock
+from cpcbl_launch.evaluation import Progress, simulate
 from cpcbl_launch.logs import seen_before
+from cpcbl_launch.options import check_duration
 from cpcbl_launch.processes import process_table
 from cpcbl_launch.recorder import Recorder, Report
 from cpcbl_launch.recording import Recording
@@ -31,6 +33,8 @@ log = logging.getLogger(__name__)
 LEAD_S = 2.0
 LEAD_S_A_PROCESS = 0.3
 REFRESH_S = 0.25
+SIMULATED_S = 30.0  # unless told otherwise
+LEAST_S = 1.0
 
 
 class Run(NamedTuple):
@@ -75,6 +79,23 @@ def run_team(run: Run, view: View, stop: Stopping) -> Report:
     """Runs a team until its time is over or `stop()`. Raises BusError without a router."""
     with tempfile.TemporaryDirectory(prefix="cpcbl-") as temporary:
         return _run_in(run, view, stop, run.folder or Path(temporary))
+
+
+def simulate_run(run: Run, progress: Progress | None = None) -> Report:
+    """The same in one process over the bus in memory, as fast as the machine is.
+
+    Raises ValueError for a robot that is not simulated, or too short a duration.
+    """
+    for name, robot in run.team.robots.items():
+        if robot.source != "simulated":
+            raise ValueError(
+                f"robots.{name}.source: {robot.source}: cannot be simulated; use `up`, or"
+                " `evaluate` for a log"
+            )
+    duration_s = SIMULATED_S if run.duration_s is None else run.duration_s
+    check_duration(duration_s, LEAST_S)
+    _, recorder = simulate(run.team, run.seed, duration_s, progress=progress)
+    return _report(run, recorder, 0.0, duration_s, {})
 
 
 def _run_in(run: Run, view: View, stop: Stopping, folder: Path) -> Report:

@@ -5,11 +5,11 @@ Callbacks run on a thread of the bus (in memory: the publisher's) and must only 
 A session does not hear what it publishes itself.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import AbstractContextManager
-from functools import lru_cache
 from typing import Protocol, TypeVar
 
+from cpcbl_transport.key_tree import KeyTree
 from cpcbl_transport.topics import Qos
 
 Receive = Callable[[str, bytes], None]
@@ -50,9 +50,8 @@ class Bus(AbstractContextManager["Bus"], Protocol):
     def close(self) -> None: ...
 
 
-@lru_cache(maxsize=65_536)
 def matches(keys: str, key: str) -> bool:
-    """Whether a key is one of `keys`."""
+    """Whether a key is one of `keys`: what patterns mean on every bus, one pair at a time."""
     pattern, chunks = keys.split("/"), key.split("/")
     if pattern[-1] == "**":
         pattern.pop()
@@ -66,60 +65,46 @@ class MemoryHub:
     """Connects the sessions of one process; delivers in the order of declaration."""
 
     def __init__(self) -> None:
-        self.receivers: dict[_Receiver, None] = {}
-        self.watchers: dict[_Watcher, None] = {}
-        self.tokens: dict[_Token, None] = {}
-        self._routes: dict[str, tuple[_Receiver, ...]] = {}
+        self.receivers: KeyTree[_Receiver] = KeyTree()
+        self.watchers: KeyTree[_Watcher] = KeyTree()
+        self.tokens: KeyTree[_Token] = KeyTree()
 
     def session(self) -> "MemoryBus":
         return MemoryBus(self)
 
-    def route(self, key: str) -> tuple["_Receiver", ...]:
-        """The receivers of a key, in all sessions; remembered until a subscription changes."""
-        if key not in self._routes:
-            self._routes[key] = tuple(r for r in self.receivers if matches(r.keys, key))
-        return self._routes[key]
-
-    def changed(self) -> None:
-        self._routes.clear()
-
     def tell(self, key: str, alive: bool) -> None:
-        for watcher in tuple(self.watchers):
-            if matches(watcher.keys, key):
-                watcher.watch(key, alive)
+        for watcher in self.watchers.find(key):
+            watcher.watch(key, alive)
 
 
 class _Receiver:
     def __init__(self, hub: MemoryHub, session: object, keys: str, receive: Receive) -> None:
-        self._hub, self.session, self.keys, self.receive = hub, session, keys, receive
-        hub.receivers[self] = None
-        hub.changed()
+        self._hub, self.session, self._keys, self.receive = hub, session, keys, receive
+        hub.receivers.add(keys, self)
 
     def close(self) -> None:
-        self._hub.receivers.pop(self, None)
-        self._hub.changed()
+        self._hub.receivers.remove(self._keys, self)
 
 
 class _Watcher:
     def __init__(self, hub: MemoryHub, keys: str, watch: Watch) -> None:
-        self._hub, self.keys, self.watch = hub, keys, watch
-        hub.watchers[self] = None
-        for token in tuple(hub.tokens):
-            if matches(keys, token.key):
-                watch(token.key, True)
+        self._hub, self._keys, self.watch = hub, keys, watch
+        hub.watchers.add(keys, self)
+        for token in hub.tokens.find(keys):
+            watch(token.key, True)
 
     def close(self) -> None:
-        self._hub.watchers.pop(self, None)
+        self._hub.watchers.remove(self._keys, self)
 
 
 class _Token:
     def __init__(self, hub: MemoryHub, key: str) -> None:
         self._hub, self.key = hub, key
-        hub.tokens[self] = None
+        hub.tokens.add(key, self)
         hub.tell(key, True)
 
     def close(self) -> None:
-        if self._hub.tokens.pop(self, self) is None:
+        if self._hub.tokens.remove(self.key, self):
             self._hub.tell(self.key, False)
 
 
@@ -129,15 +114,15 @@ class _MemoryPublisher:
 
     @property
     def matching(self) -> bool:
-        return self._open and any(self._others())
+        return self._open and bool(self._others())
 
     def put(self, payload: bytes) -> None:
         if self._open:
-            for receiver in tuple(self._others()):
+            for receiver in self._others():
                 receiver.receive(self._key, payload)
 
-    def _others(self) -> Iterator[_Receiver]:
-        return (r for r in self._hub.route(self._key) if r.session is not self._session)
+    def _others(self) -> list[_Receiver]:
+        return [r for r in self._hub.receivers.find(self._key) if r.session is not self._session]
 
     def close(self) -> None:
         self._open = False
