@@ -46,7 +46,7 @@ class CollaborationAgent:
         budget: Budget,
     ) -> None:
         self._robot, self._settings, self._teammates = robot, settings, teammates
-        self._rules, self._budget = settings.collaboration, budget
+        self._rules, self.budget = settings.collaboration, budget
         self._from_ns = start_ns + int(self._rules.after_s * 1e9)
         self._belief_ns = start_ns
         self._track_ns = -1
@@ -198,7 +198,7 @@ class CollaborationAgent:
 
     def _affords(self, now_ns: int, size: int, value: float, urgent: bool) -> bool:
         """Whether help of this value may be sent; it is paid for at once."""
-        budget, least = self._budget, self._rules.least_value
+        budget, least = self.budget, self._rules.least_value
         wanted = urgent or value >= budget.price(now_ns, size)
         if not (wanted and budget.admits(now_ns, size, urgent)):
             return False

@@ -203,6 +203,7 @@ class Node:
             None if learned is None else learned[:3],
             sent,
             heard,
+            self._robot.collaboration.budget.spending(now_ns),
         )
 
 

@@ -11,6 +11,7 @@ from collections import deque
 from typing import NamedTuple
 
 from cpcbl_team.config import BudgetSettings
+from cpcbl_transport.messages import Spending
 
 BYTES_WINDOW_S = 10.0
 LEAST_BYTES = 500.0  # in a window, so that a small budget can be used up by whole messages
@@ -21,20 +22,25 @@ _ROUNDING = 1e-9
 class Window:
     """At most `capacity` within any `window_s`, of it `reserve` for what is urgent."""
 
-    def __init__(self, capacity: float, window_s: float, reserve: float) -> None:
+    def __init__(self, unit: str, capacity: float, window_s: float, reserve: float) -> None:
         self.capacity, self.pace_s = capacity, window_s / capacity
-        self._window_ns, self._reserve = int(window_s * 1e9), reserve
+        self._unit, self._window_s, self._reserve = unit, window_s, reserve
         self._spent: deque[tuple[int, float]] = deque()
-        self._sum = 0.0
+        self._sum = self._most = 0.0
 
     def room(self, now_ns: int, urgent: bool) -> float:
-        while self._spent and now_ns - self._spent[0][0] >= self._window_ns:
+        back_ns = now_ns - int(self._window_s * 1e9)
+        while self._spent and self._spent[0][0] <= back_ns:
             self._sum -= self._spent.popleft()[1]
         return self.capacity - self._sum - (0.0 if urgent else self._reserve)
 
     def spend(self, now_ns: int, amount: float) -> None:
         self._spent.append((now_ns, amount))
         self._sum += amount
+        self._most = max(self._most, self._sum)
+
+    def spending(self, now_ns: int) -> Spending:
+        return Spending(self._unit, self._window_s, self.capacity, self._most)
 
 
 class Savings:
@@ -51,6 +57,9 @@ class Savings:
 
     def spend(self, now_ns: int, amount: float) -> None:
         self._spent += amount
+
+    def spending(self, now_ns: int) -> Spending:
+        return Spending("messages", 0.0, self.room(now_ns, urgent=True) + self._spent, self._spent)
 
 
 class _Cost(NamedTuple):
@@ -77,11 +86,11 @@ class Budget:
         self._bytes = self._messages = self._match = None
         if s.bytes_per_s:
             most = max(BYTES_WINDOW_S * s.bytes_per_s, LEAST_BYTES)
-            self._bytes = Window(most, most / s.bytes_per_s, s.urgent_share * most)
+            self._bytes = Window("bytes", most, most / s.bytes_per_s, s.urgent_share * most)
         if s.messages_per_minute:
             most = math.ceil(s.messages_per_minute)
             window_s = 60.0 * most / s.messages_per_minute
-            self._messages = Window(most, window_s, math.floor(s.urgent_share * most))
+            self._messages = Window("messages", most, window_s, math.floor(s.urgent_share * most))
         if match_rate_hz is not None:
             self._match = Savings(start_ns, match_rate_hz, s.urgent_share)
         for window in (self._bytes, self._messages):
@@ -107,6 +116,10 @@ class Budget:
         self._price_ns = now_ns
         for limit, amount in self._costs(size):
             limit.spend(now_ns, amount)
+
+    def spending(self, now_ns: int) -> tuple[Spending, ...]:
+        """Its limits, and how near it came to each."""
+        return tuple(limit.spending(now_ns) for limit, _ in self._costs(0))
 
     def _earned_s(self, size: int) -> float:
         """The time in which a message of this size is earned."""

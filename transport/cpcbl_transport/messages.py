@@ -40,6 +40,18 @@ class Flow(msgspec.Struct, frozen=True, array_like=True):
     latest_ns: int = 0
 
 
+class Spending(msgspec.Struct, frozen=True, array_like=True):
+    """A limit on fixes and beliefs, and how near the robot came to it."""
+
+    unit: str
+    """bytes or messages"""
+    window_s: float
+    """0: over all the time."""
+    allowed: float
+    most: float
+    """The most that was spent within one window."""
+
+
 class Status(msgspec.Struct, frozen=True, array_like=True, tag="status"):
     """A robot's health, for operators. Metres, radians, counts since its process started."""
 
@@ -59,6 +71,7 @@ class Status(msgspec.Struct, frozen=True, array_like=True, tag="status"):
     """Self-calibration: distance scale, turn scale, bearing bias (rad); None where it is off."""
     sent: tuple[Flow, ...] = ()
     heard: tuple[Flow, ...] = ()
+    spending: tuple[Spending, ...] = ()
 
 
 class Track(msgspec.Struct, frozen=True, array_like=True, tag="track"):
