@@ -134,11 +134,26 @@ def _widened(prior: Estimate, weight: float) -> Covariance3:
 def _split(prior: Estimate, seen: Observation, scope: Scope, weight: float) -> tuple[float, float]:
     """(what is to be small, the weight)."""
     widened = _widened(prior, weight)
+    if scope is POSE:
+        noise = seen.noise(1.0 / (1.0 - weight))
+        return _merged_determinant(widened, noise, seen.rows), weight
     evidence = seen.information(1.0 / (1.0 - weight)).matrix
     merged = product(survival(widened, evidence), widened)
-    if scope is POSE:
-        return merged.determinant(), weight
     return (merged.hh if scope is HEADING else merged.xx + merged.yy), weight
+
+
+def _merged_determinant(p: Covariance3, r: Covariance2, rows: tuple[Row, ...]) -> float:
+    """det (P^-1 + H^T R^-1 H)^-1 = det P det R / det (R + H P H^T), the lemma of determinants."""
+    x, y, a = rows[0]
+    px, py, ph = p.times(rows[0])
+    sxx = x * px + y * py + a * ph + r.xx
+    if len(rows) == 1:
+        return p.determinant() * r.xx / sxx
+    x, y, a = rows[1]
+    sxy = x * px + y * py + a * ph + r.xy
+    px, py, ph = p.times(rows[1])
+    syy = x * px + y * py + a * ph + r.yy
+    return p.determinant() * r.determinant() / (sxx * syy - sxy * sxy)
 
 
 def _merge_split_at(prior: Estimate, seen: Observation, scope: Scope, weight: float) -> Estimate:
