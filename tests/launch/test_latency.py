@@ -2,13 +2,17 @@
 
 import io
 import math
+import os
+import time
 from collections.abc import Iterable
 
 import msgspec
+import pytest
 from rich.console import Console, RenderableType
 
-from cpcbl_launch.experiments import latency
-from cpcbl_transport.compact import FIX_BYTES
+from cpcbl_launch.experiments import latency, processes
+from cpcbl_launch.usage import MIB, usage
+from cpcbl_transport.compact import BELIEF_BYTES, FIX_BYTES
 
 
 def test_sightings_change_the_teammates_belief_and_every_stage_is_told() -> None:
@@ -48,6 +52,60 @@ def test_the_latency_table_fits_80_columns() -> None:
         **stages,
     )
     assert_fits(latency.tables(result), "belief changed", "12346")
+
+
+def test_a_team_and_a_broadcast_of_the_same_size_are_measured(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(processes, "WARM_S", 1.0)
+    done: list[None] = []
+    result = processes.measured([2], 3.0, lambda: done.append(None))
+    assert len(done) == 1
+    (size,) = result.sizes
+    assert size.robots == 2
+    assert result.most_kept in (0, 2)
+    for load in (size.team, size.broadcast):
+        assert 0.0 <= load.kept <= load.kept_mean <= 1.0
+        assert load.kept_mean > 0.0
+        assert 0.0 < load.cpu < 2.0
+        assert 0.0 < load.proportional_mib <= load.resident_mib
+    assert size.team.field_kept is not None
+    assert size.team.cpu_field is not None
+    assert size.broadcast.field_kept is size.broadcast.cpu_field is None
+    assert size.broadcast.received_hz > 0.0
+    received = size.broadcast.received_bytes_s / BELIEF_BYTES
+    assert received == pytest.approx(size.broadcast.received_hz, rel=0.1)
+    assert_fits(processes.tables(result), "broadcast", "10 Hz")
+
+
+def test_sizes_grow_until_one_does_not_keep_10_hz(monkeypatch: pytest.MonkeyPatch) -> None:
+    def load(robots: int, seconds: float) -> processes.Load:
+        figures = dict.fromkeys(processes.Load.__struct_fields__, 1.0)
+        return processes.Load(**{**figures, "kept": 0.96 if robots < 8 else 0.94})
+
+    monkeypatch.setattr(processes, "_team", load)
+    monkeypatch.setattr(processes, "_broadcast", load)
+    result = processes.measured([2, 4, 8, 16], 1.0)
+    assert [size.robots for size in result.sizes] == [2, 4, 8]
+    assert result.most_kept == 4
+
+
+@pytest.mark.parametrize("text", ["", "4,", "0", "4,x", "-1", "10000"])
+def test_sizes_are_checked(text: str) -> None:
+    with pytest.raises(ValueError, match="such as 4,8,16"):
+        processes.sizes_in(text)
+    assert processes.sizes_in("4, 8,16") == [4, 8, 16]
+
+
+def test_the_use_of_a_process_is_its_own() -> None:
+    before, until = usage(os.getpid()), time.process_time() + 0.2
+    while time.process_time() < until:
+        pass
+    after = usage(os.getpid())
+    assert after.cpu_s - before.cpu_s >= 0.1
+    assert 10 * MIB < after.proportional_bytes <= after.resident_bytes
+    with pytest.raises(OSError, match="No such"):
+        usage(2**30)
 
 
 def assert_fits(tables: Iterable[RenderableType], *words: str) -> None:

@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from rich.console import RenderableType
 
     from cpcbl_launch.experiments.latency import Latency
+    from cpcbl_launch.experiments.processes import Processes
     from cpcbl_launch.experiments.results import Experiment
 
 experiment_app = typer.Typer(
@@ -89,6 +90,28 @@ def latency(
     _shown(result, latency.tables(result), output, as_json)
 
 
+@experiment_app.command("processes")
+def processes(
+    robots: Annotated[
+        str, typer.Option(help="Sizes of the team, until one does not keep 10 Hz.")
+    ] = "4,8,16,24,32,48,64",
+    seconds: Annotated[float, typer.Option(min=1.0, help="Measured, of each size.")] = 15.0,
+    output: Annotated[Path, typer.Option(help="Folder for processes.json.")] = Path(),
+    as_json: AsJson = False,
+) -> None:
+    """Real processes that keep 10 Hz: CPU and memory a robot, beside an all-to-all broadcast."""
+    from cpcbl_launch.experiments import processes
+    from cpcbl_launch.options import folder_for
+    from cpcbl_launch.usage import must_measure
+
+    must_measure("experiment processes")
+    folder_for("--output", output)
+    sizes = processes.sizes_in(robots)
+    with _progress("processes", len(sizes), "sizes") as done:
+        result = processes.measured(sizes, seconds, done)
+    _shown(result, processes.tables(result), output, as_json)
+
+
 def conduct(
     experiment: "Experiment", seeds: int, jobs: int | None, output: Path, as_json: bool
 ) -> None:
@@ -117,7 +140,7 @@ def conduct(
 
 
 def _shown(
-    result: "Latency", tables: "Iterable[RenderableType]", output: Path, as_json: bool
+    result: "Latency | Processes", tables: "Iterable[RenderableType]", output: Path, as_json: bool
 ) -> None:
     """Writes and shows what was measured on this machine."""
     from rich.console import Console
