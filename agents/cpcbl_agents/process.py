@@ -76,10 +76,11 @@ def run_robot(
 
 def run_node(node: Node, wake: Wake, clock: Clock, stop: Callable[[], bool]) -> None:
     """Steps a node until `stop()`: when something arrives, which sets `wake`, or is due."""
+    node.step(clock.now_ns())
     while not stop():
-        node.step(clock.now_ns())
         if not node.waiting:
             wake.wait(min(clock.seconds_until(node.next_ns), LONGEST_WAIT_S))
+        node.step(clock.now_ns())
 
 
 def _not_knowing_its_start(name: str, team: Team) -> Team:

@@ -18,7 +18,7 @@ from typing import NamedTuple
 
 from cpcbl_team.inputs import NAME_PATTERN, Belief, Fix
 from cpcbl_transport import topics
-from cpcbl_transport.messages import VERSION, Refusal, numbers_in, refused_head
+from cpcbl_transport.messages import VERSION, Refusal, refused_head
 
 STAMP_NS = 1_000
 PLACES = 100_000  # a metre
@@ -75,10 +75,9 @@ def encode_help(message: Belief | Fix) -> bytes:
     """The payload of a belief or a fix. What is too large is sent as the largest that can be said,
     which no listener takes; speeds are clamped.
 
-    Raises ValueError for what no agent says: a number that is not finite, a stamp 1,100 years away.
+    Raises ValueError for what no agent says: NaN, an infinite heading, a variance below zero, a
+    stamp 1,100 years away.
     """
-    if not all(map(math.isfinite, numbers_in(message))):
-        raise ValueError(f"what is not finite cannot be sent: {message}")
     x, y = _PLACE.clamped(message.x_m * PLACES), _PLACE.clamped(message.y_m * PLACES)
     start = (message.stamp_ns // STAMP_NS, x, y)
     if isinstance(message, Fix):
@@ -145,6 +144,8 @@ def _read(numbers: Sequence[_Number], payload: bytes) -> list[int]:
 
 def _area_counts(xx: float, xy: float, yy: float) -> tuple[int, int, int]:
     """Of C = L D L^T; what D is raised by is added to the covariance."""
+    if xx < -LEAST or yy < -LEAST:
+        raise ValueError(f"no variances: {xx}, {yy}")
     d1 = max(xx, LEAST)
     l21 = xy / d1
     d2 = max(yy - l21 * xy, LEAST)
@@ -156,6 +157,8 @@ def _area_counts(xx: float, xy: float, yy: float) -> tuple[int, int, int]:
 def _volume_counts(
     xx: float, xy: float, yy: float, xh: float, yh: float, hh: float
 ) -> tuple[int, int, int, int, int, int]:
+    if hh < -LEAST:
+        raise ValueError(f"no variance: {hh}")
     x, y, yx = _area_counts(xx, xy, yy)
     a, b, t21 = _sigma(x), _sigma(y), yx * SLOPE
     d1 = max(xx, LEAST)
@@ -173,8 +176,7 @@ def _volume_counts(
 
 def _rounded_up(sigma: float) -> tuple[int, float]:
     """The count of a sigma, and what it stands for."""
-    steps = math.ceil(SIGMA_STEPS * math.log2(sigma * WIDER))
-    count = steps if steps < _SIGMA.most else _SIGMA.most
+    count = math.ceil(min(SIGMA_STEPS * math.log2(sigma * WIDER), _SIGMA.most))
     return count, _sigma(count)
 
 

@@ -138,7 +138,7 @@ def refusal(message: Message, now_ns: int) -> Refusal | None:
     is finite and its covariance is one.
     """
     if not isinstance(message, Sightings):
-        numbers = numbers_in(message)
+        numbers = _numbers(message)
         if not all(map(math.isfinite, numbers)):
             return Refusal.NOT_FINITE
         if any(abs(n) > LARGEST_NUMBER for n in numbers):
@@ -159,7 +159,7 @@ def _is_covariance(xx: float, xy: float, yy: float) -> bool:
     return xx >= 0.0 and yy >= 0.0 and xy * xy <= xx * yy * (1.0 + 1e-6) + 1e-12
 
 
-def numbers_in(message: Message) -> list[float]:
+def _numbers(message: Message) -> list[float]:
     """All floats in a message, however deep."""
     found, parts = [], list(msgspec.structs.astuple(message))
     for part in parts:  # it grows on the way
