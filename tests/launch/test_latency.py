@@ -5,9 +5,11 @@ import math
 import os
 import time
 from collections.abc import Iterable
+from pathlib import Path
 
 import msgspec
 import pytest
+from process_helpers import cpcbl_team
 from rich.console import Console, RenderableType
 
 from cpcbl_launch.experiments import latency, processes
@@ -15,10 +17,12 @@ from cpcbl_launch.usage import MIB, usage
 from cpcbl_transport.compact import BELIEF_BYTES, FIX_BYTES
 
 
-def test_sightings_change_the_teammates_belief_and_every_stage_is_told() -> None:
-    done: list[None] = []
-    result = latency.measured(10, lambda: done.append(None))
-    assert len(done) == 10 + latency.UNMEASURED
+def test_sightings_change_the_teammates_belief_and_every_stage_is_told(tmp_path: Path) -> None:
+    ran = cpcbl_team("experiment", "latency", "--sightings", 10, "--output", tmp_path, "--json")
+    assert ran.returncode == 0, ran.stderr
+    assert ran.stdout == (tmp_path / "latency.json").read_text()
+    result = msgspec.json.decode(ran.stdout, type=latency.Latency)
+    assert result.experiment == "latency"
     assert result.sightings == 10
     assert 5 <= result.changed <= 10
     assert 5 <= result.bare_puts <= 10
@@ -29,7 +33,6 @@ def test_sightings_change_the_teammates_belief_and_every_stage_is_told() -> None
     assert max(q.p50_us for q in stages) < result.sighting_to_belief.p50_us
     assert result.sighting_to_belief.p50_us < result.driver_to_belief.p50_us
     assert result.ratio_p50 == result.sighting_to_belief.p50_us / result.bare.p50_us
-    assert msgspec.json.decode(msgspec.json.encode(result))["experiment"] == "latency"
 
 
 def test_the_latency_table_fits_80_columns() -> None:
@@ -95,6 +98,14 @@ def test_sizes_are_checked(text: str) -> None:
     with pytest.raises(ValueError, match="such as 4,8,16"):
         processes.sizes_in(text)
     assert processes.sizes_in("4, 8,16") == [4, 8, 16]
+
+
+def test_a_bad_size_is_one_line_and_exit_code_2(tmp_path: Path) -> None:
+    ran = cpcbl_team("experiment", "processes", "--robots", "x", "--output", tmp_path)
+    assert ran.returncode == 2
+    assert ran.stderr.splitlines() == [
+        "cpcbl-team: --robots x: name sizes from 1 to 9999, such as 4,8,16"
+    ]
 
 
 def test_the_use_of_a_process_is_its_own() -> None:

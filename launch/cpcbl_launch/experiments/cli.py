@@ -17,7 +17,8 @@ if TYPE_CHECKING:
     from cpcbl_launch.experiments.results import Experiment
 
 experiment_app = typer.Typer(
-    help="The paper's experiments on a simulated field: a table, NAME.json and NAME.png.",
+    help="The paper's experiments on a simulated field, and what real processes take: a table,"
+    " NAME.json and (of the simulated ones) NAME.png.",
     no_args_is_help=True,
 )
 
