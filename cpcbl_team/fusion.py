@@ -7,6 +7,7 @@ noise is fresh and merged as usual.
 """
 
 import math
+from collections.abc import Callable
 from statistics import NormalDist
 from typing import NamedTuple
 
@@ -111,34 +112,70 @@ def merge_split(prior: Estimate, seen: Observation, scope: Scope = POSE) -> Esti
     position or variance of the heading. Scopes other than POSE expect a prior of which nothing or
     all is shared.
     """
+    goal = _determinant(prior, seen) if scope is POSE else _variance(prior, seen, scope)
     low, high = 0.02, 0.98
     left, right = high - _GOLDEN * (high - low), low + _GOLDEN * (high - low)
-    best_left, best_right = (_split(prior, seen, scope, w) for w in (left, right))
+    best_left, best_right = goal(left), goal(right)
     for _ in range(6):
-        if best_left[0] <= best_right[0]:
+        if best_left <= best_right:
             high, right, best_right = right, left, best_left
             left = high - _GOLDEN * (high - low)
-            best_left = _split(prior, seen, scope, left)
+            best_left = goal(left)
         else:
             low, left, best_left = left, right, best_right
             right = low + _GOLDEN * (high - low)
-            best_right = _split(prior, seen, scope, right)
-    _, weight = min(best_left, best_right)
-    return _merge_split_at(prior, seen, scope, weight)
+            best_right = goal(right)
+    return _merge_split_at(prior, seen, scope, left if best_left <= best_right else right)
 
 
 def _widened(prior: Estimate, weight: float) -> Covariance3:
     return prior.covariance.plus(prior.shared, 1.0 / weight - 1.0)
 
 
-def _split(prior: Estimate, seen: Observation, scope: Scope, weight: float) -> tuple[float, float]:
-    """(what is to be small, the weight)."""
-    widened = _widened(prior, weight)
-    evidence = seen.information(1.0 / (1.0 - weight)).matrix
-    merged = product(survival(widened, evidence), widened)
-    if scope is POSE:
-        return merged.determinant(), weight
-    return (merged.hh if scope is HEADING else merged.xx + merged.yy), weight
+def _variance(prior: Estimate, seen: Observation, scope: Scope) -> Callable[[float], float]:
+    """Of the merged position (its trace) or heading, by the weight."""
+
+    def variance(weight: float) -> float:
+        widened = _widened(prior, weight)
+        evidence = seen.information(1.0 / (1.0 - weight)).matrix
+        merged = product(survival(widened, evidence), widened)
+        return merged.hh if scope is HEADING else merged.xx + merged.yy
+
+    return variance
+
+
+def _determinant(prior: Estimate, seen: Observation) -> Callable[[float], float]:
+    """Of the merged covariance, by the weight: det (P1^-1 + H^T R^-1 H)^-1 =
+    det P1 det R / det (R + H P1 H^T), the lemma of determinants."""
+    # P1 = P + k P_d, so H P1 H^T = H P H^T + k H P_d H^T
+    (p_xx, p_xy, p_yy), (s_xx, s_xy, s_yy) = (
+        _projected(c, seen.rows) for c in (prior.covariance, prior.shared)
+    )
+    alone = len(seen.rows) == 1
+
+    def determinant(weight: float) -> float:
+        k = 1.0 / weight - 1.0
+        widened = prior.covariance.plus(prior.shared, k).determinant()
+        xx, xy, yy = seen.noise(1.0 / (1.0 - weight))
+        sxx, sxy, syy = xx + p_xx + k * s_xx, xy + p_xy + k * s_xy, yy + p_yy + k * s_yy
+        if alone:
+            return widened * xx / sxx
+        return widened * (xx * yy - xy * xy) / (sxx * syy - sxy * sxy)
+
+    return determinant
+
+
+def _projected(p: Covariance3, rows: tuple[Row, ...]) -> tuple[float, float, float]:
+    """H P H^T as xx, xy, yy; of one row xx only."""
+    x, y, a = rows[0]
+    px, py, ph = p.times(rows[0])
+    xx = x * px + y * py + a * ph
+    if len(rows) == 1:
+        return xx, 0.0, 0.0
+    x, y, a = rows[1]
+    xy = x * px + y * py + a * ph
+    px, py, ph = p.times(rows[1])
+    return xx, xy, x * px + y * py + a * ph
 
 
 def _merge_split_at(prior: Estimate, seen: Observation, scope: Scope, weight: float) -> Estimate:

@@ -161,9 +161,10 @@ def test_a_deaf_observer_stays_wrong_and_one_that_listens_does_not() -> None:
     errors = {}
     for direction in ("deaf", "both-ways"):
         case = cases[2, direction, "split-ci", 0.2]._replace(scored=("navigator0", "observer0"))
-        errors[direction] = run(case, 2).robots["observer0"].offset[-1]
-    assert np.hypot(*errors["deaf"][:2]) == pytest.approx(0.2, abs=0.01)
-    assert np.hypot(*errors["both-ways"][:2]) < 0.1
+        last = [run(case, seed).robots["observer0"].offset[-1] for seed in range(1, 6)]
+        errors[direction] = np.median([np.hypot(*offset[:2]) for offset in last])
+    assert errors["deaf"] == pytest.approx(0.2, abs=0.01)
+    assert errors["both-ways"] < 0.1
 
 
 @pytest.mark.parametrize("sizes", [[], [1], [21], [5, 0]])

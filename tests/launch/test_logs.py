@@ -25,6 +25,7 @@ from cpcbl_team.config import (
     SensorSettings,
     Start,
 )
+from cpcbl_transport.compact import BELIEF_BYTES, FIX_BYTES
 
 MILLIMETRE = 1e-3
 TURNING_MATE_M = 0.02  # a teammate that stops is believed to drive on until its next belief
@@ -203,7 +204,8 @@ def test_what_one_robot_sends_another_receives(tmp_path: Path) -> None:
     better, worse = report(on._replace(team=team))["robots"].values()
     assert worse["messages_received"] > 20
     assert worse["messages_received"] == pytest.approx(better["messages_sent"], abs=10)
-    assert better["bytes_sent"] > 50 * better["messages_sent"]
+    sent = better["messages_sent"]
+    assert FIX_BYTES * sent <= better["bytes_sent"] <= BELIEF_BYTES * sent
 
 
 def wrong_about_wheels(on: LoggedTeam, *learners: str) -> LoggedTeam:

@@ -221,27 +221,49 @@ def test_a_heading_comes_back_wrapped(heading_rad: float) -> None:
 # What cannot be said ------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
-@pytest.mark.parametrize(
-    ("message", "field"),
-    [
-        (message, field)
-        for message in (FIX, BELIEF)
-        for field in message.__struct_fields__
-        if isinstance(getattr(message, field), float | tuple)
-    ],
-    ids=lambda part: part if isinstance(part, str) else type(part).__name__,
-)
-def test_a_number_that_is_not_finite_is_not_sent(message: Help, field: str, value: float) -> None:
-    old = getattr(message, field)
-    news = (
-        [(*old[:n], value, *old[n + 1 :]) for n in range(len(old))]
-        if isinstance(old, tuple)
-        else [value]
-    )
-    for new in news:
-        with pytest.raises(ValueError, match="cannot be sent"):
-            encode_help(replace(message, **{field: new}))
+def with_number(message: Help, value: float) -> list[tuple[str, Help]]:
+    """The message with each of its numbers replaced in turn, and the field that it is in."""
+    found = []
+    for field in message.__struct_fields__:
+        old = getattr(message, field)
+        if isinstance(old, float):
+            found.append((field, replace(message, **{field: value})))
+        elif isinstance(old, tuple):
+            for n in range(len(old)):
+                new = (*old[:n], value, *old[n + 1 :])
+                found.append((field, replace(message, **{field: new})))
+    return found
+
+
+@per_kind
+def test_nan_is_not_sent(key: str, message: Help) -> None:
+    for _, bad in with_number(message, math.nan):
+        with pytest.raises(ValueError, match="NaN"):
+            encode_help(bad)
+
+
+@per_kind
+@pytest.mark.parametrize("value", [math.inf, -math.inf])
+def test_what_is_infinite_is_not_sent_or_not_taken(key: str, message: Help, value: float) -> None:
+    for field, bad in with_number(message, value):
+        try:
+            again = there_and_back(bad)
+        except ValueError:
+            continue
+        reason = refusal(again, NOW)
+        clamped = field in ("speed_m_s", "turn_rate_rad_s")
+        assert reason is (None if clamped else Refusal.IMPLAUSIBLE), bad
+
+
+@pytest.mark.parametrize("bad", [(-0.1, 0.0, 0.1), (0.1, 0.0, -0.1)])
+def test_a_variance_below_zero_is_not_sent(bad: tuple[float, float, float]) -> None:
+    for message in (
+        replace(FIX, observer_covariance=bad),
+        replace(BELIEF, covariance=(*bad, 0.0, 0.0, 0.1)),
+        replace(BELIEF, covariance=(0.1, 0.0, 0.1, 0.0, 0.0, -0.1)),
+    ):
+        with pytest.raises(ValueError, match="no variance"):
+            encode_help(message)
 
 
 @per_kind

@@ -13,11 +13,12 @@ is read is never less than C (in the order of covariances) and, down to sigmas o
 import math
 import re
 from collections.abc import Sequence
+from functools import lru_cache
 from typing import NamedTuple
 
 from cpcbl_team.inputs import NAME_PATTERN, Belief, Fix
 from cpcbl_transport import topics
-from cpcbl_transport.messages import VERSION, Refusal, numbers_in, refused_head
+from cpcbl_transport.messages import VERSION, Refusal, refused_head
 
 STAMP_NS = 1_000
 PLACES = 100_000  # a metre
@@ -30,38 +31,36 @@ RATES = 1_000  # a metre a second, a radian a second
 LEAST = SIGMA**2
 STEEPEST = 4095.0  # slope; a thinner ellipse is sent thicker
 TURNED = math.sqrt(3.0) * SLOPE / 2.0  # norm of what rounding three slopes does to the factor
-INFLATION = (1.0 - TURNED) ** -2  # of the covariance, so that this claims nothing
+WIDER = 1.0 / (1.0 - TURNED) / SIGMA  # so that this claims nothing
 
 
 class _Number(NamedTuple):
-    """One number on the wire."""
+    """One number on the wire: its width in bytes, the least and the most that it can say."""
 
     width: int
-    signed: bool = True
-
-    @property
-    def least(self) -> int:
-        return -(1 << (8 * self.width - 1)) if self.signed else 0
-
-    @property
-    def most(self) -> int:
-        return self.least + (1 << (8 * self.width)) - 1
-
-    def written(self, count: int) -> bytes:
-        """Raises OverflowError for one that does not fit."""
-        return count.to_bytes(self.width, "little", signed=self.signed)
+    least: int
+    most: int
 
     def clamped(self, value: float) -> int:
         """The nearest count that fits."""
         return round(min(max(value, self.least), self.most))
 
 
-_STAMP = _Number(7)  # to the year 3111
-_PLACE = _Number(5)  # to 5,497 km
-_HEADING = _Number(3, signed=False)
-_SIGMA = _Number(2, signed=False)
-_SLOPE = _Number(3)  # to 4,096
-_RATE = _Number(2)  # to 32 m/s, 32 rad/s
+def _signed(width: int) -> _Number:
+    half = 1 << (8 * width - 1)
+    return _Number(width, -half, half - 1)
+
+
+def _unsigned(width: int) -> _Number:
+    return _Number(width, 0, (1 << (8 * width)) - 1)
+
+
+_STAMP = _signed(7)  # to the year 3111
+_PLACE = _signed(5)  # to 5,497 km
+_HEADING = _unsigned(3)
+_SIGMA = _unsigned(2)
+_SLOPE = _signed(3)  # to 4,096
+_RATE = _signed(2)  # to 32 m/s, 32 rad/s
 _AREA = (_SIGMA, _SIGMA, _SLOPE)
 _VOLUME = (*_AREA, _SIGMA, _SLOPE, _SLOPE)
 _FIX = (_STAMP, _PLACE, _PLACE, *_AREA, *_AREA)
@@ -76,91 +75,108 @@ def encode_help(message: Belief | Fix) -> bytes:
     """The payload of a belief or a fix. What is too large is sent as the largest that can be said,
     which no listener takes; speeds are clamped.
 
-    Raises ValueError for what no agent says: a number that is not finite, a stamp 1,100 years away.
+    Raises ValueError for what no agent says: NaN, an infinite heading, a variance below zero, a
+    stamp 1,100 years away.
     """
-    if not all(map(math.isfinite, numbers_in(message))):
-        raise ValueError(f"what is not finite cannot be sent: {message}")
-    counts = [message.stamp_ns // STAMP_NS]
-    counts += [_PLACE.clamped(message.x_m * PLACES), _PLACE.clamped(message.y_m * PLACES)]
+    x, y = _PLACE.clamped(message.x_m * PLACES), _PLACE.clamped(message.y_m * PLACES)
+    start = (message.stamp_ns // STAMP_NS, x, y)
     if isinstance(message, Fix):
-        counts += _factor(*message.sensor_covariance)[:3]
-        counts += _factor(*message.observer_covariance)[:3]
-        return _written(_FIX, counts)
-    counts.append(round(math.fmod(message.heading_rad, math.tau) / HEADING_RAD) % 2**24)
-    counts += _factor(*message.covariance)
-    counts.append(_RATE.clamped(message.speed_m_s * RATES))
-    counts.append(_RATE.clamped(message.turn_rate_rad_s * RATES))
-    return _written(_BELIEF, counts)
+        sensor, observer = message.sensor_covariance, message.observer_covariance
+        return _written(_FIX, (*start, *_area_counts(*sensor), *_area_counts(*observer)))
+    heading = round(math.fmod(message.heading_rad, math.tau) / HEADING_RAD) % 2**24
+    factor = _volume_counts(*message.covariance)
+    speed = _RATE.clamped(message.speed_m_s * RATES)
+    turn_rate = _RATE.clamped(message.turn_rate_rad_s * RATES)
+    return _written(_BELIEF, (*start, heading, *factor, speed, turn_rate))
 
 
 def decode_help(key: str, payload: bytes) -> Belief | Fix | Refusal:
     """The belief or fix in a payload under this key, or why there is none."""
-    topic = topics.FIX if key.startswith("fix/") else topics.BELIEF
-    names = topic.names(key)
-    if names is None:
-        return Refusal.WRONG_TYPE
-    if not all(map(_is_name, names.values())):
-        return Refusal.UNKNOWN_ROBOT
+    names = _names(key)
+    if isinstance(names, Refusal):
+        return names
     reason = refused_head(payload)
     if reason is not None:
         return reason
-    numbers = _FIX if topic is topics.FIX else _BELIEF
-    if len(payload) != 1 + sum(number.width for number in numbers):
+    is_fix = "observer" in names
+    if len(payload) != (FIX_BYTES if is_fix else BELIEF_BYTES):
         return Refusal.GARBAGE
-    stamp, x, y, *rest = _read(numbers, payload)
-    stamp_ns, x_m, y_m = stamp * STAMP_NS, x / PLACES, y / PLACES
-    if topic is topics.FIX:
-        sensor, observer = _area(*rest[:3]), _area(*rest[3:])
-        return Fix(names["robot"], names["observer"], stamp_ns, x_m, y_m, sensor, observer)
+    stamp, x, y, *rest = _read(_FIX if is_fix else _BELIEF, payload)
+    place = stamp * STAMP_NS, x / PLACES, y / PLACES
+    if is_fix:
+        return Fix(names["robot"], names["observer"], *place, _area(*rest[:3]), _area(*rest[3:]))
     heading, *factor, speed, turn_rate = rest
     heading_rad = math.remainder(heading * HEADING_RAD, math.tau)
     rates = speed / RATES, turn_rate / RATES
-    return Belief(names["robot"], stamp_ns, x_m, y_m, heading_rad, _volume(*factor), *rates)
+    return Belief(names["robot"], *place, heading_rad, _volume(*factor), *rates)
 
 
 _is_name = re.compile(NAME_PATTERN).fullmatch
 
 
+@lru_cache(maxsize=4096)
+def _names(key: str) -> dict[str, str] | Refusal:
+    """The names in the key of a belief or fix."""
+    names = topics.BELIEF.names(key) or topics.FIX.names(key)
+    if names is None:
+        return Refusal.WRONG_TYPE
+    return names if all(map(_is_name, names.values())) else Refusal.UNKNOWN_ROBOT
+
+
 def _written(numbers: Sequence[_Number], counts: Sequence[int]) -> bytes:
     try:
-        return _HEAD + b"".join(map(_Number.written, numbers, counts))
+        return _HEAD + b"".join(
+            count.to_bytes(width, "little", signed=least < 0)
+            for (width, least, _), count in zip(numbers, counts, strict=True)
+        )
     except OverflowError:
         raise ValueError(f"a stamp of {counts[0]} us cannot be sent") from None
 
 
 def _read(numbers: Sequence[_Number], payload: bytes) -> list[int]:
     counts, at = [], 1
-    for number in numbers:
-        end = at + number.width
-        counts.append(int.from_bytes(payload[at:end], "little", signed=number.signed))
+    for width, least, _ in numbers:
+        end = at + width
+        counts.append(int.from_bytes(payload[at:end], "little", signed=least < 0))
         at = end
     return counts
 
 
-def _factor(
-    xx: float, xy: float, yy: float, xh: float = 0.0, yh: float = 0.0, hh: float = 0.0
-) -> list[int]:
-    """The counts of a covariance's Cholesky factor; of an area's they are the first three."""
-    # C = L D L^T; what D is raised by is added to the covariance
+def _area_counts(xx: float, xy: float, yy: float) -> tuple[int, int, int]:
+    """Of C = L D L^T; what D is raised by is added to the covariance."""
+    if xx < -LEAST or yy < -LEAST:
+        raise ValueError(f"no variances: {xx}, {yy}")
+    d1 = max(xx, LEAST)
+    l21 = xy / d1
+    d2 = max(yy - l21 * xy, LEAST)
+    x, a = _rounded_up(math.sqrt(d1))
+    y, b = _rounded_up(max(math.sqrt(d2), abs(l21) * a / STEEPEST))
+    return x, y, _SLOPE.clamped(l21 * a / b / SLOPE)
+
+
+def _volume_counts(
+    xx: float, xy: float, yy: float, xh: float, yh: float, hh: float
+) -> tuple[int, int, int, int, int, int]:
+    if hh < -LEAST:
+        raise ValueError(f"no variance: {hh}")
+    x, y, yx = _area_counts(xx, xy, yy)
+    a, b, t21 = _sigma(x), _sigma(y), yx * SLOPE
     d1 = max(xx, LEAST)
     l21, l31 = xy / d1, xh / d1
     d2 = max(yy - l21 * xy, LEAST)
     l32 = (yh - l31 * xy) / d2
     d3 = max(hh - l31 * xh - l32 * l32 * d2, LEAST)
-    first, a = _rounded_up(math.sqrt(d1))
-    second, b = _rounded_up(max(math.sqrt(d2), abs(l21) * a / STEEPEST))
-    third, c = _rounded_up(max(math.sqrt(d3), abs(l31) * a / STEEPEST, abs(l32) * b / STEEPEST))
-    # T, rounded to T (I + F): the last slope answers for the error of the first
-    t21, t31, t32 = l21 * a / b, l31 * a / c, l32 * b / c
-    yx = _SLOPE.clamped(t21 / SLOPE)
-    hx = _SLOPE.clamped((t31 + t32 * (yx * SLOPE - t21)) / SLOPE)
-    return [first, second, yx, third, hx, _SLOPE.clamped(t32 / SLOPE)]
+    least = max(abs(l31) * a, abs(l32) * b) / STEEPEST
+    heading, c = _rounded_up(max(math.sqrt(d3), least))
+    # T, rounded to T (I + F): the slope on x answers for the error of y's
+    t31, t32 = l31 * a / c, l32 * b / c
+    hx = _SLOPE.clamped((t31 + t32 * (t21 - l21 * a / b)) / SLOPE)
+    return x, y, yx, heading, hx, _SLOPE.clamped(t32 / SLOPE)
 
 
 def _rounded_up(sigma: float) -> tuple[int, float]:
     """The count of a sigma, and what it stands for."""
-    octaves = math.log2(sigma * math.sqrt(INFLATION) / SIGMA)
-    count = _SIGMA.clamped(math.ceil(SIGMA_STEPS * octaves))
+    count = math.ceil(min(SIGMA_STEPS * math.log2(sigma * WIDER), _SIGMA.most))
     return count, _sigma(count)
 
 

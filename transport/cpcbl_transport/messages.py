@@ -6,7 +6,6 @@ be used is a `Refusal` with a reason, never an exception.
 """
 
 import math
-from collections.abc import Iterator
 from enum import StrEnum
 
 import msgspec
@@ -174,7 +173,7 @@ def refusal(message: Message, now_ns: int) -> Refusal | None:
     is finite and its covariance is one.
     """
     if not isinstance(message, Sightings):
-        numbers = list(numbers_in(message))
+        numbers = _numbers(message)
         if not all(map(math.isfinite, numbers)):
             return Refusal.NOT_FINITE
         if any(abs(n) > LARGEST_NUMBER for n in numbers):
@@ -195,13 +194,14 @@ def _is_covariance(xx: float, xy: float, yy: float) -> bool:
     return xx >= 0.0 and yy >= 0.0 and xy * xy <= xx * yy * (1.0 + 1e-6) + 1e-12
 
 
-def numbers_in(value: object) -> Iterator[float]:
+def _numbers(message: Message) -> list[float]:
     """All floats in a message, however deep."""
-    if isinstance(value, float):
-        yield value
-    elif isinstance(value, tuple):
-        for part in value:
-            yield from numbers_in(part)
-    elif isinstance(value, msgspec.Struct):
-        for name in value.__struct_fields__:
-            yield from numbers_in(getattr(value, name))
+    found, parts = [], list(msgspec.structs.astuple(message))
+    for part in parts:  # it grows on the way
+        if isinstance(part, float):
+            found.append(part)
+        elif isinstance(part, tuple):
+            parts.extend(part)
+        elif isinstance(part, msgspec.Struct):
+            parts.extend(msgspec.structs.astuple(part))
+    return found

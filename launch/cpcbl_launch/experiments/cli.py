@@ -2,7 +2,7 @@
 
 import os
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Optional
@@ -10,10 +10,15 @@ from typing import TYPE_CHECKING, Annotated, Optional
 import typer
 
 if TYPE_CHECKING:
+    from rich.console import RenderableType
+
+    from cpcbl_launch.experiments.latency import Latency
+    from cpcbl_launch.experiments.processes import Processes
     from cpcbl_launch.experiments.results import Experiment
 
 experiment_app = typer.Typer(
-    help="The paper's experiments on a simulated field: a table, NAME.json and NAME.png.",
+    help="The paper's experiments on a simulated field, and what real processes take: a table,"
+    " NAME.json and (of the simulated ones) NAME.png.",
     no_args_is_help=True,
 )
 
@@ -70,6 +75,44 @@ def one_way_vs_both(
     conduct(of_sizes(sizes), seeds, jobs, output, as_json)
 
 
+@experiment_app.command("latency")
+def latency(
+    sightings: Annotated[int, typer.Option(min=10, help="Sightings measured; ten a second.")] = 500,
+    output: Annotated[Path, typer.Option(help="Folder for latency.json.")] = Path(),
+    as_json: AsJson = False,
+) -> None:
+    """Sighting on one robot -> belief of its teammate, beside a bare put: real processes, Zenoh."""
+    from cpcbl_launch.experiments import latency
+    from cpcbl_launch.options import folder_for
+
+    folder_for("--output", output)
+    with _progress("latency", latency.UNMEASURED + sightings, "sightings") as done:
+        result = latency.measured(sightings, done)
+    _shown(result, latency.tables(result), output, as_json)
+
+
+@experiment_app.command("processes")
+def processes(
+    robots: Annotated[
+        str, typer.Option(help="Sizes of the team, until one does not keep 10 Hz.")
+    ] = "4,8,16,24,32,48,64",
+    seconds: Annotated[float, typer.Option(min=1.0, help="Measured, of each size.")] = 15.0,
+    output: Annotated[Path, typer.Option(help="Folder for processes.json.")] = Path(),
+    as_json: AsJson = False,
+) -> None:
+    """Real processes that keep 10 Hz: CPU and memory a robot, beside an all-to-all broadcast."""
+    from cpcbl_launch.experiments import processes
+    from cpcbl_launch.options import folder_for
+    from cpcbl_launch.usage import must_measure
+
+    must_measure("experiment processes")
+    folder_for("--output", output)
+    sizes = processes.sizes_in(robots)
+    with _progress("processes", len(sizes), "sizes") as done:
+        result = processes.measured(sizes, seconds, done)
+    _shown(result, processes.tables(result), output, as_json)
+
+
 def conduct(
     experiment: "Experiment", seeds: int, jobs: int | None, output: Path, as_json: bool
 ) -> None:
@@ -97,9 +140,28 @@ def conduct(
     console.print(f"written: {output / experiment.name}.json, .png", highlight=False)
 
 
+def _shown(
+    result: "Latency | Processes", tables: "Iterable[RenderableType]", output: Path, as_json: bool
+) -> None:
+    """Writes and shows what was measured on this machine."""
+    from rich.console import Console
+
+    from cpcbl_launch.options import encoded
+
+    text = encoded(result) + "\n"
+    (output / f"{result.experiment}.json").write_text(text, encoding="utf-8")
+    if as_json:
+        sys.stdout.write(text)
+        return
+    console = Console()
+    for shown in tables:
+        console.print(shown, highlight=False)
+    console.print(f"written: {output / result.experiment}.json", highlight=False)
+
+
 @contextmanager
-def _progress(title: str, total: int) -> Iterator[Callable[[], None]]:
-    """Runs done of all, on standard error."""
+def _progress(title: str, total: int, unit: str = "runs") -> Iterator[Callable[[], None]]:
+    """How many are done of all, on standard error."""
     from rich.console import Console
     from rich.progress import (
         BarColumn,
@@ -109,7 +171,7 @@ def _progress(title: str, total: int) -> Iterator[Callable[[], None]]:
         TimeRemainingColumn,
     )
 
-    columns = (TextColumn(title), BarColumn(), MofNCompleteColumn(), TextColumn("runs"))
+    columns = (TextColumn(title), BarColumn(), MofNCompleteColumn(), TextColumn(unit))
     console = Console(stderr=True)
     with Progress(*columns, TimeRemainingColumn(), console=console, transient=True) as progress:
         task = progress.add_task(title, total=total)

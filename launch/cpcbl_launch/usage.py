@@ -1,0 +1,33 @@
+"""What a process has used, from /proc (Linux)."""
+
+import os
+from pathlib import Path
+from typing import NamedTuple
+
+MIB = 2**20
+_PROC = Path("/proc")
+_TICKS_A_SECOND = os.sysconf("SC_CLK_TCK")
+
+
+class Usage(NamedTuple):
+    """Of one process, up to now."""
+
+    cpu_s: float  # user and system
+    resident_bytes: int
+    proportional_bytes: int  # pages that n processes share count 1 / n
+
+
+def must_measure(what: str) -> None:
+    """Raises ValueError where processes cannot be measured."""
+    if not (_PROC / "self" / "smaps_rollup").exists():
+        raise ValueError(f"{what} needs /proc/PID/smaps_rollup: run it on Linux")
+
+
+def usage(pid: int) -> Usage:
+    """Raises OSError when there is no such process."""
+    stat = (_PROC / str(pid) / "stat").read_text()
+    fields = stat.rpartition(")")[2].split()  # the name before it may hold anything
+    user, system = int(fields[11]), int(fields[12])
+    lines = (_PROC / str(pid) / "smaps_rollup").read_text().splitlines()[1:]
+    kib = {name: int(rest.split()[0]) for name, rest in (line.split(":") for line in lines)}
+    return Usage((user + system) / _TICKS_A_SECOND, kib["Rss"] * 1024, kib["Pss"] * 1024)
