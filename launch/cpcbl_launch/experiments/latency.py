@@ -21,7 +21,7 @@ import msgspec
 import numpy as np
 from rich.console import RenderableType
 
-from cpcbl_agents.agent import Tick
+from cpcbl_agents.agent import FromBus, Tick
 from cpcbl_agents.clock import Clock
 from cpcbl_agents.node import Node
 from cpcbl_agents.process import Stop, Wake, run_node
@@ -36,7 +36,7 @@ from cpcbl_team.config import (
     Start,
     Team,
 )
-from cpcbl_team.inputs import Fix, Odometry, Sighting, Sightings, Told
+from cpcbl_team.inputs import Fix, Odometry, Sighting, Sightings
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus, Handle, Publisher, Receive, Watch
 from cpcbl_transport.compact import FIX_BYTES, decode_help
@@ -160,7 +160,7 @@ class NotingRobot(Robot):
         self.changed_ns: dict[int, int] = {}
         """By the stamp of the fix."""
 
-    def handle(self, message: Message | Tick | Told, now_ns: int) -> list[Message]:
+    def handle(self, message: Message | Tick | FromBus, now_ns: int) -> list[Message]:
         before = self.filter.timeline.state
         said = super().handle(message, now_ns)
         if isinstance(message, Fix):
@@ -227,7 +227,7 @@ def pair() -> Team:
     """An observer that stands, and a teammate with poor wheels that drives round it."""
     eyes = SensorSettings(range_share=0.05, bearing_sigma_deg=3.0, field_of_view_deg=360.0)
     wheels = OdometrySettings(distance_sigma_m_per_sqrt_m=0.3, turn_sigma_rad_per_sqrt_rad=0.1)
-    rules = CollaborationSettings(passive=False)
+    rules = CollaborationSettings(passive=False, least_value=0.0)  # each sighting becomes a fix
     return Team(
         name="latency",
         robots={
