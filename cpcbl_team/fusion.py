@@ -113,6 +113,11 @@ def merge_split(prior: Estimate, seen: Observation, scope: Scope = POSE) -> Esti
     all is shared.
     """
     goal = _determinant(prior, seen) if scope is POSE else _variance(prior, seen, scope)
+    return _merge_split_at(prior, seen, scope, best_weight(goal))
+
+
+def best_weight(goal: Callable[[float], float]) -> float:
+    """The weight of covariance intersection at which the goal is smallest, by golden section."""
     low, high = 0.02, 0.98
     left, right = high - _GOLDEN * (high - low), low + _GOLDEN * (high - low)
     best_left, best_right = goal(left), goal(right)
@@ -125,7 +130,7 @@ def merge_split(prior: Estimate, seen: Observation, scope: Scope = POSE) -> Esti
             low, left, best_left = left, right, best_right
             right = low + _GOLDEN * (high - low)
             best_right = goal(right)
-    return _merge_split_at(prior, seen, scope, left if best_left <= best_right else right)
+    return left if best_left <= best_right else right
 
 
 def _widened(prior: Estimate, weight: float) -> Covariance3:

@@ -10,14 +10,14 @@ from typing import NamedTuple
 
 from cpcbl_team.collaboration import LOWEST_TIER, TIER_ZERO_SIGMA_M
 from cpcbl_team.config import CollaborationSettings, Fusion
-from cpcbl_team.estimate import Covariance3, Estimate
+from cpcbl_team.estimate import SMALLEST_VARIANCE, Covariance3, Estimate
+from cpcbl_team.fusion import best_weight
 from cpcbl_team.gaussian import Covariance2
 from cpcbl_team.geometry import Pose2, step
 from cpcbl_team.inputs import Belief, Fix
 
 LOST_SIGMA_M = 2.0
 DRIFT_SHARE = 0.1  # of its way: what a teammate's position loses between two fixes
-_WEIGHTS = tuple(0.05 * n for n in range(1, 20))
 
 
 class Helped(NamedTuple):
@@ -64,18 +64,34 @@ def merged(
     By split covariance intersection all of the prior is taken as dependent: what was told once is
     worth little the second time.
     """
+    prior, fresh = _not_exact(prior), _not_exact(fresh)
     if fusion == "naive":
         return _product(prior, fresh + dependent)
-    candidates = (
-        _product(prior.scaled(1.0 / w), fresh + dependent.scaled(1.0 / (1.0 - w))) for w in _WEIGHTS
-    )
-    best = min(candidates, key=Covariance2.determinant)
-    return best if best.determinant() < prior.determinant() else prior
+    weight = best_weight(lambda w: _determinant(prior, fresh, dependent, w))
+    after = _product(prior.scaled(1.0 / weight), fresh + dependent.scaled(1.0 / (1.0 - weight)))
+    return after if after.determinant() < prior.determinant() else prior
+
+
+def _determinant(
+    prior: Covariance2, fresh: Covariance2, dependent: Covariance2, weight: float
+) -> float:
+    """|A| |B| / |A + B|, of (A^-1 + B^-1)^-1 with A = prior / w, B = fresh + dependent / (1 - w)."""
+    k, m = 1.0 / weight, 1.0 / (1.0 - weight)
+    axx, axy, ayy = k * prior.xx, k * prior.xy, k * prior.yy
+    bxx, bxy = fresh.xx + m * dependent.xx, fresh.xy + m * dependent.xy
+    byy = fresh.yy + m * dependent.yy
+    both = (axx + bxx) * (ayy + byy) - (axy + bxy) ** 2
+    return (axx * ayy - axy * axy) * (bxx * byy - bxy * bxy) / both
 
 
 def worth(prior: Covariance2, after: Covariance2) -> float:
     """Nats gained from `prior` to `after`."""
-    return 0.5 * math.log(prior.determinant() / after.determinant())
+    return 0.5 * math.log(_not_exact(prior).determinant() / after.determinant())
+
+
+def _not_exact(c: Covariance2) -> Covariance2:
+    """What is called exact has a variance too: an inverse."""
+    return Covariance2(c.xx + SMALLEST_VARIANCE, c.xy, c.yy + SMALLEST_VARIANCE)
 
 
 def _product(a: Covariance2, b: Covariance2) -> Covariance2:
@@ -94,7 +110,8 @@ def use_of(fix: Fix, tier: int, estimate: Estimate, settings: CollaborationSetti
     theirs = Covariance2(sigma * sigma, 0.0, sigma * sigma)
     position = worth(prior, merged(prior, sensor, theirs, settings.fusion))
     dx, dy = fix.x_m - estimate.pose.x, fix.y_m - estimate.pose.y
-    across = (sensor + theirs + prior).along(-dy, dx) / (dx * dx + dy * dy) ** 2
+    away = max(dx * dx + dy * dy, SMALLEST_VARIANCE)
+    across = _not_exact(sensor + theirs + prior).along(-dy, dx) / (away * away)
     heading = 0.5 * math.log1p(estimate.covariance.hh / across)
     return max(position, heading)
 
@@ -111,6 +128,7 @@ def staleness(copy: Belief | None, now: Belief) -> float:
         Covariance3(*copy.covariance).position(),
         Covariance3(*now.covariance).position(),
     )
+    before, after = _not_exact(before), _not_exact(after)
     off = math.sqrt(after.mahalanobis_squared(now.x_m - pose.x, now.y_m - pose.y))
     ratio = 0.5 * math.log(after.determinant() / before.determinant())
     return max(off, abs(ratio))

@@ -90,12 +90,13 @@ class Node:
 
     def step(self, now_ns: int) -> None:
         """Takes in what has arrived, lets the robot work, sends what it says."""
-        self._take_news(now_ns)
+        self._take_tokens(now_ns)
         with suppress(IndexError):
             while True:
                 message = self._accepted(*self._inbox.popleft(), now_ns)
                 if message is not None:
                     self._send(self._robot.handle(message, now_ns), now_ns)
+        self._ask_for_listeners(now_ns)
         self._send(self._robot.handle(Tick(), now_ns), now_ns)
         for name in self._wiring.follow(self._robot.collaboration):
             self._tokens.forget(name)
@@ -104,8 +105,8 @@ class Node:
             self._status_ns = now_ns
             self._publish(topics.STATUS, topics.STATUS.at(robot=self._name), self._status(now_ns))
 
-    def _take_news(self, now_ns: int) -> None:
-        """What the bus knows of teammates: who is there with which tier, whether any listens."""
+    def _take_tokens(self, now_ns: int) -> None:
+        """What the bus knows of teammates: who is there, with which tier."""
         with suppress(IndexError):
             while True:
                 presence = self._tokens.changed(*self._news.popleft())
@@ -113,6 +114,8 @@ class Node:
                     self.counts["bad_token"] += 1
                 else:
                     self._robot.handle(Presence(*presence), now_ns)
+
+    def _ask_for_listeners(self, now_ns: int) -> None:
         tier = self._wiring.tier
         if tier is None or not self._passive:
             return
