@@ -1,6 +1,8 @@
 """The command line `cpcbl-team`."""
 
 import logging
+import math
+import shlex
 import sys
 from enum import StrEnum
 from pathlib import Path
@@ -25,6 +27,20 @@ app.add_typer(experiment_app, name="experiment")
 
 TeamFile = Annotated[Path, typer.Option("--team", help="Team file (TOML).")]
 Blind = Annotated[str, typer.Option(help="Robots that shall not see landmarks, e.g. 3,4,5.")]
+BytesPerS = Annotated[
+    Optional[float],
+    typer.Option(
+        min=0.0, help="Budget of each robot for fixes and beliefs, on its link; 0: no limit."
+    ),
+]
+MessagesPerMinute = Annotated[
+    Optional[float],
+    typer.Option(min=0.0, help="The same in messages; 0: no limit."),
+]
+MatchMessages = Annotated[
+    Optional[int],
+    typer.Option(min=0, help="The team's fixes and beliefs in a match; 0: no limit."),
+]
 AsJson = Annotated[bool, typer.Option("--json", help="Print the report as JSON.")]
 Connect = Annotated[
     Optional[list[str]],
@@ -90,6 +106,9 @@ def up(
     robots: Annotated[
         str, typer.Option(help="Robots to start on this machine; default: all.")
     ] = "",
+    bytes_per_s: BytesPerS = None,
+    messages_per_minute: MessagesPerMinute = None,
+    match_messages: MatchMessages = None,
     report: Annotated[
         Optional[Path], typer.Option(help="Write the report to this file (JSON).")
     ] = None,
@@ -111,13 +130,21 @@ def up(
 
     from cpcbl_agents.process import Stop
     from cpcbl_launch import logs as real_logs
+    from cpcbl_launch.evaluation import Choice, chosen
     from cpcbl_launch.options import encoded, must_draw
     from cpcbl_launch.show import LiveTable, print_report
-    from cpcbl_launch.up import SIMULATED_S, Run, run_team
+    from cpcbl_launch.up import SIMULATED_S, Run, dialled, listening, run_team
 
+    typed = file or Path("demo")
     if file == Path("mrclam") and data is not None and not file.exists():
         file = real_logs.builtin_for(data)
-    team = _load(file or Path("demo"))
+    team = listening(_load(file or Path("demo")))
+    budgets = Choice(
+        bytes_per_s=bytes_per_s,
+        messages_per_minute=messages_per_minute,
+        match_messages=match_messages,
+    )
+    team = chosen(team, budgets)
     if picture is not None:
         must_draw("--picture")
     run = Run(team, duration, speed, seed, folder=logs, picture=picture, record=record)
@@ -137,6 +164,8 @@ def up(
         run = run._replace(here=_names(robots))
     console = Console(stderr=as_json)
     title = f"team {team.name}, {len(run.team.robots)} robots, {speed:g} x real time"
+    watch = ["cpcbl-team", "traffic", str(typed), "--connect", dialled(team.transport.listen[0])]
+    console.print(f"watch it: {shlex.join(watch)}", style="dim", highlight=False, soft_wrap=True)
     with LiveTable(title, console, quiet=as_json) as table:
         result = run_team(run, table, Stop())
     if report is not None:
@@ -145,6 +174,59 @@ def up(
         sys.stdout.write(encoded(result) + "\n")
     else:
         print_report(result, console)
+
+
+@app.command()
+def traffic(
+    file: Annotated[
+        Optional[Path], typer.Argument(help="Team file, or a built-in one: demo (default).")
+    ] = None,
+    team_name: Annotated[
+        Optional[str], typer.Option(help="The running team's name, where its file is not at hand.")
+    ] = None,
+    connect: Connect = None,
+    duration: Annotated[
+        Optional[float], typer.Option("--for", help="Seconds to watch; default: until Ctrl-C.")
+    ] = None,
+    wait: Annotated[
+        float, typer.Option(min=0.0, help="Seconds to wait for the team's router.")
+    ] = 5.0,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Print what was seen last as JSON, at the end.")
+    ] = False,
+) -> None:
+    """Watch a running team, from any machine: who helps whom, and what it costs.
+
+    Listens to the robots' status (1 Hz) only, never to fixes or beliefs: these
+    are sent where somebody listens, and watching must not cause any.
+    """
+    from rich.console import Console
+
+    from cpcbl_agents.process import Stop
+    from cpcbl_launch.options import encoded
+    from cpcbl_launch.traffic.show import TrafficView, drawn
+    from cpcbl_launch.traffic.watch import Watch, watch_team
+    from cpcbl_team.config import TransportSettings
+
+    if duration is not None and not duration > 0.0:
+        raise ValueError(f"--for {duration:g}: more than 0 seconds")
+    logging.getLogger("cpcbl_transport").setLevel(logging.WARNING)
+    team = None if team_name is not None and file is None else _load(file or Path("demo"))
+    endpoints = connect or (team.transport if team is not None else TransportSettings()).connect
+    watch = Watch(
+        team_name or (team.name if team is not None else ""),
+        () if team is None else tuple(team.robots),
+        endpoints,
+        math.inf if duration is None else duration,
+        wait,
+    )
+    console, where = Console(), ", ".join(endpoints)
+    with TrafficView(where, console, quiet=as_json) as view:
+        result = watch_team(watch, view, Stop())
+    if as_json:
+        sys.stdout.write(encoded(result) + "\n")
+    else:
+        console.print(drawn(result, where))
 
 
 @app.command()
@@ -204,6 +286,9 @@ def evaluate_mrclam(
     collaboration: Annotated[Optional[Kinds], typer.Option(help="For all robots.")] = None,
     fusion: Annotated[Optional[FusionName], typer.Option(help="For all robots.")] = None,
     direction: Annotated[Optional[DirectionName], typer.Option(help="For all robots.")] = None,
+    bytes_per_s: BytesPerS = None,
+    messages_per_minute: MessagesPerMinute = None,
+    match_messages: MatchMessages = None,
     duration: Annotated[
         Optional[float], typer.Option(help="Seconds of the log; default: all.")
     ] = None,
@@ -227,7 +312,15 @@ def evaluate_mrclam(
     from cpcbl_launch.tum import export_tum
 
     team = _load(team_file or real_logs.builtin_for(data))
-    choice = Choice(variant, collaboration, fusion, direction)
+    choice = Choice(
+        variant,
+        collaboration,
+        fusion,
+        direction,
+        bytes_per_s,
+        messages_per_minute,
+        match_messages,
+    )
     logged = real_logs.on_log(chosen(team, choice), data)
     logged = logged._replace(team=real_logs.blinded(logged.team, _names(blind)))
     logged = real_logs.shortened(logged, duration)
@@ -307,6 +400,9 @@ def simulate(
         typer.Option(help="Seconds of robot time; default: 5 with --robots, else 30."),
     ] = None,
     seed: Annotated[int, typer.Option(help="Of the noise, and of generated teams.")] = 1,
+    bytes_per_s: BytesPerS = None,
+    messages_per_minute: MessagesPerMinute = None,
+    match_messages: MatchMessages = None,
     report: Annotated[
         Optional[Path], typer.Option(help="Write the report to this file (JSON).")
     ] = None,
@@ -325,6 +421,7 @@ def simulate(
     """
     from rich.console import Console
 
+    from cpcbl_launch.evaluation import Choice, chosen
     from cpcbl_launch.options import encoded, file_for, must_draw
     from cpcbl_launch.recorder import Report
     from cpcbl_launch.scale.measure import DURATION_S, Scale, measured, parsed_sizes
@@ -332,8 +429,15 @@ def simulate(
     from cpcbl_launch.show import print_report, progress_bar
     from cpcbl_launch.up import Run, simulate_run
 
+    budgets = Choice(
+        bytes_per_s=bytes_per_s,
+        messages_per_minute=messages_per_minute,
+        match_messages=match_messages,
+    )
     if file is not None and robots:
         raise ValueError("simulate: FILE or --robots, which generates its teams; leave one out")
+    if robots and budgets != Choice():
+        raise ValueError("simulate: generated teams have no budgets; name a team file instead")
     if report is not None:
         file_for("--report", report)
     if picture is not None:
@@ -345,7 +449,8 @@ def simulate(
             duration = DURATION_S if duration is None else duration
             result = measured(parsed_sizes(robots), seed, duration, progress, picture)
         else:
-            run = Run(_load(file or Path("demo")), duration, seed=seed, picture=picture)
+            team = chosen(_load(file or Path("demo")), budgets)
+            run = Run(team, duration, seed=seed, picture=picture)
             result = simulate_run(run, progress)
     if report is not None:
         report.write_text(encoded(result), encoding="utf-8")

@@ -11,6 +11,7 @@ from cpcbl_agents.node import Node
 from cpcbl_agents.robot import Robot
 from cpcbl_launch.field import FieldNode, SimulatedField
 from cpcbl_launch.logs import LoggedTeam, seen_before, shortened
+from cpcbl_launch.options import check_limit
 from cpcbl_launch.recorder import Recorder, Report
 from cpcbl_launch.recording import Recording
 from cpcbl_launch.yardstick import inputs_of, scored, yardsticks
@@ -28,11 +29,19 @@ class Choice(NamedTuple):
     collaboration: str | None = None  # none, passive, active, both
     fusion: str | None = None
     direction: str | None = None
+    bytes_per_s: float | None = None  # of each robot
+    messages_per_minute: float | None = None  # of each robot
+    match_messages: int | None = None  # of the team
 
 
 def chosen(team: Team, choice: Choice) -> Team:
-    """The team with these choices made for all its robots."""
+    """The team with these choices made for all its robots. Raises ValueError for a bad limit."""
     rules: dict[str, object] = {}
+    limits = {}
+    for name in ("bytes_per_s", "messages_per_minute"):
+        if (limit := getattr(choice, name)) is not None:
+            check_limit(f"--{name.replace('_', '-')}", limit)
+            limits[name] = limit
     if choice.collaboration is not None:
         rules["passive"] = choice.collaboration in ("passive", "both")
         rules["active"] = choice.collaboration in ("active", "both")
@@ -45,11 +54,14 @@ def chosen(team: Team, choice: Choice) -> Team:
         name: replace(
             robot,
             localizer=replace(robot.localizer, **local),
-            collaboration=replace(robot.collaboration, **rules),
+            collaboration=replace(
+                robot.collaboration, budget=replace(robot.collaboration.budget, **limits), **rules
+            ),
         )
         for name, robot in team.robots.items()
     }
-    return replace(team, robots=robots)
+    match = {} if choice.match_messages is None else {"messages": choice.match_messages}
+    return replace(team, robots=robots, match=replace(team.match, **match))
 
 
 class Evaluated(NamedTuple):

@@ -36,6 +36,12 @@ def check_duration(duration_s: float, least_s: float) -> None:
         raise ValueError(f"--duration {duration_s:g}: at least {least_s:g} seconds of robot time")
 
 
+def check_limit(option: str, limit: float) -> None:
+    """Raises ValueError for a budget that is no number, or endless."""
+    if not 0.0 <= limit < math.inf:
+        raise ValueError(f"{option} {limit:g}: no limit; write a number, 0 for as much as it likes")
+
+
 def must_draw(what: str, path: Path | None = None) -> None:
     """Raises ValueError where pictures, or pictures of this kind, cannot be drawn."""
     if path is not None and path.suffix.lower() not in PICTURES:

@@ -7,6 +7,13 @@ from collections.abc import Iterable, Mapping, Sequence
 import msgspec
 import numpy as np
 
+from cpcbl_launch.traffic.flows import (
+    FlowReport,
+    SpendingReport,
+    all_held,
+    summed_flows,
+    summed_spending,
+)
 from cpcbl_team.metrics import Floats, Samples, Score, Trajectory, compared, score, seconds
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus
@@ -22,7 +29,10 @@ class LearnedReport(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class RobotReport(Score, frozen=True, kw_only=True):
-    """One robot's figures; messages and payload bytes are those of beliefs and fixes."""
+    """One robot's figures; messages and bytes are those of beliefs and fixes.
+
+    Bytes are those on the sender's link with Zenoh's own, without those of TCP/IP.
+    """
 
     variant: str
     lost_share: float
@@ -36,6 +46,10 @@ class RobotReport(Score, frozen=True, kw_only=True):
     counts: dict[str, int]
     learned: LearnedReport | None = None
     """None where self-calibration is off."""
+    sent: tuple[FlowReport, ...] = ()
+    heard: tuple[FlowReport, ...] = ()
+    spending: tuple[SpendingReport, ...] = ()
+    """Its limits; empty where there are none."""
 
 
 class MeanScore(msgspec.Struct, frozen=True, kw_only=True):
@@ -54,6 +68,8 @@ class TeamReport(MeanScore, frozen=True, kw_only=True):
 
     messages_sent: int
     bytes_sent: int
+    within_budget: bool | None = None
+    """Whether every limit of every robot held; None where there is none."""
 
 
 class YardstickReport(msgspec.Struct, frozen=True, kw_only=True):
@@ -181,6 +197,9 @@ class Recorder:
                 bytes_received=sum(s.bytes_received for s in statuses),
                 counts=_added(statuses),
                 learned=_learned(statuses),
+                sent=summed_flows(s.sent for s in statuses),
+                heard=summed_flows(s.heard for s in statuses),
+                spending=summed_spending(s.spending for s in statuses),
             )
         return Report(robots=robots, team=_team(robots))
 
@@ -238,4 +257,5 @@ def _team(robots: Mapping[str, RobotReport]) -> TeamReport:
         **msgspec.structs.asdict(mean_score(robots.values())),
         messages_sent=sum(r.messages_sent for r in robots.values()),
         bytes_sent=sum(r.bytes_sent for r in robots.values()),
+        within_budget=all_held(s for r in robots.values() for s in r.spending),
     )

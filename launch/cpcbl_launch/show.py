@@ -1,54 +1,38 @@
 """What a person sees: the live table, the report, progress. Fits 80 columns."""
 
 import math
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from rich.console import Console
-from rich.live import Live
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 from rich.text import Text
 
+from cpcbl_launch.live import LiveView
 from cpcbl_launch.recorder import LearnedReport, MeanScore, Recorder, Report
 from cpcbl_launch.supervisor import Supervisor
-from cpcbl_launch.tables import number, percent, table
+from cpcbl_launch.tables import number, percent, short, table
+from cpcbl_launch.traffic.show import EXPLAINED, spent_table, verdict
 from cpcbl_team.collaboration import LOWEST_TIER
 from cpcbl_team.metrics import Score
 from cpcbl_transport.messages import Status, Track, Truth
 
-SNAPSHOT_S = 5.0
 FIGURES = ("RMSE m", "mean m", "max m", "deg", "in 3 σ", "NEES")
 ProgressSetter = Callable[[float], None]
 Cell = str | Text
 
 
-class LiveTable:
+class LiveTable(LiveView):
     """The team as it runs: redrawn on a terminal, else a snapshot every few seconds."""
 
     def __init__(self, title: str, console: Console, quiet: bool = False) -> None:
-        self._title, self._console, self._quiet = title, console, quiet
-        self._live = Live(console=console, auto_refresh=False, transient=True)
-        self._next_s = 0.0
-
-    def __enter__(self) -> "LiveTable":
-        if self._console.is_terminal and not self._quiet:
-            self._live.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._live.stop()
+        super().__init__(console, quiet)
+        self._title = title
 
     def show(self, recorder: Recorder, supervisor: Supervisor, elapsed_s: float) -> None:
         """Called several times a second."""
-        if self._quiet:
-            return
-        if self._console.is_terminal:
-            self._live.update(self._table(recorder, supervisor, elapsed_s), refresh=True)
-        elif recorder.tracks and time.monotonic() >= self._next_s:
-            self._next_s = time.monotonic() + SNAPSHOT_S
-            self._console.print(self._table(recorder, supervisor, elapsed_s))
+        self.draw(lambda: self._table(recorder, supervisor, elapsed_s), bool(recorder.tracks))
 
     def _table(self, recorder: Recorder, supervisor: Supervisor, elapsed_s: float) -> Table:
         tracks, statuses, truths = recorder.latest()
@@ -105,16 +89,8 @@ def _traffic_cells(status: Status | None) -> list[Cell]:
         return [""] * 4
     s = status
     return [
-        _short(n) for n in (s.messages_sent, s.bytes_sent, s.messages_received, s.bytes_received)
+        short(n) for n in (s.messages_sent, s.bytes_sent, s.messages_received, s.bytes_received)
     ]
-
-
-def _short(n: int) -> str:
-    for unit, size in (("", 1.0), ("k", 1e3), ("M", 1e6)):
-        if n < 999.5 * size:
-            digits = 1 if unit and n < 9.95 * size else 0
-            return f"{n / size:.{digits}f}{unit}"
-    return f"{n / 1e9:.1f}G"
 
 
 def _graded(error: float | None) -> Text:
@@ -138,8 +114,8 @@ def print_report(report: Report, console: Console) -> None:
             *([number(alone.position_rmse_m)] if alone is not None else []),
             *_figures(r),
             percent(r.lost_share),
-            _short(r.messages_sent),
-            _short(r.bytes_sent),
+            short(r.messages_sent),
+            short(r.bytes_sent),
         )
     t = report.team
     known = [s.position_rmse_m for s in report.alone.values() if s.position_rmse_m is not None]
@@ -149,11 +125,17 @@ def print_report(report: Report, console: Console) -> None:
         *([number(sum(known) / len(known) if known else None)] if report.alone else []),
         *_figures(t),
         "",
-        _short(t.messages_sent),
-        _short(t.bytes_sent),
+        short(t.messages_sent),
+        short(t.bytes_sent),
         style="bold",
     )
     console.print(figures)
+    if any(r.sent or r.spending for r in report.robots.values()):
+        console.print()
+        console.print(spent_table(report))
+        console.print(EXPLAINED, style="yellow", highlight=False)
+    if (said := verdict(report)) is not None:
+        console.print(said)
     if report.yardsticks:
         console.print(_yardsticks(report))
     for line in _remarks(report):
@@ -185,7 +167,7 @@ def _figures(s: Score | MeanScore) -> list[str]:
 def _remarks(report: Report) -> Iterator[str]:
     if report.alone:
         yield "before: RMSE before teammates began to help; the other columns are from then on"
-    yield "consistent: 98.9 % in 3 σ, NEES 2; out, B: help sent, its payload bytes"
+    yield "consistent: 98.9 % in 3 σ, NEES 2; out, B: help sent, bytes with Zenoh's own"
     if report.calibrated_on:
         flattering = ": this log too, the figures flatter" if report.seen_before else ""
         yield f"robots calibrated on {', '.join(report.calibrated_on)}{flattering}"

@@ -29,3 +29,12 @@ def number(value: float | None, digits: int = 3) -> str:
 
 def percent(value: float | None) -> str:
     return "-" if value is None else f"{100.0 * value:.1f}%"
+
+
+def short(n: float) -> str:
+    """A count with its unit: 950, 1.2k, 33k, 4.0M."""
+    for unit, size in (("", 1.0), ("k", 1e3), ("M", 1e6)):
+        if n < 999.5 * size:
+            digits = 1 if unit and n < 9.95 * size else 0
+            return f"{n / size:.{digits}f}{unit}"
+    return f"{n / 1e9:.1f}G"

@@ -75,6 +75,19 @@ def free_endpoint() -> str:
         return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
 
 
+def listening(team: Team) -> Team:
+    """The team with an endpoint for its router: its own, or a free one of this machine."""
+    if team.transport.listen:
+        return team
+    transport = msgspec.structs.replace(team.transport, listen=(free_endpoint(),))
+    return msgspec.structs.replace(team, transport=transport)
+
+
+def dialled(listen: str) -> str:
+    """The endpoint at which robots of this machine find a router that listens everywhere."""
+    return listen.replace("/0.0.0.0:", "/127.0.0.1:").replace("/[::]:", "/[::1]:")
+
+
 def run_team(run: Run, view: View, stop: Stopping) -> Report:
     """Runs a team until its time is over or `stop()`. Raises BusError without a router."""
     with tempfile.TemporaryDirectory(prefix="cpcbl-") as temporary:
@@ -99,18 +112,19 @@ def simulate_run(run: Run, progress: Progress | None = None) -> Report:
 
 
 def _run_in(run: Run, view: View, stop: Stopping, folder: Path) -> Report:
-    team, here = run.team, run.team.robots if run.here is None else run.here
+    team = listening(run.team)
+    here = team.robots if run.here is None else run.here
     folder.mkdir(parents=True, exist_ok=True)
     team_file = folder / "team.json"
     save_resolved(team, team_file)
-    listen = team.transport.listen or (free_endpoint(),)
+    listen = team.transport.listen
     lead_s = LEAD_S + LEAD_S_A_PROCESS * len(here)
     clock = Clock(
         run.epoch_ns if run.epoch_ns is not None else time.time_ns() + int(lead_s * 1e9),
         time.monotonic_ns() + int(lead_s * 1e9),
         run.speed,
     )
-    table = process_table(team, team_file, _dialled(listen[0]), clock, run.seed, here)
+    table = process_table(team, team_file, dialled(listen[0]), clock, run.seed, here)
     guards = guard_rules(team, run.speed)
     with open_router(team.name, listen, guards=guards) as bus, _recording(run, bus):
         recorder = Recorder(bus)
@@ -139,11 +153,6 @@ def _recording(run: Run, bus: Bus) -> AbstractContextManager[object]:
             ", ".join(replayed),
         )
     return Recording(run.record, run.team, bus)
-
-
-def _dialled(listen: str) -> str:
-    """The endpoint at which robots of this machine find a router that listens everywhere."""
-    return listen.replace("/0.0.0.0:", "/127.0.0.1:").replace("/[::]:", "/[::1]:")
 
 
 def _report(
