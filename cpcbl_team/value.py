@@ -75,7 +75,7 @@ def merged(
 def _determinant(
     prior: Covariance2, fresh: Covariance2, dependent: Covariance2, weight: float
 ) -> float:
-    """|A| |B| / |A + B|, of (A^-1 + B^-1)^-1 with A = prior / w, B = fresh + dependent / (1 - w)."""
+    """|A| |B| / |A + B|, as of (A^-1 + B^-1)^-1; A = prior / w, B = fresh + dependent / (1 - w)."""
     k, m = 1.0 / weight, 1.0 / (1.0 - weight)
     axx, axy, ayy = k * prior.xx, k * prior.xy, k * prior.yy
     bxx, bxy = fresh.xx + m * dependent.xx, fresh.xy + m * dependent.xy

@@ -75,6 +75,45 @@ def one_way_vs_both(
     conduct(of_sizes(sizes), seeds, jobs, output, as_json)
 
 
+@experiment_app.command("budget")
+def budget(
+    data: Annotated[Path, typer.Argument(help="Folder of an MRCLAM log, e.g. MRCLAM6.")],
+    blind: Annotated[str, typer.Option(help="Robots that shall not see landmarks.")] = "3,4,5",
+    duration: Annotated[
+        Optional[float], typer.Option(help="Seconds of the log; default: all.")
+    ] = None,
+    jobs: Jobs = None,
+    output: Output = Path(),
+    as_json: AsJson = False,
+) -> None:
+    """A real log: accuracy against bytes, by value and budget, by fixed intervals, all of it."""
+    from rich.console import Console
+
+    from cpcbl_launch import logs
+    from cpcbl_launch.experiments import budget as experiment
+    from cpcbl_launch.experiments.pictures import draw_budget
+    from cpcbl_launch.options import encoded, folder_for, must_draw
+    from cpcbl_launch.team_file import load_team
+
+    must_draw("experiment")
+    folder_for("--output", output)
+    logged = logs.shortened(logs.on_log(load_team(logs.builtin_for(data)), data), duration)
+    names = [name.strip() for name in blind.split(",") if name.strip()]
+    logged = logged._replace(team=logs.blinded(logged.team, names))
+    with _progress("budget", len(experiment.cases())) as done:
+        result = experiment.curve(logged, jobs, done)
+    text = encoded(result) + "\n"
+    (output / "budget.json").write_text(text, encoding="utf-8")
+    draw_budget(result, output / "budget.png")
+    if as_json:
+        sys.stdout.write(text)
+        return
+    console = Console()
+    for shown in experiment.tables(result):
+        console.print(shown, highlight=False)
+    console.print(f"written: {output / 'budget'}.json, .png", highlight=False)
+
+
 @experiment_app.command("latency")
 def latency(
     sightings: Annotated[int, typer.Option(min=10, help="Sightings measured; ten a second.")] = 500,

@@ -6,6 +6,7 @@ from typing import Any
 
 import matplotlib as mpl
 
+from cpcbl_launch.experiments.budget import Curve, Point
 from cpcbl_launch.experiments.results import Accuracy, Outcome
 from cpcbl_team.config import RobotSettings, Team
 
@@ -90,6 +91,30 @@ def draw_variants(result: Outcome, path: Path) -> None:
         )
         axes.grid(True, axis="y", alpha=0.3)
     errors.legend()
+    _save(figure, path)
+
+
+def draw_budget(result: Curve, path: Path) -> None:
+    """Team RMSE against bytes; lines to the left and below are better."""
+    figure, axes = plt.subplots(figsize=(8.5, 5.0), layout="constrained")
+    series: dict[str, list[Point]] = {}
+    for point in result.points:
+        series.setdefault(point.series, []).append(point)
+    for name, points in series.items():
+        cost = [p.bytes_per_s for p in points]
+        errors = [p.position_rmse_m for p in points]
+        if name == "nothing":
+            axes.axhline(errors[0], color="0.5", linestyle=":", label="alone")
+            continue
+        style = "*" if len(points) == 1 else "--x" if name == "fixed interval" else "-o"
+        axes.plot(cost, errors, style, ms=12 if len(points) == 1 else 5, label=name)
+    for target in result.targets:
+        axes.axhline(target.allowed_rmse_m, color="0.8", linewidth=0.8, zorder=0)
+    axes.set(xscale="log", yscale="log", xlabel="sent (B/s a robot, on the wire)")
+    axes.set(ylabel="position RMSE, team (m)", title=f"{result.log}, blind: {result.blind}")
+    axes.yaxis.set_minor_formatter(lambda value, _: f"{value:g}")
+    axes.grid(True, which="both", alpha=0.3)
+    axes.legend()
     _save(figure, path)
 
 
