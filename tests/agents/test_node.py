@@ -29,6 +29,7 @@ from cpcbl_team.estimate import ZERO3, Estimate
 from cpcbl_team.inputs import Belief, Fix, Odometry, Position, Sighting, Sightings
 from cpcbl_team.self_calibration import Learned
 from cpcbl_team.timeline import HORIZON_NS
+from cpcbl_team.value import sigma_range_m
 from cpcbl_transport import topics
 from cpcbl_transport.bus import MemoryBus, MemoryHub, Publisher, matches
 from cpcbl_transport.compact import BELIEF_BYTES
@@ -436,6 +437,15 @@ def listens(stand: Stand, key: str) -> bool:
     return stand.bus.publisher(key, topics.Qos.FRESH).matching
 
 
+def drive(stand: Stand, way_m: float, robot: str = "me") -> None:
+    """One robot drives straight ahead within 100 ms, the others stand."""
+    before, stand.now_ns = stand.now_ns, stand.now_ns + 100 * MS
+    for name in stand.robots:
+        way = way_m if name == robot else 0.0
+        stand.odometry(name, Odometry(before, stand.now_ns, way, 0.0))
+    stand.step()
+
+
 class Recalling(MemoryHub):
     """Its sessions remember what publishers they were asked for."""
 
@@ -474,9 +484,7 @@ def test_after_a_change_of_tier_the_new_keys_are_in_force() -> None:
     assert tokens == [(topics.ALIVE.at(tier=before, robot="me", incarnation="1"), True)]
     assert set(ear.keys) == {topics.BELIEF.at(tier=before, robot="me")}
 
-    stand.odometry("me", Odometry(stand.now_ns, stand.now_ns + 100 * MS, 4.0, 0.0))
-    stand.now_ns += 100 * MS
-    stand.step()
+    drive(stand, 4.0)
     after = tier(stand, "me")
     assert after > before
     assert tiers_listened_to(stand) == list(range(after))
@@ -488,6 +496,29 @@ def test_after_a_change_of_tier_the_new_keys_are_in_force() -> None:
     stand.stand_still(1.0)
     assert set(ear.keys) == {topics.BELIEF.at(tier=after, robot="me")}
     assert hub.open_keys(topics.BELIEF.at(robot="me")) == set(ear.keys)
+
+
+def test_a_belief_is_said_under_the_tier_of_its_own_sigma() -> None:
+    """A robot that gets worse says so to none who listened to what it was before, and one that
+    gets better tells all who listen to the better tier at once."""
+    stand = helper()
+    ear, rules = stand.ear("belief/**"), stand.team.robots["me"].collaboration
+    stand.stand_still(1.1)
+    drive(stand, 2.0)
+    stand.stand_still(1.0)
+    for _ in range(5):
+        stand.stand_still(0.1)
+        stand.sightings("me", saw(stand.now_ns, Sighting("oak", 2.0, 0.0)))
+    stand.stand_still(1.0)
+    said: dict[int, list[Belief]] = {}
+    for key, belief in zip(ear.keys, ear.messages, strict=True):
+        assert isinstance(belief, Belief)
+        (_, tier, _) = key.split("/")
+        sigma = math.sqrt((belief.covariance[0] + belief.covariance[2]) / 2.0)
+        least, most = sigma_range_m(int(tier), rules)
+        assert least * 0.99 < sigma < most * 1.01
+        said.setdefault(int(tier), []).append(belief)
+    assert len(said) > 2
 
 
 def test_a_robot_that_has_become_better_no_longer_listens_to_its_equals() -> None:
@@ -533,10 +564,7 @@ def test_robots_that_swap_tiers_swap_the_direction_of_help() -> None:
     assert before["me"].messages_received > 0
     assert before["mate"].heard == ()
     for way_m in (50.0, -50.0):  # there and back
-        stand.odometry("mate", Odometry(stand.now_ns, stand.now_ns + 100 * MS, way_m, 0.0))
-        stand.odometry("me", standing(stand.now_ns + 100 * MS, stand.now_ns))
-        stand.now_ns += 100 * MS
-        stand.step()
+        drive(stand, way_m, "mate")
     assert tier(stand, "mate") > tier(stand, "me")
     exchange(stand)
     after = stand.statuses()
