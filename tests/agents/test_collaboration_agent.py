@@ -157,7 +157,7 @@ def test_a_budget_for_one_goes_to_the_fix_that_is_worth_most() -> None:
 def test_what_is_close_by_is_seen_better_and_worth_more() -> None:
     alone = Alone()
     alone.tell(Presence("mate", POOR), Presence("other", POOR))
-    assert robots(alone.sees(ahead("mate", 4.0), ahead("other", 1.0))) == ["other", "mate"]
+    assert robots(alone.sees(ahead("mate", 4.0), ahead("other", 1.2))) == ["other", "mate"]
 
 
 def test_who_is_lost_comes_first_whatever_it_is_worth() -> None:
@@ -196,6 +196,19 @@ def test_a_message_that_is_not_worth_its_price_is_counted_as_beyond_the_budget()
     spent = sum(alone.tally("fix", name).messages for name in MATES)
     assert 0 < spent * 42 < 800
     assert sum(alone.tally("fix", name).over_budget for name in MATES) > 0
+
+
+def test_a_budget_just_free_again_does_not_go_to_what_is_worth_little() -> None:
+    weak = Presence("other", GOOD + 2)
+    at_first = Alone(budget=BudgetSettings(messages_per_minute=4.0, urgent_share=0.0))
+    at_first.tell(weak)
+    assert robots(at_first.sees(ahead("other", 1.2))) == ["other"]
+    alone = Alone(budget=BudgetSettings(messages_per_minute=4.0, urgent_share=0.0))
+    alone.tell(Presence("mate", POORER), weak)
+    sent = [bool(alone.sees(ahead(), after_ns=SECOND)) for _ in range(60)]
+    assert sent == [True] * 4 + [False] * 56
+    assert alone.sees(ahead("other", 1.2), after_ns=SECOND) == []
+    assert len(alone.sees(ahead())) == 1
 
 
 def helped(alone: Alone, frames: int, range_m: float = 2.0) -> list[int]:
@@ -446,6 +459,7 @@ def test_a_robot_that_is_lost_says_nothing_and_listens_to_all_who_are_better() -
     alone.tell(Presence("mate", LOWEST_TIER - 1), Presence("other", POOR), Listened(by_any=True))
     assert len(alone.later(0.2)) == 1
     alone.becomes(lost=LOST)
+    assert alone.sees(*map(ahead, sorted(MATES))) == []
     assert alone.later(2.0) == []
     assert alone.agent.tier == LOWEST_TIER
     assert alone.sees(*map(ahead, sorted(MATES))) == []
