@@ -21,7 +21,7 @@ from cpcbl_team.config import (
 )
 from cpcbl_team.inputs import Belief, Fix, Odometry, Sighting, Sightings
 from cpcbl_transport import topics
-from cpcbl_transport.bus import Bus, MemoryHub
+from cpcbl_transport.bus import Bus, Handle, MemoryHub
 from cpcbl_transport.compact import decode_help, encode_help
 from cpcbl_transport.messages import Message, Refusal, Status, decode, encode
 
@@ -140,6 +140,10 @@ class Stand:
     def sightings(self, robot: str, frame: Sightings) -> None:
         self.put(topics.IN_SIGHTINGS.at(robot=robot), frame)
 
+    def announce(self, robot: str, tier: int) -> Handle:
+        """The token of a robot whose part the test plays."""
+        return self.bus.announce(topics.ALIVE.at(tier=tier, robot=robot, incarnation="1"))
+
     def step(self) -> None:
         """Steps every robot once, then those that something has arrived for, until all is quiet."""
         due = list(self.nodes.values())
@@ -159,11 +163,12 @@ class Stand:
     def ear(self, keys: str) -> Ear:
         return Ear(self.bus, keys)
 
-    def status(self, robot: str) -> Status:
-        """The status that a robot says within the next second or so."""
-        ear = self.ear(topics.STATUS.at(robot=robot))
+    def statuses(self) -> dict[str, Status]:
+        """What the robots say of themselves within the next second or so."""
+        ear = self.ear(topics.STATUS.at())
         self.stand_still(1.1)
         ear.close()
-        latest = ear.messages[-1]
-        assert isinstance(latest, Status)
-        return latest
+        return {m.robot: m for m in ear.messages if isinstance(m, Status)}
+
+    def status(self, robot: str) -> Status:
+        return self.statuses()[robot]

@@ -199,11 +199,14 @@ class CollaborationAgent:
     def _affords(self, now_ns: int, size: int, value: float, urgent: bool) -> bool:
         """Whether help of this value may be sent; it is paid for at once."""
         budget, least = self.budget, self._rules.least_value
-        wanted = urgent or value >= budget.price(now_ns, size)
-        if not (wanted and budget.admits(now_ns, size, urgent)):
+        if not urgent and value < budget.price(now_ns, size):
             return False
-        budget.spend(now_ns, size, least)
-        return True
+        admitted = budget.admits(now_ns, size, urgent)
+        if admitted:
+            budget.spend(now_ns, size, least)
+        else:
+            budget.refuse(now_ns, least)
+        return admitted
 
     def _sent(self, sent: Sent) -> None:
         message = sent.message

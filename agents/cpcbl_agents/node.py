@@ -51,7 +51,7 @@ class Node:
         self._news: deque[tuple[str, bool]] = deque(maxlen=INBOX)
         self._wiring = Wiring(robot.name, incarnation, rules, bus, self._arrived, self._seen_alive)
         self._tokens = Tokens()
-        self._listened = False
+        self._listened = ""
         self._status_ns = start_ns
         self.counts: Counter[str] = Counter()
         self._heard = Tallies()
@@ -97,10 +97,11 @@ class Node:
                 if message is not None:
                     self._send(self._robot.handle(message, now_ns), now_ns)
         self._ask_for_listeners(now_ns)
-        self._send(self._robot.handle(Tick(), now_ns), now_ns)
+        said = self._robot.handle(Tick(), now_ns)
         for name in self._wiring.follow(self._robot.collaboration):
             self._tokens.forget(name)
             self._robot.handle(Presence(name, None), now_ns)
+        self._send(said, now_ns)  # under the tier of what is said
         if now_ns - self._status_ns >= STATUS_NS and self._wiring.tier is not None:
             self._status_ns = now_ns
             self._publish(topics.STATUS, topics.STATUS.at(robot=self._name), self._status(now_ns))
@@ -120,10 +121,10 @@ class Node:
         if tier is None or not self._passive:
             return
         key = topics.BELIEF.at(tier=tier, robot=self._name)
-        listened = self._wiring.publisher(topics.BELIEF, key).matching
-        if listened != self._listened:
+        listened = key if self._wiring.publisher(topics.BELIEF, key).matching else ""
+        if listened != self._listened:  # to another key others may listen
             self._listened = listened
-            self._robot.handle(Listened(listened), now_ns)
+            self._robot.handle(Listened(bool(listened)), now_ns)
 
     def _accepted(self, key: str, payload: bytes, now_ns: int) -> Message | None:
         helps = key.startswith(("belief/", "fix/"))

@@ -12,6 +12,7 @@ from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus, Handle, Publisher, Receive, Watch
 from cpcbl_transport.topics import Topic
 
+_TIERS = {str(tier): tier for tier in range(LOWEST_TIER + 1)}
 _BY_TIER = tuple(topic.key.split("/")[0] + "/" for topic in (topics.BELIEF, topics.FIX))
 
 
@@ -97,13 +98,13 @@ class Tokens:
     def changed(self, key: str, alive: bool) -> tuple[str, int | None] | None:
         """The teammate and its tier, None once it is gone; None for what is no robot's token."""
         names: Mapping[str, str] = topics.ALIVE.names(key) or {}
-        tier = names.get("tier", "")
-        if not (tier.isascii() and tier.isdigit() and int(tier) <= LOWEST_TIER):
+        tier = _TIERS.get(names.get("tier", ""))
+        if tier is None:
             return None
         tiers = self._tiers.setdefault(names["robot"], {})
         tiers.pop(key, None)
         if alive:
-            tiers[key] = int(tier)
+            tiers[key] = tier
         return names["robot"], next(reversed(tiers.values()), None)
 
     def forget(self, robot: str) -> None:

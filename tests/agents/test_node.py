@@ -29,10 +29,12 @@ from cpcbl_team.estimate import ZERO3, Estimate
 from cpcbl_team.inputs import Belief, Fix, Odometry, Position, Sighting, Sightings
 from cpcbl_team.self_calibration import Learned
 from cpcbl_team.timeline import HORIZON_NS
+from cpcbl_team.value import sigma_range_m
 from cpcbl_transport import topics
 from cpcbl_transport.bus import MemoryBus, MemoryHub, Publisher, matches
 from cpcbl_transport.compact import BELIEF_BYTES
 from cpcbl_transport.messages import LARGEST_PAYLOAD, VERSION, Message, Refusal, Track
+from cpcbl_transport.overhead import sent_bytes
 
 GOOD, POOR = 0.02, 0.3
 COVARIANCE = (0.0004, 0.0, 0.0004, 0.0, 0.0, 0.0001)
@@ -55,10 +57,21 @@ def two_robots(me_sigma_m: float = POOR, mate_sigma_m: float = GOOD, **rules: An
 
 
 def only_me() -> Stand:
-    """The robot `me` at NOW; the test plays its mate."""
+    """The robot `me` at NOW, which listens to its mate since it saw it; the test plays the mate."""
     stand = Stand(two_robots(), here=["me"])
-    stand.stand_still(NOW / SECOND)
+    stand.announce("mate", 2)
+    stand.stand_still(NOW / SECOND - 0.2)
+    look(stand)
+    stand.stand_still(0.2)
     return stand
+
+
+def look(stand: Stand, *robots: str) -> None:
+    """These robots, or all that are there, see each other."""
+    for name, seen in (("me", "mate"), ("mate", "me")):
+        if name in (robots or stand.robots):
+            stand.sightings(name, saw(stand.now_ns, Sighting(seen, 2.0, 0.0)))
+    stand.step()
 
 
 def estimate(stand: Stand, robot: str = "me") -> Estimate:
@@ -109,13 +122,8 @@ BAD = [
     Bad(Refusal.FUTURE, FIX_KEY, changed(FIX, stamp_ns=NOW + SECOND)),
     Bad(Refusal.FUTURE, IN_SIGHTINGS, saw(NOW + SECOND)),
     Bad(Refusal.DURATION, IN_ODOMETRY, standing(NOW, NOW)),
-    Bad(
-        Refusal.UNKNOWN_ROBOT,
-        topics.BELIEF.at(tier=2, robot="ghost"),
-        changed(BELIEF, robot="ghost"),
-    ),
     Bad(Refusal.UNKNOWN_ROBOT, topics.FIX.at(robot="me", tier=2, observer="ghost"), FIX),
-    Bad(Refusal.OWN, topics.BELIEF.at(tier=2, robot="me"), changed(BELIEF, robot="me")),
+    Bad(Refusal.OWN, topics.FIX.at(robot="me", tier=2, observer="me"), FIX),
     Bad("too_late", FIX_KEY, changed(FIX, stamp_ns=NOW - HORIZON_NS - SECOND)),
 ]
 
@@ -132,7 +140,9 @@ def test_a_bad_payload_is_counted_and_changes_nothing_else(bad: Bad) -> None:
         without.put(bad.key, saw(bad.payload.stamp_ns))
     for stand in (with_it, without):
         stand.put(FIX_KEY, FIX)
-        stand.stand_still(0.5)
+        stand.stand_still(0.2)
+        look(stand)
+        stand.stand_still(0.3)
     assert estimate(with_it) == estimate(without)
     assert estimate(with_it) != estimate(only_me())
     counts = [stand.status("me").counts for stand in (with_it, without)]
@@ -165,12 +175,12 @@ def test_a_duplicate_is_counted_and_changes_nothing_else(
 
 
 def test_a_duplicate_frame_does_not_repeat_its_fixes() -> None:
-    stand = Stand(two_robots(GOOD, POOR), here=["me"])
-    stand.stand_still(1.0)
+    stand = helper(least_value=0.0)
+    exchange(stand, 1.0)
     ear = stand.ear(topics.FIX.at(robot="mate"))
+    stand.stand_still(0.1)
     for _ in range(2):
-        stand.sightings("me", saw(stand.now_ns, MATE_SEEN))
-        stand.step()
+        look(stand)
     assert len(ear.messages) == 1
 
 
@@ -288,7 +298,7 @@ def test_no_finite_numbers_raise(keyed: tuple[str, Message]) -> None:
 def test_a_full_inbox_drops_the_oldest_and_counts_it() -> None:
     stand = only_me()
     for _ in range(INBOX + 3):
-        stand.put(BELIEF_KEY, b"")
+        stand.put(FIX_KEY, b"")
     stand.step()
     assert stand.nodes["me"].counts == {"inbox_overflow": 3, Refusal.EMPTY: INBOX}
 
@@ -305,14 +315,20 @@ def test_status_comes_once_a_second() -> None:
 
 
 def test_status_tells_quality_and_traffic() -> None:
-    stand = Stand(two_robots())
-    stand.stand_still(2.0)
-    mine, mates = stand.status("me"), stand.status("mate")
+    stand = Stand(two_robots(active=False))
+    exchange(stand)
+    mine, mates = stand.statuses().values()
     assert mine.tier == tier(stand, "me") > mates.tier == tier(stand, "mate")
-    assert mine.position_sigma_m == pytest.approx(POOR)
+    assert mine.position_sigma_m == estimate(stand).position_sigma_m
     assert mine.lost == ""
-    assert mates.messages_sent >= mine.messages_received > 0
-    assert mates.bytes_sent >= mine.bytes_received == BELIEF_BYTES * mine.messages_received
+    assert mates.messages_sent == mine.messages_received > 1
+    assert mates.bytes_sent == mine.bytes_received
+    assert mine.bytes_received == sent_bytes(BELIEF_BYTES) * mine.messages_received
+    (said,), (heard,) = mates.sent, mine.heard
+    assert (said.topic, said.peer, heard.topic, heard.peer) == ("belief", "", "belief", "mate")
+    assert (said.messages, said.bytes) == (mates.messages_sent, mates.bytes_sent)
+    assert said.latest_ns == heard.latest_ns
+    assert said.silent > 0
 
 
 # Who hears whom ---------------------------------------------------------------------------------
@@ -322,31 +338,47 @@ def exchange(stand: Stand, seconds: float = 2.0) -> None:
     """Both robots stand and see each other at 5 Hz."""
     for _ in range(round(5 * seconds)):
         stand.stand_still(0.2)
-        for name, seen in (("me", "mate"), ("mate", "me")):
-            if name in stand.robots:
-                stand.sightings(name, saw(stand.now_ns, Sighting(seen, 2.0, 0.0)))
-        stand.step()
+        look(stand)
+
+
+def helper(**rules: Any) -> Stand:
+    """The robot `me`, which is good; the test plays its mate, which is poor."""
+    stand = Stand(two_robots(GOOD, POOR, **rules), here=["me"])
+    stand.announce("mate", tier_of(POOR, math.sqrt(2.0)))
+    return stand
 
 
 def test_nothing_is_sent_uphill() -> None:
     stand = Stand(two_robots())
     exchange(stand)
-    worse, better = stand.nodes["me"], stand.nodes["mate"]
-    assert better.received == {}
-    assert worse.sent == {}
-    assert worse.received["messages"] == better.sent["messages"] > 10
+    worse, better = stand.statuses().values()
+    assert better.heard == worse.sent == ()
+    assert {flow.topic for flow in better.sent} == {"belief", "fix"}
+    assert worse.messages_received == better.messages_sent > 2
 
 
 def test_robots_of_the_same_tier_tell_each_other_nothing() -> None:
     stand = Stand(two_robots(GOOD, GOOD))
     exchange(stand)
-    assert [node.received for node in stand.nodes.values()] == [{}, {}]
+    assert [(s.sent, s.heard) for s in stand.statuses().values()] == [((), ())] * 2
 
 
 def test_both_ways_sends_uphill_too() -> None:
-    stand = Stand(two_robots(direction="both-ways"))
+    stand = Stand(two_robots(direction="both-ways", least_value=0.0, least_use=0.0))
     exchange(stand)
-    assert all(node.received["messages"] > 10 for node in stand.nodes.values())
+    for status in stand.statuses().values():
+        assert {flow.topic for flow in status.heard if flow.messages} == {"belief", "fix"}
+
+
+def test_only_teammates_in_sight_are_listened_to() -> None:
+    stand = Stand(two_robots())
+    stand.stand_still(2.0)
+    assert [s.heard for s in stand.statuses().values()] == [(), ()]
+    exchange(stand, 1.0)
+    heard = stand.status("me").messages_received
+    assert heard > 0
+    stand.stand_still(2.0)
+    assert stand.status("me").messages_received == heard
 
 
 @pytest.mark.parametrize(
@@ -363,7 +395,7 @@ def test_both_ways_sends_uphill_too() -> None:
 def test_help_is_of_the_kinds_that_are_chosen(
     rules: dict[str, Any], kinds: set[type[Message]]
 ) -> None:
-    stand = Stand(two_robots(GOOD, POOR, **rules), here=["me"])
+    stand = helper(**rules)
     beliefs, fixes = stand.ear("belief/**"), stand.ear("fix/**")
     exchange(stand)
     assert {type(m) for m in beliefs.messages + fixes.messages} == kinds
@@ -380,6 +412,7 @@ def test_help_begins_after_the_chosen_time() -> None:
 @pytest.mark.parametrize("known", [True, False], ids=["knows where it is", "lost"])
 def test_a_lost_robot_tells_teammates_nothing(known: bool) -> None:
     stand = Stand(team_of(me=robot_at(sigma_m=GOOD, known=known), mate=robot_at(2.0)), here=["me"])
+    stand.announce("mate", LOWEST_TIER)
     help_, track = stand.ear("*/*/me"), stand.ear(topics.TRACK.at(robot="me"))
     fixes = stand.ear("fix/**")
     exchange(stand)
@@ -395,19 +428,22 @@ def test_a_lost_robot_tells_teammates_nothing(known: bool) -> None:
 
 
 def tiers_listened_to(stand: Stand) -> list[int]:
-    """The tiers whose beliefs and fixes `me` subscribes to."""
-    beliefs, fixes = (
-        [
-            t
-            for t in range(LOWEST_TIER + 1)
-            if stand.bus.publisher(
-                topic.at(tier=t, robot=robot, observer="mate"), topic.qos
-            ).matching
-        ]
-        for topic, robot in ((topics.BELIEF, "mate"), (topics.FIX, "me"))
-    )
-    assert beliefs == fixes
-    return beliefs
+    """The tiers whose fixes `me` subscribes to."""
+    keys = [topics.FIX.at(robot="me", tier=t, observer="mate") for t in range(LOWEST_TIER + 1)]
+    return [t for t, key in enumerate(keys) if listens(stand, key)]
+
+
+def listens(stand: Stand, key: str) -> bool:
+    return stand.bus.publisher(key, topics.Qos.FRESH).matching
+
+
+def drive(stand: Stand, way_m: float, robot: str = "me") -> None:
+    """One robot drives straight ahead within 100 ms, the others stand."""
+    before, stand.now_ns = stand.now_ns, stand.now_ns + 100 * MS
+    for name in stand.robots:
+        way = way_m if name == robot else 0.0
+        stand.odometry(name, Odometry(before, stand.now_ns, way, 0.0))
+    stand.step()
 
 
 class Recalling(MemoryHub):
@@ -448,9 +484,7 @@ def test_after_a_change_of_tier_the_new_keys_are_in_force() -> None:
     assert tokens == [(topics.ALIVE.at(tier=before, robot="me", incarnation="1"), True)]
     assert set(ear.keys) == {topics.BELIEF.at(tier=before, robot="me")}
 
-    stand.odometry("me", Odometry(stand.now_ns, stand.now_ns + 100 * MS, 4.0, 0.0))
-    stand.now_ns += 100 * MS
-    stand.step()
+    drive(stand, 4.0)
     after = tier(stand, "me")
     assert after > before
     assert tiers_listened_to(stand) == list(range(after))
@@ -462,6 +496,29 @@ def test_after_a_change_of_tier_the_new_keys_are_in_force() -> None:
     stand.stand_still(1.0)
     assert set(ear.keys) == {topics.BELIEF.at(tier=after, robot="me")}
     assert hub.open_keys(topics.BELIEF.at(robot="me")) == set(ear.keys)
+
+
+def test_a_belief_is_said_under_the_tier_of_its_own_sigma() -> None:
+    """A robot that gets worse says so to none who listened to what it was before, and one that
+    gets better tells all who listen to the better tier at once."""
+    stand = helper()
+    ear, rules = stand.ear("belief/**"), stand.team.robots["me"].collaboration
+    stand.stand_still(1.1)
+    drive(stand, 2.0)
+    stand.stand_still(1.0)
+    for _ in range(5):
+        stand.stand_still(0.1)
+        stand.sightings("me", saw(stand.now_ns, Sighting("oak", 2.0, 0.0)))
+    stand.stand_still(1.0)
+    said: dict[int, list[Belief]] = {}
+    for key, belief in zip(ear.keys, ear.messages, strict=True):
+        assert isinstance(belief, Belief)
+        (_, tier, _) = key.split("/")
+        sigma = math.sqrt((belief.covariance[0] + belief.covariance[2]) / 2.0)
+        least, most = sigma_range_m(int(tier), rules)
+        assert least * 0.99 < sigma < most * 1.01
+        said.setdefault(int(tier), []).append(belief)
+    assert len(said) > 2
 
 
 def test_a_robot_that_has_become_better_no_longer_listens_to_its_equals() -> None:
@@ -477,25 +534,49 @@ def test_a_robot_that_has_become_better_no_longer_listens_to_its_equals() -> Non
     assert tiers_listened_to(stand) == list(range(tier(stand, "me")))
 
 
+def test_the_belief_of_a_teammate_is_followed_to_its_next_tier() -> None:
+    stand = only_me()
+    second, third = (topics.BELIEF.at(tier=t, robot="mate") for t in (2, 3))
+    assert listens(stand, second)
+    token = stand.announce("mate", 3)
+    stand.stand_still(0.1)
+    assert (listens(stand, second), listens(stand, third)) == (False, True)
+    token.close()
+    stand.stand_still(0.1)
+    assert (listens(stand, second), listens(stand, third)) == (True, False)
+
+
+def test_a_robot_listens_no_more_to_a_teammate_that_is_gone() -> None:
+    stand = Stand(two_robots(), here=["me"])
+    token = stand.announce("mate", 2)
+    exchange(stand, 1.0)
+    assert listens(stand, BELIEF_KEY)
+    token.close()
+    look(stand)
+    stand.stand_still(0.1)
+    assert not listens(stand, BELIEF_KEY)
+
+
 def test_robots_that_swap_tiers_swap_the_direction_of_help() -> None:
     stand = Stand(two_robots())
-    stand.stand_still(1.0)
-    stand.odometry("mate", Odometry(stand.now_ns, stand.now_ns + 100 * MS, 100.0, 0.0))
-    stand.odometry("me", standing(stand.now_ns + 100 * MS, stand.now_ns))
-    stand.now_ns += 100 * MS
-    stand.step()
+    exchange(stand)
+    before = stand.statuses()
+    assert before["me"].messages_received > 0
+    assert before["mate"].heard == ()
+    for way_m in (50.0, -50.0):  # there and back
+        drive(stand, way_m, "mate")
     assert tier(stand, "mate") > tier(stand, "me")
-    told = stand.nodes["me"].received["messages"]
-    stand.stand_still(2.0)
-    assert stand.nodes["me"].received["messages"] == told
-    assert stand.nodes["mate"].received["messages"] > 0
+    exchange(stand)
+    after = stand.statuses()
+    assert after["me"].messages_received == before["me"].messages_received
+    assert {flow.topic for flow in after["mate"].heard} == {"belief", "fix"}
 
 
 # What was told may come back ---------------------------------------------------------------------
 
 
 def test_nothing_is_shared_while_nobody_listens() -> None:
-    stand = Stand(two_robots(GOOD, POOR), here=["me"])
+    stand = helper()
     stand.ear(topics.TRACK.at(robot="me"))
     exchange(stand)
     assert estimate(stand).shared == ZERO3
@@ -503,8 +584,9 @@ def test_nothing_is_shared_while_nobody_listens() -> None:
 
 @pytest.mark.parametrize("topic", [topics.BELIEF, topics.FIX], ids=lambda t: t.key)
 def test_all_is_shared_once_help_was_really_sent(topic: topics.Topic) -> None:
-    stand = Stand(two_robots(GOOD, POOR), here=["me"])
+    stand = helper(least_value=0.0)
     exchange(stand)
+    assert estimate(stand).shared == ZERO3
     ear = stand.ear(topic.at())
     exchange(stand)
     assert ear.messages
@@ -513,8 +595,10 @@ def test_all_is_shared_once_help_was_really_sent(topic: topics.Topic) -> None:
 
 def test_a_listener_shares_only_what_it_has_used() -> None:
     stand = Stand(two_robots(passive=True, active=False))
-    stand.stand_still(2.0)
-    assert stand.nodes["me"].received["messages"] > 0
+    stand.stand_still(0.5)
+    look(stand, "me")
+    stand.stand_still(0.5)
+    assert stand.status("me").messages_received > 0
     assert estimate(stand, "me").shared == ZERO3
     exchange(stand)
     assert estimate(stand, "me").shared != ZERO3

@@ -7,10 +7,11 @@ import pytest
 from bus_helpers import MS, SECOND, robot_at, saw, team_of, with_robot
 from msgspec.structs import replace
 
-from cpcbl_agents.agent import Located, Tick
+from cpcbl_agents.agent import Located, Presence, Tick
 from cpcbl_agents.driving import COMMAND_NS, MOST_TURN_RAD_S, REACHED_M, Pilot, steer
 from cpcbl_agents.filtering import PATIENCE_NS
 from cpcbl_agents.robot import Robot
+from cpcbl_team.collaboration import LOWEST_TIER
 from cpcbl_team.config import (
     CollaborationSettings,
     LocalizerSettings,
@@ -32,7 +33,10 @@ TEAM = team_of(me=robot_at(sigma_m=0.1), mate=robot_at(2.0))
 
 
 def robot(team: Team = TEAM) -> Robot:
-    return Robot("me", team, 0)
+    """It knows of a teammate that is lost."""
+    subject = Robot("me", team, 0)
+    subject.handle(Presence("mate", LOWEST_TIER), 0)
+    return subject
 
 
 def belief(robot: Robot) -> Estimate:
@@ -303,7 +307,7 @@ def test_a_robot_that_stands_waits_for_no_odometry() -> None:
 
 
 def test_fixes_keep_their_least_interval() -> None:
-    rules = CollaborationSettings(fix_interval_s=0.5)
+    rules = CollaborationSettings(fix_interval_s=0.5, least_value=0.0)
     subject = robot(with_robot(TEAM, "me", collaboration=rules))
     stamps = []
     for piece in pieces(2.0, 0.0, 0.0):

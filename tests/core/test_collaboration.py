@@ -127,7 +127,7 @@ def test_a_teammate_that_turns_is_carried_along_its_arc() -> None:
     assert (place.x, place.y) == pytest.approx((0.5 * math.cos(0.1), 0.5 * math.sin(0.1)))
 
 
-@pytest.mark.parametrize(("age_s", "used"), [(-0.1, False), (0.0, True), (1.0, True), (1.1, False)])
+@pytest.mark.parametrize(("age_s", "used"), [(-0.1, False), (0.0, True), (1.5, True), (1.6, False)])
 def test_a_belief_is_used_up_to_its_greatest_age(age_s: float, used: bool) -> None:
     found = placed(belief(1.0, 2.0, 5 * SECOND), int((5.0 + age_s) * SECOND), RULES)
     assert (found is not None) is used

@@ -103,7 +103,7 @@ BOUNDS = {  # the largest error that is allowed, whatever the standard error
     "turn_bias_rad_per_m": 0.04,
     "distance_sigma_m_per_sqrt_rad": 0.1,
     "distance_sigma_m_per_sqrt_m": 0.04,
-    "turn_sigma_rad_per_sqrt_rad": 0.05,
+    "turn_sigma_rad_per_sqrt_rad": 0.06,
     "turn_sigma_rad_per_sqrt_m": 0.07,
     "range_scale": 0.03,
     "range_bias_m": 0.1,

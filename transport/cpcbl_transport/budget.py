@@ -4,6 +4,8 @@ A limit is a bucket whose tokens come back one window after they were spent: so 
 more than is allowed, and nothing has to be held back for bursts, as in a bucket that fills evenly.
 The price spreads the spending: it falls while nothing is sent, rises with each message, and so
 finds the level at which as much is worth sending as may be sent (dual ascent on the constraint).
+It does not fall while only the limits hold back what is worth it: else whatever comes first after
+each full window would be sent, however little it is worth.
 """
 
 import math
@@ -29,7 +31,7 @@ class Window:
         self._sum = self._most = 0.0
 
     def room(self, now_ns: int, urgent: bool) -> float:
-        back_ns = now_ns - int(self._window_s * 1e9)
+        back_ns = now_ns - round(self._window_s * 1e9)
         while self._spent and self._spent[0][0] <= back_ns:
             self._sum -= self._spent.popleft()[1]
         return self.capacity - self._sum - (0.0 if urgent else self._reserve)
@@ -116,6 +118,10 @@ class Budget:
         self._price_ns = now_ns
         for limit, amount in self._costs(size):
             limit.spend(now_ns, amount)
+
+    def refuse(self, now_ns: int, least: float) -> None:
+        """A message that was worth its price, at least `least`, is not admitted."""
+        self._price, self._price_ns = max(self._price, least), now_ns
 
     def spending(self, now_ns: int) -> tuple[Spending, ...]:
         """Its limits, and how near it came to each."""

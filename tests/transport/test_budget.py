@@ -1,0 +1,311 @@
+"""What a robot may spend: never more, little less, and on what is worth most."""
+
+import math
+from collections.abc import Callable, Sequence
+from itertools import accumulate
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+from bus_helpers import MS, SECOND, examples
+from hypothesis import given
+from hypothesis import strategies as st
+
+from cpcbl_team.config import BudgetSettings
+from cpcbl_transport.budget import BYTES_WINDOW_S, LEAST_BYTES, Budget
+from cpcbl_transport.messages import Spending
+
+FIX, BELIEF = 42, 50
+LEAST = 0.05
+HOUR = 3600 * SECOND
+
+
+class Wish(NamedTuple):
+    """A message that a robot would like to send."""
+
+    at_ns: int
+    size: int
+    urgent: bool = False
+
+
+def wishes_with_gaps(most_gap_ns: int) -> st.SearchStrategy[list[Wish]]:
+    """Gaps of any length, and often none at all."""
+    gap = st.integers(0, most_gap_ns) | st.just(0) | st.integers(0, 10)
+    sized = st.tuples(gap, st.integers(1, 300), st.booleans())
+
+    def timed(wishes: list[tuple[int, int, bool]]) -> list[Wish]:
+        stamps = accumulate(gap for gap, _, _ in wishes)
+        return [Wish(at, w[1], w[2]) for at, w in zip(stamps, wishes, strict=True)]
+
+    return st.lists(sized, max_size=150).map(timed)
+
+
+SHARES = st.floats(0.0, 1.0)
+WISHES = wishes_with_gaps(3 * SECOND)
+
+
+def granted(budget: Budget, wishes: Sequence[Wish]) -> list[Wish]:
+    """What the budget admits, whatever it is worth."""
+    sent = []
+    for wish in wishes:
+        if budget.admits(*wish):
+            budget.spend(wish.at_ns, wish.size, LEAST)
+            sent.append(wish)
+    return sent
+
+
+def most_within(window_s: float, sent: Sequence[Wish], amount: Callable[[Wish], float]) -> float:
+    """The most in any window; what is as far apart as it is long does not share it."""
+    window_ns = round(window_s * 1e9)
+    return max(
+        (
+            sum(amount(w) for w in sent if first.at_ns <= w.at_ns < first.at_ns + window_ns)
+            for first in sent
+        ),
+        default=0.0,
+    )
+
+
+def size_of(wish: Wish) -> float:
+    return float(wish.size)
+
+
+def one(_: Wish) -> float:
+    return 1.0
+
+
+# Never more -------------------------------------------------------------------------------------
+
+
+@examples(200)
+@given(st.floats(1.0, 1000.0), SHARES, WISHES)
+def test_no_window_holds_more_bytes_than_allowed(
+    bytes_per_s: float, share: float, wishes: list[Wish]
+) -> None:
+    budget = Budget(BudgetSettings(bytes_per_s=bytes_per_s, urgent_share=share), 0)
+    sent = granted(budget, wishes)
+    window_s = max(BYTES_WINDOW_S, LEAST_BYTES / bytes_per_s)
+    assert most_within(window_s, sent, size_of) <= window_s * bytes_per_s + 1e-6
+
+
+@examples(200)
+@given(st.floats(50.0, 1000.0), WISHES)
+def test_from_50_bytes_a_second_on_the_window_is_10_s(
+    bytes_per_s: float, wishes: list[Wish]
+) -> None:
+    sent = granted(Budget(BudgetSettings(bytes_per_s=bytes_per_s), 0), wishes)
+    assert most_within(10.0, sent, size_of) <= 10.0 * bytes_per_s + 1e-6
+
+
+@examples(200)
+@given(st.floats(0.1, 60.0), SHARES, wishes_with_gaps(20 * SECOND))
+def test_no_window_holds_more_messages_than_allowed(
+    per_minute: float, share: float, wishes: list[Wish]
+) -> None:
+    budget = Budget(BudgetSettings(messages_per_minute=per_minute, urgent_share=share), 0)
+    sent = granted(budget, wishes)
+    most = math.ceil(per_minute)
+    assert most_within(60.0 * most / per_minute, sent, one) <= most
+
+
+@examples(100)
+@given(st.integers(1, 60), wishes_with_gaps(20 * SECOND))
+def test_no_minute_holds_more_messages_than_a_whole_number(
+    per_minute: int, wishes: list[Wish]
+) -> None:
+    sent = granted(Budget(BudgetSettings(messages_per_minute=per_minute), 0), wishes)
+    assert most_within(60.0, sent, one) <= per_minute
+
+
+def test_of_two_and_a_half_messages_a_minute_three_come_in_72_s() -> None:
+    budget = Budget(BudgetSettings(messages_per_minute=2.5, urgent_share=0.0), 0)
+    wishes = [Wish(n * 100 * MS, FIX) for n in range(1500)]
+    stamps = [wish.at_ns // SECOND for wish in granted(budget, wishes)]
+    assert stamps == [0, 0, 0, 72, 72, 72, 144, 144, 144]
+
+
+@examples(200)
+@given(st.floats(0.001, 5.0), SHARES, WISHES, st.lists(st.integers(0, 200), max_size=3))
+def test_a_match_never_costs_more_than_was_earned_whatever_was_restarted(
+    rate_hz: float, share: float, wishes: list[Wish], restarts_s: list[int]
+) -> None:
+    settings, sent = BudgetSettings(urgent_share=share), list[Wish]()
+    begins = [0, *sorted(s * SECOND for s in restarts_s)]
+    for begin, end in zip(begins, [*begins[1:], HOUR], strict=True):
+        budget = Budget(settings, begin, rate_hz, renewed=begin > 0)
+        sent += granted(budget, [w for w in wishes if begin <= w.at_ns < end])
+    for number, wish in enumerate(sent, start=1):
+        assert number <= rate_hz * wish.at_ns * 1e-9 + 1e-6
+
+
+@examples(200)
+@given(st.floats(50.0, 500.0), st.integers(1, 30), WISHES, st.integers(0, 100 * SECOND))
+def test_no_window_holds_more_after_a_restart_either(
+    bytes_per_s: float, per_minute: int, wishes: list[Wish], restart_ns: int
+) -> None:
+    settings = BudgetSettings(bytes_per_s=bytes_per_s, messages_per_minute=per_minute)
+    before = [w for w in wishes if w.at_ns <= restart_ns]
+    sent = granted(Budget(settings, 0), before)
+    sent += granted(Budget(settings, restart_ns, renewed=True), wishes[len(before) :])
+    assert most_within(10.0, sent, size_of) <= 10.0 * bytes_per_s + 1e-6
+    assert most_within(60.0, sent, one) <= per_minute
+
+
+def test_after_a_restart_there_is_something_to_spend_again_one_window_later() -> None:
+    budget = Budget(BudgetSettings(bytes_per_s=100.0), 5 * SECOND, renewed=True)
+    assert not budget.admits(15 * SECOND - 1, 1, urgent=True)
+    assert budget.admits(15 * SECOND, 1000, urgent=True)
+
+
+def test_what_is_larger_than_all_there_is_is_never_sent() -> None:
+    budget = Budget(BudgetSettings(bytes_per_s=10.0), 0)
+    assert budget.admits(0, 500, urgent=True)
+    assert not budget.admits(0, 501, urgent=True)
+
+
+# The reserve ------------------------------------------------------------------------------------
+
+
+@examples(200)
+@given(SHARES, WISHES)
+def test_the_reserve_is_there_for_what_is_urgent_and_only_for_that(
+    share: float, wishes: list[Wish]
+) -> None:
+    """Of 10 s with 1,000 bytes."""
+    budget = Budget(BudgetSettings(bytes_per_s=100.0, urgent_share=share), 0)
+    sent: list[Wish] = []
+    for wish in wishes:
+        inside = sum(w.size for w in sent if w.at_ns > wish.at_ns - 10 * SECOND)
+        room = 1000.0 - inside - (0.0 if wish.urgent else share * 1000.0)
+        assert budget.admits(*wish) is (wish.size <= room + 1e-9)
+        sent += granted(budget, [wish])
+
+
+def test_the_reserve_of_messages_is_whole_messages() -> None:
+    budget = Budget(BudgetSettings(messages_per_minute=9.0, urgent_share=0.3), 0)
+    assert len(granted(budget, [Wish(0, FIX)] * 20)) == 7
+    assert len(granted(budget, [Wish(0, FIX, urgent=True)] * 20)) == 2
+
+
+def test_the_reserve_of_a_match_is_a_share_of_what_was_earned() -> None:
+    budget = Budget(BudgetSettings(urgent_share=0.2), 0, match_rate_hz=1.0)
+    assert len(granted(budget, [Wish(100 * SECOND, FIX)] * 200)) == 80
+    assert len(granted(budget, [Wish(100 * SECOND, FIX, urgent=True)] * 200)) == 20
+
+
+# The price --------------------------------------------------------------------------------------
+
+LIMITED = [
+    Budget(BudgetSettings(bytes_per_s=100.0), 0),
+    Budget(BudgetSettings(messages_per_minute=10.0), 0),
+    Budget(BudgetSettings(), 0, match_rate_hz=0.5),
+]
+
+
+@pytest.mark.parametrize("budget", LIMITED, ids=["bytes", "messages", "match"])
+def test_the_price_rises_with_each_message_and_falls_while_nothing_is_sent(
+    budget: Budget,
+) -> None:
+    assert budget.price(0, FIX) == 0.0
+    prices = []
+    for _ in range(10):
+        budget.spend(SECOND, FIX, LEAST)
+        prices.append(budget.price(SECOND, FIX))
+    assert prices == sorted(prices)
+    assert prices[0] >= LEAST
+    assert prices[-1] > 10 * prices[0]
+    later = [budget.price(SECOND * n, FIX) for n in range(1, 600)]
+    assert later == sorted(later, reverse=True)
+    assert later[-1] < LEAST < later[0]
+
+
+def test_the_price_does_not_fall_while_only_the_limits_hold_back_what_is_worth_it() -> None:
+    budget = Budget(BudgetSettings(messages_per_minute=4.0, urgent_share=0.0), 0)
+    assert len(granted(budget, [Wish(0, FIX)] * 5)) == 4
+    price = budget.price(0, FIX)
+    for second in range(1, 30):
+        assert not budget.admits(second * SECOND, FIX, urgent=False)
+        budget.refuse(second * SECOND, LEAST)
+    assert budget.price(29 * SECOND, FIX) == price
+    assert budget.price(59 * SECOND, FIX) < price
+
+
+def test_a_small_message_after_a_large_one_costs_little_less_than_before() -> None:
+    """There is one price: it fades by the time in which the message at hand is earned."""
+    budget = Budget(BudgetSettings(bytes_per_s=100.0), 0)
+    budget.spend(0, BELIEF, LEAST)
+    assert budget.price(0, FIX) == budget.price(0, BELIEF)
+
+
+@examples(100)
+@given(WISHES)
+def test_without_limits_all_is_admitted_and_nothing_has_a_price(wishes: list[Wish]) -> None:
+    budget = Budget(BudgetSettings(), 0)
+    for wish in wishes:
+        assert budget.price(wish.at_ns, wish.size) == 0.0
+        assert budget.admits(*wish)
+        budget.spend(wish.at_ns, wish.size, LEAST)
+    assert budget.spending(HOUR) == ()
+
+
+def values_sent(budget: Budget, values: Sequence[float], *, at_a_price: bool) -> list[float]:
+    """Of fixes of these values, offered at 5 Hz, those that are sent."""
+    sent = []
+    for n, value in enumerate(values, start=1):
+        now_ns = n * 200 * MS
+        if at_a_price and value < budget.price(now_ns, FIX):
+            continue
+        if budget.admits(now_ns, FIX, urgent=False):
+            budget.spend(now_ns, FIX, LEAST)
+            sent.append(value)
+        else:
+            budget.refuse(now_ns, LEAST)
+    return sent
+
+
+MATCH_HZ = 0.25
+TEN_MINUTES_OF = [
+    pytest.param(BudgetSettings(bytes_per_s=50.0, urgent_share=0.0), None, 600 * 50 / FIX),
+    pytest.param(BudgetSettings(messages_per_minute=10.0, urgent_share=0.0), None, 100),
+    pytest.param(BudgetSettings(urgent_share=0.0), MATCH_HZ, 600 * MATCH_HZ),
+]
+
+
+@pytest.mark.parametrize(("settings", "match_hz", "whole"), TEN_MINUTES_OF)
+@pytest.mark.parametrize("seed", range(3))
+def test_at_a_price_the_budget_is_used_for_what_is_worth_more(
+    seed: int, settings: BudgetSettings, match_hz: float | None, whole: float
+) -> None:
+    values = np.random.default_rng(seed).exponential(1.0, 3000).tolist()
+    dear, first_come = (
+        values_sent(Budget(settings, 0, match_hz), values, at_a_price=priced)
+        for priced in (True, False)
+    )
+    assert 0.6 * whole < len(dear) <= 1.1 * whole
+    assert np.mean(dear) > 2.0 * np.mean(first_come)
+    assert sum(dear) > 1.5 * sum(first_come)
+
+
+# What is reported -------------------------------------------------------------------------------
+
+
+@examples(200)
+@given(st.floats(1.0, 1000.0), st.floats(0.1, 60.0), st.floats(0.001, 5.0), WISHES)
+def test_spending_tells_how_near_the_robot_came_to_each_limit(
+    bytes_per_s: float, per_minute: float, match_hz: float, wishes: list[Wish]
+) -> None:
+    budget = Budget(
+        BudgetSettings(bytes_per_s=bytes_per_s, messages_per_minute=per_minute), 0, match_hz
+    )
+    sent = granted(budget, wishes)
+    in_bytes, in_messages, in_match = budget.spending(HOUR)
+    window_s = max(BYTES_WINDOW_S, LEAST_BYTES / bytes_per_s)
+    allowed = max(BYTES_WINDOW_S * bytes_per_s, LEAST_BYTES)
+    spent = most_within(window_s, sent, size_of)
+    assert in_bytes == Spending("bytes", in_bytes.window_s, allowed, spent)
+    assert in_bytes.window_s == pytest.approx(window_s)
+    most = math.ceil(per_minute)
+    window_s = 60.0 * most / per_minute
+    assert in_messages == Spending("messages", window_s, most, most_within(window_s, sent, one))
+    assert (in_match.unit, in_match.window_s, in_match.most) == ("messages", 0.0, len(sent))
+    assert in_match.allowed == pytest.approx(3600.0 * match_hz)
