@@ -108,8 +108,9 @@ def merge_split(prior: Estimate, seen: Observation, scope: Scope = POSE) -> Esti
 
     P1 = P_d / w + P_i, R = R_d / (1 - w) + R_i, w chosen by golden section for the smallest merged
     determinant (POSE; a trace of the position alone would give the heading away), trace of the
-    position or variance of the heading. Scopes other than POSE expect a prior of which nothing or
-    all is shared.
+    position or variance of the heading. Where none makes that smaller the prior stays: widened for
+    nothing, again and again, it would lose what only it knows. Scopes other than POSE expect a
+    prior of which nothing or all is shared.
     """
     low, high = 0.02, 0.98
     left, right = high - _GOLDEN * (high - low), low + _GOLDEN * (high - low)
@@ -123,7 +124,9 @@ def merge_split(prior: Estimate, seen: Observation, scope: Scope = POSE) -> Esti
             low, left, best_left = left, right, best_right
             right = low + _GOLDEN * (high - low)
             best_right = _split(prior, seen, scope, right)
-    _, weight = min(best_left, best_right)
+    least, weight = min(best_left, best_right)
+    if least >= _extent(prior.covariance, scope):
+        return prior
     return _merge_split_at(prior, seen, scope, weight)
 
 
@@ -136,9 +139,14 @@ def _split(prior: Estimate, seen: Observation, scope: Scope, weight: float) -> t
     widened = _widened(prior, weight)
     evidence = seen.information(1.0 / (1.0 - weight)).matrix
     merged = product(survival(widened, evidence), widened)
+    return _extent(merged, scope), weight
+
+
+def _extent(covariance: Covariance3, scope: Scope) -> float:
+    """What a merge is to make small."""
     if scope is POSE:
-        return merged.determinant(), weight
-    return (merged.hh if scope is HEADING else merged.xx + merged.yy), weight
+        return covariance.determinant()
+    return covariance.hh if scope is HEADING else covariance.xx + covariance.yy
 
 
 def _merge_split_at(prior: Estimate, seen: Observation, scope: Scope, weight: float) -> Estimate:
