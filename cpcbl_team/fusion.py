@@ -109,11 +109,15 @@ def merge_split(prior: Estimate, seen: Observation, scope: Scope = POSE) -> Esti
 
     P1 = P_d / w + P_i, R = R_d / (1 - w) + R_i, w chosen by golden section for the smallest merged
     determinant (POSE; a trace of the position alone would give the heading away), trace of the
-    position or variance of the heading. Scopes other than POSE expect a prior of which nothing or
-    all is shared.
+    position or variance of the heading. Where none makes that smaller the prior stays: widened for
+    nothing, again and again, it would lose what only it knows. Scopes other than POSE expect a
+    prior of which nothing or all is shared.
     """
     goal = _determinant(prior, seen) if scope is POSE else _variance(prior, seen, scope)
-    return _merge_split_at(prior, seen, scope, best_weight(goal))
+    weight = best_weight(goal)
+    if goal(weight) >= _extent(prior.covariance, scope):
+        return prior
+    return _merge_split_at(prior, seen, scope, weight)
 
 
 def best_weight(goal: Callable[[float], float]) -> float:
@@ -133,6 +137,13 @@ def best_weight(goal: Callable[[float], float]) -> float:
     return left if best_left <= best_right else right
 
 
+def _extent(covariance: Covariance3, scope: Scope) -> float:
+    """What a merge within this scope is to make small."""
+    if scope is POSE:
+        return covariance.determinant()
+    return covariance.hh if scope is HEADING else covariance.xx + covariance.yy
+
+
 def _widened(prior: Estimate, weight: float) -> Covariance3:
     return prior.covariance.plus(prior.shared, 1.0 / weight - 1.0)
 
@@ -144,7 +155,7 @@ def _variance(prior: Estimate, seen: Observation, scope: Scope) -> Callable[[flo
         widened = _widened(prior, weight)
         evidence = seen.information(1.0 / (1.0 - weight)).matrix
         merged = product(survival(widened, evidence), widened)
-        return merged.hh if scope is HEADING else merged.xx + merged.yy
+        return _extent(merged, scope)
 
     return variance
 

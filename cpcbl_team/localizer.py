@@ -281,8 +281,7 @@ class Localizer:
     ) -> State:
         """The robot is said to be at (x, y); `observer` is a teammate's part of the covariance."""
         state = self.moved(state, stamp_ns)
-        both = sensor if observer is None else sensor + observer
-        piece = recovery.told_evidence(state, source, x, y, both, by_teammate=observer is not None)
+        piece = recovery.told_evidence(state, source, x, y, sensor, observer)
         memory, prior = recovery.remembered(state.memory, [piece]), state.estimate
         state = replace(state, memory=memory)
         least = self._rules.object_interval_s * 1e9

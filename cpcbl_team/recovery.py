@@ -50,12 +50,13 @@ def seen_evidence(state: State, m: Measured) -> Evidence:
 
 
 def told_evidence(
-    state: State, source: str, x: float, y: float, covariance: Covariance2, by_teammate: bool
+    state: State, source: str, x: float, y: float, sensor: Covariance2, observer: Covariance2 | None
 ) -> Evidence:
-    """What a teammate or a position sensor says of the robot's own place, as evidence."""
-    sigma = math.sqrt(0.5 * (covariance.xx + covariance.yy))
+    """What a teammate (`observer`: its part) or a position sensor says of the robot's own place."""
     now, pose = state.stamp_ns, state.odometry_from_robot
-    return Evidence(now, pose, source, x, y, None, None, 0.0, 0.0, sigma, by_teammate)
+    own = math.sqrt(0.5 * (sensor.xx + sensor.yy))
+    its = 0.0 if observer is None else math.sqrt(0.5 * (observer.xx + observer.yy))
+    return Evidence(now, pose, source, x, y, None, None, own, 0.0, its, observer is not None)
 
 
 def remembered(memory: Memory, pieces: Sequence[Evidence]) -> Memory:
@@ -146,11 +147,13 @@ def relocalized(
     """The pose from recent evidence alone, or None where it does not determine one.
 
     Needs one residual more than unknowns, a fit that the chi-square bound accepts, and no second
-    pose that fits nearly as well.
+    pose that fits nearly as well. What n pieces owe to teammates may be one and the same error:
+    each counts it with n times its variance (split covariance intersection of n, equal weights).
     """
     if len({(e.x, e.y) for e in evidence}) < 2:
         return None
-    pieces = [_Carried(e, odometry_from_robot) for e in evidence]
+    told = sum(e.told for e in evidence)
+    pieces = [_Carried(e, odometry_from_robot, told) for e in evidence]
     if sum(p.residual_count for p in pieces) < 4:
         return None
     starts = sorted(_starts(pieces, field), key=lambda start: _cost(start, pieces))
@@ -164,28 +167,25 @@ def relocalized(
     if any(f[0] < cost + 6.0 and _apart(f[1].pose, estimate.pose) for f in found[1:]):
         return None
     covariance = estimate.covariance.scaled(max(1.0, cost / freedom))
-    told = any(e.told for e in evidence)
     return Estimate(estimate.pose, covariance, covariance if told else ZERO3)
 
 
 class _Carried:
     """A piece of evidence, carried to the present by dead reckoning."""
 
-    def __init__(self, evidence: Evidence, odometry_from_robot: Pose2) -> None:
+    def __init__(self, evidence: Evidence, odometry_from_robot: Pose2, told: int) -> None:
         self.e = evidence
         self.now_from_then = odometry_from_robot.inverse() @ evidence.odometry_from_robot
         way = math.hypot(self.now_from_then.x, self.now_from_then.y)
         self.drift = DRIFT_SHARE * (way + 0.3 * abs(self.now_from_then.heading))
         self.is_fix = evidence.range_m is None and evidence.bearing_rad is None
+        repeated = math.sqrt(told) if evidence.told else 1.0
+        self.sigma_m = math.hypot(repeated * evidence.place_sigma_m, self.drift)
 
     @property
     def residual_count(self) -> int:
         e = self.e
         return 2 if self.is_fix else (e.range_m is not None) + (e.bearing_rad is not None)
-
-    @property
-    def sigma_m(self) -> float:
-        return math.hypot(self.e.place_sigma_m, self.drift)
 
     def point(self) -> tuple[float, float] | None:
         """The object (or the robot then) in the present robot's frame, if its range is known."""
@@ -202,7 +202,7 @@ class _Carried:
         e = self.e
         hx, hy = pose.y - then.y, then.x - pose.x  # d(place then) / d(heading now)
         if self.is_fix:
-            variance = self.sigma_m**2 + SMALLEST_VARIANCE
+            variance = self.sigma_m**2 + e.range_sigma_m**2 + SMALLEST_VARIANCE
             yield (1.0, 0.0, hx), e.x - then.x, variance
             yield (0.0, 1.0, hy), e.y - then.y, variance
             return
@@ -245,7 +245,7 @@ def _aligned(pieces: list[_Carried]) -> Pose2 | None:
     for piece in pieces:
         point = piece.point()
         if point is not None:
-            sigma = math.hypot(piece.sigma_m, 0.0 if piece.is_fix else piece.e.range_sigma_m)
+            sigma = math.hypot(piece.sigma_m, piece.e.range_sigma_m)
             pairs.append((1.0 / (sigma * sigma + 1e-6), *point, piece.e.x, piece.e.y))
     total = sum(p[0] for p in pairs)
     if len(pairs) < 2:

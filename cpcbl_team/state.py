@@ -36,9 +36,9 @@ class Evidence(NamedTuple):
     y: float
     range_m: float | None
     bearing_rad: float | None
-    range_sigma_m: float
+    range_sigma_m: float  # for a fix: of (x, y), as far as it is the sensor's
     bearing_sigma_rad: float
-    place_sigma_m: float  # of (x, y); zero for what is on the map
+    place_sigma_m: float  # of (x, y), as far as it is a teammate's; zero for what is on the map
     told: bool  # by a teammate
 
 

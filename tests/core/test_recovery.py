@@ -251,6 +251,18 @@ def test_evidence_that_contradicts_itself_finds_nobody() -> None:
     assert relocalized(tuple(wrong), PATH[-1], CORNERS) is None
 
 
+@pytest.mark.parametrize("times", [1, 6])
+def test_teammates_that_repeat_themselves_are_not_believed_more(times: int) -> None:
+    """Their error, of 0.1 m, may be the same each time."""
+    told = [fix_piece(i, pose) for i, pose in enumerate(PATH * times)]
+    found = relocalized(tuple(told), PATH[-1], CORNERS)
+    own = relocalized(tuple(e._replace(told=False) for e in told), PATH[-1], CORNERS)
+    assert found is not None
+    assert own is not None
+    assert found.position_sigma_m > 0.1
+    assert own.position_sigma_m < 0.14 / math.sqrt(times)
+
+
 def test_what_a_teammate_told_is_shared_when_one_is_found_by_it() -> None:
     told = relocalized(tuple(fix_piece(i, pose) for i, pose in enumerate(PATH)), PATH[-1], CORNERS)
     seen = relocalized(seen_along(PATH, ["ne", "nw"]), PATH[-1], CORNERS)

@@ -150,7 +150,7 @@ def test_a_robot_that_learns_gives_the_same_bits_in_any_order() -> None:
 @pytest.mark.parametrize("late_by_ms", [1, 300, 1000])
 def test_a_fix_that_comes_late_counts_from_when_it_was_measured(late_by_ms: int) -> None:
     robot, inputs = localizer("joint", MIXED), history(2.0)
-    late_fix = fix(-1.7, -1.0, 500 * MS)
+    late_fix = fix(-1.7, -1.0, 500 * MS, sensor_m=0.01, observer_m=0.01)
     timeline = after(robot, [i for i in inputs if time_of(i) <= (500 + late_by_ms) * MS])
     before = timeline.state
     assert timeline.add(late_fix) == ""
