@@ -19,6 +19,7 @@ EXPLAINED = (
     "still tell. B: on the sender's link with Zenoh's own, without TCP/IP's"
 )
 _LIVE = (
+    "alive: presence and tier, anew at each change of tier; its bytes are not counted\n"
     f"counts: since a robot's process started; rates: over the last {RATES_NS // 10**9} s\n"
     "heard is status/* only: watching makes nobody send a fix or belief"
 )
@@ -98,7 +99,7 @@ class TrafficView(LiveView):
 
 
 def drawn(now: Traffic, where: str) -> Group:
-    """Who helps whom, what each sent, and what that means."""
+    """Who helps whom, how near each came to its limits, what it sent, and what that means."""
     title = f"team {now.team} at {where}, watched for {now.watched_s:.0f} s"
     if not now.robots:
         return Group(Text(f"{title}\nno robot of this name's team has been heard", "yellow"))
@@ -109,9 +110,9 @@ def drawn(now: Traffic, where: str) -> Group:
     ]
     return Group(
         help_table(now, title),
+        *limits,
         "",
         flow_table(now),
-        *limits,
         Text(f"{EXPLAINED}\n{_LIVE}\n", "yellow"),
     )
 
@@ -161,16 +162,18 @@ def flow_table(now: Traffic) -> Table:
     """A row for each robot and key."""
     shown = table("", ("robot", "key"), ("messages", "B", "/s", "B/s", *NOT_SENT))
     for name, robot in now.robots.items():
-        for i, flow in enumerate(robot.sent):
+        style = "dim" if robot.away else ""
+        shown.add_row(name, "alive", str(robot.announced), style=style)
+        for flow in robot.sent:
             key = f"{flow.topic} → {flow.peer}" if flow.peer else flow.topic
             shown.add_row(
-                name if i == 0 else "",
+                "",
                 Text(key, COLOURS[flow.topic]),
                 short(flow.messages),
                 short(flow.bytes),
                 number(flow.messages_per_s, 1),
                 number(flow.bytes_per_s, 0),
                 *_not_sent([flow]),
-                style="dim" if robot.away else "",
+                style=style,
             )
     return shown
