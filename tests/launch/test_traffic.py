@@ -229,6 +229,8 @@ def test_a_robot_that_falls_silent_is_away_and_helps_nobody() -> None:
     last = team_at(11.5)
     assert [n for n, r in last.robots.items() if r.away] == ["good", "gone", "patrol", "adrift"]
     assert last.help == ()
+    (row,) = (line for line in rendered(drawn(last, "here")) if "18  756" in line)
+    assert row.split()[-5:] == ["-", "-", "0", "0", "0"]
 
 
 DRAWING = """\

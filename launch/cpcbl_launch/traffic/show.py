@@ -67,7 +67,7 @@ def limit_text(s: SpendingReport) -> Text:
     """`412 of 500 B in 10 s`, green while within."""
     unit = "B" if s.unit == "bytes" else "msg"
     within = f" in {s.window_s:.3g} s" if s.window_s else " so far"
-    most, allowed = (f"{n:.0f}" if n == round(n) else f"{n:.1f}" for n in (s.most, s.allowed))
+    most, allowed = (f"{n:.1f}".removesuffix(".0") for n in (s.most, s.allowed))
     return Text(f"{most} of {allowed} {unit}{within}", "green" if s.held else "bold red")
 
 
@@ -102,14 +102,17 @@ def drawn(now: Traffic, where: str) -> Group:
     """Who helps whom, how near each came to its limits, what it sent, and what that means."""
     title = f"team {now.team} at {where}, watched for {now.watched_s:.0f} s"
     if not now.robots:
-        return Group(Text(f"{title}\nno robot of this name's team has been heard", "yellow"))
+        return Group(
+            Text(f"{title}\nno robot of this team has been heard: is the name right?", "yellow")
+        )
     limits = [
         Text(f"{name}: most ").append_text(Text(", ").join(map(limit_text, robot.spending)))
         for name, robot in now.robots.items()
         if robot.spending
     ]
     return Group(
-        help_table(now, title),
+        Text(title, "bold"),
+        help_table(now),
         *limits,
         "",
         flow_table(now),
@@ -117,9 +120,9 @@ def drawn(now: Traffic, where: str) -> Group:
     )
 
 
-def help_table(now: Traffic, title: str) -> Table:
+def help_table(now: Traffic) -> Table:
     """The drawing: the best informed robot first, an arrow to each teammate that it helps."""
-    shown = table(title, ("robot",), ("tier", "σ m"))
+    shown = table("", ("robot",), ("tier", "σ m"))
     shown.add_column(f"helps (in the last {AT_PRESENT_NS // 10**9} s)", overflow="fold")
     for name, robot in now.robots.items():
         style = "dim" if robot.away else "bold red" if robot.lost else ""
@@ -171,8 +174,8 @@ def flow_table(now: Traffic) -> Table:
                 Text(key, COLOURS[flow.topic]),
                 short(flow.messages),
                 short(flow.bytes),
-                number(flow.messages_per_s, 1),
-                number(flow.bytes_per_s, 0),
+                number(None if robot.away else flow.messages_per_s, 1),
+                number(None if robot.away else flow.bytes_per_s, 0),
                 *_not_sent([flow]),
                 style=style,
             )
