@@ -2,6 +2,7 @@
 
 import io
 import json
+import math
 import shlex
 import signal
 import subprocess
@@ -11,7 +12,7 @@ from typing import Any
 
 import msgspec
 import pytest
-from bus_helpers import SECOND, wait_until
+from bus_helpers import SECOND, Stand, robot_at, saw, team_of, wait_until
 from log_helpers import write_log
 from process_helpers import cpcbl_team, pids_of
 from rich.console import Console, RenderableType
@@ -31,6 +32,7 @@ from cpcbl_launch.traffic.flows import (
 from cpcbl_launch.traffic.show import TrafficView, drawn, limit_text
 from cpcbl_launch.traffic.watch import Arrival, Traffic, Watcher, traffic
 from cpcbl_launch.up import free_endpoint
+from cpcbl_team.inputs import Sighting
 from cpcbl_transport import topics
 from cpcbl_transport.bus import MemoryHub
 from cpcbl_transport.messages import Flow, Spending, Status, encode
@@ -313,6 +315,16 @@ def test_a_watcher_keeps_one_process_and_the_last_seconds() -> None:
     assert stamps() == [7]
     say(encode(status("a", 7, 0, incarnation="2")))
     assert stamps() == [7]
+
+
+def test_a_status_counts_the_tokens_that_came() -> None:
+    stand, tokens = Stand(team_of(me=robot_at(sigma_m=0.5))), []
+    stand.bus.watch(topics.ALIVE.at(), lambda key, alive: tokens.append(key) if alive else None)
+    for _ in range(5):
+        stand.stand_still(0.1)
+        oak, elm = Sighting("oak", 4.0, 0.0), Sighting("elm", 4.0, 0.5 * math.pi)
+        stand.sightings("me", saw(stand.now_ns, oak, elm))
+    assert stand.status("me").counts["announced"] == len(tokens) > 1
 
 
 def test_watching_makes_nobody_send_help() -> None:
