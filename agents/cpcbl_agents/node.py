@@ -199,7 +199,7 @@ class Node:
             located.estimate.heading_sigma_rad,
             self._robot.collaboration.tier,
             located.lost,
-            dict(self._robot.counts + self.counts),
+            dict(self._robot.counts + self.counts + Counter(announced=self._wiring.announced)),
             sum(flow.messages for flow in sent),
             sum(flow.bytes for flow in sent),
             sum(flow.messages for flow in heard),

@@ -38,6 +38,8 @@ class Wiring:
         self._neighbours: frozenset[str] = frozenset()
         self.tier: int | None = None
         """The tier that is announced."""
+        self.announced = 0
+        """Tokens so far: one at first, one a change of tier."""
 
     def publisher(self, topic: Topic, key: str) -> Publisher:
         """The publisher of a key, declared when it is first asked for."""
@@ -54,6 +56,7 @@ class Wiring:
             self.tier = agent.tier
             key = topics.ALIVE.at(tier=agent.tier, robot=self._robot, incarnation=self._incarnation)
             self._token = self._bus.announce(key)
+            self.announced += 1
         if moved or agent.sources != self._sources:
             self._sources = agent.sources
             hear = self._bus.subscribe

@@ -189,7 +189,7 @@ def traffic(
         Optional[float], typer.Option("--for", help="Seconds to watch; default: until Ctrl-C.")
     ] = None,
     wait: Annotated[
-        float, typer.Option(min=0.0, help="Seconds to wait for the team's router.")
+        float, typer.Option(min=0.1, help="Seconds to wait for the team's router.")
     ] = 5.0,
     as_json: Annotated[
         bool, typer.Option("--json", help="Print what was seen last as JSON, at the end.")

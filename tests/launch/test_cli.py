@@ -45,7 +45,8 @@ odometry = { moves = false }
 
 
 @pytest.mark.parametrize(
-    "command", [[], ["up"], ["robot"], ["field"], ["check"], ["evaluate"], ["calibrate"]]
+    "command",
+    [[], ["up"], ["robot"], ["field"], ["check"], ["evaluate"], ["calibrate"], ["traffic"]],
 )
 def test_every_command_explains_itself(command: list[str]) -> None:
     shown = cpcbl_team(*command, "--help")
@@ -107,10 +108,13 @@ def test_up_reports_to_file_and_standard_output(tmp_path: Path) -> None:
     assert not pids_of(["cpcbl_launch", str(tmp_path)])
 
 
-def test_up_shows_a_table_and_draws_a_picture(tmp_path: Path) -> None:
-    team, picture = tmp_path / "team.toml", tmp_path / "run.png"
-    team.write_text(PAIR)
-    ran = cpcbl_team("up", team, "--duration", 3, "--picture", picture)
+def test_up_shows_a_table_and_draws_a_picture(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    picture = tmp_path / "run.png"
+    (tmp_path / "team.toml").write_text(PAIR)
+    monkeypatch.chdir(tmp_path)
+    ran = cpcbl_team("up", "team.toml", "--duration", 3, "--picture", picture)
     assert ran.returncode == 0, ran.stderr
     for word in ("driver", "watcher", "err m", "RMSE m", "NEES"):
         assert word in ran.stdout

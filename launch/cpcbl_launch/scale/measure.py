@@ -30,7 +30,8 @@ LEAST_S = 2.0  # a robot tells once a second what it has sent
 
 
 class Size(msgspec.Struct, frozen=True, kw_only=True):
-    """A team's figures, means over its robots; seconds are robot time, bytes are payloads."""
+    """A team's figures, means over its robots; seconds are robot time, bytes those
+    on the sender's link with Zenoh's own."""
 
     robots: int
     in_sight: float

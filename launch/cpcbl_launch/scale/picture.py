@@ -21,7 +21,7 @@ def draw_scale(scale: Scale, path: Path) -> None:
     ):
         traffic.plot(sizes, rates, "o-", label=label)
     cpu.plot(sizes, [s.cpu_ms_per_s for s in scale.sizes], "o-", color="C2")
-    traffic.set(title="fixes and beliefs of a robot", ylabel="payload bytes a second")
+    traffic.set(title="fixes and beliefs of a robot", ylabel="bytes a second on their link")
     traffic.legend()
     cpu.set(title="CPU of a robot", ylabel="ms in a second of robot time")
     for axes in (traffic, cpu):

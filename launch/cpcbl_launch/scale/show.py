@@ -7,7 +7,7 @@ from cpcbl_launch.tables import number, percent, table
 
 _EXPLAINED = (
     "means over the robots; in sight: teammates in a frame; out, in: fixes and",
-    "beliefs, payload bytes; CPU ms/s: of a robot's own steps, a second of its time",
+    "beliefs, bytes on their link; CPU ms/s: of a robot's own steps, a second of its time",
 )
 
 

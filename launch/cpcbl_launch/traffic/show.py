@@ -19,6 +19,7 @@ EXPLAINED = (
     "still tell. B: on the sender's link with Zenoh's own, without TCP/IP's"
 )
 _LIVE = (
+    "alive: presence and tier, anew at each change of tier; its bytes are not counted\n"
     f"counts: since a robot's process started; rates: over the last {RATES_NS // 10**9} s\n"
     "heard is status/* only: watching makes nobody send a fix or belief"
 )
@@ -66,7 +67,7 @@ def limit_text(s: SpendingReport) -> Text:
     """`412 of 500 B in 10 s`, green while within."""
     unit = "B" if s.unit == "bytes" else "msg"
     within = f" in {s.window_s:.3g} s" if s.window_s else " so far"
-    most, allowed = (f"{n:.0f}" if n == round(n) else f"{n:.1f}" for n in (s.most, s.allowed))
+    most, allowed = (f"{n:.1f}".removesuffix(".0") for n in (s.most, s.allowed))
     return Text(f"{most} of {allowed} {unit}{within}", "green" if s.held else "bold red")
 
 
@@ -98,27 +99,30 @@ class TrafficView(LiveView):
 
 
 def drawn(now: Traffic, where: str) -> Group:
-    """Who helps whom, what each sent, and what that means."""
+    """Who helps whom, how near each came to its limits, what it sent, and what that means."""
     title = f"team {now.team} at {where}, watched for {now.watched_s:.0f} s"
     if not now.robots:
-        return Group(Text(f"{title}\nno robot of this name's team has been heard", "yellow"))
+        return Group(
+            Text(f"{title}\nno robot of this team has been heard: is the name right?", "yellow")
+        )
     limits = [
         Text(f"{name}: most ").append_text(Text(", ").join(map(limit_text, robot.spending)))
         for name, robot in now.robots.items()
         if robot.spending
     ]
     return Group(
-        help_table(now, title),
+        Text(title, "bold"),
+        help_table(now),
+        *limits,
         "",
         flow_table(now),
-        *limits,
         Text(f"{EXPLAINED}\n{_LIVE}\n", "yellow"),
     )
 
 
-def help_table(now: Traffic, title: str) -> Table:
+def help_table(now: Traffic) -> Table:
     """The drawing: the best informed robot first, an arrow to each teammate that it helps."""
-    shown = table(title, ("robot",), ("tier", "σ m"))
+    shown = table("", ("robot",), ("tier", "σ m"))
     shown.add_column(f"helps (in the last {AT_PRESENT_NS // 10**9} s)", overflow="fold")
     for name, robot in now.robots.items():
         style = "dim" if robot.away else "bold red" if robot.lost else ""
@@ -161,16 +165,18 @@ def flow_table(now: Traffic) -> Table:
     """A row for each robot and key."""
     shown = table("", ("robot", "key"), ("messages", "B", "/s", "B/s", *NOT_SENT))
     for name, robot in now.robots.items():
-        for i, flow in enumerate(robot.sent):
+        style = "dim" if robot.away else ""
+        shown.add_row(name, "alive", str(robot.announced), style=style)
+        for flow in robot.sent:
             key = f"{flow.topic} → {flow.peer}" if flow.peer else flow.topic
             shown.add_row(
-                name if i == 0 else "",
+                "",
                 Text(key, COLOURS[flow.topic]),
                 short(flow.messages),
                 short(flow.bytes),
-                number(flow.messages_per_s, 1),
-                number(flow.bytes_per_s, 0),
+                number(None if robot.away else flow.messages_per_s, 1),
+                number(None if robot.away else flow.bytes_per_s, 0),
                 *_not_sent([flow]),
-                style="dim" if robot.away else "",
+                style=style,
             )
     return shown

@@ -47,6 +47,8 @@ class RobotNow(msgspec.Struct, frozen=True, kw_only=True):
     silent_s: float
     """Real time since that status."""
     away: bool
+    announced: int
+    """Tokens on `alive/*`: one at first, one a change of tier."""
     sent: tuple[FlowNow, ...]
     heard: tuple[FlowNow, ...]
     spending: tuple[SpendingReport, ...]
@@ -110,6 +112,7 @@ def _robot(seen: Sequence[Arrival], now_s: float) -> RobotNow:
         lost=last.lost,
         silent_s=silent_s,
         away=silent_s > max(AWAY_S, 3.0 * pause_s),
+        announced=last.counts.get("announced", 0),
         sent=tuple(_flows(first, last, first.sent, last.sent)),
         heard=tuple(_flows(first, last, first.heard, last.heard)),
         spending=summed_spending([last.spending]),
