@@ -85,11 +85,11 @@ class Alone:
             said += self.located()
         return said
 
-    def sees(self, *sightings: Sighting, after_ns: int = 1) -> list[Fix]:
+    def sees(self, *sightings: Sighting, after_ns: int = 1, late_ns: int = 0) -> list[Fix]:
         """A frame; its fixes."""
         self.now_ns += after_ns
-        frame = Sightings(self.now_ns, sightings)
-        seen = self.here._replace(stamp_ns=self.now_ns, frame=frame)
+        frame = Sightings(self.now_ns - late_ns, sightings)
+        seen = self.here._replace(stamp_ns=frame.stamp_ns, frame=frame)
         return self._sent(self.agent.handle(seen, self.now_ns), Fix)
 
     def _sent(self, said: Sequence[object], kind: type[Help]) -> list[Help]:
@@ -152,6 +152,14 @@ def test_a_budget_for_one_goes_to_the_fix_that_is_worth_most() -> None:
     assert robots(alone.sees(ahead("mate"), ahead("other"))) == ["other"]
     assert [alone.tally("fix", name).over_budget for name in ("mate", "other")] == [1, 0]
     assert [alone.tally("fix", name).messages for name in ("mate", "other")] == [0, 1]
+
+
+def test_what_a_late_frame_costs_is_of_the_time_at_which_it_is_sent() -> None:
+    alone = Alone(budget=BudgetSettings(messages_per_minute=1.0, urgent_share=0.0))
+    alone.tell(Presence("mate", POORER))
+    assert len(alone.sees(ahead(), after_ns=2 * SECOND, late_ns=SECOND)) == 1
+    assert alone.sees(ahead(), after_ns=60 * SECOND - 1) == []
+    assert len(alone.sees(ahead())) == 1
 
 
 def test_what_is_close_by_is_seen_better_and_worth_more() -> None:
