@@ -81,7 +81,7 @@ class CollaborationAgent:
             case Listened():
                 self._listened, self._copy = message.by_any, None
             case Sent():
-                self._sent(message)
+                self._sent(message, now_ns)
         return ()
 
     def _located(self, now: Located, now_ns: int) -> Sequence[Anything]:
@@ -208,11 +208,23 @@ class CollaborationAgent:
             budget.refuse(now_ns, least)
         return admitted
 
-    def _sent(self, sent: Sent) -> None:
+    def _sent(self, sent: Sent, now_ns: int) -> None:
         message = sent.message
+        if not sent.size:
+            self._not_sent(message, now_ns)
+            return
         to = message.robot if isinstance(message, Fix) else ""
         topic = "fix" if isinstance(message, Fix) else "belief"
         self.tallies.of(topic, to).add(sent.size, message.stamp_ns)
+
+    def _not_sent(self, message: Belief | Fix, now_ns: int) -> None:
+        """A key that is new is often not listened to yet: the next frame may say the same again."""
+        if isinstance(message, Fix):
+            self._helped.pop(message.robot, None)
+            self.budget.take_back(now_ns, _FIX_SIZE)
+        else:
+            self._copy = None
+            self.budget.take_back(now_ns, _BELIEF_SIZE)
 
     def _track(self, now: Located) -> Track:
         pose, covariance, _ = now.estimate
