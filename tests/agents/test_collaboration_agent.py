@@ -165,7 +165,9 @@ def test_what_a_late_frame_costs_is_of_the_time_at_which_it_is_sent() -> None:
 
 def test_help_that_nobody_heard_costs_nothing_and_is_offered_again() -> None:
     alone = Alone(
-        budget=BudgetSettings(messages_per_minute=2.0, urgent_share=0.0), belief_silence_s=60.0
+        budget=BudgetSettings(messages_per_minute=2.0, urgent_share=0.0),
+        fix_interval_s=60.0,
+        belief_silence_s=60.0,
     )
     alone.tell(Presence("mate", POORER), Listened(by_any=True))
     alone.heard = False
