@@ -44,7 +44,7 @@ class Listened(NamedTuple):
 
 
 class Sent(NamedTuple):
-    """Help that has really left this robot, and its bytes on the wire."""
+    """Help that has left this robot, and its bytes on the wire; 0: nobody listened, it has not."""
 
     message: Belief | Fix
     size: int

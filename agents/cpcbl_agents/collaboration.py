@@ -71,9 +71,9 @@ class CollaborationAgent:
     def handle(self, message: Anything, now_ns: int) -> Sequence[Anything]:
         match message:
             case Located(frame=None) if message.stamp_ns > self._track_ns:
-                return self._located(message)
+                return self._located(message, now_ns)
             case Located() if message.frame is not None:
-                return self._framed(message)
+                return self._framed(message, now_ns)
             case Presence(name, tier):
                 self._tiers.pop(name, None)
                 if tier is not None:
@@ -81,16 +81,16 @@ class CollaborationAgent:
             case Listened():
                 self._listened, self._copy = message.by_any, None
             case Sent():
-                self._sent(message)
+                self._sent(message, now_ns)
         return ()
 
-    def _located(self, now: Located) -> Sequence[Anything]:
+    def _located(self, now: Located, now_ns: int) -> Sequence[Anything]:
         first = self.located is None
         self.located = now
         self._track_ns = now.stamp_ns
         self._rank(now, None if first else self.tier)
         self._look_round(now)
-        return [self._track(now), *self._beliefs(now)]
+        return [self._track(now), *self._beliefs(now, now_ns)]
 
     def _rank(self, now: Located, present: int | None) -> None:
         """Follows the belief's quality; not at every breath, for each change is announced."""
@@ -123,7 +123,7 @@ class CollaborationAgent:
 
     # Active help --------------------------------------------------------------------------------
 
-    def _framed(self, seen: Located) -> list[Fix]:
+    def _framed(self, seen: Located, now_ns: int) -> list[Fix]:
         """The fixes of a frame that are worth sending, the best first."""
         offers = []
         for fix in self._possible(seen):
@@ -137,7 +137,7 @@ class CollaborationAgent:
             else:
                 self.tallies.of("fix", fix.robot).worthless += 1
         offers.sort(key=lambda offer: (offer.urgent, offer.value), reverse=True)
-        return [offer.fix for offer in offers if self._paid(offer)]
+        return [offer.fix for offer in offers if self._paid(offer, now_ns)]
 
     def _possible(self, seen: Located) -> list[Fix]:
         """Where this frame has the robot's teammates."""
@@ -163,9 +163,9 @@ class CollaborationAgent:
         told = Helped(fix.x_m, fix.y_m, after)
         return _Offer(worth(prior, after), tier == LOWEST_TIER, told, fix)
 
-    def _paid(self, offer: _Offer) -> bool:
+    def _paid(self, offer: _Offer, now_ns: int) -> bool:
         fix = offer.fix
-        if not self._affords(fix.stamp_ns, _FIX_SIZE, offer.value, offer.urgent):
+        if not self._affords(now_ns, _FIX_SIZE, offer.value, offer.urgent):
             self.tallies.of("fix", fix.robot).over_budget += 1
             return False
         self._helped[fix.robot] = fix.stamp_ns, offer.after
@@ -173,7 +173,7 @@ class CollaborationAgent:
 
     # Passive help -------------------------------------------------------------------------------
 
-    def _beliefs(self, now: Located) -> list[Belief]:
+    def _beliefs(self, now: Located, now_ns: int) -> list[Belief]:
         """The belief, when it is due, listened to, and news."""
         rules, tally = self._rules, self.tallies.of("belief", "")
         due = now.stamp_ns >= self._belief_ns + int(1e9 / rules.belief_rate_hz)
@@ -188,7 +188,7 @@ class CollaborationAgent:
             tally.silent += 1
             return []
         # The error of a listener's copy in sigmas, as the nats of correcting it
-        if not self._affords(now.stamp_ns, _BELIEF_SIZE, 0.5 * stale * stale, urgent=False):
+        if not self._affords(now_ns, _BELIEF_SIZE, 0.5 * stale * stale, urgent=False):
             tally.over_budget += 1
             return []
         self._copy = belief
@@ -214,11 +214,23 @@ class CollaborationAgent:
             budget.refuse(now_ns, least)
         return admitted
 
-    def _sent(self, sent: Sent) -> None:
+    def _sent(self, sent: Sent, now_ns: int) -> None:
         message = sent.message
+        if not sent.size:
+            self._not_sent(message, now_ns)
+            return
         to = message.robot if isinstance(message, Fix) else ""
         topic = "fix" if isinstance(message, Fix) else "belief"
         self.tallies.of(topic, to).add(sent.size, message.stamp_ns)
+
+    def _not_sent(self, message: Belief | Fix, now_ns: int) -> None:
+        """A key that is new is often not listened to yet: the next frame may say the same again."""
+        if isinstance(message, Fix):
+            self._helped.pop(message.robot, None)
+            self.budget.take_back(now_ns, _FIX_SIZE)
+        else:
+            self._copy = None
+            self.budget.take_back(now_ns, _BELIEF_SIZE)
 
     def _track(self, now: Located) -> Track:
         pose, covariance, _ = now.estimate

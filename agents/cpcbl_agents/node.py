@@ -160,8 +160,8 @@ class Node:
         for message in said:
             topic, key = self._addressed(message)
             size = self._publish(topic, key, message)
-            if size and isinstance(message, topics.COLLABORATION):
-                self._robot.handle(Sent(message, sent_bytes(size)), now_ns)
+            if isinstance(message, topics.COLLABORATION):
+                self._robot.handle(Sent(message, sent_bytes(size) if size else 0), now_ns)
 
     def _addressed(self, message: Message) -> tuple[Topic, str]:
         me, tier = self._name, self._wiring.tier

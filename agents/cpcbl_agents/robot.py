@@ -55,7 +55,7 @@ class Robot:
             return []
         if isinstance(message, FromBus):
             self.collaboration.handle(message, now_ns)
-            if isinstance(message, Sent):
+            if isinstance(message, Sent) and message.size:
                 self._told(message.message.stamp_ns, now_ns)
             return []
         raw = isinstance(message, (Odometry, Sightings, Position))

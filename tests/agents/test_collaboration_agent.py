@@ -52,6 +52,7 @@ class Alone:
         )
         self.agent = CollaborationAgent("me", settings, MATES, 0, Budget(budget, 0))
         self.now_ns = 0
+        self.heard = True
         self.here = Located(
             0, Estimate(Pose2(0.0, 0.0, 0.0), diagonal(SIGMA_M[tier], 0.02)), "", 0.0, 0.0
         )
@@ -85,11 +86,11 @@ class Alone:
             said += self.located()
         return said
 
-    def sees(self, *sightings: Sighting, after_ns: int = 1) -> list[Fix]:
+    def sees(self, *sightings: Sighting, after_ns: int = 1, late_ns: int = 0) -> list[Fix]:
         """A frame; its fixes."""
         self.now_ns += after_ns
-        frame = Sightings(self.now_ns, sightings)
-        seen = self.here._replace(stamp_ns=self.now_ns, frame=frame)
+        frame = Sightings(self.now_ns - late_ns, sightings)
+        seen = self.here._replace(stamp_ns=frame.stamp_ns, frame=frame)
         return self._sent(self.agent.handle(seen, self.now_ns), Fix)
 
     def _sent(self, said: Sequence[object], kind: type[Help]) -> list[Help]:
@@ -97,7 +98,7 @@ class Alone:
         messages = [m for m in said if isinstance(m, kind)]
         assert len(messages) == len(said)
         for message in messages:
-            self.agent.handle(Sent(message, 42), self.now_ns)
+            self.agent.handle(Sent(message, 42 if self.heard else 0), self.now_ns)
         return messages
 
     def tally(self, topic: str, peer: str = "") -> Tally:
@@ -152,6 +153,30 @@ def test_a_budget_for_one_goes_to_the_fix_that_is_worth_most() -> None:
     assert robots(alone.sees(ahead("mate"), ahead("other"))) == ["other"]
     assert [alone.tally("fix", name).over_budget for name in ("mate", "other")] == [1, 0]
     assert [alone.tally("fix", name).messages for name in ("mate", "other")] == [0, 1]
+
+
+def test_what_a_late_frame_costs_is_of_the_time_at_which_it_is_sent() -> None:
+    alone = Alone(budget=BudgetSettings(messages_per_minute=1.0, urgent_share=0.0))
+    alone.tell(Presence("mate", POORER))
+    assert len(alone.sees(ahead(), after_ns=2 * SECOND, late_ns=SECOND)) == 1
+    assert alone.sees(ahead(), after_ns=60 * SECOND - 1) == []
+    assert len(alone.sees(ahead())) == 1
+
+
+def test_help_that_nobody_heard_costs_nothing_and_is_offered_again() -> None:
+    alone = Alone(
+        budget=BudgetSettings(messages_per_minute=2.0, urgent_share=0.0),
+        fix_interval_s=60.0,
+        belief_silence_s=60.0,
+    )
+    alone.tell(Presence("mate", POORER), Listened(by_any=True))
+    alone.heard = False
+    for _ in range(5):
+        assert len(alone.sees(ahead())) == len(alone.later(0.2)) == 1
+    assert alone.agent.tallies.flows() == ()
+    alone.heard = True
+    assert len(alone.sees(ahead())) == len(alone.later(0.2)) == 1
+    assert (alone.sees(ahead()), alone.later(0.2)) == ([], [])
 
 
 def test_what_is_close_by_is_seen_better_and_worth_more() -> None:

@@ -24,7 +24,7 @@ from msgspec.structs import replace
 from cpcbl_agents.node import INBOX, Node
 from cpcbl_agents.robot import Robot
 from cpcbl_team.collaboration import LOWEST_TIER, tier_of
-from cpcbl_team.config import LocalizerSettings, Team
+from cpcbl_team.config import BudgetSettings, LocalizerSettings, Team
 from cpcbl_team.estimate import ZERO3, Estimate
 from cpcbl_team.inputs import Belief, Fix, Odometry, Position, Sighting, Sightings
 from cpcbl_team.self_calibration import Learned
@@ -368,6 +368,16 @@ def test_both_ways_sends_uphill_too() -> None:
     exchange(stand)
     for status in stand.statuses().values():
         assert {flow.topic for flow in status.heard if flow.messages} == {"belief", "fix"}
+
+
+def test_a_budget_is_not_spent_on_what_nobody_hears() -> None:
+    stand = helper(budget=BudgetSettings(messages_per_minute=1.0, urgent_share=0.0))
+    exchange(stand)
+    ear = stand.ear(topics.FIX.at(robot="mate"))
+    exchange(stand)
+    assert len(ear.messages) == 1
+    (spending,) = stand.status("me").spending
+    assert (spending.most, spending.allowed) == (1.0, 1.0)
 
 
 def test_only_teammates_in_sight_are_listened_to() -> None:

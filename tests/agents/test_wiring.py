@@ -267,10 +267,13 @@ def test_of_a_teammate_that_is_forgotten_no_token_remains() -> None:
     wired.sees("mate")
     wired.stand_still(11.0)
     token.close()
-    wired.sees("mate")
-    wired.stand_still(0.2)
-    assert wired.robots["me"].collaboration.neighbours == {"mate"}
-    assert wired.robots["me"].collaboration.sources == frozenset()
+    for again in (False, True):
+        wired.sees("mate")
+        if again:
+            wired.announce("mate", 3).close()
+        wired.stand_still(0.2)
+        assert wired.robots["me"].collaboration.neighbours == {"mate"}
+        assert wired.robots["me"].collaboration.sources == frozenset()
 
 
 def test_exactly_the_beliefs_of_sources_are_subscribed_to() -> None:
@@ -281,6 +284,22 @@ def test_exactly_the_beliefs_of_sources_are_subscribed_to() -> None:
     wired.stand_still(0.2)
     heard = [key for key in wired.recording.open("subscribe") if key.startswith("belief/")]
     assert heard == [topics.BELIEF.at(tier=2, robot="mate")]
+
+
+def test_a_source_that_changes_its_tier_is_always_heard() -> None:
+    wired = Wired()
+    before, after = (topics.BELIEF.at(tier=t, robot="mate") for t in (2, 3))
+    wired.announce("mate", 2)
+    wired.sees("mate")
+    wired.stand_still(0.2)
+    wired.announce("mate", 3)
+    wired.stand_still(0.2)
+    events = [e for e in wired.recording.events if e.key in (before, after)]
+    assert events == [
+        Event("subscribe", before, declared=True),
+        Event("subscribe", after, declared=True),
+        Event("subscribe", before, declared=False),
+    ]
 
 
 def test_at_a_change_of_tier_the_new_is_declared_before_the_old_is_taken_back() -> None:

@@ -163,6 +163,16 @@ def test_what_is_larger_than_all_there_is_is_never_sent() -> None:
     assert not budget.admits(0, 501, urgent=True)
 
 
+def test_what_is_taken_back_can_be_spent_again() -> None:
+    settings = BudgetSettings(bytes_per_s=50.0, messages_per_minute=3.0, urgent_share=0.0)
+    budget = Budget(settings, 0, match_rate_hz=1.0)
+    for _ in range(10):
+        budget.spend(5 * SECOND, FIX, LEAST)
+        budget.take_back(5 * SECOND, FIX)
+    assert budget.price(5 * SECOND, FIX) <= LEAST
+    assert len(granted(budget, [Wish(5 * SECOND, FIX)] * 5)) == 3
+
+
 # The reserve ------------------------------------------------------------------------------------
 
 

@@ -119,6 +119,12 @@ class Budget:
         for limit, amount in self._costs(size):
             limit.spend(now_ns, amount)
 
+    def take_back(self, now_ns: int, size: int) -> None:
+        """A message of this size for which was spent just now has not been sent."""
+        self._price *= math.exp(-1.0 / MEMORY)
+        for limit, amount in self._costs(size):
+            limit.spend(now_ns, -amount)
+
     def refuse(self, now_ns: int, least: float) -> None:
         """A message that was worth its price, at least `least`, is not admitted."""
         self._price, self._price_ns = max(self._price, least), now_ns
