@@ -166,7 +166,7 @@ def test_what_is_out_of_scope_keeps_its_mean_and_variance(
     prior = told(Estimate(POSE, covariance3(random_matrix(rng, 3))))
     seen = random_observation(rng, 2)
     seen = seen._replace(
-        independent=seen.independent.scaled(0.01), dependent=seen.dependent.scaled(0.01)
+        independent=seen.independent.scaled(1e-4), dependent=seen.dependent.scaled(1e-4)
     )
     merged = merger(prior, seen, scope)
     block = np.ix_(kept, kept)
