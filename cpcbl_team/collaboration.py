@@ -5,6 +5,7 @@ Passive: a teammate whose belief I was told is one more landmark, with its own u
 """
 
 import math
+from collections.abc import Iterable
 from typing import NamedTuple
 
 from cpcbl_team.config import CollaborationSettings, SensorSettings
@@ -16,6 +17,9 @@ from cpcbl_team.sensors import sighting_fault, sighting_sigmas
 
 TIER_ZERO_SIGMA_M = 0.01
 LOWEST_TIER = 15  # also that of a robot that is lost
+BELIEF_SERVES_BACK_NS = 500_000_000
+"""A belief also says where its robot was so long before: who sees a teammate asks for its belief,
+and what was seen meanwhile shall not be lost."""
 
 
 class Place(NamedTuple):
@@ -59,14 +63,17 @@ def fix_for(
     return Fix(robot, observer, stamp_ns, x, y, rotated, observer_part)
 
 
-def placed(belief: Belief, at_ns: int, settings: CollaborationSettings) -> Place | None:
-    """The teammate as a landmark at the time of a sighting; None when its belief is too old.
+def placed(beliefs: Iterable[Belief], at_ns: int, settings: CollaborationSettings) -> Place | None:
+    """A teammate as a landmark at the time of a sighting, by what it said at the nearest time.
 
     It is carried along its speed and turn rate; a third of that way is added to its sigma, for it
-    may have stopped or turned.
+    may have stopped or turned. None when what it said is too old.
     """
+    belief = min(beliefs, key=lambda b: abs(at_ns - b.stamp_ns), default=None)
+    if belief is None:
+        return None
     age = (at_ns - belief.stamp_ns) * 1e-9
-    if not 0.0 <= age <= settings.max_age_s:
+    if not -BELIEF_SERVES_BACK_NS * 1e-9 <= age <= settings.max_age_s:
         return None
     way = belief.speed_m_s * age
     pose = Pose2(belief.x_m, belief.y_m, belief.heading_rad)

@@ -9,6 +9,7 @@ from collections.abc import Iterable
 from msgspec.structs import replace
 
 from cpcbl_team import recovery, weighted
+from cpcbl_team.collaboration import BELIEF_SERVES_BACK_NS
 from cpcbl_team.config import Field, LocalizationSettings
 from cpcbl_team.estimate import (
     HEADING,
@@ -305,10 +306,14 @@ class Localizer:
 
     def hear(self, state: State, belief: Belief) -> State:
         """Passive collaboration: keeps a teammate's belief, to use it when the teammate is seen."""
-        state = self.moved(state, belief.stamp_ns)
-        forgotten_ns = belief.stamp_ns - self._max_age_ns
-        fresh = {n: b for n, b in state.memory.teammates.items() if b.stamp_ns >= forgotten_ns}
-        teammates = {**fresh, belief.robot: belief}
+        now_ns = belief.stamp_ns - BELIEF_SERVES_BACK_NS
+        state = self.moved(state, now_ns)
+        teammates = {
+            name: tuple(b for b in beliefs if now_ns - b.stamp_ns <= self._max_age_ns)
+            for name, beliefs in state.memory.teammates.items()
+            if now_ns - beliefs[-1].stamp_ns <= self._max_age_ns
+        }
+        teammates[belief.robot] = (*teammates.get(belief.robot, ()), belief)
         return replace(state, memory=replace(state.memory, teammates=teammates))
 
     def tell(self, state: State, event: Told) -> State:

@@ -74,7 +74,7 @@ def measured(
     stamp_ns: int,
     pose: Pose2,
     field: Field,
-    teammates: Mapping[str, Belief],
+    teammates: Mapping[str, tuple[Belief, ...]],
     settings: LocalizationSettings,
 ) -> Measured | None:
     """The sighting, seen from about `pose`, with its object's place; None if that is not known."""

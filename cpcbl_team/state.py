@@ -52,7 +52,7 @@ class Memory(msgspec.Struct, frozen=True, gc=False):
     innovations: int = 1  # accepted or not; see `innovated`
     accepted: int = 0  # observations since the start
     gated: int = 0
-    teammates: Mapping[str, Belief] = _NONE
+    teammates: Mapping[str, tuple[Belief, ...]] = _NONE
     evidence: tuple[Evidence, ...] = ()
     noted: frozenset[str] = frozenset()  # the sources of which no more is needed yet,
     noted_until_ns: int = 0  # until then

@@ -8,6 +8,7 @@ going back costs nothing.
 from bisect import bisect_left, bisect_right
 from collections.abc import Callable
 
+from cpcbl_team.collaboration import BELIEF_SERVES_BACK_NS
 from cpcbl_team.inputs import Belief, Fix, Input, Odometry, Position, Sightings, Told
 from cpcbl_team.localizer import Localizer
 from cpcbl_team.state import State
@@ -30,6 +31,8 @@ _rank = {kind: rank for rank, kind in enumerate(_apply)}
 def _key(item: Input) -> Key:
     """Sorts by time, then by kind and content, so that the order of arrival plays no part."""
     time_ns = item.from_ns if isinstance(item, Odometry) else item.stamp_ns
+    if isinstance(item, Belief):
+        time_ns -= BELIEF_SERVES_BACK_NS
     who = item.observer if isinstance(item, Fix) else getattr(item, "robot", "")
     return time_ns, _rank[type(item)], who, "" if isinstance(item, Odometry) else repr(item)
 
