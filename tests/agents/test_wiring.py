@@ -150,9 +150,7 @@ def test_strange_tokens_are_counted_and_harm_nobody() -> None:
 
 # Declaring ----------------------------------------------------------------------------------------
 
-TEAM = team_of(
-    me=robot_at(sigma_m=0.3, tier_dwell_s=0.0), mate=robot_at(2.0), other=robot_at(0.0, 2.0)
-)
+TEAM = team_of(me=robot_at(sigma_m=0.3), mate=robot_at(2.0), other=robot_at(0.0, 2.0))
 
 
 class Event(NamedTuple):

@@ -318,7 +318,7 @@ def test_a_watcher_keeps_one_process_and_the_last_seconds() -> None:
 
 
 def test_a_status_counts_the_tokens_that_came() -> None:
-    stand, tokens = Stand(team_of(me=robot_at(sigma_m=0.5, tier_dwell_s=0.0))), []
+    stand, tokens = Stand(team_of(me=robot_at(sigma_m=0.5))), []
     stand.bus.watch(topics.ALIVE.at(), lambda key, alive: tokens.append(key) if alive else None)
     for _ in range(5):
         stand.stand_still(0.1)
