@@ -169,9 +169,6 @@ class CollaborationSettings(Table, frozen=True, kw_only=True):
     """Ratio of position sigma from one tier to the next."""
     tier_hysteresis: Annotated[float, msgspec.Meta(ge=1.0)] = 1.1
     """A tier is left only when sigma is beyond its edge by this factor."""
-    tier_dwell_s: NotNegative = 2.0
-    """Least time in a tier, but for a robot that gets lost or finds itself: a change of tier costs
-    some hundred bytes of declarations."""
     budget: BudgetSettings = BudgetSettings()
     least_value: NotNegative = 0.05
     """What a fix must be worth (nats): the logarithm of the factor by which the ellipse of the

@@ -74,6 +74,7 @@ class Covariance3(NamedTuple):
 
 
 SMALLEST_VARIANCE = 1e-10  # (10 um)^2, (10 urad)^2: what is called exact
+SHARPEST_VARIANCE = 1e-8  # of a measurement: sharper ones drown the inverse of I + P A in rounding
 SPREAD_SHARE = 0.25  # of an ellipse's spread that its circle keeps
 ZERO3 = Covariance3(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 Row = tuple[float, float, float]
@@ -125,7 +126,7 @@ class Information(NamedTuple):
         """With these (row, residual, variance) of scalar measurements."""
         (xx, xy, yy, xh, yh, hh), (ex, ey, eh) = self
         for (x, y, a), residual, variance in measurements:
-            w = 1.0 / (variance if variance > SMALLEST_VARIANCE else SMALLEST_VARIANCE)
+            w = 1.0 / (variance if variance > SHARPEST_VARIANCE else SHARPEST_VARIANCE)
             r, wx, wy = residual * w, w * x, w * y
             xx += wx * x
             xy += wx * y

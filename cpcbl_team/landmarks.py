@@ -19,6 +19,7 @@ from cpcbl_team.estimate import (
     HEADING,
     POSE,
     POSITION,
+    SHARPEST_VARIANCE,
     SMALLEST_VARIANCE,
     Covariance3,
     Information,
@@ -65,7 +66,7 @@ class Landmarks:
         self._of_nothing = _places(marks, ranges=False, bearings=False)
         self._gates = gates
         self._range_model = s.range_share**2, s.range_floor_m**2, s.max_range_for_range_m
-        self._heading_weight = 1.0 / max(s.bearing_sigma_rad**2, SMALLEST_VARIANCE)
+        self._heading_weight = 1.0 / max(s.bearing_sigma_rad**2, SHARPEST_VARIANCE)
         self._sine_squared = math.sin(min(s.bearing_sigma_rad, 0.5 * math.pi)) ** 2
         self._bearing_sigma_rad = s.bearing_sigma_rad
 
@@ -129,7 +130,7 @@ class Landmarks:
                 u, v, e = -dx / d, -dy / d, range_m - d
                 due = d if 0.5 * range_m <= d <= 2.0 * range_m else range_to_expect(d, range_m)
                 w = share * due * due + floor
-                w = 1.0 / (w if w > SMALLEST_VARIANCE else SMALLEST_VARIANCE)
+                w = 1.0 / (w if w > SHARPEST_VARIANCE else SHARPEST_VARIANCE)
             if bearing is None:
                 pass
             elif not as_ray:  # a heading
@@ -142,7 +143,7 @@ class Landmarks:
                 if ahead >= NEAREST_M:
                     m, n, f = -s / ahead, c / ahead, (c * dy - s * dx) / ahead
                     k = q * sine_squared  # the ray's width, squared
-                    k = ahead * ahead / (k if k > SMALLEST_VARIANCE else SMALLEST_VARIANCE)
+                    k = ahead * ahead / (k if k > SHARPEST_VARIANCE else SHARPEST_VARIANCE)
                 elif range_m is None:
                     continue
             # the gate, which all pass that the sensor's noise alone explains

@@ -49,7 +49,7 @@ class CollaborationAgent:
         self._rules, self.budget = settings.collaboration, budget
         self._from_ns = start_ns + int(self._rules.after_s * 1e9)
         self._belief_ns = start_ns
-        self._track_ns = self._tier_ns = -1
+        self._track_ns = -1
         self._seen: dict[str, Fix] = {}
         self._tiers: dict[str, int] = {}
         self._helped: dict[str, tuple[int, Helped]] = {}
@@ -88,17 +88,10 @@ class CollaborationAgent:
         first = self.located is None
         self.located = now
         self._track_ns = now.stamp_ns
-        self._rank(now, None if first else self.tier)
+        sigma, present = now.estimate.position_sigma_m, None if first else self.tier
+        self.tier = next_tier(present, sigma, bool(now.lost), self._rules)
         self._look_round(now)
         return [self._track(now), *self._beliefs(now, now_ns)]
-
-    def _rank(self, now: Located, present: int | None) -> None:
-        """Follows the belief's quality; not at every breath, for each change is announced."""
-        sigma, lost = now.estimate.position_sigma_m, bool(now.lost)
-        tier = next_tier(present, sigma, lost, self._rules)
-        dwelt = now.stamp_ns - self._tier_ns >= self._rules.tier_dwell_s * 1e9
-        if tier != self.tier and (lost or dwelt or self.tier == LOWEST_TIER):
-            self.tier, self._tier_ns = tier, now.stamp_ns
 
     # Whom to listen to --------------------------------------------------------------------------
 

@@ -606,7 +606,7 @@ def test_all_is_shared_once_help_was_really_sent(topic: topics.Topic) -> None:
 def test_a_listener_shares_only_what_it_has_used() -> None:
     stand = Stand(two_robots(passive=True, active=False))
     stand.stand_still(0.5)
-    look(stand, "me")
+    stand.sightings("me", saw(stand.now_ns, Sighting("mate", 40.0, 0.0)))  # the gate rejects it
     stand.stand_still(0.5)
     assert stand.status("me").messages_received > 0
     assert estimate(stand, "me").shared == ZERO3
