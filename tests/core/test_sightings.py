@@ -32,7 +32,7 @@ def seen_as(
     sighting: Sighting,
     field: Field = CORNERS,
     *,
-    teammates: Mapping[str, Belief] | None = None,
+    teammates: Mapping[str, tuple[Belief, ...]] | None = None,
     sensor: SensorSettings | None = None,
     passive: bool = True,
     stamp_ns: int = 0,
@@ -106,7 +106,7 @@ def test_an_unknown_object_is_not_used() -> None:
 
 
 def test_a_teammate_that_told_its_pose_is_one_more_landmark() -> None:
-    told = {"mate": belief(1.0, 2.0, sigma_m=0.3)}
+    told = {"mate": (belief(1.0, 2.0, sigma_m=0.3),)}
     seen = seen_as(Sighting("mate", 2.0, 0.5), teammates=told)
     assert seen is not None  # row 25
     assert seen.teammate
@@ -115,7 +115,7 @@ def test_a_teammate_that_told_its_pose_is_one_more_landmark() -> None:
 
 
 def test_a_teammate_whose_belief_is_too_old_is_not_used() -> None:
-    told = {"mate": belief(1.0, 2.0)}
+    told = {"mate": (belief(1.0, 2.0),)}
     late = Sighting("mate", math.sqrt(5.0), 0.5)
     assert seen_as(late, teammates=told, stamp_ns=2 * SECOND) is None
 
@@ -125,7 +125,7 @@ def test_a_teammate_whose_belief_is_too_old_is_not_used() -> None:
 def test_the_gate_measures_the_innovation_of_the_whole_observation(name: str, turn: Scope) -> None:
     """For a landmark in a shorter way, for its place is exact."""
     prior = state_at(HERE, diagonal(0.2, 0.1)).estimate
-    seen = seen_as(Sighting(name, 3.0, 0.7), teammates={"mate": belief(1.0, 2.0, sigma_m=0.3)})
+    seen = seen_as(Sighting(name, 3.0, 0.7), teammates={"mate": (belief(1.0, 2.0, sigma_m=0.3),)})
     assert seen is not None
     cs = constraints_of(HERE, seen, turn, LocalizerSettings())
     whole = observation_of(prior, seen, cs, prior)
