@@ -20,6 +20,7 @@ LOWEST_TIER = 15  # also that of a robot that is lost
 BELIEF_SERVES_BACK_NS = 500_000_000
 """A belief also says where its robot was so long before: who sees a teammate asks for its belief,
 and what was seen meanwhile shall not be lost."""
+_SERVES_BACK_S = BELIEF_SERVES_BACK_NS * 1e-9
 
 
 class Place(NamedTuple):
@@ -67,14 +68,13 @@ def placed(beliefs: Iterable[Belief], at_ns: int, settings: CollaborationSetting
     """A teammate as a landmark at the time of a sighting, by what it said at the nearest time.
 
     It is carried along its speed and turn rate; a third of that way is added to its sigma, for it
-    may have stopped or turned. None when what it said is too old.
+    may have stopped or turned. None when all that it said is too old, or of too long after.
     """
-    belief = min(beliefs, key=lambda b: abs(at_ns - b.stamp_ns), default=None)
-    if belief is None:
+    ages = (((at_ns - b.stamp_ns) * 1e-9, b) for b in beliefs)
+    usable = [(a, b) for a, b in ages if -_SERVES_BACK_S <= a <= settings.max_age_s]
+    if not usable:
         return None
-    age = (at_ns - belief.stamp_ns) * 1e-9
-    if not -BELIEF_SERVES_BACK_NS * 1e-9 <= age <= settings.max_age_s:
-        return None
+    age, belief = min(usable, key=lambda told: abs(told[0]))
     way = belief.speed_m_s * age
     pose = Pose2(belief.x_m, belief.y_m, belief.heading_rad)
     pose = step(pose, way, belief.turn_rate_rad_s * age)

@@ -308,10 +308,11 @@ class Localizer:
         """Passive collaboration: keeps a teammate's belief, to use it when the teammate is seen."""
         now_ns = belief.stamp_ns - BELIEF_SERVES_BACK_NS
         state = self.moved(state, now_ns)
+        forgotten_ns = now_ns - self._max_age_ns
         teammates = {
-            name: tuple(b for b in beliefs if now_ns - b.stamp_ns <= self._max_age_ns)
+            name: fresh
             for name, beliefs in state.memory.teammates.items()
-            if now_ns - beliefs[-1].stamp_ns <= self._max_age_ns
+            if (fresh := tuple(b for b in beliefs if b.stamp_ns >= forgotten_ns))
         }
         teammates[belief.robot] = (*teammates.get(belief.robot, ()), belief)
         return replace(state, memory=replace(state.memory, teammates=teammates))

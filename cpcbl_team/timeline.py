@@ -28,9 +28,13 @@ _apply: dict[type, Callable[[Localizer, State, Input], State]] = {
 _rank = {kind: rank for rank, kind in enumerate(_apply)}
 
 
+def _measured_ns(item: Input) -> int:
+    return item.from_ns if isinstance(item, Odometry) else item.stamp_ns
+
+
 def _key(item: Input) -> Key:
     """Sorts by time, then by kind and content, so that the order of arrival plays no part."""
-    time_ns = item.from_ns if isinstance(item, Odometry) else item.stamp_ns
+    time_ns = _measured_ns(item)
     if isinstance(item, Belief):
         time_ns -= BELIEF_SERVES_BACK_NS
     who = item.observer if isinstance(item, Fix) else getattr(item, "robot", "")
@@ -47,13 +51,15 @@ class Timeline:
         self._keys: list[Key] = []
         self._before: list[State] = []
         self.state = state
-        self._oldest_ns = state.stamp_ns
+        self._start_ns = self._oldest_ns = state.stamp_ns
 
     def add(self, item: Input) -> str:
         """Takes an input; the reason if it cannot be used: `too_late`, `duplicate`."""
         key = _key(item)
         keys = self._keys
-        if key[0] < self._oldest_ns or (keys and key[0] < keys[-1][0] - self._horizon_ns):
+        if _measured_ns(item) < self._start_ns:
+            return "too_late"
+        if keys and key[0] < keys[-1][0] - self._horizon_ns:
             return "too_late"
         if not keys or key > keys[-1]:
             self._append(key, item)
@@ -94,7 +100,8 @@ class Timeline:
             self._forget()
 
     def _forget(self) -> None:
-        oldest = bisect_left(self._keys, (self._keys[-1][0] - self._horizon_ns,))
+        oldest_ns = self._keys[-1][0] - self._horizon_ns
+        oldest = bisect_left(self._keys, (oldest_ns,))
         if oldest >= _PRUNE:
-            self._oldest_ns = self._keys[oldest][0]
+            self._oldest_ns = max(self._start_ns, oldest_ns)
             del self._keys[:oldest], self._inputs[:oldest], self._before[:oldest]

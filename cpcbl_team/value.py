@@ -51,7 +51,7 @@ def expected(
     way = math.hypot(x_m - helped.x_m, y_m - helped.y_m)
     doubt = (DRIFT_SHARE * way) ** 2
     xx, xy, yy = helped.covariance
-    grown = Covariance2(xx + doubt, xy, yy + doubt)
+    grown = _not_exact(Covariance2(xx + doubt, xy, yy + doubt))
     sigma = math.sqrt(0.5 * (grown.xx + grown.yy))
     return grown.scaled((min(max(sigma, least), most) / sigma) ** 2)
 
@@ -85,8 +85,9 @@ def _determinant(
 
 
 def worth(prior: Covariance2, after: Covariance2) -> float:
-    """Nats gained from `prior` to `after`."""
-    return 0.5 * math.log(_not_exact(prior).determinant() / after.determinant())
+    """Nats gained from `prior` to `after`; beyond what is called exact nothing is gained."""
+    left = max(after.determinant(), SMALLEST_VARIANCE**2)
+    return 0.5 * math.log(_not_exact(prior).determinant() / left)
 
 
 def _not_exact(c: Covariance2) -> Covariance2:
@@ -103,16 +104,17 @@ def use_of(fix: Fix, tier: int, estimate: Estimate, settings: CollaborationSetti
     """What the belief of a teammate of this tier is worth to the robot that sees it (nats).
 
     `fix` is where the robot sees the teammate. The sighting tells of the position and, by its
-    bearing, of the heading; what both tell is counted for the one that gains more.
+    bearing, of the heading (of a teammate at the same place it tells nothing); what both tell is
+    counted for the one that gains more.
     """
     prior = estimate.covariance.position()
     sensor, sigma = Covariance2(*fix.sensor_covariance), sum(sigma_range_m(tier, settings)) / 2.0
     theirs = Covariance2(sigma * sigma, 0.0, sigma * sigma)
     position = worth(prior, merged(prior, sensor, theirs, settings.fusion))
     dx, dy = fix.x_m - estimate.pose.x, fix.y_m - estimate.pose.y
-    away = max(dx * dx + dy * dy, SMALLEST_VARIANCE)
-    across = _not_exact(sensor + theirs + prior).along(-dy, dx) / (away * away)
-    heading = 0.5 * math.log1p(estimate.covariance.hh / across)
+    direction = math.atan2(dy, dx)
+    across = _not_exact(sensor + theirs + prior).along(-math.sin(direction), math.cos(direction))
+    heading = 0.5 * math.log1p(estimate.covariance.hh * (dx * dx + dy * dy) / across)
     return max(position, heading)
 
 

@@ -1,5 +1,5 @@
 import math
-from itertools import pairwise
+from itertools import pairwise, permutations
 
 import numpy as np
 import pytest
@@ -106,7 +106,7 @@ def there(place: Place | None) -> Place:
 
 
 def test_a_teammate_that_stands_is_where_it_said() -> None:
-    place = there(placed(belief(1.0, 2.0, sigma_m=0.2), SECOND // 2, RULES))
+    place = there(placed([belief(1.0, 2.0, sigma_m=0.2)], SECOND // 2, RULES))
     assert (place.x, place.y) == (1.0, 2.0)
     assert place.covariance == pytest.approx((0.04, 0.0, 0.04))
 
@@ -114,7 +114,7 @@ def test_a_teammate_that_stands_is_where_it_said() -> None:
 def test_a_teammate_that_drives_is_carried_along() -> None:
     """Resolution e: 0.5 s at 1 m/s to the north; a third of the way is added to its sigma."""
     told = belief(1.0, 2.0, heading=0.5 * math.pi, sigma_m=0.2, speed_m_s=1.0)
-    place = there(placed(told, SECOND // 2, RULES))
+    place = there(placed([told], SECOND // 2, RULES))
     assert (place.x, place.y) == pytest.approx((1.0, 2.5))
     doubt = (0.5 / 3.0) ** 2
     sideways = 0.04 + (0.5 * 0.05) ** 2 + doubt  # with its heading's sigma of 0.05
@@ -123,23 +123,57 @@ def test_a_teammate_that_drives_is_carried_along() -> None:
 
 def test_a_teammate_that_turns_is_carried_along_its_arc() -> None:
     told = belief(0.0, 0.0, speed_m_s=1.0, turn_rate_rad_s=0.4)
-    place = there(placed(told, SECOND // 2, RULES))
+    place = there(placed([told], SECOND // 2, RULES))
     assert (place.x, place.y) == pytest.approx((0.5 * math.cos(0.1), 0.5 * math.sin(0.1)))
 
 
-@pytest.mark.parametrize(("age_s", "used"), [(-0.1, False), (0.0, True), (1.5, True), (1.6, False)])
-def test_a_belief_is_used_up_to_its_greatest_age(age_s: float, used: bool) -> None:
-    found = placed(belief(1.0, 2.0, 5 * SECOND), int((5.0 + age_s) * SECOND), RULES)
+def test_a_teammate_that_was_seen_before_it_spoke_is_carried_back() -> None:
+    told = belief(1.0, 2.0, SECOND, sigma_m=0.2, speed_m_s=1.0)
+    place = there(placed([told], SECOND - SECOND // 4, RULES))
+    assert (place.x, place.y) == pytest.approx((0.75, 2.0))
+    doubt = (0.25 / 3.0) ** 2
+    sideways = 0.04 + (0.25 * 0.05) ** 2 + doubt
+    assert place.covariance == pytest.approx((0.04 + doubt, 0.0, sideways))
+
+
+@pytest.mark.parametrize(
+    ("age_s", "used"),
+    [(-0.6, False), (-0.5, True), (-0.1, True), (0.0, True), (1.5, True), (1.6, False)],
+)
+def test_a_belief_is_used_from_half_a_second_before_it_up_to_its_greatest_age(
+    age_s: float, used: bool
+) -> None:
+    found = placed([belief(1.0, 2.0, 5 * SECOND)], int((5.0 + age_s) * SECOND), RULES)
     assert (found is not None) is used
 
 
-@given(st.floats(0.0, 1.0), st.floats(-2.0, 2.0), st.floats(-2.0, 2.0))
-def test_a_place_is_never_more_certain_for_being_older(
+@pytest.mark.parametrize(
+    ("ages_s", "nearest"),
+    [
+        ((0.3, 0.1, 0.2), 0.1),
+        ((0.3, -0.2, -0.4), -0.2),
+        ((0.7, -0.6), 0.7),  # that of 0.6 s later is nearer, but of no use
+        ((1.5, 1.6), 1.5),
+        ((1.6, -0.6), None),
+        ((), None),
+    ],
+)
+def test_of_several_beliefs_the_nearest_that_is_of_use_is_taken(
+    ages_s: tuple[float, ...], nearest: float | None
+) -> None:
+    for ages in permutations(ages_s):
+        beliefs = [belief(age, 2.0, 5 * SECOND - round(age * SECOND)) for age in ages]
+        place = placed(beliefs, 5 * SECOND, RULES)
+        assert (place.x if place else None) == nearest
+
+
+@given(st.floats(-0.5, 1.0), st.floats(-2.0, 2.0), st.floats(-2.0, 2.0))
+def test_a_place_is_never_more_certain_for_being_farther_in_time(
     age_s: float, speed: float, turn_rate: float
 ) -> None:
     told = belief(1.0, 2.0, speed_m_s=speed, turn_rate_rad_s=turn_rate)
-    later = matrix2(there(placed(told, int(age_s * SECOND), RULES)).covariance)
-    assert least_eigenvalue(later - matrix2(there(placed(told, 0, RULES)).covariance)) > -1e-12
+    later = matrix2(there(placed([told], int(age_s * SECOND), RULES)).covariance)
+    assert least_eigenvalue(later - matrix2(there(placed([told], 0, RULES)).covariance)) > -1e-12
 
 
 # Tiers --------------------------------------------------------------------------------------------

@@ -1,4 +1,5 @@
 from collections.abc import Iterable
+from itertools import permutations
 from random import Random
 
 import numpy as np
@@ -22,7 +23,9 @@ from core_helpers import (
 )
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from msgspec.structs import replace
 
+from cpcbl_team.collaboration import BELIEF_SERVES_BACK_NS
 from cpcbl_team.config import LocalizerSettings, SensorSettings, Variant
 from cpcbl_team.inputs import Belief, Fix, Input, Odometry, Position, Sightings, Told
 from cpcbl_team.localizer import Localizer
@@ -58,8 +61,13 @@ def history(seconds: float, seed: int = 1) -> list[Input]:
     return sorted(inputs, key=time_of)
 
 
-def time_of(item: Input) -> int:
+def stamp_of(item: Input) -> int:
     return item.from_ns if isinstance(item, Odometry) else item.stamp_ns
+
+
+def time_of(item: Input) -> int:
+    """From when on it counts: a belief serves the sightings of half a second before it."""
+    return stamp_of(item) - (BELIEF_SERVES_BACK_NS if isinstance(item, Belief) else 0)
 
 
 def by_hand(robot: Localizer, inputs: Iterable[Input]) -> State:
@@ -124,7 +132,7 @@ def test_a_long_run_with_delays_gives_the_same_bits(seed: int) -> None:
     """Long enough for the timeline to forget; each kind of input has its own delay."""
     rng, robot, inputs = np.random.default_rng(seed), localizer("joint", MIXED), history(8.0)
     delay = {Odometry: 20, Sightings: 300, Position: 50, Fix: 900, Belief: 500, Told: 100}
-    arrivals = [time_of(i) + rng.uniform(0.0, delay[type(i)]) * MS for i in inputs]
+    arrivals = [stamp_of(i) + rng.uniform(0.0, delay[type(i)]) * MS for i in inputs]
     late = after(robot, [inputs[i] for i in np.argsort(arrivals)])
     assert same(late.state, by_hand(robot, inputs))
 
@@ -141,7 +149,7 @@ def test_a_robot_that_learns_gives_the_same_bits_in_any_order() -> None:
     assert all(a != b for a, b in zip(expected.memory.learned, Learned(), strict=True))
     for seed in range(3):
         rng = np.random.default_rng(seed)
-        arrivals = [time_of(i) + rng.uniform(0.0, delay.get(type(i), 50)) * MS for i in inputs]
+        arrivals = [stamp_of(i) + rng.uniform(0.0, delay.get(type(i), 50)) * MS for i in inputs]
         late = after(robot, [inputs[i] for i in np.argsort(arrivals)])
         assert same(late.state, expected)
         assert repr(late.state.memory.learned) == repr(expected.memory.learned)
@@ -183,6 +191,79 @@ def test_odometry_that_comes_after_its_frame_still_carries_it() -> None:
     assert same(early.latest(300 * MS), after(robot, [*wheels, seen]).latest(300 * MS))
 
 
+# Beliefs that come after the sighting -------------------------------------------------------------
+
+
+def frame_of_mate(stamp_ns: int) -> Sightings:
+    """The teammate at (1, 0), seen from the start."""
+    return Sightings(stamp_ns, (point_sighting(LOOP_START, "mate", 1.0, 0.0),))
+
+
+@variants
+@pytest.mark.parametrize(
+    ("after_ms", "used"), [(0, True), (1, True), (300, True), (500, True), (501, False)]
+)
+def test_a_belief_that_comes_after_the_sighting_counts_as_if_it_had_come_before(
+    variant: Variant, after_ms: int, used: bool
+) -> None:
+    robot, seen = localizer(variant, MIXED), frame_of_mate(SECOND)
+    told = belief(1.05, 0.02, SECOND + after_ms * MS, sigma_m=0.02)
+    late = after(robot, [seen])
+    before = late.state
+    assert late.add(told) == ""
+    assert (late.state.memory.counts == {"accepted": 1}) is used
+    known = late.at(SECOND)
+    assert known is not None
+    assert (known.estimate != before.estimate) is used
+    early = after(robot, [told, seen])
+    assert same(late.state, early.state)
+    assert same(late.state, by_hand(robot, [told, seen] if used else [seen, told]))
+
+
+def test_of_several_beliefs_in_any_order_the_nearest_is_used() -> None:
+    """Ages 0.3, -0.1 and -0.4 s, and one of 0.6 s after the sighting."""
+    robot, seen = localizer("joint", MIXED), frame_of_mate(SECOND)
+    nearest = belief(1.05, 0.0, 1100 * MS)
+    others = [belief(0.9 + 1e-4 * ms, 0.0, ms * MS) for ms in (700, 1400, 1600)]
+    alone = after(robot, [nearest, seen]).at(SECOND)
+    assert alone is not None
+    inputs: list[Input] = [seen, nearest, *others]
+    in_order = after(robot, sorted(inputs, key=time_of))
+    for shuffled in permutations(inputs):
+        timeline = after(robot, shuffled)
+        assert same(timeline.state, in_order.state)
+        found = timeline.at(SECOND)
+        assert found is not None
+        assert found.estimate.pose == pytest.approx(alone.estimate.pose, abs=1e-12)
+
+
+told_at = st.builds(
+    lambda ms, x, name: replace(belief(x, 0.0, ms * MS), robot=name),
+    st.integers(0, 1500),
+    st.sampled_from([0.95, 1.0, 1.05]),
+    st.sampled_from(["mate", "other"]),
+)
+
+
+@variants
+@settings(max_examples=15, deadline=None)
+@given(
+    beliefs=st.lists(told_at, max_size=12, unique_by=repr),
+    shuffler=st.randoms(use_true_random=False),
+)
+def test_beliefs_in_any_order_give_the_same_bits(
+    variant: Variant, beliefs: list[Belief], shuffler: Random
+) -> None:
+    """Some of one time and teammate that say different things."""
+    robot = localizer(variant, MIXED)
+    seen = [frame_of_mate(ms * MS) for ms in range(0, 1500, 100)]
+    wheels = [Odometry(ms * MS, (ms + 50) * MS, 0.001, 0.001) for ms in range(0, 1500, 50)]
+    shuffled: list[Input] = [*seen, *beliefs, *wheels]
+    in_order = after(robot, sorted(shuffled, key=time_of))
+    shuffler.shuffle(shuffled)
+    assert same(after(robot, shuffled).state, in_order.state)
+
+
 # What is refused ----------------------------------------------------------------------------------
 
 
@@ -209,14 +290,32 @@ def test_what_is_older_than_the_horizon_is_refused() -> None:
     before = timeline.state
     assert timeline.add(fix(0.0, 0.0, newest - HORIZON_NS - 1)) == "too_late"
     assert timeline.state is before
-    assert timeline.add(fix(0.0, 0.0, newest - HORIZON_NS + 200 * MS)) == ""
+    assert timeline.add(fix(0.0, 0.0, newest - HORIZON_NS)) == ""
+
+
+def test_a_belief_is_too_late_as_soon_as_the_sightings_before_it_are() -> None:
+    timeline = after(localizer("joint", MIXED), history(5.0))
+    oldest = time_of(history(5.0)[-1]) - HORIZON_NS + BELIEF_SERVES_BACK_NS
+    assert timeline.add(belief(1.0, 0.0, oldest - 1)) == "too_late"
+    assert timeline.add(belief(1.0, 0.0, oldest)) == ""
 
 
 def test_what_is_older_than_the_start_is_refused() -> None:
     robot = localizer("joint", MIXED)
     timeline = Timeline(robot, state_at(LOOP_START, diagonal(0.1, 0.1), SECOND))
     assert timeline.add(frame(LOOP_START, SECOND - 1, MIXED)) == "too_late"
+    assert timeline.add(belief(1.0, 0.0, SECOND - 1)) == "too_late"
     assert timeline.add(frame(LOOP_START, SECOND, MIXED)) == ""
+
+
+def test_a_belief_of_the_start_is_used() -> None:
+    """It stands in the timeline before the start, and is none the worse for it."""
+    robot = localizer("joint", MIXED)
+    timeline = Timeline(robot, state_at(LOOP_START, diagonal(0.1, 0.1), SECOND))
+    assert timeline.add(frame_of_mate(SECOND)) == ""
+    assert timeline.add(belief(1.0, 0.0, SECOND)) == ""
+    assert timeline.state.memory.counts == {"accepted": 1}
+    assert timeline.at(SECOND - 1) is None
 
 
 def test_a_timeline_forgets_what_is_older_than_its_horizon() -> None:

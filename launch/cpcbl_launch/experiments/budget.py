@@ -21,8 +21,14 @@ from cpcbl_launch.logs import LoggedTeam
 from cpcbl_launch.tables import number, percent, table
 
 EVERYTHING: Mapping[str, Any] = {"least_value": 0.0, "least_use": 0.0, "belief_share": 0.0}
-DEAR: Mapping[str, Any] = {"least_value": 0.2, "least_use": 0.9}
-"""For a few messages a minute: what is worth less would only delay what is worth more."""
+RARE: Mapping[str, Any] = {
+    "least_value": 0.2,
+    "least_use": 0.9,
+    "fix_interval_s": 8.0,
+    "belief_rate_hz": 1.0 / 8.0,
+}
+"""For a few messages a minute: what is worth less, or comes soon again, would only delay what is
+worth more."""
 
 
 class Point(msgspec.Struct, frozen=True, kw_only=True):
@@ -77,8 +83,8 @@ def cases() -> list[Case]:
     both = {**EVERYTHING, "direction": "both-ways"}
     return [
         none,
-        *(_limited("bytes_per_s", n, "B/s", DEAR if n < 5 else {}) for n in (1, 2, 5, 10, 20, 50)),
-        *(_limited("messages_per_minute", n, "a minute", DEAR) for n in (3, 5, 6.5, 8, 12)),
+        *(_limited("bytes_per_s", n, "B/s", {}) for n in (1, 2, 5, 10, 20, 50)),
+        *(_limited("messages_per_minute", n, "a minute", RARE) for n in (2, 3, 4, 6, 8)),
         *(_worth(least) for least in (0.4, 0.2, 0.1, 0.05, 0.02)),
         *(_every(seconds) for seconds in (60, 30, 15, 8, 4, 2, 1, 0.5)),
         Case(series="everything, one way", setting="all", rules=dict(EVERYTHING)),
