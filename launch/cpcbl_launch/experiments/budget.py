@@ -31,6 +31,9 @@ RARE: Mapping[str, Any] = {
 worth more."""
 
 
+OURS = ("bytes limited", "messages limited", "value alone")
+
+
 class Point(msgspec.Struct, frozen=True, kw_only=True):
     """One run. Bytes are those on the senders' links, without TCP/IP's; means over the robots."""
 
@@ -84,17 +87,17 @@ def cases() -> list[Case]:
     return [
         none,
         *(_limited("bytes_per_s", n, "B/s", {}) for n in (1, 2, 5, 10, 20, 50)),
-        *(_limited("messages_per_minute", n, "a minute", RARE) for n in (2, 3, 4, 6, 8)),
+        *(_limited("messages_per_minute", n, "/min", RARE) for n in (2, 3, 4, 6, 8)),
         *(_worth(least) for least in (0.4, 0.2, 0.1, 0.05, 0.02)),
         *(_every(seconds) for seconds in (60, 30, 15, 8, 4, 2, 1, 0.5)),
-        Case(series="everything, one way", setting="all", rules=dict(EVERYTHING)),
-        Case(series="everything, both ways", setting="all", rules=both),
+        Case(series="all, one way", setting="no limit", rules=dict(EVERYTHING)),
+        Case(series="all, both ways", setting="no limit", rules=both),
     ]
 
 
 def _limited(key: str, allowed: float, unit: str, rules: Mapping[str, Any]) -> Case:
-    budget = {key: allowed, "urgent_share": 0.0 if unit == "a minute" else 0.2}
-    series = "value, bytes limited" if key == "bytes_per_s" else "value, messages limited"
+    budget = {key: allowed, "urgent_share": 0.0 if unit == "/min" else 0.2}
+    series = "bytes limited" if key == "bytes_per_s" else "messages limited"
     return Case(series=series, setting=f"{allowed:g} {unit}", rules=dict(rules), budget=budget)
 
 
@@ -166,8 +169,8 @@ def curve(logged: LoggedTeam, jobs: int | None, done: Callable[[], None]) -> Cur
 def targets(points: Iterable[Point]) -> Iterable[Target]:
     """Of sending by value, against everything both ways: near its RMSE for little of its cost."""
     points = list(points)
-    all_of = next(p for p in points if p.series == "everything, both ways")
-    ours = [p for p in points if p.series.startswith("value")]
+    all_of = next(p for p in points if p.series == "all, both ways")
+    ours = [p for p in points if p.series in OURS]
     quarter = [p for p in ours if p.bytes_per_s <= 0.25 * all_of.bytes_per_s]
     few = [p for p in ours if p.messages_per_minute <= 2.5]
     yield _target("10 % of it at a quarter of its bytes", 1.1 * all_of.position_rmse_m, quarter)
@@ -182,9 +185,7 @@ def _target(said: str, allowed_m: float, within: list[Point]) -> Target:
 
 def tables(result: Curve) -> Iterable[RenderableType]:
     title = f"{result.log}, blind: {', '.join(result.blind) or 'none'}; a robot"
-    shown = table(
-        title, ("sent", ""), ("B/s", "/min", "RMSE m", "blind m", "deg", "in 3 σ", "NEES")
-    )
+    shown = table(title, ("sent", ""), ("B/s", "/min", "RMSE m", "blind", "deg", "in 3 σ", "NEES"))
     last = None
     for p in result.points:
         if last not in (None, p.series):
