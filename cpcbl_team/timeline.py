@@ -8,14 +8,17 @@ going back costs nothing.
 from bisect import bisect_left, bisect_right
 from collections.abc import Callable
 
+import msgspec
+
 from cpcbl_team.collaboration import BELIEF_SERVES_BACK_NS
 from cpcbl_team.inputs import Belief, Fix, Input, Odometry, Position, Sightings, Told
 from cpcbl_team.localizer import Localizer
 from cpcbl_team.state import State
 
-Key = tuple[int, int, str, str]
+Key = tuple[int, int, str, bytes]
 HORIZON_NS = 2_000_000_000
 _PRUNE = 64
+_content = msgspec.msgpack.Encoder(enc_hook=float).encode  # numpy's numbers too; `repr` is slow
 
 _apply: dict[type, Callable[[Localizer, State, Input], State]] = {
     Odometry: Localizer.drive,  # type: ignore[dict-item]
@@ -38,7 +41,12 @@ def _key(item: Input) -> Key:
     if isinstance(item, Belief):
         time_ns -= BELIEF_SERVES_BACK_NS
     who = item.observer if isinstance(item, Fix) else getattr(item, "robot", "")
-    return time_ns, _rank[type(item)], who, "" if isinstance(item, Odometry) else repr(item)
+    return (
+        time_ns,
+        _rank[type(item)],
+        who,
+        b"" if isinstance(item, Odometry) else _content(item),
+    )
 
 
 class Timeline:
@@ -87,7 +95,7 @@ class Timeline:
         """The state at a time (after the inputs stamped with it); None if it is forgotten."""
         if stamp_ns < self._oldest_ns:
             return None
-        after = bisect_right(self._keys, (stamp_ns, len(_rank), "", ""))
+        after = bisect_right(self._keys, (stamp_ns, len(_rank), "", b""))
         state = self._before[after] if after < len(self._keys) else self.state
         return self._localizer.moved(state, stamp_ns)
 

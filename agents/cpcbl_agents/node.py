@@ -2,7 +2,6 @@
 
 from collections import Counter, deque
 from collections.abc import Callable, Iterable
-from contextlib import suppress
 
 from cpcbl_agents.agent import Listened, Presence, Sent, Tick
 from cpcbl_agents.robot import Robot
@@ -91,11 +90,10 @@ class Node:
     def step(self, now_ns: int) -> None:
         """Takes in what has arrived, lets the robot work, sends what it says."""
         self._take_tokens(now_ns)
-        with suppress(IndexError):
-            while True:
-                message = self._accepted(*self._inbox.popleft(), now_ns)
-                if message is not None:
-                    self._send(self._robot.handle(message, now_ns), now_ns)
+        while self._inbox:
+            message = self._accepted(*self._inbox.popleft(), now_ns)
+            if message is not None:
+                self._send(self._robot.handle(message, now_ns), now_ns)
         self._ask_for_listeners(now_ns)
         said = self._robot.handle(Tick(), now_ns)
         for name in self._wiring.follow(self._robot.collaboration):
@@ -108,13 +106,12 @@ class Node:
 
     def _take_tokens(self, now_ns: int) -> None:
         """What the bus knows of teammates: who is there, with which tier."""
-        with suppress(IndexError):
-            while True:
-                presence = self._tokens.changed(*self._news.popleft())
-                if presence is None:
-                    self.counts["bad_token"] += 1
-                else:
-                    self._robot.handle(Presence(*presence), now_ns)
+        while self._news:
+            presence = self._tokens.changed(*self._news.popleft())
+            if presence is None:
+                self.counts["bad_token"] += 1
+            else:
+                self._robot.handle(Presence(*presence), now_ns)
 
     def _ask_for_listeners(self, now_ns: int) -> None:
         tier = self._wiring.tier
