@@ -110,8 +110,9 @@ def draw_budget(result: Curve, path: Path) -> None:
         axes.plot(cost, errors, style, ms=12 if len(points) == 1 else 5, label=name)
     for target in result.targets:
         axes.axhline(target.allowed_rmse_m, color="0.8", linewidth=0.8, zorder=0)
+    title = f"{result.log}, blind: {', '.join(result.blind) or 'none'}"
     axes.set(xscale="log", yscale="log", xlabel="sent (B/s a robot, on the wire)")
-    axes.set(ylabel="position RMSE, team (m)", title=f"{result.log}, blind: {result.blind}")
+    axes.set(ylabel="position RMSE, team (m)", title=title)
     axes.yaxis.set_minor_formatter(lambda value, _: f"{value:g}")
     axes.grid(True, which="both", alpha=0.3)
     axes.legend()
