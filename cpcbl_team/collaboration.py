@@ -96,14 +96,15 @@ def tier_of(sigma_m: float, width: float) -> int:
 def next_tier(
     present: int | None, sigma_m: float, lost: bool, settings: CollaborationSettings
 ) -> int:
-    """The tier to announce: kept while sigma stays near it, the lowest at once when lost."""
+    """The tier to announce: kept while sigma stays near it, the lowest at once when lost, never
+    better than the configured best."""
     if lost:
         return LOWEST_TIER
     if present is None or present == LOWEST_TIER:
-        return tier_of(sigma_m, settings.tier_width)
+        return max(settings.best_tier, tier_of(sigma_m, settings.tier_width))
     best = tier_of(sigma_m / settings.tier_hysteresis, settings.tier_width)
     worst = tier_of(sigma_m * settings.tier_hysteresis, settings.tier_width)
-    return min(max(present, best), worst)
+    return max(settings.best_tier, min(max(present, best), worst))
 
 
 def hears(own: int, other: int, settings: CollaborationSettings) -> bool:

@@ -169,6 +169,8 @@ class CollaborationSettings(Table, frozen=True, kw_only=True):
     """Ratio of position sigma from one tier to the next."""
     tier_hysteresis: Annotated[float, msgspec.Meta(ge=1.0)] = 1.1
     """A tier is left only when sigma is beyond its edge by this factor."""
+    best_tier: Annotated[int, msgspec.Meta(ge=0, le=15)] = 0
+    """No better tier is announced, however certain the robot is: for sensors that err unseen."""
     budget: BudgetSettings = BudgetSettings()
     least_value: NotNegative = 0.05
     """What a fix must be worth (nats): the logarithm of the factor by which the ellipse of the

@@ -34,7 +34,7 @@ def sigma_range_m(tier: int, settings: CollaborationSettings) -> tuple[float, fl
     least = TIER_ZERO_SIGMA_M * width ** (tier - 1) / slack
     if tier == LOWEST_TIER:
         return least, max(LOST_SIGMA_M, least)
-    return (0.0 if tier == 0 else least), TIER_ZERO_SIGMA_M * width**tier * slack
+    return (0.0 if tier <= settings.best_tier else least), TIER_ZERO_SIGMA_M * width**tier * slack
 
 
 def expected(

@@ -167,6 +167,16 @@ def test_of_several_beliefs_the_nearest_that_is_of_use_is_taken(
         assert (place.x if place else None) == nearest
 
 
+@given(st.none() | st.integers(0, LOWEST_TIER), sigmas, st.integers(0, LOWEST_TIER))
+def test_no_robot_claims_more_than_its_best_tier(
+    present: int | None, sigma_m: float, best: int
+) -> None:
+    limited = CollaborationSettings(tier_width=2.0, tier_hysteresis=1.2, best_tier=best)
+    free = next_tier(present, sigma_m, False, RULES)
+    assert next_tier(present, sigma_m, False, limited) == max(best, free)
+    assert next_tier(present, sigma_m, True, limited) == LOWEST_TIER
+
+
 @given(st.floats(-0.5, 1.0), st.floats(-2.0, 2.0), st.floats(-2.0, 2.0))
 def test_a_place_is_never_more_certain_for_being_farther_in_time(
     age_s: float, speed: float, turn_rate: float

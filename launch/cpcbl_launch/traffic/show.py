@@ -32,7 +32,7 @@ def spent_table(report: Report) -> Table:
     """What each robot sent, what it did not send and why, and how near it came to its limits."""
     limited = any(r.spending for r in report.robots.values())
     shown = table(
-        "help sent, and not sent because of budget, value, silence",
+        "help sent, and not sent for budget, value, silence",
         ("robot",),
         ("fixes", "beliefs", "B/s", *NOT_SENT),
     )
