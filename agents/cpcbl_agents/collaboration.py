@@ -8,6 +8,8 @@ or beyond the budget is never encoded. A robot that is lost tells teammates noth
 from collections.abc import Sequence
 from typing import NamedTuple
 
+from msgspec.structs import replace
+
 from cpcbl_agents.agent import Anything, Listened, Located, Presence, Sent
 from cpcbl_agents.tally import Tallies
 from cpcbl_team.collaboration import LOWEST_TIER, fix_for, hears, next_tier
@@ -47,6 +49,8 @@ class CollaborationAgent:
     ) -> None:
         self._robot, self._settings, self._teammates = robot, settings, teammates
         self._rules, self.budget = settings.collaboration, budget
+        if settings.localizer.variant == "weighted":  # without a covariance worth cannot be judged
+            self._rules = replace(self._rules, least_value=0.0, least_use=0.0, belief_share=0.0)
         self._from_ns = start_ns + int(self._rules.after_s * 1e9)
         self._belief_ns = start_ns
         self._track_ns = -1

@@ -470,9 +470,12 @@ def test_watching_ends_with_a_signal(number: signal.Signals) -> None:
         publisher = bus.publisher("status/a", topics.STATUS.qos)
         command = [*PROGRAM, "traffic", "--team-name", "nobody", "--connect", endpoint]
         with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
-            wait_until(lambda: publisher.matching)
-            process.send_signal(number)
-            text, _ = process.communicate(timeout=5.0)
+            try:
+                wait_until(lambda: publisher.matching)
+                process.send_signal(number)
+                text, _ = process.communicate(timeout=30.0)
+            finally:
+                process.kill()
             assert process.returncode == 0
     assert text.startswith(f"team nobody at {endpoint}, watched for ")
     assert "no robot" in text
