@@ -64,6 +64,13 @@ def fix_for(
     return Fix(robot, observer, stamp_ns, x, y, rotated, observer_part)
 
 
+def carried(belief: Belief, at_ns: int) -> Pose2:
+    """Where a belief has its robot at another time: along its speed and turn rate."""
+    age = (at_ns - belief.stamp_ns) * 1e-9
+    pose = Pose2(belief.x_m, belief.y_m, belief.heading_rad)
+    return step(pose, belief.speed_m_s * age, belief.turn_rate_rad_s * age)
+
+
 def placed(beliefs: Iterable[Belief], at_ns: int, settings: CollaborationSettings) -> Place | None:
     """A teammate as a landmark at the time of a sighting, by what it said at the nearest time.
 
@@ -75,13 +82,11 @@ def placed(beliefs: Iterable[Belief], at_ns: int, settings: CollaborationSetting
     if not usable:
         return None
     age, belief = min(usable, key=lambda told: abs(told[0]))
-    way = belief.speed_m_s * age
-    pose = Pose2(belief.x_m, belief.y_m, belief.heading_rad)
-    pose = step(pose, way, belief.turn_rate_rad_s * age)
+    pose = carried(belief, at_ns)
     covariance = Covariance3(*belief.covariance)
     lever = (1.0, 0.0, belief.y_m - pose.y, 0.0, 1.0, pose.x - belief.x_m, 0.0, 0.0, 1.0)
     xx, xy, yy, *_ = covariance.transformed(lever)
-    doubt = (way / 3.0) ** 2
+    doubt = (belief.speed_m_s * age / 3.0) ** 2
     return Place(pose.x, pose.y, Covariance2(xx + doubt, xy, yy + doubt))
 
 

@@ -8,12 +8,11 @@ half that of the determinants (as in the mutual information of Gaussians).
 import math
 from typing import NamedTuple
 
-from cpcbl_team.collaboration import LOWEST_TIER, TIER_ZERO_SIGMA_M
+from cpcbl_team.collaboration import LOWEST_TIER, TIER_ZERO_SIGMA_M, carried
 from cpcbl_team.config import CollaborationSettings, Fusion
 from cpcbl_team.estimate import SMALLEST_VARIANCE, Covariance3, Estimate
 from cpcbl_team.fusion import best_weight
 from cpcbl_team.gaussian import Covariance2
-from cpcbl_team.geometry import Pose2, step
 from cpcbl_team.inputs import Belief, Fix
 
 LOST_SIGMA_M = 2.0
@@ -123,9 +122,7 @@ def staleness(copy: Belief | None, now: Belief) -> float:
     or twice the logarithm of the ratio of the sigmas. Infinite without a copy."""
     if copy is None:
         return math.inf
-    age = (now.stamp_ns - copy.stamp_ns) * 1e-9
-    pose = Pose2(copy.x_m, copy.y_m, copy.heading_rad)
-    pose = step(pose, copy.speed_m_s * age, copy.turn_rate_rad_s * age)
+    pose = carried(copy, now.stamp_ns)
     before, after = (
         Covariance3(*copy.covariance).position(),
         Covariance3(*now.covariance).position(),

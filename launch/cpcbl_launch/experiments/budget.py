@@ -7,9 +7,7 @@ sees the robot.
 
 import os
 from collections.abc import Callable, Iterable, Mapping
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from importlib.metadata import version
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +15,7 @@ import msgspec
 from rich.console import RenderableType
 
 from cpcbl_launch.evaluation import evaluate_log
+from cpcbl_launch.experiments.runs import in_processes
 from cpcbl_launch.logs import LoggedTeam
 from cpcbl_launch.tables import number, percent, table
 
@@ -143,18 +142,8 @@ def point(logged: LoggedTeam, case: Case) -> Point:
 
 def curve(logged: LoggedTeam, jobs: int | None, done: Callable[[], None]) -> Curve:
     """All points; `done` is called after each. The same log gives the same figures."""
-    every = cases()
-    pool = ProcessPoolExecutor(jobs or os.cpu_count() or 1, mp_context=get_context("spawn"))
-    with pool:
-        futures = [pool.submit(point, logged, case) for case in every]
-        try:
-            for future in as_completed(futures):
-                future.result()
-                done()
-        except BaseException:
-            pool.shutdown(cancel_futures=True)
-            raise
-        points = tuple(future.result() for future in futures)
+    tasks = [(logged, case) for case in cases()]
+    points = tuple(in_processes(point, tasks, jobs or os.cpu_count() or 1, done))
     return Curve(
         experiment="budget",
         version=version("cpcbl-team"),

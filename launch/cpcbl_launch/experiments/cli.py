@@ -5,15 +5,15 @@ import sys
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Optional
+from typing import TYPE_CHECKING, Annotated, Any, Optional
 
 import typer
+
+from cpcbl_launch.commands.arguments import names_in
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
 
-    from cpcbl_launch.experiments.latency import Latency
-    from cpcbl_launch.experiments.processes import Processes
     from cpcbl_launch.experiments.results import Experiment
 
 experiment_app = typer.Typer(
@@ -87,31 +87,19 @@ def budget(
     as_json: AsJson = False,
 ) -> None:
     """A real log: accuracy against bytes, by value and budget, by fixed intervals, all of it."""
-    from rich.console import Console
-
     from cpcbl_launch import logs
     from cpcbl_launch.experiments import budget as experiment
     from cpcbl_launch.experiments.pictures import draw_budget
-    from cpcbl_launch.options import encoded, folder_for, must_draw
+    from cpcbl_launch.options import folder_for, must_draw
     from cpcbl_launch.team_file import load_team
 
     must_draw("experiment")
     folder_for("--output", output)
     logged = logs.shortened(logs.on_log(load_team(logs.builtin_for(data)), data), duration)
-    names = [name.strip() for name in blind.split(",") if name.strip()]
-    logged = logged._replace(team=logs.blinded(logged.team, names))
+    logged = logged._replace(team=logs.blinded(logged.team, names_in(blind)))
     with _progress("budget", len(experiment.cases())) as done:
         result = experiment.curve(logged, jobs, done)
-    text = encoded(result) + "\n"
-    (output / "budget.json").write_text(text, encoding="utf-8")
-    draw_budget(result, output / "budget.png")
-    if as_json:
-        sys.stdout.write(text)
-        return
-    console = Console()
-    for shown in experiment.tables(result):
-        console.print(shown, highlight=False)
-    console.print(f"written: {output / 'budget'}.json, .png", highlight=False)
+    _written(result, experiment.tables(result), output, as_json, draw_budget)
 
 
 @experiment_app.command("latency")
@@ -127,7 +115,7 @@ def latency(
     folder_for("--output", output)
     with _progress("latency", latency.UNMEASURED + sightings, "sightings") as done:
         result = latency.measured(sightings, done)
-    _shown(result, latency.tables(result), output, as_json)
+    _written(result, latency.tables(result), output, as_json)
 
 
 @experiment_app.command("processes")
@@ -149,17 +137,15 @@ def processes(
     sizes = processes.sizes_in(robots)
     with _progress("processes", len(sizes), "sizes") as done:
         result = processes.measured(sizes, seconds, done)
-    _shown(result, processes.tables(result), output, as_json)
+    _written(result, processes.tables(result), output, as_json)
 
 
 def conduct(
     experiment: "Experiment", seeds: int, jobs: int | None, output: Path, as_json: bool
 ) -> None:
     """Runs, writes and shows one experiment. Raises ValueError for what the user can mend."""
-    from rich.console import Console
-
     from cpcbl_launch.experiments.runs import run_all
-    from cpcbl_launch.options import encoded, folder_for, must_draw
+    from cpcbl_launch.options import folder_for, must_draw
 
     must_draw("experiment")
     folder_for("--output", output)
@@ -167,35 +153,33 @@ def conduct(
     with _progress(experiment.name, len(cases) * seeds) as done:
         results = run_all(cases, range(1, seeds + 1), jobs or os.cpu_count() or 1, done)
     outcome = experiment.outcome(results)
-    text = encoded(outcome) + "\n"
-    (output / f"{experiment.name}.json").write_text(text, encoding="utf-8")
-    experiment.draw(outcome, output / f"{experiment.name}.png")
-    if as_json:
-        sys.stdout.write(text)
-        return
-    console = Console()
-    for shown in experiment.tables(outcome):
-        console.print(shown, highlight=False)
-    console.print(f"written: {output / experiment.name}.json, .png", highlight=False)
+    _written(outcome, experiment.tables(outcome), output, as_json, experiment.draw)
 
 
-def _shown(
-    result: "Latency | Processes", tables: "Iterable[RenderableType]", output: Path, as_json: bool
+def _written(
+    result: Any,
+    tables: "Iterable[RenderableType]",
+    output: Path,
+    as_json: bool,
+    draw: Callable[[Any, Path], None] | None = None,
 ) -> None:
-    """Writes and shows what was measured on this machine."""
+    """Writes what came out, a picture too where one is drawn, and shows it."""
     from rich.console import Console
 
     from cpcbl_launch.options import encoded
 
-    text = encoded(result) + "\n"
-    (output / f"{result.experiment}.json").write_text(text, encoding="utf-8")
+    text, name = encoded(result) + "\n", output / result.experiment
+    Path(f"{name}.json").write_text(text, encoding="utf-8")
+    if draw is not None:
+        draw(result, Path(f"{name}.png"))
     if as_json:
         sys.stdout.write(text)
         return
     console = Console()
     for shown in tables:
         console.print(shown, highlight=False)
-    console.print(f"written: {output / result.experiment}.json", highlight=False)
+    pictured = ", .png" if draw is not None else ""
+    console.print(f"written: {name}.json{pictured}", highlight=False)
 
 
 @contextmanager

@@ -11,7 +11,7 @@ import math
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from multiprocessing import get_context
-from typing import NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -36,6 +36,7 @@ LOOPS = 5
 MOST_RESTARTS = 30
 OTHER_NOISE = 1_000_003  # from the seed of one attempt to that of the next
 Key = TypeVar("Key", bound=Hashable)
+Result = TypeVar("Result")
 
 
 class Case(NamedTuple):
@@ -143,22 +144,34 @@ def _errors(samples: Samples) -> Floats:
 def run_all(
     cases: Mapping[Key, Case], seeds: Sequence[int], jobs: int, done: Callable[[], None]
 ) -> dict[Key, list[Run]]:
-    """All cases with all seeds; `done` is called after each run. The order in which processes come
-    through changes nothing."""
+    """All cases with all seeds; `done` is called after each run."""
+    tasks = [(case, seed) for case in cases.values() for seed in seeds]
+    runs = in_processes(run, tasks, jobs, done)
+    return {key: runs[i * len(seeds) : (i + 1) * len(seeds)] for i, key in enumerate(cases)}
+
+
+def in_processes(
+    function: Callable[..., Result],
+    tasks: Sequence[tuple[Any, ...]],
+    jobs: int,
+    done: Callable[[], None],
+) -> list[Result]:
+    """What the function makes of each task's arguments, in their order, `jobs` at a time; `done`
+    is called after each. The order in which processes come through changes nothing."""
     if jobs == 1:
-        return {key: [_told(done, run(case, s)) for s in seeds] for key, case in cases.items()}
+        return [_told(done, function(*task)) for task in tasks]
     with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
-        futures = {key: [pool.submit(run, case, s) for s in seeds] for key, case in cases.items()}
+        futures = [pool.submit(function, *task) for task in tasks]
         try:
-            for future in as_completed(f for some in futures.values() for f in some):
+            for future in as_completed(futures):
                 future.result()
                 done()
         except BaseException:
             pool.shutdown(cancel_futures=True)
             raise
-        return {key: [f.result() for f in some] for key, some in futures.items()}
+        return [future.result() for future in futures]
 
 
-def _told(done: Callable[[], None], result: Run) -> Run:
+def _told(done: Callable[[], None], result: Result) -> Result:
     done()
     return result

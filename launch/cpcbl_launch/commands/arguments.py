@@ -1,0 +1,55 @@
+"""Arguments and options that several commands have in common."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Optional
+
+import typer
+
+if TYPE_CHECKING:
+    from cpcbl_team.config import Team
+
+TeamFile = Annotated[Path, typer.Option("--team", help="Team file (TOML).")]
+TeamArgument = Annotated[
+    Optional[Path], typer.Argument(help="Team file, or a built-in one: demo (default).")
+]
+Blind = Annotated[str, typer.Option(help="Robots that shall not see landmarks, e.g. 3,4,5.")]
+BytesPerS = Annotated[
+    Optional[float],
+    typer.Option(
+        min=0.0, help="Budget of each robot for fixes and beliefs, on its link; 0: no limit."
+    ),
+]
+MessagesPerMinute = Annotated[
+    Optional[float],
+    typer.Option(min=0.0, help="The same in messages; 0: no limit."),
+]
+MatchMessages = Annotated[
+    Optional[int],
+    typer.Option(min=0, help="The team's fixes and beliefs in a match; 0: no limit."),
+]
+ReportFile = Annotated[Optional[Path], typer.Option(help="Write the report to this file (JSON).")]
+PictureFile = Annotated[
+    Optional[Path], typer.Option(help="Draw it into this file (PNG or SVG; extra `plot`).")
+]
+AsJson = Annotated[bool, typer.Option("--json", help="Print the report as JSON.")]
+Connect = Annotated[
+    Optional[list[str]],
+    typer.Option(help="Endpoint of the router, e.g. tcp/192.168.1.10:7447; default: the file's."),
+]
+ClockText = Annotated[str, typer.Option("--clock", hidden=True)]
+Parent = Annotated[Optional[int], typer.Option(hidden=True)]
+
+
+def load(path: Path) -> "Team":
+    """The team in a file, or one that comes with the package by its name. Raises TeamFileError."""
+    from cpcbl_launch.team_file import builtin, load_team
+
+    own = builtin(path.name)
+    return load_team(
+        own if not path.exists() and path == Path(path.name) and own.exists() else path
+    )
+
+
+def names_in(text: str) -> list[str]:
+    """The names of a list with commas."""
+    return [name.strip() for name in text.split(",") if name.strip()]

@@ -1,0 +1,223 @@
+"""Commands that measure: real logs, calibration, a simulated team in one process."""
+
+import sys
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated, Optional
+
+import typer
+
+from cpcbl_launch.commands.arguments import (
+    AsJson,
+    Blind,
+    BytesPerS,
+    MatchMessages,
+    MessagesPerMinute,
+    PictureFile,
+    ReportFile,
+    TeamArgument,
+    load,
+    names_in,
+)
+
+
+class VariantName(StrEnum):
+    joint = "joint"
+    oval = "oval"
+    circular = "circular"
+    weighted = "weighted"
+
+
+class Kinds(StrEnum):
+    none = "none"
+    passive = "passive"
+    active = "active"
+    both = "both"
+
+
+class FusionName(StrEnum):
+    naive = "naive"
+    split_ci = "split-ci"
+
+
+class DirectionName(StrEnum):
+    one_way = "one-way"
+    both_ways = "both-ways"
+
+
+def evaluate_mrclam(
+    data: Annotated[Path, typer.Argument(help="Folder of one data set, e.g. MRCLAM6.")],
+    team_file: Annotated[
+        Optional[Path],
+        typer.Option("--team", help="Team file; default: the built-in mrclam without this log."),
+    ] = None,
+    blind: Blind = "",
+    variant: Annotated[Optional[VariantName], typer.Option(help="For all robots.")] = None,
+    collaboration: Annotated[Optional[Kinds], typer.Option(help="For all robots.")] = None,
+    fusion: Annotated[Optional[FusionName], typer.Option(help="For all robots.")] = None,
+    direction: Annotated[Optional[DirectionName], typer.Option(help="For all robots.")] = None,
+    bytes_per_s: BytesPerS = None,
+    messages_per_minute: MessagesPerMinute = None,
+    match_messages: MatchMessages = None,
+    duration: Annotated[
+        Optional[float], typer.Option(help="Seconds of the log; default: all.")
+    ] = None,
+    yardstick: Annotated[
+        bool,
+        typer.Option(help="Also dead reckoning, a solo EKF a robot, a centralized EKF."),
+    ] = False,
+    export: Annotated[
+        Optional[Path],
+        typer.Option(help="Write estimates and truth into this folder (TUM files, as evo reads)."),
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Five robots of a real log (UTIAS MRCLAM) against its ground truth."""
+    from rich.console import Console
+
+    from cpcbl_launch import logs as real_logs
+    from cpcbl_launch.evaluation import Choice, chosen, evaluated
+    from cpcbl_launch.options import encoded, folder_for
+    from cpcbl_launch.show import print_report, progress_bar
+    from cpcbl_launch.tum import export_tum
+
+    team = load(team_file or real_logs.builtin_for(data))
+    choice = Choice(
+        variant,
+        collaboration,
+        fusion,
+        direction,
+        bytes_per_s,
+        messages_per_minute,
+        match_messages,
+    )
+    logged = real_logs.on_log(chosen(team, choice), data)
+    logged = logged._replace(team=real_logs.blinded(logged.team, names_in(blind)))
+    logged = real_logs.shortened(logged, duration)
+    folder = None if export is None else folder_for("--export", export)
+    with progress_bar(f"{data.name}", quiet=as_json) as progress:
+        result, paths = evaluated(logged, progress, with_yardsticks=yardstick)
+    if folder is not None:
+        export_tum(folder, paths, logged.truth)
+    if as_json:
+        typer.echo(encoded(result))
+    else:
+        print_report(result, Console())
+
+
+def calibrate(
+    logs: Annotated[
+        list[Path], typer.Argument(help="MRCLAM folders, or recordings of `up --record` (.mcap).")
+    ],
+    team_file: Annotated[
+        Optional[Path],
+        typer.Option(
+            "--team", help="Team file to add types to; default: the recorded team, or mrclam."
+        ),
+    ] = None,
+    output: Annotated[Path, typer.Option(help="Team file to write.")] = Path("calibrated.toml"),
+    margin: Annotated[
+        float,
+        typer.Option(min=0.0, help="Share by which noise is written larger: days differ."),
+    ] = 0.5,
+    picture: Annotated[
+        Optional[Path],
+        typer.Option(help="Draw residuals into this file (PNG or SVG; extra `plot`)."),
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Estimate odometry and sensor errors from logs with truth, as types of a team file."""
+    from rich.console import Console
+
+    from cpcbl_launch.calibration.logs import read_logs
+    from cpcbl_launch.calibration.robots import calibrated
+    from cpcbl_launch.calibration.show import print_calibration
+    from cpcbl_launch.calibration.team_text import base_text, team_text
+    from cpcbl_launch.options import encoded, must_draw
+    from cpcbl_launch.show import progress_bar
+
+    if picture is not None:
+        must_draw("--picture")
+    base, base_name = base_text(logs, team_file)
+    names = [log.resolve().name for log in logs]
+    robot_logs = read_logs(logs)
+    with progress_bar("calibrating", quiet=as_json) as progress:
+        result = calibrated(robot_logs, names, progress)
+    output.write_text(team_text(result, base, base_name, margin), encoding="utf-8")
+    if picture is not None:
+        from cpcbl_launch.calibration.picture import draw_residuals
+
+        draw_residuals(robot_logs, result, picture)
+    if as_json:
+        typer.echo(encoded(result))
+    else:
+        print_calibration(result, Console())
+        typer.echo(f"written: {output}")
+
+
+def simulate(
+    file: TeamArgument = None,
+    robots: Annotated[
+        str,
+        typer.Option(help="No FILE: generated teams of these sizes, e.g. 2,10,50,200,1000."),
+    ] = "",
+    duration: Annotated[
+        Optional[float],
+        typer.Option(help="Seconds of robot time; default: 5 with --robots, else 30."),
+    ] = None,
+    seed: Annotated[int, typer.Option(help="Of the noise, and of generated teams.")] = 1,
+    bytes_per_s: BytesPerS = None,
+    messages_per_minute: MessagesPerMinute = None,
+    match_messages: MatchMessages = None,
+    report: ReportFile = None,
+    picture: PictureFile = None,
+    as_json: AsJson = False,
+) -> None:
+    """Run a simulated team in one process, without Zenoh: deterministic for a seed.
+
+    With a team file: the report of `up`. With --robots: what a robot costs in
+    teams of each size, on a field that grows with them. Measured are the fixes
+    and beliefs that it sends and receives, and the CPU time of its own steps;
+    simulating the field is apart.
+    """
+    from rich.console import Console
+
+    from cpcbl_launch.evaluation import Choice, chosen
+    from cpcbl_launch.options import encoded, file_for, must_draw
+    from cpcbl_launch.recorder import Report
+    from cpcbl_launch.scale.measure import DURATION_S, Scale, measured, parsed_sizes
+    from cpcbl_launch.scale.show import print_scale
+    from cpcbl_launch.show import print_report, progress_bar
+    from cpcbl_launch.up import Run, simulate_run
+
+    budgets = Choice(
+        bytes_per_s=bytes_per_s,
+        messages_per_minute=messages_per_minute,
+        match_messages=match_messages,
+    )
+    if file is not None and robots:
+        raise ValueError("simulate: FILE or --robots, which generates its teams; leave one out")
+    if robots and budgets != Choice():
+        raise ValueError("simulate: generated teams have no budgets; name a team file instead")
+    if report is not None:
+        file_for("--report", report)
+    if picture is not None:
+        file_for("--picture", picture)
+        must_draw("--picture", picture)
+    result: Report | Scale
+    with progress_bar("simulating", quiet=as_json) as progress:
+        if robots:
+            duration = DURATION_S if duration is None else duration
+            result = measured(parsed_sizes(robots), seed, duration, progress, picture)
+        else:
+            team = chosen(load(file or Path("demo")), budgets)
+            run = Run(team, duration, seed=seed, picture=picture)
+            result = simulate_run(run, progress)
+    if report is not None:
+        report.write_text(encoded(result), encoding="utf-8")
+    if as_json:
+        sys.stdout.write(encoded(result) + "\n")
+    elif isinstance(result, Scale):
+        print_scale(result, Console())
+    else:
+        print_report(result, Console())

@@ -1,0 +1,164 @@
+"""Commands that run a team, or a part of one."""
+
+import shlex
+import sys
+from pathlib import Path
+from typing import Annotated, Optional
+
+import typer
+
+from cpcbl_launch.commands.arguments import (
+    AsJson,
+    Blind,
+    BytesPerS,
+    ClockText,
+    Connect,
+    MatchMessages,
+    MessagesPerMinute,
+    Parent,
+    ReportFile,
+    TeamFile,
+    load,
+    names_in,
+)
+
+
+def check(
+    file: Annotated[Path, typer.Argument(help="Team file (TOML).")],
+) -> None:
+    """Validate a team file without starting anything."""
+
+    team = load(file)
+    marks, walls = len(team.map.landmarks), len(team.map.walls)
+    typer.echo(
+        f"{file}: good: team {team.name!r}, {len(team.robots)} robots"
+        f" ({', '.join(team.robots)}), {marks} landmarks, {walls} walls"
+    )
+
+
+def up(
+    file: Annotated[
+        Optional[Path], typer.Argument(help="Team file, or a built-in one: demo (default), mrclam.")
+    ] = None,
+    duration: Annotated[
+        Optional[float],
+        typer.Option(help="Seconds of robot time; default: 30 simulated, or the whole log."),
+    ] = None,
+    speed: Annotated[float, typer.Option(min=0.05, help="Times real time.")] = 1.0,
+    seed: Annotated[int, typer.Option(help="Of the simulated noise.")] = 1,
+    data: Annotated[
+        Optional[Path], typer.Option(help="Folder of an MRCLAM log, for source mrclam.")
+    ] = None,
+    blind: Blind = "",
+    robots: Annotated[
+        str, typer.Option(help="Robots to start on this machine; default: all.")
+    ] = "",
+    bytes_per_s: BytesPerS = None,
+    messages_per_minute: MessagesPerMinute = None,
+    match_messages: MatchMessages = None,
+    report: ReportFile = None,
+    picture: Annotated[
+        Optional[Path],
+        typer.Option(help="Draw paths and errors into this file (PNG or SVG; extra `plot`)."),
+    ] = None,
+    record: Annotated[
+        Optional[Path],
+        typer.Option(help="Record inputs, tracks, status and truth into this file (MCAP)."),
+    ] = None,
+    logs: Annotated[
+        Optional[Path], typer.Option(help="Keep the processes' logs in this folder.")
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Start a team: the field, a process per robot, a live table, a report at the end."""
+    from rich.console import Console
+
+    from cpcbl_agents.process import Stop
+    from cpcbl_launch import logs as real_logs
+    from cpcbl_launch.evaluation import Choice, chosen
+    from cpcbl_launch.options import encoded, must_draw
+    from cpcbl_launch.show import LiveTable, print_report
+    from cpcbl_launch.up import SIMULATED_S, Run, dialled, listening, run_team
+
+    typed = file or Path("demo")
+    if file == Path("mrclam") and data is not None and not file.exists():
+        file = real_logs.builtin_for(data)
+    team = listening(load(file or Path("demo")))
+    budgets = Choice(
+        bytes_per_s=bytes_per_s,
+        messages_per_minute=messages_per_minute,
+        match_messages=match_messages,
+    )
+    team = chosen(team, budgets)
+    if picture is not None:
+        must_draw("--picture")
+    run = Run(team, duration, speed, seed, folder=logs, picture=picture, record=record)
+    if any(robot.source == "mrclam" for robot in team.robots.values()):
+        logged = real_logs.on_log(team, Path(data or team.data or "."))
+        run = run._replace(
+            team=logged.team,
+            truth=logged.truth,
+            left_out=logged.left_out,
+            epoch_ns=logged.start_ns,
+            duration_s=min(duration or 1e9, (logged.end_ns - logged.start_ns) * 1e-9),
+        )
+    elif duration is None:
+        run = run._replace(duration_s=SIMULATED_S)
+    run = run._replace(team=real_logs.blinded(run.team, names_in(blind)))
+    if robots:
+        run = run._replace(here=names_in(robots))
+    console = Console(stderr=as_json)
+    title = f"team {team.name}, {len(run.team.robots)} robots, {speed:g} x real time"
+    watch = ["cpcbl-team", "traffic", str(typed), "--connect", dialled(team.transport.listen[0])]
+    console.print(f"watch it: {shlex.join(watch)}", style="dim", highlight=False, soft_wrap=True)
+    with LiveTable(title, console, quiet=as_json) as table:
+        result = run_team(run, table, Stop())
+    if report is not None:
+        report.write_text(encoded(result), encoding="utf-8")
+    if as_json:
+        sys.stdout.write(encoded(result) + "\n")
+    else:
+        print_report(result, console)
+
+
+def robot(
+    name: Annotated[str, typer.Argument(help="The robot's name in the team file.")],
+    team_file: TeamFile,
+    connect: Connect = None,
+    clock: ClockText = "",
+    parent: Parent = None,
+    restarted: Annotated[
+        bool, typer.Option(help="It does not know where it is: find the pose first.")
+    ] = False,
+) -> None:
+    """Run one robot, on any machine, until SIGINT or SIGTERM."""
+    from cpcbl_agents.clock import Clock
+    from cpcbl_agents.process import Stop, run_robot
+    from cpcbl_launch.team_file import TeamFileError
+
+    team = load(team_file)
+    if name not in team.robots:
+        raise TeamFileError(
+            f"{team_file}: robots.{name}: not in the file; it has: {', '.join(team.robots)}"
+        )
+    when = Clock.parse(clock) if clock else Clock.wall()
+    run_robot(name, team, connect or team.transport.connect, when, Stop(parent), restarted)
+
+
+def field(
+    team_file: TeamFile,
+    seed: Annotated[int, typer.Option(help="Of the noise.")] = 1,
+    connect: Connect = None,
+    clock: ClockText = "",
+    parent: Parent = None,
+) -> None:
+    """Run the simulated field until SIGINT or SIGTERM."""
+    from cpcbl_agents.clock import Clock
+    from cpcbl_agents.process import Stop
+    from cpcbl_launch.field import run_field
+    from cpcbl_transport.zenoh_bus import open_bus
+
+    team = load(team_file)
+    stop = Stop(parent)
+    with open_bus(team.name, connect or team.transport.connect, stop) as bus:
+        run_field(team, seed, bus, Clock.parse(clock) if clock else Clock.wall(), stop)
