@@ -1,9 +1,11 @@
 """A robot on a bus: which keys it hears, what it may send, what it refuses."""
 
+import logging
 from collections import Counter, deque
 from collections.abc import Callable, Iterable
+from typing import Protocol
 
-from cpcbl_agents.agent import Listened, Presence, Sent, Tick
+from cpcbl_agents.agent import Listened, Presence, Sent, Stranger, Tick
 from cpcbl_agents.robot import Robot
 from cpcbl_agents.tally import Tallies
 from cpcbl_agents.wiring import Tokens, Wiring
@@ -25,8 +27,25 @@ from cpcbl_transport.messages import (
 from cpcbl_transport.overhead import sent_bytes
 from cpcbl_transport.topics import Topic
 
+log = logging.getLogger(__name__)
+
 STATUS_NS = 1_000_000_000
 INBOX = 10_000
+
+
+class Stepped(Protocol):
+    """A robot's node, or whatever else is stepped like one."""
+
+    @property
+    def next_ns(self) -> int:
+        """When there is something to do even if nothing arrives."""
+
+    @property
+    def waiting(self) -> bool:
+        """Whether something has arrived."""
+
+    def step(self, now_ns: int) -> None:
+        """Does what is due and takes what has arrived."""
 
 
 class Node:
@@ -110,8 +129,12 @@ class Node:
             presence = self._tokens.changed(*self._news.popleft())
             if presence is None:
                 self.counts["bad_token"] += 1
-            else:
-                self._robot.handle(Presence(*presence), now_ns)
+                continue
+            guests, (name, tier) = self._robot.collaboration.guests, presence
+            known = name in guests
+            self._robot.handle(Presence(name, tier), now_ns)
+            if known is not (name in guests):
+                log.info("%s: guest %s %s", self._name, name, "left" if known else "joined")
 
     def _ask_for_listeners(self, now_ns: int) -> None:
         tier = self._wiring.tier
@@ -149,7 +172,8 @@ class Node:
                 return refusal(message, now_ns)
             case _:
                 return Refusal.WRONG_TYPE
-        if sender not in self._team:
+        if sender not in self._team and sender not in self._robot.collaboration.guests:
+            self._robot.handle(Stranger(sender), now_ns)
             return Refusal.UNKNOWN_ROBOT
         return Refusal.OWN if sender == self._name else refusal(message, now_ns)
 

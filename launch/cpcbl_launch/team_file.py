@@ -16,6 +16,7 @@ import msgspec
 
 from cpcbl_team.config import (
     Field,
+    GuestSettings,
     Landmark,
     MatchSettings,
     RobotSettings,
@@ -48,6 +49,7 @@ class _File(Table, frozen=True, kw_only=True):
     transport: TransportSettings = TransportSettings()
     match: MatchSettings = MatchSettings()
     simulation: SimulationSettings = SimulationSettings()
+    guests: GuestSettings = GuestSettings()
     calibrated_on: tuple[str, ...] = ()
     data: str = ""
     defaults: Layer = msgspec.field(default_factory=dict)
@@ -92,7 +94,7 @@ def parse_team(text: str, name: str = "team file") -> Team:
     for key in _not_finite(raw):
         raise TeamFileError(f"{name}: {key}: not a finite number; write a finite one")
     file = _converted(raw, _File, "", name)
-    _converted(file.defaults, RobotSettings, "defaults", name)
+    defaults = _converted(file.defaults, RobotSettings, "defaults", name)
     for kind, layer in _named(file.types, "types", name):
         _converted(layer, RobotSettings, f"types.{kind}", name)
     robots = {}
@@ -124,6 +126,8 @@ def parse_team(text: str, name: str = "team file") -> Team:
         transport=file.transport,
         match=file.match,
         simulation=file.simulation,
+        guests=file.guests,
+        defaults=defaults,
         calibrated_on=file.calibrated_on,
         data=file.data,
     )

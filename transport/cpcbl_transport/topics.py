@@ -9,7 +9,7 @@ from enum import Enum
 from typing import NamedTuple
 
 from cpcbl_team.inputs import Belief, Fix, Odometry, Position, Sightings
-from cpcbl_transport.messages import Drive, Message, Status, Track, Truths
+from cpcbl_transport.messages import Drive, Join, Message, Status, Track, Truths
 
 
 class Treatment(NamedTuple):
@@ -120,10 +120,21 @@ DRIVE = Topic(
     Qos.COMMAND,
     "a late command is a collision",
 )
+JOIN = Topic(
+    "field/join/<robot>",
+    Join,
+    "2 Hz of a guest, simulation only",
+    Qos.COMMAND,
+    "without it the field takes the guest's body away; a field that restarts hears it again",
+)
 TRUTH = Topic(
     "field/truth", Truths, "every step, simulation only", Qos.TELEMETRY, "for reports only"
 )
 
-TOPICS = (ALIVE, BELIEF, FIX, STATUS, TRACK, IN_ODOMETRY, IN_SIGHTINGS, IN_POSITION, DRIVE, TRUTH)
+TOPICS = (
+    *(ALIVE, BELIEF, FIX, STATUS, TRACK),
+    *(IN_ODOMETRY, IN_SIGHTINGS, IN_POSITION),
+    *(DRIVE, JOIN, TRUTH),
+)
 INPUTS = (IN_ODOMETRY, IN_SIGHTINGS, IN_POSITION)
 COLLABORATION = (Belief, Fix)
