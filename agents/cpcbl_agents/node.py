@@ -72,7 +72,7 @@ class Node:
         self._listened = ""
         self._status_ns = start_ns
         self.counts: Counter[str] = Counter()
-        self._heard = Tallies()
+        self.heard = Tallies()
         self._inputs = [
             bus.subscribe(topic.at(robot=robot.name), self._arrived) for topic in topics.INPUTS
         ]
@@ -157,9 +157,9 @@ class Node:
         size = sent_bytes(len(payload))
         match message:
             case Fix():
-                self._heard.of("fix", message.observer).add(size, message.stamp_ns)
+                self.heard.of("fix", message.observer).add(size, message.stamp_ns)
             case Belief():
-                self._heard.of("belief", message.robot).add(size, message.stamp_ns)
+                self.heard.of("belief", message.robot).add(size, message.stamp_ns)
         return message
 
     def _refused(self, key: str, message: Message, now_ns: int) -> Refusal | None:
@@ -211,7 +211,7 @@ class Node:
         located = self._robot.collaboration.located
         assert located is not None
         learned = self._robot.filter.learned
-        sent, heard = self._robot.collaboration.tallies.flows(), self._heard.flows()
+        sent, heard = self._robot.collaboration.tallies.flows(), self.heard.flows()
         return Status(
             self._name,
             self._incarnation,

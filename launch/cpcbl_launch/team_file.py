@@ -7,7 +7,7 @@ import difflib
 import math
 import re
 import tomllib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from importlib import resources
 from pathlib import Path
 from typing import Any, get_args, get_type_hints
@@ -134,6 +134,34 @@ def parse_team(text: str, name: str = "team file") -> Team:
     for problem in problems(team):
         raise TeamFileError(f"{name}: {problem}")
     return team
+
+
+def read_layer(path: Path) -> Layer:
+    """A TOML file with the keys of a robot's type, not yet checked. Raises TeamFileError."""
+    try:
+        layer = tomllib.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise TeamFileError(f"{path}: no such file") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise TeamFileError(f"{path}: cannot be read: {error}") from error
+    except tomllib.TOMLDecodeError as error:
+        raise TeamFileError(f"{path}: not TOML: {error}") from error
+    for key in _not_finite(layer):
+        raise TeamFileError(f"{path}: {key}: not a finite number; write a finite one")
+    return layer
+
+
+def beside(team: Team, name: str, layers: Sequence[Layer], source: str) -> Team:
+    """The team with one more robot, by layers over the team's defaults. Its name must be new.
+
+    `source` is what errors call the layers. Raises TeamFileError.
+    """
+    merged = _merged(msgspec.to_builtins(team.defaults), *layers)
+    robot = _converted(merged, RobotSettings, "", source)
+    more = msgspec.structs.replace(team, robots={**team.robots, name: robot})
+    for problem in problems(more):
+        raise TeamFileError(f"{source}: {problem}")
+    return more
 
 
 def problems(team: Team) -> Iterator[str]:
