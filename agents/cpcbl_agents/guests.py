@@ -9,6 +9,7 @@ from collections.abc import Collection
 
 TRIED_NS = 1_000_000_000  # so long a stranger keeps others waiting
 FORGOTTEN_NS = 10_000_000_000  # so long one without a token is remembered after it was noticed
+REMEMBERED = 64  # names of those who found no room, and of those who were looked up in vain
 
 
 class Guests:
@@ -21,6 +22,8 @@ class Guests:
         self._known, self._most = known, most
         self._noticed: dict[str, tuple[int, int]] = {}  # first and last
         self._here: set[str] = set()
+        self._waiting: dict[str, int] = {}  # since when
+        self._vain: dict[str, int] = {}  # until when
         self.counts: Counter[str] = Counter()
 
     def __contains__(self, name: object) -> bool:
@@ -36,24 +39,28 @@ class Guests:
         """Somebody of this name was seen or heard; whether he is followed from now on."""
         if name in self._known or not self._most:
             return False
-        if name not in self._noticed and not self._has_room(stamp_ns):
+        if name not in self._noticed and not self._has_room(name, stamp_ns):
             self.counts["guest_refused"] += 1
             return False
         first_ns, last_ns = self._noticed.get(name, (stamp_ns, stamp_ns))
         self._noticed[name] = first_ns, max(last_ns, stamp_ns)
         return True
 
-    def _has_room(self, now_ns: int) -> bool:
-        """A stranger who was looked up for long enough makes room for the next one."""
+    def _has_room(self, name: str, now_ns: int) -> bool:
+        """Whether there is room, or a stranger who was looked up for long enough makes it: for a
+        name that comes again, as garbage hardly does, and that was not looked up in vain itself."""
         if len(self._noticed) < self._most:
             return True
         strangers = {n: first for n, (first, _) in self._noticed.items() if n not in self._here}
-        if not strangers:
+        since_ns = self._waiting.get(name, now_ns)
+        _remember(self._waiting, name, since_ns)
+        if not strangers or since_ns == now_ns or now_ns < self._vain.get(name, now_ns):
             return False
         oldest = min(strangers, key=strangers.__getitem__)
         if now_ns - strangers[oldest] < TRIED_NS:
             return False
         del self._noticed[oldest]
+        _remember(self._vain, oldest, now_ns + FORGOTTEN_NS)
         return True
 
     def present(self, name: str, there: bool) -> None:
@@ -71,3 +78,11 @@ class Guests:
         for name in [n for n, (_, last) in self._noticed.items() if last < old_ns]:
             if name not in self._here:
                 del self._noticed[name]
+
+
+def _remember(names: dict[str, int], name: str, time_ns: int) -> None:
+    """The latest few."""
+    names.pop(name, None)
+    names[name] = time_ns
+    if len(names) > REMEMBERED:
+        del names[next(iter(names))]

@@ -109,14 +109,8 @@ def up(
         run = run._replace(here=names_in(robots))
     console = Console(stderr=as_json)
     title = f"team {team.name}, {len(run.team.robots)} robots, {speed:g} x real time"
-    there = ["--connect", dialled(team.transport.listen[0])]
-    lines = {"watch it": ["cpcbl-team", "traffic", str(typed), *there]}
-    if team.guests.allowed and "simulated" in {r.source for r in team.robots.values()}:
-        observer = ["cpcbl-team", "observer", "NAME", "--at", "X,Y,DEG", "--team", str(typed)]
-        lines["join it"] = [*observer, *there]
-    for what, line in lines.items():
-        text = f"{what}: {shlex.join(line)}"
-        console.print(text, style="dim", highlight=False, soft_wrap=True)
+    watch = ["cpcbl-team", "traffic", str(typed), "--connect", dialled(team.transport.listen[0])]
+    console.print(f"watch it: {shlex.join(watch)}", style="dim", highlight=False, soft_wrap=True)
     with LiveTable(title, run.team.robots, console, quiet=as_json) as table:
         result = run_team(run, table, Stop())
     if report is not None:
