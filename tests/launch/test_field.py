@@ -43,6 +43,9 @@ ALL_ROUND = SensorSettings(field_of_view_deg=360.0, rate_hz=50.0)
 EVERY_STEP = OdometrySettings(rate_hz=50.0)
 
 
+LOOP = ((3.0, 0.0), (3.0, 2.0), (0.0, 2.0), (0.0, 0.0))
+
+
 def robot(x_m: float = 0.0, y_m: float = 0.0, heading_deg: float = 0.0, **more: Any) -> Any:
     """A robot of which odometry and frames are due at every step."""
     start = Start(x_m=x_m, y_m=y_m, heading_deg=heading_deg, sigma_m=0.0, heading_sigma_deg=0.0)
@@ -753,3 +756,35 @@ def test_a_sensor_that_never_errs_stops_no_robot(
     variances = [t.covariance[i] for t in tracks if t.covariance is not None for i in (0, 2, 5)]
     assert min(variances, default=0.0) >= 0.0
     assert [r.samples > 190 for r in report.robots.values()] == [True, True]
+
+
+@pytest.mark.parametrize("delay_s", [0.0, 0.3])
+def test_a_position_sensor_keeps_a_robot_that_sees_nothing_on_its_way(delay_s: float) -> None:
+    """However late it is, as long as the settings say so."""
+    sensor = PositionSensor(sigma_m=0.03, rate_hz=5.0, delay_s=delay_s)
+    blind = SensorSettings(sees_landmarks=False, sees_robots=False)
+    start = Start(x_m=0.0, y_m=0.0)
+    robots = {
+        "by_dead_reckoning": RobotSettings(start=start, sensor=blind, waypoints_m=LOOP),
+        "with_gps": RobotSettings(
+            start=start, sensor=blind, waypoints_m=LOOP, position_sensor=sensor
+        ),
+    }
+    believed = Team(name="t", robots=robots)
+    report, _ = simulate(believed, 2, 60.0)
+    with_gps = report.robots["with_gps"]
+    assert with_gps.position_rmse_m is not None
+    assert with_gps.position_rmse_m < 0.05
+    assert with_gps.inside_3_sigma is not None
+    assert with_gps.inside_3_sigma > 0.95
+    reckoning = report.robots["by_dead_reckoning"].position_rmse_m
+    assert reckoning is not None
+    assert reckoning > 0.1
+    if delay_s:
+        prompt = msgspec.structs.replace(sensor, delay_s=0.0)
+        unaware = msgspec.structs.replace(robots["with_gps"], position_sensor=prompt)
+        other = msgspec.structs.replace(believed, robots={**robots, "with_gps": unaware})
+        wrong, _ = simulate(other, 2, 60.0, truth=believed)
+        misled = wrong.robots["with_gps"].position_rmse_m
+        assert misled is not None
+        assert misled > 1.5 * with_gps.position_rmse_m
