@@ -26,6 +26,7 @@ from cpcbl_team.config import (
     Wall,
 )
 from cpcbl_team.inputs import NAME_PATTERN, Name
+from cpcbl_transport.security import PROTOCOLS
 
 Layer = dict[str, Any]
 
@@ -75,7 +76,16 @@ def load_team(path: Path) -> Team:
             return msgspec.json.decode(text, type=Team)
         except msgspec.MsgspecError as error:
             raise TeamFileError(f"{path}: {error}") from error
-    return parse_team(text, str(path))
+    team = parse_team(text, str(path))
+    if not team.transport.secured:
+        return team
+    transport = msgspec.structs.replace(team.transport, keys=str(key_folder(team, path)))
+    return msgspec.structs.replace(team, transport=transport)
+
+
+def key_folder(team: Team, path: Path) -> Path:
+    """Where the keys of the team in a file are."""
+    return (path.parent / team.transport.keys).absolute()
 
 
 def save_resolved(team: Team, path: Path) -> None:
@@ -121,7 +131,7 @@ def parse_team(text: str, name: str = "team file") -> Team:
         name=file.name,
         robots=robots,
         map=field,
-        transport=file.transport,
+        transport=_transport(file.transport, raw),
         match=file.match,
         simulation=file.simulation,
         calibrated_on=file.calibrated_on,
@@ -130,6 +140,13 @@ def parse_team(text: str, name: str = "team file") -> Team:
     for problem in problems(team):
         raise TeamFileError(f"{name}: {problem}")
     return team
+
+
+def _transport(transport: TransportSettings, raw: Layer) -> TransportSettings:
+    """Where the file does not say it, a secured router is looked for at the usual port too."""
+    if not transport.secured or "connect" in raw["transport"]:
+        return transport
+    return msgspec.structs.replace(transport, connect=("tls/127.0.0.1:7447",))
 
 
 def problems(team: Team) -> Iterator[str]:
@@ -164,6 +181,12 @@ def problems(team: Team) -> Iterator[str]:
                 yield (
                     f"transport.{key}: {endpoint!r} is no endpoint;"
                     " write it as tcp/192.168.1.10:7447"
+                )
+            elif (endpoint.partition("/")[0] in PROTOCOLS) is not team.transport.secured:
+                has, wants = ("mtls", "tls") if team.transport.secured else ("none", "tcp")
+                yield (
+                    f"transport.{key}: {endpoint!r} does not go with security = {has!r}; write it"
+                    f" as {wants}/{endpoint.partition('/')[2]}, or change transport.security"
                 )
 
 

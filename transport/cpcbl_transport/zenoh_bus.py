@@ -17,6 +17,7 @@ from typing import Any
 import zenoh
 
 from cpcbl_transport.bus import Handle, Publisher, Receive, Watch
+from cpcbl_transport.security import Credentials, link_options
 from cpcbl_transport.topics import Qos, namespace
 
 log = logging.getLogger(__name__)
@@ -30,11 +31,14 @@ class BusError(Exception):
 
 
 def open_bus(
-    team: str, connect: Sequence[str], give_up: Callable[[], bool] = lambda: False
+    team: str,
+    connect: Sequence[str],
+    give_up: Callable[[], bool] = lambda: False,
+    credentials: Credentials | None = None,
 ) -> "ZenohBus":
     """A client's session below the team's namespace; waits for a router until `give_up()`.
 
-    Raises BusError when it gave up.
+    With credentials every link is mutual TLS. Raises BusError when it gave up.
     """
     options = {
         "mode": "client",
@@ -48,6 +52,7 @@ def open_bus(
                 "period_increase_factor": 2,
             },
         },
+        **(link_options(credentials) if credentials else {}),
     }
     reason = "stopped before a router answered"
     while not give_up():
@@ -65,15 +70,17 @@ def open_router(
     listen: Sequence[str],
     connect: Sequence[str] = (),
     guards: Mapping[str, Any] = NO_GUARDS,
+    credentials: Credentials | None = None,
 ) -> "ZenohBus":
     """A session that is the team's router. Raises BusError when it cannot listen there.
 
-    `guards`: what `guard_rules` says; none, and everything is let in.
+    `guards`: what `guard_rules` and `access_rules` say; none, and everything is let in.
     """
     options = {
         "mode": "router",
         "listen": {"endpoints": list(listen), "exit_on_failure": True},
         "connect": {"endpoints": list(connect), "timeout_ms": -1, "exit_on_failure": False},
+        **(link_options(credentials) if credentials else {}),
         **guards,
     }
     try:

@@ -156,9 +156,12 @@ def field(
     from cpcbl_agents.clock import Clock
     from cpcbl_agents.process import Stop
     from cpcbl_launch.field import run_field
+    from cpcbl_transport.security import Identity, link_of
+    from cpcbl_transport.topics import Role
     from cpcbl_transport.zenoh_bus import open_bus
 
     team = load(team_file)
     stop = Stop(parent)
-    with open_bus(team.name, connect or team.transport.connect, stop) as bus:
+    link = link_of(team, Identity(Role.FIELD), connect or team.transport.connect)
+    with open_bus(team.name, link.endpoints, stop, link.credentials) as bus:
         run_field(team, seed, bus, Clock.parse(clock) if clock else Clock.wall(), stop)
