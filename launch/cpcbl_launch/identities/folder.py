@@ -33,7 +33,6 @@ from cpcbl_transport.security import (
     MEMBERS,
     PRIVATE_KEY,
     Identity,
-    Member,
     members_in,
 )
 from cpcbl_transport.topics import Role
