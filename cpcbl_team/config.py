@@ -291,6 +291,11 @@ class TransportSettings(Table, frozen=True, kw_only=True):
     def secured(self) -> bool:
         return self.security == "mtls"
 
+    @property
+    def usual(self) -> tuple[str, ...]:
+        """Where the router of this machine is looked for, unless the file says otherwise."""
+        return ("tls/127.0.0.1:7447",) if self.secured else ("tcp/127.0.0.1:7447",)
+
 
 class MatchSettings(Table, frozen=True, kw_only=True):
     """A limit for a whole match, as in RoboCup: 1,200 messages a team."""

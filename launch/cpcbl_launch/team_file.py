@@ -26,7 +26,7 @@ from cpcbl_team.config import (
     Wall,
 )
 from cpcbl_team.inputs import NAME_PATTERN, Name
-from cpcbl_transport.security import PROTOCOLS
+from cpcbl_transport.security import PROTOCOL
 
 Layer = dict[str, Any]
 
@@ -143,10 +143,10 @@ def parse_team(text: str, name: str = "team file") -> Team:
 
 
 def _transport(transport: TransportSettings, raw: Layer) -> TransportSettings:
-    """Where the file does not say it, a secured router is looked for at the usual port too."""
-    if not transport.secured or "connect" in raw["transport"]:
+    """With the endpoint that is usual, where the file does not name one."""
+    if "connect" in raw.get("transport", {}):
         return transport
-    return msgspec.structs.replace(transport, connect=("tls/127.0.0.1:7447",))
+    return msgspec.structs.replace(transport, connect=transport.usual)
 
 
 def problems(team: Team) -> Iterator[str]:
@@ -182,12 +182,18 @@ def problems(team: Team) -> Iterator[str]:
                     f"transport.{key}: {endpoint!r} is no endpoint;"
                     " write it as tcp/192.168.1.10:7447"
                 )
-            elif (endpoint.partition("/")[0] in PROTOCOLS) is not team.transport.secured:
-                has, wants = ("mtls", "tls") if team.transport.secured else ("none", "tcp")
-                yield (
-                    f"transport.{key}: {endpoint!r} does not go with security = {has!r}; write it"
-                    f" as {wants}/{endpoint.partition('/')[2]}, or change transport.security"
-                )
+            elif reason := _insecure(endpoint, team.transport.secured):
+                yield f"transport.{key}: {endpoint!r}: {reason}"
+
+
+def _insecure(endpoint: str, secured: bool) -> str:
+    """Why an endpoint does not go with the team's security; empty if it does."""
+    protocol, _, where = endpoint.partition("/")
+    if secured and protocol != PROTOCOL:
+        return f'with security = "mtls" every link is TLS; write it as {PROTOCOL}/{where}'
+    if not secured and protocol in ("tls", "quic"):
+        return f'needs certificates; add security = "mtls", or write it as tcp/{where}'
+    return ""
 
 
 def _guard_problems(team: Team) -> Iterator[str]:

@@ -132,7 +132,7 @@ TRACK = Topic(
     "10 Hz while somebody records",
     Qos.TELEMETRY,
     "for reports; costs nothing when nobody listens",
-    _themselves("robot", Role.ROBOT),
+    _themselves("robot"),
 )
 SENSED = (*_themselves("robot"), Speaker(Role.FIELD))  # its own driver, or the simulated field
 IN_ODOMETRY = Topic(
@@ -155,7 +155,7 @@ DRIVE = Topic(
     "10 Hz, simulation only",
     Qos.COMMAND,
     "a late command is a collision",
-    _themselves("robot", Role.ROBOT),
+    _themselves("robot"),
 )
 TRUTH = Topic(
     "field/truth",
