@@ -1,5 +1,6 @@
 """What is to be done to a key folder: who is new, who stays, who gets another certificate."""
 
+import re
 from collections.abc import Collection, Iterator, Sequence
 from enum import StrEnum
 from typing import NamedTuple
@@ -8,6 +9,7 @@ import msgspec
 
 from cpcbl_launch.processes import is_simulated
 from cpcbl_team.config import Team
+from cpcbl_team.inputs import NAME_PATTERN
 from cpcbl_transport.security import Identity, Member
 from cpcbl_transport.topics import Role
 
@@ -43,6 +45,10 @@ def plan(
     Raises ValueError for names that nobody has.
     """
     for name in observers:
+        if not re.fullmatch(NAME_PATTERN, name):
+            raise ValueError(
+                f"--observer {name}: a name has 1 to 32 letters, digits, _, . or -; rename it"
+            )
         if name in team.robots:
             raise ValueError(f"--observer {name}: is a robot of the team; name it otherwise")
     before = {member.identity: member for member in known}
