@@ -21,7 +21,8 @@ from cpcbl_team.inputs import Odometry, Position, Sighting, Sightings
 from cpcbl_team.sensors import LEAST_COSINE
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus, Publisher
-from cpcbl_transport.messages import Drive, Truth, Truths, decode, encode, refusal
+from cpcbl_transport.messages import Drive, Truth, Truths, encode, refusal
+from cpcbl_transport.reading import read
 
 COMMAND_LASTS_NS = 500_000_000
 
@@ -288,7 +289,7 @@ class FieldNode:
 
     def __init__(self, field: SimulatedField, bus: Bus) -> None:
         self._field = field
-        self._drives: deque[bytes] = deque(maxlen=10_000)
+        self._drives: deque[tuple[str, bytes]] = deque(maxlen=10_000)
         self._truth = bus.publisher(topics.TRUTH.at(), topics.TRUTH.qos)
         self._publishers: dict[tuple[str, type], Publisher] = {}
         for name in field.robots:
@@ -296,7 +297,7 @@ class FieldNode:
                 assert topic.carries is not None
                 publisher = bus.publisher(topic.at(robot=name), topic.qos)
                 self._publishers[name, topic.carries] = publisher
-        bus.subscribe(topics.DRIVE.at(), lambda key, payload: self._drives.append(payload))
+        bus.subscribe(topics.DRIVE.at(), lambda *drive: self._drives.append(drive))
 
     @property
     def next_ns(self) -> int:
@@ -309,7 +310,7 @@ class FieldNode:
     def step(self, now_ns: int) -> None:
         """Advances the field to `now_ns` and tells the robots what they sense."""
         while self._drives:
-            drive = decode(self._drives.popleft())
+            drive = read(*self._drives.popleft())
             if isinstance(drive, Drive) and refusal(drive, now_ns) is None:
                 self._field.command(drive)
         while self._field.next_ns <= now_ns:

@@ -25,7 +25,12 @@ def process_table(
         for name in team.robots
         if name in here
     ]
-    if any(robot.source == "simulated" for robot in team.robots.values()):
+    if is_simulated(team):
         field = (*PROGRAM, "field", "--seed", str(seed), *common)
         table.insert(0, ProcessSpec("field", field))
     return table
+
+
+def is_simulated(team: Team) -> bool:
+    """Whether the team has a field of its own."""
+    return any(robot.source == "simulated" for robot in team.robots.values())

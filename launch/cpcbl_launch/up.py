@@ -4,7 +4,7 @@ import logging
 import socket
 import tempfile
 import time
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from types import MappingProxyType
@@ -17,7 +17,7 @@ from cpcbl_agents.clock import Clock
 from cpcbl_launch.evaluation import Progress, simulate
 from cpcbl_launch.logs import seen_before
 from cpcbl_launch.options import check_duration
-from cpcbl_launch.processes import process_table
+from cpcbl_launch.processes import is_simulated, process_table
 from cpcbl_launch.recorder import Recorder, Report
 from cpcbl_launch.recording import Recording
 from cpcbl_launch.supervisor import Supervisor
@@ -26,6 +26,8 @@ from cpcbl_team.config import Team
 from cpcbl_team.metrics import Floats, score
 from cpcbl_transport.bus import Bus
 from cpcbl_transport.guards import guard_rules
+from cpcbl_transport.security import Identity, access_control, link_of
+from cpcbl_transport.topics import Role
 from cpcbl_transport.zenoh_bus import open_router
 
 log = logging.getLogger(__name__)
@@ -68,18 +70,19 @@ class Stopping(Protocol):
     def __call__(self) -> bool: ...
 
 
-def free_endpoint() -> str:
+def free_endpoint(protocol: str = "tcp") -> str:
     """An endpoint of this machine that nobody listens at."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+        return f"{protocol}/127.0.0.1:{probe.getsockname()[1]}"
 
 
 def listening(team: Team) -> Team:
     """The team with an endpoint for its router: its own, or a free one of this machine."""
     if team.transport.listen:
         return team
-    transport = msgspec.structs.replace(team.transport, listen=(free_endpoint(),))
+    endpoint = free_endpoint("tls" if team.transport.secured else "tcp")
+    transport = msgspec.structs.replace(team.transport, listen=(endpoint,))
     return msgspec.structs.replace(team, transport=transport)
 
 
@@ -125,8 +128,14 @@ def _run_in(run: Run, view: View, stop: Stopping, folder: Path) -> Report:
         run.speed,
     )
     table = process_table(team, team_file, dialled(listen[0]), clock, run.seed, here)
-    guards = guard_rules(team, run.speed)
-    with open_router(team.name, listen, guards=guards) as bus, _recording(run, bus):
+    link = link_of(team, Identity(Role.ROUTER), listen)
+    for identity in _started(team, here):  # what one of them would die of is said before any starts
+        link_of(team, identity, listen)
+    guards = guard_rules(team, run.speed) | access_control(team)
+    with (
+        open_router(team.name, listen, guards=guards, credentials=link.credentials) as bus,
+        _recording(run, bus),
+    ):
         recorder = Recorder(bus)
         with Supervisor(table, folder) as supervisor:
             end_ns = None if run.duration_s is None else int(run.duration_s * 1e9)
@@ -140,6 +149,12 @@ def _run_in(run: Run, view: View, stop: Stopping, folder: Path) -> Report:
             elapsed_s = (clock.now_ns() - clock.epoch_ns) * 1e-9
             restarts = supervisor.restarts
     return _report(run, recorder, clock.epoch_ns * 1e-9, elapsed_s, restarts)
+
+
+def _started(team: Team, here: Collection[str]) -> Iterator[Identity]:
+    if is_simulated(team):
+        yield Identity(Role.FIELD)
+    yield from (Identity(Role.ROBOT, name) for name in here)
 
 
 def _recording(run: Run, bus: Bus) -> AbstractContextManager[object]:

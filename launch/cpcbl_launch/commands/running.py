@@ -156,9 +156,52 @@ def field(
     from cpcbl_agents.clock import Clock
     from cpcbl_agents.process import Stop
     from cpcbl_launch.field import run_field
+    from cpcbl_transport.security import Identity, link_of
+    from cpcbl_transport.topics import Role
     from cpcbl_transport.zenoh_bus import open_bus
 
     team = load(team_file)
     stop = Stop(parent)
-    with open_bus(team.name, connect or team.transport.connect, stop) as bus:
+    link = link_of(team, Identity(Role.FIELD), connect or team.transport.connect)
+    with open_bus(team.name, link.endpoints, stop, link.credentials) as bus:
         run_field(team, seed, bus, Clock.parse(clock) if clock else Clock.wall(), stop)
+
+
+def router(
+    file: Annotated[Optional[Path], typer.Argument(help="Team file.")] = None,
+    listen: Annotated[
+        Optional[list[str]],
+        typer.Option(help="Endpoint to listen at; default: the file's, else tcp/127.0.0.1:7447."),
+    ] = None,
+    connect: Annotated[
+        Optional[list[str]], typer.Option(help="Endpoint of another site's router to join.")
+    ] = None,
+    config: Annotated[
+        Optional[Path], typer.Option(help="No FILE: a configuration of Zenoh (JSON5).")
+    ] = None,
+    print_config: Annotated[
+        bool, typer.Option(help="Print the configuration, for zenohd or --config.")
+    ] = False,
+) -> None:
+    """Run the team's Zenoh router, on any machine, until SIGINT or SIGTERM."""
+    from cpcbl_agents.process import Stop
+    from cpcbl_launch.router import run_router, team_router, written_config
+    from cpcbl_transport.zenoh_bus import read_router_config
+
+    if (file is None) == (config is None):
+        raise ValueError("router: a team FILE, or --config FILE; one of them")
+    if config is not None and (listen or connect):
+        raise ValueError(f"--config {config}: says where it listens and connects; change it there")
+    if config is not None:
+        title, options = f"router of {config}", read_router_config(config)
+    else:
+        assert file is not None
+        team = load(file)
+        title, options = (
+            f"router of team {team.name}",
+            team_router(team, listen or (), connect or ()),
+        )
+    if print_config:
+        typer.echo(written_config(options, title))
+    else:
+        run_router(options, title, Stop())
