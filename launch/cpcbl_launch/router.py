@@ -16,14 +16,16 @@ log = logging.getLogger(__name__)
 LOOK_S = 0.5
 
 
-def team_router(team: Team, listen: Sequence[str], connect: Sequence[str]) -> dict[str, Any]:
+def team_router(
+    team: Team, listen: Sequence[str], connect: Sequence[str], speed: float = 1.0
+) -> dict[str, Any]:
     """The configuration of a team's router; without `listen` where its file says.
 
     A file that does not say gets the endpoint at which robots of this machine look. `connect`:
-    the routers of other sites.
+    the routers of other sites; `speed`: robot time over real time.
     """
     here = listen or team.transport.listen or TransportSettings().connect
-    return router_config(here, connect, guard_rules(team))
+    return router_config(here, connect, guard_rules(team, speed))
 
 
 def written_config(config: Mapping[str, Any], title: str) -> str:
