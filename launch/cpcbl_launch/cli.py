@@ -7,6 +7,7 @@ import typer
 
 from cpcbl_launch.commands.deploying import compose
 from cpcbl_launch.commands.measuring import calibrate, evaluate_mrclam, simulate
+from cpcbl_launch.commands.observing import observer
 from cpcbl_launch.commands.running import check, field, robot, router, up
 from cpcbl_launch.commands.securing import keys
 from cpcbl_launch.commands.watching import traffic
@@ -23,6 +24,7 @@ for command in (
     up,
     traffic,
     robot,
+    observer,
     router,
     field,
     compose,
