@@ -163,6 +163,7 @@ JOIN = Topic(
     "2 Hz of a guest, simulation only",
     Qos.COMMAND,
     "without it the field takes the guest's body away; a field that restarts hears it again",
+    _themselves("robot", Role.OBSERVER),
 )
 TRUTH = Topic(
     "field/truth",
