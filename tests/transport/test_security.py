@@ -4,6 +4,7 @@ import json
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
+from statistics import mode
 from typing import Any
 
 import pytest
@@ -18,6 +19,7 @@ from key_helpers import (
     REFUSED_S,
     ROUTER,
     TRIPOD,
+    SealedRelay,
     again,
     lasting,
     router_of,
@@ -33,7 +35,9 @@ from cpcbl_launch.up import free_endpoint
 from cpcbl_team.config import Team
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus
+from cpcbl_transport.compact import FIX_BYTES
 from cpcbl_transport.security import (
+    Credentials,
     Identity,
     Link,
     Member,
@@ -174,7 +178,7 @@ OWN_OBSERVER = {
     *("in/tripod/odometry", "in/tripod/sightings", "in/tripod/position"),
 }
 OWN_FIELD = {
-    "field/truth",
+    *("field/truth", "in/*/odometry"),  # to all robots at once
     *(f"in/{name}/odometry" for name in ("r1", "r2", "tripod")),
     *(f"in/{name}/sightings" for name in ("r1", "r2", "tripod")),
     *(f"in/{name}/position" for name in ("r1", "r2", "tripod")),
@@ -185,6 +189,7 @@ KEYS = sorted(
         *(key.replace("r1", "r2") for key in OWN_ROBOT if "r2" not in key),
         *("fix/r1/3/r2", "fix/tripod/3/r2", "status/r1/more"),
         *("alive/3/r1/1", "anything", "status/router", "in/r1/frame", "field/join/tripod"),
+        *("**", "*/r2", "status/*", "belief/*/*", "fix/*/3/*", "in/*/odometry", "field/**"),
     }
 )
 SAID = {R1: OWN_ROBOT, TRIPOD: OWN_OBSERVER, FIELD: OWN_FIELD, OPERATOR: set[str]()}
@@ -238,6 +243,8 @@ def test_a_token_is_announced_under_ones_own_name_only(team: Team, endpoint: str
             for name in ("r2", "tripod", "r1", own):
                 if name != own or name is None:
                     bus.announce(topics.ALIVE.at(tier=3, robot=name or "r1", incarnation="false"))
+            for pattern in ("**", "alive/**", "alive/3/*/1"):
+                bus.announce(pattern)
             if own is not None:
                 bus.announce(topics.ALIVE.at(tier=3, robot=own, incarnation="true"))
         wait_until(lambda: len(seen) >= 2)
@@ -450,3 +457,48 @@ def test_a_robot_cannot_join_a_router_as_a_router(team: Team, endpoint: str) -> 
         say(false, MARK, b"mark")
         wait_until(lambda: b"mark" in ear.payloads)
         assert ear.payloads == [b"mark"]
+
+
+# What it costs, and what is written about it ----------------------------------------------------
+
+
+def written_at_once(team: Team, secured: bool) -> int:
+    """Bytes of one fix on its sender's link."""
+    endpoint = free_endpoint("tls" if secured else "tcp")
+
+    def shown(identity: Identity) -> Credentials | None:
+        return shown_by(team, identity) if secured else None
+
+    with (
+        open_router(team.name, [endpoint], credentials=shown(ROUTER)),
+        SealedRelay(endpoint) as link,
+        closing(with_credentials(team, shown(R1), link.endpoint, PATIENCE_S)) as robot,
+        closing(with_credentials(team, shown(R2), endpoint, PATIENCE_S)) as mate,
+    ):
+        ear = Ear(mate, "fix/r2/3/*")
+        publisher = robot.publisher("fix/r2/3/r1", Qos.FRESH)
+        wait_until(lambda: publisher.matching)
+        before = len(link.up)
+        for n in range(40):
+            publisher.put(bytes(FIX_BYTES))
+            wait_until(lambda n=n: len(ear.samples) > n)  # type: ignore[misc]
+        return mode(len(batch.content) for batch in link.up[before:])
+
+
+def test_tls_takes_22_bytes_for_what_is_written_at_once(team: Team) -> None:
+    assert written_at_once(team, secured=True) - written_at_once(team, secured=False) == 22
+
+
+def test_the_table_in_the_docs_is_that_of_the_topics() -> None:
+    text = (Path(__file__).parents[2] / "docs" / "security.md").read_text()
+    rows = {
+        f"| `{topic.key}` | "
+        + "; ".join(
+            f"{speaker.role}, own `<{speaker.own}>`" if speaker.own else str(speaker.role)
+            for speaker in topic.said_by
+        )
+        + " |"
+        for topic in topics.TOPICS
+    }
+    table = text.partition("| key | who |\n|---|---|\n")[2].partition("\n\n")[0]
+    assert set(table.splitlines()) == rows
