@@ -5,6 +5,7 @@ import sys
 
 import typer
 
+from cpcbl_launch.commands.deploying import compose
 from cpcbl_launch.commands.measuring import calibrate, evaluate_mrclam, simulate
 from cpcbl_launch.commands.running import check, field, robot, router, up
 from cpcbl_launch.commands.securing import keys
@@ -17,7 +18,7 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
-for command in (check, up, traffic, robot, router, field, calibrate, simulate, keys):
+for command in (check, up, traffic, robot, router, field, compose, calibrate, simulate, keys):
     app.command()(command)
 
 evaluate_app = typer.Typer(help="Real logs in one process: deterministic and fast.")

@@ -18,15 +18,19 @@ log = logging.getLogger(__name__)
 LOOK_S = 0.5
 
 
-def team_router(team: Team, listen: Sequence[str], connect: Sequence[str]) -> dict[str, Any]:
+def team_router(
+    team: Team, listen: Sequence[str], connect: Sequence[str], speed: float = 1.0
+) -> dict[str, Any]:
     """The configuration of a team's router; without `listen` where its file says.
 
     A file that does not say gets the endpoint at which robots of this machine look. `connect`:
-    the routers of other sites. Raises SecurityError without the keys of a secured team.
+    the routers of other sites; `speed`: robot time over real time. Raises SecurityError without the
+    keys of a secured team.
     """
     here = listen or team.transport.listen or team.transport.usual
     _, credentials = link_of(team, Identity(Role.ROUTER), [*here, *connect])
-    return router_config(here, connect, guard_rules(team) | access_control(team), credentials)
+    guards = guard_rules(team, speed) | access_control(team)
+    return router_config(here, connect, guards, credentials)
 
 
 def written_config(config: Mapping[str, Any], title: str) -> str:

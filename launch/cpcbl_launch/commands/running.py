@@ -2,17 +2,21 @@
 
 import shlex
 import sys
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Optional
 
 import typer
 
 from cpcbl_launch.commands.arguments import (
+    BASE_IMAGE,
     AsJson,
+    BaseImage,
     Blind,
     BytesPerS,
     ClockText,
     Connect,
+    Image,
     MatchMessages,
     MessagesPerMinute,
     Parent,
@@ -68,6 +72,11 @@ def up(
     logs: Annotated[
         Optional[Path], typer.Option(help="Keep the processes' logs in this folder.")
     ] = None,
+    containers: Annotated[
+        bool, typer.Option("--containers", help="A container a robot (needs Docker).")
+    ] = False,
+    image: Image = None,
+    base_image: BaseImage = BASE_IMAGE,
     as_json: AsJson = False,
 ) -> None:
     """Start a team: the field, a process per robot, a live table, a report at the end."""
@@ -75,10 +84,19 @@ def up(
 
     from cpcbl_agents.process import Stop
     from cpcbl_launch import logs as real_logs
+    from cpcbl_launch.containers.launch import InContainers, progress_on
     from cpcbl_launch.evaluation import Choice, chosen
     from cpcbl_launch.options import encoded, must_draw
     from cpcbl_launch.show import LiveTable, print_report
-    from cpcbl_launch.up import SIMULATED_S, Run, dialled, listening, run_team
+    from cpcbl_launch.up import (
+        SIMULATED_S,
+        Launch,
+        OnThisMachine,
+        Run,
+        dialled,
+        listening,
+        run_team,
+    )
 
     typed = file or Path("demo")
     if file == Path("mrclam") and data is not None and not file.exists():
@@ -108,11 +126,14 @@ def up(
     if robots:
         run = run._replace(here=names_in(robots))
     console = Console(stderr=as_json)
+    launch: Launch = OnThisMachine
+    if containers:
+        launch = partial(InContainers, image=image, base=base_image, said=progress_on(console))
     title = f"team {team.name}, {len(run.team.robots)} robots, {speed:g} x real time"
     watch = ["cpcbl-team", "traffic", str(typed), "--connect", dialled(team.transport.listen[0])]
     console.print(f"watch it: {shlex.join(watch)}", style="dim", highlight=False, soft_wrap=True)
     with LiveTable(title, console, quiet=as_json) as table:
-        result = run_team(run, table, Stop())
+        result = run_team(run, table, Stop(), launch)
     if report is not None:
         report.write_text(encoded(result), encoding="utf-8")
     if as_json:
@@ -179,6 +200,7 @@ def router(
     config: Annotated[
         Optional[Path], typer.Option(help="No FILE: a configuration of Zenoh (JSON5).")
     ] = None,
+    speed: Annotated[float, typer.Option(hidden=True, help="Guards let more in.")] = 1.0,
     print_config: Annotated[
         bool, typer.Option(help="Print the configuration, for zenohd or --config.")
     ] = False,
@@ -199,7 +221,7 @@ def router(
         team = load(file)
         title, options = (
             f"router of team {team.name}",
-            team_router(team, listen or (), connect or ()),
+            team_router(team, listen or (), connect or (), speed),
         )
     if print_config:
         typer.echo(written_config(options, title))
