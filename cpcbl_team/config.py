@@ -100,6 +100,8 @@ class PositionSensor(Table, frozen=True, kw_only=True):
 
     sigma_m: Positive = 0.02
     rate_hz: Positive = 5.0
+    delay_s: NotNegative = 0.0
+    """Stamps are so much later than the measurement."""
 
 
 class Weights(Table, frozen=True, kw_only=True):
@@ -306,6 +308,14 @@ class MatchSettings(Table, frozen=True, kw_only=True):
     """They are earned evenly over this time."""
 
 
+class GuestSettings(Table, frozen=True, kw_only=True):
+    """Robots that are not in the file but may join the team while it runs, such as observers."""
+
+    allowed: bool = True
+    most: Annotated[int, msgspec.Meta(ge=1, le=100)] = 8
+    """So many at a time are let in by a robot, and by the simulated field."""
+
+
 class SimulationSettings(Table, frozen=True, kw_only=True):
     """The simulated field."""
 
@@ -324,6 +334,9 @@ class Team(Table, frozen=True, kw_only=True):
     transport: TransportSettings = TransportSettings()
     match: MatchSettings = MatchSettings()
     simulation: SimulationSettings = SimulationSettings()
+    guests: GuestSettings = GuestSettings()
+    defaults: RobotSettings = RobotSettings()
+    """The file's layer below its robots: what a guest begins with too."""
     calibrated_on: tuple[str, ...] = ()
     """Logs from which `calibrate` took the robots' types: no measure of their worth."""
     data: str = ""

@@ -1,9 +1,11 @@
 """A robot on a bus: which keys it hears, what it may send, what it refuses."""
 
+import logging
 from collections import Counter, deque
 from collections.abc import Callable, Iterable
+from typing import Protocol
 
-from cpcbl_agents.agent import Listened, Presence, Sent, Tick
+from cpcbl_agents.agent import Listened, Presence, Sent, Stranger, Tick
 from cpcbl_agents.robot import Robot
 from cpcbl_agents.tally import Tallies
 from cpcbl_agents.wiring import Tokens, Wiring
@@ -25,8 +27,25 @@ from cpcbl_transport.messages import (
 from cpcbl_transport.overhead import sent_bytes
 from cpcbl_transport.topics import Topic
 
+log = logging.getLogger(__name__)
+
 STATUS_NS = 1_000_000_000
 INBOX = 10_000
+
+
+class Stepped(Protocol):
+    """A robot's node, or whatever else is stepped like one."""
+
+    @property
+    def next_ns(self) -> int:
+        """When there is something to do even if nothing arrives."""
+
+    @property
+    def waiting(self) -> bool:
+        """Whether something has arrived."""
+
+    def step(self, now_ns: int) -> None:
+        """Does what is due and takes what has arrived."""
 
 
 class Node:
@@ -53,7 +72,7 @@ class Node:
         self._listened = ""
         self._status_ns = start_ns
         self.counts: Counter[str] = Counter()
-        self._heard = Tallies()
+        self.heard = Tallies()
         self._inputs = [
             bus.subscribe(topic.at(robot=robot.name), self._arrived) for topic in topics.INPUTS
         ]
@@ -110,8 +129,12 @@ class Node:
             presence = self._tokens.changed(*self._news.popleft())
             if presence is None:
                 self.counts["bad_token"] += 1
-            else:
-                self._robot.handle(Presence(*presence), now_ns)
+                continue
+            guests, (name, tier) = self._robot.collaboration.guests, presence
+            known = name in guests
+            self._robot.handle(Presence(name, tier), now_ns)
+            if known is not (name in guests):
+                log.info("%s: guest %s %s", self._name, name, "left" if known else "joined")
 
     def _ask_for_listeners(self, now_ns: int) -> None:
         tier = self._wiring.tier
@@ -134,9 +157,9 @@ class Node:
         size = sent_bytes(len(payload))
         match message:
             case Fix():
-                self._heard.of("fix", message.observer).add(size, message.stamp_ns)
+                self.heard.of("fix", message.observer).add(size, message.stamp_ns)
             case Belief():
-                self._heard.of("belief", message.robot).add(size, message.stamp_ns)
+                self.heard.of("belief", message.robot).add(size, message.stamp_ns)
         return message
 
     def _refused(self, key: str, message: Message, now_ns: int) -> Refusal | None:
@@ -149,7 +172,8 @@ class Node:
                 return refusal(message, now_ns)
             case _:
                 return Refusal.WRONG_TYPE
-        if sender not in self._team:
+        if sender not in self._team and sender not in self._robot.collaboration.guests:
+            self._robot.handle(Stranger(sender), now_ns)
             return Refusal.UNKNOWN_ROBOT
         return Refusal.OWN if sender == self._name else refusal(message, now_ns)
 
@@ -187,7 +211,7 @@ class Node:
         located = self._robot.collaboration.located
         assert located is not None
         learned = self._robot.filter.learned
-        sent, heard = self._robot.collaboration.tallies.flows(), self._heard.flows()
+        sent, heard = self._robot.collaboration.tallies.flows(), self.heard.flows()
         return Status(
             self._name,
             self._incarnation,

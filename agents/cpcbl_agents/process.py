@@ -10,7 +10,7 @@ from types import FrameType
 import msgspec
 
 from cpcbl_agents.clock import Clock
-from cpcbl_agents.node import Node
+from cpcbl_agents.node import Node, Stepped
 from cpcbl_agents.robot import Robot
 from cpcbl_team.config import Team
 from cpcbl_transport.security import Identity, link_of
@@ -79,7 +79,7 @@ def run_robot(
         run_node(node, wake, clock, stop)
 
 
-def run_node(node: Node, wake: Wake, clock: Clock, stop: Callable[[], bool]) -> None:
+def run_node(node: Stepped, wake: Wake, clock: Clock, stop: Callable[[], bool]) -> None:
     """Steps a node until `stop()`: when something arrives, which sets `wake`, or is due."""
     node.step(clock.now_ns())
     while not stop():

@@ -7,7 +7,7 @@ import difflib
 import math
 import re
 import tomllib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from importlib import resources
 from pathlib import Path
 from typing import Any, get_args, get_type_hints
@@ -16,6 +16,7 @@ import msgspec
 
 from cpcbl_team.config import (
     Field,
+    GuestSettings,
     Landmark,
     MatchSettings,
     RobotSettings,
@@ -49,6 +50,7 @@ class _File(Table, frozen=True, kw_only=True):
     transport: TransportSettings = TransportSettings()
     match: MatchSettings = MatchSettings()
     simulation: SimulationSettings = SimulationSettings()
+    guests: GuestSettings = GuestSettings()
     calibrated_on: tuple[str, ...] = ()
     data: str = ""
     defaults: Layer = msgspec.field(default_factory=dict)
@@ -102,7 +104,7 @@ def parse_team(text: str, name: str = "team file") -> Team:
     for key in _not_finite(raw):
         raise TeamFileError(f"{name}: {key}: not a finite number; write a finite one")
     file = _converted(raw, _File, "", name)
-    _converted(file.defaults, RobotSettings, "defaults", name)
+    defaults = _converted(file.defaults, RobotSettings, "defaults", name)
     for kind, layer in _named(file.types, "types", name):
         _converted(layer, RobotSettings, f"types.{kind}", name)
     robots = {}
@@ -134,6 +136,8 @@ def parse_team(text: str, name: str = "team file") -> Team:
         transport=_transport(file.transport, raw),
         match=file.match,
         simulation=file.simulation,
+        guests=file.guests,
+        defaults=defaults,
         calibrated_on=file.calibrated_on,
         data=file.data,
     )
@@ -147,6 +151,34 @@ def _transport(transport: TransportSettings, raw: Layer) -> TransportSettings:
     if "connect" in raw.get("transport", {}):
         return transport
     return msgspec.structs.replace(transport, connect=transport.usual)
+
+
+def read_layer(path: Path) -> Layer:
+    """A TOML file with the keys of a robot's type, not yet checked. Raises TeamFileError."""
+    try:
+        layer = tomllib.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise TeamFileError(f"{path}: no such file") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise TeamFileError(f"{path}: cannot be read: {error}") from error
+    except tomllib.TOMLDecodeError as error:
+        raise TeamFileError(f"{path}: not TOML: {error}") from error
+    for key in _not_finite(layer):
+        raise TeamFileError(f"{path}: {key}: not a finite number; write a finite one")
+    return layer
+
+
+def beside(team: Team, name: str, layers: Sequence[Layer], source: str) -> Team:
+    """The team with one more robot, by layers over the team's defaults. Its name must be new.
+
+    `source` is what errors call the layers. Raises TeamFileError.
+    """
+    merged = _merged(msgspec.to_builtins(team.defaults), *layers)
+    robot = _converted(merged, RobotSettings, "", source)
+    more = msgspec.structs.replace(team, robots={**team.robots, name: robot})
+    for problem in problems(more):
+        raise TeamFileError(f"{source}: {problem}")
+    return more
 
 
 def problems(team: Team) -> Iterator[str]:

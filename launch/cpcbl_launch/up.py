@@ -17,13 +17,14 @@ from cpcbl_agents.clock import Clock
 from cpcbl_launch.evaluation import Progress, simulate
 from cpcbl_launch.logs import seen_before
 from cpcbl_launch.options import check_duration
+from cpcbl_launch.phases import Span, guest_reports, phase
 from cpcbl_launch.processes import process_table, tasks
 from cpcbl_launch.recorder import Recorder, Report
 from cpcbl_launch.recording import Recording
 from cpcbl_launch.supervisor import Processes, Supervisor
 from cpcbl_launch.team_file import save_resolved
 from cpcbl_team.config import Team
-from cpcbl_team.metrics import Floats, score
+from cpcbl_team.metrics import Floats
 from cpcbl_transport.bus import Bus
 from cpcbl_transport.guards import guard_rules
 from cpcbl_transport.security import Identity, access_control, link_of
@@ -208,17 +209,18 @@ def _report(
     after_s = max(robot.collaboration.after_s for robot in robots.values())
     helped_from_s = epoch_s + after_s if after_s else None
     variants = {name: robot.localizer.variant for name, robot in robots.items()}
+    begin_s = -np.inf if helped_from_s is None else helped_from_s
+    guests = guest_reports(recorder, list(robots), truth, epoch_s, begin_s)
     if run.picture is not None:
         from cpcbl_launch.picture import draw_run
 
-        draw_run(recorder, run.team, truth, run.picture, helped_from_s)
-    report = recorder.report(variants, truth, helped_from_s or -np.inf)
+        present_s = {name: guest.present_s for name, guest in guests.items()}
+        draw_run(recorder, run.team, truth, run.picture, epoch_s, helped_from_s, present_s)
+    report = recorder.report(variants, truth, begin_s)
     alone = {}
     if helped_from_s is not None:
-        alone = {
-            name: score(recorder.samples(name, truth.get(name), until_s=helped_from_s))
-            for name in robots
-        }
+        until = [Span(until_s=helped_from_s)]
+        alone = {name: phase(recorder, name, truth.get(name), until) for name in robots}
     return msgspec.structs.replace(
         report,
         calibrated_on=run.team.calibrated_on,
@@ -227,4 +229,5 @@ def _report(
         duration_s=elapsed_s,
         restarts=restarts,
         alone=alone,
+        guests=guests,
     )

@@ -182,7 +182,7 @@ OWN_ROBOT = {
 }
 OWN_OBSERVER = {
     *("belief/3/tripod", "fix/r1/3/tripod", "fix/r2/3/tripod", "status/tripod", "track/tripod"),
-    "field/drive/tripod",  # its own body on the simulated field
+    *("field/join/tripod", "field/drive/tripod"),  # its own body on the simulated field
     *("in/tripod/odometry", "in/tripod/sightings", "in/tripod/position"),
 }
 OWN_FIELD = {
@@ -196,7 +196,7 @@ KEYS = sorted(
         *(OWN_ROBOT | OWN_OBSERVER | OWN_FIELD),
         *(key.replace("r1", "r2") for key in OWN_ROBOT if "r2" not in key),
         *("fix/r1/3/r2", "fix/tripod/3/r2", "status/r1/more"),
-        *("alive/3/r1/1", "anything", "status/router", "in/r1/frame", "field/join/tripod"),
+        *("alive/3/r1/1", "anything", "status/router", "in/r1/frame", "field/join/r1"),
         *("**", "*/r2", "status/*", "belief/*/*", "fix/*/3/*", "in/*/odometry", "field/**"),
     }
 )

@@ -10,7 +10,7 @@ from enum import Enum, StrEnum
 from typing import NamedTuple
 
 from cpcbl_team.inputs import Belief, Fix, Odometry, Position, Sightings
-from cpcbl_transport.messages import Drive, Message, Status, Track, Truths
+from cpcbl_transport.messages import Drive, Join, Message, Status, Track, Truths
 
 
 class Treatment(NamedTuple):
@@ -157,6 +157,14 @@ DRIVE = Topic(
     "a late command is a collision",
     _themselves("robot"),
 )
+JOIN = Topic(
+    "field/join/<robot>",
+    Join,
+    "2 Hz of a guest, simulation only",
+    Qos.COMMAND,
+    "without it the field takes the guest's body away; a field that restarts hears it again",
+    _themselves("robot", Role.OBSERVER),
+)
 TRUTH = Topic(
     "field/truth",
     Truths,
@@ -166,6 +174,10 @@ TRUTH = Topic(
     (Speaker(Role.FIELD),),
 )
 
-TOPICS = (ALIVE, BELIEF, FIX, STATUS, TRACK, IN_ODOMETRY, IN_SIGHTINGS, IN_POSITION, DRIVE, TRUTH)
+TOPICS = (
+    *(ALIVE, BELIEF, FIX, STATUS, TRACK),
+    *(IN_ODOMETRY, IN_SIGHTINGS, IN_POSITION),
+    *(DRIVE, JOIN, TRUTH),
+)
 INPUTS = (IN_ODOMETRY, IN_SIGHTINGS, IN_POSITION)
 COLLABORATION = (Belief, Fix)

@@ -132,7 +132,7 @@ def up(
     title = f"team {team.name}, {len(run.team.robots)} robots, {speed:g} x real time"
     watch = ["cpcbl-team", "traffic", str(typed), "--connect", dialled(team.transport.listen[0])]
     console.print(f"watch it: {shlex.join(watch)}", style="dim", highlight=False, soft_wrap=True)
-    with LiveTable(title, console, quiet=as_json) as table:
+    with LiveTable(title, run.team.robots, console, quiet=as_json) as table:
         result = run_team(run, table, Stop(), launch)
     if report is not None:
         report.write_text(encoded(result), encoding="utf-8")
