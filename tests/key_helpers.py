@@ -1,17 +1,18 @@
 """Teams with keys, and sessions that show them."""
 
+import socket
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from datetime import timedelta
 from pathlib import Path
 
 import msgspec
+from wire import Batch, Kind, Relay
 
 from cpcbl_launch.identities.folder import KeysReport, Wish, make_keys
 from cpcbl_launch.up import free_endpoint
 from cpcbl_team.config import Field, RobotSettings, Start, Team, TransportSettings
-from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus
 from cpcbl_transport.guards import guard_rules
 from cpcbl_transport.security import Credentials, Identity, access_control, credentials_in
@@ -71,6 +72,22 @@ def with_credentials(
     return open_bus(team.name, [endpoint], lambda: time.monotonic() > until, credentials)
 
 
-def marker(identity: Identity) -> str:
-    """A key under which this member may speak."""
-    return topics.STATUS.at(robot=identity.name)
+class SealedRelay(Relay):
+    """Between a client and a router like any relay; cannot tell what passes, only how much."""
+
+    def __init__(self, endpoint: str) -> None:
+        self._protocol, where = endpoint.split("/")
+        super().__init__(f"tcp/{where}")
+
+    @property
+    def endpoint(self) -> str:
+        return super().endpoint.replace("tcp/", f"{self._protocol}/")
+
+    def _pass_on(self, source: socket.socket, sink: socket.socket, seen: list[Batch]) -> None:
+        with suppress(OSError):  # either side may leave at any time
+            while data := source.recv(65_536):
+                seen.append(Batch(time.monotonic(), Kind.OTHER, data))
+                sink.sendall(data)
+        for end in (source, sink):
+            with suppress(OSError):
+                end.shutdown(socket.SHUT_RDWR)

@@ -20,17 +20,8 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 for command in (
-    check,
-    up,
-    traffic,
-    robot,
-    observer,
-    router,
-    field,
-    compose,
-    keys,
-    calibrate,
-    simulate,
+    *(check, keys, up, traffic, robot, observer, router, field, compose),
+    *(calibrate, simulate),
 ):
     app.command()(command)
 

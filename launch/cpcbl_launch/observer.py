@@ -168,10 +168,11 @@ def visit(
 ) -> Visited:
     """Runs an observer that `team` holds until `stop()`, or for so many seconds of robot time.
 
-    Raises BusError when stopped before a router answered, ValueError for a name that is taken or
-    keys that are absent.
+    Raises BusError when stopped before a router answered, ValueError for a name that is taken,
+    SecurityError without the keys of a secured team.
     """
-    wake, link = Wake(), link_of(team, Identity(Role.OBSERVER, name), connect)
+    wake = Wake()
+    link = link_of(team, Identity(Role.OBSERVER, name), connect)
     with open_bus(team.name, link.endpoints, stop, link.credentials) as bus:
         _look_for_namesakes(name, bus, stop)
         start_ns = clock.now_ns()

@@ -24,8 +24,8 @@ def team_router(
     """The configuration of a team's router; without `listen` where its file says.
 
     A file that does not say gets the endpoint at which robots of this machine look. `connect`:
-    the routers of other sites; `speed`: robot time over real time. Raises SecurityError without
-    the keys of a secured team.
+    the routers of other sites; `speed`: robot time over real time. Raises SecurityError without the
+    keys of a secured team.
     """
     here = listen or team.transport.listen or team.transport.usual
     _, credentials = link_of(team, Identity(Role.ROUTER), [*here, *connect])

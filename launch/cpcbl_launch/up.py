@@ -4,7 +4,7 @@ import logging
 import socket
 import tempfile
 import time
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from types import MappingProxyType
@@ -18,7 +18,7 @@ from cpcbl_launch.evaluation import Progress, simulate
 from cpcbl_launch.logs import seen_before
 from cpcbl_launch.options import check_duration
 from cpcbl_launch.phases import Span, guest_reports, phase
-from cpcbl_launch.processes import is_simulated, process_table
+from cpcbl_launch.processes import process_table, tasks
 from cpcbl_launch.recorder import Recorder, Report
 from cpcbl_launch.recording import Recording
 from cpcbl_launch.supervisor import Processes, Supervisor
@@ -95,11 +95,10 @@ class OnThisMachine:
 
     def router(self) -> AbstractContextManager[Bus]:
         team, listen = self._run.team, self._run.team.transport.listen
-        link = link_of(team, Identity(Role.ROUTER), listen)
-        for identity in _started(team, self._here):  # said before any dies of it
-            link_of(team, identity, listen)
+        check_keys(team, listen, self._here)
         guards = guard_rules(team, self._run.speed) | access_control(team)
-        return open_router(team.name, listen, guards=guards, credentials=link.credentials)
+        _, credentials = link_of(team, Identity(Role.ROUTER), listen)
+        return open_router(team.name, listen, guards=guards, credentials=credentials)
 
     def processes(self, clock: Clock) -> AbstractContextManager[Processes]:
         team, path = self._run.team, self._folder / "team.json"
@@ -110,6 +109,12 @@ class OnThisMachine:
 
 
 Launch = Callable[[Run, Path, Stopping], Launcher]
+
+
+def check_keys(team: Team, listen: Sequence[str], here: Collection[str]) -> None:
+    """Says what a process would die of before any starts. Raises SecurityError."""
+    for task in tasks(team, (), 0, here):
+        link_of(team, task.identity, listen)
 
 
 def free_endpoint(protocol: str = "tcp") -> str:
@@ -175,12 +180,6 @@ def _run_in(run: Run, view: View, stop: Stopping, folder: Path, launch: Launch) 
             elapsed_s = (clock.now_ns() - clock.epoch_ns) * 1e-9
             restarts = processes.restarts
     return _report(run, recorder, clock.epoch_ns * 1e-9, elapsed_s, restarts)
-
-
-def _started(team: Team, here: Collection[str]) -> Iterator[Identity]:
-    if is_simulated(team):
-        yield Identity(Role.FIELD)
-    yield from (Identity(Role.ROBOT, name) for name in here)
 
 
 def _clock(run: Run, lead_s: float) -> Clock:

@@ -444,6 +444,7 @@ def test_a_real_tripod_is_fed_by_its_own_driver(tmp_path: Path) -> None:
                 lambda: "r1" in heard and any(f.peer == "tripod" for f in heard["r1"].heard)
             )
             assert eventually(lambda: heard["r1"].position_sigma_m < 0.05)
+            assert eventually(lambda: "tripod" in heard)
         finally:
             for process in processes:
                 process.send_signal(signal.SIGINT)

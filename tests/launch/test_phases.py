@@ -3,6 +3,7 @@
 import io
 import math
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,7 +12,8 @@ from rich.console import Console
 
 from cpcbl_launch.phases import AWAY_S, Span, guest_reports, phase, presence, split
 from cpcbl_launch.recorder import MeanScore, Recorder, Report, TeamReport
-from cpcbl_launch.show import print_report
+from cpcbl_launch.show import LiveTable, print_report
+from cpcbl_launch.supervisor import Supervisor
 from cpcbl_team.metrics import Floats
 from cpcbl_transport import topics
 from cpcbl_transport.bus import MemoryHub
@@ -127,3 +129,25 @@ def test_the_report_shows_guests_beside_the_team() -> None:
     assert isinstance(report.team, TeamReport)
     assert isinstance(report.team, MeanScore)
     assert report.team.position_rmse_m == 0.0
+
+
+class NoProcesses(Supervisor):
+    """The robots run on other machines."""
+
+    def __init__(self) -> None:
+        super().__init__([], Path())
+
+
+def test_the_live_table_shows_who_is_a_guest_and_who_has_left() -> None:
+    said, out = Said(), io.StringIO()
+    said.tracks("r1", 0.0, 30.0)
+    said.tracks("a-guest", 10.0, 30.0)
+    said.tracks("another", 10.0, 20.0)
+    with LiveTable("team", ["r1"], Console(file=out, width=80)) as view:
+        view.show(said.recorder, NoProcesses(), 30.0)
+    rows = [line.split() for line in out.getvalue().splitlines()[3:]]
+    assert [(row[0], row[1], row[-1]) for row in rows if row] == [
+        ("r1", "away", "ok"),
+        ("a-guest", "guest", "ok"),
+        ("another", "guest", "left"),
+    ]

@@ -4,6 +4,7 @@ import json
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
+from statistics import mode
 from typing import Any
 
 import pytest
@@ -18,6 +19,7 @@ from key_helpers import (
     REFUSED_S,
     ROUTER,
     TRIPOD,
+    SealedRelay,
     again,
     lasting,
     router_of,
@@ -33,7 +35,9 @@ from cpcbl_launch.up import free_endpoint
 from cpcbl_team.config import Team
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus
+from cpcbl_transport.compact import FIX_BYTES
 from cpcbl_transport.security import (
+    Credentials,
     Identity,
     Link,
     Member,
@@ -103,8 +107,11 @@ def test_with_a_foreign_certificate_there_is_no_session(
     team: Team, endpoint: str, tmp_path: Path
 ) -> None:
     foreign = shown_by(secured_team(tmp_path), R1)
-    for shown in (foreign._replace(ca=shown_by(team, R1).ca), foreign):
-        with pytest.raises(BusError):
+    for shown, reason in (
+        (foreign._replace(ca=shown_by(team, R1).ca), "refuses .*certificate.crt: .* of another"),
+        (foreign, "cannot be trusted: unable to get local issuer"),
+    ):
+        with pytest.raises(BusError, match=reason):
             with_credentials(team, shown, endpoint)
 
 
@@ -113,7 +120,7 @@ def test_with_an_expired_certificate_there_is_no_session(tmp_path: Path) -> None
     lasting(team, "r1", -1.0)
     with router_of(team) as (_, endpoint):
         session(team, R2, endpoint).close()
-        with pytest.raises(BusError):
+        with pytest.raises(BusError, match=r"refuses .*certificate.crt: it has expired"):
             with_credentials(team, shown_by(team, R1), endpoint)
 
 
@@ -136,6 +143,8 @@ def test_a_secured_session_dials_no_plain_router(team: Team) -> None:
         with_credentials(team, None, plain).close()
         with pytest.raises(BusError):
             with_credentials(team, shown_by(team, R1), plain)
+        with pytest.raises(BusError, match="does not speak TLS"):
+            with_credentials(team, shown_by(team, R1), plain.replace("tcp/", "tls/"))
 
 
 def test_a_router_with_a_foreign_certificate_is_not_trusted(team: Team, tmp_path: Path) -> None:
@@ -145,14 +154,17 @@ def test_a_router_with_a_foreign_certificate_is_not_trusted(team: Team, tmp_path
 
 def test_a_robot_cannot_pass_for_the_router(team: Team) -> None:
     where = free_endpoint("tls")
-    with open_router(team.name, [where], credentials=shown_by(team, R2)), pytest.raises(BusError):
+    with (
+        open_router(team.name, [where], credentials=shown_by(team, R2)),
+        pytest.raises(BusError, match="cannot be trusted"),
+    ):
         with_credentials(team, shown_by(team, R1), where)
 
 
 def test_a_router_is_trusted_where_its_certificate_says(tmp_path: Path) -> None:
     team = secured_team(tmp_path)
     where = free_endpoint("tls").replace("127.0.0.1", "127.0.0.2")
-    with router_of(team, where), pytest.raises(BusError):
+    with router_of(team, where), pytest.raises(BusError, match=r"not valid for '127\.0\.0\.2'"):
         with_credentials(team, shown_by(team, R1), where)
     again(team, hosts=("127.0.0.2",), renew=("router",))
     with router_of(team, where):
@@ -170,11 +182,11 @@ OWN_ROBOT = {
 }
 OWN_OBSERVER = {
     *("belief/3/tripod", "fix/r1/3/tripod", "fix/r2/3/tripod", "status/tripod", "track/tripod"),
-    "field/drive/tripod",  # its own body on the simulated field
+    *("field/join/tripod", "field/drive/tripod"),  # its own body on the simulated field
     *("in/tripod/odometry", "in/tripod/sightings", "in/tripod/position"),
 }
 OWN_FIELD = {
-    "field/truth",
+    *("field/truth", "in/*/odometry"),  # to all robots at once
     *(f"in/{name}/odometry" for name in ("r1", "r2", "tripod")),
     *(f"in/{name}/sightings" for name in ("r1", "r2", "tripod")),
     *(f"in/{name}/position" for name in ("r1", "r2", "tripod")),
@@ -184,7 +196,8 @@ KEYS = sorted(
         *(OWN_ROBOT | OWN_OBSERVER | OWN_FIELD),
         *(key.replace("r1", "r2") for key in OWN_ROBOT if "r2" not in key),
         *("fix/r1/3/r2", "fix/tripod/3/r2", "status/r1/more"),
-        *("alive/3/r1/1", "anything", "status/router", "in/r1/frame", "field/join/tripod"),
+        *("alive/3/r1/1", "anything", "status/router", "in/r1/frame", "field/join/r1"),
+        *("**", "*/r2", "status/*", "belief/*/*", "fix/*/3/*", "in/*/odometry", "field/**"),
     }
 )
 SAID = {R1: OWN_ROBOT, TRIPOD: OWN_OBSERVER, FIELD: OWN_FIELD, OPERATOR: set[str]()}
@@ -238,6 +251,8 @@ def test_a_token_is_announced_under_ones_own_name_only(team: Team, endpoint: str
             for name in ("r2", "tripod", "r1", own):
                 if name != own or name is None:
                     bus.announce(topics.ALIVE.at(tier=3, robot=name or "r1", incarnation="false"))
+            for pattern in ("**", "alive/**", "alive/3/*/1"):
+                bus.announce(pattern)
             if own is not None:
                 bus.announce(topics.ALIVE.at(tier=3, robot=own, incarnation="true"))
         wait_until(lambda: len(seen) >= 2)
@@ -450,3 +465,48 @@ def test_a_robot_cannot_join_a_router_as_a_router(team: Team, endpoint: str) -> 
         say(false, MARK, b"mark")
         wait_until(lambda: b"mark" in ear.payloads)
         assert ear.payloads == [b"mark"]
+
+
+# What it costs, and what is written about it ----------------------------------------------------
+
+
+def written_at_once(team: Team, secured: bool) -> int:
+    """Bytes of one fix on its sender's link."""
+    endpoint = free_endpoint("tls" if secured else "tcp")
+
+    def shown(identity: Identity) -> Credentials | None:
+        return shown_by(team, identity) if secured else None
+
+    with (
+        open_router(team.name, [endpoint], credentials=shown(ROUTER)),
+        SealedRelay(endpoint) as link,
+        closing(with_credentials(team, shown(R1), link.endpoint, PATIENCE_S)) as robot,
+        closing(with_credentials(team, shown(R2), endpoint, PATIENCE_S)) as mate,
+    ):
+        ear = Ear(mate, "fix/r2/3/*")
+        publisher = robot.publisher("fix/r2/3/r1", Qos.FRESH)
+        wait_until(lambda: publisher.matching)
+        before = len(link.up)
+        for n in range(40):
+            publisher.put(bytes(FIX_BYTES))
+            wait_until(lambda n=n: len(ear.samples) > n)  # type: ignore[misc]
+        return mode(len(batch.content) for batch in link.up[before:])
+
+
+def test_tls_takes_22_bytes_for_what_is_written_at_once(team: Team) -> None:
+    assert written_at_once(team, secured=True) - written_at_once(team, secured=False) == 22
+
+
+def test_the_table_in_the_docs_is_that_of_the_topics() -> None:
+    text = (Path(__file__).parents[2] / "docs" / "security.md").read_text()
+    rows = {
+        f"| `{topic.key}` | "
+        + "; ".join(
+            f"{speaker.role}, own `<{speaker.own}>`" if speaker.own else str(speaker.role)
+            for speaker in topic.said_by
+        )
+        + " |"
+        for topic in topics.TOPICS
+    }
+    table = text.partition("| key | who |\n|---|---|\n")[2].partition("\n\n")[0]
+    assert set(table.splitlines()) == rows

@@ -18,6 +18,7 @@ from typing import Any
 import zenoh
 
 from cpcbl_transport.bus import Handle, Publisher, Receive, Watch
+from cpcbl_transport.handshake import why_not
 from cpcbl_transport.security import Credentials
 from cpcbl_transport.topics import Qos, namespace
 from cpcbl_transport.zenoh_config import NO_GUARDS, client_config, router_config
@@ -45,10 +46,20 @@ def open_bus(
         try:
             return ZenohBus(_open(config, namespace(team)))
         except zenoh.ZError as error:
-            reason = str(error)
-            log.info("no router at %s yet", ", ".join(connect))
+            reason = _why_not(connect, credentials) or _told(error)
+            log.info(
+                "no router at %s yet%s", ", ".join(connect), f": {reason}" if credentials else ""
+            )
             time.sleep(0.2)
     raise BusError(f"no router at {', '.join(connect)}: {reason}")
+
+
+def _why_not(connect: Sequence[str], credentials: Credentials | None) -> str:
+    """What stands in the way of TLS, of which Zenoh tells nothing; empty without credentials."""
+    if credentials is None:
+        return ""
+    reasons = {endpoint: why_not(endpoint, credentials) for endpoint in connect}
+    return "; ".join(dict.fromkeys(filter(None, reasons.values())))
 
 
 def open_router(

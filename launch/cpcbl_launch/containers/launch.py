@@ -11,21 +11,25 @@ from rich.console import Console
 
 from cpcbl_agents.clock import Clock
 from cpcbl_launch.containers.compose import Deployment, Mount, compose_text
+from cpcbl_launch.containers.deployment import owner
 from cpcbl_launch.containers.docker import Said, check_daemon, compose_program
 from cpcbl_launch.containers.fleet import Fleet, Project
 from cpcbl_launch.containers.image import image_for
 from cpcbl_launch.processes import tasks
 from cpcbl_launch.supervisor import Processes
 from cpcbl_launch.team_file import save_resolved
-from cpcbl_launch.up import Run, dialled
+from cpcbl_launch.up import Run, check_keys, dialled
 from cpcbl_team.config import Team
 from cpcbl_transport.bus import Bus
+from cpcbl_transport.security import Identity, link_of
+from cpcbl_transport.topics import Role
 from cpcbl_transport.zenoh_bus import open_bus
 
 LEAD_S = 4.0
 LEAD_S_A_CONTAINER = 0.8
 INSIDE = "/team/team.json"
 DATA_INSIDE = "/team/data"
+KEYS_INSIDE = "/team/keys"
 
 
 class InContainers:
@@ -41,11 +45,12 @@ class InContainers:
         said: Said,
     ) -> None:
         """`image`: the one to use; None: of these sources, on `base`. Raises DockerError."""
+        self._here = run.team.robots if run.here is None else run.here
+        check_keys(run.team, run.team.transport.listen, self._here)
         check_daemon()
         program = compose_program()
         self._run, self._folder, self._stop, self._said = run, folder, stop, said
         self._image = image or image_for(base, stop, said)
-        self._here = run.team.robots if run.here is None else run.here
         self.lead_s = LEAD_S + LEAD_S_A_CONTAINER * len(self._here)
         self._file = folder / "compose.yaml"
         name = f"{_project_name(run.team)}-{secrets.token_hex(3)}"
@@ -60,9 +65,11 @@ class InContainers:
         self._write("")
         self._said(f"starting {len(self._here)} robots in containers: project {self._project.name}")
         team = self._run.team
+        here = [dialled(team.transport.listen[0])]
+        link = link_of(team, Identity(Role.OPERATOR), here)
         try:
             self._project.up("router")
-            with open_bus(team.name, [dialled(team.transport.listen[0])], self._stop) as bus:
+            with open_bus(team.name, here, self._stop, link.credentials) as bus:
                 yield bus
         finally:
             if self._run.folder is not None:
@@ -84,6 +91,8 @@ class InContainers:
             self._image,
             published=tuple(published(endpoint) for endpoint in endpoints),
             mounts=(Mount(str((self._folder / "team.json").resolve()), INSIDE), *_data(run.team)),
+            keys=_keys(run.team),
+            user=owner(run.team),
             seed=run.seed,
             speed=run.speed,
             clock=clock,
@@ -100,8 +109,13 @@ def progress_on(console: Console) -> Said:
 
 
 def inside(team: Team) -> Team:
-    """The team as containers see it: a log's folder is where it is mounted."""
-    return msgspec.structs.replace(team, data=DATA_INSIDE) if _replays(team) else team
+    """The team as containers see it: a log's folder and keys are where they are mounted."""
+    if _replays(team):
+        team = msgspec.structs.replace(team, data=DATA_INSIDE)
+    if team.transport.secured:
+        transport = msgspec.structs.replace(team.transport, keys=KEYS_INSIDE)
+        team = msgspec.structs.replace(team, transport=transport)
+    return team
 
 
 def published(endpoint: str) -> str:
@@ -122,6 +136,10 @@ def published(endpoint: str) -> str:
 
 def _data(team: Team) -> tuple[Mount, ...]:
     return (Mount(str(Path(team.data).resolve()), DATA_INSIDE),) if _replays(team) else ()
+
+
+def _keys(team: Team) -> Mount | None:
+    return Mount(team.transport.keys, KEYS_INSIDE) if team.transport.secured else None
 
 
 def _replays(team: Team) -> bool:

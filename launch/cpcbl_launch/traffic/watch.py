@@ -76,6 +76,8 @@ class Traffic(msgspec.Struct, frozen=True, kw_only=True):
     never_heard: tuple[str, ...]
     """Robots of the team file that have said nothing."""
     help: tuple[Help, ...]
+    guests: tuple[str, ...] = ()
+    """Robots that the team file, where there is one, does not name."""
 
 
 class Arrival(NamedTuple):
@@ -101,6 +103,7 @@ def traffic(
         robots=robots,
         never_heard=tuple(name for name in known if name not in robots),
         help=tuple(_help(robots)),
+        guests=tuple(name for name in robots if known and name not in known),
     )
 
 
