@@ -17,6 +17,7 @@ Fusion = Literal["split-ci", "naive"]
 Direction = Literal["one-way", "both-ways"]
 Gives = Literal["both", "range", "bearing", "none"]
 Source = Literal["simulated", "mrclam", "external"]
+Security = Literal["none", "mtls"]
 
 
 class Table(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -283,6 +284,19 @@ class TransportSettings(Table, frozen=True, kw_only=True):
     connect: tuple[str, ...] = ("tcp/127.0.0.1:7447",)
     """Endpoints at which a robot looks for the router."""
     guards: GuardSettings = GuardSettings()
+    security: Security = "none"
+    """mtls: every link is mutual TLS, and each certificate may say only what its owner may."""
+    keys: Annotated[str, msgspec.Meta(min_length=1)] = "keys"
+    """Folder of the keys that `cpcbl-team keys` makes, relative to the team file."""
+
+    @property
+    def secured(self) -> bool:
+        return self.security == "mtls"
+
+    @property
+    def usual(self) -> tuple[str, ...]:
+        """Where the router of this machine is looked for, unless the file says otherwise."""
+        return ("tls/127.0.0.1:7447",) if self.secured else ("tcp/127.0.0.1:7447",)
 
 
 class MatchSettings(Table, frozen=True, kw_only=True):

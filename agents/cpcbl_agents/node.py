@@ -24,7 +24,7 @@ from cpcbl_transport.messages import (
     encode,
     refusal,
 )
-from cpcbl_transport.overhead import sent_bytes
+from cpcbl_transport.overhead import received_bytes, sent_bytes
 from cpcbl_transport.topics import Topic
 
 log = logging.getLogger(__name__)
@@ -154,12 +154,12 @@ class Node:
             self.counts[reason] += 1
             return None
         assert not isinstance(message, Refusal)
-        size = sent_bytes(len(payload))
+        size = len(payload)
         match message:
-            case Fix():
-                self.heard.of("fix", message.observer).add(size, message.stamp_ns)
-            case Belief():
-                self.heard.of("belief", message.robot).add(size, message.stamp_ns)
+            case Fix(observer=name):  # by a subscription to all observers
+                self.heard.of("fix", name).add(received_bytes(size, name), message.stamp_ns)
+            case Belief(robot=name):  # by one to this key
+                self.heard.of("belief", name).add(sent_bytes(size), message.stamp_ns)
         return message
 
     def _refused(self, key: str, message: Message, now_ns: int) -> Refusal | None:

@@ -13,6 +13,8 @@ from cpcbl_agents.clock import Clock
 from cpcbl_agents.node import Node, Stepped
 from cpcbl_agents.robot import Robot
 from cpcbl_team.config import Team
+from cpcbl_transport.security import Identity, link_of
+from cpcbl_transport.topics import Role
 from cpcbl_transport.zenoh_bus import open_bus
 
 LONGEST_WAIT_S = 0.2
@@ -62,10 +64,12 @@ def run_robot(
 ) -> None:
     """Runs a robot until `stop()`. One that is restarted, or late, does not know where it is.
 
-    Raises BusError when stopped before a router answered, LogError for an unreadable log.
+    Raises BusError when stopped before a router answered, LogError for an unreadable log,
+    SecurityError without the keys of a secured team.
     """
     wake = Wake()
-    with open_bus(team.name, connect, give_up=stop) as bus:
+    link = link_of(team, Identity(Role.ROBOT, name), connect)
+    with open_bus(team.name, link.endpoints, stop, link.credentials) as bus:
         start_ns = clock.now_ns()
         if restarted or start_ns > clock.epoch_ns + LATE_NS * max(1.0, clock.speed):
             team = _not_knowing_its_start(name, team)

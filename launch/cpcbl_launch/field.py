@@ -24,7 +24,8 @@ from cpcbl_team.inputs import Odometry, Position, Sighting, Sightings
 from cpcbl_team.sensors import LEAST_COSINE
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus, Publisher
-from cpcbl_transport.messages import Body, Drive, Join, Truth, Truths, decode, encode, refusal
+from cpcbl_transport.messages import Body, Drive, Join, Truth, Truths, encode, refusal
+from cpcbl_transport.reading import read
 
 log = logging.getLogger(__name__)
 
@@ -330,14 +331,14 @@ class FieldNode:
         self._bodies = Bodies(field.team)
         self._guests: dict[str, str] = {}  # with the incarnation that asked
         self._refused: set[str] = set()
-        self._drives: deque[bytes] = deque(maxlen=10_000)
+        self._drives: deque[tuple[str, bytes]] = deque(maxlen=10_000)
         self._joins: deque[tuple[str, bytes]] = deque(maxlen=1_000)
         self._truth = bus.publisher(topics.TRUTH.at(), topics.TRUTH.qos)
         self._publishers: dict[tuple[str, type], Publisher] = {}
         for name in field.robots:
             self._declare(name)
-        bus.subscribe(topics.DRIVE.at(), lambda key, payload: self._drives.append(payload))
-        bus.subscribe(topics.JOIN.at(), lambda key, payload: self._joins.append((key, payload)))
+        bus.subscribe(topics.DRIVE.at(), lambda *drive: self._drives.append(drive))
+        bus.subscribe(topics.JOIN.at(), lambda *join: self._joins.append(join))
 
     def _declare(self, name: str) -> None:
         for topic in topics.INPUTS:
@@ -357,7 +358,7 @@ class FieldNode:
         """Advances the field to `now_ns` and tells the robots what they sense."""
         self._let_in_and_out(now_ns)
         while self._drives:
-            drive = decode(self._drives.popleft())
+            drive = read(*self._drives.popleft())
             if isinstance(drive, Drive) and refusal(drive, now_ns) is None:
                 self._field.command(drive)
         while self._field.next_ns <= now_ns:
@@ -382,8 +383,8 @@ class FieldNode:
                 log.info("guest %s joined the field", name)
 
     def _asked(self, key: str, payload: bytes, now_ns: int) -> None:
-        join = decode(payload)
-        if not isinstance(join, Join) or topics.JOIN.at(robot=join.robot) != key:
+        join = read(key, payload)
+        if not isinstance(join, Join):
             return
         reason = refusal(join, now_ns) or self._bodies.ask(join, now_ns)
         if reason and len(self._refused) < MOST_REFUSED and join.robot not in self._refused:

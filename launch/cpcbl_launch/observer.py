@@ -21,6 +21,8 @@ from cpcbl_team.config import Team
 from cpcbl_team.inputs import NAME_PATTERN
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus
+from cpcbl_transport.security import Identity, link_of
+from cpcbl_transport.topics import Role
 from cpcbl_transport.zenoh_bus import open_bus
 
 NAMESAKE_S = 0.3  # so long a token of the same name is waited for
@@ -166,10 +168,12 @@ def visit(
 ) -> Visited:
     """Runs an observer that `team` holds until `stop()`, or for so many seconds of robot time.
 
-    Raises BusError when stopped before a router answered, ValueError for a name that is taken.
+    Raises BusError when stopped before a router answered, ValueError for a name that is taken,
+    SecurityError without the keys of a secured team.
     """
     wake = Wake()
-    with open_bus(team.name, connect, give_up=stop) as bus:
+    link = link_of(team, Identity(Role.OBSERVER, name), connect)
+    with open_bus(team.name, link.endpoints, stop, link.credentials) as bus:
         _look_for_namesakes(name, bus, stop)
         start_ns = clock.now_ns()
         node = Visit(name, team, bus, start_ns, f"{os.getpid():x}", wake.set)

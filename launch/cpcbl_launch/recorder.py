@@ -17,7 +17,8 @@ from cpcbl_launch.traffic.flows import (
 from cpcbl_team.metrics import Floats, Samples, Score, Trajectory, compared, score, seconds
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus
-from cpcbl_transport.messages import Status, Track, Truth, Truths, decode
+from cpcbl_transport.messages import Status, Track, Truth, Truths
+from cpcbl_transport.reading import read
 
 
 class LearnedReport(msgspec.Struct, frozen=True, kw_only=True):
@@ -137,7 +138,7 @@ class Recorder:
             bus.subscribe(topic.at(), self._arrived)
 
     def _arrived(self, key: str, payload: bytes) -> None:
-        message = decode(payload)
+        message = read(key, payload)
         with self._lock:
             match message:
                 case Track():

@@ -27,6 +27,7 @@ from cpcbl_team.config import (
     Wall,
 )
 from cpcbl_team.inputs import NAME_PATTERN, Name
+from cpcbl_transport.security import PROTOCOL
 
 Layer = dict[str, Any]
 
@@ -77,7 +78,16 @@ def load_team(path: Path) -> Team:
             return msgspec.json.decode(text, type=Team)
         except msgspec.MsgspecError as error:
             raise TeamFileError(f"{path}: {error}") from error
-    return parse_team(text, str(path))
+    team = parse_team(text, str(path))
+    if not team.transport.secured:
+        return team
+    transport = msgspec.structs.replace(team.transport, keys=str(key_folder(team, path)))
+    return msgspec.structs.replace(team, transport=transport)
+
+
+def key_folder(team: Team, path: Path) -> Path:
+    """Where the keys of the team in a file are."""
+    return (path.parent / team.transport.keys).absolute()
 
 
 def save_resolved(team: Team, path: Path) -> None:
@@ -123,7 +133,7 @@ def parse_team(text: str, name: str = "team file") -> Team:
         name=file.name,
         robots=robots,
         map=field,
-        transport=file.transport,
+        transport=_transport(file.transport, raw),
         match=file.match,
         simulation=file.simulation,
         guests=file.guests,
@@ -134,6 +144,13 @@ def parse_team(text: str, name: str = "team file") -> Team:
     for problem in problems(team):
         raise TeamFileError(f"{name}: {problem}")
     return team
+
+
+def _transport(transport: TransportSettings, raw: Layer) -> TransportSettings:
+    """With the endpoint that is usual, where the file does not name one."""
+    if "connect" in raw.get("transport", {}):
+        return transport
+    return msgspec.structs.replace(transport, connect=transport.usual)
 
 
 def read_layer(path: Path) -> Layer:
@@ -197,6 +214,18 @@ def problems(team: Team) -> Iterator[str]:
                     f"transport.{key}: {endpoint!r} is no endpoint;"
                     " write it as tcp/192.168.1.10:7447"
                 )
+            elif reason := _insecure(endpoint, team.transport.secured):
+                yield f"transport.{key}: {endpoint!r}: {reason}"
+
+
+def _insecure(endpoint: str, secured: bool) -> str:
+    """Why an endpoint does not go with the team's security; empty if it does."""
+    protocol, _, where = endpoint.partition("/")
+    if secured and protocol != PROTOCOL:
+        return f'with security = "mtls" every link is TLS; write it as {PROTOCOL}/{where}'
+    if not secured and protocol in ("tls", "quic"):
+        return f'needs certificates; add security = "mtls", or write it as tcp/{where}'
+    return ""
 
 
 def _guard_problems(team: Team) -> Iterator[str]:

@@ -4,7 +4,7 @@ import logging
 import socket
 import tempfile
 import time
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from types import MappingProxyType
@@ -18,15 +18,17 @@ from cpcbl_launch.evaluation import Progress, simulate
 from cpcbl_launch.logs import seen_before
 from cpcbl_launch.options import check_duration
 from cpcbl_launch.phases import Span, guest_reports, phase
-from cpcbl_launch.processes import process_table
+from cpcbl_launch.processes import process_table, tasks
 from cpcbl_launch.recorder import Recorder, Report
 from cpcbl_launch.recording import Recording
-from cpcbl_launch.supervisor import Supervisor
+from cpcbl_launch.supervisor import Processes, Supervisor
 from cpcbl_launch.team_file import save_resolved
 from cpcbl_team.config import Team
 from cpcbl_team.metrics import Floats
 from cpcbl_transport.bus import Bus
 from cpcbl_transport.guards import guard_rules
+from cpcbl_transport.security import Identity, access_control, link_of
+from cpcbl_transport.topics import Role
 from cpcbl_transport.zenoh_bus import open_router
 
 log = logging.getLogger(__name__)
@@ -62,25 +64,72 @@ class Run(NamedTuple):
 class View(Protocol):
     """Shows a run to a person."""
 
-    def show(self, recorder: Recorder, supervisor: Supervisor, elapsed_s: float) -> None: ...
+    def show(self, recorder: Recorder, processes: Processes, elapsed_s: float) -> None: ...
 
 
 class Stopping(Protocol):
     def __call__(self) -> bool: ...
 
 
-def free_endpoint() -> str:
+class Launcher(Protocol):
+    """Starts what a run needs, and ends it."""
+
+    @property
+    def lead_s(self) -> float:
+        """Real seconds that all processes take to be ready."""
+
+    def router(self) -> AbstractContextManager[Bus]:
+        """The team's router, and a session on it."""
+
+    def processes(self, clock: Clock) -> AbstractContextManager[Processes]:
+        """The robots and the field; robot time is the clock's."""
+
+
+class OnThisMachine:
+    """The router in this process, everybody else in a process of its own."""
+
+    def __init__(self, run: Run, folder: Path, stop: Stopping) -> None:
+        self._run, self._folder = run, folder
+        self._here = run.team.robots if run.here is None else run.here
+        self.lead_s = LEAD_S + LEAD_S_A_PROCESS * len(self._here)
+
+    def router(self) -> AbstractContextManager[Bus]:
+        team, listen = self._run.team, self._run.team.transport.listen
+        check_keys(team, listen, self._here)
+        guards = guard_rules(team, self._run.speed) | access_control(team)
+        _, credentials = link_of(team, Identity(Role.ROUTER), listen)
+        return open_router(team.name, listen, guards=guards, credentials=credentials)
+
+    def processes(self, clock: Clock) -> AbstractContextManager[Processes]:
+        team, path = self._run.team, self._folder / "team.json"
+        save_resolved(team, path)
+        endpoint = dialled(team.transport.listen[0])
+        table = process_table(team, path, endpoint, clock, self._run.seed, self._here)
+        return Supervisor(table, self._folder)
+
+
+Launch = Callable[[Run, Path, Stopping], Launcher]
+
+
+def check_keys(team: Team, listen: Sequence[str], here: Collection[str]) -> None:
+    """Says what a process would die of before any starts. Raises SecurityError."""
+    for task in tasks(team, (), 0, here):
+        link_of(team, task.identity, listen)
+
+
+def free_endpoint(protocol: str = "tcp") -> str:
     """An endpoint of this machine that nobody listens at."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+        return f"{protocol}/127.0.0.1:{probe.getsockname()[1]}"
 
 
 def listening(team: Team) -> Team:
     """The team with an endpoint for its router: its own, or a free one of this machine."""
     if team.transport.listen:
         return team
-    transport = msgspec.structs.replace(team.transport, listen=(free_endpoint(),))
+    endpoint = free_endpoint("tls" if team.transport.secured else "tcp")
+    transport = msgspec.structs.replace(team.transport, listen=(endpoint,))
     return msgspec.structs.replace(team, transport=transport)
 
 
@@ -89,10 +138,10 @@ def dialled(listen: str) -> str:
     return listen.replace("/0.0.0.0:", "/127.0.0.1:").replace("/[::]:", "/[::1]:")
 
 
-def run_team(run: Run, view: View, stop: Stopping) -> Report:
+def run_team(run: Run, view: View, stop: Stopping, launch: Launch = OnThisMachine) -> Report:
     """Runs a team until its time is over or `stop()`. Raises BusError without a router."""
     with tempfile.TemporaryDirectory(prefix="cpcbl-") as temporary:
-        return _run_in(run, view, stop, run.folder or Path(temporary))
+        return _run_in(run, view, stop, run.folder or Path(temporary), launch)
 
 
 def simulate_run(run: Run, progress: Progress | None = None) -> Report:
@@ -112,35 +161,31 @@ def simulate_run(run: Run, progress: Progress | None = None) -> Report:
     return _report(run, recorder, 0.0, duration_s, {})
 
 
-def _run_in(run: Run, view: View, stop: Stopping, folder: Path) -> Report:
-    team = listening(run.team)
-    here = team.robots if run.here is None else run.here
+def _run_in(run: Run, view: View, stop: Stopping, folder: Path, launch: Launch) -> Report:
+    run = run._replace(team=listening(run.team))
     folder.mkdir(parents=True, exist_ok=True)
-    team_file = folder / "team.json"
-    save_resolved(team, team_file)
-    listen = team.transport.listen
-    lead_s = LEAD_S + LEAD_S_A_PROCESS * len(here)
-    clock = Clock(
-        run.epoch_ns if run.epoch_ns is not None else time.time_ns() + int(lead_s * 1e9),
-        time.monotonic_ns() + int(lead_s * 1e9),
-        run.speed,
-    )
-    table = process_table(team, team_file, dialled(listen[0]), clock, run.seed, here)
-    guards = guard_rules(team, run.speed)
-    with open_router(team.name, listen, guards=guards) as bus, _recording(run, bus):
+    launcher = launch(run, folder, stop)
+    with launcher.router() as bus, _recording(run, bus):
         recorder = Recorder(bus)
-        with Supervisor(table, folder) as supervisor:
+        clock = _clock(run, launcher.lead_s)
+        with launcher.processes(clock) as processes:
             end_ns = None if run.duration_s is None else int(run.duration_s * 1e9)
             while not stop():
                 elapsed_ns = clock.now_ns() - clock.epoch_ns
                 if end_ns is not None and elapsed_ns >= end_ns:
                     break
-                supervisor.watch()
-                view.show(recorder, supervisor, elapsed_ns * 1e-9)
+                processes.watch()
+                view.show(recorder, processes, elapsed_ns * 1e-9)
                 time.sleep(REFRESH_S)
             elapsed_s = (clock.now_ns() - clock.epoch_ns) * 1e-9
-            restarts = supervisor.restarts
+            restarts = processes.restarts
     return _report(run, recorder, clock.epoch_ns * 1e-9, elapsed_s, restarts)
+
+
+def _clock(run: Run, lead_s: float) -> Clock:
+    lead_ns = int(lead_s * 1e9)
+    epoch_ns = time.time_ns() + lead_ns if run.epoch_ns is None else run.epoch_ns
+    return Clock(epoch_ns, time.monotonic_ns() + lead_ns, run.speed)
 
 
 def _recording(run: Run, bus: Bus) -> AbstractContextManager[object]:

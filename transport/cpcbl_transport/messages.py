@@ -156,6 +156,7 @@ class Refusal(StrEnum):
     DURATION = "impossible_duration"
     UNKNOWN_ROBOT = "unknown_robot"
     OWN = "own_message"
+    NOT_ITS_OWN = "name_of_another"
 
 
 _encoder = msgspec.msgpack.Encoder()

@@ -20,7 +20,9 @@ from cpcbl_launch.traffic.flows import (
 )
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus
-from cpcbl_transport.messages import Flow, Status, decode
+from cpcbl_transport.messages import Flow, Status
+from cpcbl_transport.reading import read
+from cpcbl_transport.security import Link
 from cpcbl_transport.zenoh_bus import BusError, open_bus
 
 AT_PRESENT_NS = 3_000_000_000  # help is given at present whose latest message is no older
@@ -159,7 +161,7 @@ class Watcher:
         bus.subscribe(topics.STATUS.at(), self._arrived)
 
     def _arrived(self, key: str, payload: bytes) -> None:
-        status = decode(payload)
+        status = read(key, payload)
         if not isinstance(status, Status):
             return
         with self._lock:
@@ -191,7 +193,7 @@ class Watch(NamedTuple):
     team: str
     known: Collection[str]
     """The robots that should be there, as far as one knows."""
-    connect: Sequence[str]
+    link: Link
     duration_s: float = math.inf
     wait_s: float = 5.0
     """For the router."""
@@ -203,14 +205,15 @@ def watch_team(watch: Watch, view: View, stop: Callable[[], bool]) -> Traffic:
     try:
         bus = open_bus(
             watch.team,
-            watch.connect,
+            watch.link.endpoints,
             lambda: stop() or time.monotonic() > began_s + watch.wait_s,
+            watch.link.credentials,
         )
     except BusError:
         if stop():
             return traffic(watch.team, watch.known, {}, began_s, time.monotonic())
         raise BusError(
-            f"no router at {', '.join(watch.connect)} within {watch.wait_s:g} s;"
+            f"no router at {', '.join(watch.link.endpoints)} within {watch.wait_s:g} s;"
             " --connect takes the endpoint that `cpcbl-team up` says"
         ) from None
     with bus:
