@@ -13,6 +13,7 @@ from cpcbl_launch.recorder import Effect, GuestReport, Phase, Recorder, RobotRep
 from cpcbl_team.metrics import Floats, Trajectory, compared, score, seconds
 
 AWAY_S = 2.0  # who says nothing of itself for longer was away
+MOST_GUESTS = 100  # as many as a team may let in; more is garbage
 
 
 class Span(NamedTuple):
@@ -71,12 +72,14 @@ def guest_reports(
     epoch_s: float,
     begin_s: float = -math.inf,
 ) -> dict[str, GuestReport]:
-    """Of everybody who was heard of and is none of the team's robots.
+    """Of those who were heard of and are none of the team's robots; of too many the most talkative.
 
     `begin_s`: the time at which figures begin; `epoch_s`: the start of the run.
     """
     reports = {}
-    for name in sorted(recorder.tracks.keys() - set(robots)):
+    heard = {name: len(tracks) for name, tracks in list(recorder.tracks.items())}
+    others = sorted(heard.keys() - set(robots), key=lambda name: (-heard[name], name))
+    for name in sorted(others[:MOST_GUESTS]):
         present = presence(seconds(recorder.trajectory(name).stamps_ns).tolist())
         parts = split(present, begin_s)
         effects = {

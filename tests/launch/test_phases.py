@@ -10,7 +10,7 @@ import pytest
 from bus_helpers import SECOND
 from rich.console import Console
 
-from cpcbl_launch.phases import AWAY_S, Span, guest_reports, phase, presence, split
+from cpcbl_launch.phases import AWAY_S, MOST_GUESTS, Span, guest_reports, phase, presence, split
 from cpcbl_launch.recorder import MeanScore, Recorder, Report, TeamReport
 from cpcbl_launch.show import LiveTable, print_report
 from cpcbl_launch.supervisor import Supervisor
@@ -108,6 +108,16 @@ def test_robots_of_the_team_are_no_guests() -> None:
     said = Said()
     said.tracks("r1", 0.0, 10.0)
     assert guest_reports(said.recorder, ["r1"], NO_TRUTH, 0.0) == {}
+
+
+def test_a_report_is_not_flooded_by_names() -> None:
+    said = Said()
+    for number in range(2 * MOST_GUESTS):
+        said.tracks(f"garbage{number}", 0.0, 0.1)
+    said.tracks("tripod", 0.0, 1.0)
+    found = guest_reports(said.recorder, ["r1"], NO_TRUTH, 0.0)
+    assert len(found) == MOST_GUESTS
+    assert "tripod" in found
 
 
 def test_the_report_shows_guests_beside_the_team() -> None:
