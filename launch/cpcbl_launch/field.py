@@ -9,7 +9,8 @@ import logging
 import math
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from types import MappingProxyType
 from typing import NamedTuple, TypeVar
 
 import numpy as np
@@ -23,7 +24,7 @@ from cpcbl_team.geometry import Pose2, step, wrap_angle
 from cpcbl_team.inputs import Odometry, Position, Sighting, Sightings
 from cpcbl_team.sensors import LEAST_COSINE
 from cpcbl_transport import topics
-from cpcbl_transport.bus import Bus, Publisher
+from cpcbl_transport.bus import Bus, Handle, Publisher
 from cpcbl_transport.messages import Body, Drive, Join, Truth, Truths, encode, refusal
 from cpcbl_transport.reading import read
 
@@ -32,6 +33,7 @@ log = logging.getLogger(__name__)
 COMMAND_LASTS_NS = 500_000_000
 MOST_REFUSED = 100  # guests whose refusal is logged
 _GUEST_SEED = 2**31  # no robot of a team file has this number
+NOWHERE: Mapping[str, Bus] = MappingProxyType({})
 
 
 class Every:
@@ -324,10 +326,12 @@ class SimulatedField:
 
 
 class FieldNode:
-    """The field on a bus."""
+    """The field on a bus. Robots of other `sites` (robot -> bus) are told on the bus of theirs, so
+    that the world goes on for them while their site is cut off.
+    """
 
-    def __init__(self, field: SimulatedField, bus: Bus) -> None:
-        self._field, self._bus = field, bus
+    def __init__(self, field: SimulatedField, bus: Bus, sites: Mapping[str, Bus] = NOWHERE) -> None:
+        self._field, self._bus, self._sites = field, bus, sites
         self._bodies = Bodies(field.team)
         self._guests: dict[str, str] = {}  # with the incarnation that asked
         self._refused: set[str] = set()
@@ -335,16 +339,19 @@ class FieldNode:
         self._joins: deque[tuple[str, bytes]] = deque(maxlen=1_000)
         self._truth = bus.publisher(topics.TRUTH.at(), topics.TRUTH.qos)
         self._publishers: dict[tuple[str, type], Publisher] = {}
+        self._driven: dict[str, Handle] = {}
         for name in field.robots:
             self._declare(name)
-        bus.subscribe(topics.DRIVE.at(), lambda *drive: self._drives.append(drive))
         bus.subscribe(topics.JOIN.at(), lambda *join: self._joins.append(join))
 
     def _declare(self, name: str) -> None:
+        bus = self._sites.get(name, self._bus)
         for topic in topics.INPUTS:
             assert topic.carries is not None
-            publisher = self._bus.publisher(topic.at(robot=name), topic.qos)
+            publisher = bus.publisher(topic.at(robot=name), topic.qos)
             self._publishers[name, topic.carries] = publisher
+        drive = topics.DRIVE.at(robot=name)
+        self._driven[name] = bus.subscribe(drive, lambda *said: self._drives.append(said))
 
     @property
     def next_ns(self) -> int:
@@ -397,12 +404,33 @@ class FieldNode:
         for topic in topics.INPUTS:
             assert topic.carries is not None
             self._publishers.pop((name, topic.carries)).close()
+        self._driven.pop(name).close()
         log.info("guest %s left the field", name)
 
 
-def run_field(team: Team, seed: int, bus: Bus, clock: Clock, stop: Callable[[], bool]) -> None:
+def robots_at(sites: Iterable[str], team: Team) -> dict[str, list[str]]:
+    """Endpoint -> robots, of `tcp/10.0.0.2:7447=r3,r4`. Raises ValueError."""
+    found = {}
+    for text in sites:
+        endpoint, _, names = text.partition("=")
+        found[endpoint] = [name.strip() for name in names.split(",")]
+        for name in found[endpoint]:
+            if name not in team.robots:
+                known = ", ".join(team.robots)
+                raise ValueError(f"--site {text}: no robot {name!r}; there are {known}")
+    return found
+
+
+def run_field(
+    team: Team,
+    seed: int,
+    bus: Bus,
+    clock: Clock,
+    stop: Callable[[], bool],
+    sites: Mapping[str, Bus] = NOWHERE,
+) -> None:
     """The field as a process: steps in robot time until `stop()`."""
-    node = FieldNode(SimulatedField(team, seed, clock.now_ns()), bus)
+    node = FieldNode(SimulatedField(team, seed, clock.now_ns()), bus, sites)
     while not stop():
         node.step(clock.now_ns())
         time.sleep(min(clock.seconds_until(node.next_ns), 0.2))
