@@ -158,6 +158,16 @@ class BudgetSettings(Table, frozen=True, kw_only=True):
     """The part of every budget that is kept for teammates that are lost."""
 
 
+class TrustSettings(Table, frozen=True, kw_only=True):
+    """How a teammate is found that says what is not so."""
+
+    enabled: bool = True
+    limit: Positive = 50.0
+    """By how much (NIS beyond the usual, summed) it may surprise: four clear contradictions."""
+    readmit_s: NotNegative = 5.0
+    """It is believed again when it was right for so long."""
+
+
 class CollaborationSettings(Table, frozen=True, kw_only=True):
     """Who helps whom, and how much is believed."""
 
@@ -172,6 +182,7 @@ class CollaborationSettings(Table, frozen=True, kw_only=True):
     best_tier: Annotated[int, msgspec.Meta(ge=0, le=15)] = 0
     """No better tier is announced, however certain the robot is: for sensors that err unseen."""
     budget: BudgetSettings = BudgetSettings()
+    trust: TrustSettings = TrustSettings()
     least_value: NotNegative = 0.05
     """What a fix must be worth (nats): the logarithm of the factor by which the ellipse of the
     helped robot's position shrinks. Less is not sent."""

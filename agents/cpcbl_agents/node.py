@@ -18,6 +18,7 @@ from cpcbl_transport.messages import (
     Refusal,
     Status,
     Track,
+    Trust,
     decode,
     encode,
     refusal,
@@ -205,6 +206,7 @@ class Node:
             sent,
             heard,
             self._robot.collaboration.budget.spending(now_ns),
+            tuple(Trust(*standing) for standing in self._robot.filter.standings(now_ns)),
         )
 
 
