@@ -30,12 +30,15 @@ CLEAR = 5.0  # sigmas by which a way must be wrong to be held against its teller
 STILL, STILL_SHARE = 3.0, 0.3  # or as many, where it is less than this share of the wheels'
 SLIP_SHARE = 0.1  # of the way: how far wheels err
 SLIP_M = 0.03
-STRIDE_M = 0.5  # a way that tells whether a sender follows the robot at all
-REST_NS = 2_000_000_000  # or a time in which it has not jumped
+STRIDE_M = 0.3  # the least way that tells whether a sender follows the robot at all
+REST_NS = 5_000_000_000  # or a time in which it has not jumped
+TIED_NS = 1_500_000_000  # one word against another: so long the wheels may decide
+CLEARLY = 0.5  # strikes
 MEMORY_S = 10.0  # strikes fade in this time
 MOST_STRIKES = 2.5
 LEAST_HEALTHY = 10  # words in agreement, and
 LEAST_STEADY = 2  # ways, before a sender is taken back
+BY_COMPARISON = ("biased", "overconfident", "outvoted")  # reasons that rest on others' words
 NEVER_NS = -(2**62)
 
 
@@ -167,7 +170,7 @@ def _driven(voice: Voice, said: Said) -> Voice:
     chord, told = math.hypot(way.x, way.y), math.hypot(now.x - then.x, now.y - then.y)
     slip = SLIP_SHARE * chord + SLIP_M
     sigma = math.sqrt(then.variance + now.variance + slip * slip)
-    far = chord >= STRIDE_M
+    far = chord >= max(STRIDE_M, (STILL + 1.0) * sigma)
     jumped = told - chord > CLEAR * sigma
     stayed = far and told < STILL_SHARE * chord and chord - told > STILL * sigma
     fade = math.exp((voice.heard_ns - now.stamp_ns) * 1e-9 / MEMORY_S)
@@ -204,24 +207,46 @@ def judged(voices: Voices, name: str, said: Said, used_ns: int, rules: TrustSett
         return _in_quarantine(voices, name, said, rules)
     if voice.strikes > MOST_STRIKES and not _my_wheels(voices, name, rules):
         return _silenced(voices, name, said.stamp_ns, used_ns)
-    if voice.score <= rules.limit:
-        return Verdict(voices, True)
-    against, beside = _split(voices, voice, said.stamp_ns, rules)
-    if OWN in beside or (OWN not in against and len(beside) >= len(against)):
-        if not beside:
-            return Verdict(voices, True)
-        return _silenced(voices, name, said.stamp_ns, used_ns)
-    return _outvoted(voices, against, beside, said.stamp_ns) if beside else Verdict(voices, True)
+    return _settled(voices, name, said.stamp_ns, used_ns, rules)
 
 
-def _split(
-    voices: Voices, doubted: Voice, now_ns: int, rules: TrustSettings
-) -> tuple[set[str], set[str]]:
-    """Those that disagree with the estimate as well, those that agreed with it meanwhile."""
+def _settled(voices: Voices, name: str, now_ns: int, used_ns: int, rules: TrustSettings) -> Verdict:
+    """Who is wrong, where somebody disagrees with the estimate for long enough.
+
+    The robot's own eyes decide, else the greater number, else the wheels, else what was believed
+    before; until then the robot goes by its wheels alone. Where nobody agrees it is for the robot
+    itself to find that it is lost.
+    """
     lately = dict(_lately(voices, now_ns))
+    doubted_ns = min((v.doubted_ns for v in lately.values() if v.score > rules.limit), default=None)
+    if doubted_ns is None:
+        return Verdict(voices, True)
     against = {n for n, v in lately.items() if v.score > 0.5 * rules.limit}
-    beside = {n for n, v in lately.items() if v.agreed_ns > doubted.doubted_ns} - against
-    return against, beside
+    beside = {n for n, v in lately.items() if v.agreed_ns > doubted_ns} - against
+    if not beside:
+        return Verdict(voices, True)
+    estimate_is_right = _right(lately, against, beside, now_ns - doubted_ns)
+    if estimate_is_right is None:
+        return Verdict(voices, False)
+    if not estimate_is_right:
+        return _outvoted(voices, against, beside, name, now_ns)
+    if name in against and lately[name].score > rules.limit:
+        return _silenced(voices, name, now_ns, used_ns)
+    return Verdict(voices, name not in against)
+
+
+def _right(lately: Voices, against: set[str], beside: set[str], since_ns: int) -> bool | None:
+    """Whether the estimate, and those beside it, are right; None while that is open."""
+    if OWN in beside or OWN in against:
+        return OWN in beside
+    denied = {n for n in against | beside if lately[n].strikes >= CLEARLY}  # by the wheels
+    if denied and not against <= denied:
+        beside = beside - denied
+    elif denied and not beside & denied:
+        against = against - denied
+    if len(beside) != len(against):
+        return len(beside) > len(against)
+    return True if since_ns >= TIED_NS else None
 
 
 def _lately(voices: Voices, now_ns: int, without: str | None = None) -> Iterator[tuple[str, Voice]]:
@@ -243,10 +268,18 @@ def _my_wheels(voices: Voices, name: str, rules: TrustSettings) -> bool:
 def _silenced(voices: Voices, name: str, now_ns: int, used_ns: int) -> Verdict:
     voice = voices[name]
     polluted = used_ns >= voice.doubted_ns and voice.doubted_ns > voice.agreed_ns
-    doubt_m = math.hypot(*voice.offset) if polluted else 0.0
-    silenced = _put_away(voice, _reason(voice), now_ns)
-    voices = {**voices, name: silenced}
-    return Verdict(voices, False, "quarantined", frozenset((name,)), doubt_m)
+    offsets = [math.hypot(*voice.offset)] if polluted else []
+    changed = {**voices, name: _put_away(voice, _reason(voice), now_ns)}
+    if voice.strikes > MOST_STRIKES:  # by the wheels alone: whom it contradicted may be right
+        for other, accused in voices.items():
+            if accused.reason in BY_COMPARISON and accused.since_ns > now_ns - ALONE_NS:
+                changed[other] = _freed(accused, now_ns)
+                offsets.append(math.hypot(*accused.offset))
+    return Verdict(changed, False, "quarantined", frozenset((name,)), max(offsets, default=0.0))
+
+
+def _freed(voice: Voice, now_ns: int) -> Voice:
+    return voice._replace(reason="", since_ns=now_ns, score=0.0, strikes=0.0, doubted_ns=NEVER_NS)
 
 
 def _put_away(voice: Voice, reason: str, now_ns: int) -> Voice:
@@ -255,13 +288,16 @@ def _put_away(voice: Voice, reason: str, now_ns: int) -> Voice:
     )
 
 
-def _outvoted(voices: Voices, against: set[str], beside: set[str], now_ns: int) -> Verdict:
-    """Most disagree with the estimate: what it followed is wrong."""
+def _outvoted(
+    voices: Voices, against: set[str], beside: set[str], name: str, now_ns: int
+) -> Verdict:
+    """What the estimate followed is wrong."""
     silenced = frozenset(beside - {OWN})
-    offsets = [math.hypot(*voices[name].offset) for name in against]
+    offsets = [math.hypot(*voices[n].offset) for n in against]
     changed = {n: _put_away(voices[n], "outvoted", now_ns) for n in silenced}
     changed |= {n: voices[n]._replace(score=0.0) for n in against}
-    return Verdict({**voices, **changed}, True, "outvoted", silenced, max(offsets))
+    changed = {**voices, **changed}
+    return Verdict(changed, name not in silenced, "outvoted", silenced, max(offsets))
 
 
 def _reason(voice: Voice) -> str:
@@ -286,8 +322,7 @@ def _in_quarantine(voices: Voices, name: str, said: Said, rules: TrustSettings) 
     steady = voice.steady >= LEAST_STEADY and now - voice.since_ns >= ALONE_NS
     if not (right or (alone and steady)):
         return Verdict(voices, False)
-    free = voice._replace(reason="", since_ns=now, score=0.0, strikes=0.0, doubted_ns=NEVER_NS)
-    return Verdict({**voices, name: free}, True, "readmitted")
+    return Verdict({**voices, name: _freed(voice, now)}, True, "readmitted")
 
 
 def forgiven(voices: Voices) -> Voices:
