@@ -166,6 +166,10 @@ class TrustSettings(Table, frozen=True, kw_only=True):
     """By how much (NIS beyond the usual, summed) it may surprise: four clear contradictions."""
     readmit_s: NotNegative = 5.0
     """It is believed again when it was right for so long."""
+    clock_ahead_s: NotNegative = 0.1
+    """Help is refused that is stamped by a clock further ahead,"""
+    clock_behind_s: Positive = 0.4
+    """or by one that is behind, or so late, by more."""
 
 
 class CollaborationSettings(Table, frozen=True, kw_only=True):
@@ -303,6 +307,19 @@ class MatchSettings(Table, frozen=True, kw_only=True):
     """They are earned evenly over this time."""
 
 
+class SimulationEvent(Table, frozen=True, kw_only=True):
+    """Something that befalls the simulated field: one of its kinds."""
+
+    at_s: NotNegative
+    """From the field's start."""
+    kidnap: str = ""
+    """The robot that is carried away; its wheels do not notice."""
+    to: tuple[float, float, float] | None = None
+    """Where it is put down: x m, y m, heading deg."""
+    hide_landmarks_s: NotNegative = 0.0
+    """For so long nobody sees a landmark or wall."""
+
+
 class SimulationSettings(Table, frozen=True, kw_only=True):
     """The simulated field."""
 
@@ -310,6 +327,7 @@ class SimulationSettings(Table, frozen=True, kw_only=True):
     noise: NotNegative = 1.0
     """True noise as a multiple of what the robots assume; 0 for none."""
     bump_radius_m: NotNegative = 0.15
+    events: tuple[SimulationEvent, ...] = ()
 
 
 class Team(Table, frozen=True, kw_only=True):

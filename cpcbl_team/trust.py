@@ -117,10 +117,10 @@ class Standing(NamedTuple):
     """How a sender stands with this robot."""
 
     robot: str
-    reason: str
-    since_ns: int
-    quarantines: int
-    unconfirmed: bool
+    reason: str = ""
+    since_ns: int = 0
+    quarantines: int = 0
+    unconfirmed: bool = False
     """It is the only voice: whether it is biased cannot be told."""
 
 

@@ -155,6 +155,6 @@ class LyingBus:
         self.close()
 
 
-def lying(lie: Lie, name: str, start_ns: int) -> Callable[[Bus], Bus]:
-    """What makes a liar of the robot whose bus it is given."""
-    return lambda bus: LyingBus(bus, Liar(lie, name, start_ns))
+def lying(lie: Lie | None, name: str, start_ns: int) -> Callable[[Bus], Bus]:
+    """What makes a liar of the robot whose bus it is given; nothing does without a lie."""
+    return lambda bus: bus if lie is None else LyingBus(bus, Liar(lie, name, start_ns))

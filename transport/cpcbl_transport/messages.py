@@ -63,6 +63,8 @@ class Trust(msgspec.Struct, frozen=True, array_like=True):
     """How often it was in quarantine so far."""
     unconfirmed: bool = False
     """Nobody else tells this robot anything: whether this one is biased cannot be told."""
+    late_s: float = 0.0
+    """The least time from its stamps to their arrival, lately; below zero its clock is ahead."""
 
 
 class Status(msgspec.Struct, frozen=True, array_like=True, tag="status"):
@@ -147,6 +149,7 @@ class Refusal(StrEnum):
     IMPLAUSIBLE = "implausible_number"
     NOT_A_COVARIANCE = "not_a_covariance"
     FUTURE = "from_the_future"
+    CLOCK = "clock_off"
     DURATION = "impossible_duration"
     UNKNOWN_ROBOT = "unknown_robot"
     OWN = "own_message"

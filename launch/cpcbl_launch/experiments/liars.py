@@ -1,28 +1,24 @@
 """One observer of three lies for a while: what it does to the team, when it is found, when it is
 believed again.
 
-Three observers with good eyes stand round the field of the demonstration; a navigator with poor
-ones and two scouts, blind to landmarks, drive between them. From 10 s to 25 s one observer says what
-is not so (`liar.py`), then the truth again. Errors are those of the robots that drive, from 10 s on,
-beside the team without that observer, and beside one that believes everything.
+Observers with good eyes stand round the field of the demonstration; a navigator with poor ones and
+two scouts, blind to landmarks, drive between them. From 10 s to 25 s one observer says what is not
+so (`liar.py`), then the truth again. Errors are those of the robots that drive, from 10 s on, beside
+the team without that observer, and beside one that believes everything.
 """
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from functools import partial
+from collections.abc import Callable, Sequence
 from importlib.metadata import version
-from pathlib import Path
 from typing import NamedTuple
 
 import msgspec
 import numpy as np
-from rich.console import RenderableType
 
 from cpcbl_launch.evaluation import simulate
 from cpcbl_launch.experiments.results import Spread, spread
 from cpcbl_launch.experiments.runs import in_processes
 from cpcbl_launch.liar import Lie, lying
-from cpcbl_launch.tables import number, table
 from cpcbl_launch.team_file import builtin, load_team
 from cpcbl_team.config import Team, TrustSettings
 from cpcbl_team.metrics import position_errors
@@ -131,9 +127,7 @@ def team(case: Case) -> Team:
     }
     trust = TrustSettings(enabled=case.trust)
     robots = {
-        name: replace(
-            robot, collaboration=replace(robot.collaboration, after_s=0.0, trust=trust)
-        )
+        name: replace(robot, collaboration=replace(robot.collaboration, after_s=0.0, trust=trust))
         for name, robot in robots.items()
     }
     return replace(base, name="liars", robots=robots)
@@ -228,7 +222,10 @@ def _row(case: Case, runs: Sequence[Run], without: Sequence[Run] | None) -> Row:
         ratio = spread(
             [_team_rmse_m(a) / _team_rmse_m(b) for a, b in zip(runs, without, strict=True)]
         )
-    rmse, worst = spread([_team_rmse_m(r) for r in runs]), spread([max(r.rmse_m.values()) for r in runs])
+    rmse, worst = (
+        spread([_team_rmse_m(r) for r in runs]),
+        spread([max(r.rmse_m.values()) for r in runs]),
+    )
     assert rmse is not None
     assert worst is not None
     reasons = [q.reason for q in last.values()]
