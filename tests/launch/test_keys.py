@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import yaml
 from key_helpers import R1, again, router_of, secured_team, session
 from process_helpers import cpcbl_team
 
@@ -345,6 +346,28 @@ def test_a_secured_team_does_as_well_as_a_plain_one(tmp_path: Path) -> None:
     assert report["team"]["inside_3_sigma"] > 0.9
 
 
+def test_an_observer_joins_a_secured_team_with_its_own_certificate(tmp_path: Path) -> None:
+    secured, endpoint = demo(tmp_path, "mtls"), free_endpoint("tls")
+    secured.write_text(secured.read_text() + f'listen = ["{endpoint}"]\n')
+    keys(secured, "--observer", "tripod")
+    join = ("--team", secured, "--connect", endpoint, "--at", "4.5,0,90", "--json")
+    assert "observer/stranger" in refused("observer", "stranger", *join)
+    with subprocess.Popen(
+        [*PROGRAM, "up", str(secured), "--duration", "14", "--json"],
+        stdout=subprocess.PIPE,
+        text=True,
+    ) as team:
+        visited = json.loads(cpcbl_team("observer", "tripod", *join, "--for", 6).stdout)
+        report = json.loads(team.communicate(timeout=60)[0])
+    assert visited["lost"] == ""
+    assert sum(flow["messages"] for flow in visited["sent"]) > 10
+    guest = report["guests"]["tripod"]
+    assert guest["messages_sent"] > 10
+    assert guest["samples"] > 10
+    counts = [robot["counts"].get("guest_joined", 0) for robot in report["robots"].values()]
+    assert sum(counts) > 0
+
+
 def test_robots_of_a_router_of_its_own(team_file: Path) -> None:
     """`router`, `robot` and `traffic`, each with its own certificate."""
     keys(team_file)
@@ -363,6 +386,54 @@ def test_robots_of_a_router_of_its_own(team_file: Path) -> None:
             process.send_signal(2)
         for process in processes:
             assert process.wait(10) == 0
+
+
+# Containers -------------------------------------------------------------------------------------
+
+
+def services(file: Path) -> dict[str, Any]:
+    """What `compose` says of each service of a team."""
+    done = cpcbl_team("compose", file)
+    assert done.returncode == 0, done.stderr
+    said: dict[str, Any] = yaml.safe_load(done.stdout)["services"]
+    return said
+
+
+def test_a_container_may_read_its_own_keys_and_no_others(tmp_path: Path) -> None:
+    secured = demo(tmp_path, "mtls")
+    assert "transport.keys" in refused("compose", secured)
+    keys(secured)
+    owner = (tmp_path / "keys" / "router" / "private.key").stat()
+    for name, service in services(secured).items():
+        targets = {mount["target"] for mount in service["volumes"]}
+        own = name.replace("robot-", "robot/")
+        assert targets == {"/team/mtls.toml", f"/team/keys/{own}"}
+        assert all(mount["read_only"] for mount in service["volumes"])
+        assert service["user"] == f"{owner.st_uid}:{owner.st_gid}"
+        assert not [word for word in service["command"] if "tcp/" in word]
+        assert [word for word in service["command"] if word.startswith("tls/")]
+
+
+def test_containers_of_a_plain_team_have_no_keys(tmp_path: Path) -> None:
+    for service in services(demo(tmp_path, "none")).values():
+        assert {mount["target"] for mount in service["volumes"]} == {"/team/none.toml"}
+        assert "user" not in service
+
+
+@pytest.mark.docker
+@pytest.mark.timeout(400)
+def test_a_secured_team_runs_in_containers(tmp_path: Path) -> None:
+    secured = demo(tmp_path, "mtls")
+    keys(secured)
+    done = cpcbl_team(
+        *("up", secured, "--containers", "--robots", "observer,patrol", "--duration", 12, "--json"),
+        timeout_s=380.0,
+    )
+    assert done.returncode == 0, done.stderr
+    report = json.loads(done.stdout)
+    for name in ("observer", "patrol"):
+        assert report["robots"][name]["samples"] > 0, name
+        assert report["robots"][name]["lost_at_end"] == "", name
 
 
 # Nobody is believed who names another in the payload --------------------------------------------
