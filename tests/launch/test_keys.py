@@ -2,18 +2,21 @@
 
 import json
 import os
+import signal
 import stat
 import subprocess
 import sys
 import threading
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
 import pytest
 import yaml
-from key_helpers import R1, again, router_of, secured_team, session
+from bus_helpers import Ear, wait_until
+from key_helpers import R1, R2, again, router_of, secured_team, session, with_credentials
 from process_helpers import cpcbl_team
 
 from cpcbl_launch.identities.authority import facts, issued, new_authority
@@ -27,6 +30,7 @@ from cpcbl_transport.messages import Drive, Refusal, Status, Track, encode
 from cpcbl_transport.reading import read
 from cpcbl_transport.security import Member
 from cpcbl_transport.topics import Qos, Role
+from cpcbl_transport.zenoh_bus import BusError
 
 SECURED = '\n[transport]\nsecurity = "mtls"\n'
 TEAM = f"""
@@ -147,14 +151,16 @@ def test_again_changes_nothing_and_adds_what_is_missing(team_file: Path) -> None
     assert changed(before, content_of(folder)) == {*new, "router/members.json"}
 
 
-def test_a_lost_key_is_made_again(team_file: Path) -> None:
+def test_a_key_that_is_lost_or_of_another_certificate_is_made_again(team_file: Path) -> None:
     keys(team_file)
     folder = team_file.parent / "keys"
     before = content_of(folder)
     (folder / "robot" / "r2" / "private.key").unlink()
+    (folder / "robot" / "r1" / "private.key").write_bytes(before["router/private.key"])
     keys(team_file)
-    pair = {"robot/r2/certificate.crt", "robot/r2/private.key"}
-    assert changed(before, content_of(folder)) == pair
+    files = ("certificate.crt", "private.key")
+    pairs = {f"robot/{robot}/{name}" for robot in ("r1", "r2") for name in files}
+    assert changed(before, content_of(folder)) == pairs
 
 
 def test_renewing_one_leaves_the_others(team_file: Path) -> None:
@@ -246,6 +252,15 @@ def test_a_table_says_what_was_made(team_file: Path) -> None:
     assert max(map(len, rows)) <= 80
 
 
+def test_no_robot_takes_the_name_of_an_observer() -> None:
+    team, tripod = parse_team(TEAM), Member(role=Role.OBSERVER, name="r1")
+    with pytest.raises(ValueError, match=r"robots\.r1: an observer has this name.*--revoke"):
+        plan(team, [tripod])
+    steps = plan(team, [tripod], revoke=["observer/r1"])
+    deeds = {str(step.member.identity): step.deed for step in steps}
+    assert (deeds["observer/r1"], deeds["robot/r1"]) == (Deed.REVOKED, Deed.MADE)
+
+
 def test_a_plan_names_all_that_the_team_needs_and_had() -> None:
     team = parse_team(TEAM)
     known = [Member(role=Role.ROBOT, name="gone"), Member(role=Role.ROBOT, name="r1")]
@@ -310,6 +325,22 @@ def test_plain_endpoints_end_every_command_with_one_line(team_file: Path) -> Non
         assert "tls/127.0.0.1:1" in line
 
 
+@contextmanager
+def running(*command: object) -> Iterator["subprocess.Popen[str]"]:
+    """A command beside the test, which ends it, and well."""
+    process = subprocess.Popen([*PROGRAM, *map(str, command)], stdout=subprocess.PIPE, text=True)
+    try:
+        yield process
+        if process.poll() is None:
+            process.send_signal(signal.SIGINT)
+        assert process.wait(timeout=20) == 0
+    finally:
+        process.kill()
+        process.wait()
+        if process.stdout is not None:
+            process.stdout.close()
+
+
 def demo(folder: Path, security: str) -> Path:
     """The demonstration, helping from its second second on."""
     path = folder / f"{security}.toml"
@@ -325,13 +356,10 @@ def test_a_secured_team_does_as_well_as_a_plain_one(tmp_path: Path) -> None:
     endpoint = free_endpoint("tls")
     secured.write_text(secured.read_text() + f'listen = ["{endpoint}"]\n')
     run = ("--duration", 10, "--seed", 5, "--json")
-    with subprocess.Popen(
-        [*PROGRAM, "traffic", str(secured), "--connect", endpoint, "--wait", "60", "--json"],
-        stdout=subprocess.PIPE,
-        text=True,
-    ) as watching:
+    watch = ("traffic", secured, "--connect", endpoint, "--wait", 60, "--json")
+    with running(*watch) as watching:
         done = cpcbl_team("up", secured, *run)
-        watching.send_signal(2)
+        watching.send_signal(signal.SIGINT)
         seen = json.loads(watching.communicate(timeout=20)[0])
     assert done.returncode == 0, done.stderr
     report = json.loads(done.stdout)
@@ -352,11 +380,7 @@ def test_an_observer_joins_a_secured_team_with_its_own_certificate(tmp_path: Pat
     keys(secured, "--observer", "tripod")
     join = ("--team", secured, "--connect", endpoint, "--at", "4.5,0,90", "--json")
     assert "observer/stranger" in refused("observer", "stranger", *join)
-    with subprocess.Popen(
-        [*PROGRAM, "up", str(secured), "--duration", "14", "--json"],
-        stdout=subprocess.PIPE,
-        text=True,
-    ) as team:
+    with running("up", secured, "--duration", 14, "--json") as team:
         visited = json.loads(cpcbl_team("observer", "tripod", *join, "--for", 6).stdout)
         report = json.loads(team.communicate(timeout=60)[0])
     assert visited["lost"] == ""
@@ -368,6 +392,27 @@ def test_an_observer_joins_a_secured_team_with_its_own_certificate(tmp_path: Pat
     assert sum(counts) > 0
 
 
+def test_a_printed_configuration_is_as_strict(team_file: Path) -> None:
+    keys(team_file)
+    endpoint = free_endpoint("tls")
+    printed = cpcbl_team("router", team_file, "--listen", endpoint, "--print-config")
+    assert "PRIVATE KEY" not in printed.stdout
+    config = team_file.parent / "router.json5"
+    config.write_text(printed.stdout)
+    team = load_team(team_file)
+    with running("router", "--config", config):
+        with session(team, R2, endpoint) as listener, session(team, R1, endpoint) as robot:
+            ear = Ear(listener, "**")
+            for key in ("status/r2", "status/r1"):
+                publisher = robot.publisher(key, Qos.INPUT)
+                wait_until(lambda publisher=publisher: publisher.matching)  # type: ignore[misc]
+                publisher.put(b"?")
+            wait_until(lambda: bool(ear.keys))
+            assert ear.keys == ["status/r1"]
+        with pytest.raises(BusError):
+            with_credentials(team, None, endpoint.replace("tls/", "tcp/"))
+
+
 def test_robots_of_a_router_of_its_own(team_file: Path) -> None:
     """`router`, `robot` and `traffic`, each with its own certificate."""
     keys(team_file)
@@ -376,16 +421,9 @@ def test_robots_of_a_router_of_its_own(team_file: Path) -> None:
         TEAM.replace('source = "external"', 'source = "external"\nstart = {x_m = 0.0, y_m = 0.0}')
         + f'listen = ["{endpoint}"]\nconnect = ["{endpoint}"]\n'
     )
-    commands = (("router", team_file), ("robot", "r1", "--team", team_file))
-    processes = [subprocess.Popen([*PROGRAM, *map(str, words)]) for words in commands]
-    try:
+    with running("router", team_file), running("robot", "r1", "--team", team_file):
         done = cpcbl_team("traffic", team_file, "--for", 4, "--wait", 30, "--json")
         assert list(json.loads(done.stdout)["robots"]) == ["r1"]
-    finally:
-        for process in processes:
-            process.send_signal(2)
-        for process in processes:
-            assert process.wait(10) == 0
 
 
 # Containers -------------------------------------------------------------------------------------
