@@ -37,9 +37,10 @@ class Visit:
         start_ns: int,
         incarnation: str,
         on_arrival: Callable[[], None] = lambda: None,
+        speed: float = 1.0,
     ) -> None:
         self.robot = Robot(name, team, start_ns)
-        self._node = Node(self.robot, team, bus, start_ns, incarnation, on_arrival)
+        self._node = Node(self.robot, team, bus, start_ns, incarnation, on_arrival, speed)
         self._incarnation, self._due_ns = incarnation, start_ns
         self._warn_ns: int | None = start_ns + PATIENCE_NS
         self._body = body_of(team.robots[name])

@@ -9,7 +9,8 @@ import logging
 import math
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from types import MappingProxyType
 from typing import NamedTuple, TypeVar
 
 import numpy as np
@@ -18,12 +19,18 @@ from cpcbl_agents.clock import Clock
 from cpcbl_agents.sensing import SensorInput
 from cpcbl_launch.bodies import Bodies
 from cpcbl_launch.grid import Grid
-from cpcbl_team.config import OdometrySettings, RobotSettings, SensorSettings, Team
+from cpcbl_team.config import (
+    OdometrySettings,
+    RobotSettings,
+    SensorSettings,
+    SimulationEvent,
+    Team,
+)
 from cpcbl_team.geometry import Pose2, step, wrap_angle
 from cpcbl_team.inputs import Odometry, Position, Sighting, Sightings
 from cpcbl_team.sensors import LEAST_COSINE
 from cpcbl_transport import topics
-from cpcbl_transport.bus import Bus, Publisher
+from cpcbl_transport.bus import Bus, Handle, Publisher
 from cpcbl_transport.messages import Body, Drive, Join, Truth, Truths, encode, refusal
 from cpcbl_transport.reading import read
 
@@ -32,6 +39,7 @@ log = logging.getLogger(__name__)
 COMMAND_LASTS_NS = 500_000_000
 MOST_REFUSED = 100  # guests whose refusal is logged
 _GUEST_SEED = 2**31  # no robot of a team file has this number
+NOWHERE: Mapping[str, Bus] = MappingProxyType({})
 
 
 class Every:
@@ -246,6 +254,9 @@ class SimulatedField:
         }
         self._marks = [Seen(n, m.x_m, m.y_m, m.gives) for n, m in team.map.landmarks.items()]
         self._marks_to_touch = Grid(team.simulation.bump_radius_m, self._marks)
+        self._start_ns = start_ns
+        self._events = deque(sorted(team.simulation.events, key=lambda event: event.at_s))
+        self._hidden_until_ns = start_ns
         self._look()
 
     def _look(self) -> None:
@@ -282,6 +293,8 @@ class SimulatedField:
     def advance(self) -> list[tuple[str, SensorInput]]:
         """One step; what each robot senses at its end."""
         self.now_ns += self._step_ns
+        while self._events and self._passed_s >= self._events[0].at_s:
+            self._befall(self._events.popleft())
         for robot in self.robots.values():
             robot.move(self.now_ns, self._step_ns * 1e-9)
             self._bump(robot)
@@ -301,8 +314,24 @@ class SimulatedField:
         robots = tuple(Truth(n, *r.pose, r.bumps) for n, r in self.robots.items())
         return Truths(self.now_ns, robots)
 
+    @property
+    def _passed_s(self) -> float:
+        return (self.now_ns - self._start_ns) * 1e-9
+
+    def _befall(self, event: SimulationEvent) -> None:
+        hidden_ns = self._start_ns + int((event.at_s + event.hide_landmarks_s) * 1e9)
+        self._hidden_until_ns = max(self._hidden_until_ns, hidden_ns)
+        if event.to is not None and event.kidnap in self.robots:
+            x, y, heading_deg = event.to
+            self.robots[event.kidnap].pose = Pose2(x, y, wrap_angle(math.radians(heading_deg)))
+
     def _visible(self, viewer: str, pose: Pose2, mates: Grid[Seen]) -> Iterable[Seen]:
-        yield from self._marks_to_see.near(pose.x, pose.y)
+        if self.now_ns >= self._hidden_until_ns:
+            yield from self._marks_to_see.near(pose.x, pose.y)
+            yield from self._walls(pose)
+        yield from (mate for mate in mates.near(pose.x, pose.y) if mate.name != viewer)
+
+    def _walls(self, pose: Pose2) -> Iterable[Seen]:
         for name, wall in self.team.map.walls.items():
             (ax, ay), (bx, by) = wall.from_m, wall.to_m
             length = math.hypot(bx - ax, by - ay)
@@ -310,7 +339,6 @@ class SimulatedField:
             along = ux * (pose.x - ax) + uy * (pose.y - ay)
             if 0.0 <= along <= length:
                 yield Seen(name, ax + along * ux, ay + along * uy, wall.gives)
-        yield from (mate for mate in mates.near(pose.x, pose.y) if mate.name != viewer)
 
     def _bump(self, robot: SimulatedRobot) -> None:
         radius = self.team.simulation.bump_radius_m
@@ -324,10 +352,12 @@ class SimulatedField:
 
 
 class FieldNode:
-    """The field on a bus."""
+    """The field on a bus. Robots of other `sites` (robot -> bus) are told on the bus of theirs, so
+    that the world goes on for them while their site is cut off.
+    """
 
-    def __init__(self, field: SimulatedField, bus: Bus) -> None:
-        self._field, self._bus = field, bus
+    def __init__(self, field: SimulatedField, bus: Bus, sites: Mapping[str, Bus] = NOWHERE) -> None:
+        self._field, self._bus, self._sites = field, bus, sites
         self._bodies = Bodies(field.team)
         self._guests: dict[str, str] = {}  # with the incarnation that asked
         self._refused: set[str] = set()
@@ -335,16 +365,19 @@ class FieldNode:
         self._joins: deque[tuple[str, bytes]] = deque(maxlen=1_000)
         self._truth = bus.publisher(topics.TRUTH.at(), topics.TRUTH.qos)
         self._publishers: dict[tuple[str, type], Publisher] = {}
+        self._driven: dict[str, Handle] = {}
         for name in field.robots:
             self._declare(name)
-        bus.subscribe(topics.DRIVE.at(), lambda *drive: self._drives.append(drive))
         bus.subscribe(topics.JOIN.at(), lambda *join: self._joins.append(join))
 
     def _declare(self, name: str) -> None:
+        bus = self._sites.get(name, self._bus)
         for topic in topics.INPUTS:
             assert topic.carries is not None
-            publisher = self._bus.publisher(topic.at(robot=name), topic.qos)
+            publisher = bus.publisher(topic.at(robot=name), topic.qos)
             self._publishers[name, topic.carries] = publisher
+        drive = topics.DRIVE.at(robot=name)
+        self._driven[name] = bus.subscribe(drive, lambda *said: self._drives.append(said))
 
     @property
     def next_ns(self) -> int:
@@ -397,12 +430,33 @@ class FieldNode:
         for topic in topics.INPUTS:
             assert topic.carries is not None
             self._publishers.pop((name, topic.carries)).close()
+        self._driven.pop(name).close()
         log.info("guest %s left the field", name)
 
 
-def run_field(team: Team, seed: int, bus: Bus, clock: Clock, stop: Callable[[], bool]) -> None:
+def robots_at(sites: Iterable[str], team: Team) -> dict[str, list[str]]:
+    """Endpoint -> robots, of `tcp/10.0.0.2:7447=r3,r4`. Raises ValueError."""
+    found = {}
+    for text in sites:
+        endpoint, _, names = text.partition("=")
+        found[endpoint] = [name.strip() for name in names.split(",")]
+        for name in found[endpoint]:
+            if name not in team.robots:
+                known = ", ".join(team.robots)
+                raise ValueError(f"--site {text}: no robot {name!r}; there are {known}")
+    return found
+
+
+def run_field(
+    team: Team,
+    seed: int,
+    bus: Bus,
+    clock: Clock,
+    stop: Callable[[], bool],
+    sites: Mapping[str, Bus] = NOWHERE,
+) -> None:
     """The field as a process: steps in robot time until `stop()`."""
-    node = FieldNode(SimulatedField(team, seed, clock.now_ns()), bus)
+    node = FieldNode(SimulatedField(team, seed, clock.now_ns()), bus, sites)
     while not stop():
         node.step(clock.now_ns())
         time.sleep(min(clock.seconds_until(node.next_ns), 0.2))

@@ -176,7 +176,7 @@ def visit(
     with open_bus(team.name, link.endpoints, stop, link.credentials) as bus:
         _look_for_namesakes(name, bus, stop)
         start_ns = clock.now_ns()
-        node = Visit(name, team, bus, start_ns, f"{os.getpid():x}", wake.set)
+        node = Visit(name, team, bus, start_ns, f"{os.getpid():x}", wake.set, clock.speed)
         run_node(node, wake, clock, lambda: stop() or clock.now_ns() - start_ns >= duration_s * 1e9)
         end_ns = clock.now_ns()
         node.leave(end_ns)

@@ -7,6 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 import msgspec
 import numpy as np
 
+from cpcbl_launch.standing import TrustReport, trust_of
 from cpcbl_launch.traffic.flows import (
     FlowReport,
     SpendingReport,
@@ -51,6 +52,8 @@ class RobotReport(Score, frozen=True, kw_only=True):
     heard: tuple[FlowReport, ...] = ()
     spending: tuple[SpendingReport, ...] = ()
     """Its limits; empty where there are none."""
+    trust: tuple[TrustReport, ...] = ()
+    """Teammates that it heard at the end, or that were in quarantine."""
 
 
 class Phase(Score, frozen=True, kw_only=True):
@@ -234,6 +237,7 @@ class Recorder:
             sent=summed_flows(s.sent for s in statuses),
             heard=summed_flows(s.heard for s in statuses),
             spending=summed_spending(s.spending for s in statuses),
+            trust=trust_of(statuses),
         )
 
 

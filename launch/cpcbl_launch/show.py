@@ -22,6 +22,7 @@ from cpcbl_launch.recorder import (
     Report,
     RobotReport,
 )
+from cpcbl_launch.standing import distrusted, trust_remarks
 from cpcbl_launch.supervisor import Processes
 from cpcbl_launch.tables import number, percent, short, table
 from cpcbl_launch.traffic.show import EXPLAINED, spent_table, verdict
@@ -63,6 +64,9 @@ class LiveTable(LiveView):
             process = f"{ROBOT}{name}"
             pid = str(pids[process]) if process in pids else "down" if name in here else "away"
             state = _state(tracks.get(name), pid, restarts.get(process, 0))
+            status = statuses.get(name)
+            if status is not None and (said := distrusted(status.trust)):
+                state.append(f", {said}", "yellow")
             if name not in self._robots:
                 there = newest_ns - tracks[name].stamp_ns <= AWAY_S * 1e9
                 pid, state = "guest", state if there else Text("left", "dim")
@@ -70,7 +74,7 @@ class LiveTable(LiveView):
                 name,
                 pid,
                 *_pose_cells(tracks.get(name), truths.get(name)),
-                *_traffic_cells(statuses.get(name)),
+                *_traffic_cells(status),
                 state,
             )
         return shown
@@ -242,6 +246,8 @@ def _remarks(report: Report) -> Iterator[str]:
     for name, r in report.robots.items():
         if r.learned is not None:
             yield f"robot {name} learned: {_corrections(r.learned)}"
+    for name, r in report.robots.items():
+        yield from trust_remarks(name, r.trust)
     for name, n in report.restarts.items():
         yield f"{name} was restarted {n} times"
 

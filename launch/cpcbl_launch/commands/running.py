@@ -2,6 +2,7 @@
 
 import shlex
 import sys
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Optional
@@ -151,10 +152,12 @@ def robot(
     restarted: Annotated[
         bool, typer.Option(help="It does not know where it is: find the pose first.")
     ] = False,
+    lie: Annotated[str, typer.Option(hidden=True)] = "",
 ) -> None:
     """Run one robot, on any machine, until SIGINT or SIGTERM."""
     from cpcbl_agents.clock import Clock
     from cpcbl_agents.process import Stop, run_robot
+    from cpcbl_launch.liar import Lie, lying
     from cpcbl_launch.team_file import TeamFileError
 
     team = load(team_file)
@@ -163,29 +166,47 @@ def robot(
             f"{team_file}: robots.{name}: not in the file; it has: {', '.join(team.robots)}"
         )
     when = Clock.parse(clock) if clock else Clock.wall()
-    run_robot(name, team, connect or team.transport.connect, when, Stop(parent), restarted)
+    through = lying(Lie.parse(lie) if lie else None, name, when.epoch_ns)
+    run_robot(name, team, connect or team.transport.connect, when, Stop(parent), restarted, through)
 
 
 def field(
     team_file: TeamFile,
     seed: Annotated[int, typer.Option(help="Of the noise.")] = 1,
     connect: Connect = None,
+    site: Annotated[
+        Optional[list[str]],
+        typer.Option(help="Robots at another router: tcp/10.0.0.2:7447=r3,r4."),
+    ] = None,
     clock: ClockText = "",
     parent: Parent = None,
 ) -> None:
     """Run the simulated field until SIGINT or SIGTERM."""
+    from contextlib import ExitStack
+
     from cpcbl_agents.clock import Clock
     from cpcbl_agents.process import Stop
-    from cpcbl_launch.field import run_field
+    from cpcbl_launch.field import robots_at, run_field
+    from cpcbl_transport.bus import Bus
     from cpcbl_transport.security import Identity, link_of
     from cpcbl_transport.topics import Role
     from cpcbl_transport.zenoh_bus import open_bus
 
     team = load(team_file)
+    elsewhere = robots_at(site or (), team)
     stop = Stop(parent)
-    link = link_of(team, Identity(Role.FIELD), connect or team.transport.connect)
-    with open_bus(team.name, link.endpoints, stop, link.credentials) as bus:
-        run_field(team, seed, bus, Clock.parse(clock) if clock else Clock.wall(), stop)
+    with ExitStack() as stack:
+
+        def session(endpoints: Sequence[str]) -> Bus:
+            link = link_of(team, Identity(Role.FIELD), endpoints)
+            return stack.enter_context(open_bus(team.name, link.endpoints, stop, link.credentials))
+
+        bus = session(connect or team.transport.connect)
+        sites: dict[str, Bus] = {}
+        for endpoint, names in elsewhere.items():
+            sites |= dict.fromkeys(names, session([endpoint]))
+        when = Clock.parse(clock) if clock else Clock.wall()
+        run_field(team, seed, bus, when, stop, sites)
 
 
 def router(

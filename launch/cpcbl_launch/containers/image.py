@@ -79,7 +79,7 @@ def _have_base(base: str, stop: Callable[[], bool], said: Said) -> None:
     fetched = ran(["docker", "pull", "--quiet", base], stop, timeout_s=BUILD_TIMEOUT_S)
     if fetched.code:
         raise DockerError(
-            f"no base image {base} ({fetched.last_line}); without a registry: docker/base-image.sh,"
+            f"no base image {base} ({fetched.problem}); without a registry: docker/base-image.sh,"
             f" then {BASE_VARIABLE}=cpcbl-base"
         )
 

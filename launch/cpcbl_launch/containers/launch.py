@@ -2,6 +2,7 @@
 
 import re
 import secrets
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -12,7 +13,7 @@ from rich.console import Console
 from cpcbl_agents.clock import Clock
 from cpcbl_launch.containers.compose import Deployment, Mount, compose_text
 from cpcbl_launch.containers.deployment import owner
-from cpcbl_launch.containers.docker import Said, check_daemon, compose_program
+from cpcbl_launch.containers.docker import DockerError, Said, check_daemon, compose_program
 from cpcbl_launch.containers.fleet import Fleet, Project
 from cpcbl_launch.containers.image import image_for
 from cpcbl_launch.processes import tasks
@@ -21,12 +22,13 @@ from cpcbl_launch.team_file import save_resolved
 from cpcbl_launch.up import Run, check_keys, dialled
 from cpcbl_team.config import Team
 from cpcbl_transport.bus import Bus
-from cpcbl_transport.security import Identity, link_of
+from cpcbl_transport.security import Identity, Link, link_of
 from cpcbl_transport.topics import Role
-from cpcbl_transport.zenoh_bus import open_bus
+from cpcbl_transport.zenoh_bus import BusError, ZenohBus, open_bus
 
 LEAD_S = 4.0
-LEAD_S_A_CONTAINER = 0.8
+LEAD_S_A_CONTAINER = 0.5
+ROUTER_WITHIN_S = 60.0
 INSIDE = "/team/team.json"
 DATA_INSIDE = "/team/data"
 KEYS_INSIDE = "/team/keys"
@@ -69,13 +71,25 @@ class InContainers:
         link = link_of(team, Identity(Role.OPERATOR), here)
         try:
             self._project.up("router")
-            with open_bus(team.name, here, self._stop, link.credentials) as bus:
+            with self._joined(link) as bus:
                 yield bus
         finally:
             if self._run.folder is not None:
                 self._project.save_logs(self._folder)
             self._said("taking the containers down")
             self._project.down()
+
+    def _joined(self, link: Link) -> ZenohBus:
+        until_s = time.monotonic() + ROUTER_WITHIN_S
+
+        def give_up() -> bool:
+            return self._stop() or time.monotonic() > until_s
+
+        try:
+            return open_bus(self._run.team.name, link.endpoints, give_up, link.credentials)
+        except BusError as error:
+            said = self._project.last_words("router")
+            raise DockerError(f"{error}; the router's container said: {said}") from error
 
     @contextmanager
     def processes(self, clock: Clock) -> Iterator[Processes]:
