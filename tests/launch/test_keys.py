@@ -1,11 +1,15 @@
 """`cpcbl-team keys` and secured teams, as a user runs them."""
 
+import io
 import json
 import os
+import secrets
+import shutil
 import signal
 import stat
 import subprocess
 import sys
+import tarfile
 import threading
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -16,6 +20,7 @@ from typing import Any
 import pytest
 import yaml
 from bus_helpers import Ear, wait_until
+from docker_helpers import TOP, image
 from key_helpers import R1, R2, again, router_of, secured_team, session, with_credentials
 from process_helpers import cpcbl_team
 
@@ -464,7 +469,8 @@ def test_a_secured_team_runs_in_containers(tmp_path: Path) -> None:
     secured = demo(tmp_path, "mtls")
     keys(secured)
     done = cpcbl_team(
-        *("up", secured, "--containers", "--robots", "observer,patrol", "--duration", 12, "--json"),
+        *("up", secured, "--containers", "--image", image(), "--robots", "observer,patrol"),
+        *("--duration", 12, "--json"),
         timeout_s=380.0,
     )
     assert done.returncode == 0, done.stderr
@@ -472,6 +478,51 @@ def test_a_secured_team_runs_in_containers(tmp_path: Path) -> None:
     for name in ("observer", "patrol"):
         assert report["robots"][name]["samples"] > 0, name
         assert report["robots"][name]["lost_at_end"] == "", name
+
+
+def checkout_with_keys(folder: Path) -> Path:
+    """A part of the sources, with a secured team's file and keys among them; where the keys are."""
+    for name in (".gitignore", ".dockerignore"):
+        shutil.copy(TOP / name, folder)
+    teams = folder / "launch" / "cpcbl_launch" / "teams"
+    shutil.copytree(TOP / "launch" / "cpcbl_launch" / "teams", teams)
+    keys(demo(teams, "mtls"))
+    return teams / "keys"
+
+
+def test_keys_do_not_get_into_a_repository(tmp_path: Path) -> None:
+    made = checkout_with_keys(tmp_path)
+    listing = ["git", "ls-files", "--others", "--exclude-standard"]
+    subprocess.run(["git", "init", "--quiet", tmp_path], check=True)
+    for ignore in (made / ".gitignore", tmp_path / ".gitignore"):  # either will do
+        done = subprocess.run(listing, cwd=tmp_path, capture_output=True, text=True, check=True)
+        assert "launch/cpcbl_launch/teams/mtls.toml" in done.stdout
+        assert "private.key" not in done.stdout
+        ignore.unlink()
+    done = subprocess.run(listing, cwd=tmp_path, capture_output=True, text=True, check=True)
+    assert "private.key" in done.stdout
+
+
+@pytest.mark.docker
+def test_keys_do_not_get_into_an_image(tmp_path: Path) -> None:
+    """Of all that the builder is given, as an image that takes everything."""
+    checkout_with_keys(tmp_path)
+    (tmp_path / "Everything").write_text("FROM scratch\nCOPY . /\n")
+    name = f"cpcbl-keys-{secrets.token_hex(4)}"
+    build = ("docker", "build", "--quiet", "--tag", name, "--file", str(tmp_path / "Everything"))
+    subprocess.run([*build, str(tmp_path)], check=True, capture_output=True)
+    try:
+        subprocess.run(
+            ["docker", "create", "--name", name, name, "nothing"], check=True, capture_output=True
+        )
+        exported = subprocess.run(["docker", "export", name], check=True, capture_output=True)
+    finally:
+        subprocess.run(["docker", "rm", name], check=False, capture_output=True)
+        subprocess.run(["docker", "rmi", name], check=False, capture_output=True)
+    with tarfile.open(fileobj=io.BytesIO(exported.stdout)) as tar:
+        names = tar.getnames()
+    assert "launch/cpcbl_launch/teams/mtls.toml" in names
+    assert not [name for name in names if "keys" in name.split("/")]
 
 
 # Nobody is believed who names another in the payload --------------------------------------------
