@@ -1,18 +1,27 @@
 """`cpcbl-team keys` and secured teams, as a user runs them."""
 
+import io
 import json
 import os
+import secrets
+import shutil
+import signal
 import stat
 import subprocess
 import sys
+import tarfile
 import threading
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
 import pytest
-from key_helpers import R1, again, router_of, secured_team, session
+import yaml
+from bus_helpers import Ear, wait_until
+from docker_helpers import TOP, image
+from key_helpers import R1, R2, again, router_of, secured_team, session, with_credentials
 from process_helpers import cpcbl_team
 
 from cpcbl_launch.identities.authority import facts, issued, new_authority
@@ -26,6 +35,7 @@ from cpcbl_transport.messages import Drive, Refusal, Status, Track, encode
 from cpcbl_transport.reading import read
 from cpcbl_transport.security import Member
 from cpcbl_transport.topics import Qos, Role
+from cpcbl_transport.zenoh_bus import BusError
 
 SECURED = '\n[transport]\nsecurity = "mtls"\n'
 TEAM = f"""
@@ -146,14 +156,16 @@ def test_again_changes_nothing_and_adds_what_is_missing(team_file: Path) -> None
     assert changed(before, content_of(folder)) == {*new, "router/members.json"}
 
 
-def test_a_lost_key_is_made_again(team_file: Path) -> None:
+def test_a_key_that_is_lost_or_of_another_certificate_is_made_again(team_file: Path) -> None:
     keys(team_file)
     folder = team_file.parent / "keys"
     before = content_of(folder)
     (folder / "robot" / "r2" / "private.key").unlink()
+    (folder / "robot" / "r1" / "private.key").write_bytes(before["router/private.key"])
     keys(team_file)
-    pair = {"robot/r2/certificate.crt", "robot/r2/private.key"}
-    assert changed(before, content_of(folder)) == pair
+    files = ("certificate.crt", "private.key")
+    pairs = {f"robot/{robot}/{name}" for robot in ("r1", "r2") for name in files}
+    assert changed(before, content_of(folder)) == pairs
 
 
 def test_renewing_one_leaves_the_others(team_file: Path) -> None:
@@ -245,6 +257,15 @@ def test_a_table_says_what_was_made(team_file: Path) -> None:
     assert max(map(len, rows)) <= 80
 
 
+def test_no_robot_takes_the_name_of_an_observer() -> None:
+    team, tripod = parse_team(TEAM), Member(role=Role.OBSERVER, name="r1")
+    with pytest.raises(ValueError, match=r"robots\.r1: an observer has this name.*--revoke"):
+        plan(team, [tripod])
+    steps = plan(team, [tripod], revoke=["observer/r1"])
+    deeds = {str(step.member.identity): step.deed for step in steps}
+    assert (deeds["observer/r1"], deeds["robot/r1"]) == (Deed.REVOKED, Deed.MADE)
+
+
 def test_a_plan_names_all_that_the_team_needs_and_had() -> None:
     team = parse_team(TEAM)
     known = [Member(role=Role.ROBOT, name="gone"), Member(role=Role.ROBOT, name="r1")]
@@ -309,6 +330,22 @@ def test_plain_endpoints_end_every_command_with_one_line(team_file: Path) -> Non
         assert "tls/127.0.0.1:1" in line
 
 
+@contextmanager
+def running(*command: object) -> Iterator["subprocess.Popen[str]"]:
+    """A command beside the test, which ends it, and well."""
+    process = subprocess.Popen([*PROGRAM, *map(str, command)], stdout=subprocess.PIPE, text=True)
+    try:
+        yield process
+        if process.poll() is None:
+            process.send_signal(signal.SIGINT)
+        assert process.wait(timeout=20) == 0
+    finally:
+        process.kill()
+        process.wait()
+        if process.stdout is not None:
+            process.stdout.close()
+
+
 def demo(folder: Path, security: str) -> Path:
     """The demonstration, helping from its second second on."""
     path = folder / f"{security}.toml"
@@ -324,13 +361,10 @@ def test_a_secured_team_does_as_well_as_a_plain_one(tmp_path: Path) -> None:
     endpoint = free_endpoint("tls")
     secured.write_text(secured.read_text() + f'listen = ["{endpoint}"]\n')
     run = ("--duration", 10, "--seed", 5, "--json")
-    with subprocess.Popen(
-        [*PROGRAM, "traffic", str(secured), "--connect", endpoint, "--wait", "60", "--json"],
-        stdout=subprocess.PIPE,
-        text=True,
-    ) as watching:
+    watch = ("traffic", secured, "--connect", endpoint, "--wait", 60, "--json")
+    with running(*watch) as watching:
         done = cpcbl_team("up", secured, *run)
-        watching.send_signal(2)
+        watching.send_signal(signal.SIGINT)
         seen = json.loads(watching.communicate(timeout=20)[0])
     assert done.returncode == 0, done.stderr
     report = json.loads(done.stdout)
@@ -345,6 +379,45 @@ def test_a_secured_team_does_as_well_as_a_plain_one(tmp_path: Path) -> None:
     assert report["team"]["inside_3_sigma"] > 0.9
 
 
+def test_an_observer_joins_a_secured_team_with_its_own_certificate(tmp_path: Path) -> None:
+    secured, endpoint = demo(tmp_path, "mtls"), free_endpoint("tls")
+    secured.write_text(secured.read_text() + f'listen = ["{endpoint}"]\n')
+    keys(secured, "--observer", "tripod")
+    join = ("--team", secured, "--connect", endpoint, "--at", "4.5,0,90", "--json")
+    assert "observer/stranger" in refused("observer", "stranger", *join)
+    with running("up", secured, "--duration", 14, "--json") as team:
+        visited = json.loads(cpcbl_team("observer", "tripod", *join, "--for", 6).stdout)
+        report = json.loads(team.communicate(timeout=60)[0])
+    assert visited["lost"] == ""
+    assert sum(flow["messages"] for flow in visited["sent"]) > 10
+    guest = report["guests"]["tripod"]
+    assert guest["messages_sent"] > 10
+    assert guest["samples"] > 10
+    counts = [robot["counts"].get("guest_joined", 0) for robot in report["robots"].values()]
+    assert sum(counts) > 0
+
+
+def test_a_printed_configuration_is_as_strict(team_file: Path) -> None:
+    keys(team_file)
+    endpoint = free_endpoint("tls")
+    printed = cpcbl_team("router", team_file, "--listen", endpoint, "--print-config")
+    assert "PRIVATE KEY" not in printed.stdout
+    config = team_file.parent / "router.json5"
+    config.write_text(printed.stdout)
+    team = load_team(team_file)
+    with running("router", "--config", config):
+        with session(team, R2, endpoint) as listener, session(team, R1, endpoint) as robot:
+            ear = Ear(listener, "**")
+            for key in ("status/r2", "status/r1"):
+                publisher = robot.publisher(key, Qos.INPUT)
+                wait_until(lambda publisher=publisher: publisher.matching)  # type: ignore[misc]
+                publisher.put(b"?")
+            wait_until(lambda: bool(ear.keys))
+            assert ear.keys == ["status/r1"]
+        with pytest.raises(BusError):
+            with_credentials(team, None, endpoint.replace("tls/", "tcp/"))
+
+
 def test_robots_of_a_router_of_its_own(team_file: Path) -> None:
     """`router`, `robot` and `traffic`, each with its own certificate."""
     keys(team_file)
@@ -353,16 +426,103 @@ def test_robots_of_a_router_of_its_own(team_file: Path) -> None:
         TEAM.replace('source = "external"', 'source = "external"\nstart = {x_m = 0.0, y_m = 0.0}')
         + f'listen = ["{endpoint}"]\nconnect = ["{endpoint}"]\n'
     )
-    commands = (("router", team_file), ("robot", "r1", "--team", team_file))
-    processes = [subprocess.Popen([*PROGRAM, *map(str, words)]) for words in commands]
-    try:
+    with running("router", team_file), running("robot", "r1", "--team", team_file):
         done = cpcbl_team("traffic", team_file, "--for", 4, "--wait", 30, "--json")
         assert list(json.loads(done.stdout)["robots"]) == ["r1"]
+
+
+# Containers -------------------------------------------------------------------------------------
+
+
+def services(file: Path) -> dict[str, Any]:
+    """What `compose` says of each service of a team."""
+    done = cpcbl_team("compose", file)
+    assert done.returncode == 0, done.stderr
+    said: dict[str, Any] = yaml.safe_load(done.stdout)["services"]
+    return said
+
+
+def test_a_container_may_read_its_own_keys_and_no_others(tmp_path: Path) -> None:
+    secured = demo(tmp_path, "mtls")
+    assert "transport.keys" in refused("compose", secured)
+    keys(secured)
+    owner = (tmp_path / "keys" / "router" / "private.key").stat()
+    for name, service in services(secured).items():
+        targets = {mount["target"] for mount in service["volumes"]}
+        own = name.replace("robot-", "robot/")
+        assert targets == {"/team/mtls.toml", f"/team/keys/{own}"}
+        assert all(mount["read_only"] for mount in service["volumes"])
+        assert service["user"] == f"{owner.st_uid}:{owner.st_gid}"
+        assert not [word for word in service["command"] if "tcp/" in word]
+        assert [word for word in service["command"] if word.startswith("tls/")]
+
+
+def test_containers_of_a_plain_team_have_no_keys(tmp_path: Path) -> None:
+    for service in services(demo(tmp_path, "none")).values():
+        assert {mount["target"] for mount in service["volumes"]} == {"/team/none.toml"}
+        assert "user" not in service
+
+
+@pytest.mark.docker
+@pytest.mark.timeout(400)
+def test_a_secured_team_runs_in_containers(tmp_path: Path) -> None:
+    secured = demo(tmp_path, "mtls")
+    keys(secured)
+    done = cpcbl_team(
+        *("up", secured, "--containers", "--image", image(), "--robots", "observer,patrol"),
+        *("--duration", 12, "--json"),
+        timeout_s=380.0,
+    )
+    assert done.returncode == 0, done.stderr
+    report = json.loads(done.stdout)
+    for name in ("observer", "patrol"):
+        assert report["robots"][name]["samples"] > 0, name
+        assert report["robots"][name]["lost_at_end"] == "", name
+
+
+def checkout_with_keys(folder: Path) -> Path:
+    """A part of the sources, with a secured team's file and keys among them; where the keys are."""
+    for name in (".gitignore", ".dockerignore"):
+        shutil.copy(TOP / name, folder)
+    teams = folder / "launch" / "cpcbl_launch" / "teams"
+    shutil.copytree(TOP / "launch" / "cpcbl_launch" / "teams", teams)
+    keys(demo(teams, "mtls"))
+    return teams / "keys"
+
+
+def test_keys_do_not_get_into_a_repository(tmp_path: Path) -> None:
+    made = checkout_with_keys(tmp_path)
+    listing = ["git", "ls-files", "--others", "--exclude-standard"]
+    subprocess.run(["git", "init", "--quiet", tmp_path], check=True)
+    for ignore in (made / ".gitignore", tmp_path / ".gitignore"):  # either will do
+        done = subprocess.run(listing, cwd=tmp_path, capture_output=True, text=True, check=True)
+        assert "launch/cpcbl_launch/teams/mtls.toml" in done.stdout
+        assert "private.key" not in done.stdout
+        ignore.unlink()
+    done = subprocess.run(listing, cwd=tmp_path, capture_output=True, text=True, check=True)
+    assert "private.key" in done.stdout
+
+
+@pytest.mark.docker
+def test_keys_do_not_get_into_an_image(tmp_path: Path) -> None:
+    """Of all that the builder is given, as an image that takes everything."""
+    checkout_with_keys(tmp_path)
+    (tmp_path / "Everything").write_text("FROM scratch\nCOPY . /\n")
+    name = f"cpcbl-keys-{secrets.token_hex(4)}"
+    build = ("docker", "build", "--quiet", "--tag", name, "--file", str(tmp_path / "Everything"))
+    subprocess.run([*build, str(tmp_path)], check=True, capture_output=True)
+    try:
+        subprocess.run(
+            ["docker", "create", "--name", name, name, "nothing"], check=True, capture_output=True
+        )
+        exported = subprocess.run(["docker", "export", name], check=True, capture_output=True)
     finally:
-        for process in processes:
-            process.send_signal(2)
-        for process in processes:
-            assert process.wait(10) == 0
+        subprocess.run(["docker", "rm", name], check=False, capture_output=True)
+        subprocess.run(["docker", "rmi", name], check=False, capture_output=True)
+    with tarfile.open(fileobj=io.BytesIO(exported.stdout)) as tar:
+        names = tar.getnames()
+    assert "launch/cpcbl_launch/teams/mtls.toml" in names
+    assert not [name for name in names if "keys" in name.split("/")]
 
 
 # Nobody is believed who names another in the payload --------------------------------------------

@@ -291,6 +291,11 @@ def test_operators_and_routers_say_nothing_of_their_own() -> None:
     assert said_by(OPERATOR) == said_by(ROUTER) == []
 
 
+def named_in_rules(team: Team, *members: Member) -> set[str]:
+    subjects = access_rules(team, members)["access_control"]["subjects"]
+    return {name for subject in subjects for name in subject["cert_common_names"]}
+
+
 def test_who_has_left_the_team_file_or_was_revoked_has_no_rule(team: Team) -> None:
     members = [
         Member(role=Role.ROBOT, name="r1"),
@@ -298,9 +303,17 @@ def test_who_has_left_the_team_file_or_was_revoked_has_no_rule(team: Team) -> No
         Member(role=Role.ROBOT, name="gone"),
         Member(role=Role.OBSERVER, name="tripod", generation=3),
     ]
-    subjects = access_rules(team, members)["access_control"]["subjects"]
-    named = {name for subject in subjects for name in subject["cert_common_names"]}
-    assert named == {"robot/r1", "observer/tripod/3"}
+    assert named_in_rules(team, *members) == {"robot/r1", "observer/tripod/3"}
+
+
+def test_who_has_no_place_in_the_team_any_more_has_no_rule(team: Team) -> None:
+    field, tripod = Member(role=Role.FIELD), Member(role=Role.OBSERVER, name="tripod")
+    assert named_in_rules(team, field, tripod) == {"field", "observer/tripod"}
+    real = {name: replace(robot, source="external") for name, robot in team.robots.items()}
+    assert named_in_rules(replace(team, robots=real), field) == set()
+    closed = replace(team, guests=replace(team.guests, allowed=False))
+    assert named_in_rules(closed, tripod) == set()
+    assert named_in_rules(team, Member(role=Role.OBSERVER, name="r1")) == set()
 
 
 def test_a_robot_may_be_called_like_a_role(tmp_path: Path) -> None:

@@ -158,8 +158,8 @@ _EVERYTHING = (
 def access_rules(team: Team, members: Iterable[Member]) -> dict[str, Any]:
     """The router's access control: nobody may say anything but what the table of topics allows.
 
-    All members hear what they like. A robot that has left the team file, and whoever is not
-    among the members or was revoked, neither says nor hears anything.
+    All members hear what they like. Who is not among the members, was revoked, or has no place in
+    the team as its file has it now, neither says nor hears anything.
     """
     space = topics.namespace(team.name)
     present = [m for m in members if not m.revoked and _belongs(m.identity, team)]
@@ -211,7 +211,15 @@ def _carries(topic: Topic) -> bool:
 
 
 def _belongs(identity: Identity, team: Team) -> bool:
-    return identity.role is not Role.ROBOT or identity.name in team.robots
+    """Whether the team as its file has it now has a place for someone who had one before."""
+    match identity.role:
+        case Role.ROBOT:
+            return identity.name in team.robots
+        case Role.OBSERVER:
+            return team.guests.allowed and identity.name not in team.robots
+        case Role.FIELD:  # a simulated one must not feed real robots
+            return any(robot.source == "simulated" for robot in team.robots.values())
+    return True
 
 
 def _rule(name: str, flow: str, messages: Collection[str], keys: list[str]) -> dict[str, Any]:

@@ -110,6 +110,16 @@ def signed_by(certificate: bytes, authority: bytes) -> bool:
     return True
 
 
+def belong_together(pair: Pair) -> bool:
+    """Whether a private key is that of a certificate."""
+    try:
+        key = serialization.load_pem_private_key(pair.private_key, None)
+        certificate = x509.load_pem_x509_certificate(pair.certificate)
+    except ValueError:
+        return False
+    return key.public_key() == certificate.public_key()
+
+
 def newest(bundle: bytes) -> bytes:
     """The first certificate of several in one text: that of the authority in use."""
     return x509.load_pem_x509_certificates(bundle)[0].public_bytes(serialization.Encoding.PEM)

@@ -19,6 +19,7 @@ import msgspec
 
 from cpcbl_launch.identities.authority import (
     Pair,
+    belong_together,
     facts,
     issued,
     new_authority,
@@ -102,10 +103,15 @@ def make_keys(team: Team, folder: Path, wish: Wish) -> list[KeysReport]:
 
 
 def _missing(step: Step, folder: Path) -> Step:
-    """A member whose key is gone gets another."""
+    """A member whose key is gone, or not that of its certificate, gets another."""
     at = folder / str(step.member.identity)
-    gone = not ((at / PRIVATE_KEY).exists() and (at / CERTIFICATE).exists())
-    return step._replace(deed=Deed.MADE) if step.deed is Deed.KEPT and gone else step
+    try:
+        whole = belong_together(
+            Pair((at / PRIVATE_KEY).read_bytes(), (at / CERTIFICATE).read_bytes())
+        )
+    except FileNotFoundError:
+        whole = False
+    return step if whole or step.deed is not Deed.KEPT else step._replace(deed=Deed.MADE)
 
 
 def _check_hosts(steps: Iterable[Step], folder: Path, named: Collection[str]) -> None:

@@ -51,6 +51,13 @@ def plan(
             )
         if name in team.robots:
             raise ValueError(f"--observer {name}: is a robot of the team; name it otherwise")
+    for member in known:
+        gone = member.revoked or str(member.identity) in revoke
+        if member.role is Role.OBSERVER and not gone and member.name in team.robots:
+            raise ValueError(
+                f"robots.{member.name}: an observer has this name; name the robot otherwise, or"
+                f" --revoke {member.identity}"
+            )
     before = {member.identity: member for member in known}
     wanted = [*_needed(team), *(Identity(Role.OBSERVER, name) for name in observers)]
     everyone = list(dict.fromkeys([*wanted, *before]))
