@@ -63,7 +63,13 @@ def image_for(base: str, stop: Callable[[], bool], said: Said) -> str:
             f"BASE_IMAGE={base}",
         ]
         command += ["--file", str(top / DOCKERFILE), str(top)]
-        done(command, stop, lambda line: _step(line, said), BUILD_TIMEOUT_S)
+
+        def told(line: str) -> None:
+            step = progress_of(line)
+            if step is not None:
+                said(step)
+
+        done(command, stop, told, BUILD_TIMEOUT_S)
     return name
 
 
@@ -84,11 +90,10 @@ def _have_base(base: str, stop: Callable[[], bool], said: Said) -> None:
         )
 
 
-def _step(line: str, said: Said) -> None:
+def progress_of(line: str) -> str | None:
     """Of all that a builder says (the classic one, or BuildKit) the lines that begin a step."""
     step = re.match(r"(?:Step (\d+/\d+) :|#\d+ \[.*?(\d+/\d+)\]) (.+)", line)
-    if step:
-        said(f"  {step[1] or step[2]} {step[3]}"[:78])
+    return f"  {step[1] or step[2]} {step[3]}"[:78] if step else None
 
 
 def _files(top: Path) -> Iterator[Path]:
