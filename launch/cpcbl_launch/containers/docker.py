@@ -38,9 +38,9 @@ class Ended(NamedTuple):
 
     @property
     def problem(self) -> str:
-        """The line that says what went wrong: the first about an error, or the last of all."""
-        errors = re.findall(r"^.*\berror\b.*$", self.output, re.IGNORECASE | re.MULTILINE)
-        return errors[0].strip() if errors else self.last_line
+        """The line that says what went wrong: one that begins with error, or the last of all."""
+        found = re.search(r"^\s*error\b.*$", self.output, re.IGNORECASE | re.MULTILINE)
+        return found[0].strip() if found else self.last_line
 
 
 def never() -> bool:

@@ -15,7 +15,7 @@ from cpcbl_launch.containers.compose import Deployment, Mount, compose_text
 from cpcbl_launch.containers.deployment import owner
 from cpcbl_launch.containers.docker import DockerError, Said, check_daemon, compose_program
 from cpcbl_launch.containers.fleet import Fleet, Project
-from cpcbl_launch.containers.image import image_for
+from cpcbl_launch.containers.image import have, image_for
 from cpcbl_launch.processes import tasks
 from cpcbl_launch.supervisor import Processes
 from cpcbl_launch.team_file import save_resolved
@@ -52,6 +52,8 @@ class InContainers:
         check_daemon()
         program = compose_program()
         self._run, self._folder, self._stop, self._said = run, folder, stop, said
+        if image is not None:
+            have(image, stop, said, "leave --image out to build one of these sources")
         self._image = image or image_for(base, stop, said)
         self.lead_s = LEAD_S + LEAD_S_A_CONTAINER * len(self._here)
         self._file = folder / "compose.yaml"
@@ -74,10 +76,7 @@ class InContainers:
             with self._joined(link) as bus:
                 yield bus
         finally:
-            if self._run.folder is not None:
-                self._project.save_logs(self._folder)
-            self._said("taking the containers down")
-            self._project.down()
+            self._end()
 
     def _joined(self, link: Link) -> ZenohBus:
         until_s = time.monotonic() + ROUTER_WITHIN_S
@@ -97,6 +96,14 @@ class InContainers:
         self._project.up()
         rows = tasks(self._run.team, (), self._run.seed, self._here)
         yield Fleet(self._project, ["router", *(row.name for row in rows)])
+
+    def _end(self) -> None:
+        try:  # also when nobody reads any more what is said
+            self._said("taking the containers down")
+            if self._run.folder is not None:
+                self._project.save_logs(self._folder)
+        finally:
+            self._project.down()
 
     def _write(self, clock: str) -> None:
         run, endpoints = self._run, self._run.team.transport.listen
