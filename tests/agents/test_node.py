@@ -122,7 +122,7 @@ BAD = [
     Bad(Refusal.FUTURE, BELIEF_KEY, changed(BELIEF, stamp_ns=NOW + SECOND)),
     Bad(Refusal.FUTURE, FIX_KEY, changed(FIX, stamp_ns=NOW + SECOND)),
     Bad(Refusal.CLOCK, BELIEF_KEY, changed(BELIEF, stamp_ns=NOW + 300 * MS)),
-    Bad(Refusal.CLOCK, FIX_KEY, changed(FIX, stamp_ns=NOW + 150 * MS)),
+    Bad(Refusal.CLOCK, FIX_KEY, changed(FIX, stamp_ns=NOW + 250 * MS)),
     Bad(Refusal.FUTURE, IN_SIGHTINGS, saw(NOW + SECOND)),
     Bad(Refusal.DURATION, IN_ODOMETRY, standing(NOW, NOW)),
     Bad(Refusal.UNKNOWN_ROBOT, topics.FIX.at(robot="me", tier=2, observer="ghost"), FIX),
