@@ -17,6 +17,7 @@ Fusion = Literal["split-ci", "naive"]
 Direction = Literal["one-way", "both-ways"]
 Gives = Literal["both", "range", "bearing", "none"]
 Source = Literal["simulated", "mrclam", "external"]
+Security = Literal["none", "mtls"]
 
 
 class Table(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -99,6 +100,8 @@ class PositionSensor(Table, frozen=True, kw_only=True):
 
     sigma_m: Positive = 0.02
     rate_hz: Positive = 5.0
+    delay_s: NotNegative = 0.0
+    """Stamps are so much later than the measurement."""
 
 
 class Weights(Table, frozen=True, kw_only=True):
@@ -158,6 +161,20 @@ class BudgetSettings(Table, frozen=True, kw_only=True):
     """The part of every budget that is kept for teammates that are lost."""
 
 
+class TrustSettings(Table, frozen=True, kw_only=True):
+    """How a teammate is found that says what is not so."""
+
+    enabled: bool = True
+    limit: Positive = 50.0
+    """By how much (NIS beyond the usual, summed) it may surprise: four clear contradictions."""
+    readmit_s: NotNegative = 5.0
+    """It is believed again when it was right for so long."""
+    clock_ahead_s: NotNegative = 0.1
+    """Help is refused that is stamped by a clock further ahead,"""
+    clock_behind_s: Positive = 0.4
+    """or by one that is behind, or so late, by more."""
+
+
 class CollaborationSettings(Table, frozen=True, kw_only=True):
     """Who helps whom, and how much is believed."""
 
@@ -172,6 +189,7 @@ class CollaborationSettings(Table, frozen=True, kw_only=True):
     best_tier: Annotated[int, msgspec.Meta(ge=0, le=15)] = 0
     """No better tier is announced, however certain the robot is: for sensors that err unseen."""
     budget: BudgetSettings = BudgetSettings()
+    trust: TrustSettings = TrustSettings()
     least_value: NotNegative = 0.05
     """What a fix must be worth (nats): the logarithm of the factor by which the ellipse of the
     helped robot's position shrinks. Less is not sent."""
@@ -281,6 +299,19 @@ class TransportSettings(Table, frozen=True, kw_only=True):
     connect: tuple[str, ...] = ("tcp/127.0.0.1:7447",)
     """Endpoints at which a robot looks for the router."""
     guards: GuardSettings = GuardSettings()
+    security: Security = "none"
+    """mtls: every link is mutual TLS, and each certificate may say only what its owner may."""
+    keys: Annotated[str, msgspec.Meta(min_length=1)] = "keys"
+    """Folder of the keys that `cpcbl-team keys` makes, relative to the team file."""
+
+    @property
+    def secured(self) -> bool:
+        return self.security == "mtls"
+
+    @property
+    def usual(self) -> tuple[str, ...]:
+        """Where the router of this machine is looked for, unless the file says otherwise."""
+        return ("tls/127.0.0.1:7447",) if self.secured else ("tcp/127.0.0.1:7447",)
 
 
 class MatchSettings(Table, frozen=True, kw_only=True):
@@ -292,6 +323,27 @@ class MatchSettings(Table, frozen=True, kw_only=True):
     """They are earned evenly over this time."""
 
 
+class GuestSettings(Table, frozen=True, kw_only=True):
+    """Robots that are not in the file but may join the team while it runs, such as observers."""
+
+    allowed: bool = True
+    most: Annotated[int, msgspec.Meta(ge=1, le=100)] = 8
+    """So many at a time are let in by a robot, and by the simulated field."""
+
+
+class SimulationEvent(Table, frozen=True, kw_only=True):
+    """Something that befalls the simulated field: one of its kinds."""
+
+    at_s: NotNegative
+    """From the field's start."""
+    kidnap: str = ""
+    """The robot that is carried away; its wheels do not notice."""
+    to: tuple[float, float, float] | None = None
+    """Where it is put down: x m, y m, heading deg."""
+    hide_landmarks_s: NotNegative = 0.0
+    """For so long nobody sees a landmark or wall."""
+
+
 class SimulationSettings(Table, frozen=True, kw_only=True):
     """The simulated field."""
 
@@ -299,6 +351,7 @@ class SimulationSettings(Table, frozen=True, kw_only=True):
     noise: NotNegative = 1.0
     """True noise as a multiple of what the robots assume; 0 for none."""
     bump_radius_m: NotNegative = 0.15
+    events: tuple[SimulationEvent, ...] = ()
 
 
 class Team(Table, frozen=True, kw_only=True):
@@ -310,6 +363,9 @@ class Team(Table, frozen=True, kw_only=True):
     transport: TransportSettings = TransportSettings()
     match: MatchSettings = MatchSettings()
     simulation: SimulationSettings = SimulationSettings()
+    guests: GuestSettings = GuestSettings()
+    defaults: RobotSettings = RobotSettings()
+    """The file's layer below its robots: what a guest begins with too."""
     calibrated_on: tuple[str, ...] = ()
     """Logs from which `calibrate` took the robots' types: no measure of their worth."""
     data: str = ""

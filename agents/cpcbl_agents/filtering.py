@@ -3,7 +3,7 @@
 from collections import Counter, deque
 from collections.abc import Sequence
 
-from cpcbl_agents.agent import Anything, Located, Tick
+from cpcbl_agents.agent import Anything, Located, Presence, Tick
 from cpcbl_team.config import Field, LocalizationSettings
 from cpcbl_team.inputs import Belief, Fix, Input, Odometry, Position, Sightings, Told
 from cpcbl_team.localizer import Localizer
@@ -11,6 +11,7 @@ from cpcbl_team.self_calibration import Learned
 from cpcbl_team.sensors import without_bearing_bias
 from cpcbl_team.state import State
 from cpcbl_team.timeline import Timeline
+from cpcbl_team.trust import Standing, standings
 
 LOCATE_NS = 100_000_000
 PATIENCE_NS = 200_000_000  # how long a frame waits for the odometry that covers it
@@ -30,6 +31,7 @@ class FilterAgent:
         self.timeline = Timeline(localizer, localizer.start(start_ns))
         self.counts: Counter[str] = Counter()
         self._known = frozenset(field.landmarks) | frozenset(field.walls) | teammates
+        self._guests: set[str] = set()
         self._moves = settings.odometry.moves
         self._learns = settings.localizer.learns
         self._waiting: deque[Sightings] = deque()
@@ -52,6 +54,10 @@ class FilterAgent:
         """What the robot has learned of its odometry and bearings; None where it does not learn."""
         return self.timeline.state.memory.learned if self._learns else None
 
+    def standings(self, now_ns: int) -> tuple[Standing, ...]:
+        """How each teammate that is heard stands with this robot."""
+        return standings(self.timeline.state.memory.voices, now_ns)
+
     def handle(self, message: Anything, now_ns: int) -> Sequence[Anything]:
         match message:
             case Odometry():
@@ -61,13 +67,17 @@ class FilterAgent:
                 return self._frames_located(now_ns)
             case Sightings():
                 for sighting in message.sightings:
-                    if sighting.id not in self._known:
+                    if sighting.id not in self._known and sighting.id not in self._guests:
                         self.counts["unknown_object"] += 1
                 if self._take(message):
                     self._waiting.append(message)
                 return self._frames_located(now_ns)
             case Position() | Belief() | Fix() | Told():
                 self._take(message)
+            case Presence(name, None):
+                self._guests.discard(name)
+            case Presence(name) if name not in self._known:
+                self._guests.add(name)
             case Tick() if now_ns >= self.next_ns:
                 return [*self._frames_located(now_ns), *self._regularly(now_ns)]
         return ()

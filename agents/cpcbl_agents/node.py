@@ -1,14 +1,18 @@
 """A robot on a bus: which keys it hears, what it may send, what it refuses."""
 
+import logging
 from collections import Counter, deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from typing import Protocol
 
-from cpcbl_agents.agent import Listened, Presence, Sent, Tick
+from cpcbl_agents.agent import Listened, Presence, Sent, Stranger, Tick
+from cpcbl_agents.clocks import Clocks
 from cpcbl_agents.robot import Robot
 from cpcbl_agents.tally import Tallies
 from cpcbl_agents.wiring import Tokens, Wiring
 from cpcbl_team.config import Team
 from cpcbl_team.inputs import Belief, Fix, Odometry, Position, Sightings
+from cpcbl_team.trust import Standing
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus
 from cpcbl_transport.compact import decode_help, encode_help
@@ -18,15 +22,33 @@ from cpcbl_transport.messages import (
     Refusal,
     Status,
     Track,
+    Trust,
     decode,
     encode,
     refusal,
 )
-from cpcbl_transport.overhead import sent_bytes
+from cpcbl_transport.overhead import received_bytes, sent_bytes
 from cpcbl_transport.topics import Topic
+
+log = logging.getLogger(__name__)
 
 STATUS_NS = 1_000_000_000
 INBOX = 10_000
+
+
+class Stepped(Protocol):
+    """A robot's node, or whatever else is stepped like one."""
+
+    @property
+    def next_ns(self) -> int:
+        """When there is something to do even if nothing arrives."""
+
+    @property
+    def waiting(self) -> bool:
+        """Whether something has arrived."""
+
+    def step(self, now_ns: int) -> None:
+        """Does what is due and takes what has arrived."""
 
 
 class Node:
@@ -40,7 +62,9 @@ class Node:
         start_ns: int,
         incarnation: str,
         on_arrival: Callable[[], None] = lambda: None,
+        speed: float = 1.0,
     ) -> None:
+        """`speed`: robot time beside real time."""
         self._robot, self._incarnation = robot, incarnation
         self._on_arrival = on_arrival
         self._name = robot.name
@@ -53,7 +77,8 @@ class Node:
         self._listened = ""
         self._status_ns = start_ns
         self.counts: Counter[str] = Counter()
-        self._heard = Tallies()
+        self.heard = Tallies()
+        self._clocks = Clocks(rules.trust, speed) if rules.trust.enabled else None
         self._inputs = [
             bus.subscribe(topic.at(robot=robot.name), self._arrived) for topic in topics.INPUTS
         ]
@@ -110,8 +135,12 @@ class Node:
             presence = self._tokens.changed(*self._news.popleft())
             if presence is None:
                 self.counts["bad_token"] += 1
-            else:
-                self._robot.handle(Presence(*presence), now_ns)
+                continue
+            guests, (name, tier) = self._robot.collaboration.guests, presence
+            known = name in guests
+            self._robot.handle(Presence(name, tier), now_ns)
+            if known is not (name in guests):
+                log.info("%s: guest %s %s", self._name, name, "left" if known else "joined")
 
     def _ask_for_listeners(self, now_ns: int) -> None:
         tier = self._wiring.tier
@@ -131,12 +160,12 @@ class Node:
             self.counts[reason] += 1
             return None
         assert not isinstance(message, Refusal)
-        size = sent_bytes(len(payload))
+        size = len(payload)
         match message:
-            case Fix():
-                self._heard.of("fix", message.observer).add(size, message.stamp_ns)
-            case Belief():
-                self._heard.of("belief", message.robot).add(size, message.stamp_ns)
+            case Fix(observer=name):  # by a subscription to all observers
+                self.heard.of("fix", name).add(received_bytes(size, name), message.stamp_ns)
+            case Belief(robot=name):  # by one to this key
+                self.heard.of("belief", name).add(sent_bytes(size), message.stamp_ns)
         return message
 
     def _refused(self, key: str, message: Message, now_ns: int) -> Refusal | None:
@@ -149,9 +178,14 @@ class Node:
                 return refusal(message, now_ns)
             case _:
                 return Refusal.WRONG_TYPE
-        if sender not in self._team:
+        if sender not in self._team and sender not in self._robot.collaboration.guests:
+            self._robot.handle(Stranger(sender), now_ns)
             return Refusal.UNKNOWN_ROBOT
-        return Refusal.OWN if sender == self._name else refusal(message, now_ns)
+        if sender == self._name:
+            return Refusal.OWN
+        if self._clocks is not None and self._clocks.refuses(sender, message.stamp_ns, now_ns):
+            return Refusal.CLOCK
+        return refusal(message, now_ns)
 
     def _send(self, said: Iterable[Message], now_ns: int) -> None:
         for message in said:
@@ -187,7 +221,7 @@ class Node:
         located = self._robot.collaboration.located
         assert located is not None
         learned = self._robot.filter.learned
-        sent, heard = self._robot.collaboration.tallies.flows(), self._heard.flows()
+        sent, heard = self._robot.collaboration.tallies.flows(), self.heard.flows()
         return Status(
             self._name,
             self._incarnation,
@@ -205,7 +239,19 @@ class Node:
             sent,
             heard,
             self._robot.collaboration.budget.spending(now_ns),
+            tuple(self._trust(now_ns)),
         )
+
+    def _trust(self, now_ns: int) -> Iterator[Trust]:
+        """How teammates stand, by what they say and by their clocks."""
+        standings = {s.robot: s for s in self._robot.filter.standings(now_ns)}
+        off = frozenset() if self._clocks is None else self._clocks.off()
+        for name in sorted(standings.keys() | off):
+            late_s = 0.0 if self._clocks is None else self._clocks.late_s(name)
+            standing = standings.get(name, Standing(name))
+            if name in off:
+                standing = standing._replace(reason="clock")
+            yield Trust(*standing, late_s)
 
 
 _INPUTS = {topic.key.rsplit("/", 1)[-1]: topic.carries for topic in topics.INPUTS}

@@ -10,9 +10,12 @@ from types import FrameType
 import msgspec
 
 from cpcbl_agents.clock import Clock
-from cpcbl_agents.node import Node
+from cpcbl_agents.node import Node, Stepped
 from cpcbl_agents.robot import Robot
 from cpcbl_team.config import Team
+from cpcbl_transport.bus import Bus
+from cpcbl_transport.security import Identity, link_of
+from cpcbl_transport.topics import Role
 from cpcbl_transport.zenoh_bus import open_bus
 
 LONGEST_WAIT_S = 0.2
@@ -59,23 +62,28 @@ def run_robot(
     clock: Clock,
     stop: Callable[[], bool],
     restarted: bool = False,
+    through: Callable[[Bus], Bus] = lambda bus: bus,
 ) -> None:
     """Runs a robot until `stop()`. One that is restarted, or late, does not know where it is.
 
-    Raises BusError when stopped before a router answered, LogError for an unreadable log.
+    `through` is what stands between the robot and its bus.
+
+    Raises BusError when stopped before a router answered, LogError for an unreadable log,
+    SecurityError without the keys of a secured team.
     """
     wake = Wake()
-    with open_bus(team.name, connect, give_up=stop) as bus:
+    link = link_of(team, Identity(Role.ROBOT, name), connect)
+    with open_bus(team.name, link.endpoints, stop, link.credentials) as bus:
         start_ns = clock.now_ns()
         if restarted or start_ns > clock.epoch_ns + LATE_NS * max(1.0, clock.speed):
             team = _not_knowing_its_start(name, team)
         incarnation = f"{os.getpid():x}"
         robot = Robot(name, team, start_ns, restarted)
-        node = Node(robot, team, bus, start_ns, incarnation, wake.set)
+        node = Node(robot, team, through(bus), start_ns, incarnation, wake.set, clock.speed)
         run_node(node, wake, clock, stop)
 
 
-def run_node(node: Node, wake: Wake, clock: Clock, stop: Callable[[], bool]) -> None:
+def run_node(node: Stepped, wake: Wake, clock: Clock, stop: Callable[[], bool]) -> None:
     """Steps a node until `stop()`: when something arrives, which sets `wake`, or is due."""
     node.step(clock.now_ns())
     while not stop():

@@ -2,29 +2,43 @@
 
 Robots send wheel commands (`field/drive/<robot>`); the field answers like a driver would, with
 odometry and sightings under the robots' `in/` keys. Deterministic for a seed and the same commands.
+Guests have a body on it for as long as they ask for it (`field/join/<robot>`).
 """
 
+import logging
 import math
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from types import MappingProxyType
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
 from cpcbl_agents.clock import Clock
 from cpcbl_agents.sensing import SensorInput
+from cpcbl_launch.bodies import Bodies
 from cpcbl_launch.grid import Grid
-from cpcbl_team.config import OdometrySettings, RobotSettings, SensorSettings, Team
+from cpcbl_team.config import (
+    OdometrySettings,
+    RobotSettings,
+    SensorSettings,
+    SimulationEvent,
+    Team,
+)
 from cpcbl_team.geometry import Pose2, step, wrap_angle
 from cpcbl_team.inputs import Odometry, Position, Sighting, Sightings
 from cpcbl_team.sensors import LEAST_COSINE
 from cpcbl_transport import topics
-from cpcbl_transport.bus import Bus, Publisher
-from cpcbl_transport.messages import Drive, Truth, Truths, decode, encode, refusal
+from cpcbl_transport.bus import Bus, Handle, Publisher
+from cpcbl_transport.messages import Body, Drive, Join, Truth, Truths, encode, refusal
+from cpcbl_transport.reading import read
+
+log = logging.getLogger(__name__)
 
 COMMAND_LASTS_NS = 500_000_000
+MOST_REFUSED = 100  # guests whose refusal is logged
+_GUEST_SEED = 2**31  # no robot of a team file has this number
 NOWHERE: Mapping[str, Bus] = MappingProxyType({})
 
 
@@ -120,6 +134,7 @@ class SimulatedRobot:
         self._reported, self._reported_ns = (0.0, 0.0), start_ns
         self._motion = Delayed(settings.odometry.delay_s * 1e9 / step_ns)
         self._frames: deque[Sightings] = deque()
+        self._positions: deque[Position] = deque()
         self._errors: dict[tuple[str, str], tuple[int, float]] = {}
         self._odometry_timer = Every(settings.odometry.rate_hz)
         self._frame_timer = Every(settings.sensor.rate_hz)
@@ -163,18 +178,19 @@ class SimulatedRobot:
         if self._frame_timer.due(now_ns):
             seen = tuple(s for o in objects if (s := self._sighted(o, now_ns)))
             self._frames.append(Sightings(now_ns + int(self.settings.sensor.delay_s * 1e9), seen))
-        out = []
-        while self._frames and self._frames[0].stamp_ns <= now_ns:
-            out.append(self._frames.popleft())
-        return out
+        return _out(self._frames, now_ns)
 
-    def position(self, now_ns: int) -> Position | None:
-        """What the position sensor says, if there is one and it is due."""
+    def positions(self, now_ns: int) -> list[Position]:
+        """What the position sensor has said by now, if there is one: `delay_s` after it measured,
+        with the stamp of that time."""
         sensor = self.settings.position_sensor
-        if sensor is None or not self._position_timer.due(now_ns):
-            return None
-        x, y = (v + self._normal(sensor.sigma_m) for v in self.pose[:2])
-        return Position(now_ns, x, y, (sensor.sigma_m**2, 0.0, sensor.sigma_m**2))
+        if sensor is None:
+            return []
+        if self._position_timer.due(now_ns):
+            x, y = (v + self._normal(sensor.sigma_m) for v in self.pose[:2])
+            variance, stamp_ns = sensor.sigma_m**2, now_ns + int(sensor.delay_s * 1e9)
+            self._positions.append(Position(stamp_ns, x, y, (variance, 0.0, variance)))
+        return _out(self._positions, now_ns)
 
     def _sighted(self, seen: Seen, now_ns: int) -> Sighting | None:
         sensor = self.settings.sensor
@@ -211,11 +227,22 @@ class SimulatedRobot:
         return float(self._random.normal(0.0, sigma)) * self._noise if sigma else 0.0
 
 
+Stamped = TypeVar("Stamped", Sightings, Position)
+
+
+def _out(waiting: deque[Stamped], now_ns: int) -> list[Stamped]:
+    """What is stamped with a time that has come."""
+    out = []
+    while waiting and waiting[0].stamp_ns <= now_ns:
+        out.append(waiting.popleft())
+    return out
+
+
 class SimulatedField:
     """All robots of a team on one field, in fixed steps of time."""
 
     def __init__(self, team: Team, seed: int, start_ns: int) -> None:
-        self._team = team
+        self.team, self._seed = team, seed
         self._step_ns = int(1e9 / team.simulation.step_rate_hz)
         self.now_ns = start_ns
         self.robots = {
@@ -225,11 +252,34 @@ class SimulatedField:
             for i, (name, settings) in enumerate(team.robots.items())
             if settings.source == "simulated"
         }
-        marks = [Seen(n, m.x_m, m.y_m, m.gives) for n, m in team.map.landmarks.items()]
+        self._marks = [Seen(n, m.x_m, m.y_m, m.gives) for n, m in team.map.landmarks.items()]
+        self._marks_to_touch = Grid(team.simulation.bump_radius_m, self._marks)
+        self._start_ns = start_ns
+        self._events = deque(sorted(team.simulation.events, key=lambda event: event.at_s))
+        self._hidden_until_ns = start_ns
+        self._look()
+
+    def _look(self) -> None:
+        """How far anybody sees, and what there is to see so far around."""
         ranges_m = [robot.settings.sensor.max_range_m for robot in self.robots.values()]
         self._reach_m = max(ranges_m, default=0.0)
-        self._marks_to_see = Grid(self._reach_m, marks)
-        self._marks_to_touch = Grid(team.simulation.bump_radius_m, marks)
+        self._marks_to_see = Grid(self._reach_m, self._marks)
+
+    def join(self, name: str, body: Body) -> None:
+        """A guest has a body from now on. Its noise is its own: the others' stays what it was."""
+        settings = RobotSettings(
+            start=body.start,
+            sensor=body.sensor,
+            odometry=body.odometry,
+            position_sensor=body.position_sensor,
+        )
+        seed, noise = (self._seed, _GUEST_SEED, *name.encode()), self.team.simulation.noise
+        self.robots[name] = SimulatedRobot(settings, noise, seed, self.now_ns, self._step_ns)
+        self._look()
+
+    def leave(self, name: str) -> None:
+        del self.robots[name]
+        self._look()
 
     @property
     def next_ns(self) -> int:
@@ -243,6 +293,8 @@ class SimulatedField:
     def advance(self) -> list[tuple[str, SensorInput]]:
         """One step; what each robot senses at its end."""
         self.now_ns += self._step_ns
+        while self._events and self._passed_s >= self._events[0].at_s:
+            self._befall(self._events.popleft())
         for robot in self.robots.values():
             robot.move(self.now_ns, self._step_ns * 1e-9)
             self._bump(robot)
@@ -254,8 +306,7 @@ class SimulatedField:
         for name, robot in self.robots.items():
             piece = robot.odometry(self.now_ns)
             frames = robot.sightings(self.now_ns, self._visible(name, robot.pose, mates))
-            position = robot.position(self.now_ns)
-            items = (piece, *frames, position)
+            items = (piece, *frames, *robot.positions(self.now_ns))
             sensed += [(name, item) for item in items if item is not None]
         return sensed
 
@@ -263,19 +314,34 @@ class SimulatedField:
         robots = tuple(Truth(n, *r.pose, r.bumps) for n, r in self.robots.items())
         return Truths(self.now_ns, robots)
 
+    @property
+    def _passed_s(self) -> float:
+        return (self.now_ns - self._start_ns) * 1e-9
+
+    def _befall(self, event: SimulationEvent) -> None:
+        hidden_ns = self._start_ns + int((event.at_s + event.hide_landmarks_s) * 1e9)
+        self._hidden_until_ns = max(self._hidden_until_ns, hidden_ns)
+        if event.to is not None and event.kidnap in self.robots:
+            x, y, heading_deg = event.to
+            self.robots[event.kidnap].pose = Pose2(x, y, wrap_angle(math.radians(heading_deg)))
+
     def _visible(self, viewer: str, pose: Pose2, mates: Grid[Seen]) -> Iterable[Seen]:
-        yield from self._marks_to_see.near(pose.x, pose.y)
-        for name, wall in self._team.map.walls.items():
+        if self.now_ns >= self._hidden_until_ns:
+            yield from self._marks_to_see.near(pose.x, pose.y)
+            yield from self._walls(pose)
+        yield from (mate for mate in mates.near(pose.x, pose.y) if mate.name != viewer)
+
+    def _walls(self, pose: Pose2) -> Iterable[Seen]:
+        for name, wall in self.team.map.walls.items():
             (ax, ay), (bx, by) = wall.from_m, wall.to_m
             length = math.hypot(bx - ax, by - ay)
             ux, uy = (bx - ax) / length, (by - ay) / length
             along = ux * (pose.x - ax) + uy * (pose.y - ay)
             if 0.0 <= along <= length:
                 yield Seen(name, ax + along * ux, ay + along * uy, wall.gives)
-        yield from (mate for mate in mates.near(pose.x, pose.y) if mate.name != viewer)
 
     def _bump(self, robot: SimulatedRobot) -> None:
-        radius = self._team.simulation.bump_radius_m
+        radius = self.team.simulation.bump_radius_m
         touching = frozenset(
             mark.name
             for mark in self._marks_to_touch.near(robot.pose.x, robot.pose.y)
@@ -291,17 +357,27 @@ class FieldNode:
     """
 
     def __init__(self, field: SimulatedField, bus: Bus, sites: Mapping[str, Bus] = NOWHERE) -> None:
-        self._field = field
-        self._drives: deque[bytes] = deque(maxlen=10_000)
+        self._field, self._bus, self._sites = field, bus, sites
+        self._bodies = Bodies(field.team)
+        self._guests: dict[str, str] = {}  # with the incarnation that asked
+        self._refused: set[str] = set()
+        self._drives: deque[tuple[str, bytes]] = deque(maxlen=10_000)
+        self._joins: deque[tuple[str, bytes]] = deque(maxlen=1_000)
         self._truth = bus.publisher(topics.TRUTH.at(), topics.TRUTH.qos)
         self._publishers: dict[tuple[str, type], Publisher] = {}
+        self._driven: dict[str, Handle] = {}
         for name in field.robots:
-            for topic in topics.INPUTS:
-                assert topic.carries is not None
-                publisher = sites.get(name, bus).publisher(topic.at(robot=name), topic.qos)
-                self._publishers[name, topic.carries] = publisher
-            drive = topics.DRIVE.at(robot=name)
-            sites.get(name, bus).subscribe(drive, lambda key, data: self._drives.append(data))
+            self._declare(name)
+        bus.subscribe(topics.JOIN.at(), lambda *join: self._joins.append(join))
+
+    def _declare(self, name: str) -> None:
+        bus = self._sites.get(name, self._bus)
+        for topic in topics.INPUTS:
+            assert topic.carries is not None
+            publisher = bus.publisher(topic.at(robot=name), topic.qos)
+            self._publishers[name, topic.carries] = publisher
+        drive = topics.DRIVE.at(robot=name)
+        self._driven[name] = bus.subscribe(drive, lambda *said: self._drives.append(said))
 
     @property
     def next_ns(self) -> int:
@@ -313,8 +389,9 @@ class FieldNode:
 
     def step(self, now_ns: int) -> None:
         """Advances the field to `now_ns` and tells the robots what they sense."""
+        self._let_in_and_out(now_ns)
         while self._drives:
-            drive = decode(self._drives.popleft())
+            drive = read(*self._drives.popleft())
             if isinstance(drive, Drive) and refusal(drive, now_ns) is None:
                 self._field.command(drive)
         while self._field.next_ns <= now_ns:
@@ -322,6 +399,39 @@ class FieldNode:
                 self._publishers[name, type(sensed)].put(encode(sensed))
             if self._truth.matching:
                 self._truth.put(encode(self._field.truth()))
+
+    def _let_in_and_out(self, now_ns: int) -> None:
+        """Guests that ask for a body get it, those that leave or are silent lose it."""
+        while self._joins:
+            self._asked(*self._joins.popleft(), now_ns)
+        present = self._bodies.present(now_ns)
+        for name, incarnation in list(self._guests.items()):
+            if name not in present or present[name].incarnation != incarnation:
+                self._let_out(name)
+        for name, join in present.items():
+            if name not in self._guests and join.body is not None:
+                self._guests[name] = join.incarnation
+                self._field.join(name, join.body)
+                self._declare(name)
+                log.info("guest %s joined the field", name)
+
+    def _asked(self, key: str, payload: bytes, now_ns: int) -> None:
+        join = read(key, payload)
+        if not isinstance(join, Join):
+            return
+        reason = refusal(join, now_ns) or self._bodies.ask(join, now_ns)
+        if reason and len(self._refused) < MOST_REFUSED and join.robot not in self._refused:
+            self._refused.add(join.robot)
+            log.warning("guest %s gets no body: %s", join.robot, reason)
+
+    def _let_out(self, name: str) -> None:
+        del self._guests[name]
+        self._field.leave(name)
+        for topic in topics.INPUTS:
+            assert topic.carries is not None
+            self._publishers.pop((name, topic.carries)).close()
+        self._driven.pop(name).close()
+        log.info("guest %s left the field", name)
 
 
 def robots_at(sites: Iterable[str], team: Team) -> dict[str, list[str]]:

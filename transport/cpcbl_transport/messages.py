@@ -10,6 +10,7 @@ from enum import StrEnum
 
 import msgspec
 
+from cpcbl_team.config import OdometrySettings, PositionSensor, SensorSettings, Start
 from cpcbl_team.inputs import Belief, Fix, Name, Odometry, Position, Sightings
 
 VERSION = 2
@@ -51,6 +52,22 @@ class Spending(msgspec.Struct, frozen=True, array_like=True):
     """The most that was spent within one window."""
 
 
+class Trust(msgspec.Struct, frozen=True, array_like=True):
+    """How a teammate stands with this robot."""
+
+    peer: str
+    reason: str = ""
+    """Why nothing that it says is used; empty while it is believed."""
+    since_ns: int = 0
+    """When that began, or ended."""
+    quarantines: int = 0
+    """How often it was in quarantine so far."""
+    unconfirmed: bool = False
+    """Nobody else tells this robot anything: whether this one is biased cannot be told."""
+    late_s: float = 0.0
+    """The least time from its stamps to their arrival, lately; below zero its clock is ahead."""
+
+
 class Status(msgspec.Struct, frozen=True, array_like=True, tag="status"):
     """A robot's health, for operators. Metres, radians, counts since its process started."""
 
@@ -71,6 +88,8 @@ class Status(msgspec.Struct, frozen=True, array_like=True, tag="status"):
     sent: tuple[Flow, ...] = ()
     heard: tuple[Flow, ...] = ()
     spending: tuple[Spending, ...] = ()
+    trust: tuple[Trust, ...] = ()
+    """Teammates that are heard, or are or were in quarantine."""
 
 
 class Track(msgspec.Struct, frozen=True, array_like=True, tag="track"):
@@ -97,6 +116,27 @@ class Drive(msgspec.Struct, frozen=True, array_like=True, tag="drive"):
     """Waypoints that the robot believes to have reached so far."""
 
 
+class Body(msgspec.Struct, frozen=True, array_like=True):
+    """What the simulated field must know of a robot: its senses, and where it starts.
+
+    The field draws the true pose around the stated one, as it does for all robots.
+    """
+
+    start: Start
+    sensor: SensorSettings
+    odometry: OdometrySettings
+    position_sensor: PositionSensor | None = None
+
+
+class Join(msgspec.Struct, frozen=True, array_like=True, tag="join"):
+    """A guest asks the simulated field for a body, again and again; None: it leaves."""
+
+    robot: Name
+    incarnation: str
+    stamp_ns: int
+    body: Body | None = None
+
+
 class Truth(msgspec.Struct, frozen=True, array_like=True):
     """Where the simulated field has a robot; bumps into landmarks so far."""
 
@@ -115,7 +155,7 @@ class Truths(msgspec.Struct, frozen=True, array_like=True, tag="truth"):
 
 
 Help = Belief | Fix
-Tagged = Odometry | Sightings | Position | Status | Track | Drive | Truths
+Tagged = Odometry | Sightings | Position | Status | Track | Drive | Join | Truths
 Message = Tagged | Help
 
 
@@ -131,9 +171,11 @@ class Refusal(StrEnum):
     IMPLAUSIBLE = "implausible_number"
     NOT_A_COVARIANCE = "not_a_covariance"
     FUTURE = "from_the_future"
+    CLOCK = "clock_off"
     DURATION = "impossible_duration"
     UNKNOWN_ROBOT = "unknown_robot"
     OWN = "own_message"
+    NOT_ITS_OWN = "name_of_another"
 
 
 _encoder = msgspec.msgpack.Encoder()

@@ -8,6 +8,7 @@ from rich.text import Text
 
 from cpcbl_launch.live import LiveView
 from cpcbl_launch.recorder import Report, RobotReport
+from cpcbl_launch.standing import distrusted
 from cpcbl_launch.tables import number, short, table
 from cpcbl_launch.traffic.flows import FlowReport, SpendingReport, all_held
 from cpcbl_launch.traffic.watch import AT_PRESENT_NS, RATES_NS, Help, RobotNow, Traffic
@@ -38,13 +39,21 @@ def spent_table(report: Report) -> Table:
     )
     if limited:
         shown.add_column("most", no_wrap=True)
-    for name, robot in report.robots.items():
-        limits = [Text("\n").join(map(limit_text, robot.spending))] if limited else []
-        shown.add_row(name, *_spent([robot], report.duration_s), *limits)
-    shown.add_section()
     robots = list(report.robots.values())
+    for name, robot in report.robots.items():
+        _add_spent(shown, name, robot, report.duration_s)
+    shown.add_section()
     shown.add_row("team", *_spent(robots, report.duration_s), style="bold")
+    if report.guests:
+        shown.add_section()
+    for name, guest in report.guests.items():
+        _add_spent(shown, f"{name}, guest", guest, report.duration_s)
     return shown
+
+
+def _add_spent(shown: Table, name: str, robot: RobotReport, duration_s: float) -> None:
+    limits = [Text("\n").join(map(limit_text, robot.spending))] if robot.spending else []
+    shown.add_row(name, *_spent([robot], duration_s), *limits)
 
 
 def _spent(robots: Sequence[RobotReport], duration_s: float) -> list[str]:
@@ -127,7 +136,7 @@ def help_table(now: Traffic) -> Table:
     for name, robot in now.robots.items():
         style = "dim" if robot.away else "bold red" if robot.lost else ""
         shown.add_row(
-            Text(name, style),
+            Text(f"{name}, guest" if name in now.guests else name, style),
             Text(str(robot.tier), style),
             Text(number(robot.position_sigma_m), style),
             _doing(robot, [h for h in now.help if h.helper == name]),
@@ -142,9 +151,10 @@ def _doing(robot: RobotNow, given: Sequence[Help]) -> Text:
         return Text(f"away: silent for {robot.silent_s:.0f} s", "yellow")
     if robot.lost:
         return Text(f"lost: {robot.lost}", "bold red")
-    if not given:
-        return Text("nobody", "dim")
-    return Text("\n").join(_arrows(given))
+    lines = list(_arrows(given)) if given else [Text("nobody", "dim")]
+    if said := distrusted(robot.trust):
+        lines.append(Text(said, "yellow"))
+    return Text("\n").join(lines)
 
 
 def _arrows(given: Sequence[Help]) -> Iterator[Text]:

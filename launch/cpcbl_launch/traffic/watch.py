@@ -12,6 +12,7 @@ from typing import NamedTuple, Protocol
 
 import msgspec
 
+from cpcbl_launch.standing import TrustReport, trust_of
 from cpcbl_launch.traffic.flows import (
     FlowReport,
     SpendingReport,
@@ -20,7 +21,9 @@ from cpcbl_launch.traffic.flows import (
 )
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus
-from cpcbl_transport.messages import Flow, Status, decode
+from cpcbl_transport.messages import Flow, Status
+from cpcbl_transport.reading import read
+from cpcbl_transport.security import Link
 from cpcbl_transport.zenoh_bus import BusError, open_bus
 
 AT_PRESENT_NS = 3_000_000_000  # help is given at present whose latest message is no older
@@ -52,6 +55,8 @@ class RobotNow(msgspec.Struct, frozen=True, kw_only=True):
     sent: tuple[FlowNow, ...]
     heard: tuple[FlowNow, ...]
     spending: tuple[SpendingReport, ...]
+    trust: tuple[TrustReport, ...] = ()
+    """What it makes of teammates."""
 
 
 class Help(msgspec.Struct, frozen=True, kw_only=True):
@@ -74,6 +79,8 @@ class Traffic(msgspec.Struct, frozen=True, kw_only=True):
     never_heard: tuple[str, ...]
     """Robots of the team file that have said nothing."""
     help: tuple[Help, ...]
+    guests: tuple[str, ...] = ()
+    """Robots that the team file, where there is one, does not name."""
 
 
 class Arrival(NamedTuple):
@@ -99,6 +106,7 @@ def traffic(
         robots=robots,
         never_heard=tuple(name for name in known if name not in robots),
         help=tuple(_help(robots)),
+        guests=tuple(name for name in robots if known and name not in known),
     )
 
 
@@ -116,6 +124,7 @@ def _robot(seen: Sequence[Arrival], now_s: float) -> RobotNow:
         sent=tuple(_flows(first, last, first.sent, last.sent)),
         heard=tuple(_flows(first, last, first.heard, last.heard)),
         spending=summed_spending([last.spending]),
+        trust=trust_of([last]),
     )
 
 
@@ -156,7 +165,7 @@ class Watcher:
         bus.subscribe(topics.STATUS.at(), self._arrived)
 
     def _arrived(self, key: str, payload: bytes) -> None:
-        status = decode(payload)
+        status = read(key, payload)
         if not isinstance(status, Status):
             return
         with self._lock:
@@ -188,7 +197,7 @@ class Watch(NamedTuple):
     team: str
     known: Collection[str]
     """The robots that should be there, as far as one knows."""
-    connect: Sequence[str]
+    link: Link
     duration_s: float = math.inf
     wait_s: float = 5.0
     """For the router."""
@@ -200,14 +209,15 @@ def watch_team(watch: Watch, view: View, stop: Callable[[], bool]) -> Traffic:
     try:
         bus = open_bus(
             watch.team,
-            watch.connect,
+            watch.link.endpoints,
             lambda: stop() or time.monotonic() > began_s + watch.wait_s,
+            watch.link.credentials,
         )
     except BusError:
         if stop():
             return traffic(watch.team, watch.known, {}, began_s, time.monotonic())
         raise BusError(
-            f"no router at {', '.join(watch.connect)} within {watch.wait_s:g} s;"
+            f"no router at {', '.join(watch.link.endpoints)} within {watch.wait_s:g} s;"
             " --connect takes the endpoint that `cpcbl-team up` says"
         ) from None
     with bus:
