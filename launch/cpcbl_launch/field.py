@@ -4,9 +4,10 @@ Robots send wheel commands (`field/drive/<robot>`); the field answers like a dri
 odometry and sightings under the robots' `in/` keys. Deterministic for a seed and the same commands.
 """
 
+import logging
 import math
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Iterable, Sequence
 from typing import NamedTuple
 
@@ -21,9 +22,13 @@ from cpcbl_team.inputs import Odometry, Position, Sighting, Sightings
 from cpcbl_team.sensors import LEAST_COSINE
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus, Publisher
-from cpcbl_transport.messages import Drive, Truth, Truths, decode, encode, refusal
+from cpcbl_transport.messages import Drive, Refusal, Truth, Truths, encode
+from cpcbl_transport.reading import read
+
+log = logging.getLogger(__name__)
 
 COMMAND_LASTS_NS = 500_000_000
+INBOX = 10_000
 
 
 class Every:
@@ -288,7 +293,9 @@ class FieldNode:
 
     def __init__(self, field: SimulatedField, bus: Bus) -> None:
         self._field = field
-        self._drives: deque[bytes] = deque(maxlen=10_000)
+        self._drives: deque[tuple[str, bytes]] = deque(maxlen=INBOX)
+        self.counts: Counter[str] = Counter()
+        """Commands that were taken (`drive`), and what was refused, by reason."""
         self._truth = bus.publisher(topics.TRUTH.at(), topics.TRUTH.qos)
         self._publishers: dict[tuple[str, type], Publisher] = {}
         for name in field.robots:
@@ -296,7 +303,12 @@ class FieldNode:
                 assert topic.carries is not None
                 publisher = bus.publisher(topic.at(robot=name), topic.qos)
                 self._publishers[name, topic.carries] = publisher
-        bus.subscribe(topics.DRIVE.at(), lambda key, payload: self._drives.append(payload))
+        bus.subscribe(topics.DRIVE.at(), self._arrived)
+
+    def _arrived(self, key: str, payload: bytes) -> None:
+        if len(self._drives) == INBOX:
+            self.counts["inbox_overflow"] += 1
+        self._drives.append((key, payload))
 
     @property
     def next_ns(self) -> int:
@@ -309,9 +321,12 @@ class FieldNode:
     def step(self, now_ns: int) -> None:
         """Advances the field to `now_ns` and tells the robots what they sense."""
         while self._drives:
-            drive = decode(self._drives.popleft())
-            if isinstance(drive, Drive) and refusal(drive, now_ns) is None:
+            drive = read(*self._drives.popleft(), now_ns)
+            if isinstance(drive, Drive) and drive.robot in self._field.robots:
+                self.counts["drive"] += 1
                 self._field.command(drive)
+            else:
+                self.counts[drive if isinstance(drive, Refusal) else Refusal.UNKNOWN_ROBOT] += 1
         while self._field.next_ns <= now_ns:
             for name, sensed in self._field.advance():
                 self._publishers[name, type(sensed)].put(encode(sensed))
@@ -325,3 +340,5 @@ def run_field(team: Team, seed: int, bus: Bus, clock: Clock, stop: Callable[[], 
     while not stop():
         node.step(clock.now_ns())
         time.sleep(min(clock.seconds_until(node.next_ns), 0.2))
+    counts = ", ".join(f"{reason} {n}" for reason, n in sorted(node.counts.items()))
+    log.info("commands, by what became of them: %s", counts or "none")

@@ -5,7 +5,7 @@ import socket
 import tempfile
 import time
 from collections.abc import Collection, Mapping
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import ExitStack
 from pathlib import Path
 from types import MappingProxyType
 from typing import NamedTuple, Protocol
@@ -16,7 +16,7 @@ import numpy as np
 from cpcbl_agents.clock import Clock
 from cpcbl_launch.evaluation import Progress, simulate
 from cpcbl_launch.logs import seen_before
-from cpcbl_launch.options import check_duration
+from cpcbl_launch.options import check_duration, not_written
 from cpcbl_launch.processes import process_table
 from cpcbl_launch.recorder import Recorder, Report
 from cpcbl_launch.recording import Recording
@@ -114,9 +114,12 @@ def simulate_run(run: Run, progress: Progress | None = None) -> Report:
 def _run_in(run: Run, view: View, stop: Stopping, folder: Path) -> Report:
     team = listening(run.team)
     here = team.robots if run.here is None else run.here
-    folder.mkdir(parents=True, exist_ok=True)
     team_file = folder / "team.json"
-    save_resolved(team, team_file)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        save_resolved(team, team_file)
+    except OSError as error:
+        raise ValueError(f"{team_file}: {error.strerror}; robots read their team there") from error
     listen = team.transport.listen
     lead_s = LEAD_S + LEAD_S_A_PROCESS * len(here)
     clock = Clock(
@@ -126,7 +129,10 @@ def _run_in(run: Run, view: View, stop: Stopping, folder: Path) -> Report:
     )
     table = process_table(team, team_file, dialled(listen[0]), clock, run.seed, here)
     guards = guard_rules(team, run.speed)
-    with open_router(team.name, listen, guards=guards) as bus, _recording(run, bus):
+    recording: Recording | None = None
+    with open_router(team.name, listen, guards=guards) as bus, ExitStack() as stack:
+        if run.record is not None:
+            recording = stack.enter_context(_recording(run, run.record, bus))
         recorder = Recorder(bus)
         with Supervisor(table, folder) as supervisor:
             end_ns = None if run.duration_s is None else int(run.duration_s * 1e9)
@@ -139,20 +145,25 @@ def _run_in(run: Run, view: View, stop: Stopping, folder: Path) -> Report:
                 time.sleep(REFRESH_S)
             elapsed_s = (clock.now_ns() - clock.epoch_ns) * 1e-9
             restarts = supervisor.restarts
-    return _report(run, recorder, clock.epoch_ns * 1e-9, elapsed_s, restarts)
+    report = _report(run, recorder, clock.epoch_ns * 1e-9, elapsed_s, restarts)
+    if recording is not None and recording.failed:
+        lost = {**report.not_written, str(run.record): recording.failed}
+        report = msgspec.structs.replace(report, not_written=lost)
+    return report
 
 
-def _recording(run: Run, bus: Bus) -> AbstractContextManager[object]:
-    if run.record is None:
-        return nullcontext()
+def _recording(run: Run, path: Path, bus: Bus) -> Recording:
     replayed = [name for name, robot in run.team.robots.items() if robot.source == "mrclam"]
     if replayed:
         log.warning(
             "%s: without the inputs of %s: robots that replay a log do not publish them",
-            run.record,
+            path,
             ", ".join(replayed),
         )
-    return Recording(run.record, run.team, bus)
+    try:
+        return Recording(path, run.team, bus)
+    except OSError as error:
+        raise ValueError(f"--record {path}: {error.strerror}; name another file") from error
 
 
 def _report(
@@ -163,10 +174,13 @@ def _report(
     after_s = max(robot.collaboration.after_s for robot in robots.values())
     helped_from_s = epoch_s + after_s if after_s else None
     variants = {name: robot.localizer.variant for name, robot in robots.items()}
-    if run.picture is not None:
+    lost: dict[str, str] = {}
+    if (picture := run.picture) is not None:
         from cpcbl_launch.picture import draw_run
 
-        draw_run(recorder, run.team, truth, run.picture, helped_from_s)
+        lost = not_written(
+            picture, lambda: draw_run(recorder, run.team, truth, picture, helped_from_s)
+        )
     report = recorder.report(variants, truth, helped_from_s or -np.inf)
     alone = {}
     if helped_from_s is not None:
@@ -182,4 +196,5 @@ def _report(
         duration_s=elapsed_s,
         restarts=restarts,
         alone=alone,
+        not_written=lost,
     )

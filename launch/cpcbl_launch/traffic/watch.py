@@ -7,7 +7,9 @@ import itertools
 import math
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from types import MappingProxyType
 from typing import NamedTuple, Protocol
 
 import msgspec
@@ -20,7 +22,8 @@ from cpcbl_launch.traffic.flows import (
 )
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus
-from cpcbl_transport.messages import Flow, Status, decode
+from cpcbl_transport.messages import Flow, Status
+from cpcbl_transport.reading import read
 from cpcbl_transport.zenoh_bus import BusError, open_bus
 
 AT_PRESENT_NS = 3_000_000_000  # help is given at present whose latest message is no older
@@ -74,6 +77,8 @@ class Traffic(msgspec.Struct, frozen=True, kw_only=True):
     never_heard: tuple[str, ...]
     """Robots of the team file that have said nothing."""
     help: tuple[Help, ...]
+    refused: dict[str, int] = {}
+    """What came on `status/*` and could not be used, by reason."""
 
 
 class Arrival(NamedTuple):
@@ -89,6 +94,7 @@ def traffic(
     arrivals: Mapping[str, Sequence[Arrival]],
     began_s: float,
     now_s: float,
+    refused: Mapping[str, int] = MappingProxyType({}),
 ) -> Traffic:
     """What the latest statuses of each robot's present process come to."""
     now = {name: _robot(seen, now_s) for name, seen in arrivals.items()}
@@ -99,6 +105,7 @@ def traffic(
         robots=robots,
         never_heard=tuple(name for name in known if name not in robots),
         help=tuple(_help(robots)),
+        refused=dict(sorted(refused.items())),
     )
 
 
@@ -153,16 +160,24 @@ class Watcher:
     def __init__(self, bus: Bus, now_s: Callable[[], float] = time.monotonic) -> None:
         self._now_s, self._lock = now_s, threading.Lock()
         self._arrivals: dict[str, list[Arrival]] = {}
+        self._refused: Counter[str] = Counter()
         bus.subscribe(topics.STATUS.at(), self._arrived)
 
     def _arrived(self, key: str, payload: bytes) -> None:
-        status = decode(payload)
-        if not isinstance(status, Status):
-            return
+        status = read(key, payload)
         with self._lock:
+            if not isinstance(status, Status):
+                self._refused[str(status)] += 1
+                return
             seen = self._arrivals.get(status.robot, [])
             kept = [a for a in seen if _goes_on(a.status, status)]
             self._arrivals[status.robot] = [*kept, Arrival(self._now_s(), status)]
+
+    @property
+    def refused(self) -> Counter[str]:
+        """What could not be used, by reason."""
+        with self._lock:
+            return self._refused.copy()
 
     def arrivals(self) -> dict[str, list[Arrival]]:
         """By robot: its process's statuses of the last seconds, at least the latest."""
@@ -214,7 +229,8 @@ def watch_team(watch: Watch, view: View, stop: Callable[[], bool]) -> Traffic:
         watcher, began_s = Watcher(bus), time.monotonic()
         while True:
             now_s = time.monotonic()
-            now = traffic(watch.team, watch.known, watcher.arrivals(), began_s, now_s)
+            heard = watcher.arrivals(), began_s, now_s, watcher.refused
+            now = traffic(watch.team, watch.known, *heard)
             view.show(now)
             if stop() or now_s - began_s >= watch.duration_s:
                 return now
