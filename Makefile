@@ -26,7 +26,7 @@ check: setup
 	PYTHONPATH=.:agents:transport:launch $(BIN)/lint-imports --no-cache
 
 unit: setup
-	$(BIN)/pytest -n 2 -m "not long and not log"
+	$(BIN)/pytest -n 2 -m "not long and not log and not docker"
 
 # Minutes long; with CPCBL_MRCLAM=folder also on real logs.
 test-long: setup

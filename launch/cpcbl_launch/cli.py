@@ -7,8 +7,9 @@ import sys
 
 import typer
 
+from cpcbl_launch.commands.deploying import compose
 from cpcbl_launch.commands.measuring import calibrate, evaluate_mrclam, simulate
-from cpcbl_launch.commands.running import check, field, robot, up
+from cpcbl_launch.commands.running import check, field, robot, router, up
 from cpcbl_launch.commands.watching import traffic
 from cpcbl_launch.experiments.cli import experiment_app
 
@@ -18,7 +19,7 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
-for command in (check, up, traffic, robot, field, calibrate, simulate):
+for command in (check, up, traffic, robot, router, field, compose, calibrate, simulate):
     app.command()(command)
 
 evaluate_app = typer.Typer(help="Real logs in one process: deterministic and fast.")

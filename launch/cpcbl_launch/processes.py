@@ -1,31 +1,48 @@
-"""THE table of processes of a run on one machine."""
+"""THE table of processes of a run, on one machine or in containers."""
 
 import os
 import sys
 from collections.abc import Collection
 from pathlib import Path
+from typing import NamedTuple
 
 from cpcbl_agents.clock import Clock
 from cpcbl_launch.supervisor import ProcessSpec
 from cpcbl_team.config import Team
 
 PROGRAM = (sys.executable, "-m", "cpcbl_launch")
+ROBOT = "robot-"
+
+
+class Task(NamedTuple):
+    """One row: what `cpcbl-team ARGUMENTS` does."""
+
+    name: str
+    arguments: tuple[str, ...]
+    on_restart: tuple[str, ...] = ()
+
+
+def tasks(team: Team, common: tuple[str, ...], seed: int, here: Collection[str]) -> list[Task]:
+    """name | arguments | when: the field if any robot is simulated, one process a robot."""
+    rows = [
+        Task(ROBOT + name, ("robot", name, *common), ("--restarted",))
+        for name in team.robots
+        if name in here
+    ]
+    if any(robot.source == "simulated" for robot in team.robots.values()):
+        rows.insert(0, Task("field", ("field", "--seed", str(seed), *common)))
+    return rows
 
 
 def process_table(
     team: Team, team_file: Path, endpoint: str, clock: Clock, seed: int, here: Collection[str]
 ) -> list[ProcessSpec]:
-    """name | command | when: the field if any robot is simulated, one process a robot."""
+    """The same as processes of this machine, which end with the one that started them."""
     common = (
         *("--team", str(team_file), "--connect", endpoint),
         *("--clock", str(clock), "--parent", str(os.getpid())),
     )
-    table = [
-        ProcessSpec(f"robot-{name}", (*PROGRAM, "robot", name, *common), ("--restarted",))
-        for name in team.robots
-        if name in here
+    return [
+        ProcessSpec(task.name, (*PROGRAM, *task.arguments), task.on_restart)
+        for task in tasks(team, common, seed, here)
     ]
-    if any(robot.source == "simulated" for robot in team.robots.values()):
-        field = (*PROGRAM, "field", "--seed", str(seed), *common)
-        table.insert(0, ProcessSpec("field", field))
-    return table

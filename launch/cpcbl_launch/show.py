@@ -10,8 +10,9 @@ from rich.table import Table
 from rich.text import Text
 
 from cpcbl_launch.live import LiveView
+from cpcbl_launch.processes import ROBOT
 from cpcbl_launch.recorder import LearnedReport, MeanScore, Recorder, Report
-from cpcbl_launch.supervisor import Supervisor
+from cpcbl_launch.supervisor import Processes
 from cpcbl_launch.tables import number, percent, short, table
 from cpcbl_launch.traffic.show import EXPLAINED, spent_table, verdict
 from cpcbl_team.collaboration import LOWEST_TIER
@@ -30,11 +31,11 @@ class LiveTable(LiveView):
         super().__init__(console, quiet)
         self._title = title
 
-    def show(self, recorder: Recorder, supervisor: Supervisor, elapsed_s: float) -> None:
+    def show(self, recorder: Recorder, processes: Processes, elapsed_s: float) -> None:
         """Called several times a second."""
-        self.draw(lambda: self._table(recorder, supervisor, elapsed_s), bool(recorder.tracks))
+        self.draw(lambda: self._table(recorder, processes, elapsed_s), bool(recorder.tracks))
 
-    def _table(self, recorder: Recorder, supervisor: Supervisor, elapsed_s: float) -> Table:
+    def _table(self, recorder: Recorder, processes: Processes, elapsed_s: float) -> Table:
         tracks, statuses, truths = recorder.latest()
         shown = table(
             f"{self._title}, {elapsed_s:.1f} s",
@@ -42,10 +43,10 @@ class LiveTable(LiveView):
             ("pid", "x m", "y m", "deg", "σ m", "err m", "tier", "out", "B", "in", "B"),
         )
         shown.add_column("", overflow="fold")
-        pids, restarts = supervisor.pids, supervisor.restarts
-        here = [n.removeprefix("robot-") for n in supervisor.names if n != "field"]
+        pids, restarts = processes.pids, processes.restarts
+        here = [n.removeprefix(ROBOT) for n in processes.names if n.startswith(ROBOT)]
         for name in [*here, *sorted(tracks.keys() - set(here))]:
-            process = f"robot-{name}"
+            process = f"{ROBOT}{name}"
             pid = str(pids[process]) if process in pids else "down" if name in here else "away"
             state = _state(tracks.get(name), pid, restarts.get(process, 0))
             shown.add_row(

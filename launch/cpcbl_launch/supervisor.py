@@ -7,7 +7,7 @@ import time
 from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import IO, NamedTuple
+from typing import IO, NamedTuple, Protocol
 
 log = logging.getLogger(__name__)
 
@@ -24,6 +24,25 @@ class ProcessSpec(NamedTuple):
     command: tuple[str, ...]
     on_restart: tuple[str, ...] = ()
     """Added to the command from the second start on."""
+
+
+class Processes(Protocol):
+    """What runs a team's robots and field: processes of this machine, or containers."""
+
+    @property
+    def names(self) -> list[str]:
+        """All of them, in the order of the table."""
+
+    @property
+    def pids(self) -> dict[str, int]:
+        """Those that run at present."""
+
+    @property
+    def restarts(self) -> dict[str, int]:
+        """Those that were started again, and how often."""
+
+    def watch(self) -> None:
+        """To be called several times a second: starts again what has ended."""
 
 
 class _Child:

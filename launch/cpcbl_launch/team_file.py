@@ -79,8 +79,12 @@ def load_team(path: Path) -> Team:
 
 
 def save_resolved(team: Team, path: Path) -> None:
-    """Writes a team with its layers merged, for the processes of one run."""
-    path.write_bytes(msgspec.json.format(msgspec.json.encode(team), indent=1))
+    """Writes a team with its layers merged, for the processes of one run. Raises TeamFileError."""
+    try:
+        path.write_bytes(msgspec.json.format(msgspec.json.encode(team), indent=1))
+    except OSError as error:
+        reason = f"{error.strerror}; the processes of a run read their team there"
+        raise TeamFileError(f"{path}: not written: {reason}") from error
 
 
 def parse_team(text: str, name: str = "team file") -> Team:

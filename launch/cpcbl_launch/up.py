@@ -4,8 +4,8 @@ import logging
 import socket
 import tempfile
 import time
-from collections.abc import Collection, Mapping
-from contextlib import ExitStack
+from collections.abc import Callable, Collection, Mapping
+from contextlib import AbstractContextManager, ExitStack
 from pathlib import Path
 from types import MappingProxyType
 from typing import NamedTuple, Protocol
@@ -20,7 +20,7 @@ from cpcbl_launch.options import check_duration, not_written
 from cpcbl_launch.processes import process_table
 from cpcbl_launch.recorder import Recorder, Report
 from cpcbl_launch.recording import Recording
-from cpcbl_launch.supervisor import Supervisor
+from cpcbl_launch.supervisor import Processes, Supervisor
 from cpcbl_launch.team_file import save_resolved
 from cpcbl_team.config import Team
 from cpcbl_team.metrics import Floats, score
@@ -61,11 +61,49 @@ class Run(NamedTuple):
 class View(Protocol):
     """Shows a run to a person."""
 
-    def show(self, recorder: Recorder, supervisor: Supervisor, elapsed_s: float) -> None: ...
+    def show(self, recorder: Recorder, processes: Processes, elapsed_s: float) -> None: ...
 
 
 class Stopping(Protocol):
     def __call__(self) -> bool: ...
+
+
+class Launcher(Protocol):
+    """Starts what a run needs, and ends it."""
+
+    @property
+    def lead_s(self) -> float:
+        """Real seconds that all processes take to be ready."""
+
+    def router(self) -> AbstractContextManager[Bus]:
+        """The team's router, and a session on it."""
+
+    def processes(self, clock: Clock) -> AbstractContextManager[Processes]:
+        """The robots and the field; robot time is the clock's."""
+
+
+class OnThisMachine:
+    """The router in this process, everybody else in a process of its own."""
+
+    def __init__(self, run: Run, folder: Path, stop: Stopping) -> None:
+        self._run, self._folder = run, folder
+        self._here = run.team.robots if run.here is None else run.here
+        self.lead_s = LEAD_S + LEAD_S_A_PROCESS * len(self._here)
+
+    def router(self) -> AbstractContextManager[Bus]:
+        team = self._run.team
+        guards = guard_rules(team, self._run.speed)
+        return open_router(team.name, team.transport.listen, guards=guards)
+
+    def processes(self, clock: Clock) -> AbstractContextManager[Processes]:
+        team, path = self._run.team, self._folder / "team.json"
+        save_resolved(team, path)
+        endpoint = dialled(team.transport.listen[0])
+        table = process_table(team, path, endpoint, clock, self._run.seed, self._here)
+        return Supervisor(table, self._folder)
+
+
+Launch = Callable[[Run, Path, Stopping], Launcher]
 
 
 def free_endpoint() -> str:
@@ -88,10 +126,10 @@ def dialled(listen: str) -> str:
     return listen.replace("/0.0.0.0:", "/127.0.0.1:").replace("/[::]:", "/[::1]:")
 
 
-def run_team(run: Run, view: View, stop: Stopping) -> Report:
+def run_team(run: Run, view: View, stop: Stopping, launch: Launch = OnThisMachine) -> Report:
     """Runs a team until its time is over or `stop()`. Raises BusError without a router."""
     with tempfile.TemporaryDirectory(prefix="cpcbl-") as temporary:
-        return _run_in(run, view, stop, run.folder or Path(temporary))
+        return _run_in(run, view, stop, run.folder or Path(temporary), launch)
 
 
 def simulate_run(run: Run, progress: Progress | None = None) -> Report:
@@ -111,45 +149,40 @@ def simulate_run(run: Run, progress: Progress | None = None) -> Report:
     return _report(run, recorder, 0.0, duration_s, {})
 
 
-def _run_in(run: Run, view: View, stop: Stopping, folder: Path) -> Report:
-    team = listening(run.team)
-    here = team.robots if run.here is None else run.here
-    team_file = folder / "team.json"
+def _run_in(run: Run, view: View, stop: Stopping, folder: Path, launch: Launch) -> Report:
+    run = run._replace(team=listening(run.team))
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        save_resolved(team, team_file)
     except OSError as error:
-        raise ValueError(f"{team_file}: {error.strerror}; robots read their team there") from error
-    listen = team.transport.listen
-    lead_s = LEAD_S + LEAD_S_A_PROCESS * len(here)
-    clock = Clock(
-        run.epoch_ns if run.epoch_ns is not None else time.time_ns() + int(lead_s * 1e9),
-        time.monotonic_ns() + int(lead_s * 1e9),
-        run.speed,
-    )
-    table = process_table(team, team_file, dialled(listen[0]), clock, run.seed, here)
-    guards = guard_rules(team, run.speed)
-    recording: Recording | None = None
-    with open_router(team.name, listen, guards=guards) as bus, ExitStack() as stack:
+        raise ValueError(f"{folder}: {error.strerror}; robots read their team there") from error
+    launcher, recording = launch(run, folder, stop), None
+    with launcher.router() as bus, ExitStack() as stack:
         if run.record is not None:
             recording = stack.enter_context(_recording(run, run.record, bus))
         recorder = Recorder(bus)
-        with Supervisor(table, folder) as supervisor:
+        clock = _clock(run, launcher.lead_s)
+        with launcher.processes(clock) as processes:
             end_ns = None if run.duration_s is None else int(run.duration_s * 1e9)
             while not stop():
                 elapsed_ns = clock.now_ns() - clock.epoch_ns
                 if end_ns is not None and elapsed_ns >= end_ns:
                     break
-                supervisor.watch()
-                view.show(recorder, supervisor, elapsed_ns * 1e-9)
+                processes.watch()
+                view.show(recorder, processes, elapsed_ns * 1e-9)
                 time.sleep(REFRESH_S)
             elapsed_s = (clock.now_ns() - clock.epoch_ns) * 1e-9
-            restarts = supervisor.restarts
+            restarts = processes.restarts
     report = _report(run, recorder, clock.epoch_ns * 1e-9, elapsed_s, restarts)
     if recording is not None and recording.failed:
         lost = {**report.not_written, str(run.record): recording.failed}
         report = msgspec.structs.replace(report, not_written=lost)
     return report
+
+
+def _clock(run: Run, lead_s: float) -> Clock:
+    lead_ns = int(lead_s * 1e9)
+    epoch_ns = time.time_ns() + lead_ns if run.epoch_ns is None else run.epoch_ns
+    return Clock(epoch_ns, time.monotonic_ns() + lead_ns, run.speed)
 
 
 def _recording(run: Run, path: Path, bus: Bus) -> Recording:

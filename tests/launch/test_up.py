@@ -15,7 +15,7 @@ from process_helpers import command_of, eventually
 
 from cpcbl_launch.processes import PROGRAM
 from cpcbl_launch.recorder import Recorder, Report
-from cpcbl_launch.supervisor import ProcessSpec, Supervisor
+from cpcbl_launch.supervisor import Processes, ProcessSpec, Supervisor
 from cpcbl_launch.team_file import builtin, load_team, save_resolved
 from cpcbl_launch.up import Run, free_endpoint, run_team
 from cpcbl_team.config import GuardSettings, Team, TransportSettings
@@ -41,11 +41,11 @@ def demo_team() -> Team:
 class Script:
     """A view that acts: every step waits for its condition, then does something."""
 
-    def __init__(self, *steps: Callable[[Recorder, Supervisor], bool]) -> None:
+    def __init__(self, *steps: Callable[[Recorder, Processes], bool]) -> None:
         self._steps = list(steps)
 
-    def show(self, recorder: Recorder, supervisor: Supervisor, elapsed_s: float) -> None:
-        if self._steps and self._steps[0](recorder, supervisor):
+    def show(self, recorder: Recorder, processes: Processes, elapsed_s: float) -> None:
+        if self._steps and self._steps[0](recorder, processes):
             self._steps.pop(0)
 
     def done(self) -> bool:
@@ -69,12 +69,12 @@ def test_kills_one_of_four_robot_processes_and_it_localizes_again(tmp_path: Path
     killed: dict[str, int] = {}
     seen: dict[str, int] = {}
 
-    def all_run(recorder: Recorder, supervisor: Supervisor) -> bool:
+    def all_run(recorder: Recorder, supervisor: Processes) -> bool:
         return recorder.tracks.keys() == set(ROBOTS) and all(
             len(t) > 20 for t in recorder.tracks.values()
         )
 
-    def kill_navigator(recorder: Recorder, supervisor: Supervisor) -> bool:
+    def kill_navigator(recorder: Recorder, supervisor: Processes) -> bool:
         seen.update(supervisor.pids)
         for name in ROBOTS:
             assert f"robot {name}" in command_of(supervisor.pids[f"robot-{name}"])
@@ -83,10 +83,10 @@ def test_kills_one_of_four_robot_processes_and_it_localizes_again(tmp_path: Path
         os.kill(seen["robot-navigator"], signal.SIGKILL)
         return True
 
-    def others_go_on(recorder: Recorder, supervisor: Supervisor) -> bool:
+    def others_go_on(recorder: Recorder, supervisor: Processes) -> bool:
         return all(len(recorder.tracks[n]) > killed[n] + 10 for n in ROBOTS if n != "navigator")
 
-    def it_is_back_and_knows_where_it_is(recorder: Recorder, supervisor: Supervisor) -> bool:
+    def it_is_back_and_knows_where_it_is(recorder: Recorder, supervisor: Processes) -> bool:
         tracks, statuses, truths = recorder.latest()
         new_pid = supervisor.pids.get("robot-navigator")
         if new_pid in (None, seen["robot-navigator"]):
@@ -202,7 +202,7 @@ def test_the_router_of_a_run_has_the_teams_guards(tmp_path: Path) -> None:
     team = msgspec.structs.replace(team_of(me=robot_at()), transport=transport)
     key = topics.FIX.at(robot="me", tier=0, observer="faulty")
 
-    def flooded(recorder: Recorder, supervisor: Supervisor) -> bool:
+    def flooded(recorder: Recorder, supervisor: Processes) -> bool:
         with open_bus(team.name, [endpoint]) as me, open_bus(team.name, [endpoint]) as faulty:
             ear, inputs = Ear(me, topics.FIX.at(robot="me")), Ear(me, "in/me/*")
             fix, last = faulty.publisher(key, Qos.INPUT), faulty.publisher("in/me/last", Qos.INPUT)

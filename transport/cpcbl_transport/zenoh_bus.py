@@ -9,20 +9,19 @@
 
 import json
 import logging
+import re
 import time
 from collections.abc import Callable, Mapping, Sequence
-from types import MappingProxyType
+from pathlib import Path
 from typing import Any
 
 import zenoh
 
 from cpcbl_transport.bus import Handle, Publisher, Receive, Watch
 from cpcbl_transport.topics import Qos, namespace
+from cpcbl_transport.zenoh_config import NO_GUARDS, client_config, router_config
 
 log = logging.getLogger(__name__)
-
-OPEN_TIMEOUT_MS = 2000
-NO_GUARDS: Mapping[str, Any] = MappingProxyType({})
 
 
 class BusError(Exception):
@@ -36,23 +35,11 @@ def open_bus(
 
     Raises BusError when it gave up.
     """
-    options = {
-        "mode": "client",
-        "connect": {
-            "endpoints": list(connect),
-            "timeout_ms": OPEN_TIMEOUT_MS,
-            "exit_on_failure": True,
-            "retry": {
-                "period_init_ms": 200,
-                "period_max_ms": 1000,
-                "period_increase_factor": 2,
-            },
-        },
-    }
+    config = client_config(connect)
     reason = "stopped before a router answered"
     while not give_up():
         try:
-            return ZenohBus(_open(team, options))
+            return ZenohBus(_open(config, namespace(team)))
         except zenoh.ZError as error:
             reason = str(error)
             log.info("no router at %s yet", ", ".join(connect))
@@ -70,31 +57,56 @@ def open_router(
 
     `guards`: what `guard_rules` says; none, and everything is let in.
     """
-    options = {
-        "mode": "router",
-        "listen": {"endpoints": list(listen), "exit_on_failure": True},
-        "connect": {"endpoints": list(connect), "timeout_ms": -1, "exit_on_failure": False},
-        **guards,
-    }
     try:
-        return ZenohBus(_open(team, options))
+        return ZenohBus(_open(router_config(listen, connect, guards), namespace(team)))
     except zenoh.ZError as error:
         raise BusError(f"cannot listen on {', '.join(listen)}: {error}") from error
 
 
-def _open(team: str, options: dict[str, Any]) -> "zenoh.Session":
-    config = zenoh.Config()
-    options |= {
-        "namespace": namespace(team),
-        "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
-        "timestamping": {"enabled": False},
-    }
-    for key, value in options.items():
-        config.insert_json5(key, json.dumps(value))
-    config.insert_json5("transport/link/tx/sequence_number_resolution", '"16bit"')
-    config.insert_json5("transport/link/tx/lease", "2000")
-    config.insert_json5("transport/link/tx/keep_alive", "4")
-    return zenoh.open(config)
+def open_plain_router(config: Mapping[str, Any]) -> "ZenohBus":
+    """A session that is a router for all teams, as its configuration says, with keys in full.
+
+    Raises BusError when it cannot listen there.
+    """
+    try:
+        return ZenohBus(_open(config))
+    except zenoh.ZError as error:
+        endpoints = ", ".join(listening_at(config))
+        raise BusError(f"cannot listen on {endpoints}: {_told(error)}") from error
+
+
+def read_router_config(path: Path) -> dict[str, Any]:
+    """A router's whole configuration from a file (JSON5), with Zenoh's defaults filled in.
+
+    Raises BusError for a file that is none.
+    """
+    try:
+        read = zenoh.Config.from_json5(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError) as error:
+        raise BusError(f"{path}: cannot be read: {error}") from error
+    except zenoh.ZError as error:
+        raise BusError(f"{path}: no configuration of Zenoh: {_told(error)}") from error
+    config: dict[str, Any] = json.loads(str(read))
+    config["mode"] = config["mode"] or "router"
+    if config["mode"] != "router":
+        raise BusError(f"{path}: mode: is {config['mode']!r}; write 'router'")
+    return config
+
+
+def listening_at(config: Mapping[str, Any]) -> list[str]:
+    """The endpoints in a router's configuration, which may list them by mode."""
+    endpoints = config["listen"]["endpoints"]
+    return list(endpoints["router"] if isinstance(endpoints, Mapping) else endpoints)
+
+
+def _told(error: "zenoh.ZError") -> str:
+    """What went wrong, in one line, without the places in Zenoh's source."""
+    return " ".join(re.sub(r" at \S+\.rs:\d+\.?", "", str(error)).split())
+
+
+def _open(config: Mapping[str, Any], space: str | None = None) -> "zenoh.Session":
+    whole = {**config, "namespace": space} if space else dict(config)
+    return zenoh.open(zenoh.Config.from_json5(json.dumps(whole)))
 
 
 class _Declared:
@@ -170,6 +182,15 @@ class ZenohBus:
         liveliness = self._session.liveliness()
         subscriber = liveliness.declare_subscriber(keys, on_sample, history=True)
         return _Declared(self, subscriber.undeclare)
+
+    def neighbours(self) -> dict[str, str]:
+        """Who is linked to this session at present: its id -> what it is and where."""
+        links = {str(link.zid): link.dst for link in self._session.info.links()}
+        return {
+            zid: f"{transport.whatami} at {links[zid]}"
+            for transport in self._session.info.transports()
+            if (zid := str(transport.zid)) in links
+        }
 
     def close(self) -> None:
         self.declared.clear()

@@ -2,7 +2,6 @@
 
 import os
 import signal
-import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -15,7 +14,7 @@ import msgspec
 
 from cpcbl_agents.clock import Clock
 from cpcbl_launch.chaos.notes import Notes, NoteTaker, found_after_s, latest_incarnation
-from cpcbl_launch.processes import process_table
+from cpcbl_launch.processes import PROGRAM, process_table
 from cpcbl_launch.supervisor import ProcessSpec, Supervisor
 from cpcbl_launch.team_file import builtin, load_team, save_resolved
 from cpcbl_launch.up import free_endpoint
@@ -33,6 +32,14 @@ class ChaosError(Exception):
     """A scenario could not be brought to its fault, or to its end."""
 
 
+class Site(NamedTuple):
+    """A router of its own, joined to the first."""
+
+    listen: str
+    joins: str
+    """The endpoint that it dials: the first router's, or a relay's to it."""
+
+
 class Plan(NamedTuple):
     """How a team is run."""
 
@@ -44,6 +51,10 @@ class Plan(NamedTuple):
     """How far a robot's clock is ahead of the others'."""
     prefix: Mapping[str, tuple[str, ...]] = MappingProxyType({})
     """What a robot's command begins with, such as `ip netns exec`."""
+    also_listen: Sequence[str] = ()
+    """Further endpoints of the router."""
+    sites: Mapping[str, Site] = MappingProxyType({})
+    """Routers of other sites, by the name of their process."""
     endpoint: str = ""
     """The router's; default: a free one of this machine."""
     left_out: Sequence[str] = ()
@@ -88,8 +99,8 @@ class TeamUnderTest:
         return self.taker.notes()
 
     def pid(self, name: str) -> int:
-        """Of a robot, the field or the router. Raises ChaosError when it does not run."""
-        process = name if name in (ROUTER, FIELD) else f"robot-{name}"
+        """Of a robot, the field or a router. Raises ChaosError when it does not run."""
+        process = f"robot-{name}" if name in self.robots else name
         pid = self.supervisor.pids.get(process)
         if pid is None:
             raise ChaosError(f"{process} does not run: {self.last_words(process)}")
@@ -205,7 +216,11 @@ def _table(plan: Plan, folder: Path, endpoint: str, clock: Clock) -> list[Proces
     own."""
     team_file = folder / "team.json"
     save_resolved(plan.team, team_file)
-    rows = [router_spec(team_file, endpoint)]
+    rows = [router_spec(team_file, (endpoint, *plan.also_listen))]
+    rows += [
+        router_spec(team_file, (site.listen,), (site.joins,), name)
+        for name, site in plan.sites.items()
+    ]
     rows += process_table(plan.team, team_file, endpoint, clock, plan.seed, here=())
     for name in plan.team.robots:
         if name in plan.left_out:
@@ -218,7 +233,11 @@ def _table(plan: Plan, folder: Path, endpoint: str, clock: Clock) -> list[Proces
     return rows
 
 
-def router_spec(team_file: Path, listen: str, *connect: str, name: str = ROUTER) -> ProcessSpec:
+def router_spec(
+    team_file: Path, listen: Sequence[str], connect: Sequence[str] = (), name: str = ROUTER
+) -> ProcessSpec:
     """A router as a process of its own."""
-    module = (sys.executable, "-m", "cpcbl_launch.chaos.router")
-    return ProcessSpec(name, (*module, str(team_file), listen, str(os.getpid()), *connect))
+    ends = (word for at in listen for word in ("--listen", at))
+    joins = (word for at in connect for word in ("--connect", at))
+    own = ("router", str(team_file), *ends, *joins, "--parent", str(os.getpid()))
+    return ProcessSpec(name, (*PROGRAM, *own))

@@ -31,6 +31,14 @@ ReportFile = Annotated[Optional[Path], typer.Option(help="Write the report to th
 PictureFile = Annotated[
     Optional[Path], typer.Option(help="Draw it into this file (PNG or SVG; extra `plot`).")
 ]
+Image = Annotated[
+    Optional[str],
+    typer.Option(help="Image of cpcbl-team to use; default: built from the checkout, when needed."),
+]
+BASE_IMAGE = "python:3.12-slim"
+BaseImage = Annotated[
+    str, typer.Option(envvar="CPCBL_BASE_IMAGE", help="What the image is built on.")
+]
 AsJson = Annotated[bool, typer.Option("--json", help="Print the report as JSON.")]
 Connect = Annotated[
     Optional[list[str]],

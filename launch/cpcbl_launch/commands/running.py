@@ -2,17 +2,21 @@
 
 import shlex
 import sys
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Optional
 
 import typer
 
 from cpcbl_launch.commands.arguments import (
+    BASE_IMAGE,
     AsJson,
+    BaseImage,
     Blind,
     BytesPerS,
     ClockText,
     Connect,
+    Image,
     MatchMessages,
     MessagesPerMinute,
     Parent,
@@ -70,6 +74,11 @@ def up(
     logs: Annotated[
         Optional[Path], typer.Option(help="Keep the processes' logs in this folder.")
     ] = None,
+    containers: Annotated[
+        bool, typer.Option("--containers", help="A container a robot (needs Docker).")
+    ] = False,
+    image: Image = None,
+    base_image: BaseImage = BASE_IMAGE,
     as_json: AsJson = False,
 ) -> None:
     """Start a team: the field, a process per robot, a live table, a report at the end."""
@@ -77,10 +86,19 @@ def up(
 
     from cpcbl_agents.process import Stop
     from cpcbl_launch import logs as real_logs
+    from cpcbl_launch.containers.launch import InContainers, progress_on
     from cpcbl_launch.evaluation import Choice, chosen
     from cpcbl_launch.options import encoded, file_for, folder_for, must_draw
     from cpcbl_launch.show import LiveTable, print_report
-    from cpcbl_launch.up import SIMULATED_S, Run, dialled, listening, run_team
+    from cpcbl_launch.up import (
+        SIMULATED_S,
+        Launch,
+        OnThisMachine,
+        Run,
+        dialled,
+        listening,
+        run_team,
+    )
 
     typed = file or Path("demo")
     if file == Path("mrclam") and data is not None and not file.exists():
@@ -115,11 +133,14 @@ def up(
     if robots:
         run = run._replace(here=names_in(robots))
     console = Console(stderr=as_json)
+    launch: Launch = OnThisMachine
+    if containers:
+        launch = partial(InContainers, image=image, base=base_image, said=progress_on(console))
     title = f"team {team.name}, {len(run.team.robots)} robots, {speed:g} x real time"
     watch = ["cpcbl-team", "traffic", str(typed), "--connect", dialled(team.transport.listen[0])]
     console.print(f"watch it: {shlex.join(watch)}", style="dim", highlight=False, soft_wrap=True)
     with LiveTable(title, console, quiet=as_json) as table:
-        result = run_team(run, table, Stop())
+        result = run_team(run, table, Stop(), launch)
     lost = dict(result.not_written) | write_report(report, result)
     if as_json:
         sys.stdout.write(encoded(result) + "\n")
@@ -169,3 +190,45 @@ def field(
     stop = Stop(parent)
     with open_bus(team.name, connect or team.transport.connect, stop) as bus:
         run_field(team, seed, bus, Clock.parse(clock) if clock else Clock.wall(), stop)
+
+
+def router(
+    file: Annotated[Optional[Path], typer.Argument(help="Team file.")] = None,
+    listen: Annotated[
+        Optional[list[str]],
+        typer.Option(help="Endpoint to listen at; default: the file's, else tcp/127.0.0.1:7447."),
+    ] = None,
+    connect: Annotated[
+        Optional[list[str]], typer.Option(help="Endpoint of another site's router to join.")
+    ] = None,
+    config: Annotated[
+        Optional[Path], typer.Option(help="No FILE: a configuration of Zenoh (JSON5).")
+    ] = None,
+    speed: Annotated[float, typer.Option(hidden=True, help="Guards let more in.")] = 1.0,
+    parent: Parent = None,
+    print_config: Annotated[
+        bool, typer.Option(help="Print the configuration, for zenohd or --config.")
+    ] = False,
+) -> None:
+    """Run the team's Zenoh router, on any machine, until SIGINT or SIGTERM."""
+    from cpcbl_agents.process import Stop
+    from cpcbl_launch.router import run_router, team_router, written_config
+    from cpcbl_transport.zenoh_bus import read_router_config
+
+    if (file is None) == (config is None):
+        raise ValueError("router: a team FILE, or --config FILE; one of them")
+    if config is not None and (listen or connect):
+        raise ValueError(f"--config {config}: says where it listens and connects; change it there")
+    if config is not None:
+        title, options = f"router of {config}", read_router_config(config)
+    else:
+        assert file is not None
+        team = load(file)
+        title, options = (
+            f"router of team {team.name}",
+            team_router(team, listen or (), connect or (), speed),
+        )
+    if print_config:
+        typer.echo(written_config(options, title))
+    else:
+        run_router(options, title, Stop(parent))

@@ -1,0 +1,31 @@
+"""Commands that put a team on other machines."""
+
+from pathlib import Path
+from typing import Annotated, Optional
+
+import typer
+
+from cpcbl_launch.commands.arguments import Image, TeamArgument, load
+
+
+def compose(
+    file: TeamArgument = None,
+    image: Image = None,
+    seed: Annotated[int, typer.Option(help="Of the simulated noise.")] = 1,
+    output: Annotated[
+        Optional[Path], typer.Option(help="Write it to this file, with paths from its folder.")
+    ] = None,
+) -> None:
+    """Print a team's compose file: for docker-compose, docker compose, a swarm."""
+    from cpcbl_launch.containers.deployment import deployed
+    from cpcbl_launch.options import file_for
+
+    if output is not None:
+        file_for("--output", output)
+    team = load(file or Path("demo"))
+    folder = Path() if output is None else output.parent
+    text = deployed(team, file or Path("demo"), folder, image, seed)
+    if output is None:
+        typer.echo(text, nl=False)
+    else:
+        output.write_text(text, encoding="utf-8")

@@ -1,0 +1,167 @@
+"""The compose file of a team: plain text for people, read by docker-compose 1.29 and 2, and swarm.
+
+Nothing here is measured or started; what is written is decided by the team and a `Deployment`.
+"""
+
+from collections.abc import Collection
+from typing import NamedTuple
+
+import yaml
+
+from cpcbl_launch.processes import tasks
+from cpcbl_team.config import Team
+
+PORT = 7447
+"""Where the router listens, inside."""
+BASE_IMAGE = "python:3.12-slim"
+BASE_VARIABLE = "CPCBL_BASE_IMAGE"
+
+
+class Mount(NamedTuple):
+    """A file or folder of the machine that a container may read."""
+
+    source: str
+    target: str
+
+
+class Deployment(NamedTuple):
+    """How a team is put into containers."""
+
+    team_file: str
+    """What the commands call it: a built-in team's name, or a path inside the containers."""
+    image: str
+    context: str | None = None
+    """The folder of the sources to build the image from; None: the image is there."""
+    published: tuple[str, ...] = (f"127.0.0.1:{PORT}",)
+    """Where the router can be reached from outside: [address:]port of this machine."""
+    scheme: str = "tcp"
+    mounts: tuple[Mount, ...] = ()
+    seed: int = 1
+    speed: float = 1.0
+    clock: str = ""
+    here: Collection[str] | None = None
+    """The robots to start; None: all."""
+
+
+def compose_text(team: Team, how: Deployment) -> str:
+    """The whole compose file: the router, the field if anything is simulated, a service a robot."""
+    here = team.robots if how.here is None else how.here
+    clock = ("--clock", how.clock) if how.clock else ()
+    common = ("--team", how.team_file, "--connect", f"{how.scheme}/router:{PORT}", *clock)
+    rows = tasks(team, common, how.seed, here)
+    parts = [
+        _HEAD.format(
+            title=_title(team, here),
+            image=_flow(how.image),
+            mounts=_mounts(how.mounts),
+            to=_flow(["CMD", "linked", "to", str(PORT)]),
+        ),
+        _ROUTER.format(
+            build=_build(how.context),
+            command=_flow(_router(how)),
+            ports=_flow([f"{outside}:{PORT}" for outside in how.published]),
+            at=_flow(["CMD", "linked", "at", str(PORT)]),
+        ),
+        *(_SERVICE.format(name=row.name, command=_flow(row.arguments)) for row in rows),
+    ]
+    return "".join(parts)
+
+
+def _title(team: Team, here: Collection[str]) -> str:
+    field = any(robot.source == "simulated" for robot in team.robots.values())
+    return f"Team {team.name}: a router,{' the simulated field,' if field else ''} and" + (
+        " one robot" if len(here) == 1 else f" {len(here)} robots"
+    )
+
+
+def _router(how: Deployment) -> list[str]:
+    command = ["router", how.team_file, "--listen", f"{how.scheme}/0.0.0.0:{PORT}"]
+    return command if how.speed == 1.0 else [*command, "--speed", f"{how.speed:g}"]
+
+
+def _build(context: str | None) -> str:
+    if context is None:
+        return ""
+    return _BUILD.format(
+        context=_flow(context), base=f"${{{BASE_VARIABLE}:-{BASE_IMAGE}}}", variable=BASE_VARIABLE
+    )
+
+
+def _mounts(mounts: Collection[Mount]) -> str:
+    if not mounts:
+        return ""
+    lines = [
+        _flow({"type": "bind", "source": m.source, "target": m.target, "read_only": True})
+        for m in mounts
+    ]
+    return "  volumes: # on every machine of a swarm\n" + "".join(f"    - {s}\n" for s in lines)
+
+
+def _flow(value: object) -> str:
+    """A value on one line, quoted where YAML needs it; compose's own `$` is escaped."""
+    text = yaml.safe_dump(
+        _plain(value), default_flow_style=True, sort_keys=False, width=float("inf")
+    )
+    return text.removesuffix("\n").removesuffix("\n...")
+
+
+def _plain(value: object) -> object:
+    match value:
+        case str():
+            return value.replace("$", "$$")
+        case dict():
+            return {key: _plain(inner) for key, inner in value.items()}
+        case list() | tuple():
+            return [_plain(inner) for inner in value]
+    return value
+
+
+_HEAD = """\
+# {title}, each in a container.
+# Written by `cpcbl-team compose`.
+#   docker-compose -f FILE up         or: docker compose -f FILE up
+#   docker-compose -f FILE down
+
+x-container: &container
+  image: {image}
+  read_only: true
+  tmpfs: [/tmp]
+  cap_drop: [ALL]
+  security_opt: ["no-new-privileges:true"]
+  init: true
+  restart: unless-stopped
+  stop_grace_period: 3s
+  logging: {{driver: json-file, options: {{max-size: 10m, max-file: "2"}}}}
+{mounts}
+x-member: &member
+  <<: *container
+  depends_on: [router]
+  healthcheck: # in the kernel's table of sockets; nothing is started in Python
+    test: {to}
+    interval: 15s
+
+services:
+"""
+
+_ROUTER = """\
+  router:
+    <<: *container
+{build}    command: {command}
+    ports: {ports}
+    healthcheck:
+      test: {at}
+      interval: 15s
+"""
+
+_BUILD = """\
+    build: # of the image that all use
+      context: {context}
+      dockerfile: docker/Dockerfile
+      args: {{BASE_IMAGE: "{base}"}}
+"""
+
+_SERVICE = """
+  {name}:
+    <<: *member
+    command: {command}
+"""

@@ -1,0 +1,101 @@
+"""The image that all containers of a team use: named after what it is built from."""
+
+import hashlib
+import re
+from collections.abc import Callable, Iterator
+from importlib import metadata
+from pathlib import Path
+
+from cpcbl_launch.containers.compose import BASE_VARIABLE
+from cpcbl_launch.containers.docker import DockerError, Said, done, ran
+
+NAME = "cpcbl-team"
+DOCKERFILE = Path("docker/Dockerfile")
+SOURCES = (
+    *("pyproject.toml", "README.md", "LICENSE", "docker/Dockerfile", "docker/linked"),
+    *("cpcbl_team", "transport", "agents", "launch"),
+)
+"""What goes into the image, from the top of the checkout; .dockerignore lets in the same."""
+BUILD_TIMEOUT_S = 1800.0
+
+
+def version() -> str:
+    return metadata.version(NAME)
+
+
+def checkout() -> Path | None:
+    """The top of the checkout that this program runs from; None: it was installed without one."""
+    top = Path(__file__).parents[3]
+    return top if (top / DOCKERFILE).exists() else None
+
+
+def tag(top: Path, base: str) -> str:
+    """cpcbl-team:VERSION-HASH, another one when a source, the recipe or the base's name changes."""
+    content = hashlib.sha256(base.encode())
+    for path in _files(top):
+        content.update(f"\n{path.relative_to(top)}\n".encode())
+        content.update(path.read_bytes())
+    return f"{NAME}:{version()}-{content.hexdigest()[:12]}"
+
+
+def image_for(base: str, stop: Callable[[], bool], said: Said) -> str:
+    """The name of an image of this very program, built where there is none yet.
+
+    Raises DockerError.
+    """
+    top = checkout()
+    if top is None:
+        raise DockerError(
+            "the image is built from a checkout, and this program was installed without one; name"
+            " one that you have: --image NAME"
+        )
+    name = tag(top, base)
+    if not there(name):
+        _have_base(base, stop, said)
+        said(f"building image {name} on {base}, once for these sources")
+        command = [
+            "docker",
+            "build",
+            "--force-rm",
+            "--tag",
+            name,
+            "--build-arg",
+            f"BASE_IMAGE={base}",
+        ]
+        command += ["--file", str(top / DOCKERFILE), str(top)]
+        done(command, stop, lambda line: _step(line, said), BUILD_TIMEOUT_S)
+    return name
+
+
+def there(image: str) -> bool:
+    """Whether the daemon has an image."""
+    return ran(["docker", "image", "inspect", "--format", "{{.Id}}", image]).code == 0
+
+
+def _have_base(base: str, stop: Callable[[], bool], said: Said) -> None:
+    if there(base):
+        return
+    said(f"fetching base image {base}")
+    fetched = ran(["docker", "pull", "--quiet", base], stop, timeout_s=BUILD_TIMEOUT_S)
+    if fetched.code:
+        raise DockerError(
+            f"no base image {base} ({fetched.last_line}); without a registry: docker/base-image.sh,"
+            f" then {BASE_VARIABLE}=cpcbl-base"
+        )
+
+
+def _step(line: str, said: Said) -> None:
+    """Of all that a builder says (the classic one, or BuildKit) the lines that begin a step."""
+    step = re.match(r"(?:Step (\d+/\d+) :|#\d+ \[.*?(\d+/\d+)\]) (.+)", line)
+    if step:
+        said(f"  {step[1] or step[2]} {step[3]}"[:78])
+
+
+def _files(top: Path) -> Iterator[Path]:
+    for source in SOURCES:
+        path = top / source
+        if path.is_file():
+            yield path
+        for inner in sorted(path.rglob("*")):
+            if inner.is_file() and "__pycache__" not in inner.parts:
+                yield inner

@@ -1,0 +1,51 @@
+"""`cpcbl-team router`: a team's Zenoh router on a machine of its own."""
+
+import json
+import logging
+import time
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+from cpcbl_team.config import Team, TransportSettings
+from cpcbl_transport.guards import guard_rules
+from cpcbl_transport.zenoh_bus import listening_at, open_plain_router
+from cpcbl_transport.zenoh_config import router_config
+
+log = logging.getLogger(__name__)
+
+LOOK_S = 0.5
+
+
+def team_router(
+    team: Team, listen: Sequence[str], connect: Sequence[str], speed: float = 1.0
+) -> dict[str, Any]:
+    """The configuration of a team's router; without `listen` where its file says.
+
+    A file that does not say gets the endpoint at which robots of this machine look. `connect`:
+    the routers of other sites; `speed`: robot time over real time.
+    """
+    here = listen or team.transport.listen or TransportSettings().connect
+    return router_config(here, connect, guard_rules(team, speed))
+
+
+def written_config(config: Mapping[str, Any], title: str) -> str:
+    """The configuration as a JSON5 file."""
+    return f"// {title}\n// zenohd -c FILE, or cpcbl-team router --config FILE\n" + json.dumps(
+        config, indent=2
+    )
+
+
+def run_router(config: Mapping[str, Any], title: str, stop: Callable[[], bool]) -> None:
+    """Routes until `stop()`; logs where it listens, and who comes and goes. Raises BusError."""
+    with open_plain_router(config) as bus:
+        log.info("%s listens at %s", title, ", ".join(listening_at(config)))
+        known: dict[str, str] = {}
+        while not stop():
+            present = bus.neighbours()
+            for came in present.keys() - known.keys():
+                log.info("+ %s (%d linked)", present[came], len(present))
+            for went in known.keys() - present.keys():
+                log.info("- %s (%d linked)", known[went], len(present))
+            known = present
+            time.sleep(LOOK_S)
+        log.info("%s ends", title)
