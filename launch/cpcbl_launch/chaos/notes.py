@@ -24,7 +24,8 @@ from cpcbl_team.metrics import (
 )
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus
-from cpcbl_transport.messages import Refusal, Status, Track, Truths, decode, refusal
+from cpcbl_transport.messages import Status, Track, Truths
+from cpcbl_transport.reading import read
 
 TRUTH_EVERY_NS = 80_000_000
 Value = TypeVar("Value")
@@ -79,6 +80,24 @@ def gone_after_s(notes: Notes, robot: str, from_s: float) -> float | None:
         if token.at_s >= from_s and not alive:
             return token.at_s - from_s
     return None
+
+
+def present_after_s(notes: Notes, robot: str, from_s: float) -> float | None:
+    """How long after `from_s` a token of the robot came."""
+    return _first((t.at_s for t in notes.tokens if t.robot == robot and t.alive), from_s)
+
+
+def helped_after_s(notes: Notes, robot: str, helpers: Iterable[str], from_s: float) -> float | None:
+    """How long after `from_s` the first status came that knows of later help by one of these; the
+    help itself was up to a second sooner."""
+    from_ns = notes.epoch_ns + int(from_s * 1e9)
+    by = frozenset(helpers)
+    helped = (
+        said.at_s
+        for said in notes.statuses.get(robot, ())
+        if any(f.peer in by and f.latest_ns >= from_ns for f in said.status.heard)
+    )
+    return _first(helped, from_s)
 
 
 def back_after_s(notes: Notes, robot: str, from_s: float, not_of: str) -> float | None:
@@ -195,6 +214,15 @@ def counted(notes: Notes, robot: str, from_s: float, until_s: float = np.inf) ->
     return total
 
 
+def all_counts(notes: Notes, robot: str) -> Counter[str]:
+    """What a robot's latest process has counted, by its latest status."""
+    said = notes.statuses.get(robot, ())
+    if not said:
+        return Counter()
+    status = said[-1].status
+    return Counter(status.counts) + Counter(messages_received=status.messages_received)
+
+
 def latest_incarnation(notes: Notes, robot: str) -> str:
     """The process that announced itself last; empty if none did."""
     mine = [t.incarnation for t in notes.tokens if t.robot == robot and t.alive]
@@ -248,7 +276,6 @@ class NoteTaker:
         self._tokens: list[Token] = []
         self._rows: dict[str, list[tuple[float, float, float, float]]] = {}
         self._truth_ns = 0
-        self.refused: Counter[str] = Counter()
 
     def listen(self, bus: Bus) -> None:
         """To what robots and the field say for people, and to tokens."""
@@ -268,24 +295,24 @@ class NoteTaker:
                 self._tokens.append(token)
 
     def _arrived(self, key: str, payload: bytes) -> None:
-        at_s, message = self.now_s, decode(payload)
-        far_ns = 2**62  # clocks that are wrong are part of the game
-        reason = message if isinstance(message, Refusal) else refusal(message, far_ns)
+        at_s, message = self.now_s, read(key, payload)
         with self._lock:
-            if reason is not None:
-                self.refused[reason] += 1
-                return
             match message:
                 case Track(robot=robot):
                     _add(self._tracks.setdefault(robot, []), Heard(at_s, message))
                 case Status(robot=robot):
                     _add(self._statuses.setdefault(robot, []), Said(at_s, message))
-                case Truths() if message.stamp_ns - self._truth_ns >= TRUTH_EVERY_NS:
+                case Truths() if self._is_next(message):
                     self._truth_ns = message.stamp_ns
                     stamp_s = (message.stamp_ns - self._clock.epoch_ns) * 1e-9
                     for t in message.robots:
                         row = (stamp_s, t.x_m, t.y_m, t.heading_rad)
                         self._rows.setdefault(t.robot, []).append(row)
+
+    def _is_next(self, truths: Truths) -> bool:
+        """Of truths not so many are needed, and some may be forged."""
+        ahead_ns = truths.stamp_ns - self._truth_ns
+        return ahead_ns >= TRUTH_EVERY_NS and truths.stamp_ns <= self._clock.now_ns()
 
     def notes(self) -> Notes:
         """All so far."""

@@ -86,7 +86,12 @@ class TeamUnderTest:
     ) -> None:
         self.plan, self.folder, self.endpoint = plan, folder, endpoint
         self.clock, self.supervisor = clock, supervisor
-        self.robots = [name for name in plan.team.robots if name not in plan.left_out]
+        self.robots = [
+            name
+            for name, robot in plan.team.robots.items()
+            if name not in plan.left_out and robot.source == "simulated"
+        ]
+        """Of the simulated field, which knows where they are."""
         self.taker = NoteTaker(clock)
         self.seen_pids: set[int] = set()
 
@@ -100,7 +105,7 @@ class TeamUnderTest:
 
     def pid(self, name: str) -> int:
         """Of a robot, the field or a router. Raises ChaosError when it does not run."""
-        process = f"robot-{name}" if name in self.robots else name
+        process = f"robot-{name}" if name in self.plan.team.robots else name
         pid = self.supervisor.pids.get(process)
         if pid is None:
             raise ChaosError(f"{process} does not run: {self.last_words(process)}")
@@ -168,9 +173,18 @@ class TeamUnderTest:
             )
         return self.now_s
 
+    def log(self, process: str) -> str:
+        """What a process wrote."""
+        path = self.folder / f"{process}.log"
+        return path.read_text(errors="replace") if path.exists() else ""
+
+    def tracebacks(self) -> int:
+        """How many there are in the logs of all processes."""
+        logs = (path.read_text(errors="replace") for path in self.folder.glob("*.log"))
+        return sum(log.count("Traceback (most recent call last)") for log in logs)
+
     def last_words(self, process: str) -> str:
-        log = self.folder / f"{process}.log"
-        lines = log.read_text(errors="replace").splitlines() if log.exists() else []
+        lines = self.log(process).splitlines()
         return lines[-1] if lines else f"{process} said nothing"
 
 
