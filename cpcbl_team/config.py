@@ -158,6 +158,20 @@ class BudgetSettings(Table, frozen=True, kw_only=True):
     """The part of every budget that is kept for teammates that are lost."""
 
 
+class TrustSettings(Table, frozen=True, kw_only=True):
+    """How a teammate is found that says what is not so."""
+
+    enabled: bool = True
+    limit: Positive = 50.0
+    """By how much (NIS beyond the usual, summed) it may surprise: four clear contradictions."""
+    readmit_s: NotNegative = 5.0
+    """It is believed again when it was right for so long."""
+    clock_ahead_s: NotNegative = 0.1
+    """Help is refused that is stamped by a clock further ahead,"""
+    clock_behind_s: Positive = 0.4
+    """or by one that is behind, or so late, by more."""
+
+
 class CollaborationSettings(Table, frozen=True, kw_only=True):
     """Who helps whom, and how much is believed."""
 
@@ -172,6 +186,7 @@ class CollaborationSettings(Table, frozen=True, kw_only=True):
     best_tier: Annotated[int, msgspec.Meta(ge=0, le=15)] = 0
     """No better tier is announced, however certain the robot is: for sensors that err unseen."""
     budget: BudgetSettings = BudgetSettings()
+    trust: TrustSettings = TrustSettings()
     least_value: NotNegative = 0.05
     """What a fix must be worth (nats): the logarithm of the factor by which the ellipse of the
     helped robot's position shrinks. Less is not sent."""
@@ -292,6 +307,19 @@ class MatchSettings(Table, frozen=True, kw_only=True):
     """They are earned evenly over this time."""
 
 
+class SimulationEvent(Table, frozen=True, kw_only=True):
+    """Something that befalls the simulated field: one of its kinds."""
+
+    at_s: NotNegative
+    """From the field's start."""
+    kidnap: str = ""
+    """The robot that is carried away; its wheels do not notice."""
+    to: tuple[float, float, float] | None = None
+    """Where it is put down: x m, y m, heading deg."""
+    hide_landmarks_s: NotNegative = 0.0
+    """For so long nobody sees a landmark or wall."""
+
+
 class SimulationSettings(Table, frozen=True, kw_only=True):
     """The simulated field."""
 
@@ -299,6 +327,7 @@ class SimulationSettings(Table, frozen=True, kw_only=True):
     noise: NotNegative = 1.0
     """True noise as a multiple of what the robots assume; 0 for none."""
     bump_radius_m: NotNegative = 0.15
+    events: tuple[SimulationEvent, ...] = ()
 
 
 class Team(Table, frozen=True, kw_only=True):

@@ -8,7 +8,7 @@ from collections.abc import Iterable
 
 from msgspec.structs import replace
 
-from cpcbl_team import recovery, weighted
+from cpcbl_team import recovery, trust, weighted
 from cpcbl_team.collaboration import BELIEF_SERVES_BACK_NS
 from cpcbl_team.config import Field, LocalizationSettings
 from cpcbl_team.estimate import (
@@ -47,10 +47,9 @@ from cpcbl_team.sightings import (
     offers,
     surprise,
 )
-from cpcbl_team.state import Memory, State, innovated
+from cpcbl_team.state import FIX, Memory, State, innovated
 
 UNSTEERABLE_SIGMA_RAD = math.radians(100.0)  # beyond, no bearing can be linearized
-_FIX = "fix:"  # marks the source of an active fix, apart from seeing that teammate
 _OWN = "position sensor"
 
 Turns = tuple[Scope | None, ...]
@@ -78,6 +77,8 @@ class Localizer:
         self._gates = chi_square_bounds(self._rules.gate_probability)
         self._landmarks = Landmarks(field, settings, self._gates)
         self._max_age_ns = int(settings.collaboration.max_age_s * 1e9)
+        self._trust = settings.collaboration.trust
+        self._judges = self._trust.enabled and not self._weighted  # without a covariance, no NIS
         split = settings.collaboration.fusion == "split-ci"
         self._merge_teammate = merge_split if split else merge_naive
 
@@ -91,22 +92,26 @@ class Localizer:
         if turn is None:
             return self._judged(state)
         prior, scope = state.estimate, POSE if self._joint else turn
-        accepted, rejected = self._gated(prior, others, turn) if others else ([], 0)  # 3.
+        accepted, refused = self._gated(prior, others, turn) if others else ([], [])  # 3.
+        if self._judges and frame.stamp_ns - state.memory.told_ns <= trust.WINDOW_NS:
+            state, accepted, refused = self._believed(state, said, accepted, refused)
+            prior = state.estimate
+        rejected = said.rejected + len(refused)
         if self._weighted:
             estimate = weighted.merged(
-                prior, [c for _, cs in accepted for c in cs], self._rules.weights
+                prior, [c for _, cs, _ in accepted for c in cs], self._rules.weights
             )
         else:
             evidence = combined(said.evidence, accepted) if accepted else said.evidence  # 4.
             estimate = merge(prior, evidence, scope, self._as_circle and not accepted)  # 5.
-            for m, cs in accepted:
+            for m, cs, _ in accepted:
                 if m.teammate:
                     told = observation_of(prior, m, cs, estimate)
                     estimate = self._merge_teammate(estimate, told, scope)
-        used = [*said.used, *(m.source for m, _ in accepted)] if accepted else said.used
+        used = [*said.used, *(m.source for m, *_ in accepted)] if accepted else said.used
         if accepted or self._reduces or estimate.shared is not ZERO3:
             estimate = self._reduced(estimate)
-        return self._judged(self._updated(state, estimate, turn, used, said.rejected + rejected))
+        return self._judged(self._updated(state, estimate, turn, used, rejected))
 
     # Step 1 -----------------------------------------------------------------------------------
 
@@ -237,17 +242,20 @@ class Localizer:
 
     # Steps 4 and 5 ----------------------------------------------------------------------------
 
-    def _gated(self, prior: Estimate, seen: list[Measured], turn: Scope) -> tuple[list[Found], int]:
-        """The constraints of those objects whose innovation the prior's chi-square bound accepts;
-        the others' number."""
-        accepted, rejected = [], 0
+    def _gated(
+        self, prior: Estimate, seen: list[Measured], turn: Scope
+    ) -> tuple[list[Found], list[Found]]:
+        """The constraints of those objects whose innovation the prior's chi-square bound accepts,
+        and of the others."""
+        accepted: list[Found] = []
+        refused: list[Found] = []
         for m in sorted(seen, key=_source):
             cs = constraints_of(prior.pose, m, turn, self._rules)
-            if cs and surprise(prior, m, cs) <= self._gates[len(cs) - 1]:
-                accepted.append((m, cs))
-            elif cs:
-                rejected += 1
-        return accepted, rejected
+            if cs:
+                nis = surprise(prior, m, cs)
+                found = accepted if nis <= self._gates[len(cs) - 1] else refused
+                found.append(Found(m, cs, nis))
+        return accepted, refused
 
     def _reduced(self, estimate: Estimate) -> Estimate:
         """The estimate in the form that the variant keeps."""
@@ -260,10 +268,57 @@ class Localizer:
 
     # Teammates --------------------------------------------------------------------------------
 
+    def _believed(
+        self, state: State, said: Said, accepted: list[Found], refused: list[Found]
+    ) -> tuple[State, list[Found], list[Found]]:
+        """A frame without the teammates in it that this robot does not trust."""
+        own = [sum(not f.measured.teammate for f in found) for found in (accepted, refused)]
+        used, rejected = own[0] + len(said.used), own[1] + said.rejected
+        now, memory = state.stamp_ns, state.memory
+        if (used or rejected) and not memory.lost:
+            own_voice = memory.voices.get(trust.OWN, trust.Voice())
+            own_voice = trust.seen(own_voice, now, used, rejected, self._trust.limit)
+            memory = replace(memory, voices={**memory.voices, trust.OWN: own_voice})
+            state = replace(state, memory=memory)
+        distrusted = set()
+        for m, cs, nis in (*accepted, *refused):
+            if m.teammate:
+                fresh = any(
+                    abs(now - b.stamp_ns) <= trust.FRESH_NS for b in memory.teammates[m.source]
+                )
+                of_two = 2.0 * nis / len(cs) if fresh and not memory.lost else None
+                state, trusted = self._weighed(state, m.source, trust.Said(now, of_two), m.source)
+                if not trusted:
+                    distrusted.add(m.source)
+        if not distrusted:
+            return state, accepted, refused
+        kept = [
+            [f for f in found if f.measured.source not in distrusted]
+            for found in (accepted, refused)
+        ]
+        return state, kept[0], kept[1]
+
+    def _weighed(
+        self, state: State, sender: str, said: trust.Said, source: str
+    ) -> tuple[State, bool]:
+        """The state after a word of a teammate, and whether the word may be used."""
+        memory = state.memory
+        used_ns = memory.objects_ns.get(source, trust.NEVER_NS)
+        verdict = trust.judged(memory.voices, sender, said, used_ns, self._trust)
+        memory = replace(memory, voices=verdict.voices)
+        if verdict.event:
+            memory = recovery.without(memory.counted(verdict.event), verdict.silenced)
+        if not verdict.trusted:
+            memory = memory.counted("distrusted")
+        estimate = state.estimate
+        if verdict.doubt_m:
+            estimate = recovery.doubted(estimate, verdict.doubt_m, self._rules)
+        return replace(state, estimate=estimate, memory=memory), verdict.trusted
+
     def fix(self, state: State, fix: Fix) -> State:
         """Active collaboration: a teammate tells where it sees this robot. Position only."""
         parts = Covariance2(*fix.sensor_covariance), Covariance2(*fix.observer_covariance)
-        return self._placed(state, fix.stamp_ns, _FIX + fix.observer, fix.x_m, fix.y_m, *parts)
+        return self._placed(state, fix.stamp_ns, FIX + fix.observer, fix.x_m, fix.y_m, *parts)
 
     def position(self, state: State, seen: Position) -> State:
         """A position sensor of the robot itself: like a fix, but nobody else's error is in it."""
@@ -282,9 +337,8 @@ class Localizer:
     ) -> State:
         """The robot is said to be at (x, y); `observer` is a teammate's part of the covariance."""
         state = self.moved(state, stamp_ns)
-        piece = recovery.told_evidence(state, source, x, y, sensor, observer)
-        memory, prior = recovery.remembered(state.memory, [piece]), state.estimate
-        state = replace(state, memory=memory)
+        state = self._noted(state, source, x, y, sensor, observer)
+        memory, prior = state.memory, state.estimate
         least = self._rules.object_interval_s * 1e9
         if not _passed(memory.objects_ns.get(source), stamp_ns, least):
             return state
@@ -292,7 +346,12 @@ class Localizer:
             sensor = sensor.scaled(self._repeated(memory, source, stamp_ns))
         offset = x - prior.pose.x, y - prior.pose.y
         seen = Observation(_AXES, offset, sensor, observer or Covariance2(0.0, 0.0, 0.0))
-        if seen.normalized_innovation_squared(prior.covariance) > self._gates[1]:
+        nis = seen.normalized_innovation_squared(prior.covariance)
+        if self._judges:
+            state, trusted = self._told_apart(state, source, (x, y), seen, nis)
+            if not trusted or state.estimate is not prior:
+                return self._judged(state)
+        if nis > self._gates[1]:
             return self._judged(self._updated(state, prior, None, [], 1))
         scope = POSE if self._joint else POSITION
         if self._weighted:
@@ -303,6 +362,49 @@ class Localizer:
             estimate = self._merge_teammate(prior, seen, scope)
         estimate = self._reduced(estimate)
         return self._judged(self._updated(state, estimate, None, [source], 0))
+
+    def _noted(
+        self,
+        state: State,
+        source: str,
+        x: float,
+        y: float,
+        sensor: Covariance2,
+        observer: Covariance2 | None,
+    ) -> State:
+        """With this as evidence of where the robot is, unless its sender is in quarantine."""
+        memory = state.memory
+        voice = memory.voices.get(source.removeprefix(FIX))
+        if voice is None or not voice.reason:
+            piece = recovery.told_evidence(state, source, x, y, sensor, observer)
+            memory = recovery.remembered(memory, [piece])
+        if observer is not None:
+            memory = replace(memory, told_ns=state.stamp_ns)
+        return replace(state, memory=memory)
+
+    def _told_apart(
+        self,
+        state: State,
+        source: str,
+        place: tuple[float, float],
+        seen: Observation,
+        nis: float,
+    ) -> tuple[State, bool]:
+        """The state after what a teammate, or the position sensor, says of the robot's place, and
+        whether that may be used."""
+        memory, now = state.memory, state.stamp_ns
+        if source == _OWN:
+            if now - memory.told_ns <= trust.WINDOW_NS and not memory.lost:
+                own = memory.voices.get(trust.OWN, trust.Voice())
+                accepted = nis <= self._gates[1]
+                own = trust.seen(own, now, accepted, not accepted, self._trust.limit)
+                memory = replace(memory, voices={**memory.voices, trust.OWN: own})
+            return replace(state, memory=memory), True
+        noise, (ex, ey) = seen.noise(), seen.residuals
+        variance = 0.5 * (noise.xx + noise.yy)
+        anchor = trust.Anchor(now, *place, variance, state.odometry_from_robot)
+        said = trust.Said(now, None if memory.lost else nis, (ex, ey), anchor)
+        return self._weighed(state, source.removeprefix(FIX), said, source)
 
     def hear(self, state: State, belief: Belief) -> State:
         """Passive collaboration: keeps a teammate's belief, to use it when the teammate is seen."""
@@ -315,7 +417,8 @@ class Localizer:
             if (fresh := tuple(b for b in beliefs if b.stamp_ns >= forgotten_ns))
         }
         teammates[belief.robot] = (*teammates.get(belief.robot, ()), belief)
-        return replace(state, memory=replace(state.memory, teammates=teammates))
+        memory = replace(state.memory, teammates=teammates, told_ns=now_ns)
+        return replace(state, memory=memory)
 
     def tell(self, state: State, event: Told) -> State:
         """This robot's belief goes to a teammate: it may come back."""
@@ -394,6 +497,7 @@ class Localizer:
             found = recovery.relocalized(evidence, state.odometry_from_robot, self.field)
         if found is not None:
             memory = replace(memory, lost="", innovations=1, anchors=None).counted("found_again")
+            memory = replace(memory, voices=trust.forgiven(memory.voices))
             return replace(state, estimate=self._reduced(found), memory=memory)
         estimate = state.estimate
         if refusing and now - memory.widened_ns >= recovery.WIDEN_NS:

@@ -7,7 +7,7 @@ An ambiguous answer is no answer.
 """
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 
 from msgspec.structs import replace
 
@@ -17,7 +17,7 @@ from cpcbl_team.estimate import SMALLEST_VARIANCE, ZERO3, Covariance3, Estimate,
 from cpcbl_team.gaussian import Covariance2
 from cpcbl_team.geometry import Pose2
 from cpcbl_team.sightings import Measured
-from cpcbl_team.state import Evidence, Memory, State
+from cpcbl_team.state import FIX, Evidence, Memory, State
 
 WINDOW_NS = 20_000_000_000
 SPACING_NS = 500_000_000  # one piece of evidence an object and so long
@@ -26,6 +26,7 @@ DRIFT_SHARE = 0.1  # of the way: how far dead reckoning errs within the window
 MOST_STARTS = 16
 WIDEN_NS = 1_000_000_000
 _OPEN = Covariance3(1e6, 0.0, 1e6, 0.0, 0.0, 1e3)
+_LEVER_M = 2.0  # over such a way an error of position has become one of heading
 _ENOUGH_POSITION_SIGMA_M = 0.7
 _ENOUGH_HEADING_SIGMA_RAD = 0.5
 
@@ -139,6 +140,23 @@ def widened(estimate: Estimate, settings: LocalizerSettings) -> Estimate:
     p, h = max(position_goal - position, 0.0), max(heading_goal - c.hh, 0.0)
     doubt = Covariance3(p, 0.0, p, 0.0, 0.0, h)
     return estimate._replace(covariance=c.plus(doubt))
+
+
+def doubted(estimate: Estimate, offset_m: float, settings: LocalizerSettings) -> Estimate:
+    """For a robot that followed somebody who was wrong by so much: it may be, too."""
+    most_m = settings.lost_position_sigma_m
+    most_rad = 0.9 * math.radians(settings.lost_heading_sigma_deg)
+    p, h = min(offset_m, most_m) ** 2, min(offset_m / _LEVER_M, most_rad) ** 2
+    grown = estimate.covariance.plus(Covariance3(p, 0.0, p, 0.0, 0.0, h))
+    return estimate._replace(covariance=grown)
+
+
+def without(memory: Memory, senders: Collection[str]) -> Memory:
+    """The memory without the evidence of these teammates."""
+    kept = tuple(
+        e for e in memory.evidence if not (e.told and e.source.removeprefix(FIX) in senders)
+    )
+    return memory if len(kept) == len(memory.evidence) else replace(memory, evidence=kept)
 
 
 def relocalized(

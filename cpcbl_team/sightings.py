@@ -3,6 +3,7 @@
 import math
 from collections.abc import Iterable, Mapping
 from functools import lru_cache
+from typing import NamedTuple
 
 import msgspec
 
@@ -66,7 +67,12 @@ class Measured(msgspec.Struct, frozen=True, gc=False):
         return self.bearing is not None and self.wall is None
 
 
-Found = tuple[Measured, list[Constraint]]
+class Found(NamedTuple):
+    """An object with its constraints, and how much they surprise: chi-square, a degree each."""
+
+    measured: Measured
+    constraints: list[Constraint]
+    surprise: float
 
 
 def measured(
@@ -153,7 +159,10 @@ def combined(evidence: Information, accepted: Iterable[Found]) -> Information:
     """Step 4: the Gaussians at the closest points of all constraints on the map's objects, as one
     with `evidence`."""
     return evidence.with_all(
-        (c.row, c.residual, c.sigma * c.sigma) for m, cs in accepted if not m.teammate for c in cs
+        (c.row, c.residual, c.sigma * c.sigma)
+        for m, cs, _ in accepted
+        if not m.teammate
+        for c in cs
     )
 
 

@@ -12,7 +12,9 @@ from cpcbl_team.estimate import Estimate
 from cpcbl_team.geometry import Pose2
 from cpcbl_team.inputs import Belief, Odometry
 from cpcbl_team.self_calibration import Anchors, Learned
+from cpcbl_team.trust import Voice
 
+FIX = "fix:"  # marks the source of an active fix, apart from seeing that teammate
 _NONE: Mapping[str, Any] = MappingProxyType({})
 
 
@@ -62,6 +64,8 @@ class Memory(msgspec.Struct, frozen=True, gc=False):
     events: Mapping[str, int] = _NONE  # number of each other thing that is counted
     learned: Learned = Learned()
     anchors: Anchors | None = None
+    voices: Mapping[str, Voice] = _NONE  # how teammates, and the robot's own eyes, stand
+    told_ns: int = -(2**62)  # when a teammate last said anything
 
     def counted(self, *events: str) -> "Memory":
         return replace(self, events=Counter(self.events) + Counter(events)) if events else self

@@ -11,6 +11,7 @@ from cpcbl_team.self_calibration import Learned
 from cpcbl_team.sensors import without_bearing_bias
 from cpcbl_team.state import State
 from cpcbl_team.timeline import Timeline
+from cpcbl_team.trust import Standing, standings
 
 LOCATE_NS = 100_000_000
 PATIENCE_NS = 200_000_000  # how long a frame waits for the odometry that covers it
@@ -51,6 +52,10 @@ class FilterAgent:
     def learned(self) -> Learned | None:
         """What the robot has learned of its odometry and bearings; None where it does not learn."""
         return self.timeline.state.memory.learned if self._learns else None
+
+    def standings(self, now_ns: int) -> tuple[Standing, ...]:
+        """How each teammate that is heard stands with this robot."""
+        return standings(self.timeline.state.memory.voices, now_ns)
 
     def handle(self, message: Anything, now_ns: int) -> Sequence[Anything]:
         match message:

@@ -1,14 +1,16 @@
 """A robot on a bus: which keys it hears, what it may send, what it refuses."""
 
 from collections import Counter, deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 
 from cpcbl_agents.agent import Listened, Presence, Sent, Tick
+from cpcbl_agents.clocks import Clocks
 from cpcbl_agents.robot import Robot
 from cpcbl_agents.tally import Tallies
 from cpcbl_agents.wiring import Tokens, Wiring
 from cpcbl_team.config import Team
 from cpcbl_team.inputs import Belief, Fix, Odometry, Position, Sightings
+from cpcbl_team.trust import Standing
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus
 from cpcbl_transport.compact import decode_help, encode_help
@@ -18,6 +20,7 @@ from cpcbl_transport.messages import (
     Refusal,
     Status,
     Track,
+    Trust,
     decode,
     encode,
     refusal,
@@ -40,7 +43,9 @@ class Node:
         start_ns: int,
         incarnation: str,
         on_arrival: Callable[[], None] = lambda: None,
+        speed: float = 1.0,
     ) -> None:
+        """`speed`: robot time beside real time."""
         self._robot, self._incarnation = robot, incarnation
         self._on_arrival = on_arrival
         self._name = robot.name
@@ -54,6 +59,7 @@ class Node:
         self._status_ns = start_ns
         self.counts: Counter[str] = Counter()
         self._heard = Tallies()
+        self._clocks = Clocks(rules.trust, speed) if rules.trust.enabled else None
         self._inputs = [
             bus.subscribe(topic.at(robot=robot.name), self._arrived) for topic in topics.INPUTS
         ]
@@ -151,7 +157,11 @@ class Node:
                 return Refusal.WRONG_TYPE
         if sender not in self._team:
             return Refusal.UNKNOWN_ROBOT
-        return Refusal.OWN if sender == self._name else refusal(message, now_ns)
+        if sender == self._name:
+            return Refusal.OWN
+        if self._clocks is not None and self._clocks.refuses(sender, message.stamp_ns, now_ns):
+            return Refusal.CLOCK
+        return refusal(message, now_ns)
 
     def _send(self, said: Iterable[Message], now_ns: int) -> None:
         for message in said:
@@ -205,7 +215,19 @@ class Node:
             sent,
             heard,
             self._robot.collaboration.budget.spending(now_ns),
+            tuple(self._trust(now_ns)),
         )
+
+    def _trust(self, now_ns: int) -> Iterator[Trust]:
+        """How teammates stand, by what they say and by their clocks."""
+        standings = {s.robot: s for s in self._robot.filter.standings(now_ns)}
+        off = frozenset() if self._clocks is None else self._clocks.off()
+        for name in sorted(standings.keys() | off):
+            late_s = 0.0 if self._clocks is None else self._clocks.late_s(name)
+            standing = standings.get(name, Standing(name))
+            if name in off:
+                standing = standing._replace(reason="clock")
+            yield Trust(*standing, late_s)
 
 
 _INPUTS = {topic.key.rsplit("/", 1)[-1]: topic.carries for topic in topics.INPUTS}

@@ -13,6 +13,7 @@ from cpcbl_agents.clock import Clock
 from cpcbl_agents.node import Node
 from cpcbl_agents.robot import Robot
 from cpcbl_team.config import Team
+from cpcbl_transport.bus import Bus
 from cpcbl_transport.zenoh_bus import open_bus
 
 LONGEST_WAIT_S = 0.2
@@ -59,8 +60,11 @@ def run_robot(
     clock: Clock,
     stop: Callable[[], bool],
     restarted: bool = False,
+    through: Callable[[Bus], Bus] = lambda bus: bus,
 ) -> None:
     """Runs a robot until `stop()`. One that is restarted, or late, does not know where it is.
+
+    `through` is what stands between the robot and its bus.
 
     Raises BusError when stopped before a router answered, LogError for an unreadable log.
     """
@@ -71,7 +75,7 @@ def run_robot(
             team = _not_knowing_its_start(name, team)
         incarnation = f"{os.getpid():x}"
         robot = Robot(name, team, start_ns, restarted)
-        node = Node(robot, team, bus, start_ns, incarnation, wake.set)
+        node = Node(robot, team, through(bus), start_ns, incarnation, wake.set, clock.speed)
         run_node(node, wake, clock, stop)
 
 

@@ -1,8 +1,9 @@
 """A team in one process over the bus in memory: deterministic, as fast as the machine is."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from pathlib import Path
+from types import MappingProxyType
 from typing import NamedTuple, Protocol
 
 import msgspec
@@ -20,6 +21,7 @@ from cpcbl_team.metrics import Trajectory
 from cpcbl_transport.bus import Bus, MemoryHub
 
 Progress = Callable[[float], None]
+Through = Callable[[Bus], Bus]
 
 
 class Choice(NamedTuple):
@@ -130,11 +132,13 @@ def simulate(
     referee: Referee | None = None,
     record: Path | None = None,
     progress: Progress | None = None,
+    through: Mapping[str, Through] = MappingProxyType({}),
 ) -> tuple[Report, Recorder]:
     """A simulated team, field and robots in one process.
 
     `truth` is the team as it really is, where that is not what its robots believe; a `referee` may
-    end the run before its time; `record` is the file to record it into.
+    end the run before its time; `record` is the file to record it into; `through` is what stands
+    between a robot and its bus.
     """
     hub, end_ns = MemoryHub(), int(duration_s * 1e9)
     recorder = Recorder(hub.session())
@@ -143,7 +147,8 @@ def simulate(
     over = (lambda: False) if referee is None else (lambda: referee.over)
     with Recording(record, team, hub.session()) if record is not None else nullcontext():
         field = FieldNode(SimulatedField(truth or team, seed, 0), hub.session())
-        run_nodes([field, *robot_nodes(team, hub, 0)], 0, end_ns, progress, over)
+        nodes = robot_nodes(team, hub, 0, through)
+        run_nodes([field, *nodes], 0, end_ns, progress, over)
     return simulated_report(recorder, team), recorder
 
 
@@ -153,10 +158,17 @@ def simulated_report(recorder: Recorder, team: Team) -> Report:
     return recorder.report(variants, recorder.simulated_truth())
 
 
-def robot_nodes(team: Team, hub: MemoryHub, start_ns: int) -> list["Stepped"]:
+def robot_nodes(
+    team: Team, hub: MemoryHub, start_ns: int, through: Mapping[str, Through] = MappingProxyType({})
+) -> list["Stepped"]:
     """A node for each robot, each with a session of its own."""
+
+    def session(name: str) -> Bus:
+        bus = hub.session()
+        return through[name](bus) if name in through else bus
+
     return [
-        Node(Robot(name, team, start_ns), team, hub.session(), start_ns, "0")
+        Node(Robot(name, team, start_ns), team, session(name), start_ns, "0")
         for name in team.robots
     ]
 

@@ -16,7 +16,13 @@ import numpy as np
 from cpcbl_agents.clock import Clock
 from cpcbl_agents.sensing import SensorInput
 from cpcbl_launch.grid import Grid
-from cpcbl_team.config import OdometrySettings, RobotSettings, SensorSettings, Team
+from cpcbl_team.config import (
+    OdometrySettings,
+    RobotSettings,
+    SensorSettings,
+    SimulationEvent,
+    Team,
+)
 from cpcbl_team.geometry import Pose2, step, wrap_angle
 from cpcbl_team.inputs import Odometry, Position, Sighting, Sightings
 from cpcbl_team.sensors import LEAST_COSINE
@@ -233,6 +239,9 @@ class SimulatedField:
         self._reach_m = max(ranges_m, default=0.0)
         self._marks_to_see = Grid(self._reach_m, marks)
         self._marks_to_touch = Grid(team.simulation.bump_radius_m, marks)
+        self._start_ns = start_ns
+        self._events = deque(sorted(team.simulation.events, key=lambda event: event.at_s))
+        self._hidden_until_ns = start_ns
 
     @property
     def next_ns(self) -> int:
@@ -246,6 +255,8 @@ class SimulatedField:
     def advance(self) -> list[tuple[str, SensorInput]]:
         """One step; what each robot senses at its end."""
         self.now_ns += self._step_ns
+        while self._events and self._passed_s >= self._events[0].at_s:
+            self._befall(self._events.popleft())
         for robot in self.robots.values():
             robot.move(self.now_ns, self._step_ns * 1e-9)
             self._bump(robot)
@@ -266,8 +277,24 @@ class SimulatedField:
         robots = tuple(Truth(n, *r.pose, r.bumps) for n, r in self.robots.items())
         return Truths(self.now_ns, robots)
 
+    @property
+    def _passed_s(self) -> float:
+        return (self.now_ns - self._start_ns) * 1e-9
+
+    def _befall(self, event: SimulationEvent) -> None:
+        hidden_ns = self._start_ns + int((event.at_s + event.hide_landmarks_s) * 1e9)
+        self._hidden_until_ns = max(self._hidden_until_ns, hidden_ns)
+        if event.to is not None and event.kidnap in self.robots:
+            x, y, heading_deg = event.to
+            self.robots[event.kidnap].pose = Pose2(x, y, wrap_angle(math.radians(heading_deg)))
+
     def _visible(self, viewer: str, pose: Pose2, mates: Grid[Seen]) -> Iterable[Seen]:
-        yield from self._marks_to_see.near(pose.x, pose.y)
+        if self.now_ns >= self._hidden_until_ns:
+            yield from self._marks_to_see.near(pose.x, pose.y)
+            yield from self._walls(pose)
+        yield from (mate for mate in mates.near(pose.x, pose.y) if mate.name != viewer)
+
+    def _walls(self, pose: Pose2) -> Iterable[Seen]:
         for name, wall in self._team.map.walls.items():
             (ax, ay), (bx, by) = wall.from_m, wall.to_m
             length = math.hypot(bx - ax, by - ay)
@@ -275,7 +302,6 @@ class SimulatedField:
             along = ux * (pose.x - ax) + uy * (pose.y - ay)
             if 0.0 <= along <= length:
                 yield Seen(name, ax + along * ux, ay + along * uy, wall.gives)
-        yield from (mate for mate in mates.near(pose.x, pose.y) if mate.name != viewer)
 
     def _bump(self, robot: SimulatedRobot) -> None:
         radius = self._team.simulation.bump_radius_m

@@ -8,6 +8,7 @@ from collections.abc import Iterable, Mapping, Sequence
 import msgspec
 import numpy as np
 
+from cpcbl_launch.standing import TrustReport, trust_of
 from cpcbl_launch.traffic.flows import (
     FlowReport,
     SpendingReport,
@@ -52,6 +53,8 @@ class RobotReport(Score, frozen=True, kw_only=True):
     heard: tuple[FlowReport, ...] = ()
     spending: tuple[SpendingReport, ...] = ()
     """Its limits; empty where there are none."""
+    trust: tuple[TrustReport, ...] = ()
+    """Teammates that it heard at the end, or that were in quarantine."""
 
 
 class MeanScore(msgspec.Struct, frozen=True, kw_only=True):
@@ -213,6 +216,7 @@ class Recorder:
                 sent=summed_flows(s.sent for s in statuses),
                 heard=summed_flows(s.heard for s in statuses),
                 spending=summed_spending(s.spending for s in statuses),
+                trust=trust_of(statuses),
             )
         return Report(robots=robots, team=_team(robots), refused=self.refused)
 

@@ -12,6 +12,7 @@ from rich.text import Text
 from cpcbl_launch.live import LiveView
 from cpcbl_launch.processes import ROBOT
 from cpcbl_launch.recorder import LearnedReport, MeanScore, Recorder, Report
+from cpcbl_launch.standing import distrusted, trust_remarks
 from cpcbl_launch.supervisor import Processes
 from cpcbl_launch.tables import number, percent, short, table
 from cpcbl_launch.traffic.show import EXPLAINED, spent_table, verdict
@@ -49,11 +50,14 @@ class LiveTable(LiveView):
             process = f"{ROBOT}{name}"
             pid = str(pids[process]) if process in pids else "down" if name in here else "away"
             state = _state(tracks.get(name), pid, restarts.get(process, 0))
+            status = statuses.get(name)
+            if status is not None and (said := distrusted(status.trust)):
+                state.append(f", {said}", "yellow")
             shown.add_row(
                 name,
                 pid,
                 *_pose_cells(tracks.get(name), truths.get(name)),
-                *_traffic_cells(statuses.get(name)),
+                *_traffic_cells(status),
                 state,
             )
         return shown
@@ -140,7 +144,7 @@ def print_report(report: Report, console: Console) -> None:
     if report.yardsticks:
         console.print(_yardsticks(report))
     for line in _remarks(report):
-        console.print(line, style="yellow", highlight=False)
+        console.print(line, style="yellow", highlight=False, markup=False)  # robots may say [/b]
 
 
 def _yardsticks(report: Report) -> Table:
@@ -182,6 +186,8 @@ def _remarks(report: Report) -> Iterator[str]:
     for name, r in report.robots.items():
         if r.learned is not None:
             yield f"robot {name} learned: {_corrections(r.learned)}"
+    for name, r in report.robots.items():
+        yield from trust_remarks(name, r.trust)
     for name, n in report.restarts.items():
         yield f"{name} was restarted {n} times"
 

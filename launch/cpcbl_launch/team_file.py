@@ -10,7 +10,7 @@ import tomllib
 from collections.abc import Iterator, Mapping
 from importlib import resources
 from pathlib import Path
-from typing import Any, get_args, get_type_hints
+from typing import Any, get_args, get_origin, get_type_hints
 
 import msgspec
 
@@ -160,6 +160,7 @@ def problems(team: Team) -> Iterator[str]:
                 " once; remove the key"
             )
     yield from _guard_problems(team)
+    yield from _event_problems(team)
     if not team.transport.connect:
         yield "transport.connect: is empty; name an endpoint such as tcp/192.168.1.10:7447"
     for key in ("listen", "connect"):
@@ -169,6 +170,19 @@ def problems(team: Team) -> Iterator[str]:
                     f"transport.{key}: {endpoint!r} is no endpoint;"
                     " write it as tcp/192.168.1.10:7447"
                 )
+
+
+def _event_problems(team: Team) -> Iterator[str]:
+    """An event is of one kind, and whole."""
+    for i, event in enumerate(team.simulation.events):
+        key = f"simulation.events[{i}]"
+        if bool(event.kidnap) == bool(event.hide_landmarks_s):
+            yield f"{key}: is of one kind; write kidnap and to, or hide_landmarks_s"
+        elif event.kidnap and event.kidnap not in team.robots:
+            known = ", ".join(team.robots)
+            yield f"{key}.kidnap: no robot {event.kidnap!r}; name one of {known}"
+        elif bool(event.kidnap) != (event.to is not None):
+            yield f"{key}.to: goes with kidnap; write to = [x_m, y_m, heading_deg]"
 
 
 def _guard_problems(team: Team) -> Iterator[str]:
@@ -235,8 +249,8 @@ def _explained(error: str, kind: type[Any], prefix: str) -> str:
 def _fields_at(kind: Any, path: str) -> list[str]:
     """The keys that a table at `path` knows."""
     for part in filter(None, path.split(".")):
-        kind = get_type_hints(kind)[part]
-        if type(None) in get_args(kind):
+        kind = get_type_hints(kind)[part.partition("[")[0]]
+        if type(None) in get_args(kind) or get_origin(kind) is tuple:
             kind = get_args(kind)[0]
     return sorted(kind.__struct_fields__)
 

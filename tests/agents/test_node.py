@@ -120,6 +120,8 @@ BAD = [
     Bad(Refusal.NOT_A_COVARIANCE, IN_POSITION, changed(POSITION, covariance=(-1.0, 0.0, 1.0))),
     Bad(Refusal.FUTURE, BELIEF_KEY, changed(BELIEF, stamp_ns=NOW + SECOND)),
     Bad(Refusal.FUTURE, FIX_KEY, changed(FIX, stamp_ns=NOW + SECOND)),
+    Bad(Refusal.CLOCK, BELIEF_KEY, changed(BELIEF, stamp_ns=NOW + 300 * MS)),
+    Bad(Refusal.CLOCK, FIX_KEY, changed(FIX, stamp_ns=NOW + 150 * MS)),
     Bad(Refusal.FUTURE, IN_SIGHTINGS, saw(NOW + SECOND)),
     Bad(Refusal.DURATION, IN_ODOMETRY, standing(NOW, NOW)),
     Bad(Refusal.UNKNOWN_ROBOT, topics.FIX.at(robot="me", tier=2, observer="ghost"), FIX),

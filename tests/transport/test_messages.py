@@ -23,6 +23,7 @@ from cpcbl_transport.messages import (
     Status,
     Tagged,
     Track,
+    Trust,
     Truth,
     Truths,
     decode,
@@ -40,7 +41,8 @@ LEARNED = (0.98, 0.96, -0.01)
 STATUS = Status("r1", "a", NOW, 0.1, 0.02, 3, "", {"odometry": 7}, 1, 20, 2, 40, LEARNED)
 SENT = (Flow("fix", "r2", 1, 41, 2, 3, 0, NOW), Flow("belief", "", 0, 0, 0, 0, 4))
 SPENDING = (Spending("bytes", 10.0, 500.0, 400.0),)
-STATUS = msgspec.structs.replace(STATUS, sent=SENT, heard=SENT[:1], spending=SPENDING)
+TRUST = (Trust("r2", "biased", NOW, 2, False, -0.4),)
+STATUS = msgspec.structs.replace(STATUS, sent=SENT, heard=SENT[:1], spending=SPENDING, trust=TRUST)
 TRACK = Track("r1", NOW, 1.0, 2.0, 0.5, COVARIANCE, 3)
 DRIVE = Drive("r1", NOW, 0.5, 0.1)
 TRUTHS = Truths(NOW, (Truth("r1", 1.0, 2.0, 0.5, 1), Truth("r2", 3.0, 4.0, -0.5)))
@@ -57,6 +59,7 @@ COVARIANCES_3 = st.tuples(FLOATS, FLOATS, FLOATS, FLOATS, FLOATS, FLOATS)
 MAYBE = FLOATS | st.none()
 FLOWS = st.builds(Flow, st.text(), st.text(), *[COUNTS] * 5, STAMPS)
 SPENDINGS = st.builds(Spending, st.text(), *[FLOATS] * 3)
+TRUSTS = st.builds(Trust, st.text(), st.text(), STAMPS, COUNTS, st.booleans(), FLOATS)
 
 MESSAGES: dict[type[Any], st.SearchStrategy[Tagged]] = {
     Odometry: st.builds(Odometry, STAMPS, STAMPS, FLOATS, FLOATS),
@@ -80,6 +83,7 @@ MESSAGES: dict[type[Any], st.SearchStrategy[Tagged]] = {
         st.tuples(FLOATS, FLOATS, FLOATS) | st.none(),
         *[st.lists(FLOWS, max_size=3).map(tuple)] * 2,
         st.lists(SPENDINGS, max_size=3).map(tuple),
+        st.lists(TRUSTS, max_size=3).map(tuple),
     ),
     Track: st.builds(
         Track,
@@ -138,7 +142,7 @@ def test_an_old_reader_skips_fields_that_a_newer_program_added(valid: Tagged) ->
     ("newer", "added"),
     [
         (TRACK, {"lost": ""}),
-        (STATUS, {"learned": None, "sent": (), "heard": (), "spending": ()}),
+        (STATUS, {"learned": None, "sent": (), "heard": (), "spending": (), "trust": ()}),
     ],
     ids=["Track", "Status"],
 )

@@ -53,6 +53,22 @@ class Spending(msgspec.Struct, frozen=True, array_like=True):
     """The most that was spent within one window."""
 
 
+class Trust(msgspec.Struct, frozen=True, array_like=True):
+    """How a teammate stands with this robot."""
+
+    peer: str
+    reason: str = ""
+    """Why nothing that it says is used; empty while it is believed."""
+    since_ns: int = 0
+    """When that began, or ended."""
+    quarantines: int = 0
+    """How often it was in quarantine so far."""
+    unconfirmed: bool = False
+    """Nobody else tells this robot anything: whether this one is biased cannot be told."""
+    late_s: float = 0.0
+    """The least time from its stamps to their arrival, lately; below zero its clock is ahead."""
+
+
 class Status(msgspec.Struct, frozen=True, array_like=True, tag="status"):
     """A robot's health, for operators. Metres, radians, counts since its process started."""
 
@@ -73,6 +89,8 @@ class Status(msgspec.Struct, frozen=True, array_like=True, tag="status"):
     sent: tuple[Flow, ...] = ()
     heard: tuple[Flow, ...] = ()
     spending: tuple[Spending, ...] = ()
+    trust: tuple[Trust, ...] = ()
+    """Teammates that are heard, or are or were in quarantine."""
 
 
 class Track(msgspec.Struct, frozen=True, array_like=True, tag="track"):
@@ -136,6 +154,7 @@ class Refusal(StrEnum):
     IMPLAUSIBLE = "implausible_number"
     NOT_A_COVARIANCE = "not_a_covariance"
     FUTURE = "from_the_future"
+    CLOCK = "clock_off"
     DURATION = "impossible_duration"
     UNKNOWN_ROBOT = "unknown_robot"
     OWN = "own_message"

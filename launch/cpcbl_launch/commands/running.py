@@ -158,10 +158,12 @@ def robot(
     restarted: Annotated[
         bool, typer.Option(help="It does not know where it is: find the pose first.")
     ] = False,
+    lie: Annotated[str, typer.Option(hidden=True)] = "",
 ) -> None:
     """Run one robot, on any machine, until SIGINT or SIGTERM."""
     from cpcbl_agents.clock import Clock
     from cpcbl_agents.process import Stop, run_robot
+    from cpcbl_launch.liar import Lie, lying
     from cpcbl_launch.team_file import TeamFileError
 
     team = load(team_file)
@@ -170,7 +172,8 @@ def robot(
             f"{team_file}: robots.{name}: not in the file; it has: {', '.join(team.robots)}"
         )
     when = Clock.parse(clock) if clock else Clock.wall()
-    run_robot(name, team, connect or team.transport.connect, when, Stop(parent), restarted)
+    through = lying(Lie.parse(lie) if lie else None, name, when.epoch_ns)
+    run_robot(name, team, connect or team.transport.connect, when, Stop(parent), restarted, through)
 
 
 def field(

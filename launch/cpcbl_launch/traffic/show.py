@@ -8,6 +8,7 @@ from rich.text import Text
 
 from cpcbl_launch.live import LiveView
 from cpcbl_launch.recorder import Report, RobotReport
+from cpcbl_launch.standing import distrusted
 from cpcbl_launch.tables import number, short, table
 from cpcbl_launch.traffic.flows import FlowReport, SpendingReport, all_held
 from cpcbl_launch.traffic.watch import AT_PRESENT_NS, RATES_NS, Help, RobotNow, Traffic
@@ -145,9 +146,10 @@ def _doing(robot: RobotNow, given: Sequence[Help]) -> Text:
         return Text(f"away: silent for {robot.silent_s:.0f} s", "yellow")
     if robot.lost:
         return Text(f"lost: {robot.lost}", "bold red")
-    if not given:
-        return Text("nobody", "dim")
-    return Text("\n").join(_arrows(given))
+    lines = list(_arrows(given)) if given else [Text("nobody", "dim")]
+    if said := distrusted(robot.trust):
+        lines.append(Text(said, "yellow"))
+    return Text("\n").join(lines)
 
 
 def _arrows(given: Sequence[Help]) -> Iterator[Text]:

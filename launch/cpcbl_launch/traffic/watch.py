@@ -14,6 +14,7 @@ from typing import NamedTuple, Protocol
 
 import msgspec
 
+from cpcbl_launch.standing import TrustReport, trust_of
 from cpcbl_launch.traffic.flows import (
     FlowReport,
     SpendingReport,
@@ -55,6 +56,8 @@ class RobotNow(msgspec.Struct, frozen=True, kw_only=True):
     sent: tuple[FlowNow, ...]
     heard: tuple[FlowNow, ...]
     spending: tuple[SpendingReport, ...]
+    trust: tuple[TrustReport, ...] = ()
+    """What it makes of teammates."""
 
 
 class Help(msgspec.Struct, frozen=True, kw_only=True):
@@ -123,6 +126,7 @@ def _robot(seen: Sequence[Arrival], now_s: float) -> RobotNow:
         sent=tuple(_flows(first, last, first.sent, last.sent)),
         heard=tuple(_flows(first, last, first.heard, last.heard)),
         spending=summed_spending([last.spending]),
+        trust=trust_of([last]),
     )
 
 
