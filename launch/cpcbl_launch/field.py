@@ -9,9 +9,10 @@ import math
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Sequence
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
+from msgspec.structs import replace
 
 from cpcbl_agents.clock import Clock
 from cpcbl_agents.sensing import SensorInput
@@ -28,7 +29,7 @@ from cpcbl_team.inputs import Odometry, Position, Sighting, Sightings
 from cpcbl_team.sensors import LEAST_COSINE
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus, Publisher
-from cpcbl_transport.messages import Drive, Refusal, Truth, Truths, encode
+from cpcbl_transport.messages import Drive, Refusal, Truth, Truths, encode, refusal
 from cpcbl_transport.reading import read
 
 log = logging.getLogger(__name__)
@@ -247,6 +248,10 @@ class SimulatedField:
     def next_ns(self) -> int:
         return self.now_ns + self._step_ns
 
+    def ahead_ns(self, robot: str) -> int:
+        """How far a robot's clock is ahead of the field's."""
+        return int(self._team.simulation.clocks_ahead_s.get(robot, 0.0) * 1e9)
+
     def command(self, drive: Drive) -> None:
         """A robot's wheels from now on; commands for unknown robots are ignored."""
         if drive.robot in self.robots:
@@ -347,17 +352,41 @@ class FieldNode:
     def step(self, now_ns: int) -> None:
         """Advances the field to `now_ns` and tells the robots what they sense."""
         while self._drives:
-            drive = read(*self._drives.popleft(), now_ns)
-            if isinstance(drive, Drive) and drive.robot in self._field.robots:
+            drive = self._read(*self._drives.popleft(), now_ns)
+            if isinstance(drive, Refusal):
+                self.counts[drive] += 1
+            else:
                 self.counts["drive"] += 1
                 self._field.command(drive)
-            else:
-                self.counts[drive if isinstance(drive, Refusal) else Refusal.UNKNOWN_ROBOT] += 1
         while self._field.next_ns <= now_ns:
             for name, sensed in self._field.advance():
-                self._publishers[name, type(sensed)].put(encode(sensed))
+                stamped = later(sensed, self._field.ahead_ns(name))
+                self._publishers[name, type(sensed)].put(encode(stamped))
             if self._truth.matching:
                 self._truth.put(encode(self._field.truth()))
+
+    def _read(self, key: str, payload: bytes, now_ns: int) -> Drive | Refusal:
+        """A command for a robot of this field, by the field's clock, or why there is none."""
+        drive = read(key, payload)
+        if isinstance(drive, Refusal):
+            return drive
+        assert isinstance(drive, Drive)
+        if drive.robot not in self._field.robots:
+            return Refusal.UNKNOWN_ROBOT
+        drive = later(drive, -self._field.ahead_ns(drive.robot))
+        return refusal(drive, now_ns) or drive
+
+
+Stamped = TypeVar("Stamped", bound=SensorInput | Drive)
+
+
+def later(message: Stamped, ns: int) -> Stamped:
+    """The message by a clock that is so far ahead."""
+    if not ns:
+        return message
+    if isinstance(message, Odometry):
+        return replace(message, from_ns=message.from_ns + ns, stamp_ns=message.stamp_ns + ns)
+    return replace(message, stamp_ns=message.stamp_ns + ns)
 
 
 def run_field(team: Team, seed: int, bus: Bus, clock: Clock, stop: Callable[[], bool]) -> None:

@@ -173,7 +173,10 @@ def problems(team: Team) -> Iterator[str]:
 
 
 def _event_problems(team: Team) -> Iterator[str]:
-    """An event is of one kind, and whole."""
+    """An event is of one kind, and whole; clocks are those of robots."""
+    for name in team.simulation.clocks_ahead_s.keys() - team.robots.keys():
+        known = ", ".join(team.robots)
+        yield f"simulation.clocks_ahead_s.{name}: no robot {name!r}; name one of {known}"
     for i, event in enumerate(team.simulation.events):
         key = f"simulation.events[{i}]"
         if bool(event.kidnap) == bool(event.hide_landmarks_s):

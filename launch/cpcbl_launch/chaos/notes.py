@@ -7,8 +7,10 @@ import threading
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from itertools import pairwise
+from types import MappingProxyType
 from typing import NamedTuple, TypeVar
 
+import msgspec
 import numpy as np
 
 from cpcbl_agents.clock import Clock
@@ -223,6 +225,40 @@ def all_counts(notes: Notes, robot: str) -> Counter[str]:
     return Counter(status.counts) + Counter(messages_received=status.messages_received)
 
 
+def distrusted_after_s(notes: Notes, robot: str, peer: str, reason: str) -> float | None:
+    """When a robot first said that it does not believe a teammate for a reason."""
+    said = (
+        s.at_s
+        for s in notes.statuses.get(robot, ())
+        if any(t.peer == peer and t.reason == reason for t in s.status.trust)
+    )
+    return next(said, None)
+
+
+def distrusted(notes: Notes, robot: str) -> dict[str, str]:
+    """Whom a robot does not believe by its latest status, and why."""
+    said = notes.statuses.get(robot, ())
+    return {t.peer: t.reason for t in said[-1].status.trust if t.reason} if said else {}
+
+
+def heard_late_s(notes: Notes, robot: str, peer: str) -> float | None:
+    """How late, at least, a teammate's words reach a robot by its latest status; below zero the
+    teammate's clock is ahead."""
+    said = notes.statuses.get(robot, ())
+    late = [t.late_s for t in said[-1].status.trust if t.peer == peer] if said else []
+    return late[0] if late else None
+
+
+def jump_s(notes: Notes, robot: str, least_m: float = 1.0) -> tuple[float, float] | None:
+    """(time, metres) of the first jump of a robot's true place."""
+    rows = notes.truth.get(robot)
+    if rows is None or len(rows) < 2:
+        return None
+    steps = np.hypot(*np.diff(rows[:, 1:3], axis=0).T)
+    jumps = np.flatnonzero(steps >= least_m)
+    return (float(rows[jumps[0] + 1, 0]), float(steps[jumps[0]])) if len(jumps) else None
+
+
 def latest_incarnation(notes: Notes, robot: str) -> str:
     """The process that announced itself last; empty if none did."""
     mine = [t.incarnation for t in notes.tokens if t.robot == robot and t.alive]
@@ -269,8 +305,10 @@ def _compared(
 class NoteTaker:
     """Listens on one bus or several; what comes twice is put down once."""
 
-    def __init__(self, clock: Clock) -> None:
+    def __init__(self, clock: Clock, ahead_s: Mapping[str, float] = MappingProxyType({})) -> None:
+        """`ahead_s`: how far robots' clocks are ahead of this one; their tracks are put right."""
         self._clock, self._lock = clock, threading.Lock()
+        self._ahead_ns = {name: int(s * 1e9) for name, s in ahead_s.items()}
         self._tracks: dict[str, list[Heard]] = {}
         self._statuses: dict[str, list[Said]] = {}
         self._tokens: list[Token] = []
@@ -298,8 +336,10 @@ class NoteTaker:
         at_s, message = self.now_s, read(key, payload)
         with self._lock:
             match message:
-                case Track(robot=robot):
-                    _add(self._tracks.setdefault(robot, []), Heard(at_s, message))
+                case Track(robot=robot, stamp_ns=stamp_ns):
+                    stamp_ns -= self._ahead_ns.get(robot, 0)
+                    track = msgspec.structs.replace(message, stamp_ns=stamp_ns)
+                    _add(self._tracks.setdefault(robot, []), Heard(at_s, track))
                 case Status(robot=robot):
                     _add(self._statuses.setdefault(robot, []), Said(at_s, message))
                 case Truths() if self._is_next(message):

@@ -47,8 +47,6 @@ class Plan(NamedTuple):
     seed: int = 1
     links: Mapping[str, str] = MappingProxyType({})
     """The endpoint that a robot dials, where it is not the router's."""
-    ahead_s: Mapping[str, float] = MappingProxyType({})
-    """How far a robot's clock is ahead of the others'."""
     prefix: Mapping[str, tuple[str, ...]] = MappingProxyType({})
     """What a robot's command begins with, such as `ip netns exec`."""
     also_listen: Sequence[str] = ()
@@ -92,7 +90,7 @@ class TeamUnderTest:
             if name not in plan.left_out and robot.source == "simulated"
         ]
         """Of the simulated field, which knows where they are."""
-        self.taker = NoteTaker(clock)
+        self.taker = NoteTaker(clock, plan.team.simulation.clocks_ahead_s)
         self.seen_pids: set[int] = set()
 
     @property
@@ -239,10 +237,8 @@ def _table(plan: Plan, folder: Path, endpoint: str, clock: Clock) -> list[Proces
     for name in plan.team.robots:
         if name in plan.left_out:
             continue
-        ahead_ns = int(plan.ahead_s.get(name, 0.0) * 1e9)
-        own_clock = clock._replace(epoch_ns=clock.epoch_ns + ahead_ns)
         link = plan.links.get(name, endpoint)
-        own = process_table(plan.team, team_file, link, own_clock, plan.seed, here=(name,))[-1]
+        own = process_table(plan.team, team_file, link, clock, plan.seed, here=(name,))[-1]
         rows.append(own._replace(command=(*plan.prefix.get(name, ()), *own.command)))
     return rows
 

@@ -3,8 +3,8 @@ believed again.
 
 Observers with good eyes stand round the field of the demonstration; a navigator with poor ones and
 two scouts, blind to landmarks, drive between them. From 10 s to 25 s one observer says what is not
-so (`liar.py`), then the truth again. Errors are those of the robots that drive, from 10 s on, beside
-the team without that observer, and beside one that believes everything.
+so (`liar.py`), then the truth again. Errors are those of the robots that drive, from 10 s on,
+beside the team without that observer, and beside one that believes everything.
 """
 
 import math
