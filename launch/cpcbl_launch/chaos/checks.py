@@ -1,6 +1,7 @@
 """What a scenario expects, what was seen, and whether it held. Plain data."""
 
 import math
+from typing import Any
 
 import msgspec
 
@@ -65,6 +66,19 @@ class Outcome(msgspec.Struct, frozen=True, kw_only=True):
         if self.not_run:
             return None
         return not self.failed and bool(self.checks) and all(c.held for c in self.checks)
+
+
+def as_data(faults: "Faults") -> dict[str, Any]:
+    """What `--json` and `--report` write: all fields, and whether each expectation held."""
+    outcomes = [
+        {
+            **msgspec.structs.asdict(o),
+            "held": o.held,
+            "checks": [{**msgspec.structs.asdict(c), "held": c.held} for c in o.checks],
+        }
+        for o in faults.outcomes
+    ]
+    return {**msgspec.structs.asdict(faults), "held": faults.held, "outcomes": outcomes}
 
 
 class Faults(msgspec.Struct, frozen=True, kw_only=True):

@@ -18,7 +18,7 @@ class Needs(StrEnum):
     NOTHING = ""
     ROOT = "root and /dev/net/tun"
     MOUNT = "root, to mount a small disk"
-    DOCKER = "docker"
+    HYPOTHESIS = "the extra `chaos`"
 
 
 class Setting(NamedTuple):

@@ -16,7 +16,7 @@ from cpcbl_launch.chaos.soak import soak
 from cpcbl_launch.chaos.world import clock_half_second, clock_hour, hidden, kidnap
 
 QUICK, SLOW = True, False
-N, ROOT, MOUNT = Needs.NOTHING, Needs.ROOT, Needs.MOUNT
+N, ROOT, MOUNT, HYPOTHESIS = Needs.NOTHING, Needs.ROOT, Needs.MOUNT, Needs.HYPOTHESIS
 
 SCENARIOS = (
     Scenario(
@@ -156,7 +156,7 @@ SCENARIOS = (
         "10,000 payloads without sense on every key (hypothesis's, random bytes, damaged ones)",
         "no process ends, nothing is thrown, each is counted by robot, field, recorder and"
         " watcher; the team goes on",
-        N,
+        HYPOTHESIS,
         SLOW,
         fuzz,
     ),
