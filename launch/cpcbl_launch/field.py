@@ -8,7 +8,8 @@ import logging
 import math
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from types import MappingProxyType
 from typing import NamedTuple, TypeVar
 
 import numpy as np
@@ -36,6 +37,7 @@ log = logging.getLogger(__name__)
 
 COMMAND_LASTS_NS = 500_000_000
 INBOX = 10_000
+NOWHERE: Mapping[str, Bus] = MappingProxyType({})
 
 
 class Every:
@@ -320,9 +322,11 @@ class SimulatedField:
 
 
 class FieldNode:
-    """The field on a bus."""
+    """The field on a bus. Robots of other `sites` (robot -> bus) are told on the bus of theirs, so
+    that the world goes on for them while their site is cut off.
+    """
 
-    def __init__(self, field: SimulatedField, bus: Bus) -> None:
+    def __init__(self, field: SimulatedField, bus: Bus, sites: Mapping[str, Bus] = NOWHERE) -> None:
         self._field = field
         self._drives: deque[tuple[str, bytes]] = deque(maxlen=INBOX)
         self.counts: Counter[str] = Counter()
@@ -332,9 +336,9 @@ class FieldNode:
         for name in field.robots:
             for topic in topics.INPUTS:
                 assert topic.carries is not None
-                publisher = bus.publisher(topic.at(robot=name), topic.qos)
+                publisher = sites.get(name, bus).publisher(topic.at(robot=name), topic.qos)
                 self._publishers[name, topic.carries] = publisher
-        bus.subscribe(topics.DRIVE.at(), self._arrived)
+            sites.get(name, bus).subscribe(topics.DRIVE.at(robot=name), self._arrived)
 
     def _arrived(self, key: str, payload: bytes) -> None:
         if len(self._drives) == INBOX:
@@ -389,9 +393,29 @@ def later(message: Stamped, ns: int) -> Stamped:
     return replace(message, stamp_ns=message.stamp_ns + ns)
 
 
-def run_field(team: Team, seed: int, bus: Bus, clock: Clock, stop: Callable[[], bool]) -> None:
+def robots_at(sites: Iterable[str], team: Team) -> dict[str, list[str]]:
+    """Endpoint -> robots, of `tcp/10.0.0.2:7447=r3,r4`. Raises ValueError."""
+    found = {}
+    for text in sites:
+        endpoint, _, names = text.partition("=")
+        found[endpoint] = [name.strip() for name in names.split(",")]
+        for name in found[endpoint]:
+            if name not in team.robots:
+                known = ", ".join(team.robots)
+                raise ValueError(f"--site {text}: no robot {name!r}; there are {known}")
+    return found
+
+
+def run_field(
+    team: Team,
+    seed: int,
+    bus: Bus,
+    clock: Clock,
+    stop: Callable[[], bool],
+    sites: Mapping[str, Bus] = NOWHERE,
+) -> None:
     """The field as a process: steps in robot time until `stop()`."""
-    node = FieldNode(SimulatedField(team, seed, clock.now_ns()), bus)
+    node = FieldNode(SimulatedField(team, seed, clock.now_ns()), bus, sites)
     while not stop():
         node.step(clock.now_ns())
         time.sleep(min(clock.seconds_until(node.next_ns), 0.2))

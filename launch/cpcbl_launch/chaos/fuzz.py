@@ -42,6 +42,7 @@ TOKENS = 300
 BURST, PAUSE_S = 50, 0.012
 SIGHTINGS_EVERY_S = 0.3
 VICTIM, MATE = "victim", "mate"  # the mate is played by the fuzzer
+DRIVEN = "patrol"  # whose commands, by their own words the mate's, it refuses all
 TO_PEOPLE = (topics.STATUS, topics.TRACK, topics.TRUTH)
 TAKEN = ("odometry", "sightings", "position", "messages_received")
 REASONS = (*Refusal, "inbox_overflow")
@@ -240,6 +241,7 @@ class Fuzzer:
 
     def _key(self, topic: Topic) -> str:
         robot = VICTIM if topic in (topics.FIX, *topics.INPUTS) else MATE
+        robot = DRIVEN if topic is topics.DRIVE else robot
         return topic.at(robot=robot, tier=0, observer=MATE)
 
     def _fuzz(self, topic: Topic, key: str) -> None:

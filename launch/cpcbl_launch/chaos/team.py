@@ -38,6 +38,8 @@ class Site(NamedTuple):
     listen: str
     joins: str
     """The endpoint that it dials: the first router's, or a relay's to it."""
+    robots: Sequence[str]
+    """Whom the field tells there what they sense."""
 
 
 class Plan(NamedTuple):
@@ -233,7 +235,10 @@ def _table(plan: Plan, folder: Path, endpoint: str, clock: Clock) -> list[Proces
         router_spec(team_file, (site.listen,), (site.joins,), name)
         for name, site in plan.sites.items()
     ]
-    rows += process_table(plan.team, team_file, endpoint, clock, plan.seed, here=())
+    for field in process_table(plan.team, team_file, endpoint, clock, plan.seed, here=()):
+        there = (f"{site.listen}={','.join(site.robots)}" for site in plan.sites.values())
+        words = [word for at in there for word in ("--site", at)]
+        rows.append(field._replace(command=(*field.command, *words)))
     for name in plan.team.robots:
         if name in plan.left_out:
             continue

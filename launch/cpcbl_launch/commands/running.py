@@ -180,19 +180,33 @@ def field(
     team_file: TeamFile,
     seed: Annotated[int, typer.Option(help="Of the noise.")] = 1,
     connect: Connect = None,
+    site: Annotated[
+        Optional[list[str]],
+        typer.Option(help="Robots at another router: tcp/10.0.0.2:7447=r3,r4."),
+    ] = None,
     clock: ClockText = "",
     parent: Parent = None,
 ) -> None:
     """Run the simulated field until SIGINT or SIGTERM."""
+    from contextlib import ExitStack
+
     from cpcbl_agents.clock import Clock
     from cpcbl_agents.process import Stop
-    from cpcbl_launch.field import run_field
+    from cpcbl_launch.field import robots_at, run_field
+    from cpcbl_transport.bus import Bus
     from cpcbl_transport.zenoh_bus import open_bus
 
     team = load(team_file)
+    elsewhere = robots_at(site or (), team)
     stop = Stop(parent)
-    with open_bus(team.name, connect or team.transport.connect, stop) as bus:
-        run_field(team, seed, bus, Clock.parse(clock) if clock else Clock.wall(), stop)
+    with ExitStack() as stack:
+        bus = stack.enter_context(open_bus(team.name, connect or team.transport.connect, stop))
+        sites: dict[str, Bus] = {}
+        for endpoint, names in elsewhere.items():
+            there = stack.enter_context(open_bus(team.name, [endpoint], stop))
+            sites |= dict.fromkeys(names, there)
+        when = Clock.parse(clock) if clock else Clock.wall()
+        run_field(team, seed, bus, when, stop, sites)
 
 
 def router(

@@ -6,6 +6,7 @@ they take too long or the user wants to stop.
 
 import os
 import platform
+import re
 import shlex
 import subprocess
 import tempfile
@@ -34,6 +35,12 @@ class Ended(NamedTuple):
     def last_line(self) -> str:
         lines = [line.strip() for line in self.output.splitlines() if line.strip()]
         return lines[-1] if lines else "it said nothing"
+
+    @property
+    def problem(self) -> str:
+        """The line that says what went wrong: one that begins with error, or the last of all."""
+        found = re.search(r"^\s*error\b.*$", self.output, re.IGNORECASE | re.MULTILINE)
+        return found[0].strip() if found else self.last_line
 
 
 def never() -> bool:
@@ -85,7 +92,7 @@ def done(
     """What a command says. Raises DockerError also when it fails."""
     ended = ran(command, stop, said, timeout_s)
     if ended.code:
-        raise DockerError(f"{shlex.join(command[:4])} ...: {ended.last_line}")
+        raise DockerError(f"{shlex.join(command[:4])} ...: {ended.problem}")
     return ended.output
 
 

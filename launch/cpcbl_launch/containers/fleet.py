@@ -84,6 +84,11 @@ class Project:
             return {}
         return parsed(json.loads(done(["docker", "inspect", *ids])))
 
+    def last_words(self, service: str) -> str:
+        """The last line that a container wrote."""
+        container = self.containers().get(service)
+        return "nothing" if container is None else ran(["docker", "logs", container.id]).last_line
+
     def save_logs(self, folder: Path) -> None:
         """What every container said, as SERVICE.log."""
         for service, container in self.containers().items():

@@ -17,6 +17,9 @@ SOURCES = (
 )
 """What goes into the image, from the top of the checkout; .dockerignore lets in the same."""
 BUILD_TIMEOUT_S = 1800.0
+WITHOUT_REGISTRY = (
+    f"without a registry of images: docker/base-image.sh, then {BASE_VARIABLE}=cpcbl-base"
+)
 
 
 def version() -> str:
@@ -51,7 +54,7 @@ def image_for(base: str, stop: Callable[[], bool], said: Said) -> str:
         )
     name = tag(top, base)
     if not there(name):
-        _have_base(base, stop, said)
+        have(base, stop, said, WITHOUT_REGISTRY)
         said(f"building image {name} on {base}, once for these sources")
         command = [
             "docker",
@@ -63,7 +66,13 @@ def image_for(base: str, stop: Callable[[], bool], said: Said) -> str:
             f"BASE_IMAGE={base}",
         ]
         command += ["--file", str(top / DOCKERFILE), str(top)]
-        done(command, stop, lambda line: _step(line, said), BUILD_TIMEOUT_S)
+
+        def told(line: str) -> None:
+            step = progress_of(line)
+            if step is not None:
+                said(step)
+
+        done(command, stop, told, BUILD_TIMEOUT_S)
     return name
 
 
@@ -72,23 +81,20 @@ def there(image: str) -> bool:
     return ran(["docker", "image", "inspect", "--format", "{{.Id}}", image]).code == 0
 
 
-def _have_base(base: str, stop: Callable[[], bool], said: Said) -> None:
-    if there(base):
+def have(image: str, stop: Callable[[], bool], said: Said, otherwise: str) -> None:
+    """Fetches an image that is not there. Raises DockerError, with what to do `otherwise`."""
+    if there(image):
         return
-    said(f"fetching base image {base}")
-    fetched = ran(["docker", "pull", "--quiet", base], stop, timeout_s=BUILD_TIMEOUT_S)
+    said(f"fetching image {image}")
+    fetched = ran(["docker", "pull", "--quiet", image], stop, timeout_s=BUILD_TIMEOUT_S)
     if fetched.code:
-        raise DockerError(
-            f"no base image {base} ({fetched.last_line}); without a registry: docker/base-image.sh,"
-            f" then {BASE_VARIABLE}=cpcbl-base"
-        )
+        raise DockerError(f"no image {image} ({fetched.problem}); {otherwise}")
 
 
-def _step(line: str, said: Said) -> None:
+def progress_of(line: str) -> str | None:
     """Of all that a builder says (the classic one, or BuildKit) the lines that begin a step."""
     step = re.match(r"(?:Step (\d+/\d+) :|#\d+ \[.*?(\d+/\d+)\]) (.+)", line)
-    if step:
-        said(f"  {step[1] or step[2]} {step[3]}"[:78])
+    return f"  {step[1] or step[2]} {step[3]}"[:78] if step else None
 
 
 def _files(top: Path) -> Iterator[Path]:

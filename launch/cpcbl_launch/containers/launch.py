@@ -2,6 +2,7 @@
 
 import re
 import secrets
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -11,19 +12,20 @@ from rich.console import Console
 
 from cpcbl_agents.clock import Clock
 from cpcbl_launch.containers.compose import Deployment, Mount, compose_text
-from cpcbl_launch.containers.docker import Said, check_daemon, compose_program
+from cpcbl_launch.containers.docker import DockerError, Said, check_daemon, compose_program
 from cpcbl_launch.containers.fleet import Fleet, Project
-from cpcbl_launch.containers.image import image_for
+from cpcbl_launch.containers.image import have, image_for
 from cpcbl_launch.processes import tasks
 from cpcbl_launch.supervisor import Processes
 from cpcbl_launch.team_file import save_resolved
 from cpcbl_launch.up import Run, dialled
 from cpcbl_team.config import Team
 from cpcbl_transport.bus import Bus
-from cpcbl_transport.zenoh_bus import open_bus
+from cpcbl_transport.zenoh_bus import BusError, ZenohBus, open_bus
 
 LEAD_S = 4.0
-LEAD_S_A_CONTAINER = 0.8
+LEAD_S_A_CONTAINER = 0.5
+ROUTER_WITHIN_S = 60.0
 INSIDE = "/team/team.json"
 DATA_INSIDE = "/team/data"
 
@@ -44,6 +46,8 @@ class InContainers:
         check_daemon()
         program = compose_program()
         self._run, self._folder, self._stop, self._said = run, folder, stop, said
+        if image is not None:
+            have(image, stop, said, "leave --image out to build one of these sources")
         self._image = image or image_for(base, stop, said)
         self._here = run.team.robots if run.here is None else run.here
         self.lead_s = LEAD_S + LEAD_S_A_CONTAINER * len(self._here)
@@ -62,13 +66,22 @@ class InContainers:
         team = self._run.team
         try:
             self._project.up("router")
-            with open_bus(team.name, [dialled(team.transport.listen[0])], self._stop) as bus:
+            with self._joined(dialled(team.transport.listen[0])) as bus:
                 yield bus
         finally:
-            if self._run.folder is not None:
-                self._project.save_logs(self._folder)
-            self._said("taking the containers down")
-            self._project.down()
+            self._end()
+
+    def _joined(self, endpoint: str) -> ZenohBus:
+        until_s = time.monotonic() + ROUTER_WITHIN_S
+
+        def give_up() -> bool:
+            return self._stop() or time.monotonic() > until_s
+
+        try:
+            return open_bus(self._run.team.name, [endpoint], give_up)
+        except BusError as error:
+            said = self._project.last_words("router")
+            raise DockerError(f"{error}; the router's container said: {said}") from error
 
     @contextmanager
     def processes(self, clock: Clock) -> Iterator[Processes]:
@@ -76,6 +89,14 @@ class InContainers:
         self._project.up()
         rows = tasks(self._run.team, (), self._run.seed, self._here)
         yield Fleet(self._project, ["router", *(row.name for row in rows)])
+
+    def _end(self) -> None:
+        try:  # also when nobody reads any more what is said
+            self._said("taking the containers down")
+            if self._run.folder is not None:
+                self._project.save_logs(self._folder)
+        finally:
+            self._project.down()
 
     def _write(self, clock: str) -> None:
         run, endpoints = self._run, self._run.team.transport.listen
