@@ -103,14 +103,12 @@ def judged_soak(
     back = [found_after_s(notes, name, calm_s, FOUND_M) for name in robots]
     grown = [life.end_mib - life.start_mib for life in lived]
     slopes = [life.mib_a_minute for life in lived if life.seconds >= LONG_LIFE_S]
-    steep = [
-        Check(
-            what=f"steepest of those that lived {LONG_LIFE_S:g} s",
-            seen=max(slopes),
-            unit="MiB/min",
-            at_most=SLOPE_MIB_A_MINUTE,
-        )
-    ]
+    steep = Check(
+        what=f"steepest of those that lived {LONG_LIFE_S:g} s",
+        seen=max(slopes, default=None),
+        unit="MiB/min",
+        at_most=SLOPE_MIB_A_MINUTE,
+    )
     return [
         Check(what="processes that ended unasked", seen=restarts - kills, at_least=0, at_most=0),
         Check(what="tracebacks in logs", seen=tracebacks, at_least=0, at_most=0),
@@ -127,7 +125,7 @@ def judged_soak(
             unit="MiB",
             at_most=GROWTH_MIB,
         ),
-        *(steep if slopes else []),
+        *([steep] if slopes else []),
         Check(
             what="open files, most more",
             seen=max((life.more_files for life in lived), default=None),
