@@ -29,7 +29,7 @@ SLOPE = 2.0**-11
 RATES = 1_000  # a metre a second, a radian a second
 
 LEAST = SIGMA**2
-NOISE = 1e-12
+NOISE = 1e-10
 """A share of a variance that may be the rounding of its double-precision factors."""
 STEEPEST = 4095.0  # slope; a thinner ellipse is sent thicker
 TURNED = math.sqrt(3.0) * SLOPE / 2.0  # norm of what rounding three slopes does to the factor
