@@ -92,7 +92,8 @@ def test_no_link_that_is_quick_enough_makes_a_clock_look_off(delays: list[int]) 
 
 def told(offset_ns: int, trust: TrustSettings = RULES) -> Status:
     """A robot's status after 2 s of fixes from a mate whose clock is ahead by so much."""
-    stand = Stand(team_of(me=robot_at(trust=trust), mate=robot_at(4.0)), here=["me"])
+    me = robot_at(trust=trust, direction="both-ways")  # whatever its own tier
+    stand = Stand(team_of(me=me, mate=robot_at(4.0)), here=["me"])
     stand.announce("mate", 2)
     stand.stand_still(0.2)
     for _ in range(20):
