@@ -23,7 +23,9 @@ from bus_helpers import Ear, wait_until
 from docker_helpers import TOP, image
 from key_helpers import R1, R2, again, router_of, secured_team, session, with_credentials
 from process_helpers import cpcbl_team
+from typer.testing import CliRunner
 
+from cpcbl_launch.cli import app
 from cpcbl_launch.identities.authority import facts, issued, new_authority
 from cpcbl_launch.identities.plan import Deed, hosts, plan
 from cpcbl_launch.processes import PROGRAM
@@ -64,8 +66,8 @@ def changed(before: Mapping[str, bytes], after: Mapping[str, bytes]) -> set[str]
 
 def keys(file: Path, *more: object) -> dict[str, dict[str, Any]]:
     """What `keys FILE MORE --json` says, by member."""
-    done = cpcbl_team("keys", file, *more, "--json")
-    assert done.returncode == 0, done.stderr
+    done = CliRunner().invoke(app, [str(word) for word in ("keys", file, *more, "--json")])
+    assert done.exit_code == 0, done.output
     return {member["who"]: member for member in json.loads(done.stdout)}
 
 
