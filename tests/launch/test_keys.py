@@ -21,7 +21,7 @@ import pytest
 import yaml
 from bus_helpers import Ear, wait_until
 from docker_helpers import TOP, image
-from key_helpers import R1, R2, again, router_of, secured_team, session, with_credentials
+from key_helpers import OPERATOR, R1, again, router_of, secured_team, session, with_credentials
 from process_helpers import cpcbl_team
 from typer.testing import CliRunner
 
@@ -408,7 +408,7 @@ def test_a_printed_configuration_is_as_strict(team_file: Path) -> None:
     config.write_text(printed.stdout)
     team = load_team(team_file)
     with running("router", "--config", config):
-        with session(team, R2, endpoint) as listener, session(team, R1, endpoint) as robot:
+        with session(team, OPERATOR, endpoint) as listener, session(team, R1, endpoint) as robot:
             ear = Ear(listener, "**")
             for key in ("status/r2", "status/r1"):
                 publisher = robot.publisher(key, Qos.INPUT)
