@@ -13,7 +13,7 @@ from cpcbl_agents.clock import Clock
 from cpcbl_agents.sensing import SensorInput
 from cpcbl_launch.bodies import LASTS_NS
 from cpcbl_launch.evaluation import Choice, chosen, simulate
-from cpcbl_launch.field import COMMAND_LASTS_NS, FieldNode, SimulatedField, run_field
+from cpcbl_launch.field import COMMAND_LASTS_NS, FieldNode, SimulatedField, robots_at, run_field
 from cpcbl_launch.team_file import builtin, load_team
 from cpcbl_team.config import (
     Field,
@@ -487,6 +487,34 @@ def test_a_field_runs_until_it_is_stopped() -> None:
     heard = Ear(hub.session(), topics.TRUTH.at())
     run_field(team, 1, hub.session(), clock, lambda: len(heard.samples) >= 3)
     assert all(isinstance(m, Truths) for m in heard.messages)
+
+
+def test_robots_of_another_site_are_told_and_heard_on_the_bus_of_theirs() -> None:
+    here, there = MemoryHub(), MemoryHub()
+    both = field(near=robot(), far=robot())
+    node = FieldNode(both, here.session(), {"far": there.session()})
+    ears = {hub: Ear(hub.session(), topics.IN_ODOMETRY.at()) for hub in (here, there)}
+    for hub, speed_m_s in ((here, 0.5), (there, -0.5)):
+        for name in ("near", "far"):
+            publisher = hub.session().publisher(topics.DRIVE.at(robot=name), topics.DRIVE.qos)
+            publisher.put(encode(Drive(name, 0, speed_m_s, 0.0)))
+    node.step(5 * STEP_NS)
+    assert set(ears[here].keys) == {topics.IN_ODOMETRY.at(robot="near")}
+    assert set(ears[there].keys) == {topics.IN_ODOMETRY.at(robot="far")}
+    assert both.robots["near"].pose.x == pytest.approx(0.05)
+    assert both.robots["far"].pose.x == pytest.approx(-0.05)
+
+
+def test_robots_of_other_sites_are_named_by_their_router() -> None:
+    team = load_team(builtin("demo"))
+    texts = ["tcp/10.0.0.2:7447=scout, patrol", "tcp/10.0.0.3:7447=observer"]
+    assert robots_at(texts, team) == {
+        "tcp/10.0.0.2:7447": ["scout", "patrol"],
+        "tcp/10.0.0.3:7447": ["observer"],
+    }
+    for wrong in ("tcp/10.0.0.2:7447", "tcp/10.0.0.2:7447=", "tcp/10.0.0.2:7447=nobody"):
+        with pytest.raises(ValueError, match=r"--site .*no robot .*navigator, observer"):
+            robots_at([wrong], team)
 
 
 # Guests -----------------------------------------------------------------------------------------
