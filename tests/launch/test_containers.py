@@ -21,7 +21,8 @@ from cpcbl_launch.processes import PROGRAM
 from cpcbl_launch.recorder import Recorder
 from cpcbl_launch.team_file import builtin, load_team
 from cpcbl_launch.up import free_endpoint
-from cpcbl_transport.zenoh_bus import open_bus
+from cpcbl_transport import topics
+from cpcbl_transport.zenoh_bus import open_bus, open_router
 
 pytestmark = [pytest.mark.docker, pytest.mark.timeout(600)]
 
@@ -227,3 +228,56 @@ def test_the_committed_compose_file_runs_and_a_robot_that_crashes_comes_back(
             return restarts == 1 and not track.lost and error_m < 0.3
 
         assert eventually(is_back_and_knows_where_it_is, 60.0)
+
+
+def observing(demo: Demo, *options: object) -> list[str]:
+    at = ("--at", "4.5,6,-90", "--connect", demo.endpoint, "--image", image())
+    command = (*PROGRAM, "observer", "tripod", "--team", demo.file, *at, "--container", *options)
+    return list(map(str, command))
+
+
+def test_an_observer_in_a_container_helps_a_team_in_containers_and_leaves(demo: Demo) -> None:
+    sensor = demo.file.parent / "a camera, of ours.toml"
+    sensor.write_text("sensor = { range_share = 0.005, field_of_view_deg = 180.0 }\n")
+    with going_up(demo, "--duration", 600, "--json") as process:
+        when(demo, lambda heard: "scout" in heard.tracks)
+        ended = subprocess.run(
+            observing(demo, "--for", 6, "--json", "--sensor", sensor, "--fov", 170),
+            capture_output=True,
+            text=True,
+            timeout=90.0,
+            check=False,
+        )
+        assert ended.returncode == 0, ended.stderr
+        visited = json.loads(ended.stdout)
+        assert visited["name"] == "tripod"
+        assert visited["lost"] == ""
+        assert {row["peer"] for row in visited["sent"] if row["topic"] == "fix"} & ROBOTS
+        process.send_signal(signal.SIGINT)
+        out, _ = process.communicate(timeout=60.0)
+    assert "tripod" in json.loads(out)["guests"]
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_observer_in_a_container_leaves_on_a_signal(demo: Demo, number: signal.Signals) -> None:
+    with open_router(demo.name, [demo.endpoint]) as bus:
+        alive: dict[str, bool] = {}
+        bus.watch(topics.ALIVE.at(robot="tripod"), alive.__setitem__)
+        command = observing(demo, "--source", "external", "--json")
+        with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+            assert eventually(lambda: any(alive.values()), 60.0)
+            process.send_signal(number)
+            out, _ = process.communicate(timeout=30.0)
+        assert process.returncode == 0
+        assert json.loads(out)["name"] == "tripod"
+        assert eventually(lambda: not any(alive.values()))
+
+
+def test_what_is_wrong_with_an_observer_in_a_container_is_one_line(demo: Demo) -> None:
+    for name, said in (("scout", "a robot of team"), ("tripod", "no such file")):
+        command = observing(demo, "--sensor", "nowhere.toml")
+        command[command.index("tripod")] = name
+        ended = subprocess.run(command, capture_output=True, text=True, check=False)
+        assert ended.returncode == 2
+        (line,) = ended.stderr.splitlines()
+        assert said in line

@@ -6,7 +6,17 @@ from typing import Annotated, Optional
 
 import typer
 
-from cpcbl_launch.commands.arguments import AsJson, ClockText, Connect, Parent, TeamFile, load
+from cpcbl_launch.commands.arguments import (
+    BASE_IMAGE,
+    AsJson,
+    BaseImage,
+    ClockText,
+    Connect,
+    Image,
+    Parent,
+    TeamFile,
+    load,
+)
 
 
 class SourceName(StrEnum):
@@ -38,6 +48,11 @@ def observer(
     duration: Annotated[
         Optional[float], typer.Option("--for", help="Seconds to stay; default: until Ctrl-C.")
     ] = None,
+    container: Annotated[
+        bool, typer.Option("--container", help="In a container of this machine (needs Docker).")
+    ] = False,
+    image: Image = None,
+    base_image: BaseImage = BASE_IMAGE,
     as_json: AsJson = False,
     clock: ClockText = "",
     parent: Parent = None,
@@ -51,6 +66,8 @@ def observer(
 
     from cpcbl_agents.clock import Clock
     from cpcbl_agents.process import Stop
+    from cpcbl_launch.containers.guest import have_image, run_observer
+    from cpcbl_launch.containers.launch import progress_on
     from cpcbl_launch.observer import Wish, joined, place_in, places_in, visit
     from cpcbl_launch.options import encoded
     from cpcbl_launch.show import print_visit
@@ -59,9 +76,16 @@ def observer(
         raise ValueError(f"--for {duration:g}: more than 0 seconds")
     team = load(team_file)
     kind = None if source is None else str(source)
-    team = joined(team, Wish(name, place_in(at), sensor, fov, places_in(move), kind))
+    alone, team = team, joined(team, Wish(name, place_in(at), sensor, fov, places_in(move), kind))
     console, stop = Console(stderr=as_json), Stop(parent)
     endpoints = connect or team.transport.connect
+    if container:
+        options = [f"--at={at}", f"--move={move}", *(f"--connect={e}" for e in endpoints)]
+        given = {"--fov": fov, "--source": kind, "--for": duration, "--clock": clock or None}
+        options += [f"{option}={value}" for option, value in given.items() if value is not None]
+        options += ["--json"] if as_json else []
+        there = have_image(image, base_image, stop, progress_on(console))
+        raise typer.Exit(run_observer(alone, name, sensor, options, there, stop))
     said = f"{name} joins team {team.name} at {', '.join(endpoints)}; Ctrl-C: it leaves"
     console.print(said, style="dim", highlight=False, soft_wrap=True)
     when = Clock.parse(clock) if clock else Clock.wall()
