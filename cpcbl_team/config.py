@@ -352,6 +352,9 @@ class SimulationSettings(Table, frozen=True, kw_only=True):
     """True noise as a multiple of what the robots assume; 0 for none."""
     bump_radius_m: NotNegative = 0.15
     events: tuple[SimulationEvent, ...] = ()
+    clocks_ahead_s: dict[str, float] = {}
+    """How far a robot's clock is ahead of the field's, where it is not the same: what the robot
+    senses is stamped by its own clock."""
 
 
 class Team(Table, frozen=True, kw_only=True):

@@ -1,11 +1,14 @@
 """The command line `cpcbl-team`: THE table of its commands."""
 
+import errno
 import logging
+import os
 import sys
 
 import typer
 
 from cpcbl_launch.commands.deploying import compose
+from cpcbl_launch.commands.faults import chaos
 from cpcbl_launch.commands.measuring import calibrate, evaluate_mrclam, simulate
 from cpcbl_launch.commands.observing import observer
 from cpcbl_launch.commands.running import check, field, robot, router, up
@@ -21,7 +24,7 @@ app = typer.Typer(
 )
 for command in (
     *(check, keys, up, traffic, robot, observer, router, field, compose),
-    *(calibrate, simulate),
+    *(calibrate, simulate, chaos),
 ):
     app.command()(command)
 
@@ -31,15 +34,32 @@ app.add_typer(evaluate_app, name="evaluate")
 app.add_typer(experiment_app, name="experiment")
 
 
+NOT_WRITABLE = {
+    *(errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EPIPE),
+    *(errno.EROFS, errno.EACCES, errno.EPERM),
+}
+
+
 def main() -> None:
-    """Runs the command line; what the user can mend is one line and exit code 2."""
+    """Runs the command line; what the user can mend is one line and exit code 2, what could not be
+    written one line and exit code 1."""
     from cpcbl_agents.sources.mrclam import LogError
     from cpcbl_launch.team_file import TeamFileError
     from cpcbl_transport.zenoh_bus import BusError
 
     logging.basicConfig(format="%(asctime)s %(levelname)s %(message)s", level=logging.INFO)
     try:
-        app()
+        try:
+            app()
+        finally:
+            sys.stdout.flush()
+    except OSError as error:
+        if error.errno not in NOT_WRITABLE:
+            raise
+        name = error.filename or "standard output"
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # at exit it is flushed once more
+        typer.secho(f"cpcbl-team: {name}: not written: {error.strerror}", fg="red", err=True)
+        sys.exit(1)
     except (TeamFileError, LogError, BusError, ValueError) as error:
         typer.secho(f"cpcbl-team: {error}", fg="red", err=True)
         sys.exit(2)

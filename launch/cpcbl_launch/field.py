@@ -8,12 +8,13 @@ Guests have a body on it for as long as they ask for it (`field/join/<robot>`).
 import logging
 import math
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from types import MappingProxyType
 from typing import NamedTuple, TypeVar
 
 import numpy as np
+from msgspec.structs import replace
 
 from cpcbl_agents.clock import Clock
 from cpcbl_agents.sensing import SensorInput
@@ -31,12 +32,13 @@ from cpcbl_team.inputs import Odometry, Position, Sighting, Sightings
 from cpcbl_team.sensors import LEAST_COSINE
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus, Handle, Publisher
-from cpcbl_transport.messages import Body, Drive, Join, Truth, Truths, encode, refusal
+from cpcbl_transport.messages import Body, Drive, Join, Refusal, Truth, Truths, encode, refusal
 from cpcbl_transport.reading import read
 
 log = logging.getLogger(__name__)
 
 COMMAND_LASTS_NS = 500_000_000
+INBOX = 10_000
 MOST_REFUSED = 100  # guests whose refusal is logged
 _GUEST_SEED = 2**31  # no robot of a team file has this number
 NOWHERE: Mapping[str, Bus] = MappingProxyType({})
@@ -285,6 +287,10 @@ class SimulatedField:
     def next_ns(self) -> int:
         return self.now_ns + self._step_ns
 
+    def ahead_ns(self, robot: str) -> int:
+        """How far a robot's clock is ahead of the field's."""
+        return int(self.team.simulation.clocks_ahead_s.get(robot, 0.0) * 1e9)
+
     def command(self, drive: Drive) -> None:
         """A robot's wheels from now on; commands for unknown robots are ignored."""
         if drive.robot in self.robots:
@@ -361,14 +367,15 @@ class FieldNode:
         self._bodies = Bodies(field.team)
         self._guests: dict[str, str] = {}  # with the incarnation that asked
         self._refused: set[str] = set()
-        self._drives: deque[tuple[str, bytes]] = deque(maxlen=10_000)
-        self._joins: deque[tuple[str, bytes]] = deque(maxlen=1_000)
+        self._said: deque[tuple[str, bytes]] = deque(maxlen=INBOX)
+        self.counts: Counter[str] = Counter()
+        """What was taken (`drive`, `join`), and what was refused, by reason."""
         self._truth = bus.publisher(topics.TRUTH.at(), topics.TRUTH.qos)
         self._publishers: dict[tuple[str, type], Publisher] = {}
         self._driven: dict[str, Handle] = {}
         for name in field.robots:
             self._declare(name)
-        bus.subscribe(topics.JOIN.at(), lambda *join: self._joins.append(join))
+        bus.subscribe(topics.JOIN.at(), self._arrived)
 
     def _declare(self, name: str) -> None:
         bus = self._sites.get(name, self._bus)
@@ -376,8 +383,12 @@ class FieldNode:
             assert topic.carries is not None
             publisher = bus.publisher(topic.at(robot=name), topic.qos)
             self._publishers[name, topic.carries] = publisher
-        drive = topics.DRIVE.at(robot=name)
-        self._driven[name] = bus.subscribe(drive, lambda *said: self._drives.append(said))
+        self._driven[name] = bus.subscribe(topics.DRIVE.at(robot=name), self._arrived)
+
+    def _arrived(self, key: str, payload: bytes) -> None:
+        if len(self._said) == INBOX:
+            self.counts["inbox_overflow"] += 1
+        self._said.append((key, payload))
 
     @property
     def next_ns(self) -> int:
@@ -389,21 +400,46 @@ class FieldNode:
 
     def step(self, now_ns: int) -> None:
         """Advances the field to `now_ns` and tells the robots what they sense."""
+        while self._said:
+            reason = self._taken(*self._said.popleft(), now_ns)
+            if reason is not None:
+                self.counts[reason] += 1
         self._let_in_and_out(now_ns)
-        while self._drives:
-            drive = read(*self._drives.popleft())
-            if isinstance(drive, Drive) and refusal(drive, now_ns) is None:
-                self._field.command(drive)
         while self._field.next_ns <= now_ns:
             for name, sensed in self._field.advance():
-                self._publishers[name, type(sensed)].put(encode(sensed))
+                stamped = later(sensed, self._field.ahead_ns(name))
+                self._publishers[name, type(sensed)].put(encode(stamped))
             if self._truth.matching:
                 self._truth.put(encode(self._field.truth()))
 
+    def _taken(self, key: str, payload: bytes, now_ns: int) -> Refusal | None:
+        """Does what a robot says, by the field's clock; or why not."""
+        said = read(key, payload)
+        if isinstance(said, Refusal):
+            return said
+        assert isinstance(said, Drive | Join)
+        if isinstance(said, Drive):
+            if said.robot not in self._field.robots:
+                return Refusal.UNKNOWN_ROBOT
+            said = later(said, -self._field.ahead_ns(said.robot))
+        reason = refusal(said, now_ns)
+        if reason is not None:
+            return reason
+        self.counts[type(said).__name__.lower()] += 1
+        if isinstance(said, Drive):
+            self._field.command(said)
+        else:
+            self._asked(said, now_ns)
+        return None
+
+    def _asked(self, join: Join, now_ns: int) -> None:
+        reason = self._bodies.ask(join, now_ns)
+        if reason and len(self._refused) < MOST_REFUSED and join.robot not in self._refused:
+            self._refused.add(join.robot)
+            log.warning("guest %s gets no body: %s", join.robot, reason)
+
     def _let_in_and_out(self, now_ns: int) -> None:
         """Guests that ask for a body get it, those that leave or are silent lose it."""
-        while self._joins:
-            self._asked(*self._joins.popleft(), now_ns)
         present = self._bodies.present(now_ns)
         for name, incarnation in list(self._guests.items()):
             if name not in present or present[name].incarnation != incarnation:
@@ -415,15 +451,6 @@ class FieldNode:
                 self._declare(name)
                 log.info("guest %s joined the field", name)
 
-    def _asked(self, key: str, payload: bytes, now_ns: int) -> None:
-        join = read(key, payload)
-        if not isinstance(join, Join):
-            return
-        reason = refusal(join, now_ns) or self._bodies.ask(join, now_ns)
-        if reason and len(self._refused) < MOST_REFUSED and join.robot not in self._refused:
-            self._refused.add(join.robot)
-            log.warning("guest %s gets no body: %s", join.robot, reason)
-
     def _let_out(self, name: str) -> None:
         del self._guests[name]
         self._field.leave(name)
@@ -432,6 +459,18 @@ class FieldNode:
             self._publishers.pop((name, topic.carries)).close()
         self._driven.pop(name).close()
         log.info("guest %s left the field", name)
+
+
+Moved = TypeVar("Moved", bound=SensorInput | Drive)
+
+
+def later(message: Moved, ns: int) -> Moved:
+    """The message by a clock that is so far ahead."""
+    if not ns:
+        return message
+    if isinstance(message, Odometry):
+        return replace(message, from_ns=message.from_ns + ns, stamp_ns=message.stamp_ns + ns)
+    return replace(message, stamp_ns=message.stamp_ns + ns)
 
 
 def robots_at(sites: Iterable[str], team: Team) -> dict[str, list[str]]:
@@ -460,3 +499,5 @@ def run_field(
     while not stop():
         node.step(clock.now_ns())
         time.sleep(min(clock.seconds_until(node.next_ns), 0.2))
+    counts = ", ".join(f"{reason} {n}" for reason, n in sorted(node.counts.items()))
+    log.info("commands, by what became of them: %s", counts or "none")

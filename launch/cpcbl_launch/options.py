@@ -2,6 +2,8 @@
 
 import importlib.util
 import math
+import os
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +23,7 @@ def folder_for(option: str, folder: Path) -> Path:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise ValueError(f"{option} {folder}: {error.strerror}; name a folder") from error
+    _must_be_writable(option, folder, folder)
     return folder
 
 
@@ -28,6 +31,24 @@ def file_for(option: str, path: Path) -> None:
     """Raises ValueError for a file that could not be written later on."""
     if not path.parent.is_dir():
         raise ValueError(f"{option} {path}: no folder {path.parent}; make it first")
+    if path.is_dir():
+        raise ValueError(f"{option} {path}: a folder; name a file")
+    _must_be_writable(option, path, path if path.exists() else path.parent)
+
+
+def _must_be_writable(option: str, path: Path, existing: Path) -> None:
+    if not os.access(existing, os.W_OK):
+        raise ValueError(f"{option} {path}: {existing} cannot be written; name another place")
+
+
+def not_written(path: Path, write: Callable[[], object]) -> dict[str, str]:
+    """Writes a file of results; what could not be written, with the reason. A disk that is full at
+    the end of a run must not take what was found with it."""
+    try:
+        write()
+    except OSError as error:
+        return {str(path): error.strerror or str(error)}
+    return {}
 
 
 def check_duration(duration_s: float, least_s: float) -> None:

@@ -52,8 +52,14 @@ def process_table(
         *("--team", str(team_file), "--connect", endpoint),
         *("--clock", str(clock), "--parent", str(os.getpid())),
     )
+    clocks = {
+        ROBOT + name: ("--clock", str(clock._replace(epoch_ns=clock.epoch_ns + int(s * 1e9))))
+        for name, s in team.simulation.clocks_ahead_s.items()
+    }
     return [
-        ProcessSpec(task.name, (*PROGRAM, *task.arguments), task.on_restart)
+        ProcessSpec(
+            task.name, (*PROGRAM, *task.arguments, *clocks.get(task.name, ())), task.on_restart
+        )
         for task in tasks(team, common, seed, here)
     ]
 

@@ -2,6 +2,7 @@
 
 import math
 import threading
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 
 import msgspec
@@ -18,7 +19,7 @@ from cpcbl_launch.traffic.flows import (
 from cpcbl_team.metrics import Floats, Samples, Score, Trajectory, compared, score, seconds
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus
-from cpcbl_transport.messages import Status, Track, Truth, Truths
+from cpcbl_transport.messages import Refusal, Status, Track, Truth, Truths
 from cpcbl_transport.reading import read
 
 
@@ -119,6 +120,10 @@ class Report(msgspec.Struct, frozen=True, kw_only=True):
     """Robots that could not take part, with the reason."""
     duration_s: float = 0.0
     restarts: dict[str, int] = {}
+    refused: dict[str, int] = {}
+    """What the recorder heard and could not use, by reason."""
+    not_written: dict[str, str] = {}
+    """Files that could not be written, with the reason."""
     alone: dict[str, Phase] = {}
     """Before collaboration began, where it began late."""
     guests: dict[str, GuestReport] = {}
@@ -135,7 +140,8 @@ class Recorder:
         self.tracks: dict[str, list[Track]] = {}
         self.status: dict[str, Status] = {}
         self.truths: list[Truths] = []
-        self.unreadable = 0
+        self.counts: Counter[str] = Counter()
+        """What was taken, by topic, and what was refused, by reason."""
         self._done: dict[str, list[Status]] = {}
         for topic in (topics.TRACK, topics.STATUS, topics.TRUTH):
             bus.subscribe(topic.at(), self._arrived)
@@ -143,6 +149,8 @@ class Recorder:
     def _arrived(self, key: str, payload: bytes) -> None:
         message = read(key, payload)
         with self._lock:
+            taken = not isinstance(message, Refusal)
+            self.counts[key.partition("/")[0] if taken else str(message)] += 1
             match message:
                 case Track():
                     self.tracks.setdefault(message.robot, []).append(message)
@@ -153,8 +161,12 @@ class Recorder:
                     self.status[message.robot] = message
                 case Truths():
                     self.truths.append(message)
-                case _:
-                    self.unreadable += 1
+
+    @property
+    def refused(self) -> dict[str, int]:
+        """What was heard and could not be used, by reason."""
+        with self._lock:
+            return {r: self.counts[r] for r in sorted(Refusal) if self.counts[r]}
 
     def latest(self) -> tuple[dict[str, Track], dict[str, Status], dict[str, Truth]]:
         """The newest track, status and simulated truth of every robot."""
@@ -208,7 +220,7 @@ class Recorder:
             name: self.robot_report(name, variant, truth.get(name), from_s)
             for name, variant in variants.items()
         }
-        return Report(robots=robots, team=_team(robots))
+        return Report(robots=robots, team=_team(robots), refused=self.refused)
 
     def robot_report(
         self, name: str, variant: str, truth: Floats | None, from_s: float = -np.inf

@@ -4,10 +4,11 @@ Messages are JSON arrays, as on the wire but readable; the team is the attachmen
 inputs of a robot that replays a log are not on the bus, so not in the file either.
 """
 
+import logging
 import struct
 import threading
 from collections.abc import Iterable
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, suppress
 from pathlib import Path
 from typing import NamedTuple
 
@@ -27,6 +28,8 @@ from cpcbl_transport.bus import Bus
 from cpcbl_transport.messages import Message, Refusal, Truths, refusal
 from cpcbl_transport.reading import read
 
+log = logging.getLogger(__name__)
+
 RECORDED = (*topics.INPUTS, topics.TRACK, topics.STATUS, topics.TRUTH)
 TEAM = "team.json"
 LAST_NS = 2**63  # what a file can hold
@@ -34,10 +37,12 @@ _decoder: msgspec.json.Decoder[Message] = msgspec.json.Decoder(Message)
 
 
 class Recording(AbstractContextManager["Recording"]):
-    """Writes what is said on a bus into a file, until it is closed. Raises OSError."""
+    """Writes what is said on a bus into a file, until it is closed. Raises OSError at the start;
+    later `failed` says why no more could be written."""
 
     def __init__(self, path: Path, team: Team, bus: Bus) -> None:
         self._lock = threading.Lock()
+        self._path, self.failed = path, ""
         self._file = path.open("wb")
         self._writer: Writer | None = Writer(self._file)
         self._writer.start(profile="cpcbl", library="cpcbl-team")
@@ -54,19 +59,36 @@ class Recording(AbstractContextManager["Recording"]):
         with self._lock:
             if self._writer is None:
                 return
-            if key not in self._channels:
-                self._channels[key] = self._writer.register_channel(key, "json", 0)
-            at_ns, data = message.stamp_ns, msgspec.json.encode(message)
-            self._writer.add_message(self._channels[key], at_ns, data, at_ns)
+            try:
+                self._write(self._writer, key, message)
+            except OSError as error:  # a full disk must not end the run
+                self._give_up(error)
+
+    def _write(self, writer: Writer, key: str, message: Message) -> None:
+        if key not in self._channels:
+            self._channels[key] = writer.register_channel(key, "json", 0)
+        at_ns, data = message.stamp_ns, msgspec.json.encode(message)
+        writer.add_message(self._channels[key], at_ns, data, at_ns)
+
+    def _give_up(self, error: OSError) -> None:
+        self.failed = error.strerror or str(error)
+        log.error("%s: no longer recorded: %s; the run goes on", self._path, self.failed)
+        self._writer = None
+        with suppress(OSError):  # what is left in the buffer finds no room either
+            self._file.close()
 
     def __exit__(self, *_: object) -> None:
         for handle in self._handles:
             handle.close()
         with self._lock:
-            if self._writer is not None:
+            if self._writer is None:
+                return
+            try:
                 self._writer.finish()  # type: ignore[no-untyped-call]
                 self._writer = None
                 self._file.close()
+            except OSError as error:
+                self._give_up(error)
 
 
 class Recorded(NamedTuple):

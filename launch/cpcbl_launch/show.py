@@ -165,7 +165,7 @@ def print_report(report: Report, console: Console) -> None:
     if report.yardsticks:
         console.print(_yardsticks(report))
     for line in _remarks(report):
-        console.print(line, style="yellow", highlight=False)
+        console.print(line, style="yellow", highlight=False, markup=False)  # robots may say [/b]
 
 
 def _robot_cells(r: RobotReport) -> list[str]:

@@ -5,8 +5,9 @@ import signal
 import subprocess
 import time
 from collections.abc import Sequence
+from contextlib import ExitStack
 from pathlib import Path
-from typing import NamedTuple, Protocol
+from typing import IO, NamedTuple, Protocol
 
 log = logging.getLogger(__name__)
 
@@ -55,7 +56,12 @@ class _Child:
 
     def _start(self, more: tuple[str, ...]) -> "subprocess.Popen[bytes]":
         self.started_s = time.monotonic()
-        with self._log.open("ab") as output:
+        with ExitStack() as stack:
+            try:
+                output: IO[bytes] | int = stack.enter_context(self._log.open("ab"))
+            except OSError as error:  # better a process without a log than none
+                log.warning("%s: not written: %s", self._log, error.strerror)
+                output = subprocess.DEVNULL
             return subprocess.Popen(
                 [*self.spec.command, *more],
                 stdin=subprocess.DEVNULL,
@@ -65,7 +71,10 @@ class _Child:
             )
 
     def _last_line(self) -> str:
-        lines = self._log.read_text(errors="replace").splitlines()
+        try:
+            lines = self._log.read_text(errors="replace").splitlines()
+        except OSError as error:
+            return f"its log cannot be read: {error.strerror}"
         return lines[-1] if lines else "it said nothing"
 
     def watch(self) -> None:

@@ -91,8 +91,12 @@ def key_folder(team: Team, path: Path) -> Path:
 
 
 def save_resolved(team: Team, path: Path) -> None:
-    """Writes a team with its layers merged, for the processes of one run."""
-    path.write_bytes(msgspec.json.format(msgspec.json.encode(team), indent=1))
+    """Writes a team with its layers merged, for the processes of one run. Raises TeamFileError."""
+    try:
+        path.write_bytes(msgspec.json.format(msgspec.json.encode(team), indent=1))
+    except OSError as error:
+        reason = f"{error.strerror}; the processes of a run read their team there"
+        raise TeamFileError(f"{path}: not written: {reason}") from error
 
 
 def parse_team(text: str, name: str = "team file") -> Team:
@@ -230,7 +234,10 @@ def _insecure(endpoint: str, secured: bool) -> str:
 
 
 def _event_problems(team: Team) -> Iterator[str]:
-    """An event is of one kind, and whole."""
+    """An event is of one kind, and whole; clocks are those of robots."""
+    for name in team.simulation.clocks_ahead_s.keys() - team.robots.keys():
+        known = ", ".join(team.robots)
+        yield f"simulation.clocks_ahead_s.{name}: no robot {name!r}; name one of {known}"
     for i, event in enumerate(team.simulation.events):
         key = f"simulation.events[{i}]"
         if bool(event.kidnap) == bool(event.hide_landmarks_s):

@@ -5,7 +5,8 @@ import socket
 import tempfile
 import time
 from collections.abc import Callable, Collection, Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager, ExitStack
+from functools import partial
 from pathlib import Path
 from types import MappingProxyType
 from typing import NamedTuple, Protocol
@@ -16,7 +17,7 @@ import numpy as np
 from cpcbl_agents.clock import Clock
 from cpcbl_launch.evaluation import Progress, simulate
 from cpcbl_launch.logs import seen_before
-from cpcbl_launch.options import check_duration
+from cpcbl_launch.options import check_duration, not_written
 from cpcbl_launch.phases import Span, guest_reports, phase
 from cpcbl_launch.processes import process_table, tasks
 from cpcbl_launch.recorder import Recorder, Report
@@ -163,9 +164,14 @@ def simulate_run(run: Run, progress: Progress | None = None) -> Report:
 
 def _run_in(run: Run, view: View, stop: Stopping, folder: Path, launch: Launch) -> Report:
     run = run._replace(team=listening(run.team))
-    folder.mkdir(parents=True, exist_ok=True)
-    launcher = launch(run, folder, stop)
-    with launcher.router() as bus, _recording(run, bus):
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ValueError(f"{folder}: {error.strerror}; robots read their team there") from error
+    launcher, recording = launch(run, folder, stop), None
+    with launcher.router() as bus, ExitStack() as stack:
+        if run.record is not None:
+            recording = stack.enter_context(_recording(run, run.record, bus))
         recorder = Recorder(bus)
         clock = _clock(run, launcher.lead_s)
         with launcher.processes(clock) as processes:
@@ -179,7 +185,11 @@ def _run_in(run: Run, view: View, stop: Stopping, folder: Path, launch: Launch) 
                 time.sleep(REFRESH_S)
             elapsed_s = (clock.now_ns() - clock.epoch_ns) * 1e-9
             restarts = processes.restarts
-    return _report(run, recorder, clock.epoch_ns * 1e-9, elapsed_s, restarts)
+    report = _report(run, recorder, clock.epoch_ns * 1e-9, elapsed_s, restarts)
+    if recording is not None and recording.failed:
+        lost = {**report.not_written, str(run.record): recording.failed}
+        report = msgspec.structs.replace(report, not_written=lost)
+    return report
 
 
 def _clock(run: Run, lead_s: float) -> Clock:
@@ -188,17 +198,18 @@ def _clock(run: Run, lead_s: float) -> Clock:
     return Clock(epoch_ns, time.monotonic_ns() + lead_ns, run.speed)
 
 
-def _recording(run: Run, bus: Bus) -> AbstractContextManager[object]:
-    if run.record is None:
-        return nullcontext()
+def _recording(run: Run, path: Path, bus: Bus) -> Recording:
     replayed = [name for name, robot in run.team.robots.items() if robot.source == "mrclam"]
     if replayed:
         log.warning(
             "%s: without the inputs of %s: robots that replay a log do not publish them",
-            run.record,
+            path,
             ", ".join(replayed),
         )
-    return Recording(run.record, run.team, bus)
+    try:
+        return Recording(path, run.team, bus)
+    except OSError as error:
+        raise ValueError(f"--record {path}: {error.strerror}; name another file") from error
 
 
 def _report(
@@ -211,11 +222,13 @@ def _report(
     variants = {name: robot.localizer.variant for name, robot in robots.items()}
     begin_s = -np.inf if helped_from_s is None else helped_from_s
     guests = guest_reports(recorder, list(robots), truth, epoch_s, begin_s)
-    if run.picture is not None:
+    lost: dict[str, str] = {}
+    if (picture := run.picture) is not None:
         from cpcbl_launch.picture import draw_run
 
         present_s = {name: guest.present_s for name, guest in guests.items()}
-        draw_run(recorder, run.team, truth, run.picture, epoch_s, helped_from_s, present_s)
+        drawn = partial(draw_run, recorder, run.team, truth, picture, epoch_s, helped_from_s)
+        lost = not_written(picture, partial(drawn, present_s))
     report = recorder.report(variants, truth, begin_s)
     alone = {}
     if helped_from_s is not None:
@@ -230,4 +243,5 @@ def _report(
         restarts=restarts,
         alone=alone,
         guests=guests,
+        not_written=lost,
     )

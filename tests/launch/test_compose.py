@@ -1,6 +1,5 @@
 """The compose file of a team, and what is decided about containers without any."""
 
-import csv
 import os
 import shutil
 import subprocess
@@ -11,7 +10,6 @@ import pytest
 import yaml
 from bus_helpers import robot_at, team_of
 from docker_helpers import TOP
-from key_helpers import TRIPOD, secured_team
 from msgspec.structs import replace
 from process_helpers import cpcbl_team
 
@@ -19,14 +17,11 @@ from cpcbl_launch.containers.compose import Deployment, Mount, compose_text
 from cpcbl_launch.containers.deployment import deployed
 from cpcbl_launch.containers.docker import DockerError, compose_program, done, ran
 from cpcbl_launch.containers.fleet import Container, parsed, restarts_between
-from cpcbl_launch.containers.guest import docker_run, own_keys
 from cpcbl_launch.containers.image import SOURCES, progress_of, tag, version
 from cpcbl_launch.containers.launch import inside, published
 from cpcbl_launch.processes import PROGRAM
 from cpcbl_launch.team_file import builtin, load_team
 from cpcbl_team.config import Team
-from cpcbl_transport.security import Identity, SecurityError
-from cpcbl_transport.topics import Role
 
 DEMO = load_team(builtin("demo"))
 HOW = Deployment("demo", "cpcbl-team:1")
@@ -161,35 +156,6 @@ def test_the_router_is_published_where_the_team_file_says(endpoint: str, port: s
 def test_docker_cannot_publish_at_a_name() -> None:
     with pytest.raises(ValueError, match=r"transport.listen: tcp/robot.local:7447"):
         published("tcp/robot.local:7447")
-
-
-# An observer --------------------------------------------------------------------------------------
-
-
-def test_an_observers_container_is_confined_too_and_may_read_what_it_is_given() -> None:
-    mount = Mount('/home/a, "b"/team.json', "/team/team.json")
-    command = docker_run("img", "cpcbl-x", [mount], "7:8", ["observer", "tripod"])
-    assert command[-3:] == ["img", "observer", "tripod"]
-    options = " ".join(command)
-    for confined in ("--read-only", "--cap-drop ALL", "no-new-privileges", "--rm", "--user 7:8"):
-        assert confined in options
-    (fields,) = csv.reader([command[command.index("--mount") + 1]])
-    assert fields == [
-        "type=bind",
-        'source=/home/a, "b"/team.json',
-        "target=/team/team.json",
-        "readonly",
-    ]
-
-
-def test_an_observers_container_reads_its_own_keys_and_no_others(tmp_path: Path) -> None:
-    team = secured_team(tmp_path / "keys")
-    mount, user = own_keys(team, TRIPOD)
-    assert mount == Mount(str(tmp_path / "keys" / "observer" / "tripod"), f"/team/keys/{TRIPOD}")
-    assert user == f"{os.getuid()}:{os.getgid()}"
-    assert inside(team).transport.keys == "/team/keys"
-    with pytest.raises(SecurityError, match="observer/nobody"):
-        own_keys(team, Identity(Role.OBSERVER, "nobody"))
 
 
 # The image --------------------------------------------------------------------------------------

@@ -21,8 +21,7 @@ from cpcbl_launch.processes import PROGRAM
 from cpcbl_launch.recorder import Recorder
 from cpcbl_launch.team_file import builtin, load_team
 from cpcbl_launch.up import free_endpoint
-from cpcbl_transport import topics
-from cpcbl_transport.zenoh_bus import open_bus, open_router
+from cpcbl_transport.zenoh_bus import open_bus
 
 pytestmark = [pytest.mark.docker, pytest.mark.timeout(600)]
 
@@ -256,28 +255,3 @@ def test_an_observer_in_a_container_helps_a_team_in_containers_and_leaves(demo: 
         process.send_signal(signal.SIGINT)
         out, _ = process.communicate(timeout=60.0)
     assert "tripod" in json.loads(out)["guests"]
-
-
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_an_observer_in_a_container_leaves_on_a_signal(demo: Demo, number: signal.Signals) -> None:
-    with open_router(demo.name, [demo.endpoint]) as bus:
-        alive: dict[str, bool] = {}
-        bus.watch(topics.ALIVE.at(robot="tripod"), alive.__setitem__)
-        command = observing(demo, "--source", "external", "--json")
-        with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
-            assert eventually(lambda: any(alive.values()), 60.0)
-            process.send_signal(number)
-            out, _ = process.communicate(timeout=30.0)
-        assert process.returncode == 0
-        assert json.loads(out)["name"] == "tripod"
-        assert eventually(lambda: not any(alive.values()))
-
-
-def test_what_is_wrong_with_an_observer_in_a_container_is_one_line(demo: Demo) -> None:
-    for name, said in (("scout", "a robot of team"), ("tripod", "no such file")):
-        command = observing(demo, "--sensor", "nowhere.toml")
-        command[command.index("tripod")] = name
-        ended = subprocess.run(command, capture_output=True, text=True, check=False)
-        assert ended.returncode == 2
-        (line,) = ended.stderr.splitlines()
-        assert said in line

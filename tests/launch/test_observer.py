@@ -13,8 +13,13 @@ from typing import Any
 import msgspec
 import pytest
 from bus_helpers import PATIENCE_S
+from docker_helpers import image, left_of
 from process_helpers import cpcbl_team, eventually, pids_of
 
+import cpcbl_launch.observer
+from cpcbl_launch.containers.compose import Mount
+from cpcbl_launch.containers.guest import docker_run, mounts_of_keys
+from cpcbl_launch.containers.launch import KEYS_INSIDE
 from cpcbl_launch.evaluation import simulate
 from cpcbl_launch.observer import Place, Wish, joined, place_in, places_in, presets
 from cpcbl_launch.phases import Span, guest_reports, phase
@@ -26,8 +31,10 @@ from cpcbl_launch.visitors import Visitor
 from cpcbl_team.config import GuestSettings, MatchSettings, Team, TransportSettings
 from cpcbl_transport import topics
 from cpcbl_transport.messages import Status, decode
+from cpcbl_transport.security import CA, CERTIFICATE, PRIVATE_KEY, SecurityError
 from cpcbl_transport.zenoh_bus import open_router
 
+SHIPPED = Path(cpcbl_launch.observer.__file__).parent / "observers"
 DRIVER = Path(__file__).parents[2] / "docs" / "tripod_driver.py"
 BLIND = load_team(builtin("blind"))
 TRIPOD = Wish("tripod", Place(4.5, 5.0, -90.0))
@@ -350,6 +357,46 @@ def test_an_observer_joins_a_running_team_and_leaves_it(
     assert report.robots.keys() == team3.team.robots.keys()
     assert all(robot.lost_at_end == "" for robot in report.robots.values())
     assert not pids_of([str(team3.file)])
+
+
+@pytest.mark.docker
+@pytest.mark.timeout(600)
+def test_an_observer_in_a_container_does_the_same(team3: Team3, tmp_path: Path) -> None:
+    sensor = tmp_path / "eyes.toml"
+    sensor.write_text((SHIPPED / "survey.toml").read_text())
+    own = ("--container", "--image", image(), "--sensor", str(sensor), "--json")
+
+    def leaves(recorder: Recorder) -> bool:
+        team3.observers[0].send_signal(signal.SIGINT)
+        return team3.observers[0].wait(timeout=PATIENCE_S) == 0
+
+    team3.run(
+        team3.all_lose_their_way,
+        lambda recorder: team3.observe(*own),
+        team3.all_know_their_place,
+        leaves,
+        team3.guest_has_left,
+    )
+    said = json.loads(team3.said[0][0])
+    assert {flow["peer"] for flow in said["sent"] if flow["topic"] == "fix"} == {"r1", "r2", "r3"}
+    assert left_of("cpcbl-tripod-") == []
+
+
+def test_a_container_may_read_the_keys_of_its_observer_and_of_nobody_else(tmp_path: Path) -> None:
+    transport = TransportSettings(security="mtls", keys=str(tmp_path))
+    with pytest.raises(SecurityError, match="observer/tripod"):
+        mounts_of_keys("tripod", changed(transport=transport))
+    mine = tmp_path / "observer" / "tripod"
+    mine.mkdir(parents=True)
+    for name in (CA, CERTIFICATE, PRIVATE_KEY):
+        (mine / name).touch()
+    (mount,) = mounts_of_keys("tripod", changed(transport=transport))
+    assert mount == Mount(str(mine), f"{KEYS_INSIDE}/observer/tripod")
+    command = docker_run("it", "image", [mount], "7:8", ["observer", "tripod"])
+    assert command[command.index("--volume") + 1].endswith("/observer/tripod:ro")
+    assert command[command.index("--user") + 1] == "7:8"
+    assert command[-3:] == ["image", "observer", "tripod"]
+    assert mounts_of_keys("tripod", BLIND) == []
 
 
 def test_after_its_time_an_observer_leaves_and_says_what_it_did(team3: Team3) -> None:

@@ -18,6 +18,8 @@ FUTURE_NS = 500_000_000
 LONGEST_ODOMETRY_NS = 10_000_000_000
 LARGEST_PAYLOAD = 65_536
 LARGEST_NUMBER = 1e6  # metres, radians, or their squares
+LARGEST_COUNT = 2**53  # sums of some still fit everywhere
+LAST_NS = 2**62  # in the year 2116
 
 
 class Flow(msgspec.Struct, frozen=True, array_like=True):
@@ -157,6 +159,7 @@ class Truths(msgspec.Struct, frozen=True, array_like=True, tag="truth"):
 Help = Belief | Fix
 Tagged = Odometry | Sightings | Position | Status | Track | Drive | Join | Truths
 Message = Tagged | Help
+Telemetry = Status | Track | Drive | Truths
 
 
 class Refusal(StrEnum):
@@ -167,6 +170,7 @@ class Refusal(StrEnum):
     VERSION = "wrong_version"
     GARBAGE = "garbage"
     WRONG_TYPE = "wrong_type"
+    """Another name than its key's."""
     NOT_FINITE = "not_finite"
     IMPLAUSIBLE = "implausible_number"
     NOT_A_COVARIANCE = "not_a_covariance"
@@ -220,6 +224,10 @@ def refusal(message: Message, now_ns: int) -> Refusal | None:
             return Refusal.NOT_FINITE
         if any(abs(n) > LARGEST_NUMBER for n in numbers):
             return Refusal.IMPLAUSIBLE
+    if abs(message.stamp_ns) >= LAST_NS:
+        return Refusal.IMPLAUSIBLE
+    if isinstance(message, Telemetry) and any(n > LARGEST_COUNT for n in _counts(message)):
+        return Refusal.IMPLAUSIBLE
     if message.stamp_ns > now_ns + FUTURE_NS:
         return Refusal.FUTURE
     match message:
@@ -246,4 +254,21 @@ def _numbers(message: Message) -> list[float]:
             parts.extend(part)
         elif isinstance(part, msgspec.Struct):
             parts.extend(msgspec.structs.astuple(part))
+    return found
+
+
+def _counts(message: msgspec.Struct) -> list[int]:
+    """The sizes of all whole numbers in a message, however deep, that are no stamps."""
+    found: list[int] = []
+    parts: list[tuple[str, object]] = [("", message)]
+    for name, part in parts:  # it grows on the way
+        if isinstance(part, int):
+            found += [] if name.endswith("_ns") and abs(part) < LAST_NS else [abs(part)]
+        elif isinstance(part, tuple):
+            parts.extend((name, item) for item in part)
+        elif isinstance(part, dict):
+            parts.extend(part.items())
+        elif isinstance(part, msgspec.Struct):
+            values = msgspec.structs.astuple(part)
+            parts.extend(zip(part.__struct_fields__, values, strict=True))
     return found

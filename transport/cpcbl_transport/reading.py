@@ -8,23 +8,27 @@ from functools import lru_cache
 
 from cpcbl_transport import topics
 from cpcbl_transport.compact import decode_help
-from cpcbl_transport.messages import Message, Refusal, decode
+from cpcbl_transport.messages import Message, Refusal, decode, refusal
 from cpcbl_transport.topics import Topic
 
 
-def read(key: str, payload: bytes) -> Message | Refusal:
-    """The message in a payload under this key, or why there is none."""
+def read(key: str, payload: bytes, now_ns: int | None = None) -> Message | Refusal:
+    """The message in a payload under this key, with numbers that can be; or why there is none.
+
+    `now_ns`: nothing is from the future of it; None for a reader without a clock.
+    """
     topic, name = _meant(key)
     if topic is None:
         return Refusal.WRONG_TYPE
-    if topic.carries in topics.COLLABORATION:
-        return decode_help(key, payload)
-    message = decode(payload)
+    helps = topic.carries in topics.COLLABORATION
+    message = decode_help(key, payload) if helps else decode(payload)
     if isinstance(message, Refusal):
         return message
     if type(message) is not topic.carries:
         return Refusal.WRONG_TYPE
-    return message if getattr(message, "robot", name) == name else Refusal.NOT_ITS_OWN
+    if getattr(message, "robot", name) != name:
+        return Refusal.NOT_ITS_OWN
+    return refusal(message, message.stamp_ns if now_ns is None else now_ns) or message
 
 
 @lru_cache(maxsize=4096)

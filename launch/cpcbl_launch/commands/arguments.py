@@ -58,6 +58,23 @@ def load(path: Path) -> "Team":
     )
 
 
+def write_report(path: Path | None, result: object) -> dict[str, str]:
+    """Writes what `--report` asks for; what could not be written, with the reason."""
+    from cpcbl_launch.options import encoded, not_written
+
+    if path is None:
+        return {}
+    return not_written(path, lambda: path.write_text(encoded(result), encoding="utf-8"))
+
+
+def say_not_written(lost: dict[str, str]) -> None:
+    """A line for each file that could not be written; with any, the exit code is 1."""
+    for name, reason in lost.items():
+        typer.secho(f"cpcbl-team: {name}: not written: {reason}", fg="red", err=True)
+    if lost:
+        raise typer.Exit(1)
+
+
 def names_in(text: str) -> list[str]:
     """The names of a list with commas."""
     return [name.strip() for name in text.split(",") if name.strip()]

@@ -18,6 +18,8 @@ from cpcbl_launch.commands.arguments import (
     TeamArgument,
     load,
     names_in,
+    say_not_written,
+    write_report,
 )
 
 
@@ -133,26 +135,31 @@ def calibrate(
     from cpcbl_launch.calibration.robots import calibrated
     from cpcbl_launch.calibration.show import print_calibration
     from cpcbl_launch.calibration.team_text import base_text, team_text
-    from cpcbl_launch.options import encoded, must_draw
+    from cpcbl_launch.options import encoded, file_for, must_draw, not_written
     from cpcbl_launch.show import progress_bar
 
+    file_for("--output", output)
     if picture is not None:
+        file_for("--picture", picture)
         must_draw("--picture")
     base, base_name = base_text(logs, team_file)
     names = [log.resolve().name for log in logs]
     robot_logs = read_logs(logs)
     with progress_bar("calibrating", quiet=as_json) as progress:
         result = calibrated(robot_logs, names, progress)
-    output.write_text(team_text(result, base, base_name, margin), encoding="utf-8")
-    if picture is not None:
+    text = team_text(result, base, base_name, margin)
+    lost = not_written(output, lambda: output.write_text(text, encoding="utf-8"))
+    if (drawing := picture) is not None:
         from cpcbl_launch.calibration.picture import draw_residuals
 
-        draw_residuals(robot_logs, result, picture)
+        lost |= not_written(drawing, lambda: draw_residuals(robot_logs, result, drawing))
     if as_json:
         typer.echo(encoded(result))
     else:
         print_calibration(result, Console())
-        typer.echo(f"written: {output}")
+        if not lost:
+            typer.echo(f"written: {output}")
+    say_not_written(lost)
 
 
 def simulate(
@@ -213,11 +220,13 @@ def simulate(
             team = chosen(load(file or Path("demo")), budgets)
             run = Run(team, duration, seed=seed, picture=picture)
             result = simulate_run(run, progress)
-    if report is not None:
-        report.write_text(encoded(result), encoding="utf-8")
+    lost = write_report(report, result)
+    if isinstance(result, Report):
+        lost |= result.not_written
     if as_json:
         sys.stdout.write(encoded(result) + "\n")
     elif isinstance(result, Scale):
         print_scale(result, Console())
     else:
         print_report(result, Console())
+    say_not_written(lost)

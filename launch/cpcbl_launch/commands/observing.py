@@ -2,6 +2,7 @@
 
 import sys
 from enum import StrEnum
+from pathlib import Path
 from typing import Annotated, Optional
 
 import typer
@@ -49,7 +50,7 @@ def observer(
         Optional[float], typer.Option("--for", help="Seconds to stay; default: until Ctrl-C.")
     ] = None,
     container: Annotated[
-        bool, typer.Option("--container", help="In a container of this machine (needs Docker).")
+        bool, typer.Option("--container", help="In a container of its own (needs Docker).")
     ] = False,
     image: Image = None,
     base_image: BaseImage = BASE_IMAGE,
@@ -66,26 +67,31 @@ def observer(
 
     from cpcbl_agents.clock import Clock
     from cpcbl_agents.process import Stop
-    from cpcbl_launch.containers.guest import have_image, run_observer
-    from cpcbl_launch.containers.launch import progress_on
-    from cpcbl_launch.observer import Wish, joined, place_in, places_in, visit
+    from cpcbl_launch.observer import Wish, joined, place_in, places_in, presets, visit
     from cpcbl_launch.options import encoded
     from cpcbl_launch.show import print_visit
 
     if duration is not None and not duration > 0.0:
         raise ValueError(f"--for {duration:g}: more than 0 seconds")
-    team = load(team_file)
+    file_team = load(team_file)
     kind = None if source is None else str(source)
-    alone, team = team, joined(team, Wish(name, place_in(at), sensor, fov, places_in(move), kind))
+    team = joined(file_team, Wish(name, place_in(at), sensor, fov, places_in(move), kind))
     console, stop = Console(stderr=as_json), Stop(parent)
     endpoints = connect or team.transport.connect
     if container:
-        options = [f"--at={at}", f"--move={move}", *(f"--connect={e}" for e in endpoints)]
-        given = {"--fov": fov, "--source": kind, "--for": duration, "--clock": clock or None}
-        options += [f"{option}={value}" for option, value in given.items() if value is not None]
-        options += ["--json"] if as_json else []
-        there = have_image(image, base_image, stop, progress_on(console))
-        raise typer.Exit(run_observer(alone, name, sensor, options, there, stop))
+        from cpcbl_launch.containers.guest import SENSOR_INSIDE, observe
+        from cpcbl_launch.containers.image import image_for
+        from cpcbl_launch.containers.launch import progress_on
+
+        own = None if sensor in presets() else Path(sensor)
+        arguments = _options(
+            *(("at", at), ("sensor", SENSOR_INSIDE if own else sensor), ("fov", fov)),
+            *(("move", move), ("source", kind), ("for", duration), ("clock", clock)),
+            *(("connect", endpoint) for endpoint in endpoints),
+        )
+        arguments += ["--json"] if as_json else []
+        built = image or image_for(base_image, stop, progress_on(console))
+        raise typer.Exit(observe(name, file_team, arguments, own, built, stop))
     said = f"{name} joins team {team.name} at {', '.join(endpoints)}; Ctrl-C: it leaves"
     console.print(said, style="dim", highlight=False, soft_wrap=True)
     when = Clock.parse(clock) if clock else Clock.wall()
@@ -95,3 +101,8 @@ def observer(
         sys.stdout.write(encoded(result) + "\n")
     else:
         print_visit(result, console)
+
+
+def _options(*given: tuple[str, object]) -> list[str]:
+    """As they are typed; what was not given is left out."""
+    return [f"--{name}={value}" for name, value in given if value not in (None, "")]

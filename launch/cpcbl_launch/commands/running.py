@@ -25,6 +25,8 @@ from cpcbl_launch.commands.arguments import (
     TeamFile,
     load,
     names_in,
+    say_not_written,
+    write_report,
 )
 
 
@@ -87,7 +89,7 @@ def up(
     from cpcbl_launch import logs as real_logs
     from cpcbl_launch.containers.launch import InContainers, progress_on
     from cpcbl_launch.evaluation import Choice, chosen
-    from cpcbl_launch.options import encoded, must_draw
+    from cpcbl_launch.options import encoded, file_for, folder_for, must_draw
     from cpcbl_launch.show import LiveTable, print_report
     from cpcbl_launch.up import (
         SIMULATED_S,
@@ -109,8 +111,13 @@ def up(
         match_messages=match_messages,
     )
     team = chosen(team, budgets)
+    for option, path in (("--report", report), ("--picture", picture), ("--record", record)):
+        if path is not None:
+            file_for(option, path)
     if picture is not None:
         must_draw("--picture")
+    if logs is not None:
+        folder_for("--logs", logs)
     run = Run(team, duration, speed, seed, folder=logs, picture=picture, record=record)
     if any(robot.source == "mrclam" for robot in team.robots.values()):
         logged = real_logs.on_log(team, Path(data or team.data or "."))
@@ -135,12 +142,12 @@ def up(
     console.print(f"watch it: {shlex.join(watch)}", style="dim", highlight=False, soft_wrap=True)
     with LiveTable(title, run.team.robots, console, quiet=as_json) as table:
         result = run_team(run, table, Stop(), launch)
-    if report is not None:
-        report.write_text(encoded(result), encoding="utf-8")
+    lost = dict(result.not_written) | write_report(report, result)
     if as_json:
         sys.stdout.write(encoded(result) + "\n")
     else:
         print_report(result, console)
+    say_not_written(lost)
 
 
 def robot(
@@ -222,6 +229,7 @@ def router(
         Optional[Path], typer.Option(help="No FILE: a configuration of Zenoh (JSON5).")
     ] = None,
     speed: Annotated[float, typer.Option(hidden=True, help="Guards let more in.")] = 1.0,
+    parent: Parent = None,
     print_config: Annotated[
         bool, typer.Option(help="Print the configuration, for zenohd or --config.")
     ] = False,
@@ -247,4 +255,4 @@ def router(
     if print_config:
         typer.echo(written_config(options, title))
     else:
-        run_router(options, title, Stop())
+        run_router(options, title, Stop(parent))

@@ -39,18 +39,21 @@ def deployed(team: Team, file: Path, folder: Path, image: str | None, seed: int)
             None if top is None else _from(folder, top),
             mounts=mounts,
             keys=keys,
-            user=owner(team),
+            user=owner(team, Identity(Role.ROUTER)),
             seed=seed,
         ),
     )
 
 
-def owner(team: Team) -> str:
-    """uid:gid of who alone can read a secured team's keys. Raises SecurityError without them."""
+def owner(team: Team, identity: Identity) -> str:
+    """uid:gid of who alone can read somebody's keys of a secured team; empty for another team.
+
+    Raises SecurityError without the keys.
+    """
     if not team.transport.secured:
         return ""
-    router = credentials_in(Path(team.transport.keys), Identity(Role.ROUTER))
-    whose = Path(router.private_key).stat()
+    credentials = credentials_in(Path(team.transport.keys), identity)
+    whose = Path(credentials.private_key).stat()
     return f"{whose.st_uid}:{whose.st_gid}"
 
 

@@ -1,8 +1,6 @@
-"""`observer --container`: the same command in a container on this machine's network."""
+"""An observer in a container of its own, beside a team that runs anywhere."""
 
-import re
 import secrets
-import signal
 import subprocess
 import tempfile
 import time
@@ -10,8 +8,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from cpcbl_launch.containers.compose import Mount
-from cpcbl_launch.containers.docker import Said, check_daemon, ran
-from cpcbl_launch.containers.image import image_for
+from cpcbl_launch.containers.deployment import owner
+from cpcbl_launch.containers.docker import check_daemon, ran
 from cpcbl_launch.containers.launch import INSIDE, KEYS_INSIDE, inside
 from cpcbl_launch.team_file import save_resolved
 from cpcbl_team.config import Team
@@ -19,86 +17,66 @@ from cpcbl_transport.security import Identity, credentials_in
 from cpcbl_transport.topics import Role
 
 SENSOR_INSIDE = "/team/sensor.toml"
-LEAVES_WITHIN_S = 10.0
+POLL_S = 0.1
 
 
-def run_observer(
-    team: Team,
+def observe(
     name: str,
-    sensor: str,
-    options: Sequence[str],
+    team: Team,
+    arguments: Sequence[str],
+    sensor_file: Path | None,
     image: str,
     stop: Callable[[], bool],
 ) -> int:
-    """Runs an observer of `team` in a container until it leaves or `stop()`; its exit code.
+    """Runs `cpcbl-team observer NAME ARGUMENTS` in a container until it ends or `stop()`.
 
-    `sensor`: a preset or a file; `options`: all others of the command, without the team's.
-    Raises DockerError, SecurityError.
+    It shares this machine's network, so that endpoints are what they are without it; what it says
+    goes where this process says things. Its exit code. Raises DockerError, or SecurityError without
+    the observer's keys.
     """
+    check_daemon()
     with tempfile.TemporaryDirectory(prefix="cpcbl-") as folder:
         team_file = Path(folder) / "team.json"
         save_resolved(inside(team), team_file)
         team_file.chmod(0o644)
-        mounts, user = [Mount(str(team_file), INSIDE)], ""
-        if team.transport.secured:
-            keys, user = own_keys(team, Identity(Role.OBSERVER, name))
-            mounts.append(keys)
-        if Path(sensor).exists():
-            mounts.append(Mount(str(Path(sensor).resolve()), SENSOR_INSIDE))
-            sensor = SENSOR_INSIDE
-        container = container_name(team, name)
-        arguments = ["observer", name, "--team", INSIDE, f"--sensor={sensor}", *options]
-        return _followed(docker_run(image, container, mounts, user, arguments), container, stop)
-
-
-def have_image(image: str | None, base: str, stop: Callable[[], bool], said: Said) -> str:
-    """`image`, or the one of these sources on `base`. Raises DockerError."""
-    check_daemon()
-    return image or image_for(base, stop, said)
+        mounts = [Mount(str(team_file), INSIDE), *mounts_of_keys(name, team)]
+        if sensor_file is not None:
+            mounts.append(Mount(str(sensor_file.resolve()), SENSOR_INSIDE))
+        container = f"cpcbl-{name}-{secrets.token_hex(3)}"
+        inner = ["observer", name, "--team", INSIDE, *arguments]
+        user = owner(team, Identity(Role.OBSERVER, name))
+        command = docker_run(container, image, mounts, user, inner)
+        process = subprocess.Popen(command, stdin=subprocess.DEVNULL, start_new_session=True)
+        try:
+            while process.poll() is None and not stop():
+                time.sleep(POLL_S)
+        finally:
+            if process.poll() is None:
+                ran(["docker", "stop", "--time", "3", container])
+            code = process.wait()
+        return code
 
 
 def docker_run(
-    image: str, container: str, mounts: Sequence[Mount], user: str, arguments: Sequence[str]
+    container: str, image: str, mounts: Sequence[Mount], user: str, inner: Sequence[str]
 ) -> list[str]:
-    """The command for one confined container that is gone when it ends."""
-    command = ["docker", "run", "--rm", "--init", "--name", container, "--network", "host"]
-    command += ["--read-only", "--tmpfs", "/tmp", "--cap-drop", "ALL"]
-    command += ["--security-opt", "no-new-privileges"]
-    for mount in mounts:
-        fields = ("type=bind", f"source={mount.source}", f"target={mount.target}", "readonly")
-        command += ["--mount", ",".join(map(_quoted, fields))]
-    if user:
-        command += ["--user", user]
-    return [*command, image, *arguments]
+    """The command: read-only, without rights, gone when it ends."""
+    return [
+        *("docker", "run", "--rm", "--init", "--name", container, "--network", "host"),
+        *("--read-only", "--tmpfs", "/tmp", "--cap-drop", "ALL"),
+        *("--security-opt", "no-new-privileges:true"),
+        *(("--user", user) if user else ()),
+        *(part for m in mounts for part in ("--volume", f"{m.source}:{m.target}:ro")),
+        image,
+        *inner,
+    ]
 
 
-def own_keys(team: Team, identity: Identity) -> tuple[Mount, str]:
-    """A member's own folder of keys, and uid:gid of who alone can read it."""
-    folder = Path(team.transport.keys)
-    owner = Path(credentials_in(folder, identity).private_key).stat()
-    mount = Mount(str((folder / str(identity)).resolve()), f"{KEYS_INSIDE}/{identity}")
-    return mount, f"{owner.st_uid}:{owner.st_gid}"
-
-
-def container_name(team: Team, name: str) -> str:
-    return re.sub(r"[^a-z0-9_.-]", "-", f"cpcbl-{team.name}-{name}-{secrets.token_hex(3)}".lower())
-
-
-def _quoted(field: str) -> str:
-    """A field of the comma-separated values that `--mount` takes."""
-    return '"' + field.replace('"', '""') + '"'
-
-
-def _followed(command: Sequence[str], container: str, stop: Callable[[], bool]) -> int:
-    """Runs a container in the foreground; what it says goes where what we say goes."""
-    process = subprocess.Popen(command, stdin=subprocess.DEVNULL, start_new_session=True)
-    try:
-        while process.poll() is None and not stop():
-            time.sleep(0.05)
-        if process.poll() is None:
-            process.send_signal(signal.SIGINT)  # docker hands it on
-        return process.wait(LEAVES_WITHIN_S)
-    finally:
-        ran(["docker", "rm", "--force", container])
-        process.kill()
-        process.wait()
+def mounts_of_keys(name: str, team: Team) -> list[Mount]:
+    """The observer's own, and nobody else's. Raises SecurityError without them."""
+    if not team.transport.secured:
+        return []
+    identity = Identity(Role.OBSERVER, name)
+    credentials_in(Path(team.transport.keys), identity)
+    own = Path(team.transport.keys).resolve() / str(identity)
+    return [Mount(str(own), f"{KEYS_INSIDE}/{identity}")]

@@ -113,7 +113,7 @@ class InContainers:
             published=tuple(published(endpoint) for endpoint in endpoints),
             mounts=(Mount(str((self._folder / "team.json").resolve()), INSIDE), *_data(run.team)),
             keys=_keys(run.team),
-            user=owner(run.team),
+            user=owner(run.team, Identity(Role.ROUTER)),
             seed=run.seed,
             speed=run.speed,
             clock=clock,

@@ -110,6 +110,9 @@ class TrafficView(LiveView):
 def drawn(now: Traffic, where: str) -> Group:
     """Who helps whom, how near each came to its limits, what it sent, and what that means."""
     title = f"team {now.team} at {where}, watched for {now.watched_s:.0f} s"
+    if now.refused:
+        reasons = ", ".join(f"{reason} {n}" for reason, n in now.refused.items())
+        title += f"\nrefused, by reason: {reasons}"
     if not now.robots:
         return Group(
             Text(f"{title}\nno robot of this team has been heard: is the name right?", "yellow")

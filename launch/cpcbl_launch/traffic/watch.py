@@ -7,7 +7,9 @@ import itertools
 import math
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from types import MappingProxyType
 from typing import NamedTuple, Protocol
 
 import msgspec
@@ -81,6 +83,8 @@ class Traffic(msgspec.Struct, frozen=True, kw_only=True):
     help: tuple[Help, ...]
     guests: tuple[str, ...] = ()
     """Robots that the team file, where there is one, does not name."""
+    refused: dict[str, int] = {}
+    """What came on `status/*` and could not be used, by reason."""
 
 
 class Arrival(NamedTuple):
@@ -96,6 +100,7 @@ def traffic(
     arrivals: Mapping[str, Sequence[Arrival]],
     began_s: float,
     now_s: float,
+    refused: Mapping[str, int] = MappingProxyType({}),
 ) -> Traffic:
     """What the latest statuses of each robot's present process come to."""
     now = {name: _robot(seen, now_s) for name, seen in arrivals.items()}
@@ -107,6 +112,7 @@ def traffic(
         never_heard=tuple(name for name in known if name not in robots),
         help=tuple(_help(robots)),
         guests=tuple(name for name in robots if known and name not in known),
+        refused=dict(sorted(refused.items())),
     )
 
 
@@ -162,16 +168,24 @@ class Watcher:
     def __init__(self, bus: Bus, now_s: Callable[[], float] = time.monotonic) -> None:
         self._now_s, self._lock = now_s, threading.Lock()
         self._arrivals: dict[str, list[Arrival]] = {}
+        self._refused: Counter[str] = Counter()
         bus.subscribe(topics.STATUS.at(), self._arrived)
 
     def _arrived(self, key: str, payload: bytes) -> None:
         status = read(key, payload)
-        if not isinstance(status, Status):
-            return
         with self._lock:
+            if not isinstance(status, Status):
+                self._refused[str(status)] += 1
+                return
             seen = self._arrivals.get(status.robot, [])
             kept = [a for a in seen if _goes_on(a.status, status)]
             self._arrivals[status.robot] = [*kept, Arrival(self._now_s(), status)]
+
+    @property
+    def refused(self) -> Counter[str]:
+        """What could not be used, by reason."""
+        with self._lock:
+            return self._refused.copy()
 
     def arrivals(self) -> dict[str, list[Arrival]]:
         """By robot: its process's statuses of the last seconds, at least the latest."""
@@ -224,7 +238,8 @@ def watch_team(watch: Watch, view: View, stop: Callable[[], bool]) -> Traffic:
         watcher, began_s = Watcher(bus), time.monotonic()
         while True:
             now_s = time.monotonic()
-            now = traffic(watch.team, watch.known, watcher.arrivals(), began_s, now_s)
+            heard = watcher.arrivals(), began_s, now_s, watcher.refused
+            now = traffic(watch.team, watch.known, *heard)
             view.show(now)
             if stop() or now_s - began_s >= watch.duration_s:
                 return now

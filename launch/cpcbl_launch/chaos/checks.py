@@ -1,0 +1,95 @@
+"""What a scenario expects, what was seen, and whether it held. Plain data."""
+
+import math
+from typing import Any
+
+import msgspec
+
+
+class Check(msgspec.Struct, frozen=True, kw_only=True):
+    """One figure of a scenario beside its bounds. It does not hold when nothing was seen."""
+
+    what: str
+    seen: float | None
+    unit: str = ""
+    at_most: float | None = None
+    at_least: float | None = None
+
+    @property
+    def held(self) -> bool:
+        if self.seen is None or not math.isfinite(self.seen):
+            return False
+        low = -math.inf if self.at_least is None else self.at_least
+        high = math.inf if self.at_most is None else self.at_most
+        return low <= self.seen <= high
+
+    def __str__(self) -> str:
+        seen = "not seen" if self.seen is None else figure(self.seen, self.unit)
+        return f"{self.what} {seen} ({self.bounds})"
+
+    @property
+    def bounds(self) -> str:
+        """Its bounds in words: `≤ 2 s`."""
+        if self.at_least is not None and self.at_least == self.at_most:
+            return f"= {figure(self.at_least, self.unit)}"
+        low = "" if self.at_least is None else f"≥ {figure(self.at_least, self.unit)}"
+        high = "" if self.at_most is None else f"≤ {figure(self.at_most, self.unit)}"
+        return " and ".join(part for part in (low, high) if part)
+
+
+def figure(value: float, unit: str) -> str:
+    """Three significant digits at most, whole numbers whole, with the unit."""
+    if unit == "%":
+        return f"{100.0 * value:.3g} %"
+    digits = f"{value:.0f}" if abs(value) >= 100.0 or value == int(value) else f"{value:.2g}"
+    return f"{digits} {unit}".rstrip()
+
+
+class Outcome(msgspec.Struct, frozen=True, kw_only=True):
+    """What came of one scenario."""
+
+    scenario: str
+    done: str
+    expectation: str
+    checks: tuple[Check, ...] = ()
+    not_run: str = ""
+    """Why it was not run: what it needs."""
+    failed: str = ""
+    """Why it could not be brought to its end."""
+    seconds: float = 0.0
+    remarks: tuple[str, ...] = ()
+    """Figures without a bound."""
+
+    @property
+    def held(self) -> bool | None:
+        """Whether every expectation held; None where it was not run."""
+        if self.not_run:
+            return None
+        return not self.failed and bool(self.checks) and all(c.held for c in self.checks)
+
+
+def as_data(faults: "Faults") -> dict[str, Any]:
+    """What `--json` and `--report` write: all fields, and whether each expectation held."""
+    outcomes = [
+        {
+            **msgspec.structs.asdict(o),
+            "held": o.held,
+            "checks": [{**msgspec.structs.asdict(c), "held": c.held} for c in o.checks],
+        }
+        for o in faults.outcomes
+    ]
+    return {**msgspec.structs.asdict(faults), "held": faults.held, "outcomes": outcomes}
+
+
+class Faults(msgspec.Struct, frozen=True, kw_only=True):
+    """What `chaos --report` writes."""
+
+    version: str
+    seed: int
+    machine: str
+    outcomes: tuple[Outcome, ...]
+
+    @property
+    def held(self) -> bool:
+        """Whether nothing that was run went against its expectation."""
+        return all(outcome.held is not False for outcome in self.outcomes)

@@ -1,0 +1,135 @@
+"""Payloads that nobody would send: random bytes, odd structures, real ones that were damaged."""
+
+import random
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+import msgspec
+
+from cpcbl_team.inputs import Belief, Fix, Odometry, Position, Sighting, Sightings
+from cpcbl_transport import topics
+from cpcbl_transport.compact import encode_help
+from cpcbl_transport.messages import (
+    VERSION,
+    Drive,
+    Flow,
+    Status,
+    Track,
+    Truth,
+    Truths,
+    encode,
+)
+from cpcbl_transport.topics import Topic
+
+COVARIANCE_2, COVARIANCE_3 = (0.04, 0.01, 0.09), (0.04, 0.01, 0.09, 0.0, 0.0, 0.01)
+TAGS = ("odometry", "sightings", "position", "status", "track", "drive", "truth")
+LONGEST = 600
+DISTINCT = 1000  # hypothesis takes some 4 ms for each
+_encode = msgspec.msgpack.Encoder().encode
+
+
+def real(topic: Topic, target: str, speaker: str, now_ns: int) -> bytes:
+    """A payload of a topic that would be taken."""
+    match topic:
+        case topics.BELIEF:
+            return encode_help(Belief(speaker, now_ns, 1.0, 2.0, 0.5, COVARIANCE_3))
+        case topics.FIX:
+            fix = Fix(target, speaker, now_ns, 1.0, 2.0, COVARIANCE_2, COVARIANCE_2)
+            return encode_help(fix)
+        case topics.STATUS:
+            flows = (Flow("fix", target, 1, 42), Flow("belief", "", 0, 0, 0, 0, 4))
+            status = Status(speaker, "1", now_ns, 0.1, 0.02, 3, "", {"odometry": 7}, 1, 20, 2, 40)
+            return encode(msgspec.structs.replace(status, sent=flows))
+        case topics.TRACK:
+            return encode(Track(speaker, now_ns, 1.0, 2.0, 0.5, COVARIANCE_3, 3))
+        case topics.IN_ODOMETRY:
+            return encode(Odometry(now_ns - 100_000_000, now_ns, 0.05, 0.01))
+        case topics.IN_SIGHTINGS:
+            return encode(Sightings(now_ns, (Sighting(speaker, 2.0, 0.1), Sighting("oak", 3.0))))
+        case topics.IN_POSITION:
+            return encode(Position(now_ns, 1.0, 2.0, COVARIANCE_2))
+        case topics.DRIVE:
+            return encode(Drive(speaker, now_ns, 0.5, 0.1))
+        case topics.TRUTH:
+            return encode(Truths(now_ns, (Truth(speaker, 1.0, 2.0, 0.5, 1),)))
+    raise ValueError(f"{topic.key}: carries no payload")
+
+
+def fuzzed(
+    count: int, original: Callable[[], bytes], found: Sequence[bytes], dice: random.Random
+) -> Iterator[bytes]:
+    """So many payloads: a third of those `found`, a third random, a third damaged real ones."""
+    makers = (
+        lambda: dice.choice(found),
+        lambda: noise(dice),
+        lambda: damaged(original(), dice),
+    )
+    for n in range(count):
+        yield makers[n % len(makers)]()
+
+
+def noise(dice: random.Random) -> bytes:
+    """Random bytes; every other one begins like a message."""
+    head = bytes([VERSION]) if dice.random() < 0.5 else b""
+    return head + dice.randbytes(dice.randrange(LONGEST))
+
+
+def damaged(payload: bytes, dice: random.Random) -> bytes:
+    """A payload with a few bytes changed, or cut, or with more at its end, or twice."""
+    data = bytearray(payload)
+    match dice.randrange(4):
+        case 0:
+            for _ in range(dice.randrange(1, 4)):
+                data[dice.randrange(len(data))] = dice.randrange(256)
+        case 1:
+            del data[dice.randrange(len(data)) :]
+        case 2:
+            data += dice.randbytes(dice.randrange(1, 20))
+        case 3:
+            data += payload[1:]
+    return bytes(data)
+
+
+def hypothetical(seed: int) -> tuple[bytes, ...]:
+    """What hypothesis makes up: bytes, and structures with a message's tag and anything in it.
+
+    Raises ImportError without hypothesis (extra `chaos`).
+    """
+    import hypothesis
+    from hypothesis import strategies as st
+
+    atoms = (
+        st.none()
+        | st.booleans()
+        | st.integers(-(2**63), 2**64 - 1)
+        | st.floats()
+        | st.text(max_size=20)
+        | st.binary(max_size=20)
+    )
+    names: st.SearchStrategy[Any] = st.text(max_size=8)
+    anything = st.recursive(
+        atoms,
+        lambda inner: st.lists(inner, max_size=8) | st.dictionaries(names, inner, max_size=4),
+        max_leaves=20,
+    )
+    tagged = st.builds(
+        lambda tag, rest: bytes([VERSION]) + _encode([tag, *rest]),
+        st.sampled_from(TAGS),
+        st.lists(anything, max_size=16),
+    )
+    found: list[bytes] = []
+
+    @hypothesis.seed(seed)
+    @hypothesis.settings(
+        max_examples=DISTINCT,
+        database=None,
+        deadline=None,
+        phases=[hypothesis.Phase.generate],
+        suppress_health_check=list(hypothesis.HealthCheck),
+    )
+    @hypothesis.given(st.binary(max_size=LONGEST) | tagged)
+    def make(payload: bytes) -> None:
+        found.append(payload)
+
+    make()
+    return tuple(found)

@@ -1,0 +1,128 @@
+"""A wire on which packets are lost: two TUN interfaces, one in a network namespace of its own.
+
+What goes into one comes out of the other, packet by packet, through this process, which loses some,
+holds some back and so reorders them, as radio does. The kernel's TCP lives with it as it can.
+Linux, as root; no traffic control, no firewall rule, nothing outside of the two interfaces.
+"""
+
+import fcntl
+import heapq
+import os
+import random
+import select
+import struct
+import subprocess
+import threading
+import time
+from pathlib import Path
+from typing import NamedTuple
+
+TUN = Path("/dev/net/tun")
+_SET_INTERFACE, _TUN_WITHOUT_HEADER = 0x400454CA, 0x1001
+_MTU = 1500
+
+
+class Weather(NamedTuple):
+    """What happens to packets, each way."""
+
+    loss: float = 0.0
+    """The share that is lost."""
+    delay_s: float = 0.0
+    jitter_s: float = 0.0
+    """Up to so much more or less, evenly spread: packets overtake each other."""
+
+
+class Wire:
+    """A namespace whose only way out is this wire. `prefix` runs a command in it; what runs there
+    finds this machine at `here`."""
+
+    def __init__(self, seed: int = 1) -> None:
+        self._random = random.Random(seed)
+        self._weather = Weather()
+        self._stop = threading.Event()
+        tag = f"{os.getpid() % 0x10000:x}"
+        self._namespace, self._near, self._far = f"cpcbl{tag}", f"cn{tag}", f"cf{tag}"
+        net = 2 * (os.getpid() % 16384)  # of 198.18.0.0/15, set aside for such tests (RFC 2544)
+        self.here = f"198.18.{net >> 8}.{net & 255}"
+        self._there = f"198.18.{net >> 8}.{(net & 255) + 1}"
+        self.passed = self.lost = 0
+
+    @property
+    def prefix(self) -> tuple[str, ...]:
+        return ("ip", "netns", "exec", self._namespace)
+
+    def set(self, weather: Weather) -> None:
+        """From any thread; for packets from now on."""
+        self._weather = weather
+
+    def __enter__(self) -> "Wire":
+        self._ends = [_interface(self._near), _interface(self._far)]
+        try:
+            _ip("netns", "add", self._namespace)
+            _ip("link", "set", self._far, "netns", self._namespace)
+            _ip("addr", "add", f"{self.here}/31", "dev", self._near)
+            _ip("link", "set", self._near, "up", "mtu", str(_MTU))
+            inside = ("-n", self._namespace)
+            _ip(*inside, "addr", "add", f"{self._there}/31", "dev", self._far)
+            _ip(*inside, "link", "set", self._far, "up", "mtu", str(_MTU))
+            _ip(*inside, "link", "set", "lo", "up")
+        except BaseException:
+            self._remove()
+            raise
+        self._thread = threading.Thread(target=self._carry, daemon=True)
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stop.set()
+        self._thread.join()
+        self._remove()
+
+    def _remove(self) -> None:
+        for end in self._ends:
+            os.close(end)
+        subprocess.run(["ip", "netns", "del", self._namespace], check=False, capture_output=True)
+
+    def _carry(self) -> None:
+        """Takes packets from either end; each leaves at the other when its time has come."""
+        waiting: list[tuple[float, int, int, bytes]] = []
+        order = 0
+        while not self._stop.is_set():
+            next_s = waiting[0][0] - time.monotonic() if waiting else 0.1
+            ready, _, _ = select.select(self._ends, [], [], min(max(next_s, 0.0), 0.1))
+            for end in ready:
+                packet = os.read(end, 65_536)
+                other = self._ends[1 - self._ends.index(end)]
+                w = self._weather
+                if self._random.random() < w.loss:
+                    self.lost += 1
+                    continue
+                self.passed += 1
+                late_s = w.delay_s + self._random.uniform(-w.jitter_s, w.jitter_s)
+                order += 1
+                heapq.heappush(waiting, (time.monotonic() + late_s, order, other, packet))
+            while waiting and waiting[0][0] <= time.monotonic():
+                _, _, end, packet = heapq.heappop(waiting)
+                os.write(end, packet)
+
+
+def missing() -> str:
+    """Why there can be no wire here; empty if there can."""
+    if os.geteuid() != 0:
+        return "needs root, for a network namespace"
+    return "" if os.access(TUN, os.R_OK | os.W_OK) else f"needs {TUN}"
+
+
+def _interface(name: str) -> int:
+    """A TUN interface, which lives as long as this descriptor is open."""
+    end = os.open(TUN, os.O_RDWR | os.O_NONBLOCK | os.O_CLOEXEC)
+    request = struct.pack("16sH22x", name.encode(), _TUN_WITHOUT_HEADER)
+    fcntl.ioctl(end, _SET_INTERFACE, request)
+    return end
+
+
+def _ip(*words: str) -> None:
+    """Raises OSError."""
+    done = subprocess.run(["ip", *words], check=False, capture_output=True, text=True)
+    if done.returncode:
+        raise OSError(f"ip {' '.join(words)}: {done.stderr.strip()}")

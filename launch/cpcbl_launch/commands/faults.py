@@ -1,0 +1,66 @@
+"""The command that makes faults on purpose."""
+
+import logging
+import signal
+import sys
+from pathlib import Path
+from typing import Annotated, Optional
+
+import typer
+
+from cpcbl_launch.commands.arguments import AsJson, ReportFile, say_not_written, write_report
+
+
+def chaos(
+    scenarios: Annotated[
+        Optional[list[str]], typer.Argument(help="Names of scenarios, or all.", metavar="SCENARIO")
+    ] = None,
+    listed: Annotated[bool, typer.Option("--list", help="Show the scenarios.")] = False,
+    seed: Annotated[int, typer.Option(help="Of noise and of random faults.")] = 1,
+    soak_s: Annotated[float, typer.Option(min=1.0, help="Seconds that the soak takes.")] = 180.0,
+    markdown: Annotated[
+        Optional[Path], typer.Option(help="Write the table into this file, as Markdown.")
+    ] = None,
+    report: ReportFile = None,
+    as_json: AsJson = False,
+) -> None:
+    """Faults on purpose, on real processes: what was expected, what was seen, whether it held.
+
+    Exit code 1 if an expectation did not hold. What cannot run here (root, for
+    lost packets and full disks) is said, and neither held nor not.
+    """
+    from rich.console import Console
+
+    from cpcbl_launch.chaos import show
+    from cpcbl_launch.chaos.checks import as_data
+    from cpcbl_launch.chaos.run import chosen, run_all
+    from cpcbl_launch.chaos.scenario import Setting
+    from cpcbl_launch.chaos.scenarios import SCENARIOS
+    from cpcbl_launch.options import encoded, file_for, not_written
+
+    if listed or not scenarios:
+        show.print_scenarios(SCENARIOS, Console())
+        return
+    for option, path in (("--report", report), ("--markdown", markdown)):
+        if path is not None:
+            file_for(option, path)
+    todo = chosen(scenarios)
+    logging.getLogger("cpcbl_launch").setLevel(logging.ERROR)  # restarts are part of it
+    logging.getLogger("cpcbl_transport").setLevel(logging.ERROR)
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # ends what it has started
+    progress = Console(stderr=True)
+    with show.Progress(progress, len(todo)) as shown:
+        setting = Setting(seed, soak_s, shown.doing)
+        faults = run_all(todo, setting, shown.began, shown.done)
+    result = as_data(faults)
+    lost = write_report(report, result)
+    if (page := markdown) is not None:
+        text = "\n".join(show.markdown(faults)) + "\n"
+        lost |= not_written(page, lambda: page.write_text(text, encoding="utf-8"))
+    if as_json:
+        sys.stdout.write(encoded(result) + "\n")
+    else:
+        show.print_faults(faults, Console())
+    say_not_written(lost)
+    if not faults.held:
+        raise typer.Exit(1)
