@@ -1,5 +1,6 @@
 """One robot as one process: the loop around a node, ended by SIGINT or SIGTERM."""
 
+import logging
 import os
 import signal
 import threading
@@ -17,6 +18,8 @@ from cpcbl_transport.bus import Bus
 from cpcbl_transport.security import Identity, link_of
 from cpcbl_transport.topics import Role
 from cpcbl_transport.zenoh_bus import open_bus
+
+log = logging.getLogger(__name__)
 
 LONGEST_WAIT_S = 0.2
 LATE_NS = 1_000_000_000
@@ -75,7 +78,9 @@ def run_robot(
     link = link_of(team, Identity(Role.ROBOT, name), connect)
     with open_bus(team.name, link.endpoints, stop, link.credentials) as bus:
         start_ns = clock.now_ns()
+        late_s = (start_ns - clock.epoch_ns) * 1e-9 / clock.speed
         if restarted or start_ns > clock.epoch_ns + LATE_NS * max(1.0, clock.speed):
+            log.warning("robot %s starts %.1f s after the team: it looks where it is", name, late_s)
             team = _not_knowing_its_start(name, team)
         incarnation = f"{os.getpid():x}"
         robot = Robot(name, team, start_ns, restarted)
