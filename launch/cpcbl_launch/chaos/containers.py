@@ -109,10 +109,10 @@ def _sites(setting: Setting) -> Iterator[_Sites]:
         project = Project(compose_program(), f"cpcbl-chaos-{secrets.token_hex(3)}", file)
         stack.callback(project.down)
         project.up()
-        takers = []
+        takers, clock = [], Clock.wall()
         for endpoint in endpoints:
             bus = stack.enter_context(open_bus("demo", [endpoint]))
-            takers.append(NoteTaker(Clock.wall()))
+            takers.append(NoteTaker(clock))
             takers[-1].listen(bus)
         yield _Sites(project, *takers)
 
