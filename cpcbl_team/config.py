@@ -165,8 +165,8 @@ class TrustSettings(Table, frozen=True, kw_only=True):
     """How a teammate is found that says what is not so."""
 
     enabled: bool = True
-    limit: Positive = 50.0
-    """By how much (NIS beyond the usual, summed) it may surprise: four clear contradictions."""
+    limit: Positive = 30.0
+    """By how much it may surprise: three clear contradictions (summed NIS beyond the usual)."""
     readmit_s: NotNegative = 5.0
     """It is believed again when it was right for so long."""
     clock_ahead_s: NotNegative = 0.1

@@ -214,6 +214,8 @@ def judged(voices: Voices, name: str, said: Said, used_ns: int, rules: TrustSett
         return _in_quarantine(voices, name, said, rules)
     if voice.strikes > MOST_STRIKES and not _my_wheels(voices, name, rules):
         return _silenced(voices, name, said.stamp_ns, used_ns)
+    if said.surprise is None:
+        return Verdict(voices, True)
     return _settled(voices, name, said.stamp_ns, used_ns, rules)
 
 

@@ -23,7 +23,7 @@ R1, R2 = Identity(Role.ROBOT, "r1"), Identity(Role.ROBOT, "r2")
 TRIPOD = Identity(Role.OBSERVER, "tripod")
 FIELD, OPERATOR, ROUTER = Identity(Role.FIELD), Identity(Role.OPERATOR), Identity(Role.ROUTER)
 PATIENCE_S = 20.0
-REFUSED_S = 2.5  # a session that is let in is open after a tenth of this
+REFUSED_S = 1.5  # a session that is let in is open after a tenth of this
 
 
 def secured_team(folder: Path, observers: tuple[str, ...] = ("tripod",)) -> Team:

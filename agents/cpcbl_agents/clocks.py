@@ -8,7 +8,7 @@ is behind looks like a slow link: beyond what links take, its words are as usele
 from typing import NamedTuple
 
 from cpcbl_team.config import TrustSettings
-from cpcbl_transport.messages import FUTURE_NS
+from cpcbl_transport.messages import FUTURE_NS, LARGEST_NUMBER
 
 SPAN_NS = 5_000_000_000
 LEAST_WORDS = 5  # before a clock is called off: a single word may have waited, or be a fault
@@ -61,9 +61,11 @@ class Clocks:
         return last.words + before.words >= LEAST_WORDS and least_ns > self._behind_ns
 
     def late_s(self, sender: str) -> float:
-        """The least time from stamp to arrival; below zero its clock is ahead."""
+        """The least time from stamp to arrival; below zero its clock is ahead. What is further off
+        than a message may say is said as that."""
         last, before = self._spans.get(sender, (Span(0, 0), Span(0, 0)))
-        return min(last.least_ns, before.least_ns) * 1e-9
+        late_s = min(last.least_ns, before.least_ns) * 1e-9
+        return max(-LARGEST_NUMBER, min(late_s, LARGEST_NUMBER))
 
     def off(self) -> frozenset[str]:
         """The teammates whose clocks are off."""

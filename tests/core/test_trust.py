@@ -309,6 +309,13 @@ def test_the_wheels_decide_between_two(court: Court) -> None:
     assert "frozen" in court.quarantined
 
 
+def test_a_lost_robot_hears_everybody_who_is_not_in_quarantine(court: Court) -> None:
+    court.hear(1.0, a=GOOD, b=GOOD)
+    court.hear(0.5, a=GOOD, b=BAD)  # not settled yet
+    for name in ("a", "b"):
+        assert court.say(name, Said(court.now_ns + 1, None)).trusted
+
+
 def test_whom_a_frozen_liar_accused_is_acquitted(court: Court) -> None:
     court.hear(3.0, liar=GOOD, honest=GOOD)
     court.hear(3.0, liar=GOOD, honest=BAD)

@@ -21,9 +21,11 @@ import pytest
 import yaml
 from bus_helpers import Ear, wait_until
 from docker_helpers import TOP, image
-from key_helpers import R1, R2, again, router_of, secured_team, session, with_credentials
+from key_helpers import OPERATOR, R1, again, router_of, secured_team, session, with_credentials
 from process_helpers import cpcbl_team
+from typer.testing import CliRunner
 
+from cpcbl_launch.cli import app
 from cpcbl_launch.identities.authority import facts, issued, new_authority
 from cpcbl_launch.identities.plan import Deed, hosts, plan
 from cpcbl_launch.processes import PROGRAM
@@ -64,8 +66,8 @@ def changed(before: Mapping[str, bytes], after: Mapping[str, bytes]) -> set[str]
 
 def keys(file: Path, *more: object) -> dict[str, dict[str, Any]]:
     """What `keys FILE MORE --json` says, by member."""
-    done = cpcbl_team("keys", file, *more, "--json")
-    assert done.returncode == 0, done.stderr
+    done = CliRunner().invoke(app, [str(word) for word in ("keys", file, *more, "--json")])
+    assert done.exit_code == 0, done.output
     return {member["who"]: member for member in json.loads(done.stdout)}
 
 
@@ -406,7 +408,7 @@ def test_a_printed_configuration_is_as_strict(team_file: Path) -> None:
     config.write_text(printed.stdout)
     team = load_team(team_file)
     with running("router", "--config", config):
-        with session(team, R2, endpoint) as listener, session(team, R1, endpoint) as robot:
+        with session(team, OPERATOR, endpoint) as listener, session(team, R1, endpoint) as robot:
             ear = Ear(listener, "**")
             for key in ("status/r2", "status/r1"):
                 publisher = robot.publisher(key, Qos.INPUT)

@@ -1,7 +1,7 @@
 """Real sessions with real certificates: who gets a link, and what a router lets each one say."""
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import closing
 from pathlib import Path
 from statistics import mode
@@ -44,12 +44,13 @@ from cpcbl_transport.security import (
     SecurityError,
     access_control,
     access_rules,
+    heard_by,
     link_of,
     link_options,
     members_in,
     said_by,
 )
-from cpcbl_transport.topics import Qos, Role
+from cpcbl_transport.topics import Qos, Role, Who
 from cpcbl_transport.zenoh_bus import BusError, open_router
 from cpcbl_transport.zenoh_config import router_config
 
@@ -67,7 +68,7 @@ def endpoint(team: Team) -> Iterator[str]:
     where = free_endpoint("tls")
     rules = access_control(team)
     access = rules["access_control"]
-    mark = {**access["rules"][0], "id": MARK, "messages": ["put"]}
+    mark = {**access["rules"][0], "id": MARK, "flows": ["ingress"], "messages": ["put"]}
     mark["key_exprs"] = [f"{topics.namespace(team.name)}/{MARK}"]
     access["rules"].append(mark)
     access["policies"].append({"rules": [MARK], "subjects": [access["subjects"][0]["id"]]})
@@ -241,7 +242,7 @@ def test_without_access_control_the_same_would_arrive(team: Team) -> None:
 def test_a_token_is_announced_under_ones_own_name_only(team: Team, endpoint: str) -> None:
     seen: dict[str, bool] = {}
     with (
-        closing(session(team, R2, endpoint)) as watcher,
+        closing(session(team, OPERATOR, endpoint)) as watcher,
         closing(session(team, R1, endpoint)) as robot,
         closing(session(team, TRIPOD, endpoint)) as observer,
         closing(session(team, OPERATOR, endpoint)) as operator,
@@ -270,9 +271,56 @@ def test_two_sessions_may_show_the_same_certificate(team: Team, endpoint: str) -
         closing(session(team, R1, endpoint)) as robot,
         closing(session(team, R1, endpoint)) as driver,
     ):
-        ear = Ear(robot, "in/r1/*")
+        ear = Ear(robot, "in/r1/odometry")
         say(driver, "in/r1/odometry", b"a piece")
         wait_until(lambda: ear.payloads == [b"a piece"])
+
+
+# Who may hear what ------------------------------------------------------------------------------
+
+HEARD = {
+    R2: {"belief/3/r1", "fix/r2/3/r1"},
+    TRIPOD: {"belief/3/r1"},
+    FIELD: {"field/drive/r1"},
+    OPERATOR: {*OWN_ROBOT, "fix/tripod/3/r1"},
+}
+ASKED = (
+    *("**", "belief/*/*", "fix/*/*/*", "fix/r2/3/*", "status/*", "track/r1"),
+    *("in/r1/odometry", "in/**", "field/drive/*", "field/**"),
+)
+
+
+@pytest.mark.parametrize("who", HEARD, ids=str)
+def test_a_certificate_hears_what_is_for_its_owner_and_nothing_else(
+    team: Team, endpoint: str, who: Identity
+) -> None:
+    """Of all that r1 says, whatever is subscribed to."""
+    with (
+        closing(session(team, who, endpoint)) as listener,
+        closing(session(team, R1, endpoint)) as speaker,
+        closing(session(team, OPERATOR, endpoint)) as operator,
+    ):
+        ears, everything = [Ear(listener, keys) for keys in ASKED], Ear(operator, "**")
+        for key in sorted({*OWN_ROBOT, "fix/tripod/3/r1"}):
+            say(speaker, key)
+        for key in sorted(HEARD[who]):  # once more, after all that it may not hear
+            say(speaker, key, b"last")
+        wait_until(lambda: HEARD[who] <= {k for e in ears for k, p in e.samples if p == b"last"})
+        assert {key for ear in ears for key in ear.keys} == HEARD[who]
+        assert set(everything.keys) == HEARD[OPERATOR]
+
+
+def test_what_a_robot_may_not_hear_is_not_even_sent(team: Team, endpoint: str) -> None:
+    with (
+        closing(session(team, R2, endpoint)) as greedy,
+        closing(session(team, R1, endpoint)) as robot,
+    ):
+        ears = [Ear(greedy, keys) for keys in ("**", "fix/r3/*/*", "status/r1", "belief/3/r1")]
+        allowed = robot.publisher("belief/3/r1", Qos.FRESH)
+        wait_until(lambda: allowed.matching)  # it was asked for last
+        for key in ("fix/r3/3/r1", "status/r1", "track/r1", "in/r1/odometry"):
+            assert not robot.publisher(key, Qos.FRESH).matching
+        assert not any(ear.samples for ear in ears)
 
 
 # The rules are the table's ----------------------------------------------------------------------
@@ -289,6 +337,17 @@ def test_the_rules_follow_the_table_of_topics() -> None:
 
 def test_operators_and_routers_say_nothing_of_their_own() -> None:
     assert said_by(OPERATOR) == said_by(ROUTER) == []
+
+
+def test_who_may_hear_follows_the_table_too() -> None:
+    me = Identity(Role.ROBOT, "me")
+    assert set(heard_by(me)) == {
+        *("alive/*/*/*", "belief/*/*", "fix/me/*/*", "status/me", "track/me"),
+        *("in/me/odometry", "in/me/sightings", "in/me/position"),
+    }
+    assert heard_by(Identity(Role.OBSERVER, "me")) == heard_by(me)
+    assert heard_by(FIELD) == ["field/drive/*", "field/join/*"]
+    assert heard_by(OPERATOR) == ["**"]
 
 
 def named_in_rules(team: Team, *members: Member) -> set[str]:
@@ -359,13 +418,12 @@ def test_all_options_are_known_to_zenoh(team: Team) -> None:
 # Rotation and revocation ------------------------------------------------------------------------
 
 
-def hears(bus: Bus, speaker: Bus, key: str) -> bool:
-    """Whether what one session says reaches another within a while."""
+def hears(bus: Bus, speaker: Bus, key: str, within_s: float = PATIENCE_S) -> bool:
+    """Whether what one session says reaches another in time."""
     ear, publisher = Ear(bus, key), speaker.publisher(key, Qos.INPUT)
-    if not eventually(lambda: publisher.matching, REFUSED_S):
-        return False
+    eventually(lambda: publisher.matching, within_s)
     publisher.put(b"?")
-    heard = eventually(lambda: bool(ear.samples), REFUSED_S)
+    heard = eventually(lambda: bool(ear.samples), within_s)
     ear.close()
     publisher.close()
     return heard
@@ -383,8 +441,8 @@ def test_a_revoked_robot_neither_says_nor_hears_anything(tmp_path: Path) -> None
         closing(session(team, OPERATOR, endpoint)) as operator,
     ):
         assert hears(operator, good, "status/r1")
-        assert not hears(operator, out, "status/r2")
-        assert not hears(out, good, "status/r1")
+        assert not hears(operator, out, "status/r2", REFUSED_S)
+        assert not hears(out, good, "belief/3/r1", REFUSED_S)
     again(team, renew=("r2",))
     old = [tmp_path / name for name in ("old-ca.crt", "old.crt", "old.key")]
     for path, content in zip(old, kept, strict=True):
@@ -396,7 +454,7 @@ def test_a_revoked_robot_neither_says_nor_hears_anything(tmp_path: Path) -> None
         closing(session(team, OPERATOR, endpoint)) as operator,
     ):
         assert hears(operator, back, "status/r2")
-        assert not hears(operator, out, "status/r2")
+        assert not hears(operator, out, "status/r2", REFUSED_S)
 
 
 def test_a_link_ends_with_its_certificate_and_a_renewed_one_opens_the_next(
@@ -404,7 +462,7 @@ def test_a_link_ends_with_its_certificate_and_a_renewed_one_opens_the_next(
 ) -> None:
     team = secured_team(tmp_path)
     alive: list[tuple[str, bool]] = []
-    lasting(team, "r1", 4.0)
+    lasting(team, "r1", 6.0)
     with (
         router_of(team) as (router, endpoint),
         closing(session(team, R1, endpoint)) as robot,
@@ -455,16 +513,16 @@ def test_two_routers_relay_what_each_lets_in(team: Team) -> None:
         closing(session(team, R1, west)) as r1,
         closing(session(team, R2, east)) as r2,
     ):
-        ear = Ear(r2, "**")
+        beliefs, fixes = Ear(r2, "belief/3/*"), Ear(r2, "fix/r2/3/*")
         tokens: dict[str, bool] = {}
-        r2.watch("alive/**", tokens.__setitem__)
+        r2.watch("alive/*/*/*", tokens.__setitem__)
         r1.announce("alive/3/r1/1")
-        say(r1, "status/r2", b"as another")
+        say(r1, "belief/3/r2", b"as another")
         say(r1, "fix/r2/3/r1", b"as itself")
-        wait_until(lambda: b"as itself" in ear.payloads)
-        assert ear.payloads == [b"as itself"]
+        wait_until(lambda: fixes.payloads == [b"as itself"])
         wait_until(lambda: tokens == {"alive/3/r1/1": True})
-        assert hears(r1, r2, "status/r2")
+        assert beliefs.payloads == []
+        assert hears(r1, r2, "belief/3/r2")
 
 
 def test_a_robot_cannot_join_a_router_as_a_router(team: Team, endpoint: str) -> None:
@@ -510,16 +568,15 @@ def test_tls_takes_22_bytes_for_what_is_written_at_once(team: Team) -> None:
     assert written_at_once(team, secured=True) - written_at_once(team, secured=False) == 22
 
 
+def in_words(who: Iterable[Who]) -> str:
+    return ", ".join(f"{w.role} (`{w.own}`)" if w.own else str(w.role) for w in who)
+
+
 def test_the_table_in_the_docs_is_that_of_the_topics() -> None:
     text = (Path(__file__).parents[2] / "docs" / "security.md").read_text()
-    rows = {
-        f"| `{topic.key}` | "
-        + "; ".join(
-            f"{speaker.role}, own `<{speaker.own}>`" if speaker.own else str(speaker.role)
-            for speaker in topic.said_by
-        )
-        + " |"
+    rows = [
+        f"| `{topic.key}` | {in_words(topic.said_by)} | {in_words(topic.heard_by)} |"
         for topic in topics.TOPICS
-    }
-    table = text.partition("| key | who |\n|---|---|\n")[2].partition("\n\n")[0]
-    assert set(table.splitlines()) == rows
+    ]
+    table = text.partition("| key | says | hears |\n|---|---|---|\n")[2].partition("\n\n")[0]
+    assert table.splitlines() == rows

@@ -13,7 +13,7 @@ Zenoh's own, as its configuration. What was measured:
   with.
 """
 
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,7 +21,7 @@ import msgspec
 
 from cpcbl_team.config import Team
 from cpcbl_transport import topics
-from cpcbl_transport.topics import Role, Topic
+from cpcbl_transport.topics import Role, Topic, Who
 
 CA, CERTIFICATE, PRIVATE_KEY, MEMBERS = "ca.crt", "certificate.crt", "private.key", "members.json"
 PROTOCOL = "tls"
@@ -146,7 +146,7 @@ def link_options(credentials: Credentials) -> dict[str, Any]:
     }
 
 
-_HEARS = ("declare_subscriber", "declare_liveliness_subscriber", "liveliness_query")
+_ASKS = ("declare_subscriber", "declare_liveliness_subscriber", "liveliness_query")
 _IS_TOLD = ("put", "declare_subscriber", "liveliness_token")
 _EVERYTHING = (
     *("put", "delete", "query", "reply", "declare_queryable"),
@@ -156,24 +156,25 @@ _EVERYTHING = (
 
 
 def access_rules(team: Team, members: Iterable[Member]) -> dict[str, Any]:
-    """The router's access control: nobody may say anything but what the table of topics allows.
+    """The router's access control: nobody may say or ask for more than the table of topics allows.
 
-    All members hear what they like. Who is not among the members, was revoked, or has no place in
+    Who is not among the members, was revoked, or has no place in
     the team as its file has it now, neither says nor hears anything.
     """
     space = topics.namespace(team.name)
     present = [m for m in members if not m.revoked and _belongs(m.identity, team)]
-    policies = [_policy("hear", present, _rule("hear", "ingress", _HEARS, [f"{space}/**"]))]
-    policies += [_policy("be told", present, _rule("be told", "egress", _IS_TOLD, [f"{space}/**"]))]
+    policies = [_policy("be told", present, _rule("be told", "egress", _IS_TOLD, [f"{space}/**"]))]
     for member in present:
-        puts, tokens = (
-            [f"{space}/{key}" for key in said_by(member.identity, carrying)]
-            for carrying in (True, False)
-        )
-        for kind, keys in (("put", puts), ("liveliness_token", tokens)):
+        who = member.identity
+        for messages, keys in (
+            (["put"], said_by(who, carrying=True)),
+            (["liveliness_token"], said_by(who, carrying=False)),
+            (_ASKS, heard_by(who)),
+        ):
             if keys:
-                name = f"{member.identity}: {kind}"
-                policies.append(_policy(name, [member], _rule(name, "ingress", [kind], keys)))
+                name = f"{who}: {messages[0]}"
+                whole = [f"{space}/{key}" for key in keys]
+                policies.append(_policy(name, [member], _rule(name, "ingress", messages, whole)))
     routers = [m for m in present if m.role is Role.ROUTER]
     for flow in ("ingress", "egress"):
         name = f"relay: {flow}"
@@ -198,12 +199,24 @@ def said_by(identity: Identity, carrying: bool | None = None) -> list[str]:
     `carrying`: those of messages, or those of tokens, which carry none; None: both.
     """
     return [
-        topic.at(**{speaker.own: identity.name} if speaker.own else {})
+        key
         for topic in topics.TOPICS
         if carrying is None or carrying is _carries(topic)
-        for speaker in topic.said_by
-        if speaker.role is identity.role
+        for key in _keys(topic, topic.said_by, identity)
     ]
+
+
+def heard_by(identity: Identity) -> list[str]:
+    """The keys that someone may subscribe to, with all that they include."""
+    if identity.role is Role.OPERATOR:
+        return ["**"]
+    return [key for topic in topics.TOPICS for key in _keys(topic, topic.heard_by, identity)]
+
+
+def _keys(topic: Topic, allowed: Iterable[Who], identity: Identity) -> Iterator[str]:
+    for who in allowed:
+        if who.role is identity.role:
+            yield topic.at(**{who.own: identity.name} if who.own else {})
 
 
 def _carries(topic: Topic) -> bool:

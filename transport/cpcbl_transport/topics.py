@@ -2,8 +2,8 @@
 
 A key stands below its team's `namespace`. The publisher's tier is part of the key and
 a robot subscribes only to tiers better than its own, so that nothing flows uphill: Zenoh itself
-drops it at the sender. Who may say a topic is a column too; a secured router holds everybody to it
-(`security`). This module does not know the bus.
+drops it at the sender. Who may say and hear a topic are columns too; a secured router holds
+everybody to them (`security`). This module does not know the bus.
 """
 
 from enum import Enum, StrEnum
@@ -47,17 +47,17 @@ class Role(StrEnum):
     ROUTER = "router"  # relays what all others say
 
 
-class Speaker(NamedTuple):
-    """Who may say a topic."""
+class Who(NamedTuple):
+    """Who may say, or hear, a topic."""
 
     role: Role
     own: str = ""
-    """The <name> of the key that must be the speaker's own; empty: any will do."""
+    """The <name> of the key that must be its own; empty: any will do."""
 
 
-def _themselves(name: str, *roles: Role) -> tuple[Speaker, ...]:
-    """Members of these roles, each under its own name only."""
-    return tuple(Speaker(role, name) for role in roles or (Role.ROBOT, Role.OBSERVER))
+def _helpers(own: str = "") -> tuple[Who, ...]:
+    """Robots and observers, each under its own name, or under any."""
+    return Who(Role.ROBOT, own), Who(Role.OBSERVER, own)
 
 
 class Topic(NamedTuple):
@@ -68,7 +68,8 @@ class Topic(NamedTuple):
     rate: str
     qos: Qos
     reason: str
-    said_by: tuple[Speaker, ...] = ()  # where names are certified; nobody, unless stated
+    said_by: tuple[Who, ...] = ()  # where names are certified; nobody, unless stated
+    heard_by: tuple[Who, ...] = ()  # besides operators, who hear everything
 
     def at(self, **names: object) -> str:
         """The key with these names; `*` for each that is left out."""
@@ -100,7 +101,8 @@ ALIVE = Topic(
     "at a change of tier",
     Qos.COMMAND,
     "a liveliness token: the bus tells when it comes and goes; presence, not health",
-    _themselves("robot"),
+    said_by=_helpers("robot"),
+    heard_by=_helpers(),
 )
 BELIEF = Topic(
     "belief/<tier>/<robot>",
@@ -108,7 +110,8 @@ BELIEF = Topic(
     "5 Hz while a worse robot listens",
     Qos.FRESH,
     "the next one is better than a late one",
-    _themselves("robot"),
+    said_by=_helpers("robot"),
+    heard_by=_helpers(),
 )
 FIX = Topic(
     "fix/<robot>/<tier>/<observer>",
@@ -116,7 +119,8 @@ FIX = Topic(
     "each sighting of a worse robot that listens",
     Qos.FRESH,
     "the next one is better than a late one",
-    _themselves("observer"),
+    said_by=_helpers("observer"),
+    heard_by=_helpers("robot"),
 )
 STATUS = Topic(
     "status/<robot>",
@@ -124,7 +128,8 @@ STATUS = Topic(
     "1 Hz",
     Qos.TELEMETRY,
     "for people; must never delay a fix",
-    _themselves("robot"),
+    said_by=_helpers("robot"),
+    heard_by=_helpers("robot"),
 )
 TRACK = Topic(
     "track/<robot>",
@@ -132,22 +137,36 @@ TRACK = Topic(
     "10 Hz while somebody records",
     Qos.TELEMETRY,
     "for reports; costs nothing when nobody listens",
-    _themselves("robot"),
+    said_by=_helpers("robot"),
+    heard_by=_helpers("robot"),
 )
-SENSED = (*_themselves("robot"), Speaker(Role.FIELD))  # its own driver, or the simulated field
+_SENSING = (*_helpers("robot"), Who(Role.FIELD))  # its own driver, or the simulated field
 IN_ODOMETRY = Topic(
     "in/<robot>/odometry",
     Odometry,
     "the driver's",
     Qos.INPUT,
     "a lost piece of odometry is a lost piece of the way",
-    SENSED,
+    said_by=_SENSING,
+    heard_by=_helpers("robot"),
 )
 IN_SIGHTINGS = Topic(
-    "in/<robot>/sightings", Sightings, "the driver's", Qos.INPUT, "inputs are not dropped", SENSED
+    "in/<robot>/sightings",
+    Sightings,
+    "the driver's",
+    Qos.INPUT,
+    "inputs are not dropped",
+    said_by=_SENSING,
+    heard_by=_helpers("robot"),
 )
 IN_POSITION = Topic(
-    "in/<robot>/position", Position, "the driver's", Qos.INPUT, "inputs are not dropped", SENSED
+    "in/<robot>/position",
+    Position,
+    "the driver's",
+    Qos.INPUT,
+    "inputs are not dropped",
+    said_by=_SENSING,
+    heard_by=_helpers("robot"),
 )
 DRIVE = Topic(
     "field/drive/<robot>",
@@ -155,7 +174,8 @@ DRIVE = Topic(
     "10 Hz, simulation only",
     Qos.COMMAND,
     "a late command is a collision",
-    _themselves("robot"),
+    said_by=_helpers("robot"),
+    heard_by=(Who(Role.FIELD),),
 )
 JOIN = Topic(
     "field/join/<robot>",
@@ -163,7 +183,8 @@ JOIN = Topic(
     "2 Hz of a guest, simulation only",
     Qos.COMMAND,
     "without it the field takes the guest's body away; a field that restarts hears it again",
-    _themselves("robot", Role.OBSERVER),
+    said_by=(Who(Role.OBSERVER, "robot"),),
+    heard_by=(Who(Role.FIELD),),
 )
 TRUTH = Topic(
     "field/truth",
@@ -171,7 +192,7 @@ TRUTH = Topic(
     "every step, simulation only",
     Qos.TELEMETRY,
     "for reports only",
-    (Speaker(Role.FIELD),),
+    said_by=(Who(Role.FIELD),),
 )
 
 TOPICS = (

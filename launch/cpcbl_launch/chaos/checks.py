@@ -41,7 +41,8 @@ def figure(value: float, unit: str) -> str:
     """Three significant digits at most, whole numbers whole, with the unit."""
     if unit == "%":
         return f"{100.0 * value:.3g} %"
-    digits = f"{value:.0f}" if abs(value) >= 100.0 or value == int(value) else f"{value:.2g}"
+    whole = not math.isfinite(value) or abs(value) >= 100.0 or value == int(value)
+    digits = f"{value:.0f}" if whole else f"{value:.2g}"
     return f"{digits} {unit}".rstrip()
 
 

@@ -70,6 +70,7 @@ def judged_partition(
     cut_s: float,
     healed_s: float,
     until_s: float,
+    most_far_m: float = FOUND_M,
 ) -> list[Check]:
     """Each side misses the other and goes on; they are one team again within 5 s of healing."""
     gone = [gone_after_s(near_notes, name, cut_s) for name in far]
@@ -81,7 +82,7 @@ def judged_partition(
     return [
         Check(what="the other side's tokens gone after", seen=worst(gone), unit="s", at_most=4.0),
         *they_go_on(near_notes, near, cut_s, healed_s, who="near side's"),
-        *they_go_on(far_notes, far, cut_s, healed_s, who="far side's"),
+        *they_go_on(far_notes, far, cut_s, healed_s, most_m=most_far_m, who="far side's"),
         Check(what="tokens back after healing", seen=worst(back), unit="s", at_most=5.0),
         Check(what="help across after healing", seen=helped, unit="s", at_most=5.0),
         *all_is_well(near_notes, [*near, *far], healed_s + 5.0, until_s),

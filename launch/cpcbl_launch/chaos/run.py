@@ -11,11 +11,12 @@ from importlib.metadata import version
 
 from msgspec.structs import replace
 
-from cpcbl_launch.chaos import files, wire
+from cpcbl_launch.chaos import containers, files, wire
 from cpcbl_launch.chaos.checks import Faults, Outcome
-from cpcbl_launch.chaos.scenario import Needs, Scenario, Setting
+from cpcbl_launch.chaos.scenario import CannotRunError, Needs, Scenario, Setting
 from cpcbl_launch.chaos.scenarios import SCENARIOS
 from cpcbl_launch.chaos.team import ChaosError
+from cpcbl_launch.containers.docker import DockerError
 from cpcbl_transport.zenoh_bus import BusError
 
 ALL = "all"
@@ -39,6 +40,8 @@ def missing(needs: Needs) -> str:
             return wire.missing()
         case Needs.MOUNT:
             return files.missing()
+        case Needs.DOCKER:
+            return containers.missing()
         case Needs.HYPOTHESIS if importlib.util.find_spec("hypothesis") is None:
             return "needs hypothesis: pip install 'cpcbl-team[chaos]'"
     return ""
@@ -53,7 +56,9 @@ def outcome_of(scenario: Scenario, setting: Setting) -> Outcome:
         return replace(outcome, not_run=reason)
     try:
         found = scenario.run(setting)
-    except (ChaosError, BusError, OSError, subprocess.TimeoutExpired) as error:
+    except CannotRunError as error:
+        return replace(outcome, not_run=str(error))
+    except (ChaosError, BusError, DockerError, OSError, subprocess.TimeoutExpired) as error:
         return replace(outcome, failed=str(error), seconds=time.monotonic() - began_s)
     return replace(
         outcome,

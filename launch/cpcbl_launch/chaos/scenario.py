@@ -19,6 +19,11 @@ class Needs(StrEnum):
     ROOT = "root and /dev/net/tun"
     MOUNT = "root, to mount a small disk"
     HYPOTHESIS = "the extra `chaos`"
+    DOCKER = "docker"
+
+
+class CannotRunError(Exception):
+    """A scenario found out that it lacks something here."""
 
 
 class Setting(NamedTuple):

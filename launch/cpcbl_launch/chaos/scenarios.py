@@ -1,5 +1,6 @@
 """THE table of scenarios."""
 
+from cpcbl_launch.chaos.containers import partition_containers
 from cpcbl_launch.chaos.files import disk_full, read_only
 from cpcbl_launch.chaos.fuzz import fuzz
 from cpcbl_launch.chaos.inputs import duplicates, flood
@@ -17,6 +18,7 @@ from cpcbl_launch.chaos.world import clock_half_second, clock_hour, hidden, kidn
 
 QUICK, SLOW = True, False
 N, ROOT, MOUNT, HYPOTHESIS = Needs.NOTHING, Needs.ROOT, Needs.MOUNT, Needs.HYPOTHESIS
+DOCKER = Needs.DOCKER
 
 SCENARIOS = (
     Scenario(
@@ -69,6 +71,14 @@ SCENARIOS = (
         N,
         QUICK,
         partition,
+    ),
+    Scenario(
+        "partition-containers",
+        "two sites in containers; `docker network disconnect` of one's router for 10 s",
+        "the same, in containers",
+        DOCKER,
+        SLOW,
+        partition_containers,
     ),
     Scenario(
         "cut-link",

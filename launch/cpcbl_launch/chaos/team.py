@@ -153,7 +153,7 @@ class TeamUnderTest:
             time.sleep(POLL_S)
         return True
 
-    def settle(self, within_m: float = SETTLED_M) -> float:
+    def settle(self, within_m: float = SETTLED_M, patience_s: float = PATIENCE_S) -> float:
         """Waits until all robots know where they are; when. Raises ChaosError."""
 
         def unsettled() -> list[str]:
@@ -165,7 +165,7 @@ class TeamUnderTest:
                 if found_after_s(notes, robot, from_s, within_m) is None
             ]
 
-        if not self.until(lambda: self.now_s > 3.0 and not unsettled()):
+        if not self.until(lambda: self.now_s > 3.0 and not unsettled(), patience_s):
             waiting = unsettled()
             raise ChaosError(
                 f"the team did not settle: {', '.join(waiting)}: "

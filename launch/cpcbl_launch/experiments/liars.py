@@ -211,7 +211,6 @@ def measured(
         _row(case, found, by_case.get(Case(lie="", liar=False, honest=case.honest)))
         for case, found in by_case.items()
     )
-    judged = [row for row in rows if row.case.lie and row.case.trust and row.ratio is not None]
     return Liars(
         experiment="liars",
         version=version("cpcbl-team"),
@@ -219,7 +218,7 @@ def measured(
         lie_s=(FROM_S, UNTIL_S, END_S),
         team=team(Case(lie="")),
         rows=rows,
-        held=all(row.ratio is not None and row.ratio.median <= MOST_RATIO for row in judged),
+        held=not any(map(_missed, _judged(rows))),
     )
 
 
@@ -267,39 +266,56 @@ def _row(case: Case, runs: Sequence[Run], without: Sequence[Run] | None) -> Row:
 
 
 def tables(result: Liars) -> Iterable[RenderableType]:
-    """A row each lie; in brackets what comes of believing everything."""
+    """A row each lie, beside what comes of believing everything."""
     believed = {(r.case.lie, r.case.honest): r for r in result.rows if not r.case.trust}
     for honest in sorted({r.case.honest for r in result.rows}, reverse=True):
-        title = f"one liar, {honest} honest: errors of the robots that drive, {result.seeds} seeds"
-        figures = ("RMSE m", "ratio", "80 %", "believed", "found", "after s", "back s", "false s")
+        title = f"one liar, {honest} honest: robots that drive, {result.seeds} seeds"
+        figures = ("m", "ratio", "80 %", "believed", "found", "s", "back", "false")
         shown = table(title, ("lie",), figures)
         for row in result.rows:
             if row.case.honest == honest and row.case.trust:
                 shown.add_row(*_cells(row, believed.get((row.case.lie, honest))))
         yield shown
     yield (
-        f"ratio: to the team without the liar, median and where 80 % of the seeds lie; at most"
-        f" {MOST_RATIO:g}:\n{'held' if result.held else 'missed'}. believed: the ratio when nobody"
-        " judges. found: robots that did;\nafter s: the lie began; back s: after it ended. false:"
-        " quarantine of honest ones,\nseconds a run"
+        "m: RMSE. ratio: to the team without the liar; where 80 % of the seeds lie;\n"
+        "believed: where nobody judges. found: robots that found it; s: after the lie\n"
+        "began; back: s after it ended. false: quarantine of honest ones, s a run"
     )
+    missed = [
+        f"{r.case.lie} beside {r.case.honest} honest" for r in _judged(result.rows) if _missed(r)
+    ]
+    yield (
+        f"held: no ratio is above {MOST_RATIO:g}"
+        if not missed
+        else f"above {MOST_RATIO:g}: {'; '.join(missed)}"
+    )
+
+
+def _judged(rows: Iterable[Row]) -> list[Row]:
+    return [row for row in rows if row.case.lie and row.case.trust]
+
+
+def _missed(row: Row) -> bool:
+    return row.ratio is None or row.ratio.median > MOST_RATIO
 
 
 def _cells(row: Row, believed: Row | None) -> list[str]:
     name = row.case.lie or ("honest" if row.case.liar else "not there")
-    lies = bool(row.case.lie)
-    range_ = f"{row.ratio.low:.2f}-{row.ratio.high:.2f}" if row.ratio is not None else "-"
+    found = [f"{row.found}/{row.listening}", *_seconds(row)] if row.case.lie else [""] * 3
+    ratio = row.ratio
     return [
         name,
         number(row.rmse_m.median),
-        number(_median(row.ratio), 2),
-        range_,
+        number(_median(ratio), 2),
+        "-" if ratio is None else f"{ratio.low:.2f}-{ratio.high:.2f}",
         number(_median(believed.ratio), 2) if believed is not None else "",
-        f"{row.found}/{row.listening}" if lies else "",
-        number(_median(row.found_after_s), 1) if lies else "",
-        number(_median(row.readmitted_after_s), 1) if lies else "",
+        *found,
         f"{row.false_quarantine_s:.1f}",
     ]
+
+
+def _seconds(row: Row) -> tuple[str, str]:
+    return number(_median(row.found_after_s), 1), number(_median(row.readmitted_after_s), 1)
 
 
 def _median(found: Spread | None) -> float | None:

@@ -1,0 +1,123 @@
+"""Full disks, and places where nothing can be written: what is lost is said, and no more is."""
+
+import json
+import resource
+import subprocess
+from pathlib import Path
+
+import pytest
+from bus_helpers import SECOND, standing
+from process_helpers import cpcbl_team
+
+from cpcbl_launch.evaluation import simulate
+from cpcbl_launch.options import file_for, folder_for
+from cpcbl_launch.processes import PROGRAM
+from cpcbl_launch.recording import Recording, read_recording
+from cpcbl_launch.supervisor import ProcessSpec, Supervisor
+from cpcbl_launch.team_file import TeamFileError, builtin, load_team, save_resolved
+from cpcbl_team.config import RobotSettings, Team
+from cpcbl_transport import topics
+from cpcbl_transport.bus import MemoryHub
+from cpcbl_transport.messages import encode
+
+TEAM = Team(name="one", robots={"r1": RobotSettings(source="external")})
+FULL = Path("/dev/full")  # takes any file's place: each write finds no space left
+NO_SPACE = "No space left on device"
+
+pytestmark = pytest.mark.skipif(not FULL.exists(), reason="/dev/full is Linux's")
+
+
+def record_much(path: Path) -> Recording:
+    """Records more than what is kept back before it is written."""
+    hub = MemoryHub()
+    publisher = hub.session().publisher("in/r1/odometry", topics.Qos.INPUT)
+    with Recording(path, TEAM, hub.session()) as recording:
+        for n in range(30_000):
+            publisher.put(encode(standing((n + 2) * SECOND, (n + 1) * SECOND)))
+    return recording
+
+
+def test_a_recording_ends_where_its_disk_is_full_and_nobody_notices(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    assert record_much(tmp_path / "good.mcap").failed == ""
+    assert read_recording(tmp_path / "good.mcap").inputs["r1"]
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, limits[1]))
+    try:
+        recording = record_much(tmp_path / "bad.mcap")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert recording.failed == "File too large"
+    assert caplog.text.count("bad.mcap: no longer recorded: File too large") == 1
+
+
+def test_a_run_on_a_full_disk_goes_on_to_its_report() -> None:
+    ran = cpcbl_team("up", "--duration", 2, "--report", FULL, "--json")
+    assert ran.returncode == 1
+    assert set(json.loads(ran.stdout)["robots"]) == {"navigator", "observer", "scout", "patrol"}
+    assert ran.stderr.splitlines()[-1] == f"cpcbl-team: /dev/full: not written: {NO_SPACE}"
+    assert "Traceback" not in ran.stderr
+
+
+def test_a_full_standard_output_is_one_line() -> None:
+    with FULL.open("w") as full:
+        ran = subprocess.run(
+            [*PROGRAM, "simulate", "--duration", "2", "--json"],
+            stdout=full,
+            stderr=subprocess.PIPE,
+            text=True,
+            timeout=60.0,
+            check=False,
+        )
+    assert ran.returncode == 1
+    assert f"cpcbl-team: standard output: not written: {NO_SPACE}" in ran.stderr.splitlines()[-1]
+    assert "Traceback" not in ran.stderr
+
+
+@pytest.mark.parametrize("option", ["--record", "--report", "--picture"])
+def test_a_file_that_cannot_be_made_is_refused_before_anything_starts(
+    option: str, tmp_path: Path
+) -> None:
+    ran = cpcbl_team("up", "--duration", 2, option, tmp_path / "nowhere" / "run.png")
+    assert ran.returncode == 2
+    assert ran.stderr.splitlines()[-1].startswith(f"cpcbl-team: {option} ")
+    assert "watch it" not in ran.stdout
+
+
+def test_a_folder_is_no_file_and_a_file_no_folder(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(ValueError, match=r"--report .*: a folder; name a file"):
+        file_for("--report", tmp_path)
+    with pytest.raises(ValueError, match=r"--logs .*; name a folder"):
+        folder_for("--logs", tmp_path / "file")
+
+
+def test_a_team_that_cannot_be_handed_to_its_processes_is_one_line() -> None:
+    with pytest.raises(TeamFileError, match=f"/dev/full: not written: {NO_SPACE}"):
+        save_resolved(TEAM, FULL)
+
+
+def test_a_process_whose_log_cannot_be_written_runs_without(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    (tmp_path / "sleeper.log").mkdir()  # no log can be written there
+    with Supervisor([ProcessSpec("sleeper", ("sleep", "60"))], tmp_path) as supervisor:
+        assert "sleeper" in supervisor.pids
+        supervisor.watch()
+    assert "sleeper.log: not written: Is a directory" in caplog.text
+
+
+def test_a_simulation_whose_picture_is_lost_still_reports(tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib")
+    path = tmp_path / "run.png"
+    path.symlink_to(FULL)
+    ran = cpcbl_team("simulate", "--duration", 4, "--picture", path, "--json")
+    assert ran.returncode == 1
+    assert json.loads(ran.stdout)["not_written"] == {str(path): NO_SPACE}
+
+
+def test_recording_a_simulation_onto_a_good_disk_loses_nothing(tmp_path: Path) -> None:
+    team = load_team(builtin("demo"))
+    report, _ = simulate(team, 1, 2.0, record=tmp_path / "run.mcap")
+    assert report.not_written == {}
