@@ -89,6 +89,9 @@ def test_a_robot_is_found_when_it_stays_right_for_a_second() -> None:
     lost = tracks_of("a", lost=(0.0, 15.0))
     assert found_after_s(notes_of([lost]), "a", AT_S, 0.3) == pytest.approx(5.0)
     assert lost_after_s(notes_of([lost]), "a", AT_S) == pytest.approx(0.0)
+    said = [status_at("a", 9.5, {"lost": 1}), status_at("a", 10.5, {"lost": 2})]
+    assert lost_after_s(notes_of([tracks_of("a")], (), said), "a", AT_S) == pytest.approx(0.5)
+    assert lost_after_s(notes_of([tracks_of("a")], (), said[:1]), "a", AT_S) is None
     never = tracks_of("a", lambda s: 1.0)
     assert found_after_s(notes_of([never]), "a", AT_S, 0.3) is None
 
