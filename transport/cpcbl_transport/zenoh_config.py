@@ -18,7 +18,10 @@ _EVERYBODY = {
     "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
     "timestamping": {"enabled": False},
     "transport": {
-        "link": {"tx": {"sequence_number_resolution": "16bit", "lease": LEASE_MS, "keep_alive": 4}}
+        "link": {"tx": {"sequence_number_resolution": "16bit", "lease": LEASE_MS, "keep_alive": 4}},
+        "shared_memory": {
+            "enabled": False
+        },  # a router kept 10 MiB of each session that sent > 3 kB
     },
 }
 
