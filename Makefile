@@ -4,7 +4,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN = $(VENV)/bin
 
-.PHONY: setup demo test check unit test-long bench clean
+.PHONY: setup demo test check unit test-long test-docker chaos bench clean
 
 setup: $(VENV)/ready
 
@@ -31,6 +31,14 @@ unit: setup
 # Minutes long; with CPCBL_MRCLAM=folder also on real logs.
 test-long: setup
 	$(BIN)/pytest -n 2 -m "$(if $(CPCBL_MRCLAM),long or log,long)"
+
+# Needs a Docker daemon: docker/dockerd.sh start. One at a time: containers share the machine.
+test-docker: setup
+	$(BIN)/pytest -m docker
+
+# Every fault scenario; those that need root or Docker say so where there is none.
+chaos: setup
+	$(BIN)/cpcbl-team chaos all --soak-s 180
 
 # Timed, so alone on the machine: the localizer's variants and their peers in the same run.
 bench: setup

@@ -17,6 +17,7 @@ Fusion = Literal["split-ci", "naive"]
 Direction = Literal["one-way", "both-ways"]
 Gives = Literal["both", "range", "bearing", "none"]
 Source = Literal["simulated", "mrclam", "external"]
+Security = Literal["none", "mtls"]
 
 
 class Table(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -99,6 +100,8 @@ class PositionSensor(Table, frozen=True, kw_only=True):
 
     sigma_m: Positive = 0.02
     rate_hz: Positive = 5.0
+    delay_s: NotNegative = 0.0
+    """Stamps are so much later than the measurement."""
 
 
 class Weights(Table, frozen=True, kw_only=True):
@@ -162,8 +165,8 @@ class TrustSettings(Table, frozen=True, kw_only=True):
     """How a teammate is found that says what is not so."""
 
     enabled: bool = True
-    limit: Positive = 50.0
-    """By how much (NIS beyond the usual, summed) it may surprise: four clear contradictions."""
+    limit: Positive = 30.0
+    """By how much it may surprise: three clear contradictions (summed NIS beyond the usual)."""
     readmit_s: NotNegative = 5.0
     """It is believed again when it was right for so long."""
     clock_ahead_s: NotNegative = 0.1
@@ -296,6 +299,19 @@ class TransportSettings(Table, frozen=True, kw_only=True):
     connect: tuple[str, ...] = ("tcp/127.0.0.1:7447",)
     """Endpoints at which a robot looks for the router."""
     guards: GuardSettings = GuardSettings()
+    security: Security = "none"
+    """mtls: every link is mutual TLS, and each certificate may say only what its owner may."""
+    keys: Annotated[str, msgspec.Meta(min_length=1)] = "keys"
+    """Folder of the keys that `cpcbl-team keys` makes, relative to the team file."""
+
+    @property
+    def secured(self) -> bool:
+        return self.security == "mtls"
+
+    @property
+    def usual(self) -> tuple[str, ...]:
+        """Where the router of this machine is looked for, unless the file says otherwise."""
+        return ("tls/127.0.0.1:7447",) if self.secured else ("tcp/127.0.0.1:7447",)
 
 
 class MatchSettings(Table, frozen=True, kw_only=True):
@@ -305,6 +321,14 @@ class MatchSettings(Table, frozen=True, kw_only=True):
     """Fixes and beliefs of all robots; 0: no limit. Each robot gets its share beforehand."""
     duration_s: Positive = 1200.0
     """They are earned evenly over this time."""
+
+
+class GuestSettings(Table, frozen=True, kw_only=True):
+    """Robots that are not in the file but may join the team while it runs, such as observers."""
+
+    allowed: bool = True
+    most: Annotated[int, msgspec.Meta(ge=1, le=100)] = 8
+    """So many at a time are let in by a robot, and by the simulated field."""
 
 
 class SimulationEvent(Table, frozen=True, kw_only=True):
@@ -342,6 +366,9 @@ class Team(Table, frozen=True, kw_only=True):
     transport: TransportSettings = TransportSettings()
     match: MatchSettings = MatchSettings()
     simulation: SimulationSettings = SimulationSettings()
+    guests: GuestSettings = GuestSettings()
+    defaults: RobotSettings = RobotSettings()
+    """The file's layer below its robots: what a guest begins with too."""
     calibrated_on: tuple[str, ...] = ()
     """Logs from which `calibrate` took the robots' types: no measure of their worth."""
     data: str = ""

@@ -84,7 +84,9 @@ class Voice(NamedTuple):
     still: bool = False
     """Whether the last of these was a way that it did not notice."""
     steady: int = 0
-    """Ways in a row that the wheels confirm."""
+    """Ways in a row that the wheels confirm,"""
+    struck_ns: int = NEVER_NS
+    """since they last denied one."""
     wrong_ns: int = NEVER_NS
     """When it last failed a test."""
     healthy: int = 0
@@ -181,7 +183,12 @@ def _driven(voice: Voice, said: Said) -> Voice:
     voice = voice._replace(anchor=now)
     if jumped or stayed:
         return voice._replace(
-            strikes=strikes + 1.0, still=stayed, steady=0, healthy=0, wrong_ns=now.stamp_ns
+            strikes=strikes + 1.0,
+            still=stayed,
+            steady=0,
+            struck_ns=now.stamp_ns,
+            healthy=0,
+            wrong_ns=now.stamp_ns,
         )
     followed = far or voice.reason != "frozen"  # a robot that stands cannot tell
     return voice._replace(steady=voice.steady + 1) if followed else voice
@@ -207,6 +214,8 @@ def judged(voices: Voices, name: str, said: Said, used_ns: int, rules: TrustSett
         return _in_quarantine(voices, name, said, rules)
     if voice.strikes > MOST_STRIKES and not _my_wheels(voices, name, rules):
         return _silenced(voices, name, said.stamp_ns, used_ns)
+    if said.surprise is None:
+        return Verdict(voices, True)
     return _settled(voices, name, said.stamp_ns, used_ns, rules)
 
 
@@ -312,14 +321,14 @@ def _reason(voice: Voice) -> str:
 
 def _in_quarantine(voices: Voices, name: str, said: Said, rules: TrustSettings) -> Verdict:
     voice, now = voices[name], said.stamp_ns
-    if voice.wrong_ns == now and said.surprise is not None and said.surprise > WRONG_NIS:
+    if voice.wrong_ns == now and (said.surprise is None or said.surprise > WRONG_NIS):
         voice = voice._replace(reason=_reason(voice))
         voices = {**voices, name: voice}
     long_ns = int(rules.readmit_s * 1e9)
     confirmed = any(v.agreed_ns >= now - WINDOW_NS for _, v in _lately(voices, now, name))
     right = voice.healthy >= LEAST_HEALTHY and now - voice.wrong_ns >= long_ns and confirmed
     alone = all(now - v.heard_ns > ALONE_NS for n, v in voices.items() if n != name)
-    steady = voice.steady >= LEAST_STEADY and now - voice.since_ns >= ALONE_NS
+    steady = voice.steady >= LEAST_STEADY and now - voice.struck_ns >= long_ns
     if not (right or (alone and steady)):
         return Verdict(voices, False)
     return Verdict({**voices, name: _freed(voice, now)}, True, "readmitted")

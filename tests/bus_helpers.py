@@ -31,6 +31,17 @@ PATIENCE_S = 10.0
 MAP = Field(landmarks={"oak": Landmark(x_m=4.0, y_m=0.0), "elm": Landmark(x_m=0.0, y_m=4.0)})
 
 
+def matches(keys: str, key: str) -> bool:
+    """Whether a key is one of `keys`: what patterns mean on every bus."""
+    pattern, chunks = keys.split("/"), key.split("/")
+    if pattern[-1] == "**":
+        pattern.pop()
+        chunks = chunks[: len(pattern)]
+    return len(pattern) == len(chunks) and all(
+        p in ("*", c) for p, c in zip(pattern, chunks, strict=True)
+    )
+
+
 def examples(count: int) -> settings:
     """So many examples of hypothesis, however long one takes."""
     return settings(max_examples=count, deadline=None, suppress_health_check=[HealthCheck.too_slow])

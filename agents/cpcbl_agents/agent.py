@@ -37,6 +37,12 @@ class Presence(NamedTuple):
     tier: int | None
 
 
+class Stranger(NamedTuple):
+    """Help has come from somebody who is neither in the team file nor known as a guest."""
+
+    robot: str
+
+
 class Listened(NamedTuple):
     """Whether any teammate listens to this robot's beliefs at present."""
 
@@ -50,7 +56,7 @@ class Sent(NamedTuple):
     size: int
 
 
-FromBus = Presence | Listened | Sent
+FromBus = Presence | Stranger | Listened | Sent
 Anything = Message | Tick | Located | Told | FromBus
 
 

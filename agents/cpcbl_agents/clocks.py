@@ -1,7 +1,7 @@
 """How far teammates' clocks are off this robot's, by what arrives: arrival minus stamp.
 
 A word cannot arrive before it was measured: one that does proves a clock that is ahead, or itself a
-fault. The least difference of the last 10 to 20 s (their lower envelope) says how far. A clock that
+fault. The least difference of the last 5 to 10 s (their lower envelope) says how far. A clock that
 is behind looks like a slow link: beyond what links take, its words are as useless either way.
 """
 
@@ -10,7 +10,7 @@ from typing import NamedTuple
 from cpcbl_team.config import TrustSettings
 from cpcbl_transport.messages import FUTURE_NS, LARGEST_NUMBER
 
-SPAN_NS = 10_000_000_000
+SPAN_NS = 5_000_000_000
 LEAST_WORDS = 5  # before a clock is called off: a single word may have waited, or be a fault
 NEVER_LATE_NS = 2**62
 

@@ -10,7 +10,8 @@ from typing import NamedTuple
 
 from msgspec.structs import replace
 
-from cpcbl_agents.agent import Anything, Listened, Located, Presence, Sent
+from cpcbl_agents.agent import Anything, Listened, Located, Presence, Sent, Stranger
+from cpcbl_agents.guests import Guests
 from cpcbl_agents.tally import Tallies
 from cpcbl_team.collaboration import LOWEST_TIER, fix_for, hears, next_tier
 from cpcbl_team.config import LocalizationSettings
@@ -46,8 +47,10 @@ class CollaborationAgent:
         teammates: frozenset[str],
         start_ns: int,
         budget: Budget,
+        guests: Guests | None = None,
     ) -> None:
         self._robot, self._settings, self._teammates = robot, settings, teammates
+        self.guests = guests or Guests()
         self._rules, self.budget = settings.collaboration, budget
         if settings.localizer.variant == "weighted":  # without a covariance worth cannot be judged
             self._rules = replace(self._rules, least_value=0.0, least_use=0.0, belief_share=0.0)
@@ -63,7 +66,7 @@ class CollaborationAgent:
         self.tier = LOWEST_TIER
         self.located: Located | None = None
         self.neighbours: frozenset[str] = frozenset()
-        """Teammates seen not long ago: their tiers are of interest."""
+        """Teammates seen not long ago, and whoever may be a guest: their tiers are of interest."""
         self.sources: frozenset[tuple[str, int]] = frozenset()
         """Teammates, with their tiers, whose beliefs are of use to this robot."""
 
@@ -79,9 +82,12 @@ class CollaborationAgent:
             case Located() if message.frame is not None:
                 return self._framed(message, now_ns)
             case Presence(name, tier):
+                self.guests.present(name, tier is not None)
                 self._tiers.pop(name, None)
-                if tier is not None:
+                if tier is not None and (name in self._teammates or name in self.guests):
                     self._tiers[name] = tier
+            case Stranger(name):
+                self.guests.notice(name, now_ns)
             case Listened():
                 self._listened, self._copy = message.by_any, None
             case Sent():
@@ -102,8 +108,14 @@ class CollaborationAgent:
     def _look_round(self, now: Located) -> None:
         """Chooses the teammates whose tiers are followed, and those whose beliefs are of use."""
         forgotten_ns = now.stamp_ns - NEIGHBOUR_NS
-        self._seen = {name: fix for name, fix in self._seen.items() if fix.stamp_ns > forgotten_ns}
-        self.neighbours = frozenset(self._seen)
+        self.guests.forget(now.stamp_ns)
+        guests = self.guests.followed
+        self._seen = {
+            name: fix
+            for name, fix in self._seen.items()
+            if fix.stamp_ns > forgotten_ns and (name in self._teammates or name in guests)
+        }
+        self.neighbours = guests.union(self._seen)
         if self._rules.passive:
             self.sources = frozenset(
                 (name, self._tiers[name])
@@ -142,7 +154,7 @@ class CollaborationAgent:
         fixes = (
             fix_for(s.id, self._robot, seen.stamp_ns, seen.estimate, s, self._settings.sensor)
             for s in seen.frame.sightings
-            if s.id in self._teammates
+            if s.id in self._teammates or self.guests.notice(s.id, seen.stamp_ns)
         )
         return [fix for fix in fixes if fix is not None]
 

@@ -3,7 +3,7 @@
 from collections import Counter, deque
 from collections.abc import Sequence
 
-from cpcbl_agents.agent import Anything, Located, Tick
+from cpcbl_agents.agent import Anything, Located, Presence, Tick
 from cpcbl_team.config import Field, LocalizationSettings
 from cpcbl_team.inputs import Belief, Fix, Input, Odometry, Position, Sightings, Told
 from cpcbl_team.localizer import Localizer
@@ -31,6 +31,7 @@ class FilterAgent:
         self.timeline = Timeline(localizer, localizer.start(start_ns))
         self.counts: Counter[str] = Counter()
         self._known = frozenset(field.landmarks) | frozenset(field.walls) | teammates
+        self._guests: set[str] = set()
         self._moves = settings.odometry.moves
         self._learns = settings.localizer.learns
         self._waiting: deque[Sightings] = deque()
@@ -66,13 +67,17 @@ class FilterAgent:
                 return self._frames_located(now_ns)
             case Sightings():
                 for sighting in message.sightings:
-                    if sighting.id not in self._known:
+                    if sighting.id not in self._known and sighting.id not in self._guests:
                         self.counts["unknown_object"] += 1
                 if self._take(message):
                     self._waiting.append(message)
                 return self._frames_located(now_ns)
             case Position() | Belief() | Fix() | Told():
                 self._take(message)
+            case Presence(name, None):
+                self._guests.discard(name)
+            case Presence(name) if name not in self._known:
+                self._guests.add(name)
             case Tick() if now_ns >= self.next_ns:
                 return [*self._frames_located(now_ns), *self._regularly(now_ns)]
         return ()

@@ -1,9 +1,11 @@
 """A robot on a bus: which keys it hears, what it may send, what it refuses."""
 
+import logging
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator
+from typing import Protocol
 
-from cpcbl_agents.agent import Listened, Presence, Sent, Tick
+from cpcbl_agents.agent import Listened, Presence, Sent, Stranger, Tick
 from cpcbl_agents.clocks import Clocks
 from cpcbl_agents.robot import Robot
 from cpcbl_agents.tally import Tallies
@@ -25,11 +27,28 @@ from cpcbl_transport.messages import (
     encode,
     refusal,
 )
-from cpcbl_transport.overhead import sent_bytes
+from cpcbl_transport.overhead import received_bytes, sent_bytes
 from cpcbl_transport.topics import Topic
+
+log = logging.getLogger(__name__)
 
 STATUS_NS = 1_000_000_000
 INBOX = 10_000
+
+
+class Stepped(Protocol):
+    """A robot's node, or whatever else is stepped like one."""
+
+    @property
+    def next_ns(self) -> int:
+        """When there is something to do even if nothing arrives."""
+
+    @property
+    def waiting(self) -> bool:
+        """Whether something has arrived."""
+
+    def step(self, now_ns: int) -> None:
+        """Does what is due and takes what has arrived."""
 
 
 class Node:
@@ -58,7 +77,7 @@ class Node:
         self._listened = ""
         self._status_ns = start_ns
         self.counts: Counter[str] = Counter()
-        self._heard = Tallies()
+        self.heard = Tallies()
         self._clocks = Clocks(rules.trust, speed) if rules.trust.enabled else None
         self._inputs = [
             bus.subscribe(topic.at(robot=robot.name), self._arrived) for topic in topics.INPUTS
@@ -116,8 +135,12 @@ class Node:
             presence = self._tokens.changed(*self._news.popleft())
             if presence is None:
                 self.counts["bad_token"] += 1
-            else:
-                self._robot.handle(Presence(*presence), now_ns)
+                continue
+            guests, (name, tier) = self._robot.collaboration.guests, presence
+            known = name in guests
+            self._robot.handle(Presence(name, tier), now_ns)
+            if known is not (name in guests):
+                log.info("%s: guest %s %s", self._name, name, "left" if known else "joined")
 
     def _ask_for_listeners(self, now_ns: int) -> None:
         tier = self._wiring.tier
@@ -137,12 +160,12 @@ class Node:
             self.counts[reason] += 1
             return None
         assert not isinstance(message, Refusal)
-        size = sent_bytes(len(payload))
+        size = len(payload)
         match message:
-            case Fix():
-                self._heard.of("fix", message.observer).add(size, message.stamp_ns)
-            case Belief():
-                self._heard.of("belief", message.robot).add(size, message.stamp_ns)
+            case Fix(observer=name):  # by a subscription to all observers
+                self.heard.of("fix", name).add(received_bytes(size, name), message.stamp_ns)
+            case Belief(robot=name):  # by one to this key
+                self.heard.of("belief", name).add(sent_bytes(size), message.stamp_ns)
         return message
 
     def _refused(self, key: str, message: Message, now_ns: int) -> Refusal | None:
@@ -155,7 +178,8 @@ class Node:
                 return refusal(message, now_ns)
             case _:
                 return Refusal.WRONG_TYPE
-        if sender not in self._team:
+        if sender not in self._team and sender not in self._robot.collaboration.guests:
+            self._robot.handle(Stranger(sender), now_ns)
             return Refusal.UNKNOWN_ROBOT
         if sender == self._name:
             return Refusal.OWN
@@ -197,7 +221,7 @@ class Node:
         located = self._robot.collaboration.located
         assert located is not None
         learned = self._robot.filter.learned
-        sent, heard = self._robot.collaboration.tallies.flows(), self._heard.flows()
+        sent, heard = self._robot.collaboration.tallies.flows(), self.heard.flows()
         return Status(
             self._name,
             self._incarnation,

@@ -1,5 +1,6 @@
 """One robot as one process: the loop around a node, ended by SIGINT or SIGTERM."""
 
+import logging
 import os
 import signal
 import threading
@@ -10,11 +11,15 @@ from types import FrameType
 import msgspec
 
 from cpcbl_agents.clock import Clock
-from cpcbl_agents.node import Node
+from cpcbl_agents.node import Node, Stepped
 from cpcbl_agents.robot import Robot
 from cpcbl_team.config import Team
 from cpcbl_transport.bus import Bus
+from cpcbl_transport.security import Identity, link_of
+from cpcbl_transport.topics import Role
 from cpcbl_transport.zenoh_bus import open_bus
+
+log = logging.getLogger(__name__)
 
 LONGEST_WAIT_S = 0.2
 LATE_NS = 1_000_000_000
@@ -66,12 +71,16 @@ def run_robot(
 
     `through` is what stands between the robot and its bus.
 
-    Raises BusError when stopped before a router answered, LogError for an unreadable log.
+    Raises BusError when stopped before a router answered, LogError for an unreadable log,
+    SecurityError without the keys of a secured team.
     """
     wake = Wake()
-    with open_bus(team.name, connect, give_up=stop) as bus:
+    link = link_of(team, Identity(Role.ROBOT, name), connect)
+    with open_bus(team.name, link.endpoints, stop, link.credentials) as bus:
         start_ns = clock.now_ns()
+        late_s = (start_ns - clock.epoch_ns) * 1e-9 / clock.speed
         if restarted or start_ns > clock.epoch_ns + LATE_NS * max(1.0, clock.speed):
+            log.warning("robot %s starts %.1f s after the team: it looks where it is", name, late_s)
             team = _not_knowing_its_start(name, team)
         incarnation = f"{os.getpid():x}"
         robot = Robot(name, team, start_ns, restarted)
@@ -79,7 +88,7 @@ def run_robot(
         run_node(node, wake, clock, stop)
 
 
-def run_node(node: Node, wake: Wake, clock: Clock, stop: Callable[[], bool]) -> None:
+def run_node(node: Stepped, wake: Wake, clock: Clock, stop: Callable[[], bool]) -> None:
     """Steps a node until `stop()`: when something arrives, which sets `wake`, or is due."""
     node.step(clock.now_ns())
     while not stop():

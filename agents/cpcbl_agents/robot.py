@@ -3,10 +3,11 @@
 from collections import Counter
 from pathlib import Path
 
-from cpcbl_agents.agent import Anything, FromBus, Sent, Tick
+from cpcbl_agents.agent import Anything, FromBus, Presence, Sent, Tick
 from cpcbl_agents.collaboration import CollaborationAgent
 from cpcbl_agents.driving import Pilot
 from cpcbl_agents.filtering import FilterAgent
+from cpcbl_agents.guests import Guests
 from cpcbl_agents.sensing import SensingAgent
 from cpcbl_agents.sources import Silent, Source
 from cpcbl_agents.sources.mrclam import MrclamSource
@@ -28,6 +29,7 @@ class Robot:
     def __init__(self, name: str, team: Team, start_ns: int, restarted: bool = False) -> None:
         settings = team.robots[name]
         teammates = frozenset(team.robots) - {name}
+        marks = frozenset(team.map.landmarks) | frozenset(team.map.walls)
         pilot = None
         if settings.source == "simulated":
             pilot = Pilot(name, settings.waypoints_m, settings.speed_m_s)
@@ -38,12 +40,14 @@ class Robot:
             source.skip_to(start_ns)
         self.name = name
         self._told_ns = start_ns
-        self.sensing = SensingAgent(settings, source, teammates, pilot)
+        self.sensing = SensingAgent(settings, source, marks, pilot)
         self.filter = FilterAgent(settings, team.map, teammates, start_ns)
         budget = Budget(
             settings.collaboration.budget, start_ns, team.messages_per_s(name), renewed=restarted
         )
-        self.collaboration = CollaborationAgent(name, settings, teammates, start_ns, budget)
+        most = team.guests.most if team.guests.allowed else 0
+        guests = Guests(marks | frozenset(team.robots), most)
+        self.collaboration = CollaborationAgent(name, settings, teammates, start_ns, budget, guests)
 
     def handle(self, message: Message | Tick | FromBus, now_ns: int) -> list[Message]:
         """Everything that one message (from the bus, or a tick) makes this robot say to others.
@@ -55,6 +59,9 @@ class Robot:
             return []
         if isinstance(message, FromBus):
             self.collaboration.handle(message, now_ns)
+            if isinstance(message, Presence):
+                there = message.robot in self.collaboration.guests
+                self.filter.handle(message if there else message._replace(tier=None), now_ns)
             if isinstance(message, Sent) and message.size:
                 self._told(message.message.stamp_ns, now_ns)
             return []
@@ -84,4 +91,5 @@ class Robot:
     @property
     def counts(self) -> Counter[str]:
         """What was used and what was refused so far, by reason."""
-        return self.sensing.counts + self.filter.all_counts
+        own = self.sensing.counts + self.filter.all_counts
+        return own + self.collaboration.guests.counts

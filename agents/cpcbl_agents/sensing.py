@@ -3,6 +3,8 @@
 from collections import Counter
 from collections.abc import Sequence
 
+import msgspec
+
 from cpcbl_agents.agent import Anything, Located, Tick
 from cpcbl_agents.driving import Pilot
 from cpcbl_agents.sources import Source
@@ -14,18 +16,23 @@ SensorInput = Odometry | Sightings | Position
 
 
 class SensingAgent:
-    """Polls the source, takes a driver's messages, corrects delays, blinds what is blind."""
+    """Polls the source, takes a driver's messages, corrects delays, blinds what is blind.
+
+    `marks`: what the map names. Whatever else is seen is a robot: a teammate, perhaps a guest.
+    """
 
     def __init__(
         self,
         settings: LocalizationSettings,
         source: Source,
-        teammates: frozenset[str],
+        marks: frozenset[str],
         pilot: Pilot | None = None,
     ) -> None:
         self._sensor, self._odometry = settings.sensor, settings.odometry
         self._sensor_delay_ns = int(settings.sensor.delay_s * 1e9)
-        self._source, self._teammates, self._pilot = source, teammates, pilot
+        own = settings.position_sensor
+        self._position_delay_ns = 0 if own is None else int(own.delay_s * 1e9)
+        self._source, self._marks, self._pilot = source, marks, pilot
         self.counts: Counter[str] = Counter()
 
     @property
@@ -51,15 +58,13 @@ class SensingAgent:
         if isinstance(item, Odometry):
             return corrected_odometry(item, self._odometry)
         if isinstance(item, Position):
-            return item
+            return msgspec.structs.replace(item, stamp_ns=item.stamp_ns - self._position_delay_ns)
         kept = tuple(
-            corrected_sighting(s, self._sensor, s.id in self._teammates)
+            corrected_sighting(s, self._sensor, s.id not in self._marks)
             for s in item.sightings
             if self._sees(s.id)
         )
         return Sightings(item.stamp_ns - self._sensor_delay_ns, kept)
 
     def _sees(self, name: str) -> bool:
-        if name in self._teammates:
-            return self._sensor.sees_robots
-        return self._sensor.sees_landmarks
+        return self._sensor.sees_landmarks if name in self._marks else self._sensor.sees_robots

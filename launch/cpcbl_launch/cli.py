@@ -10,7 +10,9 @@ import typer
 from cpcbl_launch.commands.deploying import compose
 from cpcbl_launch.commands.faults import chaos
 from cpcbl_launch.commands.measuring import calibrate, evaluate_mrclam, simulate
+from cpcbl_launch.commands.observing import observer
 from cpcbl_launch.commands.running import check, field, robot, router, up
+from cpcbl_launch.commands.securing import keys
 from cpcbl_launch.commands.watching import traffic
 from cpcbl_launch.experiments.cli import experiment_app
 
@@ -20,7 +22,10 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
-for command in (check, up, traffic, robot, router, field, compose, calibrate, simulate, chaos):
+for command in (
+    *(check, keys, up, traffic, robot, observer, router, field, compose),
+    *(calibrate, simulate, chaos),
+):
     app.command()(command)
 
 evaluate_app = typer.Typer(help="Real logs in one process: deterministic and fast.")

@@ -8,13 +8,14 @@ from typing import NamedTuple, Protocol
 
 import msgspec
 
-from cpcbl_agents.node import Node
+from cpcbl_agents.node import Node, Stepped
 from cpcbl_agents.robot import Robot
 from cpcbl_launch.field import FieldNode, SimulatedField
 from cpcbl_launch.logs import LoggedTeam, seen_before, shortened
 from cpcbl_launch.options import check_limit
 from cpcbl_launch.recorder import Recorder, Report
 from cpcbl_launch.recording import Recording
+from cpcbl_launch.visitors import Visiting, Visitor
 from cpcbl_launch.yardstick import inputs_of, scored, yardsticks
 from cpcbl_team.config import Team
 from cpcbl_team.metrics import Trajectory
@@ -132,9 +133,10 @@ def simulate(
     referee: Referee | None = None,
     record: Path | None = None,
     progress: Progress | None = None,
+    visitors: Sequence[Visitor] = (),
     through: Mapping[str, Through] = MappingProxyType({}),
 ) -> tuple[Report, Recorder]:
-    """A simulated team, field and robots in one process.
+    """A simulated team, field and robots in one process, with guests that come and go.
 
     `truth` is the team as it really is, where that is not what its robots believe; a `referee` may
     end the run before its time; `record` is the file to record it into; `through` is what stands
@@ -147,8 +149,9 @@ def simulate(
     over = (lambda: False) if referee is None else (lambda: referee.over)
     with Recording(record, team, hub.session()) if record is not None else nullcontext():
         field = FieldNode(SimulatedField(truth or team, seed, 0), hub.session())
-        nodes = robot_nodes(team, hub, 0, through)
-        run_nodes([field, *nodes], 0, end_ns, progress, over)
+        guests = [Visiting(visitor, team, hub) for visitor in visitors]
+        nodes = [field, *robot_nodes(team, hub, 0, through), *guests]
+        run_nodes(nodes, 0, end_ns, progress, over)
     return simulated_report(recorder, team), recorder
 
 
@@ -160,7 +163,7 @@ def simulated_report(recorder: Recorder, team: Team) -> Report:
 
 def robot_nodes(
     team: Team, hub: MemoryHub, start_ns: int, through: Mapping[str, Through] = MappingProxyType({})
-) -> list["Stepped"]:
+) -> list[Stepped]:
     """A node for each robot, each with a session of its own."""
 
     def session(name: str) -> Bus:
@@ -171,18 +174,6 @@ def robot_nodes(
         Node(Robot(name, team, start_ns), team, session(name), start_ns, "0")
         for name in team.robots
     ]
-
-
-class Stepped(Protocol):
-    """A robot's or the field's node."""
-
-    @property
-    def next_ns(self) -> int: ...
-
-    @property
-    def waiting(self) -> bool: ...
-
-    def step(self, now_ns: int) -> None: ...
 
 
 def run_nodes(

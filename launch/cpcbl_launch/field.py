@@ -2,6 +2,7 @@
 
 Robots send wheel commands (`field/drive/<robot>`); the field answers like a driver would, with
 odometry and sightings under the robots' `in/` keys. Deterministic for a seed and the same commands.
+Guests have a body on it for as long as they ask for it (`field/join/<robot>`).
 """
 
 import logging
@@ -17,6 +18,7 @@ from msgspec.structs import replace
 
 from cpcbl_agents.clock import Clock
 from cpcbl_agents.sensing import SensorInput
+from cpcbl_launch.bodies import Bodies
 from cpcbl_launch.grid import Grid
 from cpcbl_team.config import (
     OdometrySettings,
@@ -29,14 +31,16 @@ from cpcbl_team.geometry import Pose2, step, wrap_angle
 from cpcbl_team.inputs import Odometry, Position, Sighting, Sightings
 from cpcbl_team.sensors import LEAST_COSINE
 from cpcbl_transport import topics
-from cpcbl_transport.bus import Bus, Publisher
-from cpcbl_transport.messages import Drive, Refusal, Truth, Truths, encode, refusal
+from cpcbl_transport.bus import Bus, Handle, Publisher
+from cpcbl_transport.messages import Body, Drive, Join, Refusal, Truth, Truths, encode, refusal
 from cpcbl_transport.reading import read
 
 log = logging.getLogger(__name__)
 
 COMMAND_LASTS_NS = 500_000_000
 INBOX = 10_000
+MOST_REFUSED = 100  # guests whose refusal is logged
+_GUEST_SEED = 2**31  # no robot of a team file has this number
 NOWHERE: Mapping[str, Bus] = MappingProxyType({})
 
 
@@ -132,6 +136,7 @@ class SimulatedRobot:
         self._reported, self._reported_ns = (0.0, 0.0), start_ns
         self._motion = Delayed(settings.odometry.delay_s * 1e9 / step_ns)
         self._frames: deque[Sightings] = deque()
+        self._positions: deque[Position] = deque()
         self._errors: dict[tuple[str, str], tuple[int, float]] = {}
         self._odometry_timer = Every(settings.odometry.rate_hz)
         self._frame_timer = Every(settings.sensor.rate_hz)
@@ -175,18 +180,19 @@ class SimulatedRobot:
         if self._frame_timer.due(now_ns):
             seen = tuple(s for o in objects if (s := self._sighted(o, now_ns)))
             self._frames.append(Sightings(now_ns + int(self.settings.sensor.delay_s * 1e9), seen))
-        out = []
-        while self._frames and self._frames[0].stamp_ns <= now_ns:
-            out.append(self._frames.popleft())
-        return out
+        return _out(self._frames, now_ns)
 
-    def position(self, now_ns: int) -> Position | None:
-        """What the position sensor says, if there is one and it is due."""
+    def positions(self, now_ns: int) -> list[Position]:
+        """What the position sensor has said by now, if there is one: `delay_s` after it measured,
+        with the stamp of that time."""
         sensor = self.settings.position_sensor
-        if sensor is None or not self._position_timer.due(now_ns):
-            return None
-        x, y = (v + self._normal(sensor.sigma_m) for v in self.pose[:2])
-        return Position(now_ns, x, y, (sensor.sigma_m**2, 0.0, sensor.sigma_m**2))
+        if sensor is None:
+            return []
+        if self._position_timer.due(now_ns):
+            x, y = (v + self._normal(sensor.sigma_m) for v in self.pose[:2])
+            variance, stamp_ns = sensor.sigma_m**2, now_ns + int(sensor.delay_s * 1e9)
+            self._positions.append(Position(stamp_ns, x, y, (variance, 0.0, variance)))
+        return _out(self._positions, now_ns)
 
     def _sighted(self, seen: Seen, now_ns: int) -> Sighting | None:
         sensor = self.settings.sensor
@@ -223,11 +229,22 @@ class SimulatedRobot:
         return float(self._random.normal(0.0, sigma)) * self._noise if sigma else 0.0
 
 
+Stamped = TypeVar("Stamped", Sightings, Position)
+
+
+def _out(waiting: deque[Stamped], now_ns: int) -> list[Stamped]:
+    """What is stamped with a time that has come."""
+    out = []
+    while waiting and waiting[0].stamp_ns <= now_ns:
+        out.append(waiting.popleft())
+    return out
+
+
 class SimulatedField:
     """All robots of a team on one field, in fixed steps of time."""
 
     def __init__(self, team: Team, seed: int, start_ns: int) -> None:
-        self._team = team
+        self.team, self._seed = team, seed
         self._step_ns = int(1e9 / team.simulation.step_rate_hz)
         self.now_ns = start_ns
         self.robots = {
@@ -237,14 +254,34 @@ class SimulatedField:
             for i, (name, settings) in enumerate(team.robots.items())
             if settings.source == "simulated"
         }
-        marks = [Seen(n, m.x_m, m.y_m, m.gives) for n, m in team.map.landmarks.items()]
-        ranges_m = [robot.settings.sensor.max_range_m for robot in self.robots.values()]
-        self._reach_m = max(ranges_m, default=0.0)
-        self._marks_to_see = Grid(self._reach_m, marks)
-        self._marks_to_touch = Grid(team.simulation.bump_radius_m, marks)
+        self._marks = [Seen(n, m.x_m, m.y_m, m.gives) for n, m in team.map.landmarks.items()]
+        self._marks_to_touch = Grid(team.simulation.bump_radius_m, self._marks)
         self._start_ns = start_ns
         self._events = deque(sorted(team.simulation.events, key=lambda event: event.at_s))
         self._hidden_until_ns = start_ns
+        self._look()
+
+    def _look(self) -> None:
+        """How far anybody sees, and what there is to see so far around."""
+        ranges_m = [robot.settings.sensor.max_range_m for robot in self.robots.values()]
+        self._reach_m = max(ranges_m, default=0.0)
+        self._marks_to_see = Grid(self._reach_m, self._marks)
+
+    def join(self, name: str, body: Body) -> None:
+        """A guest has a body from now on. Its noise is its own: the others' stays what it was."""
+        settings = RobotSettings(
+            start=body.start,
+            sensor=body.sensor,
+            odometry=body.odometry,
+            position_sensor=body.position_sensor,
+        )
+        seed, noise = (self._seed, _GUEST_SEED, *name.encode()), self.team.simulation.noise
+        self.robots[name] = SimulatedRobot(settings, noise, seed, self.now_ns, self._step_ns)
+        self._look()
+
+    def leave(self, name: str) -> None:
+        del self.robots[name]
+        self._look()
 
     @property
     def next_ns(self) -> int:
@@ -252,7 +289,7 @@ class SimulatedField:
 
     def ahead_ns(self, robot: str) -> int:
         """How far a robot's clock is ahead of the field's."""
-        return int(self._team.simulation.clocks_ahead_s.get(robot, 0.0) * 1e9)
+        return int(self.team.simulation.clocks_ahead_s.get(robot, 0.0) * 1e9)
 
     def command(self, drive: Drive) -> None:
         """A robot's wheels from now on; commands for unknown robots are ignored."""
@@ -275,8 +312,7 @@ class SimulatedField:
         for name, robot in self.robots.items():
             piece = robot.odometry(self.now_ns)
             frames = robot.sightings(self.now_ns, self._visible(name, robot.pose, mates))
-            position = robot.position(self.now_ns)
-            items = (piece, *frames, position)
+            items = (piece, *frames, *robot.positions(self.now_ns))
             sensed += [(name, item) for item in items if item is not None]
         return sensed
 
@@ -302,7 +338,7 @@ class SimulatedField:
         yield from (mate for mate in mates.near(pose.x, pose.y) if mate.name != viewer)
 
     def _walls(self, pose: Pose2) -> Iterable[Seen]:
-        for name, wall in self._team.map.walls.items():
+        for name, wall in self.team.map.walls.items():
             (ax, ay), (bx, by) = wall.from_m, wall.to_m
             length = math.hypot(bx - ax, by - ay)
             ux, uy = (bx - ax) / length, (by - ay) / length
@@ -311,7 +347,7 @@ class SimulatedField:
                 yield Seen(name, ax + along * ux, ay + along * uy, wall.gives)
 
     def _bump(self, robot: SimulatedRobot) -> None:
-        radius = self._team.simulation.bump_radius_m
+        radius = self.team.simulation.bump_radius_m
         touching = frozenset(
             mark.name
             for mark in self._marks_to_touch.near(robot.pose.x, robot.pose.y)
@@ -327,23 +363,32 @@ class FieldNode:
     """
 
     def __init__(self, field: SimulatedField, bus: Bus, sites: Mapping[str, Bus] = NOWHERE) -> None:
-        self._field = field
-        self._drives: deque[tuple[str, bytes]] = deque(maxlen=INBOX)
+        self._field, self._bus, self._sites = field, bus, sites
+        self._bodies = Bodies(field.team)
+        self._guests: dict[str, str] = {}  # with the incarnation that asked
+        self._refused: set[str] = set()
+        self._said: deque[tuple[str, bytes]] = deque(maxlen=INBOX)
         self.counts: Counter[str] = Counter()
-        """Commands that were taken (`drive`), and what was refused, by reason."""
+        """What was taken (`drive`, `join`), and what was refused, by reason."""
         self._truth = bus.publisher(topics.TRUTH.at(), topics.TRUTH.qos)
         self._publishers: dict[tuple[str, type], Publisher] = {}
+        self._driven: dict[str, Handle] = {}
         for name in field.robots:
-            for topic in topics.INPUTS:
-                assert topic.carries is not None
-                publisher = sites.get(name, bus).publisher(topic.at(robot=name), topic.qos)
-                self._publishers[name, topic.carries] = publisher
-            sites.get(name, bus).subscribe(topics.DRIVE.at(robot=name), self._arrived)
+            self._declare(name)
+        bus.subscribe(topics.JOIN.at(), self._arrived)
+
+    def _declare(self, name: str) -> None:
+        bus = self._sites.get(name, self._bus)
+        for topic in topics.INPUTS:
+            assert topic.carries is not None
+            publisher = bus.publisher(topic.at(robot=name), topic.qos)
+            self._publishers[name, topic.carries] = publisher
+        self._driven[name] = bus.subscribe(topics.DRIVE.at(robot=name), self._arrived)
 
     def _arrived(self, key: str, payload: bytes) -> None:
-        if len(self._drives) == INBOX:
+        if len(self._said) == INBOX:
             self.counts["inbox_overflow"] += 1
-        self._drives.append((key, payload))
+        self._said.append((key, payload))
 
     @property
     def next_ns(self) -> int:
@@ -355,13 +400,11 @@ class FieldNode:
 
     def step(self, now_ns: int) -> None:
         """Advances the field to `now_ns` and tells the robots what they sense."""
-        while self._drives:
-            drive = self._read(*self._drives.popleft(), now_ns)
-            if isinstance(drive, Refusal):
-                self.counts[drive] += 1
-            else:
-                self.counts["drive"] += 1
-                self._field.command(drive)
+        while self._said:
+            reason = self._taken(*self._said.popleft(), now_ns)
+            if reason is not None:
+                self.counts[reason] += 1
+        self._let_in_and_out(now_ns)
         while self._field.next_ns <= now_ns:
             for name, sensed in self._field.advance():
                 stamped = later(sensed, self._field.ahead_ns(name))
@@ -369,22 +412,59 @@ class FieldNode:
             if self._truth.matching:
                 self._truth.put(encode(self._field.truth()))
 
-    def _read(self, key: str, payload: bytes, now_ns: int) -> Drive | Refusal:
-        """A command for a robot of this field, by the field's clock, or why there is none."""
-        drive = read(key, payload)
-        if isinstance(drive, Refusal):
-            return drive
-        assert isinstance(drive, Drive)
-        if drive.robot not in self._field.robots:
-            return Refusal.UNKNOWN_ROBOT
-        drive = later(drive, -self._field.ahead_ns(drive.robot))
-        return refusal(drive, now_ns) or drive
+    def _taken(self, key: str, payload: bytes, now_ns: int) -> Refusal | None:
+        """Does what a robot says, by the field's clock; or why not."""
+        said = read(key, payload)
+        if isinstance(said, Refusal):
+            return said
+        assert isinstance(said, Drive | Join)
+        if isinstance(said, Drive):
+            if said.robot not in self._field.robots:
+                return Refusal.UNKNOWN_ROBOT
+            said = later(said, -self._field.ahead_ns(said.robot))
+        reason = refusal(said, now_ns)
+        if reason is not None:
+            return reason
+        self.counts[type(said).__name__.lower()] += 1
+        if isinstance(said, Drive):
+            self._field.command(said)
+        else:
+            self._asked(said, now_ns)
+        return None
+
+    def _asked(self, join: Join, now_ns: int) -> None:
+        reason = self._bodies.ask(join, now_ns)
+        if reason and len(self._refused) < MOST_REFUSED and join.robot not in self._refused:
+            self._refused.add(join.robot)
+            log.warning("guest %s gets no body: %s", join.robot, reason)
+
+    def _let_in_and_out(self, now_ns: int) -> None:
+        """Guests that ask for a body get it, those that leave or are silent lose it."""
+        present = self._bodies.present(now_ns)
+        for name, incarnation in list(self._guests.items()):
+            if name not in present or present[name].incarnation != incarnation:
+                self._let_out(name)
+        for name, join in present.items():
+            if name not in self._guests and join.body is not None:
+                self._guests[name] = join.incarnation
+                self._field.join(name, join.body)
+                self._declare(name)
+                log.info("guest %s joined the field", name)
+
+    def _let_out(self, name: str) -> None:
+        del self._guests[name]
+        self._field.leave(name)
+        for topic in topics.INPUTS:
+            assert topic.carries is not None
+            self._publishers.pop((name, topic.carries)).close()
+        self._driven.pop(name).close()
+        log.info("guest %s left the field", name)
 
 
-Stamped = TypeVar("Stamped", bound=SensorInput | Drive)
+Moved = TypeVar("Moved", bound=SensorInput | Drive)
 
 
-def later(message: Stamped, ns: int) -> Stamped:
+def later(message: Moved, ns: int) -> Moved:
     """The message by a clock that is so far ahead."""
     if not ns:
         return message

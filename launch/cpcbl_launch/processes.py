@@ -9,6 +9,8 @@ from typing import NamedTuple
 from cpcbl_agents.clock import Clock
 from cpcbl_launch.supervisor import ProcessSpec
 from cpcbl_team.config import Team
+from cpcbl_transport.security import Identity
+from cpcbl_transport.topics import Role
 
 PROGRAM = (sys.executable, "-m", "cpcbl_launch")
 ROBOT = "robot-"
@@ -19,18 +21,26 @@ class Task(NamedTuple):
 
     name: str
     arguments: tuple[str, ...]
+    identity: Identity
+    """Whose keys it needs in a secured team."""
     on_restart: tuple[str, ...] = ()
 
 
 def tasks(team: Team, common: tuple[str, ...], seed: int, here: Collection[str]) -> list[Task]:
     """name | arguments | when: the field if any robot is simulated, one process a robot."""
     rows = [
-        Task(ROBOT + name, ("robot", name, *common), ("--restarted",))
+        Task(
+            ROBOT + name,
+            ("robot", name, *common),
+            Identity(Role.ROBOT, name),
+            ("--restarted",),
+        )
         for name in team.robots
         if name in here
     ]
-    if any(robot.source == "simulated" for robot in team.robots.values()):
-        rows.insert(0, Task("field", ("field", "--seed", str(seed), *common)))
+    if is_simulated(team):
+        field = ("field", "--seed", str(seed), *common)
+        rows.insert(0, Task("field", field, Identity(Role.FIELD)))
     return rows
 
 
@@ -52,3 +62,8 @@ def process_table(
         )
         for task in tasks(team, common, seed, here)
     ]
+
+
+def is_simulated(team: Team) -> bool:
+    """Whether the team has a field of its own."""
+    return any(robot.source == "simulated" for robot in team.robots.values())

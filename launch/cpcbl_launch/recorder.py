@@ -57,6 +57,29 @@ class RobotReport(Score, frozen=True, kw_only=True):
     """Teammates that it heard at the end, or that were in quarantine."""
 
 
+class Phase(Score, frozen=True, kw_only=True):
+    """A robot's figures in a part of a run; None for what nothing is known of."""
+
+    position_sigma_m: float | None
+    """Root mean square of what the robot itself claims; needs no truth."""
+
+
+class Effect(msgspec.Struct, frozen=True, kw_only=True):
+    """A robot before a guest came, while it was there, and after it was gone."""
+
+    before: Phase
+    during: Phase
+    after: Phase
+
+
+class GuestReport(RobotReport, frozen=True, kw_only=True):
+    """A guest's own figures, when it was there, and what that did to the robots of the team."""
+
+    present_s: tuple[tuple[float, float], ...]
+    """From when until when, since the start of the run."""
+    robots: dict[str, Effect]
+
+
 class MeanScore(msgspec.Struct, frozen=True, kw_only=True):
     """Means over the robots that could be scored."""
 
@@ -101,8 +124,10 @@ class Report(msgspec.Struct, frozen=True, kw_only=True):
     """What the recorder heard and could not use, by reason."""
     not_written: dict[str, str] = {}
     """Files that could not be written, with the reason."""
-    alone: dict[str, Score] = {}
+    alone: dict[str, Phase] = {}
     """Before collaboration began, where it began late."""
+    guests: dict[str, GuestReport] = {}
+    """Robots that the team file does not name; no part of the team's figures."""
     yardsticks: dict[str, YardstickReport] = {}
     """dead_reckoning, solo_ekf, centralized_ekf, where they were asked for."""
 
@@ -191,34 +216,41 @@ class Recorder:
         from_s: float = -np.inf,
     ) -> Report:
         """The figures of all robots from `from_s` on."""
-        _, _, last_truth = self.latest()
-        robots = {}
-        for name, variant in variants.items():
-            figures = score(self.samples(name, truth.get(name), from_s))
-            tracks = self.tracks.get(name, [])
-            statuses = [
-                *self._done.get(name, ()),
-                *([self.status[name]] if name in self.status else []),
-            ]
-            robots[name] = RobotReport(
-                **msgspec.structs.asdict(figures),
-                variant=variant,
-                lost_share=sum(bool(t.lost) for t in tracks) / max(len(tracks), 1),
-                longest_lost_s=_longest_lost_s(tracks),
-                lost_at_end=tracks[-1].lost if tracks else "was never heard of",
-                bumps=last_truth[name].bumps if name in last_truth else 0,
-                messages_sent=sum(s.messages_sent for s in statuses),
-                bytes_sent=sum(s.bytes_sent for s in statuses),
-                messages_received=sum(s.messages_received for s in statuses),
-                bytes_received=sum(s.bytes_received for s in statuses),
-                counts=_added(statuses),
-                learned=_learned(statuses),
-                sent=summed_flows(s.sent for s in statuses),
-                heard=summed_flows(s.heard for s in statuses),
-                spending=summed_spending(s.spending for s in statuses),
-                trust=trust_of(statuses),
-            )
+        robots = {
+            name: self.robot_report(name, variant, truth.get(name), from_s)
+            for name, variant in variants.items()
+        }
         return Report(robots=robots, team=_team(robots), refused=self.refused)
+
+    def robot_report(
+        self, name: str, variant: str, truth: Floats | None, from_s: float = -np.inf
+    ) -> RobotReport:
+        """One robot's figures from `from_s` on."""
+        _, _, last_truth = self.latest()
+        figures = score(self.samples(name, truth, from_s))
+        tracks = self.tracks.get(name, [])
+        statuses = [
+            *self._done.get(name, ()),
+            *([self.status[name]] if name in self.status else []),
+        ]
+        return RobotReport(
+            **msgspec.structs.asdict(figures),
+            variant=variant,
+            lost_share=sum(bool(t.lost) for t in tracks) / max(len(tracks), 1),
+            longest_lost_s=_longest_lost_s(tracks),
+            lost_at_end=tracks[-1].lost if tracks else "was never heard of",
+            bumps=last_truth[name].bumps if name in last_truth else 0,
+            messages_sent=sum(s.messages_sent for s in statuses),
+            bytes_sent=sum(s.bytes_sent for s in statuses),
+            messages_received=sum(s.messages_received for s in statuses),
+            bytes_received=sum(s.bytes_received for s in statuses),
+            counts=_added(statuses),
+            learned=_learned(statuses),
+            sent=summed_flows(s.sent for s in statuses),
+            heard=summed_flows(s.heard for s in statuses),
+            spending=summed_spending(s.spending for s in statuses),
+            trust=trust_of(statuses),
+        )
 
 
 def truth_rows(truths: Iterable[Truths]) -> dict[str, Floats]:

@@ -25,7 +25,8 @@ from cpcbl_team.inputs import Odometry, Position, Sightings
 from cpcbl_team.metrics import Floats
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus
-from cpcbl_transport.messages import Message, Refusal, Truths, decode, refusal
+from cpcbl_transport.messages import Message, Refusal, Truths, refusal
+from cpcbl_transport.reading import read
 
 log = logging.getLogger(__name__)
 
@@ -50,7 +51,7 @@ class Recording(AbstractContextManager["Recording"]):
         self._handles = [bus.subscribe(topic.at(), self._arrived) for topic in RECORDED]
 
     def _arrived(self, key: str, payload: bytes) -> None:
-        message = decode(payload)
+        message = read(key, payload)
         if isinstance(message, Refusal) or refusal(message, message.stamp_ns) is not None:
             return
         if not 0 <= message.stamp_ns < LAST_NS:

@@ -6,8 +6,10 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-from cpcbl_team.config import Team, TransportSettings
+from cpcbl_team.config import Team
 from cpcbl_transport.guards import guard_rules
+from cpcbl_transport.security import Identity, access_control, link_of
+from cpcbl_transport.topics import Role
 from cpcbl_transport.zenoh_bus import listening_at, open_plain_router
 from cpcbl_transport.zenoh_config import router_config
 
@@ -22,10 +24,13 @@ def team_router(
     """The configuration of a team's router; without `listen` where its file says.
 
     A file that does not say gets the endpoint at which robots of this machine look. `connect`:
-    the routers of other sites; `speed`: robot time over real time.
+    the routers of other sites; `speed`: robot time over real time. Raises SecurityError without the
+    keys of a secured team.
     """
-    here = listen or team.transport.listen or TransportSettings().connect
-    return router_config(here, connect, guard_rules(team, speed))
+    here = listen or team.transport.listen or team.transport.usual
+    _, credentials = link_of(team, Identity(Role.ROUTER), [*here, *connect])
+    guards = guard_rules(team, speed) | access_control(team)
+    return router_config(here, connect, guards, credentials)
 
 
 def written_config(config: Mapping[str, Any], title: str) -> str:

@@ -1,7 +1,7 @@
 """What a person sees: the live table, the report, progress. Fits 80 columns."""
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 
 from rich.console import Console
@@ -10,8 +10,18 @@ from rich.table import Table
 from rich.text import Text
 
 from cpcbl_launch.live import LiveView
+from cpcbl_launch.observer import Visited
+from cpcbl_launch.phases import AWAY_S
 from cpcbl_launch.processes import ROBOT
-from cpcbl_launch.recorder import LearnedReport, MeanScore, Recorder, Report
+from cpcbl_launch.recorder import (
+    Effect,
+    GuestReport,
+    LearnedReport,
+    MeanScore,
+    Recorder,
+    Report,
+    RobotReport,
+)
 from cpcbl_launch.standing import distrusted, trust_remarks
 from cpcbl_launch.supervisor import Processes
 from cpcbl_launch.tables import number, percent, short, table
@@ -28,9 +38,12 @@ Cell = str | Text
 class LiveTable(LiveView):
     """The team as it runs: redrawn on a terminal, else a snapshot every few seconds."""
 
-    def __init__(self, title: str, console: Console, quiet: bool = False) -> None:
+    def __init__(
+        self, title: str, robots: Collection[str], console: Console, quiet: bool = False
+    ) -> None:
+        """`robots`: those of the team file; who else is heard of is a guest."""
         super().__init__(console, quiet)
-        self._title = title
+        self._title, self._robots = title, robots
 
     def show(self, recorder: Recorder, processes: Processes, elapsed_s: float) -> None:
         """Called several times a second."""
@@ -46,13 +59,17 @@ class LiveTable(LiveView):
         shown.add_column("", overflow="fold")
         pids, restarts = processes.pids, processes.restarts
         here = [n.removeprefix(ROBOT) for n in processes.names if n.startswith(ROBOT)]
-        for name in [*here, *sorted(tracks.keys() - set(here))]:
+        newest_ns = max((t.stamp_ns for t in tracks.values()), default=0)
+        for name in [*here, *sorted(tracks.keys() - set(here), key=self._guests_last)]:
             process = f"{ROBOT}{name}"
             pid = str(pids[process]) if process in pids else "down" if name in here else "away"
             state = _state(tracks.get(name), pid, restarts.get(process, 0))
             status = statuses.get(name)
             if status is not None and (said := distrusted(status.trust)):
                 state.append(f", {said}", "yellow")
+            if name not in self._robots:
+                there = newest_ns - tracks[name].stamp_ns <= AWAY_S * 1e9
+                pid, state = "guest", state if there else Text("left", "dim")
             shown.add_row(
                 name,
                 pid,
@@ -61,6 +78,9 @@ class LiveTable(LiveView):
                 state,
             )
         return shown
+
+    def _guests_last(self, name: str) -> tuple[bool, str]:
+        return name not in self._robots, name
 
 
 def _state(track: Track | None, pid: str, restarts: int) -> Text:
@@ -114,14 +134,8 @@ def print_report(report: Report, console: Console) -> None:
     )
     for name, r in report.robots.items():
         alone = report.alone.get(name)
-        figures.add_row(
-            name,
-            *([number(alone.position_rmse_m)] if alone is not None else []),
-            *_figures(r),
-            percent(r.lost_share),
-            short(r.messages_sent),
-            short(r.bytes_sent),
-        )
+        before_m = [] if alone is None else [number(alone.position_rmse_m)]
+        figures.add_row(name, *before_m, *_robot_cells(r))
     t = report.team
     known = [s.position_rmse_m for s in report.alone.values() if s.position_rmse_m is not None]
     figures.add_section()
@@ -134,7 +148,14 @@ def print_report(report: Report, console: Console) -> None:
         short(t.bytes_sent),
         style="bold",
     )
+    if report.guests:
+        figures.add_section()
+    for name, guest in report.guests.items():
+        figures.add_row(f"{name}, guest", *("-" for _ in before), *_robot_cells(guest))
     console.print(figures)
+    for name, guest in report.guests.items():
+        console.print()
+        console.print(_effects(name, guest))
     if any(r.sent or r.spending for r in report.robots.values()):
         console.print()
         console.print(spent_table(report))
@@ -145,6 +166,45 @@ def print_report(report: Report, console: Console) -> None:
         console.print(_yardsticks(report))
     for line in _remarks(report):
         console.print(line, style="yellow", highlight=False, markup=False)  # robots may say [/b]
+
+
+def _robot_cells(r: RobotReport) -> list[str]:
+    """The cells of a robot from FIGURES on."""
+    return [*_figures(r), percent(r.lost_share), short(r.messages_sent), short(r.bytes_sent)]
+
+
+def _effects(name: str, guest: GuestReport) -> Table:
+    """What a guest's presence did to each robot."""
+    parts = Effect.__struct_fields__
+    present = ", ".join(f"{a:.1f} to {b:.1f} s" for a, b in guest.present_s)
+    shown = table(
+        f"before, during, after guest {name}: there from {present}",
+        ("robot",),
+        [f"{what} {part}" for what in ("RMSE", "σ") for part in parts],
+    )
+    for robot, effect in guest.robots.items():
+        phases = [getattr(effect, part) for part in parts]
+        rmse = [number(p.position_rmse_m) for p in phases]
+        shown.add_row(robot, *rmse, *(number(p.position_sigma_m) for p in phases))
+    return shown
+
+
+def print_visit(visited: Visited, console: Console) -> None:
+    """What an observer did while it was there."""
+    sigma = number(visited.position_sigma_m)
+    said = f"{visited.name} was there for {visited.seconds:.1f} s, σ {sigma} m at the end"
+    console.print(said, style="bold", highlight=False)
+    shown = table("", ("help",), ("messages", "B"))
+    for said, flows in (("sent", visited.sent), ("heard", visited.heard)):
+        for flow in flows:
+            peer = f" {'to' if said == 'sent' else 'from'} {flow.peer}" if flow.peer else ""
+            shown.add_row(f"{flow.topic} {said}{peer}", short(flow.messages), short(flow.bytes))
+    if shown.row_count:
+        console.print(shown)
+    if visited.lost:
+        console.print(f"{visited.name} is lost: {visited.lost}", style="yellow", highlight=False)
+    if visited.unfed:
+        console.print(f"{visited.name}: {visited.unfed}", style="yellow", highlight=False)
 
 
 def _yardsticks(report: Report) -> Table:

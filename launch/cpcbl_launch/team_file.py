@@ -7,7 +7,7 @@ import difflib
 import math
 import re
 import tomllib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from importlib import resources
 from pathlib import Path
 from typing import Any, get_args, get_origin, get_type_hints
@@ -16,6 +16,7 @@ import msgspec
 
 from cpcbl_team.config import (
     Field,
+    GuestSettings,
     Landmark,
     MatchSettings,
     RobotSettings,
@@ -26,6 +27,7 @@ from cpcbl_team.config import (
     Wall,
 )
 from cpcbl_team.inputs import NAME_PATTERN, Name
+from cpcbl_transport.security import PROTOCOL
 
 Layer = dict[str, Any]
 
@@ -48,6 +50,7 @@ class _File(Table, frozen=True, kw_only=True):
     transport: TransportSettings = TransportSettings()
     match: MatchSettings = MatchSettings()
     simulation: SimulationSettings = SimulationSettings()
+    guests: GuestSettings = GuestSettings()
     calibrated_on: tuple[str, ...] = ()
     data: str = ""
     defaults: Layer = msgspec.field(default_factory=dict)
@@ -75,7 +78,16 @@ def load_team(path: Path) -> Team:
             return msgspec.json.decode(text, type=Team)
         except msgspec.MsgspecError as error:
             raise TeamFileError(f"{path}: {error}") from error
-    return parse_team(text, str(path))
+    team = parse_team(text, str(path))
+    if not team.transport.secured:
+        return team
+    transport = msgspec.structs.replace(team.transport, keys=str(key_folder(team, path)))
+    return msgspec.structs.replace(team, transport=transport)
+
+
+def key_folder(team: Team, path: Path) -> Path:
+    """Where the keys of the team in a file are."""
+    return (path.parent / team.transport.keys).absolute()
 
 
 def save_resolved(team: Team, path: Path) -> None:
@@ -96,7 +108,7 @@ def parse_team(text: str, name: str = "team file") -> Team:
     for key in _not_finite(raw):
         raise TeamFileError(f"{name}: {key}: not a finite number; write a finite one")
     file = _converted(raw, _File, "", name)
-    _converted(file.defaults, RobotSettings, "defaults", name)
+    defaults = _converted(file.defaults, RobotSettings, "defaults", name)
     for kind, layer in _named(file.types, "types", name):
         _converted(layer, RobotSettings, f"types.{kind}", name)
     robots = {}
@@ -125,15 +137,52 @@ def parse_team(text: str, name: str = "team file") -> Team:
         name=file.name,
         robots=robots,
         map=field,
-        transport=file.transport,
+        transport=_transport(file.transport, raw),
         match=file.match,
         simulation=file.simulation,
+        guests=file.guests,
+        defaults=defaults,
         calibrated_on=file.calibrated_on,
         data=file.data,
     )
     for problem in problems(team):
         raise TeamFileError(f"{name}: {problem}")
     return team
+
+
+def _transport(transport: TransportSettings, raw: Layer) -> TransportSettings:
+    """With the endpoint that is usual, where the file does not name one."""
+    if "connect" in raw.get("transport", {}):
+        return transport
+    return msgspec.structs.replace(transport, connect=transport.usual)
+
+
+def read_layer(path: Path) -> Layer:
+    """A TOML file with the keys of a robot's type, not yet checked. Raises TeamFileError."""
+    try:
+        layer = tomllib.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise TeamFileError(f"{path}: no such file") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise TeamFileError(f"{path}: cannot be read: {error}") from error
+    except tomllib.TOMLDecodeError as error:
+        raise TeamFileError(f"{path}: not TOML: {error}") from error
+    for key in _not_finite(layer):
+        raise TeamFileError(f"{path}: {key}: not a finite number; write a finite one")
+    return layer
+
+
+def beside(team: Team, name: str, layers: Sequence[Layer], source: str) -> Team:
+    """The team with one more robot, by layers over the team's defaults. Its name must be new.
+
+    `source` is what errors call the layers. Raises TeamFileError.
+    """
+    merged = _merged(msgspec.to_builtins(team.defaults), *layers)
+    robot = _converted(merged, RobotSettings, "", source)
+    more = msgspec.structs.replace(team, robots={**team.robots, name: robot})
+    for problem in problems(more):
+        raise TeamFileError(f"{source}: {problem}")
+    return more
 
 
 def problems(team: Team) -> Iterator[str]:
@@ -170,6 +219,18 @@ def problems(team: Team) -> Iterator[str]:
                     f"transport.{key}: {endpoint!r} is no endpoint;"
                     " write it as tcp/192.168.1.10:7447"
                 )
+            elif reason := _insecure(endpoint, team.transport.secured):
+                yield f"transport.{key}: {endpoint!r}: {reason}"
+
+
+def _insecure(endpoint: str, secured: bool) -> str:
+    """Why an endpoint does not go with the team's security; empty if it does."""
+    protocol, _, where = endpoint.partition("/")
+    if secured and protocol != PROTOCOL:
+        return f'with security = "mtls" every link is TLS; write it as {PROTOCOL}/{where}'
+    if not secured and protocol in ("tls", "quic"):
+        return f'needs certificates; add security = "mtls", or write it as tcp/{where}'
+    return ""
 
 
 def _event_problems(team: Team) -> Iterator[str]:

@@ -4,8 +4,9 @@ import logging
 import socket
 import tempfile
 import time
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack
+from functools import partial
 from pathlib import Path
 from types import MappingProxyType
 from typing import NamedTuple, Protocol
@@ -17,15 +18,18 @@ from cpcbl_agents.clock import Clock
 from cpcbl_launch.evaluation import Progress, simulate
 from cpcbl_launch.logs import seen_before
 from cpcbl_launch.options import check_duration, not_written
-from cpcbl_launch.processes import process_table
+from cpcbl_launch.phases import Span, guest_reports, phase
+from cpcbl_launch.processes import process_table, tasks
 from cpcbl_launch.recorder import Recorder, Report
 from cpcbl_launch.recording import Recording
 from cpcbl_launch.supervisor import Processes, Supervisor
 from cpcbl_launch.team_file import save_resolved
 from cpcbl_team.config import Team
-from cpcbl_team.metrics import Floats, score
+from cpcbl_team.metrics import Floats
 from cpcbl_transport.bus import Bus
 from cpcbl_transport.guards import guard_rules
+from cpcbl_transport.security import Identity, access_control, link_of
+from cpcbl_transport.topics import Role
 from cpcbl_transport.zenoh_bus import open_router
 
 log = logging.getLogger(__name__)
@@ -91,9 +95,11 @@ class OnThisMachine:
         self.lead_s = LEAD_S + LEAD_S_A_PROCESS * len(self._here)
 
     def router(self) -> AbstractContextManager[Bus]:
-        team = self._run.team
-        guards = guard_rules(team, self._run.speed)
-        return open_router(team.name, team.transport.listen, guards=guards)
+        team, listen = self._run.team, self._run.team.transport.listen
+        check_keys(team, listen, self._here)
+        guards = guard_rules(team, self._run.speed) | access_control(team)
+        _, credentials = link_of(team, Identity(Role.ROUTER), listen)
+        return open_router(team.name, listen, guards=guards, credentials=credentials)
 
     def processes(self, clock: Clock) -> AbstractContextManager[Processes]:
         team, path = self._run.team, self._folder / "team.json"
@@ -106,18 +112,25 @@ class OnThisMachine:
 Launch = Callable[[Run, Path, Stopping], Launcher]
 
 
-def free_endpoint() -> str:
+def check_keys(team: Team, listen: Sequence[str], here: Collection[str]) -> None:
+    """Says what a process would die of before any starts. Raises SecurityError."""
+    for task in tasks(team, (), 0, here):
+        link_of(team, task.identity, listen)
+
+
+def free_endpoint(protocol: str = "tcp") -> str:
     """An endpoint of this machine that nobody listens at."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+        return f"{protocol}/127.0.0.1:{probe.getsockname()[1]}"
 
 
 def listening(team: Team) -> Team:
     """The team with an endpoint for its router: its own, or a free one of this machine."""
     if team.transport.listen:
         return team
-    transport = msgspec.structs.replace(team.transport, listen=(free_endpoint(),))
+    endpoint = free_endpoint("tls" if team.transport.secured else "tcp")
+    transport = msgspec.structs.replace(team.transport, listen=(endpoint,))
     return msgspec.structs.replace(team, transport=transport)
 
 
@@ -207,20 +220,20 @@ def _report(
     after_s = max(robot.collaboration.after_s for robot in robots.values())
     helped_from_s = epoch_s + after_s if after_s else None
     variants = {name: robot.localizer.variant for name, robot in robots.items()}
+    begin_s = -np.inf if helped_from_s is None else helped_from_s
+    guests = guest_reports(recorder, list(robots), truth, epoch_s, begin_s)
     lost: dict[str, str] = {}
     if (picture := run.picture) is not None:
         from cpcbl_launch.picture import draw_run
 
-        lost = not_written(
-            picture, lambda: draw_run(recorder, run.team, truth, picture, helped_from_s)
-        )
-    report = recorder.report(variants, truth, helped_from_s or -np.inf)
+        present_s = {name: guest.present_s for name, guest in guests.items()}
+        drawn = partial(draw_run, recorder, run.team, truth, picture, epoch_s, helped_from_s)
+        lost = not_written(picture, partial(drawn, present_s))
+    report = recorder.report(variants, truth, begin_s)
     alone = {}
     if helped_from_s is not None:
-        alone = {
-            name: score(recorder.samples(name, truth.get(name), until_s=helped_from_s))
-            for name in robots
-        }
+        until = [Span(until_s=helped_from_s)]
+        alone = {name: phase(recorder, name, truth.get(name), until) for name in robots}
     return msgspec.structs.replace(
         report,
         calibrated_on=run.team.calibrated_on,
@@ -229,5 +242,6 @@ def _report(
         duration_s=elapsed_s,
         restarts=restarts,
         alone=alone,
+        guests=guests,
         not_written=lost,
     )

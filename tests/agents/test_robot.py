@@ -16,6 +16,7 @@ from cpcbl_team.config import (
     CollaborationSettings,
     LocalizerSettings,
     OdometrySettings,
+    PositionSensor,
     SensorSettings,
     Team,
 )
@@ -151,6 +152,17 @@ def test_a_position_pulls_the_belief_there_as_far_as_it_is_certain() -> None:
         assert (pose.x, pose.y) == pytest.approx((0.1 * share, -0.1 * share), abs=1e-3)
         assert belief(subject).shared == ZERO3
         assert subject.counts["position"] == 1
+
+
+def test_the_delay_of_a_position_sensor_moves_what_it_says_to_when_it_was_so() -> None:
+    sensor = PositionSensor(delay_s=0.3)
+    late = robot(with_robot(TEAM, "me", position_sensor=sensor))
+    prompt = robot(with_robot(TEAM, "me", position_sensor=PositionSensor()))
+    for subject, stamp_ns in ((prompt, 500 * MS), (late, 800 * MS)):
+        for piece in pieces(1.0):
+            subject.handle(piece, SECOND)
+        subject.handle(Position(stamp_ns, 0.3, 0.05, (0.0004, 0.0, 0.0004)), SECOND)
+    assert belief(late) == belief(prompt) != belief(told(in_order(pieces(1.0))))
 
 
 # Blind robots -----------------------------------------------------------------------------------

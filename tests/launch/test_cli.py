@@ -46,7 +46,17 @@ odometry = { moves = false }
 
 @pytest.mark.parametrize(
     "command",
-    [[], ["up"], ["robot"], ["field"], ["check"], ["evaluate"], ["calibrate"], ["traffic"]],
+    [
+        [],
+        ["up"],
+        ["robot"],
+        ["field"],
+        ["check"],
+        ["evaluate"],
+        ["calibrate"],
+        ["traffic"],
+        ["observer"],
+    ],
 )
 def test_every_command_explains_itself(command: list[str]) -> None:
     shown = cpcbl_team(*command, "--help")

@@ -227,3 +227,31 @@ def test_the_committed_compose_file_runs_and_a_robot_that_crashes_comes_back(
             return restarts == 1 and not track.lost and error_m < 0.3
 
         assert eventually(is_back_and_knows_where_it_is, 60.0)
+
+
+def observing(demo: Demo, *options: object) -> list[str]:
+    at = ("--at", "4.5,6,-90", "--connect", demo.endpoint, "--image", image())
+    command = (*PROGRAM, "observer", "tripod", "--team", demo.file, *at, "--container", *options)
+    return list(map(str, command))
+
+
+def test_an_observer_in_a_container_helps_a_team_in_containers_and_leaves(demo: Demo) -> None:
+    sensor = demo.file.parent / "a camera, of ours.toml"
+    sensor.write_text("sensor = { range_share = 0.005, field_of_view_deg = 180.0 }\n")
+    with going_up(demo, "--duration", 600, "--json") as process:
+        when(demo, lambda heard: "scout" in heard.tracks)
+        ended = subprocess.run(
+            observing(demo, "--for", 6, "--json", "--sensor", sensor, "--fov", 170),
+            capture_output=True,
+            text=True,
+            timeout=90.0,
+            check=False,
+        )
+        assert ended.returncode == 0, ended.stderr
+        visited = json.loads(ended.stdout)
+        assert visited["name"] == "tripod"
+        assert visited["lost"] == ""
+        assert {row["peer"] for row in visited["sent"] if row["topic"] == "fix"} & ROBOTS
+        process.send_signal(signal.SIGINT)
+        out, _ = process.communicate(timeout=60.0)
+    assert "tripod" in json.loads(out)["guests"]

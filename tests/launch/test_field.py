@@ -11,12 +11,21 @@ from bus_helpers import MS, SECOND, Ear
 
 from cpcbl_agents.clock import Clock
 from cpcbl_agents.sensing import SensorInput
+from cpcbl_launch.bodies import LASTS_NS
 from cpcbl_launch.evaluation import Choice, chosen, simulate
-from cpcbl_launch.field import COMMAND_LASTS_NS, INBOX, FieldNode, SimulatedField, run_field
+from cpcbl_launch.field import (
+    COMMAND_LASTS_NS,
+    INBOX,
+    FieldNode,
+    SimulatedField,
+    robots_at,
+    run_field,
+)
 from cpcbl_launch.team_file import builtin, load_team
 from cpcbl_team.config import (
     Field,
     Gives,
+    GuestSettings,
     Landmark,
     LocalizerSettings,
     OdometrySettings,
@@ -33,12 +42,15 @@ from cpcbl_team.geometry import Pose2, step
 from cpcbl_team.inputs import Odometry, Position, Sighting, Sightings
 from cpcbl_transport import topics
 from cpcbl_transport.bus import MemoryHub
-from cpcbl_transport.messages import Drive, Refusal, Truths, encode
+from cpcbl_transport.messages import Body, Drive, Join, Refusal, Truths, encode
 
 STEP_NS = 20 * MS
 MILLIMETRE = 1e-3
 ALL_ROUND = SensorSettings(field_of_view_deg=360.0, rate_hz=50.0)
 EVERY_STEP = OdometrySettings(rate_hz=50.0)
+
+
+LOOP = ((3.0, 0.0), (3.0, 2.0), (0.0, 2.0), (0.0, 0.0))
 
 
 def robot(x_m: float = 0.0, y_m: float = 0.0, heading_deg: float = 0.0, **more: Any) -> Any:
@@ -282,6 +294,24 @@ def test_a_position_sensor_errs_by_the_sigma_that_it_states(noise: float) -> Non
     assert all(m.covariance == pytest.approx((0.01, 0.0, 0.01)) for m in seen)
 
 
+@pytest.mark.parametrize("delay_s", [0.0, 0.03, 0.3])
+def test_a_position_is_out_when_its_stamp_says_so(delay_s: float) -> None:
+    """It is late by the delay, and so is its stamp: of where the robot was."""
+    sensor = PositionSensor(sigma_m=0.1, rate_hz=50.0, delay_s=delay_s)
+    subject = field(r1=robot(position_sensor=sensor))
+    true: dict[int, float] = {}
+    seen: list[tuple[int, Position]] = []
+    for _ in range(50):
+        subject.command(Drive("r1", subject.now_ns, 0.5, 0.0))
+        items = subject.advance()
+        true[subject.now_ns] = subject.robots["r1"].pose.x
+        seen += [(subject.now_ns, m) for _, m in items if isinstance(m, Position)]
+    assert len(seen) >= 30
+    for heard_ns, position in seen:
+        assert position.x_m == pytest.approx(true[position.stamp_ns - int(delay_s * 1e9)])
+        assert 0 <= heard_ns - position.stamp_ns < STEP_NS
+
+
 def sensed(seed: int) -> list[tuple[str, SensorInput]]:
     subject = field(
         noise=1.0, seed=seed, on=marks(oak=(3.0, 1.0)), r1=robot(), r2=robot(1.0, 1.0, 90.0)
@@ -410,8 +440,8 @@ class OnBus:
 
     def __init__(self) -> None:
         self.field = field(on=marks(oak=(3.0, 0.0)), r1=robot())
-        hub = MemoryHub()
-        self.node, self.bus = FieldNode(self.field, hub.session()), hub.session()
+        self.hub = MemoryHub()
+        self.node, self.bus = FieldNode(self.field, self.hub.session()), self.hub.session()
 
     def command(self, payload: bytes) -> None:
         self.bus.publisher(topics.DRIVE.at(robot="r1"), topics.DRIVE.qos).put(payload)
@@ -498,6 +528,224 @@ def test_a_field_runs_until_it_is_stopped() -> None:
     assert all(isinstance(m, Truths) for m in heard.messages)
 
 
+def test_robots_of_another_site_are_told_and_heard_on_the_bus_of_theirs() -> None:
+    here, there = MemoryHub(), MemoryHub()
+    both = field(near=robot(), far=robot())
+    node = FieldNode(both, here.session(), {"far": there.session()})
+    ears = {hub: Ear(hub.session(), topics.IN_ODOMETRY.at()) for hub in (here, there)}
+    for hub, speed_m_s in ((here, 0.5), (there, -0.5)):
+        for name in ("near", "far"):
+            publisher = hub.session().publisher(topics.DRIVE.at(robot=name), topics.DRIVE.qos)
+            publisher.put(encode(Drive(name, 0, speed_m_s, 0.0)))
+    node.step(5 * STEP_NS)
+    assert set(ears[here].keys) == {topics.IN_ODOMETRY.at(robot="near")}
+    assert set(ears[there].keys) == {topics.IN_ODOMETRY.at(robot="far")}
+    assert both.robots["near"].pose.x == pytest.approx(0.05)
+    assert both.robots["far"].pose.x == pytest.approx(-0.05)
+
+
+def test_robots_of_other_sites_are_named_by_their_router() -> None:
+    team = load_team(builtin("demo"))
+    texts = ["tcp/10.0.0.2:7447=scout, patrol", "tcp/10.0.0.3:7447=observer"]
+    assert robots_at(texts, team) == {
+        "tcp/10.0.0.2:7447": ["scout", "patrol"],
+        "tcp/10.0.0.3:7447": ["observer"],
+    }
+    for wrong in ("tcp/10.0.0.2:7447", "tcp/10.0.0.2:7447=", "tcp/10.0.0.2:7447=nobody"):
+        with pytest.raises(ValueError, match=r"--site .*no robot .*navigator, observer"):
+            robots_at([wrong], team)
+
+
+# Guests -----------------------------------------------------------------------------------------
+
+
+def body(x_m: float = 0.0, y_m: float = 3.0, heading_deg: float = -90.0, **more: Any) -> Body:
+    start = Start(x_m=x_m, y_m=y_m, heading_deg=heading_deg, sigma_m=0.0, heading_sigma_deg=0.0)
+    return Body(start, **{"sensor": ALL_ROUND, "odometry": EVERY_STEP, **more})
+
+
+def polar(seen: Sighting) -> tuple[float | None, float | None]:
+    return seen.range_m, seen.bearing_rad
+
+
+class WithGuests(OnBus):
+    """The same with what a guest says."""
+
+    def __init__(self, **rules: Any) -> None:
+        super().__init__()
+        if rules:
+            self.field.team = msgspec.structs.replace(
+                self.field.team, guests=GuestSettings(**rules)
+            )
+            self.node = FieldNode(self.field, self.hub.session())
+
+    def ask(self, wanted: Body | None, name: str = "tripod", incarnation: str = "1") -> None:
+        self.say(name, encode(Join(name, incarnation, self.field.now_ns, wanted)))
+
+    def say(self, name: str, payload: bytes) -> None:
+        self.bus.publisher(topics.JOIN.at(robot=name), topics.JOIN.qos).put(payload)
+
+    def steps(self, count: int) -> None:
+        for _ in range(count):
+            self.node.step(self.field.next_ns)
+
+    @property
+    def guests(self) -> set[str]:
+        return set(self.field.robots) - {"r1"}
+
+
+def test_a_guest_has_a_body_at_the_next_step_and_others_see_it() -> None:
+    on = WithGuests()
+    seen = Ear(on.bus, topics.IN_SIGHTINGS.at())
+    truth = Ear(on.bus, topics.TRUTH.at())
+    on.ask(body())
+    on.steps(1)
+    frames = {key.split("/")[1]: m for key, m in zip(seen.keys, seen.messages, strict=True)}
+    assert isinstance(frames["r1"], Sightings)
+    by_name = {s.id: s for s in frames["r1"].sightings}
+    assert polar(by_name["tripod"]) == pytest.approx((3.0, math.pi / 2))
+    assert isinstance(frames["tripod"], Sightings)
+    theirs = {s.id: s for s in frames["tripod"].sightings}
+    assert polar(theirs["r1"]) == pytest.approx((3.0, 0.0))
+    assert theirs["oak"].range_m == pytest.approx(math.hypot(3.0, 3.0))
+    latest = truth.messages[-1]
+    assert isinstance(latest, Truths)
+    assert [t.robot for t in latest.robots] == ["r1", "tripod"]
+
+
+def test_a_guest_drives_like_a_robot_and_its_position_sensor_works() -> None:
+    on = WithGuests()
+    on.ask(body(heading_deg=0.0, position_sensor=PositionSensor(rate_hz=50.0)))
+    on.steps(1)
+    positions = Ear(on.bus, topics.IN_POSITION.at(robot="tripod"))
+    on.bus.publisher(topics.DRIVE.at(robot="tripod"), topics.DRIVE.qos).put(
+        encode(Drive("tripod", on.field.now_ns, 0.5, 0.0))
+    )
+    on.steps(5)
+    assert on.field.robots["tripod"].pose == pytest.approx(Pose2(0.05, 3.0, 0.0))
+    latest = positions.messages[-1]
+    assert isinstance(latest, Position)
+    assert (latest.x_m, latest.y_m) == pytest.approx((0.05, 3.0))
+
+
+def test_a_guest_is_gone_two_seconds_after_its_last_word_or_at_once_when_it_says_so() -> None:
+    on = WithGuests()
+    on.ask(body())
+    on.steps(1)
+    on.steps(LASTS_NS // STEP_NS)
+    assert on.guests == {"tripod"}
+    on.steps(1)
+    assert on.guests == set()
+    on.ask(body())
+    on.steps(1)
+    assert on.guests == {"tripod"}
+    on.ask(None)
+    on.steps(1)
+    assert on.guests == set()
+    heard = Ear(on.bus, topics.IN_SIGHTINGS.at(robot="tripod"))
+    on.steps(5)
+    assert heard.samples == []
+
+
+def test_a_guest_that_asks_again_keeps_its_body_but_a_new_process_starts_anew() -> None:
+    on = WithGuests()
+    on.ask(body(heading_deg=0.0))
+    on.steps(1)
+    on.bus.publisher(topics.DRIVE.at(robot="tripod"), topics.DRIVE.qos).put(
+        encode(Drive("tripod", on.field.now_ns, 0.5, 0.0))
+    )
+    on.steps(5)
+    on.ask(body(heading_deg=0.0))
+    on.steps(1)
+    assert on.field.robots["tripod"].pose.x > 0.04
+    on.ask(body(heading_deg=0.0), incarnation="2")
+    on.steps(1)
+    assert on.field.robots["tripod"].pose.x == 0.0
+
+
+def test_a_guest_that_sees_farther_than_all_others_sees_what_is_there() -> None:
+    on = WithGuests()
+    frames = Ear(on.bus, topics.IN_SIGHTINGS.at(robot="tripod"))
+    far = msgspec.structs.replace(ALL_ROUND, max_range_m=50.0)
+    on.ask(body(40.0, 0.0, sensor=far))
+    on.steps(1)
+    (frame,) = frames.messages
+    assert isinstance(frame, Sightings)
+    assert {s.id for s in frame.sightings} == {"oak", "r1"}
+
+
+@pytest.mark.parametrize(
+    ("name", "payload"),
+    [
+        ("tripod", b""),
+        ("tripod", b"\x02garbage"),
+        ("tripod", encode(Drive("tripod", 0, 1.0, 1.0))),
+        ("tripod", encode(Join("other", "1", 0, body()))),
+        ("tripod", encode(Join("tripod", "1", 0, body(math.nan)))),
+        ("tripod", encode(Join("tripod", "1", 0, body(0.0, math.inf)))),
+        ("tripod", encode(Join("tripod", "1", 60 * SECOND, body()))),
+        ("tripod", encode(Join("tripod", "1", 0, body(odometry=OdometrySettings(delay_s=1e5))))),
+        ("r1", encode(Join("r1", "1", 0, body()))),
+    ],
+    ids=[
+        "empty",
+        "garbage",
+        "wrong type",
+        "under another name's key",
+        "NaN",
+        "infinite",
+        "from the future",
+        "endless delay",
+        "a robot's name",
+    ],
+)
+def test_a_guest_that_makes_no_sense_gets_no_body(name: str, payload: bytes) -> None:
+    on = WithGuests()
+    before = on.field.robots["r1"]
+    on.say(name, payload)
+    on.steps(2)
+    assert on.field.robots == {"r1": before}
+
+
+def test_a_team_that_lets_no_guests_in_has_none_on_its_field(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    on = WithGuests(allowed=False)
+    for _ in range(3):
+        on.ask(body())
+        on.steps(1)
+    assert on.guests == set()
+    (record,) = caplog.records
+    assert "guest tripod gets no body: guests.allowed is false" in record.getMessage()
+
+
+def test_no_more_guests_than_the_team_allows_have_a_body() -> None:
+    on = WithGuests(most=2)
+    for i in range(5):
+        on.ask(body(), f"guest{i}")
+    on.steps(1)
+    assert on.guests == {"guest0", "guest1"}
+    on.ask(None, "guest0")
+    on.ask(body(), "guest4")
+    on.steps(1)
+    assert on.guests == {"guest1", "guest4"}
+
+
+def test_a_guest_changes_nothing_of_the_noise_before_it_came() -> None:
+    def poses(guest: bool) -> list[Pose2]:
+        subject = field(noise=1.0, r1=robot(), r2=robot(1.0, 1.0, 90.0))
+        subject.command(Drive("r1", 0, 0.5, 0.2))
+        found = []
+        for step_number in range(20):
+            if guest and step_number == 10:
+                subject.join("tripod", body())
+            subject.advance()
+            found += [subject.robots["r1"].pose, subject.robots["r2"].pose]
+        return found
+
+    assert poses(True)[:22] == poses(False)[:22]
+
+
 # Robots on the field ----------------------------------------------------------------------------
 
 MOVING = ("navigator", "scout", "patrol")
@@ -575,3 +823,35 @@ def test_a_sensor_that_never_errs_stops_no_robot(
     variances = [t.covariance[i] for t in tracks if t.covariance is not None for i in (0, 2, 5)]
     assert min(variances, default=0.0) >= 0.0
     assert [r.samples > 190 for r in report.robots.values()] == [True, True]
+
+
+@pytest.mark.parametrize("delay_s", [0.0, 0.3])
+def test_a_position_sensor_keeps_a_robot_that_sees_nothing_on_its_way(delay_s: float) -> None:
+    """However late it is, as long as the settings say so."""
+    sensor = PositionSensor(sigma_m=0.03, rate_hz=5.0, delay_s=delay_s)
+    blind = SensorSettings(sees_landmarks=False, sees_robots=False)
+    start = Start(x_m=0.0, y_m=0.0)
+    robots = {
+        "by_dead_reckoning": RobotSettings(start=start, sensor=blind, waypoints_m=LOOP),
+        "with_gps": RobotSettings(
+            start=start, sensor=blind, waypoints_m=LOOP, position_sensor=sensor
+        ),
+    }
+    believed = Team(name="t", robots=robots)
+    report, _ = simulate(believed, 2, 60.0)
+    with_gps = report.robots["with_gps"]
+    assert with_gps.position_rmse_m is not None
+    assert with_gps.position_rmse_m < 0.05
+    assert with_gps.inside_3_sigma is not None
+    assert with_gps.inside_3_sigma > 0.95
+    reckoning = report.robots["by_dead_reckoning"].position_rmse_m
+    assert reckoning is not None
+    assert reckoning > 0.1
+    if delay_s:
+        prompt = msgspec.structs.replace(sensor, delay_s=0.0)
+        unaware = msgspec.structs.replace(robots["with_gps"], position_sensor=prompt)
+        other = msgspec.structs.replace(believed, robots={**robots, "with_gps": unaware})
+        wrong, _ = simulate(other, 2, 60.0, truth=believed)
+        misled = wrong.robots["with_gps"].position_rmse_m
+        assert misled is not None
+        assert misled > 1.5 * with_gps.position_rmse_m

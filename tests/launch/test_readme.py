@@ -9,6 +9,7 @@ from log_helpers import write_log
 from process_helpers import cpcbl_team
 
 from cpcbl_launch.team_file import parse_team
+from cpcbl_team.config import GuestSettings, PositionSensor
 
 ROOT = Path(__file__).parents[2]
 README = (ROOT / "README.md").read_text()
@@ -53,7 +54,9 @@ def test_a_command_of_the_readme_runs(
 def test_the_documented_team_file_is_good() -> None:
     (text,) = TOML
     team = parse_team(text)
-    assert team.robots.keys() == {"r1", "r2", "tripod"}
+    assert team.robots.keys() == {"r1", "r2", "rover", "tripod"}
+    assert team.robots["rover"].position_sensor == PositionSensor(delay_s=0.1)
+    assert team.guests == GuestSettings()
     assert team.robots["r2"].start is None
     assert team.transport.listen == ("tcp/0.0.0.0:7447",)
 

@@ -5,7 +5,7 @@ import signal
 import subprocess
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import pytest
@@ -178,6 +178,20 @@ def test_two_routers_are_joined_and_find_each_other_again(team_file: Path) -> No
             with running(team_file, "--listen", west), open_bus("lab", [west]) as western:
                 assert heard(eastern, western)
                 assert heard(western, eastern)
+
+
+def test_a_robot_that_knows_two_routers_goes_on_over_the_second(team_file: Path) -> None:
+    first, second = free_endpoint(), free_endpoint()
+    with (
+        running(team_file, "--listen", second),
+        open_bus("lab", [second]) as other,
+        ExitStack() as stack,
+    ):
+        with running(team_file, "--listen", first, "--connect", second):
+            robot = stack.enter_context(open_bus("lab", [first, second]))
+            assert heard(robot, other)
+        assert heard(robot, other)
+        assert heard(other, robot)
 
 
 def test_any_configuration_of_a_router_is_read(tmp_path: Path) -> None:

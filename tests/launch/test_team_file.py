@@ -114,8 +114,8 @@ oak = { x_m = 1.0, y_m = 2.0, gives = "bearing" }
 [map.walls]
 north = { from_m = [0.0, 5.0], to_m = [9.0, 5.0], gives = "range" }
 [transport]
-listen = ["tcp/0.0.0.0:7447", "quic/[::]:7448"]
-connect = ["tls/router.example:7447"]
+listen = ["tcp/0.0.0.0:7447", "udp/[::]:7448"]
+connect = ["ws/router.example:7447"]
 guards = { fix_rate_hz = 44.0, largest_help_bytes = 100 }
 [simulation]
 step_rate_hz = 100

@@ -200,7 +200,8 @@ def team_at(now_s: float) -> Traffic:
         "adrift": seen(status("adrift", 7, 16, lost="poor sigma", sent=())),
         "gone": seen(status("gone", 1, 2, sent=(flow("fix", "scout", 5, 1.0),))),
     }
-    return traffic("five", ("gone", "scout", "spare"), arrivals, 0.0, now_s)
+    known = ("gone", "scout", "spare", "good", "patrol", "adrift")
+    return traffic("five", known, arrivals, 0.0, now_s)
 
 
 def test_rates_are_those_since_the_first_status_kept() -> None:
@@ -427,6 +428,17 @@ def test_a_log_is_evaluated_with_a_budget(tmp_path: Path) -> None:
     assert sum(f["over_budget"] for f in report["robots"]["1"]["sent"]) > 0
 
 
+def test_who_is_not_in_the_team_file_is_shown_as_a_guest() -> None:
+    seen = {name: [Arrival(1.0, status(name, 1, 3))] for name in ("r1", "tripod")}
+    now = traffic("t", ["r1"], seen, 0.0, 1.0)
+    assert now.guests == ("tripod",)
+    console = Console(file=io.StringIO(), width=80)
+    with console.capture() as capture:
+        console.print(drawn(now, "here"))
+    assert "tripod, guest" in capture.get()
+    assert traffic("t", [], seen, 0.0, 1.0).guests == ()  # nobody knows
+
+
 # Processes --------------------------------------------------------------------------------------
 
 
@@ -518,9 +530,9 @@ def test_what_is_no_status_is_counted_and_shown() -> None:
         ("status/a", encode(status("a", 1, 0))),
     ):
         speaker.publisher(key, topics.STATUS.qos).put(payload)
-    assert watcher.refused == {"wrong_version": 1, "wrong_name": 1}
+    assert watcher.refused == {"wrong_version": 1, "name_of_another": 1}
     now = traffic("trio", (), watcher.arrivals(), 0.0, 1.0, watcher.refused)
-    assert now.refused == {"wrong_name": 1, "wrong_version": 1}
+    assert now.refused == {"name_of_another": 1, "wrong_version": 1}
     console = Console(file=io.StringIO(), width=80)
     console.print(drawn(now, "here"))
-    assert "refused, by reason: wrong_name 1, wrong_version 1" in console.file.getvalue()  # type: ignore[attr-defined]
+    assert "refused, by reason: name_of_another 1, wrong_version 1" in console.file.getvalue()  # type: ignore[attr-defined]

@@ -3,11 +3,10 @@
 from typing import NamedTuple
 
 import pytest
-from bus_helpers import examples
+from bus_helpers import examples, matches
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cpcbl_transport.bus import matches
 from cpcbl_transport.key_tree import KeyTree
 
 CHUNK = st.sampled_from(["a", "b", "belief", "3", "r1"])

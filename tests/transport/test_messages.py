@@ -9,6 +9,7 @@ from bus_helpers import SECOND, examples
 from hypothesis import given
 from hypothesis import strategies as st
 
+from cpcbl_team.config import OdometrySettings, PositionSensor, SensorSettings, Start
 from cpcbl_team.inputs import Odometry, Position, Sighting, Sightings
 from cpcbl_transport.messages import (
     FUTURE_NS,
@@ -16,8 +17,10 @@ from cpcbl_transport.messages import (
     LARGEST_PAYLOAD,
     LONGEST_ODOMETRY_NS,
     VERSION,
+    Body,
     Drive,
     Flow,
+    Join,
     Refusal,
     Spending,
     Status,
@@ -45,8 +48,10 @@ TRUST = (Trust("r2", "biased", NOW, 2, False, -0.4),)
 STATUS = msgspec.structs.replace(STATUS, sent=SENT, heard=SENT[:1], spending=SPENDING, trust=TRUST)
 TRACK = Track("r1", NOW, 1.0, 2.0, 0.5, COVARIANCE, 3)
 DRIVE = Drive("r1", NOW, 0.5, 0.1)
+BODY = Body(Start(x_m=1.0, y_m=2.0), SensorSettings(), OdometrySettings(), PositionSensor())
+JOIN = Join("tripod", "a", NOW, BODY)
 TRUTHS = Truths(NOW, (Truth("r1", 1.0, 2.0, 0.5, 1), Truth("r2", 3.0, 4.0, -0.5)))
-VALID = (ODOMETRY, SIGHTINGS, POSITION, STATUS, TRACK, DRIVE, TRUTHS)
+VALID = (ODOMETRY, SIGHTINGS, POSITION, STATUS, TRACK, DRIVE, JOIN, TRUTHS)
 KINDS = [type(m).__name__ for m in VALID]
 
 NAMES = st.from_regex(r"[A-Za-z0-9_.-]{1,32}", fullmatch=True)
@@ -60,6 +65,15 @@ MAYBE = FLOATS | st.none()
 FLOWS = st.builds(Flow, st.text(), st.text(), *[COUNTS] * 5, STAMPS)
 SPENDINGS = st.builds(Spending, st.text(), *[FLOATS] * 3)
 TRUSTS = st.builds(Trust, st.text(), st.text(), STAMPS, COUNTS, st.booleans(), FLOATS)
+
+POSITIVE = st.floats(1e-9, 1e9)
+BODIES = st.builds(
+    Body,
+    st.builds(Start, x_m=FLOATS, y_m=FLOATS, heading_deg=FLOATS),
+    st.builds(SensorSettings, range_scale=POSITIVE, delay_s=FLOATS, sees_robots=st.booleans()),
+    st.builds(OdometrySettings, rate_hz=POSITIVE, moves=st.booleans()),
+    st.builds(PositionSensor, sigma_m=POSITIVE) | st.none(),
+)
 
 MESSAGES: dict[type[Any], st.SearchStrategy[Tagged]] = {
     Odometry: st.builds(Odometry, STAMPS, STAMPS, FLOATS, FLOATS),
@@ -97,6 +111,7 @@ MESSAGES: dict[type[Any], st.SearchStrategy[Tagged]] = {
         st.text(),
     ),
     Drive: st.builds(Drive, NAMES, STAMPS, FLOATS, FLOATS),
+    Join: st.builds(Join, NAMES, st.text(), STAMPS, BODIES | st.none()),
     Truths: st.builds(
         Truths,
         STAMPS,

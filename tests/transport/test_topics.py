@@ -4,11 +4,11 @@ from typing import get_args
 
 import pytest
 import zenoh
+from bus_helpers import matches
 
 from cpcbl_team.collaboration import LOWEST_TIER, tiers_heard
 from cpcbl_team.config import CollaborationSettings
 from cpcbl_transport import topics
-from cpcbl_transport.bus import matches
 from cpcbl_transport.messages import Message
 from cpcbl_transport.topics import TOPICS, Qos, Topic
 

@@ -50,17 +50,6 @@ class Bus(AbstractContextManager["Bus"], Protocol):
     def close(self) -> None: ...
 
 
-def matches(keys: str, key: str) -> bool:
-    """Whether a key is one of `keys`: what patterns mean on every bus, one pair at a time."""
-    pattern, chunks = keys.split("/"), key.split("/")
-    if pattern[-1] == "**":
-        pattern.pop()
-        chunks = chunks[: len(pattern)]
-    return len(pattern) == len(chunks) and all(
-        p in ("*", c) for p, c in zip(pattern, chunks, strict=True)
-    )
-
-
 class MemoryHub:
     """Connects the sessions of one process; delivers in the order of declaration."""
 

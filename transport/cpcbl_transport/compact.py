@@ -29,6 +29,8 @@ SLOPE = 2.0**-11
 RATES = 1_000  # a metre a second, a radian a second
 
 LEAST = SIGMA**2
+NOISE = 1e-10
+"""A share of a variance that may be the rounding of its double-precision factors."""
 STEEPEST = 4095.0  # slope; a thinner ellipse is sent thicker
 TURNED = math.sqrt(3.0) * SLOPE / 2.0  # norm of what rounding three slopes does to the factor
 WIDER = 1.0 / (1.0 - TURNED) / SIGMA  # so that this claims nothing
@@ -148,7 +150,7 @@ def _area_counts(xx: float, xy: float, yy: float) -> tuple[int, int, int]:
         raise ValueError(f"no variances: {xx}, {yy}")
     d1 = max(xx, LEAST)
     l21 = xy / d1
-    d2 = max(yy - l21 * xy, LEAST)
+    d2 = max(yy - l21 * xy, NOISE * yy, LEAST)
     x, a = _rounded_up(math.sqrt(d1))
     y, b = _rounded_up(max(math.sqrt(d2), abs(l21) * a / STEEPEST))
     return x, y, _SLOPE.clamped(l21 * a / b / SLOPE)
@@ -163,9 +165,9 @@ def _volume_counts(
     a, b, t21 = _sigma(x), _sigma(y), yx * SLOPE
     d1 = max(xx, LEAST)
     l21, l31 = xy / d1, xh / d1
-    d2 = max(yy - l21 * xy, LEAST)
+    d2 = max(yy - l21 * xy, NOISE * yy, LEAST)
     l32 = (yh - l31 * xy) / d2
-    d3 = max(hh - l31 * xh - l32 * l32 * d2, LEAST)
+    d3 = max(hh - l31 * xh - l32 * l32 * d2, NOISE * hh, LEAST)
     least = max(abs(l31) * a, abs(l32) * b) / STEEPEST
     heading, c = _rounded_up(max(math.sqrt(d3), least))
     # T, rounded to T (I + F): the slope on x answers for the error of y's

@@ -10,6 +10,7 @@ from enum import StrEnum
 
 import msgspec
 
+from cpcbl_team.config import OdometrySettings, PositionSensor, SensorSettings, Start
 from cpcbl_team.inputs import Belief, Fix, Name, Odometry, Position, Sightings
 
 VERSION = 2
@@ -117,6 +118,27 @@ class Drive(msgspec.Struct, frozen=True, array_like=True, tag="drive"):
     """Waypoints that the robot believes to have reached so far."""
 
 
+class Body(msgspec.Struct, frozen=True, array_like=True):
+    """What the simulated field must know of a robot: its senses, and where it starts.
+
+    The field draws the true pose around the stated one, as it does for all robots.
+    """
+
+    start: Start
+    sensor: SensorSettings
+    odometry: OdometrySettings
+    position_sensor: PositionSensor | None = None
+
+
+class Join(msgspec.Struct, frozen=True, array_like=True, tag="join"):
+    """A guest asks the simulated field for a body, again and again; None: it leaves."""
+
+    robot: Name
+    incarnation: str
+    stamp_ns: int
+    body: Body | None = None
+
+
 class Truth(msgspec.Struct, frozen=True, array_like=True):
     """Where the simulated field has a robot; bumps into landmarks so far."""
 
@@ -135,7 +157,7 @@ class Truths(msgspec.Struct, frozen=True, array_like=True, tag="truth"):
 
 
 Help = Belief | Fix
-Tagged = Odometry | Sightings | Position | Status | Track | Drive | Truths
+Tagged = Odometry | Sightings | Position | Status | Track | Drive | Join | Truths
 Message = Tagged | Help
 Telemetry = Status | Track | Drive | Truths
 
@@ -148,7 +170,6 @@ class Refusal(StrEnum):
     VERSION = "wrong_version"
     GARBAGE = "garbage"
     WRONG_TYPE = "wrong_type"
-    WRONG_NAME = "wrong_name"
     """Another name than its key's."""
     NOT_FINITE = "not_finite"
     IMPLAUSIBLE = "implausible_number"
@@ -158,6 +179,7 @@ class Refusal(StrEnum):
     DURATION = "impossible_duration"
     UNKNOWN_ROBOT = "unknown_robot"
     OWN = "own_message"
+    NOT_ITS_OWN = "name_of_another"
 
 
 _encoder = msgspec.msgpack.Encoder()

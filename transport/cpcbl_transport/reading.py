@@ -1,28 +1,41 @@
-"""Reading what robots and the field tell people, and what robots tell the field.
+"""What came under a key: the message of the key's topic, said of the robot that the key names.
 
-Whoever listens to a whole team must expect anything under any key.
+A router that certifies names holds everybody to keys (`security`), so nobody may be believed who
+names another one in the payload.
 """
 
-from cpcbl_transport.messages import Drive, Refusal, Status, Track, Truths, decode, refusal
-from cpcbl_transport.topics import DRIVE, STATUS, TRACK, TRUTH
+from functools import lru_cache
 
-Told = Status | Track | Truths | Drive
-_BY_ROOT = {topic.key.partition("<")[0]: topic for topic in (STATUS, TRACK, TRUTH, DRIVE)}
+from cpcbl_transport import topics
+from cpcbl_transport.compact import decode_help
+from cpcbl_transport.messages import Message, Refusal, decode, refusal
+from cpcbl_transport.topics import Topic
 
 
-def read(key: str, payload: bytes, now_ns: int | None = None) -> Told | Refusal:
-    """The message, or why there is none: of the type that its key's topic carries, with the name
-    that its key has and numbers that can be. `now_ns`: nothing is from the future of it; None for a
-    reader without a clock.
+def read(key: str, payload: bytes, now_ns: int | None = None) -> Message | Refusal:
+    """The message in a payload under this key, with numbers that can be; or why there is none.
+
+    `now_ns`: nothing is from the future of it; None for a reader without a clock.
     """
-    message = decode(payload)
+    topic, name = _meant(key)
+    if topic is None:
+        return Refusal.WRONG_TYPE
+    helps = topic.carries in topics.COLLABORATION
+    message = decode_help(key, payload) if helps else decode(payload)
     if isinstance(message, Refusal):
         return message
-    topic = next((t for root, t in _BY_ROOT.items() if key.startswith(root)), None)
-    if topic is None or not isinstance(message, topic.carries or ()):
+    if type(message) is not topic.carries:
         return Refusal.WRONG_TYPE
-    names = topic.names(key)
-    if names is None or names.get("robot") != getattr(message, "robot", None):
-        return Refusal.WRONG_NAME
-    assert isinstance(message, Told)
+    if getattr(message, "robot", name) != name:
+        return Refusal.NOT_ITS_OWN
     return refusal(message, message.stamp_ns if now_ns is None else now_ns) or message
+
+
+@lru_cache(maxsize=4096)
+def _meant(key: str) -> tuple[Topic | None, str]:
+    """The topic of a key, and the robot that it names, if any."""
+    for topic in topics.TOPICS:
+        names = topic.names(key)
+        if names is not None:
+            return topic, names.get("robot", "")
+    return None, ""

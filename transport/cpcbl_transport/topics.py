@@ -2,14 +2,15 @@
 
 A key stands below its team's `namespace`. The publisher's tier is part of the key and
 a robot subscribes only to tiers better than its own, so that nothing flows uphill: Zenoh itself
-drops it at the sender. This module does not know the bus.
+drops it at the sender. Who may say and hear a topic are columns too; a secured router holds
+everybody to them (`security`). This module does not know the bus.
 """
 
-from enum import Enum
+from enum import Enum, StrEnum
 from typing import NamedTuple
 
 from cpcbl_team.inputs import Belief, Fix, Odometry, Position, Sightings
-from cpcbl_transport.messages import Drive, Message, Status, Track, Truths
+from cpcbl_transport.messages import Drive, Join, Message, Status, Track, Truths
 
 
 class Treatment(NamedTuple):
@@ -36,6 +37,29 @@ class Qos(Enum):
     TELEMETRY = Treatment("BACKGROUND", "DROP", reliable=False, express=False)
 
 
+class Role(StrEnum):
+    """What a member of a team is, as its certificate says."""
+
+    ROBOT = "robot"
+    OBSERVER = "observer"  # helps a team while it runs, and is no part of it
+    FIELD = "field"  # the simulated one
+    OPERATOR = "operator"  # people: live tables, recordings
+    ROUTER = "router"  # relays what all others say
+
+
+class Who(NamedTuple):
+    """Who may say, or hear, a topic."""
+
+    role: Role
+    own: str = ""
+    """The <name> of the key that must be its own; empty: any will do."""
+
+
+def _helpers(own: str = "") -> tuple[Who, ...]:
+    """Robots and observers, each under its own name, or under any."""
+    return Who(Role.ROBOT, own), Who(Role.OBSERVER, own)
+
+
 class Topic(NamedTuple):
     """One row of the table."""
 
@@ -44,6 +68,8 @@ class Topic(NamedTuple):
     rate: str
     qos: Qos
     reason: str
+    said_by: tuple[Who, ...] = ()  # where names are certified; nobody, unless stated
+    heard_by: tuple[Who, ...] = ()  # besides operators, who hear everything
 
     def at(self, **names: object) -> str:
         """The key with these names; `*` for each that is left out."""
@@ -75,6 +101,8 @@ ALIVE = Topic(
     "at a change of tier",
     Qos.COMMAND,
     "a liveliness token: the bus tells when it comes and goes; presence, not health",
+    said_by=_helpers("robot"),
+    heard_by=_helpers(),
 )
 BELIEF = Topic(
     "belief/<tier>/<robot>",
@@ -82,6 +110,8 @@ BELIEF = Topic(
     "5 Hz while a worse robot listens",
     Qos.FRESH,
     "the next one is better than a late one",
+    said_by=_helpers("robot"),
+    heard_by=_helpers(),
 )
 FIX = Topic(
     "fix/<robot>/<tier>/<observer>",
@@ -89,9 +119,17 @@ FIX = Topic(
     "each sighting of a worse robot that listens",
     Qos.FRESH,
     "the next one is better than a late one",
+    said_by=_helpers("observer"),
+    heard_by=_helpers("robot"),
 )
 STATUS = Topic(
-    "status/<robot>", Status, "1 Hz", Qos.TELEMETRY, "for people; must never delay a fix"
+    "status/<robot>",
+    Status,
+    "1 Hz",
+    Qos.TELEMETRY,
+    "for people; must never delay a fix",
+    said_by=_helpers("robot"),
+    heard_by=_helpers("robot"),
 )
 TRACK = Topic(
     "track/<robot>",
@@ -99,19 +137,36 @@ TRACK = Topic(
     "10 Hz while somebody records",
     Qos.TELEMETRY,
     "for reports; costs nothing when nobody listens",
+    said_by=_helpers("robot"),
+    heard_by=_helpers("robot"),
 )
+_SENSING = (*_helpers("robot"), Who(Role.FIELD))  # its own driver, or the simulated field
 IN_ODOMETRY = Topic(
     "in/<robot>/odometry",
     Odometry,
     "the driver's",
     Qos.INPUT,
     "a lost piece of odometry is a lost piece of the way",
+    said_by=_SENSING,
+    heard_by=_helpers("robot"),
 )
 IN_SIGHTINGS = Topic(
-    "in/<robot>/sightings", Sightings, "the driver's", Qos.INPUT, "inputs are not dropped"
+    "in/<robot>/sightings",
+    Sightings,
+    "the driver's",
+    Qos.INPUT,
+    "inputs are not dropped",
+    said_by=_SENSING,
+    heard_by=_helpers("robot"),
 )
 IN_POSITION = Topic(
-    "in/<robot>/position", Position, "the driver's", Qos.INPUT, "inputs are not dropped"
+    "in/<robot>/position",
+    Position,
+    "the driver's",
+    Qos.INPUT,
+    "inputs are not dropped",
+    said_by=_SENSING,
+    heard_by=_helpers("robot"),
 )
 DRIVE = Topic(
     "field/drive/<robot>",
@@ -119,11 +174,31 @@ DRIVE = Topic(
     "10 Hz, simulation only",
     Qos.COMMAND,
     "a late command is a collision",
+    said_by=_helpers("robot"),
+    heard_by=(Who(Role.FIELD),),
+)
+JOIN = Topic(
+    "field/join/<robot>",
+    Join,
+    "2 Hz of a guest, simulation only",
+    Qos.COMMAND,
+    "without it the field takes the guest's body away; a field that restarts hears it again",
+    said_by=(Who(Role.OBSERVER, "robot"),),
+    heard_by=(Who(Role.FIELD),),
 )
 TRUTH = Topic(
-    "field/truth", Truths, "every step, simulation only", Qos.TELEMETRY, "for reports only"
+    "field/truth",
+    Truths,
+    "every step, simulation only",
+    Qos.TELEMETRY,
+    "for reports only",
+    said_by=(Who(Role.FIELD),),
 )
 
-TOPICS = (ALIVE, BELIEF, FIX, STATUS, TRACK, IN_ODOMETRY, IN_SIGHTINGS, IN_POSITION, DRIVE, TRUTH)
+TOPICS = (
+    *(ALIVE, BELIEF, FIX, STATUS, TRACK),
+    *(IN_ODOMETRY, IN_SIGHTINGS, IN_POSITION),
+    *(DRIVE, JOIN, TRUTH),
+)
 INPUTS = (IN_ODOMETRY, IN_SIGHTINGS, IN_POSITION)
 COLLABORATION = (Belief, Fix)

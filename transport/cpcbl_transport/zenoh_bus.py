@@ -18,6 +18,8 @@ from typing import Any
 import zenoh
 
 from cpcbl_transport.bus import Handle, Publisher, Receive, Watch
+from cpcbl_transport.handshake import why_not
+from cpcbl_transport.security import Credentials
 from cpcbl_transport.topics import Qos, namespace
 from cpcbl_transport.zenoh_config import NO_GUARDS, client_config, router_config
 
@@ -29,22 +31,35 @@ class BusError(Exception):
 
 
 def open_bus(
-    team: str, connect: Sequence[str], give_up: Callable[[], bool] = lambda: False
+    team: str,
+    connect: Sequence[str],
+    give_up: Callable[[], bool] = lambda: False,
+    credentials: Credentials | None = None,
 ) -> "ZenohBus":
     """A client's session below the team's namespace; waits for a router until `give_up()`.
 
-    Raises BusError when it gave up.
+    With credentials every link is mutual TLS. Raises BusError when it gave up.
     """
-    config = client_config(connect)
+    config = client_config(connect, credentials)
     reason = "stopped before a router answered"
     while not give_up():
         try:
             return ZenohBus(_open(config, namespace(team)))
         except zenoh.ZError as error:
-            reason = str(error)
-            log.info("no router at %s yet", ", ".join(connect))
+            reason = _why_not(connect, credentials) or _told(error)
+            log.info(
+                "no router at %s yet%s", ", ".join(connect), f": {reason}" if credentials else ""
+            )
             time.sleep(0.2)
     raise BusError(f"no router at {', '.join(connect)}: {reason}")
+
+
+def _why_not(connect: Sequence[str], credentials: Credentials | None) -> str:
+    """What stands in the way of TLS, of which Zenoh tells nothing; empty without credentials."""
+    if credentials is None:
+        return ""
+    reasons = {endpoint: why_not(endpoint, credentials) for endpoint in connect}
+    return "; ".join(dict.fromkeys(filter(None, reasons.values())))
 
 
 def open_router(
@@ -52,13 +67,15 @@ def open_router(
     listen: Sequence[str],
     connect: Sequence[str] = (),
     guards: Mapping[str, Any] = NO_GUARDS,
+    credentials: Credentials | None = None,
 ) -> "ZenohBus":
     """A session that is the team's router. Raises BusError when it cannot listen there.
 
-    `guards`: what `guard_rules` says; none, and everything is let in.
+    `guards`: what `guard_rules` and `access_rules` say; none, and everything is let in.
     """
+    config = router_config(listen, connect, guards, credentials)
     try:
-        return ZenohBus(_open(router_config(listen, connect, guards), namespace(team)))
+        return ZenohBus(_open(config, namespace(team)))
     except zenoh.ZError as error:
         raise BusError(f"cannot listen on {', '.join(listen)}: {error}") from error
 

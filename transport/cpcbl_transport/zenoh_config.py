@@ -9,24 +9,29 @@ from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import Any
 
+from cpcbl_transport.security import Credentials, link_options
+
 OPEN_TIMEOUT_MS = 2000
 LEASE_MS = 2000
 NO_GUARDS: Mapping[str, Any] = MappingProxyType({})
 
 _RETRY = {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 2}
-_EVERYBODY = {
-    "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
-    "timestamping": {"enabled": False},
-    "transport": {
-        "link": {"tx": {"sequence_number_resolution": "16bit", "lease": LEASE_MS, "keep_alive": 4}},
-        "shared_memory": {
-            "enabled": False
-        },  # a router kept 10 MiB of each session that sent > 3 kB
-    },
-}
+_TX = {"sequence_number_resolution": "16bit", "lease": LEASE_MS, "keep_alive": 4}
 
 
-def client_config(connect: Sequence[str]) -> dict[str, Any]:
+def _everybody(credentials: Credentials | None) -> dict[str, Any]:
+    return {
+        "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
+        "timestamping": {"enabled": False},
+        "transport": {
+            "link": {"tx": _TX, **(link_options(credentials) if credentials else {})},
+            # With it a router kept 10 MiB of every session that had sent a payload beyond 3 kB
+            "shared_memory": {"enabled": False},
+        },
+    }
+
+
+def client_config(connect: Sequence[str], credentials: Credentials | None = None) -> dict[str, Any]:
     """Of a session that looks for a router at these endpoints, once."""
     return {
         "mode": "client",
@@ -36,17 +41,20 @@ def client_config(connect: Sequence[str]) -> dict[str, Any]:
             "exit_on_failure": True,
             "retry": _RETRY,
         },
-        **_EVERYBODY,
+        **_everybody(credentials),
     }
 
 
 def router_config(
-    listen: Sequence[str], connect: Sequence[str] = (), guards: Mapping[str, Any] = NO_GUARDS
+    listen: Sequence[str],
+    connect: Sequence[str] = (),
+    guards: Mapping[str, Any] = NO_GUARDS,
+    credentials: Credentials | None = None,
 ) -> dict[str, Any]:
     """Of a router that listens at all of `listen` and joins the routers at `connect`.
 
     It looks for these as long as it lives, again after a link broke. `guards`: what `guard_rules`
-    says; none, and everything is let in.
+    and `access_control` say; none, and everything is let in.
     """
     return {
         "mode": "router",
@@ -57,6 +65,6 @@ def router_config(
             "exit_on_failure": False,
             "retry": _RETRY,
         },
-        **_EVERYBODY,
+        **_everybody(credentials),
         **guards,
     }

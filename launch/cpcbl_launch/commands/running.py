@@ -2,6 +2,7 @@
 
 import shlex
 import sys
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Optional
@@ -139,7 +140,7 @@ def up(
     title = f"team {team.name}, {len(run.team.robots)} robots, {speed:g} x real time"
     watch = ["cpcbl-team", "traffic", str(typed), "--connect", dialled(team.transport.listen[0])]
     console.print(f"watch it: {shlex.join(watch)}", style="dim", highlight=False, soft_wrap=True)
-    with LiveTable(title, console, quiet=as_json) as table:
+    with LiveTable(title, run.team.robots, console, quiet=as_json) as table:
         result = run_team(run, table, Stop(), launch)
     lost = dict(result.not_written) | write_report(report, result)
     if as_json:
@@ -194,17 +195,23 @@ def field(
     from cpcbl_agents.process import Stop
     from cpcbl_launch.field import robots_at, run_field
     from cpcbl_transport.bus import Bus
+    from cpcbl_transport.security import Identity, link_of
+    from cpcbl_transport.topics import Role
     from cpcbl_transport.zenoh_bus import open_bus
 
     team = load(team_file)
     elsewhere = robots_at(site or (), team)
     stop = Stop(parent)
     with ExitStack() as stack:
-        bus = stack.enter_context(open_bus(team.name, connect or team.transport.connect, stop))
+
+        def session(endpoints: Sequence[str]) -> Bus:
+            link = link_of(team, Identity(Role.FIELD), endpoints)
+            return stack.enter_context(open_bus(team.name, link.endpoints, stop, link.credentials))
+
+        bus = session(connect or team.transport.connect)
         sites: dict[str, Bus] = {}
         for endpoint, names in elsewhere.items():
-            there = stack.enter_context(open_bus(team.name, [endpoint], stop))
-            sites |= dict.fromkeys(names, there)
+            sites |= dict.fromkeys(names, session([endpoint]))
         when = Clock.parse(clock) if clock else Clock.wall()
         run_field(team, seed, bus, when, stop, sites)
 

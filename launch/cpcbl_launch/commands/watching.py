@@ -39,16 +39,21 @@ def traffic(
     from cpcbl_launch.traffic.show import TrafficView, drawn
     from cpcbl_launch.traffic.watch import Watch, watch_team
     from cpcbl_team.config import TransportSettings
+    from cpcbl_transport.security import Identity, Link, link_of
+    from cpcbl_transport.topics import Role
 
     if duration is not None and not duration > 0.0:
         raise ValueError(f"--for {duration:g}: more than 0 seconds")
     logging.getLogger("cpcbl_transport").setLevel(logging.WARNING)
     team = None if team_name is not None and file is None else load(file or Path("demo"))
     endpoints = connect or (team.transport if team is not None else TransportSettings()).connect
+    link = Link(tuple(endpoints))
+    if team is not None:
+        link = link_of(team, Identity(Role.OPERATOR), endpoints)
     watch = Watch(
         team_name or (team.name if team is not None else ""),
         () if team is None else tuple(team.robots),
-        endpoints,
+        link,
         math.inf if duration is None else duration,
         wait,
     )

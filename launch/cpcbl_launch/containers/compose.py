@@ -10,6 +10,8 @@ import yaml
 
 from cpcbl_launch.processes import tasks
 from cpcbl_team.config import Team
+from cpcbl_transport.security import Identity
+from cpcbl_transport.topics import Role
 
 PORT = 7447
 """Where the router listens, inside."""
@@ -34,8 +36,11 @@ class Deployment(NamedTuple):
     """The folder of the sources to build the image from; None: the image is there."""
     published: tuple[str, ...] = (f"127.0.0.1:{PORT}",)
     """Where the router can be reached from outside: [address:]port of this machine."""
-    scheme: str = "tcp"
     mounts: tuple[Mount, ...] = ()
+    keys: Mount | None = None
+    """The key folder of a secured team: of it each container may read its own part."""
+    user: str = ""
+    """uid:gid of all containers, where the image's will not do."""
     seed: int = 1
     speed: float = 1.0
     clock: str = ""
@@ -47,22 +52,29 @@ def compose_text(team: Team, how: Deployment) -> str:
     """The whole compose file: the router, the field if anything is simulated, a service a robot."""
     here = team.robots if how.here is None else how.here
     clock = ("--clock", how.clock) if how.clock else ()
-    common = ("--team", how.team_file, "--connect", f"{how.scheme}/router:{PORT}", *clock)
+    common = ("--team", how.team_file, "--connect", f"{_scheme(how)}/router:{PORT}", *clock)
     rows = tasks(team, common, how.seed, here)
     parts = [
         _HEAD.format(
             title=_title(team, here),
             image=_flow(how.image),
-            mounts=_mounts(how.mounts),
+            user=_user(how.user),
+            mounts="" if how.keys else _mounts(how.mounts, ""),
             to=_flow(["CMD", "linked", "to", str(PORT)]),
         ),
         _ROUTER.format(
             build=_build(how.context),
             command=_flow(_router(how)),
+            keys=_own_mounts(how, Identity(Role.ROUTER)),
             ports=_flow([f"{outside}:{PORT}" for outside in how.published]),
             at=_flow(["CMD", "linked", "at", str(PORT)]),
         ),
-        *(_SERVICE.format(name=row.name, command=_flow(row.arguments)) for row in rows),
+        *(
+            _SERVICE.format(
+                name=row.name, command=_flow(row.arguments), keys=_own_mounts(how, row.identity)
+            )
+            for row in rows
+        ),
     ]
     return "".join(parts)
 
@@ -75,7 +87,7 @@ def _title(team: Team, here: Collection[str]) -> str:
 
 
 def _router(how: Deployment) -> list[str]:
-    command = ["router", how.team_file, "--listen", f"{how.scheme}/0.0.0.0:{PORT}"]
+    command = ["router", how.team_file, "--listen", f"{_scheme(how)}/0.0.0.0:{PORT}"]
     return command if how.speed == 1.0 else [*command, "--speed", f"{how.speed:g}"]
 
 
@@ -87,14 +99,33 @@ def _build(context: str | None) -> str:
     )
 
 
-def _mounts(mounts: Collection[Mount]) -> str:
+def _scheme(how: Deployment) -> str:
+    return "tcp" if how.keys is None else "tls"
+
+
+def _user(user: str) -> str:
+    return (
+        f"  user: {_flow(user)} # whose the keys are; nobody else can read them\n" if user else ""
+    )
+
+
+def _own_mounts(how: Deployment, identity: Identity) -> str:
+    """What one service may read of a secured team: what all may, and its own keys."""
+    if how.keys is None:
+        return ""
+    own = Mount(f"{how.keys.source}/{identity}", f"{how.keys.target}/{identity}")
+    return _mounts((*how.mounts, own), "  ")
+
+
+def _mounts(mounts: Collection[Mount], indent: str) -> str:
     if not mounts:
         return ""
     lines = [
         _flow({"type": "bind", "source": m.source, "target": m.target, "read_only": True})
         for m in mounts
     ]
-    return "  volumes: # on every machine of a swarm\n" + "".join(f"    - {s}\n" for s in lines)
+    head = f"{indent}  volumes: # on every machine of a swarm\n"
+    return head + "".join(f"{indent}    - {line}\n" for line in lines)
 
 
 def _flow(value: object) -> str:
@@ -132,7 +163,7 @@ x-container: &container
   restart: unless-stopped
   stop_grace_period: 3s
   logging: {{driver: json-file, options: {{max-size: 10m, max-file: "2"}}}}
-{mounts}
+{user}{mounts}
 x-member: &member
   <<: *container
   depends_on: [router]
@@ -148,7 +179,7 @@ _ROUTER = """\
     <<: *container
 {build}    command: {command}
     ports: {ports}
-    healthcheck:
+{keys}    healthcheck:
       test: {at}
       interval: 15s
 """
@@ -164,4 +195,4 @@ _SERVICE = """
   {name}:
     <<: *member
     command: {command}
-"""
+{keys}"""

@@ -12,22 +12,28 @@ from rich.console import Console
 
 from cpcbl_agents.clock import Clock
 from cpcbl_launch.containers.compose import Deployment, Mount, compose_text
+from cpcbl_launch.containers.deployment import owner
 from cpcbl_launch.containers.docker import DockerError, Said, check_daemon, compose_program
 from cpcbl_launch.containers.fleet import Fleet, Project
 from cpcbl_launch.containers.image import have, image_for
 from cpcbl_launch.processes import tasks
 from cpcbl_launch.supervisor import Processes
 from cpcbl_launch.team_file import save_resolved
-from cpcbl_launch.up import Run, dialled
+from cpcbl_launch.up import Run, check_keys, dialled
 from cpcbl_team.config import Team
 from cpcbl_transport.bus import Bus
+from cpcbl_transport.security import Identity, Link, link_of
+from cpcbl_transport.topics import Role
 from cpcbl_transport.zenoh_bus import BusError, ZenohBus, open_bus
 
 LEAD_S = 4.0
 LEAD_S_A_CONTAINER = 0.5
+ROUTERS, ROUTERS_A_CONTAINER = 2.0, 0.4
+"""The same in times that the router took: on a busy machine all take as much longer."""
 ROUTER_WITHIN_S = 60.0
 INSIDE = "/team/team.json"
 DATA_INSIDE = "/team/data"
+KEYS_INSIDE = "/team/keys"
 
 
 class InContainers:
@@ -43,13 +49,14 @@ class InContainers:
         said: Said,
     ) -> None:
         """`image`: the one to use; None: of these sources, on `base`. Raises DockerError."""
+        self._here = run.team.robots if run.here is None else run.here
+        check_keys(run.team, run.team.transport.listen, self._here)
         check_daemon()
         program = compose_program()
         self._run, self._folder, self._stop, self._said = run, folder, stop, said
         if image is not None:
             have(image, stop, said, "leave --image out to build one of these sources")
         self._image = image or image_for(base, stop, said)
-        self._here = run.team.robots if run.here is None else run.here
         self.lead_s = LEAD_S + LEAD_S_A_CONTAINER * len(self._here)
         self._file = folder / "compose.yaml"
         name = f"{_project_name(run.team)}-{secrets.token_hex(3)}"
@@ -64,21 +71,26 @@ class InContainers:
         self._write("")
         self._said(f"starting {len(self._here)} robots in containers: project {self._project.name}")
         team = self._run.team
+        here = [dialled(team.transport.listen[0])]
+        link = link_of(team, Identity(Role.OPERATOR), here)
         try:
+            began_s = time.monotonic()
             self._project.up("router")
-            with self._joined(dialled(team.transport.listen[0])) as bus:
+            with self._joined(link) as bus:
+                routers = ROUTERS + ROUTERS_A_CONTAINER * len(self._here)
+                self.lead_s = max(self.lead_s, routers * (time.monotonic() - began_s))
                 yield bus
         finally:
             self._end()
 
-    def _joined(self, endpoint: str) -> ZenohBus:
+    def _joined(self, link: Link) -> ZenohBus:
         until_s = time.monotonic() + ROUTER_WITHIN_S
 
         def give_up() -> bool:
             return self._stop() or time.monotonic() > until_s
 
         try:
-            return open_bus(self._run.team.name, [endpoint], give_up)
+            return open_bus(self._run.team.name, link.endpoints, give_up, link.credentials)
         except BusError as error:
             said = self._project.last_words("router")
             raise DockerError(f"{error}; the router's container said: {said}") from error
@@ -105,6 +117,8 @@ class InContainers:
             self._image,
             published=tuple(published(endpoint) for endpoint in endpoints),
             mounts=(Mount(str((self._folder / "team.json").resolve()), INSIDE), *_data(run.team)),
+            keys=_keys(run.team),
+            user=owner(run.team, Identity(Role.ROUTER)),
             seed=run.seed,
             speed=run.speed,
             clock=clock,
@@ -121,8 +135,13 @@ def progress_on(console: Console) -> Said:
 
 
 def inside(team: Team) -> Team:
-    """The team as containers see it: a log's folder is where it is mounted."""
-    return msgspec.structs.replace(team, data=DATA_INSIDE) if _replays(team) else team
+    """The team as containers see it: a log's folder and keys are where they are mounted."""
+    if _replays(team):
+        team = msgspec.structs.replace(team, data=DATA_INSIDE)
+    if team.transport.secured:
+        transport = msgspec.structs.replace(team.transport, keys=KEYS_INSIDE)
+        team = msgspec.structs.replace(team, transport=transport)
+    return team
 
 
 def published(endpoint: str) -> str:
@@ -143,6 +162,10 @@ def published(endpoint: str) -> str:
 
 def _data(team: Team) -> tuple[Mount, ...]:
     return (Mount(str(Path(team.data).resolve()), DATA_INSIDE),) if _replays(team) else ()
+
+
+def _keys(team: Team) -> Mount | None:
+    return Mount(team.transport.keys, KEYS_INSIDE) if team.transport.secured else None
 
 
 def _replays(team: Team) -> bool:

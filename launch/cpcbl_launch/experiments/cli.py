@@ -102,6 +102,22 @@ def budget(
     _written(result, experiment.tables(result), output, as_json, draw_budget)
 
 
+@experiment_app.command("liars")
+def liars(
+    seeds: Seeds = 10, jobs: Jobs = None, output: Output = Path(), as_json: AsJson = False
+) -> None:
+    """One observer of several lies for a while: what it does to the team, and when it is found."""
+    from cpcbl_launch.experiments import liars as experiment
+    from cpcbl_launch.experiments.pictures import draw_liars
+    from cpcbl_launch.options import folder_for, must_draw
+
+    must_draw("experiment")
+    folder_for("--output", output)
+    with _progress("liars", len(experiment.cases()) * seeds) as done:
+        result = experiment.measured(seeds, jobs or os.cpu_count() or 1, done)
+    _written(result, experiment.tables(result), output, as_json, draw_liars)
+
+
 @experiment_app.command("latency")
 def latency(
     sightings: Annotated[int, typer.Option(min=10, help="Sightings measured; ten a second.")] = 500,

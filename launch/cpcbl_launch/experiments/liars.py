@@ -3,22 +3,24 @@ believed again.
 
 Observers with good eyes stand round the field of the demonstration; a navigator with poor ones and
 two scouts, blind to landmarks, drive between them. From 10 s to 25 s one observer says what is not
-so (`liar.py`), then the truth again. Errors are those of the robots that drive, from 10 s on,
-beside the team without that observer, and beside one that believes everything.
+so (`liar.py`), then the truth again; two or only one are honest beside it. Errors are those of the
+robots that drive, from 10 s on, beside the team without the liar, and beside one that believes all.
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from importlib.metadata import version
 from typing import NamedTuple
 
 import msgspec
 import numpy as np
+from rich.console import RenderableType
 
 from cpcbl_launch.evaluation import simulate
 from cpcbl_launch.experiments.results import Spread, spread
 from cpcbl_launch.experiments.runs import in_processes
 from cpcbl_launch.liar import Lie, lying
+from cpcbl_launch.tables import number, table
 from cpcbl_launch.team_file import builtin, load_team
 from cpcbl_team.config import Team, TrustSettings
 from cpcbl_team.metrics import position_errors
@@ -29,7 +31,17 @@ from cpcbl_transport.messages import Status, decode
 FROM_S, UNTIL_S, END_S = 10.0, 25.0, 45.0
 MOST_RATIO = 1.3
 LIAR = "west"
-KINDS = ("bias:0.5,0.5", "bias:0.2,0.0", "frozen", "jumps:1.5", "overconfident:0.3")
+KINDS = (
+    "bias:0.5,0.5",
+    "bias:0.2,0.0",
+    "frozen",
+    "jumps:1.5",
+    "overconfident:0.3",
+    "clock:-0.3",
+    "clock:-0.5",
+)
+HONEST = (2, 1)
+HONEST_POSTS = ("north", "south")
 POSTS = {"north": (4.5, 5.0, -90.0), "south": (4.5, 0.0, 90.0), LIAR: (0.0, 2.5, 0.0)}
 DRIVERS = ("navigator", "scout", "scout2")
 
@@ -40,7 +52,9 @@ class Case(msgspec.Struct, frozen=True, kw_only=True):
     lie: str
     """As in `--lie`, without its times; empty: the truth."""
     liar: bool = True
-    """Whether the third observer is there at all."""
+    """Whether the liar is there at all."""
+    honest: int = 2
+    """Observers beside it."""
     trust: bool = True
     """Whether robots judge what they are told."""
 
@@ -71,7 +85,7 @@ class Row(msgspec.Struct, frozen=True, kw_only=True):
     worst_m: Spread
     """Of the robot that errs most."""
     ratio: Spread | None
-    """To the team without the third observer, with the same seed."""
+    """To the team without the liar, with the same seed."""
     found: int
     """Robots that put the liar into quarantine, over all seeds."""
     listening: int
@@ -107,15 +121,15 @@ def team(case: Case) -> Team:
     assert observer.start is not None
     assert scout.start is not None
     sensor = replace(observer.sensor, range_share=0.01, bearing_sigma_deg=1.0, max_range_m=10.0)
-    robots = {
-        name: replace(
+    posts = [*list(HONEST_POSTS)[: case.honest], *([LIAR] if case.liar else [])]
+    robots = {}
+    for name in posts:
+        x, y, heading_deg = POSTS[name]
+        robots[name] = replace(
             observer,
             sensor=replace(sensor, field_of_view_deg=120.0),
             start=replace(observer.start, x_m=x, y_m=y, heading_deg=heading_deg),
         )
-        for name, (x, y, heading_deg) in POSTS.items()
-        if case.liar or name != LIAR
-    }
     robots |= {
         "navigator": base.robots["navigator"],
         "scout": scout,
@@ -134,9 +148,14 @@ def team(case: Case) -> Team:
 
 
 def cases() -> list[Case]:
-    """Without the third observer, with it, and with each kind of lie, believed or judged."""
-    lies = [Case(lie=kind, trust=trust) for kind in KINDS for trust in (True, False)]
-    return [Case(lie="", liar=False), Case(lie=""), *lies]
+    """Without the liar, with it while it is honest, with each kind of lie, judged or believed."""
+    every = []
+    for honest in HONEST:
+        every += [Case(lie="", liar=False, honest=honest), Case(lie="", honest=honest)]
+        every += [
+            Case(lie=kind, honest=honest, trust=trust) for kind in KINDS for trust in (True, False)
+        ]
+    return every
 
 
 class _Statuses:
@@ -153,14 +172,15 @@ class _Statuses:
     def _arrived(self, key: str, payload: bytes) -> None:
         status = decode(payload)
         assert isinstance(status, Status)
-        for peer, reason, since_ns, quarantines, _ in map(msgspec.structs.astuple, status.trust):
-            key_ = status.robot, peer, quarantines
-            if reason:
-                first = self.found.get(key_)
+        for trust in status.trust:
+            key_ = status.robot, trust.peer, trust.quarantines
+            since_ns = trust.since_ns or status.stamp_ns  # of a clock it is not said
+            first = self.found.get(key_)
+            if trust.reason:
                 from_s = since_ns * 1e-9 if first is None else first.from_s
-                self.found[key_] = Quarantine(status.robot, peer, reason, from_s, None)
-            elif key_ in self.found and self.found[key_].until_s is None:
-                self.found[key_] = self.found[key_]._replace(until_s=since_ns * 1e-9)
+                self.found[key_] = Quarantine(status.robot, trust.peer, trust.reason, from_s, None)
+            elif first is not None and first.until_s is None:
+                self.found[key_] = first._replace(until_s=since_ns * 1e-9)
 
 
 def run(case: Case, seed: int) -> Run:
@@ -187,9 +207,10 @@ def measured(
     tasks = [(case, seed) for case in wanted for seed in range(1, seeds + 1)]
     runs = in_processes(run, tasks, jobs, done)
     by_case = {case: runs[i * seeds : (i + 1) * seeds] for i, case in enumerate(wanted)}
-    without = by_case.get(Case(lie="", liar=False))
-    rows = tuple(_row(case, found, without) for case, found in by_case.items())
-    judged = [row for row in rows if row.case.lie and row.case.trust and row.ratio is not None]
+    rows = tuple(
+        _row(case, found, by_case.get(Case(lie="", liar=False, honest=case.honest)))
+        for case, found in by_case.items()
+    )
     return Liars(
         experiment="liars",
         version=version("cpcbl-team"),
@@ -197,7 +218,7 @@ def measured(
         lie_s=(FROM_S, UNTIL_S, END_S),
         team=team(Case(lie="")),
         rows=rows,
-        held=all(row.ratio is not None and row.ratio.median <= MOST_RATIO for row in judged),
+        held=not any(map(_missed, _judged(rows))),
     )
 
 
@@ -242,3 +263,60 @@ def _row(case: Case, runs: Sequence[Run], without: Sequence[Run] | None) -> Row:
         false_quarantines=len(false),
         false_quarantine_s=sum((q.until_s or END_S) - q.from_s for q in false) / len(runs),
     )
+
+
+def tables(result: Liars) -> Iterable[RenderableType]:
+    """A row each lie, beside what comes of believing everything."""
+    believed = {(r.case.lie, r.case.honest): r for r in result.rows if not r.case.trust}
+    for honest in sorted({r.case.honest for r in result.rows}, reverse=True):
+        title = f"one liar, {honest} honest: robots that drive, {result.seeds} seeds"
+        figures = ("m", "ratio", "80 %", "believed", "found", "s", "back", "false")
+        shown = table(title, ("lie",), figures)
+        for row in result.rows:
+            if row.case.honest == honest and row.case.trust:
+                shown.add_row(*_cells(row, believed.get((row.case.lie, honest))))
+        yield shown
+    yield (
+        "m: RMSE. ratio: to the team without the liar; where 80 % of the seeds lie;\n"
+        "believed: where nobody judges. found: robots that found it; s: after the lie\n"
+        "began; back: s after it ended. false: quarantine of honest ones, s a run"
+    )
+    missed = [
+        f"{r.case.lie} beside {r.case.honest} honest" for r in _judged(result.rows) if _missed(r)
+    ]
+    yield (
+        f"held: no ratio is above {MOST_RATIO:g}"
+        if not missed
+        else f"above {MOST_RATIO:g}: {'; '.join(missed)}"
+    )
+
+
+def _judged(rows: Iterable[Row]) -> list[Row]:
+    return [row for row in rows if row.case.lie and row.case.trust]
+
+
+def _missed(row: Row) -> bool:
+    return row.ratio is None or row.ratio.median > MOST_RATIO
+
+
+def _cells(row: Row, believed: Row | None) -> list[str]:
+    name = row.case.lie or ("honest" if row.case.liar else "not there")
+    found = [f"{row.found}/{row.listening}", *_seconds(row)] if row.case.lie else [""] * 3
+    ratio = row.ratio
+    return [
+        name,
+        number(row.rmse_m.median),
+        number(_median(ratio), 2),
+        "-" if ratio is None else f"{ratio.low:.2f}-{ratio.high:.2f}",
+        number(_median(believed.ratio), 2) if believed is not None else "",
+        *found,
+        f"{row.false_quarantine_s:.1f}",
+    ]
+
+
+def _seconds(row: Row) -> tuple[str, str]:
+    return number(_median(row.found_after_s), 1), number(_median(row.readmitted_after_s), 1)
+
+
+def _median(found: Spread | None) -> float | None:
+    return None if found is None else found.median

@@ -7,12 +7,14 @@ from typing import Any
 import matplotlib as mpl
 
 from cpcbl_launch.experiments.budget import Curve, Point
-from cpcbl_launch.experiments.results import Accuracy, Outcome
+from cpcbl_launch.experiments.liars import Liars
+from cpcbl_launch.experiments.results import Accuracy, Outcome, Spread
 from cpcbl_team.config import RobotSettings, Team
 
 mpl.use("Agg")
 
 from matplotlib import pyplot as plt
+from matplotlib.lines import Line2D
 from matplotlib.patches import Wedge
 
 DPI = 90
@@ -147,6 +149,39 @@ def draw_directions(result: Outcome, path: Path) -> None:
     handles, labels = panels[0][0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=len(ways))
     _save(figure, path)
+
+
+def draw_liars(result: Liars, path: Path) -> None:
+    """The team's error beside that without the liar, judged and believed; when it was found."""
+    sizes = sorted({row.case.honest for row in result.rows}, reverse=True)
+    figure, panels = plt.subplots(
+        2, len(sizes), figsize=(12, 6.5), sharex=True, squeeze=False, layout="constrained"
+    )
+    kinds = list(dict.fromkeys(row.case.lie for row in result.rows if row.case.lie))
+    for (ratios, times), honest in zip(panels.T, sizes, strict=True):
+        lies = [row for row in result.rows if row.case.lie and row.case.honest == honest]
+        for row in lies:
+            if row.ratio is not None:
+                at = kinds.index(row.case.lie) + (-0.1 if row.case.trust else 0.1)
+                _bar(ratios, at, row.ratio, "C0" if row.case.trust else "C3")
+            if row.case.trust:
+                for found, colour in ((row.found_after_s, "C1"), (row.readmitted_after_s, "C2")):
+                    if found is not None:
+                        _bar(times, kinds.index(row.case.lie), found, colour)
+        ratios.axhline(1.3, color="0.5", linestyle="--")
+        ratios.set(title=f"one liar, {honest} honest", yscale="log")
+        times.set_xticks(range(len(kinds)), kinds, rotation=30, ha="right")
+    panels[0][0].set_ylabel("RMSE, to the team without it")
+    panels[1][0].set_ylabel("found, taken back (s)")
+    colours = {"judged": "C0", "believed": "C3", "found": "C1", "taken back": "C2"}
+    handles = [Line2D([], [], marker="o", color=c, label=n) for n, c in colours.items()]
+    figure.legend(handles=handles, loc="outside lower center", ncols=len(colours))
+    _save(figure, path)
+
+
+def _bar(axes: Any, at: float, found: Spread, colour: str) -> None:
+    bars = [[found.median - found.low], [found.high - found.median]]
+    axes.errorbar(at, found.median, bars, fmt="o", ms=4, capsize=3, color=colour)
 
 
 def _field(axes: Any, team: Team) -> None:

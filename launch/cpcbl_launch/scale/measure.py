@@ -8,9 +8,9 @@ from pathlib import Path
 
 import msgspec
 
+from cpcbl_agents.node import Stepped
 from cpcbl_launch.evaluation import (
     Progress,
-    Stepped,
     robot_nodes,
     run_nodes,
     simulated_report,

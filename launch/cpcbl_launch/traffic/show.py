@@ -39,13 +39,21 @@ def spent_table(report: Report) -> Table:
     )
     if limited:
         shown.add_column("most", no_wrap=True)
-    for name, robot in report.robots.items():
-        limits = [Text("\n").join(map(limit_text, robot.spending))] if limited else []
-        shown.add_row(name, *_spent([robot], report.duration_s), *limits)
-    shown.add_section()
     robots = list(report.robots.values())
+    for name, robot in report.robots.items():
+        _add_spent(shown, name, robot, report.duration_s)
+    shown.add_section()
     shown.add_row("team", *_spent(robots, report.duration_s), style="bold")
+    if report.guests:
+        shown.add_section()
+    for name, guest in report.guests.items():
+        _add_spent(shown, f"{name}, guest", guest, report.duration_s)
     return shown
+
+
+def _add_spent(shown: Table, name: str, robot: RobotReport, duration_s: float) -> None:
+    limits = [Text("\n").join(map(limit_text, robot.spending))] if robot.spending else []
+    shown.add_row(name, *_spent([robot], duration_s), *limits)
 
 
 def _spent(robots: Sequence[RobotReport], duration_s: float) -> list[str]:
@@ -131,7 +139,7 @@ def help_table(now: Traffic) -> Table:
     for name, robot in now.robots.items():
         style = "dim" if robot.away else "bold red" if robot.lost else ""
         shown.add_row(
-            Text(name, style),
+            Text(f"{name}, guest" if name in now.guests else name, style),
             Text(str(robot.tier), style),
             Text(number(robot.position_sigma_m), style),
             _doing(robot, [h for h in now.help if h.helper == name]),

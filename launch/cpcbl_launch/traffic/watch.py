@@ -25,6 +25,7 @@ from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus
 from cpcbl_transport.messages import Flow, Status
 from cpcbl_transport.reading import read
+from cpcbl_transport.security import Link
 from cpcbl_transport.zenoh_bus import BusError, open_bus
 
 AT_PRESENT_NS = 3_000_000_000  # help is given at present whose latest message is no older
@@ -80,6 +81,8 @@ class Traffic(msgspec.Struct, frozen=True, kw_only=True):
     never_heard: tuple[str, ...]
     """Robots of the team file that have said nothing."""
     help: tuple[Help, ...]
+    guests: tuple[str, ...] = ()
+    """Robots that the team file, where there is one, does not name."""
     refused: dict[str, int] = {}
     """What came on `status/*` and could not be used, by reason."""
 
@@ -108,6 +111,7 @@ def traffic(
         robots=robots,
         never_heard=tuple(name for name in known if name not in robots),
         help=tuple(_help(robots)),
+        guests=tuple(name for name in robots if known and name not in known),
         refused=dict(sorted(refused.items())),
     )
 
@@ -207,7 +211,7 @@ class Watch(NamedTuple):
     team: str
     known: Collection[str]
     """The robots that should be there, as far as one knows."""
-    connect: Sequence[str]
+    link: Link
     duration_s: float = math.inf
     wait_s: float = 5.0
     """For the router."""
@@ -219,14 +223,15 @@ def watch_team(watch: Watch, view: View, stop: Callable[[], bool]) -> Traffic:
     try:
         bus = open_bus(
             watch.team,
-            watch.connect,
+            watch.link.endpoints,
             lambda: stop() or time.monotonic() > began_s + watch.wait_s,
+            watch.link.credentials,
         )
     except BusError:
         if stop():
             return traffic(watch.team, watch.known, {}, began_s, time.monotonic())
         raise BusError(
-            f"no router at {', '.join(watch.connect)} within {watch.wait_s:g} s;"
+            f"no router at {', '.join(watch.link.endpoints)} within {watch.wait_s:g} s;"
             " --connect takes the endpoint that `cpcbl-team up` says"
         ) from None
     with bus:

@@ -1,0 +1,100 @@
+"""A guest's node: on a simulated field it also asks for a body, again and again."""
+
+import logging
+from collections import Counter
+from collections.abc import Callable
+
+from cpcbl_agents.node import Node
+from cpcbl_agents.robot import Robot
+from cpcbl_team.config import RobotSettings, Team
+from cpcbl_transport import topics
+from cpcbl_transport.bus import Bus
+from cpcbl_transport.messages import Body, Flow, Join, encode
+
+log = logging.getLogger(__name__)
+
+ASK_NS = 500_000_000
+AGAIN_NS = 50_000_000  # while no field listens
+PATIENCE_NS = 3_000_000_000  # so long it may take until something is sensed
+
+
+def body_of(settings: RobotSettings) -> Body | None:
+    """What a simulated field must know of a robot; None for a real one."""
+    start, s = settings.start, settings
+    if s.source != "simulated" or start is None:
+        return None
+    return Body(start, s.sensor, s.odometry, s.position_sensor)
+
+
+class Visit:
+    """Runs a guest that `team` holds beside its robots, from `start_ns` until `leave`."""
+
+    def __init__(
+        self,
+        name: str,
+        team: Team,
+        bus: Bus,
+        start_ns: int,
+        incarnation: str,
+        on_arrival: Callable[[], None] = lambda: None,
+        speed: float = 1.0,
+    ) -> None:
+        self.robot = Robot(name, team, start_ns)
+        self._node = Node(self.robot, team, bus, start_ns, incarnation, on_arrival, speed)
+        self._incarnation, self._due_ns = incarnation, start_ns
+        self._warn_ns: int | None = start_ns + PATIENCE_NS
+        self._body = body_of(team.robots[name])
+        self._join = bus.publisher(topics.JOIN.at(robot=name), topics.JOIN.qos)
+
+    @property
+    def next_ns(self) -> int:
+        return self._node.next_ns if self._body is None else min(self._node.next_ns, self._due_ns)
+
+    @property
+    def waiting(self) -> bool:
+        return self._node.waiting
+
+    @property
+    def heard(self) -> tuple[Flow, ...]:
+        """Help that others have sent it."""
+        return self._node.heard.flows()
+
+    @property
+    def counts(self) -> Counter[str]:
+        """What was used and what was refused so far, by reason."""
+        return self.robot.counts + self._node.counts
+
+    @property
+    def unfed(self) -> str:
+        """Why nothing has been sensed so far; empty if something has."""
+        if self.robot.sensing.counts:
+            return ""
+        if self._body is None:
+            keys = topics.IN_SIGHTINGS.at(robot=self.robot.name)
+            return f"senses nothing: nothing came on {keys}; is its driver there?"
+        return (
+            "senses nothing: no field gives it a body; is the team simulated in real time, and does"
+            " its file let guests in?"
+        )
+
+    def step(self, now_ns: int) -> None:
+        """What a node does, and a word to the field when it is due."""
+        if self._warn_ns is not None and now_ns >= self._warn_ns:
+            self._warn_ns = None
+            if self.unfed:
+                log.warning("%s %s", self.robot.name, self.unfed)
+        if self._body is not None and now_ns >= self._due_ns:
+            self._due_ns = now_ns + (ASK_NS if self._ask(now_ns, self._body) else AGAIN_NS)
+        self._node.step(now_ns)
+
+    def leave(self, now_ns: int) -> None:
+        """Gives the body back. The rest goes with the session."""
+        if self._body is not None:
+            self._ask(now_ns, None)
+
+    def _ask(self, now_ns: int, body: Body | None) -> bool:
+        """Whether a field listens."""
+        if not self._join.matching:
+            return False
+        self._join.put(encode(Join(self.robot.name, self._incarnation, now_ns, body)))
+        return True

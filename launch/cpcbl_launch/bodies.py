@@ -1,0 +1,59 @@
+"""Which guests have a body on the simulated field: those that ask for one, and ask again."""
+
+from collections.abc import Iterator, Mapping
+
+from cpcbl_team.config import Team
+from cpcbl_transport.messages import Body, Join
+
+LASTS_NS = 2_000_000_000  # who has not asked again for so long is gone
+LONGEST_DELAY_S = 10.0  # what is sensed with a delay is kept so long
+
+
+class Bodies:
+    """What guests have asked for, by the team's rules. Times are the field's."""
+
+    def __init__(self, team: Team) -> None:
+        self._robots, self._rules = frozenset(team.robots), team.guests
+        self._asked: dict[str, tuple[int, Join]] = {}
+
+    def ask(self, join: Join, now_ns: int) -> str:
+        """Takes a guest's word; the reason if it is refused."""
+        if join.body is None:
+            self._asked.pop(join.robot, None)
+            return ""
+        reason = self._refusal(join.robot) or unfit(join.body)
+        if not reason:
+            self._asked[join.robot] = now_ns, join
+        return reason
+
+    def _refusal(self, name: str) -> str:
+        if not self._rules.allowed:
+            return "guests.allowed is false"
+        if name in self._robots:
+            return "a robot of the team has this name"
+        full = len(self._asked) >= self._rules.most and name not in self._asked
+        return f"there are {self._rules.most} guests, guests.most" if full else ""
+
+    def present(self, now_ns: int) -> Mapping[str, Join]:
+        """The guests that have a body now, with what each asked for last."""
+        self._asked = {
+            name: (asked_ns, join)
+            for name, (asked_ns, join) in self._asked.items()
+            if now_ns - asked_ns <= LASTS_NS
+        }
+        return {name: join for name, (_, join) in self._asked.items()}
+
+
+def unfit(body: Body) -> str:
+    """Why the field cannot give a guest this body; empty if it can."""
+    for key, delay_s in _delays_s(body):
+        if abs(delay_s) > LONGEST_DELAY_S:
+            return f"{key}: {delay_s:g} s; at most {LONGEST_DELAY_S:g} s"
+    return ""
+
+
+def _delays_s(body: Body) -> Iterator[tuple[str, float]]:
+    yield "sensor.delay_s", body.sensor.delay_s
+    yield "odometry.delay_s", body.odometry.delay_s
+    if body.position_sensor is not None:
+        yield "position_sensor.delay_s", body.position_sensor.delay_s

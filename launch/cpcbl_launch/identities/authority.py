@@ -1,0 +1,182 @@
+"""A certificate authority and what it signs: X.509 with keys on the curve P-256, as PEM.
+
+Raises ValueError where `cryptography` is not installed.
+"""
+
+import ipaddress
+from collections.abc import Iterable
+from datetime import datetime, timedelta
+from typing import NamedTuple
+
+try:
+    from cryptography import x509
+    from cryptography.hazmat.primitives import hashes, serialization
+    from cryptography.hazmat.primitives.asymmetric import ec
+    from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
+except ImportError as error:
+    raise ValueError("keys needs cryptography: pip install 'cpcbl-team[security]'") from error
+
+CLOCKS_APART = timedelta(days=1)  # a machine whose clock is late takes a new certificate too
+AUTHORITY_DAYS = 3650
+
+
+class Pair(NamedTuple):
+    """A private key and its certificate, in PEM."""
+
+    private_key: bytes
+    certificate: bytes
+
+
+class Facts(NamedTuple):
+    """What a certificate says."""
+
+    common_name: str
+    not_before: datetime
+    not_after: datetime
+    hosts: tuple[str, ...]
+
+
+def new_authority(team: str, now: datetime) -> Pair:
+    """An authority that signs the certificates of members, and no other authority's."""
+    key = ec.generate_private_key(ec.SECP256R1())
+    serial = x509.random_serial_number()
+    # Two authorities of a team have two names: a verifier looks for the signer by its name.
+    name = _name(f"{team} authority {serial % 2**32:08x}")
+    lasting = timedelta(days=AUTHORITY_DAYS)
+    certificate = (
+        _begun(name, name, key.public_key(), now, lasting)
+        .serial_number(serial)
+        .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
+        .add_extension(_usage(signs=True), critical=True)
+        .add_extension(x509.SubjectKeyIdentifier.from_public_key(key.public_key()), critical=False)
+        .sign(key, hashes.SHA256())
+    )
+    return _pem(key, certificate)
+
+
+def issued(
+    authority: Pair, common_name: str, hosts: Iterable[str], now: datetime, lasting: timedelta
+) -> Pair:
+    """A certificate with a new key. With hosts its owner may be dialled there, else only dial.
+
+    Raises ValueError for hosts that are none, and for an authority that ends sooner.
+    """
+    signer = serialization.load_pem_private_key(authority.private_key, None)
+    assert isinstance(signer, ec.EllipticCurvePrivateKey)
+    above = x509.load_pem_x509_certificate(authority.certificate)
+    if now + lasting > above.not_valid_after_utc:
+        raise ValueError(
+            f"--days: the authority ends {above.not_valid_after_utc:%Y-%m-%d}; ask for fewer days,"
+            " or make a new one with --renew ca"
+        )
+    key = ec.generate_private_key(ec.SECP256R1())
+    usages, names = [ExtendedKeyUsageOID.CLIENT_AUTH], [_host(host) for host in hosts]
+    builder = (
+        _begun(_name(common_name), above.subject, key.public_key(), now, lasting)
+        .serial_number(x509.random_serial_number())
+        .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
+        .add_extension(_usage(signs=False), critical=True)
+        .add_extension(
+            x509.AuthorityKeyIdentifier.from_issuer_public_key(signer.public_key()), critical=False
+        )
+    )
+    if names:
+        usages.append(ExtendedKeyUsageOID.SERVER_AUTH)
+        builder = builder.add_extension(x509.SubjectAlternativeName(names), critical=False)
+    builder = builder.add_extension(x509.ExtendedKeyUsage(usages), critical=False)
+    return _pem(key, builder.sign(signer, hashes.SHA256()))
+
+
+def facts(certificate: bytes) -> Facts:
+    """What a certificate says. Raises ValueError for one that cannot be read."""
+    read = x509.load_pem_x509_certificate(certificate)
+    try:
+        names = read.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+        hosts = tuple(str(name.value) for name in names)
+    except x509.ExtensionNotFound:
+        hosts = ()
+    common_name = read.subject.get_attributes_for_oid(NameOID.COMMON_NAME)[0].value
+    return Facts(str(common_name), read.not_valid_before_utc, read.not_valid_after_utc, hosts)
+
+
+def signed_by(certificate: bytes, authority: bytes) -> bool:
+    """Whether an authority signed a certificate."""
+    try:
+        x509.load_pem_x509_certificate(certificate).verify_directly_issued_by(
+            x509.load_pem_x509_certificate(authority)
+        )
+    except Exception:
+        return False
+    return True
+
+
+def belong_together(pair: Pair) -> bool:
+    """Whether a private key is that of a certificate."""
+    try:
+        key = serialization.load_pem_private_key(pair.private_key, None)
+        certificate = x509.load_pem_x509_certificate(pair.certificate)
+    except ValueError:
+        return False
+    return key.public_key() == certificate.public_key()
+
+
+def newest(bundle: bytes) -> bytes:
+    """The first certificate of several in one text: that of the authority in use."""
+    return x509.load_pem_x509_certificates(bundle)[0].public_bytes(serialization.Encoding.PEM)
+
+
+def _begun(
+    subject: "x509.Name",
+    issuer: "x509.Name",
+    key: "ec.EllipticCurvePublicKey",
+    now: datetime,
+    lasting: timedelta,
+) -> "x509.CertificateBuilder":
+    return (
+        x509.CertificateBuilder()
+        .subject_name(subject)
+        .issuer_name(issuer)
+        .public_key(key)
+        .not_valid_before(now - CLOCKS_APART)
+        .not_valid_after(now + lasting)
+    )
+
+
+def _name(common_name: str) -> "x509.Name":
+    return x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, common_name)])
+
+
+def _host(host: str) -> "x509.GeneralName":
+    try:
+        return x509.IPAddress(ipaddress.ip_address(host.strip("[]")))
+    except ValueError:
+        pass
+    try:
+        return x509.DNSName(host)
+    except ValueError as error:
+        raise ValueError(f"--host {host!r}: neither an address nor a name in ASCII") from error
+
+
+def _usage(signs: bool) -> "x509.KeyUsage":
+    return x509.KeyUsage(
+        digital_signature=not signs,
+        key_cert_sign=signs,
+        crl_sign=signs,
+        content_commitment=False,
+        key_encipherment=False,
+        data_encipherment=False,
+        key_agreement=False,
+        encipher_only=False,
+        decipher_only=False,
+    )
+
+
+def _pem(key: "ec.EllipticCurvePrivateKey", certificate: "x509.Certificate") -> Pair:
+    return Pair(
+        key.private_bytes(
+            serialization.Encoding.PEM,
+            serialization.PrivateFormat.PKCS8,
+            serialization.NoEncryption(),
+        ),
+        certificate.public_bytes(serialization.Encoding.PEM),
+    )

@@ -1,0 +1,100 @@
+"""What a robot was worth in parts of a run: before help began; before, during, after a guest."""
+
+import math
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
+from typing import NamedTuple
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from cpcbl_launch.recorder import Effect, GuestReport, Phase, Recorder, RobotReport
+from cpcbl_team.metrics import Floats, Trajectory, compared, score, seconds
+
+AWAY_S = 2.0  # who says nothing of itself for longer was away
+MOST_GUESTS = 100  # as many as a team may let in; more is garbage
+
+
+class Span(NamedTuple):
+    """From one time on until another one, which is not in it (s)."""
+
+    from_s: float = -math.inf
+    until_s: float = math.inf
+
+
+def phase(recorder: Recorder, robot: str, truth: Floats | None, spans: Sequence[Span]) -> Phase:
+    """A robot's figures in some parts of a run."""
+    path = recorder.trajectory(robot)
+    inside = _inside(seconds(path.stamps_ns), spans)
+    covariance = None if path.covariance is None else path.covariance[inside]
+    part = Trajectory(path.stamps_ns[inside], path.estimate[inside], covariance)
+    figures = score(compared(part, truth)[1])
+    return Phase(**msgspec.structs.asdict(figures), position_sigma_m=_sigma_m(part))
+
+
+def _inside(times_s: Floats, spans: Sequence[Span]) -> NDArray[np.bool_]:
+    inside = np.zeros(len(times_s), dtype=np.bool_)
+    for span in spans:
+        inside |= (span.from_s <= times_s) & (times_s < span.until_s)
+    return inside
+
+
+def _sigma_m(path: Trajectory) -> float | None:
+    if path.covariance is None or not len(path.covariance):
+        return None
+    return float(np.sqrt(0.5 * np.mean(path.covariance[:, 0] + path.covariance[:, 2])))
+
+
+def presence(times_s: Sequence[float]) -> list[Span]:
+    """When somebody was there who spoke at these times, which are in order."""
+    if not len(times_s):
+        return []
+    gaps = [(a, b) for a, b in pairwise(times_s) if b - a > AWAY_S]
+    begins = [times_s[0], *(b for _, b in gaps)]
+    ends = [*(a for a, _ in gaps), times_s[-1]]
+    return [Span(*span) for span in zip(begins, ends, strict=True)]
+
+
+def split(present: Sequence[Span], begin_s: float) -> tuple[list[Span], list[Span], list[Span]]:
+    """The parts of a run from `begin_s` on before, during and after somebody's presence."""
+    before = [Span(begin_s, present[0].from_s)]
+    during = [Span(max(begin_s, p.from_s), p.until_s) for p in present]
+    ends = [*(p.from_s for p in present[1:]), math.inf]
+    after = [Span(max(begin_s, p.until_s), end_s) for p, end_s in zip(present, ends, strict=True)]
+    return before, during, after
+
+
+def guest_reports(
+    recorder: Recorder,
+    robots: Sequence[str],
+    truth: Mapping[str, Floats],
+    epoch_s: float,
+    begin_s: float = -math.inf,
+) -> dict[str, GuestReport]:
+    """Of those who were heard of and are none of the team's robots; of too many the most talkative.
+
+    `begin_s`: the time at which figures begin; `epoch_s`: the start of the run.
+    """
+    reports = {}
+    heard = {name: len(tracks) for name, tracks in list(recorder.tracks.items())}
+    others = sorted(heard.keys() - set(robots), key=lambda name: (-heard[name], name))
+    for name in sorted(others[:MOST_GUESTS]):
+        present = presence(seconds(recorder.trajectory(name).stamps_ns).tolist())
+        parts = split(present, begin_s)
+        effects = {
+            robot: Effect(
+                **{
+                    part: phase(recorder, robot, truth.get(robot), spans)
+                    for part, spans in zip(Effect.__struct_fields__, parts, strict=True)
+                }
+            )
+            for robot in robots
+        }
+        own = recorder.robot_report(name, "", truth.get(name))
+        reports[name] = GuestReport(
+            **{key: getattr(own, key) for key in RobotReport.__struct_fields__},
+            present_s=tuple((p.from_s - epoch_s, p.until_s - epoch_s) for p in present),
+            robots=effects,
+        )
+    return reports

@@ -1,0 +1,64 @@
+"""Real robots, whose errors are correlated and unmodelled, are honest: none is quarantined."""
+
+import os
+from functools import cache
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from cpcbl_launch import logs
+from cpcbl_launch.evaluation import evaluate_log, robot_nodes, run_nodes
+from cpcbl_launch.liar import Lie, lying
+from cpcbl_launch.recorder import Recorder, Report
+from cpcbl_launch.team_file import load_team
+from cpcbl_team.config import Team, TrustSettings
+from cpcbl_transport.bus import MemoryHub
+
+pytestmark = [pytest.mark.log, pytest.mark.timeout(900)]
+LOGS = Path(os.environ.get("CPCBL_MRCLAM", "."))
+
+
+def judging(team: Team, enabled: bool) -> Team:
+    replace, trust = msgspec.structs.replace, TrustSettings(enabled=enabled)
+    robots = {
+        name: replace(robot, collaboration=replace(robot.collaboration, trust=trust))
+        for name, robot in team.robots.items()
+    }
+    return replace(team, robots=robots)
+
+
+def logged(name: str, enabled: bool) -> logs.LoggedTeam:
+    folder = LOGS / name
+    found = logs.on_log(judging(load_team(logs.builtin_for(folder)), enabled), folder)
+    return found._replace(team=logs.blinded(found.team, ["3", "4", "5"]))
+
+
+@cache
+def judged(name: str) -> Report:
+    return evaluate_log(logged(name, True))
+
+
+def quarantines(report: Report) -> int:
+    return sum(robot.counts.get("quarantined", 0) for robot in report.robots.values())
+
+
+@pytest.mark.parametrize("name", ["MRCLAM2", "MRCLAM4", "MRCLAM6"])
+def test_no_honest_robot_is_quarantined_and_nobody_gets_worse(name: str) -> None:
+    report, believing = judged(name), evaluate_log(logged(name, False))
+    assert quarantines(report) == 0
+    assert report.team.position_rmse_m is not None
+    assert believing.team.position_rmse_m is not None
+    assert report.team.position_rmse_m <= 1.02 * believing.team.position_rmse_m
+
+
+def test_a_robot_of_the_log_that_lies_is_found() -> None:
+    log = logged("MRCLAM6", True)
+    hub = MemoryHub()
+    recorder = Recorder(hub.session())
+    through = {"1": lying(Lie.parse("bias:1.0,1.0@300-900"), "1", log.start_ns)}
+    nodes = robot_nodes(log.team, hub, log.start_ns, through)
+    run_nodes(nodes, log.start_ns, log.start_ns + 600 * 10**9)
+    trust = {name: s.trust for name, s in recorder.status.items()}
+    assert sum(t.peer == "1" and bool(t.reason) for of in trust.values() for t in of) >= 2
+    assert not any(t.quarantines for of in trust.values() for t in of if t.peer != "1")

@@ -1,0 +1,251 @@
+"""Mutual TLS and access control: whose keys a session shows, and what a router lets each one say.
+
+Zenoh's own, as its configuration. What was measured:
+
+- The common name of a certificate is the one thing that access control knows of its owner; it is
+  compared as it is, without patterns.
+- Keys in rules are whole keys, with the namespace.
+- What is denied is dropped silently: the sender hears nothing of it, `matching` stays true.
+- A key file is read when a link is opened, so a renewed one counts from the next link on. The
+  router's own files, and the rules, are read when it starts.
+- There are no lists of revoked certificates: who is no member any more opens a link that carries
+  nothing, until its certificate expires. Links do not outlive the certificates they were opened
+  with.
+"""
+
+from collections.abc import Collection, Iterable, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import msgspec
+
+from cpcbl_team.config import Team
+from cpcbl_transport import topics
+from cpcbl_transport.topics import Role, Topic, Who
+
+CA, CERTIFICATE, PRIVATE_KEY, MEMBERS = "ca.crt", "certificate.crt", "private.key", "members.json"
+PROTOCOL = "tls"
+"""Not QUIC, which certifies names as well: what is said first under a new key is lost at times."""
+
+
+class SecurityError(ValueError):
+    """Keys or endpoints that cannot be used; the text names file or key, and the fix."""
+
+
+class Identity(NamedTuple):
+    """Who a session belongs to. Robots and observers have names, of the others there is one."""
+
+    role: Role
+    name: str = ""
+
+    def __str__(self) -> str:
+        """`robot/r1`, `field`: also the folder of its keys."""
+        return f"{self.role}/{self.name}" if self.name else str(self.role)
+
+
+class Member(msgspec.Struct, frozen=True, kw_only=True):
+    """One row of the list from which the router's rules are made."""
+
+    role: Role
+    name: str = ""
+    generation: int = 1
+    """One more for every certificate that was revoked: its name is never used again."""
+    revoked: bool = False
+
+    @property
+    def identity(self) -> Identity:
+        return Identity(self.role, self.name)
+
+    @property
+    def common_name(self) -> str:
+        """What its certificate says: `robot/r1`, `robot/r1/2`. No name has a slash in it."""
+        later = f"/{self.generation}" if self.generation > 1 else ""
+        return f"{self.identity}{later}"
+
+
+class Credentials(NamedTuple):
+    """Key files of one session."""
+
+    ca: str
+    """Certificates of the authorities that are trusted."""
+    certificate: str
+    private_key: str
+
+
+class Link(NamedTuple):
+    """Where a session dials or listens, and what it shows there."""
+
+    endpoints: tuple[str, ...]
+    credentials: Credentials | None = None
+
+
+def link_of(team: Team, identity: Identity, endpoints: Collection[str]) -> Link:
+    """The link of a member of a team. Raises SecurityError for what a secured team cannot use."""
+    if not team.transport.secured:
+        return Link(tuple(endpoints))
+    for endpoint in endpoints:
+        if not endpoint.startswith(f"{PROTOCOL}/"):
+            raise SecurityError(
+                f'{endpoint}: with transport.security = "mtls" every link is TLS; write it as'
+                f" {PROTOCOL}/{endpoint.partition('/')[2]}"
+            )
+    return Link(tuple(endpoints), credentials_in(Path(team.transport.keys), identity))
+
+
+def credentials_in(folder: Path, identity: Identity) -> Credentials:
+    """The key files of a member in the team's key folder. Raises SecurityError if one is absent."""
+    paths = [folder / str(identity) / name for name in (CA, CERTIFICATE, PRIVATE_KEY)]
+    for path in paths:
+        try:
+            path.open("rb").close()
+        except OSError as error:
+            raise SecurityError(
+                f"transport.keys: {path}: {error.strerror}; `cpcbl-team keys FILE` makes the keys"
+                f" of {identity}, which this process must be able to read"
+            ) from error
+    return Credentials(*map(str, paths))
+
+
+def members_in(folder: Path) -> tuple[Member, ...]:
+    """Who is known in a key folder. Raises SecurityError for a list that cannot be read."""
+    path = folder / str(Role.ROUTER) / MEMBERS
+    try:
+        return msgspec.json.decode(path.read_bytes(), type=tuple[Member, ...])
+    except OSError as error:
+        reason = error.strerror
+    except msgspec.MsgspecError as error:
+        reason = str(error)
+    raise SecurityError(f"transport.keys: {path}: {reason}; `cpcbl-team keys FILE` writes it")
+
+
+def access_control(team: Team) -> dict[str, Any]:
+    """What a router of this team adds to its guards; nothing for a team that is not secured.
+
+    Raises SecurityError without the list of members.
+    """
+    if not team.transport.secured:
+        return {}
+    return access_rules(team, members_in(Path(team.transport.keys)))
+
+
+def link_options(credentials: Credentials) -> dict[str, Any]:
+    """What stands below `transport/link` where every link is mutual TLS."""
+    ca, certificate, private_key = credentials
+    return {
+        "protocols": [PROTOCOL],
+        "tls": {
+            "enable_mtls": True,
+            "root_ca_certificate": ca,
+            "connect_certificate": certificate,
+            "connect_private_key": private_key,
+            "listen_certificate": certificate,
+            "listen_private_key": private_key,
+            "verify_name_on_connect": True,
+            "close_link_on_expiration": True,
+        },
+    }
+
+
+_ASKS = ("declare_subscriber", "declare_liveliness_subscriber", "liveliness_query")
+_IS_TOLD = ("put", "declare_subscriber", "liveliness_token")
+_EVERYTHING = (
+    *("put", "delete", "query", "reply", "declare_queryable"),
+    *("declare_subscriber", "declare_liveliness_subscriber"),
+    *("liveliness_token", "liveliness_query"),
+)
+
+
+def access_rules(team: Team, members: Iterable[Member]) -> dict[str, Any]:
+    """The router's access control: nobody may say or ask for more than the table of topics allows.
+
+    Who is not among the members, was revoked, or has no place in
+    the team as its file has it now, neither says nor hears anything.
+    """
+    space = topics.namespace(team.name)
+    present = [m for m in members if not m.revoked and _belongs(m.identity, team)]
+    policies = [_policy("be told", present, _rule("be told", "egress", _IS_TOLD, [f"{space}/**"]))]
+    for member in present:
+        who = member.identity
+        for messages, keys in (
+            (["put"], said_by(who, carrying=True)),
+            (["liveliness_token"], said_by(who, carrying=False)),
+            (_ASKS, heard_by(who)),
+        ):
+            if keys:
+                name = f"{who}: {messages[0]}"
+                whole = [f"{space}/{key}" for key in keys]
+                policies.append(_policy(name, [member], _rule(name, "ingress", messages, whole)))
+    routers = [m for m in present if m.role is Role.ROUTER]
+    for flow in ("ingress", "egress"):
+        name = f"relay: {flow}"
+        policies.append(_policy(name, routers, _rule(name, flow, _EVERYTHING, [f"{space}/**"])))
+    policies = [p for p in policies if p["subject"]["cert_common_names"]]
+    return {
+        "access_control": {
+            "enabled": True,
+            "default_permission": "deny",
+            "rules": [p["rule"] for p in policies],
+            "subjects": [p["subject"] for p in policies],
+            "policies": [
+                {"rules": [p["rule"]["id"]], "subjects": [p["subject"]["id"]]} for p in policies
+            ],
+        }
+    }
+
+
+def said_by(identity: Identity, carrying: bool | None = None) -> list[str]:
+    """The keys under which someone may speak, below the namespace.
+
+    `carrying`: those of messages, or those of tokens, which carry none; None: both.
+    """
+    return [
+        key
+        for topic in topics.TOPICS
+        if carrying is None or carrying is _carries(topic)
+        for key in _keys(topic, topic.said_by, identity)
+    ]
+
+
+def heard_by(identity: Identity) -> list[str]:
+    """The keys that someone may subscribe to, with all that they include."""
+    if identity.role is Role.OPERATOR:
+        return ["**"]
+    return [key for topic in topics.TOPICS for key in _keys(topic, topic.heard_by, identity)]
+
+
+def _keys(topic: Topic, allowed: Iterable[Who], identity: Identity) -> Iterator[str]:
+    for who in allowed:
+        if who.role is identity.role:
+            yield topic.at(**{who.own: identity.name} if who.own else {})
+
+
+def _carries(topic: Topic) -> bool:
+    return topic.carries is not None
+
+
+def _belongs(identity: Identity, team: Team) -> bool:
+    """Whether the team as its file has it now has a place for someone who had one before."""
+    match identity.role:
+        case Role.ROBOT:
+            return identity.name in team.robots
+        case Role.OBSERVER:
+            return team.guests.allowed and identity.name not in team.robots
+        case Role.FIELD:  # a simulated one must not feed real robots
+            return any(robot.source == "simulated" for robot in team.robots.values())
+    return True
+
+
+def _rule(name: str, flow: str, messages: Collection[str], keys: list[str]) -> dict[str, Any]:
+    return {
+        "id": name,
+        "permission": "allow",
+        "flows": [flow],
+        "messages": list(messages),
+        "key_exprs": keys,
+    }
+
+
+def _policy(name: str, members: Iterable[Member], rule: dict[str, Any]) -> dict[str, Any]:
+    """A rule and the one subject that it is for."""
+    names = [member.common_name for member in members]
+    return {"rule": rule, "subject": {"id": name, "cert_common_names": names}}
