@@ -248,6 +248,9 @@ def _remarks(report: Report) -> Iterator[str]:
             yield f"robot {name} learned: {_corrections(r.learned)}"
     for name, r in report.robots.items():
         yield from trust_remarks(name, r.trust)
+    if report.refused:
+        counts = ", ".join(f"{reason} {n}" for reason, n in report.refused.items())
+        yield f"heard and of no use, by reason: {counts}"
     for name, n in report.restarts.items():
         yield f"{name} was restarted {n} times"
 

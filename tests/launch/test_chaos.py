@@ -1,8 +1,12 @@
-"""Faults on real processes over real Zenoh; each scenario's expectation is its own assertion."""
+"""Faults on real processes over real Zenoh; each scenario's expectation is its own assertion.
+
+Here are the quick ones; `make chaos` runs them all.
+"""
 
 import json
 import socket
 import subprocess
+import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -21,10 +25,13 @@ from cpcbl_launch.chaos.relay import Quality, Relay
 from cpcbl_launch.chaos.run import chosen, outcome_of, run_all
 from cpcbl_launch.chaos.scenario import Found, Needs, Scenario, Setting
 from cpcbl_launch.chaos.scenarios import SCENARIOS
-from cpcbl_launch.chaos.team import ChaosError, Plan, demo_team, running
+from cpcbl_launch.chaos.team import ROUTER, ChaosError, Plan, demo_team, router_spec, running
 from cpcbl_launch.chaos.wire import Weather, Wire
 from cpcbl_launch.processes import PROGRAM
+from cpcbl_launch.supervisor import Supervisor
+from cpcbl_launch.team_file import save_resolved
 from cpcbl_launch.up import free_endpoint
+from cpcbl_launch.usage import MIB, usage
 from cpcbl_transport import topics
 from cpcbl_transport.topics import Qos
 from cpcbl_transport.zenoh_bus import open_bus, open_router
@@ -40,20 +47,9 @@ def judged(outcome: Outcome) -> None:
     assert outcome.held, f"{outcome.failed}\n{seen}"
 
 
-def rows(quick: bool) -> list[object]:
-    return [pytest.param(s, id=s.name) for s in SCENARIOS if s.quick is quick]
-
-
 @pytest.mark.timeout(300)
-@pytest.mark.parametrize("scenario", rows(quick=True))
+@pytest.mark.parametrize("scenario", [pytest.param(s, id=s.name) for s in SCENARIOS if s.quick])
 def test_a_quick_scenario_holds(scenario: Scenario) -> None:
-    judged(outcome_of(scenario, SETTING))
-
-
-@pytest.mark.long
-@pytest.mark.timeout(600)
-@pytest.mark.parametrize("scenario", rows(quick=False))
-def test_a_scenario_holds(scenario: Scenario) -> None:
     judged(outcome_of(scenario, SETTING))
 
 
@@ -235,6 +231,30 @@ def test_a_wire_loses_packets_and_tcp_lives_with_it() -> None:
         name = lossy.prefix[-1]
     listed = subprocess.run(["ip", "netns"], capture_output=True, text=True, check=True).stdout
     assert name not in listed
+
+
+SPEAKS = """
+import sys, time
+from cpcbl_transport.topics import Qos
+from cpcbl_transport.zenoh_bus import open_bus
+with open_bus("demo", [sys.argv[1]]) as bus:
+    publisher = bus.publisher("status/patrol", Qos.INPUT)
+    for _ in range(40):
+        publisher.put(bytes(60_000))
+        time.sleep(0.02)
+"""
+
+
+@pytest.mark.skipif(not Path("/proc/self/smaps_rollup").exists(), reason="measures on Linux")
+def test_a_router_keeps_no_memory_of_sessions_that_sent_much(tmp_path: Path) -> None:
+    team_file, endpoint = tmp_path / "team.json", free_endpoint()
+    save_resolved(demo_team(), team_file)
+    with Supervisor([router_spec(team_file, [endpoint])], tmp_path) as supervisor:
+        held = []
+        for _ in range(4):
+            subprocess.run([sys.executable, "-c", SPEAKS, endpoint], check=True, timeout=60.0)
+            held.append(usage(supervisor.pids[ROUTER]).proportional_bytes / MIB)
+    assert held[-1] - held[0] < 8.0  # with shared memory 10 MiB each
 
 
 def test_an_echo_says_everything_twice_more() -> None:

@@ -6,7 +6,7 @@ from msgspec.structs import replace
 
 from cpcbl_launch.chaos.checks import Check, Faults, Outcome, as_data
 from cpcbl_launch.chaos.files import Ended, judged_full, judged_read_only
-from cpcbl_launch.chaos.fuzz import TOKENS, Sent, Taken, judged_fuzz
+from cpcbl_launch.chaos.fuzz import TO_FIELD, TO_PEOPLE, TOKENS, Sent, Taken, judged_fuzz
 from cpcbl_launch.chaos.inputs import judged_duplicates, judged_flood
 from cpcbl_launch.chaos.network import judged_bad, judged_cut, judged_partition
 from cpcbl_launch.chaos.notes import (
@@ -19,10 +19,12 @@ from cpcbl_launch.chaos.notes import (
     lost_after_s,
     rmse_m,
 )
+from cpcbl_launch.chaos.payloads import real
 from cpcbl_launch.chaos.processes import judged_field, judged_freeze, judged_kill, judged_router
 from cpcbl_launch.chaos.soak import Life, Sample, judged_soak, lives
 from cpcbl_launch.chaos.world import judged_clocks, judged_hidden, judged_kidnap
 from cpcbl_launch.usage import MIB
+from cpcbl_transport import topics
 
 AT_S = 10.0
 GOOD = notes_of([tracks_of("a"), tracks_of("b")])
@@ -89,6 +91,9 @@ def test_a_robot_is_found_when_it_stays_right_for_a_second() -> None:
     lost = tracks_of("a", lost=(0.0, 15.0))
     assert found_after_s(notes_of([lost]), "a", AT_S, 0.3) == pytest.approx(5.0)
     assert lost_after_s(notes_of([lost]), "a", AT_S) == pytest.approx(0.0)
+    said = [status_at("a", 9.5, {"lost": 1}), status_at("a", 10.5, {"lost": 2})]
+    assert lost_after_s(notes_of([tracks_of("a")], (), said), "a", AT_S) == pytest.approx(0.5)
+    assert lost_after_s(notes_of([tracks_of("a")], (), said[:1]), "a", AT_S) is None
     never = tracks_of("a", lambda s: 1.0)
     assert found_after_s(notes_of([never]), "a", AT_S, 0.3) is None
 
@@ -243,11 +248,11 @@ def test_a_flood() -> None:
     }
 
 
-SENT = Sent(help=100, inputs=60, drives=30, to_people=90, no_messages=80, no_statuses=25)
+SENT = Sent(help=100, inputs=60, commands=30, to_people=90, no_messages=80, no_statuses=25)
 TAKEN = Taken(
     after_help={"garbage": 90, "messages_received": 10, "sightings": 7},
     victim={"garbage": 130, "messages_received": 10, "sightings": 20, "bad_token": TOKENS},
-    field={"garbage": 20, "wrong_name": 10, "drive": 500},
+    field={"garbage": 20, "not_its_own": 10, "drive": 500},
     recorder={"garbage": 80, "track": 10},
     watcher={"garbage": 25},
     restarts=0,
@@ -392,3 +397,10 @@ def test_a_soak() -> None:
         "open files, most more",
     }
     assert "memory grown most by" in broken(judged_soak(GOOD, ["a"], [], times, 0, 0, 0))
+
+
+def test_every_topic_with_a_payload_is_fuzzed() -> None:
+    fuzzed = {topics.FIX, topics.BELIEF, *topics.INPUTS, *TO_PEOPLE, *TO_FIELD}
+    assert fuzzed == {topic for topic in topics.TOPICS if topic.carries is not None}
+    for topic in fuzzed:
+        assert real(topic, "victim", "mate", 5_000_000_000)

@@ -13,7 +13,14 @@ from cpcbl_agents.clock import Clock
 from cpcbl_agents.sensing import SensorInput
 from cpcbl_launch.bodies import LASTS_NS
 from cpcbl_launch.evaluation import Choice, chosen, simulate
-from cpcbl_launch.field import COMMAND_LASTS_NS, FieldNode, SimulatedField, robots_at, run_field
+from cpcbl_launch.field import (
+    COMMAND_LASTS_NS,
+    INBOX,
+    FieldNode,
+    SimulatedField,
+    robots_at,
+    run_field,
+)
 from cpcbl_launch.team_file import builtin, load_team
 from cpcbl_team.config import (
     Field,
@@ -35,7 +42,7 @@ from cpcbl_team.geometry import Pose2, step
 from cpcbl_team.inputs import Odometry, Position, Sighting, Sightings
 from cpcbl_transport import topics
 from cpcbl_transport.bus import MemoryHub
-from cpcbl_transport.messages import Body, Drive, Join, Truths, encode
+from cpcbl_transport.messages import Body, Drive, Join, Refusal, Truths, encode
 
 STEP_NS = 20 * MS
 MILLIMETRE = 1e-3
@@ -469,12 +476,44 @@ def test_the_field_answers_commands_with_what_a_driver_would_say() -> None:
     ],
     ids=["empty", "garbage", "wrong type", "unknown robot", "NaN", "infinite"],
 )
-def test_a_command_that_makes_no_sense_is_ignored(payload: bytes) -> None:
+def test_a_command_that_makes_no_sense_is_counted_and_ignored(payload: bytes) -> None:
     on = OnBus()
     on.command(encode(Drive("r1", 0, 0.5, 0.0)))
     on.command(payload)
     on.node.step(5 * STEP_NS)
+    assert on.node.counts["drive"] == 1
+    assert sum(on.node.counts[reason] for reason in Refusal) == 1
     assert on.field.robots["r1"].pose == pytest.approx(Pose2(0.05, 0.0, 0.0))
+
+
+def test_too_many_commands_at_once_are_counted_and_the_oldest_dropped() -> None:
+    on = OnBus()
+    for _ in range(INBOX + 3):
+        on.command(encode(Drive("r1", 0, 0.5, 0.0)))
+    on.node.step(STEP_NS)
+    assert on.node.counts == {"drive": INBOX, "inbox_overflow": 3}
+
+
+@pytest.mark.parametrize("ahead_s", [0.5, 3600.0, -0.3])
+def test_a_robot_whose_clock_is_off_gets_and_gives_its_own_stamps(ahead_s: float) -> None:
+    hub, ahead_ns = MemoryHub(), int(ahead_s * 1e9)
+    clocks = SimulationSettings(noise=0.0, clocks_ahead_s={"r1": ahead_s})
+    subject = SimulatedField(Team(name="t", robots={"r1": robot()}, simulation=clocks), 1, 0)
+    node, bus = FieldNode(subject, hub.session()), hub.session()
+    odometry, truth = Ear(bus, topics.IN_ODOMETRY.at()), Ear(bus, topics.TRUTH.at())
+    wheels = bus.publisher(topics.DRIVE.at(robot="r1"), topics.DRIVE.qos)
+    wheels.put(encode(Drive("r1", ahead_ns, 0.5, 0.0)))
+    node.step(5 * STEP_NS)
+    pieces = [m for m in odometry.messages if isinstance(m, Odometry)]
+    assert sum(p.distance_m for p in pieces) == pytest.approx(0.05)
+    assert pieces[0].from_ns == ahead_ns
+    assert pieces[-1].stamp_ns <= ahead_ns + 5 * STEP_NS
+    latest = truth.messages[-1]
+    assert isinstance(latest, Truths)
+    assert latest.stamp_ns == 5 * STEP_NS
+    wheels.put(encode(Drive("r1", ahead_ns + SECOND, 0.5, 0.0)))
+    node.step(6 * STEP_NS)
+    assert node.counts == {"drive": 1, "from_the_future": 1}
 
 
 def test_a_field_runs_until_it_is_stopped() -> None:

@@ -338,6 +338,24 @@ def test_watching_makes_nobody_send_help() -> None:
         assert [key for key in keys if publishers[key].matching] == ["status/b"]
 
 
+def test_what_a_robot_says_is_not_taken_for_markup() -> None:
+    named = msgspec.structs.replace(status("a", 1, 0), counts={"[/bold]": 1})
+    report = recorded(named)
+    robots = {n: msgspec.structs.replace(r, lost_at_end="[/red]") for n, r in report.robots.items()}
+    text = shown(msgspec.structs.replace(report, robots=robots, refused={"garbage": 3}))
+    assert "robot a is lost: [/red]" in text
+    assert "heard and of no use, by reason: garbage 3" in text
+
+
+def test_a_recorder_counts_what_it_takes_and_what_it_refuses() -> None:
+    hub = MemoryHub()
+    recorder, speaker = Recorder(hub.session()), hub.session()
+    for key, payload in (("status/a", encode(status("a", 1, 0))), ("track/a", b"\x02garbage")):
+        speaker.publisher(key, topics.STATUS.qos).put(payload)
+    assert recorder.counts == {"status": 1, "garbage": 1}
+    assert recorder.report({}, {}).refused == {"garbage": 1}
+
+
 # Budgets of a command line ----------------------------------------------------------------------
 
 
@@ -501,3 +519,20 @@ def test_without_a_router_watching_ends_with_one_line() -> None:
     assert f"no router at {endpoint} within 0.5 s" in line
     assert "--connect" in line
     assert ended.stdout == ""
+
+
+def test_what_is_no_status_is_counted_and_shown() -> None:
+    hub = MemoryHub()
+    watcher, speaker = Watcher(hub.session()), hub.session()
+    for key, payload in (
+        ("status/a", b"garbage"),
+        ("status/a", encode(status("b", 1, 0))),
+        ("status/a", encode(status("a", 1, 0))),
+    ):
+        speaker.publisher(key, topics.STATUS.qos).put(payload)
+    assert watcher.refused == {"wrong_version": 1, "name_of_another": 1}
+    now = traffic("trio", (), watcher.arrivals(), 0.0, 1.0, watcher.refused)
+    assert now.refused == {"name_of_another": 1, "wrong_version": 1}
+    console = Console(file=io.StringIO(), width=80)
+    console.print(drawn(now, "here"))
+    assert "refused, by reason: name_of_another 1, wrong_version 1" in console.file.getvalue()  # type: ignore[attr-defined]

@@ -23,7 +23,11 @@ def _everybody(credentials: Credentials | None) -> dict[str, Any]:
     return {
         "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
         "timestamping": {"enabled": False},
-        "transport": {"link": {"tx": _TX, **(link_options(credentials) if credentials else {})}},
+        "transport": {
+            "link": {"tx": _TX, **(link_options(credentials) if credentials else {})},
+            # With it a router kept 10 MiB of every session that had sent a payload beyond 3 kB
+            "shared_memory": {"enabled": False},
+        },
     }
 
 

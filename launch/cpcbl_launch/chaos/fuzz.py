@@ -43,6 +43,7 @@ BURST, PAUSE_S = 50, 0.012
 SIGHTINGS_EVERY_S = 0.3
 VICTIM, MATE = "victim", "mate"  # the mate is played by the fuzzer
 DRIVEN = "patrol"  # whose commands, by their own words the mate's, it refuses all
+TO_FIELD = (topics.DRIVE, topics.JOIN)
 TO_PEOPLE = (topics.STATUS, topics.TRACK, topics.TRUTH)
 TAKEN = ("odometry", "sightings", "position", "messages_received")
 REASONS = (*Refusal, "inbox_overflow")
@@ -55,7 +56,8 @@ class Sent(NamedTuple):
     """Fixes and beliefs for the victim."""
     inputs: int
     """For the victim's driver keys, and true sightings of the mate, so that it listens."""
-    drives: int
+    commands: int
+    """For the field."""
     to_people: int
     """Status, tracks, truth."""
     no_messages: int
@@ -142,7 +144,7 @@ def judged_fuzz(sent: Sent, taken: Taken) -> list[Check]:
     """Nobody ends, nothing is thrown, everything is counted, by reason."""
     then, victim = taken.after_help, taken.victim
     help_counted = _counted(then) - then.get("sightings", 0)
-    drives = sum(taken.field.values()) - taken.field.get("drive", 0)
+    refused_commands = sum(n for what, n in taken.field.items() if what not in ("drive", "join"))
     refused, watched = _refused(taken.recorder), sum(taken.watcher.values())
     return [
         _exactly("processes that ended", taken.restarts, 0),
@@ -161,7 +163,7 @@ def judged_fuzz(sent: Sent, taken: Taken) -> list[Check]:
             at_least=sent.inputs,
         ),
         Check(what="odd tokens counted", seen=victim.get("bad_token", 0), at_least=TOKENS),
-        _exactly("commands refused by the field", drives, sent.drives),
+        _exactly("commands refused by the field", refused_commands, sent.commands),
         _exactly("refused by the recorder", refused, sent.no_messages),
         _exactly("refused by the traffic watcher", watched, sent.no_statuses),
         _exactly("`cpcbl-team traffic` exits with", taken.traffic_exit, 0),
@@ -215,7 +217,7 @@ class Fuzzer:
             self._bus.announce(topics.ALIVE.at(tier=chunk, robot=MATE, incarnation=chunk)).close()
 
     def everything_else(self) -> None:
-        for topic in (*topics.INPUTS, *TO_PEOPLE, topics.DRIVE):
+        for topic in (*topics.INPUTS, *TO_PEOPLE, *TO_FIELD):
             self._fuzz(topic, self._key(topic))
 
     @property
@@ -229,7 +231,7 @@ class Fuzzer:
         return Sent(
             help=count[topics.FIX.key] + count[topics.BELIEF.key],
             inputs=sum(count[t.key] for t in topics.INPUTS) + self.true_sightings,
-            drives=count[topics.DRIVE.key],
+            commands=sum(count[t.key] for t in TO_FIELD),
             to_people=sum(count[t.key] for t in TO_PEOPLE),
             no_messages=sum(count[f"bad {t.key}"] for t in TO_PEOPLE),
             no_statuses=count[f"bad {topics.STATUS.key}"],
@@ -241,7 +243,7 @@ class Fuzzer:
 
     def _key(self, topic: Topic) -> str:
         robot = VICTIM if topic in (topics.FIX, *topics.INPUTS) else MATE
-        robot = DRIVEN if topic is topics.DRIVE else robot
+        robot = DRIVEN if topic in TO_FIELD else robot
         return topic.at(robot=robot, tier=0, observer=MATE)
 
     def _fuzz(self, topic: Topic, key: str) -> None:

@@ -117,9 +117,15 @@ def heard_after_s(notes: Notes, robot: str, from_s: float) -> float | None:
 
 
 def lost_after_s(notes: Notes, robot: str, from_s: float) -> float | None:
-    """How long after `from_s` the robot first said that it is lost."""
-    stamps = (_stamp_s(notes, h) for h in notes.tracks.get(robot, ()) if h.track.lost)
-    return _first(stamps, from_s)
+    """How long after `from_s` the robot first said that it is lost: in a track, or, where it found
+    itself before the next one, in what its status counts."""
+    stamps = [_stamp_s(notes, h) for h in notes.tracks.get(robot, ()) if h.track.lost]
+    known, more = 0, []
+    for said in notes.statuses.get(robot, ()):
+        count = said.status.counts.get("lost", 0)
+        more += [said.at_s] if count > known else []
+        known = count
+    return _first(sorted([*stamps, *more]), from_s)
 
 
 def found_after_s(

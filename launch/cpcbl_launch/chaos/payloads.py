@@ -13,6 +13,7 @@ from cpcbl_transport.messages import (
     VERSION,
     Drive,
     Flow,
+    Join,
     Status,
     Track,
     Truth,
@@ -22,7 +23,7 @@ from cpcbl_transport.messages import (
 from cpcbl_transport.topics import Topic
 
 COVARIANCE_2, COVARIANCE_3 = (0.04, 0.01, 0.09), (0.04, 0.01, 0.09, 0.0, 0.0, 0.01)
-TAGS = ("odometry", "sightings", "position", "status", "track", "drive", "truth")
+TAGS = ("odometry", "sightings", "position", "status", "track", "drive", "truth", "join")
 LONGEST = 600
 DISTINCT = 1000  # hypothesis takes some 4 ms for each
 _encode = msgspec.msgpack.Encoder().encode
@@ -50,6 +51,8 @@ def real(topic: Topic, target: str, speaker: str, now_ns: int) -> bytes:
             return encode(Position(now_ns, 1.0, 2.0, COVARIANCE_2))
         case topics.DRIVE:
             return encode(Drive(speaker, now_ns, 0.5, 0.1))
+        case topics.JOIN:
+            return encode(Join(speaker, "1", now_ns))
         case topics.TRUTH:
             return encode(Truths(now_ns, (Truth(speaker, 1.0, 2.0, 0.5, 1),)))
     raise ValueError(f"{topic.key}: carries no payload")

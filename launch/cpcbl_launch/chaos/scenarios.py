@@ -117,7 +117,7 @@ SCENARIOS = (
         "all help of the best observer comes again at once, and again up to 4 s late",
         "it is counted as duplicate or too late, and changes nothing",
         N,
-        QUICK,
+        SLOW,
         duplicates,
     ),
     Scenario(
