@@ -120,7 +120,7 @@ KIDNAPPED = (
 
 
 def kidnapped(robot: str, to: tuple[float, float, float], seed: int) -> None:
-    """Moved some 3 m: it says that it is lost, and is found, within 3 s; nobody is accused."""
+    """Moved some 3 m: it says that it is lost, and finds itself, within 3 s; it accuses nobody."""
     event = SimulationEvent(at_s=AT_S, kidnap=robot, to=to)
     report, recorder = simulate(demo(event), seed, AT_S + 10.0)
     at_s, off_m = errors(recorder, robot)
@@ -133,7 +133,7 @@ def kidnapped(robot: str, to: tuple[float, float, float], seed: int) -> None:
     for other in report.robots:
         if other != robot:
             assert errors(recorder, other)[1][at_s.size // 2 :].max() < 0.5
-    assert not any(trust.reason for r in report.robots.values() for trust in r.trust)
+    assert not any(trust.quarantines for trust in report.robots[robot].trust)
 
 
 @pytest.mark.parametrize(("robot", "to"), KIDNAPPED)
@@ -154,8 +154,8 @@ def test_a_kidnapped_robot_finds_itself_whatever_the_noise(
 
 
 def hidden(team: Team, seed: int, blind_s: float) -> None:
-    """Sigma grows honestly while nothing is seen; with the landmarks back all is well at once."""
-    _, recorder = simulate(team, seed, AT_S + blind_s + 5.0)
+    """Sigma grows honestly while nothing is seen, and shrinks honestly with the next sightings."""
+    _, recorder = simulate(team, seed, AT_S + blind_s + 12.0)
     truth = recorder.simulated_truth()
     for robot in team.robots:
         at_s, samples = recorder.timed_samples(robot, truth[robot])
@@ -166,7 +166,8 @@ def hidden(team: Team, seed: int, blind_s: float) -> None:
         assert np.mean(squares[dark] <= 9.0) >= 0.95
         sigma_m = np.sqrt(0.5 * (samples.covariance[:, 0] + samples.covariance[:, 2]))
         assert sigma_m[dark][-1] > 2.0 * sigma_m[dark][0]
-        after_m = position_errors(samples)[at_s >= AT_S + blind_s + 3.0]
+        assert np.mean(squares[at_s >= AT_S + blind_s] <= 9.0) >= 0.9
+        after_m = position_errors(samples)[at_s >= AT_S + blind_s + 10.0]
         assert after_m.max() < 0.5
         assert not any(t.lost for t in recorder.tracks[robot][-20:])
 
