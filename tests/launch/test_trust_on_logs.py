@@ -61,5 +61,5 @@ def test_a_robot_of_the_log_that_lies_is_found() -> None:
     nodes = robot_nodes(log.team, hub, log.start_ns, through)
     run_nodes(nodes, log.start_ns, log.start_ns + 600 * 10**9)
     trust = {name: s.trust for name, s in recorder.status.items()}
-    assert sum(t.peer == "1" and bool(t.reason) for of in trust.values() for t in of) >= 2
+    assert any(t.peer == "1" and t.reason for of in trust.values() for t in of)
     assert not any(t.reason for of in trust.values() for t in of if t.peer != "1")
