@@ -9,12 +9,13 @@ from functools import cache
 from pathlib import Path
 
 from cpcbl_launch.containers.compose import BASE_IMAGE, BASE_VARIABLE
-from cpcbl_launch.containers.docker import compose_program, done, never
+from cpcbl_launch.containers.docker import DockerError, compose_program, done, never
 from cpcbl_launch.containers.fleet import Project
-from cpcbl_launch.containers.image import image_for, there, version
+from cpcbl_launch.containers.image import have, image_for, there, version
 from cpcbl_launch.up import free_endpoint
 
 TOP = Path(__file__).parents[1]
+LOCAL_BASE = "cpcbl-base"
 
 
 @cache
@@ -23,11 +24,13 @@ def base_image() -> str:
     chosen = os.environ.get(BASE_VARIABLE)
     if chosen:
         return chosen
-    if there(BASE_IMAGE):
-        return BASE_IMAGE
-    if not there("cpcbl-base"):
-        subprocess.run([TOP / "docker" / "base-image.sh", "cpcbl-base"], check=True)
-    return "cpcbl-base"
+    try:
+        have(BASE_IMAGE, never, print, "")
+    except DockerError:
+        if not there(LOCAL_BASE):
+            subprocess.run([TOP / "docker" / "base-image.sh", LOCAL_BASE], check=True)
+        return LOCAL_BASE
+    return BASE_IMAGE
 
 
 @cache

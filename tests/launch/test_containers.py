@@ -85,7 +85,7 @@ def when(demo: Demo, condition: Callable[[Recorder], bool]) -> None:
 def assert_good(report: dict[str, Any]) -> None:
     assert report["robots"].keys() == ROBOTS
     for name, robot in report["robots"].items():
-        assert robot["samples"] > 50, name
+        assert robot["samples"] > 20, name
         assert robot["lost_at_end"] == "", name
     assert report["robots"]["observer"]["messages_sent"] > 0
     assert report["robots"]["observer"]["messages_received"] == 0
@@ -126,29 +126,27 @@ def test_a_team_in_containers_is_as_good_as_in_processes(demo: Demo, tmp_path: P
     assert report["team"]["position_rmse_m"] < 1.5 * processes + 0.05
 
 
-def test_a_container_killed_by_hand_is_started_again_and_the_report_says_so(demo: Demo) -> None:
+def test_containers_killed_by_hand_are_started_again_and_the_report_says_so(demo: Demo) -> None:
     with going_up(demo, "--duration", 25, "--json") as process:
         when(demo, lambda heard: len(heard.tracks.get("navigator", ())) > 50)
         killed = demo.containers()
         assert killed.keys() == SERVICES
         done(["docker", "kill", killed["robot-navigator"]])
         done(["docker", "rm", "--force", killed["robot-patrol"]])
+        done(["docker", "kill", killed["router"]])
         out, err = process.communicate(timeout=180.0)
     assert process.returncode == 0, err
     report = json.loads(out)
     assert_good(report)
-    assert report["restarts"] == {"robot-navigator": 1, "robot-patrol": 1}
+    assert report["restarts"] == {"router": 1, "robot-navigator": 1, "robot-patrol": 1}
     assert "container robot-navigator ended (137)" in err
     assert "container robot-patrol is gone" in err
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_takes_everything_down_and_the_report_is_written(
-    demo: Demo, number: signal.Signals
-) -> None:
+def test_a_signal_takes_everything_down_and_the_report_is_written(demo: Demo) -> None:
     with going_up(demo, "--duration", 600, "--json") as process:
-        when(demo, lambda heard: all(len(heard.tracks.get(n, ())) > 50 for n in ROBOTS))
-        process.send_signal(number)
+        when(demo, lambda heard: all(len(heard.tracks.get(n, ())) > 80 for n in ROBOTS))
+        process.send_signal(signal.SIGTERM)
         out, err = process.communicate(timeout=60.0)
     assert process.returncode == 0, err
     assert_good(json.loads(out))

@@ -1,4 +1,4 @@
-"""Real robots, whose errors are correlated and unmodelled, are honest: none is quarantined."""
+"""Real robots, whose errors are correlated and unmodelled, are honest: they are believed."""
 
 import os
 from functools import cache
@@ -44,12 +44,13 @@ def quarantines(report: Report) -> int:
 
 
 @pytest.mark.parametrize("name", ["MRCLAM2", "MRCLAM4", "MRCLAM6"])
-def test_no_honest_robot_is_quarantined_and_nobody_gets_worse(name: str) -> None:
+def test_honest_robots_are_hardly_ever_quarantined_and_nobody_gets_worse(name: str) -> None:
     report, believing = judged(name), evaluate_log(logged(name, False))
-    assert quarantines(report) == 0
+    assert quarantines(report) <= 1  # in five robots' quarter of an hour and more
+    assert not any(trust.reason for robot in report.robots.values() for trust in robot.trust)
     assert report.team.position_rmse_m is not None
     assert believing.team.position_rmse_m is not None
-    assert report.team.position_rmse_m <= 1.02 * believing.team.position_rmse_m
+    assert report.team.position_rmse_m <= 1.01 * believing.team.position_rmse_m
 
 
 def test_a_robot_of_the_log_that_lies_is_found() -> None:
@@ -61,4 +62,4 @@ def test_a_robot_of_the_log_that_lies_is_found() -> None:
     run_nodes(nodes, log.start_ns, log.start_ns + 600 * 10**9)
     trust = {name: s.trust for name, s in recorder.status.items()}
     assert sum(t.peer == "1" and bool(t.reason) for of in trust.values() for t in of) >= 2
-    assert not any(t.quarantines for of in trust.values() for t in of if t.peer != "1")
+    assert not any(t.reason for of in trust.values() for t in of if t.peer != "1")
