@@ -107,7 +107,7 @@ SCENARIOS = (
     Scenario(
         "lossy-link",
         "every fifth packet of a robot's link is lost, each way, for 20 s",
-        "the same, with silences of 8 s at most",
+        "the same, with silences of 8 s and 1 m at most, as its odometry comes in bursts",
         ROOT,
         SLOW,
         lossy_link,
