@@ -15,6 +15,7 @@ class Usage(NamedTuple):
     cpu_s: float  # user and system
     resident_bytes: int
     proportional_bytes: int  # pages that n processes share count 1 / n
+    own_bytes: int  # no file's pages: heap and stacks, whoever else runs
 
 
 def must_measure(what: str) -> None:
@@ -30,4 +31,5 @@ def usage(pid: int) -> Usage:
     user, system = int(fields[11]), int(fields[12])
     lines = (_PROC / str(pid) / "smaps_rollup").read_text().splitlines()[1:]
     kib = {name: int(rest.split()[0]) for name, rest in (line.split(":") for line in lines)}
-    return Usage((user + system) / _TICKS_A_SECOND, kib["Rss"] * 1024, kib["Pss"] * 1024)
+    resident, proportional, own = (kib[name] * 1024 for name in ("Rss", "Pss", "Anonymous"))
+    return Usage((user + system) / _TICKS_A_SECOND, resident, proportional, own)

@@ -253,7 +253,7 @@ def test_a_router_keeps_no_memory_of_sessions_that_sent_much(tmp_path: Path) -> 
         held = []
         for _ in range(4):
             subprocess.run([sys.executable, "-c", SPEAKS, endpoint], check=True, timeout=60.0)
-            held.append(usage(supervisor.pids[ROUTER]).proportional_bytes / MIB)
+            held.append(usage(supervisor.pids[ROUTER]).own_bytes / MIB)
     assert held[-1] - held[0] < 8.0  # with shared memory 10 MiB each
 
 

@@ -22,7 +22,7 @@ from cpcbl_launch.chaos.notes import (
 from cpcbl_launch.chaos.payloads import real
 from cpcbl_launch.chaos.processes import judged_field, judged_freeze, judged_kill, judged_router
 from cpcbl_launch.chaos.soak import Life, Sample, judged_soak, lives
-from cpcbl_launch.chaos.world import judged_clocks, judged_hidden, judged_kidnap
+from cpcbl_launch.chaos.world import judged_clocks, judged_hidden, judged_kidnap, judged_liar
 from cpcbl_launch.usage import MIB
 from cpcbl_transport import topics
 
@@ -362,6 +362,23 @@ def test_clocks_that_are_off() -> None:
         "said at",
         "its help refused",
         "robots that blame r's clock",
+    }
+
+
+def test_a_liar() -> None:
+    tracks = [tracks_of("a"), tracks_of("b"), tracks_of("w")]
+    said = [status_at(n, 14.0, trust=[("w", "biased")]) for n in "ab"]
+    healed = [status_at(n, 40.0, trust=[("w", "")]) for n in "ab"]
+    good = notes_of(tracks, (), [*said, *healed])
+    assert not broken(judged_liar(good, "w", ["a", "b"], ["a", "b", "w"], AT_S, 25.0))
+    harmed = [tracks_of("a", lambda s: 0.5), *tracks[1:]]
+    bad = notes_of(harmed, (), [said[0]])
+    assert broken(judged_liar(bad, "w", ["a", "b"], ["a", "b", "w"], AT_S, 25.0)) == {
+        "robots that found it",
+        "found by two after",
+        "worst RMSE meanwhile",
+        "others' worst RMSE",
+        "robots that do not believe it 20 s later",
     }
 
 

@@ -241,6 +241,18 @@ def distrusted_after_s(notes: Notes, robot: str, peer: str, reason: str) -> floa
     return next(said, None)
 
 
+def quarantined_s(
+    notes: Notes, robot: str, peer: str, from_s: float, until_s: float
+) -> float | None:
+    """When, within [from_s, until_s), a robot first said that it does not believe a teammate."""
+    said = (
+        s.at_s
+        for s in notes.statuses.get(robot, ())
+        if from_s <= s.at_s < until_s and any(t.peer == peer and t.reason for t in s.status.trust)
+    )
+    return next(said, None)
+
+
 def distrusted(notes: Notes, robot: str) -> dict[str, str]:
     """Whom a robot does not believe by its latest status, and why."""
     said = notes.statuses.get(robot, ())

@@ -14,7 +14,7 @@ from cpcbl_launch.chaos.processes import (
 )
 from cpcbl_launch.chaos.scenario import Needs, Scenario
 from cpcbl_launch.chaos.soak import soak
-from cpcbl_launch.chaos.world import clock_half_second, clock_hour, hidden, kidnap
+from cpcbl_launch.chaos.world import clock_half_second, clock_hour, hidden, kidnap, liar
 
 QUICK, SLOW = True, False
 N, ROOT, MOUNT, HYPOTHESIS = Needs.NOTHING, Needs.ROOT, Needs.MOUNT, Needs.HYPOTHESIS
@@ -107,7 +107,7 @@ SCENARIOS = (
     Scenario(
         "lossy-link",
         "every fifth packet of a robot's link is lost, each way, for 20 s",
-        "the same, with silences of 8 s at most",
+        "the same, with silences of 8 s and 1 m at most, as its odometry comes in bursts",
         ROOT,
         SLOW,
         lossy_link,
@@ -186,6 +186,15 @@ SCENARIOS = (
         N,
         SLOW,
         hidden,
+    ),
+    Scenario(
+        "liar",
+        "one of three observers says everything 0.7 m away, for 15 s",
+        "two of the three that drive find it within 10 s (one may be out of its sight); they err by"
+        " 0.15 m at most; 20 s later all believe it again",
+        N,
+        SLOW,
+        liar,
     ),
     Scenario(
         "soak",

@@ -35,7 +35,7 @@ class Sample(NamedTuple):
     at_s: float
     process: str
     pid: int
-    proportional_bytes: int
+    own_bytes: int
     files: int
 
 
@@ -152,12 +152,12 @@ def _life(process: str, samples: Sequence[Sample]) -> Life:
     warm = [s for s in samples if s.at_s >= begin_s + WARM_S]
     first = [s for s in warm if s.at_s <= begin_s + WARM_S + SPAN_S]
     last = [s for s in warm if s.at_s >= end_s - SPAN_S]
-    mib = [s.proportional_bytes / MIB for s in warm]
+    mib = [s.own_bytes / MIB for s in warm]
     return Life(
         process,
         end_s - begin_s,
-        median(s.proportional_bytes for s in first) / MIB,
-        median(s.proportional_bytes for s in last) / MIB,
+        median(s.own_bytes for s in first) / MIB,
+        median(s.own_bytes for s in last) / MIB,
         60.0 * linear_regression([s.at_s for s in warm], mib).slope,
         int(median(s.files for s in last) - median(s.files for s in first)),
     )
@@ -203,7 +203,7 @@ class _Tormentor:
             for process, pid in self._team.supervisor.pids.items():
                 try:
                     files = len(list(Path(f"/proc/{pid}/fd").iterdir()))
-                    held = usage(pid).proportional_bytes
+                    held = usage(pid).own_bytes
                 except (OSError, KeyError):  # it ends just now
                     continue
                 self.samples.append(Sample(now_s, process, pid, held, files))

@@ -51,6 +51,8 @@ class Plan(NamedTuple):
     """The endpoint that a robot dials, where it is not the router's."""
     prefix: Mapping[str, tuple[str, ...]] = MappingProxyType({})
     """What a robot's command begins with, such as `ip netns exec`."""
+    more: Mapping[str, tuple[str, ...]] = MappingProxyType({})
+    """What a robot's command ends with, such as `--lie bias:0.5,0.5`."""
     also_listen: Sequence[str] = ()
     """Further endpoints of the router."""
     sites: Mapping[str, Site] = MappingProxyType({})
@@ -244,7 +246,11 @@ def _table(plan: Plan, folder: Path, endpoint: str, clock: Clock) -> list[Proces
             continue
         link = plan.links.get(name, endpoint)
         own = process_table(plan.team, team_file, link, clock, plan.seed, here=(name,))[-1]
-        rows.append(own._replace(command=(*plan.prefix.get(name, ()), *own.command)))
+        rows.append(
+            own._replace(
+                command=(*plan.prefix.get(name, ()), *own.command, *plan.more.get(name, ()))
+            )
+        )
     return rows
 
 

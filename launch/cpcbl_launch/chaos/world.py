@@ -15,11 +15,13 @@ from cpcbl_launch.chaos.notes import (
     inside,
     jump_s,
     lost_after_s,
+    quarantined_s,
     rmse_m,
     worst,
 )
-from cpcbl_launch.chaos.scenario import FOUND_M, Found, Setting, all_is_well, they_go_on
+from cpcbl_launch.chaos.scenario import FOUND_M, GOOD_M, Found, Setting, all_is_well, they_go_on
 from cpcbl_launch.chaos.team import Plan, demo_team, running
+from cpcbl_launch.experiments import liars
 from cpcbl_team.config import SimulationEvent, Team
 from cpcbl_transport.messages import Refusal
 
@@ -29,6 +31,8 @@ KIDNAPPED, TO = "patrol", (6.0, 3.5, 180.0)  # 3 m from where its round has take
 CLOCK_S = 20.0
 CLOCK_REASONS = (Refusal.CLOCK, Refusal.FUTURE)
 TOLERATED_S = 0.05
+FINDERS = 2  # of three that drive; one may be out of its sight for long
+LIE, LIE_S = "bias:0.5,0.5", (12.0, 27.0)
 
 
 # Kidnapped ----------------------------------------------------------------------------------------
@@ -159,6 +163,53 @@ def judged_clocks(
         *they_go_on(notes, others, from_s, until_s, most_m=1.0),
         Check(what="others inside 3 σ", seen=share, unit="%", at_least=0.9),
         Check(what="its own RMSE", seen=own, unit="m", at_most=FOUND_M),
+    ]
+
+
+# A liar -------------------------------------------------------------------------------------------
+
+
+def liar(setting: Setting) -> Found:
+    """One of three observers says everything 0.7 m away, for a while."""
+    lie = f"{LIE}@{LIE_S[0]:g}-{LIE_S[1]:g}"
+    crowd = liars.team(liars.Case(lie=LIE))
+    with running(Plan(crowd, setting.seed, more={liars.LIAR: ("--lie", lie)})) as team:
+        setting.say("starting a team")
+        team.settle()
+        setting.say(f"{liars.LIAR} lies from {LIE_S[0]:g} s to {LIE_S[1]:g} s")
+        team.until(lambda: team.now_s >= LIE_S[1] + 20.0, LIE_S[1] + 40.0)
+        return Found(judged_liar(team.notes, liars.LIAR, liars.DRIVERS, team.robots, *LIE_S))
+
+
+def judged_liar(
+    notes: Notes,
+    liar: str,
+    listeners: Sequence[str],
+    robots: Sequence[str],
+    from_s: float,
+    until_s: float,
+) -> list[Check]:
+    """It is found by those that it lies to, does little harm, and is believed again later."""
+    found = [quarantined_s(notes, name, liar, from_s, until_s) for name in listeners]
+    known = sorted(at_s - from_s for at_s in found if at_s is not None)
+    last = [distrusted(notes, name) for name in robots]
+    errors = [rmse_m(notes, name, from_s, until_s) for name in listeners]
+    return [
+        Check(what="robots that found it", seen=len(known), at_least=FINDERS),
+        Check(
+            what="found by two after",
+            seen=known[FINDERS - 1] if len(known) >= FINDERS else None,
+            unit="s",
+            at_most=10.0,
+        ),
+        Check(what="worst RMSE meanwhile", seen=worst(errors), unit="m", at_most=GOOD_M),
+        Check(
+            what="robots that do not believe it 20 s later",
+            seen=sum(liar in peers for peers in last),
+            at_least=0,
+            at_most=0,
+        ),
+        *they_go_on(notes, robots, from_s, until_s),
     ]
 
 
