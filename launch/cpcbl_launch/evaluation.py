@@ -10,12 +10,12 @@ import msgspec
 
 from cpcbl_agents.node import Node, Stepped
 from cpcbl_agents.robot import Robot
-from cpcbl_launch.field import FieldNode, SimulatedField
 from cpcbl_launch.logs import LoggedTeam, seen_before, shortened
 from cpcbl_launch.options import check_limit
-from cpcbl_launch.recorder import Recorder, Report
-from cpcbl_launch.recording import Recording
-from cpcbl_launch.visitors import Visiting, Visitor
+from cpcbl_launch.reporting.recorder import Recorder, Report
+from cpcbl_launch.reporting.recording import Recording
+from cpcbl_launch.simulation.field import FieldNode, SimulatedField
+from cpcbl_launch.simulation.visitors import Visiting, Visitor
 from cpcbl_launch.yardstick import inputs_of, scored, yardsticks
 from cpcbl_team.config import Team
 from cpcbl_team.metrics import Trajectory

@@ -14,7 +14,7 @@ import msgspec
 from cpcbl_agents.clock import Clock
 from cpcbl_agents.process import Wake, run_node
 from cpcbl_agents.visit import Visit, body_of
-from cpcbl_launch.bodies import unfit
+from cpcbl_launch.simulation.bodies import unfit
 from cpcbl_launch.team_file import beside, read_layer
 from cpcbl_launch.traffic.flows import FlowReport, summed_flows
 from cpcbl_team.config import Team

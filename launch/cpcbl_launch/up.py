@@ -18,10 +18,10 @@ from cpcbl_agents.clock import Clock
 from cpcbl_launch.evaluation import Progress, simulate
 from cpcbl_launch.logs import seen_before
 from cpcbl_launch.options import check_duration, not_written
-from cpcbl_launch.phases import Span, guest_reports, phase
 from cpcbl_launch.processes import process_table, tasks
-from cpcbl_launch.recorder import Recorder, Report
-from cpcbl_launch.recording import Recording
+from cpcbl_launch.reporting.phases import Span, guest_reports, phase
+from cpcbl_launch.reporting.recorder import Recorder, Report
+from cpcbl_launch.reporting.recording import Recording
 from cpcbl_launch.supervisor import Processes, Supervisor
 from cpcbl_launch.team_file import save_resolved
 from cpcbl_team.config import Team
@@ -224,7 +224,7 @@ def _report(
     guests = guest_reports(recorder, list(robots), truth, epoch_s, begin_s)
     lost: dict[str, str] = {}
     if (picture := run.picture) is not None:
-        from cpcbl_launch.picture import draw_run
+        from cpcbl_launch.reporting.picture import draw_run
 
         present_s = {name: guest.present_s for name, guest in guests.items()}
         drawn = partial(draw_run, recorder, run.team, truth, picture, epoch_s, helped_from_s)

@@ -22,7 +22,7 @@ import numpy as np
 from cpcbl_agents.agent import Tick
 from cpcbl_agents.robot import Robot
 from cpcbl_launch.logs import LoggedTeam
-from cpcbl_launch.recorder import YardstickReport, mean_score
+from cpcbl_launch.reporting.recorder import YardstickReport, mean_score
 from cpcbl_team.config import Field, LocalizationSettings
 from cpcbl_team.constraints import NEAREST_M
 from cpcbl_team.estimate import Estimate

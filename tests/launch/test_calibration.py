@@ -21,7 +21,7 @@ from cpcbl_launch.calibration.sensor import calibrate_sensor
 from cpcbl_launch.calibration.statistics import Estimate, decimals, robust_fit, told, variance_parts
 from cpcbl_launch.calibration.team_text import changed_keys, team_text
 from cpcbl_launch.evaluation import Choice, chosen, simulate
-from cpcbl_launch.recording import read_recording
+from cpcbl_launch.reporting.recording import read_recording
 from cpcbl_launch.team_file import TeamFileError, load_team, parse_team
 from cpcbl_team.config import (
     Field,

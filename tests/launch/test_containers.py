@@ -18,7 +18,7 @@ from process_helpers import cpcbl_team, eventually
 from cpcbl_launch.containers.docker import done
 from cpcbl_launch.containers.fleet import SERVICE_LABEL
 from cpcbl_launch.processes import PROGRAM
-from cpcbl_launch.recorder import Recorder
+from cpcbl_launch.reporting.recorder import Recorder
 from cpcbl_launch.team_file import builtin, load_team
 from cpcbl_launch.up import free_endpoint
 from cpcbl_transport.zenoh_bus import open_bus

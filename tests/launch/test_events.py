@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from cpcbl_launch.evaluation import simulate
-from cpcbl_launch.field import SimulatedField
-from cpcbl_launch.recorder import Recorder
+from cpcbl_launch.reporting.recorder import Recorder
+from cpcbl_launch.simulation.field import SimulatedField
 from cpcbl_launch.team_file import TeamFileError, builtin, load_team, parse_team, save_resolved
 from cpcbl_team.config import SimulationEvent, Team
 from cpcbl_team.inputs import Sightings

@@ -11,9 +11,9 @@ from bus_helpers import MS, SECOND, Ear
 
 from cpcbl_agents.clock import Clock
 from cpcbl_agents.sensing import SensorInput
-from cpcbl_launch.bodies import LASTS_NS
 from cpcbl_launch.evaluation import Choice, chosen, simulate
-from cpcbl_launch.field import (
+from cpcbl_launch.simulation.bodies import LASTS_NS
+from cpcbl_launch.simulation.field import (
     COMMAND_LASTS_NS,
     INBOX,
     FieldNode,

@@ -8,7 +8,7 @@ from bus_helpers import examples
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cpcbl_launch.grid import Grid
+from cpcbl_launch.simulation.grid import Grid
 
 
 class Post(NamedTuple):

@@ -11,7 +11,7 @@ from process_helpers import cpcbl_team
 
 from cpcbl_launch.experiments import liars
 from cpcbl_launch.experiments.pictures import draw_liars
-from cpcbl_launch.liar import CLAIM_M, Liar, Lie, LyingBus, lying
+from cpcbl_launch.simulation.liar import CLAIM_M, Liar, Lie, LyingBus, lying
 from cpcbl_launch.team_file import builtin
 from cpcbl_team.inputs import Belief, Fix
 from cpcbl_transport import topics

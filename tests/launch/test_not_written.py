@@ -12,7 +12,7 @@ from process_helpers import cpcbl_team
 from cpcbl_launch.evaluation import simulate
 from cpcbl_launch.options import file_for, folder_for
 from cpcbl_launch.processes import PROGRAM
-from cpcbl_launch.recording import Recording, read_recording
+from cpcbl_launch.reporting.recording import Recording, read_recording
 from cpcbl_launch.supervisor import ProcessSpec, Supervisor
 from cpcbl_launch.team_file import TeamFileError, builtin, load_team, save_resolved
 from cpcbl_team.config import RobotSettings, Team

@@ -22,12 +22,12 @@ from cpcbl_launch.containers.guest import docker_run, mounts_of_keys
 from cpcbl_launch.containers.launch import KEYS_INSIDE
 from cpcbl_launch.evaluation import simulate
 from cpcbl_launch.observer import Place, Wish, joined, place_in, places_in, presets
-from cpcbl_launch.phases import Span, guest_reports, phase
 from cpcbl_launch.processes import PROGRAM
-from cpcbl_launch.recorder import Recorder, Report
+from cpcbl_launch.reporting.phases import Span, guest_reports, phase
+from cpcbl_launch.reporting.recorder import Recorder, Report
+from cpcbl_launch.simulation.visitors import Visitor
 from cpcbl_launch.team_file import TeamFileError, builtin, load_team, parse_team, save_resolved
 from cpcbl_launch.up import Run, free_endpoint, run_team
-from cpcbl_launch.visitors import Visitor
 from cpcbl_team.config import GuestSettings, MatchSettings, Team, TransportSettings
 from cpcbl_transport import topics
 from cpcbl_transport.messages import Status, decode

@@ -10,9 +10,17 @@ import pytest
 from bus_helpers import SECOND
 from rich.console import Console
 
-from cpcbl_launch.phases import AWAY_S, MOST_GUESTS, Span, guest_reports, phase, presence, split
-from cpcbl_launch.recorder import MeanScore, Recorder, Report, TeamReport
-from cpcbl_launch.show import LiveTable, print_report
+from cpcbl_launch.reporting.phases import (
+    AWAY_S,
+    MOST_GUESTS,
+    Span,
+    guest_reports,
+    phase,
+    presence,
+    split,
+)
+from cpcbl_launch.reporting.recorder import MeanScore, Recorder, Report, TeamReport
+from cpcbl_launch.reporting.show import LiveTable, print_report
 from cpcbl_launch.supervisor import Supervisor
 from cpcbl_team.metrics import Floats
 from cpcbl_transport import topics

@@ -12,7 +12,7 @@ from process_helpers import cpcbl_team
 from cpcbl_launch.evaluation import Choice, chosen, evaluate_log
 from cpcbl_launch.evaluation import evaluated as evaluated_log
 from cpcbl_launch.logs import blinded, builtin_for, on_log
-from cpcbl_launch.recorder import Report
+from cpcbl_launch.reporting.recorder import Report
 from cpcbl_launch.team_file import builtin, load_team
 
 pytestmark = [pytest.mark.log, pytest.mark.timeout(900)]

@@ -9,7 +9,7 @@ from log_helpers import write_log
 from process_helpers import cpcbl_team
 
 from cpcbl_launch.evaluation import simulate
-from cpcbl_launch.recording import Recording, read_recording
+from cpcbl_launch.reporting.recording import Recording, read_recording
 from cpcbl_launch.team_file import builtin, load_team
 from cpcbl_team.config import RobotSettings, Team
 from cpcbl_team.inputs import Odometry, Position, Sighting, Sightings

@@ -20,8 +20,8 @@ from rich.console import Console, RenderableType
 from cpcbl_launch.cli import main
 from cpcbl_launch.evaluation import Choice, chosen
 from cpcbl_launch.processes import PROGRAM
-from cpcbl_launch.recorder import Recorder, Report
-from cpcbl_launch.show import print_report
+from cpcbl_launch.reporting.recorder import Recorder, Report
+from cpcbl_launch.reporting.show import print_report
 from cpcbl_launch.team_file import parse_team
 from cpcbl_launch.traffic.flows import (
     SpendingReport,

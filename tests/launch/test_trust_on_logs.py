@@ -9,8 +9,8 @@ import pytest
 
 from cpcbl_launch import logs
 from cpcbl_launch.evaluation import evaluate_log, robot_nodes, run_nodes
-from cpcbl_launch.liar import Lie, lying
-from cpcbl_launch.recorder import Recorder, Report
+from cpcbl_launch.reporting.recorder import Recorder, Report
+from cpcbl_launch.simulation.liar import Lie, lying
 from cpcbl_launch.team_file import load_team
 from cpcbl_team.config import Team, TrustSettings
 from cpcbl_team.metrics import score

@@ -8,7 +8,7 @@ from docker_helpers import composed
 from process_helpers import eventually
 
 from cpcbl_launch.containers.docker import done
-from cpcbl_launch.recorder import Recorder
+from cpcbl_launch.reporting.recorder import Recorder
 from cpcbl_transport.zenoh_bus import open_bus
 
 WEST, EAST = {"navigator", "observer"}, {"scout", "patrol"}

@@ -14,7 +14,7 @@ from bus_helpers import Ear, robot_at, team_of, wait_until
 from process_helpers import command_of, eventually
 
 from cpcbl_launch.processes import PROGRAM
-from cpcbl_launch.recorder import Recorder, Report
+from cpcbl_launch.reporting.recorder import Recorder, Report
 from cpcbl_launch.supervisor import Processes, ProcessSpec, Supervisor
 from cpcbl_launch.team_file import builtin, load_team, save_resolved
 from cpcbl_launch.up import Run, free_endpoint, run_team

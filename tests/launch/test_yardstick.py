@@ -16,7 +16,7 @@ from process_helpers import cpcbl_team
 from cpcbl_agents.sources.mrclam import read_table
 from cpcbl_launch.evaluation import evaluated
 from cpcbl_launch.logs import LoggedTeam, blinded, on_log
-from cpcbl_launch.recorder import YardstickReport
+from cpcbl_launch.reporting.recorder import YardstickReport
 from cpcbl_launch.yardstick import Ekf, Inputs, expected_sighting, inputs_of, scored, yardsticks
 from cpcbl_team.config import (
     Field,

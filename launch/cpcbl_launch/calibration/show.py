@@ -4,7 +4,7 @@ from rich.console import Console
 
 from cpcbl_launch.calibration.robots import Calibration
 from cpcbl_launch.calibration.statistics import Estimate, decimals
-from cpcbl_launch.tables import table
+from cpcbl_launch.reporting.tables import table
 
 
 def print_calibration(calibration: Calibration, console: Console) -> None:

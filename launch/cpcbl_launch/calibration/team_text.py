@@ -13,7 +13,7 @@ from tomlkit.toml_document import TOMLDocument
 from cpcbl_launch.calibration import odometry, sensor
 from cpcbl_launch.calibration.robots import Calibration, RobotCalibration
 from cpcbl_launch.calibration.statistics import Estimate, decimals
-from cpcbl_launch.recording import read_recording
+from cpcbl_launch.reporting.recording import read_recording
 from cpcbl_launch.team_file import TeamFileError, builtin, parse_team
 
 MARGIN = 0.5

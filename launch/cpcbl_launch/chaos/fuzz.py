@@ -19,7 +19,7 @@ from cpcbl_launch.chaos.payloads import fuzzed, hypothetical, real
 from cpcbl_launch.chaos.scenario import Found, Setting, all_is_well, they_go_on
 from cpcbl_launch.chaos.team import FIELD, ChaosError, Plan, TeamUnderTest, demo_team, running
 from cpcbl_launch.processes import PROGRAM
-from cpcbl_launch.recorder import Recorder
+from cpcbl_launch.reporting.recorder import Recorder
 from cpcbl_launch.traffic.watch import Watcher
 from cpcbl_team.config import (
     CollaborationSettings,

@@ -90,7 +90,7 @@ def up(
     from cpcbl_launch.containers.launch import InContainers, progress_on
     from cpcbl_launch.evaluation import Choice, chosen
     from cpcbl_launch.options import encoded, file_for, folder_for, must_draw
-    from cpcbl_launch.show import LiveTable, print_report
+    from cpcbl_launch.reporting.show import LiveTable, print_report
     from cpcbl_launch.up import (
         SIMULATED_S,
         Launch,
@@ -164,7 +164,7 @@ def robot(
     """Run one robot, on any machine, until SIGINT or SIGTERM."""
     from cpcbl_agents.clock import Clock
     from cpcbl_agents.process import Stop, run_robot
-    from cpcbl_launch.liar import Lie, lying
+    from cpcbl_launch.simulation.liar import Lie, lying
     from cpcbl_launch.team_file import TeamFileError
 
     team = load(team_file)
@@ -193,7 +193,7 @@ def field(
 
     from cpcbl_agents.clock import Clock
     from cpcbl_agents.process import Stop
-    from cpcbl_launch.field import robots_at, run_field
+    from cpcbl_launch.simulation.field import robots_at, run_field
     from cpcbl_transport.bus import Bus
     from cpcbl_transport.security import Identity, link_of
     from cpcbl_transport.topics import Role

@@ -17,7 +17,7 @@ from rich.console import RenderableType
 from cpcbl_launch.evaluation import evaluate_log
 from cpcbl_launch.experiments.runs import in_processes
 from cpcbl_launch.logs import LoggedTeam
-from cpcbl_launch.tables import number, percent, table
+from cpcbl_launch.reporting.tables import number, percent, table
 
 EVERYTHING: Mapping[str, Any] = {"least_value": 0.0, "least_use": 0.0, "belief_share": 0.0}
 RARE: Mapping[str, Any] = {

@@ -29,7 +29,7 @@ from cpcbl_launch.experiments.results import (
     spread,
 )
 from cpcbl_launch.experiments.runs import Case
-from cpcbl_launch.tables import number, percent, table
+from cpcbl_launch.reporting.tables import number, percent, table
 from cpcbl_team.config import RobotSettings, Start, Team
 
 DURATION_S = 20.0

@@ -23,7 +23,7 @@ from cpcbl_launch.experiments.results import (
     pattern_lines,
 )
 from cpcbl_launch.experiments.runs import Case
-from cpcbl_launch.tables import number, percent, table
+from cpcbl_launch.reporting.tables import number, percent, table
 
 CONFIGURATIONS = {
     "A": "odometry",

@@ -26,7 +26,7 @@ from cpcbl_agents.clock import Clock
 from cpcbl_agents.node import Node
 from cpcbl_agents.process import Stop, Wake, run_node
 from cpcbl_agents.robot import Robot
-from cpcbl_launch.tables import table
+from cpcbl_launch.reporting.tables import table
 from cpcbl_launch.up import free_endpoint
 from cpcbl_team.config import (
     CollaborationSettings,

@@ -19,8 +19,8 @@ from rich.console import RenderableType
 from cpcbl_launch.evaluation import simulate
 from cpcbl_launch.experiments.results import Spread, spread
 from cpcbl_launch.experiments.runs import in_processes
-from cpcbl_launch.liar import Lie, lying
-from cpcbl_launch.tables import number, table
+from cpcbl_launch.reporting.tables import number, table
+from cpcbl_launch.simulation.liar import Lie, lying
 from cpcbl_launch.team_file import builtin, load_team
 from cpcbl_team.config import Team, TrustSettings
 from cpcbl_team.metrics import position_errors

@@ -25,9 +25,9 @@ from cpcbl_agents.clock import Clock
 from cpcbl_agents.node import STATUS_NS
 from cpcbl_agents.process import Stop
 from cpcbl_launch.processes import process_table
+from cpcbl_launch.reporting.tables import number, table
 from cpcbl_launch.scale.swarm import MOST_ROBOTS, swarm
 from cpcbl_launch.supervisor import Supervisor
-from cpcbl_launch.tables import number, table
 from cpcbl_launch.team_file import save_resolved
 from cpcbl_launch.up import free_endpoint
 from cpcbl_launch.usage import MIB, usage

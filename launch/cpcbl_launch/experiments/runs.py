@@ -16,7 +16,7 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 
 from cpcbl_launch.evaluation import simulate
-from cpcbl_launch.recorder import Recorder
+from cpcbl_launch.reporting.recorder import Recorder
 from cpcbl_team.config import Team
 from cpcbl_team.geometry import Pose2, step
 from cpcbl_team.inputs import Odometry

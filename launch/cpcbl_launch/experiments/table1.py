@@ -26,7 +26,7 @@ from cpcbl_launch.experiments.results import (
     spread,
 )
 from cpcbl_launch.experiments.runs import Case, Run
-from cpcbl_launch.tables import table
+from cpcbl_launch.reporting.tables import table
 from cpcbl_team.config import Weights
 from cpcbl_team.metrics import Floats
 

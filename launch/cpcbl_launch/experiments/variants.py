@@ -19,7 +19,7 @@ from cpcbl_launch.experiments.results import (
     new_outcome,
 )
 from cpcbl_launch.experiments.runs import Case
-from cpcbl_launch.tables import table
+from cpcbl_launch.reporting.tables import table
 
 VARIANTS = ("joint", "oval", "circular", "weighted")
 HELP = {"alone": "C", "helped": "F"}

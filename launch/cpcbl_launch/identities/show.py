@@ -5,7 +5,7 @@ from collections.abc import Iterable
 from rich.table import Table
 
 from cpcbl_launch.identities.folder import KeysReport
-from cpcbl_launch.tables import table
+from cpcbl_launch.reporting.tables import table
 
 
 def drawn(members: Iterable[KeysReport]) -> Table:

@@ -15,10 +15,10 @@ from cpcbl_launch.evaluation import (
     run_nodes,
     simulated_report,
 )
-from cpcbl_launch.field import FieldNode, SimulatedField
 from cpcbl_launch.options import check_duration
-from cpcbl_launch.recorder import Recorder
+from cpcbl_launch.reporting.recorder import Recorder
 from cpcbl_launch.scale.swarm import MOST_ROBOTS, swarm
+from cpcbl_launch.simulation.field import FieldNode, SimulatedField
 from cpcbl_team.config import Team
 from cpcbl_team.inputs import Sightings
 from cpcbl_transport import topics

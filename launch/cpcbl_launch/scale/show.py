@@ -2,8 +2,8 @@
 
 from rich.console import Console
 
+from cpcbl_launch.reporting.tables import number, percent, table
 from cpcbl_launch.scale.measure import Scale
-from cpcbl_launch.tables import number, percent, table
 
 _EXPLAINED = (
     "means over the robots; in sight: teammates in a frame; out, in: fixes and",

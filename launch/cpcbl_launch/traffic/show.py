@@ -6,10 +6,10 @@ from rich.console import Console, Group
 from rich.table import Table
 from rich.text import Text
 
-from cpcbl_launch.live import LiveView
-from cpcbl_launch.recorder import Report, RobotReport
-from cpcbl_launch.standing import distrusted
-from cpcbl_launch.tables import number, short, table
+from cpcbl_launch.reporting.live import LiveView
+from cpcbl_launch.reporting.recorder import Report, RobotReport
+from cpcbl_launch.reporting.standing import distrusted
+from cpcbl_launch.reporting.tables import number, short, table
 from cpcbl_launch.traffic.flows import FlowReport, SpendingReport, all_held
 from cpcbl_launch.traffic.watch import AT_PRESENT_NS, RATES_NS, Help, RobotNow, Traffic
 

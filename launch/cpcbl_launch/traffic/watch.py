@@ -14,7 +14,7 @@ from typing import NamedTuple, Protocol
 
 import msgspec
 
-from cpcbl_launch.standing import TrustReport, trust_of
+from cpcbl_launch.reporting.standing import TrustReport, trust_of
 from cpcbl_launch.traffic.flows import (
     FlowReport,
     SpendingReport,

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping, Sequence
 import msgspec
 import numpy as np
 
-from cpcbl_launch.standing import TrustReport, trust_of
+from cpcbl_launch.reporting.standing import TrustReport, trust_of
 from cpcbl_launch.traffic.flows import (
     FlowReport,
     SpendingReport,

@@ -19,7 +19,7 @@ from mcap.writer import Writer
 
 from cpcbl_agents.sensing import SensorInput
 from cpcbl_agents.sources.mrclam import LogError
-from cpcbl_launch.recorder import truth_rows
+from cpcbl_launch.reporting.recorder import truth_rows
 from cpcbl_team.config import Team
 from cpcbl_team.inputs import Odometry, Position, Sightings
 from cpcbl_team.metrics import Floats

@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from cpcbl_launch.recorder import Effect, GuestReport, Phase, Recorder, RobotReport
+from cpcbl_launch.reporting.recorder import Effect, GuestReport, Phase, Recorder, RobotReport
 from cpcbl_team.metrics import Floats, Trajectory, compared, score, seconds
 
 AWAY_S = 2.0  # who says nothing of itself for longer was away

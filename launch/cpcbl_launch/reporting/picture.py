@@ -6,7 +6,7 @@ from types import MappingProxyType
 
 import matplotlib as mpl
 
-from cpcbl_launch.recorder import Recorder
+from cpcbl_launch.reporting.recorder import Recorder
 from cpcbl_team.config import Team
 from cpcbl_team.metrics import Floats, position_errors
 

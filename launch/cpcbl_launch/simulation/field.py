@@ -18,8 +18,8 @@ from msgspec.structs import replace
 
 from cpcbl_agents.clock import Clock
 from cpcbl_agents.sensing import SensorInput
-from cpcbl_launch.bodies import Bodies
-from cpcbl_launch.grid import Grid
+from cpcbl_launch.simulation.bodies import Bodies
+from cpcbl_launch.simulation.grid import Grid
 from cpcbl_team.config import (
     OdometrySettings,
     RobotSettings,

@@ -9,11 +9,11 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 from rich.text import Text
 
-from cpcbl_launch.live import LiveView
 from cpcbl_launch.observer import Visited
-from cpcbl_launch.phases import AWAY_S
 from cpcbl_launch.processes import ROBOT
-from cpcbl_launch.recorder import (
+from cpcbl_launch.reporting.live import LiveView
+from cpcbl_launch.reporting.phases import AWAY_S
+from cpcbl_launch.reporting.recorder import (
     Effect,
     GuestReport,
     LearnedReport,
@@ -22,9 +22,9 @@ from cpcbl_launch.recorder import (
     Report,
     RobotReport,
 )
-from cpcbl_launch.standing import distrusted, trust_remarks
+from cpcbl_launch.reporting.standing import distrusted, trust_remarks
+from cpcbl_launch.reporting.tables import number, percent, short, table
 from cpcbl_launch.supervisor import Processes
-from cpcbl_launch.tables import number, percent, short, table
 from cpcbl_launch.traffic.show import EXPLAINED, spent_table, verdict
 from cpcbl_team.collaboration import LOWEST_TIER
 from cpcbl_team.metrics import Score
