@@ -8,13 +8,13 @@ import sys
 import typer
 
 from cpcbl_launch.commands.deploying import compose
+from cpcbl_launch.commands.experimenting import experiment_app
 from cpcbl_launch.commands.faults import chaos
 from cpcbl_launch.commands.measuring import calibrate, evaluate_mrclam, simulate
 from cpcbl_launch.commands.observing import observer
 from cpcbl_launch.commands.running import check, field, robot, router, up
 from cpcbl_launch.commands.securing import keys
 from cpcbl_launch.commands.watching import traffic
-from cpcbl_launch.experiments.cli import experiment_app
 
 app = typer.Typer(
     help="A team of robots that find out where they are, together.",

@@ -14,9 +14,9 @@ import msgspec
 from cpcbl_agents.clock import Clock
 from cpcbl_agents.process import Wake, run_node
 from cpcbl_agents.visit import Visit, body_of
+from cpcbl_launch.reporting.flows import FlowReport, summed_flows
 from cpcbl_launch.simulation.bodies import unfit
 from cpcbl_launch.team_file import beside, read_layer
-from cpcbl_launch.traffic.flows import FlowReport, summed_flows
 from cpcbl_team.config import Team
 from cpcbl_team.inputs import NAME_PATTERN
 from cpcbl_transport import topics

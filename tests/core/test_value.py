@@ -58,8 +58,9 @@ def exactness(*covariances: Covariance2) -> float:
 def test_naive_merging_is_the_product(
     prior: Covariance2, fresh: Covariance2, dependent: Covariance2
 ) -> None:
+    exact = Covariance2(-SMALLEST_VARIANCE, 0.0, -SMALLEST_VARIANCE)  # is called so, and raised
     product = merge(Gaussian2(0.0, 0.0, prior), Gaussian2(0.0, 0.0, fresh + dependent))
-    after = merged(prior, fresh, dependent, "naive")
+    after = merged(prior + exact, fresh + exact, dependent, "naive")
     assert after == pytest.approx(product.covariance, rel=1e-6, abs=1e-9)
 
 

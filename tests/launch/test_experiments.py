@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from process_helpers import cpcbl_team
 
+from cpcbl_launch.commands.experimenting import conduct
 from cpcbl_launch.experiments import directions, figure7, runs, table1, variants
 from cpcbl_launch.experiments.circuit import circuit, loops, with_keys
-from cpcbl_launch.experiments.cli import conduct
 from cpcbl_launch.experiments.results import Experiment, Outcome, Results, accuracy, spread
 from cpcbl_launch.experiments.runs import Case, run, run_all
 from cpcbl_team.config import Team

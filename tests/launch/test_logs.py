@@ -16,7 +16,7 @@ from cpcbl_agents.sources.mrclam import LogError
 from cpcbl_launch.evaluation import Choice, chosen, evaluate_log
 from cpcbl_launch.logs import LoggedTeam, blinded, builtin_for, on_log, seen_before
 from cpcbl_launch.reporting.recorder import LearnedReport, Report
-from cpcbl_launch.reporting.show import print_report
+from cpcbl_launch.show import print_report
 from cpcbl_launch.team_file import builtin, load_team
 from cpcbl_team.config import (
     LocalizerSettings,

@@ -20,7 +20,7 @@ from cpcbl_launch.reporting.phases import (
     split,
 )
 from cpcbl_launch.reporting.recorder import MeanScore, Recorder, Report, TeamReport
-from cpcbl_launch.reporting.show import LiveTable, print_report
+from cpcbl_launch.show import LiveTable, print_report
 from cpcbl_launch.supervisor import Supervisor
 from cpcbl_team.metrics import Floats
 from cpcbl_transport import topics

@@ -7,8 +7,8 @@ import pytest
 from rich.console import Console
 
 from cpcbl_launch.reporting.recorder import Recorder, Report
-from cpcbl_launch.reporting.show import print_report
 from cpcbl_launch.reporting.standing import TrustReport, distrusted, trust_of, trust_remarks
+from cpcbl_launch.show import print_report
 from cpcbl_launch.traffic.show import drawn
 from cpcbl_launch.traffic.watch import Arrival, traffic
 from cpcbl_transport import topics

@@ -20,15 +20,15 @@ from rich.console import Console, RenderableType
 from cpcbl_launch.cli import main
 from cpcbl_launch.evaluation import Choice, chosen
 from cpcbl_launch.processes import PROGRAM
-from cpcbl_launch.reporting.recorder import Recorder, Report
-from cpcbl_launch.reporting.show import print_report
-from cpcbl_launch.team_file import parse_team
-from cpcbl_launch.traffic.flows import (
+from cpcbl_launch.reporting.flows import (
     SpendingReport,
     all_held,
     summed_flows,
     summed_spending,
 )
+from cpcbl_launch.reporting.recorder import Recorder, Report
+from cpcbl_launch.show import print_report
+from cpcbl_launch.team_file import parse_team
 from cpcbl_launch.traffic.show import TrafficView, drawn, limit_text
 from cpcbl_launch.traffic.watch import Arrival, Traffic, Watcher, traffic
 from cpcbl_launch.up import free_endpoint

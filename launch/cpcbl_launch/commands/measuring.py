@@ -80,8 +80,8 @@ def evaluate_mrclam(
     from cpcbl_launch import logs as real_logs
     from cpcbl_launch.evaluation import Choice, chosen, evaluated
     from cpcbl_launch.options import encoded, folder_for
-    from cpcbl_launch.reporting.show import print_report, progress_bar
     from cpcbl_launch.reporting.tum import export_tum
+    from cpcbl_launch.show import print_report, progress_bar
 
     team = load(team_file or real_logs.builtin_for(data))
     choice = Choice(
@@ -136,7 +136,7 @@ def calibrate(
     from cpcbl_launch.calibration.show import print_calibration
     from cpcbl_launch.calibration.team_text import base_text, team_text
     from cpcbl_launch.options import encoded, file_for, must_draw, not_written
-    from cpcbl_launch.reporting.show import progress_bar
+    from cpcbl_launch.show import progress_bar
 
     file_for("--output", output)
     if picture is not None:
@@ -190,11 +190,11 @@ def simulate(
     from rich.console import Console
 
     from cpcbl_launch.evaluation import Choice, chosen
-    from cpcbl_launch.options import encoded, file_for, must_draw
+    from cpcbl_launch.options import encoded, file_for, must_draw, not_written
     from cpcbl_launch.reporting.recorder import Report
-    from cpcbl_launch.reporting.show import print_report, progress_bar
     from cpcbl_launch.scale.measure import DURATION_S, Scale, measured, parsed_sizes
     from cpcbl_launch.scale.show import print_scale
+    from cpcbl_launch.show import print_report, progress_bar
     from cpcbl_launch.up import Run, simulate_run
 
     budgets = Choice(
@@ -215,7 +215,7 @@ def simulate(
     with progress_bar("simulating", quiet=as_json) as progress:
         if robots:
             duration = DURATION_S if duration is None else duration
-            result = measured(parsed_sizes(robots), seed, duration, progress, picture)
+            result = measured(parsed_sizes(robots), seed, duration, progress)
         else:
             team = chosen(load(file or Path("demo")), budgets)
             run = Run(team, duration, seed=seed, picture=picture)
@@ -223,6 +223,10 @@ def simulate(
     lost = write_report(report, result)
     if isinstance(result, Report):
         lost |= result.not_written
+    elif (drawing := picture) is not None:
+        from cpcbl_launch.scale.picture import draw_scale
+
+        lost |= not_written(drawing, lambda: draw_scale(result, drawing))
     if as_json:
         sys.stdout.write(encoded(result) + "\n")
     elif isinstance(result, Scale):

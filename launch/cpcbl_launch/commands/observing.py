@@ -69,7 +69,7 @@ def observer(
     from cpcbl_agents.process import Stop
     from cpcbl_launch.observer import Wish, joined, place_in, places_in, presets, visit
     from cpcbl_launch.options import encoded
-    from cpcbl_launch.reporting.show import print_visit
+    from cpcbl_launch.show import print_visit
 
     if duration is not None and not duration > 0.0:
         raise ValueError(f"--for {duration:g}: more than 0 seconds")

@@ -90,7 +90,7 @@ def up(
     from cpcbl_launch.containers.launch import InContainers, progress_on
     from cpcbl_launch.evaluation import Choice, chosen
     from cpcbl_launch.options import encoded, file_for, folder_for, must_draw
-    from cpcbl_launch.reporting.show import LiveTable, print_report
+    from cpcbl_launch.show import LiveTable, print_report
     from cpcbl_launch.up import (
         SIMULATED_S,
         Launch,

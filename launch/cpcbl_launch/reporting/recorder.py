@@ -8,14 +8,14 @@ from collections.abc import Iterable, Mapping, Sequence
 import msgspec
 import numpy as np
 
-from cpcbl_launch.reporting.standing import TrustReport, trust_of
-from cpcbl_launch.traffic.flows import (
+from cpcbl_launch.reporting.flows import (
     FlowReport,
     SpendingReport,
     all_held,
     summed_flows,
     summed_spending,
 )
+from cpcbl_launch.reporting.standing import TrustReport, trust_of
 from cpcbl_team.metrics import Floats, Samples, Score, Trajectory, compared, score, seconds
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus

@@ -4,7 +4,6 @@ import gc
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from pathlib import Path
 
 import msgspec
 
@@ -72,9 +71,8 @@ def measured(
     seed: int = 1,
     duration_s: float = DURATION_S,
     progress: Progress | None = None,
-    picture: Path | None = None,
 ) -> Scale:
-    """Generated teams of these sizes, one after the other; `picture` is the file to draw into.
+    """Generated teams of these sizes, one after the other.
 
     Raises ValueError for a duration that is too short to measure anything.
     """
@@ -83,12 +81,7 @@ def measured(
     for i, size in enumerate(sizes):
         part = _part(progress, sum(sizes[:i]), size, sum(sizes))
         figures.append(measured_team(swarm(size, seed), seed, duration_s, part))
-    scale = Scale(duration_s=duration_s, seed=seed, sizes=tuple(figures))
-    if picture is not None:
-        from cpcbl_launch.scale.picture import draw_scale
-
-        draw_scale(scale, picture)
-    return scale
+    return Scale(duration_s=duration_s, seed=seed, sizes=tuple(figures))
 
 
 def _part(progress: Progress | None, before: int, size: int, total: int) -> Progress:

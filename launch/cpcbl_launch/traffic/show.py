@@ -6,11 +6,11 @@ from rich.console import Console, Group
 from rich.table import Table
 from rich.text import Text
 
+from cpcbl_launch.reporting.flows import FlowReport, SpendingReport, all_held
 from cpcbl_launch.reporting.live import LiveView
 from cpcbl_launch.reporting.recorder import Report, RobotReport
 from cpcbl_launch.reporting.standing import distrusted
 from cpcbl_launch.reporting.tables import number, short, table
-from cpcbl_launch.traffic.flows import FlowReport, SpendingReport, all_held
 from cpcbl_launch.traffic.watch import AT_PRESENT_NS, RATES_NS, Help, RobotNow, Traffic
 
 COLOURS = {"fix": "cyan", "belief": "magenta"}

@@ -14,13 +14,13 @@ from typing import NamedTuple, Protocol
 
 import msgspec
 
-from cpcbl_launch.reporting.standing import TrustReport, trust_of
-from cpcbl_launch.traffic.flows import (
+from cpcbl_launch.reporting.flows import (
     FlowReport,
     SpendingReport,
     summed_flows,
     summed_spending,
 )
+from cpcbl_launch.reporting.standing import TrustReport, trust_of
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus
 from cpcbl_transport.messages import Flow, Status
