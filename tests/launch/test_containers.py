@@ -3,6 +3,7 @@
 import json
 import math
 import os
+import re
 import secrets
 import signal
 import subprocess
@@ -140,7 +141,7 @@ def test_containers_killed_by_hand_are_started_again_and_the_report_says_so(demo
     assert_good(report)
     assert report["restarts"] == {"router": 1, "robot-navigator": 1, "robot-patrol": 1}
     assert "container robot-navigator ended (137)" in err
-    assert "container robot-patrol is gone" in err
+    assert re.search("container robot-patrol (is gone|ended)", err)  # ended: while it is removed
 
 
 def test_a_signal_takes_everything_down_and_the_report_is_written(demo: Demo) -> None:
