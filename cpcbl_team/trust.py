@@ -229,7 +229,8 @@ def _settled(voices: Voices, name: str, now_ns: int, used_ns: int, rules: TrustS
     if doubted_ns is None:
         return Verdict(voices, True)
     against = {n for n, v in lately.items() if v.score > 0.5 * rules.limit}
-    beside = {n for n, v in lately.items() if v.agreed_ns > doubted_ns} - against
+    agreeing = {n for n, v in lately.items() if v.agreed_ns > max(doubted_ns, v.doubted_ns)}
+    beside = agreeing - against
     if not beside:
         return Verdict(voices, True)
     estimate_is_right = _right(lately, against, beside, now_ns - doubted_ns)

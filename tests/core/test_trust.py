@@ -135,6 +135,18 @@ def test_the_last_agreement_before_a_kidnapping_counts_for_nothing(court: Court)
     assert court.quarantined == {}
 
 
+def test_who_has_just_begun_to_disagree_too_is_nobodys_witness() -> None:
+    """A kidnapping in the middle of a dispute: the last word of east, too, contradicts it all."""
+    now_ns = 10 * SECOND
+    voices = {
+        "west": Voice(heard_ns=now_ns - 1, doubted_ns=8 * SECOND, score=RULES.limit - 1.0),
+        "east": Voice(now_ns - 1, agreed_ns=9 * SECOND, doubted_ns=now_ns - 1, strikes=1.0),
+    }
+    verdict = judged(voices, "west", Said(now_ns, BAD, (3.0, 0.0)), now_ns - 1, RULES)
+    assert not verdict.event
+    assert not any(voice.reason for voice in verdict.voices.values())
+
+
 def test_one_word_against_another_uses_neither_until_time_decides(court: Court) -> None:
     court.hear(1.0, honest=GOOD, liar=GOOD)
     court.hear(1.0, honest=GOOD, liar=BAD)
