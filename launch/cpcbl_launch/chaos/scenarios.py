@@ -75,7 +75,8 @@ SCENARIOS = (
     Scenario(
         "partition-containers",
         "two sites in containers; `docker network disconnect` of one's router for 10 s",
-        "the same, in containers",
+        "the same, in containers; 1 m for the far site, whose blind scout is far from those that"
+        " know best",
         DOCKER,
         SLOW,
         partition_containers,
