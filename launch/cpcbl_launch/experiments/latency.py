@@ -26,6 +26,7 @@ from cpcbl_agents.clock import Clock
 from cpcbl_agents.node import Node
 from cpcbl_agents.process import Stop, Wake, run_node
 from cpcbl_agents.robot import Robot
+from cpcbl_launch.passing import PassingBus, PassingPublisher
 from cpcbl_launch.reporting.tables import table
 from cpcbl_launch.up import free_endpoint
 from cpcbl_team.config import (
@@ -38,7 +39,7 @@ from cpcbl_team.config import (
 )
 from cpcbl_team.inputs import Fix, Odometry, Sighting, Sightings
 from cpcbl_transport import topics
-from cpcbl_transport.bus import Bus, Handle, Publisher, Receive, Watch
+from cpcbl_transport.bus import Bus, Handle, Publisher, Receive
 from cpcbl_transport.compact import FIX_BYTES, decode_help
 from cpcbl_transport.messages import Message, decode, encode
 from cpcbl_transport.topics import Qos
@@ -100,56 +101,35 @@ class Noted(NamedTuple):
     payload: bytes
 
 
-class _Publisher:
+class _NotingPublisher(PassingPublisher):
     """A publisher that notes what is put."""
 
     def __init__(self, publisher: Publisher, key: str, said: list[Noted]) -> None:
-        self._publisher, self._key, self._said = publisher, key, said
-
-    @property
-    def matching(self) -> bool:
-        return self._publisher.matching
+        super().__init__(publisher)
+        self._key, self._said = key, said
 
     def put(self, payload: bytes) -> None:
         self._said.append(Noted(time.monotonic_ns(), self._key, payload))
-        self._publisher.put(payload)
-
-    def close(self) -> None:
-        self._publisher.close()
+        super().put(payload)
 
 
-class NotingBus:
+class NotingBus(PassingBus):
     """A bus that notes what passes, and when."""
 
     def __init__(self, bus: Bus) -> None:
-        self._bus = bus
+        super().__init__(bus)
         self.heard: list[Noted] = []
         self.said: list[Noted] = []
 
     def publisher(self, key: str, qos: Qos) -> Publisher:
-        return _Publisher(self._bus.publisher(key, qos), key, self.said)
+        return _NotingPublisher(super().publisher(key, qos), key, self.said)
 
     def subscribe(self, keys: str, receive: Receive) -> Handle:
         def arrived(key: str, payload: bytes) -> None:
             self.heard.append(Noted(time.monotonic_ns(), key, payload))
             receive(key, payload)
 
-        return self._bus.subscribe(keys, arrived)
-
-    def announce(self, key: str) -> Handle:
-        return self._bus.announce(key)
-
-    def watch(self, keys: str, watch: Watch) -> Handle:
-        return self._bus.watch(keys, watch)
-
-    def close(self) -> None:
-        self._bus.close()
-
-    def __enter__(self) -> "NotingBus":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
+        return super().subscribe(keys, arrived)
 
 
 class NotingRobot(Robot):

@@ -19,8 +19,9 @@ from typing import NamedTuple
 
 import msgspec
 
+from cpcbl_launch.passing import PassingBus, PassingPublisher
 from cpcbl_team.inputs import Belief, Fix
-from cpcbl_transport.bus import Bus, Handle, Publisher, Receive, Watch
+from cpcbl_transport.bus import Bus, Publisher
 from cpcbl_transport.compact import decode_help, encode_help
 from cpcbl_transport.messages import Refusal
 from cpcbl_transport.topics import Qos
@@ -109,50 +110,27 @@ def _certain(message: Help) -> Help:
     return replace(message, covariance=(tiny, 0.0, tiny, 0.0, 0.0, tiny))
 
 
-class _LyingPublisher:
+class _LyingPublisher(PassingPublisher):
     def __init__(self, key: str, publisher: Publisher, liar: Liar) -> None:
-        self._key, self._publisher, self._liar = key, publisher, liar
-
-    @property
-    def matching(self) -> bool:
-        return self._publisher.matching
+        super().__init__(publisher)
+        self._key, self._liar = key, liar
 
     def put(self, payload: bytes) -> None:
         message = decode_help(self._key, payload)
         assert not isinstance(message, Refusal)  # the robot itself is honest
-        self._publisher.put(encode_help(self._liar.said(message)))
-
-    def close(self) -> None:
-        self._publisher.close()
+        super().put(encode_help(self._liar.said(message)))
 
 
-class LyingBus:
+class LyingBus(PassingBus):
     """A bus on which fixes and beliefs are changed on their way out."""
 
     def __init__(self, bus: Bus, liar: Liar) -> None:
-        self._bus, self._liar = bus, liar
+        super().__init__(bus)
+        self._liar = liar
 
     def publisher(self, key: str, qos: Qos) -> Publisher:
-        publisher = self._bus.publisher(key, qos)
+        publisher = super().publisher(key, qos)
         return _LyingPublisher(key, publisher, self._liar) if key.startswith(_HELP) else publisher
-
-    def subscribe(self, keys: str, receive: Receive) -> Handle:
-        return self._bus.subscribe(keys, receive)
-
-    def announce(self, key: str) -> Handle:
-        return self._bus.announce(key)
-
-    def watch(self, keys: str, watch: Watch) -> Handle:
-        return self._bus.watch(keys, watch)
-
-    def close(self) -> None:
-        self._bus.close()
-
-    def __enter__(self) -> "LyingBus":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
 
 def lying(lie: Lie | None, name: str, start_ns: int) -> Callable[[Bus], Bus]:

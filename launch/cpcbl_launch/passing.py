@@ -1,0 +1,51 @@
+"""A bus that passes everything on: for those that change or note what passes."""
+
+from typing import Self
+
+from cpcbl_transport.bus import Bus, Handle, Publisher, Receive, Watch
+from cpcbl_transport.topics import Qos
+
+
+class PassingBus:
+    """Stands before a bus and does what it does."""
+
+    def __init__(self, bus: Bus) -> None:
+        self._bus = bus
+
+    def publisher(self, key: str, qos: Qos) -> Publisher:
+        return self._bus.publisher(key, qos)
+
+    def subscribe(self, keys: str, receive: Receive) -> Handle:
+        return self._bus.subscribe(keys, receive)
+
+    def announce(self, key: str) -> Handle:
+        return self._bus.announce(key)
+
+    def watch(self, keys: str, watch: Watch) -> Handle:
+        return self._bus.watch(keys, watch)
+
+    def close(self) -> None:
+        self._bus.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+class PassingPublisher:
+    """Stands before a publisher and does what it does."""
+
+    def __init__(self, publisher: Publisher) -> None:
+        self._publisher = publisher
+
+    @property
+    def matching(self) -> bool:
+        return self._publisher.matching
+
+    def put(self, payload: bytes) -> None:
+        self._publisher.put(payload)
+
+    def close(self) -> None:
+        self._publisher.close()
