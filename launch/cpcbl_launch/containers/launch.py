@@ -28,7 +28,7 @@ from cpcbl_transport.zenoh_bus import BusError, ZenohBus, open_bus
 
 LEAD_S = 4.0
 LEAD_S_A_CONTAINER = 0.5
-ROUTERS, ROUTERS_A_CONTAINER = 2.0, 0.4
+ROUTERS, ROUTERS_A_CONTAINER = 3.0, 0.8
 """The same in times that the router took: on a busy machine all take as much longer."""
 ROUTER_WITHIN_S = 60.0
 INSIDE = "/team/team.json"
