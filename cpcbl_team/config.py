@@ -374,6 +374,11 @@ class Team(Table, frozen=True, kw_only=True):
     data: str = ""
     """Folder of the log, for robots whose source is `mrclam`."""
 
+    @property
+    def simulated(self) -> bool:
+        """Whether the team needs a simulated field."""
+        return any(robot.source == "simulated" for robot in self.robots.values())
+
     def messages_per_s(self, robot: str) -> float | None:
         """The rate at which a robot earns its share of the match's messages; None: no limit."""
         if not self.match.messages:

@@ -276,9 +276,7 @@ class Localizer:
         used, rejected = own[0] + len(said.used), own[1] + said.rejected
         now, memory = state.stamp_ns, state.memory
         if (used or rejected) and not memory.lost:
-            own_voice = memory.voices.get(trust.OWN, trust.Voice())
-            own_voice = trust.seen(own_voice, now, used, rejected, self._trust.limit)
-            memory = replace(memory, voices={**memory.voices, trust.OWN: own_voice})
+            memory = self._own_word(memory, now, used, rejected)
             state = replace(state, memory=memory)
         distrusted = set()
         for m, cs, nis in (*accepted, *refused):
@@ -297,6 +295,12 @@ class Localizer:
             for found in (accepted, refused)
         ]
         return state, kept[0], kept[1]
+
+    def _own_word(self, memory: Memory, now_ns: int, used: int, rejected: int) -> Memory:
+        """With what the robot's own sensors say of the estimate."""
+        own = memory.voices.get(trust.OWN, trust.Voice())
+        own = trust.seen(own, now_ns, used, rejected, self._trust.limit)
+        return replace(memory, voices={**memory.voices, trust.OWN: own})
 
     def _weighed(
         self, state: State, sender: str, said: trust.Said, source: str
@@ -395,10 +399,8 @@ class Localizer:
         memory, now = state.memory, state.stamp_ns
         if source == _OWN:
             if now - memory.told_ns <= trust.WINDOW_NS and not memory.lost:
-                own = memory.voices.get(trust.OWN, trust.Voice())
                 accepted = nis <= self._gates[1]
-                own = trust.seen(own, now, accepted, not accepted, self._trust.limit)
-                memory = replace(memory, voices={**memory.voices, trust.OWN: own})
+                memory = self._own_word(memory, now, accepted, not accepted)
             return replace(state, memory=memory), True
         noise, (ex, ey) = seen.noise(), seen.residuals
         variance = 0.5 * (noise.xx + noise.yy)

@@ -38,7 +38,7 @@ def tasks(team: Team, common: tuple[str, ...], seed: int, here: Collection[str])
         for name in team.robots
         if name in here
     ]
-    if is_simulated(team):
+    if team.simulated:
         field = ("field", "--seed", str(seed), *common)
         rows.insert(0, Task("field", field, Identity(Role.FIELD)))
     return rows
@@ -62,8 +62,3 @@ def process_table(
         )
         for task in tasks(team, common, seed, here)
     ]
-
-
-def is_simulated(team: Team) -> bool:
-    """Whether the team has a field of its own."""
-    return any(robot.source == "simulated" for robot in team.robots.values())

@@ -170,7 +170,6 @@ class Refusal(StrEnum):
     VERSION = "wrong_version"
     GARBAGE = "garbage"
     WRONG_TYPE = "wrong_type"
-    """Another name than its key's."""
     NOT_FINITE = "not_finite"
     IMPLAUSIBLE = "implausible_number"
     NOT_A_COVARIANCE = "not_a_covariance"
@@ -180,6 +179,7 @@ class Refusal(StrEnum):
     UNKNOWN_ROBOT = "unknown_robot"
     OWN = "own_message"
     NOT_ITS_OWN = "name_of_another"
+    """Another name than its key's."""
 
 
 _encoder = msgspec.msgpack.Encoder()

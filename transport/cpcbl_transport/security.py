@@ -231,7 +231,7 @@ def _belongs(identity: Identity, team: Team) -> bool:
         case Role.OBSERVER:
             return team.guests.allowed and identity.name not in team.robots
         case Role.FIELD:  # a simulated one must not feed real robots
-            return any(robot.source == "simulated" for robot in team.robots.values())
+            return team.simulated
     return True
 
 

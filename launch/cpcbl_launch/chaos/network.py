@@ -23,6 +23,7 @@ from cpcbl_launch.chaos.scenario import (
     Found,
     Setting,
     all_is_well,
+    it_is_missed,
     they_go_on,
 )
 from cpcbl_launch.chaos.sites import two_sites
@@ -114,12 +115,7 @@ def judged_cut(
 ) -> list[Check]:
     """A robot whose link is silent is missed like a dead one, and back when its link is."""
     return [
-        Check(
-            what="its token gone after",
-            seen=gone_after_s(notes, robot, cut_s),
-            unit="s",
-            at_most=4.0,
-        ),
+        it_is_missed(notes, robot, cut_s, 4.0),
         *they_go_on(notes, others, cut_s, healed_s),
         Check(
             what="its token back after healing",

@@ -6,7 +6,6 @@ from cpcbl_launch.chaos.notes import (
     back_after_s,
     counted,
     found_after_s,
-    gone_after_s,
     heard_after_s,
     late_tracks,
     longest_gap_s,
@@ -19,6 +18,7 @@ from cpcbl_launch.chaos.scenario import (
     Found,
     Setting,
     all_is_well,
+    it_is_missed,
     they_go_on,
 )
 from cpcbl_launch.chaos.team import FIELD, ROUTER, Plan, TeamUnderTest, demo_team, running
@@ -85,12 +85,7 @@ def judged_kill(
     back_s = back_after_s(notes, robot, killed_s, before)
     found = None if back_s is None else found_after_s(notes, robot, killed_s + back_s, FOUND_M)
     return [
-        Check(
-            what="its token gone after",
-            seen=gone_after_s(notes, robot, killed_s),
-            unit="s",
-            at_most=1.0,
-        ),
+        it_is_missed(notes, robot, killed_s, 1.0),
         Check(what="a new process after", seen=back_s, unit="s", at_most=10.0),
         Check(what="it knows where it is after another", seen=found, unit="s", at_most=15.0),
         *they_go_on(notes, others, killed_s, found_s),
@@ -212,12 +207,7 @@ def judged_freeze(
 ) -> list[Check]:
     """A frozen robot is dropped like a dead one, and does no harm when it wakes."""
     return [
-        Check(
-            what="its token gone after",
-            seen=gone_after_s(notes, robot, frozen_s),
-            unit="s",
-            at_most=4.0,
-        ),
+        it_is_missed(notes, robot, frozen_s, 4.0),
         *they_go_on(notes, others, frozen_s, thawed_s),
         Check(
             what="it is heard after waking",

@@ -5,7 +5,7 @@ from enum import StrEnum
 from typing import NamedTuple
 
 from cpcbl_launch.chaos.checks import Check
-from cpcbl_launch.chaos.notes import Notes, inside, longest_gap_s, rmse_m, worst
+from cpcbl_launch.chaos.notes import Notes, gone_after_s, inside, longest_gap_s, rmse_m, worst
 
 BASELINE_S = 4.0
 FOUND_M = 0.3
@@ -52,6 +52,12 @@ class Scenario(NamedTuple):
     quick: bool
     """Whether it is a test of the ordinary suite too."""
     run: Callable[[Setting], Found]
+
+
+def it_is_missed(notes: Notes, robot: str, from_s: float, within_s: float) -> Check:
+    """Teammates hear that it is gone."""
+    seen = gone_after_s(notes, robot, from_s)
+    return Check(what="its token gone after", seen=seen, unit="s", at_most=within_s)
 
 
 def they_go_on(

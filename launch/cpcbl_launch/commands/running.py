@@ -87,7 +87,6 @@ def up(
 
     from cpcbl_agents.process import Stop
     from cpcbl_launch import logs as real_logs
-    from cpcbl_launch.containers.launch import InContainers, progress_on
     from cpcbl_launch.evaluation import Choice, chosen
     from cpcbl_launch.options import encoded, file_for, folder_for, must_draw
     from cpcbl_launch.show import LiveTable, print_report
@@ -136,6 +135,8 @@ def up(
     console = Console(stderr=as_json)
     launch: Launch = OnThisMachine
     if containers:
+        from cpcbl_launch.containers.launch import InContainers, progress_on
+
         launch = partial(InContainers, image=image, base=base_image, said=progress_on(console))
     title = f"team {team.name}, {len(run.team.robots)} robots, {speed:g} x real time"
     watch = ["cpcbl-team", "traffic", str(typed), "--connect", dialled(team.transport.listen[0])]

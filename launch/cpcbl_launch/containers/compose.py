@@ -80,8 +80,7 @@ def compose_text(team: Team, how: Deployment) -> str:
 
 
 def _title(team: Team, here: Collection[str]) -> str:
-    field = any(robot.source == "simulated" for robot in team.robots.values())
-    return f"Team {team.name}: a router,{' the simulated field,' if field else ''} and" + (
+    return f"Team {team.name}: a router,{' the simulated field,' if team.simulated else ''} and" + (
         " one robot" if len(here) == 1 else f" {len(here)} robots"
     )
 

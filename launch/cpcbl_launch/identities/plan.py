@@ -7,7 +7,6 @@ from typing import NamedTuple
 
 import msgspec
 
-from cpcbl_launch.processes import is_simulated
 from cpcbl_team.config import Team
 from cpcbl_team.inputs import NAME_PATTERN
 from cpcbl_transport.security import Identity, Member
@@ -79,7 +78,7 @@ def hosts(team: Team, named: Collection[str]) -> tuple[str, ...]:
 def _needed(team: Team) -> Iterator[Identity]:
     yield Identity(Role.ROUTER)
     yield Identity(Role.OPERATOR)
-    if is_simulated(team):
+    if team.simulated:
         yield Identity(Role.FIELD)
     for name in team.robots:
         yield Identity(Role.ROBOT, name)
