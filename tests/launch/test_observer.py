@@ -23,12 +23,13 @@ from cpcbl_launch.containers.launch import KEYS_INSIDE
 from cpcbl_launch.evaluation import simulate
 from cpcbl_launch.observer import Place, Wish, joined, place_in, places_in, presets
 from cpcbl_launch.processes import PROGRAM
-from cpcbl_launch.reporting.phases import Span, guest_reports, phase
+from cpcbl_launch.reporting.phases import Span, guest_reports, phase, presence
 from cpcbl_launch.reporting.recorder import Recorder, Report
 from cpcbl_launch.simulation.visitors import Visitor
 from cpcbl_launch.team_file import TeamFileError, builtin, load_team, parse_team, save_resolved
 from cpcbl_launch.up import Run, free_endpoint, run_team
 from cpcbl_team.config import GuestSettings, MatchSettings, Team, TransportSettings
+from cpcbl_team.metrics import seconds
 from cpcbl_transport import topics
 from cpcbl_transport.messages import Status, decode
 from cpcbl_transport.security import CA, CERTIFICATE, PRIVATE_KEY, SecurityError
@@ -38,6 +39,7 @@ SHIPPED = Path(cpcbl_launch.observer.__file__).parent / "observers"
 DRIVER = Path(__file__).parents[2] / "docs" / "tripod_driver.py"
 BLIND = load_team(builtin("blind"))
 TRIPOD = Wish("tripod", Place(4.5, 5.0, -90.0))
+STAY_S = 5.0  # of a guest, longer than it takes to help everybody
 ROVER = Wish("rover", Place(2.0, 2.5), "gps", moves=((7.0, 2.5), (2.0, 2.5)))
 
 
@@ -308,6 +310,10 @@ class Team3:
     def all_know_their_place(self, recorder: Recorder) -> bool:
         return all(sigma_m(recorder, name) < 0.05 for name in self.team.robots)
 
+    def guest_stays(self, recorder: Recorder) -> bool:
+        (present,) = presence(seconds(recorder.trajectory("tripod").stamps_ns).tolist())
+        return present.until_s - present.from_s > STAY_S
+
     def guest_has_left(self, recorder: Recorder) -> bool:
         status = recorder.latest()[1]
         return all(status[name].counts.get("guest_left") for name in self.team.robots)
@@ -334,6 +340,7 @@ def test_an_observer_joins_a_running_team_and_leaves_it(
         team3.all_lose_their_way,
         lambda recorder: team3.observe(),
         team3.all_know_their_place,
+        team3.guest_stays,
         leaves,
         team3.guest_has_left,
         team3.all_lose_their_way,
