@@ -18,6 +18,17 @@ Direction = Literal["one-way", "both-ways"]
 Gives = Literal["both", "range", "bearing", "none"]
 Source = Literal["simulated", "mrclam", "external"]
 Security = Literal["none", "mtls"]
+Sensing = Literal["sightings", "camera"]
+Side = Literal["front", "left", "back", "right"]
+Bands = tuple[str, str]  # names of colours, the upper one first
+MarkerFamily = Literal[
+    "aruco_4x4_50",
+    "aruco_5x5_50",
+    "aruco_6x6_50",
+    "apriltag_16h5",
+    "apriltag_25h9",
+    "apriltag_36h11",
+]
 
 
 class Table(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -102,6 +113,89 @@ class PositionSensor(Table, frozen=True, kw_only=True):
     rate_hz: Positive = 5.0
     delay_s: NotNegative = 0.0
     """Stamps are so much later than the measurement."""
+
+
+class CameraSettings(Table, frozen=True, kw_only=True):
+    """A camera, and where it is on its robot.
+
+    A pinhole with OpenCV's distortion; the robot's frame is x forward, y left, z up, from the floor
+    below its centre. Yaw is to the left, tilt down, roll clockwise as the camera sees it.
+    """
+
+    frames: str = ""
+    """A device's number, a video file, a folder of pictures, a URL (RTSP, HTTP); empty: they come
+    as messages, `in/<robot>/frame`."""
+    width_px: Annotated[int, msgspec.Meta(ge=16, le=8192)] = 640
+    height_px: Annotated[int, msgspec.Meta(ge=16, le=8192)] = 480
+    fx_px: Positive = 400.0
+    fy_px: Positive = 400.0
+    cx_px: float = 319.5
+    cy_px: float = 239.5
+    distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
+    """k1, k2, p1, p2, k3."""
+    x_m: float = 0.0
+    y_m: float = 0.0
+    mounted_m: Positive = 0.2
+    """Height of the lens above the floor."""
+    yaw_deg: float = 0.0
+    tilt_deg: float = 0.0
+    roll_deg: float = 0.0
+    edge_sigma_px: Positive = 0.4
+    """How well the edge of a blob, or the corner of a marker, is found."""
+    tilt_sigma_deg: NotNegative = 0.2
+    """How well tilt is known, as the floor is not even: what foot points are worth."""
+    yaw_sigma_deg: NotNegative = 0.1
+    """How well the direction is known: added to the sigma of every bearing."""
+    focal_share: NotNegative = 0.005
+    """How well the focal length is known, as a share of it: added to the sigma of every range."""
+
+
+class Colour(Table, frozen=True, kw_only=True):
+    """Thresholds of one colour in OpenCV's 8-bit HSV, from and to, both in."""
+
+    hue: tuple[int, int]
+    """0 to 179, half degrees; from more than to: through red."""
+    saturation: tuple[int, int] = (80, 255)
+    value: tuple[int, int] = (40, 255)
+
+
+COLOURS = {
+    "red": Colour(hue=(172, 8)),
+    "orange": Colour(hue=(10, 20)),
+    "yellow": Colour(hue=(23, 35)),
+    "green": Colour(hue=(50, 75)),
+    "cyan": Colour(hue=(83, 98)),
+    "blue": Colour(hue=(105, 122)),
+    "pink": Colour(hue=(145, 168)),
+}
+
+
+class Cylinder(Table, frozen=True, kw_only=True):
+    """The shape of a coloured landmark or mast: two bands of the same height, one on the other."""
+
+    radius_m: Positive = 0.05
+    height_m: Positive = 0.4
+    """Of both bands."""
+    foot_m: NotNegative = 0.0
+    """Height of the lower band's lower edge above the floor."""
+
+
+class VisionSettings(Table, frozen=True, kw_only=True):
+    """What the team's cameras look for."""
+
+    colours: dict[str, Colour] = msgspec.field(default_factory=COLOURS.copy)
+    """The colours that a file names are used in place of these."""
+    landmark: Cylinder = Cylinder()
+    """The shape of coloured landmarks."""
+    mast: Cylinder = Cylinder(radius_m=0.04, height_m=0.16, foot_m=0.25)
+    """The shape of robots' colour bands, above their centre."""
+    family: MarkerFamily = "aruco_4x4_50"
+    marker_m: Positive = 0.12
+    """Side of a marker's black square."""
+    marker_mounted_m: Positive = 0.12
+    """Height of a marker's centre above the floor; markers stand upright."""
+    marker_distance_m: Positive = 0.12
+    """From the robot's centre to each of its markers."""
 
 
 class Weights(Table, frozen=True, kw_only=True):
@@ -227,6 +321,8 @@ class Landmark(Table, frozen=True, kw_only=True):
     x_m: float
     y_m: float
     gives: Gives = "both"
+    colours: Bands | None = None
+    """Of a cylinder with two bands, the upper one first: what a camera knows it by."""
 
 
 class Wall(Table, frozen=True, kw_only=True):
@@ -272,6 +368,13 @@ class RobotSettings(LocalizationSettings, frozen=True, kw_only=True):
     """One robot of a team: a robot type's keys and its own, over the team's defaults."""
 
     source: Source = "simulated"
+    sensing: Sensing = "sightings"
+    """camera: sightings are found in frames; else they come as such."""
+    camera: CameraSettings = CameraSettings()
+    markers: dict[Side, int] = {}
+    """The markers that it carries, by side: what teammates' cameras know it by."""
+    colours: Bands | None = None
+    """Colour bands on a mast: the same from farther away, without the heading."""
     waypoints_m: tuple[tuple[float, float], ...] = ()
     """Simulated robots drive loops through these by their own estimates."""
     speed_m_s: NotNegative = 0.5
@@ -289,6 +392,8 @@ class GuardSettings(Table, frozen=True, kw_only=True):
     """Payload of a fix or belief."""
     largest_bytes: Annotated[int, msgspec.Meta(ge=1)] = 65_536
     """Payload of anything else; robots refuse what is larger."""
+    largest_frame_bytes: Annotated[int, msgspec.Meta(ge=1)] = 1_048_576
+    """Payload of a camera's frame, plain or annotated."""
 
 
 class TransportSettings(Table, frozen=True, kw_only=True):
@@ -363,6 +468,7 @@ class Team(Table, frozen=True, kw_only=True):
     name: Annotated[str, msgspec.Meta(pattern=r"^[A-Za-z0-9_.-]{1,32}$")]
     robots: dict[str, RobotSettings]
     map: Field = Field()
+    vision: VisionSettings = VisionSettings()
     transport: TransportSettings = TransportSettings()
     match: MatchSettings = MatchSettings()
     simulation: SimulationSettings = SimulationSettings()

@@ -23,13 +23,18 @@ class Odometry(msgspec.Struct, frozen=True, array_like=True, tag="odometry"):
 
 class Sighting(msgspec.Struct, frozen=True, array_like=True):
     """One object in the robot's frame. `range_m` to a wall is the perpendicular distance, its
-    bearing the direction of that perpendicular. A sigma that is left out is the sensor model's."""
+    bearing the direction of that perpendicular. A sigma that is left out is the sensor model's.
+
+    `heading_rad`: where a teammate looks, in the robot's frame, if that was seen; with its sigma.
+    """
 
     id: Name
     range_m: float | None = None
     bearing_rad: float | None = None
     range_sigma_m: float | None = None
     bearing_sigma_rad: float | None = None
+    heading_rad: float | None = None
+    heading_sigma_rad: float | None = None
 
 
 class Sightings(msgspec.Struct, frozen=True, array_like=True, tag="sightings"):

@@ -26,7 +26,7 @@ def corrected_odometry(piece: Odometry, s: OdometrySettings) -> Odometry:
 
 def corrected_sighting(sighting: Sighting, sensor: SensorSettings, teammate: bool) -> Sighting:
     """The sighting without the sensor's systematic errors; a fault stays as it is."""
-    name, range_m, bearing, range_sigma, bearing_sigma = msgspec.structs.astuple(sighting)
+    name, range_m, bearing, range_sigma, bearing_sigma, *heading = msgspec.structs.astuple(sighting)
     if bearing is not None and abs(bearing) > math.pi:
         return sighting
     if range_m is not None:
@@ -38,7 +38,7 @@ def corrected_sighting(sighting: Sighting, sensor: SensorSettings, teammate: boo
     if bearing is not None:
         bias = math.radians(sensor.bearing_bias_deg)
         bearing = wrap_angle(sensor.bearing_scale * bearing - bias)
-    return Sighting(name, range_m, bearing, range_sigma, bearing_sigma)
+    return Sighting(name, range_m, bearing, range_sigma, bearing_sigma, *heading)
 
 
 def without_bearing_bias(frame: Sightings, bias_rad: float) -> Sightings:

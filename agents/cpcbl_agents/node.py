@@ -17,7 +17,10 @@ from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus
 from cpcbl_transport.compact import decode_help, encode_help
 from cpcbl_transport.messages import (
+    LARGEST_FRAME,
+    LARGEST_PAYLOAD,
     Drive,
+    Frame,
     Message,
     Refusal,
     Status,
@@ -68,9 +71,11 @@ class Node:
         self._robot, self._incarnation = robot, incarnation
         self._on_arrival = on_arrival
         self._name = robot.name
+        self._frame_key = topics.IN_FRAME.at(robot=robot.name)
         rules = team.robots[robot.name].collaboration
         self._team, self._passive = frozenset(team.robots), rules.passive
         self._inbox: deque[tuple[str, bytes]] = deque(maxlen=INBOX)
+        self._frame: tuple[str, bytes] | None = None
         self._news: deque[tuple[str, bool]] = deque(maxlen=INBOX)
         self._wiring = Wiring(robot.name, incarnation, rules, bus, self._arrived, self._seen_alive)
         self._tokens = Tokens()
@@ -87,9 +92,14 @@ class Node:
     # On the bus's thread: only put away ---------------------------------------------------------
 
     def _arrived(self, key: str, payload: bytes) -> None:
-        if len(self._inbox) == INBOX:
-            self.counts["inbox_overflow"] += 1
-        self._inbox.append((key, payload))
+        if key == self._frame_key:  # only the latest: a robot that is slow sees less, not late
+            if self._frame is not None:
+                self.counts["frame_skipped"] += 1
+            self._frame = key, payload
+        else:
+            if len(self._inbox) == INBOX:
+                self.counts["inbox_overflow"] += 1
+            self._inbox.append((key, payload))
         self._on_arrival()
 
     def _seen_alive(self, key: str, alive: bool) -> None:
@@ -110,15 +120,16 @@ class Node:
     @property
     def waiting(self) -> bool:
         """Whether something has arrived."""
-        return bool(self._inbox or self._news)
+        return bool(self._inbox or self._news or self._frame)
 
     def step(self, now_ns: int) -> None:
         """Takes in what has arrived, lets the robot work, sends what it says."""
         self._take_tokens(now_ns)
         while self._inbox:
-            message = self._accepted(*self._inbox.popleft(), now_ns)
-            if message is not None:
-                self._send(self._robot.handle(message, now_ns), now_ns)
+            self._take(*self._inbox.popleft(), now_ns)
+        if self._frame is not None:
+            frame, self._frame = self._frame, None
+            self._take(*frame, now_ns)
         self._ask_for_listeners(now_ns)
         said = self._robot.handle(Tick(), now_ns)
         for name in self._wiring.follow(self._robot.collaboration):
@@ -128,6 +139,11 @@ class Node:
         if now_ns - self._status_ns >= STATUS_NS and self._wiring.tier is not None:
             self._status_ns = now_ns
             self._publish(topics.STATUS, topics.STATUS.at(robot=self._name), self._status(now_ns))
+
+    def _take(self, key: str, payload: bytes, now_ns: int) -> None:
+        message = self._accepted(key, payload, now_ns)
+        if message is not None:
+            self._send(self._robot.handle(message, now_ns), now_ns)
 
     def _take_tokens(self, now_ns: int) -> None:
         """What the bus knows of teammates: who is there, with which tier."""
@@ -154,7 +170,8 @@ class Node:
 
     def _accepted(self, key: str, payload: bytes, now_ns: int) -> Message | None:
         helps = key.startswith(("belief/", "fix/"))
-        message = decode_help(key, payload) if helps else decode(payload)
+        largest = LARGEST_FRAME if key == self._frame_key else LARGEST_PAYLOAD
+        message = decode_help(key, payload) if helps else decode(payload, largest)
         reason = message if isinstance(message, Refusal) else self._refused(key, message, now_ns)
         if reason is not None:
             self.counts[reason] += 1
@@ -174,7 +191,9 @@ class Node:
         match message:
             case Belief(robot=sender) | Fix(observer=sender):
                 pass
-            case Odometry() | Sightings() | Position() if type(message) is _INPUTS.get(last):
+            case Odometry() | Sightings() | Position() | Frame() if type(message) is _INPUTS.get(
+                last
+            ):
                 return refusal(message, now_ns)
             case _:
                 return Refusal.WRONG_TYPE

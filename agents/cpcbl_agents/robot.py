@@ -6,6 +6,7 @@ from pathlib import Path
 from cpcbl_agents.agent import Anything, FromBus, Presence, Sent, Tick
 from cpcbl_agents.collaboration import CollaborationAgent
 from cpcbl_agents.driving import Pilot
+from cpcbl_agents.eyes import Eyes
 from cpcbl_agents.filtering import FilterAgent
 from cpcbl_agents.guests import Guests
 from cpcbl_agents.sensing import SensingAgent
@@ -14,7 +15,7 @@ from cpcbl_agents.sources.mrclam import MrclamSource
 from cpcbl_team.config import Team
 from cpcbl_team.inputs import Belief, Fix, Odometry, Position, Sightings, Told
 from cpcbl_transport.budget import Budget
-from cpcbl_transport.messages import Drive, Message, Track
+from cpcbl_transport.messages import Drive, Frame, Message, Track
 
 NEVER_NS = 2**62
 _OUTGOING = (Belief, Fix, Track, Drive)
@@ -40,7 +41,7 @@ class Robot:
             source.skip_to(start_ns)
         self.name = name
         self._told_ns = start_ns
-        self.sensing = SensingAgent(settings, source, marks, pilot)
+        self.sensing = SensingAgent(settings, source, marks, pilot, _eyes(name, team))
         self.filter = FilterAgent(settings, team.map, teammates, start_ns)
         budget = Budget(
             settings.collaboration.budget, start_ns, team.messages_per_s(name), renewed=restarted
@@ -65,7 +66,7 @@ class Robot:
             if isinstance(message, Sent) and message.size:
                 self._told(message.message.stamp_ns, now_ns)
             return []
-        raw = isinstance(message, (Odometry, Sightings, Position))
+        raw = isinstance(message, (Odometry, Sightings, Position, Frame))
         inputs: list[Anything] = [] if raw else [message]
         inputs += self.sensing.handle(message, now_ns)
         located = [out for m in inputs for out in self.filter.handle(m, now_ns)]
@@ -93,3 +94,12 @@ class Robot:
         """What was used and what was refused so far, by reason."""
         own = self.sensing.counts + self.filter.all_counts
         return own + self.collaboration.guests.counts
+
+
+def _eyes(name: str, team: Team) -> Eyes | None:
+    """Of a robot with a camera; OpenCV is loaded for nobody else."""
+    if team.robots[name].sensing != "camera":
+        return None
+    from cpcbl_agents.vision.eyes import CameraEyes
+
+    return CameraEyes(name, team)

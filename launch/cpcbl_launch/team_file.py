@@ -24,6 +24,7 @@ from cpcbl_team.config import (
     Table,
     Team,
     TransportSettings,
+    VisionSettings,
     Wall,
 )
 from cpcbl_team.inputs import NAME_PATTERN, Name
@@ -48,6 +49,7 @@ class _File(Table, frozen=True, kw_only=True):
     robots: Layer
     map: _Map = _Map()
     transport: TransportSettings = TransportSettings()
+    vision: VisionSettings = VisionSettings()
     match: MatchSettings = MatchSettings()
     simulation: SimulationSettings = SimulationSettings()
     guests: GuestSettings = GuestSettings()
@@ -137,6 +139,7 @@ def parse_team(text: str, name: str = "team file") -> Team:
         name=file.name,
         robots=robots,
         map=field,
+        vision=file.vision,
         transport=_transport(file.transport, raw),
         match=file.match,
         simulation=file.simulation,
@@ -208,6 +211,7 @@ def problems(team: Team) -> Iterator[str]:
                 f"robots.{name}.localizer.alternate: only the joint variant can update both at"
                 " once; remove the key"
             )
+    yield from _vision_problems(team)
     yield from _guard_problems(team)
     yield from _event_problems(team)
     if not team.transport.connect:
@@ -221,6 +225,22 @@ def problems(team: Team) -> Iterator[str]:
                 )
             elif reason := _insecure(endpoint, team.transport.secured):
                 yield f"transport.{key}: {endpoint!r}: {reason}"
+
+
+def _vision_problems(team: Team) -> Iterator[str]:
+    """Colours have thresholds, landmarks have bands of their own."""
+    known = ", ".join(team.vision.colours)
+    bands = {f"map.landmarks.{n}": m.colours for n, m in team.map.landmarks.items()}
+    bands.update({f"robots.{n}": r.colours for n, r in team.robots.items()})
+    for key, colours in bands.items():
+        for colour in set(colours or ()) - team.vision.colours.keys():
+            yield f"{key}.colours: no colour {colour!r}; use one of {known}, or add its thresholds"
+        if colours is not None and colours[0] == colours[1]:
+            yield f"{key}.colours: both bands are {colours[0]}; use two colours"
+    if any(robot.sensing == "camera" for robot in team.robots.values()):
+        marks = [m.colours for m in team.map.landmarks.values() if m.colours is not None]
+        for twice in sorted({c for c in marks if marks.count(c) > 1}):
+            yield f"map.landmarks: two have the colours {list(twice)}; give each its own"
 
 
 def _insecure(endpoint: str, secured: bool) -> str:

@@ -55,7 +55,7 @@ def test_what_robots_tell_each_other_has_the_priority_that_costs_nothing(topic: 
 def test_commands_go_before_help_help_before_inputs_and_these_before_reports() -> None:
     priorities = [getattr(zenoh.Priority, qos.value.priority) for qos in Qos]
     assert sorted(priorities, key=int) == priorities
-    assert list(Qos) == [Qos.COMMAND, Qos.FRESH, Qos.INPUT, Qos.TELEMETRY]
+    assert list(Qos) == [Qos.COMMAND, Qos.FRESH, Qos.INPUT, Qos.FRAME, Qos.TELEMETRY]
 
 
 @per_topic

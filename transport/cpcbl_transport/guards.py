@@ -18,8 +18,10 @@ tracks are for people; no robot hears them.
 
 from typing import Any
 
-from cpcbl_team.config import Team
+from cpcbl_team.config import GuardSettings, Team
 from cpcbl_transport import topics
+from cpcbl_transport.messages import LARGEST_PAYLOAD
+from cpcbl_transport.topics import Topic
 
 _PUTS = {"flows": ["ingress"], "messages": ["put", "delete"]}
 
@@ -35,8 +37,8 @@ def guard_rules(team: Team, speed: float = 1.0) -> dict[str, Any]:
     space, faster = topics.namespace(team.name), max(1.0, speed)
     rates = {topics.FIX.at(robot=name): guards.fix_rate_hz for name in team.robots}
     rates[topics.BELIEF.at()] = guards.belief_rate_hz
-    limits = {topics.FIX.at(): guards.largest_help_bytes, "**": guards.largest_bytes}
-    limits[topics.BELIEF.at()] = guards.largest_help_bytes
+    limits = {topic.at(): _limit(topic, guards) for topic in topics.TOPICS if topic.carries}
+    limits["**"] = max(limits.values())
     return {
         "downsampling": [
             {
@@ -52,3 +54,10 @@ def guard_rules(team: Team, speed: float = 1.0) -> dict[str, Any]:
             for keys, size in limits.items()
         ],
     }
+
+
+def _limit(topic: Topic, guards: GuardSettings) -> int:
+    """Of a payload under this topic (bytes)."""
+    if topic.carries in topics.COLLABORATION:
+        return guards.largest_help_bytes
+    return guards.largest_frame_bytes if topic.largest > LARGEST_PAYLOAD else guards.largest_bytes

@@ -11,15 +11,41 @@ from enum import StrEnum
 import msgspec
 
 from cpcbl_team.config import OdometrySettings, PositionSensor, SensorSettings, Start
-from cpcbl_team.inputs import Belief, Fix, Name, Odometry, Position, Sightings
+from cpcbl_team.inputs import Belief, Fix, Name, Odometry, Position, Sighting, Sightings
 
 VERSION = 2
 FUTURE_NS = 500_000_000
 LONGEST_ODOMETRY_NS = 10_000_000_000
 LARGEST_PAYLOAD = 65_536
+LARGEST_FRAME = 1_048_576
 LARGEST_NUMBER = 1e6  # metres, radians, or their squares
 LARGEST_COUNT = 2**53  # sums of some still fit everywhere
 LAST_NS = 2**62  # in the year 2116
+
+
+class Frame(msgspec.Struct, frozen=True, array_like=True, tag="frame"):
+    """A camera's picture at the time of its exposure, as a JPEG (or PNG)."""
+
+    stamp_ns: int
+    image: bytes
+
+
+class Unclear(msgspec.Struct, frozen=True, array_like=True):
+    """Something in a frame that is not reported as a sighting, and why."""
+
+    reason: str
+    names: tuple[str, ...] = ()
+    """What it could be."""
+
+
+class Look(msgspec.Struct, frozen=True, array_like=True, tag="look"):
+    """What a robot made of a frame, with the frame: what was found is drawn into it (JPEG)."""
+
+    robot: Name
+    stamp_ns: int
+    image: bytes
+    found: tuple[Sighting, ...] = ()
+    unclear: tuple[Unclear, ...] = ()
 
 
 class Flow(msgspec.Struct, frozen=True, array_like=True):
@@ -157,7 +183,7 @@ class Truths(msgspec.Struct, frozen=True, array_like=True, tag="truth"):
 
 
 Help = Belief | Fix
-Tagged = Odometry | Sightings | Position | Status | Track | Drive | Join | Truths
+Tagged = Odometry | Sightings | Position | Frame | Look | Status | Track | Drive | Join | Truths
 Message = Tagged | Help
 Telemetry = Status | Track | Drive | Truths
 
@@ -192,9 +218,9 @@ def encode(message: Tagged) -> bytes:
     return _HEAD + _encoder.encode(message)
 
 
-def decode(payload: bytes) -> Tagged | Refusal:
+def decode(payload: bytes, largest: int = LARGEST_PAYLOAD) -> Tagged | Refusal:
     """The message in a payload, or why there is none."""
-    reason = refused_head(payload)
+    reason = refused_head(payload, largest)
     if reason is not None:
         return reason
     try:
@@ -203,11 +229,11 @@ def decode(payload: bytes) -> Tagged | Refusal:
         return Refusal.GARBAGE
 
 
-def refused_head(payload: bytes) -> Refusal | None:
+def refused_head(payload: bytes, largest: int = LARGEST_PAYLOAD) -> Refusal | None:
     """Why a payload need not be read at all, or None."""
     if not payload:
         return Refusal.EMPTY
-    if len(payload) > LARGEST_PAYLOAD:
+    if len(payload) > largest:
         return Refusal.TOO_LARGE
     return None if payload[0] == VERSION else Refusal.VERSION
 

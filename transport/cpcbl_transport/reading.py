@@ -21,7 +21,7 @@ def read(key: str, payload: bytes, now_ns: int | None = None) -> Message | Refus
     if topic is None:
         return Refusal.WRONG_TYPE
     helps = topic.carries in topics.COLLABORATION
-    message = decode_help(key, payload) if helps else decode(payload)
+    message = decode_help(key, payload) if helps else decode(payload, topic.largest)
     if isinstance(message, Refusal):
         return message
     if type(message) is not topic.carries:

@@ -10,7 +10,18 @@ from enum import Enum, StrEnum
 from typing import NamedTuple
 
 from cpcbl_team.inputs import Belief, Fix, Odometry, Position, Sightings
-from cpcbl_transport.messages import Drive, Join, Message, Status, Track, Truths
+from cpcbl_transport.messages import (
+    LARGEST_FRAME,
+    LARGEST_PAYLOAD,
+    Drive,
+    Frame,
+    Join,
+    Look,
+    Message,
+    Status,
+    Track,
+    Truths,
+)
 
 
 class Treatment(NamedTuple):
@@ -34,6 +45,7 @@ class Qos(Enum):
     COMMAND = Treatment("INTERACTIVE_HIGH", "BLOCK", reliable=True, express=False)
     FRESH = Treatment("DATA", "DROP", reliable=False, express=False)
     INPUT = Treatment("DATA_LOW", "BLOCK", reliable=True, express=False)
+    FRAME = Treatment("DATA_LOW", "DROP", reliable=False, express=False)
     TELEMETRY = Treatment("BACKGROUND", "DROP", reliable=False, express=False)
 
 
@@ -70,6 +82,7 @@ class Topic(NamedTuple):
     reason: str
     said_by: tuple[Who, ...] = ()  # where names are certified; nobody, unless stated
     heard_by: tuple[Who, ...] = ()  # besides operators, who hear everything
+    largest: int = LARGEST_PAYLOAD  # payload that is read at all
 
     def at(self, **names: object) -> str:
         """The key with these names; `*` for each that is left out."""
@@ -168,6 +181,26 @@ IN_POSITION = Topic(
     said_by=_SENSING,
     heard_by=_helpers("robot"),
 )
+IN_FRAME = Topic(
+    "in/<robot>/frame",
+    Frame,
+    "the camera's",
+    Qos.FRAME,
+    "the next frame is better than a late one",
+    said_by=_SENSING,
+    heard_by=_helpers("robot"),
+    largest=LARGEST_FRAME,
+)
+LOOK = Topic(
+    "look/<robot>",
+    Look,
+    "2 Hz while somebody looks",
+    Qos.TELEMETRY,
+    "for people; costs nothing when nobody looks",
+    said_by=_helpers("robot"),
+    heard_by=_helpers("robot"),
+    largest=LARGEST_FRAME,
+)
 DRIVE = Topic(
     "field/drive/<robot>",
     Drive,
@@ -197,8 +230,8 @@ TRUTH = Topic(
 
 TOPICS = (
     *(ALIVE, BELIEF, FIX, STATUS, TRACK),
-    *(IN_ODOMETRY, IN_SIGHTINGS, IN_POSITION),
+    *(IN_ODOMETRY, IN_SIGHTINGS, IN_POSITION, IN_FRAME, LOOK),
     *(DRIVE, JOIN, TRUTH),
 )
-INPUTS = (IN_ODOMETRY, IN_SIGHTINGS, IN_POSITION)
+INPUTS = (IN_ODOMETRY, IN_SIGHTINGS, IN_POSITION, IN_FRAME)
 COLLABORATION = (Belief, Fix)

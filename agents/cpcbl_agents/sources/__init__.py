@@ -1,12 +1,10 @@
-"""Where odometry and sightings come from: a driver on the bus, the simulated field, a real log.
-
-(A camera will be one more.)
-"""
+"""Where inputs come from: a driver on the bus, the simulated field, a camera, a real log."""
 
 from collections.abc import Sequence
 from typing import Protocol
 
 from cpcbl_team.inputs import Odometry, Sightings
+from cpcbl_transport.messages import Frame
 
 
 class Source(Protocol):
@@ -20,7 +18,7 @@ class Source(Protocol):
     def over(self) -> bool:
         """Whether there will never be anything more: the end of a log."""
 
-    def poll(self, now_ns: int) -> Sequence[Odometry | Sightings]:
+    def poll(self, now_ns: int) -> Sequence[Odometry | Sightings | Frame]:
         """Everything up to now that was not polled yet."""
 
 
@@ -30,5 +28,5 @@ class Silent:
     next_ns: int | None = None
     over = False
 
-    def poll(self, now_ns: int) -> Sequence[Odometry | Sightings]:
+    def poll(self, now_ns: int) -> Sequence[Odometry | Sightings | Frame]:
         return ()

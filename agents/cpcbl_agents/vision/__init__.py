@@ -1,0 +1,1 @@
+"""Landmarks and teammates in camera frames. Needs OpenCV (the extra `camera`)."""
