@@ -43,8 +43,9 @@ LEAST_INSIDE = 0.98
 class Record(NamedTuple):
     """Something that was due, or was reported rightly, or both."""
 
-    due: Kind | None
+    due: tuple[Kind, ...]
     seen_by: Kind | None
+    """By a marker where a heading is said, else by a mast."""
     range_m: float
     range_error_m: float | None = None
     range_sigma_m: float | None = None
@@ -230,7 +231,7 @@ def figures(
     """Of one kind, between two ranges. A mistake is as far away as it says; without a range it
     counts wherever it may be: from 0 up."""
     near = [r for r in records if from_m <= r.range_m < to_m]
-    due = [r for r in near if r.due == kind]
+    due = [r for r in near if kind in r.due]
     found = sum(r.seen_by is not None for r in due)
     right = [r for r in near if r.seen_by == kind]
     wrong = sum(m.kind == kind and from_m <= (m.range_m or 0.0) < to_m for m in mistakes)
@@ -305,8 +306,8 @@ def tables(result: Eyes) -> Iterable[RenderableType]:
             shown.add_row(kind, f"< {ERRORS_WITHIN_M:g}", *_cells(result.accuracy[kind]))
     yield shown
     yield (
-        "due: all of it to be seen. said: sightings. range, bear., head.: σ about zero, as\n"
-        "a share, in degrees, in degrees; 3σ: shares inside three stated ones"
+        "due: all of it to be seen. said: sightings. range, bear., head.: σ about zero,\n"
+        "a share, degrees, degrees; 3σ r, b, h: shares inside three stated ones"
     )
     yield f"doubted: {_listed(result.doubts)}"
     if result.refused:

@@ -7,7 +7,7 @@ robot believes: by the sigmas that its settings state. What could be seen follow
 
 - landmark: due when all of it is in the frame with nothing before it;
 - marker: a teammate is due when one of its markers is all to be seen, within 60 degrees of facing;
-- mast: when no marker is due, but its bands are all to be seen.
+- mast: a teammate is due when its bands are all to be seen.
 
 A sighting is right when some of what it names is to be seen within 3 degrees of its bearing, and
 its range, where it says one, is off by at most 20 %. It has a wrong id when nothing of that name is
@@ -68,13 +68,11 @@ class Thing(NamedTuple):
     """Something that has a name, in the viewer's frame."""
 
     name: str
-    kind: Kind
-    """What it should be seen by, or would be nearest to."""
     range_m: float
     bearing_rad: float
-    heading_rad: float | None
-    whole: bool
-    """Whether it is due."""
+    heading_rad: float
+    due: tuple[Kind, ...]
+    """What is all to be seen."""
     some: bool
     """Whether anything of it can be seen at all."""
     half_width_rad: float
@@ -217,6 +215,7 @@ def things(frame: Drawn) -> dict[str, Thing]:
     return found
 
 
+Due = Mapping[Kind, float]  # how much of each kind of feature is to be seen
 Before = tuple[Sequence[Solid], Sequence[Solid]]  # what certainly hides no more; no less
 
 
@@ -226,7 +225,7 @@ def _solids(frame: Drawn, robot_from_field: Pose2, body_m: float) -> dict[str, t
     clutter = {
         f"\n{i}": post for i, post in enumerate(frame.scene.clutter)
     }  # no name has a newline
-    for name, post in (frame.scene.landmarks | clutter).items():
+    for name, post in {**frame.scene.landmarks, **clutter}.items():
         solids[name] = (_standing(post, *robot_from_field.transform(post.x_m, post.y_m)),)
     vision = team().vision
     for robot in frame.robots:
@@ -253,7 +252,8 @@ def _others(solids: Mapping[str, Sequence[Solid]], but: str) -> list[Solid]:
 def _landmark(name: str, solid: Solid, camera: Camera, before: Before) -> Thing:
     points = cylinder_points(solid, camera.position)
     whole, some = (share_shown(points, camera, solids) for solids in before)
-    return _thing(name, "landmark", Pose2(solid.x, solid.y, 0.0), whole, some, solid.radius)
+    due: Due = {"landmark": whole}
+    return _thing(name, Pose2(solid.x, solid.y, 0.0), due, some, solid.radius)
 
 
 def _teammate(name: str, seen: Pose2, camera: Camera, before: Before) -> Thing:
@@ -272,10 +272,8 @@ def _teammate(name: str, seen: Pose2, camera: Camera, before: Before) -> Thing:
         points = cylinder_points(solid, camera.position)
         mast = share_shown(points, camera, most)
         some = max(some, share_shown(points, camera, least))
-    by_marker = marker >= ALL_OF_IT or robot.colours is None
-    kind: Kind = "marker" if by_marker else "mast"
     half_m = math.sqrt(2.0) * vision.marker_distance_m
-    return _thing(name, kind, seen, marker if by_marker else mast, some, half_m)
+    return _thing(name, seen, {"marker": marker, "mast": mast}, some, half_m)
 
 
 def _marker(side: Side, seen: Pose2, camera: Camera) -> tuple[Floats, float]:
@@ -289,14 +287,14 @@ def _marker(side: Side, seen: Pose2, camera: Camera) -> tuple[Floats, float]:
     return points, abs(wrap_angle(to_lens - facing))
 
 
-def _thing(name: str, kind: Kind, seen: Pose2, whole: float, some: float, half_m: float) -> Thing:
+def _thing(name: str, seen: Pose2, shown: Due, some: float, half_m: float) -> Thing:
+    range_m = math.hypot(seen.x, seen.y)
     return Thing(
         name=name,
-        kind=kind,
-        range_m=(range_m := math.hypot(seen.x, seen.y)),
+        range_m=range_m,
         bearing_rad=math.atan2(seen.y, seen.x),
-        heading_rad=None if kind == "landmark" else seen.heading,
-        whole=whole >= ALL_OF_IT,
+        heading_rad=seen.heading,
+        due=tuple(kind for kind, share in shown.items() if share >= ALL_OF_IT),
         some=some > 0.0,
         half_width_rad=math.asin(min(1.0, half_m / range_m)),
     )
@@ -329,8 +327,8 @@ def judged(
 
 def _missed(there: Mapping[str, Thing], right: set[str]) -> Iterator[Record]:
     for name, thing in there.items():
-        if thing.whole and name not in right:
-            yield Record(thing.kind, None, thing.range_m)
+        if thing.due and name not in right:
+            yield Record(thing.due, None, thing.range_m)
 
 
 def _why_wrong(sighting: Sighting, thing: Thing | None) -> Wrong | None:
@@ -352,11 +350,11 @@ def _seen_by(sighting: Sighting) -> Kind:
 def _record(sighting: Sighting, thing: Thing) -> Record:
     assert sighting.bearing_rad is not None
     heading = None
-    if sighting.heading_rad is not None and thing.heading_rad is not None:
+    if sighting.heading_rad is not None:
         heading = wrap_angle(sighting.heading_rad - thing.heading_rad)
     ranged = sighting.range_m is not None
     return Record(
-        due=thing.kind if thing.whole else None,
+        due=thing.due,
         seen_by=_seen_by(sighting),
         range_m=thing.range_m,
         range_error_m=None if sighting.range_m is None else sighting.range_m - thing.range_m,
