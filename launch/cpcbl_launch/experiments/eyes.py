@@ -19,7 +19,7 @@ import msgspec
 from rich.console import RenderableType
 
 from cpcbl_launch.experiments.runs import in_processes
-from cpcbl_launch.reporting.tables import number, percent, table
+from cpcbl_launch.reporting.tables import number, table
 from cpcbl_launch.team_file import builtin, load_team
 from cpcbl_team.config import Team
 
@@ -29,7 +29,7 @@ KINDS: tuple[Kind, ...] = ("landmark", "marker", "mast")
 WITHIN_M: dict[Kind, float] = {"landmark": 5.0, "marker": 3.0, "mast": 5.0}
 """What recall and precision are about; masts have no target."""
 ERRORS_WITHIN_M = 4.0
-EDGES_M = (0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0)
+EDGES_M = (0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 7.0, 12.0)
 CHUNK = 25
 DRAWN = 1500  # errors of each kind that the picture shows
 
@@ -55,12 +55,12 @@ class Record(NamedTuple):
     heading_sigma_rad: float | None = None
 
 
-class Mistake(NamedTuple):
+class Mistake(msgspec.Struct, frozen=True, kw_only=True):
     """A sighting that is not right."""
 
     frame: int
     kind: Kind
-    name: str
+    id: str
     why: Wrong
     range_m: float | None
     bearing_deg: float | None
@@ -295,7 +295,7 @@ def tables(result: Eyes) -> Iterable[RenderableType]:
     shown = table(
         f"rendered frames: {result.frames}, seed {result.seed}",
         ("", "m"),
-        ("due", "recall", "said", "prec.", "range", "bear.", "head.", "3σ r", "3σ b", "3σ h"),
+        ("due", "recall", "said", "prec.", "r %", "b °", "h °", "3σ r", "3σ b", "3σ h"),
     )
     for kind, bins in result.bins.items():
         for f in bins:
@@ -306,8 +306,8 @@ def tables(result: Eyes) -> Iterable[RenderableType]:
             shown.add_row(kind, f"< {ERRORS_WITHIN_M:g}", *_cells(result.accuracy[kind]))
     yield shown
     yield (
-        "due: all of it to be seen. said: sightings. range, bear., head.: σ about zero,\n"
-        "a share, degrees, degrees; 3σ r, b, h: shares inside three stated ones"
+        "due: all of it to be seen. said: sightings. r, b, h: errors of range, bearing and\n"
+        "heading, σ about zero; 3σ: the shares of them inside three stated ones"
     )
     yield f"doubted: {_listed(result.doubts)}"
     if result.refused:
@@ -331,12 +331,12 @@ def _cells(f: Figures) -> tuple[str, ...]:
         number(f.recall),
         str(f.reported),
         number(f.precision),
-        percent(f.range_sigma_share),
+        number(None if f.range_sigma_share is None else 100.0 * f.range_sigma_share, 1),
         number(f.bearing_sigma_deg, 2),
         number(f.heading_sigma_deg, 1),
-        percent(f.range_inside),
-        percent(f.bearing_inside),
-        percent(f.heading_inside),
+        number(f.range_inside),
+        number(f.bearing_inside),
+        number(f.heading_inside),
     )
 
 

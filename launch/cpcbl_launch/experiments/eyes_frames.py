@@ -36,14 +36,13 @@ from cpcbl_launch.simulation.visible import (
     Solid,
     cylinder_points,
     plate_points,
-    share_shown,
+    shares_shown,
 )
 from cpcbl_team.config import CameraSettings, Cylinder, Light, Side
 from cpcbl_team.geometry import Pose2, wrap_angle
 from cpcbl_team.inputs import Sighting
 
 NEAREST_M = 0.45  # between what stands on the field
-FARTHEST_SEEN_M = 6.0
 MOST_CLUTTER = 3
 FACING_DEG = 60.0
 ALL_OF_IT = 0.999
@@ -166,7 +165,7 @@ def _light(random: np.random.Generator) -> Light:
         gradient=float(uniform(-0.5, 0.5)),
         tint=(blue, green, red),
         blur_px=float(uniform(0.3, 1.2)),
-        noise=float(uniform(1.0, 6.0)),
+        noise=float(random.integers(1, 7)),
     )
 
 
@@ -196,22 +195,19 @@ def picture(frame: Drawn, random: np.random.Generator) -> Pixels:
 
 
 def things(frame: Drawn) -> dict[str, Thing]:
-    """Everything with a name that is not too far away."""
+    """Everything with a name."""
     camera, robot_from_field = Camera(frame.camera), frame.pose.inverse()
     half_m = team().vision.marker_distance_m
     # A robot hides no more than from corner to corner, and no less than from side to side.
     most, least = (_solids(frame, robot_from_field, f * half_m) for f in (math.sqrt(2.0), 1.0))
     found = {}
-    for name, post in frame.scene.landmarks.items():
-        x, y = robot_from_field.transform(post.x_m, post.y_m)
-        if math.hypot(x, y) <= FARTHEST_SEEN_M:
-            before = _others(most, name), _others(least, name)
-            found[name] = _landmark(name, most[name][0], camera, before)
+    for name in frame.scene.landmarks:
+        before = _others(most, name), _others(least, name)
+        found[name] = _landmark(name, most[name][0], camera, before)
     for robot in frame.robots:
         seen = robot_from_field @ Pose2(robot.x_m, robot.y_m, robot.heading_rad)
-        if math.hypot(seen.x, seen.y) <= FARTHEST_SEEN_M:
-            before = _others(most, robot.name), _others(least, robot.name)
-            found[robot.name] = _teammate(robot.name, seen, camera, before)
+        before = _others(most, robot.name), _others(least, robot.name)
+        found[robot.name] = _teammate(robot.name, seen, camera, before)
     return found
 
 
@@ -251,27 +247,26 @@ def _others(solids: Mapping[str, Sequence[Solid]], but: str) -> list[Solid]:
 
 def _landmark(name: str, solid: Solid, camera: Camera, before: Before) -> Thing:
     points = cylinder_points(solid, camera.position)
-    whole, some = (share_shown(points, camera, solids) for solids in before)
+    whole, some = shares_shown(points, camera, before)
     due: Due = {"landmark": whole}
     return _thing(name, Pose2(solid.x, solid.y, 0.0), due, some, solid.radius)
 
 
 def _teammate(name: str, seen: Pose2, camera: Camera, before: Before) -> Thing:
     robot, vision = team().robots[name], team().vision
-    most, least = before
     marker = mast = some = 0.0
     for side in robot.markers:
         points, angle = _marker(side, seen, camera)
         if angle < 0.5 * math.pi:
-            some = max(some, share_shown(points, camera, least))
-        if angle <= math.radians(FACING_DEG):
-            marker = max(marker, share_shown(points, camera, most))
+            whole, part = shares_shown(points, camera, before)
+            some = max(some, part)
+            marker = max(marker, whole if angle <= math.radians(FACING_DEG) else 0.0)
     if robot.colours is not None:
         shape = vision.mast
         solid = Solid(seen.x, seen.y, shape.radius_m, shape.foot_m, _top_m(shape))
         points = cylinder_points(solid, camera.position)
-        mast = share_shown(points, camera, most)
-        some = max(some, share_shown(points, camera, least))
+        mast, part = shares_shown(points, camera, before)
+        some = max(some, part)
     half_m = math.sqrt(2.0) * vision.marker_distance_m
     return _thing(name, seen, {"marker": marker, "mast": mast}, some, half_m)
 
@@ -320,7 +315,16 @@ def judged(
                 None if sighting.bearing_rad is None else math.degrees(sighting.bearing_rad)
             )
             kind = _seen_by(sighting)
-            mistakes.append(Mistake(number, kind, sighting.id, why, sighting.range_m, bearing_deg))
+            mistakes.append(
+                Mistake(
+                    frame=number,
+                    kind=kind,
+                    id=sighting.id,
+                    why=why,
+                    range_m=sighting.range_m,
+                    bearing_deg=bearing_deg,
+                )
+            )
     records += _missed(there, right)
     return records, mistakes
 

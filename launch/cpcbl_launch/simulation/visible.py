@@ -28,10 +28,17 @@ class Solid(NamedTuple):
     high: float
 
 
-def share_shown(points: Floats, camera: Camera, before: Sequence[Solid]) -> float:
-    """The share of points (n, 3) of the robot's frame that lie in the frame, with none of these
-    solids before them."""
-    return float(np.mean(in_frame(points, camera) & ~hidden(points, camera.position, before)))
+def shares_shown(
+    points: Floats, camera: Camera, before: Sequence[Sequence[Solid]]
+) -> tuple[float, ...]:
+    """The share of points (n, 3) of the robot's frame that lie in the frame, with none of the
+    solids before them: for each of some sets of solids."""
+    inside = in_frame(points, camera)
+    if not inside.any():
+        return (0.0,) * len(before)
+    return tuple(
+        float(np.mean(inside & ~hidden(points, camera.position, solids))) for solids in before
+    )
 
 
 def in_frame(points: Floats, camera: Camera) -> Mask:
@@ -46,9 +53,22 @@ def in_frame(points: Floats, camera: Camera) -> Mask:
 def hidden(points: Floats, lens: Floats, before: Sequence[Solid]) -> Mask:
     """Which of the points (n, 3) have one of the solids between them and the lens (3,)."""
     covered = np.zeros(len(points), dtype=np.bool_)
+    x, y, _ = (float(v) for v in points.mean(axis=0) - lens)
+    far, spread = math.hypot(x, y), float(np.abs(points - points.mean(axis=0)).max()) * 1.5
     for solid in before:
-        covered |= _crossed(points, lens, solid)
+        if _between(
+            solid.x - float(lens[0]), solid.y - float(lens[1]), solid.radius, x, y, far, spread
+        ):
+            covered |= _crossed(points, lens, solid)
     return covered
+
+
+def _between(
+    a: float, b: float, radius: float, x: float, y: float, far: float, spread: float
+) -> bool:
+    """Whether a circle about (a, b) may touch the way to what lies within `spread` of (x, y)."""
+    along, across = (a * x + b * y) / far, abs(a * y - b * x) / far
+    return -radius <= along <= far + spread + radius and across <= spread + radius
 
 
 def _crossed(points: Floats, lens: Floats, solid: Solid) -> Mask:
