@@ -127,10 +127,10 @@ def eyes(
     as_json: AsJson = False,
 ) -> None:
     """What cameras see of rendered frames: precision, recall, errors against stated sigmas."""
-    from cpcbl_launch.options import folder_for, must_draw, must_see
+    from cpcbl_launch.options import folder_for, must_draw, must_have_opencv
 
     must_draw("experiment")
-    must_see("experiment eyes")
+    must_have_opencv("experiment eyes")
     folder_for("--output", output)
     from cpcbl_launch.experiments import eyes as experiment
 
@@ -152,9 +152,9 @@ def pictures(
     as_json: AsJson = False,
 ) -> None:
     """Real pictures whose truth is known: what is found and missed of them, and by how much."""
-    from cpcbl_launch.options import folder_for, must_see
+    from cpcbl_launch.options import folder_for, must_have_opencv
 
-    must_see("experiment pictures")
+    must_have_opencv("experiment pictures")
     folder_for("--output", output)
     from cpcbl_launch.experiments import real_pictures
 
