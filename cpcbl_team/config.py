@@ -500,6 +500,12 @@ class Team(Table, frozen=True, kw_only=True):
         """Whether the team needs a simulated field."""
         return any(robot.source == "simulated" for robot in self.robots.values())
 
+    @property
+    def renders(self) -> bool:
+        """Whether the simulated field must make pictures."""
+        robots = self.robots.values()
+        return any(r.source == "simulated" and r.sensing == "camera" for r in robots)
+
     def messages_per_s(self, robot: str) -> float | None:
         """The rate at which a robot earns its share of the match's messages; None: no limit."""
         if not self.match.messages:
