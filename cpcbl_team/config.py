@@ -460,6 +460,20 @@ class SimulationEvent(Table, frozen=True, kw_only=True):
     """For so long nobody sees a landmark or wall."""
 
 
+class Light(Table, frozen=True, kw_only=True):
+    """How the simulated field's cameras see it."""
+
+    brightness: Positive = 1.0
+    gradient: Annotated[float, msgspec.Meta(ge=-2.0, le=2.0)] = 0.2
+    """By how much the left of a picture is brighter than its right, as a share of the middle."""
+    tint: tuple[Positive, Positive, Positive] = (1.0, 1.0, 1.0)
+    """Factors of blue, green and red."""
+    blur_px: NotNegative = 0.6
+    """Standard deviation."""
+    noise: NotNegative = 3.0
+    """Standard deviation, of 255 grey levels."""
+
+
 class SimulationSettings(Table, frozen=True, kw_only=True):
     """The simulated field."""
 
@@ -467,6 +481,7 @@ class SimulationSettings(Table, frozen=True, kw_only=True):
     noise: NotNegative = 1.0
     """True noise as a multiple of what the robots assume; 0 for none."""
     bump_radius_m: NotNegative = 0.15
+    light: Light = Light()
     events: tuple[SimulationEvent, ...] = ()
     clocks_ahead_s: dict[str, float] = {}
     """How far a robot's clock is ahead of the field's, where it is not the same: what the robot
