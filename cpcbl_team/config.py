@@ -29,6 +29,17 @@ MarkerFamily = Literal[
     "apriltag_25h9",
     "apriltag_36h11",
 ]
+MARKERS: dict[MarkerFamily, int] = {
+    "aruco_4x4_50": 50,
+    "aruco_5x5_50": 50,
+    "aruco_6x6_50": 50,
+    "apriltag_16h5": 30,
+    "apriltag_25h9": 35,
+    "apriltag_36h11": 587,
+}
+"""How many markers a family has: 0, 1, ..."""
+LIKE_MIRRORED: dict[MarkerFamily, frozenset[int]] = {"aruco_4x4_50": frozenset({8, 9, 17, 47})}
+"""Markers that are their own mirror image: one cannot tell whether they are seen in a mirror."""
 
 
 class Table(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -499,6 +510,12 @@ class Team(Table, frozen=True, kw_only=True):
     def simulated(self) -> bool:
         """Whether the team needs a simulated field."""
         return any(robot.source == "simulated" for robot in self.robots.values())
+
+    @property
+    def renders(self) -> bool:
+        """Whether the simulated field must make pictures."""
+        robots = self.robots.values()
+        return any(r.source == "simulated" and r.sensing == "camera" for r in robots)
 
     def messages_per_s(self, robot: str) -> float | None:
         """The rate at which a robot earns its share of the match's messages; None: no limit."""

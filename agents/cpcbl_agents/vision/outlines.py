@@ -11,7 +11,7 @@ import numpy as np
 
 from cpcbl_agents.vision.camera import Floats, Pixels
 from cpcbl_agents.vision.colours import Blob
-from cpcbl_agents.vision.edges import edge
+from cpcbl_agents.vision.profiles import edge
 from cpcbl_agents.vision.panorama import Panorama
 from cpcbl_team.config import Bands
 
