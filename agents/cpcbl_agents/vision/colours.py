@@ -65,7 +65,7 @@ def _outlines(hsv: cv2.typing.MatLike, bounds: Bounds) -> list[cv2.typing.MatLik
     """The outer contours of a colour's blobs, the largest of them."""
     mask = cv2.inRange(hsv, *bounds[0])
     for more in bounds[1:]:
-        mask |= cv2.inRange(hsv, *more)
+        mask = cv2.bitwise_or(mask, cv2.inRange(hsv, *more))
     found, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     long = [outline for outline in found if len(outline) >= 2 * LEAST_PX]
     if len(long) > MOST_BLOBS:

@@ -16,7 +16,7 @@ from cpcbl_agents.vision.glimpses import Doubt, Found, Glimpses
 from cpcbl_agents.vision.outlines import Candidate, Outline, candidates, outlined
 from cpcbl_agents.vision.panorama import Panorama
 from cpcbl_agents.vision.silhouette import FOOT, TOP, WIDTH, Shape
-from cpcbl_agents.vision.verdicts import WHOLE, Look, Verdict, reason, verdict
+from cpcbl_agents.vision.verdicts import WHOLE, Look, Verdict, best, reason, verdict
 from cpcbl_team.config import Bands, Team
 from cpcbl_team.geometry import wrap_angle
 from cpcbl_team.inputs import Sighting
@@ -24,7 +24,7 @@ from cpcbl_team.inputs import Sighting
 LEAST_PX = 6.0  # high, both bands
 LEAST_BAND_PX = 6.0  # high and wide: what a single band must be to be worth a doubt
 RIVAL = 3.0  # what fits so much worse is still possible
-REASONS = "mirror_image", "ranges_disagree", "occluded", "wrong_shape"  # the most telling first
+REASONS = "cut_by_frame", "mirror_image", "ranges_disagree", "wrong_shape"  # the most telling first
 
 
 class Kind(NamedTuple):
@@ -63,33 +63,28 @@ class Cylinders:
         names = _names(kinds)
         if pair.height < LEAST_PX:
             return Doubt("too_small", names, pair.outline)
-        outline = outlined(pixels, self._panorama, pair)
-        if outline is None:
-            return Doubt("wrong_shape", names, pair.outline)
-        look = self._look(outline)
-        verdicts = [verdict(kind.shape, look) for kind in kinds]
-        sure = [one for one in verdicts if one is not None]
+        looks = [self._look(outline) for outline in outlined(pixels, self._panorama, pair)]
+        judged = {kind: best(verdict(kind.shape, look) for look in looks) for kind in kinds}
+        sure = [one for one in judged.values() if one is not None]
         if not sure:
-            return Doubt(self._reason(kinds, look, outline), names, pair.outline)
-        possible = [
-            kind
-            for kind, one in zip(kinds, verdicts, strict=True)
-            if one or verdict(kind.shape, look, RIVAL)
-        ]
-        names = _names(possible)
+            return Doubt(self._reason(kinds, looks), names, pair.outline)
+        names = _names(
+            [
+                kind
+                for kind, one in judged.items()
+                if one or best(verdict(kind.shape, look, RIVAL) for look in looks)
+            ]
+        )
         if len(names) > 1:
             return Doubt("ambiguous", names, pair.outline)
-        return Found(self._sighting(names[0], sure[0], look, outline), pair.outline)
+        return Found(self._sighting(names[0], sure[0]), pair.outline)
 
     def _stranger(self, pixels: Pixels, pair: Candidate) -> Doubt:
         """A pair that nothing known has: perhaps the mirror image of something."""
         upside_down = self._kinds.get((pair.lower.colour, pair.upper.colour), ())
         if upside_down and pair.height >= LEAST_PX:
-            outline = outlined(pixels, self._panorama, pair)
-            if (
-                outline is not None
-                and self._reason(upside_down, self._look(outline), outline) == "mirror_image"
-            ):
+            looks = [self._look(outline) for outline in outlined(pixels, self._panorama, pair)]
+            if self._reason(upside_down, looks) == "mirror_image":
                 return Doubt("mirror_image", _names(upside_down), pair.outline)
         return Doubt("unknown_pair", (), pair.outline)
 
@@ -114,9 +109,10 @@ class Cylinders:
         hidden = {
             TOP: "top" in o.cut or math.isnan(o.top),
             FOOT: "foot" in o.cut or math.isnan(o.foot),
-            WIDTH: o.uneven or "left" in o.cut or "right" in o.cut,
+            WIDTH: "left" in o.cut or "right" in o.cut,
         }
         return Look(
+            panorama.azimuth(middle),
             (
                 panorama.slope(o.top),
                 panorama.slope(o.mid),
@@ -126,19 +122,19 @@ class Cylinders:
             (top, mid, foot, 0.5 * math.hypot(left, right)),
             math.radians(self._settings.tilt_sigma_deg),
             frozenset(i for i in WHOLE if not hidden.get(i)),
+            bool(o.cut),
         )
 
-    def _reason(self, kinds: Sequence[Kind], look: Look, outline: Outline) -> str:
+    def _reason(self, kinds: Sequence[Kind], looks: Sequence[Look]) -> str:
         """Why it is none of these."""
-        if outline.cut:
-            return "cut_by_frame"
         lens_m = self._settings.mounted_m
-        return min((reason(kind.shape, lens_m, look) for kind in kinds), key=REASONS.index)
+        reasons = {reason(kind.shape, lens_m, look) for kind in kinds for look in looks}
+        return min(reasons, key=REASONS.index, default="wrong_shape")
 
-    def _sighting(self, name: str, sure: Verdict, look: Look, outline: Outline) -> Sighting:
+    def _sighting(self, name: str, sure: Verdict) -> Sighting:
         """Range and bearing from the robot's centre; the bearing only if something is hidden."""
-        s = self._settings
-        azimuth = self._panorama.azimuth(0.5 * (outline.left + outline.right))
+        s, look = self._settings, sure.look
+        azimuth = look.azimuth
         oblique = s.focal_share * math.sin(azimuth) * math.cos(azimuth)
         azimuth_sigma = math.hypot(look.sigmas[WIDTH], oblique)
         if sure.hidden == WIDTH:  # the axis is within the radius of the middle of what is seen
@@ -161,7 +157,7 @@ class Cylinders:
 def kinds(robot: str, team: Team, lens_m: float) -> dict[Bands, tuple[Kind, ...]]:
     """What a robot knows by colours: the landmarks and its teammates, but not itself."""
     landmark = Shape.of(team.vision.landmark, lens_m)
-    mast = Shape.of(team.vision.mast, lens_m)
+    mast = Shape.of(team.vision.mast, lens_m, team.vision.marker_distance_m)
     known = [(m.colours, landmark, name) for name, m in team.map.landmarks.items()]
     known += [(r.colours, mast, name) for name, r in team.robots.items() if name != robot]
     groups: dict[Bands, dict[Shape, list[str]]] = {}

@@ -11,17 +11,22 @@ import numpy as np
 
 from cpcbl_agents.vision.camera import Floats, Pixels
 from cpcbl_agents.vision.colours import Blob
-from cpcbl_agents.vision.profiles import edge
+from cpcbl_agents.vision.profiles import NEAREST_PX, edge
 from cpcbl_agents.vision.panorama import Panorama
 from cpcbl_team.config import Bands
 
 GAP_PX, GAP_SHARE = 2.5, 0.15  # between the bands, of the lower height
+OVERLAP_SHARE = 0.7  # with something of its colour beside it, a blob goes farther up or down
 LEAST_OVERLAP = 0.5  # of the narrower band
 SLACK_PX = 2.0
 WIDER, HIGHER = 2.0, 4.0  # one band than the other, at most
 UNEVEN = 1.4  # then the end of the higher band is looked for where the other band says it is
 BORDER_PX = 1.5  # an edge so near to the frame's border is cut
-APART_PX = 2.0  # the sides of two bands
+REST_PX = 7.0  # around the farthest edge
+LEAST_PATCH_PX = 3
+LEAST_WIDTH = 1.0
+INSET = 0.2  # of a band, above and below the rows that tell its sides
+APART_PX = 1.5  # the sides of two bands
 
 
 class Candidate(NamedTuple):
@@ -47,10 +52,8 @@ class Candidate(NamedTuple):
 
 
 class Outline(NamedTuple):
-    """Columns and rows of the panorama; NaN for an edge that is not found.
-
-    `cut`: which of "left", "right", "top", "foot" is the frame's border; `uneven`: the sides of the
-    bands are not one above the other.
+    """Columns and rows of the panorama; NaN for a top or foot that is not found. `cut`: which of
+    "left", "right", "top", "foot" is the frame's border.
     """
 
     left: float
@@ -59,7 +62,6 @@ class Outline(NamedTuple):
     mid: float
     foot: float
     cut: frozenset[str]
-    uneven: bool
 
 
 def candidates(blobs: Sequence[Blob]) -> list[Candidate]:
@@ -73,7 +75,8 @@ def candidates(blobs: Sequence[Blob]) -> list[Candidate]:
 
 def _stacked(upper: Blob, lower: Blob) -> bool:
     heights = sorted((upper.height, lower.height))
-    if abs(lower.top - upper.bottom) > GAP_PX + GAP_SHARE * heights[0]:
+    gap = lower.top - upper.bottom
+    if not -OVERLAP_SHARE * heights[0] < gap < GAP_PX + GAP_SHARE * heights[0]:
         return False
     widths = sorted((upper.width, lower.width))
     overlap = min(upper.right, lower.right) - max(upper.left, lower.left)
@@ -84,37 +87,47 @@ def _stacked(upper: Blob, lower: Blob) -> bool:
     )
 
 
-def outlined(pixels: Pixels, panorama: Panorama, candidate: Candidate) -> Outline | None:
-    """The outline of a candidate; None if its bands are not told apart by an edge."""
+def outlined(pixels: Pixels, panorama: Panorama, candidate: Candidate) -> list[Outline]:
+    """What the outline of a candidate may be; empty if it has no sides, or no line between its
+    bands. If its bands do not end one above the other, each of them may be the one that is whole.
+    """
     upper, lower = candidate
     mid = 0.5 * (upper.bottom + lower.top)
-    top, foot = upper.top, lower.bottom
     left, right = 0.5 * (upper.left + lower.left), 0.5 * (upper.right + lower.right)
-    reach = _between(0.25 * (right - left), 2.5, 8.0)
-    margin = reach + 7.0
-    box = panorama.clipped(left - margin, top - margin, right + margin, foot + margin)
+    margin = _reach(right - left) + REST_PX
+    box = panorama.clipped(left - margin, upper.top - margin, right + margin, lower.bottom + margin)
     patch = panorama.cut(pixels, box)
-    if min(patch.shape[:2]) < 3:
-        return None
-
-    middle = 0.5 * (left + right) - box.left
-    quarter = 0.25 * (right - left)
+    if min(patch.shape[:2]) < LEAST_PATCH_PX:
+        return []
+    middle, quarter = 0.5 * (left + right) - box.left, 0.25 * (right - left)
     rows = _Profile(_mean(patch, middle - quarter, middle + quarter, axis=1), box.top)
     mid = rows.edge(mid, 0.5 * min(upper.height, lower.height))
     if math.isnan(mid):
-        return None
-    top, foot = _ends(rows, top, mid, foot)
+        return []
+    top, foot = _ends(rows, upper.top, mid, lower.bottom)
     sides = []
     for start, end in ((upper.top, mid), (mid, lower.bottom)):
-        inset = 0.2 * (end - start)
+        inset = INSET * (end - start)
         part = _mean(patch, start + inset - box.top, end - inset - box.top, axis=0)
         columns = _Profile(part, box.left)
         sides.append((columns.edge(left, right - left), columns.edge(right, right - left)))
-    left, uneven_left = _together(sides[0][0], sides[1][0], -1.0)
-    right, uneven_right = _together(sides[0][1], sides[1][1], 1.0)
-    uneven = uneven_left or uneven_right
-    outline = Outline(left, right, top, mid, foot, frozenset(), uneven)
-    return outline._replace(cut=frozenset(_cut(panorama, outline)))
+    found = (
+        Outline(left, right, top, mid, foot, frozenset())
+        for left, right in _choices(sides[0], sides[1])
+        if right - left >= LEAST_WIDTH
+    )
+    return [outline._replace(cut=frozenset(_cut(panorama, outline))) for outline in found]
+
+
+Sides = tuple[float, float]
+
+
+def _choices(upper: Sides, lower: Sides) -> Sequence[Sides]:
+    """The sides of both bands: their mean, if they are one above the other; else either's."""
+    apart = (abs(a - b) for a, b in zip(upper, lower, strict=True))
+    if all(px <= APART_PX for px in apart):
+        return [(0.5 * (upper[0] + lower[0]), 0.5 * (upper[1] + lower[1]))]
+    return upper, lower
 
 
 class _Profile:
@@ -125,8 +138,7 @@ class _Profile:
 
     def edge(self, guess: float, size: float) -> float:
         """The edge about there, of something so large; NaN if there is none."""
-        farthest, reach = _between(0.45 * size, 1.5, 6.0), _between(0.25 * size, 2.5, 8.0)
-        found = edge(self._colours, guess - self._start, farthest, reach)
+        found = edge(self._colours, guess - self._start, max(0.45 * size, NEAREST_PX), _reach(size))
         return math.nan if found is None else found + self._start
 
 
@@ -145,15 +157,6 @@ def _ends(rows: _Profile, top: float, mid: float, foot: float) -> tuple[float, f
     return rows.edge(top, above), rows.edge(foot, below)
 
 
-def _together(upper: float, lower: float, outward: float) -> tuple[float, bool]:
-    """One side of both bands, and whether theirs differ; then it is the outer one."""
-    if math.isnan(upper) or math.isnan(lower):
-        return (lower if math.isnan(upper) else upper), True
-    if abs(upper - lower) > APART_PX:
-        return outward * max(outward * upper, outward * lower), True
-    return 0.5 * (upper + lower), False
-
-
 def _cut(panorama: Panorama, outline: "Outline") -> Iterator[str]:
     """Which edges are the frame's border, or beyond it."""
     left, right, top, mid, foot = outline[:5]
@@ -167,6 +170,11 @@ def _cut(panorama: Panorama, outline: "Outline") -> Iterator[str]:
     for name, points in places.items():
         if any(panorama.at_border(column, row, BORDER_PX) for column, row in points):
             yield name
+
+
+def _reach(size: float) -> float:
+    """How far the edge of something so large may be from where its colour ends."""
+    return _between(0.25 * size, 2.5, 8.0)
 
 
 def _mean(patch: Pixels, start: float, end: float, axis: int) -> Floats:

@@ -9,7 +9,7 @@ import numpy as np
 from cpcbl_agents.vision.camera import Floats
 
 LEAST_CONTRAST = 10.0  # grey levels, over the three channels
-NEAREST_PX, FARTHEST_PX = 1.5, 4.5  # from the edge: where a side's colour is taken
+NEAREST_PX, FARTHEST_PX = 1.5, 3.0  # from the edge: where a side's colour is taken
 ROUNDS = 4
 SETTLED_PX = 0.1
 

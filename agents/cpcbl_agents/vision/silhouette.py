@@ -25,20 +25,13 @@ class Shape(NamedTuple):
     top: float
     mid: float
     foot: float
+    rim: float = 0.0
+    """How far what it stands on may reach from its axis: seen from below, that hides its foot."""
 
     @staticmethod
-    def of(cylinder: Cylinder, lens_m: float) -> "Shape":
-        foot = lens_m - cylinder.foot_m
-        return Shape(
-            cylinder.radius_m,
-            foot - cylinder.height_m,
-            foot - 0.5 * cylinder.height_m,
-            foot,
-        )
-
-    @property
-    def height(self) -> float:
-        return self.foot - self.top
+    def of(cylinder: Cylinder, lens_m: float, rim_m: float = 0.0) -> "Shape":
+        foot, half = lens_m - cylinder.foot_m, 0.5 * cylinder.height_m
+        return Shape(cylinder.radius_m, foot - 2.0 * half, foot - half, foot, rim_m)
 
 
 class Fit(NamedTuple):
@@ -52,16 +45,25 @@ class Fit(NamedTuple):
 def looks(shape: Shape, distance: float) -> tuple[float, float, float, float]:
     """(top, mid, foot, half width) of a cylinder at this distance, more than its radius.
 
-    The rim that is seen is the near one, but for a top seen from above: there it is the far one.
+    All three lines are on the side that is near: a lid that is seen from above, or what is seen of
+    it from below, is not of the colour of the bands.
     """
     near = distance - LEVEL * shape.radius
-    far = distance + LEVEL * shape.radius
     return (
-        shape.top / (near if shape.top < 0.0 else far),
+        shape.top / near,
         shape.mid / near,
-        shape.foot / near,
+        shape.foot / near + _hidden(shape, distance),
         math.asin(min(1.0, shape.radius / distance)),
     )
+
+
+def _hidden(shape: Shape, distance: float) -> float:
+    """Half of what may be hidden of the foot, as a slope: the foot is expected there, give or take
+    as much."""
+    if shape.foot >= 0.0 or shape.rim <= shape.radius:
+        return 0.0
+    near = distance - LEVEL * shape.radius
+    return 0.5 * (shape.foot / max(distance - shape.rim, 0.5 * near) - shape.foot / near)
 
 
 def fit(
@@ -84,7 +86,9 @@ def fit(
         a_little = looks(shape, distance * 1.0001)
         slopes = [(a_little[i] - expected[i]) / (1e-4 * distance) for i in use]
         errors = [seen[i] - expected[i] for i in use]
-        weigh = _Weights([sigmas[i] for i in use], shared)
+        unsure = [_hidden(shape, distance) if i == FOOT else 0.0 for i in use]
+        own = [math.hypot(sigmas[i], more) for i, more in zip(use, unsure, strict=True)]
+        weigh = _Weights(own, shared)
         information = weigh(slopes, slopes)
         if information <= 0.0:
             return Fit(distance, math.inf, math.inf)
@@ -121,8 +125,3 @@ class _Weights:
         in_a = sum(s * x for s, x in zip(self._shared, a, strict=True))
         in_b = sum(s * y for s, y in zip(self._shared, b, strict=True))
         return own - self._scale * in_a * in_b
-
-
-def off(shape: Shape, distance: float, seen: Sequence[float], what: int) -> float:
-    """By how much one of the four numbers is more than a cylinder at this distance has."""
-    return seen[what] - looks(shape, distance)[what]

@@ -6,7 +6,7 @@ for a bearing.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 from cpcbl_agents.vision.silhouette import FOOT, MID, TOP, WIDTH, Fit, Shape, fit, looks
@@ -21,23 +21,28 @@ ANY_TILT_RAD = 10.0
 
 
 class Look(NamedTuple):
-    """What a camera sees of something with two bands, as angles: top, mid, foot and half width as
-    in `silhouette`, their sigmas, and which of the four are whole: neither cut by the frame's
-    border nor hidden as far as one can tell."""
+    """What a camera sees of something with two bands, as angles: the azimuth of its middle; top,
+    mid, foot and half width as in `silhouette`, with their sigmas; which of the four are whole,
+    as far as one can tell; and whether the frame's border cuts it."""
 
+    azimuth: float
     seen: tuple[float, float, float, float]
     sigmas: tuple[float, float, float, float]
     tilt_sigma: float
     whole: frozenset[int] = frozenset(WHOLE)
+    cut: bool = False
 
 
 class Verdict(NamedTuple):
     """The distance of the axis from the lens and its sigma (m), half of its width there (rad);
-    `hidden`: the one of the four that could not be used."""
+    how much it is off by (chi-square over its limit); `hidden`: the one of the four that could not
+    be used."""
 
+    look: Look
     distance: float
     sigma: float
     half_width: float
+    misfit: float
     hidden: int | None = None
 
 
@@ -49,19 +54,27 @@ def verdict(shape: Shape, look: Look, leniency: float = 1.0) -> Verdict | None:
     if look.whole.issuperset(WHOLE):
         whole = _fit(shape, look, WHOLE)
         if whole.chi2 <= leniency * WHOLE_GATE:
-            return _verdict(shape, whole, None)
+            return _verdict(shape, look, whole, None)
     for use, hidden in PARTS:
         if look.whole.issuperset(use):
             part = _fit(shape, look, use)
             if part.chi2 <= leniency * PART_GATE and not _sticks_out(shape, look, part, hidden):
-                return _verdict(shape, part, hidden)
+                return _verdict(shape, look, part, hidden)
     return None
+
+
+def best(verdicts: Iterable[Verdict | None]) -> Verdict | None:
+    """The one that tells the most; of such, the one that fits best."""
+    given = [one for one in verdicts if one is not None]
+    return min(given, key=lambda one: (one.hidden is not None, one.misfit), default=None)
 
 
 def reason(shape: Shape, lens_m: float, look: Look) -> str:
     """Why it is not of this shape, or not surely."""
+    if look.cut:
+        return "cut_by_frame"
     if len(look.whole) < len(WHOLE):
-        return "occluded"
+        return "wrong_shape"
     free = fit(shape, look.seen, look.sigmas, ANY_TILT_RAD, WHOLE)
     if free.chi2 > WHOLE_GATE:
         return "wrong_shape"
@@ -69,9 +82,10 @@ def reason(shape: Shape, lens_m: float, look: Look) -> str:
     return "mirror_image" if below else "ranges_disagree"
 
 
-def _verdict(shape: Shape, fitted: Fit, hidden: int | None) -> Verdict:
-    half_width = looks(shape, fitted.distance)[WIDTH]
-    return Verdict(fitted.distance, fitted.sigma, half_width, hidden)
+def _verdict(shape: Shape, look: Look, fitted: Fit, hidden: int | None) -> Verdict:
+    distance, sigma, chi2 = fitted
+    misfit = chi2 / (WHOLE_GATE if hidden is None else PART_GATE)
+    return Verdict(look, distance, sigma, looks(shape, distance)[WIDTH], misfit, hidden)
 
 
 def _fit(shape: Shape, look: Look, use: Sequence[int]) -> Fit:
