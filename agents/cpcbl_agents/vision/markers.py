@@ -74,11 +74,22 @@ class Markers:
             sides = steps(grey, quads, self._codes.cells)
             quads = corners(sides)
         plane = corners(self._camera.undistorted(sides.reshape(-1, 2)).reshape(sides.shape))
-        return [
-            Mark(code.id, np.roll(quad, -code.first, axis=0), np.roll(flat, -code.first, axis=0))
-            for quad, flat, code in zip(quads, plane, self._codes.read(grey, quads), strict=True)
-            if code is not None
-        ]
+        marks = []
+        for quad, flat, code in zip(quads, plane, self._codes.read(grey, quads), strict=True):
+            if code is not None:
+                first = code.first + self._upside_down(np.roll(flat, -code.first, axis=0))
+                quad, flat = (np.roll(points, -first, axis=0) for points in (quad, flat))
+                marks.append(Mark(code.id, quad, flat))
+        return marks
+
+    def _upside_down(self, plane: Floats) -> int:
+        """By how many corners a marker has to be turned to stand upright: 2, or 0.
+
+        Before version 5, OpenCV's AprilTags are upside down beside those of the AprilTag library
+        (opencv/opencv#28823); robots are not.
+        """
+        heights = np.column_stack([plane, np.ones(4)]) @ self._camera.robot_from_camera[2]
+        return 2 if heights[:2].sum() < heights[2:].sum() else 0
 
     def _placed(self, name: str, sides: Mapping[Side, Mark]) -> Glimpses:
         """A teammate by the markers that are seen of it."""

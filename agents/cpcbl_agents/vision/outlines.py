@@ -11,8 +11,8 @@ import numpy as np
 
 from cpcbl_agents.vision.camera import Floats, Pixels
 from cpcbl_agents.vision.colours import Blob
-from cpcbl_agents.vision.profiles import NEAREST_PX, edge
 from cpcbl_agents.vision.panorama import Panorama
+from cpcbl_agents.vision.profiles import NEAREST_PX, edge
 from cpcbl_team.config import Bands
 
 GAP_PX, GAP_SHARE = 2.5, 0.15  # between the bands, of the lower height

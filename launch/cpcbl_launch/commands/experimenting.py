@@ -144,7 +144,7 @@ def pictures(
     name: Annotated[
         str,
         typer.Argument(
-            metavar="SET", help="duckiebot or frc-2024; or your NAME.csv, NAME.toml beside it."
+            metavar="SET", help="duckiebot, frc-speaker, frc-amp; or NAME.csv, NAME.toml beside it."
         ),
     ],
     folder: Annotated[Path, typer.Argument(help="Where the set's pictures are.")],
