@@ -78,8 +78,8 @@ def run_robot(
     wake = Wake()
     link = link_of(team, Identity(Role.ROBOT, name), connect)
     with (
-        open_bus(team.name, link.endpoints, stop, link.credentials) as bus,
         own_camera(name, team, clock, wake) as camera,
+        open_bus(team.name, link.endpoints, stop, link.credentials) as bus,
     ):
         start_ns = clock.now_ns()
         late_s = (start_ns - clock.epoch_ns) * 1e-9 / clock.speed
@@ -94,8 +94,13 @@ def run_robot(
 
 @contextmanager
 def own_camera(name: str, team: Team, clock: Clock, wake: Wake) -> Iterator[OwnCamera | None]:
-    """The camera that a robot reads itself, until the end; None where nobody or a driver does."""
+    """The camera that a robot reads itself, until the end; None where nobody or a driver does.
+
+    Raises ValueError for a camera that cannot be used, or without OpenCV.
+    """
     robot = team.robots[name]
+    if robot.sensing == "camera":
+        import cpcbl_agents.vision  # noqa: F401  it says what is missing
     if robot.sensing != "camera" or not robot.camera.frames:
         yield None
         return

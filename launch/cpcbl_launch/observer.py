@@ -174,8 +174,8 @@ def visit(
     wake = Wake()
     link = link_of(team, Identity(Role.OBSERVER, name), connect)
     with (
-        open_bus(team.name, link.endpoints, stop, link.credentials) as bus,
         own_camera(name, team, clock, wake) as camera,
+        open_bus(team.name, link.endpoints, stop, link.credentials) as bus,
     ):
         _look_for_namesakes(name, bus, stop)
         start_ns = clock.now_ns()

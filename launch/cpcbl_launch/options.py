@@ -9,6 +9,8 @@ from typing import Any
 
 import msgspec
 
+from cpcbl_team.config import Team
+
 PICTURES = (".png", ".svg")
 
 
@@ -61,6 +63,12 @@ def check_limit(option: str, limit: float) -> None:
     """Raises ValueError for a budget that is no number, or endless."""
     if not 0.0 <= limit < math.inf:
         raise ValueError(f"{option} {limit:g}: no limit; write a number, 0 for as much as it likes")
+
+
+def must_see(team: Team) -> None:
+    """Raises ValueError where a robot has a camera and OpenCV is not installed."""
+    if any(robot.sensing == "camera" for robot in team.robots.values()):
+        importlib.import_module("cpcbl_agents.vision")
 
 
 def must_draw(what: str, path: Path | None = None) -> None:

@@ -9,13 +9,17 @@ once, in robot time from the start on. Raises ValueError where OpenCV is not ins
 import logging
 import math
 import os
+import re
+import socket
 import threading
 from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Protocol
+from urllib.parse import urlsplit
 
+import cv2
 import numpy as np
 
 from cpcbl_agents.eyes import Picture
@@ -24,19 +28,18 @@ from cpcbl_agents.vision.camera import Pixels
 from cpcbl_team.config import CameraSettings
 from cpcbl_transport.messages import Frame
 
-os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # what is wrong is said here, once
-import cv2
-
-cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)
-
 log = logging.getLogger(__name__)
 
 SUFFIXES = frozenset({".png", ".jpg", ".jpeg"})
-TIMEOUT_MS = 1500  # of a URL that does not answer
-PATIENCE_S = 1.0  # for the thread at the end; it is a daemon
+TIMEOUT_S = 1  # of a camera that does not answer
+PATIENCE_S = 1.8  # for the thread at the end: a process that ends while OpenCV waits is aborted
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.25, 4.0
 EARLY = 0.8  # of the time between two frames: rates of cameras are not exact
 NOTHING: Pixels = np.empty((0, 0, 3), np.uint8)
+
+os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # what is wrong is said here, once
+os.environ.setdefault("OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT", str(TIMEOUT_S))
+cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)
 
 
 def opened(
@@ -72,6 +75,7 @@ class LiveCamera:
         wake: Callable[[], None],
     ) -> None:
         self._settings, self._now_ns, self._wake = settings, now_ns, wake
+        self._name = re.sub("//[^/]*@", "//", settings.frames)  # without a password
         self._pause_ns, self._latest_ns = EARLY * 1e9 / rate_hz, -math.inf
         self._newest: deque[Picture] = deque(maxlen=1)
         self._lost = False
@@ -99,7 +103,7 @@ class LiveCamera:
             if not self._lost and not self._stop.is_set():
                 self._lost = True
                 self.counts["camera_lost"] += 1
-                log.warning("camera %s gives no frames; it is tried again", self._settings.frames)
+                log.warning("camera %s gives no frames; it is tried again", self._name)
             self._stop.wait(pause_s)
             pause_s = min(2.0 * pause_s, LONGEST_PAUSE_S)
 
@@ -108,17 +112,16 @@ class LiveCamera:
         any_came = False
         with suppress(cv2.error):  # a stream that cannot be decoded: as if it had ended
             capture = _opened(self._settings)
-            while not self._stop.is_set() and capture.grab():
+            while capture is not None and not self._stop.is_set() and capture.grab():
                 self._take(capture, self._now_ns())
                 any_came = True
-            capture.release()
         return any_came
 
     def _take(self, capture: "cv2.VideoCapture", stamp_ns: int) -> None:
         if self._lost:
             self._lost = False
             self.counts["camera_back"] += 1
-            log.warning("camera %s is back", self._settings.frames)
+            log.warning("camera %s is back", self._name)
         if 0 <= stamp_ns - self._latest_ns < self._pause_ns:
             return
         self._latest_ns = stamp_ns
@@ -129,12 +132,17 @@ class LiveCamera:
         self._wake()
 
 
-def _opened(settings: CameraSettings) -> "cv2.VideoCapture":
-    """Perhaps in vain: then it gives no frames."""
+def _opened(settings: CameraSettings) -> "cv2.VideoCapture | None":
+    """Perhaps in vain: then it gives no frames. None where the name of a URL's machine is unknown,
+    which OpenCV would wait for without a bound."""
     where = settings.frames
     if "://" in where:
+        try:
+            socket.getaddrinfo(urlsplit(where).hostname, None)
+        except (OSError, ValueError):
+            return None
         timeouts = (cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, cv2.CAP_PROP_READ_TIMEOUT_MSEC)
-        parameters = [n for timeout in timeouts for n in (timeout, TIMEOUT_MS)]
+        parameters = [n for timeout in timeouts for n in (timeout, 1000 * TIMEOUT_S)]
         return cv2.VideoCapture(where, cv2.CAP_FFMPEG, parameters)
     device = cv2.VideoCapture(int(where)) if where.isdecimal() else cv2.VideoCapture(where)
     if device.isOpened():

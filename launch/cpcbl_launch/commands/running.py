@@ -88,7 +88,7 @@ def up(
     from cpcbl_agents.process import Stop
     from cpcbl_launch import logs as real_logs
     from cpcbl_launch.evaluation import Choice, chosen
-    from cpcbl_launch.options import encoded, file_for, folder_for, must_draw
+    from cpcbl_launch.options import encoded, file_for, folder_for, must_draw, must_see
     from cpcbl_launch.show import LiveTable, print_report
     from cpcbl_launch.up import (
         SIMULATED_S,
@@ -115,6 +115,8 @@ def up(
             file_for(option, path)
     if picture is not None:
         must_draw("--picture")
+    if not containers:
+        must_see(team)
     if logs is not None:
         folder_for("--logs", logs)
     run = Run(team, duration, speed, seed, folder=logs, picture=picture, record=record)
