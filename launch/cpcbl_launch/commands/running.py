@@ -136,7 +136,9 @@ def up(
         run = run._replace(here=names_in(robots))
     console = Console(stderr=as_json)
     launch: Launch = OnThisMachine
-    if containers:
+    if not containers:
+        must_see(run.team, run.team.robots if run.here is None else run.here, field=True)
+    else:
         from cpcbl_launch.containers.launch import InContainers, progress_on
 
         launch = partial(InContainers, image=image, base=base_image, said=progress_on(console))
@@ -167,6 +169,7 @@ def robot(
     """Run one robot, on any machine, until SIGINT or SIGTERM."""
     from cpcbl_agents.clock import Clock
     from cpcbl_agents.process import Stop, run_robot
+    from cpcbl_launch.options import must_see
     from cpcbl_launch.simulation.liar import Lie, lying
     from cpcbl_launch.team_file import TeamFileError
 
@@ -175,6 +178,7 @@ def robot(
         raise TeamFileError(
             f"{team_file}: robots.{name}: not in the file; it has: {', '.join(team.robots)}"
         )
+    must_see(team, [name])
     when = Clock.parse(clock) if clock else Clock.wall()
     through = lying(Lie.parse(lie) if lie else None, name, when.epoch_ns)
     run_robot(name, team, connect or team.transport.connect, when, Stop(parent), restarted, through)
@@ -196,6 +200,7 @@ def field(
 
     from cpcbl_agents.clock import Clock
     from cpcbl_agents.process import Stop
+    from cpcbl_launch.options import must_see
     from cpcbl_launch.simulation.field import robots_at, run_field
     from cpcbl_transport.bus import Bus
     from cpcbl_transport.security import Identity, link_of
@@ -203,6 +208,7 @@ def field(
     from cpcbl_transport.zenoh_bus import open_bus
 
     team = load(team_file)
+    must_see(team, field=True)
     elsewhere = robots_at(site or (), team)
     stop = Stop(parent)
     with ExitStack() as stack:
