@@ -65,12 +65,6 @@ def check_limit(option: str, limit: float) -> None:
         raise ValueError(f"{option} {limit:g}: no limit; write a number, 0 for as much as it likes")
 
 
-def must_see(team: Team) -> None:
-    """Raises ValueError where a robot has a camera and OpenCV is not installed."""
-    if any(robot.sensing == "camera" for robot in team.robots.values()):
-        importlib.import_module("cpcbl_agents.vision")
-
-
 def must_draw(what: str, path: Path | None = None) -> None:
     """Raises ValueError where pictures, or pictures of this kind, cannot be drawn."""
     if path is not None and path.suffix.lower() not in PICTURES:

@@ -115,8 +115,6 @@ def up(
             file_for(option, path)
     if picture is not None:
         must_draw("--picture")
-    if not containers:
-        must_see(team)
     if logs is not None:
         folder_for("--logs", logs)
     run = Run(team, duration, speed, seed, folder=logs, picture=picture, record=record)
