@@ -69,3 +69,9 @@ def must_draw(what: str, path: Path | None = None) -> None:
         raise ValueError(f"{what} {path}: not a picture; end its name in {' or '.join(PICTURES)}")
     if importlib.util.find_spec("matplotlib") is None:
         raise ValueError(f"{what} needs matplotlib: pip install 'cpcbl-team[plot]'")
+
+
+def must_see(what: str) -> None:
+    """Raises ValueError where pictures cannot be read."""
+    if importlib.util.find_spec("cv2") is None:
+        raise ValueError(f"{what} needs OpenCV: pip install 'cpcbl-team[camera]'")
