@@ -76,8 +76,8 @@ def edited(text: str, name: str, places: Mapping[Place, Mapping[str, Written]]) 
     for place, values in places.items():
         _must_be_there(document, place, name)
         table: Any = document
-        for part in place.path:
-            table = _inside(table, part)
+        for i, part in enumerate(place.path):
+            table = _inside(table, part, bare=i < len(place.path) - 1)
         for key, value in values.items():
             table[key] = _item(value, table)
     changed = tomlkit.dumps(document)
@@ -137,11 +137,11 @@ def _must_be_there(document: Mapping[str, Any], place: Place, name: str) -> None
         raise TeamFileError(f"{name}: {layer}.{rest[0]}: not in the file; name one of: {there}")
 
 
-def _inside(table: Any, part: str) -> Any:
-    """The table of this name within another, made if it is not there."""
+def _inside(table: Any, part: str, bare: bool) -> Any:
+    """The table of this name within another, made if it is not there; `bare`: of tables only."""
     if part not in table:
         inline = isinstance(table, InlineTable)
-        table[part] = tomlkit.inline_table() if inline else tomlkit.table()
+        table[part] = tomlkit.inline_table() if inline else tomlkit.table(is_super_table=bare)
     return table[part]
 
 

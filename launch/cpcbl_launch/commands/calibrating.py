@@ -123,6 +123,68 @@ def camera(
     say_not_written(lost)
 
 
+@calibrate_app.command("colours")
+def colours(
+    pictures: Annotated[
+        Optional[list[Path]],
+        typer.Argument(help="Pictures, or folders of them: where samples are, or no colour is."),
+    ] = None,
+    sample: Annotated[
+        Optional[list[str]],
+        typer.Option(help="PICTURE:COLOUR=X,Y,WIDTH,HEIGHT, or X,Y,RADIUS; any number of them."),
+    ] = None,
+    samples: Annotated[
+        Optional[Path],
+        typer.Option(help="File of samples (TOML, JSON, CSV): picture, colour, at."),
+    ] = None,
+    margin: Annotated[
+        float, typer.Option(min=0.0, max=0.9, help="Share by which ranges are widened.")
+    ] = 0.4,
+    preview: Annotated[
+        Optional[Path],
+        typer.Option(help="Draw samples, and what the thresholds take, into this file (PNG, JPG)."),
+    ] = None,
+    team_file: ToTeam = None,
+    output: ToFile = None,
+    as_json: AsJson = False,
+) -> None:
+    """Thresholds of colours, from samples of them in pictures."""
+    from rich.console import Console
+
+    from cpcbl_launch.options import encoded, file_for, must_see, not_written
+
+    must_see("calibrate colours")
+    from cpcbl_launch.calibration import patches
+    from cpcbl_launch.calibration.colours import calibrated_colours
+    from cpcbl_launch.calibration.colours_show import colour_values, kept_colours, print_colours
+    from cpcbl_launch.calibration.pictures import picture_files
+    from cpcbl_launch.calibration.samples import named_in, parsed_sample, read_samples
+
+    said = [parsed_sample(text) for text in sample or ()]
+    said += read_samples(samples) if samples is not None else []
+    if not said:
+        raise ValueError("calibrate colours: say where colours are, by --sample or --samples")
+    if preview is not None:
+        file_for("--preview", preview)
+        patches.must_write(preview)
+    _check_target(team_file, output)
+    files = picture_files(pictures or [])
+    seen = patches.labelled(named_in(said, files), files)
+    kept, stays = kept_colours(team_file, {s.colour for s in said})
+    found = calibrated_colours(patches.patches_of(seen), patches.elsewhere(seen), kept, margin)
+    lost: dict[str, str] = {}
+    if (drawing := preview) is not None:
+        every = {name: fit.thresholds for name, fit in found.colours.items()} | found.kept
+        shown = patches.preview(seen, every)
+        lost |= not_written(drawing, lambda: patches.write_preview(drawing, shown))
+    if as_json:
+        typer.echo(encoded(found))
+    else:
+        print_colours(found, Console())
+    lost |= _save(colour_values(found, stays), team_file, output, as_json)
+    say_not_written(lost)
+
+
 def _check_target(team_file: Path | None, output: Path | None) -> None:
     """Raises ValueError, TeamFileError before anything is measured in vain."""
     from cpcbl_launch.calibration.team_edit import team_source
