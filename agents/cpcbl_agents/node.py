@@ -75,7 +75,7 @@ class Node:
         rules = team.robots[robot.name].collaboration
         self._team, self._passive = frozenset(team.robots), rules.passive
         self._inbox: deque[tuple[str, bytes]] = deque(maxlen=INBOX)
-        self._frame: tuple[str, bytes] | None = None
+        self._frames: deque[tuple[str, bytes]] = deque(maxlen=1)
         self._news: deque[tuple[str, bool]] = deque(maxlen=INBOX)
         self._wiring = Wiring(robot.name, incarnation, rules, bus, self._arrived, self._seen_alive)
         self._tokens = Tokens()
@@ -93,13 +93,14 @@ class Node:
 
     def _arrived(self, key: str, payload: bytes) -> None:
         if key == self._frame_key:  # only the latest: a robot that is slow sees less, not late
-            if self._frame is not None:
+            if self._frames:
                 self.counts["frame_skipped"] += 1
-            self._frame = key, payload
+            self._frames.append((key, payload))
         else:
             if len(self._inbox) == INBOX:
                 self.counts["inbox_overflow"] += 1
-            self._inbox.append((key, payload))
+            enough = payload[: LARGEST_PAYLOAD + 1]  # to refuse it; it may be as large as a frame
+            self._inbox.append((key, enough))
         self._on_arrival()
 
     def _seen_alive(self, key: str, alive: bool) -> None:
@@ -120,16 +121,15 @@ class Node:
     @property
     def waiting(self) -> bool:
         """Whether something has arrived."""
-        return bool(self._inbox or self._news or self._frame)
+        return bool(self._inbox or self._news or self._frames)
 
     def step(self, now_ns: int) -> None:
         """Takes in what has arrived, lets the robot work, sends what it says."""
         self._take_tokens(now_ns)
         while self._inbox:
             self._take(*self._inbox.popleft(), now_ns)
-        if self._frame is not None:
-            frame, self._frame = self._frame, None
-            self._take(*frame, now_ns)
+        if self._frames:
+            self._take(*self._frames.popleft(), now_ns)
         self._ask_for_listeners(now_ns)
         said = self._robot.handle(Tick(), now_ns)
         for name in self._wiring.follow(self._robot.collaboration):

@@ -15,6 +15,8 @@ from typing import Any, get_args, get_origin, get_type_hints
 import msgspec
 
 from cpcbl_team.config import (
+    LIKE_MIRRORED,
+    MARKERS,
     Field,
     GuestSettings,
     Landmark,
@@ -241,6 +243,24 @@ def _vision_problems(team: Team) -> Iterator[str]:
         marks = [m.colours for m in team.map.landmarks.values() if m.colours is not None]
         for twice in sorted({c for c in marks if marks.count(c) > 1}):
             yield f"map.landmarks: two have the colours {list(twice)}; give each its own"
+    yield from _marker_problems(team)
+
+
+def _marker_problems(team: Team) -> Iterator[str]:
+    """Markers are of the family, and tell a robot's sides apart. Two robots may carry the same
+    ones: that is said when they are seen."""
+    family = team.vision.family
+    mirrored = LIKE_MIRRORED.get(family, frozenset())
+    for name, robot in team.robots.items():
+        ids = list(robot.markers.values())
+        for side, number in robot.markers.items():
+            key = f"robots.{name}.markers.{side}"
+            if not 0 <= number < MARKERS[family]:
+                yield f"{key}: {family} has no marker {number}; use 0 to {MARKERS[family] - 1}"
+            elif number in mirrored:
+                yield f"{key}: marker {number} of {family} is its own mirror image; use another"
+            elif ids.count(number) > 1:
+                yield f"{key}: marker {number} is on two sides; give each side its own"
 
 
 def _insecure(endpoint: str, secured: bool) -> str:

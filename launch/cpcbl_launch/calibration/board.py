@@ -7,14 +7,15 @@ ChArUco: a chessboard with markers in its white squares, found in part too (Garr
 import re
 from enum import StrEnum
 from pathlib import Path
-from typing import NamedTuple, get_args
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from cpcbl_agents.vision.camera import Pixels
-from cpcbl_team.config import MarkerFamily
+from cpcbl_agents.vision.codes import DICTIONARIES
+from cpcbl_team.config import MARKERS, MarkerFamily
 
 LEAST_SQUARES = 4
 LEAST_CORNERS = 8  # in a picture: fewer hardly tell a lens from a pose
@@ -36,8 +37,7 @@ class Board(NamedTuple):
     """Across and down, black and white ones."""
     square_m: float
     marker_m: float
-    family: str
-    """One of `MarkerFamily`."""
+    family: MarkerFamily
 
 
 class Corners(NamedTuple):
@@ -57,10 +57,10 @@ def parsed_board(
     across, down = int(match[1]), int(match[2])
     if min(across, down) < LEAST_SQUARES:
         raise ValueError(f"--squares {squares}: at least {LEAST_SQUARES} across and down")
-    if family not in get_args(MarkerFamily):
-        known = ", ".join(get_args(MarkerFamily))
-        raise ValueError(f"--family {family}: no such family; use one of {known}")
-    board = Board(Pattern(pattern), (across, down), square_m, marker_m, family)
+    markers = {str(name): name for name in MARKERS}
+    if family not in markers:
+        raise ValueError(f"--family {family}: no such family; use one of {', '.join(markers)}")
+    board = Board(Pattern(pattern), (across, down), square_m, marker_m, markers[family])
     if board.pattern is Pattern.charuco:
         _check_markers(board)
     return board
@@ -73,7 +73,7 @@ def _check_markers(board: Board) -> None:
             f" --square-m {board.square_m:g}"
         )
     across, down = board.squares
-    needed, there = across * down // 2, len(_dictionary(board.family).bytesList)
+    needed, there = across * down // 2, MARKERS[board.family]
     if needed > there:
         raise ValueError(
             f"--squares {across}x{down}: needs {needed} markers, {board.family} has {there};"
@@ -151,7 +151,15 @@ def _sharpened(grey: Pixels, pixels: Points) -> Points:
 
 
 def _charuco(board: Board) -> cv2.aruco.CharucoBoard:
-    family = _dictionary(board.family)
+    family = cv2.aruco.getPredefinedDictionary(DICTIONARIES[board.family])
+    return cv2.aruco.CharucoBoard(board.squares, board.square_m, board.marker_m, family)
+
+
+_PRECISE), np.float32)
+
+
+def _charuco(board: Board) -> cv2.aruco.CharucoBoard:
+    family = cv2.aruco.getPredefinedDictionary(DICTIONARIES[board.family])
     return cv2.aruco.CharucoBoard(board.squares, board.square_m, board.marker_m, family)
 
 

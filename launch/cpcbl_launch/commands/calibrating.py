@@ -80,10 +80,10 @@ def camera(
     """Lens and distortion of a camera, from pictures of a printed board."""
     from rich.console import Console
 
-    from cpcbl_launch.options import encoded, file_for, must_draw, must_see, not_written
+    from cpcbl_launch.options import encoded, file_for, must_draw, must_read, not_written
     from cpcbl_launch.show import progress_bar
 
-    must_see("calibrate camera")
+    must_read("calibrate camera")
     from cpcbl_launch.calibration.board import parsed_board, write_board
     from cpcbl_launch.calibration.lens import calibrated_lens
     from cpcbl_launch.calibration.lens_show import camera_values, print_lens
@@ -151,9 +151,9 @@ def colours(
     """Thresholds of colours, from samples of them in pictures."""
     from rich.console import Console
 
-    from cpcbl_launch.options import encoded, file_for, must_see, not_written
+    from cpcbl_launch.options import encoded, file_for, must_read, not_written
 
-    must_see("calibrate colours")
+    must_read("calibrate colours")
     from cpcbl_launch.calibration import patches
     from cpcbl_launch.calibration.colours import calibrated_colours
     from cpcbl_launch.calibration.colours_show import colour_values, kept_colours, print_colours

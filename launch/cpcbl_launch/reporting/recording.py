@@ -30,7 +30,10 @@ from cpcbl_transport.reading import read
 
 log = logging.getLogger(__name__)
 
-RECORDED = (*topics.INPUTS, topics.TRACK, topics.STATUS, topics.TRUTH)
+RECORDED = (
+    *(topics.IN_ODOMETRY, topics.IN_SIGHTINGS, topics.IN_POSITION),  # not frames: they are large
+    *(topics.TRACK, topics.STATUS, topics.TRUTH),
+)
 TEAM = "team.json"
 LAST_NS = 2**63  # what a file can hold
 _decoder: msgspec.json.Decoder[Message] = msgspec.json.Decoder(Message)
