@@ -155,18 +155,5 @@ def _charuco(board: Board) -> cv2.aruco.CharucoBoard:
     return cv2.aruco.CharucoBoard(board.squares, board.square_m, board.marker_m, family)
 
 
-_PRECISE), np.float32)
-
-
-def _charuco(board: Board) -> cv2.aruco.CharucoBoard:
-    family = cv2.aruco.getPredefinedDictionary(DICTIONARIES[board.family])
-    return cv2.aruco.CharucoBoard(board.squares, board.square_m, board.marker_m, family)
-
-
-def _dictionary(family: str) -> cv2.aruco.Dictionary:
-    name = f"DICT_{family.removeprefix('aruco_').upper()}"
-    return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
-
-
 _PRECISE = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 30, 0.01)
 _NONE = Corners(np.empty((0, 3), np.float32), np.empty((0, 2), np.float32))
