@@ -83,6 +83,7 @@ def test_a_good_picture_is_decoded(data: bytes) -> None:
     assert pixels.shape == GOOD.shape
     assert number_of(pixels) == 7
     assert fault(pixels, SIZE) == ""
+    assert not isinstance(decoded(data), str)
 
 
 @pytest.mark.parametrize("what", BAD)

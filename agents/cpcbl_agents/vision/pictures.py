@@ -35,10 +35,10 @@ class Header(NamedTuple):
     """Of each channel."""
 
 
-def decoded(image: bytes, size_px: tuple[int, int]) -> Pixels | str:
-    """The pixels of a colour JPEG or PNG of this size (width, height), BGR; or why there are none.
+def decoded(image: bytes, size_px: tuple[int, int] | None = None) -> Pixels | str:
+    """The pixels of a colour JPEG or PNG, BGR; or why there are none.
 
-    It is never larger in memory than that size.
+    With a size (width, height) of that only: no other is decoded, however large it claims to be.
     """
     if not image:
         return "frame_empty"
@@ -78,14 +78,14 @@ def header_of(image: bytes) -> Header | None:
     return None
 
 
-def _unfit(header: Header, size_px: tuple[int, int]) -> str:
+def _unfit(header: Header, size_px: tuple[int, int] | None) -> str:
     if not header.width_px or not header.height_px:
         return "frame_empty"
     if header.channels != 3:
         return "frame_wrong_channels"
     if header.bits != 8:
         return "frame_wrong_depth"
-    return "" if (header.width_px, header.height_px) == size_px else "frame_wrong_size"
+    return "" if size_px in (None, (header.width_px, header.height_px)) else "frame_wrong_size"
 
 
 def _whole(image: bytes) -> bool:
