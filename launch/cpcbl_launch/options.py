@@ -73,6 +73,12 @@ def must_draw(what: str, path: Path | None = None) -> None:
         raise ValueError(f"{what} needs matplotlib: pip install 'cpcbl-team[plot]'")
 
 
+def must_have_opencv(what: str) -> None:
+    """Raises ValueError where OpenCV is not installed."""
+    if importlib.util.find_spec("cv2") is None:
+        raise ValueError(f"{what} needs OpenCV: pip install 'cpcbl-team[camera]'")
+
+
 def must_see(team: Team, robots: Collection[str] = (), field: bool = False) -> None:
     """Raises ValueError where these robots, or the simulated field, need OpenCV and it is not
     there."""
@@ -84,3 +90,9 @@ def must_see(team: Team, robots: Collection[str] = (), field: bool = False) -> N
             f'team {team.name}: {who}: sensing = "camera" needs OpenCV:'
             " pip install 'cpcbl-team[camera]'"
         )
+
+
+def must_read(what: str) -> None:
+    """Raises ValueError where pictures cannot be read."""
+    if importlib.util.find_spec("cv2") is None:
+        raise ValueError(f"{what} needs OpenCV: pip install 'cpcbl-team[camera]'")
