@@ -8,7 +8,7 @@ from msgspec.structs import replace
 from cpcbl_agents.vision import annotate, eyes
 from cpcbl_agents.vision.camera import Pixels
 from cpcbl_agents.vision.glimpses import Glimpses
-from cpcbl_agents.vision.pictures import decoded
+from cpcbl_agents.vision.pictures import received
 from cpcbl_team.config import CameraSettings, Team
 from cpcbl_transport import topics
 from cpcbl_transport.messages import Frame, Look, Unclear
@@ -43,7 +43,7 @@ def test_frames_are_shown_twice_a_second_with_what_was_seen() -> None:
     shown = looks(ear)
     assert [look.stamp_ns // MS for look in shown] == [100, 600, 1100, 1600]
     assert {(look.robot, look.found, look.unclear) for look in shown} == {("me", (), ())}
-    pixels = decoded(shown[0].image, SIZE)
+    pixels = received(shown[0].image, SIZE)
     assert not isinstance(pixels, str)
     assert number_of(pixels) == 4
     counts = stand.robots["me"].counts
@@ -79,7 +79,7 @@ def test_a_frame_that_cannot_be_used_is_shown_with_its_reason() -> None:
     assert (undecodable.image, undecodable.unclear) == (b"", (Unclear("frame_undecodable"),))
     assert (wrong.image, wrong.unclear) == (b"", (Unclear("frame_wrong_size"),))
     assert black.unclear == (Unclear("frame_black"),)
-    assert not isinstance(decoded(black.image, SIZE), str)
+    assert not isinstance(received(black.image, SIZE), str)
 
 
 def test_who_looks_changes_nothing_else() -> None:
