@@ -31,7 +31,11 @@ SMALL = 1e-3  # squared error (in sigmas): a step that gains less no longer matt
 RIVAL = 12.0
 """By so much more squared error (in sigmas) the other turn is out of the question."""
 LEAST_WEIGHT = 0.1
-"""Of an answer that may be true: so much, and three sigma of both together reach it."""
+"""Of a heading that may be true, relative to the best: so much, and three sigma reach it."""
+NARROW = math.radians(1.5)
+"""Within so much what is seen changes evenly with the heading; beyond, headings are surveyed."""
+HEADINGS = 41
+MOST_SIGMA = math.radians(20.0)
 
 
 class Fit(NamedTuple):
@@ -67,8 +71,16 @@ def fitted(seen: Mapping[Side, Floats], vision: VisionSettings, camera: Camera) 
     view = _View(shape, plane, camera)
     poses, sums = _improved(_starts(seen, vision, camera), view)
     errors = sums[:, 3, 3]
-    misfit = float(errors.min()) / (plane.size - 3)
-    return _together(poses, errors, _inverse(sums[:, :3, :3]), misfit)
+    best, possible = int(errors.argmin()), errors - errors.min() < RIVAL
+    covariances = _inverse(sums[:, :3, :3])
+    sigmas = np.sqrt(covariances[:, 2, 2])
+    mean, covariance = poses[best], covariances[best]
+    if sigmas[best] > NARROW or np.ptp(_unwrapped(poses[possible, 2] - mean[2])) > NARROW:
+        pivot = shape[:4, :2].mean(axis=0)
+        mean, covariance = _surveyed(poses[possible], sigmas[possible], pivot, view)
+    x, y, heading = mean.tolist()
+    misfit = float(errors[best]) / (plane.size - 3)
+    return Fit(Pose2(x, y, wrap_angle(heading)), covariance, misfit)
 
 
 def _inverse(matrices: Floats) -> Floats:
@@ -166,20 +178,34 @@ def _improved(poses: Floats, view: _View) -> tuple[Floats, Floats]:
     return poses, sums
 
 
-def _together(poses: Floats, errors: Floats, covariances: Floats, misfit: float) -> Fit:
-    """The best of the answers; or, where another may be true as well, one that covers both."""
-    best = int(errors.argmin())
-    x, y, heading = poses[best]
-    apart = poses - poses[best]
-    apart[:, 2] = [wrap_angle(float(turn)) for turn in apart[:, 2]]
-    likely = np.exp(-0.5 * (errors - errors[best]))
-    possible = errors - errors[best] < RIVAL
-    weights = np.where(possible, np.maximum(likely, LEAST_WEIGHT), 0.0)
-    weights /= weights.sum()
-    mean = weights @ apart
-    spread = apart - mean
-    covariance: Floats = np.einsum("k,kij->ij", weights, covariances) + np.einsum(
-        "k,ki,kj->ij", weights, spread, spread
-    )
-    pose = Pose2(x + mean[0], y + mean[1], wrap_angle(float(heading + mean[2])))
-    return Fit(pose, covariance, misfit)
+def _surveyed(poses: Floats, sigmas: Floats, pivot: Floats, view: _View) -> tuple[Floats, Floats]:
+    """Mean (3) and covariance (3, 3) over all headings about those of the poses (k, 3), each with
+    the place that suits it best; `pivot`: a marker's middle in its robot's frame."""
+    headings = poses[0, 2] + _unwrapped(poses[:, 2] - poses[0, 2])
+    reach = 4.0 * np.minimum(sigmas, MOST_SIGMA)
+    turns = np.linspace((headings - reach).min(), (headings + reach).max(), HEADINGS)
+    middle = poses[0, :2] + _turned(pivot, poses[0, 2:])[0]
+    tried = np.column_stack([middle - _turned(pivot, turns), turns])
+    for _ in range(3):
+        sums = view.sums(tried)
+        tried[:, :2] += np.linalg.solve(sums[:, :2, :2], sums[:, :2, 3:])[..., 0]
+    sums = view.sums(tried)
+    errors = sums[:, 3, 3] - sums[:, 3, 3].min()
+    likely = np.where(errors < RIVAL, np.maximum(np.exp(-0.5 * errors), LEAST_WEIGHT), 0.0)
+    weights = likely / likely.sum()
+    mean = weights @ tried
+    spread = tried - mean
+    covariance: Floats = (weights[:, None] * spread).T @ spread
+    covariance[:2, :2] += np.tensordot(weights, _inverse(sums[:, :2, :2]), 1)
+    return mean, covariance
+
+
+def _turned(point: Floats, angles: Floats) -> Floats:
+    """A point (2) of a robot's frame, seen from robots with these headings (n): (n, 2)."""
+    cos, sin = np.cos(angles), np.sin(angles)
+    return np.column_stack([cos * point[0] - sin * point[1], sin * point[0] + cos * point[1]])
+
+
+def _unwrapped(angles: Floats) -> Floats:
+    wrapped: Floats = (angles + np.pi) % (2.0 * np.pi) - np.pi
+    return wrapped
