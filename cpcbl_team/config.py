@@ -134,8 +134,8 @@ class CameraSettings(Table, frozen=True, kw_only=True):
     """
 
     frames: str = ""
-    """A device's number, a video file, a folder of pictures, a URL (RTSP, HTTP); empty: they come
-    as messages, `in/<robot>/frame`."""
+    """A device's number, a URL (RTSP, HTTP), a video file or a folder of pictures, relative to the
+    team file; empty: they come as messages, `in/<robot>/frame`."""
     width_px: Annotated[int, msgspec.Meta(ge=16, le=8192)] = 640
     height_px: Annotated[int, msgspec.Meta(ge=16, le=8192)] = 480
     fx_px: Positive = 400.0
@@ -159,6 +159,12 @@ class CameraSettings(Table, frozen=True, kw_only=True):
     """How well the direction is known: added to the sigma of every bearing."""
     focal_share: NotNegative = 0.005
     """How well the focal length is known, as a share of it: added to the sigma of every range."""
+
+    @property
+    def live(self) -> bool:
+        """Whether frames come from a device or a URL; not played, not as messages."""
+        where = self.frames
+        return where.isdecimal() or "://" in where or where.startswith("/dev/")
 
 
 class Colour(Table, frozen=True, kw_only=True):
@@ -510,6 +516,12 @@ class Team(Table, frozen=True, kw_only=True):
     def simulated(self) -> bool:
         """Whether the team needs a simulated field."""
         return any(robot.source == "simulated" for robot in self.robots.values())
+
+    @property
+    def renders(self) -> bool:
+        """Whether the simulated field must make pictures."""
+        robots = self.robots.values()
+        return any(r.source == "simulated" and r.sensing == "camera" for r in robots)
 
     def messages_per_s(self, robot: str) -> float | None:
         """The rate at which a robot earns its share of the match's messages; None: no limit."""

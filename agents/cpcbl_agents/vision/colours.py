@@ -1,0 +1,103 @@
+"""Blobs of one colour in a frame, by the thresholds of the team file."""
+
+from collections.abc import Iterable, Iterator, Sequence
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+from cpcbl_agents.vision.camera import Floats, Pixels
+from cpcbl_agents.vision.panorama import Panorama
+from cpcbl_team.config import Colour
+
+BITS = 8  # colours that are told apart in one go
+MOST_BLOBS = 30  # of a colour; the largest
+LEAST_PX = 2  # high and wide
+STRAY = 0.04  # share of an outline that may stick out
+
+
+class Blob(NamedTuple):
+    """A patch of one colour; its extent is in columns and rows of the panorama."""
+
+    colour: str
+    left: float
+    top: float
+    right: float
+    bottom: float
+    outline: Floats
+    """Corners (4, 2) of the box around it in the frame, in pixels."""
+
+    @property
+    def width(self) -> float:
+        return self.right - self.left
+
+    @property
+    def height(self) -> float:
+        return self.bottom - self.top
+
+
+class Colours:
+    """Finds blobs of those colours that are looked for."""
+
+    def __init__(self, colours: dict[str, Colour], used: Iterable[str]) -> None:
+        names = sorted(set(used))
+        groups = [names[i : i + BITS] for i in range(0, len(names), BITS)]
+        self._groups = [(group, _table([colours[name] for name in group])) for group in groups]
+
+    def blobs(self, pixels: Pixels, panorama: Panorama) -> list[Blob]:
+        hsv = cv2.cvtColor(pixels, cv2.COLOR_BGR2HSV)
+        return [
+            _blob(name, outline, panorama)
+            for names, table in self._groups
+            for name, outline in _outlines(hsv, names, table)
+        ]
+
+
+def _table(colours: Sequence[Colour]) -> Pixels:
+    """For each hue, saturation and value, (256, 1, 3), the colours that it is good for, a bit each:
+    a pixel is of those whose bit all three have."""
+    table = np.zeros((256, 1, 3), np.uint8)
+    for bit, colour in enumerate(colours):
+        (first, last), *others = colour.hue, colour.saturation, colour.value
+        parts = [(first, last)] if first <= last else [(first, 179), (0, last)]
+        for channel, ranges in enumerate((parts, *([other] for other in others))):
+            for low, high in ranges:
+                table[low : high + 1, 0, channel] |= 1 << bit
+    return table
+
+
+def _outlines(
+    hsv: cv2.typing.MatLike, names: Sequence[str], table: Pixels
+) -> Iterator[tuple[str, cv2.typing.MatLike]]:
+    """The outer contours of each colour's blobs, the largest of them."""
+    hue, saturation, value = cv2.split(cv2.LUT(hsv, table))
+    bits = cv2.bitwise_and(cv2.bitwise_and(hue, saturation), value)
+    left, top, width, height = cv2.boundingRect(bits)
+    if not width:
+        return
+    bits = bits[top : top + height, left : left + width]
+    for bit, name in enumerate(names):
+        mask = bits & np.uint8(1 << bit)
+        found, _ = cv2.findContours(
+            mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE, offset=(left, top)
+        )
+        long = [outline for outline in found if len(outline) >= 2 * LEAST_PX]
+        if len(long) > MOST_BLOBS:
+            long = sorted(long, key=len)[-MOST_BLOBS:]
+        yield from ((name, o) for o in long if min(cv2.boundingRect(o)[2:]) >= LEAST_PX)
+
+
+def _blob(colour: str, outline: cv2.typing.MatLike, panorama: Panorama) -> Blob:
+    x, y = outline[:, 0, 0], outline[:, 0, 1]
+    columns, rows = np.sort(panorama.columns[y, x]), np.sort(panorama.rows[y, x])
+    stray = int(STRAY * len(x))
+    left, top, width, height = cv2.boundingRect(outline)
+    right, bottom = left + width - 1, top + height - 1
+    return Blob(
+        colour,
+        float(columns[stray]) - 0.5,
+        float(rows[stray]) - 0.5,
+        float(columns[-1 - stray]) + 0.5,
+        float(rows[-1 - stray]) + 0.5,
+        np.array([[left, top], [right, top], [right, bottom], [left, bottom]], dtype=np.float64),
+    )

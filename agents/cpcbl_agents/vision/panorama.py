@@ -1,0 +1,153 @@
+"""The frame, unrolled: columns are azimuths, rows are slopes, whatever the tilt, roll and lens.
+
+What stands upright is upright here: the sides of a cylinder are columns, and a height z at the
+distance d from the lens is the row (lens - z) / d. So edges can be averaged along columns and rows.
+"""
+
+import math
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from cpcbl_agents.vision.camera import Camera, Floats, Pixels
+
+STEEPEST = 4.0  # slopes: what is farther below or above than this is not unrolled
+WIDEST_RAD = math.radians(85.0)  # to each side of the camera's yaw
+MARGIN_PX = 2.0
+LEAST_SCALE = 0.1
+FOLD_PX = 0.5  # a lens model that folds back does not come back to its pixel
+
+Map = NDArray[np.float32]
+
+
+class Box(NamedTuple):
+    """A part of the panorama: columns and rows, first and behind the last."""
+
+    left: int
+    top: int
+    right: int
+    bottom: int
+
+
+class Scale(NamedTuple):
+    """Pixels of the frame per column and per row of the panorama."""
+
+    across_px: float
+    along_px: float
+
+
+class Panorama:
+    """The maps between one camera's pixels and its panorama.
+
+    Column 0 and row 0 are at (`first_azimuth`, `first_slope`), one step is about a pixel at the
+    optical axis. Azimuths are to the right of the camera's yaw, slopes are downwards.
+    """
+
+    def __init__(self, camera: Camera) -> None:
+        self._camera = camera
+        self._yaw = math.radians(camera.settings.yaw_deg)
+        self.step = 1.0 / camera.settings.fx_px
+        width, height = camera.size_px
+        azimuths, slopes = self._unrolled(_grid(width, height))
+        seen = (np.abs(slopes) < STEEPEST) & (np.abs(azimuths) < WIDEST_RAD)
+        self.first_azimuth = float(azimuths[seen].min())
+        self.first_slope = float(slopes[seen].min())
+        self.columns = self._placed(azimuths - self.first_azimuth, height, width)
+        """Of each pixel (height, width)."""
+        self.rows = self._placed(slopes - self.first_slope, height, width)
+        last_column = math.ceil(float(azimuths[seen].max() - self.first_azimuth) / self.step)
+        last_row = math.ceil(float(slopes[seen].max() - self.first_slope) / self.step)
+        self.size = last_column + 1, last_row + 1
+        """(columns, rows)."""
+        self.x, self.y = self._pixels()
+
+    def azimuth(self, column: float) -> float:
+        """Rad, to the right of the camera's yaw."""
+        return self.first_azimuth + column * self.step
+
+    def slope(self, row: float) -> float:
+        """Way down by way ahead."""
+        return self.first_slope + row * self.step
+
+    def bearing(self, azimuth: float) -> float:
+        """Rad, to the left of the robot's front, not wrapped."""
+        return self._yaw - azimuth
+
+    def cut(self, pixels: Pixels, box: Box) -> Pixels:
+        """A part of the panorama, (rows, columns, 3); black outside of the frame."""
+        part = slice(box.top, box.bottom), slice(box.left, box.right)
+        cut = cv2.remap(pixels, self.x[part], self.y[part], cv2.INTER_LINEAR)
+        return cut.astype(np.uint8, copy=False)
+
+    def clipped(self, left: float, top: float, right: float, bottom: float) -> Box:
+        """The box around these columns and rows, as far as there is a panorama."""
+        columns, rows = self.size
+        return Box(
+            max(0, math.floor(left)),
+            max(0, math.floor(top)),
+            min(columns, math.ceil(right) + 1),
+            min(rows, math.ceil(bottom) + 1),
+        )
+
+    def at_border(self, column: float, row: float, margin_px: float) -> bool:
+        """Whether a place of the panorama is at the frame's border, or beyond it."""
+        columns, rows = self.size
+        if not (0.0 <= row <= rows - 1 and 0.0 <= column <= columns - 1):
+            return True  # NaN too
+        x, y = self.x[round(row), round(column)], self.y[round(row), round(column)]
+        width, height = self._camera.size_px
+        return not (
+            margin_px <= x + 0.5 <= width - margin_px and margin_px <= y + 0.5 <= height - margin_px
+        )
+
+    def scale(self, column: float, row: float) -> Scale:
+        """How large the frame is about a place."""
+        columns, rows = self.size
+        i = min(max(round(row), 1), rows - 2)
+        j = min(max(round(column), 1), columns - 2)
+        x, y = self.x, self.y
+        across = math.hypot(x[i, j + 1] - x[i, j - 1], y[i, j + 1] - y[i, j - 1])
+        along = math.hypot(x[i + 1, j] - x[i - 1, j], y[i + 1, j] - y[i - 1, j])
+        return Scale(max(0.5 * across, LEAST_SCALE), max(0.5 * along, LEAST_SCALE))
+
+    def _unrolled(self, pixels: Floats) -> tuple[Floats, Floats]:
+        """Azimuths and slopes (n,) of pixels (n, 2)."""
+        rays = self._camera.rays(pixels)
+        azimuths = self._yaw - np.arctan2(rays[:, 1], rays[:, 0])
+        azimuths = np.remainder(azimuths + math.pi, math.tau) - math.pi
+        return azimuths, -rays[:, 2] / np.maximum(np.hypot(rays[:, 0], rays[:, 1]), 1e-9)
+
+    def _placed(self, angles: Floats, height: int, width: int) -> Map:
+        return (angles / self.step).reshape(height, width).astype(np.float32)
+
+    def _pixels(self) -> tuple[Map, Map]:
+        """The pixel (x, y) of each place of the panorama, each (rows, columns)."""
+        columns, rows = self.size
+        places = _grid(columns, rows)
+        bearings = self._yaw - (self.first_azimuth + places[:, 0] * self.step)
+        down = self.first_slope + places[:, 1] * self.step
+        points = np.column_stack([np.cos(bearings), np.sin(bearings), -down])
+        pixels = self._camera.project(points + self._camera.position)
+        width, height = self._camera.size_px
+        outside = ~(
+            (pixels > -MARGIN_PX).all(axis=1)
+            & (pixels[:, 0] < width + MARGIN_PX)
+            & (pixels[:, 1] < height + MARGIN_PX)
+        )
+        pixels[outside] = -9.0
+        azimuths, slopes = self._unrolled(pixels)
+        off = np.hypot(
+            (azimuths - self.first_azimuth) / self.step - places[:, 0],
+            (slopes - self.first_slope) / self.step - places[:, 1],
+        )
+        pixels[off > FOLD_PX] = -9.0
+        x, y = pixels.astype(np.float32).T.reshape(2, rows, columns)
+        return np.ascontiguousarray(x), np.ascontiguousarray(y)
+
+
+def _grid(width: int, height: int) -> Floats:
+    """All (x, y) of a picture, row by row: (width * height, 2)."""
+    y, x = np.mgrid[:height, :width]
+    return np.column_stack([x.ravel(), y.ravel()]).astype(np.float64)
