@@ -5,9 +5,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 import cv2
+import numpy as np
 
 from cpcbl_agents.vision.camera import Pixels
-from cpcbl_agents.vision.pictures import decoded
 
 PICTURES = (".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp")
 VIDEOS = (".avi", ".m4v", ".mkv", ".mov", ".mp4", ".webm")
@@ -55,10 +55,13 @@ def read_pictures(
 def read_picture(file: Path) -> Picture:
     """One picture, or why there is none."""
     try:
-        pixels = decoded(file.read_bytes())
+        image = np.frombuffer(file.read_bytes(), np.uint8)
     except OSError as error:
         return Picture(file.name, error.strerror or "cannot be read")
-    return Picture(file.name, "no picture" if isinstance(pixels, str) else pixels)
+    pixels = cv2.imdecode(image, cv2.IMREAD_COLOR) if image.size else None
+    return Picture(
+        file.name, "no picture" if pixels is None else pixels.astype("uint8", copy=False)
+    )
 
 
 def _frames(file: Path, every_s: float) -> Iterator[Picture]:
