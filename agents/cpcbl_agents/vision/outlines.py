@@ -16,6 +16,7 @@ from cpcbl_agents.vision.panorama import Panorama
 from cpcbl_agents.vision.silhouette import FOOT, TOP, WIDTH
 from cpcbl_team.config import Bands
 
+MOST_CANDIDATES = 32
 GAP_PX, GAP_SHARE = 2.5, 0.15  # between the bands, of the lower height
 OVERLAP_SHARE = 1.0  # with something of its colour beside it, a blob goes farther up or down
 LEAST_OVERLAP = 0.5  # of the narrower band
@@ -92,12 +93,14 @@ class Patch(NamedTuple):
 
 
 def candidates(blobs: Sequence[Blob]) -> list[Candidate]:
-    """All pairs of touching blobs of two colours that might be the bands of a cylinder."""
-    return [
+    """The pairs of touching blobs of two colours that might be the bands of a cylinder; of very
+    many the highest, so that no picture takes for ever."""
+    pairs = [
         Candidate(upper, lower)
         for upper, lower in itertools.permutations(blobs, 2)
         if upper.colour != lower.colour and _stacked(upper, lower)
     ]
+    return sorted(pairs, key=lambda pair: -pair.height)[:MOST_CANDIDATES]
 
 
 def _stacked(upper: Blob, lower: Blob) -> bool:
