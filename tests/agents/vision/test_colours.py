@@ -17,7 +17,8 @@ PANORAMA = Panorama(Camera(SETTINGS))
 
 def bgr(hue: int, saturation: int = 200, value: int = 200) -> Pixels:
     hsv = np.array([[[hue, saturation, value]]], np.uint8)
-    return cv2.cvtColor(hsv, cv2.COLOR_HSV2BGR)[0, 0].astype(np.uint8)
+    pixel: Pixels = cv2.cvtColor(hsv, cv2.COLOR_HSV2BGR)[0, 0].astype(np.uint8)
+    return pixel
 
 
 def frame(*boxes: tuple[int, int, int, int, int]) -> Pixels:
