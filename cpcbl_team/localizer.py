@@ -342,30 +342,34 @@ class Localizer:
                 return self._judged(state)
         if nis > self._gates[1]:
             return self._judged(self._updated(state, prior, None, [], 1))
+        estimate = self._with_position(prior, seen, observed=said.observer is not None)
+        heading = said.of_heading(estimate.pose)
+        used, refused = [source], 0
+        if heading is not None:
+            if heading.normalized_innovation_squared(estimate.covariance) <= self._gates[0]:
+                estimate = self._with_heading(estimate, heading)
+            else:
+                # The position is kept, for a marker is sooner seen askew than elsewhere. Still the
+                # word counts as refused: a robot that looks elsewhere shall find that it is lost.
+                used, refused = [], 1
+                state = replace(state, memory=state.memory.counted("heading_gated"))
+        return self._judged(self._updated(state, self._reduced(estimate), None, used, refused))
+
+    def _with_position(self, prior: Estimate, seen: Observation, observed: bool) -> Estimate:
+        """The estimate after a teammate (or nobody else) observed the position."""
         scope = POSE if self._joint else POSITION
         if self._weighted:
             x, y = seen.residuals
-            estimate = weighted.averaged(prior, (x, y), None, self._rules.weights)
-        elif said.observer is None:
-            estimate = merge(prior, seen.information(), scope)
-        else:
-            estimate = self._merge_teammate(prior, seen, scope)
-        estimate, refused = self._turned(estimate, said)
-        state = self._updated(state, self._reduced(estimate), None, [source], len(refused))
-        return self._judged(replace(state, memory=state.memory.counted(*refused)))
+            return weighted.averaged(prior, (x, y), None, self._rules.weights)
+        if observed:
+            return self._merge_teammate(prior, seen, scope)
+        return merge(prior, seen.information(), scope)
 
-    def _turned(self, estimate: Estimate, said: Whereabouts) -> tuple[Estimate, tuple[str, ...]]:
-        """The estimate with the heading that is told, if any; what is counted if the gate refuses
-        that. It is judged apart from the position: a marker is more often turned than misplaced."""
-        seen = said.of_heading(estimate.pose)
-        if seen is None:
-            return estimate, ()
-        if seen.normalized_innovation_squared(estimate.covariance) > self._gates[0]:
-            return estimate, ("heading_gated",)
+    def _with_heading(self, prior: Estimate, seen: Observation) -> Estimate:
+        """The estimate after a teammate observed the heading."""
         if self._weighted:
-            (offset,), weights = seen.residuals, self._rules.weights
-            return weighted.averaged(estimate, (0.0, 0.0), offset, weights), ()
-        return self._merge_teammate(estimate, seen, POSE if self._joint else HEADING), ()
+            return weighted.averaged(prior, (0.0, 0.0), seen.residuals[0], self._rules.weights)
+        return self._merge_teammate(prior, seen, POSE if self._joint else HEADING)
 
     def _noted(self, state: State, said: Whereabouts) -> State:
         """With this as evidence of where the robot is, unless its sender is in quarantine."""
