@@ -91,6 +91,16 @@ class Panorama:
             min(rows, math.ceil(bottom) + 1),
         )
 
+    def corners(self, left: float, top: float, right: float, bottom: float) -> Floats:
+        """The pixels (4, 2) of a box of the panorama, as far as they are in the frame."""
+        columns, rows = self.size
+        places = ((left, top), (right, top), (right, bottom), (left, bottom))
+        i = [min(max(round(row), 0), rows - 1) for _, row in places]
+        j = [min(max(round(column), 0), columns - 1) for column, _ in places]
+        width, height = self._camera.size_px
+        pixels = np.column_stack([self.x[i, j], self.y[i, j]]).astype(np.float64)
+        return pixels.clip(0.0, (width - 1.0, height - 1.0))
+
     def at_border(self, column: float, row: float, margin_px: float) -> bool:
         """Whether a place of the panorama is at the frame's border, or beyond it."""
         columns, rows = self.size

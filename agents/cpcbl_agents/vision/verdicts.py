@@ -9,6 +9,7 @@ import math
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
+from cpcbl_agents.vision.camera import Floats
 from cpcbl_agents.vision.silhouette import FOOT, MID, TOP, WIDTH, Fit, Shape, fit, looks
 
 WHOLE = (TOP, MID, FOOT, WIDTH)
@@ -22,14 +23,16 @@ ANY_TILT_RAD = 10.0
 
 class Look(NamedTuple):
     """What a camera sees of something with two bands, as angles: the azimuth of its middle; top,
-    mid, foot and half width as in `silhouette`, with their sigmas; which of the four are whole,
-    as far as one can tell; and whether the frame's border cuts it."""
+    mid, foot and half width as in `silhouette`, with their sigmas; its corners (4, 2) in the frame;
+    which of the four are known to be hidden; whether the frame's border is what `cut` them.
+    """
 
     azimuth: float
     seen: tuple[float, float, float, float]
     sigmas: tuple[float, float, float, float]
     tilt_sigma: float
-    whole: frozenset[int] = frozenset(WHOLE)
+    outline: Floats
+    hidden: frozenset[int] = frozenset()
     cut: bool = False
 
 
@@ -51,12 +54,12 @@ def verdict(shape: Shape, look: Look, leniency: float = 1.0) -> Verdict | None:
 
     With a leniency of more than 1: what might be.
     """
-    if look.whole.issuperset(WHOLE):
+    if not look.hidden:
         whole = _fit(shape, look, WHOLE)
         if whole.chi2 <= leniency * WHOLE_GATE:
             return _verdict(shape, look, whole, None)
     for use, hidden in PARTS:
-        if look.whole.issuperset(use):
+        if look.hidden.isdisjoint(use):
             part = _fit(shape, look, use)
             if part.chi2 <= leniency * PART_GATE and not _sticks_out(shape, look, part, hidden):
                 return _verdict(shape, look, part, hidden)
@@ -73,7 +76,7 @@ def reason(shape: Shape, lens_m: float, look: Look) -> str:
     """Why it is not of this shape, or not surely."""
     if look.cut:
         return "cut_by_frame"
-    if len(look.whole) < len(WHOLE):
+    if look.hidden:
         return "wrong_shape"
     free = fit(shape, look.seen, look.sigmas, ANY_TILT_RAD, WHOLE)
     if free.chi2 > WHOLE_GATE:
@@ -95,8 +98,6 @@ def _fit(shape: Shape, look: Look, use: Sequence[int]) -> Fit:
 def _sticks_out(shape: Shape, look: Look, part: Fit, hidden: int) -> bool:
     """Whether what should be hidden reaches beyond where it would be seen."""
     seen = look.seen[hidden]
-    if math.isnan(seen):
-        return True
     expected = looks(shape, part.distance)
     farther = looks(shape, part.distance + part.sigma)
     outward = -1.0 if hidden == TOP else 1.0
