@@ -26,11 +26,11 @@ check: setup
 	PYTHONPATH=.:agents:transport:launch $(BIN)/lint-imports --no-cache
 
 unit: setup
-	$(BIN)/pytest -n 2 -m "not long and not log and not docker"
+	$(BIN)/pytest -n 2 -m "not long and not log and not pictures and not docker"
 
-# Minutes long; with CPCBL_MRCLAM=folder also on real logs.
+# Minutes long; with CPCBL_MRCLAM=folder also on real logs, with CPCBL_PICTURES=folder real pictures.
 test-long: setup
-	$(BIN)/pytest -n 2 -m "$(if $(CPCBL_MRCLAM),long or log,long)"
+	$(BIN)/pytest -n 2 -m "long$(if $(CPCBL_MRCLAM), or log)$(if $(CPCBL_PICTURES), or pictures)"
 
 # Needs a Docker daemon: docker/dockerd.sh start. One at a time: containers share the machine.
 test-docker: setup

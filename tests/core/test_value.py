@@ -20,6 +20,7 @@ from cpcbl_team.value import (
     LOST_SIGMA_M,
     USUAL_HEADING_SIGMA_RAD,
     Helped,
+    Turned,
     expected,
     expected_heading,
     heading_worth,
@@ -262,10 +263,10 @@ def test_the_observers_own_heading_is_told_once(prior: float, observer: float) -
 def test_a_heading_is_news_again_after_a_way_but_no_more_than_at_first(
     left: float, a: float, b: float
 ) -> None:
-    helped = Helped(1.0, 2.0, NOTHING, min(left, USUAL))
-    near, far = (expected_heading(GOOD, helped, 1.0 + way, 2.0) for way in sorted((a, b)))
-    assert helped.heading_variance <= near <= far <= expected_heading(GOOD, None, 1.0, 2.0)
-    assert expected_heading(LOWEST_TIER, helped, 1.0, 2.0) > USUAL
+    told = Turned(1.0, 2.0, min(left, USUAL))
+    near, far = (expected_heading(GOOD, told, 1.0 + way, 2.0) for way in sorted((a, b)))
+    assert told.variance <= near <= far <= expected_heading(GOOD, None, 1.0, 2.0)
+    assert expected_heading(LOWEST_TIER, told, 1.0, 2.0) > USUAL
 
 
 def test_a_heading_is_news_after_a_metre_or_two() -> None:
@@ -273,7 +274,7 @@ def test_a_heading_is_news_after_a_metre_or_two() -> None:
     said = headed(math.radians(3.0) ** 2, math.radians(1.0) ** 2)
     left, gained = USUAL, []
     for way in (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 2.0):
-        prior = expected_heading(GOOD, Helped(way, 0.0, NOTHING, left), 0.0, 0.0)
+        prior = expected_heading(GOOD, Turned(way, 0.0, left), 0.0, 0.0)
         left = merged_heading(prior, said, "split-ci")
         gained.append(heading_worth(prior, left))
     assert gained[0] > 1.0

@@ -85,12 +85,23 @@ class Markers:
         sides = steps(grey, rough, self._codes.cells)
         exact = corners(sides)
         plane = corners(self._camera.undistorted(sides.reshape(-1, 2)).reshape(sides.shape))
-        marks = [
-            Mark(code.id, np.roll(quad, -code.first, axis=0), np.roll(flat, -code.first, axis=0))
-            for code, quad, flat in zip(codes.values(), exact, plane, strict=True)
-        ]
+        marks = []
+        for code, quad, flat in zip(codes.values(), exact, plane, strict=True):
+            first = code.first + self._upside_down(np.roll(flat, -code.first, axis=0))
+            marks.append(
+                Mark(code.id, *(np.roll(points, -first, axis=0) for points in (quad, flat)))
+            )
         moved = np.abs(exact - rough).max(axis=(1, 2))
         return [marks[i] for i in moved.argsort() if moved[i] < FAR_PX]
+
+    def _upside_down(self, plane: Floats) -> int:
+        """By how many corners a marker has to be turned to stand upright: 2, or 0.
+
+        Before version 5, OpenCV's AprilTags are upside down beside those of the AprilTag library
+        (opencv/opencv#28823); robots are not.
+        """
+        heights = np.column_stack([plane, np.ones(4)]) @ self._camera.robot_from_camera[2]
+        return 2 if heights[:2].sum() < heights[2:].sum() else 0
 
     def _placed(self, name: str, sides: Mapping[Side, Mark]) -> Glimpses:
         """A teammate by the markers that are seen of it."""
