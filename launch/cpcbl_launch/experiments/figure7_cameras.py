@@ -2,7 +2,7 @@
 
 The field, its circuit, the odometry and what helps whom are those of `figure7`; landmarks are
 cylinders of two colours, robots carry markers and masts. The navigator's camera is a cheap one of a
-wide angle that shakes, and its focal length is not well known; the observer's is a sharper one. Both
+wide angle that shakes, its focal length not well known; the observer's is a sharper one. Both
 are as badly known as their settings say (`simulation/cameras.py`).
 """
 
