@@ -25,7 +25,7 @@ from cpcbl_team.inputs import Odometry, Position, Sightings
 from cpcbl_team.metrics import Floats
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus
-from cpcbl_transport.messages import Message, Refusal, Truths, refusal
+from cpcbl_transport.messages import Look, Message, Refusal, Truths, refusal
 from cpcbl_transport.reading import read
 
 log = logging.getLogger(__name__)
@@ -111,7 +111,7 @@ def read_recording(path: Path) -> Recorded:
             messages = [
                 (channel.topic, _decoder.decode(message.data))
                 for _, channel, message in reader.iter_messages()
-                if channel.topic.startswith(("in/", topics.TRUTH.key))
+                if channel.topic.startswith(("in/", "look/", topics.TRUTH.key))
             ]
         if not attached:
             raise LogError(f"{path}: holds no team: not a recording of `up --record`")
@@ -129,4 +129,7 @@ def _inputs(messages: Iterable[tuple[str, Message]]) -> dict[str, list[SensorInp
     for key, message in messages:
         if isinstance(message, Odometry | Sightings | Position):
             inputs.setdefault(key.split("/")[1], []).append(message)
+        elif isinstance(message, Look):  # what the robot's eyes found in a frame
+            seen = Sightings(message.stamp_ns, message.found)
+            inputs.setdefault(key.split("/")[1], []).append(seen)
     return inputs
