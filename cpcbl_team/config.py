@@ -134,8 +134,8 @@ class CameraSettings(Table, frozen=True, kw_only=True):
     """
 
     frames: str = ""
-    """A device's number, a video file, a folder of pictures, a URL (RTSP, HTTP); empty: they come
-    as messages, `in/<robot>/frame`."""
+    """A device's number, a URL (RTSP, HTTP), a video file or a folder of pictures, relative to the
+    team file; empty: they come as messages, `in/<robot>/frame`."""
     width_px: Annotated[int, msgspec.Meta(ge=16, le=8192)] = 640
     height_px: Annotated[int, msgspec.Meta(ge=16, le=8192)] = 480
     fx_px: Positive = 400.0
@@ -159,6 +159,12 @@ class CameraSettings(Table, frozen=True, kw_only=True):
     """How well the direction is known: added to the sigma of every bearing."""
     focal_share: NotNegative = 0.005
     """How well the focal length is known, as a share of it: added to the sigma of every range."""
+
+    @property
+    def live(self) -> bool:
+        """Whether frames come from a device or a URL; not played, not as messages."""
+        where = self.frames
+        return where.isdecimal() or "://" in where or where.startswith("/dev/")
 
 
 class Colour(Table, frozen=True, kw_only=True):

@@ -5,7 +5,7 @@ from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator
 from typing import Protocol
 
-from cpcbl_agents.agent import Listened, Presence, Sent, Stranger, Tick
+from cpcbl_agents.agent import Listened, Looked, Presence, Sent, Stranger, Tick
 from cpcbl_agents.clocks import Clocks
 from cpcbl_agents.robot import Robot
 from cpcbl_agents.tally import Tallies
@@ -21,6 +21,7 @@ from cpcbl_transport.messages import (
     LARGEST_PAYLOAD,
     Drive,
     Frame,
+    Look,
     Message,
     Refusal,
     Status,
@@ -79,7 +80,7 @@ class Node:
         self._news: deque[tuple[str, bool]] = deque(maxlen=INBOX)
         self._wiring = Wiring(robot.name, incarnation, rules, bus, self._arrived, self._seen_alive)
         self._tokens = Tokens()
-        self._listened = ""
+        self._listened, self._looked = "", False
         self._status_ns = start_ns
         self.counts: Counter[str] = Counter()
         self.heard = Tallies()
@@ -131,6 +132,7 @@ class Node:
         if self._frames:
             self._take(*self._frames.popleft(), now_ns)
         self._ask_for_listeners(now_ns)
+        self._ask_for_lookers(now_ns)
         said = self._robot.handle(Tick(), now_ns)
         for name in self._wiring.follow(self._robot.collaboration):
             self._tokens.forget(name)
@@ -167,6 +169,15 @@ class Node:
         if listened != self._listened:  # to another key others may listen
             self._listened = listened
             self._robot.handle(Listened(bool(listened)), now_ns)
+
+    def _ask_for_lookers(self, now_ns: int) -> None:
+        if not self._robot.sensing.has_eyes:
+            return
+        key = topics.LOOK.at(robot=self._name)
+        looked = self._wiring.publisher(topics.LOOK, key).matching
+        if looked is not self._looked:
+            self._looked = looked
+            self._robot.handle(Looked(looked), now_ns)
 
     def _accepted(self, key: str, payload: bytes, now_ns: int) -> Message | None:
         helps = key.startswith(("belief/", "fix/"))
@@ -223,6 +234,8 @@ class Node:
                 return topics.FIX, key
             case Track():
                 return topics.TRACK, topics.TRACK.at(robot=me)
+            case Look():
+                return topics.LOOK, topics.LOOK.at(robot=me)
             case Drive():
                 return topics.DRIVE, topics.DRIVE.at(robot=me)
         raise TypeError(f"robots do not send {type(message).__name__}")

@@ -15,7 +15,7 @@ from cpcbl_launch.commands.measuring import evaluate_mrclam, simulate
 from cpcbl_launch.commands.observing import observer
 from cpcbl_launch.commands.running import check, field, robot, router, up
 from cpcbl_launch.commands.securing import keys
-from cpcbl_launch.commands.watching import traffic
+from cpcbl_launch.commands.watching import look, traffic
 
 app = typer.Typer(
     help="A team of robots that find out where they are, together.",
@@ -24,7 +24,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 for command in (
-    *(check, keys, up, traffic, robot, observer, router, field, compose),
+    *(check, keys, up, traffic, look, robot, observer, router, field, compose),
     *(simulate, chaos),
 ):
     app.command()(command)

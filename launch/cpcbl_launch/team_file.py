@@ -82,11 +82,23 @@ def load_team(path: Path) -> Team:
             return msgspec.json.decode(text, type=Team)
         except msgspec.MsgspecError as error:
             raise TeamFileError(f"{path}: {error}") from error
-    team = parse_team(text, str(path))
+    team = _with_frames_beside(parse_team(text, str(path)), path)
     if not team.transport.secured:
         return team
     transport = msgspec.structs.replace(team.transport, keys=str(key_folder(team, path)))
     return msgspec.structs.replace(team, transport=transport)
+
+
+def _with_frames_beside(team: Team, path: Path) -> Team:
+    """The videos and folders of cameras are relative to the file."""
+    robots = dict(team.robots)
+    for name, robot in team.robots.items():
+        camera = robot.camera
+        if camera.frames and not camera.live:
+            there = str((path.parent / camera.frames).absolute())
+            camera = msgspec.structs.replace(camera, frames=there)
+            robots[name] = msgspec.structs.replace(robot, camera=camera)
+    return msgspec.structs.replace(team, robots=robots)
 
 
 def key_folder(team: Team, path: Path) -> Path:
@@ -234,6 +246,9 @@ def _vision_problems(team: Team) -> Iterator[str]:
     known = ", ".join(team.vision.colours)
     bands = {f"map.landmarks.{n}": m.colours for n, m in team.map.landmarks.items()}
     bands.update({f"robots.{n}": r.colours for n, r in team.robots.items()})
+    for name, robot in team.robots.items():
+        if robot.source == "simulated" and robot.camera.frames:
+            yield f"robots.{name}.camera.frames: simulated frames are the field's; remove the key"
     for key, colours in bands.items():
         for colour in set(colours or ()) - team.vision.colours.keys():
             yield f"{key}.colours: no colour {colour!r}; use one of {known}, or add its thresholds"

@@ -50,13 +50,14 @@ class Codes:
         self._most_wrong = int(WRONG_SHARE * self.dictionary.maxCorrectionBits)
         self._places = _places(self.cells)
 
-    def read(self, grey: Pixels, quads: Floats) -> list[Code | None]:
-        """What the quads (m, 4, 2) show, clockwise in the picture; None: no marker."""
-        if not len(quads):
-            return []
-        levels = sampled(grey, _laid(self._places, quads).reshape(len(quads), -1, 2))
-        levels = levels.reshape(len(quads), -1, len(_WITHIN)).mean(axis=2)
-        return [self._one(one.reshape(self.cells + 2, self.cells + 2)) for one in levels]
+    def read(self, grey: Pixels, quads: Floats) -> dict[int, Code]:
+        """What the quads (m, 4, 2) show, clockwise in the picture: by index, of those that are
+        markers."""
+        places = np.stack([_laid(self._places, quad) for quad in quads])
+        levels = sampled(grey, places).reshape(len(quads), -1, len(_WITHIN)).mean(axis=2)
+        size = self.cells + 2
+        codes = {i: self._one(one.reshape(size, size)) for i, one in enumerate(levels)}
+        return {i: code for i, code in codes.items() if code is not None}
 
     def _one(self, levels: Floats) -> Code | None:
         """The code in the levels of a marker's cells and the ring around it."""
@@ -78,16 +79,11 @@ def _places(cells: int) -> Floats:
     return cell.reshape(-1, 2)
 
 
-def _laid(places: Floats, quads: Floats) -> Floats:
-    """Places (n, 2) of the unit square, seen within each of the quads: (m, n, 2)."""
-    return np.stack(
-        [
-            cv2.perspectiveTransform(
-                places[None], cv2.getPerspectiveTransform(_CORNERS, quad.astype(np.float32))
-            )[0]
-            for quad in quads
-        ]
-    )
+def _laid(places: Floats, quad: Floats) -> Floats:
+    """Places (n, 2) of the unit square, seen within a quad."""
+    laid = cv2.getPerspectiveTransform(_CORNERS, quad.astype(np.float32))
+    seen: Floats = cv2.perspectiveTransform(places[None], laid)[0].astype(np.float64, copy=False)
+    return seen
 
 
 def _ring(levels: Floats) -> Floats:

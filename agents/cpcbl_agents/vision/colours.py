@@ -1,6 +1,6 @@
 """Blobs of one colour in a frame, by the thresholds of the team file."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from typing import NamedTuple
 
 import cv2
@@ -10,6 +10,7 @@ from cpcbl_agents.vision.camera import Floats, Pixels
 from cpcbl_agents.vision.panorama import Panorama
 from cpcbl_team.config import Colour
 
+BITS = 8  # colours that are told apart in one go
 MOST_BLOBS = 30  # of a colour; the largest
 LEAST_PX = 2  # high and wide
 STRAY = 0.04  # share of an outline that may stick out
@@ -39,38 +40,51 @@ class Colours:
     """Finds blobs of those colours that are looked for."""
 
     def __init__(self, colours: dict[str, Colour], used: Iterable[str]) -> None:
-        self._bounds = {name: tuple(_bounds(colours[name])) for name in sorted(set(used))}
+        names = sorted(set(used))
+        groups = [names[i : i + BITS] for i in range(0, len(names), BITS)]
+        self._groups = [(group, _table([colours[name] for name in group])) for group in groups]
 
     def blobs(self, pixels: Pixels, panorama: Panorama) -> list[Blob]:
         hsv = cv2.cvtColor(pixels, cv2.COLOR_BGR2HSV)
         return [
             _blob(name, outline, panorama)
-            for name, bounds in self._bounds.items()
-            for outline in _outlines(hsv, bounds)
+            for names, table in self._groups
+            for name, outline in _outlines(hsv, names, table)
         ]
 
 
-Bounds = tuple[tuple[tuple[int, int, int], tuple[int, int, int]], ...]
+def _table(colours: Sequence[Colour]) -> Pixels:
+    """For each hue, saturation and value, (256, 1, 3), the colours that it is good for, a bit each:
+    a pixel is of those whose bit all three have."""
+    table = np.zeros((256, 1, 3), np.uint8)
+    for bit, colour in enumerate(colours):
+        (first, last), *others = colour.hue, colour.saturation, colour.value
+        parts = [(first, last)] if first <= last else [(first, 179), (0, last)]
+        for channel, ranges in enumerate((parts, *([other] for other in others))):
+            for low, high in ranges:
+                table[low : high + 1, 0, channel] |= 1 << bit
+    return table
 
 
-def _bounds(colour: Colour) -> Iterator[tuple[tuple[int, int, int], tuple[int, int, int]]]:
-    """(from, to) in HSV; two of them for a colour whose hue goes through red."""
-    (first, last), (dull, bright), (dark, light) = colour.hue, colour.saturation, colour.value
-    parts = [(first, last)] if first <= last else [(first, 179), (0, last)]
-    for start, end in parts:
-        yield (start, dull, dark), (end, bright, light)
-
-
-def _outlines(hsv: cv2.typing.MatLike, bounds: Bounds) -> list[cv2.typing.MatLike]:
-    """The outer contours of a colour's blobs, the largest of them."""
-    mask = cv2.inRange(hsv, *bounds[0])
-    for more in bounds[1:]:
-        mask = cv2.bitwise_or(mask, cv2.inRange(hsv, *more))
-    found, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    long = [outline for outline in found if len(outline) >= 2 * LEAST_PX]
-    if len(long) > MOST_BLOBS:
-        long = sorted(long, key=len)[-MOST_BLOBS:]
-    return [outline for outline in long if min(cv2.boundingRect(outline)[2:]) >= LEAST_PX]
+def _outlines(
+    hsv: cv2.typing.MatLike, names: Sequence[str], table: Pixels
+) -> Iterator[tuple[str, cv2.typing.MatLike]]:
+    """The outer contours of each colour's blobs, the largest of them."""
+    hue, saturation, value = cv2.split(cv2.LUT(hsv, table))
+    bits = cv2.bitwise_and(cv2.bitwise_and(hue, saturation), value)
+    left, top, width, height = cv2.boundingRect(bits)
+    if not width:
+        return
+    bits = bits[top : top + height, left : left + width]
+    for bit, name in enumerate(names):
+        mask = bits & np.uint8(1 << bit)
+        found, _ = cv2.findContours(
+            mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE, offset=(left, top)
+        )
+        long = [outline for outline in found if len(outline) >= 2 * LEAST_PX]
+        if len(long) > MOST_BLOBS:
+            long = sorted(long, key=len)[-MOST_BLOBS:]
+        yield from ((name, o) for o in long if min(cv2.boundingRect(o)[2:]) >= LEAST_PX)
 
 
 def _blob(colour: str, outline: cv2.typing.MatLike, panorama: Panorama) -> Blob:

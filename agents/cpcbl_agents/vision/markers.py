@@ -18,6 +18,7 @@ from cpcbl_team.inputs import Sighting
 
 WINDOW_PX = 7  # of the adaptive threshold; one is enough, as what is found is refined
 LEAST_SIDE_PX = 6.0
+PASSES = 2  # until corners are exact enough to read between them
 MOST_MISFIT = 5.0  # mean squared error in sigmas, of a marker that stands where it should
 CLEAR_RAD = math.radians(10.0)
 """A heading that is known worse than that is left out."""
@@ -63,22 +64,31 @@ class Markers:
         return found
 
     def _marks(self, grey: Pixels) -> list[Mark]:
-        """Every marker of the family in a picture. OpenCV finds outlines; which of them are
-        markers is read between corners that are exact."""
+        """Every marker of the family in a picture, those that are outlined best first.
+
+        OpenCV finds outlines, of paper around a marker too; which of them are markers is read
+        between corners that are nearly exact.
+        """
         right, _, wrong = self._detector.detectMarkers(grey)
         quads = np.array([*right, *wrong], dtype=np.float64).reshape(-1, 4, 2)
         quads = quads[_least_sides(quads) > LEAST_SIDE_PX]
         if not len(quads):
             return []
-        for _ in range(2):
-            sides = steps(grey, quads, self._codes.cells)
-            quads = corners(sides)
+        for _ in range(PASSES):
+            quads = corners(steps(grey, quads, self._codes.cells))
+        codes = self._codes.read(grey, quads)
+        if not codes:
+            return []
+        rough = quads[list(codes)]
+        sides = steps(grey, rough, self._codes.cells)
+        exact = corners(sides)
         plane = corners(self._camera.undistorted(sides.reshape(-1, 2)).reshape(sides.shape))
-        return [
+        marks = [
             Mark(code.id, np.roll(quad, -code.first, axis=0), np.roll(flat, -code.first, axis=0))
-            for quad, flat, code in zip(quads, plane, self._codes.read(grey, quads), strict=True)
-            if code is not None
+            for code, quad, flat in zip(codes.values(), exact, plane, strict=True)
         ]
+        moved = np.abs(exact - rough).max(axis=(1, 2))
+        return [marks[i] for i in moved.argsort()]
 
     def _placed(self, name: str, sides: Mapping[Side, Mark]) -> Glimpses:
         """A teammate by the markers that are seen of it."""

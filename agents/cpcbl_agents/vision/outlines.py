@@ -11,8 +11,8 @@ import numpy as np
 
 from cpcbl_agents.vision.camera import Floats, Pixels
 from cpcbl_agents.vision.colours import Blob
-from cpcbl_agents.vision.profiles import NEAREST_PX, edge
 from cpcbl_agents.vision.panorama import Panorama
+from cpcbl_agents.vision.profiles import Profile
 from cpcbl_team.config import Bands
 
 GAP_PX, GAP_SHARE = 2.5, 0.15  # between the bands, of the lower height
@@ -100,8 +100,8 @@ def outlined(pixels: Pixels, panorama: Panorama, candidate: Candidate) -> list[O
     if min(patch.shape[:2]) < LEAST_PATCH_PX:
         return []
     middle, quarter = 0.5 * (left + right) - box.left, 0.25 * (right - left)
-    rows = _Profile(_mean(patch, middle - quarter, middle + quarter, axis=1), box.top)
-    mid = rows.edge(mid, 0.5 * min(upper.height, lower.height))
+    rows = Profile(_mean(patch, middle - quarter, middle + quarter, axis=1), box.top)
+    mid = _edge(rows, mid, 0.5 * min(upper.height, lower.height))
     if math.isnan(mid):
         return []
     top, foot = _ends(rows, upper.top, mid, lower.bottom)
@@ -109,8 +109,8 @@ def outlined(pixels: Pixels, panorama: Panorama, candidate: Candidate) -> list[O
     for start, end in ((upper.top, mid), (mid, lower.bottom)):
         inset = INSET * (end - start)
         part = _mean(patch, start + inset - box.top, end - inset - box.top, axis=0)
-        columns = _Profile(part, box.left)
-        sides.append((columns.edge(left, right - left), columns.edge(right, right - left)))
+        columns = Profile(part, box.left)
+        sides.append((_edge(columns, left, right - left), _edge(columns, right, right - left)))
     found = (
         Outline(left, right, top, mid, foot, frozenset())
         for left, right in _choices(sides[0], sides[1])
@@ -130,31 +130,24 @@ def _choices(upper: Sides, lower: Sides) -> Sequence[Sides]:
     return upper, lower
 
 
-class _Profile:
-    """Colours (n, 3) along a line, the first one at `start`."""
-
-    def __init__(self, colours: Floats, start: float) -> None:
-        self._colours, self._start = colours, start
-
-    def edge(self, guess: float, size: float) -> float:
-        """The edge about there, of something so large; NaN if there is none."""
-        found = edge(self._colours, guess - self._start, max(0.45 * size, NEAREST_PX), _reach(size))
-        return math.nan if found is None else found + self._start
+def _edge(line: Profile, guess: float, size: float) -> float:
+    """The edge about there, of something so large; NaN if there is none."""
+    return line.edge(guess, 0.45 * size, _reach(size))
 
 
-def _ends(rows: _Profile, top: float, mid: float, foot: float) -> tuple[float, float]:
+def _ends(rows: Profile, top: float, mid: float, foot: float) -> tuple[float, float]:
     """Top and foot. A band that is much higher than the other may go on in something of the same
     colour, such as its own reflection: its end is first looked for where it ought to be."""
     above, below = mid - top, foot - mid
     if above > UNEVEN * below + SLACK_PX:
-        nearer = rows.edge(mid - below, below)
-        top = rows.edge(top, above) if math.isnan(nearer) else nearer
-        return top, rows.edge(foot, below)
+        nearer = _edge(rows, mid - below, below)
+        top = _edge(rows, top, above) if math.isnan(nearer) else nearer
+        return top, _edge(rows, foot, below)
     if below > UNEVEN * above + SLACK_PX:
-        nearer = rows.edge(mid + above, above)
-        foot = rows.edge(foot, below) if math.isnan(nearer) else nearer
-        return rows.edge(top, above), foot
-    return rows.edge(top, above), rows.edge(foot, below)
+        nearer = _edge(rows, mid + above, above)
+        foot = _edge(rows, foot, below) if math.isnan(nearer) else nearer
+        return _edge(rows, top, above), foot
+    return _edge(rows, top, above), _edge(rows, foot, below)
 
 
 def _cut(panorama: Panorama, outline: "Outline") -> Iterator[str]:

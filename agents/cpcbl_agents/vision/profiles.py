@@ -4,6 +4,9 @@ At half of the way from the colour on the one side to that on the other: neither
 moves that, as they would the place where a threshold is passed.
 """
 
+import math
+from itertools import pairwise
+
 import numpy as np
 
 from cpcbl_agents.vision.camera import Floats
@@ -14,48 +17,52 @@ ROUNDS = 4
 SETTLED_PX = 0.1
 
 
-def edge(profile: Floats, guess: float, farthest: float, reach: float) -> float | None:
-    """The edge in a profile (n, 3) near `guess`, within `reach`; None if there is none.
+class Profile:
+    """Colours (n, 3) along a line, the first one at `start`, the next a step farther on."""
 
-    A side's colour is taken no farther from the edge than `farthest`. Positions are in steps, the
-    first sample is at 0.
-    """
-    at = guess
-    for _ in range(ROUNDS):
-        found = _crossing(profile, at, min(farthest, FARTHEST_PX), reach)
-        if found is None or abs(found - guess) > reach:
-            return None
-        if abs(found - at) < SETTLED_PX:
-            return found
-        at = found
-    return at
+    def __init__(self, colours: Floats, start: float) -> None:
+        self._colours, self._start = colours, start
+        self._sums = np.zeros((len(colours) + 1, 3))
+        np.cumsum(colours, axis=0, out=self._sums[1:])
 
+    def edge(self, guess: float, farthest: float, reach: float) -> float:
+        """The edge near `guess`, within `reach`; NaN if there is none.
 
-def _crossing(profile: Floats, at: float, farthest: float, reach: float) -> float | None:
-    """The place nearest to `at` where the profile is halfway between its colours at both sides."""
-    before = _mean(profile, at - farthest, at - NEAREST_PX)
-    behind = _mean(profile, at + NEAREST_PX, at + farthest)
-    if before is None or behind is None:
-        return None
-    way = behind - before
-    contrast = float(way @ way)
-    if contrast < LEAST_CONTRAST**2:
-        return None
-    first = max(0, int(at - reach - 1.0))
-    last = min(len(profile), int(at + reach + 3.0))
-    share = (profile[first:last] - before) @ way / contrast - 0.5
-    steps = np.flatnonzero((share[:-1] < 0.0) & (share[1:] >= 0.0))
-    if not len(steps):
-        return None
-    places = first + steps + share[steps] / (share[steps] - share[steps + 1])
-    nearest: float = places[np.argmin(np.abs(places - at))]
-    return float(nearest)
+        The colour of either side is taken no farther from the edge than `farthest`.
+        """
+        first = at = guess - self._start
+        farthest = min(max(farthest, NEAREST_PX), FARTHEST_PX)
+        for _ in range(ROUNDS):
+            last, at = at, self._crossing(at, farthest, reach)
+            if not abs(at - first) <= reach:  # NaN too
+                return math.nan
+            if abs(at - last) < SETTLED_PX:
+                break
+        return at + self._start
 
+    def _crossing(self, at: float, farthest: float, reach: float) -> float:
+        """The place nearest to `at` where it is halfway between its colours at both sides."""
+        before = self._mean(at - farthest, at - NEAREST_PX)
+        behind = self._mean(at + NEAREST_PX, at + farthest)
+        way = behind - before
+        contrast = float(way @ way)
+        if not contrast >= LEAST_CONTRAST**2:  # NaN too
+            return math.nan
+        first = max(0, int(at - reach - 1.0))
+        part = self._colours[first : int(at + reach + 3.0)]
+        shares = ((part - before) @ way / contrast).tolist()
+        places = [
+            first + i + (0.5 - a) / (b - a)
+            for i, (a, b) in enumerate(pairwise(shares))
+            if a < 0.5 <= b
+        ]
+        return min(places, key=lambda place: abs(place - at), default=math.nan)
 
-def _mean(profile: Floats, start: float, end: float) -> Floats | None:
-    """The mean colour of the samples between two places, of one at least."""
-    first, last = round(start), round(end)
-    if last < 0 or first >= len(profile):
-        return None
-    part: Floats = profile[max(first, 0) : last + 1].mean(axis=0)
-    return part
+    def _mean(self, start: float, end: float) -> Floats:
+        """The mean colour of the samples between two places, of one at least; NaN beyond both
+        ends."""
+        first, last = max(round(start), 0), min(round(end) + 1, len(self._colours))
+        if last <= first:
+            return np.full(3, math.nan)
+        mean: Floats = (self._sums[last] - self._sums[first]) / (last - first)
+        return mean

@@ -12,10 +12,10 @@ from typing import NamedTuple
 from cpcbl_agents.vision.silhouette import FOOT, MID, TOP, WIDTH, Fit, Shape, fit, looks
 
 WHOLE = (TOP, MID, FOOT, WIDTH)
-WHOLE_GATE = 16.3  # chi-square, 3 degrees of freedom, 0.999
+WHOLE_GATE = 7.8  # chi-square, 3 degrees of freedom, 0.95
 PARTS = (((TOP, MID, WIDTH), FOOT), ((MID, FOOT, WIDTH), TOP), ((TOP, MID, FOOT), WIDTH))
 """What is used when one of the four is hidden."""
-PART_GATE = 9.2  # 2 degrees of freedom, 0.99
+PART_GATE = 6.0  # 2 degrees of freedom, 0.95
 SIGMAS = 3.0
 ANY_TILT_RAD = 10.0
 

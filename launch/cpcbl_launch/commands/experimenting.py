@@ -50,6 +50,18 @@ def figure7(
     conduct(EXPERIMENT, seeds, jobs, output, as_json)
 
 
+@experiment_app.command("figure7-cameras")
+def figure7_cameras(
+    seeds: Seeds = 5, jobs: Jobs = None, output: Output = Path(), as_json: AsJson = False
+) -> None:
+    """The same from pixels: a cheap camera on the navigator, a sharper one on the observer."""
+    from cpcbl_launch.experiments.figure7_cameras import EXPERIMENT
+    from cpcbl_launch.options import must_have_opencv
+
+    must_have_opencv("experiment figure7-cameras")
+    conduct(EXPERIMENT, seeds, jobs, output, as_json)
+
+
 @experiment_app.command("circular-vs-oval")
 def circular_vs_oval(
     seeds: Seeds = 10, jobs: Jobs = None, output: Output = Path(), as_json: AsJson = False
@@ -144,7 +156,7 @@ def pictures(
     name: Annotated[
         str,
         typer.Argument(
-            metavar="SET", help="duckiebot or frc-2024; or your NAME.csv, NAME.toml beside it."
+            metavar="SET", help="duckiebot, frc-speaker, frc-amp; or NAME.csv, NAME.toml beside it."
         ),
     ],
     folder: Annotated[Path, typer.Argument(help="Where the set's pictures are.")],

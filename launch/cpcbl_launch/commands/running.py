@@ -70,7 +70,7 @@ def up(
     ] = None,
     record: Annotated[
         Optional[Path],
-        typer.Option(help="Record inputs, tracks, status and truth into this file (MCAP)."),
+        typer.Option(help="Record inputs, tracks, what cameras see, status and truth (MCAP)."),
     ] = None,
     logs: Annotated[
         Optional[Path], typer.Option(help="Keep the processes' logs in this folder.")

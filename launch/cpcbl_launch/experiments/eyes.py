@@ -306,7 +306,7 @@ def tables(result: Eyes) -> Iterable[RenderableType]:
             shown.add_row(kind, f"< {ERRORS_WITHIN_M:g}", *_cells(result.accuracy[kind]))
     yield shown
     yield (
-        "due: all of it to be seen. said: sightings. r, b, h: errors of range, bearing and\n"
+        "due: all of it to be seen. said: sightings. r, b, h: errors of range, bearing,\n"
         "heading, σ about zero; 3σ: the shares of them inside three stated ones"
     )
     yield f"doubted: {_listed(result.doubts)}"

@@ -22,13 +22,13 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import cv2
-import msgspec
 import numpy as np
 
 from cpcbl_agents.vision.camera import Camera, Floats, Pixels
 from cpcbl_agents.vision.eyes import CameraEyes
 from cpcbl_agents.vision.pictures import decoded
 from cpcbl_launch.experiments.eyes import Batch, Kind, Mistake, Record, Wrong, team
+from cpcbl_launch.simulation.cameras import off_focus, shaken
 from cpcbl_launch.simulation.carriers import SIDES, body_top_m
 from cpcbl_launch.simulation.render import render
 from cpcbl_launch.simulation.scene import Post, Scene, Standing
@@ -136,7 +136,7 @@ def drawn(random: np.random.Generator) -> Drawn:
             other = _free(random, taken, near)
             taken.append((other.x, other.y))
             robots.append(Standing(name, *other))
-    camera = _mounted(team().robots[viewer].camera, random)
+    camera = shaken(off_focus(team().robots[viewer].camera, 1.0, random), 1.0, random)
     return Drawn(viewer, pose, tuple(robots), scene, _light(random), camera)
 
 
@@ -166,19 +166,6 @@ def _light(random: np.random.Generator) -> Light:
         tint=(blue, green, red),
         blur_px=float(uniform(0.3, 1.2)),
         noise=float(random.integers(1, 7)),
-    )
-
-
-def _mounted(camera: CameraSettings, random: np.random.Generator) -> CameraSettings:
-    """The camera as it may well be, for what its settings say of how well it is known."""
-    tilt, yaw, focal = random.normal(size=3)
-    share = 1.0 + camera.focal_share * float(focal)
-    return msgspec.structs.replace(
-        camera,
-        tilt_deg=camera.tilt_deg + camera.tilt_sigma_deg * float(tilt),
-        yaw_deg=camera.yaw_deg + camera.yaw_sigma_deg * float(yaw),
-        fx_px=camera.fx_px * share,
-        fy_px=camera.fy_px * share,
     )
 
 

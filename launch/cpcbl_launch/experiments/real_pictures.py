@@ -183,19 +183,19 @@ def tables(result: RealPictures) -> Iterable[RenderableType]:
     shown = table(
         f"{result.set}: {result.pictures} pictures",
         ("picture", "id"),
-        ("range m", "error m", "± σ", "bearing°", "± σ", "head.°", "± σ"),
+        ("m", "off m", "± σ", "b. off°", "± σ", "h. off°", "± σ"),
     )
     for c in result.lines:
         errors = (
-            *_pair(c.range_error_m, c.range_sigma_m, 3),
+            *_pair(c.range_error_m, c.range_sigma_m, 2),
             *_pair(c.bearing_error_deg, c.bearing_sigma_deg, 1),
             *_pair(c.heading_error_deg, c.heading_sigma_deg, 1),
         )
-        first = "missed" if not c.found else "-" if c.range_m is None else f"{c.range_m:.3f}"
+        first = "missed" if not c.found else "-" if c.range_m is None else f"{c.range_m:.2f}"
         shown.add_row(c.picture.rsplit(".", 1)[0], c.id, first, *errors)
     yield shown
     found = sum(c.found for c in result.lines)
-    yield f"found {found} of {len(result.lines)}; errors where the set's table has the truth"
+    yield f"found {found} of {len(result.lines)}. m: range; off: from the truth, of which σ is ours"
     yield f"seen but not in the table: {_listed(result.unexpected)}"
     yield f"doubted: {_listed(result.doubted)}"
     if result.refused:

@@ -9,7 +9,7 @@ from msgspec.structs import replace
 from cpcbl_agents.vision.camera import Camera, Pixels
 from cpcbl_launch.simulation.render import render
 from cpcbl_launch.simulation.scene import Scene, Standing
-from cpcbl_team.config import Team
+from cpcbl_team.config import CameraSettings, Team
 from cpcbl_team.geometry import Pose2
 from cpcbl_transport.messages import LARGEST_FRAME, Frame
 
@@ -21,21 +21,24 @@ cv2.setNumThreads(1)
 
 
 class Cameras:
-    """Takes pictures of the field. The same seed and the same calls give the same pictures."""
+    """Takes pictures of the field. The same seed and the same calls give the same pictures.
+
+    Cameras are as badly known as their settings say, times the simulation's noise.
+    """
 
     def __init__(self, team: Team, seed: int) -> None:
         self._scene = Scene.of(team)
         self._bare = self._scene.without_landmarks()
-        self._cameras = {
-            name: Camera(robot.camera)
-            for name, robot in team.robots.items()
-            if robot.sensing == "camera"
-        }
+        seeing = [name for name, robot in team.robots.items() if robot.sensing == "camera"]
         self._random = {
-            name: np.random.default_rng((seed, _SEED, i)) for i, name in enumerate(self._cameras)
+            name: np.random.default_rng((seed, _SEED, i)) for i, name in enumerate(seeing)
         }
-        light, noise = team.simulation.light, team.simulation.noise
-        self._light = replace(light, noise=light.noise * noise)
+        light, self._noise = team.simulation.light, team.simulation.noise
+        self._light = replace(light, noise=light.noise * self._noise)
+        self._cameras = {
+            name: off_focus(team.robots[name].camera, self._noise, random)
+            for name, random in self._random.items()
+        }
         guards = team.transport.guards
         largest = min(
             guards.largest_frame_bytes if guards.enabled else LARGEST_FRAME, LARGEST_FRAME
@@ -49,13 +52,31 @@ class Cameras:
         scene = self._bare if bare else self._scene
         pixels = render(
             scene,
-            self._cameras[viewer],
+            Camera(shaken(self._cameras[viewer], self._noise, self._random[viewer])),
             poses[viewer],
             others,
             self._light,
             self._random[viewer],
         )
         return Frame(stamp_ns, encoded(pixels, self._largest))
+
+
+def off_focus(camera: CameraSettings, noise: float, random: np.random.Generator) -> CameraSettings:
+    """With the focal length that it may well have, by what the settings say of how well it is
+    known; `noise`: times that."""
+    share = 1.0 + noise * camera.focal_share * float(random.normal())
+    return replace(camera, fx_px=camera.fx_px * share, fy_px=camera.fy_px * share)
+
+
+def shaken(camera: CameraSettings, noise: float, random: np.random.Generator) -> CameraSettings:
+    """As it looks on a floor that is not even, by its sigmas of tilt and yaw; `noise`: times
+    these."""
+    tilt, yaw = (noise * float(draw) for draw in random.normal(size=2))
+    return replace(
+        camera,
+        tilt_deg=camera.tilt_deg + camera.tilt_sigma_deg * tilt,
+        yaw_deg=camera.yaw_deg + camera.yaw_sigma_deg * yaw,
+    )
 
 
 def encoded(pixels: Pixels, largest: int, qualities: Sequence[int] = QUALITIES) -> bytes:

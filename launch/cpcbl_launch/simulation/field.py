@@ -53,6 +53,7 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 COMMAND_LASTS_NS = 500_000_000
+PICTURES_LATE_NS = 150_000_000  # a field that is further behind catches up without making pictures
 INBOX = 10_000
 MOST_REFUSED = 100  # guests whose refusal is logged
 _GUEST_SEED = 2**31  # no robot of a team file has this number
@@ -190,13 +191,15 @@ class SimulatedRobot:
         return piece
 
     def frames(
-        self, now_ns: int, exposed: Callable[[int], Sightings | Frame]
+        self, now_ns: int, exposed: Callable[[int], Sightings | Frame | None]
     ) -> list[Sightings | Frame]:
         """The frames that are out by now. One is `exposed` when it is due and stamped `delay_s`
         later; the camera hands it over at its stamp, or at once where the stamp is earlier.
         """
         if self._frame_timer.due(now_ns):
-            self._frames.append(exposed(now_ns + int(self.settings.sensor.delay_s * 1e9)))
+            frame = exposed(now_ns + int(self.settings.sensor.delay_s * 1e9))
+            if frame is not None:
+                self._frames.append(frame)
         return _out(self._frames, now_ns)
 
     def sightings(self, now_ns: int, stamp_ns: int, objects: Iterable[Seen]) -> Sightings:
@@ -275,12 +278,14 @@ class SimulatedField:
                 (seed, i),
                 start_ns,
                 self._step_ns,
-                _in_turn(team, name, start_ns),
+                _in_turn(team, name, start_ns + self._step_ns),
             )
             for i, (name, settings) in enumerate(team.robots.items())
             if settings.source == "simulated"
         }
         self._cameras = _cameras(team, seed)
+        self.not_taken = 0
+        """Frames that were due in steps without pictures."""
         self._marks = [Seen(n, m.x_m, m.y_m, m.gives) for n, m in team.map.landmarks.items()]
         self._marks_to_touch = Grid(team.simulation.bump_radius_m, self._marks)
         self._start_ns = start_ns
@@ -323,8 +328,8 @@ class SimulatedField:
         if drive.robot in self.robots:
             self.robots[drive.robot].drive = drive
 
-    def advance(self) -> list[tuple[str, SensorInput]]:
-        """One step; what each robot senses at its end."""
+    def advance(self, pictures: bool = True) -> list[tuple[str, SensorInput]]:
+        """One step; what each robot senses at its end, with or without its camera."""
         self.now_ns += self._step_ns
         while self._events and self._passed_s >= self._events[0].at_s:
             self._befall(self._events.popleft())
@@ -338,7 +343,7 @@ class SimulatedField:
         sensed: list[tuple[str, SensorInput]] = []
         for name, robot in self.robots.items():
             piece = robot.odometry(self.now_ns)
-            frames = robot.frames(self.now_ns, partial(self._exposed, name, mates))
+            frames = robot.frames(self.now_ns, partial(self._exposed, name, mates, pictures))
             items = (piece, *frames, *robot.positions(self.now_ns))
             sensed += [(name, item) for item in items if item is not None]
         return sensed
@@ -358,10 +363,15 @@ class SimulatedField:
             x, y, heading_deg = event.to
             self.robots[event.kidnap].pose = Pose2(x, y, wrap_angle(math.radians(heading_deg)))
 
-    def _exposed(self, name: str, mates: Grid[Seen], stamp_ns: int) -> Sightings | Frame:
+    def _exposed(
+        self, name: str, mates: Grid[Seen], pictures: bool, stamp_ns: int
+    ) -> Sightings | Frame | None:
         """What a robot sees now: a picture, if it has a camera."""
         robot = self.robots[name]
         if robot.settings.sensing == "camera" and self._cameras is not None:
+            if not pictures:
+                self.not_taken += 1
+                return None
             poses = {other: r.pose for other, r in self.robots.items()}
             return self._cameras.frame(name, stamp_ns, poses, self._landmarks_hidden)
         return robot.sightings(self.now_ns, stamp_ns, self._visible(name, robot.pose, mates))
@@ -405,14 +415,14 @@ def _cameras(team: Team, seed: int) -> "Cameras | None":
     return Cameras(team, seed)
 
 
-def _in_turn(team: Team, name: str, start_ns: int) -> int | None:
+def _in_turn(team: Team, name: str, from_ns: int) -> int | None:
     """When a camera's first frame is due: one after the other, as cameras do not wait for each
     other and pictures take time."""
     robots = [n for n, robot in team.robots.items() if robot.sensing == "camera"]
     if name not in robots:
         return None
     period_ns = 1e9 / team.robots[name].sensor.rate_hz
-    return start_ns + int(period_ns * robots.index(name) / len(robots))
+    return from_ns + int(period_ns * robots.index(name) / len(robots))
 
 
 class FieldNode:
@@ -453,6 +463,10 @@ class FieldNode:
         return self._field.next_ns
 
     @property
+    def pictures_not_taken(self) -> int:
+        return self._field.not_taken
+
+    @property
     def waiting(self) -> bool:
         return False  # commands take effect with the next step
 
@@ -464,7 +478,8 @@ class FieldNode:
                 self.counts[reason] += 1
         self._let_in_and_out(now_ns)
         while self._field.next_ns <= now_ns:
-            for name, sensed in self._field.advance():
+            in_time = now_ns - self._field.next_ns <= PICTURES_LATE_NS
+            for name, sensed in self._field.advance(in_time):
                 stamped = later(sensed, self._field.ahead_ns(name))
                 self._publishers[name, type(sensed)].put(encode(stamped))
             if self._truth.matching:
@@ -559,3 +574,5 @@ def run_field(
         time.sleep(min(clock.seconds_until(node.next_ns), 0.2))
     counts = ", ".join(f"{reason} {n}" for reason, n in sorted(node.counts.items()))
     log.info("commands, by what became of them: %s", counts or "none")
+    if node.pictures_not_taken:
+        log.warning("frames not taken, as the field was late: %d", node.pictures_not_taken)
