@@ -336,7 +336,7 @@ def test_json_and_boards_and_what_is_wrong(folder: Path, tmp_path: Path) -> None
 def test_help_lists_every_calibration_and_logs_need_no_word() -> None:
     shown = cpcbl_team("calibrate", "--help")
     assert shown.returncode == 0
-    for word in ("log", "camera", "colours"):
+    for word in ("log", "camera", "colours", "sensor"):
         assert f" {word} " in shown.stdout
     for words in ((), ("log",)):
         failed = cpcbl_team("calibrate", *words, "--json", "nowhere")

@@ -5,9 +5,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 import cv2
+import numpy as np
 
 from cpcbl_agents.vision.camera import Pixels
-from cpcbl_agents.vision.pictures import decoded
 
 PICTURES = (".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp")
 VIDEOS = (".avi", ".m4v", ".mkv", ".mov", ".mp4", ".webm")
@@ -53,12 +53,13 @@ def read_pictures(
 
 
 def read_picture(file: Path) -> Picture:
-    """One picture, or why there is none."""
+    """One picture, in colour; or why there is none."""
     try:
-        pixels = decoded(file.read_bytes())
+        data = np.frombuffer(file.read_bytes(), np.uint8)
     except OSError as error:
         return Picture(file.name, error.strerror or "cannot be read")
-    return Picture(file.name, "no picture" if isinstance(pixels, str) else pixels)
+    pixels = cv2.imdecode(data, cv2.IMREAD_COLOR) if len(data) else None
+    return Picture(file.name, "no picture" if pixels is None else pixels.astype(np.uint8))
 
 
 def _frames(file: Path, every_s: float) -> Iterator[Picture]:
@@ -70,7 +71,7 @@ def _frames(file: Path, every_s: float) -> Iterator[Picture]:
             if number % step == 0:
                 read, pixels = video.retrieve()
                 name = f"{file.name}:{number}"
-                yield Picture(name, pixels.astype("uint8", copy=False) if read else "no picture")
+                yield Picture(name, pixels.astype(np.uint8) if read else "no picture")
             number += 1
         if number == 0:
             yield Picture(file.name, "no frame in this video")

@@ -9,6 +9,7 @@ from cpcbl_launch.calibration.show import with_error
 from cpcbl_launch.calibration.sights import Looked
 from cpcbl_launch.calibration.statistics import Estimate
 from cpcbl_launch.calibration.team_edit import Place, Written, written
+from cpcbl_launch.calibration.team_text import LEAST
 from cpcbl_launch.reporting.tables import number, percent, table
 from cpcbl_team.config import CameraSettings
 
@@ -75,7 +76,7 @@ def seeing_values(
     """The tables of a team file: corrections and noise, and the camera's sigmas where errors are
     larger than they say. They are never made smaller: what is the same in all of these pictures,
     such as how the camera is mounted, may be otherwise tomorrow."""
-    corrections = {name: written(value) for name, value in seeing.sensor.items()}
+    corrections = {name: _at_least(name, written(value)) for name, value in seeing.sensor.items()}
     if seeing.range_is_depth:
         corrections["range_is_depth"] = Written(True)
     places: dict[Place, Mapping[str, Written]] = {sensor: corrections}
@@ -86,6 +87,10 @@ def seeing_values(
             for key in SIGMAS
         }
     return places
+
+
+def _at_least(name: str, value: Written) -> Written:
+    return value._replace(value=max(value.value, LEAST[name])) if name in LEAST else value
 
 
 def _off(times: Estimate) -> bool:

@@ -81,10 +81,10 @@ def camera(
     """Lens and distortion of a camera, from pictures of a printed board."""
     from rich.console import Console
 
-    from cpcbl_launch.options import encoded, file_for, must_draw, must_read, not_written
+    from cpcbl_launch.options import encoded, file_for, must_draw, must_have_opencv, not_written
     from cpcbl_launch.show import progress_bar
 
-    must_read("calibrate camera")
+    must_have_opencv("calibrate camera")
     from cpcbl_launch.calibration.board import parsed_board, write_board
     from cpcbl_launch.calibration.lens import calibrated_lens
     from cpcbl_launch.calibration.lens_show import camera_values, print_lens
@@ -152,9 +152,9 @@ def colours(
     """Thresholds of colours, from samples of them in pictures."""
     from rich.console import Console
 
-    from cpcbl_launch.options import encoded, file_for, must_read, not_written
+    from cpcbl_launch.options import encoded, file_for, must_have_opencv, not_written
 
-    must_read("calibrate colours")
+    must_have_opencv("calibrate colours")
     from cpcbl_launch.calibration import patches
     from cpcbl_launch.calibration.colours import calibrated_colours
     from cpcbl_launch.calibration.colours_show import colour_values, kept_colours, print_colours
@@ -244,10 +244,10 @@ def _photographed(
 ) -> "Looked":
     """What a robot of the team file sees in pictures. Raises ValueError."""
     from cpcbl_launch.calibration.sights import photographed, viewer
-    from cpcbl_launch.options import must_read
+    from cpcbl_launch.options import must_have_opencv
     from cpcbl_launch.show import progress_bar
 
-    must_read("calibrate sensor --pictures")
+    must_have_opencv("calibrate sensor --pictures")
     if poses is None:
         raise ValueError("--pictures: goes with --poses FILE.csv, where they were taken")
     if team_file is None:
