@@ -53,13 +53,15 @@ def read_pictures(
 
 
 def read_picture(file: Path) -> Picture:
-    """One picture, in colour; or why there is none."""
+    """One picture, or why there is none."""
     try:
-        data = np.frombuffer(file.read_bytes(), np.uint8)
+        image = np.frombuffer(file.read_bytes(), np.uint8)
     except OSError as error:
         return Picture(file.name, error.strerror or "cannot be read")
-    pixels = cv2.imdecode(data, cv2.IMREAD_COLOR) if len(data) else None
-    return Picture(file.name, "no picture" if pixels is None else pixels.astype(np.uint8))
+    pixels = cv2.imdecode(image, cv2.IMREAD_COLOR) if image.size else None
+    return Picture(
+        file.name, "no picture" if pixels is None else pixels.astype("uint8", copy=False)
+    )
 
 
 def _frames(file: Path, every_s: float) -> Iterator[Picture]:
@@ -71,7 +73,7 @@ def _frames(file: Path, every_s: float) -> Iterator[Picture]:
             if number % step == 0:
                 read, pixels = video.retrieve()
                 name = f"{file.name}:{number}"
-                yield Picture(name, pixels.astype(np.uint8) if read else "no picture")
+                yield Picture(name, pixels.astype("uint8", copy=False) if read else "no picture")
             number += 1
         if number == 0:
             yield Picture(file.name, "no frame in this video")
