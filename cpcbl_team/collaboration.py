@@ -1,6 +1,7 @@
 """Robots that help each other: active fixes, passive landmarks, and tiers of quality.
 
-Active: "I see you there", position only, for a camera does not see a teammate's heading.
+Active: "I see you there": position only, as in the paper, and the heading too where it was seen
+(by a teammate's marker; beyond the paper).
 Passive: a teammate whose belief I was told is one more landmark, with its own uncertainty.
 """
 
@@ -8,10 +9,12 @@ import math
 from collections.abc import Iterable
 from typing import NamedTuple
 
+from msgspec.structs import replace
+
 from cpcbl_team.config import CollaborationSettings, SensorSettings
 from cpcbl_team.estimate import Covariance3, Estimate
 from cpcbl_team.gaussian import Covariance2, sighting_gaussian
-from cpcbl_team.geometry import Pose2, step
+from cpcbl_team.geometry import Pose2, step, wrap_angle
 from cpcbl_team.inputs import Belief, Fix, Sighting
 from cpcbl_team.sensors import sighting_fault, sighting_sigmas
 
@@ -43,6 +46,7 @@ def fix_for(
 
     The sighting as a Gaussian (equations 1-2) is rotated into the field's frame and compounded
     with the observer's pose covariance before it is sent: J C J^T, J the Jacobian of compounding.
+    A heading that was seen is the observer's plus the one in its frame, as are their variances.
     """
     range_m, bearing = sighting.range_m, sighting.bearing_rad
     if range_m is None or bearing is None or sighting_fault(sighting):
@@ -61,7 +65,23 @@ def fix_for(
     )
     lever = (1.0, 0.0, pose.y - y, 0.0, 1.0, x - pose.x, 0.0, 0.0, 0.0)
     observer_part = covariance.transformed(lever).position()
-    return Fix(robot, observer, stamp_ns, x, y, rotated, observer_part)
+    fix = Fix(robot, observer, stamp_ns, x, y, rotated, observer_part)
+    heading, heading_sigma = sighting.heading_rad, sighting.heading_sigma_rad
+    if heading is None or heading_sigma is None:
+        return fix
+    return replace(
+        fix,
+        heading_rad=wrap_angle(pose.heading + heading),
+        heading_sensor_variance=heading_sigma * heading_sigma,
+        heading_observer_variance=covariance.hh,
+    )
+
+
+def without_heading(fix: Fix) -> Fix:
+    """The fix as of a robot whose heading was not seen."""
+    return replace(
+        fix, heading_rad=None, heading_sensor_variance=0.0, heading_observer_variance=0.0
+    )
 
 
 def carried(belief: Belief, at_ns: int) -> Pose2:

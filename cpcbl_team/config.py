@@ -29,6 +29,17 @@ MarkerFamily = Literal[
     "apriltag_25h9",
     "apriltag_36h11",
 ]
+MARKERS: dict[MarkerFamily, int] = {
+    "aruco_4x4_50": 50,
+    "aruco_5x5_50": 50,
+    "aruco_6x6_50": 50,
+    "apriltag_16h5": 30,
+    "apriltag_25h9": 35,
+    "apriltag_36h11": 587,
+}
+"""How many markers a family has: 0, 1, ..."""
+LIKE_MIRRORED: dict[MarkerFamily, frozenset[int]] = {"aruco_4x4_50": frozenset({8, 9, 17, 47})}
+"""Markers that are their own mirror image: one cannot tell whether they are seen in a mirror."""
 
 
 class Table(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -123,8 +134,8 @@ class CameraSettings(Table, frozen=True, kw_only=True):
     """
 
     frames: str = ""
-    """A device's number, a video file, a folder of pictures, a URL (RTSP, HTTP); empty: they come
-    as messages, `in/<robot>/frame`."""
+    """A device's number, a URL (RTSP, HTTP), a video file or a folder of pictures, relative to the
+    team file; empty: they come as messages, `in/<robot>/frame`."""
     width_px: Annotated[int, msgspec.Meta(ge=16, le=8192)] = 640
     height_px: Annotated[int, msgspec.Meta(ge=16, le=8192)] = 480
     fx_px: Positive = 400.0
@@ -148,6 +159,12 @@ class CameraSettings(Table, frozen=True, kw_only=True):
     """How well the direction is known: added to the sigma of every bearing."""
     focal_share: NotNegative = 0.005
     """How well the focal length is known, as a share of it: added to the sigma of every range."""
+
+    @property
+    def live(self) -> bool:
+        """Whether frames come from a device or a URL; not played, not as messages."""
+        where = self.frames
+        return where.isdecimal() or "://" in where or where.startswith("/dev/")
 
 
 class Colour(Table, frozen=True, kw_only=True):
@@ -499,6 +516,12 @@ class Team(Table, frozen=True, kw_only=True):
     def simulated(self) -> bool:
         """Whether the team needs a simulated field."""
         return any(robot.source == "simulated" for robot in self.robots.values())
+
+    @property
+    def renders(self) -> bool:
+        """Whether the simulated field must make pictures."""
+        robots = self.robots.values()
+        return any(r.source == "simulated" and r.sensing == "camera" for r in robots)
 
     def messages_per_s(self, robot: str) -> float | None:
         """The rate at which a robot earns its share of the match's messages; None: no limit."""

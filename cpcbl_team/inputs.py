@@ -77,7 +77,8 @@ class Fix(msgspec.Struct, frozen=True, array_like=True, tag="fix"):
     """Active observation: where `observer` saw `robot`, in the field's frame.
 
     The two parts of the covariance (xx, xy, yy; m^2) stay apart: the sensor's part is fresh noise,
-    the observer's own pose error is the same in every fix that it sends.
+    the observer's own pose error is the same in every fix that it sends. So do the two parts of the
+    variance (rad^2) of the heading, which is None where it was not seen.
     """
 
     robot: Name
@@ -87,6 +88,9 @@ class Fix(msgspec.Struct, frozen=True, array_like=True, tag="fix"):
     y_m: float
     sensor_covariance: tuple[float, float, float]
     observer_covariance: tuple[float, float, float]
+    heading_rad: float | None = None
+    heading_sensor_variance: float = 0.0
+    heading_observer_variance: float = 0.0
 
 
 class Told(msgspec.Struct, frozen=True, array_like=True, tag="told"):

@@ -100,6 +100,8 @@ class Landmarks:
                 place is None
                 or seen.range_sigma_m is not None
                 or seen.bearing_sigma_rad is not None
+                or seen.heading_rad is not None
+                or seen.heading_sigma_rad is not None
                 or name in resting
                 or not (range_m is None or 0.0 < range_m <= LARGEST_M)
                 or not (bearing is None or -LARGEST_BEARING_RAD <= bearing <= LARGEST_BEARING_RAD)
@@ -204,7 +206,7 @@ class Landmarks:
         if range_m is None and bearing is None:
             return None
         now, pose, sigma_rad = state.stamp_ns, state.odometry_from_robot, self._bearing_sigma_rad
-        piece = now, pose, name, x, y, range_m, bearing, sigma_m, sigma_rad, 0.0, False
+        piece = now, pose, name, x, y, range_m, bearing, sigma_m, sigma_rad, 0.0, False, None, 0.0
         return new(Evidence, piece)
 
 

@@ -8,7 +8,7 @@ from collections.abc import Iterable
 
 from msgspec.structs import replace
 
-from cpcbl_team import recovery, trust, weighted
+from cpcbl_team import recovery, trust, weighted, whereabouts
 from cpcbl_team.collaboration import BELIEF_SERVES_BACK_NS
 from cpcbl_team.config import Field, LocalizationSettings
 from cpcbl_team.estimate import (
@@ -30,7 +30,6 @@ from cpcbl_team.fusion import (
     told,
     with_all_shared,
 )
-from cpcbl_team.gaussian import Covariance2
 from cpcbl_team.geometry import Pose2, step, wrap_angle
 from cpcbl_team.inputs import Belief, Fix, Odometry, Position, Sighting, Sightings, Told
 from cpcbl_team.landmarks import Landmarks, Said
@@ -48,12 +47,11 @@ from cpcbl_team.sightings import (
     surprise,
 )
 from cpcbl_team.state import FIX, Memory, State, innovated
+from cpcbl_team.whereabouts import Whereabouts
 
 UNSTEERABLE_SIGMA_RAD = math.radians(100.0)  # beyond, no bearing can be linearized
-_OWN = "position sensor"
 
 Turns = tuple[Scope | None, ...]
-_AXES = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
 
 
 class Localizer:
@@ -320,93 +318,89 @@ class Localizer:
         return replace(state, estimate=estimate, memory=memory), verdict.trusted
 
     def fix(self, state: State, fix: Fix) -> State:
-        """Active collaboration: a teammate tells where it sees this robot. Position only."""
-        parts = Covariance2(*fix.sensor_covariance), Covariance2(*fix.observer_covariance)
-        return self._placed(state, fix.stamp_ns, FIX + fix.observer, fix.x_m, fix.y_m, *parts)
+        """Active collaboration: a teammate tells where it sees this robot, and perhaps its heading;
+        that is merged as evidence of its own, after the position."""
+        return self._placed(state, fix.stamp_ns, whereabouts.by_fix(fix))
 
     def position(self, state: State, seen: Position) -> State:
         """A position sensor of the robot itself: like a fix, but nobody else's error is in it."""
-        own = Covariance2(*seen.covariance)
-        return self._placed(state, seen.stamp_ns, _OWN, seen.x_m, seen.y_m, own, None)
+        return self._placed(state, seen.stamp_ns, whereabouts.by_sensor(seen))
 
-    def _placed(
-        self,
-        state: State,
-        stamp_ns: int,
-        source: str,
-        x: float,
-        y: float,
-        sensor: Covariance2,
-        observer: Covariance2 | None,
-    ) -> State:
-        """The robot is said to be at (x, y); `observer` is a teammate's part of the covariance."""
-        state = self.moved(state, stamp_ns)
-        state = self._noted(state, source, x, y, sensor, observer)
-        memory, prior = state.memory, state.estimate
+    def _placed(self, state: State, stamp_ns: int, said: Whereabouts) -> State:
+        state = self._noted(self.moved(state, stamp_ns), said)
+        memory, prior, source = state.memory, state.estimate, said.source
         least = self._rules.object_interval_s * 1e9
         if not _passed(memory.objects_ns.get(source), stamp_ns, least):
             return state
         if self._correlated:
-            sensor = sensor.scaled(self._repeated(memory, source, stamp_ns))
-        offset = x - prior.pose.x, y - prior.pose.y
-        seen = Observation(_AXES, offset, sensor, observer or Covariance2(0.0, 0.0, 0.0))
+            said = said.doubted(self._repeated(memory, source, stamp_ns))
+        seen = said.of_position(prior.pose)
         nis = seen.normalized_innovation_squared(prior.covariance)
         if self._judges:
-            state, trusted = self._told_apart(state, source, (x, y), seen, nis)
+            state, trusted = self._told_apart(state, said, seen, nis)
             if not trusted or state.estimate is not prior:
                 return self._judged(state)
         if nis > self._gates[1]:
             return self._judged(self._updated(state, prior, None, [], 1))
+        estimate = self._with_position(prior, seen, observed=said.observer is not None)
+        heading = said.of_heading(estimate.pose)
+        used, refused = [source], 0
+        if heading is not None:
+            if heading.normalized_innovation_squared(estimate.covariance) <= self._gates[0]:
+                estimate = self._with_heading(estimate, heading)
+            else:
+                # The position is kept, for a marker is sooner seen askew than elsewhere. Still the
+                # word counts as refused: a robot that looks elsewhere shall find that it is lost.
+                used, refused = [], 1
+                state = replace(state, memory=state.memory.counted("heading_gated"))
+        return self._judged(self._updated(state, self._reduced(estimate), None, used, refused))
+
+    def _with_position(self, prior: Estimate, seen: Observation, observed: bool) -> Estimate:
+        """The estimate after a teammate (or nobody else) observed the position."""
         scope = POSE if self._joint else POSITION
         if self._weighted:
-            estimate = weighted.averaged(prior, offset, None, self._rules.weights)
-        elif observer is None:
-            estimate = merge(prior, seen.information(), scope)
-        else:
-            estimate = self._merge_teammate(prior, seen, scope)
-        estimate = self._reduced(estimate)
-        return self._judged(self._updated(state, estimate, None, [source], 0))
+            x, y = seen.residuals
+            return weighted.averaged(prior, (x, y), None, self._rules.weights)
+        if observed:
+            return self._merge_teammate(prior, seen, scope)
+        return merge(prior, seen.information(), scope)
 
-    def _noted(
-        self,
-        state: State,
-        source: str,
-        x: float,
-        y: float,
-        sensor: Covariance2,
-        observer: Covariance2 | None,
-    ) -> State:
+    def _with_heading(self, prior: Estimate, seen: Observation) -> Estimate:
+        """The estimate after a teammate observed the heading."""
+        if self._weighted:
+            return weighted.averaged(prior, (0.0, 0.0), seen.residuals[0], self._rules.weights)
+        return self._merge_teammate(prior, seen, POSE if self._joint else HEADING)
+
+    def _noted(self, state: State, said: Whereabouts) -> State:
         """With this as evidence of where the robot is, unless its sender is in quarantine."""
         memory = state.memory
-        voice = memory.voices.get(source.removeprefix(FIX))
+        voice = memory.voices.get(said.source.removeprefix(FIX))
         if voice is None or not voice.reason:
-            piece = recovery.told_evidence(state, source, x, y, sensor, observer)
-            memory = recovery.remembered(memory, [piece])
-        if observer is not None:
+            memory = recovery.remembered(memory, [recovery.told_evidence(state, said)])
+        if said.observer is not None:
             memory = replace(memory, told_ns=state.stamp_ns)
         return replace(state, memory=memory)
 
     def _told_apart(
-        self,
-        state: State,
-        source: str,
-        place: tuple[float, float],
-        seen: Observation,
-        nis: float,
+        self, state: State, said: Whereabouts, seen: Observation, nis: float
     ) -> tuple[State, bool]:
         """The state after what a teammate, or the position sensor, says of the robot's place, and
         whether that may be used."""
         memory, now = state.memory, state.stamp_ns
-        if source == _OWN:
+        if said.observer is None:
             if now - memory.told_ns <= trust.WINDOW_NS and not memory.lost:
                 accepted = nis <= self._gates[1]
                 memory = self._own_word(memory, now, accepted, not accepted)
             return replace(state, memory=memory), True
+        turned = said.of_heading(state.estimate.pose)
+        if turned is not None:  # of three degrees of freedom, as of two
+            nis += turned.normalized_innovation_squared(state.estimate.covariance)
+            nis *= 2.0 / 3.0
         noise, (ex, ey) = seen.noise(), seen.residuals
         variance = 0.5 * (noise.xx + noise.yy)
-        anchor = trust.Anchor(now, *place, variance, state.odometry_from_robot)
-        said = trust.Said(now, None if memory.lost else nis, (ex, ey), anchor)
-        return self._weighed(state, source.removeprefix(FIX), said, source)
+        anchor = trust.Anchor(now, said.x, said.y, variance, state.odometry_from_robot)
+        word = trust.Said(now, None if memory.lost else nis, (ex, ey), anchor)
+        return self._weighed(state, said.source.removeprefix(FIX), word, said.source)
 
     def hear(self, state: State, belief: Belief) -> State:
         """Passive collaboration: keeps a teammate's belief, to use it when the teammate is seen."""

@@ -14,10 +14,10 @@ from msgspec.structs import replace
 from cpcbl_team.config import Field, LocalizerSettings
 from cpcbl_team.constraints import Constraint, bearing_heading, range_circle
 from cpcbl_team.estimate import SMALLEST_VARIANCE, ZERO3, Covariance3, Estimate, Information, merge
-from cpcbl_team.gaussian import Covariance2
 from cpcbl_team.geometry import Pose2
 from cpcbl_team.sightings import Measured
 from cpcbl_team.state import FIX, Evidence, Memory, State
+from cpcbl_team.whereabouts import Whereabouts
 
 WINDOW_NS = 20_000_000_000
 SPACING_NS = 500_000_000  # one piece of evidence an object and so long
@@ -50,14 +50,17 @@ def seen_evidence(state: State, m: Measured) -> Evidence:
     )
 
 
-def told_evidence(
-    state: State, source: str, x: float, y: float, sensor: Covariance2, observer: Covariance2 | None
-) -> Evidence:
-    """What a teammate (`observer`: its part) or a position sensor says of the robot's own place."""
+def told_evidence(state: State, said: Whereabouts) -> Evidence:
+    """What a teammate or a position sensor says of the robot's own place (and heading)."""
     now, pose = state.stamp_ns, state.odometry_from_robot
+    source, x, y, sensor, observer, heading = said
     own = math.sqrt(0.5 * (sensor.xx + sensor.yy))
     its = 0.0 if observer is None else math.sqrt(0.5 * (observer.xx + observer.yy))
-    return Evidence(now, pose, source, x, y, None, None, own, 0.0, its, observer is not None)
+    place = now, pose, source, x, y, None, None, own
+    if heading is None:
+        return Evidence(*place, 0.0, its, observer is not None)
+    own_rad, its_rad = math.sqrt(heading.sensor), math.sqrt(heading.observer)
+    return Evidence(*place, own_rad, its, True, heading.rad, its_rad)
 
 
 def remembered(memory: Memory, pieces: Sequence[Evidence]) -> Memory:
@@ -166,11 +169,14 @@ def relocalized(
 
     Needs one residual more than unknowns, a fit that the chi-square bound accepts, and no second
     pose that fits nearly as well. What n pieces owe to teammates may be one and the same error:
-    each counts it with n times its variance (split covariance intersection of n, equal weights).
+    each counts it with n times its variance (split covariance intersection of n, equal weights). A
+    fix with a heading counts as two, for one error of its observer may be in both; it is a whole
+    pose, but alone there is nothing that confirms it.
     """
-    if len({(e.x, e.y) for e in evidence}) < 2:
+    headed = sum(e.heading_rad is not None for e in evidence)
+    if not headed and len({(e.x, e.y) for e in evidence}) < 2:
         return None
-    told = sum(e.told for e in evidence)
+    told = sum(e.told for e in evidence) + headed
     pieces = [_Carried(e, odometry_from_robot, told) for e in evidence]
     if sum(p.residual_count for p in pieces) < 4:
         return None
@@ -199,11 +205,24 @@ class _Carried:
         self.is_fix = evidence.range_m is None and evidence.bearing_rad is None
         repeated = math.sqrt(told) if evidence.told else 1.0
         self.sigma_m = math.hypot(repeated * evidence.place_sigma_m, self.drift)
+        turned = DRIFT_SHARE * (abs(self.now_from_then.heading) + 0.3 * way)
+        self.sigma_rad = math.hypot(
+            repeated * evidence.place_sigma_rad, turned, evidence.bearing_sigma_rad
+        )
 
     @property
     def residual_count(self) -> int:
         e = self.e
-        return 2 if self.is_fix else (e.range_m is not None) + (e.bearing_rad is not None)
+        if self.is_fix:
+            return 2 + (e.heading_rad is not None)
+        return (e.range_m is not None) + (e.bearing_rad is not None)
+
+    def pose(self) -> Pose2 | None:
+        """The present pose, if a fix tells the whole of it."""
+        e = self.e
+        if e.heading_rad is None:
+            return None
+        return Pose2(e.x, e.y, e.heading_rad) @ self.now_from_then.inverse()
 
     def point(self) -> tuple[float, float] | None:
         """The object (or the robot then) in the present robot's frame, if its range is known."""
@@ -223,6 +242,9 @@ class _Carried:
             variance = self.sigma_m**2 + e.range_sigma_m**2 + SMALLEST_VARIANCE
             yield (1.0, 0.0, hx), e.x - then.x, variance
             yield (0.0, 1.0, hy), e.y - then.y, variance
+            if e.heading_rad is not None:
+                off = math.remainder(e.heading_rad - then.heading, math.tau)
+                yield (0.0, 0.0, 1.0), off, self.sigma_rad**2 + SMALLEST_VARIANCE
             return
         seen: list[Constraint | None] = []
         if e.range_m is not None:
@@ -245,9 +267,13 @@ def _cost(pose: Pose2, pieces: list[_Carried]) -> float:
 
 
 def _starts(pieces: list[_Carried], field: Field) -> Iterator[Pose2]:
+    told = [pose for piece in pieces if (pose := piece.pose()) is not None]
     aligned = _aligned(pieces)
+    if told:
+        yield min(told, key=lambda pose: _cost(pose, pieces))
     if aligned is not None:
         yield aligned
+    if told or aligned is not None:
         return
     x0, y0, x1, y1 = field.bounds()
     for i in range(5):

@@ -25,9 +25,14 @@ def corrected_odometry(piece: Odometry, s: OdometrySettings) -> Odometry:
 
 
 def corrected_sighting(sighting: Sighting, sensor: SensorSettings, teammate: bool) -> Sighting:
-    """The sighting without the sensor's systematic errors; a fault stays as it is."""
-    name, range_m, bearing, range_sigma, bearing_sigma, *heading = msgspec.structs.astuple(sighting)
-    if bearing is not None and abs(bearing) > math.pi:
+    """The sighting without the sensor's systematic errors; a fault stays as it is.
+
+    A heading is seen against the line of sight, so it turns by what its bearing is corrected by.
+    """
+    (name, range_m, bearing, range_sigma, bearing_sigma, heading, heading_sigma) = (
+        msgspec.structs.astuple(sighting)
+    )
+    if any(angle is not None and abs(angle) > math.pi for angle in (bearing, heading)):
         return sighting
     if range_m is not None:
         if sensor.range_is_depth and bearing is not None:
@@ -36,34 +41,46 @@ def corrected_sighting(sighting: Sighting, sensor: SensorSettings, teammate: boo
         bias = sensor.robot_range_bias_m if teammate else sensor.range_bias_m
         range_m = sensor.range_scale * range_m - bias
     if bearing is not None:
-        bias = math.radians(sensor.bearing_bias_deg)
-        bearing = wrap_angle(sensor.bearing_scale * bearing - bias)
-    return Sighting(name, range_m, bearing, range_sigma, bearing_sigma, *heading)
+        bias, seen = math.radians(sensor.bearing_bias_deg), bearing
+        bearing = wrap_angle(sensor.bearing_scale * seen - bias)
+        heading = None if heading is None else wrap_angle(heading + bearing - seen)
+    return Sighting(name, range_m, bearing, range_sigma, bearing_sigma, heading, heading_sigma)
 
 
 def without_bearing_bias(frame: Sightings, bias_rad: float) -> Sightings:
-    """The frame with this bias taken from its bearings; a fault stays as it is."""
+    """The frame with this bias taken from its bearings, and from the headings that were seen with
+    them; a fault stays as it is."""
     if bias_rad == 0.0:
         return frame
     return Sightings(frame.stamp_ns, tuple(_unbiased(s, bias_rad) for s in frame.sightings))
 
 
 def _unbiased(sighting: Sighting, bias_rad: float) -> Sighting:
-    bearing = sighting.bearing_rad
+    bearing, heading = sighting.bearing_rad, sighting.heading_rad
     if bearing is None or sighting_fault(sighting):
         return sighting
-    return msgspec.structs.replace(sighting, bearing_rad=wrap_angle(bearing - bias_rad))
+    return msgspec.structs.replace(
+        sighting,
+        bearing_rad=wrap_angle(bearing - bias_rad),
+        heading_rad=None if heading is None else wrap_angle(heading - bias_rad),
+    )
 
 
 def sighting_fault(sighting: Sighting) -> str:
-    """Why a sighting must not be used (resolution i); empty if it may."""
-    r, a = sighting.range_m, sighting.bearing_rad
+    """Why a sighting must not be used (resolution i); empty if it may.
+
+    A heading needs its sigma, for no model of the sensor has one.
+    """
+    r, a, h = sighting.range_m, sighting.bearing_rad, sighting.heading_rad
     range_sigma, bearing_sigma = sighting.range_sigma_m, sighting.bearing_sigma_rad
+    heading_sigma = sighting.heading_sigma_rad
     if (
         (r is None or 0.0 < r <= LARGEST_M)
         and (a is None or -LARGEST_BEARING_RAD <= a <= LARGEST_BEARING_RAD)
         and (range_sigma is None or 0.0 < range_sigma <= LARGEST_M)
         and (bearing_sigma is None or 0.0 < bearing_sigma <= LARGEST_M)
+        and (h is None or -LARGEST_BEARING_RAD <= h <= LARGEST_BEARING_RAD)
+        and (h is None if heading_sigma is None else 0.0 < heading_sigma <= LARGEST_M)
         and not (r is None and a is None)
     ):
         return ""
@@ -77,6 +94,8 @@ def _fault(sighting: Sighting) -> str:
         sighting.bearing_rad,
         sighting.range_sigma_m,
         sighting.bearing_sigma_rad,
+        sighting.heading_rad,
+        sighting.heading_sigma_rad,
     )
     given = [n for n in numbers if n is not None]
     if not all(math.isfinite(n) for n in given):
@@ -89,6 +108,11 @@ def _fault(sighting: Sighting) -> str:
         return "range_not_positive"
     if sighting.bearing_rad is not None and abs(sighting.bearing_rad) > LARGEST_BEARING_RAD:
         return "bearing_out_of_range"
+    if sighting.heading_rad is not None:
+        if abs(sighting.heading_rad) > LARGEST_BEARING_RAD:
+            return "heading_out_of_range"
+        if sighting.heading_sigma_rad is None:
+            return "heading_without_sigma"
     return "sigma_not_positive"
 
 

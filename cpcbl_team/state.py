@@ -39,9 +39,11 @@ class Evidence(NamedTuple):
     range_m: float | None
     bearing_rad: float | None
     range_sigma_m: float  # for a fix: of (x, y), as far as it is the sensor's
-    bearing_sigma_rad: float
+    bearing_sigma_rad: float  # for a fix: of the heading, as far as it is the sensor's
     place_sigma_m: float  # of (x, y), as far as it is a teammate's; zero for what is on the map
     told: bool  # by a teammate
+    heading_rad: float | None = None  # of the robot itself, if a fix told it;
+    place_sigma_rad: float = 0.0  # its sigma, as far as it is a teammate's
 
 
 class Memory(msgspec.Struct, frozen=True, gc=False):

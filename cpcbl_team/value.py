@@ -2,7 +2,8 @@
 
 The helper knows of its teammate no more than the tier that it announces, and what it has told it
 before. Worth is in nats: the logarithm of the factor by which the ellipse of the position shrinks,
-half that of the determinants (as in the mutual information of Gaussians).
+half that of the determinants (as in the mutual information of Gaussians), and of that by which the
+sigma of the heading does, where that is told too.
 """
 
 import math
@@ -19,12 +20,18 @@ LOST_SIGMA_M = 2.0
 DRIFT_SHARE = 0.1  # of its way: what a teammate's position loses between two fixes
 
 
+LOST_HEADING_SIGMA_RAD = math.pi / math.sqrt(3.0)  # any is as likely
+USUAL_HEADING_SIGMA_RAD = math.radians(10.0)  # no tier tells of it
+HEADING_DRIFT_RAD_PER_M = 0.05  # of its way: what a teammate's heading loses between two fixes
+
+
 class Helped(NamedTuple):
     """A teammate after the last fix that it was sent: where it was seen, how well it knew that."""
 
     x_m: float
     y_m: float
     covariance: Covariance2
+    heading_variance: float = USUAL_HEADING_SIGMA_RAD**2
 
 
 def sigma_range_m(tier: int, settings: CollaborationSettings) -> tuple[float, float]:
@@ -53,6 +60,40 @@ def expected(
     grown = _not_exact(Covariance2(xx + doubt, xy, yy + doubt))
     sigma = math.sqrt(0.5 * (grown.xx + grown.yy))
     return grown.scaled((min(max(sigma, least), most) / sigma) ** 2)
+
+
+def expected_heading(tier: int, helped: Helped | None, x_m: float, y_m: float) -> float:
+    """What the heading's variance (rad^2) of a teammate at (x, y) is likely to be.
+
+    A lost one's is unknown. Another's is what is usual, or what the last heading that it was told
+    left and its way has added: so its heading is told while that is news.
+    """
+    if tier == LOWEST_TIER:
+        return LOST_HEADING_SIGMA_RAD**2
+    usual = USUAL_HEADING_SIGMA_RAD**2
+    if helped is None:
+        return usual
+    way = math.hypot(x_m - helped.x_m, y_m - helped.y_m)
+    return min(helped.heading_variance + (HEADING_DRIFT_RAD_PER_M * way) ** 2, usual)
+
+
+def merged_heading(prior: float, fix: Fix, fusion: Fusion) -> float:
+    """The heading's variance after that of a fix, as the teammate merges it; see `merged`."""
+    prior += SMALLEST_VARIANCE
+    fresh, dependent = fix.heading_sensor_variance, fix.heading_observer_variance
+    fresh += SMALLEST_VARIANCE
+    if fusion == "naive":
+        return 1.0 / (1.0 / prior + 1.0 / (fresh + dependent))
+
+    def after(weight: float) -> float:
+        return 1.0 / (weight / prior + 1.0 / (fresh + dependent / (1.0 - weight)))
+
+    return min(prior, after(best_weight(after)))
+
+
+def heading_worth(prior: float, after: float) -> float:
+    """Nats gained from one variance of the heading to another."""
+    return 0.5 * math.log((prior + SMALLEST_VARIANCE) / max(after, SMALLEST_VARIANCE))
 
 
 def merged(

@@ -245,11 +245,21 @@ def belief(
 
 
 def fix(
-    x: float, y: float, stamp_ns: int = 0, *, sensor_m: float = 0.05, observer_m: float = 0.05
+    x: float,
+    y: float,
+    stamp_ns: int = 0,
+    *,
+    sensor_m: float = 0.05,
+    observer_m: float = 0.05,
+    heading: float | None = None,
+    sensor_rad: float = 0.05,
+    observer_rad: float = 0.02,
 ) -> Fix:
-    """Where the teammate "mate" sees the robot "me"."""
+    """Where the teammate "mate" sees the robot "me", and where that looks, if it sees that too."""
     sensor, observer = sensor_m**2, observer_m**2
-    return Fix("me", "mate", stamp_ns, x, y, (sensor, 0.0, sensor), (observer, 0.0, observer))
+    told = () if heading is None else (heading, sensor_rad**2, observer_rad**2)
+    parts = (sensor, 0.0, sensor), (observer, 0.0, observer)
+    return Fix("me", "mate", stamp_ns, x, y, *parts, *told)
 
 
 def placed_at(x: float, y: float, stamp_ns: int = 0, sigma_m: float = 0.05) -> Position:

@@ -49,6 +49,12 @@ class Listened(NamedTuple):
     by_any: bool
 
 
+class Looked(NamedTuple):
+    """Whether anybody looks at what this robot's camera sees."""
+
+    by_any: bool
+
+
 class Sent(NamedTuple):
     """Help that has left this robot, and its bytes on the wire; 0: nobody listened, it has not."""
 
@@ -56,7 +62,7 @@ class Sent(NamedTuple):
     size: int
 
 
-FromBus = Presence | Stranger | Listened | Sent
+FromBus = Presence | Stranger | Listened | Looked | Sent
 Anything = Message | Tick | Located | Told | FromBus
 
 

@@ -13,19 +13,33 @@ from msgspec.structs import replace
 from cpcbl_agents.agent import Anything, Listened, Located, Presence, Sent, Stranger
 from cpcbl_agents.guests import Guests
 from cpcbl_agents.tally import Tallies
-from cpcbl_team.collaboration import LOWEST_TIER, fix_for, hears, next_tier
+from cpcbl_team.collaboration import LOWEST_TIER, fix_for, hears, next_tier, without_heading
 from cpcbl_team.config import LocalizationSettings
 from cpcbl_team.gaussian import Covariance2
 from cpcbl_team.inputs import Belief, Fix
-from cpcbl_team.value import Helped, expected, merged, staleness, use_of, worth
+from cpcbl_team.value import (
+    Helped,
+    expected,
+    expected_heading,
+    heading_worth,
+    merged,
+    merged_heading,
+    staleness,
+    use_of,
+    worth,
+)
 from cpcbl_transport.budget import Budget
-from cpcbl_transport.compact import BELIEF_BYTES, FIX_BYTES
+from cpcbl_transport.compact import help_bytes
 from cpcbl_transport.messages import Track
 from cpcbl_transport.overhead import sent_bytes
 
 NEIGHBOUR_NS = 10_000_000_000  # so long a teammate's tier is followed after it was seen
 IN_SIGHT_NS = 1_000_000_000  # so long its beliefs are of use
-_BELIEF_SIZE, _FIX_SIZE = sent_bytes(BELIEF_BYTES), sent_bytes(FIX_BYTES)
+
+
+def _size(message: Belief | Fix) -> int:
+    """What it takes on the link, at most."""
+    return sent_bytes(help_bytes(message))
 
 
 class _Offer(NamedTuple):
@@ -165,16 +179,26 @@ class CollaborationAgent:
         return rules.active and self.helps and rested and hears(tier, self.tier, rules)
 
     def _offer(self, fix: Fix, tier: int) -> _Offer:
+        """The fix with its worth; with the heading only if that is worth its own bytes."""
         _, before = self._helped.get(fix.robot, (0, None))
-        prior = expected(tier, before, fix.x_m, fix.y_m, self._rules)
+        rules, place = self._rules, (fix.x_m, fix.y_m)
+        prior = expected(tier, before, *place, rules)
         parts = Covariance2(*fix.sensor_covariance), Covariance2(*fix.observer_covariance)
-        after = merged(prior, *parts, self._rules.fusion)
-        told = Helped(fix.x_m, fix.y_m, after)
-        return _Offer(worth(prior, after), tier == LOWEST_TIER, told, fix)
+        after = merged(prior, *parts, rules.fusion)
+        value, variance = worth(prior, after), expected_heading(tier, before, *place)
+        if fix.heading_rad is not None:
+            left = merged_heading(variance, fix, rules.fusion)
+            gained = heading_worth(variance, left)
+            if gained >= rules.least_value:
+                value, variance = value + gained, left
+            else:
+                fix = without_heading(fix)
+        told = Helped(*place, after, variance)
+        return _Offer(value, tier == LOWEST_TIER, told, fix)
 
     def _paid(self, offer: _Offer, now_ns: int) -> bool:
         fix = offer.fix
-        if not self._affords(now_ns, _FIX_SIZE, offer.value, offer.urgent):
+        if not self._affords(now_ns, _size(fix), offer.value, offer.urgent):
             self.tallies.of("fix", fix.robot).over_budget += 1
             return False
         self._helped[fix.robot] = fix.stamp_ns, offer.after
@@ -197,7 +221,7 @@ class CollaborationAgent:
             tally.silent += 1
             return []
         # The error of a listener's copy in sigmas, as the nats of correcting it
-        if not self._affords(now_ns, _BELIEF_SIZE, 0.5 * stale * stale, urgent=False):
+        if not self._affords(now_ns, _size(belief), 0.5 * stale * stale, urgent=False):
             tally.over_budget += 1
             return []
         self._copy = belief
@@ -236,10 +260,9 @@ class CollaborationAgent:
         """A key that is new is often not listened to yet: the next frame may say the same again."""
         if isinstance(message, Fix):
             self._helped.pop(message.robot, None)
-            self.budget.take_back(now_ns, _FIX_SIZE)
         else:
             self._copy = None
-            self.budget.take_back(now_ns, _BELIEF_SIZE)
+        self.budget.take_back(now_ns, _size(message))
 
     def _track(self, now: Located) -> Track:
         pose, covariance, _ = now.estimate

@@ -1,13 +1,26 @@
 """What makes sightings of a camera's frames: the protocol, without OpenCV (`vision` has that)."""
 
-from typing import Protocol
+from typing import NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
 
 from cpcbl_team.inputs import Sightings
-from cpcbl_transport.messages import Frame
+from cpcbl_transport.messages import Frame, Look
+
+
+class Picture(NamedTuple):
+    """A frame that needs no decoding: pixels (height, width, 3), BGR, at the time of exposure."""
+
+    stamp_ns: int
+    pixels: NDArray[np.uint8]
 
 
 class Eyes(Protocol):
     """Sees landmarks and teammates in frames."""
 
-    def seen(self, frame: Frame) -> Sightings | str:
+    def seen(self, frame: Frame | Picture) -> Sightings | str:
         """What is in a frame, at its stamp; or why the frame cannot be used (`frame_...`)."""
+
+    def shown(self, frame: Frame | Picture) -> tuple[Sightings | str, Look]:
+        """The same, and the frame with all that drawn into it."""

@@ -5,7 +5,7 @@ from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator
 from typing import Protocol
 
-from cpcbl_agents.agent import Listened, Presence, Sent, Stranger, Tick
+from cpcbl_agents.agent import Listened, Looked, Presence, Sent, Stranger, Tick
 from cpcbl_agents.clocks import Clocks
 from cpcbl_agents.robot import Robot
 from cpcbl_agents.tally import Tallies
@@ -21,6 +21,7 @@ from cpcbl_transport.messages import (
     LARGEST_PAYLOAD,
     Drive,
     Frame,
+    Look,
     Message,
     Refusal,
     Status,
@@ -75,11 +76,11 @@ class Node:
         rules = team.robots[robot.name].collaboration
         self._team, self._passive = frozenset(team.robots), rules.passive
         self._inbox: deque[tuple[str, bytes]] = deque(maxlen=INBOX)
-        self._frame: tuple[str, bytes] | None = None
+        self._frames: deque[tuple[str, bytes]] = deque(maxlen=1)
         self._news: deque[tuple[str, bool]] = deque(maxlen=INBOX)
         self._wiring = Wiring(robot.name, incarnation, rules, bus, self._arrived, self._seen_alive)
         self._tokens = Tokens()
-        self._listened = ""
+        self._listened, self._looked = "", False
         self._status_ns = start_ns
         self.counts: Counter[str] = Counter()
         self.heard = Tallies()
@@ -93,13 +94,14 @@ class Node:
 
     def _arrived(self, key: str, payload: bytes) -> None:
         if key == self._frame_key:  # only the latest: a robot that is slow sees less, not late
-            if self._frame is not None:
+            if self._frames:
                 self.counts["frame_skipped"] += 1
-            self._frame = key, payload
+            self._frames.append((key, payload))
         else:
             if len(self._inbox) == INBOX:
                 self.counts["inbox_overflow"] += 1
-            self._inbox.append((key, payload))
+            enough = payload[: LARGEST_PAYLOAD + 1]  # to refuse it; it may be as large as a frame
+            self._inbox.append((key, enough))
         self._on_arrival()
 
     def _seen_alive(self, key: str, alive: bool) -> None:
@@ -120,17 +122,17 @@ class Node:
     @property
     def waiting(self) -> bool:
         """Whether something has arrived."""
-        return bool(self._inbox or self._news or self._frame)
+        return bool(self._inbox or self._news or self._frames)
 
     def step(self, now_ns: int) -> None:
         """Takes in what has arrived, lets the robot work, sends what it says."""
         self._take_tokens(now_ns)
         while self._inbox:
             self._take(*self._inbox.popleft(), now_ns)
-        if self._frame is not None:
-            frame, self._frame = self._frame, None
-            self._take(*frame, now_ns)
+        if self._frames:
+            self._take(*self._frames.popleft(), now_ns)
         self._ask_for_listeners(now_ns)
+        self._ask_for_lookers(now_ns)
         said = self._robot.handle(Tick(), now_ns)
         for name in self._wiring.follow(self._robot.collaboration):
             self._tokens.forget(name)
@@ -167,6 +169,15 @@ class Node:
         if listened != self._listened:  # to another key others may listen
             self._listened = listened
             self._robot.handle(Listened(bool(listened)), now_ns)
+
+    def _ask_for_lookers(self, now_ns: int) -> None:
+        if not self._robot.sensing.has_eyes:
+            return
+        key = topics.LOOK.at(robot=self._name)
+        looked = self._wiring.publisher(topics.LOOK, key).matching
+        if looked is not self._looked:
+            self._looked = looked
+            self._robot.handle(Looked(looked), now_ns)
 
     def _accepted(self, key: str, payload: bytes, now_ns: int) -> Message | None:
         helps = key.startswith(("belief/", "fix/"))
@@ -223,6 +234,8 @@ class Node:
                 return topics.FIX, key
             case Track():
                 return topics.TRACK, topics.TRACK.at(robot=me)
+            case Look():
+                return topics.LOOK, topics.LOOK.at(robot=me)
             case Drive():
                 return topics.DRIVE, topics.DRIVE.at(robot=me)
         raise TypeError(f"robots do not send {type(message).__name__}")

@@ -4,8 +4,8 @@ import logging
 import os
 import signal
 import threading
-from collections.abc import Callable, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from types import FrameType
 
 import msgspec
@@ -13,6 +13,7 @@ import msgspec
 from cpcbl_agents.clock import Clock
 from cpcbl_agents.node import Node, Stepped
 from cpcbl_agents.robot import Robot
+from cpcbl_agents.sources import OwnCamera
 from cpcbl_team.config import Team
 from cpcbl_transport.bus import Bus
 from cpcbl_transport.security import Identity, link_of
@@ -72,20 +73,44 @@ def run_robot(
     `through` is what stands between the robot and its bus.
 
     Raises BusError when stopped before a router answered, LogError for an unreadable log,
-    SecurityError without the keys of a secured team.
+    SecurityError without the keys of a secured team, ValueError for a camera that cannot be used.
     """
     wake = Wake()
     link = link_of(team, Identity(Role.ROBOT, name), connect)
-    with open_bus(team.name, link.endpoints, stop, link.credentials) as bus:
+    with (
+        own_camera(name, team, clock, wake) as camera,
+        open_bus(team.name, link.endpoints, stop, link.credentials) as bus,
+    ):
         start_ns = clock.now_ns()
         late_s = (start_ns - clock.epoch_ns) * 1e-9 / clock.speed
         if restarted or start_ns > clock.epoch_ns + LATE_NS * max(1.0, clock.speed):
             log.warning("robot %s starts %.1f s after the team: it looks where it is", name, late_s)
             team = _not_knowing_its_start(name, team)
         incarnation = f"{os.getpid():x}"
-        robot = Robot(name, team, start_ns, restarted)
+        robot = Robot(name, team, start_ns, restarted, camera)
         node = Node(robot, team, through(bus), start_ns, incarnation, wake.set, clock.speed)
         run_node(node, wake, clock, stop)
+
+
+@contextmanager
+def own_camera(name: str, team: Team, clock: Clock, wake: Wake) -> Iterator[OwnCamera | None]:
+    """The camera that a robot reads itself, until the end; None where nobody or a driver does.
+
+    Raises ValueError for a camera that cannot be used, or without OpenCV.
+    """
+    robot = team.robots[name]
+    if robot.sensing == "camera":
+        import cpcbl_agents.vision  # noqa: F401  it says what is missing
+    if robot.sensing != "camera" or not robot.camera.frames:
+        yield None
+        return
+    from cpcbl_agents.sources.camera import opened
+
+    camera = opened(name, robot.camera, robot.sensor.rate_hz, clock.now_ns, wake.set)
+    try:
+        yield camera
+    finally:
+        camera.close()
 
 
 def run_node(node: Stepped, wake: Wake, clock: Clock, stop: Callable[[], bool]) -> None:

@@ -3,31 +3,40 @@
 from collections import Counter
 from pathlib import Path
 
-from cpcbl_agents.agent import Anything, FromBus, Presence, Sent, Tick
+from cpcbl_agents.agent import Anything, FromBus, Looked, Presence, Sent, Tick
 from cpcbl_agents.collaboration import CollaborationAgent
 from cpcbl_agents.driving import Pilot
 from cpcbl_agents.eyes import Eyes
 from cpcbl_agents.filtering import FilterAgent
 from cpcbl_agents.guests import Guests
 from cpcbl_agents.sensing import SensingAgent
-from cpcbl_agents.sources import Silent, Source
+from cpcbl_agents.sources import OwnCamera, Silent, Source
 from cpcbl_agents.sources.mrclam import MrclamSource
 from cpcbl_team.config import Team
 from cpcbl_team.inputs import Belief, Fix, Odometry, Position, Sightings, Told
 from cpcbl_transport.budget import Budget
-from cpcbl_transport.messages import Drive, Frame, Message, Track
+from cpcbl_transport.messages import Drive, Frame, Look, Message, Track
 
 NEVER_NS = 2**62
 _OUTGOING = (Belief, Fix, Track, Drive)
 
 
 class Robot:
-    """The agents of one robot of a team. Raises LogError for a log that cannot be read.
+    """The agents of one robot of a team. Raises LogError for a log that cannot be read, ValueError
+    for a camera's robot without OpenCV.
 
-    `restarted`: its process ran before, and may have spent its budget then.
+    `restarted`: its process ran before, and may have spent its budget then. `camera`: where frames
+    come from that nobody sends.
     """
 
-    def __init__(self, name: str, team: Team, start_ns: int, restarted: bool = False) -> None:
+    def __init__(
+        self,
+        name: str,
+        team: Team,
+        start_ns: int,
+        restarted: bool = False,
+        camera: OwnCamera | None = None,
+    ) -> None:
         settings = team.robots[name]
         teammates = frozenset(team.robots) - {name}
         marks = frozenset(team.map.landmarks) | frozenset(team.map.walls)
@@ -41,7 +50,7 @@ class Robot:
             source.skip_to(start_ns)
         self.name = name
         self._told_ns = start_ns
-        self.sensing = SensingAgent(settings, source, marks, pilot, _eyes(name, team))
+        self.sensing = SensingAgent(settings, source, marks, pilot, _eyes(name, team), camera)
         self.filter = FilterAgent(settings, team.map, teammates, start_ns)
         budget = Budget(
             settings.collaboration.budget, start_ns, team.messages_per_s(name), renewed=restarted
@@ -60,6 +69,8 @@ class Robot:
             return []
         if isinstance(message, FromBus):
             self.collaboration.handle(message, now_ns)
+            if isinstance(message, Looked):
+                self.sensing.handle(message, now_ns)
             if isinstance(message, Presence):
                 there = message.robot in self.collaboration.guests
                 self.filter.handle(message if there else message._replace(tier=None), now_ns)
@@ -72,7 +83,8 @@ class Robot:
         located = [out for m in inputs for out in self.filter.handle(m, now_ns)]
         said = [out for m in located for out in self.collaboration.handle(m, now_ns)]
         said += [out for m in located for out in self.sensing.handle(m, now_ns)]
-        return [m for m in said if isinstance(m, _OUTGOING)]
+        looks = [m for m in inputs if isinstance(m, Look)]
+        return [*looks, *(m for m in said if isinstance(m, _OUTGOING))]
 
     def _told(self, stamp_ns: int, now_ns: int) -> None:
         """From now on what this robot knows may be in what its teammates say."""

@@ -5,20 +5,23 @@ from collections.abc import Sequence
 
 import msgspec
 
-from cpcbl_agents.agent import Anything, Located, Tick
+from cpcbl_agents.agent import Anything, Located, Looked, Tick
 from cpcbl_agents.driving import Pilot
-from cpcbl_agents.eyes import Eyes
-from cpcbl_agents.sources import Source
+from cpcbl_agents.eyes import Eyes, Picture
+from cpcbl_agents.sources import OwnCamera, Source
 from cpcbl_team.config import LocalizationSettings
 from cpcbl_team.inputs import Odometry, Position, Sightings
 from cpcbl_team.sensors import corrected_odometry, corrected_sighting
 from cpcbl_transport.messages import Frame
 
+LOOK_NS = 500_000_000
+
 SensorInput = Odometry | Sightings | Position | Frame
 
 
 class SensingAgent:
-    """Polls the source, takes a driver's messages, corrects delays, blinds what is blind.
+    """Polls the source and the camera, takes a driver's messages, corrects delays, blinds what is
+    blind.
 
     `marks`: what the map names. Whatever else is seen is a robot: a teammate, perhaps a guest.
     """
@@ -30,17 +33,29 @@ class SensingAgent:
         marks: frozenset[str],
         pilot: Pilot | None = None,
         eyes: Eyes | None = None,
+        camera: OwnCamera | None = None,
     ) -> None:
         self._sensor, self._odometry = settings.sensor, settings.odometry
         self._sensor_delay_ns = int(settings.sensor.delay_s * 1e9)
         own = settings.position_sensor
         self._position_delay_ns = 0 if own is None else int(own.delay_s * 1e9)
         self._source, self._marks, self._pilot, self._eyes = source, marks, pilot, eyes
-        self.counts: Counter[str] = Counter()
+        self._camera, self._looked, self._look_ns = camera, False, 0
+        self._counts: Counter[str] = Counter()
+
+    @property
+    def counts(self) -> Counter[str]:
+        """What was sensed, and what could not be used, by reason."""
+        return self._counts + (Counter() if self._camera is None else self._camera.counts)
+
+    @property
+    def has_eyes(self) -> bool:
+        return self._eyes is not None
 
     @property
     def next_ns(self) -> int | None:
-        return self._source.next_ns
+        sources = (self._source,) if self._camera is None else (self._source, self._camera)
+        return min((s.next_ns for s in sources if s.next_ns is not None), default=None)
 
     @property
     def over(self) -> bool:
@@ -49,28 +64,38 @@ class SensingAgent:
     def handle(self, message: Anything, now_ns: int) -> Sequence[Anything]:
         match message:
             case Tick():
-                return [out for item in self._source.poll(now_ns) for out in self._sensed(item)]
+                items = list(self._source.poll(now_ns))
+                items += () if self._camera is None else self._camera.poll(now_ns)
+                return [out for item in items for out in self._sensed(item)]
             case Odometry() | Sightings() | Position() | Frame():
                 return self._sensed(message)
+            case Looked():
+                self._looked = message.by_any
             case Located() if self._pilot is not None and message.frame is None:
                 return self._pilot.command(message)
         return ()
 
-    def _sensed(self, item: SensorInput) -> Sequence[Anything]:
-        if not isinstance(item, Frame):
+    def _sensed(self, item: SensorInput | Picture) -> Sequence[Anything]:
+        if not isinstance(item, Frame | Picture):
             return [self._corrected(item)]
         if self._eyes is None:
-            self.counts["no_camera"] += 1
+            self._counts["no_camera"] += 1
             return ()
-        self.counts["frame"] += 1
-        seen = self._eyes.seen(item)
+        self._counts["frame"] += 1
+        said: list[Anything] = []
+        if self._looked and not 0 <= item.stamp_ns - self._look_ns < LOOK_NS:
+            self._look_ns = item.stamp_ns
+            seen, look = self._eyes.shown(item)
+            said.append(look)
+        else:
+            seen = self._eyes.seen(item)
         if isinstance(seen, str):
-            self.counts[seen] += 1
-            return ()
-        return [self._corrected(seen)]
+            self._counts[seen] += 1
+            return said
+        return [*said, self._corrected(seen)]
 
     def _corrected(self, item: Odometry | Sightings | Position) -> Odometry | Sightings | Position:
-        self.counts[type(item).__name__.lower()] += 1
+        self._counts[type(item).__name__.lower()] += 1
         if isinstance(item, Odometry):
             return corrected_odometry(item, self._odometry)
         if isinstance(item, Position):

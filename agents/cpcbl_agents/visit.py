@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 from cpcbl_agents.node import Node
 from cpcbl_agents.robot import Robot
+from cpcbl_agents.sources import OwnCamera
 from cpcbl_team.config import RobotSettings, Team
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus
@@ -38,8 +39,9 @@ class Visit:
         incarnation: str,
         on_arrival: Callable[[], None] = lambda: None,
         speed: float = 1.0,
+        camera: OwnCamera | None = None,
     ) -> None:
-        self.robot = Robot(name, team, start_ns)
+        self.robot = Robot(name, team, start_ns, camera=camera)
         self._node = Node(self.robot, team, bus, start_ns, incarnation, on_arrival, speed)
         self._incarnation, self._due_ns = incarnation, start_ns
         self._warn_ns: int | None = start_ns + PATIENCE_NS

@@ -7,14 +7,15 @@ import sys
 
 import typer
 
+from cpcbl_launch.commands.calibrating import calibrate_app
 from cpcbl_launch.commands.deploying import compose
 from cpcbl_launch.commands.experimenting import experiment_app
 from cpcbl_launch.commands.faults import chaos
-from cpcbl_launch.commands.measuring import calibrate, evaluate_mrclam, simulate
+from cpcbl_launch.commands.measuring import evaluate_mrclam, simulate
 from cpcbl_launch.commands.observing import observer
 from cpcbl_launch.commands.running import check, field, robot, router, up
 from cpcbl_launch.commands.securing import keys
-from cpcbl_launch.commands.watching import traffic
+from cpcbl_launch.commands.watching import look, traffic
 
 app = typer.Typer(
     help="A team of robots that find out where they are, together.",
@@ -23,14 +24,15 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 for command in (
-    *(check, keys, up, traffic, robot, observer, router, field, compose),
-    *(calibrate, simulate, chaos),
+    *(check, keys, up, traffic, look, robot, observer, router, field, compose),
+    *(simulate, chaos),
 ):
     app.command()(command)
 
 evaluate_app = typer.Typer(help="Real logs in one process: deterministic and fast.")
 evaluate_app.command("mrclam")(evaluate_mrclam)
 app.add_typer(evaluate_app, name="evaluate")
+app.add_typer(calibrate_app, name="calibrate")
 app.add_typer(experiment_app, name="experiment")
 
 

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import msgspec
 
 from cpcbl_agents.clock import Clock
-from cpcbl_agents.process import Wake, run_node
+from cpcbl_agents.process import Wake, own_camera, run_node
 from cpcbl_agents.visit import Visit, body_of
 from cpcbl_launch.reporting.flows import FlowReport, summed_flows
 from cpcbl_launch.simulation.bodies import unfit
@@ -173,10 +173,14 @@ def visit(
     """
     wake = Wake()
     link = link_of(team, Identity(Role.OBSERVER, name), connect)
-    with open_bus(team.name, link.endpoints, stop, link.credentials) as bus:
+    with (
+        own_camera(name, team, clock, wake) as camera,
+        open_bus(team.name, link.endpoints, stop, link.credentials) as bus,
+    ):
         _look_for_namesakes(name, bus, stop)
         start_ns = clock.now_ns()
-        node = Visit(name, team, bus, start_ns, f"{os.getpid():x}", wake.set, clock.speed)
+        incarnation = f"{os.getpid():x}"
+        node = Visit(name, team, bus, start_ns, incarnation, wake.set, clock.speed, camera)
         run_node(node, wake, clock, lambda: stop() or clock.now_ns() - start_ns >= duration_s * 1e9)
         end_ns = clock.now_ns()
         node.leave(end_ns)

@@ -3,11 +3,13 @@
 import importlib.util
 import math
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import Any
 
 import msgspec
+
+from cpcbl_team.config import Team
 
 PICTURES = (".png", ".svg")
 
@@ -69,3 +71,28 @@ def must_draw(what: str, path: Path | None = None) -> None:
         raise ValueError(f"{what} {path}: not a picture; end its name in {' or '.join(PICTURES)}")
     if importlib.util.find_spec("matplotlib") is None:
         raise ValueError(f"{what} needs matplotlib: pip install 'cpcbl-team[plot]'")
+
+
+def must_have_opencv(what: str) -> None:
+    """Raises ValueError where OpenCV is not installed."""
+    if importlib.util.find_spec("cv2") is None:
+        raise ValueError(f"{what} needs OpenCV: pip install 'cpcbl-team[camera]'")
+
+
+def must_see(team: Team, robots: Collection[str] = (), field: bool = False) -> None:
+    """Raises ValueError where these robots, or the simulated field, need OpenCV and it is not
+    there."""
+    cameras = [name for name, robot in team.robots.items() if robot.sensing == "camera"]
+    eyes = [f"robots.{name}" for name in cameras if name in robots]
+    who = eyes[0] if eyes else "the simulated field" if field and team.renders else ""
+    if who and importlib.util.find_spec("cv2") is None:
+        raise ValueError(
+            f'team {team.name}: {who}: sensing = "camera" needs OpenCV:'
+            " pip install 'cpcbl-team[camera]'"
+        )
+
+
+def must_read(what: str) -> None:
+    """Raises ValueError where pictures cannot be read."""
+    if importlib.util.find_spec("cv2") is None:
+        raise ValueError(f"{what} needs OpenCV: pip install 'cpcbl-team[camera]'")

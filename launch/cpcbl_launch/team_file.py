@@ -15,6 +15,8 @@ from typing import Any, get_args, get_origin, get_type_hints
 import msgspec
 
 from cpcbl_team.config import (
+    LIKE_MIRRORED,
+    MARKERS,
     Field,
     GuestSettings,
     Landmark,
@@ -80,11 +82,23 @@ def load_team(path: Path) -> Team:
             return msgspec.json.decode(text, type=Team)
         except msgspec.MsgspecError as error:
             raise TeamFileError(f"{path}: {error}") from error
-    team = parse_team(text, str(path))
+    team = _with_frames_beside(parse_team(text, str(path)), path)
     if not team.transport.secured:
         return team
     transport = msgspec.structs.replace(team.transport, keys=str(key_folder(team, path)))
     return msgspec.structs.replace(team, transport=transport)
+
+
+def _with_frames_beside(team: Team, path: Path) -> Team:
+    """The videos and folders of cameras are relative to the file."""
+    robots = dict(team.robots)
+    for name, robot in team.robots.items():
+        camera = robot.camera
+        if camera.frames and not camera.live:
+            there = str((path.parent / camera.frames).absolute())
+            camera = msgspec.structs.replace(camera, frames=there)
+            robots[name] = msgspec.structs.replace(robot, camera=camera)
+    return msgspec.structs.replace(team, robots=robots)
 
 
 def key_folder(team: Team, path: Path) -> Path:
@@ -232,6 +246,9 @@ def _vision_problems(team: Team) -> Iterator[str]:
     known = ", ".join(team.vision.colours)
     bands = {f"map.landmarks.{n}": m.colours for n, m in team.map.landmarks.items()}
     bands.update({f"robots.{n}": r.colours for n, r in team.robots.items()})
+    for name, robot in team.robots.items():
+        if robot.source == "simulated" and robot.camera.frames:
+            yield f"robots.{name}.camera.frames: simulated frames are the field's; remove the key"
     for key, colours in bands.items():
         for colour in set(colours or ()) - team.vision.colours.keys():
             yield f"{key}.colours: no colour {colour!r}; use one of {known}, or add its thresholds"
@@ -241,6 +258,24 @@ def _vision_problems(team: Team) -> Iterator[str]:
         marks = [m.colours for m in team.map.landmarks.values() if m.colours is not None]
         for twice in sorted({c for c in marks if marks.count(c) > 1}):
             yield f"map.landmarks: two have the colours {list(twice)}; give each its own"
+    yield from _marker_problems(team)
+
+
+def _marker_problems(team: Team) -> Iterator[str]:
+    """Markers are of the family, and tell a robot's sides apart. Two robots may carry the same
+    ones: that is said when they are seen."""
+    family = team.vision.family
+    mirrored = LIKE_MIRRORED.get(family, frozenset())
+    for name, robot in team.robots.items():
+        ids = list(robot.markers.values())
+        for side, number in robot.markers.items():
+            key = f"robots.{name}.markers.{side}"
+            if not 0 <= number < MARKERS[family]:
+                yield f"{key}: {family} has no marker {number}; use 0 to {MARKERS[family] - 1}"
+            elif number in mirrored:
+                yield f"{key}: marker {number} of {family} is its own mirror image; use another"
+            elif ids.count(number) > 1:
+                yield f"{key}: marker {number} is on two sides; give each side its own"
 
 
 def _insecure(endpoint: str, secured: bool) -> str:

@@ -19,13 +19,17 @@ from cpcbl_team.config import (
     BudgetSettings,
     CollaborationSettings,
     LocalizationSettings,
+    LocalizerSettings,
     SensorSettings,
+    Variant,
 )
 from cpcbl_team.estimate import Estimate
 from cpcbl_team.geometry import Pose2
 from cpcbl_team.inputs import Belief, Fix, Sighting, Sightings
 from cpcbl_transport.budget import Budget
+from cpcbl_transport.compact import help_bytes
 from cpcbl_transport.messages import Flow, Track
+from cpcbl_transport.overhead import sent_bytes
 
 GOOD, POOR, POORER = 2, 9, 12  # tiers
 SIGMA_M = {GOOD: 0.019, POOR: 0.2, POORER: 0.6}
@@ -43,10 +47,12 @@ class Alone:
         *,
         sensor: SensorSettings | None = None,
         budget: BudgetSettings | None = None,
+        variant: Variant = "joint",
         **rules: Any,
     ) -> None:
         budget = budget or BudgetSettings()
         settings = LocalizationSettings(
+            localizer=LocalizerSettings(variant=variant),
             sensor=sensor or SensorSettings(),
             collaboration=CollaborationSettings(budget=budget, **rules),
         )
@@ -98,7 +104,8 @@ class Alone:
         messages = [m for m in said if isinstance(m, kind)]
         assert len(messages) == len(said)
         for message in messages:
-            self.agent.handle(Sent(message, 42 if self.heard else 0), self.now_ns)
+            size = sent_bytes(help_bytes(message))
+            self.agent.handle(Sent(message, size if self.heard else 0), self.now_ns)
         return messages
 
     def tally(self, topic: str, peer: str = "") -> Tally:
@@ -107,6 +114,14 @@ class Alone:
 
 def ahead(name: str = "mate", range_m: float = 2.0) -> Sighting:
     return Sighting(name, range_m, 0.0)
+
+
+def turned(
+    name: str = "mate", range_m: float = 2.0, heading_rad: float = 0.5, sigma_rad: float = 0.05
+) -> Sighting:
+    """A teammate ahead whose heading is seen, too."""
+    seen = ahead(name, range_m)
+    return replace(seen, heading_rad=heading_rad, heading_sigma_rad=sigma_rad)
 
 
 def robots(fixes: list[Fix]) -> list[str]:
@@ -276,6 +291,72 @@ def test_within_its_tier_a_way_makes_a_fix_worth_more() -> None:
     assert sent == [0, 1]
 
 
+# What it tells of headings ----------------------------------------------------------------------
+
+
+def test_a_heading_is_told_with_the_fix_and_paid_for() -> None:
+    alone = Alone(budget=BudgetSettings(bytes_per_s=100.0))
+    alone.tell(Presence("mate", POORER))
+    (fix,) = alone.sees(turned())
+    assert fix.heading_rad == pytest.approx(0.5)
+    assert fix.heading_observer_variance == pytest.approx(0.02**2)
+    (spending,) = alone.agent.budget.spending(alone.now_ns)
+    assert spending.most == alone.tally("fix", "mate").bytes == 49
+
+
+def test_a_heading_that_nobody_heard_costs_nothing() -> None:
+    alone = Alone(budget=BudgetSettings(bytes_per_s=50.0, urgent_share=0.0))
+    alone.tell(Presence("mate", POORER))
+    alone.heard = False
+    for _ in range(50):
+        (fix,) = alone.sees(turned())
+        assert fix.heading_rad is not None
+    assert alone.agent.budget.admits(alone.now_ns, 500, urgent=False)
+
+
+def test_who_knows_its_place_is_told_its_heading_until_that_is_no_news() -> None:
+    """Far away, its position alone would be worth too little; the same again is, too."""
+    alone = Alone()
+    alone.tell(Presence("mate", GOOD + 1))
+    assert alone.sees(ahead(range_m=7.0)) == []
+    fixes = [fix for _ in range(20) for fix in alone.sees(turned(range_m=7.0))]
+    assert 0 < len(fixes) < 8
+    assert all(fix.heading_rad is not None for fix in fixes)
+    assert alone.tally("fix", "mate").worthless == 1 + 20 - len(fixes)
+
+
+def test_a_heading_that_is_no_news_is_left_out_of_a_fix_that_is() -> None:
+    """Of a teammate that drives across; its heading is known by then to what this robot knows."""
+    alone = Alone(tier_width=1.5)
+    alone.tell(Presence("mate", POOR))
+    told = [fix for _ in range(30) for fix in alone.sees(turned())]
+    (later,) = alone.sees(
+        Sighting("mate", 2.0, 0.4, heading_rad=0.5, heading_sigma_rad=1.0), after_ns=SECOND
+    )
+    assert told[0].heading_rad is not None
+    assert later.heading_rad is None
+    assert later.heading_sensor_variance == later.heading_observer_variance == 0.0
+
+
+def test_who_is_lost_is_told_its_heading_every_time() -> None:
+    alone = Alone()
+    alone.tell(Presence("mate", LOWEST_TIER))
+    for _ in range(10):
+        (fix,) = alone.sees(turned(), after_ns=100 * MS)
+        assert fix.heading_rad is not None
+
+
+def test_without_a_covariance_every_heading_is_told() -> None:
+    alone = Alone(variant="weighted")
+    alone.tell(Presence("mate", POOR))
+    fixes = [fix for _ in range(10) for fix in alone.sees(turned())]
+    assert len(fixes) == 10
+    assert all(fix.heading_rad is not None for fix in fixes)
+
+
+# When and how much ------------------------------------------------------------------------------
+
+
 def test_no_fixes_where_active_help_is_switched_off_or_has_not_begun() -> None:
     for rules, then in (({"active": False}, 0), ({"after_s": 2.0}, 1)):
         alone = Alone(**rules)
@@ -293,24 +374,33 @@ def test_no_fixes_where_active_help_is_switched_off_or_has_not_begun() -> None:
             st.integers(0, LOWEST_TIER),
             st.floats(0.3, 8.0),
             st.integers(1, 500).map(lambda n: n * MS),
+            st.booleans(),
         ),
         max_size=60,
     ),
     st.floats(20.0, 200.0),
 )
 def test_every_offer_is_sent_or_counted_and_the_budget_holds(
-    seen: list[tuple[str, int, float, int]], bytes_per_s: float
+    seen: list[tuple[str, int, float, int, bool]], bytes_per_s: float
 ) -> None:
+    """Of fixes with a heading, too, by what each takes."""
     alone = Alone(budget=BudgetSettings(bytes_per_s=bytes_per_s))
-    offers = 0
-    for name, tier, range_m, after_ns in seen:
+    offers, sent = 0, [(0, 0)]
+    for name, tier, range_m, after_ns, headed in seen:
         alone.tell(Presence(name, tier))
-        alone.sees(ahead(name, range_m), after_ns=after_ns)
+        sight = (turned if headed else ahead)(name, range_m)
+        fixes = alone.sees(sight, after_ns=after_ns)
+        sent += [(alone.now_ns, 42 if fix.heading_rad is None else 49) for fix in fixes]
         offers += tier > alone.agent.tier
     flows = alone.agent.tallies.flows()
     assert sum(f.messages + f.worthless + f.over_budget for f in flows) == offers
     (spending,) = alone.agent.budget.spending(alone.now_ns)
     assert spending.most <= spending.allowed
+    window_ns = round(spending.allowed / bytes_per_s * SECOND)
+    for end_ns, _ in sent:
+        within = [size for at_ns, size in sent if end_ns - window_ns < at_ns <= end_ns]
+        assert sum(within) <= spending.allowed
+    assert sum(size for _, size in sent) == sum(f.bytes for f in flows)
 
 
 # When it says what it believes --------------------------------------------------------------------
@@ -518,7 +608,7 @@ def test_what_has_left_the_robot_is_counted_by_kind_and_teammate() -> None:
     (belief,) = alone.later(0.2)
     alone.agent.handle(Sent(replace(fix, stamp_ns=7 * SECOND), 8), alone.now_ns)
     assert alone.agent.tallies.flows() == (
-        Flow("belief", "", 1, 42, latest_ns=belief.stamp_ns),
+        Flow("belief", "", 1, 50, latest_ns=belief.stamp_ns),
         Flow("fix", fix.robot, 2, 50, latest_ns=7 * SECOND),
         Flow("fix", "other" if fix.robot == "mate" else "mate", 1, 42, latest_ns=fix.stamp_ns),
     )

@@ -34,13 +34,21 @@ from cpcbl_team.value import sigma_range_m
 from cpcbl_transport import topics
 from cpcbl_transport.bus import MemoryBus, MemoryHub, Publisher
 from cpcbl_transport.compact import BELIEF_BYTES
-from cpcbl_transport.messages import LARGEST_PAYLOAD, VERSION, Message, Refusal, Track
+from cpcbl_transport.messages import (
+    LARGEST_FRAME,
+    LARGEST_PAYLOAD,
+    VERSION,
+    Frame,
+    Message,
+    Refusal,
+    Track,
+)
 from cpcbl_transport.overhead import sent_bytes
 
 GOOD, POOR = 0.02, 0.3
 COVARIANCE = (0.0004, 0.0, 0.0004, 0.0, 0.0, 0.0001)
 NOW = 3 * SECOND
-IN_ODOMETRY, IN_SIGHTINGS, IN_POSITION = (t.at(robot="me") for t in topics.INPUTS)
+IN_ODOMETRY, IN_SIGHTINGS, IN_POSITION, IN_FRAME = (t.at(robot="me") for t in topics.INPUTS)
 BELIEF_KEY = topics.BELIEF.at(tier=2, robot="mate")
 FIX_KEY = topics.FIX.at(robot="me", tier=2, observer="mate")
 BELIEF = Belief("mate", NOW, 2.0, 0.0, 0.0, COVARIANCE)
@@ -101,6 +109,8 @@ def changed(message: Message, **fields: object) -> Message:
 BAD = [
     Bad(Refusal.EMPTY, BELIEF_KEY, b""),
     Bad(Refusal.TOO_LARGE, BELIEF_KEY, bytes(LARGEST_PAYLOAD + 1)),
+    Bad(Refusal.TOO_LARGE, IN_ODOMETRY, Frame(NOW, bytes(LARGEST_PAYLOAD))),
+    Bad(Refusal.TOO_LARGE, IN_FRAME, Frame(NOW, bytes(LARGEST_FRAME))),
     Bad(Refusal.VERSION, BELIEF_KEY, bytes([VERSION + 1]) + written(BELIEF)[1:]),
     Bad(Refusal.VERSION, FIX_KEY, bytes([VERSION + 1]) + written(FIX)[1:]),
     Bad(Refusal.GARBAGE, BELIEF_KEY, written(BELIEF)[:-3]),
@@ -112,6 +122,9 @@ BAD = [
     Bad(Refusal.WRONG_TYPE, IN_SIGHTINGS, Track("me", NOW, 0.0, 0.0, 0.0, None, 3)),
     Bad(Refusal.WRONG_TYPE, IN_ODOMETRY, saw(NOW, Sighting("oak", 3.5, 0.0))),
     Bad(Refusal.WRONG_TYPE, IN_SIGHTINGS, POSITION),
+    Bad(Refusal.WRONG_TYPE, IN_SIGHTINGS, Frame(NOW, b"jpeg")),
+    Bad(Refusal.WRONG_TYPE, IN_FRAME, saw(NOW, Sighting("oak", 3.5, 0.0))),
+    Bad("no_camera", IN_FRAME, Frame(NOW, bytes(LARGEST_PAYLOAD))),
     Bad(Refusal.NOT_FINITE, IN_POSITION, changed(POSITION, y_m=math.nan)),
     Bad(Refusal.NOT_FINITE, IN_ODOMETRY, Odometry(NOW, NOW + 50 * MS, math.nan, 0.0)),
     Bad("not_finite", IN_SIGHTINGS, saw(NOW, Sighting("oak", math.nan, 0.0))),
@@ -124,6 +137,7 @@ BAD = [
     Bad(Refusal.CLOCK, BELIEF_KEY, changed(BELIEF, stamp_ns=NOW + 300 * MS)),
     Bad(Refusal.CLOCK, FIX_KEY, changed(FIX, stamp_ns=NOW + 250 * MS)),
     Bad(Refusal.FUTURE, IN_SIGHTINGS, saw(NOW + SECOND)),
+    Bad(Refusal.FUTURE, IN_FRAME, Frame(NOW + SECOND, b"jpeg")),
     Bad(Refusal.DURATION, IN_ODOMETRY, standing(NOW, NOW)),
     Bad(Refusal.UNKNOWN_ROBOT, topics.FIX.at(robot="me", tier=2, observer="ghost"), FIX),
     Bad(Refusal.OWN, topics.FIX.at(robot="me", tier=2, observer="me"), FIX),
@@ -297,6 +311,18 @@ def test_no_finite_numbers_raise(keyed: tuple[str, Message]) -> None:
     stand.sightings("me", saw(stand.now_ns, MATE_SEEN, Sighting("oak", 4.0, 0.0)))
     stand.step()
     assert stand.nodes["me"].next_ns > NOW
+
+
+def test_of_frames_only_the_latest_is_kept() -> None:
+    stand = only_me()
+    for n in range(5):
+        stand.put(IN_FRAME, Frame(NOW - n, b"jpeg"))
+        stand.put(IN_FRAME, b"garbage")
+    stand.put(IN_FRAME, Frame(NOW, b"jpeg"))
+    stand.step()
+    assert stand.nodes["me"].counts["frame_skipped"] == 10
+    assert Refusal.VERSION not in stand.nodes["me"].counts
+    assert stand.robots["me"].counts["no_camera"] == 1
 
 
 def test_a_full_inbox_drops_the_oldest_and_counts_it() -> None:

@@ -7,12 +7,14 @@ from core_helpers import (
     SECOND,
     belief,
     covariance3,
+    diagonal,
     least_eigenvalue,
     matrix2,
     random_matrix,
 )
 from hypothesis import given
 from hypothesis import strategies as st
+from msgspec.structs import replace
 
 from cpcbl_team.collaboration import (
     LOWEST_TIER,
@@ -23,6 +25,7 @@ from cpcbl_team.collaboration import (
     placed,
     tier_of,
     tiers_heard,
+    without_heading,
 )
 from cpcbl_team.config import CollaborationSettings, SensorSettings
 from cpcbl_team.estimate import Estimate
@@ -85,6 +88,7 @@ def test_a_fix_is_the_sighting_compounded_with_the_observers_pose(seed: int) -> 
         Sighting("me", math.nan, 0.1),
         Sighting("me", -1.0, 0.1),
         Sighting("me", 3.0, 9.0),
+        Sighting("me", 3.0, 0.1, None, None, 0.4),
     ],
 )
 def test_a_fix_needs_a_good_range_and_bearing(sighting: Sighting) -> None:
@@ -95,6 +99,23 @@ def test_a_range_that_is_too_long_to_be_good_makes_no_fix() -> None:
     sensor = SensorSettings(max_range_for_range_m=2.0)  # row 3
     assert observed(Sighting("me", 1.9, 0.1), an_observer(0), sensor) is not None
     assert observed(Sighting("me", 2.1, 0.1), an_observer(0), sensor) is None
+
+
+@given(st.floats(-math.pi, math.pi), st.floats(-math.pi, math.pi), st.floats(0.001, 1.0))
+def test_a_heading_that_was_seen_is_told_in_the_fields_frame(
+    own: float, seen: float, sigma: float
+) -> None:
+    observer = Estimate(Pose2(1.0, -2.0, own), diagonal(0.1, 0.03))
+    sighting = Sighting("me", 3.0, 0.4)
+    plain = observed(sighting, observer)
+    sent = observed(replace(sighting, heading_rad=seen, heading_sigma_rad=sigma), observer)
+    assert sent is not None
+    assert sent.heading_rad is not None
+    assert abs(sent.heading_rad) <= math.pi
+    assert math.remainder(sent.heading_rad - own - seen, math.tau) == pytest.approx(0.0, abs=1e-9)
+    variances = sent.heading_sensor_variance, sent.heading_observer_variance
+    assert variances == pytest.approx((sigma**2, 0.03**2))
+    assert without_heading(sent) == plain
 
 
 # Passive ------------------------------------------------------------------------------------------

@@ -44,7 +44,9 @@ marks = st.builds(Landmark, x_m=st.floats(-5.0, 5.0), y_m=st.floats(-5.0, 5.0), 
 fields = st.lists(marks, min_size=1, max_size=len(NAMES)).map(
     lambda found: Field(landmarks=dict(zip(NAMES, found, strict=False)))
 )
-kinds = st.sampled_from(3 * ("both",) + ("range", "bearing", "none", "nan", "own"))
+kinds = st.sampled_from(
+    3 * ("both",) + ("range", "bearing", "none", "nan", "own", "headed", "faulty")
+)
 readings = st.lists(
     st.tuples(kinds, errors, errors),
     min_size=len(NAMES),
@@ -82,6 +84,8 @@ def read_as(exact: Sighting, kind: str, range_error: float, bearing_error: float
         "none": Sighting(exact.id),
         "nan": Sighting(exact.id, math.nan, bearing),
         "own": Sighting(exact.id, range_m, bearing, 0.3, 0.1),
+        "headed": Sighting(exact.id, range_m, bearing, None, None, 0.5, 0.1),
+        "faulty": Sighting(exact.id, range_m, bearing, None, None, 0.5),
     }[kind]
 
 

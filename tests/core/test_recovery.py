@@ -155,6 +155,13 @@ def fix_piece(stamp_ns: int, robot: Pose2) -> Evidence:
     return Evidence(stamp_ns, robot, "fix:mate", robot.x, robot.y, None, None, 0.0, 0.0, 0.1, True)
 
 
+def headed_piece(stamp_ns: int, robot: Pose2, sigma_rad: float = 0.05) -> Evidence:
+    """A fix with the heading, half of whose variance is the observer's."""
+    part = sigma_rad * math.sqrt(0.5)
+    told = fix_piece(stamp_ns, robot)._replace(bearing_sigma_rad=part)
+    return told._replace(heading_rad=robot.heading, place_sigma_rad=part)
+
+
 def seen_along(
     path: Iterable[Pose2], names: Sequence[str], gives: Gives = "both"
 ) -> tuple[Evidence, ...]:
@@ -205,6 +212,18 @@ def found_at(evidence: Iterable[Evidence], truth: Pose2) -> Estimate | None:
         pytest.param(
             (fix_piece(0, PATH[0]), *seen_along(PATH[1:], ["ne"])), id="a fix and a landmark"
         ),
+        pytest.param(
+            tuple(headed_piece(i * SPACING_NS, PATH[0]) for i in range(2)),
+            id="two fixes with a heading at one place",
+        ),
+        pytest.param(
+            (headed_piece(0, PATH[0]), *seen_along(PATH[1:2], ["ne"], "bearing")),
+            id="a fix with a heading, and a bearing",
+        ),
+        pytest.param(
+            (headed_piece(0, PATH[0]), fix_piece(SPACING_NS, PATH[0])),
+            id="a fix with a heading, and one without",
+        ),
     ],
 )
 def test_a_robot_is_found_by_triangulation(evidence: tuple[Evidence, ...]) -> None:
@@ -232,6 +251,7 @@ ON_THE_LINE = tuple(
         pytest.param(
             tuple(fix_piece(i * SPACING_NS, PATH[0]) for i in range(4)), id="fixes at one place"
         ),
+        pytest.param((headed_piece(0, PATH[0]),), id="one fix with a heading: nothing confirms it"),
     ],
 )
 def test_what_is_ambiguous_finds_nobody(evidence: tuple[Evidence, ...]) -> None:
@@ -249,6 +269,29 @@ def test_evidence_that_contradicts_itself_finds_nobody() -> None:
     evidence = seen_along(PATH[-1:], ["ne", "nw"])
     wrong = [e._replace(range_m=1.0, bearing_rad=0.1 * i) for i, e in enumerate(evidence)]
     assert relocalized(tuple(wrong), PATH[-1], CORNERS) is None
+
+
+def test_headings_that_contradict_each_other_find_nobody() -> None:
+    one, other = (headed_piece(i * SPACING_NS, PATH[0]) for i in range(2))
+    other = other._replace(heading_rad=PATH[0].heading + 1.0)
+    assert relocalized((one, other), PATH[0], CORNERS) is None
+
+
+def test_a_wrong_heading_among_right_ones_is_left_out() -> None:
+    evidence = [headed_piece(i * SPACING_NS, pose) for i, pose in enumerate(PATH * 2)]
+    evidence[1] = evidence[1]._replace(heading_rad=-2.0)
+    assert found_at(evidence, PATH[-1]) is not None
+
+
+@pytest.mark.parametrize("times", [1, 6])
+def test_an_observer_that_repeats_a_heading_is_not_believed_more(times: int) -> None:
+    """Of its own 0.1 rad nothing is averaged away, and nothing of it by its position either."""
+    told = [headed_piece(i, PATH[0], 0.1 * math.sqrt(2.0)) for i in range(2 * times)]
+    sure = [e._replace(bearing_sigma_rad=0.001) for e in told]
+    found = relocalized(tuple(sure), PATH[0], CORNERS)
+    assert found is not None
+    assert found.heading_sigma_rad > 0.1
+    assert found.shared == found.covariance
 
 
 @pytest.mark.parametrize("times", [1, 6])

@@ -2,6 +2,8 @@ import math
 
 import msgspec
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from cpcbl_team.config import OdometrySettings, SensorSettings
 from cpcbl_team.inputs import Odometry, Sighting, Sightings
@@ -34,6 +36,14 @@ NAN = math.nan
         (Sighting("a", None, -3.2), "bearing_out_of_range"),
         (Sighting("a", 1.0, 0.1, 0.0), "sigma_not_positive"),
         (Sighting("a", 1.0, 0.1, None, -0.1), "sigma_not_positive"),
+        (Sighting("a", 1.0, 0.1, None, None, NAN, 0.1), "not_finite"),
+        (Sighting("a", 1.0, 0.1, None, None, 0.3, math.inf), "not_finite"),
+        (Sighting("a", 1.0, 0.1, None, None, 1e7, 0.1), "implausible_number"),
+        (Sighting("a", None, None, None, None, 0.3, 0.1), "empty_sighting"),
+        (Sighting("a", 1.0, 0.1, None, None, -3.2, 0.1), "heading_out_of_range"),
+        (Sighting("a", 1.0, 0.1, None, None, 0.3), "heading_without_sigma"),
+        (Sighting("a", 1.0, 0.1, None, None, 0.3, 0.0), "sigma_not_positive"),
+        (Sighting("a", 1.0, 0.1, None, None, None, -0.1), "sigma_not_positive"),
     ],
 )
 def test_a_sighting_that_must_not_be_used_says_why(sighting: Sighting, fault: str) -> None:
@@ -47,6 +57,8 @@ def test_a_sighting_that_must_not_be_used_says_why(sighting: Sighting, fault: st
         Sighting("a", None, math.pi),
         Sighting("a", None, -math.pi),
         Sighting("a", 1e-6, 0.0, 1e-6, 1e-6),
+        Sighting("a", 1.0, 0.1, None, None, math.pi, 1e-6),
+        Sighting("a", 1.0, 0.1, None, None, None, 0.1),
     ],
 )
 def test_a_sighting_may_give_either_or_both(sighting: Sighting) -> None:
@@ -121,9 +133,35 @@ def test_readings_made_from_the_truth_are_corrected_to_it(teammate: bool, is_dep
     assert (found.id, found.range_sigma_m, found.bearing_sigma_rad) == ("a", 0.1, 0.2)
 
 
+@given(
+    st.floats(-3.0, 3.0), st.floats(-math.pi, math.pi), st.floats(0.9, 1.1), st.floats(-20.0, 20.0)
+)
+def test_a_heading_stays_as_it_was_seen_against_the_line_of_sight(
+    bearing: float, heading: float, scale: float, bias_deg: float
+) -> None:
+    """A marker tells how it is turned against the ray on which it stands."""
+    sensor = SensorSettings(bearing_scale=scale, bearing_bias_deg=bias_deg)
+    seen = Sighting("a", 2.0, bearing, None, None, heading, 0.1)
+    found = corrected_sighting(seen, sensor, True)
+    for after in (found, *without_bearing_bias(Sightings(7, (seen,)), 0.3).sightings):
+        assert after.heading_rad is not None
+        assert after.bearing_rad is not None
+        assert abs(after.heading_rad) <= math.pi
+        turned = after.heading_rad - after.bearing_rad - (heading - bearing)
+        assert math.remainder(turned, math.tau) == pytest.approx(0.0, abs=1e-9)
+        assert after.heading_sigma_rad == 0.1
+
+
 @pytest.mark.parametrize(
     "sighting",
-    [Sighting("a", 1.0, None), Sighting("a", None, 0.1), Sighting("a"), Sighting("a", 1.0, 3.2)],
+    [
+        Sighting("a", 1.0, None),
+        Sighting("a", None, 0.1),
+        Sighting("a"),
+        Sighting("a", 1.0, 3.2),
+        Sighting("a", 1.0, 0.25, None, None, -2.5, 0.1),
+        Sighting("a", 1.0, 0.25, None, None, 3.2, 0.1),
+    ],
 )
 def test_a_neutral_correction_changes_nothing(sighting: Sighting) -> None:
     assert corrected_sighting(sighting, SensorSettings(), True) == sighting
@@ -136,6 +174,9 @@ def test_faulty_readings_stay_faulty() -> None:
         (Sighting("a", 1.0, NAN), "not_finite"),
         (Sighting("a", 1.0, 3.2), "bearing_out_of_range"),
         (Sighting("a", 0.05, 0.1), "range_not_positive"),
+        (Sighting("a", 1.0, 0.1, None, None, 3.2, 0.1), "heading_out_of_range"),
+        (Sighting("a", 1.0, 0.1, None, None, NAN, 0.1), "not_finite"),
+        (Sighting("a", 1.0, 0.1, None, None, 0.1), "heading_without_sigma"),
     ):
         assert sighting_fault(corrected_sighting(sighting, sensor, False)) == fault
 

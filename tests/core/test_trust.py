@@ -12,7 +12,9 @@ from core_helpers import (
     belief,
     diagonal,
     driven,
+    fix,
     frame,
+    heading_error,
     localizer,
     loop,
     position_error,
@@ -21,6 +23,7 @@ from core_helpers import (
 )
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from msgspec.structs import replace
 
 from cpcbl_team import trust
 from cpcbl_team.config import (
@@ -31,7 +34,7 @@ from cpcbl_team.config import (
     TrustSettings,
     Variant,
 )
-from cpcbl_team.geometry import Pose2
+from cpcbl_team.geometry import Pose2, wrap_angle
 from cpcbl_team.inputs import Fix, Input, Odometry, Sighting, Sightings
 from cpcbl_team.localizer import Localizer
 from cpcbl_team.state import State
@@ -462,6 +465,24 @@ def test_a_liar_does_little_harm_to_a_blind_robot(kind: str, others: Sequence[st
         assert "liar" in told.quarantines
         assert not any(voice.reason for voice in told.state.memory.voices.values())
     assert np.median([told.rmse_m for told in runs]) <= 1.3 * np.median(without)
+
+
+def test_who_lies_about_the_heading_alone_is_found_by_the_robots_own_eyes() -> None:
+    """Its positions are right; an honest teammate tells both."""
+    off = {"liar": 0.6, "honest": 0.0}
+    robot = localizer(sensor=SensorSettings(sees_landmarks=True), odometry=NOISE)
+    noise = sensor_noise(np.random.default_rng(4), robot.settings.sensor)
+    state, errors = state_at(LOOP_START, diagonal(0.05, 0.05)), []
+    for piece, truth in driven(LOOP_START, loop()[:200]):
+        now = piece.stamp_ns
+        state = robot.cycle(robot.drive(state, piece), frame(truth, now, noise=noise))
+        for name, lie in off.items():
+            told = fix(truth.x, truth.y, now, heading=wrap_angle(truth.heading + lie))
+            state = robot.fix(state, replace(told, observer=name))
+        errors.append(heading_error(state.estimate, truth))
+    assert state.memory.voices["liar"].reason
+    assert not state.memory.voices["honest"].reason
+    assert max(errors) < 0.1
 
 
 @kinds

@@ -18,9 +18,13 @@ from cpcbl_team.geometry import Pose2, step
 from cpcbl_team.inputs import Belief, Fix
 from cpcbl_team.value import (
     LOST_SIGMA_M,
+    USUAL_HEADING_SIGMA_RAD,
     Helped,
     expected,
+    expected_heading,
+    heading_worth,
     merged,
+    merged_heading,
     sigma_range_m,
     staleness,
     use_of,
@@ -32,6 +36,7 @@ SECOND = 1_000_000_000
 NOTHING = Covariance2(0.0, 0.0, 0.0)
 sigmas = st.floats(0.005, 2.0)
 covariances = st.builds(oriented, sigmas, sigmas, st.floats(-math.pi, math.pi))
+fusions = st.sampled_from(["split-ci", "naive"])
 tiers = st.integers(0, LOWEST_TIER)
 coordinates = st.floats(-20.0, 20.0)
 
@@ -209,6 +214,73 @@ def test_what_the_last_fix_left_is_believed_within_the_bounds(covariance: Covari
     assert after == pytest.approx(covariance, abs=1.01 * SMALLEST_VARIANCE)
 
 
+# What a heading is worth --------------------------------------------------------------------------
+
+GOOD, USUAL = 5, USUAL_HEADING_SIGMA_RAD**2
+variances = st.floats(1e-6, math.pi**2)
+
+
+def headed(sensor_variance: float, observer_variance: float) -> Fix:
+    place = Fix("mate", "me", 0, 1.0, 2.0, NOTHING, NOTHING)
+    return replace(
+        place,
+        heading_rad=0.5,
+        heading_sensor_variance=sensor_variance,
+        heading_observer_variance=observer_variance,
+    )
+
+
+def test_what_a_heading_is_worth_by_hand() -> None:
+    """From 10 degrees to 5 is a factor of two; for who is lost, from any to nearly 5."""
+    after = merged_heading(USUAL, headed(USUAL / 3.0, 0.0), "naive")
+    assert heading_worth(USUAL, after) == pytest.approx(math.log(2.0), rel=1e-6)
+    lost = expected_heading(LOWEST_TIER, None, 0.0, 0.0)
+    assert lost == pytest.approx(math.pi**2 / 3.0)
+    after = merged_heading(lost, headed(math.radians(5.0) ** 2, 0.0), "naive")
+    assert heading_worth(lost, after) == pytest.approx(math.log(1.8138 / 0.08716), rel=1e-3)
+
+
+@given(variances, variances, variances, fusions)
+def test_a_heading_never_makes_worse_nor_better_than_it_is_known(
+    prior: float, sensor: float, observer: float, fusion: Fusion
+) -> None:
+    after = merged_heading(prior, headed(sensor, observer), fusion)
+    assert -1e-9 <= heading_worth(prior, after) < math.inf
+    assert after >= 0.99 / (1.0 / prior + 1.0 / (sensor + observer))
+
+
+@given(variances, variances)
+def test_the_observers_own_heading_is_told_once(prior: float, observer: float) -> None:
+    """By split covariance intersection: what all depends on it comes to no more than it is."""
+    once = merged_heading(prior, headed(0.0, observer), "split-ci")
+    twice = merged_heading(once, headed(0.0, observer), "split-ci")
+    assert twice >= 0.99 * min(prior, observer)
+    assert heading_worth(once, twice) < 0.05
+
+
+@given(variances, st.floats(0.0, 20.0), st.floats(0.0, 20.0))
+def test_a_heading_is_news_again_after_a_way_but_no_more_than_at_first(
+    left: float, a: float, b: float
+) -> None:
+    helped = Helped(1.0, 2.0, NOTHING, min(left, USUAL))
+    near, far = (expected_heading(GOOD, helped, 1.0 + way, 2.0) for way in sorted((a, b)))
+    assert helped.heading_variance <= near <= far <= expected_heading(GOOD, None, 1.0, 2.0)
+    assert expected_heading(LOWEST_TIER, helped, 1.0, 2.0) > USUAL
+
+
+def test_a_heading_is_news_after_a_metre_or_two() -> None:
+    """Of an observer that knows its own to 1 degree, by a marker good to 3."""
+    said = headed(math.radians(3.0) ** 2, math.radians(1.0) ** 2)
+    left, gained = USUAL, []
+    for way in (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 2.0):
+        prior = expected_heading(GOOD, Helped(way, 0.0, NOTHING, left), 0.0, 0.0)
+        left = merged_heading(prior, said, "split-ci")
+        gained.append(heading_worth(prior, left))
+    assert gained[0] > 1.0
+    assert gained[5] < 0.1
+    assert gained[6] > 0.3
+
+
 # Whose belief is of use ---------------------------------------------------------------------------
 
 
@@ -307,7 +379,6 @@ def test_news_of_the_sigma_is_of_the_ellipse_whatever_its_direction(shape: Covar
 
 exact_or_not = st.just(0.0) | st.floats(1e-9, 20.0)
 areas = st.builds(oriented, exact_or_not, exact_or_not, st.floats(-math.pi, math.pi))
-fusions = st.sampled_from(["split-ci", "naive"])
 ways = st.just(0.0) | st.floats(-20.0, 20.0)
 either_rules = CollaborationSettings(fusion="split-ci"), CollaborationSettings(fusion="naive")
 

@@ -248,13 +248,29 @@ def test_a_flood() -> None:
     }
 
 
-SENT = Sent(help=100, inputs=60, commands=30, to_people=90, no_messages=80, no_statuses=25)
+SENT = Sent(
+    help=100,
+    inputs=60,
+    commands=30,
+    to_people=90,
+    no_messages=80,
+    no_statuses=25,
+    no_looks=20,
+)
 TAKEN = Taken(
     after_help={"garbage": 90, "messages_received": 10, "sightings": 7},
-    victim={"garbage": 130, "messages_received": 10, "sightings": 20, "bad_token": TOKENS},
+    victim={
+        "garbage": 110,
+        "messages_received": 10,
+        "sightings": 20,
+        "bad_token": TOKENS,
+        "frame_skipped": 15,
+        "no_camera": 5,
+    },
     field={"garbage": 20, "not_its_own": 10, "drive": 500},
-    recorder={"garbage": 80, "track": 10},
+    recorder={"garbage": 60, "track": 10},
     watcher={"garbage": 25},
+    looks={"garbage": 20},
     restarts=0,
     tracebacks=0,
     traffic_exit=0,
@@ -271,11 +287,13 @@ def test_fuzzed_payloads_are_all_counted() -> None:
         ({"restarts": 1}, "processes that ended"),
         ({"tracebacks": 2}, "tracebacks in logs"),
         ({"after_help": {"garbage": 80}}, "fixes and beliefs counted"),
-        ({"victim": {**TAKEN.victim, "garbage": 120}}, "inputs counted"),
+        ({"victim": {**TAKEN.victim, "garbage": 100}}, "inputs counted"),
+        ({"victim": {**TAKEN.victim, "frame_skipped": 14}}, "inputs counted"),
         ({"victim": {**TAKEN.victim, "bad_token": 3}}, "odd tokens counted"),
         ({"field": {"drive": 500}}, "commands refused by the field"),
-        ({"recorder": {"garbage": 79}}, "refused by the recorder"),
+        ({"recorder": {"garbage": 59}}, "refused by the recorder"),
         ({"watcher": {}}, "refused by the traffic watcher"),
+        ({"looks": {"garbage": 19}}, "refused by who looks"),
         ({"traffic_exit": 1}, "`cpcbl-team traffic` exits with"),
     ],
 )

@@ -2,6 +2,7 @@
 
 import re
 import shlex
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -9,7 +10,13 @@ from log_helpers import write_log
 from process_helpers import cpcbl_team
 
 from cpcbl_launch.team_file import parse_team
-from cpcbl_team.config import GuestSettings, PositionSensor
+from cpcbl_team.config import (
+    COLOURS,
+    CameraSettings,
+    GuestSettings,
+    PositionSensor,
+    VisionSettings,
+)
 
 ROOT = Path(__file__).parents[2]
 README = (ROOT / "README.md").read_text()
@@ -59,6 +66,18 @@ def test_the_documented_team_file_is_good() -> None:
     assert team.guests == GuestSettings()
     assert team.robots["r2"].start is None
     assert team.transport.listen == ("tcp/0.0.0.0:7447",)
+    assert team.map.landmarks["door"].colours == ("orange", "blue")
+
+
+def test_the_documented_team_file_has_every_key_of_cameras_with_its_default() -> None:
+    team = parse_team(TOML[0])
+    raw = tomllib.loads(TOML[0])
+    camera, vision = raw["robots"]["r2"]["camera"], raw["vision"]
+    assert camera.keys() == {*CameraSettings.__struct_fields__}
+    assert team.robots["r2"].camera == CameraSettings()
+    assert vision.keys() == {*VisionSettings.__struct_fields__}
+    colours = {name: COLOURS[name] for name in vision["colours"]}
+    assert team.vision == VisionSettings(colours=colours)
 
 
 @pytest.mark.parametrize("document", sorted(ROOT.glob("*.md")) + sorted(ROOT.glob("docs/*.md")))

@@ -13,7 +13,14 @@ from msgspec.structs import replace
 
 from cpcbl_team.inputs import Belief, Fix
 from cpcbl_transport import topics
-from cpcbl_transport.compact import BELIEF_BYTES, FIX_BYTES, decode_help, encode_help
+from cpcbl_transport.compact import (
+    BELIEF_BYTES,
+    FIX_BYTES,
+    HEADED_FIX_BYTES,
+    decode_help,
+    encode_help,
+    help_bytes,
+)
 from cpcbl_transport.messages import (
     FUTURE_NS,
     LARGEST_PAYLOAD,
@@ -22,10 +29,14 @@ from cpcbl_transport.messages import (
     Refusal,
     refusal,
 )
+from cpcbl_transport.overhead import sent_bytes
 
 NOW = 1_700_000_000 * SECOND
 PLANE = (0.04, 0.01, 0.09)
 FIX = Fix("r2", "r1", NOW, 1.0, -2.0, PLANE, (0.01, 0.0, 0.01))
+HEADED = replace(
+    FIX, heading_rad=-2.5, heading_sensor_variance=0.01, heading_observer_variance=0.0004
+)
 BELIEF = Belief("r1", NOW, 1.0, -2.0, 0.5, (*PLANE, 0.002, -0.003, 0.01), 0.3, -0.1)
 FIX_KEY, BELIEF_KEY = "fix/r2/3/r1", "belief/3/r1"
 RATIO = 200.0
@@ -36,7 +47,9 @@ SHARES = st.floats(math.log(1.0 / RATIO), 0.0).map(math.exp)
 PLACES = st.floats(-1e6, 1e6)
 STAMPS = st.integers(-(10**18), 4 * 10**18)
 per_kind = pytest.mark.parametrize(
-    ("key", "message"), [(FIX_KEY, FIX), (BELIEF_KEY, BELIEF)], ids=["fix", "belief"]
+    ("key", "message"),
+    [(FIX_KEY, FIX), (FIX_KEY, HEADED), (BELIEF_KEY, BELIEF)],
+    ids=["fix", "fix with heading", "belief"],
 )
 
 
@@ -95,13 +108,17 @@ VOLUMES = st.builds(
     SHARES,
     *[ANGLES] * 3,
 )
+VARIANCES = SIGMAS.map(lambda sigma: sigma**2)
 FIXES = st.builds(
-    lambda stamp, x, y, own, its: Fix("r2", "r1", stamp, x, y, triangle(own), triangle(its)),
+    lambda stamp, x, y, own, its, heading: Fix(
+        "r2", "r1", stamp, x, y, triangle(own), triangle(its), *heading
+    ),
     STAMPS,
     PLACES,
     PLACES,
     PLANES,
     PLANES,
+    st.just(()) | st.tuples(ANGLES, VARIANCES, VARIANCES),
 )
 BELIEFS = st.builds(
     lambda stamp, x, y, heading, c, *rates: Belief("r1", stamp, x, y, heading, triangle(c), *rates),
@@ -127,17 +144,35 @@ def assert_just_more(true: Sequence[float], read: Sequence[float]) -> None:
     assert most <= 1.0031
 
 
+def assert_heading_just_more(true: Fix, read: Fix) -> None:
+    if true.heading_rad is None:
+        assert (read.heading_rad, read.heading_sensor_variance) == (None, 0.0)
+        return
+    assert read.heading_rad is not None
+    off = math.remainder(read.heading_rad - true.heading_rad, math.tau)
+    for field in ("heading_sensor_variance", "heading_observer_variance"):
+        variance = getattr(true, field)
+        assert 1.0 <= getattr(read, field) / variance <= 1.0031
+        assert off * off < 0.01**2 * variance
+
+
 # Size ------------------------------------------------------------------------------------------
 
 
 def test_a_belief_and_a_fix_are_at_most_40_bytes() -> None:
-    assert (BELIEF_BYTES, FIX_BYTES) == (40, 32)
+    assert (BELIEF_BYTES, FIX_BYTES, HEADED_FIX_BYTES) == (40, 32, 39)
+    assert sent_bytes(HEADED_FIX_BYTES) <= 60
 
 
 @examples(100)
 @given(FIXES | BELIEFS)
 def test_every_fix_and_every_belief_has_its_size(message: Help) -> None:
-    assert len(encode_help(message)) == (FIX_BYTES if isinstance(message, Fix) else BELIEF_BYTES)
+    size = len(encode_help(message))
+    assert size == help_bytes(message)
+    if isinstance(message, Fix):
+        assert size == (FIX_BYTES if message.heading_rad is None else HEADED_FIX_BYTES)
+    else:
+        assert size == BELIEF_BYTES
 
 
 def test_a_worked_example() -> None:
@@ -167,6 +202,21 @@ def test_a_worked_example() -> None:
     assert again.covariance == pytest.approx(covariance, rel=0.003)
 
 
+def test_a_worked_example_of_a_heading() -> None:
+    """It stands behind a fix as it was; an exact variance is said as 1 urad, raised by 0.04 %."""
+    message = replace(FIX, heading_rad=-math.pi / 2.0, heading_sensor_variance=0.001**2)
+    written = [
+        "00 00 c0",  # three quarters of 2^24
+        "de 27",  # 10,206 steps, 1 mrad
+        "01 00",  # a step
+    ]
+    assert encode_help(message).hex(" ") == " ".join([encode_help(FIX).hex(" "), *written])
+    again = there_and_back(message)
+    assert again.heading_rad == -math.pi / 2.0
+    assert again.heading_sensor_variance == pytest.approx(0.001**2, rel=0.003)
+    assert again.heading_observer_variance == pytest.approx(1e-12, rel=0.003)
+
+
 # What rounding costs ------------------------------------------------------------------------------
 
 
@@ -177,6 +227,7 @@ def test_rounding_costs_less_than_one_percent_of_sigma(message: Help) -> None:
     off = [again.x_m - message.x_m, again.y_m - message.y_m]
     if isinstance(message, Fix):
         fields = ["sensor_covariance", "observer_covariance"]
+        assert_heading_just_more(message, again)
     else:
         fields = ["covariance"]
         off.append(math.remainder(again.heading_rad - message.heading_rad, math.tau))
@@ -217,15 +268,20 @@ def test_a_heading_comes_back_wrapped(heading_rad: float) -> None:
     again = there_and_back(replace(BELIEF, heading_rad=heading_rad)).heading_rad
     assert abs(again) <= math.pi
     assert abs(math.remainder(again - heading_rad, math.tau)) < 1e-6
+    assert there_and_back(replace(HEADED, heading_rad=heading_rad)).heading_rad == again
 
 
 # What cannot be said ------------------------------------------------------------------------------
 
 
 def with_number(message: Help, value: float) -> list[tuple[str, Help]]:
-    """The message with each of its numbers replaced in turn, and the field that it is in."""
+    """The message with each of its numbers replaced in turn, and the field that it is in. Of a
+    heading that is not told no variance is sent."""
+    headless = isinstance(message, Fix) and message.heading_rad is None
     found = []
     for field in message.__struct_fields__:
+        if headless and field.startswith("heading_"):
+            continue
         old = getattr(message, field)
         if isinstance(old, float):
             found.append((field, replace(message, **{field: value})))
@@ -262,6 +318,8 @@ def test_a_variance_below_zero_is_not_sent(bad: tuple[float, float, float]) -> N
         replace(FIX, observer_covariance=bad),
         replace(BELIEF, covariance=(*bad, 0.0, 0.0, 0.1)),
         replace(BELIEF, covariance=(0.1, 0.0, 0.1, 0.0, 0.0, -0.1)),
+        replace(HEADED, heading_sensor_variance=-0.1),
+        replace(HEADED, heading_observer_variance=-0.1),
     ):
         with pytest.raises(ValueError, match="no variance"):
             encode_help(message)
@@ -279,6 +337,8 @@ def test_a_stamp_of_another_age_is_not_sent(key: str, message: Help) -> None:
         replace(FIX, x_m=-1e30),
         replace(FIX, y_m=1.1e6),
         replace(FIX, sensor_covariance=(1e200, 0.0, 1e200)),
+        replace(HEADED, heading_sensor_variance=1e7),
+        replace(HEADED, heading_observer_variance=1e200),
         replace(BELIEF, y_m=1e30),
         replace(BELIEF, covariance=(1e200, 0.0, 0.01, 0.0, 0.0, 0.01)),
         replace(BELIEF, covariance=(0.01, 0.0, 0.01, 0.0, 0.0, 1e7)),
@@ -367,6 +427,9 @@ def assert_usable(read: Belief | Fix | Refusal) -> None:
     for part in parts:
         values = np.linalg.eigvalsh(matrix(part))
         assert values[0] >= -1e-12 * values[-1]
+    if isinstance(read, Fix) and read.heading_rad is not None:
+        assert abs(read.heading_rad) <= math.pi
+        assert read.heading_sensor_variance > 0.0 < read.heading_observer_variance
 
 
 @examples(500)
@@ -380,6 +443,9 @@ def test_random_bytes_never_raise(noise: bytes) -> None:
 @examples(500)
 @given(
     st.binary(min_size=FIX_BYTES - 1, max_size=FIX_BYTES - 1).map(lambda b: (FIX_KEY, b))
+    | st.binary(min_size=HEADED_FIX_BYTES - 1, max_size=HEADED_FIX_BYTES - 1).map(
+        lambda b: (FIX_KEY, b)
+    )
     | st.binary(min_size=BELIEF_BYTES - 1, max_size=BELIEF_BYTES - 1).map(lambda b: (BELIEF_KEY, b))
 )
 def test_any_bytes_of_the_right_length_are_a_gaussian(keyed: tuple[str, bytes]) -> None:

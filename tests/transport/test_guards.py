@@ -16,7 +16,7 @@ from cpcbl_team.config import GuardSettings, Team, TransportSettings
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus
 from cpcbl_transport.guards import guard_rules
-from cpcbl_transport.messages import LARGEST_PAYLOAD
+from cpcbl_transport.messages import LARGEST_FRAME, LARGEST_PAYLOAD
 from cpcbl_transport.topics import Qos
 from cpcbl_transport.zenoh_bus import open_bus, open_router
 
@@ -41,7 +41,8 @@ def limits(rules: dict[str, Any]) -> dict[str, int]:
 
 
 def test_every_target_and_beliefs_have_a_rate_and_every_key_a_size() -> None:
-    team = guarded(fix_rate_hz=30.0, belief_rate_hz=20.0, largest_help_bytes=99, largest_bytes=999)
+    rates_hz: dict[str, Any] = {"fix_rate_hz": 30.0, "belief_rate_hz": 20.0}
+    team = guarded(**rates_hz, largest_help_bytes=99, largest_bytes=999, largest_frame_bytes=99_999)
     rules = guard_rules(team)
     assert rates(rules) == {
         "cpcbl/tests/fix/victim/*/*": 30.0,
@@ -52,7 +53,17 @@ def test_every_target_and_beliefs_have_a_rate_and_every_key_a_size() -> None:
     assert limits(rules) == {
         "cpcbl/tests/fix/*/*/*": 99,
         "cpcbl/tests/belief/*/*": 99,
-        "cpcbl/tests/**": 999,
+        "cpcbl/tests/status/*": 999,
+        "cpcbl/tests/track/*": 999,
+        "cpcbl/tests/in/*/odometry": 999,
+        "cpcbl/tests/in/*/sightings": 999,
+        "cpcbl/tests/in/*/position": 999,
+        "cpcbl/tests/in/*/frame": 99_999,
+        "cpcbl/tests/look/*": 99_999,
+        "cpcbl/tests/field/drive/*": 999,
+        "cpcbl/tests/field/join/*": 999,
+        "cpcbl/tests/field/truth": 999,
+        "cpcbl/tests/**": 99_999,
     }
 
 
@@ -74,7 +85,9 @@ def test_rules_of_rate_do_not_overlap() -> None:
 
 
 def test_by_default_what_robots_would_take_is_let_in() -> None:
-    assert limits(guard_rules(guarded()))["cpcbl/tests/**"] == LARGEST_PAYLOAD
+    for topic in topics.TOPICS:
+        if topic.carries not in (None, *topics.COLLABORATION):
+            assert limits(guard_rules(guarded()))[f"cpcbl/tests/{topic.at()}"] == topic.largest
 
 
 # Over a real router -----------------------------------------------------------------------------
@@ -193,13 +206,15 @@ def test_what_is_sent_at_once_has_a_rate_for_each_target_and_each_robot() -> Non
 def test_what_is_too_large_is_not_let_in() -> None:
     belief = topics.BELIEF.at(tier=7, robot="faulty")
     odometry = topics.IN_ODOMETRY.at(robot="victim")
-    small, largest = bytes(256), bytes(LARGEST_PAYLOAD)
+    frame = topics.IN_FRAME.at(robot="victim")
+    small, largest, largest_frame = bytes(256), bytes(LARGEST_PAYLOAD), bytes(LARGEST_FRAME)
     with three_robots(guarded(belief_rate_hz=ANY_RATE_HZ)) as robots:
         put(robots.faulty, belief, bytes(1_000_000), bytes(257), small)
         put(robots.faulty, odometry, bytes(1_000_000), bytes(LARGEST_PAYLOAD + 1), largest)
+        put(robots.faulty, frame, bytes(LARGEST_FRAME + 1), largest_frame)
         last_of(robots.faulty, robots.inputs)
     assert robots.beliefs.payloads == [small]
-    assert robots.inputs.payloads == [largest, b"last"]
+    assert robots.inputs.payloads == [largest, largest_frame, b"last"]
 
 
 def test_inputs_are_let_in_as_they_come() -> None:

@@ -13,6 +13,7 @@ from cpcbl_team.config import OdometrySettings, PositionSensor, SensorSettings, 
 from cpcbl_team.inputs import Odometry, Position, Sighting, Sightings
 from cpcbl_transport.messages import (
     FUTURE_NS,
+    LARGEST_FRAME,
     LARGEST_NUMBER,
     LARGEST_PAYLOAD,
     LONGEST_ODOMETRY_NS,
@@ -20,7 +21,9 @@ from cpcbl_transport.messages import (
     Body,
     Drive,
     Flow,
+    Frame,
     Join,
+    Look,
     Refusal,
     Spending,
     Status,
@@ -29,6 +32,7 @@ from cpcbl_transport.messages import (
     Trust,
     Truth,
     Truths,
+    Unclear,
     decode,
     encode,
     refusal,
@@ -40,6 +44,10 @@ COVARIANCE = (0.04, 0.01, 0.09, 0.0, 0.0, 0.01)
 ODOMETRY = Odometry(NOW - SECOND, NOW, 0.5, 0.1)
 SIGHTINGS = Sightings(NOW, (Sighting("oak", 2.0, 0.1), Sighting("elm", None, -0.5, None, 0.02)))
 POSITION = Position(NOW, 1.0, 2.0, (0.0004, 0.0, 0.0009))
+JPEG = bytes(range(256))
+FRAME = Frame(NOW, JPEG)
+MATE_SEEN = Sighting("r2", 2.0, 0.1, 0.02, 0.003, -1.5, 0.05)
+LOOK = Look("r1", NOW, JPEG, (MATE_SEEN,), (Unclear("ambiguous", ("r2", "r3")),))
 LEARNED = (0.98, 0.96, -0.01)
 STATUS = Status("r1", "a", NOW, 0.1, 0.02, 3, "", {"odometry": 7}, 1, 20, 2, 40, LEARNED)
 SENT = (Flow("fix", "r2", 1, 41, 2, 3, 0, NOW), Flow("belief", "", 0, 0, 0, 0, 4))
@@ -51,7 +59,7 @@ DRIVE = Drive("r1", NOW, 0.5, 0.1)
 BODY = Body(Start(x_m=1.0, y_m=2.0), SensorSettings(), OdometrySettings(), PositionSensor())
 JOIN = Join("tripod", "a", NOW, BODY)
 TRUTHS = Truths(NOW, (Truth("r1", 1.0, 2.0, 0.5, 1), Truth("r2", 3.0, 4.0, -0.5)))
-VALID = (ODOMETRY, SIGHTINGS, POSITION, STATUS, TRACK, DRIVE, JOIN, TRUTHS)
+VALID = (ODOMETRY, SIGHTINGS, POSITION, FRAME, LOOK, STATUS, TRACK, DRIVE, JOIN, TRUTHS)
 KINDS = [type(m).__name__ for m in VALID]
 
 NAMES = st.from_regex(r"[A-Za-z0-9_.-]{1,32}", fullmatch=True)
@@ -66,6 +74,9 @@ FLOWS = st.builds(Flow, st.text(), st.text(), *[COUNTS] * 5, STAMPS)
 SPENDINGS = st.builds(Spending, st.text(), *[FLOATS] * 3)
 TRUSTS = st.builds(Trust, st.text(), st.text(), STAMPS, COUNTS, st.booleans(), FLOATS)
 
+SIGHTED = st.lists(st.builds(Sighting, NAMES, *[MAYBE] * 6), max_size=4).map(tuple)
+UNCLEAR = st.builds(Unclear, st.text(), st.lists(st.text(), max_size=3).map(tuple))
+
 POSITIVE = st.floats(1e-9, 1e9)
 BODIES = st.builds(
     Body,
@@ -77,12 +88,17 @@ BODIES = st.builds(
 
 MESSAGES: dict[type[Any], st.SearchStrategy[Tagged]] = {
     Odometry: st.builds(Odometry, STAMPS, STAMPS, FLOATS, FLOATS),
-    Sightings: st.builds(
-        Sightings,
-        STAMPS,
-        st.lists(st.builds(Sighting, NAMES, MAYBE, MAYBE, MAYBE, MAYBE), max_size=4).map(tuple),
-    ),
+    Sightings: st.builds(Sightings, STAMPS, SIGHTED),
     Position: st.builds(Position, STAMPS, FLOATS, FLOATS, COVARIANCES_2),
+    Frame: st.builds(Frame, STAMPS, st.binary(max_size=200)),
+    Look: st.builds(
+        Look,
+        NAMES,
+        STAMPS,
+        st.binary(max_size=200),
+        SIGHTED,
+        st.lists(UNCLEAR, max_size=3).map(tuple),
+    ),
     Status: st.builds(
         Status,
         NAMES,
@@ -158,8 +174,9 @@ def test_an_old_reader_skips_fields_that_a_newer_program_added(valid: Tagged) ->
     [
         (TRACK, {"lost": ""}),
         (STATUS, {"learned": None, "sent": (), "heard": (), "spending": (), "trust": ()}),
+        (LOOK, {"found": (), "unclear": ()}),
     ],
-    ids=["Track", "Status"],
+    ids=["Track", "Status", "Look"],
 )
 def test_a_new_reader_fills_in_what_an_older_program_left_out(
     newer: Tagged, added: dict[str, Any]
@@ -171,8 +188,10 @@ def test_a_new_reader_fills_in_what_an_older_program_left_out(
 def test_nested_fields_evolve_as_well() -> None:
     older = decode(wire("truth", NOW, [["r1", 1.0, 2.0, 0.5]]))
     assert older == Truths(NOW, (Truth("r1", 1.0, 2.0, 0.5, bumps=0),))
-    newer = decode(wire("sightings", NOW, [["oak", 2.0, 0.1, None, None, "colour"]]))
+    newer = decode(wire("sightings", NOW, [["oak", 2.0, 0.1, *[None] * 4, "colour"]]))
     assert newer == Sightings(NOW, (Sighting("oak", 2.0, 0.1),))
+    without_heading = decode(wire("sightings", NOW, [["oak", 2.0, 0.1, None, 0.02]]))
+    assert without_heading == Sightings(NOW, (Sighting("oak", 2.0, 0.1, None, 0.02),))
 
 
 @per_kind
@@ -227,6 +246,14 @@ def test_the_largest_payload_is_still_read() -> None:
     assert isinstance(decode(fits), Status)
 
 
+def test_a_frame_is_read_up_to_a_size_of_its_own() -> None:
+    rest = LARGEST_FRAME - len(encode(Frame(NOW, bytes(LARGEST_PAYLOAD)))) + LARGEST_PAYLOAD
+    largest, larger = encode(Frame(NOW, bytes(rest))), encode(Frame(NOW, bytes(rest + 1)))
+    assert len(largest) == LARGEST_FRAME
+    assert isinstance(decode(largest, LARGEST_FRAME), Frame)
+    assert decode(larger, LARGEST_FRAME) is decode(largest) is Refusal.TOO_LARGE
+
+
 @per_kind
 def test_a_valid_message_is_not_refused(valid: Tagged) -> None:
     assert refusal(valid, NOW) is None
@@ -244,7 +271,7 @@ def with_number(message: Any, field: str, value: float) -> list[Any]:
     for entry in old:
         if isinstance(entry, float):
             entries.append([value])
-        else:
+        elif not isinstance(entry, str):
             entries.append(
                 [n for f in entry.__struct_fields__ for n in with_number(entry, f, value)]
             )
@@ -300,7 +327,7 @@ def test_what_is_no_covariance_is_refused(bad: tuple[float, float, float]) -> No
     assert refusal(message, NOW) is Refusal.NOT_A_COVARIANCE
 
 
-@pytest.mark.parametrize("message", [ODOMETRY, POSITION, TRACK, DRIVE, TRUTHS])
+@pytest.mark.parametrize("message", [ODOMETRY, POSITION, LOOK, TRACK, DRIVE, TRUTHS])
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_a_number_larger_than_any_field_is_refused(message: Tagged, sign: float) -> None:
     for field in message.__struct_fields__:

@@ -8,11 +8,16 @@ from bus_helpers import SECOND, examples, standing
 from hypothesis import given
 from hypothesis import strategies as st
 
+from cpcbl_team.inputs import Sighting
 from cpcbl_transport.messages import (
     LARGEST_COUNT,
+    LARGEST_FRAME,
+    LARGEST_PAYLOAD,
     LAST_NS,
     Drive,
     Flow,
+    Frame,
+    Look,
     Refusal,
     Status,
     Tagged,
@@ -35,6 +40,8 @@ GOOD: dict[str, Tagged] = {
     "field/drive/r1": DRIVE,
     "field/truth": TRUTHS,
     "in/r1/odometry": standing(NOW),
+    "in/r1/frame": Frame(NOW, bytes(LARGEST_PAYLOAD)),
+    "look/r1": Look("r1", NOW, bytes(LARGEST_PAYLOAD), (Sighting("oak", 2.0, 0.1),)),
 }
 
 
@@ -55,6 +62,12 @@ def test_what_the_key_allows_is_taken(key: str) -> None:
         ("track/r1/more", TRACK, Refusal.WRONG_TYPE),
         ("in/r1/odometry", TRACK, Refusal.WRONG_TYPE),
         ("elsewhere", STATUS, Refusal.WRONG_TYPE),
+        ("in/r1/frame", Frame(NOW, bytes(LARGEST_FRAME)), Refusal.TOO_LARGE),
+        ("in/r1/odometry", Frame(NOW, bytes(LARGEST_PAYLOAD)), Refusal.TOO_LARGE),
+        ("in/r1/odometry", Frame(NOW, b"jpeg"), Refusal.WRONG_TYPE),
+        ("in/r1/frame", standing(NOW), Refusal.WRONG_TYPE),
+        ("look/r2", Look("r1", NOW, b"jpeg"), Refusal.NOT_ITS_OWN),
+        ("look/r1", Look("r1", NOW, b"jpeg", (Sighting("oak", math.nan),)), Refusal.NOT_FINITE),
         ("track/r1", msgspec.structs.replace(TRACK, x_m=math.nan), Refusal.NOT_FINITE),
         ("track/r1", msgspec.structs.replace(TRACK, x_m=1e7), Refusal.IMPLAUSIBLE),
         ("track/r1", msgspec.structs.replace(TRACK, stamp_ns=LAST_NS), Refusal.IMPLAUSIBLE),

@@ -178,26 +178,28 @@ def test_a_router_is_trusted_where_its_certificate_says(tmp_path: Path) -> None:
 # Who may say what -------------------------------------------------------------------------------
 
 OWN_ROBOT = {
-    *("belief/3/r1", "fix/r2/3/r1", "status/r1", "track/r1", "field/drive/r1"),
-    *("in/r1/odometry", "in/r1/sightings", "in/r1/position"),
+    *("belief/3/r1", "fix/r2/3/r1", "status/r1", "track/r1", "look/r1", "field/drive/r1"),
+    *("in/r1/odometry", "in/r1/sightings", "in/r1/position", "in/r1/frame"),
 }
 OWN_OBSERVER = {
     *("belief/3/tripod", "fix/r1/3/tripod", "fix/r2/3/tripod", "status/tripod", "track/tripod"),
     *("field/join/tripod", "field/drive/tripod"),  # its own body on the simulated field
     *("in/tripod/odometry", "in/tripod/sightings", "in/tripod/position"),
+    *("look/tripod", "in/tripod/frame"),
 }
 OWN_FIELD = {
     *("field/truth", "in/*/odometry"),  # to all robots at once
     *(f"in/{name}/odometry" for name in ("r1", "r2", "tripod")),
     *(f"in/{name}/sightings" for name in ("r1", "r2", "tripod")),
     *(f"in/{name}/position" for name in ("r1", "r2", "tripod")),
+    *(f"in/{name}/frame" for name in ("r1", "r2", "tripod")),
 }
 KEYS = sorted(
     {
         *(OWN_ROBOT | OWN_OBSERVER | OWN_FIELD),
         *(key.replace("r1", "r2") for key in OWN_ROBOT if "r2" not in key),
         *("fix/r1/3/r2", "fix/tripod/3/r2", "status/r1/more"),
-        *("alive/3/r1/1", "anything", "status/router", "in/r1/frame", "field/join/r1"),
+        *("alive/3/r1/1", "anything", "status/router", "in/r1/more", "field/join/r1"),
         *("**", "*/r2", "status/*", "belief/*/*", "fix/*/3/*", "in/*/odometry", "field/**"),
     }
 )
@@ -286,7 +288,7 @@ HEARD = {
 }
 ASKED = (
     *("**", "belief/*/*", "fix/*/*/*", "fix/r2/3/*", "status/*", "track/r1"),
-    *("in/r1/odometry", "in/**", "field/drive/*", "field/**"),
+    *("in/r1/odometry", "in/**", "look/*", "field/drive/*", "field/**"),
 )
 
 
@@ -342,8 +344,8 @@ def test_operators_and_routers_say_nothing_of_their_own() -> None:
 def test_who_may_hear_follows_the_table_too() -> None:
     me = Identity(Role.ROBOT, "me")
     assert set(heard_by(me)) == {
-        *("alive/*/*/*", "belief/*/*", "fix/me/*/*", "status/me", "track/me"),
-        *("in/me/odometry", "in/me/sightings", "in/me/position"),
+        *("alive/*/*/*", "belief/*/*", "fix/me/*/*", "status/me", "track/me", "look/me"),
+        *("in/me/odometry", "in/me/sightings", "in/me/position", "in/me/frame"),
     }
     assert heard_by(Identity(Role.OBSERVER, "me")) == heard_by(me)
     assert heard_by(FIELD) == ["field/drive/*", "field/join/*"]

@@ -14,6 +14,7 @@ from wire import Batch, Kind, Relay, kind_of, most_in_window, put_down, total
 from cpcbl_launch.up import free_endpoint
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus
+from cpcbl_transport.compact import BELIEF_BYTES, FIX_BYTES, HEADED_FIX_BYTES
 from cpcbl_transport.overhead import received_bytes, sent_bytes
 from cpcbl_transport.topics import Qos
 from cpcbl_transport.zenoh_bus import open_bus, open_router
@@ -171,7 +172,7 @@ def test_the_fullest_window_is_found(timed: list[tuple[int, int]], window: int) 
 
 
 @pytest.mark.parametrize("observer", ["r1", LONG_NAME])
-@pytest.mark.parametrize("size", [34, 40])
+@pytest.mark.parametrize("size", [FIX_BYTES, HEADED_FIX_BYTES, BELIEF_BYTES])
 def test_what_a_fix_and_a_belief_cost(links: Links, size: int, observer: str) -> None:
     ways = [
         (topics.FIX.at(robot="r3", tier=7, observer=observer), topics.FIX.at(robot="r3", tier=7)),

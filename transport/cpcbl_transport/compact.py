@@ -1,13 +1,15 @@
-"""The wire format of help: a belief in 40 bytes, a fix in 32. Everything else is in `messages`.
+"""The wire format of help: a belief in 40 bytes, a fix in 32, with a heading in 39. Everything else
+is in `messages`.
 
 One version byte, then whole numbers of fixed width, little-endian, each a count of its unit; names
-travel in the key. Poses are rounded to the nearest count. A covariance C travels as its Cholesky
-factor, row by row: the sigma of each coordinate given those before it, rounded up on a logarithmic
-scale, and its slopes on those, in units of that sigma. Correlations would be shorter to say, but
-for a thin ellipse their sigmas could not be rounded one by one: rounding one of two correlated at
-0.99995 (axes 200 : 1) up by 0.07 % turns the ellipse and claims 6 % too much across it. Here what
-is read is never less than C (in the order of covariances) and, down to sigmas of 1 um, at most
-0.3 % more; and whatever the bytes, it is a covariance.
+travel in the key, and the length tells whether a fix has a heading. Poses are rounded to the
+nearest count. A covariance C travels as its Cholesky factor, row by row: the sigma of each
+coordinate given those before it, rounded up on a logarithmic scale, and its slopes on those, in
+units of that sigma. Correlations would be shorter to say, but for a thin ellipse their sigmas could
+not be rounded one by one: rounding one of two correlated at 0.99995 (axes 200 : 1) up by 0.07 %
+turns the ellipse and claims 6 % too much across it. Here what is read is never less than C (in the
+order of covariances) and, down to sigmas of 1 um, at most 0.3 % more; and whatever the bytes, it is
+a covariance.
 """
 
 import math
@@ -66,11 +68,22 @@ _RATE = _signed(2)  # to 32 m/s, 32 rad/s
 _AREA = (_SIGMA, _SIGMA, _SLOPE)
 _VOLUME = (*_AREA, _SIGMA, _SLOPE, _SLOPE)
 _FIX = (_STAMP, _PLACE, _PLACE, *_AREA, *_AREA)
+_HEADED_FIX = (*_FIX, _HEADING, _SIGMA, _SIGMA)
 _BELIEF = (_STAMP, _PLACE, _PLACE, _HEADING, *_VOLUME, _RATE, _RATE)
 
 _HEAD = bytes([VERSION])
 FIX_BYTES = 1 + sum(number.width for number in _FIX)
+HEADED_FIX_BYTES = 1 + sum(number.width for number in _HEADED_FIX)
 BELIEF_BYTES = 1 + sum(number.width for number in _BELIEF)
+_FIXES = {FIX_BYTES: _FIX, HEADED_FIX_BYTES: _HEADED_FIX}
+_BELIEFS = {BELIEF_BYTES: _BELIEF}
+
+
+def help_bytes(message: Belief | Fix) -> int:
+    """The size of the payload of a belief or a fix."""
+    if isinstance(message, Belief):
+        return BELIEF_BYTES
+    return FIX_BYTES if message.heading_rad is None else HEADED_FIX_BYTES
 
 
 def encode_help(message: Belief | Fix) -> bytes:
@@ -84,8 +97,13 @@ def encode_help(message: Belief | Fix) -> bytes:
     start = (message.stamp_ns // STAMP_NS, x, y)
     if isinstance(message, Fix):
         sensor, observer = message.sensor_covariance, message.observer_covariance
-        return _written(_FIX, (*start, *_area_counts(*sensor), *_area_counts(*observer)))
-    heading = round(math.fmod(message.heading_rad, math.tau) / HEADING_RAD) % 2**24
+        counts = (*start, *_area_counts(*sensor), *_area_counts(*observer))
+        if message.heading_rad is None:
+            return _written(_FIX, counts)
+        parts = message.heading_sensor_variance, message.heading_observer_variance
+        heading = _heading_count(message.heading_rad)
+        return _written(_HEADED_FIX, (*counts, heading, *map(_variance_count, parts)))
+    heading = _heading_count(message.heading_rad)
     factor = _volume_counts(*message.covariance)
     speed = _RATE.clamped(message.speed_m_s * RATES)
     turn_rate = _RATE.clamped(message.turn_rate_rad_s * RATES)
@@ -100,17 +118,20 @@ def decode_help(key: str, payload: bytes) -> Belief | Fix | Refusal:
     reason = refused_head(payload)
     if reason is not None:
         return reason
-    is_fix = "observer" in names
-    if len(payload) != (FIX_BYTES if is_fix else BELIEF_BYTES):
+    layout = (_FIXES if "observer" in names else _BELIEFS).get(len(payload))
+    if layout is None:
         return Refusal.GARBAGE
-    stamp, x, y, *rest = _read(_FIX if is_fix else _BELIEF, payload)
+    stamp, x, y, *rest = _read(layout, payload)
     place = stamp * STAMP_NS, x / PLACES, y / PLACES
-    if is_fix:
-        return Fix(names["robot"], names["observer"], *place, _area(*rest[:3]), _area(*rest[3:]))
-    heading, *factor, speed, turn_rate = rest
-    heading_rad = math.remainder(heading * HEADING_RAD, math.tau)
-    rates = speed / RATES, turn_rate / RATES
-    return Belief(names["robot"], *place, heading_rad, _volume(*factor), *rates)
+    if layout is _BELIEF:
+        heading, *factor, speed, turn_rate = rest
+        rates = speed / RATES, turn_rate / RATES
+        return Belief(names["robot"], *place, _heading(heading), _volume(*factor), *rates)
+    fix = names["robot"], names["observer"], *place, _area(*rest[:3]), _area(*rest[3:6])
+    if layout is _FIX:
+        return Fix(*fix)
+    heading, sensor, observer = rest[6:]
+    return Fix(*fix, _heading(heading), _sigma(sensor) ** 2, _sigma(observer) ** 2)
 
 
 _is_name = re.compile(NAME_PATTERN).fullmatch
@@ -142,6 +163,20 @@ def _read(numbers: Sequence[_Number], payload: bytes) -> list[int]:
         counts.append(int.from_bytes(payload[at:end], "little", signed=least < 0))
         at = end
     return counts
+
+
+def _heading_count(heading_rad: float) -> int:
+    return round(math.fmod(heading_rad, math.tau) / HEADING_RAD) % 2**24
+
+
+def _heading(count: int) -> float:
+    return math.remainder(count * HEADING_RAD, math.tau)
+
+
+def _variance_count(variance: float) -> int:
+    if variance < -LEAST:
+        raise ValueError(f"no variance: {variance}")
+    return _rounded_up(math.sqrt(max(variance, LEAST)))[0]
 
 
 def _area_counts(xx: float, xy: float, yy: float) -> tuple[int, int, int]:

@@ -1,8 +1,10 @@
 """Where inputs come from: a driver on the bus, the simulated field, a camera, a real log."""
 
+from collections import Counter
 from collections.abc import Sequence
 from typing import Protocol
 
+from cpcbl_agents.eyes import Picture
 from cpcbl_team.inputs import Odometry, Sightings
 from cpcbl_transport.messages import Frame
 
@@ -18,8 +20,19 @@ class Source(Protocol):
     def over(self) -> bool:
         """Whether there will never be anything more: the end of a log."""
 
-    def poll(self, now_ns: int) -> Sequence[Odometry | Sightings | Frame]:
+    def poll(self, now_ns: int) -> Sequence[Odometry | Sightings | Frame | Picture]:
         """Everything up to now that was not polled yet."""
+
+
+class OwnCamera(Source, Protocol):
+    """A source of frames beside another one that has the odometry."""
+
+    @property
+    def counts(self) -> Counter[str]:
+        """What befell it, by reason."""
+
+    def close(self) -> None:
+        """Lets the camera go."""
 
 
 class Silent:
@@ -28,5 +41,5 @@ class Silent:
     next_ns: int | None = None
     over = False
 
-    def poll(self, now_ns: int) -> Sequence[Odometry | Sightings | Frame]:
+    def poll(self, now_ns: int) -> Sequence[Odometry | Sightings | Frame | Picture]:
         return ()

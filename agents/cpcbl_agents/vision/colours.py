@@ -96,7 +96,7 @@ def _outlines(bits: Pixels, names: Sequence[str]) -> Iterator[tuple[str, cv2.typ
         return
     bits = bits[top : top + height, left : left + width]
     for bit, name in enumerate(names):
-        mask = bits & np.uint8(1 << bit)
+        mask = np.bitwise_and(bits, np.uint8(1 << bit), dtype=np.uint8)
         found, _ = cv2.findContours(
             mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE, offset=(left, top)
         )

@@ -4,37 +4,53 @@ Landmarks by their colour bands (`cylinders`), teammates by their markers (`mark
 away, by the bands of their masts.
 """
 
-import cv2
-
+from cpcbl_agents.eyes import Picture
+from cpcbl_agents.vision.annotate import annotated
 from cpcbl_agents.vision.camera import Camera, Pixels
 from cpcbl_agents.vision.cylinders import Cylinders
 from cpcbl_agents.vision.glimpses import Glimpses
 from cpcbl_agents.vision.markers import Markers
-from cpcbl_agents.vision.pictures import decoded, fault
+from cpcbl_agents.vision.pictures import decoded, encoded, fault
 from cpcbl_team.config import Team
 from cpcbl_team.inputs import Sightings
-from cpcbl_transport.messages import Frame
-
-cv2.setNumThreads(1)  # a robot is one process of many on its machine
+from cpcbl_transport.messages import Frame, Look, Unclear
 
 
 class CameraEyes:
     """The eyes of one robot of a team."""
 
     def __init__(self, robot: str, team: Team) -> None:
-        self.camera = Camera(team.robots[robot].camera)
+        self.robot, self.camera = robot, Camera(team.robots[robot].camera)
         self._cylinders = Cylinders(robot, team, self.camera)
         self._markers = Markers(robot, team, self.camera)
 
-    def seen(self, frame: Frame) -> Sightings | str:
+    def seen(self, frame: Frame | Picture) -> Sightings | str:
         """What is in a frame, at its stamp; or why the frame cannot be used (`frame_...`)."""
-        pixels = decoded(frame.image)
-        if isinstance(pixels, str):
-            return pixels
-        glimpses = self.glimpses(pixels)
+        pixels = self._pixels(frame)
+        glimpses = pixels if isinstance(pixels, str) else self.glimpses(pixels)
         if isinstance(glimpses, str):
             return glimpses
         return Sightings(frame.stamp_ns, tuple(found.sighting for found in glimpses.found))
+
+    def shown(self, frame: Frame | Picture) -> tuple[Sightings | str, Look]:
+        """The same, and the frame with all that drawn into it; without picture if there is none."""
+        pixels = self._pixels(frame)
+        if isinstance(pixels, str):
+            return pixels, Look(self.robot, frame.stamp_ns, b"", (), (Unclear(pixels),))
+        glimpses = self.glimpses(pixels)
+        if isinstance(glimpses, str):
+            image = encoded(pixels) if pixels.size else b""
+            return glimpses, Look(self.robot, frame.stamp_ns, image, (), (Unclear(glimpses),))
+        found = tuple(found.sighting for found in glimpses.found)
+        unclear = tuple(Unclear(doubt.reason, doubt.names) for doubt in glimpses.doubts)
+        image = encoded(annotated(pixels, glimpses))
+        look = Look(self.robot, frame.stamp_ns, image, found, unclear)
+        return Sightings(frame.stamp_ns, found), look
+
+    def _pixels(self, frame: Frame | Picture) -> Pixels | str:
+        if isinstance(frame, Picture):
+            return frame.pixels
+        return decoded(frame.image, self.camera.size_px)
 
     def glimpses(self, pixels: Pixels) -> Glimpses | str:
         """Everything in a picture (height, width, 3), BGR; or why it cannot be used."""

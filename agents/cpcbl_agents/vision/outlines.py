@@ -11,8 +11,8 @@ import numpy as np
 
 from cpcbl_agents.vision.camera import Floats, Pixels
 from cpcbl_agents.vision.colours import Blob
-from cpcbl_agents.vision.edges import Profile
 from cpcbl_agents.vision.panorama import Panorama
+from cpcbl_agents.vision.profiles import Profile
 from cpcbl_agents.vision.silhouette import FOOT, TOP, WIDTH
 from cpcbl_team.config import Bands
 

@@ -1,29 +1,124 @@
-"""Pictures as bytes and as pixels, and what is wrong with those that cannot be used."""
+"""Pictures as bytes and as pixels, and what is wrong with those that cannot be used.
+
+What a picture says of itself (its header) is judged before it is decoded: a few bytes may claim
+gigabytes of pixels, and OpenCV would turn grey, transparent or 16-bit pictures into others that
+look right. A picture that ends too soon is refused by its missing end: some decoders fill it up.
+"""
+
+import struct
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 
 from cpcbl_agents.vision.camera import Pixels
 
-LEAST_CONTRAST = 4.0  # standard deviation of grey levels: a frame of one colour shows nothing
+LEAST_CONTRAST = 4.0  # standard deviation of levels: a frame of one colour shows nothing
+DARK, BRIGHT = 32.0, 223.0  # mean level of a frame of one colour that is called black, white
+QUALITY = 85  # of JPEGs, percent
+WIDEST_SHOWN_PX = 1280
+
+_PNG, _PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND\xaeB`\x82"
+_PNG_CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}  # grey, RGB, palette, grey and RGB with alpha
+_JPEG, _JPEG_END = b"\xff\xd8\xff", b"\xff\xd9"
+_JPEG_SIZES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}  # markers of segments that say it
+_JPEG_BARE = frozenset({0x01, *range(0xD0, 0xD8)})  # markers without a segment
 
 
-def decoded(image: bytes) -> Pixels | str:
-    """The pixels of a JPEG or PNG, BGR; or why there are none."""
+class Header(NamedTuple):
+    """What a picture says of itself."""
+
+    width_px: int
+    height_px: int
+    channels: int
+    bits: int
+    """Of each channel."""
+
+
+def decoded(image: bytes, size_px: tuple[int, int]) -> Pixels | str:
+    """The pixels of a colour JPEG or PNG of this size (width, height), BGR; or why there are none.
+
+    It is never larger in memory than that size.
+    """
     if not image:
         return "frame_empty"
+    header = header_of(image)
+    if header is None:
+        return "frame_undecodable"
+    reason = _unfit(header, size_px)
+    if reason:
+        return reason
+    if not _whole(image):
+        return "frame_truncated"
     pixels = cv2.imdecode(np.frombuffer(image, np.uint8), cv2.IMREAD_COLOR)
     return "frame_undecodable" if pixels is None else pixels.astype(np.uint8, copy=False)
+
+
+def header_of(image: bytes) -> Header | None:
+    """What a JPEG or PNG says of itself; None for what is neither, or ends before."""
+    if image.startswith(_PNG):
+        if len(image) < 26:
+            return None
+        width, height, bits, kind = struct.unpack_from(">IIBB", image, 16)
+        return Header(width, height, _PNG_CHANNELS.get(kind, 0), bits)
+    if not image.startswith(_JPEG):
+        return None
+    at = 2
+    while at + 10 <= len(image) and image[at] == 0xFF:
+        marker = image[at + 1]
+        if marker in _JPEG_SIZES:
+            bits, height, width, channels = struct.unpack_from(">BHHB", image, at + 4)
+            return Header(width, height, channels, bits)
+        if marker == 0xFF:  # fill bytes may stand before a marker
+            at += 1
+        elif marker in _JPEG_BARE:
+            at += 2
+        else:
+            at += 2 + int.from_bytes(image[at + 2 : at + 4], "big")
+    return None
+
+
+def _unfit(header: Header, size_px: tuple[int, int]) -> str:
+    if not header.width_px or not header.height_px:
+        return "frame_empty"
+    if header.channels != 3:
+        return "frame_wrong_channels"
+    if header.bits != 8:
+        return "frame_wrong_depth"
+    return "" if (header.width_px, header.height_px) == size_px else "frame_wrong_size"
+
+
+def _whole(image: bytes) -> bool:
+    """Whether the end is there; some cameras fill their buffer up with zeros after it."""
+    end = _PNG_END if image.startswith(_PNG) else _JPEG_END
+    return image.endswith(end) or image.rstrip(b"\0").endswith(end)
 
 
 def fault(pixels: Pixels, size_px: tuple[int, int]) -> str:
     """Why a picture cannot be used by a camera of this size (width, height); empty if it can."""
     if pixels.size == 0:
         return "frame_empty"
-    if pixels.dtype != np.uint8 or pixels.ndim != 3 or pixels.shape[2] != 3:
+    if pixels.ndim != 3 or pixels.shape[2] != 3:
         return "frame_wrong_channels"
+    if pixels.dtype != np.uint8:
+        return "frame_wrong_depth"
     if (pixels.shape[1], pixels.shape[0]) != size_px:
         return "frame_wrong_size"
-    if float(pixels[::8, ::8].std()) < LEAST_CONTRAST:
-        return "frame_blank"
-    return ""
+    some = pixels[::8, ::8].reshape(-1, 3)
+    if some.std(axis=0).max() >= LEAST_CONTRAST:
+        return ""
+    level = float(some.mean())
+    if level < DARK:
+        return "frame_black"
+    return "frame_white" if level > BRIGHT else "frame_blank"
+
+
+def encoded(pixels: Pixels) -> bytes:
+    """A JPEG for people, of at most 1280 pixels' width."""
+    shrunk = WIDEST_SHOWN_PX / pixels.shape[1]
+    if shrunk < 1.0:
+        size = WIDEST_SHOWN_PX, max(1, round(pixels.shape[0] * shrunk))
+        pixels = cv2.resize(pixels, size, interpolation=cv2.INTER_AREA).astype(np.uint8)
+    done, data = cv2.imencode(".jpg", pixels, (cv2.IMWRITE_JPEG_QUALITY, QUALITY))
+    assert done
+    return bytes(data)

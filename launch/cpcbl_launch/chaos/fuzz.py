@@ -18,6 +18,7 @@ from cpcbl_launch.chaos.notes import all_counts
 from cpcbl_launch.chaos.payloads import fuzzed, hypothetical, real
 from cpcbl_launch.chaos.scenario import Found, Setting, all_is_well, they_go_on
 from cpcbl_launch.chaos.team import FIELD, ChaosError, Plan, TeamUnderTest, demo_team, running
+from cpcbl_launch.looking.ear import LookEar
 from cpcbl_launch.processes import PROGRAM
 from cpcbl_launch.reporting.recorder import Recorder
 from cpcbl_launch.traffic.watch import Watcher
@@ -44,9 +45,10 @@ SIGHTINGS_EVERY_S = 0.3
 VICTIM, MATE = "victim", "mate"  # the mate is played by the fuzzer
 DRIVEN = "patrol"  # whose commands, by their own words the mate's, it refuses all
 TO_FIELD = (topics.DRIVE, topics.JOIN)
-TO_PEOPLE = (topics.STATUS, topics.TRACK, topics.TRUTH)
+TO_PEOPLE = (topics.STATUS, topics.TRACK, topics.TRUTH, topics.LOOK)
 TAKEN = ("odometry", "sightings", "position", "messages_received")
-REASONS = (*Refusal, "inbox_overflow")
+NO_FRAMES = ("frame_skipped", "no_camera")  # the latest frame counts, and the victim has no eyes
+REASONS = (*Refusal, "inbox_overflow", *NO_FRAMES)
 
 
 class Sent(NamedTuple):
@@ -59,11 +61,13 @@ class Sent(NamedTuple):
     commands: int
     """For the field."""
     to_people: int
-    """Status, tracks, truth."""
+    """Status, tracks, truth, looks."""
     no_messages: int
     """Of these, what is none."""
     no_statuses: int
     """Of these, what came under `status/*`."""
+    no_looks: int
+    """Of these, what came under `look/*`."""
 
 
 class Taken(NamedTuple):
@@ -76,6 +80,7 @@ class Taken(NamedTuple):
     field: Mapping[str, int]
     recorder: Mapping[str, int]
     watcher: Mapping[str, int]
+    looks: Mapping[str, int]
     restarts: int
     tracebacks: int
     traffic_exit: int
@@ -107,7 +112,7 @@ def fuzz(setting: Setting, a_key: int = A_KEY) -> Found:
         team = stack.enter_context(running(plan))
         bus = stack.enter_context(open_bus(plan.team.name, [team.endpoint]))
         ears = stack.enter_context(open_bus(plan.team.name, [team.endpoint]))
-        recorder, watcher = Recorder(ears), Watcher(ears)
+        recorder, watcher, looks = Recorder(ears), Watcher(ears), LookEar(ears)
         setting.say("starting a team")
         team.settle()
         from_s = team.now_s
@@ -118,7 +123,9 @@ def fuzz(setting: Setting, a_key: int = A_KEY) -> Found:
         fuzzer.everything_else()
         sent = fuzzer.sent()
         team.until(lambda: _counted(fuzzer.victim()) >= fuzzer.to_victim, 15.0)
-        team.until(lambda: _refused(recorder.counts) >= sent.no_messages, 15.0)
+        recorded = sent.no_messages - sent.no_looks
+        team.until(lambda: _refused(recorder.counts) >= recorded, 15.0)
+        team.until(lambda: looks.refused.total() >= sent.no_looks, 15.0)
         until_s = team.now_s
         taken = Taken(
             after_help,
@@ -126,6 +133,7 @@ def fuzz(setting: Setting, a_key: int = A_KEY) -> Found:
             {},
             dict(recorder.counts),
             watcher.refused,
+            looks.refused,
             sum(team.supervisor.restarts.values()),
             0,
             _traffic_exit(team),
@@ -146,6 +154,7 @@ def judged_fuzz(sent: Sent, taken: Taken) -> list[Check]:
     help_counted = _counted(then) - then.get("sightings", 0)
     refused_commands = sum(n for what, n in taken.field.items() if what not in ("drive", "join"))
     refused, watched = _refused(taken.recorder), sum(taken.watcher.values())
+    looked = sum(taken.looks.values())
     return [
         _exactly("processes that ended", taken.restarts, 0),
         _exactly("tracebacks in logs", taken.tracebacks, 0),
@@ -164,8 +173,9 @@ def judged_fuzz(sent: Sent, taken: Taken) -> list[Check]:
         ),
         Check(what="odd tokens counted", seen=victim.get("bad_token", 0), at_least=TOKENS),
         _exactly("commands refused by the field", refused_commands, sent.commands),
-        _exactly("refused by the recorder", refused, sent.no_messages),
+        _exactly("refused by the recorder", refused, sent.no_messages - sent.no_looks),
         _exactly("refused by the traffic watcher", watched, sent.no_statuses),
+        _exactly("refused by who looks", looked, sent.no_looks),
         _exactly("`cpcbl-team traffic` exits with", taken.traffic_exit, 0),
     ]
 
@@ -235,6 +245,7 @@ class Fuzzer:
             to_people=sum(count[t.key] for t in TO_PEOPLE),
             no_messages=sum(count[f"bad {t.key}"] for t in TO_PEOPLE),
             no_statuses=count[f"bad {topics.STATUS.key}"],
+            no_looks=count[f"bad {topics.LOOK.key}"],
         )
 
     def victim(self) -> Counter[str]:

@@ -13,7 +13,9 @@ from cpcbl_transport.messages import (
     VERSION,
     Drive,
     Flow,
+    Frame,
     Join,
+    Look,
     Status,
     Track,
     Truth,
@@ -23,7 +25,10 @@ from cpcbl_transport.messages import (
 from cpcbl_transport.topics import Topic
 
 COVARIANCE_2, COVARIANCE_3 = (0.04, 0.01, 0.09), (0.04, 0.01, 0.09, 0.0, 0.0, 0.01)
-TAGS = ("odometry", "sightings", "position", "status", "track", "drive", "truth", "join")
+TAGS = (
+    *("odometry", "sightings", "position", "frame", "look"),
+    *("status", "track", "drive", "truth", "join"),
+)
 LONGEST = 600
 DISTINCT = 1000  # hypothesis takes some 4 ms for each
 _encode = msgspec.msgpack.Encoder().encode
@@ -49,6 +54,10 @@ def real(topic: Topic, target: str, speaker: str, now_ns: int) -> bytes:
             return encode(Sightings(now_ns, (Sighting(speaker, 2.0, 0.1), Sighting("oak", 3.0))))
         case topics.IN_POSITION:
             return encode(Position(now_ns, 1.0, 2.0, COVARIANCE_2))
+        case topics.IN_FRAME:
+            return encode(Frame(now_ns, b"a picture"))
+        case topics.LOOK:
+            return encode(Look(speaker, now_ns, b"a picture", (Sighting(target, 2.0, 0.1),)))
         case topics.DRIVE:
             return encode(Drive(speaker, now_ns, 0.5, 0.1))
         case topics.JOIN:

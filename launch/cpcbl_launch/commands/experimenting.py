@@ -50,6 +50,18 @@ def figure7(
     conduct(EXPERIMENT, seeds, jobs, output, as_json)
 
 
+@experiment_app.command("figure7-cameras")
+def figure7_cameras(
+    seeds: Seeds = 5, jobs: Jobs = None, output: Output = Path(), as_json: AsJson = False
+) -> None:
+    """The same from pixels: a cheap camera on the navigator, a sharper one on the observer."""
+    from cpcbl_launch.experiments.figure7_cameras import EXPERIMENT
+    from cpcbl_launch.options import must_have_opencv
+
+    must_have_opencv("experiment figure7-cameras")
+    conduct(EXPERIMENT, seeds, jobs, output, as_json)
+
+
 @experiment_app.command("circular-vs-oval")
 def circular_vs_oval(
     seeds: Seeds = 10, jobs: Jobs = None, output: Output = Path(), as_json: AsJson = False
@@ -116,6 +128,50 @@ def liars(
     with _progress("liars", len(experiment.cases()) * seeds) as done:
         result = experiment.measured(seeds, jobs or os.cpu_count() or 1, done)
     _written(result, experiment.tables(result), output, as_json, draw_liars)
+
+
+@experiment_app.command("eyes")
+def eyes(
+    frames: Annotated[int, typer.Option(min=1, help="Rendered frames.")] = 2000,
+    seed: Annotated[int, typer.Option(min=0, help="Of poses, light and noise.")] = 1,
+    jobs: Jobs = None,
+    output: Output = Path(),
+    as_json: AsJson = False,
+) -> None:
+    """What cameras see of rendered frames: precision, recall, errors against stated sigmas."""
+    from cpcbl_launch.options import folder_for, must_draw, must_have_opencv
+
+    must_draw("experiment")
+    must_have_opencv("experiment eyes")
+    folder_for("--output", output)
+    from cpcbl_launch.experiments import eyes as experiment
+
+    with _progress("eyes", -(-frames // experiment.CHUNK), "batches") as done:
+        result = experiment.measured(frames, seed, jobs or os.cpu_count() or 1, done)
+    _written(result, experiment.tables(result), output, as_json, experiment.draw)
+
+
+@experiment_app.command("pictures")
+def pictures(
+    name: Annotated[
+        str,
+        typer.Argument(
+            metavar="SET", help="duckiebot, frc-speaker, frc-amp; or NAME.csv, NAME.toml beside it."
+        ),
+    ],
+    folder: Annotated[Path, typer.Argument(help="Where the set's pictures are.")],
+    output: Annotated[Path, typer.Option(help="Folder for pictures-SET.json.")] = Path(),
+    as_json: AsJson = False,
+) -> None:
+    """Real pictures whose truth is known: what is found and missed of them, and by how much."""
+    from cpcbl_launch.options import folder_for, must_have_opencv
+
+    must_have_opencv("experiment pictures")
+    folder_for("--output", output)
+    from cpcbl_launch.experiments import real_pictures
+
+    result = real_pictures.measured(name, folder)
+    _written(result, real_pictures.tables(result), output, as_json)
 
 
 @experiment_app.command("latency")

@@ -190,7 +190,7 @@ def simulate(
     from rich.console import Console
 
     from cpcbl_launch.evaluation import Choice, chosen
-    from cpcbl_launch.options import encoded, file_for, must_draw, not_written
+    from cpcbl_launch.options import encoded, file_for, must_draw, must_see, not_written
     from cpcbl_launch.reporting.recorder import Report
     from cpcbl_launch.scale.measure import DURATION_S, Scale, measured, parsed_sizes
     from cpcbl_launch.scale.show import print_scale
@@ -218,6 +218,7 @@ def simulate(
             result = measured(parsed_sizes(robots), seed, duration, progress)
         else:
             team = chosen(load(file or Path("demo")), budgets)
+            must_see(team, team.robots, field=True)
             run = Run(team, duration, seed=seed, picture=picture)
             result = simulate_run(run, progress)
     lost = write_report(report, result)

@@ -70,7 +70,7 @@ def up(
     ] = None,
     record: Annotated[
         Optional[Path],
-        typer.Option(help="Record inputs, tracks, status and truth into this file (MCAP)."),
+        typer.Option(help="Record inputs, tracks, what cameras see, status and truth (MCAP)."),
     ] = None,
     logs: Annotated[
         Optional[Path], typer.Option(help="Keep the processes' logs in this folder.")
@@ -88,7 +88,7 @@ def up(
     from cpcbl_agents.process import Stop
     from cpcbl_launch import logs as real_logs
     from cpcbl_launch.evaluation import Choice, chosen
-    from cpcbl_launch.options import encoded, file_for, folder_for, must_draw
+    from cpcbl_launch.options import encoded, file_for, folder_for, must_draw, must_see
     from cpcbl_launch.show import LiveTable, print_report
     from cpcbl_launch.up import (
         SIMULATED_S,
@@ -134,7 +134,9 @@ def up(
         run = run._replace(here=names_in(robots))
     console = Console(stderr=as_json)
     launch: Launch = OnThisMachine
-    if containers:
+    if not containers:
+        must_see(run.team, run.team.robots if run.here is None else run.here, field=True)
+    else:
         from cpcbl_launch.containers.launch import InContainers, progress_on
 
         launch = partial(InContainers, image=image, base=base_image, said=progress_on(console))
@@ -165,6 +167,7 @@ def robot(
     """Run one robot, on any machine, until SIGINT or SIGTERM."""
     from cpcbl_agents.clock import Clock
     from cpcbl_agents.process import Stop, run_robot
+    from cpcbl_launch.options import must_see
     from cpcbl_launch.simulation.liar import Lie, lying
     from cpcbl_launch.team_file import TeamFileError
 
@@ -173,6 +176,7 @@ def robot(
         raise TeamFileError(
             f"{team_file}: robots.{name}: not in the file; it has: {', '.join(team.robots)}"
         )
+    must_see(team, [name])
     when = Clock.parse(clock) if clock else Clock.wall()
     through = lying(Lie.parse(lie) if lie else None, name, when.epoch_ns)
     run_robot(name, team, connect or team.transport.connect, when, Stop(parent), restarted, through)
@@ -194,6 +198,7 @@ def field(
 
     from cpcbl_agents.clock import Clock
     from cpcbl_agents.process import Stop
+    from cpcbl_launch.options import must_see
     from cpcbl_launch.simulation.field import robots_at, run_field
     from cpcbl_transport.bus import Bus
     from cpcbl_transport.security import Identity, link_of
@@ -201,6 +206,7 @@ def field(
     from cpcbl_transport.zenoh_bus import open_bus
 
     team = load(team_file)
+    must_see(team, field=True)
     elsewhere = robots_at(site or (), team)
     stop = Stop(parent)
     with ExitStack() as stack:

@@ -1,14 +1,20 @@
 """Commands that watch a running team."""
 
+import itertools
 import logging
 import math
 import sys
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated, Optional
+from typing import TYPE_CHECKING, Annotated, Optional
 
 import typer
 
-from cpcbl_launch.commands.arguments import Connect, TeamArgument, load
+from cpcbl_launch.commands.arguments import Connect, TeamArgument, TeamFile, load
+
+if TYPE_CHECKING:
+    from cpcbl_team.config import Team
+    from cpcbl_transport.messages import Look
 
 
 def traffic(
@@ -64,3 +70,81 @@ def traffic(
         sys.stdout.write(encoded(result) + "\n")
     else:
         console.print(drawn(result, where))
+
+
+def look(
+    robot: Annotated[str, typer.Argument(help="The robot whose camera it is.")],
+    team_file: TeamFile,
+    pictures: Annotated[
+        Optional[Path],
+        typer.Option(help="Show its eyes this picture, or folder of pictures; no team need run."),
+    ] = None,
+    connect: Connect = None,
+    save: Annotated[
+        Path, typer.Option(help="Folder for the annotated pictures, made if need be.")
+    ] = Path("looks"),
+    count: Annotated[
+        Optional[int],
+        typer.Option(min=1, help="Frames to look at; default: one, or all pictures."),
+    ] = None,
+    wait: Annotated[
+        float, typer.Option(min=0.1, help="Seconds to wait for the router, and for a frame.")
+    ] = 10.0,
+    as_json: Annotated[bool, typer.Option("--json", help="Print what is seen as JSON.")] = False,
+) -> None:
+    """Look through a robot's camera: what it finds in its frames, and what it rejects and why.
+
+    Prints a table a frame and saves the frames with all that drawn in. A running
+    robot draws them, twice a second at most, only while somebody looks.
+    """
+    from rich.console import Console
+
+    from cpcbl_launch.looking.report import LookReport, print_look, reported, written
+    from cpcbl_launch.options import encoded, folder_for, must_see
+
+    team = load(team_file)
+    if robot not in team.robots:
+        raise ValueError(f"look {robot}: not in {team_file}; it has: {', '.join(team.robots)}")
+    if team.robots[robot].sensing != "camera":
+        raise ValueError(f'look {robot}: has no camera in {team_file}; set sensing = "camera"')
+    if pictures is not None:
+        must_see(team, [robot])
+    folder = folder_for("--save", save)
+    looks = _looks(robot, team, connect, wait) if pictures is None else _at(robot, team, pictures)
+    most = 1 if count is None and pictures is None else count
+    console, reports = Console(), list[LookReport]()
+    for frame, name, one in itertools.islice(looks, most):
+        reports.append(reported(one, frame, written(one, folder, name)))
+        if not as_json:
+            print_look(reports[-1], console)
+    if as_json:
+        sys.stdout.write(encoded(reports) + "\n")
+
+
+def _looks(
+    robot: str, team: "Team", connect: list[str] | None, wait_s: float
+) -> Iterator[tuple[str, str, "Look"]]:
+    """The frames of a running robot: as they are called, as their files are called, themselves."""
+    from cpcbl_agents.process import Stop
+    from cpcbl_launch.looking.watch import looks_of
+    from cpcbl_transport.security import Identity, link_of
+    from cpcbl_transport.topics import Role
+
+    logging.getLogger("cpcbl_transport").setLevel(logging.WARNING)
+    link = link_of(team, Identity(Role.OPERATOR), connect or team.transport.connect)
+    for one in looks_of(robot, team.name, link, Stop(), wait_s):
+        yield str(one.stamp_ns), f"{robot}_{one.stamp_ns}", one
+
+
+def _at(robot: str, team: "Team", pictures: Path) -> Iterator[tuple[str, str, "Look"]]:
+    """The same of picture files."""
+    from cpcbl_agents.sources.camera import pictures_in
+    from cpcbl_launch.looking.watch import looks_at
+
+    if not pictures.exists():
+        raise ValueError(f"--pictures {pictures}: no such file or folder")
+    paths = pictures_in(pictures) if pictures.is_dir() else [pictures]
+    if not paths:
+        raise ValueError(f"--pictures {pictures}: no pictures (.png, .jpg) in it")
+    for path, one in looks_at(paths, robot, team):
+        yield path.name, f"{robot}_{path.stem}", one

@@ -69,15 +69,15 @@ def pattern(figures: Mapping[str, Accuracy]) -> dict[str, bool]:
     inside = [figures[c].inside_3_sigma for c in "CDEF"]
 
     return {
-        "D about C (mean position error, 20 %)": abs(_ratio(mean["D"], mean["C"]) - 1.0) <= ABOUT,
-        "F about E (mean position error, 20 %)": abs(_ratio(mean["F"], mean["E"]) - 1.0) <= ABOUT,
-        "E at most 0.4 x C (mean position error)": _ratio(mean["E"], mean["C"]) <= 0.4,
-        "heading of E better than of C": _ratio(heading["E"], heading["C"]) < 1.0,
+        "D about C (mean position error, 20 %)": abs(ratio(mean["D"], mean["C"]) - 1.0) <= ABOUT,
+        "F about E (mean position error, 20 %)": abs(ratio(mean["F"], mean["E"]) - 1.0) <= ABOUT,
+        "E at most 0.4 x C (mean position error)": ratio(mean["E"], mean["C"]) <= 0.4,
+        "heading of E better than of C": ratio(heading["E"], heading["C"]) < 1.0,
         "C to F: at least 97 % inside 3 σ": all(i is not None and i >= 0.97 for i in inside),
     }
 
 
-def _ratio(a: float | None, b: float | None) -> float:
+def ratio(a: float | None, b: float | None) -> float:
     return math.nan if a is None or b is None else a / b
 
 

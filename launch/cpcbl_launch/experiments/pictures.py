@@ -2,11 +2,13 @@
 
 import math
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 import matplotlib as mpl
 
 from cpcbl_launch.experiments.budget import Curve, Point
+from cpcbl_launch.experiments.eyes import LEAST_RECALL, MOST_BEARING_DEG, MOST_RANGE_SHARE, Eyes
 from cpcbl_launch.experiments.liars import Liars
 from cpcbl_launch.experiments.results import Accuracy, Outcome, Spread
 from cpcbl_team.config import RobotSettings, Team
@@ -177,6 +179,59 @@ def draw_liars(result: Liars, path: Path) -> None:
     handles = [Line2D([], [], marker="o", color=c, label=n) for n, c in colours.items()]
     figure.legend(handles=handles, loc="outside lower center", ncols=len(colours))
     _save(figure, path)
+
+
+def draw_eyes(result: Eyes, path: Path) -> None:
+    """A column a kind of thing: errors against range with three stated sigmas, and recall."""
+    kinds = [kind for kind, errors in result.errors.items() if errors]
+    figure, panels = plt.subplots(
+        3, max(1, len(kinds)), figsize=(12, 8), sharex=True, squeeze=False, layout="constrained"
+    )
+    for (ranges, bearings, recall), kind in zip(panels.T, kinds, strict=False):
+        errors = result.errors[kind]
+        shares = [
+            (e.range_m, 100.0 * e.range_share, 100.0 * e.range_sigma_share)
+            for e in errors
+            if e.range_share is not None and e.range_sigma_share is not None
+        ]
+        angles = [
+            (e.range_m, e.bearing_deg, e.bearing_sigma_deg)
+            for e in errors
+            if e.bearing_deg is not None and e.bearing_sigma_deg is not None
+        ]
+        _scattered(ranges, shares, 100.0 * MOST_RANGE_SHARE)
+        _scattered(bearings, angles, MOST_BEARING_DEG)
+        bins = [f for f in result.bins[kind] if f.recall is not None]
+        middles = [0.5 * (f.from_m + f.to_m) for f in bins]
+        recall.plot(middles, [100.0 * (f.recall or 0.0) for f in bins], "o-", color="C0")
+        recall.axhline(100.0 * LEAST_RECALL, color="0.5", linestyle="--")
+        recall.set(ylim=(0.0, 103.0), xlabel="range (m)")
+        ranges.set_title(f"{kind}s: {result.within[kind].right} seen")
+    labels = ("range error (%)", "bearing error (°)", "found of what was due (%)")
+    for axes, label in zip(panels[:, 0], labels, strict=True):
+        axes.set_ylabel(label)
+    handles = [
+        Line2D([], [], color="C3", label="three stated σ, median of half a metre"),
+        Line2D([], [], color="0.5", linestyle="--", label="targets: one σ, recall"),
+    ]
+    figure.legend(handles=handles, loc="outside lower center", ncols=2)
+    _save(figure, path)
+
+
+def _scattered(axes: Any, errors: list[tuple[float, float, float]], target: float) -> None:
+    """Errors against range, with the band of three stated sigmas and that of one allowed."""
+    axes.plot([e[0] for e in errors], [e[1] for e in errors], ".", ms=2, alpha=0.5, color="C0")
+    halves: dict[int, list[float]] = {}
+    for range_m, _, sigma in errors:
+        halves.setdefault(int(range_m / 0.5), []).append(sigma)
+    middles = [0.5 * half + 0.25 for half in sorted(halves)]
+    sigmas = [3.0 * median(halves[half]) for half in sorted(halves)]
+    for sign in (1.0, -1.0):
+        axes.plot(middles, [sign * s for s in sigmas], color="C3", linewidth=1)
+        axes.axhline(sign * target, color="0.5", linestyle="--", linewidth=1)
+    limit = 1.5 * max([target, *sigmas])
+    axes.set_ylim(-limit, limit)
+    axes.grid(True, alpha=0.3)
 
 
 def _bar(axes: Any, at: float, found: Spread, colour: str) -> None:

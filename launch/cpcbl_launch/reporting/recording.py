@@ -1,7 +1,9 @@
 """A run in one file (MCAP, mcap.dev): what robots sensed and said, the truth, the team.
 
 Messages are JSON arrays, as on the wire but readable; the team is the attachment `team.json`. The
-inputs of a robot that replays a log are not on the bus, so not in the file either.
+inputs of a robot that replays a log are not on the bus, so not in the file either. Of cameras there
+is what robots show while somebody looks, twice a second: what was found under `look/<robot>`, the
+annotated frame under `picture/<robot>`, as Foxglove shows pictures.
 """
 
 import logging
@@ -19,18 +21,22 @@ from mcap.writer import Writer
 
 from cpcbl_agents.sensing import SensorInput
 from cpcbl_agents.sources.mrclam import LogError
+from cpcbl_launch.reporting.foxglove import PICTURE, PICTURE_SCHEMA, picture
 from cpcbl_launch.reporting.recorder import truth_rows
 from cpcbl_team.config import Team
 from cpcbl_team.inputs import Odometry, Position, Sightings
 from cpcbl_team.metrics import Floats
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus
-from cpcbl_transport.messages import Message, Refusal, Truths, refusal
+from cpcbl_transport.messages import Look, Message, Refusal, Truths, refusal
 from cpcbl_transport.reading import read
 
 log = logging.getLogger(__name__)
 
-RECORDED = (*topics.INPUTS, topics.TRACK, topics.STATUS, topics.TRUTH)
+RECORDED = (
+    *(topics.IN_ODOMETRY, topics.IN_SIGHTINGS, topics.IN_POSITION),  # not frames: they are large
+    *(topics.TRACK, topics.STATUS, topics.TRUTH, topics.LOOK),
+)
 TEAM = "team.json"
 LAST_NS = 2**63  # what a file can hold
 _decoder: msgspec.json.Decoder[Message] = msgspec.json.Decoder(Message)
@@ -48,6 +54,7 @@ class Recording(AbstractContextManager["Recording"]):
         self._writer.start(profile="cpcbl", library="cpcbl-team")
         self._writer.add_attachment(0, 0, TEAM, "application/json", msgspec.json.encode(team))
         self._channels: dict[str, int] = {}
+        self._schema = 0
         self._handles = [bus.subscribe(topic.at(), self._arrived) for topic in RECORDED]
 
     def _arrived(self, key: str, payload: bytes) -> None:
@@ -65,9 +72,22 @@ class Recording(AbstractContextManager["Recording"]):
                 self._give_up(error)
 
     def _write(self, writer: Writer, key: str, message: Message) -> None:
+        if isinstance(message, Look):
+            if message.image:
+                self._write_picture(writer, message)
+            message = msgspec.structs.replace(message, image=b"")
         if key not in self._channels:
             self._channels[key] = writer.register_channel(key, "json", 0)
         at_ns, data = message.stamp_ns, msgspec.json.encode(message)
+        writer.add_message(self._channels[key], at_ns, data, at_ns)
+
+    def _write_picture(self, writer: Writer, look: Look) -> None:
+        key, at_ns = f"picture/{look.robot}", look.stamp_ns
+        if key not in self._channels:
+            if not self._schema:
+                self._schema = writer.register_schema(PICTURE, "jsonschema", PICTURE_SCHEMA)
+            self._channels[key] = writer.register_channel(key, "json", self._schema)
+        data = picture(look.robot, at_ns, look.image)
         writer.add_message(self._channels[key], at_ns, data, at_ns)
 
     def _give_up(self, error: OSError) -> None:
@@ -92,7 +112,10 @@ class Recording(AbstractContextManager["Recording"]):
 
 
 class Recorded(NamedTuple):
-    """What a recording says: inputs and truth (rows of s, x, y, heading) by robot."""
+    """What a recording says: inputs and truth (rows of s, x, y, heading) by robot.
+
+    Of robots with cameras, sightings are those of the frames that were shown: twice a second.
+    """
 
     team: Team
     inputs: dict[str, list[SensorInput]]
@@ -108,7 +131,7 @@ def read_recording(path: Path) -> Recorded:
             messages = [
                 (channel.topic, _decoder.decode(message.data))
                 for _, channel, message in reader.iter_messages()
-                if channel.topic.startswith(("in/", topics.TRUTH.key))
+                if channel.topic.startswith(("in/", "look/", topics.TRUTH.key))
             ]
         if not attached:
             raise LogError(f"{path}: holds no team: not a recording of `up --record`")
@@ -124,6 +147,8 @@ def read_recording(path: Path) -> Recorded:
 def _inputs(messages: Iterable[tuple[str, Message]]) -> dict[str, list[SensorInput]]:
     inputs: dict[str, list[SensorInput]] = {}
     for key, message in messages:
+        if isinstance(message, Look):
+            message = Sightings(message.stamp_ns, message.found)
         if isinstance(message, Odometry | Sightings | Position):
             inputs.setdefault(key.split("/")[1], []).append(message)
     return inputs

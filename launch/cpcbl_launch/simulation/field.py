@@ -1,7 +1,8 @@
 """The simulated field: true poses, what robots sense of it, what they bump into.
 
 Robots send wheel commands (`field/drive/<robot>`); the field answers like a driver would, with
-odometry and sightings under the robots' `in/` keys. Deterministic for a seed and the same commands.
+odometry and sightings, or a camera's frames, under the robots' `in/` keys. Deterministic for a seed
+and the same commands.
 Guests have a body on it for as long as they ask for it (`field/join/<robot>`).
 """
 
@@ -10,8 +11,9 @@ import math
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from types import MappingProxyType
-from typing import NamedTuple, TypeVar
+from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
 import numpy as np
 from msgspec.structs import replace
@@ -32,12 +34,26 @@ from cpcbl_team.inputs import Odometry, Position, Sighting, Sightings
 from cpcbl_team.sensors import LEAST_COSINE
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus, Handle, Publisher
-from cpcbl_transport.messages import Body, Drive, Join, Refusal, Truth, Truths, encode, refusal
+from cpcbl_transport.messages import (
+    Body,
+    Drive,
+    Frame,
+    Join,
+    Refusal,
+    Truth,
+    Truths,
+    encode,
+    refusal,
+)
 from cpcbl_transport.reading import read
+
+if TYPE_CHECKING:
+    from cpcbl_launch.simulation.cameras import Cameras
 
 log = logging.getLogger(__name__)
 
 COMMAND_LASTS_NS = 500_000_000
+PICTURES_LATE_NS = 150_000_000  # a field that is further behind catches up without making pictures
 INBOX = 10_000
 MOST_REFUSED = 100  # guests whose refusal is logged
 _GUEST_SEED = 2**31  # no robot of a team file has this number
@@ -45,11 +61,11 @@ NOWHERE: Mapping[str, Bus] = MappingProxyType({})
 
 
 class Every:
-    """Says when something is due that happens so many times a second."""
+    """Says when something is due that happens so many times a second, from a time on or at once."""
 
-    def __init__(self, rate_hz: float) -> None:
+    def __init__(self, rate_hz: float, from_ns: int | None = None) -> None:
         self._period_ns = int(1e9 / rate_hz)
-        self._due_ns: int | None = None
+        self._due_ns = from_ns
 
     def due(self, now_ns: int) -> bool:
         if self._due_ns is None:
@@ -120,6 +136,7 @@ class SimulatedRobot:
         seed: Sequence[int],
         start_ns: int,
         step_ns: int,
+        frames_from_ns: int | None = None,
     ) -> None:
         assert settings.start is not None
         self.settings, self._noise = settings, noise
@@ -135,11 +152,11 @@ class SimulatedRobot:
         self.touching: frozenset[str] = frozenset()
         self._reported, self._reported_ns = (0.0, 0.0), start_ns
         self._motion = Delayed(settings.odometry.delay_s * 1e9 / step_ns)
-        self._frames: deque[Sightings] = deque()
+        self._frames: deque[Sightings | Frame] = deque()
         self._positions: deque[Position] = deque()
         self._errors: dict[tuple[str, str], tuple[int, float]] = {}
         self._odometry_timer = Every(settings.odometry.rate_hz)
-        self._frame_timer = Every(settings.sensor.rate_hz)
+        self._frame_timer = Every(settings.sensor.rate_hz, frames_from_ns)
         sensor = settings.position_sensor
         self._position_timer = Every(sensor.rate_hz if sensor is not None else 1.0)
 
@@ -173,14 +190,21 @@ class SimulatedRobot:
         self._reported, self._reported_ns = (0.0, 0.0), now_ns
         return piece
 
-    def sightings(self, now_ns: int, objects: Iterable[Seen]) -> list[Sightings]:
-        """The frames that are out by now. One is exposed when it is due and stamped `delay_s`
+    def frames(
+        self, now_ns: int, exposed: Callable[[int], Sightings | Frame | None]
+    ) -> list[Sightings | Frame]:
+        """The frames that are out by now. One is `exposed` when it is due and stamped `delay_s`
         later; the camera hands it over at its stamp, or at once where the stamp is earlier.
         """
         if self._frame_timer.due(now_ns):
-            seen = tuple(s for o in objects if (s := self._sighted(o, now_ns)))
-            self._frames.append(Sightings(now_ns + int(self.settings.sensor.delay_s * 1e9), seen))
+            frame = exposed(now_ns + int(self.settings.sensor.delay_s * 1e9))
+            if frame is not None:
+                self._frames.append(frame)
         return _out(self._frames, now_ns)
+
+    def sightings(self, now_ns: int, stamp_ns: int, objects: Iterable[Seen]) -> Sightings:
+        """What it sees of these objects now."""
+        return Sightings(stamp_ns, tuple(s for o in objects if (s := self._sighted(o, now_ns))))
 
     def positions(self, now_ns: int) -> list[Position]:
         """What the position sensor has said by now, if there is one: `delay_s` after it measured,
@@ -229,7 +253,7 @@ class SimulatedRobot:
         return float(self._random.normal(0.0, sigma)) * self._noise if sigma else 0.0
 
 
-Stamped = TypeVar("Stamped", Sightings, Position)
+Stamped = TypeVar("Stamped", bound=Sightings | Frame | Position)
 
 
 def _out(waiting: deque[Stamped], now_ns: int) -> list[Stamped]:
@@ -249,11 +273,19 @@ class SimulatedField:
         self.now_ns = start_ns
         self.robots = {
             name: SimulatedRobot(
-                settings, team.simulation.noise, (seed, i), start_ns, self._step_ns
+                settings,
+                team.simulation.noise,
+                (seed, i),
+                start_ns,
+                self._step_ns,
+                _in_turn(team, name, start_ns + self._step_ns),
             )
             for i, (name, settings) in enumerate(team.robots.items())
             if settings.source == "simulated"
         }
+        self._cameras = _cameras(team, seed)
+        self.not_taken = 0
+        """Frames that were due in steps without pictures."""
         self._marks = [Seen(n, m.x_m, m.y_m, m.gives) for n, m in team.map.landmarks.items()]
         self._marks_to_touch = Grid(team.simulation.bump_radius_m, self._marks)
         self._start_ns = start_ns
@@ -296,8 +328,8 @@ class SimulatedField:
         if drive.robot in self.robots:
             self.robots[drive.robot].drive = drive
 
-    def advance(self) -> list[tuple[str, SensorInput]]:
-        """One step; what each robot senses at its end."""
+    def advance(self, pictures: bool = True) -> list[tuple[str, SensorInput]]:
+        """One step; what each robot senses at its end, with or without its camera."""
         self.now_ns += self._step_ns
         while self._events and self._passed_s >= self._events[0].at_s:
             self._befall(self._events.popleft())
@@ -311,7 +343,7 @@ class SimulatedField:
         sensed: list[tuple[str, SensorInput]] = []
         for name, robot in self.robots.items():
             piece = robot.odometry(self.now_ns)
-            frames = robot.sightings(self.now_ns, self._visible(name, robot.pose, mates))
+            frames = robot.frames(self.now_ns, partial(self._exposed, name, mates, pictures))
             items = (piece, *frames, *robot.positions(self.now_ns))
             sensed += [(name, item) for item in items if item is not None]
         return sensed
@@ -331,8 +363,25 @@ class SimulatedField:
             x, y, heading_deg = event.to
             self.robots[event.kidnap].pose = Pose2(x, y, wrap_angle(math.radians(heading_deg)))
 
+    def _exposed(
+        self, name: str, mates: Grid[Seen], pictures: bool, stamp_ns: int
+    ) -> Sightings | Frame | None:
+        """What a robot sees now: a picture, if it has a camera."""
+        robot = self.robots[name]
+        if robot.settings.sensing == "camera" and self._cameras is not None:
+            if not pictures:
+                self.not_taken += 1
+                return None
+            poses = {other: r.pose for other, r in self.robots.items()}
+            return self._cameras.frame(name, stamp_ns, poses, self._landmarks_hidden)
+        return robot.sightings(self.now_ns, stamp_ns, self._visible(name, robot.pose, mates))
+
+    @property
+    def _landmarks_hidden(self) -> bool:
+        return self.now_ns < self._hidden_until_ns
+
     def _visible(self, viewer: str, pose: Pose2, mates: Grid[Seen]) -> Iterable[Seen]:
-        if self.now_ns >= self._hidden_until_ns:
+        if not self._landmarks_hidden:
             yield from self._marks_to_see.near(pose.x, pose.y)
             yield from self._walls(pose)
         yield from (mate for mate in mates.near(pose.x, pose.y) if mate.name != viewer)
@@ -355,6 +404,25 @@ class SimulatedField:
         )
         robot.bumps += len(touching - robot.touching)
         robot.touching = touching
+
+
+def _cameras(team: Team, seed: int) -> "Cameras | None":
+    """Of the team's simulated robots; OpenCV is loaded for nobody else."""
+    if not team.renders:
+        return None
+    from cpcbl_launch.simulation.cameras import Cameras
+
+    return Cameras(team, seed)
+
+
+def _in_turn(team: Team, name: str, from_ns: int) -> int | None:
+    """When a camera's first frame is due: one after the other, as cameras do not wait for each
+    other and pictures take time."""
+    robots = [n for n, robot in team.robots.items() if robot.sensing == "camera"]
+    if name not in robots:
+        return None
+    period_ns = 1e9 / team.robots[name].sensor.rate_hz
+    return from_ns + int(period_ns * robots.index(name) / len(robots))
 
 
 class FieldNode:
@@ -395,6 +463,10 @@ class FieldNode:
         return self._field.next_ns
 
     @property
+    def pictures_not_taken(self) -> int:
+        return self._field.not_taken
+
+    @property
     def waiting(self) -> bool:
         return False  # commands take effect with the next step
 
@@ -406,7 +478,8 @@ class FieldNode:
                 self.counts[reason] += 1
         self._let_in_and_out(now_ns)
         while self._field.next_ns <= now_ns:
-            for name, sensed in self._field.advance():
+            in_time = now_ns - self._field.next_ns <= PICTURES_LATE_NS
+            for name, sensed in self._field.advance(in_time):
                 stamped = later(sensed, self._field.ahead_ns(name))
                 self._publishers[name, type(sensed)].put(encode(stamped))
             if self._truth.matching:
@@ -501,3 +574,5 @@ def run_field(
         time.sleep(min(clock.seconds_until(node.next_ns), 0.2))
     counts = ", ".join(f"{reason} {n}" for reason, n in sorted(node.counts.items()))
     log.info("commands, by what became of them: %s", counts or "none")
+    if node.pictures_not_taken:
+        log.warning("frames not taken, as the field was late: %d", node.pictures_not_taken)

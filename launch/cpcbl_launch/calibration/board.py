@@ -1,0 +1,159 @@
+"""The board that a camera is calibrated with: drawn to be printed, found in pictures.
+
+ChArUco: a chessboard with markers in its white squares, found in part too (Garrido-Jurado et al.,
+2014). A plain chessboard must be seen whole. Needs OpenCV (extra `camera`).
+"""
+
+import re
+from enum import StrEnum
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from cpcbl_agents.vision.camera import Pixels
+from cpcbl_agents.vision.codes import DICTIONARIES
+from cpcbl_team.config import MARKERS, MarkerFamily
+
+LEAST_SQUARES = 4
+LEAST_CORNERS = 8  # in a picture: fewer hardly tell a lens from a pose
+PRINTED_PX_PER_M = 300 / 0.0254  # 300 dots an inch
+
+Points = NDArray[np.float32]
+
+
+class Pattern(StrEnum):
+    charuco = "charuco"
+    chessboard = "chessboard"
+
+
+class Board(NamedTuple):
+    """What is printed; sides in metres."""
+
+    pattern: Pattern
+    squares: tuple[int, int]
+    """Across and down, black and white ones."""
+    square_m: float
+    marker_m: float
+    family: MarkerFamily
+
+
+class Corners(NamedTuple):
+    """Inner corners of the squares: on the board (n, 3), m, and in the picture (n, 2), px."""
+
+    places: Points
+    pixels: Points
+
+
+def parsed_board(
+    pattern: str, squares: str, square_m: float, marker_m: float, family: str
+) -> Board:
+    """A board by the words of the command line. Raises ValueError for one that cannot be made."""
+    match = re.fullmatch(r"(\d{1,3})x(\d{1,3})", squares.strip().lower())
+    if match is None:
+        raise ValueError(f"--squares {squares}: write it as 7x5: squares across and down")
+    across, down = int(match[1]), int(match[2])
+    if min(across, down) < LEAST_SQUARES:
+        raise ValueError(f"--squares {squares}: at least {LEAST_SQUARES} across and down")
+    markers = {str(name): name for name in MARKERS}
+    if family not in markers:
+        raise ValueError(f"--family {family}: no such family; use one of {', '.join(markers)}")
+    board = Board(Pattern(pattern), (across, down), square_m, marker_m, markers[family])
+    if board.pattern is Pattern.charuco:
+        _check_markers(board)
+    return board
+
+
+def _check_markers(board: Board) -> None:
+    if not 0.0 < board.marker_m < board.square_m:
+        raise ValueError(
+            f"--marker-m {board.marker_m:g}: markers are inside of squares; write less than"
+            f" --square-m {board.square_m:g}"
+        )
+    across, down = board.squares
+    needed, there = across * down // 2, MARKERS[board.family]
+    if needed > there:
+        raise ValueError(
+            f"--squares {across}x{down}: needs {needed} markers, {board.family} has {there};"
+            " use fewer squares"
+        )
+
+
+def drawn(board: Board) -> Pixels:
+    """The board as a grey picture (height, width), with a white margin, at 300 dots an inch."""
+    side = max(round(board.square_m * PRINTED_PX_PER_M), 8)
+    across, down = board.squares
+    if board.pattern is Pattern.charuco:
+        size = (side * (across + 1), side * (down + 1))
+        return _charuco(board).generateImage(size, marginSize=side // 2).astype(np.uint8)
+    rows, columns = np.indices((down, across))
+    inside = np.kron((rows + columns) % 2, np.ones((side, side))) * 255
+    return np.pad(inside, side // 2, constant_values=255).astype(np.uint8)
+
+
+def write_board(board: Board, path: Path) -> None:
+    """The board as a picture file. Raises ValueError, OSError."""
+    try:
+        written, picture = cv2.imencode(path.suffix or ".png", drawn(board))
+    except cv2.error:
+        written = False
+    if not written:
+        raise ValueError(f"--print-board {path}: not a picture; end its name in .png")
+    path.write_bytes(picture.tobytes())
+
+
+def found(pixels: Pixels, board: Board) -> Corners | str:
+    """The board's corners in a picture (height, width, 3), BGR; or why they cannot be used."""
+    grey = cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY).astype(np.uint8, copy=False)
+    corners = (
+        _in_charuco(grey, board) if board.pattern is Pattern.charuco else _in_chess(grey, board)
+    )
+    n = len(corners.pixels)
+    if n == 0:
+        return "no board found"
+    if n < LEAST_CORNERS:
+        return f"only {n} corners; {LEAST_CORNERS} are needed"
+    if np.linalg.matrix_rank(corners.places - corners.places[0]) < 2:
+        return "all corners in one row"
+    return corners
+
+
+def _in_charuco(grey: Pixels, board: Board) -> Corners:
+    made = _charuco(board)
+    pixels, ids, _, _ = cv2.aruco.CharucoDetector(made).detectBoard(grey)
+    if ids is None or len(ids) == 0:
+        return _NONE
+    places = np.asarray(made.getChessboardCorners(), np.float32)[np.ravel(ids)]
+    return Corners(places, np.asarray(pixels, np.float32).reshape(-1, 2))
+
+
+def _in_chess(grey: Pixels, board: Board) -> Corners:
+    across, down = board.squares[0] - 1, board.squares[1] - 1
+    flags = cv2.CALIB_CB_NORMALIZE_IMAGE
+    whole, pixels = cv2.findChessboardCornersSB(grey, (across, down), flags=flags)
+    if not whole:
+        return _NONE
+    pixels = _sharpened(grey, np.asarray(pixels, np.float32).reshape(down, across, 2))
+    rows, columns = np.indices((down, across), np.float32)
+    places = np.stack([columns, rows, np.zeros_like(rows)], axis=-1).reshape(-1, 3)
+    return Corners(places * np.float32(board.square_m), pixels.reshape(-1, 2))
+
+
+def _sharpened(grey: Pixels, pixels: Points) -> Points:
+    """Corners (down, across, 2) as the edges around each say: the detector's own are off by more
+    than their scatter, alike in neighbours, which least squares does not expect."""
+    gap = min(float(np.linalg.norm(np.diff(pixels, axis=i), axis=2).min()) for i in (0, 1))
+    half = int(np.clip(0.4 * gap, 2, 5))
+    points = np.ascontiguousarray(pixels.reshape(-1, 1, 2))
+    return np.asarray(cv2.cornerSubPix(grey, points, (half, half), (-1, -1), _PRECISE), np.float32)
+
+
+def _charuco(board: Board) -> cv2.aruco.CharucoBoard:
+    family = cv2.aruco.getPredefinedDictionary(DICTIONARIES[board.family])
+    return cv2.aruco.CharucoBoard(board.squares, board.square_m, board.marker_m, family)
+
+
+_PRECISE = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 30, 0.01)
+_NONE = Corners(np.empty((0, 3), np.float32), np.empty((0, 2), np.float32))

@@ -1,0 +1,81 @@
+"""Pictures from files, folders and videos. Needs OpenCV (extra `camera`)."""
+
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+from cpcbl_agents.vision.camera import Pixels
+
+PICTURES = (".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp")
+VIDEOS = (".avi", ".m4v", ".mkv", ".mov", ".mp4", ".webm")
+FRAMES_HZ = 30.0  # of a video that does not say its own
+
+
+class Picture(NamedTuple):
+    """A picture (height, width, 3), BGR; a text where there is none: why."""
+
+    name: str
+    pixels: Pixels | str
+
+
+def picture_files(paths: Sequence[Path]) -> list[Path]:
+    """Files, and those of folders that are pictures or videos by their names. Raises ValueError."""
+    files: list[Path] = []
+    for path in paths:
+        if path.is_dir():
+            inside = sorted(f for f in path.iterdir() if f.suffix.lower() in (*PICTURES, *VIDEOS))
+            if not inside:
+                raise ValueError(f"{path}: no picture in this folder; name one that has some")
+            files += inside
+        elif path.is_file():
+            files.append(path)
+        else:
+            raise ValueError(f"{path}: no such file or folder; name pictures, a folder or a video")
+    return files
+
+
+def read_pictures(
+    files: Sequence[Path], every_s: float = 0.5, progress: Callable[[float], None] = lambda d: None
+) -> Iterator[Picture]:
+    """One after the other; of a video a frame every so many seconds. What cannot be read is said.
+
+    `progress` is told the share of the files that are done.
+    """
+    for i, file in enumerate(files):
+        if file.suffix.lower() in VIDEOS:
+            yield from _frames(file, every_s)
+        else:
+            yield read_picture(file)
+        progress((i + 1) / len(files))
+
+
+def read_picture(file: Path) -> Picture:
+    """One picture, or why there is none."""
+    try:
+        image = np.frombuffer(file.read_bytes(), np.uint8)
+    except OSError as error:
+        return Picture(file.name, error.strerror or "cannot be read")
+    pixels = cv2.imdecode(image, cv2.IMREAD_COLOR) if image.size else None
+    return Picture(
+        file.name, "no picture" if pixels is None else pixels.astype("uint8", copy=False)
+    )
+
+
+def _frames(file: Path, every_s: float) -> Iterator[Picture]:
+    video = cv2.VideoCapture(str(file))
+    try:
+        step = max(round(every_s * (video.get(cv2.CAP_PROP_FPS) or FRAMES_HZ)), 1)
+        number = 0
+        while video.grab():
+            if number % step == 0:
+                read, pixels = video.retrieve()
+                name = f"{file.name}:{number}"
+                yield Picture(name, pixels.astype("uint8", copy=False) if read else "no picture")
+            number += 1
+        if number == 0:
+            yield Picture(file.name, "no frame in this video")
+    finally:
+        video.release()

@@ -1,0 +1,114 @@
+"""Figure 7 of the paper with cameras: pixels in place of simulated sightings.
+
+The field, its circuit, the odometry and what helps whom are those of `figure7`; landmarks are
+cylinders of two colours, the navigator carries markers and a mast. Its camera is a cheap one of a
+wide angle that shakes and whose focal length is not well known; the observer's is a sharper one
+that stands still. Both are as badly known as their settings say (`simulation/cameras.py`).
+"""
+
+from collections.abc import Iterable, Mapping
+
+import msgspec
+from rich.console import RenderableType
+
+from cpcbl_launch.experiments import figure7
+from cpcbl_launch.experiments.figure7 import ABOUT, CONFIGURATIONS, EXPLAINED, accuracy_table, ratio
+from cpcbl_launch.experiments.results import (
+    Accuracy,
+    Experiment,
+    Outcome,
+    Results,
+    accuracy,
+    new_outcome,
+    pattern_lines,
+)
+from cpcbl_launch.experiments.runs import Case
+from cpcbl_team.config import Bands, CameraSettings, Light, Side, Team
+
+NAVIGATOR = CameraSettings(
+    width_px=320,
+    height_px=240,
+    fx_px=135.0,
+    fy_px=135.0,
+    cx_px=159.5,
+    cy_px=119.5,
+    edge_sigma_px=1.0,
+    tilt_sigma_deg=2.0,
+    yaw_sigma_deg=4.0,
+    focal_share=0.03,
+)
+OBSERVER = CameraSettings(
+    fx_px=600.0, fy_px=600.0, tilt_sigma_deg=0.2, yaw_sigma_deg=0.3, focal_share=0.003
+)
+LIGHT = Light(blur_px=1.0, noise=4.0)
+LANDMARKS: Mapping[str, Bands] = {
+    "southwest": ("yellow", "blue"),
+    "southeast": ("blue", "yellow"),
+    "northeast": ("green", "pink"),
+    "northwest": ("pink", "green"),
+}
+MARKERS: dict[Side, int] = {"front": 0, "left": 1, "back": 2, "right": 3}
+MAST: Bands = ("pink", "yellow")
+
+
+def team_case(configuration: str) -> Case:
+    """One of the six configurations. Odometry alone needs no camera."""
+    case = figure7.team_case(configuration)
+    return case if configuration == "A" else case._replace(team=seeing(case.team))
+
+
+def seeing(team: Team) -> Team:
+    """The team with cameras, and with what they know landmarks and the navigator by."""
+    replace = msgspec.structs.replace
+    marks = {
+        name: replace(mark, colours=LANDMARKS[name]) for name, mark in team.map.landmarks.items()
+    }
+    cameras = {"navigator": NAVIGATOR, "observer": OBSERVER}
+    robots = {
+        name: replace(robot, sensing="camera", camera=cameras[name])
+        for name, robot in team.robots.items()
+    }
+    robots["navigator"] = replace(robots["navigator"], markers=MARKERS, colours=MAST)
+    return replace(
+        team,
+        robots=robots,
+        map=replace(team.map, landmarks=marks),
+        simulation=replace(team.simulation, light=LIGHT),
+    )
+
+
+def cases() -> Mapping[str, Case]:
+    return {c: team_case(c) for c in CONFIGURATIONS}
+
+
+def outcome(results: Results) -> Outcome:
+    figures = {c: accuracy(runs) for c, runs in results.items()}
+    return new_outcome(
+        "figure7-cameras", results, cases(), figures=figures, pattern=pattern(figures)
+    )
+
+
+def pattern(figures: Mapping[str, Accuracy]) -> dict[str, bool]:
+    """What the paper found, with bounds. Nothing holds without figures."""
+    mean = {c: f.position_mean_m for c, f in figures.items()}
+    heading = {c: f.heading_mean_deg for c, f in figures.items()}
+    inside = [figures[c].inside_3_sigma for c in "CDEF"]
+    return {
+        "D about C (mean position error, 20 %)": abs(ratio(mean["D"], mean["C"]) - 1.0) <= ABOUT,
+        "F about E (mean position error, 20 %)": abs(ratio(mean["F"], mean["E"]) - 1.0) <= ABOUT,
+        "E at most 0.5 x C (mean position error)": ratio(mean["E"], mean["C"]) <= 0.5,
+        "heading of E better than of C": ratio(heading["E"], heading["C"]) < 1.0,
+        "C to F: at least 97 % inside 3 σ": all(i is not None and i >= 0.97 for i in inside),
+    }
+
+
+def tables(result: Outcome) -> Iterable[RenderableType]:
+    yield accuracy_table(
+        f"navigator with a camera, {result.loops} loops, {result.seeds} runs each",
+        {f"{c} {name}": result.figures[c] for c, name in CONFIGURATIONS.items()},
+    )
+    yield EXPLAINED
+    yield from pattern_lines(result)
+
+
+EXPERIMENT = Experiment("figure7-cameras", cases, outcome, tables, figure7.draw)

@@ -1,0 +1,1 @@
+"""What robots see, for people: annotated frames."""
