@@ -351,7 +351,7 @@ def _converted(raw: Any, kind: type[Any], prefix: str, name: str) -> Any:
 def _explained(error: str, kind: type[Any], prefix: str) -> str:
     """msgspec's text as `key: problem; fix`."""
     problem, _, where = error.partition(" - at `")
-    path = where.rstrip("`").removeprefix("$").lstrip(".")
+    path = where.removeprefix("key` in `").rstrip("`").removeprefix("$").lstrip(".")
     key = ".".join(part for part in (prefix, path) if part)
     unknown = re.search(r"unknown field `(.+)`", problem)
     if unknown:
