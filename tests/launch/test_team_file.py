@@ -458,3 +458,25 @@ to_m = [9.0, 14.0]
     ).map
     assert field.bounds() == (-1.0, 2.0, 9.0, 14.0)
     assert field.walls["north"].direction_rad == pytest.approx(math.pi / 4.0)
+
+
+# Cameras ----------------------------------------------------------------------------------------
+
+
+def test_videos_and_folders_are_found_beside_the_team_file(tmp_path: Path) -> None:
+    frames = {"film": "film.avi", "shots": "../shots", "device": "0", "dev": "/dev/video2"}
+    frames |= {"stream": "rtsp://10.0.0.7/a", "driver": "", "root": "/films/a.avi"}
+    text = "".join(
+        f'[robots.{name}]\nsource = "external"\ncamera = {{ frames = "{where}" }}\n'
+        for name, where in frames.items()
+    )
+    path = tmp_path / "team.toml"
+    path.write_text(f'name = "t"\n{text}')
+    found = {name: robot.camera.frames for name, robot in load_team(path).robots.items()}
+    beside = {"film": str(tmp_path / "film.avi"), "shots": str(tmp_path / "../shots")}
+    assert found == {**frames, **beside}
+
+
+def test_simulated_frames_are_the_fields() -> None:
+    with pytest.raises(TeamFileError, match=r"robots\.r1\.camera\.frames: .*; remove the key"):
+        team(f'{ROBOT}sensing = "camera"\ncamera = {{ frames = "0" }}')

@@ -54,6 +54,8 @@ class Codes:
     def read(self, grey: Pixels, quads: Floats) -> dict[int, Code]:
         """What the quads (m, 4, 2) show, clockwise in the picture: by index, of those that are
         markers."""
+        if not len(quads):
+            return {}
         places = np.stack([_laid(self._places, quad) for quad in quads])
         levels = sampled(grey, places).reshape(len(quads), -1, len(_WITHIN)).mean(axis=2)
         margins, borders = levels[:, self._rings == 0], levels[:, self._rings == 1]

@@ -11,7 +11,7 @@ from cpcbl_agents.vision.panorama import Panorama
 from cpcbl_team.config import Colour
 
 BITS = 8  # colours that are told apart in one go
-MOST_BLOBS = 30  # of a colour; the largest
+MOST_BLOBS = 16  # of a colour; the largest
 LEAST_PX = 2  # high and wide
 LEAST_SHARE = 0.3  # of a patch: light and shade take some beyond the thresholds
 MOST_OTHERS = 0.3  # of other colours, as a share of its own

@@ -13,7 +13,7 @@ from cpcbl_agents.vision.camera import Camera, Pixels
 from cpcbl_agents.vision.colours import Blob, Colours
 from cpcbl_agents.vision.glimpses import Doubt, Found, Glimpses
 from cpcbl_agents.vision.outlines import Candidate, Outline, Patch, candidates, outlined, patch_of
-from cpcbl_agents.vision.panorama import Panorama
+from cpcbl_agents.vision.panorama import panorama_of
 from cpcbl_agents.vision.silhouette import WIDTH, Shape
 from cpcbl_agents.vision.twins import without_twins
 from cpcbl_agents.vision.verdicts import Look, Verdict, best, reason, verdict
@@ -42,7 +42,7 @@ class Cylinders:
         self._kinds = kinds(robot, team, camera.settings.mounted_m)
         used = {colour for bands in self._kinds for colour in bands}
         self._colours = Colours(team.vision.colours, used)
-        self._panorama = Panorama(camera)
+        self._panorama = panorama_of(camera.settings)
 
     def glimpses(self, pixels: Pixels) -> Glimpses:
         """All known cylinders in a frame (height, width, 3), BGR, of the camera's size."""

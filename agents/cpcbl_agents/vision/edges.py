@@ -26,6 +26,8 @@ _NEXT = [1, 2, 3, 0]
 
 def sampled(grey: Pixels, points: Floats) -> NDArray[np.float32]:
     """The grey levels (...) at points (..., 2), pixels."""
+    if not points.size:
+        return np.zeros(points.shape[:-1], np.float32)
     flat = points.astype(np.float32).reshape(-1, points.shape[-2], 2)
     levels = cv2.remap(grey, flat[..., 0], flat[..., 1], cv2.INTER_LINEAR)
     return levels.astype(np.float32).reshape(points.shape[:-1])

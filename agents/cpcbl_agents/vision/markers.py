@@ -19,6 +19,7 @@ from cpcbl_team.inputs import Sighting
 WINDOW_PX = 7  # of the adaptive threshold; one is enough, as what is found is refined
 LEAST_SIDE_PX = 6.0
 PASSES = 2  # until corners are exact enough to read between them
+FAR_PX = 8.0  # a corner that moves by so much in a pass is none
 MOST_MISFIT = 5.0  # mean squared error in sigmas, of a marker that stands where it should
 CLEAR_RAD = math.radians(10.0)
 """A heading that is known worse than that is left out."""
@@ -72,10 +73,11 @@ class Markers:
         right, _, wrong = self._detector.detectMarkers(grey)
         quads = np.array([*right, *wrong], dtype=np.float64).reshape(-1, 4, 2)
         quads = quads[_least_sides(quads) > LEAST_SIDE_PX]
-        if not len(quads):
-            return []
         for _ in range(PASSES):
-            quads = corners(steps(grey, quads, self._codes.cells))
+            better = corners(steps(grey, quads, self._codes.cells))
+            near = np.abs(better - quads).max(axis=(1, 2), initial=0.0) < FAR_PX
+            quads = better[near]
+            quads = quads[_least_sides(quads) > LEAST_SIDE_PX]
         codes = self._codes.read(grey, quads)
         if not codes:
             return []
@@ -90,7 +92,7 @@ class Markers:
                 Mark(code.id, *(np.roll(points, -first, axis=0) for points in (quad, flat)))
             )
         moved = np.abs(exact - rough).max(axis=(1, 2))
-        return [marks[i] for i in moved.argsort()]
+        return [marks[i] for i in moved.argsort() if moved[i] < FAR_PX]
 
     def _upside_down(self, plane: Floats) -> int:
         """By how many corners a marker has to be turned to stand upright: 2, or 0.
@@ -186,7 +188,7 @@ def _parameters() -> cv2.aruco.DetectorParameters:
 
 
 def _least_sides(quads: Floats) -> Floats:
-    least: Floats = np.linalg.norm(np.roll(quads, -1, axis=1) - quads, axis=2).min(axis=1)
+    least: Floats = np.linalg.norm(quads[:, [1, 2, 3, 0]] - quads, axis=2).min(axis=1)
     return least
 
 

@@ -16,6 +16,7 @@ from cpcbl_agents.vision.profiles import Profile
 from cpcbl_agents.vision.silhouette import FOOT, TOP, WIDTH
 from cpcbl_team.config import Bands
 
+MOST_CANDIDATES = 32
 GAP_PX, GAP_SHARE = 2.5, 0.15  # between the bands, of the lower height
 OVERLAP_SHARE = 1.0  # with something of its colour beside it, a blob goes farther up or down
 LEAST_OVERLAP = 0.5  # of the narrower band
@@ -92,12 +93,14 @@ class Patch(NamedTuple):
 
 
 def candidates(blobs: Sequence[Blob]) -> list[Candidate]:
-    """All pairs of touching blobs of two colours that might be the bands of a cylinder."""
-    return [
+    """The pairs of touching blobs of two colours that might be the bands of a cylinder; of very
+    many the highest, so that no picture takes for ever."""
+    pairs = [
         Candidate(upper, lower)
         for upper, lower in itertools.permutations(blobs, 2)
         if upper.colour != lower.colour and _stacked(upper, lower)
     ]
+    return sorted(pairs, key=lambda pair: -pair.height)[:MOST_CANDIDATES]
 
 
 def _stacked(upper: Blob, lower: Blob) -> bool:
@@ -126,8 +129,7 @@ def patch_of(pixels: Pixels, panorama: Panorama, candidate: Candidate) -> Patch 
 
 
 def outlined(patch: Patch, panorama: Panorama, candidate: Candidate) -> list[Outline]:
-    """What the outline of a candidate may be; empty if it has no sides, or no line between its
-    bands.
+    """What the outline of a candidate may be; empty if there is no line between its bands.
 
     A blob may go on in something of its colour beside or behind it: where the sides of the two
     bands are not one above the other, either may be the true one.
@@ -141,13 +143,17 @@ def outlined(patch: Patch, panorama: Panorama, candidate: Candidate) -> list[Out
         return []
     top, foot = _ends(rows, upper.top, mid, lower.bottom)
     inset = INSET * min(mid - upper.top, lower.bottom - mid)
+    lost: frozenset[int] = frozenset()
     found = _choices(
         _sides(patch.across(upper.top + inset, mid - inset), upper),
         _sides(patch.across(mid + inset, lower.bottom - inset), lower),
     )
-    lost = frozenset(i for i, edge in ((TOP, top), (FOOT, foot)) if math.isnan(edge))
-    top = upper.top if TOP in lost else top
-    foot = lower.bottom if FOOT in lost else foot
+    if not found:
+        lost, found = lost | {WIDTH}, [(min(upper.left, lower.left), max(upper.right, lower.right))]
+    if math.isnan(top):
+        lost, top = lost | {TOP}, upper.top
+    if math.isnan(foot):
+        lost, foot = lost | {FOOT}, lower.bottom
     outlines = (Outline(left, right, top, mid, foot, lost) for left, right in found)
     return [_with_cuts(panorama, outline) for outline in outlines]
 

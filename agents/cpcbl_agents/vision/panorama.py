@@ -5,6 +5,7 @@ distance d from the lens is the row (lens - z) / d. So edges can be averaged alo
 """
 
 import math
+from functools import lru_cache
 from typing import NamedTuple
 
 import cv2
@@ -12,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cpcbl_agents.vision.camera import Camera, Floats, Pixels
+from cpcbl_team.config import CameraSettings
 
 STEEPEST = 4.0  # slopes: what is farther below or above than this is not unrolled
 WIDEST_RAD = math.radians(85.0)  # to each side of the camera's yaw
@@ -155,6 +157,12 @@ class Panorama:
         pixels[off > FOLD_PX] = -9.0
         x, y = pixels.astype(np.float32).T.reshape(2, rows, columns)
         return np.ascontiguousarray(x), np.ascontiguousarray(y)
+
+
+@lru_cache(maxsize=4)
+def panorama_of(settings: CameraSettings) -> Panorama:
+    """The panorama of a camera; it takes a while to make, and is the same for all alike."""
+    return Panorama(Camera(settings))
 
 
 def _grid(width: int, height: int) -> Floats:

@@ -10,7 +10,7 @@ from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 from cpcbl_agents.vision.camera import Floats
-from cpcbl_agents.vision.silhouette import FOOT, MID, TOP, WIDTH, Fit, Shape, fit, looks
+from cpcbl_agents.vision.silhouette import FOOT, LEVEL, MID, TOP, WIDTH, Fit, Shape, fit, looks
 
 WHOLE = (TOP, MID, FOOT, WIDTH)
 WHOLE_GATE = 7.8  # chi-square, 3 degrees of freedom, 0.95
@@ -18,7 +18,6 @@ PARTS = (((TOP, MID, WIDTH), FOOT), ((MID, FOOT, WIDTH), TOP), ((TOP, MID, FOOT)
 """What is used when one of the four is hidden."""
 PART_GATE = 6.0  # 2 degrees of freedom, 0.95
 SIGMAS = 3.0
-ANY_TILT_RAD = 10.0
 
 
 class Look(NamedTuple):
@@ -78,11 +77,17 @@ def reason(shape: Shape, lens_m: float, look: Look) -> str:
         return "cut_by_frame"
     if look.hidden:
         return "wrong_shape"
-    free = fit(shape, look.seen, look.sigmas, ANY_TILT_RAD, WHOLE)
-    if free.chi2 > WHOLE_GATE:
+    top, mid, foot, width = look.seen
+    near = shape.height / max(foot - top, 1e-9)  # by its height alone, wherever it stands
+    expected = math.asin(min(1.0, shape.radius / (near + LEVEL * shape.radius)))
+    edge = look.sigmas[MID]
+    width_sigma = math.hypot(look.sigmas[WIDTH], expected * edge * math.sqrt(2.0) / (foot - top))
+    if (
+        abs(foot - 2.0 * mid + top) > SIGMAS * math.sqrt(6.0) * edge
+        or abs(width - expected) > SIGMAS * width_sigma
+    ):
         return "wrong_shape"
-    below = lens_m - look.seen[MID] * free.distance < 0.0
-    return "mirror_image" if below else "ranges_disagree"
+    return "mirror_image" if lens_m < mid * near else "ranges_disagree"
 
 
 def _verdict(shape: Shape, look: Look, fitted: Fit, hidden: int | None) -> Verdict:

@@ -144,7 +144,7 @@ def _seen(eyes: CameraEyes, path: Path) -> Glimpses | str:
         image = path.read_bytes()
     except OSError as error:
         raise ValueError(f"{path}: {error.strerror}; name the folder of the pictures") from error
-    pixels = decoded(image, eyes.camera.size_px)
+    pixels = decoded(image)
     return pixels if isinstance(pixels, str) else eyes.glimpses(pixels)
 
 

@@ -3,6 +3,7 @@ doubted."""
 
 import math
 
+import cv2
 import numpy as np
 import pytest
 from marker_helpers import CARRIED, looked, off, picture, standing, team
@@ -62,7 +63,7 @@ def names(glimpses: Glimpses) -> set[str]:
 @pytest.mark.parametrize("lens", LENSES)
 def test_teammates_within_three_metres_are_found_placed_and_their_headings_told(lens: str) -> None:
     random, settings = np.random.default_rng(2), LENSES[lens]
-    errors, headings, missed, frames = [], 0, 0, 20
+    errors, headings, missed, frames = [], 0, 0, 16
     for seed in range(frames):
         robots = three(random)
         pixels = picture(TEAM, robots, settings, any_light(random), seed)
@@ -140,6 +141,20 @@ def test_nothing_is_seen_in_noise_or_of_a_team_without_markers() -> None:
     assert looked(TEAM, noise) == Glimpses()
     bare = team({"r1": {}})
     assert looked(bare, picture(TEAM, [standing("r1", 1.0, 0.0, 180.0)])) == Glimpses()
+
+
+def test_nothing_is_seen_in_a_heap_of_papers_and_lines() -> None:
+    random = np.random.default_rng(7)
+    for _ in range(20):
+        pixels = np.full((480, 640, 3), 128, np.uint8)
+        for shade in random.integers(0, 256, 120).tolist():
+            middle, reach = random.uniform([0, 0], [640, 480]), random.uniform(4, 60)
+            corners = (middle + random.uniform(-reach, reach, (4, 2))).astype(np.int32)
+            if shade % 2:
+                cv2.fillConvexPoly(pixels, cv2.convexHull(corners), (shade,) * 3)
+            else:
+                cv2.polylines(pixels, [corners], True, (shade,) * 3)
+        assert looked(TEAM, pixels).found == ()
 
 
 # What is doubted ---------------------------------------------------------------------------------
