@@ -26,11 +26,11 @@ check: setup
 	PYTHONPATH=.:agents:transport:launch $(BIN)/lint-imports --no-cache
 
 unit: setup
-	$(BIN)/pytest -n 2 -m "not long and not log and not docker"
+	$(BIN)/pytest -n 2 -m "not long and not log and not pictures and not docker"
 
-# Minutes long; with CPCBL_MRCLAM=folder also on real logs.
+# Minutes long; with CPCBL_MRCLAM=folder also on real logs, with CPCBL_PICTURES=folder real pictures.
 test-long: setup
-	$(BIN)/pytest -n 2 -m "$(if $(CPCBL_MRCLAM),long or log,long)"
+	$(BIN)/pytest -n 2 -m "long$(if $(CPCBL_MRCLAM), or log)$(if $(CPCBL_PICTURES), or pictures)"
 
 # Needs a Docker daemon: docker/dockerd.sh start. One at a time: containers share the machine.
 test-docker: setup
@@ -40,14 +40,20 @@ test-docker: setup
 chaos: setup
 	$(BIN)/cpcbl-team chaos all --soak-s 180
 
-# Timed, so alone on the machine: the localizer's variants and their peers in the same run.
+# Timed, so alone on the machine: the localizer's variants and their peers in the same run, then a
+# robot's eyes and OpenCV's marker detection.
 bench: setup
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev,bench]'
 	@mkdir -p build
-	$(BIN)/pytest -q --benchmark-json=build/bench_raw.json --benchmark-columns=median \
-	  --benchmark-timer=time.process_time --benchmark-sort=name tests/benchmarks/bench_cycle.py > build/bench.log \
-	  || { cat build/bench.log; exit 1; }
-	PYTHONPATH=.:agents:transport:launch:tests $(BIN)/python -m benchmarks.table build/bench_raw.json build/bench.json
+	$(call timed,cycle,bench)
+	$(call timed,eyes,bench_eyes)
+	PYTHONPATH=$(BENCH_PATH) $(BIN)/python -m benchmarks.table build/bench_raw.json build/bench.json
+	PYTHONPATH=$(BENCH_PATH) $(BIN)/python -m benchmarks.eyes_table build/bench_eyes_raw.json build/bench_eyes.json
+
+BENCH_PATH = .:agents:transport:launch:tests
+timed = $(BIN)/pytest -q --benchmark-json=build/$(2)_raw.json --benchmark-columns=median \
+  --benchmark-timer=time.process_time --benchmark-sort=name tests/benchmarks/bench_$(1).py \
+  > build/$(2).log || { cat build/$(2).log; exit 1; }
 
 clean:
 	rm -rf $(VENV) build .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -22,7 +22,15 @@ DRIFT_SHARE = 0.1  # of its way: what a teammate's position loses between two fi
 
 LOST_HEADING_SIGMA_RAD = math.pi / math.sqrt(3.0)  # any is as likely
 USUAL_HEADING_SIGMA_RAD = math.radians(10.0)  # no tier tells of it
-HEADING_DRIFT_RAD_PER_M = 0.05  # of its way: what a teammate's heading loses between two fixes
+HEADING_DRIFT_RAD_PER_SQRT_M = 0.1  # what a teammate's heading loses on its way, as a random walk
+
+
+class Turned(NamedTuple):
+    """A teammate after the last heading that it was sent: where that was, how well it knew it."""
+
+    x_m: float
+    y_m: float
+    variance: float
 
 
 class Helped(NamedTuple):
@@ -31,7 +39,7 @@ class Helped(NamedTuple):
     x_m: float
     y_m: float
     covariance: Covariance2
-    heading_variance: float = USUAL_HEADING_SIGMA_RAD**2
+    turned: Turned | None = None
 
 
 def sigma_range_m(tier: int, settings: CollaborationSettings) -> tuple[float, float]:
@@ -62,19 +70,22 @@ def expected(
     return grown.scaled((min(max(sigma, least), most) / sigma) ** 2)
 
 
-def expected_heading(tier: int, helped: Helped | None, x_m: float, y_m: float) -> float:
-    """What the heading's variance (rad^2) of a teammate at (x, y) is likely to be.
+def expected_heading(tier: int, turned: Turned | None, fix: Fix) -> float:
+    """What the heading's variance (rad^2) of a teammate that is seen there is likely to be.
 
     A lost one's is unknown. Another's is what is usual, or what the last heading that it was told
-    left and its way has added: so its heading is told while that is news.
+    left and its way has added: so its heading is told while that is news. A robot that stands seems
+    to move by the sensor's noise; that is no way.
     """
     if tier == LOWEST_TIER:
         return LOST_HEADING_SIGMA_RAD**2
     usual = USUAL_HEADING_SIGMA_RAD**2
-    if helped is None:
+    if turned is None:
         return usual
-    way = math.hypot(x_m - helped.x_m, y_m - helped.y_m)
-    return min(helped.heading_variance + (HEADING_DRIFT_RAD_PER_M * way) ** 2, usual)
+    xx, _, yy = fix.sensor_covariance
+    way = math.hypot(fix.x_m - turned.x_m, fix.y_m - turned.y_m)
+    way = max(0.0, way - 2.0 * math.sqrt(xx + yy))
+    return min(turned.variance + HEADING_DRIFT_RAD_PER_SQRT_M**2 * way, usual)
 
 
 def merged_heading(prior: float, fix: Fix, fusion: Fusion) -> float:

@@ -19,6 +19,7 @@ from cpcbl_team.gaussian import Covariance2
 from cpcbl_team.inputs import Belief, Fix
 from cpcbl_team.value import (
     Helped,
+    Turned,
     expected,
     expected_heading,
     heading_worth,
@@ -185,16 +186,16 @@ class CollaborationAgent:
         prior = expected(tier, before, *place, rules)
         parts = Covariance2(*fix.sensor_covariance), Covariance2(*fix.observer_covariance)
         after = merged(prior, *parts, rules.fusion)
-        value, variance = worth(prior, after), expected_heading(tier, before, *place)
+        value, turned = worth(prior, after), None if before is None else before.turned
         if fix.heading_rad is not None:
+            variance = expected_heading(tier, turned, fix)
             left = merged_heading(variance, fix, rules.fusion)
             gained = heading_worth(variance, left)
             if gained >= rules.least_value:
-                value, variance = value + gained, left
+                value, turned = value + gained, Turned(*place, left)
             else:
                 fix = without_heading(fix)
-        told = Helped(*place, after, variance)
-        return _Offer(value, tier == LOWEST_TIER, told, fix)
+        return _Offer(value, tier == LOWEST_TIER, Helped(*place, after, turned), fix)
 
     def _paid(self, offer: _Offer, now_ns: int) -> bool:
         fix = offer.fix

@@ -40,7 +40,7 @@ class SensingAgent:
         own = settings.position_sensor
         self._position_delay_ns = 0 if own is None else int(own.delay_s * 1e9)
         self._source, self._marks, self._pilot, self._eyes = source, marks, pilot, eyes
-        self._camera, self._looked, self._look_ns = camera, False, 0
+        self._camera, self._looked, self._look_ns = camera, False, -LOOK_NS
         self._counts: Counter[str] = Counter()
 
     @property

@@ -16,7 +16,7 @@ from process_helpers import eventually
 from cpcbl_agents.eyes import Picture
 from cpcbl_agents.sources import OwnCamera
 from cpcbl_agents.sources.camera import LiveCamera, opened
-from cpcbl_agents.vision.pictures import decoded, fault
+from cpcbl_agents.vision.pictures import fault, received
 from cpcbl_team.config import CameraSettings
 from cpcbl_transport.messages import Frame
 
@@ -30,7 +30,7 @@ def polled(source: OwnCamera, now_ns: int) -> list[tuple[int, int]]:
     """(stamp, number) of the pictures that are there now."""
     found = []
     for item in source.poll(now_ns):
-        pixels = item.pixels if isinstance(item, Picture) else decoded(image_of(item), SIZE)
+        pixels = item.pixels if isinstance(item, Picture) else received(image_of(item), SIZE)
         assert not isinstance(pixels, str)
         found.append((item.stamp_ns, number_of(pixels)))
     return found
@@ -107,7 +107,7 @@ def test_a_picture_that_is_gone_or_broken_is_a_frame_that_cannot_be_used(tmp_pat
     source = camera(tmp_path)
     (tmp_path / "a.png").unlink()
     frames = [item for now in (0, 50 * MS, 100 * MS) for item in source.poll(now)]
-    said = [decoded(image_of(frame), SIZE) for frame in frames]
+    said = [received(image_of(frame), SIZE) for frame in frames]
     assert said[:2] == ["frame_empty", "frame_undecodable"]
     assert not isinstance(said[2], str)
 

@@ -12,7 +12,7 @@ from camera_helpers import SIZE, jpeg, number_of, picture, png
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cpcbl_agents.vision.pictures import Header, decoded, encoded, fault, header_of
+from cpcbl_agents.vision.pictures import Header, decoded, encoded, fault, header_of, received
 
 GOOD = picture(7)
 GREY = cv2.cvtColor(GOOD, cv2.COLOR_BGR2GRAY).astype(np.uint8)
@@ -78,23 +78,33 @@ BAD: dict[str, tuple[str, bytes]] = {
 
 @pytest.mark.parametrize("data", [JPEG, PNG, JPEG + bytes(50)], ids=["JPEG", "PNG", "padded"])
 def test_a_good_picture_is_decoded(data: bytes) -> None:
-    pixels = decoded(data, SIZE)
+    pixels = received(data, SIZE)
     assert not isinstance(pixels, str)
     assert pixels.shape == GOOD.shape
     assert number_of(pixels) == 7
     assert fault(pixels, SIZE) == ""
 
 
+@pytest.mark.parametrize("pixels", [GREY, CLEAR, LEVELS_16], ids=["grey", "clear", "16 bit"])
+def test_a_file_that_a_person_names_may_be_of_any_kind(pixels: Any) -> None:
+    made = decoded(png(pixels))
+    assert not isinstance(made, str)
+    assert made.shape == GOOD.shape
+    assert made.dtype == np.uint8
+    assert decoded(b"") == "frame_empty"
+    assert decoded(b"no picture") == "frame_undecodable"
+
+
 @pytest.mark.parametrize("what", BAD)
 def test_what_cannot_be_used_is_refused_by_its_reason(what: str) -> None:
     reason, data = BAD[what]
-    assert decoded(data, SIZE) == reason
+    assert received(data, SIZE) == reason
 
 
 @pytest.mark.parametrize("data", [JPEG, PNG], ids=["JPEG", "PNG"])
 def test_a_picture_that_ends_anywhere_too_soon_is_refused(data: bytes) -> None:
     for length in range(len(data)):
-        assert isinstance(decoded(data[:length], SIZE), str), length
+        assert isinstance(received(data[:length], SIZE), str), length
 
 
 @pytest.mark.parametrize("progressive", [0, 1])
@@ -110,7 +120,7 @@ def test_headers_of_whole_pictures(progressive: int) -> None:
 @examples(300)
 @given(st.binary(max_size=200), st.sampled_from([b"", JPEG[:20], PNG[:20], b"\xff\xd8\xff"]))
 def test_nothing_raises(noise: bytes, head: bytes) -> None:
-    assert isinstance(decoded(head + noise, SIZE), str)
+    assert isinstance(received(head + noise, SIZE), str)
 
 
 def plain(*levels: float) -> "np.typing.NDArray[np.uint8]":
@@ -139,7 +149,7 @@ def test_pixels_that_show_nothing_are_refused(reason: str, pixels: Any) -> None:
 
 
 def test_a_picture_for_people_is_a_jpeg_of_moderate_size() -> None:
-    small = decoded(encoded(GOOD), SIZE)
+    small = received(encoded(GOOD), SIZE)
     assert not isinstance(small, str)
     assert number_of(small) == 7
     assert header_of(encoded(picture(7, (2560, 1000)))) == Header(1280, 500, 3, 8)

@@ -311,6 +311,28 @@ def test_fixes_are_without_the_bias_that_the_robot_has_learned(learns: bool) -> 
     assert (fix.x_m, fix.y_m) == pytest.approx(expected, abs=1e-9)
 
 
+@pytest.mark.parametrize("learns", [True, False])
+def test_a_heading_is_told_without_the_learned_bias_and_used(learns: bool) -> None:
+    """A marker is seen against the line of sight, so it is off by as much as the bearing."""
+    rules = LocalizerSettings(self_calibration=learns)
+    subject = robot(with_robot(TEAM, "me", localizer=rules))
+    state = subject.filter.timeline.state
+    known = Learned(bearing_bias_rad=0.1)
+    subject.filter.timeline.state = replace(state, memory=replace(state.memory, learned=known))
+    for piece in pieces(0.5, 0.0, 0.0):
+        subject.handle(piece, piece.stamp_ns)
+        subject.handle(Tick(), piece.stamp_ns)
+    seen = Sighting("mate", 2.0, 0.1, None, None, 1.1, 0.05)
+    (fix,) = fixes(subject.handle(saw(400 * MS, seen), 500 * MS))
+    own = subject.filter.timeline.state.estimate.pose.heading
+    assert fix.heading_rad == pytest.approx(own + (1.0 if learns else 1.1), abs=1e-9)
+    helped = robot()
+    here = {"x_m": 0.0, "y_m": 0.0, "heading_rad": 0.05}
+    helped.handle(replace(fix, robot="me", observer="mate", **here), 500 * MS)
+    before, after = (r.filter.timeline.state.estimate for r in (robot(), helped))
+    assert after.heading_sigma_rad < before.heading_sigma_rad
+
+
 def test_a_robot_that_stands_waits_for_no_odometry() -> None:
     subject = robot(with_robot(TEAM, "me", odometry=OdometrySettings(moves=False)))
     subject.handle(saw(100 * MS), 100 * MS)

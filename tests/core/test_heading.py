@@ -237,7 +237,7 @@ class Observer:
 
 
 def blind(robot: Localizer, seed: int, headed: bool, off_m: float, off_deg: float) -> Run:
-    """A round among nothing but an observer that sees the robot twice a second."""
+    """Half a round among nothing but an observer that sees the robot twice a second."""
     rng = np.random.default_rng(seed)
     state = robot.start(0)
     observer = Observer(off_m, off_deg, rng)

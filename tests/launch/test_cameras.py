@@ -12,7 +12,7 @@ from msgspec.structs import replace
 
 from cpcbl_agents.sensing import SensorInput
 from cpcbl_agents.vision.camera import Camera, Pixels
-from cpcbl_agents.vision.pictures import decoded, header_of
+from cpcbl_agents.vision.pictures import decoded
 from cpcbl_launch.simulation.cameras import QUALITIES, Cameras, encoded
 from cpcbl_launch.simulation.field import PICTURES_LATE_NS, FieldNode, SimulatedField
 from cpcbl_launch.simulation.render import Scene, Standing, render
@@ -65,9 +65,7 @@ def frames(field: SimulatedField, steps: int, robot: str = "eye") -> list[Frame]
 
 
 def pixels_of(frame: Frame) -> Pixels:
-    header = header_of(frame.image)
-    assert header is not None
-    pixels = decoded(frame.image, (header.width_px, header.height_px))
+    pixels = decoded(frame.image)
     assert not isinstance(pixels, str)
     return pixels
 

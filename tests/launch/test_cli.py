@@ -55,6 +55,7 @@ odometry = { moves = false }
         ["evaluate"],
         ["calibrate"],
         ["traffic"],
+        ["look"],
         ["observer"],
     ],
 )

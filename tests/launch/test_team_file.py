@@ -333,6 +333,34 @@ WRONG = [
         "robots.r1.localizer.alternate",
         "remove",
     ),
+    Wrong(
+        "a marker that the family lacks",
+        "[defaults.markers]\nfront = 50",
+        "robots.r1.markers.front",
+        "use 0 to 49",
+    ),
+    Wrong(
+        "a marker that another family has",
+        "[vision]\nfamily = 'apriltag_16h5'\n[defaults.markers]\nleft = 30",
+        "robots.r1.markers.left",
+        "use 0 to 29",
+    ),
+    Wrong(
+        "a marker below none", "[defaults.markers]\nback = -1", "robots.r1.markers.back", "use 0 to"
+    ),
+    Wrong("a side that robots lack", "[defaults.markers]\ntop = 1", "defaults.markers", "'top'"),
+    Wrong(
+        "a marker on two sides",
+        "[defaults.markers]\nfront = 3\nback = 3",
+        "robots.r1.markers.front",
+        "give each side its own",
+    ),
+    Wrong(
+        "a marker that is its own mirror image",
+        "[defaults.markers]\nfront = 17",
+        "robots.r1.markers.front",
+        "use another",
+    ),
 ]
 
 
@@ -355,6 +383,13 @@ def test_a_mistake_is_one_line_with_key_and_fix(tmp_path: Path, wrong: Wrong) ->
     said = complaint(tmp_path / "team.toml", "\n".join(parts))
     assert said[: len(wrong.key)] == wrong.key
     assert wrong.fix in said.removeprefix(wrong.key)
+
+
+def test_two_robots_may_carry_the_same_marker() -> None:
+    other = ROBOT.replace("r1", "r2")
+    both = robots(f"{ROBOT}markers = {{ front = 3 }}\n{other}markers = {{ left = 3 }}")
+    assert both["r1"].markers == {"front": 3}
+    assert both["r2"].markers == {"left": 3}
 
 
 def test_every_text_with_a_mistake_has_only_that_one() -> None:
@@ -423,3 +458,25 @@ to_m = [9.0, 14.0]
     ).map
     assert field.bounds() == (-1.0, 2.0, 9.0, 14.0)
     assert field.walls["north"].direction_rad == pytest.approx(math.pi / 4.0)
+
+
+# Cameras ----------------------------------------------------------------------------------------
+
+
+def test_videos_and_folders_are_found_beside_the_team_file(tmp_path: Path) -> None:
+    frames = {"film": "film.avi", "shots": "../shots", "device": "0", "dev": "/dev/video2"}
+    frames |= {"stream": "rtsp://10.0.0.7/a", "driver": "", "root": "/films/a.avi"}
+    text = "".join(
+        f'[robots.{name}]\nsource = "external"\ncamera = {{ frames = "{where}" }}\n'
+        for name, where in frames.items()
+    )
+    path = tmp_path / "team.toml"
+    path.write_text(f'name = "t"\n{text}')
+    found = {name: robot.camera.frames for name, robot in load_team(path).robots.items()}
+    beside = {"film": str(tmp_path / "film.avi"), "shots": str(tmp_path / "../shots")}
+    assert found == {**frames, **beside}
+
+
+def test_simulated_frames_are_the_fields() -> None:
+    with pytest.raises(TeamFileError, match=r"robots\.r1\.camera\.frames: .*; remove the key"):
+        team(f'{ROBOT}sensing = "camera"\ncamera = {{ frames = "0" }}')

@@ -33,24 +33,37 @@ class Box(NamedTuple):
         apart_x = self.right <= other.left or other.right <= self.left
         return not (apart_x or self.bottom <= other.top or other.bottom <= self.top)
 
-    def moved(self, down: int) -> "Box":
-        return self._replace(top=self.top + down, bottom=self.bottom + down)
+
+class Label(NamedTuple):
+    """What is written about something in a frame, and where."""
+
+    lines: tuple[str, ...]
+    colour: Colour
+    box: Box
 
 
 def annotated(pixels: Pixels, glimpses: Glimpses) -> Pixels:
     """A copy of a frame (height, width, 3) with outlines and labels."""
-    drawn = pixels.copy()
-    scale = max(1.0, pixels.shape[1] / PLAIN_WIDTH_PX)
-    marks = [(f.outline, labelled(f.sighting), FOUND) for f in glimpses.found]
-    marks += [(d.outline, doubted(d), DOUBTED) for d in glimpses.doubts]
-    for outline, _, colour in marks:
-        _outline(drawn, outline, colour, scale)
-    taken: list[Box] = []
-    for outline, lines, colour in marks:
-        box = _place(drawn, outline, lines, taken, scale)
-        taken.append(box)
-        _write(drawn, lines, box, colour, scale)
+    drawn, scale = pixels.copy(), _scale(pixels.shape[1])
+    for found in glimpses.found:
+        _outline(drawn, found.outline, FOUND, scale)
+    for doubt in glimpses.doubts:
+        _outline(drawn, doubt.outline, DOUBTED, scale)
+    for label in labels(glimpses, (pixels.shape[1], pixels.shape[0])):
+        _write(drawn, label, scale)
     return drawn
+
+
+def labels(glimpses: Glimpses, size_px: tuple[int, int]) -> list[Label]:
+    """Beside what they are about, inside of a frame of this size (width, height), apart from each
+    other as long as there is room."""
+    said = [(f.outline, labelled(f.sighting), FOUND) for f in glimpses.found]
+    said += [(d.outline, doubted(d), DOUBTED) for d in glimpses.doubts]
+    placed: list[Label] = []
+    for outline, lines, colour in said:
+        box = _place(size_px, outline, lines, [label.box for label in placed])
+        placed.append(Label(tuple(lines), colour, box))
+    return placed
 
 
 def labelled(sighting: Sighting) -> list[str]:
@@ -95,31 +108,34 @@ def _corners(outline: Floats) -> "np.typing.NDArray[np.int32]":
 
 
 def _place(
-    drawn: Pixels, outline: Floats, lines: Sequence[str], taken: Sequence[Box], scale: float
+    size_px: tuple[int, int], outline: Floats, lines: Sequence[str], taken: Sequence[Box]
 ) -> Box:
-    """Where a label goes: right of its outline or left of it, inside of the frame, below others."""
-    height, width = drawn.shape[:2]
+    """Right of its outline or left of it, as high as it, or as near to that as there is room."""
+    (width, height), scale = size_px, _scale(size_px[0])
     sizes = [cv2.getTextSize(text, FONT, TEXT_SCALE * scale, 1)[0][0] for text in lines]
     wide, high = max(sizes) + round(6 * scale), round((LINE_PX * len(lines) + 4) * scale)
     corners = _corners(outline)
     least, most = (corners.min(axis=0), corners.max(axis=0)) if len(corners) else ((0, 0), (0, 0))
-    gap = round(4 * scale)
-    left = int(most[0]) + gap
-    if left + wide > width:
-        left = int(least[0]) - gap - wide
-    left = min(max(left, 0), max(width - wide, 0))
+    gap, last = round(4 * scale), max(width - wide, 0)
+    beside = int(most[0]) + gap, int(least[0]) - gap - wide
+    lefts = [left for left in beside if 0 <= left <= last] or [min(max(beside[1], 0), last)]
     top = min(max(int(least[1]), 0), max(height - high, 0))
-    box = Box(left, top, left + wide, top + high)
-    places = [box.moved(step) for step in range(0, height - box.bottom + 1, LINE_PX)]
-    places += [box.moved(-step) for step in range(LINE_PX, box.top + 1, LINE_PX)]
-    free = (p for p in places if not any(p.meets(other) for other in taken))
-    return next(free, box)
+    tops = sorted({top, *range(0, height - high + 1, LINE_PX)}, key=lambda y: abs(y - top))
+    places = [Box(left, y, left + wide, y + high) for y in tops for left in lefts]
+    free = (place for place in places if not any(place.meets(other) for other in taken))
+    return next(free, places[0])
 
 
-def _write(drawn: Pixels, lines: Sequence[str], box: Box, colour: Colour, scale: float) -> None:
+def _write(drawn: Pixels, label: Label, scale: float) -> None:
     """On dark paper, so that it can be read on anything."""
-    part = drawn[max(box.top, 0) : box.bottom, max(box.left, 0) : box.right]
+    box = label.box
+    part = drawn[box.top : box.bottom, box.left : box.right]
     part[:] = part // 4 + np.array(PAPER, np.uint8) // 2
-    for n, text in enumerate(lines, start=1):
+    for n, text in enumerate(label.lines, start=1):
         at = box.left + round(3 * scale), box.top + round((LINE_PX * n - BASELINE_PX + 2) * scale)
-        cv2.putText(drawn, text, at, FONT, TEXT_SCALE * scale, colour, 1, cv2.LINE_AA)
+        cv2.putText(drawn, text, at, FONT, TEXT_SCALE * scale, label.colour, 1, cv2.LINE_AA)
+
+
+def _scale(width_px: int) -> float:
+    """Of text and lines in a picture of this width."""
+    return max(1.0, width_px / PLAIN_WIDTH_PX)

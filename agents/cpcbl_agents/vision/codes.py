@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from cpcbl_agents.vision.camera import Floats, Pixels
 from cpcbl_agents.vision.edges import sampled
@@ -25,7 +26,7 @@ LEAST_CONTRAST = 12.0  # grey levels between a marker's black and its margin's w
 WRONG_SHARE = 0.25  # of the bits that a family could set right: a wrong name is worse than none
 
 _CORNERS = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], np.float32)
-_WITHIN = np.array([[x, y] for y in (-0.2, 0.0, 0.2) for x in (-0.2, 0.0, 0.2)])
+_WITHIN = np.array([[x, y] for y in (-0.15, 0.15) for x in (-0.15, 0.15)])
 
 
 class Code(NamedTuple):
@@ -48,27 +49,25 @@ class Codes:
         plain = [np.where(one[1:-1, 1:-1] > 0, 1, -1) for one in shown]
         self._signs = np.array([np.rot90(one, turn).ravel() for one in plain for turn in range(4)])
         self._most_wrong = int(WRONG_SHARE * self.dictionary.maxCorrectionBits)
-        self._places = _places(self.cells)
+        self._places, self._rings = _places(self.cells), _rings(self.cells)
 
     def read(self, grey: Pixels, quads: Floats) -> dict[int, Code]:
         """What the quads (m, 4, 2) show, clockwise in the picture: by index, of those that are
         markers."""
+        if not len(quads):
+            return {}
         places = np.stack([_laid(self._places, quad) for quad in quads])
         levels = sampled(grey, places).reshape(len(quads), -1, len(_WITHIN)).mean(axis=2)
-        size = self.cells + 2
-        codes = {i: self._one(one.reshape(size, size)) for i, one in enumerate(levels)}
-        return {i: code for i, code in codes.items() if code is not None}
-
-    def _one(self, levels: Floats) -> Code | None:
-        """The code in the levels of a marker's cells and the ring around it."""
-        margin, border, bits = _ring(levels), _ring(levels[1:-1, 1:-1]), levels[2:-2, 2:-2]
-        white, black = float(np.median(margin)), float(np.median(border))
+        margins, borders = levels[:, self._rings == 0], levels[:, self._rings == 1]
+        white, black = margins.mean(axis=1), borders.mean(axis=1)
         middle = 0.5 * (white + black)
-        if white - black < LEAST_CONTRAST or border.max() > middle or margin.min() < middle:
-            return None
-        wrong = (bits.size - self._signs @ np.where(bits > middle, 1, -1).ravel()) // 2
-        best = int(wrong.argmin())
-        return Code(best // 4, -best % 4) if wrong[best] <= self._most_wrong else None
+        framed = (borders.max(axis=1) < middle) & (middle < margins.min(axis=1))
+        framed &= white - black > LEAST_CONTRAST
+        bits = np.where(levels[:, self._rings > 1] > middle[:, None], 1, -1)
+        wrong = (self._bits**2 - bits @ self._signs.T) // 2
+        best = wrong.argmin(axis=1)
+        read = framed & (wrong.min(axis=1) <= self._most_wrong)
+        return {int(i): Code(int(best[i]) // 4, -int(best[i]) % 4) for i in read.nonzero()[0]}
 
 
 def _places(cells: int) -> Floats:
@@ -86,5 +85,8 @@ def _laid(places: Floats, quad: Floats) -> Floats:
     return seen
 
 
-def _ring(levels: Floats) -> Floats:
-    return np.concatenate([levels[0], levels[-1], levels[1:-1, 0], levels[1:-1, -1]])
+def _rings(cells: int) -> NDArray[np.int64]:
+    """Of each cell, of the ring around the marker too, how far it is from the outside."""
+    along = np.arange(cells + 2)
+    from_side = np.minimum(along, along[::-1])
+    return np.minimum(from_side[:, None], from_side).ravel()

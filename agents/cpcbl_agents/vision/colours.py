@@ -11,8 +11,10 @@ from cpcbl_agents.vision.panorama import Panorama
 from cpcbl_team.config import Colour
 
 BITS = 8  # colours that are told apart in one go
-MOST_BLOBS = 30  # of a colour; the largest
+MOST_BLOBS = 16  # of a colour; the largest
 LEAST_PX = 2  # high and wide
+LEAST_SHARE = 0.3  # of a patch: light and shade take some beyond the thresholds
+MOST_OTHERS = 0.3  # of other colours, as a share of its own
 STRAY = 0.04  # share of an outline that may stick out
 
 
@@ -45,12 +47,26 @@ class Colours:
         self._groups = [(group, _table([colours[name] for name in group])) for group in groups]
 
     def blobs(self, pixels: Pixels, panorama: Panorama) -> list[Blob]:
+        """Of a frame (height, width, 3), BGR."""
         hsv = cv2.cvtColor(pixels, cv2.COLOR_BGR2HSV)
         return [
             _blob(name, outline, panorama)
             for names, table in self._groups
-            for name, outline in _outlines(hsv, names, table)
+            for name, outline in _outlines(_bits(hsv, table), names)
         ]
+
+    def clear(self, pixels: Pixels, colour: str) -> bool:
+        """Whether a patch (height, width, 3), BGR, is of this colour and of no other."""
+        hsv = cv2.cvtColor(pixels, cv2.COLOR_BGR2HSV)
+        own = others = 0
+        for names, table in self._groups:
+            bits = _bits(hsv, table)
+            if colour in names:
+                of_colour = bits & np.uint8(1 << names.index(colour))
+                own = cv2.countNonZero(of_colour)
+                bits = bits ^ of_colour
+            others += cv2.countNonZero(bits)
+        return own > LEAST_SHARE * hsv.shape[0] * hsv.shape[1] and others <= MOST_OTHERS * own
 
 
 def _table(colours: Sequence[Colour]) -> Pixels:
@@ -66,12 +82,15 @@ def _table(colours: Sequence[Colour]) -> Pixels:
     return table
 
 
-def _outlines(
-    hsv: cv2.typing.MatLike, names: Sequence[str], table: Pixels
-) -> Iterator[tuple[str, cv2.typing.MatLike]]:
-    """The outer contours of each colour's blobs, the largest of them."""
+def _bits(hsv: cv2.typing.MatLike, table: Pixels) -> Pixels:
+    """The colours that each pixel is of."""
     hue, saturation, value = cv2.split(cv2.LUT(hsv, table))
-    bits = cv2.bitwise_and(cv2.bitwise_and(hue, saturation), value)
+    both = cv2.bitwise_and(hue, saturation)
+    return cv2.bitwise_and(both, value).astype(np.uint8, copy=False)
+
+
+def _outlines(bits: Pixels, names: Sequence[str]) -> Iterator[tuple[str, cv2.typing.MatLike]]:
+    """The outer contours of each colour's blobs, the largest of them."""
     left, top, width, height = cv2.boundingRect(bits)
     if not width:
         return

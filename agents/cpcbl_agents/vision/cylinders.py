@@ -6,17 +6,17 @@ same colours and what is partly hidden are not mistaken for it.
 """
 
 import math
-from collections import Counter
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 from cpcbl_agents.vision.camera import Camera, Pixels
 from cpcbl_agents.vision.colours import Blob, Colours
 from cpcbl_agents.vision.glimpses import Doubt, Found, Glimpses
-from cpcbl_agents.vision.outlines import Candidate, Outline, candidates, outlined
-from cpcbl_agents.vision.panorama import Panorama
+from cpcbl_agents.vision.outlines import Candidate, Outline, Patch, candidates, outlined, patch_of
+from cpcbl_agents.vision.panorama import panorama_of
 from cpcbl_agents.vision.silhouette import FOOT, TOP, WIDTH, Shape
-from cpcbl_agents.vision.verdicts import WHOLE, Look, Verdict, best, reason, verdict
+from cpcbl_agents.vision.twins import without_twins
+from cpcbl_agents.vision.verdicts import Look, Verdict, best, reason, verdict
 from cpcbl_team.config import Bands, Team
 from cpcbl_team.geometry import wrap_angle
 from cpcbl_team.inputs import Sighting
@@ -24,6 +24,7 @@ from cpcbl_team.inputs import Sighting
 LEAST_PX = 6.0  # high, both bands
 LEAST_BAND_PX = 6.0  # high and wide: what a single band must be to be worth a doubt
 RIVAL = 3.0  # what fits so much worse is still possible
+UNSURE = 4.0  # how much worse an edge is known beyond which the colour goes on
 REASONS = "cut_by_frame", "mirror_image", "ranges_disagree", "wrong_shape"  # the most telling first
 
 
@@ -42,7 +43,7 @@ class Cylinders:
         self._kinds = kinds(robot, team, camera.settings.mounted_m)
         used = {colour for bands in self._kinds for colour in bands}
         self._colours = Colours(team.vision.colours, used)
-        self._panorama = Panorama(camera)
+        self._panorama = panorama_of(camera.settings)
 
     def glimpses(self, pixels: Pixels) -> Glimpses:
         """All known cylinders in a frame (height, width, 3), BGR, of the camera's size."""
@@ -63,7 +64,7 @@ class Cylinders:
         names = _names(kinds)
         if pair.height < LEAST_PX:
             return Doubt("too_small", names, pair.outline)
-        looks = [self._look(outline) for outline in outlined(pixels, self._panorama, pair)]
+        looks = self._looks(pixels, pair)
         judged = {kind: best(verdict(kind.shape, look) for look in looks) for kind in kinds}
         sure = [one for one in judged.values() if one is not None]
         if not sure:
@@ -77,13 +78,14 @@ class Cylinders:
         )
         if len(names) > 1:
             return Doubt("ambiguous", names, pair.outline)
-        return Found(self._sighting(names[0], sure[0]), pair.outline)
+        (one,) = sure
+        return Found(self._sighting(names[0], one), one.look.outline)
 
     def _stranger(self, pixels: Pixels, pair: Candidate) -> Doubt:
         """A pair that nothing known has: perhaps the mirror image of something."""
         upside_down = self._kinds.get((pair.lower.colour, pair.upper.colour), ())
         if upside_down and pair.height >= LEAST_PX:
-            looks = [self._look(outline) for outline in outlined(pixels, self._panorama, pair)]
+            looks = self._looks(pixels, pair)
             if self._reason(upside_down, looks) == "mirror_image":
                 return Doubt("mirror_image", _names(upside_down), pair.outline)
         return Doubt("unknown_pair", (), pair.outline)
@@ -96,33 +98,38 @@ class Cylinders:
                 kinds = (k for bands, ks in self._kinds.items() if blob.colour in bands for k in ks)
                 yield Doubt("one_band_only", _names(tuple(kinds)), blob.outline)
 
+    def _looks(self, pixels: Pixels, pair: Candidate) -> list[Look]:
+        patch = patch_of(pixels, self._panorama, pair)
+        if patch is None:
+            return []
+        outlines = outlined(patch, self._panorama, pair)
+        return [self._look(outline) for outline in outlines if self._clear(patch, pair, outline)]
+
+    def _clear(self, patch: Patch, pair: Candidate, o: Outline) -> bool:
+        """Whether both bands are of their colours throughout, and of no other."""
+        upper = patch.inside(o.left + 1.0, o.right - 1.0, o.top + 1.0, o.mid - 1.0)
+        lower = patch.inside(o.left + 1.0, o.right - 1.0, o.mid + 1.0, o.foot - 1.0)
+        clear = self._colours.clear
+        return clear(upper, pair.upper.colour) and clear(lower, pair.lower.colour)
+
     def _look(self, o: Outline) -> Look:
         """The outline as angles."""
-        panorama, edge_px = self._panorama, self._settings.edge_sigma_px
-        middle = 0.5 * (o.left + o.right)
-        rows, sides = (o.top, o.mid, o.foot), (o.left, o.right)
-        left, right = (edge_px * panorama.step / panorama.scale(x, o.mid).across_px for x in sides)
-        top, mid, foot = (
-            edge_px * panorama.step / panorama.scale(middle, o.mid if math.isnan(y) else y).along_px
-            for y in rows
-        )
-        hidden = {
-            TOP: "top" in o.cut or math.isnan(o.top),
-            FOOT: "foot" in o.cut or math.isnan(o.foot),
-            WIDTH: "left" in o.cut or "right" in o.cut,
-        }
+        panorama = self._panorama
+        edge_sigma = self._settings.edge_sigma_px * panorama.step
+        middle, rows = 0.5 * (o.left + o.right), (o.top, o.mid, o.foot)
+        left, right = (edge_sigma / panorama.scale(x, o.mid).across_px for x in (o.left, o.right))
+        top, mid, foot = (edge_sigma / panorama.scale(middle, y).along_px for y in rows)
+        top *= UNSURE if TOP in o.unsure else 1.0
+        foot *= UNSURE if FOOT in o.unsure else 1.0
+        half_width = 0.5 * (o.right - o.left) * panorama.step
         return Look(
             panorama.azimuth(middle),
-            (
-                panorama.slope(o.top),
-                panorama.slope(o.mid),
-                panorama.slope(o.foot),
-                0.5 * (o.right - o.left) * panorama.step,
-            ),
+            (panorama.slope(o.top), panorama.slope(o.mid), panorama.slope(o.foot), half_width),
             (top, mid, foot, 0.5 * math.hypot(left, right)),
             math.radians(self._settings.tilt_sigma_deg),
-            frozenset(i for i in WHOLE if not hidden.get(i)),
-            bool(o.cut),
+            panorama.corners(o.left, o.top, o.right, o.foot),
+            o.hidden,
+            o.cut,
         )
 
     def _reason(self, kinds: Sequence[Kind], looks: Sequence[Look]) -> str:
@@ -168,18 +175,6 @@ def kinds(robot: str, team: Team, lens_m: float) -> dict[Bands, tuple[Kind, ...]
         bands: tuple(Kind(tuple(names), shape) for shape, names in shapes.items())
         for bands, shapes in groups.items()
     }
-
-
-def without_twins(glimpses: Glimpses) -> Glimpses:
-    """The same, but what is seen at several places is at none of them for sure."""
-    times = Counter(found.sighting.id for found in glimpses.found)
-    kept = tuple(found for found in glimpses.found if times[found.sighting.id] == 1)
-    twins = tuple(
-        Doubt("seen_twice", (found.sighting.id,), found.outline)
-        for found in glimpses.found
-        if times[found.sighting.id] > 1
-    )
-    return Glimpses(kept, glimpses.doubts + twins)
 
 
 class Polar(NamedTuple):

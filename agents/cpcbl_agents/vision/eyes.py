@@ -10,7 +10,7 @@ from cpcbl_agents.vision.camera import Camera, Pixels
 from cpcbl_agents.vision.cylinders import Cylinders
 from cpcbl_agents.vision.glimpses import Glimpses
 from cpcbl_agents.vision.markers import Markers
-from cpcbl_agents.vision.pictures import decoded, encoded, fault
+from cpcbl_agents.vision.pictures import encoded, fault, received
 from cpcbl_team.config import Team
 from cpcbl_team.inputs import Sightings
 from cpcbl_transport.messages import Frame, Look, Unclear
@@ -50,7 +50,7 @@ class CameraEyes:
     def _pixels(self, frame: Frame | Picture) -> Pixels | str:
         if isinstance(frame, Picture):
             return frame.pixels
-        return decoded(frame.image, self.camera.size_px)
+        return received(frame.image, self.camera.size_px)
 
     def glimpses(self, pixels: Pixels) -> Glimpses | str:
         """Everything in a picture (height, width, 3), BGR; or why it cannot be used."""

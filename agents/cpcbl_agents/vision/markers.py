@@ -19,6 +19,7 @@ from cpcbl_team.inputs import Sighting
 WINDOW_PX = 7  # of the adaptive threshold; one is enough, as what is found is refined
 LEAST_SIDE_PX = 6.0
 PASSES = 2  # until corners are exact enough to read between them
+FAR_PX = 8.0  # a corner that moves by so much in a pass is none
 MOST_MISFIT = 5.0  # mean squared error in sigmas, of a marker that stands where it should
 CLEAR_RAD = math.radians(10.0)
 """A heading that is known worse than that is left out."""
@@ -72,10 +73,11 @@ class Markers:
         right, _, wrong = self._detector.detectMarkers(grey)
         quads = np.array([*right, *wrong], dtype=np.float64).reshape(-1, 4, 2)
         quads = quads[_least_sides(quads) > LEAST_SIDE_PX]
-        if not len(quads):
-            return []
         for _ in range(PASSES):
-            quads = corners(steps(grey, quads, self._codes.cells))
+            better = corners(steps(grey, quads, self._codes.cells))
+            near = np.abs(better - quads).max(axis=(1, 2), initial=0.0) < FAR_PX
+            quads = better[near]
+            quads = quads[_least_sides(quads) > LEAST_SIDE_PX]
         codes = self._codes.read(grey, quads)
         if not codes:
             return []
@@ -83,12 +85,23 @@ class Markers:
         sides = steps(grey, rough, self._codes.cells)
         exact = corners(sides)
         plane = corners(self._camera.undistorted(sides.reshape(-1, 2)).reshape(sides.shape))
-        marks = [
-            Mark(code.id, np.roll(quad, -code.first, axis=0), np.roll(flat, -code.first, axis=0))
-            for code, quad, flat in zip(codes.values(), exact, plane, strict=True)
-        ]
+        marks = []
+        for code, quad, flat in zip(codes.values(), exact, plane, strict=True):
+            first = code.first + self._upside_down(np.roll(flat, -code.first, axis=0))
+            marks.append(
+                Mark(code.id, *(np.roll(points, -first, axis=0) for points in (quad, flat)))
+            )
         moved = np.abs(exact - rough).max(axis=(1, 2))
-        return [marks[i] for i in moved.argsort()]
+        return [marks[i] for i in moved.argsort() if moved[i] < FAR_PX]
+
+    def _upside_down(self, plane: Floats) -> int:
+        """By how many corners a marker has to be turned to stand upright: 2, or 0.
+
+        Before version 5, OpenCV's AprilTags are upside down beside those of the AprilTag library
+        (opencv/opencv#28823); robots are not.
+        """
+        heights = np.column_stack([plane, np.ones(4)]) @ self._camera.robot_from_camera[2]
+        return 2 if heights[:2].sum() < heights[2:].sum() else 0
 
     def _placed(self, name: str, sides: Mapping[Side, Mark]) -> Glimpses:
         """A teammate by the markers that are seen of it."""
@@ -175,7 +188,7 @@ def _parameters() -> cv2.aruco.DetectorParameters:
 
 
 def _least_sides(quads: Floats) -> Floats:
-    least: Floats = np.linalg.norm(np.roll(quads, -1, axis=1) - quads, axis=2).min(axis=1)
+    least: Floats = np.linalg.norm(quads[:, [1, 2, 3, 0]] - quads, axis=2).min(axis=1)
     return least
 
 

@@ -3,7 +3,7 @@ pixel."""
 
 import itertools
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import cv2
@@ -13,13 +13,15 @@ from cpcbl_agents.vision.camera import Floats, Pixels
 from cpcbl_agents.vision.colours import Blob
 from cpcbl_agents.vision.panorama import Panorama
 from cpcbl_agents.vision.profiles import Profile
+from cpcbl_agents.vision.silhouette import FOOT, TOP, WIDTH
 from cpcbl_team.config import Bands
 
+MOST_CANDIDATES = 32
 GAP_PX, GAP_SHARE = 2.5, 0.15  # between the bands, of the lower height
-OVERLAP_SHARE = 0.7  # with something of its colour beside it, a blob goes farther up or down
+OVERLAP_SHARE = 1.0  # with something of its colour beside it, a blob goes farther up or down
 LEAST_OVERLAP = 0.5  # of the narrower band
 SLACK_PX = 2.0
-WIDER, HIGHER = 2.0, 4.0  # one band than the other, at most
+WIDER, HIGHER = 3.0, 4.0  # one band than the other, at most
 UNEVEN = 1.4  # then the end of the higher band is looked for where the other band says it is
 BORDER_PX = 1.5  # an edge so near to the frame's border is cut
 REST_PX = 7.0  # around the farthest edge
@@ -52,25 +54,55 @@ class Candidate(NamedTuple):
 
 
 class Outline(NamedTuple):
-    """Columns and rows of the panorama; NaN for a top or foot that is not found. `cut`: which of
-    "left", "right", "top", "foot" is the frame's border.
-    """
+    """Columns and rows of the panorama. `hidden`: which of `TOP`, `FOOT`, `WIDTH` are not where an
+    edge of it is, but where the frame ends (`cut`) or its colour does; `unsure`: at which of them
+    its colour goes on beyond the edge, as in its reflection."""
 
     left: float
     right: float
     top: float
     mid: float
     foot: float
-    cut: frozenset[str]
+    hidden: frozenset[int] = frozenset()
+    cut: bool = False
+    unsure: frozenset[int] = frozenset()
+
+
+class Patch(NamedTuple):
+    """A part of the panorama, (rows, columns, 3), and where it begins."""
+
+    pixels: Pixels
+    left: int
+    top: int
+
+    def inside(self, left: float, right: float, top: float, bottom: float) -> Pixels:
+        """What is between these columns and rows; a pixel at least."""
+        rows, columns = self.pixels.shape[:2]
+        return self.pixels[
+            _from_to(top - self.top, bottom - self.top, rows),
+            _from_to(left - self.left, right - self.left, columns),
+        ]
+
+    def down(self, left: float, right: float) -> Profile:
+        """The mean of the columns between these, row by row."""
+        part = self.pixels[:, _from_to(left - self.left, right - self.left, self.pixels.shape[1])]
+        return Profile(_mean(part, 1), self.top)
+
+    def across(self, top: float, bottom: float) -> Profile:
+        """The mean of the rows between these, column by column."""
+        part = self.pixels[_from_to(top - self.top, bottom - self.top, self.pixels.shape[0])]
+        return Profile(_mean(part, 0), self.left)
 
 
 def candidates(blobs: Sequence[Blob]) -> list[Candidate]:
-    """All pairs of touching blobs of two colours that might be the bands of a cylinder."""
-    return [
+    """The pairs of touching blobs of two colours that might be the bands of a cylinder; of very
+    many the highest, so that no picture takes for ever."""
+    pairs = [
         Candidate(upper, lower)
         for upper, lower in itertools.permutations(blobs, 2)
         if upper.colour != lower.colour and _stacked(upper, lower)
     ]
+    return sorted(pairs, key=lambda pair: -pair.height)[:MOST_CANDIDATES]
 
 
 def _stacked(upper: Blob, lower: Blob) -> bool:
@@ -87,47 +119,63 @@ def _stacked(upper: Blob, lower: Blob) -> bool:
     )
 
 
-def outlined(pixels: Pixels, panorama: Panorama, candidate: Candidate) -> list[Outline]:
-    """What the outline of a candidate may be; empty if it has no sides, or no line between its
-    bands. If its bands do not end one above the other, each of them may be the one that is whole.
-    """
+def patch_of(pixels: Pixels, panorama: Panorama, candidate: Candidate) -> Patch | None:
+    """The panorama about a candidate; None if there is next to nothing."""
     upper, lower = candidate
-    mid = 0.5 * (upper.bottom + lower.top)
-    left, right = 0.5 * (upper.left + lower.left), 0.5 * (upper.right + lower.right)
+    left, right = min(upper.left, lower.left), max(upper.right, lower.right)
     margin = _reach(right - left) + REST_PX
     box = panorama.clipped(left - margin, upper.top - margin, right + margin, lower.bottom + margin)
-    patch = panorama.cut(pixels, box)
-    if min(patch.shape[:2]) < LEAST_PATCH_PX:
-        return []
-    middle, quarter = 0.5 * (left + right) - box.left, 0.25 * (right - left)
-    rows = Profile(_mean(patch, middle - quarter, middle + quarter, axis=1), box.top)
-    mid = _edge(rows, mid, 0.5 * min(upper.height, lower.height))
-    if math.isnan(mid):
+    if box.right - box.left < LEAST_PATCH_PX or box.bottom - box.top < LEAST_PATCH_PX:
+        return None
+    return Patch(panorama.cut(pixels, box), box.left, box.top)
+
+
+def outlined(patch: Patch, panorama: Panorama, candidate: Candidate) -> list[Outline]:
+    """What the outline of a candidate may be; empty if there is no line between its bands.
+
+    A blob may go on in something of its colour beside or behind it: where the sides of the two
+    bands are not one above the other, either may be the true one.
+    """
+    upper, lower = candidate
+    left, right = max(upper.left, lower.left), min(upper.right, lower.right)
+    middle, quarter = 0.5 * (left + right), 0.25 * (right - left)
+    rows = patch.down(middle - quarter, middle + quarter)
+    mid = _mid(rows, upper, lower)
+    if not upper.top < mid < lower.bottom:  # NaN too
         return []
     top, foot = _ends(rows, upper.top, mid, lower.bottom)
-    sides = []
-    for start, end in ((upper.top, mid), (mid, lower.bottom)):
-        inset = INSET * (end - start)
-        part = _mean(patch, start + inset - box.top, end - inset - box.top, axis=0)
-        columns = Profile(part, box.left)
-        sides.append((_edge(columns, left, right - left), _edge(columns, right, right - left)))
-    found = (
-        Outline(left, right, top, mid, foot, frozenset())
-        for left, right in _choices(sides[0], sides[1])
-        if right - left >= LEAST_WIDTH
+    inset = INSET * min(mid - upper.top, lower.bottom - mid)
+    lost: frozenset[int] = frozenset()
+    found = _choices(
+        _sides(patch.across(upper.top + inset, mid - inset), upper),
+        _sides(patch.across(mid + inset, lower.bottom - inset), lower),
     )
-    return [outline._replace(cut=frozenset(_cut(panorama, outline))) for outline in found]
+    if not found:
+        lost, found = lost | {WIDTH}, [(min(upper.left, lower.left), max(upper.right, lower.right))]
+    if math.isnan(top):
+        lost, top = lost | {TOP}, upper.top
+    if math.isnan(foot):
+        lost, foot = lost | {FOOT}, lower.bottom
+    beyond = GAP_PX + GAP_SHARE * min(mid - top, foot - mid)
+    goes_on = {TOP: top - upper.top > beyond, FOOT: lower.bottom - foot > beyond}
+    unsure = frozenset(i for i, so in goes_on.items() if so)
+    outlines = (Outline(left, right, top, mid, foot, lost, unsure=unsure) for left, right in found)
+    return [_with_cuts(panorama, outline) for outline in outlines]
 
 
 Sides = tuple[float, float]
 
 
-def _choices(upper: Sides, lower: Sides) -> Sequence[Sides]:
-    """The sides of both bands: their mean, if they are one above the other; else either's."""
-    apart = (abs(a - b) for a, b in zip(upper, lower, strict=True))
-    if all(px <= APART_PX for px in apart):
+def _sides(columns: Profile, band: Blob) -> Sides:
+    return _edge(columns, band.left, band.width), _edge(columns, band.right, band.width)
+
+
+def _choices(upper: Sides, lower: Sides) -> list[Sides]:
+    """The mean sides of both bands if they are one above the other; else all there may be."""
+    if all(abs(a - b) <= APART_PX for a, b in zip(upper, lower, strict=True)):
         return [(0.5 * (upper[0] + lower[0]), 0.5 * (upper[1] + lower[1]))]
-    return upper, lower
+    pairs = itertools.product((upper[0], lower[0]), (upper[1], lower[1]))
+    return [(left, right) for left, right in pairs if right - left >= LEAST_WIDTH]
 
 
 def _edge(line: Profile, guess: float, size: float) -> float:
@@ -135,50 +183,61 @@ def _edge(line: Profile, guess: float, size: float) -> float:
     return line.edge(guess, 0.45 * size, _reach(size))
 
 
+def _mid(rows: Profile, upper: Blob, lower: Blob) -> float:
+    """The line between the bands: where they meet, or where either ends; NaN if there is none."""
+    size = 0.5 * min(upper.height, lower.height)
+    guesses = lower.top, upper.bottom
+    if abs(lower.top - upper.bottom) <= GAP_PX:
+        guesses = 0.5 * (lower.top + upper.bottom), lower.top
+    found = _edge(rows, guesses[0], size)
+    return _edge(rows, guesses[1], size) if math.isnan(found) else found
+
+
 def _ends(rows: Profile, top: float, mid: float, foot: float) -> tuple[float, float]:
     """Top and foot. A band that is much higher than the other may go on in something of the same
     colour, such as its own reflection: its end is first looked for where it ought to be."""
     above, below = mid - top, foot - mid
+    tops, feet = (top, mid - below), (foot, mid + above)
     if above > UNEVEN * below + SLACK_PX:
-        nearer = _edge(rows, mid - below, below)
-        top = _edge(rows, top, above) if math.isnan(nearer) else nearer
-        return top, _edge(rows, foot, below)
+        tops = tops[::-1]
     if below > UNEVEN * above + SLACK_PX:
-        nearer = _edge(rows, mid + above, above)
-        foot = _edge(rows, foot, below) if math.isnan(nearer) else nearer
-        return _edge(rows, top, above), foot
-    return _edge(rows, top, above), _edge(rows, foot, below)
+        feet = feet[::-1]
+    size = min(above, below)
+    first, second = (
+        next((found for guess in guesses if (found := _edge(rows, guess, size)) == found), math.nan)
+        for guesses in (tops, feet)
+    )
+    return first, second
 
 
-def _cut(panorama: Panorama, outline: "Outline") -> Iterator[str]:
-    """Which edges are the frame's border, or beyond it."""
-    left, right, top, mid, foot = outline[:5]
-    middle = 0.5 * (left + right)
+def _with_cuts(panorama: Panorama, outline: Outline) -> Outline:
+    """With those edges that are the frame's border, or beyond it."""
+    left, right, top, mid, foot, hidden, *_ = outline
+    middle, rows = 0.5 * (left + right), (0.5 * (top + mid), 0.5 * (mid + foot))
     places = {
-        "left": ((left, 0.5 * (top + mid)), (left, 0.5 * (mid + foot))),
-        "right": ((right, 0.5 * (top + mid)), (right, 0.5 * (mid + foot))),
-        "top": ((middle, top),),
-        "foot": ((middle, foot),),
+        TOP: [(middle, top)],
+        FOOT: [(middle, foot)],
+        WIDTH: [(column, row) for column in (left, right) for row in rows],
     }
-    for name, points in places.items():
-        if any(panorama.at_border(column, row, BORDER_PX) for column, row in points):
-            yield name
+    cut = {
+        what
+        for what, points in places.items()
+        if any(panorama.at_border(column, row, BORDER_PX) for column, row in points)
+    }
+    return outline._replace(hidden=hidden | cut, cut=bool(cut))
 
 
 def _reach(size: float) -> float:
     """How far the edge of something so large may be from where its colour ends."""
-    return _between(0.25 * size, 2.5, 8.0)
+    return min(max(0.25 * size, 2.5), 8.0)
 
 
-def _mean(patch: Pixels, start: float, end: float, axis: int) -> Floats:
-    """The mean colours (n, 3) of the rows (axis 0) or columns (axis 1) from start to end."""
-    size = patch.shape[axis]
-    first = int(_between(math.ceil(start), 0, size - 1))
-    last = int(_between(math.floor(end), first, size - 1)) + 1
-    part = patch[first:last] if axis == 0 else patch[:, first:last]
-    mean = cv2.reduce(part, axis, cv2.REDUCE_AVG, dtype=cv2.CV_64F)
+def _from_to(start: float, end: float, size: int) -> slice:
+    """The whole numbers between two places, one at least, of those below `size`."""
+    first = min(max(math.ceil(start), 0), size - 1)
+    return slice(first, min(max(math.floor(end), first), size - 1) + 1)
+
+
+def _mean(pixels: Pixels, axis: int) -> Floats:
+    mean = cv2.reduce(pixels, axis, cv2.REDUCE_AVG, dtype=cv2.CV_64F)
     return mean.reshape(-1, 3).astype(np.float64, copy=False)
-
-
-def _between(value: float, least: float, most: float) -> float:
-    return min(max(value, least), most)

@@ -5,6 +5,7 @@ distance d from the lens is the row (lens - z) / d. So edges can be averaged alo
 """
 
 import math
+from functools import lru_cache
 from typing import NamedTuple
 
 import cv2
@@ -12,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cpcbl_agents.vision.camera import Camera, Floats, Pixels
+from cpcbl_team.config import CameraSettings
 
 STEEPEST = 4.0  # slopes: what is farther below or above than this is not unrolled
 WIDEST_RAD = math.radians(85.0)  # to each side of the camera's yaw
@@ -91,6 +93,16 @@ class Panorama:
             min(rows, math.ceil(bottom) + 1),
         )
 
+    def corners(self, left: float, top: float, right: float, bottom: float) -> Floats:
+        """The pixels (4, 2) of a box of the panorama, as far as they are in the frame."""
+        columns, rows = self.size
+        places = ((left, top), (right, top), (right, bottom), (left, bottom))
+        i = [min(max(round(row), 0), rows - 1) for _, row in places]
+        j = [min(max(round(column), 0), columns - 1) for column, _ in places]
+        width, height = self._camera.size_px
+        pixels = np.column_stack([self.x[i, j], self.y[i, j]]).astype(np.float64)
+        return pixels.clip(0.0, (width - 1.0, height - 1.0))
+
     def at_border(self, column: float, row: float, margin_px: float) -> bool:
         """Whether a place of the panorama is at the frame's border, or beyond it."""
         columns, rows = self.size
@@ -145,6 +157,12 @@ class Panorama:
         pixels[off > FOLD_PX] = -9.0
         x, y = pixels.astype(np.float32).T.reshape(2, rows, columns)
         return np.ascontiguousarray(x), np.ascontiguousarray(y)
+
+
+@lru_cache(maxsize=4)
+def panorama_of(settings: CameraSettings) -> Panorama:
+    """The panorama of a camera; it takes a while to make, and is the same for all alike."""
+    return Panorama(Camera(settings))
 
 
 def _grid(width: int, height: int) -> Floats:

@@ -1,8 +1,8 @@
 """Pictures as bytes and as pixels, and what is wrong with those that cannot be used.
 
-What a picture says of itself (its header) is judged before it is decoded: a few bytes may claim
+What a frame says of itself (its header) is judged before it is decoded: a few bytes may claim
 gigabytes of pixels, and OpenCV would turn grey, transparent or 16-bit pictures into others that
-look right. A picture that ends too soon is refused by its missing end: some decoders fill it up.
+look right. One that ends too soon is refused by its missing end: some decoders fill it up.
 """
 
 import struct
@@ -35,23 +35,25 @@ class Header(NamedTuple):
     """Of each channel."""
 
 
-def decoded(image: bytes, size_px: tuple[int, int]) -> Pixels | str:
-    """The pixels of a colour JPEG or PNG of this size (width, height), BGR; or why there are none.
+def decoded(image: bytes) -> Pixels | str:
+    """The pixels of a picture of any kind that OpenCV reads, made colour, BGR; or why there are
+    none. For files that a person names; a camera's frames are `received`."""
+    if not image:
+        return "frame_empty"
+    pixels = cv2.imdecode(np.frombuffer(image, np.uint8), cv2.IMREAD_COLOR)
+    return "frame_undecodable" if pixels is None else pixels.astype(np.uint8, copy=False)
 
-    It is never larger in memory than that size.
-    """
+
+def received(image: bytes, size_px: tuple[int, int]) -> Pixels | str:
+    """The pixels of a frame, BGR: a JPEG or PNG in colour, of this size (width, height); or why
+    there are none. No other is decoded, however large it claims to be."""
     if not image:
         return "frame_empty"
     header = header_of(image)
     if header is None:
         return "frame_undecodable"
-    reason = _unfit(header, size_px)
-    if reason:
-        return reason
-    if not _whole(image):
-        return "frame_truncated"
-    pixels = cv2.imdecode(np.frombuffer(image, np.uint8), cv2.IMREAD_COLOR)
-    return "frame_undecodable" if pixels is None else pixels.astype(np.uint8, copy=False)
+    reason = _unfit(header, size_px) or ("" if _whole(image) else "frame_truncated")
+    return reason or decoded(image)
 
 
 def header_of(image: bytes) -> Header | None:

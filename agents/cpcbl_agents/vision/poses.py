@@ -27,11 +27,15 @@ CORNER_SHARE = 0.5
 """A marker's corner is where two lines through many places meet: this much of `edge_sigma_px`."""
 LEAST_TURN = math.radians(15.0)
 STEPS = 12
-SMALL = 1e-5  # m, rad: a step that no longer matters
+SMALL = 1e-3  # squared error (in sigmas): a step that gains less no longer matters
 RIVAL = 12.0
 """By so much more squared error (in sigmas) the other turn is out of the question."""
 LEAST_WEIGHT = 0.1
-"""Of an answer that may be true: so much, and three sigma of both together reach it."""
+"""Of a heading that may be true, relative to the best: so much, and three sigma reach it."""
+NARROW = math.radians(1.5)
+"""Within so much what is seen changes evenly with the heading; beyond, headings are surveyed."""
+HEADINGS = 41
+MOST_SIGMA = math.radians(20.0)
 
 
 class Fit(NamedTuple):
@@ -64,12 +68,19 @@ def fitted(seen: Mapping[Side, Floats], vision: VisionSettings, camera: Camera) 
     """
     shape = np.concatenate([side_corners(side, vision) for side in seen])
     plane = np.concatenate(list(seen.values()))
-    weights = _inverse(_noise(plane, camera.settings))
-    side, corners = next(iter(seen.items()))
-    poses = _starts(side, corners, vision, camera)
-    poses, errors, information = _improved(poses, shape, plane, weights, camera)
-    misfit = float(errors.min()) / (plane.size - 3)
-    return _together(poses, errors, _inverse(information), misfit)
+    view = _View(shape, plane, camera)
+    poses, sums = _improved(_starts(seen, vision, camera), view)
+    errors = sums[:, 3, 3]
+    best, possible = int(errors.argmin()), errors - errors.min() < RIVAL
+    covariances = _inverse(sums[:, :3, :3])
+    sigmas = np.sqrt(covariances[:, 2, 2])
+    mean, covariance = poses[best], covariances[best]
+    if sigmas[best] > NARROW or np.ptp(_unwrapped(poses[possible, 2] - mean[2])) > NARROW:
+        pivot = shape[:4, :2].mean(axis=0)
+        mean, covariance = _surveyed(poses[possible], sigmas[possible], pivot, view)
+    x, y, heading = mean.tolist()
+    misfit = float(errors[best]) / (plane.size - 3)
+    return Fit(Pose2(x, y, wrap_angle(heading)), covariance, misfit)
 
 
 def _inverse(matrices: Floats) -> Floats:
@@ -92,9 +103,10 @@ def _noise(plane: Floats, s: CameraSettings) -> Floats:
     return noise
 
 
-def _starts(side: Side, corners: Floats, vision: VisionSettings, camera: Camera) -> Floats:
+def _starts(seen: Mapping[Side, Floats], vision: VisionSettings, camera: Camera) -> Floats:
     """Two guesses (2, 3), turned to the left and to the right: from a marker's size, and by how
     much it is narrower than high."""
+    side, corners = next(iter(seen.items()))
     above, right, below, left = np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1)
     narrow = min(1.0, (above + below) / (left + right))
     turn = max(math.acos(narrow), LEAST_TURN)
@@ -114,71 +126,86 @@ def _starts(side: Side, corners: Floats, vision: VisionSettings, camera: Camera)
     )
 
 
-def _improved(
-    poses: Floats, shape: Floats, plane: Floats, weights: Floats, camera: Camera
-) -> tuple[Floats, Floats, Floats]:
-    """Levenberg-Marquardt from each of the poses (k, 3): where it ends, the squared error (k) there
-    and the information (k, 3, 3)."""
-    damping = np.full(len(poses), 1e-3)
-    off, slopes = _seen(poses, shape, plane, camera)
-    errors = _squared(off, weights)
+class _View:
+    """What a pose of the shape (n, 3) would show, against what is seen on the plane (n, 2)."""
+
+    def __init__(self, shape: Floats, plane: Floats, camera: Camera) -> None:
+        axes = camera.robot_from_camera
+        ahead, aside, up = shape.T
+        self._plane = plane
+        self._weights = _inverse(_noise(plane, camera.settings))
+        self._still = np.outer(up, axes[2]) - camera.position @ axes
+        along = np.outer(ahead, axes[0]) + np.outer(aside, axes[1])
+        across = np.outer(ahead, axes[1]) - np.outer(aside, axes[0])
+        self._turned = np.stack([along.ravel(), across.ravel()])
+        self._axes = axes[:2].copy()
+
+    def sums(self, poses: Floats) -> Floats:
+        """Of each of the poses (k, 3), (4, 4): products of the slopes by x, y, heading and of what
+        is off, in sigmas. The first three are the information, the last is the squared error."""
+        cos, sin = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+        turns = (np.array([[cos, sin], [-sin, cos]]).transpose(0, 2, 1) @ self._turned).reshape(
+            2, len(poses), -1, 3
+        )
+        points = turns[0] + self._still + (poses[:, :2] @ self._axes)[:, None]
+        deep = np.maximum(points[..., 2:], NEAREST_M)
+        shown = points[..., :2] / deep
+        moves = np.empty((*shown.shape, 4))
+        moves[..., 0] = self._axes[0, :2] - shown * self._axes[0, 2]
+        moves[..., 1] = self._axes[1, :2] - shown * self._axes[1, 2]
+        moves[..., 2] = turns[1, ..., :2] - shown * turns[1, ..., 2:]
+        moves[..., :3] /= deep[..., None]
+        moves[..., 3] = self._plane - shown
+        flat = moves.reshape(len(poses), -1, 4)
+        sums: Floats = flat.transpose(0, 2, 1) @ self._weights @ flat
+        return sums
+
+
+def _improved(poses: Floats, view: _View) -> tuple[Floats, Floats]:
+    """Levenberg-Marquardt from each of the poses (k, 3): where it ends, with the sums there."""
+    sums, damping = view.sums(poses), np.full(len(poses), 1e-3)
     for _ in range(STEPS):
-        weighted = slopes.transpose(0, 2, 1) @ weights
-        information = weighted @ slopes
-        damped = information * (1.0 + damping[:, None, None] * np.eye(3))
-        step = np.linalg.solve(damped, weighted @ off[..., None])[..., 0]
-        next_off, next_slopes = _seen(poses + step, shape, plane, camera)
-        next_errors = _squared(next_off, weights)
-        better = next_errors <= errors
-        poses = np.where(better[:, None], poses + step, poses)
-        off = np.where(better[:, None], next_off, off)
-        slopes = np.where(better[:, None, None], next_slopes, slopes)
-        errors = np.where(better, next_errors, errors)
-        damping = np.where(better, 0.1 * damping, 10.0 * damping)
-        if np.abs(step).max() < SMALL:
+        damped = sums[:, :3, :3] * (1.0 + damping[:, None, None] * np.eye(3))
+        slope = sums[:, :3, 3]
+        step = np.linalg.solve(damped, slope[..., None])[..., 0]
+        if (step * slope).sum(axis=1).max() < SMALL:
             break
-    return poses, errors, slopes.transpose(0, 2, 1) @ weights @ slopes
+        moved = view.sums(poses + step)
+        better = moved[:, 3, 3] <= sums[:, 3, 3]
+        poses = np.where(better[:, None], poses + step, poses)
+        sums = np.where(better[:, None, None], moved, sums)
+        damping = np.where(better, 0.1 * damping, 10.0 * damping)
+    return poses, sums
 
 
-def _squared(off: Floats, weights: Floats) -> Floats:
-    errors: Floats = np.einsum("ki,ij,kj->k", off, weights, off)
-    return errors
+def _surveyed(poses: Floats, sigmas: Floats, pivot: Floats, view: _View) -> tuple[Floats, Floats]:
+    """Mean (3) and covariance (3, 3) over all headings about those of the poses (k, 3), each with
+    the place that suits it best; `pivot`: a marker's middle in its robot's frame."""
+    headings = poses[0, 2] + _unwrapped(poses[:, 2] - poses[0, 2])
+    reach = 4.0 * np.minimum(sigmas, MOST_SIGMA)
+    turns = np.linspace((headings - reach).min(), (headings + reach).max(), HEADINGS)
+    middle = poses[0, :2] + _turned(pivot, poses[0, 2:])[0]
+    tried = np.column_stack([middle - _turned(pivot, turns), turns])
+    for _ in range(3):
+        sums = view.sums(tried)
+        tried[:, :2] += np.linalg.solve(sums[:, :2, :2], sums[:, :2, 3:])[..., 0]
+    sums = view.sums(tried)
+    errors = sums[:, 3, 3] - sums[:, 3, 3].min()
+    likely = np.where(errors < RIVAL, np.maximum(np.exp(-0.5 * errors), LEAST_WEIGHT), 0.0)
+    weights = likely / likely.sum()
+    mean = weights @ tried
+    spread = tried - mean
+    covariance: Floats = (weights[:, None] * spread).T @ spread
+    covariance[:2, :2] += np.tensordot(weights, _inverse(sums[:, :2, :2]), 1)
+    return mean, covariance
 
 
-def _seen(poses: Floats, shape: Floats, plane: Floats, camera: Camera) -> tuple[Floats, Floats]:
-    """By how much the points of the plane are off what the poses (k, 3) would show: (k, 2n); and
-    the slopes (k, 2n, 3) of what they show."""
-    cos, sin = np.cos(poses[:, 2:]), np.sin(poses[:, 2:])
-    ahead, aside, up = shape.T
-    along, across = cos * ahead - sin * aside, sin * ahead + cos * aside
-    x, y = poses[:, :1] + along, poses[:, 1:2] + across
-    axes = camera.robot_from_camera
-    points = np.stack([x, y, np.broadcast_to(up, x.shape)], axis=2)
-    right, down, deep = np.moveaxis((points - camera.position) @ axes, 2, 0)
-    deep = np.maximum(deep, NEAREST_M)
-    shown = np.stack([right / deep, down / deep], axis=2)
-    turned = np.stack([-across, along], axis=2) @ axes[:2]
-    moved = np.broadcast_to(axes[:2], (*x.shape, 2, 3))
-    moves = np.concatenate([moved, turned[:, :, None]], axis=2)
-    slopes = (moves[..., :2] - shown[:, :, None] * moves[..., 2:]) / deep[..., None, None]
-    count = 2 * len(shape)
-    return (plane - shown).reshape(-1, count), slopes.transpose(0, 1, 3, 2).reshape(-1, count, 3)
+def _turned(point: Floats, angles: Floats) -> Floats:
+    """A point (2) of a robot's frame, seen from robots with these headings (n): (n, 2)."""
+    cos, sin = np.cos(angles), np.sin(angles)
+    return np.column_stack([cos * point[0] - sin * point[1], sin * point[0] + cos * point[1]])
 
 
-def _together(poses: Floats, errors: Floats, covariances: Floats, misfit: float) -> Fit:
-    """The best of the answers; or, where another may be true as well, one that covers both."""
-    best = int(errors.argmin())
-    x, y, heading = poses[best]
-    apart = poses - poses[best]
-    apart[:, 2] = [wrap_angle(float(turn)) for turn in apart[:, 2]]
-    likely = np.exp(-0.5 * (errors - errors[best]))
-    possible = errors - errors[best] < RIVAL
-    weights = np.where(possible, np.maximum(likely, LEAST_WEIGHT), 0.0)
-    weights /= weights.sum()
-    mean = weights @ apart
-    spread = apart - mean
-    covariance: Floats = np.einsum("k,kij->ij", weights, covariances) + np.einsum(
-        "k,ki,kj->ij", weights, spread, spread
-    )
-    pose = Pose2(x + mean[0], y + mean[1], wrap_angle(float(heading + mean[2])))
-    return Fit(pose, covariance, misfit)
+def _unwrapped(angles: Floats) -> Floats:
+    wrapped: Floats = (angles + np.pi) % (2.0 * np.pi) - np.pi
+    return wrapped

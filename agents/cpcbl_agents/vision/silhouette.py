@@ -33,6 +33,10 @@ class Shape(NamedTuple):
         foot, half = lens_m - cylinder.foot_m, 0.5 * cylinder.height_m
         return Shape(cylinder.radius_m, foot - 2.0 * half, foot - half, foot, rim_m)
 
+    @property
+    def height(self) -> float:
+        return self.foot - self.top
+
 
 class Fit(NamedTuple):
     """The distance of the axis from the lens along the floor, and how well the looks agree."""

@@ -9,7 +9,8 @@ import math
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
-from cpcbl_agents.vision.silhouette import FOOT, MID, TOP, WIDTH, Fit, Shape, fit, looks
+from cpcbl_agents.vision.camera import Floats
+from cpcbl_agents.vision.silhouette import FOOT, LEVEL, MID, TOP, WIDTH, Fit, Shape, fit, looks
 
 WHOLE = (TOP, MID, FOOT, WIDTH)
 WHOLE_GATE = 7.8  # chi-square, 3 degrees of freedom, 0.95
@@ -17,19 +18,20 @@ PARTS = (((TOP, MID, WIDTH), FOOT), ((MID, FOOT, WIDTH), TOP), ((TOP, MID, FOOT)
 """What is used when one of the four is hidden."""
 PART_GATE = 6.0  # 2 degrees of freedom, 0.95
 SIGMAS = 3.0
-ANY_TILT_RAD = 10.0
 
 
 class Look(NamedTuple):
     """What a camera sees of something with two bands, as angles: the azimuth of its middle; top,
-    mid, foot and half width as in `silhouette`, with their sigmas; which of the four are whole,
-    as far as one can tell; and whether the frame's border cuts it."""
+    mid, foot and half width as in `silhouette`, with their sigmas; its corners (4, 2) in the frame;
+    which of the four are known to be hidden; whether the frame's border is what `cut` them.
+    """
 
     azimuth: float
     seen: tuple[float, float, float, float]
     sigmas: tuple[float, float, float, float]
     tilt_sigma: float
-    whole: frozenset[int] = frozenset(WHOLE)
+    outline: Floats
+    hidden: frozenset[int] = frozenset()
     cut: bool = False
 
 
@@ -51,12 +53,12 @@ def verdict(shape: Shape, look: Look, leniency: float = 1.0) -> Verdict | None:
 
     With a leniency of more than 1: what might be.
     """
-    if look.whole.issuperset(WHOLE):
+    if not look.hidden:
         whole = _fit(shape, look, WHOLE)
         if whole.chi2 <= leniency * WHOLE_GATE:
             return _verdict(shape, look, whole, None)
     for use, hidden in PARTS:
-        if look.whole.issuperset(use):
+        if look.hidden.isdisjoint(use):
             part = _fit(shape, look, use)
             if part.chi2 <= leniency * PART_GATE and not _sticks_out(shape, look, part, hidden):
                 return _verdict(shape, look, part, hidden)
@@ -73,13 +75,19 @@ def reason(shape: Shape, lens_m: float, look: Look) -> str:
     """Why it is not of this shape, or not surely."""
     if look.cut:
         return "cut_by_frame"
-    if len(look.whole) < len(WHOLE):
+    if look.hidden:
         return "wrong_shape"
-    free = fit(shape, look.seen, look.sigmas, ANY_TILT_RAD, WHOLE)
-    if free.chi2 > WHOLE_GATE:
+    top, mid, foot, width = look.seen
+    near = shape.height / max(foot - top, 1e-9)  # by its height alone, wherever it stands
+    expected = math.asin(min(1.0, shape.radius / (near + LEVEL * shape.radius)))
+    edge = look.sigmas[MID]
+    width_sigma = math.hypot(look.sigmas[WIDTH], expected * edge * math.sqrt(2.0) / (foot - top))
+    if (
+        abs(foot - 2.0 * mid + top) > SIGMAS * math.sqrt(6.0) * edge
+        or abs(width - expected) > SIGMAS * width_sigma
+    ):
         return "wrong_shape"
-    below = lens_m - look.seen[MID] * free.distance < 0.0
-    return "mirror_image" if below else "ranges_disagree"
+    return "mirror_image" if lens_m < mid * near else "ranges_disagree"
 
 
 def _verdict(shape: Shape, look: Look, fitted: Fit, hidden: int | None) -> Verdict:
@@ -95,8 +103,6 @@ def _fit(shape: Shape, look: Look, use: Sequence[int]) -> Fit:
 def _sticks_out(shape: Shape, look: Look, part: Fit, hidden: int) -> bool:
     """Whether what should be hidden reaches beyond where it would be seen."""
     seen = look.seen[hidden]
-    if math.isnan(seen):
-        return True
     expected = looks(shape, part.distance)
     farther = looks(shape, part.distance + part.sigma)
     outward = -1.0 if hidden == TOP else 1.0

@@ -173,7 +173,7 @@ def picture(frame: Drawn, random: np.random.Generator) -> Pixels:
     """The frame as the robot gets it: through a JPEG."""
     made = render(frame.scene, Camera(frame.camera), frame.pose, frame.robots, frame.light, random)
     _, coded = cv2.imencode(".jpg", made, (cv2.IMWRITE_JPEG_QUALITY, QUALITY))
-    pixels = decoded(coded.tobytes(), (frame.camera.width_px, frame.camera.height_px))
+    pixels = decoded(coded.tobytes())
     assert not isinstance(pixels, str)
     return pixels
 

@@ -1,0 +1,28 @@
+"""The frames that every contender of `bench_eyes` looks at: of the team `eyes`, rendered."""
+
+from functools import lru_cache
+
+import numpy as np
+
+from cpcbl_agents.vision.camera import Pixels
+from cpcbl_launch.experiments.eyes_frames import drawn, picture
+from cpcbl_launch.team_file import builtin, load_team
+
+FRAMES = 24
+VIEWER = "rover1"
+TEAM = load_team(builtin("eyes"))
+
+
+@lru_cache(maxsize=1)
+def frames() -> tuple[Pixels, ...]:
+    """What a rover's camera sees, 640 x 480: three teammates, six landmarks, some clutter, each
+    anywhere, in any light."""
+    found: list[Pixels] = []
+    number = 0
+    while len(found) < FRAMES:
+        random = np.random.default_rng((5, number))
+        frame = drawn(random)
+        if frame.viewer == VIEWER:
+            found.append(picture(frame, random))
+        number += 1
+    return tuple(found)
