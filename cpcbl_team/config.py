@@ -523,6 +523,11 @@ class Team(Table, frozen=True, kw_only=True):
         robots = self.robots.values()
         return any(r.source == "simulated" and r.sensing == "camera" for r in robots)
 
+    @property
+    def sees(self) -> bool:
+        """Whether any robot has a camera."""
+        return any(robot.sensing == "camera" for robot in self.robots.values())
+
     def messages_per_s(self, robot: str) -> float | None:
         """The rate at which a robot earns its share of the match's messages; None: no limit."""
         if not self.match.messages:

@@ -70,18 +70,21 @@ def expected(
     return grown.scaled((min(max(sigma, least), most) / sigma) ** 2)
 
 
-def expected_heading(tier: int, turned: Turned | None, x_m: float, y_m: float) -> float:
-    """What the heading's variance (rad^2) of a teammate at (x, y) is likely to be.
+def expected_heading(tier: int, turned: Turned | None, fix: Fix) -> float:
+    """What the heading's variance (rad^2) of a teammate that is seen there is likely to be.
 
     A lost one's is unknown. Another's is what is usual, or what the last heading that it was told
-    left and its way has added: so its heading is told while that is news.
+    left and its way has added: so its heading is told while that is news. A robot that stands seems
+    to move by the sensor's noise; that is no way.
     """
     if tier == LOWEST_TIER:
         return LOST_HEADING_SIGMA_RAD**2
     usual = USUAL_HEADING_SIGMA_RAD**2
     if turned is None:
         return usual
-    way = math.hypot(x_m - turned.x_m, y_m - turned.y_m)
+    xx, _, yy = fix.sensor_covariance
+    way = math.hypot(fix.x_m - turned.x_m, fix.y_m - turned.y_m)
+    way = max(0.0, way - 2.0 * math.sqrt(xx + yy))
     return min(turned.variance + HEADING_DRIFT_RAD_PER_SQRT_M**2 * way, usual)
 
 

@@ -34,9 +34,9 @@ def base_image() -> str:
 
 
 @cache
-def image() -> str:
-    """The image of these sources, built when it is not there."""
-    return image_for(base_image(), never, print)
+def image(extras: str = "") -> str:
+    """The image of these sources with these extras, built when it is not there."""
+    return image_for(base_image(), never, print, extras)
 
 
 def left_of(project: str) -> list[str]:

@@ -188,7 +188,7 @@ class CollaborationAgent:
         after = merged(prior, *parts, rules.fusion)
         value, turned = worth(prior, after), None if before is None else before.turned
         if fix.heading_rad is not None:
-            variance = expected_heading(tier, turned, *place)
+            variance = expected_heading(tier, turned, fix)
             left = merged_heading(variance, fix, rules.fusion)
             gained = heading_worth(variance, left)
             if gained >= rules.least_value:

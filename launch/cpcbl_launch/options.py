@@ -90,9 +90,3 @@ def must_see(team: Team, robots: Collection[str] = (), field: bool = False) -> N
             f'team {team.name}: {who}: sensing = "camera" needs OpenCV:'
             " pip install 'cpcbl-team[camera]'"
         )
-
-
-def must_read(what: str) -> None:
-    """Raises ValueError where pictures cannot be read."""
-    if importlib.util.find_spec("cv2") is None:
-        raise ValueError(f"{what} needs OpenCV: pip install 'cpcbl-team[camera]'")

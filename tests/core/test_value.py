@@ -221,6 +221,17 @@ GOOD, USUAL = 5, USUAL_HEADING_SIGMA_RAD**2
 variances = st.floats(1e-6, math.pi**2)
 
 
+def seen_at(way: float, sensor_m: float = 0.0) -> Fix:
+    """A teammate that far from (1, 2), where it was last told its heading."""
+    return Fix("mate", "me", 0, 1.0 + way, 2.0, round_(sensor_m), NOTHING)
+
+
+def test_a_robot_that_stands_does_not_drift_for_the_noise_with_which_it_is_seen() -> None:
+    told = Turned(1.0, 2.0, 0.001)
+    assert expected_heading(GOOD, told, seen_at(0.2, sensor_m=0.1)) == 0.001
+    assert expected_heading(GOOD, told, seen_at(0.2)) > 0.002
+
+
 def headed(sensor_variance: float, observer_variance: float) -> Fix:
     place = Fix("mate", "me", 0, 1.0, 2.0, NOTHING, NOTHING)
     return replace(
@@ -235,7 +246,7 @@ def test_what_a_heading_is_worth_by_hand() -> None:
     """From 10 degrees to 5 is a factor of two; for who is lost, from any to nearly 5."""
     after = merged_heading(USUAL, headed(USUAL / 3.0, 0.0), "naive")
     assert heading_worth(USUAL, after) == pytest.approx(math.log(2.0), rel=1e-6)
-    lost = expected_heading(LOWEST_TIER, None, 0.0, 0.0)
+    lost = expected_heading(LOWEST_TIER, None, seen_at(0.0))
     assert lost == pytest.approx(math.pi**2 / 3.0)
     after = merged_heading(lost, headed(math.radians(5.0) ** 2, 0.0), "naive")
     assert heading_worth(lost, after) == pytest.approx(math.log(1.8138 / 0.08716), rel=1e-3)
@@ -264,9 +275,9 @@ def test_a_heading_is_news_again_after_a_way_but_no_more_than_at_first(
     left: float, a: float, b: float
 ) -> None:
     told = Turned(1.0, 2.0, min(left, USUAL))
-    near, far = (expected_heading(GOOD, told, 1.0 + way, 2.0) for way in sorted((a, b)))
-    assert told.variance <= near <= far <= expected_heading(GOOD, None, 1.0, 2.0)
-    assert expected_heading(LOWEST_TIER, told, 1.0, 2.0) > USUAL
+    near, far = (expected_heading(GOOD, told, seen_at(way)) for way in sorted((a, b)))
+    assert told.variance <= near <= far <= expected_heading(GOOD, None, seen_at(a))
+    assert expected_heading(LOWEST_TIER, told, seen_at(a)) > USUAL
 
 
 def test_a_heading_is_news_after_a_metre_or_two() -> None:
@@ -274,7 +285,7 @@ def test_a_heading_is_news_after_a_metre_or_two() -> None:
     said = headed(math.radians(3.0) ** 2, math.radians(1.0) ** 2)
     left, gained = USUAL, []
     for way in (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 2.0):
-        prior = expected_heading(GOOD, Turned(way, 0.0, left), 0.0, 0.0)
+        prior = expected_heading(GOOD, Turned(1.0, 2.0, left), seen_at(way))
         left = merged_heading(prior, said, "split-ci")
         gained.append(heading_worth(prior, left))
     assert gained[0] > 1.0

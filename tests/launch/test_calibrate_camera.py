@@ -138,11 +138,17 @@ def test_a_board_that_was_bent_is_left_out(taken: list[Picture]) -> None:
     assert max(map(abs, in_sigmas(lens))) < 4.5
 
 
-def _bent(pixels: Pixels | str) -> Pixels:
-    """A wave of 2 pixels through the picture."""
+def test_errors_that_are_many_are_said(taken: list[Picture]) -> None:
+    lens, _ = calibrated_lens([Picture(p.name, _bent(p.pixels, 5.0)) for p in taken], CHARUCO)
+    assert lens.rms_px > 1.0
+    assert any("px are many: blurred pictures" in note for note in lens.notes)
+
+
+def _bent(pixels: Pixels | str, wave_px: float = 2.0) -> Pixels:
+    """A wave through the picture."""
     assert not isinstance(pixels, str)
     y, x = (np.asarray(i, np.float32) for i in np.indices(pixels.shape[:2]))
-    wave = x + 2.0 * np.sin(y / 15.0, dtype=np.float32)
+    wave = x + wave_px * np.sin(y / 15.0, dtype=np.float32)
     bent: Pixels = cv2.remap(pixels, wave, y, cv2.INTER_LINEAR).astype(np.uint8)
     return bent
 
@@ -205,6 +211,15 @@ def test_a_printed_board_is_found_again(family: str) -> None:
         assert len(corners.pixels) == 35
         side = np.linalg.norm(corners.pixels[1] - corners.pixels[0])
         assert side == pytest.approx(0.02 / 0.0254 * 300, abs=1.0)
+
+
+def test_boards_as_they_were_drawn_before_are_found_too() -> None:
+    board = parsed_board("charuco", "8x6", 0.02, 0.015, "aruco_4x4_50")
+    family = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
+    made = cv2.aruco.CharucoBoard(board.squares, board.square_m, board.marker_m, family)
+    made.setLegacyPattern(True)
+    old = made.generateImage((640, 480)).astype(np.uint8)
+    assert len(_corners(cv2.cvtColor(old, cv2.COLOR_GRAY2BGR).astype(np.uint8), board).pixels) == 35
 
 
 def test_pictures_come_from_folders_files_and_videos(taken: list[Picture], tmp_path: Path) -> None:
@@ -336,7 +351,7 @@ def test_json_and_boards_and_what_is_wrong(folder: Path, tmp_path: Path) -> None
 def test_help_lists_every_calibration_and_logs_need_no_word() -> None:
     shown = cpcbl_team("calibrate", "--help")
     assert shown.returncode == 0
-    for word in ("log", "camera", "colours"):
+    for word in ("log", "camera", "colours", "sensor"):
         assert f" {word} " in shown.stdout
     for words in ((), ("log",)):
         failed = cpcbl_team("calibrate", *words, "--json", "nowhere")

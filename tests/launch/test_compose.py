@@ -88,6 +88,13 @@ def test_only_one_service_builds_the_image_and_all_others_come_after_it() -> Non
     assert all("router" in s["depends_on"] for name, s in found.items() if name != "router")
 
 
+def test_only_a_team_with_cameras_needs_opencv_in_its_image() -> None:
+    how = HOW._replace(context="..")
+    assert "EXTRAS" not in services(DEMO, how)["router"]["build"]["args"]
+    seeing = services(load_team(builtin("eyes")), how)
+    assert seeing["router"]["build"]["args"]["EXTRAS"] == "camera"
+
+
 def test_what_yaml_or_compose_would_take_for_something_else_stays_what_it_is() -> None:
     names = ("1", "no", "null", "1e3", "0x10", "on", "1.5", "-", "router", "field")
     team = team_of(**{name: robot_at() for name in names})
@@ -181,7 +188,7 @@ def test_the_image_has_another_name_whenever_a_source_changes(tmp_path: Path) ->
         (path / "code.py" if path.is_dir() else path).write_text("x = 2\n")
         names.append(tag(top, "base"))
     (top / "agents" / "code.py").rename(top / "agents" / "renamed.py")
-    names += [tag(top, "base"), tag(top, "other")]
+    names += [tag(top, "base"), tag(top, "base", "camera"), tag(top, "other")]
     assert len(set(names)) == len(names)
     (top / "launch" / "__pycache__").mkdir()
     (top / "launch" / "__pycache__" / "code.pyc").write_text("compiled")

@@ -50,11 +50,19 @@ class Demo(NamedTuple):
 
 @pytest.fixture
 def demo(tmp_path: Path) -> Iterator[Demo]:
+    with renamed("demo", tmp_path) as team:
+        yield team
+
+
+@contextmanager
+def renamed(shipped: str, folder: Path) -> Iterator[Demo]:
     """Fails when a container or network of the team is left."""
-    name, endpoint = f"demo{secrets.token_hex(3)}", free_endpoint()
-    text = builtin("demo").read_text()
-    text = text.replace('name = "demo"', f'name = "{name}"\ntransport.listen = ["{endpoint}"]')
-    file = tmp_path / "team.toml"
+    name, endpoint = f"{shipped}{secrets.token_hex(3)}", free_endpoint()
+    text = builtin(shipped).read_text()
+    text = text.replace(
+        f'name = "{shipped}"', f'name = "{name}"\ntransport.listen = ["{endpoint}"]'
+    )
+    file = folder / "team.toml"
     file.write_text(text.replace("after_s = 10.0", "after_s = 2.0"))
     assert load_team(file).name == name
     team = Demo(file, name, endpoint)
@@ -63,9 +71,9 @@ def demo(tmp_path: Path) -> Iterator[Demo]:
 
 
 @contextmanager
-def going_up(demo: Demo, *options: object) -> Iterator["subprocess.Popen[str]"]:
+def going_up(demo: Demo, *options: object, extras: str = "") -> Iterator["subprocess.Popen[str]"]:
     """`up --containers` as a process; stopped as a user would when the test fails."""
-    command = [*PROGRAM, "up", demo.file, "--containers", "--image", image(), *options]
+    command = [*PROGRAM, "up", demo.file, "--containers", "--image", image(extras), *options]
     with subprocess.Popen(
         list(map(str, command)), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     ) as process:
@@ -125,6 +133,20 @@ def test_a_team_in_containers_is_as_good_as_in_processes(demo: Demo, tmp_path: P
     assert ran.returncode == 0, ran.stderr
     processes = json.loads(ran.stdout)["team"]["position_rmse_m"]
     assert report["team"]["position_rmse_m"] < 1.5 * processes + 0.05
+
+
+def test_robots_with_cameras_see_in_containers_too(tmp_path: Path) -> None:
+    options = ("--duration", 12, "--seed", 3, "--json")
+    with (
+        renamed("eyes", tmp_path) as eyes,
+        going_up(eyes, *options, extras="camera") as process,
+    ):
+        out, err = process.communicate()
+        assert process.returncode == 0, err
+    for name, robot in json.loads(out)["robots"].items():
+        assert robot["lost_at_end"] == "", name
+        assert robot["counts"]["frame"] > 20, name
+        assert robot["position_rmse_m"] < 0.5, name
 
 
 def test_containers_killed_by_hand_are_started_again_and_the_report_says_so(demo: Demo) -> None:

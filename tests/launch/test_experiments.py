@@ -12,7 +12,7 @@ import pytest
 from process_helpers import cpcbl_team
 
 from cpcbl_launch.commands.experimenting import conduct
-from cpcbl_launch.experiments import directions, figure7, runs, table1, variants
+from cpcbl_launch.experiments import directions, figure7, figure7_cameras, runs, table1, variants
 from cpcbl_launch.experiments.circuit import circuit, loops, with_keys
 from cpcbl_launch.experiments.results import Experiment, Outcome, Results, accuracy, spread
 from cpcbl_launch.experiments.runs import Case, run, run_all
@@ -205,6 +205,34 @@ def test_table_1_is_reached_in_every_cell_by_the_probabilistic_variants() -> Non
 @pytest.mark.timeout(600)
 def test_figure_7_has_the_pattern_of_the_paper() -> None:
     found = outcome_of(figure7.EXPERIMENT, 10, figure7.cases())
+    assert len(found.pattern) == 5
+    assert all(found.pattern.values()), found.pattern
+    assert found.figures["C"].failed == 0
+
+
+def test_a_sharper_camera_helps_a_cheap_one(tmp_path: Path) -> None:
+    experiment = figure7_cameras.EXPERIMENT
+
+    def cases() -> Mapping[Any, Case]:
+        return {c: case._replace(loops=1) for c, case in experiment.cases().items()}
+
+    conduct(experiment._replace(cases=cases), seeds=1, jobs=2, output=tmp_path, as_json=False)
+    written = json.loads((tmp_path / "figure7-cameras.json").read_text())
+    assert (tmp_path / "figure7-cameras.png").read_bytes().startswith(PNG)
+    sensing = {name: r["sensing"] for name, r in written["teams"]["F"]["robots"].items()}
+    assert sensing == {"navigator": "camera", "observer": "camera"}
+    mean_m = {c: figures["position_mean_m"] for c, figures in written["figures"].items()}
+    assert mean_m["E"] < 0.6 * mean_m["C"]
+    assert mean_m["F"] < 0.6 * mean_m["C"]
+    assert mean_m["C"] < 0.2
+
+
+@pytest.mark.long
+@pytest.mark.timeout(1800)
+def test_figure_7_with_cameras_has_the_pattern_of_the_paper() -> None:
+    found = figure7_cameras.EXPERIMENT.outcome(
+        run_all(figure7_cameras.cases(), range(1, 6), 2, lambda: None)
+    )
     assert len(found.pattern) == 5
     assert all(found.pattern.values()), found.pattern
     assert found.figures["C"].failed == 0

@@ -33,9 +33,6 @@ class Box(NamedTuple):
         apart_x = self.right <= other.left or other.right <= self.left
         return not (apart_x or self.bottom <= other.top or other.bottom <= self.top)
 
-    def moved(self, down: int) -> "Box":
-        return self._replace(top=self.top + down, bottom=self.bottom + down)
-
 
 class Label(NamedTuple):
     """What is written about something in a frame, and where."""
@@ -113,23 +110,20 @@ def _corners(outline: Floats) -> "np.typing.NDArray[np.int32]":
 def _place(
     size_px: tuple[int, int], outline: Floats, lines: Sequence[str], taken: Sequence[Box]
 ) -> Box:
-    """Right of its outline or left of it; below or above what is there already."""
+    """Right of its outline or left of it, as high as it, or as near to that as there is room."""
     (width, height), scale = size_px, _scale(size_px[0])
     sizes = [cv2.getTextSize(text, FONT, TEXT_SCALE * scale, 1)[0][0] for text in lines]
     wide, high = max(sizes) + round(6 * scale), round((LINE_PX * len(lines) + 4) * scale)
     corners = _corners(outline)
     least, most = (corners.min(axis=0), corners.max(axis=0)) if len(corners) else ((0, 0), (0, 0))
-    gap = round(4 * scale)
-    left = int(most[0]) + gap
-    if left + wide > width:
-        left = int(least[0]) - gap - wide
-    left = min(max(left, 0), max(width - wide, 0))
+    gap, last = round(4 * scale), max(width - wide, 0)
+    beside = int(most[0]) + gap, int(least[0]) - gap - wide
+    lefts = [left for left in beside if 0 <= left <= last] or [min(max(beside[1], 0), last)]
     top = min(max(int(least[1]), 0), max(height - high, 0))
-    box = Box(left, top, left + wide, top + high)
-    places = [box.moved(step) for step in range(0, height - box.bottom + 1, LINE_PX)]
-    places += [box.moved(-step) for step in range(LINE_PX, box.top + 1, LINE_PX)]
+    tops = sorted({top, *range(0, height - high + 1, LINE_PX)}, key=lambda y: abs(y - top))
+    places = [Box(left, y, left + wide, y + high) for y in tops for left in lefts]
     free = (place for place in places if not any(place.meets(other) for other in taken))
-    return next(free, box)
+    return next(free, places[0])
 
 
 def _write(drawn: Pixels, label: Label, scale: float) -> None:

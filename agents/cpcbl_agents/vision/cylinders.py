@@ -14,7 +14,7 @@ from cpcbl_agents.vision.colours import Blob, Colours
 from cpcbl_agents.vision.glimpses import Doubt, Found, Glimpses
 from cpcbl_agents.vision.outlines import Candidate, Outline, Patch, candidates, outlined, patch_of
 from cpcbl_agents.vision.panorama import panorama_of
-from cpcbl_agents.vision.silhouette import WIDTH, Shape
+from cpcbl_agents.vision.silhouette import FOOT, TOP, WIDTH, Shape
 from cpcbl_agents.vision.twins import without_twins
 from cpcbl_agents.vision.verdicts import Look, Verdict, best, reason, verdict
 from cpcbl_team.config import Bands, Team
@@ -24,6 +24,7 @@ from cpcbl_team.inputs import Sighting
 LEAST_PX = 6.0  # high, both bands
 LEAST_BAND_PX = 6.0  # high and wide: what a single band must be to be worth a doubt
 RIVAL = 3.0  # what fits so much worse is still possible
+UNSURE = 4.0  # how much worse an edge is known beyond which the colour goes on
 REASONS = "cut_by_frame", "mirror_image", "ranges_disagree", "wrong_shape"  # the most telling first
 
 
@@ -118,6 +119,8 @@ class Cylinders:
         middle, rows = 0.5 * (o.left + o.right), (o.top, o.mid, o.foot)
         left, right = (edge_sigma / panorama.scale(x, o.mid).across_px for x in (o.left, o.right))
         top, mid, foot = (edge_sigma / panorama.scale(middle, y).along_px for y in rows)
+        top *= UNSURE if TOP in o.unsure else 1.0
+        foot *= UNSURE if FOOT in o.unsure else 1.0
         half_width = 0.5 * (o.right - o.left) * panorama.step
         return Look(
             panorama.azimuth(middle),

@@ -55,7 +55,8 @@ class Candidate(NamedTuple):
 
 class Outline(NamedTuple):
     """Columns and rows of the panorama. `hidden`: which of `TOP`, `FOOT`, `WIDTH` are not where an
-    edge of it is, but where the frame ends (`cut`) or its colour does."""
+    edge of it is, but where the frame ends (`cut`) or its colour does; `unsure`: at which of them
+    its colour goes on beyond the edge, as in its reflection."""
 
     left: float
     right: float
@@ -64,6 +65,7 @@ class Outline(NamedTuple):
     foot: float
     hidden: frozenset[int] = frozenset()
     cut: bool = False
+    unsure: frozenset[int] = frozenset()
 
 
 class Patch(NamedTuple):
@@ -154,7 +156,10 @@ def outlined(patch: Patch, panorama: Panorama, candidate: Candidate) -> list[Out
         lost, top = lost | {TOP}, upper.top
     if math.isnan(foot):
         lost, foot = lost | {FOOT}, lower.bottom
-    outlines = (Outline(left, right, top, mid, foot, lost) for left, right in found)
+    beyond = GAP_PX + GAP_SHARE * min(mid - top, foot - mid)
+    goes_on = {TOP: top - upper.top > beyond, FOOT: lower.bottom - foot > beyond}
+    unsure = frozenset(i for i, so in goes_on.items() if so)
+    outlines = (Outline(left, right, top, mid, foot, lost, unsure=unsure) for left, right in found)
     return [_with_cuts(panorama, outline) for outline in outlines]
 
 
@@ -207,7 +212,7 @@ def _ends(rows: Profile, top: float, mid: float, foot: float) -> tuple[float, fl
 
 def _with_cuts(panorama: Panorama, outline: Outline) -> Outline:
     """With those edges that are the frame's border, or beyond it."""
-    left, right, top, mid, foot, hidden, _ = outline
+    left, right, top, mid, foot, hidden, *_ = outline
     middle, rows = 0.5 * (left + right), (0.5 * (top + mid), 0.5 * (mid + foot))
     places = {
         TOP: [(middle, top)],

@@ -122,11 +122,13 @@ def found(pixels: Pixels, board: Board) -> Corners | str:
 
 def _in_charuco(grey: Pixels, board: Board) -> Corners:
     made = _charuco(board)
-    pixels, ids, _, _ = cv2.aruco.CharucoDetector(made).detectBoard(grey)
-    if ids is None or len(ids) == 0:
-        return _NONE
-    places = np.asarray(made.getChessboardCorners(), np.float32)[np.ravel(ids)]
-    return Corners(places, np.asarray(pixels, np.float32).reshape(-1, 2))
+    for old in (False, True):
+        made.setLegacyPattern(old)  # as OpenCV before 4.6 drew boards of an even number down
+        pixels, ids, _, _ = cv2.aruco.CharucoDetector(made).detectBoard(grey)
+        if ids is not None and len(ids):
+            places = np.asarray(made.getChessboardCorners(), np.float32)[np.ravel(ids)]
+            return Corners(places, np.asarray(pixels, np.float32).reshape(-1, 2))
+    return _NONE
 
 
 def _in_chess(grey: Pixels, board: Board) -> Corners:

@@ -22,6 +22,7 @@ OUTLYING, OUTLYING_PX = 3.0, 0.5  # times the median error, and by at least so m
 TOLD = 3.0  # k3 stays 0 unless it is so many of its standard deviations from 0
 MOVED_PX = 2.0  # corners that moved less are in the same place
 LEAST_FOCAL_SHARE = 0.001  # a lens warms up, and is bumped
+WEAK_RMS_PX = 1.0  # well taken pictures leave 0.1 to 0.3
 WEAK_FOCAL_SHARE = 0.01
 FIELDS = 4  # the picture's parts, across and down, in which corners should be
 INTRINSICS = ("fx_px", "fy_px", "cx_px", "cy_px")
@@ -215,6 +216,11 @@ def _lens(solution: _Solution, size_px: tuple[int, int], pictures: tuple[View, .
         notes.append(
             f"no corners in {empty} of the {FIELDS**2} parts of the picture: distortion is a guess"
             " there; hold the board into it too"
+        )
+    if solution.rms_px > WEAK_RMS_PX:
+        notes.append(
+            f"errors of {solution.rms_px:.1f} px are many: blurred pictures, a board that is not"
+            " flat, or not the one that --squares says"
         )
     if share > WEAK_FOCAL_SHARE:
         notes.append("focal length is hardly told: tilt the board by 30 to 45 degrees")

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -68,24 +68,38 @@ def _logs(
     frames: Mapping[str, Any],
 ) -> dict[str, RobotLog]:
     """Arrays of what was read, for every robot with truth."""
+    truth, objects, teammates = placed(landmarks, truth)
+    number = {name: i for i, name in enumerate(objects)}
+    return {
+        name: RobotLog(
+            rows,
+            _pieces(odometry.get(name, ())),
+            _sightings(frames.get(name, ()), number),
+            tuple(objects.values()),
+            teammates,
+        )
+        for name, rows in truth.items()
+        if len(rows) > 1
+    }
+
+
+class Placed(NamedTuple):
+    """Where everything truly was: the robots' poses, each stamp once, and all that can be seen."""
+
+    truth: dict[str, Floats]
+    objects: dict[str, Floats]
+    teammates: frozenset[int]
+
+
+def placed(landmarks: Mapping[str, Landmark], truth: Mapping[str, Floats]) -> Placed:
+    """Landmarks and robots as `RobotLog` has them: `objects` and `teammates`."""
     truth = {
         name: rows[np.unique(rows[:, 0], return_index=True)[1]] for name, rows in truth.items()
     }
     places = {name: np.array([[0.0, mark.x_m, mark.y_m]]) for name, mark in landmarks.items()}
     places |= {name: rows[:, :3] for name, rows in truth.items()}
     number = {name: i for i, name in enumerate(places)}
-    teammates = frozenset(number[name] for name in truth)
-    return {
-        name: RobotLog(
-            rows,
-            _pieces(odometry.get(name, ())),
-            _sightings(frames.get(name, ()), number),
-            tuple(places.values()),
-            teammates,
-        )
-        for name, rows in truth.items()
-        if len(rows) > 1
-    }
+    return Placed(truth, places, frozenset(number[name] for name in truth))
 
 
 def _pieces(odometry: Any) -> Floats:

@@ -105,7 +105,7 @@ def _sighted(log: RobotLog, number: int, delay_s: float) -> SensorRows:
     stamp_s, which = log.sightings[:, 0], log.sightings[:, 1].astype(np.int64)
     readings, bearings = log.sightings[:, 2], log.sightings[:, 3]
     (range_m, bearing, good), earlier, later = (
-        _seen(log, which, stamp_s - delay_s + nudge) for nudge in (0.0, -NUDGE_S, NUDGE_S)
+        truly_seen(log, which, stamp_s - delay_s + nudge) for nudge in (0.0, -NUDGE_S, NUDGE_S)
     )
     rows = SensorRows(
         stretches(stamp_s, log.truth[:, 0], number),
@@ -124,7 +124,7 @@ def _sighted(log: RobotLog, number: int, delay_s: float) -> SensorRows:
     return kept(rows, good & earlier[2] & later[2] & plausible)
 
 
-def _seen(log: RobotLog, which: Integers, times_s: Floats) -> tuple[Floats, Floats, Mask]:
+def truly_seen(log: RobotLog, which: Integers, times_s: Floats) -> tuple[Floats, Floats, Mask]:
     """True range and bearing of objects at times, and where the truth is known."""
     stamps = log.truth[:, 0]
     good = known(stamps, times_s)
@@ -236,6 +236,12 @@ def _best(logs: Sequence[RobotLog]) -> _Fitted | None:
 def _range_spread(found: _Fitted) -> float:
     errors = found.after.range_errors(found.rows) / found.rows.true_range
     return spread(np.abs(errors[np.isfinite(errors)]))
+
+
+def corrections(logs: Sequence[RobotLog]) -> Corrections:
+    """Those that `calibrate_sensor` tells; none with too few sightings."""
+    best = _best(logs)
+    return Corrections() if best is None else best.after
 
 
 def calibrate_sensor(logs: Sequence[RobotLog]) -> tuple[dict[str, Estimate], bool]:

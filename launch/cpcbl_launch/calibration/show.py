@@ -13,7 +13,7 @@ def print_calibration(calibration: Calibration, console: Console) -> None:
         shown = table(title, ("robot",), tuple(names.values()))
         for robot, found in calibration.robots.items():
             values = getattr(found, part)
-            shown.add_row(robot, *(_with_error(values.get(name)) for name in names))
+            shown.add_row(robot, *(with_error(values.get(name)) for name in names))
         console.print(shown)
         console.print()
     console.print("± standard error; -: the logs do not tell it", style="yellow", highlight=False)
@@ -22,7 +22,8 @@ def print_calibration(calibration: Calibration, console: Console) -> None:
             console.print(f"robot {robot}: {note}", style="yellow", highlight=False)
 
 
-def _with_error(estimate: Estimate | None) -> str:
+def with_error(estimate: Estimate | None) -> str:
+    """A value ± its standard error, in as many digits as it is worth."""
     if estimate is None:
         return "-"
     digits = decimals(estimate.standard_error)

@@ -78,8 +78,11 @@ def edited(text: str, name: str, places: Mapping[Place, Mapping[str, Written]]) 
         table: Any = document
         for i, part in enumerate(place.path):
             table = _inside(table, part, bare=i < len(place.path) - 1)
+        fresh = isinstance(table, Table) and not len(table)
         for key, value in values.items():
             table[key] = _item(value, table)
+        if fresh:
+            table.add(tomlkit.nl())
     changed = tomlkit.dumps(document)
     parse_team(changed, name)
     return changed

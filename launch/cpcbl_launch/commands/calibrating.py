@@ -8,10 +8,11 @@ from typing import TYPE_CHECKING, Annotated, Any, Optional
 import typer
 from typer.core import TyperGroup
 
-from cpcbl_launch.commands.arguments import AsJson, say_not_written
+from cpcbl_launch.commands.arguments import AsJson, load, say_not_written
 from cpcbl_launch.commands.measuring import calibrate
 
 if TYPE_CHECKING:
+    from cpcbl_launch.calibration.sights import Looked
     from cpcbl_launch.calibration.team_edit import Place, Written
 
 LOG = "log"
@@ -80,10 +81,10 @@ def camera(
     """Lens and distortion of a camera, from pictures of a printed board."""
     from rich.console import Console
 
-    from cpcbl_launch.options import encoded, file_for, must_draw, must_read, not_written
+    from cpcbl_launch.options import encoded, file_for, must_draw, must_have_opencv, not_written
     from cpcbl_launch.show import progress_bar
 
-    must_read("calibrate camera")
+    must_have_opencv("calibrate camera")
     from cpcbl_launch.calibration.board import parsed_board, write_board
     from cpcbl_launch.calibration.lens import calibrated_lens
     from cpcbl_launch.calibration.lens_show import camera_values, print_lens
@@ -151,9 +152,9 @@ def colours(
     """Thresholds of colours, from samples of them in pictures."""
     from rich.console import Console
 
-    from cpcbl_launch.options import encoded, file_for, must_read, not_written
+    from cpcbl_launch.options import encoded, file_for, must_have_opencv, not_written
 
-    must_read("calibrate colours")
+    must_have_opencv("calibrate colours")
     from cpcbl_launch.calibration import patches
     from cpcbl_launch.calibration.colours import calibrated_colours
     from cpcbl_launch.calibration.colours_show import colour_values, kept_colours, print_colours
@@ -183,6 +184,78 @@ def colours(
         print_colours(found, Console())
     lost |= _save(colour_values(found, stays), team_file, output, as_json)
     say_not_written(lost)
+
+
+@calibrate_app.command("sensor")
+def sensor(
+    recordings: Annotated[
+        Optional[list[Path]],
+        typer.Argument(help="Recordings with truth (`up --record`, .mcap) of robots with cameras."),
+    ] = None,
+    pictures: Annotated[
+        Optional[Path], typer.Option(help="Or a folder of pictures that a robot took.")
+    ] = None,
+    poses: Annotated[
+        Optional[Path],
+        typer.Option(help="Where (CSV): file, x_m, y_m, heading_deg, and robot for teammates."),
+    ] = None,
+    team_file: ToTeam = None,
+    robot: Annotated[
+        Optional[str], typer.Option(help="Whose eyes; default: all with a camera.")
+    ] = None,
+    kind: Annotated[
+        Optional[str], typer.Option("--type", help="Write into this type, not into the robot.")
+    ] = None,
+    output: ToFile = None,
+    as_json: AsJson = False,
+) -> None:
+    """Range and bearing noise of cameras against known poses, and whether they know it."""
+    from rich.console import Console
+
+    from cpcbl_launch.calibration.agreement import calibrated_seeing
+    from cpcbl_launch.calibration.seeing_show import print_seeing, seeing_values
+    from cpcbl_launch.calibration.sights import recorded
+    from cpcbl_launch.calibration.team_edit import robot_place
+    from cpcbl_launch.options import encoded
+
+    if bool(recordings) == (pictures is not None):
+        raise ValueError("calibrate sensor: name recordings, or --pictures FOLDER --poses FILE.csv")
+    _check_target(team_file, output)
+    if pictures is None:
+        looked = recorded(recordings or [], robot)
+    else:
+        looked = _photographed(pictures, poses, team_file, robot, as_json)
+    one = looked.robots[0] if len(looked.robots) == 1 else None
+    sensor, camera = (
+        robot_place(team_file, None if kind or team_file is None else one, kind, part)
+        for part in ("sensor", "camera")
+    )
+    seeing = calibrated_seeing(looked.sights)
+    if as_json:
+        typer.echo(encoded(seeing))
+    else:
+        print_seeing(seeing, looked, Console())
+    values = seeing_values(seeing, looked.camera, sensor, camera)
+    say_not_written(_save(values, team_file, output, as_json))
+
+
+def _photographed(
+    pictures: Path, poses: Path | None, team_file: Path | None, robot: str | None, quiet: bool
+) -> "Looked":
+    """What a robot of the team file sees in pictures. Raises ValueError."""
+    from cpcbl_launch.calibration.sights import photographed, viewer
+    from cpcbl_launch.options import must_have_opencv
+    from cpcbl_launch.show import progress_bar
+
+    must_have_opencv("calibrate sensor --pictures")
+    if poses is None:
+        raise ValueError("--pictures: goes with --poses FILE.csv, where they were taken")
+    if team_file is None:
+        raise ValueError("--pictures: goes with --team FILE, which says what is to be seen")
+    team = load(team_file)
+    whose = viewer(team, robot)
+    with progress_bar("looking", quiet) as progress:
+        return photographed(pictures, poses, whose, team, progress)
 
 
 def _check_target(team_file: Path | None, output: Path | None) -> None:

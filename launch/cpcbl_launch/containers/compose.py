@@ -63,7 +63,7 @@ def compose_text(team: Team, how: Deployment) -> str:
             to=_flow(["CMD", "linked", "to", str(PORT)]),
         ),
         _ROUTER.format(
-            build=_build(how.context),
+            build=_build(how.context, extras_of(team)),
             command=_flow(_router(how)),
             keys=_own_mounts(how, Identity(Role.ROUTER)),
             ports=_flow([f"{outside}:{PORT}" for outside in how.published]),
@@ -90,12 +90,18 @@ def _router(how: Deployment) -> list[str]:
     return command if how.speed == 1.0 else [*command, "--speed", f"{how.speed:g}"]
 
 
-def _build(context: str | None) -> str:
+def _build(context: str | None, extras: str) -> str:
     if context is None:
         return ""
+    base = f"${{{BASE_VARIABLE}:-{BASE_IMAGE}}}"
     return _BUILD.format(
-        context=_flow(context), base=f"${{{BASE_VARIABLE}:-{BASE_IMAGE}}}", variable=BASE_VARIABLE
+        context=_flow(context), base=base, extras=f", EXTRAS: {extras}" if extras else ""
     )
+
+
+def extras_of(team: Team) -> str:
+    """The extras of this program that the containers of a team need."""
+    return "camera" if team.sees else ""
 
 
 def _scheme(how: Deployment) -> str:
@@ -187,7 +193,7 @@ _BUILD = """\
     build: # of the image that all use
       context: {context}
       dockerfile: docker/Dockerfile
-      args: {{BASE_IMAGE: "{base}"}}
+      args: {{BASE_IMAGE: "{base}"{extras}}}
 """
 
 _SERVICE = """

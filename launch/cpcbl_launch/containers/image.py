@@ -32,17 +32,18 @@ def checkout() -> Path | None:
     return top if (top / DOCKERFILE).exists() else None
 
 
-def tag(top: Path, base: str) -> str:
-    """cpcbl-team:VERSION-HASH, another one when a source, the recipe or the base's name changes."""
-    content = hashlib.sha256(base.encode())
+def tag(top: Path, base: str, extras: str = "") -> str:
+    """cpcbl-team:VERSION-HASH, another one when a source, the recipe, the base's name or the extras
+    change."""
+    content = hashlib.sha256(f"{base} {extras}".encode())
     for path in _files(top):
         content.update(f"\n{path.relative_to(top)}\n".encode())
         content.update(path.read_bytes())
     return f"{NAME}:{version()}-{content.hexdigest()[:12]}"
 
 
-def image_for(base: str, stop: Callable[[], bool], said: Said) -> str:
-    """The name of an image of this very program, built where there is none yet.
+def image_for(base: str, stop: Callable[[], bool], said: Said, extras: str = "") -> str:
+    """The name of an image of this very program with these extras, built where there is none yet.
 
     Raises DockerError.
     """
@@ -52,7 +53,7 @@ def image_for(base: str, stop: Callable[[], bool], said: Said) -> str:
             "the image is built from a checkout, and this program was installed without one; name"
             " one that you have: --image NAME"
         )
-    name = tag(top, base)
+    name = tag(top, base, extras)
     if not there(name):
         have(base, stop, said, WITHOUT_REGISTRY)
         said(f"building image {name} on {base}, once for these sources")
@@ -64,6 +65,8 @@ def image_for(base: str, stop: Callable[[], bool], said: Said) -> str:
             name,
             "--build-arg",
             f"BASE_IMAGE={base}",
+            "--build-arg",
+            f"EXTRAS={extras}",
         ]
         command += ["--file", str(top / DOCKERFILE), str(top)]
 

@@ -11,7 +11,7 @@ import msgspec
 from rich.console import Console
 
 from cpcbl_agents.clock import Clock
-from cpcbl_launch.containers.compose import Deployment, Mount, compose_text
+from cpcbl_launch.containers.compose import Deployment, Mount, compose_text, extras_of
 from cpcbl_launch.containers.deployment import owner
 from cpcbl_launch.containers.docker import DockerError, Said, check_daemon, compose_program
 from cpcbl_launch.containers.fleet import Fleet, Project
@@ -56,7 +56,7 @@ class InContainers:
         self._run, self._folder, self._stop, self._said = run, folder, stop, said
         if image is not None:
             have(image, stop, said, "leave --image out to build one of these sources")
-        self._image = image or image_for(base, stop, said)
+        self._image = image or image_for(base, stop, said, extras_of(run.team))
         self.lead_s = LEAD_S + LEAD_S_A_CONTAINER * len(self._here)
         self._file = folder / "compose.yaml"
         name = f"{_project_name(run.team)}-{secrets.token_hex(3)}"

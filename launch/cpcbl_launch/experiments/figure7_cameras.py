@@ -1,9 +1,9 @@
 """Figure 7 of the paper with cameras: pixels in place of simulated sightings.
 
 The field, its circuit, the odometry and what helps whom are those of `figure7`; landmarks are
-cylinders of two colours, the navigator carries markers and a mast. Its camera is a cheap one of a
-wide angle that shakes and whose focal length is not well known; the observer's is a sharper one
-that stands still. Both are as badly known as their settings say (`simulation/cameras.py`).
+cylinders of two colours, robots carry markers and masts. The navigator's camera is a cheap one of a
+wide angle that shakes, its focal length not well known; the observer's is a sharper one. Both
+are as badly known as their settings say (`simulation/cameras.py`).
 """
 
 from collections.abc import Iterable, Mapping
@@ -47,8 +47,12 @@ LANDMARKS: Mapping[str, Bands] = {
     "northeast": ("green", "pink"),
     "northwest": ("pink", "green"),
 }
-MARKERS: dict[Side, int] = {"front": 0, "left": 1, "back": 2, "right": 3}
-MAST: Bands = ("pink", "yellow")
+MARKERS: Mapping[str, dict[Side, int]] = {
+    "navigator": {"front": 0, "left": 1, "back": 2, "right": 3},
+    "observer": {"front": 4, "left": 5, "back": 6, "right": 7},
+}
+MASTS: Mapping[str, Bands] = {"navigator": ("pink", "yellow"), "observer": ("yellow", "green")}
+CAMERAS: Mapping[str, CameraSettings] = {"navigator": NAVIGATOR, "observer": OBSERVER}
 
 
 def team_case(configuration: str) -> Case:
@@ -58,17 +62,21 @@ def team_case(configuration: str) -> Case:
 
 
 def seeing(team: Team) -> Team:
-    """The team with cameras, and with what they know landmarks and the navigator by."""
+    """The team with cameras, and with what they know landmarks and robots by."""
     replace = msgspec.structs.replace
     marks = {
         name: replace(mark, colours=LANDMARKS[name]) for name, mark in team.map.landmarks.items()
     }
-    cameras = {"navigator": NAVIGATOR, "observer": OBSERVER}
     robots = {
-        name: replace(robot, sensing="camera", camera=cameras[name])
+        name: replace(
+            robot,
+            sensing="camera",
+            camera=CAMERAS[name],
+            markers=MARKERS[name],
+            colours=MASTS[name],
+        )
         for name, robot in team.robots.items()
     }
-    robots["navigator"] = replace(robots["navigator"], markers=MARKERS, colours=MAST)
     return replace(
         team,
         robots=robots,

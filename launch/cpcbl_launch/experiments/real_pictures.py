@@ -8,7 +8,7 @@ by who wants them, and stay where they are.
 
 import csv
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from importlib.metadata import version
 from importlib.resources import files
 from pathlib import Path
@@ -187,7 +187,7 @@ def tables(result: RealPictures) -> Iterable[RenderableType]:
     )
     for c in result.lines:
         errors = (
-            *_pair(c.range_error_m, c.range_sigma_m, 2),
+            *_pair(c.range_error_m, c.range_sigma_m, 3),
             *_pair(c.bearing_error_deg, c.bearing_sigma_deg, 1),
             *_pair(c.heading_error_deg, c.heading_sigma_deg, 1),
         )
@@ -196,10 +196,23 @@ def tables(result: RealPictures) -> Iterable[RenderableType]:
     yield shown
     found = sum(c.found for c in result.lines)
     yield f"found {found} of {len(result.lines)}. m: range; off: from the truth, of which σ is ours"
+    yield f"inside three σ: {', '.join(_inside(result.lines)) or 'no truth but the ids'}"
     yield f"seen but not in the table: {_listed(result.unexpected)}"
     yield f"doubted: {_listed(result.doubted)}"
     if result.refused:
         yield f"refused: {_listed(tuple(result.refused.items()))}"
+
+
+def _inside(lines: Sequence[Compared]) -> Iterator[str]:
+    """Of how many errors that are known how many are within three stated sigmas."""
+    for what, pairs in {
+        "range": [(c.range_error_m, c.range_sigma_m) for c in lines],
+        "bearing": [(c.bearing_error_deg, c.bearing_sigma_deg) for c in lines],
+        "heading": [(c.heading_error_deg, c.heading_sigma_deg) for c in lines],
+    }.items():
+        known = [(e, s or 0.0) for e, s in pairs if e is not None]
+        if known:
+            yield f"{what} {sum(abs(e) <= 3.0 * s for e, s in known)} of {len(known)}"
 
 
 def _pair(error: float | None, sigma: float | None, digits: int) -> tuple[str, str]:
@@ -209,4 +222,9 @@ def _pair(error: float | None, sigma: float | None, digits: int) -> tuple[str, s
 
 
 def _listed(pairs: Sequence[tuple[str, str]]) -> str:
-    return "; ".join(f"{picture}: {what}" for picture, what in pairs) or "nothing"
+    """What, and in which pictures."""
+    pictures: dict[str, list[str]] = {}
+    for picture, what in pairs:
+        pictures.setdefault(what, []).append(picture)
+    told = (f"{what} ({', '.join(dict.fromkeys(where))})" for what, where in pictures.items())
+    return "; ".join(told) or "nothing"

@@ -151,4 +151,7 @@ def _inputs(messages: Iterable[tuple[str, Message]]) -> dict[str, list[SensorInp
             message = Sightings(message.stamp_ns, message.found)
         if isinstance(message, Odometry | Sightings | Position):
             inputs.setdefault(key.split("/")[1], []).append(message)
+        elif isinstance(message, Look):  # what the robot's eyes found in a frame
+            seen = Sightings(message.stamp_ns, message.found)
+            inputs.setdefault(key.split("/")[1], []).append(seen)
     return inputs
