@@ -25,7 +25,6 @@ DICTIONARIES: dict[MarkerFamily, int] = {
 LEAST_CONTRAST = 12.0  # grey levels between a marker's black and its margin's white
 WRONG_SHARE = 0.25  # of the bits that a family could set right: a wrong name is worse than none
 
-_CORNERS = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], np.float32)
 _WITHIN = np.array([[x, y] for y in (-0.15, 0.15) for x in (-0.15, 0.15)])
 
 
@@ -56,8 +55,11 @@ class Codes:
         markers."""
         if not len(quads):
             return {}
-        places = np.stack([_laid(self._places, quad) for quad in quads])
-        levels = sampled(grey, places).reshape(len(quads), -1, len(_WITHIN)).mean(axis=2)
+        levels = (
+            sampled(grey, _laid(self._places, quads))
+            .reshape(len(quads), -1, len(_WITHIN))
+            .mean(axis=2)
+        )
         margins, borders = levels[:, self._rings == 0], levels[:, self._rings == 1]
         white, black = margins.mean(axis=1), borders.mean(axis=1)
         middle = 0.5 * (white + black)
@@ -78,11 +80,24 @@ def _places(cells: int) -> Floats:
     return cell.reshape(-1, 2)
 
 
-def _laid(places: Floats, quad: Floats) -> Floats:
-    """Places (n, 2) of the unit square, seen within a quad."""
-    laid = cv2.getPerspectiveTransform(_CORNERS, quad.astype(np.float32))
-    seen: Floats = cv2.perspectiveTransform(places[None], laid)[0].astype(np.float64, copy=False)
-    return seen
+def _laid(places: Floats, quads: Floats) -> Floats:
+    """Places (n, 2) of the unit square, seen within each of the quads: (m, n, 2). (Heckbert,
+    Fundamentals of texture mapping, 1989, section 2.2.3.)"""
+    a, b, c, d = quads.transpose(1, 0, 2)
+    right, below, bend = b - c, d - c, a - b + c - d
+    size = _crossed(right, below)
+    across, down = _crossed(bend, below) / size, _crossed(right, bend) / size
+    x = b - a + across[:, None] * b
+    y = d - a + down[:, None] * d
+    s, t = places.T[:, None, :, None]
+    deep = 1.0 + across[:, None, None] * s + down[:, None, None] * t
+    laid: Floats = (s * x[:, None] + t * y[:, None] + a[:, None]) / deep
+    return laid
+
+
+def _crossed(a: Floats, b: Floats) -> Floats:
+    crossed: Floats = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
+    return crossed
 
 
 def _rings(cells: int) -> NDArray[np.int64]:

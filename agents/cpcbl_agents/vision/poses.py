@@ -37,6 +37,8 @@ NARROW = math.radians(1.5)
 HEADINGS = 41
 MOST_SIGMA = math.radians(20.0)
 
+_DIAGONAL = np.eye(3)
+
 
 class Fit(NamedTuple):
     """`viewer_from_mate`, its covariance (3, 3; m, rad), the mean squared error in sigmas."""
@@ -165,7 +167,7 @@ def _improved(poses: Floats, view: _View) -> tuple[Floats, Floats]:
     """Levenberg-Marquardt from each of the poses (k, 3): where it ends, with the sums there."""
     sums, damping = view.sums(poses), np.full(len(poses), 1e-3)
     for _ in range(STEPS):
-        damped = sums[:, :3, :3] * (1.0 + damping[:, None, None] * np.eye(3))
+        damped = sums[:, :3, :3] * (1.0 + damping[:, None, None] * _DIAGONAL)
         slope = sums[:, :3, 3]
         step = np.linalg.solve(damped, slope[..., None])[..., 0]
         if (step * slope).sum(axis=1).max() < SMALL:

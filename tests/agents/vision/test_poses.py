@@ -10,7 +10,7 @@ from marker_helpers import SIDES, seen_at
 from msgspec.structs import replace
 
 from cpcbl_agents.vision.camera import Camera, Floats
-from cpcbl_agents.vision.poses import ANGLES, CORNER_SHARE, fitted
+from cpcbl_agents.vision.poses import ANGLES, CORNER_SHARE, NARROW, fitted
 from cpcbl_team.config import CameraSettings, Side, VisionSettings
 from cpcbl_team.geometry import Pose2, wrap_angle
 
@@ -56,9 +56,10 @@ def test_exact_corners_tell_the_pose(
     x, y = fit.pose.x - robot.x, fit.pose.y - robot.y
     turn = wrap_angle(fit.pose.heading - robot.heading)
     sigmas = np.sqrt(np.diag(fit.covariance))
-    if len(seen) > 1 or range_m < 1.2:  # what is told is one pose, not the middle of two
+    if sigmas[2] < NARROW:  # what is told is one pose, not the middle of many
         assert math.hypot(x, y) < 2e-3
         assert abs(turn) < 5e-3
+    assert len(seen) < 2 or sigmas[2] < NARROW
     assert (np.abs([x, y, turn]) < 3.0 * sigmas).all()
 
 
