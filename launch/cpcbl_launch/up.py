@@ -36,6 +36,7 @@ log = logging.getLogger(__name__)
 
 LEAD_S = 2.0
 LEAD_S_A_PROCESS = 0.3
+LEAD_S_A_CAMERA = 1.0  # OpenCV is loaded, the lens laid out
 REFRESH_S = 0.25
 SIMULATED_S = 30.0  # unless told otherwise
 LEAST_S = 1.0
@@ -92,7 +93,8 @@ class OnThisMachine:
     def __init__(self, run: Run, folder: Path, stop: Stopping) -> None:
         self._run, self._folder = run, folder
         self._here = run.team.robots if run.here is None else run.here
-        self.lead_s = LEAD_S + LEAD_S_A_PROCESS * len(self._here)
+        cameras = sum(run.team.robots[name].sensing == "camera" for name in self._here)
+        self.lead_s = LEAD_S + LEAD_S_A_PROCESS * len(self._here) + LEAD_S_A_CAMERA * cameras
 
     def router(self) -> AbstractContextManager[Bus]:
         team, listen = self._run.team, self._run.team.transport.listen
