@@ -1,6 +1,7 @@
 """Pictures of a calibration board as a known camera with distortion takes them."""
 
 from collections.abc import Iterator
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -12,9 +13,17 @@ from cpcbl_team.config import CameraSettings
 FINER = 2  # samples a pixel, across and down
 
 
+class Shot(NamedTuple):
+    """A picture, and where the board was: `camera_from_board`, a rotation (3, 3) and m (3)."""
+
+    pixels: Pixels
+    turn: Floats
+    move: Floats
+
+
 def board_pictures(
     settings: CameraSettings, board: Board, count: int, random: np.random.Generator
-) -> Iterator[Pixels]:
+) -> Iterator[Shot]:
     """The board near and far, in all parts of the picture, tilted by up to 40 degrees."""
     rays = undistorted_grid(settings)
     sheet = cv2.GaussianBlur(drawn(board), (0, 0), 2.0).astype(np.uint8)
@@ -27,7 +36,7 @@ def board_pictures(
         tilt = np.radians(random.uniform(-40, 40, 2))
         turn = cv2.Rodrigues(np.array([*tilt, random.uniform(-0.5, 0.5)]))[0].astype(float)
         centre = np.array([*middle, 1.0]) * away - turn @ np.array([width / 2, height / 2, 0.0])
-        yield _picture(rays, sheet, turn, centre, board, random)
+        yield Shot(_picture(rays, sheet, turn, centre, board, random), turn, centre)
 
 
 def undistorted_grid(settings: CameraSettings) -> Floats:

@@ -30,7 +30,7 @@ sensing = "camera"
 source = "external"
 markers = { front = 1, left = 2, back = 3, right = 4 }
 """
-SETS = ("duckiebot", "frc-speaker", "frc-amp")
+SETS = ("duckiebot", "frc-speaker", "frc-amp", "nao")
 
 
 def picture(*robots: Standing, landmarks: bool = True) -> Pixels:
@@ -135,10 +135,15 @@ def test_a_marker_that_is_upside_down_is_read_as_upright(family: MarkerFamily) -
 @pytest.mark.pictures
 @pytest.mark.parametrize(
     ("name", "found", "off_share"),
-    [("duckiebot", 12, 0.06), ("frc-speaker", 10, 0.06), ("frc-amp", 1, 0.06)],
+    [
+        ("duckiebot", 12, 0.06),
+        ("frc-speaker", 10, 0.06),
+        ("frc-amp", 1, 0.06),
+        ("nao", 3, 0.1),
+    ],
 )
 def test_real_pictures(name: str, found: int, off_share: float) -> None:
-    folder = "duckiebot" if name == "duckiebot" else "frc"
+    folder = name.partition("-")[0]
     result = measured(name, Path(os.environ["CPCBL_PICTURES"]) / folder)
     assert not result.unexpected
     assert not result.refused

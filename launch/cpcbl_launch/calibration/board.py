@@ -19,6 +19,7 @@ from cpcbl_team.config import MARKERS, MarkerFamily
 
 LEAST_SQUARES = 4
 LEAST_CORNERS = 8  # in a picture: fewer hardly tell a lens from a pose
+WINDOW_PX = (2, 5)  # to each side of a corner: within it there are its own edges only
 PRINTED_PX_PER_M = 300 / 0.0254  # 300 dots an inch
 
 Points = NDArray[np.float32]
@@ -127,7 +128,8 @@ def _in_charuco(grey: Pixels, board: Board) -> Corners:
         pixels, ids, _, _ = cv2.aruco.CharucoDetector(made).detectBoard(grey)
         if ids is not None and len(ids):
             places = np.asarray(made.getChessboardCorners(), np.float32)[np.ravel(ids)]
-            return Corners(places, np.asarray(pixels, np.float32).reshape(-1, 2))
+            free = 0.4 * (1.0 - board.marker_m / board.square_m)  # markers begin at 0.5
+            return Corners(places, _sharpened(grey, np.asarray(pixels), free))
     return _NONE
 
 
@@ -137,19 +139,25 @@ def _in_chess(grey: Pixels, board: Board) -> Corners:
     whole, pixels = cv2.findChessboardCornersSB(grey, (across, down), flags=flags)
     if not whole:
         return _NONE
-    pixels = _sharpened(grey, np.asarray(pixels, np.float32).reshape(down, across, 2))
     rows, columns = np.indices((down, across), np.float32)
     places = np.stack([columns, rows, np.zeros_like(rows)], axis=-1).reshape(-1, 3)
-    return Corners(places * np.float32(board.square_m), pixels.reshape(-1, 2))
+    return Corners(places * np.float32(board.square_m), _sharpened(grey, np.asarray(pixels), 0.4))
 
 
-def _sharpened(grey: Pixels, pixels: Points) -> Points:
-    """Corners (down, across, 2) as the edges around each say: the detector's own are off by more
-    than their scatter, alike in neighbours, which least squares does not expect."""
-    gap = min(float(np.linalg.norm(np.diff(pixels, axis=i), axis=2).min()) for i in (0, 1))
-    half = int(np.clip(0.4 * gap, 2, 5))
-    points = np.ascontiguousarray(pixels.reshape(-1, 1, 2))
-    return np.asarray(cv2.cornerSubPix(grey, points, (half, half), (-1, -1), _PRECISE), np.float32)
+def _sharpened(grey: Pixels, pixels: NDArray[np.floating], free: float) -> Points:
+    """Corners (n, 2) as the edges around each say, where nothing else is within this share of a
+    square.
+
+    Those of the chessboard's detector are off by more than their scatter, alike in neighbours,
+    which least squares does not expect; those of ChArUco's are off by half a pixel in OpenCV
+    4.10.
+    """
+    points = np.ascontiguousarray(pixels.reshape(-1, 1, 2), dtype=np.float32)
+    apart = np.linalg.norm(points - points.reshape(1, -1, 2), axis=2)
+    gap = np.min(apart[apart > 0.0], initial=np.inf)
+    half = int(np.clip(free * gap, *WINDOW_PX))
+    sharp = cv2.cornerSubPix(grey, points, (half, half), (-1, -1), _PRECISE)
+    return np.asarray(sharp, np.float32).reshape(-1, 2)
 
 
 def _charuco(board: Board) -> cv2.aruco.CharucoBoard:

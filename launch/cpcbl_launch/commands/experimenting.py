@@ -156,7 +156,8 @@ def pictures(
     name: Annotated[
         str,
         typer.Argument(
-            metavar="SET", help="duckiebot, frc-speaker, frc-amp; or NAME.csv, NAME.toml beside it."
+            metavar="SET",
+            help="duckiebot, frc-speaker, frc-amp, nao; or NAME.csv, NAME.toml beside it.",
         ),
     ],
     folder: Annotated[Path, typer.Argument(help="Where the set's pictures are.")],

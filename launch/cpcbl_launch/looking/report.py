@@ -72,15 +72,18 @@ def written(look: Look, folder: Path, name: str) -> str:
 
 
 def print_look(report: LookReport, console: Console) -> None:
-    """The table of a frame, and where its picture is."""
+    """What was found, what was not reported with the reason, and where the picture is."""
     console.print(look_table(report))
+    for unclear in report.unclear:
+        names = f": {' or '.join(unclear.names)}" if unclear.names else ""
+        console.print(f"{unclear.reason}{names}", style="yellow", highlight=False)
     if report.picture:
         console.print(report.picture, style="dim", highlight=False, soft_wrap=True)
     console.print()
 
 
 def look_table(report: LookReport) -> Table:
-    """A row for each thing that was found, then what was not reported, with the reason."""
+    """A row for each thing that was found."""
     columns = ("range m", "σ", "bearing °", "σ", "heading °", "σ")
     shown = table(f"{report.robot}, frame {report.frame}", ("seen",), columns)
     for f in report.found:
@@ -88,10 +91,7 @@ def look_table(report: LookReport) -> Table:
         bearings = _cell(f.bearing_deg, 1), _cell(f.bearing_sigma_deg, 2)
         headings = _cell(f.heading_deg, 1), _cell(f.heading_sigma_deg, 1)
         shown.add_row(f.id, *ranges, *bearings, *headings)
-    for unclear in report.unclear:
-        names = f": {' or '.join(unclear.names)}" if unclear.names else ""
-        shown.add_row(f"{unclear.reason}{names}", style="yellow")
-    if not report.found and not report.unclear:
+    if not report.found:
         shown.add_row("nothing", style="dim")
     return shown
 
