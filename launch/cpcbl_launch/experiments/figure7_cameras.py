@@ -23,7 +23,7 @@ from cpcbl_launch.experiments.results import (
     pattern_lines,
 )
 from cpcbl_launch.experiments.runs import Case
-from cpcbl_team.config import Bands, CameraSettings, Light, Side, Team
+from cpcbl_team.config import Bands, CameraSettings, Side, Team
 
 NAVIGATOR = CameraSettings(
     width_px=320,
@@ -40,7 +40,6 @@ NAVIGATOR = CameraSettings(
 OBSERVER = CameraSettings(
     fx_px=600.0, fy_px=600.0, tilt_sigma_deg=0.2, yaw_sigma_deg=0.3, focal_share=0.003
 )
-LIGHT = Light(blur_px=1.0, noise=4.0)
 LANDMARKS: Mapping[str, Bands] = {
     "southwest": ("yellow", "blue"),
     "southeast": ("blue", "yellow"),
@@ -77,12 +76,7 @@ def seeing(team: Team) -> Team:
         )
         for name, robot in team.robots.items()
     }
-    return replace(
-        team,
-        robots=robots,
-        map=replace(team.map, landmarks=marks),
-        simulation=replace(team.simulation, light=LIGHT),
-    )
+    return replace(team, robots=robots, map=replace(team.map, landmarks=marks))
 
 
 def cases() -> Mapping[str, Case]:
