@@ -11,8 +11,8 @@ from msgspec.structs import replace
 from process_helpers import cpcbl_team
 
 from cpcbl_agents.vision.camera import Camera, Floats, Pixels
-from cpcbl_launch.experiments import eyes, eyes_frames
-from cpcbl_launch.experiments.eyes import Batch, Kind, Mistake, Record
+from cpcbl_launch.experiments import eyes, eyes_figures, eyes_frames
+from cpcbl_launch.experiments.eyes_figures import Batch, Kind, Mistake, Record
 from cpcbl_launch.experiments.eyes_frames import Drawn, Thing, judged
 from cpcbl_launch.simulation.render import Light, render
 from cpcbl_launch.simulation.visible import (
@@ -196,7 +196,7 @@ def test_figures_count_what_they_say() -> None:
     wrong = [
         Mistake(frame=1, kind="landmark", id="a", why="wrong id", range_m=1.0, bearing_deg=0.0)
     ]
-    f = eyes.figures("landmark", records, wrong, 0.0, 4.0)
+    f = eyes_figures.figures("landmark", records, wrong, 0.0, 4.0)
     assert (f.due, f.found, f.reported, f.right, f.ranged) == (3, 2, 4, 3, 2)
     assert f.recall == pytest.approx(2 / 3)
     assert f.precision == pytest.approx(3 / 4)
@@ -205,12 +205,12 @@ def test_figures_count_what_they_say() -> None:
     assert f.bearing_sigma_deg == pytest.approx(math.degrees(0.01))
     assert f.range_inside == 0.5
     assert f.bearing_inside == pytest.approx(2 / 3)
-    marker = eyes.figures("marker", records, wrong, 0.0, 4.0)
+    marker = eyes_figures.figures("marker", records, wrong, 0.0, 4.0)
     assert (marker.recall, marker.precision, marker.heading_inside) == (1.0, 1.0, 0.0)
 
 
 def test_nothing_holds_without_figures() -> None:
-    result = eyes.outcome(1, 1, [Batch([], [], {}, {"frame_blank": 1}, 0.0, 0.0)])
+    result = eyes_figures.outcome(1, 1, [Batch([], [], {}, {"frame_blank": 1}, 0.0, 0.0)])
     assert [said for said, held in result.pattern.items() if held] == ["no wrong id"]
 
 
@@ -218,11 +218,11 @@ def test_nothing_holds_without_figures() -> None:
 
 
 @pytest.fixture(scope="module")
-def small() -> eyes.Eyes:
+def small() -> eyes_figures.Eyes:
     return eyes.measured(150, 1, 2, lambda: None)
 
 
-def test_little_is_missed_and_nothing_mistaken(small: eyes.Eyes) -> None:
+def test_little_is_missed_and_nothing_mistaken(small: eyes_figures.Eyes) -> None:
     assert not small.refused
     assert not [m for m in small.mistakes if m.why == "wrong id"]
     least: dict[Kind, int] = {"landmark": 90, "marker": 120}
@@ -239,7 +239,7 @@ def test_little_is_missed_and_nothing_mistaken(small: eyes.Eyes) -> None:
         assert known.bearing_sigma_deg < 0.6
 
 
-def test_stated_sigmas_are_honest(small: eyes.Eyes) -> None:
+def test_stated_sigmas_are_honest(small: eyes_figures.Eyes) -> None:
     for kind, known in small.accuracy.items():
         shares = [known.range_inside, known.bearing_inside]
         shares += [known.heading_inside] if kind == "marker" else []

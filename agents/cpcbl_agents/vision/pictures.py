@@ -106,10 +106,10 @@ def fault(pixels: Pixels, size_px: tuple[int, int]) -> str:
         return "frame_wrong_depth"
     if (pixels.shape[1], pixels.shape[0]) != size_px:
         return "frame_wrong_size"
-    some = pixels[::8, ::8].reshape(-1, 3)
-    if some.std(axis=0).max() >= LEAST_CONTRAST:
+    means, spreads = cv2.meanStdDev(np.ascontiguousarray(pixels[::8, ::8]))
+    if spreads.max() >= LEAST_CONTRAST:
         return ""
-    level = float(some.mean())
+    level = float(means.mean())
     if level < DARK:
         return "frame_black"
     return "frame_white" if level > BRIGHT else "frame_blank"

@@ -34,7 +34,7 @@ LEAST_WEIGHT = 0.1
 """Of a heading that may be true, relative to the best: so much, and three sigma reach it."""
 NARROW = math.radians(1.5)
 """Within so much what is seen changes evenly with the heading; beyond, headings are surveyed."""
-HEADINGS = 41
+HEADINGS = 31
 MOST_SIGMA = math.radians(20.0)
 
 _DIAGONAL = np.eye(3)
@@ -188,7 +188,7 @@ def _surveyed(poses: Floats, sigmas: Floats, pivot: Floats, view: _View) -> tupl
     turns = np.linspace((headings - reach).min(), (headings + reach).max(), HEADINGS)
     middle = poses[0, :2] + _turned(pivot, poses[0, 2:])[0]
     tried = np.column_stack([middle - _turned(pivot, turns), turns])
-    for _ in range(3):
+    for _ in range(2):
         sums = view.sums(tried)
         tried[:, :2] += np.linalg.solve(sums[:, :2, :2], sums[:, :2, 3:])[..., 0]
     sums = view.sums(tried)

@@ -27,7 +27,7 @@ import numpy as np
 from cpcbl_agents.vision.camera import Camera, Floats, Pixels
 from cpcbl_agents.vision.eyes import CameraEyes
 from cpcbl_agents.vision.pictures import decoded
-from cpcbl_launch.experiments.eyes import Batch, Kind, Mistake, Record, Wrong, team
+from cpcbl_launch.experiments.eyes_figures import Batch, Kind, Mistake, Record, Wrong, team
 from cpcbl_launch.simulation.cameras import off_focus, shaken
 from cpcbl_launch.simulation.carriers import SIDES, body_top_m
 from cpcbl_launch.simulation.render import render

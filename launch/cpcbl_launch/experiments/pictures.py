@@ -8,7 +8,12 @@ from typing import Any
 import matplotlib as mpl
 
 from cpcbl_launch.experiments.budget import Curve, Point
-from cpcbl_launch.experiments.eyes import LEAST_RECALL, MOST_BEARING_DEG, MOST_RANGE_SHARE, Eyes
+from cpcbl_launch.experiments.eyes_figures import (
+    LEAST_RECALL,
+    MOST_BEARING_DEG,
+    MOST_RANGE_SHARE,
+    Eyes,
+)
 from cpcbl_launch.experiments.liars import Liars
 from cpcbl_launch.experiments.results import Accuracy, Outcome, Spread
 from cpcbl_team.config import RobotSettings, Team
