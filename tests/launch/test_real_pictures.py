@@ -109,7 +109,8 @@ def test_built_in_sets_are_whole(name: str) -> None:
     team, lines = load_team(path.with_suffix(".toml")), truths(path)
     assert lines
     assert {line.viewer for line in lines} <= team.robots.keys()
-    assert {line.id for line in lines if line.id} <= team.robots.keys()
+    named = team.robots.keys() | team.map.landmarks.keys()
+    assert {line.id for line in lines if line.id} <= named
 
 
 @pytest.mark.parametrize("family", ["apriltag_36h11", "aruco_4x4_50"])
