@@ -13,6 +13,7 @@ from cpcbl_agents.vision.camera import Camera, Floats, Pixels
 from cpcbl_launch.simulation.carriers import quiet
 from cpcbl_launch.simulation.render import Light, Scene, Standing, render
 from cpcbl_launch.simulation.scene import PAINTS
+from cpcbl_launch.simulation.view import NEAREST_M, View
 from cpcbl_team.config import (
     COLOURS,
     Bands,
@@ -414,6 +415,32 @@ def test_what_is_behind_around_or_close_to_the_lens_does_no_harm(
     pixels = picture(subject, settings, [mate("r2", ahead_m, 0.01, 33.0)], Light())
     assert pixels.shape == (480, 640, 3)
     assert pixels.dtype == np.uint8
+
+
+@pytest.mark.parametrize("camera", CAMERAS[:2])
+def test_the_box_around_a_thing_beside_the_lens_holds_what_is_seen_of_it(
+    camera: CameraSettings,
+) -> None:
+    """Also where some of its corners are behind: never all of the picture for next to nothing."""
+    view, random = View(Camera(camera), POSE), np.random.default_rng(5)
+    whole = camera.width_px * camera.height_px
+    small = 0
+    for _ in range(300):
+        corners = view.lens + random.uniform(-0.8, 0.8, 3) + random.uniform(-0.2, 0.2, (8, 3))
+        inside = random.dirichlet(np.ones(8), 4000) @ corners
+        seen = (inside - view.lens) @ view.field_from_camera
+        ahead = seen[seen[:, 2] > NEAREST_M]
+        pixels = ahead @ view.matrix.T
+        x, y = (pixels[:, :2] / pixels[:, 2:]).T
+        shown = (x > 0) & (x < camera.width_px - 1) & (y > 0) & (y < camera.height_px - 1)
+        box = view.box(corners)
+        if box is None:
+            assert not shown.any()
+            continue
+        assert ((box.left <= x) & (x < box.right) & (box.top <= y) & (y < box.bottom))[shown].all()
+        width, height = box.size
+        small += bool(len(ahead) < len(seen) and width * height < 0.5 * whole)
+    assert small
 
 
 def test_a_picture_has_the_camera_s_size() -> None:
