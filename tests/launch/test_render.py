@@ -421,10 +421,9 @@ def test_what_is_behind_around_or_close_to_the_lens_does_no_harm(
 def test_the_box_around_a_thing_beside_the_lens_holds_what_is_seen_of_it(
     camera: CameraSettings,
 ) -> None:
-    """Also where some of its corners are behind: never all of the picture for next to nothing."""
+    """Also where some of its corners are behind; a thing that is out of sight has none."""
     view, random = View(Camera(camera), POSE), np.random.default_rng(5)
-    whole = camera.width_px * camera.height_px
-    small = 0
+    out_of_sight = 0
     for _ in range(300):
         corners = view.lens + random.uniform(-0.8, 0.8, 3) + random.uniform(-0.2, 0.2, (8, 3))
         inside = random.dirichlet(np.ones(8), 4000) @ corners
@@ -436,11 +435,10 @@ def test_the_box_around_a_thing_beside_the_lens_holds_what_is_seen_of_it(
         box = view.box(corners)
         if box is None:
             assert not shown.any()
+            out_of_sight += bool(0 < len(ahead) < len(seen))
             continue
         assert ((box.left <= x) & (x < box.right) & (box.top <= y) & (y < box.bottom))[shown].all()
-        width, height = box.size
-        small += bool(len(ahead) < len(seen) and width * height < 0.5 * whole)
-    assert small
+    assert out_of_sight > 10
 
 
 def test_a_picture_has_the_camera_s_size() -> None:
