@@ -23,6 +23,7 @@ from cpcbl_team.inputs import Sighting
 
 LEAST_PX = 6.0  # high, both bands
 LEAST_BAND_PX = 6.0  # high and wide: what a single band must be to be worth a doubt
+NARROW_PX = 3.5  # wide: blur mixes the middle with what is beside it, and edges move outwards
 RIVAL = 3.0  # what fits so much worse is still possible
 UNSURE = 4.0  # how much worse an edge is known beyond which the colour goes on
 REASONS = "cut_by_frame", "mirror_image", "ranges_disagree", "wrong_shape"  # the most telling first
@@ -115,7 +116,8 @@ class Cylinders:
     def _look(self, o: Outline) -> Look:
         """The outline as angles."""
         panorama = self._panorama
-        edge_sigma = self._settings.edge_sigma_px * panorama.step
+        narrow = NARROW_PX / max(o.right - o.left, 1.0)
+        edge_sigma = self._settings.edge_sigma_px * panorama.step * (1.0 + narrow * narrow)
         middle, rows = 0.5 * (o.left + o.right), (o.top, o.mid, o.foot)
         left, right = (edge_sigma / panorama.scale(x, o.mid).across_px for x in (o.left, o.right))
         top, mid, foot = (edge_sigma / panorama.scale(middle, y).along_px for y in rows)
