@@ -23,7 +23,9 @@ from cpcbl_team.inputs import Sighting
 
 LEAST_PX = 6.0  # high, both bands
 LEAST_BAND_PX = 6.0  # high and wide: what a single band must be to be worth a doubt
-NARROW_PX = 3.5  # wide: blur mixes the middle with what is beside it, and edges move outwards
+NARROW_PX = 4.0
+"""So wide, and range errs twice as much: blur mixes its middle with what is beside it, and moves its
+edges outwards. What it is is judged without that: a wrong name is worse than none."""
 RIVAL = 3.0  # what fits so much worse is still possible
 UNSURE = 4.0  # how much worse an edge is known beyond which the colour goes on
 REASONS = "cut_by_frame", "mirror_image", "ranges_disagree", "wrong_shape"  # the most telling first
@@ -116,8 +118,7 @@ class Cylinders:
     def _look(self, o: Outline) -> Look:
         """The outline as angles."""
         panorama = self._panorama
-        narrow = NARROW_PX / max(o.right - o.left, 1.0)
-        edge_sigma = self._settings.edge_sigma_px * panorama.step * (1.0 + narrow * narrow)
+        edge_sigma = self._settings.edge_sigma_px * panorama.step
         middle, rows = 0.5 * (o.left + o.right), (o.top, o.mid, o.foot)
         left, right = (edge_sigma / panorama.scale(x, o.mid).across_px for x in (o.left, o.right))
         top, mid, foot = (edge_sigma / panorama.scale(middle, y).along_px for y in rows)
@@ -148,12 +149,14 @@ class Cylinders:
         azimuth_sigma = math.hypot(look.sigmas[WIDTH], oblique)
         if sure.hidden == WIDTH:  # the axis is within the radius of the middle of what is seen
             azimuth_sigma += sure.half_width
+        narrow = NARROW_PX * self._panorama.step / max(2.0 * look.seen[WIDTH], 1e-6)
+        range_sigma = sure.sigma * (1.0 + narrow * narrow)
         seen = seen_from_robot(
             (s.x_m, s.y_m),
             Polar(
                 sure.distance,
                 self._panorama.bearing(azimuth),
-                math.hypot(sure.sigma, s.focal_share * sure.distance),
+                math.hypot(range_sigma, s.focal_share * sure.distance),
                 azimuth_sigma,
             ),
         )
