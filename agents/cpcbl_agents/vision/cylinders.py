@@ -24,7 +24,7 @@ from cpcbl_team.inputs import Sighting
 LEAST_PX = 6.0  # high, both bands
 LEAST_BAND_PX = 6.0  # high and wide: what a single band must be to be worth a doubt
 NARROW_PX = 4.0
-"""So wide, and range errs twice as much: blur mixes its middle with what is beside it, and moves its
+"""So wide, and range errs twice as much: blur mixes its middle with what is beside it and moves its
 edges outwards. What it is is judged without that: a wrong name is worse than none."""
 RIVAL = 3.0  # what fits so much worse is still possible
 UNSURE = 4.0  # how much worse an edge is known beyond which the colour goes on
