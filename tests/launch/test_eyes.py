@@ -248,6 +248,17 @@ def test_stated_sigmas_are_honest(small: eyes_figures.Eyes) -> None:
             assert inside > 0.96, kind
 
 
+@pytest.mark.parametrize(
+    "number",
+    [
+        pytest.param(2582, id="a strip of another colour between two bands"),
+        pytest.param(6801, id="a sliver of a mast behind another one"),
+    ],
+)
+def test_what_was_mistaken_once_is_not_again(number: int) -> None:
+    assert eyes_frames.frames(2, number, 1).mistakes == []
+
+
 def test_the_number_of_jobs_changes_no_figure() -> None:
     one, two = (eyes.measured(40, 3, jobs, lambda: None) for jobs in (1, 2))
     assert one.within["landmark"].due > 10

@@ -12,7 +12,15 @@ from typing import NamedTuple
 from cpcbl_agents.vision.camera import Camera, Pixels
 from cpcbl_agents.vision.colours import Blob, Colours
 from cpcbl_agents.vision.glimpses import Doubt, Found, Glimpses
-from cpcbl_agents.vision.outlines import Candidate, Outline, Patch, candidates, outlined, patch_of
+from cpcbl_agents.vision.outlines import (
+    GAP_PX,
+    Candidate,
+    Outline,
+    Patch,
+    candidates,
+    outlined,
+    patch_of,
+)
 from cpcbl_agents.vision.panorama import panorama_of
 from cpcbl_agents.vision.silhouette import FOOT, TOP, WIDTH, Shape
 from cpcbl_agents.vision.twins import without_twins
@@ -22,6 +30,7 @@ from cpcbl_team.geometry import wrap_angle
 from cpcbl_team.inputs import Sighting
 
 LEAST_PX = 6.0  # high, both bands
+LEAST_PART_PX = 3.0  # wide
 LEAST_BAND_PX = 6.0  # high and wide: what a single band must be to be worth a doubt
 NARROW_PX = 4.0
 """So wide, and range errs twice as much: blur mixes its middle with what is beside it and moves its
@@ -82,7 +91,14 @@ class Cylinders:
         if len(names) > 1:
             return Doubt("ambiguous", names, pair.outline)
         (one,) = sure
+        if one.hidden is not None and not self._is_good_part(pair, one):
+            return Doubt("cut_by_frame" if one.look.cut else "wrong_shape", names, pair.outline)
         return Found(self._sighting(names[0], one), one.look.outline)
+
+    def _is_good_part(self, pair: Candidate, part: Verdict) -> bool:
+        """Whether a part is no sliver, and nothing shows between its bands."""
+        width = 2.0 * part.look.seen[WIDTH] / self._panorama.step
+        return width >= LEAST_PART_PX and pair.lower.top - pair.upper.bottom <= GAP_PX
 
     def _stranger(self, pixels: Pixels, pair: Candidate) -> Doubt:
         """A pair that nothing known has: perhaps the mirror image of something."""
