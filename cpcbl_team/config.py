@@ -518,15 +518,14 @@ class Team(Table, frozen=True, kw_only=True):
         return any(robot.source == "simulated" for robot in self.robots.values())
 
     @property
-    def renders(self) -> bool:
-        """Whether the simulated field must make pictures."""
-        robots = self.robots.values()
-        return any(r.source == "simulated" and r.sensing == "camera" for r in robots)
+    def cameras(self) -> tuple[str, ...]:
+        """The robots that see by a camera."""
+        return tuple(name for name, robot in self.robots.items() if robot.sensing == "camera")
 
     @property
-    def sees(self) -> bool:
-        """Whether any robot has a camera."""
-        return any(robot.sensing == "camera" for robot in self.robots.values())
+    def renders(self) -> bool:
+        """Whether the simulated field must make pictures."""
+        return any(self.robots[name].source == "simulated" for name in self.cameras)
 
     def messages_per_s(self, robot: str) -> float | None:
         """The rate at which a robot earns its share of the match's messages; None: no limit."""

@@ -82,8 +82,7 @@ def must_have_opencv(what: str) -> None:
 def must_see(team: Team, robots: Collection[str] = (), field: bool = False) -> None:
     """Raises ValueError where these robots, or the simulated field, need OpenCV and it is not
     there."""
-    cameras = [name for name, robot in team.robots.items() if robot.sensing == "camera"]
-    eyes = [f"robots.{name}" for name in cameras if name in robots]
+    eyes = [f"robots.{name}" for name in team.cameras if name in robots]
     who = eyes[0] if eyes else "the simulated field" if field and team.renders else ""
     if who and importlib.util.find_spec("cv2") is None:
         raise ValueError(

@@ -254,7 +254,7 @@ def _vision_problems(team: Team) -> Iterator[str]:
             yield f"{key}.colours: no colour {colour!r}; use one of {known}, or add its thresholds"
         if colours is not None and colours[0] == colours[1]:
             yield f"{key}.colours: both bands are {colours[0]}; use two colours"
-    if team.sees:
+    if team.cameras:
         marks = [m.colours for m in team.map.landmarks.values() if m.colours is not None]
         for twice in sorted({c for c in marks if marks.count(c) > 1}):
             yield f"map.landmarks: two have the colours {list(twice)}; give each its own"

@@ -93,7 +93,7 @@ class OnThisMachine:
     def __init__(self, run: Run, folder: Path, stop: Stopping) -> None:
         self._run, self._folder = run, folder
         self._here = run.team.robots if run.here is None else run.here
-        cameras = sum(run.team.robots[name].sensing == "camera" for name in self._here)
+        cameras = sum(name in self._here for name in run.team.cameras)
         self.lead_s = LEAD_S + LEAD_S_A_PROCESS * len(self._here) + LEAD_S_A_CAMERA * cameras
 
     def router(self) -> AbstractContextManager[Bus]:

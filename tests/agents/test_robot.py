@@ -294,9 +294,8 @@ def test_a_late_frames_fixes_are_of_its_own_time() -> None:
     assert (fix.x_m, fix.y_m) == pytest.approx((2.03, 0.0), abs=0.02)
 
 
-@pytest.mark.parametrize("learns", [True, False])
-def test_fixes_are_without_the_bias_that_the_robot_has_learned(learns: bool) -> None:
-    """Bearings are 0.1 rad too large: the mate is 2 m ahead all the same."""
+def stood_with_bias(learns: bool) -> Robot:
+    """Half a second; its bearings are 0.1 rad too large, as it has learned if it learns."""
     rules = LocalizerSettings(self_calibration=learns)
     subject = robot(with_robot(TEAM, "me", localizer=rules))
     state = subject.filter.timeline.state
@@ -305,6 +304,13 @@ def test_fixes_are_without_the_bias_that_the_robot_has_learned(learns: bool) -> 
     for piece in pieces(0.5, 0.0, 0.0):
         subject.handle(piece, piece.stamp_ns)
         subject.handle(Tick(), piece.stamp_ns)
+    return subject
+
+
+@pytest.mark.parametrize("learns", [True, False])
+def test_fixes_are_without_the_bias_that_the_robot_has_learned(learns: bool) -> None:
+    """Bearings are 0.1 rad too large: the mate is 2 m ahead all the same."""
+    subject = stood_with_bias(learns)
     (fix,) = fixes(subject.handle(saw(400 * MS, Sighting("mate", 2.0, 0.1)), 500 * MS))
     bearing = 0.0 if learns else 0.1
     expected = 2.0 * math.cos(bearing), 2.0 * math.sin(bearing)
@@ -314,14 +320,7 @@ def test_fixes_are_without_the_bias_that_the_robot_has_learned(learns: bool) -> 
 @pytest.mark.parametrize("learns", [True, False])
 def test_a_heading_is_told_without_the_learned_bias_and_used(learns: bool) -> None:
     """A marker is seen against the line of sight, so it is off by as much as the bearing."""
-    rules = LocalizerSettings(self_calibration=learns)
-    subject = robot(with_robot(TEAM, "me", localizer=rules))
-    state = subject.filter.timeline.state
-    known = Learned(bearing_bias_rad=0.1)
-    subject.filter.timeline.state = replace(state, memory=replace(state.memory, learned=known))
-    for piece in pieces(0.5, 0.0, 0.0):
-        subject.handle(piece, piece.stamp_ns)
-        subject.handle(Tick(), piece.stamp_ns)
+    subject = stood_with_bias(learns)
     seen = Sighting("mate", 2.0, 0.1, None, None, 1.1, 0.05)
     (fix,) = fixes(subject.handle(saw(400 * MS, seen), 500 * MS))
     own = subject.filter.timeline.state.estimate.pose.heading

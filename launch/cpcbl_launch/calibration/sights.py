@@ -65,7 +65,7 @@ def recorded(paths: Sequence[Path], robot: str | None) -> Looked:
         if not recording.truth:
             raise LogError(f"{path}: holds no truth; publish poses on field/truth")
         where, team = placed(recording.team.map.landmarks, recording.truth), recording.team
-        for name in [robot] if robot else cameras(team):
+        for name in [robot] if robot else team.cameras:
             said = [i for i in recording.inputs.get(name, ()) if isinstance(i, Sightings)]
             if said and len(where.truth.get(name, ())) > 1:
                 camera = team.robots[name].camera
@@ -77,14 +77,9 @@ def recorded(paths: Sequence[Path], robot: str | None) -> Looked:
     return Looked(tuple(names), found[0][1], seen)
 
 
-def cameras(team: Team) -> list[str]:
-    """The robots that see by a camera."""
-    return [name for name, robot in team.robots.items() if robot.sensing == "camera"]
-
-
 def viewer(team: Team, robot: str | None) -> str:
     """Whose camera it is: the one that is named, or the only one. Raises ValueError."""
-    there = cameras(team)
+    there = team.cameras
     if robot is None and len(there) == 1:
         return there[0]
     if robot not in there:

@@ -101,7 +101,7 @@ def _build(context: str | None, extras: str) -> str:
 
 def extras_of(team: Team) -> str:
     """The extras of this program that the containers of a team need."""
-    return "camera" if team.sees else ""
+    return "camera" if team.cameras else ""
 
 
 def _scheme(how: Deployment) -> str:

@@ -122,7 +122,7 @@ def _eyes(viewer: str) -> CameraEyes:
 def drawn(random: np.random.Generator) -> Drawn:
     """A viewer, where everything stands, and the light."""
     names = list(team().robots)
-    viewers = [name for name in names if team().robots[name].sensing == "camera"]
+    viewers = team().cameras
     viewer = viewers[int(random.integers(len(viewers)))]
     scene = _scene().with_clutter(int(random.integers(MOST_CLUTTER + 1)), random)
     posts = [*scene.landmarks.values(), *scene.clutter]

@@ -29,9 +29,8 @@ class Cameras:
     def __init__(self, team: Team, seed: int) -> None:
         self._scene = Scene.of(team)
         self._bare = self._scene.without_landmarks()
-        seeing = [name for name, robot in team.robots.items() if robot.sensing == "camera"]
         self._random = {
-            name: np.random.default_rng((seed, _SEED, i)) for i, name in enumerate(seeing)
+            name: np.random.default_rng((seed, _SEED, i)) for i, name in enumerate(team.cameras)
         }
         light, self._noise = team.simulation.light, team.simulation.noise
         self._light = replace(light, noise=light.noise * self._noise)

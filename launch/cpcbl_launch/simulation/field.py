@@ -418,7 +418,7 @@ def _cameras(team: Team, seed: int) -> "Cameras | None":
 def _in_turn(team: Team, name: str, from_ns: int) -> int | None:
     """When a camera's first frame is due: one after the other, as cameras do not wait for each
     other and pictures take time."""
-    robots = [n for n, robot in team.robots.items() if robot.sensing == "camera"]
+    robots = team.cameras
     if name not in robots:
         return None
     period_ns = 1e9 / team.robots[name].sensor.rate_hz
