@@ -63,6 +63,9 @@ class OdometrySettings(OdometryNoise, frozen=True, kw_only=True):
     distance_loss_m_per_rad: NotNegative = 0.0
     """true distance = distance_scale x reported - distance_loss_m_per_rad x |reported turn|, but no
     less than none: wheels that are told to drive a curve do not reach their speed."""
+    least_speed_m_s: NotNegative = 0.0
+    """A robot that is told to drive slower drives this fast (before that loss): motors have a dead
+    zone, and odometry that is made of commands does not know of it."""
     turn_scale: Positive = 1.0
     turn_bias_rad_per_m: float = 0.0
     """true turn = turn_scale x reported + turn_bias_rad_per_m x true distance."""

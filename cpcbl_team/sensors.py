@@ -18,6 +18,8 @@ def corrected_odometry(piece: Odometry, s: OdometrySettings) -> Odometry:
     """What the wheels really did, and when."""
     delay_ns = int(s.delay_s * 1e9)
     way = s.distance_scale * abs(piece.distance_m)
+    if way:
+        way = max(way, s.least_speed_m_s * (piece.stamp_ns - piece.from_ns) * 1e-9)
     way = max(0.0, way - s.distance_loss_m_per_rad * abs(piece.turn_rad))
     distance = math.copysign(way, piece.distance_m)
     turn = s.turn_scale * piece.turn_rad + s.turn_bias_rad_per_m * distance

@@ -111,6 +111,15 @@ def test_a_turn_on_the_spot_does_not_drive_backwards() -> None:
     assert corrected_odometry(Odometry(0, 10, 0.01, 1.0), s).distance_m == 0.0
 
 
+@pytest.mark.parametrize(
+    ("commanded", "driven"), [(0.03, 0.03), (0.01, 0.02), (-0.01, -0.02), (0.0, 0.0)]
+)
+def test_nobody_drives_slower_than_his_motors_can(commanded: float, driven: float) -> None:
+    s = OdometrySettings(least_speed_m_s=0.02)
+    piece = Odometry(0, 500_000_000, 0.5 * commanded, 0.0)
+    assert corrected_odometry(piece, s).distance_m == pytest.approx(0.5 * driven)
+
+
 @pytest.mark.parametrize("teammate", [False, True])
 @pytest.mark.parametrize("is_depth", [False, True])
 def test_readings_made_from_the_truth_are_corrected_to_it(teammate: bool, is_depth: bool) -> None:

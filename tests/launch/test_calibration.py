@@ -213,6 +213,29 @@ def test_gross_outliers_do_not_matter() -> None:
             assert dirty[name].value == pytest.approx(estimate.value, abs=slack), name
 
 
+def crawling(least_speed: float, slow: float = 0.008) -> RobotLog:
+    """Straight on, by turns at 0.3 m/s and slowly; the truth is known to 0.5 mm."""
+    times = np.arange(0.0, 120.0, 0.02)
+    commanded = np.where(times % 10.0 < 5.0, 0.3, slow)
+    way = np.concatenate([[0.0], np.cumsum(np.maximum(commanded, least_speed) * 0.02)[:-1]])
+    way += np.random.default_rng(3).normal(0.0, 0.0005, len(way))
+    nothing = np.zeros_like(way)
+    from_s = times[:-1:5]
+    step = np.full_like(from_s, 0.1)
+    odometry = np.stack([from_s, from_s + 0.1, commanded[:-1:5] * step, 0.0 * step], axis=1)
+    return RobotLog(
+        np.stack([times, way, nothing, nothing], axis=1), odometry, np.empty((0, 4)), ()
+    )
+
+
+def test_motors_with_a_dead_zone_are_found_to_have_one() -> None:
+    found = calibrate_odometry([crawling(least_speed=0.02)])
+    assert found["least_speed_m_s"].value == pytest.approx(0.02, abs=0.001)
+    assert found["distance_scale"].value == pytest.approx(1.0, abs=3e-3)
+    without = calibrate_odometry([crawling(least_speed=0.0)])
+    assert "least_speed_m_s" not in without
+
+
 def test_a_robot_that_only_turns_tells_no_distance_scale() -> None:
     found = calibrate_odometry([circling(turn_rate=0.5, speed=0.0)])
     assert "distance_scale" not in found

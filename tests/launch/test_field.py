@@ -40,6 +40,7 @@ from cpcbl_team.config import (
 )
 from cpcbl_team.geometry import Pose2, step
 from cpcbl_team.inputs import Odometry, Position, Sighting, Sightings
+from cpcbl_team.sensors import corrected_odometry
 from cpcbl_transport import topics
 from cpcbl_transport.bus import MemoryHub
 from cpcbl_transport.messages import Body, Drive, Join, Refusal, Truths, encode
@@ -105,6 +106,20 @@ def test_corrected_odometry_adds_up_to_the_true_way(
         assert pose == pytest.approx(subject.robots["r1"].pose, abs=1e-9)
     assert at_ns == subject.now_ns == 2 * SECOND
     assert math.hypot(pose.x - 1.0, pose.y - 2.0) > 0.2
+
+
+@pytest.mark.parametrize("loss", [0.0, 0.05])
+def test_a_robot_that_is_told_to_crawl_drives_at_its_least_speed(loss: float) -> None:
+    odometry = OdometrySettings(
+        rate_hz=50.0, distance_scale=0.9, distance_loss_m_per_rad=loss, least_speed_m_s=0.1
+    )
+    subject = field(r1=robot(1.0, 2.0, 30.0, odometry=odometry))
+    pose = subject.robots["r1"].pose
+    for speed, turn_rate in ((0.05, 0.0), (0.05, 0.5), (-0.02, 0.2), (0.3, 0.2), (0.0, 0.5)):
+        for piece in drive(subject, 25, speed, turn_rate):
+            driven = corrected_odometry(piece, odometry)
+            pose = step(pose, driven.distance_m, driven.turn_rad)
+        assert pose == pytest.approx(subject.robots["r1"].pose, abs=1e-9)
 
 
 def test_a_robot_that_does_not_move_reports_no_odometry() -> None:

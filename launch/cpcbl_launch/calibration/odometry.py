@@ -17,6 +17,8 @@ from cpcbl_launch.calibration.statistics import (
     Estimate,
     Fit,
     Integers,
+    Keep,
+    Mask,
     jackknife,
     kept,
     robust_fit,
@@ -32,6 +34,9 @@ WINDOW_S = 2.0
 NOISE_WINDOWS_S = (1.0, 2.0, 4.0, 8.0, 16.0)
 LEAST_MOTION = 0.02  # m or rad in a window; less tells nothing of scales
 DELAYS_S = np.arange(0.0, 1.001, 0.02)
+LEAST_SPEEDS_M_S = np.arange(0.0, 0.0501, 0.001)
+SLIPPED_M = 0.1  # a way that errs more than this in a window is no matter of a dead zone
+SURE = 3.0  # standard errors
 NUDGE_S = 0.01
 CORRECTIONS = (
     "distance_scale",
@@ -195,6 +200,41 @@ def odometry_delay_s(logs: Sequence[RobotLog]) -> float:
     return float(DELAYS_S[int(np.argmin(costs))])
 
 
+def least_speed(logs: Sequence[RobotLog], now: Corrections) -> Estimate | None:
+    """The speed (m/s) at which it drives when told to drive slower, if the logs tell it: that on
+    a grid with which ways fit best.
+    """
+    each, stretch = [], np.empty(0, np.int64)
+    for speed in LEAST_SPEEDS_M_S:
+        rows = odometry_rows(
+            [no_slower(log, speed / now.distance_scale) for log in logs], now.delay_s, WINDOW_S
+        )
+        each.append(np.abs(rows.true_way - now.ways(rows)))
+        stretch = rows.stretch
+    errors = np.minimum(each, SLIPPED_M)
+    slow = np.ptp(errors, axis=0) > 0.0
+    if slow.sum() < LEAST_ROWS // 2:
+        return None
+
+    def best(keep: Keep) -> Floats:
+        cost = errors[:, keep(stretch) & slow].sum(axis=1)
+        return LEAST_SPEEDS_M_S[[int(np.argmin(cost))]]
+
+    (found,) = jackknife(best, stretch)
+    step = float(LEAST_SPEEDS_M_S[1])
+    found = Estimate(found.value, max(found.standard_error, step / math.sqrt(12.0)))
+    return found if found.value > SURE * found.standard_error else None
+
+
+def no_slower(log: RobotLog, speed_m_s: float) -> RobotLog:
+    """The log as of a robot that is never told to drive slower, but for standing."""
+    odometry = log.odometry.copy()
+    from_s, until_s, distance, _ = odometry.T
+    slow = (distance != 0.0) & (np.abs(distance) < speed_m_s * (until_s - from_s))
+    odometry[slow, 2] = np.copysign(speed_m_s * (until_s - from_s), distance)[slow]
+    return log._replace(odometry=odometry)
+
+
 def odometry_fit(rows: OdometryRows, now: Corrections, noise: Floats) -> Fit:
     """Moving windows as rows of a fit of `CORRECTIONS`, in units of their sigma.
 
@@ -259,29 +299,52 @@ def _covering(errors: Floats, columns: Floats, counts: Floats) -> Floats:
     return parts * max(1.0, worst)
 
 
+class _Fitted(NamedTuple):
+    """Corrections that fit best, and what they were fitted to."""
+
+    now: Corrections
+    known: Mask  # of `CORRECTIONS`
+    fit: Fit
+    windows: Sequence[OdometryRows]  # of `NOISE_WINDOWS_S`
+
+
 def calibrate_odometry(logs: Sequence[RobotLog]) -> dict[str, Estimate]:
     """Values by the names of `OdometrySettings`; those that the logs do not tell are missing."""
     logs = [log for log in logs if len(log.odometry)]
     if not logs:
         return {}
-    now = Corrections(1.0, 1.0, odometry_delay_s(logs), 0.0, 0.0)
-    for _ in range(4):
-        windows = [odometry_rows(logs, now.delay_s, length_s) for length_s in NOISE_WINDOWS_S]
-        noise = odometry_noise(windows, now)
-        if np.isnan(noise).all():
-            return {}
-        rows = odometry_rows(logs, now.delay_s, WINDOW_S)
-        fit = odometry_fit(rows, now, np.nan_to_num(noise[0]))
-        known = told(fit.columns, LIMITS)
-        now = _changed(now, solved(fit, known), bool(known[2]))
+    found = _fitted(logs, Corrections(1.0, 1.0, odometry_delay_s(logs), 0.0, 0.0))
+    least = None if found is None else least_speed(logs, found.now)
+    if found is not None and least is not None:
+        speed = least.value / found.now.distance_scale
+        found = _fitted([no_slower(log, speed) for log in logs], found.now)
+    if found is None:
+        return {}
+    now, known, fit, windows = found
     changes = jackknife(lambda keep: solved(kept(fit, keep(fit.stretch)), known), fit.stretch)
-    found = [Estimate(v, c.standard_error) for v, c in zip(now, changes, strict=True)]
+    values = [Estimate(v, c.standard_error) for v, c in zip(now, changes, strict=True)]
     grown = sigmas(
         lambda keep: odometry_noise([kept(w, keep(w.stretch)) for w in windows], now),
         windows[0].stretch,
     )
-    result = {name: v for name, v, k in zip(CORRECTIONS, found, known, strict=True) if k}
+    result = {name: v for name, v, k in zip(CORRECTIONS, values, known, strict=True) if k}
+    if least is not None:
+        result["least_speed_m_s"] = least
     return result | dict(zip(NOISE, grown, strict=False))
+
+
+def _fitted(logs: Sequence[RobotLog], now: Corrections) -> _Fitted | None:
+    """None where too little moved."""
+    for _ in range(4):
+        windows = [odometry_rows(logs, now.delay_s, length_s) for length_s in NOISE_WINDOWS_S]
+        noise = odometry_noise(windows, now)
+        if np.isnan(noise).all():
+            return None
+        rows = odometry_rows(logs, now.delay_s, WINDOW_S)
+        fit = odometry_fit(rows, now, np.nan_to_num(noise[0]))
+        known = told(fit.columns, LIMITS)
+        now = _changed(now, solved(fit, known), bool(known[2]))
+    return _Fitted(now, known, fit, windows)
 
 
 def _changed(now: Corrections, change: Floats, tells_delay: bool) -> Corrections:

@@ -37,6 +37,7 @@ _CALIBRATED = (
         {
             "distance_scale": "scale",
             "distance_loss_m_per_rad": "loss m/rad",
+            "least_speed_m_s": "least m/s",
             "delay_s": "delay s",
         },
     ),

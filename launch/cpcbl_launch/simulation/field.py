@@ -105,12 +105,26 @@ class Delayed:
         return late * before[0] + soon * now[0], late * before[1] + soon * now[1]
 
 
+def really_driven(distance: float, turn: float, seconds: float, o: OdometrySettings) -> float:
+    """How far wheels go that are told to go this far: no slower than their least speed."""
+    if not (distance and o.least_speed_m_s):
+        return distance
+    lost = o.distance_loss_m_per_rad * abs(_reported_turn(distance, turn, o))
+    way = max(abs(distance) + lost, o.least_speed_m_s * seconds) - lost
+    return math.copysign(max(way, 0.0), distance)
+
+
 def misreported(distance: float, turn: float, o: OdometrySettings) -> tuple[float, float]:
-    """What wheels report of a true motion: the inverse of `corrected_odometry`."""
-    reported_turn = (turn - o.turn_bias_rad_per_m * distance) / o.turn_scale
+    """What wheels report of a motion that they were told: `corrected_odometry` makes of it what
+    is `really_driven`, and without a least speed the motion itself."""
+    reported_turn = _reported_turn(distance, turn, o)
     lost = o.distance_loss_m_per_rad * abs(reported_turn) if distance else 0.0
     way = (abs(distance) + lost) / o.distance_scale
     return math.copysign(way, distance), reported_turn
+
+
+def _reported_turn(distance: float, turn: float, o: OdometrySettings) -> float:
+    return (turn - o.turn_bias_rad_per_m * distance) / o.turn_scale
 
 
 def misread(
@@ -168,8 +182,8 @@ class SimulatedRobot:
         distance = self.drive.speed_m_s * seconds if commanded else 0.0
         turn = self.drive.turn_rate_rad_s * seconds if commanded else 0.0
         self._reported = (self._reported[0] + distance, self._reported[1] + turn)
-        distance, turn = self._motion.next((distance, turn))
         o = self.settings.odometry
+        distance, turn = self._motion.next((really_driven(distance, turn, seconds, o), turn))
         along = math.sqrt(
             o.distance_sigma_m_per_sqrt_m**2 * abs(distance)
             + o.distance_sigma_m_per_sqrt_rad**2 * abs(turn)
