@@ -12,8 +12,8 @@ Schmidt 1966) and gives the correlated sideways drift of resolution b.
 import math
 from collections.abc import Iterable
 from enum import Enum
-from math import hypot, remainder, tau
-from typing import NamedTuple
+from math import hypot
+from typing import Final, NamedTuple
 
 from cpcbl_team.gaussian import Covariance2
 from cpcbl_team.geometry import Pose2, new, wrap_angle
@@ -73,10 +73,12 @@ class Covariance3(NamedTuple):
         )
 
 
-SMALLEST_VARIANCE = 1e-10  # (10 um)^2, (10 urad)^2: what is called exact
-SHARPEST_VARIANCE = 1e-8  # of a measurement: sharper ones drown the inverse of I + P A in rounding
-SPREAD_SHARE = 0.25  # of an ellipse's spread that its circle keeps
-ZERO3 = Covariance3(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+SMALLEST_VARIANCE: Final = 1e-10  # (10 um)^2, (10 urad)^2: what is called exact
+SHARPEST_VARIANCE: Final = (
+    1e-8  # of a measurement: sharper ones drown the inverse of I + P A in rounding
+)
+SPREAD_SHARE: Final = 0.25  # of an ellipse's spread that its circle keeps
+ZERO3: Final = Covariance3(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 Row = tuple[float, float, float]
 
 
@@ -105,7 +107,10 @@ class Scope(Enum):
     HEADING = "heading"
 
 
-POSE, POSITION, HEADING = Scope  # a look-up in an enum costs as much as a scalar update
+# a look-up in an enum costs as much as a scalar update
+POSE: Final = Scope.POSE
+POSITION: Final = Scope.POSITION
+HEADING: Final = Scope.HEADING
 
 
 class Information(NamedTuple):
@@ -218,15 +223,15 @@ def merge(
     """
     (x, y, heading), covariance, shared = prior
     xx, xy, yy, xh, yh, hh = covariance
-    ex, ey, eh = evidence.vector
-    survive = survival(covariance, evidence.matrix)
+    matrix, (ex, ey, eh) = evidence
+    survive = survival(covariance, matrix)
     a, b, c, d, e, f, g, h, i = survive
     # survive times covariance, as in `product`, of it what is in scope
     xh_after = g * xx + h * xy + i * xh
     yh_after = g * xy + h * yy + i * yh
     if scope is not POSITION:
         hh = g * xh + h * yh + i * hh
-        heading = remainder(heading + xh_after * ex + yh_after * ey + hh * eh, tau)
+        heading = wrap_angle(heading + xh_after * ex + yh_after * ey + hh * eh)
     if scope is not HEADING:
         xx, xy, yy = a * xx + b * xy + c * xh, d * xx + e * xy + f * xh, d * xy + e * yy + f * yh
         x += xx * ex + xy * ey + xh_after * eh

@@ -8,10 +8,9 @@ the two together.
 """
 
 import math
-from collections.abc import Container, Mapping, Sequence
-from math import atan2, cos, remainder, sin, sqrt, tau
-
-import msgspec
+from collections.abc import Container, Mapping
+from math import atan2, cos, pi, remainder, sin, sqrt, tau
+from typing import NamedTuple
 
 from cpcbl_team.config import Field, Landmark, LocalizationSettings
 from cpcbl_team.constraints import NEAREST_M
@@ -33,18 +32,18 @@ from cpcbl_team.sensors import LARGEST_BEARING_RAD, LARGEST_M, range_to_expect
 from cpcbl_team.state import Evidence, State
 
 
-class Said(msgspec.Struct, frozen=True, gc=False):
+class Said(NamedTuple):
     """What the landmarks of a frame say."""
 
     evidence: Information  # about the offset from the prior
-    used: list[str]
+    used: dict[str, int]  # the objects that count, and when: now
     rejected: int  # by the gate
     offered: bool  # anything of the type that was asked for, accepted or not
     pieces: list[Evidence]  # for finding the robot again
     others: list[Sighting]  # not plain
 
 
-Places = Mapping[str, tuple[float, float, bool, bool]]  # x, y, by range, by bearing
+Places = dict[str, tuple[float, float, bool, bool]]  # x, y, by range, by bearing
 
 
 class Landmarks:
@@ -73,7 +72,7 @@ class Landmarks:
     def read(
         self,
         state: State,
-        sightings: Sequence[Sighting],
+        sightings: tuple[Sighting, ...],
         turn: Scope | None,
         resting: Container[str],
         noted: Container[str],
@@ -87,10 +86,10 @@ class Landmarks:
         places, as_ray = self._places_for(turn), turn is POSITION
         share, floor, farthest = self._range_model
         sharp, sine_squared, (gate, _) = self._heading_weight, self._sine_squared, self._gates
-        (x, y, h), covariance, _ = state.estimate
+        now, ((x, y, h), covariance, _) = state.stamp_ns, state.estimate
         axx = axy = ayy = axh = ayh = ahh = bx = by = bh = 0.0
         rejected, offered = 0, False
-        used: list[str] = []
+        used: dict[str, int] = {}
         pieces: list[Evidence] = []
         others: list[Sighting] = []
         for seen in sightings:
@@ -137,7 +136,9 @@ class Landmarks:
                 pass
             elif not as_ray:  # a heading
                 m, n, k = -dy / q, dx / q, sharp
-                f = remainder(atan2(dy, dx) - bearing - h, tau)
+                f = atan2(dy, dx) - bearing - h
+                if not -pi <= f <= pi:
+                    f = remainder(f, tau)
             else:  # a ray
                 direction = h + bearing
                 c, s = cos(direction), sin(direction)
@@ -154,7 +155,7 @@ class Landmarks:
             ):
                 rejected += 1
                 continue
-            used.append(name)
+            used[name] = now
             # the sum
             if range_m is not None:
                 wu, wv = w * u, w * v
@@ -175,7 +176,8 @@ class Landmarks:
                 by += kn * f
                 bh += k * f
         matrix = new(Covariance3, (axx, axy, ayy, axh, ayh, ahh))
-        return Said(Information(matrix, (bx, by, bh)), used, rejected, offered, pieces, others)
+        evidence = new(Information, (matrix, (bx, by, bh)))
+        return new(Said, (evidence, used, rejected, offered, pieces, others))
 
     def _places_for(self, turn: Scope | None) -> Places:
         if turn is POSE:

@@ -46,7 +46,7 @@ from cpcbl_team.sightings import (
     offers,
     surprise,
 )
-from cpcbl_team.state import FIX, Memory, State, innovated
+from cpcbl_team.state import FIX, Memory, State, Updates
 from cpcbl_team.whereabouts import Whereabouts
 
 UNSTEERABLE_SIGMA_RAD = math.radians(100.0)  # beyond, no bearing can be linearized
@@ -68,12 +68,15 @@ class Localizer:
         self._orders: tuple[Turns, Turns] = ((HEADING, POSITION, None), (POSITION, HEADING, None))
         if not self._rules.alternates:
             self._orders = ((POSE, None), (POSE, None))
+        self._window = self._rules.lost_window
         self._rests = self._rules.object_interval_s > 0.0
         self._timeout_ns = int(settings.odometry.timeout_s * 1e9)
         self._correlated = settings.sensor.correlation_s > 0.0
         self._learns = self._rules.learns
         self._gates = chi_square_bounds(self._rules.gate_probability)
         self._landmarks = Landmarks(field, settings, self._gates)
+        self._limits = recovery.Limits.of(self._rules)
+        self._limits_when_lost = recovery.Limits.of(self._rules, slack=0.5)
         self._max_age_ns = int(settings.collaboration.max_age_s * 1e9)
         self._trust = settings.collaboration.trust
         self._judges = self._trust.enabled and not self._weighted  # without a covariance, no NIS
@@ -94,22 +97,23 @@ class Localizer:
         if self._judges and frame.stamp_ns - state.memory.told_ns <= trust.WINDOW_NS:
             state, accepted, refused = self._believed(state, said, accepted, refused)
             prior = state.estimate
-        rejected = said.rejected + len(refused)
+        evidence, used, rejected, *_ = said
         if self._weighted:
             estimate = weighted.merged(
                 prior, [c for _, cs, _ in accepted for c in cs], self._rules.weights
             )
         else:
-            evidence = combined(said.evidence, accepted) if accepted else said.evidence  # 4.
+            evidence = combined(evidence, accepted) if accepted else evidence  # 4.
             estimate = merge(prior, evidence, scope, self._as_circle and not accepted)  # 5.
             for m, cs, _ in accepted:
                 if m.teammate:
                     told = observation_of(prior, m, cs, estimate)
                     estimate = self._merge_teammate(estimate, told, scope)
-        used = [*said.used, *(m.source for m, *_ in accepted)] if accepted else said.used
+        if accepted:
+            used = {**used, **{m.source: frame.stamp_ns for m, *_ in accepted}}
         if accepted or self._reduces or estimate.shared is not ZERO3:
             estimate = self._reduced(estimate)
-        return self._judged(self._updated(state, estimate, turn, used, rejected))
+        return self._judged(self._updated(state, estimate, turn, used, rejected + len(refused)))
 
     # Step 1 -----------------------------------------------------------------------------------
 
@@ -126,6 +130,7 @@ class Localizer:
             odometry,
             max(state.odometry_ns, odometry.stamp_ns),
             state.memory,
+            state.updates,
         )
 
     def moved(self, state: State, until_ns: int) -> State:
@@ -154,7 +159,7 @@ class Localizer:
         silent_ns = until_ns - odometry_ns - self._timeout_ns
         if silent_ns > 0:
             estimate = self._unknown_motion(estimate, min(silent_ns, until_ns - stamp_ns))
-        return State(until_ns, estimate, reckoned, motion, odometry_ns, memory)
+        return State(until_ns, estimate, reckoned, motion, odometry_ns, memory, state.updates)
 
     def _unknown_motion(self, estimate: Estimate, silent_ns: int) -> Estimate:
         """The growth of uncertainty while odometry is missing (a second of it: gap_speed)."""
@@ -174,11 +179,11 @@ class Localizer:
         its other usable sightings. New evidence and faults are in the state's memory then."""
         memory, now, sightings = state.memory, frame.stamp_ns, frame.sightings
         noted = recovery.noted(memory, state.stamp_ns)
-        resting = self._resting(memory, now) if self._rests or now < state.stamp_ns else ()
+        resting = self._resting(state.updates, now) if self._rests or now < state.stamp_ns else ()
         for turn in self._turns(state):
             said = self._landmarks.read(state, sightings, turn, resting, noted)
             seen, faults = self._others(state, said.others, now) if said.others else ([], [])
-            fresh = self._fresh(memory, seen, now) if seen else seen
+            fresh = self._fresh(state.updates, seen, now) if seen else seen
             if said.offered or any(offers(m, turn, self._rules) for m in fresh):
                 break
         if said.pieces or seen or faults:
@@ -192,11 +197,12 @@ class Localizer:
         memory, now = state.memory, state.stamp_ns
         if memory.lost and state.estimate.heading_sigma_rad > UNSTEERABLE_SIGMA_RAD:
             return (None,)
-        turns = self._orders[memory.heading_is_latest]
+        updates = state.updates
+        turns = self._orders[updates.heading_is_latest]
         least = self._rules.minimum_interval_s * 1e9
         if least > 0.0:
-            position = _passed(memory.position_ns, now, least)
-            heading = _passed(memory.heading_ns, now, least)
+            position = _passed(updates.position_ns, now, least)
+            heading = _passed(updates.heading_ns, now, least)
             rests = {POSITION: not position, HEADING: not heading, POSE: not (position or heading)}
             turns = tuple(turn for turn in turns if turn is None or not rests[turn])
         return turns
@@ -218,23 +224,23 @@ class Localizer:
                 seen.append(m if bias == 0.0 else m.turned(-bias))
         return seen, faults
 
-    def _resting(self, memory: Memory, now_ns: int) -> set[str]:
+    def _resting(self, updates: Updates, now_ns: int) -> set[str]:
         """The objects that were used too short a time ago."""
         least = self._rules.object_interval_s * 1e9
-        return {name for name, ns in memory.objects_ns.items() if not _passed(ns, now_ns, least)}
+        return {name for name, ns in updates.objects_ns.items() if not _passed(ns, now_ns, least)}
 
-    def _fresh(self, memory: Memory, seen: list[Measured], now_ns: int) -> list[Measured]:
+    def _fresh(self, updates: Updates, seen: list[Measured], now_ns: int) -> list[Measured]:
         """Without those of objects that rest; those of one that was used not long ago count for
         less: their errors are correlated."""
-        least, used_ns = self._rules.object_interval_s * 1e9, memory.objects_ns.get
+        least, used_ns = self._rules.object_interval_s * 1e9, updates.objects_ns.get
         fresh = [m for m in seen if _passed(used_ns(m.source), now_ns, least)]
         if self._correlated:
-            fresh = [m.doubted(self._repeated(memory, m.source, now_ns)) for m in fresh]
+            fresh = [m.doubted(self._repeated(updates, m.source, now_ns)) for m in fresh]
         return fresh
 
-    def _repeated(self, memory: Memory, source: str, now_ns: int) -> float:
+    def _repeated(self, updates: Updates, source: str, now_ns: int) -> float:
         """By how much the variance of what this source says now is to grow."""
-        last_ns = memory.objects_ns.get(source)
+        last_ns = updates.objects_ns.get(source)
         seconds = None if last_ns is None else (now_ns - last_ns) * 1e-9
         return repeated_share(seconds, self.settings.sensor.correlation_s)
 
@@ -305,7 +311,7 @@ class Localizer:
     ) -> tuple[State, bool]:
         """The state after a word of a teammate, and whether the word may be used."""
         memory = state.memory
-        used_ns = memory.objects_ns.get(source, trust.NEVER_NS)
+        used_ns = state.updates.objects_ns.get(source, trust.NEVER_NS)
         verdict = trust.judged(memory.voices, sender, said, used_ns, self._trust)
         memory = replace(memory, voices=verdict.voices)
         if verdict.event:
@@ -328,12 +334,12 @@ class Localizer:
 
     def _placed(self, state: State, stamp_ns: int, said: Whereabouts) -> State:
         state = self._noted(self.moved(state, stamp_ns), said)
-        memory, prior, source = state.memory, state.estimate, said.source
+        updates, prior, source = state.updates, state.estimate, said.source
         least = self._rules.object_interval_s * 1e9
-        if not _passed(memory.objects_ns.get(source), stamp_ns, least):
+        if not _passed(state.updates.objects_ns.get(source), stamp_ns, least):
             return state
         if self._correlated:
-            said = said.doubted(self._repeated(memory, source, stamp_ns))
+            said = said.doubted(self._repeated(updates, source, stamp_ns))
         seen = said.of_position(prior.pose)
         nis = seen.normalized_innovation_squared(prior.covariance)
         if self._judges:
@@ -341,17 +347,17 @@ class Localizer:
             if not trusted or state.estimate is not prior:
                 return self._judged(state)
         if nis > self._gates[1]:
-            return self._judged(self._updated(state, prior, None, [], 1))
+            return self._judged(self._updated(state, prior, None, {}, 1))
         estimate = self._with_position(prior, seen, observed=said.observer is not None)
         heading = said.of_heading(estimate.pose)
-        used, refused = [source], 0
+        used, refused = {source: stamp_ns}, 0
         if heading is not None:
             if heading.normalized_innovation_squared(estimate.covariance) <= self._gates[0]:
                 estimate = self._with_heading(estimate, heading)
             else:
                 # The position is kept, for a marker is sooner seen askew than elsewhere. Still the
                 # word counts as refused: a robot that looks elsewhere shall find that it is lost.
-                used, refused = [], 1
+                used, refused = {}, 1
                 state = replace(state, memory=state.memory.counted("heading_gated"))
         return self._judged(self._updated(state, self._reduced(estimate), None, used, refused))
 
@@ -443,29 +449,28 @@ class Localizer:
         state: State,
         estimate: Estimate,
         turn: Scope | None,
-        sources: Iterable[str],
+        used: dict[str, int],
         rejected: int,
     ) -> State:
-        """The new estimate, with timers, windows and counts of an update of a type by sources."""
-        now, memory = state.stamp_ns, state.memory
-        used = dict.fromkeys(sources, now)
-        n = len(used)
+        """The new estimate, with timers, window and counts of an update of a type by what is used
+        (when: now)."""
+        now, memory, last, n = state.stamp_ns, state.memory, state.updates, len(used)
         # An attempt passes the turn on, an update starts the type's timer.
         position = n and (turn is POSITION or turn is POSE)
         heading = n and (turn is HEADING or turn is POSE)
-        memory = replace(
-            memory,
-            position_ns=now if position else memory.position_ns,
-            heading_ns=now if heading else memory.heading_ns,
-            heading_is_latest=memory.heading_is_latest if turn is None else turn is HEADING,
-            objects_ns={**memory.objects_ns, **used},
-            innovations=innovated(memory.innovations, n, rejected, self._rules.lost_window),
-            accepted=memory.accepted + n,
-            gated=memory.gated + rejected,
+        updates = Updates(
+            now if position else last.position_ns,
+            now if heading else last.heading_ns,
+            last.heading_is_latest if turn is None else turn is HEADING,
+            {**last.objects_ns, **used},
+            recovery.innovated(last.innovations, n, rejected, self._window),
+            last.accepted + n,
+            last.gated + rejected,
         )
+        reckoned = state.odometry_from_robot
         if n and self._learns:
-            memory = self._taught(Anchor(now, estimate, state.odometry_from_robot), memory)
-        return replace(state, estimate=estimate, memory=memory)
+            memory = self._taught(Anchor(now, estimate, reckoned), memory)
+        return State(now, estimate, reckoned, state.motion, state.odometry_ns, memory, updates)
 
     def _taught(self, here: Anchor, memory: Memory) -> Memory:
         """What the robot has learned of its odometry and bearings, from this update too."""
@@ -476,25 +481,28 @@ class Localizer:
 
     def _judged(self, state: State) -> State:
         """Lost or not. If lost: found again from recent evidence, else in more and more doubt."""
-        memory, now = state.memory, state.stamp_ns
-        reason = recovery.lost_reason(state.estimate, memory, self._rules)
+        memory, innovations = state.memory, state.updates.innovations
+        limits = self._limits_when_lost if memory.lost else self._limits
+        reason = recovery.lost_reason(state.estimate, innovations, limits)
         if not reason:
             return replace(state, memory=replace(memory, lost="")) if memory.lost else state
+        now = state.stamp_ns
         if not memory.lost:
             memory = replace(memory, widened_ns=now).counted("lost")
         memory = replace(memory, lost=reason)
-        refusing = memory.innovations & 1 == 0
+        refusing = innovations & 1 == 0
         # What was seen before the refusals began may have been seen from elsewhere.
-        since_ns = max(memory.objects_ns.values(), default=0) if refusing else 0
+        since_ns = max(state.updates.objects_ns.values(), default=0) if refusing else 0
         evidence = tuple(e for e in memory.evidence if e.stamp_ns > since_ns)
         found = None
         if evidence and evidence[-1].stamp_ns > memory.sought_ns:
             memory = replace(memory, sought_ns=evidence[-1].stamp_ns)
             found = recovery.relocalized(evidence, state.odometry_from_robot, self.field)
         if found is not None:
-            memory = replace(memory, lost="", innovations=1, anchors=None).counted("found_again")
+            memory = replace(memory, lost="", anchors=None).counted("found_again")
             memory = replace(memory, voices=trust.forgiven(memory.voices))
-            return replace(state, estimate=self._reduced(found), memory=memory)
+            updates = replace(state.updates, innovations=1)
+            return replace(state, estimate=self._reduced(found), memory=memory, updates=updates)
         estimate = state.estimate
         if refusing and now - memory.widened_ns >= recovery.WIDEN_NS:
             estimate = recovery.widened(estimate, self._rules)

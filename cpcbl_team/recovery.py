@@ -8,6 +8,7 @@ An ambiguous answer is no answer.
 
 import math
 from collections.abc import Collection, Iterator, Sequence
+from typing import NamedTuple
 
 from msgspec.structs import replace
 
@@ -111,21 +112,46 @@ def with_seen(state: State, seen: Sequence[Measured], pieces: Sequence[Evidence]
     return remembered(state.memory, pieces) if pieces else state.memory
 
 
-def lost_reason(estimate: Estimate, memory: Memory, settings: LocalizerSettings) -> str:
-    """Why the robot is lost; empty if it is not. Being lost ends at half of each limit."""
-    slack = 0.5 if memory.lost else 1.0
-    most_m, most_deg = (
-        slack * settings.lost_position_sigma_m,
-        slack * settings.lost_heading_sigma_deg,
-    )
-    xx, _, yy, _, _, hh = estimate.covariance
-    if 0.5 * (xx + yy) > most_m * most_m:
+def innovated(window: int, accepted: int, rejected: int, length: int) -> int:
+    """The window of innovations after these more: the last `length`, the latest in the lowest bit.
+
+    A bit each, set for an accepted one, after a leading bit that is always set: 1 is empty.
+    """
+    window = ((window + 1 << accepted) - 1) << rejected
+    full = 1 << length
+    return window if window < full else full | window & full - 1
+
+
+class Limits(NamedTuple):
+    """Beyond one of these a robot is lost."""
+
+    position_variance: float  # m^2, the mean of both axes
+    heading_variance: float  # rad^2
+    innovations: int  # the window has at least so many,
+    rejected: float  # of which more than so many were rejected
+
+    @staticmethod
+    def of(settings: LocalizerSettings, slack: float = 1.0) -> "Limits":
+        """`slack`: the share of each limit that counts."""
+        return Limits(
+            (slack * settings.lost_position_sigma_m) ** 2,
+            math.radians(slack * settings.lost_heading_sigma_deg) ** 2,
+            settings.lost_window // 2,
+            slack * settings.lost_share * settings.lost_window,
+        )
+
+
+def lost_reason(estimate: Estimate, innovations: int, limits: Limits) -> str:
+    """Why the robot is lost; empty if it is not."""
+    position_variance, heading_variance, least, most = limits
+    _, (xx, _, yy, _, _, hh), _ = estimate
+    if 0.5 * (xx + yy) > position_variance:
         return f"position sigma {estimate.position_sigma_m:.2f} m"
-    if hh > math.radians(most_deg) ** 2:
+    if hh > heading_variance:
         return f"heading sigma {math.degrees(estimate.heading_sigma_rad):.0f} deg"
-    digits, length = memory.innovations.bit_length(), settings.lost_window
-    rejected = digits - memory.innovations.bit_count()
-    if digits > length // 2 and rejected > slack * settings.lost_share * length:
+    digits = innovations.bit_length()
+    rejected = digits - innovations.bit_count()
+    if rejected > most and digits > least:
         return f"{rejected} of the last {digits - 1} innovations rejected"
     return ""
 

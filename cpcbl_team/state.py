@@ -18,16 +18,6 @@ FIX = "fix:"  # marks the source of an active fix, apart from seeing that teamma
 _NONE: Mapping[str, Any] = MappingProxyType({})
 
 
-def innovated(window: int, accepted: int, rejected: int, length: int) -> int:
-    """The window of innovations after these more: the last `length`, the latest in the lowest bit.
-
-    A bit each, set for an accepted one, after a leading bit that is always set: 1 is empty.
-    """
-    window = ((window + 1 << accepted) - 1) << rejected
-    full = 1 << length
-    return window if window < full else full | window & full - 1
-
-
 class Evidence(NamedTuple):
     """One thing seen (or told) lately, kept for finding the robot again when it is lost."""
 
@@ -46,16 +36,21 @@ class Evidence(NamedTuple):
     place_sigma_rad: float = 0.0  # its sigma, as far as it is a teammate's
 
 
-class Memory(msgspec.Struct, frozen=True, gc=False):
-    """What only changes when something is seen or told."""
+class Updates(msgspec.Struct, frozen=True, gc=False):
+    """What every update changes: its timers, window and counts."""
 
     position_ns: int | None = None  # last update of the type
     heading_ns: int | None = None
     heading_is_latest: bool = False
     objects_ns: Mapping[str, int] = _NONE  # last use of each object
-    innovations: int = 1  # accepted or not; see `innovated`
+    innovations: int = 1  # accepted or not; see `recovery.innovated`
     accepted: int = 0  # observations since the start
     gated: int = 0
+
+
+class Memory(msgspec.Struct, frozen=True, gc=False):
+    """What few cycles change."""
+
     teammates: Mapping[str, tuple[Belief, ...]] = _NONE
     evidence: tuple[Evidence, ...] = ()
     noted: frozenset[str] = frozenset()  # the sources of which no more is needed yet,
@@ -72,12 +67,6 @@ class Memory(msgspec.Struct, frozen=True, gc=False):
     def counted(self, *events: str) -> "Memory":
         return replace(self, events=Counter(self.events) + Counter(events)) if events else self
 
-    @property
-    def counts(self) -> Mapping[str, int]:
-        """How often each thing has happened that has happened at all."""
-        used = {"accepted": self.accepted, "gated": self.gated}
-        return {name: n for name, n in {**used, **self.events}.items() if n}
-
 
 class State(msgspec.Struct, frozen=True, gc=False):
     """The localizer's state at `stamp_ns`."""
@@ -88,3 +77,10 @@ class State(msgspec.Struct, frozen=True, gc=False):
     motion: Odometry | None = None  # the piece of odometry that is being driven
     odometry_ns: int = 0  # until when odometry is known
     memory: Memory = Memory()
+    updates: Updates = Updates()
+
+    @property
+    def counts(self) -> Mapping[str, int]:
+        """How often each thing has happened that has happened at all."""
+        counts = {"accepted": self.updates.accepted, "gated": self.updates.gated}
+        return {name: n for name, n in {**counts, **self.memory.events}.items() if n}

@@ -331,7 +331,7 @@ def test_a_robot_that_was_lost_compares_with_nothing_before() -> None:
     assert before.memory.anchors is not None
     assert before.memory.learned != Learned()
     *_, (last, truth) = followed(robot, before, elsewhere, [(0.0, 0.0)] * 100)
-    assert last.memory.counts["found_again"] >= 1
+    assert last.counts["found_again"] >= 1
     assert position_error(last.estimate, truth) < 0.2
     assert last.memory.learned == before.memory.learned
     assert last.memory.anchors is not None
@@ -344,7 +344,7 @@ def test_while_a_robot_is_lost_it_has_no_anchors() -> None:
     lost = robot.start(0)
     memory = replace(lost.memory, lost="for the test", anchors=both(at))
     seen = robot.cycle(replace(lost, memory=memory), frame(LOOP_START, SECOND // 10))
-    assert seen.memory.counts["accepted"] == len(CORNERS.landmarks)
+    assert seen.counts["accepted"] == len(CORNERS.landmarks)
     assert seen.memory.anchors is None
 
 
