@@ -5,17 +5,16 @@ A pose is written `a_from_b`: it maps coordinates of frame b into frame a. A rob
 """
 
 import math
-from math import cos, pi, remainder, sin, tau
+from math import cos, remainder, sin, tau
 from typing import Final, NamedTuple
 
-new: Final = (
-    tuple.__new__
-)  # new(Pose2, (x, y, heading)) takes half the time of Pose2(x, y, heading)
+PI: Final = math.pi
+new: Final = tuple.__new__  # new(Pose2, (x, y, h)) takes half the time of Pose2(x, y, h)
 
 
 def wrap_angle(angle: float) -> float:
     """The same angle within [-pi, pi]."""
-    return angle if -pi <= angle <= pi else remainder(angle, tau)
+    return angle if -PI <= angle <= PI else remainder(angle, tau)
 
 
 class Pose2(NamedTuple):

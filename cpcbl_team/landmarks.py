@@ -8,9 +8,8 @@ the two together.
 """
 
 import math
-from collections.abc import Container, Mapping
-from math import atan2, cos, pi, remainder, sin, sqrt, tau
-from typing import NamedTuple
+from collections.abc import Mapping
+from math import atan2, cos, sin, sqrt
 
 from cpcbl_team.config import Field, Landmark, LocalizationSettings
 from cpcbl_team.constraints import NEAREST_M
@@ -21,26 +20,20 @@ from cpcbl_team.estimate import (
     SHARPEST_VARIANCE,
     SMALLEST_VARIANCE,
     Covariance3,
-    Information,
     Row,
     Scope,
+    Sums,
 )
 from cpcbl_team.fusion import chi_square
-from cpcbl_team.geometry import new
+from cpcbl_team.geometry import PI, Pose2, new, wrap_angle
 from cpcbl_team.inputs import Sighting
 from cpcbl_team.sensors import LARGEST_BEARING_RAD, LARGEST_M, range_to_expect
 from cpcbl_team.state import Evidence, State
 
-
-class Said(NamedTuple):
-    """What the landmarks of a frame say."""
-
-    evidence: Information  # about the offset from the prior
-    used: dict[str, int]  # the objects that count, and when: now
-    rejected: int  # by the gate
-    offered: bool  # anything of the type that was asked for, accepted or not
-    pieces: list[Evidence]  # for finding the robot again
-    others: list[Sighting]  # not plain
+Said = tuple[Sums, dict[str, int], int, bool, list[Evidence], list[Sighting]]
+"""What the landmarks of a frame say: about the offset from the prior; the objects that count, and
+when (now); how many the gate rejected; whether there was anything of the type that was asked for,
+accepted or not; evidence for finding the robot again; the sightings that are not plain."""
 
 
 Places = dict[str, tuple[float, float, bool, bool]]  # x, y, by range, by bearing
@@ -74,8 +67,8 @@ class Landmarks:
         state: State,
         sightings: tuple[Sighting, ...],
         turn: Scope | None,
-        resting: Container[str],
-        noted: Container[str],
+        resting: frozenset[str],
+        noted: frozenset[str],
     ) -> Said:
         """What the landmarks among `sightings` say about position or heading, or about both.
 
@@ -86,7 +79,9 @@ class Landmarks:
         places, as_ray = self._places_for(turn), turn is POSITION
         share, floor, farthest = self._range_model
         sharp, sine_squared, (gate, _) = self._heading_weight, self._sine_squared, self._gates
-        now, ((x, y, h), covariance, _) = state.stamp_ns, state.estimate
+        now, estimate, reckoned, _, _, _, _ = state
+        pose, covariance, _ = estimate
+        x, y, h = pose
         axx = axy = ayy = axh = ayh = ahh = bx = by = bh = 0.0
         rejected, offered = 0, False
         used: dict[str, int] = {}
@@ -113,8 +108,8 @@ class Landmarks:
             q = dx * dx + dy * dy
             d = sqrt(q)
             if name not in noted:
-                piece = self._evidence(state, seen, d)
-                if piece:
+                piece = self._evidence(now, reckoned, name, range_m, bearing, d)
+                if piece is not None:
                     pieces.append(piece)
             if not by_range or (range_m is not None and range_m > farthest):
                 range_m = None
@@ -137,8 +132,8 @@ class Landmarks:
             elif not as_ray:  # a heading
                 m, n, k = -dy / q, dx / q, sharp
                 f = atan2(dy, dx) - bearing - h
-                if not -pi <= f <= pi:
-                    f = remainder(f, tau)
+                if not -PI <= f <= PI:
+                    f = wrap_angle(f)
             else:  # a ray
                 direction = h + bearing
                 c, s = cos(direction), sin(direction)
@@ -175,9 +170,8 @@ class Landmarks:
                 bx += km * f
                 by += kn * f
                 bh += k * f
-        matrix = new(Covariance3, (axx, axy, ayy, axh, ayh, ahh))
-        evidence = new(Information, (matrix, (bx, by, bh)))
-        return new(Said, (evidence, used, rejected, offered, pieces, others))
+        sums = (axx, axy, ayy, axh, ayh, ahh), (bx, by, bh)
+        return sums, used, rejected, offered, pieces, others
 
     def _places_for(self, turn: Scope | None) -> Places:
         if turn is POSE:
@@ -193,9 +187,19 @@ class Landmarks:
         surprise = chi_square(prior, (first, 0.0, last), rows, residuals)
         return surprise > self._gates[len(rows) - 1]
 
-    def _evidence(self, state: State, seen: Sighting, due_m: float) -> Evidence | None:
-        """The sighting as evidence, if any of it is of use."""
-        name, range_m, bearing = seen.id, seen.range_m, seen.bearing_rad
+    def _evidence(
+        self,
+        now: int,
+        reckoned: Pose2,
+        name: str,
+        range_m: float | None,
+        bearing: float | None,
+        due_m: float,
+    ) -> Evidence | None:
+        """A sighting as evidence, if any of it is of use.
+
+        `now`: in ns; `reckoned`: odometry_from_robot; `due_m`: from the estimate to the landmark.
+        """
         x, y, by_range, by_bearing = self._of_pose[name]
         share, floor, farthest = self._range_model
         if not by_range or range_m is None or range_m > farthest:
@@ -207,8 +211,8 @@ class Landmarks:
             bearing = None
         if range_m is None and bearing is None:
             return None
-        now, pose, sigma_rad = state.stamp_ns, state.odometry_from_robot, self._bearing_sigma_rad
-        piece = now, pose, name, x, y, range_m, bearing, sigma_m, sigma_rad, 0.0, False, None, 0.0
+        rad = self._bearing_sigma_rad
+        piece = now, reckoned, name, x, y, range_m, bearing, sigma_m, rad, 0.0, False, None, 0.0
         return new(Evidence, piece)
 
 

@@ -18,6 +18,7 @@ from cpcbl_team.estimate import (
     ZERO3,
     Covariance3,
     Estimate,
+    Information,
     Scope,
     circular,
     merge,
@@ -30,7 +31,7 @@ from cpcbl_team.fusion import (
     told,
     with_all_shared,
 )
-from cpcbl_team.geometry import Pose2, step, wrap_angle
+from cpcbl_team.geometry import Pose2, new, step, wrap_angle
 from cpcbl_team.inputs import Belief, Fix, Odometry, Position, Sighting, Sightings, Told
 from cpcbl_team.landmarks import Landmarks, Said
 from cpcbl_team.motion import move
@@ -51,6 +52,8 @@ from cpcbl_team.whereabouts import Whereabouts
 
 UNSTEERABLE_SIGMA_RAD = math.radians(100.0)  # beyond, no bearing can be linearized
 
+_NOTHING: frozenset[str] = frozenset()
+
 Turns = tuple[Scope | None, ...]
 
 
@@ -70,6 +73,7 @@ class Localizer:
             self._orders = ((POSE, None), (POSE, None))
         self._window = self._rules.lost_window
         self._rests = self._rules.object_interval_s > 0.0
+        self._odometry = settings.odometry
         self._timeout_ns = int(settings.odometry.timeout_s * 1e9)
         self._correlated = settings.sensor.correlation_s > 0.0
         self._learns = self._rules.learns
@@ -97,13 +101,13 @@ class Localizer:
         if self._judges and frame.stamp_ns - state.memory.told_ns <= trust.WINDOW_NS:
             state, accepted, refused = self._believed(state, said, accepted, refused)
             prior = state.estimate
-        evidence, used, rejected, *_ = said
+        evidence, used, rejected, _, _, _ = said
         if self._weighted:
             estimate = weighted.merged(
                 prior, [c for _, cs, _ in accepted for c in cs], self._rules.weights
             )
         else:
-            evidence = combined(evidence, accepted) if accepted else evidence  # 4.
+            evidence = combined(Information.of(evidence), accepted) if accepted else evidence  # 4.
             estimate = merge(prior, evidence, scope, self._as_circle and not accepted)  # 5.
             for m, cs, _ in accepted:
                 if m.teammate:
@@ -119,51 +123,45 @@ class Localizer:
 
     def drive(self, state: State, odometry: Odometry) -> State:
         """Takes the next piece of odometry; it is driven along as later inputs ask for it."""
-        if odometry.stamp_ns <= odometry.from_ns:
-            return replace(state, memory=state.memory.counted("impossible_duration"))
-        if odometry.from_ns > state.stamp_ns:
-            state = self.moved(state, odometry.from_ns)
-        return State(
-            state.stamp_ns,
-            state.estimate,
-            state.odometry_from_robot,
-            odometry,
-            max(state.odometry_ns, odometry.stamp_ns),
-            state.memory,
-            state.updates,
-        )
+        from_ns, until_ns = odometry.from_ns, odometry.stamp_ns
+        if until_ns <= from_ns:
+            return state._replace(memory=state.memory.counted("impossible_duration"))
+        if from_ns > state.stamp_ns:
+            state = self.moved(state, from_ns)
+        now, estimate, reckoned, _, known_ns, memory, updates = state
+        known_ns = max(known_ns, until_ns)
+        return new(State, (now, estimate, reckoned, odometry, known_ns, memory, updates))
 
     def moved(self, state: State, until_ns: int) -> State:
         """The state at `until_ns`, driven on along the known odometry."""
-        stamp_ns, odometry_ns, memory = state.stamp_ns, state.odometry_ns, state.memory
+        stamp_ns, estimate, reckoned, motion, odometry_ns, memory, updates = state
         if until_ns <= stamp_ns:
             return state
-        estimate, reckoned, motion = state.estimate, state.odometry_from_robot, state.motion
         if motion is not None:
             distance, turn = motion.distance_m, motion.turn_rad
-            if motion.from_ns != stamp_ns or motion.stamp_ns > until_ns:  # not the whole piece
-                end_ns = min(motion.stamp_ns, until_ns)
-                driven_ns = max(0, end_ns - max(stamp_ns, motion.from_ns))
-                share = driven_ns / (motion.stamp_ns - motion.from_ns)
+            from_ns, end_ns = motion.from_ns, motion.stamp_ns
+            if from_ns != stamp_ns or end_ns > until_ns:  # not the whole piece
+                driven_ns = max(0, min(end_ns, until_ns) - max(stamp_ns, from_ns))
+                share = driven_ns / (end_ns - from_ns)
                 distance, turn = share * distance, share * turn
             if self._learns:
                 distance *= memory.learned.distance_scale
                 turn *= memory.learned.turn_scale
             if distance != 0.0 or turn != 0.0:
                 reckoned = step(reckoned, distance, turn)
-                estimate = move(estimate, distance, turn, self.settings.odometry, self._as_circle)
+                estimate = move(estimate, distance, turn, self._odometry, self._as_circle)
                 if self._reduces or estimate.shared is not ZERO3:
                     estimate = self._reduced(estimate)
-            if motion.stamp_ns <= until_ns:
+            if end_ns <= until_ns:
                 motion = None
         silent_ns = until_ns - odometry_ns - self._timeout_ns
         if silent_ns > 0:
             estimate = self._unknown_motion(estimate, min(silent_ns, until_ns - stamp_ns))
-        return State(until_ns, estimate, reckoned, motion, odometry_ns, memory, state.updates)
+        return new(State, (until_ns, estimate, reckoned, motion, odometry_ns, memory, updates))
 
     def _unknown_motion(self, estimate: Estimate, silent_ns: int) -> Estimate:
         """The growth of uncertainty while odometry is missing (a second of it: gap_speed)."""
-        s = self.settings.odometry
+        s = self._odometry
         if not s.moves:
             return estimate
         p = s.gap_speed_m_s**2 * silent_ns * 1e-9
@@ -177,27 +175,30 @@ class Localizer:
     ) -> tuple[State, Scope | None, Said, list[Measured]]:
         """What the frame may update (None: nothing), what its plain landmarks say about that, and
         its other usable sightings. New evidence and faults are in the state's memory then."""
-        memory, now, sightings = state.memory, frame.stamp_ns, frame.sightings
-        noted = recovery.noted(memory, state.stamp_ns)
-        resting = self._resting(state.updates, now) if self._rests or now < state.stamp_ns else ()
+        now, sightings = frame.stamp_ns, frame.sightings
+        stamp_ns, estimate, reckoned, motion, odometry_ns, memory, updates = state
+        noted = recovery.noted(memory, stamp_ns)
+        resting = self._resting(updates, now) if self._rests or now < stamp_ns else _NOTHING
         for turn in self._turns(state):
             said = self._landmarks.read(state, sightings, turn, resting, noted)
-            seen, faults = self._others(state, said.others, now) if said.others else ([], [])
-            fresh = self._fresh(state.updates, seen, now) if seen else seen
-            if said.offered or any(offers(m, turn, self._rules) for m in fresh):
+            _, _, _, offered, pieces, others = said
+            seen, faults = self._others(state, others, now) if others else ([], [])
+            fresh = self._fresh(updates, seen, now) if seen else seen
+            if offered or any(offers(m, turn, self._rules) for m in fresh):
                 break
-        if said.pieces or seen or faults:
-            memory = recovery.with_seen(state, seen, said.pieces).counted(*faults)
-            state = replace(state, memory=memory)
+        if pieces or seen or faults:
+            memory = recovery.with_seen(state, seen, pieces)
+            if faults:
+                memory = memory.counted(*faults)
+            state = new(State, (stamp_ns, estimate, reckoned, motion, odometry_ns, memory, updates))
         return state, turn, said, fresh
 
     def _turns(self, state: State) -> Turns:
         """What may be updated: heading or position, first the one that waits longer; one timer a
         type. The last is None: nothing."""
-        memory, now = state.memory, state.stamp_ns
-        if memory.lost and state.estimate.heading_sigma_rad > UNSTEERABLE_SIGMA_RAD:
+        now, estimate, _, _, _, memory, updates = state
+        if memory.lost and estimate.heading_sigma_rad > UNSTEERABLE_SIGMA_RAD:
             return (None,)
-        updates = state.updates
         turns = self._orders[updates.heading_is_latest]
         least = self._rules.minimum_interval_s * 1e9
         if least > 0.0:
@@ -224,10 +225,11 @@ class Localizer:
                 seen.append(m if bias == 0.0 else m.turned(-bias))
         return seen, faults
 
-    def _resting(self, updates: Updates, now_ns: int) -> set[str]:
+    def _resting(self, updates: Updates, now_ns: int) -> frozenset[str]:
         """The objects that were used too short a time ago."""
         least = self._rules.object_interval_s * 1e9
-        return {name for name, ns in updates.objects_ns.items() if not _passed(ns, now_ns, least)}
+        used_ns = updates.objects_ns.items()
+        return frozenset(name for name, ns in used_ns if not _passed(ns, now_ns, least))
 
     def _fresh(self, updates: Updates, seen: list[Measured], now_ns: int) -> list[Measured]:
         """Without those of objects that rest; those of one that was used not long ago count for
@@ -277,11 +279,11 @@ class Localizer:
     ) -> tuple[State, list[Found], list[Found]]:
         """A frame without the teammates in it that this robot does not trust."""
         own = [sum(not f.measured.teammate for f in found) for found in (accepted, refused)]
-        used, rejected = own[0] + len(said.used), own[1] + said.rejected
+        used, rejected = own[0] + len(said[1]), own[1] + said[2]
         now, memory = state.stamp_ns, state.memory
         if (used or rejected) and not memory.lost:
             memory = self._own_word(memory, now, used, rejected)
-            state = replace(state, memory=memory)
+            state = state._replace(memory=memory)
         distrusted = set()
         for m, cs, nis in (*accepted, *refused):
             if m.teammate:
@@ -321,7 +323,7 @@ class Localizer:
         estimate = state.estimate
         if verdict.doubt_m:
             estimate = recovery.doubted(estimate, verdict.doubt_m, self._rules)
-        return replace(state, estimate=estimate, memory=memory), verdict.trusted
+        return state._replace(estimate=estimate, memory=memory), verdict.trusted
 
     def fix(self, state: State, fix: Fix) -> State:
         """Active collaboration: a teammate tells where it sees this robot, and perhaps its heading;
@@ -358,7 +360,7 @@ class Localizer:
                 # The position is kept, for a marker is sooner seen askew than elsewhere. Still the
                 # word counts as refused: a robot that looks elsewhere shall find that it is lost.
                 used, refused = {}, 1
-                state = replace(state, memory=state.memory.counted("heading_gated"))
+                state = state._replace(memory=state.memory.counted("heading_gated"))
         return self._judged(self._updated(state, self._reduced(estimate), None, used, refused))
 
     def _with_position(self, prior: Estimate, seen: Observation, observed: bool) -> Estimate:
@@ -385,7 +387,7 @@ class Localizer:
             memory = recovery.remembered(memory, [recovery.told_evidence(state, said)])
         if said.observer is not None:
             memory = replace(memory, told_ns=state.stamp_ns)
-        return replace(state, memory=memory)
+        return state._replace(memory=memory)
 
     def _told_apart(
         self, state: State, said: Whereabouts, seen: Observation, nis: float
@@ -397,7 +399,7 @@ class Localizer:
             if now - memory.told_ns <= trust.WINDOW_NS and not memory.lost:
                 accepted = nis <= self._gates[1]
                 memory = self._own_word(memory, now, accepted, not accepted)
-            return replace(state, memory=memory), True
+            return state._replace(memory=memory), True
         turned = said.of_heading(state.estimate.pose)
         if turned is not None:  # of three degrees of freedom, as of two
             nis += turned.normalized_innovation_squared(state.estimate.covariance)
@@ -420,12 +422,12 @@ class Localizer:
         }
         teammates[belief.robot] = (*teammates.get(belief.robot, ()), belief)
         memory = replace(state.memory, teammates=teammates, told_ns=now_ns)
-        return replace(state, memory=memory)
+        return state._replace(memory=memory)
 
     def tell(self, state: State, event: Told) -> State:
         """This robot's belief goes to a teammate: it may come back."""
         state = self.moved(state, event.stamp_ns)
-        return replace(state, estimate=told(state.estimate))
+        return state._replace(estimate=told(state.estimate))
 
     # The start, being lost, the way back --------------------------------------------------------
 
@@ -454,23 +456,24 @@ class Localizer:
     ) -> State:
         """The new estimate, with timers, window and counts of an update of a type by what is used
         (when: now)."""
-        now, memory, last, n = state.stamp_ns, state.memory, state.updates, len(used)
+        now, _, reckoned, motion, odometry_ns, memory, updates = state
+        position_ns, heading_ns, is_latest, objects_ns, window, accepted, gated = updates
+        n = len(used)
         # An attempt passes the turn on, an update starts the type's timer.
-        position = n and (turn is POSITION or turn is POSE)
-        heading = n and (turn is HEADING or turn is POSE)
-        updates = Updates(
-            now if position else last.position_ns,
-            now if heading else last.heading_ns,
-            last.heading_is_latest if turn is None else turn is HEADING,
-            {**last.objects_ns, **used},
-            recovery.innovated(last.innovations, n, rejected, self._window),
-            last.accepted + n,
-            last.gated + rejected,
-        )
-        reckoned = state.odometry_from_robot
+        if n and (turn is POSITION or turn is POSE):
+            position_ns = now
+        if n and (turn is HEADING or turn is POSE):
+            heading_ns = now
+        if turn is not None:
+            is_latest = turn is HEADING
+        objects_ns = {**objects_ns, **used}
+        window = recovery.innovated(window, n, rejected, self._window)
+        accepted, gated = accepted + n, gated + rejected
+        last = position_ns, heading_ns, is_latest, objects_ns, window, accepted, gated
+        updates = new(Updates, last)
         if n and self._learns:
             memory = self._taught(Anchor(now, estimate, reckoned), memory)
-        return State(now, estimate, reckoned, state.motion, state.odometry_ns, memory, updates)
+        return new(State, (now, estimate, reckoned, motion, odometry_ns, memory, updates))
 
     def _taught(self, here: Anchor, memory: Memory) -> Memory:
         """What the robot has learned of its odometry and bearings, from this update too."""
@@ -485,7 +488,7 @@ class Localizer:
         limits = self._limits_when_lost if memory.lost else self._limits
         reason = recovery.lost_reason(state.estimate, innovations, limits)
         if not reason:
-            return replace(state, memory=replace(memory, lost="")) if memory.lost else state
+            return state._replace(memory=replace(memory, lost="")) if memory.lost else state
         now = state.stamp_ns
         if not memory.lost:
             memory = replace(memory, widened_ns=now).counted("lost")
@@ -501,13 +504,13 @@ class Localizer:
         if found is not None:
             memory = replace(memory, lost="", anchors=None).counted("found_again")
             memory = replace(memory, voices=trust.forgiven(memory.voices))
-            updates = replace(state.updates, innovations=1)
-            return replace(state, estimate=self._reduced(found), memory=memory, updates=updates)
+            updates = state.updates._replace(innovations=1)
+            return state._replace(estimate=self._reduced(found), memory=memory, updates=updates)
         estimate = state.estimate
         if refusing and now - memory.widened_ns >= recovery.WIDEN_NS:
             estimate = recovery.widened(estimate, self._rules)
             memory = replace(memory, widened_ns=now)
-        return replace(state, estimate=estimate, memory=memory)
+        return state._replace(estimate=estimate, memory=memory)
 
 
 def _passed(last_ns: int | None, now_ns: int, least_ns: float) -> bool:

@@ -42,7 +42,9 @@ def move(
     F P F^T + C is written out, for it runs for every odometry step. `as_circle`: the position's
     covariance is kept as a circle.
     """
-    (x, y, heading), (xx, xy, yy, xh, yh, hh), shared = estimate
+    pose, covariance, shared = estimate
+    x, y, heading = pose
+    xx, xy, yy, xh, yh, hh = covariance
     direction = heading + 0.5 * turn
     c, s = cos(direction), sin(direction)
     way, turned = abs(distance), abs(turn)

@@ -144,7 +144,7 @@ class Limits(NamedTuple):
 def lost_reason(estimate: Estimate, innovations: int, limits: Limits) -> str:
     """Why the robot is lost; empty if it is not."""
     position_variance, heading_variance, least, most = limits
-    _, (xx, _, yy, _, _, hh), _ = estimate
+    xx, _, yy, _, _, hh = estimate.covariance
     if 0.5 * (xx + yy) > position_variance:
         return f"position sigma {estimate.position_sigma_m:.2f} m"
     if hh > heading_variance:

@@ -36,7 +36,7 @@ class Evidence(NamedTuple):
     place_sigma_rad: float = 0.0  # its sigma, as far as it is a teammate's
 
 
-class Updates(msgspec.Struct, frozen=True, gc=False):
+class Updates(NamedTuple):
     """What every update changes: its timers, window and counts."""
 
     position_ns: int | None = None  # last update of the type
@@ -62,13 +62,13 @@ class Memory(msgspec.Struct, frozen=True, gc=False):
     learned: Learned = Learned()
     anchors: Anchors | None = None
     voices: Mapping[str, Voice] = _NONE  # how teammates, and the robot's own eyes, stand
-    told_ns: int = -(2**62)  # when a teammate last said anything
+    told_ns: int = -(2**61)  # when a teammate last said anything
 
     def counted(self, *events: str) -> "Memory":
         return replace(self, events=Counter(self.events) + Counter(events)) if events else self
 
 
-class State(msgspec.Struct, frozen=True, gc=False):
+class State(NamedTuple):
     """The localizer's state at `stamp_ns`."""
 
     stamp_ns: int

@@ -348,7 +348,7 @@ def test_who_is_in_quarantine_finds_nobody() -> None:
     state = robot.fix(state, fix(1.0, 2.0, 1, heading=0.5))
     voice = state.memory.voices["mate"]._replace(reason="biased")
     lost = replace(robot.start(0).memory, voices={"mate": voice})
-    state = replace(robot.start(0), memory=lost)
+    state = robot.start(0)._replace(memory=lost)
     for i in range(1, 5):
         state = robot.fix(state, fix(1.0, 2.0, i * SECOND, heading=0.5))
     assert state.memory.lost != ""

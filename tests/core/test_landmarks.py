@@ -18,7 +18,6 @@ from core_helpers import (
 )
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from msgspec.structs import replace
 
 from cpcbl_team.config import (
     Field,
@@ -165,8 +164,8 @@ def test_a_frame_says_what_its_constraints_say_one_by_one(
         objects_ns={name: before for name in NAMES if rng.random() < 0.5},
     )
     if not rules.alternates:
-        updates = replace(updates, heading_ns=updates.position_ns)  # there one timer is both
-    state = replace(state_at(true, covariance, NOW), updates=updates)
+        updates = updates._replace(heading_ns=updates.position_ns)  # there one timer is both
+    state = state_at(true, covariance, NOW)._replace(updates=updates)
     exact = [point_sighting(true, n, p.x_m, p.y_m) for n, p in field.landmarks.items()]
     seen = [read_as(s, *kind) for s, kind in zip(exact, kinds, strict=False)]
     frame = Sightings(NOW, tuple(seen))

@@ -31,7 +31,6 @@ from core_helpers import (
 )
 from hypothesis import given
 from hypothesis import strategies as st
-from msgspec.structs import replace
 
 from cpcbl_team.config import (
     Field,
@@ -394,11 +393,11 @@ def sideways_sigma(paper: bool, heading_sigma: float) -> float:
     field = Field(landmarks={"ahead": Landmark(x_m=4.0, y_m=0.0, gives="bearing")})
     robot = standing("oval", field, paper_uncertainty=paper, sensor=SensorSettings())
     state = state_at(ORIGIN, diagonal(1.0, heading_sigma))
-    state = replace(state, updates=replace(state.updates, heading_is_latest=True))
+    state = state._replace(updates=state.updates._replace(heading_is_latest=True))
     for i in range(1, 40):
         seen = Sightings(i, (Sighting("ahead", None, 0.0, None, 0.01),))
         state = robot.cycle(state, seen)
-        state = replace(state, updates=replace(state.updates, heading_is_latest=True))
+        state = state._replace(updates=state.updates._replace(heading_is_latest=True))
     assert state.updates.heading_ns is None
     return math.sqrt(state.estimate.covariance.yy)
 
@@ -639,7 +638,7 @@ def test_a_faulty_sighting_is_counted_and_nothing_else(
 ) -> None:
     before = state_at(ORIGIN, diagonal(0.1, 0.05), 1)  # resolution i
     after = standing(variant).cycle(before, Sightings(1, (sighting,)))
-    assert after == replace(before, memory=before.memory.counted(reason))
+    assert after == before._replace(memory=before.memory.counted(reason))
 
 
 @variants

@@ -22,7 +22,6 @@ from core_helpers import (
     sensor_noise,
     state_at,
 )
-from msgspec.structs import replace
 
 from cpcbl_team.collaboration import Place
 from cpcbl_team.config import (
@@ -110,9 +109,9 @@ def test_a_robot_is_lost_when_most_of_what_it_sees_is_rejected(
 def test_being_lost_ends_at_half_the_limit(sigma_m: float, still: bool) -> None:
     robot = localizer(rules=RULES)
     memory = Memory(lost="before")
-    state = replace(state_at(ORIGIN, diagonal(sigma_m, 0.1)), memory=memory)
+    state = state_at(ORIGIN, diagonal(sigma_m, 0.1))._replace(memory=memory)
     assert (robot.cycle(state, Sightings(1, ())).memory.lost != "") is still
-    state = replace(state, memory=Memory())
+    state = state._replace(memory=Memory())
     assert robot.cycle(state, Sightings(1, ())).memory.lost == ""
 
 
@@ -339,9 +338,8 @@ def test_an_object_that_was_seen_a_short_time_ago_is_no_new_evidence(
     age_ns: int, kept: list[str]
 ) -> None:
     state = state_at(ORIGIN, diagonal(0.1, 0.1), stamp_ns=SECOND)
-    state = replace(
-        state, memory=Memory(evidence=(piece(SECOND - age_ns, ORIGIN, "ne", 4.5, 2.5),))
-    )
+    memory = Memory(evidence=(piece(SECOND - age_ns, ORIGIN, "ne", 4.5, 2.5),))
+    state = state._replace(memory=memory)
     place, both = Place(4.5, 2.5, Covariance2(0.0, 0.0, 0.0)), (5.0, 0.5)
     seen = [Measured(name, place, None, False, *both, 0.1, 0.1) for name in ("ne", "ne")]
     assert [e.source for e in with_seen(state, seen).evidence] == kept
@@ -458,6 +456,6 @@ def test_a_robot_says_why_it_is_lost_now() -> None:
     robot = localizer(rules=LocalizerSettings(variant="joint"))
     memory = Memory(lost="13 of the last 20 innovations rejected")
     updates = Updates(innovations=innovated(1, 20, 0, 20))
-    state = replace(state_at(ORIGIN, diagonal(0.1, 1.0)), memory=memory, updates=updates)
+    state = state_at(ORIGIN, diagonal(0.1, 1.0))._replace(memory=memory, updates=updates)
     state = robot.cycle(state, Sightings(1, ()))
     assert state.memory.lost == "heading sigma 57 deg"
