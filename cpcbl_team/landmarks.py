@@ -11,6 +11,8 @@ import math
 from collections.abc import Mapping
 from math import atan2, cos, sin, sqrt
 
+from msgspec.structs import astuple
+
 from cpcbl_team.config import Field, Landmark, LocalizationSettings
 from cpcbl_team.constraints import NEAREST_M
 from cpcbl_team.estimate import (
@@ -36,6 +38,9 @@ when (now); how many the gate rejected; whether there was anything of the type t
 accepted or not; evidence for finding the robot again; the sightings that are not plain."""
 
 
+Numbers = tuple[
+    str, float | None, float | None, float | None, float | None, float | None, float | None
+]  # of a sighting, in its order
 Places = dict[str, tuple[float, float, bool, bool]]  # x, y, by range, by bearing
 
 
@@ -78,7 +83,7 @@ class Landmarks:
         """
         places, as_ray = self._places_for(turn), turn is POSITION
         share, floor, farthest = self._range_model
-        sharp, sine_squared, (gate, _) = self._heading_weight, self._sine_squared, self._gates
+        sharp, sine_squared, gate = self._heading_weight, self._sine_squared, self._gates[0]
         now, estimate, reckoned, _, _, _, _ = state
         pose, covariance, _ = estimate
         x, y, h = pose
@@ -88,14 +93,15 @@ class Landmarks:
         pieces: list[Evidence] = []
         others: list[Sighting] = []
         for seen in sightings:
-            name, range_m, bearing = seen.id, seen.range_m, seen.bearing_rad
+            numbers: Numbers = astuple(seen)
+            name, range_m, bearing, range_sigma, bearing_sigma, heading, heading_sigma = numbers
             place = places.get(name)
             if (
                 place is None
-                or seen.range_sigma_m is not None
-                or seen.bearing_sigma_rad is not None
-                or seen.heading_rad is not None
-                or seen.heading_sigma_rad is not None
+                or range_sigma is not None
+                or bearing_sigma is not None
+                or heading is not None
+                or heading_sigma is not None
                 or name in resting
                 or not (range_m is None or 0.0 < range_m <= LARGEST_M)
                 or not (bearing is None or -LARGEST_BEARING_RAD <= bearing <= LARGEST_BEARING_RAD)

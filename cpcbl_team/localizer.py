@@ -72,6 +72,7 @@ class Localizer:
         if not self._rules.alternates:
             self._orders = ((POSE, None), (POSE, None))
         self._window = self._rules.lost_window
+        self._least_ns = self._rules.minimum_interval_s * 1e9
         self._rests = self._rules.object_interval_s > 0.0
         self._odometry = settings.odometry
         self._timeout_ns = int(settings.odometry.timeout_s * 1e9)
@@ -200,7 +201,7 @@ class Localizer:
         if memory.lost and estimate.heading_sigma_rad > UNSTEERABLE_SIGMA_RAD:
             return (None,)
         turns = self._orders[updates.heading_is_latest]
-        least = self._rules.minimum_interval_s * 1e9
+        least = self._least_ns
         if least > 0.0:
             position = _passed(updates.position_ns, now, least)
             heading = _passed(updates.heading_ns, now, least)
