@@ -47,7 +47,7 @@ from cpcbl_team.sightings import (
     offers,
     surprise,
 )
-from cpcbl_team.state import FIX, Memory, State, Updates
+from cpcbl_team.state import FIX, Evidence, Look, Memory, State, Updates
 from cpcbl_team.whereabouts import Whereabouts
 
 UNSTEERABLE_SIGMA_RAD = math.radians(100.0)  # beyond, no bearing can be linearized
@@ -182,16 +182,18 @@ class Localizer:
         resting = self._resting(updates, now) if self._rests or now < stamp_ns else _NOTHING
         for turn in self._turns(state):
             said = self._landmarks.read(state, sightings, turn, resting, noted)
-            _, _, _, offered, pieces, others = said
+            _, _, _, offered, landmarks, others = said
             seen, faults = self._others(state, others, now) if others else ([], [])
             fresh = self._fresh(updates, seen, now) if seen else seen
             if offered or any(offers(m, turn, self._rules) for m in fresh):
                 break
-        if pieces or seen or faults:
-            memory = recovery.with_seen(state, seen, pieces)
-            if faults:
-                memory = memory.counted(*faults)
+        if landmarks:
+            look = new(Look, (stamp_ns, reckoned, estimate.pose, tuple(landmarks)))
+            memory = recovery.looked(memory, look)
             state = new(State, (stamp_ns, estimate, reckoned, motion, odometry_ns, memory, updates))
+        if seen or faults:
+            memory = recovery.with_seen(state, seen).counted(*faults)
+            state = state._replace(memory=memory)
         return state, turn, said, fresh
 
     def _turns(self, state: State) -> Turns:
@@ -447,6 +449,10 @@ class Localizer:
         memory = Memory(lost="start pose unknown", widened_ns=stamp_ns)
         return State(stamp_ns, estimate, odometry_ns=stamp_ns, memory=memory)
 
+    def evidence(self, memory: Memory) -> tuple[Evidence, ...]:
+        """What the robot can find itself with, the latest last."""
+        return self._landmarks.evidence(memory)
+
     def _updated(
         self,
         state: State,
@@ -497,7 +503,7 @@ class Localizer:
         refusing = innovations & 1 == 0
         # What was seen before the refusals began may have been seen from elsewhere.
         since_ns = max(state.updates.objects_ns.values(), default=0) if refusing else 0
-        evidence = tuple(e for e in memory.evidence if e.stamp_ns > since_ns)
+        evidence = tuple(e for e in self.evidence(memory) if e.stamp_ns > since_ns)
         found = None
         if evidence and evidence[-1].stamp_ns > memory.sought_ns:
             memory = replace(memory, sought_ns=evidence[-1].stamp_ns)

@@ -17,7 +17,7 @@ from cpcbl_team.constraints import Constraint, bearing_heading, range_circle
 from cpcbl_team.estimate import SMALLEST_VARIANCE, ZERO3, Covariance3, Estimate, Information, merge
 from cpcbl_team.geometry import Pose2
 from cpcbl_team.sightings import Measured
-from cpcbl_team.state import FIX, Evidence, Memory, State
+from cpcbl_team.state import FIX, Evidence, Look, Memory, State
 from cpcbl_team.whereabouts import Whereabouts
 
 WINDOW_NS = 20_000_000_000
@@ -64,34 +64,54 @@ def told_evidence(state: State, said: Whereabouts) -> Evidence:
     return Evidence(*place, own_rad, its, True, heading.rad, its_rad)
 
 
+def looked(memory: Memory, look: Look) -> Memory:
+    """The memory with landmarks that were not `noted`, without what is too old."""
+    now, recent = look.stamp_ns, _recent(memory, look.stamp_ns)
+    for seen in look.sightings:
+        recent[seen.id] = now
+    looks = (*memory.looks, look)[-MOST_PIECES:]
+    if now - looks[0].stamp_ns > WINDOW_NS:
+        looks = tuple(one for one in looks if now - one.stamp_ns <= WINDOW_NS)
+    until_ns = min(recent.values()) + SPACING_NS
+    return replace(memory, looks=looks, noted=frozenset(recent), noted_until_ns=until_ns)
+
+
 def remembered(memory: Memory, pieces: Sequence[Evidence]) -> Memory:
     """The memory with new evidence of one time, without what is too old or too alike."""
     now = pieces[0].stamp_ns
-    recent = _recent(memory.evidence, now)
-    latest = {e.source: e for e in recent}
+    recent = _recent(memory, now)
     new = []
     for piece in pieces:
-        if piece.source not in latest:
-            latest[piece.source] = piece
+        if piece.source not in recent:
+            recent[piece.source] = now
             new.append(piece)
     if not new:
         return memory
-    kept = (*memory.evidence, *new)[-MOST_PIECES:]
-    if now - kept[0].stamp_ns > WINDOW_NS:
-        kept = tuple(e for e in kept if now - e.stamp_ns <= WINDOW_NS)
-    oldest_ns = recent[-1].stamp_ns if recent else now
-    return replace(
-        memory, evidence=kept, noted=frozenset(latest), noted_until_ns=oldest_ns + SPACING_NS
-    )
+    kept = latest((*memory.evidence, *new))
+    until_ns = min(recent.values()) + SPACING_NS
+    return replace(memory, evidence=kept, noted=frozenset(recent), noted_until_ns=until_ns)
 
 
-def _recent(evidence: Sequence[Evidence], now_ns: int) -> list[Evidence]:
-    """Of which no more is needed yet, the latest first."""
-    recent = []
-    for e in reversed(evidence):
+def latest(evidence: tuple[Evidence, ...]) -> tuple[Evidence, ...]:
+    """Without what is too old, or too much."""
+    kept = evidence[-MOST_PIECES:]
+    if kept and kept[-1].stamp_ns - kept[0].stamp_ns > WINDOW_NS:
+        kept = tuple(e for e in kept if kept[-1].stamp_ns - e.stamp_ns <= WINDOW_NS)
+    return kept
+
+
+def _recent(memory: Memory, now_ns: int) -> dict[str, int]:
+    """The sources of which no more evidence is needed yet, and when each gave some."""
+    recent = {}
+    for look in reversed(memory.looks):
+        if now_ns - look.stamp_ns >= SPACING_NS:
+            break
+        for seen in look.sightings:
+            recent[seen.id] = look.stamp_ns
+    for e in reversed(memory.evidence):
         if now_ns - e.stamp_ns >= SPACING_NS:
             break
-        recent.append(e)
+        recent[e.source] = e.stamp_ns
     return recent
 
 
@@ -99,17 +119,15 @@ def noted(memory: Memory, now_ns: int) -> frozenset[str]:
     """The sources of which no more evidence is needed yet."""
     if now_ns < memory.noted_until_ns:
         return memory.noted
-    return frozenset(e.source for e in _recent(memory.evidence, now_ns))
+    return frozenset(_recent(memory, now_ns))
 
 
-def with_seen(state: State, seen: Sequence[Measured], pieces: Sequence[Evidence] = ()) -> Memory:
-    """The memory with these pieces and those of a frame's other sightings that are not too alike
-    to what it holds."""
-    if seen:
-        recent = noted(state.memory, state.stamp_ns)
-        new = [m for m in seen if m.source not in recent and m.usable and m.wall is None]
-        pieces = [*pieces, *(seen_evidence(state, m) for m in new)]
-    return remembered(state.memory, pieces) if pieces else state.memory
+def with_seen(state: State, seen: Sequence[Measured]) -> Memory:
+    """The memory with those of a frame's sightings that are not too alike to what it holds."""
+    memory, now = state.memory, state.stamp_ns
+    recent = noted(memory, now)
+    new = [m for m in seen if m.source not in recent and m.usable and m.wall is None]
+    return remembered(memory, [seen_evidence(state, m) for m in new]) if new else memory
 
 
 def innovated(window: int, accepted: int, rejected: int, length: int) -> int:

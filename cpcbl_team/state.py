@@ -10,7 +10,7 @@ from msgspec.structs import replace
 
 from cpcbl_team.estimate import Estimate
 from cpcbl_team.geometry import Pose2
-from cpcbl_team.inputs import Belief, Odometry
+from cpcbl_team.inputs import Belief, Odometry, Sighting
 from cpcbl_team.self_calibration import Anchors, Learned
 from cpcbl_team.trust import Voice
 
@@ -36,6 +36,15 @@ class Evidence(NamedTuple):
     place_sigma_rad: float = 0.0  # its sigma, as far as it is a teammate's
 
 
+class Look(NamedTuple):
+    """Landmarks seen at one time, of which evidence is made when the robot is lost."""
+
+    stamp_ns: int
+    odometry_from_robot: Pose2  # dead reckoning at that time
+    pose: Pose2  # as it was believed: ranges err by what they should have been
+    sightings: tuple[Sighting, ...]
+
+
 class Updates(NamedTuple):
     """What every update changes: its timers, window and counts."""
 
@@ -52,7 +61,8 @@ class Memory(msgspec.Struct, frozen=True, gc=False):
     """What few cycles change."""
 
     teammates: Mapping[str, tuple[Belief, ...]] = _NONE
-    evidence: tuple[Evidence, ...] = ()
+    looks: tuple[Look, ...] = ()
+    evidence: tuple[Evidence, ...] = ()  # of all else
     noted: frozenset[str] = frozenset()  # the sources of which no more is needed yet,
     noted_until_ns: int = 0  # until then
     lost: str = ""  # the reason, empty when the robot knows where it is

@@ -187,7 +187,7 @@ def test_new_evidence_is_that_of_a_measurement(variant: Variant, given: Gives) -
     robot = localizer(variant, field)
     seen = Sighting("post", 5.0, 0.3)  # farther than it can be
     state = state_at(LOOP_START, covariance3(0.1 * np.eye(3)), NOW)
-    (piece,) = robot.cycle(state, Sightings(NOW, (seen,))).memory.evidence
+    (piece,) = robot.evidence(robot.cycle(state, Sightings(NOW, (seen,))).memory)
     m = measured(seen, NOW, LOOP_START, field, {}, robot.settings)
     assert m is not None
     assert (piece.source, piece.x, piece.y) == ("post", 1.0, 2.0)

@@ -352,7 +352,7 @@ def test_a_reading_that_may_not_be_used_is_no_evidence(gives: Gives) -> None:
     seen = point_sighting(ORIGIN, "ne", 4.5, 2.5)
     ranged = Sightings(1, (Sighting("ne", seen.range_m),))
     state = robot.cycle(state_at(ORIGIN, diagonal(0.1, 0.1)), ranged)
-    assert all((e.range_m, e.bearing_rad) != (None, None) for e in state.memory.evidence)
+    assert all((e.range_m, e.bearing_rad) != (None, None) for e in robot.evidence(state.memory))
 
 
 # The whole way back -------------------------------------------------------------------------------
