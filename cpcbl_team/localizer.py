@@ -115,7 +115,7 @@ class Localizer:
                     told = observation_of(prior, m, cs, estimate)
                     estimate = self._merge_teammate(estimate, told, scope)
         if accepted:
-            used = {**used, **{m.source: frame.stamp_ns for m, *_ in accepted}}
+            used = {**used, **{m.source: state.stamp_ns for m, *_ in accepted}}
         if accepted or self._reduces or estimate.shared is not ZERO3:
             estimate = self._reduced(estimate)
         return self._judged(self._updated(state, estimate, turn, used, rejected + len(refused)))
@@ -282,7 +282,8 @@ class Localizer:
     ) -> tuple[State, list[Found], list[Found]]:
         """A frame without the teammates in it that this robot does not trust."""
         own = [sum(not f.measured.teammate for f in found) for found in (accepted, refused)]
-        used, rejected = own[0] + len(said[1]), own[1] + said[2]
+        _, plain, refusals, _, _, _ = said
+        used, rejected = own[0] + len(plain), own[1] + refusals
         now, memory = state.stamp_ns, state.memory
         if (used or rejected) and not memory.lost:
             memory = self._own_word(memory, now, used, rejected)
@@ -355,7 +356,7 @@ class Localizer:
             return self._judged(self._updated(state, prior, None, {}, 1))
         estimate = self._with_position(prior, seen, observed=said.observer is not None)
         heading = said.of_heading(estimate.pose)
-        used, refused = {source: stamp_ns}, 0
+        used, refused = {source: state.stamp_ns}, 0
         if heading is not None:
             if heading.normalized_innovation_squared(estimate.covariance) <= self._gates[0]:
                 estimate = self._with_heading(estimate, heading)
