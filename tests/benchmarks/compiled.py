@@ -3,6 +3,7 @@
 import importlib
 import sys
 from filecmp import cmpfiles
+from importlib.machinery import EXTENSION_SUFFIXES
 from pathlib import Path
 from types import ModuleType
 
@@ -15,7 +16,9 @@ _NAMES = ("joint", "joint, alternating", "oval", "circular", contenders.YARDSTIC
 
 
 def fresh() -> bool:
-    """Whether there is a compiled core, and it is of these very sources."""
+    """Whether there is a compiled core, for this Python and of these very sources."""
+    if not (FOLDER / "cpcbl_team" / f"localizer{EXTENSION_SUFFIXES[0]}").exists():
+        return False
     core = [path.name for path in (TOP / "cpcbl_team").glob("*.py")]
     same, _, _ = cmpfiles(FOLDER / "cpcbl_team", TOP / "cpcbl_team", core, shallow=False)
     yardstick = ["float_ekf.py"]
