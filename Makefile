@@ -4,7 +4,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN = $(VENV)/bin
 
-.PHONY: setup demo test check unit test-long test-docker chaos bench clean
+.PHONY: setup demo test check unit test-long test-compiled test-docker chaos compiled bench clean
 
 setup: $(VENV)/ready
 
@@ -32,6 +32,11 @@ unit: setup
 test-long: setup
 	$(BIN)/pytest -n 2 -m "long$(if $(CPCBL_MRCLAM), or log)$(if $(CPCBL_PICTURES), or pictures)"
 
+# The core's tests with its hot files compiled, and that they say the same.
+test-compiled: compiled
+	$(BIN)/pytest -o pythonpath="$(COMPILED) agents transport launch tests" tests/core
+	$(BIN)/pytest tests/benchmarks/test_compiled.py
+
 # Needs a Docker daemon: docker/dockerd.sh start. One at a time: containers share the machine.
 test-docker: setup
 	$(BIN)/pytest -m docker
@@ -40,9 +45,21 @@ test-docker: setup
 chaos: setup
 	$(BIN)/cpcbl-team chaos all --soak-s 180
 
+# The core with its hot files compiled (hatch_build.py), and the benchmarks' yardstick: beside the
+# checkout's own, which stay as they are. Needs a C compiler.
+COMPILED = build/compiled
+compiled: setup
+	rm -rf $(COMPILED)
+	HATCH_BUILD_HOOKS_ENABLE=1 $(BIN)/python -m pip install --quiet --disable-pip-version-check \
+	  --no-deps --target $(COMPILED) .
+	mkdir $(COMPILED)/benchmarks
+	cp tests/benchmarks/float_ekf.py $(COMPILED)/benchmarks
+	cd $(COMPILED) && MYPYPATH=../../tests $(abspath $(BIN))/mypyc --namespace-packages \
+	  --explicit-package-bases --ignore-missing-imports benchmarks/float_ekf.py > mypyc.log
+
 # Timed, so alone on the machine: the localizer's variants and their peers in the same run, then a
 # robot's eyes and OpenCV's marker detection.
-bench: setup
+bench: setup compiled
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev,bench]'
 	@mkdir -p build
 	$(call timed,cycle,bench)

@@ -9,13 +9,14 @@ so that `row` is the curve's normal with, where the heading matters, its lever (
 """
 
 import math
+from typing import Final
 
 import msgspec
 
 from cpcbl_team.estimate import Row
 from cpcbl_team.geometry import Pose2, wrap_angle
 
-NEAREST_M = 1e-3  # nearer than this a direction means nothing
+NEAREST_M: Final = 1e-3  # nearer than this a direction means nothing
 
 
 class Constraint(msgspec.Struct, frozen=True, gc=False):

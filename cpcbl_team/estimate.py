@@ -12,8 +12,8 @@ Schmidt 1966) and gives the correlated sideways drift of resolution b.
 import math
 from collections.abc import Iterable
 from enum import Enum
-from math import hypot, remainder, tau
-from typing import NamedTuple
+from math import sqrt
+from typing import Final, NamedTuple
 
 from cpcbl_team.gaussian import Covariance2
 from cpcbl_team.geometry import Pose2, new, wrap_angle
@@ -73,10 +73,12 @@ class Covariance3(NamedTuple):
         )
 
 
-SMALLEST_VARIANCE = 1e-10  # (10 um)^2, (10 urad)^2: what is called exact
-SHARPEST_VARIANCE = 1e-8  # of a measurement: sharper ones drown the inverse of I + P A in rounding
-SPREAD_SHARE = 0.25  # of an ellipse's spread that its circle keeps
-ZERO3 = Covariance3(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+SMALLEST_VARIANCE: Final = 1e-10  # (10 um)^2, (10 urad)^2: what is called exact
+SHARPEST_VARIANCE: Final = (
+    1e-8  # of a measurement: sharper ones drown the inverse of I + P A in rounding
+)
+SPREAD_SHARE: Final = 0.25  # of an ellipse's spread that its circle keeps
+ZERO3: Final = Covariance3(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 Row = tuple[float, float, float]
 
 
@@ -105,7 +107,15 @@ class Scope(Enum):
     HEADING = "heading"
 
 
-POSE, POSITION, HEADING = Scope  # a look-up in an enum costs as much as a scalar update
+# a look-up in an enum costs as much as a scalar update
+POSE: Final = Scope.POSE
+POSITION: Final = Scope.POSITION
+HEADING: Final = Scope.HEADING
+
+
+Six = tuple[float, float, float, float, float, float]
+Sums = tuple[Six, Row]
+"""The numbers of an `Information`, which is one."""
 
 
 class Information(NamedTuple):
@@ -117,6 +127,11 @@ class Information(NamedTuple):
     @staticmethod
     def none() -> "Information":
         return Information(ZERO3, (0.0, 0.0, 0.0))
+
+    @staticmethod
+    def of(sums: Sums) -> "Information":
+        matrix, vector = sums
+        return Information(Covariance3(*matrix), vector)
 
     def add(self, h: Row, residual: float, variance: float) -> "Information":
         """With one more scalar measurement: residual = h . offset + noise of this variance."""
@@ -140,7 +155,7 @@ class Information(NamedTuple):
         return Information(Covariance3(xx, xy, yy, xh, yh, hh), (ex, ey, eh))
 
 
-def survival(prior: Covariance3, information: Covariance3) -> Matrix3:
+def survival(prior: Covariance3, information: Six) -> Matrix3:
     """(I + P A)^-1, the share of the prior's error that survives the evidence A."""
     xx, xy, yy, xh, yh, hh = prior
     axx, axy, ayy, axh, ayh, ahh = information
@@ -209,24 +224,26 @@ def shifted(pose: Pose2, offset: Row, scope: Scope) -> Pose2:
 
 
 def merge(
-    prior: Estimate, evidence: Information, scope: Scope = POSE, as_circle: bool = False
+    prior: Estimate, evidence: Sums, scope: Scope = POSE, as_circle: bool = False
 ) -> Estimate:
     """Bayes' product of a prior and independent evidence (equations 3 and 4 in three dimensions).
 
     Works for evidence of any rank: one range says nothing along the tangent of its circle.
     `as_circle`: the position's covariance is kept as a circle.
     """
-    (x, y, heading), covariance, shared = prior
+    pose, covariance, shared = prior
+    x, y, heading = pose
     xx, xy, yy, xh, yh, hh = covariance
-    ex, ey, eh = evidence.vector
-    survive = survival(covariance, evidence.matrix)
+    matrix, vector = evidence
+    ex, ey, eh = vector
+    survive = survival(covariance, matrix)
     a, b, c, d, e, f, g, h, i = survive
     # survive times covariance, as in `product`, of it what is in scope
     xh_after = g * xx + h * xy + i * xh
     yh_after = g * xy + h * yy + i * yh
     if scope is not POSITION:
         hh = g * xh + h * yh + i * hh
-        heading = remainder(heading + xh_after * ex + yh_after * ey + hh * eh, tau)
+        heading = wrap_angle(heading + xh_after * ex + yh_after * ey + hh * eh)
     if scope is not HEADING:
         xx, xy, yy = a * xx + b * xy + c * xh, d * xx + e * xy + f * xh, d * xy + e * yy + f * yh
         x += xx * ex + xy * ey + xh_after * eh
@@ -249,7 +266,8 @@ def circle_variance(xx: float, xy: float, yy: float, xh: float, yh: float, hh: f
     """
     variance = 0.5 * (xx + yy)
     if xy != 0.0 or xx != yy:
-        variance += SPREAD_SHARE * hypot(0.5 * (xx - yy), xy)
+        half = 0.5 * (xx - yy)
+        variance += SPREAD_SHARE * sqrt(half * half + xy * xy)
     if hh > 0.0:
         drift = (xh * xh + yh * yh) / hh
         if drift > variance:

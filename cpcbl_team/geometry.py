@@ -6,14 +6,15 @@ A pose is written `a_from_b`: it maps coordinates of frame b into frame a. A rob
 
 import math
 from math import cos, remainder, sin, tau
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
-new = tuple.__new__  # new(Pose2, (x, y, heading)) takes half the time of Pose2(x, y, heading)
+PI: Final = math.pi
+new: Final = tuple.__new__  # new(Pose2, (x, y, h)) takes half the time of Pose2(x, y, h)
 
 
 def wrap_angle(angle: float) -> float:
     """The same angle within [-pi, pi]."""
-    return math.remainder(angle, math.tau)
+    return angle if -PI <= angle <= PI else remainder(angle, tau)
 
 
 class Pose2(NamedTuple):
@@ -45,4 +46,4 @@ def step(pose: Pose2, distance: float, turn: float) -> Pose2:
     direction = heading + 0.5 * turn
     x += distance * cos(direction)
     y += distance * sin(direction)
-    return new(Pose2, (x, y, remainder(heading + turn, tau)))
+    return new(Pose2, (x, y, wrap_angle(heading + turn)))

@@ -8,12 +8,12 @@ the two together.
 """
 
 import math
-from collections.abc import Container, Mapping, Sequence
-from math import atan2, cos, remainder, sin, sqrt, tau
+from collections.abc import Iterator
+from math import atan2, cos, sin, sqrt
 
-import msgspec
+from msgspec.structs import astuple
 
-from cpcbl_team.config import Field, Landmark, LocalizationSettings
+from cpcbl_team.config import Field, LocalizationSettings
 from cpcbl_team.constraints import NEAREST_M
 from cpcbl_team.estimate import (
     HEADING,
@@ -22,29 +22,27 @@ from cpcbl_team.estimate import (
     SHARPEST_VARIANCE,
     SMALLEST_VARIANCE,
     Covariance3,
-    Information,
     Row,
     Scope,
+    Sums,
 )
 from cpcbl_team.fusion import chi_square
-from cpcbl_team.geometry import new
+from cpcbl_team.geometry import PI, wrap_angle
 from cpcbl_team.inputs import Sighting
+from cpcbl_team.recovery import latest
 from cpcbl_team.sensors import LARGEST_BEARING_RAD, LARGEST_M, range_to_expect
-from cpcbl_team.state import Evidence, State
+from cpcbl_team.state import Evidence, Look, Memory, State
+
+Said = tuple[Sums, dict[str, int], int, bool, list[Sighting], list[Sighting]]
+"""What the landmarks of a frame say: about the offset from the prior; the objects that count, and
+when (now); how many the gate rejected; whether there was anything of the type that was asked for,
+accepted or not; the sightings that are new evidence; those that are not plain."""
 
 
-class Said(msgspec.Struct, frozen=True, gc=False):
-    """What the landmarks of a frame say."""
-
-    evidence: Information  # about the offset from the prior
-    used: list[str]
-    rejected: int  # by the gate
-    offered: bool  # anything of the type that was asked for, accepted or not
-    pieces: list[Evidence]  # for finding the robot again
-    others: list[Sighting]  # not plain
-
-
-Places = Mapping[str, tuple[float, float, bool, bool]]  # x, y, by range, by bearing
+Numbers = tuple[
+    str, float | None, float | None, float | None, float | None, float | None, float | None
+]  # of a sighting, in its order
+Places = dict[str, tuple[float, float, bool, bool]]  # x, y, gives ranges, gives bearings
 
 
 class Landmarks:
@@ -59,11 +57,11 @@ class Landmarks:
         plain = rules.variant != "weighted" and not (
             rules.paper_uncertainty or rules.learns or s.correlation_s > 0.0
         )
-        marks = field.landmarks if plain else {}
-        self._of_pose = _places(marks, ranges=True, bearings=True)
-        self._of_position = _places(marks, ranges=True, bearings=rules.bearing_for_position)
-        self._of_heading = _places(marks, ranges=False, bearings=True)
-        self._of_nothing = _places(marks, ranges=False, bearings=False)
+        self._places: Places = {
+            name: (p.x_m, p.y_m, p.gives in ("both", "range"), p.gives in ("both", "bearing"))
+            for name, p in (field.landmarks if plain else {}).items()
+        }
+        self._as_rays = rules.bearing_for_position
         self._gates = gates
         self._range_model = s.range_share**2, s.range_floor_m**2, s.max_range_for_range_m
         self._heading_weight = 1.0 / max(s.bearing_sigma_rad**2, SHARPEST_VARIANCE)
@@ -73,10 +71,10 @@ class Landmarks:
     def read(
         self,
         state: State,
-        sightings: Sequence[Sighting],
+        sightings: tuple[Sighting, ...],
         turn: Scope | None,
-        resting: Container[str],
-        noted: Container[str],
+        resting: frozenset[str],
+        noted: frozenset[str],
     ) -> Said:
         """What the landmarks among `sightings` say about position or heading, or about both.
 
@@ -84,24 +82,29 @@ class Landmarks:
         that is `noted` is no new evidence. A range gives the row (u, v, 0), a bearing the row
         (m, n, 1): about the heading as it is, about the position as a ray over the way ahead.
         """
-        places, as_ray = self._places_for(turn), turn is POSITION
+        places, as_ray = self._places, turn is POSITION
+        ranges = as_ray or turn is POSE
+        bearings = turn is HEADING or turn is POSE or (as_ray and self._as_rays)
         share, floor, farthest = self._range_model
-        sharp, sine_squared, (gate, _) = self._heading_weight, self._sine_squared, self._gates
-        (x, y, h), covariance, _ = state.estimate
+        sharp, sine_squared, gate = self._heading_weight, self._sine_squared, self._gates[0]
+        now, estimate, _, _, _, _, _ = state
+        pose, covariance, _ = estimate
+        x, y, h = pose
         axx = axy = ayy = axh = ayh = ahh = bx = by = bh = 0.0
         rejected, offered = 0, False
-        used: list[str] = []
-        pieces: list[Evidence] = []
+        used: dict[str, int] = {}
+        fresh: list[Sighting] = []
         others: list[Sighting] = []
         for seen in sightings:
-            name, range_m, bearing = seen.id, seen.range_m, seen.bearing_rad
+            numbers: Numbers = astuple(seen)
+            name, range_m, bearing, range_sigma, bearing_sigma, heading, heading_sigma = numbers
             place = places.get(name)
             if (
                 place is None
-                or seen.range_sigma_m is not None
-                or seen.bearing_sigma_rad is not None
-                or seen.heading_rad is not None
-                or seen.heading_sigma_rad is not None
+                or range_sigma is not None
+                or bearing_sigma is not None
+                or heading is not None
+                or heading_sigma is not None
                 or name in resting
                 or not (range_m is None or 0.0 < range_m <= LARGEST_M)
                 or not (bearing is None or -LARGEST_BEARING_RAD <= bearing <= LARGEST_BEARING_RAD)
@@ -109,17 +112,21 @@ class Landmarks:
             ):
                 others.append(seen)
                 continue
-            px, py, by_range, by_bearing = place
+            px, py, gives_range, gives_bearing = place
             dx, dy = px - x, py - y
             q = dx * dx + dy * dy
             d = sqrt(q)
-            if name not in noted:
-                piece = self._evidence(state, seen, d)
-                if piece:
-                    pieces.append(piece)
-            if not by_range or (range_m is not None and range_m > farthest):
+            if not gives_range or (range_m is not None and range_m > farthest):
                 range_m = None
-            if not by_bearing:
+            if not gives_bearing:
+                bearing = None
+            if range_m is None and bearing is None:
+                continue
+            if name not in noted:
+                fresh.append(seen)
+            if not ranges:
+                range_m = None
+            if not bearings:
                 bearing = None
             if range_m is None and bearing is None:
                 continue
@@ -137,7 +144,9 @@ class Landmarks:
                 pass
             elif not as_ray:  # a heading
                 m, n, k = -dy / q, dx / q, sharp
-                f = remainder(atan2(dy, dx) - bearing - h, tau)
+                f = atan2(dy, dx) - bearing - h
+                if not -PI <= f <= PI:
+                    f = wrap_angle(f)
             else:  # a ray
                 direction = h + bearing
                 c, s = cos(direction), sin(direction)
@@ -154,7 +163,7 @@ class Landmarks:
             ):
                 rejected += 1
                 continue
-            used.append(name)
+            used[name] = now
             # the sum
             if range_m is not None:
                 wu, wv = w * u, w * v
@@ -174,15 +183,8 @@ class Landmarks:
                 bx += km * f
                 by += kn * f
                 bh += k * f
-        matrix = new(Covariance3, (axx, axy, ayy, axh, ayh, ahh))
-        return Said(Information(matrix, (bx, by, bh)), used, rejected, offered, pieces, others)
-
-    def _places_for(self, turn: Scope | None) -> Places:
-        if turn is POSE:
-            return self._of_pose
-        if turn is POSITION:
-            return self._of_position
-        return self._of_heading if turn is HEADING else self._of_nothing
+        sums = (axx, axy, ayy, axh, ayh, ahh), (bx, by, bh)
+        return sums, used, rejected, offered, fresh, others
 
     def _refuses(self, prior: Covariance3, *constraints: tuple[Row, float, float]) -> bool:
         """Whether the chi-square bound refuses an object's (row, residual, weight)."""
@@ -191,33 +193,30 @@ class Landmarks:
         surprise = chi_square(prior, (first, 0.0, last), rows, residuals)
         return surprise > self._gates[len(rows) - 1]
 
-    def _evidence(self, state: State, seen: Sighting, due_m: float) -> Evidence | None:
-        """The sighting as evidence, if any of it is of use."""
-        name, range_m, bearing = seen.id, seen.range_m, seen.bearing_rad
-        x, y, by_range, by_bearing = self._of_pose[name]
+    def evidence(self, memory: Memory) -> tuple[Evidence, ...]:
+        """All the evidence in a memory, the latest last."""
+        pieces = [piece for look in memory.looks for piece in self._pieces(look)]
+        return latest(tuple(sorted((*pieces, *memory.evidence), key=_stamp)))
+
+    def _pieces(self, look: Look) -> Iterator[Evidence]:
+        """The evidence of a look, one piece a landmark."""
         share, floor, farthest = self._range_model
-        if not by_range or range_m is None or range_m > farthest:
-            range_m, sigma_m = None, 0.0
-        else:
-            due_m = range_to_expect(due_m, range_m)
-            sigma_m = sqrt(share * due_m * due_m + floor)
-        if not by_bearing:
-            bearing = None
-        if range_m is None and bearing is None:
-            return None
-        now, pose, sigma_rad = state.stamp_ns, state.odometry_from_robot, self._bearing_sigma_rad
-        piece = now, pose, name, x, y, range_m, bearing, sigma_m, sigma_rad, 0.0, False, None, 0.0
-        return new(Evidence, piece)
+        now, reckoned, pose, sightings = look
+        first: dict[str, Sighting] = {}
+        for seen in sightings:
+            first.setdefault(seen.id, seen)
+        for name, seen in first.items():
+            x, y, gives_range, gives_bearing = self._places[name]
+            range_m, sigma_m = seen.range_m, 0.0
+            if not gives_range or range_m is None or range_m > farthest:
+                range_m = None
+            else:
+                due_m = range_to_expect(math.hypot(x - pose.x, y - pose.y), range_m)
+                sigma_m = sqrt(share * due_m * due_m + floor)
+            bearing = seen.bearing_rad if gives_bearing else None
+            sigmas = sigma_m, self._bearing_sigma_rad, 0.0
+            yield Evidence(now, reckoned, name, x, y, range_m, bearing, *sigmas, False)
 
 
-def _places(marks: Mapping[str, Landmark], *, ranges: bool, bearings: bool) -> Places:
-    """The landmarks, with what each gives of that which is wanted."""
-    return {
-        name: (
-            p.x_m,
-            p.y_m,
-            ranges and p.gives in ("both", "range"),
-            bearings and p.gives in ("both", "bearing"),
-        )
-        for name, p in marks.items()
-    }
+def _stamp(piece: Evidence) -> int:
+    return piece.stamp_ns

@@ -18,6 +18,7 @@ from cpcbl_team.estimate import (
     ZERO3,
     Covariance3,
     Estimate,
+    Information,
     Scope,
     circular,
     merge,
@@ -30,7 +31,7 @@ from cpcbl_team.fusion import (
     told,
     with_all_shared,
 )
-from cpcbl_team.geometry import Pose2, step, wrap_angle
+from cpcbl_team.geometry import Pose2, new, step, wrap_angle
 from cpcbl_team.inputs import Belief, Fix, Odometry, Position, Sighting, Sightings, Told
 from cpcbl_team.landmarks import Landmarks, Said
 from cpcbl_team.motion import move
@@ -46,10 +47,12 @@ from cpcbl_team.sightings import (
     offers,
     surprise,
 )
-from cpcbl_team.state import FIX, Memory, State, innovated
+from cpcbl_team.state import FIX, Evidence, Look, Memory, State, Updates
 from cpcbl_team.whereabouts import Whereabouts
 
 UNSTEERABLE_SIGMA_RAD = math.radians(100.0)  # beyond, no bearing can be linearized
+
+_NOTHING: frozenset[str] = frozenset()
 
 Turns = tuple[Scope | None, ...]
 
@@ -68,12 +71,17 @@ class Localizer:
         self._orders: tuple[Turns, Turns] = ((HEADING, POSITION, None), (POSITION, HEADING, None))
         if not self._rules.alternates:
             self._orders = ((POSE, None), (POSE, None))
+        self._window = self._rules.lost_window
+        self._least_ns = self._rules.minimum_interval_s * 1e9
         self._rests = self._rules.object_interval_s > 0.0
+        self._odometry = settings.odometry
         self._timeout_ns = int(settings.odometry.timeout_s * 1e9)
         self._correlated = settings.sensor.correlation_s > 0.0
         self._learns = self._rules.learns
         self._gates = chi_square_bounds(self._rules.gate_probability)
         self._landmarks = Landmarks(field, settings, self._gates)
+        self._limits = recovery.Limits.of(self._rules)
+        self._limits_when_lost = recovery.Limits.of(self._rules, slack=0.5)
         self._max_age_ns = int(settings.collaboration.max_age_s * 1e9)
         self._trust = settings.collaboration.trust
         self._judges = self._trust.enabled and not self._weighted  # without a covariance, no NIS
@@ -94,71 +102,67 @@ class Localizer:
         if self._judges and frame.stamp_ns - state.memory.told_ns <= trust.WINDOW_NS:
             state, accepted, refused = self._believed(state, said, accepted, refused)
             prior = state.estimate
-        rejected = said.rejected + len(refused)
+        evidence, used, rejected, _, _, _ = said
         if self._weighted:
             estimate = weighted.merged(
                 prior, [c for _, cs, _ in accepted for c in cs], self._rules.weights
             )
         else:
-            evidence = combined(said.evidence, accepted) if accepted else said.evidence  # 4.
+            evidence = combined(Information.of(evidence), accepted) if accepted else evidence  # 4.
             estimate = merge(prior, evidence, scope, self._as_circle and not accepted)  # 5.
             for m, cs, _ in accepted:
                 if m.teammate:
                     told = observation_of(prior, m, cs, estimate)
                     estimate = self._merge_teammate(estimate, told, scope)
-        used = [*said.used, *(m.source for m, *_ in accepted)] if accepted else said.used
+        if accepted:
+            used = {**used, **{m.source: state.stamp_ns for m, *_ in accepted}}
         if accepted or self._reduces or estimate.shared is not ZERO3:
             estimate = self._reduced(estimate)
-        return self._judged(self._updated(state, estimate, turn, used, rejected))
+        return self._judged(self._updated(state, estimate, turn, used, rejected + len(refused)))
 
     # Step 1 -----------------------------------------------------------------------------------
 
     def drive(self, state: State, odometry: Odometry) -> State:
         """Takes the next piece of odometry; it is driven along as later inputs ask for it."""
-        if odometry.stamp_ns <= odometry.from_ns:
-            return replace(state, memory=state.memory.counted("impossible_duration"))
-        if odometry.from_ns > state.stamp_ns:
-            state = self.moved(state, odometry.from_ns)
-        return State(
-            state.stamp_ns,
-            state.estimate,
-            state.odometry_from_robot,
-            odometry,
-            max(state.odometry_ns, odometry.stamp_ns),
-            state.memory,
-        )
+        from_ns, until_ns = odometry.from_ns, odometry.stamp_ns
+        if until_ns <= from_ns:
+            return state._replace(memory=state.memory.counted("impossible_duration"))
+        if from_ns > state.stamp_ns:
+            state = self.moved(state, from_ns)
+        now, estimate, reckoned, _, known_ns, memory, updates = state
+        known_ns = max(known_ns, until_ns)
+        return new(State, (now, estimate, reckoned, odometry, known_ns, memory, updates))
 
     def moved(self, state: State, until_ns: int) -> State:
         """The state at `until_ns`, driven on along the known odometry."""
-        stamp_ns, odometry_ns, memory = state.stamp_ns, state.odometry_ns, state.memory
+        stamp_ns, estimate, reckoned, motion, odometry_ns, memory, updates = state
         if until_ns <= stamp_ns:
             return state
-        estimate, reckoned, motion = state.estimate, state.odometry_from_robot, state.motion
         if motion is not None:
             distance, turn = motion.distance_m, motion.turn_rad
-            if motion.from_ns != stamp_ns or motion.stamp_ns > until_ns:  # not the whole piece
-                end_ns = min(motion.stamp_ns, until_ns)
-                driven_ns = max(0, end_ns - max(stamp_ns, motion.from_ns))
-                share = driven_ns / (motion.stamp_ns - motion.from_ns)
+            from_ns, end_ns = motion.from_ns, motion.stamp_ns
+            if from_ns != stamp_ns or end_ns > until_ns:  # not the whole piece
+                driven_ns = max(0, min(end_ns, until_ns) - max(stamp_ns, from_ns))
+                share = driven_ns / (end_ns - from_ns)
                 distance, turn = share * distance, share * turn
             if self._learns:
                 distance *= memory.learned.distance_scale
                 turn *= memory.learned.turn_scale
             if distance != 0.0 or turn != 0.0:
                 reckoned = step(reckoned, distance, turn)
-                estimate = move(estimate, distance, turn, self.settings.odometry, self._as_circle)
+                estimate = move(estimate, distance, turn, self._odometry, self._as_circle)
                 if self._reduces or estimate.shared is not ZERO3:
                     estimate = self._reduced(estimate)
-            if motion.stamp_ns <= until_ns:
+            if end_ns <= until_ns:
                 motion = None
         silent_ns = until_ns - odometry_ns - self._timeout_ns
         if silent_ns > 0:
             estimate = self._unknown_motion(estimate, min(silent_ns, until_ns - stamp_ns))
-        return State(until_ns, estimate, reckoned, motion, odometry_ns, memory)
+        return new(State, (until_ns, estimate, reckoned, motion, odometry_ns, memory, updates))
 
     def _unknown_motion(self, estimate: Estimate, silent_ns: int) -> Estimate:
         """The growth of uncertainty while odometry is missing (a second of it: gap_speed)."""
-        s = self.settings.odometry
+        s = self._odometry
         if not s.moves:
             return estimate
         p = s.gap_speed_m_s**2 * silent_ns * 1e-9
@@ -172,31 +176,37 @@ class Localizer:
     ) -> tuple[State, Scope | None, Said, list[Measured]]:
         """What the frame may update (None: nothing), what its plain landmarks say about that, and
         its other usable sightings. New evidence and faults are in the state's memory then."""
-        memory, now, sightings = state.memory, frame.stamp_ns, frame.sightings
-        noted = recovery.noted(memory, state.stamp_ns)
-        resting = self._resting(memory, now) if self._rests or now < state.stamp_ns else ()
+        now, sightings = frame.stamp_ns, frame.sightings
+        stamp_ns, estimate, reckoned, motion, odometry_ns, memory, updates = state
+        noted = recovery.noted(memory, stamp_ns)
+        resting = self._resting(updates, now) if self._rests or now < stamp_ns else _NOTHING
         for turn in self._turns(state):
             said = self._landmarks.read(state, sightings, turn, resting, noted)
-            seen, faults = self._others(state, said.others, now) if said.others else ([], [])
-            fresh = self._fresh(memory, seen, now) if seen else seen
-            if said.offered or any(offers(m, turn, self._rules) for m in fresh):
+            _, _, _, offered, landmarks, others = said
+            seen, faults = self._others(state, others, now) if others else ([], [])
+            fresh = self._fresh(updates, seen, now) if seen else seen
+            if offered or any(offers(m, turn, self._rules) for m in fresh):
                 break
-        if said.pieces or seen or faults:
-            memory = recovery.with_seen(state, seen, said.pieces).counted(*faults)
-            state = replace(state, memory=memory)
+        if landmarks:
+            look = new(Look, (stamp_ns, reckoned, estimate.pose, tuple(landmarks)))
+            memory = recovery.looked(memory, look)
+            state = new(State, (stamp_ns, estimate, reckoned, motion, odometry_ns, memory, updates))
+        if seen or faults:
+            memory = recovery.with_seen(state, seen).counted(*faults)
+            state = state._replace(memory=memory)
         return state, turn, said, fresh
 
     def _turns(self, state: State) -> Turns:
         """What may be updated: heading or position, first the one that waits longer; one timer a
         type. The last is None: nothing."""
-        memory, now = state.memory, state.stamp_ns
-        if memory.lost and state.estimate.heading_sigma_rad > UNSTEERABLE_SIGMA_RAD:
+        now, estimate, _, _, _, memory, updates = state
+        if memory.lost and estimate.heading_sigma_rad > UNSTEERABLE_SIGMA_RAD:
             return (None,)
-        turns = self._orders[memory.heading_is_latest]
-        least = self._rules.minimum_interval_s * 1e9
+        turns = self._orders[updates.heading_is_latest]
+        least = self._least_ns
         if least > 0.0:
-            position = _passed(memory.position_ns, now, least)
-            heading = _passed(memory.heading_ns, now, least)
+            position = _passed(updates.position_ns, now, least)
+            heading = _passed(updates.heading_ns, now, least)
             rests = {POSITION: not position, HEADING: not heading, POSE: not (position or heading)}
             turns = tuple(turn for turn in turns if turn is None or not rests[turn])
         return turns
@@ -218,23 +228,24 @@ class Localizer:
                 seen.append(m if bias == 0.0 else m.turned(-bias))
         return seen, faults
 
-    def _resting(self, memory: Memory, now_ns: int) -> set[str]:
+    def _resting(self, updates: Updates, now_ns: int) -> frozenset[str]:
         """The objects that were used too short a time ago."""
         least = self._rules.object_interval_s * 1e9
-        return {name for name, ns in memory.objects_ns.items() if not _passed(ns, now_ns, least)}
+        used_ns = updates.objects_ns.items()
+        return frozenset(name for name, ns in used_ns if not _passed(ns, now_ns, least))
 
-    def _fresh(self, memory: Memory, seen: list[Measured], now_ns: int) -> list[Measured]:
+    def _fresh(self, updates: Updates, seen: list[Measured], now_ns: int) -> list[Measured]:
         """Without those of objects that rest; those of one that was used not long ago count for
         less: their errors are correlated."""
-        least, used_ns = self._rules.object_interval_s * 1e9, memory.objects_ns.get
+        least, used_ns = self._rules.object_interval_s * 1e9, updates.objects_ns.get
         fresh = [m for m in seen if _passed(used_ns(m.source), now_ns, least)]
         if self._correlated:
-            fresh = [m.doubted(self._repeated(memory, m.source, now_ns)) for m in fresh]
+            fresh = [m.doubted(self._repeated(updates, m.source, now_ns)) for m in fresh]
         return fresh
 
-    def _repeated(self, memory: Memory, source: str, now_ns: int) -> float:
+    def _repeated(self, updates: Updates, source: str, now_ns: int) -> float:
         """By how much the variance of what this source says now is to grow."""
-        last_ns = memory.objects_ns.get(source)
+        last_ns = updates.objects_ns.get(source)
         seconds = None if last_ns is None else (now_ns - last_ns) * 1e-9
         return repeated_share(seconds, self.settings.sensor.correlation_s)
 
@@ -271,11 +282,12 @@ class Localizer:
     ) -> tuple[State, list[Found], list[Found]]:
         """A frame without the teammates in it that this robot does not trust."""
         own = [sum(not f.measured.teammate for f in found) for found in (accepted, refused)]
-        used, rejected = own[0] + len(said.used), own[1] + said.rejected
+        _, plain, refusals, _, _, _ = said
+        used, rejected = own[0] + len(plain), own[1] + refusals
         now, memory = state.stamp_ns, state.memory
         if (used or rejected) and not memory.lost:
             memory = self._own_word(memory, now, used, rejected)
-            state = replace(state, memory=memory)
+            state = state._replace(memory=memory)
         distrusted = set()
         for m, cs, nis in (*accepted, *refused):
             if m.teammate:
@@ -305,7 +317,7 @@ class Localizer:
     ) -> tuple[State, bool]:
         """The state after a word of a teammate, and whether the word may be used."""
         memory = state.memory
-        used_ns = memory.objects_ns.get(source, trust.NEVER_NS)
+        used_ns = state.updates.objects_ns.get(source, trust.NEVER_NS)
         verdict = trust.judged(memory.voices, sender, said, used_ns, self._trust)
         memory = replace(memory, voices=verdict.voices)
         if verdict.event:
@@ -315,7 +327,7 @@ class Localizer:
         estimate = state.estimate
         if verdict.doubt_m:
             estimate = recovery.doubted(estimate, verdict.doubt_m, self._rules)
-        return replace(state, estimate=estimate, memory=memory), verdict.trusted
+        return state._replace(estimate=estimate, memory=memory), verdict.trusted
 
     def fix(self, state: State, fix: Fix) -> State:
         """Active collaboration: a teammate tells where it sees this robot, and perhaps its heading;
@@ -328,12 +340,12 @@ class Localizer:
 
     def _placed(self, state: State, stamp_ns: int, said: Whereabouts) -> State:
         state = self._noted(self.moved(state, stamp_ns), said)
-        memory, prior, source = state.memory, state.estimate, said.source
+        updates, prior, source = state.updates, state.estimate, said.source
         least = self._rules.object_interval_s * 1e9
-        if not _passed(memory.objects_ns.get(source), stamp_ns, least):
+        if not _passed(state.updates.objects_ns.get(source), stamp_ns, least):
             return state
         if self._correlated:
-            said = said.doubted(self._repeated(memory, source, stamp_ns))
+            said = said.doubted(self._repeated(updates, source, stamp_ns))
         seen = said.of_position(prior.pose)
         nis = seen.normalized_innovation_squared(prior.covariance)
         if self._judges:
@@ -341,18 +353,18 @@ class Localizer:
             if not trusted or state.estimate is not prior:
                 return self._judged(state)
         if nis > self._gates[1]:
-            return self._judged(self._updated(state, prior, None, [], 1))
+            return self._judged(self._updated(state, prior, None, {}, 1))
         estimate = self._with_position(prior, seen, observed=said.observer is not None)
         heading = said.of_heading(estimate.pose)
-        used, refused = [source], 0
+        used, refused = {source: state.stamp_ns}, 0
         if heading is not None:
             if heading.normalized_innovation_squared(estimate.covariance) <= self._gates[0]:
                 estimate = self._with_heading(estimate, heading)
             else:
                 # The position is kept, for a marker is sooner seen askew than elsewhere. Still the
                 # word counts as refused: a robot that looks elsewhere shall find that it is lost.
-                used, refused = [], 1
-                state = replace(state, memory=state.memory.counted("heading_gated"))
+                used, refused = {}, 1
+                state = state._replace(memory=state.memory.counted("heading_gated"))
         return self._judged(self._updated(state, self._reduced(estimate), None, used, refused))
 
     def _with_position(self, prior: Estimate, seen: Observation, observed: bool) -> Estimate:
@@ -379,7 +391,7 @@ class Localizer:
             memory = recovery.remembered(memory, [recovery.told_evidence(state, said)])
         if said.observer is not None:
             memory = replace(memory, told_ns=state.stamp_ns)
-        return replace(state, memory=memory)
+        return state._replace(memory=memory)
 
     def _told_apart(
         self, state: State, said: Whereabouts, seen: Observation, nis: float
@@ -391,7 +403,7 @@ class Localizer:
             if now - memory.told_ns <= trust.WINDOW_NS and not memory.lost:
                 accepted = nis <= self._gates[1]
                 memory = self._own_word(memory, now, accepted, not accepted)
-            return replace(state, memory=memory), True
+            return state._replace(memory=memory), True
         turned = said.of_heading(state.estimate.pose)
         if turned is not None:  # of three degrees of freedom, as of two
             nis += turned.normalized_innovation_squared(state.estimate.covariance)
@@ -414,12 +426,12 @@ class Localizer:
         }
         teammates[belief.robot] = (*teammates.get(belief.robot, ()), belief)
         memory = replace(state.memory, teammates=teammates, told_ns=now_ns)
-        return replace(state, memory=memory)
+        return state._replace(memory=memory)
 
     def tell(self, state: State, event: Told) -> State:
         """This robot's belief goes to a teammate: it may come back."""
         state = self.moved(state, event.stamp_ns)
-        return replace(state, estimate=told(state.estimate))
+        return state._replace(estimate=told(state.estimate))
 
     # The start, being lost, the way back --------------------------------------------------------
 
@@ -438,34 +450,38 @@ class Localizer:
         memory = Memory(lost="start pose unknown", widened_ns=stamp_ns)
         return State(stamp_ns, estimate, odometry_ns=stamp_ns, memory=memory)
 
+    def evidence(self, memory: Memory) -> tuple[Evidence, ...]:
+        """What the robot can find itself with, the latest last."""
+        return self._landmarks.evidence(memory)
+
     def _updated(
         self,
         state: State,
         estimate: Estimate,
         turn: Scope | None,
-        sources: Iterable[str],
+        used: dict[str, int],
         rejected: int,
     ) -> State:
-        """The new estimate, with timers, windows and counts of an update of a type by sources."""
-        now, memory = state.stamp_ns, state.memory
-        used = dict.fromkeys(sources, now)
+        """The new estimate, with timers, window and counts of an update of a type by what is used
+        (when: now)."""
+        now, _, reckoned, motion, odometry_ns, memory, updates = state
+        position_ns, heading_ns, is_latest, objects_ns, window, accepted, gated = updates
         n = len(used)
         # An attempt passes the turn on, an update starts the type's timer.
-        position = n and (turn is POSITION or turn is POSE)
-        heading = n and (turn is HEADING or turn is POSE)
-        memory = replace(
-            memory,
-            position_ns=now if position else memory.position_ns,
-            heading_ns=now if heading else memory.heading_ns,
-            heading_is_latest=memory.heading_is_latest if turn is None else turn is HEADING,
-            objects_ns={**memory.objects_ns, **used},
-            innovations=innovated(memory.innovations, n, rejected, self._rules.lost_window),
-            accepted=memory.accepted + n,
-            gated=memory.gated + rejected,
-        )
+        if n and (turn is POSITION or turn is POSE):
+            position_ns = now
+        if n and (turn is HEADING or turn is POSE):
+            heading_ns = now
+        if turn is not None:
+            is_latest = turn is HEADING
+        objects_ns = {**objects_ns, **used}
+        window = recovery.innovated(window, n, rejected, self._window)
+        accepted, gated = accepted + n, gated + rejected
+        last = position_ns, heading_ns, is_latest, objects_ns, window, accepted, gated
+        updates = new(Updates, last)
         if n and self._learns:
-            memory = self._taught(Anchor(now, estimate, state.odometry_from_robot), memory)
-        return replace(state, estimate=estimate, memory=memory)
+            memory = self._taught(Anchor(now, estimate, reckoned), memory)
+        return new(State, (now, estimate, reckoned, motion, odometry_ns, memory, updates))
 
     def _taught(self, here: Anchor, memory: Memory) -> Memory:
         """What the robot has learned of its odometry and bearings, from this update too."""
@@ -476,30 +492,33 @@ class Localizer:
 
     def _judged(self, state: State) -> State:
         """Lost or not. If lost: found again from recent evidence, else in more and more doubt."""
-        memory, now = state.memory, state.stamp_ns
-        reason = recovery.lost_reason(state.estimate, memory, self._rules)
+        memory, innovations = state.memory, state.updates.innovations
+        limits = self._limits_when_lost if memory.lost else self._limits
+        reason = recovery.lost_reason(state.estimate, innovations, limits)
         if not reason:
-            return replace(state, memory=replace(memory, lost="")) if memory.lost else state
+            return state._replace(memory=replace(memory, lost="")) if memory.lost else state
+        now = state.stamp_ns
         if not memory.lost:
             memory = replace(memory, widened_ns=now).counted("lost")
         memory = replace(memory, lost=reason)
-        refusing = memory.innovations & 1 == 0
+        refusing = innovations & 1 == 0
         # What was seen before the refusals began may have been seen from elsewhere.
-        since_ns = max(memory.objects_ns.values(), default=0) if refusing else 0
-        evidence = tuple(e for e in memory.evidence if e.stamp_ns > since_ns)
+        since_ns = max(state.updates.objects_ns.values(), default=0) if refusing else 0
+        evidence = tuple(e for e in self.evidence(memory) if e.stamp_ns > since_ns)
         found = None
         if evidence and evidence[-1].stamp_ns > memory.sought_ns:
             memory = replace(memory, sought_ns=evidence[-1].stamp_ns)
             found = recovery.relocalized(evidence, state.odometry_from_robot, self.field)
         if found is not None:
-            memory = replace(memory, lost="", innovations=1, anchors=None).counted("found_again")
+            memory = replace(memory, lost="", anchors=None).counted("found_again")
             memory = replace(memory, voices=trust.forgiven(memory.voices))
-            return replace(state, estimate=self._reduced(found), memory=memory)
+            updates = state.updates._replace(innovations=1)
+            return state._replace(estimate=self._reduced(found), memory=memory, updates=updates)
         estimate = state.estimate
         if refusing and now - memory.widened_ns >= recovery.WIDEN_NS:
             estimate = recovery.widened(estimate, self._rules)
             memory = replace(memory, widened_ns=now)
-        return replace(state, estimate=estimate, memory=memory)
+        return state._replace(estimate=estimate, memory=memory)
 
 
 def _passed(last_ns: int | None, now_ns: int, least_ns: float) -> bool:

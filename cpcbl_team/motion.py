@@ -5,11 +5,11 @@ compounding with respect to both. Motion noise is white, so its variance grows w
 """
 
 import math
-from math import cos, remainder, sin, tau
+from math import cos, sin
 
 from cpcbl_team.config import OdometryNoise
 from cpcbl_team.estimate import ZERO3, Covariance3, Estimate, Matrix3, circle_variance
-from cpcbl_team.geometry import Pose2, new
+from cpcbl_team.geometry import Pose2, new, wrap_angle
 
 
 def motion_jacobian(heading: float, distance: float, turn: float) -> Matrix3:
@@ -42,7 +42,9 @@ def move(
     F P F^T + C is written out, for it runs for every odometry step. `as_circle`: the position's
     covariance is kept as a circle.
     """
-    (x, y, heading), (xx, xy, yy, xh, yh, hh), shared = estimate
+    pose, covariance, shared = estimate
+    x, y, heading = pose
+    xx, xy, yy, xh, yh, hh = covariance
     direction = heading + 0.5 * turn
     c, s = cos(direction), sin(direction)
     way, turned = abs(distance), abs(turn)
@@ -64,5 +66,5 @@ def move(
         xy = 0.0
     if shared is not ZERO3:
         shared = shared.transformed(motion_jacobian(heading, distance, turn))
-    pose = new(Pose2, (x + ly, y - lx, remainder(heading + turn, tau)))
+    pose = new(Pose2, (x + ly, y - lx, wrap_angle(heading + turn)))
     return new(Estimate, (pose, new(Covariance3, (xx, xy, yy, xh, yh, hh)), shared))

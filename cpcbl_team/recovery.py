@@ -8,6 +8,7 @@ An ambiguous answer is no answer.
 
 import math
 from collections.abc import Collection, Iterator, Sequence
+from typing import NamedTuple
 
 from msgspec.structs import replace
 
@@ -16,7 +17,7 @@ from cpcbl_team.constraints import Constraint, bearing_heading, range_circle
 from cpcbl_team.estimate import SMALLEST_VARIANCE, ZERO3, Covariance3, Estimate, Information, merge
 from cpcbl_team.geometry import Pose2
 from cpcbl_team.sightings import Measured
-from cpcbl_team.state import FIX, Evidence, Memory, State
+from cpcbl_team.state import FIX, Evidence, Look, Memory, State
 from cpcbl_team.whereabouts import Whereabouts
 
 WINDOW_NS = 20_000_000_000
@@ -63,34 +64,54 @@ def told_evidence(state: State, said: Whereabouts) -> Evidence:
     return Evidence(*place, own_rad, its, True, heading.rad, its_rad)
 
 
+def looked(memory: Memory, look: Look) -> Memory:
+    """The memory with landmarks that were not `noted`, without what is too old."""
+    now, recent = look.stamp_ns, _recent(memory, look.stamp_ns)
+    for seen in look.sightings:
+        recent[seen.id] = now
+    looks = (*memory.looks, look)[-MOST_PIECES:]
+    if now - looks[0].stamp_ns > WINDOW_NS:
+        looks = tuple(one for one in looks if now - one.stamp_ns <= WINDOW_NS)
+    until_ns = min(recent.values()) + SPACING_NS
+    return replace(memory, looks=looks, noted=frozenset(recent), noted_until_ns=until_ns)
+
+
 def remembered(memory: Memory, pieces: Sequence[Evidence]) -> Memory:
     """The memory with new evidence of one time, without what is too old or too alike."""
     now = pieces[0].stamp_ns
-    recent = _recent(memory.evidence, now)
-    latest = {e.source: e for e in recent}
+    recent = _recent(memory, now)
     new = []
     for piece in pieces:
-        if piece.source not in latest:
-            latest[piece.source] = piece
+        if piece.source not in recent:
+            recent[piece.source] = now
             new.append(piece)
     if not new:
         return memory
-    kept = (*memory.evidence, *new)[-MOST_PIECES:]
-    if now - kept[0].stamp_ns > WINDOW_NS:
-        kept = tuple(e for e in kept if now - e.stamp_ns <= WINDOW_NS)
-    oldest_ns = recent[-1].stamp_ns if recent else now
-    return replace(
-        memory, evidence=kept, noted=frozenset(latest), noted_until_ns=oldest_ns + SPACING_NS
-    )
+    kept = latest((*memory.evidence, *new))
+    until_ns = min(recent.values()) + SPACING_NS
+    return replace(memory, evidence=kept, noted=frozenset(recent), noted_until_ns=until_ns)
 
 
-def _recent(evidence: Sequence[Evidence], now_ns: int) -> list[Evidence]:
-    """Of which no more is needed yet, the latest first."""
-    recent = []
-    for e in reversed(evidence):
+def latest(evidence: tuple[Evidence, ...]) -> tuple[Evidence, ...]:
+    """Without what is too old, or too much."""
+    kept = evidence[-MOST_PIECES:]
+    if kept and kept[-1].stamp_ns - kept[0].stamp_ns > WINDOW_NS:
+        kept = tuple(e for e in kept if kept[-1].stamp_ns - e.stamp_ns <= WINDOW_NS)
+    return kept
+
+
+def _recent(memory: Memory, now_ns: int) -> dict[str, int]:
+    """The sources of which no more evidence is needed yet, and when each gave some."""
+    recent = {}
+    for look in reversed(memory.looks):
+        if now_ns - look.stamp_ns >= SPACING_NS:
+            break
+        for seen in look.sightings:
+            recent[seen.id] = look.stamp_ns
+    for e in reversed(memory.evidence):
         if now_ns - e.stamp_ns >= SPACING_NS:
             break
-        recent.append(e)
+        recent[e.source] = e.stamp_ns
     return recent
 
 
@@ -98,34 +119,57 @@ def noted(memory: Memory, now_ns: int) -> frozenset[str]:
     """The sources of which no more evidence is needed yet."""
     if now_ns < memory.noted_until_ns:
         return memory.noted
-    return frozenset(e.source for e in _recent(memory.evidence, now_ns))
+    return frozenset(_recent(memory, now_ns))
 
 
-def with_seen(state: State, seen: Sequence[Measured], pieces: Sequence[Evidence] = ()) -> Memory:
-    """The memory with these pieces and those of a frame's other sightings that are not too alike
-    to what it holds."""
-    if seen:
-        recent = noted(state.memory, state.stamp_ns)
-        new = [m for m in seen if m.source not in recent and m.usable and m.wall is None]
-        pieces = [*pieces, *(seen_evidence(state, m) for m in new)]
-    return remembered(state.memory, pieces) if pieces else state.memory
+def with_seen(state: State, seen: Sequence[Measured]) -> Memory:
+    """The memory with those of a frame's sightings that are not too alike to what it holds."""
+    memory, now = state.memory, state.stamp_ns
+    recent = noted(memory, now)
+    new = [m for m in seen if m.source not in recent and m.usable and m.wall is None]
+    return remembered(memory, [seen_evidence(state, m) for m in new]) if new else memory
 
 
-def lost_reason(estimate: Estimate, memory: Memory, settings: LocalizerSettings) -> str:
-    """Why the robot is lost; empty if it is not. Being lost ends at half of each limit."""
-    slack = 0.5 if memory.lost else 1.0
-    most_m, most_deg = (
-        slack * settings.lost_position_sigma_m,
-        slack * settings.lost_heading_sigma_deg,
-    )
+def innovated(window: int, accepted: int, rejected: int, length: int) -> int:
+    """The window of innovations after these more: the last `length`, the latest in the lowest bit.
+
+    A bit each, set for an accepted one, after a leading bit that is always set: 1 is empty.
+    """
+    window = ((window + 1 << accepted) - 1) << rejected
+    full = 1 << length
+    return window if window < full else full | window & full - 1
+
+
+class Limits(NamedTuple):
+    """Beyond one of these a robot is lost."""
+
+    position_variance: float  # m^2, the mean of both axes
+    heading_variance: float  # rad^2
+    innovations: int  # the window has at least so many,
+    rejected: float  # of which more than so many were rejected
+
+    @staticmethod
+    def of(settings: LocalizerSettings, slack: float = 1.0) -> "Limits":
+        """`slack`: the share of each limit that counts."""
+        return Limits(
+            (slack * settings.lost_position_sigma_m) ** 2,
+            math.radians(slack * settings.lost_heading_sigma_deg) ** 2,
+            settings.lost_window // 2,
+            slack * settings.lost_share * settings.lost_window,
+        )
+
+
+def lost_reason(estimate: Estimate, innovations: int, limits: Limits) -> str:
+    """Why the robot is lost; empty if it is not."""
+    position_variance, heading_variance, least, most = limits
     xx, _, yy, _, _, hh = estimate.covariance
-    if 0.5 * (xx + yy) > most_m * most_m:
+    if 0.5 * (xx + yy) > position_variance:
         return f"position sigma {estimate.position_sigma_m:.2f} m"
-    if hh > math.radians(most_deg) ** 2:
+    if hh > heading_variance:
         return f"heading sigma {math.degrees(estimate.heading_sigma_rad):.0f} deg"
-    digits, length = memory.innovations.bit_length(), settings.lost_window
-    rejected = digits - memory.innovations.bit_count()
-    if digits > length // 2 and rejected > slack * settings.lost_share * length:
+    digits = innovations.bit_length()
+    rejected = digits - innovations.bit_count()
+    if rejected > most and digits > least:
         return f"{rejected} of the last {digits - 1} innovations rejected"
     return ""
 

@@ -1,6 +1,7 @@
 """Readings made right by what calibration knows; what a sighting is worth."""
 
 import math
+from typing import Final
 
 import msgspec
 
@@ -8,8 +9,8 @@ from cpcbl_team.config import OdometrySettings, SensorSettings
 from cpcbl_team.geometry import wrap_angle
 from cpcbl_team.inputs import Odometry, Sighting, Sightings
 
-LARGEST_M = 1e6
-LARGEST_BEARING_RAD = math.pi + 1e-9
+LARGEST_M: Final = 1e6
+LARGEST_BEARING_RAD: Final = math.pi + 1e-9
 SOONEST_S = 1e-3
 LEAST_COSINE = 0.1  # a depth says nothing of what is seen across the optical axis
 

@@ -10,22 +10,12 @@ from msgspec.structs import replace
 
 from cpcbl_team.estimate import Estimate
 from cpcbl_team.geometry import Pose2
-from cpcbl_team.inputs import Belief, Odometry
+from cpcbl_team.inputs import Belief, Odometry, Sighting
 from cpcbl_team.self_calibration import Anchors, Learned
 from cpcbl_team.trust import Voice
 
 FIX = "fix:"  # marks the source of an active fix, apart from seeing that teammate
 _NONE: Mapping[str, Any] = MappingProxyType({})
-
-
-def innovated(window: int, accepted: int, rejected: int, length: int) -> int:
-    """The window of innovations after these more: the last `length`, the latest in the lowest bit.
-
-    A bit each, set for an accepted one, after a leading bit that is always set: 1 is empty.
-    """
-    window = ((window + 1 << accepted) - 1) << rejected
-    full = 1 << length
-    return window if window < full else full | window & full - 1
 
 
 class Evidence(NamedTuple):
@@ -46,18 +36,33 @@ class Evidence(NamedTuple):
     place_sigma_rad: float = 0.0  # its sigma, as far as it is a teammate's
 
 
-class Memory(msgspec.Struct, frozen=True, gc=False):
-    """What only changes when something is seen or told."""
+class Look(NamedTuple):
+    """Landmarks seen at one time, of which evidence is made when the robot is lost."""
+
+    stamp_ns: int
+    odometry_from_robot: Pose2  # dead reckoning at that time
+    pose: Pose2  # as it was believed: ranges err by what they should have been
+    sightings: tuple[Sighting, ...]
+
+
+class Updates(NamedTuple):
+    """What every update changes: its timers, window and counts."""
 
     position_ns: int | None = None  # last update of the type
     heading_ns: int | None = None
     heading_is_latest: bool = False
     objects_ns: Mapping[str, int] = _NONE  # last use of each object
-    innovations: int = 1  # accepted or not; see `innovated`
+    innovations: int = 1  # accepted or not; see `recovery.innovated`
     accepted: int = 0  # observations since the start
     gated: int = 0
+
+
+class Memory(msgspec.Struct, frozen=True, gc=False):
+    """What few cycles change."""
+
     teammates: Mapping[str, tuple[Belief, ...]] = _NONE
-    evidence: tuple[Evidence, ...] = ()
+    looks: tuple[Look, ...] = ()
+    evidence: tuple[Evidence, ...] = ()  # of all else
     noted: frozenset[str] = frozenset()  # the sources of which no more is needed yet,
     noted_until_ns: int = 0  # until then
     lost: str = ""  # the reason, empty when the robot knows where it is
@@ -67,19 +72,13 @@ class Memory(msgspec.Struct, frozen=True, gc=False):
     learned: Learned = Learned()
     anchors: Anchors | None = None
     voices: Mapping[str, Voice] = _NONE  # how teammates, and the robot's own eyes, stand
-    told_ns: int = -(2**62)  # when a teammate last said anything
+    told_ns: int = -(2**61)  # when a teammate last said anything
 
     def counted(self, *events: str) -> "Memory":
         return replace(self, events=Counter(self.events) + Counter(events)) if events else self
 
-    @property
-    def counts(self) -> Mapping[str, int]:
-        """How often each thing has happened that has happened at all."""
-        used = {"accepted": self.accepted, "gated": self.gated}
-        return {name: n for name, n in {**used, **self.events}.items() if n}
 
-
-class State(msgspec.Struct, frozen=True, gc=False):
+class State(NamedTuple):
     """The localizer's state at `stamp_ns`."""
 
     stamp_ns: int
@@ -88,3 +87,10 @@ class State(msgspec.Struct, frozen=True, gc=False):
     motion: Odometry | None = None  # the piece of odometry that is being driven
     odometry_ns: int = 0  # until when odometry is known
     memory: Memory = Memory()
+    updates: Updates = Updates()
+
+    @property
+    def counts(self) -> Mapping[str, int]:
+        """How often each thing has happened that has happened at all."""
+        counts = {"accepted": self.updates.accepted, "gated": self.updates.gated}
+        return {name: n for name, n in {**counts, **self.memory.events}.items() if n}

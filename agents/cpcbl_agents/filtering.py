@@ -47,7 +47,7 @@ class FilterAgent:
     @property
     def all_counts(self) -> Counter[str]:
         """What was refused here, what was used and gated by the localizer."""
-        return self.counts + Counter(self.timeline.state.memory.counts)
+        return self.counts + Counter(self.timeline.state.counts)
 
     @property
     def learned(self) -> Learned | None:

@@ -681,6 +681,6 @@ def test_the_status_of_a_robot_that_learns_says_what() -> None:
     for robot in stand.robots.values():
         timeline = robot.filter.timeline
         memory = replace(timeline.state.memory, learned=Learned(0.98, 0.96, 0.01))
-        timeline.state = replace(timeline.state, memory=memory)
+        timeline.state = timeline.state._replace(memory=memory)
     assert stand.status("me").learned == (0.98, 0.96, 0.01)
     assert stand.status("mate").learned is None

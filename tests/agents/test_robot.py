@@ -300,7 +300,7 @@ def stood_with_bias(learns: bool) -> Robot:
     subject = robot(with_robot(TEAM, "me", localizer=rules))
     state = subject.filter.timeline.state
     known = Learned(bearing_bias_rad=0.1)
-    subject.filter.timeline.state = replace(state, memory=replace(state.memory, learned=known))
+    subject.filter.timeline.state = state._replace(memory=replace(state.memory, learned=known))
     for piece in pieces(0.5, 0.0, 0.0):
         subject.handle(piece, piece.stamp_ns)
         subject.handle(Tick(), piece.stamp_ns)

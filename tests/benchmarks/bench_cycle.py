@@ -8,7 +8,7 @@ for all.
 from typing import Any
 
 import pytest
-from benchmarks.contenders import ALL
+from benchmarks.compiled import ALL
 from benchmarks.drive import drive
 
 LAPS = 7

@@ -6,21 +6,21 @@ and nothing remembered; `gated` alone has gates and counters like the localizer'
 
 import math
 from math import atan2, cos, remainder, sin, sqrt, tau
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 from benchmarks.drive import MAP, ODOMETRY, SENSOR, START_SIGMA_M, START_SIGMA_RAD, Plain
 from core_helpers import LOOP_START
 
 State = tuple[float, float, float, float, float, float, float, float, float]
 
-_ALONG = ODOMETRY.distance_sigma_m_per_sqrt_m**2
-_AROUND_TURN = ODOMETRY.turn_sigma_rad_per_sqrt_rad**2
-_AROUND_WAY = ODOMETRY.turn_sigma_rad_per_sqrt_m**2
-_SHARE = SENSOR.range_share**2
-_FLOOR = SENSOR.range_floor_m**2
-_BEARING = SENSOR.bearing_sigma_rad**2
-_GATE = -2.0 * math.log(1.0 - 0.999)  # chi-square, two degrees of freedom
-_WINDOW = 20
+_ALONG: Final = ODOMETRY.distance_sigma_m_per_sqrt_m**2
+_AROUND_TURN: Final = ODOMETRY.turn_sigma_rad_per_sqrt_rad**2
+_AROUND_WAY: Final = ODOMETRY.turn_sigma_rad_per_sqrt_m**2
+_SHARE: Final = SENSOR.range_share**2
+_FLOOR: Final = SENSOR.range_floor_m**2
+_BEARING: Final = SENSOR.bearing_sigma_rad**2
+_GATE: Final = -2.0 * math.log(1.0 - 0.999)  # chi-square, two degrees of freedom
+_WINDOW: Final = 20
 
 
 def begin() -> State:

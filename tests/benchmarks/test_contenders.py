@@ -55,7 +55,7 @@ def test_the_drive_is_followed(name: str) -> None:
 def test_every_update_of_the_localizer_really_happens(name: str) -> None:
     contender = OURS[name]
     state = contender.run(map(contender.reading, DRIVE))
-    assert dict(state.memory.counts) == {"accepted": 4 * CYCLES}
+    assert dict(state.counts) == {"accepted": 4 * CYCLES}
     assert not state.memory.lost
 
 

@@ -18,7 +18,6 @@ from core_helpers import (
 )
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from msgspec.structs import replace
 
 from cpcbl_team.config import (
     Field,
@@ -34,7 +33,7 @@ from cpcbl_team.inputs import Sighting, Sightings
 from cpcbl_team.localizer import Localizer
 from cpcbl_team.sensors import sighting_fault
 from cpcbl_team.sightings import Measured, constraints_of, measured, offers, surprise
-from cpcbl_team.state import Memory, State
+from cpcbl_team.state import State, Updates
 
 NOW = 5 * SECOND
 NAMES = "abcde"
@@ -93,10 +92,10 @@ def since(last_ns: int | None, seconds: float) -> bool:
     return last_ns is None or NOW - last_ns >= seconds * 1e9
 
 
-def turn_of(robot: Localizer, memory: Memory, seen: Sequence[Measured]) -> Scope | None:
+def turn_of(robot: Localizer, updates: Updates, seen: Sequence[Measured]) -> Scope | None:
     """The type that waits longer, of those that have anything; None: neither."""
     r = robot.settings.localizer
-    last_ns = {Scope.POSITION: memory.position_ns, Scope.HEADING: memory.heading_ns}
+    last_ns = {Scope.POSITION: updates.position_ns, Scope.HEADING: updates.heading_ns}
     ready = [
         turn
         for turn in (Scope.POSITION, Scope.HEADING)
@@ -105,24 +104,24 @@ def turn_of(robot: Localizer, memory: Memory, seen: Sequence[Measured]) -> Scope
     if not r.alternates:
         return POSE if ready else None
     if len(ready) == 2:
-        return ready[0] if memory.heading_is_latest else ready[1]
+        return ready[0] if updates.heading_is_latest else ready[1]
     return ready[0] if ready else None
 
 
 def composed(robot: Localizer, state: State, frame: Sightings) -> tuple[Estimate, dict[str, int]]:
     """One cycle among landmarks without motion, and its counts, formula by formula."""
-    r, prior, memory = robot.settings.localizer, state.estimate, state.memory
+    r, prior, updates = robot.settings.localizer, state.estimate, state.updates
     good = [s for s in frame.sightings if not sighting_fault(s)]
     found = (measured(s, NOW, prior.pose, robot.field, {}, robot.settings) for s in good)
-    seen = [m for m in found if m and since(memory.objects_ns.get(m.source), r.object_interval_s)]
+    seen = [m for m in found if m and since(updates.objects_ns.get(m.source), r.object_interval_s)]
     tau_s = robot.settings.sensor.correlation_s
     if tau_s:
         rho = math.exp(-0.1 / tau_s)
         seen = [
-            m.doubted((1 + rho) / (1 - rho)) if m.source in memory.objects_ns else m for m in seen
+            m.doubted((1 + rho) / (1 - rho)) if m.source in updates.objects_ns else m for m in seen
         ]
     counts = {"accepted": 0, "gated": 0}
-    turn, evidence = turn_of(robot, memory, seen), Information.none()
+    turn, evidence = turn_of(robot, updates, seen), Information.none()
     for m in seen if turn else ():
         assert turn is not None
         cs = constraints_of(prior.pose, m, turn, r)
@@ -159,14 +158,14 @@ def test_a_frame_says_what_its_constraints_say_one_by_one(
     if rules.variant == "circular":
         covariance = circular(Estimate(true, covariance)).covariance
     before = NOW - SECOND // 10
-    memory = Memory(
+    updates = Updates(
         position_ns=before if rng.random() < 0.5 else None,
         heading_is_latest=bool(rng.random() < 0.5),
         objects_ns={name: before for name in NAMES if rng.random() < 0.5},
     )
     if not rules.alternates:
-        memory = replace(memory, heading_ns=memory.position_ns)  # there one timer is both
-    state = replace(state_at(true, covariance, NOW), memory=memory)
+        updates = updates._replace(heading_ns=updates.position_ns)  # there one timer is both
+    state = state_at(true, covariance, NOW)._replace(updates=updates)
     exact = [point_sighting(true, n, p.x_m, p.y_m) for n, p in field.landmarks.items()]
     seen = [read_as(s, *kind) for s, kind in zip(exact, kinds, strict=False)]
     frame = Sightings(NOW, tuple(seen))
@@ -175,7 +174,7 @@ def test_a_frame_says_what_its_constraints_say_one_by_one(
     after = robot.cycle(state, frame)
     assert after.estimate.pose == pytest.approx(expected.pose, rel=1e-9, abs=1e-9)
     assert after.estimate.covariance == pytest.approx(expected.covariance, rel=1e-9, abs=1e-9)
-    assert (after.memory.accepted, after.memory.gated) == (counts["accepted"], counts["gated"])
+    assert (after.updates.accepted, after.updates.gated) == (counts["accepted"], counts["gated"])
     assert sum(after.memory.events.get(e, 0) for e in ("not_finite", "empty_sighting")) == sum(
         kind in ("none", "nan") for kind, *_ in kinds[: len(exact)]
     )
@@ -188,7 +187,7 @@ def test_new_evidence_is_that_of_a_measurement(variant: Variant, given: Gives) -
     robot = localizer(variant, field)
     seen = Sighting("post", 5.0, 0.3)  # farther than it can be
     state = state_at(LOOP_START, covariance3(0.1 * np.eye(3)), NOW)
-    (piece,) = robot.cycle(state, Sightings(NOW, (seen,))).memory.evidence
+    (piece,) = robot.evidence(robot.cycle(state, Sightings(NOW, (seen,))).memory)
     m = measured(seen, NOW, LOOP_START, field, {}, robot.settings)
     assert m is not None
     assert (piece.source, piece.x, piece.y) == ("post", 1.0, 2.0)
@@ -207,4 +206,4 @@ def test_a_plain_landmark_is_not_measured_the_general_way(monkeypatch: pytest.Mo
         robot = localizer(variant)
         exact = (point_sighting(LOOP_START, n, p.x_m, p.y_m) for n, p in CORNERS.landmarks.items())
         after = robot.cycle(state, Sightings(NOW, tuple(exact)))
-        assert after.memory.accepted == 4
+        assert after.updates.accepted == 4

@@ -31,7 +31,6 @@ from core_helpers import (
 )
 from hypothesis import given
 from hypothesis import strategies as st
-from msgspec.structs import replace
 
 from cpcbl_team.config import (
     Field,
@@ -138,7 +137,7 @@ def test_where_one_type_is_refused_the_other_runs(variant: Variant) -> None:
     state = state_at(ORIGIN, Covariance3(0.04, 0.0, 0.04, 0.0, 0.0, 0.0004))
     for i in range(1, 5):
         state = robot.cycle(state, frame(Pose2(0.3, 0.0, 0.6), i * TENTH))
-    assert state.memory.position_ns is not None
+    assert state.updates.position_ns is not None
 
 
 @separated
@@ -159,11 +158,11 @@ def test_an_object_rests_between_two_uses() -> None:
     state = state_at(ORIGIN, diagonal(0.3, 0.2))
     used = []
     for stamp_ns, names in ((TENTH, ["ne"]), (2 * TENTH, ["ne", "nw"]), (4 * TENTH, ["ne", "nw"])):
-        before = state.memory.counts.get("accepted", 0)
+        before = state.counts.get("accepted", 0)
         state = robot.cycle(state, frame(ORIGIN, stamp_ns, names=names))
-        used.append(state.memory.counts["accepted"] - before)
+        used.append(state.counts["accepted"] - before)
     assert used == [1, 1, 1]
-    assert state.memory.objects_ns == {"ne": 4 * TENTH, "nw": 2 * TENTH}
+    assert state.updates.objects_ns == {"ne": 4 * TENTH, "nw": 2 * TENTH}
 
 
 # Correlated errors --------------------------------------------------------------------------------
@@ -299,8 +298,8 @@ def test_without_noise_there_is_no_error(variant: Variant, field: Field) -> None
     state, truth = run[-1]
     assert worst < 1e-6
     assert heading_error(state.estimate, truth) < 1e-6
-    assert set(state.memory.counts) == {"accepted"}
-    assert state.memory.counts["accepted"] > 900
+    assert set(state.counts) == {"accepted"}
+    assert state.counts["accepted"] > 900
 
 
 @pytest.mark.parametrize("field", [CORNERS, MIXED], ids=["corners", "mixed"])
@@ -394,12 +393,12 @@ def sideways_sigma(paper: bool, heading_sigma: float) -> float:
     field = Field(landmarks={"ahead": Landmark(x_m=4.0, y_m=0.0, gives="bearing")})
     robot = standing("oval", field, paper_uncertainty=paper, sensor=SensorSettings())
     state = state_at(ORIGIN, diagonal(1.0, heading_sigma))
-    state = replace(state, memory=replace(state.memory, heading_is_latest=True))
+    state = state._replace(updates=state.updates._replace(heading_is_latest=True))
     for i in range(1, 40):
         seen = Sightings(i, (Sighting("ahead", None, 0.0, None, 0.01),))
         state = robot.cycle(state, seen)
-        state = replace(state, memory=replace(state.memory, heading_is_latest=True))
-    assert state.memory.heading_ns is None
+        state = state._replace(updates=state.updates._replace(heading_is_latest=True))
+    assert state.updates.heading_ns is None
     return math.sqrt(state.estimate.covariance.yy)
 
 
@@ -434,7 +433,7 @@ def test_a_teammates_uncertainty_is_compounded_before_the_constraint(
     for i in (1, 2):
         seen = point_sighting(Pose2(0.1, 0.05, 0.05), "mate", 2.0, 0.5)
         state = robot.cycle(state, Sightings(i, (seen,)))
-    assert state.memory.counts == {"accepted": 2}
+    assert state.counts == {"accepted": 2}
     assert state.estimate.pose == pytest.approx(ORIGIN, abs=1e-3)
 
 
@@ -472,7 +471,7 @@ def test_a_fix_moves_the_position(variant: Variant) -> None:
     pose = state.estimate.pose
     assert 0.0 < pose.x <= 0.2
     assert pose.y == pytest.approx(-0.5 * pose.x)
-    assert state.memory.counts == {"accepted": 1}
+    assert state.counts == {"accepted": 1}
 
 
 LEANING = Covariance3(0.04, 0.0, 0.09, 0.0, 0.02, 0.01)
@@ -503,7 +502,7 @@ def test_a_position_sensor_places_the_robot_and_nothing_of_it_is_shared(variant:
     assert moved_parts(before, after) == "position"
     assert after.estimate.pose == pytest.approx(exact.estimate.pose)
     assert after.estimate.shared == ZERO3
-    assert after.memory.counts == {"accepted": 1}
+    assert after.counts == {"accepted": 1}
 
 
 @variants
@@ -511,7 +510,7 @@ def test_a_position_far_off_is_rejected_and_counted(variant: Variant) -> None:
     before = state_at(ORIGIN, diagonal(0.1, 0.05))
     after = standing(variant).position(before, placed_at(3.0, 0.0, 1))
     assert after.estimate == before.estimate
-    assert after.memory.counts == {"gated": 1}
+    assert after.counts == {"gated": 1}
 
 
 @separated
@@ -525,9 +524,9 @@ def test_a_position_sensor_leaves_the_heading_alone(variant: Variant) -> None:
 def test_a_fix_is_no_update_of_a_type() -> None:
     robot = standing("oval", minimum_interval_s=1.0)
     state = robot.fix(state_at(ORIGIN, diagonal(0.3, 0.2)), fix(0.1, 0.1, 1))
-    memory = state.memory
-    assert (memory.position_ns, memory.heading_ns) == (None, None)
-    assert memory.objects_ns == {"fix:mate": 1}
+    updates = state.updates
+    assert (updates.position_ns, updates.heading_ns) == (None, None)
+    assert updates.objects_ns == {"fix:mate": 1}
 
 
 def test_what_a_told_robot_hears_back_is_not_new() -> None:
@@ -600,9 +599,9 @@ def test_an_outlier_is_rejected_and_counted(variant: Variant) -> None:
     wrong = Sighting("ne", true.range_m + 3.0, true.bearing_rad + 1.0)
     after = robot.cycle(before, Sightings(1, (wrong,)))
     assert after.estimate == before.estimate
-    assert after.memory.counts == {"gated": 1}
-    assert after.memory.innovations == 0b10  # one, rejected
-    assert (after.memory.position_ns, after.memory.heading_ns) == (None, None)
+    assert after.counts == {"gated": 1}
+    assert after.updates.innovations == 0b10  # one, rejected
+    assert (after.updates.position_ns, after.updates.heading_ns) == (None, None)
 
 
 @variants
@@ -611,7 +610,7 @@ def test_one_outlier_does_not_keep_the_others_out(variant: Variant) -> None:
     seen = frame(ORIGIN, 1).sightings
     wrong = Sighting("ne", 1.0, -2.0)
     state = robot.cycle(state_at(ORIGIN, diagonal(0.1, 0.05)), Sightings(1, (wrong, *seen[1:])))
-    assert state.memory.counts == {"accepted": 3, "gated": 1}
+    assert state.counts == {"accepted": 3, "gated": 1}
 
 
 @variants
@@ -619,7 +618,7 @@ def test_a_fix_far_off_is_rejected_and_counted(variant: Variant) -> None:
     before = state_at(ORIGIN, diagonal(0.1, 0.05))
     after = standing(variant).fix(before, fix(3.0, 0.0, 1))
     assert after.estimate == before.estimate
-    assert after.memory.counts == {"gated": 1}
+    assert after.counts == {"gated": 1}
 
 
 @variants
@@ -639,7 +638,7 @@ def test_a_faulty_sighting_is_counted_and_nothing_else(
 ) -> None:
     before = state_at(ORIGIN, diagonal(0.1, 0.05), 1)  # resolution i
     after = standing(variant).cycle(before, Sightings(1, (sighting,)))
-    assert after == replace(before, memory=before.memory.counted(reason))
+    assert after == before._replace(memory=before.memory.counted(reason))
 
 
 @variants

@@ -22,7 +22,6 @@ from core_helpers import (
     sensor_noise,
     state_at,
 )
-from msgspec.structs import replace
 
 from cpcbl_team.collaboration import Place
 from cpcbl_team.config import (
@@ -43,6 +42,8 @@ from cpcbl_team.recovery import (
     MOST_PIECES,
     SPACING_NS,
     WINDOW_NS,
+    Limits,
+    innovated,
     lost_reason,
     relocalized,
     remembered,
@@ -50,10 +51,11 @@ from cpcbl_team.recovery import (
     with_seen,
 )
 from cpcbl_team.sightings import Measured
-from cpcbl_team.state import Evidence, Memory, State, innovated
+from cpcbl_team.state import Evidence, Memory, State, Updates
 
 ORIGIN = Pose2(0.0, 0.0, 0.0)
 RULES = LocalizerSettings()
+LIMITS = Limits.of(RULES)
 SENSOR = SensorSettings()
 UNKNOWN = Start(known=False, x_m=0.0, y_m=0.0)
 
@@ -84,7 +86,7 @@ def test_a_robot_is_lost_by_its_own_uncertainty(
     sigma_m: float, sigma_rad: float, reason: str
 ) -> None:
     estimate = Estimate(ORIGIN, diagonal(sigma_m, sigma_rad))  # row 20, resolution f
-    assert lost_reason(estimate, Memory(), RULES) == reason
+    assert lost_reason(estimate, 1, LIMITS) == reason
 
 
 @pytest.mark.parametrize(
@@ -99,15 +101,18 @@ def test_a_robot_is_lost_by_its_own_uncertainty(
 def test_a_robot_is_lost_when_most_of_what_it_sees_is_rejected(
     rejected: int, accepted: int, reason: str
 ) -> None:
-    memory = Memory(innovations=innovated(1, accepted, rejected, 20))
-    assert lost_reason(Estimate(ORIGIN, diagonal(0.1, 0.1)), memory, RULES) == reason
+    innovations = innovated(1, accepted, rejected, 20)
+    assert lost_reason(Estimate(ORIGIN, diagonal(0.1, 0.1)), innovations, LIMITS) == reason
 
 
 @pytest.mark.parametrize(("sigma_m", "still"), [(1.1, True), (0.9, False)])
 def test_being_lost_ends_at_half_the_limit(sigma_m: float, still: bool) -> None:
-    estimate = Estimate(ORIGIN, diagonal(sigma_m, 0.1))
-    assert (lost_reason(estimate, Memory(lost="before"), RULES) != "") is still
-    assert lost_reason(estimate, Memory(), RULES) == ""
+    robot = localizer(rules=RULES)
+    memory = Memory(lost="before")
+    state = state_at(ORIGIN, diagonal(sigma_m, 0.1))._replace(memory=memory)
+    assert (robot.cycle(state, Sightings(1, ())).memory.lost != "") is still
+    state = state._replace(memory=Memory())
+    assert robot.cycle(state, Sightings(1, ())).memory.lost == ""
 
 
 def test_doubt_doubles_sigma_up_to_the_limits_of_being_lost() -> None:
@@ -333,9 +338,8 @@ def test_an_object_that_was_seen_a_short_time_ago_is_no_new_evidence(
     age_ns: int, kept: list[str]
 ) -> None:
     state = state_at(ORIGIN, diagonal(0.1, 0.1), stamp_ns=SECOND)
-    state = replace(
-        state, memory=Memory(evidence=(piece(SECOND - age_ns, ORIGIN, "ne", 4.5, 2.5),))
-    )
+    memory = Memory(evidence=(piece(SECOND - age_ns, ORIGIN, "ne", 4.5, 2.5),))
+    state = state._replace(memory=memory)
     place, both = Place(4.5, 2.5, Covariance2(0.0, 0.0, 0.0)), (5.0, 0.5)
     seen = [Measured(name, place, None, False, *both, 0.1, 0.1) for name in ("ne", "ne")]
     assert [e.source for e in with_seen(state, seen).evidence] == kept
@@ -348,7 +352,7 @@ def test_a_reading_that_may_not_be_used_is_no_evidence(gives: Gives) -> None:
     seen = point_sighting(ORIGIN, "ne", 4.5, 2.5)
     ranged = Sightings(1, (Sighting("ne", seen.range_m),))
     state = robot.cycle(state_at(ORIGIN, diagonal(0.1, 0.1)), ranged)
-    assert all((e.range_m, e.bearing_rad) != (None, None) for e in state.memory.evidence)
+    assert all((e.range_m, e.bearing_rad) != (None, None) for e in robot.evidence(state.memory))
 
 
 # The whole way back -------------------------------------------------------------------------------
@@ -359,7 +363,7 @@ def test_a_robot_with_an_unknown_start_finds_itself() -> None:
     state = robot.start(0)
     state = robot.cycle(state, frame(PATH[0], SECOND // 10, names=["ne", "se"]))
     assert state.memory.lost == ""
-    assert state.memory.counts["found_again"] == 1
+    assert state.counts["found_again"] == 1
     assert position_error(state.estimate, PATH[0]) < 1e-3
 
 
@@ -369,7 +373,7 @@ def kidnapped(variant: Variant, names: Sequence[str], before_s: float) -> tuple[
     begin, way = state_at(LOOP_START, diagonal(0.05, 0.05)), loop()[: int(before_s * 10)]
     before = followed(robot, begin, LOOP_START, way, names=lambda _: names, noise=noise)
     state, truth = [(begin, LOOP_START), *before][-1]
-    assert not state.memory.counts.get("lost")
+    assert not state.counts.get("lost")
     away = math.copysign(3.0, -truth.x)
     elsewhere = Pose2(truth.x + away, truth.y, wrap_angle(truth.heading + 1.2))
     on = [(0.03, 0.02)] * 30
@@ -384,7 +388,7 @@ def test_a_kidnapped_robot_is_back_within_three_seconds(
     variant: Variant, names: Sequence[str], before_s: float
 ) -> None:
     state, truth = kidnapped(variant, names, before_s)
-    assert state.memory.counts["lost"] >= 1
+    assert state.counts["lost"] >= 1
     assert state.memory.lost == ""
     assert position_error(state.estimate, truth) < 0.5
     assert heading_error(state.estimate, truth) < 0.3
@@ -394,7 +398,7 @@ def test_a_kidnapped_robot_is_back_within_three_seconds(
 def test_a_kidnapped_robot_is_not_found_where_it_no_longer_is(variant: Variant) -> None:
     """Being found at the old place makes it confident, and heard, while it is wrong."""
     state, _ = kidnapped(variant, tuple(CORNERS.landmarks), 8.0)
-    assert state.memory.counts["found_again"] == 1
+    assert state.counts["found_again"] == 1
 
 
 @variants
@@ -426,7 +430,7 @@ def test_an_overconfident_robot_with_one_landmark_does_not_reject_it_for_ever(
     state = state_at(Pose2(0.5, 1.0, -1.0), diagonal(0.02, 0.02))
     for i in range(1, 46):
         state = robot.cycle(state, frame(LOOP_START, i * SECOND // 3, names=["ne"]))
-    assert state.memory.innovations.bit_count() - 1 >= 10
+    assert state.updates.innovations.bit_count() - 1 >= 10
 
 
 @pytest.mark.parametrize("own", [False, True], ids=["a teammate's fixes", "its own sensor"])
@@ -442,7 +446,7 @@ def test_a_lost_robot_is_found_by_its_places_along_the_way(variant: Variant, own
         else:
             state = robot.fix(state, fix(truth.x, truth.y, now))
     assert state.memory.lost == ""
-    assert "lost" not in state.memory.counts  # not again
+    assert "lost" not in state.counts  # not again
     assert position_error(state.estimate, truth) < 0.1
     assert heading_error(state.estimate, truth) < 0.2
 
@@ -450,9 +454,8 @@ def test_a_lost_robot_is_found_by_its_places_along_the_way(variant: Variant, own
 def test_a_robot_says_why_it_is_lost_now() -> None:
     """Not why it was at first: the rejections are over, its heading is still unknown."""
     robot = localizer(rules=LocalizerSettings(variant="joint"))
-    memory = Memory(
-        innovations=innovated(1, 20, 0, 20), lost="13 of the last 20 innovations rejected"
-    )
-    state = replace(state_at(ORIGIN, diagonal(0.1, 1.0)), memory=memory)
+    memory = Memory(lost="13 of the last 20 innovations rejected")
+    updates = Updates(innovations=innovated(1, 20, 0, 20))
+    state = state_at(ORIGIN, diagonal(0.1, 1.0))._replace(memory=memory, updates=updates)
     state = robot.cycle(state, Sightings(1, ()))
     assert state.memory.lost == "heading sigma 57 deg"

@@ -314,7 +314,7 @@ def test_nothing_is_learned_where_nothing_is_wrong(variant: Variant) -> None:
 def test_what_is_known_corrects_wheels_and_bearings(learns: bool) -> None:
     known = Learned(0.9, 0.8, 0.1)
     before = state_at(ORIGIN, diagonal(0.1, 0.05))
-    before = replace(before, memory=replace(before.memory, learned=known))
+    before = before._replace(memory=replace(before.memory, learned=known))
     robot = robot_that(learns)
     moved = robot.moved(robot.drive(before, Odometry(0, SECOND, 1.0, 0.5)), SECOND)
     expected = step(ORIGIN, 0.9, 0.4) if learns else step(ORIGIN, 1.0, 0.5)
@@ -331,7 +331,7 @@ def test_a_robot_that_was_lost_compares_with_nothing_before() -> None:
     assert before.memory.anchors is not None
     assert before.memory.learned != Learned()
     *_, (last, truth) = followed(robot, before, elsewhere, [(0.0, 0.0)] * 100)
-    assert last.memory.counts["found_again"] >= 1
+    assert last.counts["found_again"] >= 1
     assert position_error(last.estimate, truth) < 0.2
     assert last.memory.learned == before.memory.learned
     assert last.memory.anchors is not None
@@ -343,8 +343,8 @@ def test_while_a_robot_is_lost_it_has_no_anchors() -> None:
     at = anchor(LOOP_START, ORIGIN, 0.0)
     lost = robot.start(0)
     memory = replace(lost.memory, lost="for the test", anchors=both(at))
-    seen = robot.cycle(replace(lost, memory=memory), frame(LOOP_START, SECOND // 10))
-    assert seen.memory.counts["accepted"] == len(CORNERS.landmarks)
+    seen = robot.cycle(lost._replace(memory=memory), frame(LOOP_START, SECOND // 10))
+    assert seen.counts["accepted"] == len(CORNERS.landmarks)
     assert seen.memory.anchors is None
 
 

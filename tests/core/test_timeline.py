@@ -180,7 +180,7 @@ def test_a_frame_inside_an_older_piece_of_odometry_is_seen_from_there() -> None:
     state = timeline.latest(400 * MS)
     assert state.estimate.pose == pytest.approx((LOOP_START.x + 0.4, LOOP_START.y, 0.0))
     assert state.estimate.position_sigma_m < 0.05
-    assert state.memory.counts == {"accepted": 6}
+    assert state.counts == {"accepted": 6}
 
 
 def test_odometry_that_comes_after_its_frame_still_carries_it() -> None:
@@ -211,7 +211,7 @@ def test_a_belief_that_comes_after_the_sighting_counts_as_if_it_had_come_before(
     late = after(robot, [seen])
     before = late.state
     assert late.add(told) == ""
-    assert (late.state.memory.counts == {"accepted": 1}) is used
+    assert (late.state.counts == {"accepted": 1}) is used
     known = late.at(SECOND)
     assert known is not None
     assert (known.estimate != before.estimate) is used
@@ -281,7 +281,7 @@ def test_two_different_frames_of_one_time_are_both_used() -> None:
     timeline = Timeline(localizer("joint", MIXED), START)
     assert timeline.add(frame(LOOP_START, 7, MIXED, ["both"])) == ""
     assert timeline.add(frame(LOOP_START, 7, MIXED, ["ranged"])) == ""
-    assert timeline.state.memory.counts == {"accepted": 2}
+    assert timeline.state.counts == {"accepted": 2}
 
 
 def test_what_is_older_than_the_horizon_is_refused() -> None:
@@ -314,7 +314,7 @@ def test_a_belief_of_the_start_is_used() -> None:
     timeline = Timeline(robot, state_at(LOOP_START, diagonal(0.1, 0.1), SECOND))
     assert timeline.add(frame_of_mate(SECOND)) == ""
     assert timeline.add(belief(1.0, 0.0, SECOND)) == ""
-    assert timeline.state.memory.counts == {"accepted": 1}
+    assert timeline.state.counts == {"accepted": 1}
     assert timeline.at(SECOND - 1) is None
 
 

@@ -521,7 +521,7 @@ def test_a_kidnapped_robot_accuses_nobody_and_goes_where_all_say() -> None:
 
     told = Told({"a": carried, "b": carried}, rounds=1)
     assert told.quarantines == {}
-    assert told.state.memory.counts["lost"] == 1
+    assert told.state.counts["lost"] == 1
     assert told.errors[-1] == pytest.approx(3.0, abs=0.3)
 
 
@@ -585,14 +585,14 @@ def watched(offset_m: float, age_ns: int = 0) -> tuple[Localizer, State]:
 def test_a_teammate_whose_belief_is_not_where_it_is_seen_is_not_used_as_a_landmark() -> None:
     _, state = watched(1.0)
     assert state.memory.voices["mate"].reason
-    assert state.memory.counts["distrusted"] > 10
-    assert "mate" not in state.memory.objects_ns
+    assert state.counts["distrusted"] > 10
+    assert "mate" not in state.updates.objects_ns
 
 
 def test_an_honest_belief_is_used() -> None:
     _, state = watched(0.0)
     assert state.memory.voices["mate"].reason == ""
-    assert state.memory.objects_ns["mate"] == state.stamp_ns
+    assert state.updates.objects_ns["mate"] == state.stamp_ns
 
 
 def test_an_old_belief_is_held_against_nobody() -> None:
