@@ -16,6 +16,9 @@ import math
 from collections.abc import Iterator, Mapping
 from typing import NamedTuple
 
+import msgspec
+from msgspec.structs import replace
+
 from cpcbl_team.config import TrustSettings
 from cpcbl_team.geometry import Pose2
 
@@ -63,7 +66,7 @@ class Anchor(NamedTuple):
     odometry_from_robot: Pose2
 
 
-class Voice(NamedTuple):
+class Voice(msgspec.Struct, frozen=True, gc=False):
     """What is kept of one sender."""
 
     heard_ns: int = NEVER_NS
@@ -132,9 +135,9 @@ class Standing(NamedTuple):
 def heard(voice: Voice, said: Said, limit: float) -> Voice:
     """The voice after one more word."""
     if voice.score and said.stamp_ns - voice.heard_ns > ALONE_NS:
-        voice = voice._replace(score=0.0)
+        voice = replace(voice, score=0.0)
     voice = _driven(voice, said)
-    voice = voice._replace(heard_ns=max(voice.heard_ns, said.stamp_ns))
+    voice = replace(voice, heard_ns=max(voice.heard_ns, said.stamp_ns))
     return voice if said.surprise is None else _agreeing(voice, said, said.surprise, limit)
 
 
@@ -142,19 +145,19 @@ def _agreeing(voice: Voice, said: Said, surprise: float, limit: float) -> Voice:
     now = said.stamp_ns
     score = max(0.0, min(voice.score + min(surprise, MOST_NIS) - USUAL_NIS, 2.0 * limit))
     if score and not voice.score and not voice.reason:  # words that cannot tell end no dispute
-        voice = voice._replace(doubted_ns=now, offset=said.offset or (0.0, 0.0), spread=0.0)
-    voice = voice._replace(score=score)
+        voice = replace(voice, doubted_ns=now, offset=said.offset or (0.0, 0.0), spread=0.0)
+    voice = replace(voice, score=score)
     if surprise <= USUAL_NIS:
-        return voice._replace(agreed_ns=now, healthy=voice.healthy + 1)
+        return replace(voice, agreed_ns=now, healthy=voice.healthy + 1)
     if said.offset is not None:
         voice = _averaged(voice, *said.offset)
-    return voice._replace(wrong_ns=now, healthy=0) if surprise > WRONG_NIS else voice
+    return replace(voice, wrong_ns=now, healthy=0) if surprise > WRONG_NIS else voice
 
 
 def _averaged(voice: Voice, x: float, y: float, share: float = 0.2) -> Voice:
     (mx, my), dx, dy = voice.offset, x - voice.offset[0], y - voice.offset[1]
     spread = (1.0 - share) * (voice.spread + share * (dx * dx + dy * dy))
-    return voice._replace(offset=(mx + share * dx, my + share * dy), spread=spread)
+    return replace(voice, offset=(mx + share * dx, my + share * dy), spread=spread)
 
 
 def _driven(voice: Voice, said: Said) -> Voice:
@@ -163,7 +166,7 @@ def _driven(voice: Voice, said: Said) -> Voice:
     if now is None:
         return voice
     if then is None or now.stamp_ns - then.stamp_ns > ALONE_NS:
-        return voice._replace(anchor=now)
+        return replace(voice, anchor=now)
     if now.stamp_ns <= then.stamp_ns:
         return voice
     way = then.odometry_from_robot.inverse() @ now.odometry_from_robot
@@ -175,12 +178,13 @@ def _driven(voice: Voice, said: Said) -> Voice:
     stayed = far and told < STILL_SHARE * chord and chord - told > STILL * sigma
     fade = math.exp((voice.heard_ns - now.stamp_ns) * 1e-9 / MEMORY_S)
     strikes, compared = fade * voice.strikes, fade * voice.compared + 1.0
-    voice = voice._replace(compared=compared, strikes=strikes)
+    voice = replace(voice, compared=compared, strikes=strikes)
     if not (jumped or far or now.stamp_ns - then.stamp_ns >= REST_NS):
         return voice
-    voice = voice._replace(anchor=now)
+    voice = replace(voice, anchor=now)
     if jumped or stayed:
-        return voice._replace(
+        return replace(
+            voice,
             strikes=strikes + 1.0,
             still=stayed,
             steady=0,
@@ -189,7 +193,7 @@ def _driven(voice: Voice, said: Said) -> Voice:
             wrong_ns=now.stamp_ns,
         )
     followed = far or voice.reason != "frozen"  # a robot that stands cannot tell
-    return voice._replace(steady=voice.steady + 1) if followed else voice
+    return replace(voice, steady=voice.steady + 1) if followed else voice
 
 
 def seen(voice: Voice, stamp_ns: int, used: int, rejected: int, limit: float) -> Voice:
@@ -287,12 +291,17 @@ def _silenced(voices: Voices, name: str, now_ns: int, used_ns: int) -> Verdict:
 
 
 def _freed(voice: Voice, now_ns: int) -> Voice:
-    return voice._replace(reason="", since_ns=now_ns, score=0.0, strikes=0.0, doubted_ns=NEVER_NS)
+    return replace(voice, reason="", since_ns=now_ns, score=0.0, strikes=0.0, doubted_ns=NEVER_NS)
 
 
 def _put_away(voice: Voice, reason: str, now_ns: int) -> Voice:
-    return voice._replace(
-        reason=reason, since_ns=now_ns, quarantines=voice.quarantines + 1, healthy=0, steady=0
+    return replace(
+        voice,
+        reason=reason,
+        since_ns=now_ns,
+        quarantines=voice.quarantines + 1,
+        healthy=0,
+        steady=0,
     )
 
 
@@ -303,7 +312,7 @@ def _outvoted(
     silenced = frozenset(beside - {OWN})
     offsets = [math.hypot(*voices[n].offset) for n in against]
     changed = {n: _put_away(voices[n], "outvoted", now_ns) for n in silenced}
-    changed |= {n: voices[n]._replace(score=0.0) for n in against}
+    changed |= {n: replace(voices[n], score=0.0) for n in against}
     changed = {**voices, **changed}
     return Verdict(changed, name not in silenced, "outvoted", silenced, max(offsets))
 
@@ -321,7 +330,7 @@ def _reason(voice: Voice) -> str:
 def _in_quarantine(voices: Voices, name: str, said: Said, rules: TrustSettings) -> Verdict:
     voice, now = voices[name], said.stamp_ns
     if voice.wrong_ns == now and (said.surprise is None or said.surprise > WRONG_NIS):
-        voice = voice._replace(reason=_reason(voice))
+        voice = replace(voice, reason=_reason(voice))
         voices = {**voices, name: voice}
     long_ns = int(rules.readmit_s * 1e9)
     confirmed = any(v.agreed_ns >= now - WINDOW_NS for _, v in _lately(voices, now, name))
@@ -335,7 +344,7 @@ def _in_quarantine(voices: Voices, name: str, said: Said, rules: TrustSettings) 
 
 def forgiven(voices: Voices) -> Voices:
     """After the robot was lost: what it held against others was its own error."""
-    return {n: v if v.reason else v._replace(score=0.0) for n, v in voices.items()}
+    return {n: v if v.reason else replace(v, score=0.0) for n, v in voices.items()}
 
 
 def standings(voices: Voices, now_ns: int) -> tuple[Standing, ...]:

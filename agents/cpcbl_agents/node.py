@@ -11,7 +11,7 @@ from cpcbl_agents.robot import Robot
 from cpcbl_agents.tally import Tallies
 from cpcbl_agents.wiring import Tokens, Wiring
 from cpcbl_team.config import Team
-from cpcbl_team.inputs import Belief, Fix, Odometry, Position, Sightings
+from cpcbl_team.inputs import Belief, Fix
 from cpcbl_team.trust import Standing
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus
@@ -20,7 +20,7 @@ from cpcbl_transport.messages import (
     LARGEST_FRAME,
     LARGEST_PAYLOAD,
     Drive,
-    Frame,
+    Help,
     Look,
     Message,
     Refusal,
@@ -90,7 +90,7 @@ class Node:
         ]
         self._own_name = bus.watch(topics.ALIVE.at(robot=robot.name), self._seen_my_name)
 
-    # On the bus's thread: only put away ---------------------------------------------------------
+    # On a thread of the bus ---------------------------------------------------------------------
 
     def _arrived(self, key: str, payload: bytes) -> None:
         if key == self._frame_key:  # only the latest: a robot that is slow sees less, not late
@@ -112,7 +112,7 @@ class Node:
         if alive and not key.endswith("/" + self._incarnation):
             self.counts["same_name_twice"] += 1
 
-    # On the robot's own thread ------------------------------------------------------------------
+    # On one thread at a time --------------------------------------------------------------------
 
     @property
     def next_ns(self) -> int:
@@ -146,6 +146,7 @@ class Node:
         message = self._accepted(key, payload, now_ns)
         if message is not None:
             self._send(self._robot.handle(message, now_ns), now_ns)
+            self._count(message, len(payload))
 
     def _take_tokens(self, now_ns: int) -> None:
         """What the bus knows of teammates: who is there, with which tier."""
@@ -188,23 +189,22 @@ class Node:
             self.counts[reason] += 1
             return None
         assert not isinstance(message, Refusal)
-        size = len(payload)
+        return message
+
+    def _count(self, message: Message, size: int) -> None:
+        """What was heard, once that has been used."""
         match message:
             case Fix(observer=name):  # by a subscription to all observers
                 self.heard.of("fix", name).add(received_bytes(size, name), message.stamp_ns)
             case Belief(robot=name):  # by one to this key
                 self.heard.of("belief", name).add(sent_bytes(size), message.stamp_ns)
-        return message
 
     def _refused(self, key: str, message: Message, now_ns: int) -> Refusal | None:
         """What the key allows, who may say it, then the numbers and the time."""
-        last = key.rsplit("/", 1)[-1]
         match message:
             case Belief(robot=sender) | Fix(observer=sender):
                 pass
-            case Odometry() | Sightings() | Position() | Frame() if type(message) is _INPUTS.get(
-                last
-            ):
+            case _ if type(message) is _INPUTS.get(key.rsplit("/", 1)[-1]):
                 return refusal(message, now_ns)
             case _:
                 return Refusal.WRONG_TYPE
@@ -245,7 +245,7 @@ class Node:
         publisher = self._wiring.publisher(topic, key)
         if not publisher.matching:
             return 0
-        payload = encode_help(message) if isinstance(message, Belief | Fix) else encode(message)
+        payload = encode_help(message) if isinstance(message, Help) else encode(message)
         publisher.put(payload)
         return len(payload)
 

@@ -15,7 +15,7 @@ from cpcbl_agents.sources.mrclam import MrclamSource
 from cpcbl_team.config import Team
 from cpcbl_team.inputs import Belief, Fix, Odometry, Position, Sightings, Told
 from cpcbl_transport.budget import Budget
-from cpcbl_transport.messages import Drive, Frame, Look, Message, Track
+from cpcbl_transport.messages import Drive, Frame, Help, Look, Message, Track
 
 NEVER_NS = 2**62
 _OUTGOING = (Belief, Fix, Track, Drive)
@@ -76,6 +76,9 @@ class Robot:
                 self.filter.handle(message if there else message._replace(tier=None), now_ns)
             if isinstance(message, Sent) and message.size:
                 self._told(message.message.stamp_ns, now_ns)
+            return []
+        if isinstance(message, Help):  # they change what is said at the next tick
+            self.filter.handle(message, now_ns)
             return []
         raw = isinstance(message, (Odometry, Sightings, Position, Frame))
         inputs: list[Anything] = [] if raw else [message]

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import msgspec
 
 from cpcbl_agents.clock import Clock
-from cpcbl_agents.process import Wake, own_camera, run_node
+from cpcbl_agents.process import Loop, own_camera
 from cpcbl_agents.visit import Visit, body_of
 from cpcbl_launch.reporting.flows import FlowReport, summed_flows
 from cpcbl_launch.simulation.bodies import unfit
@@ -171,17 +171,17 @@ def visit(
     Raises BusError when stopped before a router answered, ValueError for a name that is taken,
     SecurityError without the keys of a secured team.
     """
-    wake = Wake()
+    loop = Loop(clock)
     link = link_of(team, Identity(Role.OBSERVER, name), connect)
     with (
-        own_camera(name, team, clock, wake) as camera,
+        own_camera(name, team, clock, loop.wake) as camera,
         open_bus(team.name, link.endpoints, stop, link.credentials) as bus,
     ):
         _look_for_namesakes(name, bus, stop)
         start_ns = clock.now_ns()
         incarnation = f"{os.getpid():x}"
-        node = Visit(name, team, bus, start_ns, incarnation, wake.set, clock.speed, camera)
-        run_node(node, wake, clock, lambda: stop() or clock.now_ns() - start_ns >= duration_s * 1e9)
+        node = Visit(name, team, bus, start_ns, incarnation, loop.arrived, clock.speed, camera)
+        loop.run(node, lambda: stop() or clock.now_ns() - start_ns >= duration_s * 1e9)
         end_ns = clock.now_ns()
         node.leave(end_ns)
     return _visited(node, team, (end_ns - start_ns) * 1e-9)

@@ -346,7 +346,7 @@ def test_who_is_in_quarantine_finds_nobody() -> None:
     robot = localizer("joint", Field(), start=UNKNOWN, odometry=STILL)
     state = robot.start(0)
     state = robot.fix(state, fix(1.0, 2.0, 1, heading=0.5))
-    voice = state.memory.voices["mate"]._replace(reason="biased")
+    voice = replace(state.memory.voices["mate"], reason="biased")
     lost = replace(robot.start(0).memory, voices={"mate": voice})
     state = robot.start(0)._replace(memory=lost)
     for i in range(1, 5):

@@ -98,6 +98,8 @@ class Budget:
         for window in (self._bytes, self._messages):
             if renewed and window is not None:
                 window.spend(start_ns, window.capacity)
+        limits = self._bytes, self._messages, self._match
+        self._limits = tuple(limit for limit in limits if limit is not None)
 
     def admits(self, now_ns: int, size: int, urgent: bool) -> bool:
         """Whether every limit has room for a message of this size now."""
@@ -138,5 +140,4 @@ class Budget:
         return max((limit.pace_s * amount for limit, amount in self._costs(size)), default=0.0)
 
     def _costs(self, size: int) -> list[_Cost]:
-        costs = ((self._bytes, float(size)), (self._messages, 1.0), (self._match, 1.0))
-        return [_Cost(limit, amount) for limit, amount in costs if limit is not None]
+        return [_Cost(limit, size if limit is self._bytes else 1.0) for limit in self._limits]

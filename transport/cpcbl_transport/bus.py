@@ -1,7 +1,8 @@
 """The one small interface to a bus, and its deterministic twin in memory.
 
 Keys are `/`-separated; in subscriptions `*` stands for one chunk and a last `**` for any rest.
-Callbacks run on a thread of the bus (in memory: the publisher's) and must only put things away.
+Callbacks run on a thread of the bus (in memory: the publisher's). One that works for some
+milliseconds holds up its own subscription alone: what comes for it meanwhile, up to 256, waits.
 A session does not hear what it publishes itself.
 """
 

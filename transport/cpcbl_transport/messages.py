@@ -246,10 +246,9 @@ def refusal(message: Message, now_ns: int) -> Refusal | None:
     """
     if not isinstance(message, Sightings):
         numbers = _numbers(message)
-        if not all(map(math.isfinite, numbers)):
-            return Refusal.NOT_FINITE
-        if any(abs(n) > LARGEST_NUMBER for n in numbers):
-            return Refusal.IMPLAUSIBLE
+        if not all(abs(n) <= LARGEST_NUMBER for n in numbers):
+            finite = all(map(math.isfinite, numbers))
+            return Refusal.IMPLAUSIBLE if finite else Refusal.NOT_FINITE
     if abs(message.stamp_ns) >= LAST_NS:
         return Refusal.IMPLAUSIBLE
     if isinstance(message, Telemetry) and any(n > LARGEST_COUNT for n in _counts(message)):

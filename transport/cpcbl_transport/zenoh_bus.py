@@ -2,6 +2,7 @@
 
 - One publisher a concrete key: a put without a publisher is uploaded even if nobody listens.
 - Sequence numbers of 16 bits: two bytes a message less than Zenoh's 32.
+- Whether anybody listens is asked only after it has changed: once in a while that takes 40 us.
 - No multicast: a client finds its router by the endpoint, which the launcher hands it.
 - `open` is retried here with a short time-out: a blocked open swallows SIGINT.
 - A session that is not closed hangs the interpreter at exit: `with open_bus(...)`.
@@ -147,13 +148,22 @@ class _ZenohPublisher(_Declared):
     def __init__(self, bus: "ZenohBus", publisher: "zenoh.Publisher") -> None:
         super().__init__(bus, publisher.undeclare)
         self._publisher = publisher
+        self._asked = self._matching = False
+        listener = zenoh.handlers.Callback(self._changed, indirect=False)  # no thread for each
+        publisher.declare_matching_listener(listener)
+
+    def _changed(self, status: "zenoh.MatchingStatus") -> None:
+        self._asked = False
 
     @property
     def matching(self) -> bool:
         if not self.open:
             return False
-        status: Any = self._publisher.matching_status  # the stubs call it a bool
-        return bool(status.matching)
+        if not self._asked:
+            self._asked = True  # first, for it may change meanwhile
+            status: Any = self._publisher.matching_status  # the stubs call it a bool
+            self._matching = bool(status.matching)
+        return self._matching
 
     def put(self, payload: bytes) -> None:
         if self.open:

@@ -24,7 +24,7 @@ from rich.console import RenderableType
 from cpcbl_agents.agent import FromBus, Tick
 from cpcbl_agents.clock import Clock
 from cpcbl_agents.node import Node
-from cpcbl_agents.process import Stop, Wake, run_node
+from cpcbl_agents.process import Loop, Stop
 from cpcbl_agents.robot import Robot
 from cpcbl_launch.passing import PassingBus, PassingPublisher
 from cpcbl_launch.reporting.tables import table
@@ -162,11 +162,11 @@ def _robot(
     name: str, team: Team, endpoint: str, clock: Clock, parent: int, out: Connection
 ) -> None:
     """A robot's process: the project's own loop around a node, on a bus that notes."""
-    stop, wake = Stop(parent), Wake()
+    stop, loop = Stop(parent), Loop(clock)
     with open_bus(team.name, [endpoint], stop) as session:
         bus, start_ns = NotingBus(session), clock.now_ns()
         robot = NotingRobot(name, team, start_ns)
-        run_node(Node(robot, team, bus, start_ns, "1", wake.set), wake, clock, stop)
+        loop.run(Node(robot, team, bus, start_ns, "1", loop.arrived), stop)
     out.send(Notes(bus.heard, bus.said, robot.changed_ns))
 
 
