@@ -60,8 +60,8 @@ class Observation(NamedTuple):
         (first, second), (e, f) = self.rows, self.residuals
         k = r.xy / r.xx
         second = (second[0] - k * first[0], second[1] - k * first[1], second[2] - k * first[2])
-        evidence = Information.none().add(first, e, r.xx)
-        return evidence.add(second, f - k * e, r.yy - k * r.xy)
+        both = (first, e, r.xx), (second, f - k * e, r.yy - k * r.xy)
+        return Information.none().with_all(both)
 
     def normalized_innovation_squared(self, prior: Covariance3) -> float:
         """e^T (H P H^T + R)^-1 e: chi-square with as many degrees of freedom as rows."""
@@ -114,14 +114,15 @@ def merge_split(prior: Estimate, seen: Observation, scope: Scope = POSE) -> Esti
     prior of which nothing or all is shared.
     """
     goal = _determinant(prior, seen) if scope is POSE else _variance(prior, seen, scope)
-    weight = best_weight(goal)
-    if goal(weight) >= _extent(prior.covariance, scope):
+    weight, extent = best_weight(goal)
+    if extent >= _extent(prior.covariance, scope):
         return prior
     return _merge_split_at(prior, seen, scope, weight)
 
 
-def best_weight(goal: Callable[[float], float]) -> float:
-    """The weight of covariance intersection at which the goal is smallest, by golden section."""
+def best_weight(goal: Callable[[float], float]) -> tuple[float, float]:
+    """The weight of covariance intersection at which the goal is smallest, by golden section, and
+    the goal there."""
     low, high = 0.02, 0.98
     left, right = high - _GOLDEN * (high - low), low + _GOLDEN * (high - low)
     best_left, best_right = goal(left), goal(right)
@@ -134,7 +135,7 @@ def best_weight(goal: Callable[[float], float]) -> float:
             low, left, best_left = left, right, best_right
             right = low + _GOLDEN * (high - low)
             best_right = goal(right)
-    return left if best_left <= best_right else right
+    return (left, best_left) if best_left <= best_right else (right, best_right)
 
 
 def _extent(covariance: Covariance3, scope: Scope) -> float:
@@ -163,20 +164,24 @@ def _variance(prior: Estimate, seen: Observation, scope: Scope) -> Callable[[flo
 def _determinant(prior: Estimate, seen: Observation) -> Callable[[float], float]:
     """Of the merged covariance, by the weight: det (P1^-1 + H^T R^-1 H)^-1 =
     det P1 det R / det (R + H P1 H^T), the lemma of determinants."""
-    # P1 = P + k P_d, so H P1 H^T = H P H^T + k H P_d H^T
-    (p_xx, p_xy, p_yy), (s_xx, s_xy, s_yy) = (
-        _projected(c, seen.rows) for c in (prior.covariance, prior.shared)
-    )
-    alone = len(seen.rows) == 1
+    # P1 = P + k P_d, so H P1 H^T = H P H^T + k H P_d H^T; plain numbers, for this is done often
+    p, d, alone = prior.covariance, prior.shared, len(seen.rows) == 1
+    (pxx, pxy, pyy, pxh, pyh, phh), (dxx, dxy, dyy, dxh, dyh, dhh) = p, d
+    (p_xx, p_xy, p_yy), (d_xx, d_xy, d_yy) = _projected(p, seen.rows), _projected(d, seen.rows)
+    (ixx, ixy, iyy), (oxx, oxy, oyy) = seen.independent, seen.dependent
 
     def determinant(weight: float) -> float:
-        k = 1.0 / weight - 1.0
-        widened = prior.covariance.plus(prior.shared, k).determinant()
-        xx, xy, yy = seen.noise(1.0 / (1.0 - weight))
-        sxx, sxy, syy = xx + p_xx + k * s_xx, xy + p_xy + k * s_xy, yy + p_yy + k * s_yy
+        k, m = 1.0 / weight - 1.0, 1.0 / (1.0 - weight)
+        xx, xy, xh = pxx + k * dxx, pxy + k * dxy, pxh + k * dxh
+        yy, yh, hh = pyy + k * dyy, pyh + k * dyh, phh + k * dhh
+        widened = xx * (yy * hh - yh * yh) - xy * (xy * hh - yh * xh) + xh * (xy * yh - yy * xh)
+        rxx = ixx + m * oxx + SMALLEST_VARIANCE
+        sxx = rxx + p_xx + k * d_xx
         if alone:
-            return widened * xx / sxx
-        return widened * (xx * yy - xy * xy) / (sxx * syy - sxy * sxy)
+            return widened * rxx / sxx
+        rxy, ryy = ixy + m * oxy, iyy + m * oyy + SMALLEST_VARIANCE
+        sxy, syy = rxy + p_xy + k * d_xy, ryy + p_yy + k * d_yy
+        return widened * (rxx * ryy - rxy * rxy) / (sxx * syy - sxy * sxy)
 
     return determinant
 

@@ -99,7 +99,7 @@ def merged_heading(prior: float, fix: Fix, fusion: Fusion) -> float:
     def after(weight: float) -> float:
         return 1.0 / (weight / prior + 1.0 / (fresh + dependent / (1.0 - weight)))
 
-    return min(prior, after(best_weight(after)))
+    return min(prior, best_weight(after)[1])
 
 
 def heading_worth(prior: float, after: float) -> float:
@@ -118,7 +118,7 @@ def merged(
     prior, fresh = _not_exact(prior), _not_exact(fresh)
     if fusion == "naive":
         return _product(prior, fresh + dependent)
-    weight = best_weight(lambda w: _determinant(prior, fresh, dependent, w))
+    weight, _ = best_weight(lambda w: _determinant(prior, fresh, dependent, w))
     after = _product(prior.scaled(1.0 / weight), fresh + dependent.scaled(1.0 / (1.0 - weight)))
     return after if after.determinant() < prior.determinant() else prior
 
