@@ -31,7 +31,7 @@ from cpcbl_team.geometry import PI, wrap_angle
 from cpcbl_team.inputs import Sighting
 from cpcbl_team.recovery import latest
 from cpcbl_team.sensors import LARGEST_BEARING_RAD, LARGEST_M, range_to_expect
-from cpcbl_team.state import Evidence, Look, Memory, State
+from cpcbl_team.state import Evidence, Glance, Memory, State
 
 Said = tuple[Sums, dict[str, int], int, bool, list[Sighting], list[Sighting]]
 """What the landmarks of a frame say: about the offset from the prior; the objects that count, and
@@ -195,13 +195,13 @@ class Landmarks:
 
     def evidence(self, memory: Memory) -> tuple[Evidence, ...]:
         """All the evidence in a memory, the latest last."""
-        pieces = [piece for look in memory.looks for piece in self._pieces(look)]
+        pieces = [piece for glance in memory.glances for piece in self._pieces(glance)]
         return latest(tuple(sorted((*pieces, *memory.evidence), key=_stamp)))
 
-    def _pieces(self, look: Look) -> Iterator[Evidence]:
-        """The evidence of a look, one piece a landmark."""
+    def _pieces(self, glance: Glance) -> Iterator[Evidence]:
+        """The evidence of a glance, one piece a landmark."""
         share, floor, farthest = self._range_model
-        now, reckoned, pose, sightings = look
+        now, reckoned, pose, sightings = glance
         first: dict[str, Sighting] = {}
         for seen in sightings:
             first.setdefault(seen.id, seen)

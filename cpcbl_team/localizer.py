@@ -47,7 +47,7 @@ from cpcbl_team.sightings import (
     offers,
     surprise,
 )
-from cpcbl_team.state import FIX, Evidence, Look, Memory, State, Updates
+from cpcbl_team.state import FIX, Evidence, Glance, Memory, State, Updates
 from cpcbl_team.whereabouts import Whereabouts
 
 UNSTEERABLE_SIGMA_RAD = math.radians(100.0)  # beyond, no bearing can be linearized
@@ -188,8 +188,8 @@ class Localizer:
             if offered or any(offers(m, turn, self._rules) for m in fresh):
                 break
         if landmarks:
-            look = new(Look, (stamp_ns, reckoned, estimate.pose, tuple(landmarks)))
-            memory = recovery.looked(memory, look)
+            glance = new(Glance, (stamp_ns, reckoned, estimate.pose, tuple(landmarks)))
+            memory = recovery.glanced(memory, glance)
             state = new(State, (stamp_ns, estimate, reckoned, motion, odometry_ns, memory, updates))
         if seen or faults:
             memory = recovery.with_seen(state, seen).counted(*faults)

@@ -17,7 +17,7 @@ from cpcbl_team.constraints import Constraint, bearing_heading, range_circle
 from cpcbl_team.estimate import SMALLEST_VARIANCE, ZERO3, Covariance3, Estimate, Information, merge
 from cpcbl_team.geometry import Pose2
 from cpcbl_team.sightings import Measured
-from cpcbl_team.state import FIX, Evidence, Look, Memory, State
+from cpcbl_team.state import FIX, Evidence, Glance, Memory, State
 from cpcbl_team.whereabouts import Whereabouts
 
 WINDOW_NS = 20_000_000_000
@@ -64,16 +64,16 @@ def told_evidence(state: State, said: Whereabouts) -> Evidence:
     return Evidence(*place, own_rad, its, True, heading.rad, its_rad)
 
 
-def looked(memory: Memory, look: Look) -> Memory:
+def glanced(memory: Memory, glance: Glance) -> Memory:
     """The memory with landmarks that were not `noted`, without what is too old."""
-    now, recent = look.stamp_ns, _recent(memory, look.stamp_ns)
-    for seen in look.sightings:
+    now, recent = glance.stamp_ns, _recent(memory, glance.stamp_ns)
+    for seen in glance.sightings:
         recent[seen.id] = now
-    looks = (*memory.looks, look)[-MOST_PIECES:]
-    if now - looks[0].stamp_ns > WINDOW_NS:
-        looks = tuple(one for one in looks if now - one.stamp_ns <= WINDOW_NS)
+    glances = (*memory.glances, glance)[-MOST_PIECES:]
+    if now - glances[0].stamp_ns > WINDOW_NS:
+        glances = tuple(one for one in glances if now - one.stamp_ns <= WINDOW_NS)
     until_ns = min(recent.values()) + SPACING_NS
-    return replace(memory, looks=looks, noted=frozenset(recent), noted_until_ns=until_ns)
+    return replace(memory, glances=glances, noted=frozenset(recent), noted_until_ns=until_ns)
 
 
 def remembered(memory: Memory, pieces: Sequence[Evidence]) -> Memory:
@@ -103,11 +103,11 @@ def latest(evidence: tuple[Evidence, ...]) -> tuple[Evidence, ...]:
 def _recent(memory: Memory, now_ns: int) -> dict[str, int]:
     """The sources of which no more evidence is needed yet, and when each gave some."""
     recent = {}
-    for look in reversed(memory.looks):
-        if now_ns - look.stamp_ns >= SPACING_NS:
+    for glance in reversed(memory.glances):
+        if now_ns - glance.stamp_ns >= SPACING_NS:
             break
-        for seen in look.sightings:
-            recent[seen.id] = look.stamp_ns
+        for seen in glance.sightings:
+            recent[seen.id] = glance.stamp_ns
     for e in reversed(memory.evidence):
         if now_ns - e.stamp_ns >= SPACING_NS:
             break

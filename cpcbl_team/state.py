@@ -36,7 +36,7 @@ class Evidence(NamedTuple):
     place_sigma_rad: float = 0.0  # its sigma, as far as it is a teammate's
 
 
-class Look(NamedTuple):
+class Glance(NamedTuple):
     """Landmarks seen at one time, of which evidence is made when the robot is lost."""
 
     stamp_ns: int
@@ -61,7 +61,7 @@ class Memory(msgspec.Struct, frozen=True, gc=False):
     """What few cycles change."""
 
     teammates: Mapping[str, tuple[Belief, ...]] = _NONE
-    looks: tuple[Look, ...] = ()
+    glances: tuple[Glance, ...] = ()
     evidence: tuple[Evidence, ...] = ()  # of all else
     noted: frozenset[str] = frozenset()  # the sources of which no more is needed yet,
     noted_until_ns: int = 0  # until then
