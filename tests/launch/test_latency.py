@@ -70,8 +70,9 @@ def test_a_team_and_a_broadcast_of_the_same_size_are_measured(
     for load in (size.team, size.broadcast):
         assert 0.0 <= load.kept <= load.kept_mean <= 1.0
         assert load.kept_mean > 0.0
-        assert 0.0 < load.cpu < 2.0
+        assert 0.0 <= load.cpu < 2.0  # two that only read may take less than a tick of the clock
         assert 0.0 < load.proportional_mib <= load.resident_mib
+    assert size.team.cpu > 0.0
     assert size.team.field_kept is not None
     assert size.team.cpu_field is not None
     assert size.broadcast.field_kept is size.broadcast.cpu_field is None
