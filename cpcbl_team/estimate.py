@@ -74,9 +74,7 @@ class Covariance3(NamedTuple):
 
 
 SMALLEST_VARIANCE: Final = 1e-10  # (10 um)^2, (10 urad)^2: what is called exact
-SHARPEST_VARIANCE: Final = (
-    1e-8  # of a measurement: sharper ones drown the inverse of I + P A in rounding
-)
+SHARPEST_VARIANCE: Final = 1e-8  # of a measurement: sharper ones drown I + P A in rounding
 SPREAD_SHARE: Final = 0.25  # of an ellipse's spread that its circle keeps
 ZERO3: Final = Covariance3(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 Row = tuple[float, float, float]

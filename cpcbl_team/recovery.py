@@ -8,7 +8,7 @@ An ambiguous answer is no answer.
 
 import math
 from collections.abc import Collection, Iterator, Sequence
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 from msgspec.structs import replace
 
@@ -30,6 +30,7 @@ _OPEN = Covariance3(1e6, 0.0, 1e6, 0.0, 0.0, 1e3)
 _LEVER_M = 2.0  # over such a way an error of position has become one of heading
 _ENOUGH_POSITION_SIGMA_M = 0.7
 _ENOUGH_HEADING_SIGMA_RAD = 0.5
+Seen = TypeVar("Seen", Evidence, Glance)
 
 
 def seen_evidence(state: State, m: Measured) -> Evidence:
@@ -69,10 +70,8 @@ def glanced(memory: Memory, glance: Glance) -> Memory:
     now, recent = glance.stamp_ns, _recent(memory, glance.stamp_ns)
     for seen in glance.sightings:
         recent[seen.id] = now
-    glances = (*memory.glances, glance)[-MOST_PIECES:]
-    if now - glances[0].stamp_ns > WINDOW_NS:
-        glances = tuple(one for one in glances if now - one.stamp_ns <= WINDOW_NS)
     until_ns = min(recent.values()) + SPACING_NS
+    glances = latest((*memory.glances, glance))
     return replace(memory, glances=glances, noted=frozenset(recent), noted_until_ns=until_ns)
 
 
@@ -92,11 +91,11 @@ def remembered(memory: Memory, pieces: Sequence[Evidence]) -> Memory:
     return replace(memory, evidence=kept, noted=frozenset(recent), noted_until_ns=until_ns)
 
 
-def latest(evidence: tuple[Evidence, ...]) -> tuple[Evidence, ...]:
+def latest(seen: tuple[Seen, ...]) -> tuple[Seen, ...]:
     """Without what is too old, or too much."""
-    kept = evidence[-MOST_PIECES:]
+    kept = seen[-MOST_PIECES:]
     if kept and kept[-1].stamp_ns - kept[0].stamp_ns > WINDOW_NS:
-        kept = tuple(e for e in kept if kept[-1].stamp_ns - e.stamp_ns <= WINDOW_NS)
+        kept = tuple(one for one in kept if kept[-1].stamp_ns - one.stamp_ns <= WINDOW_NS)
     return kept
 
 
