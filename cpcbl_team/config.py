@@ -54,6 +54,9 @@ class OdometryNoise(Table, frozen=True, kw_only=True):
     """Wheels that turn on the spot slip to and fro."""
     turn_sigma_rad_per_sqrt_rad: NotNegative = 0.05
     turn_sigma_rad_per_sqrt_m: NotNegative = 0.05
+    crawl_sigma_m_per_sqrt_s: NotNegative = 0.0
+    """While it drives at `least_speed_m_s`, the variance of its way grows with time, by this at
+    least: in their dead zone motors do as they like."""
 
 
 class OdometrySettings(OdometryNoise, frozen=True, kw_only=True):

@@ -36,7 +36,7 @@ from cpcbl_team.inputs import Belief, Fix, Odometry, Position, Sighting, Sightin
 from cpcbl_team.landmarks import Landmarks, Said
 from cpcbl_team.motion import move
 from cpcbl_team.self_calibration import Anchor, Anchors, learned
-from cpcbl_team.sensors import repeated_share, sighting_fault
+from cpcbl_team.sensors import crawled_s, repeated_share, sighting_fault
 from cpcbl_team.sightings import (
     Found,
     Measured,
@@ -115,7 +115,7 @@ class Localizer:
                     told = observation_of(prior, m, cs, estimate)
                     estimate = self._merge_teammate(estimate, told, scope)
         if accepted:
-            used = {**used, **{m.source: state.stamp_ns for m, *_ in accepted}}
+            used = used | {m.source: state.stamp_ns for m, *_ in accepted}
         if accepted or self._reduces or estimate.shared is not ZERO3:
             estimate = self._reduced(estimate)
         return self._judged(self._updated(state, estimate, turn, used, rejected + len(refused)))
@@ -141,16 +141,19 @@ class Localizer:
         if motion is not None:
             distance, turn = motion.distance_m, motion.turn_rad
             from_ns, end_ns = motion.from_ns, motion.stamp_ns
+            driven_ns = whole_ns = end_ns - from_ns
             if from_ns != stamp_ns or end_ns > until_ns:  # not the whole piece
                 driven_ns = max(0, min(end_ns, until_ns) - max(stamp_ns, from_ns))
-                share = driven_ns / (end_ns - from_ns)
+                share = driven_ns / whole_ns
                 distance, turn = share * distance, share * turn
+            s = self._odometry
+            crawled = crawled_s(distance, driven_ns * 1e-9, s) if s.least_speed_m_s else 0.0
             if self._learns:
                 distance *= memory.learned.distance_scale
                 turn *= memory.learned.turn_scale
             if distance != 0.0 or turn != 0.0:
                 reckoned = step(reckoned, distance, turn)
-                estimate = move(estimate, distance, turn, self._odometry, self._as_circle)
+                estimate = move(estimate, distance, turn, s, crawled, self._as_circle)
                 if self._reduces or estimate.shared is not ZERO3:
                     estimate = self._reduced(estimate)
             if end_ns <= until_ns:
@@ -342,7 +345,7 @@ class Localizer:
         state = self._noted(self.moved(state, stamp_ns), said)
         updates, prior, source = state.updates, state.estimate, said.source
         least = self._rules.object_interval_s * 1e9
-        if not _passed(state.updates.objects_ns.get(source), stamp_ns, least):
+        if not _passed(updates.objects_ns.get(source), stamp_ns, least):
             return state
         if self._correlated:
             said = said.doubted(self._repeated(updates, source, stamp_ns))

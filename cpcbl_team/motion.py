@@ -28,19 +28,27 @@ def motion_jacobian(heading: float, distance: float, turn: float) -> Matrix3:
     )
 
 
-def motion_noise(heading: float, distance: float, turn: float, noise: OdometryNoise) -> Covariance3:
+def motion_noise(
+    heading: float, distance: float, turn: float, noise: OdometryNoise, crawled_s: float = 0.0
+) -> Covariance3:
     """The differential motion's covariance, rotated into the field's frame."""
     certain = Estimate(Pose2(0.0, 0.0, heading), ZERO3)
-    return move(certain, distance, turn, noise).covariance
+    return move(certain, distance, turn, noise, crawled_s).covariance
 
 
 def move(
-    estimate: Estimate, distance: float, turn: float, noise: OdometryNoise, as_circle: bool = False
+    estimate: Estimate,
+    distance: float,
+    turn: float,
+    noise: OdometryNoise,
+    crawled_s: float = 0.0,
+    as_circle: bool = False,
 ) -> Estimate:
     """The estimate after the wheels report an arc of `distance` metres that turns by `turn`.
 
-    F P F^T + C is written out, for it runs for every odometry step. `as_circle`: the position's
-    covariance is kept as a circle.
+    F P F^T + C is written out, for it runs for every odometry step. `crawled_s`: how many seconds
+    of it the robot drove at its least speed. `as_circle`: the position's covariance is kept as a
+    circle.
     """
     pose, covariance, shared = estimate
     x, y, heading = pose
@@ -49,7 +57,10 @@ def move(
     c, s = cos(direction), sin(direction)
     way, turned = abs(distance), abs(turn)
     per_m, per_rad = noise.distance_sigma_m_per_sqrt_m, noise.distance_sigma_m_per_sqrt_rad
-    along = per_m * per_m * way + per_rad * per_rad * turned
+    along = per_m * per_m * way
+    if crawled_s > 0.0:
+        along = max(along, noise.crawl_sigma_m_per_sqrt_s**2 * crawled_s)
+    along += per_rad * per_rad * turned
     per_m, per_rad = noise.turn_sigma_rad_per_sqrt_m, noise.turn_sigma_rad_per_sqrt_rad
     around = per_m * per_m * way + per_rad * per_rad * turned
     # where a heading error of one radian leads, in metres: the last column of F

@@ -12,6 +12,7 @@ from cpcbl_team.inputs import Odometry, Sighting, Sightings
 LARGEST_M: Final = 1e6
 LARGEST_BEARING_RAD: Final = math.pi + 1e-9
 SOONEST_S = 1e-3
+SAME_SPEED: Final = 1e-6  # speeds that differ by less are one
 LEAST_COSINE = 0.1  # a depth says nothing of what is seen across the optical axis
 
 
@@ -25,6 +26,12 @@ def corrected_odometry(piece: Odometry, s: OdometrySettings) -> Odometry:
     distance = math.copysign(way, piece.distance_m)
     turn = s.turn_scale * piece.turn_rad + s.turn_bias_rad_per_m * distance
     return Odometry(piece.from_ns + delay_ns, piece.stamp_ns + delay_ns, distance, turn)
+
+
+def crawled_s(distance_m: float, seconds: float, s: OdometrySettings) -> float:
+    """How many of these seconds a robot that truly drove so far drove at its least speed."""
+    slow = s.least_speed_m_s * seconds * (1.0 + SAME_SPEED)
+    return seconds if 0.0 < abs(distance_m) <= slow else 0.0
 
 
 def corrected_sighting(sighting: Sighting, sensor: SensorSettings, teammate: bool) -> Sighting:

@@ -31,7 +31,7 @@ from cpcbl_team.geometry import Pose2, step, wrap_angle
 from cpcbl_team.inputs import Odometry, Sighting, Sightings
 from cpcbl_team.metrics import Floats, Trajectory, compared, score
 from cpcbl_team.motion import motion_noise
-from cpcbl_team.sensors import repeated_share, sighting_fault, sighting_sigmas
+from cpcbl_team.sensors import crawled_s, repeated_share, sighting_fault, sighting_sigmas
 
 SMALLEST_VARIANCE = 1e-12  # (1 um)^2: exact sensors must not make a matrix singular
 _TRIANGLE = ((0, 0, 1, 0, 1, 2), (0, 1, 1, 2, 2, 2))  # xx, xy, yy, xh, yh, hh
@@ -194,8 +194,9 @@ class Ekf:
             piece = robot.pieces[0]
             end_ns = min(piece.stamp_ns, until_ns)
             whole_ns = piece.stamp_ns - piece.from_ns
-            share = max(0, end_ns - max(robot.now_ns, piece.from_ns)) / whole_ns
-            self._move(robot, share * piece.distance_m, share * piece.turn_rad)
+            driven_ns = max(0, end_ns - max(robot.now_ns, piece.from_ns))
+            share = driven_ns / whole_ns
+            self._move(robot, share * piece.distance_m, share * piece.turn_rad, driven_ns * 1e-9)
             robot.covered_ns = max(robot.covered_ns, piece.stamp_ns)
             if piece.stamp_ns > until_ns:
                 break
@@ -203,7 +204,7 @@ class Ekf:
         self._doubt_motion(robot, until_ns)
         robot.now_ns = until_ns
 
-    def _move(self, robot: _Member, distance: float, turn: float) -> None:
+    def _move(self, robot: _Member, distance: float, turn: float, seconds: float) -> None:
         if distance == 0.0 and turn == 0.0:
             return
         i, p = robot.first, self.covariance
@@ -213,7 +214,9 @@ class Ekf:
         lever = np.array([before.y - after.y, after.x - before.x])  # d(x, y) / d(heading)
         p[i : i + 2] += lever[:, None] * p[i + 2]
         p[:, i : i + 2] += p[:, i + 2, None] * lever
-        self._add(i, motion_noise(before.heading, distance, turn, robot.settings.odometry))
+        s = robot.settings.odometry
+        crawled = crawled_s(distance, seconds, s)
+        self._add(i, motion_noise(before.heading, distance, turn, s, crawled))
 
     def _doubt_motion(self, robot: _Member, until_ns: int) -> None:
         """The growth of uncertainty while odometry is missing, as in the team."""

@@ -703,6 +703,31 @@ def test_odometry_is_driven_as_time_passes(variant: Variant) -> None:
     assert halves.odometry_from_robot == pytest.approx((1.0, 0.0, 0.0))
 
 
+@probabilistic
+def test_a_crawl_errs_with_its_time_however_it_is_cut(variant: Variant) -> None:
+    dead_zone = OdometrySettings(
+        distance_sigma_m_per_sqrt_m=0.0,
+        turn_sigma_rad_per_sqrt_m=0.0,
+        least_speed_m_s=0.02,
+        crawl_sigma_m_per_sqrt_s=0.05,
+    )
+    robot = localizer(variant, odometry=dead_zone)
+    start, at_once = state_at(ORIGIN, diagonal(0.0, 0.0)), []
+    for speed in (0.02, 0.03):
+        driven = robot.drive(start, Odometry(0, 4 * SECOND, 4.0 * speed, 0.0))
+        whole = robot.moved(driven, 4 * SECOND).estimate
+        cut = robot.moved(robot.moved(driven, SECOND), 4 * SECOND).estimate
+        assert cut.pose == pytest.approx(whole.pose)
+        assert tuple(cut.covariance) == pytest.approx(tuple(whole.covariance))
+        at_once.append(whole)
+    crawled, drove = at_once
+    assert crawled.pose.x == pytest.approx(0.08)
+    of_circle = 0.5 * (1.0 + SPREAD_SHARE)
+    along = 0.05**2 * 4.0 * (of_circle if variant == "circular" else 1.0)
+    assert crawled.covariance.xx == pytest.approx(along)
+    assert drove.covariance.xx == 0.0
+
+
 def test_motion_on_the_spot_is_none() -> None:
     robot, before = localizer(), state_at(ORIGIN, diagonal(0.1, 0.05))
     after = robot.moved(robot.drive(before, Odometry(0, 10, 0.0, 0.0)), 10)

@@ -10,6 +10,7 @@ from cpcbl_team.inputs import Odometry, Sighting, Sightings
 from cpcbl_team.sensors import (
     corrected_odometry,
     corrected_sighting,
+    crawled_s,
     repeated_share,
     sighting_fault,
     sighting_sigmas,
@@ -118,6 +119,18 @@ def test_nobody_drives_slower_than_his_motors_can(commanded: float, driven: floa
     s = OdometrySettings(least_speed_m_s=0.02)
     piece = Odometry(0, 500_000_000, 0.5 * commanded, 0.0)
     assert corrected_odometry(piece, s).distance_m == pytest.approx(0.5 * driven)
+
+
+@pytest.mark.parametrize("share", [1.0, 0.3])
+@pytest.mark.parametrize(
+    ("commanded", "crawls"), [(0.03, False), (0.01, True), (-0.01, True), (0.0, False)]
+)
+def test_a_robot_crawls_at_its_least_speed(commanded: float, crawls: bool, share: float) -> None:
+    s = OdometrySettings(least_speed_m_s=0.02, distance_scale=0.97)
+    driven = corrected_odometry(Odometry(0, 500_000_000, 0.5 * commanded, 0.0), s).distance_m
+    seconds = share * 0.5
+    assert crawled_s(share * driven, seconds, s) == (seconds if crawls else 0.0)
+    assert crawled_s(share * driven, seconds, OdometrySettings()) == 0.0
 
 
 @pytest.mark.parametrize("teammate", [False, True])

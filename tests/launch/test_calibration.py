@@ -213,12 +213,16 @@ def test_gross_outliers_do_not_matter() -> None:
             assert dirty[name].value == pytest.approx(estimate.value, abs=slack), name
 
 
-def crawling(least_speed: float, slow: float = 0.008) -> RobotLog:
-    """Straight on, by turns at 0.3 m/s and slowly; the truth is known to 0.5 mm."""
+def crawling(least_speed: float, slow: float = 0.008, sigma: float = 0.0) -> RobotLog:
+    """Straight on, by turns at 0.3 m/s and slowly; the truth is known to 0.5 mm. `sigma`: of the
+    way while it is slow, in m per root of a second."""
+    random = np.random.default_rng(3)
     times = np.arange(0.0, 120.0, 0.02)
     commanded = np.where(times % 10.0 < 5.0, 0.3, slow)
-    way = np.concatenate([[0.0], np.cumsum(np.maximum(commanded, least_speed) * 0.02)[:-1]])
-    way += np.random.default_rng(3).normal(0.0, 0.0005, len(way))
+    each = np.maximum(commanded, least_speed) * 0.02
+    each += random.normal(0.0, sigma * math.sqrt(0.02), len(each)) * (commanded == slow)
+    way = np.concatenate([[0.0], np.cumsum(each)[:-1]])
+    way += random.normal(0.0, 0.0005, len(way))
     nothing = np.zeros_like(way)
     from_s = times[:-1:5]
     step = np.full_like(from_s, 0.1)
@@ -234,6 +238,14 @@ def test_motors_with_a_dead_zone_are_found_to_have_one() -> None:
     assert found["distance_scale"].value == pytest.approx(1.0, abs=3e-3)
     without = calibrate_odometry([crawling(least_speed=0.0)])
     assert "least_speed_m_s" not in without
+    assert "crawl_sigma_m_per_sqrt_s" not in without
+
+
+def test_how_crawling_errs_is_found() -> None:
+    found = calibrate_odometry([crawling(least_speed=0.02, sigma=0.006)])
+    crawl = found["crawl_sigma_m_per_sqrt_s"]
+    assert crawl.standard_error < 0.0015
+    assert abs(crawl.value - 0.006) < 3.0 * crawl.standard_error
 
 
 def test_a_robot_that_only_turns_tells_no_distance_scale() -> None:
@@ -360,8 +372,14 @@ source = "external"
 """
 
 
+def written(
+    found: Calibration, base: str, margin: float = 0.0, correction_margin: float = 0.0
+) -> str:
+    return team_text(found, base, margin=margin, correction_margin=correction_margin)
+
+
 def test_types_are_added_to_the_base_team_file() -> None:
-    text = team_text(FOUND, BASE, margin=0.0)
+    text = written(FOUND, BASE)
     team, before = parse_team(text), parse_team(BASE)
     assert text.startswith("# Calibrated by `cpcbl-team calibrate` from log.")
     assert "# kept" in text
@@ -383,25 +401,38 @@ def test_noise_is_written_as_of_another_day() -> None:
         "bearing_sigma_deg": Estimate(1.0, 0.1),
     }
     found = Calibration(("log",), {"r1": RobotCalibration({}, sensor, range_is_depth=True)})
-    r1 = parse_team(team_text(found, BASE, margin=0.5)).robots["r1"].sensor
+    r1 = parse_team(written(found, BASE, margin=0.5, correction_margin=0.4)).robots["r1"].sensor
     assert r1.range_is_depth
-    assert r1.range_share == pytest.approx(math.hypot(0.03, 0.05), abs=5e-4)
-    assert r1.range_floor_m == pytest.approx(0.02, abs=5e-4)
+    assert r1.range_share == pytest.approx(math.hypot(0.03, 0.04), abs=5e-4)
+    assert r1.range_floor_m == pytest.approx(0.016, abs=5e-4)
     assert r1.bearing_sigma_deg == pytest.approx(1.5, abs=0.05)
 
 
+def test_a_dead_zone_of_another_day_is_in_the_noise_of_crawling() -> None:
+    odometry = {
+        "least_speed_m_s": Estimate(0.02, 0.001),
+        "distance_sigma_m_per_sqrt_m": Estimate(0.03, 0.001),
+        "crawl_sigma_m_per_sqrt_s": Estimate(0.006, 0.0003),
+    }
+    found = Calibration(("log",), {"r1": RobotCalibration(odometry, {})})
+    r1 = parse_team(written(found, BASE, margin=0.5, correction_margin=0.4)).robots["r1"].odometry
+    for_two_s = 0.4 * 0.02 * math.sqrt(2.0)
+    assert r1.crawl_sigma_m_per_sqrt_s == pytest.approx(math.hypot(0.009, for_two_s), abs=1e-4)
+    assert r1.distance_sigma_m_per_sqrt_m == pytest.approx(0.045, abs=5e-4)
+
+
 def test_a_calibrated_team_file_can_be_calibrated_again() -> None:
-    once = team_text(FOUND, BASE)
-    twice = team_text(FOUND, once)
+    once = written(FOUND, BASE)
+    twice = written(FOUND, once)
     assert parse_team(twice).robots == parse_team(once).robots
     assert parse_team(twice).calibrated_on == ("log",)
 
 
 def test_a_base_without_the_robots_is_refused() -> None:
     with pytest.raises(ValueError, match="has none of the robots r1"):
-        team_text(FOUND, 'name = "x"\n[robots.other]\nsource = "external"\n')
+        written(FOUND, 'name = "x"\n[robots.other]\nsource = "external"\n')
     with pytest.raises(TeamFileError):
-        team_text(FOUND, "nonsense")
+        written(FOUND, "nonsense")
 
 
 def test_a_recorded_team_is_written_as_it_was(recorded: Path) -> None:

@@ -257,8 +257,8 @@ def test_sightings_have_the_stated_sigma(noise: float) -> None:
 
 @pytest.mark.parametrize(
     ("speed", "turn_rate", "sigma_along", "sigma_around"),
-    [(1.0, 0.0, 0.1, 0.3), (0.0, 1.0, 0.0, 0.2)],
-    ids=["straight ahead", "on the spot"],
+    [(1.0, 0.0, 0.1, 0.3), (0.0, 1.0, 0.0, 0.2), (0.01, 0.0, 0.05, 0.3 * math.sqrt(0.02))],
+    ids=["straight ahead", "on the spot", "at its least speed"],
 )
 def test_the_ground_has_the_noise_that_the_settings_state(
     speed: float, turn_rate: float, sigma_along: float, sigma_around: float
@@ -268,6 +268,8 @@ def test_the_ground_has_the_noise_that_the_settings_state(
         distance_sigma_m_per_sqrt_m=0.1,
         turn_sigma_rad_per_sqrt_rad=0.2,
         turn_sigma_rad_per_sqrt_m=0.3,
+        least_speed_m_s=0.02,
+        crawl_sigma_m_per_sqrt_s=0.05,
     )
     subject = field(noise=1.0, r1=robot(odometry=odometry))
     way, turns = [], []

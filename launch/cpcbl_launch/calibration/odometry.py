@@ -1,7 +1,6 @@
 """How a robot's odometry errs: windows of a drive against true poses.
 
-Conventions are those of `OdometrySettings`. A way is compared along its own direction, a turn
-whole; windows of a few seconds tell the corrections, longer ones how the noise grows.
+Windows of a few seconds tell the corrections, longer ones how the noise grows.
 """
 
 import math
@@ -10,34 +9,33 @@ from typing import NamedTuple
 
 import numpy as np
 
-from cpcbl_launch.calibration.robot_log import LONGEST_GAP_S, RobotLog
+from cpcbl_launch.calibration.dead_zone import CRAWL_NOISE, crawl_noise, least_speed, no_slower
+from cpcbl_launch.calibration.robot_log import RobotLog
 from cpcbl_launch.calibration.statistics import (
     GROSS,
     LEAST_ROWS,
     Estimate,
     Fit,
-    Integers,
-    Keep,
     Mask,
     jackknife,
     kept,
     robust_fit,
     sigmas,
     solved,
-    stretches,
     told,
     variance_parts,
 )
+from cpcbl_launch.calibration.windows import (
+    NOISE_WINDOWS_S,
+    WINDOW_S,
+    Corrections,
+    OdometryRows,
+    odometry_rows,
+)
 from cpcbl_team.metrics import Floats
 
-WINDOW_S = 2.0
-NOISE_WINDOWS_S = (1.0, 2.0, 4.0, 8.0, 16.0)
 LEAST_MOTION = 0.02  # m or rad in a window; less tells nothing of scales
 DELAYS_S = np.arange(0.0, 1.001, 0.02)
-LEAST_SPEEDS_M_S = np.arange(0.0, 0.0501, 0.001)
-SLIPPED_M = 0.1  # a way that errs more than this in a window is no matter of a dead zone
-SURE = 3.0  # standard errors
-NUDGE_S = 0.01
 CORRECTIONS = (
     "distance_scale",
     "turn_scale",
@@ -54,136 +52,6 @@ NOISE = (
 )
 
 
-class OdometryRows(NamedTuple):
-    """Windows of a drive, each beside what the truth says. Shapes (n,)."""
-
-    stretch: Integers
-    turn: Floats  # commanded
-    turn_rate: Floats  # by how much `turn` falls for a second of delay
-    true_turn: Floats
-    way: Floats  # commanded way along the true headings
-    way_rate: Floats
-    true_way: Floats  # the part of the true displacement along it
-    loss: Floats  # the part along it of |turn| while driving
-    drove: Floats  # sum of distance
-    turned_driving: Floats  # sum of |turn| while driving
-    along: Floats  # sum of |distance| that errs along it: times cos^2 of the direction between
-    turned_along: Floats  # the same of |turn|
-    path: Floats  # sum of |distance|
-    turned: Floats  # sum of |turn|
-
-
-class Corrections(NamedTuple):
-    """Present values by the names of `OdometrySettings`."""
-
-    distance_scale: float
-    turn_scale: float
-    delay_s: float
-    loss: float
-    bias: float
-
-    def ways(self, rows: OdometryRows) -> Floats:
-        return np.asarray(self.distance_scale * rows.way - self.loss * rows.loss)
-
-    def turns(self, rows: OdometryRows) -> Floats:
-        return np.asarray(self.turn_scale * rows.turn + self.bias * self.drove(rows))
-
-    def drove(self, rows: OdometryRows) -> Floats:
-        return np.asarray(self.distance_scale * rows.drove - self.loss * rows.turned_driving)
-
-
-def odometry_rows(logs: Sequence[RobotLog], delay_s: float, length_s: float) -> OdometryRows:
-    """Windows of about `length_s` that lie between rows of truth without long gaps."""
-    parts = [_windows(log, i, delay_s, length_s) for i, log in enumerate(logs)]
-    return OdometryRows(*map(np.concatenate, zip(*parts, strict=True)))
-
-
-def _windows(log: RobotLog, number: int, delay_s: float, length_s: float) -> OdometryRows:
-    stamps = log.truth[:, 0]
-    x, y, heading = log.truth[:, 1], log.truth[:, 2], np.unwrap(log.truth[:, 3])
-    first, last = _spans(stamps, log.odometry, delay_s, length_s)
-    a, b = stamps[first], stamps[last]
-    before, now, after = (
-        _driven(log.odometry, stamps, heading, delay_s + nudge, a, b)
-        for nudge in (-NUDGE_S, 0.0, NUDGE_S)
-    )
-    turn, px, py, lx, ly, drove, turned_driving, path, turned, *doubled = now.T
-    way = np.hypot(px, py)
-    still = way < 1e-3
-    ux = np.where(still, np.cos(heading[first]), px / np.maximum(way, 1e-9))
-    uy = np.where(still, np.sin(heading[first]), py / np.maximum(way, 1e-9))
-    rate = (after - before) / (2.0 * NUDGE_S)
-    cos2, sin2 = ux * ux - uy * uy, 2.0 * ux * uy
-    return OdometryRows(
-        stretches(a, stamps, number),
-        turn,
-        rate[:, 0],
-        heading[last] - heading[first],
-        ux * px + uy * py,
-        ux * rate[:, 1] + uy * rate[:, 2],
-        ux * (x[last] - x[first]) + uy * (y[last] - y[first]),
-        ux * lx + uy * ly,
-        drove,
-        turned_driving,
-        0.5 * (path + cos2 * doubled[0] + sin2 * doubled[1]),
-        0.5 * (turned + cos2 * doubled[2] + sin2 * doubled[3]),
-        path,
-        turned,
-    )
-
-
-def _spans(
-    stamps: Floats, odometry: Floats, delay_s: float, length_s: float
-) -> tuple[Integers, Integers]:
-    """First and last truth row of each window; windows do not overlap."""
-    begin, end = max(stamps[0], odometry[0, 0]) + 1.0, min(stamps[-1], odometry[-1, 1]) - 1.0
-    grid = np.arange(begin, end - length_s, length_s)
-    ends = odometry[:, 1] + delay_s
-    first = _row_at_end(stamps, ends, grid)
-    last = _row_at_end(stamps, ends, stamps[first] + length_s)
-    gaps = np.concatenate(([0], np.cumsum(np.diff(stamps) > LONGEST_GAP_S)))
-    seconds = stamps[last] - stamps[first]
-    good = (gaps[first] == gaps[last]) & (stamps[first] - grid < 0.5 * length_s)
-    good &= (seconds > 0.75 * length_s) & (seconds < 1.5 * length_s)
-    return first[good], last[good]
-
-
-def _row_at_end(stamps: Floats, ends: Floats, times_s: Floats) -> Integers:
-    """Of the next rows of truth the one nearest to an end of odometry, within which there is only
-    a mean speed.
-    """
-    rows = np.searchsorted(stamps, times_s)[:, None] + np.arange(6)
-    rows = np.minimum(rows, len(stamps) - 1)
-    after = np.clip(np.searchsorted(ends, stamps[rows]), 1, len(ends) - 1)
-    aside = np.minimum(np.abs(ends[after] - stamps[rows]), np.abs(stamps[rows] - ends[after - 1]))
-    late = stamps[rows] - stamps[rows[:, :1]] > 0.12
-    return np.asarray(rows[np.arange(len(rows)), np.argmin(np.where(late, 9.0, aside), axis=1)])
-
-
-def _driven(
-    odometry: Floats, stamps: Floats, heading: Floats, delay_s: float, a: Floats, b: Floats
-) -> Floats:
-    """What was commanded from a to b, shape (n, 13): turn; way, and |turn| while driving, in x and
-    y along the true headings; way; |turn| while driving; |way|; |turn|; both times cos and sin of
-    twice the heading.
-    """
-    from_s, until_s, distance, turn = odometry.T
-    direction = np.interp(0.5 * (from_s + until_s) + delay_s, stamps, heading)
-    c, s, way, turned = np.cos(direction), np.sin(direction), np.abs(distance), np.abs(turn)
-    cos2, sin2 = np.cos(2.0 * direction), np.sin(2.0 * direction)
-    lost = np.sign(distance) * turned
-    along = [distance * c, distance * s, lost * c, lost * s]
-    doubled = [way * cos2, way * sin2, turned * cos2, turned * sin2]
-    pieces = np.stack([turn, *along, distance, lost, way, turned, *doubled])
-    knots = np.stack([from_s, until_s], axis=1).ravel() + delay_s
-    sums = []
-    for piece in pieces:
-        total = np.cumsum(piece)
-        levels = np.stack([total - piece, total], axis=1).ravel()
-        sums.append(np.interp(b, knots, levels) - np.interp(a, knots, levels))
-    return np.stack(sums, axis=1)
-
-
 def odometry_delay_s(logs: Sequence[RobotLog]) -> float:
     """The delay on a grid with which turns and ways fit best, each with its own scale."""
     costs = []
@@ -198,41 +66,6 @@ def odometry_delay_s(logs: Sequence[RobotLog]) -> float:
                 cost += moving.sum() * math.log(max(error, 1e-9))
         costs.append(cost)
     return float(DELAYS_S[int(np.argmin(costs))])
-
-
-def least_speed(logs: Sequence[RobotLog], now: Corrections) -> Estimate | None:
-    """The speed (m/s) at which it drives when told to drive slower, if the logs tell it: that on
-    a grid with which ways fit best.
-    """
-    each, stretch = [], np.empty(0, np.int64)
-    for speed in LEAST_SPEEDS_M_S:
-        rows = odometry_rows(
-            [no_slower(log, speed / now.distance_scale) for log in logs], now.delay_s, WINDOW_S
-        )
-        each.append(np.abs(rows.true_way - now.ways(rows)))
-        stretch = rows.stretch
-    errors = np.minimum(each, SLIPPED_M)
-    slow = np.ptp(errors, axis=0) > 0.0
-    if slow.sum() < LEAST_ROWS // 2:
-        return None
-
-    def best(keep: Keep) -> Floats:
-        cost = errors[:, keep(stretch) & slow].sum(axis=1)
-        return LEAST_SPEEDS_M_S[[int(np.argmin(cost))]]
-
-    (found,) = jackknife(best, stretch)
-    step = float(LEAST_SPEEDS_M_S[1])
-    found = Estimate(found.value, max(found.standard_error, step / math.sqrt(12.0)))
-    return found if found.value > SURE * found.standard_error else None
-
-
-def no_slower(log: RobotLog, speed_m_s: float) -> RobotLog:
-    """The log as of a robot that is never told to drive slower, but for standing."""
-    odometry = log.odometry.copy()
-    from_s, until_s, distance, _ = odometry.T
-    slow = (distance != 0.0) & (np.abs(distance) < speed_m_s * (until_s - from_s))
-    odometry[slow, 2] = np.copysign(speed_m_s * (until_s - from_s), distance)[slow]
-    return log._replace(odometry=odometry)
 
 
 def odometry_fit(rows: OdometryRows, now: Corrections, noise: Floats) -> Fit:
@@ -267,7 +100,8 @@ def odometry_sigmas(rows: OdometryRows, now: Corrections, noise: Floats) -> tupl
 
 def odometry_noise(windows: Sequence[OdometryRows], now: Corrections) -> Floats:
     """Variances by how residuals grow, shape (2, 6) as of `variance_parts`: those of `NOISE`, and
-    what is constant (m^2, rad^2): the truth's own errors. Short and long windows weigh the same.
+    what is constant (m^2, rad^2): the truth's own errors. Long windows, of which there are few,
+    weigh more: what is alike for seconds tells in them.
     """
 
     def joined(name: str) -> Floats:
@@ -279,23 +113,23 @@ def odometry_noise(windows: Sequence[OdometryRows], now: Corrections) -> Floats:
     turns = np.concatenate([w.true_turn - now.turns(w) for w in windows])
     one = np.ones_like(path)
     sizes = [len(w.path) for w in windows]
-    counts = np.concatenate([np.full(n, sizes[0] / max(n, 1)) for n in sizes])
+    weights = np.concatenate([np.full(n, sizes[0] / max(n, 1)) for n in sizes])
     moving = (path > LEAST_MOTION) | (turned > LEAST_MOTION)
     of_ways, of_turns = (
-        _covering(errors[moving], np.stack(columns, axis=1)[moving], counts[moving])
+        _covering(errors[moving], np.stack(columns, axis=1)[moving], weights[moving])
         for errors, columns in ((ways, (along, turned_along, one)), (turns, (turned, path, one)))
     )
     return np.concatenate([of_ways, of_turns], axis=1)[:, [0, 1, 3, 4, 2, 5]]
 
 
-def _covering(errors: Floats, columns: Floats, counts: Floats) -> Floats:
-    """Variance parts, grown where windows of one length (they share a count) err by more: drift
+def _covering(errors: Floats, columns: Floats, weights: Floats) -> Floats:
+    """Variance parts, grown where windows of one length (they share a weight) err by more: drift
     that is alike for seconds grows faster than the root of the way, and tails are heavy."""
-    parts = variance_parts(errors, columns, counts)
+    parts = variance_parts(errors, columns, weights)
     if np.isnan(parts).any():
         return parts
     unit = errors**2 / np.maximum(columns @ parts[0], 1e-12)
-    worst = max(float(np.minimum(unit[counts == c], GROSS**2).mean()) for c in np.unique(counts))
+    worst = max(float(np.minimum(unit[weights == w], GROSS**2).mean()) for w in np.unique(weights))
     return parts * max(1.0, worst)
 
 
@@ -315,8 +149,10 @@ def calibrate_odometry(logs: Sequence[RobotLog]) -> dict[str, Estimate]:
         return {}
     found = _fitted(logs, Corrections(1.0, 1.0, odometry_delay_s(logs), 0.0, 0.0))
     least = None if found is None else least_speed(logs, found.now)
+    crawl = None
     if found is not None and least is not None:
         speed = least.value / found.now.distance_scale
+        crawl = crawl_noise(logs, found.now, speed)
         found = _fitted([no_slower(log, speed) for log in logs], found.now)
     if found is None:
         return {}
@@ -330,6 +166,8 @@ def calibrate_odometry(logs: Sequence[RobotLog]) -> dict[str, Estimate]:
     result = {name: v for name, v, k in zip(CORRECTIONS, values, known, strict=True) if k}
     if least is not None:
         result["least_speed_m_s"] = least
+    if crawl is not None:
+        result[CRAWL_NOISE] = crawl
     return result | dict(zip(NOISE, grown, strict=False))
 
 

@@ -37,7 +37,6 @@ _CALIBRATED = (
         {
             "distance_scale": "scale",
             "distance_loss_m_per_rad": "loss m/rad",
-            "least_speed_m_s": "least m/s",
             "delay_s": "delay s",
         },
     ),
@@ -45,6 +44,11 @@ _CALIBRATED = (
         "turn, true = scale x reported + bias x way",
         "odometry",
         {"turn_scale": "scale", "turn_bias_rad_per_m": "bias rad/m"},
+    ),
+    (
+        "least speed, and σ by root of time there",
+        "odometry",
+        {"least_speed_m_s": "least m/s", "crawl_sigma_m_per_sqrt_s": "σ m/√s"},
     ),
     (
         "odometry noise, σ by root of way and turn",

@@ -80,10 +80,10 @@ def solved(fit: Fit, known: Mask) -> Floats:
     return result
 
 
-def variance_parts(errors: Floats, columns: Floats, counts: Floats | None = None) -> Floats:
+def variance_parts(errors: Floats, columns: Floats, weights: Floats | None = None) -> Floats:
     """Parts with E[error^2] = columns (n, k) @ parts, shape (2, k); NaN with too few errors.
 
-    `counts` (n,): how often each error counts; default: once.
+    `weights` (n,): by what each row is multiplied in the fit; default: 1.
 
     First those of maximum likelihood for independent normal errors (Fisher scoring), none of them
     negative; then those that one more step would give if they might be. Gross errors do not count.
@@ -91,14 +91,14 @@ def variance_parts(errors: Floats, columns: Floats, counts: Floats | None = None
     if len(errors) < LEAST_ROWS:
         return np.full((2, columns.shape[1]), np.nan)
     square = errors * errors
-    often = np.ones_like(square) if counts is None else counts
+    given = np.ones_like(square) if weights is None else weights
     shape = (columns / np.maximum(columns.mean(axis=0), 1e-16)).mean(axis=1)
     level = max(float(np.median(square / shape)) / 0.455, 1e-16)  # the median of a chi-square of 1
     parts = np.zeros(columns.shape[1])
     expected, free = level * shape, np.ones(columns.shape[1], bool)
     for _ in range(20):
         good = square < GROSS**2 * expected
-        weight = np.where(good, often / expected, 0.0)
+        weight = np.where(good, given / expected, 0.0)
         parts[:] = 0.0
         parts[free] = _weighted(columns[:, free], square, weight)
         if (parts < 0.0).any():

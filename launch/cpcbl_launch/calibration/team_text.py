@@ -7,16 +7,17 @@ from typing import Any
 
 import msgspec
 import tomlkit
+from msgspec.structs import replace
 from tomlkit.items import Table
 from tomlkit.toml_document import TOMLDocument
 
-from cpcbl_launch.calibration import odometry, sensor
+from cpcbl_launch.calibration import dead_zone, odometry, sensor
 from cpcbl_launch.calibration.robots import Calibration, RobotCalibration
 from cpcbl_launch.calibration.statistics import Estimate, decimals
+from cpcbl_launch.calibration.windows import WINDOW_S
 from cpcbl_launch.reporting.recording import read_recording
 from cpcbl_launch.team_file import TeamFileError, builtin, parse_team
 
-MARGIN = 0.5
 INTERVAL_S = 0.5  # with correlation_s known, using an object more often tells little
 LEAST = {  # what is written at least: without any noise a filter would believe without bounds
     "odometry.delay_s": 0.0,
@@ -63,13 +64,19 @@ def _plain(value: Any) -> Any:
 
 
 def team_text(
-    calibration: Calibration, base: str, name: str = "team file", margin: float = MARGIN
+    calibration: Calibration,
+    base: str,
+    name: str = "team file",
+    *,
+    margin: float,
+    correction_margin: float,
 ) -> str:
     """The base team file with a type for each calibrated robot. Raises TeamFileError, ValueError.
 
     A robot's former type goes into its new one; keys of its own that were calibrated are taken out.
-    `margin`: all sigmas are written larger by this share, and this share of each correction of the
-    sensor, which may be another one on another day, is added to its noise.
+    `margin`: all sigmas are written larger by this share. `correction_margin`: this share of each
+    correction (range, bearing, least speed), which may be another one on another day, is added to
+    its noise.
     """
     parse_team(base, name)
     document = tomlkit.parse(base)
@@ -77,7 +84,11 @@ def team_text(
     if not there:
         raise ValueError(f"{name}: has none of the robots {', '.join(calibration.robots)}")
     for robot in there:
-        _add_type(document, robot, calibration.robots[robot], margin)
+        found = calibration.robots[robot]
+        noise = (*odometry.NOISE, dead_zone.CRAWL_NOISE)
+        driving = _with_margin(found.odometry, noise, margin, correction_margin)
+        seeing = _with_margin(found.sensor, sensor.NOISE, margin, correction_margin)
+        _add_type(document, robot, replace(found, odometry=driving, sensor=seeing))
     document["calibrated_on"] = list(calibration.logs)
     text = f"# Calibrated by `cpcbl-team calibrate` from {', '.join(calibration.logs)}.\n"
     text += tomlkit.dumps(document)
@@ -85,17 +96,16 @@ def team_text(
     return text
 
 
-def _add_type(document: TOMLDocument, robot: str, found: RobotCalibration, margin: float) -> None:
+def _add_type(document: TOMLDocument, robot: str, written: RobotCalibration) -> None:
     own: Any = document["robots"][robot]
     types: Any = document.setdefault("types", tomlkit.table(is_super_table=True))
     former = dict(types.get(own.get("type", ""), {}))
     kind = f"robot-{robot}" if len(robot) < 26 else robot
     table = tomlkit.table()
-    driving = _with_margin(found.odometry, odometry.NOISE, margin)
-    seeing = _with_margin(found.sensor, sensor.NOISE, margin)
+    driving, seeing = written.odometry, written.sensor
     rules = dict(former.get("localizer", {}))
     if seeing:
-        former["sensor"] = {**former.get("sensor", {}), "range_is_depth": found.range_is_depth}
+        former["sensor"] = {**former.get("sensor", {}), "range_is_depth": written.range_is_depth}
         rules["object_interval_s"] = INTERVAL_S
     if driving:
         rules["self_calibration"] = False
@@ -115,13 +125,16 @@ def _add_type(document: TOMLDocument, robot: str, found: RobotCalibration, margi
 
 
 def _with_margin(
-    values: Mapping[str, Estimate], noise: Sequence[str], margin: float
+    values: Mapping[str, Estimate],
+    noise: Sequence[str],
+    margin: float,
+    correction_margin: float,
 ) -> dict[str, Estimate]:
     """With noise as of another day: sigmas grown, and a share of each correction in them."""
     result = dict(values)
     for name in noise:
         if name in result:
-            doubt = margin * abs(_corrected_by(values, name))
+            doubt = correction_margin * abs(_corrected_by(values, name))
             sigma = math.hypot((1.0 + margin) * result[name].value, doubt)
             result[name] = Estimate(sigma, result[name].standard_error)
     return result
@@ -136,6 +149,8 @@ def _corrected_by(values: Mapping[str, Estimate], noise: str) -> float:
             return values["range_bias_m"].value
         case "bearing_sigma_deg" if "bearing_bias_deg" in values:
             return values["bearing_bias_deg"].value
+        case dead_zone.CRAWL_NOISE if "least_speed_m_s" in values:
+            return values["least_speed_m_s"].value * math.sqrt(WINDOW_S)  # for a window
     return 0.0
 
 

@@ -114,13 +114,20 @@ def calibrate(
     team_file: Annotated[
         Optional[Path],
         typer.Option(
-            "--team", help="Team file to add types to; default: the recorded team, or mrclam."
+            "--team",
+            help="Team file to add types to; default: the recorded team, or mrclam-uncalibrated.",
         ),
     ] = None,
     output: Annotated[Path, typer.Option(help="Team file to write.")] = Path("calibrated.toml"),
     margin: Annotated[
         float,
         typer.Option(min=0.0, help="Share by which noise is written larger: days differ."),
+    ] = 0.25,
+    correction_margin: Annotated[
+        float,
+        typer.Option(
+            min=0.0, help="Share of a range's, bearing's or crawl's correction added to its noise."
+        ),
     ] = 0.5,
     picture: Annotated[
         Optional[Path],
@@ -147,7 +154,7 @@ def calibrate(
     robot_logs = read_logs(logs)
     with progress_bar("calibrating", quiet=as_json) as progress:
         result = calibrated(robot_logs, names, progress)
-    text = team_text(result, base, base_name, margin)
+    text = team_text(result, base, base_name, margin=margin, correction_margin=correction_margin)
     lost = not_written(output, lambda: output.write_text(text, encoding="utf-8"))
     if (drawing := picture) is not None:
         from cpcbl_launch.calibration.picture import draw_residuals

@@ -31,7 +31,8 @@ from cpcbl_team.config import (
 )
 from cpcbl_team.geometry import Pose2, step, wrap_angle
 from cpcbl_team.inputs import Odometry, Position, Sighting, Sightings
-from cpcbl_team.sensors import LEAST_COSINE
+from cpcbl_team.motion import motion_noise
+from cpcbl_team.sensors import LEAST_COSINE, corrected_odometry, crawled_s
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus, Handle, Publisher
 from cpcbl_transport.messages import (
@@ -107,24 +108,19 @@ class Delayed:
 
 def really_driven(distance: float, turn: float, seconds: float, o: OdometrySettings) -> float:
     """How far wheels go that are told to go this far: no slower than their least speed."""
-    if not (distance and o.least_speed_m_s):
+    if not o.least_speed_m_s:
         return distance
-    lost = o.distance_loss_m_per_rad * abs(_reported_turn(distance, turn, o))
-    way = max(abs(distance) + lost, o.least_speed_m_s * seconds) - lost
-    return math.copysign(max(way, 0.0), distance)
+    reported = Odometry(0, round(seconds * 1e9), *misreported(distance, turn, o))
+    return corrected_odometry(reported, o).distance_m
 
 
 def misreported(distance: float, turn: float, o: OdometrySettings) -> tuple[float, float]:
     """What wheels report of a motion that they were told: `corrected_odometry` makes of it what
     is `really_driven`, and without a least speed the motion itself."""
-    reported_turn = _reported_turn(distance, turn, o)
+    reported_turn = (turn - o.turn_bias_rad_per_m * distance) / o.turn_scale
     lost = o.distance_loss_m_per_rad * abs(reported_turn) if distance else 0.0
     way = (abs(distance) + lost) / o.distance_scale
     return math.copysign(way, distance), reported_turn
-
-
-def _reported_turn(distance: float, turn: float, o: OdometrySettings) -> float:
-    return (turn - o.turn_bias_rad_per_m * distance) / o.turn_scale
 
 
 def misread(
@@ -184,14 +180,9 @@ class SimulatedRobot:
         self._reported = (self._reported[0] + distance, self._reported[1] + turn)
         o = self.settings.odometry
         distance, turn = self._motion.next((really_driven(distance, turn, seconds, o), turn))
-        along = math.sqrt(
-            o.distance_sigma_m_per_sqrt_m**2 * abs(distance)
-            + o.distance_sigma_m_per_sqrt_rad**2 * abs(turn)
-        )
-        around = math.sqrt(
-            o.turn_sigma_rad_per_sqrt_rad**2 * abs(turn)
-            + o.turn_sigma_rad_per_sqrt_m**2 * abs(distance)
-        )
+        crawled = crawled_s(distance, seconds, o)
+        in_its_direction = motion_noise(-0.5 * turn, distance, turn, o, crawled)
+        along, around = math.sqrt(in_its_direction.xx), math.sqrt(in_its_direction.hh)
         self.pose = step(self.pose, distance + self._normal(along), turn + self._normal(around))
 
     def odometry(self, now_ns: int) -> Odometry | None:
