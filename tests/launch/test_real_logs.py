@@ -72,7 +72,7 @@ def test_robots_calibrated_on_other_logs_are_accurate_and_know_how_much(
     assert not report.seen_before
     assert team_rmse_m(report) <= rmse_m
     assert report.team.nees is not None
-    assert 0.5 < report.team.nees < 3.0
+    assert 1.0 <= report.team.nees <= 4.0
     for robot, r in report.robots.items():
         assert r.inside_3_sigma is not None
         assert r.inside_3_sigma >= 0.95, robot
