@@ -23,8 +23,8 @@ EVERYTHING: Mapping[str, Any] = {"least_value": 0.0, "least_use": 0.0, "belief_s
 RARE: Mapping[str, Any] = {
     "least_value": 0.2,
     "least_use": 0.9,
-    "fix_interval_s": 8.0,
-    "belief_rate_hz": 1.0 / 8.0,
+    "fix_interval_s": 10.0,
+    "belief_rate_hz": 0.1,
 }
 """For a few messages a minute: what is worth less, or comes soon again, would only delay what is
 worth more."""
