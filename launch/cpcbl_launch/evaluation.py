@@ -14,7 +14,8 @@ from cpcbl_launch.logs import LoggedTeam, seen_before, shortened
 from cpcbl_launch.options import check_limit
 from cpcbl_launch.reporting.recorder import Recorder, Report
 from cpcbl_launch.reporting.recording import Recording
-from cpcbl_launch.simulation.field import FieldNode, SimulatedField
+from cpcbl_launch.simulation.field import SimulatedField
+from cpcbl_launch.simulation.field_node import FieldNode
 from cpcbl_launch.simulation.visitors import Visiting, Visitor
 from cpcbl_launch.yardstick import inputs_of, scored, yardsticks
 from cpcbl_team.config import Team

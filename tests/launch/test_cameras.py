@@ -14,7 +14,8 @@ from cpcbl_agents.sensing import SensorInput
 from cpcbl_agents.vision.camera import Camera, Pixels
 from cpcbl_agents.vision.pictures import decoded
 from cpcbl_launch.simulation.cameras import QUALITIES, Cameras, encoded
-from cpcbl_launch.simulation.field import PICTURES_LATE_NS, FieldNode, SimulatedField
+from cpcbl_launch.simulation.field import SimulatedField
+from cpcbl_launch.simulation.field_node import PICTURES_LATE_NS, FieldNode
 from cpcbl_launch.simulation.render import Scene, Standing, render
 from cpcbl_launch.team_file import builtin, load_team, parse_team
 from cpcbl_team.config import Team

@@ -199,7 +199,7 @@ def field(
     from cpcbl_agents.clock import Clock
     from cpcbl_agents.process import Stop
     from cpcbl_launch.options import must_see
-    from cpcbl_launch.simulation.field import robots_at, run_field
+    from cpcbl_launch.simulation.field_node import robots_at, run_field
     from cpcbl_transport.bus import Bus
     from cpcbl_transport.security import Identity, link_of
     from cpcbl_transport.topics import Role

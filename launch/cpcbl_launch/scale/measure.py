@@ -17,7 +17,8 @@ from cpcbl_launch.evaluation import (
 from cpcbl_launch.options import check_duration
 from cpcbl_launch.reporting.recorder import Recorder
 from cpcbl_launch.scale.swarm import MOST_ROBOTS, swarm
-from cpcbl_launch.simulation.field import FieldNode, SimulatedField
+from cpcbl_launch.simulation.field import SimulatedField
+from cpcbl_launch.simulation.field_node import FieldNode
 from cpcbl_team.config import Team
 from cpcbl_team.inputs import Sightings
 from cpcbl_transport import topics

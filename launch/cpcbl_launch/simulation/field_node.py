@@ -1,0 +1,186 @@
+"""The simulated field on a bus, and as a process.
+
+Robots send wheel commands (`field/drive/<robot>`); the field answers like a driver would, with
+odometry and sightings, or a camera's frames, under the robots' `in/` keys. Guests have a body on it
+for as long as they ask for it (`field/join/<robot>`).
+"""
+
+import logging
+import time
+from collections import Counter, deque
+from collections.abc import Callable, Iterable, Mapping
+from types import MappingProxyType
+from typing import TypeVar
+
+from msgspec.structs import replace
+
+from cpcbl_agents.clock import Clock
+from cpcbl_agents.sensing import SensorInput
+from cpcbl_launch.simulation.bodies import Bodies
+from cpcbl_launch.simulation.field import SimulatedField
+from cpcbl_team.config import Team
+from cpcbl_team.inputs import Odometry
+from cpcbl_transport import topics
+from cpcbl_transport.bus import Bus, Handle, Publisher
+from cpcbl_transport.messages import Drive, Join, Refusal, encode, refusal
+from cpcbl_transport.reading import read
+
+log = logging.getLogger(__name__)
+
+PICTURES_LATE_NS = 150_000_000  # a field that is further behind catches up without making pictures
+INBOX = 10_000
+MOST_REFUSED = 100  # guests whose refusal is logged
+NOWHERE: Mapping[str, Bus] = MappingProxyType({})
+
+
+class FieldNode:
+    """The field on a bus. Robots of other `sites` (robot -> bus) are told on the bus of theirs, so
+    that the world goes on for them while their site is cut off.
+    """
+
+    def __init__(self, field: SimulatedField, bus: Bus, sites: Mapping[str, Bus] = NOWHERE) -> None:
+        self._field, self._bus, self._sites = field, bus, sites
+        self._bodies = Bodies(field.team)
+        self._guests: dict[str, str] = {}  # with the incarnation that asked
+        self._refused: set[str] = set()
+        self._said: deque[tuple[str, bytes]] = deque(maxlen=INBOX)
+        self.counts: Counter[str] = Counter()
+        """What was taken (`drive`, `join`), and what was refused, by reason."""
+        self._truth = bus.publisher(topics.TRUTH.at(), topics.TRUTH.qos)
+        self._publishers: dict[tuple[str, type], Publisher] = {}
+        self._driven: dict[str, Handle] = {}
+        for name in field.robots:
+            self._declare(name)
+        bus.subscribe(topics.JOIN.at(), self._arrived)
+
+    def _declare(self, name: str) -> None:
+        bus = self._sites.get(name, self._bus)
+        for topic in topics.INPUTS:
+            assert topic.carries is not None
+            publisher = bus.publisher(topic.at(robot=name), topic.qos)
+            self._publishers[name, topic.carries] = publisher
+        self._driven[name] = bus.subscribe(topics.DRIVE.at(robot=name), self._arrived)
+
+    def _arrived(self, key: str, payload: bytes) -> None:
+        if len(self._said) == INBOX:
+            self.counts["inbox_overflow"] += 1
+        self._said.append((key, payload))
+
+    @property
+    def next_ns(self) -> int:
+        return self._field.next_ns
+
+    @property
+    def pictures_not_taken(self) -> int:
+        return self._field.not_taken
+
+    @property
+    def waiting(self) -> bool:
+        return False  # commands take effect with the next step
+
+    def step(self, now_ns: int) -> None:
+        """Advances the field to `now_ns` and tells the robots what they sense."""
+        while self._said:
+            reason = self._taken(*self._said.popleft(), now_ns)
+            if reason is not None:
+                self.counts[reason] += 1
+        self._let_in_and_out(now_ns)
+        while self._field.next_ns <= now_ns:
+            in_time = now_ns - self._field.next_ns <= PICTURES_LATE_NS
+            for name, sensed in self._field.advance(in_time):
+                stamped = later(sensed, self._field.ahead_ns(name))
+                self._publishers[name, type(sensed)].put(encode(stamped))
+            if self._truth.matching:
+                self._truth.put(encode(self._field.truth()))
+
+    def _taken(self, key: str, payload: bytes, now_ns: int) -> Refusal | None:
+        """Does what a robot says, by the field's clock; or why not."""
+        said = read(key, payload)
+        if isinstance(said, Refusal):
+            return said
+        assert isinstance(said, Drive | Join)
+        if isinstance(said, Drive):
+            if said.robot not in self._field.robots:
+                return Refusal.UNKNOWN_ROBOT
+            said = later(said, -self._field.ahead_ns(said.robot))
+        reason = refusal(said, now_ns)
+        if reason is not None:
+            return reason
+        self.counts[type(said).__name__.lower()] += 1
+        if isinstance(said, Drive):
+            self._field.command(said)
+        else:
+            self._asked(said, now_ns)
+        return None
+
+    def _asked(self, join: Join, now_ns: int) -> None:
+        reason = self._bodies.ask(join, now_ns)
+        if reason and len(self._refused) < MOST_REFUSED and join.robot not in self._refused:
+            self._refused.add(join.robot)
+            log.warning("guest %s gets no body: %s", join.robot, reason)
+
+    def _let_in_and_out(self, now_ns: int) -> None:
+        """Guests that ask for a body get it, those that leave or are silent lose it."""
+        present = self._bodies.present(now_ns)
+        for name, incarnation in list(self._guests.items()):
+            if name not in present or present[name].incarnation != incarnation:
+                self._let_out(name)
+        for name, join in present.items():
+            if name not in self._guests and join.body is not None:
+                self._guests[name] = join.incarnation
+                self._field.join(name, join.body)
+                self._declare(name)
+                log.info("guest %s joined the field", name)
+
+    def _let_out(self, name: str) -> None:
+        del self._guests[name]
+        self._field.leave(name)
+        for topic in topics.INPUTS:
+            assert topic.carries is not None
+            self._publishers.pop((name, topic.carries)).close()
+        self._driven.pop(name).close()
+        log.info("guest %s left the field", name)
+
+
+Moved = TypeVar("Moved", bound=SensorInput | Drive)
+
+
+def later(message: Moved, ns: int) -> Moved:
+    """The message by a clock that is so far ahead."""
+    if not ns:
+        return message
+    if isinstance(message, Odometry):
+        return replace(message, from_ns=message.from_ns + ns, stamp_ns=message.stamp_ns + ns)
+    return replace(message, stamp_ns=message.stamp_ns + ns)
+
+
+def robots_at(sites: Iterable[str], team: Team) -> dict[str, list[str]]:
+    """Endpoint -> robots, of `tcp/10.0.0.2:7447=r3,r4`. Raises ValueError."""
+    found = {}
+    for text in sites:
+        endpoint, _, names = text.partition("=")
+        found[endpoint] = [name.strip() for name in names.split(",")]
+        for name in found[endpoint]:
+            if name not in team.robots:
+                known = ", ".join(team.robots)
+                raise ValueError(f"--site {text}: no robot {name!r}; there are {known}")
+    return found
+
+
+def run_field(
+    team: Team,
+    seed: int,
+    bus: Bus,
+    clock: Clock,
+    stop: Callable[[], bool],
+    sites: Mapping[str, Bus] = NOWHERE,
+) -> None:
+    """The field as a process: steps in robot time until `stop()`."""
+    node = FieldNode(SimulatedField(team, seed, clock.now_ns()), bus, sites)
+    while not stop():
+        node.step(clock.now_ns())
+        time.sleep(min(clock.seconds_until(node.next_ns), 0.2))
+    counts = ", ".join(f"{reason} {n}" for reason, n in sorted(node.counts.items()))
+    log.info("commands, by what became of them: %s", counts or "none")
+    if node.pictures_not_taken:
+        log.warning("frames not taken, as the field was late: %d", node.pictures_not_taken)
