@@ -226,7 +226,8 @@ def merge(
 ) -> Estimate:
     """Bayes' product of a prior and independent evidence (equations 3 and 4 in three dimensions).
 
-    Works for evidence of any rank: one range says nothing along the tangent of its circle.
+    Works for evidence of any rank: one range says nothing along the tangent of its circle. Evidence
+    that is so much sharper than the prior that I + P A is lost in rounding changes nothing.
     `as_circle`: the position's covariance is kept as a circle.
     """
     pose, covariance, shared = prior
@@ -246,6 +247,8 @@ def merge(
         xx, xy, yy = a * xx + b * xy + c * xh, d * xx + e * xy + f * xh, d * xy + e * yy + f * yh
         x += xx * ex + xy * ey + xh_after * eh
         y += xy * ex + yy * ey + yh_after * eh
+    if xx < 0.0 or yy < 0.0 or hh < 0.0:
+        return prior
     if as_circle:
         xx = yy = circle_variance(xx, xy, yy, xh_after, yh_after, hh)
         xy = 0.0

@@ -14,6 +14,7 @@ from typing import NamedTuple
 from cpcbl_team.estimate import (
     HEADING,
     POSE,
+    SHARPEST_VARIANCE,
     SMALLEST_VARIANCE,
     ZERO3,
     Covariance3,
@@ -45,11 +46,7 @@ class Observation(NamedTuple):
     def noise(self, dependent_factor: float = 1.0) -> Covariance2:
         """The covariance of the residuals, with the dependent part times `dependent_factor`."""
         i, d, k = self.independent, self.dependent, dependent_factor
-        return Covariance2(
-            i.xx + k * d.xx + SMALLEST_VARIANCE,
-            i.xy + k * d.xy,
-            i.yy + k * d.yy + SMALLEST_VARIANCE,
-        )
+        return Covariance2(*_noise(i.xx + k * d.xx, i.xy + k * d.xy, i.yy + k * d.yy))
 
     def information(self, dependent_factor: float = 1.0) -> Information:
         """The evidence with the dependent part of its covariance times `dependent_factor`."""
@@ -66,6 +63,12 @@ class Observation(NamedTuple):
     def normalized_innovation_squared(self, prior: Covariance3) -> float:
         """e^T (H P H^T + R)^-1 e: chi-square with as many degrees of freedom as rows."""
         return chi_square(prior, self.noise(), self.rows, self.residuals)
+
+
+def _noise(xx: float, xy: float, yy: float) -> tuple[float, float, float]:
+    """No sharper than evidence may be, along any axis: else a part of it is more than the whole."""
+    xx = max(xx + SMALLEST_VARIANCE, SHARPEST_VARIANCE)
+    return xx, xy, max(yy + SMALLEST_VARIANCE, xy * xy / xx + SHARPEST_VARIANCE)
 
 
 def chi_square(
@@ -175,11 +178,10 @@ def _determinant(prior: Estimate, seen: Observation) -> Callable[[float], float]
         xx, xy, xh = pxx + k * dxx, pxy + k * dxy, pxh + k * dxh
         yy, yh, hh = pyy + k * dyy, pyh + k * dyh, phh + k * dhh
         widened = xx * (yy * hh - yh * yh) - xy * (xy * hh - yh * xh) + xh * (xy * yh - yy * xh)
-        rxx = ixx + m * oxx + SMALLEST_VARIANCE
+        rxx, rxy, ryy = _noise(ixx + m * oxx, ixy + m * oxy, iyy + m * oyy)
         sxx = rxx + p_xx + k * d_xx
         if alone:
             return widened * rxx / sxx
-        rxy, ryy = ixy + m * oxy, iyy + m * oyy + SMALLEST_VARIANCE
         sxy, syy = rxy + p_xy + k * d_xy, ryy + p_yy + k * d_yy
         return widened * (rxx * ryy - rxy * rxy) / (sxx * syy - sxy * sxy)
 
@@ -204,6 +206,8 @@ def _merge_split_at(prior: Estimate, seen: Observation, scope: Scope, weight: fl
     evidence = seen.information(1.0 / (1.0 - weight))
     survive = survival(widened, evidence.matrix)
     merged = product(survive, widened)
+    if min(merged.xx, merged.yy, merged.hh) < 0.0:  # as in `merge`
+        return prior
     pose = shifted(prior.pose, merged.times(evidence.vector), scope)
     if scope is POSE:
         own = prior.covariance.plus(prior.shared, -1.0).transformed(survive)

@@ -6,6 +6,8 @@ Written for plain floats: on 2 x 2 matrices numpy costs about ten times more.
 import math
 from typing import NamedTuple
 
+MOST_CORRELATION = 1.0 - 1e-6
+
 
 class Covariance2(NamedTuple):
     """A symmetric 2 x 2 covariance [[xx, xy], [xy, yy]], m^2."""
@@ -27,6 +29,13 @@ class Covariance2(NamedTuple):
         """Raises ZeroDivisionError when singular."""
         det = self.determinant()
         return Covariance2(self.yy / det, -self.xy / det, self.xx / det)
+
+    def possible(self) -> "Covariance2":
+        """With a correlation below one: what somebody else computed and rounded may be beyond."""
+        most = MOST_CORRELATION * math.sqrt(self.xx * self.yy)
+        if -most <= self.xy <= most:
+            return self
+        return Covariance2(self.xx, math.copysign(most, self.xy), self.yy)
 
     def along(self, nx: float, ny: float) -> float:
         """The variance along the unit vector (nx, ny)."""
@@ -72,12 +81,13 @@ def sighting_gaussian(
     """A sighting as a Gaussian in the robot's frame, the major axis along the line of sight.
 
     x = r cos a, y = r sin a (equations 2a, 2b); sigma_maj = sigma_r, sigma_min = r sin sigma_a
-    (equations 1a, 1b).
+    (equations 1a, 1b), r for a bearing that is not known at all.
     """
+    across_m = range_m * math.sin(min(bearing_sigma, 0.5 * math.pi))
     return Gaussian2(
         range_m * math.cos(bearing),
         range_m * math.sin(bearing),
-        oriented(range_sigma_m, range_m * math.sin(bearing_sigma), bearing),
+        oriented(range_sigma_m, across_m, bearing),
     )
 
 

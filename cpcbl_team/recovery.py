@@ -27,6 +27,7 @@ DRIFT_SHARE = 0.1  # of the way: how far dead reckoning errs within the window
 MOST_STARTS = 16
 WIDEN_NS = 1_000_000_000
 _OPEN = Covariance3(1e6, 0.0, 1e6, 0.0, 0.0, 1e3)
+_SHARPEST = 1e-6  # (1 mm)^2, (1 mrad)^2: sharper evidence drowns _OPEN in rounding
 _LEVER_M = 2.0  # over such a way an error of position has become one of heading
 _ENOUGH_POSITION_SIGMA_M = 0.7
 _ENOUGH_HEADING_SIGMA_RAD = 0.5
@@ -282,12 +283,12 @@ class _Carried:
         e = self.e
         hx, hy = pose.y - then.y, then.x - pose.x  # d(place then) / d(heading now)
         if self.is_fix:
-            variance = self.sigma_m**2 + e.range_sigma_m**2 + SMALLEST_VARIANCE
+            variance = _variance(self.sigma_m**2 + e.range_sigma_m**2)
             yield (1.0, 0.0, hx), e.x - then.x, variance
             yield (0.0, 1.0, hy), e.y - then.y, variance
             if e.heading_rad is not None:
                 off = math.remainder(e.heading_rad - then.heading, math.tau)
-                yield (0.0, 0.0, 1.0), off, self.sigma_rad**2 + SMALLEST_VARIANCE
+                yield (0.0, 0.0, 1.0), off, _variance(self.sigma_rad**2)
             return
         seen: list[Constraint | None] = []
         if e.range_m is not None:
@@ -298,11 +299,12 @@ class _Carried:
             if c is not None:
                 x, y, a = c.row
                 spread = self.sigma_m / c.distance_m if c.on_heading else self.sigma_m
-                yield (
-                    (x, y, a + x * hx + y * hy),
-                    c.residual,
-                    c.sigma**2 + spread**2 + SMALLEST_VARIANCE,
-                )
+                row = x, y, a + x * hx + y * hy
+                yield row, c.residual, _variance(c.sigma**2 + spread**2)
+
+
+def _variance(variance: float) -> float:
+    return max(variance + SMALLEST_VARIANCE, _SHARPEST)
 
 
 def _cost(pose: Pose2, pieces: list[_Carried]) -> float:
@@ -374,9 +376,12 @@ def _refined(start: Pose2, pieces: list[_Carried]) -> tuple[float, Estimate, int
 
 
 def _certain(estimate: Estimate) -> bool:
+    """Sharp evidence that determines no pose leaves variances that are nothing but rounding."""
+    xx, _, yy, _, _, hh = estimate.covariance
     return (
-        estimate.position_sigma_m < _ENOUGH_POSITION_SIGMA_M
-        and estimate.heading_sigma_rad < _ENOUGH_HEADING_SIGMA_RAD
+        min(xx, yy, hh) > 0.0
+        and 0.5 * (xx + yy) < _ENOUGH_POSITION_SIGMA_M**2
+        and hh < _ENOUGH_HEADING_SIGMA_RAD**2
     )
 
 

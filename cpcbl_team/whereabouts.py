@@ -63,14 +63,16 @@ class Whereabouts(NamedTuple):
 
 def by_fix(fix: Fix) -> Whereabouts:
     """What a teammate says."""
-    parts = Covariance2(*fix.sensor_covariance), Covariance2(*fix.observer_covariance)
+    sensor, observer = Covariance2(*fix.sensor_covariance), Covariance2(*fix.observer_covariance)
     heading = None
     if fix.heading_rad is not None:
         variances = fix.heading_sensor_variance, fix.heading_observer_variance
         heading = Heading(fix.heading_rad, *variances)
-    return Whereabouts(FIX + fix.observer, fix.x_m, fix.y_m, *parts, heading)
+    source, parts = FIX + fix.observer, (sensor.possible(), observer.possible())
+    return Whereabouts(source, fix.x_m, fix.y_m, *parts, heading)
 
 
 def by_sensor(seen: Position) -> Whereabouts:
     """What the robot's own position sensor says."""
-    return Whereabouts(_OWN, seen.x_m, seen.y_m, Covariance2(*seen.covariance), None)
+    covariance = Covariance2(*seen.covariance).possible()
+    return Whereabouts(_OWN, seen.x_m, seen.y_m, covariance, None)
