@@ -136,9 +136,17 @@ def heard(voice: Voice, said: Said, limit: float) -> Voice:
     """The voice after one more word."""
     if voice.score and said.stamp_ns - voice.heard_ns > ALONE_NS:
         voice = replace(voice, score=0.0)
-    voice = _driven(voice, said)
+    voice = _driven(_faded(voice, said.stamp_ns), said)
     voice = replace(voice, heard_ns=max(voice.heard_ns, said.stamp_ns))
     return voice if said.surprise is None else _agreeing(voice, said, said.surprise, limit)
+
+
+def _faded(voice: Voice, now_ns: int) -> Voice:
+    """What the wheels said, as far as it is remembered."""
+    if not voice.compared or now_ns <= voice.heard_ns:
+        return voice
+    fade = math.exp((voice.heard_ns - now_ns) * 1e-9 / MEMORY_S)
+    return replace(voice, strikes=fade * voice.strikes, compared=fade * voice.compared)
 
 
 def _agreeing(voice: Voice, said: Said, surprise: float, limit: float) -> Voice:
@@ -176,16 +184,14 @@ def _driven(voice: Voice, said: Said) -> Voice:
     far = chord >= max(STRIDE_M, (STILL + 1.0) * sigma)
     jumped = told - chord > CLEAR * sigma
     stayed = far and told < STILL_SHARE * chord and chord - told > STILL * sigma
-    fade = math.exp((voice.heard_ns - now.stamp_ns) * 1e-9 / MEMORY_S)
-    strikes, compared = fade * voice.strikes, fade * voice.compared + 1.0
-    voice = replace(voice, compared=compared, strikes=strikes)
+    voice = replace(voice, compared=voice.compared + 1.0)
     if not (jumped or far or now.stamp_ns - then.stamp_ns >= REST_NS):
         return voice
     voice = replace(voice, anchor=now)
     if jumped or stayed:
         return replace(
             voice,
-            strikes=strikes + 1.0,
+            strikes=voice.strikes + 1.0,
             still=stayed,
             steady=0,
             struck_ns=now.stamp_ns,
@@ -252,10 +258,8 @@ def _right(lately: Voices, against: set[str], beside: set[str], since_ns: int) -
     if OWN in beside or OWN in against:
         return OWN in beside
     denied = {n for n in against | beside if lately[n].strikes >= CLEARLY}  # by the wheels
-    if denied and not against <= denied:
-        beside = beside - denied
-    elif denied and not beside & denied:
-        against = against - denied
+    if not against | beside <= denied:
+        against, beside = against - denied, beside - denied
     if len(beside) != len(against):
         return len(beside) > len(against)
     return True if since_ns >= TIED_NS else None

@@ -39,7 +39,18 @@ from cpcbl_team.inputs import Fix, Input, Odometry, Sighting, Sightings
 from cpcbl_team.localizer import Localizer
 from cpcbl_team.state import State
 from cpcbl_team.timeline import Timeline
-from cpcbl_team.trust import OWN, Anchor, Said, Verdict, Voice, Voices, judged, seen, standings
+from cpcbl_team.trust import (
+    OWN,
+    Anchor,
+    Said,
+    Verdict,
+    Voice,
+    Voices,
+    heard,
+    judged,
+    seen,
+    standings,
+)
 
 MS = 1_000_000
 RULES = TrustSettings()
@@ -321,6 +332,36 @@ def test_one_jump_is_no_habit(court: Court) -> None:
     drive(court, 5.0, honest=along)
     drive(court, 20.0, honest=lambda way: (way + 3.0, 0.0))
     assert court.events == []
+
+
+def test_what_the_wheels_denied_fades_whoever_speaks_how(court: Court) -> None:
+    """By words of all kinds, and by none: passive ones say nothing of the way."""
+    denied = Voice(heard_ns=0, strikes=2.0, compared=20.0)
+    left = 2.0 * math.exp(-3.0)
+    for count in (1, 30, 300):
+        voice = denied
+        for i in range(1, count + 1):
+            voice = heard(voice, Said(30 * SECOND * i // count, GOOD), RULES.limit)
+        assert voice.strikes == pytest.approx(left)
+
+
+def test_whom_the_wheels_deny_has_no_say_against_whom_they_do_not() -> None:
+    """Denied and undenied against an undenied one: as one against one, which time decides."""
+    now_ns = 10 * SECOND
+    doubting = Voice(heard_ns=now_ns - 1, doubted_ns=9 * SECOND, score=40.0, offset=(1.0, 0.0))
+    voices = {
+        "denied": replace(doubting, strikes=1.0),
+        "other": doubting,
+        "honest": Voice(heard_ns=now_ns - 1, agreed_ns=now_ns - 1),
+    }
+    verdict = judged(voices, "other", Said(now_ns, BAD, (1.0, 0.0)), now_ns - 1, RULES)
+    assert (verdict.event, verdict.silenced, verdict.trusted) == ("", frozenset(), False)
+    voices = {
+        **voices,
+        "other": replace(doubting, strikes=1.0),
+    }  # both denied: who is left is right
+    verdict = judged(voices, "other", Said(now_ns, BAD, (1.0, 0.0)), now_ns - 1, RULES)
+    assert verdict.silenced == {"other"}
 
 
 def test_the_wheels_decide_between_two(court: Court) -> None:
