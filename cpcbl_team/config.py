@@ -78,8 +78,10 @@ class OdometrySettings(OdometryNoise, frozen=True, kw_only=True):
     moves: bool = True
     """False for a robot that stands still and reports no odometry."""
     timeout_s: Positive = 0.5
-    """Without odometry for longer, the position may have changed by `gap_speed_m_s`."""
+    """Without odometry for longer, the pose's variances grow with the time."""
     gap_speed_m_s: NotNegative = 0.3
+    """So far (m, and rad) the pose may have changed after a second of that, twice as far after
+    four."""
 
 
 class SensorSettings(Table, frozen=True, kw_only=True):

@@ -129,7 +129,9 @@ class Localizer:
             return state._replace(memory=state.memory.counted("impossible_duration"))
         if from_ns > state.stamp_ns:
             state = self.moved(state, from_ns)
-        now, estimate, reckoned, _, known_ns, memory, updates = state
+        now, estimate, reckoned, motion, known_ns, memory, updates = state
+        if motion is not None:  # of an earlier piece that lasts longer
+            memory = memory.counted("odometry_overlap")
         known_ns = max(known_ns, until_ns)
         return new(State, (now, estimate, reckoned, odometry, known_ns, memory, updates))
 
@@ -151,6 +153,7 @@ class Localizer:
             if self._learns:
                 distance *= memory.learned.distance_scale
                 turn *= memory.learned.turn_scale
+                memory = replace(memory, turned_rad=memory.turned_rad + turn)
             if distance != 0.0 or turn != 0.0:
                 reckoned = step(reckoned, distance, turn)
                 estimate = move(estimate, distance, turn, s, crawled, self._as_circle)
@@ -366,8 +369,10 @@ class Localizer:
             else:
                 # The position is kept, for a marker is sooner seen askew than elsewhere. Still the
                 # word counts as refused: a robot that looks elsewhere shall find that it is lost.
+                updates = updates._replace(objects_ns={**updates.objects_ns, **used})
+                memory = state.memory.counted("heading_gated")
+                state = state._replace(memory=memory, updates=updates)
                 used, refused = {}, 1
-                state = state._replace(memory=state.memory.counted("heading_gated"))
         return self._judged(self._updated(state, self._reduced(estimate), None, used, refused))
 
     def _with_position(self, prior: Estimate, seen: Observation, observed: bool) -> Estimate:
@@ -468,7 +473,7 @@ class Localizer:
         """The new estimate, with timers, window and counts of an update of a type by what is used
         (when: now)."""
         now, _, reckoned, motion, odometry_ns, memory, updates = state
-        position_ns, heading_ns, is_latest, objects_ns, window, accepted, gated = updates
+        position_ns, heading_ns, is_latest, objects_ns, agreed_ns, window, accepted, gated = updates
         n = len(used)
         # An attempt passes the turn on, an update starts the type's timer.
         if n and (turn is POSITION or turn is POSE):
@@ -477,13 +482,14 @@ class Localizer:
             heading_ns = now
         if turn is not None:
             is_latest = turn is HEADING
-        objects_ns = {**objects_ns, **used}
+        if n:
+            objects_ns, agreed_ns = {**objects_ns, **used}, now
         window = recovery.innovated(window, n, rejected, self._window)
         accepted, gated = accepted + n, gated + rejected
-        last = position_ns, heading_ns, is_latest, objects_ns, window, accepted, gated
+        last = position_ns, heading_ns, is_latest, objects_ns, agreed_ns, window, accepted, gated
         updates = new(Updates, last)
         if n and self._learns:
-            memory = self._taught(Anchor(now, estimate, reckoned), memory)
+            memory = self._taught(Anchor(now, estimate, reckoned, memory.turned_rad), memory)
         return new(State, (now, estimate, reckoned, motion, odometry_ns, memory, updates))
 
     def _taught(self, here: Anchor, memory: Memory) -> Memory:
@@ -506,7 +512,7 @@ class Localizer:
         memory = replace(memory, lost=reason)
         refusing = innovations & 1 == 0
         # What was seen before the refusals began may have been seen from elsewhere.
-        since_ns = max(state.updates.objects_ns.values(), default=0) if refusing else 0
+        since_ns = state.updates.agreed_ns if refusing else 0
         evidence = tuple(e for e in self.evidence(memory) if e.stamp_ns > since_ns)
         found = None
         if evidence and evidence[-1].stamp_ns > memory.sought_ns:

@@ -15,6 +15,7 @@ from cpcbl_team.geometry import Pose2, wrap_angle
 
 LEAST_WAY_M = 0.7
 LEAST_TURN_RAD = 1.0
+MOST_TOLD_RAD = math.radians(170.0)  # beyond half a circle two headings tell another turn
 MOST_TURN_RAD = 0.7  # beyond, a chord says little of the way
 LONGEST_NS = 30_000_000_000
 RENEWED_SHARE = 0.5  # of the variance that odometry alone would leave
@@ -38,6 +39,7 @@ class Anchor(NamedTuple):
     stamp_ns: int
     estimate: Estimate
     odometry_from_robot: Pose2
+    turned_rad: float  # by the wheels since the start: more than a circle is more than none
 
 
 class Anchors(NamedTuple):
@@ -53,15 +55,18 @@ def learned(
     """What is known after one more update, and the anchors of the next comparisons.
 
     An anchor moves on when there was something to compare, or when there can be no more: it is too
-    old, or the robot has turned too far since for a chord.
+    old, or the robot has turned too far since for a chord, or to tell by how much.
     """
     turned, drove = anchors
-    wheels = turned.odometry_from_robot.inverse() @ now.odometry_from_robot
-    if abs(wheels.heading) >= LEAST_TURN_RAD:
+    turn = abs(now.turned_rad - turned.turned_rad)
+    if turn > MOST_TOLD_RAD:
+        turned = now
+    elif turn >= LEAST_TURN_RAD:
+        wheels = turned.odometry_from_robot.inverse() @ now.odometry_from_robot
         so_far, turned = _turn_compared(so_far, turned, now, wheels, noise), now
     wheels = drove.odometry_from_robot.inverse() @ now.odometry_from_robot
     way = math.hypot(wheels.x, wheels.y)
-    if abs(wheels.heading) > MOST_TURN_RAD:
+    if abs(now.turned_rad - drove.turned_rad) > MOST_TURN_RAD:
         drove = now
     elif way >= LEAST_WAY_M:
         so_far, drove = _way_compared(so_far, drove, now, wheels, noise), now

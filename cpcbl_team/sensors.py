@@ -34,6 +34,22 @@ def crawled_s(distance_m: float, seconds: float, s: OdometrySettings) -> float:
     return seconds if 0.0 < abs(distance_m) <= slow else 0.0
 
 
+def once_each(sightings: tuple[Sighting, ...]) -> tuple[Sighting, ...]:
+    """Without those that read again what an earlier one of the same object has read: the same
+    error would count as two."""
+    if len({s.id for s in sightings}) == len(sightings):
+        return sightings
+    kept: list[Sighting] = []
+    read: set[tuple[str, str]] = set()
+    for s in sightings:
+        numbers = ("range", s.range_m), ("bearing", s.bearing_rad), ("heading", s.heading_rad)
+        readings = {(s.id, what) for what, number in numbers if number is not None}
+        if not readings or not readings & read:
+            kept.append(s)
+            read |= readings
+    return tuple(kept)
+
+
 def corrected_sighting(sighting: Sighting, sensor: SensorSettings, teammate: bool) -> Sighting:
     """The sighting without the sensor's systematic errors; a fault stays as it is.
 

@@ -52,6 +52,7 @@ class Updates(NamedTuple):
     heading_ns: int | None = None
     heading_is_latest: bool = False
     objects_ns: Mapping[str, int] = _NONE  # last use of each object
+    agreed_ns: int = 0  # last one that was accepted whole
     innovations: int = 1  # accepted or not; see `recovery.innovated`
     accepted: int = 0  # observations since the start
     gated: int = 0
@@ -72,6 +73,7 @@ class Memory(msgspec.Struct, frozen=True, gc=False):
     learned: Learned = Learned()
     anchors: Anchors | None = None
     voices: Mapping[str, Voice] = _NONE  # how teammates, and the robot's own eyes, stand
+    turned_rad: float = 0.0  # by the wheels since the start, of a robot that learns
     told_ns: int = -(2**61)  # when a teammate last said anything
 
     def counted(self, *events: str) -> "Memory":

@@ -41,12 +41,7 @@ def _key(item: Input) -> Key:
     if isinstance(item, Belief):
         time_ns -= BELIEF_SERVES_BACK_NS
     who = item.observer if isinstance(item, Fix) else getattr(item, "robot", "")
-    return (
-        time_ns,
-        _rank[type(item)],
-        who,
-        b"" if isinstance(item, Odometry) else _content(item),
-    )
+    return time_ns, _rank[type(item)], who, _content(item)
 
 
 class Timeline:

@@ -11,7 +11,7 @@ from cpcbl_agents.eyes import Eyes, Picture
 from cpcbl_agents.sources import OwnCamera, Source
 from cpcbl_team.config import LocalizationSettings
 from cpcbl_team.inputs import Odometry, Position, Sightings
-from cpcbl_team.sensors import corrected_odometry, corrected_sighting
+from cpcbl_team.sensors import corrected_odometry, corrected_sighting, once_each
 from cpcbl_transport.messages import Frame
 
 LOOK_NS = 500_000_000
@@ -100,9 +100,12 @@ class SensingAgent:
             return corrected_odometry(item, self._odometry)
         if isinstance(item, Position):
             return msgspec.structs.replace(item, stamp_ns=item.stamp_ns - self._position_delay_ns)
+        sightings = once_each(item.sightings)
+        if len(sightings) < len(item.sightings):
+            self._counts["seen_twice"] += len(item.sightings) - len(sightings)
         kept = tuple(
             corrected_sighting(s, self._sensor, s.id not in self._marks)
-            for s in item.sightings
+            for s in sightings
             if self._sees(s.id)
         )
         return Sightings(item.stamp_ns - self._sensor_delay_ns, kept)

@@ -204,6 +204,12 @@ def test_a_blind_robot_still_helps_the_teammates_that_it_sees() -> None:
     assert [type(m) for m in said] == [Fix]
 
 
+def test_what_a_frame_says_again_is_counted_and_plays_no_part() -> None:
+    subject = after_seeing(SensorSettings(), OAK, *[OAK] * 99)
+    assert belief(subject) == belief(after_seeing(SensorSettings(), OAK))
+    assert subject.counts["seen_twice"] == 99
+
+
 def test_an_unknown_object_is_counted_and_plays_no_part() -> None:
     ghost = Sighting("barcode-99", 1.0, 0.0)
     subject = after_seeing(SensorSettings(), OAK, ghost)

@@ -20,6 +20,7 @@ from core_helpers import (
     localizer,
     loop,
     matrix3,
+    placed_at,
     point_sighting,
     position_error,
     state_at,
@@ -33,6 +34,7 @@ from cpcbl_team.config import (
     CollaborationSettings,
     Field,
     Fusion,
+    LocalizerSettings,
     OdometrySettings,
     SensorSettings,
     Start,
@@ -44,7 +46,7 @@ from cpcbl_team.inputs import Fix, Odometry, Sighting, Told
 from cpcbl_team.localizer import Localizer
 from cpcbl_team.motion import motion_noise
 from cpcbl_team.state import State
-from cpcbl_team.whereabouts import by_fix
+from cpcbl_team.whereabouts import by_fix, by_sensor
 
 ORIGIN = Pose2(0.0, 0.0, 0.0)
 STILL = OdometrySettings(moves=False)
@@ -131,8 +133,9 @@ def test_a_heading_told_back_is_not_new() -> None:
     assert state.estimate.heading_sigma_rad > 0.99 * 0.1
 
 
-def test_a_position_sensor_tells_no_heading() -> None:
+def test_a_fix_without_one_and_a_position_sensor_tell_no_heading() -> None:
     assert by_fix(fix(1.0, 2.0)).of_heading(ORIGIN) is None
+    assert by_sensor(placed_at(1.0, 2.0)).of_heading(ORIGIN) is None
 
 
 # The gate -----------------------------------------------------------------------------------------
@@ -146,6 +149,28 @@ def test_a_heading_far_off_is_refused_and_counted_but_not_the_position(variant: 
     assert after.estimate == plain.estimate
     assert after.counts == {"gated": 1, "heading_gated": 1}
     assert after.updates.innovations == 0b10  # one, rejected
+
+
+@pytest.mark.parametrize(
+    ("rules", "sensor"),
+    [
+        (LocalizerSettings(object_interval_s=1.0), SensorSettings()),
+        (LocalizerSettings(), SensorSettings(correlation_s=5.0)),
+    ],
+    ids=["interval", "correlation"],
+)
+def test_a_position_whose_heading_is_refused_has_been_used(
+    rules: LocalizerSettings, sensor: SensorSettings
+) -> None:
+    """And is not soon used as news again."""
+    robot = localizer(rules=rules, sensor=sensor, odometry=STILL)
+    askew = plain = state_at(ORIGIN, diagonal(0.3, 0.05))
+    for i in range(1, 6):
+        told = fix(0.2, 0.0, i * SECOND // 100, sensor_m=0.1, observer_m=0.0, heading=1.5)
+        askew, plain = robot.fix(askew, told), robot.fix(plain, without_heading(told))
+    found, due = (state.estimate.position_sigma_m for state in (askew, plain))
+    assert found == pytest.approx(due, rel=1e-3)
+    assert askew.counts["heading_gated"] >= 1
 
 
 @variants

@@ -58,7 +58,8 @@ def anchor(
     pose: Pose2, wheels: Pose2, seconds: float = 1.0, sigma_m: float = 0.01, sigma: float = 0.01
 ) -> Anchor:
     """A moment at which the robot was found at `pose`, and by its wheels at `wheels`."""
-    return Anchor(round(seconds * SECOND), Estimate(pose, diagonal(sigma_m, sigma)), wheels)
+    estimate = Estimate(pose, diagonal(sigma_m, sigma))
+    return Anchor(round(seconds * SECOND), estimate, wheels, wheels.heading)
 
 
 def both(at: Anchor) -> Anchors:
@@ -213,6 +214,20 @@ def test_scales_and_bias_are_recovered_from_exact_poses(
     assert found.turn_scale == pytest.approx(turn_scale, abs=2e-4)
     assert found.bearing_bias_rad == pytest.approx(bias, abs=2e-4)
     assert taught(STRAIGHT + TURNS, 1.0, 1.0, 0.0)[:3] == pytest.approx((1.0, 1.0, 0.0), abs=1e-9)
+
+
+@pytest.mark.parametrize("turn", [2.0, 3.5, 5.0, 8.0, -3.5])
+def test_turns_between_two_updates_are_not_taken_for_others(turn: float) -> None:
+    """Beyond half a circle nothing is learned: the headings tell another turn than the wheels."""
+    robot, true_scale = robot_that(True), 1.05
+    truth, state = LOOP_START, robot.start(0)
+    for i in range(30):
+        from_ns, until_ns = 5 * SECOND * i, 5 * SECOND * (i + 1)
+        state = robot.drive(state, Odometry(from_ns, until_ns, 0.0, turn / true_scale))
+        truth = step(truth, 0.0, turn)
+        state = robot.cycle(state, frame(truth, until_ns))
+    learned_turn = state.memory.learned.turn_scale
+    assert learned_turn == pytest.approx(true_scale if abs(turn) < 3.0 else 1.0, abs=5e-3)
 
 
 # In the localizer ---------------------------------------------------------------------------------

@@ -11,6 +11,7 @@ from cpcbl_team.sensors import (
     corrected_odometry,
     corrected_sighting,
     crawled_s,
+    once_each,
     repeated_share,
     sighting_fault,
     sighting_sigmas,
@@ -201,6 +202,17 @@ def test_faulty_readings_stay_faulty() -> None:
         (Sighting("a", 1.0, 0.1, None, None, 0.1), "heading_without_sigma"),
     ):
         assert sighting_fault(corrected_sighting(sighting, sensor, False)) == fault
+
+
+def test_what_one_frame_reads_twice_is_read_once() -> None:
+    """Range and bearing of one object may come apart; a fault is for the filter to count."""
+    ranged, borne = Sighting("oak", 2.0), Sighting("oak", None, 0.3)
+    whole, empty = Sighting("elm", 2.0, 0.3), Sighting("elm")
+    each = (ranged, borne, whole, empty, Sighting("elm", None, None, heading_rad=1.0))
+    assert once_each(each) == each
+    assert once_each(each[:3]) == each[:3]
+    assert once_each((whole,) * 100) == (whole,)
+    assert once_each((whole, Sighting("elm", 2.1), Sighting("elm", None, 0.31))) == (whole,)
 
 
 def test_a_bias_is_taken_from_all_bearings_that_are_good() -> None:

@@ -277,6 +277,18 @@ def test_what_came_already_is_refused(kind: type[Input]) -> None:
     assert timeline.state is before
 
 
+def test_of_pieces_of_odometry_of_one_time_the_order_of_arrival_plays_no_part() -> None:
+    """One of them is driven, and that it is not the only one is counted."""
+    pieces = [Odometry(0, 100 * MS, 0.1, 0.0), Odometry(0, 50 * MS, 0.5, 0.0)]
+    found = []
+    for order in permutations(pieces):
+        timeline = Timeline(localizer("joint", MIXED), START)
+        assert [timeline.add(piece) for piece in order] == ["", ""]
+        found.append(timeline.latest(100 * MS))
+    assert found[0] == found[1]
+    assert found[0].counts == {"odometry_overlap": 1}
+
+
 def test_two_different_frames_of_one_time_are_both_used() -> None:
     timeline = Timeline(localizer("joint", MIXED), START)
     assert timeline.add(frame(LOOP_START, 7, MIXED, ["both"])) == ""
