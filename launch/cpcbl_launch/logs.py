@@ -30,13 +30,13 @@ class LoggedTeam(NamedTuple):
 
 def builtin_for(folder: Path) -> Path:
     """The built-in team file that was not calibrated on this data set (by the name's number)."""
-    without = builtin(f"mrclam-without-{_number(folder.name)}")
+    without = builtin(f"mrclam-without-{_number(folder.resolve().name)}")
     return without if without.exists() else builtin("mrclam")
 
 
 def seen_before(team: Team, folder: Path) -> bool:
     """Whether the team's robots were calibrated on this very data set."""
-    return _number(folder.name) in map(_number, team.calibrated_on)
+    return _number(folder.resolve().name) in map(_number, team.calibrated_on)
 
 
 def _number(name: str) -> str:

@@ -239,7 +239,7 @@ def _report(
     return msgspec.structs.replace(
         report,
         calibrated_on=run.team.calibrated_on,
-        seen_before=seen_before(run.team, Path(run.team.data)),
+        seen_before=bool(run.team.data) and seen_before(run.team, Path(run.team.data)),
         left_out=dict(run.left_out),
         duration_s=elapsed_s,
         restarts=restarts,

@@ -283,3 +283,14 @@ def test_a_built_in_team_is_not_judged_on_what_it_was_calibrated_on(folder: str)
     assert file.stem == ("mrclam" if number == "9" else f"mrclam-without-{number}")
     assert not seen_before(team, Path(folder))
     assert seen_before(load_team(builtin("mrclam")), Path(folder)) == (number != "9")
+
+
+@pytest.mark.parametrize("named", [".", "../MRCLAM6/", "../latest"])
+def test_a_data_set_is_known_however_its_folder_is_named(
+    named: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "MRCLAM6").mkdir()
+    (tmp_path / "latest").symlink_to("MRCLAM6")
+    monkeypatch.chdir(tmp_path / "MRCLAM6")
+    assert builtin_for(Path(named)).stem == "mrclam-without-6"
+    assert seen_before(load_team(builtin("mrclam")), Path(named))
