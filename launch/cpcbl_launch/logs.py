@@ -10,12 +10,14 @@ import msgspec
 import numpy as np
 
 from cpcbl_agents.sources import mrclam
+from cpcbl_launch.options import check_duration
 from cpcbl_launch.team_file import builtin
 from cpcbl_team.config import Field, Start, Team
 from cpcbl_team.geometry import Pose2, step
 from cpcbl_team.metrics import Floats, truth_at
 
 LATEST_TRUTH_NS = 30_000_000_000
+LEAST_S = 1.0
 
 
 class LoggedTeam(NamedTuple):
@@ -47,7 +49,8 @@ def _number(name: str) -> str:
 def on_log(team: Team, folder: Path) -> LoggedTeam:
     """The team on the MRCLAM log in `folder`: robots start at the log's first true pose.
 
-    A robot whose files are missing is left out. Raises LogError.
+    A robot whose files are missing is left out. Raises LogError, and ValueError for a robot with
+    files that would not read them.
     """
     there = set(mrclam.robots_in(folder))
     left_out = {
@@ -58,6 +61,7 @@ def on_log(team: Team, folder: Path) -> LoggedTeam:
     names = [name for name in team.robots if name in there]
     if not names:
         raise mrclam.LogError(f"{folder}: has files for none of the robots {', '.join(left_out)}")
+    _must_read(team, names)
     truth = {name: mrclam.read_truth(folder, name) for name in names}
     spans = {name: mrclam.odometry_span_ns(folder, name) for name in names}
     robots = {
@@ -75,10 +79,20 @@ def on_log(team: Team, folder: Path) -> LoggedTeam:
 
 
 def shortened(logged: LoggedTeam, duration_s: float | None) -> LoggedTeam:
-    """The same log, of which only so much is used; None: all of it."""
+    """The same log, of which only so much is used; None: all of it. Raises ValueError."""
     if duration_s is None:
         return logged
+    check_duration(duration_s, LEAST_S)
     return logged._replace(end_ns=min(logged.end_ns, logged.start_ns + int(duration_s * 1e9)))
+
+
+def _must_read(team: Team, names: Collection[str]) -> None:
+    for name in names:
+        source = team.robots[name].source
+        if source != "mrclam":
+            raise ValueError(
+                f'robots.{name}.source: {source}: reads no log; write source = "mrclam"'
+            )
 
 
 def _start(folder: Path, robot: str, truth: Floats) -> Start | None:

@@ -14,7 +14,8 @@ from rich.console import Console
 
 from cpcbl_agents.sources.mrclam import LogError
 from cpcbl_launch.evaluation import Choice, chosen, evaluate_log
-from cpcbl_launch.logs import LoggedTeam, blinded, builtin_for, on_log, seen_before
+from cpcbl_launch.experiments import budget
+from cpcbl_launch.logs import LoggedTeam, blinded, builtin_for, on_log, seen_before, shortened
 from cpcbl_launch.reporting.recorder import LearnedReport, Report
 from cpcbl_launch.show import print_report
 from cpcbl_launch.team_file import builtin, load_team
@@ -95,6 +96,30 @@ def test_a_log_with_none_of_the_robots_is_an_error(tmp_path: Path) -> None:
     write_log(tmp_path, ("1", "2"), seconds=1.0)
     with pytest.raises(LogError, match=r"none of the robots 4, 5"):
         on_log(log_team("4", "5"), tmp_path)
+
+
+def test_a_robot_that_would_not_read_its_log_is_refused(tmp_path: Path) -> None:
+    write_log(tmp_path, ("1", "2"), seconds=1.0)
+    team = log_team("1", "2", "3")
+    robots = {**team.robots, "3": RobotSettings()}  # without files: left out, whatever it reads
+    assert on_log(msgspec.structs.replace(team, robots=robots), tmp_path).left_out.keys() == {"3"}
+    robots["2"] = RobotSettings(source="external")
+    with pytest.raises(ValueError, match=r'robots\.2\.source: external: .* source = "mrclam"'):
+        on_log(msgspec.structs.replace(team, robots=robots), tmp_path)
+
+
+@pytest.mark.parametrize("duration_s", [-1.0, 0.0, math.inf, math.nan])
+def test_so_much_of_a_log_cannot_be_used(duration_s: float, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="--duration .*: at least 1 seconds"):
+        shortened(logged(tmp_path), duration_s)
+
+
+def test_a_budget_is_not_held_where_nothing_can_be_scored(tmp_path: Path) -> None:
+    on, case = logged(tmp_path, seconds=8.0), budget.cases()[0]
+    assert budget.point(on, case).position_rmse_m < MILLIMETRE
+    late = {name: rows[rows[:, 0] > EPOCH_MS * 1e-3 + 6.0] for name, rows in on.truth.items()}
+    with pytest.raises(ValueError, match=r"no truth in these 2 s; take more of the log"):
+        budget.point(shortened(on._replace(truth=late), 2.0), case)
 
 
 def test_blinding_takes_landmarks_from_the_named_robots_only(tmp_path: Path) -> None:

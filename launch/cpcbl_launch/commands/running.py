@@ -120,12 +120,13 @@ def up(
     run = Run(team, duration, speed, seed, folder=logs, picture=picture, record=record)
     if any(robot.source == "mrclam" for robot in team.robots.values()):
         logged = real_logs.on_log(team, Path(data or team.data or "."))
+        logged = real_logs.shortened(logged, duration)
         run = run._replace(
             team=logged.team,
             truth=logged.truth,
             left_out=logged.left_out,
             epoch_ns=logged.start_ns,
-            duration_s=min(duration or 1e9, (logged.end_ns - logged.start_ns) * 1e-9),
+            duration_s=(logged.end_ns - logged.start_ns) * 1e-9,
         )
     elif duration is None:
         run = run._replace(duration_s=SIMULATED_S)

@@ -111,7 +111,7 @@ def _every(seconds: float) -> Case:
 
 
 def point(logged: LoggedTeam, case: Case) -> Point:
-    """The figures of one case."""
+    """The figures of one case. Raises ValueError where there is no truth to score it by."""
     replace = msgspec.structs.replace
     robots = {}
     for name, robot in logged.team.robots.items():
@@ -121,6 +121,10 @@ def point(logged: LoggedTeam, case: Case) -> Point:
     run = logged._replace(team=replace(logged.team, robots=robots))
     report = evaluate_log(run)
     team, minutes = report.team, report.duration_s / 60.0 * len(robots)
+    if team.position_rmse_m is None or team.heading_rmse_deg is None:
+        raise ValueError(
+            f"{logged.team.data}: no truth in these {report.duration_s:g} s; take more of the log"
+        )
     blind = [
         r.position_rmse_m
         for name, r in report.robots.items()
@@ -131,9 +135,9 @@ def point(logged: LoggedTeam, case: Case) -> Point:
         setting=case.setting,
         bytes_per_s=team.bytes_sent / 60.0 / minutes,
         messages_per_minute=team.messages_sent / minutes,
-        position_rmse_m=team.position_rmse_m or 0.0,
+        position_rmse_m=team.position_rmse_m,
         blind_rmse_m=sum(blind) / len(blind) if blind else None,
-        heading_rmse_deg=team.heading_rmse_deg or 0.0,
+        heading_rmse_deg=team.heading_rmse_deg,
         inside_3_sigma=team.inside_3_sigma,
         nees=team.nees,
         within_budget=all(s.most <= s.allowed for r in report.robots.values() for s in r.spending),
