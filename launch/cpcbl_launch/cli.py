@@ -38,7 +38,7 @@ app.add_typer(experiment_app, name="experiment")
 
 NOT_WRITABLE = {
     *(errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EPIPE),
-    *(errno.EROFS, errno.EACCES, errno.EPERM),
+    *(errno.EROFS, errno.EACCES, errno.EPERM, errno.EISDIR),
 }
 
 

@@ -3,10 +3,12 @@
 import json
 import resource
 import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 from bus_helpers import SECOND, standing
+from log_helpers import write_log
 from process_helpers import cpcbl_team
 
 from cpcbl_launch.evaluation import simulate
@@ -115,6 +117,59 @@ def test_a_simulation_whose_picture_is_lost_still_reports(tmp_path: Path) -> Non
     ran = cpcbl_team("simulate", "--duration", 4, "--picture", path, "--json")
     assert ran.returncode == 1
     assert json.loads(ran.stdout)["not_written"] == {str(path): NO_SPACE}
+
+
+def test_an_experiment_whose_files_are_lost_still_shows_its_figures(tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib")
+    files = [tmp_path / f"one-way-vs-both.{ending}" for ending in ("json", "png")]
+    for path in files:
+        path.symlink_to(FULL)
+    small = ("one-way-vs-both", "--robots", 2, "--seeds", 1, "--output", tmp_path, "--json")
+    ran = cpcbl_team("experiment", *small)
+    assert ran.returncode == 1
+    assert json.loads(ran.stdout)["experiment"] == "one-way-vs-both"
+    said = [f"cpcbl-team: {path}: not written: {NO_SPACE}" for path in files]
+    assert ran.stderr.splitlines()[-2:] == said
+
+
+@pytest.mark.parametrize("ending", ["json", "png"])
+def test_an_experiment_whose_file_is_a_folder_is_refused_before_it_runs(
+    ending: str, tmp_path: Path
+) -> None:
+    pytest.importorskip("matplotlib")
+    (tmp_path / f"table1.{ending}").mkdir()
+    ran = cpcbl_team("experiment", "table1", "--output", tmp_path)
+    assert ran.returncode == 2
+    (line,) = ran.stderr.splitlines()
+    assert f"table1.{ending}: a folder; name a file" in line
+
+
+def test_an_evaluation_whose_export_is_lost_still_reports(tmp_path: Path) -> None:
+    write_log(tmp_path / "log", seconds=4.0)
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "1_estimate.tum").symlink_to(FULL)
+    ran = cpcbl_team(
+        *("evaluate", "mrclam", tmp_path / "log", "--team", "mrclam-uncalibrated"),
+        *("--export", tmp_path / "out", "--json"),
+    )
+    assert ran.returncode == 1
+    assert json.loads(ran.stdout)["robots"].keys() == {"1", "2"}
+    assert ran.stderr.splitlines() == [f"cpcbl-team: {tmp_path / 'out'}: not written: {NO_SPACE}"]
+
+
+def test_a_compose_file_that_is_lost_is_named() -> None:
+    ran = cpcbl_team("compose", "--output", FULL)
+    assert ran.returncode == 1
+    assert ran.stderr.splitlines() == [f"cpcbl-team: /dev/full: not written: {NO_SPACE}"]
+
+
+def test_a_file_that_became_a_folder_is_one_line(tmp_path: Path) -> None:
+    ends = (
+        f"from cpcbl_launch import cli; cli.app = lambda: open({str(tmp_path)!r}, 'w'); cli.main()"
+    )
+    ran = subprocess.run([sys.executable, "-c", ends], capture_output=True, text=True, check=False)
+    assert ran.returncode == 1
+    assert ran.stderr.splitlines() == [f"cpcbl-team: {tmp_path}: not written: Is a directory"]
 
 
 def test_recording_a_simulation_onto_a_good_disk_loses_nothing(tmp_path: Path) -> None:

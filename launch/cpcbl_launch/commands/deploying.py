@@ -5,7 +5,7 @@ from typing import Annotated, Optional
 
 import typer
 
-from cpcbl_launch.commands.arguments import Image, TeamArgument, load
+from cpcbl_launch.commands.arguments import Image, TeamArgument, load, say_not_written
 
 
 def compose(
@@ -18,7 +18,7 @@ def compose(
 ) -> None:
     """Print a team's compose file: for docker-compose, docker compose, a swarm."""
     from cpcbl_launch.containers.deployment import deployed
-    from cpcbl_launch.options import file_for
+    from cpcbl_launch.options import file_for, not_written
 
     if output is not None:
         file_for("--output", output)
@@ -28,4 +28,4 @@ def compose(
     if output is None:
         typer.echo(text, nl=False)
     else:
-        output.write_text(text, encoding="utf-8")
+        say_not_written(not_written(output, lambda: output.write_text(text, encoding="utf-8")))

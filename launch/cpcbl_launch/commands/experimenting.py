@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Optional
 
 import typer
 
-from cpcbl_launch.commands.arguments import names_in
+from cpcbl_launch.commands.arguments import names_in, say_not_written
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -102,11 +102,11 @@ def budget(
     from cpcbl_launch import logs
     from cpcbl_launch.experiments import budget as experiment
     from cpcbl_launch.experiments.pictures import draw_budget
-    from cpcbl_launch.options import folder_for, must_draw
+    from cpcbl_launch.options import must_draw
     from cpcbl_launch.team_file import load_team
 
     must_draw("experiment")
-    folder_for("--output", output)
+    _must_be_writable(output, "budget")
     logged = logs.shortened(logs.on_log(load_team(logs.builtin_for(data)), data), duration)
     logged = logged._replace(team=logs.blinded(logged.team, names_in(blind)))
     with _progress("budget", len(experiment.cases())) as done:
@@ -121,10 +121,10 @@ def liars(
     """One observer of several lies for a while: what it does to the team, and when it is found."""
     from cpcbl_launch.experiments import liars as experiment
     from cpcbl_launch.experiments.pictures import draw_liars
-    from cpcbl_launch.options import folder_for, must_draw
+    from cpcbl_launch.options import must_draw
 
     must_draw("experiment")
-    folder_for("--output", output)
+    _must_be_writable(output, "liars")
     with _progress("liars", len(experiment.cases()) * seeds) as done:
         result = experiment.measured(seeds, jobs or os.cpu_count() or 1, done)
     _written(result, experiment.tables(result), output, as_json, draw_liars)
@@ -139,11 +139,11 @@ def eyes(
     as_json: AsJson = False,
 ) -> None:
     """What cameras see of rendered frames: precision, recall, errors against stated sigmas."""
-    from cpcbl_launch.options import folder_for, must_draw, must_have_opencv
+    from cpcbl_launch.options import must_draw, must_have_opencv
 
     must_draw("experiment")
     must_have_opencv("experiment eyes")
-    folder_for("--output", output)
+    _must_be_writable(output, "eyes")
     from cpcbl_launch.experiments import eyes as experiment
 
     with _progress("eyes", -(-frames // experiment.CHUNK), "batches") as done:
@@ -165,12 +165,12 @@ def pictures(
     as_json: AsJson = False,
 ) -> None:
     """Real pictures whose truth is known: what is found and missed of them, and by how much."""
-    from cpcbl_launch.options import folder_for, must_have_opencv
+    from cpcbl_launch.options import must_have_opencv
 
     must_have_opencv("experiment pictures")
-    folder_for("--output", output)
     from cpcbl_launch.experiments import real_pictures
 
+    _must_be_writable(output, f"pictures-{real_pictures.set_named(name).stem}", drawn=False)
     result = real_pictures.measured(name, folder)
     _written(result, real_pictures.tables(result), output, as_json)
 
@@ -183,9 +183,8 @@ def latency(
 ) -> None:
     """Sighting on one robot -> belief of its teammate, beside a bare put: real processes, Zenoh."""
     from cpcbl_launch.experiments import latency
-    from cpcbl_launch.options import folder_for
 
-    folder_for("--output", output)
+    _must_be_writable(output, "latency", drawn=False)
     with _progress("latency", latency.UNMEASURED + sightings, "sightings") as done:
         result = latency.measured(sightings, done)
     _written(result, latency.tables(result), output, as_json)
@@ -202,11 +201,10 @@ def processes(
 ) -> None:
     """Real processes that keep 10 Hz: CPU and memory a robot, beside an all-to-all broadcast."""
     from cpcbl_launch.experiments import processes
-    from cpcbl_launch.options import folder_for
     from cpcbl_launch.usage import must_measure
 
     must_measure("experiment processes")
-    folder_for("--output", output)
+    _must_be_writable(output, "processes", drawn=False)
     sizes = processes.sizes_in(robots)
     with _progress("processes", len(sizes), "sizes") as done:
         result = processes.measured(sizes, seconds, done)
@@ -218,15 +216,24 @@ def conduct(
 ) -> None:
     """Runs, writes and shows one experiment. Raises ValueError for what the user can mend."""
     from cpcbl_launch.experiments.runs import run_all
-    from cpcbl_launch.options import folder_for, must_draw
+    from cpcbl_launch.options import must_draw
 
     must_draw("experiment")
-    folder_for("--output", output)
+    _must_be_writable(output, experiment.name)
     cases = experiment.cases()
     with _progress(experiment.name, len(cases) * seeds) as done:
         results = run_all(cases, range(1, seeds + 1), jobs or os.cpu_count() or 1, done)
     outcome = experiment.outcome(results)
     _written(outcome, experiment.tables(outcome), output, as_json, experiment.draw)
+
+
+def _must_be_writable(output: Path, name: str, *, drawn: bool = True) -> None:
+    """Raises ValueError where the files of an experiment could not be written later on."""
+    from cpcbl_launch.options import file_for, folder_for
+
+    folder_for("--output", output)
+    for ending in ("json", "png") if drawn else ("json",):
+        file_for("--output", output / f"{name}.{ending}")
 
 
 def _written(
@@ -236,23 +243,26 @@ def _written(
     as_json: bool,
     draw: Callable[[Any, Path], None] | None = None,
 ) -> None:
-    """Writes what came out, a picture too where one is drawn, and shows it."""
+    """Writes what came out, a picture too where one is drawn, and shows it, written or not."""
     from rich.console import Console
 
-    from cpcbl_launch.options import encoded
+    from cpcbl_launch.options import encoded, not_written
 
     text, name = encoded(result) + "\n", output / result.experiment
-    Path(f"{name}.json").write_text(text, encoding="utf-8")
+    figures, picture = Path(f"{name}.json"), Path(f"{name}.png")
+    lost = not_written(figures, lambda: figures.write_text(text, encoding="utf-8"))
     if draw is not None:
-        draw(result, Path(f"{name}.png"))
+        lost |= not_written(picture, lambda: draw(result, picture))
     if as_json:
         sys.stdout.write(text)
-        return
-    console = Console()
-    for shown in tables:
-        console.print(shown, highlight=False)
-    pictured = ", .png" if draw is not None else ""
-    console.print(f"written: {name}.json{pictured}", highlight=False)
+    else:
+        console = Console()
+        for shown in tables:
+            console.print(shown, highlight=False)
+        pictured = ", .png" if draw is not None else ""
+        if not lost:
+            console.print(f"written: {figures}{pictured}", highlight=False)
+    say_not_written(lost)
 
 
 @contextmanager

@@ -79,7 +79,7 @@ def evaluate_mrclam(
 
     from cpcbl_launch import logs as real_logs
     from cpcbl_launch.evaluation import Choice, chosen, evaluated
-    from cpcbl_launch.options import encoded, folder_for
+    from cpcbl_launch.options import encoded, folder_for, not_written
     from cpcbl_launch.reporting.tum import export_tum
     from cpcbl_launch.show import print_report, progress_bar
 
@@ -96,15 +96,18 @@ def evaluate_mrclam(
     logged = real_logs.on_log(chosen(team, choice), data)
     logged = logged._replace(team=real_logs.blinded(logged.team, names_in(blind)))
     logged = real_logs.shortened(logged, duration)
-    folder = None if export is None else folder_for("--export", export)
+    if export is not None:
+        folder_for("--export", export)
     with progress_bar(f"{data.name}", quiet=as_json) as progress:
         result, paths = evaluated(logged, progress, with_yardsticks=yardstick)
-    if folder is not None:
-        export_tum(folder, paths, logged.truth)
+    lost: dict[str, str] = {}
+    if (folder := export) is not None:
+        lost |= not_written(folder, lambda: export_tum(folder, paths, logged.truth))
     if as_json:
         typer.echo(encoded(result))
     else:
         print_report(result, Console())
+    say_not_written(lost)
 
 
 def calibrate(
