@@ -221,6 +221,16 @@ def test_stated_sigmas_grow_where_errors_are_larger(times: float, grown: bool) -
     assert team.robots["eye"].camera.tilt_deg == 5.0
 
 
+def test_ranges_that_are_no_depths_are_written_as_such() -> None:
+    place = Place(("types", "eye", "sensor"))
+    depths = TEAM.replace(
+        "[types.eye.camera]", "sensor = { range_is_depth = true }\n[types.eye.camera]"
+    )
+    assert parse_team(depths).robots["eye"].sensor.range_is_depth
+    places = seeing_values(calibrated_seeing([said(1.0)]), CameraSettings(), place, place)
+    assert not parse_team(edited(depths, "lab", places)).robots["eye"].sensor.range_is_depth
+
+
 def test_eyes_that_state_nothing_are_calibrated_too() -> None:
     seeing = calibrated_seeing([said(1.0, told=0.0)])
     assert seeing.times is None

@@ -19,7 +19,7 @@ from cpcbl_launch.calibration.robot_log import RobotLog
 from cpcbl_launch.calibration.robots import Calibration, RobotCalibration, calibrated
 from cpcbl_launch.calibration.sensor import calibrate_sensor
 from cpcbl_launch.calibration.statistics import Estimate, decimals, robust_fit, told, variance_parts
-from cpcbl_launch.calibration.team_text import changed_keys, team_text
+from cpcbl_launch.calibration.team_text import INTERVAL_S, changed_keys, team_text
 from cpcbl_launch.evaluation import Choice, chosen, simulate
 from cpcbl_launch.reporting.recording import read_recording
 from cpcbl_launch.team_file import TeamFileError, load_team, parse_team
@@ -390,6 +390,28 @@ def test_types_are_added_to_the_base_team_file() -> None:
     assert r1.speed_m_s == 0.3
     assert team.robots["r2"] == before.robots["r2"]
     assert "[types.robot-1" not in text
+
+
+def test_what_a_robot_says_itself_does_not_go_before_what_was_calibrated() -> None:
+    own = BASE.replace(
+        "rate_hz = 5.0 }",
+        """rate_hz = 5.0 }
+sensor = { range_is_depth = true, max_range_m = 4.0 }
+localizer = { self_calibration = true, object_interval_s = 3.0, variant = "oval" }""",
+    )
+    r1 = parse_team(written(FOUND, own)).robots["r1"]
+    assert not r1.sensor.range_is_depth
+    assert not r1.localizer.self_calibration
+    assert r1.localizer.object_interval_s == INTERVAL_S
+    assert (r1.sensor.max_range_m, r1.localizer.variant) == (4.0, "oval")
+
+
+def test_a_type_that_others_have_is_not_overwritten() -> None:
+    named = BASE.replace("old", "robot-r1")
+    with pytest.raises(ValueError, match=r"robots\.r2\.type: robot-r1: robot r1 gets a type"):
+        written(FOUND, named)
+    alone = named.split("[robots.r2]")[0]
+    assert parse_team(written(FOUND, alone)).robots["r1"].speed_m_s == 0.3
 
 
 def test_noise_is_written_as_of_another_day() -> None:

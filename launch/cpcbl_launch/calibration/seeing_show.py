@@ -77,8 +77,7 @@ def seeing_values(
     larger than they say. They are never made smaller: what is the same in all of these pictures,
     such as how the camera is mounted, may be otherwise tomorrow."""
     corrections = {name: _at_least(name, written(value)) for name, value in seeing.sensor.items()}
-    if seeing.range_is_depth:
-        corrections["range_is_depth"] = Written(True)
+    corrections["range_is_depth"] = Written(seeing.range_is_depth)
     places: dict[Place, Mapping[str, Written]] = {sensor: corrections}
     if seeing.times is not None and seeing.times.value > 1.0 and _off(seeing.times):
         factor = seeing.times.value

@@ -100,28 +100,48 @@ def _add_type(document: TOMLDocument, robot: str, written: RobotCalibration) -> 
     own: Any = document["robots"][robot]
     types: Any = document.setdefault("types", tomlkit.table(is_super_table=True))
     former = dict(types.get(own.get("type", ""), {}))
-    kind = f"robot-{robot}" if len(robot) < 26 else robot
+    kind = _type_of(document, robot)
     table = tomlkit.table()
-    driving, seeing = written.odometry, written.sensor
-    rules = dict(former.get("localizer", {}))
-    if seeing:
-        former["sensor"] = {**former.get("sensor", {}), "range_is_depth": written.range_is_depth}
-        rules["object_interval_s"] = INTERVAL_S
-    if driving:
-        rules["self_calibration"] = False
-    if rules:
-        former["localizer"] = rules
+    calibrated = {"odometry": written.odometry, "sensor": written.sensor}
+    besides = _besides(written)
+    for part, said in besides.items():
+        former[part] = {**former.get(part, {}), **said}
     for key, value in former.items():
-        if key not in ("odometry", "sensor"):
+        if key not in calibrated:
             table.add(key, value)
-    for part, values in (("odometry", driving), ("sensor", seeing)):
+    for part, values in calibrated.items():
         kept = {k: v for k, v in former.get(part, {}).items() if k not in values}
         if kept or values:
             table.add(part, _part(part, kept, values))
-        for key in values:
+    for part in ("odometry", "sensor", "localizer"):
+        for key in (*calibrated.get(part, ()), *besides.get(part, ())):
             own.get(part, {}).pop(key, None)
     types[kind] = table
     own["type"] = kind
+
+
+def _type_of(document: TOMLDocument, robot: str) -> str:
+    """The name of a robot's new type. Raises ValueError where others have a type of that name."""
+    kind = f"robot-{robot}" if len(robot) < 26 else robot
+    robots: Any = document["robots"]
+    for other, own in robots.items():
+        if other != robot and own.get("type") == kind:
+            raise ValueError(
+                f"robots.{other}.type: {kind}: robot {robot} gets a type of that name; give the"
+                " present one another"
+            )
+    return kind
+
+
+def _besides(written: RobotCalibration) -> dict[str, dict[str, bool | float]]:
+    """What goes with calibrated values: what a range is, how often to use one, not to learn."""
+    parts: dict[str, dict[str, bool | float]] = {}
+    if written.sensor:
+        parts["sensor"] = {"range_is_depth": written.range_is_depth}
+        parts["localizer"] = {"object_interval_s": INTERVAL_S}
+    if written.odometry:
+        parts.setdefault("localizer", {})["self_calibration"] = False
+    return parts
 
 
 def _with_margin(
