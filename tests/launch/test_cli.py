@@ -91,6 +91,8 @@ def test_check_names_file_key_and_fix_in_one_line(tmp_path: Path) -> None:
         (["up", "demo", "--blind", "nobody"], "no robot nobody to blind"),
         (["evaluate", "mrclam", "nowhere"], "asrl.utias.utoronto.ca"),
         (["robot", "nobody", "--team", "demo"], "nobody: not in the file"),
+        (["up", "--picture", "run.xyz"], "--picture run.xyz: not a picture"),
+        (["calibrate", "nowhere", "--picture", "run.xyz"], "--picture run.xyz: not a picture"),
     ],
 )
 def test_what_the_user_can_mend_is_one_line(arguments: list[str], said: str) -> None:

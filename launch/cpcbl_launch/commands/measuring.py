@@ -151,7 +151,7 @@ def calibrate(
     file_for("--output", output)
     if picture is not None:
         file_for("--picture", picture)
-        must_draw("--picture")
+        must_draw("--picture", picture)
     base, base_name = base_text(logs, team_file)
     names = [log.resolve().name for log in logs]
     robot_logs = read_logs(logs)

@@ -114,7 +114,7 @@ def up(
         if path is not None:
             file_for(option, path)
     if picture is not None:
-        must_draw("--picture")
+        must_draw("--picture", picture)
     if logs is not None:
         folder_for("--logs", logs)
     run = Run(team, duration, speed, seed, folder=logs, picture=picture, record=record)
