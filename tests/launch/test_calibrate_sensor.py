@@ -247,16 +247,19 @@ def test_too_few_sightings_are_said() -> None:
 # Files --------------------------------------------------------------------------------------------
 
 
-def test_looks_of_a_recording_are_sightings(tmp_path: Path) -> None:
-    robots = {"eye": RobotSettings(source="external", sensing="camera")}
-    team, path = Team(name="lab", robots=robots), tmp_path / "run.mcap"
+EYE = RobotSettings(source="external", sensing="camera")
+
+
+def record(path: Path, log: Sights, *names: str, **robots: RobotSettings) -> Team:
+    """What robots of these names look at in a run of this team, all from the same places."""
+    team = Team(name="lab", robots=robots)
     team = replace(team, map=replace(team.map, landmarks=MARKS))
-    hub, log = MemoryHub(), said(1.0, 30)
-    looks = hub.session().publisher("look/eye", topics.Qos.TELEMETRY)
+    hub = MemoryHub()
+    looks = {n: hub.session().publisher(f"look/{n}", topics.Qos.TELEMETRY) for n in names}
     truths = hub.session().publisher("field/truth", topics.Qos.TELEMETRY)
     with Recording(path, team, hub.session()):
-        for at, x, y, heading in log.log.truth.tolist():
-            truths.put(encode(Truths(int(at * 1e9), (Truth("eye", x, y, heading),))))
+        for at, *pose in log.log.truth.tolist():
+            truths.put(encode(Truths(int(at * 1e9), tuple(Truth(n, *pose) for n in names))))
             mine = np.isclose(log.log.sightings[:, 0], at)
             found = tuple(
                 Sighting("ab"[int(which)], r, b, sigma[0], sigma[1])
@@ -265,7 +268,14 @@ def test_looks_of_a_recording_are_sightings(tmp_path: Path) -> None:
                 )
                 if which < 2
             )
-            looks.put(encode(Look("eye", int(at * 1e9), b"", found)))
+            for name in names:
+                looks[name].put(encode(Look(name, int(at * 1e9), b"", found)))
+    return team
+
+
+def test_looks_of_a_recording_are_sightings(tmp_path: Path) -> None:
+    path, log = tmp_path / "run.mcap", said(1.0, 30)
+    team = record(path, log, "eye", eye=EYE)
     looked = recorded([path], None)
     assert looked.robots == ("eye",)
     (sights,) = looked.sights
@@ -277,10 +287,29 @@ def test_looks_of_a_recording_are_sightings(tmp_path: Path) -> None:
         recorded([path], "other")
     with pytest.raises(ValueError, match="no recording of"):
         recorded([tmp_path], None)
-    with Recording(tmp_path / "blind.mcap", team, hub.session()):
+    with Recording(tmp_path / "blind.mcap", team, MemoryHub().session()):
         pass
     with pytest.raises(LogError, match="holds no truth"):
         recorded([tmp_path / "blind.mcap"], None)
+
+
+def test_like_cameras_are_pooled_and_unlike_ones_refused(tmp_path: Path) -> None:
+    path, log = tmp_path / "run.mcap", said(1.0, 30)
+    at_a_device = replace(EYE, camera=CameraSettings(frames="0"))
+    record(path, log, "one", "two", one=EYE, two=at_a_device)
+    assert recorded([path], None).robots == ("one", "two")
+    longer = replace(EYE, camera=CameraSettings(fx_px=500.0))
+    record(path, log, "one", "two", one=EYE, two=longer)
+    with pytest.raises(ValueError, match=r"one, two: unlike cameras, .* by --robot"):
+        recorded([path], None)
+    assert recorded([path], "two").camera == longer.camera
+
+
+def test_a_guests_camera_is_not_known(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    record(path, said(1.0, 30), "eye", "guest", eye=EYE)
+    with pytest.raises(ValueError, match=r"--robot guest: a guest of .*; with a camera: eye"):
+        recorded([path], "guest")
 
 
 def test_pictures_that_cannot_be_used_are_said(honest: Path, tmp_path: Path) -> None:

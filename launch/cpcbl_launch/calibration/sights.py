@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import msgspec
 import numpy as np
+from msgspec.structs import replace
 
 from cpcbl_agents.sources.mrclam import LogError
 from cpcbl_launch.calibration.logs import Placed, placed
@@ -57,7 +58,7 @@ class _Row(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 def recorded(paths: Sequence[Path], robot: str | None) -> Looked:
     """What this robot, or every one with a camera, saw. Raises LogError, ValueError."""
-    found: list[tuple[str, CameraSettings, Sights]] = []
+    found: list[tuple[str, CameraSettings, Sights]] = []  # cameras without where frames come from
     for path in paths:
         if path.suffix != ".mcap":
             raise ValueError(f"{path}: no recording of `up --record` (.mcap)")
@@ -68,13 +69,21 @@ def recorded(paths: Sequence[Path], robot: str | None) -> Looked:
         for name in [robot] if robot else team.cameras:
             said = [i for i in recording.inputs.get(name, ()) if isinstance(i, Sightings)]
             if said and len(where.truth.get(name, ())) > 1:
-                camera = team.robots[name].camera
+                if name not in team.robots:
+                    there = ", ".join(team.cameras)
+                    raise ValueError(f"--robot {name}: a guest of {path}; with a camera: {there}")
+                camera = replace(team.robots[name].camera, frames="")
                 found.append((name, camera, sights_of(name, said, where)))
     if not found:
         who = robot or "robots with cameras"
         raise ValueError(f"{paths[0]}: no sightings of {who} where the truth is known")
-    names, seen = dict.fromkeys(name for name, _, _ in found), [sights for _, _, sights in found]
-    return Looked(tuple(names), found[0][1], seen)
+    names = tuple(dict.fromkeys(name for name, _, _ in found))
+    if len({camera for _, camera, _ in found}) > 1:
+        raise ValueError(
+            f"{', '.join(names)}: unlike cameras, which err each in their way; name one robot by"
+            " --robot, and recordings of one camera"
+        )
+    return Looked(names, found[0][1], [sights for _, _, sights in found])
 
 
 def viewer(team: Team, robot: str | None) -> str:
