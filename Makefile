@@ -57,10 +57,11 @@ compiled: setup
 	cd $(COMPILED) && MYPYPATH=../../tests $(abspath $(BIN))/mypyc --namespace-packages \
 	  --explicit-package-bases --ignore-missing-imports benchmarks/float_ekf.py > mypyc.log
 
-# Timed, so alone on the machine: the localizer's variants and their peers in the same run, then a
-# robot's eyes and OpenCV's marker detection.
+# First that all of them compute the same. Then timed, so alone on the machine: the localizer's
+# variants and their peers in the same run, then a robot's eyes and OpenCV's marker detection.
 bench: setup compiled
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev,bench]'
+	$(BIN)/pytest -q tests/benchmarks
 	@mkdir -p build
 	$(call timed,cycle,bench)
 	$(call timed,eyes,bench_eyes)
