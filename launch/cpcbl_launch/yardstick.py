@@ -7,9 +7,10 @@ a team. Smith, Self, Cheeseman (1990) for the joint state; Roumeliotis & Bekey (
 Inputs come through the robots' own sensing agents, so that delays, scales, biases and blindness are
 those of the team, as are start poses, noise, gates, `object_interval_s` and `correlation_s`. What
 belongs to the team's method (turns of heading and position, tiers, `minimum_interval_s`) plays no
-part, and yardsticks do not learn (`self_calibration`). Inputs are taken in the order of the times they speak of: nothing arrives late. A filter that
-rejects most of what it sees doubts itself until its gates open; one that does not know its start
-begins with a Gaussian over the whole field, and no plain EKF is sure to find itself from there.
+part, and yardsticks do not learn (`self_calibration`). Inputs are taken in the order of the times
+they speak of: nothing arrives late. A filter that rejects most of what it sees doubts itself until
+its gates open; one that does not know its start begins with a Gaussian over the whole field, and no
+plain EKF is sure to find itself from there.
 """
 
 import math

@@ -71,6 +71,12 @@ def test_found_missed_unexpected_and_refused_are_told_apart(own_set: Path) -> No
     assert result.refused == {"cut.png": "frame_wrong_size"}
 
 
+def test_what_is_unexpected_is_in_the_same_order_each_time(own_set: Path) -> None:
+    own_set.write_text("picture,viewer,id,range_m,bearing_deg,heading_deg\nboth.png,eye,,,,\n")
+    found = measured(str(own_set), own_set.parent).unexpected
+    assert found == (("both.png", "mark"), ("both.png", "mate"))
+
+
 def test_the_command_shows_and_writes(own_set: Path, tmp_path: Path) -> None:
     shown = cpcbl_team("experiment", "pictures", own_set, own_set.parent, "--output", tmp_path)
     assert shown.returncode == 0, shown.stderr

@@ -9,7 +9,13 @@ import msgspec
 import numpy as np
 
 from cpcbl_launch.calibration.robot_log import wrapped
-from cpcbl_launch.calibration.sensor import Corrections, calibrate_sensor, corrections, truly_seen
+from cpcbl_launch.calibration.sensor import (
+    Corrections,
+    SensorRows,
+    calibrate_sensor,
+    corrections,
+    truly_seen,
+)
 from cpcbl_launch.calibration.sights import Sights
 from cpcbl_launch.calibration.statistics import (
     GROSS,
@@ -104,19 +110,25 @@ def _errors(seen: Sights, now: Corrections, number: int) -> _Rows:
     stamp_s, which, ranges, bearings = seen.log.sightings.T
     objects = which.astype(np.int64)
     true_range, true_bearing, known = truly_seen(seen.log, objects, stamp_s - now.delay_s)
-    teammate = np.isin(objects, list(seen.log.teammates))
-    along = ranges
-    if now.is_depth:
-        along = ranges / np.maximum(np.cos(np.nan_to_num(bearings - now.optical_axis)), 0.1)
-    bias = np.where(teammate, now.robot_range_bias_m, now.range_bias_m)
+    readings = SensorRows(
+        stretches(stamp_s, seen.log.truth[:, 0], number),
+        stamp_s,
+        objects,
+        np.isin(objects, list(seen.log.teammates)),
+        ranges,
+        bearings,
+        true_range,
+        true_bearing,
+        *np.full((2, len(stamp_s)), math.nan),  # rates: errors do not take them
+    )
     heading, heading_sigma, true_heading = seen.headings.T
     rows = _Rows(
-        stretches(stamp_s, seen.log.truth[:, 0], number),
-        teammate,
+        readings.stretch,
+        readings.teammate,
         true_range,
-        now.range_scale * along - bias - true_range,
+        now.range_errors(readings),
         seen.stated[:, 0],
-        wrapped(now.bearing_scale * bearings - now.bearing_bias - true_bearing),
+        now.bearing_errors(readings),
         seen.stated[:, 1],
         wrapped(heading - true_heading),
         heading_sigma,

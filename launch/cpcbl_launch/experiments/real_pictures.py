@@ -109,7 +109,7 @@ def measured(name: str, folder: Path) -> RealPictures:
     path = set_named(name)
     team, lines = load_team(path.with_suffix(".toml")), truths(path)
     viewers = {line.viewer for line in lines}
-    for viewer in viewers - team.robots.keys():
+    for viewer in sorted(viewers - team.robots.keys()):
         raise ValueError(f"{path}: no robot {viewer} in {path.with_suffix('.toml')}")
     eyes = {viewer: CameraEyes(viewer, team) for viewer in viewers}
     compared: list[Compared] = []
@@ -124,7 +124,7 @@ def measured(name: str, folder: Path) -> RealPictures:
             continue
         seen = {found.sighting.id: found.sighting for found in glimpses.found}
         compared += [_compared(line, seen.get(line.id)) for line in due if line.id]
-        unexpected += [(picture, name) for name in seen.keys() - {line.id for line in due}]
+        unexpected += [(picture, one) for one in sorted(seen.keys() - {line.id for line in due})]
         doubted += [(picture, doubt.reason) for doubt in glimpses.doubts]
     return RealPictures(
         experiment=f"pictures-{path.stem}",

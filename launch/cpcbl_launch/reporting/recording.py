@@ -147,11 +147,8 @@ def read_recording(path: Path) -> Recorded:
 def _inputs(messages: Iterable[tuple[str, Message]]) -> dict[str, list[SensorInput]]:
     inputs: dict[str, list[SensorInput]] = {}
     for key, message in messages:
-        if isinstance(message, Look):
+        if isinstance(message, Look):  # what the robot's eyes found in a frame
             message = Sightings(message.stamp_ns, message.found)
         if isinstance(message, Odometry | Sightings | Position):
             inputs.setdefault(key.split("/")[1], []).append(message)
-        elif isinstance(message, Look):  # what the robot's eyes found in a frame
-            seen = Sightings(message.stamp_ns, message.found)
-            inputs.setdefault(key.split("/")[1], []).append(seen)
     return inputs
