@@ -1,4 +1,4 @@
-"""Two-dimensional Gaussians in closed form (equations 1-4 of the paper).
+"""Two-dimensional Gaussians in closed form (equations 1 and 2 of the paper).
 
 Written for plain floats: on 2 x 2 matrices numpy costs about ten times more.
 """
@@ -41,18 +41,6 @@ class Covariance2(NamedTuple):
         """The variance along the unit vector (nx, ny)."""
         return self.xx * nx * nx + 2.0 * self.xy * nx * ny + self.yy * ny * ny
 
-    def axes(self) -> tuple[float, float, float]:
-        """(sigma of the major axis, sigma of the minor axis, angle of the major axis)."""
-        mean = 0.5 * (self.xx + self.yy)
-        spread = math.hypot(0.5 * (self.xx - self.yy), self.xy)
-        angle = 0.5 * math.atan2(2.0 * self.xy, self.xx - self.yy)
-        return math.sqrt(mean + spread), math.sqrt(max(0.0, mean - spread)), angle
-
-    def circular(self) -> "Covariance2":
-        """The circular covariance with the same mean variance (paper, section 4)."""
-        mean = 0.5 * (self.xx + self.yy)
-        return Covariance2(mean, 0.0, mean)
-
     def mahalanobis_squared(self, dx: float, dy: float) -> float:
         """d^T C^-1 d. Raises ZeroDivisionError when singular."""
         return (
@@ -88,26 +76,4 @@ def sighting_gaussian(
         range_m * math.cos(bearing),
         range_m * math.sin(bearing),
         oriented(range_sigma_m, across_m, bearing),
-    )
-
-
-def merge(first: Gaussian2, second: Gaussian2) -> Gaussian2:
-    """The product of two Gaussians over the same point.
-
-    C' = C1 - C1 (C1 + C2)^-1 C1 (equation 3), X' = X1 + C1 (C1 + C2)^-1 (X2 - X1) (equation 4).
-    Raises ZeroDivisionError when C1 + C2 is singular.
-    """
-    c1 = first.covariance
-    s = (c1 + second.covariance).inverse()
-    kxx, kxy = c1.xx * s.xx + c1.xy * s.xy, c1.xx * s.xy + c1.xy * s.yy
-    kyx, kyy = c1.xy * s.xx + c1.yy * s.xy, c1.xy * s.xy + c1.yy * s.yy
-    dx, dy = second.x - first.x, second.y - first.y
-    return Gaussian2(
-        first.x + kxx * dx + kxy * dy,
-        first.y + kyx * dx + kyy * dy,
-        Covariance2(
-            c1.xx - kxx * c1.xx - kxy * c1.xy,
-            c1.xy - kxx * c1.xy - kxy * c1.yy,
-            c1.yy - kyx * c1.xy - kyy * c1.yy,
-        ),
     )

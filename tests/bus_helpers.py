@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import msgspec
-from hypothesis import HealthCheck, settings
+from hypothesis import settings
 
 from cpcbl_agents.node import Node
 from cpcbl_agents.robot import Robot
@@ -43,8 +43,8 @@ def matches(keys: str, key: str) -> bool:
 
 
 def examples(count: int) -> settings:
-    """So many examples of hypothesis, however long one takes."""
-    return settings(max_examples=count, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+    """So many examples of hypothesis."""
+    return settings(max_examples=count)
 
 
 def wait_until(condition: Callable[[], bool]) -> None:

@@ -20,7 +20,7 @@ from cpcbl_team.config import (
     Wall,
 )
 from cpcbl_team.estimate import Covariance3, Estimate
-from cpcbl_team.gaussian import Covariance2
+from cpcbl_team.gaussian import Covariance2, Gaussian2
 from cpcbl_team.geometry import Pose2, step, wrap_angle
 from cpcbl_team.inputs import Belief, Fix, Odometry, Position, Sighting, Sightings
 from cpcbl_team.localizer import Localizer
@@ -84,6 +84,15 @@ def random_matrix(rng: np.random.Generator, size: int, rank: int | None = None) 
     """A covariance of full rank (or this one), with axes between about 0.05 and 1."""
     root = rng.normal(size=(size, rank or size)) * rng.uniform(0.05, 1.0, size=rank or size)
     return np.asarray(root @ root.T)
+
+
+def product_of(first: Gaussian2, second: Gaussian2) -> Gaussian2:
+    """Two Gaussians over one point as one: equations 3 and 4, as the paper has them (row 37)."""
+    c1, c2 = matrix2(first.covariance), matrix2(second.covariance)
+    x1, x2 = np.array(first[:2]), np.array(second[:2])
+    gain = c1 @ np.linalg.inv(c1 + c2)
+    x, y = x1 + gain @ (x2 - x1)
+    return Gaussian2(float(x), float(y), covariance2(c1 - gain @ c1))
 
 
 def least_eigenvalue(m: Matrix) -> float:

@@ -26,6 +26,7 @@ from core_helpers import (
     placed_at,
     point_sighting,
     position_error,
+    product_of,
     sensor_noise,
     state_at,
 )
@@ -44,7 +45,7 @@ from cpcbl_team.config import (
 )
 from cpcbl_team.constraints import range_circle
 from cpcbl_team.estimate import SPREAD_SHARE, ZERO3, Covariance3
-from cpcbl_team.gaussian import Covariance2, Gaussian2, merge
+from cpcbl_team.gaussian import Covariance2, Gaussian2
 from cpcbl_team.geometry import Pose2
 from cpcbl_team.inputs import Fix, Odometry, Sighting, Sightings, Told
 from cpcbl_team.localizer import Localizer
@@ -365,10 +366,10 @@ def test_weighted_averages_are_circular_gaussians_of_constant_relative_covarianc
         circle = range_circle(pose, landmark.x_m, landmark.y_m, range_m, 0.1)
         assert circle is not None
         point = Gaussian2(*circle.closest_point(pose), Covariance2(range_m, 0.0, range_m))
-        sensor = point if sensor is None else merge(sensor, point)
+        sensor = point if sensor is None else product_of(sensor, point)
     assert sensor is not None
     own = sensor.covariance.scaled(weight / (1.0 - weight))
-    expected = merge(Gaussian2(x, y, own), sensor)
+    expected = product_of(Gaussian2(x, y, own), sensor)
 
     robot = standing("weighted", PAIR, weights=Weights(position=weight))
     seen = Sightings(1, tuple(Sighting(name, r) for name, r in ranges.items()))

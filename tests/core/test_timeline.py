@@ -113,7 +113,7 @@ def test_in_order_a_timeline_does_what_the_localizer_does(variant: Variant) -> N
 
 
 @variants
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=8)
 @given(shuffler=st.randoms(use_true_random=False))
 def test_any_order_within_the_horizon_gives_the_same_bits(
     variant: Variant, shuffler: Random
@@ -246,7 +246,7 @@ told_at = st.builds(
 
 
 @variants
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(
     beliefs=st.lists(told_at, max_size=12, unique_by=repr),
     shuffler=st.randoms(use_true_random=False),

@@ -21,7 +21,7 @@ from core_helpers import (
     sensor_noise,
     state_at,
 )
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
@@ -231,7 +231,6 @@ def test_what_is_usual_never_quarantines(surprises: list[float]) -> None:
     assert court.quarantined == {}
 
 
-@settings(deadline=None)
 @given(
     st.lists(
         st.tuples(st.sampled_from(["own", "a", "b", "c"]), st.sampled_from([GOOD, 8.0, BAD])),

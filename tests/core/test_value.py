@@ -5,7 +5,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from core_helpers import Matrix, belief, diagonal, least_eigenvalue, matrix2
+from core_helpers import Matrix, belief, diagonal, least_eigenvalue, matrix2, product_of
 from hypothesis import assume, given
 from hypothesis import strategies as st
 from msgspec.structs import replace
@@ -13,7 +13,7 @@ from msgspec.structs import replace
 from cpcbl_team.collaboration import LOWEST_TIER, TIER_ZERO_SIGMA_M, next_tier
 from cpcbl_team.config import CollaborationSettings, Fusion
 from cpcbl_team.estimate import SMALLEST_VARIANCE, Covariance3, Estimate
-from cpcbl_team.gaussian import Covariance2, Gaussian2, merge, oriented
+from cpcbl_team.gaussian import Covariance2, Gaussian2, oriented
 from cpcbl_team.geometry import Pose2, step
 from cpcbl_team.inputs import Belief, Fix
 from cpcbl_team.value import (
@@ -65,7 +65,7 @@ def test_naive_merging_is_the_product(
     prior: Covariance2, fresh: Covariance2, dependent: Covariance2
 ) -> None:
     exact = Covariance2(-SMALLEST_VARIANCE, 0.0, -SMALLEST_VARIANCE)  # is called so, and raised
-    product = merge(Gaussian2(0.0, 0.0, prior), Gaussian2(0.0, 0.0, fresh + dependent))
+    product = product_of(Gaussian2(0.0, 0.0, prior), Gaussian2(0.0, 0.0, fresh + dependent))
     after = merged(prior + exact, fresh + exact, dependent, "naive")
     assert after == pytest.approx(product.covariance, rel=1e-6, abs=1e-9)
 
