@@ -16,6 +16,7 @@ from cpcbl_transport.messages import (
     LARGEST_FRAME,
     LARGEST_NUMBER,
     LARGEST_PAYLOAD,
+    LARGEST_PIECE,
     LONGEST_ODOMETRY_NS,
     VERSION,
     Body,
@@ -319,8 +320,25 @@ def test_odometry_of_the_longest_and_shortest_duration_is_taken() -> None:
         assert refusal(Odometry(NOW - duration_ns, NOW, 0.0, 0.0), NOW) is None
 
 
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_piece_of_odometry_that_is_farther_than_any_robot_moves_is_refused(sign: float) -> None:
+    for field in ("distance_m", "turn_rad"):
+        largest = msgspec.structs.replace(ODOMETRY, **{field: sign * LARGEST_PIECE})
+        larger = msgspec.structs.replace(ODOMETRY, **{field: sign * LARGEST_PIECE * 1.001})
+        assert refusal(largest, NOW) is None
+        assert refusal(larger, NOW) is Refusal.IMPLAUSIBLE
+
+
 @pytest.mark.parametrize(
-    "bad", [(-1.0, 0.0, 1.0), (1.0, 0.0, -1.0), (1.0, 2.0, 1.0), (1.0, -2.0, 1.0)]
+    "bad",
+    [
+        (-1.0, 0.0, 1.0),
+        (1.0, 0.0, -1.0),
+        (1.0, 2.0, 1.0),
+        (1.0, -2.0, 1.0),
+        (0.0, 0.0, 1.0),
+        (1.0, 0.0, 0.0),
+    ],
 )
 def test_what_is_no_covariance_is_refused(bad: tuple[float, float, float]) -> None:
     message = msgspec.structs.replace(POSITION, covariance=bad)

@@ -19,6 +19,7 @@ LONGEST_ODOMETRY_NS = 10_000_000_000
 LARGEST_PAYLOAD = 65_536
 LARGEST_FRAME = 1_048_576
 LARGEST_NUMBER = 1e6  # metres, radians, or their squares
+LARGEST_PIECE = 1e3  # of odometry (metres, radians): its square is a variance
 LARGEST_COUNT = 2**53  # sums of some still fit everywhere
 LAST_NS = 2**62  # in the year 2116
 
@@ -259,6 +260,8 @@ def refusal(message: Message, now_ns: int) -> Refusal | None:
         case Odometry():
             if not 0 < message.stamp_ns - message.from_ns <= LONGEST_ODOMETRY_NS:
                 return Refusal.DURATION
+            if max(abs(message.distance_m), abs(message.turn_rad)) > LARGEST_PIECE:
+                return Refusal.IMPLAUSIBLE
         case Position():
             if not _is_covariance(*message.covariance):
                 return Refusal.NOT_A_COVARIANCE
@@ -266,7 +269,8 @@ def refusal(message: Message, now_ns: int) -> Refusal | None:
 
 
 def _is_covariance(xx: float, xy: float, yy: float) -> bool:
-    return xx >= 0.0 and yy >= 0.0 and xy * xy <= xx * yy * (1.0 + 1e-6) + 1e-12
+    """Of a sensor: none is exact."""
+    return xx > 0.0 and yy > 0.0 and xy * xy <= xx * yy * (1.0 + 1e-6) + 1e-12
 
 
 def _numbers(message: Message) -> list[float]:
