@@ -38,6 +38,7 @@ log = logging.getLogger(__name__)
 
 STATUS_NS = 1_000_000_000
 INBOX = 10_000
+ON_ARRIVAL = ("frame_skipped", "inbox_overflow", "news_overflow", "same_name_twice")
 
 
 class Stepped(Protocol):
@@ -82,7 +83,8 @@ class Node:
         self._tokens = Tokens()
         self._listened, self._looked = "", False
         self._status_ns = start_ns
-        self.counts: Counter[str] = Counter()
+        # What threads of the bus count has its entry: to add one, another thread must not read
+        self.counts: Counter[str] = Counter(dict.fromkeys(ON_ARRIVAL, 0))
         self.heard = Tallies()
         self._clocks = Clocks(rules.trust, speed) if rules.trust.enabled else None
         self._inputs = [
@@ -105,6 +107,8 @@ class Node:
         self._on_arrival()
 
     def _seen_alive(self, key: str, alive: bool) -> None:
+        if len(self._news) == INBOX:
+            self.counts["news_overflow"] += 1
         self._news.append((key, alive))
         self._on_arrival()
 
@@ -125,9 +129,12 @@ class Node:
         return bool(self._inbox or self._news or self._frames)
 
     def step(self, now_ns: int) -> None:
-        """Takes in what has arrived, lets the robot work, sends what it says."""
+        """Takes in what has arrived, lets the robot work, sends what it says.
+
+        What arrives meanwhile is for the next step: under a flood there is always more.
+        """
         self._take_tokens(now_ns)
-        while self._inbox:
+        for _ in range(len(self._inbox)):
             self._take(*self._inbox.popleft(), now_ns)
         if self._frames:
             self._take(*self._frames.popleft(), now_ns)
@@ -150,7 +157,7 @@ class Node:
 
     def _take_tokens(self, now_ns: int) -> None:
         """What the bus knows of teammates: who is there, with which tier."""
-        while self._news:
+        for _ in range(len(self._news)):
             presence = self._tokens.changed(*self._news.popleft())
             if presence is None:
                 self.counts["bad_token"] += 1

@@ -330,7 +330,49 @@ def test_a_full_inbox_drops_the_oldest_and_counts_it() -> None:
     for _ in range(INBOX + 3):
         stand.put(FIX_KEY, b"")
     stand.step()
-    assert stand.nodes["me"].counts == {"inbox_overflow": 3, Refusal.EMPTY: INBOX}
+    assert +stand.nodes["me"].counts == {"inbox_overflow": 3, Refusal.EMPTY: INBOX}
+
+
+def test_news_of_teammates_that_do_not_fit_are_counted() -> None:
+    stand = only_me()
+    for _ in range(INBOX // 2 + 2):  # each comes and goes
+        stand.announce("mate", 2).close()
+    stand.step()
+    assert +stand.nodes["me"].counts == {"news_overflow": 4}
+
+
+def test_a_step_ends_although_more_and_more_arrives(monkeypatch: pytest.MonkeyPatch) -> None:
+    stand, answered = only_me(), 0
+    robot = stand.robots["me"]
+    handle = robot.handle
+
+    def answered_at_once(message: Any, now_ns: int) -> list[Message]:
+        nonlocal answered
+        if isinstance(message, Position) and answered < 100:
+            answered += 1
+            stand.put(IN_POSITION, POSITION)
+        return handle(message, now_ns)
+
+    monkeypatch.setattr(robot, "handle", answered_at_once)
+    stand.put(IN_POSITION, POSITION)
+    for steps in (1, 2):
+        stand.nodes["me"].step(stand.now_ns)
+        assert answered == steps
+
+
+def test_what_threads_of_the_bus_count_is_read_while_they_count() -> None:
+    """No entry is added under the reader, and what never happened is not reported."""
+    stand = only_me()
+    counts = stand.nodes["me"].counts
+    entries = set(counts)
+    for _ in range(INBOX + 1):
+        stand.put(IN_FRAME, b"")
+        stand.put(IN_POSITION, b"")
+        stand.announce("mate", 2).close()
+    stand.bus.announce(topics.ALIVE.at(tier=0, robot="me", incarnation="2"))
+    assert set(counts) == entries
+    assert min(+counts[name] for name in entries) > 0
+    assert 0 not in only_me().status("me").counts.values()
 
 
 # Status -----------------------------------------------------------------------------------------

@@ -35,6 +35,7 @@ TIMEOUT_S = 1  # of a camera that does not answer
 PATIENCE_S = 1.8  # for the thread at the end: a process that ends while OpenCV waits is aborted
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.25, 4.0
 EARLY = 0.8  # of the time between two frames: rates of cameras are not exact
+COUNTED = ("camera_lost", "camera_back", "frame_skipped")
 NOTHING: Pixels = np.empty((0, 0, 3), np.uint8)
 
 os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # what is wrong is said here, once
@@ -79,7 +80,7 @@ class LiveCamera:
         self._pause_ns, self._latest_ns = EARLY * 1e9 / rate_hz, -math.inf
         self._newest: deque[Picture] = deque(maxlen=1)
         self._lost = False
-        self.counts: Counter[str] = Counter()
+        self.counts: Counter[str] = Counter(dict.fromkeys(COUNTED, 0))  # the thread adds no entry
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="camera", daemon=True)
         self._thread.start()
