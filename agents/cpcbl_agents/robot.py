@@ -53,7 +53,11 @@ class Robot:
         self.sensing = SensingAgent(settings, source, marks, pilot, _eyes(name, team), camera)
         self.filter = FilterAgent(settings, team.map, teammates, start_ns)
         budget = Budget(
-            settings.collaboration.budget, start_ns, team.messages_per_s(name), renewed=restarted
+            settings.collaboration.budget,
+            start_ns,
+            team.messages_per_s(name),
+            renewed=restarted,
+            match_s=team.match.duration_s,
         )
         most = team.guests.most if team.guests.allowed else 0
         guests = Guests(marks | frozenset(team.robots), most)

@@ -15,6 +15,7 @@ from cpcbl_team.collaboration import LOWEST_TIER
 from cpcbl_team.config import (
     CollaborationSettings,
     LocalizerSettings,
+    MatchSettings,
     OdometrySettings,
     PositionSensor,
     SensorSettings,
@@ -54,6 +55,12 @@ def pieces(seconds: float, distance_m: float = 0.05, turn_rad: float = 0.02) -> 
 
 def fix(stamp_ns: int, x_m: float) -> Fix:
     return Fix("me", "mate", stamp_ns, x_m, 0.05, (0.01, 0.0, 0.01), (0.0004, 0.0, 0.0004))
+
+
+def test_a_robots_messages_of_a_match_are_its_share_and_no_more() -> None:
+    match = MatchSettings(messages=100, duration_s=60.0)
+    (spending,) = robot(replace(TEAM, match=match)).collaboration.budget.spending(3600 * SECOND)
+    assert spending.allowed == 50.0
 
 
 # Late and out of order --------------------------------------------------------------------------

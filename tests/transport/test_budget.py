@@ -203,6 +203,18 @@ def test_the_reserve_of_a_match_is_a_share_of_what_was_earned() -> None:
     assert len(granted(budget, [Wish(100 * SECOND, FIX, urgent=True)] * 200)) == 20
 
 
+@pytest.mark.parametrize("first_s", [300, 1200, 36_000])
+def test_a_match_has_no_more_messages_however_early_the_robot_is_switched_on(first_s: int) -> None:
+    """A quarter of 1,200 in 1,200 s is 300: one in 4 s."""
+    budget = Budget(BudgetSettings(urgent_share=0.0), 0, 300 / 1200, match_s=1200.0)
+    early = granted(budget, [Wish(first_s * SECOND, FIX)] * 1000)
+    assert len(early) == min(first_s, 1200) / 4
+    late = granted(budget, [Wish(100 * HOUR, FIX, urgent=True)] * 1000)
+    assert len(early) + len(late) == 300
+    (spending,) = budget.spending(100 * HOUR)
+    assert (spending.most, spending.allowed) == (300.0, 300.0)
+
+
 # The price --------------------------------------------------------------------------------------
 
 LIMITED = [

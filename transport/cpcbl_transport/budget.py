@@ -46,15 +46,18 @@ class Window:
 
 
 class Savings:
-    """What is earned evenly from the start on and never comes back, as a match's messages."""
+    """What is earned evenly over a match from the start on and never comes back: its messages."""
 
-    def __init__(self, start_ns: int, rate_hz: float, urgent_share: float) -> None:
+    def __init__(
+        self, start_ns: int, rate_hz: float, urgent_share: float, match_s: float = math.inf
+    ) -> None:
         self.pace_s = 1.0 / rate_hz if rate_hz else math.inf
         self._start_ns, self._rate_hz, self._urgent_share = start_ns, rate_hz, urgent_share
+        self._match_s = match_s
         self._spent = 0.0
 
     def room(self, now_ns: int, urgent: bool) -> float:
-        earned = self._rate_hz * (now_ns - self._start_ns) * 1e-9
+        earned = self._rate_hz * min((now_ns - self._start_ns) * 1e-9, self._match_s)
         return earned * (1.0 if urgent else 1.0 - self._urgent_share) - self._spent
 
     def spend(self, now_ns: int, amount: float) -> None:
@@ -72,8 +75,9 @@ class _Cost(NamedTuple):
 class Budget:
     """One robot's budget. Times are the robot's, sizes are bytes on the wire.
 
-    `match_rate_hz`: at which it earns messages of the match; None without such a limit. `renewed`:
-    of a process that was restarted and cannot know what was spent before: it starts with nothing.
+    `match_rate_hz`: at which it earns messages of the match, for `match_s`; None without such a
+    limit. `renewed`: of a process that was restarted and cannot know what was spent before: it
+    starts with nothing.
     """
 
     def __init__(
@@ -82,6 +86,7 @@ class Budget:
         start_ns: int,
         match_rate_hz: float | None = None,
         renewed: bool = False,
+        match_s: float = math.inf,
     ) -> None:
         s = settings
         self._price, self._price_ns = 0.0, start_ns
@@ -94,7 +99,7 @@ class Budget:
             window_s = 60.0 * most / s.messages_per_minute
             self._messages = Window("messages", most, window_s, math.floor(s.urgent_share * most))
         if match_rate_hz is not None:
-            self._match = Savings(start_ns, match_rate_hz, s.urgent_share)
+            self._match = Savings(start_ns, match_rate_hz, s.urgent_share, match_s)
         for window in (self._bytes, self._messages):
             if renewed and window is not None:
                 window.spend(start_ns, window.capacity)
