@@ -17,6 +17,7 @@ from cpcbl_launch.containers.compose import Deployment, Mount, compose_text
 from cpcbl_launch.containers.deployment import deployed
 from cpcbl_launch.containers.docker import DockerError, compose_program, done, ran
 from cpcbl_launch.containers.fleet import Container, parsed, restarts_between
+from cpcbl_launch.containers.guest import observe
 from cpcbl_launch.containers.image import SOURCES, progress_of, tag, version
 from cpcbl_launch.containers.launch import inside, published
 from cpcbl_launch.processes import PROGRAM
@@ -329,3 +330,22 @@ def test_a_command_is_ended_when_the_user_wants_to_stop() -> None:
         ran(["sleep", "60"], stop=lambda: True)
     with pytest.raises(DockerError, match="no end of sleep 60"):
         ran(["sleep", "60"], timeout_s=0.1)
+
+
+SLOW_TO_START = """
+cd "$(dirname "$0")"
+case $1 in
+  info) uname -r ;;
+  run) while [ ! -e ended ]; do sleep 0.05; done; exit 7 ;;
+  stop) echo stop >> asked; [ "$(wc -l < asked)" -lt 3 ] || touch ended ;;
+esac
+"""
+
+
+def test_a_container_is_stopped_again_until_it_is_there_to_be_stopped(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("PATH", str(tmp_path), prepend=os.pathsep)
+    program(tmp_path, "docker", SLOW_TO_START)
+    assert observe("tripod", DEMO, [], None, "image", stop=lambda: True) == 7
+    assert (tmp_path / "asked").read_text().split() == ["stop"] * 3

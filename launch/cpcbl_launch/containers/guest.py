@@ -5,6 +5,7 @@ import subprocess
 import tempfile
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
 
 from cpcbl_launch.containers.compose import Mount
@@ -51,10 +52,16 @@ def observe(
             while process.poll() is None and not stop():
                 time.sleep(POLL_S)
         finally:
-            if process.poll() is None:
-                ran(["docker", "stop", "--time", "3", container])
-            code = process.wait()
-        return code
+            _ended(process, container)
+        return process.returncode
+
+
+def _ended(process: "subprocess.Popen[bytes]", container: str) -> None:
+    """Stops the container until it ends: what is not there yet cannot be stopped."""
+    while process.poll() is None:
+        ran(["docker", "stop", "--time", "3", container])
+        with suppress(subprocess.TimeoutExpired):
+            process.wait(POLL_S)
 
 
 def docker_run(
