@@ -10,6 +10,8 @@ class Clock(NamedTuple):
     epoch_ns: int
     from_ns: int
     speed: float
+    unix: bool = False
+    """Whether it is the machine's own time, which may be set."""
 
     def now_ns(self) -> int:
         elapsed = max(0, time.monotonic_ns() - self.from_ns)
@@ -19,6 +21,15 @@ class Clock(NamedTuple):
         """Real seconds until robot time reaches a stamp; 0 if it has."""
         ahead = (stamp_ns - self.epoch_ns) / self.speed
         return max(0.0, (self.from_ns + ahead - time.monotonic_ns()) * 1e-9)
+
+    def set_by_s(self) -> float:
+        """By how much the machine's time was set since, or ran on while the machine slept.
+
+        0 of a clock that has nothing to do with it.
+        """
+        before, machine_ns, after = self.now_ns(), time.time_ns(), self.now_ns()
+        between = min(max(before, machine_ns), after)  # it may have taken long to ask
+        return (machine_ns - between) * 1e-9 if self.unix else 0.0
 
     def __str__(self) -> str:
         return f"{self.epoch_ns}:{self.from_ns}:{self.speed}"
@@ -32,4 +43,4 @@ class Clock(NamedTuple):
     @staticmethod
     def wall() -> "Clock":
         """Unix time at its own speed."""
-        return Clock(time.time_ns(), time.monotonic_ns(), 1.0)
+        return Clock(time.time_ns(), time.monotonic_ns(), 1.0, unix=True)

@@ -1,7 +1,8 @@
-"""One robot as one process: the loop around a node, ended by SIGINT or SIGTERM."""
+"""One robot as one process: the loop around a node, ended by SIGINT, SIGTERM or SIGHUP."""
 
 import logging
 import os
+import secrets
 import signal
 import threading
 import time
@@ -25,17 +26,20 @@ log = logging.getLogger(__name__)
 
 LONGEST_WAIT_S = 0.2
 LATE_NS = 1_000_000_000
+SET_S = 0.25  # a clock that is set by more makes inputs late, or from the future
 BUSY_NS = 1_000_000  # after a step: what comes sooner may have queued behind it
 
 
 class Stop:
-    """Set by SIGINT and SIGTERM, and when the process that started this one is gone."""
+    """Set by SIGINT, SIGTERM and SIGHUP (a closed terminal, unless it is ignored: nohup), and when
+    the process that started this one is gone."""
 
     def __init__(self, parent: int | None = None) -> None:
         self._event = threading.Event()
         self._parent = parent
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, self._on_signal)
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:
+                signal.signal(number, self._on_signal)
 
     def _on_signal(self, number: int, frame: FrameType | None) -> None:
         self._event.set()
@@ -117,7 +121,8 @@ def run_robot(
     `through` is what stands between the robot and its bus.
 
     Raises BusError when stopped before a router answered, LogError for an unreadable log,
-    SecurityError without the keys of a secured team, ValueError for a camera that cannot be used.
+    SecurityError without the keys of a secured team, ValueError for a camera that cannot be used,
+    or when this machine's clock was set.
     """
     loop = Loop(clock)
     link = link_of(team, Identity(Role.ROBOT, name), connect)
@@ -125,15 +130,51 @@ def run_robot(
         own_camera(name, team, clock, loop.wake) as camera,
         open_bus(team.name, link.endpoints, stop, link.credentials) as bus,
     ):
-        start_ns = clock.now_ns()
-        late_s = (start_ns - clock.epoch_ns) * 1e-9 / clock.speed
-        if restarted or start_ns > clock.epoch_ns + LATE_NS * max(1.0, clock.speed):
-            log.warning("robot %s starts %.1f s after the team: it looks where it is", name, late_s)
-            team = _not_knowing_its_start(name, team)
-        incarnation = f"{os.getpid():x}"
-        robot = Robot(name, team, start_ns, restarted, camera)
+        robot = begun(name, team, clock, restarted, camera)
+        start_ns, incarnation = clock.now_ns(), new_incarnation()
         node = Node(robot, team, through(bus), start_ns, incarnation, loop.arrived, clock.speed)
-        loop.run(node, stop)
+        loop.run(node, while_time_holds(name, team, clock, stop))
+
+
+def begun(
+    name: str, team: Team, clock: Clock, restarted: bool = False, camera: OwnCamera | None = None
+) -> Robot:
+    """The robot as it starts now. After a restart it does not know where it is, nor what it spent.
+
+    Docker starts a robot again without a word: then it is late.
+    """
+    start_ns = clock.now_ns()
+    late_s = (start_ns - clock.epoch_ns) * 1e-9 / clock.speed
+    late = start_ns > clock.epoch_ns + LATE_NS * max(1.0, clock.speed)
+    if restarted or late:
+        log.warning("robot %s starts %.1f s after the team: it looks where it is", name, late_s)
+        team = _not_knowing_its_start(name, team)
+    spent = restarted or (late and not clock.unix)  # by its own time it waited for its router
+    return Robot(name, team, start_ns, spent, camera)
+
+
+def new_incarnation() -> str:
+    """What tells this process from any before: in containers, process ids repeat."""
+    return secrets.token_hex(4)
+
+
+def while_time_holds(
+    name: str, team: Team, clock: Clock, stop: Callable[[], bool]
+) -> Callable[[], bool]:
+    """`stop`, which raises ValueError when the machine's time was set under a robot with real
+    inputs: their stamps are of another time from then on."""
+    if team.robots[name].source != "external":
+        return stop
+
+    def checked() -> bool:
+        if abs(by_s := clock.set_by_s()) > SET_S:
+            raise ValueError(
+                f"robot {name}: this machine's clock was set by {by_s:+.2f} s, or it slept: start"
+                " the robot again"
+            )
+        return stop()
+
+    return checked
 
 
 @contextmanager

@@ -1,7 +1,6 @@
 """`cpcbl-team observer`: a robot that joins a running team for a while, with a better sensor."""
 
 import math
-import os
 import re
 import time
 from collections.abc import Callable, Sequence
@@ -12,7 +11,7 @@ from typing import Any, NamedTuple
 import msgspec
 
 from cpcbl_agents.clock import Clock
-from cpcbl_agents.process import Loop, own_camera
+from cpcbl_agents.process import Loop, new_incarnation, own_camera, while_time_holds
 from cpcbl_agents.visit import Visit, body_of
 from cpcbl_launch.reporting.flows import FlowReport, summed_flows
 from cpcbl_launch.simulation.bodies import unfit
@@ -168,8 +167,8 @@ def visit(
 ) -> Visited:
     """Runs an observer that `team` holds until `stop()`, or for so many seconds of robot time.
 
-    Raises BusError when stopped before a router answered, ValueError for a name that is taken,
-    SecurityError without the keys of a secured team.
+    Raises BusError when stopped before a router answered, ValueError for a name that is taken, or
+    when this machine's clock was set, SecurityError without the keys of a secured team.
     """
     loop = Loop(clock)
     link = link_of(team, Identity(Role.OBSERVER, name), connect)
@@ -179,9 +178,10 @@ def visit(
     ):
         _look_for_namesakes(name, bus, stop)
         start_ns = clock.now_ns()
-        incarnation = f"{os.getpid():x}"
+        incarnation = new_incarnation()
         node = Visit(name, team, bus, start_ns, incarnation, loop.arrived, clock.speed, camera)
-        loop.run(node, lambda: stop() or clock.now_ns() - start_ns >= duration_s * 1e9)
+        over = while_time_holds(name, team, clock, stop)
+        loop.run(node, lambda: over() or clock.now_ns() - start_ns >= duration_s * 1e9)
         end_ns = clock.now_ns()
         node.leave(end_ns)
     return _visited(node, team, (end_ns - start_ns) * 1e-9)

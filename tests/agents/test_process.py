@@ -1,15 +1,19 @@
 """The loop around a node: who steps it, and when."""
 
+import re
+import signal
 import threading
+import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 
 import pytest
-from bus_helpers import wait_until
+from bus_helpers import robot_at, team_of, wait_until, with_robot
 
 from cpcbl_agents import process
 from cpcbl_agents.clock import Clock
-from cpcbl_agents.process import Loop
+from cpcbl_agents.process import Loop, Stop, begun, new_incarnation, while_time_holds
+from cpcbl_team.config import BudgetSettings
 
 
 class Counting:
@@ -161,3 +165,78 @@ def test_nothing_is_stepped_before_it_runs_or_after() -> None:
     steps = len(on.node.threads)
     assert not on.arrives_here()
     assert len(on.node.threads) == steps
+
+
+# When it starts, and when its time is another ----------------------------------------------------
+
+LIMITED = team_of(me=robot_at(budget=BudgetSettings(messages_per_minute=6.0)))
+
+
+def since(seconds: float, unix: bool = False) -> Clock:
+    """The clock of a team that runs since then."""
+    return Clock(0, time.monotonic_ns() - round(seconds * 1e9), 1.0, unix)
+
+
+@pytest.mark.parametrize(
+    ("clock", "restarted", "knows_its_place", "may_send"),
+    [
+        (since(-60.0), False, True, True),
+        (since(-60.0), True, False, False),
+        (since(60.0), False, False, False),
+        (since(60.0, unix=True), False, False, True),
+    ],
+    ids=["with the team", "restarted by up", "restarted by Docker", "waited for its router"],
+)
+def test_a_robot_that_may_have_run_before_knows_neither_its_place_nor_what_it_spent(
+    clock: Clock, restarted: bool, knows_its_place: bool, may_send: bool
+) -> None:
+    robot = begun("me", LIMITED, clock, restarted)
+    assert (not robot.filter.timeline.state.memory.lost) is knows_its_place
+    now_ns = clock.now_ns()
+    assert robot.collaboration.budget.admits(now_ns, 42, urgent=True) is may_send
+
+
+def test_processes_are_told_apart_in_containers_too() -> None:
+    assert len({new_incarnation() for _ in range(100)}) == 100
+
+
+@pytest.mark.parametrize("by_s", [3600.0, 0.5, -0.5, -3600.0])
+def test_a_robot_ends_when_the_clock_of_its_machine_is_set(by_s: float) -> None:
+    """As if it had been set since the robot started: the robot's time goes on as it was."""
+    wall = Clock.wall()
+    clock = wall._replace(epoch_ns=wall.epoch_ns - round(by_s * 1e9))
+    steps = iter([False] * 10 + [True])
+    with pytest.raises(ValueError, match=re.escape(f"clock was set by {by_s:+.2f} s")):
+        Loop(clock).run(Counting(), while_time_holds("me", LIMITED, clock, steps.__next__))
+
+
+def test_a_robot_goes_on_while_its_clock_holds_or_is_none_of_the_machine() -> None:
+    simulated = with_robot(LIMITED, "me", source="simulated")
+    elsewhere = Clock.wall()._replace(epoch_ns=0)
+    for team, clock in (
+        (LIMITED, Clock.wall()),
+        (LIMITED, elsewhere._replace(unix=False)),
+        (simulated, elsewhere),
+    ):
+        steps = iter([False] * 10 + [True])
+        node, loop = Counting(), Loop(clock)
+        node.during = loop.wake
+        loop.run(node, while_time_holds("me", team, clock, steps.__next__))
+        assert len(node.threads) == 10
+
+
+def test_a_closed_terminal_ends_a_process_unless_nohup_says_otherwise() -> None:
+    numbers = signal.SIGINT, signal.SIGTERM, signal.SIGHUP
+    before = {number: signal.getsignal(number) for number in numbers}
+    try:
+        signal.signal(signal.SIGHUP, signal.SIG_IGN)
+        stop = Stop()
+        signal.raise_signal(signal.SIGHUP)
+        assert not stop()
+        signal.signal(signal.SIGHUP, signal.SIG_DFL)
+        stop = Stop()
+        signal.raise_signal(signal.SIGHUP)
+        assert stop()
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

@@ -333,7 +333,7 @@ def test_an_observer_joins_a_running_team_and_leaves_it(
     def leaves(recorder: Recorder) -> bool:
         (process,) = team3.observers
         process.send_signal(number)
-        gone.append(process.wait(timeout=2.0 if number is not signal.SIGKILL else PATIENCE_S))
+        gone.append(process.wait(timeout=PATIENCE_S))
         return True
 
     report = team3.run(

@@ -68,6 +68,7 @@ def run(script: Script, team: Team, folder: Path, limit_s: float = 60.0) -> Repo
 def test_kills_one_of_four_robot_processes_and_it_localizes_again(tmp_path: Path) -> None:
     killed: dict[str, int] = {}
     seen: dict[str, int] = {}
+    incarnations: dict[str, str] = {}
 
     def all_run(recorder: Recorder, supervisor: Processes) -> bool:
         return recorder.tracks.keys() == set(ROBOTS) and all(
@@ -75,7 +76,10 @@ def test_kills_one_of_four_robot_processes_and_it_localizes_again(tmp_path: Path
         )
 
     def kill_navigator(recorder: Recorder, supervisor: Processes) -> bool:
+        if recorder.latest()[1].keys() != set(ROBOTS):
+            return False
         seen.update(supervisor.pids)
+        incarnations.update({n: s.incarnation for n, s in recorder.latest()[1].items()})
         for name in ROBOTS:
             assert f"robot {name}" in command_of(supervisor.pids[f"robot-{name}"])
         assert len(set(seen.values())) == len(ROBOTS) + 1
@@ -91,7 +95,7 @@ def test_kills_one_of_four_robot_processes_and_it_localizes_again(tmp_path: Path
         new_pid = supervisor.pids.get("robot-navigator")
         if new_pid in (None, seen["robot-navigator"]):
             return False
-        if statuses["navigator"].incarnation != f"{new_pid:x}":
+        if statuses["navigator"].incarnation == incarnations["navigator"]:
             return False
         track, truth = tracks["navigator"], truths["navigator"]
         error = ((track.x_m - truth.x_m) ** 2 + (track.y_m - truth.y_m) ** 2) ** 0.5
@@ -145,8 +149,8 @@ def lone_robot(tmp_path: Path) -> tuple[list[str], str, Team]:
     return command, endpoint, team
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_ends_a_robot_within_two_seconds(
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_ends_a_robot_soon(
     lone_robot: tuple[list[str], str, Team], number: signal.Signals
 ) -> None:
     command, endpoint, team = lone_robot
@@ -156,7 +160,7 @@ def test_a_signal_ends_a_robot_within_two_seconds(
         with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
             assert eventually(lambda: any(alive.values())), process.stderr
             process.send_signal(number)
-            assert process.wait(timeout=2.0) == 0
+            assert process.wait(timeout=5.0) == 0
         assert eventually(lambda: not any(alive.values()))
 
 
@@ -168,7 +172,7 @@ def test_a_robot_waiting_for_its_router_can_be_stopped(
         assert process.stderr is not None
         assert "no router" in process.stderr.readline()
         process.send_signal(signal.SIGINT)
-        assert process.wait(timeout=2.0) == 2
+        assert process.wait(timeout=5.0) == 2
         assert endpoint in process.stderr.read().splitlines()[-1]
 
 

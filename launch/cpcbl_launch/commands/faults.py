@@ -47,7 +47,9 @@ def chaos(
     todo = chosen(scenarios)
     logging.getLogger("cpcbl_launch").setLevel(logging.ERROR)  # restarts are part of it
     logging.getLogger("cpcbl_transport").setLevel(logging.ERROR)
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # ends what it has started
+    for number in (signal.SIGTERM, signal.SIGHUP):  # each ends what it has started
+        if signal.getsignal(number) != signal.SIG_IGN:
+            signal.signal(number, signal.default_int_handler)
     progress = Console(stderr=True)
     with show.Progress(progress, len(todo)) as shown:
         setting = Setting(seed, soak_s, shown.doing)

@@ -165,7 +165,7 @@ def robot(
     ] = False,
     lie: Annotated[str, typer.Option(hidden=True)] = "",
 ) -> None:
-    """Run one robot, on any machine, until SIGINT or SIGTERM."""
+    """Run one robot, on any machine, until SIGINT, SIGTERM or SIGHUP."""
     from cpcbl_agents.clock import Clock
     from cpcbl_agents.process import Stop, run_robot
     from cpcbl_launch.options import must_see
@@ -194,7 +194,7 @@ def field(
     clock: ClockText = "",
     parent: Parent = None,
 ) -> None:
-    """Run the simulated field until SIGINT or SIGTERM."""
+    """Run the simulated field until SIGINT, SIGTERM or SIGHUP."""
     from contextlib import ExitStack
 
     from cpcbl_agents.clock import Clock
@@ -242,7 +242,7 @@ def router(
         bool, typer.Option(help="Print the configuration, for zenohd or --config.")
     ] = False,
 ) -> None:
-    """Run the team's Zenoh router, on any machine, until SIGINT or SIGTERM."""
+    """Run the team's Zenoh router, on any machine, until SIGINT, SIGTERM or SIGHUP."""
     from cpcbl_agents.process import Stop
     from cpcbl_launch.router import run_router, team_router, written_config
     from cpcbl_transport.zenoh_bus import read_router_config
