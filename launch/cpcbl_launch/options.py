@@ -11,6 +11,7 @@ import msgspec
 
 from cpcbl_team.config import Team
 
+LEAST_SPEED, MOST_SPEED = 0.05, 1000.0
 PICTURES = (".png", ".svg")
 
 
@@ -57,6 +58,12 @@ def check_duration(duration_s: float, least_s: float) -> None:
     """Raises ValueError for seconds of robot time that are too few, or no number."""
     if not least_s <= duration_s < math.inf:
         raise ValueError(f"--duration {duration_s:g}: at least {least_s:g} seconds of robot time")
+
+
+def check_speed(speed: float) -> None:
+    """Raises ValueError for a pace at which no process could run, or that is no number."""
+    if not LEAST_SPEED <= speed <= MOST_SPEED:
+        raise ValueError(f"--speed {speed:g}: from {LEAST_SPEED:g} to {MOST_SPEED:g} x real time")
 
 
 def check_limit(option: str, limit: float) -> None:

@@ -232,13 +232,16 @@ def problems(team: Team) -> Iterator[str]:
         yield "transport.connect: is empty; name an endpoint such as tcp/192.168.1.10:7447"
     for key in ("listen", "connect"):
         for endpoint in getattr(team.transport, key):
-            if not re.fullmatch(r"(tcp|tls|quic|udp|ws)/.+:\d{1,5}", endpoint):
-                yield (
-                    f"transport.{key}: {endpoint!r} is no endpoint;"
-                    " write it as tcp/192.168.1.10:7447"
-                )
-            elif reason := _insecure(endpoint, team.transport.secured):
+            reason = not_an_endpoint(endpoint) or _insecure(endpoint, team.transport.secured)
+            if reason:
                 yield f"transport.{key}: {endpoint!r}: {reason}"
+
+
+def not_an_endpoint(text: str) -> str:
+    """Why Zenoh cannot listen or connect there; empty if it can."""
+    if re.fullmatch(r"(tcp|tls|quic|udp|ws)/.+:\d{1,5}", text):
+        return ""
+    return "no endpoint; write it as tcp/192.168.1.10:7447"
 
 
 def _vision_problems(team: Team) -> Iterator[str]:
@@ -367,10 +370,12 @@ def _explained(error: str, kind: type[Any], prefix: str) -> str:
 
 def _fields_at(kind: Any, path: str) -> list[str]:
     """The keys that a table at `path` knows."""
-    for part in filter(None, path.split(".")):
-        kind = get_type_hints(kind)[part.partition("[")[0]]
+    for part in filter(None, re.sub(r"\[[^]]*\]", "", path).split(".")):
+        kind = get_type_hints(kind)[part]
         if type(None) in get_args(kind) or get_origin(kind) is tuple:
             kind = get_args(kind)[0]
+        elif get_origin(kind) is dict:
+            kind = get_args(kind)[1]
     return sorted(kind.__struct_fields__)
 
 

@@ -93,6 +93,13 @@ def test_check_names_file_key_and_fix_in_one_line(tmp_path: Path) -> None:
         (["robot", "nobody", "--team", "demo"], "nobody: not in the file"),
         (["up", "--picture", "run.xyz"], "--picture run.xyz: not a picture"),
         (["calibrate", "nowhere", "--picture", "run.xyz"], "--picture run.xyz: not a picture"),
+        (["up", "--robots", "scout,nobody"], "nobody; there are navigator, observer, scout"),
+        (["up", "--robots", ","], "it names none; there are"),
+        *((["up", "--duration", s], f"--duration {s}: at least 1") for s in ("inf", "nan", "-1")),
+        *((["up", "--speed", s], f"--speed {s}: from 0.05 to") for s in ("inf", "nan", "0")),
+        (["robot", "scout", "--team", "demo", "--connect", "base:7447"], "--connect base:7447: no"),
+        (["router", "demo", "--listen", "7447"], "--listen 7447: no endpoint; write it as tcp/"),
+        (["field", "--team", "demo", "--site", "base=scout"], "--site base=scout: no endpoint"),
     ],
 )
 def test_what_the_user_can_mend_is_one_line(arguments: list[str], said: str) -> None:

@@ -197,6 +197,18 @@ WRONG = [
         "'to_m'",
     ),
     Wrong("unknown in transport", "[transport]\nlisten_at = []", "transport.listen_at", "listen"),
+    Wrong(
+        "unknown in a colour",
+        "[vision.colours.orange]\nhues = [1, 2]",
+        "vision.colours[...].hues",
+        "'hue'",
+    ),
+    Wrong(
+        "unknown in an event",
+        "[[simulation.events]]\nat = 1.0",
+        "simulation.events[0].at",
+        "'at_s'",
+    ),
     Wrong("unknown in simulation", "[simulation]\nnois = 1", "simulation.nois", "'noise'"),
     # types and ranges
     Wrong("text for a number", "[simulation]\nnoise = 'x'", "simulation.noise", "float"),

@@ -8,6 +8,17 @@ import typer
 if TYPE_CHECKING:
     from cpcbl_team.config import Team
 
+
+def endpoints(option: typer.CallbackParam, given: list[str] | None) -> list[str] | None:
+    """Raises ValueError for what Zenoh would try again and again, and never say why."""
+    from cpcbl_launch.team_file import not_an_endpoint
+
+    for endpoint in given or ():
+        if reason := not_an_endpoint(endpoint):
+            raise ValueError(f"--{option.name} {endpoint}: {reason}")
+    return given
+
+
 TeamFile = Annotated[Path, typer.Option("--team", help="Team file (TOML).")]
 TeamArgument = Annotated[
     Optional[Path], typer.Argument(help="Team file, or a built-in one: demo (default).")
@@ -42,7 +53,10 @@ BaseImage = Annotated[
 AsJson = Annotated[bool, typer.Option("--json", help="Print the report as JSON.")]
 Connect = Annotated[
     Optional[list[str]],
-    typer.Option(help="Endpoint of the router, e.g. tcp/192.168.1.10:7447; default: the file's."),
+    typer.Option(
+        callback=endpoints,
+        help="Endpoint of the router, e.g. tcp/192.168.1.10:7447; default: the file's.",
+    ),
 ]
 ClockText = Annotated[str, typer.Option("--clock", hidden=True)]
 Parent = Annotated[Optional[int], typer.Option(hidden=True)]
@@ -73,6 +87,18 @@ def say_not_written(lost: dict[str, str]) -> None:
         typer.secho(f"cpcbl-team: {name}: not written: {reason}", fg="red", err=True)
     if lost:
         raise typer.Exit(1)
+
+
+def known_robots(option: str, text: str, team: "Team") -> list[str]:
+    """The robots of a list with commas. Raises ValueError for one that the team does not have."""
+    names = names_in(text)
+    unknown = [name for name in names if name not in team.robots]
+    if unknown or not names:
+        who = ", ".join(unknown) or "it names none"
+        raise ValueError(
+            f"{option} {text}: no such robot: {who}; there are {', '.join(team.robots)}"
+        )
+    return names
 
 
 def names_in(text: str) -> list[str]:

@@ -58,7 +58,7 @@ def observer(
     clock: ClockText = "",
     parent: Parent = None,
 ) -> None:
-    """Join a running team, from any machine, with a better sensor; leave on SIGINT, SIGTERM, SIGHUP.
+    """Join a running team, from any machine, with a better sensor; leave when it is stopped.
 
     The team file need not name it. Robots that it sees know better where they
     are within a second. On a simulated field it gets a body at once.

@@ -23,6 +23,8 @@ from cpcbl_launch.commands.arguments import (
     Parent,
     ReportFile,
     TeamFile,
+    endpoints,
+    known_robots,
     load,
     names_in,
     say_not_written,
@@ -51,7 +53,7 @@ def up(
         Optional[float],
         typer.Option(help="Seconds of robot time; default: 30 simulated, or the whole log."),
     ] = None,
-    speed: Annotated[float, typer.Option(min=0.05, help="Times real time.")] = 1.0,
+    speed: Annotated[float, typer.Option(help="Times real time, from 0.05 on.")] = 1.0,
     seed: Annotated[int, typer.Option(help="Of the simulated noise.")] = 1,
     data: Annotated[
         Optional[Path], typer.Option(help="Folder of an MRCLAM log, for source mrclam.")
@@ -88,9 +90,18 @@ def up(
     from cpcbl_agents.process import Stop
     from cpcbl_launch import logs as real_logs
     from cpcbl_launch.evaluation import Choice, chosen
-    from cpcbl_launch.options import encoded, file_for, folder_for, must_draw, must_see
+    from cpcbl_launch.options import (
+        check_duration,
+        check_speed,
+        encoded,
+        file_for,
+        folder_for,
+        must_draw,
+        must_see,
+    )
     from cpcbl_launch.show import LiveTable, print_report
     from cpcbl_launch.up import (
+        LEAST_S,
         SIMULATED_S,
         Launch,
         OnThisMachine,
@@ -100,6 +111,9 @@ def up(
         run_team,
     )
 
+    check_speed(speed)
+    if duration is not None:
+        check_duration(duration, LEAST_S)
     typed = file or Path("demo")
     if file == Path("mrclam") and data is not None and not file.exists():
         file = real_logs.builtin_for(data)
@@ -132,7 +146,7 @@ def up(
         run = run._replace(duration_s=SIMULATED_S)
     run = run._replace(team=real_logs.blinded(run.team, names_in(blind)))
     if robots:
-        run = run._replace(here=names_in(robots))
+        run = run._replace(here=known_robots("--robots", robots, run.team))
     console = Console(stderr=as_json)
     launch: Launch = OnThisMachine
     if not containers:
@@ -228,10 +242,14 @@ def router(
     file: Annotated[Optional[Path], typer.Argument(help="Team file.")] = None,
     listen: Annotated[
         Optional[list[str]],
-        typer.Option(help="Endpoint to listen at; default: the file's, else tcp/127.0.0.1:7447."),
+        typer.Option(
+            callback=endpoints,
+            help="Endpoint to listen at; default: the file's, else tcp/127.0.0.1:7447.",
+        ),
     ] = None,
     connect: Annotated[
-        Optional[list[str]], typer.Option(help="Endpoint of another site's router to join.")
+        Optional[list[str]],
+        typer.Option(callback=endpoints, help="Endpoint of another site's router to join."),
     ] = None,
     config: Annotated[
         Optional[Path], typer.Option(help="No FILE: a configuration of Zenoh (JSON5).")

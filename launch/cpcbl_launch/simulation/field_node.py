@@ -18,6 +18,7 @@ from cpcbl_agents.clock import Clock
 from cpcbl_agents.sensing import SensorInput
 from cpcbl_launch.simulation.bodies import Bodies
 from cpcbl_launch.simulation.field import SimulatedField
+from cpcbl_launch.team_file import not_an_endpoint
 from cpcbl_team.config import Team
 from cpcbl_team.inputs import Odometry
 from cpcbl_transport import topics
@@ -159,6 +160,8 @@ def robots_at(sites: Iterable[str], team: Team) -> dict[str, list[str]]:
     found = {}
     for text in sites:
         endpoint, _, names = text.partition("=")
+        if reason := not_an_endpoint(endpoint):
+            raise ValueError(f"--site {text}: {reason}")
         found[endpoint] = [name.strip() for name in names.split(",")]
         for name in found[endpoint]:
             if name not in team.robots:
