@@ -169,7 +169,7 @@ def hidden(team: Team, robots: Sequence[str], seed: int, blind_s: float) -> None
         assert sigma_m[dark][-1] > 2.0 * sigma_m[dark][0]
         after_m = position_errors(samples)[at_s >= AT_S + blind_s + 10.0]
         assert after_m.max() < 0.5
-        assert not any(t.lost for t in recorder.tracks[robot][-20:])
+        assert not any(t.lost for t in list(recorder.tracks[robot])[-20:])
 
 
 def test_sigma_grows_honestly_while_all_landmarks_are_hidden() -> None:

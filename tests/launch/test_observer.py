@@ -235,7 +235,7 @@ def test_a_team_that_lets_no_guest_in_does_as_if_there_were_none() -> None:
     with_guest = simulate(closed, 1, 10.0, visitors=[guest])[1]
     without = simulate(closed, 1, 10.0)[1]
     for name in closed.robots:
-        assert with_guest.tracks[name] == without.tracks[name]
+        assert list(with_guest.tracks[name]) == list(without.tracks[name])
 
 
 # Real processes ---------------------------------------------------------------------------------

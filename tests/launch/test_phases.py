@@ -2,6 +2,7 @@
 
 import io
 import math
+import tracemalloc
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -169,3 +170,15 @@ def test_the_live_table_shows_who_is_a_guest_and_who_has_left() -> None:
         ("a-guest", "guest", "ok"),
         ("another", "guest", "left"),
     ]
+
+
+def test_a_recorder_takes_little_room_for_what_it_hears_over_days() -> None:
+    said = Said()
+    said.tracks("r1", 0.0, 0.1)
+    tracemalloc.start()
+    said.tracks("r1", 0.1, 100.0)
+    taken, _ = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    tracks = list(said.recorder.tracks["r1"])
+    assert [track.stamp_ns for track in tracks] == [n * SECOND // 10 for n in range(1000)]
+    assert taken < 250 * len(tracks)

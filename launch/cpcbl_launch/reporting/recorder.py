@@ -15,6 +15,7 @@ from cpcbl_launch.reporting.flows import (
     summed_flows,
     summed_spending,
 )
+from cpcbl_launch.reporting.kept import Kept
 from cpcbl_launch.reporting.standing import TrustReport, trust_of
 from cpcbl_team.metrics import Floats, Samples, Score, Trajectory, compared, score, seconds
 from cpcbl_transport import topics
@@ -137,9 +138,9 @@ class Recorder:
 
     def __init__(self, bus: Bus) -> None:
         self._lock = threading.Lock()
-        self.tracks: dict[str, list[Track]] = {}
+        self.tracks: dict[str, Kept[Track]] = {}
         self.status: dict[str, Status] = {}
-        self.truths: list[Truths] = []
+        self.truths: Kept[Truths] = Kept()
         self.counts: Counter[str] = Counter()
         """What was taken, by topic, and what was refused, by reason."""
         self._done: dict[str, list[Status]] = {}
@@ -153,14 +154,14 @@ class Recorder:
             self.counts[key.partition("/")[0] if taken else str(message)] += 1
             match message:
                 case Track():
-                    self.tracks.setdefault(message.robot, []).append(message)
+                    self.tracks.setdefault(message.robot, Kept()).append(payload)
                 case Status():
                     before = self.status.get(message.robot)
                     if before is not None and before.incarnation != message.incarnation:
                         self._done.setdefault(message.robot, []).append(before)
                     self.status[message.robot] = message
                 case Truths():
-                    self.truths.append(message)
+                    self.truths.append(payload)
 
     @property
     def refused(self) -> dict[str, int]:
@@ -171,22 +172,20 @@ class Recorder:
     def latest(self) -> tuple[dict[str, Track], dict[str, Status], dict[str, Truth]]:
         """The newest track, status and simulated truth of every robot."""
         with self._lock:
-            truth = {t.robot: t for t in self.truths[-1].robots} if self.truths else {}
-            tracks = {name: t[-1] for name, t in self.tracks.items()}
+            truth = {t.robot: t for t in self.truths.last.robots} if self.truths else {}
+            tracks = {name: t.last for name, t in self.tracks.items()}
             return tracks, dict(self.status), truth
 
     def simulated_truth(self) -> dict[str, Floats]:
         """Rows of seconds, x, y, heading for every robot of the simulated field."""
-        with self._lock:
-            return truth_rows(self.truths)
+        return truth_rows(self.truths)
 
     def trajectory(
         self, robot: str, from_s: float = -np.inf, until_s: float = np.inf
     ) -> Trajectory:
         """A robot's estimates within [from_s, until_s)."""
-        with self._lock:
-            tracks = list(self.tracks.get(robot, ()))
-        tracks = [t for t in tracks if from_s <= t.stamp_ns * 1e-9 < until_s]
+        heard = self.tracks.get(robot, ())
+        tracks = [t for t in heard if from_s <= t.stamp_ns * 1e-9 < until_s]
         covariance = None
         if all(t.covariance is not None for t in tracks):
             covariance = np.array([t.covariance for t in tracks]).reshape(-1, 6)
@@ -228,7 +227,7 @@ class Recorder:
         """One robot's figures from `from_s` on."""
         _, _, last_truth = self.latest()
         figures = score(self.samples(name, truth, from_s))
-        tracks = self.tracks.get(name, [])
+        tracks = list(self.tracks.get(name, ()))
         statuses = [
             *self._done.get(name, ()),
             *([self.status[name]] if name in self.status else []),
