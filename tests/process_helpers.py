@@ -1,6 +1,7 @@
 """Starting the command line as a user would, and looking at processes."""
 
 import subprocess
+import sys
 import time
 from collections.abc import Callable, Sequence
 
@@ -16,6 +17,21 @@ def cpcbl_team(*arguments: object, timeout_s: float = 90.0) -> "subprocess.Compl
         timeout=timeout_s,
         check=False,
     )
+
+
+PATIENT = """
+import cpcbl_launch.up
+from cpcbl_launch.cli import main
+cpcbl_launch.up.LEAD_S = 8.0
+main()
+"""
+
+
+def patient_up(*arguments: object) -> "subprocess.CompletedProcess[str]":
+    """Runs `cpcbl-team up ARGUMENTS` with a longer lead: on a machine that is busy a robot starts
+    late, and then it does not know where it is."""
+    words = [sys.executable, "-c", PATIENT, "up", *map(str, arguments)]
+    return subprocess.run(words, capture_output=True, text=True, timeout=90.0, check=False)
 
 
 def command_of(pid: int) -> str:

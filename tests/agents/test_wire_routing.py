@@ -396,7 +396,7 @@ def test_of_two_processes_the_better_one_sends_and_the_worse_one_receives(tmp_pa
     )
     team_file, endpoint = tmp_path / "team.json", free_endpoint()
     save_resolved(team, team_file)
-    clock = Clock(EPOCH_MS * 1_000_000, time.monotonic_ns() + 2_000_000_000, 2.0)
+    clock = Clock(EPOCH_MS * 1_000_000, time.monotonic_ns() + 6_000_000_000, 2.0)
     common = ("--team", str(team_file), "--clock", str(clock), "--parent", str(os.getpid()))
     with (
         open_router(team.name, [endpoint], guards=guard_rules(team, clock.speed)),
@@ -408,7 +408,9 @@ def test_of_two_processes_the_better_one_sends_and_the_worse_one_receives(tmp_pa
             for name, link in (("1", better), ("2", worse))
         ]
         with Supervisor(table, tmp_path) as supervisor:
-            assert eventually(lambda: received(worse) > 5000), (tmp_path / "2.log").read_text()
+            assert eventually(lambda: received(worse) > 5000, 30.0), (
+                tmp_path / "2.log"
+            ).read_text()
             supervisor.watch()
             assert supervisor.restarts == {}
     assert sent(better) > 4000

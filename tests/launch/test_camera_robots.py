@@ -22,19 +22,21 @@ from cpcbl_transport.messages import Frame, Refusal, Status, encode
 from cpcbl_transport.reading import read
 from cpcbl_transport.zenoh_bus import open_router
 
+PATIENCE_S = 60.0
 TEAM = """
 name = "tests"
 [robots.r1]
 source = "external"
 sensing = "camera"
 start = {{ x_m = 1.0, y_m = 1.0 }}
+sensor = {{ rate_hz = {rate_hz} }}
 camera = {{ frames = "{frames}", width_px = 64, height_px = 48 }}
 """
 
 
-def write_team(folder: Path, frames: str = "") -> Path:
+def write_team(folder: Path, frames: str = "", rate_hz: float = 5.0) -> Path:
     path = folder / "team.toml"
-    path.write_text(TEAM.format(frames=frames))
+    path.write_text(TEAM.format(frames=frames, rate_hz=rate_hz))
     return path
 
 
@@ -63,10 +65,12 @@ class Driven:
 
     def until(self, **counts: int) -> None:
         """Returns when it has counted so much."""
-        assert eventually(lambda: counts.items() <= self.counts().items()), self.counts()
+        assert eventually(lambda: counts.items() <= self.counts().items(), PATIENCE_S), (
+            self.counts()
+        )
 
     def counted(self, name: str, least: int) -> bool:
-        return eventually(lambda: self.counts().get(name, 0) >= least)
+        return eventually(lambda: self.counts().get(name, 0) >= least, PATIENCE_S)
 
 
 @contextmanager
@@ -141,7 +145,7 @@ def test_a_robot_ends_whose_camera_does_not_answer(tmp_path: Path) -> None:
 def test_a_folder_ends_and_the_robot_goes_on(tmp_path: Path) -> None:
     for name in "abc":
         (tmp_path / f"{name}.png").write_bytes(png(GOOD))
-    with driven(write_team(tmp_path, ".")) as robot:
+    with driven(write_team(tmp_path, ".", rate_hz=1.0)) as robot:
         assert robot.counted("odometry", robot.counts()["odometry"] + 20)
         robot.until(frame=3, sightings=3)
 

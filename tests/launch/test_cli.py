@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 from log_helpers import write_log
-from process_helpers import cpcbl_team, eventually, pids_of
+from process_helpers import cpcbl_team, eventually, patient_up, pids_of
 
 from cpcbl_launch.processes import PROGRAM
 from cpcbl_launch.up import free_endpoint
@@ -112,8 +112,8 @@ def test_what_the_user_can_mend_is_one_line(arguments: list[str], said: str) -> 
 def test_up_reports_to_file_and_standard_output(tmp_path: Path) -> None:
     team, written = tmp_path / "team.toml", tmp_path / "report.json"
     team.write_text(PAIR)
-    ran = cpcbl_team(
-        "up", team, "--duration", 20, "--speed", 4, "--seed", 5, "--json", "--report", written
+    ran = patient_up(
+        *(team, "--duration", 20, "--speed", 4, "--seed", 5, "--json", "--report", written)
     )
     assert ran.returncode == 0, ran.stderr
     report = json.loads(ran.stdout)
@@ -161,7 +161,7 @@ def test_up_on_a_log_agrees_with_evaluate(tmp_path: Path) -> None:
         "evaluate", "mrclam", tmp_path, "--team", PLAIN, "--blind", "2", "--json"
     )
     assert evaluated.returncode == 0, evaluated.stderr
-    ran = cpcbl_team("up", PLAIN, "--data", tmp_path, "--blind", "2", "--speed", 5, "--json")
+    ran = patient_up(PLAIN, "--data", tmp_path, "--blind", "2", "--speed", 5, "--json")
     assert ran.returncode == 0, ran.stderr
     alone, together = json.loads(evaluated.stdout), json.loads(ran.stdout)
     assert together["left_out"].keys() == {"3", "4", "5"}

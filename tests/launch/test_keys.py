@@ -22,7 +22,7 @@ import yaml
 from bus_helpers import Ear, wait_until
 from docker_helpers import TOP, image
 from key_helpers import OPERATOR, R1, again, router_of, secured_team, session, with_credentials
-from process_helpers import cpcbl_team
+from process_helpers import cpcbl_team, patient_up
 from typer.testing import CliRunner
 
 from cpcbl_launch.cli import app
@@ -365,12 +365,12 @@ def test_a_secured_team_does_as_well_as_a_plain_one(tmp_path: Path) -> None:
     run = ("--duration", 10, "--seed", 5, "--json")
     watch = ("traffic", secured, "--connect", endpoint, "--wait", 60, "--json")
     with running(*watch) as watching:
-        done = cpcbl_team("up", secured, *run)
+        done = patient_up(secured, *run)
         watching.send_signal(signal.SIGINT)
         seen = json.loads(watching.communicate(timeout=20)[0])
     assert done.returncode == 0, done.stderr
     report = json.loads(done.stdout)
-    other = json.loads(cpcbl_team("up", plain, *run).stdout)
+    other = json.loads(patient_up(plain, *run).stdout)
     assert report["restarts"] == {}
     assert set(seen["robots"]) == set(report["robots"])
     for name, robot in report["robots"].items():
@@ -387,8 +387,8 @@ def test_an_observer_joins_a_secured_team_with_its_own_certificate(tmp_path: Pat
     keys(secured, "--observer", "tripod")
     join = ("--team", secured, "--connect", endpoint, "--at", "4.5,0,90", "--json")
     assert "observer/stranger" in refused("observer", "stranger", *join)
-    with running("up", secured, "--duration", 14, "--json") as team:
-        visited = json.loads(cpcbl_team("observer", "tripod", *join, "--for", 6).stdout)
+    with running("up", secured, "--duration", 20, "--json") as team:
+        visited = json.loads(cpcbl_team("observer", "tripod", *join, "--for", 12).stdout)
         report = json.loads(team.communicate(timeout=60)[0])
     assert visited["lost"] == ""
     assert sum(flow["messages"] for flow in visited["sent"]) > 10

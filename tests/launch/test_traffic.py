@@ -454,8 +454,7 @@ def test_a_running_team_is_watched_with_the_command_that_up_says(
         first = up.stdout.readline()
         assert first.startswith("watch it: cpcbl-team traffic trio.toml --connect tcp/127.0.0.1:")
         words = shlex.split(first.removeprefix("watch it: "))[1:]
-        while "driver" not in up.stdout.readline():
-            pass
+        assert any("driver" in line for line in iter(up.stdout.readline, ""))
         watched = cpcbl_team(*words, "--for", 3, "--json")
         text, _ = up.communicate(timeout=60.0)
         assert up.returncode == 0
