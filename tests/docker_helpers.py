@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 
-from cpcbl_launch.containers.compose import BASE_IMAGE, BASE_VARIABLE
+from cpcbl_launch.containers import BASE_IMAGE, BASE_VARIABLE
 from cpcbl_launch.containers.docker import DockerError, compose_program, done, never
 from cpcbl_launch.containers.fleet import Project
 from cpcbl_launch.containers.image import have, image_for, there, version

@@ -1,11 +1,10 @@
-"""What an agent is, and what the agents of one robot say to each other.
+"""What the agents of one robot say to each other.
 
 An agent is an object with `handle(message, now_ns) -> messages`. It sees neither bus nor clock, so
 the same object runs live, in one process with others, and in replay.
 """
 
-from collections.abc import Sequence
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 from cpcbl_team.estimate import Estimate
 from cpcbl_team.inputs import Belief, Fix, Sightings, Told
@@ -64,10 +63,3 @@ class Sent(NamedTuple):
 
 FromBus = Presence | Stranger | Listened | Looked | Sent
 Anything = Message | Tick | Located | Told | FromBus
-
-
-class Agent(Protocol):
-    """One of the three agents of a robot."""
-
-    def handle(self, message: Anything, now_ns: int) -> Sequence[Anything]:
-        """What this message makes the agent say."""

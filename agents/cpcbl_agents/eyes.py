@@ -8,6 +8,8 @@ from numpy.typing import NDArray
 from cpcbl_team.inputs import Sightings
 from cpcbl_transport.messages import Frame, Look
 
+NEEDS_OPENCV = "needs OpenCV: pip install 'cpcbl-team[camera]'"
+
 
 class Picture(NamedTuple):
     """A frame that needs no decoding: pixels (height, width, 3), BGR, at the time of exposure."""

@@ -9,6 +9,7 @@ from typing import Any
 
 import msgspec
 
+from cpcbl_agents.eyes import NEEDS_OPENCV
 from cpcbl_team.config import Team
 
 LEAST_SPEED, MOST_SPEED = 0.05, 1000.0
@@ -83,7 +84,7 @@ def must_draw(what: str, path: Path | None = None) -> None:
 def must_have_opencv(what: str) -> None:
     """Raises ValueError where OpenCV is not installed."""
     if importlib.util.find_spec("cv2") is None:
-        raise ValueError(f"{what} needs OpenCV: pip install 'cpcbl-team[camera]'")
+        raise ValueError(f"{what} {NEEDS_OPENCV}")
 
 
 def must_see(team: Team, robots: Collection[str] = (), field: bool = False) -> None:
@@ -91,8 +92,5 @@ def must_see(team: Team, robots: Collection[str] = (), field: bool = False) -> N
     there."""
     eyes = [f"robots.{name}" for name in team.cameras if name in robots]
     who = eyes[0] if eyes else "the simulated field" if field and team.renders else ""
-    if who and importlib.util.find_spec("cv2") is None:
-        raise ValueError(
-            f'team {team.name}: {who}: sensing = "camera" needs OpenCV:'
-            " pip install 'cpcbl-team[camera]'"
-        )
+    if who:
+        must_have_opencv(f'team {team.name}: {who}: sensing = "camera"')

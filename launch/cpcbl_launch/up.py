@@ -58,7 +58,7 @@ class Run(NamedTuple):
     folder: Path | None = None
     """Where processes write their logs; None: a temporary folder."""
     picture: Path | None = None
-    """The picture of the run to write (PNG, SVG or PDF)."""
+    """The picture of the run to write (PNG or SVG)."""
     record: Path | None = None
     """The recording of the run to write (MCAP)."""
 

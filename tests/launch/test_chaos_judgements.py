@@ -252,7 +252,6 @@ SENT = Sent(
     help=100,
     inputs=60,
     commands=30,
-    to_people=90,
     no_messages=80,
     no_statuses=25,
     no_looks=20,

@@ -14,7 +14,7 @@ from cpcbl_launch.chaos.network import AFTER_S, CUT_S, judged_partition
 from cpcbl_launch.chaos.notes import Notes, NoteTaker, all_counts
 from cpcbl_launch.chaos.scenario import CannotRunError, Found, Setting
 from cpcbl_launch.chaos.team import PATIENCE_S, ChaosError
-from cpcbl_launch.containers.compose import BASE_IMAGE, BASE_VARIABLE
+from cpcbl_launch.containers import BASE_IMAGE, BASE_VARIABLE
 from cpcbl_launch.containers.docker import (
     DockerError,
     check_daemon,

@@ -60,10 +60,8 @@ class Sent(NamedTuple):
     """For the victim's driver keys, and true sightings of the mate, so that it listens."""
     commands: int
     """For the field."""
-    to_people: int
-    """Status, tracks, truth, looks."""
     no_messages: int
-    """Of these, what is none."""
+    """For people (status, tracks, truth, looks), what is none."""
     no_statuses: int
     """Of these, what came under `status/*`."""
     no_looks: int
@@ -242,7 +240,6 @@ class Fuzzer:
             help=count[topics.FIX.key] + count[topics.BELIEF.key],
             inputs=sum(count[t.key] for t in topics.INPUTS) + self.true_sightings,
             commands=sum(count[t.key] for t in TO_FIELD),
-            to_people=sum(count[t.key] for t in TO_PEOPLE),
             no_messages=sum(count[f"bad {t.key}"] for t in TO_PEOPLE),
             no_statuses=count[f"bad {topics.STATUS.key}"],
             no_looks=count[f"bad {topics.LOOK.key}"],

@@ -10,10 +10,10 @@ from cpcbl_launch.chaos.checks import Check
 from cpcbl_launch.chaos.injectors import Echo
 from cpcbl_launch.chaos.notes import Notes, counted, latency_s, worst
 from cpcbl_launch.chaos.scenario import (
-    BASELINE_S,
     Found,
     Setting,
     all_is_well,
+    settled,
     they_go_on,
 )
 from cpcbl_launch.chaos.team import Plan, TeamUnderTest, demo_team, running
@@ -29,7 +29,7 @@ FLOOD_S = 12.0
 def duplicates(setting: Setting) -> Found:
     """All help of the best observer once more at once, and once more up to 4 s late."""
     with running(Plan(demo_team(), setting.seed)) as team:
-        _settled(team, setting)
+        settled(team, setting)
         setting.say(f"the observer's help comes three times for {ECHO_S:g} s")
         from_s = team.now_s
         with (
@@ -65,7 +65,7 @@ def flood(setting: Setting) -> Found:
     """One robot says all that it may say as fast as it can: fixes, beliefs, 60 kB for status."""
     flooder = "patrol"
     with running(Plan(demo_team(), setting.seed, left_out=(flooder,))) as team:
-        _settled(team, setting)
+        settled(team, setting)
         setting.say(f"{flooder} floods for {FLOOD_S:g} s")
         targets = team.others()
         from_s = team.now_s
@@ -102,9 +102,3 @@ def judged_flood(
         Check(what="others' delay, 99 %", seen=worst(late), unit="s", at_most=1.0),
         *all_is_well(notes, robots, until_s + 1.0, end_s),
     ]
-
-
-def _settled(team: TeamUnderTest, setting: Setting) -> None:
-    setting.say("starting a team")
-    team.settle()
-    team.run_for(BASELINE_S)

@@ -24,6 +24,7 @@ from cpcbl_launch.chaos.scenario import (
     Setting,
     all_is_well,
     it_is_missed,
+    settled,
     they_go_on,
 )
 from cpcbl_launch.chaos.sites import two_sites
@@ -156,7 +157,7 @@ def lossy_link(setting: Setting) -> Found:
             also_listen=(own,),
         )
         with running(plan) as team:
-            _settled(team, setting)
+            settled(team, setting)
             found = _bad_link(
                 team,
                 robot,
@@ -266,11 +267,5 @@ def _relayed(robot: str, setting: Setting) -> Iterator[tuple[TeamUnderTest, Rela
     with Relay(endpoint, setting.seed) as link:
         plan = Plan(demo_team(), setting.seed, endpoint=endpoint, links={robot: link.endpoint})
         with running(plan) as team:
-            _settled(team, setting)
+            settled(team, setting)
             yield team, link
-
-
-def _settled(team: TeamUnderTest, setting: Setting) -> None:
-    setting.say("starting a team")
-    team.settle()
-    team.run_for(BASELINE_S)

@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 from cpcbl_launch.chaos.checks import Check
 from cpcbl_launch.chaos.notes import Notes, gone_after_s, inside, longest_gap_s, rmse_m, worst
+from cpcbl_launch.chaos.team import TeamUnderTest
 
 BASELINE_S = 4.0
 FOUND_M = 0.3
@@ -52,6 +53,13 @@ class Scenario(NamedTuple):
     quick: bool
     """Whether it is a test of the ordinary suite too."""
     run: Callable[[Setting], Found]
+
+
+def settled(team: TeamUnderTest, setting: Setting) -> None:
+    """Returns when the team knows where it is and has run for a while: as before a fault."""
+    setting.say("starting a team")
+    team.settle()
+    team.run_for(BASELINE_S)
 
 
 def it_is_missed(notes: Notes, robot: str, from_s: float, within_s: float) -> Check:

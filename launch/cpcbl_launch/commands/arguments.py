@@ -5,6 +5,9 @@ from typing import TYPE_CHECKING, Annotated, Optional
 
 import typer
 
+from cpcbl_launch.containers import BASE_IMAGE as BASE_IMAGE
+from cpcbl_launch.containers import BASE_VARIABLE
+
 if TYPE_CHECKING:
     from cpcbl_team.config import Team
 
@@ -46,10 +49,7 @@ Image = Annotated[
     Optional[str],
     typer.Option(help="Image of cpcbl-team to use; default: built from the checkout, when needed."),
 ]
-BASE_IMAGE = "python:3.12-slim"
-BaseImage = Annotated[
-    str, typer.Option(envvar="CPCBL_BASE_IMAGE", help="What the image is built on.")
-]
+BaseImage = Annotated[str, typer.Option(envvar=BASE_VARIABLE, help="What the image is built on.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print the report as JSON.")]
 Connect = Annotated[
     Optional[list[str]],

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import yaml
 
+from cpcbl_launch.containers import BASE_IMAGE, BASE_VARIABLE
 from cpcbl_launch.processes import tasks
 from cpcbl_team.config import Team
 from cpcbl_transport.security import Identity
@@ -15,8 +16,6 @@ from cpcbl_transport.topics import Role
 
 PORT = 7447
 """Where the router listens, inside."""
-BASE_IMAGE = "python:3.12-slim"
-BASE_VARIABLE = "CPCBL_BASE_IMAGE"
 
 
 class Mount(NamedTuple):

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 from importlib import metadata
 from pathlib import Path
 
-from cpcbl_launch.containers.compose import BASE_VARIABLE
+from cpcbl_launch.containers import BASE_VARIABLE
 from cpcbl_launch.containers.docker import DockerError, Said, done, ran
 
 NAME = "cpcbl-team"

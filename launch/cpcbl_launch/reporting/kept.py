@@ -1,7 +1,7 @@
 """Messages of a run of days, kept as they came and read again when somebody asks.
 
-Read, each is many objects: a track takes 440 bytes, 150 as it came; the truth of four robots 920 and
-200.
+Read, each is many objects: a track takes 440 bytes, 150 as it came; the truth of four robots 920
+and 200.
 """
 
 from collections.abc import Iterator
