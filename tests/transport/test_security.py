@@ -308,6 +308,7 @@ def test_a_certificate_hears_what_is_for_its_owner_and_nothing_else(
         for key in sorted(HEARD[who]):  # once more, after all that it may not hear
             say(speaker, key, b"last")
         wait_until(lambda: HEARD[who] <= {k for e in ears for k, p in e.samples if p == b"last"})
+        wait_until(lambda: HEARD[OPERATOR] <= set(everything.keys))
         assert {key for ear in ears for key in ear.keys} == HEARD[who]
         assert set(everything.keys) == HEARD[OPERATOR]
 
