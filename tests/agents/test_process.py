@@ -178,18 +178,19 @@ def since(seconds: float, unix: bool = False) -> Clock:
 
 
 @pytest.mark.parametrize(
-    ("clock", "restarted", "knows_its_place", "may_send"),
+    ("since_s", "unix", "restarted", "knows_its_place", "may_send"),
     [
-        (since(-60.0), False, True, True),
-        (since(-60.0), True, False, False),
-        (since(60.0), False, False, False),
-        (since(60.0, unix=True), False, False, True),
+        (-60.0, False, False, True, True),
+        (-60.0, False, True, False, False),
+        (60.0, False, False, False, False),
+        (60.0, True, False, False, True),
     ],
     ids=["with the team", "restarted by up", "restarted by Docker", "waited for its router"],
 )
 def test_a_robot_that_may_have_run_before_knows_neither_its_place_nor_what_it_spent(
-    clock: Clock, restarted: bool, knows_its_place: bool, may_send: bool
+    since_s: float, unix: bool, restarted: bool, knows_its_place: bool, may_send: bool
 ) -> None:
+    clock = since(since_s, unix)
     robot = begun("me", LIMITED, clock, restarted)
     assert (not robot.filter.timeline.state.memory.lost) is knows_its_place
     now_ns = clock.now_ns()

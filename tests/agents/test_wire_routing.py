@@ -19,6 +19,7 @@ from process_helpers import eventually
 from wire import Batch, Kind, Relay, most_in_window, total
 
 from cpcbl_agents.clock import Clock
+from cpcbl_agents.collaboration import CollaborationAgent
 from cpcbl_agents.node import Node
 from cpcbl_agents.robot import Robot
 from cpcbl_agents.sources.mrclam import read_landmarks
@@ -136,6 +137,11 @@ def data(batches: Sequence[Batch]) -> list[Batch]:
 def sent(link: Relay) -> int:
     """Bytes of data from a robot to the router."""
     return total(link.up, Kind.DATA)
+
+
+def said(agent: CollaborationAgent) -> int:
+    """Fixes and beliefs that a robot has put."""
+    return sum(flow.messages for flow in agent.tallies.flows())
 
 
 def received(link: Relay) -> int:
@@ -266,8 +272,7 @@ def spent(bytes_per_s: float, seconds: int, at_once: int = 1) -> Spent:
                     stand.sightings("observer", frame)
                 frames.clear()
             stand.step()
-            messages = sum(flow.messages for flow in agent.tallies.flows())
-            wait_until(lambda: sum(len(ear.samples) for ear in ears) == messages)
+            wait_until(lambda: sum(len(ear.samples) for ear in ears) == said(agent))
             new = data(link.up)[len(batches) :]
             batches.extend(batch._replace(at_s=stand.now_ns // (100 * MS)) for batch in new)
 
@@ -311,8 +316,7 @@ def test_a_fix_and_a_belief_are_small_on_both_links(kinds: dict[str, Any], paylo
 
         def step() -> None:
             robots.exchange()
-            messages = sum(flow.messages for flow in agent.tallies.flows())
-            wait_until(lambda: len(data(worse.down)) == messages)
+            wait_until(lambda: len(data(worse.down)) == said(agent))
 
         repeat_until(step, lambda: len(data(worse.down)) >= 10)
     assert payload <= 40
@@ -362,13 +366,13 @@ def test_who_is_lost_is_helped_by_all_and_who_finds_itself_helps() -> None:
         mates = stand.robots["second"].collaboration
         repeat_until(lambda: look(worst=marks), lambda: agent.tier < mates.tier)
         towards = seen_between("second", here, PLACES["second"])
-        so_far = sent(second)
+        so_far = said(mates)
         repeat_until(
             lambda: look(worst=[*marks, towards]),
             lambda: agent.tallies.of("fix", "second").messages > 0,
         )
         wait_until(lambda: min(sent(worst), received(second)) > 0)
-        assert sent(second) == so_far
+        assert said(mates) == so_far
         assert received(best) == 0
 
 

@@ -78,7 +78,7 @@ class Watching:
         self.done = False
 
     def show(self, recorder: Recorder, processes: Processes, elapsed_s: float) -> None:
-        for name, status in recorder.status.items():
+        for name, status in recorder.latest()[1].items():
             self.frames[name] = dict(status.counts).get("sightings", 0)
         self.done = (
             len(self.frames) == len(recorder.tracks) == 4

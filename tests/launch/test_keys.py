@@ -22,7 +22,7 @@ import yaml
 from bus_helpers import Ear, wait_until
 from docker_helpers import TOP, image
 from key_helpers import OPERATOR, R1, again, router_of, secured_team, session, with_credentials
-from process_helpers import cpcbl_team, patient_up
+from process_helpers import cpcbl_team, eventually, patient_up
 from typer.testing import CliRunner
 
 from cpcbl_launch.cli import app
@@ -429,6 +429,9 @@ def test_robots_of_a_router_of_its_own(team_file: Path) -> None:
         + f'listen = ["{endpoint}"]\nconnect = ["{endpoint}"]\n'
     )
     with running("router", team_file), running("robot", "r1", "--team", team_file):
+        with session(load_team(team_file), OPERATOR, endpoint) as operator:
+            ear = Ear(operator, topics.STATUS.at())
+            assert eventually(lambda: bool(ear.samples))
         done = cpcbl_team("traffic", team_file, "--for", 4, "--wait", 30, "--json")
         assert list(json.loads(done.stdout)["robots"]) == ["r1"]
 

@@ -311,8 +311,8 @@ class Team3:
         return all(sigma_m(recorder, name) < 0.05 for name in self.team.robots)
 
     def guest_stays(self, recorder: Recorder) -> bool:
-        (present,) = presence(seconds(recorder.trajectory("tripod").stamps_ns).tolist())
-        return present.until_s - present.from_s > STAY_S
+        spans = presence(seconds(recorder.trajectory("tripod").stamps_ns).tolist())
+        return any(span.until_s - span.from_s > STAY_S for span in spans)
 
     def guest_has_left(self, recorder: Recorder) -> bool:
         status = recorder.latest()[1]
@@ -498,13 +498,14 @@ def test_a_real_tripod_is_fed_by_its_own_driver(tmp_path: Path) -> None:
                 lambda: "r1" in heard and any(f.peer == "tripod" for f in heard["r1"].heard)
             )
             assert eventually(lambda: heard["r1"].position_sigma_m < 0.05)
-            assert eventually(lambda: "tripod" in heard)
+            assert eventually(
+                lambda: "tripod" in heard and heard["tripod"].counts.get("sightings", 0) > 0
+            )
         finally:
             for process in processes:
                 process.send_signal(signal.SIGINT)
                 process.wait(timeout=10.0)
     assert heard["r1"].counts["guest_joined"] == 1
-    assert heard["tripod"].counts["sightings"] > 0
 
 
 @pytest.mark.parametrize(

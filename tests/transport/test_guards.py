@@ -199,6 +199,8 @@ def test_what_is_sent_at_once_has_a_rate_for_each_target_and_each_robot() -> Non
         for bus in (robots.faulty, robots.healthy):
             last_of(bus, robots.inputs)
         wait_until(lambda: bool(others.samples))
+        for ear in (robots.fixes, robots.beliefs):
+            wait_until(lambda ear=ear: len(ear.samples) >= 2)  # type: ignore[misc]
     for observer in ("faulty", "healthy"):
         assert by(observer, robots.fixes) == [b"1"]
         assert by(observer, robots.beliefs) == [b"4"]
@@ -215,6 +217,7 @@ def test_what_is_too_large_is_not_let_in() -> None:
         put(robots.faulty, odometry, bytes(1_000_000), bytes(LARGEST_PAYLOAD + 1), largest)
         put(robots.faulty, frame, bytes(LARGEST_FRAME + 1), largest_frame)
         last_of(robots.faulty, robots.inputs)
+        wait_until(lambda: bool(robots.beliefs.samples))
     assert robots.beliefs.payloads == [small]
     assert robots.inputs.payloads == [largest, largest_frame, b"last"]
 

@@ -124,6 +124,7 @@ def fuzz(setting: Setting, a_key: int = A_KEY) -> Found:
         recorded = sent.no_messages - sent.no_looks
         team.until(lambda: _refused(recorder.counts) >= recorded, 15.0)
         team.until(lambda: looks.refused.total() >= sent.no_looks, 15.0)
+        team.until(lambda: watcher.refused.total() >= sent.no_statuses, 15.0)
         until_s = team.now_s
         taken = Taken(
             after_help,
