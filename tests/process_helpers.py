@@ -22,7 +22,7 @@ def cpcbl_team(*arguments: object, timeout_s: float = 90.0) -> "subprocess.Compl
 PATIENT = """
 import cpcbl_launch.up
 from cpcbl_launch.cli import main
-cpcbl_launch.up.LEAD_S = 8.0
+cpcbl_launch.up.LEAD_S = 5.0
 main()
 """
 

@@ -356,7 +356,7 @@ def demo(folder: Path, security: str) -> Path:
     return path
 
 
-def test_a_secured_team_does_as_well_as_a_plain_one(tmp_path: Path) -> None:
+def test_a_secured_team_does_as_well_as_one_without_a_network(tmp_path: Path) -> None:
     """Both with the same noise; an operator watches the secured one."""
     plain, secured = demo(tmp_path, "none"), demo(tmp_path, "mtls")
     keys(secured)
@@ -370,7 +370,7 @@ def test_a_secured_team_does_as_well_as_a_plain_one(tmp_path: Path) -> None:
         seen = json.loads(watching.communicate(timeout=20)[0])
     assert done.returncode == 0, done.stderr
     report = json.loads(done.stdout)
-    other = json.loads(patient_up(plain, *run).stdout)
+    other = json.loads(cpcbl_team("simulate", plain, *run).stdout)
     assert report["restarts"] == {}
     assert set(seen["robots"]) == set(report["robots"])
     for name, robot in report["robots"].items():

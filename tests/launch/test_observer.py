@@ -324,7 +324,10 @@ def team3(tmp_path: Path) -> Team3:
     return Team3(tmp_path)
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
+@pytest.mark.parametrize(
+    "number",
+    [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.long), signal.SIGKILL],
+)
 def test_an_observer_joins_a_running_team_and_leaves_it(
     team3: Team3, number: signal.Signals
 ) -> None:

@@ -68,7 +68,7 @@ def run(script: Script, team: Team, folder: Path, limit_s: float = 60.0) -> Repo
 def test_kills_one_of_four_robot_processes_and_it_localizes_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("cpcbl_launch.up.LEAD_S", 6.0)  # who starts late would be helped
+    monkeypatch.setattr("cpcbl_launch.up.LEAD_S", 5.0)  # who starts late would be helped
     killed: dict[str, int] = {}
     seen: dict[str, int] = {}
     incarnations: dict[str, str] = {}
