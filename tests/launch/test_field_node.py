@@ -87,6 +87,25 @@ def test_too_many_commands_at_once_are_counted_and_the_oldest_dropped() -> None:
     assert on.node.counts == {"drive": INBOX, "inbox_overflow": 3}
 
 
+def test_a_step_ends_although_more_and_more_commands_arrive(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    on, obeyed = OnBus(), 0
+    payload = encode(Drive("r1", 0, 0.5, 0.0))
+
+    def obeyed_at_once(_: Drive) -> None:
+        nonlocal obeyed
+        obeyed += 1
+        if obeyed < 100:
+            on.command(payload)
+
+    monkeypatch.setattr(on.field, "command", obeyed_at_once)
+    on.command(payload)
+    for steps in (1, 2):
+        on.node.step(steps * STEP_NS)
+        assert obeyed == steps
+
+
 @pytest.mark.parametrize("ahead_s", [0.5, 3600.0, -0.3])
 def test_a_robot_whose_clock_is_off_gets_and_gives_its_own_stamps(ahead_s: float) -> None:
     hub, ahead_ns = MemoryHub(), int(ahead_s * 1e9)

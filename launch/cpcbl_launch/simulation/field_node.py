@@ -80,8 +80,11 @@ class FieldNode:
         return False  # commands take effect with the next step
 
     def step(self, now_ns: int) -> None:
-        """Advances the field to `now_ns` and tells the robots what they sense."""
-        while self._said:
+        """Advances the field to `now_ns` and tells the robots what they sense.
+
+        What arrives meanwhile is for the next step: under a flood there is always more.
+        """
+        for _ in range(len(self._said)):
             reason = self._taken(*self._said.popleft(), now_ns)
             if reason is not None:
                 self.counts[reason] += 1
