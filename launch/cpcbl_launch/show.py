@@ -77,6 +77,8 @@ class LiveTable(LiveView):
                 *_traffic_cells(status),
                 state,
             )
+        if not self.fits(shown):
+            shown.padding = (0, 0)  # closer together, before a state is folded
         return shown
 
     def _guests_last(self, name: str) -> tuple[bool, str]:

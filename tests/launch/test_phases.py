@@ -172,6 +172,30 @@ def test_the_live_table_shows_who_is_a_guest_and_who_has_left() -> None:
     ]
 
 
+class FarOn(NoProcesses):
+    """A robot whose machine has started many processes."""
+
+    @property
+    def names(self) -> list[str]:
+        return ["robot-navigator"]
+
+    @property
+    def pids(self) -> dict[str, int]:
+        return {"robot-navigator": 4_194_303}
+
+
+def test_a_live_table_moves_together_before_it_folds_a_state() -> None:
+    said = Said()
+    said.tracks("navigator", 0.0, 30.0)
+    for width, gap in ((62, " "), (80, "  ")):
+        out = io.StringIO()
+        with LiveTable("team", ["navigator"], Console(file=out, width=width)) as view:
+            view.show(said.recorder, FarOn(), 30.0)
+        _, _, _, row = out.getvalue().splitlines()
+        assert row.startswith(f"navigator{gap}4194303{gap}")
+        assert row.split()[-1] == "ok"
+
+
 def test_a_recorder_takes_little_room_for_what_it_hears_over_days() -> None:
     said = Said()
     said.tracks("r1", 0.0, 0.1)

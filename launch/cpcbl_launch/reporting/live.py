@@ -26,6 +26,11 @@ class LiveView:
     def __exit__(self, *_: object) -> None:
         self._live.stop()
 
+    def fits(self, drawn: RenderableType) -> bool:
+        """Whether the console is as wide as this would like to be."""
+        wide = self._console.options.update(max_width=10 * self._console.width)
+        return self._console.measure(drawn, options=wide).maximum <= self._console.width
+
     def draw(self, drawn: Callable[[], RenderableType], worth_a_snapshot: bool) -> None:
         """To be called several times a second."""
         if self._quiet:
