@@ -73,7 +73,7 @@ def partition_containers(setting: Setting) -> Found:
         time.sleep(CUT_S)
         done(["docker", "network", "connect", link, router])
         healed_s = sites.west.now_s
-        setting.say("together again")
+        setting.say("the link between the sites is back")
         time.sleep(5.0 + AFTER_S)
         times = cut_s, healed_s, sites.west.now_s
         return Found(judged_partition(*sites.notes, WEST, EAST, *times, most_far_m=BLIND_M))

@@ -30,11 +30,11 @@ def disk_full(setting: Setting) -> Found:
     """`up` records, reports and draws onto a disk of 64 kB, and keeps its logs there."""
     with tempfile.TemporaryDirectory(prefix="cpcbl-chaos-") as name:
         disk, names = Path(name), ("run.mcap", "report.json", "run.png")
-        setting.say(f"up on a disk of {DISK}B")
+        setting.say(f"running `up` on a disk of {DISK}B")
         record, report, picture = (disk / n for n in names)
         options = ["--record", record, "--report", report, "--picture", picture]
         ended = _on_disk(f"size={DISK}", disk, "up", *_short(), *options, "--logs", disk / "logs")
-        setting.say("up --json into a full device")
+        setting.say("running `up --json` with a full device as standard output")
         full = _run("sh", "-c", f"{_command('up', *_short(), '--json')} > /dev/full")
     return Found(judged_full(ended, names, full))
 
@@ -46,11 +46,11 @@ def judged_full(ended: Ended, names: tuple[str, ...], full: Ended) -> list[Check
     ]
     return [
         Check(what="robots in the report on the terminal", seen=_robots(ended.out), at_least=4),
-        Check(what="lines that say which file was lost", seen=sum(lines), at_least=3, at_most=3),
+        Check(what="lines that name a lost file", seen=sum(lines), at_least=3, at_most=3),
         _exit(ended.code, 1),
         *_clean(ended),
         Check(
-            what="lines for a full standard output",
+            what="lines that report the full standard output",
             seen=full.said.count("standard output: not written: "),
             at_least=1,
             at_most=1,
@@ -65,10 +65,10 @@ def read_only(setting: Setting) -> Found:
     with tempfile.TemporaryDirectory(prefix="cpcbl-chaos-") as name:
         disk, ended = Path(name), {}
         for option in READ_ONLY:
-            setting.say(f"up {option} on a read-only file system")
+            setting.say(f"running `up {option}` on a read-only file system")
             path = disk / ("run.png" if option == "--picture" else "written")
             ended[option] = _on_disk("ro", disk, "up", *_short(), option, path)
-        setting.say("calibrate --output on a read-only file system")
+        setting.say("running `calibrate --output` on a read-only file system")
         words = ("calibrate", "run.mcap", "--output", disk / "new.toml")
         ended["--output"] = _on_disk("ro", disk, *words)
     return Found(judged_read_only(ended))
@@ -83,8 +83,8 @@ def judged_read_only(ended: dict[str, Ended]) -> list[Check]:
     codes = [e.code == 2 for e in ended.values()]
     n = len(ended)
     return [
-        Check(what="options refused with one clear line", seen=sum(clear), at_least=n),
-        Check(what="exit code 2", seen=sum(codes), at_least=n),
+        Check(what="options refused with one line of error", seen=sum(clear), at_least=n),
+        Check(what="commands that ended with exit code 2", seen=sum(codes), at_least=n),
         *(check for e in ended.values() for check in _clean(e) if not check.held),
     ]
 

@@ -103,7 +103,7 @@ def fuzz_team() -> Team:
 
 def fuzz(setting: Setting, a_key: int = A_KEY) -> Found:
     """Hypothesis's payloads, random bytes and damaged messages on every key; odd tokens."""
-    setting.say("hypothesis makes up payloads")
+    setting.say("hypothesis generates payloads")
     found = hypothetical(setting.seed)
     with ExitStack() as stack:
         plan = Plan(fuzz_team(), setting.seed, left_out=(MATE,))
@@ -165,17 +165,13 @@ def judged_fuzz(sent: Sent, taken: Taken) -> list[Check]:
             at_most=sent.help + 10,
         ),
         # the filter counts what is odd inside of what was taken once more
-        Check(
-            what="inputs counted",
-            seen=_counted(victim) - help_counted,
-            at_least=sent.inputs,
-        ),
-        Check(what="odd tokens counted", seen=victim.get("bad_token", 0), at_least=TOKENS),
+        Check(what="inputs counted", seen=_counted(victim) - help_counted, at_least=sent.inputs),
+        Check(what="malformed tokens counted", seen=victim.get("bad_token", 0), at_least=TOKENS),
         _exactly("commands refused by the field", refused_commands, sent.commands),
-        _exactly("refused by the recorder", refused, sent.no_messages - sent.no_looks),
-        _exactly("refused by the traffic watcher", watched, sent.no_statuses),
-        _exactly("refused by who looks", looked, sent.no_looks),
-        _exactly("`cpcbl-team traffic` exits with", taken.traffic_exit, 0),
+        _exactly("messages refused by the recorder", refused, sent.no_messages - sent.no_looks),
+        _exactly("messages refused by the traffic watcher", watched, sent.no_statuses),
+        _exactly("messages refused by the subscriber of annotated frames", looked, sent.no_looks),
+        _exactly("exit code of `cpcbl-team traffic`", taken.traffic_exit, 0),
     ]
 
 

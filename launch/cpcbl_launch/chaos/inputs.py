@@ -30,7 +30,7 @@ def duplicates(setting: Setting) -> Found:
     """All help of the best observer once more at once, and once more up to 4 s late."""
     with running(Plan(demo_team(), setting.seed)) as team:
         settled(team, setting)
-        setting.say(f"the observer's help comes three times for {ECHO_S:g} s")
+        setting.say(f"each help message of the observer is sent three times, for {ECHO_S:g} s")
         from_s = team.now_s
         with (
             open_bus(team.plan.team.name, [team.endpoint]) as bus,
@@ -96,9 +96,14 @@ def judged_flood(
     ]
     late = [latency_s(notes, name, from_s, until_s) for name in robots]
     return [
-        Check(what="flood", seen=sent / seconds, unit="messages/s", at_least=1000.0),
-        Check(what="taken by the worst hit", seen=worst(taken), unit="messages/s", at_most=200.0),
+        Check(what="rate of the flood", seen=sent / seconds, unit="messages/s", at_least=1000.0),
+        Check(
+            what="most received by one robot",
+            seen=worst(taken),
+            unit="messages/s",
+            at_most=200.0,
+        ),
         *they_go_on(notes, robots, from_s, until_s, most_silent_s=2.0),
-        Check(what="others' delay, 99 %", seen=worst(late), unit="s", at_most=1.0),
+        Check(what="others' delay, 99th percentile", seen=worst(late), unit="s", at_most=1.0),
         *all_is_well(notes, robots, until_s + 1.0, end_s),
     ]

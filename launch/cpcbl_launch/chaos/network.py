@@ -58,7 +58,7 @@ def partition(setting: Setting) -> Found:
         team.run_for(CUT_S)
         healed_s = team.now_s
         sites.link.set(Quality())
-        setting.say("together again")
+        setting.say("the link between the sites is back")
         team.run_for(5.0 + AFTER_S)
         near = team.others(*FAR)
         times = cut_s, healed_s, team.now_s
@@ -83,11 +83,16 @@ def judged_partition(
     heard = [helped_after_s(far_notes, name, near, healed_s) for name in far]
     helped = min((s for s in heard if s is not None), default=None)
     return [
-        Check(what="the other side's tokens gone after", seen=worst(gone), unit="s", at_most=4.0),
+        Check(
+            what="other side's tokens disappeared after",
+            seen=worst(gone),
+            unit="s",
+            at_most=4.0,
+        ),
         *they_go_on(near_notes, near, cut_s, healed_s, who="near side's"),
         *they_go_on(far_notes, far, cut_s, healed_s, most_m=most_far_m, who="far side's"),
-        Check(what="tokens back after healing", seen=worst(back), unit="s", at_most=5.0),
-        Check(what="help across after healing", seen=helped, unit="s", at_most=5.0),
+        Check(what="from healing to all tokens back", seen=worst(back), unit="s", at_most=5.0),
+        Check(what="from healing to the first help", seen=helped, unit="s", at_most=5.0),
         *all_is_well(near_notes, [*near, *far], healed_s + 5.0, until_s),
     ]
 
@@ -119,13 +124,13 @@ def judged_cut(
         it_is_missed(notes, robot, cut_s, 4.0),
         *they_go_on(notes, others, cut_s, healed_s),
         Check(
-            what="its token back after healing",
+            what="from healing to its token back",
             seen=present_after_s(notes, robot, healed_s),
             unit="s",
             at_most=5.0,
         ),
         Check(
-            what="it knows where it is after healing",
+            what="from healing until it was localized",
             seen=found_after_s(notes, robot, healed_s, FOUND_M),
             unit="s",
             at_most=8.0,
@@ -227,31 +232,26 @@ def judged_bad(
     notice."""
     return [
         Check(
-            what="its longest silence",
+            what="its longest gap between tracks",
             seen=longest_gap_s(notes, robot, bad_s, good_s),
             unit="s",
             at_most=most_silent_s,
         ),
         Check(
-            what="its tracks' delay, 99 %",
+            what="its tracks' delay, 99th percentile",
             seen=latency_s(notes, robot, bad_s, good_s),
             unit="s",
             at_most=most_late_s,
         ),
+        Check(what="its RMSE", seen=rmse_m(notes, robot, bad_s, good_s), unit="m", at_most=most_m),
         Check(
-            what="its RMSE",
-            seen=rmse_m(notes, robot, bad_s, good_s),
-            unit="m",
-            at_most=most_m,
-        ),
-        Check(
-            what="help it received",
+            what="help messages that it received",
             seen=counted(notes, robot, bad_s, good_s)["messages_received"],
             at_least=20,
         ),
         *they_go_on(notes, others, bad_s, good_s),
         Check(
-            what="others' delay, 99 %",
+            what="others' delay, 99th percentile",
             seen=worst(latency_s(notes, name, bad_s, good_s) for name in others),
             unit="s",
             at_most=0.5,

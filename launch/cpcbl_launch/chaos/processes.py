@@ -86,8 +86,8 @@ def judged_kill(
     found = None if back_s is None else found_after_s(notes, robot, killed_s + back_s, FOUND_M)
     return [
         it_is_missed(notes, robot, killed_s, 1.0),
-        Check(what="a new process after", seen=back_s, unit="s", at_most=10.0),
-        Check(what="it knows where it is after another", seen=found, unit="s", at_most=15.0),
+        Check(what="a new process started after", seen=back_s, unit="s", at_most=10.0),
+        Check(what="from then until it was localized", seen=found, unit="s", at_most=15.0),
         *they_go_on(notes, others, killed_s, found_s),
         *all_is_well(notes, [robot, *others], found_s, until_s),
     ]
@@ -120,14 +120,16 @@ def judged_router(
     helped = sum(counted(notes, name, back_s)["messages_received"] for name in robots)
     tokens = [t for t in notes.tokens if t.at_s >= killed_s and t.alive]
     return [
-        Check(what="longest silence", seen=worst(gaps), unit="s", at_most=6.0),
+        Check(what="longest gap between tracks", seen=worst(gaps), unit="s", at_most=6.0),
         Check(
-            what="robots announced to the new router",
+            what="robots with a token at the new router",
             seen=len({t.robot for t in tokens} & set(robots)),
             at_least=len(robots),
         ),
         Check(
-            what=f"help received in the {until_s - back_s:.0f} s after", seen=helped, at_least=20
+            what=f"help received in the {until_s - back_s:.0f} s after",
+            seen=helped,
+            at_least=20,
         ),
         *all_is_well(notes, robots, back_s, until_s),
     ]
@@ -168,11 +170,9 @@ def judged_field(
     gaps = [longest_gap_s(notes, name, killed_s, found_s) for name in robots]
     found = [found_after_s(notes, name, anew_s + 1.0, FOUND_M) for name in robots]
     return [
-        Check(what="longest silence of a robot", seen=worst(gaps), unit="s", at_most=1.5),
-        Check(what="a new field after", seen=anew_s - killed_s, unit="s", at_most=10.0),
-        Check(
-            what="all know where they are after another", seen=worst(found), unit="s", at_most=20.0
-        ),
+        Check(what="longest gap between tracks", seen=worst(gaps), unit="s", at_most=1.5),
+        Check(what="a new field started after", seen=anew_s - killed_s, unit="s", at_most=10.0),
+        Check(what="from then until all were localized", seen=worst(found), unit="s", at_most=20.0),
         *all_is_well(notes, robots, found_s, until_s),
     ]
 
@@ -210,24 +210,24 @@ def judged_freeze(
         it_is_missed(notes, robot, frozen_s, 4.0),
         *they_go_on(notes, others, frozen_s, thawed_s),
         Check(
-            what="it is heard after waking",
+            what="from waking to its first new track",
             seen=heard_after_s(notes, robot, thawed_s),
             unit="s",
             at_most=3.0,
         ),
         Check(
-            what="it knows where it is after waking",
+            what="from waking until it was localized",
             seen=found_after_s(notes, robot, thawed_s, FOUND_M),
             unit="s",
             at_most=5.0,
         ),
         Check(
-            what=f"tracks that came more than {LATE_S:g} s late",
+            what=f"tracks that arrived more than {LATE_S:g} s late",
             seen=late_tracks(notes, robot, thawed_s, LATE_S),
             at_most=10,
         ),
         Check(
-            what="others' worst error in the 4 s after",
+            what="others' largest error in the 4 s after it woke",
             seen=worst(worst_m(notes, name, thawed_s, thawed_s + 4.0) for name in others),
             unit="m",
             at_most=0.5,

@@ -65,7 +65,7 @@ def settled(team: TeamUnderTest, setting: Setting) -> None:
 def it_is_missed(notes: Notes, robot: str, from_s: float, within_s: float) -> Check:
     """Teammates hear that it is gone."""
     seen = gone_after_s(notes, robot, from_s)
-    return Check(what="its token gone after", seen=seen, unit="s", at_most=within_s)
+    return Check(what="its token disappeared after", seen=seen, unit="s", at_most=within_s)
 
 
 def they_go_on(
@@ -83,7 +83,12 @@ def they_go_on(
     gaps = [longest_gap_s(notes, name, from_s, until_s) for name in names]
     errors = [rmse_m(notes, name, from_s, until_s) for name in names]
     return [
-        Check(what=f"{who} longest silence", seen=worst(gaps), unit="s", at_most=most_silent_s),
+        Check(
+            what=f"{who} longest gap between tracks",
+            seen=worst(gaps),
+            unit="s",
+            at_most=most_silent_s,
+        ),
         Check(what=f"{who} worst RMSE", seen=worst(errors), unit="m", at_most=most_m),
     ]
 

@@ -65,7 +65,7 @@ def soak(setting: Setting) -> Found:
         team.settle()
         tormentor = _Tormentor(team, links, setting)
         tormentor.run()
-        setting.say("is everybody well?")
+        setting.say("waiting until all robots are localized")
         calm_s = team.now_s
         team.until(lambda: _all_found(team.notes, team.robots, calm_s), STUCK_S)
         well_s = team.now_s
@@ -104,30 +104,35 @@ def judged_soak(
     grown = [life.end_mib - life.start_mib for life in lived]
     slopes = [life.mib_a_minute for life in lived if life.seconds >= LONG_LIFE_S]
     steep = Check(
-        what=f"steepest of those that lived {LONG_LIFE_S:g} s",
+        what=f"steepest growth of a process that ran for {LONG_LIFE_S:g} s",
         seen=max(slopes, default=None),
         unit="MiB/min",
         at_most=SLOPE_MIB_A_MINUTE,
     )
     return [
-        Check(what="processes that ended unasked", seen=restarts - kills, at_least=0, at_most=0),
-        Check(what="tracebacks in logs", seen=tracebacks, at_least=0, at_most=0),
-        Check(what="longest silence of a robot", seen=worst(silent), unit="s", at_most=STUCK_S),
         Check(
-            what="all know where they are after the last fault",
+            what="processes that ended without being killed",
+            seen=restarts - kills,
+            at_least=0,
+            at_most=0,
+        ),
+        Check(what="tracebacks in logs", seen=tracebacks, at_least=0, at_most=0),
+        Check(what="longest gap between tracks", seen=worst(silent), unit="s", at_most=STUCK_S),
+        Check(
+            what="from the last fault until all were localized",
             seen=worst(back),
             unit="s",
             at_most=STUCK_S,
         ),
         Check(
-            what="memory grown most by",
+            what="largest growth of memory",
             seen=max(grown, default=None),
             unit="MiB",
             at_most=GROWTH_MIB,
         ),
         *([steep] if slopes else []),
         Check(
-            what="open files, most more",
+            what="largest growth of the number of open files",
             seen=max((life.more_files for life in lived), default=None),
             at_most=MORE_FILES,
         ),

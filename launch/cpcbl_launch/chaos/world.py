@@ -56,15 +56,15 @@ def judged_kidnap(notes: Notes, robot: str, others: Sequence[str], until_s: floa
     at_s, moved_m = jump_s(notes, robot) or (until_s, 0.0)
     believed = [name for name in (robot, *others) if not distrusted(notes, name)]
     return [
-        Check(what="carried", seen=moved_m, unit="m", at_least=2.9),
+        Check(what="distance of the kidnapping", seen=moved_m, unit="m", at_least=2.9),
         Check(
-            what="it says that it is lost after",
+            what="it reported that it was lost after",
             seen=lost_after_s(notes, robot, at_s),
             unit="s",
             at_most=3.0,
         ),
         Check(
-            what="it knows where it is after",
+            what="it was localized after",
             seen=found_after_s(notes, robot, at_s, FOUND_M),
             unit="s",
             at_most=8.0,
@@ -72,7 +72,7 @@ def judged_kidnap(notes: Notes, robot: str, others: Sequence[str], until_s: floa
         *they_go_on(notes, others, at_s, until_s),
         *all_is_well(notes, [robot, *others], at_s + 8.0, until_s),
         Check(
-            what="robots that believe all others at the end",
+            what="robots that trust all others at the end",
             seen=len(believed),
             at_least=len(others) + 1,
         ),
@@ -101,12 +101,12 @@ def judged_hidden(notes: Notes, robots: Sequence[str], until_s: float) -> list[C
     return [
         *they_go_on(notes, robots, dark_s, light_s, most_m=0.5, who="team's"),
         Check(
-            what="inside 3 σ in the dark",
+            what="inside 3 σ while landmarks are hidden",
             seen=inside(notes, robots, dark_s, light_s),
             unit="%",
             at_least=0.9,
         ),
-        Check(what="all know where they are after", seen=worst(back), unit="s", at_most=8.0),
+        Check(what="all were localized after", seen=worst(back), unit="s", at_most=8.0),
         *all_is_well(notes, robots, light_s + 3.0, until_s),
     ]
 
@@ -136,7 +136,7 @@ def _clocks(ahead_s: dict[str, float], setting: Setting) -> Found:
         checks = judged_clocks(team.notes, wrong, right, others, from_s, team.now_s)
         late = [heard_late_s(team.notes, name, wrong) for name in others]
         said = ", ".join(f"{-s:.2f} s" for s in late if s is not None)
-        return Found(checks, (f"by the others its clock is ahead by {said}",))
+        return Found(checks, (f"the other robots estimate that its clock is ahead by {said}",))
 
 
 def judged_clocks(
@@ -156,10 +156,14 @@ def judged_clocks(
     share = inside(notes, others, from_s, until_s)
     own = rmse_m(notes, wrong, from_s, until_s)
     return [
-        Check(what="robots that say its clock is off", seen=len(known), at_least=1),
-        Check(what="said at", seen=max(known, default=None), unit="s", at_most=15.0),
-        Check(what="its help refused", seen=refused, at_least=20),
-        Check(what=f"robots that blame {right}'s clock", seen=len(blamed), at_most=0),
+        Check(what="robots that report that its clock is wrong", seen=len(known), at_least=1),
+        Check(
+            what="last of these reports at", seen=max(known, default=None), unit="s", at_most=15.0
+        ),
+        Check(what="refused help messages from it", seen=refused, at_least=20),
+        Check(
+            what=f"robots that report that {right}'s clock is wrong", seen=len(blamed), at_most=0
+        ),
         *they_go_on(notes, others, from_s, until_s, most_m=1.0),
         Check(what="others inside 3 σ", seen=share, unit="%", at_least=0.9),
         Check(what="its own RMSE", seen=own, unit="m", at_most=FOUND_M),
@@ -176,7 +180,7 @@ def liar(setting: Setting) -> Found:
     with running(Plan(crowd, setting.seed, more={liars.LIAR: ("--lie", lie)})) as team:
         setting.say("starting a team")
         team.settle()
-        setting.say(f"{liars.LIAR} lies from {LIE_S[0]:g} s to {LIE_S[1]:g} s")
+        setting.say(f"{liars.LIAR} sends wrong positions from {LIE_S[0]:g} s to {LIE_S[1]:g} s")
         team.until(lambda: team.now_s >= LIE_S[1] + 20.0, LIE_S[1] + 40.0)
         return Found(judged_liar(team.notes, liars.LIAR, liars.DRIVERS, team.robots, *LIE_S))
 
@@ -195,16 +199,16 @@ def judged_liar(
     last = [distrusted(notes, name) for name in robots]
     errors = [rmse_m(notes, name, from_s, until_s) for name in listeners]
     return [
-        Check(what="robots that found it", seen=len(known), at_least=FINDERS),
+        Check(what="robots that quarantined it", seen=len(known), at_least=FINDERS),
         Check(
-            what="found by two after",
+            what="quarantined by two robots after",
             seen=known[FINDERS - 1] if len(known) >= FINDERS else None,
             unit="s",
             at_most=10.0,
         ),
-        Check(what="worst RMSE meanwhile", seen=worst(errors), unit="m", at_most=GOOD_M),
+        Check(what="worst RMSE during the fault", seen=worst(errors), unit="m", at_most=GOOD_M),
         Check(
-            what="robots that do not believe it 20 s later",
+            what="robots that still distrust it 20 s later",
             seen=sum(liar in peers for peers in last),
             at_least=0,
             at_most=0,
