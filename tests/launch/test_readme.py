@@ -78,12 +78,3 @@ def test_the_documented_team_file_has_every_key_of_cameras_with_its_default() ->
     assert vision.keys() == {*VisionSettings.__struct_fields__}
     colours = {name: COLOURS[name] for name in vision["colours"]}
     assert team.vision == VisionSettings(colours=colours)
-
-
-@pytest.mark.parametrize("document", sorted(ROOT.glob("*.md")) + sorted(ROOT.glob("docs/*.md")))
-def test_links_and_paths_of_a_document_lead_somewhere(document: Path) -> None:
-    text = document.read_text()
-    for target in re.findall(r"\]\(([^)#:]+)\)", text):
-        assert (document.parent / target).exists(), target
-    for path in re.findall(r"`((?:cpcbl_team|transport|agents|launch|tests|docs)/[\w/.]+)", text):
-        assert (ROOT / path).exists(), path

@@ -1,0 +1,80 @@
+"""Every link, anchor, path and function that the documentation names exists."""
+
+import ast
+import re
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+DOCUMENTS = sorted(ROOT.glob("*.md")) + sorted(ROOT.glob("docs/*.md"))
+SOURCES = "cpcbl_team|transport|agents|launch|tests|docs|docker"
+
+
+@cache
+def anchors(document: Path) -> frozenset[str]:
+    """The anchors that GitHub gives to the headings of a page (headings of code blocks excluded)."""
+    text = re.sub(r"^```.*?^```", "", document.read_text(), flags=re.DOTALL | re.MULTILINE)
+    headings = re.findall(r"^#+ +(.+?) *$", text, re.MULTILINE)
+    slugs = (re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings)
+    return frozenset(slugs)
+
+
+@cache
+def names_in(source: Path) -> frozenset[str]:
+    """What a module defines: `name`, and inside of a class also `Class.name`."""
+    found = set()
+    for node in ast.parse(source.read_text()).body:
+        found |= _names(node)
+        if isinstance(node, ast.ClassDef):
+            inside = {name for inner in node.body for name in _names(inner)}
+            found |= inside | {f"{node.name}.{name}" for name in inside}
+    return frozenset(found)
+
+
+def _names(node: ast.stmt) -> set[str]:
+    match node:
+        case ast.FunctionDef(name=name) | ast.AsyncFunctionDef(name=name) | ast.ClassDef(name=name):
+            return {name}
+        case ast.Assign(targets=targets):
+            return {n.id for t in targets for n in ast.walk(t) if isinstance(n, ast.Name)}
+        case ast.AnnAssign(target=ast.Name(id=name)):
+            return {name}
+    return set()
+
+
+def test_anchors_are_those_of_github(tmp_path: Path) -> None:
+    page = tmp_path / "page.md"
+    page.write_text(
+        "# The paper, row by row\n```sh\n# no heading\n```\n## `joint`: 3 × 3 (default)\n"
+    )
+    assert anchors(page) == {"the-paper-row-by-row", "joint-3--3-default"}
+
+
+def test_names_are_those_that_a_module_defines(tmp_path: Path) -> None:
+    source = tmp_path / "a.py"
+    source.write_text("A, B = 1, 2\nC: int = 3\nclass D:\n    e: int\n    def f(self): pass\n")
+    assert names_in(source) == {"A", "B", "C", "D", "e", "f", "D.e", "D.f"}
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.name)
+def test_relative_links_lead_to_a_file_and_a_heading(document: Path) -> None:
+    for target in re.findall(r"\]\(([^)\s]+)\)", document.read_text()):
+        if "://" in target:
+            continue
+        path, _, anchor = target.partition("#")
+        page = (document.parent / path).resolve() if path else document
+        assert page.exists(), target
+        if anchor:
+            assert anchor in anchors(page), target
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.name)
+def test_paths_and_the_names_behind_them_exist(document: Path) -> None:
+    """A reference is `path` or `path: name, Class.name`, from the root of the repository."""
+    pattern = rf"`((?:{SOURCES})/[\w/.-]+)(?:: ([\w., ]+))?`"
+    for path, names in re.findall(pattern, document.read_text()):
+        assert (ROOT / path).exists(), path
+        for name in names.split(", ") if names else ():
+            assert name in names_in(ROOT / path), f"{path}: {name}"
