@@ -34,10 +34,7 @@ from cpcbl_team.fusion import (
 from cpcbl_team.geometry import Pose2, new, step, wrap_angle
 from cpcbl_team.inputs import Belief, Fix, Odometry, Position, Sighting, Sightings, Told
 from cpcbl_team.landmarks import Landmarks, Said
-from cpcbl_team.motion import move
-from cpcbl_team.self_calibration import Anchor, Anchors, learned
-from cpcbl_team.sensors import crawled_s, repeated_share, sighting_fault
-from cpcbl_team.sightings import (
+from cpcbl_team.measurements import (
     Found,
     Measured,
     combined,
@@ -47,6 +44,9 @@ from cpcbl_team.sightings import (
     offers,
     surprise,
 )
+from cpcbl_team.motion import move
+from cpcbl_team.self_calibration import Anchor, Anchors, learned
+from cpcbl_team.sensors import crawled_s, repeated_share, sighting_fault
 from cpcbl_team.state import FIX, Evidence, Glance, Memory, State, Updates
 from cpcbl_team.whereabouts import Whereabouts
 

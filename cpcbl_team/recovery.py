@@ -16,7 +16,7 @@ from cpcbl_team.config import Field, LocalizerSettings
 from cpcbl_team.constraints import Constraint, bearing_heading, range_circle
 from cpcbl_team.estimate import SMALLEST_VARIANCE, ZERO3, Covariance3, Estimate, Information, merge
 from cpcbl_team.geometry import Pose2
-from cpcbl_team.sightings import Measured
+from cpcbl_team.measurements import Measured
 from cpcbl_team.state import FIX, Evidence, Glance, Memory, State
 from cpcbl_team.whereabouts import Whereabouts
 

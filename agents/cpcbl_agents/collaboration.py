@@ -11,13 +11,12 @@ from typing import NamedTuple
 from msgspec.structs import replace
 
 from cpcbl_agents.agent import Anything, Listened, Located, Presence, Sent, Stranger
+from cpcbl_agents.counters import Tallies
 from cpcbl_agents.guests import Guests
-from cpcbl_agents.tally import Tallies
 from cpcbl_team.collaboration import LOWEST_TIER, fix_for, hears, next_tier, without_heading
 from cpcbl_team.config import LocalizationSettings
 from cpcbl_team.gaussian import Covariance2
-from cpcbl_team.inputs import Belief, Fix
-from cpcbl_team.value import (
+from cpcbl_team.information_gain import (
     Helped,
     Turned,
     expected,
@@ -29,10 +28,11 @@ from cpcbl_team.value import (
     use_of,
     worth,
 )
+from cpcbl_team.inputs import Belief, Fix
 from cpcbl_transport.budget import Budget
 from cpcbl_transport.compact import help_bytes
+from cpcbl_transport.link_size import sent_bytes
 from cpcbl_transport.messages import Track
-from cpcbl_transport.overhead import sent_bytes
 
 NEIGHBOUR_NS = 10_000_000_000  # so long a teammate's tier is followed after it was seen
 IN_SIGHT_NS = 1_000_000_000  # so long its beliefs are of use

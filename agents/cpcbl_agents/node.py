@@ -7,15 +7,16 @@ from typing import Protocol
 
 from cpcbl_agents.agent import Listened, Looked, Presence, Sent, Stranger, Tick
 from cpcbl_agents.clocks import Clocks
+from cpcbl_agents.counters import Tallies
+from cpcbl_agents.declarations import Tokens, Wiring
 from cpcbl_agents.robot import Robot
-from cpcbl_agents.tally import Tallies
-from cpcbl_agents.wiring import Tokens, Wiring
 from cpcbl_team.config import Team
 from cpcbl_team.inputs import Belief, Fix
 from cpcbl_team.trust import Standing
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus
 from cpcbl_transport.compact import decode_help, encode_help
+from cpcbl_transport.link_size import received_bytes, sent_bytes
 from cpcbl_transport.messages import (
     LARGEST_FRAME,
     LARGEST_PAYLOAD,
@@ -31,7 +32,6 @@ from cpcbl_transport.messages import (
     encode,
     refusal,
 )
-from cpcbl_transport.overhead import received_bytes, sent_bytes
 from cpcbl_transport.topics import Topic
 
 log = logging.getLogger(__name__)

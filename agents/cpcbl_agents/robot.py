@@ -5,13 +5,13 @@ from pathlib import Path
 
 from cpcbl_agents.agent import Anything, FromBus, Looked, Presence, Sent, Tick
 from cpcbl_agents.collaboration import CollaborationAgent
-from cpcbl_agents.driving import Pilot
-from cpcbl_agents.eyes import Eyes
+from cpcbl_agents.detector import Eyes
 from cpcbl_agents.filtering import FilterAgent
 from cpcbl_agents.guests import Guests
 from cpcbl_agents.sensing import SensingAgent
 from cpcbl_agents.sources import OwnCamera, Silent, Source
 from cpcbl_agents.sources.mrclam import MrclamSource
+from cpcbl_agents.waypoint_follower import Pilot
 from cpcbl_team.config import Team
 from cpcbl_team.inputs import Belief, Fix, Odometry, Position, Sightings, Told
 from cpcbl_transport.budget import Budget
@@ -119,6 +119,6 @@ def _eyes(name: str, team: Team) -> Eyes | None:
     """Of a robot with a camera; OpenCV is loaded for nobody else."""
     if team.robots[name].sensing != "camera":
         return None
-    from cpcbl_agents.vision.eyes import CameraEyes
+    from cpcbl_agents.vision.detector import CameraEyes
 
     return CameraEyes(name, team)

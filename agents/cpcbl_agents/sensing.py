@@ -6,9 +6,9 @@ from collections.abc import Sequence
 import msgspec
 
 from cpcbl_agents.agent import Anything, Located, Looked, Tick
-from cpcbl_agents.driving import Pilot
-from cpcbl_agents.eyes import Eyes, Picture
+from cpcbl_agents.detector import Eyes, Picture
 from cpcbl_agents.sources import OwnCamera, Source
+from cpcbl_agents.waypoint_follower import Pilot
 from cpcbl_team.config import LocalizationSettings
 from cpcbl_team.inputs import Odometry, Position, Sightings
 from cpcbl_team.sensors import corrected_odometry, corrected_sighting, once_each

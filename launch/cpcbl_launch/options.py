@@ -9,7 +9,7 @@ from typing import Any
 
 import msgspec
 
-from cpcbl_agents.eyes import NEEDS_OPENCV
+from cpcbl_agents.detector import NEEDS_OPENCV
 from cpcbl_team.config import Team
 
 LEAST_SPEED, MOST_SPEED = 0.05, 1000.0

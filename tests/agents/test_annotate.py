@@ -5,11 +5,11 @@ import math
 
 import numpy as np
 import pytest
-from camera_helpers import picture
+from support.cameras import picture
 
 from cpcbl_agents.vision.annotate import DOUBTED, FOUND, Box, annotated, labelled, labels
 from cpcbl_agents.vision.camera import Floats
-from cpcbl_agents.vision.glimpses import Doubt, Found, Glimpses
+from cpcbl_agents.vision.detections import Doubt, Found, Glimpses
 from cpcbl_team.inputs import Sighting
 
 SIZE = (640, 480)

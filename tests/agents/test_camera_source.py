@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from bus_helpers import MS, SECOND, wait_until
-from camera_helpers import SIZE, jpeg, number_of, picture, png, streaming, url, write_video
-from process_helpers import eventually
+from support.buses import MS, SECOND, wait_until
+from support.cameras import SIZE, jpeg, number_of, picture, png, streaming, url, write_video
+from support.processes import eventually
 
-from cpcbl_agents.eyes import Picture
+from cpcbl_agents.detector import Picture
 from cpcbl_agents.sources import OwnCamera
 from cpcbl_agents.sources.camera import LiveCamera, opened
 from cpcbl_agents.vision.pictures import fault, received

@@ -1,9 +1,9 @@
 """A teammate's clock that is off is found, reported, and its words refused by a stated rule."""
 
 import pytest
-from bus_helpers import MS, SECOND, Stand, robot_at, saw, team_of
 from hypothesis import given
 from hypothesis import strategies as st
+from support.buses import MS, SECOND, Stand, robot_at, saw, team_of
 
 from cpcbl_agents.clocks import LEAST_WORDS, SPAN_NS, Clocks
 from cpcbl_team.config import TrustSettings

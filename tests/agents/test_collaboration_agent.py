@@ -5,15 +5,15 @@ from collections.abc import Sequence
 from typing import Any, TypeVar
 
 import pytest
-from bus_helpers import MS, SECOND, examples
-from core_helpers import diagonal
 from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
+from support.buses import MS, SECOND, examples
+from support.core import diagonal
 
 from cpcbl_agents.agent import Listened, Located, Presence, Sent
 from cpcbl_agents.collaboration import CollaborationAgent
-from cpcbl_agents.tally import Tally
+from cpcbl_agents.counters import Tally
 from cpcbl_team.collaboration import LOWEST_TIER, next_tier
 from cpcbl_team.config import (
     BudgetSettings,
@@ -28,8 +28,8 @@ from cpcbl_team.geometry import Pose2
 from cpcbl_team.inputs import Belief, Fix, Sighting, Sightings
 from cpcbl_transport.budget import Budget
 from cpcbl_transport.compact import help_bytes
+from cpcbl_transport.link_size import sent_bytes
 from cpcbl_transport.messages import Flow, Track
-from cpcbl_transport.overhead import sent_bytes
 
 GOOD, POOR, POORER = 2, 9, 12  # tiers
 SIGMA_M = {GOOD: 0.019, POOR: 0.2, POORER: 0.6}

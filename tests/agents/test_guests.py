@@ -3,10 +3,10 @@
 from typing import Any
 
 import pytest
-from bus_helpers import SECOND, Stand, examples, robot_at, saw, team_of
 from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
+from support.buses import SECOND, Stand, examples, robot_at, saw, team_of
 
 from cpcbl_agents.guests import FORGOTTEN_NS, TRIED_NS, Guests
 from cpcbl_team.collaboration import LOWEST_TIER

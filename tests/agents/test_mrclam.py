@@ -6,7 +6,7 @@ from pathlib import Path
 
 import msgspec
 import pytest
-from log_helpers import (
+from support.logs import (
     BARCODES,
     EPOCH_MS,
     FRAME_MS,

@@ -5,7 +5,10 @@ from typing import Any, NamedTuple
 
 import msgspec
 import pytest
-from bus_helpers import (
+from hypothesis import given
+from hypothesis import strategies as st
+from msgspec.structs import replace
+from support.buses import (
     MS,
     SECOND,
     Stand,
@@ -18,22 +21,20 @@ from bus_helpers import (
     with_robot,
     written,
 )
-from hypothesis import given
-from hypothesis import strategies as st
-from msgspec.structs import replace
 
 from cpcbl_agents.node import INBOX, Node
 from cpcbl_agents.robot import Robot
 from cpcbl_team.collaboration import LOWEST_TIER, tier_of
 from cpcbl_team.config import BudgetSettings, LocalizerSettings, Team
 from cpcbl_team.estimate import ZERO3, Estimate
+from cpcbl_team.information_gain import sigma_range_m
 from cpcbl_team.inputs import Belief, Fix, Odometry, Position, Sighting, Sightings
 from cpcbl_team.self_calibration import Learned
 from cpcbl_team.timeline import HORIZON_NS
-from cpcbl_team.value import sigma_range_m
 from cpcbl_transport import topics
 from cpcbl_transport.bus import MemoryBus, MemoryHub, Publisher
 from cpcbl_transport.compact import BELIEF_BYTES
+from cpcbl_transport.link_size import sent_bytes
 from cpcbl_transport.messages import (
     LARGEST_FRAME,
     LARGEST_PAYLOAD,
@@ -43,7 +44,6 @@ from cpcbl_transport.messages import (
     Refusal,
     Track,
 )
-from cpcbl_transport.overhead import sent_bytes
 
 GOOD, POOR = 0.02, 0.3
 COVARIANCE = (0.0004, 0.0, 0.0004, 0.0, 0.0, 0.0001)

@@ -7,10 +7,10 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from bus_helpers import examples
-from camera_helpers import SIZE, jpeg, number_of, picture, png
 from hypothesis import given
 from hypothesis import strategies as st
+from support.buses import examples
+from support.cameras import SIZE, jpeg, number_of, picture, png
 
 from cpcbl_agents.vision.pictures import Header, decoded, encoded, fault, header_of, received
 

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 
 import pytest
-from bus_helpers import robot_at, team_of, wait_until, with_robot
+from support.buses import robot_at, team_of, wait_until, with_robot
 
 from cpcbl_agents import process
 from cpcbl_agents.clock import Clock

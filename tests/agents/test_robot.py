@@ -4,13 +4,13 @@ import math
 from collections.abc import Sequence
 
 import pytest
-from bus_helpers import MS, SECOND, robot_at, saw, team_of, with_robot
 from msgspec.structs import replace
+from support.buses import MS, SECOND, robot_at, saw, team_of, with_robot
 
 from cpcbl_agents.agent import Located, Presence, Tick
-from cpcbl_agents.driving import COMMAND_NS, MOST_TURN_RAD_S, REACHED_M, Pilot, steer
 from cpcbl_agents.filtering import PATIENCE_NS
 from cpcbl_agents.robot import Robot
+from cpcbl_agents.waypoint_follower import COMMAND_NS, MOST_TURN_RAD_S, REACHED_M, Pilot, steer
 from cpcbl_team.collaboration import LOWEST_TIER
 from cpcbl_team.config import (
     CollaborationSettings,

@@ -13,20 +13,20 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import pytest
-from bus_helpers import MS, PATIENCE_S, SECOND, Ear, Stand, robot_at, saw, team_of, wait_until
-from log_helpers import EPOCH_MS, STARTS, write_log
-from process_helpers import eventually
-from wire import Batch, Kind, Relay, most_in_window, total
+from support.buses import MS, PATIENCE_S, SECOND, Ear, Stand, robot_at, saw, team_of, wait_until
+from support.logs import EPOCH_MS, STARTS, write_log
+from support.processes import eventually
+from support.wire_tap import Batch, Kind, Relay, most_in_window, total
 
 from cpcbl_agents.clock import Clock
 from cpcbl_agents.collaboration import CollaborationAgent
 from cpcbl_agents.node import Node
 from cpcbl_agents.robot import Robot
 from cpcbl_agents.sources.mrclam import read_landmarks
-from cpcbl_launch.processes import PROGRAM
-from cpcbl_launch.supervisor import ProcessSpec, Supervisor
+from cpcbl_launch.run.processes import PROGRAM
+from cpcbl_launch.run.supervisor import ProcessSpec, Supervisor
+from cpcbl_launch.run.up import free_endpoint
 from cpcbl_launch.team_file import save_resolved
-from cpcbl_launch.up import free_endpoint
 from cpcbl_team.collaboration import LOWEST_TIER
 from cpcbl_team.config import (
     BudgetSettings,
@@ -43,8 +43,8 @@ from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus, Handle, MemoryBus, Publisher, Receive, Watch
 from cpcbl_transport.compact import BELIEF_BYTES, FIX_BYTES
 from cpcbl_transport.guards import guard_rules
+from cpcbl_transport.link_size import received_bytes, sent_bytes
 from cpcbl_transport.messages import Spending
-from cpcbl_transport.overhead import received_bytes, sent_bytes
 from cpcbl_transport.topics import Qos
 from cpcbl_transport.zenoh_bus import ZenohBus, open_bus, open_router
 

@@ -11,7 +11,7 @@ from benchmarks import contenders
 
 TOP = Path(__file__).parents[2]
 FOLDER = TOP / "build" / "compiled"
-_ANEW = ("cpcbl_team", "benchmarks", "core_helpers")
+_ANEW = ("cpcbl_team", "benchmarks", "support")
 _NAMES = ("joint", "joint, alternating", "oval", "circular", contenders.YARDSTICK)
 
 

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 from benchmarks import float_ekf, numpy_peers
 from benchmarks.drive import ODOMETRY, SENSOR, START_SIGMA_M, START_SIGMA_RAD, Cycle
-from core_helpers import CORNERS, LOOP_START, localizer
+from support.core import CORNERS, LOOP_START, localizer
 
 from cpcbl_team.config import LocalizerSettings, Start
 from cpcbl_team.geometry import Pose2

@@ -4,7 +4,7 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from core_helpers import CORNERS, LOOP_START, driven, frame, loop, sensor_noise
+from support.core import CORNERS, LOOP_START, driven, frame, loop, sensor_noise
 
 from cpcbl_team.config import OdometrySettings, SensorSettings
 from cpcbl_team.geometry import Pose2

@@ -9,7 +9,7 @@ from math import atan2, cos, remainder, sin, sqrt, tau
 from typing import Final, NamedTuple
 
 from benchmarks.drive import MAP, ODOMETRY, SENSOR, START_SIGMA_M, START_SIGMA_RAD, Plain
-from core_helpers import LOOP_START
+from support.core import LOOP_START
 
 State = tuple[float, float, float, float, float, float, float, float, float]
 

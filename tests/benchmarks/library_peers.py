@@ -18,8 +18,8 @@ from benchmarks.numpy_peers import (
     start_covariance,
     stepped,
 )
-from core_helpers import LOOP_START
 from filterpy.kalman import ExtendedKalmanFilter
+from support.core import LOOP_START
 
 
 class _Robot(ExtendedKalmanFilter):  # type: ignore[misc]

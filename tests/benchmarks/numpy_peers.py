@@ -4,8 +4,8 @@ from typing import NamedTuple
 
 import numpy as np
 from benchmarks.drive import MAP, ODOMETRY, SENSOR, START_SIGMA_M, START_SIGMA_RAD, Plain
-from core_helpers import LOOP_START
 from numpy.typing import NDArray
+from support.core import LOOP_START
 
 from cpcbl_team.geometry import Pose2, step, wrap_angle
 from cpcbl_team.motion import motion_jacobian, motion_noise

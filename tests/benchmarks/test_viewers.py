@@ -3,7 +3,7 @@
 from benchmarks.frames import FRAMES, TEAM, frames
 from benchmarks.viewers import EYES, VIEWERS, YARDSTICK
 
-from cpcbl_agents.vision.glimpses import Glimpses
+from cpcbl_agents.vision.detections import Glimpses
 
 
 def test_the_eyes_see_landmarks_and_teammates_in_the_frames() -> None:

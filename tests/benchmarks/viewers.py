@@ -9,7 +9,7 @@ from benchmarks.frames import TEAM, VIEWER
 from cpcbl_agents.vision.camera import Camera, Pixels
 from cpcbl_agents.vision.codes import DICTIONARIES
 from cpcbl_agents.vision.cylinders import Cylinders
-from cpcbl_agents.vision.eyes import CameraEyes
+from cpcbl_agents.vision.detector import CameraEyes
 from cpcbl_agents.vision.markers import Markers
 
 YARDSTICK = "OpenCV's marker detection"

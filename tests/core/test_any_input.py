@@ -5,7 +5,8 @@ import random
 from collections.abc import Iterator
 
 import pytest
-from core_helpers import (
+from msgspec.structs import replace
+from support.core import (
     PROBABILISTIC,
     SECOND,
     VARIANTS,
@@ -17,7 +18,6 @@ from core_helpers import (
     placed_at,
     state_at,
 )
-from msgspec.structs import replace
 
 from cpcbl_team.collaboration import fix_for
 from cpcbl_team.config import Field, Landmark, OdometrySettings, SensorSettings, Start, Variant

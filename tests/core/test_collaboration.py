@@ -3,7 +3,10 @@ from itertools import pairwise, permutations
 
 import numpy as np
 import pytest
-from core_helpers import (
+from hypothesis import given
+from hypothesis import strategies as st
+from msgspec.structs import replace
+from support.core import (
     SECOND,
     belief,
     covariance3,
@@ -12,9 +15,6 @@ from core_helpers import (
     matrix2,
     random_matrix,
 )
-from hypothesis import given
-from hypothesis import strategies as st
-from msgspec.structs import replace
 
 from cpcbl_team.collaboration import (
     LOWEST_TIER,

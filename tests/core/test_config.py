@@ -3,7 +3,7 @@ from typing import Any
 
 import msgspec
 import pytest
-from core_helpers import CORNERS, MIXED
+from support.core import CORNERS, MIXED
 
 from cpcbl_team.config import (
     Field,

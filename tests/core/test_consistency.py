@@ -10,7 +10,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from core_helpers import (
+from support.core import (
     CORNERS,
     LOOP_START,
     PROBABILISTIC,
@@ -25,6 +25,7 @@ from core_helpers import (
     sensor_noise,
 )
 
+from cpcbl_launch.reporting.metrics import Samples, Score, score
 from cpcbl_team.config import (
     CollaborationSettings,
     Field,
@@ -38,7 +39,6 @@ from cpcbl_team.estimate import Covariance3
 from cpcbl_team.geometry import Pose2, step, wrap_angle
 from cpcbl_team.inputs import Fix, Odometry, Sighting, Sightings
 from cpcbl_team.localizer import Localizer
-from cpcbl_team.metrics import Samples, Score, score
 from cpcbl_team.motion import motion_noise
 
 ODOMETRY = OdometrySettings()

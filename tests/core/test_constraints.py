@@ -2,9 +2,9 @@ import math
 from collections.abc import Callable
 
 import pytest
-from core_helpers import angles, coordinates, point_sighting, poses, wall_sighting
 from hypothesis import assume, given
 from hypothesis import strategies as st
+from support.core import angles, coordinates, point_sighting, poses, wall_sighting
 
 from cpcbl_team.config import Wall
 from cpcbl_team.constraints import (

@@ -3,7 +3,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from core_helpers import (
+from support.core import (
     Matrix,
     covariance2,
     covariance3,

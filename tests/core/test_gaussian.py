@@ -2,9 +2,9 @@ import math
 
 import numpy as np
 import pytest
-from core_helpers import least_eigenvalue, matrix2, product_of
 from hypothesis import given
 from hypothesis import strategies as st
+from support.core import least_eigenvalue, matrix2, product_of
 
 from cpcbl_team import estimate
 from cpcbl_team.estimate import Covariance3, Estimate, Information

@@ -1,9 +1,9 @@
 import math
 
 import pytest
-from core_helpers import angles, coordinates, poses
 from hypothesis import given
 from hypothesis import strategies as st
+from support.core import angles, coordinates, poses
 
 from cpcbl_team.geometry import Pose2, step, wrap_angle
 

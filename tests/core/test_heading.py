@@ -7,7 +7,10 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from core_helpers import (
+from hypothesis import given
+from hypothesis import strategies as st
+from msgspec.structs import replace
+from support.core import (
     LOOP_START,
     PROBABILISTIC,
     SECOND,
@@ -25,9 +28,6 @@ from core_helpers import (
     position_error,
     state_at,
 )
-from hypothesis import given
-from hypothesis import strategies as st
-from msgspec.structs import replace
 
 from cpcbl_team.collaboration import fix_for, without_heading
 from cpcbl_team.config import (

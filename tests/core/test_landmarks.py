@@ -5,7 +5,9 @@ from collections.abc import Sequence
 
 import numpy as np
 import pytest
-from core_helpers import (
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from support.core import (
     CORNERS,
     LOOP_START,
     PROBABILISTIC,
@@ -16,8 +18,6 @@ from core_helpers import (
     random_matrix,
     state_at,
 )
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from cpcbl_team.config import (
     Field,
@@ -31,8 +31,8 @@ from cpcbl_team.estimate import POSE, Estimate, Information, Scope, circular, me
 from cpcbl_team.geometry import Pose2, wrap_angle
 from cpcbl_team.inputs import Sighting, Sightings
 from cpcbl_team.localizer import Localizer
+from cpcbl_team.measurements import Measured, constraints_of, measured, offers, surprise
 from cpcbl_team.sensors import sighting_fault
-from cpcbl_team.sightings import Measured, constraints_of, measured, offers, surprise
 from cpcbl_team.state import State, Updates
 
 NOW = 5 * SECOND

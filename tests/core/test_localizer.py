@@ -4,7 +4,9 @@ from itertools import permutations
 
 import numpy as np
 import pytest
-from core_helpers import (
+from hypothesis import given
+from hypothesis import strategies as st
+from support.core import (
     CORNERS,
     LOOP_START,
     MIXED,
@@ -30,8 +32,6 @@ from core_helpers import (
     sensor_noise,
     state_at,
 )
-from hypothesis import given
-from hypothesis import strategies as st
 
 from cpcbl_team.config import (
     Field,

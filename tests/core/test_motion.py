@@ -3,7 +3,9 @@ import math
 import msgspec
 import numpy as np
 import pytest
-from core_helpers import (
+from hypothesis import given
+from hypothesis import strategies as st
+from support.core import (
     Matrix,
     covariance3,
     diagonal,
@@ -12,8 +14,6 @@ from core_helpers import (
     poses,
     random_matrix,
 )
-from hypothesis import given
-from hypothesis import strategies as st
 
 from cpcbl_team.config import OdometryNoise
 from cpcbl_team.estimate import ZERO3, Estimate

@@ -3,7 +3,7 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 import pytest
-from core_helpers import (
+from support.core import (
     CORNERS,
     LOOP_START,
     SECOND,
@@ -38,6 +38,7 @@ from cpcbl_team.estimate import Estimate
 from cpcbl_team.gaussian import Covariance2
 from cpcbl_team.geometry import Pose2, wrap_angle
 from cpcbl_team.inputs import Sighting, Sightings
+from cpcbl_team.measurements import Measured
 from cpcbl_team.recovery import (
     MOST_PIECES,
     SPACING_NS,
@@ -50,7 +51,6 @@ from cpcbl_team.recovery import (
     widened,
     with_seen,
 )
-from cpcbl_team.sightings import Measured
 from cpcbl_team.state import Evidence, Memory, State, Updates
 
 ORIGIN = Pose2(0.0, 0.0, 0.0)

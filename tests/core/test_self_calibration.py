@@ -6,7 +6,10 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from core_helpers import (
+from hypothesis import given
+from hypothesis import strategies as st
+from msgspec.structs import replace
+from support.core import (
     CORNERS,
     LOOP_START,
     PROBABILISTIC,
@@ -21,9 +24,6 @@ from core_helpers import (
     sensor_noise,
     state_at,
 )
-from hypothesis import given
-from hypothesis import strategies as st
-from msgspec.structs import replace
 
 from cpcbl_team.config import (
     LocalizerSettings,

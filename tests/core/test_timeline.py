@@ -4,7 +4,10 @@ from random import Random
 
 import numpy as np
 import pytest
-from core_helpers import (
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from msgspec.structs import replace
+from support.core import (
     LOOP_START,
     MIXED,
     SECOND,
@@ -21,9 +24,6 @@ from core_helpers import (
     sensor_noise,
     state_at,
 )
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from msgspec.structs import replace
 
 from cpcbl_team.collaboration import BELIEF_SERVES_BACK_NS
 from cpcbl_team.config import LocalizerSettings, SensorSettings, Variant

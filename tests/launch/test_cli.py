@@ -7,11 +7,11 @@ import sys
 from pathlib import Path
 
 import pytest
-from log_helpers import write_log
-from process_helpers import cpcbl_team, eventually, patient_up, pids_of
+from support.logs import write_log
+from support.processes import cpcbl_team, eventually, patient_up, pids_of
 
-from cpcbl_launch.processes import PROGRAM
-from cpcbl_launch.up import free_endpoint
+from cpcbl_launch.run.processes import PROGRAM
+from cpcbl_launch.run.up import free_endpoint
 from cpcbl_transport import topics
 from cpcbl_transport.messages import Status, decode
 from cpcbl_transport.zenoh_bus import open_router

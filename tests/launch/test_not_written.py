@@ -7,15 +7,15 @@ import sys
 from pathlib import Path
 
 import pytest
-from bus_helpers import SECOND, standing
-from log_helpers import write_log
-from process_helpers import cpcbl_team
+from support.buses import SECOND, standing
+from support.logs import write_log
+from support.processes import cpcbl_team
 
-from cpcbl_launch.evaluation import simulate
 from cpcbl_launch.options import file_for, folder_for
-from cpcbl_launch.processes import PROGRAM
 from cpcbl_launch.reporting.recording import Recording, read_recording
-from cpcbl_launch.supervisor import ProcessSpec, Supervisor
+from cpcbl_launch.run.processes import PROGRAM
+from cpcbl_launch.run.supervisor import ProcessSpec, Supervisor
+from cpcbl_launch.simulation.in_process import simulate
 from cpcbl_launch.team_file import TeamFileError, builtin, load_team, save_resolved
 from cpcbl_team.config import RobotSettings, Team
 from cpcbl_transport import topics

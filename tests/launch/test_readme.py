@@ -6,8 +6,8 @@ import tomllib
 from pathlib import Path
 
 import pytest
-from log_helpers import write_log
-from process_helpers import cpcbl_team
+from support.logs import write_log
+from support.processes import cpcbl_team
 
 from cpcbl_launch.team_file import parse_team
 from cpcbl_team.config import (

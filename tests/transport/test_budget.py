@@ -7,9 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from bus_helpers import MS, SECOND, examples
 from hypothesis import given
 from hypothesis import strategies as st
+from support.buses import MS, SECOND, examples
 
 from cpcbl_team.config import BudgetSettings
 from cpcbl_transport.budget import BYTES_WINDOW_S, LEAST_BYTES, Budget

@@ -8,11 +8,11 @@ from typing import NamedTuple
 
 import pytest
 import zenoh
-from bus_helpers import Ear, examples, matches, wait_until
 from hypothesis import given
 from hypothesis import strategies as st
+from support.buses import Ear, examples, matches, wait_until
 
-from cpcbl_launch.up import free_endpoint
+from cpcbl_launch.run.up import free_endpoint
 from cpcbl_transport.bus import Bus, MemoryHub
 from cpcbl_transport.topics import Qos
 from cpcbl_transport.zenoh_bus import BusError, open_bus, open_router

@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from bus_helpers import SECOND, examples
 from hypothesis import example, given
 from hypothesis import strategies as st
 from msgspec.structs import replace
+from support.buses import SECOND, examples
 
 from cpcbl_team.inputs import Belief, Fix
 from cpcbl_transport import topics
@@ -21,6 +21,7 @@ from cpcbl_transport.compact import (
     encode_help,
     help_bytes,
 )
+from cpcbl_transport.link_size import sent_bytes
 from cpcbl_transport.messages import (
     FUTURE_NS,
     LARGEST_PAYLOAD,
@@ -29,7 +30,6 @@ from cpcbl_transport.messages import (
     Refusal,
     refusal,
 )
-from cpcbl_transport.overhead import sent_bytes
 
 NOW = 1_700_000_000 * SECOND
 PLANE = (0.04, 0.01, 0.09)

@@ -8,10 +8,10 @@ from typing import Any, NamedTuple
 
 import pytest
 import zenoh
-from bus_helpers import Ear, robot_at, team_of, wait_until
 from msgspec.structs import replace
+from support.buses import Ear, robot_at, team_of, wait_until
 
-from cpcbl_launch.up import free_endpoint
+from cpcbl_launch.run.up import free_endpoint
 from cpcbl_team.config import GuardSettings, Team, TransportSettings
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus

@@ -3,9 +3,9 @@
 from typing import NamedTuple
 
 import pytest
-from bus_helpers import examples, matches
 from hypothesis import given
 from hypothesis import strategies as st
+from support.buses import examples, matches
 
 from cpcbl_transport.key_tree import KeyTree
 

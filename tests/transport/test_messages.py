@@ -5,9 +5,9 @@ from typing import Any, get_args
 
 import msgspec
 import pytest
-from bus_helpers import SECOND, examples
 from hypothesis import given
 from hypothesis import strategies as st
+from support.buses import SECOND, examples
 
 from cpcbl_team.config import OdometrySettings, PositionSensor, SensorSettings, Start
 from cpcbl_team.inputs import Odometry, Position, Sighting, Sightings

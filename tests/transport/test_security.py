@@ -9,8 +9,9 @@ from typing import Any
 
 import pytest
 import zenoh
-from bus_helpers import Ear, wait_until
-from key_helpers import (
+from msgspec.structs import replace
+from support.buses import Ear, wait_until
+from support.keys import (
     FIELD,
     OPERATOR,
     PATIENCE_S,
@@ -28,10 +29,9 @@ from key_helpers import (
     shown_by,
     with_credentials,
 )
-from msgspec.structs import replace
-from process_helpers import eventually
+from support.processes import eventually
 
-from cpcbl_launch.up import free_endpoint
+from cpcbl_launch.run.up import free_endpoint
 from cpcbl_team.config import Team
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus

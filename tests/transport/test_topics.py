@@ -4,7 +4,7 @@ from typing import get_args
 
 import pytest
 import zenoh
-from bus_helpers import matches
+from support.buses import matches
 
 from cpcbl_team.collaboration import LOWEST_TIER, tiers_heard
 from cpcbl_team.config import CollaborationSettings

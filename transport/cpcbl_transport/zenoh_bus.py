@@ -19,8 +19,8 @@ from typing import Any
 import zenoh
 
 from cpcbl_transport.bus import Handle, Publisher, Receive, Watch
-from cpcbl_transport.handshake import why_not
 from cpcbl_transport.security import Credentials
+from cpcbl_transport.tls_diagnosis import why_not
 from cpcbl_transport.topics import Qos, namespace
 from cpcbl_transport.zenoh_config import NO_GUARDS, client_config, router_config
 

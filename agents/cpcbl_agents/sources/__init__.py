@@ -4,7 +4,7 @@ from collections import Counter
 from collections.abc import Sequence
 from typing import Protocol
 
-from cpcbl_agents.eyes import Picture
+from cpcbl_agents.detector import Picture
 from cpcbl_team.inputs import Odometry, Sightings
 from cpcbl_transport.messages import Frame
 

@@ -22,7 +22,7 @@ from urllib.parse import urlsplit
 import cv2
 import numpy as np
 
-from cpcbl_agents.eyes import Picture
+from cpcbl_agents.detector import Picture
 from cpcbl_agents.sources import OwnCamera
 from cpcbl_agents.vision.camera import Pixels
 from cpcbl_team.config import CameraSettings

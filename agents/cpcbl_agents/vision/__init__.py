@@ -1,6 +1,6 @@
 """Landmarks and teammates in camera frames. Raises ValueError where OpenCV is not installed."""
 
-from cpcbl_agents.eyes import NEEDS_OPENCV
+from cpcbl_agents.detector import NEEDS_OPENCV
 
 try:
     import cv2

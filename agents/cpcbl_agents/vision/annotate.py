@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from cpcbl_agents.vision.camera import Floats, Pixels
-from cpcbl_agents.vision.glimpses import Doubt, Glimpses
+from cpcbl_agents.vision.detections import Doubt, Glimpses
 from cpcbl_team.inputs import Sighting
 
 Colour = tuple[int, int, int]

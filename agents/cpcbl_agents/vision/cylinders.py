@@ -11,7 +11,9 @@ from typing import NamedTuple
 
 from cpcbl_agents.vision.camera import Camera, Pixels
 from cpcbl_agents.vision.colours import Blob, Colours
-from cpcbl_agents.vision.glimpses import Doubt, Found, Glimpses
+from cpcbl_agents.vision.cylinder_fit import Look, Verdict, best, reason, verdict
+from cpcbl_agents.vision.detections import Doubt, Found, Glimpses
+from cpcbl_agents.vision.duplicates import without_twins
 from cpcbl_agents.vision.outlines import (
     GAP_PX,
     Candidate,
@@ -23,8 +25,6 @@ from cpcbl_agents.vision.outlines import (
 )
 from cpcbl_agents.vision.panorama import panorama_of
 from cpcbl_agents.vision.silhouette import FOOT, TOP, WIDTH, Shape
-from cpcbl_agents.vision.twins import without_twins
-from cpcbl_agents.vision.verdicts import Look, Verdict, best, reason, verdict
 from cpcbl_team.config import Bands, Team
 from cpcbl_team.geometry import wrap_angle
 from cpcbl_team.inputs import Sighting

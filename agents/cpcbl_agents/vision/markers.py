@@ -10,8 +10,8 @@ import numpy as np
 
 from cpcbl_agents.vision.camera import Camera, Floats, Pixels
 from cpcbl_agents.vision.codes import Codes
+from cpcbl_agents.vision.detections import Doubt, Found, Glimpses
 from cpcbl_agents.vision.edges import corners, steps
-from cpcbl_agents.vision.glimpses import Doubt, Found, Glimpses
 from cpcbl_agents.vision.poses import Fit, fitted
 from cpcbl_team.config import Side, Team
 from cpcbl_team.inputs import Sighting

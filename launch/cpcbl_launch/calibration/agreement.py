@@ -28,7 +28,7 @@ from cpcbl_launch.calibration.statistics import (
     spread,
     stretches,
 )
-from cpcbl_team.metrics import Floats
+from cpcbl_launch.reporting.metrics import Floats
 
 BINS_M = (0.0, 2.0, 4.0, math.inf)
 LEAST_IN_BIN = 10

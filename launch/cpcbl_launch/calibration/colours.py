@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cpcbl_launch.calibration.statistics import Mask
+from cpcbl_launch.reporting.metrics import Floats
 from cpcbl_team.config import Colour
-from cpcbl_team.metrics import Floats
 
 HUES = 180
 OUTER = 0.02  # share of the pixels at each end of a range that do not count: edges, glints

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from cpcbl_launch.calibration.statistics import GROSS, LEAST_ROWS, Integers
-from cpcbl_team.metrics import Floats
+from cpcbl_launch.reporting.metrics import Floats
 
 LAGS_S = (0.05, 0.1, 0.2, 0.3, 0.5, 0.8, 1.2, 2.0, 3.0, 5.0, 8.0, 12.0, 20.0)
 

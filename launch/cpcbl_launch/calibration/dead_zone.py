@@ -23,7 +23,7 @@ from cpcbl_launch.calibration.windows import (
     Corrections,
     odometry_rows,
 )
-from cpcbl_team.metrics import Floats
+from cpcbl_launch.reporting.metrics import Floats
 
 LEAST_SPEEDS_M_S = np.arange(0.0, 0.0501, 0.001)
 SLIPPED_M = 0.1  # a way that errs more than this in a window is no matter of a dead zone

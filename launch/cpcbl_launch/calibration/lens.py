@@ -15,7 +15,7 @@ import numpy as np
 from cpcbl_launch.calibration.board import Board, Corners, found
 from cpcbl_launch.calibration.pictures import Picture
 from cpcbl_launch.calibration.statistics import Estimate
-from cpcbl_team.metrics import Floats
+from cpcbl_launch.reporting.metrics import Floats
 
 LEAST_PICTURES = 4
 OUTLYING, OUTLYING_PX = 3.0, 0.5  # times the median error, and by at least so much

@@ -10,10 +10,10 @@ import numpy as np
 from cpcbl_agents.sources import mrclam
 from cpcbl_agents.sources.mrclam import LogError
 from cpcbl_launch.calibration.robot_log import RobotLog
+from cpcbl_launch.reporting.metrics import Floats
 from cpcbl_launch.reporting.recording import read_recording
 from cpcbl_team.config import Landmark
 from cpcbl_team.inputs import Odometry, Sightings
-from cpcbl_team.metrics import Floats
 
 RobotLogs = dict[str, list[RobotLog]]
 

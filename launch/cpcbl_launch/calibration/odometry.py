@@ -32,7 +32,7 @@ from cpcbl_launch.calibration.windows import (
     OdometryRows,
     odometry_rows,
 )
-from cpcbl_team.metrics import Floats
+from cpcbl_launch.reporting.metrics import Floats
 
 LEAST_MOTION = 0.02  # m or rad in a window; less tells nothing of scales
 DELAYS_S = np.arange(0.0, 1.001, 0.02)

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from cpcbl_launch.calibration.statistics import Mask
-from cpcbl_team.metrics import Floats
+from cpcbl_launch.reporting.metrics import Floats
 
 LONGEST_GAP_S = 1.0  # truth is interpolated only between rows as near as this
 

@@ -28,7 +28,7 @@ from cpcbl_launch.calibration.statistics import (
     told,
     variance_parts,
 )
-from cpcbl_team.metrics import Floats
+from cpcbl_launch.reporting.metrics import Floats
 from cpcbl_team.sensors import LEAST_COSINE
 
 NUDGE_S = 0.01

@@ -17,10 +17,10 @@ from msgspec.structs import replace
 from cpcbl_agents.sources.mrclam import LogError
 from cpcbl_launch.calibration.logs import Placed, placed
 from cpcbl_launch.calibration.robot_log import RobotLog, wrapped
+from cpcbl_launch.reporting.metrics import Floats
 from cpcbl_launch.reporting.recording import read_recording
 from cpcbl_team.config import CameraSettings, Team
 from cpcbl_team.inputs import Sightings
-from cpcbl_team.metrics import Floats
 
 APART_S = 100.0  # pictures have no time; so far apart nothing is taken for alike, or a motion
 STANDING_S = 0.1  # for so long before and after a picture all stand still
@@ -105,7 +105,7 @@ def photographed(
     progress: Callable[[float], None] = lambda done: None,
 ) -> Looked:
     """What a robot's eyes see in pictures at known poses. Raises ValueError. Needs OpenCV."""
-    from cpcbl_agents.vision.eyes import CameraEyes
+    from cpcbl_agents.vision.detector import CameraEyes
     from cpcbl_launch.calibration.pictures import read_picture
 
     rows = read_poses(poses, team)

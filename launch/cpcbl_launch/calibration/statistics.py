@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from cpcbl_team.metrics import Floats
+from cpcbl_launch.reporting.metrics import Floats
 
 Mask = NDArray[np.bool_]
 Integers = NDArray[np.int64]

@@ -11,7 +11,7 @@ import numpy as np
 
 from cpcbl_launch.calibration.robot_log import LONGEST_GAP_S, RobotLog
 from cpcbl_launch.calibration.statistics import Integers, stretches
-from cpcbl_team.metrics import Floats
+from cpcbl_launch.reporting.metrics import Floats
 
 WINDOW_S = 2.0
 NOISE_WINDOWS_S = (1.0, 2.0, 4.0, 8.0, 16.0)

@@ -5,8 +5,8 @@ from typing import TYPE_CHECKING, Annotated, Optional
 
 import typer
 
-from cpcbl_launch.containers import BASE_IMAGE as BASE_IMAGE
-from cpcbl_launch.containers import BASE_VARIABLE
+from cpcbl_launch.run.containers import BASE_IMAGE as BASE_IMAGE
+from cpcbl_launch.run.containers import BASE_VARIABLE
 
 if TYPE_CHECKING:
     from cpcbl_team.config import Team

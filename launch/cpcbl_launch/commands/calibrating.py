@@ -82,7 +82,7 @@ def camera(
     from rich.console import Console
 
     from cpcbl_launch.options import encoded, file_for, must_draw, must_have_opencv, not_written
-    from cpcbl_launch.show import progress_bar
+    from cpcbl_launch.views.run import progress_bar
 
     must_have_opencv("calibrate camera")
     from cpcbl_launch.calibration.board import parsed_board, write_board
@@ -245,7 +245,7 @@ def _photographed(
     """What a robot of the team file sees in pictures. Raises ValueError."""
     from cpcbl_launch.calibration.sights import photographed, viewer
     from cpcbl_launch.options import must_have_opencv
-    from cpcbl_launch.show import progress_bar
+    from cpcbl_launch.views.run import progress_bar
 
     must_have_opencv("calibrate sensor --pictures")
     if poses is None:

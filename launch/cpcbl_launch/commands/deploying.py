@@ -17,8 +17,8 @@ def compose(
     ] = None,
 ) -> None:
     """Print a team's compose file: for docker-compose, docker compose, a swarm."""
-    from cpcbl_launch.containers.deployment import deployed
     from cpcbl_launch.options import file_for, not_written
+    from cpcbl_launch.run.containers.deployment import deployed
 
     if output is not None:
         file_for("--output", output)

@@ -14,7 +14,7 @@ from cpcbl_launch.commands.arguments import names_in, say_not_written
 if TYPE_CHECKING:
     from rich.console import RenderableType
 
-    from cpcbl_launch.experiments.results import Experiment
+    from cpcbl_launch.lab.experiments.results import Experiment
 
 experiment_app = typer.Typer(
     help="The paper's experiments on a simulated field, and what real processes take: a table,"
@@ -35,7 +35,7 @@ def table1(
     seeds: Seeds = 20, jobs: Jobs = None, output: Output = Path(), as_json: AsJson = False
 ) -> None:
     """One robot, odometry alone and landmarks A, B, C, beside table 1 of the paper."""
-    from cpcbl_launch.experiments.table1 import EXPERIMENT
+    from cpcbl_launch.lab.experiments.table1 import EXPERIMENT
 
     conduct(EXPERIMENT, seeds, jobs, output, as_json)
 
@@ -45,7 +45,7 @@ def figure7(
     seeds: Seeds = 5, jobs: Jobs = None, output: Output = Path(), as_json: AsJson = False
 ) -> None:
     """A navigator, alone and helped by an observer, A-F, beside figure 7 of the paper."""
-    from cpcbl_launch.experiments.figure7 import EXPERIMENT
+    from cpcbl_launch.lab.experiments.figure7 import EXPERIMENT
 
     conduct(EXPERIMENT, seeds, jobs, output, as_json)
 
@@ -55,7 +55,7 @@ def figure7_cameras(
     seeds: Seeds = 5, jobs: Jobs = None, output: Output = Path(), as_json: AsJson = False
 ) -> None:
     """The same from pixels: a cheap camera on the navigator, a sharper one on the observer."""
-    from cpcbl_launch.experiments.figure7_cameras import EXPERIMENT
+    from cpcbl_launch.lab.experiments.figure7_cameras import EXPERIMENT
     from cpcbl_launch.options import must_have_opencv
 
     must_have_opencv("experiment figure7-cameras")
@@ -67,7 +67,7 @@ def circular_vs_oval(
     seeds: Seeds = 10, jobs: Jobs = None, output: Output = Path(), as_json: AsJson = False
 ) -> None:
     """All four variants: accuracy, consistency, cost."""
-    from cpcbl_launch.experiments.variants import EXPERIMENT
+    from cpcbl_launch.lab.experiments.variants import EXPERIMENT
 
     conduct(EXPERIMENT, seeds, jobs, output, as_json)
 
@@ -81,7 +81,7 @@ def one_way_vs_both(
     robots: Annotated[str, typer.Option(help="Sizes of the teams.")] = "2,5,10,20",
 ) -> None:
     """Accuracy against bytes in teams of 2 to 20, with observers that are wrong."""
-    from cpcbl_launch.experiments.directions import of_sizes
+    from cpcbl_launch.lab.experiments.directions import of_sizes
 
     sizes = [int(s) if s.strip().isdecimal() else 0 for s in robots.split(",")]
     conduct(of_sizes(sizes), seeds, jobs, output, as_json)
@@ -99,16 +99,18 @@ def budget(
     as_json: AsJson = False,
 ) -> None:
     """A real log: accuracy against bytes, by value and budget, by fixed intervals, all of it."""
-    from cpcbl_launch import logs
-    from cpcbl_launch.experiments import budget as experiment
-    from cpcbl_launch.experiments.pictures import draw_budget
+    from cpcbl_launch.lab.experiments import budget as experiment
+    from cpcbl_launch.lab.experiments.pictures import draw_budget
     from cpcbl_launch.options import must_draw
+    from cpcbl_launch.run import logged_team
     from cpcbl_launch.team_file import load_team
 
     must_draw("experiment")
     _must_be_writable(output, "budget")
-    logged = logs.shortened(logs.on_log(load_team(logs.builtin_for(data)), data), duration)
-    logged = logged._replace(team=logs.blinded(logged.team, names_in(blind)))
+    logged = logged_team.shortened(
+        logged_team.on_log(load_team(logged_team.builtin_for(data)), data), duration
+    )
+    logged = logged._replace(team=logged_team.blinded(logged.team, names_in(blind)))
     with _progress("budget", len(experiment.cases())) as done:
         result = experiment.curve(logged, jobs, done)
     _written(result, experiment.tables(result), output, as_json, draw_budget)
@@ -119,8 +121,8 @@ def liars(
     seeds: Seeds = 10, jobs: Jobs = None, output: Output = Path(), as_json: AsJson = False
 ) -> None:
     """One observer of several lies for a while: what it does to the team, and when it is found."""
-    from cpcbl_launch.experiments import liars as experiment
-    from cpcbl_launch.experiments.pictures import draw_liars
+    from cpcbl_launch.lab.experiments import liars as experiment
+    from cpcbl_launch.lab.experiments.pictures import draw_liars
     from cpcbl_launch.options import must_draw
 
     must_draw("experiment")
@@ -144,7 +146,7 @@ def eyes(
     must_draw("experiment")
     must_have_opencv("experiment eyes")
     _must_be_writable(output, "eyes")
-    from cpcbl_launch.experiments import eyes as experiment
+    from cpcbl_launch.lab.experiments import eyes as experiment
 
     with _progress("eyes", -(-frames // experiment.CHUNK), "batches") as done:
         result = experiment.measured(frames, seed, jobs or os.cpu_count() or 1, done)
@@ -168,7 +170,7 @@ def pictures(
     from cpcbl_launch.options import must_have_opencv
 
     must_have_opencv("experiment pictures")
-    from cpcbl_launch.experiments import real_pictures
+    from cpcbl_launch.lab.experiments import real_pictures
 
     _must_be_writable(output, f"pictures-{real_pictures.set_named(name).stem}", drawn=False)
     result = real_pictures.measured(name, folder)
@@ -182,7 +184,7 @@ def latency(
     as_json: AsJson = False,
 ) -> None:
     """Sighting on one robot -> belief of its teammate, beside a bare put: real processes, Zenoh."""
-    from cpcbl_launch.experiments import latency
+    from cpcbl_launch.lab.experiments import latency
 
     _must_be_writable(output, "latency", drawn=False)
     with _progress("latency", latency.UNMEASURED + sightings, "sightings") as done:
@@ -200,8 +202,8 @@ def processes(
     as_json: AsJson = False,
 ) -> None:
     """Real processes that keep 10 Hz: CPU and memory a robot, beside an all-to-all broadcast."""
-    from cpcbl_launch.experiments import processes
-    from cpcbl_launch.usage import must_measure
+    from cpcbl_launch.lab.experiments import processes
+    from cpcbl_launch.run.usage import must_measure
 
     must_measure("experiment processes")
     _must_be_writable(output, "processes", drawn=False)
@@ -215,7 +217,7 @@ def conduct(
     experiment: "Experiment", seeds: int, jobs: int | None, output: Path, as_json: bool
 ) -> None:
     """Runs, writes and shows one experiment. Raises ValueError for what the user can mend."""
-    from cpcbl_launch.experiments.runs import run_all
+    from cpcbl_launch.lab.experiments.runs import run_all
     from cpcbl_launch.options import must_draw
 
     must_draw("experiment")

@@ -31,11 +31,11 @@ def chaos(
     """
     from rich.console import Console
 
-    from cpcbl_launch.chaos import show
-    from cpcbl_launch.chaos.checks import as_data
-    from cpcbl_launch.chaos.run import chosen, run_all
-    from cpcbl_launch.chaos.scenario import Setting
-    from cpcbl_launch.chaos.scenarios import SCENARIOS
+    from cpcbl_launch.lab.chaos import show
+    from cpcbl_launch.lab.chaos.checks import as_data
+    from cpcbl_launch.lab.chaos.run import chosen, run_all
+    from cpcbl_launch.lab.chaos.scenario import Setting
+    from cpcbl_launch.lab.chaos.scenarios import SCENARIOS
     from cpcbl_launch.options import encoded, file_for, not_written
 
     if listed or not scenarios:

@@ -77,11 +77,11 @@ def evaluate_mrclam(
     """Five robots of a real log (UTIAS MRCLAM) against its ground truth."""
     from rich.console import Console
 
-    from cpcbl_launch import logs as real_logs
-    from cpcbl_launch.evaluation import Choice, chosen, evaluated
     from cpcbl_launch.options import encoded, folder_for, not_written
     from cpcbl_launch.reporting.tum import export_tum
-    from cpcbl_launch.show import print_report, progress_bar
+    from cpcbl_launch.run import logged_team as real_logs
+    from cpcbl_launch.simulation.in_process import Choice, chosen, evaluated
+    from cpcbl_launch.views.run import print_report, progress_bar
 
     team = load(team_file or real_logs.builtin_for(data))
     choice = Choice(
@@ -146,7 +146,7 @@ def calibrate(
     from cpcbl_launch.calibration.show import print_calibration
     from cpcbl_launch.calibration.team_text import base_text, team_text
     from cpcbl_launch.options import encoded, file_for, must_draw, not_written
-    from cpcbl_launch.show import progress_bar
+    from cpcbl_launch.views.run import progress_bar
 
     file_for("--output", output)
     if picture is not None:
@@ -199,13 +199,13 @@ def simulate(
     """
     from rich.console import Console
 
-    from cpcbl_launch.evaluation import Choice, chosen
+    from cpcbl_launch.lab.scaling.measure import DURATION_S, Scale, measured, parsed_sizes
+    from cpcbl_launch.lab.scaling.show import print_scale
     from cpcbl_launch.options import encoded, file_for, must_draw, must_see, not_written
     from cpcbl_launch.reporting.recorder import Report
-    from cpcbl_launch.scale.measure import DURATION_S, Scale, measured, parsed_sizes
-    from cpcbl_launch.scale.show import print_scale
-    from cpcbl_launch.show import print_report, progress_bar
-    from cpcbl_launch.up import Run, simulate_run
+    from cpcbl_launch.run.up import Run, simulate_run
+    from cpcbl_launch.simulation.in_process import Choice, chosen
+    from cpcbl_launch.views.run import print_report, progress_bar
 
     budgets = Choice(
         bytes_per_s=bytes_per_s,
@@ -235,7 +235,7 @@ def simulate(
     if isinstance(result, Report):
         lost |= result.not_written
     elif (drawing := picture) is not None:
-        from cpcbl_launch.scale.picture import draw_scale
+        from cpcbl_launch.lab.scaling.picture import draw_scale
 
         lost |= not_written(drawing, lambda: draw_scale(result, drawing))
     if as_json:

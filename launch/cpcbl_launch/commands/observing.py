@@ -67,9 +67,9 @@ def observer(
 
     from cpcbl_agents.clock import Clock
     from cpcbl_agents.process import Stop
-    from cpcbl_launch.observer import Wish, joined, place_in, places_in, presets, visit
     from cpcbl_launch.options import encoded
-    from cpcbl_launch.show import print_visit
+    from cpcbl_launch.run.observer import Wish, joined, place_in, places_in, presets, visit
+    from cpcbl_launch.views.run import print_visit
 
     if duration is not None and not duration > 0.0:
         raise ValueError(f"--for {duration:g}: more than 0 seconds")
@@ -79,9 +79,9 @@ def observer(
     console, stop = Console(stderr=as_json), Stop(parent)
     endpoints = connect or team.transport.connect
     if container:
-        from cpcbl_launch.containers.guest import SENSOR_INSIDE, observe
-        from cpcbl_launch.containers.image import image_for
-        from cpcbl_launch.containers.launch import progress_on
+        from cpcbl_launch.run.containers.guest import SENSOR_INSIDE, observe
+        from cpcbl_launch.run.containers.image import image_for
+        from cpcbl_launch.run.containers.launch import progress_on
 
         own = None if sensor in presets() else Path(sensor)
         arguments = _options(

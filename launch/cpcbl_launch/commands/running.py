@@ -88,8 +88,6 @@ def up(
     from rich.console import Console
 
     from cpcbl_agents.process import Stop
-    from cpcbl_launch import logs as real_logs
-    from cpcbl_launch.evaluation import Choice, chosen
     from cpcbl_launch.options import (
         check_duration,
         check_speed,
@@ -99,8 +97,8 @@ def up(
         must_draw,
         must_see,
     )
-    from cpcbl_launch.show import LiveTable, print_report
-    from cpcbl_launch.up import (
+    from cpcbl_launch.run import logged_team as real_logs
+    from cpcbl_launch.run.up import (
         LEAST_S,
         SIMULATED_S,
         Launch,
@@ -110,6 +108,8 @@ def up(
         listening,
         run_team,
     )
+    from cpcbl_launch.simulation.in_process import Choice, chosen
+    from cpcbl_launch.views.run import LiveTable, print_report
 
     check_speed(speed)
     if duration is not None:
@@ -152,7 +152,7 @@ def up(
     if not containers:
         must_see(run.team, run.team.robots if run.here is None else run.here, field=True)
     else:
-        from cpcbl_launch.containers.launch import InContainers, progress_on
+        from cpcbl_launch.run.containers.launch import InContainers, progress_on
 
         launch = partial(InContainers, image=image, base=base_image, said=progress_on(console))
     title = f"team {team.name}, {len(run.team.robots)} robots, {speed:g} x real time"
@@ -182,8 +182,8 @@ def robot(
     """Run one robot, on any machine, until SIGINT, SIGTERM or SIGHUP."""
     from cpcbl_agents.clock import Clock
     from cpcbl_agents.process import Stop, run_robot
+    from cpcbl_launch.lab.faulty_robot import Lie, lying
     from cpcbl_launch.options import must_see
-    from cpcbl_launch.simulation.liar import Lie, lying
     from cpcbl_launch.team_file import TeamFileError
 
     team = load(team_file)
@@ -262,7 +262,7 @@ def router(
 ) -> None:
     """Run the team's Zenoh router, on any machine, until SIGINT, SIGTERM or SIGHUP."""
     from cpcbl_agents.process import Stop
-    from cpcbl_launch.router import run_router, team_router, written_config
+    from cpcbl_launch.run.router import run_router, team_router, written_config
     from cpcbl_transport.zenoh_bus import read_router_config
 
     if (file is None) == (config is None):

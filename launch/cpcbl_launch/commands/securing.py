@@ -44,8 +44,8 @@ def keys(
     """
     from rich.console import Console
 
-    from cpcbl_launch.identities.folder import Wish, make_keys
-    from cpcbl_launch.identities.show import drawn
+    from cpcbl_launch.keys.folder import Wish, make_keys
+    from cpcbl_launch.keys.show import drawn
     from cpcbl_launch.options import encoded
     from cpcbl_launch.team_file import key_folder
 

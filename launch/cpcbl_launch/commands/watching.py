@@ -42,8 +42,8 @@ def traffic(
 
     from cpcbl_agents.process import Stop
     from cpcbl_launch.options import encoded
-    from cpcbl_launch.traffic.show import TrafficView, drawn
-    from cpcbl_launch.traffic.watch import Watch, watch_team
+    from cpcbl_launch.views.traffic.show import TrafficView, drawn
+    from cpcbl_launch.views.traffic.watch import Watch, watch_team
     from cpcbl_team.config import TransportSettings
     from cpcbl_transport.security import Identity, Link, link_of
     from cpcbl_transport.topics import Role
@@ -99,8 +99,8 @@ def look(
     """
     from rich.console import Console
 
-    from cpcbl_launch.looking.report import LookReport, print_look, reported, written
     from cpcbl_launch.options import encoded, folder_for, must_see
+    from cpcbl_launch.views.frames.report import LookReport, print_look, reported, written
 
     team = load(team_file)
     if robot not in team.robots:
@@ -126,7 +126,7 @@ def _looks(
 ) -> Iterator[tuple[str, str, "Look"]]:
     """The frames of a running robot: as they are called, as their files are called, themselves."""
     from cpcbl_agents.process import Stop
-    from cpcbl_launch.looking.watch import looks_of
+    from cpcbl_launch.views.frames.watch import looks_of
     from cpcbl_transport.security import Identity, link_of
     from cpcbl_transport.topics import Role
 
@@ -139,7 +139,7 @@ def _looks(
 def _at(robot: str, team: "Team", pictures: Path) -> Iterator[tuple[str, str, "Look"]]:
     """The same of picture files."""
     from cpcbl_agents.sources.camera import pictures_in
-    from cpcbl_launch.looking.watch import looks_at
+    from cpcbl_launch.views.frames.watch import looks_at
 
     if not pictures.exists():
         raise ValueError(f"--pictures {pictures}: no such file or folder")

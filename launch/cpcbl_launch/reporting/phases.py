@@ -9,8 +9,8 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from cpcbl_launch.reporting.metrics import Floats, Trajectory, compared, score, seconds
 from cpcbl_launch.reporting.recorder import Effect, GuestReport, Phase, Recorder, RobotReport
-from cpcbl_team.metrics import Floats, Trajectory, compared, score, seconds
 
 AWAY_S = 2.0  # who says nothing of itself for longer was away
 MOST_GUESTS = 100  # as many as a team may let in; more is garbage

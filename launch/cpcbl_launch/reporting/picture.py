@@ -6,9 +6,9 @@ from types import MappingProxyType
 
 import matplotlib as mpl
 
+from cpcbl_launch.reporting.metrics import Floats, position_errors
 from cpcbl_launch.reporting.recorder import Recorder
 from cpcbl_team.config import Team
-from cpcbl_team.metrics import Floats, position_errors
 
 mpl.use("Agg")
 

@@ -8,6 +8,7 @@ from collections.abc import Iterable, Mapping, Sequence
 import msgspec
 import numpy as np
 
+from cpcbl_launch.reporting.encoded_log import Kept
 from cpcbl_launch.reporting.flows import (
     FlowReport,
     SpendingReport,
@@ -15,13 +16,20 @@ from cpcbl_launch.reporting.flows import (
     summed_flows,
     summed_spending,
 )
-from cpcbl_launch.reporting.kept import Kept
-from cpcbl_launch.reporting.standing import TrustReport, trust_of
-from cpcbl_team.metrics import Floats, Samples, Score, Trajectory, compared, score, seconds
+from cpcbl_launch.reporting.metrics import (
+    Floats,
+    Samples,
+    Score,
+    Trajectory,
+    compared,
+    score,
+    seconds,
+)
+from cpcbl_launch.reporting.trust_report import TrustReport, trust_of
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus
+from cpcbl_transport.decoding import read
 from cpcbl_transport.messages import Refusal, Status, Track, Truth, Truths
-from cpcbl_transport.reading import read
 
 
 class LearnedReport(msgspec.Struct, frozen=True, kw_only=True):

@@ -22,14 +22,14 @@ from mcap.writer import Writer
 from cpcbl_agents.sensing import SensorInput
 from cpcbl_agents.sources.mrclam import LogError
 from cpcbl_launch.reporting.foxglove import PICTURE, PICTURE_SCHEMA, picture
+from cpcbl_launch.reporting.metrics import Floats
 from cpcbl_launch.reporting.recorder import truth_rows
 from cpcbl_team.config import Team
 from cpcbl_team.inputs import Odometry, Position, Sightings
-from cpcbl_team.metrics import Floats
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus
+from cpcbl_transport.decoding import read
 from cpcbl_transport.messages import Look, Message, Refusal, Truths
-from cpcbl_transport.reading import read
 
 log = logging.getLogger(__name__)
 

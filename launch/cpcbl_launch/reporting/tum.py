@@ -4,7 +4,7 @@ import math
 from collections.abc import Mapping
 from pathlib import Path
 
-from cpcbl_team.metrics import Floats, Stamps, Trajectory, compared
+from cpcbl_launch.reporting.metrics import Floats, Stamps, Trajectory, compared
 
 
 def export_tum(

@@ -18,7 +18,7 @@ from cpcbl_team.inputs import Sightings
 from cpcbl_transport.messages import Body, Drive, Frame, Truth, Truths
 
 if TYPE_CHECKING:
-    from cpcbl_launch.simulation.cameras import Cameras
+    from cpcbl_launch.simulation.camera.cameras import Cameras
 
 _GUEST_SEED = 2**31  # no robot of a team file has this number
 
@@ -169,7 +169,7 @@ def _cameras(team: Team, seed: int) -> "Cameras | None":
     """Of the team's simulated robots; OpenCV is loaded for nobody else."""
     if not team.renders:
         return None
-    from cpcbl_launch.simulation.cameras import Cameras
+    from cpcbl_launch.simulation.camera.cameras import Cameras
 
     return Cameras(team, seed)
 

@@ -16,15 +16,15 @@ from msgspec.structs import replace
 
 from cpcbl_agents.clock import Clock
 from cpcbl_agents.sensing import SensorInput
-from cpcbl_launch.simulation.bodies import Bodies
 from cpcbl_launch.simulation.field import SimulatedField
+from cpcbl_launch.simulation.guest_bodies import Bodies
 from cpcbl_launch.team_file import not_an_endpoint
 from cpcbl_team.config import Team
 from cpcbl_team.inputs import Odometry
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus, Handle, Publisher
+from cpcbl_transport.decoding import read
 from cpcbl_transport.messages import Drive, Join, Refusal, encode, refusal
-from cpcbl_transport.reading import read
 
 log = logging.getLogger(__name__)
 

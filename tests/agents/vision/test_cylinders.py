@@ -5,12 +5,12 @@ import math
 import msgspec
 import numpy as np
 import pytest
-from field_pictures import HERE, USUAL, glimpsed, mirrored, picture, polar, post, team_of
+from support.field_pictures import HERE, USUAL, glimpsed, mirrored, picture, polar, post, team_of
 
 from cpcbl_agents.vision.camera import Camera
 from cpcbl_agents.vision.cylinders import Cylinders, Polar, kinds, seen_from_robot
-from cpcbl_agents.vision.glimpses import Glimpses
-from cpcbl_launch.simulation.render import Light, Standing
+from cpcbl_agents.vision.detections import Glimpses
+from cpcbl_launch.simulation.camera.render import Light, Standing
 from cpcbl_team.config import CameraSettings, Cylinder, Team
 from cpcbl_team.geometry import Pose2, wrap_angle
 

@@ -6,11 +6,11 @@ import math
 import cv2
 import numpy as np
 import pytest
-from marker_helpers import CARRIED, looked, off, picture, standing, team
 from msgspec.structs import replace
+from support.markers import CARRIED, looked, off, picture, standing, team
 
-from cpcbl_agents.vision.glimpses import Glimpses
-from cpcbl_launch.simulation.render import Light, Standing
+from cpcbl_agents.vision.detections import Glimpses
+from cpcbl_launch.simulation.camera.render import Light, Standing
 from cpcbl_team.config import CameraSettings, MarkerFamily
 
 CAMERA = CameraSettings()

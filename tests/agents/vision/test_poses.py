@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from marker_helpers import SIDES, seen_at
 from msgspec.structs import replace
+from support.markers import SIDES, seen_at
 
 from cpcbl_agents.vision.camera import Camera, Floats
 from cpcbl_agents.vision.poses import ANGLES, CORNER_SHARE, NARROW, fitted

@@ -1,0 +1,50 @@
+"""What is found at one place by two names, or by one name at two places, cannot be so."""
+
+from collections import defaultdict
+from collections.abc import Sequence
+
+from cpcbl_agents.vision.detections import Doubt, Found, Glimpses
+
+SAME_PLACE = 0.5  # share of the larger outline's box that is in the other's too
+
+
+def without_twins(glimpses: Glimpses) -> Glimpses:
+    """The same, with a doubt in place of what cannot be so; what is found twice at one place is
+    found once."""
+    found: list[Found] = []
+    doubts = list(glimpses.doubts)
+    for group in _by_place(glimpses.found):
+        names = tuple(sorted({one.sighting.id for one in group}))
+        if len(names) > 1:
+            doubts.append(Doubt("ambiguous", names, group[0].outline))
+        else:
+            found.append(min(group, key=lambda one: one.sighting.range_m is None))
+    places = defaultdict(list)
+    for one in found:
+        places[one.sighting.id].append(one)
+    for name, group in places.items():
+        if len(group) > 1:
+            doubts += [Doubt("seen_twice", (name,), one.outline) for one in group]
+    kept = tuple(one for one in found if len(places[one.sighting.id]) == 1)
+    return Glimpses(kept, tuple(doubts))
+
+
+def _by_place(found: Sequence[Found]) -> list[list[Found]]:
+    """Those whose outlines are about the same, together."""
+    groups: list[list[Found]] = []
+    for one in found:
+        for group in groups:
+            if any(_same_place(one, other) for other in group):
+                group.append(one)
+                break
+        else:
+            groups.append([one])
+    return groups
+
+
+def _same_place(a: Found, b: Found) -> bool:
+    low_a, high_a = a.outline.min(axis=0), a.outline.max(axis=0)
+    low_b, high_b = b.outline.min(axis=0), b.outline.max(axis=0)
+    common = (high_a.clip(max=high_b) - low_a.clip(min=low_b)).clip(min=0.0).prod()
+    larger = max((high_a - low_a).prod(), (high_b - low_b).prod())
+    return bool(common > SAME_PLACE * larger)

@@ -1,0 +1,1 @@
+"""The laboratory: experiments, fault scenarios, scaling, baselines, and robots with faults."""

@@ -1,0 +1,321 @@
+"""Yardsticks: what plain filters make of the same log with the same settings.
+
+Dead reckoning; a solo extended Kalman filter (EKF) a robot, which sees landmarks only; one
+centralized EKF over the poses of all robots, with everything that all of them see: the ceiling for
+a team. Smith, Self, Cheeseman (1990) for the joint state; Roumeliotis & Bekey (2002) for the team.
+
+Inputs come through the robots' own sensing agents, so that delays, scales, biases and blindness are
+those of the team, as are start poses, noise, gates, `object_interval_s` and `correlation_s`. What
+belongs to the team's method (turns of heading and position, tiers, `minimum_interval_s`) plays no
+part, and yardsticks do not learn (`self_calibration`). Inputs are taken in the order of the times
+they speak of: nothing arrives late. A filter that rejects most of what it sees doubts itself until
+its gates open; one that does not know its start begins with a Gaussian over the whole field, and no
+plain EKF is sure to find itself from there.
+"""
+
+import math
+from collections import deque
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from cpcbl_agents.agent import Tick
+from cpcbl_agents.robot import Robot
+from cpcbl_launch.reporting.metrics import Floats, Trajectory, compared, score
+from cpcbl_launch.reporting.recorder import YardstickReport, mean_score
+from cpcbl_launch.run.logged_team import LoggedTeam
+from cpcbl_team.config import Field, LocalizationSettings
+from cpcbl_team.constraints import NEAREST_M
+from cpcbl_team.estimate import Estimate
+from cpcbl_team.fusion import chi_square_bounds
+from cpcbl_team.geometry import Pose2, step, wrap_angle
+from cpcbl_team.inputs import Odometry, Sighting, Sightings
+from cpcbl_team.motion import motion_noise
+from cpcbl_team.sensors import crawled_s, repeated_share, sighting_fault, sighting_sigmas
+
+SMALLEST_VARIANCE = 1e-12  # (1 um)^2: exact sensors must not make a matrix singular
+_TRIANGLE = ((0, 0, 1, 0, 1, 2), (0, 1, 1, 2, 2, 2))  # xx, xy, yy, xh, yh, hh
+
+
+class Inputs(NamedTuple):
+    """What one robot's filter is told: where it starts, corrected odometry, corrected frames."""
+
+    settings: LocalizationSettings
+    start_ns: int
+    start: Estimate
+    odometry: tuple[Odometry, ...]
+    frames: tuple[Sightings, ...]
+
+
+def inputs_of(logged: LoggedTeam) -> dict[str, Inputs]:
+    """What each robot's own sensing agent makes of its log. Raises LogError."""
+    found = {}
+    for name, settings in logged.team.robots.items():
+        robot = Robot(name, logged.team, logged.start_ns)
+        begin = robot.filter.timeline.state
+        said = robot.sensing.handle(Tick(), logged.end_ns)
+        odometry = tuple(m for m in said if isinstance(m, Odometry))
+        frames = tuple(m for m in said if isinstance(m, Sightings))
+        found[name] = Inputs(settings, begin.stamp_ns, begin.estimate, odometry, frames)
+    return found
+
+
+def yardsticks(
+    inputs: Mapping[str, Inputs],
+    field: Field,
+    stamps_ns: Mapping[str, Sequence[int]],
+    progress: Callable[[float], None] = lambda done: None,
+) -> dict[str, dict[str, Trajectory]]:
+    """Each yardstick's estimates of each robot at these times."""
+    runs = [("dead_reckoning", {n: told._replace(frames=())}) for n, told in inputs.items()]
+    runs += [("solo_ekf", {n: told}) for n, told in inputs.items()]
+    runs += [("centralized_ekf", dict(inputs))]
+    paths: dict[str, dict[str, Trajectory]] = {}
+    done = 0
+    for kind, told in runs:
+        paths.setdefault(kind, {}).update(filtered(told, field, stamps_ns))
+        done += len(told)
+        progress(done / (3 * len(inputs)))
+    return paths
+
+
+def scored(paths: Mapping[str, Trajectory], truth: Mapping[str, Floats]) -> YardstickReport:
+    """One yardstick's figures, by the same metrics as the team's."""
+    robots = {n: score(compared(path, truth.get(n))[1]) for n, path in paths.items()}
+    return YardstickReport(robots=robots, team=mean_score(robots.values()))
+
+
+def filtered(
+    inputs: Mapping[str, Inputs], field: Field, stamps_ns: Mapping[str, Sequence[int]]
+) -> dict[str, Trajectory]:
+    """The estimates of one EKF over these robots, at each robot's own times (after its frames)."""
+    ekf = Ekf(inputs, field)
+    events: list[tuple[int, int, str, Sightings | None]] = []
+    for name, told in inputs.items():
+        events += [(frame.stamp_ns, 0, name, frame) for frame in told.frames]
+        events += [(stamp_ns, 1, name, None) for stamp_ns in stamps_ns.get(name, ())]
+    estimates: dict[str, list[Floats]] = {name: [] for name in inputs}
+    covariances: dict[str, list[Floats]] = {name: [] for name in inputs}
+    for stamp_ns, _, name, frame in sorted(events, key=lambda event: event[:3]):
+        ekf.advance(name, stamp_ns)
+        if frame is not None:
+            ekf.see(name, frame)
+            continue
+        mean, covariance = ekf.marginal(name)
+        estimates[name].append(mean)
+        covariances[name].append(covariance[_TRIANGLE])
+    return {
+        name: Trajectory(
+            np.array(sorted(stamps_ns.get(name, ())), dtype=np.int64),
+            np.array(estimates[name]).reshape(-1, 3),
+            np.array(covariances[name]).reshape(-1, 6),
+        )
+        for name in inputs
+    }
+
+
+def expected_sighting(pose: Floats, place: Floats) -> tuple[Floats, Floats]:
+    """(range m, bearing rad) of a point (x, y) seen from (x, y, heading); its Jacobian, (2, 5).
+
+    Columns: robot's x, y, heading, then the point's x, y.
+    """
+    dx, dy = place[:2] - pose[:2]
+    squared = dx * dx + dy * dy
+    r = math.sqrt(squared)
+    ux, uy, vx, vy = dx / r, dy / r, -dy / squared, dx / squared
+    jacobian = np.array([[-ux, -uy, 0.0, ux, uy], [-vx, -vy, -1.0, vx, vy]])
+    return np.array([r, wrap_angle(math.atan2(dy, dx) - pose[2])]), jacobian
+
+
+class _Member:
+    """One robot in the filter: its place in the state, its time, the odometry still to come."""
+
+    def __init__(self, first: int, told: Inputs) -> None:
+        self.first = first  # column of its x
+        self.settings = told.settings
+        self.now_ns = self.covered_ns = told.start_ns
+        self.pieces = deque(sorted(told.odometry, key=lambda piece: piece.from_ns))
+        self.used_ns: dict[str, int] = {}
+        self.bounds = chi_square_bounds(told.settings.localizer.gate_probability)
+        window = told.settings.localizer.lost_window
+        self.innovations = {kind: deque[bool](maxlen=window) for kind in ("landmark", "robot")}
+
+    @property
+    def columns(self) -> list[int]:
+        return [self.first, self.first + 1, self.first + 2]
+
+    def refuses(self, kind: str, accepted: bool) -> bool:
+        """Whether most of the latest innovations of a kind were rejected, this one included.
+
+        Kinds are judged apart: a team that is displaced as a whole agrees about its own robots.
+        """
+        window, rules = self.innovations[kind], self.settings.localizer
+        window.append(accepted)
+        return window.count(False) > rules.lost_share * rules.lost_window
+
+
+class _Measurement(NamedTuple):
+    """Innovation = Jacobian . (error of these columns of the state) + noise of this covariance."""
+
+    columns: list[int]
+    jacobian: Floats
+    innovation: Floats
+    noise: Floats
+
+
+class Ekf:
+    """One EKF whose state is the poses (x, y, heading) of some robots, each at its own time.
+
+    A robot is driven on along its odometry when it sees, is seen, or is asked for; motions are
+    independent, so that the poses of the others may wait.
+    """
+
+    def __init__(self, inputs: Mapping[str, Inputs], field: Field) -> None:
+        self._field = field
+        self._robots = {name: _Member(3 * i, told) for i, (name, told) in enumerate(inputs.items())}
+        self.mean = np.array([told.start.pose for told in inputs.values()], dtype=float).ravel()
+        self.covariance = np.zeros((len(self.mean), len(self.mean)))
+        for name, told in inputs.items():
+            self._add(self._robots[name].first, told.start.covariance)
+
+    def marginal(self, name: str) -> tuple[Floats, Floats]:
+        """One robot's pose, shape (3,), and covariance, shape (3, 3)."""
+        i = self._robots[name].first
+        return self.mean[i : i + 3].copy(), self.covariance[i : i + 3, i : i + 3].copy()
+
+    # Motion -----------------------------------------------------------------------------------
+
+    def advance(self, name: str, until_ns: int) -> None:
+        """Drives a robot on along its odometry. Does nothing if it is there already."""
+        robot = self._robots[name]
+        if until_ns <= robot.now_ns:
+            return
+        while robot.pieces and robot.pieces[0].from_ns < until_ns:
+            piece = robot.pieces[0]
+            end_ns = min(piece.stamp_ns, until_ns)
+            whole_ns = piece.stamp_ns - piece.from_ns
+            driven_ns = max(0, end_ns - max(robot.now_ns, piece.from_ns))
+            share = driven_ns / whole_ns
+            self._move(robot, share * piece.distance_m, share * piece.turn_rad, driven_ns * 1e-9)
+            robot.covered_ns = max(robot.covered_ns, piece.stamp_ns)
+            if piece.stamp_ns > until_ns:
+                break
+            robot.pieces.popleft()
+        self._doubt_motion(robot, until_ns)
+        robot.now_ns = until_ns
+
+    def _move(self, robot: _Member, distance: float, turn: float, seconds: float) -> None:
+        if distance == 0.0 and turn == 0.0:
+            return
+        i, p = robot.first, self.covariance
+        before = Pose2(*self.mean[i : i + 3].tolist())
+        after = step(before, distance, turn)
+        self.mean[i : i + 3] = after
+        lever = np.array([before.y - after.y, after.x - before.x])  # d(x, y) / d(heading)
+        p[i : i + 2] += lever[:, None] * p[i + 2]
+        p[:, i : i + 2] += p[:, i + 2, None] * lever
+        s = robot.settings.odometry
+        crawled = crawled_s(distance, seconds, s)
+        self._add(i, motion_noise(before.heading, distance, turn, s, crawled))
+
+    def _doubt_motion(self, robot: _Member, until_ns: int) -> None:
+        """The growth of uncertainty while odometry is missing, as in the team."""
+        s = robot.settings.odometry
+        silent_ns = until_ns - max(robot.now_ns, robot.covered_ns + int(s.timeout_s * 1e9))
+        if silent_ns > 0 and s.moves:
+            q = s.gap_speed_m_s**2 * silent_ns * 1e-9
+            self._add(robot.first, (q, 0.0, q, 0.0, 0.0, q))
+
+    def _add(self, first: int, noise: Iterable[float]) -> None:
+        """Adds xx, xy, yy, xh, yh, hh to a robot's own block."""
+        xx, xy, yy, xh, yh, hh = noise
+        block = np.array(((xx, xy, xh), (xy, yy, yh), (xh, yh, hh)))
+        self.covariance[first : first + 3, first : first + 3] += block
+
+    # Sightings --------------------------------------------------------------------------------
+
+    def see(self, name: str, frame: Sightings) -> None:
+        """Updates by the sightings of one frame, one after the other."""
+        robot = self._robots[name]
+        least_ns = robot.settings.localizer.object_interval_s * 1e9
+        for sighting in frame.sightings:
+            last_ns = robot.used_ns.get(sighting.id)
+            since_ns = None if last_ns is None else frame.stamp_ns - last_ns
+            fresh = since_ns is None or since_ns >= least_ns
+            if not fresh or sighting_fault(sighting):
+                continue
+            mate = self._robots.get(sighting.id)
+            if mate is not None:
+                self.advance(sighting.id, frame.stamp_ns)
+            found = self._measured(robot, mate, sighting)
+            if found is None:
+                continue
+            seconds = None if since_ns is None else since_ns * 1e-9
+            doubt = repeated_share(seconds, robot.settings.sensor.correlation_s)
+            found = found._replace(noise=doubt * found.noise)
+            accepted = self._corrected(found, robot.bounds)
+            if accepted:
+                robot.used_ns[sighting.id] = frame.stamp_ns
+            kind, concerned = ("landmark", [robot]) if mate is None else ("robot", [robot, mate])
+            for member in concerned:
+                if member.refuses(kind, accepted):
+                    self._widen(member)
+
+    def _measured(
+        self, robot: _Member, mate: _Member | None, sighting: Sighting
+    ) -> _Measurement | None:
+        """What a sighting of a robot or a landmark says; None if there is nothing to use."""
+        landmark = self._field.landmarks.get(sighting.id)
+        if mate is not None:
+            place, gives = self.mean[mate.columns[:2]], "both"
+        elif landmark is not None:
+            place, gives = np.array([landmark.x_m, landmark.y_m]), landmark.gives
+        else:
+            return None
+        pose, sensor = self.mean[robot.columns], robot.settings.sensor
+        far = (sighting.range_m or 0.0) > sensor.max_range_for_range_m
+        readings = (
+            sighting.range_m if gives in ("both", "range") and not far else None,
+            sighting.bearing_rad if gives in ("both", "bearing") else None,
+        )
+        rows = [row for row in (0, 1) if readings[row] is not None]
+        if not rows or math.hypot(*(place - pose[:2])) < NEAREST_M:
+            return None
+        expected, jacobian = expected_sighting(pose, place)
+        innovation = np.array([readings[row] for row in rows]) - expected[rows]
+        if 1 in rows:
+            innovation[-1] = wrap_angle(innovation[-1])
+        columns = robot.columns + (mate.columns[:2] if mate is not None else [])
+        sigmas = np.array(sighting_sigmas(sighting, sensor, expected[0]))[rows]
+        noise = np.diag(sigmas**2 + SMALLEST_VARIANCE)
+        return _Measurement(columns, jacobian[rows, : len(columns)], innovation, noise)
+
+    def _corrected(self, m: _Measurement, bounds: tuple[float, float]) -> bool:
+        """The Kalman update, if the chi-square gate opens; whether it did."""
+        cross = self.covariance[:, m.columns] @ m.jacobian.T
+        weights = np.linalg.inv(m.jacobian @ cross[m.columns] + m.noise)
+        if m.innovation @ weights @ m.innovation > bounds[len(m.innovation) - 1]:
+            return False
+        gain = cross @ weights
+        self.mean += gain @ m.innovation
+        self.mean[2::3] = (self.mean[2::3] + math.pi) % math.tau - math.pi
+        self.covariance -= gain @ cross.T
+        self.covariance = 0.5 * (self.covariance + self.covariance.T)
+        return True
+
+    def _widen(self, robot: _Member) -> None:
+        """The way back of a robot that refuses what it sees: it doubles its sigma until its gates
+        open, from 0.1 m and 0.1 rad at least to the limits of being lost at most."""
+        i, rules = robot.first, robot.settings.localizer
+        xx, yy, hh = np.diag(self.covariance)[i : i + 3].tolist()
+        most = rules.lost_position_sigma_m**2, math.radians(rules.lost_heading_sigma_deg) ** 2
+        p = _doubt(0.5 * (xx + yy), most[0])
+        self._add(i, (p, 0.0, p, 0.0, 0.0, _doubt(hh, most[1])))
+        for window in robot.innovations.values():
+            window.clear()
+
+
+def _doubt(variance: float, most: float) -> float:
+    """What to add to a variance so that its sigma doubles, within bounds."""
+    return max(min(max(4.0 * variance, 0.01), most) - variance, 0.0)

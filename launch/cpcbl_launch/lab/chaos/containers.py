@@ -1,0 +1,127 @@
+"""Two sites in containers: the network between their routers is taken away and given back."""
+
+import os
+import secrets
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import NamedTuple
+
+from cpcbl_agents.clock import Clock
+from cpcbl_launch.lab.chaos.network import AFTER_S, CUT_S, judged_partition
+from cpcbl_launch.lab.chaos.notes import Notes, NoteTaker, all_counts
+from cpcbl_launch.lab.chaos.scenario import CannotRunError, Found, Setting
+from cpcbl_launch.lab.chaos.team import PATIENCE_S, ChaosError
+from cpcbl_launch.run.containers import BASE_IMAGE, BASE_VARIABLE
+from cpcbl_launch.run.containers.docker import (
+    DockerError,
+    check_daemon,
+    compose_program,
+    done,
+    never,
+)
+from cpcbl_launch.run.containers.fleet import Project
+from cpcbl_launch.run.containers.image import checkout, image_for, there, version
+from cpcbl_launch.run.up import free_endpoint
+from cpcbl_transport.zenoh_bus import open_bus
+
+SITES = Path("docker/two-sites.yaml")
+OWN_BASE = "cpcbl-base"
+WEST, EAST = ("navigator", "observer"), ("scout", "patrol")
+PORTS = ("7447", "7448")
+BEGINS_S = 20.0  # the demonstration's robots help from 10 s on
+BLIND_M = 1.0  # the blind scout is far from those that know best
+
+
+class _Sites(NamedTuple):
+    project: Project
+    west: NoteTaker
+    east: NoteTaker
+
+    @property
+    def notes(self) -> tuple[Notes, Notes]:
+        """What was heard in the west and in the east; the truth is told in the west."""
+        west = self.west.notes()
+        return west, self.east.notes()._replace(truth=west.truth)
+
+
+def missing() -> str:
+    """Why there can be no containers here; empty if there can."""
+    if checkout() is None:
+        return f"needs a checkout, for {SITES} and the image's sources"
+    try:
+        check_daemon()
+        compose_program()
+    except DockerError as error:
+        return f"needs Docker: {error}"
+    return ""
+
+
+def partition_containers(setting: Setting) -> Found:
+    """`docker network disconnect` of one site's router, and `connect` again."""
+    with _sites(setting) as sites:
+        setting.say("starting a team at two sites, in containers")
+        _until(lambda: _helps(sites), "the team did not begin to help")
+        time.sleep(BEGINS_S)
+        link = f"{sites.project.name}_link"
+        router = sites.project.containers()["router-east"].id
+        setting.say(f"the sites are apart for {CUT_S:g} s")
+        cut_s = sites.west.now_s
+        done(["docker", "network", "disconnect", link, router])
+        time.sleep(CUT_S)
+        done(["docker", "network", "connect", link, router])
+        healed_s = sites.west.now_s
+        setting.say("the link between the sites is back")
+        time.sleep(5.0 + AFTER_S)
+        times = cut_s, healed_s, sites.west.now_s
+        return Found(judged_partition(*sites.notes, WEST, EAST, *times, most_far_m=BLIND_M))
+
+
+def _helps(sites: _Sites) -> bool:
+    """Whether all are heard, and the scout of the east is helped."""
+    west, east = sites.notes
+    heard = {*WEST, *EAST} <= west.tracks.keys() & east.tracks.keys()
+    return heard and all_counts(east, "scout")["messages_received"] > 20
+
+
+def _until(condition: Callable[[], bool], otherwise: str) -> None:
+    end_s = time.monotonic() + 2.0 * PATIENCE_S
+    while not condition():
+        if time.monotonic() > end_s:
+            raise ChaosError(otherwise)
+        time.sleep(0.2)
+
+
+@contextmanager
+def _sites(setting: Setting) -> Iterator[_Sites]:
+    top = checkout()
+    assert top is not None
+    with ExitStack() as stack:
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="cpcbl-chaos-")))
+        endpoints = [free_endpoint() for _ in PORTS]
+        text = (top / SITES).read_text().replace(f"cpcbl-team:{version()}", _image(setting))
+        for port, endpoint in zip(PORTS, endpoints, strict=True):
+            text = text.replace(f"127.0.0.1:{port}:", endpoint.removeprefix("tcp/") + ":")
+        file = folder / SITES.name
+        file.write_text(text)
+        project = Project(compose_program(), f"cpcbl-chaos-{secrets.token_hex(3)}", file)
+        stack.callback(project.down)
+        project.up()
+        takers, clock = [], Clock.wall()
+        for endpoint in endpoints:
+            bus = stack.enter_context(open_bus("demo", [endpoint]))
+            takers.append(NoteTaker(clock))
+            takers[-1].listen(bus)
+        yield _Sites(project, *takers)
+
+
+def _image(setting: Setting) -> str:
+    """The image of these sources. Raises CannotRunError where none can be had."""
+    bases = (os.environ.get(BASE_VARIABLE), BASE_IMAGE, OWN_BASE)
+    try:
+        base = next((b for b in bases if b and there(b)), bases[0] or BASE_IMAGE)
+        return image_for(base, never, setting.say)
+    except DockerError as error:
+        raise CannotRunError(f"needs an image: {error}") from error

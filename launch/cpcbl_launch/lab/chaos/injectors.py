@@ -1,0 +1,98 @@
+"""Those who say too much: an echo of one robot's help, late and in any order; a flood."""
+
+import heapq
+import random
+import sys
+import threading
+import time
+
+from cpcbl_agents.process import Stop
+from cpcbl_team.inputs import Belief, Fix
+from cpcbl_transport import topics
+from cpcbl_transport.bus import Bus, Publisher
+from cpcbl_transport.compact import encode_help
+from cpcbl_transport.zenoh_bus import open_bus
+
+UNSURE = (25.0, 0.0, 25.0, 0.0, 0.0, 1.0)
+
+
+class Echo:
+    """A session that says again what one robot said to others: once at once, once after up to
+    `latest_s`, so that nothing keeps its order. A context manager."""
+
+    def __init__(self, bus: Bus, robot: str, latest_s: float, seed: int) -> None:
+        self._bus, self._latest_s, self._random = bus, latest_s, random.Random(seed)
+        self._keys = (topics.FIX.at(observer=robot), topics.BELIEF.at(robot=robot))
+        self._publishers: dict[str, Publisher] = {}
+        self._due: list[tuple[float, int, str, bytes]] = []
+        self._lock, self._stop = threading.Lock(), threading.Event()
+        self.copies = 0
+
+    def __enter__(self) -> "Echo":
+        self._handles = [self._bus.subscribe(key, self._heard) for key in self._keys]
+        self._thread = threading.Thread(target=self._speak, daemon=True)
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for handle in self._handles:
+            handle.close()
+        self._stop.set()
+        self._thread.join()
+
+    def _heard(self, key: str, payload: bytes) -> None:
+        now_s = time.monotonic()
+        with self._lock:
+            for late_s in (0.0, self._random.uniform(0.0, self._latest_s)):
+                heapq.heappush(self._due, (now_s + late_s, len(self._due), key, payload))
+
+    def _speak(self) -> None:
+        while not self._stop.wait(0.01):
+            now_s = time.monotonic()
+            with self._lock:
+                due = []
+                while self._due and self._due[0][0] <= now_s:
+                    due.append(heapq.heappop(self._due))
+            for _, _, key, payload in due:
+                self._put(key, payload)
+
+    def _put(self, key: str, payload: bytes) -> None:
+        if key not in self._publishers:
+            self._publishers[key] = self._bus.publisher(key, topics.Qos.FRESH)
+        self._publishers[key].put(payload)
+        self.copies += 1
+
+
+def flood(team: str, endpoint: str, robot: str, targets: list[str], stop: Stop) -> int:
+    """Says all that a robot may say as fast as it can; how many messages.
+
+    What it says is true but worthless (it does not know where it is), so that only the flood harms.
+    """
+    with open_bus(team, [endpoint], stop) as bus:
+        token = bus.announce(topics.ALIVE.at(tier=0, robot=robot, incarnation="f"))
+        keys = [topics.FIX.at(robot=name, tier=0, observer=robot) for name in targets]
+        fixes = [bus.publisher(key, topics.FIX.qos) for key in keys]
+        belief = bus.publisher(topics.BELIEF.at(tier=0, robot=robot), topics.BELIEF.qos)
+        status = bus.publisher(topics.STATUS.at(robot=robot), topics.STATUS.qos)
+        sent = 0
+        while not stop():
+            now_ns = time.time_ns()
+            belief.put(encode_help(Belief(robot, now_ns, 4.5, 2.5, 0.0, UNSURE)))
+            for name, publisher in zip(targets, fixes, strict=True):
+                area = (25.0, 0.0, 25.0)
+                publisher.put(encode_help(Fix(name, robot, now_ns, 4.5, 2.5, area, area)))
+            sent += 1 + len(fixes)
+            if sent % 100 == 0:
+                status.put(bytes(60_000))
+        token.close()
+    return sent
+
+
+def main(team: str, endpoint: str, parent: str, robot: str, *targets: str) -> None:
+    """`python -m cpcbl_launch.lab.chaos.injectors TEAM ENDPOINT PARENT ROBOT TARGET ...`"""
+    sent = flood(team, endpoint, robot, list(targets), Stop(int(parent)))
+    sys.stdout.write(f"{sent}\n")
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

@@ -1,0 +1,95 @@
+"""Running scenarios one after another, so that their figures are clean."""
+
+import difflib
+import importlib.util
+import os
+import platform
+import subprocess
+import time
+from collections.abc import Callable, Iterable, Sequence
+from importlib.metadata import version
+
+from msgspec.structs import replace
+
+from cpcbl_launch.lab.chaos import containers, files, wire
+from cpcbl_launch.lab.chaos.checks import Faults, Outcome
+from cpcbl_launch.lab.chaos.scenario import CannotRunError, Needs, Scenario, Setting
+from cpcbl_launch.lab.chaos.scenarios import SCENARIOS
+from cpcbl_launch.lab.chaos.team import ChaosError
+from cpcbl_launch.run.containers.docker import DockerError
+from cpcbl_transport.zenoh_bus import BusError
+
+ALL = "all"
+
+
+def chosen(names: Sequence[str]) -> list[Scenario]:
+    """The scenarios of these names, `all` for all; in the order of the table. Raises ValueError."""
+    known = {scenario.name: scenario for scenario in SCENARIOS}
+    for name in names:
+        if name not in known and name != ALL:
+            close = difflib.get_close_matches(name, known, 1)
+            hint = f"did you mean {close[0]}?" if close else f"one of {', '.join(known)}, {ALL}"
+            raise ValueError(f"chaos: no scenario {name!r}; {hint}")
+    return [s for s in SCENARIOS if ALL in names or s.name in names]
+
+
+def missing(needs: Needs) -> str:
+    """Why a scenario that needs this cannot run here; empty if it can."""
+    match needs:
+        case Needs.ROOT:
+            return wire.missing()
+        case Needs.MOUNT:
+            return files.missing()
+        case Needs.DOCKER:
+            return containers.missing()
+        case Needs.HYPOTHESIS if importlib.util.find_spec("hypothesis") is None:
+            return "needs hypothesis: pip install 'cpcbl-team[chaos]'"
+    return ""
+
+
+def outcome_of(scenario: Scenario, setting: Setting) -> Outcome:
+    """Runs one scenario."""
+    name, done, expectation = scenario[:3]
+    outcome = Outcome(scenario=name, done=done, expectation=expectation)
+    began_s = time.monotonic()
+    if reason := missing(scenario.needs):
+        return replace(outcome, not_run=reason)
+    try:
+        found = scenario.run(setting)
+    except CannotRunError as error:
+        return replace(outcome, not_run=str(error))
+    except (ChaosError, BusError, DockerError, OSError, subprocess.TimeoutExpired) as error:
+        return replace(outcome, failed=str(error), seconds=time.monotonic() - began_s)
+    return replace(
+        outcome,
+        checks=tuple(found.checks),
+        remarks=found.remarks,
+        seconds=time.monotonic() - began_s,
+    )
+
+
+def run_all(
+    scenarios: Iterable[Scenario],
+    setting: Setting,
+    began: Callable[[Scenario], None],
+    done: Callable[[Outcome], None],
+) -> Faults:
+    """Runs them all; `began` and `done` are told of each."""
+    outcomes = []
+    for scenario in scenarios:
+        began(scenario)
+        outcomes.append(outcome_of(scenario, setting))
+        done(outcomes[-1])
+    return Faults(
+        version=version("cpcbl-team"),
+        seed=setting.seed,
+        machine=machine(),
+        outcomes=tuple(outcomes),
+    )
+
+
+def machine() -> str:
+    """What kind of machine this is, for those who read the figures."""
+    cores = os.cpu_count() or 1
+    load = os.getloadavg()[0]
+    return f"{platform.system()} {platform.machine()}, {cores} cores, load {load:.1f}"

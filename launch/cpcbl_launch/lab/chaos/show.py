@@ -1,0 +1,95 @@
+"""What came of scenarios, for people: on a terminal, in a page."""
+
+from collections.abc import Iterator
+
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from cpcbl_launch.lab.chaos.checks import Faults, Outcome
+from cpcbl_launch.lab.chaos.scenario import Scenario
+
+_VERDICT = {True: ("held", "green"), False: ("NOT HELD", "bold red"), None: ("not run", "yellow")}
+
+
+def print_scenarios(scenarios: tuple[Scenario, ...], console: Console) -> None:
+    """The table of scenarios: `--list`."""
+    shown = _table("scenario", "what is done", "expectation", "needs")
+    for s in scenarios:
+        name = f"{s.name} (quick)" if s.quick else s.name
+        shown.add_row(Text(name), Text(s.done), Text(s.expectation), Text(s.needs.value))
+    console.print(shown)
+
+
+def print_faults(faults: Faults, console: Console) -> None:
+    """Scenario, expectation, what was seen, whether it held."""
+    shown = _table("scenario", "expectation", "seen", "")
+    for outcome in faults.outcomes:
+        shown.add_row(
+            Text(outcome.scenario), Text(outcome.expectation), _seen(outcome), verdict(outcome)
+        )
+    console.print(shown)
+    for outcome in faults.outcomes:
+        for remark in outcome.remarks:
+            console.print(Text(f"{outcome.scenario}: {remark}", "dim"))
+    counts = {text: 0 for text, _ in _VERDICT.values()}
+    for outcome in faults.outcomes:
+        counts[_VERDICT[outcome.held][0]] += 1
+    said = ", ".join(f"{n} {text}" for text, n in counts.items() if n)
+    console.print(Text(f"{said}; {faults.machine}; seed {faults.seed}", "bold"))
+
+
+def verdict(outcome: Outcome) -> Text:
+    """In a word, in its colour."""
+    return Text(*_VERDICT[outcome.held])
+
+
+def _table(*columns: str) -> Table:
+    shown = Table(show_lines=True)
+    for column in columns:
+        shown.add_column(column, overflow="fold")
+    return shown
+
+
+def _seen(outcome: Outcome) -> Text:
+    if reason := outcome.not_run or outcome.failed:
+        return Text(reason, "yellow" if outcome.not_run else "red")
+    return Text("\n").join(Text(str(c), "" if c.held else "red") for c in outcome.checks)
+
+
+def markdown(faults: Faults) -> Iterator[str]:
+    """The same as lines of a page."""
+    yield "| scenario | what is done | expectation | seen | |"
+    yield "|---|---|---|---|---|"
+    for o in faults.outcomes:
+        seen = o.not_run or o.failed or "; ".join(map(str, o.checks))
+        yield f"| `{o.scenario}` | {o.done} | {o.expectation} | {seen} | {verdict(o).plain} |"
+
+
+class Progress:
+    """What is going on: a moving line on a terminal, and a line for each scenario that is done. A
+    context manager."""
+
+    def __init__(self, console: Console, total: int) -> None:
+        self._console, self._total = console, total
+        self._status = console.status("")
+        self._name, self._count = "", 0
+
+    def __enter__(self) -> "Progress":
+        if self._console.is_terminal:
+            self._status.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._status.stop()
+
+    def began(self, scenario: Scenario) -> None:
+        self._name, self._count = scenario.name, self._count + 1
+        self.doing("starting")
+
+    def doing(self, what: str) -> None:
+        self._status.update(Text(f"{self._count}/{self._total} {self._name}: {what}"))
+
+    def done(self, outcome: Outcome) -> None:
+        line = Text(f"{self._count}/{self._total} {outcome.scenario}, {outcome.seconds:.0f} s: ")
+        self._console.print(line.append_text(verdict(outcome)))

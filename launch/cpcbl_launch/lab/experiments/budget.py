@@ -1,0 +1,207 @@
+"""Accuracy against bytes on a real log: value and budget, fixed intervals, everything both ways.
+
+Every point is the whole log once, all robots with the same settings; what it cost is what was sent,
+not what was allowed. Everything: a fix of each sighting of a teammate, beliefs at 5 Hz to whoever
+sees the robot.
+"""
+
+import os
+from collections.abc import Callable, Iterable, Mapping
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import msgspec
+from rich.console import RenderableType
+
+from cpcbl_launch.lab.experiments.runs import in_processes
+from cpcbl_launch.reporting.tables import number, percent, table
+from cpcbl_launch.run.logged_team import LoggedTeam
+from cpcbl_launch.simulation.in_process import evaluate_log
+
+EVERYTHING: Mapping[str, Any] = {"least_value": 0.0, "least_use": 0.0, "belief_share": 0.0}
+RARE: Mapping[str, Any] = {
+    "least_value": 0.2,
+    "least_use": 0.9,
+    "fix_interval_s": 10.0,
+    "belief_rate_hz": 0.1,
+}
+"""For a few messages a minute: what is worth less, or comes soon again, would only delay what is
+worth more."""
+
+
+OURS = ("bytes limited", "messages limited", "value alone")
+
+
+class Point(msgspec.Struct, frozen=True, kw_only=True):
+    """One run. Bytes are those on the senders' links, without TCP/IP's; means over the robots."""
+
+    series: str
+    setting: str
+    bytes_per_s: float
+    messages_per_minute: float
+    position_rmse_m: float
+    blind_rmse_m: float | None
+    """Of the robots that see no landmark."""
+    heading_rmse_deg: float
+    inside_3_sigma: float | None
+    nees: float | None
+    within_budget: bool
+
+
+class Target(msgspec.Struct, frozen=True, kw_only=True):
+    """What a series has to reach, and the best that did within its cost."""
+
+    said: str
+    allowed_rmse_m: float
+    best: Point | None
+    held: bool
+
+
+class Curve(msgspec.Struct, frozen=True, kw_only=True):
+    """What the experiment writes."""
+
+    experiment: str
+    version: str
+    log: str
+    blind: tuple[str, ...]
+    duration_s: float
+    points: tuple[Point, ...]
+    targets: tuple[Target, ...]
+
+
+class Case(msgspec.Struct, frozen=True, kw_only=True):
+    """The settings of one point: keys of all robots' collaboration, and of its budget."""
+
+    series: str
+    setting: str
+    rules: dict[str, Any]
+    budget: dict[str, float] = {}
+
+
+def cases() -> list[Case]:
+    """From nothing to everything, each series from little to much."""
+    none = Case(series="nothing", setting="alone", rules={"active": False, "passive": False})
+    both = {**EVERYTHING, "direction": "both-ways"}
+    return [
+        none,
+        *(_limited("bytes_per_s", n, "B/s", {}) for n in (1, 2, 5, 10, 20, 50)),
+        *(_limited("messages_per_minute", n, "/min", RARE) for n in (2, 3, 4, 6, 8)),
+        *(_worth(least) for least in (0.4, 0.2, 0.1, 0.05, 0.02)),
+        *(_every(seconds) for seconds in (60, 30, 15, 8, 4, 2, 1, 0.5)),
+        Case(series="all, one way", setting="no limit", rules=dict(EVERYTHING)),
+        Case(series="all, both ways", setting="no limit", rules=both),
+    ]
+
+
+def _limited(key: str, allowed: float, unit: str, rules: Mapping[str, Any]) -> Case:
+    budget = {key: allowed, "urgent_share": 0.0 if unit == "/min" else 0.2}
+    series = "bytes limited" if key == "bytes_per_s" else "messages limited"
+    return Case(series=series, setting=f"{allowed:g} {unit}", rules=dict(rules), budget=budget)
+
+
+def _worth(least: float) -> Case:
+    rules = {"least_value": least, "least_use": 4.0 * least}
+    return Case(series="value alone", setting=f"{least:g} nats", rules=rules)
+
+
+def _every(seconds: float) -> Case:
+    rules = {**EVERYTHING, "fix_interval_s": seconds, "belief_rate_hz": 1.0 / seconds}
+    return Case(series="fixed interval", setting=f"{seconds:g} s", rules=rules)
+
+
+def point(logged: LoggedTeam, case: Case) -> Point:
+    """The figures of one case. Raises ValueError where there is no truth to score it by."""
+    replace = msgspec.structs.replace
+    robots = {}
+    for name, robot in logged.team.robots.items():
+        rules = robot.collaboration
+        budget = replace(rules.budget, **case.budget)
+        robots[name] = replace(robot, collaboration=replace(rules, budget=budget, **case.rules))
+    run = logged._replace(team=replace(logged.team, robots=robots))
+    report = evaluate_log(run)
+    team, minutes = report.team, report.duration_s / 60.0 * len(robots)
+    if team.position_rmse_m is None or team.heading_rmse_deg is None:
+        raise ValueError(
+            f"{logged.team.data}: no truth in these {report.duration_s:g} s; take more of the log"
+        )
+    blind = [
+        r.position_rmse_m
+        for name, r in report.robots.items()
+        if not robots[name].sensor.sees_landmarks and r.position_rmse_m is not None
+    ]
+    return Point(
+        series=case.series,
+        setting=case.setting,
+        bytes_per_s=team.bytes_sent / 60.0 / minutes,
+        messages_per_minute=team.messages_sent / minutes,
+        position_rmse_m=team.position_rmse_m,
+        blind_rmse_m=sum(blind) / len(blind) if blind else None,
+        heading_rmse_deg=team.heading_rmse_deg,
+        inside_3_sigma=team.inside_3_sigma,
+        nees=team.nees,
+        within_budget=all(s.most <= s.allowed for r in report.robots.values() for s in r.spending),
+    )
+
+
+def curve(logged: LoggedTeam, jobs: int | None, done: Callable[[], None]) -> Curve:
+    """All points; `done` is called after each. The same log gives the same figures."""
+    tasks = [(logged, case) for case in cases()]
+    points = tuple(in_processes(point, tasks, jobs or os.cpu_count() or 1, done))
+    return Curve(
+        experiment="budget",
+        version=version("cpcbl-team"),
+        log=Path(logged.team.data).name,
+        blind=tuple(n for n, r in logged.team.robots.items() if not r.sensor.sees_landmarks),
+        duration_s=(logged.end_ns - logged.start_ns) * 1e-9,
+        points=points,
+        targets=tuple(targets(points)),
+    )
+
+
+def targets(points: Iterable[Point]) -> Iterable[Target]:
+    """Of sending by value, against everything both ways: near its RMSE for little of its cost."""
+    points = list(points)
+    all_of = next(p for p in points if p.series == "all, both ways")
+    ours = [p for p in points if p.series in OURS]
+    quarter = [p for p in ours if p.bytes_per_s <= 0.25 * all_of.bytes_per_s]
+    few = [p for p in ours if p.messages_per_minute <= 2.5]
+    yield _target("10 % of it at a quarter of its bytes", 1.1 * all_of.position_rmse_m, quarter)
+    yield _target("20 % of it at 2.5 messages a minute", 1.2 * all_of.position_rmse_m, few)
+
+
+def _target(said: str, allowed_m: float, within: list[Point]) -> Target:
+    best = min(within, key=lambda p: p.position_rmse_m, default=None)
+    held = best is not None and best.position_rmse_m <= allowed_m
+    return Target(said=f"within {said}", allowed_rmse_m=allowed_m, best=best, held=held)
+
+
+def tables(result: Curve) -> Iterable[RenderableType]:
+    title = f"{result.log}, blind: {', '.join(result.blind) or 'none'}; a robot"
+    shown = table(title, ("sent", ""), ("B/s", "/min", "RMSE m", "blind", "deg", "in 3 σ", "NEES"))
+    last = None
+    for p in result.points:
+        if last not in (None, p.series):
+            shown.add_section()
+        shown.add_row(
+            p.series if p.series != last else "",
+            p.setting,
+            f"{p.bytes_per_s:.1f}",
+            f"{p.messages_per_minute:.1f}",
+            number(p.position_rmse_m),
+            number(p.blind_rmse_m),
+            number(p.heading_rmse_deg, 1),
+            percent(p.inside_3_sigma),
+            number(p.nees, 1),
+        )
+        last = p.series
+    yield shown
+    for t in result.targets:
+        verdict = "held" if t.held else "missed"
+        best = "nothing was" if t.best is None else f"{t.best.position_rmse_m:.3f} m"
+        off = ""
+        if t.best is not None:
+            off = f" ({t.best.setting}: {t.best.bytes_per_s:.1f} B/s)"
+        yield f"{verdict}: {t.said}: {best}{off}, allowed {t.allowed_rmse_m:.3f} m"
+    if not all(p.within_budget for p in result.points):
+        yield "a budget was exceeded"

@@ -1,0 +1,212 @@
+"""One-directional against mutual help: accuracy against bytes, naive against split-CI merging.
+
+Teams of 2 to 20 on a rectangle round the field. One robot in five (at least one) is an observer:
+stationary, blind to landmarks, with good eyes. It says that its position has a sigma of 0.1 m and
+is wrong by 0, 1 or 2 sigma without knowing it, each in another direction. The others see poorly;
+every second of them (scouts) sees teammates, but no landmarks. All by `joint`.
+
+Observers take help too, and are soon corrected by those they help. In teams of two there is also a
+`deaf` observer: it uses no teammate, its teammate does not see it, and so it stays wrong.
+"""
+
+import itertools
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+
+import msgspec
+from rich.console import RenderableType
+
+from cpcbl_launch.lab.experiments.circuit import circuit, with_keys
+from cpcbl_launch.lab.experiments.results import (
+    Experiment,
+    Outcome,
+    Results,
+    accuracy,
+    new_outcome,
+    spread,
+)
+from cpcbl_launch.lab.experiments.runs import Case
+from cpcbl_launch.reporting.tables import number, percent, table
+from cpcbl_launch.simulation.in_process import Choice, chosen
+from cpcbl_team.config import RobotSettings, Start, Team
+
+DURATION_S = 20.0
+SIZES = (2, 5, 10, 20)
+OFFSETS_M = (0.0, 0.1, 0.2)
+CLAIMED_SIGMA_M = 0.1
+WAYS = tuple(itertools.product(("one-way", "both-ways"), ("split-ci", "naive")))
+CORNERS = ((7.5, 1.0), (7.5, 4.0), (1.5, 4.0), (1.5, 1.0))
+POSTS = ((4.5, 5.0, -90.0), (4.5, 0.0, 90.0), (0.0, 2.5, 0.0), (9.0, 2.5, 180.0))
+Key = tuple[int, str, str, float]  # size, direction (or "alone"), fusion, offset of the observers
+
+
+def cases(sizes: Sequence[int] = SIZES) -> Mapping[Key, Case]:
+    """Teams of these sizes, alone and with every way of help."""
+    every: dict[Key, Case] = {}
+    for size in sizes:
+        team = crowd(size)
+        mobile = tuple(n for n, r in team.robots.items() if r.odometry.moves)
+        every[size, "alone", "", 0.0] = Case(
+            chosen(team, Choice(collaboration="none")), mobile, DURATION_S
+        )
+        for (direction, fusion), offset in itertools.product(WAYS, OFFSETS_M):
+            helping = chosen(team, Choice(direction=direction, fusion=fusion))
+            truth = displaced(helping, offset)
+            every[size, direction, fusion, offset] = Case(helping, mobile, DURATION_S, 0, truth)
+        if size == 2:
+            every |= _deaf(team, mobile)
+    return every
+
+
+def _deaf(pair: Team, mobile: tuple[str, ...]) -> dict[Key, Case]:
+    """The robot that moves takes every fix, whatever its tier; nothing goes the other way."""
+    (navigator,), (observer,) = mobile, (n for n in pair.robots if n not in mobile)
+    every: dict[Key, Case] = {}
+    for fusion, offset in itertools.product(("split-ci", "naive"), OFFSETS_M):
+        team = chosen(pair, Choice(direction="both-ways", fusion=fusion))
+        team = with_keys(team, navigator, sensor={"sees_robots": False})
+        team = with_keys(team, observer, collaboration={"passive": False})
+        truth = displaced(team, offset)
+        every[2, "deaf", fusion, offset] = Case(team, mobile, DURATION_S, 0, truth)
+    return every
+
+
+def crowd(size: int) -> Team:
+    """A team of so many robots: observers at their posts, the others along the rectangle."""
+    base = circuit(["navigator", "observer"])
+    posts = POSTS[: max(1, size // 5)]
+    robots = {f"observer{i}": _observer(base, post) for i, post in enumerate(posts)}
+    for i in range(size - len(posts)):
+        name = f"scout{i}" if i % 2 else f"navigator{i}"
+        robots[name] = _mobile(base, i / (size - len(posts)), blind=bool(i % 2))
+    return msgspec.structs.replace(base, name="crowd", robots=robots)
+
+
+def _observer(base: Team, post: tuple[float, float, float]) -> RobotSettings:
+    x, y, heading_deg = post
+    settings = base.robots["observer"]
+    return msgspec.structs.replace(
+        settings,
+        sensor=msgspec.structs.replace(settings.sensor, sees_landmarks=False, max_range_m=10.0),
+        start=Start(
+            x_m=x, y_m=y, heading_deg=heading_deg, sigma_m=CLAIMED_SIGMA_M, heading_sigma_deg=0.5
+        ),
+    )
+
+
+def _mobile(base: Team, share: float, blind: bool) -> RobotSettings:
+    """A robot that starts at this share of the way round the rectangle."""
+    corner, rest = divmod(4.0 * share, 1.0)
+    last = int(corner)
+    (ax, ay), (bx, by) = CORNERS[last - 1], CORNERS[last]
+    settings = base.robots["navigator"]
+    return msgspec.structs.replace(
+        settings,
+        sensor=msgspec.structs.replace(settings.sensor, sees_landmarks=not blind),
+        waypoints_m=CORNERS[last:] + CORNERS[:last],
+        start=Start(
+            x_m=ax + rest * (bx - ax),
+            y_m=ay + rest * (by - ay),
+            heading_deg=math.degrees(math.atan2(by - ay, bx - ax)),
+        ),
+    )
+
+
+def displaced(team: Team, offset_m: float) -> Team:
+    """The team as it is: observers stand so far from where they believe to stand, one another way
+    than the next."""
+    robots = dict(team.robots)
+    for i, (name, settings) in enumerate(team.robots.items()):
+        start = settings.start
+        if settings.odometry.moves or start is None:
+            continue
+        away = math.radians(30.0 + 137.5 * i)  # the golden angle
+        robots[name] = msgspec.structs.replace(
+            settings,
+            start=msgspec.structs.replace(
+                start,
+                x_m=start.x_m + offset_m * math.cos(away),
+                y_m=start.y_m + offset_m * math.sin(away),
+                sigma_m=0.0,
+            ),
+        )
+    return msgspec.structs.replace(team, robots=robots)
+
+
+def outcome(results: Results) -> Outcome:
+    rows = []
+    for (size, direction, fusion, offset), runs in results.items():
+        names = list(runs[0].robots)
+        all_of, sighted, blind = (
+            accuracy(runs, [n for n in names if n.startswith(prefix)])
+            for prefix in ("", "navigator", "scout")
+        )
+        rows.append(
+            {
+                "robots": size,
+                "direction": direction,
+                "fusion": fusion,
+                "observer_off_m": offset,
+                "position_rmse_m": all_of.position_rmse_m,
+                "rmse_of_runs_m": spread([accuracy([r]).position_rmse_m or 0.0 for r in runs]),
+                "navigators_rmse_m": sighted.position_rmse_m,
+                "scouts_rmse_m": blind.position_rmse_m,
+                "inside_3_sigma": all_of.inside_3_sigma,
+                "navigators_inside_3_sigma": sighted.inside_3_sigma,
+                "scouts_inside_3_sigma": blind.inside_3_sigma,
+                "bytes_per_s": sum(r.bytes_per_s for r in runs) / len(runs),
+            }
+        )
+    sizes = dict.fromkeys(size for size, *_ in results)
+    teams = {str(size): Case(crowd(size), (), DURATION_S) for size in sizes}
+    figures = {"duration_s": DURATION_S, "observer_sigma_m": CLAIMED_SIGMA_M, "rows": rows}
+    return new_outcome("one-way-vs-both", results, teams, figures=figures)
+
+
+def tables(result: Outcome) -> Iterable[RenderableType]:
+    shown = table(
+        f"robots that move: position RMSE, {DURATION_S:g} s, {result.seeds} seeds",
+        ("", "help", "merging"),
+        ("off m", "all m", "sighted m", "in 3 σ", "blind m", "in 3 σ", "B/s"),
+    )
+    last = None
+    for row in result.figures["rows"]:
+        size = row["robots"]
+        if last not in (None, size):
+            shown.add_section()
+        shown.add_row(
+            str(size) if size != last else "",
+            row["direction"],
+            row["fusion"],
+            "" if row["direction"] == "alone" else f"{row['observer_off_m']:g}",
+            number(row["position_rmse_m"]),
+            number(row["navigators_rmse_m"]),
+            percent(row["navigators_inside_3_sigma"]),
+            number(row["scouts_rmse_m"]),
+            percent(row["scouts_inside_3_sigma"]),
+            f"{row['bytes_per_s']:.0f}",
+        )
+        last = size
+    yield shown
+    if any(row["direction"] == "deaf" for row in result.figures["rows"]):
+        yield "deaf: nobody corrects the observer; elsewhere those that it helps do"
+    yield f"off: how wrong the observers are; they claim a σ of {CLAIMED_SIGMA_M:g} m"
+    yield "blind: sees teammates but no landmark; B/s: help sent, mean over the robots"
+
+
+def draw(result: Outcome, path: Path) -> None:
+    from cpcbl_launch.lab.experiments.pictures import draw_directions
+
+    draw_directions(result, path)
+
+
+def of_sizes(sizes: Sequence[int]) -> Experiment:
+    """The experiment with teams of these sizes only. Raises ValueError."""
+    if not sizes or any(not 2 <= size <= 20 for size in sizes):
+        raise ValueError("--robots: team sizes from 2 to 20, such as 2,5")
+    return EXPERIMENT._replace(cases=partial(cases, sizes))
+
+
+EXPERIMENT = Experiment("one-way-vs-both", cases, outcome, tables, draw)

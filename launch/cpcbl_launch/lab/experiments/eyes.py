@@ -1,0 +1,88 @@
+"""What cameras see: rendered frames over poses, light, clutter and what stands in the way.
+
+Each frame is drawn and judged by itself (`eyes_frames.py`); `eyes_figures.py` has the figures.
+"""
+
+from collections import Counter
+from collections.abc import Callable, Iterable
+from pathlib import Path
+
+from rich.console import RenderableType
+
+from cpcbl_launch.lab.experiments.eyes_figures import (
+    ERRORS_WITHIN_M,
+    WITHIN_M,
+    Eyes,
+    Figures,
+    outcome,
+)
+from cpcbl_launch.lab.experiments.runs import in_processes
+from cpcbl_launch.reporting.tables import number, table
+
+CHUNK = 25
+
+
+def measured(count: int, seed: int, jobs: int, done: Callable[[], None]) -> Eyes:
+    """So many frames, `jobs` processes at a time; `done` is called after each `CHUNK` of them."""
+    from cpcbl_launch.lab.experiments.eyes_frames import frames  # needs OpenCV
+
+    starts = range(0, count, CHUNK)
+    tasks = [(seed, start, min(CHUNK, count - start)) for start in starts]
+    batches = in_processes(frames, tasks, jobs, done)
+    return outcome(count, seed, batches)
+
+
+def tables(result: Eyes) -> Iterable[RenderableType]:
+    """What was found by range, what was wrong or doubted, and the targets."""
+    shown = table(
+        f"rendered frames: {result.frames}, seed {result.seed}",
+        ("", "m"),
+        ("due", "recall", "said", "prec.", "r %", "b °", "h °", "3σ r", "3σ b", "3σ h"),
+    )
+    for kind, bins in result.bins.items():
+        for f in bins:
+            if f.due or f.reported:
+                shown.add_row(kind, f"{f.from_m:g}-{f.to_m:g}", *_cells(f))
+        shown.add_row(kind, f"< {WITHIN_M[kind]:g}", *_cells(result.within[kind]))
+        if WITHIN_M[kind] != ERRORS_WITHIN_M:
+            shown.add_row(kind, f"< {ERRORS_WITHIN_M:g}", *_cells(result.accuracy[kind]))
+    yield shown
+    yield (
+        "due: all of it to be seen. said: sightings. r, b, h: errors of range, bearing,\n"
+        "heading, σ about zero; 3σ: the shares of them inside three stated ones"
+    )
+    yield f"doubted: {_listed(result.doubts)}"
+    if result.refused:
+        yield f"frames refused: {_listed(result.refused)}"
+    yield f"mistakes: {_listed(Counter(f'{m.kind}, {m.why}' for m in result.mistakes))}"
+    yield (
+        f"cost: {result.cost['see_ms']:.1f} ms a frame to see,"
+        f" {result.cost['render_ms']:.1f} ms to render"
+    )
+    for said, ok in result.pattern.items():
+        yield f"target: {'held  ' if ok else 'missed'} {said}"
+
+
+def _listed(counts: dict[str, int]) -> str:
+    return ", ".join(f"{name} {count}" for name, count in counts.items()) or "nothing"
+
+
+def _cells(f: Figures) -> tuple[str, ...]:
+    return (
+        str(f.due),
+        number(f.recall),
+        str(f.reported),
+        number(f.precision),
+        number(None if f.range_sigma_share is None else 100.0 * f.range_sigma_share, 1),
+        number(f.bearing_sigma_deg, 2),
+        number(f.heading_sigma_deg, 1),
+        number(f.range_inside),
+        number(f.bearing_inside),
+        number(f.heading_inside),
+    )
+
+
+def draw(result: Eyes, path: Path) -> None:
+    from cpcbl_launch.lab.experiments.pictures import draw_eyes
+
+    draw_eyes(result, path)

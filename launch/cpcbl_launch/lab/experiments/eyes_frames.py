@@ -1,0 +1,357 @@
+"""One rendered frame of the experiment `eyes`: what was there to see, and what was made of it.
+
+A viewer, its teammates and posts that are on no map stand at random on the team's field, under
+light that differs from frame to frame, and the camera is not quite mounted, nor focused, as the
+robot believes: by the sigmas that its settings state. What could be seen follows from the geometry
+(`simulation/visible.py`), not from the picture.
+
+- landmark: due when all of it is in the frame with nothing before it;
+- marker: a teammate is due when one of its markers is all to be seen, within 60 degrees of facing;
+- mast: a teammate is due when its bands are all to be seen.
+
+A sighting is right when some of what it names is to be seen within 3 degrees of its bearing, and
+its range, where it says one, is off by at most 20 %. It has a wrong id when nothing of that name is
+to be seen there.
+"""
+
+import math
+import time
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from functools import lru_cache
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+from cpcbl_agents.vision.camera import Camera, Floats, Pixels
+from cpcbl_agents.vision.detector import CameraEyes
+from cpcbl_agents.vision.pictures import decoded
+from cpcbl_launch.lab.experiments.eyes_figures import Batch, Kind, Mistake, Record, Wrong, team
+from cpcbl_launch.simulation.camera.cameras import off_focus, shaken
+from cpcbl_launch.simulation.camera.render import render
+from cpcbl_launch.simulation.camera.robots import SIDES, body_top_m
+from cpcbl_launch.simulation.camera.scene import Post, Scene, Standing
+from cpcbl_launch.simulation.camera.visibility import (
+    Solid,
+    cylinder_points,
+    plate_points,
+    shares_shown,
+)
+from cpcbl_team.config import CameraSettings, Cylinder, Light, Side
+from cpcbl_team.geometry import Pose2, wrap_angle
+from cpcbl_team.inputs import Sighting
+
+NEAREST_M = 0.45  # between what stands on the field
+MOST_CLUTTER = 3
+FACING_DEG = 60.0
+ALL_OF_IT = 0.999
+WRONG_BEARING_DEG = 3.0
+WRONG_RANGE = 0.2
+QUALITY = 90  # of the JPEG that carries the frame
+
+
+class Drawn(NamedTuple):
+    """What is random about a frame."""
+
+    viewer: str
+    pose: Pose2
+    robots: tuple[Standing, ...]
+    scene: Scene
+    light: Light
+    camera: CameraSettings
+    """As it is, not as the viewer believes."""
+
+
+class Thing(NamedTuple):
+    """Something that has a name, in the viewer's frame."""
+
+    name: str
+    range_m: float
+    bearing_rad: float
+    heading_rad: float
+    due: tuple[Kind, ...]
+    """What is all to be seen."""
+    some: bool
+    """Whether anything of it can be seen at all."""
+    half_width_rad: float
+
+
+def frames(seed: int, first: int, count: int) -> Batch:
+    """These frames. The same seed and numbers give the same figures."""
+    cv2.setNumThreads(1)
+    batch = Batch([], [], {}, {}, 0.0, 0.0)
+    doubts: Counter[str] = Counter()
+    refused: Counter[str] = Counter()
+    see_s = render_s = 0.0
+    for number in range(first, first + count):
+        random = np.random.default_rng((seed, number))
+        began_s = time.perf_counter()
+        frame = drawn(random)
+        pixels = picture(frame, random)
+        rendered_s = time.perf_counter()
+        glimpses = _eyes(frame.viewer).glimpses(pixels)
+        see_s += time.perf_counter() - rendered_s
+        render_s += rendered_s - began_s
+        if isinstance(glimpses, str):
+            refused[glimpses] += 1
+            continue
+        doubts.update(doubt.reason for doubt in glimpses.doubts)
+        seen = [found.sighting for found in glimpses.found]
+        records, mistakes = judged(number, seen, things(frame))
+        batch.records.extend(records)
+        batch.mistakes.extend(mistakes)
+    return batch._replace(
+        doubts=dict(doubts), refused=dict(refused), see_s=see_s, render_s=render_s
+    )
+
+
+@lru_cache(maxsize=1)
+def _scene() -> Scene:
+    return Scene.of(team())
+
+
+@lru_cache(maxsize=16)
+def _eyes(viewer: str) -> CameraEyes:
+    return CameraEyes(viewer, team())
+
+
+# What is random ----------------------------------------------------------------------------------
+
+
+def drawn(random: np.random.Generator) -> Drawn:
+    """A viewer, where everything stands, and the light."""
+    names = list(team().robots)
+    viewers = team().cameras
+    viewer = viewers[int(random.integers(len(viewers)))]
+    scene = _scene().with_clutter(int(random.integers(MOST_CLUTTER + 1)), random)
+    posts = [*scene.landmarks.values(), *scene.clutter]
+    taken = [(post.x_m, post.y_m) for post in posts]
+    pose = _free(random, taken, None)
+    taken.append((pose.x, pose.y))
+    robots = []
+    for name in names:
+        if name != viewer:
+            near = pose if random.random() < 0.7 else None
+            other = _free(random, taken, near)
+            taken.append((other.x, other.y))
+            robots.append(Standing(name, *other))
+    camera = shaken(off_focus(team().robots[viewer].camera, 1.0, random), 1.0, random)
+    return Drawn(viewer, pose, tuple(robots), scene, _light(random), camera)
+
+
+def _free(
+    random: np.random.Generator, taken: Sequence[tuple[float, float]], near: Pose2 | None
+) -> Pose2:
+    """A place on the field with nothing else on it; or one that a viewer at `near` looks at."""
+    marks = np.array([(m.x_m, m.y_m) for m in team().map.landmarks.values()])
+    low, high = marks.min(axis=0), marks.max(axis=0)
+    while True:
+        x, y = random.uniform(low, high)
+        heading = float(random.uniform(-math.pi, math.pi))
+        if near is not None:
+            away, aside = float(random.uniform(NEAREST_M, 5.0)), float(random.uniform(-0.7, 0.7))
+            x, y = near.transform(away * math.cos(aside), away * math.sin(aside))
+        if all(math.hypot(x - a, y - b) > NEAREST_M for a, b in taken):
+            return Pose2(float(x), float(y), heading)
+
+
+def _light(random: np.random.Generator) -> Light:
+    """From dim to bright, warm to cold, sharp to blurred."""
+    uniform = random.uniform
+    blue, green, red = (float(t) for t in uniform(0.88, 1.12, 3))
+    return Light(
+        brightness=float(uniform(0.55, 1.25)),
+        gradient=float(uniform(-0.5, 0.5)),
+        tint=(blue, green, red),
+        blur_px=float(uniform(0.3, 1.2)),
+        noise=float(random.integers(1, 7)),
+    )
+
+
+def picture(frame: Drawn, random: np.random.Generator) -> Pixels:
+    """The frame as the robot gets it: through a JPEG."""
+    made = render(frame.scene, Camera(frame.camera), frame.pose, frame.robots, frame.light, random)
+    _, coded = cv2.imencode(".jpg", made, (cv2.IMWRITE_JPEG_QUALITY, QUALITY))
+    pixels = decoded(coded.tobytes())
+    assert not isinstance(pixels, str)
+    return pixels
+
+
+# What there is to see ----------------------------------------------------------------------------
+
+
+def things(frame: Drawn) -> dict[str, Thing]:
+    """Everything with a name."""
+    camera, robot_from_field = Camera(frame.camera), frame.pose.inverse()
+    half_m = team().vision.marker_distance_m
+    # A robot hides no more than from corner to corner, and no less than from side to side.
+    most, least = (_solids(frame, robot_from_field, f * half_m) for f in (math.sqrt(2.0), 1.0))
+    found = {}
+    for name in frame.scene.landmarks:
+        before = _others(most, name), _others(least, name)
+        found[name] = _landmark(name, most[name][0], camera, before)
+    for robot in frame.robots:
+        seen = robot_from_field @ Pose2(robot.x_m, robot.y_m, robot.heading_rad)
+        before = _others(most, robot.name), _others(least, robot.name)
+        found[robot.name] = _teammate(robot.name, seen, camera, before)
+    return found
+
+
+Due = Mapping[Kind, float]  # how much of each kind of feature is to be seen
+Before = tuple[Sequence[Solid], Sequence[Solid]]  # what certainly hides no more; no less
+
+
+def _solids(frame: Drawn, robot_from_field: Pose2, body_m: float) -> dict[str, tuple[Solid, ...]]:
+    """What hides other things, by name; the bodies of robots with this radius."""
+    solids: dict[str, tuple[Solid, ...]] = {}
+    clutter = {
+        f"\n{i}": post for i, post in enumerate(frame.scene.clutter)
+    }  # no name has a newline
+    for name, post in {**frame.scene.landmarks, **clutter}.items():
+        solids[name] = (_standing(post, *robot_from_field.transform(post.x_m, post.y_m)),)
+    vision = team().vision
+    for robot in frame.robots:
+        x, y = robot_from_field.transform(robot.x_m, robot.y_m)
+        body = Solid(x, y, body_m, 0.0, body_top_m(vision))
+        mast = Solid(x, y, vision.mast.radius_m, body.high, _top_m(vision.mast))
+        has_mast = team().robots[robot.name].colours is not None
+        solids[robot.name] = (body, mast) if has_mast else (body,)
+    return solids
+
+
+def _standing(post: Post, x: float, y: float) -> Solid:
+    return Solid(x, y, post.radius_m, post.bands[0].from_m, post.bands[-1].to_m)
+
+
+def _top_m(shape: Cylinder) -> float:
+    return shape.foot_m + shape.height_m
+
+
+def _others(solids: Mapping[str, Sequence[Solid]], but: str) -> list[Solid]:
+    return [solid for name, some in solids.items() if name != but for solid in some]
+
+
+def _landmark(name: str, solid: Solid, camera: Camera, before: Before) -> Thing:
+    points = cylinder_points(solid, camera.position)
+    whole, some = shares_shown(points, camera, before)
+    due: Due = {"landmark": whole}
+    return _thing(name, Pose2(solid.x, solid.y, 0.0), due, some, solid.radius)
+
+
+def _teammate(name: str, seen: Pose2, camera: Camera, before: Before) -> Thing:
+    robot, vision = team().robots[name], team().vision
+    marker = mast = some = 0.0
+    for side in robot.markers:
+        points, angle = _marker(side, seen, camera)
+        if angle < 0.5 * math.pi:
+            whole, part = shares_shown(points, camera, before)
+            some = max(some, part)
+            marker = max(marker, whole if angle <= math.radians(FACING_DEG) else 0.0)
+    if robot.colours is not None:
+        shape = vision.mast
+        solid = Solid(seen.x, seen.y, shape.radius_m, shape.foot_m, _top_m(shape))
+        points = cylinder_points(solid, camera.position)
+        mast, part = shares_shown(points, camera, before)
+        some = max(some, part)
+    half_m = math.sqrt(2.0) * vision.marker_distance_m
+    return _thing(name, seen, {"marker": marker, "mast": mast}, some, half_m)
+
+
+def _marker(side: Side, seen: Pose2, camera: Camera) -> tuple[Floats, float]:
+    """Points of a teammate's marker, and by how much it looks past the viewer (rad)."""
+    vision, direction = team().vision, SIDES[side]
+    away = vision.marker_distance_m
+    x, y = seen.transform(away * math.cos(direction), away * math.sin(direction))
+    facing = wrap_angle(seen.heading + direction)
+    to_lens = math.atan2(camera.position[1] - y, camera.position[0] - x)
+    points = plate_points(x, y, vision.marker_mounted_m, facing, vision.marker_m)
+    return points, abs(wrap_angle(to_lens - facing))
+
+
+def _thing(name: str, seen: Pose2, shown: Due, some: float, half_m: float) -> Thing:
+    range_m = math.hypot(seen.x, seen.y)
+    return Thing(
+        name=name,
+        range_m=range_m,
+        bearing_rad=math.atan2(seen.y, seen.x),
+        heading_rad=seen.heading,
+        due=tuple(kind for kind, share in shown.items() if share >= ALL_OF_IT),
+        some=some > 0.0,
+        half_width_rad=math.asin(min(1.0, half_m / range_m)),
+    )
+
+
+# What was made of it -----------------------------------------------------------------------------
+
+
+def judged(
+    number: int, seen: Sequence[Sighting], there: Mapping[str, Thing]
+) -> tuple[list[Record], list[Mistake]]:
+    """Sightings beside what there was to see."""
+    records, mistakes, right = [], [], set()
+    for sighting in seen:
+        thing = there.get(sighting.id)
+        why = _why_wrong(sighting, thing)
+        if why is None:
+            assert thing is not None
+            right.add(thing.name)
+            records.append(_record(sighting, thing))
+        else:
+            bearing_deg = (
+                None if sighting.bearing_rad is None else math.degrees(sighting.bearing_rad)
+            )
+            kind = _seen_by(sighting)
+            mistakes.append(
+                Mistake(
+                    frame=number,
+                    kind=kind,
+                    id=sighting.id,
+                    why=why,
+                    range_m=sighting.range_m,
+                    bearing_deg=bearing_deg,
+                )
+            )
+    records += _missed(there, right)
+    return records, mistakes
+
+
+def _missed(there: Mapping[str, Thing], right: set[str]) -> Iterator[Record]:
+    for name, thing in there.items():
+        if thing.due and name not in right:
+            yield Record(thing.due, None, thing.range_m)
+
+
+def _why_wrong(sighting: Sighting, thing: Thing | None) -> Wrong | None:
+    if thing is None or not thing.some or sighting.bearing_rad is None:
+        return "wrong id"
+    off = abs(wrap_angle(sighting.bearing_rad - thing.bearing_rad))
+    if off > math.radians(WRONG_BEARING_DEG) + thing.half_width_rad:
+        return "wrong id"
+    off_m = 0.0 if sighting.range_m is None else abs(sighting.range_m - thing.range_m)
+    return "wrong range" if off_m > WRONG_RANGE * thing.range_m else None
+
+
+def _seen_by(sighting: Sighting) -> Kind:
+    if sighting.id not in team().robots:
+        return "landmark"
+    return "mast" if sighting.heading_rad is None else "marker"
+
+
+def _record(sighting: Sighting, thing: Thing) -> Record:
+    assert sighting.bearing_rad is not None
+    heading = None
+    if sighting.heading_rad is not None:
+        heading = wrap_angle(sighting.heading_rad - thing.heading_rad)
+    ranged = sighting.range_m is not None
+    return Record(
+        due=thing.due,
+        seen_by=_seen_by(sighting),
+        range_m=thing.range_m,
+        range_error_m=None if sighting.range_m is None else sighting.range_m - thing.range_m,
+        range_sigma_m=sighting.range_sigma_m if ranged else None,
+        bearing_error_rad=wrap_angle(sighting.bearing_rad - thing.bearing_rad),
+        bearing_sigma_rad=sighting.bearing_sigma_rad,
+        heading_error_rad=heading,
+        heading_sigma_rad=sighting.heading_sigma_rad,
+    )

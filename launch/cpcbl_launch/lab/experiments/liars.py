@@ -1,0 +1,323 @@
+"""One observer of three lies for a while: what it does to the team, when it is found, when it is
+believed again.
+
+Observers with good eyes stand round the field of the demonstration; a navigator with poor ones and
+two scouts, blind to landmarks, drive between them. From 10 s to 25 s one observer says what is not
+so (`liar.py`), then the truth again; two or only one are honest beside it. Errors are those of the
+robots that drive, from 10 s on, beside the team without the liar, and beside one that believes all.
+"""
+
+import math
+from collections.abc import Callable, Iterable, Sequence
+from importlib.metadata import version
+from typing import NamedTuple
+
+import msgspec
+import numpy as np
+from rich.console import RenderableType
+
+from cpcbl_launch.lab.experiments.results import Spread, spread
+from cpcbl_launch.lab.experiments.runs import in_processes
+from cpcbl_launch.lab.faulty_robot import Lie, lying
+from cpcbl_launch.reporting.metrics import position_errors
+from cpcbl_launch.reporting.tables import number, table
+from cpcbl_launch.simulation.in_process import simulate
+from cpcbl_launch.team_file import builtin, load_team
+from cpcbl_team.config import Team, TrustSettings
+from cpcbl_transport import topics
+from cpcbl_transport.bus import Bus
+from cpcbl_transport.messages import Status, decode
+
+FROM_S, UNTIL_S, END_S = 10.0, 25.0, 45.0
+MOST_RATIO = 1.3
+LIAR = "west"
+KINDS = (
+    "bias:0.5,0.5",
+    "bias:0.2,0.0",
+    "frozen",
+    "jumps:1.5",
+    "overconfident:0.3",
+    "clock:-0.3",
+    "clock:-0.5",
+)
+HONEST = (2, 1)
+HONEST_POSTS = ("north", "south")
+POSTS = {"north": (4.5, 5.0, -90.0), "south": (4.5, 0.0, 90.0), LIAR: (0.0, 2.5, 0.0)}
+DRIVERS = ("navigator", "scout", "scout2")
+
+
+class Case(msgspec.Struct, frozen=True, kw_only=True):
+    """What is run."""
+
+    lie: str
+    """As in `--lie`, without its times; empty: the truth."""
+    liar: bool = True
+    """Whether the liar is there at all."""
+    honest: int = 2
+    """Observers beside it."""
+    trust: bool = True
+    """Whether robots judge what they are told."""
+
+
+class Quarantine(NamedTuple):
+    """Of one sender by one robot, seconds from the start."""
+
+    by: str
+    of: str
+    reason: str
+    from_s: float
+    until_s: float | None
+
+
+class Run(NamedTuple):
+    """One run."""
+
+    rmse_m: dict[str, float]
+    quarantines: tuple[Quarantine, ...]
+
+
+class Row(msgspec.Struct, frozen=True, kw_only=True):
+    """One case over its seeds."""
+
+    case: Case
+    rmse_m: Spread
+    """Of the robots that drive: root of the mean over all their samples."""
+    worst_m: Spread
+    """Of the robot that errs most."""
+    ratio: Spread | None
+    """To the team without the liar, with the same seed."""
+    found: int
+    """Robots that put the liar into quarantine, over all seeds."""
+    listening: int
+    """Robots that drive, over all seeds."""
+    found_after_s: Spread | None
+    readmitted_after_s: Spread | None
+    """After the lie ended."""
+    reasons: dict[str, int]
+    false_quarantines: int
+    """Of honest robots, or of the liar before it lied, over all seeds."""
+    false_quarantine_s: float
+    """How long these lasted, seconds a run."""
+
+
+class Liars(msgspec.Struct, frozen=True, kw_only=True):
+    """What the experiment writes."""
+
+    experiment: str
+    version: str
+    seeds: int
+    lie_s: tuple[float, float, float]
+    """From, until, end of the run."""
+    team: Team
+    rows: tuple[Row, ...]
+    held: bool
+    """Whether every kind's median ratio is within the target."""
+
+
+def team(case: Case) -> Team:
+    """The observers at their posts and the robots that drive."""
+    base, replace = load_team(builtin("demo")), msgspec.structs.replace
+    observer, scout = base.robots["observer"], base.robots["scout"]
+    assert observer.start is not None
+    assert scout.start is not None
+    sensor = replace(observer.sensor, range_share=0.01, bearing_sigma_deg=1.0, max_range_m=10.0)
+    posts = [*list(HONEST_POSTS)[: case.honest], *([LIAR] if case.liar else [])]
+    robots = {}
+    for name in posts:
+        x, y, heading_deg = POSTS[name]
+        robots[name] = replace(
+            observer,
+            sensor=replace(sensor, field_of_view_deg=120.0),
+            start=replace(observer.start, x_m=x, y_m=y, heading_deg=heading_deg),
+        )
+    robots |= {
+        "navigator": base.robots["navigator"],
+        "scout": scout,
+        "scout2": replace(
+            scout,
+            waypoints_m=(*scout.waypoints_m[3:], *scout.waypoints_m[:3]),
+            start=replace(scout.start, x_m=6.0, y_m=1.0, heading_deg=0.0),
+        ),
+    }
+    trust = TrustSettings(enabled=case.trust)
+    robots = {
+        name: replace(robot, collaboration=replace(robot.collaboration, after_s=0.0, trust=trust))
+        for name, robot in robots.items()
+    }
+    return replace(base, name="liars", robots=robots)
+
+
+def cases() -> list[Case]:
+    """Without the liar, with it while it is honest, with each kind of lie, judged or believed."""
+    every = []
+    for honest in HONEST:
+        every += [Case(lie="", liar=False, honest=honest), Case(lie="", honest=honest)]
+        every += [
+            Case(lie=kind, honest=honest, trust=trust) for kind in KINDS for trust in (True, False)
+        ]
+    return every
+
+
+class _Statuses:
+    """A referee that ends nothing: it keeps what robots say of each other."""
+
+    over = False
+
+    def __init__(self) -> None:
+        self.found: dict[tuple[str, str, int], Quarantine] = {}
+
+    def attach(self, bus: Bus) -> None:
+        bus.subscribe(topics.STATUS.at(), self._arrived)
+
+    def _arrived(self, key: str, payload: bytes) -> None:
+        status = decode(payload)
+        assert isinstance(status, Status)
+        for trust in status.trust:
+            key_ = status.robot, trust.peer, trust.quarantines
+            since_ns = trust.since_ns or status.stamp_ns  # of a clock it is not said
+            first = self.found.get(key_)
+            if trust.reason:
+                from_s = since_ns * 1e-9 if first is None else first.from_s
+                self.found[key_] = Quarantine(status.robot, trust.peer, trust.reason, from_s, None)
+            elif first is not None and first.until_s is None:
+                self.found[key_] = first._replace(until_s=since_ns * 1e-9)
+
+
+def run(case: Case, seed: int) -> Run:
+    """One run. The same case and seed give the same figures."""
+    statuses, through = _Statuses(), {}
+    if case.lie:
+        lie = Lie.parse(f"{case.lie}@{FROM_S}-{UNTIL_S}")
+        through = {LIAR: lying(lie, LIAR, 0)}
+    _, recorder = simulate(team(case), seed, END_S, referee=statuses, through=through)
+    truth = recorder.simulated_truth()
+    errors = {
+        name: position_errors(recorder.samples(name, truth[name], from_s=FROM_S))
+        for name in DRIVERS
+    }
+    rmse_m = {name: float(np.sqrt(np.mean(e * e))) for name, e in errors.items()}
+    return Run(rmse_m, tuple(statuses.found.values()))
+
+
+def measured(
+    seeds: int, jobs: int, done: Callable[[], None], chosen: Sequence[Case] | None = None
+) -> Liars:
+    """All cases (or these) with all seeds; `done` is called after each run."""
+    wanted = cases() if chosen is None else list(chosen)
+    tasks = [(case, seed) for case in wanted for seed in range(1, seeds + 1)]
+    runs = in_processes(run, tasks, jobs, done)
+    by_case = {case: runs[i * seeds : (i + 1) * seeds] for i, case in enumerate(wanted)}
+    rows = tuple(
+        _row(case, found, by_case.get(Case(lie="", liar=False, honest=case.honest)))
+        for case, found in by_case.items()
+    )
+    return Liars(
+        experiment="liars",
+        version=version("cpcbl-team"),
+        seeds=seeds,
+        lie_s=(FROM_S, UNTIL_S, END_S),
+        team=team(Case(lie="")),
+        rows=rows,
+        held=not any(map(_missed, _judged(rows))),
+    )
+
+
+def _team_rmse_m(one: Run) -> float:
+    return math.sqrt(sum(e * e for e in one.rmse_m.values()) / len(one.rmse_m))
+
+
+def _row(case: Case, runs: Sequence[Run], without: Sequence[Run] | None) -> Row:
+    quarantines = [q for one in runs for q in one.quarantines]
+    began_s = FROM_S - 1.0  # by the stamps of a clock that is behind
+    deserved = [q for q in quarantines if case.lie and q.of == LIAR and q.from_s >= began_s]
+    false = [q for q in quarantines if q not in deserved]
+    first: dict[tuple[int, str], Quarantine] = {}
+    last: dict[tuple[int, str], Quarantine] = {}
+    for i, one in enumerate(runs):
+        for q in one.quarantines:
+            if q in deserved:
+                first.setdefault((i, q.by), q)
+                last[i, q.by] = q
+    healed = [q.until_s - UNTIL_S for q in last.values() if q.until_s is not None]
+    ratio = None
+    if without is not None:
+        ratio = spread(
+            [_team_rmse_m(a) / _team_rmse_m(b) for a, b in zip(runs, without, strict=True)]
+        )
+    rmse, worst = (
+        spread([_team_rmse_m(r) for r in runs]),
+        spread([max(r.rmse_m.values()) for r in runs]),
+    )
+    assert rmse is not None
+    assert worst is not None
+    reasons = [q.reason for q in last.values()]
+    return Row(
+        case=case,
+        rmse_m=rmse,
+        worst_m=worst,
+        ratio=ratio,
+        found=len(first),
+        listening=len(runs) * len(DRIVERS),
+        found_after_s=spread([q.from_s - FROM_S for q in first.values()]),
+        readmitted_after_s=spread(healed),
+        reasons={r: reasons.count(r) for r in sorted(set(reasons))},
+        false_quarantines=len(false),
+        false_quarantine_s=sum((q.until_s or END_S) - q.from_s for q in false) / len(runs),
+    )
+
+
+def tables(result: Liars) -> Iterable[RenderableType]:
+    """A row each lie, beside what comes of believing everything."""
+    believed = {(r.case.lie, r.case.honest): r for r in result.rows if not r.case.trust}
+    for honest in sorted({r.case.honest for r in result.rows}, reverse=True):
+        title = f"one liar, {honest} honest: robots that drive, {result.seeds} seeds"
+        figures = ("m", "ratio", "80 %", "believed", "found", "s", "back", "false")
+        shown = table(title, ("lie",), figures)
+        for row in result.rows:
+            if row.case.honest == honest and row.case.trust:
+                shown.add_row(*_cells(row, believed.get((row.case.lie, honest))))
+        yield shown
+    yield (
+        "m: RMSE. ratio: to the team without the liar; where 80 % of the seeds lie;\n"
+        "believed: where nobody judges. found: robots that found it; s: after the lie\n"
+        "began; back: s after it ended. false: quarantine of honest ones, s a run"
+    )
+    missed = [
+        f"{r.case.lie} beside {r.case.honest} honest" for r in _judged(result.rows) if _missed(r)
+    ]
+    yield (
+        f"held: no ratio is above {MOST_RATIO:g}"
+        if not missed
+        else f"above {MOST_RATIO:g}: {'; '.join(missed)}"
+    )
+
+
+def _judged(rows: Iterable[Row]) -> list[Row]:
+    return [row for row in rows if row.case.lie and row.case.trust]
+
+
+def _missed(row: Row) -> bool:
+    return row.ratio is None or row.ratio.median > MOST_RATIO
+
+
+def _cells(row: Row, believed: Row | None) -> list[str]:
+    name = row.case.lie or ("honest" if row.case.liar else "not there")
+    found = [f"{row.found}/{row.listening}", *_seconds(row)] if row.case.lie else [""] * 3
+    ratio = row.ratio
+    return [
+        name,
+        number(row.rmse_m.median),
+        number(_median(ratio), 2),
+        "-" if ratio is None else f"{ratio.low:.2f}-{ratio.high:.2f}",
+        number(_median(believed.ratio), 2) if believed is not None else "",
+        *found,
+        f"{row.false_quarantine_s:.1f}",
+    ]
+
+
+def _seconds(row: Row) -> tuple[str, str]:
+    return number(_median(row.found_after_s), 1), number(_median(row.readmitted_after_s), 1)
+
+
+def _median(found: Spread | None) -> float | None:
+    return None if found is None else found.median

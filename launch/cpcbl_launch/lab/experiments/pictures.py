@@ -1,0 +1,284 @@
+"""The experiments as pictures. Needs extra `plot`."""
+
+import math
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import matplotlib as mpl
+
+from cpcbl_launch.lab.experiments.budget import Curve, Point
+from cpcbl_launch.lab.experiments.eyes_figures import (
+    LEAST_RECALL,
+    MOST_BEARING_DEG,
+    MOST_RANGE_SHARE,
+    Eyes,
+)
+from cpcbl_launch.lab.experiments.liars import Liars
+from cpcbl_launch.lab.experiments.results import Accuracy, Outcome, Spread
+from cpcbl_team.config import RobotSettings, Team
+
+mpl.use("Agg")
+
+from matplotlib import pyplot as plt
+from matplotlib.lines import Line2D
+from matplotlib.patches import Wedge
+
+DPI = 90
+
+
+def draw_table1(result: Outcome, path: Path) -> None:
+    """Field, then a panel a quantity: the paper's as bars, ours as points with 10-90 %."""
+    figure = plt.figure(figsize=(13, 7), layout="constrained")
+    panels = figure.subplot_mosaic("FFabc\nFFdef", width_ratios=(1, 1, 1.2, 1.2, 1.2))
+    _field(panels["F"], result.teams["joint C"])
+    for i, quantity in enumerate(result.figures["quantities"]):
+        axes = panels["abcdef"[i]]
+        theirs = [result.paper[c][i] for c in "ABC"]
+        axes.bar(range(3), theirs, color="0.85", label="paper")
+        for k, (how, rows) in enumerate(result.figures["rows"].items()):
+            for x, c in enumerate("ABC"):
+                s = rows[c][i]
+                if s is not None:
+                    bars = [[s.median - s.low], [s.high - s.median]]
+                    at = x - 0.24 + 0.16 * k
+                    label = how if x == 0 else None
+                    axes.errorbar(
+                        at, s.median, bars, fmt="o", ms=4, capsize=2, color=f"C{k}", label=label
+                    )
+        axes.set(title=quantity, xticks=range(3), xticklabels="ABC", ylim=(0, None))
+    figure.legend(*panels["a"].get_legend_handles_labels(), loc="outside lower right", ncols=5)
+    _save(figure, path)
+
+
+def draw_figure7(result: Outcome, path: Path) -> None:
+    """The field, and as figure 7 of the paper: mean position error, bars of one sigma."""
+    figure, (field, errors) = plt.subplots(
+        1, 2, figsize=(12, 4.4), width_ratios=(3, 2), layout="constrained"
+    )
+    _field(field, result.teams["F"])
+    names = list(result.figures)
+    for x, a in enumerate(result.figures.values()):
+        if a.position_mean_m is not None:
+            errors.errorbar(
+                x, a.position_mean_m, a.position_sigma_m, fmt="o", capsize=5, color="C0"
+            )
+            at, text = (x, a.position_mean_m), f"{a.position_mean_m:.3f}"
+            errors.annotate(text, at, (8, 0), textcoords="offset points", annotation_clip=True)
+    errors.set(xticks=range(len(names)), xticklabels=names, ylabel="position error (m)")
+    errors.set(title="mean, and one σ (A is off the scale where cut)")
+    rest = [_top(a) for c, a in result.figures.items() if c != "A"]
+    errors.set_ylim(0.0, 1.6 * max(rest, default=0.0) or 1.0)
+    errors.set_xlim(-0.6, len(names) - 0.2)
+    errors.grid(True, axis="y", alpha=0.3)
+    _save(figure, path)
+
+
+def draw_variants(result: Outcome, path: Path) -> None:
+    """Accuracy, consistency and cost of the variants."""
+    figure, (errors, inside, cost) = plt.subplots(1, 3, figsize=(12, 3.8), layout="constrained")
+    variants = list(result.cost)
+    for k, how in enumerate(("alone", "helped")):
+        for x, variant in enumerate(variants):
+            a = result.figures[f"{variant} {how}"]
+            label, at = how if x == 0 else None, x - 0.1 + 0.2 * k
+            if a.position_mean_m is not None:
+                errors.errorbar(
+                    at, a.position_mean_m, a.position_sigma_m, fmt="o", capsize=4, color=f"C{k}",
+                    label=label,
+                )  # fmt: skip
+            if a.inside_3_sigma is not None:
+                inside.plot(at, 100.0 * a.inside_3_sigma, "o", color=f"C{k}")
+    inside.axhline(98.9, color="0.4", linestyle="--", linewidth=1)
+    cost.bar(range(len(variants)), [c.ratio_to_joint for c in result.cost.values()], color="0.7")
+    errors.set(title="position error (m), mean and one σ", ylim=(0, None))
+    inside.set(title="inside 3 σ (%), 98.9 due", ylim=(None, 100.2))
+    cost.set(title="cost of a cycle, of joint's")
+    for axes in (errors, inside, cost):
+        axes.set(
+            xticks=range(len(variants)), xticklabels=variants, xlim=(-0.5, len(variants) - 0.5)
+        )
+        axes.grid(True, axis="y", alpha=0.3)
+    errors.legend()
+    _save(figure, path)
+
+
+def draw_budget(result: Curve, path: Path) -> None:
+    """Team RMSE against bytes; lines to the left and below are better."""
+    figure, axes = plt.subplots(figsize=(8.5, 5.0), layout="constrained")
+    series: dict[str, list[Point]] = {}
+    for point in result.points:
+        series.setdefault(point.series, []).append(point)
+    for name, points in series.items():
+        cost = [p.bytes_per_s for p in points]
+        errors = [p.position_rmse_m for p in points]
+        if name == "nothing":
+            axes.axhline(errors[0], color="0.5", linestyle=":", label="alone")
+            continue
+        style = "*" if len(points) == 1 else "--x" if name == "fixed interval" else "-o"
+        axes.plot(cost, errors, style, ms=12 if len(points) == 1 else 5, label=name)
+    for target in result.targets:
+        axes.axhline(target.allowed_rmse_m, color="0.8", linewidth=0.8, zorder=0)
+    title = f"{result.log}, blind: {', '.join(result.blind) or 'none'}"
+    axes.set(xscale="log", yscale="log", xlabel="sent (B/s a robot, on the wire)")
+    axes.set(ylabel="position RMSE, team (m)", title=title)
+    axes.yaxis.set_minor_formatter(lambda value, _: f"{value:g}")
+    axes.grid(True, which="both", alpha=0.3)
+    axes.legend()
+    _save(figure, path)
+
+
+def draw_directions(result: Outcome, path: Path) -> None:
+    """RMSE against bytes, a panel for each error of the observers; a line through team sizes."""
+    rows = [row for row in result.figures["rows"] if row["direction"] != "deaf"]
+    offsets = sorted({row["observer_off_m"] for row in rows})
+    ways = list(dict.fromkeys((r["direction"], r["fusion"]) for r in rows if r["fusion"]))
+    figure, panels = plt.subplots(
+        1, len(offsets), figsize=(12, 4), sharey=True, layout="constrained", squeeze=False
+    )
+    for axes, offset in zip(panels[0], offsets, strict=True):
+        for k, way in enumerate(ways):
+            line = [
+                r
+                for r in rows
+                if (r["direction"], r["fusion"], r["observer_off_m"]) == (*way, offset)
+            ]
+            bytes_, rmse = [r["bytes_per_s"] for r in line], [r["position_rmse_m"] for r in line]
+            style = "o-" if way[0] == "one-way" else "s--"
+            axes.plot(bytes_, rmse, style, ms=4, color=f"C{k}", label=" ".join(way))
+            for r in line:
+                at = r["bytes_per_s"], r["position_rmse_m"]
+                axes.annotate(str(r["robots"]), at, (3, 3), textcoords="offset points", fontsize=7)
+        axes.set(title=f"observers off by {offset:g} m", xlabel="bytes/s a robot", xscale="symlog")
+        axes.set_yscale("log")
+        axes.grid(True, which="both", alpha=0.3)
+    panels[0][0].set(ylabel="position RMSE (m); numbers: robots")
+    handles, labels = panels[0][0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=len(ways))
+    _save(figure, path)
+
+
+def draw_liars(result: Liars, path: Path) -> None:
+    """The team's error beside that without the liar, judged and believed; when it was found."""
+    sizes = sorted({row.case.honest for row in result.rows}, reverse=True)
+    figure, panels = plt.subplots(
+        2, len(sizes), figsize=(12, 6.5), sharex=True, squeeze=False, layout="constrained"
+    )
+    kinds = list(dict.fromkeys(row.case.lie for row in result.rows if row.case.lie))
+    for (ratios, times), honest in zip(panels.T, sizes, strict=True):
+        lies = [row for row in result.rows if row.case.lie and row.case.honest == honest]
+        for row in lies:
+            if row.ratio is not None:
+                at = kinds.index(row.case.lie) + (-0.1 if row.case.trust else 0.1)
+                _bar(ratios, at, row.ratio, "C0" if row.case.trust else "C3")
+            if row.case.trust:
+                for found, colour in ((row.found_after_s, "C1"), (row.readmitted_after_s, "C2")):
+                    if found is not None:
+                        _bar(times, kinds.index(row.case.lie), found, colour)
+        ratios.axhline(1.3, color="0.5", linestyle="--")
+        ratios.set(title=f"one liar, {honest} honest", yscale="log")
+        times.set_xticks(range(len(kinds)), kinds, rotation=30, ha="right")
+    panels[0][0].set_ylabel("RMSE, to the team without it")
+    panels[1][0].set_ylabel("found, taken back (s)")
+    colours = {"judged": "C0", "believed": "C3", "found": "C1", "taken back": "C2"}
+    handles = [Line2D([], [], marker="o", color=c, label=n) for n, c in colours.items()]
+    figure.legend(handles=handles, loc="outside lower center", ncols=len(colours))
+    _save(figure, path)
+
+
+def draw_eyes(result: Eyes, path: Path) -> None:
+    """A column a kind of thing: errors against range with three stated sigmas, and recall."""
+    kinds = [kind for kind, errors in result.errors.items() if errors]
+    figure, panels = plt.subplots(
+        3, max(1, len(kinds)), figsize=(12, 8), sharex=True, squeeze=False, layout="constrained"
+    )
+    for (ranges, bearings, recall), kind in zip(panels.T, kinds, strict=False):
+        errors = result.errors[kind]
+        shares = [
+            (e.range_m, 100.0 * e.range_share, 100.0 * e.range_sigma_share)
+            for e in errors
+            if e.range_share is not None and e.range_sigma_share is not None
+        ]
+        angles = [
+            (e.range_m, e.bearing_deg, e.bearing_sigma_deg)
+            for e in errors
+            if e.bearing_deg is not None and e.bearing_sigma_deg is not None
+        ]
+        _scattered(ranges, shares, 100.0 * MOST_RANGE_SHARE)
+        _scattered(bearings, angles, MOST_BEARING_DEG)
+        bins = [f for f in result.bins[kind] if f.recall is not None]
+        middles = [0.5 * (f.from_m + f.to_m) for f in bins]
+        recall.plot(middles, [100.0 * (f.recall or 0.0) for f in bins], "o-", color="C0")
+        recall.axhline(100.0 * LEAST_RECALL, color="0.5", linestyle="--")
+        recall.set(ylim=(0.0, 103.0), xlabel="range (m)")
+        ranges.set_title(f"{kind}s: {result.within[kind].right} seen")
+    labels = ("range error (%)", "bearing error (°)", "found of what was due (%)")
+    for axes, label in zip(panels[:, 0], labels, strict=True):
+        axes.set_ylabel(label)
+    handles = [
+        Line2D([], [], color="C3", label="three stated σ, median of half a metre"),
+        Line2D([], [], color="0.5", linestyle="--", label="targets: one σ, recall"),
+    ]
+    figure.legend(handles=handles, loc="outside lower center", ncols=2)
+    _save(figure, path)
+
+
+def _scattered(axes: Any, errors: list[tuple[float, float, float]], target: float) -> None:
+    """Errors against range, with the band of three stated sigmas and that of one allowed."""
+    axes.plot([e[0] for e in errors], [e[1] for e in errors], ".", ms=2, alpha=0.5, color="C0")
+    halves: dict[int, list[float]] = {}
+    for range_m, _, sigma in errors:
+        halves.setdefault(int(range_m / 0.5), []).append(sigma)
+    middles = [0.5 * half + 0.25 for half in sorted(halves)]
+    sigmas = [3.0 * median(halves[half]) for half in sorted(halves)]
+    for sign in (1.0, -1.0):
+        axes.plot(middles, [sign * s for s in sigmas], color="C3", linewidth=1)
+        axes.axhline(sign * target, color="0.5", linestyle="--", linewidth=1)
+    limit = 1.5 * max([target, *sigmas])
+    axes.set_ylim(-limit, limit)
+    axes.grid(True, alpha=0.3)
+
+
+def _bar(axes: Any, at: float, found: Spread, colour: str) -> None:
+    bars = [[found.median - found.low], [found.high - found.median]]
+    axes.errorbar(at, found.median, bars, fmt="o", ms=4, capsize=3, color=colour)
+
+
+def _field(axes: Any, team: Team) -> None:
+    """Landmarks, circuit, and what an observer sees."""
+    for mark in team.map.landmarks.values():
+        both = mark.gives == "both"
+        axes.plot(mark.x_m, mark.y_m, "s" if both else "^", color="0.3" if both else "C1")
+    for robot in team.robots.values():
+        _robot(axes, robot)
+    axes.plot([0, 9, 9, 0, 0], [0, 0, 5, 5, 0], color="0.6", linewidth=0.8)
+    axes.set(xlabel="x (m)", ylabel="y (m)", title="the circuit; ■ landmarks, ▲ bearing only")
+    axes.set_aspect("equal")
+
+
+def _robot(axes: Any, robot: RobotSettings) -> None:
+    start = robot.start
+    assert start is not None
+    if robot.waypoints_m:
+        axes.plot(*zip(*robot.waypoints_m, robot.waypoints_m[0], strict=True), "o-", color="C0")
+    half, heading = _half_view_deg(robot), start.heading_deg
+    reach = 1.0 if robot.waypoints_m else 4.0
+    centre = (start.x_m, start.y_m)
+    axes.add_patch(Wedge(centre, reach, heading - half, heading + half, color="C2", alpha=0.15))
+    tip = (math.cos(math.radians(heading)), math.sin(math.radians(heading)))
+    axes.quiver(*centre, *tip, color="C2", scale=18)
+
+
+def _half_view_deg(robot: RobotSettings) -> float:
+    if robot.sensing != "camera":
+        return 0.5 * robot.sensor.field_of_view_deg
+    return math.degrees(math.atan(0.5 * robot.camera.width_px / robot.camera.fx_px))
+
+
+def _top(a: Accuracy) -> float:
+    return (a.position_mean_m or 0.0) + (a.position_sigma_m or 0.0)
+
+
+def _save(figure: Any, path: Path) -> None:
+    figure.savefig(path, dpi=DPI)
+    plt.close(figure)

@@ -1,0 +1,230 @@
+"""What cameras see of real pictures whose truth is known: found, missed, errors.
+
+A set is a team file and a table (CSV) of the same name: a line says that in a picture a viewer of
+the team sees something, and where it is in the viewer's frame as far as that is known; a line
+without an id, that nothing of the team is in it. The pictures are somebody's else: they are fetched
+by who wants them, and stay where they are.
+"""
+
+import csv
+import math
+from collections.abc import Iterable, Iterator, Sequence
+from importlib.metadata import version
+from importlib.resources import files
+from pathlib import Path
+from typing import NamedTuple
+
+import msgspec
+from rich.console import RenderableType
+
+from cpcbl_agents.vision.detections import Glimpses
+from cpcbl_agents.vision.detector import CameraEyes
+from cpcbl_agents.vision.pictures import decoded
+from cpcbl_launch.reporting.tables import table
+from cpcbl_launch.team_file import load_team
+from cpcbl_team.config import Team
+from cpcbl_team.geometry import wrap_angle
+from cpcbl_team.inputs import Sighting
+
+COLUMNS = ("picture", "viewer", "id", "range_m", "bearing_deg", "heading_deg")
+
+
+class Truth(NamedTuple):
+    """One line of the table."""
+
+    picture: str
+    viewer: str
+    id: str
+    range_m: float | None
+    bearing_deg: float | None
+    heading_deg: float | None
+
+
+class Compared(msgspec.Struct, frozen=True, kw_only=True):
+    """A line beside what was seen; an error is None where there is no truth, or nothing seen."""
+
+    picture: str
+    id: str
+    found: bool
+    range_m: float | None = None
+    range_error_m: float | None = None
+    range_sigma_m: float | None = None
+    bearing_error_deg: float | None = None
+    bearing_sigma_deg: float | None = None
+    heading_error_deg: float | None = None
+    heading_sigma_deg: float | None = None
+
+
+class RealPictures(msgspec.Struct, frozen=True, kw_only=True):
+    """What the experiment writes."""
+
+    experiment: str
+    version: str
+    set: str
+    team: Team
+    pictures: int
+    lines: tuple[Compared, ...]
+    unexpected: tuple[tuple[str, str], ...]
+    """Picture and id of what was seen and is not in the table."""
+    doubted: tuple[tuple[str, str], ...]
+    """Picture and reason."""
+    refused: dict[str, str]
+    """Pictures that could not be used, with the reason."""
+
+
+def set_named(name: str) -> Path:
+    """The table of a built-in set, or one's own file; its team file is beside it. Raises
+    ValueError."""
+    own = Path(name)
+    path = own if own.suffix == ".csv" else _folder() / f"{name}.csv"
+    for needed in (path, path.with_suffix(".toml")):
+        if not needed.is_file():
+            known = ", ".join(sorted(p.stem for p in _folder().glob("*.csv")))
+            raise ValueError(f"{name}: no {needed}; a set is one of {known}, or your own NAME.csv")
+    return path
+
+
+def _folder() -> Path:
+    return Path(str(files("cpcbl_launch") / "picture_sets"))
+
+
+def truths(path: Path) -> list[Truth]:
+    """The lines of a table. Raises ValueError, naming file and line."""
+    with path.open(newline="", encoding="utf-8") as file:
+        reader = csv.DictReader(file)
+        if tuple(reader.fieldnames or ()) != COLUMNS:
+            raise ValueError(f"{path}: line 1: the columns are {','.join(COLUMNS)}")
+        lines = []
+        for row in reader:
+            try:
+                numbers = [float(row[c]) if row[c] else None for c in COLUMNS[3:]]
+            except (TypeError, ValueError) as error:
+                raise ValueError(f"{path}: line {reader.line_num}: {error}") from error
+            lines.append(Truth(row["picture"], row["viewer"], row["id"], *numbers))
+    return lines
+
+
+def measured(name: str, folder: Path) -> RealPictures:
+    """Everything in the set's pictures. Raises ValueError for what the user can mend."""
+    path = set_named(name)
+    team, lines = load_team(path.with_suffix(".toml")), truths(path)
+    viewers = {line.viewer for line in lines}
+    for viewer in sorted(viewers - team.robots.keys()):
+        raise ValueError(f"{path}: no robot {viewer} in {path.with_suffix('.toml')}")
+    eyes = {viewer: CameraEyes(viewer, team) for viewer in viewers}
+    compared: list[Compared] = []
+    unexpected: list[tuple[str, str]] = []
+    doubted: list[tuple[str, str]] = []
+    refused: dict[str, str] = {}
+    for picture in dict.fromkeys(line.picture for line in lines):
+        due = [line for line in lines if line.picture == picture]
+        glimpses = _seen(eyes[due[0].viewer], folder / picture)
+        if isinstance(glimpses, str):
+            refused[picture] = glimpses
+            continue
+        seen = {found.sighting.id: found.sighting for found in glimpses.found}
+        compared += [_compared(line, seen.get(line.id)) for line in due if line.id]
+        unexpected += [(picture, one) for one in sorted(seen.keys() - {line.id for line in due})]
+        doubted += [(picture, doubt.reason) for doubt in glimpses.doubts]
+    return RealPictures(
+        experiment=f"pictures-{path.stem}",
+        version=version("cpcbl-team"),
+        set=path.stem,
+        team=team,
+        pictures=len({line.picture for line in lines}),
+        lines=tuple(compared),
+        unexpected=tuple(unexpected),
+        doubted=tuple(doubted),
+        refused=refused,
+    )
+
+
+def _seen(eyes: CameraEyes, path: Path) -> Glimpses | str:
+    try:
+        image = path.read_bytes()
+    except OSError as error:
+        raise ValueError(f"{path}: {error.strerror}; name the folder of the pictures") from error
+    pixels = decoded(image)
+    return pixels if isinstance(pixels, str) else eyes.glimpses(pixels)
+
+
+def _compared(line: Truth, seen: Sighting | None) -> Compared:
+    if seen is None:
+        return Compared(picture=line.picture, id=line.id, found=False)
+    off = None
+    if line.range_m is not None and seen.range_m is not None:
+        off = seen.range_m - line.range_m
+    return Compared(
+        picture=line.picture,
+        id=line.id,
+        found=True,
+        range_m=seen.range_m,
+        range_error_m=off,
+        range_sigma_m=seen.range_sigma_m,
+        bearing_error_deg=_turned(seen.bearing_rad, line.bearing_deg),
+        bearing_sigma_deg=_degrees(seen.bearing_sigma_rad),
+        heading_error_deg=_turned(seen.heading_rad, line.heading_deg),
+        heading_sigma_deg=_degrees(seen.heading_sigma_rad),
+    )
+
+
+def _turned(seen_rad: float | None, true_deg: float | None) -> float | None:
+    if seen_rad is None or true_deg is None:
+        return None
+    return math.degrees(wrap_angle(seen_rad - math.radians(true_deg)))
+
+
+def _degrees(angle: float | None) -> float | None:
+    return None if angle is None else math.degrees(angle)
+
+
+def tables(result: RealPictures) -> Iterable[RenderableType]:
+    """A row each line of the set's table, then what should not be there."""
+    shown = table(
+        f"{result.set}: {result.pictures} pictures",
+        ("picture", "id"),
+        ("m", "off m", "± σ", "b. off°", "± σ", "h. off°", "± σ"),
+    )
+    for c in result.lines:
+        errors = (
+            *_pair(c.range_error_m, c.range_sigma_m, 3),
+            *_pair(c.bearing_error_deg, c.bearing_sigma_deg, 1),
+            *_pair(c.heading_error_deg, c.heading_sigma_deg, 1),
+        )
+        first = "missed" if not c.found else "-" if c.range_m is None else f"{c.range_m:.2f}"
+        shown.add_row(c.picture.rsplit(".", 1)[0], c.id, first, *errors)
+    yield shown
+    found = sum(c.found for c in result.lines)
+    yield f"found {found} of {len(result.lines)}. m: range; off: from the truth, of which σ is ours"
+    yield f"inside three σ: {', '.join(_inside(result.lines)) or 'no truth but the ids'}"
+    yield f"seen but not in the table: {_listed(result.unexpected)}"
+    yield f"doubted: {_listed(result.doubted)}"
+    if result.refused:
+        yield f"refused: {_listed(tuple(result.refused.items()))}"
+
+
+def _inside(lines: Sequence[Compared]) -> Iterator[str]:
+    """Of how many errors that are known how many are within three stated sigmas."""
+    for what, pairs in {
+        "range": [(c.range_error_m, c.range_sigma_m) for c in lines],
+        "bearing": [(c.bearing_error_deg, c.bearing_sigma_deg) for c in lines],
+        "heading": [(c.heading_error_deg, c.heading_sigma_deg) for c in lines],
+    }.items():
+        known = [(e, s or 0.0) for e, s in pairs if e is not None]
+        if known:
+            yield f"{what} {sum(abs(e) <= 3.0 * s for e, s in known)} of {len(known)}"
+
+
+def _pair(error: float | None, sigma: float | None, digits: int) -> tuple[str, str]:
+    if error is None:
+        return "", ""
+    return f"{error:+.{digits}f}", "-" if sigma is None else f"{sigma:.{digits}f}"
+
+
+def _listed(pairs: Sequence[tuple[str, str]]) -> str:
+    """What, and in which pictures."""
+    pictures: dict[str, list[str]] = {}
+    for picture, what in pairs:
+        pictures.setdefault(what, []).append(picture)
+    told = (f"{what} ({', '.join(dict.fromkeys(where))})" for what, where in pictures.items())
+    return "; ".join(told) or "nothing"

@@ -1,0 +1,1 @@
+"""Running a team: the processes of a run, their supervisor, the router, observers, containers."""

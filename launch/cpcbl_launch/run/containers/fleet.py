@@ -1,0 +1,153 @@
+"""The containers of a run: as the supervisor does for processes, watched and started again."""
+
+import json
+import logging
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from cpcbl_launch.run.containers.docker import DockerError, done, ran
+
+log = logging.getLogger(__name__)
+
+LOOK_S = 1.0
+LONGEST_START_S = 120.0
+PROJECT_LABEL = "com.docker.compose.project"
+SERVICE_LABEL = "com.docker.compose.service"
+
+
+class Container(NamedTuple):
+    """What Docker says of one."""
+
+    id: str
+    running: bool
+    restarting: bool
+    """Docker waits a moment before it starts it again."""
+    pid: int
+    """On this machine; of its init."""
+    code: int
+    started_at: str
+    restarts: int
+    """By Docker itself, since it was last started by hand."""
+
+
+def parsed(inspected: Sequence[Mapping[str, Any]]) -> dict[str, Container]:
+    """Service -> container, of what `docker inspect` says."""
+    found = {}
+    for c in inspected:
+        state = c["State"]
+        found[c["Config"]["Labels"][SERVICE_LABEL]] = Container(
+            c["Id"],
+            state["Running"] and not state["Restarting"],
+            state["Restarting"],
+            state["Pid"],
+            state["ExitCode"],
+            state["StartedAt"],
+            c["RestartCount"],
+        )
+    return found
+
+
+def restarts_between(before: Container, now: Container) -> int:
+    """How often it was started from one look to the next."""
+    if (now.id, now.started_at) == (before.id, before.started_at):
+        return 0
+    return max(1, now.restarts - before.restarts)
+
+
+class Project:
+    """A compose file that is brought up step by step, and taken down as a whole."""
+
+    def __init__(self, program: Sequence[str], name: str, file: Path) -> None:
+        self.name = name
+        self._compose = [*program, "--project-name", name, "--file", str(file)]
+
+    def up(self, *services: str) -> None:
+        """Creates and starts what does not run. Raises DockerError."""
+        command = [*self._compose, "up", "--detach", "--no-build", "--no-recreate", *services]
+        done(command, timeout_s=LONGEST_START_S)
+
+    def down(self) -> None:
+        """Stops and removes all containers and networks; what is left over is said."""
+        command = [*self._compose, "down", "--timeout", "3", "--volumes", "--remove-orphans"]
+        try:
+            done(command, timeout_s=LONGEST_START_S)
+        except DockerError as error:
+            log.error("containers of project %s may be left: %s", self.name, error)
+
+    def containers(self) -> dict[str, Container]:
+        """Service -> container, those that stand still too. Raises DockerError."""
+        label = f"label={PROJECT_LABEL}={self.name}"
+        ids = done(["docker", "ps", "--all", "--quiet", "--no-trunc", "--filter", label]).split()
+        if not ids:
+            return {}
+        return parsed(json.loads(done(["docker", "inspect", *ids])))
+
+    def last_words(self, service: str) -> str:
+        """The last line that a container wrote."""
+        container = self.containers().get(service)
+        return "nothing" if container is None else ran(["docker", "logs", container.id]).last_line
+
+    def save_logs(self, folder: Path) -> None:
+        """What every container said, as SERVICE.log."""
+        for service, container in self.containers().items():
+            said = ran(["docker", "logs", container.id])
+            (folder / f"{service}.log").write_text(said.output, encoding="utf-8")
+
+
+class Fleet:
+    """The containers of a project. Docker starts again what crashes; what was killed or removed by
+    hand it leaves, so that is done here.
+    """
+
+    def __init__(self, project: Project, services: Sequence[str]) -> None:
+        self._project, self._services = project, services
+        self._now: dict[str, Container] = {}
+        self._last: dict[str, Container] = {}
+        self._restarts: dict[str, int] = {}
+        self._next_s = 0.0
+
+    @property
+    def names(self) -> list[str]:
+        return list(self._services)
+
+    @property
+    def pids(self) -> dict[str, int]:
+        return {name: c.pid for name, c in self._now.items() if c.running}
+
+    @property
+    def restarts(self) -> dict[str, int]:
+        return {name: n for name, n in self._restarts.items() if n}
+
+    def watch(self) -> None:
+        """To be called several times a second; looks once a second."""
+        if time.monotonic() < self._next_s:
+            return
+        self._next_s = time.monotonic() + LOOK_S
+        try:
+            self._look()
+        except (DockerError, json.JSONDecodeError) as error:
+            log.warning("containers: %s", error)
+
+    def _look(self) -> None:
+        self._now = self._project.containers()
+        for name, container in self._now.items():
+            new = restarts_between(self._last.get(name, container), container)
+            self._restarts[name] = self._restarts.get(name, 0) + new
+            if new:
+                log.warning("container %s was started again", name)
+        self._last |= self._now
+        down = [name for name in self._services if self._is_down(name)]
+        if down:
+            self._project.up(*down)
+
+    def _is_down(self, name: str) -> bool:
+        container = self._now.get(name)
+        if container is None:
+            log.warning("container %s is gone", name)
+        elif not container.running and not container.restarting:
+            log.warning("container %s ended (%d)", name, container.code)
+        else:
+            return False
+        return True

@@ -1,0 +1,136 @@
+"""A team on a real log: its map, where its robots start, what truth there is."""
+
+import math
+import re
+from collections.abc import Collection
+from pathlib import Path
+from typing import NamedTuple
+
+import msgspec
+import numpy as np
+
+from cpcbl_agents.sources import mrclam
+from cpcbl_launch.options import check_duration
+from cpcbl_launch.reporting.metrics import Floats, truth_at
+from cpcbl_launch.team_file import builtin
+from cpcbl_team.config import Field, Start, Team
+from cpcbl_team.geometry import Pose2, step
+
+LATEST_TRUTH_NS = 30_000_000_000
+LEAST_S = 1.0
+
+
+class LoggedTeam(NamedTuple):
+    """A team whose robots have logs, and what the logs say besides."""
+
+    team: Team
+    truth: dict[str, Floats]
+    left_out: dict[str, str]
+    start_ns: int
+    end_ns: int
+
+
+def builtin_for(folder: Path) -> Path:
+    """The built-in team file that was not calibrated on this data set (by the name's number)."""
+    without = builtin(f"mrclam-without-{_number(folder.resolve().name)}")
+    return without if without.exists() else builtin("mrclam")
+
+
+def seen_before(team: Team, folder: Path) -> bool:
+    """Whether the team's robots were calibrated on this very data set."""
+    return _number(folder.resolve().name) in map(_number, team.calibrated_on)
+
+
+def _number(name: str) -> str:
+    found = re.search(r"\d+$", name)
+    return found.group() if found else name
+
+
+def on_log(team: Team, folder: Path) -> LoggedTeam:
+    """The team on the MRCLAM log in `folder`: robots start at the log's first true pose.
+
+    A robot whose files are missing is left out. Raises LogError, and ValueError for a robot with
+    files that would not read them.
+    """
+    there = set(mrclam.robots_in(folder))
+    left_out = {
+        name: "no " + ", ".join(mrclam.missing_files(folder, name))
+        for name in team.robots
+        if name not in there
+    }
+    names = [name for name in team.robots if name in there]
+    if not names:
+        raise mrclam.LogError(f"{folder}: has files for none of the robots {', '.join(left_out)}")
+    _must_read(team, names)
+    truth = {name: mrclam.read_truth(folder, name) for name in names}
+    spans = {name: mrclam.odometry_span_ns(folder, name) for name in names}
+    robots = {
+        name: msgspec.structs.replace(team.robots[name], start=_start(folder, name, truth[name]))
+        for name in names
+    }
+    ready = msgspec.structs.replace(
+        team,
+        robots=robots,
+        map=Field(landmarks=mrclam.read_landmarks(folder)),
+        data=str(folder.resolve()),
+    )
+    start_ns = min(first for first, _ in spans.values())
+    return LoggedTeam(ready, truth, left_out, start_ns, max(last for _, last in spans.values()))
+
+
+def shortened(logged: LoggedTeam, duration_s: float | None) -> LoggedTeam:
+    """The same log, of which only so much is used; None: all of it. Raises ValueError."""
+    if duration_s is None:
+        return logged
+    check_duration(duration_s, LEAST_S)
+    return logged._replace(end_ns=min(logged.end_ns, logged.start_ns + int(duration_s * 1e9)))
+
+
+def _must_read(team: Team, names: Collection[str]) -> None:
+    for name in names:
+        source = team.robots[name].source
+        if source != "mrclam":
+            raise ValueError(
+                f'robots.{name}.source: {source}: reads no log; write source = "mrclam"'
+            )
+
+
+def _start(folder: Path, robot: str, truth: Floats) -> Start | None:
+    """The true pose at the start of a robot's odometry, or None where truth begins long after it.
+
+    Where truth begins a little later, its first row is carried back along the odometry, and a
+    tenth of that way is added to sigma.
+    """
+    reckoned, way = Pose2(0.0, 0.0, 0.0), 0.0
+    first_ns, _ = mrclam.odometry_span_ns(folder, robot)
+    first_truth_ns = max(first_ns, int(truth[0, 0] * 1e9))
+    if first_truth_ns - first_ns > LATEST_TRUTH_NS:
+        return None
+    for piece in mrclam.read_odometry(folder, robot):
+        if piece.from_ns >= first_truth_ns:
+            break
+        whole_ns = piece.stamp_ns - piece.from_ns
+        share = min(first_truth_ns - piece.from_ns, whole_ns) / whole_ns
+        reckoned = step(reckoned, share * piece.distance_m, share * piece.turn_rad)
+        way += abs(share * piece.distance_m)
+    pose, _ = truth_at(np.array([first_truth_ns * 1e-9]), truth)
+    x, y, heading = Pose2(*pose[0].tolist()) @ reckoned.inverse()
+    return Start(x_m=x, y_m=y, heading_deg=math.degrees(heading), sigma_m=0.05 + 0.1 * way)
+
+
+def blinded(team: Team, blind: Collection[str]) -> Team:
+    """The team with some robots blind to landmarks. Raises ValueError for an unknown name."""
+    unknown = sorted(set(blind) - set(team.robots))
+    if unknown:
+        raise ValueError(
+            f"no robot {', '.join(unknown)} to blind; there are {', '.join(team.robots)}"
+        )
+    robots = {
+        name: msgspec.structs.replace(
+            robot, sensor=msgspec.structs.replace(robot.sensor, sees_landmarks=False)
+        )
+        if name in blind
+        else robot
+        for name, robot in team.robots.items()
+    }
+    return msgspec.structs.replace(team, robots=robots)

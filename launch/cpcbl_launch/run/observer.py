@@ -1,0 +1,213 @@
+"""`cpcbl-team observer`: a robot that joins a running team for a while, with a better sensor."""
+
+import math
+import re
+import time
+from collections.abc import Callable, Sequence
+from importlib import resources
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import msgspec
+
+from cpcbl_agents.clock import Clock
+from cpcbl_agents.guest_node import Visit, body_of
+from cpcbl_agents.process import Loop, new_incarnation, own_camera, while_time_holds
+from cpcbl_launch.reporting.flows import FlowReport, summed_flows
+from cpcbl_launch.simulation.guest_bodies import unfit
+from cpcbl_launch.team_file import beside, read_layer
+from cpcbl_team.config import Team
+from cpcbl_team.inputs import NAME_PATTERN
+from cpcbl_transport import topics
+from cpcbl_transport.bus import Bus
+from cpcbl_transport.security import Identity, link_of
+from cpcbl_transport.topics import Role
+from cpcbl_transport.zenoh_bus import open_bus
+
+NAMESAKE_S = 0.3  # so long a token of the same name is waited for
+
+
+class Place(NamedTuple):
+    """Where an observer stands, or begins, in the field's frame."""
+
+    x_m: float
+    y_m: float
+    heading_deg: float = 0.0
+
+
+class Wish(NamedTuple):
+    """Who wants to join, where, with which senses."""
+
+    name: str
+    at: Place
+    sensor: str = "survey"
+    """A preset, or a TOML file with the keys of a robot's type."""
+    fov_deg: float | None = None
+    moves: tuple[tuple[float, float], ...] = ()
+    """Waypoints; none: as the sensor's file has it."""
+    source: str | None = None
+    """simulated or external; None: what the team's robots are."""
+
+
+class Visited(msgspec.Struct, frozen=True, kw_only=True):
+    """What `observer --json` writes."""
+
+    name: str
+    team: str
+    seconds: float
+    position_sigma_m: float | None
+    """At the end; None when it was over before it began."""
+    lost: str
+    unfed: str
+    """Why it has sensed nothing, if so."""
+    sent: tuple[FlowReport, ...]
+    heard: tuple[FlowReport, ...]
+    counts: dict[str, int]
+
+
+def presets() -> list[str]:
+    """The names of the sensors that come with the package."""
+    return sorted(p.name[:-5] for p in _shipped().iterdir() if p.name.endswith(".toml"))
+
+
+def _shipped() -> Any:
+    return resources.files("cpcbl_launch") / "observers"
+
+
+def place_in(text: str) -> Place:
+    """`X,Y` or `X,Y,HEADING_DEG`. Raises ValueError."""
+    numbers = _numbers(text)
+    if len(numbers) not in (2, 3):
+        raise ValueError(f"--at {text}: write X,Y or X,Y,HEADING_DEG, such as 4.5,5,-90")
+    return Place(*numbers)
+
+
+def places_in(text: str) -> tuple[tuple[float, float], ...]:
+    """`X,Y;X,Y...`, none for an empty text. Raises ValueError."""
+    places = [_numbers(part) for part in text.split(";") if part.strip()]
+    if any(len(place) != 2 for place in places):
+        raise ValueError(f"--move {text}: write X,Y;X,Y, such as 2,1;7,1")
+    return tuple((x, y) for x, y in places)
+
+
+def _numbers(text: str) -> list[float]:
+    """The finite numbers of a list with commas; empty if one of them is none."""
+    try:
+        numbers = [float(part) for part in text.split(",")]
+    except ValueError:
+        return []
+    return numbers if all(map(math.isfinite, numbers)) else []
+
+
+def joined(team: Team, wish: Wish) -> Team:
+    """The team as the observer sees it: itself beside the robots of the file.
+
+    Raises ValueError or TeamFileError for a wish that cannot be granted.
+    """
+    name = wish.name
+    if not re.fullmatch(NAME_PATTERN, name):
+        raise ValueError(f"observer {name!r}: a name has 1 to 32 letters, digits, _, . or -")
+    if name in team.robots:
+        raise ValueError(
+            f"observer {name}: a robot of team {team.name} has this name; choose another one"
+        )
+    if not team.guests.allowed:
+        raise ValueError(
+            f"observer {name}: team {team.name} lets no guest in; set guests.allowed = true in its"
+            " file, and start it again"
+        )
+    if team.match.messages:
+        raise ValueError(
+            f"observer {name}: match.messages are divided among the robots of the file, none are"
+            " left for a guest; take the limit away, or put the observer into the file"
+        )
+    source = wish.source or _source_of(team)
+    shipped = wish.sensor in presets()
+    path = Path(str(_shipped() / f"{wish.sensor}.toml")) if shipped else Path(wish.sensor)
+    if not shipped and not path.exists():
+        raise ValueError(
+            f"--sensor {wish.sensor}: no such file; write one, or {' or '.join(presets())}"
+        )
+    more = beside(team, name, [_PLAIN, read_layer(path), _own(wish, source)], str(path))
+    body = body_of(more.robots[name])
+    reason = "" if body is None else unfit(body)
+    if reason:
+        raise ValueError(f"{path}: {reason}")
+    return more
+
+
+_PLAIN = {"waypoints_m": [], "collaboration": {"after_s": 0.0}}
+"""Of the team's defaults a guest does not take these."""
+
+
+def _own(wish: Wish, source: str) -> dict[str, Any]:
+    """What the command line says, as the last layer."""
+    own: dict[str, Any] = {"source": source, "start": {**wish.at._asdict(), "known": True}}
+    if wish.fov_deg is not None:
+        own["sensor"] = {"field_of_view_deg": wish.fov_deg}
+    if wish.moves:
+        own |= {"waypoints_m": [list(place) for place in wish.moves], "odometry": {"moves": True}}
+    return own
+
+
+def _source_of(team: Team) -> str:
+    sources = {robot.source for robot in team.robots.values()}
+    if sources == {"mrclam"}:
+        raise ValueError(f"team {team.name} replays a log: nobody can join it")
+    return "simulated" if "simulated" in sources else "external"
+
+
+def visit(
+    name: str,
+    team: Team,
+    connect: Sequence[str],
+    clock: Clock,
+    stop: Callable[[], bool],
+    duration_s: float = math.inf,
+) -> Visited:
+    """Runs an observer that `team` holds until `stop()`, or for so many seconds of robot time.
+
+    Raises BusError when stopped before a router answered, ValueError for a name that is taken, or
+    when this machine's clock was set, SecurityError without the keys of a secured team.
+    """
+    loop = Loop(clock)
+    link = link_of(team, Identity(Role.OBSERVER, name), connect)
+    with (
+        own_camera(name, team, clock, loop.wake) as camera,
+        open_bus(team.name, link.endpoints, stop, link.credentials) as bus,
+    ):
+        _look_for_namesakes(name, bus, stop)
+        start_ns = clock.now_ns()
+        incarnation = new_incarnation()
+        node = Visit(name, team, bus, start_ns, incarnation, loop.arrived, clock.speed, camera)
+        over = while_time_holds(name, team, clock, stop)
+        loop.run(node, lambda: over() or clock.now_ns() - start_ns >= duration_s * 1e9)
+        end_ns = clock.now_ns()
+        node.leave(end_ns)
+    return _visited(node, team, (end_ns - start_ns) * 1e-9)
+
+
+def _look_for_namesakes(name: str, bus: Bus, stop: Callable[[], bool]) -> None:
+    found: list[str] = []
+    watch = bus.watch(topics.ALIVE.at(robot=name), lambda key, alive: found.append(key))
+    until = time.monotonic() + NAMESAKE_S
+    while time.monotonic() < until and not found and not stop():
+        time.sleep(0.02)
+    watch.close()
+    if found:
+        raise ValueError(f"observer {name}: the team has one of this name; choose another one")
+
+
+def _visited(node: Visit, team: Team, seconds: float) -> Visited:
+    located = node.robot.collaboration.located
+    return Visited(
+        name=node.robot.name,
+        team=team.name,
+        seconds=seconds,
+        position_sigma_m=None if located is None else located.estimate.position_sigma_m,
+        lost="" if located is None else located.lost,
+        unfed=node.unfed,
+        sent=summed_flows([node.robot.collaboration.tallies.flows()]),
+        heard=summed_flows([node.heard]),
+        counts=dict(node.counts),
+    )

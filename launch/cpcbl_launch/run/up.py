@@ -1,0 +1,249 @@
+"""`cpcbl-team up`: router, field and a process per robot; a live table; a report at the end."""
+
+import logging
+import socket
+import tempfile
+import time
+from collections.abc import Callable, Collection, Mapping, Sequence
+from contextlib import AbstractContextManager, ExitStack
+from functools import partial
+from pathlib import Path
+from types import MappingProxyType
+from typing import NamedTuple, Protocol
+
+import msgspec
+import numpy as np
+
+from cpcbl_agents.clock import Clock
+from cpcbl_launch.options import check_duration, not_written
+from cpcbl_launch.reporting.metrics import Floats
+from cpcbl_launch.reporting.phases import Span, guest_reports, phase
+from cpcbl_launch.reporting.recorder import Recorder, Report
+from cpcbl_launch.reporting.recording import Recording
+from cpcbl_launch.run.logged_team import seen_before
+from cpcbl_launch.run.processes import process_table, tasks
+from cpcbl_launch.run.supervisor import Processes, Supervisor
+from cpcbl_launch.simulation.in_process import Progress, simulate
+from cpcbl_launch.team_file import save_resolved
+from cpcbl_team.config import Team
+from cpcbl_transport.bus import Bus
+from cpcbl_transport.guards import guard_rules
+from cpcbl_transport.security import Identity, access_control, link_of
+from cpcbl_transport.topics import Role
+from cpcbl_transport.zenoh_bus import open_router
+
+log = logging.getLogger(__name__)
+
+LEAD_S = 2.0
+LEAD_S_A_PROCESS = 0.3
+LEAD_S_A_CAMERA = 1.0  # OpenCV is loaded, the lens laid out
+REFRESH_S = 0.25
+SIMULATED_S = 30.0  # unless told otherwise
+LEAST_S = 1.0
+
+
+class Run(NamedTuple):
+    """What is to be run."""
+
+    team: Team
+    duration_s: float | None
+    speed: float = 1.0
+    seed: int = 1
+    here: Collection[str] | None = None
+    """The robots to start on this machine; None: all."""
+    truth: Mapping[str, Floats] = MappingProxyType({})
+    left_out: Mapping[str, str] = MappingProxyType({})
+    epoch_ns: int | None = None
+    """Robot time at the start; None: now."""
+    folder: Path | None = None
+    """Where processes write their logs; None: a temporary folder."""
+    picture: Path | None = None
+    """The picture of the run to write (PNG or SVG)."""
+    record: Path | None = None
+    """The recording of the run to write (MCAP)."""
+
+
+class View(Protocol):
+    """Shows a run to a person."""
+
+    def show(self, recorder: Recorder, processes: Processes, elapsed_s: float) -> None: ...
+
+
+class Stopping(Protocol):
+    def __call__(self) -> bool: ...
+
+
+class Launcher(Protocol):
+    """Starts what a run needs, and ends it."""
+
+    @property
+    def lead_s(self) -> float:
+        """Real seconds that all processes take to be ready."""
+
+    def router(self) -> AbstractContextManager[Bus]:
+        """The team's router, and a session on it."""
+
+    def processes(self, clock: Clock) -> AbstractContextManager[Processes]:
+        """The robots and the field; robot time is the clock's."""
+
+
+class OnThisMachine:
+    """The router in this process, everybody else in a process of its own."""
+
+    def __init__(self, run: Run, folder: Path, stop: Stopping) -> None:
+        self._run, self._folder = run, folder
+        self._here = run.team.robots if run.here is None else run.here
+        cameras = sum(name in self._here for name in run.team.cameras)
+        self.lead_s = LEAD_S + LEAD_S_A_PROCESS * len(self._here) + LEAD_S_A_CAMERA * cameras
+
+    def router(self) -> AbstractContextManager[Bus]:
+        team, listen = self._run.team, self._run.team.transport.listen
+        check_keys(team, listen, self._here)
+        guards = guard_rules(team, self._run.speed) | access_control(team)
+        _, credentials = link_of(team, Identity(Role.ROUTER), listen)
+        return open_router(team.name, listen, guards=guards, credentials=credentials)
+
+    def processes(self, clock: Clock) -> AbstractContextManager[Processes]:
+        team, path = self._run.team, self._folder / "team.json"
+        save_resolved(team, path)
+        endpoint = dialled(team.transport.listen[0])
+        table = process_table(team, path, endpoint, clock, self._run.seed, self._here)
+        return Supervisor(table, self._folder)
+
+
+Launch = Callable[[Run, Path, Stopping], Launcher]
+
+
+def check_keys(team: Team, listen: Sequence[str], here: Collection[str]) -> None:
+    """Says what a process would die of before any starts. Raises SecurityError."""
+    for task in tasks(team, (), 0, here):
+        link_of(team, task.identity, listen)
+
+
+def free_endpoint(protocol: str = "tcp") -> str:
+    """An endpoint of this machine that nobody listens at."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"{protocol}/127.0.0.1:{probe.getsockname()[1]}"
+
+
+def listening(team: Team) -> Team:
+    """The team with an endpoint for its router: its own, or a free one of this machine."""
+    if team.transport.listen:
+        return team
+    endpoint = free_endpoint("tls" if team.transport.secured else "tcp")
+    transport = msgspec.structs.replace(team.transport, listen=(endpoint,))
+    return msgspec.structs.replace(team, transport=transport)
+
+
+def dialled(listen: str) -> str:
+    """The endpoint at which robots of this machine find a router that listens everywhere."""
+    return listen.replace("/0.0.0.0:", "/127.0.0.1:").replace("/[::]:", "/[::1]:")
+
+
+def run_team(run: Run, view: View, stop: Stopping, launch: Launch = OnThisMachine) -> Report:
+    """Runs a team until its time is over or `stop()`. Raises BusError without a router."""
+    with tempfile.TemporaryDirectory(prefix="cpcbl-") as temporary:
+        return _run_in(run, view, stop, run.folder or Path(temporary), launch)
+
+
+def simulate_run(run: Run, progress: Progress | None = None) -> Report:
+    """The same in one process over the bus in memory, as fast as the machine is.
+
+    Raises ValueError for a robot that is not simulated, or too short a duration.
+    """
+    for name, robot in run.team.robots.items():
+        if robot.source != "simulated":
+            raise ValueError(
+                f"robots.{name}.source: {robot.source}: cannot be simulated; use `up`, or"
+                " `evaluate` for a log"
+            )
+    duration_s = SIMULATED_S if run.duration_s is None else run.duration_s
+    check_duration(duration_s, LEAST_S)
+    _, recorder = simulate(run.team, run.seed, duration_s, progress=progress)
+    return _report(run, recorder, 0.0, duration_s, {})
+
+
+def _run_in(run: Run, view: View, stop: Stopping, folder: Path, launch: Launch) -> Report:
+    run = run._replace(team=listening(run.team))
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ValueError(f"{folder}: {error.strerror}; robots read their team there") from error
+    launcher, recording = launch(run, folder, stop), None
+    with launcher.router() as bus, ExitStack() as stack:
+        if run.record is not None:
+            recording = stack.enter_context(_recording(run, run.record, bus))
+        recorder = Recorder(bus)
+        clock = _clock(run, launcher.lead_s)
+        with launcher.processes(clock) as processes:
+            end_ns = None if run.duration_s is None else int(run.duration_s * 1e9)
+            while not stop():
+                elapsed_ns = clock.now_ns() - clock.epoch_ns
+                if end_ns is not None and elapsed_ns >= end_ns:
+                    break
+                processes.watch()
+                view.show(recorder, processes, elapsed_ns * 1e-9)
+                time.sleep(REFRESH_S)
+            elapsed_s = (clock.now_ns() - clock.epoch_ns) * 1e-9
+            restarts = processes.restarts
+    report = _report(run, recorder, clock.epoch_ns * 1e-9, elapsed_s, restarts)
+    if recording is not None and recording.failed:
+        lost = {**report.not_written, str(run.record): recording.failed}
+        report = msgspec.structs.replace(report, not_written=lost)
+    return report
+
+
+def _clock(run: Run, lead_s: float) -> Clock:
+    lead_ns = int(lead_s * 1e9)
+    epoch_ns = time.time_ns() + lead_ns if run.epoch_ns is None else run.epoch_ns
+    return Clock(epoch_ns, time.monotonic_ns() + lead_ns, run.speed)
+
+
+def _recording(run: Run, path: Path, bus: Bus) -> Recording:
+    replayed = [name for name, robot in run.team.robots.items() if robot.source == "mrclam"]
+    if replayed:
+        log.warning(
+            "%s: without the inputs of %s: robots that replay a log do not publish them",
+            path,
+            ", ".join(replayed),
+        )
+    try:
+        return Recording(path, run.team, bus)
+    except OSError as error:
+        raise ValueError(f"--record {path}: {error.strerror}; name another file") from error
+
+
+def _report(
+    run: Run, recorder: Recorder, epoch_s: float, elapsed_s: float, restarts: dict[str, int]
+) -> Report:
+    robots = run.team.robots
+    truth = run.truth or recorder.simulated_truth()
+    after_s = max(robot.collaboration.after_s for robot in robots.values())
+    helped_from_s = epoch_s + after_s if after_s else None
+    variants = {name: robot.localizer.variant for name, robot in robots.items()}
+    begin_s = -np.inf if helped_from_s is None else helped_from_s
+    guests = guest_reports(recorder, list(robots), truth, epoch_s, begin_s)
+    lost: dict[str, str] = {}
+    if (picture := run.picture) is not None:
+        from cpcbl_launch.reporting.picture import draw_run
+
+        present_s = {name: guest.present_s for name, guest in guests.items()}
+        drawn = partial(draw_run, recorder, run.team, truth, picture, epoch_s, helped_from_s)
+        lost = not_written(picture, partial(drawn, present_s))
+    report = recorder.report(variants, truth, begin_s)
+    alone = {}
+    if helped_from_s is not None:
+        until = [Span(until_s=helped_from_s)]
+        alone = {name: phase(recorder, name, truth.get(name), until) for name in robots}
+    return msgspec.structs.replace(
+        report,
+        calibrated_on=run.team.calibrated_on,
+        seen_before=bool(run.team.data) and seen_before(run.team, Path(run.team.data)),
+        left_out=dict(run.left_out),
+        duration_s=elapsed_s,
+        restarts=restarts,
+        alone=alone,
+        guests=guests,
+        not_written=lost,
+    )

@@ -1,0 +1,1 @@
+"""Pictures of the simulated field, as a camera on a robot would take them."""

@@ -1,0 +1,89 @@
+"""The cameras of a simulated team. Needs OpenCV; without a camera this module is not loaded."""
+
+from collections.abc import Mapping, Sequence
+
+import cv2
+import numpy as np
+from msgspec.structs import replace
+
+from cpcbl_agents.vision.camera import Camera, Pixels
+from cpcbl_launch.simulation.camera.render import render
+from cpcbl_launch.simulation.camera.scene import Scene, Standing
+from cpcbl_team.config import CameraSettings, Team
+from cpcbl_team.geometry import Pose2
+from cpcbl_transport.messages import LARGEST_FRAME, Frame
+
+QUALITIES = (90, 75, 50, 25, 10)  # of a JPEG; the best that the guards let through
+HEAD_BYTES = 64  # of a message, beside its picture
+_SEED = 2**30  # apart from robots' own noise
+
+cv2.setNumThreads(1)
+
+
+class Cameras:
+    """Takes pictures of the field. The same seed and the same calls give the same pictures.
+
+    Cameras are as badly known as their settings say, times the simulation's noise.
+    """
+
+    def __init__(self, team: Team, seed: int) -> None:
+        self._scene = Scene.of(team)
+        self._bare = self._scene.without_landmarks()
+        self._random = {
+            name: np.random.default_rng((seed, _SEED, i)) for i, name in enumerate(team.cameras)
+        }
+        light, self._noise = team.simulation.light, team.simulation.noise
+        self._light = replace(light, noise=light.noise * self._noise)
+        self._cameras = {
+            name: off_focus(team.robots[name].camera, self._noise, random)
+            for name, random in self._random.items()
+        }
+        guards = team.transport.guards
+        largest = min(
+            guards.largest_frame_bytes if guards.enabled else LARGEST_FRAME, LARGEST_FRAME
+        )
+        self._largest = largest - HEAD_BYTES
+
+    def frame(self, viewer: str, stamp_ns: int, poses: Mapping[str, Pose2], bare: bool) -> Frame:
+        """What a robot's camera sees now, from among all that stand on the field; `bare`: no
+        landmark can be seen."""
+        others = [Standing(name, *pose) for name, pose in poses.items() if name != viewer]
+        scene = self._bare if bare else self._scene
+        pixels = render(
+            scene,
+            Camera(shaken(self._cameras[viewer], self._noise, self._random[viewer])),
+            poses[viewer],
+            others,
+            self._light,
+            self._random[viewer],
+        )
+        return Frame(stamp_ns, encoded(pixels, self._largest))
+
+
+def off_focus(camera: CameraSettings, noise: float, random: np.random.Generator) -> CameraSettings:
+    """With the focal length that it may well have, by what the settings say of how well it is
+    known; `noise`: times that."""
+    share = 1.0 + noise * camera.focal_share * float(random.normal())
+    return replace(camera, fx_px=camera.fx_px * share, fy_px=camera.fy_px * share)
+
+
+def shaken(camera: CameraSettings, noise: float, random: np.random.Generator) -> CameraSettings:
+    """As it looks on a floor that is not even, by its sigmas of tilt and yaw; `noise`: times
+    these."""
+    tilt, yaw = (noise * float(draw) for draw in random.normal(size=2))
+    return replace(
+        camera,
+        tilt_deg=camera.tilt_deg + camera.tilt_sigma_deg * tilt,
+        yaw_deg=camera.yaw_deg + camera.yaw_sigma_deg * yaw,
+    )
+
+
+def encoded(pixels: Pixels, largest: int, qualities: Sequence[int] = QUALITIES) -> bytes:
+    """A picture as a JPEG of at most so many bytes, if any of the qualities does that."""
+    image = b""
+    for quality in qualities:
+        _, buffer = cv2.imencode(".jpg", pixels, (cv2.IMWRITE_JPEG_QUALITY, quality))
+        image = buffer.tobytes()
+        if len(image) <= largest:
+            break
+    return image

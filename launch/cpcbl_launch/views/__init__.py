@@ -1,0 +1,1 @@
+"""What people watch: a run, the traffic between robots, the frames of their cameras."""

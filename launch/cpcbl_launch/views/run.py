@@ -1,0 +1,274 @@
+"""What a person sees: the live table, the report, progress. Fits 80 columns."""
+
+import math
+from collections.abc import Callable, Collection, Iterator
+from contextlib import contextmanager
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Table
+from rich.text import Text
+
+from cpcbl_launch.reporting.live import LiveView
+from cpcbl_launch.reporting.metrics import Score
+from cpcbl_launch.reporting.phases import AWAY_S
+from cpcbl_launch.reporting.recorder import (
+    Effect,
+    GuestReport,
+    LearnedReport,
+    MeanScore,
+    Recorder,
+    Report,
+    RobotReport,
+)
+from cpcbl_launch.reporting.tables import number, percent, short, table
+from cpcbl_launch.reporting.trust_report import distrusted, trust_remarks
+from cpcbl_launch.run.observer import Visited
+from cpcbl_launch.run.processes import ROBOT
+from cpcbl_launch.run.supervisor import Processes
+from cpcbl_launch.views.traffic.show import EXPLAINED, spent_table, verdict
+from cpcbl_team.collaboration import LOWEST_TIER
+from cpcbl_transport.messages import Status, Track, Truth
+
+FIGURES = ("RMSE m", "mean m", "max m", "deg", "in 3 σ", "NEES")
+ProgressSetter = Callable[[float], None]
+Cell = str | Text
+
+
+class LiveTable(LiveView):
+    """The team as it runs: redrawn on a terminal, else a snapshot every few seconds."""
+
+    def __init__(
+        self, title: str, robots: Collection[str], console: Console, quiet: bool = False
+    ) -> None:
+        """`robots`: those of the team file; who else is heard of is a guest."""
+        super().__init__(console, quiet)
+        self._title, self._robots = title, robots
+
+    def show(self, recorder: Recorder, processes: Processes, elapsed_s: float) -> None:
+        """Called several times a second."""
+        self.draw(lambda: self._table(recorder, processes, elapsed_s), bool(recorder.tracks))
+
+    def _table(self, recorder: Recorder, processes: Processes, elapsed_s: float) -> Table:
+        tracks, statuses, truths = recorder.latest()
+        shown = table(
+            f"{self._title}, {elapsed_s:.1f} s",
+            ("robot",),
+            ("pid", "x m", "y m", "deg", "σ m", "err m", "tier", "out", "B", "in", "B"),
+        )
+        shown.add_column("", overflow="fold")
+        pids, restarts = processes.pids, processes.restarts
+        here = [n.removeprefix(ROBOT) for n in processes.names if n.startswith(ROBOT)]
+        newest_ns = max((t.stamp_ns for t in tracks.values()), default=0)
+        for name in [*here, *sorted(tracks.keys() - set(here), key=self._guests_last)]:
+            process = f"{ROBOT}{name}"
+            pid = str(pids[process]) if process in pids else "down" if name in here else "away"
+            state = _state(tracks.get(name), pid, restarts.get(process, 0))
+            status = statuses.get(name)
+            if status is not None and (said := distrusted(status.trust)):
+                state.append(f", {said}", "yellow")
+            if name not in self._robots:
+                there = newest_ns - tracks[name].stamp_ns <= AWAY_S * 1e9
+                pid, state = "guest", state if there else Text("left", "dim")
+            shown.add_row(
+                name,
+                pid,
+                *_pose_cells(tracks.get(name), truths.get(name)),
+                *_traffic_cells(status),
+                state,
+            )
+        if not self.fits(shown):
+            shown.padding = (0, 0)  # closer together, before a state is folded
+        return shown
+
+    def _guests_last(self, name: str) -> tuple[bool, str]:
+        return name not in self._robots, name
+
+
+def _state(track: Track | None, pid: str, restarts: int) -> Text:
+    if pid == "down":
+        state = Text("down", style="bold red")
+    elif track is None:
+        state = Text("starting", style="dim")
+    else:
+        state = Text(f"lost: {track.lost}", "bold red") if track.lost else Text("ok", "green")
+    return state.append(f" (restarted {restarts})", "yellow") if restarts else state
+
+
+def _pose_cells(track: Track | None, truth: Truth | None) -> list[Cell]:
+    if track is None:
+        return [""] * 6
+    c = track.covariance
+    error = None if truth is None else math.hypot(truth.x_m - track.x_m, truth.y_m - track.y_m)
+    tier = Text(str(track.tier), "green" if track.tier < LOWEST_TIER // 2 else "yellow")
+    return [
+        f"{track.x_m:.2f}",
+        f"{track.y_m:.2f}",
+        f"{math.degrees(track.heading_rad):.0f}",
+        "-" if c is None else f"{math.sqrt(0.5 * (c[0] + c[2])):.3f}",
+        _graded(error),
+        tier,
+    ]
+
+
+def _traffic_cells(status: Status | None) -> list[Cell]:
+    if status is None:
+        return [""] * 4
+    s = status
+    return [
+        short(n) for n in (s.messages_sent, s.bytes_sent, s.messages_received, s.bytes_received)
+    ]
+
+
+def _graded(error: float | None) -> Text:
+    if error is None:
+        return Text("-")
+    return Text(f"{error:.3f}", "green" if error < 0.15 else "yellow" if error < 0.5 else "red")
+
+
+def print_report(report: Report, console: Console) -> None:
+    """The figures of a run as a table with units."""
+    before = ("before m",) if report.alone else ()
+    figures = table(
+        "errors of position and heading (deg, RMSE)",
+        ("robot",),
+        (*before, *FIGURES, "lost", "out", "B"),
+    )
+    for name, r in report.robots.items():
+        alone = report.alone.get(name)
+        before_m = [] if alone is None else [number(alone.position_rmse_m)]
+        figures.add_row(name, *before_m, *_robot_cells(r))
+    t = report.team
+    known = [s.position_rmse_m for s in report.alone.values() if s.position_rmse_m is not None]
+    figures.add_section()
+    figures.add_row(
+        "team",
+        *([number(sum(known) / len(known) if known else None)] if report.alone else []),
+        *_figures(t),
+        "",
+        short(t.messages_sent),
+        short(t.bytes_sent),
+        style="bold",
+    )
+    if report.guests:
+        figures.add_section()
+    for name, guest in report.guests.items():
+        figures.add_row(f"{name}, guest", *("-" for _ in before), *_robot_cells(guest))
+    console.print(figures)
+    for name, guest in report.guests.items():
+        console.print()
+        console.print(_effects(name, guest))
+    if any(r.sent or r.spending for r in report.robots.values()):
+        console.print()
+        console.print(spent_table(report))
+        console.print(EXPLAINED, style="yellow", highlight=False)
+    if (said := verdict(report)) is not None:
+        console.print(said)
+    if report.yardsticks:
+        console.print(_yardsticks(report))
+    for line in _remarks(report):
+        console.print(line, style="yellow", highlight=False, markup=False)  # robots may say [/b]
+
+
+def _robot_cells(r: RobotReport) -> list[str]:
+    """The cells of a robot from FIGURES on."""
+    return [*_figures(r), percent(r.lost_share), short(r.messages_sent), short(r.bytes_sent)]
+
+
+def _effects(name: str, guest: GuestReport) -> Table:
+    """What a guest's presence did to each robot."""
+    parts = Effect.__struct_fields__
+    present = ", ".join(f"{a:.1f} to {b:.1f} s" for a, b in guest.present_s)
+    shown = table(
+        f"before, during, after guest {name}: there from {present}",
+        ("robot",),
+        [f"{what} {part}" for what in ("RMSE", "σ") for part in parts],
+    )
+    for robot, effect in guest.robots.items():
+        phases = [getattr(effect, part) for part in parts]
+        rmse = [number(p.position_rmse_m) for p in phases]
+        shown.add_row(robot, *rmse, *(number(p.position_sigma_m) for p in phases))
+    return shown
+
+
+def print_visit(visited: Visited, console: Console) -> None:
+    """What an observer did while it was there."""
+    sigma = number(visited.position_sigma_m)
+    said = f"{visited.name} was there for {visited.seconds:.1f} s, σ {sigma} m at the end"
+    console.print(said, style="bold", highlight=False)
+    shown = table("", ("help",), ("messages", "B"))
+    for said, flows in (("sent", visited.sent), ("heard", visited.heard)):
+        for flow in flows:
+            peer = f" {'to' if said == 'sent' else 'from'} {flow.peer}" if flow.peer else ""
+            shown.add_row(f"{flow.topic} {said}{peer}", short(flow.messages), short(flow.bytes))
+    if shown.row_count:
+        console.print(shown)
+    if visited.lost:
+        console.print(f"{visited.name} is lost: {visited.lost}", style="yellow", highlight=False)
+    if visited.unfed:
+        console.print(f"{visited.name}: {visited.unfed}", style="yellow", highlight=False)
+
+
+def _yardsticks(report: Report) -> Table:
+    """Plain filters beside the team: means over the robots."""
+    shown = table("yardsticks: the same data and settings, team means", ("filter",), FIGURES)
+    for name, yardstick in report.yardsticks.items():
+        shown.add_row(name.replace("_", " ").replace("ekf", "EKF"), *_figures(yardstick.team))
+    shown.add_section()
+    shown.add_row("this team", *_figures(report.team), style="bold")
+    return shown
+
+
+def _figures(s: Score | MeanScore) -> list[str]:
+    """The cells below FIGURES."""
+    return [
+        number(s.position_rmse_m),
+        number(s.position_mean_m),
+        number(s.position_max_m),
+        number(s.heading_rmse_deg, 1),
+        percent(s.inside_3_sigma),
+        number(s.nees, 1),
+    ]
+
+
+def _remarks(report: Report) -> Iterator[str]:
+    if report.alone:
+        yield "before: RMSE before teammates began to help; the other columns are from then on"
+    yield "consistent: 98.9 % in 3 σ, NEES 2; out, B: help sent, bytes with Zenoh's own"
+    if report.calibrated_on:
+        flattering = ": this log too, the figures flatter" if report.seen_before else ""
+        yield f"robots calibrated on {', '.join(report.calibrated_on)}{flattering}"
+    for name, reason in report.left_out.items():
+        yield f"left out: robot {name}: {reason}"
+    for name, r in report.robots.items():
+        if r.bumps:
+            yield f"robot {name} bumped into a landmark {r.bumps} times"
+        if r.lost_at_end:
+            yield f"robot {name} is lost: {r.lost_at_end}"
+    for name, r in report.robots.items():
+        if r.learned is not None:
+            yield f"robot {name} learned: {_corrections(r.learned)}"
+    for name, r in report.robots.items():
+        yield from trust_remarks(name, r.trust)
+    if report.refused:
+        counts = ", ".join(f"{reason} {n}" for reason, n in report.refused.items())
+        yield f"heard and of no use, by reason: {counts}"
+    for name, n in report.restarts.items():
+        yield f"{name} was restarted {n} times"
+
+
+def _corrections(found: LearnedReport) -> str:
+    """What is done to readings: `distance × 0.98, turn × 0.96, bearings -0.6°`."""
+    distance, turn, turned = found.distance_scale, found.turn_scale, -found.bearing_bias_deg
+    return f"distance × {distance:.2f}, turn × {turn:.2f}, bearings {turned:+z.1f}°"
+
+
+@contextmanager
+def progress_bar(title: str, quiet: bool) -> Iterator[ProgressSetter]:
+    """A bar on standard error; call what it yields with the share that is done."""
+    console = Console(stderr=True)
+    columns = (TextColumn(title), BarColumn(), TimeRemainingColumn())
+    disable = quiet or not console.is_terminal
+    with Progress(*columns, console=console, transient=True, disable=disable) as progress:
+        task = progress.add_task(title, total=1.0)
+        yield lambda done: progress.update(task, completed=done)

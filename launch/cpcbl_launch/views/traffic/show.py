@@ -1,0 +1,195 @@
+"""Traffic on a terminal: what a run spent, and live who helps whom. Fits 80 columns."""
+
+from collections.abc import Iterable, Iterator, Sequence
+
+from rich.console import Console, Group
+from rich.table import Table
+from rich.text import Text
+
+from cpcbl_launch.reporting.flows import FlowReport, SpendingReport, all_held
+from cpcbl_launch.reporting.live import LiveView
+from cpcbl_launch.reporting.recorder import Report, RobotReport
+from cpcbl_launch.reporting.tables import number, short, table
+from cpcbl_launch.reporting.trust_report import distrusted
+from cpcbl_launch.views.traffic.watch import AT_PRESENT_NS, RATES_NS, Help, RobotNow, Traffic
+
+COLOURS = {"fix": "cyan", "belief": "magenta"}
+NOT_SENT = ("budget", "value", "silence")
+EXPLAINED = (
+    "not sent: over the budget; of too little value; in silence, as listeners can\n"
+    "still tell. B: on the sender's link with Zenoh's own, without TCP/IP's"
+)
+_LIVE = (
+    "alive: presence and tier, anew at each change of tier; its bytes are not counted\n"
+    f"counts: since a robot's process started; rates: over the last {RATES_NS // 10**9} s\n"
+    "heard is status/* only: watching makes nobody send a fix or belief"
+)
+
+
+# The report of a run ----------------------------------------------------------------------------
+
+
+def spent_table(report: Report) -> Table:
+    """What each robot sent, what it did not send and why, and how near it came to its limits."""
+    limited = any(r.spending for r in report.robots.values())
+    shown = table(
+        "help sent, and not sent for budget, value, silence",
+        ("robot",),
+        ("fixes", "beliefs", "B/s", *NOT_SENT),
+    )
+    if limited:
+        shown.add_column("most", no_wrap=True)
+    robots = list(report.robots.values())
+    for name, robot in report.robots.items():
+        _add_spent(shown, name, robot, report.duration_s)
+    shown.add_section()
+    shown.add_row("team", *_spent(robots, report.duration_s), style="bold")
+    if report.guests:
+        shown.add_section()
+    for name, guest in report.guests.items():
+        _add_spent(shown, f"{name}, guest", guest, report.duration_s)
+    return shown
+
+
+def _add_spent(shown: Table, name: str, robot: RobotReport, duration_s: float) -> None:
+    limits = [Text("\n").join(map(limit_text, robot.spending))] if robot.spending else []
+    shown.add_row(name, *_spent([robot], duration_s), *limits)
+
+
+def _spent(robots: Sequence[RobotReport], duration_s: float) -> list[str]:
+    flows = [flow for robot in robots for flow in robot.sent]
+    per_s = sum(f.bytes for f in flows) / duration_s if duration_s else None
+    return [
+        *(short(sum(f.messages for f in flows if f.topic == topic)) for topic in COLOURS),
+        "-" if per_s is None else short(per_s),
+        *_not_sent(flows),
+    ]
+
+
+def _not_sent(flows: Iterable[FlowReport]) -> list[str]:
+    """The cells below NOT_SENT."""
+    rows = [(f.over_budget, f.worthless, f.silent) for f in flows]
+    return [short(sum(column)) for column in zip(*rows, strict=True)] or ["0", "0", "0"]
+
+
+def limit_text(s: SpendingReport) -> Text:
+    """`412 of 500 B in 10 s`, green while within."""
+    unit = "B" if s.unit == "bytes" else "msg"
+    within = f" in {s.window_s:.3g} s" if s.window_s else " so far"
+    most, allowed = (f"{n:.1f}".removesuffix(".0") for n in (s.most, s.allowed))
+    return Text(f"{most} of {allowed} {unit}{within}", "green" if s.held else "bold red")
+
+
+def verdict(report: Report) -> Text | None:
+    """In words, whether every limit held; None without any."""
+    spendings = [(name, s) for name, r in report.robots.items() for s in r.spending]
+    held = all_held(s for _, s in spendings)
+    if held is None:
+        return None
+    if held:
+        return Text("every limit held: nobody spent more than is allowed in any window", "green")
+    broken = (f"{name}: {limit_text(s)}" for name, s in spendings if not s.held)
+    return Text(f"limits did not hold: {'; '.join(broken)}", "bold red")
+
+
+# Live -------------------------------------------------------------------------------------------
+
+
+class TrafficView(LiveView):
+    """Redrawn on a terminal, else a snapshot every few seconds."""
+
+    def __init__(self, where: str, console: Console, quiet: bool = False) -> None:
+        super().__init__(console, quiet)
+        self._where = where
+
+    def show(self, now: Traffic) -> None:
+        """Called several times a second."""
+        self.draw(lambda: drawn(now, self._where), bool(now.robots))
+
+
+def drawn(now: Traffic, where: str) -> Group:
+    """Who helps whom, how near each came to its limits, what it sent, and what that means."""
+    title = f"team {now.team} at {where}, watched for {now.watched_s:.0f} s"
+    if now.refused:
+        reasons = ", ".join(f"{reason} {n}" for reason, n in now.refused.items())
+        title += f"\nrefused, by reason: {reasons}"
+    if not now.robots:
+        return Group(
+            Text(f"{title}\nno robot of this team has been heard: is the name right?", "yellow")
+        )
+    limits = [
+        Text(f"{name}: most ").append_text(Text(", ").join(map(limit_text, robot.spending)))
+        for name, robot in now.robots.items()
+        if robot.spending
+    ]
+    return Group(
+        Text(title, "bold"),
+        help_table(now),
+        *limits,
+        "",
+        flow_table(now),
+        Text(f"{EXPLAINED}\n{_LIVE}\n", "yellow"),
+    )
+
+
+def help_table(now: Traffic) -> Table:
+    """The drawing: the best informed robot first, an arrow to each teammate that it helps."""
+    shown = table("", ("robot",), ("tier", "σ m"))
+    shown.add_column(f"helps (in the last {AT_PRESENT_NS // 10**9} s)", overflow="fold")
+    for name, robot in now.robots.items():
+        style = "dim" if robot.away else "bold red" if robot.lost else ""
+        shown.add_row(
+            Text(f"{name}, guest" if name in now.guests else name, style),
+            Text(str(robot.tier), style),
+            Text(number(robot.position_sigma_m), style),
+            _doing(robot, [h for h in now.help if h.helper == name]),
+        )
+    for name in now.never_heard:
+        shown.add_row(Text(name, "dim"), "", "", Text("not heard of", "yellow"))
+    return shown
+
+
+def _doing(robot: RobotNow, given: Sequence[Help]) -> Text:
+    if robot.away:
+        return Text(f"away: silent for {robot.silent_s:.0f} s", "yellow")
+    if robot.lost:
+        return Text(f"lost: {robot.lost}", "bold red")
+    lines = list(_arrows(given)) if given else [Text("nobody", "dim")]
+    if said := distrusted(robot.trust):
+        lines.append(Text(said, "yellow"))
+    return Text("\n").join(lines)
+
+
+def _arrows(given: Sequence[Help]) -> Iterator[Text]:
+    """A line for each teammate: `──▶ scout  fix 9.5/s, belief 2.0/s`."""
+    width = max(len(h.helped) for h in given)
+    for helped in dict.fromkeys(h.helped for h in given):
+        kinds = [
+            Text(h.topic + (f" {h.messages_per_s:.1f}/s" if h.messages_per_s else ""))
+            for h in given
+            if h.helped == helped
+        ]
+        for kind in kinds:
+            kind.stylize(COLOURS[kind.plain.split()[0]])
+        yield Text(f"──▶ {helped:<{width}}  ").append_text(Text(", ").join(kinds))
+
+
+def flow_table(now: Traffic) -> Table:
+    """A row for each robot and key."""
+    shown = table("", ("robot", "key"), ("messages", "B", "/s", "B/s", *NOT_SENT))
+    for name, robot in now.robots.items():
+        style = "dim" if robot.away else ""
+        shown.add_row(name, "alive", str(robot.announced), style=style)
+        for flow in robot.sent:
+            key = f"{flow.topic} → {flow.peer}" if flow.peer else flow.topic
+            shown.add_row(
+                "",
+                Text(key, COLOURS[flow.topic]),
+                short(flow.messages),
+                short(flow.bytes),
+                number(None if robot.away else flow.messages_per_s, 1),
+                number(None if robot.away else flow.bytes_per_s, 0),
+                *_not_sent([flow]),
+                style=style,
+            )
+    return shown

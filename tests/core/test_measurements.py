@@ -1,0 +1,134 @@
+import math
+from collections.abc import Mapping
+
+import pytest
+from support.core import CORNERS, SECOND, belief, diagonal, state_at
+
+from cpcbl_team.config import (
+    CollaborationSettings,
+    Field,
+    Gives,
+    Landmark,
+    LocalizationSettings,
+    LocalizerSettings,
+    SensorSettings,
+    Wall,
+)
+from cpcbl_team.estimate import Scope
+from cpcbl_team.geometry import Pose2
+from cpcbl_team.inputs import Belief, Sighting
+from cpcbl_team.measurements import (
+    Measured,
+    constraints_of,
+    measured,
+    observation_of,
+    surprise,
+)
+
+HERE = Pose2(0.0, 0.0, 0.0)
+
+
+def seen_as(
+    sighting: Sighting,
+    field: Field = CORNERS,
+    *,
+    teammates: Mapping[str, tuple[Belief, ...]] | None = None,
+    sensor: SensorSettings | None = None,
+    passive: bool = True,
+    stamp_ns: int = 0,
+) -> Measured | None:
+    settings = LocalizationSettings(
+        sensor=sensor or SensorSettings(),
+        collaboration=CollaborationSettings(passive=passive),
+    )
+    return measured(sighting, stamp_ns, HERE, field, teammates or {}, settings)
+
+
+@pytest.mark.parametrize(
+    ("gives", "range_m", "bearing"),
+    [
+        ("both", 2.0, 0.5),
+        ("range", 2.0, None),
+        ("bearing", None, 0.5),
+        ("none", None, None),
+    ],
+)
+def test_a_landmark_gives_what_it_is_configured_to(
+    gives: Gives, range_m: float | None, bearing: float | None
+) -> None:
+    field = Field(
+        landmarks={"post": Landmark(x_m=1.0, y_m=2.0, gives=gives)},
+        walls={"wall": Wall(from_m=(0.0, 2.0), to_m=(1.0, 2.0), gives=gives)},
+    )
+    for name in ("post", "wall"):  # rows 2, 11, 19
+        seen = seen_as(Sighting(name, 2.0, 0.5), field)
+        assert seen is not None
+        assert (seen.range_m, seen.bearing) == (range_m, bearing)
+        assert seen.gives_point_bearing is (name == "post" and bearing is not None)
+
+
+@pytest.mark.parametrize(("range_m", "used"), [(2.9, 2.9), (3.1, None)])
+def test_a_range_beyond_the_good_ones_leaves_the_bearing(
+    range_m: float, used: float | None
+) -> None:
+    seen = seen_as(Sighting("ne", range_m, 0.5), sensor=SensorSettings(max_range_for_range_m=3.0))
+    assert seen is not None  # row 3
+    assert (seen.range_m, seen.bearing) == (used, 0.5)
+
+
+def test_a_sighting_may_lack_a_quantity() -> None:
+    seen = seen_as(Sighting("ne", None, 0.5))
+    assert seen is not None
+    assert seen.range_m is None
+
+
+def test_what_is_on_the_map_is_placed_exactly() -> None:
+    seen = seen_as(Sighting("ne", 2.0, 0.5))
+    assert seen is not None
+    assert seen.place == (4.5, 2.5, (0.0, 0.0, 0.0))
+    assert not seen.teammate
+
+
+def test_the_range_sigma_is_that_of_the_range_to_be_expected() -> None:
+    sensor = SensorSettings(range_share=0.1, range_floor_m=0.0)
+    field = Field(
+        landmarks={"post": Landmark(x_m=3.0, y_m=4.0)},
+        walls={"wall": Wall(from_m=(-9.0, 5.0), to_m=(0.0, 5.0))},
+    )
+    for name in field.landmarks | field.walls:
+        seen = seen_as(Sighting(name, 4.0, 0.0), field, sensor=sensor)
+        assert seen is not None
+        assert seen.range_sigma == pytest.approx(0.5)
+
+
+def test_an_unknown_object_is_not_used() -> None:
+    assert seen_as(Sighting("mate", 2.0, 0.5)) is None
+
+
+def test_a_teammate_that_told_its_pose_is_one_more_landmark() -> None:
+    told = {"mate": (belief(1.0, 2.0, sigma_m=0.3),)}
+    seen = seen_as(Sighting("mate", 2.0, 0.5), teammates=told)
+    assert seen is not None  # row 25
+    assert seen.teammate
+    assert seen.place.covariance == pytest.approx((0.09, 0.0, 0.09))
+    assert seen_as(Sighting("mate", 2.0, 0.5), teammates=told, passive=False) is None
+
+
+def test_a_teammate_whose_belief_is_too_old_is_not_used() -> None:
+    told = {"mate": (belief(1.0, 2.0),)}
+    late = Sighting("mate", math.sqrt(5.0), 0.5)
+    assert seen_as(late, teammates=told, stamp_ns=2 * SECOND) is None
+
+
+@pytest.mark.parametrize("turn", Scope)
+@pytest.mark.parametrize("name", ["ne", "mate"])
+def test_the_gate_measures_the_innovation_of_the_whole_observation(name: str, turn: Scope) -> None:
+    """For a landmark in a shorter way, for its place is exact."""
+    prior = state_at(HERE, diagonal(0.2, 0.1)).estimate
+    seen = seen_as(Sighting(name, 3.0, 0.7), teammates={"mate": (belief(1.0, 2.0, sigma_m=0.3),)})
+    assert seen is not None
+    cs = constraints_of(HERE, seen, turn, LocalizerSettings())
+    whole = observation_of(prior, seen, cs, prior)
+    expected = whole.normalized_innovation_squared(prior.covariance)
+    assert expected > 0.0
+    assert surprise(prior, seen, cs) == pytest.approx(expected, rel=1e-12)

@@ -1,0 +1,416 @@
+"""Dead reckoning, solo and centralized EKF on logs whose noise is known; their TUM files."""
+
+import json
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+from support.core import LOOP_START, diagonal, driven, loop
+from support.logs import FRAME_MS, STEP_MS, log_team, write_log
+from support.processes import cpcbl_team
+
+from cpcbl_agents.sources.mrclam import read_table
+from cpcbl_launch.lab.baselines import Ekf, Inputs, expected_sighting, inputs_of, scored, yardsticks
+from cpcbl_launch.reporting.metrics import Floats, Trajectory, compared, position_errors
+from cpcbl_launch.reporting.recorder import YardstickReport
+from cpcbl_launch.run.logged_team import LoggedTeam, blinded, on_log
+from cpcbl_launch.simulation.in_process import evaluated
+from cpcbl_team.config import (
+    Field,
+    LocalizerSettings,
+    OdometrySettings,
+    RobotSettings,
+    SensorSettings,
+    Team,
+)
+from cpcbl_team.estimate import Estimate
+from cpcbl_team.geometry import Pose2, step
+from cpcbl_team.inputs import Odometry, Sighting, Sightings
+
+ROBOTS = ("1", "2", "3")
+KINDS = ("dead_reckoning", "solo_ekf", "centralized_ekf")
+SENSOR = SensorSettings(range_share=0.05, range_floor_m=0.02, bearing_sigma_deg=2.0)
+# Noise of turns by the way only: noise by the turn would itself be a turn, and so count twice.
+ODOMETRY = OdometrySettings(
+    distance_sigma_m_per_sqrt_m=0.08,
+    turn_sigma_rad_per_sqrt_rad=0.0,
+    turn_sigma_rad_per_sqrt_m=0.08,
+)
+
+
+# Logs --------------------------------------------------------------------------------------------
+
+
+def rewritten(path: Path, change: Callable[[Floats], Floats], columns: int) -> None:
+    np.savetxt(path, change(read_table(path, columns)), fmt="%.9f")
+
+
+def add_noise(folder: Path, seed: int) -> None:
+    """White noise exactly as SENSOR and ODOMETRY say."""
+    rng, step_s = np.random.default_rng(seed), STEP_MS * 1e-3
+    shares = ODOMETRY.distance_sigma_m_per_sqrt_m, ODOMETRY.turn_sigma_rad_per_sqrt_m
+
+    def wheels(rows: Floats) -> Floats:
+        root = np.sqrt(np.abs(rows[:, 1:2]) * step_s)
+        rows[:, 1:] += root * np.array(shares) * rng.normal(size=(len(rows), 2)) / step_s
+        return rows
+
+    def camera(rows: Floats) -> Floats:
+        sigma = np.hypot(SENSOR.range_share * rows[:, 2], SENSOR.range_floor_m)
+        rows[:, 2] += sigma * rng.normal(size=len(rows))
+        rows[:, 3] += SENSOR.bearing_sigma_rad * rng.normal(size=len(rows))
+        rows[:, 3] = (rows[:, 3] + math.pi) % math.tau - math.pi
+        return rows
+
+    for path in sorted(folder.glob("Robot*_Odometry.dat")):
+        rewritten(path, wheels, 3)
+    for path in sorted(folder.glob("Robot*_Measurement.dat")):
+        rewritten(path, camera, 4)
+
+
+def changed(team: Team, **settings: Any) -> Team:
+    """All robots with other settings."""
+    robots = {n: msgspec.structs.replace(r, **settings) for n, r in team.robots.items()}
+    return msgspec.structs.replace(team, robots=robots)
+
+
+def noisy(folder: Path, seed: int, seconds: float = 40.0) -> LoggedTeam:
+    write_log(folder, ROBOTS, seconds)
+    add_noise(folder, seed)
+    return started(on_log(changed(log_team(*ROBOTS), sensor=SENSOR, odometry=ODOMETRY), folder))
+
+
+def started(logged: LoggedTeam, dx_m: float = 0.0, dy_m: float = 0.0) -> LoggedTeam:
+    """Robots that are sure of starts which are so far off."""
+    robots = {}
+    for name, robot in logged.team.robots.items():
+        assert robot.start is not None
+        start = msgspec.structs.replace(
+            robot.start,
+            x_m=robot.start.x_m + dx_m,
+            y_m=robot.start.y_m + dy_m,
+            sigma_m=1e-4,
+            heading_sigma_deg=0.01,
+        )
+        robots[name] = msgspec.structs.replace(robot, start=start)
+    return logged._replace(team=msgspec.structs.replace(logged.team, robots=robots))
+
+
+def paths_of(logged: LoggedTeam) -> dict[str, dict[str, Trajectory]]:
+    stamps = range(logged.start_ns, logged.end_ns, 100_000_000)
+    return yardsticks(inputs_of(logged), logged.team.map, dict.fromkeys(logged.team.robots, stamps))
+
+
+def reports_of(logged: LoggedTeam) -> dict[str, YardstickReport]:
+    return {kind: scored(paths, logged.truth) for kind, paths in paths_of(logged).items()}
+
+
+def figure(report: YardstickReport, name: str = "position_rmse_m", robot: str = "") -> float:
+    value = getattr(report.robots[robot] if robot else report.team, name)
+    assert isinstance(value, float)
+    return value
+
+
+# Accuracy ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("blind", [[], ["2"]], ids=["full map", "blind"])
+def test_no_noise_no_error(tmp_path: Path, blind: list[str]) -> None:
+    write_log(tmp_path, ROBOTS, 20.0, unknown_barcode=True)
+    logged = on_log(log_team(*ROBOTS), tmp_path)
+    reports = reports_of(logged._replace(team=blinded(logged.team, blind)))
+    assert tuple(reports) == KINDS
+    for report in reports.values():
+        assert report.robots.keys() == set(ROBOTS)
+        for robot in report.robots.values():
+            assert robot.samples == 200
+            assert robot.position_max_m == pytest.approx(0.0, abs=1e-6)
+            assert robot.heading_rmse_deg == pytest.approx(0.0, abs=1e-4)
+            assert robot.inside_3_sigma == 1.0
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> list[dict[str, YardstickReport]]:
+    """Five noisy logs."""
+    return [reports_of(noisy(tmp_path_factory.mktemp("log"), seed)) for seed in range(5)]
+
+
+def test_who_knows_more_errs_less(runs: list[dict[str, YardstickReport]]) -> None:
+    for run in runs:
+        reckoning, solo, centralized = (figure(run[kind]) for kind in KINDS)
+        assert 0.001 < centralized <= solo <= 0.7 * reckoning
+
+
+@pytest.mark.parametrize("kind", KINDS[1:])
+def test_filters_are_consistent_on_white_noise(
+    runs: list[dict[str, YardstickReport]], kind: str
+) -> None:
+    """Over thirty other seeds NEES is 2.03 (solo) and 1.92, means of five scatter by 0.11."""
+    assert np.mean([figure(run[kind], "nees") for run in runs]) == pytest.approx(2.0, abs=0.4)
+    assert np.mean([figure(run[kind], "inside_3_sigma") for run in runs]) > 0.97
+
+
+def test_a_blind_robot_has_only_the_centralized_filter(tmp_path: Path) -> None:
+    logged = noisy(tmp_path, 4, 20.0)
+    full = reports_of(logged)
+    blind = reports_of(logged._replace(team=blinded(logged.team, ["2"])))
+    assert blind["solo_ekf"].robots["2"] == blind["dead_reckoning"].robots["2"]
+    assert blind["solo_ekf"].robots["1"] == full["solo_ekf"].robots["1"]
+    alone, helped = (figure(blind[kind], robot="2") for kind in KINDS[1:])
+    assert figure(full["centralized_ekf"], robot="2") < helped < 0.5 * alone
+
+
+def test_without_sightings_of_robots_the_centralized_filter_is_many_solo_filters(
+    tmp_path: Path,
+) -> None:
+    logged = noisy(tmp_path, 5, 10.0)
+    sensor = msgspec.structs.replace(SENSOR, sees_robots=False)
+    paths = paths_of(logged._replace(team=changed(logged.team, sensor=sensor)))
+    for name, alone in paths["solo_ekf"].items():
+        together = paths["centralized_ekf"][name]
+        np.testing.assert_allclose(together.estimate, alone.estimate, atol=1e-9)
+        assert alone.covariance is not None
+        assert together.covariance is not None
+        np.testing.assert_allclose(together.covariance, alone.covariance, atol=1e-9)
+
+
+# Settings ----------------------------------------------------------------------------------------
+
+
+def test_corrections_of_the_team_are_those_of_the_yardsticks(tmp_path: Path) -> None:
+    write_log(tmp_path, ROBOTS, 20.0)
+    wheels, late = np.array([1.0, 1.25, 1.0 / 0.9]), np.array([0.1, 0.0, 0.0, 0.0])
+    for robot in ROBOTS:
+        rewritten(tmp_path / f"Robot{robot}_Odometry.dat", lambda rows: rows * wheels, 3)
+        rewritten(tmp_path / f"Robot{robot}_Measurement.dat", lambda rows: rows + late, 4)
+    odometry = OdometrySettings(distance_scale=0.8, turn_scale=0.9)
+    plain, corrected = (
+        reports_of(on_log(team, tmp_path))
+        for team in (
+            log_team(*ROBOTS),
+            changed(log_team(*ROBOTS), odometry=odometry, sensor=SensorSettings(delay_s=0.1)),
+        )
+    )
+    for kind in KINDS:
+        assert figure(plain[kind]) > 0.005
+        assert figure(corrected[kind]) == pytest.approx(0.0, abs=1e-4)
+
+
+def test_what_is_seen_again_soon_counts_for_nothing_or_for_less(tmp_path: Path) -> None:
+    """Both leave a wider covariance; an interval of one frame uses every frame."""
+    logged = noisy(tmp_path, 6, 10.0)
+
+    def spread(interval_s: float = 0.0, correlation_s: float = 0.0) -> float:
+        rules = LocalizerSettings(object_interval_s=interval_s)
+        sensor = msgspec.structs.replace(SENSOR, correlation_s=correlation_s)
+        team = changed(logged.team, localizer=rules, sensor=sensor)
+        covariance = paths_of(logged._replace(team=team))["solo_ekf"]["1"].covariance
+        assert covariance is not None
+        return float(covariance[:, 0].mean())
+
+    assert spread(interval_s=FRAME_MS * 1e-3) == spread()
+    assert spread(interval_s=1.0) > 1.5 * spread()
+    assert spread(correlation_s=2.0) > 1.5 * spread()
+
+
+def test_a_filter_that_refuses_everything_comes_back(tmp_path: Path) -> None:
+    """All robots start 1 m off and are sure of it: every gate stays shut until they doubt."""
+    logged = started(noisy(tmp_path, 7, 25.0), 1.0, -0.5)
+    paths = paths_of(logged)
+    for kind in KINDS[1:]:
+        for name, path in paths[kind].items():
+            errors = position_errors(compared(path, logged.truth[name])[1])
+            assert errors[0] > 1.0
+            assert errors[200:].max() < 0.2, (kind, name)
+
+
+# One filter, step by step ------------------------------------------------------------------------
+
+
+def told(pose: Pose2, *pieces: Odometry, sigma: float = 0.1) -> Inputs:
+    settings = RobotSettings(sensor=SENSOR, odometry=ODOMETRY, source="mrclam")
+    return Inputs(settings, 0, Estimate(pose, diagonal(sigma, sigma)), pieces, ())
+
+
+def differences(function: Callable[[Floats], Floats], at: Floats) -> Floats:
+    """The Jacobian of a function by central differences."""
+    h = 1e-6
+    columns = [(function(at + h * e) - function(at - h * e)) / (2.0 * h) for e in np.eye(len(at))]
+    return np.stack(columns, axis=1)
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_the_jacobian_of_a_sighting_is_that_of_finite_differences(seed: int) -> None:
+    x = np.random.default_rng(seed).uniform(-3.0, 3.0, size=5)
+    expected = differences(lambda at: expected_sighting(at[:3], at[3:])[0], x)
+    np.testing.assert_allclose(expected_sighting(x[:3], x[3:])[1], expected, atol=1e-6)
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_motion_shears_the_whole_covariance_by_its_jacobian(seed: int) -> None:
+    """Of two robots with cross-covariance, of which one drives; without noise of its wheels."""
+    rng = np.random.default_rng(seed)
+    distance, turn = rng.uniform(0.1, 1.0), rng.uniform(-1.0, 1.0)
+    pose = Pose2(*rng.uniform(-2.0, 2.0, size=3).tolist())
+    exact = OdometrySettings(
+        distance_sigma_m_per_sqrt_m=0.0,
+        turn_sigma_rad_per_sqrt_rad=0.0,
+        turn_sigma_rad_per_sqrt_m=0.0,
+    )
+    driver = told(pose, Odometry(0, 1_000_000_000, distance, turn))
+    driver = driver._replace(settings=RobotSettings(odometry=exact))
+    ekf = Ekf({"other": told(Pose2(1.0, 1.0, 0.0)), "driver": driver}, Field())
+    root = rng.normal(size=(6, 6))
+    ekf.covariance = root @ root.T
+    jacobian = np.eye(6)
+    jacobian[3:, 3:] = differences(
+        lambda at: np.array(step(Pose2(*at.tolist()), distance, turn)), np.array(pose)
+    )
+    expected = jacobian @ ekf.covariance @ jacobian.T
+    ekf.advance("driver", 1_000_000_000)
+    np.testing.assert_allclose(ekf.covariance, expected, atol=1e-6)
+    np.testing.assert_allclose(ekf.mean, [1.0, 1.0, 0.0, *step(pose, distance, turn)])
+
+
+def test_odometry_in_parts_is_odometry_in_one() -> None:
+    pieces = [piece for piece, _ in driven(LOOP_START, loop()[:40])]
+    whole, parts = (Ekf({"r": told(LOOP_START, *pieces)}, Field()) for _ in range(2))
+    whole.advance("r", pieces[-1].stamp_ns)
+    for stamp_ns in range(0, pieces[-1].stamp_ns + 1, 50_000_000):
+        parts.advance("r", stamp_ns)
+    np.testing.assert_allclose(parts.marginal("r")[0], whole.marginal("r")[0], atol=1e-9)
+    np.testing.assert_allclose(parts.marginal("r")[1], whole.marginal("r")[1], atol=1e-4)
+
+
+def test_doubt_grows_with_the_way_as_the_settings_say() -> None:
+    ekf = Ekf({"r": told(Pose2(0.0, 0.0, 0.0), Odometry(0, 100, 0.25, 0.0), sigma=0.0)}, Field())
+    ekf.advance("r", 100)
+    gained = np.diag(ekf.covariance)
+    assert gained[0] == pytest.approx(ODOMETRY.distance_sigma_m_per_sqrt_m**2 * 0.25)
+    assert gained[2] == pytest.approx(ODOMETRY.turn_sigma_rad_per_sqrt_m**2 * 0.25)
+
+
+def test_a_bearing_straight_behind_has_no_seam() -> None:
+    ekf = Ekf({"a": told(Pose2(0.0, 0.0, 0.0)), "b": told(Pose2(-2.0, 0.001, 0.0))}, Field())
+    ekf.see("a", Sightings(0, (Sighting("b", 2.0, 0.01 - math.pi),)))
+    assert ekf.mean[2] == pytest.approx(-0.01, abs=0.009)
+    assert ekf.covariance[2, 2] < 0.9 * 0.1**2
+
+
+def test_one_sighting_informs_both_robots_and_ties_them() -> None:
+    ekf = Ekf({"a": told(Pose2(0.0, 0.0, 0.0)), "b": told(Pose2(2.0, 0.0, 0.0))}, Field())
+    ekf.see("a", Sightings(0, (Sighting("b", 2.1, 0.0),)))
+    assert ekf.mean[0] == pytest.approx(-(ekf.mean[3] - 2.0))
+    assert ekf.mean[3] > 2.02
+    assert ekf.covariance[0, 3] > 0.003
+    assert ekf.covariance[0, 0] < 0.008
+
+
+def test_an_outlier_is_gated_and_a_fault_is_left_out() -> None:
+    ekf = Ekf({"a": told(Pose2(0.0, 0.0, 0.0)), "b": told(Pose2(2.0, 0.0, 0.0))}, Field())
+    mean, covariance = ekf.mean.copy(), ekf.covariance.copy()
+    wrong = (Sighting("b", 4.0, 0.0), Sighting("b", math.nan, 0.0), Sighting("nobody", 1.0, 0.0))
+    ekf.see("a", Sightings(0, wrong))
+    np.testing.assert_array_equal(ekf.mean, mean)
+    np.testing.assert_array_equal(ekf.covariance, covariance)
+
+
+def test_where_odometry_has_ended_doubt_grows() -> None:
+    ekf = Ekf({"r": told(Pose2(0.0, 0.0, 0.0), Odometry(0, 100_000_000, 0.05, 0.0))}, Field())
+    ekf.advance("r", 500_000_000)
+    before = ekf.marginal("r")[1]
+    ekf.advance("r", 2_600_000_000)
+    gained = ekf.marginal("r")[1] - before
+    np.testing.assert_allclose(gained, 2.0 * 0.3**2 * np.eye(3), atol=1e-9)
+
+
+# The command -------------------------------------------------------------------------------------
+
+
+def rows_of(path: Path) -> Floats:
+    rows = np.array([[float(v) for v in line.split(" ")] for line in path.read_text().splitlines()])
+    assert rows.shape[1] == 8
+    np.testing.assert_allclose(np.linalg.norm(rows[:, 4:], axis=1), 1.0, atol=1e-6)
+    np.testing.assert_array_equal(rows[:, 3:6], 0.0)
+    return rows
+
+
+def rmse_of(folder: Path, name: str) -> tuple[float, float]:
+    """(position m, heading deg) of an estimate, from the TUM files alone."""
+    estimate, truth = rows_of(folder / f"{name}.tum"), rows_of(folder / f"{name[0]}_truth.tum")
+    _, i, j = np.intersect1d(estimate[:, 0], truth[:, 0], return_indices=True)
+    assert len(j) == len(truth)
+    offset = estimate[i] - truth[j]
+    heading = [2.0 * np.arctan2(rows[:, 6], rows[:, 7]) for rows in (estimate[i], truth[j])]
+    turn = (heading[0] - heading[1] + math.pi) % math.tau - math.pi
+    position = np.sqrt(np.mean(offset[:, 1] ** 2 + offset[:, 2] ** 2))
+    return float(position), math.degrees(float(np.sqrt(np.mean(turn**2))))
+
+
+def test_evaluate_compares_and_exports(tmp_path: Path) -> None:
+    data, files = tmp_path / "log", tmp_path / "new" / "tum"
+    write_log(data, ROBOTS, 10.0)
+    add_noise(data, 8)
+    options = ("--yardstick", "--export", files, "--blind", "3", "--json")
+    ran = cpcbl_team("evaluate", "mrclam", data, "--team", "mrclam-uncalibrated", *options)
+    assert ran.returncode == 0, ran.stderr
+    report = json.loads(ran.stdout)
+    assert tuple(report["yardsticks"]) == KINDS
+    filters = {"estimate": report["robots"]}
+    filters |= {kind: report["yardsticks"][kind]["robots"] for kind in KINDS}
+    names = {f"{robot}_{kind}.tum" for robot in ROBOTS for kind in (*filters, "truth")}
+    assert {path.name for path in files.iterdir()} == names
+    for kind, robots in filters.items():
+        for name, figures in robots.items():
+            assert figures["samples"] == report["robots"][name]["samples"] > 90
+            position, heading = rmse_of(files, f"{name}_{kind}")
+            assert position == pytest.approx(figures["position_rmse_m"], abs=1e-6)
+            assert heading == pytest.approx(figures["heading_rmse_deg"], abs=1e-4)
+    for kind in KINDS:
+        team = report["yardsticks"][kind]["team"]
+        each = [robot["nees"] for robot in filters[kind].values()]
+        assert team["nees"] == pytest.approx(np.mean(each))
+
+
+def test_the_table_of_yardsticks_fits_and_is_shown_on_demand(tmp_path: Path) -> None:
+    write_log(tmp_path, ROBOTS, 3.0)
+    plain, compared_ = (
+        cpcbl_team("evaluate", "mrclam", tmp_path, "--team", "mrclam-uncalibrated", *options)
+        for options in ((), ("--yardstick",))
+    )
+    for words in ("dead reckoning", "solo EKF", "centralized EKF", "this team"):
+        assert words in compared_.stdout
+        assert words not in plain.stdout
+    assert max(map(len, compared_.stdout.splitlines())) <= 80
+
+
+def test_an_export_that_cannot_be_written_is_one_line(tmp_path: Path) -> None:
+    write_log(tmp_path / "log", ROBOTS, 2.0)
+    taken = tmp_path / "file"
+    taken.write_text("")
+    ran = cpcbl_team("evaluate", "mrclam", tmp_path / "log", "--export", taken)
+    assert ran.returncode == 2
+    (line,) = ran.stderr.splitlines()
+    assert f"--export {taken}" in line
+
+
+def test_a_team_without_yardsticks_is_what_it_was(tmp_path: Path) -> None:
+    write_log(tmp_path, ROBOTS, 5.0)
+    logged = on_log(log_team(*ROBOTS), tmp_path)
+    plain = evaluated(logged)
+    with_them = evaluated(logged, with_yardsticks=True)
+    assert plain.report.yardsticks == {}
+    assert msgspec.structs.replace(with_them.report, yardsticks={}) == plain.report
+    assert tuple(with_them.paths) == ("estimate", *KINDS)
+
+
+def test_progress_reaches_the_end_once(tmp_path: Path) -> None:
+    write_log(tmp_path, ROBOTS, 2.0)
+    shown: list[float] = []
+    evaluated(on_log(log_team(*ROBOTS), tmp_path), shown.append, with_yardsticks=True)
+    assert shown == sorted(shown)
+    assert shown[-1] == 1.0

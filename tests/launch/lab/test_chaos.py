@@ -1,0 +1,291 @@
+"""Faults on real processes over real Zenoh; each scenario's expectation is its own assertion.
+
+Here are the quick ones; `make chaos` runs them all.
+"""
+
+import json
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+from support.buses import Ear, wait_until
+from support.processes import cpcbl_team, eventually, pids_of
+
+from cpcbl_launch.lab.chaos import wire
+from cpcbl_launch.lab.chaos.checks import Check, Outcome
+from cpcbl_launch.lab.chaos.fuzz import fuzz
+from cpcbl_launch.lab.chaos.injectors import Echo
+from cpcbl_launch.lab.chaos.relay import Quality, Relay
+from cpcbl_launch.lab.chaos.run import chosen, outcome_of, run_all
+from cpcbl_launch.lab.chaos.scenario import Found, Needs, Scenario, Setting
+from cpcbl_launch.lab.chaos.scenarios import SCENARIOS
+from cpcbl_launch.lab.chaos.team import ROUTER, ChaosError, Plan, demo_team, router_spec, running
+from cpcbl_launch.lab.chaos.wire import Weather, Wire
+from cpcbl_launch.run.processes import PROGRAM
+from cpcbl_launch.run.supervisor import Supervisor
+from cpcbl_launch.run.up import free_endpoint
+from cpcbl_launch.run.usage import MIB, usage
+from cpcbl_launch.team_file import save_resolved
+from cpcbl_transport import topics
+from cpcbl_transport.topics import Qos
+from cpcbl_transport.zenoh_bus import open_bus, open_router
+
+SETTING = Setting(seed=3, soak_s=60.0)
+
+
+def judged(outcome: Outcome) -> None:
+    """Fails with all that was seen; skips what cannot run here."""
+    if outcome.not_run:
+        pytest.skip(outcome.not_run)
+    seen = "\n".join(f"{'held' if c.held else 'NOT HELD'}: {c}" for c in outcome.checks)
+    assert outcome.held, f"{outcome.failed}\n{seen}"
+
+
+@pytest.mark.timeout(300)
+@pytest.mark.parametrize("scenario", [pytest.param(s, id=s.name) for s in SCENARIOS if s.quick])
+def test_a_quick_scenario_holds(scenario: Scenario) -> None:
+    judged(outcome_of(scenario, SETTING))
+
+
+@pytest.mark.timeout(300)
+def test_a_few_hundred_fuzzed_payloads_on_every_key_are_counted() -> None:
+    checks = list(fuzz(SETTING, a_key=300).checks)
+    assert [str(check) for check in checks if not check.held] == []
+
+
+# The table and its command ------------------------------------------------------------------------
+
+
+def scenario_of(name: str, *checks: Check, needs: Needs = Needs.NOTHING) -> Scenario:
+    return Scenario(name, "what is done", "what is expected", needs, True, lambda _: Found(checks))
+
+
+def test_every_scenario_has_its_own_name_and_says_what_it_expects() -> None:
+    names = [s.name for s in SCENARIOS]
+    assert len(set(names)) == len(names)
+    assert all(s.done and s.expectation for s in SCENARIOS)
+    assert chosen(["all"]) == list(SCENARIOS)
+    assert [s.name for s in chosen([names[3], names[1]])] == [names[1], names[3]]
+
+
+def test_a_name_that_is_no_scenario_is_one_line_with_a_hint() -> None:
+    ran = cpcbl_team("chaos", "kill-robto")
+    assert ran.returncode == 2
+    assert "no scenario 'kill-robto'; did you mean kill-robot?" in ran.stderr
+
+
+def test_the_scenarios_are_listed() -> None:
+    ran = cpcbl_team("chaos", "--list")
+    assert ran.returncode == 0
+    for scenario in SCENARIOS:
+        assert scenario.name[:8] in ran.stdout
+
+
+def test_what_fails_and_what_cannot_run_is_told_apart(monkeypatch: pytest.MonkeyPatch) -> None:
+    def breaks(_: Setting) -> Found:
+        raise ChaosError("the team did not settle")
+
+    monkeypatch.setattr("cpcbl_launch.lab.chaos.wire.missing", lambda: "needs root")
+    good = Check(what="n", seen=1, at_least=1)
+    table = [
+        scenario_of("good", good),
+        scenario_of("bad", good, Check(what="m", seen=0, at_least=1)),
+        scenario_of("broken")._replace(run=breaks),
+        scenario_of("rooted", good, needs=Needs.ROOT),
+    ]
+    began: list[str] = []
+    done: list[Outcome] = []
+    faults = run_all(table, Setting(), lambda s: began.append(s.name), done.append)
+    assert [o.held for o in faults.outcomes] == [True, False, False, None]
+    assert faults.outcomes[2].failed == "the team did not settle"
+    assert faults.outcomes[3].not_run == "needs root"
+    assert began == [o.scenario for o in done] == ["good", "bad", "broken", "rooted"]
+    assert not faults.held
+
+
+@pytest.mark.long
+def test_the_command_reports_a_scenario_in_words_data_and_markdown(tmp_path: Path) -> None:
+    report, page = tmp_path / "chaos.json", tmp_path / "chaos.md"
+    ran = cpcbl_team("chaos", "kill-robot", "--json", "--report", report, "--markdown", page)
+    assert ran.returncode == 0, ran.stderr
+    data = json.loads(ran.stdout)
+    assert json.loads(report.read_text()) == data
+    assert data["held"] is True
+    (outcome,) = data["outcomes"]
+    assert outcome["checks"][0]["unit"] == "s"
+    assert page.read_text().splitlines()[2].startswith("| `kill-robot` |")
+    assert "1/1 kill-robot" in ran.stderr
+
+
+def test_a_scenario_that_is_interrupted_leaves_no_process() -> None:
+    command = [*PROGRAM, "chaos", "kill-robot"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        children = ["robot", "navigator", "--parent", str(process.pid)]
+        try:
+            assert eventually(lambda: bool(pids_of(children)))
+        finally:
+            process.terminate()
+            process.communicate(timeout=30.0)
+        assert eventually(lambda: not pids_of(["--parent", str(process.pid)]))
+
+
+# What makes links bad -----------------------------------------------------------------------------
+
+
+@contextmanager
+def echoing() -> Iterator[str]:
+    """The endpoint of a server that sends back what it gets."""
+
+    def serve(end: socket.socket) -> None:
+        with end:
+            while data := end.recv(65_536):
+                end.sendall(data)
+
+    def accept() -> None:
+        while True:
+            try:
+                end, _ = server.accept()
+            except OSError:
+                return
+            threading.Thread(target=serve, args=(end,), daemon=True).start()
+
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        threading.Thread(target=accept, daemon=True).start()
+        yield f"tcp/127.0.0.1:{server.getsockname()[1]}"
+        server.shutdown(socket.SHUT_RDWR)
+
+
+def dial(endpoint: str) -> socket.socket:
+    host, port = endpoint.removeprefix("tcp/").split(":")
+    return socket.create_connection((host, int(port)), timeout=10.0)
+
+
+def round_trip_s(link: socket.socket, data: bytes) -> float:
+    began_s, got = time.monotonic(), b""
+    link.sendall(data)
+    while len(got) < len(data):
+        got += link.recv(65_536)
+    assert got == data
+    return time.monotonic() - began_s
+
+
+def test_a_relay_carries_delays_and_limits() -> None:
+    with echoing() as server, Relay(server) as relay, dial(relay.endpoint) as link:
+        assert round_trip_s(link, bytes(range(256)) * 2_000) < 5.0
+        relay.set(Quality(delay_s=0.2))
+        wait_until(lambda: round_trip_s(link, b"x") >= 0.4)
+        relay.set(Quality(bytes_per_s=20_000.0))
+        wait_until(lambda: relay.quality.bytes_per_s > 0.0)
+        assert round_trip_s(link, bytes(8_000)) >= 0.4
+        assert relay.passed > 1_000_000
+
+
+def test_a_cut_relay_is_silent_and_loses_nothing() -> None:
+    with echoing() as server, Relay(server) as relay, dial(relay.endpoint) as link:
+        round_trip_s(link, b"before")
+        relay.set(Quality(cut=True))
+        wait_until(lambda: relay.quality.cut)
+        link.sendall(b"meanwhile")
+        link.settimeout(0.5)
+        with pytest.raises(TimeoutError):
+            link.recv(100)
+        relay.set(Quality())
+        link.settimeout(10.0)
+        assert link.recv(100) == b"meanwhile"
+
+
+def test_a_relay_hands_on_that_an_end_has_left() -> None:
+    with echoing() as server, Relay(server) as relay:
+        with dial(relay.endpoint) as link:
+            round_trip_s(link, b"x")
+        with dial(relay.endpoint) as link:
+            link.shutdown(socket.SHUT_WR)
+            assert link.recv(10) == b""
+
+
+@pytest.mark.skipif(bool(wire.missing()), reason="needs root and /dev/net/tun")
+def test_a_wire_loses_packets_and_tcp_lives_with_it() -> None:
+    with Wire(seed=1) as lossy, socket.create_server((lossy.here, 0)) as server:
+        server.settimeout(30.0)
+        port = server.getsockname()[1]
+        code = (
+            f"import socket; c = socket.create_connection(('{lossy.here}', {port}));"
+            "c.sendall(bytes(300_000)); c.shutdown(1); c.recv(1)"
+        )
+        lossy.set(Weather(loss=0.2, delay_s=0.01, jitter_s=0.01))
+        with subprocess.Popen([*lossy.prefix, "python3", "-c", code]) as process:
+            end, _ = server.accept()
+            with end:
+                total = 0
+                while data := end.recv(65_536):
+                    total += len(data)
+            process.wait(timeout=30.0)
+        assert total == 300_000
+        assert 0.1 < lossy.lost / (lossy.lost + lossy.passed) < 0.3
+        name = lossy.prefix[-1]
+    listed = subprocess.run(["ip", "netns"], capture_output=True, text=True, check=True).stdout
+    assert name not in listed
+
+
+SPEAKS = """
+import sys, time
+from cpcbl_transport.topics import Qos
+from cpcbl_transport.zenoh_bus import open_bus
+with open_bus("demo", [sys.argv[1]]) as bus:
+    publisher = bus.publisher("status/patrol", Qos.INPUT)
+    for _ in range(40):
+        publisher.put(bytes(60_000))
+        time.sleep(0.02)
+"""
+
+
+@pytest.mark.skipif(not Path("/proc/self/smaps_rollup").exists(), reason="measures on Linux")
+def test_a_router_keeps_no_memory_of_sessions_that_sent_much(tmp_path: Path) -> None:
+    team_file, endpoint = tmp_path / "team.json", free_endpoint()
+    save_resolved(demo_team(), team_file)
+    with Supervisor([router_spec(team_file, [endpoint])], tmp_path) as supervisor:
+        held = []
+        for _ in range(4):
+            subprocess.run([sys.executable, "-c", SPEAKS, endpoint], check=True, timeout=60.0)
+            held.append(usage(supervisor.pids[ROUTER]).own_bytes / MIB)
+    assert held[-1] - held[0] < 8.0  # with shared memory 10 MiB each
+
+
+def test_an_echo_says_everything_twice_more() -> None:
+    endpoint = free_endpoint()
+    key = topics.FIX.at(robot="a", tier=0, observer="b")
+    with (
+        open_router("tests", [endpoint]),
+        open_bus("tests", [endpoint]) as speaker,
+        open_bus("tests", [endpoint]) as listener,
+        open_bus("tests", [endpoint]) as echoes,
+    ):
+        ear, publisher = Ear(listener, key), speaker.publisher(key, Qos.INPUT)
+        wait_until(lambda: publisher.matching)
+        with Echo(echoes, "b", latest_s=0.5, seed=1) as echo:
+
+            def echoed() -> bool:  # its subscription cannot be told from the listener's
+                publisher.put(b"")
+                return echo.copies > 0
+
+            wait_until(echoed)
+            for n in range(20):
+                publisher.put(bytes([n]))
+            wait_until(lambda: len(list(filter(None, ear.payloads))) == 60)
+        heard = list(filter(None, ear.payloads))
+        assert sorted(heard) == sorted([bytes([n]) for n in range(20)] * 3)
+        assert heard != sorted(heard)
+
+
+def test_a_team_that_does_not_settle_says_who_and_why() -> None:
+    with (
+        pytest.raises(ChaosError, match=r"did not settle: .*patrol"),
+        running(Plan(demo_team(), links={"patrol": free_endpoint()})) as team,
+    ):
+        team.settle(patience_s=8.0)

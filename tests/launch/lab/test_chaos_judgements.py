@@ -1,0 +1,440 @@
+"""What scenarios make of what was recorded: expectations that hold, and that do not."""
+
+import pytest
+from msgspec.structs import replace
+from support.chaos import UNTIL_S, broken, came, notes_of, status_at, tracks_of, went
+
+from cpcbl_launch.lab.chaos.checks import Check, Faults, Outcome, as_data
+from cpcbl_launch.lab.chaos.files import Ended, judged_full, judged_read_only
+from cpcbl_launch.lab.chaos.fuzz import TO_FIELD, TO_PEOPLE, TOKENS, Sent, Taken, judged_fuzz
+from cpcbl_launch.lab.chaos.inputs import judged_duplicates, judged_flood
+from cpcbl_launch.lab.chaos.network import judged_bad, judged_cut, judged_partition
+from cpcbl_launch.lab.chaos.notes import (
+    back_after_s,
+    counted,
+    found_after_s,
+    gone_after_s,
+    latency_s,
+    longest_gap_s,
+    lost_after_s,
+    rmse_m,
+)
+from cpcbl_launch.lab.chaos.payloads import real
+from cpcbl_launch.lab.chaos.processes import judged_field, judged_freeze, judged_kill, judged_router
+from cpcbl_launch.lab.chaos.soak import Life, Sample, judged_soak, lives
+from cpcbl_launch.lab.chaos.world import judged_clocks, judged_hidden, judged_kidnap, judged_liar
+from cpcbl_launch.run.usage import MIB
+from cpcbl_transport import topics
+
+AT_S = 10.0
+GOOD = notes_of([tracks_of("a"), tracks_of("b")])
+
+
+def outcome(*checks: Check) -> Outcome:
+    return Outcome(scenario="s", done="d", expectation="e", checks=checks)
+
+
+@pytest.mark.parametrize(
+    ("check", "held", "said"),
+    [
+        (Check(what="gap", seen=0.5, unit="s", at_most=1.0), True, "gap 0.5 s (≤ 1 s)"),
+        (Check(what="gap", seen=1.5, unit="s", at_most=1.0), False, "gap 1.5 s (≤ 1 s)"),
+        (Check(what="gap", seen=None, unit="s", at_most=1.0), False, "gap not seen (≤ 1 s)"),
+        (Check(what="gap", seen=float("nan"), at_most=1.0), False, "gap nan (≤ 1)"),
+        (Check(what="in", seen=0.95, unit="%", at_least=0.9), True, "in 95 % (≥ 90 %)"),
+        (Check(what="n", seen=3, at_least=3, at_most=3), True, "n 3 (= 3)"),
+        (Check(what="n", seen=4, at_least=3, at_most=3), False, "n 4 (= 3)"),
+    ],
+)
+def test_a_check_holds_within_its_bounds_and_says_both(check: Check, held: bool, said: str) -> None:
+    assert check.held is held
+    assert str(check) == said
+
+
+def test_an_outcome_without_a_check_does_not_hold() -> None:
+    good = outcome(Check(what="n", seen=1, at_least=1))
+    assert good.held is True
+    assert outcome().held is False
+    assert replace(good, failed="no router").held is False
+    assert replace(outcome(), not_run="needs root").held is None
+
+
+def test_what_was_not_run_breaks_nothing_and_is_in_the_data() -> None:
+    skipped = replace(outcome(), not_run="needs root")
+    good = Faults(version="1", seed=1, machine="m", outcomes=(skipped,))
+    assert good.held
+    bad = outcome(Check(what="n", seen=0, at_least=1))
+    data = as_data(replace(good, outcomes=(skipped, bad)))
+    assert data["held"] is False
+    assert [o["held"] for o in data["outcomes"]] == [None, False]
+    assert data["outcomes"][1]["checks"][0]["held"] is False
+
+
+# Figures ------------------------------------------------------------------------------------------
+
+
+def test_a_robot_is_gone_when_the_last_of_its_tokens_is() -> None:
+    tokens = [came(0, "a"), came(9, "a", tier="4"), went(9.1, "a"), went(10.5, "a", tier="4")]
+    assert gone_after_s(notes_of([], tokens), "a", AT_S) == pytest.approx(0.5)
+    assert gone_after_s(notes_of([], tokens[:3]), "a", AT_S) is None
+
+
+def test_a_robot_is_back_with_another_process() -> None:
+    tokens = [came(0, "a"), came(11.0, "a"), came(12.0, "a", "2"), came(11.5, "b", "2")]
+    assert back_after_s(notes_of([], tokens), "a", AT_S, "1") == pytest.approx(2.0)
+    assert back_after_s(notes_of([], tokens[:2]), "a", AT_S, "1") is None
+
+
+def test_a_robot_is_found_when_it_stays_right_for_a_second() -> None:
+    flickers = tracks_of("a", lambda s: 1.0 if s < 12.0 or 12.5 < s < 14.0 else 0.1)
+    assert found_after_s(notes_of([flickers]), "a", AT_S, 0.3) == pytest.approx(4.0)
+    lost = tracks_of("a", lost=(0.0, 15.0))
+    assert found_after_s(notes_of([lost]), "a", AT_S, 0.3) == pytest.approx(5.0)
+    assert lost_after_s(notes_of([lost]), "a", AT_S) == pytest.approx(0.0)
+    said = [status_at("a", 9.5, {"lost": 1}), status_at("a", 10.5, {"lost": 2})]
+    assert lost_after_s(notes_of([tracks_of("a")], (), said), "a", AT_S) == pytest.approx(0.5)
+    assert lost_after_s(notes_of([tracks_of("a")], (), said[:1]), "a", AT_S) is None
+    never = tracks_of("a", lambda s: 1.0)
+    assert found_after_s(notes_of([never]), "a", AT_S, 0.3) is None
+
+
+def test_silence_error_and_delay_are_those_of_the_window() -> None:
+    notes = notes_of(
+        [tracks_of("a", lambda s: 3.0 if s >= 20.0 else 0.3, (12.0, 15.0), late_s=0.2)]
+    )
+    assert longest_gap_s(notes, "a", AT_S, 20.0) == pytest.approx(3.1, abs=0.11)
+    assert longest_gap_s(notes, "a", 16.0, 20.0) == pytest.approx(0.1, abs=0.11)
+    assert longest_gap_s(notes, "nobody", 16.0, 20.0) == pytest.approx(4.0)
+    assert rmse_m(notes, "a", AT_S, 20.0) == pytest.approx(0.3)
+    assert rmse_m(notes, "a", 20.0) == pytest.approx(3.0)
+    assert latency_s(notes, "a", AT_S, 20.0) == pytest.approx(0.2)
+
+
+def test_counts_are_those_of_the_window_over_all_processes() -> None:
+    statuses = [
+        status_at("a", 9.0, {"garbage": 5}),
+        status_at("a", 11.0, {"garbage": 7}),
+        status_at("a", 13.0, {"garbage": 3}, incarnation="2"),
+        status_at("a", 30.0, {"garbage": 99}, incarnation="2"),
+    ]
+    assert counted(notes_of([], (), statuses), "a", AT_S, 20.0)["garbage"] == 2 + 3
+
+
+# Processes ----------------------------------------------------------------------------------------
+
+KILLED = [came(0.0, "a"), came(0.0, "b"), went(10.1, "a"), came(11.0, "a", "2")]
+
+
+def test_a_killed_robot() -> None:
+    good = notes_of([tracks_of("a", silent=(10.0, 11.0)), tracks_of("b")], KILLED)
+    assert not broken(judged_kill(good, "a", AT_S, "1", ["b"], 13.0, UNTIL_S))
+    never_back = notes_of([tracks_of("a", silent=(10.0, 99.0)), tracks_of("b")], KILLED[:2])
+    assert broken(judged_kill(never_back, "a", AT_S, "1", ["b"], 13.0, UNTIL_S)) >= {
+        "its token disappeared after",
+        "a new process started after",
+        "from then until it was localized",
+        "RMSE afterwards, worst robot",
+    }
+    others_stop = notes_of([tracks_of("a"), tracks_of("b", silent=(10.5, 12.5))], KILLED)
+    assert broken(judged_kill(others_stop, "a", AT_S, "1", ["b"], 13.0, UNTIL_S)) == {
+        "others' longest gap between tracks"
+    }
+
+
+def test_a_killed_router() -> None:
+    tokens = [came(12.0, "a"), came(12.0, "b")]
+    said = [status_at("a", 13.0), status_at("a", 20.0, {"messages_received": 30})]
+    tracks = [tracks_of("a", silent=(10.0, 12.0)), tracks_of("b", silent=(10.0, 12.0))]
+    good = notes_of(tracks, tokens, said)
+    assert not broken(judged_router(good, ["a", "b"], AT_S, 13.0, 21.0))
+    bad = notes_of([tracks_of("a", silent=(10.0, 18.0)), tracks[1]], tokens[:1], said[:1])
+    assert broken(judged_router(bad, ["a", "b"], AT_S, 13.0, 21.0)) == {
+        "longest gap between tracks",
+        "robots with a token at the new router",
+        "help received in the 8 s after",
+    }
+
+
+def test_a_killed_field() -> None:
+    wrong_for_a_while = [tracks_of(n, lambda s: 2.0 if 11.0 < s < 14.0 else 0.02) for n in "ab"]
+    good = judged_field(notes_of(wrong_for_a_while), ["a", "b"], AT_S, 11.0, 16.0, UNTIL_S)
+    assert not broken(good)
+    stuck = notes_of([tracks_of("a"), tracks_of("b", lambda s: 2.0 if s > 11.0 else 0.02)])
+    assert broken(judged_field(stuck, ["a", "b"], AT_S, 11.0, 16.0, UNTIL_S)) >= {
+        "from then until all were localized",
+        "RMSE afterwards, worst robot",
+    }
+
+
+def test_a_frozen_robot() -> None:
+    tokens = [came(0.0, "a"), came(0.0, "b"), went(12.0, "a"), came(15.2, "a")]
+    tracks = [tracks_of("a", silent=(10.0, 15.0)), tracks_of("b")]
+    assert not broken(judged_freeze(notes_of(tracks, tokens), "a", AT_S, 15.0, ["b"], UNTIL_S))
+    burst = [h._replace(at_s=15.1) if 10.0 <= h.at_s < 14.0 else h for h in tracks_of("a")]
+    led_astray = tracks_of("b", lambda s: 0.8 if 15.0 < s < 17.0 else 0.02)
+    bad = notes_of([sorted(burst, key=lambda h: h.at_s), led_astray], tokens[:2])
+    assert broken(judged_freeze(bad, "a", AT_S, 15.0, ["b"], UNTIL_S)) == {
+        "its token disappeared after",
+        "tracks that arrived more than 1 s late",
+        "others' largest error in the 4 s after it woke",
+    }
+
+
+# Networks -----------------------------------------------------------------------------------------
+
+
+def test_a_partition() -> None:
+    near_tokens = [came(0, "far"), went(12.0, "far"), came(20.5, "far")]
+    far_tokens = [came(0, "near"), went(12.0, "near"), came(20.5, "near")]
+    both = [tracks_of("near"), tracks_of("far")]
+    helped = [status_at("far", 21.0, heard=[("near", 20.6)])]
+    near, far = notes_of(both, near_tokens), notes_of(both, far_tokens, helped)
+    times = AT_S, 20.0, UNTIL_S
+    assert not broken(judged_partition(near, far, ["near"], ["far"], *times))
+    late = notes_of(both, [*near_tokens[:2], came(26.0, "far")])
+    stopped = notes_of([both[0], tracks_of("far", silent=(11.0, 19.0))], far_tokens)
+    assert broken(judged_partition(late, stopped, ["near"], ["far"], *times)) == {
+        "far side's longest gap between tracks",
+        "from healing to all tokens back",
+        "from healing to the first help",
+    }
+
+
+def test_a_cut_link() -> None:
+    tokens = [came(0, "a"), went(12.0, "a"), came(20.5, "a")]
+    good = notes_of([tracks_of("a", silent=(10.0, 20.0)), tracks_of("b")], tokens)
+    assert not broken(judged_cut(good, "a", ["b"], AT_S, 20.0, UNTIL_S))
+    bad = notes_of([tracks_of("a", silent=(10.0, 30.0)), tracks_of("b")], tokens[:1])
+    assert broken(judged_cut(bad, "a", ["b"], AT_S, 20.0, UNTIL_S)) == {
+        "its token disappeared after",
+        "from healing to its token back",
+        "from healing until it was localized",
+    }
+
+
+def test_a_bad_link() -> None:
+    said = [status_at("a", 9.0), status_at("a", 20.0, {"messages_received": 50})]
+    good = notes_of([tracks_of("a", late_s=0.5), tracks_of("b")], (), said)
+    assert not broken(judged_bad(good, "a", ["b"], AT_S, 25.0, UNTIL_S, 2.0, 1.5))
+    bad = notes_of([tracks_of("a", late_s=3.0), tracks_of("b", late_s=0.9)])
+    assert broken(judged_bad(bad, "a", ["b"], AT_S, 25.0, UNTIL_S, 2.0, 1.5)) == {
+        "its tracks' delay, 99th percentile",
+        "help messages that it received",
+        "others' delay, 99th percentile",
+    }
+
+
+# Inputs -------------------------------------------------------------------------------------------
+
+
+def test_duplicates() -> None:
+    said = [status_at("a", 9.0), status_at("a", 20.0, {"duplicate": 60, "too_late": 25})]
+    good = notes_of([tracks_of("a"), tracks_of("b")], (), said)
+    assert not broken(judged_duplicates(good, ["a", "b"], AT_S, 25.0, 300))
+    assert broken(judged_duplicates(GOOD, ["a", "b"], AT_S, 25.0, 300)) == {
+        "counted as duplicate",
+        "counted as too late",
+    }
+
+
+def test_a_flood() -> None:
+    assert not broken(judged_flood(GOOD, ["a", "b"], AT_S, 20.0, 30.0, 50_000))
+    said = [status_at("a", 9.0), status_at("a", 20.0, {"messages_received": 5000})]
+    bad = notes_of([tracks_of("a", late_s=2.0), tracks_of("b")], (), said)
+    assert broken(judged_flood(bad, ["a", "b"], AT_S, 20.0, 30.0, 500)) >= {
+        "rate of the flood",
+        "most received by one robot",
+        "others' delay, 99th percentile",
+    }
+
+
+SENT = Sent(
+    help=100,
+    inputs=60,
+    commands=30,
+    no_messages=80,
+    no_statuses=25,
+    no_looks=20,
+)
+TAKEN = Taken(
+    after_help={"garbage": 90, "messages_received": 10, "sightings": 7},
+    victim={
+        "garbage": 110,
+        "messages_received": 10,
+        "sightings": 20,
+        "bad_token": TOKENS,
+        "frame_skipped": 15,
+        "no_camera": 5,
+    },
+    field={"garbage": 20, "not_its_own": 10, "drive": 500},
+    recorder={"garbage": 60, "track": 10},
+    watcher={"garbage": 25},
+    looks={"garbage": 20},
+    restarts=0,
+    tracebacks=0,
+    traffic_exit=0,
+)
+
+
+def test_fuzzed_payloads_are_all_counted() -> None:
+    assert not broken(judged_fuzz(SENT, TAKEN))
+
+
+@pytest.mark.parametrize(
+    ("change", "what"),
+    [
+        ({"restarts": 1}, "processes that ended"),
+        ({"tracebacks": 2}, "tracebacks in logs"),
+        ({"after_help": {"garbage": 80}}, "fixes and beliefs counted"),
+        ({"victim": {**TAKEN.victim, "garbage": 100}}, "inputs counted"),
+        ({"victim": {**TAKEN.victim, "frame_skipped": 14}}, "inputs counted"),
+        ({"victim": {**TAKEN.victim, "bad_token": 3}}, "malformed tokens counted"),
+        ({"field": {"drive": 500}}, "commands refused by the field"),
+        ({"recorder": {"garbage": 59}}, "messages refused by the recorder"),
+        ({"watcher": {}}, "messages refused by the traffic watcher"),
+        ({"looks": {"garbage": 19}}, "messages refused by the subscriber of annotated frames"),
+        ({"traffic_exit": 1}, "exit code of `cpcbl-team traffic`"),
+    ],
+)
+def test_a_fuzzed_payload_that_is_missing_is_noticed(change: dict[str, object], what: str) -> None:
+    assert what in broken(judged_fuzz(SENT, TAKEN._replace(**change)))  # type: ignore[arg-type]
+
+
+# Files --------------------------------------------------------------------------------------------
+
+TABLE = "errors of position\nnavigator 1\nobserver 1\nscout 1\npatrol 1\n"
+LOST = "".join(f"cpcbl-team: /d/{n}: not written: No space left\n" for n in ("r", "p"))
+OUTPUT = Ended(1, "", "cpcbl-team: standard output: not written: No space left on device\n")
+
+
+def test_a_full_disk() -> None:
+    assert not [
+        c.what for c in judged_full(Ended(1, TABLE, LOST), ("r", "p", "p"), OUTPUT) if not c.held
+    ]
+    silent = Ended(0, "", "Traceback (most recent call last)")
+    assert broken(judged_full(silent, ("r", "p", "p"), OUTPUT)) == {
+        "robots in the report on the terminal",
+        "lines that name a lost file",
+        "exit code",
+        "tracebacks",
+    }
+
+
+def test_a_read_only_disk() -> None:
+    clear = Ended(2, "", "cpcbl-team: --record /d/x: Read-only file system\n")
+    assert not broken(judged_read_only({"--record": clear}))
+    thrown = Ended(1, "", "Traceback (most recent call last)\nOSError\n")
+    assert broken(judged_read_only({"--record": thrown})) == {
+        "options refused with one line of error",
+        "commands that ended with exit code 2",
+        "tracebacks",
+    }
+
+
+# The world ----------------------------------------------------------------------------------------
+
+
+def test_a_kidnapped_robot() -> None:
+    found = tracks_of("a", lambda s: 3.02 if s >= 13.0 else 0.02, lost=(10.5, 13.0))
+    good = notes_of([found, tracks_of("b")], jump=("a", AT_S, 3.0))
+    assert not broken(judged_kidnap(good, "a", ["b"], UNTIL_S))
+    never = notes_of([tracks_of("a"), tracks_of("b")], jump=("a", AT_S, 3.0))
+    assert broken(judged_kidnap(never, "a", ["b"], UNTIL_S)) == {
+        "it reported that it was lost after",
+        "it was localized after",
+        "RMSE afterwards, worst robot",
+        "inside 3 σ afterwards",
+    }
+    blamed = [status_at("b", 30.0, trust=[("a", "jumps")])]
+    distrustful = notes_of([found, tracks_of("b")], (), blamed, jump=("a", AT_S, 3.0))
+    assert broken(judged_kidnap(distrustful, "a", ["b"], UNTIL_S)) == {
+        "robots that trust all others at the end"
+    }
+    assert "distance of the kidnapping" in broken(judged_kidnap(GOOD, "a", ["b"], UNTIL_S))
+
+
+def test_hidden_landmarks() -> None:
+    drifts = tracks_of("a", lambda s: 0.1 if 12.0 <= s < 74.0 else 0.02)
+    good = judged_hidden(notes_of([drifts, tracks_of("b")]), ["a", "b"], UNTIL_S)
+    assert not broken(good)
+    overconfident = tracks_of("a", lambda s: 0.6 if s >= 20.0 else 0.02)
+    bad = judged_hidden(notes_of([overconfident, tracks_of("b")]), ["a", "b"], UNTIL_S)
+    assert broken(bad) == {
+        "team's worst RMSE",
+        "inside 3 σ while landmarks are hidden",
+        "all were localized after",
+        "RMSE afterwards, worst robot",
+        "inside 3 σ afterwards",
+    }
+
+
+def test_clocks_that_are_off() -> None:
+    found = [status_at(n, 5.0, {"clock_off": 30}, trust=[("w", "clock")]) for n in "ab"]
+    tracks = [tracks_of("a"), tracks_of("b"), tracks_of("w")]
+    good = notes_of(tracks, (), found)
+    assert not broken(judged_clocks(good, "w", "r", ["a", "b"], AT_S, 30.0))
+    unnoticed = notes_of(tracks, (), [status_at("a", 5.0, trust=[("r", "clock")])])
+    assert broken(judged_clocks(unnoticed, "w", "r", ["a", "b"], AT_S, 30.0)) == {
+        "robots that report that its clock is wrong",
+        "last of these reports at",
+        "refused help messages from it",
+        "robots that report that r's clock is wrong",
+    }
+
+
+def test_a_liar() -> None:
+    tracks = [tracks_of("a"), tracks_of("b"), tracks_of("w")]
+    said = [status_at(n, 14.0, trust=[("w", "biased")]) for n in "ab"]
+    healed = [status_at(n, 40.0, trust=[("w", "")]) for n in "ab"]
+    good = notes_of(tracks, (), [*said, *healed])
+    assert not broken(judged_liar(good, "w", ["a", "b"], ["a", "b", "w"], AT_S, 25.0))
+    harmed = [tracks_of("a", lambda s: 0.5), *tracks[1:]]
+    bad = notes_of(harmed, (), [said[0]])
+    assert broken(judged_liar(bad, "w", ["a", "b"], ["a", "b", "w"], AT_S, 25.0)) == {
+        "robots that quarantined it",
+        "quarantined by two robots after",
+        "worst RMSE during the fault",
+        "others' worst RMSE",
+        "robots that still distrust it 20 s later",
+    }
+
+
+# Soak ---------------------------------------------------------------------------------------------
+
+
+def samples(process: str, mib_a_minute: float, seconds: float = 400.0) -> list[Sample]:
+    return [
+        Sample(5.0 * n, process, 7, int((30.0 + mib_a_minute * n / 12.0) * MIB), 20)
+        for n in range(int(seconds / 5.0))
+    ]
+
+
+def test_a_life_is_told_from_its_samples() -> None:
+    (life,) = lives(samples("field", 1.2))
+    assert life.mib_a_minute == pytest.approx(1.2, rel=0.01)
+    assert life.end_mib - life.start_mib == pytest.approx(1.2 * (395 - 40) / 60, rel=0.05)
+    assert lives(samples("field", 1.2, seconds=60.0)) == []
+
+
+def test_a_soak() -> None:
+    times = 0.0, 20.0, 25.0, UNTIL_S
+    flat = lives([*samples("field", 0.01), *samples("router", 0.0)])
+    assert not broken(judged_soak(GOOD, ["a", "b"], flat, times, 3, 3, 0))
+    leaking = [*flat, Life("robot-a", 400.0, 30.0, 45.0, 2.0, 30)]
+    stuck = notes_of([tracks_of("a"), tracks_of("b", lambda s: 2.0)])
+    assert broken(judged_soak(stuck, ["a", "b"], leaking, times, 4, 3, 1)) >= {
+        "processes that ended without being killed",
+        "tracebacks in logs",
+        "from the last fault until all were localized",
+        "largest growth of memory",
+        "steepest growth of a process that ran for 300 s",
+        "largest growth of the number of open files",
+    }
+    assert "largest growth of memory" in broken(judged_soak(GOOD, ["a"], [], times, 0, 0, 0))
+
+
+def test_every_topic_with_a_payload_is_fuzzed() -> None:
+    fuzzed = {topics.FIX, topics.BELIEF, *topics.INPUTS, *TO_PEOPLE, *TO_FIELD}
+    assert fuzzed == {topic for topic in topics.TOPICS if topic.carries is not None}
+    for topic in fuzzed:
+        assert real(topic, "victim", "mate", 5_000_000_000)

@@ -1,0 +1,183 @@
+"""Real processes of robots with cameras: broken frames, cameras that come and go, no OpenCV."""
+
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, closing, contextmanager
+from pathlib import Path
+
+import pytest
+from support.cameras import jpeg, picture, png, streaming, url
+from support.processes import eventually
+
+from cpcbl_launch.run.processes import PROGRAM
+from cpcbl_launch.run.up import free_endpoint
+from cpcbl_team.inputs import Odometry
+from cpcbl_transport import topics
+from cpcbl_transport.bus import Bus
+from cpcbl_transport.decoding import read
+from cpcbl_transport.messages import Frame, Refusal, Status, encode
+from cpcbl_transport.zenoh_bus import open_router
+
+PATIENCE_S = 60.0
+TEAM = """
+name = "tests"
+[robots.r1]
+source = "external"
+sensing = "camera"
+start = {{ x_m = 1.0, y_m = 1.0 }}
+sensor = {{ rate_hz = {rate_hz} }}
+camera = {{ frames = "{frames}", width_px = 64, height_px = 48 }}
+"""
+
+
+def write_team(folder: Path, frames: str = "", rate_hz: float = 5.0) -> Path:
+    path = folder / "team.toml"
+    path.write_text(TEAM.format(frames=frames, rate_hz=rate_hz))
+    return path
+
+
+class Driven:
+    """A robot's process; the test is its driver, and hears its status."""
+
+    def __init__(self, bus: Bus, process: "subprocess.Popen[bytes]") -> None:
+        self.process, self._statuses = process, list[Status]()
+        topic = topics.IN_ODOMETRY
+        self._odometry = bus.publisher(topic.at(robot="r1"), topic.qos)
+        self.frames = bus.publisher(topics.IN_FRAME.at(robot="r1"), topics.Qos.INPUT)
+        self._last_ns = time.time_ns()
+        bus.subscribe(topics.STATUS.at(), self._heard)
+
+    def _heard(self, key: str, payload: bytes) -> None:
+        status = read(key, payload)
+        assert isinstance(status, Status)
+        self._statuses.append(status)
+
+    def counts(self) -> dict[str, int]:
+        """What its latest status says, while it drives on."""
+        now_ns = time.time_ns()
+        self._odometry.put(encode(Odometry(self._last_ns, now_ns, 0.001, 0.0)))
+        self._last_ns = now_ns
+        return self._statuses[-1].counts if self._statuses else {}
+
+    def until(self, **counts: int) -> None:
+        """Returns when it has counted so much."""
+        assert eventually(lambda: counts.items() <= self.counts().items(), PATIENCE_S), (
+            self.counts()
+        )
+
+    def counted(self, name: str, least: int) -> bool:
+        return eventually(lambda: self.counts().get(name, 0) >= least, PATIENCE_S)
+
+
+@contextmanager
+def driven(team: Path) -> Iterator[Driven]:
+    endpoint = free_endpoint()
+    command = [*PROGRAM, "robot", "r1", "--team", str(team), "--connect", endpoint]
+    with open_router("tests", [endpoint]) as bus:
+        process = subprocess.Popen(command, stderr=subprocess.PIPE)
+        try:
+            robot = Driven(bus, process)
+            assert robot.counted("odometry", 1)
+            yield robot
+        finally:
+            process.send_signal(signal.SIGINT)
+            _, said = process.communicate(timeout=5.0)
+    assert process.returncode == 0, said
+    assert b"Traceback" not in said
+
+
+GOOD = picture(3, (64, 48))
+BROKEN = {
+    "frame_empty": b"",
+    "frame_undecodable": b"garbage" * 100,
+    "frame_truncated": jpeg(GOOD)[:-20],
+    "frame_wrong_channels": png(GOOD[:, :, :1]),
+    "frame_wrong_depth": png(GOOD.astype("uint16") * 257),
+    "frame_wrong_size": jpeg(picture(3, (128, 96))),
+    "frame_black": jpeg(GOOD // 255),
+    "frame_white": jpeg(GOOD // 255 + 254),
+}
+
+
+def test_broken_frames_between_good_ones_are_counted_by_reason(tmp_path: Path) -> None:
+    with driven(write_team(tmp_path)) as robot:
+        for n, image in enumerate(BROKEN.values(), start=1):
+            robot.frames.put(encode(Frame(time.time_ns(), jpeg(GOOD))))
+            robot.until(sightings=n, frame=2 * n - 1)
+            robot.frames.put(encode(Frame(time.time_ns(), image)))
+            robot.until(frame=2 * n)
+        robot.frames.put(b"no message")
+        robot.frames.put(encode(Frame(time.time_ns(), jpeg(GOOD))))
+        robot.until(sightings=len(BROKEN) + 1, **dict.fromkeys(BROKEN, 1))
+        before = robot.counts()["odometry"]
+        assert robot.counted("odometry", before + 1)
+        refused = {str(reason) for reason in Refusal} & robot.counts().keys()
+        assert refused <= {"wrong_version"}  # unless the good frame was sooner at hand
+
+
+def test_a_camera_disappears_and_comes_back_and_the_robot_goes_on(tmp_path: Path) -> None:
+    with ExitStack() as first:
+        port = first.enter_context(streaming())
+        with driven(write_team(tmp_path, url(port))) as robot:
+            assert robot.counted("sightings", 3)
+            first.close()
+            robot.until(camera_lost=1)
+            before = robot.counts()
+            assert robot.counted("odometry", before["odometry"] + 10)
+            assert "camera_back" not in robot.counts()
+            with streaming(port):
+                robot.until(camera_lost=1, camera_back=1)
+                assert robot.counted("sightings", before["sightings"] + 3)
+
+
+def test_a_robot_ends_whose_camera_does_not_answer(tmp_path: Path) -> None:
+    with closing(socket.socket()) as mute:
+        mute.bind(("127.0.0.1", 0))
+        mute.listen()
+        with driven(write_team(tmp_path, url(mute.getsockname()[1]))) as robot:
+            assert robot.counted("odometry", 10)
+
+
+def test_a_folder_ends_and_the_robot_goes_on(tmp_path: Path) -> None:
+    for name in "abc":
+        (tmp_path / f"{name}.png").write_bytes(png(GOOD))
+    with driven(write_team(tmp_path, ".", rate_hz=1.0)) as robot:
+        assert robot.counted("odometry", robot.counts()["odometry"] + 20)
+        robot.until(frame=3, sightings=3)
+
+
+def test_a_camera_that_cannot_be_played_is_one_line(tmp_path: Path) -> None:
+    team = write_team(tmp_path, "gone.avi")
+    done = subprocess.run(
+        [*PROGRAM, "robot", "r1", "--team", str(team)], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 2
+    (line,) = done.stderr.splitlines()
+    assert f"robots.r1.camera.frames: {tmp_path}/gone.avi: no such file" in line
+
+
+@pytest.mark.parametrize("words", [["robot", "r1", "--team"], ["up"]], ids=["robot", "up"])
+def test_without_opencv_the_extra_is_named(tmp_path: Path, words: list[str]) -> None:
+    arguments = ["cpcbl-team", *words, str(write_team(tmp_path))]
+    code = (
+        f"import sys; sys.modules['cv2'] = None; sys.argv = {arguments!r};"
+        "from cpcbl_launch.cli import main; main()"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    (line,) = done.stderr.splitlines()
+    assert "pip install 'cpcbl-team[camera]'" in line
+
+
+def test_a_robot_without_a_camera_does_not_load_opencv(tmp_path: Path) -> None:
+    code = (
+        "import sys; from cpcbl_agents.robot import Robot; from cpcbl_launch import up;"
+        "from cpcbl_agents import process; from cpcbl_launch.team_file import builtin, load_team;"
+        "Robot('scout', load_team(builtin('demo')), 0); print('cv2' in sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "False"

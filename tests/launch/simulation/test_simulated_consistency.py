@@ -1,0 +1,52 @@
+"""Twenty seeds of the whole chain (field, messages, agents): 3 sigma holds 3 sigma."""
+
+from collections.abc import Collection
+from functools import partial
+
+import msgspec
+import numpy as np
+import pytest
+
+from cpcbl_launch.simulation.in_process import Choice, chosen, simulate
+from cpcbl_launch.team_file import builtin, load_team
+from cpcbl_team.config import Team
+
+SEEDS = range(20)
+VARIANTS = pytest.mark.parametrize("variant", ["joint", "circular"])
+
+
+def demo_team(variant: str, fusion: str, robots: Collection[str]) -> Team:
+    """These robots of the demonstration, helping from the start."""
+    team = chosen(load_team(builtin("demo")), Choice(variant=variant, fusion=fusion))
+    replace = msgspec.structs.replace
+    return replace(
+        team,
+        robots={
+            name: replace(robot, collaboration=replace(robot.collaboration, after_s=0.0))
+            for name, robot in team.robots.items()
+            if name in robots
+        },
+    )
+
+
+def inside_3_sigma(team: Team) -> float:
+    """Mean share over robots and seeds, after checking that nobody was lost at the end."""
+    reports = [report for report, _ in map(partial(simulate, team, duration_s=60.0), SEEDS)]
+    for report in reports:
+        assert not any(robot.lost_at_end for robot in report.robots.values())
+    return float(np.mean([report.team.inside_3_sigma for report in reports]))
+
+
+@VARIANTS
+def test_a_robot_alone_is_consistent(variant: str) -> None:
+    assert inside_3_sigma(demo_team(variant, "split-ci", ["navigator"])) >= 0.98
+
+
+@pytest.mark.long
+@pytest.mark.timeout(600)
+@VARIANTS
+def test_a_team_is_consistent_with_split_ci_and_more_so_than_by_naive_merging(variant: str) -> None:
+    everyone = load_team(builtin("demo")).robots
+    split = inside_3_sigma(demo_team(variant, "split-ci", everyone))
+    assert split >= 0.98
+    assert split > inside_3_sigma(demo_team(variant, "naive", everyone))

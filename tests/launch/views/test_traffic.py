@@ -1,0 +1,537 @@
+"""Traffic in reports and live: sums and drawings by worked examples, then a team of processes."""
+
+import io
+import json
+import math
+import shlex
+import signal
+import subprocess
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+from rich.console import Console, RenderableType
+from support.buses import SECOND, Stand, robot_at, saw, team_of, wait_until
+from support.logs import write_log
+from support.processes import cpcbl_team, pids_of
+
+from cpcbl_launch.cli import main
+from cpcbl_launch.reporting.flows import (
+    SpendingReport,
+    all_held,
+    summed_flows,
+    summed_spending,
+)
+from cpcbl_launch.reporting.recorder import Recorder, Report
+from cpcbl_launch.run.processes import PROGRAM
+from cpcbl_launch.run.up import free_endpoint
+from cpcbl_launch.simulation.in_process import Choice, chosen
+from cpcbl_launch.team_file import parse_team
+from cpcbl_launch.views.run import print_report
+from cpcbl_launch.views.traffic.show import TrafficView, drawn, limit_text
+from cpcbl_launch.views.traffic.watch import Arrival, Traffic, Watcher, traffic
+from cpcbl_team.inputs import Sighting
+from cpcbl_transport import topics
+from cpcbl_transport.bus import MemoryHub
+from cpcbl_transport.messages import Flow, Spending, Status, encode
+from cpcbl_transport.zenoh_bus import open_bus, open_router
+
+MISER_BYTES_PER_S = 5.0
+TEAM = f"""
+name = "trio"
+[map.landmarks]
+a = {{ x_m = 0.0, y_m = 0.0 }}
+b = {{ x_m = 6.0, y_m = 0.0 }}
+c = {{ x_m = 3.0, y_m = 4.0 }}
+[types.watcher]
+sensor = {{ range_share = 0.005, bearing_sigma_deg = 0.5, field_of_view_deg = 180.0 }}
+odometry = {{ moves = false }}
+[robots.driver]
+start = {{ x_m = 1.0, y_m = 1.0 }}
+waypoints_m = [[5.0, 1.0], [3.0, 3.0], [1.0, 1.0]]
+sensor = {{ sees_landmarks = false }}
+[robots.giver]
+type = "watcher"
+start = {{ x_m = 3.0, y_m = 3.5, heading_deg = -90.0 }}
+[robots.miser]
+type = "watcher"
+start = {{ x_m = 2.0, y_m = 3.5, heading_deg = -90.0 }}
+collaboration = {{ budget = {{ bytes_per_s = {MISER_BYTES_PER_S} }} }}
+"""
+
+
+def status(robot: str, at_s: float, tier: int, incarnation: str = "1", **more: Any) -> Status:
+    health = (0.01 * (tier + 1), 0.1, tier, more.pop("lost", ""), {"announced": 2})
+    return Status(robot, incarnation, int(at_s * SECOND), *health, 0, 0, 0, 0, **more)
+
+
+def flow(topic: str, peer: str, messages: int, latest_s: float = 0.0, **more: int) -> Flow:
+    return Flow(topic, peer, messages, 42 * messages, latest_ns=int(latest_s * SECOND), **more)
+
+
+def rendered(what: RenderableType, width: int = 80) -> list[str]:
+    console = Console(file=io.StringIO(), width=width)
+    with console.capture() as capture:
+        console.print(what)
+    return [line.rstrip() for line in capture.get().splitlines()]
+
+
+# Sums -------------------------------------------------------------------------------------------
+
+
+def test_flows_of_all_processes_are_added_by_topic_and_peer() -> None:
+    first = (flow("fix", "b", 3, over_budget=1), flow("belief", "", 2, silent=4))
+    second = (flow("fix", "b", 5, worthless=7), flow("fix", "c", 1))
+    belief, to_b, to_c = summed_flows([first, (), second])
+    assert (belief.topic, belief.peer, belief.messages, belief.silent) == ("belief", "", 2, 4)
+    assert (to_b.peer, to_b.messages, to_b.bytes) == ("b", 8, 336)
+    assert (to_b.over_budget, to_b.worthless, to_b.silent) == (1, 7, 0)
+    assert (to_c.peer, to_c.messages) == ("c", 1)
+
+
+def test_windows_report_the_fullest_one_and_a_match_its_sum() -> None:
+    first = (Spending("bytes", 10.0, 500.0, 412.0), Spending("messages", 0.0, 6.5, 4.0))
+    second = (Spending("bytes", 10.0, 500.0, 90.0), Spending("messages", 0.0, 2.5, 2.0))
+    window, match = summed_spending([first, second])
+    assert (window.unit, window.window_s, window.allowed, window.most) == ("bytes", 10, 500, 412)
+    assert (match.unit, match.window_s, match.allowed, match.most) == ("messages", 0, 9, 6)
+
+
+@pytest.mark.parametrize(
+    ("unit", "window_s", "allowed", "most", "said", "held"),
+    [
+        ("bytes", 10.0, 500.0, 412.0, "412 of 500 B in 10 s", True),
+        ("bytes", 10.0, 500.0, 500.0, "500 of 500 B in 10 s", True),
+        ("messages", 72.0, 3.0, 4.0, "4 of 3 msg in 72 s", False),
+        ("messages", 0.0, 2.5, 2.0, "2 of 2.5 msg so far", True),
+    ],
+)
+def test_a_limit_in_words(
+    unit: str, window_s: float, allowed: float, most: float, said: str, held: bool
+) -> None:
+    limit = SpendingReport(unit=unit, window_s=window_s, allowed=allowed, most=most)
+    assert (limit_text(limit).plain, limit.held) == (said, held)
+    assert limit_text(limit).style == ("green" if held else "bold red")
+    assert all_held([limit]) is held
+    assert all_held([]) is None
+
+
+def recorded(*statuses: Status) -> Report:
+    """What a recorder that heard these reports after ten seconds."""
+    hub = MemoryHub()
+    recorder, speaker = Recorder(hub.session()), hub.session()
+    for said in statuses:
+        key = topics.STATUS.at(robot=said.robot)
+        speaker.publisher(key, topics.STATUS.qos).put(encode(said))
+    report = recorder.report({s.robot: "joint" for s in statuses}, {})
+    return msgspec.structs.replace(report, duration_s=10.0)
+
+
+def shown(report: Report) -> str:
+    console = Console(file=io.StringIO(), width=80)
+    with console.capture() as capture:
+        print_report(report, console)
+    return capture.get()
+
+
+def test_the_report_adds_the_processes_of_a_robot_and_says_that_limits_held() -> None:
+    spent = (Spending("bytes", 10.0, 500.0, 412.0),)
+    full = (Spending("bytes", 10.0, 500.0, 500.0),)
+    report = recorded(
+        status("a", 1, 0, "1", sent=(flow("fix", "b", 2),), spending=spent),
+        status("a", 4, 0, "1", sent=(flow("fix", "b", 9, over_budget=6),), spending=spent),
+        status("a", 8, 0, "2", sent=(flow("fix", "b", 1, worthless=5),), spending=full),
+        status("b", 8, 3, heard=(flow("fix", "a", 10),)),
+    )
+    (sent,) = report.robots["a"].sent
+    assert (sent.messages, sent.bytes, sent.over_budget, sent.worthless) == (10, 420, 6, 5)
+    (limit,) = report.robots["a"].spending
+    assert (limit.most, limit.allowed) == (500.0, 500.0)
+    assert report.robots["b"].heard[0].messages == 10
+    assert report.team.within_budget is True
+    text = shown(report)
+    (row,) = (line.split() for line in text.splitlines() if "500 B in 10 s" in line)
+    assert row[:10] == ["a", "10", "0", "42", "6", "5", "0", "500", "of", "500"]
+    assert "every limit held" in text
+    assert max(map(len, text.splitlines())) <= 80
+
+
+def test_the_report_says_which_limit_did_not_hold() -> None:
+    broken = (Spending("messages", 60.0, 3.0, 4.0),)
+    report = recorded(
+        status("a", 1, 0, spending=broken),
+        status("b", 1, 0, spending=(Spending("messages", 60.0, 3.0, 3.0),)),
+    )
+    assert report.team.within_budget is False
+    assert "limits did not hold: a: 4 of 3 msg in 60 s" in shown(report)
+
+
+def test_a_report_without_help_or_limits_has_no_table_of_them() -> None:
+    report = recorded(status("a", 1, 0))
+    assert report.team.within_budget is None
+    assert "not sent" not in shown(report)
+
+
+# Live -------------------------------------------------------------------------------------------
+
+
+def seen(*statuses: Status) -> list[Arrival]:
+    """Each comes at its own time."""
+    return [Arrival(s.stamp_ns / SECOND, s) for s in statuses]
+
+
+def team_at(now_s: float) -> Traffic:
+    """A scout that two help, one of them with beliefs too; a lost robot; one that fell silent."""
+    good = [(flow("fix", "scout", 9 * n, 1.0 + n), flow("belief", "", n, 1.0 + n)) for n in (1, 2)]
+    old = flow("fix", "patrol", 4, 1.0, over_budget=3, silent=2)
+    spent = (Spending("bytes", 10.0, 500.0, 412.0), Spending("messages", 60.0, 3.0, 4.0))
+    arrivals = {
+        "scout": seen(
+            status("scout", 5, 9, heard=(flow("belief", "good", 1, 5.0),)),
+            status("scout", 7, 9, heard=(flow("belief", "good", 4, 6.5),)),
+        ),
+        "good": seen(
+            status("good", 3, 0, sent=good[0], spending=spent),
+            status("good", 5, 0, sent=(*good[1], old), spending=spent),
+        ),
+        "patrol": seen(status("patrol", 7, 4, sent=(flow("fix", "scout", 2, 6.9),))),
+        "adrift": seen(status("adrift", 7, 16, lost="poor sigma", sent=())),
+        "gone": seen(status("gone", 1, 2, sent=(flow("fix", "scout", 5, 1.0),))),
+    }
+    known = ("gone", "scout", "spare", "good", "patrol", "adrift")
+    return traffic("five", known, arrivals, 0.0, now_s)
+
+
+def test_rates_are_those_since_the_first_status_kept() -> None:
+    now = team_at(7.0)
+    assert list(now.robots) == ["good", "gone", "patrol", "scout", "adrift"]
+    assert now.never_heard == ("spare",)
+    fix, belief, old = now.robots["good"].sent
+    assert (fix.messages, fix.messages_per_s, fix.bytes_per_s) == (18, 4.5, 189.0)
+    assert (belief.topic, belief.messages_per_s) == ("belief", 0.5)
+    assert (old.messages_per_s, old.over_budget, old.at_present) == (2.0, 3, False)
+    (unknown,) = now.robots["patrol"].sent
+    assert (unknown.messages_per_s, unknown.bytes_per_s, unknown.at_present) == (None, None, True)
+
+
+def test_who_helps_whom_at_present() -> None:
+    helps = [(h.helper, h.helped, h.topic, h.messages_per_s) for h in team_at(7.0).help]
+    assert helps == [
+        ("good", "scout", "fix", 4.5),
+        ("good", "scout", "belief", 1.5),
+        ("patrol", "scout", "fix", None),
+    ]
+
+
+def test_a_robot_that_falls_silent_is_away_and_helps_nobody() -> None:
+    assert [n for n, r in team_at(7.0).robots.items() if r.away] == ["gone"]
+    later = team_at(8.9)  # good was heard of every 2 s: it may pause for 6
+    assert [n for n, r in later.robots.items() if r.away] == ["gone"]
+    last = team_at(11.5)
+    assert [n for n, r in last.robots.items() if r.away] == ["good", "gone", "patrol", "adrift"]
+    assert last.help == ()
+    (row,) = (line for line in rendered(drawn(last, "here")) if "18  756" in line)
+    assert row.split()[-5:] == ["-", "-", "0", "0", "0"]
+
+
+DRAWING = """\
+team five at here, watched for 7 s
+robot   tier    σ m  helps (in the last 3 s)
+────────────────────────────────────────────────────────
+good       0  0.010  ──▶ scout  fix 4.5/s, belief 1.5/s
+gone       2  0.030  away: silent for 6 s
+patrol     4  0.050  ──▶ scout  fix
+scout      9  0.100  nobody
+adrift    16  0.170  lost: poor sigma
+spare                not heard of
+good: most 412 of 500 B in 10 s, 4 of 3 msg in 60 s
+
+robot   key           messages    B   /s  B/s  budget  value  silence
+──────────────────────────────────────────────────────────────────────
+good    alive                2
+        fix → scout         18  756  4.5  189       0      0        0
+        belief               2   84  0.5   21       0      0        0
+        fix → patrol         4  168  2.0   84       3      0        2
+gone    alive                2
+        fix → scout          5  210    -    -       0      0        0
+patrol  alive                2
+        fix → scout          2   84    -    -       0      0        0
+scout   alive                2
+adrift  alive                2
+not sent: over the budget; of too little value; in silence, as listeners can
+still tell. B: on the sender's link with Zenoh's own, without TCP/IP's
+"""
+
+
+def test_the_drawing_of_a_team() -> None:
+    lines = rendered(drawn(team_at(7.0), "here"))
+    assert lines[: DRAWING.count("\n")] == DRAWING.splitlines()
+    assert max(map(len, lines)) <= 80
+
+
+def test_colours_tell_kinds_the_lost_and_the_idle() -> None:
+    console = Console(file=io.StringIO(), width=80, force_terminal=True, color_system="standard")
+    with console.capture() as capture:
+        console.print(drawn(team_at(7.0), "here"))
+    text = capture.get()
+    for code, words in (
+        ("36", "fix 4.5/s"),
+        ("35", "belief 1.5/s"),
+        ("1;31", "lost: poor sigma"),
+        ("2", "nobody"),
+        ("33", "away: silent for 6 s"),
+        ("32", "412 of 500 B in 10 s"),
+        ("1;31", "4 of 3 msg in 60 s"),
+    ):
+        assert f"\x1b[{code}m{words}" in text
+
+
+def test_a_terminal_is_redrawn_and_a_file_gets_snapshots() -> None:
+    for terminal in (True, False):
+        file = io.StringIO()
+        console = Console(file=file, width=80, force_terminal=terminal)
+        with TrafficView("here", console) as view:
+            for _ in range(3):
+                view.show(team_at(7.0))
+        assert (file.getvalue().count("lost: poor sigma") == 1) is not terminal
+
+
+def test_a_watcher_keeps_one_process_and_the_last_seconds() -> None:
+    hub, clock = MemoryHub(), iter(range(100))
+    watcher, speaker = Watcher(hub.session(), lambda: float(next(clock))), hub.session()
+
+    def say(payload: bytes) -> None:
+        speaker.publisher("status/a", topics.STATUS.qos).put(payload)
+
+    def stamps() -> Sequence[float]:
+        return [a.status.stamp_ns / SECOND for a in watcher.arrivals()["a"]]
+
+    for at_s in (1, 2, 4, 6.5):
+        say(encode(status("a", at_s, 0)))
+    assert stamps() == [2, 4, 6.5]
+    say(b"garbage")
+    say(encode(status("a", 7, 0, incarnation="2")))
+    assert stamps() == [7]
+    say(encode(status("a", 7, 0, incarnation="2")))
+    assert stamps() == [7]
+
+
+def test_a_status_counts_the_tokens_that_came() -> None:
+    stand, tokens = Stand(team_of(me=robot_at(sigma_m=0.5))), []
+    stand.bus.watch(topics.ALIVE.at(), lambda key, alive: tokens.append(key) if alive else None)
+    for _ in range(5):
+        stand.stand_still(0.1)
+        oak, elm = Sighting("oak", 4.0, 0.0), Sighting("elm", 4.0, 0.5 * math.pi)
+        stand.sightings("me", saw(stand.now_ns, oak, elm))
+    assert stand.status("me").counts["announced"] == len(tokens) > 1
+
+
+def test_watching_makes_nobody_send_help() -> None:
+    endpoint = free_endpoint()
+    with open_router("trio", [endpoint]) as router, open_bus("trio", [endpoint]) as client:
+        keys = ("status/b", "fix/a/0/b", "belief/0/b", "track/b")
+        publishers = {key: router.publisher(key, topics.Qos.INPUT) for key in keys}
+        Watcher(client)
+        wait_until(lambda: publishers["status/b"].matching)
+        assert [key for key in keys if publishers[key].matching] == ["status/b"]
+
+
+def test_what_a_robot_says_is_not_taken_for_markup() -> None:
+    named = msgspec.structs.replace(status("a", 1, 0), counts={"[/bold]": 1})
+    report = recorded(named)
+    robots = {n: msgspec.structs.replace(r, lost_at_end="[/red]") for n, r in report.robots.items()}
+    text = shown(msgspec.structs.replace(report, robots=robots, refused={"garbage": 3}))
+    assert "robot a is lost: [/red]" in text
+    assert "heard and of no use, by reason: garbage 3" in text
+
+
+def test_a_recorder_counts_what_it_takes_and_what_it_refuses() -> None:
+    hub = MemoryHub()
+    recorder, speaker = Recorder(hub.session()), hub.session()
+    for key, payload in (("status/a", encode(status("a", 1, 0))), ("track/a", b"\x02garbage")):
+        speaker.publisher(key, topics.STATUS.qos).put(payload)
+    assert recorder.counts == {"status": 1, "garbage": 1}
+    assert recorder.report({}, {}).refused == {"garbage": 1}
+
+
+# Budgets of a command line ----------------------------------------------------------------------
+
+
+def test_budgets_of_a_command_line_are_those_of_all_robots() -> None:
+    team = parse_team(TEAM)
+    assert chosen(team, Choice()) == team
+    limited = chosen(team, Choice(bytes_per_s=50.0, messages_per_minute=2.5, match_messages=1200))
+    for robot in limited.robots.values():
+        budget = robot.collaboration.budget
+        assert (budget.bytes_per_s, budget.messages_per_minute) == (50.0, 2.5)
+    assert limited.match.messages == 1200
+    assert limited.messages_per_s("driver") == pytest.approx(1200 / 3 / 1200)
+    free = chosen(limited, Choice(bytes_per_s=0.0, match_messages=0)).robots["miser"]
+    assert free.collaboration.budget.bytes_per_s == 0.0
+    assert free.collaboration.budget.messages_per_minute == 2.5
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["simulate", "demo", "--bytes-per-s", "inf"], "--bytes-per-s inf"),
+        (["up", "demo", "--messages-per-minute", "inf"], "--messages-per-minute inf"),
+        (["simulate", "--robots", "2", "--match-messages", "9"], "generated teams have no budgets"),
+        (["traffic", "demo", "--for", "0"], "--for 0"),
+        (["traffic", "nowhere.toml"], "nowhere.toml: no such file"),
+    ],
+)
+def test_what_the_user_can_mend_is_one_line(
+    arguments: list[str],
+    said: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr("sys.argv", ["cpcbl-team", *arguments])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    assert ended.value.code == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert said in line
+
+
+def test_a_simulated_team_keeps_to_a_tiny_budget(tmp_path: Path) -> None:
+    path = tmp_path / "trio.toml"
+    path.write_text(TEAM)
+    options = ["--bytes-per-s", 20, "--match-messages", 600, "--duration", 10]
+    ran = cpcbl_team("simulate", path, *options, "--json")
+    assert ran.returncode == 0, ran.stderr
+    report = json.loads(ran.stdout)
+    assert report["team"]["within_budget"] is True
+    for robot in report["robots"].values():
+        window, match = robot["spending"]
+        assert (window["unit"], window["allowed"], window["window_s"]) == ("bytes", 500.0, 25.0)
+        assert robot["bytes_sent"] <= window["most"] <= window["allowed"]
+        assert (match["unit"], match["window_s"]) == ("messages", 0.0)
+        assert robot["messages_sent"] <= match["most"] <= match["allowed"] <= 600 / 3 * 10 / 1200
+    for name in ("giver", "miser"):
+        assert sum(f["over_budget"] for f in report["robots"][name]["sent"]) > 50
+    assert sum(r["messages_sent"] for r in report["robots"].values()) > 0
+
+
+def test_a_log_is_evaluated_with_a_budget(tmp_path: Path) -> None:
+    write_log(tmp_path, ("1", "2"), seconds=20.0)
+    options = ["--team", "mrclam-uncalibrated", "--blind", "2", "--messages-per-minute", 2.5]
+    ran = cpcbl_team("evaluate", "mrclam", tmp_path, *options, "--json")
+    assert ran.returncode == 0, ran.stderr
+    report = json.loads(ran.stdout)
+    (limit,) = report["robots"]["1"]["spending"]
+    assert (limit["window_s"], limit["allowed"]) == (72.0, 3.0)
+    assert 0 < report["robots"]["1"]["messages_sent"] <= limit["most"] <= 3.0
+    assert sum(f["over_budget"] for f in report["robots"]["1"]["sent"]) > 0
+
+
+def test_who_is_not_in_the_team_file_is_shown_as_a_guest() -> None:
+    seen = {name: [Arrival(1.0, status(name, 1, 3))] for name in ("r1", "tripod")}
+    now = traffic("t", ["r1"], seen, 0.0, 1.0)
+    assert now.guests == ("tripod",)
+    console = Console(file=io.StringIO(), width=80)
+    with console.capture() as capture:
+        console.print(drawn(now, "here"))
+    assert "tripod, guest" in capture.get()
+    assert traffic("t", [], seen, 0.0, 1.0).guests == ()  # nobody knows
+
+
+# Processes --------------------------------------------------------------------------------------
+
+
+def test_a_running_team_is_watched_with_the_command_that_up_says(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "trio.toml").write_text(TEAM)
+    monkeypatch.chdir(tmp_path)
+    options = ["--duration", "9", "--messages-per-minute", "900", "--report", "report.json"]
+    command = [*PROGRAM, "up", "trio.toml", *options, "--logs", str(tmp_path / "logs")]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as up:
+        assert up.stdout is not None
+        first = up.stdout.readline()
+        assert first.startswith("watch it: cpcbl-team traffic trio.toml --connect tcp/127.0.0.1:")
+        words = shlex.split(first.removeprefix("watch it: "))[1:]
+        assert any("driver" in line for line in iter(up.stdout.readline, ""))
+        watched = cpcbl_team(*words, "--for", 3, "--json")
+        text, _ = up.communicate(timeout=60.0)
+        assert up.returncode == 0
+    assert watched.returncode == 0, watched.stderr
+    assert watched.stderr == ""
+    assert not pids_of([str(tmp_path)])
+
+    now = msgspec.json.decode(watched.stdout, type=Traffic)
+    assert (now.team, now.never_heard, len(now.robots)) == ("trio", (), 3)
+    assert now.watched_s >= 3.0
+    assert not any(robot.away for robot in now.robots.values())
+    assert list(now.robots)[-1] == "driver"
+    (given,) = (h for h in now.help if (h.helper, h.topic) == ("giver", "fix"))
+    assert given.helped == "driver"
+    assert given.messages_per_s is not None
+    assert given.messages_per_s > 0.0
+    assert "driver" not in {h.helper for h in now.help}
+    to_driver = {f.peer: f for f in now.robots["miser"].sent if f.topic == "fix"}["driver"]
+    assert to_driver.over_budget > 0
+
+    report = json.loads((tmp_path / "report.json").read_text())
+    miser = report["robots"]["miser"]
+    assert [s["unit"] for s in miser["spending"]] == ["bytes", "messages"]
+    assert miser["spending"][0]["allowed"] == 100 * MISER_BYTES_PER_S
+    assert miser["bytes_sent"] <= miser["spending"][0]["most"] <= 100 * MISER_BYTES_PER_S
+    for robot in report["robots"].values():
+        assert robot["spending"][-1]["allowed"] == 900.0
+        assert robot["messages_sent"] <= robot["spending"][-1]["most"] <= 900.0
+        assert robot["messages_sent"] == sum(f["messages"] for f in robot["sent"])
+        assert robot["messages_received"] == sum(f["messages"] for f in robot["heard"])
+    assert report["robots"]["giver"]["messages_sent"] > 0
+    assert report["team"]["within_budget"] is True
+    assert "every limit held" in text
+    assert "of 500 B in 100 s" in text
+    assert max(map(len, text.splitlines())) <= 80
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_watching_ends_with_a_signal(number: signal.Signals) -> None:
+    endpoint = free_endpoint()
+    with open_router("nobody", [endpoint]) as bus:
+        publisher = bus.publisher("status/a", topics.STATUS.qos)
+        command = [*PROGRAM, "traffic", "--team-name", "nobody", "--connect", endpoint]
+        with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+            try:
+                wait_until(lambda: publisher.matching)
+                process.send_signal(number)
+                text, _ = process.communicate(timeout=30.0)
+            finally:
+                process.kill()
+            assert process.returncode == 0
+    assert text.startswith(f"team nobody at {endpoint}, watched for ")
+    assert "no robot" in text
+
+
+def test_without_a_router_watching_ends_with_one_line() -> None:
+    endpoint = free_endpoint()
+    ended = cpcbl_team("traffic", "demo", "--connect", endpoint, "--wait", 0.5)
+    assert ended.returncode == 2
+    (line,) = ended.stderr.splitlines()
+    assert f"no router at {endpoint} within 0.5 s" in line
+    assert "--connect" in line
+    assert ended.stdout == ""
+
+
+def test_what_is_no_status_is_counted_and_shown() -> None:
+    hub = MemoryHub()
+    watcher, speaker = Watcher(hub.session()), hub.session()
+    for key, payload in (
+        ("status/a", b"garbage"),
+        ("status/a", encode(status("b", 1, 0))),
+        ("status/a", encode(status("a", 1, 0))),
+    ):
+        speaker.publisher(key, topics.STATUS.qos).put(payload)
+    assert watcher.refused == {"wrong_version": 1, "name_of_another": 1}
+    now = traffic("trio", (), watcher.arrivals(), 0.0, 1.0, watcher.refused)
+    assert now.refused == {"name_of_another": 1, "wrong_version": 1}
+    console = Console(file=io.StringIO(), width=80)
+    console.print(drawn(now, "here"))
+    assert "refused, by reason: name_of_another 1, wrong_version 1" in console.file.getvalue()  # type: ignore[attr-defined]

@@ -1,0 +1,115 @@
+"""Notes on runs that never were, to judge."""
+
+from collections.abc import Callable, Mapping, Sequence
+
+import numpy as np
+
+from cpcbl_launch.lab.chaos.checks import Check
+from cpcbl_launch.lab.chaos.notes import Heard, Notes, Said, Token
+from cpcbl_transport.messages import Flow, Status, Track, Trust
+from support.buses import SECOND
+
+EPOCH_NS = 1_000_000 * SECOND
+UNTIL_S = 85.0
+TENTHS = tuple(round(0.1 * n, 1) for n in range(int(10 * UNTIL_S)))
+COVARIANCE = (0.01, 0.0, 0.01, 0.0, 0.0, 0.01)
+
+
+def error_of(_: float) -> float:
+    """Of a good robot, in metres."""
+    return 0.02
+
+
+def tracks_of(
+    robot: str,
+    error_m: Callable[[float], float] = error_of,
+    silent: tuple[float, float] = (0.0, 0.0),
+    lost: tuple[float, float] = (0.0, 0.0),
+    late_s: float = 0.01,
+) -> list[Heard]:
+    """Ten tracks a second of a robot that stands at (1, 2), but for a time of silence."""
+    return [
+        Heard(
+            at_s + late_s,
+            Track(
+                robot,
+                EPOCH_NS + round(at_s * SECOND),
+                1.0 + error_m(at_s),
+                2.0,
+                0.0,
+                COVARIANCE,
+                3,
+                "position sigma 3 m" if lost[0] <= at_s < lost[1] else "",
+            ),
+        )
+        for at_s in TENTHS
+        if not silent[0] <= at_s < silent[1]
+    ]
+
+
+def status_at(
+    robot: str,
+    at_s: float,
+    counts: Mapping[str, int] | None = None,
+    heard: Sequence[tuple[str, float]] = (),
+    trust: Sequence[tuple[str, str]] = (),
+    incarnation: str = "1",
+) -> Said:
+    """`heard`: (peer, time of its latest help); `trust`: (peer, reason)."""
+    stamp_ns = EPOCH_NS + round(at_s * SECOND)
+    flows = tuple(
+        Flow("fix", peer, 1, 40, latest_ns=EPOCH_NS + round(s * SECOND)) for peer, s in heard
+    )
+    counted = dict(counts or {})
+    received = counted.pop("messages_received", 0)
+    return Said(
+        at_s,
+        Status(
+            robot,
+            incarnation,
+            stamp_ns,
+            0.1,
+            0.1,
+            3,
+            "",
+            counted,
+            0,
+            0,
+            received,
+            0,
+            heard=flows,
+            trust=tuple(Trust(peer, reason, 0, 0, False, 0.0) for peer, reason in trust),
+        ),
+    )
+
+
+def notes_of(
+    tracks: Sequence[Sequence[Heard]],
+    tokens: Sequence[Token] = (),
+    statuses: Sequence[Said] = (),
+    jump: tuple[str, float, float] | None = None,
+) -> Notes:
+    """`jump`: (robot, time, metres) of its true place."""
+    by_robot = {heard[0].track.robot: tuple(heard) for heard in tracks}
+    rows = {name: np.array([(at_s, 1.0, 2.0, 0.0) for at_s in TENTHS]) for name in by_robot}
+    if jump is not None:
+        robot, at_s, metres = jump
+        moved = rows[robot][:, 0] >= at_s
+        rows[robot][moved, 1] += metres
+    said: dict[str, list[Said]] = {}
+    for one in statuses:
+        said.setdefault(one.status.robot, []).append(one)
+    return Notes(EPOCH_NS, by_robot, said, tuple(tokens), rows)
+
+
+def came(at_s: float, robot: str, incarnation: str = "1", tier: str = "3") -> Token:
+    return Token(at_s, robot, tier, incarnation, True)
+
+
+def went(at_s: float, robot: str, incarnation: str = "1", tier: str = "3") -> Token:
+    return Token(at_s, robot, tier, incarnation, False)
+
+
+def broken(checks: Sequence[Check]) -> set[str]:
+    """What did not hold."""
+    return {check.what for check in checks if not check.held}

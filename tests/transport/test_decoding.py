@@ -1,0 +1,99 @@
+"""What listeners to a whole team take, and what they refuse, by reason."""
+
+import math
+
+import msgspec
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from support.buses import SECOND, examples, standing
+
+from cpcbl_team.inputs import Sighting
+from cpcbl_transport.decoding import read
+from cpcbl_transport.messages import (
+    LARGEST_COUNT,
+    LARGEST_FRAME,
+    LARGEST_PAYLOAD,
+    LAST_NS,
+    Drive,
+    Flow,
+    Frame,
+    Look,
+    Refusal,
+    Status,
+    Tagged,
+    Track,
+    Truth,
+    Truths,
+    encode,
+)
+
+NOW = 5 * SECOND
+COVARIANCE = (0.04, 0.01, 0.09, 0.0, 0.0, 0.01)
+STATUS = Status("r1", "a", NOW, 0.1, 0.02, 3, "", {"odometry": 7}, 1, 20, 2, 40)
+TRACK = Track("r1", NOW, 1.0, 2.0, 0.5, COVARIANCE, 3)
+DRIVE = Drive("r1", NOW, 0.5, 0.1)
+TRUTHS = Truths(NOW, (Truth("r1", 1.0, 2.0, 0.5, 1),))
+GOOD: dict[str, Tagged] = {
+    "status/r1": STATUS,
+    "track/r1": TRACK,
+    "field/drive/r1": DRIVE,
+    "field/truth": TRUTHS,
+    "in/r1/odometry": standing(NOW),
+    "in/r1/frame": Frame(NOW, bytes(LARGEST_PAYLOAD)),
+    "look/r1": Look("r1", NOW, bytes(LARGEST_PAYLOAD), (Sighting("oak", 2.0, 0.1),)),
+}
+
+
+@pytest.mark.parametrize("key", GOOD)
+def test_what_the_key_allows_is_taken(key: str) -> None:
+    assert read(key, encode(GOOD[key])) == GOOD[key]
+    assert read(key, encode(GOOD[key]), NOW) == GOOD[key]
+
+
+@pytest.mark.parametrize(
+    ("key", "message", "reason"),
+    [
+        ("status/r1", TRACK, Refusal.WRONG_TYPE),
+        ("status/r2", STATUS, Refusal.NOT_ITS_OWN),
+        ("track/r2", TRACK, Refusal.NOT_ITS_OWN),
+        ("field/drive/r2", DRIVE, Refusal.NOT_ITS_OWN),
+        ("field/truth/r1", TRUTHS, Refusal.WRONG_TYPE),
+        ("track/r1/more", TRACK, Refusal.WRONG_TYPE),
+        ("in/r1/odometry", TRACK, Refusal.WRONG_TYPE),
+        ("elsewhere", STATUS, Refusal.WRONG_TYPE),
+        ("in/r1/frame", Frame(NOW, bytes(LARGEST_FRAME)), Refusal.TOO_LARGE),
+        ("in/r1/odometry", Frame(NOW, bytes(LARGEST_PAYLOAD)), Refusal.TOO_LARGE),
+        ("in/r1/odometry", Frame(NOW, b"jpeg"), Refusal.WRONG_TYPE),
+        ("in/r1/frame", standing(NOW), Refusal.WRONG_TYPE),
+        ("look/r2", Look("r1", NOW, b"jpeg"), Refusal.NOT_ITS_OWN),
+        ("look/r1", Look("r1", NOW, b"jpeg", (Sighting("oak", math.nan),)), Refusal.NOT_FINITE),
+        ("track/r1", msgspec.structs.replace(TRACK, x_m=math.nan), Refusal.NOT_FINITE),
+        ("track/r1", msgspec.structs.replace(TRACK, x_m=1e7), Refusal.IMPLAUSIBLE),
+        ("track/r1", msgspec.structs.replace(TRACK, stamp_ns=LAST_NS), Refusal.IMPLAUSIBLE),
+        ("track/r1", msgspec.structs.replace(TRACK, stamp_ns=-LAST_NS), Refusal.IMPLAUSIBLE),
+        (
+            "status/r1",
+            msgspec.structs.replace(STATUS, counts={"x": 2 * LARGEST_COUNT}),
+            Refusal.IMPLAUSIBLE,
+        ),
+        (
+            "status/r1",
+            msgspec.structs.replace(STATUS, sent=(Flow("fix", "r2", 2 * LARGEST_COUNT),)),
+            Refusal.IMPLAUSIBLE,
+        ),
+    ],
+)
+def test_what_it_does_not_allow_is_refused(key: str, message: Tagged, reason: Refusal) -> None:
+    assert read(key, encode(message)) is reason
+
+
+def test_the_future_is_refused_by_those_with_a_clock() -> None:
+    assert read("track/r1", encode(TRACK), NOW - 2 * SECOND) is Refusal.FUTURE
+    assert read("track/r1", encode(TRACK)) == TRACK
+
+
+@given(st.sampled_from(sorted(GOOD)), st.binary(max_size=300))
+@examples(300)
+def test_anything_is_a_message_or_a_reason(key: str, payload: bytes) -> None:
+    assert isinstance(read(key, payload), Refusal | type(GOOD[key]))
