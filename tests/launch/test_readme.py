@@ -20,15 +20,17 @@ from cpcbl_team.config import (
 
 ROOT = Path(__file__).parents[2]
 README = (ROOT / "README.md").read_text()
+REAL_ROBOTS = (ROOT / "docs" / "real_robots.md").read_text()
 TEAM_FILE = (ROOT / "docs" / "team_file.md").read_text()
 TOML = re.findall(r"```toml\n(.*?)```", TEAM_FILE, re.DOTALL)
 
 
 def readme_commands() -> list[str]:
-    """Every `cpcbl-team` command of the README that has no placeholder."""
-    blocks = "\n".join(re.findall(r"```sh\n(.*?)```", README, re.DOTALL))
+    """Every `cpcbl-team` command of the README and of its page on real logs without placeholder."""
+    text = README + REAL_ROBOTS
+    blocks = "\n".join(re.findall(r"```sh\n(.*?)```", text, re.DOTALL))
     lines = [line.split("#")[0] for line in blocks.splitlines()]
-    inline = re.findall(r"`(cpcbl-team [^`]+)`", README)
+    inline = re.findall(r"`(cpcbl-team [^`]+)`", text)
     found = [line.strip() for line in (*lines, *inline) if line.startswith("cpcbl-team")]
     return [c for c in dict.fromkeys(found) if not re.search(r"\b(FILE|NAME|DIR|LOG)\b", c)]
 
