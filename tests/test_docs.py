@@ -14,7 +14,7 @@ SOURCES = "cpcbl_team|transport|agents|launch|tests|docs|docker"
 
 @cache
 def anchors(document: Path) -> frozenset[str]:
-    """The anchors that GitHub gives to the headings of a page (headings of code blocks excluded)."""
+    """The anchors that GitHub gives to the headings of a page, but not to code."""
     text = re.sub(r"^```.*?^```", "", document.read_text(), flags=re.DOTALL | re.MULTILINE)
     headings = re.findall(r"^#+ +(.+?) *$", text, re.MULTILINE)
     slugs = (re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings)
