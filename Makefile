@@ -1,10 +1,12 @@
 # make demo: a team of robots for half a minute.   make test: format, lint, types, layers, tests.
+# make net: stores what the localizer computes now as the reference of tests/net, and prints what has
+#   moved; only for a change that is meant to move numbers.
 # make bench: what a cycle costs, beside other filters.
 PYTHON ?= python3
 VENV ?= .venv
 BIN = $(VENV)/bin
 
-.PHONY: setup demo test check unit test-long test-compiled test-docker chaos compiled bench clean
+.PHONY: setup demo test check unit test-long test-compiled test-docker chaos net compiled bench clean
 
 setup: $(VENV)/ready
 
@@ -44,6 +46,10 @@ test-docker: setup
 # Every fault scenario; those that need root or Docker say so where there is none.
 chaos: setup
 	$(BIN)/cpcbl-team chaos all --soak-s 180
+
+# The net proves that a refactoring changes no bit; see tests/net/test_net.py.
+net: setup
+	PYTHONPATH=$(BENCH_PATH) $(BIN)/python -m net.reference
 
 # The core with its hot files compiled (hatch_build.py), and the benchmarks' yardstick: beside the
 # checkout's own, which stay as they are. Needs a C compiler.

@@ -1,0 +1,145 @@
+"""The adapter between the project's records and the net's stored reference.
+
+This is the only file of the net that reads fields of a `State`. The names in its dictionaries
+belong to the stored reference: whoever renames or splits a record of the project edits the right
+sides here, and the left sides stay as they are.
+"""
+
+from collections.abc import Iterable
+from typing import Any
+
+from cpcbl_team.estimate import Estimate
+from cpcbl_team.inputs import Belief
+from cpcbl_team.localizer import Localizer
+from cpcbl_team.state import Evidence, Memory, State
+from cpcbl_team.trust import Voice
+from cpcbl_transport.messages import Track
+
+Canonical = dict[str, Any]
+"""Dictionaries, lists, numbers and texts only; the keys do not depend on names of the project."""
+
+
+def canonical_state(localizer: Localizer, state: State, with_evidence: bool) -> Canonical:
+    """All that can influence what the localizer computes from here on.
+
+    To compute the evidence takes longer than all the rest, so not every step has it. It stays in
+    the state for many steps, so a difference is found all the same.
+    """
+    memory, updates, pending = state.memory, state.updates, state.motion
+    evidence = localizer.evidence(memory) if with_evidence else ()
+    learned = memory.learned
+    return {
+        "stamp_ns": state.stamp_ns,
+        "estimate": _estimate(state.estimate),
+        "odometry_from_robot": list(state.odometry_from_robot),
+        "odometry_known_until_ns": state.odometry_ns,
+        "pending_odometry": None
+        if pending is None
+        else [pending.from_ns, pending.stamp_ns, pending.distance_m, pending.turn_rad],
+        "counts": dict(state.counts),
+        "last_position_update_ns": updates.position_ns,
+        "last_heading_update_ns": updates.heading_ns,
+        "last_update_was_heading": updates.heading_is_latest,
+        "last_use_of_object_ns": dict(updates.objects_ns),
+        "last_acceptance_ns": updates.agreed_ns,
+        "innovation_window": bin(updates.innovations),
+        "lost_reason": str(memory.lost),
+        "last_inflation_ns": memory.widened_ns,
+        "last_relocalization_ns": memory.sought_ns,
+        "evidence": [_evidence(piece) for piece in evidence],
+        "recently_recorded": sorted(memory.noted),
+        "recently_recorded_until_ns": memory.noted_until_ns,
+        "last_word_of_teammate_ns": memory.told_ns,
+        "self_calibration": {
+            "distance_scale": [learned.distance_scale, learned.distance_variance],
+            "turn_scale": [learned.turn_scale, learned.turn_variance],
+            "bearing_bias": [learned.bearing_bias_rad, learned.bearing_variance],
+            "total_turn_rad": memory.turned_rad,
+            "anchors": _calibration_anchors(memory),
+        },
+        "trust": {sender or "own sensors": _sender(v) for sender, v in memory.voices.items()},
+        "beliefs": {
+            name: [_belief(b) for b in beliefs] for name, beliefs in memory.teammates.items()
+        },
+    }
+
+
+def canonical_track(track: Track) -> Canonical:
+    """What a robot published about itself."""
+    return {
+        "stamp_ns": track.stamp_ns,
+        "pose": [track.x_m, track.y_m, track.heading_rad],
+        "covariance": _listed(track.covariance),
+        "tier": track.tier,
+        "lost_reason": str(track.lost),
+    }
+
+
+def _estimate(estimate: Estimate) -> Canonical:
+    return {
+        "pose": list(estimate.pose),
+        "covariance": list(estimate.covariance),
+        "shared": list(estimate.shared),
+    }
+
+
+def _evidence(e: Evidence) -> Canonical:
+    return {
+        "stamp_ns": e.stamp_ns,
+        "odometry_from_robot": list(e.odometry_from_robot),
+        "source": e.source,
+        "position": [e.x, e.y],
+        "range_and_bearing": [e.range_m, e.bearing_rad],
+        "sigmas_of_sensor": [e.range_sigma_m, e.bearing_sigma_rad],
+        "sigmas_of_teammate": [e.place_sigma_m, e.place_sigma_rad],
+        "from_teammate": e.told,
+        "heading_rad": e.heading_rad,
+    }
+
+
+def _calibration_anchors(memory: Memory) -> list[list[Any]] | None:
+    if memory.anchors is None:
+        return None
+    pairs = memory.anchors.turned, memory.anchors.drove
+    return [
+        [a.stamp_ns, _estimate(a.estimate), list(a.odometry_from_robot), a.turned_rad]
+        for a in pairs
+    ]
+
+
+def _belief(b: Belief) -> list[Any]:
+    place, rates = (b.x_m, b.y_m, b.heading_rad), (b.speed_m_s, b.turn_rate_rad_s)
+    return [b.stamp_ns, *place, *b.covariance, *rates]
+
+
+def _sender(voice: Voice) -> Canonical:
+    anchor = voice.anchor
+    return {
+        "heard_ns": voice.heard_ns,
+        "agreed_ns": voice.agreed_ns,
+        "doubted_ns": voice.doubted_ns,
+        "score": voice.score,
+        "offset": list(voice.offset),
+        "spread": voice.spread,
+        "last_fix": None
+        if anchor is None
+        else [
+            anchor.stamp_ns,
+            *(anchor.x, anchor.y, anchor.variance),
+            *anchor.odometry_from_robot,
+        ],
+        "odometry_comparisons": voice.compared,
+        "odometry_conflicts": voice.strikes,
+        "missed_motion": voice.still,
+        "confirmed_in_a_row": voice.steady,
+        "last_conflict_ns": voice.struck_ns,
+        "last_failure_ns": voice.wrong_ns,
+        "agreements_since_failure": voice.healthy,
+        "reason": str(voice.reason),
+        "reason_since_ns": voice.since_ns,
+        "quarantines": voice.quarantines,
+    }
+
+
+def _listed(numbers: Iterable[float] | None) -> list[float] | None:
+    return None if numbers is None else list(numbers)
