@@ -7,24 +7,17 @@ from collections.abc import Callable
 from cpcbl_agents.node import Node
 from cpcbl_agents.robot import Robot
 from cpcbl_agents.sources import OwnCamera
-from cpcbl_team.config import RobotSettings, Team
+from cpcbl_team.config import Team
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus
-from cpcbl_transport.messages import Body, Flow, Join, encode
+from cpcbl_transport.messages import Flow, Join, encode
+from cpcbl_transport.robot_model import SimulatedRobotModel, model_from_settings
 
 log = logging.getLogger(__name__)
 
 ASK_NS = 500_000_000
 AGAIN_NS = 50_000_000  # while no field listens
 PATIENCE_NS = 3_000_000_000  # so long it may take until something is sensed
-
-
-def body_of(settings: RobotSettings) -> Body | None:
-    """What a simulated field must know of a robot; None for a real one."""
-    start, s = settings.start, settings
-    if s.source != "simulated" or start is None:
-        return None
-    return Body(start, s.sensor, s.odometry, s.position_sensor)
 
 
 class Visit:
@@ -45,12 +38,12 @@ class Visit:
         self._node = Node(self.robot, team, bus, start_ns, incarnation, on_arrival, speed)
         self._incarnation, self._due_ns = incarnation, start_ns
         self._warn_ns: int | None = start_ns + PATIENCE_NS
-        self._body = body_of(team.robots[name])
+        self._model = model_from_settings(team.robots[name])
         self._join = bus.publisher(topics.JOIN.at(robot=name), topics.JOIN.qos)
 
     @property
     def next_ns(self) -> int:
-        return self._node.next_ns if self._body is None else min(self._node.next_ns, self._due_ns)
+        return self._node.next_ns if self._model is None else min(self._node.next_ns, self._due_ns)
 
     @property
     def waiting(self) -> bool:
@@ -71,7 +64,7 @@ class Visit:
         """Why nothing has been sensed so far; empty if something has."""
         if self.robot.sensing.counts:
             return ""
-        if self._body is None:
+        if self._model is None:
             keys = topics.IN_SIGHTINGS.at(robot=self.robot.name)
             return f"senses nothing: nothing came on {keys}; is its driver there?"
         return (
@@ -85,18 +78,18 @@ class Visit:
             self._warn_ns = None
             if self.unfed:
                 log.warning("%s %s", self.robot.name, self.unfed)
-        if self._body is not None and now_ns >= self._due_ns:
-            self._due_ns = now_ns + (ASK_NS if self._ask(now_ns, self._body) else AGAIN_NS)
+        if self._model is not None and now_ns >= self._due_ns:
+            self._due_ns = now_ns + (ASK_NS if self._ask(now_ns, self._model) else AGAIN_NS)
         self._node.step(now_ns)
 
     def leave(self, now_ns: int) -> None:
         """Gives the body back. The rest goes with the session."""
-        if self._body is not None:
+        if self._model is not None:
             self._ask(now_ns, None)
 
-    def _ask(self, now_ns: int, body: Body | None) -> bool:
+    def _ask(self, now_ns: int, model: SimulatedRobotModel | None) -> bool:
         """Whether a field listens."""
         if not self._join.matching:
             return False
-        self._join.put(encode(Join(self.robot.name, self._incarnation, now_ns, body)))
+        self._join.put(encode(Join(self.robot.name, self._incarnation, now_ns, model)))
         return True

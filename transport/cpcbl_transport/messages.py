@@ -10,8 +10,8 @@ from enum import StrEnum
 
 import msgspec
 
-from cpcbl_team.config import OdometrySettings, PositionSensor, SensorSettings, Start
 from cpcbl_team.inputs import Belief, Fix, Name, Odometry, Position, Sighting, Sightings
+from cpcbl_transport.robot_model import SimulatedRobotModel
 
 VERSION = 2
 FUTURE_NS = 500_000_000
@@ -145,25 +145,13 @@ class Drive(msgspec.Struct, frozen=True, array_like=True, tag="drive"):
     """Waypoints that the robot believes to have reached so far."""
 
 
-class Body(msgspec.Struct, frozen=True, array_like=True):
-    """What the simulated field must know of a robot: its senses, and where it starts.
-
-    The field draws the true pose around the stated one, as it does for all robots.
-    """
-
-    start: Start
-    sensor: SensorSettings
-    odometry: OdometrySettings
-    position_sensor: PositionSensor | None = None
-
-
 class Join(msgspec.Struct, frozen=True, array_like=True, tag="join"):
-    """A guest asks the simulated field for a body, again and again; None: it leaves."""
+    """A guest asks the simulated field, again and again, to simulate it; None: it leaves."""
 
     robot: Name
     incarnation: str
     stamp_ns: int
-    body: Body | None = None
+    model: SimulatedRobotModel | None = None
 
 
 class Truth(msgspec.Struct, frozen=True, array_like=True):

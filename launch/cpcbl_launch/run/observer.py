@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import msgspec
 
 from cpcbl_agents.clock import Clock
-from cpcbl_agents.guest_node import Visit, body_of
+from cpcbl_agents.guest_node import Visit
 from cpcbl_agents.process import Loop, new_incarnation, own_camera, while_time_holds
 from cpcbl_launch.reporting.flows import FlowReport, summed_flows
 from cpcbl_launch.simulation.guest_bodies import unfit
@@ -20,6 +20,7 @@ from cpcbl_team.config import Team
 from cpcbl_team.inputs import NAME_PATTERN
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus
+from cpcbl_transport.robot_model import model_from_settings
 from cpcbl_transport.security import Identity, link_of
 from cpcbl_transport.topics import Role
 from cpcbl_transport.zenoh_bus import open_bus
@@ -129,8 +130,8 @@ def joined(team: Team, wish: Wish) -> Team:
             f"--sensor {wish.sensor}: no such file; write one, or {' or '.join(presets())}"
         )
     more = beside(team, name, [_PLAIN, read_layer(path), _own(wish, source)], str(path))
-    body = body_of(more.robots[name])
-    reason = "" if body is None else unfit(body)
+    model = model_from_settings(more.robots[name])
+    reason = "" if model is None else unfit(model)
     if reason:
         raise ValueError(f"{path}: {reason}")
     return more

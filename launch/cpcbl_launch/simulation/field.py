@@ -12,10 +12,11 @@ from typing import TYPE_CHECKING
 from cpcbl_agents.sensing import SensorInput
 from cpcbl_launch.simulation.grid import Grid
 from cpcbl_launch.simulation.robot import Seen, SimulatedRobot
-from cpcbl_team.config import RobotSettings, SimulationEvent, Team
+from cpcbl_team.config import SimulationEvent, Team
 from cpcbl_team.geometry import Pose2, wrap_angle
 from cpcbl_team.inputs import Sightings
-from cpcbl_transport.messages import Body, Drive, Frame, Truth, Truths
+from cpcbl_transport.messages import Drive, Frame, Truth, Truths
+from cpcbl_transport.robot_model import SimulatedRobotModel, settings_from_model
 
 if TYPE_CHECKING:
     from cpcbl_launch.simulation.camera.cameras import Cameras
@@ -58,14 +59,9 @@ class SimulatedField:
         self._reach_m = max(ranges_m, default=0.0)
         self._marks_to_see = Grid(self._reach_m, self._marks)
 
-    def join(self, name: str, body: Body) -> None:
+    def join(self, name: str, model: SimulatedRobotModel) -> None:
         """A guest has a body from now on. Its noise is its own: the others' stays what it was."""
-        settings = RobotSettings(
-            start=body.start,
-            sensor=body.sensor,
-            odometry=body.odometry,
-            position_sensor=body.position_sensor,
-        )
+        settings = settings_from_model(model)
         seed, noise = (self._seed, _GUEST_SEED, *name.encode()), self.team.simulation.noise
         self.robots[name] = SimulatedRobot(settings, noise, seed, self.now_ns, self._step_ns)
         self._look()

@@ -130,9 +130,9 @@ class FieldNode:
             if name not in present or present[name].incarnation != incarnation:
                 self._let_out(name)
         for name, join in present.items():
-            if name not in self._guests and join.body is not None:
+            if name not in self._guests and join.model is not None:
                 self._guests[name] = join.incarnation
-                self._field.join(name, join.body)
+                self._field.join(name, join.model)
                 self._declare(name)
                 log.info("guest %s joined the field", name)
 

@@ -3,7 +3,8 @@
 from collections.abc import Iterator, Mapping
 
 from cpcbl_team.config import Team
-from cpcbl_transport.messages import Body, Join
+from cpcbl_transport.messages import Join
+from cpcbl_transport.robot_model import SimulatedRobotModel
 
 LASTS_NS = 2_000_000_000  # who has not asked again for so long is gone
 LONGEST_DELAY_S = 10.0  # what is sensed with a delay is kept so long
@@ -18,10 +19,10 @@ class Bodies:
 
     def ask(self, join: Join, now_ns: int) -> str:
         """Takes a guest's word; the reason if it is refused."""
-        if join.body is None:
+        if join.model is None:
             self._asked.pop(join.robot, None)
             return ""
-        reason = self._refusal(join.robot) or unfit(join.body)
+        reason = self._refusal(join.robot) or unfit(join.model)
         if not reason:
             self._asked[join.robot] = now_ns, join
         return reason
@@ -44,16 +45,16 @@ class Bodies:
         return {name: join for name, (_, join) in self._asked.items()}
 
 
-def unfit(body: Body) -> str:
+def unfit(model: SimulatedRobotModel) -> str:
     """Why the field cannot give a guest this body; empty if it can."""
-    for key, delay_s in _delays_s(body):
+    for key, delay_s in _delays_s(model):
         if abs(delay_s) > LONGEST_DELAY_S:
             return f"{key}: {delay_s:g} s; at most {LONGEST_DELAY_S:g} s"
     return ""
 
 
-def _delays_s(body: Body) -> Iterator[tuple[str, float]]:
-    yield "sensor.delay_s", body.sensor.delay_s
-    yield "odometry.delay_s", body.odometry.delay_s
-    if body.position_sensor is not None:
-        yield "position_sensor.delay_s", body.position_sensor.delay_s
+def _delays_s(model: SimulatedRobotModel) -> Iterator[tuple[str, float]]:
+    yield "sensor.delay_s", model.sensor.delay_s
+    yield "odometry.delay_s", model.odometry.delay_s
+    if model.position_sensor is not None:
+        yield "position_sensor.delay_s", model.position_sensor.delay_s

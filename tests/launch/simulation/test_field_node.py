@@ -6,7 +6,7 @@ from typing import Any
 import msgspec
 import pytest
 from support.buses import SECOND, Ear
-from support.fields import ALL_ROUND, EVERY_STEP, STEP_NS, field, marks, robot
+from support.fields import ALL_ROUND, STEP_NS, field, marks, robot
 
 from cpcbl_agents.clock import Clock
 from cpcbl_launch.simulation.field import SimulatedField
@@ -18,14 +18,14 @@ from cpcbl_team.config import (
     OdometrySettings,
     PositionSensor,
     SimulationSettings,
-    Start,
     Team,
 )
 from cpcbl_team.geometry import Pose2
 from cpcbl_team.inputs import Odometry, Position, Sighting, Sightings
 from cpcbl_transport import topics
 from cpcbl_transport.bus import MemoryHub
-from cpcbl_transport.messages import Body, Drive, Join, Refusal, Truths, encode
+from cpcbl_transport.messages import Drive, Join, Refusal, Truths, encode
+from cpcbl_transport.robot_model import SimulatedRobotModel, model_from_settings
 
 
 class OnBus:
@@ -171,9 +171,12 @@ def test_robots_of_other_sites_are_named_by_their_router() -> None:
 # Guests -----------------------------------------------------------------------------------------
 
 
-def body(x_m: float = 0.0, y_m: float = 3.0, heading_deg: float = -90.0, **more: Any) -> Body:
-    start = Start(x_m=x_m, y_m=y_m, heading_deg=heading_deg, sigma_m=0.0, heading_sigma_deg=0.0)
-    return Body(start, **{"sensor": ALL_ROUND, "odometry": EVERY_STEP, **more})
+def body(
+    x_m: float = 0.0, y_m: float = 3.0, heading_deg: float = -90.0, **more: Any
+) -> SimulatedRobotModel:
+    model = model_from_settings(robot(x_m, y_m, heading_deg, **more))
+    assert model is not None
+    return model
 
 
 def polar(seen: Sighting) -> tuple[float | None, float | None]:
@@ -191,7 +194,9 @@ class WithGuests(OnBus):
             )
             self.node = FieldNode(self.field, self.hub.session())
 
-    def ask(self, wanted: Body | None, name: str = "tripod", incarnation: str = "1") -> None:
+    def ask(
+        self, wanted: SimulatedRobotModel | None, name: str = "tripod", incarnation: str = "1"
+    ) -> None:
         self.say(name, encode(Join(name, incarnation, self.field.now_ns, wanted)))
 
     def say(self, name: str, payload: bytes) -> None:
