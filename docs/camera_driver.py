@@ -1,4 +1,4 @@
-"""A camera's driver in ten lines: its frames onto the bus, as JPEG. Odometry is another driver's.
+"""A camera driver in ten lines: it publishes images as JPEG. Another driver publishes odometry.
 
 python camera_driver.py [CAMERA [TEAM [ROBOT [ENDPOINT]]]]     # a device's number, a file or a URL
 """
@@ -18,7 +18,7 @@ capture = cv2.VideoCapture(int(camera)) if camera.isdigit() else cv2.VideoCaptur
 with open_bus(team, [endpoint]) as bus:
     frames = bus.publisher(topics.IN_FRAME.at(robot=robot), topics.IN_FRAME.qos)
     while capture.grab():
-        stamp_ns = time.time_ns()  # as near to the exposure as you can
+        stamp_ns = time.time_ns()  # as close to the exposure as possible
         _, pixels = capture.retrieve()
         frames.put(encode(Frame(stamp_ns, cv2.imencode(".jpg", pixels)[1].tobytes())))
         time.sleep(0.1)

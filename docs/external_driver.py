@@ -1,4 +1,4 @@
-"""A robot's own driver in ten lines: odometry and sightings onto the bus.
+"""A driver in ten lines: it publishes the odometry and the sightings of a robot.
 
 python external_driver.py [TEAM [ROBOT [ENDPOINT]]]
 """

@@ -1,4 +1,4 @@
-"""A real tripod's driver in ten lines: what its camera sees of robots, onto the bus.
+"""A driver for a tripod camera in ten lines: it publishes the robots that the camera sees.
 
 python tripod_driver.py [TEAM [NAME [ENDPOINT]]]
 """
@@ -19,5 +19,5 @@ with open_bus(team, [endpoint]) as bus:
     sightings = bus.publisher(topics.IN_SIGHTINGS.at(robot=name), topics.IN_SIGHTINGS.qos)
     while True:
         time.sleep(0.1)
-        seen = Sighting("r1", range_m=2.0, bearing_rad=0.0)  # what your camera says
+        seen = Sighting("r1", range_m=2.0, bearing_rad=0.0)  # what your camera measures
         sightings.put(encode(Sightings(time.time_ns(), (seen,))))
