@@ -3,6 +3,8 @@
 import time
 from typing import NamedTuple
 
+from cpcbl_team.errors import InputError
+
 
 class Clock(NamedTuple):
     """Stands at `epoch_ns` until the machine's monotonic clock shows `from_ns`, then runs."""
@@ -36,9 +38,12 @@ class Clock(NamedTuple):
 
     @staticmethod
     def parse(text: str) -> "Clock":
-        """What `str` wrote. Raises ValueError."""
-        epoch_ns, from_ns, speed = text.split(":")
-        return Clock(int(epoch_ns), int(from_ns), float(speed))
+        """What `str` wrote. Raises InputError."""
+        try:
+            epoch_ns, from_ns, speed = text.split(":")
+            return Clock(int(epoch_ns), int(from_ns), float(speed))
+        except ValueError:
+            raise InputError(f"--clock {text}: write EPOCH_NS:FROM_NS:SPEED") from None
 
     @staticmethod
     def wall() -> "Clock":

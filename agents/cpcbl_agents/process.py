@@ -17,6 +17,7 @@ from cpcbl_agents.node import Node, Stepped
 from cpcbl_agents.robot import Robot
 from cpcbl_agents.sources import OwnCamera
 from cpcbl_team.config import Team
+from cpcbl_team.errors import ClockError
 from cpcbl_transport.bus import Bus
 from cpcbl_transport.security import Identity, link_of
 from cpcbl_transport.topics import Role
@@ -121,8 +122,8 @@ def run_robot(
     `through` is what stands between the robot and its bus.
 
     Raises BusError when stopped before a router answered, LogError for an unreadable log,
-    SecurityError without the keys of a secured team, ValueError for a camera that cannot be used,
-    or when this machine's clock was set.
+    SecurityError without the keys of a secured team, InputError for a camera that cannot be used,
+    DependencyError without OpenCV, ClockError when this machine's clock was set.
     """
     loop = Loop(clock)
     link = link_of(team, Identity(Role.ROBOT, name), connect)
@@ -161,14 +162,14 @@ def new_incarnation() -> str:
 def while_time_holds(
     name: str, team: Team, clock: Clock, stop: Callable[[], bool]
 ) -> Callable[[], bool]:
-    """`stop`, which raises ValueError when the machine's time was set under a robot with real
+    """`stop`, which raises ClockError when the machine's time was set under a robot with real
     inputs: their stamps are of another time from then on."""
     if team.robots[name].source != "external":
         return stop
 
     def checked() -> bool:
         if abs(by_s := clock.set_by_s()) > SET_S:
-            raise ValueError(
+            raise ClockError(
                 f"robot {name}: this machine's clock was set by {by_s:+.2f} s, or it slept: start"
                 " the robot again"
             )
@@ -183,7 +184,7 @@ def own_camera(
 ) -> Iterator[OwnCamera | None]:
     """The camera that a robot reads itself, until the end; None where nobody or a driver does.
 
-    Raises ValueError for a camera that cannot be used, or without OpenCV.
+    Raises InputError for a camera that cannot be used, DependencyError without OpenCV.
     """
     robot = team.robots[name]
     if robot.sensing == "camera":

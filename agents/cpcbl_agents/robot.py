@@ -22,8 +22,9 @@ _OUTGOING = (Belief, Fix, Track, Drive)
 
 
 class Robot:
-    """The agents of one robot of a team. Raises LogError for a log that cannot be read, ValueError
-    for a camera's robot without OpenCV.
+    """The agents of one robot of a team.
+
+    Raises LogError for a log that cannot be read, DependencyError for a camera without OpenCV.
 
     `restarted`: its process ran before, and may have spent its budget then. `camera`: where frames
     come from that nobody sends.

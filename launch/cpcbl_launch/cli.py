@@ -16,6 +16,7 @@ from cpcbl_launch.commands.observing import observer
 from cpcbl_launch.commands.running import check, field, robot, router, up
 from cpcbl_launch.commands.securing import keys
 from cpcbl_launch.commands.watching import look, traffic
+from cpcbl_team.errors import CpcblError
 
 app = typer.Typer(
     help="A team of robots that find out where they are, together.",
@@ -43,12 +44,8 @@ NOT_WRITABLE = {
 
 
 def main() -> None:
-    """Runs the command line; what the user can mend is one line and exit code 2, what could not be
-    written one line and exit code 1."""
-    from cpcbl_agents.sources.mrclam import LogError
-    from cpcbl_launch.team_file import TeamFileError
-    from cpcbl_transport.zenoh_bus import BusError
-
+    """Runs the command line. What the user can mend is one line and exit code 2; what could not be
+    written is one line and exit code 1; anything else is a bug, and its traceback is shown."""
     logging.basicConfig(format="%(asctime)s %(levelname)s %(message)s", level=logging.INFO)
     try:
         try:
@@ -62,6 +59,6 @@ def main() -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # at exit it is flushed once more
         typer.secho(f"cpcbl-team: {name}: not written: {error.strerror}", fg="red", err=True)
         sys.exit(1)
-    except (TeamFileError, LogError, BusError, ValueError) as error:
+    except CpcblError as error:
         typer.secho(f"cpcbl-team: {error}", fg="red", err=True)
         sys.exit(2)

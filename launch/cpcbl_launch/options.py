@@ -11,6 +11,7 @@ import msgspec
 
 from cpcbl_agents.detector import NEEDS_OPENCV
 from cpcbl_team.config import Team
+from cpcbl_team.errors import DependencyError, InputError
 
 LEAST_SPEED, MOST_SPEED = 0.05, 1000.0
 PICTURES = (".png", ".svg")
@@ -22,27 +23,27 @@ def encoded(result: Any) -> str:
 
 
 def folder_for(option: str, folder: Path) -> Path:
-    """A folder to write into, made if it was not there. Raises ValueError."""
+    """A folder to write into, made if it was not there. Raises InputError."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise ValueError(f"{option} {folder}: {error.strerror}; name a folder") from error
+        raise InputError(f"{option} {folder}: {error.strerror}; name a folder") from error
     _must_be_writable(option, folder, folder)
     return folder
 
 
 def file_for(option: str, path: Path) -> None:
-    """Raises ValueError for a file that could not be written later on."""
+    """Raises InputError for a file that could not be written later on."""
     if not path.parent.is_dir():
-        raise ValueError(f"{option} {path}: no folder {path.parent}; make it first")
+        raise InputError(f"{option} {path}: no folder {path.parent}; make it first")
     if path.is_dir():
-        raise ValueError(f"{option} {path}: a folder; name a file")
+        raise InputError(f"{option} {path}: a folder; name a file")
     _must_be_writable(option, path, path if path.exists() else path.parent)
 
 
 def _must_be_writable(option: str, path: Path, existing: Path) -> None:
     if not os.access(existing, os.W_OK):
-        raise ValueError(f"{option} {path}: {existing} cannot be written; name another place")
+        raise InputError(f"{option} {path}: {existing} cannot be written; name another place")
 
 
 def not_written(path: Path, write: Callable[[], object]) -> dict[str, str]:
@@ -56,39 +57,39 @@ def not_written(path: Path, write: Callable[[], object]) -> dict[str, str]:
 
 
 def check_duration(duration_s: float, least_s: float) -> None:
-    """Raises ValueError for seconds of robot time that are too few, or no number."""
+    """Raises InputError for seconds of robot time that are too few, or no number."""
     if not least_s <= duration_s < math.inf:
-        raise ValueError(f"--duration {duration_s:g}: at least {least_s:g} seconds of robot time")
+        raise InputError(f"--duration {duration_s:g}: at least {least_s:g} seconds of robot time")
 
 
 def check_speed(speed: float) -> None:
-    """Raises ValueError for a pace at which no process could run, or that is no number."""
+    """Raises InputError for a pace at which no process could run, or that is no number."""
     if not LEAST_SPEED <= speed <= MOST_SPEED:
-        raise ValueError(f"--speed {speed:g}: from {LEAST_SPEED:g} to {MOST_SPEED:g} x real time")
+        raise InputError(f"--speed {speed:g}: from {LEAST_SPEED:g} to {MOST_SPEED:g} x real time")
 
 
 def check_limit(option: str, limit: float) -> None:
-    """Raises ValueError for a budget that is no number, or endless."""
+    """Raises InputError for a budget that is no number, or endless."""
     if not 0.0 <= limit < math.inf:
-        raise ValueError(f"{option} {limit:g}: no limit; write a number, 0 for as much as it likes")
+        raise InputError(f"{option} {limit:g}: no limit; write a number, 0 for as much as it likes")
 
 
 def must_draw(what: str, path: Path | None = None) -> None:
-    """Raises ValueError where pictures, or pictures of this kind, cannot be drawn."""
+    """Raises InputError where pictures, or pictures of this kind, cannot be drawn."""
     if path is not None and path.suffix.lower() not in PICTURES:
-        raise ValueError(f"{what} {path}: not a picture; end its name in {' or '.join(PICTURES)}")
+        raise InputError(f"{what} {path}: not a picture; end its name in {' or '.join(PICTURES)}")
     if importlib.util.find_spec("matplotlib") is None:
-        raise ValueError(f"{what} needs matplotlib: pip install 'cpcbl-team[plot]'")
+        raise DependencyError(f"{what} needs matplotlib: pip install 'cpcbl-team[plot]'")
 
 
 def must_have_opencv(what: str) -> None:
-    """Raises ValueError where OpenCV is not installed."""
+    """Raises DependencyError where OpenCV is not installed."""
     if importlib.util.find_spec("cv2") is None:
-        raise ValueError(f"{what} {NEEDS_OPENCV}")
+        raise DependencyError(f"{what} {NEEDS_OPENCV}")
 
 
 def must_see(team: Team, robots: Collection[str] = (), field: bool = False) -> None:
-    """Raises ValueError where these robots, or the simulated field, need OpenCV and it is not
+    """Raises DependencyError where these robots, or the simulated field, need OpenCV and it is not
     there."""
     eyes = [f"robots.{name}" for name in team.cameras if name in robots]
     who = eyes[0] if eyes else "the simulated field" if field and team.renders else ""

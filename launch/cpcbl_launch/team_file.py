@@ -29,13 +29,14 @@ from cpcbl_team.config import (
     VisionSettings,
     Wall,
 )
+from cpcbl_team.errors import InputError
 from cpcbl_team.inputs import NAME_PATTERN, Name
 from cpcbl_transport.security import PROTOCOL
 
 Layer = dict[str, Any]
 
 
-class TeamFileError(Exception):
+class TeamFileError(InputError):
     """A team file that cannot be used; the text names file, key and fix."""
 
 

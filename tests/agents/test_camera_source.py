@@ -18,6 +18,7 @@ from cpcbl_agents.sources import OwnCamera
 from cpcbl_agents.sources.camera import LiveCamera, opened
 from cpcbl_agents.vision.pictures import fault, received
 from cpcbl_team.config import CameraSettings
+from cpcbl_team.errors import InputError
 from cpcbl_transport.messages import Frame
 
 
@@ -120,7 +121,7 @@ def test_what_cannot_be_played_is_said_with_its_key(tmp_path: Path) -> None:
         ("text.avi", "not a video"),
         ("empty", "no pictures"),
     ):
-        with pytest.raises(ValueError, match=rf"robots\.r1\.camera\.frames: .*{frames}: {said}"):
+        with pytest.raises(InputError, match=rf"robots\.r1\.camera\.frames: .*{frames}: {said}"):
             camera(tmp_path / frames)
 
 

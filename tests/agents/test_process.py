@@ -14,6 +14,7 @@ from cpcbl_agents import process
 from cpcbl_agents.clock import Clock
 from cpcbl_agents.process import Loop, Stop, begun, new_incarnation, while_time_holds
 from cpcbl_team.config import BudgetSettings
+from cpcbl_team.errors import ClockError
 
 
 class Counting:
@@ -207,7 +208,7 @@ def test_a_robot_ends_when_the_clock_of_its_machine_is_set(by_s: float) -> None:
     wall = Clock.wall()
     clock = wall._replace(epoch_ns=wall.epoch_ns - round(by_s * 1e9))
     steps = iter([False] * 10 + [True])
-    with pytest.raises(ValueError, match=re.escape(f"clock was set by {by_s:+.2f} s")):
+    with pytest.raises(ClockError, match=re.escape(f"clock was set by {by_s:+.2f} s")):
         Loop(clock).run(Counting(), while_time_holds("me", LIMITED, clock, steps.__next__))
 
 

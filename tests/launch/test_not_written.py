@@ -18,6 +18,7 @@ from cpcbl_launch.run.supervisor import ProcessSpec, Supervisor
 from cpcbl_launch.simulation.in_process import simulate
 from cpcbl_launch.team_file import TeamFileError, builtin, load_team, save_resolved
 from cpcbl_team.config import RobotSettings, Team
+from cpcbl_team.errors import InputError
 from cpcbl_transport import topics
 from cpcbl_transport.bus import MemoryHub
 from cpcbl_transport.messages import encode
@@ -89,9 +90,9 @@ def test_a_file_that_cannot_be_made_is_refused_before_anything_starts(
 
 def test_a_folder_is_no_file_and_a_file_no_folder(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
-    with pytest.raises(ValueError, match=r"--report .*: a folder; name a file"):
+    with pytest.raises(InputError, match=r"--report .*: a folder; name a file"):
         file_for("--report", tmp_path)
-    with pytest.raises(ValueError, match=r"--logs .*; name a folder"):
+    with pytest.raises(InputError, match=r"--logs .*; name a folder"):
         folder_for("--logs", tmp_path / "file")
 
 

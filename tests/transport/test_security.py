@@ -33,6 +33,7 @@ from support.processes import eventually
 
 from cpcbl_launch.run.up import free_endpoint
 from cpcbl_team.config import Team
+from cpcbl_team.errors import InputError
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus
 from cpcbl_transport.compact import FIX_BYTES
@@ -492,7 +493,7 @@ def test_two_authorities_overlap_until_the_old_one_is_retired(tmp_path: Path) ->
     again(team, renew=("ca",))
     with router_of(team) as (_, endpoint):  # it still shows a certificate of the old authority
         with_credentials(team, copies[R1], endpoint, PATIENCE_S).close()
-    with pytest.raises(ValueError, match=r"--retire-ca.*--renew all"):
+    with pytest.raises(InputError, match=r"--retire-ca.*--renew all"):
         again(team, retire_ca=True)
     again(team, renew=("all",))
     with router_of(team) as (_, endpoint):

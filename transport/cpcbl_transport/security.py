@@ -20,6 +20,7 @@ from typing import Any, NamedTuple
 import msgspec
 
 from cpcbl_team.config import Team
+from cpcbl_team.errors import CpcblError
 from cpcbl_transport import topics
 from cpcbl_transport.topics import Role, Topic, Who
 
@@ -28,7 +29,7 @@ PROTOCOL = "tls"
 """Not QUIC, which certifies names as well: what is said first under a new key is lost at times."""
 
 
-class SecurityError(ValueError):
+class SecurityError(CpcblError):
     """Keys or endpoints that cannot be used; the text names file or key, and the fix."""
 
 

@@ -18,6 +18,7 @@ from typing import Any
 
 import zenoh
 
+from cpcbl_team.errors import CpcblError
 from cpcbl_transport.bus import Handle, Publisher, Receive, Watch
 from cpcbl_transport.security import Credentials
 from cpcbl_transport.tls_diagnosis import why_not
@@ -27,7 +28,7 @@ from cpcbl_transport.zenoh_config import NO_GUARDS, client_config, router_config
 log = logging.getLogger(__name__)
 
 
-class BusError(Exception):
+class BusError(CpcblError):
     """The bus could not be opened."""
 
 

@@ -3,7 +3,7 @@
 A live camera is read by a thread, as fast as it gives frames, so that none is old when it is looked
 at; the robot gets the newest, `sensor.rate_hz` times a second at most. A camera that is silent, or
 not there, is opened again and again; the robot goes on without it. A video or a folder is played
-once, in robot time from the start on. Raises ValueError where OpenCV is not installed.
+once, in robot time from the start on. Raises DependencyError where OpenCV is not installed.
 """
 
 import logging
@@ -26,6 +26,7 @@ from cpcbl_agents.detector import Picture
 from cpcbl_agents.sources import OwnCamera
 from cpcbl_agents.vision.camera import Pixels
 from cpcbl_team.config import CameraSettings
+from cpcbl_team.errors import InputError
 from cpcbl_transport.messages import Frame
 
 log = logging.getLogger(__name__)
@@ -52,13 +53,13 @@ def opened(
 ) -> OwnCamera:
     """The camera that a team file names. `wake` is called, from another thread, for each frame.
 
-    Raises ValueError for a file or folder that cannot be played.
+    Raises InputError for a file or folder that cannot be played.
     """
     if settings.live:
         return LiveCamera(settings, rate_hz, now_ns, wake)
     path, key = Path(settings.frames), f"robots.{robot}.camera.frames"
     if not path.exists():
-        raise ValueError(f"{key}: {path}: no such file or folder; correct it, or empty it")
+        raise InputError(f"{key}: {path}: no such file or folder; correct it, or empty it")
     return Played(Folder(path, key, rate_hz) if path.is_dir() else Video(path, key, rate_hz))
 
 
@@ -213,7 +214,7 @@ class Video:
     def __init__(self, path: Path, key: str, rate_hz: float) -> None:
         self._capture = cv2.VideoCapture(str(path))
         if not self._capture.isOpened():
-            raise ValueError(f"{key}: {path}: not a video that OpenCV can play; name another one")
+            raise InputError(f"{key}: {path}: not a video that OpenCV can play; name another one")
         own_hz = self._capture.get(cv2.CAP_PROP_FPS)
         own_hz = own_hz if math.isfinite(own_hz) and own_hz > 0.0 else rate_hz
         self._every = max(1, round(own_hz / rate_hz))
@@ -241,7 +242,7 @@ class Folder:
         self.rate_hz = rate_hz
         self._paths = deque(pictures_in(path))
         if not self._paths:
-            raise ValueError(f"{key}: {path}: no pictures (.png, .jpg) in it; name another folder")
+            raise InputError(f"{key}: {path}: no pictures (.png, .jpg) in it; name another folder")
 
     def skip(self) -> bool:
         return bool(self._paths and self._paths.popleft())

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cpcbl_team.config import Landmark
+from cpcbl_team.errors import InputError
 from cpcbl_team.inputs import Odometry, Sighting, Sightings
 
 LONGEST_PIECE_NS = 100_000_000
@@ -19,7 +20,7 @@ WHERE = "asrl.utias.utoronto.ca/datasets/mrclam"
 ROBOTS = ("1", "2", "3", "4", "5")
 
 
-class LogError(Exception):
+class LogError(InputError):
     """A log that is not there or cannot be read; says which file and why."""
 
 

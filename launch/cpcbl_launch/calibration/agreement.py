@@ -29,6 +29,7 @@ from cpcbl_launch.calibration.statistics import (
     stretches,
 )
 from cpcbl_launch.reporting.metrics import Floats
+from cpcbl_team.errors import InputError
 
 BINS_M = (0.0, 2.0, 4.0, math.inf)
 LEAST_IN_BIN = 10
@@ -87,11 +88,11 @@ class _Rows(NamedTuple):
 
 
 def calibrated_seeing(sights: Sequence[Sights]) -> Seeing:
-    """How eyes err, from all that they saw. Raises ValueError with too little."""
+    """How eyes err, from all that they saw. Raises InputError with too little."""
     logs = [seen.log for seen in sights]
     rows = _rows(sights, Corrections())
     if len(rows.stretch) < LEAST_ROWS:
-        raise ValueError(
+        raise InputError(
             f"{len(rows.stretch)} sightings with known truth; at least {LEAST_ROWS} are needed:"
             " more pictures or a longer drive, near and far, all over the picture"
         )

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from cpcbl_agents.vision.camera import Pixels
 from cpcbl_agents.vision.codes import DICTIONARIES
 from cpcbl_team.config import MARKERS, MarkerFamily
+from cpcbl_team.errors import InputError
 
 LEAST_SQUARES = 4
 LEAST_CORNERS = 8  # in a picture: fewer hardly tell a lens from a pose
@@ -51,16 +52,16 @@ class Corners(NamedTuple):
 def parsed_board(
     pattern: str, squares: str, square_m: float, marker_m: float, family: str
 ) -> Board:
-    """A board by the words of the command line. Raises ValueError for one that cannot be made."""
+    """A board by the words of the command line. Raises InputError for one that cannot be made."""
     match = re.fullmatch(r"(\d{1,3})x(\d{1,3})", squares.strip().lower())
     if match is None:
-        raise ValueError(f"--squares {squares}: write it as 7x5: squares across and down")
+        raise InputError(f"--squares {squares}: write it as 7x5: squares across and down")
     across, down = int(match[1]), int(match[2])
     if min(across, down) < LEAST_SQUARES:
-        raise ValueError(f"--squares {squares}: at least {LEAST_SQUARES} across and down")
+        raise InputError(f"--squares {squares}: at least {LEAST_SQUARES} across and down")
     markers = {str(name): name for name in MARKERS}
     if family not in markers:
-        raise ValueError(f"--family {family}: no such family; use one of {', '.join(markers)}")
+        raise InputError(f"--family {family}: no such family; use one of {', '.join(markers)}")
     board = Board(Pattern(pattern), (across, down), square_m, marker_m, markers[family])
     if board.pattern is Pattern.charuco:
         _check_markers(board)
@@ -69,14 +70,14 @@ def parsed_board(
 
 def _check_markers(board: Board) -> None:
     if not 0.0 < board.marker_m < board.square_m:
-        raise ValueError(
+        raise InputError(
             f"--marker-m {board.marker_m:g}: markers are inside of squares; write less than"
             f" --square-m {board.square_m:g}"
         )
     across, down = board.squares
     needed, there = across * down // 2, MARKERS[board.family]
     if needed > there:
-        raise ValueError(
+        raise InputError(
             f"--squares {across}x{down}: needs {needed} markers, {board.family} has {there};"
             " use fewer squares"
         )
@@ -95,13 +96,13 @@ def drawn(board: Board) -> Pixels:
 
 
 def write_board(board: Board, path: Path) -> None:
-    """The board as a picture file. Raises ValueError, OSError."""
+    """The board as a picture file. Raises InputError, OSError."""
     try:
         written, picture = cv2.imencode(path.suffix or ".png", drawn(board))
     except cv2.error:
         written = False
     if not written:
-        raise ValueError(f"--print-board {path}: not a picture; end its name in .png")
+        raise InputError(f"--print-board {path}: not a picture; end its name in .png")
     path.write_bytes(picture.tobytes())
 
 

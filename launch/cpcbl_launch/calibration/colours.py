@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from cpcbl_launch.calibration.statistics import Mask
 from cpcbl_launch.reporting.metrics import Floats
 from cpcbl_team.config import Colour
+from cpcbl_team.errors import InputError
 
 HUES = 180
 OUTER = 0.02  # share of the pixels at each end of a range that do not count: edges, glints
@@ -86,14 +87,14 @@ def calibrated_colours(
     kept: Mapping[str, Colour] | None = None,
     margin: float = MARGIN,
 ) -> Colours:
-    """Thresholds of all colours that were sampled. Raises ValueError.
+    """Thresholds of all colours that were sampled. Raises InputError.
 
     `elsewhere`: (n, 3), HSV, what is not labelled; `kept`: the colours that are not calibrated.
     """
     kept = dict(kept or {})
     for name in {patch.colour for patch in patches}:
         if sum(len(p.hsv) for p in patches if p.colour == name) < LEAST_PX:
-            raise ValueError(f"{name}: fewer than {LEAST_PX} pixels; take larger samples")
+            raise InputError(f"{name}: fewer than {LEAST_PX} pixels; take larger samples")
     found = thresholds(patches, margin)
     pooled = _pooled(patches)
     fits = {

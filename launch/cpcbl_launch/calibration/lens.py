@@ -16,6 +16,7 @@ from cpcbl_launch.calibration.board import Board, Corners, found
 from cpcbl_launch.calibration.pictures import Picture
 from cpcbl_launch.calibration.statistics import Estimate
 from cpcbl_launch.reporting.metrics import Floats
+from cpcbl_team.errors import InputError
 
 LEAST_PICTURES = 4
 OUTLYING, OUTLYING_PX = 3.0, 0.5  # times the median error, and by at least so much
@@ -78,7 +79,7 @@ class _Solution(NamedTuple):
 
 
 def calibrated_lens(pictures: Iterable[Picture], board: Board) -> tuple[Lens, Residuals]:
-    """The lens that took these pictures. Raises ValueError for what cannot be calibrated from."""
+    """The lens that took these pictures. Raises InputError for what cannot be calibrated from."""
     looked = _each_once(_looked(picture, board) for picture in pictures)
     seen = [view for view in looked if isinstance(view, _Seen)]
     out = [view for view in looked if isinstance(view, View)]
@@ -128,12 +129,12 @@ def _check(seen: Sequence[_Seen], out: Sequence[View]) -> None:
     if len(seen) >= LEAST_PICTURES:
         return
     if not seen and out and all(view.left_out == "no board found" for view in out):
-        raise ValueError(
+        raise InputError(
             f"no board found in any of {len(out)} pictures; say the printed board by --board,"
             " --squares and --family"
         )
     why = f": {out[0].picture}: {out[0].left_out}" if out else ""
-    raise ValueError(
+    raise InputError(
         f"{len(seen)} of {len(seen) + len(out)} pictures show the board well enough{why}; take at"
         f" least {LEAST_PICTURES}, better 20, with the board at all angles"
     )
@@ -144,7 +145,7 @@ def _one_size(seen: Sequence[_Seen]) -> tuple[int, int]:
     for view in seen:
         if view.size_px != first.size_px:
             (width, height), (w, h) = view.size_px, first.size_px
-            raise ValueError(
+            raise InputError(
                 f"{view.picture} has {width} x {height} pixels, {first.picture} has {w} x {h}: a"
                 " camera has one size; leave out the others"
             )
@@ -176,7 +177,7 @@ def _with_told(views: Sequence[_Seen], size_px: tuple[int, int]) -> _Solution:
 
 
 def _solved(views: Sequence[_Seen], size_px: tuple[int, int], flags: int) -> _Solution:
-    """Raises ValueError where the views do not tell a lens."""
+    """Raises InputError where the views do not tell a lens."""
     places = [view.corners.places for view in views]
     pixels = [view.corners.pixels for view in views]
     try:
@@ -184,10 +185,10 @@ def _solved(views: Sequence[_Seen], size_px: tuple[int, int], flags: int) -> _So
             places, pixels, size_px, np.eye(3), np.zeros(5), flags=flags
         )
     except cv2.error as error:
-        raise ValueError(f"{_UNTOLD} ({error.err})") from error
+        raise InputError(f"{_UNTOLD} ({error.err})") from error
     lens, known = np.ravel(distortion)[:5].astype(float), np.ravel(deviations)[:9].astype(float)
     if not (np.isfinite(matrix).all() and np.isfinite(known).all()) or matrix[0, 0] <= 0.0:
-        raise ValueError(_UNTOLD)
+        raise InputError(_UNTOLD)
     errors = [
         there - cv2.projectPoints(place, turn, move, matrix, lens)[0].reshape(-1, 2)
         for there, place, turn, move in zip(pixels, places, turns, moves, strict=True)

@@ -13,6 +13,7 @@ from cpcbl_launch.calibration.pictures import PICTURES, read_picture
 from cpcbl_launch.calibration.samples import FORM, Sample
 from cpcbl_launch.calibration.statistics import Mask
 from cpcbl_team.config import Colour
+from cpcbl_team.errors import InputError
 
 WIDEST_PX = 640  # a picture in the preview
 BOTH = (255, 255, 255)  # pixels that two colours take
@@ -29,7 +30,7 @@ class Labelled(NamedTuple):
 
 
 def labelled(samples: Sequence[Sample], more: Iterable[Path]) -> list[Labelled]:
-    """The pictures of the samples, then those without any. Raises ValueError."""
+    """The pictures of the samples, then those without any. Raises InputError."""
     files = dict.fromkeys([*(sample.picture for sample in samples), *more])
     return [_labelled(file, [s for s in samples if s.picture == file]) for file in files]
 
@@ -59,9 +60,9 @@ def preview(pictures: Sequence[Labelled], colours: Mapping[str, Colour]) -> Pixe
 
 
 def must_write(path: Path) -> None:
-    """Raises ValueError for a file that is not a picture by its name."""
+    """Raises InputError for a file that is not a picture by its name."""
     if path.suffix.lower() not in PICTURES:
-        raise ValueError(f"--preview {path}: not a picture; end its name in .png or .jpg")
+        raise InputError(f"--preview {path}: not a picture; end its name in .png or .jpg")
 
 
 def write_preview(path: Path, picture: Pixels) -> None:
@@ -72,13 +73,13 @@ def write_preview(path: Path, picture: Pixels) -> None:
 def _labelled(file: Path, samples: Sequence[Sample]) -> Labelled:
     pixels = read_picture(file).pixels
     if isinstance(pixels, str):
-        raise ValueError(f"{file}: {pixels}; name a picture")
+        raise InputError(f"{file}: {pixels}; name a picture")
     hsv = cv2.cvtColor(pixels, cv2.COLOR_BGR2HSV).astype(np.uint8, copy=False)
     return Labelled(file.name, pixels, hsv, tuple((s, _mask(s, pixels)) for s in samples))
 
 
 def _mask(sample: Sample, pixels: Pixels) -> Mask:
-    """The pixels of a sample. Raises ValueError for one that is not in the picture."""
+    """The pixels of a sample. Raises InputError for one that is not in the picture."""
     height, width = pixels.shape[:2]
     mask = np.zeros((height, width), np.uint8)
     x, y, *size = sample.at
@@ -90,7 +91,7 @@ def _mask(sample: Sample, pixels: Pixels) -> Mask:
         cv2.circle(mask, (x, y), size[0], 1, cv2.FILLED)
     if not inside or not mask.any():
         at = ",".join(map(str, sample.at))
-        raise ValueError(
+        raise InputError(
             f"{sample.picture}: {sample.colour}={at} is not inside of {width} x {height} px; {FORM}"
         )
     return mask.astype(bool)

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 
 from cpcbl_agents.vision.camera import Pixels
+from cpcbl_team.errors import InputError
 
 PICTURES = (".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp")
 VIDEOS = (".avi", ".m4v", ".mkv", ".mov", ".mp4", ".webm")
@@ -22,18 +23,18 @@ class Picture(NamedTuple):
 
 
 def picture_files(paths: Sequence[Path]) -> list[Path]:
-    """Files, and those of folders that are pictures or videos by their names. Raises ValueError."""
+    """Files, and those of folders that are pictures or videos by their names. Raises InputError."""
     files: list[Path] = []
     for path in paths:
         if path.is_dir():
             inside = sorted(f for f in path.iterdir() if f.suffix.lower() in (*PICTURES, *VIDEOS))
             if not inside:
-                raise ValueError(f"{path}: no picture in this folder; name one that has some")
+                raise InputError(f"{path}: no picture in this folder; name one that has some")
             files += inside
         elif path.is_file():
             files.append(path)
         else:
-            raise ValueError(f"{path}: no such file or folder; name pictures, a folder or a video")
+            raise InputError(f"{path}: no such file or folder; name pictures, a folder or a video")
     return files
 
 

@@ -8,6 +8,7 @@ from cpcbl_launch.calibration import odometry, sensor
 from cpcbl_launch.calibration.logs import RobotLogs
 from cpcbl_launch.calibration.robot_log import RobotLog
 from cpcbl_launch.calibration.statistics import Estimate
+from cpcbl_team.errors import InputError
 
 
 class RobotCalibration(msgspec.Struct, frozen=True):
@@ -29,13 +30,13 @@ class Calibration(msgspec.Struct, frozen=True):
 def calibrated(
     logs: RobotLogs, names: Sequence[str], progress: Callable[[float], None] = lambda done: None
 ) -> Calibration:
-    """All robots of the logs with these names, each over all its logs. Raises ValueError."""
+    """All robots of the logs with these names, each over all its logs. Raises InputError."""
     robots = {}
     for i, (robot, parts) in enumerate(logs.items()):
         robots[robot] = calibrated_robot(parts)
         progress((i + 1) / len(logs))
     if not any(robot.odometry or robot.sensor for robot in robots.values()):
-        raise ValueError(
+        raise InputError(
             f"{', '.join(names)}: nothing to calibrate: no robot drives, and none sees landmarks or"
             " robots where the truth is known"
         )

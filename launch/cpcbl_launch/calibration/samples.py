@@ -13,6 +13,7 @@ from typing import Annotated, NamedTuple
 
 import msgspec
 
+from cpcbl_team.errors import InputError
 from cpcbl_team.inputs import Name
 
 FORM = "write it as PICTURE:COLOUR=X,Y,WIDTH,HEIGHT or PICTURE:COLOUR=X,Y,RADIUS"
@@ -44,24 +45,24 @@ class _Rows(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def parsed_sample(text: str) -> Sample:
-    """A sample as the command line has it. Raises ValueError."""
+    """A sample as the command line has it. Raises InputError."""
     match = re.fullmatch(r"(.+):([A-Za-z0-9_.-]{1,32})=(\d+(?:,\d+){2,3})", text.strip())
     if match is None:
-        raise ValueError(f"--sample {text}: {FORM}")
+        raise InputError(f"--sample {text}: {FORM}")
     return Sample(Path(match[1]), match[2], tuple(map(int, match[3].split(","))))
 
 
 def read_samples(path: Path) -> list[Sample]:
-    """Those of a TOML, JSON or CSV file. Raises ValueError."""
+    """Those of a TOML, JSON or CSV file. Raises InputError."""
     try:
         text = path.read_text(encoding="utf-8")
         rows = _rows(path.suffix.lower(), text)
     except FileNotFoundError:
-        raise ValueError(f"--samples {path}: no such file") from None
+        raise InputError(f"--samples {path}: no such file") from None
     except (OSError, UnicodeDecodeError) as error:
-        raise ValueError(f"--samples {path}: cannot be read: {error}") from error
+        raise InputError(f"--samples {path}: cannot be read: {error}") from error
     except (tomllib.TOMLDecodeError, msgspec.MsgspecError, csv.Error) as error:
-        raise ValueError(f"--samples {path}: {error}; each has picture, colour, at") from error
+        raise InputError(f"--samples {path}: {error}; each has picture, colour, at") from error
     return [Sample(path.parent / row.picture, row.colour, row.at) for row in rows]
 
 

@@ -20,6 +20,7 @@ from cpcbl_launch.calibration.robot_log import RobotLog, wrapped
 from cpcbl_launch.reporting.metrics import Floats
 from cpcbl_launch.reporting.recording import read_recording
 from cpcbl_team.config import CameraSettings, Team
+from cpcbl_team.errors import InputError
 from cpcbl_team.inputs import Sightings
 
 APART_S = 100.0  # pictures have no time; so far apart nothing is taken for alike, or a motion
@@ -57,11 +58,11 @@ class _Row(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def recorded(paths: Sequence[Path], robot: str | None) -> Looked:
-    """What this robot, or every one with a camera, saw. Raises LogError, ValueError."""
+    """What this robot, or every one with a camera, saw. Raises LogError, InputError."""
     found: list[tuple[str, CameraSettings, Sights]] = []  # cameras without where frames come from
     for path in paths:
         if path.suffix != ".mcap":
-            raise ValueError(f"{path}: no recording of `up --record` (.mcap)")
+            raise InputError(f"{path}: no recording of `up --record` (.mcap)")
         recording = read_recording(path)
         if not recording.truth:
             raise LogError(f"{path}: holds no truth; publish poses on field/truth")
@@ -71,15 +72,15 @@ def recorded(paths: Sequence[Path], robot: str | None) -> Looked:
             if said and len(where.truth.get(name, ())) > 1:
                 if name not in team.robots:
                     there = ", ".join(team.cameras)
-                    raise ValueError(f"--robot {name}: a guest of {path}; with a camera: {there}")
+                    raise InputError(f"--robot {name}: a guest of {path}; with a camera: {there}")
                 camera = replace(team.robots[name].camera, frames="")
                 found.append((name, camera, sights_of(name, said, where)))
     if not found:
         who = robot or "robots with cameras"
-        raise ValueError(f"{paths[0]}: no sightings of {who} where the truth is known")
+        raise InputError(f"{paths[0]}: no sightings of {who} where the truth is known")
     names = tuple(dict.fromkeys(name for name, _, _ in found))
     if len({camera for _, camera, _ in found}) > 1:
-        raise ValueError(
+        raise InputError(
             f"{', '.join(names)}: unlike cameras, which err each in their way; name one robot by"
             " --robot, and recordings of one camera"
         )
@@ -87,13 +88,13 @@ def recorded(paths: Sequence[Path], robot: str | None) -> Looked:
 
 
 def viewer(team: Team, robot: str | None) -> str:
-    """Whose camera it is: the one that is named, or the only one. Raises ValueError."""
+    """Whose camera it is: the one that is named, or the only one. Raises InputError."""
     there = team.cameras
     if robot is None and len(there) == 1:
         return there[0]
     if robot not in there:
         known = ", ".join(there) or 'none; write sensing = "camera"'
-        raise ValueError(f"--robot: say whose camera took the pictures; with a camera: {known}")
+        raise InputError(f"--robot: say whose camera took the pictures; with a camera: {known}")
     return robot
 
 
@@ -104,7 +105,7 @@ def photographed(
     team: Team,
     progress: Callable[[float], None] = lambda done: None,
 ) -> Looked:
-    """What a robot's eyes see in pictures at known poses. Raises ValueError. Needs OpenCV."""
+    """What a robot's eyes see in pictures at known poses. Raises InputError. Needs OpenCV."""
     from cpcbl_agents.vision.detector import CameraEyes
     from cpcbl_launch.calibration.pictures import read_picture
 
@@ -125,7 +126,7 @@ def photographed(
         progress((i + 1) / len(names))
     if not frames:
         name, reason = next(iter(refused.items()))
-        raise ValueError(f"{folder}: no picture can be used: {name}: {reason}")
+        raise InputError(f"{folder}: no picture can be used: {name}: {reason}")
     where = placed(team.map.landmarks, _standing(rows, names, robot))
     notes = [f"{name}: {reason}" for name, reason in refused.items()]
     if doubts:
@@ -157,24 +158,24 @@ def sights_of(robot: str, frames: Iterable[Sightings], where: Placed) -> Sights:
 
 
 def read_poses(path: Path, team: Team) -> list[_Row]:
-    """A CSV file: file, x_m, y_m, heading_deg, and robot for teammates. Raises ValueError."""
+    """A CSV file: file, x_m, y_m, heading_deg, and robot for teammates. Raises InputError."""
     try:
         lines = list(csv.DictReader(path.read_text(encoding="utf-8").splitlines()))
         given = [{k: (v or "").strip() for k, v in line.items() if k} for line in lines]
         rows = msgspec.convert(given, list[_Row], strict=False)
     except FileNotFoundError:
-        raise ValueError(f"--poses {path}: no such file") from None
+        raise InputError(f"--poses {path}: no such file") from None
     except (OSError, UnicodeDecodeError) as error:
-        raise ValueError(f"--poses {path}: cannot be read: {error}") from error
+        raise InputError(f"--poses {path}: cannot be read: {error}") from error
     except (csv.Error, msgspec.ValidationError) as error:
         columns = ",".join(COLUMNS)
-        raise ValueError(f"--poses {path}: {error}; its columns are {columns},robot") from error
+        raise InputError(f"--poses {path}: {error}; its columns are {columns},robot") from error
     if not rows:
-        raise ValueError(f"--poses {path}: no poses; its columns are {','.join(COLUMNS)},robot")
+        raise InputError(f"--poses {path}: no poses; its columns are {','.join(COLUMNS)},robot")
     for row in rows:
         if row.robot and row.robot not in team.robots:
             known = ", ".join(team.robots)
-            raise ValueError(f"--poses {path}: no robot {row.robot!r} in the team; known: {known}")
+            raise InputError(f"--poses {path}: no robot {row.robot!r} in the team; known: {known}")
     return rows
 
 

@@ -11,6 +11,7 @@ from tomlkit.items import InlineTable, Table
 
 from cpcbl_launch.calibration.statistics import Estimate, decimals
 from cpcbl_launch.team_file import TeamFileError, builtin, parse_team
+from cpcbl_team.errors import InputError
 
 
 class Written(NamedTuple):
@@ -40,12 +41,12 @@ class Place(NamedTuple):
 def robot_place(team_file: Path | None, robot: str | None, kind: str | None, part: str) -> Place:
     """The part of a robot's or a type's table; without a team file that of a type `eye`.
 
-    Raises ValueError unless one of them is named.
+    Raises InputError unless one of them is named.
     """
     if team_file is None and robot is None and kind is None:
         return Place(("types", "eye", part))
     if (robot is None) == (kind is None):
-        raise ValueError("--team: say whose table it is: --robot NAME or --type NAME")
+        raise InputError("--team: say whose table it is: --robot NAME or --type NAME")
     return Place(("robots", robot, part) if robot is not None else ("types", str(kind), part))
 
 

@@ -17,6 +17,7 @@ from cpcbl_launch.calibration.statistics import Estimate, decimals
 from cpcbl_launch.calibration.windows import WINDOW_S
 from cpcbl_launch.reporting.recording import read_recording
 from cpcbl_launch.team_file import TeamFileError, builtin, parse_team
+from cpcbl_team.errors import InputError
 
 INTERVAL_S = 0.5  # with correlation_s known, using an object more often tells little
 LEAST = {  # what is written at least: without any noise a filter would believe without bounds
@@ -71,7 +72,7 @@ def team_text(
     margin: float,
     correction_margin: float,
 ) -> str:
-    """The base team file with a type for each calibrated robot. Raises TeamFileError, ValueError.
+    """The base team file with a type for each calibrated robot. Raises TeamFileError, InputError.
 
     A robot's former type goes into its new one; keys of its own that were calibrated are taken out.
     `margin`: all sigmas are written larger by this share. `correction_margin`: this share of each
@@ -82,7 +83,7 @@ def team_text(
     document = tomlkit.parse(base)
     there = [n for n in calibration.robots if n in document["robots"]]
     if not there:
-        raise ValueError(f"{name}: has none of the robots {', '.join(calibration.robots)}")
+        raise InputError(f"{name}: has none of the robots {', '.join(calibration.robots)}")
     for robot in there:
         found = calibration.robots[robot]
         noise = (*odometry.NOISE, dead_zone.CRAWL_NOISE)
@@ -121,12 +122,12 @@ def _add_type(document: TOMLDocument, robot: str, written: RobotCalibration) -> 
 
 
 def _type_of(document: TOMLDocument, robot: str) -> str:
-    """The name of a robot's new type. Raises ValueError where others have a type of that name."""
+    """The name of a robot's new type. Raises InputError where others have a type of that name."""
     kind = f"robot-{robot}" if len(robot) < 26 else robot
     robots: Any = document["robots"]
     for other, own in robots.items():
         if other != robot and own.get("type") == kind:
-            raise ValueError(
+            raise InputError(
                 f"robots.{other}.type: {kind}: robot {robot} gets a type of that name; give the"
                 " present one another"
             )

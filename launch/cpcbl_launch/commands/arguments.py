@@ -7,18 +7,19 @@ import typer
 
 from cpcbl_launch.run.containers import BASE_IMAGE as BASE_IMAGE
 from cpcbl_launch.run.containers import BASE_VARIABLE
+from cpcbl_team.errors import InputError
 
 if TYPE_CHECKING:
     from cpcbl_team.config import Team
 
 
 def endpoints(option: typer.CallbackParam, given: list[str] | None) -> list[str] | None:
-    """Raises ValueError for what Zenoh would try again and again, and never say why."""
+    """Raises InputError for what Zenoh would try again and again, and never say why."""
     from cpcbl_launch.team_file import not_an_endpoint
 
     for endpoint in given or ():
         if reason := not_an_endpoint(endpoint):
-            raise ValueError(f"--{option.name} {endpoint}: {reason}")
+            raise InputError(f"--{option.name} {endpoint}: {reason}")
     return given
 
 
@@ -90,12 +91,12 @@ def say_not_written(lost: dict[str, str]) -> None:
 
 
 def known_robots(option: str, text: str, team: "Team") -> list[str]:
-    """The robots of a list with commas. Raises ValueError for one that the team does not have."""
+    """The robots of a list with commas. Raises InputError for one that the team does not have."""
     names = names_in(text)
     unknown = [name for name in names if name not in team.robots]
     if unknown or not names:
         who = ", ".join(unknown) or "it names none"
-        raise ValueError(
+        raise InputError(
             f"{option} {text}: no such robot: {who}; there are {', '.join(team.robots)}"
         )
     return names

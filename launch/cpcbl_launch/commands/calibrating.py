@@ -10,6 +10,7 @@ from typer.core import TyperGroup
 
 from cpcbl_launch.commands.arguments import AsJson, load, say_not_written
 from cpcbl_launch.commands.measuring import calibrate
+from cpcbl_team.errors import InputError
 
 if TYPE_CHECKING:
     from cpcbl_launch.calibration.sights import Looked
@@ -101,7 +102,7 @@ def camera(
         if not pictures:
             return
     if not pictures:
-        raise ValueError("calibrate camera: name pictures of the board, or --print-board FILE.png")
+        raise InputError("calibrate camera: name pictures of the board, or --print-board FILE.png")
     if picture is not None:
         file_for("--picture", picture)
         must_draw("--picture", picture)
@@ -164,7 +165,7 @@ def colours(
     said = [parsed_sample(text) for text in sample or ()]
     said += read_samples(samples) if samples is not None else []
     if not said:
-        raise ValueError("calibrate colours: say where colours are, by --sample or --samples")
+        raise InputError("calibrate colours: say where colours are, by --sample or --samples")
     if preview is not None:
         file_for("--preview", preview)
         patches.must_write(preview)
@@ -219,7 +220,7 @@ def sensor(
     from cpcbl_launch.options import encoded
 
     if bool(recordings) == (pictures is not None):
-        raise ValueError("calibrate sensor: name recordings, or --pictures FOLDER --poses FILE.csv")
+        raise InputError("calibrate sensor: name recordings, or --pictures FOLDER --poses FILE.csv")
     _check_target(team_file, output)
     if pictures is None:
         looked = recorded(recordings or [], robot)
@@ -242,16 +243,16 @@ def sensor(
 def _photographed(
     pictures: Path, poses: Path | None, team_file: Path | None, robot: str | None, quiet: bool
 ) -> "Looked":
-    """What a robot of the team file sees in pictures. Raises ValueError."""
+    """What a robot of the team file sees in pictures. Raises InputError."""
     from cpcbl_launch.calibration.sights import photographed, viewer
     from cpcbl_launch.options import must_have_opencv
     from cpcbl_launch.views.run import progress_bar
 
     must_have_opencv("calibrate sensor --pictures")
     if poses is None:
-        raise ValueError("--pictures: goes with --poses FILE.csv, where they were taken")
+        raise InputError("--pictures: goes with --poses FILE.csv, where they were taken")
     if team_file is None:
-        raise ValueError("--pictures: goes with --team FILE, which says what is to be seen")
+        raise InputError("--pictures: goes with --team FILE, which says what is to be seen")
     team = load(team_file)
     whose = viewer(team, robot)
     with progress_bar("looking", quiet) as progress:
@@ -259,14 +260,14 @@ def _photographed(
 
 
 def _check_target(team_file: Path | None, output: Path | None) -> None:
-    """Raises ValueError, TeamFileError before anything is measured in vain."""
+    """Raises InputError, TeamFileError before anything is measured in vain."""
     from cpcbl_launch.calibration.team_edit import team_source
     from cpcbl_launch.options import file_for
 
     if team_file is not None:
         file_for("--output" if output else "--team", team_source(team_file, output)[1])
     elif output is not None:
-        raise ValueError("--output: goes with --team FILE, the team to write")
+        raise InputError("--output: goes with --team FILE, the team to write")
 
 
 def _save(

@@ -216,7 +216,7 @@ def processes(
 def conduct(
     experiment: "Experiment", seeds: int, jobs: int | None, output: Path, as_json: bool
 ) -> None:
-    """Runs, writes and shows one experiment. Raises ValueError for what the user can mend."""
+    """Runs, writes and shows one experiment. Raises InputError for what the user can mend."""
     from cpcbl_launch.lab.experiments.runs import run_all
     from cpcbl_launch.options import must_draw
 
@@ -230,7 +230,7 @@ def conduct(
 
 
 def _must_be_writable(output: Path, name: str, *, drawn: bool = True) -> None:
-    """Raises ValueError where the files of an experiment could not be written later on."""
+    """Raises InputError where the files of an experiment could not be written later on."""
     from cpcbl_launch.options import file_for, folder_for
 
     folder_for("--output", output)

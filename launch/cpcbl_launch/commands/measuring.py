@@ -21,6 +21,7 @@ from cpcbl_launch.commands.arguments import (
     say_not_written,
     write_report,
 )
+from cpcbl_team.errors import InputError
 
 
 class VariantName(StrEnum):
@@ -213,9 +214,9 @@ def simulate(
         match_messages=match_messages,
     )
     if file is not None and robots:
-        raise ValueError("simulate: FILE or --robots, which generates its teams; leave one out")
+        raise InputError("simulate: FILE or --robots, which generates its teams; leave one out")
     if robots and budgets != Choice():
-        raise ValueError("simulate: generated teams have no budgets; name a team file instead")
+        raise InputError("simulate: generated teams have no budgets; name a team file instead")
     if report is not None:
         file_for("--report", report)
     if picture is not None:

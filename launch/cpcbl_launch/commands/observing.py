@@ -18,6 +18,7 @@ from cpcbl_launch.commands.arguments import (
     TeamFile,
     load,
 )
+from cpcbl_team.errors import InputError
 
 
 class SourceName(StrEnum):
@@ -72,7 +73,7 @@ def observer(
     from cpcbl_launch.views.run import print_visit
 
     if duration is not None and not duration > 0.0:
-        raise ValueError(f"--for {duration:g}: more than 0 seconds")
+        raise InputError(f"--for {duration:g}: more than 0 seconds")
     file_team = load(team_file)
     kind = None if source is None else str(source)
     team = joined(file_team, Wish(name, place_in(at), sensor, fov, places_in(move), kind))

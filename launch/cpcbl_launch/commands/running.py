@@ -30,6 +30,7 @@ from cpcbl_launch.commands.arguments import (
     say_not_written,
     write_report,
 )
+from cpcbl_team.errors import InputError
 
 
 def check(
@@ -266,9 +267,9 @@ def router(
     from cpcbl_transport.zenoh_bus import read_router_config
 
     if (file is None) == (config is None):
-        raise ValueError("router: a team FILE, or --config FILE; one of them")
+        raise InputError("router: a team FILE, or --config FILE; one of them")
     if config is not None and (listen or connect):
-        raise ValueError(f"--config {config}: says where it listens and connects; change it there")
+        raise InputError(f"--config {config}: says where it listens and connects; change it there")
     if config is not None:
         title, options = f"router of {config}", read_router_config(config)
     else:

@@ -8,6 +8,7 @@ from typing import Annotated, Optional
 import typer
 
 from cpcbl_launch.commands.arguments import AsJson, load
+from cpcbl_team.errors import InputError
 
 
 def keys(
@@ -51,9 +52,9 @@ def keys(
 
     team = load(file)
     if not 0.0 < days < 36500.0:
-        raise ValueError(f"--days {days:g}: more than 0, and less than a hundred years")
+        raise InputError(f"--days {days:g}: more than 0, and less than a hundred years")
     if output is None and not file.exists():
-        raise ValueError(f"{file}: comes with the package; copy it, or name a folder by --output")
+        raise InputError(f"{file}: comes with the package; copy it, or name a folder by --output")
     folder = output or key_folder(team, file)
     wish = Wish(
         observers=tuple(observer or ()),
@@ -66,7 +67,7 @@ def keys(
     try:
         made = make_keys(team, folder, wish)
     except OSError as error:
-        raise ValueError(f"{error.filename or folder}: {error.strerror}; name a folder") from error
+        raise InputError(f"{error.filename or folder}: {error.strerror}; name a folder") from error
     if as_json:
         sys.stdout.write(encoded(made) + "\n")
         return

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Optional
 import typer
 
 from cpcbl_launch.commands.arguments import Connect, TeamArgument, TeamFile, load
+from cpcbl_team.errors import InputError
 
 if TYPE_CHECKING:
     from cpcbl_team.config import Team
@@ -49,7 +50,7 @@ def traffic(
     from cpcbl_transport.topics import Role
 
     if duration is not None and not duration > 0.0:
-        raise ValueError(f"--for {duration:g}: more than 0 seconds")
+        raise InputError(f"--for {duration:g}: more than 0 seconds")
     logging.getLogger("cpcbl_transport").setLevel(logging.WARNING)
     team = None if team_name is not None and file is None else load(file or Path("demo"))
     endpoints = connect or (team.transport if team is not None else TransportSettings()).connect
@@ -104,9 +105,9 @@ def look(
 
     team = load(team_file)
     if robot not in team.robots:
-        raise ValueError(f"look {robot}: not in {team_file}; it has: {', '.join(team.robots)}")
+        raise InputError(f"look {robot}: not in {team_file}; it has: {', '.join(team.robots)}")
     if team.robots[robot].sensing != "camera":
-        raise ValueError(f'look {robot}: has no camera in {team_file}; set sensing = "camera"')
+        raise InputError(f'look {robot}: has no camera in {team_file}; set sensing = "camera"')
     if pictures is not None:
         must_see(team, [robot])
     folder = folder_for("--save", save)
@@ -142,9 +143,9 @@ def _at(robot: str, team: "Team", pictures: Path) -> Iterator[tuple[str, str, "L
     from cpcbl_launch.views.frames.watch import looks_at
 
     if not pictures.exists():
-        raise ValueError(f"--pictures {pictures}: no such file or folder")
+        raise InputError(f"--pictures {pictures}: no such file or folder")
     paths = pictures_in(pictures) if pictures.is_dir() else [pictures]
     if not paths:
-        raise ValueError(f"--pictures {pictures}: no pictures (.png, .jpg) in it")
+        raise InputError(f"--pictures {pictures}: no pictures (.png, .jpg) in it")
     for path, one in looks_at(paths, robot, team):
         yield path.name, f"{robot}_{path.stem}", one

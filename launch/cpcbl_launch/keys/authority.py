@@ -1,12 +1,16 @@
 """A certificate authority and what it signs: X.509 with keys on the curve P-256, as PEM.
 
-Raises ValueError where `cryptography` is not installed.
+Raises DependencyError where `cryptography` is not installed.
 """
 
 import ipaddress
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from datetime import datetime, timedelta
 from typing import NamedTuple
+
+from cpcbl_team.errors import DependencyError, InputError
+from cpcbl_transport.security import CERTIFICATE, SecurityError
 
 try:
     from cryptography import x509
@@ -14,7 +18,7 @@ try:
     from cryptography.hazmat.primitives.asymmetric import ec
     from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 except ImportError as error:
-    raise ValueError("keys needs cryptography: pip install 'cpcbl-team[security]'") from error
+    raise DependencyError("keys needs cryptography: pip install 'cpcbl-team[security]'") from error
 
 CLOCKS_APART = timedelta(days=1)  # a machine whose clock is late takes a new certificate too
 AUTHORITY_DAYS = 3650
@@ -59,13 +63,14 @@ def issued(
 ) -> Pair:
     """A certificate with a new key. With hosts its owner may be dialled there, else only dial.
 
-    Raises ValueError for hosts that are none, and for an authority that ends sooner.
+    Raises InputError for hosts that are none, and for an authority that ends sooner.
     """
-    signer = serialization.load_pem_private_key(authority.private_key, None)
+    with _reading("ca/private.key"):
+        signer = serialization.load_pem_private_key(authority.private_key, None)
     assert isinstance(signer, ec.EllipticCurvePrivateKey)
     above = x509.load_pem_x509_certificate(authority.certificate)
     if now + lasting > above.not_valid_after_utc:
-        raise ValueError(
+        raise InputError(
             f"--days: the authority ends {above.not_valid_after_utc:%Y-%m-%d}; ask for fewer days,"
             " or make a new one with --renew ca"
         )
@@ -88,8 +93,9 @@ def issued(
 
 
 def facts(certificate: bytes) -> Facts:
-    """What a certificate says. Raises ValueError for one that cannot be read."""
-    read = x509.load_pem_x509_certificate(certificate)
+    """What a certificate says. Raises SecurityError for one that cannot be read."""
+    with _reading(CERTIFICATE):
+        read = x509.load_pem_x509_certificate(certificate)
     try:
         names = read.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
         hosts = tuple(str(name.value) for name in names)
@@ -121,8 +127,22 @@ def belong_together(pair: Pair) -> bool:
 
 
 def newest(bundle: bytes) -> bytes:
-    """The first certificate of several in one text: that of the authority in use."""
-    return x509.load_pem_x509_certificates(bundle)[0].public_bytes(serialization.Encoding.PEM)
+    """The first certificate of several in one text: that of the authority in use.
+
+    Raises SecurityError for a text that holds none.
+    """
+    with _reading("ca/ca.crt"):
+        first, *_ = x509.load_pem_x509_certificates(bundle)
+    return first.public_bytes(serialization.Encoding.PEM)
+
+
+@contextmanager
+def _reading(file: str) -> Iterator[None]:
+    """Raises SecurityError where the text of a file of keys cannot be read."""
+    try:
+        yield
+    except ValueError as error:
+        raise SecurityError(f"{file}: cannot be read: {error}; bring back a good copy") from error
 
 
 def _begun(
@@ -154,7 +174,7 @@ def _host(host: str) -> "x509.GeneralName":
     try:
         return x509.DNSName(host)
     except ValueError as error:
-        raise ValueError(f"--host {host!r}: neither an address nor a name in ASCII") from error
+        raise InputError(f"--host {host!r}: neither an address nor a name in ASCII") from error
 
 
 def _usage(signs: bool) -> "x509.KeyUsage":

@@ -17,6 +17,7 @@ from pathlib import Path
 
 import msgspec
 
+from cpcbl_team.errors import InputError
 from cpcbl_launch.keys.authority import (
     Pair,
     belong_together,
@@ -65,7 +66,7 @@ class Wish(msgspec.Struct, frozen=True, kw_only=True):
 def make_keys(team: Team, folder: Path, wish: Wish) -> list[KeysReport]:
     """Makes what is missing in a key folder, and what the wish names anew.
 
-    Raises ValueError for a wish that cannot be met, OSError where nothing can be written.
+    Raises InputError for a wish that cannot be met, OSError where nothing can be written.
     """
     now = datetime.now(UTC)
     known = members_in(folder) if (folder / str(Role.ROUTER) / MEMBERS).exists() else ()
@@ -121,7 +122,7 @@ def _check_hosts(steps: Iterable[Step], folder: Path, named: Collection[str]) ->
             has = facts((folder / str(Role.ROUTER) / CERTIFICATE).read_bytes()).hosts
             lacking = [host for host in named if host not in has]
             if lacking:
-                raise ValueError(
+                raise InputError(
                     f"--host {lacking[0]}: not in the router's certificate, which has"
                     f" {', '.join(has)}; add --renew router"
                 )
@@ -155,7 +156,7 @@ def _signer(folder: Path, authorities: bytes) -> Pair:
     try:
         return Pair(path.read_bytes(), newest(authorities))
     except FileNotFoundError:
-        raise ValueError(
+        raise InputError(
             f"{path}: the authority's key is not here; bring it back from where it is kept, or make"
             " a new authority with --renew ca"
         ) from None
@@ -167,7 +168,7 @@ def _retired(steps: Iterable[Step], folder: Path, authorities: bytes) -> bytes:
     for step in steps:
         certificate = folder / str(step.member.identity) / CERTIFICATE
         if step.deed is not Deed.REVOKED and not signed_by(certificate.read_bytes(), latest):
-            raise ValueError(
+            raise InputError(
                 f"--retire-ca: {step.member.identity} still has a certificate of the old authority;"
                 " --renew all first, and bring the new ones to their machines"
             )

@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import msgspec
 
+from cpcbl_team.errors import InputError
 from cpcbl_team.config import Team
 from cpcbl_team.inputs import NAME_PATTERN
 from cpcbl_transport.security import Identity, Member
@@ -41,19 +42,19 @@ def plan(
 ) -> tuple[Step, ...]:
     """A step for each member that the team needs, is told to have, or had before.
 
-    Raises ValueError for names that nobody has.
+    Raises InputError for names that nobody has.
     """
     for name in observers:
         if not re.fullmatch(NAME_PATTERN, name):
-            raise ValueError(
+            raise InputError(
                 f"--observer {name}: a name has 1 to 32 letters, digits, _, . or -; rename it"
             )
         if name in team.robots:
-            raise ValueError(f"--observer {name}: is a robot of the team; name it otherwise")
+            raise InputError(f"--observer {name}: is a robot of the team; name it otherwise")
     for member in known:
         gone = member.revoked or str(member.identity) in revoke
         if member.role is Role.OBSERVER and not gone and member.name in team.robots:
-            raise ValueError(
+            raise InputError(
                 f"robots.{member.name}: an observer has this name; name the robot otherwise, or"
                 f" --revoke {member.identity}"
             )
@@ -63,7 +64,7 @@ def plan(
     for option, names in (("--renew", {*renew} - {ALL, AUTHORITY}), ("--revoke", revoke)):
         for name in names:
             if not any(_called(identity, name) for identity in everyone):
-                raise ValueError(f"{option} {name}: nobody has this name; {_names(everyone)}")
+                raise InputError(f"{option} {name}: nobody has this name; {_names(everyone)}")
     return tuple(_step(identity, before.get(identity), renew, revoke) for identity in everyone)
 
 

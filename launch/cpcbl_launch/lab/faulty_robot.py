@@ -19,6 +19,7 @@ from typing import NamedTuple
 
 import msgspec
 
+from cpcbl_team.errors import InputError
 from cpcbl_team.inputs import Belief, Fix
 from cpcbl_transport.bus import Bus, Publisher
 from cpcbl_transport.bus_proxy import PassingBus, PassingPublisher
@@ -44,18 +45,18 @@ class Lie(NamedTuple):
 
     @staticmethod
     def parse(text: str) -> "Lie":
-        """Raises ValueError."""
+        """Raises InputError."""
         match = _TEXT.fullmatch(text)
         kind = match["kind"] if match else ""
         if match is None or kind not in ARGUMENTS:
-            raise ValueError(f"--lie {text}: write {', '.join(ARGUMENTS)}, e.g. bias:0.5,0.5@10-30")
+            raise InputError(f"--lie {text}: write {', '.join(ARGUMENTS)}, e.g. bias:0.5,0.5@10-30")
         try:
             values = tuple(float(v) for v in (match["values"] or "").split(",") if v)
             since, until = float(match["since"] or 0.0), float(match["until"] or math.inf)
         except ValueError:
-            raise ValueError(f"--lie {text}: numbers, e.g. bias:0.5,0.5@10-30") from None
+            raise InputError(f"--lie {text}: numbers, e.g. bias:0.5,0.5@10-30") from None
         if len(values) != ARGUMENTS[kind] or not all(map(math.isfinite, values)):
-            raise ValueError(f"--lie {text}: {kind} takes {ARGUMENTS[kind]} numbers")
+            raise InputError(f"--lie {text}: {kind} takes {ARGUMENTS[kind]} numbers")
         return Lie(kind, values, since, until)
 
 

@@ -135,7 +135,7 @@ def read_recording(path: Path) -> Recorded:
         team = msgspec.json.decode(attached[0], type=Team)
     except OSError as error:
         raise LogError(f"{path}: cannot be read: {error.strerror}") from error
-    except (McapError, struct.error, msgspec.MsgspecError) as error:
+    except (McapError, struct.error, msgspec.MsgspecError, ValueError) as error:
         raise LogError(f"{path}: not a whole recording: {error}") from error
     truths = [message for _, message in messages if isinstance(message, Truths)]
     return Recorded(team, _inputs(messages), truth_rows(truths))

@@ -14,6 +14,7 @@ from cpcbl_launch.options import check_duration
 from cpcbl_launch.reporting.metrics import Floats, truth_at
 from cpcbl_launch.team_file import builtin
 from cpcbl_team.config import Field, Start, Team
+from cpcbl_team.errors import InputError
 from cpcbl_team.geometry import Pose2, step
 
 LATEST_TRUTH_NS = 30_000_000_000
@@ -49,7 +50,7 @@ def _number(name: str) -> str:
 def on_log(team: Team, folder: Path) -> LoggedTeam:
     """The team on the MRCLAM log in `folder`: robots start at the log's first true pose.
 
-    A robot whose files are missing is left out. Raises LogError, and ValueError for a robot with
+    A robot whose files are missing is left out. Raises LogError, and InputError for a robot with
     files that would not read them.
     """
     there = set(mrclam.robots_in(folder))
@@ -79,7 +80,7 @@ def on_log(team: Team, folder: Path) -> LoggedTeam:
 
 
 def shortened(logged: LoggedTeam, duration_s: float | None) -> LoggedTeam:
-    """The same log, of which only so much is used; None: all of it. Raises ValueError."""
+    """The same log, of which only so much is used; None: all of it. Raises InputError."""
     if duration_s is None:
         return logged
     check_duration(duration_s, LEAST_S)
@@ -90,7 +91,7 @@ def _must_read(team: Team, names: Collection[str]) -> None:
     for name in names:
         source = team.robots[name].source
         if source != "mrclam":
-            raise ValueError(
+            raise InputError(
                 f'robots.{name}.source: {source}: reads no log; write source = "mrclam"'
             )
 
@@ -119,10 +120,10 @@ def _start(folder: Path, robot: str, truth: Floats) -> Start | None:
 
 
 def blinded(team: Team, blind: Collection[str]) -> Team:
-    """The team with some robots blind to landmarks. Raises ValueError for an unknown name."""
+    """The team with some robots blind to landmarks. Raises InputError for an unknown name."""
     unknown = sorted(set(blind) - set(team.robots))
     if unknown:
-        raise ValueError(
+        raise InputError(
             f"no robot {', '.join(unknown)} to blind; there are {', '.join(team.robots)}"
         )
     robots = {

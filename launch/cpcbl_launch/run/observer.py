@@ -17,6 +17,7 @@ from cpcbl_launch.reporting.flows import FlowReport, summed_flows
 from cpcbl_launch.simulation.guest_bodies import unfit
 from cpcbl_launch.team_file import beside, read_layer
 from cpcbl_team.config import Team
+from cpcbl_team.errors import InputError
 from cpcbl_team.inputs import NAME_PATTERN
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus
@@ -76,18 +77,18 @@ def _shipped() -> Any:
 
 
 def place_in(text: str) -> Place:
-    """`X,Y` or `X,Y,HEADING_DEG`. Raises ValueError."""
+    """`X,Y` or `X,Y,HEADING_DEG`. Raises InputError."""
     numbers = _numbers(text)
     if len(numbers) not in (2, 3):
-        raise ValueError(f"--at {text}: write X,Y or X,Y,HEADING_DEG, such as 4.5,5,-90")
+        raise InputError(f"--at {text}: write X,Y or X,Y,HEADING_DEG, such as 4.5,5,-90")
     return Place(*numbers)
 
 
 def places_in(text: str) -> tuple[tuple[float, float], ...]:
-    """`X,Y;X,Y...`, none for an empty text. Raises ValueError."""
+    """`X,Y;X,Y...`, none for an empty text. Raises InputError."""
     places = [_numbers(part) for part in text.split(";") if part.strip()]
     if any(len(place) != 2 for place in places):
-        raise ValueError(f"--move {text}: write X,Y;X,Y, such as 2,1;7,1")
+        raise InputError(f"--move {text}: write X,Y;X,Y, such as 2,1;7,1")
     return tuple((x, y) for x, y in places)
 
 
@@ -103,22 +104,22 @@ def _numbers(text: str) -> list[float]:
 def joined(team: Team, wish: Wish) -> Team:
     """The team as the observer sees it: itself beside the robots of the file.
 
-    Raises ValueError or TeamFileError for a wish that cannot be granted.
+    Raises InputError or TeamFileError for a wish that cannot be granted.
     """
     name = wish.name
     if not re.fullmatch(NAME_PATTERN, name):
-        raise ValueError(f"observer {name!r}: a name has 1 to 32 letters, digits, _, . or -")
+        raise InputError(f"observer {name!r}: a name has 1 to 32 letters, digits, _, . or -")
     if name in team.robots:
-        raise ValueError(
+        raise InputError(
             f"observer {name}: a robot of team {team.name} has this name; choose another one"
         )
     if not team.guests.allowed:
-        raise ValueError(
+        raise InputError(
             f"observer {name}: team {team.name} lets no guest in; set guests.allowed = true in its"
             " file, and start it again"
         )
     if team.match.messages:
-        raise ValueError(
+        raise InputError(
             f"observer {name}: match.messages are divided among the robots of the file, none are"
             " left for a guest; take the limit away, or put the observer into the file"
         )
@@ -126,14 +127,14 @@ def joined(team: Team, wish: Wish) -> Team:
     shipped = wish.sensor in presets()
     path = Path(str(_shipped() / f"{wish.sensor}.toml")) if shipped else Path(wish.sensor)
     if not shipped and not path.exists():
-        raise ValueError(
+        raise InputError(
             f"--sensor {wish.sensor}: no such file; write one, or {' or '.join(presets())}"
         )
     more = beside(team, name, [_PLAIN, read_layer(path), _own(wish, source)], str(path))
     model = model_from_settings(more.robots[name])
     reason = "" if model is None else unfit(model)
     if reason:
-        raise ValueError(f"{path}: {reason}")
+        raise InputError(f"{path}: {reason}")
     return more
 
 
@@ -154,7 +155,7 @@ def _own(wish: Wish, source: str) -> dict[str, Any]:
 def _source_of(team: Team) -> str:
     sources = {robot.source for robot in team.robots.values()}
     if sources == {"mrclam"}:
-        raise ValueError(f"team {team.name} replays a log: nobody can join it")
+        raise InputError(f"team {team.name} replays a log: nobody can join it")
     return "simulated" if "simulated" in sources else "external"
 
 
@@ -168,7 +169,7 @@ def visit(
 ) -> Visited:
     """Runs an observer that `team` holds until `stop()`, or for so many seconds of robot time.
 
-    Raises BusError when stopped before a router answered, ValueError for a name that is taken, or
+    Raises BusError when stopped before a router answered, InputError for a name that is taken, or
     when this machine's clock was set, SecurityError without the keys of a secured team.
     """
     loop = Loop(clock)
@@ -196,7 +197,7 @@ def _look_for_namesakes(name: str, bus: Bus, stop: Callable[[], bool]) -> None:
         time.sleep(0.02)
     watch.close()
     if found:
-        raise ValueError(f"observer {name}: the team has one of this name; choose another one")
+        raise InputError(f"observer {name}: the team has one of this name; choose another one")
 
 
 def _visited(node: Visit, team: Team, seconds: float) -> Visited:

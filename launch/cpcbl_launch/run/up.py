@@ -26,6 +26,7 @@ from cpcbl_launch.run.supervisor import Processes, Supervisor
 from cpcbl_launch.simulation.in_process import Progress, simulate
 from cpcbl_launch.team_file import save_resolved
 from cpcbl_team.config import Team
+from cpcbl_team.errors import InputError
 from cpcbl_transport.bus import Bus
 from cpcbl_transport.guards import guard_rules
 from cpcbl_transport.security import Identity, access_control, link_of
@@ -150,11 +151,11 @@ def run_team(run: Run, view: View, stop: Stopping, launch: Launch = OnThisMachin
 def simulate_run(run: Run, progress: Progress | None = None) -> Report:
     """The same in one process over the bus in memory, as fast as the machine is.
 
-    Raises ValueError for a robot that is not simulated, or too short a duration.
+    Raises InputError for a robot that is not simulated, or too short a duration.
     """
     for name, robot in run.team.robots.items():
         if robot.source != "simulated":
-            raise ValueError(
+            raise InputError(
                 f"robots.{name}.source: {robot.source}: cannot be simulated; use `up`, or"
                 " `evaluate` for a log"
             )
@@ -169,7 +170,7 @@ def _run_in(run: Run, view: View, stop: Stopping, folder: Path, launch: Launch) 
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise ValueError(f"{folder}: {error.strerror}; robots read their team there") from error
+        raise InputError(f"{folder}: {error.strerror}; robots read their team there") from error
     launcher, recording = launch(run, folder, stop), None
     with launcher.router() as bus, ExitStack() as stack:
         if run.record is not None:
@@ -211,7 +212,7 @@ def _recording(run: Run, path: Path, bus: Bus) -> Recording:
     try:
         return Recording(path, run.team, bus)
     except OSError as error:
-        raise ValueError(f"--record {path}: {error.strerror}; name another file") from error
+        raise InputError(f"--record {path}: {error.strerror}; name another file") from error
 
 
 def _report(

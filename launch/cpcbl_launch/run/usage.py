@@ -4,6 +4,8 @@ import os
 from pathlib import Path
 from typing import NamedTuple
 
+from cpcbl_team.errors import DependencyError
+
 MIB = 2**20
 _PROC = Path("/proc")
 _TICKS_A_SECOND = os.sysconf("SC_CLK_TCK")
@@ -19,9 +21,9 @@ class Usage(NamedTuple):
 
 
 def must_measure(what: str) -> None:
-    """Raises ValueError where processes cannot be measured."""
+    """Raises InputError where processes cannot be measured."""
     if not (_PROC / "self" / "smaps_rollup").exists():
-        raise ValueError(f"{what} needs /proc/PID/smaps_rollup: run it on Linux")
+        raise DependencyError(f"{what} needs /proc/PID/smaps_rollup: run it on Linux")
 
 
 def usage(pid: int) -> Usage:

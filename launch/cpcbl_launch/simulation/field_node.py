@@ -20,6 +20,7 @@ from cpcbl_launch.simulation.field import SimulatedField
 from cpcbl_launch.simulation.guest_bodies import Bodies
 from cpcbl_launch.team_file import not_an_endpoint
 from cpcbl_team.config import Team
+from cpcbl_team.errors import InputError
 from cpcbl_team.inputs import Odometry
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus, Handle, Publisher
@@ -159,17 +160,17 @@ def later(message: Moved, ns: int) -> Moved:
 
 
 def robots_at(sites: Iterable[str], team: Team) -> dict[str, list[str]]:
-    """Endpoint -> robots, of `tcp/10.0.0.2:7447=r3,r4`. Raises ValueError."""
+    """Endpoint -> robots, of `tcp/10.0.0.2:7447=r3,r4`. Raises InputError."""
     found = {}
     for text in sites:
         endpoint, _, names = text.partition("=")
         if reason := not_an_endpoint(endpoint):
-            raise ValueError(f"--site {text}: {reason}")
+            raise InputError(f"--site {text}: {reason}")
         found[endpoint] = [name.strip() for name in names.split(",")]
         for name in found[endpoint]:
             if name not in team.robots:
                 known = ", ".join(team.robots)
-                raise ValueError(f"--site {text}: no robot {name!r}; there are {known}")
+                raise InputError(f"--site {text}: no robot {name!r}; there are {known}")
     return found
 
 

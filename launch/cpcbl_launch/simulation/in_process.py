@@ -39,7 +39,7 @@ class Choice(NamedTuple):
 
 
 def chosen(team: Team, choice: Choice) -> Team:
-    """The team with these choices made for all its robots. Raises ValueError for a bad limit."""
+    """The team with these choices made for all its robots. Raises InputError for a bad limit."""
     rules: dict[str, object] = {}
     limits = {}
     for name in ("bytes_per_s", "messages_per_minute"):

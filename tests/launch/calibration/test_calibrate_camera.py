@@ -27,6 +27,7 @@ from cpcbl_launch.calibration.team_edit import (
 )
 from cpcbl_launch.team_file import TeamFileError, load_team, parse_team
 from cpcbl_team.config import CameraSettings
+from cpcbl_team.errors import InputError
 
 LENS = CameraSettings(
     width_px=480,
@@ -175,7 +176,7 @@ def test_what_cannot_be_calibrated_from_is_one_line(taken: list[Picture]) -> Non
         ([*taken, narrow], "narrow.png has 460 x 360 pixels, 00.png has 480 x 360"),
         ([taken[0]] * 6, "1 of 6 pictures.*00.png: the board is where it is in 00.png"),
     ):
-        with pytest.raises(ValueError, match=said):
+        with pytest.raises(InputError, match=said):
             calibrated_lens(pictures, CHARUCO)
 
 
@@ -210,7 +211,7 @@ def _only_left(pixels: Pixels) -> Pixels:
 def test_boards_that_cannot_be_are_said(
     words: tuple[str, str, float, float, str], said: str
 ) -> None:
-    with pytest.raises(ValueError, match=said):
+    with pytest.raises(InputError, match=said):
         parsed_board(*words)
 
 
@@ -248,10 +249,10 @@ def test_pictures_come_from_folders_files_and_videos(taken: list[Picture], tmp_p
     assert read[0].pixels == "no picture"
     assert _pixels(read[1]).shape == (360, 480, 3)
     assert done == [0.5, 1.0]
-    with pytest.raises(ValueError, match=r"c\.png: no such file"):
+    with pytest.raises(InputError, match=r"c\.png: no such file"):
         picture_files([tmp_path / "c.png"])
     (tmp_path / "empty").mkdir()
-    with pytest.raises(ValueError, match="empty: no picture in this folder"):
+    with pytest.raises(InputError, match="empty: no picture in this folder"):
         picture_files([tmp_path / "empty"])
 
 
@@ -297,7 +298,7 @@ def test_what_is_not_in_the_file_is_said() -> None:
         with pytest.raises(TeamFileError, match=said):
             edited(TEAM, "lab.toml", {robot_place(Path("t"), robot, kind, "camera"): VALUES})
     for robot, kind in ((None, None), ("a", "eye")):
-        with pytest.raises(ValueError, match="--robot NAME or --type NAME"):
+        with pytest.raises(InputError, match="--robot NAME or --type NAME"):
             robot_place(Path("t"), robot, kind, "camera")
     with pytest.raises(TeamFileError, match="a built-in team stays as it is; name --output"):
         team_source(Path("demo"), None)

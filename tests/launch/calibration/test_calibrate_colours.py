@@ -24,6 +24,7 @@ from cpcbl_launch.calibration.samples import Sample, named_in, parsed_sample, re
 from cpcbl_launch.calibration.team_edit import edited
 from cpcbl_launch.team_file import TeamFileError, load_team, parse_team
 from cpcbl_team.config import COLOURS, Colour
+from cpcbl_team.errors import InputError
 
 PAINT = {  # BGR in full light
     "red": (40, 30, 210),
@@ -198,7 +199,7 @@ def test_samples_are_read_from_options_and_files(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("text", ["a.png", "a.png:red", "a.png:red=1,2", "red=1,2,3", "a:r=1,2,-3"])
 def test_samples_that_are_none_are_said(text: str) -> None:
-    with pytest.raises(ValueError, match="write it as PICTURE:COLOUR=X,Y,WIDTH,HEIGHT"):
+    with pytest.raises(InputError, match="write it as PICTURE:COLOUR=X,Y,WIDTH,HEIGHT"):
         parsed_sample(text)
 
 
@@ -214,17 +215,17 @@ def test_samples_that_are_none_are_said(text: str) -> None:
 )
 def test_files_that_hold_no_samples_are_said(tmp_path: Path, name: str, text: str) -> None:
     (tmp_path / name).write_text(text)
-    with pytest.raises(ValueError, match=r"--samples .*; each has picture, colour, at"):
+    with pytest.raises(InputError, match=r"--samples .*; each has picture, colour, at"):
         read_samples(tmp_path / name)
 
 
 def test_samples_outside_of_their_picture_are_said(folder: Path) -> None:
     for at in ((350, 70, 20, 5), (400, 5, 3), (5, 5, 0, 9)):
-        with pytest.raises(ValueError, match="is not inside of 360 x 80 px"):
+        with pytest.raises(InputError, match="is not inside of 360 x 80 px"):
             labelled([Sample(folder / "0.png", "red", at)], [])
-    with pytest.raises(ValueError, match=r"no\.png: No such file"):
+    with pytest.raises(InputError, match=r"no\.png: No such file"):
         labelled([Sample(folder / "no.png", "red", (1, 1, 3))], [])
-    with pytest.raises(ValueError, match="red: fewer than 20 pixels"):
+    with pytest.raises(InputError, match="red: fewer than 20 pixels"):
         calibrated_colours([Patch("red", np.zeros((19, 3), np.uint8))], np.zeros((0, 3), np.uint8))
 
 

@@ -29,6 +29,7 @@ from cpcbl_launch.reporting.recording import Recording
 from cpcbl_launch.simulation.camera.render import Light, Scene, Standing, render
 from cpcbl_launch.team_file import load_team, parse_team
 from cpcbl_team.config import CameraSettings, Landmark, RobotSettings, Team
+from cpcbl_team.errors import InputError
 from cpcbl_team.geometry import Pose2
 from cpcbl_team.inputs import Sighting, Sightings
 from cpcbl_transport import topics
@@ -240,7 +241,7 @@ def test_eyes_that_state_nothing_are_calibrated_too() -> None:
 
 
 def test_too_few_sightings_are_said() -> None:
-    with pytest.raises(ValueError, match="18 sightings with known truth; at least 40"):
+    with pytest.raises(InputError, match="18 sightings with known truth; at least 40"):
         calibrated_seeing([said(1.0, seconds=5)])
 
 
@@ -283,9 +284,9 @@ def test_looks_of_a_recording_are_sightings(tmp_path: Path) -> None:
     assert calibrated_seeing(looked.sights).sensor["range_scale"].value == pytest.approx(
         1.0, abs=0.02
     )
-    with pytest.raises(ValueError, match=r"run\.mcap: no sightings of other"):
+    with pytest.raises(InputError, match=r"run\.mcap: no sightings of other"):
         recorded([path], "other")
-    with pytest.raises(ValueError, match="no recording of"):
+    with pytest.raises(InputError, match="no recording of"):
         recorded([tmp_path], None)
     with Recording(tmp_path / "blind.mcap", team, MemoryHub().session()):
         pass
@@ -300,7 +301,7 @@ def test_like_cameras_are_pooled_and_unlike_ones_refused(tmp_path: Path) -> None
     assert recorded([path], None).robots == ("one", "two")
     longer = replace(EYE, camera=CameraSettings(fx_px=500.0))
     record(path, log, "one", "two", one=EYE, two=longer)
-    with pytest.raises(ValueError, match=r"one, two: unlike cameras, .* by --robot"):
+    with pytest.raises(InputError, match=r"one, two: unlike cameras, .* by --robot"):
         recorded([path], None)
     assert recorded([path], "two").camera == longer.camera
 
@@ -308,7 +309,7 @@ def test_like_cameras_are_pooled_and_unlike_ones_refused(tmp_path: Path) -> None
 def test_a_guests_camera_is_not_known(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     record(path, said(1.0, 30), "eye", "guest", eye=EYE)
-    with pytest.raises(ValueError, match=r"--robot guest: a guest of .*; with a camera: eye"):
+    with pytest.raises(InputError, match=r"--robot guest: a guest of .*; with a camera: eye"):
         recorded([path], "guest")
 
 
@@ -322,7 +323,7 @@ def test_pictures_that_cannot_be_used_are_said(honest: Path, tmp_path: Path) -> 
     looked = photographed(tmp_path, tmp_path / "poses.csv", "eye", LAB)
     assert looked.notes[:2] == ("00.png: no picture", "01.png: frame_black")
     (tmp_path / "poses.csv").write_text("file,x_m,y_m,heading_deg\n00.png,1,1,0\n")
-    with pytest.raises(ValueError, match=r"no picture can be used: 00\.png: no picture"):
+    with pytest.raises(InputError, match=r"no picture can be used: 00\.png: no picture"):
         photographed(tmp_path, tmp_path / "poses.csv", "eye", LAB)
 
 
@@ -337,14 +338,14 @@ def test_pictures_that_cannot_be_used_are_said(honest: Path, tmp_path: Path) -> 
 )
 def test_poses_that_are_none_are_said(tmp_path: Path, text: str, said: str) -> None:
     (tmp_path / "poses.csv").write_text(text)
-    with pytest.raises(ValueError, match=said):
+    with pytest.raises(InputError, match=said):
         read_poses(tmp_path / "poses.csv", LAB)
 
 
 def test_whose_camera_it_is() -> None:
     assert viewer(LAB, None) == "eye"
     for robot in ("mate", "nobody"):
-        with pytest.raises(ValueError, match="with a camera: eye"):
+        with pytest.raises(InputError, match="with a camera: eye"):
             viewer(LAB, robot)
 
 

@@ -32,6 +32,7 @@ from cpcbl_team.config import (
     Start,
     Team,
 )
+from cpcbl_team.errors import InputError
 
 SECONDS = 90.0
 PLACES = [(0.0, 0.0), (9.0, 0.0), (9.0, 5.0), (0.0, 5.0), (4.5, -1.0), (4.5, 6.0)]
@@ -359,7 +360,7 @@ def test_a_team_that_sees_and_does_nothing_is_one_line(tmp_path: Path) -> None:
     path = tmp_path / "blind.mcap"
     blind = Team(name="blind", robots={"c": STANDING})
     simulate(blind, 1, 20.0, record=path)
-    with pytest.raises(ValueError, match="nothing to calibrate") as raised:
+    with pytest.raises(InputError, match="nothing to calibrate") as raised:
         calibrated(read_logs([path]), ["blind.mcap"])
     assert "\n" not in str(raised.value)
 
@@ -426,7 +427,7 @@ localizer = { self_calibration = true, object_interval_s = 3.0, variant = "oval"
 
 def test_a_type_that_others_have_is_not_overwritten() -> None:
     named = BASE.replace("old", "robot-r1")
-    with pytest.raises(ValueError, match=r"robots\.r2\.type: robot-r1: robot r1 gets a type"):
+    with pytest.raises(InputError, match=r"robots\.r2\.type: robot-r1: robot r1 gets a type"):
         written(FOUND, named)
     alone = named.split("[robots.r2]")[0]
     assert parse_team(written(FOUND, alone)).robots["r1"].speed_m_s == 0.3
@@ -469,7 +470,7 @@ def test_a_calibrated_team_file_can_be_calibrated_again() -> None:
 
 
 def test_a_base_without_the_robots_is_refused() -> None:
-    with pytest.raises(ValueError, match="has none of the robots r1"):
+    with pytest.raises(InputError, match="has none of the robots r1"):
         written(FOUND, 'name = "x"\n[robots.other]\nsource = "external"\n')
     with pytest.raises(TeamFileError):
         written(FOUND, "nonsense")

@@ -25,6 +25,7 @@ from support.keys import OPERATOR, R1, again, router_of, secured_team, session, 
 from support.processes import cpcbl_team, eventually, patient_up
 from typer.testing import CliRunner
 
+from cpcbl_team.errors import InputError
 from cpcbl_launch.cli import app
 from cpcbl_launch.keys.authority import facts, issued, new_authority
 from cpcbl_launch.keys.plan import Deed, hosts, plan
@@ -219,7 +220,7 @@ def test_the_authoritys_key_can_be_kept_elsewhere(team_file: Path) -> None:
 
 def test_an_authority_signs_for_no_longer_than_it_lasts() -> None:
     now = datetime.now(UTC)
-    with pytest.raises(ValueError, match=r"--days: the authority ends"):
+    with pytest.raises(InputError, match=r"--days: the authority ends"):
         issued(new_authority("lab", now), "robot/r1", (), now, timedelta(days=3651))
 
 
@@ -261,7 +262,7 @@ def test_a_table_says_what_was_made(team_file: Path) -> None:
 
 def test_no_robot_takes_the_name_of_an_observer() -> None:
     team, tripod = parse_team(TEAM), Member(role=Role.OBSERVER, name="r1")
-    with pytest.raises(ValueError, match=r"robots\.r1: an observer has this name.*--revoke"):
+    with pytest.raises(InputError, match=r"robots\.r1: an observer has this name.*--revoke"):
         plan(team, [tripod])
     steps = plan(team, [tripod], revoke=["observer/r1"])
     deeds = {str(step.member.identity): step.deed for step in steps}

@@ -24,6 +24,7 @@ from cpcbl_launch.lab.experiments.circuit import circuit, loops, with_keys
 from cpcbl_launch.lab.experiments.results import Experiment, Outcome, Results, accuracy, spread
 from cpcbl_launch.lab.experiments.runs import Case, run, run_all
 from cpcbl_team.config import Team
+from cpcbl_team.errors import InputError
 
 EVERY = {e.name: e for e in (m.EXPERIMENT for m in (table1, figure7, variants, directions))}
 KEYS = {"experiment", "version", "seeds", "loops", "teams", "figures", "paper", "pattern", "cost"}
@@ -176,7 +177,7 @@ def test_a_deaf_observer_stays_wrong_and_one_that_listens_does_not() -> None:
 
 @pytest.mark.parametrize("sizes", [[], [1], [21], [5, 0]])
 def test_team_sizes_are_checked(sizes: list[int]) -> None:
-    with pytest.raises(ValueError, match="--robots: team sizes from 2 to 20"):
+    with pytest.raises(InputError, match="--robots: team sizes from 2 to 20"):
         directions.of_sizes(sizes)
 
 

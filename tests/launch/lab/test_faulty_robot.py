@@ -13,6 +13,7 @@ from cpcbl_launch.lab.experiments import liars
 from cpcbl_launch.lab.experiments.pictures import draw_liars
 from cpcbl_launch.lab.faulty_robot import CLAIM_M, Liar, Lie, LyingBus, lying
 from cpcbl_launch.team_file import builtin
+from cpcbl_team.errors import InputError
 from cpcbl_team.inputs import Belief, Fix
 from cpcbl_transport import topics
 from cpcbl_transport.bus import MemoryHub
@@ -55,7 +56,7 @@ def test_a_lie_is_read_from_text(text: str, lie: Lie) -> None:
     ["", "nothing", "bias", "bias:1", "bias:a,b", "frozen:1", "jumps:nan", "bias:1,1@x-2", "@1-2"],
 )
 def test_what_is_no_lie_is_refused_with_an_example(text: str) -> None:
-    with pytest.raises(ValueError, match="--lie"):
+    with pytest.raises(InputError, match="--lie"):
         Lie.parse(text)
 
 

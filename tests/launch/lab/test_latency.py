@@ -14,6 +14,7 @@ from support.processes import cpcbl_team
 
 from cpcbl_launch.lab.experiments import latency, processes
 from cpcbl_launch.run.usage import MIB, usage
+from cpcbl_team.errors import InputError
 from cpcbl_transport.compact import BELIEF_BYTES, FIX_BYTES
 
 
@@ -96,7 +97,7 @@ def test_sizes_grow_until_one_does_not_keep_10_hz(monkeypatch: pytest.MonkeyPatc
 
 @pytest.mark.parametrize("text", ["", "4,", "0", "4,x", "-1", "10000"])
 def test_sizes_are_checked(text: str) -> None:
-    with pytest.raises(ValueError, match="such as 4,8,16"):
+    with pytest.raises(InputError, match="such as 4,8,16"):
         processes.sizes_in(text)
     assert processes.sizes_in("4, 8,16") == [4, 8, 16]
 

@@ -23,6 +23,7 @@ from cpcbl_launch.run.containers.launch import inside, published
 from cpcbl_launch.run.processes import PROGRAM
 from cpcbl_launch.team_file import builtin, load_team
 from cpcbl_team.config import Team
+from cpcbl_team.errors import InputError
 
 DEMO = load_team(builtin("demo"))
 HOW = Deployment("demo", "cpcbl-team:1")
@@ -138,7 +139,7 @@ def test_a_file_of_ones_own_is_mounted_by_its_way_from_the_compose_file(tmp_path
 
 
 def test_a_log_is_not_for_a_compose_file() -> None:
-    with pytest.raises(ValueError, match=r"up --containers --data"):
+    with pytest.raises(InputError, match=r"up --containers --data"):
         deployed(load_team(builtin("mrclam")), Path("mrclam"), Path(), None, 1)
 
 
@@ -162,7 +163,7 @@ def test_the_router_is_published_where_the_team_file_says(endpoint: str, port: s
 
 
 def test_docker_cannot_publish_at_a_name() -> None:
-    with pytest.raises(ValueError, match=r"transport.listen: tcp/robot.local:7447"):
+    with pytest.raises(InputError, match=r"transport.listen: tcp/robot.local:7447"):
         published("tcp/robot.local:7447")
 
 

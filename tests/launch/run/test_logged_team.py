@@ -33,6 +33,7 @@ from cpcbl_team.config import (
     SensorSettings,
     Start,
 )
+from cpcbl_team.errors import InputError
 from cpcbl_transport.compact import BELIEF_BYTES, FIX_BYTES
 from cpcbl_transport.link_size import sent_bytes
 
@@ -111,13 +112,13 @@ def test_a_robot_that_would_not_read_its_log_is_refused(tmp_path: Path) -> None:
     robots = {**team.robots, "3": RobotSettings()}  # without files: left out, whatever it reads
     assert on_log(msgspec.structs.replace(team, robots=robots), tmp_path).left_out.keys() == {"3"}
     robots["2"] = RobotSettings(source="external")
-    with pytest.raises(ValueError, match=r'robots\.2\.source: external: .* source = "mrclam"'):
+    with pytest.raises(InputError, match=r'robots\.2\.source: external: .* source = "mrclam"'):
         on_log(msgspec.structs.replace(team, robots=robots), tmp_path)
 
 
 @pytest.mark.parametrize("duration_s", [-1.0, 0.0, math.inf, math.nan])
 def test_so_much_of_a_log_cannot_be_used(duration_s: float, tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="at least 1 seconds of robot time"):
+    with pytest.raises(InputError, match="at least 1 seconds of robot time"):
         shortened(logged(tmp_path), duration_s)
 
 
@@ -125,7 +126,7 @@ def test_a_budget_is_not_held_where_nothing_can_be_scored(tmp_path: Path) -> Non
     on, case = logged(tmp_path, seconds=8.0), budget.cases()[0]
     assert budget.point(on, case).position_rmse_m < MILLIMETRE
     late = {name: rows[rows[:, 0] > EPOCH_MS * 1e-3 + 6.0] for name, rows in on.truth.items()}
-    with pytest.raises(ValueError, match=r"no truth in these 2 s; take more of the log"):
+    with pytest.raises(InputError, match=r"no truth in these 2 s; take more of the log"):
         budget.point(shortened(on._replace(truth=late), 2.0), case)
 
 
@@ -136,7 +137,7 @@ def test_blinding_takes_landmarks_from_the_named_robots_only(tmp_path: Path) -> 
 
 
 def test_blinding_an_unknown_robot_names_it_and_those_there_are() -> None:
-    with pytest.raises(ValueError, match=r"no robot 7, x to blind; there are 1, 2"):
+    with pytest.raises(InputError, match=r"no robot 7, x to blind; there are 1, 2"):
         blinded(log_team("1", "2"), ["x", "1", "7"])
 
 

@@ -28,8 +28,9 @@ from cpcbl_launch.run.processes import PROGRAM
 from cpcbl_launch.run.up import Run, free_endpoint, run_team
 from cpcbl_launch.simulation.in_process import simulate
 from cpcbl_launch.simulation.scheduled_guests import Visitor
-from cpcbl_launch.team_file import TeamFileError, builtin, load_team, parse_team, save_resolved
+from cpcbl_launch.team_file import builtin, load_team, parse_team, save_resolved
 from cpcbl_team.config import GuestSettings, MatchSettings, Team, TransportSettings
+from cpcbl_team.errors import InputError
 from cpcbl_transport import topics
 from cpcbl_transport.messages import Status, decode
 from cpcbl_transport.security import CA, CERTIFICATE, PRIVATE_KEY, SecurityError
@@ -60,7 +61,7 @@ def test_places_as_they_are_typed(text: str, place: Place) -> None:
 
 @pytest.mark.parametrize("text", ["", "1", "1,2,3,4", "1;2", "x,1", "nan,1", "1,inf", "1,2,nan"])
 def test_places_that_are_none_are_refused(text: str) -> None:
-    with pytest.raises(ValueError, match=r"--at .*such as"):
+    with pytest.raises(InputError, match=r"--at .*such as"):
         place_in(text)
 
 
@@ -68,7 +69,7 @@ def test_waypoints_as_they_are_typed() -> None:
     assert places_in("") == ()
     assert places_in("2,1; 7,1;") == ((2.0, 1.0), (7.0, 1.0))
     for text in ("1", "1,2;3", "1,2;nan,1", "1,2;x"):
-        with pytest.raises(ValueError, match=r"--move .*such as"):
+        with pytest.raises(InputError, match=r"--move .*such as"):
             places_in(text)
 
 
@@ -96,7 +97,7 @@ def changed(**fields: Any) -> Team:
 def test_a_wish_that_cannot_be_granted_is_refused_with_the_reason(
     team: Team, wish: Wish, said: str
 ) -> None:
-    with pytest.raises((ValueError, TeamFileError), match=said) as refused:
+    with pytest.raises(InputError, match=said) as refused:
         joined(team, wish)
     assert "\n" not in str(refused.value)
 
@@ -114,7 +115,7 @@ def test_a_wish_that_cannot_be_granted_is_refused_with_the_reason(
 def test_a_sensor_file_is_checked_like_a_team_file(text: str, said: str, tmp_path: Path) -> None:
     path = tmp_path / "laser.toml"
     path.write_text(text)
-    with pytest.raises((ValueError, TeamFileError), match=said) as refused:
+    with pytest.raises(InputError, match=said) as refused:
         joined(BLIND, TRIPOD._replace(sensor=str(path)))
     assert str(path) in str(refused.value)
 

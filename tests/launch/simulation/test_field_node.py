@@ -20,6 +20,7 @@ from cpcbl_team.config import (
     SimulationSettings,
     Team,
 )
+from cpcbl_team.errors import InputError
 from cpcbl_team.geometry import Pose2
 from cpcbl_team.inputs import Odometry, Position, Sighting, Sightings
 from cpcbl_transport import topics
@@ -164,7 +165,7 @@ def test_robots_of_other_sites_are_named_by_their_router() -> None:
         "tcp/10.0.0.3:7447": ["observer"],
     }
     for wrong in ("tcp/10.0.0.2:7447", "tcp/10.0.0.2:7447=", "tcp/10.0.0.2:7447=nobody"):
-        with pytest.raises(ValueError, match=r"--site .*no robot .*navigator, observer"):
+        with pytest.raises(InputError, match=r"--site .*no robot .*navigator, observer"):
             robots_at([wrong], team)
 
 

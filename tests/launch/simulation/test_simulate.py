@@ -23,6 +23,7 @@ from cpcbl_team.config import (
     Start,
     Team,
 )
+from cpcbl_team.errors import InputError
 
 TIMED = ("cpu_ms_per_s", "field_cpu_ms_per_s", "times_real_time")
 PNG = b"\x89PNG\r\n\x1a\n"
@@ -84,13 +85,13 @@ def test_robots_of_a_generated_team_drive_round_their_homes() -> None:
 
 @pytest.mark.parametrize("text", ["", "2,", "1", "0,5", "-2", "2,x", "2.5", "10000", "2;5"])
 def test_sizes_that_are_none_are_refused(text: str) -> None:
-    with pytest.raises(ValueError, match=r"--robots .*such as 2,10,50"):
+    with pytest.raises(InputError, match=r"--robots .*such as 2,10,50"):
         parsed_sizes(text)
 
 
 @pytest.mark.parametrize("duration_s", [1.9, 0.0, -5.0, math.nan, math.inf])
 def test_too_short_a_time_measures_nothing(duration_s: float) -> None:
-    with pytest.raises(ValueError, match="--duration"):
+    with pytest.raises(InputError, match="--duration"):
         measured([2], 1, duration_s)
 
 

@@ -17,19 +17,20 @@ from cpcbl_launch.lab.chaos.scenario import CannotRunError, Needs, Scenario, Set
 from cpcbl_launch.lab.chaos.scenarios import SCENARIOS
 from cpcbl_launch.lab.chaos.team import ChaosError
 from cpcbl_launch.run.containers.docker import DockerError
+from cpcbl_team.errors import InputError
 from cpcbl_transport.zenoh_bus import BusError
 
 ALL = "all"
 
 
 def chosen(names: Sequence[str]) -> list[Scenario]:
-    """The scenarios of these names, `all` for all; in the order of the table. Raises ValueError."""
+    """The scenarios of these names, `all` for all; in the order of the table. Raises InputError."""
     known = {scenario.name: scenario for scenario in SCENARIOS}
     for name in names:
         if name not in known and name != ALL:
             close = difflib.get_close_matches(name, known, 1)
             hint = f"did you mean {close[0]}?" if close else f"one of {', '.join(known)}, {ALL}"
-            raise ValueError(f"chaos: no scenario {name!r}; {hint}")
+            raise InputError(f"chaos: no scenario {name!r}; {hint}")
     return [s for s in SCENARIOS if ALL in names or s.name in names]
 
 

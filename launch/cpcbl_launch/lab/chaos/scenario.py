@@ -7,6 +7,7 @@ from typing import NamedTuple
 from cpcbl_launch.lab.chaos.checks import Check
 from cpcbl_launch.lab.chaos.notes import Notes, gone_after_s, inside, longest_gap_s, rmse_m, worst
 from cpcbl_launch.lab.chaos.team import TeamUnderTest
+from cpcbl_team.errors import CpcblError
 
 BASELINE_S = 4.0
 FOUND_M = 0.3
@@ -23,7 +24,7 @@ class Needs(StrEnum):
     DOCKER = "docker"
 
 
-class CannotRunError(Exception):
+class CannotRunError(CpcblError):
     """A scenario found out that it lacks something here."""
 
 

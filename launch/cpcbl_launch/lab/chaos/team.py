@@ -19,6 +19,7 @@ from cpcbl_launch.run.supervisor import ProcessSpec, Supervisor
 from cpcbl_launch.run.up import free_endpoint
 from cpcbl_launch.team_file import builtin, load_team, save_resolved
 from cpcbl_team.config import Team
+from cpcbl_team.errors import CpcblError
 from cpcbl_transport.zenoh_bus import open_bus
 
 LEAD_S, LEAD_S_A_PROCESS = 2.0, 0.4
@@ -28,7 +29,7 @@ POLL_S = 0.05
 ROUTER, FIELD = "router", "field"
 
 
-class ChaosError(Exception):
+class ChaosError(CpcblError):
     """A scenario could not be brought to its fault, or to its end."""
 
 

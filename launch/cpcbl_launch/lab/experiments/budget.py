@@ -18,6 +18,7 @@ from cpcbl_launch.lab.experiments.runs import in_processes
 from cpcbl_launch.reporting.tables import number, percent, table
 from cpcbl_launch.run.logged_team import LoggedTeam
 from cpcbl_launch.simulation.in_process import evaluate_log
+from cpcbl_team.errors import InputError
 
 EVERYTHING: Mapping[str, Any] = {"least_value": 0.0, "least_use": 0.0, "belief_share": 0.0}
 RARE: Mapping[str, Any] = {
@@ -111,7 +112,7 @@ def _every(seconds: float) -> Case:
 
 
 def point(logged: LoggedTeam, case: Case) -> Point:
-    """The figures of one case. Raises ValueError where there is no truth to score it by."""
+    """The figures of one case. Raises InputError where there is no truth to score it by."""
     replace = msgspec.structs.replace
     robots = {}
     for name, robot in logged.team.robots.items():
@@ -122,7 +123,7 @@ def point(logged: LoggedTeam, case: Case) -> Point:
     report = evaluate_log(run)
     team, minutes = report.team, report.duration_s / 60.0 * len(robots)
     if team.position_rmse_m is None or team.heading_rmse_deg is None:
-        raise ValueError(
+        raise InputError(
             f"{logged.team.data}: no truth in these {report.duration_s:g} s; take more of the log"
         )
     blind = [

@@ -31,6 +31,7 @@ from cpcbl_launch.lab.experiments.runs import Case
 from cpcbl_launch.reporting.tables import number, percent, table
 from cpcbl_launch.simulation.in_process import Choice, chosen
 from cpcbl_team.config import RobotSettings, Start, Team
+from cpcbl_team.errors import InputError
 
 DURATION_S = 20.0
 SIZES = (2, 5, 10, 20)
@@ -203,9 +204,9 @@ def draw(result: Outcome, path: Path) -> None:
 
 
 def of_sizes(sizes: Sequence[int]) -> Experiment:
-    """The experiment with teams of these sizes only. Raises ValueError."""
+    """The experiment with teams of these sizes only. Raises InputError."""
     if not sizes or any(not 2 <= size <= 20 for size in sizes):
-        raise ValueError("--robots: team sizes from 2 to 20, such as 2,5")
+        raise InputError("--robots: team sizes from 2 to 20, such as 2,5")
     return EXPERIMENT._replace(cases=partial(cases, sizes))
 
 

@@ -32,6 +32,7 @@ from cpcbl_launch.run.up import free_endpoint
 from cpcbl_launch.run.usage import MIB, usage
 from cpcbl_launch.team_file import save_resolved
 from cpcbl_team.config import CollaborationSettings
+from cpcbl_team.errors import InputError
 from cpcbl_team.inputs import Belief, Odometry
 from cpcbl_transport import topics
 from cpcbl_transport.compact import BELIEF_BYTES, decode_help, encode_help
@@ -132,10 +133,10 @@ class _Ear:
 
 
 def sizes_in(text: str) -> list[int]:
-    """Sizes as they are written on a command line: `4,8,16`. Raises ValueError."""
+    """Sizes as they are written on a command line: `4,8,16`. Raises InputError."""
     parts = [part.strip() for part in text.split(",")]
     if not all(part.isdecimal() and 1 <= int(part) <= MOST_ROBOTS for part in parts):
-        raise ValueError(f"--robots {text}: name sizes from 1 to {MOST_ROBOTS}, such as 4,8,16")
+        raise InputError(f"--robots {text}: name sizes from 1 to {MOST_ROBOTS}, such as 4,8,16")
     return [int(part) for part in parts]
 
 

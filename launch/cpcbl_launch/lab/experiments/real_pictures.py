@@ -23,6 +23,7 @@ from cpcbl_agents.vision.pictures import decoded
 from cpcbl_launch.reporting.tables import table
 from cpcbl_launch.team_file import load_team
 from cpcbl_team.config import Team
+from cpcbl_team.errors import InputError
 from cpcbl_team.geometry import wrap_angle
 from cpcbl_team.inputs import Sighting
 
@@ -74,13 +75,13 @@ class RealPictures(msgspec.Struct, frozen=True, kw_only=True):
 
 def set_named(name: str) -> Path:
     """The table of a built-in set, or one's own file; its team file is beside it. Raises
-    ValueError."""
+    InputError."""
     own = Path(name)
     path = own if own.suffix == ".csv" else _folder() / f"{name}.csv"
     for needed in (path, path.with_suffix(".toml")):
         if not needed.is_file():
             known = ", ".join(sorted(p.stem for p in _folder().glob("*.csv")))
-            raise ValueError(f"{name}: no {needed}; a set is one of {known}, or your own NAME.csv")
+            raise InputError(f"{name}: no {needed}; a set is one of {known}, or your own NAME.csv")
     return path
 
 
@@ -89,28 +90,34 @@ def _folder() -> Path:
 
 
 def truths(path: Path) -> list[Truth]:
-    """The lines of a table. Raises ValueError, naming file and line."""
-    with path.open(newline="", encoding="utf-8") as file:
-        reader = csv.DictReader(file)
-        if tuple(reader.fieldnames or ()) != COLUMNS:
-            raise ValueError(f"{path}: line 1: the columns are {','.join(COLUMNS)}")
-        lines = []
-        for row in reader:
-            try:
-                numbers = [float(row[c]) if row[c] else None for c in COLUMNS[3:]]
-            except (TypeError, ValueError) as error:
-                raise ValueError(f"{path}: line {reader.line_num}: {error}") from error
-            lines.append(Truth(row["picture"], row["viewer"], row["id"], *numbers))
+    """The lines of a table. Raises InputError, naming file and line."""
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            return _lines(path, csv.DictReader(file))
+    except (csv.Error, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: cannot be read: {error}") from error
+
+
+def _lines(path: Path, reader: "csv.DictReader[str]") -> list[Truth]:
+    if tuple(reader.fieldnames or ()) != COLUMNS:
+        raise InputError(f"{path}: line 1: the columns are {','.join(COLUMNS)}")
+    lines = []
+    for row in reader:
+        try:
+            numbers = [float(row[c]) if row[c] else None for c in COLUMNS[3:]]
+        except (TypeError, ValueError) as error:
+            raise InputError(f"{path}: line {reader.line_num}: {error}") from error
+        lines.append(Truth(row["picture"], row["viewer"], row["id"], *numbers))
     return lines
 
 
 def measured(name: str, folder: Path) -> RealPictures:
-    """Everything in the set's pictures. Raises ValueError for what the user can mend."""
+    """Everything in the set's pictures. Raises InputError for what the user can mend."""
     path = set_named(name)
     team, lines = load_team(path.with_suffix(".toml")), truths(path)
     viewers = {line.viewer for line in lines}
     for viewer in sorted(viewers - team.robots.keys()):
-        raise ValueError(f"{path}: no robot {viewer} in {path.with_suffix('.toml')}")
+        raise InputError(f"{path}: no robot {viewer} in {path.with_suffix('.toml')}")
     eyes = {viewer: CameraEyes(viewer, team) for viewer in viewers}
     compared: list[Compared] = []
     unexpected: list[tuple[str, str]] = []
@@ -143,7 +150,7 @@ def _seen(eyes: CameraEyes, path: Path) -> Glimpses | str:
     try:
         image = path.read_bytes()
     except OSError as error:
-        raise ValueError(f"{path}: {error.strerror}; name the folder of the pictures") from error
+        raise InputError(f"{path}: {error.strerror}; name the folder of the pictures") from error
     pixels = decoded(image)
     return pixels if isinstance(pixels, str) else eyes.glimpses(pixels)
 

@@ -20,6 +20,7 @@ from cpcbl_launch.simulation.in_process import (
     simulated_report,
 )
 from cpcbl_team.config import Team
+from cpcbl_team.errors import InputError
 from cpcbl_team.inputs import Sightings
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus, MemoryHub
@@ -60,10 +61,10 @@ class Scale(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def parsed_sizes(text: str) -> list[int]:
-    """The sizes in `2,10,50`. Raises ValueError."""
+    """The sizes in `2,10,50`. Raises InputError."""
     sizes = [int(part) if part.strip().isdecimal() else 0 for part in text.split(",")]
     if not all(2 <= size <= MOST_ROBOTS for size in sizes):
-        raise ValueError(f"--robots {text}: team sizes from 2 to {MOST_ROBOTS}, such as 2,10,50")
+        raise InputError(f"--robots {text}: team sizes from 2 to {MOST_ROBOTS}, such as 2,10,50")
     return sizes
 
 
@@ -75,7 +76,7 @@ def measured(
 ) -> Scale:
     """Generated teams of these sizes, one after the other.
 
-    Raises ValueError for a duration that is too short to measure anything.
+    Raises InputError for a duration that is too short to measure anything.
     """
     check_duration(duration_s, LEAST_S)
     figures: list[Size] = []

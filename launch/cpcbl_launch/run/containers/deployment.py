@@ -7,6 +7,7 @@ from cpcbl_launch.run.containers.compose import Deployment, Mount, compose_text
 from cpcbl_launch.run.containers.image import NAME, checkout, version
 from cpcbl_launch.team_file import parse_team
 from cpcbl_team.config import Team
+from cpcbl_team.errors import InputError
 from cpcbl_transport.security import Identity, credentials_in
 from cpcbl_transport.topics import Role
 
@@ -15,11 +16,11 @@ def deployed(team: Team, file: Path, folder: Path, image: str | None, seed: int)
     """The compose file of the team in `file`, to lie in `folder`.
 
     `file` is mounted into the containers unless it is a built-in team's name. Without `image` the
-    file tells how to build one from the checkout. Raises ValueError for robots that replay a log.
+    file tells how to build one from the checkout. Raises InputError for robots that replay a log.
     """
     for name, robot in team.robots.items():
         if robot.source == "mrclam":
-            raise ValueError(
+            raise InputError(
                 f"robots.{name}.source: mrclam: a log is replayed by `up --containers --data DIR`"
             )
     inside, mounts, keys = str(file), tuple[Mount, ...](), None

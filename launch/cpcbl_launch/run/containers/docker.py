@@ -14,13 +14,15 @@ import time
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
+from cpcbl_team.errors import CpcblError
+
 ON_DEBIAN = "docker/dockerd.sh start installs and starts what is missing on Debian"
 POLL_S = 0.05
 
 Said = Callable[[str], None]
 
 
-class DockerError(ValueError):
+class DockerError(CpcblError):
     """Docker cannot do it; the text says why in one line, and what to do."""
 
 

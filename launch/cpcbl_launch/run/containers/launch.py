@@ -21,6 +21,7 @@ from cpcbl_launch.run.supervisor import Processes
 from cpcbl_launch.run.up import Run, check_keys, dialled
 from cpcbl_launch.team_file import save_resolved
 from cpcbl_team.config import Team
+from cpcbl_team.errors import InputError
 from cpcbl_transport.bus import Bus
 from cpcbl_transport.security import Identity, Link, link_of
 from cpcbl_transport.topics import Role
@@ -147,13 +148,13 @@ def inside(team: Team) -> Team:
 def published(endpoint: str) -> str:
     """[address:]port of this machine for an endpoint; all addresses for 0.0.0.0 and [::].
 
-    Raises ValueError for a name, at which Docker cannot publish.
+    Raises InputError for a name, at which Docker cannot publish.
     """
     address, _, port = endpoint.partition("/")[2].rpartition(":")
     if address in ("0.0.0.0", "[::]"):
         return port
     if not re.fullmatch(r"[0-9.]+", address):
-        raise ValueError(
+        raise InputError(
             f"transport.listen: {endpoint}: Docker publishes at an IPv4 address; write one, or"
             " tcp/0.0.0.0:7447"
         )

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from cpcbl_launch.views.frames.ear import LookEar
 from cpcbl_team.config import Team
+from cpcbl_team.errors import InputError
 from cpcbl_transport.messages import Frame, Look
 from cpcbl_transport.security import Link
 from cpcbl_transport.zenoh_bus import BusError, open_bus
@@ -18,7 +19,7 @@ def looks_of(
 ) -> Iterator[Look]:
     """What a running robot says of its frames, until `stop()`; twice a second at most.
 
-    Raises BusError without a router, ValueError when it says nothing for `wait_s`.
+    Raises BusError without a router, InputError when it says nothing for `wait_s`.
     """
     until_s = time.monotonic() + wait_s
     endpoints = ", ".join(link.endpoints)
@@ -45,7 +46,7 @@ def looks_of(
             now_s = time.monotonic()
             until_s = now_s + wait_s if looks else until_s
             if now_s > until_s:
-                raise ValueError(
+                raise InputError(
                     f"look {robot}: no frame of {robot} in team {team} at {endpoints} for"
                     f" {wait_s:g} s: does it run, and does its camera?"
                 )
@@ -53,7 +54,7 @@ def looks_of(
 
 
 def looks_at(paths: Sequence[Path], robot: str, team: Team) -> Iterator[tuple[Path, Look]]:
-    """What the eyes of a robot make of picture files. Raises OSError, ValueError without OpenCV."""
+    """What the eyes of a robot make of picture files. Raises OSError, InputError without OpenCV."""
     from cpcbl_agents.vision.detector import CameraEyes
 
     eyes = CameraEyes(robot, team)

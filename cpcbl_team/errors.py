@@ -1,0 +1,36 @@
+"""The errors that a user can cause, and can mend: one root for all of them."""
+
+
+class CpcblError(Exception):
+    """Something that a user can cause; its text is one line that names the cause and the remedy.
+
+    The command line catches this class and `OSError`, and nothing else: every other exception is a
+    bug, and ends the program with a traceback.
+
+        CpcblError
+        ├── InputError          an option, an argument or a file of the user
+        │   ├── TeamFileError   a team file (cpcbl_launch.team_file)
+        │   └── LogError        a log or a recording (cpcbl_agents.sources.mrclam)
+        ├── DependencyError     a package or a system that this machine does not have
+        ├── ClockError          the machine's clock was set while a robot ran
+        ├── BusError            no router, or a router that cannot listen (cpcbl_transport)
+        ├── SecurityError       keys or endpoints of a secured team (cpcbl_transport.security)
+        ├── DockerError         Docker refused, or did not end in time (cpcbl_launch.run.containers)
+        ├── CannotRunError      a fault scenario that cannot run here (cpcbl_launch.lab.chaos)
+        └── ChaosError          a fault scenario that did not go its way (cpcbl_launch.lab.chaos)
+
+    Errors of an external library are converted where the file is read. A `ValueError`
+    of this project reports a mistake of the programmer, such as a negative variance.
+    """
+
+
+class InputError(CpcblError):
+    """An option, an argument or a file of the user cannot be used."""
+
+
+class DependencyError(CpcblError):
+    """This machine lacks a package or a facility; the text says how to get it."""
+
+
+class ClockError(CpcblError):
+    """The clock of this machine was set while a robot with real inputs was running."""
