@@ -586,5 +586,7 @@ def test_the_table_in_the_docs_is_that_of_the_topics() -> None:
         f"| `{topic.key}` | {in_words(topic.said_by)} | {in_words(topic.heard_by)} |"
         for topic in topics.TOPICS
     ]
-    table = text.partition("| key | may publish | may subscribe |\n|---|---|---|\n")[2].partition("\n\n")[0]
+    table = text.partition("| key | may publish | may subscribe |\n|---|---|---|\n")[2].partition(
+        "\n\n"
+    )[0]
     assert table.splitlines() == rows

@@ -178,12 +178,10 @@ def robot(
     restarted: Annotated[
         bool, typer.Option(help="It does not know where it is: find the pose first.")
     ] = False,
-    lie: Annotated[str, typer.Option(hidden=True)] = "",
 ) -> None:
     """Run one robot, on any machine, until SIGINT, SIGTERM or SIGHUP."""
     from cpcbl_agents.clock import Clock
     from cpcbl_agents.process import Stop, run_robot
-    from cpcbl_launch.lab.faulty_robot import Lie, lying
     from cpcbl_launch.options import must_see
     from cpcbl_launch.team_file import TeamFileError
 
@@ -194,8 +192,7 @@ def robot(
         )
     must_see(team, [name])
     when = Clock.parse(clock) if clock else Clock.wall()
-    through = lying(Lie.parse(lie) if lie else None, name, when.epoch_ns)
-    run_robot(name, team, connect or team.transport.connect, when, Stop(parent), restarted, through)
+    run_robot(name, team, connect or team.transport.connect, when, Stop(parent), restarted)
 
 
 def field(

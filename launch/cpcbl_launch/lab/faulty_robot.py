@@ -1,25 +1,38 @@
-"""A robot that is let in and says what is not so: for experiments and for trying faults out.
+"""A robot of the team that sends wrong positions on purpose, for experiments and fault scenarios.
 
-`LyingBus` stands between an honest robot and its bus and changes the fixes and beliefs that leave
-it; the robot itself does not know. A lie is written `KIND:VALUES@FROM-UNTIL`, seconds after the
-start, from its own start to the end where the times are left out:
+`FaultyBus` stands between a robot and its bus and changes the fixes and beliefs that the robot
+sends; the robot itself works correctly. A fault is written `KIND:VALUES@FROM-UNTIL`, with times in
+seconds after the start. Without times it lasts from the start to the end.
 
-| `bias:0.5,0.5` | everything so many metres away, x and y |
-| `frozen` | each teammate, and itself, where it saw it last |
-| `jumps:1.5` | everything so far away, every 2 s in another direction |
-| `overconfident:0.3` | with an error of this sigma in metres, and a claim of 1 mm |
-| `clock:0.5` | stamped so many seconds later (below zero: earlier) |
+| fault | effect on each fix and belief |
+|---|---|
+| `bias:0.5,0.5` | its position is shifted by so many metres in x and y |
+| `frozen` | its position stays the last one from before the fault |
+| `jumps:1.5` | its position is shifted by so many metres, every 2 s in another direction |
+| `overconfident:0.3` | its position has an error of this sigma (m), but it states 1 mm |
+| `clock:0.5` | its stamp is so many seconds too late (negative: too early) |
+
+`python -m cpcbl_launch.lab.faulty_robot NAME --team FILE --fault FAULT` runs such a robot.
 """
 
+import argparse
+import logging
 import math
 import random
 import re
-from collections.abc import Callable
+import sys
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
 from typing import NamedTuple
 
 import msgspec
 
-from cpcbl_team.errors import InputError
+from cpcbl_agents.clock import Clock
+from cpcbl_agents.process import Stop, run_robot
+from cpcbl_launch.run.processes import PROGRAM
+from cpcbl_launch.team_file import load_team
+from cpcbl_team.errors import CpcblError, InputError
 from cpcbl_team.inputs import Belief, Fix
 from cpcbl_transport.bus import Bus, Publisher
 from cpcbl_transport.bus_proxy import PassingBus, PassingPublisher
@@ -28,15 +41,15 @@ from cpcbl_transport.messages import Refusal
 from cpcbl_transport.topics import Qos
 
 Help = Belief | Fix
-ARGUMENTS = {"bias": 2, "frozen": 0, "jumps": 1, "overconfident": 1, "clock": 1}
+VALUE_COUNTS = {"bias": 2, "frozen": 0, "jumps": 1, "overconfident": 1, "clock": 1}
 JUMP_NS = 2_000_000_000
-CLAIM_M = 0.001
-_HELP = ("fix/", "belief/")
+STATED_SIGMA_M = 0.001
+_HELP_KEYS = ("fix/", "belief/")
 _TEXT = re.compile(r"(?P<kind>[a-z]+)(:(?P<values>[^@]*))?(@(?P<since>[^-@]+)-(?P<until>[^-@]*))?")
 
 
-class Lie(NamedTuple):
-    """What is said, and when."""
+class Fault(NamedTuple):
+    """What is wrong with the messages of a robot, and when."""
 
     kind: str
     values: tuple[float, ...] = ()
@@ -44,96 +57,136 @@ class Lie(NamedTuple):
     until_s: float = math.inf
 
     @staticmethod
-    def parse(text: str) -> "Lie":
-        """Raises InputError."""
+    def parse(text: str) -> "Fault":
+        """The fault that a text such as `bias:0.5,0.5@10-30` describes. Raises InputError."""
         match = _TEXT.fullmatch(text)
         kind = match["kind"] if match else ""
-        if match is None or kind not in ARGUMENTS:
-            raise InputError(f"--lie {text}: write {', '.join(ARGUMENTS)}, e.g. bias:0.5,0.5@10-30")
+        if match is None or kind not in VALUE_COUNTS:
+            kinds = ", ".join(VALUE_COUNTS)
+            raise InputError(f"--fault {text}: write {kinds}, e.g. bias:0.5,0.5@10-30")
         try:
             values = tuple(float(v) for v in (match["values"] or "").split(",") if v)
             since, until = float(match["since"] or 0.0), float(match["until"] or math.inf)
         except ValueError:
-            raise InputError(f"--lie {text}: numbers, e.g. bias:0.5,0.5@10-30") from None
-        if len(values) != ARGUMENTS[kind] or not all(map(math.isfinite, values)):
-            raise InputError(f"--lie {text}: {kind} takes {ARGUMENTS[kind]} numbers")
-        return Lie(kind, values, since, until)
+            raise InputError(f"--fault {text}: write numbers, e.g. bias:0.5,0.5@10-30") from None
+        if len(values) != VALUE_COUNTS[kind] or not all(map(math.isfinite, values)):
+            raise InputError(f"--fault {text}: {kind} takes {VALUE_COUNTS[kind]} numbers")
+        return Fault(kind, values, since, until)
 
 
-class Liar:
-    """Changes what a robot says. The same words and the same name give the same lies."""
+class FaultInjector:
+    """Changes the messages of one robot. The same messages and name give the same changes."""
 
-    def __init__(self, lie: Lie, name: str, start_ns: int) -> None:
-        self._lie, self._start_ns = lie, start_ns
-        self._name = name
+    def __init__(self, fault: Fault, name: str, start_ns: int) -> None:
+        self._fault, self._name, self._start_ns = fault, name, start_ns
         self._random = random.Random(name)
-        self._last: dict[tuple[type, str], tuple[float, float]] = {}
+        self._last_xy_m: dict[tuple[type, str], tuple[float, float]] = {}
 
-    def said(self, message: Help) -> Help:
-        """What leaves the robot in place of its message."""
+    def alter(self, message: Help) -> Help:
+        """What the robot sends in place of the message."""
         since_s = (message.stamp_ns - self._start_ns) * 1e-9
-        lies = self._lie.from_s <= since_s < self._lie.until_s
-        if self._lie.kind == "frozen":
-            return self._frozen(message, lies)
-        if not lies:
+        is_active = self._fault.from_s <= since_s < self._fault.until_s
+        if self._fault.kind == "frozen":
+            return self._freeze(message, is_active)
+        if not is_active:
             return message
         replace = msgspec.structs.replace
-        if self._lie.kind == "clock":
-            return replace(message, stamp_ns=message.stamp_ns + int(self._lie.values[0] * 1e9))
+        if self._fault.kind == "clock":
+            return replace(message, stamp_ns=message.stamp_ns + int(self._fault.values[0] * 1e9))
         dx, dy = self._offset(message.stamp_ns)
         message = replace(message, x_m=message.x_m + dx, y_m=message.y_m + dy)
-        return _certain(message) if self._lie.kind == "overconfident" else message
+        return _with_tiny_covariance(message) if self._fault.kind == "overconfident" else message
 
     def _offset(self, stamp_ns: int) -> tuple[float, float]:
-        first, *_ = self._lie.values
-        if self._lie.kind == "bias":
-            return first, self._lie.values[1]
-        if self._lie.kind == "overconfident":
+        """Metres in x and y."""
+        first, *_ = self._fault.values
+        if self._fault.kind == "bias":
+            return first, self._fault.values[1]
+        if self._fault.kind == "overconfident":
             return self._random.gauss(0.0, first), self._random.gauss(0.0, first)
-        turn = (stamp_ns - self._start_ns) // JUMP_NS
-        direction = random.Random(f"{self._name} {turn}").uniform(0.0, math.tau)
+        jump = (stamp_ns - self._start_ns) // JUMP_NS
+        direction = random.Random(f"{self._name} {jump}").uniform(0.0, math.tau)
         return first * math.cos(direction), first * math.sin(direction)
 
-    def _frozen(self, message: Help, lies: bool) -> Help:
+    def _freeze(self, message: Help, is_active: bool) -> Help:
         key = type(message), message.robot
-        if not lies or key not in self._last:
-            self._last[key] = message.x_m, message.y_m
-        x, y = self._last[key]
+        if not is_active or key not in self._last_xy_m:
+            self._last_xy_m[key] = message.x_m, message.y_m
+        x, y = self._last_xy_m[key]
         return msgspec.structs.replace(message, x_m=x, y_m=y)
 
 
-def _certain(message: Help) -> Help:
-    """With next to no covariance."""
-    tiny, replace = CLAIM_M * CLAIM_M, msgspec.structs.replace
+def _with_tiny_covariance(message: Help) -> Help:
+    variance, replace = STATED_SIGMA_M**2, msgspec.structs.replace
     if isinstance(message, Fix):
-        claim = (tiny, 0.0, tiny)
-        return replace(message, sensor_covariance=claim, observer_covariance=claim)
-    return replace(message, covariance=(tiny, 0.0, tiny, 0.0, 0.0, tiny))
+        position = (variance, 0.0, variance)
+        return replace(message, sensor_covariance=position, observer_covariance=position)
+    return replace(message, covariance=(variance, 0.0, variance, 0.0, 0.0, variance))
 
 
-class _LyingPublisher(PassingPublisher):
-    def __init__(self, key: str, publisher: Publisher, liar: Liar) -> None:
+class _FaultyPublisher(PassingPublisher):
+    def __init__(self, key: str, publisher: Publisher, injector: FaultInjector) -> None:
         super().__init__(publisher)
-        self._key, self._liar = key, liar
+        self._key, self._injector = key, injector
 
     def put(self, payload: bytes) -> None:
         message = decode_help(self._key, payload)
-        assert not isinstance(message, Refusal)  # the robot itself is honest
-        super().put(encode_help(self._liar.said(message)))
+        assert not isinstance(message, Refusal)  # the robot itself works correctly
+        super().put(encode_help(self._injector.alter(message)))
 
 
-class LyingBus(PassingBus):
-    """A bus on which fixes and beliefs are changed on their way out."""
+class FaultyBus(PassingBus):
+    """A bus that changes the fixes and beliefs of the robot `name` when they are sent."""
 
-    def __init__(self, bus: Bus, liar: Liar) -> None:
+    def __init__(self, bus: Bus, fault: Fault, name: str, start_ns: int) -> None:
         super().__init__(bus)
-        self._liar = liar
+        self._injector = FaultInjector(fault, name, start_ns)
 
     def publisher(self, key: str, qos: Qos) -> Publisher:
         publisher = super().publisher(key, qos)
-        return _LyingPublisher(key, publisher, self._liar) if key.startswith(_HELP) else publisher
+        if not key.startswith(_HELP_KEYS):
+            return publisher
+        return _FaultyPublisher(key, publisher, self._injector)
 
 
-def lying(lie: Lie | None, name: str, start_ns: int) -> Callable[[Bus], Bus]:
-    """What makes a liar of the robot whose bus it is given; nothing does without a lie."""
-    return lambda bus: bus if lie is None else LyingBus(bus, Liar(lie, name, start_ns))
+def faulty_command(command: Sequence[str], fault: str) -> tuple[str, ...]:
+    """The command of a faulty robot, made from that of the robot (`cpcbl-team robot ...`)."""
+    after = len(PROGRAM)
+    assert tuple(command[: after + 1]) == (*PROGRAM, "robot")
+    return (
+        sys.executable,
+        "-m",
+        "cpcbl_launch.lab.faulty_robot",
+        *command[after + 1 :],
+        "--fault",
+        fault,
+    )
+
+
+def main() -> None:
+    """Runs one faulty robot until SIGINT, SIGTERM or SIGHUP."""
+    parser = argparse.ArgumentParser(prog="faulty_robot", description=main.__doc__)
+    parser.add_argument("name", help="The robot's name in the team file.")
+    parser.add_argument("--team", type=Path, required=True, help="Team file.")
+    parser.add_argument("--fault", required=True, help="For example bias:0.5,0.5@10-30.")
+    parser.add_argument("--connect", action="append", help="Endpoint of the router.")
+    parser.add_argument("--clock", default="", help="The clock of the run.")
+    parser.add_argument("--parent", type=int, help="It ends when this process has ended.")
+    parser.add_argument("--restarted", action="store_true", help="Its start pose is not known.")
+    given = parser.parse_args()
+    logging.basicConfig(format="%(asctime)s %(levelname)s %(message)s", level=logging.INFO)
+    try:
+        fault, team = Fault.parse(given.fault), load_team(given.team)
+        if given.name not in team.robots:
+            raise InputError(f"{given.team}: it has no robot {given.name}")
+    except CpcblError as error:
+        parser.error(str(error))
+    clock = Clock.parse(given.clock) if given.clock else Clock.wall()
+    wrap_bus = partial(FaultyBus, fault=fault, name=given.name, start_ns=clock.epoch_ns)
+    endpoints = given.connect or team.transport.connect
+    stop = Stop(given.parent)
+    run_robot(given.name, team, endpoints, clock, stop, given.restarted, wrap_bus)
+
+
+if __name__ == "__main__":
+    main()

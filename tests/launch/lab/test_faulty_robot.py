@@ -1,17 +1,24 @@
-"""The liar of the experiments: what it says in place of the truth, and what a team makes of it."""
+"""Faulty robots: what they send in place of correct positions, and how a team reacts to them."""
 
 import json
 import math
 from pathlib import Path
+from subprocess import run
 
 import msgspec
 import pytest
 from support.buses import MS, SECOND, Ear
-from support.processes import cpcbl_team
 
 from cpcbl_launch.lab.experiments import liars
 from cpcbl_launch.lab.experiments.pictures import draw_liars
-from cpcbl_launch.lab.faulty_robot import CLAIM_M, Liar, Lie, LyingBus, lying
+from cpcbl_launch.lab.faulty_robot import (
+    STATED_SIGMA_M,
+    Fault,
+    FaultInjector,
+    FaultyBus,
+    faulty_command,
+)
+from cpcbl_launch.run.processes import PROGRAM
 from cpcbl_launch.team_file import builtin
 from cpcbl_team.errors import InputError
 from cpcbl_team.inputs import Belief, Fix
@@ -33,65 +40,65 @@ def belief(at_s: float, x: float = 1.0) -> Belief:
     return Belief("liar", round(at_s * SECOND), x, 0.0, 0.0, (0.01, 0.0, 0.01, 0.0, 0.0, 0.01))
 
 
-def liar(text: str) -> Liar:
-    return Liar(Lie.parse(text), "liar", 0)
+def injector(text: str) -> FaultInjector:
+    return FaultInjector(Fault.parse(text), "liar", 0)
 
 
 @pytest.mark.parametrize(
-    ("text", "lie"),
+    ("text", "fault"),
     [
-        ("bias:0.5,-0.5@10-30", Lie("bias", (0.5, -0.5), 10.0, 30.0)),
-        ("frozen", Lie("frozen", (), 0.0, math.inf)),
-        ("jumps:1.5@3-", Lie("jumps", (1.5,), 3.0, math.inf)),
-        ("overconfident:0.3@0-1.5", Lie("overconfident", (0.3,), 0.0, 1.5)),
-        ("clock:-0.5", Lie("clock", (-0.5,), 0.0, math.inf)),
+        ("bias:0.5,-0.5@10-30", Fault("bias", (0.5, -0.5), 10.0, 30.0)),
+        ("frozen", Fault("frozen", (), 0.0, math.inf)),
+        ("jumps:1.5@3-", Fault("jumps", (1.5,), 3.0, math.inf)),
+        ("overconfident:0.3@0-1.5", Fault("overconfident", (0.3,), 0.0, 1.5)),
+        ("clock:-0.5", Fault("clock", (-0.5,), 0.0, math.inf)),
     ],
 )
-def test_a_lie_is_read_from_text(text: str, lie: Lie) -> None:
-    assert Lie.parse(text) == lie
+def test_a_fault_is_parsed_from_text(text: str, fault: Fault) -> None:
+    assert Fault.parse(text) == fault
 
 
 @pytest.mark.parametrize(
     "text",
     ["", "nothing", "bias", "bias:1", "bias:a,b", "frozen:1", "jumps:nan", "bias:1,1@x-2", "@1-2"],
 )
-def test_what_is_no_lie_is_refused_with_an_example(text: str) -> None:
-    with pytest.raises(InputError, match="--lie"):
-        Lie.parse(text)
+def test_a_text_that_is_no_fault_is_refused_with_an_example(text: str) -> None:
+    with pytest.raises(InputError, match="--fault"):
+        Fault.parse(text)
 
 
-def test_before_and_after_its_time_the_truth_is_said() -> None:
+def test_messages_are_unchanged_before_and_after_the_fault() -> None:
     for kind in ("bias:1,1", "frozen", "jumps:1", "overconfident:1", "clock:1"):
-        teller = liar(f"{kind}@10-20")
+        faulty = injector(f"{kind}@10-20")
         for at_s in (0.0, 9.9, 20.0, 30.0):
-            assert teller.said(fix(at_s)) == fix(at_s)
-        assert teller.said(fix(10.0, x=5.0)) != fix(10.0, x=5.0)
+            assert faulty.alter(fix(at_s)) == fix(at_s)
+        assert faulty.alter(fix(10.0, x=5.0)) != fix(10.0, x=5.0)
 
 
-def test_each_kind_says_what_it_states() -> None:
-    biased = liar("bias:0.5,-0.25").said(fix(1.0))
+def test_each_kind_changes_what_it_names() -> None:
+    biased = injector("bias:0.5,-0.25").alter(fix(1.0))
     assert (biased.x_m, biased.y_m) == (1.5, 1.75)
-    late = liar("clock:-0.5").said(fix(1.0))
+    late = injector("clock:-0.5").alter(fix(1.0))
     assert late == msgspec.structs.replace(fix(1.0), stamp_ns=500 * MS)
-    frozen = liar("frozen@1-9")
-    frozen.said(fix(0.5))
-    assert frozen.said(fix(1.0, x=7.0)).x_m == frozen.said(fix(2.0, x=8.0)).x_m == 1.0
-    sure = liar("overconfident:0.3").said(fix(1.0))
+    frozen = injector("frozen@1-9")
+    frozen.alter(fix(0.5))
+    assert frozen.alter(fix(1.0, x=7.0)).x_m == frozen.alter(fix(2.0, x=8.0)).x_m == 1.0
+    sure = injector("overconfident:0.3").alter(fix(1.0))
     assert isinstance(sure, Fix)
-    assert sure.sensor_covariance == (CLAIM_M**2, 0.0, CLAIM_M**2)
+    assert sure.sensor_covariance == (STATED_SIGMA_M**2, 0.0, STATED_SIGMA_M**2)
 
 
 def test_jumps_last_two_seconds_and_are_as_far_as_stated() -> None:
-    teller = liar("jumps:1.5")
-    places = [teller.said(fix(at_s)) for at_s in (0.0, 1.9, 2.0, 3.9)]
+    faulty = injector("jumps:1.5")
+    places = [faulty.alter(fix(at_s)) for at_s in (0.0, 1.9, 2.0, 3.9)]
     assert places[0].x_m == places[1].x_m != places[2].x_m == places[3].x_m
     assert all(math.hypot(p.x_m - 1.0, p.y_m - 2.0) == pytest.approx(1.5) for p in places)
 
 
-def test_the_same_liar_tells_the_same_lies() -> None:
+def test_the_same_fault_and_name_give_the_same_changes() -> None:
     said = [
-        [teller.said(fix(0.1 * i)) for i in range(20)]
-        for teller in (liar("overconfident:0.3"), liar("overconfident:0.3"))
+        [faulty.alter(fix(0.1 * i)) for i in range(20)]
+        for faulty in (injector("overconfident:0.3"), injector("overconfident:0.3"))
     ]
     assert said[0] == said[1]
 
@@ -99,8 +106,7 @@ def test_the_same_liar_tells_the_same_lies() -> None:
 def test_only_fixes_and_beliefs_are_changed_on_their_way_out() -> None:
     hub = MemoryHub()
     ear = Ear(hub.session(), "**")
-    bus = lying(Lie.parse("bias:1,0"), "liar", 0)(hub.session())
-    assert isinstance(bus, LyingBus)
+    bus = FaultyBus(hub.session(), Fault.parse("bias:1,0"), "liar", 0)
     track = Track("liar", 0, 1.0, 0.0, 0.0, None, 3)
     with bus:
         for key, payload in (
@@ -112,15 +118,12 @@ def test_only_fixes_and_beliefs_are_changed_on_their_way_out() -> None:
     assert [getattr(m, "x_m", None) for m in ear.messages] == [2.0, 2.0, 1.0]
 
 
-def test_without_a_lie_the_bus_is_the_robots_own() -> None:
-    bus = MemoryHub().session()
-    assert lying(None, "honest", 0)(bus) is bus
-
-
-def test_a_robot_process_refuses_a_lie_that_is_none() -> None:
-    result = cpcbl_team("robot", "patrol", "--team", builtin("demo"), "--lie", "bias:1")
+def test_the_process_refuses_a_text_that_is_no_fault() -> None:
+    command = (*PROGRAM, "robot", "patrol", "--team", str(builtin("demo")))
+    words = faulty_command(command, "bias:1")
+    result = run(words, capture_output=True, text=True, timeout=60.0, check=False)
     assert result.returncode == 2
-    assert "--lie bias:1: bias takes 2 numbers" in result.stderr
+    assert "--fault bias:1: bias takes 2 numbers" in result.stderr
 
 
 # The experiment -----------------------------------------------------------------------------------

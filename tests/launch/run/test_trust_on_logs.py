@@ -1,13 +1,13 @@
 """Real robots, whose errors are correlated and unmodelled, are honest: they are believed."""
 
 import os
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 
 import msgspec
 import pytest
 
-from cpcbl_launch.lab.faulty_robot import Lie, lying
+from cpcbl_launch.lab.faulty_robot import Fault, FaultyBus
 from cpcbl_launch.reporting.metrics import score
 from cpcbl_launch.reporting.recorder import Recorder, Report
 from cpcbl_launch.run import logged_team
@@ -59,7 +59,8 @@ def test_a_robot_that_sees_landmarks_is_not_harmed_by_a_liar() -> None:
     log = logged("MRCLAM6", True)
     hub = MemoryHub()
     recorder = Recorder(hub.session())
-    through = {"1": lying(Lie.parse("bias:1.0,1.0@300-900"), "1", log.start_ns)}
+    fault = Fault.parse("bias:1.0,1.0@300-900")
+    through = {"1": partial(FaultyBus, fault=fault, name="1", start_ns=log.start_ns)}
     nodes = robot_nodes(log.team, hub, log.start_ns, through)
     run_nodes(nodes, log.start_ns, log.start_ns + 600 * 10**9)
     assert [t.peer for t in recorder.status["2"].trust if t.quarantines] == ["1"]

@@ -14,6 +14,7 @@ import msgspec
 
 from cpcbl_agents.clock import Clock
 from cpcbl_launch.lab.chaos.notes import Notes, NoteTaker, found_after_s, latest_incarnation
+from cpcbl_launch.lab.faulty_robot import faulty_command
 from cpcbl_launch.run.processes import PROGRAM, process_table
 from cpcbl_launch.run.supervisor import ProcessSpec, Supervisor
 from cpcbl_launch.run.up import free_endpoint
@@ -52,8 +53,8 @@ class Plan(NamedTuple):
     """The endpoint that a robot dials, where it is not the router's."""
     prefix: Mapping[str, tuple[str, ...]] = MappingProxyType({})
     """What a robot's command begins with, such as `ip netns exec`."""
-    more: Mapping[str, tuple[str, ...]] = MappingProxyType({})
-    """What a robot's command ends with, such as `--lie bias:0.5,0.5`."""
+    faults: Mapping[str, str] = MappingProxyType({})
+    """The fault of a robot that sends wrong positions, such as `bias:0.5,0.5@10-30`."""
     also_listen: Sequence[str] = ()
     """Further endpoints of the router."""
     sites: Mapping[str, Site] = MappingProxyType({})
@@ -247,11 +248,9 @@ def _table(plan: Plan, folder: Path, endpoint: str, clock: Clock) -> list[Proces
             continue
         link = plan.links.get(name, endpoint)
         own = process_table(plan.team, team_file, link, clock, plan.seed, here=(name,))[-1]
-        rows.append(
-            own._replace(
-                command=(*plan.prefix.get(name, ()), *own.command, *plan.more.get(name, ()))
-            )
-        )
+        fault = plan.faults.get(name, "")
+        command = faulty_command(own.command, fault) if fault else own.command
+        rows.append(own._replace(command=(*plan.prefix.get(name, ()), *command)))
     return rows
 
 

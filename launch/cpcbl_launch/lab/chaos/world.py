@@ -177,7 +177,7 @@ def liar(setting: Setting) -> Found:
     """One of three observers says everything 0.7 m away, for a while."""
     lie = f"{LIE}@{LIE_S[0]:g}-{LIE_S[1]:g}"
     crowd = liars.team(liars.Case(lie=LIE))
-    with running(Plan(crowd, setting.seed, more={liars.LIAR: ("--lie", lie)})) as team:
+    with running(Plan(crowd, setting.seed, faults={liars.LIAR: lie})) as team:
         setting.say("starting a team")
         team.settle()
         setting.say(f"{liars.LIAR} sends wrong positions from {LIE_S[0]:g} s to {LIE_S[1]:g} s")

@@ -9,6 +9,7 @@ robots that drive, from 10 s on, beside the team without the liar, and beside on
 
 import math
 from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 from importlib.metadata import version
 from typing import NamedTuple
 
@@ -18,7 +19,7 @@ from rich.console import RenderableType
 
 from cpcbl_launch.lab.experiments.results import Spread, spread
 from cpcbl_launch.lab.experiments.runs import in_processes
-from cpcbl_launch.lab.faulty_robot import Lie, lying
+from cpcbl_launch.lab.faulty_robot import Fault, FaultyBus
 from cpcbl_launch.reporting.metrics import position_errors
 from cpcbl_launch.reporting.tables import number, table
 from cpcbl_launch.simulation.in_process import simulate
@@ -50,7 +51,7 @@ class Case(msgspec.Struct, frozen=True, kw_only=True):
     """What is run."""
 
     lie: str
-    """As in `--lie`, without its times; empty: the truth."""
+    """The fault of the liar without its times; empty: it works correctly."""
     liar: bool = True
     """Whether the liar is there at all."""
     honest: int = 2
@@ -187,8 +188,8 @@ def run(case: Case, seed: int) -> Run:
     """One run. The same case and seed give the same figures."""
     statuses, through = _Statuses(), {}
     if case.lie:
-        lie = Lie.parse(f"{case.lie}@{FROM_S}-{UNTIL_S}")
-        through = {LIAR: lying(lie, LIAR, 0)}
+        fault = Fault.parse(f"{case.lie}@{FROM_S}-{UNTIL_S}")
+        through = {LIAR: partial(FaultyBus, fault=fault, name=LIAR, start_ns=0)}
     _, recorder = simulate(team(case), seed, END_S, referee=statuses, through=through)
     truth = recorder.simulated_truth()
     errors = {
