@@ -12,7 +12,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 from net.canonical import Canonical, canonical_state, canonical_track
-from net.scenario import FIELD, START, arrivals
+from net.scenario import FIELD, START, arrivals, with_bearings_only, without_landmarks
 
 import cpcbl_launch
 from cpcbl_launch.simulation.in_process import simulate
@@ -86,9 +86,13 @@ CONFIGURATIONS: dict[str, LocalizationSettings] = {
 
 
 def recorded_states() -> dict[str, Run]:
-    """The state after every input of the drive, for each configuration."""
+    """The states after every input: each configuration on the drive, `joint` on other drives."""
     inputs = [arrival.item for arrival in arrivals()]
-    return {name: _drive(settings, inputs) for name, settings in CONFIGURATIONS.items()}
+    runs = {name: _drive(settings, inputs) for name, settings in CONFIGURATIONS.items()}
+    joint = CONFIGURATIONS["joint"]
+    runs["joint, without landmarks"] = _drive(joint, without_landmarks())
+    runs["joint, bearings only"] = _drive(joint, with_bearings_only())
+    return runs
 
 
 def _drive(settings: LocalizationSettings, inputs: Iterable[Input]) -> Run:

@@ -69,7 +69,7 @@ def _first_in_run(name: str, old: Run, new: Run, exact: bool) -> str:
     if not found:
         return f"{line}; no state that is stored whole differs"
     first = [d for d in found if d.step == found[0].step]
-    fields = ", ".join(dict.fromkeys(d.field.partition(".")[0] for d in first))
+    fields = ", ".join(dict.fromkeys(_field_name(d.field).partition(".")[0] for d in first))
     return (
         f"{line}; in the first whole state, of step {first[0].step}, {first[0].field} was "
         f"{first[0].old!r}, is {first[0].new!r} ({len(first)} numbers differ, in: {fields})"

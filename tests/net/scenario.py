@@ -11,6 +11,8 @@ from collections.abc import Iterator
 from random import Random
 from typing import NamedTuple
 
+from msgspec.structs import replace
+
 from cpcbl_team.config import Field, Landmark, Wall
 from cpcbl_team.geometry import Pose2, step, wrap_angle
 from cpcbl_team.inputs import Belief, Fix, Input, Odometry, Position, Sighting, Sightings, Told
@@ -154,3 +156,46 @@ def _fix(rng: Random, name: str, tick: int, now: int, truth: Pose2) -> Fix:
         return Fix("me", name, now, x, y, *parts)
     away = 1.5 if name == "ally" and tick % 40 < 3 else 0.05 * rng.gauss(0.0, 1.0)
     return Fix("me", name, now, x, y, *parts, wrap_angle(truth.heading + away), 0.002, 0.001)
+
+
+# Other drives -------------------------------------------------------------------------------------
+
+
+def without_landmarks() -> list[Input]:
+    """The same drive of a robot that depends on two teammates. What `liar` sends drifts away, later
+    it repeats one position ("frozen"); in between the fixes of `mate` jump to and fro."""
+    found: list[Input] = []
+    for _, item in arrivals():
+        if isinstance(item, Position) or getattr(item, "observer", "") == "ally":
+            continue
+        if isinstance(item, Sightings):
+            kept = tuple(s for s in item.sightings if s.id in ("liar", "mate"))
+            item = Sightings(item.stamp_ns, kept)
+        found.append(_with_faults(item) if isinstance(item, Fix) else item)
+    return found
+
+
+def _with_faults(fix: Fix) -> Fix:
+    second = fix.stamp_ns * 1e-9
+    if fix.observer == "liar" and second < 16.0:
+        honest_m = fix.x_m - _offset_m("liar", fix.stamp_ns // _TICK_NS)
+        return replace(fix, x_m=honest_m + 0.1 * max(0.0, second - 5.0))
+    if fix.observer == "liar" and second > 28.0:
+        return replace(fix, x_m=-1.0, y_m=-1.0)
+    if fix.observer == "mate" and 18.0 < second < 24.0:
+        return replace(fix, x_m=fix.x_m + (1.5 if int(second) % 2 else -1.5))
+    return fix
+
+
+def with_bearings_only() -> list[Input]:
+    """The same drive of a robot that is alone and measures no ranges."""
+    found: list[Input] = []
+    for _, item in arrivals():
+        if item.stamp_ns > 24_000_000_000:  # it has found itself again
+            break
+        if isinstance(item, Odometry):
+            found.append(item)
+        elif isinstance(item, Sightings):
+            bearings = (Sighting(s.id, None, s.bearing_rad) for s in item.sightings)
+            found.append(Sightings(item.stamp_ns, tuple(bearings)))
+    return found

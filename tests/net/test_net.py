@@ -1,10 +1,10 @@
 """The net: a refactoring must not change a single bit of what the localizer computes.
 
 Two recordings are compared with a stored reference: the localizer's state after every input of a
-drive in which everything happens once (`scenario`), for ten configurations (`recording`), and the
-tracks of all robots of the simulated demo for three seeds. The reference has a hash of every state
-and some whole states, so that a failure can name the first number that differs. It knows nothing
-of Python names: after a rename only `canonical` is edited.
+drive in which everything happens once (`scenario`), for ten configurations (`recording`), one of
+them also on two other drives; and the tracks of all robots of the simulated demo for three seeds.
+The reference has a hash of every state and some whole states, so that a failure can name the first
+number that differs. It knows nothing of Python names: after a rename only `canonical` is edited.
 
 The reference holds for CPython's mathematics on glibc, x86-64, with numpy's random numbers. On a
 platform where these give other bits (a fingerprint is stored) the whole states are compared within
@@ -32,6 +32,7 @@ WHAT_HAPPENS = {
     "range_not_positive",
     "readmitted",
 }
+REASONS = {"biased", "frozen", "jumps", "outvoted", "overconfident"}
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -41,9 +42,13 @@ def test_nothing_has_moved(kind: str) -> None:
 
 def test_everything_happens_in_the_drive() -> None:
     """The reference holds every event that the localizer counts, and all kinds of senders."""
-    last = [run.kept[max(run.kept)] for run in read_reference("states").runs.values()]
+    runs = read_reference("states").runs.values()
+    last = [run.kept[max(run.kept)] for run in runs]
     assert {event for state in last for event in state["counts"]} >= WHAT_HAPPENS
-    assert all(len(state["beliefs"]) == 3 for state in last)
+    states = [state for run in runs for state in run.kept.values()]
+    senders = [item for state in states for item in state["trust"].items()]
+    assert {sender["reason"] for _, sender in senders} >= REASONS
+    assert {name for name, _ in senders} == {"own sensors", "ally", "liar", "mate"}
     moved = [state["self_calibration"]["distance_scale"][0] for state in last]
     assert sum(scale != 1.0 for scale in moved) == 1
 
