@@ -1,41 +1,11 @@
-"""The command line `cpcbl-team`: THE table of its commands."""
+"""The entry point `cpcbl-team`: runs a command, and says in one line what its user can mend."""
 
 import errno
 import logging
 import os
 import sys
 
-import typer
-
-from cpcbl_launch.commands.calibrating import calibrate_app
-from cpcbl_launch.commands.deploying import compose
-from cpcbl_launch.commands.experimenting import experiment_app
-from cpcbl_launch.commands.faults import chaos
-from cpcbl_launch.commands.measuring import evaluate_mrclam, simulate
-from cpcbl_launch.commands.observing import observer
-from cpcbl_launch.commands.running import check, field, robot, router, up
-from cpcbl_launch.commands.securing import keys
-from cpcbl_launch.commands.watching import look, traffic
 from cpcbl_team.errors import CpcblError
-
-app = typer.Typer(
-    help="A team of robots that find out where they are, together.",
-    no_args_is_help=True,
-    add_completion=False,
-    pretty_exceptions_enable=False,
-)
-for command in (
-    *(check, keys, up, traffic, look, robot, observer, router, field, compose),
-    *(simulate, chaos),
-):
-    app.command()(command)
-
-evaluate_app = typer.Typer(help="Real logs in one process: deterministic and fast.")
-evaluate_app.command("mrclam")(evaluate_mrclam)
-app.add_typer(evaluate_app, name="evaluate")
-app.add_typer(calibrate_app, name="calibrate")
-app.add_typer(experiment_app, name="experiment")
-
 
 NOT_WRITABLE = {
     *(errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EPIPE),
@@ -44,12 +14,15 @@ NOT_WRITABLE = {
 
 
 def main() -> None:
-    """Runs the command line. What the user can mend is one line and exit code 2; what could not be
-    written is one line and exit code 1; anything else is a bug, and its traceback is shown."""
+    """Runs the command line.
+
+    An error that the user can mend is one line and exit code 2. A file that could not be written is
+    one line and exit code 1. Everything else is a bug, and its traceback is shown.
+    """
     logging.basicConfig(format="%(asctime)s %(levelname)s %(message)s", level=logging.INFO)
     try:
         try:
-            app()
+            _run_command()
         finally:
             sys.stdout.flush()
     except OSError as error:
@@ -57,8 +30,24 @@ def main() -> None:
             raise
         name = error.filename or "standard output"
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # at exit it is flushed once more
-        typer.secho(f"cpcbl-team: {name}: not written: {error.strerror}", fg="red", err=True)
-        sys.exit(1)
+        _end(f"{name}: not written: {error.strerror}", 1)
     except CpcblError as error:
-        typer.secho(f"cpcbl-team: {error}", fg="red", err=True)
-        sys.exit(2)
+        _end(str(error), 2)
+
+
+def _run_command() -> None:
+    """A robot's process loads neither typer nor the other commands."""
+    if sys.argv[1:2] == ["robot"]:
+        from cpcbl_launch.robot import main as run_robot
+
+        run_robot(sys.argv[2:])
+    else:
+        from cpcbl_launch.app import app
+
+        app()
+
+
+def _end(problem: str, code: int) -> None:
+    red, plain = ("\033[31m", "\033[0m") if sys.stderr.isatty() else ("", "")
+    sys.stderr.write(f"{red}cpcbl-team: {problem}{plain}\n")
+    sys.exit(code)

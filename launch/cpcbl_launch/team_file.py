@@ -67,6 +67,16 @@ def builtin(name: str) -> Path:
     return Path(str(resources.files("cpcbl_launch") / "teams" / f"{name}.toml"))
 
 
+def find_team(path: Path) -> Team:
+    """The team in this file, or the one of this name that comes with the package.
+
+    Raises TeamFileError.
+    """
+    own = builtin(path.name)
+    is_name = path == Path(path.name) and not path.exists()
+    return load_team(own if is_name and own.exists() else path)
+
+
 def load_team(path: Path) -> Team:
     """The team in a TOML file, or in a JSON file that `save_resolved` wrote.
 

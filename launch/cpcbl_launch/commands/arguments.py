@@ -63,16 +63,6 @@ ClockText = Annotated[str, typer.Option("--clock", hidden=True)]
 Parent = Annotated[Optional[int], typer.Option(hidden=True)]
 
 
-def load(path: Path) -> "Team":
-    """The team in a file, or one that comes with the package by its name. Raises TeamFileError."""
-    from cpcbl_launch.team_file import builtin, load_team
-
-    own = builtin(path.name)
-    return load_team(
-        own if not path.exists() and path == Path(path.name) and own.exists() else path
-    )
-
-
 def write_report(path: Path | None, result: object) -> dict[str, str]:
     """Writes what `--report` asks for; what could not be written, with the reason."""
     from cpcbl_launch.options import encoded, not_written

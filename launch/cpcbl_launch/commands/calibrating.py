@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Optional
 import typer
 from typer.core import TyperGroup
 
-from cpcbl_launch.commands.arguments import AsJson, load, say_not_written
+from cpcbl_launch.commands.arguments import AsJson, say_not_written
 from cpcbl_launch.commands.measuring import calibrate
+from cpcbl_launch.team_file import find_team
 from cpcbl_team.errors import InputError
 
 if TYPE_CHECKING:
@@ -253,7 +254,7 @@ def _photographed(
         raise InputError("--pictures: goes with --poses FILE.csv, where they were taken")
     if team_file is None:
         raise InputError("--pictures: goes with --team FILE, which says what is to be seen")
-    team = load(team_file)
+    team = find_team(team_file)
     whose = viewer(team, robot)
     with progress_bar("looking", quiet) as progress:
         return photographed(pictures, poses, whose, team, progress)

@@ -5,7 +5,8 @@ from typing import Annotated, Optional
 
 import typer
 
-from cpcbl_launch.commands.arguments import Image, TeamArgument, load, say_not_written
+from cpcbl_launch.commands.arguments import Image, TeamArgument, say_not_written
+from cpcbl_launch.team_file import find_team
 
 
 def compose(
@@ -22,7 +23,7 @@ def compose(
 
     if output is not None:
         file_for("--output", output)
-    team = load(file or Path("demo"))
+    team = find_team(file or Path("demo"))
     folder = Path() if output is None else output.parent
     text = deployed(team, file or Path("demo"), folder, image, seed)
     if output is None:

@@ -16,11 +16,11 @@ from cpcbl_launch.commands.arguments import (
     PictureFile,
     ReportFile,
     TeamArgument,
-    load,
     names_in,
     say_not_written,
     write_report,
 )
+from cpcbl_launch.team_file import find_team
 from cpcbl_team.errors import InputError
 
 
@@ -84,7 +84,7 @@ def evaluate_mrclam(
     from cpcbl_launch.simulation.in_process import Choice, chosen, evaluated
     from cpcbl_launch.views.run import print_report, progress_bar
 
-    team = load(team_file or real_logs.builtin_for(data))
+    team = find_team(team_file or real_logs.builtin_for(data))
     choice = Choice(
         variant,
         collaboration,
@@ -228,7 +228,7 @@ def simulate(
             duration = DURATION_S if duration is None else duration
             result = measured(parsed_sizes(robots), seed, duration, progress)
         else:
-            team = chosen(load(file or Path("demo")), budgets)
+            team = chosen(find_team(file or Path("demo")), budgets)
             must_see(team, team.robots, field=True)
             run = Run(team, duration, seed=seed, picture=picture)
             result = simulate_run(run, progress)

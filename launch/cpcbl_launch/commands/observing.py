@@ -16,8 +16,8 @@ from cpcbl_launch.commands.arguments import (
     Image,
     Parent,
     TeamFile,
-    load,
 )
+from cpcbl_launch.team_file import find_team
 from cpcbl_team.errors import InputError
 
 
@@ -74,7 +74,7 @@ def observer(
 
     if duration is not None and not duration > 0.0:
         raise InputError(f"--for {duration:g}: more than 0 seconds")
-    file_team = load(team_file)
+    file_team = find_team(team_file)
     kind = None if source is None else str(source)
     team = joined(file_team, Wish(name, place_in(at), sensor, fov, places_in(move), kind))
     console, stop = Console(stderr=as_json), Stop(parent)

@@ -25,11 +25,11 @@ from cpcbl_launch.commands.arguments import (
     TeamFile,
     endpoints,
     known_robots,
-    load,
     names_in,
     say_not_written,
     write_report,
 )
+from cpcbl_launch.team_file import find_team
 from cpcbl_team.errors import InputError
 
 
@@ -38,7 +38,7 @@ def check(
 ) -> None:
     """Validate a team file without starting anything."""
 
-    team = load(file)
+    team = find_team(file)
     marks, walls = len(team.map.landmarks), len(team.map.walls)
     typer.echo(
         f"{file}: good: team {team.name!r}, {len(team.robots)} robots"
@@ -118,7 +118,7 @@ def up(
     typed = file or Path("demo")
     if file == Path("mrclam") and data is not None and not file.exists():
         file = real_logs.builtin_for(data)
-    team = listening(load(file or Path("demo")))
+    team = listening(find_team(file or Path("demo")))
     budgets = Choice(
         bytes_per_s=bytes_per_s,
         messages_per_minute=messages_per_minute,
@@ -169,32 +169,6 @@ def up(
     say_not_written(lost)
 
 
-def robot(
-    name: Annotated[str, typer.Argument(help="The robot's name in the team file.")],
-    team_file: TeamFile,
-    connect: Connect = None,
-    clock: ClockText = "",
-    parent: Parent = None,
-    restarted: Annotated[
-        bool, typer.Option(help="It does not know where it is: find the pose first.")
-    ] = False,
-) -> None:
-    """Run one robot, on any machine, until SIGINT, SIGTERM or SIGHUP."""
-    from cpcbl_agents.clock import Clock
-    from cpcbl_agents.process import Stop, run_robot
-    from cpcbl_launch.options import must_see
-    from cpcbl_launch.team_file import TeamFileError
-
-    team = load(team_file)
-    if name not in team.robots:
-        raise TeamFileError(
-            f"{team_file}: robots.{name}: not in the file; it has: {', '.join(team.robots)}"
-        )
-    must_see(team, [name])
-    when = Clock.parse(clock) if clock else Clock.wall()
-    run_robot(name, team, connect or team.transport.connect, when, Stop(parent), restarted)
-
-
 def field(
     team_file: TeamFile,
     seed: Annotated[int, typer.Option(help="Of the noise.")] = 1,
@@ -218,7 +192,7 @@ def field(
     from cpcbl_transport.topics import Role
     from cpcbl_transport.zenoh_bus import open_bus
 
-    team = load(team_file)
+    team = find_team(team_file)
     must_see(team, field=True)
     elsewhere = robots_at(site or (), team)
     stop = Stop(parent)
@@ -271,7 +245,7 @@ def router(
         title, options = f"router of {config}", read_router_config(config)
     else:
         assert file is not None
-        team = load(file)
+        team = find_team(file)
         title, options = (
             f"router of team {team.name}",
             team_router(team, listen or (), connect or (), speed),

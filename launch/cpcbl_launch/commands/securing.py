@@ -7,7 +7,8 @@ from typing import Annotated, Optional
 
 import typer
 
-from cpcbl_launch.commands.arguments import AsJson, load
+from cpcbl_launch.commands.arguments import AsJson
+from cpcbl_launch.team_file import find_team
 from cpcbl_team.errors import InputError
 
 
@@ -50,7 +51,7 @@ def keys(
     from cpcbl_launch.options import encoded
     from cpcbl_launch.team_file import key_folder
 
-    team = load(file)
+    team = find_team(file)
     if not 0.0 < days < 36500.0:
         raise InputError(f"--days {days:g}: more than 0, and less than a hundred years")
     if output is None and not file.exists():

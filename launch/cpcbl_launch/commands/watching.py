@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Optional
 
 import typer
 
-from cpcbl_launch.commands.arguments import Connect, TeamArgument, TeamFile, load
+from cpcbl_launch.commands.arguments import Connect, TeamArgument, TeamFile
+from cpcbl_launch.team_file import find_team
 from cpcbl_team.errors import InputError
 
 if TYPE_CHECKING:
@@ -52,7 +53,7 @@ def traffic(
     if duration is not None and not duration > 0.0:
         raise InputError(f"--for {duration:g}: more than 0 seconds")
     logging.getLogger("cpcbl_transport").setLevel(logging.WARNING)
-    team = None if team_name is not None and file is None else load(file or Path("demo"))
+    team = None if team_name is not None and file is None else find_team(file or Path("demo"))
     endpoints = connect or (team.transport if team is not None else TransportSettings()).connect
     link = Link(tuple(endpoints))
     if team is not None:
@@ -103,7 +104,7 @@ def look(
     from cpcbl_launch.options import encoded, folder_for, must_see
     from cpcbl_launch.views.frames.report import LookReport, print_look, reported, written
 
-    team = load(team_file)
+    team = find_team(team_file)
     if robot not in team.robots:
         raise InputError(f"look {robot}: not in {team_file}; it has: {', '.join(team.robots)}")
     if team.robots[robot].sensing != "camera":

@@ -15,23 +15,18 @@ seconds after the start. Without times it lasts from the start to the end.
 `python -m cpcbl_launch.lab.faulty_robot NAME --team FILE --fault FAULT` runs such a robot.
 """
 
-import argparse
 import logging
 import math
 import random
 import re
 import sys
 from collections.abc import Sequence
-from functools import partial
-from pathlib import Path
 from typing import NamedTuple
 
 import msgspec
 
-from cpcbl_agents.clock import Clock
-from cpcbl_agents.process import Stop, run_robot
+from cpcbl_launch.robot import robot_parser, run_robot_command
 from cpcbl_launch.run.processes import PROGRAM
-from cpcbl_launch.team_file import load_team
 from cpcbl_team.errors import CpcblError, InputError
 from cpcbl_team.inputs import Belief, Fix
 from cpcbl_transport.bus import Bus, Publisher
@@ -165,27 +160,17 @@ def faulty_command(command: Sequence[str], fault: str) -> tuple[str, ...]:
 
 def main() -> None:
     """Runs one faulty robot until SIGINT, SIGTERM or SIGHUP."""
-    parser = argparse.ArgumentParser(prog="faulty_robot", description=main.__doc__)
-    parser.add_argument("name", help="The robot's name in the team file.")
-    parser.add_argument("--team", type=Path, required=True, help="Team file.")
+    parser = robot_parser("faulty_robot")
     parser.add_argument("--fault", required=True, help="For example bias:0.5,0.5@10-30.")
-    parser.add_argument("--connect", action="append", help="Endpoint of the router.")
-    parser.add_argument("--clock", default="", help="The clock of the run.")
-    parser.add_argument("--parent", type=int, help="It ends when this process has ended.")
-    parser.add_argument("--restarted", action="store_true", help="Its start pose is not known.")
-    given = parser.parse_args()
+    arguments = parser.parse_args()
     logging.basicConfig(format="%(asctime)s %(levelname)s %(message)s", level=logging.INFO)
     try:
-        fault, team = Fault.parse(given.fault), load_team(given.team)
-        if given.name not in team.robots:
-            raise InputError(f"{given.team}: it has no robot {given.name}")
+        fault = Fault.parse(arguments.fault)
+        run_robot_command(
+            arguments, lambda name, clock, bus: FaultyBus(bus, fault, name, clock.epoch_ns)
+        )
     except CpcblError as error:
         parser.error(str(error))
-    clock = Clock.parse(given.clock) if given.clock else Clock.wall()
-    wrap_bus = partial(FaultyBus, fault=fault, name=given.name, start_ns=clock.epoch_ns)
-    endpoints = given.connect or team.transport.connect
-    stop = Stop(given.parent)
-    run_robot(given.name, team, endpoints, clock, stop, given.restarted, wrap_bus)
 
 
 if __name__ == "__main__":

@@ -26,7 +26,7 @@ from support.processes import cpcbl_team, eventually, patient_up
 from typer.testing import CliRunner
 
 from cpcbl_team.errors import InputError
-from cpcbl_launch.cli import app
+from cpcbl_launch.app import app
 from cpcbl_launch.keys.authority import facts, issued, new_authority
 from cpcbl_launch.keys.plan import Deed, hosts, plan
 from cpcbl_launch.run.processes import PROGRAM

@@ -1,0 +1,92 @@
+"""`cpcbl-team robot`: the command of one robot's process.
+
+A robot runs on a small computer, and a team has many of them. This command is therefore parsed by
+argparse: typer and rich would cost each robot 8 MB of memory and a fifth of a second at its start.
+"""
+
+import argparse
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from cpcbl_agents.clock import Clock
+from cpcbl_agents.process import Stop, run_robot
+from cpcbl_launch.team_file import TeamFileError, find_team, not_an_endpoint
+from cpcbl_team.config import Team
+from cpcbl_team.errors import InputError
+from cpcbl_transport.bus import Bus
+
+DESCRIPTION = "Run one robot, on any machine, until SIGINT, SIGTERM or SIGHUP."
+
+
+class _Formatter(argparse.HelpFormatter):
+    """The help text of this command begins as that of every other command does."""
+
+    def add_usage(self, usage, actions, groups, prefix=None):  # type: ignore[no-untyped-def]
+        super().add_usage(usage, actions, groups, "Usage: ")
+
+
+def robot_parser(program: str = "cpcbl-team robot") -> argparse.ArgumentParser:
+    """The parser of the arguments and options of the command."""
+    parser = argparse.ArgumentParser(
+        program, description=DESCRIPTION, allow_abbrev=False, formatter_class=_Formatter
+    )
+    add = parser.add_argument
+    add("name", metavar="NAME", help="The robot's name in the team file.")
+    add("--team", type=Path, required=True, metavar="FILE", help="Team file (TOML).")
+    add(
+        "--connect",
+        action="append",
+        metavar="ENDPOINT",
+        help="Endpoint of the router, e.g. tcp/192.168.1.10:7447; default: the file's.",
+    )
+    add(
+        "--restarted",
+        action=argparse.BooleanOptionalAction,
+        default=False,
+        help="The robot does not know its pose: it has to find it first.",
+    )
+    add("--clock", default="", help=argparse.SUPPRESS)
+    add("--parent", type=int, help=argparse.SUPPRESS)
+    return parser
+
+
+def run_robot_command(
+    arguments: argparse.Namespace,
+    wrap_bus: Callable[[str, Clock, Bus], Bus] = lambda name, clock, bus: bus,
+) -> None:
+    """Runs the robot that parsed arguments of `robot_parser` name.
+
+    `wrap_bus` may put something between the robot of this name and clock, and its bus. Raises
+    TeamFileError, InputError, and what `run_robot` raises.
+    """
+    team = _team_with(arguments.name, arguments.team)
+    for endpoint in arguments.connect or ():
+        if reason := not_an_endpoint(endpoint):
+            raise InputError(f"--connect {endpoint}: {reason}")
+    clock = Clock.parse(arguments.clock) if arguments.clock else Clock.wall()
+    run_robot(
+        arguments.name,
+        team,
+        arguments.connect or team.transport.connect,
+        clock,
+        Stop(arguments.parent),
+        arguments.restarted,
+        lambda bus: wrap_bus(arguments.name, clock, bus),
+    )
+
+
+def main(arguments: Sequence[str]) -> None:
+    """Parses the arguments that follow `robot`, and runs the robot."""
+    run_robot_command(robot_parser().parse_args(arguments))
+
+
+def _team_with(name: str, path: Path) -> Team:
+    team = find_team(path)
+    if name not in team.robots:
+        known = ", ".join(team.robots)
+        raise TeamFileError(f"{path}: robots.{name}: not in the file; it has: {known}")
+    if name in team.cameras:
+        from cpcbl_launch.options import must_see
+
+        must_see(team, [name])
+    return team
