@@ -17,36 +17,36 @@ LEAST_SPEED, MOST_SPEED = 0.05, 1000.0
 PICTURES = (".png", ".svg")
 
 
-def encoded(result: Any) -> str:
+def json_text(result: Any) -> str:
     """JSON as it is printed and written."""
     return msgspec.json.format(msgspec.json.encode(result), indent=2).decode()
 
 
-def folder_for(option: str, folder: Path) -> Path:
+def require_folder(option: str, folder: Path) -> Path:
     """A folder to write into, made if it was not there. Raises InputError."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"{option} {folder}: {error.strerror}; name a folder") from error
-    _must_be_writable(option, folder, folder)
+    _require_writable(option, folder, folder)
     return folder
 
 
-def file_for(option: str, path: Path) -> None:
+def require_writable_file(option: str, path: Path) -> None:
     """Raises InputError for a file that could not be written later on."""
     if not path.parent.is_dir():
         raise InputError(f"{option} {path}: no folder {path.parent}; make it first")
     if path.is_dir():
         raise InputError(f"{option} {path}: a folder; name a file")
-    _must_be_writable(option, path, path if path.exists() else path.parent)
+    _require_writable(option, path, path if path.exists() else path.parent)
 
 
-def _must_be_writable(option: str, path: Path, existing: Path) -> None:
+def _require_writable(option: str, path: Path, existing: Path) -> None:
     if not os.access(existing, os.W_OK):
         raise InputError(f"{option} {path}: {existing} cannot be written; name another place")
 
 
-def not_written(path: Path, write: Callable[[], object]) -> dict[str, str]:
+def write_or_reason(path: Path, write: Callable[[], object]) -> dict[str, str]:
     """Writes a file of results; what could not be written, with the reason. A disk that is full at
     the end of a run must not take what was found with it."""
     try:
@@ -74,7 +74,7 @@ def check_limit(option: str, limit: float) -> None:
         raise InputError(f"{option} {limit:g}: no limit; write a number, 0 for as much as it likes")
 
 
-def must_draw(what: str, path: Path | None = None) -> None:
+def require_matplotlib(what: str, path: Path | None = None) -> None:
     """Raises InputError where pictures, or pictures of this kind, cannot be drawn."""
     if path is not None and path.suffix.lower() not in PICTURES:
         raise InputError(f"{what} {path}: not a picture; end its name in {' or '.join(PICTURES)}")
@@ -82,16 +82,16 @@ def must_draw(what: str, path: Path | None = None) -> None:
         raise DependencyError(f"{what} needs matplotlib: pip install 'cpcbl-team[plot]'")
 
 
-def must_have_opencv(what: str) -> None:
+def require_opencv(what: str) -> None:
     """Raises DependencyError where OpenCV is not installed."""
     if importlib.util.find_spec("cv2") is None:
         raise DependencyError(f"{what} {NEEDS_OPENCV}")
 
 
-def must_see(team: Team, robots: Collection[str] = (), field: bool = False) -> None:
+def require_team_opencv(team: Team, robots: Collection[str] = (), field: bool = False) -> None:
     """Raises DependencyError where these robots, or the simulated field, need OpenCV and it is not
     there."""
     eyes = [f"robots.{name}" for name in team.cameras if name in robots]
     who = eyes[0] if eyes else "the simulated field" if field and team.renders else ""
     if who:
-        must_have_opencv(f'team {team.name}: {who}: sensing = "camera"')
+        require_opencv(f'team {team.name}: {who}: sensing = "camera"')

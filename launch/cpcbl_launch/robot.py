@@ -10,7 +10,7 @@ from pathlib import Path
 
 from cpcbl_agents.clock import Clock
 from cpcbl_agents.process import Stop, run_robot
-from cpcbl_launch.team_file import TeamFileError, find_team, not_an_endpoint
+from cpcbl_launch.team_file import TeamFileError, endpoint_problem, find_team
 from cpcbl_team.config import Team
 from cpcbl_team.errors import InputError
 from cpcbl_transport.bus import Bus
@@ -61,7 +61,7 @@ def run_robot_command(
     """
     team = _team_with(arguments.name, arguments.team)
     for endpoint in arguments.connect or ():
-        if reason := not_an_endpoint(endpoint):
+        if reason := endpoint_problem(endpoint):
             raise InputError(f"--connect {endpoint}: {reason}")
     clock = Clock.parse(arguments.clock) if arguments.clock else Clock.wall()
     run_robot(
@@ -86,7 +86,7 @@ def _team_with(name: str, path: Path) -> Team:
         known = ", ".join(team.robots)
         raise TeamFileError(f"{path}: robots.{name}: not in the file; it has: {known}")
     if name in team.cameras:
-        from cpcbl_launch.options import must_see
+        from cpcbl_launch.options import require_team_opencv
 
-        must_see(team, [name])
+        require_team_opencv(team, [name])
     return team

@@ -62,7 +62,7 @@ class _File(Table, frozen=True, kw_only=True):
     types: Layer = msgspec.field(default_factory=dict)
 
 
-def builtin(name: str) -> Path:
+def builtin_path(name: str) -> Path:
     """The path of a team file that comes with the package."""
     return Path(str(resources.files("cpcbl_launch") / "teams" / f"{name}.toml"))
 
@@ -72,7 +72,7 @@ def find_team(path: Path) -> Team:
 
     Raises TeamFileError.
     """
-    own = builtin(path.name)
+    own = builtin_path(path.name)
     is_name = path == Path(path.name) and not path.exists()
     return load_team(own if is_name and own.exists() else path)
 
@@ -134,12 +134,12 @@ def parse_team(text: str, name: str = "team file") -> Team:
         raise TeamFileError(f"{name}: not TOML: {error}") from error
     for key in _not_finite(raw):
         raise TeamFileError(f"{name}: {key}: not a finite number; write a finite one")
-    file = _converted(raw, _File, "", name)
-    defaults = _converted(file.defaults, RobotSettings, "defaults", name)
-    for kind, layer in _named(file.types, "types", name):
-        _converted(layer, RobotSettings, f"types.{kind}", name)
+    file = _convert(raw, _File, "", name)
+    defaults = _convert(file.defaults, RobotSettings, "defaults", name)
+    for kind, layer in _named_tables(file.types, "types", name):
+        _convert(layer, RobotSettings, f"types.{kind}", name)
     robots = {}
-    for robot, layer in _named(file.robots, "robots", name):
+    for robot, layer in _named_tables(file.robots, "robots", name):
         kind = layer.pop("type", None)
         if kind is not None and not (isinstance(kind, str) and kind in file.types):
             known = ", ".join(file.types) or "none"
@@ -147,17 +147,17 @@ def parse_team(text: str, name: str = "team file") -> Team:
                 f"{name}: robots.{robot}.type: no type {kind!r}; use a type that has its table"
                 f" [types.NAME], here: {known}"
             )
-        _converted(layer, RobotSettings, f"robots.{robot}", name)
-        merged = _merged(file.defaults, file.types.get(kind, {}), layer)
-        robots[robot] = _converted(merged, RobotSettings, f"robots.{robot}", name)
+        _convert(layer, RobotSettings, f"robots.{robot}", name)
+        merged = _merge(file.defaults, file.types.get(kind, {}), layer)
+        robots[robot] = _convert(merged, RobotSettings, f"robots.{robot}", name)
     field = Field(
         landmarks={
-            mark: _converted(table, Landmark, f"map.landmarks.{mark}", name)
-            for mark, table in _named(file.map.landmarks, "map.landmarks", name)
+            mark: _convert(table, Landmark, f"map.landmarks.{mark}", name)
+            for mark, table in _named_tables(file.map.landmarks, "map.landmarks", name)
         },
         walls={
-            wall: _converted(table, Wall, f"map.walls.{wall}", name)
-            for wall, table in _named(file.map.walls, "map.walls", name)
+            wall: _convert(table, Wall, f"map.walls.{wall}", name)
+            for wall, table in _named_tables(file.map.walls, "map.walls", name)
         },
     )
     team = Team(
@@ -200,13 +200,13 @@ def read_layer(path: Path) -> Layer:
     return layer
 
 
-def beside(team: Team, name: str, layers: Sequence[Layer], source: str) -> Team:
+def with_added_robot(team: Team, name: str, layers: Sequence[Layer], source: str) -> Team:
     """The team with one more robot, by layers over the team's defaults. Its name must be new.
 
     `source` is what errors call the layers. Raises TeamFileError.
     """
-    merged = _merged(msgspec.to_builtins(team.defaults), *layers)
-    robot = _converted(merged, RobotSettings, "", source)
+    merged = _merge(msgspec.to_builtins(team.defaults), *layers)
+    robot = _convert(merged, RobotSettings, "", source)
     more = msgspec.structs.replace(team, robots={**team.robots, name: robot})
     for problem in problems(more):
         raise TeamFileError(f"{source}: {problem}")
@@ -243,12 +243,12 @@ def problems(team: Team) -> Iterator[str]:
         yield "transport.connect: is empty; name an endpoint such as tcp/192.168.1.10:7447"
     for key in ("listen", "connect"):
         for endpoint in getattr(team.transport, key):
-            reason = not_an_endpoint(endpoint) or _insecure(endpoint, team.transport.secured)
+            reason = endpoint_problem(endpoint) or _insecure(endpoint, team.transport.secured)
             if reason:
                 yield f"transport.{key}: {endpoint!r}: {reason}"
 
 
-def not_an_endpoint(text: str) -> str:
+def endpoint_problem(text: str) -> str:
     """Why Zenoh cannot listen or connect there; empty if it can."""
     if re.fullmatch(r"(tcp|tls|quic|udp|ws)/.+:\d{1,5}", text):
         return ""
@@ -333,7 +333,7 @@ def _guard_problems(team: Team) -> Iterator[str]:
                 )
 
 
-def _named(tables: Layer, where: str, name: str) -> Iterator[tuple[str, Layer]]:
+def _named_tables(tables: Layer, where: str, name: str) -> Iterator[tuple[str, Layer]]:
     """The tables with names of the user's own, which become part of keys on the bus."""
     for own, table in tables.items():
         if not re.fullmatch(NAME_PATTERN, own):
@@ -345,24 +345,24 @@ def _named(tables: Layer, where: str, name: str) -> Iterator[tuple[str, Layer]]:
         yield own, table
 
 
-def _merged(*layers: Mapping[str, Any]) -> Layer:
+def _merge(*layers: Mapping[str, Any]) -> Layer:
     result: Layer = {}
     for layer in layers:
         for key, value in layer.items():
             old = result.get(key)
             deeper = isinstance(old, dict) and isinstance(value, dict)
-            result[key] = _merged(old or {}, value) if deeper else value
+            result[key] = _merge(old or {}, value) if deeper else value
     return result
 
 
-def _converted(raw: Any, kind: type[Any], prefix: str, name: str) -> Any:
+def _convert(raw: Any, kind: type[Any], prefix: str, name: str) -> Any:
     try:
         return msgspec.convert(raw, kind)
     except msgspec.ValidationError as error:
-        raise TeamFileError(f"{name}: {_explained(str(error), kind, prefix)}") from None
+        raise TeamFileError(f"{name}: {_error_text(str(error), kind, prefix)}") from None
 
 
-def _explained(error: str, kind: type[Any], prefix: str) -> str:
+def _error_text(error: str, kind: type[Any], prefix: str) -> str:
     """msgspec's text as `key: problem; fix`."""
     problem, _, where = error.partition(" - at `")
     path = where.removeprefix("key` in `").rstrip("`").removeprefix("$").lstrip(".")

@@ -6,11 +6,11 @@ import numpy as np
 
 from cpcbl_agents.vision.camera import Pixels
 from cpcbl_launch.lab.experiments.eyes_frames import drawn, picture
-from cpcbl_launch.team_file import builtin, load_team
+from cpcbl_launch.team_file import builtin_path, load_team
 
 FRAMES = 24
 VIEWER = "rover1"
-TEAM = load_team(builtin("eyes"))
+TEAM = load_team(builtin_path("eyes"))
 
 
 @lru_cache(maxsize=1)

@@ -11,12 +11,12 @@ from support.buses import SECOND, standing
 from support.logs import write_log
 from support.processes import cpcbl_team
 
-from cpcbl_launch.options import file_for, folder_for
+from cpcbl_launch.options import require_folder, require_writable_file
 from cpcbl_launch.reporting.recording import Recording, read_recording
 from cpcbl_launch.run.processes import PROGRAM
 from cpcbl_launch.run.supervisor import ProcessSpec, Supervisor
 from cpcbl_launch.simulation.in_process import simulate
-from cpcbl_launch.team_file import TeamFileError, builtin, load_team, save_resolved
+from cpcbl_launch.team_file import TeamFileError, builtin_path, load_team, save_resolved
 from cpcbl_team.config import RobotSettings, Team
 from cpcbl_team.errors import InputError
 from cpcbl_transport import topics
@@ -91,9 +91,9 @@ def test_a_file_that_cannot_be_made_is_refused_before_anything_starts(
 def test_a_folder_is_no_file_and_a_file_no_folder(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(InputError, match=r"--report .*: a folder; name a file"):
-        file_for("--report", tmp_path)
+        require_writable_file("--report", tmp_path)
     with pytest.raises(InputError, match=r"--logs .*; name a folder"):
-        folder_for("--logs", tmp_path / "file")
+        require_folder("--logs", tmp_path / "file")
 
 
 def test_a_team_that_cannot_be_handed_to_its_processes_is_one_line() -> None:
@@ -174,6 +174,6 @@ def test_a_file_that_became_a_folder_is_one_line(tmp_path: Path) -> None:
 
 
 def test_recording_a_simulation_onto_a_good_disk_loses_nothing(tmp_path: Path) -> None:
-    team = load_team(builtin("demo"))
+    team = load_team(builtin_path("demo"))
     report, _ = simulate(team, 1, 2.0, record=tmp_path / "run.mcap")
     assert report.not_written == {}

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import pytest
 
-from cpcbl_launch.team_file import TeamFileError, builtin, load_team, parse_team, save_resolved
+from cpcbl_launch.team_file import TeamFileError, builtin_path, load_team, parse_team, save_resolved
 from cpcbl_team.config import RobotSettings, Team
 
 ROBOT = """
@@ -92,7 +92,7 @@ def test_layers_of_one_robot_leave_the_others_alone() -> None:
     ],
 )
 def test_the_built_in_teams_load(name: str, members: set[str], source: str) -> None:
-    loaded = load_team(builtin(name))
+    loaded = load_team(builtin_path(name))
     assert loaded.name == name
     assert set(loaded.robots) == members
     assert {robot.source for robot in loaded.robots.values()} == {source}
@@ -100,7 +100,7 @@ def test_the_built_in_teams_load(name: str, members: set[str], source: str) -> N
 
 @pytest.mark.parametrize("name", ["demo", "mrclam"])
 def test_a_resolved_team_comes_back_as_it_was(tmp_path: Path, name: str) -> None:
-    loaded, path = load_team(builtin(name)), tmp_path / "team.json"
+    loaded, path = load_team(builtin_path(name)), tmp_path / "team.json"
     save_resolved(loaded, path)
     assert load_team(path) == loaded
 

@@ -9,9 +9,14 @@ from functools import cache
 from pathlib import Path
 
 from cpcbl_launch.run.containers import BASE_IMAGE, BASE_VARIABLE
-from cpcbl_launch.run.containers.docker import DockerError, compose_program, done, never
+from cpcbl_launch.run.containers.docker import (
+    DockerError,
+    command_output,
+    compose_program,
+    never_stop,
+)
 from cpcbl_launch.run.containers.fleet import Project
-from cpcbl_launch.run.containers.image import have, image_for, there, version
+from cpcbl_launch.run.containers.image import ensure_image, fetch_image, has_image, version
 from cpcbl_launch.run.up import free_endpoint
 
 TOP = Path(__file__).parents[2]
@@ -25,9 +30,9 @@ def base_image() -> str:
     if chosen:
         return chosen
     try:
-        have(BASE_IMAGE, never, print, "")
+        fetch_image(BASE_IMAGE, never_stop, print, "")
     except DockerError:
-        if not there(LOCAL_BASE):
+        if not has_image(LOCAL_BASE):
             subprocess.run([TOP / "docker" / "base-image.sh", LOCAL_BASE], check=True)
         return LOCAL_BASE
     return BASE_IMAGE
@@ -36,13 +41,13 @@ def base_image() -> str:
 @cache
 def image(extras: str = "") -> str:
     """The image of these sources with these extras, built when it is not there."""
-    return image_for(base_image(), never, print, extras)
+    return ensure_image(base_image(), never_stop, print, extras)
 
 
 def left_of(project: str) -> list[str]:
     """Containers and networks whose names begin like this, running or not."""
-    containers = done(["docker", "ps", "--all", "--format", "{{.Names}}"]).splitlines()
-    networks = done(["docker", "network", "ls", "--format", "{{.Name}}"]).splitlines()
+    containers = command_output(["docker", "ps", "--all", "--format", "{{.Names}}"]).splitlines()
+    networks = command_output(["docker", "network", "ls", "--format", "{{.Name}}"]).splitlines()
     return [name for name in (*containers, *networks) if name.startswith(project)]
 
 
@@ -78,7 +83,7 @@ def composed(
         yield project, endpoints
     except BaseException as error:
         for service in project.containers():
-            error.add_note(f"{service}: {project.last_words(service)}")
+            error.add_note(f"{service}: {project.last_log_line(service)}")
         raise
     finally:
         project.down()

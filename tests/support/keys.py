@@ -9,7 +9,7 @@ from pathlib import Path
 
 import msgspec
 
-from cpcbl_launch.keys.folder import KeysReport, Wish, make_keys
+from cpcbl_launch.keys.folder import KeyRequest, KeysReport, make_keys
 from cpcbl_launch.run.up import free_endpoint
 from cpcbl_team.config import Field, RobotSettings, Start, Team, TransportSettings
 from cpcbl_transport.bus import Bus
@@ -37,12 +37,12 @@ def secured_team(folder: Path, observers: tuple[str, ...] = ("tripod",)) -> Team
 
 def again(team: Team, **wish: object) -> list[KeysReport]:
     """`cpcbl-team keys` once more, with these wishes."""
-    return make_keys(team, Path(team.transport.keys), msgspec.convert(wish, Wish))
+    return make_keys(team, Path(team.transport.keys), msgspec.convert(wish, KeyRequest))
 
 
 def lasting(team: Team, name: str, seconds: float) -> None:
     """Gives a member a certificate that ends so soon, or has ended."""
-    wish = Wish(renew=(name,), lasting=timedelta(seconds=seconds))
+    wish = KeyRequest(renew=(name,), lasting=timedelta(seconds=seconds))
     make_keys(team, Path(team.transport.keys), wish)
 
 

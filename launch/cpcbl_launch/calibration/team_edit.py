@@ -10,7 +10,7 @@ import tomlkit
 from tomlkit.items import InlineTable, Table
 
 from cpcbl_launch.calibration.statistics import Estimate, decimals
-from cpcbl_launch.team_file import TeamFileError, builtin, parse_team
+from cpcbl_launch.team_file import TeamFileError, builtin_path, parse_team
 from cpcbl_team.errors import InputError
 
 
@@ -53,10 +53,10 @@ def robot_place(team_file: Path | None, robot: str | None, kind: str | None, par
 def team_source(path: Path, output: Path | None) -> tuple[str, Path]:
     """The text of a team file, or of a built-in one by its name, and where to write it: into
     `output`, else into the file itself. Raises TeamFileError."""
-    if not path.exists() and builtin(path.name).exists():
+    if not path.exists() and builtin_path(path.name).exists():
         if output is None:
             raise TeamFileError(f"{path}: a built-in team stays as it is; name --output FILE")
-        path = builtin(path.name)
+        path = builtin_path(path.name)
     try:
         return path.read_text(encoding="utf-8"), output or path
     except FileNotFoundError:

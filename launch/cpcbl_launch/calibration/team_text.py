@@ -16,7 +16,7 @@ from cpcbl_launch.calibration.robots import Calibration, RobotCalibration
 from cpcbl_launch.calibration.statistics import Estimate, decimals
 from cpcbl_launch.calibration.windows import WINDOW_S
 from cpcbl_launch.reporting.recording import read_recording
-from cpcbl_launch.team_file import TeamFileError, builtin, parse_team
+from cpcbl_launch.team_file import TeamFileError, builtin_path, parse_team
 from cpcbl_team.errors import InputError
 
 INTERVAL_S = 0.5  # with correlation_s known, using an object more often tells little
@@ -37,9 +37,9 @@ def base_text(logs: Sequence[Path], team_file: Path | None) -> tuple[str, str]:
     """
     if team_file is None and logs[0].suffix == ".mcap":
         return tomlkit.dumps(changed_keys(read_recording(logs[0]).team)), str(logs[0])
-    path = team_file or builtin("mrclam-uncalibrated")
-    if not path.exists() and builtin(path.name).exists():
-        path = builtin(path.name)
+    path = team_file or builtin_path("mrclam-uncalibrated")
+    if not path.exists() and builtin_path(path.name).exists():
+        path = builtin_path(path.name)
     try:
         return path.read_text(encoding="utf-8"), str(path)
     except (OSError, UnicodeDecodeError) as error:

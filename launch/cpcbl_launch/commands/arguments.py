@@ -15,10 +15,10 @@ if TYPE_CHECKING:
 
 def endpoints(option: typer.CallbackParam, given: list[str] | None) -> list[str] | None:
     """Raises InputError for what Zenoh would try again and again, and never say why."""
-    from cpcbl_launch.team_file import not_an_endpoint
+    from cpcbl_launch.team_file import endpoint_problem
 
     for endpoint in given or ():
-        if reason := not_an_endpoint(endpoint):
+        if reason := endpoint_problem(endpoint):
             raise InputError(f"--{option.name} {endpoint}: {reason}")
     return given
 
@@ -65,14 +65,14 @@ Parent = Annotated[Optional[int], typer.Option(hidden=True)]
 
 def write_report(path: Path | None, result: object) -> dict[str, str]:
     """Writes what `--report` asks for; what could not be written, with the reason."""
-    from cpcbl_launch.options import encoded, not_written
+    from cpcbl_launch.options import json_text, write_or_reason
 
     if path is None:
         return {}
-    return not_written(path, lambda: path.write_text(encoded(result), encoding="utf-8"))
+    return write_or_reason(path, lambda: path.write_text(json_text(result), encoding="utf-8"))
 
 
-def say_not_written(lost: dict[str, str]) -> None:
+def print_not_written(lost: dict[str, str]) -> None:
     """A line for each file that could not be written; with any, the exit code is 1."""
     for name, reason in lost.items():
         typer.secho(f"cpcbl-team: {name}: not written: {reason}", fg="red", err=True)
@@ -80,9 +80,9 @@ def say_not_written(lost: dict[str, str]) -> None:
         raise typer.Exit(1)
 
 
-def known_robots(option: str, text: str, team: "Team") -> list[str]:
+def parse_robots(option: str, text: str, team: "Team") -> list[str]:
     """The robots of a list with commas. Raises InputError for one that the team does not have."""
-    names = names_in(text)
+    names = parse_names(text)
     unknown = [name for name in names if name not in team.robots]
     if unknown or not names:
         who = ", ".join(unknown) or "it names none"
@@ -92,6 +92,6 @@ def known_robots(option: str, text: str, team: "Team") -> list[str]:
     return names
 
 
-def names_in(text: str) -> list[str]:
+def parse_names(text: str) -> list[str]:
     """The names of a list with commas."""
     return [name.strip() for name in text.split(",") if name.strip()]

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Optional
 import typer
 from typer.core import TyperGroup
 
-from cpcbl_launch.commands.arguments import AsJson, say_not_written
+from cpcbl_launch.commands.arguments import AsJson, print_not_written
 from cpcbl_launch.commands.measuring import calibrate
 from cpcbl_launch.team_file import find_team
 from cpcbl_team.errors import InputError
@@ -83,10 +83,16 @@ def camera(
     """Lens and distortion of a camera, from pictures of a printed board."""
     from rich.console import Console
 
-    from cpcbl_launch.options import encoded, file_for, must_draw, must_have_opencv, not_written
+    from cpcbl_launch.options import (
+        json_text,
+        require_matplotlib,
+        require_opencv,
+        require_writable_file,
+        write_or_reason,
+    )
     from cpcbl_launch.views.run import progress_bar
 
-    must_have_opencv("calibrate camera")
+    require_opencv("calibrate camera")
     from cpcbl_launch.calibration.board import parsed_board, write_board
     from cpcbl_launch.calibration.lens import calibrated_lens
     from cpcbl_launch.calibration.lens_show import camera_values, print_lens
@@ -95,7 +101,7 @@ def camera(
 
     printed = parsed_board(board, squares, square_m, marker_m, family)
     if print_board is not None:
-        file_for("--print-board", print_board)
+        require_writable_file("--print-board", print_board)
         write_board(printed, print_board)
         typer.echo(
             f"written: {print_board}; measure a square of it when it is printed", err=as_json
@@ -105,8 +111,8 @@ def camera(
     if not pictures:
         raise InputError("calibrate camera: name pictures of the board, or --print-board FILE.png")
     if picture is not None:
-        file_for("--picture", picture)
-        must_draw("--picture", picture)
+        require_writable_file("--picture", picture)
+        require_matplotlib("--picture", picture)
     _check_target(team_file, output)
     place = robot_place(team_file, robot, kind, "camera")
     files = picture_files(pictures)
@@ -117,13 +123,13 @@ def camera(
     if (drawing := picture) is not None:
         from cpcbl_launch.calibration.lens_picture import draw_lens
 
-        lost |= not_written(drawing, lambda: draw_lens(lens, left, drawing))
+        lost |= write_or_reason(drawing, lambda: draw_lens(lens, left, drawing))
     if as_json:
-        typer.echo(encoded(lens))
+        typer.echo(json_text(lens))
     else:
         print_lens(lens, Console())
     lost |= _save({place: camera_values(lens)}, team_file, output, as_json)
-    say_not_written(lost)
+    print_not_written(lost)
 
 
 @calibrate_app.command("colours")
@@ -154,9 +160,14 @@ def colours(
     """Thresholds of colours, from samples of them in pictures."""
     from rich.console import Console
 
-    from cpcbl_launch.options import encoded, file_for, must_have_opencv, not_written
+    from cpcbl_launch.options import (
+        json_text,
+        require_opencv,
+        require_writable_file,
+        write_or_reason,
+    )
 
-    must_have_opencv("calibrate colours")
+    require_opencv("calibrate colours")
     from cpcbl_launch.calibration import patches
     from cpcbl_launch.calibration.colours import calibrated_colours
     from cpcbl_launch.calibration.colours_show import colour_values, kept_colours, print_colours
@@ -168,7 +179,7 @@ def colours(
     if not said:
         raise InputError("calibrate colours: say where colours are, by --sample or --samples")
     if preview is not None:
-        file_for("--preview", preview)
+        require_writable_file("--preview", preview)
         patches.must_write(preview)
     _check_target(team_file, output)
     files = picture_files(pictures or [])
@@ -179,13 +190,13 @@ def colours(
     if (drawing := preview) is not None:
         every = {name: fit.thresholds for name, fit in found.colours.items()} | found.kept
         shown = patches.preview(seen, every)
-        lost |= not_written(drawing, lambda: patches.write_preview(drawing, shown))
+        lost |= write_or_reason(drawing, lambda: patches.write_preview(drawing, shown))
     if as_json:
-        typer.echo(encoded(found))
+        typer.echo(json_text(found))
     else:
         print_colours(found, Console())
     lost |= _save(colour_values(found, stays), team_file, output, as_json)
-    say_not_written(lost)
+    print_not_written(lost)
 
 
 @calibrate_app.command("sensor")
@@ -218,7 +229,7 @@ def sensor(
     from cpcbl_launch.calibration.seeing_show import print_seeing, seeing_values
     from cpcbl_launch.calibration.sights import recorded
     from cpcbl_launch.calibration.team_edit import robot_place
-    from cpcbl_launch.options import encoded
+    from cpcbl_launch.options import json_text
 
     if bool(recordings) == (pictures is not None):
         raise InputError("calibrate sensor: name recordings, or --pictures FOLDER --poses FILE.csv")
@@ -234,11 +245,11 @@ def sensor(
     )
     seeing = calibrated_seeing(looked.sights)
     if as_json:
-        typer.echo(encoded(seeing))
+        typer.echo(json_text(seeing))
     else:
         print_seeing(seeing, looked, Console())
     values = seeing_values(seeing, looked.camera, sensor, camera)
-    say_not_written(_save(values, team_file, output, as_json))
+    print_not_written(_save(values, team_file, output, as_json))
 
 
 def _photographed(
@@ -246,10 +257,10 @@ def _photographed(
 ) -> "Looked":
     """What a robot of the team file sees in pictures. Raises InputError."""
     from cpcbl_launch.calibration.sights import photographed, viewer
-    from cpcbl_launch.options import must_have_opencv
+    from cpcbl_launch.options import require_opencv
     from cpcbl_launch.views.run import progress_bar
 
-    must_have_opencv("calibrate sensor --pictures")
+    require_opencv("calibrate sensor --pictures")
     if poses is None:
         raise InputError("--pictures: goes with --poses FILE.csv, where they were taken")
     if team_file is None:
@@ -263,10 +274,10 @@ def _photographed(
 def _check_target(team_file: Path | None, output: Path | None) -> None:
     """Raises InputError, TeamFileError before anything is measured in vain."""
     from cpcbl_launch.calibration.team_edit import team_source
-    from cpcbl_launch.options import file_for
+    from cpcbl_launch.options import require_writable_file
 
     if team_file is not None:
-        file_for("--output" if output else "--team", team_source(team_file, output)[1])
+        require_writable_file("--output" if output else "--team", team_source(team_file, output)[1])
     elif output is not None:
         raise InputError("--output: goes with --team FILE, the team to write")
 
@@ -285,7 +296,7 @@ def _save(
         shadowed,
         team_source,
     )
-    from cpcbl_launch.options import not_written
+    from cpcbl_launch.options import write_or_reason
 
     if team_file is None:
         if not quiet:
@@ -293,7 +304,7 @@ def _save(
         return {}
     text, target = team_source(team_file, output)
     changed = edited(text, str(team_file), places)
-    lost = not_written(target, lambda: replace_file(target, changed))
+    lost = write_or_reason(target, lambda: replace_file(target, changed))
     for place, values in places.items() if not quiet else ():
         for own in shadowed(changed, place, list(values)):
             typer.echo(f"{own} stays, and goes before {place}")

@@ -5,7 +5,7 @@ from typing import Annotated, Optional
 
 import typer
 
-from cpcbl_launch.commands.arguments import Image, TeamArgument, say_not_written
+from cpcbl_launch.commands.arguments import Image, TeamArgument, print_not_written
 from cpcbl_launch.team_file import find_team
 
 
@@ -18,15 +18,17 @@ def compose(
     ] = None,
 ) -> None:
     """Print a team's compose file: for docker-compose, docker compose, a swarm."""
-    from cpcbl_launch.options import file_for, not_written
-    from cpcbl_launch.run.containers.deployment import deployed
+    from cpcbl_launch.options import require_writable_file, write_or_reason
+    from cpcbl_launch.run.containers.deployment import deployment_text
 
     if output is not None:
-        file_for("--output", output)
+        require_writable_file("--output", output)
     team = find_team(file or Path("demo"))
     folder = Path() if output is None else output.parent
-    text = deployed(team, file or Path("demo"), folder, image, seed)
+    text = deployment_text(team, file or Path("demo"), folder, image, seed)
     if output is None:
         typer.echo(text, nl=False)
     else:
-        say_not_written(not_written(output, lambda: output.write_text(text, encoding="utf-8")))
+        print_not_written(
+            write_or_reason(output, lambda: output.write_text(text, encoding="utf-8"))
+        )

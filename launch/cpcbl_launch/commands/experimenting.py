@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Optional
 
 import typer
 
-from cpcbl_launch.commands.arguments import names_in, say_not_written
+from cpcbl_launch.commands.arguments import parse_names, print_not_written
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -56,9 +56,9 @@ def figure7_cameras(
 ) -> None:
     """The same from pixels: a cheap camera on the navigator, a sharper one on the observer."""
     from cpcbl_launch.lab.experiments.figure7_cameras import EXPERIMENT
-    from cpcbl_launch.options import must_have_opencv
+    from cpcbl_launch.options import require_opencv
 
-    must_have_opencv("experiment figure7-cameras")
+    require_opencv("experiment figure7-cameras")
     conduct(EXPERIMENT, seeds, jobs, output, as_json)
 
 
@@ -101,16 +101,16 @@ def budget(
     """A real log: accuracy against bytes, by value and budget, by fixed intervals, all of it."""
     from cpcbl_launch.lab.experiments import budget as experiment
     from cpcbl_launch.lab.experiments.pictures import draw_budget
-    from cpcbl_launch.options import must_draw
+    from cpcbl_launch.options import require_matplotlib
     from cpcbl_launch.run import logged_team
     from cpcbl_launch.team_file import load_team
 
-    must_draw("experiment")
+    require_matplotlib("experiment")
     _must_be_writable(output, "budget")
-    logged = logged_team.shortened(
-        logged_team.on_log(load_team(logged_team.builtin_for(data)), data), duration
+    logged = logged_team.with_duration(
+        logged_team.load_logged_team(load_team(logged_team.builtin_for(data)), data), duration
     )
-    logged = logged._replace(team=logged_team.blinded(logged.team, names_in(blind)))
+    logged = logged._replace(team=logged_team.with_blind_robots(logged.team, parse_names(blind)))
     with _progress("budget", len(experiment.cases())) as done:
         result = experiment.curve(logged, jobs, done)
     _written(result, experiment.tables(result), output, as_json, draw_budget)
@@ -123,9 +123,9 @@ def liars(
     """One observer of several lies for a while: what it does to the team, and when it is found."""
     from cpcbl_launch.lab.experiments import liars as experiment
     from cpcbl_launch.lab.experiments.pictures import draw_liars
-    from cpcbl_launch.options import must_draw
+    from cpcbl_launch.options import require_matplotlib
 
-    must_draw("experiment")
+    require_matplotlib("experiment")
     _must_be_writable(output, "liars")
     with _progress("liars", len(experiment.cases()) * seeds) as done:
         result = experiment.measured(seeds, jobs or os.cpu_count() or 1, done)
@@ -141,10 +141,10 @@ def eyes(
     as_json: AsJson = False,
 ) -> None:
     """What cameras see of rendered frames: precision, recall, errors against stated sigmas."""
-    from cpcbl_launch.options import must_draw, must_have_opencv
+    from cpcbl_launch.options import require_matplotlib, require_opencv
 
-    must_draw("experiment")
-    must_have_opencv("experiment eyes")
+    require_matplotlib("experiment")
+    require_opencv("experiment eyes")
     _must_be_writable(output, "eyes")
     from cpcbl_launch.lab.experiments import eyes as experiment
 
@@ -167,9 +167,9 @@ def pictures(
     as_json: AsJson = False,
 ) -> None:
     """Real pictures whose truth is known: what is found and missed of them, and by how much."""
-    from cpcbl_launch.options import must_have_opencv
+    from cpcbl_launch.options import require_opencv
 
-    must_have_opencv("experiment pictures")
+    require_opencv("experiment pictures")
     from cpcbl_launch.lab.experiments import real_pictures
 
     _must_be_writable(output, f"pictures-{real_pictures.set_named(name).stem}", drawn=False)
@@ -203,9 +203,9 @@ def processes(
 ) -> None:
     """Real processes that keep 10 Hz: CPU and memory a robot, beside an all-to-all broadcast."""
     from cpcbl_launch.lab.experiments import processes
-    from cpcbl_launch.run.usage import must_measure
+    from cpcbl_launch.run.usage import require_process_usage
 
-    must_measure("experiment processes")
+    require_process_usage("experiment processes")
     _must_be_writable(output, "processes", drawn=False)
     sizes = processes.sizes_in(robots)
     with _progress("processes", len(sizes), "sizes") as done:
@@ -218,9 +218,9 @@ def conduct(
 ) -> None:
     """Runs, writes and shows one experiment. Raises InputError for what the user can mend."""
     from cpcbl_launch.lab.experiments.runs import run_all
-    from cpcbl_launch.options import must_draw
+    from cpcbl_launch.options import require_matplotlib
 
-    must_draw("experiment")
+    require_matplotlib("experiment")
     _must_be_writable(output, experiment.name)
     cases = experiment.cases()
     with _progress(experiment.name, len(cases) * seeds) as done:
@@ -231,11 +231,11 @@ def conduct(
 
 def _must_be_writable(output: Path, name: str, *, drawn: bool = True) -> None:
     """Raises InputError where the files of an experiment could not be written later on."""
-    from cpcbl_launch.options import file_for, folder_for
+    from cpcbl_launch.options import require_folder, require_writable_file
 
-    folder_for("--output", output)
+    require_folder("--output", output)
     for ending in ("json", "png") if drawn else ("json",):
-        file_for("--output", output / f"{name}.{ending}")
+        require_writable_file("--output", output / f"{name}.{ending}")
 
 
 def _written(
@@ -248,13 +248,13 @@ def _written(
     """Writes what came out, a picture too where one is drawn, and shows it, written or not."""
     from rich.console import Console
 
-    from cpcbl_launch.options import encoded, not_written
+    from cpcbl_launch.options import json_text, write_or_reason
 
-    text, name = encoded(result) + "\n", output / result.experiment
+    text, name = json_text(result) + "\n", output / result.experiment
     figures, picture = Path(f"{name}.json"), Path(f"{name}.png")
-    lost = not_written(figures, lambda: figures.write_text(text, encoding="utf-8"))
+    lost = write_or_reason(figures, lambda: figures.write_text(text, encoding="utf-8"))
     if draw is not None:
-        lost |= not_written(picture, lambda: draw(result, picture))
+        lost |= write_or_reason(picture, lambda: draw(result, picture))
     if as_json:
         sys.stdout.write(text)
     else:
@@ -264,7 +264,7 @@ def _written(
         pictured = ", .png" if draw is not None else ""
         if not lost:
             console.print(f"written: {figures}{pictured}", highlight=False)
-    say_not_written(lost)
+    print_not_written(lost)
 
 
 @contextmanager

@@ -8,7 +8,7 @@ from typing import Annotated, Optional
 
 import typer
 
-from cpcbl_launch.commands.arguments import AsJson, ReportFile, say_not_written, write_report
+from cpcbl_launch.commands.arguments import AsJson, ReportFile, print_not_written, write_report
 
 
 def chaos(
@@ -36,14 +36,14 @@ def chaos(
     from cpcbl_launch.lab.chaos.run import chosen, run_all
     from cpcbl_launch.lab.chaos.scenario import Setting
     from cpcbl_launch.lab.chaos.scenarios import SCENARIOS
-    from cpcbl_launch.options import encoded, file_for, not_written
+    from cpcbl_launch.options import json_text, require_writable_file, write_or_reason
 
     if listed or not scenarios:
         show.print_scenarios(SCENARIOS, Console())
         return
     for option, path in (("--report", report), ("--markdown", markdown)):
         if path is not None:
-            file_for(option, path)
+            require_writable_file(option, path)
     todo = chosen(scenarios)
     logging.getLogger("cpcbl_launch").setLevel(logging.ERROR)  # restarts are part of it
     logging.getLogger("cpcbl_transport").setLevel(logging.ERROR)
@@ -58,11 +58,11 @@ def chaos(
     lost = write_report(report, result)
     if (page := markdown) is not None:
         text = "\n".join(show.markdown(faults)) + "\n"
-        lost |= not_written(page, lambda: page.write_text(text, encoding="utf-8"))
+        lost |= write_or_reason(page, lambda: page.write_text(text, encoding="utf-8"))
     if as_json:
-        sys.stdout.write(encoded(result) + "\n")
+        sys.stdout.write(json_text(result) + "\n")
     else:
         show.print_faults(faults, Console())
-    say_not_written(lost)
+    print_not_written(lost)
     if not faults.held:
         raise typer.Exit(1)

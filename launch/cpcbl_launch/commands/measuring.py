@@ -16,8 +16,8 @@ from cpcbl_launch.commands.arguments import (
     PictureFile,
     ReportFile,
     TeamArgument,
-    names_in,
-    say_not_written,
+    parse_names,
+    print_not_written,
     write_report,
 )
 from cpcbl_launch.team_file import find_team
@@ -78,14 +78,18 @@ def evaluate_mrclam(
     """Five robots of a real log (UTIAS MRCLAM) against its ground truth."""
     from rich.console import Console
 
-    from cpcbl_launch.options import encoded, folder_for, not_written
+    from cpcbl_launch.options import json_text, require_folder, write_or_reason
     from cpcbl_launch.reporting.tum import export_tum
     from cpcbl_launch.run import logged_team as real_logs
-    from cpcbl_launch.simulation.in_process import Choice, chosen, evaluated
+    from cpcbl_launch.simulation.in_process import (
+        Overrides,
+        evaluate_log_with_paths,
+        with_overrides,
+    )
     from cpcbl_launch.views.run import print_report, progress_bar
 
     team = find_team(team_file or real_logs.builtin_for(data))
-    choice = Choice(
+    choice = Overrides(
         variant,
         collaboration,
         fusion,
@@ -94,21 +98,21 @@ def evaluate_mrclam(
         messages_per_minute,
         match_messages,
     )
-    logged = real_logs.on_log(chosen(team, choice), data)
-    logged = logged._replace(team=real_logs.blinded(logged.team, names_in(blind)))
-    logged = real_logs.shortened(logged, duration)
+    logged = real_logs.load_logged_team(with_overrides(team, choice), data)
+    logged = logged._replace(team=real_logs.with_blind_robots(logged.team, parse_names(blind)))
+    logged = real_logs.with_duration(logged, duration)
     if export is not None:
-        folder_for("--export", export)
+        require_folder("--export", export)
     with progress_bar(f"{data.name}", quiet=as_json) as progress:
-        result, paths = evaluated(logged, progress, with_yardsticks=yardstick)
+        result, paths = evaluate_log_with_paths(logged, progress, with_yardsticks=yardstick)
     lost: dict[str, str] = {}
     if (folder := export) is not None:
-        lost |= not_written(folder, lambda: export_tum(folder, paths, logged.truth))
+        lost |= write_or_reason(folder, lambda: export_tum(folder, paths, logged.truth))
     if as_json:
-        typer.echo(encoded(result))
+        typer.echo(json_text(result))
     else:
         print_report(result, Console())
-    say_not_written(lost)
+    print_not_written(lost)
 
 
 def calibrate(
@@ -146,31 +150,36 @@ def calibrate(
     from cpcbl_launch.calibration.robots import calibrated
     from cpcbl_launch.calibration.show import print_calibration
     from cpcbl_launch.calibration.team_text import base_text, team_text
-    from cpcbl_launch.options import encoded, file_for, must_draw, not_written
+    from cpcbl_launch.options import (
+        json_text,
+        require_matplotlib,
+        require_writable_file,
+        write_or_reason,
+    )
     from cpcbl_launch.views.run import progress_bar
 
-    file_for("--output", output)
+    require_writable_file("--output", output)
     if picture is not None:
-        file_for("--picture", picture)
-        must_draw("--picture", picture)
+        require_writable_file("--picture", picture)
+        require_matplotlib("--picture", picture)
     base, base_name = base_text(logs, team_file)
     names = [log.resolve().name for log in logs]
     robot_logs = read_logs(logs)
     with progress_bar("calibrating", quiet=as_json) as progress:
         result = calibrated(robot_logs, names, progress)
     text = team_text(result, base, base_name, margin=margin, correction_margin=correction_margin)
-    lost = not_written(output, lambda: output.write_text(text, encoding="utf-8"))
+    lost = write_or_reason(output, lambda: output.write_text(text, encoding="utf-8"))
     if (drawing := picture) is not None:
         from cpcbl_launch.calibration.picture import draw_residuals
 
-        lost |= not_written(drawing, lambda: draw_residuals(robot_logs, result, drawing))
+        lost |= write_or_reason(drawing, lambda: draw_residuals(robot_logs, result, drawing))
     if as_json:
-        typer.echo(encoded(result))
+        typer.echo(json_text(result))
     else:
         print_calibration(result, Console())
         if not lost:
             typer.echo(f"written: {output}")
-    say_not_written(lost)
+    print_not_written(lost)
 
 
 def simulate(
@@ -202,34 +211,40 @@ def simulate(
 
     from cpcbl_launch.lab.scaling.measure import DURATION_S, Scale, measured, parsed_sizes
     from cpcbl_launch.lab.scaling.show import print_scale
-    from cpcbl_launch.options import encoded, file_for, must_draw, must_see, not_written
+    from cpcbl_launch.options import (
+        json_text,
+        require_matplotlib,
+        require_team_opencv,
+        require_writable_file,
+        write_or_reason,
+    )
     from cpcbl_launch.reporting.recorder import Report
     from cpcbl_launch.run.up import Run, simulate_run
-    from cpcbl_launch.simulation.in_process import Choice, chosen
+    from cpcbl_launch.simulation.in_process import Overrides, with_overrides
     from cpcbl_launch.views.run import print_report, progress_bar
 
-    budgets = Choice(
+    budgets = Overrides(
         bytes_per_s=bytes_per_s,
         messages_per_minute=messages_per_minute,
         match_messages=match_messages,
     )
     if file is not None and robots:
         raise InputError("simulate: FILE or --robots, which generates its teams; leave one out")
-    if robots and budgets != Choice():
+    if robots and budgets != Overrides():
         raise InputError("simulate: generated teams have no budgets; name a team file instead")
     if report is not None:
-        file_for("--report", report)
+        require_writable_file("--report", report)
     if picture is not None:
-        file_for("--picture", picture)
-        must_draw("--picture", picture)
+        require_writable_file("--picture", picture)
+        require_matplotlib("--picture", picture)
     result: Report | Scale
     with progress_bar("simulating", quiet=as_json) as progress:
         if robots:
             duration = DURATION_S if duration is None else duration
             result = measured(parsed_sizes(robots), seed, duration, progress)
         else:
-            team = chosen(find_team(file or Path("demo")), budgets)
-            must_see(team, team.robots, field=True)
+            team = with_overrides(find_team(file or Path("demo")), budgets)
+            require_team_opencv(team, team.robots, field=True)
             run = Run(team, duration, seed=seed, picture=picture)
             result = simulate_run(run, progress)
     lost = write_report(report, result)
@@ -238,11 +253,11 @@ def simulate(
     elif (drawing := picture) is not None:
         from cpcbl_launch.lab.scaling.picture import draw_scale
 
-        lost |= not_written(drawing, lambda: draw_scale(result, drawing))
+        lost |= write_or_reason(drawing, lambda: draw_scale(result, drawing))
     if as_json:
-        sys.stdout.write(encoded(result) + "\n")
+        sys.stdout.write(json_text(result) + "\n")
     elif isinstance(result, Scale):
         print_scale(result, Console())
     else:
         print_report(result, Console())
-    say_not_written(lost)
+    print_not_written(lost)

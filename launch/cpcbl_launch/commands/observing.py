@@ -68,21 +68,30 @@ def observer(
 
     from cpcbl_agents.clock import Clock
     from cpcbl_agents.process import Stop
-    from cpcbl_launch.options import encoded
-    from cpcbl_launch.run.observer import Wish, joined, place_in, places_in, presets, visit
-    from cpcbl_launch.views.run import print_visit
+    from cpcbl_launch.options import json_text
+    from cpcbl_launch.run.observer import (
+        ObserverRequest,
+        parse_pose,
+        parse_waypoints,
+        presets,
+        run_observer,
+        team_with_observer,
+    )
+    from cpcbl_launch.views.run import print_observer_report
 
     if duration is not None and not duration > 0.0:
         raise InputError(f"--for {duration:g}: more than 0 seconds")
     file_team = find_team(team_file)
     kind = None if source is None else str(source)
-    team = joined(file_team, Wish(name, place_in(at), sensor, fov, places_in(move), kind))
+    team = team_with_observer(
+        file_team, ObserverRequest(name, parse_pose(at), sensor, fov, parse_waypoints(move), kind)
+    )
     console, stop = Console(stderr=as_json), Stop(parent)
     endpoints = connect or team.transport.connect
     if container:
-        from cpcbl_launch.run.containers.guest import SENSOR_INSIDE, observe
-        from cpcbl_launch.run.containers.image import image_for
-        from cpcbl_launch.run.containers.launch import progress_on
+        from cpcbl_launch.run.containers.guest import SENSOR_INSIDE, run_observer_container
+        from cpcbl_launch.run.containers.image import ensure_image
+        from cpcbl_launch.run.containers.launch import line_printer
 
         own = None if sensor in presets() else Path(sensor)
         arguments = _options(
@@ -91,17 +100,17 @@ def observer(
             *(("connect", endpoint) for endpoint in endpoints),
         )
         arguments += ["--json"] if as_json else []
-        built = image or image_for(base_image, stop, progress_on(console))
-        raise typer.Exit(observe(name, file_team, arguments, own, built, stop))
+        built = image or ensure_image(base_image, stop, line_printer(console))
+        raise typer.Exit(run_observer_container(name, file_team, arguments, own, built, stop))
     said = f"{name} joins team {team.name} at {', '.join(endpoints)}; Ctrl-C: it leaves"
     console.print(said, style="dim", highlight=False, soft_wrap=True)
     when = Clock.parse(clock) if clock else Clock.wall()
     limit = float("inf") if duration is None else duration
-    result = visit(name, team, endpoints, when, stop, limit)
+    result = run_observer(name, team, endpoints, when, stop, limit)
     if as_json:
-        sys.stdout.write(encoded(result) + "\n")
+        sys.stdout.write(json_text(result) + "\n")
     else:
-        print_visit(result, console)
+        print_observer_report(result, console)
 
 
 def _options(*given: tuple[str, object]) -> list[str]:

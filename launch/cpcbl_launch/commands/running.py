@@ -24,9 +24,9 @@ from cpcbl_launch.commands.arguments import (
     ReportFile,
     TeamFile,
     endpoints,
-    known_robots,
-    names_in,
-    say_not_written,
+    parse_names,
+    parse_robots,
+    print_not_written,
     write_report,
 )
 from cpcbl_launch.team_file import find_team
@@ -92,11 +92,11 @@ def up(
     from cpcbl_launch.options import (
         check_duration,
         check_speed,
-        encoded,
-        file_for,
-        folder_for,
-        must_draw,
-        must_see,
+        json_text,
+        require_folder,
+        require_matplotlib,
+        require_team_opencv,
+        require_writable_file,
     )
     from cpcbl_launch.run import logged_team as real_logs
     from cpcbl_launch.run.up import (
@@ -105,11 +105,11 @@ def up(
         Launch,
         OnThisMachine,
         Run,
-        dialled,
-        listening,
+        local_endpoint,
         run_team,
+        with_listen_endpoint,
     )
-    from cpcbl_launch.simulation.in_process import Choice, chosen
+    from cpcbl_launch.simulation.in_process import Overrides, with_overrides
     from cpcbl_launch.views.run import LiveTable, print_report
 
     check_speed(speed)
@@ -118,24 +118,24 @@ def up(
     typed = file or Path("demo")
     if file == Path("mrclam") and data is not None and not file.exists():
         file = real_logs.builtin_for(data)
-    team = listening(find_team(file or Path("demo")))
-    budgets = Choice(
+    team = with_listen_endpoint(find_team(file or Path("demo")))
+    budgets = Overrides(
         bytes_per_s=bytes_per_s,
         messages_per_minute=messages_per_minute,
         match_messages=match_messages,
     )
-    team = chosen(team, budgets)
+    team = with_overrides(team, budgets)
     for option, path in (("--report", report), ("--picture", picture), ("--record", record)):
         if path is not None:
-            file_for(option, path)
+            require_writable_file(option, path)
     if picture is not None:
-        must_draw("--picture", picture)
+        require_matplotlib("--picture", picture)
     if logs is not None:
-        folder_for("--logs", logs)
+        require_folder("--logs", logs)
     run = Run(team, duration, speed, seed, folder=logs, picture=picture, record=record)
     if any(robot.source == "mrclam" for robot in team.robots.values()):
-        logged = real_logs.on_log(team, Path(data or team.data or "."))
-        logged = real_logs.shortened(logged, duration)
+        logged = real_logs.load_logged_team(team, Path(data or team.data or "."))
+        logged = real_logs.with_duration(logged, duration)
         run = run._replace(
             team=logged.team,
             truth=logged.truth,
@@ -145,28 +145,34 @@ def up(
         )
     elif duration is None:
         run = run._replace(duration_s=SIMULATED_S)
-    run = run._replace(team=real_logs.blinded(run.team, names_in(blind)))
+    run = run._replace(team=real_logs.with_blind_robots(run.team, parse_names(blind)))
     if robots:
-        run = run._replace(here=known_robots("--robots", robots, run.team))
+        run = run._replace(here=parse_robots("--robots", robots, run.team))
     console = Console(stderr=as_json)
     launch: Launch = OnThisMachine
     if not containers:
-        must_see(run.team, run.team.robots if run.here is None else run.here, field=True)
+        require_team_opencv(run.team, run.team.robots if run.here is None else run.here, field=True)
     else:
-        from cpcbl_launch.run.containers.launch import InContainers, progress_on
+        from cpcbl_launch.run.containers.launch import InContainers, line_printer
 
-        launch = partial(InContainers, image=image, base=base_image, said=progress_on(console))
+        launch = partial(InContainers, image=image, base=base_image, said=line_printer(console))
     title = f"team {team.name}, {len(run.team.robots)} robots, {speed:g} x real time"
-    watch = ["cpcbl-team", "traffic", str(typed), "--connect", dialled(team.transport.listen[0])]
+    watch = [
+        "cpcbl-team",
+        "traffic",
+        str(typed),
+        "--connect",
+        local_endpoint(team.transport.listen[0]),
+    ]
     console.print(f"watch it: {shlex.join(watch)}", style="dim", highlight=False, soft_wrap=True)
     with LiveTable(title, run.team.robots, console, quiet=as_json) as table:
         result = run_team(run, table, Stop(), launch)
     lost = dict(result.not_written) | write_report(report, result)
     if as_json:
-        sys.stdout.write(encoded(result) + "\n")
+        sys.stdout.write(json_text(result) + "\n")
     else:
         print_report(result, console)
-    say_not_written(lost)
+    print_not_written(lost)
 
 
 def field(
@@ -185,16 +191,16 @@ def field(
 
     from cpcbl_agents.clock import Clock
     from cpcbl_agents.process import Stop
-    from cpcbl_launch.options import must_see
-    from cpcbl_launch.simulation.field_node import robots_at, run_field
+    from cpcbl_launch.options import require_team_opencv
+    from cpcbl_launch.simulation.field_node import parse_sites, run_field
     from cpcbl_transport.bus import Bus
     from cpcbl_transport.security import Identity, link_of
     from cpcbl_transport.topics import Role
     from cpcbl_transport.zenoh_bus import open_bus
 
     team = find_team(team_file)
-    must_see(team, field=True)
-    elsewhere = robots_at(site or (), team)
+    require_team_opencv(team, field=True)
+    elsewhere = parse_sites(site or (), team)
     stop = Stop(parent)
     with ExitStack() as stack:
 
@@ -234,7 +240,7 @@ def router(
 ) -> None:
     """Run the team's Zenoh router, on any machine, until SIGINT, SIGTERM or SIGHUP."""
     from cpcbl_agents.process import Stop
-    from cpcbl_launch.run.router import run_router, team_router, written_config
+    from cpcbl_launch.run.router import config_text, run_router, team_router
     from cpcbl_transport.zenoh_bus import read_router_config
 
     if (file is None) == (config is None):
@@ -251,6 +257,6 @@ def router(
             team_router(team, listen or (), connect or (), speed),
         )
     if print_config:
-        typer.echo(written_config(options, title))
+        typer.echo(config_text(options, title))
     else:
         run_router(options, title, Stop(parent))

@@ -46,9 +46,9 @@ def keys(
     """
     from rich.console import Console
 
-    from cpcbl_launch.keys.folder import Wish, make_keys
-    from cpcbl_launch.keys.show import drawn
-    from cpcbl_launch.options import encoded
+    from cpcbl_launch.keys.folder import KeyRequest, make_keys
+    from cpcbl_launch.keys.show import key_table
+    from cpcbl_launch.options import json_text
     from cpcbl_launch.team_file import key_folder
 
     team = find_team(file)
@@ -57,7 +57,7 @@ def keys(
     if output is None and not file.exists():
         raise InputError(f"{file}: comes with the package; copy it, or name a folder by --output")
     folder = output or key_folder(team, file)
-    wish = Wish(
+    wish = KeyRequest(
         observers=tuple(observer or ()),
         hosts=tuple(host or ()),
         lasting=timedelta(days=days),
@@ -70,9 +70,9 @@ def keys(
     except OSError as error:
         raise InputError(f"{error.filename or folder}: {error.strerror}; name a folder") from error
     if as_json:
-        sys.stdout.write(encoded(made) + "\n")
+        sys.stdout.write(json_text(made) + "\n")
         return
-    Console().print(drawn(made))
+    Console().print(key_table(made))
     router = next(member for member in made if member.hosts)
     typer.echo(f"the router can be dialled at {', '.join(router.hosts)}")
     typer.echo(f"{folder}: bring ca/private.key to a safe place, each other folder to its machine")

@@ -43,9 +43,9 @@ def traffic(
     from rich.console import Console
 
     from cpcbl_agents.process import Stop
-    from cpcbl_launch.options import encoded
-    from cpcbl_launch.views.traffic.show import TrafficView, drawn
-    from cpcbl_launch.views.traffic.watch import Watch, watch_team
+    from cpcbl_launch.options import json_text
+    from cpcbl_launch.views.traffic.show import TrafficView, traffic_view
+    from cpcbl_launch.views.traffic.watch import WatchRequest, watch_team
     from cpcbl_team.config import TransportSettings
     from cpcbl_transport.security import Identity, Link, link_of
     from cpcbl_transport.topics import Role
@@ -58,7 +58,7 @@ def traffic(
     link = Link(tuple(endpoints))
     if team is not None:
         link = link_of(team, Identity(Role.OPERATOR), endpoints)
-    watch = Watch(
+    watch = WatchRequest(
         team_name or (team.name if team is not None else ""),
         () if team is None else tuple(team.robots),
         link,
@@ -69,9 +69,9 @@ def traffic(
     with TrafficView(where, console, quiet=as_json) as view:
         result = watch_team(watch, view, Stop())
     if as_json:
-        sys.stdout.write(encoded(result) + "\n")
+        sys.stdout.write(json_text(result) + "\n")
     else:
-        console.print(drawn(result, where))
+        console.print(traffic_view(result, where))
 
 
 def look(
@@ -101,7 +101,7 @@ def look(
     """
     from rich.console import Console
 
-    from cpcbl_launch.options import encoded, folder_for, must_see
+    from cpcbl_launch.options import json_text, require_folder, require_team_opencv
     from cpcbl_launch.views.frames.report import LookReport, print_look, reported, written
 
     team = find_team(team_file)
@@ -110,8 +110,8 @@ def look(
     if team.robots[robot].sensing != "camera":
         raise InputError(f'look {robot}: has no camera in {team_file}; set sensing = "camera"')
     if pictures is not None:
-        must_see(team, [robot])
-    folder = folder_for("--save", save)
+        require_team_opencv(team, [robot])
+    folder = require_folder("--save", save)
     looks = _looks(robot, team, connect, wait) if pictures is None else _at(robot, team, pictures)
     most = 1 if count is None and pictures is None else count
     console, reports = Console(), list[LookReport]()
@@ -120,7 +120,7 @@ def look(
         if not as_json:
             print_look(reports[-1], console)
     if as_json:
-        sys.stdout.write(encoded(reports) + "\n")
+        sys.stdout.write(json_text(reports) + "\n")
 
 
 def _looks(

@@ -24,14 +24,14 @@ CLOCKS_APART = timedelta(days=1)  # a machine whose clock is late takes a new ce
 AUTHORITY_DAYS = 3650
 
 
-class Pair(NamedTuple):
+class KeyPair(NamedTuple):
     """A private key and its certificate, in PEM."""
 
     private_key: bytes
     certificate: bytes
 
 
-class Facts(NamedTuple):
+class CertificateFacts(NamedTuple):
     """What a certificate says."""
 
     common_name: str
@@ -40,7 +40,7 @@ class Facts(NamedTuple):
     hosts: tuple[str, ...]
 
 
-def new_authority(team: str, now: datetime) -> Pair:
+def new_authority(team: str, now: datetime) -> KeyPair:
     """An authority that signs the certificates of members, and no other authority's."""
     key = ec.generate_private_key(ec.SECP256R1())
     serial = x509.random_serial_number()
@@ -48,7 +48,7 @@ def new_authority(team: str, now: datetime) -> Pair:
     name = _name(f"{team} authority {serial % 2**32:08x}")
     lasting = timedelta(days=AUTHORITY_DAYS)
     certificate = (
-        _begun(name, name, key.public_key(), now, lasting)
+        _certificate_builder(name, name, key.public_key(), now, lasting)
         .serial_number(serial)
         .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
         .add_extension(_usage(signs=True), critical=True)
@@ -58,9 +58,9 @@ def new_authority(team: str, now: datetime) -> Pair:
     return _pem(key, certificate)
 
 
-def issued(
-    authority: Pair, common_name: str, hosts: Iterable[str], now: datetime, lasting: timedelta
-) -> Pair:
+def issue_certificate(
+    authority: KeyPair, common_name: str, hosts: Iterable[str], now: datetime, lasting: timedelta
+) -> KeyPair:
     """A certificate with a new key. With hosts its owner may be dialled there, else only dial.
 
     Raises InputError for hosts that are none, and for an authority that ends sooner.
@@ -77,7 +77,7 @@ def issued(
     key = ec.generate_private_key(ec.SECP256R1())
     usages, names = [ExtendedKeyUsageOID.CLIENT_AUTH], [_host(host) for host in hosts]
     builder = (
-        _begun(_name(common_name), above.subject, key.public_key(), now, lasting)
+        _certificate_builder(_name(common_name), above.subject, key.public_key(), now, lasting)
         .serial_number(x509.random_serial_number())
         .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
         .add_extension(_usage(signs=False), critical=True)
@@ -92,7 +92,7 @@ def issued(
     return _pem(key, builder.sign(signer, hashes.SHA256()))
 
 
-def facts(certificate: bytes) -> Facts:
+def certificate_facts(certificate: bytes) -> CertificateFacts:
     """What a certificate says. Raises SecurityError for one that cannot be read."""
     with _reading(CERTIFICATE):
         read = x509.load_pem_x509_certificate(certificate)
@@ -102,10 +102,10 @@ def facts(certificate: bytes) -> Facts:
     except x509.ExtensionNotFound:
         hosts = ()
     common_name = read.subject.get_attributes_for_oid(NameOID.COMMON_NAME)[0].value
-    return Facts(str(common_name), read.not_valid_before_utc, read.not_valid_after_utc, hosts)
+    return CertificateFacts(str(common_name), read.not_valid_before_utc, read.not_valid_after_utc, hosts)
 
 
-def signed_by(certificate: bytes, authority: bytes) -> bool:
+def is_signed_by(certificate: bytes, authority: bytes) -> bool:
     """Whether an authority signed a certificate."""
     try:
         x509.load_pem_x509_certificate(certificate).verify_directly_issued_by(
@@ -116,7 +116,7 @@ def signed_by(certificate: bytes, authority: bytes) -> bool:
     return True
 
 
-def belong_together(pair: Pair) -> bool:
+def is_matching_pair(pair: KeyPair) -> bool:
     """Whether a private key is that of a certificate."""
     try:
         key = serialization.load_pem_private_key(pair.private_key, None)
@@ -126,7 +126,7 @@ def belong_together(pair: Pair) -> bool:
     return key.public_key() == certificate.public_key()
 
 
-def newest(bundle: bytes) -> bytes:
+def newest_certificate(bundle: bytes) -> bytes:
     """The first certificate of several in one text: that of the authority in use.
 
     Raises SecurityError for a text that holds none.
@@ -145,7 +145,7 @@ def _reading(file: str) -> Iterator[None]:
         raise SecurityError(f"{file}: cannot be read: {error}; bring back a good copy") from error
 
 
-def _begun(
+def _certificate_builder(
     subject: "x509.Name",
     issuer: "x509.Name",
     key: "ec.EllipticCurvePublicKey",
@@ -191,8 +191,8 @@ def _usage(signs: bool) -> "x509.KeyUsage":
     )
 
 
-def _pem(key: "ec.EllipticCurvePrivateKey", certificate: "x509.Certificate") -> Pair:
-    return Pair(
+def _pem(key: "ec.EllipticCurvePrivateKey", certificate: "x509.Certificate") -> KeyPair:
+    return KeyPair(
         key.private_bytes(
             serialization.Encoding.PEM,
             serialization.PrivateFormat.PKCS8,

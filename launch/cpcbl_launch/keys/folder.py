@@ -19,15 +19,15 @@ import msgspec
 
 from cpcbl_team.errors import InputError
 from cpcbl_launch.keys.authority import (
-    Pair,
-    belong_together,
-    facts,
-    issued,
+    KeyPair,
+    is_matching_pair,
+    certificate_facts,
+    issue_certificate,
     new_authority,
-    newest,
-    signed_by,
+    newest_certificate,
+    is_signed_by,
 )
-from cpcbl_launch.keys.plan import AUTHORITY, Deed, Step, hosts, plan
+from cpcbl_launch.keys.plan import AUTHORITY, KeyAction, MemberAction, hosts, plan_actions
 from cpcbl_team.config import Team
 from cpcbl_transport.security import (
     CA,
@@ -52,7 +52,7 @@ class KeysReport(msgspec.Struct, frozen=True, kw_only=True):
     hosts: tuple[str, ...] = ()
 
 
-class Wish(msgspec.Struct, frozen=True, kw_only=True):
+class KeyRequest(msgspec.Struct, frozen=True, kw_only=True):
     """What `keys` is asked for."""
 
     observers: tuple[str, ...] = ()
@@ -63,63 +63,63 @@ class Wish(msgspec.Struct, frozen=True, kw_only=True):
     retire_ca: bool = False
 
 
-def make_keys(team: Team, folder: Path, wish: Wish) -> list[KeysReport]:
+def make_keys(team: Team, folder: Path, wish: KeyRequest) -> list[KeysReport]:
     """Makes what is missing in a key folder, and what the wish names anew.
 
     Raises InputError for a wish that cannot be met, OSError where nothing can be written.
     """
     now = datetime.now(UTC)
     known = members_in(folder) if (folder / str(Role.ROUTER) / MEMBERS).exists() else ()
-    steps = plan(team, known, wish.observers, wish.renew, wish.revoke)
-    steps = tuple(_missing(step, folder) for step in steps)
+    steps = plan_actions(team, known, wish.observers, wish.renew, wish.revoke)
+    steps = tuple(_with_missing_key(step, folder) for step in steps)
     reached = hosts(team, wish.hosts)
     _check_hosts(steps, folder, wish.hosts)
-    _folder(folder)
-    _write(folder / ".gitignore", b"*\n", PUBLIC)
+    _make_folder(folder)
+    _replace_file(folder / ".gitignore", b"*\n", PUBLIC)
     before = (folder / AUTHORITY / CA).exists()
     authorities = _authorities(team, folder, wish, now)
     for step in steps:
         at = folder / str(step.member.identity)
-        if step.deed in (Deed.MADE, Deed.RENEWED):
+        if step.action in (KeyAction.MADE, KeyAction.RENEWED):
             names = _hosts_of(step.member.identity, at, reached)
-            pair = issued(
-                _signer(folder, authorities), step.member.common_name, names, now, wish.lasting
+            pair = issue_certificate(
+                _signing_pair(folder, authorities), step.member.common_name, names, now, wish.lasting
             )
-            _folder(at)
-            _write(at / PRIVATE_KEY, pair.private_key, SECRET)
-            _write(at / CERTIFICATE, pair.certificate, PUBLIC)
+            _make_folder(at)
+            _replace_file(at / PRIVATE_KEY, pair.private_key, SECRET)
+            _replace_file(at / CERTIFICATE, pair.certificate, PUBLIC)
     if wish.retire_ca:
-        authorities = _retired(steps, folder, authorities)
+        authorities = _retire_old_authorities(steps, folder, authorities)
     for step in steps:
-        if step.deed is not Deed.REVOKED:
-            _write(folder / str(step.member.identity) / CA, authorities, PUBLIC)
+        if step.action is not KeyAction.REVOKED:
+            _replace_file(folder / str(step.member.identity) / CA, authorities, PUBLIC)
     members = msgspec.json.encode([step.member for step in steps])
-    _write(folder / str(Role.ROUTER) / MEMBERS, msgspec.json.format(members, indent=1), PUBLIC)
-    deed = Deed.MADE if not before else Deed.RENEWED if AUTHORITY in wish.renew else Deed.KEPT
-    said = facts(newest(authorities))
+    _replace_file(folder / str(Role.ROUTER) / MEMBERS, msgspec.json.format(members, indent=1), PUBLIC)
+    deed = KeyAction.MADE if not before else KeyAction.RENEWED if AUTHORITY in wish.renew else KeyAction.KEPT
+    said = certificate_facts(newest_certificate(authorities))
     authority = KeysReport(
         who=AUTHORITY, common_name=said.common_name, deed=deed, valid_until=said.not_after
     )
     return [authority, *(_report(step, folder) for step in steps)]
 
 
-def _missing(step: Step, folder: Path) -> Step:
+def _with_missing_key(step: MemberAction, folder: Path) -> MemberAction:
     """A member whose key is gone, or not that of its certificate, gets another."""
     at = folder / str(step.member.identity)
     try:
-        whole = belong_together(
-            Pair((at / PRIVATE_KEY).read_bytes(), (at / CERTIFICATE).read_bytes())
+        whole = is_matching_pair(
+            KeyPair((at / PRIVATE_KEY).read_bytes(), (at / CERTIFICATE).read_bytes())
         )
     except FileNotFoundError:
         whole = False
-    return step if whole or step.deed is not Deed.KEPT else step._replace(deed=Deed.MADE)
+    return step if whole or step.action is not KeyAction.KEPT else step._replace(action=KeyAction.MADE)
 
 
-def _check_hosts(steps: Iterable[Step], folder: Path, named: Collection[str]) -> None:
+def _check_hosts(steps: Iterable[MemberAction], folder: Path, named: Collection[str]) -> None:
     """A router that keeps its certificate cannot be dialled at another host."""
     for step in steps:
-        if step.member.role is Role.ROUTER and step.deed is Deed.KEPT:
-            has = facts((folder / str(Role.ROUTER) / CERTIFICATE).read_bytes()).hosts
+        if step.member.role is Role.ROUTER and step.action is KeyAction.KEPT:
+            has = certificate_facts((folder / str(Role.ROUTER) / CERTIFICATE).read_bytes()).hosts
             lacking = [host for host in named if host not in has]
             if lacking:
                 raise InputError(
@@ -133,28 +133,28 @@ def _hosts_of(identity: Identity, at: Path, reached: tuple[str, ...]) -> tuple[s
     if identity.role is not Role.ROUTER:
         return ()
     old = at / CERTIFICATE
-    before = facts(old.read_bytes()).hosts if old.exists() else ()
+    before = certificate_facts(old.read_bytes()).hosts if old.exists() else ()
     return tuple(dict.fromkeys((*before, *reached)))
 
 
-def _authorities(team: Team, folder: Path, wish: Wish, now: datetime) -> bytes:
+def _authorities(team: Team, folder: Path, wish: KeyRequest, now: datetime) -> bytes:
     """The certificates of all authorities that are trusted, that in use first."""
     at = folder / AUTHORITY
     trusted = (at / CA).read_bytes() if (at / CA).exists() else b""
     if trusted and AUTHORITY not in wish.renew:
         return trusted
-    _folder(at)
+    _make_folder(at)
     authority = new_authority(team.name, now)
     # The certificate first: a key without it could sign what nobody trusts.
-    _write(at / CA, authority.certificate + trusted, PUBLIC)
-    _write(at / PRIVATE_KEY, authority.private_key, SECRET)
+    _replace_file(at / CA, authority.certificate + trusted, PUBLIC)
+    _replace_file(at / PRIVATE_KEY, authority.private_key, SECRET)
     return authority.certificate + trusted
 
 
-def _signer(folder: Path, authorities: bytes) -> Pair:
+def _signing_pair(folder: Path, authorities: bytes) -> KeyPair:
     path = folder / AUTHORITY / PRIVATE_KEY
     try:
-        return Pair(path.read_bytes(), newest(authorities))
+        return KeyPair(path.read_bytes(), newest_certificate(authorities))
     except FileNotFoundError:
         raise InputError(
             f"{path}: the authority's key is not here; bring it back from where it is kept, or make"
@@ -162,39 +162,39 @@ def _signer(folder: Path, authorities: bytes) -> Pair:
         ) from None
 
 
-def _retired(steps: Iterable[Step], folder: Path, authorities: bytes) -> bytes:
+def _retire_old_authorities(steps: Iterable[MemberAction], folder: Path, authorities: bytes) -> bytes:
     """Trusts the newest authority alone."""
-    latest = newest(authorities)
+    latest = newest_certificate(authorities)
     for step in steps:
         certificate = folder / str(step.member.identity) / CERTIFICATE
-        if step.deed is not Deed.REVOKED and not signed_by(certificate.read_bytes(), latest):
+        if step.action is not KeyAction.REVOKED and not is_signed_by(certificate.read_bytes(), latest):
             raise InputError(
                 f"--retire-ca: {step.member.identity} still has a certificate of the old authority;"
                 " --renew all first, and bring the new ones to their machines"
             )
-    _write(folder / AUTHORITY / CA, latest, PUBLIC)
+    _replace_file(folder / AUTHORITY / CA, latest, PUBLIC)
     return latest
 
 
-def _report(step: Step, folder: Path) -> KeysReport:
+def _report(step: MemberAction, folder: Path) -> KeysReport:
     path = folder / str(step.member.identity) / CERTIFICATE
-    said = facts(path.read_bytes()) if path.exists() else None
+    said = certificate_facts(path.read_bytes()) if path.exists() else None
     return KeysReport(
         who=str(step.member.identity),
         common_name=step.member.common_name,
-        deed=step.deed,
+        deed=step.action,
         valid_until=said.not_after if said else None,
         hosts=said.hosts if said else (),
     )
 
 
-def _folder(path: Path) -> None:
+def _make_folder(path: Path) -> None:
     missing = [p for p in (path, *path.parents) if not p.exists()]
     for each in reversed(missing):
         each.mkdir(mode=0o700)
 
 
-def _write(path: Path, content: bytes, mode: int) -> None:
+def _replace_file(path: Path, content: bytes, mode: int) -> None:
     """Replaces a file as a whole; nobody else can ever read what is secret."""
     if path.exists() and path.read_bytes() == content:
         return

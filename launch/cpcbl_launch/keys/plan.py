@@ -17,7 +17,7 @@ ALL, AUTHORITY = "all", "ca"
 SELF_NAMED = ("localhost", "127.0.0.1", "::1", "router")
 
 
-class Deed(StrEnum):
+class KeyAction(StrEnum):
     """What is done to one member."""
 
     MADE = "made"
@@ -26,20 +26,20 @@ class Deed(StrEnum):
     REVOKED = "revoked"
 
 
-class Step(NamedTuple):
+class MemberAction(NamedTuple):
     """One member, and what is done to it."""
 
     member: Member
-    deed: Deed
+    action: KeyAction
 
 
-def plan(
+def plan_actions(
     team: Team,
     known: Sequence[Member],
     observers: Collection[str] = (),
     renew: Collection[str] = (),
     revoke: Collection[str] = (),
-) -> tuple[Step, ...]:
+) -> tuple[MemberAction, ...]:
     """A step for each member that the team needs, is told to have, or had before.
 
     Raises InputError for names that nobody has.
@@ -59,13 +59,13 @@ def plan(
                 f" --revoke {member.identity}"
             )
     before = {member.identity: member for member in known}
-    wanted = [*_needed(team), *(Identity(Role.OBSERVER, name) for name in observers)]
+    wanted = [*_required_identities(team), *(Identity(Role.OBSERVER, name) for name in observers)]
     everyone = list(dict.fromkeys([*wanted, *before]))
     for option, names in (("--renew", {*renew} - {ALL, AUTHORITY}), ("--revoke", revoke)):
         for name in names:
-            if not any(_called(identity, name) for identity in everyone):
+            if not any(_is_named(identity, name) for identity in everyone):
                 raise InputError(f"{option} {name}: nobody has this name; {_names(everyone)}")
-    return tuple(_step(identity, before.get(identity), renew, revoke) for identity in everyone)
+    return tuple(_member_action(identity, before.get(identity), renew, revoke) for identity in everyone)
 
 
 def hosts(team: Team, named: Collection[str]) -> tuple[str, ...]:
@@ -76,7 +76,7 @@ def hosts(team: Team, named: Collection[str]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(h for h in (*SELF_NAMED, *dialled, *named) if h not in everywhere))
 
 
-def _needed(team: Team) -> Iterator[Identity]:
+def _required_identities(team: Team) -> Iterator[Identity]:
     yield Identity(Role.ROUTER)
     yield Identity(Role.OPERATOR)
     if team.simulated:
@@ -85,23 +85,23 @@ def _needed(team: Team) -> Iterator[Identity]:
         yield Identity(Role.ROBOT, name)
 
 
-def _step(
+def _member_action(
     identity: Identity, before: Member | None, renew: Collection[str], revoke: Collection[str]
-) -> Step:
+) -> MemberAction:
     if before is None:
-        return Step(Member(role=identity.role, name=identity.name), Deed.MADE)
-    if any(_called(identity, name) for name in revoke):
-        return Step(msgspec.structs.replace(before, revoked=True), Deed.REVOKED)
-    by_name = any(_called(identity, name) for name in renew)
+        return MemberAction(Member(role=identity.role, name=identity.name), KeyAction.MADE)
+    if any(_is_named(identity, name) for name in revoke):
+        return MemberAction(msgspec.structs.replace(before, revoked=True), KeyAction.REVOKED)
+    by_name = any(_is_named(identity, name) for name in renew)
     if by_name and before.revoked:
         again = msgspec.structs.replace(before, revoked=False, generation=before.generation + 1)
-        return Step(again, Deed.MADE)
+        return MemberAction(again, KeyAction.MADE)
     if by_name or (ALL in renew and not before.revoked):
-        return Step(before, Deed.RENEWED)
-    return Step(before, Deed.REVOKED if before.revoked else Deed.KEPT)
+        return MemberAction(before, KeyAction.RENEWED)
+    return MemberAction(before, KeyAction.REVOKED if before.revoked else KeyAction.KEPT)
 
 
-def _called(identity: Identity, name: str) -> bool:
+def _is_named(identity: Identity, name: str) -> bool:
     """`r1`, or `robot/r1` where a name alone would not do."""
     return name in (str(identity), identity.name or str(identity.role))
 

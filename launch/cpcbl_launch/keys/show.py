@@ -8,7 +8,7 @@ from cpcbl_launch.keys.folder import KeysReport
 from cpcbl_launch.reporting.tables import table
 
 
-def drawn(members: Iterable[KeysReport]) -> Table:
+def key_table(members: Iterable[KeysReport]) -> Table:
     """Who has which name in certificates, until when, and what was done about it."""
     shown = table("", ("who", "certificate says", "valid until (UTC)", ""), ())
     for member in members:

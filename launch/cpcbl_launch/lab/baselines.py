@@ -22,8 +22,8 @@ import numpy as np
 
 from cpcbl_agents.agent import Tick
 from cpcbl_agents.robot import Robot
-from cpcbl_launch.reporting.metrics import Floats, Trajectory, compared, score
-from cpcbl_launch.reporting.recorder import YardstickReport, mean_score
+from cpcbl_launch.reporting.metrics import Floats, Trajectory, samples_with_truth, score
+from cpcbl_launch.reporting.recorder import BaselineReport, mean_score
 from cpcbl_launch.run.logged_team import LoggedTeam
 from cpcbl_team.config import Field, LocalizationSettings
 from cpcbl_team.constraints import NEAREST_M
@@ -80,10 +80,10 @@ def yardsticks(
     return paths
 
 
-def scored(paths: Mapping[str, Trajectory], truth: Mapping[str, Floats]) -> YardstickReport:
+def scored(paths: Mapping[str, Trajectory], truth: Mapping[str, Floats]) -> BaselineReport:
     """One yardstick's figures, by the same metrics as the team's."""
-    robots = {n: score(compared(path, truth.get(n))[1]) for n, path in paths.items()}
-    return YardstickReport(robots=robots, team=mean_score(robots.values()))
+    robots = {n: score(samples_with_truth(path, truth.get(n))[1]) for n, path in paths.items()}
+    return BaselineReport(robots=robots, team=mean_score(robots.values()))
 
 
 def filtered(

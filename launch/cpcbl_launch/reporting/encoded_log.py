@@ -12,7 +12,7 @@ from cpcbl_transport.messages import Tagged, decode
 M = TypeVar("M", bound=Tagged)
 
 
-class Kept(Generic[M]):
+class EncodedLog(Generic[M]):
     """Messages of one type, in the order of their arrival."""
 
     def __init__(self) -> None:

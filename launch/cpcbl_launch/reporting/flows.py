@@ -36,7 +36,7 @@ class SpendingReport(msgspec.Struct, frozen=True, kw_only=True):
     """The most within one window."""
 
     @property
-    def held(self) -> bool:
+    def is_kept(self) -> bool:
         return self.most <= self.allowed * (1.0 + 1e-9)
 
 
@@ -74,7 +74,7 @@ def summed_spending(processes: Iterable[Iterable[Spending]]) -> tuple[SpendingRe
     )
 
 
-def all_held(spendings: Iterable[SpendingReport]) -> bool | None:
+def are_limits_kept(spendings: Iterable[SpendingReport]) -> bool | None:
     """Whether every limit held; None where there is none."""
-    held = [s.held for s in spendings]
+    held = [s.is_kept for s in spendings]
     return all(held) if held else None

@@ -23,7 +23,7 @@ PICTURE_SCHEMA = msgspec.json.encode(
 )
 
 
-def picture(frame: str, stamp_ns: int, jpeg: bytes) -> bytes:
+def foxglove_image(frame: str, stamp_ns: int, jpeg: bytes) -> bytes:
     """A JPEG at a time, in a frame of reference."""
     sec, nsec = divmod(stamp_ns, 10**9)
     return msgspec.json.encode(

@@ -45,13 +45,13 @@ def seconds(stamps_ns: Stamps) -> Floats:
     return np.asarray(stamps_ns * 1e-9, dtype=np.float64)
 
 
-def compared(trajectory: Trajectory, truth: Floats | None) -> tuple[Stamps, Samples]:
+def samples_with_truth(trajectory: Trajectory, truth: Floats | None) -> tuple[Stamps, Samples]:
     """A trajectory beside the truth (rows: s, x, y, heading), where it counts; with its stamps."""
     stamps_ns, estimate, covariance = trajectory
     if truth is None or len(truth) == 0:
         nothing = np.empty((0, 3))
         return stamps_ns[:0], Samples(nothing, nothing, None)
-    at, counts = truth_at(seconds(stamps_ns), truth)
+    at, counts = interpolated_truth(seconds(stamps_ns), truth)
     covariance = None if covariance is None else covariance[counts]
     return stamps_ns[counts], Samples(estimate[counts], at[counts], covariance)
 
@@ -111,7 +111,7 @@ def _rms(values: Floats) -> float:
     return float(np.sqrt(np.mean(values * values)))
 
 
-def truth_at(
+def interpolated_truth(
     times_s: Floats, truth: Floats, nearest_s: float = 2.5
 ) -> tuple[Floats, NDArray[np.bool_]]:
     """Truth (rows: s, x, y, heading) interpolated at times, shape (n, 3), and where it counts:

@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from cpcbl_launch.reporting.metrics import Floats, Trajectory, compared, score, seconds
+from cpcbl_launch.reporting.metrics import Floats, Trajectory, samples_with_truth, score, seconds
 from cpcbl_launch.reporting.recorder import Effect, GuestReport, Phase, Recorder, RobotReport
 
 AWAY_S = 2.0  # who says nothing of itself for longer was away
@@ -23,13 +23,15 @@ class Span(NamedTuple):
     until_s: float = math.inf
 
 
-def phase(recorder: Recorder, robot: str, truth: Floats | None, spans: Sequence[Span]) -> Phase:
+def phase_report(
+    recorder: Recorder, robot: str, truth: Floats | None, spans: Sequence[Span]
+) -> Phase:
     """A robot's figures in some parts of a run."""
     path = recorder.trajectory(robot)
     inside = _inside(seconds(path.stamps_ns), spans)
     covariance = None if path.covariance is None else path.covariance[inside]
     part = Trajectory(path.stamps_ns[inside], path.estimate[inside], covariance)
-    figures = score(compared(part, truth)[1])
+    figures = score(samples_with_truth(part, truth)[1])
     return Phase(**msgspec.structs.asdict(figures), position_sigma_m=_sigma_m(part))
 
 
@@ -46,7 +48,7 @@ def _sigma_m(path: Trajectory) -> float | None:
     return float(np.sqrt(0.5 * np.mean(path.covariance[:, 0] + path.covariance[:, 2])))
 
 
-def presence(times_s: Sequence[float]) -> list[Span]:
+def presence_spans(times_s: Sequence[float]) -> list[Span]:
     """When somebody was there who spoke at these times, which are in order."""
     if not len(times_s):
         return []
@@ -56,7 +58,9 @@ def presence(times_s: Sequence[float]) -> list[Span]:
     return [Span(*span) for span in zip(begins, ends, strict=True)]
 
 
-def split(present: Sequence[Span], begin_s: float) -> tuple[list[Span], list[Span], list[Span]]:
+def split_by_presence(
+    present: Sequence[Span], begin_s: float
+) -> tuple[list[Span], list[Span], list[Span]]:
     """The parts of a run from `begin_s` on before, during and after somebody's presence."""
     before = [Span(begin_s, present[0].from_s)]
     during = [Span(max(begin_s, p.from_s), p.until_s) for p in present]
@@ -80,12 +84,12 @@ def guest_reports(
     heard = {name: len(tracks) for name, tracks in list(recorder.tracks.items())}
     others = sorted(heard.keys() - set(robots), key=lambda name: (-heard[name], name))
     for name in sorted(others[:MOST_GUESTS]):
-        present = presence(seconds(recorder.trajectory(name).stamps_ns).tolist())
-        parts = split(present, begin_s)
+        present = presence_spans(seconds(recorder.trajectory(name).stamps_ns).tolist())
+        parts = split_by_presence(present, begin_s)
         effects = {
             robot: Effect(
                 **{
-                    part: phase(recorder, robot, truth.get(robot), spans)
+                    part: phase_report(recorder, robot, truth.get(robot), spans)
                     for part, spans in zip(Effect.__struct_fields__, parts, strict=True)
                 }
             )

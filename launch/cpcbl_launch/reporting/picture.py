@@ -55,7 +55,7 @@ def draw_run(
     errors.grid(True, which="both", alpha=0.3)
     if helped_from_s is not None:
         errors.axvline(helped_from_s - begin_s, color="black", linestyle="--")
-        _written_at(errors, helped_from_s - begin_s, "teammates begin to help")
+        _annotate_time(errors, helped_from_s - begin_s, "teammates begin to help")
     figure.legend(*errors.get_legend_handles_labels(), loc="outside upper center", ncols=len(names))
     figure.savefig(path, dpi=110)
     plt.close(figure)
@@ -66,14 +66,14 @@ def _draw_guest(
 ) -> None:
     for from_s, until_s in present_s:
         errors.axvspan(from_s, until_s, color="0.85", zorder=0)
-        _written_at(errors, from_s, f"{name} is there")
+        _annotate_time(errors, from_s, f"{name} is there")
     if truth is not None:
         field.plot(truth[:, 1], truth[:, 2], color="black", linewidth=0.7)
         field.plot(truth[-1, 1], truth[-1, 2], "*", markersize=12, color="black")
         field.annotate(name, tuple(truth[-1, 1:3]), (7, -3), textcoords="offset points", fontsize=8)
 
 
-def _written_at(errors: Axes, time_s: float, text: str) -> None:
+def _annotate_time(errors: Axes, time_s: float, text: str) -> None:
     """At the top, just after a time."""
     errors.annotate(
         text,

@@ -8,11 +8,11 @@ from collections.abc import Iterable, Mapping, Sequence
 import msgspec
 import numpy as np
 
-from cpcbl_launch.reporting.encoded_log import Kept
+from cpcbl_launch.reporting.encoded_log import EncodedLog
 from cpcbl_launch.reporting.flows import (
     FlowReport,
     SpendingReport,
-    all_held,
+    are_limits_kept,
     summed_flows,
     summed_spending,
 )
@@ -21,11 +21,11 @@ from cpcbl_launch.reporting.metrics import (
     Samples,
     Score,
     Trajectory,
-    compared,
+    samples_with_truth,
     score,
     seconds,
 )
-from cpcbl_launch.reporting.trust_report import TrustReport, trust_of
+from cpcbl_launch.reporting.trust_report import TrustReport, trust_reports
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus
 from cpcbl_transport.decoding import read
@@ -109,7 +109,7 @@ class TeamReport(MeanScore, frozen=True, kw_only=True):
     """Whether every limit of every robot held; None where there is none."""
 
 
-class YardstickReport(msgspec.Struct, frozen=True, kw_only=True):
+class BaselineReport(msgspec.Struct, frozen=True, kw_only=True):
     """What another filter makes of the same inputs."""
 
     robots: dict[str, Score]
@@ -137,7 +137,7 @@ class Report(msgspec.Struct, frozen=True, kw_only=True):
     """Before collaboration began, where it began late."""
     guests: dict[str, GuestReport] = {}
     """Robots that the team file does not name; no part of the team's figures."""
-    yardsticks: dict[str, YardstickReport] = {}
+    yardsticks: dict[str, BaselineReport] = {}
     """dead_reckoning, solo_ekf, centralized_ekf, where they were asked for."""
 
 
@@ -146,27 +146,27 @@ class Recorder:
 
     def __init__(self, bus: Bus) -> None:
         self._lock = threading.Lock()
-        self.tracks: dict[str, Kept[Track]] = {}
+        self.tracks: dict[str, EncodedLog[Track]] = {}
         self.status: dict[str, Status] = {}
-        self.truths: Kept[Truths] = Kept()
+        self.truths: EncodedLog[Truths] = EncodedLog()
         self.counts: Counter[str] = Counter()
         """What was taken, by topic, and what was refused, by reason."""
-        self._done: dict[str, list[Status]] = {}
+        self._earlier_processes: dict[str, list[Status]] = {}
         for topic in (topics.TRACK, topics.STATUS, topics.TRUTH):
-            bus.subscribe(topic.at(), self._arrived)
+            bus.subscribe(topic.at(), self._receive)
 
-    def _arrived(self, key: str, payload: bytes) -> None:
+    def _receive(self, key: str, payload: bytes) -> None:
         message = read(key, payload)
         with self._lock:
             taken = not isinstance(message, Refusal)
             self.counts[key.partition("/")[0] if taken else str(message)] += 1
             match message:
                 case Track():
-                    self.tracks.setdefault(message.robot, Kept()).append(payload)
+                    self.tracks.setdefault(message.robot, EncodedLog()).append(payload)
                 case Status():
                     before = self.status.get(message.robot)
                     if before is not None and before.incarnation != message.incarnation:
-                        self._done.setdefault(message.robot, []).append(before)
+                        self._earlier_processes.setdefault(message.robot, []).append(before)
                     self.status[message.robot] = message
                 case Truths():
                     self.truths.append(payload)
@@ -207,13 +207,13 @@ class Recorder:
         self, robot: str, truth: Floats | None, from_s: float = -np.inf, until_s: float = np.inf
     ) -> Samples:
         """A robot's estimates within [from_s, until_s), beside the truth, where there is one."""
-        return compared(self.trajectory(robot, from_s, until_s), truth)[1]
+        return samples_with_truth(self.trajectory(robot, from_s, until_s), truth)[1]
 
     def timed_samples(
         self, robot: str, truth: Floats, from_s: float = -np.inf, until_s: float = np.inf
     ) -> tuple[Floats, Samples]:
         """The same with its times (s)."""
-        stamps_ns, samples = compared(self.trajectory(robot, from_s, until_s), truth)
+        stamps_ns, samples = samples_with_truth(self.trajectory(robot, from_s, until_s), truth)
         return seconds(stamps_ns), samples
 
     def report(
@@ -227,7 +227,7 @@ class Recorder:
             name: self.robot_report(name, variant, truth.get(name), from_s)
             for name, variant in variants.items()
         }
-        return Report(robots=robots, team=_team(robots), refused=self.refused)
+        return Report(robots=robots, team=_team_report(robots), refused=self.refused)
 
     def robot_report(
         self, name: str, variant: str, truth: Floats | None, from_s: float = -np.inf
@@ -237,7 +237,7 @@ class Recorder:
         figures = score(self.samples(name, truth, from_s))
         tracks = list(self.tracks.get(name, ()))
         statuses = [
-            *self._done.get(name, ()),
+            *self._earlier_processes.get(name, ()),
             *([self.status[name]] if name in self.status else []),
         ]
         return RobotReport(
@@ -251,12 +251,12 @@ class Recorder:
             bytes_sent=sum(s.bytes_sent for s in statuses),
             messages_received=sum(s.messages_received for s in statuses),
             bytes_received=sum(s.bytes_received for s in statuses),
-            counts=_added(statuses),
-            learned=_learned(statuses),
+            counts=_summed_counts(statuses),
+            learned=_learned_report(statuses),
             sent=summed_flows(s.sent for s in statuses),
             heard=summed_flows(s.heard for s in statuses),
             spending=summed_spending(s.spending for s in statuses),
-            trust=trust_of(statuses),
+            trust=trust_reports(statuses),
         )
 
 
@@ -280,7 +280,7 @@ def _longest_lost_s(tracks: list[Track]) -> float:
     return longest_ns * 1e-9
 
 
-def _added(statuses: list[Status]) -> dict[str, int]:
+def _summed_counts(statuses: list[Status]) -> dict[str, int]:
     total: dict[str, int] = {}
     for status in statuses:
         for reason, n in status.counts.items():
@@ -288,7 +288,7 @@ def _added(statuses: list[Status]) -> dict[str, int]:
     return dict(sorted(total.items()))
 
 
-def _learned(statuses: Sequence[Status]) -> LearnedReport | None:
+def _learned_report(statuses: Sequence[Status]) -> LearnedReport | None:
     if not statuses or statuses[-1].learned is None:
         return None
     distance, turn, bias = statuses[-1].learned
@@ -308,10 +308,10 @@ def mean_score(scores: Iterable[Score]) -> MeanScore:
     return MeanScore(**{name: mean(name) for name in MeanScore.__struct_fields__})
 
 
-def _team(robots: Mapping[str, RobotReport]) -> TeamReport:
+def _team_report(robots: Mapping[str, RobotReport]) -> TeamReport:
     return TeamReport(
         **msgspec.structs.asdict(mean_score(robots.values())),
         messages_sent=sum(r.messages_sent for r in robots.values()),
         bytes_sent=sum(r.bytes_sent for r in robots.values()),
-        within_budget=all_held(s for r in robots.values() for s in r.spending),
+        within_budget=are_limits_kept(s for r in robots.values() for s in r.spending),
     )

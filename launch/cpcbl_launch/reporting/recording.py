@@ -21,7 +21,7 @@ from mcap.writer import Writer
 
 from cpcbl_agents.sensing import SensorInput
 from cpcbl_agents.sources.mrclam import LogError
-from cpcbl_launch.reporting.foxglove import PICTURE, PICTURE_SCHEMA, picture
+from cpcbl_launch.reporting.foxglove import PICTURE, PICTURE_SCHEMA, foxglove_image
 from cpcbl_launch.reporting.metrics import Floats
 from cpcbl_launch.reporting.recorder import truth_rows
 from cpcbl_team.config import Team
@@ -54,9 +54,9 @@ class Recording(AbstractContextManager["Recording"]):
         self._writer.add_attachment(0, 0, TEAM, "application/json", msgspec.json.encode(team))
         self._channels: dict[str, int] = {}
         self._schema = 0
-        self._handles = [bus.subscribe(topic.at(), self._arrived) for topic in RECORDED]
+        self._handles = [bus.subscribe(topic.at(), self._receive) for topic in RECORDED]
 
-    def _arrived(self, key: str, payload: bytes) -> None:
+    def _receive(self, key: str, payload: bytes) -> None:
         message = read(key, payload)
         if isinstance(message, Refusal) or message.stamp_ns < 0:  # a file knows no time before 1970
             return
@@ -84,7 +84,7 @@ class Recording(AbstractContextManager["Recording"]):
             if not self._schema:
                 self._schema = writer.register_schema(PICTURE, "jsonschema", PICTURE_SCHEMA)
             self._channels[key] = writer.register_channel(key, "json", self._schema)
-        data = picture(look.robot, at_ns, look.image)
+        data = foxglove_image(look.robot, at_ns, look.image)
         writer.add_message(self._channels[key], at_ns, data, at_ns)
 
     def _give_up(self, error: OSError) -> None:
@@ -108,7 +108,7 @@ class Recording(AbstractContextManager["Recording"]):
                 self._give_up(error)
 
 
-class Recorded(NamedTuple):
+class RecordedRun(NamedTuple):
     """What a recording says: inputs and truth (rows of s, x, y, heading) by robot.
 
     Of robots with cameras, sightings are those of the frames that were shown: twice a second.
@@ -119,7 +119,7 @@ class Recorded(NamedTuple):
     truth: dict[str, Floats]
 
 
-def read_recording(path: Path) -> Recorded:
+def read_recording(path: Path) -> RecordedRun:
     """What `Recording` wrote. Raises LogError."""
     try:
         with path.open("rb") as file:
@@ -138,7 +138,7 @@ def read_recording(path: Path) -> Recorded:
     except (McapError, struct.error, msgspec.MsgspecError, ValueError) as error:
         raise LogError(f"{path}: not a whole recording: {error}") from error
     truths = [message for _, message in messages if isinstance(message, Truths)]
-    return Recorded(team, _inputs(messages), truth_rows(truths))
+    return RecordedRun(team, _inputs(messages), truth_rows(truths))
 
 
 def _inputs(messages: Iterable[tuple[str, Message]]) -> dict[str, list[SensorInput]]:

@@ -22,7 +22,7 @@ class TrustReport(msgspec.Struct, frozen=True, kw_only=True):
     """The least time from stamp to arrival; below zero the teammate's clock is ahead."""
 
 
-def trust_of(statuses: Sequence[Status]) -> tuple[TrustReport, ...]:
+def trust_reports(statuses: Sequence[Status]) -> tuple[TrustReport, ...]:
     """By the last status of the robot's last process; quarantines of all of them."""
     earlier = [t for status in statuses[:-1] for t in status.trust]
     return tuple(
@@ -37,13 +37,13 @@ def trust_of(statuses: Sequence[Status]) -> tuple[TrustReport, ...]:
     )
 
 
-def distrusted(trust: Iterable[Trust | TrustReport]) -> str:
+def distrust_text(trust: Iterable[Trust | TrustReport]) -> str:
     """`distrusts west (biased), r4 (clock 0.45 s ahead)`; empty where all are believed."""
-    named = [f"{t.peer} ({_why(t)})" for t in trust if t.reason]
+    named = [f"{t.peer} ({_reason_text(t)})" for t in trust if t.reason]
     return f"distrusts {', '.join(named)}" if named else ""
 
 
-def _why(t: Trust | TrustReport) -> str:
+def _reason_text(t: Trust | TrustReport) -> str:
     if t.reason != "clock":
         return t.reason
     return f"clock {-t.late_s:.2f} s ahead" if t.late_s < 0.0 else f"{t.late_s:.2f} s late"
@@ -54,6 +54,6 @@ def trust_remarks(robot: str, trust: Iterable[TrustReport]) -> Iterator[str]:
     for t in trust:
         times = f"{t.quarantines} times" if t.quarantines != 1 else "once"
         if t.reason:
-            yield f"robot {robot} does not believe {t.peer}: {_why(t)}"
+            yield f"robot {robot} does not believe {t.peer}: {_reason_text(t)}"
         elif t.quarantines:
             yield f"robot {robot} did not believe {t.peer} for a time ({times})"

@@ -4,7 +4,7 @@ import math
 from collections.abc import Mapping
 from pathlib import Path
 
-from cpcbl_launch.reporting.metrics import Floats, Stamps, Trajectory, compared
+from cpcbl_launch.reporting.metrics import Floats, Stamps, Trajectory, samples_with_truth
 
 
 def export_tum(
@@ -18,7 +18,7 @@ def export_tum(
     for kind, robots in paths.items():
         for name, path in robots.items():
             _write(folder / f"{name}_{kind}.tum", path.stamps_ns, path.estimate)
-            stamps_ns, samples = compared(path, truth.get(name))
+            stamps_ns, samples = samples_with_truth(path, truth.get(name))
             _write(folder / f"{name}_truth.tum", stamps_ns, samples.truth)
 
 

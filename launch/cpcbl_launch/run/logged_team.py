@@ -11,8 +11,8 @@ import numpy as np
 
 from cpcbl_agents.sources import mrclam
 from cpcbl_launch.options import check_duration
-from cpcbl_launch.reporting.metrics import Floats, truth_at
-from cpcbl_launch.team_file import builtin
+from cpcbl_launch.reporting.metrics import Floats, interpolated_truth
+from cpcbl_launch.team_file import builtin_path
 from cpcbl_team.config import Field, Start, Team
 from cpcbl_team.errors import InputError
 from cpcbl_team.geometry import Pose2, step
@@ -33,11 +33,11 @@ class LoggedTeam(NamedTuple):
 
 def builtin_for(folder: Path) -> Path:
     """The built-in team file that was not calibrated on this data set (by the name's number)."""
-    without = builtin(f"mrclam-without-{_number(folder.resolve().name)}")
-    return without if without.exists() else builtin("mrclam")
+    without = builtin_path(f"mrclam-without-{_number(folder.resolve().name)}")
+    return without if without.exists() else builtin_path("mrclam")
 
 
-def seen_before(team: Team, folder: Path) -> bool:
+def is_calibrated_on(team: Team, folder: Path) -> bool:
     """Whether the team's robots were calibrated on this very data set."""
     return _number(folder.resolve().name) in map(_number, team.calibrated_on)
 
@@ -47,7 +47,7 @@ def _number(name: str) -> str:
     return found.group() if found else name
 
 
-def on_log(team: Team, folder: Path) -> LoggedTeam:
+def load_logged_team(team: Team, folder: Path) -> LoggedTeam:
     """The team on the MRCLAM log in `folder`: robots start at the log's first true pose.
 
     A robot whose files are missing is left out. Raises LogError, and InputError for a robot with
@@ -62,7 +62,7 @@ def on_log(team: Team, folder: Path) -> LoggedTeam:
     names = [name for name in team.robots if name in there]
     if not names:
         raise mrclam.LogError(f"{folder}: has files for none of the robots {', '.join(left_out)}")
-    _must_read(team, names)
+    _require_log_source(team, names)
     truth = {name: mrclam.read_truth(folder, name) for name in names}
     spans = {name: mrclam.odometry_span_ns(folder, name) for name in names}
     robots = {
@@ -79,7 +79,7 @@ def on_log(team: Team, folder: Path) -> LoggedTeam:
     return LoggedTeam(ready, truth, left_out, start_ns, max(last for _, last in spans.values()))
 
 
-def shortened(logged: LoggedTeam, duration_s: float | None) -> LoggedTeam:
+def with_duration(logged: LoggedTeam, duration_s: float | None) -> LoggedTeam:
     """The same log, of which only so much is used; None: all of it. Raises InputError."""
     if duration_s is None:
         return logged
@@ -87,7 +87,7 @@ def shortened(logged: LoggedTeam, duration_s: float | None) -> LoggedTeam:
     return logged._replace(end_ns=min(logged.end_ns, logged.start_ns + int(duration_s * 1e9)))
 
 
-def _must_read(team: Team, names: Collection[str]) -> None:
+def _require_log_source(team: Team, names: Collection[str]) -> None:
     for name in names:
         source = team.robots[name].source
         if source != "mrclam":
@@ -114,12 +114,12 @@ def _start(folder: Path, robot: str, truth: Floats) -> Start | None:
         share = min(first_truth_ns - piece.from_ns, whole_ns) / whole_ns
         reckoned = step(reckoned, share * piece.distance_m, share * piece.turn_rad)
         way += abs(share * piece.distance_m)
-    pose, _ = truth_at(np.array([first_truth_ns * 1e-9]), truth)
+    pose, _ = interpolated_truth(np.array([first_truth_ns * 1e-9]), truth)
     x, y, heading = Pose2(*pose[0].tolist()) @ reckoned.inverse()
     return Start(x_m=x, y_m=y, heading_deg=math.degrees(heading), sigma_m=0.05 + 0.1 * way)
 
 
-def blinded(team: Team, blind: Collection[str]) -> Team:
+def with_blind_robots(team: Team, blind: Collection[str]) -> Team:
     """The team with some robots blind to landmarks. Raises InputError for an unknown name."""
     unknown = sorted(set(blind) - set(team.robots))
     if unknown:

@@ -14,8 +14,8 @@ from cpcbl_agents.clock import Clock
 from cpcbl_agents.guest_node import Visit
 from cpcbl_agents.process import Loop, new_incarnation, own_camera, while_time_holds
 from cpcbl_launch.reporting.flows import FlowReport, summed_flows
-from cpcbl_launch.simulation.guest_bodies import unfit
-from cpcbl_launch.team_file import beside, read_layer
+from cpcbl_launch.simulation.guest_bodies import unsupported_delay
+from cpcbl_launch.team_file import read_layer, with_added_robot
 from cpcbl_team.config import Team
 from cpcbl_team.errors import InputError
 from cpcbl_team.inputs import NAME_PATTERN
@@ -29,7 +29,7 @@ from cpcbl_transport.zenoh_bus import open_bus
 NAMESAKE_S = 0.3  # so long a token of the same name is waited for
 
 
-class Place(NamedTuple):
+class ObserverPose(NamedTuple):
     """Where an observer stands, or begins, in the field's frame."""
 
     x_m: float
@@ -37,11 +37,11 @@ class Place(NamedTuple):
     heading_deg: float = 0.0
 
 
-class Wish(NamedTuple):
+class ObserverRequest(NamedTuple):
     """Who wants to join, where, with which senses."""
 
     name: str
-    at: Place
+    at: ObserverPose
     sensor: str = "survey"
     """A preset, or a TOML file with the keys of a robot's type."""
     fov_deg: float | None = None
@@ -51,7 +51,7 @@ class Wish(NamedTuple):
     """simulated or external; None: what the team's robots are."""
 
 
-class Visited(msgspec.Struct, frozen=True, kw_only=True):
+class ObserverReport(msgspec.Struct, frozen=True, kw_only=True):
     """What `observer --json` writes."""
 
     name: str
@@ -76,15 +76,15 @@ def _shipped() -> Any:
     return resources.files("cpcbl_launch") / "observers"
 
 
-def place_in(text: str) -> Place:
+def parse_pose(text: str) -> ObserverPose:
     """`X,Y` or `X,Y,HEADING_DEG`. Raises InputError."""
     numbers = _numbers(text)
     if len(numbers) not in (2, 3):
         raise InputError(f"--at {text}: write X,Y or X,Y,HEADING_DEG, such as 4.5,5,-90")
-    return Place(*numbers)
+    return ObserverPose(*numbers)
 
 
-def places_in(text: str) -> tuple[tuple[float, float], ...]:
+def parse_waypoints(text: str) -> tuple[tuple[float, float], ...]:
     """`X,Y;X,Y...`, none for an empty text. Raises InputError."""
     places = [_numbers(part) for part in text.split(";") if part.strip()]
     if any(len(place) != 2 for place in places):
@@ -101,7 +101,7 @@ def _numbers(text: str) -> list[float]:
     return numbers if all(map(math.isfinite, numbers)) else []
 
 
-def joined(team: Team, wish: Wish) -> Team:
+def team_with_observer(team: Team, wish: ObserverRequest) -> Team:
     """The team as the observer sees it: itself beside the robots of the file.
 
     Raises InputError or TeamFileError for a wish that cannot be granted.
@@ -130,9 +130,11 @@ def joined(team: Team, wish: Wish) -> Team:
         raise InputError(
             f"--sensor {wish.sensor}: no such file; write one, or {' or '.join(presets())}"
         )
-    more = beside(team, name, [_PLAIN, read_layer(path), _own(wish, source)], str(path))
+    more = with_added_robot(
+        team, name, [_PLAIN, read_layer(path), _request_layer(wish, source)], str(path)
+    )
     model = model_from_settings(more.robots[name])
-    reason = "" if model is None else unfit(model)
+    reason = "" if model is None else unsupported_delay(model)
     if reason:
         raise InputError(f"{path}: {reason}")
     return more
@@ -142,7 +144,7 @@ _PLAIN = {"waypoints_m": [], "collaboration": {"after_s": 0.0}}
 """Of the team's defaults a guest does not take these."""
 
 
-def _own(wish: Wish, source: str) -> dict[str, Any]:
+def _request_layer(wish: ObserverRequest, source: str) -> dict[str, Any]:
     """What the command line says, as the last layer."""
     own: dict[str, Any] = {"source": source, "start": {**wish.at._asdict(), "known": True}}
     if wish.fov_deg is not None:
@@ -159,14 +161,14 @@ def _source_of(team: Team) -> str:
     return "simulated" if "simulated" in sources else "external"
 
 
-def visit(
+def run_observer(
     name: str,
     team: Team,
     connect: Sequence[str],
     clock: Clock,
     stop: Callable[[], bool],
     duration_s: float = math.inf,
-) -> Visited:
+) -> ObserverReport:
     """Runs an observer that `team` holds until `stop()`, or for so many seconds of robot time.
 
     Raises BusError when stopped before a router answered, InputError for a name that is taken, or
@@ -178,7 +180,7 @@ def visit(
         own_camera(name, team, clock, loop.wake) as camera,
         open_bus(team.name, link.endpoints, stop, link.credentials) as bus,
     ):
-        _look_for_namesakes(name, bus, stop)
+        _require_unique_name(name, bus, stop)
         start_ns = clock.now_ns()
         incarnation = new_incarnation()
         node = Visit(name, team, bus, start_ns, incarnation, loop.arrived, clock.speed, camera)
@@ -186,10 +188,10 @@ def visit(
         loop.run(node, lambda: over() or clock.now_ns() - start_ns >= duration_s * 1e9)
         end_ns = clock.now_ns()
         node.leave(end_ns)
-    return _visited(node, team, (end_ns - start_ns) * 1e-9)
+    return _observer_report(node, team, (end_ns - start_ns) * 1e-9)
 
 
-def _look_for_namesakes(name: str, bus: Bus, stop: Callable[[], bool]) -> None:
+def _require_unique_name(name: str, bus: Bus, stop: Callable[[], bool]) -> None:
     found: list[str] = []
     watch = bus.watch(topics.ALIVE.at(robot=name), lambda key, alive: found.append(key))
     until = time.monotonic() + NAMESAKE_S
@@ -200,9 +202,9 @@ def _look_for_namesakes(name: str, bus: Bus, stop: Callable[[], bool]) -> None:
         raise InputError(f"observer {name}: the team has one of this name; choose another one")
 
 
-def _visited(node: Visit, team: Team, seconds: float) -> Visited:
+def _observer_report(node: Visit, team: Team, seconds: float) -> ObserverReport:
     located = node.robot.collaboration.located
-    return Visited(
+    return ObserverReport(
         name=node.robot.name,
         team=team.name,
         seconds=seconds,

@@ -33,7 +33,7 @@ def team_router(
     return router_config(here, connect, guards, credentials)
 
 
-def written_config(config: Mapping[str, Any], title: str) -> str:
+def config_text(config: Mapping[str, Any], title: str) -> str:
     """The configuration as a JSON5 file."""
     return f"// {title}\n// zenohd -c FILE, or cpcbl-team router --config FILE\n" + json.dumps(
         config, indent=2

@@ -15,12 +15,12 @@ import msgspec
 import numpy as np
 
 from cpcbl_agents.clock import Clock
-from cpcbl_launch.options import check_duration, not_written
+from cpcbl_launch.options import check_duration, write_or_reason
 from cpcbl_launch.reporting.metrics import Floats
-from cpcbl_launch.reporting.phases import Span, guest_reports, phase
+from cpcbl_launch.reporting.phases import Span, guest_reports, phase_report
 from cpcbl_launch.reporting.recorder import Recorder, Report
 from cpcbl_launch.reporting.recording import Recording
-from cpcbl_launch.run.logged_team import seen_before
+from cpcbl_launch.run.logged_team import is_calibrated_on
 from cpcbl_launch.run.processes import process_table, tasks
 from cpcbl_launch.run.supervisor import Processes, Supervisor
 from cpcbl_launch.simulation.in_process import Progress, simulate
@@ -99,7 +99,7 @@ class OnThisMachine:
 
     def router(self) -> AbstractContextManager[Bus]:
         team, listen = self._run.team, self._run.team.transport.listen
-        check_keys(team, listen, self._here)
+        require_keys(team, listen, self._here)
         guards = guard_rules(team, self._run.speed) | access_control(team)
         _, credentials = link_of(team, Identity(Role.ROUTER), listen)
         return open_router(team.name, listen, guards=guards, credentials=credentials)
@@ -107,7 +107,7 @@ class OnThisMachine:
     def processes(self, clock: Clock) -> AbstractContextManager[Processes]:
         team, path = self._run.team, self._folder / "team.json"
         save_resolved(team, path)
-        endpoint = dialled(team.transport.listen[0])
+        endpoint = local_endpoint(team.transport.listen[0])
         table = process_table(team, path, endpoint, clock, self._run.seed, self._here)
         return Supervisor(table, self._folder)
 
@@ -115,7 +115,7 @@ class OnThisMachine:
 Launch = Callable[[Run, Path, Stopping], Launcher]
 
 
-def check_keys(team: Team, listen: Sequence[str], here: Collection[str]) -> None:
+def require_keys(team: Team, listen: Sequence[str], here: Collection[str]) -> None:
     """Says what a process would die of before any starts. Raises SecurityError."""
     for task in tasks(team, (), 0, here):
         link_of(team, task.identity, listen)
@@ -128,7 +128,7 @@ def free_endpoint(protocol: str = "tcp") -> str:
         return f"{protocol}/127.0.0.1:{probe.getsockname()[1]}"
 
 
-def listening(team: Team) -> Team:
+def with_listen_endpoint(team: Team) -> Team:
     """The team with an endpoint for its router: its own, or a free one of this machine."""
     if team.transport.listen:
         return team
@@ -137,7 +137,7 @@ def listening(team: Team) -> Team:
     return msgspec.structs.replace(team, transport=transport)
 
 
-def dialled(listen: str) -> str:
+def local_endpoint(listen: str) -> str:
     """The endpoint at which robots of this machine find a router that listens everywhere."""
     return listen.replace("/0.0.0.0:", "/127.0.0.1:").replace("/[::]:", "/[::1]:")
 
@@ -166,7 +166,7 @@ def simulate_run(run: Run, progress: Progress | None = None) -> Report:
 
 
 def _run_in(run: Run, view: View, stop: Stopping, folder: Path, launch: Launch) -> Report:
-    run = run._replace(team=listening(run.team))
+    run = run._replace(team=with_listen_endpoint(run.team))
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -231,16 +231,16 @@ def _report(
 
         present_s = {name: guest.present_s for name, guest in guests.items()}
         drawn = partial(draw_run, recorder, run.team, truth, picture, epoch_s, helped_from_s)
-        lost = not_written(picture, partial(drawn, present_s))
+        lost = write_or_reason(picture, partial(drawn, present_s))
     report = recorder.report(variants, truth, begin_s)
     alone = {}
     if helped_from_s is not None:
         until = [Span(until_s=helped_from_s)]
-        alone = {name: phase(recorder, name, truth.get(name), until) for name in robots}
+        alone = {name: phase_report(recorder, name, truth.get(name), until) for name in robots}
     return msgspec.structs.replace(
         report,
         calibrated_on=run.team.calibrated_on,
-        seen_before=bool(run.team.data) and seen_before(run.team, Path(run.team.data)),
+        seen_before=bool(run.team.data) and is_calibrated_on(run.team, Path(run.team.data)),
         left_out=dict(run.left_out),
         duration_s=elapsed_s,
         restarts=restarts,

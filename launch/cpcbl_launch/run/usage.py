@@ -20,13 +20,13 @@ class Usage(NamedTuple):
     own_bytes: int  # no file's pages: heap and stacks, whoever else runs
 
 
-def must_measure(what: str) -> None:
+def require_process_usage(what: str) -> None:
     """Raises InputError where processes cannot be measured."""
     if not (_PROC / "self" / "smaps_rollup").exists():
         raise DependencyError(f"{what} needs /proc/PID/smaps_rollup: run it on Linux")
 
 
-def usage(pid: int) -> Usage:
+def process_usage(pid: int) -> Usage:
     """Raises OSError when there is no such process."""
     stat = (_PROC / str(pid) / "stat").read_text()
     fields = stat.rpartition(")")[2].split()  # the name before it may hold anything

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from cpcbl_agents.sensing import SensorInput
 from cpcbl_launch.simulation.grid import Grid
-from cpcbl_launch.simulation.robot import Seen, SimulatedRobot
+from cpcbl_launch.simulation.robot import SimulatedRobot, VisibleObject
 from cpcbl_team.config import SimulationEvent, Team
 from cpcbl_team.geometry import Pose2, wrap_angle
 from cpcbl_team.inputs import Sightings
@@ -38,43 +38,45 @@ class SimulatedField:
                 (seed, i),
                 start_ns,
                 self._step_ns,
-                _in_turn(team, name, start_ns + self._step_ns),
+                _first_frame_ns(team, name, start_ns + self._step_ns),
             )
             for i, (name, settings) in enumerate(team.robots.items())
             if settings.source == "simulated"
         }
         self._cameras = _cameras(team, seed)
-        self.not_taken = 0
+        self.skipped_frames = 0
         """Frames that were due in steps without pictures."""
-        self._marks = [Seen(n, m.x_m, m.y_m, m.gives) for n, m in team.map.landmarks.items()]
-        self._marks_to_touch = Grid(team.simulation.bump_radius_m, self._marks)
+        self._landmarks = [
+            VisibleObject(n, m.x_m, m.y_m, m.gives) for n, m in team.map.landmarks.items()
+        ]
+        self._landmarks_to_bump = Grid(team.simulation.bump_radius_m, self._landmarks)
         self._start_ns = start_ns
         self._events = deque(sorted(team.simulation.events, key=lambda event: event.at_s))
         self._hidden_until_ns = start_ns
-        self._look()
+        self._update_sensing_range()
 
-    def _look(self) -> None:
+    def _update_sensing_range(self) -> None:
         """How far anybody sees, and what there is to see so far around."""
         ranges_m = [robot.settings.sensor.max_range_m for robot in self.robots.values()]
         self._reach_m = max(ranges_m, default=0.0)
-        self._marks_to_see = Grid(self._reach_m, self._marks)
+        self._landmarks_to_see = Grid(self._reach_m, self._landmarks)
 
-    def join(self, name: str, model: SimulatedRobotModel) -> None:
+    def add_guest(self, name: str, model: SimulatedRobotModel) -> None:
         """A guest has a body from now on. Its noise is its own: the others' stays what it was."""
         settings = settings_from_model(model)
         seed, noise = (self._seed, _GUEST_SEED, *name.encode()), self.team.simulation.noise
         self.robots[name] = SimulatedRobot(settings, noise, seed, self.now_ns, self._step_ns)
-        self._look()
+        self._update_sensing_range()
 
-    def leave(self, name: str) -> None:
+    def remove_guest(self, name: str) -> None:
         del self.robots[name]
-        self._look()
+        self._update_sensing_range()
 
     @property
     def next_ns(self) -> int:
         return self.now_ns + self._step_ns
 
-    def ahead_ns(self, robot: str) -> int:
+    def clock_offset_ns(self, robot: str) -> int:
         """How far a robot's clock is ahead of the field's."""
         return int(self.team.simulation.clocks_ahead_s.get(robot, 0.0) * 1e9)
 
@@ -86,19 +88,22 @@ class SimulatedField:
     def advance(self, pictures: bool = True) -> list[tuple[str, SensorInput]]:
         """One step; what each robot senses at its end, with or without its camera."""
         self.now_ns += self._step_ns
-        while self._events and self._passed_s >= self._events[0].at_s:
-            self._befall(self._events.popleft())
+        while self._events and self._elapsed_s >= self._events[0].at_s:
+            self._apply_event(self._events.popleft())
         for robot in self.robots.values():
             robot.move(self.now_ns, self._step_ns * 1e-9)
-            self._bump(robot)
+            self._count_bumps(robot)
         mates = Grid(
             self._reach_m,
-            (Seen(n, r.pose.x, r.pose.y, "both", teammate=True) for n, r in self.robots.items()),
+            (
+                VisibleObject(n, r.pose.x, r.pose.y, "both", teammate=True)
+                for n, r in self.robots.items()
+            ),
         )
         sensed: list[tuple[str, SensorInput]] = []
         for name, robot in self.robots.items():
             piece = robot.odometry(self.now_ns)
-            frames = robot.frames(self.now_ns, partial(self._exposed, name, mates, pictures))
+            frames = robot.frames(self.now_ns, partial(self._take_frame, name, mates, pictures))
             items = (piece, *frames, *robot.positions(self.now_ns))
             sensed += [(name, item) for item in items if item is not None]
         return sensed
@@ -108,53 +113,57 @@ class SimulatedField:
         return Truths(self.now_ns, robots)
 
     @property
-    def _passed_s(self) -> float:
+    def _elapsed_s(self) -> float:
         return (self.now_ns - self._start_ns) * 1e-9
 
-    def _befall(self, event: SimulationEvent) -> None:
+    def _apply_event(self, event: SimulationEvent) -> None:
         hidden_ns = self._start_ns + int((event.at_s + event.hide_landmarks_s) * 1e9)
         self._hidden_until_ns = max(self._hidden_until_ns, hidden_ns)
         if event.to is not None and event.kidnap in self.robots:
             x, y, heading_deg = event.to
             self.robots[event.kidnap].pose = Pose2(x, y, wrap_angle(math.radians(heading_deg)))
 
-    def _exposed(
-        self, name: str, mates: Grid[Seen], pictures: bool, stamp_ns: int
+    def _take_frame(
+        self, name: str, mates: Grid[VisibleObject], pictures: bool, stamp_ns: int
     ) -> Sightings | Frame | None:
         """What a robot sees now: a picture, if it has a camera."""
         robot = self.robots[name]
         if robot.settings.sensing == "camera" and self._cameras is not None:
             if not pictures:
-                self.not_taken += 1
+                self.skipped_frames += 1
                 return None
             poses = {other: r.pose for other, r in self.robots.items()}
-            return self._cameras.frame(name, stamp_ns, poses, self._landmarks_hidden)
-        return robot.sightings(self.now_ns, stamp_ns, self._visible(name, robot.pose, mates))
+            return self._cameras.frame(name, stamp_ns, poses, self._are_landmarks_hidden)
+        return robot.sightings(
+            self.now_ns, stamp_ns, self._visible_objects(name, robot.pose, mates)
+        )
 
     @property
-    def _landmarks_hidden(self) -> bool:
+    def _are_landmarks_hidden(self) -> bool:
         return self.now_ns < self._hidden_until_ns
 
-    def _visible(self, viewer: str, pose: Pose2, mates: Grid[Seen]) -> Iterable[Seen]:
-        if not self._landmarks_hidden:
-            yield from self._marks_to_see.near(pose.x, pose.y)
-            yield from self._walls(pose)
+    def _visible_objects(
+        self, viewer: str, pose: Pose2, mates: Grid[VisibleObject]
+    ) -> Iterable[VisibleObject]:
+        if not self._are_landmarks_hidden:
+            yield from self._landmarks_to_see.near(pose.x, pose.y)
+            yield from self._nearest_wall_points(pose)
         yield from (mate for mate in mates.near(pose.x, pose.y) if mate.name != viewer)
 
-    def _walls(self, pose: Pose2) -> Iterable[Seen]:
+    def _nearest_wall_points(self, pose: Pose2) -> Iterable[VisibleObject]:
         for name, wall in self.team.map.walls.items():
             (ax, ay), (bx, by) = wall.from_m, wall.to_m
             length = math.hypot(bx - ax, by - ay)
             ux, uy = (bx - ax) / length, (by - ay) / length
             along = ux * (pose.x - ax) + uy * (pose.y - ay)
             if 0.0 <= along <= length:
-                yield Seen(name, ax + along * ux, ay + along * uy, wall.gives)
+                yield VisibleObject(name, ax + along * ux, ay + along * uy, wall.gives)
 
-    def _bump(self, robot: SimulatedRobot) -> None:
+    def _count_bumps(self, robot: SimulatedRobot) -> None:
         radius = self.team.simulation.bump_radius_m
         touching = frozenset(
             mark.name
-            for mark in self._marks_to_touch.near(robot.pose.x, robot.pose.y)
+            for mark in self._landmarks_to_bump.near(robot.pose.x, robot.pose.y)
             if math.hypot(mark.x - robot.pose.x, mark.y - robot.pose.y) < radius
         )
         robot.bumps += len(touching - robot.touching)
@@ -170,7 +179,7 @@ def _cameras(team: Team, seed: int) -> "Cameras | None":
     return Cameras(team, seed)
 
 
-def _in_turn(team: Team, name: str, from_ns: int) -> int | None:
+def _first_frame_ns(team: Team, name: str, from_ns: int) -> int | None:
     """When a camera's first frame is due: one after the other, as cameras do not wait for each
     other and pictures take time."""
     robots = team.cameras

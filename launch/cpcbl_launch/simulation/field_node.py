@@ -17,8 +17,8 @@ from msgspec.structs import replace
 from cpcbl_agents.clock import Clock
 from cpcbl_agents.sensing import SensorInput
 from cpcbl_launch.simulation.field import SimulatedField
-from cpcbl_launch.simulation.guest_bodies import Bodies
-from cpcbl_launch.team_file import not_an_endpoint
+from cpcbl_launch.simulation.guest_bodies import GuestBodies
+from cpcbl_launch.team_file import endpoint_problem
 from cpcbl_team.config import Team
 from cpcbl_team.errors import InputError
 from cpcbl_team.inputs import Odometry
@@ -32,7 +32,7 @@ log = logging.getLogger(__name__)
 PICTURES_LATE_NS = 150_000_000  # a field that is further behind catches up without making pictures
 INBOX = 10_000
 MOST_REFUSED = 100  # guests whose refusal is logged
-NOWHERE: Mapping[str, Bus] = MappingProxyType({})
+NO_SITES: Mapping[str, Bus] = MappingProxyType({})
 
 
 class FieldNode:
@@ -40,20 +40,22 @@ class FieldNode:
     that the world goes on for them while their site is cut off.
     """
 
-    def __init__(self, field: SimulatedField, bus: Bus, sites: Mapping[str, Bus] = NOWHERE) -> None:
+    def __init__(
+        self, field: SimulatedField, bus: Bus, sites: Mapping[str, Bus] = NO_SITES
+    ) -> None:
         self._field, self._bus, self._sites = field, bus, sites
-        self._bodies = Bodies(field.team)
+        self._guest_bodies = GuestBodies(field.team)
         self._guests: dict[str, str] = {}  # with the incarnation that asked
         self._refused: set[str] = set()
-        self._said: deque[tuple[str, bytes]] = deque(maxlen=INBOX)
+        self._inbox: deque[tuple[str, bytes]] = deque(maxlen=INBOX)
         self.counts: Counter[str] = Counter()
         """What was taken (`drive`, `join`), and what was refused, by reason."""
         self._truth = bus.publisher(topics.TRUTH.at(), topics.TRUTH.qos)
         self._publishers: dict[tuple[str, type], Publisher] = {}
-        self._driven: dict[str, Handle] = {}
+        self._drive_subscriptions: dict[str, Handle] = {}
         for name in field.robots:
             self._declare(name)
-        bus.subscribe(topics.JOIN.at(), self._arrived)
+        bus.subscribe(topics.JOIN.at(), self._receive)
 
     def _declare(self, name: str) -> None:
         bus = self._sites.get(name, self._bus)
@@ -61,20 +63,20 @@ class FieldNode:
             assert topic.carries is not None
             publisher = bus.publisher(topic.at(robot=name), topic.qos)
             self._publishers[name, topic.carries] = publisher
-        self._driven[name] = bus.subscribe(topics.DRIVE.at(robot=name), self._arrived)
+        self._drive_subscriptions[name] = bus.subscribe(topics.DRIVE.at(robot=name), self._receive)
 
-    def _arrived(self, key: str, payload: bytes) -> None:
-        if len(self._said) == INBOX:
+    def _receive(self, key: str, payload: bytes) -> None:
+        if len(self._inbox) == INBOX:
             self.counts["inbox_overflow"] += 1
-        self._said.append((key, payload))
+        self._inbox.append((key, payload))
 
     @property
     def next_ns(self) -> int:
         return self._field.next_ns
 
     @property
-    def pictures_not_taken(self) -> int:
-        return self._field.not_taken
+    def skipped_frames(self) -> int:
+        return self._field.skipped_frames
 
     @property
     def waiting(self) -> bool:
@@ -85,20 +87,20 @@ class FieldNode:
 
         What arrives meanwhile is for the next step: under a flood there is always more.
         """
-        for _ in range(len(self._said)):
-            reason = self._taken(*self._said.popleft(), now_ns)
+        for _ in range(len(self._inbox)):
+            reason = self._handle(*self._inbox.popleft(), now_ns)
             if reason is not None:
                 self.counts[reason] += 1
-        self._let_in_and_out(now_ns)
+        self._update_guests(now_ns)
         while self._field.next_ns <= now_ns:
             in_time = now_ns - self._field.next_ns <= PICTURES_LATE_NS
             for name, sensed in self._field.advance(in_time):
-                stamped = later(sensed, self._field.ahead_ns(name))
+                stamped = with_clock_offset(sensed, self._field.clock_offset_ns(name))
                 self._publishers[name, type(sensed)].put(encode(stamped))
             if self._truth.matching:
                 self._truth.put(encode(self._field.truth()))
 
-    def _taken(self, key: str, payload: bytes, now_ns: int) -> Refusal | None:
+    def _handle(self, key: str, payload: bytes, now_ns: int) -> Refusal | None:
         """Does what a robot says, by the field's clock; or why not."""
         said = read(key, payload)
         if isinstance(said, Refusal):
@@ -107,7 +109,7 @@ class FieldNode:
         if isinstance(said, Drive):
             if said.robot not in self._field.robots:
                 return Refusal.UNKNOWN_ROBOT
-            said = later(said, -self._field.ahead_ns(said.robot))
+            said = with_clock_offset(said, -self._field.clock_offset_ns(said.robot))
         reason = refusal(said, now_ns)
         if reason is not None:
             return reason
@@ -115,42 +117,42 @@ class FieldNode:
         if isinstance(said, Drive):
             self._field.command(said)
         else:
-            self._asked(said, now_ns)
+            self._request_body(said, now_ns)
         return None
 
-    def _asked(self, join: Join, now_ns: int) -> None:
-        reason = self._bodies.ask(join, now_ns)
+    def _request_body(self, join: Join, now_ns: int) -> None:
+        reason = self._guest_bodies.request(join, now_ns)
         if reason and len(self._refused) < MOST_REFUSED and join.robot not in self._refused:
             self._refused.add(join.robot)
             log.warning("guest %s gets no body: %s", join.robot, reason)
 
-    def _let_in_and_out(self, now_ns: int) -> None:
+    def _update_guests(self, now_ns: int) -> None:
         """Guests that ask for a body get it, those that leave or are silent lose it."""
-        present = self._bodies.present(now_ns)
+        present = self._guest_bodies.present(now_ns)
         for name, incarnation in list(self._guests.items()):
             if name not in present or present[name].incarnation != incarnation:
-                self._let_out(name)
+                self._remove_guest(name)
         for name, join in present.items():
             if name not in self._guests and join.model is not None:
                 self._guests[name] = join.incarnation
-                self._field.join(name, join.model)
+                self._field.add_guest(name, join.model)
                 self._declare(name)
                 log.info("guest %s joined the field", name)
 
-    def _let_out(self, name: str) -> None:
+    def _remove_guest(self, name: str) -> None:
         del self._guests[name]
-        self._field.leave(name)
+        self._field.remove_guest(name)
         for topic in topics.INPUTS:
             assert topic.carries is not None
             self._publishers.pop((name, topic.carries)).close()
-        self._driven.pop(name).close()
+        self._drive_subscriptions.pop(name).close()
         log.info("guest %s left the field", name)
 
 
-Moved = TypeVar("Moved", bound=SensorInput | Drive)
+Stamped = TypeVar("Stamped", bound=SensorInput | Drive)
 
 
-def later(message: Moved, ns: int) -> Moved:
+def with_clock_offset(message: Stamped, ns: int) -> Stamped:
     """The message by a clock that is so far ahead."""
     if not ns:
         return message
@@ -159,12 +161,12 @@ def later(message: Moved, ns: int) -> Moved:
     return replace(message, stamp_ns=message.stamp_ns + ns)
 
 
-def robots_at(sites: Iterable[str], team: Team) -> dict[str, list[str]]:
+def parse_sites(sites: Iterable[str], team: Team) -> dict[str, list[str]]:
     """Endpoint -> robots, of `tcp/10.0.0.2:7447=r3,r4`. Raises InputError."""
     found = {}
     for text in sites:
         endpoint, _, names = text.partition("=")
-        if reason := not_an_endpoint(endpoint):
+        if reason := endpoint_problem(endpoint):
             raise InputError(f"--site {text}: {reason}")
         found[endpoint] = [name.strip() for name in names.split(",")]
         for name in found[endpoint]:
@@ -180,7 +182,7 @@ def run_field(
     bus: Bus,
     clock: Clock,
     stop: Callable[[], bool],
-    sites: Mapping[str, Bus] = NOWHERE,
+    sites: Mapping[str, Bus] = NO_SITES,
 ) -> None:
     """The field as a process: steps in robot time until `stop()`."""
     node = FieldNode(SimulatedField(team, seed, clock.now_ns()), bus, sites)
@@ -189,5 +191,5 @@ def run_field(
         time.sleep(min(clock.seconds_until(node.next_ns), 0.2))
     counts = ", ".join(f"{reason} {n}" for reason, n in sorted(node.counts.items()))
     log.info("commands, by what became of them: %s", counts or "none")
-    if node.pictures_not_taken:
-        log.warning("frames not taken, as the field was late: %d", node.pictures_not_taken)
+    if node.skipped_frames:
+        log.warning("frames not taken, as the field was late: %d", node.skipped_frames)

@@ -5,7 +5,7 @@ from collections.abc import Iterable
 from typing import Generic, Protocol, TypeVar
 
 
-class Placed(Protocol):
+class HasPosition(Protocol):
     """Something with a place in the field's frame, in metres."""
 
     @property
@@ -15,24 +15,24 @@ class Placed(Protocol):
     def y(self) -> float: ...
 
 
-Thing = TypeVar("Thing", bound=Placed)
+Item = TypeVar("Item", bound=HasPosition)
 _MARGIN_M = 1e-3  # so that rounding moves nothing beyond the next cell
 
 
-class Grid(Generic[Thing]):
+class Grid(Generic[Item]):
     """Things by cell; a cell is as wide as anybody can reach, so that nine of them are enough."""
 
-    def __init__(self, reach_m: float, things: Iterable[Thing]) -> None:
+    def __init__(self, reach_m: float, things: Iterable[Item]) -> None:
         self._side_m = reach_m + _MARGIN_M
-        self._cells: dict[tuple[int, int], list[tuple[int, Thing]]] = {}
+        self._cells: dict[tuple[int, int], list[tuple[int, Item]]] = {}
         for numbered in enumerate(things):
             cell = self._cell(numbered[1].x, numbered[1].y)
             self._cells.setdefault(cell, []).append(numbered)
 
-    def near(self, x: float, y: float) -> list[Thing]:
+    def near(self, x: float, y: float) -> list[Item]:
         """All within reach of a place (metres) and some beyond, in the order they were given."""
         column, row = self._cell(x, y)
-        found: list[tuple[int, Thing]] = []
+        found: list[tuple[int, Item]] = []
         for i in (column - 1, column, column + 1):
             for j in (row - 1, row, row + 1):
                 found += self._cells.get((i, j), ())

@@ -6,25 +6,25 @@ from cpcbl_team.config import Team
 from cpcbl_transport.messages import Join
 from cpcbl_transport.robot_model import SimulatedRobotModel
 
-LASTS_NS = 2_000_000_000  # who has not asked again for so long is gone
+REQUEST_LASTS_NS = 2_000_000_000  # who has not asked again for so long is gone
 LONGEST_DELAY_S = 10.0  # what is sensed with a delay is kept so long
 
 
-class Bodies:
+class GuestBodies:
     """What guests have asked for, by the team's rules. Times are the field's."""
 
     def __init__(self, team: Team) -> None:
         self._robots, self._rules = frozenset(team.robots), team.guests
-        self._asked: dict[str, tuple[int, Join]] = {}
+        self._requests: dict[str, tuple[int, Join]] = {}
 
-    def ask(self, join: Join, now_ns: int) -> str:
+    def request(self, join: Join, now_ns: int) -> str:
         """Takes a guest's word; the reason if it is refused."""
         if join.model is None:
-            self._asked.pop(join.robot, None)
+            self._requests.pop(join.robot, None)
             return ""
-        reason = self._refusal(join.robot) or unfit(join.model)
+        reason = self._refusal(join.robot) or unsupported_delay(join.model)
         if not reason:
-            self._asked[join.robot] = now_ns, join
+            self._requests[join.robot] = now_ns, join
         return reason
 
     def _refusal(self, name: str) -> str:
@@ -32,20 +32,20 @@ class Bodies:
             return "guests.allowed is false"
         if name in self._robots:
             return "a robot of the team has this name"
-        full = len(self._asked) >= self._rules.most and name not in self._asked
+        full = len(self._requests) >= self._rules.most and name not in self._requests
         return f"there are {self._rules.most} guests, guests.most" if full else ""
 
     def present(self, now_ns: int) -> Mapping[str, Join]:
         """The guests that have a body now, with what each asked for last."""
-        self._asked = {
+        self._requests = {
             name: (asked_ns, join)
-            for name, (asked_ns, join) in self._asked.items()
-            if now_ns - asked_ns <= LASTS_NS
+            for name, (asked_ns, join) in self._requests.items()
+            if now_ns - asked_ns <= REQUEST_LASTS_NS
         }
-        return {name: join for name, (_, join) in self._asked.items()}
+        return {name: join for name, (_, join) in self._requests.items()}
 
 
-def unfit(model: SimulatedRobotModel) -> str:
+def unsupported_delay(model: SimulatedRobotModel) -> str:
     """Why the field cannot give a guest this body; empty if it can."""
     for key, delay_s in _delays_s(model):
         if abs(delay_s) > LONGEST_DELAY_S:

@@ -15,18 +15,18 @@ from cpcbl_launch.options import check_limit
 from cpcbl_launch.reporting.metrics import Trajectory
 from cpcbl_launch.reporting.recorder import Recorder, Report
 from cpcbl_launch.reporting.recording import Recording
-from cpcbl_launch.run.logged_team import LoggedTeam, seen_before, shortened
+from cpcbl_launch.run.logged_team import LoggedTeam, is_calibrated_on, with_duration
 from cpcbl_launch.simulation.field import SimulatedField
 from cpcbl_launch.simulation.field_node import FieldNode
-from cpcbl_launch.simulation.scheduled_guests import Visiting, Visitor
+from cpcbl_launch.simulation.scheduled_guests import ScheduledGuest, ScheduledGuestNode
 from cpcbl_team.config import Team
 from cpcbl_transport.bus import Bus, MemoryHub
 
 Progress = Callable[[float], None]
-Through = Callable[[Bus], Bus]
+BusWrapper = Callable[[Bus], Bus]
 
 
-class Choice(NamedTuple):
+class Overrides(NamedTuple):
     """What a command line sets for all robots; None leaves the team file's value."""
 
     variant: str | None = None
@@ -38,7 +38,7 @@ class Choice(NamedTuple):
     match_messages: int | None = None  # of the team
 
 
-def chosen(team: Team, choice: Choice) -> Team:
+def with_overrides(team: Team, choice: Overrides) -> Team:
     """The team with these choices made for all its robots. Raises InputError for a bad limit."""
     rules: dict[str, object] = {}
     limits = {}
@@ -68,7 +68,7 @@ def chosen(team: Team, choice: Choice) -> Team:
     return replace(team, robots=robots, match=replace(team.match, **match))
 
 
-class Evaluated(NamedTuple):
+class LogEvaluation(NamedTuple):
     """The figures of a log, and the estimates that they are about."""
 
     report: Report
@@ -80,24 +80,24 @@ def evaluate_log(
     logged: LoggedTeam, duration_s: float | None = None, progress: Progress | None = None
 ) -> Report:
     """All robots of a log, scored against its truth."""
-    return evaluated(shortened(logged, duration_s), progress).report
+    return evaluate_log_with_paths(with_duration(logged, duration_s), progress).report
 
 
-def evaluated(
+def evaluate_log_with_paths(
     logged: LoggedTeam, progress: Progress | None = None, *, with_yardsticks: bool = False
-) -> Evaluated:
+) -> LogEvaluation:
     """The same with its paths, and if wished with yardsticks on the same inputs and times."""
     show, half = progress or (lambda done: None), 0.5 if with_yardsticks else 1.0
     report, recorder = _run_log(logged, lambda done: show(half * done))
     own = {name: recorder.trajectory(name) for name in logged.team.robots}
     if not with_yardsticks:
-        return Evaluated(report, {"estimate": own})
+        return LogEvaluation(report, {"estimate": own})
     stamps_ns = {name: path.stamps_ns.tolist() for name, path in own.items()}
     inputs, field = inputs_of(logged), logged.team.map
     others = yardsticks(inputs, field, stamps_ns, lambda done: show(half + half * done))
     figures = {kind: scored(paths, logged.truth) for kind, paths in others.items()}
     report = msgspec.structs.replace(report, yardsticks=figures)
-    return Evaluated(report, {"estimate": own, **others})
+    return LogEvaluation(report, {"estimate": own, **others})
 
 
 def _run_log(logged: LoggedTeam, progress: Progress) -> tuple[Report, Recorder]:
@@ -111,7 +111,7 @@ def _run_log(logged: LoggedTeam, progress: Progress) -> tuple[Report, Recorder]:
     return msgspec.structs.replace(
         report,
         calibrated_on=team.calibrated_on,
-        seen_before=seen_before(team, Path(team.data)),
+        seen_before=is_calibrated_on(team, Path(team.data)),
         left_out=logged.left_out,
         duration_s=duration_s,
     ), recorder
@@ -134,8 +134,8 @@ def simulate(
     referee: Referee | None = None,
     record: Path | None = None,
     progress: Progress | None = None,
-    visitors: Sequence[Visitor] = (),
-    through: Mapping[str, Through] = MappingProxyType({}),
+    guests: Sequence[ScheduledGuest] = (),
+    bus_wrappers: Mapping[str, BusWrapper] = MappingProxyType({}),
 ) -> tuple[Report, Recorder]:
     """A simulated team, field and robots in one process, with guests that come and go.
 
@@ -150,8 +150,8 @@ def simulate(
     over = (lambda: False) if referee is None else (lambda: referee.over)
     with Recording(record, team, hub.session()) if record is not None else nullcontext():
         field = FieldNode(SimulatedField(truth or team, seed, 0), hub.session())
-        guests = [Visiting(visitor, team, hub) for visitor in visitors]
-        nodes = [field, *robot_nodes(team, hub, 0, through), *guests]
+        guest_nodes = [ScheduledGuestNode(visitor, team, hub) for visitor in guests]
+        nodes = [field, *robot_nodes(team, hub, 0, bus_wrappers), *guest_nodes]
         run_nodes(nodes, 0, end_ns, progress, over)
     return simulated_report(recorder, team), recorder
 
@@ -163,13 +163,16 @@ def simulated_report(recorder: Recorder, team: Team) -> Report:
 
 
 def robot_nodes(
-    team: Team, hub: MemoryHub, start_ns: int, through: Mapping[str, Through] = MappingProxyType({})
+    team: Team,
+    hub: MemoryHub,
+    start_ns: int,
+    bus_wrappers: Mapping[str, BusWrapper] = MappingProxyType({}),
 ) -> list[Stepped]:
     """A node for each robot, each with a session of its own."""
 
     def session(name: str) -> Bus:
         bus = hub.session()
-        return through[name](bus) if name in through else bus
+        return bus_wrappers[name](bus) if name in bus_wrappers else bus
 
     return [
         Node(Robot(name, team, start_ns), team, session(name), start_ns, "0")

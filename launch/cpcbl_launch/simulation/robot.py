@@ -17,14 +17,14 @@ from cpcbl_transport.messages import Drive, Frame
 COMMAND_LASTS_NS = 500_000_000
 
 
-class Every:
+class Timer:
     """Says when something is due that happens so many times a second, from a time on or at once."""
 
     def __init__(self, rate_hz: float, from_ns: int | None = None) -> None:
         self._period_ns = int(1e9 / rate_hz)
         self._due_ns = from_ns
 
-    def due(self, now_ns: int) -> bool:
+    def is_due(self, now_ns: int) -> bool:
         if self._due_ns is None:
             self._due_ns = now_ns
         if now_ns < self._due_ns:
@@ -34,7 +34,7 @@ class Every:
         return True
 
 
-class Seen(NamedTuple):
+class VisibleObject(NamedTuple):
     """Something on the field, at the place that is seen of it."""
 
     name: str
@@ -44,7 +44,7 @@ class Seen(NamedTuple):
     teammate: bool = False
 
 
-class Delayed:
+class DelayedMotion:
     """Steps of a motion that happen `steps` (whole and a fraction) after they were commanded."""
 
     def __init__(self, steps: float) -> None:
@@ -62,15 +62,15 @@ class Delayed:
         return late * before[0] + soon * now[0], late * before[1] + soon * now[1]
 
 
-def really_driven(distance: float, turn: float, seconds: float, o: OdometrySettings) -> float:
+def actual_distance(distance: float, turn: float, seconds: float, o: OdometrySettings) -> float:
     """How far wheels go that are told to go this far: no slower than their least speed."""
     if not o.least_speed_m_s:
         return distance
-    reported = Odometry(0, round(seconds * 1e9), *misreported(distance, turn, o))
+    reported = Odometry(0, round(seconds * 1e9), *reported_odometry(distance, turn, o))
     return corrected_odometry(reported, o).distance_m
 
 
-def misreported(distance: float, turn: float, o: OdometrySettings) -> tuple[float, float]:
+def reported_odometry(distance: float, turn: float, o: OdometrySettings) -> tuple[float, float]:
     """What wheels report of a motion that they were told: `corrected_odometry` makes of it what
     is `really_driven`, and without a least speed the motion itself."""
     reported_turn = (turn - o.turn_bias_rad_per_m * distance) / o.turn_scale
@@ -79,7 +79,7 @@ def misreported(distance: float, turn: float, o: OdometrySettings) -> tuple[floa
     return math.copysign(way, distance), reported_turn
 
 
-def misread(
+def sensor_reading(
     range_m: float, bearing: float, sensor: SensorSettings, teammate: bool
 ) -> tuple[float, float]:
     """What a camera reads of a true range and bearing: the inverse of `corrected_sighting`."""
@@ -117,14 +117,14 @@ class SimulatedRobot:
         self.bumps = 0
         self.touching: frozenset[str] = frozenset()
         self._reported, self._reported_ns = (0.0, 0.0), start_ns
-        self._motion = Delayed(settings.odometry.delay_s * 1e9 / step_ns)
+        self._motion = DelayedMotion(settings.odometry.delay_s * 1e9 / step_ns)
         self._frames: deque[Sightings | Frame] = deque()
         self._positions: deque[Position] = deque()
         self._errors: dict[tuple[str, str], tuple[int, float]] = {}
-        self._odometry_timer = Every(settings.odometry.rate_hz)
-        self._frame_timer = Every(settings.sensor.rate_hz, frames_from_ns)
+        self._odometry_timer = Timer(settings.odometry.rate_hz)
+        self._frame_timer = Timer(settings.sensor.rate_hz, frames_from_ns)
         sensor = settings.position_sensor
-        self._position_timer = Every(sensor.rate_hz if sensor is not None else 1.0)
+        self._position_timer = Timer(sensor.rate_hz if sensor is not None else 1.0)
 
     def move(self, now_ns: int, seconds: float) -> None:
         """The wheels report what is commanded; the ground does it later and adds noise."""
@@ -135,7 +135,7 @@ class SimulatedRobot:
         turn = self.drive.turn_rate_rad_s * seconds if commanded else 0.0
         self._reported = (self._reported[0] + distance, self._reported[1] + turn)
         o = self.settings.odometry
-        distance, turn = self._motion.next((really_driven(distance, turn, seconds, o), turn))
+        distance, turn = self._motion.next((actual_distance(distance, turn, seconds, o), turn))
         crawled = crawled_s(distance, seconds, o)
         in_its_direction = motion_noise(-0.5 * turn, distance, turn, o, crawled)
         along, around = math.sqrt(in_its_direction.xx), math.sqrt(in_its_direction.hh)
@@ -144,28 +144,28 @@ class SimulatedRobot:
     def odometry(self, now_ns: int) -> Odometry | None:
         """The piece since the last one, when it is due; as reported, before any correction."""
         o = self.settings.odometry
-        if not o.moves or not self._odometry_timer.due(now_ns):
+        if not o.moves or not self._odometry_timer.is_due(now_ns):
             return None
         distance, turn = self._reported
-        piece = Odometry(self._reported_ns, now_ns, *misreported(distance, turn, o))
+        piece = Odometry(self._reported_ns, now_ns, *reported_odometry(distance, turn, o))
         self._reported, self._reported_ns = (0.0, 0.0), now_ns
         return piece
 
     def frames(
-        self, now_ns: int, exposed: Callable[[int], Sightings | Frame | None]
+        self, now_ns: int, take_frame: Callable[[int], Sightings | Frame | None]
     ) -> list[Sightings | Frame]:
         """The frames that are out by now. One is `exposed` when it is due and stamped `delay_s`
         later; the camera hands it over at its stamp, or at once where the stamp is earlier.
         """
-        if self._frame_timer.due(now_ns):
-            frame = exposed(now_ns + int(self.settings.sensor.delay_s * 1e9))
+        if self._frame_timer.is_due(now_ns):
+            frame = take_frame(now_ns + int(self.settings.sensor.delay_s * 1e9))
             if frame is not None:
                 self._frames.append(frame)
-        return _out(self._frames, now_ns)
+        return _pop_due(self._frames, now_ns)
 
-    def sightings(self, now_ns: int, stamp_ns: int, objects: Iterable[Seen]) -> Sightings:
+    def sightings(self, now_ns: int, stamp_ns: int, objects: Iterable[VisibleObject]) -> Sightings:
         """What it sees of these objects now."""
-        return Sightings(stamp_ns, tuple(s for o in objects if (s := self._sighted(o, now_ns))))
+        return Sightings(stamp_ns, tuple(s for o in objects if (s := self._sighting(o, now_ns))))
 
     def positions(self, now_ns: int) -> list[Position]:
         """What the position sensor has said by now, if there is one: `delay_s` after it measured,
@@ -173,13 +173,13 @@ class SimulatedRobot:
         sensor = self.settings.position_sensor
         if sensor is None:
             return []
-        if self._position_timer.due(now_ns):
+        if self._position_timer.is_due(now_ns):
             x, y = (v + self._normal(sensor.sigma_m) for v in self.pose[:2])
             variance, stamp_ns = sensor.sigma_m**2, now_ns + int(sensor.delay_s * 1e9)
             self._positions.append(Position(stamp_ns, x, y, (variance, 0.0, variance)))
-        return _out(self._positions, now_ns)
+        return _pop_due(self._positions, now_ns)
 
-    def _sighted(self, seen: Seen, now_ns: int) -> Sighting | None:
+    def _sighting(self, seen: VisibleObject, now_ns: int) -> Sighting | None:
         sensor = self.settings.sensor
         dx, dy = seen.x - self.pose.x, seen.y - self.pose.y
         range_m = math.hypot(dx, dy)
@@ -188,16 +188,16 @@ class SimulatedRobot:
         bearing = wrap_angle(math.atan2(dy, dx) - self.pose.heading)
         if abs(bearing) > math.radians(sensor.field_of_view_deg) / 2.0:
             return None
-        range_m += self._error(seen.name, "range", sensor.range_sigma_m(range_m), now_ns)
-        bearing += self._error(seen.name, "bearing", sensor.bearing_sigma_rad, now_ns)
-        reading_m, reading = misread(range_m, bearing, sensor, seen.teammate)
+        range_m += self._reading_error(seen.name, "range", sensor.range_sigma_m(range_m), now_ns)
+        bearing += self._reading_error(seen.name, "bearing", sensor.bearing_sigma_rad, now_ns)
+        reading_m, reading = sensor_reading(range_m, bearing, sensor, seen.teammate)
         return Sighting(
             seen.name,
             max(reading_m, 0.01) if seen.gives in ("both", "range") else None,
             reading if seen.gives in ("both", "bearing") else None,
         )
 
-    def _error(self, name: str, kind: str, sigma: float, now_ns: int) -> float:
+    def _reading_error(self, name: str, kind: str, sigma: float, now_ns: int) -> float:
         """The error of a reading: white, or like the last one of the same object (Gauss-Markov)."""
         if not self.settings.sensor.correlation_s:
             return self._normal(sigma)
@@ -217,7 +217,7 @@ class SimulatedRobot:
 Stamped = TypeVar("Stamped", bound=Sightings | Frame | Position)
 
 
-def _out(waiting: deque[Stamped], now_ns: int) -> list[Stamped]:
+def _pop_due(waiting: deque[Stamped], now_ns: int) -> list[Stamped]:
     """What is stamped with a time that has come."""
     out = []
     while waiting and waiting[0].stamp_ns <= now_ns:

@@ -10,7 +10,7 @@ from cpcbl_team.config import RobotSettings, Team
 from cpcbl_transport.bus import Bus, MemoryHub
 
 
-class Visitor(NamedTuple):
+class ScheduledGuest(NamedTuple):
     """A guest, and when it is there (seconds of robot time)."""
 
     name: str
@@ -19,10 +19,10 @@ class Visitor(NamedTuple):
     until_s: float
 
 
-class Visiting:
+class ScheduledGuestNode:
     """A visitor's node, with a session of its own from its coming to its going."""
 
-    def __init__(self, visitor: Visitor, team: Team, hub: MemoryHub) -> None:
+    def __init__(self, visitor: ScheduledGuest, team: Team, hub: MemoryHub) -> None:
         self._name, self._hub = visitor.name, hub
         self._team = with_guest(team, visitor.name, visitor.settings)
         self._from_ns, self._until_ns = (round(s * 1e9) for s in visitor[2:])

@@ -22,11 +22,11 @@ from cpcbl_launch.reporting.recorder import (
     RobotReport,
 )
 from cpcbl_launch.reporting.tables import number, percent, short, table
-from cpcbl_launch.reporting.trust_report import distrusted, trust_remarks
-from cpcbl_launch.run.observer import Visited
+from cpcbl_launch.reporting.trust_report import distrust_text, trust_remarks
+from cpcbl_launch.run.observer import ObserverReport
 from cpcbl_launch.run.processes import ROBOT
 from cpcbl_launch.run.supervisor import Processes
-from cpcbl_launch.views.traffic.show import EXPLAINED, spent_table, verdict
+from cpcbl_launch.views.traffic.show import COLUMNS_EXPLAINED, help_traffic_table, limits_text
 from cpcbl_team.collaboration import LOWEST_TIER
 from cpcbl_transport.messages import Status, Track, Truth
 
@@ -65,7 +65,7 @@ class LiveTable(LiveView):
             pid = str(pids[process]) if process in pids else "down" if name in here else "away"
             state = _state(tracks.get(name), pid, restarts.get(process, 0))
             status = statuses.get(name)
-            if status is not None and (said := distrusted(status.trust)):
+            if status is not None and (said := distrust_text(status.trust)):
                 state.append(f", {said}", "yellow")
             if name not in self._robots:
                 there = newest_ns - tracks[name].stamp_ns <= AWAY_S * 1e9
@@ -106,7 +106,7 @@ def _pose_cells(track: Track | None, truth: Truth | None) -> list[Cell]:
         f"{track.y_m:.2f}",
         f"{math.degrees(track.heading_rad):.0f}",
         "-" if c is None else f"{math.sqrt(0.5 * (c[0] + c[2])):.3f}",
-        _graded(error),
+        _coloured_error(error),
         tier,
     ]
 
@@ -120,7 +120,7 @@ def _traffic_cells(status: Status | None) -> list[Cell]:
     ]
 
 
-def _graded(error: float | None) -> Text:
+def _coloured_error(error: float | None) -> Text:
     if error is None:
         return Text("-")
     return Text(f"{error:.3f}", "green" if error < 0.15 else "yellow" if error < 0.5 else "red")
@@ -160,12 +160,12 @@ def print_report(report: Report, console: Console) -> None:
         console.print(_effects(name, guest))
     if any(r.sent or r.spending for r in report.robots.values()):
         console.print()
-        console.print(spent_table(report))
-        console.print(EXPLAINED, style="yellow", highlight=False)
-    if (said := verdict(report)) is not None:
+        console.print(help_traffic_table(report))
+        console.print(COLUMNS_EXPLAINED, style="yellow", highlight=False)
+    if (said := limits_text(report)) is not None:
         console.print(said)
     if report.yardsticks:
-        console.print(_yardsticks(report))
+        console.print(_baseline_table(report))
     for line in _remarks(report):
         console.print(line, style="yellow", highlight=False, markup=False)  # robots may say [/b]
 
@@ -191,7 +191,7 @@ def _effects(name: str, guest: GuestReport) -> Table:
     return shown
 
 
-def print_visit(visited: Visited, console: Console) -> None:
+def print_observer_report(visited: ObserverReport, console: Console) -> None:
     """What an observer did while it was there."""
     sigma = number(visited.position_sigma_m)
     said = f"{visited.name} was there for {visited.seconds:.1f} s, σ {sigma} m at the end"
@@ -209,7 +209,7 @@ def print_visit(visited: Visited, console: Console) -> None:
         console.print(f"{visited.name}: {visited.unfed}", style="yellow", highlight=False)
 
 
-def _yardsticks(report: Report) -> Table:
+def _baseline_table(report: Report) -> Table:
     """Plain filters beside the team: means over the robots."""
     shown = table("yardsticks: the same data and settings, team means", ("filter",), FIGURES)
     for name, yardstick in report.yardsticks.items():

@@ -21,7 +21,7 @@ from cpcbl_launch.calibration.sensor import calibrate_sensor
 from cpcbl_launch.calibration.statistics import Estimate, decimals, robust_fit, told, variance_parts
 from cpcbl_launch.calibration.team_text import INTERVAL_S, changed_keys, team_text
 from cpcbl_launch.reporting.recording import read_recording
-from cpcbl_launch.simulation.in_process import Choice, chosen, simulate
+from cpcbl_launch.simulation.in_process import Overrides, simulate, with_overrides
 from cpcbl_launch.team_file import TeamFileError, load_team, parse_team
 from cpcbl_team.config import (
     Field,
@@ -95,9 +95,9 @@ STANDING = RobotSettings(
     odometry=OdometrySettings(moves=False),
     sensor=SensorSettings(field_of_view_deg=180.0, max_range_m=12.0, bearing_bias_deg=0.5),
 )
-TEAM = chosen(  # without help: where they drive does not depend on how help is routed
+TEAM = with_overrides(  # without help: where they drive does not depend on how help is routed
     Team(name="trio", robots={"a": WORSE, "b": BETTER, "c": STANDING}, map=MAP),
-    Choice(collaboration="none"),
+    Overrides(collaboration="none"),
 )
 BOUNDS = {  # of robots a and b: the largest error that is allowed, whatever the standard error
     "distance_scale": (0.03, 0.025),

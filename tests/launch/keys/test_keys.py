@@ -27,10 +27,10 @@ from typer.testing import CliRunner
 
 from cpcbl_team.errors import InputError
 from cpcbl_launch.app import app
-from cpcbl_launch.keys.authority import facts, issued, new_authority
-from cpcbl_launch.keys.plan import Deed, hosts, plan
+from cpcbl_launch.keys.authority import certificate_facts, issue_certificate, new_authority
+from cpcbl_launch.keys.plan import KeyAction, hosts, plan_actions
 from cpcbl_launch.run.processes import PROGRAM
-from cpcbl_launch.team_file import TeamFileError, builtin, load_team, parse_team
+from cpcbl_launch.team_file import TeamFileError, builtin_path, load_team, parse_team
 from cpcbl_launch.run.up import free_endpoint
 from cpcbl_team.config import Team
 from cpcbl_transport import topics
@@ -92,14 +92,14 @@ def test_every_member_has_a_folder_with_all_that_it_needs(team_file: Path) -> No
     for who in members:
         names = {path.name for path in (folder / who).iterdir()}
         assert names >= {"ca.crt", "certificate.crt", "private.key"}
-        assert facts((folder / who / "certificate.crt").read_bytes()).common_name == who
+        assert certificate_facts((folder / who / "certificate.crt").read_bytes()).common_name == who
         assert (folder / who / "ca.crt").read_bytes() == (folder / "ca" / "ca.crt").read_bytes()
     assert (folder / ".gitignore").read_text() == "*\n"
 
 
 def test_only_a_simulated_team_has_a_field(tmp_path: Path) -> None:
     path = tmp_path / "demo.toml"
-    path.write_text(builtin("demo").read_text())
+    path.write_text(builtin_path("demo").read_text())
     assert "field" in keys(path)
 
 
@@ -221,7 +221,7 @@ def test_the_authoritys_key_can_be_kept_elsewhere(team_file: Path) -> None:
 def test_an_authority_signs_for_no_longer_than_it_lasts() -> None:
     now = datetime.now(UTC)
     with pytest.raises(InputError, match=r"--days: the authority ends"):
-        issued(new_authority("lab", now), "robot/r1", (), now, timedelta(days=3651))
+        issue_certificate(new_authority("lab", now), "robot/r1", (), now, timedelta(days=3651))
 
 
 @pytest.mark.parametrize(
@@ -263,18 +263,18 @@ def test_a_table_says_what_was_made(team_file: Path) -> None:
 def test_no_robot_takes_the_name_of_an_observer() -> None:
     team, tripod = parse_team(TEAM), Member(role=Role.OBSERVER, name="r1")
     with pytest.raises(InputError, match=r"robots\.r1: an observer has this name.*--revoke"):
-        plan(team, [tripod])
-    steps = plan(team, [tripod], revoke=["observer/r1"])
-    deeds = {str(step.member.identity): step.deed for step in steps}
-    assert (deeds["observer/r1"], deeds["robot/r1"]) == (Deed.REVOKED, Deed.MADE)
+        plan_actions(team, [tripod])
+    steps = plan_actions(team, [tripod], revoke=["observer/r1"])
+    deeds = {str(step.member.identity): step.action for step in steps}
+    assert (deeds["observer/r1"], deeds["robot/r1"]) == (KeyAction.REVOKED, KeyAction.MADE)
 
 
 def test_a_plan_names_all_that_the_team_needs_and_had() -> None:
     team = parse_team(TEAM)
     known = [Member(role=Role.ROBOT, name="gone"), Member(role=Role.ROBOT, name="r1")]
-    deeds = {str(step.member.identity): step.deed for step in plan(team, known)}
-    assert deeds["robot/gone"] is deeds["robot/r1"] is Deed.KEPT
-    assert deeds["robot/r2"] is deeds["router"] is Deed.MADE
+    deeds = {str(step.member.identity): step.action for step in plan_actions(team, known)}
+    assert deeds["robot/gone"] is deeds["robot/r1"] is KeyAction.KEPT
+    assert deeds["robot/r2"] is deeds["router"] is KeyAction.MADE
     assert "0.0.0.0" not in hosts(team, ("0.0.0.0",))
 
 
@@ -352,7 +352,7 @@ def running(*command: object) -> Iterator["subprocess.Popen[str]"]:
 def demo(folder: Path, security: str) -> Path:
     """The demonstration, helping from its second second on."""
     path = folder / f"{security}.toml"
-    text = builtin("demo").read_text().replace("after_s = 10.0", "after_s = 2.0")
+    text = builtin_path("demo").read_text().replace("after_s = 10.0", "after_s = 2.0")
     path.write_text(f'{text}\n[transport]\nsecurity = "{security}"\n')
     return path
 

@@ -15,10 +15,10 @@ from support.processes import cpcbl_team
 
 from cpcbl_agents.sources.mrclam import read_table
 from cpcbl_launch.lab.baselines import Ekf, Inputs, expected_sighting, inputs_of, scored, yardsticks
-from cpcbl_launch.reporting.metrics import Floats, Trajectory, compared, position_errors
-from cpcbl_launch.reporting.recorder import YardstickReport
-from cpcbl_launch.run.logged_team import LoggedTeam, blinded, on_log
-from cpcbl_launch.simulation.in_process import evaluated
+from cpcbl_launch.reporting.metrics import Floats, Trajectory, position_errors, samples_with_truth
+from cpcbl_launch.reporting.recorder import BaselineReport
+from cpcbl_launch.run.logged_team import LoggedTeam, load_logged_team, with_blind_robots
+from cpcbl_launch.simulation.in_process import evaluate_log_with_paths
 from cpcbl_team.config import (
     Field,
     LocalizerSettings,
@@ -81,7 +81,9 @@ def changed(team: Team, **settings: Any) -> Team:
 def noisy(folder: Path, seed: int, seconds: float = 40.0) -> LoggedTeam:
     write_log(folder, ROBOTS, seconds)
     add_noise(folder, seed)
-    return started(on_log(changed(log_team(*ROBOTS), sensor=SENSOR, odometry=ODOMETRY), folder))
+    return started(
+        load_logged_team(changed(log_team(*ROBOTS), sensor=SENSOR, odometry=ODOMETRY), folder)
+    )
 
 
 def started(logged: LoggedTeam, dx_m: float = 0.0, dy_m: float = 0.0) -> LoggedTeam:
@@ -105,11 +107,11 @@ def paths_of(logged: LoggedTeam) -> dict[str, dict[str, Trajectory]]:
     return yardsticks(inputs_of(logged), logged.team.map, dict.fromkeys(logged.team.robots, stamps))
 
 
-def reports_of(logged: LoggedTeam) -> dict[str, YardstickReport]:
+def reports_of(logged: LoggedTeam) -> dict[str, BaselineReport]:
     return {kind: scored(paths, logged.truth) for kind, paths in paths_of(logged).items()}
 
 
-def figure(report: YardstickReport, name: str = "position_rmse_m", robot: str = "") -> float:
+def figure(report: BaselineReport, name: str = "position_rmse_m", robot: str = "") -> float:
     value = getattr(report.robots[robot] if robot else report.team, name)
     assert isinstance(value, float)
     return value
@@ -121,8 +123,8 @@ def figure(report: YardstickReport, name: str = "position_rmse_m", robot: str = 
 @pytest.mark.parametrize("blind", [[], ["2"]], ids=["full map", "blind"])
 def test_no_noise_no_error(tmp_path: Path, blind: list[str]) -> None:
     write_log(tmp_path, ROBOTS, 20.0, unknown_barcode=True)
-    logged = on_log(log_team(*ROBOTS), tmp_path)
-    reports = reports_of(logged._replace(team=blinded(logged.team, blind)))
+    logged = load_logged_team(log_team(*ROBOTS), tmp_path)
+    reports = reports_of(logged._replace(team=with_blind_robots(logged.team, blind)))
     assert tuple(reports) == KINDS
     for report in reports.values():
         assert report.robots.keys() == set(ROBOTS)
@@ -134,12 +136,12 @@ def test_no_noise_no_error(tmp_path: Path, blind: list[str]) -> None:
 
 
 @pytest.fixture(scope="module")
-def runs(tmp_path_factory: pytest.TempPathFactory) -> list[dict[str, YardstickReport]]:
+def runs(tmp_path_factory: pytest.TempPathFactory) -> list[dict[str, BaselineReport]]:
     """Five noisy logs."""
     return [reports_of(noisy(tmp_path_factory.mktemp("log"), seed)) for seed in range(5)]
 
 
-def test_who_knows_more_errs_less(runs: list[dict[str, YardstickReport]]) -> None:
+def test_who_knows_more_errs_less(runs: list[dict[str, BaselineReport]]) -> None:
     for run in runs:
         reckoning, solo, centralized = (figure(run[kind]) for kind in KINDS)
         assert 0.001 < centralized <= solo <= 0.7 * reckoning
@@ -147,7 +149,7 @@ def test_who_knows_more_errs_less(runs: list[dict[str, YardstickReport]]) -> Non
 
 @pytest.mark.parametrize("kind", KINDS[1:])
 def test_filters_are_consistent_on_white_noise(
-    runs: list[dict[str, YardstickReport]], kind: str
+    runs: list[dict[str, BaselineReport]], kind: str
 ) -> None:
     """Over thirty other seeds NEES is 2.03 (solo) and 1.92, means of five scatter by 0.11."""
     assert np.mean([figure(run[kind], "nees") for run in runs]) == pytest.approx(2.0, abs=0.4)
@@ -157,7 +159,7 @@ def test_filters_are_consistent_on_white_noise(
 def test_a_blind_robot_has_only_the_centralized_filter(tmp_path: Path) -> None:
     logged = noisy(tmp_path, 4, 20.0)
     full = reports_of(logged)
-    blind = reports_of(logged._replace(team=blinded(logged.team, ["2"])))
+    blind = reports_of(logged._replace(team=with_blind_robots(logged.team, ["2"])))
     assert blind["solo_ekf"].robots["2"] == blind["dead_reckoning"].robots["2"]
     assert blind["solo_ekf"].robots["1"] == full["solo_ekf"].robots["1"]
     alone, helped = (figure(blind[kind], robot="2") for kind in KINDS[1:])
@@ -189,7 +191,7 @@ def test_corrections_of_the_team_are_those_of_the_yardsticks(tmp_path: Path) -> 
         rewritten(tmp_path / f"Robot{robot}_Measurement.dat", lambda rows: rows + late, 4)
     odometry = OdometrySettings(distance_scale=0.8, turn_scale=0.9)
     plain, corrected = (
-        reports_of(on_log(team, tmp_path))
+        reports_of(load_logged_team(team, tmp_path))
         for team in (
             log_team(*ROBOTS),
             changed(log_team(*ROBOTS), odometry=odometry, sensor=SensorSettings(delay_s=0.1)),
@@ -223,7 +225,7 @@ def test_a_filter_that_refuses_everything_comes_back(tmp_path: Path) -> None:
     paths = paths_of(logged)
     for kind in KINDS[1:]:
         for name, path in paths[kind].items():
-            errors = position_errors(compared(path, logged.truth[name])[1])
+            errors = position_errors(samples_with_truth(path, logged.truth[name])[1])
             assert errors[0] > 1.0
             assert errors[200:].max() < 0.2, (kind, name)
 
@@ -400,9 +402,9 @@ def test_an_export_that_cannot_be_written_is_one_line(tmp_path: Path) -> None:
 
 def test_a_team_without_yardsticks_is_what_it_was(tmp_path: Path) -> None:
     write_log(tmp_path, ROBOTS, 5.0)
-    logged = on_log(log_team(*ROBOTS), tmp_path)
-    plain = evaluated(logged)
-    with_them = evaluated(logged, with_yardsticks=True)
+    logged = load_logged_team(log_team(*ROBOTS), tmp_path)
+    plain = evaluate_log_with_paths(logged)
+    with_them = evaluate_log_with_paths(logged, with_yardsticks=True)
     assert plain.report.yardsticks == {}
     assert msgspec.structs.replace(with_them.report, yardsticks={}) == plain.report
     assert tuple(with_them.paths) == ("estimate", *KINDS)
@@ -411,6 +413,8 @@ def test_a_team_without_yardsticks_is_what_it_was(tmp_path: Path) -> None:
 def test_progress_reaches_the_end_once(tmp_path: Path) -> None:
     write_log(tmp_path, ROBOTS, 2.0)
     shown: list[float] = []
-    evaluated(on_log(log_team(*ROBOTS), tmp_path), shown.append, with_yardsticks=True)
+    evaluate_log_with_paths(
+        load_logged_team(log_team(*ROBOTS), tmp_path), shown.append, with_yardsticks=True
+    )
     assert shown == sorted(shown)
     assert shown[-1] == 1.0

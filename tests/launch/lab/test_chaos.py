@@ -30,7 +30,7 @@ from cpcbl_launch.lab.chaos.wire import Weather, Wire
 from cpcbl_launch.run.processes import PROGRAM
 from cpcbl_launch.run.supervisor import Supervisor
 from cpcbl_launch.run.up import free_endpoint
-from cpcbl_launch.run.usage import MIB, usage
+from cpcbl_launch.run.usage import MIB, process_usage
 from cpcbl_launch.team_file import save_resolved
 from cpcbl_transport import topics
 from cpcbl_transport.topics import Qos
@@ -253,7 +253,7 @@ def test_a_router_keeps_no_memory_of_sessions_that_sent_much(tmp_path: Path) -> 
         held = []
         for _ in range(4):
             subprocess.run([sys.executable, "-c", SPEAKS, endpoint], check=True, timeout=60.0)
-            held.append(usage(supervisor.pids[ROUTER]).own_bytes / MIB)
+            held.append(process_usage(supervisor.pids[ROUTER]).own_bytes / MIB)
     assert held[-1] - held[0] < 8.0  # with shared memory 10 MiB each
 
 

@@ -11,12 +11,12 @@ import pytest
 from support.equal_teams import SHAPES, START_SIGMA_M, Sighted, equal_team, nees_bounds, team_nees
 
 from cpcbl_launch.lab.experiments.runs import Case, run
-from cpcbl_launch.simulation.in_process import Choice, chosen, simulate
+from cpcbl_launch.simulation.in_process import Overrides, simulate, with_overrides
 from cpcbl_team.config import Team
 
-SPLIT = Choice()
-MUTUAL = Choice(direction="both-ways")
-MUTUAL_NAIVE = Choice(direction="both-ways", fusion="naive")
+SPLIT = Overrides()
+MUTUAL = Overrides(direction="both-ways")
+MUTUAL_NAIVE = Overrides(direction="both-ways", fusion="naive")
 
 
 def first_and_last_third(team: Team, seeds: int, duration_s: float) -> tuple[float, float]:
@@ -36,8 +36,8 @@ def test_the_bounds_are_those_of_chi_square() -> None:
 @pytest.mark.parametrize(
     ("choice", "honest"), [(SPLIT, True), (MUTUAL, True), (MUTUAL_NAIVE, False)]
 )
-def test_what_goes_round_between_two_is_counted_once(choice: Choice, honest: bool) -> None:
-    team = chosen(equal_team("pair", "none"), choice)
+def test_what_goes_round_between_two_is_counted_once(choice: Overrides, honest: bool) -> None:
+    team = with_overrides(equal_team("pair", "none"), choice)
     _, last = first_and_last_third(team, 4, 40.0)
     assert (last <= nees_bounds(4)[1]) is honest
 
@@ -46,11 +46,11 @@ def test_what_goes_round_between_two_is_counted_once(choice: Choice, honest: boo
     ("choice", "honest"), [(SPLIT, True), (MUTUAL, True), (MUTUAL_NAIVE, False)]
 )
 def test_standing_robots_that_see_only_each_other_know_no_more_than_all_starts_together(
-    choice: Choice, honest: bool
+    choice: Overrides, honest: bool
 ) -> None:
     """What they see of each other says nothing of where all of them are: its sigma stays that of
     the mean of their starts, and no robot's can be less."""
-    team = chosen(equal_team("clique", "none", drives=False), choice)
+    team = with_overrides(equal_team("clique", "none", drives=False), choice)
     _, recorder = simulate(team, 1, 20.0)
     claimed = [recorder.trajectory(name).covariance for name in team.robots]
     every = np.concatenate([c for c in claimed if c is not None])

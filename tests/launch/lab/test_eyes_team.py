@@ -9,9 +9,9 @@ import pytest
 
 from cpcbl_launch.reporting.recorder import Recorder, Report
 from cpcbl_launch.run.supervisor import Processes
-from cpcbl_launch.run.up import Run, listening, run_team
+from cpcbl_launch.run.up import Run, run_team, with_listen_endpoint
 from cpcbl_launch.simulation.in_process import simulate
-from cpcbl_launch.team_file import builtin, load_team
+from cpcbl_launch.team_file import builtin_path, load_team
 from cpcbl_team.config import Team
 
 RUN_S = 8.0
@@ -20,7 +20,7 @@ WITHIN = pytest.mark.timeout(300)  # a machine that has other things to do
 
 
 def eyes() -> Team:
-    return listening(load_team(builtin("eyes")))
+    return with_listen_endpoint(load_team(builtin_path("eyes")))
 
 
 def fresh(seed: int, team: Team | None = None) -> Report:

@@ -19,7 +19,7 @@ from cpcbl_launch.lab.faulty_robot import (
     faulty_command,
 )
 from cpcbl_launch.run.processes import PROGRAM
-from cpcbl_launch.team_file import builtin
+from cpcbl_launch.team_file import builtin_path
 from cpcbl_team.errors import InputError
 from cpcbl_team.inputs import Belief, Fix
 from cpcbl_transport import topics
@@ -119,7 +119,7 @@ def test_only_fixes_and_beliefs_are_changed_on_their_way_out() -> None:
 
 
 def test_the_process_refuses_a_text_that_is_no_fault() -> None:
-    command = (*PROGRAM, "robot", "patrol", "--team", str(builtin("demo")))
+    command = (*PROGRAM, "robot", "patrol", "--team", str(builtin_path("demo")))
     words = faulty_command(command, "bias:1")
     result = run(words, capture_output=True, text=True, timeout=60.0, check=False)
     assert result.returncode == 2

@@ -13,7 +13,7 @@ from rich.console import Console, RenderableType
 from support.processes import cpcbl_team
 
 from cpcbl_launch.lab.experiments import latency, processes
-from cpcbl_launch.run.usage import MIB, usage
+from cpcbl_launch.run.usage import MIB, process_usage
 from cpcbl_team.errors import InputError
 from cpcbl_transport.compact import BELIEF_BYTES, FIX_BYTES
 
@@ -111,14 +111,14 @@ def test_a_bad_size_is_one_line_and_exit_code_2(tmp_path: Path) -> None:
 
 
 def test_the_use_of_a_process_is_its_own() -> None:
-    before, until = usage(os.getpid()), time.process_time() + 0.2
+    before, until = process_usage(os.getpid()), time.process_time() + 0.2
     while time.process_time() < until:
         pass
-    after = usage(os.getpid())
+    after = process_usage(os.getpid())
     assert after.cpu_s - before.cpu_s >= 0.1
     assert 10 * MIB < after.proportional_bytes <= after.resident_bytes
     with pytest.raises(OSError, match="No such"):
-        usage(2**30)
+        process_usage(2**30)
 
 
 def assert_fits(tables: Iterable[RenderableType], *words: str) -> None:

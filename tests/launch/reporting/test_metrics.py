@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from support.core import Matrix
 
-from cpcbl_launch.reporting.metrics import Samples, position_nees, score, truth_at
+from cpcbl_launch.reporting.metrics import Samples, interpolated_truth, position_nees, score
 
 TRUTH = np.array([[0.0, 0.0, 0.0], [1.0, 2.0, 3.1], [2.0, 2.0, -1.0]])
 OFFSETS = np.array([[0.3, 0.4, 0.1], [0.0, 0.0, 0.1], [0.0, -0.6, -0.2]])
@@ -68,7 +68,7 @@ def test_the_nees_is_the_quadratic_form(xy: float) -> None:
 
 def test_truth_is_interpolated_the_short_way_round() -> None:
     truth = np.array([[0.0, 0.0, 0.0, 3.0], [2.0, 4.0, -2.0, -3.0]])
-    at, counts = truth_at(np.array([1.0]), truth)
+    at, counts = interpolated_truth(np.array([1.0]), truth)
     assert counts.all()
     np.testing.assert_allclose(at[0, :2], [2.0, -1.0])
     assert math.remainder(at[0, 2] - math.pi, math.tau) == pytest.approx(0.0)
@@ -77,11 +77,11 @@ def test_truth_is_interpolated_the_short_way_round() -> None:
 def test_truth_counts_within_two_and_a_half_seconds_of_a_row() -> None:
     truth = np.array([[10.0, 1.0, 2.0, 0.0], [30.0, 1.0, 2.0, 0.0]])
     times = np.array([7.4, 7.6, 10.0, 12.4, 12.6, 20.0, 27.6, 32.4, 32.6])
-    _, counts = truth_at(times, truth)
+    _, counts = interpolated_truth(times, truth)
     assert counts.tolist() == [False, True, True, True, False, False, True, True, False]
 
 
 def test_one_row_of_truth_is_enough_near_it() -> None:
-    at, counts = truth_at(np.array([0.5, 4.0]), np.array([[1.0, 5.0, 6.0, 0.1]]))
+    at, counts = interpolated_truth(np.array([0.5, 4.0]), np.array([[1.0, 5.0, 6.0, 0.1]]))
     np.testing.assert_allclose(at[0], [5.0, 6.0, 0.1])
     assert counts.tolist() == [True, False]

@@ -17,9 +17,9 @@ from cpcbl_launch.reporting.phases import (
     MOST_GUESTS,
     Span,
     guest_reports,
-    phase,
-    presence,
-    split,
+    phase_report,
+    presence_spans,
+    split_by_presence,
 )
 from cpcbl_launch.reporting.recorder import MeanScore, Recorder, Report, TeamReport
 from cpcbl_launch.run.supervisor import Supervisor
@@ -65,21 +65,21 @@ def standing_at_origin() -> Floats:
 def test_who_is_silent_for_long_was_away(
     times_s: Sequence[float], spans: list[tuple[float, float]]
 ) -> None:
-    assert presence(times_s) == spans
+    assert presence_spans(times_s) == spans
 
 
 def test_a_run_is_split_at_comings_and_goings() -> None:
-    before, during, after = split([Span(20.0, 30.0), Span(50.0, 60.0)], 10.0)
+    before, during, after = split_by_presence([Span(20.0, 30.0), Span(50.0, 60.0)], 10.0)
     assert before == [(10.0, 20.0)]
     assert during == [(20.0, 30.0), (50.0, 60.0)]
     assert after == [(30.0, 50.0), (60.0, math.inf)]
 
 
 def test_who_was_there_before_figures_begin_has_no_time_before() -> None:
-    before, during, after = split([Span(5.0, 30.0)], 10.0)
+    before, during, after = split_by_presence([Span(5.0, 30.0)], 10.0)
     said = Said()
     said.tracks("r1", 0.0, 40.0)
-    assert phase(said.recorder, "r1", None, before).position_sigma_m is None
+    assert phase_report(said.recorder, "r1", None, before).position_sigma_m is None
     assert during == [(10.0, 30.0)]
     assert after == [(30.0, math.inf)]
 
@@ -107,7 +107,7 @@ def test_figures_of_parts_of_a_run() -> None:
 def test_without_truth_a_robots_own_sigma_is_left() -> None:
     said = Said()
     said.tracks("r1", 0.0, 10.0, 0.3, 0.2)
-    part = phase(said.recorder, "r1", None, [Span(2.0, 4.0)])
+    part = phase_report(said.recorder, "r1", None, [Span(2.0, 4.0)])
     assert part.samples == 0
     assert part.position_rmse_m is None
     assert part.position_sigma_m == pytest.approx(0.2)

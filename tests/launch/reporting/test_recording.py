@@ -10,7 +10,7 @@ from support.processes import cpcbl_team
 
 from cpcbl_launch.reporting.recording import Recording, read_recording
 from cpcbl_launch.simulation.in_process import simulate
-from cpcbl_launch.team_file import builtin, load_team
+from cpcbl_launch.team_file import builtin_path, load_team
 from cpcbl_team.config import RobotSettings, Team
 from cpcbl_team.inputs import Odometry, Position, Sighting, Sightings
 from cpcbl_transport import topics
@@ -70,7 +70,7 @@ def test_nothing_is_written_after_the_end(tmp_path: Path) -> None:
 
 
 def test_recording_does_not_change_a_run(tmp_path: Path) -> None:
-    team, path = load_team(builtin("demo")), tmp_path / "demo.mcap"
+    team, path = load_team(builtin_path("demo")), tmp_path / "demo.mcap"
     alone, _ = simulate(team, 3, 4.0)
     watched, recorder = simulate(team, 3, 4.0, record=path)
     assert watched == alone

@@ -7,10 +7,15 @@ import pytest
 from rich.console import Console
 
 from cpcbl_launch.reporting.recorder import Recorder, Report
-from cpcbl_launch.reporting.trust_report import TrustReport, distrusted, trust_of, trust_remarks
+from cpcbl_launch.reporting.trust_report import (
+    TrustReport,
+    distrust_text,
+    trust_remarks,
+    trust_reports,
+)
 from cpcbl_launch.views.run import print_report
-from cpcbl_launch.views.traffic.show import drawn
-from cpcbl_launch.views.traffic.watch import Arrival, traffic
+from cpcbl_launch.views.traffic.show import traffic_view
+from cpcbl_launch.views.traffic.watch import Arrival, traffic_from_statuses
 from cpcbl_transport import topics
 from cpcbl_transport.bus import MemoryHub
 from cpcbl_transport.messages import Status, Trust, encode
@@ -35,20 +40,20 @@ def status(trust: Sequence[Trust], incarnation: str = "1") -> Status:
     ],
 )
 def test_who_is_not_believed_is_named_with_the_reason(trust: list[Trust], said: str) -> None:
-    assert distrusted(trust) == said
+    assert distrust_text(trust) == said
 
 
 def test_a_report_sums_the_quarantines_of_all_processes() -> None:
-    found = trust_of([status([BIASED]), status([BIASED, HEALED], "2")])
+    found = trust_reports([status([BIASED]), status([BIASED, HEALED], "2")])
     assert found[0] == TrustReport(
         peer="west", reason="biased", quarantines=4, unconfirmed=False, late_s=0.0
     )
     assert (found[1].quarantines, found[1].unconfirmed) == (1, True)
-    assert trust_of([]) == ()
+    assert trust_reports([]) == ()
 
 
 def test_the_report_says_it_in_words() -> None:
-    found = trust_of([status([BIASED, HEALED, AHEAD])])
+    found = trust_reports([status([BIASED, HEALED, AHEAD])])
     assert list(trust_remarks("scout", found)) == [
         "robot scout does not believe west: biased",
         "robot scout did not believe north for a time (once)",
@@ -66,15 +71,17 @@ def report_of(trust: Sequence[Trust]) -> Report:
 
 def test_a_recorder_puts_it_into_the_report_and_the_report_on_the_screen() -> None:
     report = report_of([BIASED])
-    assert report.robots["scout"].trust == trust_of([status([BIASED])])
+    assert report.robots["scout"].trust == trust_reports([status([BIASED])])
     text = io.StringIO()
     print_report(report, Console(file=text, width=80))
     assert "robot scout does not believe west: biased" in text.getvalue()
 
 
 def test_traffic_shows_it_beside_whom_a_robot_helps() -> None:
-    now = traffic("t", ["scout"], {"scout": [Arrival(0.0, status([BIASED]))]}, 0.0, 1.0)
+    now = traffic_from_statuses(
+        "t", ["scout"], {"scout": [Arrival(0.0, status([BIASED]))]}, 0.0, 1.0
+    )
     assert now.robots["scout"].trust[0].peer == "west"
     text = io.StringIO()
-    Console(file=text, width=80).print(drawn(now, "tcp/127.0.0.1:1"))
+    Console(file=text, width=80).print(traffic_view(now, "tcp/127.0.0.1:1"))
     assert "distrusts west (biased)" in text.getvalue()

@@ -14,18 +14,23 @@ from support.docker import TOP
 from support.processes import cpcbl_team
 
 from cpcbl_launch.run.containers.compose import Deployment, Mount, compose_text
-from cpcbl_launch.run.containers.deployment import deployed
-from cpcbl_launch.run.containers.docker import DockerError, compose_program, done, ran
-from cpcbl_launch.run.containers.fleet import Container, parsed, restarts_between
-from cpcbl_launch.run.containers.guest import observe
-from cpcbl_launch.run.containers.image import SOURCES, progress_of, tag, version
-from cpcbl_launch.run.containers.launch import inside, published
+from cpcbl_launch.run.containers.deployment import deployment_text
+from cpcbl_launch.run.containers.docker import (
+    DockerError,
+    command_output,
+    compose_program,
+    run_command,
+)
+from cpcbl_launch.run.containers.fleet import Container, containers_by_service, restarts_between
+from cpcbl_launch.run.containers.guest import run_observer_container
+from cpcbl_launch.run.containers.image import SOURCES, build_step, tag, version
+from cpcbl_launch.run.containers.launch import published_port, team_in_containers
 from cpcbl_launch.run.processes import PROGRAM
-from cpcbl_launch.team_file import builtin, load_team
+from cpcbl_launch.team_file import builtin_path, load_team
 from cpcbl_team.config import Team
 from cpcbl_team.errors import InputError
 
-DEMO = load_team(builtin("demo"))
+DEMO = load_team(builtin_path("demo"))
 HOW = Deployment("demo", "cpcbl-team:1")
 
 
@@ -93,7 +98,7 @@ def test_only_one_service_builds_the_image_and_all_others_come_after_it() -> Non
 def test_only_a_team_with_cameras_needs_opencv_in_its_image() -> None:
     how = HOW._replace(context="..")
     assert "EXTRAS" not in services(DEMO, how)["router"]["build"]["args"]
-    seeing = services(load_team(builtin("eyes")), how)
+    seeing = services(load_team(builtin_path("eyes")), how)
     assert seeing["router"]["build"]["args"]["EXTRAS"] == "camera"
 
 
@@ -127,7 +132,7 @@ def test_a_part_of_the_team_at_another_speed_and_seed() -> None:
 def test_a_file_of_ones_own_is_mounted_by_its_way_from_the_compose_file(tmp_path: Path) -> None:
     (tmp_path / "teams").mkdir()
     team_file, output = tmp_path / "teams" / "lab.toml", tmp_path / "compose.yaml"
-    shutil.copy(builtin("demo"), team_file)
+    shutil.copy(builtin_path("demo"), team_file)
     ended = cpcbl_team("compose", team_file, "--image", "mine:2", "--output", output)
     assert ended.returncode == 0, ended.stderr
     found = yaml.safe_load(output.read_text())["services"]
@@ -140,13 +145,13 @@ def test_a_file_of_ones_own_is_mounted_by_its_way_from_the_compose_file(tmp_path
 
 def test_a_log_is_not_for_a_compose_file() -> None:
     with pytest.raises(InputError, match=r"up --containers --data"):
-        deployed(load_team(builtin("mrclam")), Path("mrclam"), Path(), None, 1)
+        deployment_text(load_team(builtin_path("mrclam")), Path("mrclam"), Path(), None, 1)
 
 
 def test_a_log_is_found_where_it_is_mounted() -> None:
-    team = replace(load_team(builtin("mrclam")), data="/home/me/MRCLAM6")
-    assert inside(team).data == "/team/data"
-    assert inside(DEMO) == DEMO
+    team = replace(load_team(builtin_path("mrclam")), data="/home/me/MRCLAM6")
+    assert team_in_containers(team).data == "/team/data"
+    assert team_in_containers(DEMO) == DEMO
 
 
 @pytest.mark.parametrize(
@@ -159,12 +164,12 @@ def test_a_log_is_found_where_it_is_mounted() -> None:
     ],
 )
 def test_the_router_is_published_where_the_team_file_says(endpoint: str, port: str) -> None:
-    assert published(endpoint) == port
+    assert published_port(endpoint) == port
 
 
 def test_docker_cannot_publish_at_a_name() -> None:
     with pytest.raises(InputError, match=r"transport.listen: tcp/robot.local:7447"):
-        published("tcp/robot.local:7447")
+        published_port("tcp/robot.local:7447")
 
 
 # The image --------------------------------------------------------------------------------------
@@ -223,7 +228,7 @@ def test_all_that_the_image_is_built_from_is_let_in_and_counts() -> None:
     ],
 )
 def test_of_a_build_its_steps_are_told(line: str, said: str | None) -> None:
-    assert progress_of(line) == said
+    assert build_step(line) == said
 
 
 # Docker's command line --------------------------------------------------------------------------
@@ -246,7 +251,7 @@ def inspected(service: str, **state: Any) -> dict[str, Any]:
 
 
 def one(**state: Any) -> Container:
-    return parsed([inspected("robot-a", **state)])["robot-a"]
+    return containers_by_service([inspected("robot-a", **state)])["robot-a"]
 
 
 @pytest.mark.parametrize(
@@ -316,21 +321,23 @@ def test_without_docker_one_line_says_what_to_install(tmp_path: Path) -> None:
 def test_a_command_that_fails_is_told_by_its_line_about_the_error() -> None:
     script = "echo begin; echo 'ERROR: port is taken' >&2; echo Encountered difficulties; exit 3"
     with pytest.raises(DockerError, match="port is taken"):
-        done(["sh", "-c", script])
+        command_output(["sh", "-c", script])
 
 
 def test_lines_are_told_as_they_come_and_in_order() -> None:
     told: list[str] = []
-    ended = ran(["sh", "-c", "printf 'a\\rb\\n'; sleep 0.2; printf 'c\\n\\nd'"], said=told.append)
+    ended = run_command(
+        ["sh", "-c", "printf 'a\\rb\\n'; sleep 0.2; printf 'c\\n\\nd'"], said=told.append
+    )
     assert told == ["a\rb", "c", ""]
     assert ended.output == "a\rb\nc\n\nd"
 
 
 def test_a_command_is_ended_when_the_user_wants_to_stop() -> None:
     with pytest.raises(DockerError, match="stopped during sleep 60"):
-        ran(["sleep", "60"], stop=lambda: True)
+        run_command(["sleep", "60"], stop=lambda: True)
     with pytest.raises(DockerError, match="no end of sleep 60"):
-        ran(["sleep", "60"], timeout_s=0.1)
+        run_command(["sleep", "60"], timeout_s=0.1)
 
 
 SLOW_TO_START = """
@@ -348,5 +355,5 @@ def test_a_container_is_stopped_again_until_it_is_there_to_be_stopped(
 ) -> None:
     monkeypatch.setenv("PATH", str(tmp_path), prepend=os.pathsep)
     program(tmp_path, "docker", SLOW_TO_START)
-    assert observe("tripod", DEMO, [], None, "image", stop=lambda: True) == 7
+    assert run_observer_container("tripod", DEMO, [], None, "image", stop=lambda: True) == 7
     assert (tmp_path / "asked").read_text().split() == ["stop"] * 3

@@ -17,11 +17,11 @@ from support.docker import composed, image, left_of
 from support.processes import cpcbl_team, eventually
 
 from cpcbl_launch.reporting.recorder import Recorder
-from cpcbl_launch.run.containers.docker import done
+from cpcbl_launch.run.containers.docker import command_output
 from cpcbl_launch.run.containers.fleet import SERVICE_LABEL
 from cpcbl_launch.run.processes import PROGRAM
 from cpcbl_launch.run.up import free_endpoint
-from cpcbl_launch.team_file import builtin, load_team
+from cpcbl_launch.team_file import builtin_path, load_team
 from cpcbl_transport.zenoh_bus import open_bus
 
 pytestmark = [pytest.mark.docker, pytest.mark.timeout(600)]
@@ -44,7 +44,9 @@ class Demo(NamedTuple):
     def containers(self) -> dict[str, str]:
         """Service -> id of the containers that run."""
         form = f'{{{{.Label "{SERVICE_LABEL}"}}}} {{{{.ID}}}}'
-        listed = done(["docker", "ps", "--filter", f"name={self.project}", "--format", form])
+        listed = command_output(
+            ["docker", "ps", "--filter", f"name={self.project}", "--format", form]
+        )
         return dict(line.split() for line in listed.splitlines())
 
 
@@ -58,7 +60,7 @@ def demo(tmp_path: Path) -> Iterator[Demo]:
 def renamed(shipped: str, folder: Path) -> Iterator[Demo]:
     """Fails when a container or network of the team is left."""
     name, endpoint = f"{shipped}{secrets.token_hex(3)}", free_endpoint()
-    text = builtin(shipped).read_text()
+    text = builtin_path(shipped).read_text()
     text = text.replace(
         f'name = "{shipped}"', f'name = "{name}"\ntransport.listen = ["{endpoint}"]'
     )
@@ -103,14 +105,14 @@ def assert_good(report: dict[str, Any]) -> None:
 
 def test_the_image_is_small_and_runs_as_nobody_on_a_read_only_file_system() -> None:
     confined = ["docker", "run", "--rm", "--read-only", "--tmpfs", "/tmp", "--cap-drop", "ALL"]
-    assert "demo: good" in done([*confined, image(), "check", "demo"])
+    assert "demo: good" in command_output([*confined, image(), "check", "demo"])
     shell = [*confined, "--entrypoint", "sh", image(), "-c"]
-    assert done([*shell, "id -u"]).strip() == "10001"
-    assert done([*shell, "touch /x 2>&1 || echo refused"]).splitlines()[-1] == "refused"
+    assert command_output([*shell, "id -u"]).strip() == "10001"
+    assert command_output([*shell, "touch /x 2>&1 || echo refused"]).splitlines()[-1] == "refused"
     for heavy in ("cv2", "matplotlib", "hatchling", "pytest"):
         found = f"python3 -c 'import {heavy}' 2>&1 || echo absent"
-        assert done([*shell, found]).splitlines()[-1] == "absent", heavy
-    size = int(done(["docker", "image", "inspect", "--format", "{{.Size}}", image()]))
+        assert command_output([*shell, found]).splitlines()[-1] == "absent", heavy
+    size = int(command_output(["docker", "image", "inspect", "--format", "{{.Size}}", image()]))
     assert size < 350e6
 
 
@@ -154,9 +156,9 @@ def test_containers_killed_by_hand_are_started_again_and_the_report_says_so(demo
         when(demo, lambda heard: len(heard.tracks.get("navigator", ())) > 50)
         killed = demo.containers()
         assert killed.keys() == SERVICES
-        done(["docker", "kill", killed["robot-navigator"]])
-        done(["docker", "rm", "--force", killed["robot-patrol"]])
-        done(["docker", "kill", killed["router"]])
+        command_output(["docker", "kill", killed["robot-navigator"]])
+        command_output(["docker", "rm", "--force", killed["robot-patrol"]])
+        command_output(["docker", "kill", killed["router"]])
         out, err = process.communicate(timeout=180.0)
     assert process.returncode == 0, err
     report = json.loads(out)
@@ -218,7 +220,9 @@ def test_a_port_that_is_taken_is_one_line_and_nothing_is_left(demo: Demo) -> Non
 
 
 def healths(ids: list[str]) -> set[str]:
-    return set(done(["docker", "inspect", "--format", "{{.State.Health.Status}}", *ids]).split())
+    return set(
+        command_output(["docker", "inspect", "--format", "{{.State.Health.Status}}", *ids]).split()
+    )
 
 
 def test_the_committed_compose_file_runs_and_a_robot_that_crashes_comes_back(

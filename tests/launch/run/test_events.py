@@ -13,7 +13,7 @@ from cpcbl_launch.reporting.metrics import Floats, position_errors, position_nee
 from cpcbl_launch.reporting.recorder import Recorder
 from cpcbl_launch.simulation.field import SimulatedField
 from cpcbl_launch.simulation.in_process import simulate
-from cpcbl_launch.team_file import TeamFileError, builtin, load_team, parse_team, save_resolved
+from cpcbl_launch.team_file import TeamFileError, builtin_path, load_team, parse_team, save_resolved
 from cpcbl_team.config import SimulationEvent, Team
 from cpcbl_team.inputs import Sightings
 
@@ -98,7 +98,7 @@ AT_S = 15.0
 
 def demo(*events: SimulationEvent, without: str = "") -> Team:
     """The demonstration, helping from the start, with these events."""
-    team, replace = load_team(builtin("demo")), msgspec.structs.replace
+    team, replace = load_team(builtin_path("demo")), msgspec.structs.replace
     robots = {
         name: replace(robot, collaboration=replace(robot.collaboration, after_s=0.0))
         for name, robot in team.robots.items()

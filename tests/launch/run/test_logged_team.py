@@ -17,14 +17,14 @@ from cpcbl_launch.lab.experiments import budget
 from cpcbl_launch.reporting.recorder import LearnedReport, Report
 from cpcbl_launch.run.logged_team import (
     LoggedTeam,
-    blinded,
     builtin_for,
-    on_log,
-    seen_before,
-    shortened,
+    is_calibrated_on,
+    load_logged_team,
+    with_blind_robots,
+    with_duration,
 )
-from cpcbl_launch.simulation.in_process import Choice, chosen, evaluate_log
-from cpcbl_launch.team_file import builtin, load_team
+from cpcbl_launch.simulation.in_process import Overrides, evaluate_log, with_overrides
+from cpcbl_launch.team_file import builtin_path, load_team
 from cpcbl_launch.views.run import print_report
 from cpcbl_team.config import (
     LocalizerSettings,
@@ -45,7 +45,7 @@ ALL = ("1", "2", "3", "4", "5")
 
 def logged(folder: Path, *robots: str, **options: Any) -> LoggedTeam:
     write_log(folder, robots or ("1", "2"), **options)
-    return on_log(log_team(*ALL), folder)
+    return load_logged_team(log_team(*ALL), folder)
 
 
 def report(team: LoggedTeam, duration_s: float | None = None) -> Any:
@@ -82,7 +82,7 @@ def start_with_truth_after(folder: Path, seconds: float) -> Start | None:
     path = folder / "Robot1_Groundtruth.dat"
     rows = [row for row in path.read_text().splitlines() if not row.startswith("#")]
     path.write_text("\n".join(rows[round(seconds * 1000) // STEP_MS :]))
-    return on_log(log_team("1", "2"), folder).team.robots["1"].start
+    return load_logged_team(log_team("1", "2"), folder).team.robots["1"].start
 
 
 @pytest.mark.parametrize("seconds", [0.1, 0.34, 2.0, 5.5])
@@ -103,23 +103,25 @@ def test_a_robot_whose_truth_begins_too_late_does_not_know_its_start(tmp_path: P
 def test_a_log_with_none_of_the_robots_is_an_error(tmp_path: Path) -> None:
     write_log(tmp_path, ("1", "2"), seconds=1.0)
     with pytest.raises(LogError, match=r"none of the robots 4, 5"):
-        on_log(log_team("4", "5"), tmp_path)
+        load_logged_team(log_team("4", "5"), tmp_path)
 
 
 def test_a_robot_that_would_not_read_its_log_is_refused(tmp_path: Path) -> None:
     write_log(tmp_path, ("1", "2"), seconds=1.0)
     team = log_team("1", "2", "3")
     robots = {**team.robots, "3": RobotSettings()}  # without files: left out, whatever it reads
-    assert on_log(msgspec.structs.replace(team, robots=robots), tmp_path).left_out.keys() == {"3"}
+    assert load_logged_team(
+        msgspec.structs.replace(team, robots=robots), tmp_path
+    ).left_out.keys() == {"3"}
     robots["2"] = RobotSettings(source="external")
     with pytest.raises(InputError, match=r'robots\.2\.source: external: .* source = "mrclam"'):
-        on_log(msgspec.structs.replace(team, robots=robots), tmp_path)
+        load_logged_team(msgspec.structs.replace(team, robots=robots), tmp_path)
 
 
 @pytest.mark.parametrize("duration_s", [-1.0, 0.0, math.inf, math.nan])
 def test_so_much_of_a_log_cannot_be_used(duration_s: float, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="at least 1 seconds of robot time"):
-        shortened(logged(tmp_path), duration_s)
+        with_duration(logged(tmp_path), duration_s)
 
 
 def test_a_budget_is_not_held_where_nothing_can_be_scored(tmp_path: Path) -> None:
@@ -127,24 +129,24 @@ def test_a_budget_is_not_held_where_nothing_can_be_scored(tmp_path: Path) -> Non
     assert budget.point(on, case).position_rmse_m < MILLIMETRE
     late = {name: rows[rows[:, 0] > EPOCH_MS * 1e-3 + 6.0] for name, rows in on.truth.items()}
     with pytest.raises(InputError, match=r"no truth in these 2 s; take more of the log"):
-        budget.point(shortened(on._replace(truth=late), 2.0), case)
+        budget.point(with_duration(on._replace(truth=late), 2.0), case)
 
 
 def test_blinding_takes_landmarks_from_the_named_robots_only(tmp_path: Path) -> None:
-    team = blinded(log_team("1", "2", "3"), ["3", "1"])
+    team = with_blind_robots(log_team("1", "2", "3"), ["3", "1"])
     assert [r.sensor.sees_landmarks for r in team.robots.values()] == [False, True, False]
-    assert blinded(team, []) == team
+    assert with_blind_robots(team, []) == team
 
 
 def test_blinding_an_unknown_robot_names_it_and_those_there_are() -> None:
     with pytest.raises(InputError, match=r"no robot 7, x to blind; there are 1, 2"):
-        blinded(log_team("1", "2"), ["x", "1", "7"])
+        with_blind_robots(log_team("1", "2"), ["x", "1", "7"])
 
 
 def test_choices_are_made_for_all_robots_and_nothing_else() -> None:
     team = log_team("1", "2")
-    assert chosen(team, Choice()) == team
-    picked = chosen(team, Choice("oval", "passive", "naive", "both-ways"))
+    assert with_overrides(team, Overrides()) == team
+    picked = with_overrides(team, Overrides("oval", "passive", "naive", "both-ways"))
     for robot in picked.robots.values():
         rules = robot.collaboration
         assert robot.localizer.variant == "oval"
@@ -170,7 +172,7 @@ def test_a_log_without_noise_gives_no_errors(
     tmp_path: Path, options: dict[str, Any], kinds: str, limit_m: float, blind: list[str]
 ) -> None:
     on = logged(tmp_path, **options)
-    team = chosen(blinded(on.team, blind), Choice(collaboration=kinds))
+    team = with_overrides(with_blind_robots(on.team, blind), Overrides(collaboration=kinds))
     for name, robot in report(on._replace(team=team))["robots"].items():
         assert robot["samples"] > 90
         assert robot["position_max_m"] < limit_m
@@ -188,7 +190,7 @@ def test_barcodes_that_nobody_carries_are_in_the_report(tmp_path: Path) -> None:
 def test_an_evaluation_sees_errors_where_there_are_some(tmp_path: Path) -> None:
     on = logged(tmp_path)
     truth = {name: rows + np.array([0.0, 0.3, 0.4, 0.1]) for name, rows in on.truth.items()}
-    team = chosen(on.team, Choice(collaboration="none"))
+    team = with_overrides(on.team, Overrides(collaboration="none"))
     robot = report(on._replace(team=team, truth=truth))["robots"]["1"]
     for figure in ("position_rmse_m", "position_mean_m", "position_max_m"):
         assert robot[figure] == pytest.approx(0.5, abs=MILLIMETRE)
@@ -314,8 +316,8 @@ def test_a_built_in_team_is_not_judged_on_what_it_was_calibrated_on(folder: str)
     number, file = folder[-1], builtin_for(Path(folder))
     team = load_team(file)
     assert file.stem == ("mrclam" if number == "9" else f"mrclam-without-{number}")
-    assert not seen_before(team, Path(folder))
-    assert seen_before(load_team(builtin("mrclam")), Path(folder)) == (number != "9")
+    assert not is_calibrated_on(team, Path(folder))
+    assert is_calibrated_on(load_team(builtin_path("mrclam")), Path(folder)) == (number != "9")
 
 
 @pytest.mark.parametrize("named", [".", "../MRCLAM6/", "../latest"])
@@ -326,4 +328,4 @@ def test_a_data_set_is_known_however_its_folder_is_named(
     (tmp_path / "latest").symlink_to("MRCLAM6")
     monkeypatch.chdir(tmp_path / "MRCLAM6")
     assert builtin_for(Path(named)).stem == "mrclam-without-6"
-    assert seen_before(load_team(builtin("mrclam")), Path(named))
+    assert is_calibrated_on(load_team(builtin_path("mrclam")), Path(named))

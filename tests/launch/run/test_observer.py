@@ -18,17 +18,24 @@ from support.processes import cpcbl_team, eventually, pids_of
 
 import cpcbl_launch
 from cpcbl_launch.reporting.metrics import seconds
-from cpcbl_launch.reporting.phases import Span, guest_reports, phase, presence
+from cpcbl_launch.reporting.phases import Span, guest_reports, phase_report, presence_spans
 from cpcbl_launch.reporting.recorder import Recorder, Report
 from cpcbl_launch.run.containers.compose import Mount
 from cpcbl_launch.run.containers.guest import docker_run, mounts_of_keys
 from cpcbl_launch.run.containers.launch import KEYS_INSIDE
-from cpcbl_launch.run.observer import Place, Wish, joined, place_in, places_in, presets
+from cpcbl_launch.run.observer import (
+    ObserverPose,
+    ObserverRequest,
+    parse_pose,
+    parse_waypoints,
+    presets,
+    team_with_observer,
+)
 from cpcbl_launch.run.processes import PROGRAM
 from cpcbl_launch.run.up import Run, free_endpoint, run_team
 from cpcbl_launch.simulation.in_process import simulate
-from cpcbl_launch.simulation.scheduled_guests import Visitor
-from cpcbl_launch.team_file import builtin, load_team, parse_team, save_resolved
+from cpcbl_launch.simulation.scheduled_guests import ScheduledGuest
+from cpcbl_launch.team_file import builtin_path, load_team, parse_team, save_resolved
 from cpcbl_team.config import GuestSettings, MatchSettings, Team, TransportSettings
 from cpcbl_team.errors import InputError
 from cpcbl_transport import topics
@@ -38,10 +45,10 @@ from cpcbl_transport.zenoh_bus import open_router
 
 SHIPPED = Path(cpcbl_launch.__file__).parent / "observers"
 DRIVER = Path(__file__).parents[3] / "docs" / "tripod_driver.py"
-BLIND = load_team(builtin("blind"))
-TRIPOD = Wish("tripod", Place(4.5, 5.0, -90.0))
+BLIND = load_team(builtin_path("blind"))
+TRIPOD = ObserverRequest("tripod", ObserverPose(4.5, 5.0, -90.0))
 STAY_S = 5.0  # of a guest, longer than it takes to help everybody
-ROVER = Wish("rover", Place(2.0, 2.5), "gps", moves=((7.0, 2.5), (2.0, 2.5)))
+ROVER = ObserverRequest("rover", ObserverPose(2.0, 2.5), "gps", moves=((7.0, 2.5), (2.0, 2.5)))
 
 
 # What is refused --------------------------------------------------------------------------------
@@ -50,27 +57,27 @@ ROVER = Wish("rover", Place(2.0, 2.5), "gps", moves=((7.0, 2.5), (2.0, 2.5)))
 @pytest.mark.parametrize(
     ("text", "place"),
     [
-        ("4.5,5", Place(4.5, 5.0, 0.0)),
-        ("4.5, 5, -90", Place(4.5, 5.0, -90.0)),
-        ("-1,1e1,0", Place(-1.0, 10.0, 0.0)),
+        ("4.5,5", ObserverPose(4.5, 5.0, 0.0)),
+        ("4.5, 5, -90", ObserverPose(4.5, 5.0, -90.0)),
+        ("-1,1e1,0", ObserverPose(-1.0, 10.0, 0.0)),
     ],
 )
-def test_places_as_they_are_typed(text: str, place: Place) -> None:
-    assert place_in(text) == place
+def test_places_as_they_are_typed(text: str, place: ObserverPose) -> None:
+    assert parse_pose(text) == place
 
 
 @pytest.mark.parametrize("text", ["", "1", "1,2,3,4", "1;2", "x,1", "nan,1", "1,inf", "1,2,nan"])
 def test_places_that_are_none_are_refused(text: str) -> None:
     with pytest.raises(InputError, match=r"--at .*such as"):
-        place_in(text)
+        parse_pose(text)
 
 
 def test_waypoints_as_they_are_typed() -> None:
-    assert places_in("") == ()
-    assert places_in("2,1; 7,1;") == ((2.0, 1.0), (7.0, 1.0))
+    assert parse_waypoints("") == ()
+    assert parse_waypoints("2,1; 7,1;") == ((2.0, 1.0), (7.0, 1.0))
     for text in ("1", "1,2;3", "1,2;nan,1", "1,2;x"):
         with pytest.raises(InputError, match=r"--move .*such as"):
-            places_in(text)
+            parse_waypoints(text)
 
 
 def changed(**fields: Any) -> Team:
@@ -90,15 +97,15 @@ def changed(**fields: Any) -> Team:
         (BLIND, TRIPOD._replace(fov_deg=361.0), "sensor.field_of_view_deg"),
         (changed(guests=GuestSettings(allowed=False)), TRIPOD, "guests.allowed = true"),
         (changed(match=MatchSettings(messages=100)), TRIPOD, "match.messages"),
-        (load_team(builtin("mrclam")), TRIPOD, "replays a log"),
+        (load_team(builtin_path("mrclam")), TRIPOD, "replays a log"),
     ],
     ids=lambda part: "" if isinstance(part, Team) else str(part)[:30],
 )
 def test_a_wish_that_cannot_be_granted_is_refused_with_the_reason(
-    team: Team, wish: Wish, said: str
+    team: Team, wish: ObserverRequest, said: str
 ) -> None:
     with pytest.raises(InputError, match=said) as refused:
-        joined(team, wish)
+        team_with_observer(team, wish)
     assert "\n" not in str(refused.value)
 
 
@@ -116,7 +123,7 @@ def test_a_sensor_file_is_checked_like_a_team_file(text: str, said: str, tmp_pat
     path = tmp_path / "laser.toml"
     path.write_text(text)
     with pytest.raises(InputError, match=said) as refused:
-        joined(BLIND, TRIPOD._replace(sensor=str(path)))
+        team_with_observer(BLIND, TRIPOD._replace(sensor=str(path)))
     assert str(path) in str(refused.value)
 
 
@@ -127,7 +134,7 @@ def test_a_guest_begins_with_the_teams_defaults_and_adds_its_sensor_and_the_comm
         "[robots.r1]\nstart = { x_m = 0.0, y_m = 0.0 }\n"
     )
     team = parse_team(text)
-    guest = joined(team, TRIPOD).robots["tripod"]
+    guest = team_with_observer(team, TRIPOD).robots["tripod"]
     rules = team.robots["r1"].collaboration
     assert guest.collaboration == msgspec.structs.replace(rules, after_s=0.0)
     assert (guest.speed_m_s, guest.waypoints_m, guest.source) == (0.3, (), "simulated")
@@ -135,11 +142,13 @@ def test_a_guest_begins_with_the_teams_defaults_and_adds_its_sensor_and_the_comm
     assert (guest.sensor.range_share, guest.sensor.bearing_sigma_deg) == (0.005, 0.5)
     assert guest.start is not None
     assert (guest.start.x_m, guest.start.heading_deg, guest.start.sigma_m) == (4.5, -90.0, 0.01)
-    wide = joined(team, TRIPOD._replace(fov_deg=360.0, moves=((1.0, 2.0),))).robots["tripod"]
+    wide = team_with_observer(team, TRIPOD._replace(fov_deg=360.0, moves=((1.0, 2.0),))).robots[
+        "tripod"
+    ]
     assert wide.sensor.field_of_view_deg == 360.0
     assert wide.odometry.moves
     assert wide.waypoints_m == ((1.0, 2.0),)
-    real = joined(team, TRIPOD._replace(source="external")).robots["tripod"]
+    real = team_with_observer(team, TRIPOD._replace(source="external")).robots["tripod"]
     assert real.source == "external"
 
 
@@ -156,24 +165,28 @@ def test_what_a_resolved_team_says_of_guests_is_what_the_file_said(tmp_path: Pat
 def test_every_preset_can_join() -> None:
     assert presets() == ["gps", "survey"]
     for sensor in presets():
-        assert "tripod" in joined(BLIND, TRIPOD._replace(sensor=sensor)).robots
+        assert "tripod" in team_with_observer(BLIND, TRIPOD._replace(sensor=sensor)).robots
 
 
 # In one process ---------------------------------------------------------------------------------
 
 
-def visited(seed: int, *wishes: Wish, from_s: float = 20.0, until_s: float = 40.0) -> Recorder:
+def visited(
+    seed: int, *wishes: ObserverRequest, from_s: float = 20.0, until_s: float = 40.0
+) -> Recorder:
     """The blind team for a minute, with guests in the middle of it."""
     guests = [
-        Visitor(wish.name, joined(BLIND, wish).robots[wish.name], from_s, until_s)
+        ScheduledGuest(
+            wish.name, team_with_observer(BLIND, wish).robots[wish.name], from_s, until_s
+        )
         for wish in wishes
     ]
-    return simulate(BLIND, seed, 60.0, visitors=guests)[1]
+    return simulate(BLIND, seed, 60.0, guests=guests)[1]
 
 
 def team_rmse_m(recorder: Recorder, span: Span) -> float:
     truth = recorder.simulated_truth()
-    errors = [phase(recorder, n, truth[n], [span]).position_rmse_m for n in BLIND.robots]
+    errors = [phase_report(recorder, n, truth[n], [span]).position_rmse_m for n in BLIND.robots]
     return sum(e for e in errors if e is not None) / len(BLIND.robots)
 
 
@@ -182,7 +195,7 @@ def team_rmse_m(recorder: Recorder, span: Span) -> float:
     ("wish", "share"), [(TRIPOD, 0.3), (ROVER, 0.6)], ids=["tripod camera", "GPS robot"]
 )
 def test_robots_get_better_while_a_guest_is_there_and_worse_again(
-    wish: Wish, share: float, seed: int
+    wish: ObserverRequest, share: float, seed: int
 ) -> None:
     """Better than before, than after, and than without it, by their sigma and by the truth."""
     recorder, alone = visited(seed, wish), visited(seed)
@@ -205,11 +218,13 @@ def test_robots_get_better_while_a_guest_is_there_and_worse_again(
 
 
 def test_a_tripod_in_sight_sharpens_every_robot_within_a_second() -> None:
-    wish = Wish("tripod", Place(4.5, 6.0, -90.0))  # has the whole field in view
+    wish = ObserverRequest("tripod", ObserverPose(4.5, 6.0, -90.0))  # has the whole field in view
     recorder = visited(1, wish)
     for name in BLIND.robots:
         spans = (Span(19.0, 20.0), Span(20.9, 21.1), Span(58.0, 60.0))
-        before, soon, late = (phase(recorder, name, None, [s]).position_sigma_m for s in spans)
+        before, soon, late = (
+            phase_report(recorder, name, None, [s]).position_sigma_m for s in spans
+        )
         assert before is not None
         assert soon is not None
         assert late is not None
@@ -220,20 +235,20 @@ def test_a_tripod_in_sight_sharpens_every_robot_within_a_second() -> None:
 def test_without_noise_guests_and_robots_agree_with_the_truth() -> None:
     quiet = msgspec.structs.replace(BLIND.simulation, noise=0.0)
     team = msgspec.structs.replace(BLIND, simulation=quiet)
-    guest = Visitor("tripod", joined(team, TRIPOD).robots["tripod"], 2.0, 8.0)
-    _, recorder = simulate(team, 1, 10.0, visitors=[guest])
+    guest = ScheduledGuest("tripod", team_with_observer(team, TRIPOD).robots["tripod"], 2.0, 8.0)
+    _, recorder = simulate(team, 1, 10.0, guests=[guest])
     truth = recorder.simulated_truth()
     assert recorder.status["r1"].counts["guest_left"] == 1
     for name in [*team.robots, "tripod"]:
-        score = phase(recorder, name, truth[name], [Span()])
+        score = phase_report(recorder, name, truth[name], [Span()])
         assert score.position_max_m is not None
         assert score.position_max_m < 2e-3, name
 
 
 def test_a_team_that_lets_no_guest_in_does_as_if_there_were_none() -> None:
     closed = changed(guests=GuestSettings(allowed=False))
-    guest = Visitor("tripod", joined(BLIND, TRIPOD).robots["tripod"], 2.0, 8.0)
-    with_guest = simulate(closed, 1, 10.0, visitors=[guest])[1]
+    guest = ScheduledGuest("tripod", team_with_observer(BLIND, TRIPOD).robots["tripod"], 2.0, 8.0)
+    with_guest = simulate(closed, 1, 10.0, guests=[guest])[1]
     without = simulate(closed, 1, 10.0)[1]
     for name in closed.robots:
         assert list(with_guest.tracks[name]) == list(without.tracks[name])
@@ -312,7 +327,7 @@ class Team3:
         return all(sigma_m(recorder, name) < 0.05 for name in self.team.robots)
 
     def guest_stays(self, recorder: Recorder) -> bool:
-        spans = presence(seconds(recorder.trajectory("tripod").stamps_ns).tolist())
+        spans = presence_spans(seconds(recorder.trajectory("tripod").stamps_ns).tolist())
         return any(span.until_s - span.from_s > STAY_S for span in spans)
 
     def guest_has_left(self, recorder: Recorder) -> bool:

@@ -10,10 +10,10 @@ import pytest
 from support.processes import cpcbl_team
 
 from cpcbl_launch.reporting.recorder import Report
-from cpcbl_launch.run.logged_team import blinded, builtin_for, on_log
-from cpcbl_launch.simulation.in_process import Choice, chosen, evaluate_log
-from cpcbl_launch.simulation.in_process import evaluated as evaluated_log
-from cpcbl_launch.team_file import builtin, load_team
+from cpcbl_launch.run.logged_team import builtin_for, load_logged_team, with_blind_robots
+from cpcbl_launch.simulation.in_process import Overrides, evaluate_log, with_overrides
+from cpcbl_launch.simulation.in_process import evaluate_log_with_paths as evaluated_log
+from cpcbl_launch.team_file import builtin_path, load_team
 
 pytestmark = [pytest.mark.log, pytest.mark.timeout(900)]
 
@@ -27,12 +27,12 @@ def log_folder(name: str) -> Path:
 
 
 @lru_cache
-def evaluated(name: str, blind: bool, choice: Choice, calibrated: bool = True) -> Report:
+def evaluated(name: str, blind: bool, choice: Overrides, calibrated: bool = True) -> Report:
     """A built-in team on a data set; the same run is not done twice."""
     folder = log_folder(name)
-    file = builtin_for(folder) if calibrated else builtin("mrclam-uncalibrated")
-    logged = on_log(chosen(load_team(file), choice), folder)
-    team = blinded(logged.team, BLIND if blind else ())
+    file = builtin_for(folder) if calibrated else builtin_path("mrclam-uncalibrated")
+    logged = load_logged_team(with_overrides(load_team(file), choice), folder)
+    team = with_blind_robots(logged.team, BLIND if blind else ())
     return evaluate_log(logged._replace(team=team))
 
 
@@ -42,8 +42,8 @@ def team_rmse_m(report: Report) -> float:
 
 
 def test_blind_robots_are_carried_by_their_teammates() -> None:
-    helped = evaluated("MRCLAM6", True, Choice())
-    alone = evaluated("MRCLAM6", True, Choice(collaboration="none"))
+    helped = evaluated("MRCLAM6", True, Overrides())
+    alone = evaluated("MRCLAM6", True, Overrides(collaboration="none"))
     assert team_rmse_m(helped) <= 0.12
     assert team_rmse_m(alone) > 0.5
     for name, robot in helped.robots.items():
@@ -67,7 +67,7 @@ def test_robots_calibrated_on_other_logs_are_accurate_and_know_how_much(
 ) -> None:
     """The bounds are what was measured, and a little; below a centralized EKF whose cameras' ranges
     are taken as ranges (0.101, 0.056, 0.047; blind 0.135, 0.107, 0.096)."""
-    report = evaluated(name, blind, Choice())
+    report = evaluated(name, blind, Overrides())
     assert name not in report.calibrated_on
     assert not report.seen_before
     assert team_rmse_m(report) <= rmse_m
@@ -80,8 +80,8 @@ def test_robots_calibrated_on_other_logs_are_accurate_and_know_how_much(
 
 
 def test_self_calibration_is_better_than_none_where_nothing_was_calibrated() -> None:
-    on = team_rmse_m(evaluated("MRCLAM4", False, Choice(), calibrated=False))
-    logged = on_log(load_team(builtin("mrclam-uncalibrated")), log_folder("MRCLAM4"))
+    on = team_rmse_m(evaluated("MRCLAM4", False, Overrides(), calibrated=False))
+    logged = load_logged_team(load_team(builtin_path("mrclam-uncalibrated")), log_folder("MRCLAM4"))
     replace = msgspec.structs.replace
     robots = {
         name: replace(robot, localizer=replace(robot.localizer, self_calibration=False))
@@ -93,7 +93,7 @@ def test_self_calibration_is_better_than_none_where_nothing_was_calibrated() -> 
 
 def test_the_yardsticks_are_worth_the_name() -> None:
     """Start poses and settings are the team's; the centralized filter is the ceiling."""
-    logged = on_log(load_team(builtin("mrclam-uncalibrated")), log_folder("MRCLAM6"))
+    logged = load_logged_team(load_team(builtin_path("mrclam-uncalibrated")), log_folder("MRCLAM6"))
     report = evaluated_log(logged, with_yardsticks=True).report
     rmse = {kind: y.team.position_rmse_m or 0.0 for kind, y in report.yardsticks.items()}
     assert 0.0 < rmse["centralized_ekf"] < 0.15
@@ -108,7 +108,7 @@ def test_processes_over_zenoh_agree_with_one_process() -> None:
     assert ran.returncode == 0, ran.stderr
     report = json.loads(ran.stdout)
     assert report["robots"].keys() == {"1", "2", "3", "4", "5"}
-    expected = team_rmse_m(evaluated("MRCLAM6", True, Choice()))
+    expected = team_rmse_m(evaluated("MRCLAM6", True, Overrides()))
     assert report["team"]["position_rmse_m"] == pytest.approx(expected, rel=0.15)
 
 
@@ -122,7 +122,7 @@ def test_no_divergence_lasts(name: str, variant: str, collaboration: str, fusion
     a covariance, as `weighted` has none, that may take 25 min: what it is told is worth little."""
     if collaboration == "none" and fusion == "naive":
         fusion = "split-ci"  # nothing is merged: the same run
-    report = evaluated(name, True, Choice(variant, collaboration, fusion), calibrated=False)
+    report = evaluated(name, True, Overrides(variant, collaboration, fusion), calibrated=False)
     for robot, r in report.robots.items():
         assert r.position_rmse_m is not None
         if robot not in BLIND:

@@ -14,7 +14,7 @@ from support.processes import cpcbl_team, eventually
 
 from cpcbl_launch.run.processes import PROGRAM
 from cpcbl_launch.run.up import free_endpoint
-from cpcbl_launch.team_file import builtin, load_team
+from cpcbl_launch.team_file import builtin_path, load_team
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus
 from cpcbl_transport.guards import guard_rules
@@ -254,5 +254,5 @@ def test_a_port_that_is_taken_is_said_in_one_line(team_file: Path) -> None:
 
 def test_without_an_endpoint_it_listens_where_the_robots_of_this_machine_look() -> None:
     printed = cpcbl_team("router", "demo", "--print-config").stdout
-    team = load_team(builtin("demo"))
+    team = load_team(builtin_path("demo"))
     assert all(f'"{endpoint}"' in printed for endpoint in team.transport.connect)

@@ -31,8 +31,10 @@ def judging(team: Team, enabled: bool) -> Team:
 
 def logged(name: str, enabled: bool) -> logged_team.LoggedTeam:
     folder = LOGS / name
-    found = logged_team.on_log(judging(load_team(logged_team.builtin_for(folder)), enabled), folder)
-    return found._replace(team=logged_team.blinded(found.team, ["3", "4", "5"]))
+    found = logged_team.load_logged_team(
+        judging(load_team(logged_team.builtin_for(folder)), enabled), folder
+    )
+    return found._replace(team=logged_team.with_blind_robots(found.team, ["3", "4", "5"]))
 
 
 @cache

@@ -8,7 +8,7 @@ from support.docker import composed
 from support.processes import eventually
 
 from cpcbl_launch.reporting.recorder import Recorder
-from cpcbl_launch.run.containers.docker import done
+from cpcbl_launch.run.containers.docker import command_output
 from cpcbl_transport.zenoh_bus import open_bus
 
 WEST, EAST = {"navigator", "observer"}, {"scout", "patrol"}
@@ -63,13 +63,13 @@ def test_each_side_goes_on_through_a_cut_and_they_are_together_soon_after(tmp_pa
         started = project.started()
         link = (f"{project.name}_link", project.id_of("router-east"))
 
-        done(["docker", "network", "disconnect", *link])
+        command_output(["docker", "network", "disconnect", *link])
         assert silent(in_the_west, EAST)
         assert silent(in_the_east, WEST)
         assert grow(in_the_west, WEST)
         assert grow(in_the_east, EAST)
 
-        done(["docker", "network", "connect", *link])
+        command_output(["docker", "network", "connect", *link])
         healed_s, before = time.monotonic(), help_to(in_the_east, "scout")
         assert grow(in_the_west, EAST, TOGETHER_WITHIN_S)
         assert grow(in_the_east, WEST, TOGETHER_WITHIN_S)

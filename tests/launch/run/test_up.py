@@ -17,7 +17,7 @@ from cpcbl_launch.reporting.recorder import Recorder, Report
 from cpcbl_launch.run.processes import PROGRAM
 from cpcbl_launch.run.supervisor import Processes, ProcessSpec, Supervisor
 from cpcbl_launch.run.up import Run, free_endpoint, run_team
-from cpcbl_launch.team_file import builtin, load_team, save_resolved
+from cpcbl_launch.team_file import builtin_path, load_team, save_resolved
 from cpcbl_team.config import GuardSettings, Team, TransportSettings
 from cpcbl_transport import topics
 from cpcbl_transport.topics import Qos
@@ -28,7 +28,7 @@ ROBOTS = ("navigator", "observer", "scout", "patrol")
 
 def demo_team() -> Team:
     """The demonstration, helping from the start."""
-    team = load_team(builtin("demo"))
+    team = load_team(builtin_path("demo"))
     robots = {
         name: msgspec.structs.replace(
             robot, collaboration=msgspec.structs.replace(robot.collaboration, after_s=0.0)

@@ -17,7 +17,7 @@ from cpcbl_launch.simulation.camera.cameras import QUALITIES, Cameras, encoded
 from cpcbl_launch.simulation.camera.render import Scene, Standing, render
 from cpcbl_launch.simulation.field import SimulatedField
 from cpcbl_launch.simulation.field_node import PICTURES_LATE_NS, FieldNode
-from cpcbl_launch.team_file import builtin, load_team, parse_team
+from cpcbl_launch.team_file import builtin_path, load_team, parse_team
 from cpcbl_team.config import Team
 from cpcbl_team.geometry import Pose2
 from cpcbl_team.inputs import Sightings
@@ -182,9 +182,9 @@ def test_a_field_that_is_late_makes_no_pictures_of_the_past() -> None:
     for at_ms in range(20, 1001, 20):
         quick.node.step(at_ms * MS)
     assert len(quick.ear.messages) == 10
-    assert quick.node.pictures_not_taken == 0
+    assert quick.node.skipped_frames == 0
     assert 1 <= len(slow.ear.messages) <= 1 + PICTURES_LATE_NS // (100 * MS)
-    assert slow.node.pictures_not_taken >= 16  # of both robots
+    assert slow.node.skipped_frames >= 16  # of both robots
     assert slow.field.truth() == quick.field.truth()
 
 
@@ -237,7 +237,7 @@ def test_opencv_keeps_to_one_thread() -> None:
 
 
 def test_the_built_in_team_s_pictures_fit_its_cameras() -> None:
-    subject = load_team(builtin("eyes"))
+    subject = load_team(builtin_path("eyes"))
     assert all(robot.sensing == "camera" for robot in subject.robots.values())
     field = SimulatedField(subject, 1, 0)
     for name, robot in subject.robots.items():

@@ -11,7 +11,7 @@ from support.fields import ALL_ROUND, STEP_NS, drive, field, frame, marks, robot
 from cpcbl_agents.sensing import SensorInput
 from cpcbl_launch.simulation.in_process import simulate
 from cpcbl_launch.simulation.robot import COMMAND_LASTS_NS
-from cpcbl_launch.team_file import builtin, load_team
+from cpcbl_launch.team_file import builtin_path, load_team
 from cpcbl_team.config import (
     Field,
     Gives,
@@ -281,7 +281,7 @@ def test_the_same_seed_gives_the_same_and_another_seed_another_field() -> None:
 
 
 def test_a_simulation_is_deterministic_for_a_seed() -> None:
-    team = load_team(builtin("demo"))
+    team = load_team(builtin_path("demo"))
     first, again, other = (msgspec.json.encode(simulate(team, seed, 5.0)[0]) for seed in (7, 7, 8))
     assert first == again
     assert first != other

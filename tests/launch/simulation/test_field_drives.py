@@ -8,8 +8,8 @@ import msgspec
 import pytest
 from support.fields import LOOP, MILLIMETRE, marks
 
-from cpcbl_launch.simulation.in_process import Choice, chosen, simulate
-from cpcbl_launch.team_file import builtin, load_team
+from cpcbl_launch.simulation.in_process import Overrides, simulate, with_overrides
+from cpcbl_launch.team_file import builtin_path, load_team
 from cpcbl_team.config import (
     LocalizerSettings,
     OdometrySettings,
@@ -31,9 +31,9 @@ TURNING_MATE_M = 0.005  # a teammate that turns is believed to drive on until it
     [("none", MILLIMETRE), ("both", TURNING_MATE_M)],
 )
 def test_robots_drive_their_loops_by_their_own_estimates(kinds: str, limit_m: float) -> None:
-    demo = load_team(builtin("demo"))
+    demo = load_team(builtin_path("demo"))
     quiet = msgspec.structs.replace(demo, simulation=SimulationSettings(noise=0.0))
-    report, recorder = simulate(chosen(quiet, Choice(collaboration=kinds)), 1, 30.0)
+    report, recorder = simulate(with_overrides(quiet, Overrides(collaboration=kinds)), 1, 30.0)
     for name, figures in report.robots.items():
         assert figures.samples > 250
         assert figures.position_max_m is not None
@@ -50,7 +50,7 @@ def test_robots_drive_their_loops_by_their_own_estimates(kinds: str, limit_m: fl
 
 
 def test_robots_pass_their_waypoints() -> None:
-    demo = load_team(builtin("demo"))
+    demo = load_team(builtin_path("demo"))
     quiet = msgspec.structs.replace(demo, simulation=SimulationSettings(noise=0.0))
     _, recorder = simulate(quiet, 1, 40.0)
     for name in MOVING:

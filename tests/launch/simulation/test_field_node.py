@@ -10,9 +10,9 @@ from support.fields import ALL_ROUND, STEP_NS, field, marks, robot
 
 from cpcbl_agents.clock import Clock
 from cpcbl_launch.simulation.field import SimulatedField
-from cpcbl_launch.simulation.field_node import INBOX, FieldNode, robots_at, run_field
-from cpcbl_launch.simulation.guest_bodies import LASTS_NS
-from cpcbl_launch.team_file import builtin, load_team
+from cpcbl_launch.simulation.field_node import INBOX, FieldNode, parse_sites, run_field
+from cpcbl_launch.simulation.guest_bodies import REQUEST_LASTS_NS
+from cpcbl_launch.team_file import builtin_path, load_team
 from cpcbl_team.config import (
     GuestSettings,
     OdometrySettings,
@@ -130,7 +130,7 @@ def test_a_robot_whose_clock_is_off_gets_and_gives_its_own_stamps(ahead_s: float
 
 
 def test_a_field_runs_until_it_is_stopped() -> None:
-    on, team = OnBus(), load_team(builtin("demo"))
+    on, team = OnBus(), load_team(builtin_path("demo"))
     ear, clock = Ear(on.bus, topics.TRUTH.at()), Clock.wall()
     with MemoryHub().session() as apart:
         run_field(team, 1, apart, clock, lambda: True)
@@ -158,15 +158,15 @@ def test_robots_of_another_site_are_told_and_heard_on_the_bus_of_theirs() -> Non
 
 
 def test_robots_of_other_sites_are_named_by_their_router() -> None:
-    team = load_team(builtin("demo"))
+    team = load_team(builtin_path("demo"))
     texts = ["tcp/10.0.0.2:7447=scout, patrol", "tcp/10.0.0.3:7447=observer"]
-    assert robots_at(texts, team) == {
+    assert parse_sites(texts, team) == {
         "tcp/10.0.0.2:7447": ["scout", "patrol"],
         "tcp/10.0.0.3:7447": ["observer"],
     }
     for wrong in ("tcp/10.0.0.2:7447", "tcp/10.0.0.2:7447=", "tcp/10.0.0.2:7447=nobody"):
         with pytest.raises(InputError, match=r"--site .*no robot .*navigator, observer"):
-            robots_at([wrong], team)
+            parse_sites([wrong], team)
 
 
 # Guests -----------------------------------------------------------------------------------------
@@ -250,7 +250,7 @@ def test_a_guest_is_gone_two_seconds_after_its_last_word_or_at_once_when_it_says
     on = WithGuests()
     on.ask(body())
     on.steps(1)
-    on.steps(LASTS_NS // STEP_NS)
+    on.steps(REQUEST_LASTS_NS // STEP_NS)
     assert on.guests == {"tripod"}
     on.steps(1)
     assert on.guests == set()
@@ -356,7 +356,7 @@ def test_a_guest_changes_nothing_of_the_noise_before_it_came() -> None:
         found = []
         for step_number in range(20):
             if guest and step_number == 10:
-                subject.join("tripod", body())
+                subject.add_guest("tripod", body())
             subject.advance()
             found += [subject.robots["r1"].pose, subject.robots["r2"].pose]
         return found

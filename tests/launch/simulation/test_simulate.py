@@ -13,7 +13,7 @@ from cpcbl_launch.cli import main
 from cpcbl_launch.lab.scaling.measure import Size, measured, measured_team, parsed_sizes
 from cpcbl_launch.lab.scaling.swarm import SPACING_M, swarm
 from cpcbl_launch.simulation.in_process import simulate
-from cpcbl_launch.team_file import builtin, load_team, problems
+from cpcbl_launch.team_file import builtin_path, load_team, problems
 from cpcbl_team.config import (
     Field,
     Landmark,
@@ -172,7 +172,7 @@ def test_a_team_file_gives_the_report_of_up(tmp_path: Path) -> None:
     assert picture.read_bytes().startswith(PNG)
     report = json.loads(written.read_text())
     assert report["duration_s"] == 12.0
-    demo = load_team(builtin("demo"))
+    demo = load_team(builtin_path("demo"))
     assert report["robots"].keys() == report["alone"].keys() == demo.robots.keys()
     _, recorder = simulate(demo, 3, 12.0)
     sent = {name: status.bytes_sent for name, status in recorder.status.items()}

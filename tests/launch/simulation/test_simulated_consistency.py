@@ -7,8 +7,8 @@ import msgspec
 import numpy as np
 import pytest
 
-from cpcbl_launch.simulation.in_process import Choice, chosen, simulate
-from cpcbl_launch.team_file import builtin, load_team
+from cpcbl_launch.simulation.in_process import Overrides, simulate, with_overrides
+from cpcbl_launch.team_file import builtin_path, load_team
 from cpcbl_team.config import Team
 
 SEEDS = range(20)
@@ -17,7 +17,9 @@ VARIANTS = pytest.mark.parametrize("variant", ["joint", "circular"])
 
 def demo_team(variant: str, fusion: str, robots: Collection[str]) -> Team:
     """These robots of the demonstration, helping from the start."""
-    team = chosen(load_team(builtin("demo")), Choice(variant=variant, fusion=fusion))
+    team = with_overrides(
+        load_team(builtin_path("demo")), Overrides(variant=variant, fusion=fusion)
+    )
     replace = msgspec.structs.replace
     return replace(
         team,
@@ -46,7 +48,7 @@ def test_a_robot_alone_is_consistent(variant: str) -> None:
 @pytest.mark.timeout(600)
 @VARIANTS
 def test_a_team_is_consistent_with_split_ci_and_more_so_than_by_naive_merging(variant: str) -> None:
-    everyone = load_team(builtin("demo")).robots
+    everyone = load_team(builtin_path("demo")).robots
     split = inside_3_sigma(demo_team(variant, "split-ci", everyone))
     assert split >= 0.98
     assert split > inside_3_sigma(demo_team(variant, "naive", everyone))

@@ -20,18 +20,23 @@ from support.processes import cpcbl_team, pids_of
 from cpcbl_launch.cli import main
 from cpcbl_launch.reporting.flows import (
     SpendingReport,
-    all_held,
+    are_limits_kept,
     summed_flows,
     summed_spending,
 )
 from cpcbl_launch.reporting.recorder import Recorder, Report
 from cpcbl_launch.run.processes import PROGRAM
 from cpcbl_launch.run.up import free_endpoint
-from cpcbl_launch.simulation.in_process import Choice, chosen
+from cpcbl_launch.simulation.in_process import Overrides, with_overrides
 from cpcbl_launch.team_file import parse_team
 from cpcbl_launch.views.run import print_report
-from cpcbl_launch.views.traffic.show import TrafficView, drawn, limit_text
-from cpcbl_launch.views.traffic.watch import Arrival, Traffic, Watcher, traffic
+from cpcbl_launch.views.traffic.show import TrafficView, limit_text, traffic_view
+from cpcbl_launch.views.traffic.watch import (
+    Arrival,
+    StatusCollector,
+    Traffic,
+    traffic_from_statuses,
+)
 from cpcbl_team.inputs import Sighting
 from cpcbl_transport import topics
 from cpcbl_transport.bus import MemoryHub
@@ -112,10 +117,10 @@ def test_a_limit_in_words(
     unit: str, window_s: float, allowed: float, most: float, said: str, held: bool
 ) -> None:
     limit = SpendingReport(unit=unit, window_s=window_s, allowed=allowed, most=most)
-    assert (limit_text(limit).plain, limit.held) == (said, held)
+    assert (limit_text(limit).plain, limit.is_kept) == (said, held)
     assert limit_text(limit).style == ("green" if held else "bold red")
-    assert all_held([limit]) is held
-    assert all_held([]) is None
+    assert are_limits_kept([limit]) is held
+    assert are_limits_kept([]) is None
 
 
 def recorded(*statuses: Status) -> Report:
@@ -201,7 +206,7 @@ def team_at(now_s: float) -> Traffic:
         "gone": seen(status("gone", 1, 2, sent=(flow("fix", "scout", 5, 1.0),))),
     }
     known = ("gone", "scout", "spare", "good", "patrol", "adrift")
-    return traffic("five", known, arrivals, 0.0, now_s)
+    return traffic_from_statuses("five", known, arrivals, 0.0, now_s)
 
 
 def test_rates_are_those_since_the_first_status_kept() -> None:
@@ -232,7 +237,7 @@ def test_a_robot_that_falls_silent_is_away_and_helps_nobody() -> None:
     last = team_at(11.5)
     assert [n for n, r in last.robots.items() if r.away] == ["good", "gone", "patrol", "adrift"]
     assert last.help == ()
-    (row,) = (line for line in rendered(drawn(last, "here")) if "18  756" in line)
+    (row,) = (line for line in rendered(traffic_view(last, "here")) if "18  756" in line)
     assert row.split()[-5:] == ["-", "-", "0", "0", "0"]
 
 
@@ -266,7 +271,7 @@ still tell. B: on the sender's link with Zenoh's own, without TCP/IP's
 
 
 def test_the_drawing_of_a_team() -> None:
-    lines = rendered(drawn(team_at(7.0), "here"))
+    lines = rendered(traffic_view(team_at(7.0), "here"))
     assert lines[: DRAWING.count("\n")] == DRAWING.splitlines()
     assert max(map(len, lines)) <= 80
 
@@ -274,7 +279,7 @@ def test_the_drawing_of_a_team() -> None:
 def test_colours_tell_kinds_the_lost_and_the_idle() -> None:
     console = Console(file=io.StringIO(), width=80, force_terminal=True, color_system="standard")
     with console.capture() as capture:
-        console.print(drawn(team_at(7.0), "here"))
+        console.print(traffic_view(team_at(7.0), "here"))
     text = capture.get()
     for code, words in (
         ("36", "fix 4.5/s"),
@@ -300,7 +305,7 @@ def test_a_terminal_is_redrawn_and_a_file_gets_snapshots() -> None:
 
 def test_a_watcher_keeps_one_process_and_the_last_seconds() -> None:
     hub, clock = MemoryHub(), iter(range(100))
-    watcher, speaker = Watcher(hub.session(), lambda: float(next(clock))), hub.session()
+    watcher, speaker = StatusCollector(hub.session(), lambda: float(next(clock))), hub.session()
 
     def say(payload: bytes) -> None:
         speaker.publisher("status/a", topics.STATUS.qos).put(payload)
@@ -333,7 +338,7 @@ def test_watching_makes_nobody_send_help() -> None:
     with open_router("trio", [endpoint]) as router, open_bus("trio", [endpoint]) as client:
         keys = ("status/b", "fix/a/0/b", "belief/0/b", "track/b")
         publishers = {key: router.publisher(key, topics.Qos.INPUT) for key in keys}
-        Watcher(client)
+        StatusCollector(client)
         wait_until(lambda: publishers["status/b"].matching)
         assert [key for key in keys if publishers[key].matching] == ["status/b"]
 
@@ -361,14 +366,16 @@ def test_a_recorder_counts_what_it_takes_and_what_it_refuses() -> None:
 
 def test_budgets_of_a_command_line_are_those_of_all_robots() -> None:
     team = parse_team(TEAM)
-    assert chosen(team, Choice()) == team
-    limited = chosen(team, Choice(bytes_per_s=50.0, messages_per_minute=2.5, match_messages=1200))
+    assert with_overrides(team, Overrides()) == team
+    limited = with_overrides(
+        team, Overrides(bytes_per_s=50.0, messages_per_minute=2.5, match_messages=1200)
+    )
     for robot in limited.robots.values():
         budget = robot.collaboration.budget
         assert (budget.bytes_per_s, budget.messages_per_minute) == (50.0, 2.5)
     assert limited.match.messages == 1200
     assert limited.messages_per_s("driver") == pytest.approx(1200 / 3 / 1200)
-    free = chosen(limited, Choice(bytes_per_s=0.0, match_messages=0)).robots["miser"]
+    free = with_overrides(limited, Overrides(bytes_per_s=0.0, match_messages=0)).robots["miser"]
     assert free.collaboration.budget.bytes_per_s == 0.0
     assert free.collaboration.budget.messages_per_minute == 2.5
 
@@ -430,13 +437,13 @@ def test_a_log_is_evaluated_with_a_budget(tmp_path: Path) -> None:
 
 def test_who_is_not_in_the_team_file_is_shown_as_a_guest() -> None:
     seen = {name: [Arrival(1.0, status(name, 1, 3))] for name in ("r1", "tripod")}
-    now = traffic("t", ["r1"], seen, 0.0, 1.0)
+    now = traffic_from_statuses("t", ["r1"], seen, 0.0, 1.0)
     assert now.guests == ("tripod",)
     console = Console(file=io.StringIO(), width=80)
     with console.capture() as capture:
-        console.print(drawn(now, "here"))
+        console.print(traffic_view(now, "here"))
     assert "tripod, guest" in capture.get()
-    assert traffic("t", [], seen, 0.0, 1.0).guests == ()  # nobody knows
+    assert traffic_from_statuses("t", [], seen, 0.0, 1.0).guests == ()  # nobody knows
 
 
 # Processes --------------------------------------------------------------------------------------
@@ -522,7 +529,7 @@ def test_without_a_router_watching_ends_with_one_line() -> None:
 
 def test_what_is_no_status_is_counted_and_shown() -> None:
     hub = MemoryHub()
-    watcher, speaker = Watcher(hub.session()), hub.session()
+    watcher, speaker = StatusCollector(hub.session()), hub.session()
     for key, payload in (
         ("status/a", b"garbage"),
         ("status/a", encode(status("b", 1, 0))),
@@ -530,8 +537,8 @@ def test_what_is_no_status_is_counted_and_shown() -> None:
     ):
         speaker.publisher(key, topics.STATUS.qos).put(payload)
     assert watcher.refused == {"wrong_version": 1, "name_of_another": 1}
-    now = traffic("trio", (), watcher.arrivals(), 0.0, 1.0, watcher.refused)
+    now = traffic_from_statuses("trio", (), watcher.arrivals(), 0.0, 1.0, watcher.refused)
     assert now.refused == {"name_of_another": 1, "wrong_version": 1}
     console = Console(file=io.StringIO(), width=80)
-    console.print(drawn(now, "here"))
+    console.print(traffic_view(now, "here"))
     assert "refused, by reason: name_of_another 1, wrong_version 1" in console.file.getvalue()  # type: ignore[attr-defined]

@@ -18,12 +18,12 @@ from cpcbl_launch.run.containers import BASE_IMAGE, BASE_VARIABLE
 from cpcbl_launch.run.containers.docker import (
     DockerError,
     check_daemon,
+    command_output,
     compose_program,
-    done,
-    never,
+    never_stop,
 )
 from cpcbl_launch.run.containers.fleet import Project
-from cpcbl_launch.run.containers.image import checkout, image_for, there, version
+from cpcbl_launch.run.containers.image import checkout, ensure_image, has_image, version
 from cpcbl_launch.run.up import free_endpoint
 from cpcbl_transport.zenoh_bus import open_bus
 
@@ -69,9 +69,9 @@ def partition_containers(setting: Setting) -> Found:
         router = sites.project.containers()["router-east"].id
         setting.say(f"the sites are apart for {CUT_S:g} s")
         cut_s = sites.west.now_s
-        done(["docker", "network", "disconnect", link, router])
+        command_output(["docker", "network", "disconnect", link, router])
         time.sleep(CUT_S)
-        done(["docker", "network", "connect", link, router])
+        command_output(["docker", "network", "connect", link, router])
         healed_s = sites.west.now_s
         setting.say("the link between the sites is back")
         time.sleep(5.0 + AFTER_S)
@@ -121,7 +121,7 @@ def _image(setting: Setting) -> str:
     """The image of these sources. Raises CannotRunError where none can be had."""
     bases = (os.environ.get(BASE_VARIABLE), BASE_IMAGE, OWN_BASE)
     try:
-        base = next((b for b in bases if b and there(b)), bases[0] or BASE_IMAGE)
-        return image_for(base, never, setting.say)
+        base = next((b for b in bases if b and has_image(b)), bases[0] or BASE_IMAGE)
+        return ensure_image(base, never_stop, setting.say)
     except DockerError as error:
         raise CannotRunError(f"needs an image: {error}") from error

@@ -21,7 +21,7 @@ from cpcbl_launch.lab.chaos.team import FIELD, ChaosError, Plan, TeamUnderTest, 
 from cpcbl_launch.reporting.recorder import Recorder
 from cpcbl_launch.run.processes import PROGRAM
 from cpcbl_launch.views.frames.ear import LookEar
-from cpcbl_launch.views.traffic.watch import Watcher
+from cpcbl_launch.views.traffic.watch import StatusCollector
 from cpcbl_team.config import (
     CollaborationSettings,
     GuardSettings,
@@ -110,7 +110,7 @@ def fuzz(setting: Setting, a_key: int = A_KEY) -> Found:
         team = stack.enter_context(running(plan))
         bus = stack.enter_context(open_bus(plan.team.name, [team.endpoint]))
         ears = stack.enter_context(open_bus(plan.team.name, [team.endpoint]))
-        recorder, watcher, looks = Recorder(ears), Watcher(ears), LookEar(ears)
+        recorder, watcher, looks = Recorder(ears), StatusCollector(ears), LookEar(ears)
         setting.say("starting a team")
         team.settle()
         from_s = team.now_s

@@ -18,9 +18,9 @@ from cpcbl_launch.reporting.metrics import (
     Floats,
     Samples,
     Trajectory,
-    compared,
     position_errors,
     position_nees,
+    samples_with_truth,
     score,
     seconds,
 )
@@ -312,7 +312,7 @@ def _compared(
         np.array([(t.x_m, t.y_m, t.heading_rad) for t in tracks]).reshape(-1, 3),
         np.array([t.covariance for t in tracks]).reshape(-1, 6),
     )
-    stamps_ns, samples = compared(trajectory, notes.truth.get(robot))
+    stamps_ns, samples = samples_with_truth(trajectory, notes.truth.get(robot))
     lost = {t.stamp_ns - notes.epoch_ns for t in tracks if t.lost}
     return seconds(stamps_ns), samples, np.array([s in lost for s in stamps_ns.tolist()], bool)
 

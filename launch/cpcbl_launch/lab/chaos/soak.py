@@ -23,7 +23,7 @@ from cpcbl_launch.lab.chaos.relay import Quality, Relay
 from cpcbl_launch.lab.chaos.scenario import FOUND_M, Found, Setting, all_is_well
 from cpcbl_launch.lab.chaos.team import FIELD, ROUTER, Plan, TeamUnderTest, demo_team, running
 from cpcbl_launch.run.up import free_endpoint
-from cpcbl_launch.run.usage import MIB, must_measure, usage
+from cpcbl_launch.run.usage import MIB, process_usage, require_process_usage
 from cpcbl_transport.zenoh_bus import open_bus
 
 SAMPLE_S = 5.0
@@ -61,7 +61,7 @@ class Life(NamedTuple):
 
 def soak(setting: Setting) -> Found:
     """Kill, freeze, cut, slow, flood, echo, again and again."""
-    must_measure("chaos soak")
+    require_process_usage("chaos soak")
     team_file, endpoint = demo_team(), free_endpoint()
     with ExitStack() as stack:
         links = {n: stack.enter_context(Relay(endpoint, setting.seed)) for n in team_file.robots}
@@ -215,7 +215,7 @@ class _Tormentor:
             for process, pid in self._team.supervisor.pids.items():
                 try:
                     files = len(list(Path(f"/proc/{pid}/fd").iterdir()))
-                    held = usage(pid).own_bytes
+                    held = process_usage(pid).own_bytes
                 except (OSError, KeyError):  # it ends just now
                     continue
                 self.samples.append(Sample(now_s, process, pid, held, files))

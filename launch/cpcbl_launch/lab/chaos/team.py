@@ -18,7 +18,7 @@ from cpcbl_launch.lab.faulty_robot import faulty_command
 from cpcbl_launch.run.processes import PROGRAM, process_table
 from cpcbl_launch.run.supervisor import ProcessSpec, Supervisor
 from cpcbl_launch.run.up import free_endpoint
-from cpcbl_launch.team_file import builtin, load_team, save_resolved
+from cpcbl_launch.team_file import builtin_path, load_team, save_resolved
 from cpcbl_team.config import Team
 from cpcbl_team.errors import CpcblError
 from cpcbl_transport.zenoh_bus import open_bus
@@ -67,7 +67,7 @@ class Plan(NamedTuple):
 
 def demo_team() -> Team:
     """The demonstration, helping from the start: navigator, observer, scout (blind), patrol."""
-    team = load_team(builtin("demo"))
+    team = load_team(builtin_path("demo"))
     return with_collaboration(team, after_s=0.0)
 
 

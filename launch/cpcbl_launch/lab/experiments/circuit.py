@@ -5,7 +5,7 @@ from collections.abc import Collection
 import msgspec
 
 from cpcbl_launch.lab.experiments.runs import LOOPS, Case
-from cpcbl_launch.team_file import builtin, load_team
+from cpcbl_launch.team_file import builtin_path, load_team
 from cpcbl_team.config import Team
 
 LIMIT_S = 400.0  # five loops take 70 s
@@ -14,7 +14,7 @@ ODOMETRY_ONLY = {"lost_position_sigma_m": 1e3, "lost_heading_sigma_deg": 1e5}  #
 
 def circuit(robots: Collection[str], beacons: bool = False) -> Team:
     """These robots among the four landmarks, with or without the four bearing-only beacons."""
-    team = load_team(builtin("circuit"))
+    team = load_team(builtin_path("circuit"))
     marks = {n: m for n, m in team.map.landmarks.items() if beacons or m.gives == "both"}
     return msgspec.structs.replace(
         team,

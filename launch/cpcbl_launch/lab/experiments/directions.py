@@ -29,7 +29,7 @@ from cpcbl_launch.lab.experiments.results import (
 )
 from cpcbl_launch.lab.experiments.runs import Case
 from cpcbl_launch.reporting.tables import number, percent, table
-from cpcbl_launch.simulation.in_process import Choice, chosen
+from cpcbl_launch.simulation.in_process import Overrides, with_overrides
 from cpcbl_team.config import RobotSettings, Start, Team
 from cpcbl_team.errors import InputError
 
@@ -50,10 +50,10 @@ def cases(sizes: Sequence[int] = SIZES) -> Mapping[Key, Case]:
         team = crowd(size)
         mobile = tuple(n for n, r in team.robots.items() if r.odometry.moves)
         every[size, "alone", "", 0.0] = Case(
-            chosen(team, Choice(collaboration="none")), mobile, DURATION_S
+            with_overrides(team, Overrides(collaboration="none")), mobile, DURATION_S
         )
         for (direction, fusion), offset in itertools.product(WAYS, OFFSETS_M):
-            helping = chosen(team, Choice(direction=direction, fusion=fusion))
+            helping = with_overrides(team, Overrides(direction=direction, fusion=fusion))
             truth = displaced(helping, offset)
             every[size, direction, fusion, offset] = Case(helping, mobile, DURATION_S, 0, truth)
         if size == 2:
@@ -66,7 +66,7 @@ def _deaf(pair: Team, mobile: tuple[str, ...]) -> dict[Key, Case]:
     (navigator,), (observer,) = mobile, (n for n in pair.robots if n not in mobile)
     every: dict[Key, Case] = {}
     for fusion, offset in itertools.product(("split-ci", "naive"), OFFSETS_M):
-        team = chosen(pair, Choice(direction="both-ways", fusion=fusion))
+        team = with_overrides(pair, Overrides(direction="both-ways", fusion=fusion))
         team = with_keys(team, navigator, sensor={"sees_robots": False})
         team = with_keys(team, observer, collaboration={"passive": False})
         truth = displaced(team, offset)

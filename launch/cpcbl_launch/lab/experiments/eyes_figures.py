@@ -15,7 +15,7 @@ from typing import Literal, NamedTuple
 
 import msgspec
 
-from cpcbl_launch.team_file import builtin, load_team
+from cpcbl_launch.team_file import builtin_path, load_team
 from cpcbl_team.config import Team
 
 Kind = Literal["landmark", "marker", "mast"]
@@ -134,7 +134,7 @@ class Eyes(msgspec.Struct, frozen=True, kw_only=True):
 @lru_cache(maxsize=1)
 def team() -> Team:
     """The team of the demonstration with cameras."""
-    return load_team(builtin("eyes"))
+    return load_team(builtin_path("eyes"))
 
 
 def outcome(count: int, seed: int, batches: Sequence[Batch]) -> Eyes:

@@ -23,7 +23,7 @@ from cpcbl_launch.lab.experiments.results import (
 )
 from cpcbl_launch.lab.experiments.runs import Case
 from cpcbl_launch.reporting.tables import number, percent, table
-from cpcbl_launch.simulation.in_process import Choice, chosen
+from cpcbl_launch.simulation.in_process import Overrides, with_overrides
 
 CONFIGURATIONS = {
     "A": "odometry",
@@ -46,7 +46,7 @@ def team_case(configuration: str, variant: str = "circular") -> Case:
     team = circuit(["navigator", "observer"] if helped else ["navigator"])
     kinds = CONFIGURATIONS[configuration] if helped else "none"
     variant = "weighted" if configuration == "B" else variant
-    team = chosen(team, Choice(variant=variant, collaboration=kinds))
+    team = with_overrides(team, Overrides(variant=variant, collaboration=kinds))
     if configuration == "A":
         blind: dict[str, object] = {"sees_landmarks": False}
         team = with_keys(team, "navigator", sensor=blind, localizer=dict(ODOMETRY_ONLY))

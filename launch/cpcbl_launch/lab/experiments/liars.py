@@ -23,7 +23,7 @@ from cpcbl_launch.lab.faulty_robot import Fault, FaultyBus
 from cpcbl_launch.reporting.metrics import position_errors
 from cpcbl_launch.reporting.tables import number, table
 from cpcbl_launch.simulation.in_process import simulate
-from cpcbl_launch.team_file import builtin, load_team
+from cpcbl_launch.team_file import builtin_path, load_team
 from cpcbl_team.config import Team, TrustSettings
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus
@@ -117,7 +117,7 @@ class Liars(msgspec.Struct, frozen=True, kw_only=True):
 
 def team(case: Case) -> Team:
     """The observers at their posts and the robots that drive."""
-    base, replace = load_team(builtin("demo")), msgspec.structs.replace
+    base, replace = load_team(builtin_path("demo")), msgspec.structs.replace
     observer, scout = base.robots["observer"], base.robots["scout"]
     assert observer.start is not None
     assert scout.start is not None
@@ -190,7 +190,7 @@ def run(case: Case, seed: int) -> Run:
     if case.lie:
         fault = Fault.parse(f"{case.lie}@{FROM_S}-{UNTIL_S}")
         through = {LIAR: partial(FaultyBus, fault=fault, name=LIAR, start_ns=0)}
-    _, recorder = simulate(team(case), seed, END_S, referee=statuses, through=through)
+    _, recorder = simulate(team(case), seed, END_S, referee=statuses, bus_wrappers=through)
     truth = recorder.simulated_truth()
     errors = {
         name: position_errors(recorder.samples(name, truth[name], from_s=FROM_S))

@@ -29,7 +29,7 @@ from cpcbl_launch.reporting.tables import number, table
 from cpcbl_launch.run.processes import process_table
 from cpcbl_launch.run.supervisor import Supervisor
 from cpcbl_launch.run.up import free_endpoint
-from cpcbl_launch.run.usage import MIB, usage
+from cpcbl_launch.run.usage import MIB, process_usage
 from cpcbl_launch.team_file import save_resolved
 from cpcbl_team.config import CollaborationSettings
 from cpcbl_team.errors import InputError
@@ -256,11 +256,14 @@ def _load(
 ) -> Load:
     """What happens from now on for so long. Raises OSError when a process has died."""
     every = {**pids, "router": os.getpid()}
-    before, (heard, status) = {n: usage(pid) for n, pid in every.items()}, ear.taken()
+    before, (heard, status) = {n: process_usage(pid) for n, pid in every.items()}, ear.taken()
     from_s = time.monotonic()
     time.sleep(seconds)
     took_s = time.monotonic() - from_s
-    after, (heard_then, status_then) = {n: usage(pid) for n, pid in every.items()}, ear.taken()
+    after, (heard_then, status_then) = (
+        {n: process_usage(pid) for n, pid in every.items()},
+        ear.taken(),
+    )
     cpu = {n: (after[n].cpu_s - before[n].cpu_s) / took_s for n in every}
     kept = [(heard_then[n] - heard[n]) / (took_s * rate_hz) for n in names]
     in_time = heard_then["odometry"] - heard["odometry"]

@@ -19,8 +19,8 @@ from cpcbl_launch.reporting.metrics import (
     Floats,
     Samples,
     heading_errors,
+    interpolated_truth,
     position_nees,
-    truth_at,
 )
 from cpcbl_launch.reporting.recorder import Recorder
 from cpcbl_launch.simulation.in_process import simulate
@@ -122,8 +122,8 @@ def _figures(case: Case, recorder: Recorder, referee: LoopReferee, restarts: int
     samples = {name: recorder.samples(name, truth[name]) for name in case.scored}
     reached_s = np.array(referee.reached_s)
     driver_s, driven = recorder.timed_samples(driver, truth[driver])
-    reckoned, _ = truth_at(reached_s, np.array(referee.reckoned))
-    true, _ = truth_at(reached_s, truth[driver])
+    reckoned, _ = interpolated_truth(reached_s, np.array(referee.reckoned))
+    true, _ = interpolated_truth(reached_s, truth[driver])
     sent = [s.bytes_sent / (s.stamp_ns * 1e-9) for s in recorder.status.values()]
     return Run(
         finished=referee.through or (not case.loops and not referee.bumped),

@@ -12,7 +12,7 @@ from cpcbl_transport.security import Identity, credentials_in
 from cpcbl_transport.topics import Role
 
 
-def deployed(team: Team, file: Path, folder: Path, image: str | None, seed: int) -> str:
+def deployment_text(team: Team, file: Path, folder: Path, image: str | None, seed: int) -> str:
     """The compose file of the team in `file`, to lie in `folder`.
 
     `file` is mounted into the containers unless it is a built-in team's name. Without `image` the
@@ -40,13 +40,13 @@ def deployed(team: Team, file: Path, folder: Path, image: str | None, seed: int)
             None if top is None else _from(folder, top),
             mounts=mounts,
             keys=keys,
-            user=owner(team, Identity(Role.ROUTER)),
+            user=key_owner(team, Identity(Role.ROUTER)),
             seed=seed,
         ),
     )
 
 
-def owner(team: Team, identity: Identity) -> str:
+def key_owner(team: Team, identity: Identity) -> str:
     """uid:gid of who alone can read somebody's keys of a secured team; empty for another team.
 
     Raises SecurityError without the keys.

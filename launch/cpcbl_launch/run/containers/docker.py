@@ -19,14 +19,14 @@ from cpcbl_team.errors import CpcblError
 ON_DEBIAN = "docker/dockerd.sh start installs and starts what is missing on Debian"
 POLL_S = 0.05
 
-Said = Callable[[str], None]
+PrintLine = Callable[[str], None]
 
 
 class DockerError(CpcblError):
     """Docker cannot do it; the text says why in one line, and what to do."""
 
 
-class Ended(NamedTuple):
+class CommandResult(NamedTuple):
     """A command that has ended."""
 
     code: int
@@ -45,27 +45,27 @@ class Ended(NamedTuple):
         return found[0].strip() if found else self.last_line
 
 
-def never() -> bool:
+def never_stop() -> bool:
     return False
 
 
-def unheard(line: str) -> None:
+def ignore_line(line: str) -> None:
     """For those who do not want to hear what a command says."""
 
 
-def ran(
+def run_command(
     command: Sequence[str],
-    stop: Callable[[], bool] = never,
-    said: Said = unheard,
+    stop: Callable[[], bool] = never_stop,
+    said: PrintLine = ignore_line,
     timeout_s: float = 60.0,
-) -> Ended:
+) -> CommandResult:
     """Runs a command to its end, and tells each line as it comes.
 
     Raises DockerError when there is no such program, it takes too long, or `stop()`.
     """
     until_s, heard, told = time.monotonic() + timeout_s, b"", 0
     with tempfile.TemporaryFile() as output:
-        process = _started(command, output.fileno())
+        process = _start(command, output.fileno())
         try:
             running = True
             while running:
@@ -76,23 +76,23 @@ def ran(
                     told += len(line) + 1
                     said(line.decode(errors="replace").rstrip())
                 if running:
-                    _check(command, stop, until_s)
+                    _check_limits(command, stop, until_s)
                     time.sleep(POLL_S)
         finally:
             if process.poll() is None:
                 process.terminate()
                 process.wait()
-    return Ended(process.returncode, heard.decode(errors="replace"))
+    return CommandResult(process.returncode, heard.decode(errors="replace"))
 
 
-def done(
+def command_output(
     command: Sequence[str],
-    stop: Callable[[], bool] = never,
-    said: Said = unheard,
+    stop: Callable[[], bool] = never_stop,
+    said: PrintLine = ignore_line,
     timeout_s: float = 60.0,
 ) -> str:
     """What a command says. Raises DockerError also when it fails."""
-    ended = ran(command, stop, said, timeout_s)
+    ended = run_command(command, stop, said, timeout_s)
     if ended.code:
         raise DockerError(f"{shlex.join(command[:4])} ...: {ended.problem}")
     return ended.output
@@ -100,7 +100,7 @@ def done(
 
 def check_daemon() -> None:
     """Raises DockerError unless a daemon answers that runs on this machine's kernel."""
-    answer = ran(["docker", "info", "--format", "{{.KernelVersion}}"], timeout_s=20.0)
+    answer = run_command(["docker", "info", "--format", "{{.KernelVersion}}"], timeout_s=20.0)
     if answer.code:
         raise DockerError(f"no Docker daemon answers ({answer.last_line}); start it: {ON_DEBIAN}")
     kernel, own = answer.last_line, platform.release()
@@ -115,7 +115,7 @@ def compose_program() -> tuple[str, ...]:
     """`docker compose` where there is one, else docker-compose. Raises DockerError."""
     for program in (("docker", "compose"), ("docker-compose",)):
         try:
-            if ran([*program, "version"]).code == 0:
+            if run_command([*program, "version"]).code == 0:
                 return program
         except DockerError:
             continue
@@ -125,7 +125,7 @@ def compose_program() -> tuple[str, ...]:
     )
 
 
-def _started(command: Sequence[str], output: int) -> "subprocess.Popen[bytes]":
+def _start(command: Sequence[str], output: int) -> "subprocess.Popen[bytes]":
     try:
         return subprocess.Popen(
             command,
@@ -141,7 +141,7 @@ def _started(command: Sequence[str], output: int) -> "subprocess.Popen[bytes]":
         ) from None
 
 
-def _check(command: Sequence[str], stop: Callable[[], bool], until_s: float) -> None:
+def _check_limits(command: Sequence[str], stop: Callable[[], bool], until_s: float) -> None:
     if stop():
         raise DockerError(f"stopped during {shlex.join(command[:4])} ...")
     if time.monotonic() > until_s:

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from cpcbl_launch.run.containers.docker import DockerError, done, ran
+from cpcbl_launch.run.containers.docker import DockerError, command_output, run_command
 
 log = logging.getLogger(__name__)
 
@@ -32,7 +32,7 @@ class Container(NamedTuple):
     """By Docker itself, since it was last started by hand."""
 
 
-def parsed(inspected: Sequence[Mapping[str, Any]]) -> dict[str, Container]:
+def containers_by_service(inspected: Sequence[Mapping[str, Any]]) -> dict[str, Container]:
     """Service -> container, of what `docker inspect` says."""
     found = {}
     for c in inspected:
@@ -66,37 +66,43 @@ class Project:
     def up(self, *services: str) -> None:
         """Creates and starts what does not run. Raises DockerError."""
         command = [*self._compose, "up", "--detach", "--no-build", "--no-recreate", *services]
-        done(command, timeout_s=LONGEST_START_S)
+        command_output(command, timeout_s=LONGEST_START_S)
 
     def down(self) -> None:
         """Stops and removes all containers and networks; what is left over is said."""
         command = [*self._compose, "down", "--timeout", "3", "--volumes", "--remove-orphans"]
         try:
-            done(command, timeout_s=LONGEST_START_S)
+            command_output(command, timeout_s=LONGEST_START_S)
         except DockerError as error:
             log.error("containers of project %s may be left: %s", self.name, error)
 
     def containers(self) -> dict[str, Container]:
         """Service -> container, those that stand still too. Raises DockerError."""
         label = f"label={PROJECT_LABEL}={self.name}"
-        ids = done(["docker", "ps", "--all", "--quiet", "--no-trunc", "--filter", label]).split()
+        ids = command_output(
+            ["docker", "ps", "--all", "--quiet", "--no-trunc", "--filter", label]
+        ).split()
         if not ids:
             return {}
-        return parsed(json.loads(done(["docker", "inspect", *ids])))
+        return containers_by_service(json.loads(command_output(["docker", "inspect", *ids])))
 
-    def last_words(self, service: str) -> str:
+    def last_log_line(self, service: str) -> str:
         """The last line that a container wrote."""
         container = self.containers().get(service)
-        return "nothing" if container is None else ran(["docker", "logs", container.id]).last_line
+        return (
+            "nothing"
+            if container is None
+            else run_command(["docker", "logs", container.id]).last_line
+        )
 
     def save_logs(self, folder: Path) -> None:
         """What every container said, as SERVICE.log."""
         for service, container in self.containers().items():
-            said = ran(["docker", "logs", container.id])
+            said = run_command(["docker", "logs", container.id])
             (folder / f"{service}.log").write_text(said.output, encoding="utf-8")
 
 
-class Fleet:
+class ContainerSupervisor:
     """The containers of a project. Docker starts again what crashes; what was killed or removed by
     hand it leaves, so that is done here.
     """

@@ -9,9 +9,9 @@ from contextlib import suppress
 from pathlib import Path
 
 from cpcbl_launch.run.containers.compose import Mount
-from cpcbl_launch.run.containers.deployment import owner
-from cpcbl_launch.run.containers.docker import check_daemon, ran
-from cpcbl_launch.run.containers.launch import INSIDE, KEYS_INSIDE, inside
+from cpcbl_launch.run.containers.deployment import key_owner
+from cpcbl_launch.run.containers.docker import check_daemon, run_command
+from cpcbl_launch.run.containers.launch import INSIDE, KEYS_INSIDE, team_in_containers
 from cpcbl_launch.team_file import save_resolved
 from cpcbl_team.config import Team
 from cpcbl_transport.security import Identity, credentials_in
@@ -21,7 +21,7 @@ SENSOR_INSIDE = "/team/sensor.toml"
 POLL_S = 0.1
 
 
-def observe(
+def run_observer_container(
     name: str,
     team: Team,
     arguments: Sequence[str],
@@ -38,28 +38,28 @@ def observe(
     check_daemon()
     with tempfile.TemporaryDirectory(prefix="cpcbl-") as folder:
         team_file = Path(folder) / "team.json"
-        save_resolved(inside(team), team_file)
+        save_resolved(team_in_containers(team), team_file)
         team_file.chmod(0o644)
         mounts = [Mount(str(team_file), INSIDE), *mounts_of_keys(name, team)]
         if sensor_file is not None:
             mounts.append(Mount(str(sensor_file.resolve()), SENSOR_INSIDE))
         container = f"cpcbl-{name}-{secrets.token_hex(3)}"
         inner = ["observer", name, "--team", INSIDE, *arguments]
-        user = owner(team, Identity(Role.OBSERVER, name))
+        user = key_owner(team, Identity(Role.OBSERVER, name))
         command = docker_run(container, image, mounts, user, inner)
         process = subprocess.Popen(command, stdin=subprocess.DEVNULL, start_new_session=True)
         try:
             while process.poll() is None and not stop():
                 time.sleep(POLL_S)
         finally:
-            _ended(process, container)
+            _stop_container(process, container)
         return process.returncode
 
 
-def _ended(process: "subprocess.Popen[bytes]", container: str) -> None:
+def _stop_container(process: "subprocess.Popen[bytes]", container: str) -> None:
     """Stops the container until it ends: what is not there yet cannot be stopped."""
     while process.poll() is None:
-        ran(["docker", "stop", "--time", "3", container])
+        run_command(["docker", "stop", "--time", "3", container])
         with suppress(subprocess.TimeoutExpired):
             process.wait(POLL_S)
 

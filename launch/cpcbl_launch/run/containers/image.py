@@ -7,7 +7,7 @@ from importlib import metadata
 from pathlib import Path
 
 from cpcbl_launch.run.containers import BASE_VARIABLE
-from cpcbl_launch.run.containers.docker import DockerError, Said, done, ran
+from cpcbl_launch.run.containers.docker import DockerError, PrintLine, command_output, run_command
 
 NAME = "cpcbl-team"
 DOCKERFILE = Path("docker/Dockerfile")
@@ -42,7 +42,7 @@ def tag(top: Path, base: str, extras: str = "") -> str:
     return f"{NAME}:{version()}-{content.hexdigest()[:12]}"
 
 
-def image_for(base: str, stop: Callable[[], bool], said: Said, extras: str = "") -> str:
+def ensure_image(base: str, stop: Callable[[], bool], said: PrintLine, extras: str = "") -> str:
     """The name of an image of this very program with these extras, built where there is none yet.
 
     Raises DockerError.
@@ -54,8 +54,8 @@ def image_for(base: str, stop: Callable[[], bool], said: Said, extras: str = "")
             " one that you have: --image NAME"
         )
     name = tag(top, base, extras)
-    if not there(name):
-        have(base, stop, said, WITHOUT_REGISTRY)
+    if not has_image(name):
+        fetch_image(base, stop, said, WITHOUT_REGISTRY)
         said(f"building image {name} on {base}, once for these sources")
         command = [
             "docker",
@@ -71,30 +71,30 @@ def image_for(base: str, stop: Callable[[], bool], said: Said, extras: str = "")
         command += ["--file", str(top / DOCKERFILE), str(top)]
 
         def told(line: str) -> None:
-            step = progress_of(line)
+            step = build_step(line)
             if step is not None:
                 said(step)
 
-        done(command, stop, told, BUILD_TIMEOUT_S)
+        command_output(command, stop, told, BUILD_TIMEOUT_S)
     return name
 
 
-def there(image: str) -> bool:
+def has_image(image: str) -> bool:
     """Whether the daemon has an image."""
-    return ran(["docker", "image", "inspect", "--format", "{{.Id}}", image]).code == 0
+    return run_command(["docker", "image", "inspect", "--format", "{{.Id}}", image]).code == 0
 
 
-def have(image: str, stop: Callable[[], bool], said: Said, otherwise: str) -> None:
+def fetch_image(image: str, stop: Callable[[], bool], said: PrintLine, otherwise: str) -> None:
     """Fetches an image that is not there. Raises DockerError, with what to do `otherwise`."""
-    if there(image):
+    if has_image(image):
         return
     said(f"fetching image {image}")
-    fetched = ran(["docker", "pull", "--quiet", image], stop, timeout_s=BUILD_TIMEOUT_S)
+    fetched = run_command(["docker", "pull", "--quiet", image], stop, timeout_s=BUILD_TIMEOUT_S)
     if fetched.code:
         raise DockerError(f"no image {image} ({fetched.problem}); {otherwise}")
 
 
-def progress_of(line: str) -> str | None:
+def build_step(line: str) -> str | None:
     """Of all that a builder says (the classic one, or BuildKit) the lines that begin a step."""
     step = re.match(r"(?:Step (\d+/\d+) :|#\d+ \[.*?(\d+/\d+)\]) (.+)", line)
     return f"  {step[1] or step[2]} {step[3]}"[:78] if step else None

@@ -12,13 +12,13 @@ from rich.console import Console
 
 from cpcbl_agents.clock import Clock
 from cpcbl_launch.run.containers.compose import Deployment, Mount, compose_text, extras_of
-from cpcbl_launch.run.containers.deployment import owner
-from cpcbl_launch.run.containers.docker import DockerError, Said, check_daemon, compose_program
-from cpcbl_launch.run.containers.fleet import Fleet, Project
-from cpcbl_launch.run.containers.image import have, image_for
+from cpcbl_launch.run.containers.deployment import key_owner
+from cpcbl_launch.run.containers.docker import DockerError, PrintLine, check_daemon, compose_program
+from cpcbl_launch.run.containers.fleet import ContainerSupervisor, Project
+from cpcbl_launch.run.containers.image import ensure_image, fetch_image
 from cpcbl_launch.run.processes import tasks
 from cpcbl_launch.run.supervisor import Processes
-from cpcbl_launch.run.up import Run, check_keys, dialled
+from cpcbl_launch.run.up import Run, local_endpoint, require_keys
 from cpcbl_launch.team_file import save_resolved
 from cpcbl_team.config import Team
 from cpcbl_team.errors import InputError
@@ -47,17 +47,17 @@ class InContainers:
         stop: Callable[[], bool],
         image: str | None,
         base: str,
-        said: Said,
+        said: PrintLine,
     ) -> None:
         """`image`: the one to use; None: of these sources, on `base`. Raises DockerError."""
         self._here = run.team.robots if run.here is None else run.here
-        check_keys(run.team, run.team.transport.listen, self._here)
+        require_keys(run.team, run.team.transport.listen, self._here)
         check_daemon()
         program = compose_program()
         self._run, self._folder, self._stop, self._said = run, folder, stop, said
         if image is not None:
-            have(image, stop, said, "leave --image out to build one of these sources")
-        self._image = image or image_for(base, stop, said, extras_of(run.team))
+            fetch_image(image, stop, said, "leave --image out to build one of these sources")
+        self._image = image or ensure_image(base, stop, said, extras_of(run.team))
         self.lead_s = LEAD_S + LEAD_S_A_CONTAINER * len(self._here)
         self._file = folder / "compose.yaml"
         name = f"{_project_name(run.team)}-{secrets.token_hex(3)}"
@@ -67,24 +67,24 @@ class InContainers:
     def router(self) -> Iterator[Bus]:
         """Takes everything down at the end, however it ends."""
         team_file = self._folder / "team.json"
-        save_resolved(inside(self._run.team), team_file)
+        save_resolved(team_in_containers(self._run.team), team_file)
         team_file.chmod(0o644)
         self._write("")
         self._said(f"starting {len(self._here)} robots in containers: project {self._project.name}")
         team = self._run.team
-        here = [dialled(team.transport.listen[0])]
+        here = [local_endpoint(team.transport.listen[0])]
         link = link_of(team, Identity(Role.OPERATOR), here)
         try:
             began_s = time.monotonic()
             self._project.up("router")
-            with self._joined(link) as bus:
+            with self._open_session(link) as bus:
                 routers = ROUTERS + ROUTERS_A_CONTAINER * len(self._here)
                 self.lead_s = max(self.lead_s, routers * (time.monotonic() - began_s))
                 yield bus
         finally:
             self._end()
 
-    def _joined(self, link: Link) -> ZenohBus:
+    def _open_session(self, link: Link) -> ZenohBus:
         until_s = time.monotonic() + ROUTER_WITHIN_S
 
         def give_up() -> bool:
@@ -93,7 +93,7 @@ class InContainers:
         try:
             return open_bus(self._run.team.name, link.endpoints, give_up, link.credentials)
         except BusError as error:
-            said = self._project.last_words("router")
+            said = self._project.last_log_line("router")
             raise DockerError(f"{error}; the router's container said: {said}") from error
 
     @contextmanager
@@ -101,7 +101,7 @@ class InContainers:
         self._write(str(clock))
         self._project.up()
         rows = tasks(self._run.team, (), self._run.seed, self._here)
-        yield Fleet(self._project, ["router", *(row.name for row in rows)])
+        yield ContainerSupervisor(self._project, ["router", *(row.name for row in rows)])
 
     def _end(self) -> None:
         try:  # also when nobody reads any more what is said
@@ -116,10 +116,10 @@ class InContainers:
         how = Deployment(
             INSIDE,
             self._image,
-            published=tuple(published(endpoint) for endpoint in endpoints),
+            published=tuple(published_port(endpoint) for endpoint in endpoints),
             mounts=(Mount(str((self._folder / "team.json").resolve()), INSIDE), *_data(run.team)),
             keys=_keys(run.team),
-            user=owner(run.team, Identity(Role.ROUTER)),
+            user=key_owner(run.team, Identity(Role.ROUTER)),
             seed=run.seed,
             speed=run.speed,
             clock=clock,
@@ -128,14 +128,14 @@ class InContainers:
         self._file.write_text(compose_text(run.team, how), encoding="utf-8")
 
 
-def progress_on(console: Console) -> Said:
+def line_printer(console: Console) -> PrintLine:
     """Says what is being done, for people."""
     return lambda line: console.print(
         line, style="dim", markup=False, highlight=False, soft_wrap=True
     )
 
 
-def inside(team: Team) -> Team:
+def team_in_containers(team: Team) -> Team:
     """The team as containers see it: a log's folder and keys are where they are mounted."""
     if _replays(team):
         team = msgspec.structs.replace(team, data=DATA_INSIDE)
@@ -145,7 +145,7 @@ def inside(team: Team) -> Team:
     return team
 
 
-def published(endpoint: str) -> str:
+def published_port(endpoint: str) -> str:
     """[address:]port of this machine for an endpoint; all addresses for 0.0.0.0 and [::].
 
     Raises InputError for a name, at which Docker cannot publish.

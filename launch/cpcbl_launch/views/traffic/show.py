@@ -6,20 +6,20 @@ from rich.console import Console, Group
 from rich.table import Table
 from rich.text import Text
 
-from cpcbl_launch.reporting.flows import FlowReport, SpendingReport, all_held
+from cpcbl_launch.reporting.flows import FlowReport, SpendingReport, are_limits_kept
 from cpcbl_launch.reporting.live import LiveView
 from cpcbl_launch.reporting.recorder import Report, RobotReport
 from cpcbl_launch.reporting.tables import number, short, table
-from cpcbl_launch.reporting.trust_report import distrusted
-from cpcbl_launch.views.traffic.watch import AT_PRESENT_NS, RATES_NS, Help, RobotNow, Traffic
+from cpcbl_launch.reporting.trust_report import distrust_text
+from cpcbl_launch.views.traffic.watch import CURRENT_HELP_NS, RATES_NS, HelpLink, LiveRobot, Traffic
 
 COLOURS = {"fix": "cyan", "belief": "magenta"}
 NOT_SENT = ("budget", "value", "silence")
-EXPLAINED = (
+COLUMNS_EXPLAINED = (
     "not sent: over the budget; of too little value; in silence, as listeners can\n"
     "still tell. B: on the sender's link with Zenoh's own, without TCP/IP's"
 )
-_LIVE = (
+_LIVE_EXPLAINED = (
     "alive: presence and tier, anew at each change of tier; its bytes are not counted\n"
     f"counts: since a robot's process started; rates: over the last {RATES_NS // 10**9} s\n"
     "heard is status/* only: watching makes nobody send a fix or belief"
@@ -29,7 +29,7 @@ _LIVE = (
 # The report of a run ----------------------------------------------------------------------------
 
 
-def spent_table(report: Report) -> Table:
+def help_traffic_table(report: Report) -> Table:
     """What each robot sent, what it did not send and why, and how near it came to its limits."""
     limited = any(r.spending for r in report.robots.values())
     shown = table(
@@ -41,22 +41,22 @@ def spent_table(report: Report) -> Table:
         shown.add_column("most", no_wrap=True)
     robots = list(report.robots.values())
     for name, robot in report.robots.items():
-        _add_spent(shown, name, robot, report.duration_s)
+        _add_traffic_row(shown, name, robot, report.duration_s)
     shown.add_section()
-    shown.add_row("team", *_spent(robots, report.duration_s), style="bold")
+    shown.add_row("team", *_traffic_cells(robots, report.duration_s), style="bold")
     if report.guests:
         shown.add_section()
     for name, guest in report.guests.items():
-        _add_spent(shown, f"{name}, guest", guest, report.duration_s)
+        _add_traffic_row(shown, f"{name}, guest", guest, report.duration_s)
     return shown
 
 
-def _add_spent(shown: Table, name: str, robot: RobotReport, duration_s: float) -> None:
+def _add_traffic_row(shown: Table, name: str, robot: RobotReport, duration_s: float) -> None:
     limits = [Text("\n").join(map(limit_text, robot.spending))] if robot.spending else []
-    shown.add_row(name, *_spent([robot], duration_s), *limits)
+    shown.add_row(name, *_traffic_cells([robot], duration_s), *limits)
 
 
-def _spent(robots: Sequence[RobotReport], duration_s: float) -> list[str]:
+def _traffic_cells(robots: Sequence[RobotReport], duration_s: float) -> list[str]:
     flows = [flow for robot in robots for flow in robot.sent]
     per_s = sum(f.bytes for f in flows) / duration_s if duration_s else None
     return [
@@ -77,18 +77,18 @@ def limit_text(s: SpendingReport) -> Text:
     unit = "B" if s.unit == "bytes" else "msg"
     within = f" in {s.window_s:.3g} s" if s.window_s else " so far"
     most, allowed = (f"{n:.1f}".removesuffix(".0") for n in (s.most, s.allowed))
-    return Text(f"{most} of {allowed} {unit}{within}", "green" if s.held else "bold red")
+    return Text(f"{most} of {allowed} {unit}{within}", "green" if s.is_kept else "bold red")
 
 
-def verdict(report: Report) -> Text | None:
+def limits_text(report: Report) -> Text | None:
     """In words, whether every limit held; None without any."""
     spendings = [(name, s) for name, r in report.robots.items() for s in r.spending]
-    held = all_held(s for _, s in spendings)
+    held = are_limits_kept(s for _, s in spendings)
     if held is None:
         return None
     if held:
         return Text("every limit held: nobody spent more than is allowed in any window", "green")
-    broken = (f"{name}: {limit_text(s)}" for name, s in spendings if not s.held)
+    broken = (f"{name}: {limit_text(s)}" for name, s in spendings if not s.is_kept)
     return Text(f"limits did not hold: {'; '.join(broken)}", "bold red")
 
 
@@ -104,10 +104,10 @@ class TrafficView(LiveView):
 
     def show(self, now: Traffic) -> None:
         """Called several times a second."""
-        self.draw(lambda: drawn(now, self._where), bool(now.robots))
+        self.draw(lambda: traffic_view(now, self._where), bool(now.robots))
 
 
-def drawn(now: Traffic, where: str) -> Group:
+def traffic_view(now: Traffic, where: str) -> Group:
     """Who helps whom, how near each came to its limits, what it sent, and what that means."""
     title = f"team {now.team} at {where}, watched for {now.watched_s:.0f} s"
     if now.refused:
@@ -128,39 +128,39 @@ def drawn(now: Traffic, where: str) -> Group:
         *limits,
         "",
         flow_table(now),
-        Text(f"{EXPLAINED}\n{_LIVE}\n", "yellow"),
+        Text(f"{COLUMNS_EXPLAINED}\n{_LIVE_EXPLAINED}\n", "yellow"),
     )
 
 
 def help_table(now: Traffic) -> Table:
     """The drawing: the best informed robot first, an arrow to each teammate that it helps."""
     shown = table("", ("robot",), ("tier", "σ m"))
-    shown.add_column(f"helps (in the last {AT_PRESENT_NS // 10**9} s)", overflow="fold")
+    shown.add_column(f"helps (in the last {CURRENT_HELP_NS // 10**9} s)", overflow="fold")
     for name, robot in now.robots.items():
         style = "dim" if robot.away else "bold red" if robot.lost else ""
         shown.add_row(
             Text(f"{name}, guest" if name in now.guests else name, style),
             Text(str(robot.tier), style),
             Text(number(robot.position_sigma_m), style),
-            _doing(robot, [h for h in now.help if h.helper == name]),
+            _activity(robot, [h for h in now.help if h.helper == name]),
         )
     for name in now.never_heard:
         shown.add_row(Text(name, "dim"), "", "", Text("not heard of", "yellow"))
     return shown
 
 
-def _doing(robot: RobotNow, given: Sequence[Help]) -> Text:
+def _activity(robot: LiveRobot, given: Sequence[HelpLink]) -> Text:
     if robot.away:
         return Text(f"away: silent for {robot.silent_s:.0f} s", "yellow")
     if robot.lost:
         return Text(f"lost: {robot.lost}", "bold red")
     lines = list(_arrows(given)) if given else [Text("nobody", "dim")]
-    if said := distrusted(robot.trust):
+    if said := distrust_text(robot.trust):
         lines.append(Text(said, "yellow"))
     return Text("\n").join(lines)
 
 
-def _arrows(given: Sequence[Help]) -> Iterator[Text]:
+def _arrows(given: Sequence[HelpLink]) -> Iterator[Text]:
     """A line for each teammate: `──▶ scout  fix 9.5/s, belief 2.0/s`."""
     width = max(len(h.helped) for h in given)
     for helped in dict.fromkeys(h.helped for h in given):

@@ -20,7 +20,7 @@ from cpcbl_launch.reporting.flows import (
     summed_flows,
     summed_spending,
 )
-from cpcbl_launch.reporting.trust_report import TrustReport, trust_of
+from cpcbl_launch.reporting.trust_report import TrustReport, trust_reports
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus
 from cpcbl_transport.decoding import read
@@ -28,13 +28,15 @@ from cpcbl_transport.messages import Flow, Status
 from cpcbl_transport.security import Link
 from cpcbl_transport.zenoh_bus import BusError, open_bus
 
-AT_PRESENT_NS = 3_000_000_000  # help is given at present whose latest message is no older
+CURRENT_HELP_NS = 3_000_000_000  # help is given at present whose latest message is no older
 RATES_NS = 5_000_000_000  # rates are over the last so many seconds of robot time
-AWAY_S = 3.0  # a robot is away that is silent for longer, and for longer than three of its pauses
+SILENT_AWAY_S = (
+    3.0  # a robot is away that is silent for longer, and for longer than three of its pauses
+)
 REFRESH_S = 0.25
 
 
-class FlowNow(FlowReport, frozen=True, kw_only=True):
+class LiveFlow(FlowReport, frozen=True, kw_only=True):
     """The same with its rates over the last seconds; None before a second status has come."""
 
     messages_per_s: float | None
@@ -43,7 +45,7 @@ class FlowNow(FlowReport, frozen=True, kw_only=True):
     """Whether the latest message is no older than 3 s."""
 
 
-class RobotNow(msgspec.Struct, frozen=True, kw_only=True):
+class LiveRobot(msgspec.Struct, frozen=True, kw_only=True):
     """One robot by its latest status; counts are since its process started."""
 
     tier: int
@@ -54,14 +56,14 @@ class RobotNow(msgspec.Struct, frozen=True, kw_only=True):
     away: bool
     announced: int
     """Tokens on `alive/*`: one at first, one a change of tier."""
-    sent: tuple[FlowNow, ...]
-    heard: tuple[FlowNow, ...]
+    sent: tuple[LiveFlow, ...]
+    heard: tuple[LiveFlow, ...]
     spending: tuple[SpendingReport, ...]
     trust: tuple[TrustReport, ...] = ()
     """What it makes of teammates."""
 
 
-class Help(msgspec.Struct, frozen=True, kw_only=True):
+class HelpLink(msgspec.Struct, frozen=True, kw_only=True):
     """Who helps whom at present."""
 
     helper: str
@@ -77,10 +79,10 @@ class Traffic(msgspec.Struct, frozen=True, kw_only=True):
     team: str
     watched_s: float
     """Real time."""
-    robots: dict[str, RobotNow]
+    robots: dict[str, LiveRobot]
     never_heard: tuple[str, ...]
     """Robots of the team file that have said nothing."""
-    help: tuple[Help, ...]
+    help: tuple[HelpLink, ...]
     guests: tuple[str, ...] = ()
     """Robots that the team file, where there is one, does not name."""
     refused: dict[str, int] = {}
@@ -94,7 +96,7 @@ class Arrival(NamedTuple):
     status: Status
 
 
-def traffic(
+def traffic_from_statuses(
     team: str,
     known: Collection[str],
     arrivals: Mapping[str, Sequence[Arrival]],
@@ -103,55 +105,55 @@ def traffic(
     refused: Mapping[str, int] = MappingProxyType({}),
 ) -> Traffic:
     """What the latest statuses of each robot's present process come to."""
-    now = {name: _robot(seen, now_s) for name, seen in arrivals.items()}
+    now = {name: _live_robot(seen, now_s) for name, seen in arrivals.items()}
     robots = dict(sorted(now.items(), key=lambda item: (item[1].tier, item[0])))
     return Traffic(
         team=team,
         watched_s=now_s - began_s,
         robots=robots,
         never_heard=tuple(name for name in known if name not in robots),
-        help=tuple(_help(robots)),
+        help=tuple(_help_links(robots)),
         guests=tuple(name for name in robots if known and name not in known),
         refused=dict(sorted(refused.items())),
     )
 
 
-def _robot(seen: Sequence[Arrival], now_s: float) -> RobotNow:
+def _live_robot(seen: Sequence[Arrival], now_s: float) -> LiveRobot:
     first, last = seen[0].status, seen[-1].status
     pause_s = seen[-1].at_s - seen[-2].at_s if len(seen) > 1 else 0.0
     silent_s = now_s - seen[-1].at_s
-    return RobotNow(
+    return LiveRobot(
         tier=last.tier,
         position_sigma_m=last.position_sigma_m,
         lost=last.lost,
         silent_s=silent_s,
-        away=silent_s > max(AWAY_S, 3.0 * pause_s),
+        away=silent_s > max(SILENT_AWAY_S, 3.0 * pause_s),
         announced=last.counts.get("announced", 0),
-        sent=tuple(_flows(first, last, first.sent, last.sent)),
-        heard=tuple(_flows(first, last, first.heard, last.heard)),
+        sent=tuple(_live_flows(first, last, first.sent, last.sent)),
+        heard=tuple(_live_flows(first, last, first.heard, last.heard)),
         spending=summed_spending([last.spending]),
-        trust=trust_of([last]),
+        trust=trust_reports([last]),
     )
 
 
-def _flows(
+def _live_flows(
     first: Status, last: Status, before: Sequence[Flow], after: Sequence[Flow]
-) -> Iterator[FlowNow]:
+) -> Iterator[LiveFlow]:
     """The flows of a status, with rates since the first one."""
     elapsed_s = (last.stamp_ns - first.stamp_ns) * 1e-9
     for flow in after:
         key = flow.topic, flow.peer
         old = next((f for f in before if (f.topic, f.peer) == key), Flow(*key))
         (report,) = summed_flows([[flow]])
-        yield FlowNow(
+        yield LiveFlow(
             **msgspec.structs.asdict(report),
             messages_per_s=(flow.messages - old.messages) / elapsed_s if elapsed_s else None,
             bytes_per_s=(flow.bytes - old.bytes) / elapsed_s if elapsed_s else None,
-            at_present=bool(flow.messages) and last.stamp_ns - flow.latest_ns <= AT_PRESENT_NS,
+            at_present=bool(flow.messages) and last.stamp_ns - flow.latest_ns <= CURRENT_HELP_NS,
         )
 
 
-def _help(robots: Mapping[str, RobotNow]) -> Iterator[Help]:
+def _help_links(robots: Mapping[str, LiveRobot]) -> Iterator[HelpLink]:
     """Fixes as their senders count them; beliefs, which any may read, as each reader does."""
     present = {name: robot for name, robot in robots.items() if not robot.away}
     for (helper, giver), (helped, taker) in itertools.permutations(present.items(), 2):
@@ -159,26 +161,26 @@ def _help(robots: Mapping[str, RobotNow]) -> Iterator[Help]:
             for flow in flows:
                 if flow.at_present and (flow.topic, flow.peer) == (topic, peer):
                     rate = flow.messages_per_s
-                    yield Help(helper=helper, helped=helped, topic=topic, messages_per_s=rate)
+                    yield HelpLink(helper=helper, helped=helped, topic=topic, messages_per_s=rate)
 
 
-class Watcher:
+class StatusCollector:
     """Keeps what came in the last seconds on `status/*`."""
 
     def __init__(self, bus: Bus, now_s: Callable[[], float] = time.monotonic) -> None:
         self._now_s, self._lock = now_s, threading.Lock()
         self._arrivals: dict[str, list[Arrival]] = {}
         self._refused: Counter[str] = Counter()
-        bus.subscribe(topics.STATUS.at(), self._arrived)
+        bus.subscribe(topics.STATUS.at(), self._receive)
 
-    def _arrived(self, key: str, payload: bytes) -> None:
+    def _receive(self, key: str, payload: bytes) -> None:
         status = read(key, payload)
         with self._lock:
             if not isinstance(status, Status):
                 self._refused[str(status)] += 1
                 return
             seen = self._arrivals.get(status.robot, [])
-            kept = [a for a in seen if _goes_on(a.status, status)]
+            kept = [a for a in seen if _is_same_process(a.status, status)]
             self._arrivals[status.robot] = [*kept, Arrival(self._now_s(), status)]
 
     @property
@@ -193,7 +195,7 @@ class Watcher:
             return dict(self._arrivals)
 
 
-def _goes_on(before: Status, now: Status) -> bool:
+def _is_same_process(before: Status, now: Status) -> bool:
     """Whether a status is of the same process, earlier, and not too old for its rates."""
     same = before.incarnation == now.incarnation
     return same and 0 < now.stamp_ns - before.stamp_ns <= RATES_NS
@@ -205,7 +207,7 @@ class View(Protocol):
     def show(self, now: Traffic) -> None: ...
 
 
-class Watch(NamedTuple):
+class WatchRequest(NamedTuple):
     """Which team is watched, and how long."""
 
     team: str
@@ -217,7 +219,7 @@ class Watch(NamedTuple):
     """For the router."""
 
 
-def watch_team(watch: Watch, view: View, stop: Callable[[], bool]) -> Traffic:
+def watch_team(watch: WatchRequest, view: View, stop: Callable[[], bool]) -> Traffic:
     """Watches until the time is over or `stop()`. Raises BusError without a router."""
     began_s = time.monotonic()
     try:
@@ -229,17 +231,17 @@ def watch_team(watch: Watch, view: View, stop: Callable[[], bool]) -> Traffic:
         )
     except BusError:
         if stop():
-            return traffic(watch.team, watch.known, {}, began_s, time.monotonic())
+            return traffic_from_statuses(watch.team, watch.known, {}, began_s, time.monotonic())
         raise BusError(
             f"no router at {', '.join(watch.link.endpoints)} within {watch.wait_s:g} s;"
             " --connect takes the endpoint that `cpcbl-team up` says"
         ) from None
     with bus:
-        watcher, began_s = Watcher(bus), time.monotonic()
+        watcher, began_s = StatusCollector(bus), time.monotonic()
         while True:
             now_s = time.monotonic()
             heard = watcher.arrivals(), began_s, now_s, watcher.refused
-            now = traffic(watch.team, watch.known, *heard)
+            now = traffic_from_statuses(watch.team, watch.known, *heard)
             view.show(now)
             if stop() or now_s - began_s >= watch.duration_s:
                 return now
