@@ -224,8 +224,8 @@ def test_without_opencv_one_line_says_what_to_install(arguments: list[str], tmp_
 def test_a_team_without_cameras_needs_no_opencv(tmp_path: Path) -> None:
     code = (
         "from cpcbl_launch.simulation.in_process import simulate\n"
-        "from cpcbl_launch.team_file import builtin, load_team\n"
-        "report, _ = simulate(load_team(builtin('demo')), 1, 2.0)\n"
+        "from cpcbl_launch.team_file import builtin_path, load_team\n"
+        "report, _ = simulate(load_team(builtin_path('demo')), 1, 2.0)\n"
         "print(len(report.robots))"
     )
     run = without_opencv(code)
