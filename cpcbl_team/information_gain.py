@@ -1,9 +1,9 @@
-"""What help is worth before it is sent: how much it would shrink a teammate's covariance.
+"""The information gain of help: by how much a message would shrink the receiver's covariance.
 
-The helper knows of its teammate no more than the tier that it announces, and what it has told it
-before. Worth is in nats: the logarithm of the factor by which the ellipse of the position shrinks,
-half that of the determinants (as in the mutual information of Gaussians), and of that by which the
-sigma of the heading does, where that is told too.
+Gains are in nats: the logarithm of the factor by which the 1 sigma ellipse of the position shrinks
+(half the logarithm of the ratio of determinants, the mutual information of Gaussians), and of the
+factor by which the sigma of the heading shrinks. A sender does not know the receiver's covariance.
+It predicts it from the tier that the receiver announces and from the last fix that it sent.
 """
 
 import math
@@ -17,33 +17,31 @@ from cpcbl_team.gaussian import Covariance2
 from cpcbl_team.inputs import Belief, Fix
 
 LOST_SIGMA_M = 2.0
-DRIFT_SHARE = 0.1  # of its way: what a teammate's position loses between two fixes
+DRIFT_SHARE = 0.1  # position sigma that a teammate gains between two fixes, per metre driven
+LOST_HEADING_SIGMA_RAD = math.pi / math.sqrt(3.0)  # of a uniform distribution
+USUAL_HEADING_SIGMA_RAD = math.radians(10.0)  # assumed: a tier describes the position only
+HEADING_DRIFT_RAD_PER_SQRT_M = 0.1  # heading sigma that a teammate gains, a random walk
 
 
-LOST_HEADING_SIGMA_RAD = math.pi / math.sqrt(3.0)  # any is as likely
-USUAL_HEADING_SIGMA_RAD = math.radians(10.0)  # no tier tells of it
-HEADING_DRIFT_RAD_PER_SQRT_M = 0.1  # what a teammate's heading loses on its way, as a random walk
-
-
-class Turned(NamedTuple):
-    """A teammate after the last heading that it was sent: where that was, how well it knew it."""
+class HeadingMemory(NamedTuple):
+    """Where a teammate was at the last heading that it was sent, and its variance (rad^2) then."""
 
     x_m: float
     y_m: float
     variance: float
 
 
-class Helped(NamedTuple):
-    """A teammate after the last fix that it was sent: where it was seen, how well it knew that."""
+class FixMemory(NamedTuple):
+    """Where a teammate was at the last fix that it was sent, and its covariance (m^2) then."""
 
     x_m: float
     y_m: float
     covariance: Covariance2
-    turned: Turned | None = None
+    heading: HeadingMemory | None = None
 
 
-def sigma_range_m(tier: int, settings: CollaborationSettings) -> tuple[float, float]:
-    """The least and the greatest position sigma that a robot of this tier may have."""
+def sigma_limits_m(tier: int, settings: CollaborationSettings) -> tuple[float, float]:
+    """The least and the greatest position sigma that a robot of this tier can have."""
     width, slack = settings.tier_width, settings.tier_hysteresis
     least = TIER_ZERO_SIGMA_M * width ** (tier - 1) / slack
     if tier == LOWEST_TIER:
@@ -51,45 +49,47 @@ def sigma_range_m(tier: int, settings: CollaborationSettings) -> tuple[float, fl
     return (0.0 if tier <= settings.best_tier else least), TIER_ZERO_SIGMA_M * width**tier * slack
 
 
-def expected(
-    tier: int, helped: Helped | None, x_m: float, y_m: float, settings: CollaborationSettings
+def predicted_teammate_covariance(
+    tier: int, last_fix: FixMemory | None, x_m: float, y_m: float, settings: CollaborationSettings
 ) -> Covariance2:
-    """What the position covariance of a teammate at (x, y) is likely to be.
+    """The predicted position covariance (m^2) of a teammate at (x, y).
 
-    Its tier bounds it; within these bounds it is what the last fix left and its way has added.
+    It is that after the last fix plus the drift since then, within the limits of its tier.
     """
-    least, most = sigma_range_m(tier, settings)
-    if helped is None:
+    least, most = sigma_limits_m(tier, settings)
+    if last_fix is None:
         variance = (most if tier == LOWEST_TIER else math.sqrt(max(least, 0.5 * most) * most)) ** 2
         return Covariance2(variance, 0.0, variance)
-    way = math.hypot(x_m - helped.x_m, y_m - helped.y_m)
-    doubt = (DRIFT_SHARE * way) ** 2
-    xx, xy, yy = helped.covariance
-    grown = _not_exact(Covariance2(xx + doubt, xy, yy + doubt))
+    distance = math.hypot(x_m - last_fix.x_m, y_m - last_fix.y_m)
+    drift = (DRIFT_SHARE * distance) ** 2
+    xx, xy, yy = last_fix.covariance
+    grown = _regularized(Covariance2(xx + drift, xy, yy + drift))
     sigma = math.sqrt(0.5 * (grown.xx + grown.yy))
     return grown.scaled((min(max(sigma, least), most) / sigma) ** 2)
 
 
-def expected_heading(tier: int, turned: Turned | None, fix: Fix) -> float:
-    """What the heading's variance (rad^2) of a teammate that is seen there is likely to be.
+def predicted_teammate_heading_variance(
+    tier: int, last_heading: HeadingMemory | None, fix: Fix
+) -> float:
+    """The predicted heading variance (rad^2) of a teammate that `fix` observes.
 
-    A lost one's is unknown. Another's is what is usual, or what the last heading that it was told
-    left and its way has added: so its heading is told while that is news. A robot that stands seems
-    to move by the sensor's noise; that is no way.
+    It is that after the last heading that it was sent plus the drift since then, at most the usual
+    one. The heading of a lost teammate is unknown. Sensor noise lets a robot that stands seem to
+    move, so two sigmas of it are subtracted from the distance.
     """
     if tier == LOWEST_TIER:
         return LOST_HEADING_SIGMA_RAD**2
     usual = USUAL_HEADING_SIGMA_RAD**2
-    if turned is None:
+    if last_heading is None:
         return usual
     xx, _, yy = fix.sensor_covariance
-    way = math.hypot(fix.x_m - turned.x_m, fix.y_m - turned.y_m)
-    way = max(0.0, way - 2.0 * math.sqrt(xx + yy))
-    return min(turned.variance + HEADING_DRIFT_RAD_PER_SQRT_M**2 * way, usual)
+    distance = math.hypot(fix.x_m - last_heading.x_m, fix.y_m - last_heading.y_m)
+    distance = max(0.0, distance - 2.0 * math.sqrt(xx + yy))
+    return min(last_heading.variance + HEADING_DRIFT_RAD_PER_SQRT_M**2 * distance, usual)
 
 
-def merged_heading(prior: float, fix: Fix, fusion: Fusion) -> float:
-    """The heading's variance after that of a fix, as the teammate merges it; see `merged`."""
+def merged_heading_variance(prior: float, fix: Fix, fusion: Fusion) -> float:
+    """The heading variance (rad^2) of a teammate after it merged `fix`; see `merged_covariance`."""
     prior += SMALLEST_VARIANCE
     fresh, dependent = fix.heading_sensor_variance, fix.heading_observer_variance
     fresh += SMALLEST_VARIANCE
@@ -102,24 +102,24 @@ def merged_heading(prior: float, fix: Fix, fusion: Fusion) -> float:
     return min(prior, best_weight(after)[1])
 
 
-def heading_worth(prior: float, after: float) -> float:
-    """Nats gained from one variance of the heading to another."""
+def heading_information_gain(prior: float, after: float) -> float:
+    """The information gain (nats) from one variance of the heading (rad^2) to another."""
     return 0.5 * math.log((prior + SMALLEST_VARIANCE) / max(after, SMALLEST_VARIANCE))
 
 
-def merged(
+def merged_covariance(
     prior: Covariance2, fresh: Covariance2, dependent: Covariance2, fusion: Fusion
 ) -> Covariance2:
-    """The covariance after evidence with a fresh and a dependent part, as the teammate merges it.
+    """The covariance of a teammate after it merged a fix with these two parts of its covariance.
 
-    By split covariance intersection all of the prior is taken as dependent: what was told once is
-    worth little the second time.
+    Split covariance intersection treats all of the prior as dependent, so the second fix of the
+    same observer gains little.
     """
-    prior, fresh = _not_exact(prior), _not_exact(fresh)
+    prior, fresh = _regularized(prior), _regularized(fresh)
     if fusion == "naive":
-        return _product(prior, fresh + dependent)
+        return _fused(prior, fresh + dependent)
     weight, _ = best_weight(lambda w: _determinant(prior, fresh, dependent, w))
-    after = _product(prior.scaled(1.0 / weight), fresh + dependent.scaled(1.0 / (1.0 - weight)))
+    after = _fused(prior.scaled(1.0 / weight), fresh + dependent.scaled(1.0 / (1.0 - weight)))
     return after if after.determinant() < prior.determinant() else prior
 
 
@@ -135,43 +135,53 @@ def _determinant(
     return (axx * ayy - axy * axy) * (bxx * byy - bxy * bxy) / both
 
 
-def worth(prior: Covariance2, after: Covariance2) -> float:
-    """Nats gained from `prior` to `after`; beyond what is called exact nothing is gained."""
+def information_gain(prior: Covariance2, after: Covariance2) -> float:
+    """The information gain (nats) from `prior` to `after`.
+
+    Nothing is gained below `SMALLEST_VARIANCE`.
+    """
     left = max(after.determinant(), SMALLEST_VARIANCE**2)
-    return 0.5 * math.log(_not_exact(prior).determinant() / left)
+    return 0.5 * math.log(_regularized(prior).determinant() / left)
 
 
-def _not_exact(c: Covariance2) -> Covariance2:
-    """What is called exact has a variance too: an inverse."""
+def _regularized(c: Covariance2) -> Covariance2:
+    """The covariance with the smallest variance added, so that it has an inverse."""
     return Covariance2(c.xx + SMALLEST_VARIANCE, c.xy, c.yy + SMALLEST_VARIANCE)
 
 
-def _product(a: Covariance2, b: Covariance2) -> Covariance2:
+def _fused(a: Covariance2, b: Covariance2) -> Covariance2:
     """(A^-1 + B^-1)^-1."""
     return (a.inverse() + b.inverse()).inverse()
 
 
-def use_of(fix: Fix, tier: int, estimate: Estimate, settings: CollaborationSettings) -> float:
-    """What the belief of a teammate of this tier is worth to the robot that sees it (nats).
+def information_gain_of_belief(
+    fix: Fix, tier: int, estimate: Estimate, settings: CollaborationSettings
+) -> float:
+    """The information gain (nats) of a teammate's belief for the robot that sees the teammate.
 
-    `fix` is where the robot sees the teammate. The sighting tells of the position and, by its
-    bearing, of the heading (of a teammate at the same place it tells nothing); what both tell is
-    counted for the one that gains more.
+    `fix` is where the robot sees the teammate, and `tier` is the teammate's. Together with its
+    belief the sighting constrains the position and, by its bearing, the heading (unless both are at
+    the same point). The larger of the two gains counts.
     """
     prior = estimate.covariance.position()
-    sensor, sigma = Covariance2(*fix.sensor_covariance), sum(sigma_range_m(tier, settings)) / 2.0
-    theirs = Covariance2(sigma * sigma, 0.0, sigma * sigma)
-    position = worth(prior, merged(prior, sensor, theirs, settings.fusion))
+    sensor, sigma = Covariance2(*fix.sensor_covariance), sum(sigma_limits_m(tier, settings)) / 2.0
+    teammate = Covariance2(sigma * sigma, 0.0, sigma * sigma)
+    position = information_gain(prior, merged_covariance(prior, sensor, teammate, settings.fusion))
     dx, dy = fix.x_m - estimate.pose.x, fix.y_m - estimate.pose.y
     direction = math.atan2(dy, dx)
-    across = _not_exact(sensor + theirs + prior).along(-math.sin(direction), math.cos(direction))
+    across = _regularized(sensor + teammate + prior).along(
+        -math.sin(direction), math.cos(direction)
+    )
     heading = 0.5 * math.log1p(estimate.covariance.hh * (dx * dx + dy * dy) / across)
     return max(position, heading)
 
 
 def staleness(copy: Belief | None, now: Belief) -> float:
-    """By how many sigma listeners err who carry `copy` along to the time of `now`: of the position,
-    or twice the logarithm of the ratio of the sigmas. Infinite without a copy."""
+    """The error, in sigmas, of receivers that extrapolate their `copy` to the time of `now`.
+
+    It is the error of the position, or twice the logarithm of the ratio of the sigmas if that is
+    larger. It is infinite without a copy.
+    """
     if copy is None:
         return math.inf
     pose = carried(copy, now.stamp_ns)
@@ -179,7 +189,7 @@ def staleness(copy: Belief | None, now: Belief) -> float:
         Covariance3(*copy.covariance).position(),
         Covariance3(*now.covariance).position(),
     )
-    before, after = _not_exact(before), _not_exact(after)
+    before, after = _regularized(before), _regularized(after)
     off = math.sqrt(after.mahalanobis_squared(now.x_m - pose.x, now.y_m - pose.y))
     ratio = 0.5 * math.log(after.determinant() / before.determinant())
     return max(off, abs(ratio))

@@ -17,16 +17,16 @@ from cpcbl_team.collaboration import LOWEST_TIER, fix_for, hears, next_tier, wit
 from cpcbl_team.config import LocalizationSettings
 from cpcbl_team.gaussian import Covariance2
 from cpcbl_team.information_gain import (
-    Helped,
-    Turned,
-    expected,
-    expected_heading,
-    heading_worth,
-    merged,
-    merged_heading,
+    FixMemory,
+    HeadingMemory,
+    heading_information_gain,
+    information_gain,
+    information_gain_of_belief,
+    merged_covariance,
+    merged_heading_variance,
+    predicted_teammate_covariance,
+    predicted_teammate_heading_variance,
     staleness,
-    use_of,
-    worth,
 )
 from cpcbl_team.inputs import Belief, Fix
 from cpcbl_transport.budget import Budget
@@ -48,7 +48,7 @@ class _Offer(NamedTuple):
 
     value: float
     urgent: bool
-    after: Helped
+    after: FixMemory
     fix: Fix
 
 
@@ -74,7 +74,7 @@ class CollaborationAgent:
         self._track_ns = -1
         self._seen: dict[str, Fix] = {}
         self._tiers: dict[str, int] = {}
-        self._helped: dict[str, tuple[int, Helped]] = {}
+        self._helped: dict[str, tuple[int, FixMemory]] = {}
         self._copy: Belief | None = None
         self._listened = False
         self.tallies = Tallies()
@@ -143,7 +143,8 @@ class CollaborationAgent:
         in_sight = now.stamp_ns - seen.stamp_ns < IN_SIGHT_NS
         if not (in_sight and hears(self.tier, tier, rules)):
             return False
-        return bool(now.lost) or use_of(seen, tier, now.estimate, rules) >= rules.least_use
+        gain = information_gain_of_belief(seen, tier, now.estimate, rules)
+        return bool(now.lost) or gain >= rules.least_use
 
     # Active help --------------------------------------------------------------------------------
 
@@ -183,19 +184,19 @@ class CollaborationAgent:
         """The fix with its worth; with the heading only if that is worth its own bytes."""
         _, before = self._helped.get(fix.robot, (0, None))
         rules, place = self._rules, (fix.x_m, fix.y_m)
-        prior = expected(tier, before, *place, rules)
+        prior = predicted_teammate_covariance(tier, before, *place, rules)
         parts = Covariance2(*fix.sensor_covariance), Covariance2(*fix.observer_covariance)
-        after = merged(prior, *parts, rules.fusion)
-        value, turned = worth(prior, after), None if before is None else before.turned
+        after = merged_covariance(prior, *parts, rules.fusion)
+        value, turned = information_gain(prior, after), None if before is None else before.heading
         if fix.heading_rad is not None:
-            variance = expected_heading(tier, turned, fix)
-            left = merged_heading(variance, fix, rules.fusion)
-            gained = heading_worth(variance, left)
+            variance = predicted_teammate_heading_variance(tier, turned, fix)
+            left = merged_heading_variance(variance, fix, rules.fusion)
+            gained = heading_information_gain(variance, left)
             if gained >= rules.least_value:
-                value, turned = value + gained, Turned(*place, left)
+                value, turned = value + gained, HeadingMemory(*place, left)
             else:
                 fix = without_heading(fix)
-        return _Offer(value, tier == LOWEST_TIER, Helped(*place, after, turned), fix)
+        return _Offer(value, tier == LOWEST_TIER, FixMemory(*place, after, turned), fix)
 
     def _paid(self, offer: _Offer, now_ns: int) -> bool:
         fix = offer.fix

@@ -27,7 +27,7 @@ from cpcbl_agents.robot import Robot
 from cpcbl_team.collaboration import LOWEST_TIER, tier_of
 from cpcbl_team.config import BudgetSettings, LocalizerSettings, Team
 from cpcbl_team.estimate import ZERO3, Estimate
-from cpcbl_team.information_gain import sigma_range_m
+from cpcbl_team.information_gain import sigma_limits_m
 from cpcbl_team.inputs import Belief, Fix, Odometry, Position, Sighting, Sightings
 from cpcbl_team.self_calibration import Learned
 from cpcbl_team.timeline import HORIZON_NS
@@ -597,7 +597,7 @@ def test_a_belief_is_said_under_the_tier_of_its_own_sigma() -> None:
         assert isinstance(belief, Belief)
         (_, tier, _) = key.split("/")
         sigma = math.sqrt((belief.covariance[0] + belief.covariance[2]) / 2.0)
-        least, most = sigma_range_m(int(tier), rules)
+        least, most = sigma_limits_m(int(tier), rules)
         assert least * 0.99 < sigma < most * 1.01
         said.setdefault(int(tier), []).append(belief)
     assert len(said) > 2
