@@ -51,6 +51,10 @@ chaos: setup
 net: setup
 	PYTHONPATH=$(BENCH_PATH) $(BIN)/python -m net.reference
 
+# Meaningless payloads on every key of a running team: some minutes.
+fuzz: setup
+	$(BIN)/pytest -q tests/fuzz
+
 # The core with its hot files compiled (hatch_build.py), and the benchmarks' yardstick: beside the
 # checkout's own, which stay as they are. Needs a C compiler.
 COMPILED = build/compiled
@@ -73,6 +77,12 @@ bench: setup compiled
 	$(call timed,eyes,bench_eyes)
 	PYTHONPATH=$(BENCH_PATH) $(BIN)/python -m benchmarks.table build/bench_raw.json build/bench.json
 	PYTHONPATH=$(BENCH_PATH) $(BIN)/python -m benchmarks.eyes_table build/bench_eyes_raw.json build/bench_eyes.json
+
+# Real processes over Zenoh, alone on the machine: ARGS='--sightings 1000', '--robots 40,48,60',
+# '--old ../earlier-checkout' (measured in the same run), ...
+bench-latency bench-processes: setup
+	@mkdir -p build
+	PYTHONPATH=$(BENCH_PATH) $(BIN)/python -m benchmarks.$(@:bench-%=%) $(ARGS)
 
 BENCH_PATH = .:agents:transport:launch:tests
 timed = $(BIN)/pytest -q --benchmark-json=build/$(2)_raw.json --benchmark-columns=median \

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Optional
 import typer
 
 from cpcbl_launch.commands.arguments import parse_names, print_not_written
+from cpcbl_team.errors import InputError
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -17,10 +18,12 @@ if TYPE_CHECKING:
     from cpcbl_launch.lab.experiments.results import Experiment
 
 experiment_app = typer.Typer(
-    help="The paper's experiments on a simulated field, and what real processes take: a table,"
-    " NAME.json and (of the simulated ones) NAME.png.",
+    help="The paper's experiments and others: each prints a table and writes NAME.json; most of"
+    " them draw NAME.png.",
     no_args_is_help=True,
 )
+
+_ANY_ARGUMENTS = {"allow_extra_args": True, "ignore_unknown_options": True}
 
 Seeds = Annotated[int, typer.Option(min=1, help="Runs of each case, each with its own noise.")]
 Jobs = Annotated[
@@ -66,7 +69,7 @@ def figure7_cameras(
 def circular_vs_oval(
     seeds: Seeds = 10, jobs: Jobs = None, output: Output = Path(), as_json: AsJson = False
 ) -> None:
-    """All four variants: accuracy, consistency, cost."""
+    """All four variants: accuracy and consistency."""
     from cpcbl_launch.lab.experiments.variants import EXPERIMENT
 
     conduct(EXPERIMENT, seeds, jobs, output, as_json)
@@ -177,40 +180,18 @@ def pictures(
     _written(result, real_pictures.tables(result), output, as_json)
 
 
-@experiment_app.command("latency")
-def latency(
-    sightings: Annotated[int, typer.Option(min=10, help="Sightings measured; ten a second.")] = 500,
-    output: Annotated[Path, typer.Option(help="Folder for latency.json.")] = Path(),
-    as_json: AsJson = False,
-) -> None:
-    """Sighting on one robot -> belief of its teammate, beside a bare put: real processes, Zenoh."""
-    from cpcbl_launch.lab.experiments import latency
-
-    _must_be_writable(output, "latency", drawn=False)
-    with _progress("latency", latency.UNMEASURED + sightings, "sightings") as done:
-        result = latency.measured(sightings, done)
-    _written(result, latency.tables(result), output, as_json)
+@experiment_app.command("latency", hidden=True, context_settings=_ANY_ARGUMENTS)
+def latency() -> None:
+    """Moved to `make bench-latency`."""
+    raise InputError("experiment latency: it is a benchmark now: make bench-latency, in a checkout")
 
 
-@experiment_app.command("processes")
-def processes(
-    robots: Annotated[
-        str, typer.Option(help="Sizes of the team, until one does not keep 10 Hz.")
-    ] = "4,8,16,24,32,48,64",
-    seconds: Annotated[float, typer.Option(min=1.0, help="Measured, of each size.")] = 15.0,
-    output: Annotated[Path, typer.Option(help="Folder for processes.json.")] = Path(),
-    as_json: AsJson = False,
-) -> None:
-    """Real processes that keep 10 Hz: CPU and memory a robot, beside an all-to-all broadcast."""
-    from cpcbl_launch.lab.experiments import processes
-    from cpcbl_launch.run.usage import require_process_usage
-
-    require_process_usage("experiment processes")
-    _must_be_writable(output, "processes", drawn=False)
-    sizes = processes.sizes_in(robots)
-    with _progress("processes", len(sizes), "sizes") as done:
-        result = processes.measured(sizes, seconds, done)
-    _written(result, processes.tables(result), output, as_json)
+@experiment_app.command("processes", hidden=True, context_settings=_ANY_ARGUMENTS)
+def processes() -> None:
+    """Moved to `make bench-processes`."""
+    raise InputError(
+        "experiment processes: it is a benchmark now: make bench-processes, in a checkout"
+    )
 
 
 def conduct(

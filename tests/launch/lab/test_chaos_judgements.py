@@ -6,7 +6,6 @@ from support.chaos import UNTIL_S, broken, came, notes_of, status_at, tracks_of,
 
 from cpcbl_launch.lab.chaos.checks import Check, Faults, Outcome, as_data
 from cpcbl_launch.lab.chaos.files import Ended, judged_full, judged_read_only
-from cpcbl_launch.lab.chaos.fuzz import TO_FIELD, TO_PEOPLE, TOKENS, Sent, Taken, judged_fuzz
 from cpcbl_launch.lab.chaos.inputs import judged_duplicates, judged_flood
 from cpcbl_launch.lab.chaos.network import judged_bad, judged_cut, judged_partition
 from cpcbl_launch.lab.chaos.notes import (
@@ -19,12 +18,10 @@ from cpcbl_launch.lab.chaos.notes import (
     lost_after_s,
     rmse_m,
 )
-from cpcbl_launch.lab.chaos.payloads import real
 from cpcbl_launch.lab.chaos.processes import judged_field, judged_freeze, judged_kill, judged_router
 from cpcbl_launch.lab.chaos.soak import Life, Sample, judged_soak, lives
 from cpcbl_launch.lab.chaos.world import judged_clocks, judged_hidden, judged_kidnap, judged_liar
 from cpcbl_launch.run.usage import MIB
-from cpcbl_transport import topics
 
 AT_S = 10.0
 GOOD = notes_of([tracks_of("a"), tracks_of("b")])
@@ -248,58 +245,6 @@ def test_a_flood() -> None:
     }
 
 
-SENT = Sent(
-    help=100,
-    inputs=60,
-    commands=30,
-    no_messages=80,
-    no_statuses=25,
-    no_looks=20,
-)
-TAKEN = Taken(
-    after_help={"garbage": 90, "messages_received": 10, "sightings": 7},
-    victim={
-        "garbage": 110,
-        "messages_received": 10,
-        "sightings": 20,
-        "bad_token": TOKENS,
-        "frame_skipped": 15,
-        "no_camera": 5,
-    },
-    field={"garbage": 20, "not_its_own": 10, "drive": 500},
-    recorder={"garbage": 60, "track": 10},
-    watcher={"garbage": 25},
-    looks={"garbage": 20},
-    restarts=0,
-    tracebacks=0,
-    traffic_exit=0,
-)
-
-
-def test_fuzzed_payloads_are_all_counted() -> None:
-    assert not broken(judged_fuzz(SENT, TAKEN))
-
-
-@pytest.mark.parametrize(
-    ("change", "what"),
-    [
-        ({"restarts": 1}, "processes that ended"),
-        ({"tracebacks": 2}, "tracebacks in logs"),
-        ({"after_help": {"garbage": 80}}, "fixes and beliefs counted"),
-        ({"victim": {**TAKEN.victim, "garbage": 100}}, "inputs counted"),
-        ({"victim": {**TAKEN.victim, "frame_skipped": 14}}, "inputs counted"),
-        ({"victim": {**TAKEN.victim, "bad_token": 3}}, "malformed tokens counted"),
-        ({"field": {"drive": 500}}, "commands refused by the field"),
-        ({"recorder": {"garbage": 59}}, "messages refused by the recorder"),
-        ({"watcher": {}}, "messages refused by the traffic watcher"),
-        ({"looks": {"garbage": 19}}, "messages refused by the subscriber of annotated frames"),
-        ({"traffic_exit": 1}, "exit code of `cpcbl-team traffic`"),
-    ],
-)
-def test_a_fuzzed_payload_that_is_missing_is_noticed(change: dict[str, object], what: str) -> None:
-    assert what in broken(judged_fuzz(SENT, TAKEN._replace(**change)))  # type: ignore[arg-type]
-
-
 # Files --------------------------------------------------------------------------------------------
 
 TABLE = "errors of position\nnavigator 1\nobserver 1\nscout 1\npatrol 1\n"
@@ -431,10 +376,3 @@ def test_a_soak() -> None:
         "largest growth of the number of open files",
     }
     assert "largest growth of memory" in broken(judged_soak(GOOD, ["a"], [], times, 0, 0, 0))
-
-
-def test_every_topic_with_a_payload_is_fuzzed() -> None:
-    fuzzed = {topics.FIX, topics.BELIEF, *topics.INPUTS, *TO_PEOPLE, *TO_FIELD}
-    assert fuzzed == {topic for topic in topics.TOPICS if topic.carries is not None}
-    for topic in fuzzed:
-        assert real(topic, "victim", "mate", 5_000_000_000)

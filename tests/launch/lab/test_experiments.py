@@ -27,7 +27,7 @@ from cpcbl_team.config import Team
 from cpcbl_team.errors import InputError
 
 EVERY = {e.name: e for e in (m.EXPERIMENT for m in (table1, figure7, variants, directions))}
-KEYS = {"experiment", "version", "seeds", "loops", "teams", "figures", "paper", "pattern", "cost"}
+KEYS = {"experiment", "version", "seeds", "loops", "teams", "figures", "paper", "pattern"}
 PNG = b"\x89PNG\r\n\x1a\n"
 
 

@@ -1,7 +1,6 @@
 """Running scenarios one after another, so that their figures are clean."""
 
 import difflib
-import importlib.util
 import os
 import platform
 import subprocess
@@ -21,12 +20,15 @@ from cpcbl_team.errors import InputError
 from cpcbl_transport.zenoh_bus import BusError
 
 ALL = "all"
+MOVED = {"fuzz": "it is a test now: run `make fuzz`, or `pytest tests/fuzz`, in a checkout"}
 
 
 def chosen(names: Sequence[str]) -> list[Scenario]:
     """The scenarios of these names, `all` for all; in the order of the table. Raises InputError."""
     known = {scenario.name: scenario for scenario in SCENARIOS}
     for name in names:
+        if name in MOVED:
+            raise InputError(f"chaos: {name}: {MOVED[name]}")
         if name not in known and name != ALL:
             close = difflib.get_close_matches(name, known, 1)
             hint = f"did you mean {close[0]}?" if close else f"one of {', '.join(known)}, {ALL}"
@@ -43,8 +45,6 @@ def missing(needs: Needs) -> str:
             return files.missing()
         case Needs.DOCKER:
             return containers.missing()
-        case Needs.HYPOTHESIS if importlib.util.find_spec("hypothesis") is None:
-            return "needs hypothesis: pip install 'cpcbl-team[chaos]'"
     return ""
 
 

@@ -20,7 +20,6 @@ class Needs(StrEnum):
     NOTHING = ""
     ROOT = "root and /dev/net/tun"
     MOUNT = "root, to mount a small disk"
-    HYPOTHESIS = "the extra `chaos`"
     DOCKER = "docker"
 
 

@@ -75,29 +75,24 @@ def draw_figure7(result: Outcome, path: Path) -> None:
 
 
 def draw_variants(result: Outcome, path: Path) -> None:
-    """Accuracy, consistency and cost of the variants."""
-    figure, (errors, inside, cost) = plt.subplots(1, 3, figsize=(12, 3.8), layout="constrained")
-    variants = list(result.cost)
-    for k, how in enumerate(("alone", "helped")):
+    """Accuracy and consistency of the variants."""
+    figure, (errors, inside) = plt.subplots(1, 2, figsize=(8, 3.8), layout="constrained")
+    variants = list(dict.fromkeys(case.split()[0] for case in result.figures))
+    for k, help_ in enumerate(("alone", "helped")):
         for x, variant in enumerate(variants):
-            a = result.figures[f"{variant} {how}"]
-            label, at = how if x == 0 else None, x - 0.1 + 0.2 * k
+            a = result.figures[f"{variant} {help_}"]
+            label, at = help_ if x == 0 else None, x - 0.1 + 0.2 * k
             if a.position_mean_m is not None:
-                errors.errorbar(
-                    at, a.position_mean_m, a.position_sigma_m, fmt="o", capsize=4, color=f"C{k}",
-                    label=label,
-                )  # fmt: skip
+                bar = a.position_mean_m, a.position_sigma_m
+                errors.errorbar(at, *bar, fmt="o", capsize=4, color=f"C{k}", label=label)
             if a.inside_3_sigma is not None:
                 inside.plot(at, 100.0 * a.inside_3_sigma, "o", color=f"C{k}")
     inside.axhline(98.9, color="0.4", linestyle="--", linewidth=1)
-    cost.bar(range(len(variants)), [c.ratio_to_joint for c in result.cost.values()], color="0.7")
     errors.set(title="position error (m), mean and one σ", ylim=(0, None))
-    inside.set(title="inside 3 σ (%), 98.9 due", ylim=(None, 100.2))
-    cost.set(title="cost of a cycle, of joint's")
-    for axes in (errors, inside, cost):
-        axes.set(
-            xticks=range(len(variants)), xticklabels=variants, xlim=(-0.5, len(variants) - 0.5)
-        )
+    inside.set(title="inside 3 σ (%); consistent: 98.9", ylim=(None, 100.2))
+    for axes in (errors, inside):
+        axes.set(xticks=range(len(variants)), xticklabels=variants)
+        axes.set_xlim(-0.5, len(variants) - 0.5)
         axes.grid(True, axis="y", alpha=0.3)
     errors.legend()
     _save(figure, path)

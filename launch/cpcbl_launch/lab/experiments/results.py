@@ -28,8 +28,6 @@ class Outcome(msgspec.Struct, frozen=True, kw_only=True):
     """The paper's own figures, where it has them."""
     pattern: dict[str, bool] = {}
     """What has to hold, and whether it did."""
-    cost: dict[str, Any] = {}
-    """Timing: of this machine and moment, the only part that the seeds do not determine."""
 
 
 Results = Mapping[Any, list[Run]]

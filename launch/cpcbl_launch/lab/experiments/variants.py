@@ -1,7 +1,7 @@
 """Circular against oval, which the paper announced, with `joint` and `weighted` beside them.
 
-The navigator of figure 7, alone (its configuration C) and helped both ways (F), by every variant:
-accuracy, consistency, and the cost of a cycle.
+The navigator of figure 7, alone (its configuration C) and helped in both directions (F), with every
+variant: accuracy and consistency. `make bench` measures what a cycle of each variant costs.
 """
 
 from collections.abc import Iterable, Mapping
@@ -9,7 +9,6 @@ from pathlib import Path
 
 from rich.console import RenderableType
 
-from cpcbl_launch.lab.experiments import cost
 from cpcbl_launch.lab.experiments.figure7 import EXPLAINED, accuracy_table, team_case
 from cpcbl_launch.lab.experiments.results import (
     Experiment,
@@ -19,7 +18,6 @@ from cpcbl_launch.lab.experiments.results import (
     new_outcome,
 )
 from cpcbl_launch.lab.experiments.runs import Case
-from cpcbl_launch.reporting.tables import table
 
 VARIANTS = ("joint", "oval", "circular", "weighted")
 HELP = {"alone": "C", "helped": "F"}
@@ -34,14 +32,8 @@ def cases() -> Mapping[str, Case]:
 
 
 def outcome(results: Results) -> Outcome:
-    known = cases()
-    return new_outcome(
-        "circular-vs-oval",
-        results,
-        known,
-        figures={name: accuracy(runs) for name, runs in results.items()},
-        cost=dict(cost.measured({v: known[f"{v} alone"] for v in VARIANTS})),
-    )
+    figures = {name: accuracy(runs) for name, runs in results.items()}
+    return new_outcome("circular-vs-oval", results, cases(), figures=figures)
 
 
 def tables(result: Outcome) -> Iterable[RenderableType]:
@@ -49,11 +41,6 @@ def tables(result: Outcome) -> Iterable[RenderableType]:
         f"navigator, {result.loops} loops, {result.seeds} runs each", result.figures
     )
     yield EXPLAINED
-    costs = table("cost of a cycle", ("variant",), ("µs", "of joint"))
-    for variant, c in result.cost.items():
-        costs.add_row(variant, f"{c.us_per_cycle:.0f}", f"{c.ratio_to_joint:.2f} x")
-    yield costs
-    yield "a cycle: the odometry since the last frame, then the frame; landmarks only"
 
 
 def draw(result: Outcome, path: Path) -> None:

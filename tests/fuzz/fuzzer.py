@@ -1,4 +1,7 @@
-"""Payloads without sense on every key of the topic table, over real Zenoh; each must be counted."""
+"""A fuzzer on a running team: meaningless payloads on every key of the topic table, over Zenoh.
+
+The robots, the field, the recorder and the watchers must count every payload, each by its reason.
+"""
 
 import os
 import random
@@ -12,10 +15,10 @@ from contextlib import ExitStack
 from typing import NamedTuple
 
 import msgspec
+from fuzz.payloads import hypothesis_payloads, mixed_payloads, valid_payload
 
 from cpcbl_launch.lab.chaos.checks import Check
 from cpcbl_launch.lab.chaos.notes import all_counts
-from cpcbl_launch.lab.chaos.payloads import fuzzed, hypothetical, real
 from cpcbl_launch.lab.chaos.scenario import Found, Setting, all_is_well, they_go_on
 from cpcbl_launch.lab.chaos.team import FIELD, ChaosError, Plan, TeamUnderTest, demo_team, running
 from cpcbl_launch.reporting.recorder import Recorder
@@ -38,41 +41,44 @@ from cpcbl_transport.messages import Refusal, encode
 from cpcbl_transport.topics import Topic
 from cpcbl_transport.zenoh_bus import open_bus
 
-A_KEY = 10_000
+PER_KEY = 10_000
 TOKENS = 300
 BURST, PAUSE_S = 50, 0.012
 SIGHTINGS_EVERY_S = 0.3
-VICTIM, MATE = "victim", "mate"  # the mate is played by the fuzzer
-DRIVEN = "patrol"  # whose commands, by their own words the mate's, it refuses all
+VICTIM, MATE = "victim", "mate"  # the fuzzer plays the mate
+DRIVEN = "patrol"  # the field refuses its commands, because they name the mate
 TO_FIELD = (topics.DRIVE, topics.JOIN)
 TO_PEOPLE = (topics.STATUS, topics.TRACK, topics.TRUTH, topics.LOOK)
-TAKEN = ("odometry", "sightings", "position", "messages_received")
-NO_FRAMES = ("frame_skipped", "no_camera")  # the latest frame counts, and the victim has no eyes
-REASONS = (*Refusal, "inbox_overflow", *NO_FRAMES)
+ACCEPTED = ("odometry", "sightings", "position", "messages_received")
+FRAME_REASONS = (
+    "frame_skipped",
+    "no_camera",
+)  # only the latest frame counts, and the victim has no camera
+REASONS = (*Refusal, "inbox_overflow", *FRAME_REASONS)
 
 
-class Sent(NamedTuple):
+class SentCounts(NamedTuple):
     """What the fuzzer sent."""
 
     help: int
     """Fixes and beliefs for the victim."""
     inputs: int
-    """For the victim's driver keys, and true sightings of the mate, so that it listens."""
+    """For the victim's driver keys; correct sightings of the mate, for which it listens, too."""
     commands: int
     """For the field."""
     no_messages: int
-    """For people (status, tracks, truth, looks), what is none."""
+    """Payloads that are no messages, on the keys for people (status, tracks, truth, frames)."""
     no_statuses: int
-    """Of these, what came under `status/*`."""
+    """Those of them under `status/*`."""
     no_looks: int
-    """Of these, what came under `look/*`."""
+    """Those of them under `look/*`."""
 
 
-class Taken(NamedTuple):
-    """What became of it."""
+class FinalCounts(NamedTuple):
+    """What the receivers counted, and how the processes ended."""
 
     after_help: Mapping[str, int]
-    """The victim's counts when help was all that it had been sent, but for sightings."""
+    """The victim's counts when it had been sent fixes, beliefs and correct sightings only."""
     victim: Mapping[str, int]
     """At the end."""
     field: Mapping[str, int]
@@ -85,9 +91,9 @@ class Taken(NamedTuple):
 
 
 def fuzz_team() -> Team:
-    """The demonstration, a robot with a driver of its own as the victim, and its teammate.
+    """The demonstration, a victim with a driver of its own, and a teammate of the victim.
 
-    Without guards: all shall arrive.
+    Without guards, so that every payload arrives.
     """
     team = demo_team()
     victim = RobotSettings(
@@ -101,10 +107,10 @@ def fuzz_team() -> Team:
     return msgspec.structs.replace(team, robots=robots, transport=transport)
 
 
-def fuzz(setting: Setting, a_key: int = A_KEY) -> Found:
-    """Hypothesis's payloads, random bytes and damaged messages on every key; odd tokens."""
+def fuzz(setting: Setting, per_key: int = PER_KEY) -> Found:
+    """Sends payloads on every key, and malformed tokens, to a running team; checks its counts."""
     setting.say("hypothesis generates payloads")
-    found = hypothetical(setting.seed)
+    examples = hypothesis_payloads(setting.seed)
     with ExitStack() as stack:
         plan = Plan(fuzz_team(), setting.seed, left_out=(MATE,))
         team = stack.enter_context(running(plan))
@@ -114,21 +120,21 @@ def fuzz(setting: Setting, a_key: int = A_KEY) -> Found:
         setting.say("starting a team")
         team.settle()
         from_s = team.now_s
-        fuzzer = Fuzzer(team, bus, a_key, found, setting)
-        fuzzer.help()
-        team.until(lambda: _counted(fuzzer.victim()) >= fuzzer.to_victim, 15.0)
-        after_help = fuzzer.victim()
-        fuzzer.everything_else()
+        fuzzer = Fuzzer(team, bus, per_key, examples, setting)
+        fuzzer.send_help()
+        team.until(lambda: _total(fuzzer.victim_counts()) >= fuzzer.to_victim, 15.0)
+        after_help = fuzzer.victim_counts()
+        fuzzer.send_everything_else()
         sent = fuzzer.sent()
-        team.until(lambda: _counted(fuzzer.victim()) >= fuzzer.to_victim, 15.0)
+        team.until(lambda: _total(fuzzer.victim_counts()) >= fuzzer.to_victim, 15.0)
         recorded = sent.no_messages - sent.no_looks
-        team.until(lambda: _refused(recorder.counts) >= recorded, 15.0)
+        team.until(lambda: _refusals(recorder.counts) >= recorded, 15.0)
         team.until(lambda: looks.refused.total() >= sent.no_looks, 15.0)
         team.until(lambda: watcher.refused.total() >= sent.no_statuses, 15.0)
         until_s = team.now_s
-        taken = Taken(
+        final = FinalCounts(
             after_help,
-            fuzzer.victim(),
+            fuzzer.victim_counts(),
             {},
             dict(recorder.counts),
             watcher.refused,
@@ -137,26 +143,26 @@ def fuzz(setting: Setting, a_key: int = A_KEY) -> Found:
             0,
             _traffic_exit(team),
         )
-        taken = taken._replace(field=_field_counts(team), tracebacks=team.tracebacks())
+        final = final._replace(field=_field_counts(team), tracebacks=team.tracebacks())
         notes, robots = team.notes, team.robots
         checks = [
-            *judged_fuzz(sent, taken),
+            *fuzz_checks(sent, final),
             *they_go_on(notes, robots, from_s, until_s, most_silent_s=2.0, who="team's"),
             *all_is_well(notes, robots, from_s, until_s),
         ]
-        return Found(checks, (_by_reason(taken.victim),))
+        return Found(checks, (_by_reason(final.victim),))
 
 
-def judged_fuzz(sent: Sent, taken: Taken) -> list[Check]:
-    """Nobody ends, nothing is thrown, everything is counted, by reason."""
-    then, victim = taken.after_help, taken.victim
-    help_counted = _counted(then) - then.get("sightings", 0)
-    refused_commands = sum(n for what, n in taken.field.items() if what not in ("drive", "join"))
-    refused, watched = _refused(taken.recorder), sum(taken.watcher.values())
-    looked = sum(taken.looks.values())
+def fuzz_checks(sent: SentCounts, final: FinalCounts) -> list[Check]:
+    """No process ends, no exception is raised, and every payload is counted by its reason."""
+    after_help, victim = final.after_help, final.victim
+    help_counted = _total(after_help) - after_help.get("sightings", 0)
+    refused_commands = sum(n for what, n in final.field.items() if what not in ("drive", "join"))
+    refused, by_watcher = _refusals(final.recorder), sum(final.watcher.values())
+    by_frames = sum(final.looks.values())
     return [
-        _exactly("processes that ended", taken.restarts, 0),
-        _exactly("tracebacks in logs", taken.tracebacks, 0),
+        _equal("processes that ended", final.restarts, 0),
+        _equal("tracebacks in logs", final.tracebacks, 0),
         # a subscription that changes may deliver a message twice
         Check(
             what="fixes and beliefs counted",
@@ -164,27 +170,27 @@ def judged_fuzz(sent: Sent, taken: Taken) -> list[Check]:
             at_least=sent.help,
             at_most=sent.help + 10,
         ),
-        # the filter counts what is odd inside of what was taken once more
-        Check(what="inputs counted", seen=_counted(victim) - help_counted, at_least=sent.inputs),
+        # the filter counts the odd parts of an accepted message a second time
+        Check(what="inputs counted", seen=_total(victim) - help_counted, at_least=sent.inputs),
         Check(what="malformed tokens counted", seen=victim.get("bad_token", 0), at_least=TOKENS),
-        _exactly("commands refused by the field", refused_commands, sent.commands),
-        _exactly("messages refused by the recorder", refused, sent.no_messages - sent.no_looks),
-        _exactly("messages refused by the traffic watcher", watched, sent.no_statuses),
-        _exactly("messages refused by the subscriber of annotated frames", looked, sent.no_looks),
-        _exactly("exit code of `cpcbl-team traffic`", taken.traffic_exit, 0),
+        _equal("commands refused by the field", refused_commands, sent.commands),
+        _equal("messages refused by the recorder", refused, sent.no_messages - sent.no_looks),
+        _equal("messages refused by the traffic watcher", by_watcher, sent.no_statuses),
+        _equal("messages refused by the subscriber of annotated frames", by_frames, sent.no_looks),
+        _equal("exit code of `cpcbl-team traffic`", final.traffic_exit, 0),
     ]
 
 
-def _exactly(what: str, seen: int, due: int) -> Check:
+def _equal(what: str, seen: int, due: int) -> Check:
     return Check(what=what, seen=seen, at_least=due, at_most=due)
 
 
-def _counted(counts: Mapping[str, int]) -> int:
-    """What a robot took and what it refused."""
-    return sum(counts.get(name, 0) for name in (*TAKEN, *REASONS))
+def _total(counts: Mapping[str, int]) -> int:
+    """The messages that a robot accepted and those that it refused."""
+    return sum(counts.get(name, 0) for name in (*ACCEPTED, *REASONS))
 
 
-def _refused(counts: Mapping[str, int]) -> int:
+def _refusals(counts: Mapping[str, int]) -> int:
     return sum(counts.get(reason, 0) for reason in REASONS)
 
 
@@ -194,56 +200,56 @@ def _by_reason(counts: Mapping[str, int]) -> str:
 
 
 class Fuzzer:
-    """Plays the mate on a session of its own."""
+    """Plays the mate on a session of its own, and counts what it sends."""
 
     def __init__(
         self,
         team: TeamUnderTest,
         bus: Bus,
-        a_key: int,
-        found: Sequence[bytes],
+        per_key: int,
+        examples: Sequence[bytes],
         setting: Setting,
     ) -> None:
-        self._team, self._bus, self._a_key, self._say = team, bus, a_key, setting.say
-        self._dice, self._found = random.Random(setting.seed), found
+        self._team, self._bus, self._per_key, self._report = team, bus, per_key, setting.say
+        self._random, self._examples = random.Random(setting.seed), examples
         self._token = bus.announce(topics.ALIVE.at(tier=0, robot=MATE, incarnation="1"))
         key = topics.IN_SIGHTINGS.at(robot=VICTIM)
         self._sightings = bus.publisher(key, topics.IN_SIGHTINGS.qos)
-        self._shown_s = 0.0
+        self._sighted_s = 0.0
         self._count: Counter[str] = Counter()
-        self.true_sightings = 0
+        self.correct_sightings = 0
 
-    def help(self) -> None:
-        """Fixes and beliefs for the victim; then, as it watches the mate, odd tokens of it."""
+    def send_help(self) -> None:
+        """Sends fixes and beliefs to the victim, then malformed tokens of the mate."""
         for topic in (topics.FIX, topics.BELIEF):
-            self._fuzz(topic, self._key(topic))
+            self._send(topic, self._key(topic))
         for n in range(TOKENS):
-            chunk = f"{n}.{self._dice.randrange(2**32):x}"
+            chunk = f"{n}.{self._random.randrange(2**32):x}"
             self._bus.announce(topics.ALIVE.at(tier=chunk, robot=MATE, incarnation=chunk)).close()
 
-    def everything_else(self) -> None:
+    def send_everything_else(self) -> None:
         for topic in (*topics.INPUTS, *TO_PEOPLE, *TO_FIELD):
-            self._fuzz(topic, self._key(topic))
+            self._send(topic, self._key(topic))
 
     @property
     def to_victim(self) -> int:
-        """What it should have counted by now."""
+        """How many messages the victim should have counted by now."""
         keys = (topics.FIX, topics.BELIEF, *topics.INPUTS)
-        return sum(self._count[t.key] for t in keys) + self.true_sightings
+        return sum(self._count[t.key] for t in keys) + self.correct_sightings
 
-    def sent(self) -> Sent:
+    def sent(self) -> SentCounts:
         count = self._count
-        return Sent(
+        return SentCounts(
             help=count[topics.FIX.key] + count[topics.BELIEF.key],
-            inputs=sum(count[t.key] for t in topics.INPUTS) + self.true_sightings,
+            inputs=sum(count[t.key] for t in topics.INPUTS) + self.correct_sightings,
             commands=sum(count[t.key] for t in TO_FIELD),
             no_messages=sum(count[f"bad {t.key}"] for t in TO_PEOPLE),
             no_statuses=count[f"bad {topics.STATUS.key}"],
             no_looks=count[f"bad {topics.LOOK.key}"],
         )
 
-    def victim(self) -> Counter[str]:
-        """What the victim has counted."""
+    def victim_counts(self) -> Counter[str]:
+        """The victim's counts."""
         return all_counts(self._team.notes, VICTIM)
 
     def _key(self, topic: Topic) -> str:
@@ -251,52 +257,55 @@ class Fuzzer:
         robot = DRIVEN if topic in TO_FIELD else robot
         return topic.at(robot=robot, tier=0, observer=MATE)
 
-    def _fuzz(self, topic: Topic, key: str) -> None:
-        self._say(f"{self._a_key} payloads on {key}")
-        publisher = self._bus.publisher(key, topics.Qos.INPUT)  # reliable: all shall arrive
-        if not self._until(lambda: publisher.matching):
+    def _send(self, topic: Topic, key: str) -> None:
+        self._report(f"{self._per_key} payloads on {key}")
+        publisher = self._bus.publisher(
+            key, topics.Qos.INPUT
+        )  # reliable, so that every payload arrives
+        if not self._wait(lambda: publisher.matching):
             raise ChaosError(f"nobody listens to {key}")
 
         def original() -> bytes:
-            return real(topic, VICTIM, MATE, self._team.clock.now_ns())
+            return valid_payload(topic, VICTIM, MATE, self._team.clock.now_ns())
 
-        for n, payload in enumerate(fuzzed(self._a_key, original, self._found, self._dice)):
+        payloads = mixed_payloads(self._per_key, original, self._examples, self._random)
+        for n, payload in enumerate(payloads):
             if n % BURST == 0:
-                self._until(lambda: publisher.matching)
+                self._wait(lambda: publisher.matching)
                 time.sleep(PAUSE_S)
             if topic in TO_PEOPLE and isinstance(read(key, payload), Refusal):
                 self._count[f"bad {topic.key}"] += 1
             publisher.put(payload)
             self._count[topic.key] += 1
 
-    def _until(self, condition: Callable[[], bool]) -> bool:
-        """Waits, and keeps the mate in the victim's sight."""
+    def _wait(self, condition: Callable[[], bool]) -> bool:
+        """Waits for a condition, and keeps the mate in the victim's view; whether it was met."""
 
         def met() -> bool:
-            self._show_mate()
+            self._send_sighting()
             return condition()
 
         self._team.watch()
         return met() or self._team.until(met, 15.0)
 
-    def _show_mate(self) -> None:
+    def _send_sighting(self) -> None:
         now_s = time.monotonic()
-        if now_s - self._shown_s >= SIGHTINGS_EVERY_S:
-            self._shown_s = now_s
+        if now_s - self._sighted_s >= SIGHTINGS_EVERY_S:
+            self._sighted_s = now_s
             frame = Sightings(self._team.clock.now_ns(), (Sighting(MATE, 2.0, 0.1),))
             self._sightings.put(encode(frame))
-            self.true_sightings += 1
+            self.correct_sightings += 1
 
 
 def _traffic_exit(team: TeamUnderTest) -> int:
-    """What `cpcbl-team traffic` exits with that has watched this team."""
+    """The exit code of `cpcbl-team traffic` that watches this team."""
     where = ("--team-name", team.plan.team.name, "--connect", team.endpoint)
     words = (*PROGRAM, "traffic", *where, "--for", "2", "--json")
     return subprocess.run(words, capture_output=True, timeout=60.0, check=False).returncode
 
 
 def _field_counts(team: TeamUnderTest) -> Counter[str]:
-    """What the field says at its end of the commands that it got."""
+    """The counts of commands that the field logs when it ends."""
     pid = team.pid(FIELD)
     os.kill(pid, signal.SIGINT)
     team.until(lambda: "what became of them" in team.log(FIELD), 10.0)

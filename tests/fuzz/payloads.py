@@ -1,4 +1,4 @@
-"""Payloads that nobody would send: random bytes, odd structures, real ones that were damaged."""
+"""Payloads that no correct program sends: random bytes, odd structures, damaged messages."""
 
 import random
 from collections.abc import Callable, Iterator, Sequence
@@ -30,12 +30,12 @@ TAGS = (
     *("status", "track", "drive", "truth", "join"),
 )
 LONGEST = 600
-DISTINCT = 1000  # hypothesis takes some 4 ms for each
+DISTINCT = 1000  # hypothesis takes about 4 ms for each
 _encode = msgspec.msgpack.Encoder().encode
 
 
-def real(topic: Topic, target: str, speaker: str, now_ns: int) -> bytes:
-    """A payload of a topic that would be taken."""
+def valid_payload(topic: Topic, target: str, speaker: str, now_ns: int) -> bytes:
+    """A payload that the subscribers of a topic accept."""
     match topic:
         case topics.BELIEF:
             return encode_help(Belief(speaker, now_ns, 1.0, 2.0, 0.5, COVARIANCE_3))
@@ -67,46 +67,43 @@ def real(topic: Topic, target: str, speaker: str, now_ns: int) -> bytes:
     raise ValueError(f"{topic.key}: carries no payload")
 
 
-def fuzzed(
-    count: int, original: Callable[[], bytes], found: Sequence[bytes], dice: random.Random
+def mixed_payloads(
+    count: int, original: Callable[[], bytes], examples: Sequence[bytes], generator: random.Random
 ) -> Iterator[bytes]:
-    """So many payloads: a third of those `found`, a third random, a third damaged real ones."""
+    """`count` payloads: a third of them from `examples`, a third random, a third damaged."""
     makers = (
-        lambda: dice.choice(found),
-        lambda: noise(dice),
-        lambda: damaged(original(), dice),
+        lambda: generator.choice(examples),
+        lambda: random_payload(generator),
+        lambda: damaged_payload(original(), generator),
     )
     for n in range(count):
         yield makers[n % len(makers)]()
 
 
-def noise(dice: random.Random) -> bytes:
-    """Random bytes; every other one begins like a message."""
-    head = bytes([VERSION]) if dice.random() < 0.5 else b""
-    return head + dice.randbytes(dice.randrange(LONGEST))
+def random_payload(generator: random.Random) -> bytes:
+    """Random bytes; half of these payloads begin with the version byte of a message."""
+    head = bytes([VERSION]) if generator.random() < 0.5 else b""
+    return head + generator.randbytes(generator.randrange(LONGEST))
 
 
-def damaged(payload: bytes, dice: random.Random) -> bytes:
-    """A payload with a few bytes changed, or cut, or with more at its end, or twice."""
+def damaged_payload(payload: bytes, generator: random.Random) -> bytes:
+    """A payload with some bytes changed, cut off or appended, or with its content twice."""
     data = bytearray(payload)
-    match dice.randrange(4):
+    match generator.randrange(4):
         case 0:
-            for _ in range(dice.randrange(1, 4)):
-                data[dice.randrange(len(data))] = dice.randrange(256)
+            for _ in range(generator.randrange(1, 4)):
+                data[generator.randrange(len(data))] = generator.randrange(256)
         case 1:
-            del data[dice.randrange(len(data)) :]
+            del data[generator.randrange(len(data)) :]
         case 2:
-            data += dice.randbytes(dice.randrange(1, 20))
+            data += generator.randbytes(generator.randrange(1, 20))
         case 3:
             data += payload[1:]
     return bytes(data)
 
 
-def hypothetical(seed: int) -> tuple[bytes, ...]:
-    """What hypothesis makes up: bytes, and structures with a message's tag and anything in it.
-
-    Raises ImportError without hypothesis (extra `chaos`).
-    """
+def hypothesis_payloads(seed: int) -> tuple[bytes, ...]:
+    """Payloads that hypothesis generates: bytes, and lists with the tag of a message in front."""
     import hypothesis
     from hypothesis import strategies as st
 
@@ -129,7 +126,7 @@ def hypothetical(seed: int) -> tuple[bytes, ...]:
         st.sampled_from(TAGS),
         st.lists(anything, max_size=16),
     )
-    found: list[bytes] = []
+    examples: list[bytes] = []
 
     @hypothesis.seed(seed)
     @hypothesis.settings(
@@ -141,7 +138,7 @@ def hypothetical(seed: int) -> tuple[bytes, ...]:
     )
     @hypothesis.given(st.binary(max_size=LONGEST) | tagged)
     def make(payload: bytes) -> None:
-        found.append(payload)
+        examples.append(payload)
 
     make()
-    return tuple(found)
+    return tuple(examples)

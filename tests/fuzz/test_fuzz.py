@@ -1,0 +1,89 @@
+"""Meaningless payloads on every key: no process ends, and every payload is counted by its reason.
+
+`make fuzz` runs all of it; `make test` runs it with few payloads.
+"""
+
+import pytest
+from fuzz.fuzzer import (
+    PER_KEY,
+    TO_FIELD,
+    TO_PEOPLE,
+    TOKENS,
+    FinalCounts,
+    SentCounts,
+    fuzz,
+    fuzz_checks,
+)
+from fuzz.payloads import valid_payload
+from support.chaos import broken
+
+from cpcbl_launch.lab.chaos.scenario import Setting
+from cpcbl_transport import topics
+
+
+@pytest.mark.timeout(900)
+@pytest.mark.parametrize(
+    ("seed", "per_key"), [(3, 300), pytest.param(1, PER_KEY, marks=pytest.mark.long)]
+)
+def test_every_payload_is_counted_and_the_team_continues(seed: int, per_key: int) -> None:
+    checks = list(fuzz(Setting(seed=seed), per_key).checks)
+    assert [str(check) for check in checks if not check.held] == []
+
+
+def test_every_topic_with_a_payload_is_fuzzed() -> None:
+    fuzzed = {topics.FIX, topics.BELIEF, *topics.INPUTS, *TO_PEOPLE, *TO_FIELD}
+    assert fuzzed == {topic for topic in topics.TOPICS if topic.carries is not None}
+    for topic in fuzzed:
+        assert valid_payload(topic, "victim", "mate", 5_000_000_000)
+
+
+SENT = SentCounts(
+    help=100,
+    inputs=60,
+    commands=30,
+    no_messages=80,
+    no_statuses=25,
+    no_looks=20,
+)
+COUNTED = FinalCounts(
+    after_help={"garbage": 90, "messages_received": 10, "sightings": 7},
+    victim={
+        "garbage": 110,
+        "messages_received": 10,
+        "sightings": 20,
+        "bad_token": TOKENS,
+        "frame_skipped": 15,
+        "no_camera": 5,
+    },
+    field={"garbage": 20, "not_its_own": 10, "drive": 500},
+    recorder={"garbage": 60, "track": 10},
+    watcher={"garbage": 25},
+    looks={"garbage": 20},
+    restarts=0,
+    tracebacks=0,
+    traffic_exit=0,
+)
+
+
+def test_fuzzed_payloads_are_all_counted() -> None:
+    assert not broken(fuzz_checks(SENT, COUNTED))
+
+
+@pytest.mark.parametrize(
+    ("change", "what"),
+    [
+        ({"restarts": 1}, "processes that ended"),
+        ({"tracebacks": 2}, "tracebacks in logs"),
+        ({"after_help": {"garbage": 80}}, "fixes and beliefs counted"),
+        ({"victim": {**COUNTED.victim, "garbage": 100}}, "inputs counted"),
+        ({"victim": {**COUNTED.victim, "frame_skipped": 14}}, "inputs counted"),
+        ({"victim": {**COUNTED.victim, "bad_token": 3}}, "malformed tokens counted"),
+        ({"field": {"drive": 500}}, "commands refused by the field"),
+        ({"recorder": {"garbage": 59}}, "messages refused by the recorder"),
+        ({"watcher": {}}, "messages refused by the traffic watcher"),
+        ({"looks": {"garbage": 19}}, "messages refused by the subscriber of annotated frames"),
+        ({"traffic_exit": 1}, "exit code of `cpcbl-team traffic`"),
+    ],
+)
+def test_a_fuzzed_payload_that_is_missing_is_noticed(change: dict[str, object], what: str) -> None:
+    assert what in broken(fuzz_checks(SENT, COUNTED._replace(**change)))  # type: ignore[arg-type]
