@@ -1,6 +1,33 @@
-"""Nothing in the suite is timed: a machine may be busy."""
+"""What holds for every test: none is timed, and no process that it started outlives it."""
 
+import signal
+from collections.abc import Iterator
+
+import pytest
 from hypothesis import HealthCheck, settings
+from support.children import adopt_orphans, children, end
 
 settings.register_profile("untimed", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("untimed")
+
+
+def pytest_configure() -> None:
+    """Restores the signals that a background job or `nohup` ignores, for children inherit that.
+
+    The tests themselves still survive a closed terminal; what they start reacts as in a terminal.
+    """
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+    if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:
+        signal.signal(signal.SIGHUP, lambda number, frame: None)
+    adopt_orphans()
+
+
+@pytest.fixture(autouse=True, scope="module")
+def no_process_outlives_its_module() -> Iterator[None]:
+    """Ends the processes that are left after the tests and fixtures of a module, and says so."""
+    before = set(children())
+    yield
+    left = {pid: command for pid, command in children().items() if pid not in before}
+    end(left)
+    assert not left, f"processes that outlived their tests: {left}"
