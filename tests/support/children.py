@@ -28,7 +28,8 @@ def children() -> dict[int, str]:
         pid, parent, state, command = line.split(maxsplit=3)
         if not state.startswith("Z"):
             parents[int(pid)], commands[int(pid)] = int(parent), command
-    found, frontier = {}, {os.getpid()}
+    found: dict[int, str] = {}
+    frontier = {os.getpid()}
     while frontier:
         frontier = {pid for pid, parent in parents.items() if parent in frontier}
         found |= {pid: commands[pid] for pid in frontier}
