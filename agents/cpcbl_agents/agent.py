@@ -36,30 +36,30 @@ class Presence(NamedTuple):
     tier: int | None
 
 
-class Stranger(NamedTuple):
+class UnknownRobot(NamedTuple):
     """Help has come from somebody who is neither in the team file nor known as a guest."""
 
     robot: str
 
 
-class Listened(NamedTuple):
+class BeliefSubscribers(NamedTuple):
     """Whether any teammate listens to this robot's beliefs at present."""
 
-    by_any: bool
+    present: bool
 
 
-class Looked(NamedTuple):
+class FrameSubscribers(NamedTuple):
     """Whether anybody looks at what this robot's camera sees."""
 
-    by_any: bool
+    present: bool
 
 
-class Sent(NamedTuple):
+class HelpSent(NamedTuple):
     """Help that has left this robot, and its bytes on the wire; 0: nobody listened, it has not."""
 
     message: Belief | Fix
     size: int
 
 
-FromBus = Presence | Stranger | Listened | Looked | Sent
-Anything = Message | Tick | Located | Told | FromBus
+BusEvent = Presence | UnknownRobot | BeliefSubscribers | FrameSubscribers | HelpSent
+AgentMessage = Message | Tick | Located | Told | BusEvent

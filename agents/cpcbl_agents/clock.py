@@ -24,7 +24,7 @@ class Clock(NamedTuple):
         ahead = (stamp_ns - self.epoch_ns) / self.speed
         return max(0.0, (self.from_ns + ahead - time.monotonic_ns()) * 1e-9)
 
-    def set_by_s(self) -> float:
+    def clock_step_s(self) -> float:
         """By how much the machine's time was set since, or ran on while the machine slept.
 
         0 of a clock that has nothing to do with it.

@@ -11,7 +11,7 @@ from cpcbl_team.config import TrustSettings
 from cpcbl_transport.messages import FUTURE_NS, LARGEST_NUMBER
 
 SPAN_NS = 5_000_000_000
-LEAST_WORDS = 5  # before a clock is called off: a single word may have waited, or be a fault
+MIN_MESSAGES = 5  # before a clock is called off: a single word may have waited, or be a fault
 NEVER_LATE_NS = 2**62
 
 
@@ -26,7 +26,7 @@ class Span(NamedTuple):
     """Those that came before they were measured, by more than is tolerated."""
 
 
-class Clocks:
+class ClockMonitor:
     """The clocks of all teammates. `speed`: robot time beside real time."""
 
     def __init__(self, rules: TrustSettings, speed: float = 1.0) -> None:
@@ -35,7 +35,7 @@ class Clocks:
         self._behind_ns = int(rules.clock_behind_s * 1e9 * slower)
         self._spans: dict[str, tuple[Span, Span]] = {}
 
-    def refuses(self, sender: str, stamp_ns: int, now_ns: int) -> bool:
+    def rejects(self, sender: str, stamp_ns: int, now_ns: int) -> bool:
         """Whether a word of this sender, that arrives now, is stamped by a clock that is off.
 
         One far ahead is left to `messages.refusal` until it is no single fault.
@@ -55,10 +55,10 @@ class Clocks:
         return self._is_off(last, before) or -FUTURE_NS <= late_ns < -self._ahead_ns
 
     def _is_off(self, last: Span, before: Span) -> bool:
-        if last.ahead + before.ahead >= LEAST_WORDS:
+        if last.ahead + before.ahead >= MIN_MESSAGES:
             return True
         least_ns = min(last.least_ns, before.least_ns)
-        return last.words + before.words >= LEAST_WORDS and least_ns > self._behind_ns
+        return last.words + before.words >= MIN_MESSAGES and least_ns > self._behind_ns
 
     def late_s(self, sender: str) -> float:
         """The least time from stamp to arrival; below zero its clock is ahead. What is further off

@@ -10,9 +10,16 @@ from typing import NamedTuple
 
 from msgspec.structs import replace
 
-from cpcbl_agents.agent import Anything, Listened, Located, Presence, Sent, Stranger
-from cpcbl_agents.counters import Tallies
-from cpcbl_agents.guests import Guests
+from cpcbl_agents.agent import (
+    AgentMessage,
+    BeliefSubscribers,
+    HelpSent,
+    Located,
+    Presence,
+    UnknownRobot,
+)
+from cpcbl_agents.counters import MessageCounters
+from cpcbl_agents.guests import GuestRegistry
 from cpcbl_team.collaboration import LOWEST_TIER, fix_for, hears, next_tier, without_heading
 from cpcbl_team.config import LocalizationSettings
 from cpcbl_team.gaussian import Covariance2
@@ -62,10 +69,10 @@ class CollaborationAgent:
         teammates: frozenset[str],
         start_ns: int,
         budget: Budget,
-        guests: Guests | None = None,
+        guests: GuestRegistry | None = None,
     ) -> None:
         self._robot, self._settings, self._teammates = robot, settings, teammates
-        self.guests = guests or Guests()
+        self.guests = guests or GuestRegistry()
         self._rules, self.budget = settings.collaboration, budget
         if settings.localizer.variant == "weighted":  # without a covariance worth cannot be judged
             self._rules = replace(self._rules, least_value=0.0, least_use=0.0, belief_share=0.0)
@@ -77,7 +84,7 @@ class CollaborationAgent:
         self._helped: dict[str, tuple[int, FixMemory]] = {}
         self._copy: Belief | None = None
         self._listened = False
-        self.tallies = Tallies()
+        self.counters = MessageCounters()
         self.tier = LOWEST_TIER
         self.located: Located | None = None
         self.neighbours: frozenset[str] = frozenset()
@@ -90,26 +97,26 @@ class CollaborationAgent:
         """Whether collaboration has begun."""
         return self.located is not None and self.located.stamp_ns >= self._from_ns
 
-    def handle(self, message: Anything, now_ns: int) -> Sequence[Anything]:
+    def handle(self, message: AgentMessage, now_ns: int) -> Sequence[AgentMessage]:
         match message:
             case Located(frame=None) if message.stamp_ns > self._track_ns:
                 return self._located(message, now_ns)
             case Located() if message.frame is not None:
                 return self._framed(message, now_ns)
             case Presence(name, tier):
-                self.guests.present(name, tier is not None)
+                self.guests.set_presence(name, tier is not None)
                 self._tiers.pop(name, None)
                 if tier is not None and (name in self._teammates or name in self.guests):
                     self._tiers[name] = tier
-            case Stranger(name):
+            case UnknownRobot(name):
                 self.guests.notice(name, now_ns)
-            case Listened():
-                self._listened, self._copy = message.by_any, None
-            case Sent():
+            case BeliefSubscribers():
+                self._listened, self._copy = message.present, None
+            case HelpSent():
                 self._sent(message, now_ns)
         return ()
 
-    def _located(self, now: Located, now_ns: int) -> Sequence[Anything]:
+    def _located(self, now: Located, now_ns: int) -> Sequence[AgentMessage]:
         first = self.located is None
         self.located = now
         self._track_ns = now.stamp_ns
@@ -124,7 +131,7 @@ class CollaborationAgent:
         """Chooses the teammates whose tiers are followed, and those whose beliefs are of use."""
         forgotten_ns = now.stamp_ns - NEIGHBOUR_NS
         self.guests.forget(now.stamp_ns)
-        guests = self.guests.followed
+        guests = self.guests.watched
         self._seen = {
             name: fix
             for name, fix in self._seen.items()
@@ -160,7 +167,7 @@ class CollaborationAgent:
             if offer.value >= self._rules.least_value:
                 offers.append(offer)
             else:
-                self.tallies.of("fix", fix.robot).worthless += 1
+                self.counters.of("fix", fix.robot).worthless += 1
         offers.sort(key=lambda offer: (offer.urgent, offer.value), reverse=True)
         return [offer.fix for offer in offers if self._paid(offer, now_ns)]
 
@@ -201,7 +208,7 @@ class CollaborationAgent:
     def _paid(self, offer: _Offer, now_ns: int) -> bool:
         fix = offer.fix
         if not self._affords(now_ns, _size(fix), offer.value, offer.urgent):
-            self.tallies.of("fix", fix.robot).over_budget += 1
+            self.counters.of("fix", fix.robot).over_budget += 1
             return False
         self._helped[fix.robot] = fix.stamp_ns, offer.after
         return True
@@ -210,7 +217,7 @@ class CollaborationAgent:
 
     def _beliefs(self, now: Located, now_ns: int) -> list[Belief]:
         """The belief, when it is due, listened to, and news."""
-        rules, tally = self._rules, self.tallies.of("belief", "")
+        rules, tally = self._rules, self.counters.of("belief", "")
         due = now.stamp_ns >= self._belief_ns + int(1e9 / rules.belief_rate_hz)
         if not (due and self.helps and rules.passive and self._listened and not now.lost):
             return []
@@ -249,14 +256,14 @@ class CollaborationAgent:
             budget.refuse(now_ns, least)
         return admitted
 
-    def _sent(self, sent: Sent, now_ns: int) -> None:
+    def _sent(self, sent: HelpSent, now_ns: int) -> None:
         message = sent.message
         if not sent.size:
             self._not_sent(message, now_ns)
             return
         to = message.robot if isinstance(message, Fix) else ""
         topic = "fix" if isinstance(message, Fix) else "belief"
-        self.tallies.of(topic, to).add(sent.size, message.stamp_ns)
+        self.counters.of(topic, to).add(sent.size, message.stamp_ns)
 
     def _not_sent(self, message: Belief | Fix, now_ns: int) -> None:
         """A key that is new is often not listened to yet: the next frame may say the same again."""

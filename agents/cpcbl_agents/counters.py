@@ -3,7 +3,7 @@
 from cpcbl_transport.messages import Flow
 
 
-class Tally:
+class MessageCounter:
     """Help of one kind from or for one teammate."""
 
     def __init__(self) -> None:
@@ -17,14 +17,14 @@ class Tally:
         self.latest_ns = max(self.latest_ns, stamp_ns)
 
 
-class Tallies:
+class MessageCounters:
     """By (topic, teammate)."""
 
     def __init__(self) -> None:
-        self._tallies: dict[tuple[str, str], Tally] = {}
+        self._tallies: dict[tuple[str, str], MessageCounter] = {}
 
-    def of(self, topic: str, peer: str) -> Tally:
-        return self._tallies.setdefault((topic, peer), Tally())
+    def of(self, topic: str, peer: str) -> MessageCounter:
+        return self._tallies.setdefault((topic, peer), MessageCounter())
 
     def flows(self) -> tuple[Flow, ...]:
         """As they are reported; without those that counted nothing."""

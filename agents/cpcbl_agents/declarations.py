@@ -9,14 +9,14 @@ from cpcbl_agents.collaboration import CollaborationAgent
 from cpcbl_team.collaboration import LOWEST_TIER, tiers_heard
 from cpcbl_team.config import CollaborationSettings
 from cpcbl_transport import topics
-from cpcbl_transport.bus import Bus, Handle, Publisher, Receive, Watch
+from cpcbl_transport.bus import Bus, Handle, LivelinessCallback, MessageCallback, Publisher
 from cpcbl_transport.topics import Topic
 
 _TIERS = {str(tier): tier for tier in range(LOWEST_TIER + 1)}
 _BY_TIER = tuple(topic.key.split("/")[0] + "/" for topic in (topics.BELIEF, topics.FIX))
 
 
-class Wiring:
+class Declarations:
     """One robot's declarations; follows what its collaboration agent wants."""
 
     def __init__(
@@ -25,8 +25,8 @@ class Wiring:
         incarnation: str,
         rules: CollaborationSettings,
         bus: Bus,
-        receive: Receive,
-        watch: Watch,
+        receive: MessageCallback,
+        watch: LivelinessCallback,
     ) -> None:
         self._robot, self._incarnation, self._rules = robot, incarnation, rules
         self._bus, self._receive, self._watch = bus, receive, watch
@@ -47,7 +47,7 @@ class Wiring:
             self._publishers[key] = self._bus.publisher(key, topic.qos)
         return self._publishers[key]
 
-    def follow(self, agent: CollaborationAgent) -> frozenset[str]:
+    def update(self, agent: CollaborationAgent) -> frozenset[str]:
         """Declares what the agent wants now. The teammates that are no longer watched."""
         if agent.located is None:
             return frozenset()
@@ -55,7 +55,7 @@ class Wiring:
         if moved:
             self.tier = agent.tier
             key = topics.ALIVE.at(tier=agent.tier, robot=self._robot, incarnation=self._incarnation)
-            self._token = self._bus.announce(key)
+            self._token = self._bus.declare_token(key)
             self.announced += 1
         if moved or agent.sources != self._sources:
             self._sources = agent.sources
@@ -65,7 +65,7 @@ class Wiring:
         if agent.neighbours != self._neighbours:
             self._neighbours = agent.neighbours
             alive = (topics.ALIVE.at(robot=name) for name in agent.neighbours)
-            watch = self._bus.watch
+            watch = self._bus.watch_liveliness
             _declare(self._watching, alive, lambda k: watch(k, self._watch))
         if moved:
             for key in [k for k in self._publishers if k.startswith(_BY_TIER)]:
@@ -92,13 +92,13 @@ def _declare(
         declared.pop(key).close()
 
 
-class Tokens:
+class LivelinessTokens:
     """The liveliness tokens of teammates; one may have two for a while, the newest counts."""
 
     def __init__(self) -> None:
         self._tiers: dict[str, dict[str, int]] = {}
 
-    def changed(self, key: str, alive: bool) -> tuple[str, int | None] | None:
+    def update(self, key: str, alive: bool) -> tuple[str, int | None] | None:
         """The teammate and its tier, None once it is gone; None for what is no robot's token."""
         names: Mapping[str, str] = topics.ALIVE.names(key) or {}
         tier = _TIERS.get(names.get("tier", ""))

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cpcbl_team.inputs import Sightings
-from cpcbl_transport.messages import Frame, Look
+from cpcbl_transport.messages import AnnotatedFrame, Frame
 
 NEEDS_OPENCV = "needs OpenCV: pip install 'cpcbl-team[camera]'"
 
@@ -24,5 +24,5 @@ class Eyes(Protocol):
     def seen(self, frame: Frame | Picture) -> Sightings | str:
         """What is in a frame, at its stamp; or why the frame cannot be used (`frame_...`)."""
 
-    def shown(self, frame: Frame | Picture) -> tuple[Sightings | str, Look]:
+    def shown(self, frame: Frame | Picture) -> tuple[Sightings | str, AnnotatedFrame]:
         """The same, and the frame with all that drawn into it."""

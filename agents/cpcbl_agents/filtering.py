@@ -3,7 +3,7 @@
 from collections import Counter, deque
 from collections.abc import Sequence
 
-from cpcbl_agents.agent import Anything, Located, Presence, Tick
+from cpcbl_agents.agent import AgentMessage, Located, Presence, Tick
 from cpcbl_team.config import Field, LocalizationSettings
 from cpcbl_team.inputs import Belief, Fix, Input, Odometry, Position, Sightings, Told
 from cpcbl_team.localizer import Localizer
@@ -58,7 +58,7 @@ class FilterAgent:
         """How each teammate that is heard stands with this robot."""
         return standings(self.timeline.state.memory.voices, now_ns)
 
-    def handle(self, message: Anything, now_ns: int) -> Sequence[Anything]:
+    def handle(self, message: AgentMessage, now_ns: int) -> Sequence[AgentMessage]:
         match message:
             case Odometry():
                 if self._take(message) and message.stamp_ns > self._covered_ns:

@@ -20,7 +20,7 @@ AGAIN_NS = 50_000_000  # while no field listens
 PATIENCE_NS = 3_000_000_000  # so long it may take until something is sensed
 
 
-class Visit:
+class GuestNode:
     """Runs a guest that `team` holds beside its robots, from `start_ns` until `leave`."""
 
     def __init__(
@@ -50,9 +50,9 @@ class Visit:
         return self._node.waiting
 
     @property
-    def heard(self) -> tuple[Flow, ...]:
+    def received(self) -> tuple[Flow, ...]:
         """Help that others have sent it."""
-        return self._node.heard.flows()
+        return self._node.received.flows()
 
     @property
     def counts(self) -> Counter[str]:
@@ -60,7 +60,7 @@ class Visit:
         return self.robot.counts + self._node.counts
 
     @property
-    def unfed(self) -> str:
+    def missing_input(self) -> str:
         """Why nothing has been sensed so far; empty if something has."""
         if self.robot.sensing.counts:
             return ""
@@ -76,8 +76,8 @@ class Visit:
         """What a node does, and a word to the field when it is due."""
         if self._warn_ns is not None and now_ns >= self._warn_ns:
             self._warn_ns = None
-            if self.unfed:
-                log.warning("%s %s", self.robot.name, self.unfed)
+            if self.missing_input:
+                log.warning("%s %s", self.robot.name, self.missing_input)
         if self._model is not None and now_ns >= self._due_ns:
             self._due_ns = now_ns + (ASK_NS if self._ask(now_ns, self._model) else AGAIN_NS)
         self._node.step(now_ns)

@@ -7,12 +7,12 @@ looked up on the bus; one whose token is there is a guest until that goes.
 from collections import Counter
 from collections.abc import Collection
 
-TRIED_NS = 1_000_000_000  # so long a stranger keeps others waiting
-FORGOTTEN_NS = 10_000_000_000  # so long one without a token is remembered after it was noticed
-REMEMBERED = 64  # names of those who found no room, and of those who were looked up in vain
+LOOKUP_NS = 1_000_000_000  # so long a stranger keeps others waiting
+FORGET_NS = 10_000_000_000  # so long one without a token is remembered after it was noticed
+MAX_REMEMBERED = 64  # names of those who found no room, and of those who were looked up in vain
 
 
-class Guests:
+class GuestRegistry:
     """The guests and strangers of one robot: at most `most` of both together.
 
     `known`: names that are neither: the map's, the team file's.
@@ -31,7 +31,7 @@ class Guests:
         return name in self._here
 
     @property
-    def followed(self) -> frozenset[str]:
+    def watched(self) -> frozenset[str]:
         """Guests and strangers: their tokens are of interest."""
         return frozenset(self._noticed)
 
@@ -57,13 +57,13 @@ class Guests:
         if not strangers or since_ns == now_ns or now_ns < self._vain.get(name, now_ns):
             return False
         oldest = min(strangers, key=strangers.__getitem__)
-        if now_ns - strangers[oldest] < TRIED_NS:
+        if now_ns - strangers[oldest] < LOOKUP_NS:
             return False
         del self._noticed[oldest]
-        _remember(self._vain, oldest, now_ns + FORGOTTEN_NS)
+        _remember(self._vain, oldest, now_ns + FORGET_NS)
         return True
 
-    def present(self, name: str, there: bool) -> None:
+    def set_presence(self, name: str, there: bool) -> None:
         """What the bus says of the token of somebody who is followed."""
         if there and name in self._noticed and name not in self._here:
             self._here.add(name)
@@ -74,7 +74,7 @@ class Guests:
 
     def forget(self, now_ns: int) -> None:
         """Strangers of whom nothing was seen or heard for long."""
-        old_ns = now_ns - FORGOTTEN_NS
+        old_ns = now_ns - FORGET_NS
         for name in [n for n, (_, last) in self._noticed.items() if last < old_ns]:
             if name not in self._here:
                 del self._noticed[name]
@@ -84,5 +84,5 @@ def _remember(names: dict[str, int], name: str, time_ns: int) -> None:
     """The latest few."""
     names.pop(name, None)
     names[name] = time_ns
-    if len(names) > REMEMBERED:
+    if len(names) > MAX_REMEMBERED:
         del names[next(iter(names))]

@@ -5,10 +5,17 @@ from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator
 from typing import Protocol
 
-from cpcbl_agents.agent import Listened, Looked, Presence, Sent, Stranger, Tick
-from cpcbl_agents.clocks import Clocks
-from cpcbl_agents.counters import Tallies
-from cpcbl_agents.declarations import Tokens, Wiring
+from cpcbl_agents.agent import (
+    BeliefSubscribers,
+    FrameSubscribers,
+    HelpSent,
+    Presence,
+    Tick,
+    UnknownRobot,
+)
+from cpcbl_agents.clocks import ClockMonitor
+from cpcbl_agents.counters import MessageCounters
+from cpcbl_agents.declarations import Declarations, LivelinessTokens
 from cpcbl_agents.robot import Robot
 from cpcbl_team.config import Team
 from cpcbl_team.inputs import Belief, Fix
@@ -20,15 +27,15 @@ from cpcbl_transport.link_size import received_bytes, sent_bytes
 from cpcbl_transport.messages import (
     LARGEST_FRAME,
     LARGEST_PAYLOAD,
+    AnnotatedFrame,
     Drive,
     Help,
-    Look,
     Message,
     Refusal,
     Status,
     Track,
     Trust,
-    decode,
+    decode_tagged,
     encode,
     refusal,
 )
@@ -41,7 +48,7 @@ INBOX = 10_000
 ON_ARRIVAL = ("frame_skipped", "inbox_overflow", "news_overflow", "same_name_twice")
 
 
-class Stepped(Protocol):
+class Steppable(Protocol):
     """A robot's node, or whatever else is stepped like one."""
 
     @property
@@ -79,18 +86,20 @@ class Node:
         self._inbox: deque[tuple[str, bytes]] = deque(maxlen=INBOX)
         self._frames: deque[tuple[str, bytes]] = deque(maxlen=1)
         self._news: deque[tuple[str, bool]] = deque(maxlen=INBOX)
-        self._wiring = Wiring(robot.name, incarnation, rules, bus, self._arrived, self._seen_alive)
-        self._tokens = Tokens()
+        self._declarations = Declarations(
+            robot.name, incarnation, rules, bus, self._arrived, self._seen_alive
+        )
+        self._tokens = LivelinessTokens()
         self._listened, self._looked = "", False
         self._status_ns = start_ns
         # What threads of the bus count has its entry: to add one, another thread must not read
         self.counts: Counter[str] = Counter(dict.fromkeys(ON_ARRIVAL, 0))
-        self.heard = Tallies()
-        self._clocks = Clocks(rules.trust, speed) if rules.trust.enabled else None
+        self.received = MessageCounters()
+        self._clocks = ClockMonitor(rules.trust, speed) if rules.trust.enabled else None
         self._inputs = [
             bus.subscribe(topic.at(robot=robot.name), self._arrived) for topic in topics.INPUTS
         ]
-        self._own_name = bus.watch(topics.ALIVE.at(robot=robot.name), self._seen_my_name)
+        self._own_name = bus.watch_liveliness(topics.ALIVE.at(robot=robot.name), self._seen_my_name)
 
     # On a thread of the bus ---------------------------------------------------------------------
 
@@ -141,11 +150,11 @@ class Node:
         self._ask_for_listeners(now_ns)
         self._ask_for_lookers(now_ns)
         said = self._robot.handle(Tick(), now_ns)
-        for name in self._wiring.follow(self._robot.collaboration):
+        for name in self._declarations.update(self._robot.collaboration):
             self._tokens.forget(name)
             self._robot.handle(Presence(name, None), now_ns)
         self._send(said, now_ns)  # under the tier of what is said
-        if now_ns - self._status_ns >= STATUS_NS and self._wiring.tier is not None:
+        if now_ns - self._status_ns >= STATUS_NS and self._declarations.tier is not None:
             self._status_ns = now_ns
             self._publish(topics.STATUS, topics.STATUS.at(robot=self._name), self._status(now_ns))
 
@@ -158,7 +167,7 @@ class Node:
     def _take_tokens(self, now_ns: int) -> None:
         """What the bus knows of teammates: who is there, with which tier."""
         for _ in range(len(self._news)):
-            presence = self._tokens.changed(*self._news.popleft())
+            presence = self._tokens.update(*self._news.popleft())
             if presence is None:
                 self.counts["bad_token"] += 1
                 continue
@@ -169,28 +178,28 @@ class Node:
                 log.info("%s: guest %s %s", self._name, name, "left" if known else "joined")
 
     def _ask_for_listeners(self, now_ns: int) -> None:
-        tier = self._wiring.tier
+        tier = self._declarations.tier
         if tier is None or not self._passive:
             return
         key = topics.BELIEF.at(tier=tier, robot=self._name)
-        listened = key if self._wiring.publisher(topics.BELIEF, key).matching else ""
+        listened = key if self._declarations.publisher(topics.BELIEF, key).matching else ""
         if listened != self._listened:  # to another key others may listen
             self._listened = listened
-            self._robot.handle(Listened(bool(listened)), now_ns)
+            self._robot.handle(BeliefSubscribers(bool(listened)), now_ns)
 
     def _ask_for_lookers(self, now_ns: int) -> None:
-        if not self._robot.sensing.has_eyes:
+        if not self._robot.sensing.has_detector:
             return
         key = topics.LOOK.at(robot=self._name)
-        looked = self._wiring.publisher(topics.LOOK, key).matching
+        looked = self._declarations.publisher(topics.LOOK, key).matching
         if looked is not self._looked:
             self._looked = looked
-            self._robot.handle(Looked(looked), now_ns)
+            self._robot.handle(FrameSubscribers(looked), now_ns)
 
     def _accepted(self, key: str, payload: bytes, now_ns: int) -> Message | None:
         helps = key.startswith(("belief/", "fix/"))
         largest = LARGEST_FRAME if key == self._frame_key else LARGEST_PAYLOAD
-        message = decode_help(key, payload) if helps else decode(payload, largest)
+        message = decode_help(key, payload) if helps else decode_tagged(payload, largest)
         reason = message if isinstance(message, Refusal) else self._refused(key, message, now_ns)
         if reason is not None:
             self.counts[reason] += 1
@@ -202,9 +211,9 @@ class Node:
         """What was heard, once that has been used."""
         match message:
             case Fix(observer=name):  # by a subscription to all observers
-                self.heard.of("fix", name).add(received_bytes(size, name), message.stamp_ns)
+                self.received.of("fix", name).add(received_bytes(size, name), message.stamp_ns)
             case Belief(robot=name):  # by one to this key
-                self.heard.of("belief", name).add(sent_bytes(size), message.stamp_ns)
+                self.received.of("belief", name).add(sent_bytes(size), message.stamp_ns)
 
     def _refused(self, key: str, message: Message, now_ns: int) -> Refusal | None:
         """What the key allows, who may say it, then the numbers and the time."""
@@ -216,11 +225,11 @@ class Node:
             case _:
                 return Refusal.WRONG_TYPE
         if sender not in self._team and sender not in self._robot.collaboration.guests:
-            self._robot.handle(Stranger(sender), now_ns)
+            self._robot.handle(UnknownRobot(sender), now_ns)
             return Refusal.UNKNOWN_ROBOT
         if sender == self._name:
             return Refusal.OWN
-        if self._clocks is not None and self._clocks.refuses(sender, message.stamp_ns, now_ns):
+        if self._clocks is not None and self._clocks.rejects(sender, message.stamp_ns, now_ns):
             return Refusal.CLOCK
         return refusal(message, now_ns)
 
@@ -229,10 +238,10 @@ class Node:
             topic, key = self._addressed(message)
             size = self._publish(topic, key, message)
             if isinstance(message, topics.COLLABORATION):
-                self._robot.handle(Sent(message, sent_bytes(size) if size else 0), now_ns)
+                self._robot.handle(HelpSent(message, sent_bytes(size) if size else 0), now_ns)
 
     def _addressed(self, message: Message) -> tuple[Topic, str]:
-        me, tier = self._name, self._wiring.tier
+        me, tier = self._name, self._declarations.tier
         match message:
             case Belief():
                 return topics.BELIEF, topics.BELIEF.at(tier=tier, robot=me)
@@ -241,7 +250,7 @@ class Node:
                 return topics.FIX, key
             case Track():
                 return topics.TRACK, topics.TRACK.at(robot=me)
-            case Look():
+            case AnnotatedFrame():
                 return topics.LOOK, topics.LOOK.at(robot=me)
             case Drive():
                 return topics.DRIVE, topics.DRIVE.at(robot=me)
@@ -249,7 +258,7 @@ class Node:
 
     def _publish(self, topic: Topic, key: str, message: Message) -> int:
         """Sends if anybody listens; the bytes of the payload."""
-        publisher = self._wiring.publisher(topic, key)
+        publisher = self._declarations.publisher(topic, key)
         if not publisher.matching:
             return 0
         payload = encode_help(message) if isinstance(message, Help) else encode(message)
@@ -260,7 +269,8 @@ class Node:
         located = self._robot.collaboration.located
         assert located is not None
         learned = self._robot.filter.learned
-        sent, heard = self._robot.collaboration.tallies.flows(), self.heard.flows()
+        sent, heard = self._robot.collaboration.counters.flows(), self.received.flows()
+        announced = Counter(announced=self._declarations.announced)
         return Status(
             self._name,
             self._incarnation,
@@ -269,7 +279,7 @@ class Node:
             located.estimate.heading_sigma_rad,
             self._robot.collaboration.tier,
             located.lost,
-            dict(self._robot.counts + self.counts + Counter(announced=self._wiring.announced)),
+            dict(self._robot.counts + self.counts + announced),
             sum(flow.messages for flow in sent),
             sum(flow.bytes for flow in sent),
             sum(flow.messages for flow in heard),

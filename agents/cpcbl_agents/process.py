@@ -13,7 +13,7 @@ from types import FrameType
 import msgspec
 
 from cpcbl_agents.clock import Clock
-from cpcbl_agents.node import Node, Stepped
+from cpcbl_agents.node import Node, Steppable
 from cpcbl_agents.robot import Robot
 from cpcbl_agents.sources import OwnCamera
 from cpcbl_team.config import Team
@@ -31,7 +31,7 @@ SET_S = 0.25  # a clock that is set by more makes inputs late, or from the futur
 BUSY_NS = 1_000_000  # after a step: what comes sooner may have queued behind it
 
 
-class Stop:
+class StopSignal:
     """Set by SIGINT, SIGTERM and SIGHUP (a closed terminal, unless it is ignored: nohup), and when
     the process that started this one is gone."""
 
@@ -64,7 +64,7 @@ class Loop:
         self._turn, self._asleep = threading.Lock(), threading.Lock()
         self._turn.acquire()  # nobody's, but while it runs
         self._asleep.acquire()
-        self._node: Stepped
+        self._node: Steppable
         self._busy_ns = 0
         self._bug: BaseException | None = None
 
@@ -73,7 +73,7 @@ class Loop:
         with suppress(RuntimeError):  # it was awake already
             self._asleep.release()
 
-    def arrived(self) -> None:
+    def on_arrival(self) -> None:
         """From a thread of the bus: something has arrived and is put away."""
         if time.monotonic_ns() < self._busy_ns or not self._turn.acquire(blocking=False):
             self.wake()
@@ -87,7 +87,7 @@ class Loop:
             self._busy_ns = time.monotonic_ns() + BUSY_NS
             self._turn.release()
 
-    def run(self, node: Stepped, stop: Callable[[], bool]) -> None:
+    def run(self, node: Steppable, stop: Callable[[], bool]) -> None:
         """Until `stop()`, or a bug: that is raised here, wherever it was."""
         self._node = node
         self._turn.release()
@@ -115,7 +115,7 @@ def run_robot(
     clock: Clock,
     stop: Callable[[], bool],
     restarted: bool = False,
-    through: Callable[[Bus], Bus] = lambda bus: bus,
+    wrap_bus: Callable[[Bus], Bus] = lambda bus: bus,
 ) -> None:
     """Runs a robot until `stop()`. One that is restarted, or late, does not know where it is.
 
@@ -131,13 +131,13 @@ def run_robot(
         own_camera(name, team, clock, loop.wake) as camera,
         open_bus(team.name, link.endpoints, stop, link.credentials) as bus,
     ):
-        robot = begun(name, team, clock, restarted, camera)
+        robot = make_robot(name, team, clock, restarted, camera)
         start_ns, incarnation = clock.now_ns(), new_incarnation()
-        node = Node(robot, team, through(bus), start_ns, incarnation, loop.arrived, clock.speed)
-        loop.run(node, while_time_holds(name, team, clock, stop))
+        node = Node(robot, team, wrap_bus(bus), start_ns, incarnation, loop.on_arrival, clock.speed)
+        loop.run(node, stop_on_clock_step(name, team, clock, stop))
 
 
-def begun(
+def make_robot(
     name: str, team: Team, clock: Clock, restarted: bool = False, camera: OwnCamera | None = None
 ) -> Robot:
     """The robot as it starts now. After a restart it does not know where it is, nor what it spent.
@@ -159,7 +159,7 @@ def new_incarnation() -> str:
     return secrets.token_hex(4)
 
 
-def while_time_holds(
+def stop_on_clock_step(
     name: str, team: Team, clock: Clock, stop: Callable[[], bool]
 ) -> Callable[[], bool]:
     """`stop`, which raises ClockError when the machine's time was set under a robot with real
@@ -168,7 +168,7 @@ def while_time_holds(
         return stop
 
     def checked() -> bool:
-        if abs(by_s := clock.set_by_s()) > SET_S:
+        if abs(by_s := clock.clock_step_s()) > SET_S:
             raise ClockError(
                 f"robot {name}: this machine's clock was set by {by_s:+.2f} s, or it slept: start"
                 " the robot again"

@@ -3,19 +3,19 @@
 from collections import Counter
 from pathlib import Path
 
-from cpcbl_agents.agent import Anything, FromBus, Looked, Presence, Sent, Tick
+from cpcbl_agents.agent import AgentMessage, BusEvent, FrameSubscribers, HelpSent, Presence, Tick
 from cpcbl_agents.collaboration import CollaborationAgent
 from cpcbl_agents.detector import Eyes
 from cpcbl_agents.filtering import FilterAgent
-from cpcbl_agents.guests import Guests
+from cpcbl_agents.guests import GuestRegistry
 from cpcbl_agents.sensing import SensingAgent
-from cpcbl_agents.sources import OwnCamera, Silent, Source
+from cpcbl_agents.sources import NoSource, OwnCamera, Source
 from cpcbl_agents.sources.mrclam import MrclamSource
-from cpcbl_agents.waypoint_follower import Pilot
+from cpcbl_agents.waypoint_follower import WaypointFollower
 from cpcbl_team.config import Team
 from cpcbl_team.inputs import Belief, Fix, Odometry, Position, Sightings, Told
 from cpcbl_transport.budget import Budget
-from cpcbl_transport.messages import Drive, Frame, Help, Look, Message, Track
+from cpcbl_transport.messages import AnnotatedFrame, Drive, Frame, Help, Message, Track
 
 NEVER_NS = 2**62
 _OUTGOING = (Belief, Fix, Track, Drive)
@@ -43,8 +43,8 @@ class Robot:
         marks = frozenset(team.map.landmarks) | frozenset(team.map.walls)
         pilot = None
         if settings.source == "simulated":
-            pilot = Pilot(name, settings.waypoints_m, settings.speed_m_s)
-        source: Source = Silent()
+            pilot = WaypointFollower(name, settings.waypoints_m, settings.speed_m_s)
+        source: Source = NoSource()
         if settings.source == "mrclam":
             source = MrclamSource(Path(team.data), name)
             start_ns = max(start_ns, source.first_ns)
@@ -61,37 +61,37 @@ class Robot:
             match_s=team.match.duration_s,
         )
         most = team.guests.most if team.guests.allowed else 0
-        guests = Guests(marks | frozenset(team.robots), most)
+        guests = GuestRegistry(marks | frozenset(team.robots), most)
         self.collaboration = CollaborationAgent(name, settings, teammates, start_ns, budget, guests)
 
-    def handle(self, message: Message | Tick | FromBus, now_ns: int) -> list[Message]:
+    def handle(self, message: Message | Tick | BusEvent, now_ns: int) -> list[Message]:
         """Everything that one message (from the bus, or a tick) makes this robot say to others.
 
         sensing -> filter -> collaboration; what the filter locates goes to the pilot as well.
         After the end of its log a robot is silent.
         """
-        if self.sensing.over:
+        if self.sensing.is_finished:
             return []
-        if isinstance(message, FromBus):
+        if isinstance(message, BusEvent):
             self.collaboration.handle(message, now_ns)
-            if isinstance(message, Looked):
+            if isinstance(message, FrameSubscribers):
                 self.sensing.handle(message, now_ns)
             if isinstance(message, Presence):
                 there = message.robot in self.collaboration.guests
                 self.filter.handle(message if there else message._replace(tier=None), now_ns)
-            if isinstance(message, Sent) and message.size:
+            if isinstance(message, HelpSent) and message.size:
                 self._told(message.message.stamp_ns, now_ns)
             return []
         if isinstance(message, Help):  # they change what is said at the next tick
             self.filter.handle(message, now_ns)
             return []
         raw = isinstance(message, (Odometry, Sightings, Position, Frame))
-        inputs: list[Anything] = [] if raw else [message]
+        inputs: list[AgentMessage] = [] if raw else [message]
         inputs += self.sensing.handle(message, now_ns)
         located = [out for m in inputs for out in self.filter.handle(m, now_ns)]
         said = [out for m in located for out in self.collaboration.handle(m, now_ns)]
         said += [out for m in located for out in self.sensing.handle(m, now_ns)]
-        looks = [m for m in inputs if isinstance(m, Look)]
+        looks = [m for m in inputs if isinstance(m, AnnotatedFrame)]
         return [*looks, *(m for m in said if isinstance(m, _OUTGOING))]
 
     def _told(self, stamp_ns: int, now_ns: int) -> None:
@@ -103,7 +103,7 @@ class Robot:
     @property
     def next_ns(self) -> int:
         """When the next tick is worth it."""
-        if self.sensing.over:
+        if self.sensing.is_finished:
             return NEVER_NS
         source_ns = self.sensing.next_ns
         due_ns = self.filter.next_ns

@@ -5,10 +5,10 @@ from collections.abc import Sequence
 
 import msgspec
 
-from cpcbl_agents.agent import Anything, Located, Looked, Tick
+from cpcbl_agents.agent import AgentMessage, FrameSubscribers, Located, Tick
 from cpcbl_agents.detector import Eyes, Picture
 from cpcbl_agents.sources import OwnCamera, Source
-from cpcbl_agents.waypoint_follower import Pilot
+from cpcbl_agents.waypoint_follower import WaypointFollower
 from cpcbl_team.config import LocalizationSettings
 from cpcbl_team.inputs import Odometry, Position, Sightings
 from cpcbl_team.sensors import corrected_odometry, corrected_sighting, once_each
@@ -31,7 +31,7 @@ class SensingAgent:
         settings: LocalizationSettings,
         source: Source,
         marks: frozenset[str],
-        pilot: Pilot | None = None,
+        pilot: WaypointFollower | None = None,
         eyes: Eyes | None = None,
         camera: OwnCamera | None = None,
     ) -> None:
@@ -49,7 +49,7 @@ class SensingAgent:
         return self._counts + (Counter() if self._camera is None else self._camera.counts)
 
     @property
-    def has_eyes(self) -> bool:
+    def has_detector(self) -> bool:
         return self._eyes is not None
 
     @property
@@ -58,10 +58,10 @@ class SensingAgent:
         return min((s.next_ns for s in sources if s.next_ns is not None), default=None)
 
     @property
-    def over(self) -> bool:
-        return self._source.over
+    def is_finished(self) -> bool:
+        return self._source.is_finished
 
-    def handle(self, message: Anything, now_ns: int) -> Sequence[Anything]:
+    def handle(self, message: AgentMessage, now_ns: int) -> Sequence[AgentMessage]:
         match message:
             case Tick():
                 items = list(self._source.poll(now_ns))
@@ -69,20 +69,20 @@ class SensingAgent:
                 return [out for item in items for out in self._sensed(item)]
             case Odometry() | Sightings() | Position() | Frame():
                 return self._sensed(message)
-            case Looked():
-                self._looked = message.by_any
+            case FrameSubscribers():
+                self._looked = message.present
             case Located() if self._pilot is not None and message.frame is None:
                 return self._pilot.command(message)
         return ()
 
-    def _sensed(self, item: SensorInput | Picture) -> Sequence[Anything]:
+    def _sensed(self, item: SensorInput | Picture) -> Sequence[AgentMessage]:
         if not isinstance(item, Frame | Picture):
             return [self._corrected(item)]
         if self._eyes is None:
             self._counts["no_camera"] += 1
             return ()
         self._counts["frame"] += 1
-        said: list[Anything] = []
+        said: list[AgentMessage] = []
         if self._looked and not 0 <= item.stamp_ns - self._look_ns < LOOK_NS:
             self._look_ns = item.stamp_ns
             seen, look = self._eyes.shown(item)

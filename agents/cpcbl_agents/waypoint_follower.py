@@ -12,14 +12,14 @@ MOST_TURN_RAD_S = 1.5
 COMMAND_NS = 100_000_000
 
 
-def steer(pose: Pose2, goal: tuple[float, float], speed_m_s: float) -> tuple[float, float]:
+def pursue(pose: Pose2, goal: tuple[float, float], speed_m_s: float) -> tuple[float, float]:
     """(speed, turn rate) towards a goal: turns on the spot first where it lies aside."""
     bearing = wrap_angle(math.atan2(goal[1] - pose.y, goal[0] - pose.x) - pose.heading)
     turn_rate = max(-MOST_TURN_RAD_S, min(MOST_TURN_RAD_S, 2.0 * bearing))
     return speed_m_s * max(0.0, math.cos(bearing)) ** 3, turn_rate
 
 
-class Pilot:
+class WaypointFollower:
     """Drives loops; stops while it is lost."""
 
     def __init__(
@@ -36,7 +36,7 @@ class Pilot:
         if located.lost:  # looks around
             return [Drive(self._robot, located.stamp_ns, 0.0, 0.5, self._reached)]
         pose = located.estimate.pose
-        command = steer(pose, self._goal_from(pose), self._speed)
+        command = pursue(pose, self._goal_from(pose), self._speed)
         return [Drive(self._robot, located.stamp_ns, *command, self._reached)]
 
     def _goal_from(self, pose: Pose2) -> tuple[float, float]:

@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from cpcbl_agents.clock import Clock
-from cpcbl_agents.process import Stop, run_robot
+from cpcbl_agents.process import StopSignal, run_robot
 from cpcbl_launch.team_file import TeamFileError, endpoint_problem, find_team
 from cpcbl_team.config import Team
 from cpcbl_team.errors import InputError
@@ -69,7 +69,7 @@ def run_robot_command(
         team,
         arguments.connect or team.transport.connect,
         clock,
-        Stop(arguments.parent),
+        StopSignal(arguments.parent),
         arguments.restarted,
         lambda bus: wrap_bus(arguments.name, clock, bus),
     )

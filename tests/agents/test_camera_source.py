@@ -59,7 +59,7 @@ def test_a_video_is_played_at_its_rate_from_the_first_poll_on(video: Path) -> No
     assert source.next_ns == SECOND + 50 * MS
     assert polled(source, SECOND + 49 * MS) == []
     assert polled(source, SECOND + 60 * MS) == [(SECOND + 50 * MS, 1)]
-    assert not source.over
+    assert not source.is_finished
     assert not source.counts
 
 
@@ -74,12 +74,12 @@ def test_a_video_ends(video: Path) -> None:
     source = camera(video)
     played = [pair for now in range(0, SECOND, 50 * MS) for pair in polled(source, now)]
     assert played == [(50 * n * MS, n) for n in range(6)]
-    assert source.over
+    assert source.is_finished
     assert source.next_ns is None
     late = camera(video)
     late.poll(0)
     assert polled(late, 10 * SECOND) == []
-    assert late.over
+    assert late.is_finished
     assert late.counts == {"frame_skipped": 5}
 
 
@@ -99,7 +99,7 @@ def test_a_folder_is_played_by_name_at_the_sensors_rate(tmp_path: Path) -> None:
     source = camera(tmp_path, rate_hz=4.0)
     played = [pair for now in range(0, 2 * SECOND, 125 * MS) for pair in polled(source, now)]
     assert played == [(0, 0), (250 * MS, 1), (500 * MS, 2)]
-    assert source.over
+    assert source.is_finished
 
 
 def test_a_picture_that_is_gone_or_broken_is_a_frame_that_cannot_be_used(tmp_path: Path) -> None:
@@ -172,7 +172,7 @@ def test_of_a_live_camera_the_newest_frame_is_taken_with_its_stamp() -> None:
         assert picture.stamp_ns >= 40 * MS
         assert camera.next_picture().stamp_ns > picture.stamp_ns
         assert camera.source.next_ns is None
-        assert not camera.source.over
+        assert not camera.source.is_finished
 
 
 def test_a_camera_that_is_faster_than_the_sensor_is_taken_at_the_sensors_rate() -> None:

@@ -3,9 +3,9 @@
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from support.buses import MS, SECOND, Stand, robot_at, saw, team_of
+from support.buses import MS, SECOND, TeamOnBus, robot_at, saw, team_of
 
-from cpcbl_agents.clocks import LEAST_WORDS, SPAN_NS, Clocks
+from cpcbl_agents.clocks import MIN_MESSAGES, SPAN_NS, ClockMonitor
 from cpcbl_team.config import TrustSettings
 from cpcbl_team.inputs import Fix, Sighting
 from cpcbl_transport import topics
@@ -16,15 +16,17 @@ NOW = 3 * SECOND
 HOUR = 3600 * SECOND
 
 
-def heard(clocks: Clocks, late_ns: int, words: int = LEAST_WORDS, now_ns: int = NOW) -> list[bool]:
+def heard(
+    clocks: ClockMonitor, late_ns: int, words: int = MIN_MESSAGES, now_ns: int = NOW
+) -> list[bool]:
     """Which of so many words are refused that arrive at 10 Hz, each so long after its stamp."""
     times = (now_ns + i * 100 * MS for i in range(words))
-    return [clocks.refuses("mate", now - late_ns, now) for now in times]
+    return [clocks.rejects("mate", now - late_ns, now) for now in times]
 
 
 @pytest.mark.parametrize("late_ns", [-100 * MS, 0, 20 * MS, 399 * MS])
 def test_a_clock_within_the_bounds_is_tolerated(late_ns: int) -> None:
-    clocks = Clocks(RULES)
+    clocks = ClockMonitor(RULES)
     assert not any(heard(clocks, late_ns, 200))
     assert clocks.off() == frozenset()
     assert clocks.late_s("mate") == pytest.approx(late_ns * 1e-9)
@@ -32,31 +34,31 @@ def test_a_clock_within_the_bounds_is_tolerated(late_ns: int) -> None:
 
 @pytest.mark.parametrize("late_ns", [-110 * MS, -500 * MS, -HOUR, 410 * MS, 500 * MS, HOUR])
 def test_a_clock_beyond_them_is_found_and_refused(late_ns: int) -> None:
-    clocks = Clocks(RULES)
+    clocks = ClockMonitor(RULES)
     refused = heard(clocks, late_ns, 20)
-    assert all(refused[LEAST_WORDS:])
+    assert all(refused[MIN_MESSAGES:])
     assert clocks.off() == {"mate"}
     assert clocks.late_s("mate") == pytest.approx(late_ns * 1e-9)
 
 
 def test_what_arrives_before_it_was_measured_is_refused_at_once() -> None:
-    assert heard(Clocks(RULES), -200 * MS, 1) == [True]
+    assert heard(ClockMonitor(RULES), -200 * MS, 1) == [True]
 
 
 def test_a_single_word_that_waited_is_used() -> None:
-    clocks = Clocks(RULES)
+    clocks = ClockMonitor(RULES)
     assert heard(clocks, 1500 * MS, 1) == [False]
     assert not any(heard(clocks, 20 * MS, 20))
 
 
 def test_a_single_word_from_far_ahead_casts_no_doubt_on_the_next() -> None:
-    clocks = Clocks(RULES)
+    clocks = ClockMonitor(RULES)
     heard(clocks, -FUTURE_NS - 1, 1)
     assert not any(heard(clocks, 20 * MS, 20))
 
 
 def test_a_congested_link_is_not_taken_for_a_slow_clock_while_some_words_are_quick() -> None:
-    clocks = Clocks(RULES)
+    clocks = ClockMonitor(RULES)
     refused = [
         heard(clocks, late * MS, 1, NOW + i * 100 * MS) for i, late in enumerate([50, 900] * 20)
     ]
@@ -65,7 +67,7 @@ def test_a_congested_link_is_not_taken_for_a_slow_clock_while_some_words_are_qui
 
 @pytest.mark.parametrize("late_ns", [-500 * MS, 500 * MS])
 def test_a_clock_that_was_set_right_is_believed_again(late_ns: int) -> None:
-    clocks = Clocks(RULES)
+    clocks = ClockMonitor(RULES)
     heard(clocks, late_ns, 50)
     heard(clocks, 20 * MS, 2 * SPAN_NS // (100 * MS), NOW + 5 * SECOND)
     assert not any(heard(clocks, 20 * MS, 10, NOW + 5 * SECOND + 2 * SPAN_NS))
@@ -73,19 +75,19 @@ def test_a_clock_that_was_set_right_is_believed_again(late_ns: int) -> None:
 
 
 def test_a_clock_that_goes_wrong_is_found_within_two_spans() -> None:
-    clocks = Clocks(RULES)
+    clocks = ClockMonitor(RULES)
     heard(clocks, 20 * MS, 50)
     assert heard(clocks, 600 * MS, 2 * SPAN_NS // (100 * MS), NOW + 5 * SECOND)[-1]
 
 
 def test_where_robot_time_runs_faster_links_are_slower_in_it() -> None:
-    assert not any(heard(Clocks(RULES, speed=10.0), 3 * SECOND, 20))
-    assert any(heard(Clocks(RULES, speed=0.1), 500 * MS, 20))
+    assert not any(heard(ClockMonitor(RULES, speed=10.0), 3 * SECOND, 20))
+    assert any(heard(ClockMonitor(RULES, speed=0.1), 500 * MS, 20))
 
 
 @given(st.lists(st.integers(0, 400 * MS), max_size=100))
 def test_no_link_that_is_quick_enough_makes_a_clock_look_off(delays: list[int]) -> None:
-    clocks = Clocks(RULES)
+    clocks = ClockMonitor(RULES)
     for i, late_ns in enumerate(delays):
         assert not heard(clocks, late_ns, 1, NOW + i * 50 * MS)[0]
 
@@ -93,7 +95,7 @@ def test_no_link_that_is_quick_enough_makes_a_clock_look_off(delays: list[int]) 
 def told(offset_ns: int, trust: TrustSettings = RULES) -> Status:
     """A robot's status after 2 s of fixes from a mate whose clock is ahead by so much."""
     me = robot_at(trust=trust, direction="both-ways")  # whatever its own tier
-    stand = Stand(team_of(me=me, mate=robot_at(4.0)), here=["me"])
+    stand = TeamOnBus(team_of(me=me, mate=robot_at(4.0)), here=["me"])
     stand.announce("mate", 2)
     stand.stand_still(0.2)
     for _ in range(20):

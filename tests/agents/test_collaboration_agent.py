@@ -11,9 +11,9 @@ from msgspec.structs import replace
 from support.buses import MS, SECOND, examples
 from support.core import diagonal
 
-from cpcbl_agents.agent import Listened, Located, Presence, Sent
+from cpcbl_agents.agent import BeliefSubscribers, HelpSent, Located, Presence
 from cpcbl_agents.collaboration import CollaborationAgent
-from cpcbl_agents.counters import Tally
+from cpcbl_agents.counters import MessageCounter
 from cpcbl_team.collaboration import LOWEST_TIER, next_tier
 from cpcbl_team.config import (
     BudgetSettings,
@@ -65,7 +65,7 @@ class Alone:
         self.located()
         assert self.agent.tier == tier
 
-    def tell(self, *presences: Presence | Listened) -> None:
+    def tell(self, *presences: Presence | BeliefSubscribers) -> None:
         for presence in presences:
             assert self.agent.handle(presence, self.now_ns) == ()
 
@@ -105,11 +105,11 @@ class Alone:
         assert len(messages) == len(said)
         for message in messages:
             size = sent_bytes(help_bytes(message))
-            self.agent.handle(Sent(message, size if self.heard else 0), self.now_ns)
+            self.agent.handle(HelpSent(message, size if self.heard else 0), self.now_ns)
         return messages
 
-    def tally(self, topic: str, peer: str = "") -> Tally:
-        return self.agent.tallies.of(topic, peer)
+    def tally(self, topic: str, peer: str = "") -> MessageCounter:
+        return self.agent.counters.of(topic, peer)
 
 
 def ahead(name: str = "mate", range_m: float = 2.0) -> Sighting:
@@ -152,7 +152,7 @@ def test_a_teammate_of_which_the_bus_knows_nothing_is_not_helped() -> None:
     assert len(alone.sees(ahead())) == 1
     alone.tell(Presence("mate", None))
     assert alone.sees(ahead(), after_ns=10 * SECOND) == []
-    assert alone.agent.tallies.flows() == (Flow("fix", "mate", 1, 42, latest_ns=2),)
+    assert alone.agent.counters.flows() == (Flow("fix", "mate", 1, 42, latest_ns=2),)
 
 
 def test_the_fix_that_is_worth_most_comes_first() -> None:
@@ -184,11 +184,11 @@ def test_help_that_nobody_heard_costs_nothing_and_is_offered_again() -> None:
         fix_interval_s=60.0,
         belief_silence_s=60.0,
     )
-    alone.tell(Presence("mate", POORER), Listened(by_any=True))
+    alone.tell(Presence("mate", POORER), BeliefSubscribers(present=True))
     alone.heard = False
     for _ in range(5):
         assert len(alone.sees(ahead())) == len(alone.later(0.2)) == 1
-    assert alone.agent.tallies.flows() == ()
+    assert alone.agent.counters.flows() == ()
     alone.heard = True
     assert len(alone.sees(ahead())) == len(alone.later(0.2)) == 1
     assert (alone.sees(ahead()), alone.later(0.2)) == ([], [])
@@ -225,7 +225,7 @@ def test_what_is_worth_too_little_is_not_sent_and_counted() -> None:
     alone = Alone()
     alone.tell(Presence("mate", GOOD + 1))
     assert alone.sees(ahead(range_m=7.0)) == []
-    assert alone.agent.tallies.flows() == (Flow("fix", "mate", worthless=1),)
+    assert alone.agent.counters.flows() == (Flow("fix", "mate", worthless=1),)
 
 
 def test_a_message_that_is_not_worth_its_price_is_counted_as_beyond_the_budget() -> None:
@@ -392,7 +392,7 @@ def test_every_offer_is_sent_or_counted_and_the_budget_holds(
         fixes = alone.sees(sight, after_ns=after_ns)
         sent += [(alone.now_ns, 42 if fix.heading_rad is None else 49) for fix in fixes]
         offers += tier > alone.agent.tier
-    flows = alone.agent.tallies.flows()
+    flows = alone.agent.counters.flows()
     assert sum(f.messages + f.worthless + f.over_budget for f in flows) == offers
     (spending,) = alone.agent.budget.spending(alone.now_ns)
     assert spending.most <= spending.allowed
@@ -413,17 +413,17 @@ def stamps_s(beliefs: list[Belief]) -> list[float]:
 def test_without_a_listener_no_belief_is_said_or_thought_of() -> None:
     alone = Alone()
     assert alone.later(3.0) == []
-    assert alone.agent.tallies.flows() == ()
+    assert alone.agent.counters.flows() == ()
 
 
 def test_a_new_listener_is_told_at_once() -> None:
     alone = Alone()
     alone.later(1.0)
-    alone.tell(Listened(by_any=True))
+    alone.tell(BeliefSubscribers(present=True))
     assert stamps_s(alone.later(0.5)) == [1.1]
-    alone.tell(Listened(by_any=False))
+    alone.tell(BeliefSubscribers(present=False))
     assert alone.later(0.2) == []
-    alone.tell(Listened(by_any=True))
+    alone.tell(BeliefSubscribers(present=True))
     assert stamps_s(alone.later(0.5)) == [1.8]
 
 
@@ -433,7 +433,7 @@ def test_while_the_listeners_copy_holds_there_is_silence_up_to_its_longest(
     silence_s: float, speed_m_s: float
 ) -> None:
     alone = Alone(belief_silence_s=silence_s)
-    alone.tell(Listened(by_any=True))
+    alone.tell(BeliefSubscribers(present=True))
     alone.becomes(speed_m_s=speed_m_s)
     stamps = stamps_s(alone.later(9.2))
     assert stamps == pytest.approx([0.2 + n * silence_s for n in range(len(stamps))])
@@ -444,7 +444,7 @@ def test_while_the_listeners_copy_holds_there_is_silence_up_to_its_longest(
 
 def test_a_robot_that_has_stopped_says_so() -> None:
     alone = Alone()
-    alone.tell(Listened(by_any=True))
+    alone.tell(BeliefSubscribers(present=True))
     alone.becomes(speed_m_s=0.5)
     assert stamps_s(alone.later(0.2)) == [0.2]
     alone.becomes(speed_m_s=0.0)
@@ -455,7 +455,7 @@ def test_a_robot_that_has_stopped_says_so() -> None:
 def test_a_robot_whose_sigma_has_changed_enough_says_so(factor: float, stamps: list[float]) -> None:
     """Half a sigma is a factor of 1.28."""
     alone = Alone(POOR)
-    alone.tell(Listened(by_any=True))
+    alone.tell(BeliefSubscribers(present=True))
     assert stamps_s(alone.later(0.3)) == [0.2]
     covariance = diagonal(SIGMA_M[POOR] * factor, 0.02)
     alone.becomes(estimate=alone.here.estimate._replace(covariance=covariance))
@@ -464,7 +464,7 @@ def test_a_robot_whose_sigma_has_changed_enough_says_so(factor: float, stamps: l
 
 def test_beliefs_that_are_always_news_keep_their_rate() -> None:
     alone = Alone(belief_share=0.0, belief_rate_hz=2.0)
-    alone.tell(Listened(by_any=True))
+    alone.tell(BeliefSubscribers(present=True))
     assert stamps_s(alone.later(3.0)) == [0.5, 1.0, 1.5, 2.0, 2.5, 3.0]
 
 
@@ -472,19 +472,19 @@ def test_a_belief_beyond_the_budget_is_counted_and_said_as_soon_as_it_may_be() -
     alone = Alone(
         budget=BudgetSettings(messages_per_minute=6.0, urgent_share=0.0), belief_share=0.0
     )
-    alone.tell(Listened(by_any=True))
+    alone.tell(BeliefSubscribers(present=True))
     alone.later(9.0)
     tally = alone.tally("belief")
     assert tally.messages == 6 or tally.over_budget > 0
     assert tally.messages + tally.over_budget == 45
-    alone.tell(Listened(by_any=True))
+    alone.tell(BeliefSubscribers(present=True))
     assert stamps_s(alone.later(52.0))[0] <= 60.2
 
 
 def test_no_beliefs_where_passive_help_is_switched_off_or_has_not_begun() -> None:
     for rules, then in (({"passive": False}, []), ({"after_s": 2.0}, [2.0])):
         alone = Alone(**rules)
-        alone.tell(Listened(by_any=True))
+        alone.tell(BeliefSubscribers(present=True))
         assert stamps_s(alone.later(2.5)) == then
 
 
@@ -571,7 +571,9 @@ def test_a_neighbour_is_forgotten_after_ten_seconds() -> None:
 def test_a_robot_that_is_lost_says_nothing_and_listens_to_all_who_are_better() -> None:
     vague = SensorSettings(range_share=0.3, bearing_sigma_deg=20.0)
     alone = looking(GOOD, sensor=vague, least_value=0.0)
-    alone.tell(Presence("mate", LOWEST_TIER - 1), Presence("other", POOR), Listened(by_any=True))
+    alone.tell(
+        Presence("mate", LOWEST_TIER - 1), Presence("other", POOR), BeliefSubscribers(present=True)
+    )
     assert len(alone.later(0.2)) == 1
     alone.becomes(lost=LOST)
     assert alone.sees(*map(ahead, sorted(MATES))) == []
@@ -586,7 +588,7 @@ def test_a_robot_that_is_lost_says_nothing_and_listens_to_all_who_are_better() -
 def test_a_robot_that_has_found_itself_helps_again() -> None:
     alone = looking(GOOD)
     alone.becomes(lost=LOST)
-    alone.tell(Listened(by_any=True))
+    alone.tell(BeliefSubscribers(present=True))
     assert (alone.later(1.0), alone.sees(ahead("third"))) == ([], [])
     alone.becomes(lost="")
     assert len(alone.later(0.1)) == 1
@@ -603,11 +605,11 @@ def test_an_older_report_changes_nothing() -> None:
 
 def test_what_has_left_the_robot_is_counted_by_kind_and_teammate() -> None:
     alone = Alone()
-    alone.tell(Presence("mate", POORER), Presence("other", POORER), Listened(by_any=True))
+    alone.tell(Presence("mate", POORER), Presence("other", POORER), BeliefSubscribers(present=True))
     (fix, _) = alone.sees(ahead("mate"), ahead("other"))
     (belief,) = alone.later(0.2)
-    alone.agent.handle(Sent(replace(fix, stamp_ns=7 * SECOND), 8), alone.now_ns)
-    assert alone.agent.tallies.flows() == (
+    alone.agent.handle(HelpSent(replace(fix, stamp_ns=7 * SECOND), 8), alone.now_ns)
+    assert alone.agent.counters.flows() == (
         Flow("belief", "", 1, 50, latest_ns=belief.stamp_ns),
         Flow("fix", fix.robot, 2, 50, latest_ns=7 * SECOND),
         Flow("fix", "other" if fix.robot == "mate" else "mate", 1, 42, latest_ns=fix.stamp_ns),

@@ -5,15 +5,16 @@ from typing import Any, NamedTuple
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from support.buses import Ear, Stand, examples, robot_at, saw, standing, team_of
+from support.buses import Subscription, TeamOnBus, examples, robot_at, saw, standing, team_of
 
-from cpcbl_agents.declarations import Tokens
+from cpcbl_agents.declarations import LivelinessTokens
 from cpcbl_agents.node import Node
 from cpcbl_agents.robot import Robot
 from cpcbl_team.collaboration import LOWEST_TIER
 from cpcbl_team.inputs import Fix, Odometry, Sighting
 from cpcbl_transport import topics
-from cpcbl_transport.bus import Handle, MemoryBus, MemoryHub, Publisher, Receive, Watch
+from cpcbl_transport.bus import Handle, LivelinessCallback, MessageCallback, Publisher
+from cpcbl_transport.memory_bus import MemoryBus, MemoryHub
 
 MS = 1_000_000
 
@@ -25,63 +26,63 @@ def alive(tier: object, robot: str = "mate", incarnation: object = 1) -> str:
 
 
 def test_a_teammate_is_there_until_its_token_goes() -> None:
-    tokens = Tokens()
-    assert tokens.changed(alive(7), True) == ("mate", 7)
-    assert tokens.changed(alive(7), False) == ("mate", None)
+    tokens = LivelinessTokens()
+    assert tokens.update(alive(7), True) == ("mate", 7)
+    assert tokens.update(alive(7), False) == ("mate", None)
 
 
 def test_of_two_tokens_the_newest_counts() -> None:
     """At a change of tier the new one comes before the old one goes."""
-    tokens = Tokens()
-    assert tokens.changed(alive(7), True) == ("mate", 7)
-    assert tokens.changed(alive(3), True) == ("mate", 3)
-    assert tokens.changed(alive(7), False) == ("mate", 3)
-    assert tokens.changed(alive(3), False) == ("mate", None)
+    tokens = LivelinessTokens()
+    assert tokens.update(alive(7), True) == ("mate", 7)
+    assert tokens.update(alive(3), True) == ("mate", 3)
+    assert tokens.update(alive(7), False) == ("mate", 3)
+    assert tokens.update(alive(3), False) == ("mate", None)
 
 
 def test_when_the_newest_token_goes_the_one_before_counts() -> None:
-    tokens = Tokens()
+    tokens = LivelinessTokens()
     for tier in (7, 3, 5):
-        tokens.changed(alive(tier), True)
-    assert tokens.changed(alive(5), False) == ("mate", 3)
+        tokens.update(alive(tier), True)
+    assert tokens.update(alive(5), False) == ("mate", 3)
 
 
 def test_a_token_that_is_told_again_is_the_newest() -> None:
-    tokens = Tokens()
+    tokens = LivelinessTokens()
     for tier in (7, 3):
-        tokens.changed(alive(tier), True)
-    assert tokens.changed(alive(7), True) == ("mate", 7)
+        tokens.update(alive(tier), True)
+    assert tokens.update(alive(7), True) == ("mate", 7)
 
 
 def test_a_process_that_is_started_again_has_a_token_of_its_own() -> None:
-    tokens = Tokens()
-    tokens.changed(alive(7, incarnation="a"), True)
-    assert tokens.changed(alive(7, incarnation="b"), True) == ("mate", 7)
-    assert tokens.changed(alive(7, incarnation="a"), False) == ("mate", 7)
+    tokens = LivelinessTokens()
+    tokens.update(alive(7, incarnation="a"), True)
+    assert tokens.update(alive(7, incarnation="b"), True) == ("mate", 7)
+    assert tokens.update(alive(7, incarnation="a"), False) == ("mate", 7)
 
 
 def test_the_tokens_of_teammates_do_not_mix() -> None:
-    tokens = Tokens()
-    tokens.changed(alive(7), True)
-    assert tokens.changed(alive(3, "other"), True) == ("other", 3)
-    assert tokens.changed(alive(3, "other"), False) == ("other", None)
-    assert tokens.changed(alive(7), True) == ("mate", 7)
+    tokens = LivelinessTokens()
+    tokens.update(alive(7), True)
+    assert tokens.update(alive(3, "other"), True) == ("other", 3)
+    assert tokens.update(alive(3, "other"), False) == ("other", None)
+    assert tokens.update(alive(7), True) == ("mate", 7)
 
 
 def test_a_token_that_goes_without_having_come_says_nothing_new() -> None:
-    tokens = Tokens()
-    assert tokens.changed(alive(7), False) == ("mate", None)
-    tokens.changed(alive(3), True)
-    assert tokens.changed(alive(7), False) == ("mate", 3)
+    tokens = LivelinessTokens()
+    assert tokens.update(alive(7), False) == ("mate", None)
+    tokens.update(alive(3), True)
+    assert tokens.update(alive(7), False) == ("mate", 3)
 
 
 def test_what_is_forgotten_plays_no_part_any_more() -> None:
-    tokens = Tokens()
-    tokens.changed(alive(7), True)
+    tokens = LivelinessTokens()
+    tokens.update(alive(7), True)
     tokens.forget("mate")
     tokens.forget("stranger")
-    tokens.changed(alive(3), True)
-    assert tokens.changed(alive(3), False) == ("mate", None)
+    tokens.update(alive(3), True)
+    assert tokens.update(alive(3), False) == ("mate", None)
 
 
 STRANGE_TIERS = ["", "x", "-1", "16", "99", "1.0", "+3", " 3", "1e1", "³", "٣", "9" * 5000]
@@ -99,16 +100,16 @@ STRANGE = [
 @pytest.mark.parametrize("key", STRANGE, ids=lambda key: key[:20] or "empty")
 @pytest.mark.parametrize("there", [True, False])
 def test_what_is_no_robots_token_is_none(key: str, there: bool) -> None:
-    tokens = Tokens()
-    tokens.changed(alive(7), True)
-    assert tokens.changed(key, there) is None
-    assert tokens.changed(alive(7), True) == ("mate", 7)
+    tokens = LivelinessTokens()
+    tokens.update(alive(7), True)
+    assert tokens.update(key, there) is None
+    assert tokens.update(alive(7), True) == ("mate", 7)
 
 
 @examples(200)
 @given(st.text(alphabet="alive/0123456789mate-*x", max_size=30), st.booleans())
 def test_no_key_raises(key: str, there: bool) -> None:
-    presence = Tokens().changed(key, there)
+    presence = LivelinessTokens().update(key, there)
     assert presence is None or presence[1] is None or 0 <= presence[1] <= LOWEST_TIER
 
 
@@ -120,24 +121,24 @@ CHANGES = st.lists(
 @examples(200)
 @given(CHANGES)
 def test_the_newest_of_what_is_there_counts(changes: list[tuple[str, int, bool]]) -> None:
-    tokens, there = Tokens(), list[tuple[str, int]]()
+    tokens, there = LivelinessTokens(), list[tuple[str, int]]()
     for robot, tier, comes in changes:
         if (robot, tier) in there:
             there.remove((robot, tier))
         if comes:
             there.append((robot, tier))
         newest = [t for name, t in there if name == robot]
-        assert tokens.changed(alive(tier, robot), comes) == (robot, newest[-1] if newest else None)
+        assert tokens.update(alive(tier, robot), comes) == (robot, newest[-1] if newest else None)
 
 
 def test_strange_tokens_are_counted_and_harm_nobody() -> None:
     """A foreign session declares them under the name of a teammate that is in sight."""
     results = []
     for strange in ([], ["alive/x/mate/1", "alive/99/mate/1", "alive/-1/mate/7"]):
-        stand = Stand(TEAM, here=["me"])
+        stand = TeamOnBus(TEAM, here=["me"])
         stand.announce("mate", 2)
         for key in strange:
-            stand.bus.announce(key)
+            stand.bus.declare_token(key)
         for _ in range(5):
             stand.stand_still(0.2)
             stand.sightings("me", saw(stand.now_ns, Sighting("mate", 2.0, 0.0)))
@@ -172,16 +173,16 @@ class Recording(MemoryBus):
         noted: Publisher = self._noted("publish", key, super().publisher(key, qos))
         return noted
 
-    def subscribe(self, keys: str, receive: Receive) -> Handle:
+    def subscribe(self, keys: str, receive: MessageCallback) -> Handle:
         noted: Handle = self._noted("subscribe", keys, super().subscribe(keys, receive))
         return noted
 
-    def announce(self, key: str) -> Handle:
-        noted: Handle = self._noted("announce", key, super().announce(key))
+    def declare_token(self, key: str) -> Handle:
+        noted: Handle = self._noted("declare_token", key, super().declare_token(key))
         return noted
 
-    def watch(self, keys: str, watch: Watch) -> Handle:
-        noted: Handle = self._noted("watch", keys, super().watch(keys, watch))
+    def watch_liveliness(self, keys: str, watch: LivelinessCallback) -> Handle:
+        noted: Handle = self._noted("watch_liveliness", keys, super().watch_liveliness(keys, watch))
         return noted
 
     def _noted(self, what: str, key: str, handle: Any) -> Any:
@@ -211,7 +212,7 @@ class _Noted:
         self._handle.close()
 
 
-class Wired(Stand):
+class Wired(TeamOnBus):
     """The robot `me` on a bus that records; the test plays its mates."""
 
     def __init__(self) -> None:
@@ -246,8 +247,8 @@ def test_a_robot_alone_declares_its_name_its_inputs_and_better_tiers() -> None:
     wired = Wired()
     inputs = [topic.at(robot="me") for topic in topics.INPUTS]
     assert wired.recording.open("subscribe") == sorted(inputs + fixes_from(range(wired.tier)))
-    assert wired.recording.open("announce") == [alive(wired.tier, "me")]
-    assert wired.recording.open("watch") == [topics.ALIVE.at(robot="me")]
+    assert wired.recording.open("declare_token") == [alive(wired.tier, "me")]
+    assert wired.recording.open("watch_liveliness") == [topics.ALIVE.at(robot="me")]
 
 
 def test_only_teammates_in_sight_are_watched_and_only_for_a_while() -> None:
@@ -255,9 +256,9 @@ def test_only_teammates_in_sight_are_watched_and_only_for_a_while() -> None:
     own = topics.ALIVE.at(robot="me")
     wired.sees("mate")
     wired.stand_still(0.1)
-    assert wired.recording.open("watch") == sorted([own, topics.ALIVE.at(robot="mate")])
+    assert wired.recording.open("watch_liveliness") == sorted([own, topics.ALIVE.at(robot="mate")])
     wired.stand_still(10.0)
-    assert wired.recording.open("watch") == [own]
+    assert wired.recording.open("watch_liveliness") == [own]
 
 
 def test_of_a_teammate_that_is_forgotten_no_token_remains() -> None:
@@ -304,7 +305,7 @@ def test_a_source_that_changes_its_tier_is_always_heard() -> None:
 
 def test_at_a_change_of_tier_the_new_is_declared_before_the_old_is_taken_back() -> None:
     wired = Wired()
-    ear = Ear(wired.bus, "belief/**")
+    ear = Subscription(wired.bus, "belief/**")
     wired.stand_still(0.5)
     old = wired.tier
     events = wired.gets_worse()
@@ -312,13 +313,13 @@ def test_at_a_change_of_tier_the_new_is_declared_before_the_old_is_taken_back() 
     assert new > old
     assert ear.samples
     for what, declared, taken_back in (
-        ("announce", alive(new, "me"), alive(old, "me")),
+        ("declare_token", alive(new, "me"), alive(old, "me")),
         ("subscribe", fixes_from(range(old, new))[0], topics.BELIEF.at(tier=old, robot="me")),
     ):
         first = events.index(Event(what, declared, declared=True))
-        kind = "announce" if what == "announce" else "publish"
+        kind = "declare_token" if what == "declare_token" else "publish"
         assert first < events.index(Event(kind, taken_back, declared=False))
-    assert wired.recording.open("announce") == [alive(new, "me")]
+    assert wired.recording.open("declare_token") == [alive(new, "me")]
     wired.stand_still(0.2)
     published = [k for k in wired.recording.open("publish") if k.startswith(("belief/", "fix/"))]
     assert published == [topics.BELIEF.at(tier=new, robot="me")]
@@ -336,12 +337,12 @@ def test_a_robot_that_gets_better_takes_back_what_it_no_longer_hears_last() -> N
         wired.put(topics.FIX.at(robot="me", tier=0, observer="mate"), fix)
     wired.stand_still(0.2)
     assert wired.tier < worse
-    assert wired.recording.open("announce") == [alive(wired.tier, "me")]
+    assert wired.recording.open("declare_token") == [alive(wired.tier, "me")]
     heard = [k for k in wired.recording.open("subscribe") if k.startswith("fix/")]
     assert heard == sorted(fixes_from(range(wired.tier)))
-    token_gone = Event("announce", alive(worse, "me"), declared=False)
+    token_gone = Event("declare_token", alive(worse, "me"), declared=False)
     events = wired.recording.events[so_far:]
-    announced = [e for e in events if e.what == "announce"]
+    announced = [e for e in events if e.what == "declare_token"]
     assert [e.declared for e in announced] == [True, False] * (len(announced) // 2)
     assert token_gone in events
 
@@ -352,7 +353,7 @@ def test_nothing_is_declared_twice_or_again_without_need() -> None:
     for _ in range(20):
         wired.sees("mate")
         wired.stand_still(0.2)
-    for what in ("announce", "subscribe", "watch", "publish"):
+    for what in ("declare_token", "subscribe", "watch_liveliness", "publish"):
         keys = wired.recording.open(what)
         assert len(keys) == len(set(keys))
         events = [e for e in wired.recording.events if e.what == what]
@@ -364,7 +365,7 @@ def test_a_robot_of_which_nothing_is_known_declares_no_tier() -> None:
     recording = Recording(hub)
     node = Node(Robot("me", TEAM, 0), TEAM, recording, 0, "1")
     node.step(0)
-    assert recording.open("announce") == []
-    Stand(TEAM, here=[], hub=hub).odometry("me", standing(100 * MS))
+    assert recording.open("declare_token") == []
+    TeamOnBus(TEAM, here=[], hub=hub).odometry("me", standing(100 * MS))
     node.step(100 * MS)
-    assert len(recording.open("announce")) == 1
+    assert len(recording.open("declare_token")) == 1

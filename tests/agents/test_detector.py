@@ -2,7 +2,7 @@
 
 import pytest
 from msgspec.structs import replace
-from support.buses import MS, Ear, Stand, robot_at, saw, team_of
+from support.buses import MS, Subscription, TeamOnBus, robot_at, saw, team_of
 from support.cameras import SIZE, jpeg, number_of, picture
 
 from cpcbl_agents.vision import annotate, detector
@@ -11,8 +11,8 @@ from cpcbl_agents.vision.detections import Glimpses
 from cpcbl_agents.vision.pictures import received
 from cpcbl_team.config import CameraSettings, Team
 from cpcbl_transport import topics
-from cpcbl_transport.decoding import read
-from cpcbl_transport.messages import Frame, Look, Unclear
+from cpcbl_transport.decoding import decode
+from cpcbl_transport.messages import AnnotatedFrame, Frame, UnclearObject
 
 KEY = topics.LOOK.at(robot="me")
 
@@ -22,7 +22,7 @@ def seeing() -> Team:
     return team_of(me=replace(robot_at(), sensing="camera", camera=camera), mate=robot_at(2.0))
 
 
-def watches(stand: Stand, seconds: float, image: bytes = jpeg(picture(4))) -> None:
+def watches(stand: TeamOnBus, seconds: float, image: bytes = jpeg(picture(4))) -> None:
     """It stands, and gets frames at 10 Hz."""
     for _ in range(round(10 * seconds)):
         stand.stand_still(0.1)
@@ -30,14 +30,14 @@ def watches(stand: Stand, seconds: float, image: bytes = jpeg(picture(4))) -> No
         stand.step()
 
 
-def looks(ear: Ear) -> list[Look]:
-    found = [read(key, payload) for key, payload in ear.samples]
-    assert all(isinstance(look, Look) for look in found)
-    return [look for look in found if isinstance(look, Look)]
+def looks(ear: Subscription) -> list[AnnotatedFrame]:
+    found = [decode(key, payload) for key, payload in ear.samples]
+    assert all(isinstance(look, AnnotatedFrame) for look in found)
+    return [look for look in found if isinstance(look, AnnotatedFrame)]
 
 
 def test_frames_are_shown_twice_a_second_with_what_was_seen() -> None:
-    stand = Stand(seeing())
+    stand = TeamOnBus(seeing())
     ear = stand.ear(KEY)
     watches(stand, 2.0)
     shown = looks(ear)
@@ -58,7 +58,7 @@ def test_nothing_is_drawn_while_nobody_looks(monkeypatch: pytest.MonkeyPatch) ->
         return drawn[-1]
 
     monkeypatch.setattr(detector, "annotated", annotated)
-    stand = Stand(seeing())
+    stand = TeamOnBus(seeing())
     watches(stand, 1.0)
     assert not drawn
     ear = stand.ear(KEY)
@@ -70,20 +70,20 @@ def test_nothing_is_drawn_while_nobody_looks(monkeypatch: pytest.MonkeyPatch) ->
 
 
 def test_a_frame_that_cannot_be_used_is_shown_with_its_reason() -> None:
-    stand = Stand(seeing())
+    stand = TeamOnBus(seeing())
     ear = stand.ear(KEY)
     watches(stand, 0.1, b"garbage")
     watches(stand, 0.5, jpeg(picture(0, (640, 480))))
     watches(stand, 0.5, jpeg(picture(0) // 255))
     undecodable, wrong, black = looks(ear)
-    assert (undecodable.image, undecodable.unclear) == (b"", (Unclear("frame_undecodable"),))
-    assert (wrong.image, wrong.unclear) == (b"", (Unclear("frame_wrong_size"),))
-    assert black.unclear == (Unclear("frame_black"),)
+    assert (undecodable.image, undecodable.unclear) == (b"", (UnclearObject("frame_undecodable"),))
+    assert (wrong.image, wrong.unclear) == (b"", (UnclearObject("frame_wrong_size"),))
+    assert black.unclear == (UnclearObject("frame_black"),)
     assert not isinstance(received(black.image, SIZE), str)
 
 
 def test_who_looks_changes_nothing_else() -> None:
-    alone, watched = Stand(seeing()), Stand(seeing())
+    alone, watched = TeamOnBus(seeing()), TeamOnBus(seeing())
     watched.ear(KEY)
     for stand in (alone, watched):
         watches(stand, 1.0)
@@ -95,7 +95,7 @@ def test_who_looks_changes_nothing_else() -> None:
 
 
 def test_a_robot_without_a_camera_declares_no_look() -> None:
-    stand = Stand(seeing())
+    stand = TeamOnBus(seeing())
     stand.put(topics.IN_FRAME.at(robot="mate"), Frame(0, jpeg(picture(4))))
     ear = stand.ear(topics.LOOK.at())
     stand.stand_still(1.0)

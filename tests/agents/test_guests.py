@@ -6,14 +6,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
-from support.buses import SECOND, Stand, examples, robot_at, saw, team_of
+from support.buses import SECOND, TeamOnBus, examples, robot_at, saw, team_of
 
-from cpcbl_agents.guests import FORGOTTEN_NS, TRIED_NS, Guests
+from cpcbl_agents.guests import FORGET_NS, LOOKUP_NS, GuestRegistry
 from cpcbl_team.collaboration import LOWEST_TIER
 from cpcbl_team.config import GuestSettings, RobotSettings, SensorSettings, Team
 from cpcbl_team.inputs import Fix, Sighting
 from cpcbl_transport import topics
-from cpcbl_transport.bus import Handle, MemoryBus, MemoryHub, Watch
+from cpcbl_transport.bus import Handle, LivelinessCallback
+from cpcbl_transport.memory_bus import MemoryBus, MemoryHub
 from cpcbl_transport.messages import Status
 
 GOOD, POOR = 0.01, 0.3
@@ -24,82 +25,82 @@ EXACT = SensorSettings(field_of_view_deg=360.0, range_share=0.0, range_floor_m=1
 
 
 def test_a_stranger_is_a_guest_while_its_token_is_there() -> None:
-    guests = Guests(most=2)
+    guests = GuestRegistry(most=2)
     assert guests.notice("tripod", 0)
-    assert guests.followed == {"tripod"}
+    assert guests.watched == {"tripod"}
     assert "tripod" not in guests
-    guests.present("tripod", True)
-    guests.present("tripod", True)  # at a change of tier
+    guests.set_presence("tripod", True)
+    guests.set_presence("tripod", True)  # at a change of tier
     assert "tripod" in guests
-    guests.present("tripod", False)
+    guests.set_presence("tripod", False)
     assert "tripod" not in guests
     assert guests.counts == {"guest_joined": 1, "guest_left": 1}
 
 
 def test_what_is_known_is_no_stranger_and_who_was_not_noticed_is_no_guest() -> None:
-    guests = Guests({"oak", "mate", "me"}, 2)
+    guests = GuestRegistry({"oak", "mate", "me"}, 2)
     for name in ("oak", "mate", "me"):
         assert not guests.notice(name, 0)
-        guests.present(name, True)
+        guests.set_presence(name, True)
         assert name not in guests
-    guests.present("tripod", True)
+    guests.set_presence("tripod", True)
     assert "tripod" not in guests
-    assert guests.followed == frozenset()
+    assert guests.watched == frozenset()
     assert not guests.counts
 
 
 def test_a_team_without_guests_notices_nobody() -> None:
-    guests = Guests(most=0)
+    guests = GuestRegistry(most=0)
     assert not guests.notice("tripod", 0)
-    assert guests.followed == frozenset()
+    assert guests.watched == frozenset()
 
 
 def test_a_stranger_without_a_token_makes_room_a_guest_does_not() -> None:
-    guests = Guests(most=2)
+    guests = GuestRegistry(most=2)
     guests.notice("tripod", 0)
-    guests.present("tripod", True)
+    guests.set_presence("tripod", True)
     assert guests.notice("garbage", 0)
-    assert not guests.notice("late", TRIED_NS - 1)
-    assert not guests.notice("new", TRIED_NS)
+    assert not guests.notice("late", LOOKUP_NS - 1)
+    assert not guests.notice("new", LOOKUP_NS)
     assert guests.counts["guest_refused"] == 2
-    assert guests.notice("late", TRIED_NS)  # it comes again
-    assert guests.followed == {"tripod", "late"}
-    for time_ns in range(0, FORGOTTEN_NS, TRIED_NS):
-        assert not guests.notice("garbage", TRIED_NS + time_ns)  # in vain before
-    assert guests.notice("garbage", TRIED_NS + FORGOTTEN_NS)
-    assert guests.notice("late", 2 * TRIED_NS + FORGOTTEN_NS) is False
-    guests = Guests(most=2)
+    assert guests.notice("late", LOOKUP_NS)  # it comes again
+    assert guests.watched == {"tripod", "late"}
+    for time_ns in range(0, FORGET_NS, LOOKUP_NS):
+        assert not guests.notice("garbage", LOOKUP_NS + time_ns)  # in vain before
+    assert guests.notice("garbage", LOOKUP_NS + FORGET_NS)
+    assert guests.notice("late", 2 * LOOKUP_NS + FORGET_NS) is False
+    guests = GuestRegistry(most=2)
     for name in ("tripod", "late"):
         guests.notice(name, 0)
-    guests.present("tripod", True)
-    guests.present("late", True)
-    assert not guests.notice("third", 100 * TRIED_NS)
-    assert guests.followed == {"tripod", "late"}
+    guests.set_presence("tripod", True)
+    guests.set_presence("late", True)
+    assert not guests.notice("third", 100 * LOOKUP_NS)
+    assert guests.watched == {"tripod", "late"}
 
 
 def test_everybody_who_is_seen_all_the_time_has_a_turn() -> None:
-    guests = Guests(most=3)
+    guests = GuestRegistry(most=3)
     turns: set[str] = set()
     for frame in range(100):
         for number in range(12):
-            guests.notice(f"g{number}", frame * TRIED_NS // 10)
-        turns |= guests.followed
+            guests.notice(f"g{number}", frame * LOOKUP_NS // 10)
+        turns |= guests.watched
     assert len(turns) == 12
 
 
 def test_strangers_are_forgotten_some_time_after_they_were_noticed_guests_are_not() -> None:
-    guests = Guests(most=3)
+    guests = GuestRegistry(most=3)
     for name in ("tripod", "garbage"):
         guests.notice(name, 0)
     guests.notice("garbage", SECOND)
-    guests.present("tripod", True)
-    guests.forget(FORGOTTEN_NS + SECOND)
-    assert guests.followed == {"tripod", "garbage"}
-    guests.forget(FORGOTTEN_NS + SECOND + 1)
-    assert guests.followed == {"tripod"}
-    guests.present("tripod", False)
-    guests.forget(FORGOTTEN_NS + SECOND + 1)
-    assert guests.followed == frozenset()
+    guests.set_presence("tripod", True)
+    guests.forget(FORGET_NS + SECOND)
+    assert guests.watched == {"tripod", "garbage"}
+    guests.forget(FORGET_NS + SECOND + 1)
+    assert guests.watched == {"tripod"}
+    guests.set_presence("tripod", False)
+    guests.forget(FORGET_NS + SECOND + 1)
+    assert guests.watched == frozenset()
 
 
 @examples(100)
@@ -112,18 +113,18 @@ def test_strangers_are_forgotten_some_time_after_they_were_noticed_guests_are_no
 def test_whatever_happens_there_are_never_more_than_allowed(
     events: list[tuple[str, str]], most: int
 ) -> None:
-    guests = Guests({"a"}, most)
+    guests = GuestRegistry({"a"}, most)
     for number, (event, name) in enumerate(events):
-        now_ns = number * TRIED_NS // 3
+        now_ns = number * LOOKUP_NS // 3
         if event == "noticed":
             guests.notice(name, now_ns)
         else:
-            guests.present(name, event == "came")
+            guests.set_presence(name, event == "came")
         guests.forget(now_ns)
-        assert len(guests.followed) <= most
+        assert len(guests.watched) <= most
         here = {n for _, n in events if n in guests}
-        assert here <= guests.followed
-        assert "a" not in guests.followed
+        assert here <= guests.watched
+        assert "a" not in guests.watched
 
 
 # Help, both ways, over the bus in memory --------------------------------------------------------
@@ -144,8 +145,8 @@ class WithGuest:
     ) -> None:
         team = replace(team_of(me=me, mate=robot_at(9.0, 9.0)), guests=guests or GuestSettings())
         tripod = tripod or external(2.0, 0.0, 180.0, GOOD)
-        self.me = Stand(team, here=["me"])
-        self.guest = Stand(
+        self.me = TeamOnBus(team, here=["me"])
+        self.guest = TeamOnBus(
             Team(name="tests", robots={**team.robots, "tripod": tripod}, map=team.map),
             here=["tripod"],
             hub=self.me.hub,
@@ -173,7 +174,7 @@ class WithGuest:
     def leave(self) -> None:
         """Its session ends: nothing of it is heard or announced any more."""
         for node in self.guest.nodes.values():
-            node._wiring._bus.close()
+            node._declarations._bus.close()
 
 
 def poor(**more: Any) -> RobotSettings:
@@ -251,7 +252,7 @@ def test_a_team_without_guests_takes_no_help_from_one_and_counts_it() -> None:
 
 
 def test_a_sender_without_a_token_is_never_a_guest() -> None:
-    stand = Stand(team_of(me=poor(), mate=robot_at(9.0, 9.0)), here=["me"])
+    stand = TeamOnBus(team_of(me=poor(), mate=robot_at(9.0, 9.0)), here=["me"])
     stand.stand_still(0.3)
     key = topics.FIX.at(robot="me", tier=0, observer="ghost")
     for _ in range(5):
@@ -280,8 +281,8 @@ class Watched(MemoryBus):
         self.keys: list[str] = []
         self.declared_so_far = 0
 
-    def watch(self, keys: str, watch: Watch) -> Handle:
-        inner = super().watch(keys, watch)
+    def watch_liveliness(self, keys: str, watch: LivelinessCallback) -> Handle:
+        inner = super().watch_liveliness(keys, watch)
         self.keys.append(keys)
         self.declared_so_far += 1
         mine = self.keys
@@ -309,7 +310,7 @@ class WatchedHub(MemoryHub):
 
 def test_nobody_is_watched_who_was_neither_seen_nor_heard() -> None:
     hub = WatchedHub()
-    stand = Stand(team_of(me=robot_at(), mate=robot_at(2.0)), here=["me"], hub=hub)
+    stand = TeamOnBus(team_of(me=robot_at(), mate=robot_at(2.0)), here=["me"], hub=hub)
     for i in range(50):
         stand.announce(f"guest{i}", 3)
     stand.stand_still(1.0)
@@ -319,7 +320,7 @@ def test_nobody_is_watched_who_was_neither_seen_nor_heard() -> None:
 def test_a_camera_full_of_garbage_makes_a_robot_watch_a_few_names_only() -> None:
     hub, most = WatchedHub(), 4
     team = replace(team_of(me=robot_at()), guests=GuestSettings(most=most))
-    stand = Stand(team, here=["me"], hub=hub)
+    stand = TeamOnBus(team, here=["me"], hub=hub)
     stand.announce("tripod", 3)
     (bus,) = hub.sessions[1:]
     for frame in range(100):
@@ -330,16 +331,16 @@ def test_a_camera_full_of_garbage_makes_a_robot_watch_a_few_names_only() -> None
         stand.step()
         assert len(bus.keys) <= most + 1
         assert len(stand.robots["me"].collaboration.neighbours) <= most
-    assert bus.declared_so_far <= 1 + most * (1 + 10 * SECOND // TRIED_NS)
+    assert bus.declared_so_far <= 1 + most * (1 + 10 * SECOND // LOOKUP_NS)
     assert stand.robots["me"].counts["guest_joined"] == 1  # it found its place among them
-    stand.stand_still(FORGOTTEN_NS / SECOND + 1.0)
+    stand.stand_still(FORGET_NS / SECOND + 1.0)
     assert bus.keys == [topics.ALIVE.at(robot="me"), topics.ALIVE.at(robot="tripod")]
 
 
 def test_a_token_with_an_absurd_name_or_tier_lets_nobody_in() -> None:
-    stand = Stand(team_of(me=poor()), here=["me"])
+    stand = TeamOnBus(team_of(me=poor()), here=["me"])
     for key in ("alive/99/tripod/1", "alive/x/tripod/1"):
-        stand.bus.announce(key)
+        stand.bus.declare_token(key)
     stand.sightings("me", saw(0, Sighting("tripod", 2.0, 0.0)))
     stand.stand_still(1.0)
     stand.sightings("me", saw(stand.now_ns, Sighting("tripod", 2.0, 0.0)))
@@ -349,7 +350,7 @@ def test_a_token_with_an_absurd_name_or_tier_lets_nobody_in() -> None:
 
 
 def test_a_robots_own_name_seen_in_a_mirror_is_no_guest() -> None:
-    stand = Stand(team_of(me=robot_at()), here=["me"])
+    stand = TeamOnBus(team_of(me=robot_at()), here=["me"])
     stand.stand_still(0.3)
     for _ in range(5):
         stand.sightings("me", saw(stand.now_ns, Sighting("me", 2.0, 0.0)))

@@ -123,13 +123,13 @@ def test_a_log_is_replayed_in_its_own_time(tmp_path: Path) -> None:
     source = MrclamSource(tmp_path, "1")
     replayed: list[Odometry | Sightings] = []
     while source.next_ns is not None:
-        assert not source.over
+        assert not source.is_finished
         now_ns = source.next_ns
         assert source.poll(now_ns - 1) == []
         items = source.poll(now_ns)
         assert {i.stamp_ns for i in items} == {now_ns}
         replayed += items
-    assert source.over
+    assert source.is_finished
     assert source.poll(FOREVER_NS) == []
     assert replayed == everything(tmp_path)
 

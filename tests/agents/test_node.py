@@ -11,7 +11,7 @@ from msgspec.structs import replace
 from support.buses import (
     MS,
     SECOND,
-    Stand,
+    TeamOnBus,
     examples,
     matches,
     robot_at,
@@ -32,9 +32,10 @@ from cpcbl_team.inputs import Belief, Fix, Odometry, Position, Sighting, Sightin
 from cpcbl_team.self_calibration import Learned
 from cpcbl_team.timeline import HORIZON_NS
 from cpcbl_transport import topics
-from cpcbl_transport.bus import MemoryBus, MemoryHub, Publisher
+from cpcbl_transport.bus import Publisher
 from cpcbl_transport.compact import BELIEF_BYTES
 from cpcbl_transport.link_size import sent_bytes
+from cpcbl_transport.memory_bus import MemoryBus, MemoryHub
 from cpcbl_transport.messages import (
     LARGEST_FRAME,
     LARGEST_PAYLOAD,
@@ -65,9 +66,9 @@ def two_robots(me_sigma_m: float = POOR, mate_sigma_m: float = GOOD, **rules: An
     )
 
 
-def only_me() -> Stand:
+def only_me() -> TeamOnBus:
     """The robot `me` at NOW, which listens to its mate since it saw it; the test plays the mate."""
-    stand = Stand(two_robots(), here=["me"])
+    stand = TeamOnBus(two_robots(), here=["me"])
     stand.announce("mate", 2)
     stand.stand_still(NOW / SECOND - 0.2)
     look(stand)
@@ -75,7 +76,7 @@ def only_me() -> Stand:
     return stand
 
 
-def look(stand: Stand, *robots: str) -> None:
+def look(stand: TeamOnBus, *robots: str) -> None:
     """These robots, or all that are there, see each other."""
     for name, seen in (("me", "mate"), ("mate", "me")):
         if name in (robots or stand.robots):
@@ -83,11 +84,11 @@ def look(stand: Stand, *robots: str) -> None:
     stand.step()
 
 
-def estimate(stand: Stand, robot: str = "me") -> Estimate:
+def estimate(stand: TeamOnBus, robot: str = "me") -> Estimate:
     return stand.robots[robot].filter.timeline.state.estimate
 
 
-def tier(stand: Stand, robot: str) -> int:
+def tier(stand: TeamOnBus, robot: str) -> int:
     return stand.robots[robot].collaboration.tier
 
 
@@ -302,7 +303,7 @@ PLANE = st.tuples(VARIANCE, NONE, VARIANCE)
     )
 )
 def test_no_finite_numbers_raise(keyed: tuple[str, Message]) -> None:
-    stand = Stand(two_robots(), here=["me"])
+    stand = TeamOnBus(two_robots(), here=["me"])
     stand.now_ns = NOW
     stand.odometry("me", standing(NOW))
     stand.step()
@@ -369,7 +370,7 @@ def test_what_threads_of_the_bus_count_is_read_while_they_count() -> None:
         stand.put(IN_FRAME, b"")
         stand.put(IN_POSITION, b"")
         stand.announce("mate", 2).close()
-    stand.bus.announce(topics.ALIVE.at(tier=0, robot="me", incarnation="2"))
+    stand.bus.declare_token(topics.ALIVE.at(tier=0, robot="me", incarnation="2"))
     assert set(counts) == entries
     assert min(+counts[name] for name in entries) > 0
     assert 0 not in only_me().status("me").counts.values()
@@ -379,7 +380,7 @@ def test_what_threads_of_the_bus_count_is_read_while_they_count() -> None:
 
 
 def test_status_comes_once_a_second() -> None:
-    stand = Stand(two_robots(), here=["me"])
+    stand = TeamOnBus(two_robots(), here=["me"])
     ear = stand.ear(topics.STATUS.at(robot="me"))
     stand.stand_still(5.0)
     stamps = [getattr(m, "stamp_ns", None) for m in ear.messages]
@@ -387,7 +388,7 @@ def test_status_comes_once_a_second() -> None:
 
 
 def test_status_tells_quality_and_traffic() -> None:
-    stand = Stand(two_robots(active=False))
+    stand = TeamOnBus(two_robots(active=False))
     exchange(stand)
     mine, mates = stand.statuses().values()
     assert mine.tier == tier(stand, "me") > mates.tier == tier(stand, "mate")
@@ -406,22 +407,22 @@ def test_status_tells_quality_and_traffic() -> None:
 # Who hears whom ---------------------------------------------------------------------------------
 
 
-def exchange(stand: Stand, seconds: float = 2.0) -> None:
+def exchange(stand: TeamOnBus, seconds: float = 2.0) -> None:
     """Both robots stand and see each other at 5 Hz."""
     for _ in range(round(5 * seconds)):
         stand.stand_still(0.2)
         look(stand)
 
 
-def helper(**rules: Any) -> Stand:
+def helper(**rules: Any) -> TeamOnBus:
     """The robot `me`, which is good; the test plays its mate, which is poor."""
-    stand = Stand(two_robots(GOOD, POOR, **rules), here=["me"])
+    stand = TeamOnBus(two_robots(GOOD, POOR, **rules), here=["me"])
     stand.announce("mate", tier_of(POOR, math.sqrt(2.0)))
     return stand
 
 
 def test_nothing_is_sent_uphill() -> None:
-    stand = Stand(two_robots())
+    stand = TeamOnBus(two_robots())
     exchange(stand)
     worse, better = stand.statuses().values()
     assert better.heard == worse.sent == ()
@@ -430,13 +431,13 @@ def test_nothing_is_sent_uphill() -> None:
 
 
 def test_robots_of_the_same_tier_tell_each_other_nothing() -> None:
-    stand = Stand(two_robots(GOOD, GOOD))
+    stand = TeamOnBus(two_robots(GOOD, GOOD))
     exchange(stand)
     assert [(s.sent, s.heard) for s in stand.statuses().values()] == [((), ())] * 2
 
 
 def test_both_ways_sends_uphill_too() -> None:
-    stand = Stand(two_robots(direction="both-ways", least_value=0.0, least_use=0.0))
+    stand = TeamOnBus(two_robots(direction="both-ways", least_value=0.0, least_use=0.0))
     exchange(stand)
     for status in stand.statuses().values():
         assert {flow.topic for flow in status.heard if flow.messages} == {"belief", "fix"}
@@ -453,7 +454,7 @@ def test_a_budget_is_not_spent_on_what_nobody_hears() -> None:
 
 
 def test_only_teammates_in_sight_are_listened_to() -> None:
-    stand = Stand(two_robots())
+    stand = TeamOnBus(two_robots())
     stand.stand_still(2.0)
     assert [s.heard for s in stand.statuses().values()] == [(), ()]
     exchange(stand, 1.0)
@@ -484,7 +485,7 @@ def test_help_is_of_the_kinds_that_are_chosen(
 
 
 def test_help_begins_after_the_chosen_time() -> None:
-    stand = Stand(two_robots(GOOD, POOR, after_s=2.0), here=["me"])
+    stand = TeamOnBus(two_robots(GOOD, POOR, after_s=2.0), here=["me"])
     ear = stand.ear("belief/**")
     exchange(stand, 4.0)
     stamps = [m.stamp_ns for m in ear.messages if isinstance(m, Belief)]
@@ -493,7 +494,9 @@ def test_help_begins_after_the_chosen_time() -> None:
 
 @pytest.mark.parametrize("known", [True, False], ids=["knows where it is", "lost"])
 def test_a_lost_robot_tells_teammates_nothing(known: bool) -> None:
-    stand = Stand(team_of(me=robot_at(sigma_m=GOOD, known=known), mate=robot_at(2.0)), here=["me"])
+    stand = TeamOnBus(
+        team_of(me=robot_at(sigma_m=GOOD, known=known), mate=robot_at(2.0)), here=["me"]
+    )
     stand.announce("mate", LOWEST_TIER)
     help_, track = stand.ear("*/*/me"), stand.ear(topics.TRACK.at(robot="me"))
     fixes = stand.ear("fix/**")
@@ -509,17 +512,17 @@ def test_a_lost_robot_tells_teammates_nothing(known: bool) -> None:
 # Change of tier ---------------------------------------------------------------------------------
 
 
-def tiers_listened_to(stand: Stand) -> list[int]:
+def tiers_listened_to(stand: TeamOnBus) -> list[int]:
     """The tiers whose fixes `me` subscribes to."""
     keys = [topics.FIX.at(robot="me", tier=t, observer="mate") for t in range(LOWEST_TIER + 1)]
     return [t for t, key in enumerate(keys) if listens(stand, key)]
 
 
-def listens(stand: Stand, key: str) -> bool:
+def listens(stand: TeamOnBus, key: str) -> bool:
     return stand.bus.publisher(key, topics.Qos.FRESH).matching
 
 
-def drive(stand: Stand, way_m: float, robot: str = "me") -> None:
+def drive(stand: TeamOnBus, way_m: float, robot: str = "me") -> None:
     """One robot drives straight ahead within 100 ms, the others stand."""
     before, stand.now_ns = stand.now_ns, stand.now_ns + 100 * MS
     for name in stand.robots:
@@ -556,9 +559,9 @@ class RecallingBus(MemoryBus):
 
 def test_after_a_change_of_tier_the_new_keys_are_in_force() -> None:
     hub = Recalling()
-    stand = Stand(two_robots(GOOD, POOR), here=["me"], hub=hub)
+    stand = TeamOnBus(two_robots(GOOD, POOR), here=["me"], hub=hub)
     tokens: list[tuple[str, bool]] = []
-    stand.bus.watch("alive/**", lambda key, alive: tokens.append((key, alive)))
+    stand.bus.watch_liveliness("alive/**", lambda key, alive: tokens.append((key, alive)))
     ear = stand.ear("belief/**")
     stand.stand_still(1.0)
     before = tier_of(GOOD, math.sqrt(2.0))
@@ -604,7 +607,7 @@ def test_a_belief_is_said_under_the_tier_of_its_own_sigma() -> None:
 
 
 def test_a_robot_that_has_become_better_no_longer_listens_to_its_equals() -> None:
-    stand = Stand(two_robots(POOR, GOOD), here=["me"])
+    stand = TeamOnBus(two_robots(POOR, GOOD), here=["me"])
     stand.stand_still(1.0)
     before = tier(stand, "me")
     for _ in range(5):
@@ -629,7 +632,7 @@ def test_the_belief_of_a_teammate_is_followed_to_its_next_tier() -> None:
 
 
 def test_a_robot_listens_no_more_to_a_teammate_that_is_gone() -> None:
-    stand = Stand(two_robots(), here=["me"])
+    stand = TeamOnBus(two_robots(), here=["me"])
     token = stand.announce("mate", 2)
     exchange(stand, 1.0)
     assert listens(stand, BELIEF_KEY)
@@ -640,7 +643,7 @@ def test_a_robot_listens_no_more_to_a_teammate_that_is_gone() -> None:
 
 
 def test_robots_that_swap_tiers_swap_the_direction_of_help() -> None:
-    stand = Stand(two_robots())
+    stand = TeamOnBus(two_robots())
     exchange(stand)
     before = stand.statuses()
     assert before["me"].messages_received > 0
@@ -676,7 +679,7 @@ def test_all_is_shared_once_help_was_really_sent(topic: topics.Topic) -> None:
 
 
 def test_a_listener_shares_only_what_it_has_used() -> None:
-    stand = Stand(two_robots(passive=True, active=False))
+    stand = TeamOnBus(two_robots(passive=True, active=False))
     stand.stand_still(0.5)
     stand.sightings("me", saw(stand.now_ns, Sighting("mate", 40.0, 0.0)))  # the gate rejects it
     stand.stand_still(0.5)
@@ -702,7 +705,7 @@ def test_a_second_robot_of_the_same_name_is_counted() -> None:
 
 def test_arrivals_wake_the_robots_own_loop() -> None:
     woken: list[bool] = []
-    stand = Stand(two_robots(), here=[])
+    stand = TeamOnBus(two_robots(), here=[])
     node = Node(
         Robot("me", stand.team, 0),
         stand.team,
@@ -719,7 +722,7 @@ def test_arrivals_wake_the_robots_own_loop() -> None:
 
 def test_the_status_of_a_robot_that_learns_says_what() -> None:
     learning = LocalizerSettings(self_calibration=True)
-    stand = Stand(with_robot(two_robots(), "me", localizer=learning))
+    stand = TeamOnBus(with_robot(two_robots(), "me", localizer=learning))
     for robot in stand.robots.values():
         timeline = robot.filter.timeline
         memory = replace(timeline.state.memory, learned=Learned(0.98, 0.96, 0.01))

@@ -12,7 +12,7 @@ from support.buses import robot_at, team_of, wait_until, with_robot
 
 from cpcbl_agents import process
 from cpcbl_agents.clock import Clock
-from cpcbl_agents.process import Loop, Stop, begun, new_incarnation, while_time_holds
+from cpcbl_agents.process import Loop, StopSignal, make_robot, new_incarnation, stop_on_clock_step
 from cpcbl_team.config import BudgetSettings
 from cpcbl_team.errors import ClockError
 
@@ -61,7 +61,7 @@ class Running:
 
     def arrives(self, number: int = 0) -> None:
         self.node.inbox.append(number)
-        self.loop.arrived()
+        self.loop.on_arrival()
 
     def arrives_here(self) -> bool:
         """Whether what arrives on this thread is stepped on it."""
@@ -192,7 +192,7 @@ def test_a_robot_that_may_have_run_before_knows_neither_its_place_nor_what_it_sp
     since_s: float, unix: bool, restarted: bool, knows_its_place: bool, may_send: bool
 ) -> None:
     clock = since(since_s, unix)
-    robot = begun("me", LIMITED, clock, restarted)
+    robot = make_robot("me", LIMITED, clock, restarted)
     assert (not robot.filter.timeline.state.memory.lost) is knows_its_place
     now_ns = clock.now_ns()
     assert robot.collaboration.budget.admits(now_ns, 42, urgent=True) is may_send
@@ -209,7 +209,7 @@ def test_a_robot_ends_when_the_clock_of_its_machine_is_set(by_s: float) -> None:
     clock = wall._replace(epoch_ns=wall.epoch_ns - round(by_s * 1e9))
     steps = iter([False] * 10 + [True])
     with pytest.raises(ClockError, match=re.escape(f"clock was set by {by_s:+.2f} s")):
-        Loop(clock).run(Counting(), while_time_holds("me", LIMITED, clock, steps.__next__))
+        Loop(clock).run(Counting(), stop_on_clock_step("me", LIMITED, clock, steps.__next__))
 
 
 def test_a_robot_goes_on_while_its_clock_holds_or_is_none_of_the_machine() -> None:
@@ -223,7 +223,7 @@ def test_a_robot_goes_on_while_its_clock_holds_or_is_none_of_the_machine() -> No
         steps = iter([False] * 10 + [True])
         node, loop = Counting(), Loop(clock)
         node.during = loop.wake
-        loop.run(node, while_time_holds("me", team, clock, steps.__next__))
+        loop.run(node, stop_on_clock_step("me", team, clock, steps.__next__))
         assert len(node.threads) == 10
 
 
@@ -232,11 +232,11 @@ def test_a_closed_terminal_ends_a_process_unless_nohup_says_otherwise() -> None:
     before = {number: signal.getsignal(number) for number in numbers}
     try:
         signal.signal(signal.SIGHUP, signal.SIG_IGN)
-        stop = Stop()
+        stop = StopSignal()
         signal.raise_signal(signal.SIGHUP)
         assert not stop()
         signal.signal(signal.SIGHUP, signal.SIG_DFL)
-        stop = Stop()
+        stop = StopSignal()
         signal.raise_signal(signal.SIGHUP)
         assert stop()
     finally:

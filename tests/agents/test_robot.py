@@ -10,7 +10,13 @@ from support.buses import MS, SECOND, robot_at, saw, team_of, with_robot
 from cpcbl_agents.agent import Located, Presence, Tick
 from cpcbl_agents.filtering import PATIENCE_NS
 from cpcbl_agents.robot import Robot
-from cpcbl_agents.waypoint_follower import COMMAND_NS, MOST_TURN_RAD_S, REACHED_M, Pilot, steer
+from cpcbl_agents.waypoint_follower import (
+    COMMAND_NS,
+    MOST_TURN_RAD_S,
+    REACHED_M,
+    WaypointFollower,
+    pursue,
+)
 from cpcbl_team.collaboration import LOWEST_TIER
 from cpcbl_team.config import (
     CollaborationSettings,
@@ -389,7 +395,7 @@ def located(pose: Pose2, stamp_ns: int, lost: str = "") -> Located:
 def test_steering_turns_towards_the_goal(
     goal: tuple[float, float], speed: float, turn_rate: float | None
 ) -> None:
-    v, w = steer(HERE, goal, 0.5)
+    v, w = pursue(HERE, goal, 0.5)
     assert v == pytest.approx(speed)
     assert (abs(w) if turn_rate is None else w) == pytest.approx(turn_rate or abs(w))
     assert abs(w) <= MOST_TURN_RAD_S
@@ -397,7 +403,7 @@ def test_steering_turns_towards_the_goal(
         assert abs(w) == MOST_TURN_RAD_S
 
 
-def drive(pilot: Pilot, pose: Pose2, stamp_ns: int, seconds: float) -> list[Pose2]:
+def drive(pilot: WaypointFollower, pose: Pose2, stamp_ns: int, seconds: float) -> list[Pose2]:
     """Where a pilot drives in a world without noise, at 10 Hz."""
     way = [pose]
     for _ in range(round(10 * seconds)):
@@ -410,7 +416,7 @@ def drive(pilot: Pilot, pose: Pose2, stamp_ns: int, seconds: float) -> list[Pose
 
 def test_a_pilot_visits_its_waypoints_in_order_and_again() -> None:
     corners = [(2.0, 0.0), (2.0, 2.0), (0.0, 2.0), (0.0, 0.0)]
-    way = drive(Pilot("me", corners, 0.5), Pose2(0.0, 0.0, 0.0), 0, 60.0)
+    way = drive(WaypointFollower("me", corners, 0.5), Pose2(0.0, 0.0, 0.0), 0, 60.0)
     visits: list[int] = []
     for pose in way:
         for i, (x, y) in enumerate(corners):
@@ -421,7 +427,7 @@ def test_a_pilot_visits_its_waypoints_in_order_and_again() -> None:
 
 
 def test_a_pilot_goes_for_the_next_waypoint_as_soon_as_it_is_near_one() -> None:
-    pilot = Pilot("me", [(1.0, 0.0), (1.0, 9.0)], 0.5)
+    pilot = WaypointFollower("me", [(1.0, 0.0), (1.0, 9.0)], 0.5)
     (ahead,) = pilot.command(located(Pose2(0.0, 0.0, 0.0), COMMAND_NS))
     (aside,) = pilot.command(located(Pose2(1.1 - REACHED_M, 0.0, 0.0), 2 * COMMAND_NS))
     assert ahead == Drive("me", COMMAND_NS, 0.5, 0.0)
@@ -429,7 +435,7 @@ def test_a_pilot_goes_for_the_next_waypoint_as_soon_as_it_is_near_one() -> None:
 
 
 def test_a_pilot_says_how_many_waypoints_it_has_reached_over_all_loops() -> None:
-    pilot = Pilot("me", [(1.0, 0.0), (0.0, 0.0)], 0.5)
+    pilot = WaypointFollower("me", [(1.0, 0.0), (0.0, 0.0)], 0.5)
     there_and_back = [0.5, 1.0, 0.5, 0.0, 0.5, 1.0]
     said = [
         pilot.command(located(Pose2(x, 0.0, 0.0), (i + 1) * COMMAND_NS))[0].reached
@@ -439,15 +445,15 @@ def test_a_pilot_says_how_many_waypoints_it_has_reached_over_all_loops() -> None
 
 
 def test_a_lost_pilot_looks_around_on_the_spot() -> None:
-    pilot = Pilot("me", [(5.0, 0.0)], 0.5)
+    pilot = WaypointFollower("me", [(5.0, 0.0)], 0.5)
     (command,) = pilot.command(located(HERE, COMMAND_NS, lost="for a test"))
     assert command.speed_m_s == 0.0
     assert command.turn_rate_rad_s != 0.0
 
 
 def test_commands_come_at_10_hz_at_most_and_only_with_waypoints() -> None:
-    pilot = Pilot("me", [(5.0, 0.0)], 0.5)
+    pilot = WaypointFollower("me", [(5.0, 0.0)], 0.5)
     stamps = range(COMMAND_NS, SECOND + COMMAND_NS, 20 * MS)
     commands = [c for at in stamps for c in pilot.command(located(HERE, at))]
     assert [c.stamp_ns for c in commands] == list(range(COMMAND_NS, SECOND + 1, COMMAND_NS))
-    assert Pilot("me", [], 0.5).command(located(HERE, COMMAND_NS)) == []
+    assert WaypointFollower("me", [], 0.5).command(located(HERE, COMMAND_NS)) == []

@@ -13,7 +13,17 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import pytest
-from support.buses import MS, PATIENCE_S, SECOND, Ear, Stand, robot_at, saw, team_of, wait_until
+from support.buses import (
+    MS,
+    PATIENCE_S,
+    SECOND,
+    Subscription,
+    TeamOnBus,
+    robot_at,
+    saw,
+    team_of,
+    wait_until,
+)
 from support.logs import EPOCH_MS, STARTS, write_log
 from support.processes import eventually
 from support.wire_tap import Batch, Kind, Relay, most_in_window, total
@@ -40,10 +50,11 @@ from cpcbl_team.config import (
 from cpcbl_team.geometry import wrap_angle
 from cpcbl_team.inputs import Sighting, Sightings
 from cpcbl_transport import topics
-from cpcbl_transport.bus import Bus, Handle, MemoryBus, Publisher, Receive, Watch
+from cpcbl_transport.bus import Bus, Handle, LivelinessCallback, MessageCallback, Publisher
 from cpcbl_transport.compact import BELIEF_BYTES, FIX_BYTES
 from cpcbl_transport.guards import guard_rules
 from cpcbl_transport.link_size import received_bytes, sent_bytes
+from cpcbl_transport.memory_bus import MemoryBus
 from cpcbl_transport.messages import Spending
 from cpcbl_transport.topics import Qos
 from cpcbl_transport.zenoh_bus import ZenohBus, open_bus, open_router
@@ -67,15 +78,15 @@ class Fed(NamedTuple):
     def publisher(self, key: str, qos: Qos) -> Publisher:
         return self.wire.publisher(key, qos)
 
-    def subscribe(self, keys: str, receive: Receive) -> Handle:
+    def subscribe(self, keys: str, receive: MessageCallback) -> Handle:
         bus: Bus = self.inputs if keys.startswith("in/") else self.wire
         return bus.subscribe(keys, receive)
 
-    def announce(self, key: str) -> Handle:
-        return self.wire.announce(key)
+    def declare_token(self, key: str) -> Handle:
+        return self.wire.declare_token(key)
 
-    def watch(self, keys: str, watch: Watch) -> Handle:
-        return self.wire.watch(keys, watch)
+    def watch_liveliness(self, keys: str, watch: LivelinessCallback) -> Handle:
+        return self.wire.watch_liveliness(keys, watch)
 
     def close(self) -> None:
         self.wire.close()
@@ -93,7 +104,7 @@ class Wired(NamedTuple):
     Robot time runs as fast as the robots can (so the router has no guards).
     """
 
-    stand: Stand
+    stand: TeamOnBus
     links: Mapping[str, Relay]
     endpoint: str
 
@@ -141,7 +152,7 @@ def sent(link: Relay) -> int:
 
 def said(agent: CollaborationAgent) -> int:
     """Fixes and beliefs that a robot has put."""
-    return sum(flow.messages for flow in agent.tallies.flows())
+    return sum(flow.messages for flow in agent.counters.flows())
 
 
 def received(link: Relay) -> int:
@@ -152,7 +163,7 @@ def received(link: Relay) -> int:
 def wired(team: Team, *here: str) -> Iterator[Wired]:
     """All robots of a team, or those that are named."""
     endpoint = free_endpoint()
-    stand = Stand(team, here=[])
+    stand = TeamOnBus(team, here=[])
     with ExitStack() as stack:
         stack.enter_context(open_router(team.name, [endpoint]))
         links = {name: stack.enter_context(Relay(endpoint)) for name in here or team.robots}
@@ -254,10 +265,10 @@ def spent(bytes_per_s: float, seconds: int, at_once: int = 1) -> Spent:
         observer=robot_at(sigma_m=GOOD, **rules), **{name: robot_at(2.0) for name in MATES}
     )
     with wired(team, "observer") as robots, open_bus(team.name, [robots.endpoint]) as mates:
-        ears = [Ear(mates, topics.FIX.at(robot=name)) for name in MATES]
-        ears.append(Ear(mates, topics.BELIEF.at(robot="observer")))
+        ears = [Subscription(mates, topics.FIX.at(robot=name)) for name in MATES]
+        ears.append(Subscription(mates, topics.BELIEF.at(robot="observer")))
         for tier, name in enumerate(MATES, start=10):
-            mates.announce(topics.ALIVE.at(tier=tier, robot=name, incarnation="1"))
+            mates.declare_token(topics.ALIVE.at(tier=tier, robot=name, incarnation="1"))
         stand, (link,) = robots.stand, robots.links.values()
         agent = stand.robots["observer"].collaboration
         batches, frames = list[Batch](), list[Sightings]()
@@ -280,7 +291,7 @@ def spent(bytes_per_s: float, seconds: int, at_once: int = 1) -> Spent:
         for _ in range(10 * seconds):
             look()
         (spending,) = agent.budget.spending(stand.now_ns)
-    return Spent(batches, spending, sum(f.over_budget for f in agent.tallies.flows()))
+    return Spent(batches, spending, sum(f.over_budget for f in agent.counters.flows()))
 
 
 @pytest.mark.parametrize("at_once", [1, 10], ids=["steady", "stuttering"])
@@ -369,7 +380,7 @@ def test_who_is_lost_is_helped_by_all_and_who_finds_itself_helps() -> None:
         so_far = said(mates)
         repeat_until(
             lambda: look(worst=[*marks, towards]),
-            lambda: agent.tallies.of("fix", "second").messages > 0,
+            lambda: agent.counters.of("fix", "second").messages > 0,
         )
         wait_until(lambda: min(sent(worst), received(second)) > 0)
         assert said(mates) == so_far

@@ -38,7 +38,7 @@ from cpcbl_launch.run.up import free_endpoint
 from cpcbl_team.inputs import Fix, Sightings
 from cpcbl_transport.bus import Bus
 from cpcbl_transport.compact import FIX_BYTES, decode_help
-from cpcbl_transport.messages import decode
+from cpcbl_transport.messages import decode_tagged
 from cpcbl_transport.zenoh_bus import open_bus, open_router
 
 PERIOD_NS = 103_000_000  # no multiple of the filter's 100 ms, so that every phase of it occurs
@@ -122,7 +122,7 @@ def _wait_for(bus: Bus, tokens: Sequence[str]) -> None:
     events = []
     for keys in tokens:
         event = threading.Event()
-        bus.watch(keys, lambda key, alive, event=event: event.set())  # type: ignore[misc]
+        bus.watch_liveliness(keys, lambda key, alive, event=event: event.set())  # type: ignore[misc]
         events.append(event)
     until = time.monotonic() + PATIENCE_S
     for keys, event in zip(tokens, events, strict=True):
@@ -158,7 +158,7 @@ def _by_stamp(messages: Sequence[Passed]) -> dict[int, int]:
     passed: dict[int, int] = {}
     for at_ns, key, payload in messages:
         fix = key.startswith("fix/")
-        message = decode_help(key, payload) if fix else decode(payload)
+        message = decode_help(key, payload) if fix else decode_tagged(payload)
         if isinstance(message, Sightings | Fix):
             passed.setdefault(message.stamp_ns, at_ns)
     return passed

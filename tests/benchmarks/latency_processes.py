@@ -12,10 +12,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from cpcbl_agents.agent import FromBus, Tick
+from cpcbl_agents.agent import BusEvent, Tick
 from cpcbl_agents.clock import Clock
 from cpcbl_agents.node import Node
-from cpcbl_agents.process import Loop, Stop
+from cpcbl_agents.process import Loop, StopSignal
 from cpcbl_agents.robot import Robot
 from cpcbl_team.config import (
     CollaborationSettings,
@@ -27,8 +27,8 @@ from cpcbl_team.config import (
 )
 from cpcbl_team.inputs import Fix, Odometry, Sighting, Sightings
 from cpcbl_transport import topics
-from cpcbl_transport.bus import Bus, Handle, Publisher, Receive
-from cpcbl_transport.bus_proxy import PassingBus, PassingPublisher
+from cpcbl_transport.bus import Bus, Handle, MessageCallback, Publisher
+from cpcbl_transport.bus_proxy import BusProxy, PublisherProxy
 from cpcbl_transport.compact import FIX_BYTES
 from cpcbl_transport.messages import Message, encode
 from cpcbl_transport.topics import Qos
@@ -46,7 +46,7 @@ class Passed(NamedTuple):
     payload: bytes
 
 
-class _TimingPublisher(PassingPublisher):
+class _TimingPublisher(PublisherProxy):
     """A publisher that records each put."""
 
     def __init__(self, publisher: Publisher, key: str, sent: list[Passed]) -> None:
@@ -58,7 +58,7 @@ class _TimingPublisher(PassingPublisher):
         super().put(payload)
 
 
-class TimingBus(PassingBus):
+class TimingBus(BusProxy):
     """A bus that records the messages that pass, and when."""
 
     def __init__(self, bus: Bus) -> None:
@@ -69,7 +69,7 @@ class TimingBus(PassingBus):
     def publisher(self, key: str, qos: Qos) -> Publisher:
         return _TimingPublisher(super().publisher(key, qos), key, self.sent)
 
-    def subscribe(self, keys: str, receive: Receive) -> Handle:
+    def subscribe(self, keys: str, receive: MessageCallback) -> Handle:
         def arrived(key: str, payload: bytes) -> None:
             self.received.append(Passed(time.monotonic_ns(), key, payload))
             receive(key, payload)
@@ -85,7 +85,7 @@ class TimingRobot(Robot):
         self.changed_ns: dict[int, int] = {}
         """When the belief changed, by the stamp of the fix."""
 
-    def handle(self, message: Message | Tick | FromBus, now_ns: int) -> list[Message]:
+    def handle(self, message: Message | Tick | BusEvent, now_ns: int) -> list[Message]:
         before = self.filter.timeline.state
         outgoing = super().handle(message, now_ns)
         if isinstance(message, Fix):
@@ -107,20 +107,20 @@ def run_timed_robot(
     name: str, team: Team, endpoint: str, clock: Clock, parent: int, out: Connection
 ) -> None:
     """The process of a robot: the project's own loop around a node, on a bus that records times."""
-    stop, loop = Stop(parent), Loop(clock)
+    stop, loop = StopSignal(parent), Loop(clock)
     with open_bus(team.name, [endpoint], stop) as session:
         bus, start_ns = TimingBus(session), clock.now_ns()
         robot = TimingRobot(name, team, start_ns)
-        loop.run(Node(robot, team, bus, start_ns, "1", loop.arrived), stop)
+        loop.run(Node(robot, team, bus, start_ns, "1", loop.on_arrival), stop)
     out.send(RobotTimes(bus.received, bus.sent, robot.changed_ns))
 
 
 def bare_sender(team: str, endpoint: str, parent: int, schedule: Connection) -> None:
     """Puts at the times that it receives from its pipe."""
-    stop = Stop(parent)
+    stop = StopSignal(parent)
     with open_bus(team, [endpoint], stop) as bus:
         publisher = bus.publisher(BARE_KEY, Qos.FRESH)
-        bus.announce("ready/sender")
+        bus.declare_token("ready/sender")
         while not stop() and not schedule.poll(0.1):
             pass
         for at_ns in schedule.recv() if schedule.poll() else ():
@@ -132,14 +132,14 @@ def bare_sender(team: str, endpoint: str, parent: int, schedule: Connection) -> 
 
 def bare_receiver(team: str, endpoint: str, parent: int, out: Connection) -> None:
     """Records how long each bare put took, in nanoseconds."""
-    stop, took_ns = Stop(parent), list[int]()
+    stop, took_ns = StopSignal(parent), list[int]()
 
     def arrived(key: str, payload: bytes) -> None:
         took_ns.append(time.monotonic_ns() - int.from_bytes(payload, "little"))
 
     with open_bus(team, [endpoint], stop) as bus:
         bus.subscribe(BARE_KEYS, arrived)
-        bus.announce("ready/receiver")
+        bus.declare_token("ready/receiver")
         while not stop():
             time.sleep(0.05)
     out.send(took_ns)

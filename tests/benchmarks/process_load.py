@@ -17,7 +17,7 @@ import msgspec
 
 from cpcbl_agents.clock import Clock
 from cpcbl_agents.node import STATUS_NS
-from cpcbl_agents.process import Stop
+from cpcbl_agents.process import StopSignal
 from cpcbl_launch.lab.chaos.team import clock_in
 from cpcbl_launch.lab.scaling.swarm import swarm
 from cpcbl_launch.run.processes import process_table
@@ -30,7 +30,7 @@ from cpcbl_team.inputs import Belief, Odometry
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus
 from cpcbl_transport.compact import BELIEF_BYTES, decode_help, encode_help
-from cpcbl_transport.messages import Status, Track, decode, encode
+from cpcbl_transport.messages import Status, Track, decode_tagged, encode
 from cpcbl_transport.zenoh_bus import open_bus, open_router
 
 LATE_NS = 100_000_000
@@ -90,7 +90,7 @@ class _Counts:
     def receive(self, key: str, payload: bytes) -> None:
         now_ns = self._clock.now_ns()
         is_belief = key.startswith("belief/")
-        message = decode_help(key, payload) if is_belief else decode(payload)
+        message = decode_help(key, payload) if is_belief else decode_tagged(payload)
         late_ns = ODOMETRY_LATE_NS if isinstance(message, Odometry) else LATE_NS
         with self._lock:
             if isinstance(message, Status):
@@ -125,7 +125,7 @@ def measure_start(starts: int, checkout: Path | None = None) -> Start:
         for _ in range(starts):
             (spec,) = _robot_specs(team, folder, endpoint, clock_in(LEAD_S), checkout, [robot])
             appeared = threading.Event()
-            tokens = bus.watch(topics.ALIVE.at(robot=robot), _setter(appeared))
+            tokens = bus.watch_liveliness(topics.ALIVE.at(robot=robot), _setter(appeared))
             began_s = time.monotonic()
             with subprocess.Popen(spec.command, stderr=subprocess.DEVNULL) as process:
                 try:
@@ -221,7 +221,7 @@ def measure_broadcast(robots: int, seconds: float) -> Load:
 
 def _broadcast(name: str, ahead_ns: int, endpoint: str, clock: Clock, parent: int) -> None:
     """A process that puts its belief, decodes those of all others, and reports its counts."""
-    stop, period_ns = Stop(parent), int(1e9 / BELIEFS_HZ)
+    stop, period_ns = StopSignal(parent), int(1e9 / BELIEFS_HZ)
     sent, received, status_ns = 0, [0, 0], clock.epoch_ns
 
     def receive(key: str, payload: bytes) -> None:

@@ -23,7 +23,7 @@ from cpcbl_launch.lab.chaos.scenario import Found, Setting, all_is_well, they_go
 from cpcbl_launch.lab.chaos.team import FIELD, ChaosError, Plan, TeamUnderTest, demo_team, running
 from cpcbl_launch.reporting.recorder import Recorder
 from cpcbl_launch.run.processes import PROGRAM
-from cpcbl_launch.views.frames.ear import LookEar
+from cpcbl_launch.views.frames.ear import FrameSubscriber
 from cpcbl_launch.views.traffic.watch import StatusCollector
 from cpcbl_team.config import (
     CollaborationSettings,
@@ -36,7 +36,7 @@ from cpcbl_team.config import (
 from cpcbl_team.inputs import Sighting, Sightings
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus
-from cpcbl_transport.decoding import read
+from cpcbl_transport.decoding import decode
 from cpcbl_transport.messages import Refusal, encode
 from cpcbl_transport.topics import Topic
 from cpcbl_transport.zenoh_bus import open_bus
@@ -116,7 +116,7 @@ def fuzz(setting: Setting, per_key: int = PER_KEY) -> Found:
         team = stack.enter_context(running(plan))
         bus = stack.enter_context(open_bus(plan.team.name, [team.endpoint]))
         ears = stack.enter_context(open_bus(plan.team.name, [team.endpoint]))
-        recorder, watcher, looks = Recorder(ears), StatusCollector(ears), LookEar(ears)
+        recorder, watcher, looks = Recorder(ears), StatusCollector(ears), FrameSubscriber(ears)
         setting.say("starting a team")
         team.settle()
         from_s = team.now_s
@@ -212,7 +212,7 @@ class Fuzzer:
     ) -> None:
         self._team, self._bus, self._per_key, self._report = team, bus, per_key, setting.say
         self._random, self._examples = random.Random(setting.seed), examples
-        self._token = bus.announce(topics.ALIVE.at(tier=0, robot=MATE, incarnation="1"))
+        self._token = bus.declare_token(topics.ALIVE.at(tier=0, robot=MATE, incarnation="1"))
         key = topics.IN_SIGHTINGS.at(robot=VICTIM)
         self._sightings = bus.publisher(key, topics.IN_SIGHTINGS.qos)
         self._sighted_s = 0.0
@@ -225,7 +225,9 @@ class Fuzzer:
             self._send(topic, self._key(topic))
         for n in range(TOKENS):
             chunk = f"{n}.{self._random.randrange(2**32):x}"
-            self._bus.announce(topics.ALIVE.at(tier=chunk, robot=MATE, incarnation=chunk)).close()
+            self._bus.declare_token(
+                topics.ALIVE.at(tier=chunk, robot=MATE, incarnation=chunk)
+            ).close()
 
     def send_everything_else(self) -> None:
         for topic in (*topics.INPUTS, *TO_PEOPLE, *TO_FIELD):
@@ -273,7 +275,7 @@ class Fuzzer:
             if n % BURST == 0:
                 self._wait(lambda: publisher.matching)
                 time.sleep(PAUSE_S)
-            if topic in TO_PEOPLE and isinstance(read(key, payload), Refusal):
+            if topic in TO_PEOPLE and isinstance(decode(key, payload), Refusal):
                 self._count[f"bad {topic.key}"] += 1
             publisher.put(payload)
             self._count[topic.key] += 1

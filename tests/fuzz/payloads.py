@@ -11,11 +11,11 @@ from cpcbl_transport import topics
 from cpcbl_transport.compact import encode_help
 from cpcbl_transport.messages import (
     VERSION,
+    AnnotatedFrame,
     Drive,
     Flow,
     Frame,
     Join,
-    Look,
     Status,
     Track,
     Truth,
@@ -57,7 +57,9 @@ def valid_payload(topic: Topic, target: str, speaker: str, now_ns: int) -> bytes
         case topics.IN_FRAME:
             return encode(Frame(now_ns, b"a picture"))
         case topics.LOOK:
-            return encode(Look(speaker, now_ns, b"a picture", (Sighting(target, 2.0, 0.1),)))
+            return encode(
+                AnnotatedFrame(speaker, now_ns, b"a picture", (Sighting(target, 2.0, 0.1),))
+            )
         case topics.DRIVE:
             return encode(Drive(speaker, now_ns, 0.5, 0.1))
         case topics.JOIN:

@@ -13,7 +13,7 @@ from support.processes import cpcbl_team, eventually, patient_up, pids_of
 from cpcbl_launch.run.processes import PROGRAM
 from cpcbl_launch.run.up import free_endpoint
 from cpcbl_transport import topics
-from cpcbl_transport.messages import Status, decode
+from cpcbl_transport.messages import Status, decode_tagged
 from cpcbl_transport.zenoh_bus import open_router
 
 DRIVER = Path(__file__).parents[2] / "docs" / "external_driver.py"
@@ -195,7 +195,7 @@ def test_the_documented_driver_feeds_a_robot(tmp_path: Path) -> None:
     heard: list[Status] = []
 
     def hear(key: str, payload: bytes) -> None:
-        status = decode(payload)
+        status = decode_tagged(payload)
         assert isinstance(status, Status)
         heard.append(status)
 

@@ -20,7 +20,7 @@ from cpcbl_launch.team_file import TeamFileError, builtin_path, load_team, save_
 from cpcbl_team.config import RobotSettings, Team
 from cpcbl_team.errors import InputError
 from cpcbl_transport import topics
-from cpcbl_transport.bus import MemoryHub
+from cpcbl_transport.memory_bus import MemoryHub
 from cpcbl_transport.messages import encode
 
 TEAM = Team(name="one", robots={"r1": RobotSettings(source="external")})

@@ -21,13 +21,15 @@ from cpcbl_team.config import (
 )
 from cpcbl_team.inputs import Belief, Fix, Odometry, Sighting, Sightings
 from cpcbl_transport import topics
-from cpcbl_transport.bus import Bus, Handle, MemoryHub
+from cpcbl_transport.bus import Bus, Handle
 from cpcbl_transport.compact import decode_help, encode_help
-from cpcbl_transport.messages import Message, Refusal, Status, decode, encode
+from cpcbl_transport.memory_bus import MemoryHub
+from cpcbl_transport.messages import Message, Refusal, Status, decode_tagged, encode
 
 MS = 1_000_000
 SECOND = 1000 * MS
 PATIENCE_S = 10.0
+HELP_KEYS = ("belief/", "fix/")
 MAP = Field(landmarks={"oak": Landmark(x_m=4.0, y_m=0.0), "elm": Landmark(x_m=0.0, y_m=4.0)})
 
 
@@ -60,7 +62,7 @@ def written(message: Message) -> bytes:
     return encode_help(message) if isinstance(message, Belief | Fix) else encode(message)
 
 
-class Ear:
+class Subscription:
     """Everything that a session hears under some keys, in order."""
 
     def __init__(self, bus: Bus, keys: str) -> None:
@@ -78,7 +80,9 @@ class Ear:
     @property
     def messages(self) -> list[Message | Refusal]:
         return [
-            decode_help(key, payload) if key.startswith(("belief/", "fix/")) else decode(payload)
+            decode_help(key, payload)
+            if key.startswith(("belief/", "fix/"))
+            else decode_tagged(payload)
             for key, payload in self.samples
         ]
 
@@ -123,7 +127,7 @@ def saw(stamp_ns: int, *sightings: Sighting) -> Sightings:
     return Sightings(stamp_ns, sightings)
 
 
-class Stand:
+class TeamOnBus:
     """The nodes of a team on one hub, with a session of the test's own beside them."""
 
     def __init__(
@@ -153,7 +157,7 @@ class Stand:
 
     def announce(self, robot: str, tier: int) -> Handle:
         """The token of a robot whose part the test plays."""
-        return self.bus.announce(topics.ALIVE.at(tier=tier, robot=robot, incarnation="1"))
+        return self.bus.declare_token(topics.ALIVE.at(tier=tier, robot=robot, incarnation="1"))
 
     def step(self) -> None:
         """Steps every robot once, then those that something has arrived for, until all is quiet."""
@@ -171,8 +175,8 @@ class Stand:
                 self.odometry(name, standing(self.now_ns, before))
             self.step()
 
-    def ear(self, keys: str) -> Ear:
-        return Ear(self.bus, keys)
+    def ear(self, keys: str) -> Subscription:
+        return Subscription(self.bus, keys)
 
     def statuses(self) -> dict[str, Status]:
         """What the robots say of themselves within the next second or so."""

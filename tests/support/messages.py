@@ -4,18 +4,18 @@ import msgspec
 
 from cpcbl_team.inputs import Belief, Fix, Odometry, Position, Sighting, Sightings
 from cpcbl_transport.messages import (
+    AnnotatedFrame,
     Drive,
     Flow,
     Frame,
     Join,
-    Look,
     Spending,
     Status,
     Track,
     Trust,
     Truth,
     Truths,
-    Unclear,
+    UnclearObject,
 )
 from cpcbl_transport.robot_model import PositionSensorModel, SimulatedRobotModel, StartModel
 from support.buses import SECOND
@@ -29,7 +29,7 @@ POSITION = Position(NOW, 1.0, 2.0, (0.0004, 0.0, 0.0009))
 JPEG = bytes(range(256))
 FRAME = Frame(NOW, JPEG)
 MATE_SEEN = Sighting("r2", 2.0, 0.1, 0.02, 0.003, -1.5, 0.05)
-LOOK = Look("r1", NOW, JPEG, (MATE_SEEN,), (Unclear("ambiguous", ("r2", "r3")),))
+LOOK = AnnotatedFrame("r1", NOW, JPEG, (MATE_SEEN,), (UnclearObject("ambiguous", ("r2", "r3")),))
 LEARNED = (0.98, 0.96, -0.01)
 STATUS = Status("r1", "a", NOW, 0.1, 0.02, 3, "", {"odometry": 7}, 1, 20, 2, 40, LEARNED)
 SENT = (Flow("fix", "r2", 1, 41, 2, 3, 0, NOW), Flow("belief", "", 0, 0, 0, 0, 4))

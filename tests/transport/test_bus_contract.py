@@ -10,10 +10,11 @@ import pytest
 import zenoh
 from hypothesis import given
 from hypothesis import strategies as st
-from support.buses import Ear, examples, matches, wait_until
+from support.buses import Subscription, examples, matches, wait_until
 
 from cpcbl_launch.run.up import free_endpoint
-from cpcbl_transport.bus import Bus, MemoryHub
+from cpcbl_transport.bus import Bus
+from cpcbl_transport.memory_bus import MemoryHub
 from cpcbl_transport.topics import Qos
 from cpcbl_transport.zenoh_bus import BusError, open_bus, open_router
 
@@ -64,7 +65,9 @@ class Watched:
 
     def __init__(self, bus: Bus, keys: str) -> None:
         self.events: list[tuple[str, bool]] = []
-        self._handle = bus.watch(keys, lambda key, alive: self.events.append((key, alive)))
+        self._handle = bus.watch_liveliness(
+            keys, lambda key, alive: self.events.append((key, alive))
+        )
 
     def close(self) -> None:
         self._handle.close()
@@ -76,7 +79,7 @@ MARKS = count()
 def settle(pair: Pair) -> None:
     """Returns when `one` knows all that `other` has declared and taken back."""
     mark = f"mark/{next(MARKS)}"
-    handle, publisher = Ear(pair.other, mark), pair.one.publisher(mark, RELIABLE)
+    handle, publisher = Subscription(pair.other, mark), pair.one.publisher(mark, RELIABLE)
     wait_until(lambda: publisher.matching)
     publisher.close()
     handle.close()
@@ -95,8 +98,8 @@ EXCLUDING = ("belief/4/r1", "belief/*", "fix/**", "belief/*/r2", "*", "belief/3/
 
 
 def test_a_message_reaches_the_subscriptions_that_include_its_key_and_no_other(pair: Pair) -> None:
-    excluding = [Ear(pair.other, keys) for keys in EXCLUDING]
-    including = [Ear(pair.other, keys) for keys in INCLUDING]
+    excluding = [Subscription(pair.other, keys) for keys in EXCLUDING]
+    including = [Subscription(pair.other, keys) for keys in INCLUDING]
     deliver(pair, KEY, b"here")
     wait_until(lambda: all(ear.samples for ear in including))
     assert [ear.samples for ear in including] == [[(KEY, b"here")]] * len(INCLUDING)
@@ -104,7 +107,7 @@ def test_a_message_reaches_the_subscriptions_that_include_its_key_and_no_other(p
 
 
 def test_a_session_does_not_hear_itself(pair: Pair) -> None:
-    own, others = Ear(pair.one, "a/*"), Ear(pair.other, "a/*")
+    own, others = Subscription(pair.one, "a/*"), Subscription(pair.other, "a/*")
     deliver(pair, "a/one", b"from one")
     deliver(Pair(pair.other, pair.one), "a/other", b"from other")
     wait_until(lambda: bool(own.samples and others.samples))
@@ -113,7 +116,7 @@ def test_a_session_does_not_hear_itself(pair: Pair) -> None:
 
 
 def test_payloads_arrive_unchanged_and_in_order(pair: Pair) -> None:
-    ear = Ear(pair.other, "a/*")
+    ear = Subscription(pair.other, "a/*")
     sent = [b"", b"\x00", bytes(range(256)) * 234, *(n.to_bytes(2, "big") for n in range(1000))]
     publisher = pair.one.publisher("a/b", RELIABLE)
     wait_until(lambda: publisher.matching)
@@ -129,22 +132,22 @@ def test_payloads_arrive_unchanged_and_in_order(pair: Pair) -> None:
 def test_matching_tells_whether_anybody_listens(pair: Pair) -> None:
     publisher = pair.one.publisher("a/b", RELIABLE)
     assert not publisher.matching
-    ear = Ear(pair.other, "a/*")
+    ear = Subscription(pair.other, "a/*")
     wait_until(lambda: publisher.matching)
     ear.close()
     wait_until(lambda: not publisher.matching)
 
 
 def test_the_publishers_own_session_and_other_keys_do_not_match(pair: Pair) -> None:
-    Ear(pair.one, "a/b")
-    Ear(pair.other, "a/c")
+    Subscription(pair.one, "a/b")
+    Subscription(pair.other, "a/c")
     asked, witness = pair.one.publisher("a/b", RELIABLE), pair.one.publisher("a/c", RELIABLE)
     wait_until(lambda: witness.matching)
     assert not asked.matching
 
 
 def test_a_closed_subscription_hears_nothing_more(pair: Pair) -> None:
-    closed, witness = Ear(pair.other, "a/*"), Ear(pair.other, "a/b")
+    closed, witness = Subscription(pair.other, "a/*"), Subscription(pair.other, "a/b")
     closed.close()
     deliver(pair, "a/b")
     wait_until(lambda: bool(witness.samples))
@@ -152,7 +155,7 @@ def test_a_closed_subscription_hears_nothing_more(pair: Pair) -> None:
 
 
 def test_a_closed_publisher_says_nothing_more(pair: Pair) -> None:
-    ear = Ear(pair.other, "a/b")
+    ear = Subscription(pair.other, "a/b")
     publisher = pair.one.publisher("a/b", RELIABLE)
     wait_until(lambda: publisher.matching)
     publisher.close()
@@ -164,7 +167,7 @@ def test_a_closed_publisher_says_nothing_more(pair: Pair) -> None:
 
 
 def test_a_closed_session_says_nothing_more(pair: Pair) -> None:
-    ear = Ear(pair.other, "a/b")
+    ear = Subscription(pair.other, "a/b")
     publisher = pair.one.publisher("a/b", RELIABLE)
     wait_until(lambda: publisher.matching)
     pair.one.close()
@@ -182,7 +185,7 @@ def test_subscriptions_outlive_their_handles(pair: Pair) -> None:
 
 
 def test_closing_a_session_ends_its_subscriptions(pair: Pair) -> None:
-    Ear(pair.other, "a/b")
+    Subscription(pair.other, "a/b")
     publisher = pair.one.publisher("a/b", RELIABLE)
     wait_until(lambda: publisher.matching)
     pair.other.close()
@@ -195,8 +198,8 @@ def test_everything_can_be_closed_twice_and_after_its_session(pair: Pair) -> Non
         return [
             bus.publisher("a/b", RELIABLE).close,
             bus.subscribe("a/b", lambda key, payload: None).close,
-            bus.announce("alive/r1").close,
-            bus.watch("alive/*", lambda key, alive: None).close,
+            bus.declare_token("alive/r1").close,
+            bus.watch_liveliness("alive/*", lambda key, alive: None).close,
         ]
 
     for close in (early := declared()):
@@ -213,7 +216,7 @@ def test_everything_can_be_closed_twice_and_after_its_session(pair: Pair) -> Non
 @pytest.mark.parametrize("watcher_first", [True, False], ids=["watched before", "watched after"])
 def test_a_token_is_seen_to_come_and_to_go(pair: Pair, watcher_first: bool) -> None:
     before = Watched(pair.other, "alive/*") if watcher_first else None
-    token = pair.one.announce("alive/r1")
+    token = pair.one.declare_token("alive/r1")
     watched = before or Watched(pair.other, "alive/*")
     wait_until(lambda: watched.events == [("alive/r1", True)])
     token.close()
@@ -222,7 +225,7 @@ def test_a_token_is_seen_to_come_and_to_go(pair: Pair, watcher_first: bool) -> N
 
 def test_a_token_goes_with_its_session(pair: Pair) -> None:
     watched = Watched(pair.other, "alive/**")
-    token = pair.one.announce("alive/3/r1/7")
+    token = pair.one.declare_token("alive/3/r1/7")
     wait_until(lambda: bool(watched.events))
     pair.one.close()
     wait_until(lambda: watched.events[1:] == [("alive/3/r1/7", False)])
@@ -231,10 +234,10 @@ def test_a_token_goes_with_its_session(pair: Pair) -> None:
 
 def test_a_token_and_a_watcher_outlive_their_handles(pair: Pair) -> None:
     events: list[tuple[str, bool]] = []
-    pair.other.watch("alive/*", lambda key, alive: events.append((key, alive)))
-    pair.one.announce("alive/r1")
+    pair.other.watch_liveliness("alive/*", lambda key, alive: events.append((key, alive)))
+    pair.one.declare_token("alive/r1")
     gc.collect()
-    witness = pair.one.announce("alive/r2")
+    witness = pair.one.declare_token("alive/r2")
     wait_until(lambda: ("alive/r2", True) in events)
     witness.close()
     wait_until(lambda: ("alive/r2", False) in events)
@@ -245,7 +248,7 @@ def test_a_watcher_hears_of_its_own_keys_only_and_until_it_is_closed(pair: Pair)
     other_keys, closed = Watched(pair.other, "alive/r2"), Watched(pair.other, "alive/*")
     witness = Watched(pair.other, "alive/*")
     closed.close()
-    token = pair.one.announce("alive/r1")
+    token = pair.one.declare_token("alive/r1")
     wait_until(lambda: bool(witness.events))
     token.close()
     assert other_keys.events == []
@@ -263,9 +266,9 @@ def test_two_teams_on_one_router_do_not_hear_each_other() -> None:
         open_bus("blue", [endpoint]) as blue,
         open_bus("blue", [endpoint]) as blue_too,
     ):
-        ear, alive = Ear(red, "**"), Watched(red, "**")
-        witness, alive_too = Ear(blue_too, "**"), Watched(blue_too, "**")
-        token = blue.announce("alive/r1")
+        ear, alive = Subscription(red, "**"), Watched(red, "**")
+        witness, alive_too = Subscription(blue_too, "**"), Watched(blue_too, "**")
+        token = blue.declare_token("alive/r1")
         deliver(Pair(blue, blue_too), "a/b")
         wait_until(lambda: bool(witness.samples and alive_too.events))
         token.close()
@@ -290,7 +293,7 @@ def test_a_client_waits_for_its_router() -> None:
         return False
 
     with open_bus("tests", [endpoint], give_up=router_comes_late) as client, opened[0] as router:
-        ear = Ear(router, "a/b")
+        ear = Subscription(router, "a/b")
         deliver(Pair(client, router), "a/b")
         wait_until(lambda: bool(ear.samples))
 

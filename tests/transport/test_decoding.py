@@ -9,16 +9,18 @@ from hypothesis import strategies as st
 from support.buses import SECOND, examples, standing
 
 from cpcbl_team.inputs import Sighting
-from cpcbl_transport.decoding import read
+from cpcbl_transport import topics
+from cpcbl_transport.decoding import Received, Subscriber, decode
+from cpcbl_transport.memory_bus import MemoryHub
 from cpcbl_transport.messages import (
     LARGEST_COUNT,
     LARGEST_FRAME,
     LARGEST_PAYLOAD,
     LAST_NS,
+    AnnotatedFrame,
     Drive,
     Flow,
     Frame,
-    Look,
     Refusal,
     Status,
     Tagged,
@@ -41,14 +43,14 @@ GOOD: dict[str, Tagged] = {
     "field/truth": TRUTHS,
     "in/r1/odometry": standing(NOW),
     "in/r1/frame": Frame(NOW, bytes(LARGEST_PAYLOAD)),
-    "look/r1": Look("r1", NOW, bytes(LARGEST_PAYLOAD), (Sighting("oak", 2.0, 0.1),)),
+    "look/r1": AnnotatedFrame("r1", NOW, bytes(LARGEST_PAYLOAD), (Sighting("oak", 2.0, 0.1),)),
 }
 
 
 @pytest.mark.parametrize("key", GOOD)
 def test_what_the_key_allows_is_taken(key: str) -> None:
-    assert read(key, encode(GOOD[key])) == GOOD[key]
-    assert read(key, encode(GOOD[key]), NOW) == GOOD[key]
+    assert decode(key, encode(GOOD[key])) == GOOD[key]
+    assert decode(key, encode(GOOD[key]), NOW) == GOOD[key]
 
 
 @pytest.mark.parametrize(
@@ -66,8 +68,12 @@ def test_what_the_key_allows_is_taken(key: str) -> None:
         ("in/r1/odometry", Frame(NOW, bytes(LARGEST_PAYLOAD)), Refusal.TOO_LARGE),
         ("in/r1/odometry", Frame(NOW, b"jpeg"), Refusal.WRONG_TYPE),
         ("in/r1/frame", standing(NOW), Refusal.WRONG_TYPE),
-        ("look/r2", Look("r1", NOW, b"jpeg"), Refusal.NOT_ITS_OWN),
-        ("look/r1", Look("r1", NOW, b"jpeg", (Sighting("oak", math.nan),)), Refusal.NOT_FINITE),
+        ("look/r2", AnnotatedFrame("r1", NOW, b"jpeg"), Refusal.NOT_ITS_OWN),
+        (
+            "look/r1",
+            AnnotatedFrame("r1", NOW, b"jpeg", (Sighting("oak", math.nan),)),
+            Refusal.NOT_FINITE,
+        ),
         ("track/r1", msgspec.structs.replace(TRACK, x_m=math.nan), Refusal.NOT_FINITE),
         ("track/r1", msgspec.structs.replace(TRACK, x_m=1e7), Refusal.IMPLAUSIBLE),
         ("track/r1", msgspec.structs.replace(TRACK, stamp_ns=LAST_NS), Refusal.IMPLAUSIBLE),
@@ -85,15 +91,31 @@ def test_what_the_key_allows_is_taken(key: str) -> None:
     ],
 )
 def test_what_it_does_not_allow_is_refused(key: str, message: Tagged, reason: Refusal) -> None:
-    assert read(key, encode(message)) is reason
+    assert decode(key, encode(message)) is reason
 
 
 def test_the_future_is_refused_by_those_with_a_clock() -> None:
-    assert read("track/r1", encode(TRACK), NOW - 2 * SECOND) is Refusal.FUTURE
-    assert read("track/r1", encode(TRACK)) == TRACK
+    assert decode("track/r1", encode(TRACK), NOW - 2 * SECOND) is Refusal.FUTURE
+    assert decode("track/r1", encode(TRACK)) == TRACK
 
 
 @given(st.sampled_from(sorted(GOOD)), st.binary(max_size=300))
 @examples(300)
 def test_anything_is_a_message_or_a_reason(key: str, payload: bytes) -> None:
-    assert isinstance(read(key, payload), Refusal | type(GOOD[key]))
+    assert isinstance(decode(key, payload), Refusal | type(GOOD[key]))
+
+
+def test_a_subscriber_gets_messages_of_its_topic_and_counts_what_is_refused() -> None:
+    hub = MemoryHub()
+    received: list[Received[Track]] = []
+    subscriber = Subscriber(hub.session(), Track, received.append, robot="r1")
+    bus = hub.session()
+    key, payload = topics.TRACK.at(robot="r1"), encode(TRACK)
+    bus.publisher(key, topics.TRACK.qos).put(payload)
+    bus.publisher(topics.TRACK.at(robot="r2"), topics.TRACK.qos).put(payload)
+    bus.publisher(key, topics.TRACK.qos).put(b"")
+    assert received == [Received(key, payload, TRACK)]
+    assert subscriber.refused == {"empty_payload": 1}
+    subscriber.close()
+    bus.publisher(key, topics.TRACK.qos).put(payload)
+    assert len(received) == 1

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import pytest
 import zenoh
 from msgspec.structs import replace
-from support.buses import Ear, robot_at, team_of, wait_until
+from support.buses import Subscription, robot_at, team_of, wait_until
 
 from cpcbl_launch.run.up import free_endpoint
 from cpcbl_team.config import GuardSettings, Team, TransportSettings
@@ -98,9 +98,9 @@ class Sessions(NamedTuple):
 
     faulty: Bus
     healthy: Bus
-    fixes: Ear
-    beliefs: Ear
-    inputs: Ear
+    fixes: Subscription
+    beliefs: Subscription
+    inputs: Subscription
 
 
 @contextmanager
@@ -112,7 +112,9 @@ def three_robots(team: Team) -> Iterator[Sessions]:
         open_bus(team.name, [endpoint]) as healthy,
         open_bus(team.name, [endpoint]) as victim,
     ):
-        ears = [Ear(victim, keys) for keys in ("fix/victim/7/*", "belief/7/*", "in/victim/*")]
+        ears = [
+            Subscription(victim, keys) for keys in ("fix/victim/7/*", "belief/7/*", "in/victim/*")
+        ]
         yield Sessions(faulty, healthy, *ears)
 
 
@@ -123,14 +125,14 @@ def put(bus: Bus, key: str, *payloads: bytes, qos: Qos = Qos.INPUT) -> None:
         publisher.put(payload)
 
 
-def last_of(bus: Bus, ear: Ear, robot: str = "victim") -> None:
+def last_of(bus: Bus, ear: Subscription, robot: str = "victim") -> None:
     """Returns when what this session put before has been delivered, or dropped."""
     before = ear.payloads.count(b"last")
     put(bus, topics.IN_POSITION.at(robot=robot), b"last")
     wait_until(lambda: ear.payloads.count(b"last") > before)
 
 
-def by(observer: str, ear: Ear) -> list[bytes]:
+def by(observer: str, ear: Subscription) -> list[bytes]:
     return [payload for key, payload in ear.samples if key.endswith("/" + observer)]
 
 
@@ -190,7 +192,7 @@ def test_without_guards_the_same_flood_comes_through() -> None:
 def test_what_is_sent_at_once_has_a_rate_for_each_target_and_each_robot() -> None:
     rare = guarded(fix_rate_hz=TOO_SELDOM_HZ, belief_rate_hz=TOO_SELDOM_HZ)
     with three_robots(rare) as robots:
-        others = Ear(robots.healthy, "fix/healthy/7/*")
+        others = Subscription(robots.healthy, "fix/healthy/7/*")
         for observer, bus in (("faulty", robots.faulty), ("healthy", robots.healthy)):
             put(bus, topics.FIX.at(robot="victim", tier=7, observer=observer), b"1", b"2")
             put(bus, topics.FIX.at(robot="victim", tier=7, observer=observer), b"3")

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from support.buses import Ear, examples, wait_until
+from support.buses import Subscription, examples, wait_until
 from support.wire_tap import Batch, Kind, Relay, kind_of, most_in_window, put_down, total
 
 from cpcbl_launch.run.up import free_endpoint
@@ -56,7 +56,7 @@ def data(batches: list[Batch]) -> list[Batch]:
 
 def carry(links: Links, key: str, keys: str, payload: bytes, qos: Qos = Qos.FRESH) -> None:
     """One put, from its publisher to a subscription."""
-    ear, publisher = Ear(links.receiver, keys), links.sender.publisher(key, qos)
+    ear, publisher = Subscription(links.receiver, keys), links.sender.publisher(key, qos)
     wait_until(lambda: publisher.matching)
     publisher.put(payload)
     wait_until(lambda: ear.payloads == [payload])
@@ -78,7 +78,7 @@ def test_a_put_passes_each_link_once_with_its_bytes(links: Links) -> None:
 
 def test_many_puts_in_shared_batches_are_all_there(links: Links) -> None:
     sent = [f"<{n:038}>".encode() for n in range(1000)]
-    ear, publisher = Ear(links.receiver, "a/b"), links.sender.publisher("a/b", Qos.INPUT)
+    ear, publisher = Subscription(links.receiver, "a/b"), links.sender.publisher("a/b", Qos.INPUT)
     wait_until(lambda: publisher.matching)
     for payload in sent:
         publisher.put(payload)

@@ -30,11 +30,11 @@ from cpcbl_transport.messages import (
     LARGEST_PIECE,
     LONGEST_ODOMETRY_NS,
     VERSION,
+    AnnotatedFrame,
     Drive,
     Flow,
     Frame,
     Join,
-    Look,
     Refusal,
     Spending,
     Status,
@@ -43,8 +43,8 @@ from cpcbl_transport.messages import (
     Trust,
     Truth,
     Truths,
-    Unclear,
-    decode,
+    UnclearObject,
+    decode_tagged,
     encode,
     refusal,
 )
@@ -71,7 +71,7 @@ SPENDINGS = st.builds(Spending, st.text(), *[FLOATS] * 3)
 TRUSTS = st.builds(Trust, st.text(), st.text(), STAMPS, COUNTS, st.booleans(), FLOATS)
 
 SIGHTED = st.lists(st.builds(Sighting, NAMES, *[MAYBE] * 6), max_size=4).map(tuple)
-UNCLEAR = st.builds(Unclear, st.text(), st.lists(st.text(), max_size=3).map(tuple))
+UNCLEAR = st.builds(UnclearObject, st.text(), st.lists(st.text(), max_size=3).map(tuple))
 
 POSITIVE = st.floats(1e-9, 1e9)
 MODELS = st.builds(
@@ -87,8 +87,8 @@ MESSAGES: dict[type[Any], st.SearchStrategy[Tagged]] = {
     Sightings: st.builds(Sightings, STAMPS, SIGHTED),
     Position: st.builds(Position, STAMPS, FLOATS, FLOATS, COVARIANCES_2),
     Frame: st.builds(Frame, STAMPS, st.binary(max_size=200)),
-    Look: st.builds(
-        Look,
+    AnnotatedFrame: st.builds(
+        AnnotatedFrame,
         NAMES,
         STAMPS,
         st.binary(max_size=200),
@@ -155,7 +155,7 @@ def test_the_strategies_and_samples_cover_the_whole_union() -> None:
 @examples(200)
 @given(ANY_MESSAGE)
 def test_every_message_comes_back_as_it_was(message: Tagged) -> None:
-    again = decode(encode(message))
+    again = decode_tagged(encode(message))
     assert again == message
     assert type(again) is type(message)
 
@@ -163,7 +163,7 @@ def test_every_message_comes_back_as_it_was(message: Tagged) -> None:
 @per_kind
 def test_a_required_field_that_is_missing_is_garbage(valid: Tagged) -> None:
     required = sum(f.required for f in msgspec.structs.fields(valid))
-    assert decode(wire(*fields_of(valid)[:required])) is Refusal.GARBAGE
+    assert decode_tagged(wire(*fields_of(valid)[:required])) is Refusal.GARBAGE
 
 
 # What is refused --------------------------------------------------------------------------------
@@ -203,21 +203,21 @@ def test_a_required_field_that_is_missing_is_garbage(valid: Tagged) -> None:
     ],
 )
 def test_a_payload_that_cannot_be_read_is_refused(payload: bytes, reason: Refusal) -> None:
-    assert decode(payload) is reason
+    assert decode_tagged(payload) is reason
 
 
 def test_the_largest_payload_is_still_read() -> None:
     fits = encode(STATUS).replace(b"\xa1a", b"\xda" + b"\xff\x00" + b"a" * 0xFF00)
     assert len(fits) <= LARGEST_PAYLOAD
-    assert isinstance(decode(fits), Status)
+    assert isinstance(decode_tagged(fits), Status)
 
 
 def test_a_frame_is_read_up_to_a_size_of_its_own() -> None:
     rest = LARGEST_FRAME - len(encode(Frame(NOW, bytes(LARGEST_PAYLOAD)))) + LARGEST_PAYLOAD
     largest, larger = encode(Frame(NOW, bytes(rest))), encode(Frame(NOW, bytes(rest + 1)))
     assert len(largest) == LARGEST_FRAME
-    assert isinstance(decode(largest, LARGEST_FRAME), Frame)
-    assert decode(larger, LARGEST_FRAME) is decode(largest) is Refusal.TOO_LARGE
+    assert isinstance(decode_tagged(largest, LARGEST_FRAME), Frame)
+    assert decode_tagged(larger, LARGEST_FRAME) is decode_tagged(largest) is Refusal.TOO_LARGE
 
 
 @per_kind
@@ -324,8 +324,8 @@ def test_a_number_larger_than_any_field_is_refused(message: Tagged, sign: float)
 @examples(500)
 @given(st.binary(max_size=200))
 def test_random_bytes_never_raise(noise: bytes) -> None:
-    assert isinstance(decode(noise), Refusal | Tagged)
-    assert isinstance(decode(bytes([VERSION]) + noise), Refusal | Tagged)
+    assert isinstance(decode_tagged(noise), Refusal | Tagged)
+    assert isinstance(decode_tagged(bytes([VERSION]) + noise), Refusal | Tagged)
 
 
 @examples(300)
@@ -333,7 +333,7 @@ def test_random_bytes_never_raise(noise: bytes) -> None:
 def test_a_truncated_payload_is_refused(message: Tagged, data: st.DataObject) -> None:
     payload = encode(message)
     kept = data.draw(st.integers(0, len(payload) - 1))
-    assert isinstance(decode(payload[:kept]), Refusal)
+    assert isinstance(decode_tagged(payload[:kept]), Refusal)
 
 
 @examples(500)
@@ -342,6 +342,6 @@ def test_a_flipped_bit_never_raises(message: Tagged, data: st.DataObject) -> Non
     payload = bytearray(encode(message))
     bit = data.draw(st.integers(0, 8 * len(payload) - 1))
     payload[bit // 8] ^= 1 << bit % 8
-    read = decode(bytes(payload))
+    read = decode_tagged(bytes(payload))
     if not isinstance(read, Refusal):
         assert refusal(read, NOW) is None or isinstance(refusal(read, NOW), Refusal)

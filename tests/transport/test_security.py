@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 import zenoh
 from msgspec.structs import replace
-from support.buses import Ear, wait_until
+from support.buses import Subscription, wait_until
 from support.keys import (
     FIELD,
     OPERATOR,
@@ -45,13 +45,13 @@ from cpcbl_transport.security import (
     SecurityError,
     access_control,
     access_rules,
-    heard_by,
     link_of,
     link_options,
     members_in,
-    said_by,
+    publish_keys,
+    subscribe_keys,
 )
-from cpcbl_transport.topics import Qos, Role, Who
+from cpcbl_transport.topics import Permission, Qos, Role
 from cpcbl_transport.zenoh_bus import BusError, open_router
 from cpcbl_transport.zenoh_config import router_config
 
@@ -222,7 +222,7 @@ def test_a_certificate_says_what_is_its_owners_and_nothing_else(
         closing(session(team, OPERATOR, endpoint)) as listener,
         closing(session(team, who, endpoint)) as speaker,
     ):
-        ear = Ear(listener, "**")
+        ear = Subscription(listener, "**")
         for key in (*KEYS, MARK):
             say(speaker, key)
         wait_until(lambda: MARK in ear.keys)
@@ -236,7 +236,7 @@ def test_without_access_control_the_same_would_arrive(team: Team) -> None:
         closing(session(team, OPERATOR, where)) as listener,
         closing(session(team, R1, where)) as speaker,
     ):
-        ear = Ear(listener, "**")
+        ear = Subscription(listener, "**")
         for key in KEYS:
             say(speaker, key)
         wait_until(lambda: ear.keys == KEYS)
@@ -250,18 +250,20 @@ def test_a_token_is_announced_under_ones_own_name_only(team: Team, endpoint: str
         closing(session(team, TRIPOD, endpoint)) as observer,
         closing(session(team, OPERATOR, endpoint)) as operator,
     ):
-        watcher.watch("**", seen.__setitem__)
+        watcher.watch_liveliness("**", seen.__setitem__)
         for bus, own in ((operator, None), (observer, "tripod"), (robot, "r1")):
             for name in ("r2", "tripod", "r1", own):
                 if name != own or name is None:
-                    bus.announce(topics.ALIVE.at(tier=3, robot=name or "r1", incarnation="false"))
+                    bus.declare_token(
+                        topics.ALIVE.at(tier=3, robot=name or "r1", incarnation="false")
+                    )
             for pattern in ("**", "alive/**", "alive/3/*/1"):
-                bus.announce(pattern)
+                bus.declare_token(pattern)
             if own is not None:
-                bus.announce(topics.ALIVE.at(tier=3, robot=own, incarnation="true"))
+                bus.declare_token(topics.ALIVE.at(tier=3, robot=own, incarnation="true"))
         wait_until(lambda: len(seen) >= 2)
         for bus in (operator, observer, robot):
-            ear = Ear(watcher, MARK)
+            ear = Subscription(watcher, MARK)
             say(bus, MARK)
             wait_until(lambda ear=ear: bool(ear.samples))  # type: ignore[misc]
         assert seen == {"alive/3/r1/true": True, "alive/3/tripod/true": True}
@@ -274,7 +276,7 @@ def test_two_sessions_may_show_the_same_certificate(team: Team, endpoint: str) -
         closing(session(team, R1, endpoint)) as robot,
         closing(session(team, R1, endpoint)) as driver,
     ):
-        ear = Ear(robot, "in/r1/odometry")
+        ear = Subscription(robot, "in/r1/odometry")
         say(driver, "in/r1/odometry", b"a piece")
         wait_until(lambda: ear.payloads == [b"a piece"])
 
@@ -303,7 +305,10 @@ def test_a_certificate_hears_what_is_for_its_owner_and_nothing_else(
         closing(session(team, R1, endpoint)) as speaker,
         closing(session(team, OPERATOR, endpoint)) as operator,
     ):
-        ears, everything = [Ear(listener, keys) for keys in ASKED], Ear(operator, "**")
+        ears, everything = (
+            [Subscription(listener, keys) for keys in ASKED],
+            Subscription(operator, "**"),
+        )
         for key in sorted({*OWN_ROBOT, "fix/tripod/3/r1"}):
             say(speaker, key)
         for key in sorted(HEARD[who]):  # once more, after all that it may not hear
@@ -319,7 +324,9 @@ def test_what_a_robot_may_not_hear_is_not_even_sent(team: Team, endpoint: str) -
         closing(session(team, R2, endpoint)) as greedy,
         closing(session(team, R1, endpoint)) as robot,
     ):
-        ears = [Ear(greedy, keys) for keys in ("**", "fix/r3/*/*", "status/r1", "belief/3/r1")]
+        ears = [
+            Subscription(greedy, keys) for keys in ("**", "fix/r3/*/*", "status/r1", "belief/3/r1")
+        ]
         allowed = robot.publisher("belief/3/r1", Qos.FRESH)
         wait_until(lambda: allowed.matching)  # it was asked for last
         for key in ("fix/r3/3/r1", "status/r1", "track/r1", "in/r1/odometry"):
@@ -332,26 +339,26 @@ def test_what_a_robot_may_not_hear_is_not_even_sent(team: Team, endpoint: str) -
 
 def test_the_rules_follow_the_table_of_topics() -> None:
     for topic in topics.TOPICS:
-        assert topic.said_by, topic.key
-        for speaker in topic.said_by:
+        assert topic.publishers, topic.key
+        for speaker in topic.publishers:
             own = {speaker.own: "me"} if speaker.own else {}
-            assert topic.at(**own) in said_by(Identity(speaker.role, "me"))
+            assert topic.at(**own) in publish_keys(Identity(speaker.role, "me"))
             assert not speaker.own or f"<{speaker.own}>" in topic.key
 
 
 def test_operators_and_routers_say_nothing_of_their_own() -> None:
-    assert said_by(OPERATOR) == said_by(ROUTER) == []
+    assert publish_keys(OPERATOR) == publish_keys(ROUTER) == []
 
 
 def test_who_may_hear_follows_the_table_too() -> None:
     me = Identity(Role.ROBOT, "me")
-    assert set(heard_by(me)) == {
+    assert set(subscribe_keys(me)) == {
         *("alive/*/*/*", "belief/*/*", "fix/me/*/*", "status/me", "track/me", "look/me"),
         *("in/me/odometry", "in/me/sightings", "in/me/position", "in/me/frame"),
     }
-    assert heard_by(Identity(Role.OBSERVER, "me")) == heard_by(me)
-    assert heard_by(FIELD) == ["field/drive/*", "field/join/*"]
-    assert heard_by(OPERATOR) == ["**"]
+    assert subscribe_keys(Identity(Role.OBSERVER, "me")) == subscribe_keys(me)
+    assert subscribe_keys(FIELD) == ["field/drive/*", "field/join/*"]
+    assert subscribe_keys(OPERATOR) == ["**"]
 
 
 def named_in_rules(team: Team, *members: Member) -> set[str]:
@@ -424,7 +431,7 @@ def test_all_options_are_known_to_zenoh(team: Team) -> None:
 
 def hears(bus: Bus, speaker: Bus, key: str, within_s: float = PATIENCE_S) -> bool:
     """Whether what one session says reaches another in time."""
-    ear, publisher = Ear(bus, key), speaker.publisher(key, Qos.INPUT)
+    ear, publisher = Subscription(bus, key), speaker.publisher(key, Qos.INPUT)
     eventually(lambda: publisher.matching, within_s)
     publisher.put(b"?")
     heard = eventually(lambda: bool(ear.samples), within_s)
@@ -471,9 +478,9 @@ def test_a_link_ends_with_its_certificate_and_a_renewed_one_opens_the_next(
         router_of(team) as (router, endpoint),
         closing(session(team, R1, endpoint)) as robot,
     ):
-        router.watch("alive/**", lambda *news: alive.append(news))
+        router.watch_liveliness("alive/**", lambda *news: alive.append(news))
         key = topics.ALIVE.at(tier=3, robot="r1", incarnation="1")
-        robot.announce(key)
+        robot.declare_token(key)
         wait_until(lambda: alive == [(key, True)])
         assert eventually(lambda: alive == [(key, True), (key, False)])
         assert not eventually(lambda: len(alive) > 2, REFUSED_S)
@@ -517,10 +524,10 @@ def test_two_routers_relay_what_each_lets_in(team: Team) -> None:
         closing(session(team, R1, west)) as r1,
         closing(session(team, R2, east)) as r2,
     ):
-        beliefs, fixes = Ear(r2, "belief/3/*"), Ear(r2, "fix/r2/3/*")
+        beliefs, fixes = Subscription(r2, "belief/3/*"), Subscription(r2, "fix/r2/3/*")
         tokens: dict[str, bool] = {}
-        r2.watch("alive/*/*/*", tokens.__setitem__)
-        r1.announce("alive/3/r1/1")
+        r2.watch_liveliness("alive/*/*/*", tokens.__setitem__)
+        r1.declare_token("alive/3/r1/1")
         say(r1, "belief/3/r2", b"as another")
         say(r1, "fix/r2/3/r1", b"as itself")
         wait_until(lambda: fixes.payloads == [b"as itself"])
@@ -535,7 +542,7 @@ def test_a_robot_cannot_join_a_router_as_a_router(team: Team, endpoint: str) -> 
         open_router(team.name, [plain], [endpoint], credentials=shown_by(team, R2)) as false,
         closing(session(team, OPERATOR, endpoint)) as operator,
     ):
-        ear = Ear(operator, "**")
+        ear = Subscription(operator, "**")
         say(false, "status/r1", b"relayed")
         say(false, MARK, b"mark")
         wait_until(lambda: b"mark" in ear.payloads)
@@ -562,7 +569,7 @@ def written_at_once(team: Team, secured: bool) -> int:
         closing(with_credentials(team, shown(R1), link.endpoint, PATIENCE_S)) as robot,
         closing(with_credentials(team, shown(R2), endpoint, PATIENCE_S)) as mate,
     ):
-        ear = Ear(mate, "fix/r2/3/*")
+        ear = Subscription(mate, "fix/r2/3/*")
         publisher = robot.publisher("fix/r2/3/r1", Qos.FRESH)
         wait_until(lambda: publisher.matching)
         before = len(link.up)
@@ -576,14 +583,14 @@ def test_tls_takes_22_bytes_for_what_is_written_at_once(team: Team) -> None:
     assert written_at_once(team, secured=True) - written_at_once(team, secured=False) == 22
 
 
-def in_words(who: Iterable[Who]) -> str:
+def in_words(who: Iterable[Permission]) -> str:
     return ", ".join(f"{w.role} (`{w.own}`)" if w.own else str(w.role) for w in who)
 
 
 def test_the_table_in_the_docs_is_that_of_the_topics() -> None:
     text = (Path(__file__).parents[2] / "docs" / "security.md").read_text()
     rows = [
-        f"| `{topic.key}` | {in_words(topic.said_by)} | {in_words(topic.heard_by)} |"
+        f"| `{topic.key}` | {in_words(topic.publishers)} | {in_words(topic.subscribers)} |"
         for topic in topics.TOPICS
     ]
     table = text.partition("| key | may publish | may subscribe |\n|---|---|---|\n")[2].partition(

@@ -2,11 +2,11 @@
 
 from typing import Self
 
-from cpcbl_transport.bus import Bus, Handle, Publisher, Receive, Watch
+from cpcbl_transport.bus import Bus, Handle, LivelinessCallback, MessageCallback, Publisher
 from cpcbl_transport.topics import Qos
 
 
-class PassingBus:
+class BusProxy:
     """Stands before a bus and does what it does."""
 
     def __init__(self, bus: Bus) -> None:
@@ -15,14 +15,14 @@ class PassingBus:
     def publisher(self, key: str, qos: Qos) -> Publisher:
         return self._bus.publisher(key, qos)
 
-    def subscribe(self, keys: str, receive: Receive) -> Handle:
-        return self._bus.subscribe(keys, receive)
+    def subscribe(self, keys: str, on_message: MessageCallback) -> Handle:
+        return self._bus.subscribe(keys, on_message)
 
-    def announce(self, key: str) -> Handle:
-        return self._bus.announce(key)
+    def declare_token(self, key: str) -> Handle:
+        return self._bus.declare_token(key)
 
-    def watch(self, keys: str, watch: Watch) -> Handle:
-        return self._bus.watch(keys, watch)
+    def watch_liveliness(self, keys: str, on_change: LivelinessCallback) -> Handle:
+        return self._bus.watch_liveliness(keys, on_change)
 
     def close(self) -> None:
         self._bus.close()
@@ -34,7 +34,7 @@ class PassingBus:
         self.close()
 
 
-class PassingPublisher:
+class PublisherProxy:
     """Stands before a publisher and does what it does."""
 
     def __init__(self, publisher: Publisher) -> None:

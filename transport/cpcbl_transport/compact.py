@@ -20,7 +20,7 @@ from typing import NamedTuple
 
 from cpcbl_team.inputs import NAME_PATTERN, Belief, Fix
 from cpcbl_transport import topics
-from cpcbl_transport.messages import VERSION, Refusal, refused_head
+from cpcbl_transport.messages import VERSION, Refusal, header_refusal
 
 STAMP_NS = 1_000
 PLACES = 100_000  # a metre
@@ -115,7 +115,7 @@ def decode_help(key: str, payload: bytes) -> Belief | Fix | Refusal:
     names = _names(key)
     if isinstance(names, Refusal):
         return names
-    reason = refused_head(payload)
+    reason = header_refusal(payload)
     if reason is not None:
         return reason
     layout = (_FIXES if "observer" in names else _BELIEFS).get(len(payload))

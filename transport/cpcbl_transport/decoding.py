@@ -1,41 +1,99 @@
-"""What came under a key: the message of the key's topic, said of the robot that the key names.
+"""Decodes a payload by its key: the message of the key's topic, about the robot that the key names.
 
-A router that certifies names holds everybody to keys (`security`), so nobody may be believed who
-names another one in the payload.
+A router that certifies names enforces keys (`security`), not payloads. So a message that names
+another robot than its key does is refused.
 """
 
+import threading
+from collections import Counter
+from collections.abc import Callable
 from functools import lru_cache
+from typing import Generic, NamedTuple, TypeVar, cast
 
 from cpcbl_transport import topics
+from cpcbl_transport.bus import Bus
 from cpcbl_transport.compact import decode_help
-from cpcbl_transport.messages import Message, Refusal, decode, refusal
-from cpcbl_transport.topics import Topic
+from cpcbl_transport.messages import Message, Refusal, decode_tagged, refusal
+from cpcbl_transport.topics import Topic, topic_of
+
+MessageT = TypeVar("MessageT", bound=Message)
 
 
-def read(key: str, payload: bytes, now_ns: int | None = None) -> Message | Refusal:
-    """The message in a payload under this key, with numbers that can be; or why there is none.
+def decode(key: str, payload: bytes, now_ns: int | None = None) -> Message | Refusal:
+    """The message in a payload under this key, with plausible numbers; or why there is none.
 
-    `now_ns`: nothing is from the future of it; None for a reader without a clock.
+    `now_ns`: a message from the future of it is refused; None for a reader without a clock.
     """
-    topic, name = _meant(key)
+    message = decode_by_key(key, payload)
+    if isinstance(message, Refusal):
+        return message
+    return refusal(message, message.stamp_ns if now_ns is None else now_ns) or message
+
+
+def decode_by_key(key: str, payload: bytes) -> Message | Refusal:
+    """The same without the check of numbers and time: the caller makes it (`messages.refusal`)."""
+    topic, name = _topic_of(key)
     if topic is None:
         return Refusal.WRONG_TYPE
-    helps = topic.carries in topics.COLLABORATION
-    message = decode_help(key, payload) if helps else decode(payload, topic.largest)
+    if topic.carries in topics.COLLABORATION:
+        return decode_help(key, payload)
+    message = decode_tagged(payload, topic.largest)
     if isinstance(message, Refusal):
         return message
     if type(message) is not topic.carries:
         return Refusal.WRONG_TYPE
-    if getattr(message, "robot", name) != name:
-        return Refusal.NOT_ITS_OWN
-    return refusal(message, message.stamp_ns if now_ns is None else now_ns) or message
+    return message if getattr(message, "robot", name) == name else Refusal.NOT_ITS_OWN
 
 
 @lru_cache(maxsize=4096)
-def _meant(key: str) -> tuple[Topic | None, str]:
+def _topic_of(key: str) -> tuple[Topic | None, str]:
     """The topic of a key, and the robot that it names, if any."""
     for topic in topics.TOPICS:
         names = topic.names(key)
         if names is not None:
             return topic, names.get("robot", "")
     return None, ""
+
+
+class Received(NamedTuple, Generic[MessageT]):
+    """A message as it arrived."""
+
+    key: str
+    payload: bytes
+    message: MessageT
+
+
+class Subscriber(Generic[MessageT]):
+    """Subscribes to messages of one type, decodes what arrives, and counts what must not be used.
+
+    `on_message` is called on a thread of the bus.
+    """
+
+    def __init__(
+        self,
+        bus: Bus,
+        kind: type[MessageT],
+        on_message: Callable[[Received[MessageT]], None],
+        **names: str,
+    ) -> None:
+        """`names`: placeholders of the topic's key; those that are left out may be anything."""
+        self._on_message, self._lock = on_message, threading.Lock()
+        self._refused: Counter[str] = Counter()
+        self._handle = bus.subscribe(topic_of(kind).at(**names), self._on_payload)
+
+    @property
+    def refused(self) -> Counter[str]:
+        """How many messages were refused, by reason."""
+        with self._lock:
+            return self._refused.copy()
+
+    def close(self) -> None:
+        self._handle.close()
+
+    def _on_payload(self, key: str, payload: bytes) -> None:
+        message = decode(key, payload)
+        if isinstance(message, Refusal):
+            with self._lock:
+                self._refused[str(message)] += 1
+        else:
+            self._on_message(Received(key, payload, cast(MessageT, message)))

@@ -31,7 +31,7 @@ class Frame(msgspec.Struct, frozen=True, array_like=True, tag="frame"):
     image: bytes
 
 
-class Unclear(msgspec.Struct, frozen=True, array_like=True):
+class UnclearObject(msgspec.Struct, frozen=True, array_like=True):
     """Something in a frame that is not reported as a sighting, and why."""
 
     reason: str
@@ -39,14 +39,14 @@ class Unclear(msgspec.Struct, frozen=True, array_like=True):
     """What it could be."""
 
 
-class Look(msgspec.Struct, frozen=True, array_like=True, tag="look"):
+class AnnotatedFrame(msgspec.Struct, frozen=True, array_like=True, tag="look"):
     """What a robot made of a frame, with the frame: what was found is drawn into it (JPEG)."""
 
     robot: Name
     stamp_ns: int
     image: bytes
     found: tuple[Sighting, ...] = ()
-    unclear: tuple[Unclear, ...] = ()
+    unclear: tuple[UnclearObject, ...] = ()
 
 
 class Flow(msgspec.Struct, frozen=True, array_like=True):
@@ -172,7 +172,18 @@ class Truths(msgspec.Struct, frozen=True, array_like=True, tag="truth"):
 
 
 Help = Belief | Fix
-Tagged = Odometry | Sightings | Position | Frame | Look | Status | Track | Drive | Join | Truths
+Tagged = (
+    Odometry
+    | Sightings
+    | Position
+    | Frame
+    | AnnotatedFrame
+    | Status
+    | Track
+    | Drive
+    | Join
+    | Truths
+)
 Message = Tagged | Help
 Telemetry = Status | Track | Drive | Truths
 
@@ -207,9 +218,9 @@ def encode(message: Tagged) -> bytes:
     return _HEAD + _encoder.encode(message)
 
 
-def decode(payload: bytes, largest: int = LARGEST_PAYLOAD) -> Tagged | Refusal:
+def decode_tagged(payload: bytes, largest: int = LARGEST_PAYLOAD) -> Tagged | Refusal:
     """The message in a payload, or why there is none."""
-    reason = refused_head(payload, largest)
+    reason = header_refusal(payload, largest)
     if reason is not None:
         return reason
     try:
@@ -218,7 +229,7 @@ def decode(payload: bytes, largest: int = LARGEST_PAYLOAD) -> Tagged | Refusal:
         return Refusal.GARBAGE
 
 
-def refused_head(payload: bytes, largest: int = LARGEST_PAYLOAD) -> Refusal | None:
+def header_refusal(payload: bytes, largest: int = LARGEST_PAYLOAD) -> Refusal | None:
     """Why a payload need not be read at all, or None."""
     if not payload:
         return Refusal.EMPTY

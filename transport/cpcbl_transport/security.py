@@ -22,7 +22,7 @@ import msgspec
 from cpcbl_team.config import Team
 from cpcbl_team.errors import CpcblError
 from cpcbl_transport import topics
-from cpcbl_transport.topics import Role, Topic, Who
+from cpcbl_transport.topics import Permission, Role, Topic
 
 CA, CERTIFICATE, PRIVATE_KEY, MEMBERS = "ca.crt", "certificate.crt", "private.key", "members.json"
 PROTOCOL = "tls"
@@ -168,9 +168,9 @@ def access_rules(team: Team, members: Iterable[Member]) -> dict[str, Any]:
     for member in present:
         who = member.identity
         for messages, keys in (
-            (["put"], said_by(who, carrying=True)),
-            (["liveliness_token"], said_by(who, carrying=False)),
-            (_ASKS, heard_by(who)),
+            (["put"], publish_keys(who, carrying=True)),
+            (["liveliness_token"], publish_keys(who, carrying=False)),
+            (_ASKS, subscribe_keys(who)),
         ):
             if keys:
                 name = f"{who}: {messages[0]}"
@@ -194,7 +194,7 @@ def access_rules(team: Team, members: Iterable[Member]) -> dict[str, Any]:
     }
 
 
-def said_by(identity: Identity, carrying: bool | None = None) -> list[str]:
+def publish_keys(identity: Identity, carrying: bool | None = None) -> list[str]:
     """The keys under which someone may speak, below the namespace.
 
     `carrying`: those of messages, or those of tokens, which carry none; None: both.
@@ -203,18 +203,18 @@ def said_by(identity: Identity, carrying: bool | None = None) -> list[str]:
         key
         for topic in topics.TOPICS
         if carrying is None or carrying is _carries(topic)
-        for key in _keys(topic, topic.said_by, identity)
+        for key in _keys(topic, topic.publishers, identity)
     ]
 
 
-def heard_by(identity: Identity) -> list[str]:
+def subscribe_keys(identity: Identity) -> list[str]:
     """The keys that someone may subscribe to, with all that they include."""
     if identity.role is Role.OPERATOR:
         return ["**"]
-    return [key for topic in topics.TOPICS for key in _keys(topic, topic.heard_by, identity)]
+    return [key for topic in topics.TOPICS for key in _keys(topic, topic.subscribers, identity)]
 
 
-def _keys(topic: Topic, allowed: Iterable[Who], identity: Identity) -> Iterator[str]:
+def _keys(topic: Topic, allowed: Iterable[Permission], identity: Identity) -> Iterator[str]:
     for who in allowed:
         if who.role is identity.role:
             yield topic.at(**{who.own: identity.name} if who.own else {})

@@ -15,7 +15,7 @@ _ALERTS = {
 }
 
 
-def why_not(endpoint: str, credentials: Credentials) -> str:
+def tls_diagnosis(endpoint: str, credentials: Credentials) -> str:
     """What stands in the way of a handshake with the router there; empty if nothing does."""
     host, _, port = endpoint.partition("/")[2].rpartition(":")
     host = host.strip("[]")

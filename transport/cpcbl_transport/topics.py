@@ -1,9 +1,9 @@
-"""THE table of topics: every key, what it carries, how often, with which quality of service.
+"""The table of topics: every key, what it carries, how often, with which quality of service.
 
-A key stands below its team's `namespace`. The publisher's tier is part of the key and
-a robot subscribes only to tiers better than its own, so that nothing flows uphill: Zenoh itself
-drops it at the sender. Who may say and hear a topic are columns too; a secured router holds
-everybody to them (`security`). This module does not know the bus.
+Every key begins with the `namespace` of its team. The publisher's tier is part of the key, and a
+robot subscribes only to better tiers than its own, so Zenoh drops at the sender what would flow to
+a better robot. The table also says who may publish and who may subscribe; a secured router enforces
+that (`security`). This module does not know the bus.
 """
 
 from enum import Enum, StrEnum
@@ -13,10 +13,10 @@ from cpcbl_team.inputs import Belief, Fix, Odometry, Position, Sightings
 from cpcbl_transport.messages import (
     LARGEST_FRAME,
     LARGEST_PAYLOAD,
+    AnnotatedFrame,
     Drive,
     Frame,
     Join,
-    Look,
     Message,
     Status,
     Track,
@@ -24,65 +24,64 @@ from cpcbl_transport.messages import (
 )
 
 
-class Treatment(NamedTuple):
-    """How the bus treats a message."""
+class QosProfile(NamedTuple):
+    """How the bus transports a message."""
 
-    priority: str  # before or after what else waits for the same link
+    priority: str  # before or after the other messages that wait for the same link
     when_full: str  # what a put does when the link's queue is full: DROP or BLOCK
     reliable: bool  # on links that can lose messages
-    express: bool  # sent without waiting for others to share its batch
+    express: bool  # sent at once, without waiting for other messages of the same batch
 
 
 class Qos(Enum):
-    """The ways to treat a topic. Highest priority first; its row of the table has the reason.
+    """The profiles in use, highest priority first; each row of the table has the reason.
 
-    DATA is what Zenoh assumes: a message of another priority, or that blocks, costs 2 to 4 bytes
-    more. So what robots tell each other is DATA and everything else stands around it. Nothing is
-    express: it costs 2 bytes more, is no faster (batches form only where a link is busy), and on a
-    busy processor messages were lost.
+    DATA is Zenoh's default: a message of another priority, or one that blocks, costs 2 to 4 bytes
+    more. So messages between robots are DATA, and everything else has a priority around it. Nothing
+    is express: it costs 2 bytes more and is no faster (batches form only where a link is busy), and
+    on a busy processor messages were lost.
     """
 
-    COMMAND = Treatment("INTERACTIVE_HIGH", "BLOCK", reliable=True, express=False)
-    FRESH = Treatment("DATA", "DROP", reliable=False, express=False)
-    INPUT = Treatment("DATA_LOW", "BLOCK", reliable=True, express=False)
-    FRAME = Treatment("DATA_LOW", "DROP", reliable=False, express=False)
-    TELEMETRY = Treatment("BACKGROUND", "DROP", reliable=False, express=False)
+    COMMAND = QosProfile("INTERACTIVE_HIGH", "BLOCK", reliable=True, express=False)
+    FRESH = QosProfile("DATA", "DROP", reliable=False, express=False)
+    INPUT = QosProfile("DATA_LOW", "BLOCK", reliable=True, express=False)
+    FRAME = QosProfile("DATA_LOW", "DROP", reliable=False, express=False)
+    TELEMETRY = QosProfile("BACKGROUND", "DROP", reliable=False, express=False)
 
 
 class Role(StrEnum):
     """What a member of a team is, as its certificate says."""
 
     ROBOT = "robot"
-    OBSERVER = "observer"  # helps a team while it runs, and is no part of it
+    OBSERVER = "observer"  # helps a running team as a guest
     FIELD = "field"  # the simulated one
     OPERATOR = "operator"  # people: live tables, recordings
-    ROUTER = "router"  # relays what all others say
+    ROUTER = "router"  # relays the messages of all others
 
 
-class Who(NamedTuple):
-    """Who may say, or hear, a topic."""
+class Permission(NamedTuple):
+    """Members of this role may publish, or subscribe to, a topic."""
 
     role: Role
     own: str = ""
-    """The <name> of the key that must be its own; empty: any will do."""
+    """The placeholder of the key that must be the member's own name; empty: any name is allowed."""
 
 
-def _helpers(own: str = "") -> tuple[Who, ...]:
-    """Robots and observers, each under its own name, or under any."""
-    return Who(Role.ROBOT, own), Who(Role.OBSERVER, own)
+def _robots_and_observers(own: str = "") -> tuple[Permission, ...]:
+    return Permission(Role.ROBOT, own), Permission(Role.OBSERVER, own)
 
 
 class Topic(NamedTuple):
     """One row of the table."""
 
-    key: str  # <name> is filled in by `at`, or by `*` for a subscription
-    carries: type[Message] | None
+    key: str  # `at` fills in each <placeholder>, or `*` for a subscription
+    carries: type[Message] | None  # None: the key of a liveliness token
     rate: str
     qos: Qos
     reason: str
-    said_by: tuple[Who, ...] = ()  # where names are certified; nobody, unless stated
-    heard_by: tuple[Who, ...] = ()  # besides operators, who hear everything
-    largest: int = LARGEST_PAYLOAD  # payload that is read at all
+    publishers: tuple[Permission, ...] = ()  # where names are certified
+    subscribers: tuple[Permission, ...] = ()  # besides operators, who may subscribe to everything
+    largest: int = LARGEST_PAYLOAD  # a larger payload is refused unread (bytes)
 
     def at(self, **names: object) -> str:
         """The key with these names; `*` for each that is left out."""
@@ -94,17 +93,17 @@ class Topic(NamedTuple):
 
     def names(self, key: str) -> dict[str, str] | None:
         """The names in a key of this topic, None for any other key: the inverse of `at`."""
-        mine, chunks = self.key.split("/"), key.split("/")
-        if len(mine) != len(chunks):
+        template, chunks = self.key.split("/"), key.split("/")
+        if len(template) != len(chunks):
             return None
-        pairs = list(zip(mine, chunks, strict=True))
+        pairs = list(zip(template, chunks, strict=True))
         if any(own != chunk for own, chunk in pairs if not own.startswith("<")):
             return None
         return {own.strip("<>"): chunk for own, chunk in pairs if own.startswith("<")}
 
 
 def namespace(team: str) -> str:
-    """What stands before all keys of a team, by its name."""
+    """The first chunks of all keys of a team."""
     return f"cpcbl/{team}"
 
 
@@ -114,17 +113,17 @@ ALIVE = Topic(
     "at a change of tier",
     Qos.COMMAND,
     "a liveliness token: the bus tells when it comes and goes; presence, not health",
-    said_by=_helpers("robot"),
-    heard_by=_helpers(),
+    publishers=_robots_and_observers("robot"),
+    subscribers=_robots_and_observers(),
 )
 BELIEF = Topic(
     "belief/<tier>/<robot>",
     Belief,
-    "5 Hz while a worse robot listens",
+    "5 Hz while a worse robot subscribes",
     Qos.FRESH,
     "the next one is better than a late one",
-    said_by=_helpers("robot"),
-    heard_by=_helpers(),
+    publishers=_robots_and_observers("robot"),
+    subscribers=_robots_and_observers(),
 )
 FIX = Topic(
     "fix/<robot>/<tier>/<observer>",
@@ -132,8 +131,8 @@ FIX = Topic(
     "each sighting of a worse robot that listens",
     Qos.FRESH,
     "the next one is better than a late one",
-    said_by=_helpers("observer"),
-    heard_by=_helpers("robot"),
+    publishers=_robots_and_observers("observer"),
+    subscribers=_robots_and_observers("robot"),
 )
 STATUS = Topic(
     "status/<robot>",
@@ -141,27 +140,30 @@ STATUS = Topic(
     "1 Hz",
     Qos.TELEMETRY,
     "for people; must never delay a fix",
-    said_by=_helpers("robot"),
-    heard_by=_helpers("robot"),
+    publishers=_robots_and_observers("robot"),
+    subscribers=_robots_and_observers("robot"),
 )
 TRACK = Topic(
     "track/<robot>",
     Track,
     "10 Hz while somebody records",
     Qos.TELEMETRY,
-    "for reports; costs nothing when nobody listens",
-    said_by=_helpers("robot"),
-    heard_by=_helpers("robot"),
+    "for reports; costs nothing without a subscriber",
+    publishers=_robots_and_observers("robot"),
+    subscribers=_robots_and_observers("robot"),
 )
-_SENSING = (*_helpers("robot"), Who(Role.FIELD))  # its own driver, or the simulated field
+_SENSING = (
+    *_robots_and_observers("robot"),
+    Permission(Role.FIELD),
+)  # its own driver, or the simulated field
 IN_ODOMETRY = Topic(
     "in/<robot>/odometry",
     Odometry,
     "the driver's",
     Qos.INPUT,
     "a lost piece of odometry is a lost piece of the way",
-    said_by=_SENSING,
-    heard_by=_helpers("robot"),
+    publishers=_SENSING,
+    subscribers=_robots_and_observers("robot"),
 )
 IN_SIGHTINGS = Topic(
     "in/<robot>/sightings",
@@ -169,8 +171,8 @@ IN_SIGHTINGS = Topic(
     "the driver's",
     Qos.INPUT,
     "inputs are not dropped",
-    said_by=_SENSING,
-    heard_by=_helpers("robot"),
+    publishers=_SENSING,
+    subscribers=_robots_and_observers("robot"),
 )
 IN_POSITION = Topic(
     "in/<robot>/position",
@@ -178,8 +180,8 @@ IN_POSITION = Topic(
     "the driver's",
     Qos.INPUT,
     "inputs are not dropped",
-    said_by=_SENSING,
-    heard_by=_helpers("robot"),
+    publishers=_SENSING,
+    subscribers=_robots_and_observers("robot"),
 )
 IN_FRAME = Topic(
     "in/<robot>/frame",
@@ -187,18 +189,18 @@ IN_FRAME = Topic(
     "the camera's",
     Qos.FRAME,
     "the next frame is better than a late one",
-    said_by=_SENSING,
-    heard_by=_helpers("robot"),
+    publishers=_SENSING,
+    subscribers=_robots_and_observers("robot"),
     largest=LARGEST_FRAME,
 )
 LOOK = Topic(
     "look/<robot>",
-    Look,
-    "2 Hz while somebody looks",
+    AnnotatedFrame,
+    "2 Hz while somebody subscribes",
     Qos.TELEMETRY,
-    "for people; costs nothing when nobody looks",
-    said_by=_helpers("robot"),
-    heard_by=_helpers("robot"),
+    "for people; costs nothing without a subscriber",
+    publishers=_robots_and_observers("robot"),
+    subscribers=_robots_and_observers("robot"),
     largest=LARGEST_FRAME,
 )
 DRIVE = Topic(
@@ -207,17 +209,17 @@ DRIVE = Topic(
     "10 Hz, simulation only",
     Qos.COMMAND,
     "a late command is a collision",
-    said_by=_helpers("robot"),
-    heard_by=(Who(Role.FIELD),),
+    publishers=_robots_and_observers("robot"),
+    subscribers=(Permission(Role.FIELD),),
 )
 JOIN = Topic(
     "field/join/<robot>",
     Join,
     "2 Hz of a guest, simulation only",
     Qos.COMMAND,
-    "without it the field takes the guest's body away; a field that restarts hears it again",
-    said_by=(Who(Role.OBSERVER, "robot"),),
-    heard_by=(Who(Role.FIELD),),
+    "without it the field removes the guest; a restarted field needs it again",
+    publishers=(Permission(Role.OBSERVER, "robot"),),
+    subscribers=(Permission(Role.FIELD),),
 )
 TRUTH = Topic(
     "field/truth",
@@ -225,7 +227,7 @@ TRUTH = Topic(
     "every step, simulation only",
     Qos.TELEMETRY,
     "for reports only",
-    said_by=(Who(Role.FIELD),),
+    publishers=(Permission(Role.FIELD),),
 )
 
 TOPICS = (
@@ -235,3 +237,9 @@ TOPICS = (
 )
 INPUTS = (IN_ODOMETRY, IN_SIGHTINGS, IN_POSITION, IN_FRAME)
 COLLABORATION = (Belief, Fix)
+
+
+def topic_of(kind: type[object]) -> Topic:
+    """The one topic that carries messages of this type."""
+    (topic,) = (topic for topic in TOPICS if topic.carries is kind)
+    return topic

@@ -19,9 +19,9 @@ from typing import Any
 import zenoh
 
 from cpcbl_team.errors import CpcblError
-from cpcbl_transport.bus import Handle, Publisher, Receive, Watch
+from cpcbl_transport.bus import Handle, LivelinessCallback, MessageCallback, Publisher
 from cpcbl_transport.security import Credentials
-from cpcbl_transport.tls_diagnosis import why_not
+from cpcbl_transport.tls_diagnosis import tls_diagnosis
 from cpcbl_transport.topics import Qos, namespace
 from cpcbl_transport.zenoh_config import NO_GUARDS, client_config, router_config
 
@@ -60,7 +60,7 @@ def _why_not(connect: Sequence[str], credentials: Credentials | None) -> str:
     """What stands in the way of TLS, of which Zenoh tells nothing; empty without credentials."""
     if credentials is None:
         return ""
-    reasons = {endpoint: why_not(endpoint, credentials) for endpoint in connect}
+    reasons = {endpoint: tls_diagnosis(endpoint, credentials) for endpoint in connect}
     return "; ".join(dict.fromkeys(filter(None, reasons.values())))
 
 
@@ -193,19 +193,19 @@ class ZenohBus:
             ),
         )
 
-    def subscribe(self, keys: str, receive: Receive) -> Handle:
+    def subscribe(self, keys: str, on_message: MessageCallback) -> Handle:
         def on_sample(sample: "zenoh.Sample") -> None:
             if sample.kind == zenoh.SampleKind.PUT:
-                receive(str(sample.key_expr), sample.payload.to_bytes())
+                on_message(str(sample.key_expr), sample.payload.to_bytes())
 
         return _Declared(self, self._session.declare_subscriber(keys, on_sample).undeclare)
 
-    def announce(self, key: str) -> Handle:
+    def declare_token(self, key: str) -> Handle:
         return _Declared(self, self._session.liveliness().declare_token(key).undeclare)
 
-    def watch(self, keys: str, watch: Watch) -> Handle:
+    def watch_liveliness(self, keys: str, on_change: LivelinessCallback) -> Handle:
         def on_sample(sample: "zenoh.Sample") -> None:
-            watch(str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT)
+            on_change(str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT)
 
         liveliness = self._session.liveliness()
         subscriber = liveliness.declare_subscriber(keys, on_sample, history=True)

@@ -17,7 +17,7 @@ class Source(Protocol):
         """When there will be something; None: not known or nothing any more."""
 
     @property
-    def over(self) -> bool:
+    def is_finished(self) -> bool:
         """Whether there will never be anything more: the end of a log."""
 
     def poll(self, now_ns: int) -> Sequence[Odometry | Sightings | Frame | Picture]:
@@ -35,11 +35,11 @@ class OwnCamera(Source, Protocol):
         """Lets the camera go."""
 
 
-class Silent:
+class NoSource:
     """For robots whose inputs arrive on the bus: from their own driver or the simulated field."""
 
     next_ns: int | None = None
-    over = False
+    is_finished = False
 
     def poll(self, now_ns: int) -> Sequence[Odometry | Sightings | Frame | Picture]:
         return ()

@@ -67,7 +67,7 @@ class LiveCamera:
     """A device or a URL; a thread of its own waits for its frames."""
 
     next_ns: int | None = None  # it wakes the robot
-    over = False
+    is_finished = False
 
     def __init__(
         self,
@@ -175,13 +175,13 @@ class Played:
     """A film in robot time, from the first poll on. A robot that is slow sees less, not late."""
 
     def __init__(self, film: Film) -> None:
-        self._film, self._count, self.over = film, 0, False
+        self._film, self._count, self.is_finished = film, 0, False
         self._from_ns: int | None = None
         self.counts: Counter[str] = Counter()
 
     @property
     def next_ns(self) -> int | None:
-        return None if self.over or self._from_ns is None else self._stamp_ns(self._count)
+        return None if self.is_finished or self._from_ns is None else self._stamp_ns(self._count)
 
     def _stamp_ns(self, count: int) -> int:
         assert self._from_ns is not None
@@ -190,22 +190,22 @@ class Played:
     def poll(self, now_ns: int) -> Sequence[Frame | Picture]:
         if self._from_ns is None:
             self._from_ns = now_ns
-        while not self.over and self._stamp_ns(self._count + 1) <= now_ns:
-            self.over = not self._film.skip()
+        while not self.is_finished and self._stamp_ns(self._count + 1) <= now_ns:
+            self.is_finished = not self._film.skip()
             self._count += 1
-            self.counts["frame_skipped"] += not self.over
-        if self.over or self._stamp_ns(self._count) > now_ns:
+            self.counts["frame_skipped"] += not self.is_finished
+        if self.is_finished or self._stamp_ns(self._count) > now_ns:
             return ()
         frame = self._film.take(self._stamp_ns(self._count))
         self._count += 1
         if frame is None:
-            self.over = True
+            self.is_finished = True
             log.info("the last frame was played; the robot goes on without a camera")
             return ()
         return [frame]
 
     def close(self) -> None:
-        self.over = True
+        self.is_finished = True
 
 
 class Video:

@@ -132,7 +132,7 @@ class MrclamSource:
         return self._items[self._next].stamp_ns if self._next < len(self._items) else None
 
     @property
-    def over(self) -> bool:
+    def is_finished(self) -> bool:
         return self._next == len(self._items)
 
     def poll(self, now_ns: int) -> Sequence[Odometry | Sightings]:

@@ -13,7 +13,7 @@ from cpcbl_agents.vision.markers import Markers
 from cpcbl_agents.vision.pictures import encoded, fault, received
 from cpcbl_team.config import Team
 from cpcbl_team.inputs import Sightings
-from cpcbl_transport.messages import Frame, Look, Unclear
+from cpcbl_transport.messages import AnnotatedFrame, Frame, UnclearObject
 
 
 class CameraEyes:
@@ -32,19 +32,23 @@ class CameraEyes:
             return glimpses
         return Sightings(frame.stamp_ns, tuple(found.sighting for found in glimpses.found))
 
-    def shown(self, frame: Frame | Picture) -> tuple[Sightings | str, Look]:
+    def shown(self, frame: Frame | Picture) -> tuple[Sightings | str, AnnotatedFrame]:
         """The same, and the frame with all that drawn into it; without picture if there is none."""
         pixels = self._pixels(frame)
         if isinstance(pixels, str):
-            return pixels, Look(self.robot, frame.stamp_ns, b"", (), (Unclear(pixels),))
+            return pixels, AnnotatedFrame(
+                self.robot, frame.stamp_ns, b"", (), (UnclearObject(pixels),)
+            )
         glimpses = self.glimpses(pixels)
         if isinstance(glimpses, str):
             image = encoded(pixels) if pixels.size else b""
-            return glimpses, Look(self.robot, frame.stamp_ns, image, (), (Unclear(glimpses),))
+            return glimpses, AnnotatedFrame(
+                self.robot, frame.stamp_ns, image, (), (UnclearObject(glimpses),)
+            )
         found = tuple(found.sighting for found in glimpses.found)
-        unclear = tuple(Unclear(doubt.reason, doubt.names) for doubt in glimpses.doubts)
+        unclear = tuple(UnclearObject(doubt.reason, doubt.names) for doubt in glimpses.doubts)
         image = encoded(annotated(pixels, glimpses))
-        look = Look(self.robot, frame.stamp_ns, image, found, unclear)
+        look = AnnotatedFrame(self.robot, frame.stamp_ns, image, found, unclear)
         return Sightings(frame.stamp_ns, found), look
 
     def _pixels(self, frame: Frame | Picture) -> Pixels | str:

@@ -67,7 +67,7 @@ def observer(
     from rich.console import Console
 
     from cpcbl_agents.clock import Clock
-    from cpcbl_agents.process import Stop
+    from cpcbl_agents.process import StopSignal
     from cpcbl_launch.options import json_text
     from cpcbl_launch.run.observer import (
         ObserverRequest,
@@ -86,7 +86,7 @@ def observer(
     team = team_with_observer(
         file_team, ObserverRequest(name, parse_pose(at), sensor, fov, parse_waypoints(move), kind)
     )
-    console, stop = Console(stderr=as_json), Stop(parent)
+    console, stop = Console(stderr=as_json), StopSignal(parent)
     endpoints = connect or team.transport.connect
     if container:
         from cpcbl_launch.run.containers.guest import SENSOR_INSIDE, run_observer_container

@@ -88,7 +88,7 @@ def up(
     """Start a team: the field, a process per robot, a live table, a report at the end."""
     from rich.console import Console
 
-    from cpcbl_agents.process import Stop
+    from cpcbl_agents.process import StopSignal
     from cpcbl_launch.options import (
         check_duration,
         check_speed,
@@ -166,7 +166,7 @@ def up(
     ]
     console.print(f"watch it: {shlex.join(watch)}", style="dim", highlight=False, soft_wrap=True)
     with LiveTable(title, run.team.robots, console, quiet=as_json) as table:
-        result = run_team(run, table, Stop(), launch)
+        result = run_team(run, table, StopSignal(), launch)
     lost = dict(result.not_written) | write_report(report, result)
     if as_json:
         sys.stdout.write(json_text(result) + "\n")
@@ -190,7 +190,7 @@ def field(
     from contextlib import ExitStack
 
     from cpcbl_agents.clock import Clock
-    from cpcbl_agents.process import Stop
+    from cpcbl_agents.process import StopSignal
     from cpcbl_launch.options import require_team_opencv
     from cpcbl_launch.simulation.field_node import parse_sites, run_field
     from cpcbl_transport.bus import Bus
@@ -201,7 +201,7 @@ def field(
     team = find_team(team_file)
     require_team_opencv(team, field=True)
     elsewhere = parse_sites(site or (), team)
-    stop = Stop(parent)
+    stop = StopSignal(parent)
     with ExitStack() as stack:
 
         def session(endpoints: Sequence[str]) -> Bus:
@@ -239,7 +239,7 @@ def router(
     ] = False,
 ) -> None:
     """Run the team's Zenoh router, on any machine, until SIGINT, SIGTERM or SIGHUP."""
-    from cpcbl_agents.process import Stop
+    from cpcbl_agents.process import StopSignal
     from cpcbl_launch.run.router import config_text, run_router, team_router
     from cpcbl_transport.zenoh_bus import read_router_config
 
@@ -259,4 +259,4 @@ def router(
     if print_config:
         typer.echo(config_text(options, title))
     else:
-        run_router(options, title, Stop(parent))
+        run_router(options, title, StopSignal(parent))

@@ -16,7 +16,7 @@ from cpcbl_team.errors import InputError
 
 if TYPE_CHECKING:
     from cpcbl_team.config import Team
-    from cpcbl_transport.messages import Look
+    from cpcbl_transport.messages import AnnotatedFrame
 
 
 def traffic(
@@ -42,7 +42,7 @@ def traffic(
     """
     from rich.console import Console
 
-    from cpcbl_agents.process import Stop
+    from cpcbl_agents.process import StopSignal
     from cpcbl_launch.options import json_text
     from cpcbl_launch.views.traffic.show import TrafficView, traffic_view
     from cpcbl_launch.views.traffic.watch import WatchRequest, watch_team
@@ -67,7 +67,7 @@ def traffic(
     )
     console, where = Console(), ", ".join(endpoints)
     with TrafficView(where, console, quiet=as_json) as view:
-        result = watch_team(watch, view, Stop())
+        result = watch_team(watch, view, StopSignal())
     if as_json:
         sys.stdout.write(json_text(result) + "\n")
     else:
@@ -125,20 +125,20 @@ def look(
 
 def _looks(
     robot: str, team: "Team", connect: list[str] | None, wait_s: float
-) -> Iterator[tuple[str, str, "Look"]]:
+) -> Iterator[tuple[str, str, "AnnotatedFrame"]]:
     """The frames of a running robot: as they are called, as their files are called, themselves."""
-    from cpcbl_agents.process import Stop
+    from cpcbl_agents.process import StopSignal
     from cpcbl_launch.views.frames.watch import looks_of
     from cpcbl_transport.security import Identity, link_of
     from cpcbl_transport.topics import Role
 
     logging.getLogger("cpcbl_transport").setLevel(logging.WARNING)
     link = link_of(team, Identity(Role.OPERATOR), connect or team.transport.connect)
-    for one in looks_of(robot, team.name, link, Stop(), wait_s):
+    for one in looks_of(robot, team.name, link, StopSignal(), wait_s):
         yield str(one.stamp_ns), f"{robot}_{one.stamp_ns}", one
 
 
-def _at(robot: str, team: "Team", pictures: Path) -> Iterator[tuple[str, str, "Look"]]:
+def _at(robot: str, team: "Team", pictures: Path) -> Iterator[tuple[str, str, "AnnotatedFrame"]]:
     """The same of picture files."""
     from cpcbl_agents.sources.camera import pictures_in
     from cpcbl_launch.views.frames.watch import looks_at

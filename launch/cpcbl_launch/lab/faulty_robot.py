@@ -30,7 +30,7 @@ from cpcbl_launch.run.processes import PROGRAM
 from cpcbl_team.errors import CpcblError, InputError
 from cpcbl_team.inputs import Belief, Fix
 from cpcbl_transport.bus import Bus, Publisher
-from cpcbl_transport.bus_proxy import PassingBus, PassingPublisher
+from cpcbl_transport.bus_proxy import BusProxy, PublisherProxy
 from cpcbl_transport.compact import decode_help, encode_help
 from cpcbl_transport.messages import Refusal
 from cpcbl_transport.topics import Qos
@@ -119,7 +119,7 @@ def _with_tiny_covariance(message: Help) -> Help:
     return replace(message, covariance=(variance, 0.0, variance, 0.0, 0.0, variance))
 
 
-class _FaultyPublisher(PassingPublisher):
+class _FaultyPublisher(PublisherProxy):
     def __init__(self, key: str, publisher: Publisher, injector: FaultInjector) -> None:
         super().__init__(publisher)
         self._key, self._injector = key, injector
@@ -130,7 +130,7 @@ class _FaultyPublisher(PassingPublisher):
         super().put(encode_help(self._injector.alter(message)))
 
 
-class FaultyBus(PassingBus):
+class FaultyBus(BusProxy):
     """A bus that changes the fixes and beliefs of the robot `name` when they are sent."""
 
     def __init__(self, bus: Bus, fault: Fault, name: str, start_ns: int) -> None:

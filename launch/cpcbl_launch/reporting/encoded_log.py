@@ -7,7 +7,7 @@ and 200.
 from collections.abc import Iterator
 from typing import Generic, TypeVar, cast
 
-from cpcbl_transport.messages import Tagged, decode
+from cpcbl_transport.messages import Tagged, decode_tagged
 
 M = TypeVar("M", bound=Tagged)
 
@@ -27,8 +27,8 @@ class EncodedLog(Generic[M]):
 
     def __iter__(self) -> Iterator[M]:
         """Those that have come by now."""
-        return (cast(M, decode(payload)) for payload in tuple(self._payloads))
+        return (cast(M, decode_tagged(payload)) for payload in tuple(self._payloads))
 
     @property
     def last(self) -> M:
-        return cast(M, decode(self._payloads[-1]))
+        return cast(M, decode_tagged(self._payloads[-1]))

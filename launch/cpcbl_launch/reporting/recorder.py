@@ -28,7 +28,7 @@ from cpcbl_launch.reporting.metrics import (
 from cpcbl_launch.reporting.trust_report import TrustReport, trust_reports
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus
-from cpcbl_transport.decoding import read
+from cpcbl_transport.decoding import decode
 from cpcbl_transport.messages import Refusal, Status, Track, Truth, Truths
 
 
@@ -156,7 +156,7 @@ class Recorder:
             bus.subscribe(topic.at(), self._receive)
 
     def _receive(self, key: str, payload: bytes) -> None:
-        message = read(key, payload)
+        message = decode(key, payload)
         with self._lock:
             taken = not isinstance(message, Refusal)
             self.counts[key.partition("/")[0] if taken else str(message)] += 1

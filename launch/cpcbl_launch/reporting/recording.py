@@ -28,8 +28,8 @@ from cpcbl_team.config import Team
 from cpcbl_team.inputs import Odometry, Position, Sightings
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus
-from cpcbl_transport.decoding import read
-from cpcbl_transport.messages import Look, Message, Refusal, Truths
+from cpcbl_transport.decoding import decode
+from cpcbl_transport.messages import AnnotatedFrame, Message, Refusal, Truths
 
 log = logging.getLogger(__name__)
 
@@ -57,7 +57,7 @@ class Recording(AbstractContextManager["Recording"]):
         self._handles = [bus.subscribe(topic.at(), self._receive) for topic in RECORDED]
 
     def _receive(self, key: str, payload: bytes) -> None:
-        message = read(key, payload)
+        message = decode(key, payload)
         if isinstance(message, Refusal) or message.stamp_ns < 0:  # a file knows no time before 1970
             return
         with self._lock:
@@ -69,7 +69,7 @@ class Recording(AbstractContextManager["Recording"]):
                 self._give_up(error)
 
     def _write(self, writer: Writer, key: str, message: Message) -> None:
-        if isinstance(message, Look):
+        if isinstance(message, AnnotatedFrame):
             if message.image:
                 self._write_picture(writer, message)
             message = msgspec.structs.replace(message, image=b"")
@@ -78,7 +78,7 @@ class Recording(AbstractContextManager["Recording"]):
         at_ns, data = message.stamp_ns, msgspec.json.encode(message)
         writer.add_message(self._channels[key], at_ns, data, at_ns)
 
-    def _write_picture(self, writer: Writer, look: Look) -> None:
+    def _write_picture(self, writer: Writer, look: AnnotatedFrame) -> None:
         key, at_ns = f"picture/{look.robot}", look.stamp_ns
         if key not in self._channels:
             if not self._schema:
@@ -144,7 +144,7 @@ def read_recording(path: Path) -> RecordedRun:
 def _inputs(messages: Iterable[tuple[str, Message]]) -> dict[str, list[SensorInput]]:
     inputs: dict[str, list[SensorInput]] = {}
     for key, message in messages:
-        if isinstance(message, Look):  # what the robot's eyes found in a frame
+        if isinstance(message, AnnotatedFrame):  # what the robot's eyes found in a frame
             message = Sightings(message.stamp_ns, message.found)
         if isinstance(message, Odometry | Sightings | Position):
             inputs.setdefault(key.split("/")[1], []).append(message)

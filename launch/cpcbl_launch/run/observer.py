@@ -11,8 +11,8 @@ from typing import Any, NamedTuple
 import msgspec
 
 from cpcbl_agents.clock import Clock
-from cpcbl_agents.guest_node import Visit
-from cpcbl_agents.process import Loop, new_incarnation, own_camera, while_time_holds
+from cpcbl_agents.guest_node import GuestNode
+from cpcbl_agents.process import Loop, new_incarnation, own_camera, stop_on_clock_step
 from cpcbl_launch.reporting.flows import FlowReport, summed_flows
 from cpcbl_launch.simulation.guest_bodies import unsupported_delay
 from cpcbl_launch.team_file import read_layer, with_added_robot
@@ -183,8 +183,10 @@ def run_observer(
         _require_unique_name(name, bus, stop)
         start_ns = clock.now_ns()
         incarnation = new_incarnation()
-        node = Visit(name, team, bus, start_ns, incarnation, loop.arrived, clock.speed, camera)
-        over = while_time_holds(name, team, clock, stop)
+        node = GuestNode(
+            name, team, bus, start_ns, incarnation, loop.on_arrival, clock.speed, camera
+        )
+        over = stop_on_clock_step(name, team, clock, stop)
         loop.run(node, lambda: over() or clock.now_ns() - start_ns >= duration_s * 1e9)
         end_ns = clock.now_ns()
         node.leave(end_ns)
@@ -193,7 +195,7 @@ def run_observer(
 
 def _require_unique_name(name: str, bus: Bus, stop: Callable[[], bool]) -> None:
     found: list[str] = []
-    watch = bus.watch(topics.ALIVE.at(robot=name), lambda key, alive: found.append(key))
+    watch = bus.watch_liveliness(topics.ALIVE.at(robot=name), lambda key, alive: found.append(key))
     until = time.monotonic() + NAMESAKE_S
     while time.monotonic() < until and not found and not stop():
         time.sleep(0.02)
@@ -202,7 +204,7 @@ def _require_unique_name(name: str, bus: Bus, stop: Callable[[], bool]) -> None:
         raise InputError(f"observer {name}: the team has one of this name; choose another one")
 
 
-def _observer_report(node: Visit, team: Team, seconds: float) -> ObserverReport:
+def _observer_report(node: GuestNode, team: Team, seconds: float) -> ObserverReport:
     located = node.robot.collaboration.located
     return ObserverReport(
         name=node.robot.name,
@@ -210,8 +212,8 @@ def _observer_report(node: Visit, team: Team, seconds: float) -> ObserverReport:
         seconds=seconds,
         position_sigma_m=None if located is None else located.estimate.position_sigma_m,
         lost="" if located is None else located.lost,
-        unfed=node.unfed,
-        sent=summed_flows([node.robot.collaboration.tallies.flows()]),
-        heard=summed_flows([node.heard]),
+        unfed=node.missing_input,
+        sent=summed_flows([node.robot.collaboration.counters.flows()]),
+        heard=summed_flows([node.received]),
         counts=dict(node.counts),
     )

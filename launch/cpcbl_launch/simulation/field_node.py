@@ -24,7 +24,7 @@ from cpcbl_team.errors import InputError
 from cpcbl_team.inputs import Odometry
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus, Handle, Publisher
-from cpcbl_transport.decoding import read
+from cpcbl_transport.decoding import decode
 from cpcbl_transport.messages import Drive, Join, Refusal, encode, refusal
 
 log = logging.getLogger(__name__)
@@ -102,7 +102,7 @@ class FieldNode:
 
     def _handle(self, key: str, payload: bytes, now_ns: int) -> Refusal | None:
         """Does what a robot says, by the field's clock; or why not."""
-        said = read(key, payload)
+        said = decode(key, payload)
         if isinstance(said, Refusal):
             return said
         assert isinstance(said, Drive | Join)

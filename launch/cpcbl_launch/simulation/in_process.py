@@ -8,7 +8,7 @@ from typing import NamedTuple, Protocol
 
 import msgspec
 
-from cpcbl_agents.node import Node, Stepped
+from cpcbl_agents.node import Node, Steppable
 from cpcbl_agents.robot import Robot
 from cpcbl_launch.lab.baselines import inputs_of, scored, yardsticks
 from cpcbl_launch.options import check_limit
@@ -20,7 +20,8 @@ from cpcbl_launch.simulation.field import SimulatedField
 from cpcbl_launch.simulation.field_node import FieldNode
 from cpcbl_launch.simulation.scheduled_guests import ScheduledGuest, ScheduledGuestNode
 from cpcbl_team.config import Team
-from cpcbl_transport.bus import Bus, MemoryHub
+from cpcbl_transport.bus import Bus
+from cpcbl_transport.memory_bus import MemoryHub
 
 Progress = Callable[[float], None]
 BusWrapper = Callable[[Bus], Bus]
@@ -167,7 +168,7 @@ def robot_nodes(
     hub: MemoryHub,
     start_ns: int,
     bus_wrappers: Mapping[str, BusWrapper] = MappingProxyType({}),
-) -> list[Stepped]:
+) -> list[Steppable]:
     """A node for each robot, each with a session of its own."""
 
     def session(name: str) -> Bus:
@@ -181,7 +182,7 @@ def robot_nodes(
 
 
 def run_nodes(
-    nodes: Sequence[Stepped],
+    nodes: Sequence[Steppable],
     start_ns: int,
     end_ns: int,
     progress: Progress | None = None,

@@ -4,10 +4,11 @@ from typing import NamedTuple
 
 import msgspec
 
-from cpcbl_agents.guest_node import Visit
+from cpcbl_agents.guest_node import GuestNode
 from cpcbl_agents.robot import NEVER_NS
 from cpcbl_team.config import RobotSettings, Team
-from cpcbl_transport.bus import Bus, MemoryHub
+from cpcbl_transport.bus import Bus
+from cpcbl_transport.memory_bus import MemoryHub
 
 
 class ScheduledGuest(NamedTuple):
@@ -26,7 +27,7 @@ class ScheduledGuestNode:
         self._name, self._hub = visitor.name, hub
         self._team = with_guest(team, visitor.name, visitor.settings)
         self._from_ns, self._until_ns = (round(s * 1e9) for s in visitor[2:])
-        self._visit: Visit | None = None
+        self._visit: GuestNode | None = None
         self._bus: Bus | None = None
 
     @property
@@ -42,7 +43,7 @@ class ScheduledGuestNode:
     def step(self, now_ns: int) -> None:
         if self._bus is None:
             self._bus = self._hub.session()
-            self._visit = Visit(self._name, self._team, self._bus, now_ns, "1")
+            self._visit = GuestNode(self._name, self._team, self._bus, now_ns, "1")
         if self._visit is None:
             return
         if now_ns < self._until_ns:

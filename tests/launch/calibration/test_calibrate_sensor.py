@@ -33,8 +33,8 @@ from cpcbl_team.errors import InputError
 from cpcbl_team.geometry import Pose2
 from cpcbl_team.inputs import Sighting, Sightings
 from cpcbl_transport import topics
-from cpcbl_transport.bus import MemoryHub
-from cpcbl_transport.messages import Look, Truth, Truths, encode
+from cpcbl_transport.memory_bus import MemoryHub
+from cpcbl_transport.messages import AnnotatedFrame, Truth, Truths, encode
 
 TEAM = """name = "lab"
 [map.landmarks]
@@ -270,7 +270,7 @@ def record(path: Path, log: Sights, *names: str, **robots: RobotSettings) -> Tea
                 if which < 2
             )
             for name in names:
-                looks[name].put(encode(Look(name, int(at * 1e9), b"", found)))
+                looks[name].put(encode(AnnotatedFrame(name, int(at * 1e9), b"", found)))
     return team
 
 

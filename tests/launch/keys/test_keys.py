@@ -19,7 +19,7 @@ from typing import Any
 
 import pytest
 import yaml
-from support.buses import Ear, wait_until
+from support.buses import Subscription, wait_until
 from support.docker import TOP, image
 from support.keys import OPERATOR, R1, again, router_of, secured_team, session, with_credentials
 from support.processes import cpcbl_team, eventually, patient_up
@@ -35,7 +35,7 @@ from cpcbl_launch.run.up import free_endpoint
 from cpcbl_team.config import Team
 from cpcbl_transport import topics
 from cpcbl_transport.messages import Drive, Refusal, Status, Track, encode
-from cpcbl_transport.decoding import read
+from cpcbl_transport.decoding import decode
 from cpcbl_transport.security import Member
 from cpcbl_transport.topics import Qos, Role
 from cpcbl_transport.zenoh_bus import BusError
@@ -410,7 +410,7 @@ def test_a_printed_configuration_is_as_strict(team_file: Path) -> None:
     team = load_team(team_file)
     with running("router", "--config", config):
         with session(team, OPERATOR, endpoint) as listener, session(team, R1, endpoint) as robot:
-            ear = Ear(listener, "**")
+            ear = Subscription(listener, "**")
             for key in ("status/r2", "status/r1"):
                 publisher = robot.publisher(key, Qos.INPUT)
                 wait_until(lambda publisher=publisher: publisher.matching)  # type: ignore[misc]
@@ -431,7 +431,7 @@ def test_robots_of_a_router_of_its_own(team_file: Path) -> None:
     )
     with running("router", team_file), running("robot", "r1", "--team", team_file):
         with session(load_team(team_file), OPERATOR, endpoint) as operator:
-            ear = Ear(operator, topics.STATUS.at())
+            ear = Subscription(operator, topics.STATUS.at())
             assert eventually(lambda: bool(ear.samples))
         done = cpcbl_team("traffic", team_file, "--for", 4, "--wait", 30, "--json")
         assert list(json.loads(done.stdout)["robots"]) == ["r1"]
@@ -543,11 +543,11 @@ LIES = (
 @pytest.mark.parametrize("lie", LIES, ids=lambda m: type(m).__name__)
 def test_a_name_in_a_payload_is_that_of_its_key(lie: Status | Track | Drive) -> None:
     (topic,) = [t for t in topics.TOPICS if t.carries is type(lie)]
-    assert read(topic.at(robot="r2"), encode(lie)) == lie
-    assert read(topic.at(robot="r1"), encode(lie)) is Refusal.NOT_ITS_OWN
-    assert read("in/r2/odometry", encode(lie)) is Refusal.WRONG_TYPE
-    assert read("field/nothing", encode(lie)) is Refusal.WRONG_TYPE
-    assert read(topic.at(robot="r2"), b"") is Refusal.EMPTY
+    assert decode(topic.at(robot="r2"), encode(lie)) == lie
+    assert decode(topic.at(robot="r1"), encode(lie)) is Refusal.NOT_ITS_OWN
+    assert decode("in/r2/odometry", encode(lie)) is Refusal.WRONG_TYPE
+    assert decode("field/nothing", encode(lie)) is Refusal.WRONG_TYPE
+    assert decode(topic.at(robot="r2"), b"") is Refusal.EMPTY
 
 
 def test_operators_are_not_told_lies_about_others(tmp_path: Path) -> None:

@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
-from support.buses import Ear, wait_until
+from support.buses import Subscription, wait_until
 from support.processes import cpcbl_team, eventually, pids_of
 
 from cpcbl_launch.lab.chaos import wire
@@ -265,7 +265,7 @@ def test_an_echo_says_everything_twice_more() -> None:
         open_bus("tests", [endpoint]) as listener,
         open_bus("tests", [endpoint]) as echoes,
     ):
-        ear, publisher = Ear(listener, key), speaker.publisher(key, Qos.INPUT)
+        ear, publisher = Subscription(listener, key), speaker.publisher(key, Qos.INPUT)
         wait_until(lambda: publisher.matching)
         with Echo(echoes, "b", latest_s=0.5, seed=1) as echo:
 

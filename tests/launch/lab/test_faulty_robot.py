@@ -7,7 +7,7 @@ from subprocess import run
 
 import msgspec
 import pytest
-from support.buses import MS, SECOND, Ear
+from support.buses import MS, SECOND, Subscription
 
 from cpcbl_launch.lab.experiments import liars
 from cpcbl_launch.lab.experiments.pictures import draw_liars
@@ -23,8 +23,8 @@ from cpcbl_launch.team_file import builtin_path
 from cpcbl_team.errors import InputError
 from cpcbl_team.inputs import Belief, Fix
 from cpcbl_transport import topics
-from cpcbl_transport.bus import MemoryHub
 from cpcbl_transport.compact import encode_help
+from cpcbl_transport.memory_bus import MemoryHub
 from cpcbl_transport.messages import Track, encode
 
 PART = (0.01, 0.0, 0.01)
@@ -105,7 +105,7 @@ def test_the_same_fault_and_name_give_the_same_changes() -> None:
 
 def test_only_fixes_and_beliefs_are_changed_on_their_way_out() -> None:
     hub = MemoryHub()
-    ear = Ear(hub.session(), "**")
+    ear = Subscription(hub.session(), "**")
     bus = FaultyBus(hub.session(), Fault.parse("bias:1,0"), "liar", 0)
     track = Track("liar", 0, 1.0, 0.0, 0.0, None, 3)
     with bus:

@@ -25,7 +25,7 @@ from cpcbl_launch.reporting.recorder import MeanScore, Recorder, Report, TeamRep
 from cpcbl_launch.run.supervisor import Supervisor
 from cpcbl_launch.views.run import LiveTable, print_report
 from cpcbl_transport import topics
-from cpcbl_transport.bus import MemoryHub
+from cpcbl_transport.memory_bus import MemoryHub
 from cpcbl_transport.messages import Track, encode
 
 NO_TRUTH: dict[str, Floats] = {}

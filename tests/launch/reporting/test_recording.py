@@ -14,7 +14,7 @@ from cpcbl_launch.team_file import builtin_path, load_team
 from cpcbl_team.config import RobotSettings, Team
 from cpcbl_team.inputs import Odometry, Position, Sighting, Sightings
 from cpcbl_transport import topics
-from cpcbl_transport.bus import MemoryHub
+from cpcbl_transport.memory_bus import MemoryHub
 from cpcbl_transport.messages import Tagged, Truth, Truths, encode
 
 TEAM = Team(name="one", robots={"r1": RobotSettings(source="external")})

@@ -39,7 +39,7 @@ from cpcbl_launch.team_file import builtin_path, load_team, parse_team, save_res
 from cpcbl_team.config import GuestSettings, MatchSettings, Team, TransportSettings
 from cpcbl_team.errors import InputError
 from cpcbl_transport import topics
-from cpcbl_transport.messages import Status, decode
+from cpcbl_transport.messages import Status, decode_tagged
 from cpcbl_transport.security import CA, CERTIFICATE, PRIVATE_KEY, SecurityError
 from cpcbl_transport.zenoh_bus import open_router
 
@@ -494,7 +494,7 @@ def test_a_real_tripod_is_fed_by_its_own_driver(tmp_path: Path) -> None:
     heard: dict[str, Status] = {}
 
     def hear(key: str, payload: bytes) -> None:
-        status = decode(payload)
+        status = decode_tagged(payload)
         assert isinstance(status, Status)
         heard[status.robot] = status
 

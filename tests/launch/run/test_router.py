@@ -9,7 +9,7 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import pytest
-from support.buses import Ear, wait_until
+from support.buses import Subscription, wait_until
 from support.processes import cpcbl_team, eventually
 
 from cpcbl_launch.run.processes import PROGRAM
@@ -65,7 +65,7 @@ def running(*arguments: object, ends_with: signal.Signals = signal.SIGINT) -> It
 
 def heard(sender: Bus, receiver: Bus, key: str = "in/victim/odometry") -> bool:
     """Whether what one session puts arrives at the other."""
-    ear, publisher = Ear(receiver, key), sender.publisher(key, Qos.INPUT)
+    ear, publisher = Subscription(receiver, key), sender.publisher(key, Qos.INPUT)
     try:
         wait_until(lambda: publisher.matching)
         publisher.put(b"hello")
@@ -100,7 +100,7 @@ def test_teams_stay_apart_on_one_router(team_file: Path) -> None:
         open_bus("lab", [endpoint]) as driver,
         open_bus("other", [endpoint]) as other,
     ):
-        ear = Ear(lab, key)
+        ear = Subscription(lab, key)
         mine, foreign = driver.publisher(key, Qos.INPUT), other.publisher(key, Qos.INPUT)
         wait_until(lambda: mine.matching)
         assert not foreign.matching
@@ -114,7 +114,7 @@ def assert_guarded(endpoint: str) -> None:
     """Of fixes of good size few come through, and none that are too large."""
     key = topics.FIX.at(robot="victim", tier=7, observer="faulty")
     with open_bus("lab", [endpoint]) as faulty, open_bus("lab", [endpoint]) as victim:
-        ear, inputs = Ear(victim, "fix/victim/7/*"), Ear(victim, "in/victim/*")
+        ear, inputs = Subscription(victim, "fix/victim/7/*"), Subscription(victim, "in/victim/*")
         fix = faulty.publisher(key, Qos.INPUT)
         last = faulty.publisher("in/victim/last", Qos.INPUT)
         wait_until(lambda: fix.matching and last.matching)

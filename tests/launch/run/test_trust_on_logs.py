@@ -14,7 +14,7 @@ from cpcbl_launch.run import logged_team
 from cpcbl_launch.simulation.in_process import evaluate_log, robot_nodes, run_nodes
 from cpcbl_launch.team_file import load_team
 from cpcbl_team.config import Team, TrustSettings
-from cpcbl_transport.bus import MemoryHub
+from cpcbl_transport.memory_bus import MemoryHub
 
 pytestmark = [pytest.mark.log, pytest.mark.timeout(900)]
 LOGS = Path(os.environ.get("CPCBL_MRCLAM", "."))

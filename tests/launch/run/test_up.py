@@ -10,7 +10,7 @@ from pathlib import Path
 
 import msgspec
 import pytest
-from support.buses import Ear, robot_at, team_of, wait_until
+from support.buses import Subscription, robot_at, team_of, wait_until
 from support.processes import command_of, eventually
 
 from cpcbl_launch.reporting.recorder import Recorder, Report
@@ -159,7 +159,7 @@ def test_a_signal_ends_a_robot_soon(
     command, endpoint, team = lone_robot
     alive: dict[str, bool] = {}
     with open_router(team.name, [endpoint]) as bus:
-        bus.watch(topics.ALIVE.at(robot="observer"), alive.__setitem__)
+        bus.watch_liveliness(topics.ALIVE.at(robot="observer"), alive.__setitem__)
         with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
             assert eventually(lambda: any(alive.values())), process.stderr
             process.send_signal(number)
@@ -190,7 +190,7 @@ def test_a_robot_ends_when_its_launcher_is_gone(
         "print(p.pid, flush=True); sys.stdin.read()"
     )
     with open_router(team.name, [endpoint]) as bus:
-        bus.watch(topics.ALIVE.at(robot="observer"), alive.__setitem__)
+        bus.watch_liveliness(topics.ALIVE.at(robot="observer"), alive.__setitem__)
         with subprocess.Popen(
             [sys.executable, "-c", launcher],
             stdin=subprocess.PIPE,
@@ -211,7 +211,7 @@ def test_the_router_of_a_run_has_the_teams_guards(tmp_path: Path) -> None:
 
     def flooded(recorder: Recorder, supervisor: Processes) -> bool:
         with open_bus(team.name, [endpoint]) as me, open_bus(team.name, [endpoint]) as faulty:
-            ear = Ear(me, "**")  # one subscription: in order
+            ear = Subscription(me, "**")  # one subscription: in order
             fix, last = faulty.publisher(key, Qos.INPUT), faulty.publisher("in/me/last", Qos.INPUT)
             wait_until(lambda: fix.matching and last.matching)
             for size in (100, 100, 100, 101):

@@ -18,7 +18,7 @@ from cpcbl_launch.run.up import free_endpoint
 from cpcbl_team.inputs import Odometry
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus
-from cpcbl_transport.decoding import read
+from cpcbl_transport.decoding import decode
 from cpcbl_transport.messages import Frame, Refusal, Status, encode
 from cpcbl_transport.zenoh_bus import open_router
 
@@ -52,7 +52,7 @@ class Driven:
         bus.subscribe(topics.STATUS.at(), self._heard)
 
     def _heard(self, key: str, payload: bytes) -> None:
-        status = read(key, payload)
+        status = decode(key, payload)
         assert isinstance(status, Status)
         self._statuses.append(status)
 

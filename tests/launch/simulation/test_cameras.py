@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 from msgspec.structs import replace
-from support.buses import MS, SECOND, Ear
+from support.buses import MS, SECOND, Subscription
 
 from cpcbl_agents.sensing import SensorInput
 from cpcbl_agents.vision.camera import Camera, Pixels
@@ -22,7 +22,7 @@ from cpcbl_team.config import Team
 from cpcbl_team.geometry import Pose2
 from cpcbl_team.inputs import Sightings
 from cpcbl_transport import topics
-from cpcbl_transport.bus import MemoryHub
+from cpcbl_transport.memory_bus import MemoryHub
 from cpcbl_transport.messages import Drive, Frame, encode
 
 TEXT = """
@@ -173,7 +173,7 @@ class Late:
         self.hub = MemoryHub()
         self.field = SimulatedField(team(), 1, 0)
         self.node = FieldNode(self.field, self.hub.session())
-        self.ear = Ear(self.hub.session(), topics.IN_FRAME.at(robot="eye"))
+        self.ear = Subscription(self.hub.session(), topics.IN_FRAME.at(robot="eye"))
 
 
 def test_a_field_that_is_late_makes_no_pictures_of_the_past() -> None:

@@ -5,7 +5,7 @@ from typing import Any
 
 import msgspec
 import pytest
-from support.buses import SECOND, Ear
+from support.buses import SECOND, Subscription
 from support.fields import ALL_ROUND, STEP_NS, field, marks, robot
 
 from cpcbl_agents.clock import Clock
@@ -24,7 +24,7 @@ from cpcbl_team.errors import InputError
 from cpcbl_team.geometry import Pose2
 from cpcbl_team.inputs import Odometry, Position, Sighting, Sightings
 from cpcbl_transport import topics
-from cpcbl_transport.bus import MemoryHub
+from cpcbl_transport.memory_bus import MemoryHub
 from cpcbl_transport.messages import Drive, Join, Refusal, Truths, encode
 from cpcbl_transport.robot_model import SimulatedRobotModel, model_from_settings
 
@@ -44,7 +44,8 @@ class OnBus:
 def test_the_field_answers_commands_with_what_a_driver_would_say() -> None:
     on = OnBus()
     odometry, sightings, truth = (
-        Ear(on.bus, topic.at()) for topic in (topics.IN_ODOMETRY, topics.IN_SIGHTINGS, topics.TRUTH)
+        Subscription(on.bus, topic.at())
+        for topic in (topics.IN_ODOMETRY, topics.IN_SIGHTINGS, topics.TRUTH)
     )
     on.command(encode(Drive("r1", 0, 0.5, 0.0)))
     on.node.step(5 * STEP_NS)
@@ -113,7 +114,10 @@ def test_a_robot_whose_clock_is_off_gets_and_gives_its_own_stamps(ahead_s: float
     clocks = SimulationSettings(noise=0.0, clocks_ahead_s={"r1": ahead_s})
     subject = SimulatedField(Team(name="t", robots={"r1": robot()}, simulation=clocks), 1, 0)
     node, bus = FieldNode(subject, hub.session()), hub.session()
-    odometry, truth = Ear(bus, topics.IN_ODOMETRY.at()), Ear(bus, topics.TRUTH.at())
+    odometry, truth = (
+        Subscription(bus, topics.IN_ODOMETRY.at()),
+        Subscription(bus, topics.TRUTH.at()),
+    )
     wheels = bus.publisher(topics.DRIVE.at(robot="r1"), topics.DRIVE.qos)
     wheels.put(encode(Drive("r1", ahead_ns, 0.5, 0.0)))
     node.step(5 * STEP_NS)
@@ -131,12 +135,12 @@ def test_a_robot_whose_clock_is_off_gets_and_gives_its_own_stamps(ahead_s: float
 
 def test_a_field_runs_until_it_is_stopped() -> None:
     on, team = OnBus(), load_team(builtin_path("demo"))
-    ear, clock = Ear(on.bus, topics.TRUTH.at()), Clock.wall()
+    ear, clock = Subscription(on.bus, topics.TRUTH.at()), Clock.wall()
     with MemoryHub().session() as apart:
         run_field(team, 1, apart, clock, lambda: True)
     assert ear.samples == []
     hub = MemoryHub()
-    heard = Ear(hub.session(), topics.TRUTH.at())
+    heard = Subscription(hub.session(), topics.TRUTH.at())
     run_field(team, 1, hub.session(), clock, lambda: len(heard.samples) >= 3)
     assert all(isinstance(m, Truths) for m in heard.messages)
 
@@ -145,7 +149,7 @@ def test_robots_of_another_site_are_told_and_heard_on_the_bus_of_theirs() -> Non
     here, there = MemoryHub(), MemoryHub()
     both = field(near=robot(), far=robot())
     node = FieldNode(both, here.session(), {"far": there.session()})
-    ears = {hub: Ear(hub.session(), topics.IN_ODOMETRY.at()) for hub in (here, there)}
+    ears = {hub: Subscription(hub.session(), topics.IN_ODOMETRY.at()) for hub in (here, there)}
     for hub, speed_m_s in ((here, 0.5), (there, -0.5)):
         for name in ("near", "far"):
             publisher = hub.session().publisher(topics.DRIVE.at(robot=name), topics.DRIVE.qos)
@@ -214,8 +218,8 @@ class WithGuests(OnBus):
 
 def test_a_guest_has_a_body_at_the_next_step_and_others_see_it() -> None:
     on = WithGuests()
-    seen = Ear(on.bus, topics.IN_SIGHTINGS.at())
-    truth = Ear(on.bus, topics.TRUTH.at())
+    seen = Subscription(on.bus, topics.IN_SIGHTINGS.at())
+    truth = Subscription(on.bus, topics.TRUTH.at())
     on.ask(body())
     on.steps(1)
     frames = {key.split("/")[1]: m for key, m in zip(seen.keys, seen.messages, strict=True)}
@@ -235,7 +239,7 @@ def test_a_guest_drives_like_a_robot_and_its_position_sensor_works() -> None:
     on = WithGuests()
     on.ask(body(heading_deg=0.0, position_sensor=PositionSensor(rate_hz=50.0)))
     on.steps(1)
-    positions = Ear(on.bus, topics.IN_POSITION.at(robot="tripod"))
+    positions = Subscription(on.bus, topics.IN_POSITION.at(robot="tripod"))
     on.bus.publisher(topics.DRIVE.at(robot="tripod"), topics.DRIVE.qos).put(
         encode(Drive("tripod", on.field.now_ns, 0.5, 0.0))
     )
@@ -260,7 +264,7 @@ def test_a_guest_is_gone_two_seconds_after_its_last_word_or_at_once_when_it_says
     on.ask(None)
     on.steps(1)
     assert on.guests == set()
-    heard = Ear(on.bus, topics.IN_SIGHTINGS.at(robot="tripod"))
+    heard = Subscription(on.bus, topics.IN_SIGHTINGS.at(robot="tripod"))
     on.steps(5)
     assert heard.samples == []
 
@@ -283,7 +287,7 @@ def test_a_guest_that_asks_again_keeps_its_body_but_a_new_process_starts_anew() 
 
 def test_a_guest_that_sees_farther_than_all_others_sees_what_is_there() -> None:
     on = WithGuests()
-    frames = Ear(on.bus, topics.IN_SIGHTINGS.at(robot="tripod"))
+    frames = Subscription(on.bus, topics.IN_SIGHTINGS.at(robot="tripod"))
     far = msgspec.structs.replace(ALL_ROUND, max_range_m=50.0)
     on.ask(body(40.0, 0.0, sensor=far))
     on.steps(1)

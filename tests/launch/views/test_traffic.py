@@ -13,7 +13,7 @@ from typing import Any
 import msgspec
 import pytest
 from rich.console import Console, RenderableType
-from support.buses import SECOND, Stand, robot_at, saw, team_of, wait_until
+from support.buses import SECOND, TeamOnBus, robot_at, saw, team_of, wait_until
 from support.logs import write_log
 from support.processes import cpcbl_team, pids_of
 
@@ -39,7 +39,7 @@ from cpcbl_launch.views.traffic.watch import (
 )
 from cpcbl_team.inputs import Sighting
 from cpcbl_transport import topics
-from cpcbl_transport.bus import MemoryHub
+from cpcbl_transport.memory_bus import MemoryHub
 from cpcbl_transport.messages import Flow, Spending, Status, encode
 from cpcbl_transport.zenoh_bus import open_bus, open_router
 
@@ -324,8 +324,10 @@ def test_a_watcher_keeps_one_process_and_the_last_seconds() -> None:
 
 
 def test_a_status_counts_the_tokens_that_came() -> None:
-    stand, tokens = Stand(team_of(me=robot_at(sigma_m=0.5))), []
-    stand.bus.watch(topics.ALIVE.at(), lambda key, alive: tokens.append(key) if alive else None)
+    stand, tokens = TeamOnBus(team_of(me=robot_at(sigma_m=0.5))), []
+    stand.bus.watch_liveliness(
+        topics.ALIVE.at(), lambda key, alive: tokens.append(key) if alive else None
+    )
     for _ in range(5):
         stand.stand_still(0.1)
         oak, elm = Sighting("oak", 4.0, 0.0), Sighting("elm", 4.0, 0.5 * math.pi)

@@ -6,7 +6,7 @@ import sys
 import threading
 import time
 
-from cpcbl_agents.process import Stop
+from cpcbl_agents.process import StopSignal
 from cpcbl_team.inputs import Belief, Fix
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus, Publisher
@@ -63,13 +63,13 @@ class Echo:
         self.copies += 1
 
 
-def flood(team: str, endpoint: str, robot: str, targets: list[str], stop: Stop) -> int:
+def flood(team: str, endpoint: str, robot: str, targets: list[str], stop: StopSignal) -> int:
     """Says all that a robot may say as fast as it can; how many messages.
 
     What it says is true but worthless (it does not know where it is), so that only the flood harms.
     """
     with open_bus(team, [endpoint], stop) as bus:
-        token = bus.announce(topics.ALIVE.at(tier=0, robot=robot, incarnation="f"))
+        token = bus.declare_token(topics.ALIVE.at(tier=0, robot=robot, incarnation="f"))
         keys = [topics.FIX.at(robot=name, tier=0, observer=robot) for name in targets]
         fixes = [bus.publisher(key, topics.FIX.qos) for key in keys]
         belief = bus.publisher(topics.BELIEF.at(tier=0, robot=robot), topics.BELIEF.qos)
@@ -90,7 +90,7 @@ def flood(team: str, endpoint: str, robot: str, targets: list[str], stop: Stop) 
 
 def main(team: str, endpoint: str, parent: str, robot: str, *targets: str) -> None:
     """`python -m cpcbl_launch.lab.chaos.injectors TEAM ENDPOINT PARENT ROBOT TARGET ...`"""
-    sent = flood(team, endpoint, robot, list(targets), Stop(int(parent)))
+    sent = flood(team, endpoint, robot, list(targets), StopSignal(int(parent)))
     sys.stdout.write(f"{sent}\n")
 
 

@@ -26,7 +26,7 @@ from cpcbl_launch.reporting.metrics import (
 )
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus
-from cpcbl_transport.decoding import read
+from cpcbl_transport.decoding import decode
 from cpcbl_transport.messages import Status, Track, Truths
 
 TRUTH_EVERY_NS = 80_000_000
@@ -337,7 +337,7 @@ class NoteTaker:
         """To what robots and the field say for people, and to tokens."""
         for topic in (topics.TRACK, topics.STATUS, topics.TRUTH):
             bus.subscribe(topic.at(), self._arrived)
-        bus.watch(topics.ALIVE.at(), self._seen)
+        bus.watch_liveliness(topics.ALIVE.at(), self._seen)
 
     @property
     def now_s(self) -> float:
@@ -351,7 +351,7 @@ class NoteTaker:
                 self._tokens.append(token)
 
     def _arrived(self, key: str, payload: bytes) -> None:
-        at_s, message = self.now_s, read(key, payload)
+        at_s, message = self.now_s, decode(key, payload)
         with self._lock:
             match message:
                 case Track(robot=robot, stamp_ns=stamp_ns):

@@ -27,7 +27,7 @@ from cpcbl_launch.team_file import builtin_path, load_team
 from cpcbl_team.config import Team, TrustSettings
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus
-from cpcbl_transport.messages import Status, decode
+from cpcbl_transport.messages import Status, decode_tagged
 
 FROM_S, UNTIL_S, END_S = 10.0, 25.0, 45.0
 MOST_RATIO = 1.3
@@ -171,7 +171,7 @@ class _Statuses:
         bus.subscribe(topics.STATUS.at(), self._arrived)
 
     def _arrived(self, key: str, payload: bytes) -> None:
-        status = decode(payload)
+        status = decode_tagged(payload)
         assert isinstance(status, Status)
         for trust in status.trust:
             key_ = status.robot, trust.peer, trust.quarantines

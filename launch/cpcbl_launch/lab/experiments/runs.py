@@ -30,7 +30,7 @@ from cpcbl_team.inputs import Odometry
 from cpcbl_team.sensors import corrected_odometry
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus
-from cpcbl_transport.messages import Drive, Truths, decode
+from cpcbl_transport.messages import Drive, Truths, decode_tagged
 
 LOOPS = 5
 MOST_RESTARTS = 30
@@ -94,7 +94,7 @@ class LoopReferee:
         return self.bumped or self.through
 
     def _arrived(self, key: str, payload: bytes) -> None:
-        match decode(payload):
+        match decode_tagged(payload):
             case Drive(stamp_ns=stamp_ns, reached=reached) if reached > len(self.reached_s):
                 self.reached_s.append(stamp_ns * 1e-9)
                 self.through = reached >= self._to_reach

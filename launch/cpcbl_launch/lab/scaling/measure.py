@@ -7,7 +7,7 @@ from contextlib import contextmanager
 
 import msgspec
 
-from cpcbl_agents.node import Stepped
+from cpcbl_agents.node import Steppable
 from cpcbl_launch.lab.scaling.swarm import MOST_ROBOTS, swarm
 from cpcbl_launch.options import check_duration
 from cpcbl_launch.reporting.recorder import Recorder
@@ -23,8 +23,9 @@ from cpcbl_team.config import Team
 from cpcbl_team.errors import InputError
 from cpcbl_team.inputs import Sightings
 from cpcbl_transport import topics
-from cpcbl_transport.bus import Bus, MemoryHub
-from cpcbl_transport.messages import Status, decode
+from cpcbl_transport.bus import Bus
+from cpcbl_transport.memory_bus import MemoryHub
+from cpcbl_transport.messages import Status, decode_tagged
 
 DURATION_S = 5.0
 LEAST_S = 2.0  # a robot tells once a second what it has sent
@@ -143,7 +144,7 @@ def no_collector() -> Iterator[None]:
 class Timed:
     """A node, and the CPU time that its steps took."""
 
-    def __init__(self, node: Stepped) -> None:
+    def __init__(self, node: Steppable) -> None:
         self._node = node
         self.cpu_s = 0.0
 
@@ -174,7 +175,7 @@ class Sight:
         return self._teammates / max(self._frames, 1)
 
     def _arrived(self, key: str, payload: bytes) -> None:
-        frame = decode(payload)
+        frame = decode_tagged(payload)
         if isinstance(frame, Sightings):
             self._frames += 1
             self._teammates += sum(seen.id in self._robots for seen in frame.sightings)

@@ -1,42 +1,35 @@
-"""Hears what robots say of the frames that they saw. They draw and say it while somebody hears."""
+"""Receives the annotated frames of robots. A robot annotates frames only for subscribers."""
 
 import threading
 from collections import Counter, deque
 
-from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus
-from cpcbl_transport.decoding import read
-from cpcbl_transport.messages import Look
+from cpcbl_transport.decoding import Received, Subscriber
+from cpcbl_transport.messages import AnnotatedFrame
 
 MOST = 50  # some 100 kB each
 
 
-class LookEar:
-    """Keeps the looks of one robot, or of all, until they are taken; the latest if they pile up."""
+class FrameSubscriber:
+    """Keeps the annotated frames of one robot, or of all, until they are taken; the latest 50."""
 
     def __init__(self, bus: Bus, robot: str = "*") -> None:
         self._lock = threading.Lock()
-        self._looks: deque[Look] = deque(maxlen=MOST)
-        self._refused: Counter[str] = Counter()
-        bus.subscribe(topics.LOOK.at(robot=robot), self._arrived)
+        self._frames: deque[AnnotatedFrame] = deque(maxlen=MOST)
+        self._subscriber = Subscriber(bus, AnnotatedFrame, self._on_frame, robot=robot)
 
-    def _arrived(self, key: str, payload: bytes) -> None:
-        look = read(key, payload)
+    def _on_frame(self, received: Received[AnnotatedFrame]) -> None:
         with self._lock:
-            if isinstance(look, Look):
-                self._looks.append(look)
-            else:
-                self._refused[str(look)] += 1
+            self._frames.append(received.message)
 
     @property
     def refused(self) -> Counter[str]:
-        """What could not be used, by reason."""
-        with self._lock:
-            return self._refused.copy()
+        """How many messages could not be used, by reason."""
+        return self._subscriber.refused
 
-    def taken(self) -> list[Look]:
+    def take(self) -> list[AnnotatedFrame]:
         """What has come since the last call, in order."""
         with self._lock:
-            looks = list(self._looks)
-            self._looks.clear()
-            return looks
+            frames = list(self._frames)
+            self._frames.clear()
+            return frames

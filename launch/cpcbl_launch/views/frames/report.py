@@ -9,7 +9,7 @@ from rich.table import Table
 
 from cpcbl_launch.reporting.tables import table
 from cpcbl_team.inputs import Sighting
-from cpcbl_transport.messages import Look, Unclear
+from cpcbl_transport.messages import AnnotatedFrame, UnclearObject
 
 
 class FoundReport(msgspec.Struct, frozen=True, kw_only=True):
@@ -35,10 +35,10 @@ class LookReport(msgspec.Struct, frozen=True, kw_only=True):
     picture: str
     """The annotated picture that was written; empty if there is none."""
     found: tuple[FoundReport, ...]
-    unclear: tuple[Unclear, ...]
+    unclear: tuple[UnclearObject, ...]
 
 
-def reported(look: Look, frame: str, picture: str) -> LookReport:
+def reported(look: AnnotatedFrame, frame: str, picture: str) -> LookReport:
     """A look in words."""
     found = tuple(_found(sighting) for sighting in look.found)
     return LookReport(
@@ -62,7 +62,7 @@ def _deg(angle: float | None) -> float | None:
     return None if angle is None else math.degrees(angle)
 
 
-def written(look: Look, folder: Path, name: str) -> str:
+def written(look: AnnotatedFrame, folder: Path, name: str) -> str:
     """Writes the annotated picture; its path, empty if there is no picture. Raises OSError."""
     if not look.image:
         return ""

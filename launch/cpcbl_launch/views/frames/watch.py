@@ -4,10 +4,10 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
-from cpcbl_launch.views.frames.ear import LookEar
+from cpcbl_launch.views.frames.ear import FrameSubscriber
 from cpcbl_team.config import Team
 from cpcbl_team.errors import InputError
-from cpcbl_transport.messages import Frame, Look
+from cpcbl_transport.messages import AnnotatedFrame, Frame
 from cpcbl_transport.security import Link
 from cpcbl_transport.zenoh_bus import BusError, open_bus
 
@@ -16,7 +16,7 @@ REFRESH_S = 0.02
 
 def looks_of(
     robot: str, team: str, link: Link, stop: Callable[[], bool], wait_s: float
-) -> Iterator[Look]:
+) -> Iterator[AnnotatedFrame]:
     """What a running robot says of its frames, until `stop()`; twice a second at most.
 
     Raises BusError without a router, InputError when it says nothing for `wait_s`.
@@ -38,10 +38,10 @@ def looks_of(
             " --connect takes the endpoint that `cpcbl-team up` says"
         ) from None
     with bus:
-        ear = LookEar(bus, robot)
+        ear = FrameSubscriber(bus, robot)
         until_s = time.monotonic() + wait_s
         while not stop():
-            looks = ear.taken()
+            looks = ear.take()
             yield from looks
             now_s = time.monotonic()
             until_s = now_s + wait_s if looks else until_s
@@ -53,7 +53,9 @@ def looks_of(
             time.sleep(REFRESH_S)
 
 
-def looks_at(paths: Sequence[Path], robot: str, team: Team) -> Iterator[tuple[Path, Look]]:
+def looks_at(
+    paths: Sequence[Path], robot: str, team: Team
+) -> Iterator[tuple[Path, AnnotatedFrame]]:
     """What the eyes of a robot make of picture files. Raises OSError, InputError without OpenCV."""
     from cpcbl_agents.vision.detector import CameraEyes
 

@@ -23,7 +23,7 @@ from cpcbl_launch.reporting.flows import (
 from cpcbl_launch.reporting.trust_report import TrustReport, trust_reports
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus
-from cpcbl_transport.decoding import read
+from cpcbl_transport.decoding import decode
 from cpcbl_transport.messages import Flow, Status
 from cpcbl_transport.security import Link
 from cpcbl_transport.zenoh_bus import BusError, open_bus
@@ -174,7 +174,7 @@ class StatusCollector:
         bus.subscribe(topics.STATUS.at(), self._receive)
 
     def _receive(self, key: str, payload: bytes) -> None:
-        status = read(key, payload)
+        status = decode(key, payload)
         with self._lock:
             if not isinstance(status, Status):
                 self._refused[str(status)] += 1
