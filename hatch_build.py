@@ -13,7 +13,20 @@ from mypyc.build import mypycify
 from setuptools import Distribution
 from setuptools.command.build_ext import build_ext
 
-HOT = ("estimate", "geometry", "landmarks", "localizer", "motion", "recovery", "sensors")
+HOT = (
+    "constraints",
+    "estimate",
+    "fusion",
+    "geometry",
+    "landmarks",
+    "localizer",
+    "motion",
+    "recovery",
+    "relocalization",
+    "sensors",
+    "state",
+    "variants",
+)
 OPTIONS = ["--strict", "--namespace-packages", "--explicit-package-bases", "--config-file="]
 
 

@@ -1,17 +1,21 @@
-"""What one measurement says about the pose: a curve, its point closest to the estimate, its width.
+"""Step 3 of the cycle: what one measurement says about the pose, as a curve (paper, section 3).
 
-Range to a point gives a circle, bearing a ray or one heading, distance to a wall a parallel line
-(paper, section 3 and figure 3). Every constraint is linearized at the same prior:
+A range to a point gives a circle, a bearing gives a ray or one heading, a distance to a wall gives
+a parallel line (figure 3). Every constraint is linearized at the same prior:
 
     residual = row . (true pose - prior pose) + noise of `sigma`
 
-so that `row` is the curve's normal with, where the heading matters, its lever (resolution a).
+`row` is the normal of the curve at its point closest to the prior (figure 1 c); where the heading
+matters, the row's third entry is its lever (docs/algorithm.md, resolution a).
+
+`circle`, `ray` and `heading` are the formulas. They take (dx, dy), the object's position minus the
+robot's in the field's frame (m), and return plain numbers, for the loop over landmarks; the other
+functions return a `Constraint`.
 """
 
 import math
-from typing import Final
-
-import msgspec
+from math import atan2, cos, sin
+from typing import Final, NamedTuple
 
 from cpcbl_team.estimate import Row
 from cpcbl_team.geometry import Pose2, wrap_angle
@@ -19,21 +23,45 @@ from cpcbl_team.geometry import Pose2, wrap_angle
 NEAREST_M: Final = 1e-3  # nearer than this a direction means nothing
 
 
-class Constraint(msgspec.Struct, frozen=True, gc=False):
-    """One scalar constraint on a pose, relative to an object: moving that moves the curve."""
+def circle(dx: float, dy: float, distance_m: float, range_m: float) -> Row:
+    """The circle of a range: its unit normal (u, v), and the residual (m)."""
+    return -dx / distance_m, -dy / distance_m, range_m - distance_m
+
+
+def ray(dx: float, dy: float, direction: float) -> tuple[float, float, float, float]:
+    """The ray to an object that is visible in this direction of the field (rad).
+
+    Returns its unit normal (u, v), the object's distance along the ray (m; negative: the object is
+    behind the robot, and no ray passes there), and the residual (m).
+    """
+    c, s = cos(direction), sin(direction)
+    return -s, c, c * dx + s * dy, c * dy - s * dx
+
+
+def heading(dx: float, dy: float, distance_squared: float, bearing: float, prior: float) -> Row:
+    """The one heading that a bearing leaves where the position is right.
+
+    Returns the change of the expected bearing with the position (rad/m), and the residual against
+    the `prior` heading (rad).
+    """
+    residual = wrap_angle(atan2(dy, dx) - bearing - prior)
+    return -dy / distance_squared, dx / distance_squared, residual
+
+
+class Constraint(NamedTuple):
+    """One scalar constraint on a pose, relative to an object: if that moves, the curve moves."""
 
     row: Row
     residual: float  # metres for a position, radians for a heading
     sigma: float  # of the sensor, in the residual's unit
     distance_m: float  # robot to object; non-probabilistic weights are its inverse
     on_heading: bool
-    place_row: tuple[float, float]  # how the residual follows an error in the object's place
+    place_row: tuple[float, float]  # how the residual follows an error in the object's position
 
     def uncoupled(self) -> "Constraint":
-        """As the paper prints it: heading and position know nothing of each other's error."""
+        """As the paper prints it: heading and position ignore each other's error."""
         x, y, h = self.row
-        row = (0.0, 0.0, h) if self.on_heading else (x, y, 0.0)
-        return msgspec.structs.replace(self, row=row)
+        return self._replace(row=(0.0, 0.0, h) if self.on_heading else (x, y, 0.0))
 
     def closest_point(self, pose: Pose2) -> tuple[float, float]:
         """The point of a position constraint that is closest to the estimate (figure 1 c)."""
@@ -43,44 +71,39 @@ class Constraint(msgspec.Struct, frozen=True, gc=False):
 def range_circle(
     pose: Pose2, x: float, y: float, range_m: float, sigma_m: float
 ) -> Constraint | None:
-    """Range to a point: a circle. Width sigma_r along its normal, nothing along its tangent."""
-    dx, dy = pose.x - x, pose.y - y
+    """A range to the point (x, y). Its width is sigma_r along the normal; a circle says nothing
+    along its tangent (checklist row 35). None where the estimate is at the point."""
+    dx, dy = x - pose.x, y - pose.y
     distance = math.hypot(dx, dy)
     if distance < NEAREST_M:
         return None
-    u, v = dx / distance, dy / distance
+    u, v, residual = circle(dx, dy, distance, range_m)
     weighed = max(range_m, NEAREST_M)
-    return Constraint((u, v, 0.0), range_m - distance, sigma_m, weighed, False, (u, v))
+    return Constraint((u, v, 0.0), residual, sigma_m, weighed, False, (u, v))
 
 
 def bearing_ray(pose: Pose2, x: float, y: float, bearing: float, sigma: float) -> Constraint | None:
-    """Bearing to a point, heading taken as right: a ray from the point. Width d sin(sigma_a).
-
-    None when the estimate lies on the other side of the point: no ray passes there.
-    """
-    direction = pose.heading + bearing
-    ux, uy = math.cos(direction), math.sin(direction)
+    """A bearing to the point (x, y), the heading taken as right. Its width is d sin(sigma_a)
+    (equation 1b). None where the estimate is on the other side of the point."""
     dx, dy = x - pose.x, y - pose.y
-    ahead = ux * dx + uy * dy
+    u, v, ahead, residual = ray(dx, dy, pose.heading + bearing)
     if ahead < NEAREST_M:
         return None
     distance = math.hypot(dx, dy)
-    residual = ux * dy - uy * dx
-    width = distance * math.sin(min(sigma, 0.5 * math.pi))
-    return Constraint((-uy, ux, ahead), residual, width, distance, False, (-uy, ux))
+    width = distance * sin(min(sigma, 0.5 * math.pi))
+    return Constraint((u, v, ahead), residual, width, distance, False, (u, v))
 
 
 def bearing_heading(
     pose: Pose2, x: float, y: float, bearing: float, sigma: float
 ) -> Constraint | None:
-    """Bearing to a point, position taken as right: one heading."""
+    """A bearing to the point (x, y), the position taken as right. None where the estimate is at
+    the point."""
     dx, dy = x - pose.x, y - pose.y
     distance = math.hypot(dx, dy)
     if distance < NEAREST_M:
         return None
-    residual = wrap_angle(math.atan2(dy, dx) - bearing - pose.heading)
-    q = distance**2
-    u, v = -dy / q, dx / q
+    u, v, residual = heading(dx, dy, distance**2, bearing, pose.heading)
     return Constraint((u, v, 1.0), residual, sigma, distance, True, (u, v))
 
 
@@ -88,7 +111,7 @@ def wall_line(
     pose: Pose2, x: float, y: float, wall_direction: float, distance_m: float, sigma_m: float
 ) -> Constraint:
     """Perpendicular distance to a wall through (x, y): the parallel line on the robot's side."""
-    nx, ny = -math.sin(wall_direction), math.cos(wall_direction)
+    nx, ny = -sin(wall_direction), cos(wall_direction)
     offset = nx * (pose.x - x) + ny * (pose.y - y)
     side = 1.0 if offset >= 0.0 else -1.0
     u, v = side * nx, side * ny
@@ -100,7 +123,7 @@ def wall_heading(
     pose: Pose2, x: float, y: float, wall_direction: float, bearing: float, sigma: float
 ) -> Constraint:
     """Direction of the perpendicular to a wall: one heading, wherever the robot is."""
-    nx, ny = -math.sin(wall_direction), math.cos(wall_direction)
+    nx, ny = -sin(wall_direction), cos(wall_direction)
     offset = nx * (pose.x - x) + ny * (pose.y - y)
     towards = wall_direction - math.copysign(0.5 * math.pi, offset)
     residual = wrap_angle(towards - bearing - pose.heading)

@@ -116,6 +116,38 @@ Sums = tuple[Six, Row]
 """The numbers of an `Information`, which is one."""
 
 
+def sharpest(variance: float) -> float:
+    """The variance (m^2 or rad^2) with which a measurement counts: never sharper than rounding
+    allows."""
+    return variance if variance > SHARPEST_VARIANCE else SHARPEST_VARIANCE
+
+
+class InformationSum:
+    """Adds up the evidence of one frame, about the offset from the prior."""
+
+    def __init__(self) -> None:
+        self.xx = self.xy = self.yy = self.xh = self.yh = self.hh = 0.0
+        self.x = self.y = self.h = 0.0
+
+    def add(self, u: float, v: float, a: float, residual: float, weight: float) -> None:
+        """Adds a scalar measurement with row (u, v, a); `weight` is the inverse of its variance."""
+        wu, wv, wa = weight * u, weight * v, weight * a
+        self.xx += wu * u
+        self.xy += wu * v
+        self.yy += wv * v
+        self.xh += wu * a
+        self.yh += wv * a
+        self.hh += wa * a
+        self.x += wu * residual
+        self.y += wv * residual
+        self.h += wa * residual
+
+    def sums(self) -> Sums:
+        """The matrix (xx, xy, yy, xh, yh, hh) and the vector (x, y, h)."""
+        matrix = self.xx, self.xy, self.yy, self.xh, self.yh, self.hh
+        return matrix, (self.x, self.y, self.h)
+
+
 class Information(NamedTuple):
     """Evidence about the offset from a prior: sum of h h^T / variance and of h e / variance."""
 
@@ -139,7 +171,7 @@ class Information(NamedTuple):
         """With these (row, residual, variance) of scalar measurements."""
         (xx, xy, yy, xh, yh, hh), (ex, ey, eh) = self
         for (x, y, a), residual, variance in measurements:
-            w = 1.0 / (variance if variance > SHARPEST_VARIANCE else SHARPEST_VARIANCE)
+            w = 1.0 / sharpest(variance)
             r, wx, wy = residual * w, w * x, w * y
             xx += wx * x
             xy += wx * y
@@ -278,6 +310,7 @@ def circle_variance(xx: float, xy: float, yy: float, xh: float, yh: float, hh: f
 
 def circular(estimate: Estimate) -> Estimate:
     """The estimate with its position's covariance reduced to a circle."""
-    pose, c, shared = estimate
-    variance = circle_variance(*c)
-    return Estimate(pose, Covariance3(variance, 0.0, variance, c.xh, c.yh, c.hh), shared)
+    pose, covariance, shared = estimate
+    xx, xy, yy, xh, yh, hh = covariance
+    variance = circle_variance(xx, xy, yy, xh, yh, hh)
+    return new(Estimate, (pose, new(Covariance3, (variance, 0.0, variance, xh, yh, hh)), shared))

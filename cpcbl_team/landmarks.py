@@ -1,48 +1,59 @@
-"""What a frame of plain landmarks says: steps 2 to 4 of the cycle in one loop of plain numbers.
+"""Steps 2 to 4 of the cycle for plain landmarks: the fast path.
 
-Nearly everything that a robot sees is a point of the map, with the sensor model's own errors. For
-those the constraints of `constraints.py`, their gates and their sum are written out, without an
-object for each: that is what a cycle costs. Everything else (walls, teammates, sightings with a
-sigma of their own, faults) is handed back, for `sightings.py`. `tests/core/test_landmarks.py` holds
-the two together.
+Nearly everything that a robot sees is a point of the map, with the sensor model's own errors. These
+sightings need no record each: the formulas of `constraints.py` are applied to plain numbers, and
+their evidence is added up. All other sightings (of walls and teammates, with sigmas of their own,
+with faults) are left to `measurements.py`. `tests/core/test_landmarks.py` compares both ways.
 """
 
 import math
-from collections.abc import Iterator
-from math import atan2, cos, sin, sqrt
+from math import sqrt
 
 from msgspec.structs import astuple
 
 from cpcbl_team.config import Field, LocalizationSettings
-from cpcbl_team.constraints import NEAREST_M
+from cpcbl_team.constraints import NEAREST_M, circle, heading, ray
 from cpcbl_team.estimate import (
     HEADING,
-    POSE,
     POSITION,
-    SHARPEST_VARIANCE,
     SMALLEST_VARIANCE,
     Covariance3,
+    Estimate,
+    InformationSum,
     Row,
     Scope,
-    Sums,
+    sharpest,
 )
 from cpcbl_team.fusion import chi_square
-from cpcbl_team.geometry import PI, wrap_angle
 from cpcbl_team.inputs import Sighting
-from cpcbl_team.recovery import latest
 from cpcbl_team.sensors import LARGEST_BEARING_RAD, LARGEST_M, range_to_expect
-from cpcbl_team.state import Evidence, Glance, Memory, State
-
-Said = tuple[Sums, dict[str, int], int, bool, list[Sighting], list[Sighting]]
-"""What the landmarks of a frame say: about the offset from the prior; the objects that count, and
-when (now); how many the gate rejected; whether there was anything of the type that was asked for,
-accepted or not; the sightings that are new evidence; those that are not plain."""
-
+from cpcbl_team.state import Evidence, LandmarkSnapshot, State
 
 Numbers = tuple[
     str, float | None, float | None, float | None, float | None, float | None, float | None
 ]  # of a sighting, in its order
-Places = dict[str, tuple[float, float, bool, bool]]  # x, y, gives ranges, gives bearings
+
+
+class Mark:
+    """A landmark of the map: its position in the field (m), and what readings of it are used."""
+
+    def __init__(self, x: float, y: float, gives: str) -> None:
+        self.x, self.y = x, y
+        self.gives_range = gives in ("both", "range")
+        self.gives_bearing = gives in ("both", "bearing")
+
+
+class LandmarkUpdate:
+    """What the plain landmarks of one frame say about the part of the pose to be updated."""
+
+    def __init__(self, stamp_ns: int) -> None:
+        self.stamp_ns = stamp_ns
+        self.evidence = InformationSum()
+        self.used: dict[str, int] = {}  # the landmarks whose evidence was accepted, and when: now
+        self.rejected = 0  # how many landmarks the gate has rejected
+        self.constrains = False  # whether any reading speaks of the part, accepted or not
+        self.unrecorded: list[Sighting] = []  # sightings that are new evidence for recovery
+        self.others: list[Sighting] = []  # sightings that are not plain
 
 
 class Landmarks:
@@ -52,171 +63,158 @@ class Landmarks:
         self, field: Field, settings: LocalizationSettings, gates: tuple[float, float]
     ) -> None:
         """`gates`: chi-square bounds of one and of two constraints. No landmark is plain where the
-        rules ask for more than `read` does."""
+        rules ask for more than `update` does."""
         rules, s = settings.localizer, settings.sensor
         plain = rules.variant != "weighted" and not (
             rules.paper_uncertainty or rules.learns or s.correlation_s > 0.0
         )
-        self._places: Places = {
-            name: (p.x_m, p.y_m, p.gives in ("both", "range"), p.gives in ("both", "bearing"))
-            for name, p in (field.landmarks if plain else {}).items()
-        }
-        self._as_rays = rules.bearing_for_position
+        self._marks: dict[str, Mark] = {}
+        if plain:
+            self._marks = {n: Mark(p.x_m, p.y_m, p.gives) for n, p in field.landmarks.items()}
+        self._uses_rays = rules.bearing_for_position
         self._gates = gates
-        self._range_model = s.range_share**2, s.range_floor_m**2, s.max_range_for_range_m
-        self._heading_weight = 1.0 / max(s.bearing_sigma_rad**2, SHARPEST_VARIANCE)
+        self._share_squared = s.range_share**2
+        self._floor_squared = s.range_floor_m**2
+        self._farthest_m = s.max_range_for_range_m
+        self._heading_weight = 1.0 / sharpest(s.bearing_sigma_rad**2)
         self._sine_squared = math.sin(min(s.bearing_sigma_rad, 0.5 * math.pi)) ** 2
         self._bearing_sigma_rad = s.bearing_sigma_rad
 
-    def read(
+    def update(
         self,
         state: State,
         sightings: tuple[Sighting, ...],
-        turn: Scope | None,
-        resting: frozenset[str],
-        noted: frozenset[str],
-    ) -> Said:
+        scope: Scope | None,
+        cooling_down: frozenset[str],
+        recorded: frozenset[str],
+    ) -> LandmarkUpdate:
         """What the landmarks among `sightings` say about position or heading, or about both.
 
-        All is linearized at the state's estimate. An object that is `resting` is not plain; one
-        that is `noted` is no new evidence. A range gives the row (u, v, 0), a bearing the row
-        (m, n, 1): about the heading as it is, about the position as a ray over the way ahead.
+        An object that is `cooling_down` is not plain; one of `recorded` is no new evidence.
         """
-        places, as_ray = self._places, turn is POSITION
-        ranges = as_ray or turn is POSE
-        bearings = turn is HEADING or turn is POSE or (as_ray and self._as_rays)
-        share, floor, farthest = self._range_model
-        sharp, sine_squared, gate = self._heading_weight, self._sine_squared, self._gates[0]
-        now, estimate, _, _, _, _, _ = state
-        pose, covariance, _ = estimate
-        x, y, h = pose
-        axx = axy = ayy = axh = ayh = ahh = bx = by = bh = 0.0
-        rejected, offered = 0, False
-        used: dict[str, int] = {}
-        fresh: list[Sighting] = []
-        others: list[Sighting] = []
-        for seen in sightings:
-            numbers: Numbers = astuple(seen)
-            name, range_m, bearing, range_sigma, bearing_sigma, heading, heading_sigma = numbers
-            place = places.get(name)
-            if (
-                place is None
-                or range_sigma is not None
-                or bearing_sigma is not None
-                or heading is not None
-                or heading_sigma is not None
-                or name in resting
-                or not (range_m is None or 0.0 < range_m <= LARGEST_M)
-                or not (bearing is None or -LARGEST_BEARING_RAD <= bearing <= LARGEST_BEARING_RAD)
-                or (range_m is None and bearing is None)
-            ):
-                others.append(seen)
+        update = LandmarkUpdate(state.stamp_ns)
+        estimate = state.estimate
+        uses_range = scope is not None and scope is not HEADING
+        uses_bearing = scope is not None and (scope is not POSITION or self._uses_rays)
+        for sighting in sightings:
+            numbers: Numbers = astuple(sighting)
+            name, range_m, bearing = numbers[0], numbers[1], numbers[2]
+            mark = self._marks.get(name)
+            if mark is None or name in cooling_down or not _is_plain(numbers):
+                update.others.append(sighting)
                 continue
-            px, py, gives_range, gives_bearing = place
-            dx, dy = px - x, py - y
-            q = dx * dx + dy * dy
-            d = sqrt(q)
-            if not gives_range or (range_m is not None and range_m > farthest):
+            if not mark.gives_range or (range_m is not None and range_m > self._farthest_m):
                 range_m = None
-            if not gives_bearing:
+            if not mark.gives_bearing:
                 bearing = None
             if range_m is None and bearing is None:
                 continue
-            if name not in noted:
-                fresh.append(seen)
-            if not ranges:
+            if name not in recorded:
+                update.unrecorded.append(sighting)
+            if not uses_range:
                 range_m = None
-            if not bearings:
+            if not uses_bearing:
                 bearing = None
-            if range_m is None and bearing is None:
-                continue
-            offered = True
-            if d < NEAREST_M:
-                continue
-            # the constraints: rows, residuals and weights, which are zero for none
-            e = f = u = v = m = n = w = k = 0.0
-            if range_m is not None:  # a circle
-                u, v, e = -dx / d, -dy / d, range_m - d
-                due = d if 0.5 * range_m <= d <= 2.0 * range_m else range_to_expect(d, range_m)
-                w = share * due * due + floor
-                w = 1.0 / (w if w > SHARPEST_VARIANCE else SHARPEST_VARIANCE)
-            if bearing is None:
-                pass
-            elif not as_ray:  # a heading
-                m, n, k = -dy / q, dx / q, sharp
-                f = atan2(dy, dx) - bearing - h
-                if not -PI <= f <= PI:
-                    f = wrap_angle(f)
-            else:  # a ray
-                direction = h + bearing
-                c, s = cos(direction), sin(direction)
-                ahead = c * dx + s * dy
-                if ahead >= NEAREST_M:
-                    m, n, f = -s / ahead, c / ahead, (c * dy - s * dx) / ahead
-                    k = q * sine_squared  # the ray's width, squared
-                    k = ahead * ahead / (k if k > SHARPEST_VARIANCE else SHARPEST_VARIANCE)
-                elif range_m is None:
-                    continue
-            # the gate, which all pass that the sensor's noise alone explains
-            if w * e * e + k * f * f > gate and self._refuses(
-                covariance, ((u, v, 0.0), e, w), ((m, n, 1.0), f, k)
-            ):
-                rejected += 1
-                continue
-            used[name] = now
-            # the sum
-            if range_m is not None:
-                wu, wv = w * u, w * v
-                axx += wu * u
-                axy += wu * v
-                ayy += wv * v
-                bx += wu * e
-                by += wv * e
-            if k:
-                km, kn = k * m, k * n
-                axx += km * m
-                axy += km * n
-                ayy += kn * n
-                axh += km
-                ayh += kn
-                ahh += k
-                bx += km * f
-                by += kn * f
-                bh += k * f
-        sums = (axx, axy, ayy, axh, ayh, ahh), (bx, by, bh)
-        return sums, used, rejected, offered, fresh, others
+            if range_m is not None or bearing is not None:
+                update.constrains = True
+                self._constrain(update, name, mark, range_m, bearing, estimate, scope is POSITION)
+        return update
 
-    def _refuses(self, prior: Covariance3, *constraints: tuple[Row, float, float]) -> bool:
-        """Whether the chi-square bound refuses an object's (row, residual, weight)."""
+    def _constrain(
+        self,
+        update: LandmarkUpdate,
+        name: str,
+        mark: Mark,
+        range_m: float | None,
+        bearing: float | None,
+        prior: Estimate,
+        as_ray: bool,
+    ) -> None:
+        """Adds the constraints of one landmark, unless the gate rejects them.
+
+        A range gives the row (u, v, 0). A bearing gives the row (m, n, 1): a heading as it is, a
+        ray divided by the distance along it.
+        """
+        pose, covariance, _ = prior
+        x, y, prior_heading = pose
+        dx, dy = mark.x - x, mark.y - y
+        distance_squared = dx * dx + dy * dy
+        distance = sqrt(distance_squared)
+        if distance < NEAREST_M:
+            return
+        u = v = m = n = range_error = bearing_error = range_weight = bearing_weight = 0.0
+        if range_m is not None:
+            u, v, range_error = circle(dx, dy, distance, range_m)
+            range_weight = 1.0 / sharpest(self._range_variance(distance, range_m))
+        if bearing is not None and as_ray:
+            m, n, ahead, across = ray(dx, dy, prior_heading + bearing)
+            if ahead >= NEAREST_M:
+                m, n, bearing_error = m / ahead, n / ahead, across / ahead
+                width_squared = sharpest(distance_squared * self._sine_squared)
+                bearing_weight = ahead * ahead / width_squared
+            elif range_m is None:
+                return
+        elif bearing is not None:
+            m, n, bearing_error = heading(dx, dy, distance_squared, bearing, prior_heading)
+            bearing_weight = self._heading_weight
+        # The NIS of a prior that is certain; that of an uncertain one is smaller.
+        largest_nis = range_weight * range_error * range_error
+        largest_nis += bearing_weight * bearing_error * bearing_error
+        if largest_nis > self._gates[0] and self._rejects(
+            covariance,
+            ((u, v, 0.0), range_error, range_weight),
+            ((m, n, 1.0), bearing_error, bearing_weight),
+        ):
+            update.rejected += 1
+            return
+        update.used[name] = update.stamp_ns
+        if range_m is not None:
+            update.evidence.add(u, v, 0.0, range_error, range_weight)
+        if bearing_weight:
+            update.evidence.add(m, n, 1.0, bearing_error, bearing_weight)
+
+    def _range_variance(self, distance_m: float, range_m: float) -> float:
+        """The sensor model's variance (m^2) of a range to a landmark at this distance."""
+        expected_m = range_to_expect(distance_m, range_m)
+        return self._share_squared * expected_m * expected_m + self._floor_squared
+
+    def _rejects(self, prior: Covariance3, *constraints: tuple[Row, float, float]) -> bool:
+        """Whether the chi-square bound rejects an object's (row, residual, weight)."""
         rows, residuals, weights = zip(*(c for c in constraints if c[2]), strict=True)
         first, last = (1.0 / weights[i] + SMALLEST_VARIANCE for i in (0, -1))
-        surprise = chi_square(prior, (first, 0.0, last), rows, residuals)
-        return surprise > self._gates[len(rows) - 1]
+        nis = chi_square(prior, (first, 0.0, last), rows, residuals)
+        return nis > self._gates[len(rows) - 1]
 
-    def evidence(self, memory: Memory) -> tuple[Evidence, ...]:
-        """All the evidence in a memory, the latest last."""
-        pieces = [piece for glance in memory.glances for piece in self._pieces(glance)]
-        return latest(tuple(sorted((*pieces, *memory.evidence), key=_stamp)))
-
-    def _pieces(self, glance: Glance) -> Iterator[Evidence]:
-        """The evidence of a glance, one piece a landmark."""
-        share, floor, farthest = self._range_model
-        now, reckoned, pose, sightings = glance
+    def evidence_of(self, snapshot: LandmarkSnapshot) -> list[Evidence]:
+        """The evidence of a snapshot, one piece a landmark."""
+        stamp_ns, odometry_from_robot, pose, sightings = snapshot
         first: dict[str, Sighting] = {}
-        for seen in sightings:
-            first.setdefault(seen.id, seen)
-        for name, seen in first.items():
-            x, y, gives_range, gives_bearing = self._places[name]
-            range_m, sigma_m = seen.range_m, 0.0
-            if not gives_range or range_m is None or range_m > farthest:
+        for sighting in sightings:
+            first.setdefault(sighting.id, sighting)
+        pieces = []
+        for name, sighting in first.items():
+            mark, range_m, sigma_m = self._marks[name], sighting.range_m, 0.0
+            if not mark.gives_range or range_m is None or range_m > self._farthest_m:
                 range_m = None
             else:
-                due_m = range_to_expect(math.hypot(x - pose.x, y - pose.y), range_m)
-                sigma_m = sqrt(share * due_m * due_m + floor)
-            bearing = seen.bearing_rad if gives_bearing else None
-            sigmas = sigma_m, self._bearing_sigma_rad, 0.0
-            yield Evidence(now, reckoned, name, x, y, range_m, bearing, *sigmas, False)
+                distance = math.hypot(mark.x - pose.x, mark.y - pose.y)
+                sigma_m = sqrt(self._range_variance(distance, range_m))
+            bearing = sighting.bearing_rad if mark.gives_bearing else None
+            where = stamp_ns, odometry_from_robot, name, mark.x, mark.y
+            sigmas = sigma_m, self._bearing_sigma_rad
+            pieces.append(Evidence(*where, range_m, bearing, *sigmas))
+        return pieces
 
 
-def _stamp(piece: Evidence) -> int:
-    return piece.stamp_ns
+def _is_plain(numbers: Numbers) -> bool:
+    """Whether these are a sound range or bearing, or both, and nothing else."""
+    _, range_m, bearing, range_sigma, bearing_sigma, heading_seen, heading_sigma = numbers
+    return (
+        range_sigma is None
+        and bearing_sigma is None
+        and heading_seen is None
+        and heading_sigma is None
+        and (range_m is None or 0.0 < range_m <= LARGEST_M)
+        and (bearing is None or -LARGEST_BEARING_RAD <= bearing <= LARGEST_BEARING_RAD)
+        and not (range_m is None and bearing is None)
+    )

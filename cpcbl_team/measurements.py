@@ -1,4 +1,5 @@
-"""Steps 2 to 4 of the cycle: from sightings to measurements, to constraints, to one evidence."""
+"""Steps 2 to 4 of the cycle, the general path: from a sighting to a measurement, its constraints,
+and their evidence."""
 
 import math
 from collections.abc import Iterable, Mapping
@@ -34,78 +35,85 @@ from cpcbl_team.sensors import sighting_sigmas
 _EXACT = Covariance2(0.0, 0.0, 0.0)
 
 
-class Measured(msgspec.Struct, frozen=True, gc=False):
-    """A sighting of an object whose place is known; a quantity is None where it is not usable."""
+class Measurement(msgspec.Struct, frozen=True, gc=False):
+    """A sighting of an object whose position is known; a reading is None where it is not used."""
 
     source: str
-    place: Place  # for a wall: a point of it
+    position: Place  # for a wall: a point of it
     wall: Wall | None
-    teammate: bool
+    is_teammate: bool
     range_m: float | None
-    bearing: float | None
+    bearing: float | None  # rad, in the robot's frame
     range_sigma: float
     bearing_sigma: float
 
     @property
-    def usable(self) -> bool:
+    def has_reading(self) -> bool:
         return self.range_m is not None or self.bearing is not None
 
-    def doubted(self, factor: float) -> "Measured":
-        """With both variances grown by this factor."""
+    @property
+    def has_point_bearing(self) -> bool:
+        return self.bearing is not None and self.wall is None
+
+    def inflated(self, factor: float) -> "Measurement":
+        """With both variances times this factor."""
         k = math.sqrt(factor)
         sigmas = {"range_sigma": k * self.range_sigma, "bearing_sigma": k * self.bearing_sigma}
         return msgspec.structs.replace(self, **sigmas)
 
-    def turned(self, angle: float) -> "Measured":
-        """Seen so much further to the left."""
+    def rotated(self, angle: float) -> "Measurement":
+        """With a bearing that is larger by this angle (rad)."""
         if self.bearing is None:
             return self
         return msgspec.structs.replace(self, bearing=wrap_angle(self.bearing + angle))
 
-    @property
-    def gives_point_bearing(self) -> bool:
-        return self.bearing is not None and self.wall is None
 
+class GatedObject(NamedTuple):
+    """An object with its constraints, and their normalized innovation squared: chi-square, with a
+    degree of freedom a constraint."""
 
-class Found(NamedTuple):
-    """An object with its constraints, and how much they surprise: chi-square, a degree each."""
-
-    measured: Measured
+    measurement: Measurement
     constraints: list[Constraint]
-    surprise: float
+    nis: float
 
 
-def measured(
+class GatedObjects(NamedTuple):
+    """What the gate makes of the objects of a frame."""
+
+    accepted: list[GatedObject]
+    rejected: list[GatedObject]
+
+
+def measurement_of(
     sighting: Sighting,
     stamp_ns: int,
     pose: Pose2,
     field: Field,
     teammates: Mapping[str, tuple[Belief, ...]],
     settings: LocalizationSettings,
-) -> Measured | None:
-    """The sighting, seen from about `pose`, with its object's place; None if that is not known."""
+) -> Measurement | None:
+    """The sighting, from about `pose`, with its object's position; None if that is not known."""
     name = sighting.id
     wall, landmark, gives = field.walls.get(name), field.landmarks.get(name), "both"
     if landmark is not None:
-        place: Place | None = _on_map(landmark.x_m, landmark.y_m)
+        position: Place | None = _on_map(landmark.x_m, landmark.y_m)
         gives = landmark.gives
     elif wall is not None:
-        place, gives = _on_map(*wall.from_m), wall.gives
+        position, gives = _on_map(*wall.from_m), wall.gives
     elif name in teammates and settings.collaboration.passive:
-        place = placed(teammates[name], stamp_ns, settings.collaboration)
+        position = placed(teammates[name], stamp_ns, settings.collaboration)
     else:
         return None
-    if place is None:
+    if position is None:
         return None
     range_m, bearing, sensor = sighting.range_m, sighting.bearing_rad, settings.sensor
     if gives == "bearing" or gives == "none" or (range_m or 0.0) > sensor.max_range_for_range_m:
         range_m = None
     if gives == "range" or gives == "none":
         bearing = None
-    expected = _expected_range(pose, place, wall)
-    range_sigma, bearing_sigma = sighting_sigmas(sighting, sensor, expected)
-    teammate = landmark is None and wall is None
-    return Measured(name, place, wall, teammate, range_m, bearing, range_sigma, bearing_sigma)
+    sigmas = sighting_sigmas(sighting, sensor, _expected_range(pose, position, wall))
+    is_teammate = landmark is None and wall is None
+    return Measurement(name, position, wall, is_teammate, range_m, bearing, *sigmas)
 
 
 @lru_cache(1024)
@@ -113,36 +121,36 @@ def _on_map(x: float, y: float) -> Place:
     return Place(x, y, _EXACT)
 
 
-def _expected_range(pose: Pose2, place: Place, wall: Wall | None) -> float:
-    dx, dy = place.x - pose.x, place.y - pose.y
+def _expected_range(pose: Pose2, position: Place, wall: Wall | None) -> float:
+    dx, dy = position.x - pose.x, position.y - pose.y
     if wall is None:
         return math.hypot(dx, dy)
     direction = wall.direction_rad
     return abs(dy * math.cos(direction) - dx * math.sin(direction))
 
 
-def offers(m: Measured, turn: Scope | None, rules: LocalizerSettings) -> bool:
-    """Whether an object says anything about what is to be updated."""
-    if turn is POSITION:
-        return m.range_m is not None or (rules.bearing_for_position and m.gives_point_bearing)
-    if turn is HEADING:
+def constrains(m: Measurement, scope: Scope | None, rules: LocalizerSettings) -> bool:
+    """Whether an object says anything about the part of the pose that is to be updated."""
+    if scope is POSITION:
+        return m.range_m is not None or (rules.bearing_for_position and m.has_point_bearing)
+    if scope is HEADING:
         return m.bearing is not None
-    return turn is not None and m.usable
+    return scope is not None and m.has_reading
 
 
 def constraints_of(
-    pose: Pose2, m: Measured, turn: Scope, rules: LocalizerSettings
+    pose: Pose2, m: Measurement, scope: Scope, rules: LocalizerSettings
 ) -> list[Constraint]:
     """Step 3: what one object says about position or heading; about both, each reading once."""
-    x, y, _ = m.place
+    x, y, _ = m.position
     range_m, bearing, wall = m.range_m, m.bearing, m.wall
     by_range = by_bearing = None
-    if range_m is not None and turn is not HEADING:
+    if range_m is not None and scope is not HEADING:
         if wall is None:
             by_range = range_circle(pose, x, y, range_m, m.range_sigma)
         else:
             by_range = wall_line(pose, x, y, wall.direction_rad, range_m, m.range_sigma)
-    if bearing is not None and turn is not POSITION:
+    if bearing is not None and scope is not POSITION:
         if wall is None:
             by_bearing = bearing_heading(pose, x, y, bearing, m.bearing_sigma)
         else:
@@ -155,20 +163,20 @@ def constraints_of(
     return found
 
 
-def combined(evidence: Information, accepted: Iterable[Found]) -> Information:
+def combine(evidence: Information, accepted: Iterable[GatedObject]) -> Information:
     """Step 4: the Gaussians at the closest points of all constraints on the map's objects, as one
     with `evidence`."""
     return evidence.with_all(
         (c.row, c.residual, c.sigma * c.sigma)
-        for m, cs, _ in accepted
-        if not m.teammate
-        for c in cs
+        for found in accepted
+        if not found.measurement.is_teammate
+        for c in found.constraints
     )
 
 
-def surprise(prior: Estimate, m: Measured, cs: list[Constraint]) -> float:
+def nis_of(prior: Estimate, m: Measurement, cs: list[Constraint]) -> float:
     """The normalized innovation squared of one object: chi-square, a degree a constraint."""
-    if m.teammate:
+    if m.is_teammate:
         return observation_of(prior, m, cs, prior).normalized_innovation_squared(prior.covariance)
     first, last = cs[0], cs[-1]
     rxx, ryy = first.sigma * first.sigma, last.sigma * last.sigma
@@ -180,18 +188,19 @@ def surprise(prior: Estimate, m: Measured, cs: list[Constraint]) -> float:
 
 
 def observation_of(
-    prior: Estimate, m: Measured, cs: list[Constraint], now: Estimate
+    prior: Estimate, m: Measurement, cs: list[Constraint], now: Estimate
 ) -> Observation:
     """The constraints of one object, about the estimate `now` though linearized at the prior.
 
-    A teammate's pose covariance is compounded with the sensor's (row 39), as the dependent part.
+    A teammate's pose covariance is compounded with the sensor's (checklist row 39), as the
+    dependent part.
     """
     dx, dy = now.pose.x - prior.pose.x, now.pose.y - prior.pose.y
     dh = wrap_angle(now.pose.heading - prior.pose.heading)
     rows = tuple(c.row for c in cs)
     residuals = tuple(c.residual - c.row[0] * dx - c.row[1] * dy - c.row[2] * dh for c in cs)
     sensor = [c.sigma * c.sigma for c in cs]
-    place = m.place.covariance
+    place = m.position.covariance
     (ax, ay), (bx, by) = cs[0].place_row, cs[-1].place_row
     return Observation(
         rows,

@@ -1,25 +1,28 @@
-"""All that a localizer knows at one time. Immutable: a copy is a checkpoint."""
+"""All that a localizer knows at one time. Immutable: a copy is a checkpoint.
+
+A state has the filter's own numbers, the bookkeeping of updates, and one record of memory for each
+of the recovery, the trust in teammates and the self-calibration. Only this file knows the order of
+their fields.
+"""
 
 from collections import Counter
 from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
-import msgspec
-from msgspec.structs import replace
-
-from cpcbl_team.estimate import Estimate
-from cpcbl_team.geometry import Pose2
+from cpcbl_team.estimate import HEADING, POSE, POSITION, Estimate, Scope
+from cpcbl_team.geometry import Pose2, new
 from cpcbl_team.inputs import Belief, Odometry, Sighting
 from cpcbl_team.self_calibration import Anchors, Learned
 from cpcbl_team.trust import Voice
 
-FIX = "fix:"  # marks the source of an active fix, apart from seeing that teammate
+FIX = "fix:"  # marks the source of an active fix, apart from a sighting of that teammate
 _NONE: Mapping[str, Any] = MappingProxyType({})
+_NEVER_NS = -(2**61)
 
 
 class Evidence(NamedTuple):
-    """One thing seen (or told) lately, kept for finding the robot again when it is lost."""
+    """One measurement or report of the last seconds; a lost robot finds itself with it."""
 
     stamp_ns: int
     odometry_from_robot: Pose2  # dead reckoning at that time
@@ -28,20 +31,20 @@ class Evidence(NamedTuple):
     y: float
     range_m: float | None
     bearing_rad: float | None
-    range_sigma_m: float  # for a fix: of (x, y), as far as it is the sensor's
-    bearing_sigma_rad: float  # for a fix: of the heading, as far as it is the sensor's
-    place_sigma_m: float  # of (x, y), as far as it is a teammate's; zero for what is on the map
-    told: bool  # by a teammate
-    heading_rad: float | None = None  # of the robot itself, if a fix told it;
-    place_sigma_rad: float = 0.0  # its sigma, as far as it is a teammate's
+    range_sigma_m: float  # for a fix: the sensor's part of the sigma of (x, y)
+    bearing_sigma_rad: float  # for a fix: the sensor's part of the sigma of the heading
+    teammate_sigma_m: float = 0.0  # a teammate's part of the sigma of (x, y)
+    from_teammate: bool = False
+    heading_rad: float | None = None  # of the robot itself, if a fix has one
+    teammate_sigma_rad: float = 0.0  # a teammate's part of its sigma
 
 
-class Glance(NamedTuple):
-    """Landmarks seen at one time, of which evidence is made when the robot is lost."""
+class LandmarkSnapshot(NamedTuple):
+    """The landmarks of one frame, from which evidence is computed when the robot is lost."""
 
     stamp_ns: int
     odometry_from_robot: Pose2  # dead reckoning at that time
-    pose: Pose2  # as it was believed: ranges err by what they should have been
+    pose: Pose2  # the estimate: the sigma of a range follows the range to be expected
     sightings: tuple[Sighting, ...]
 
 
@@ -52,32 +55,78 @@ class Updates(NamedTuple):
     heading_ns: int | None = None
     heading_is_latest: bool = False
     objects_ns: Mapping[str, int] = _NONE  # last use of each object
-    agreed_ns: int = 0  # last one that was accepted whole
-    innovations: int = 1  # accepted or not; see `recovery.innovated`
+    accepted_ns: int = 0  # last frame or report of which something was accepted
+    innovations: int = 1  # accepted or not; see `recovery.with_innovations`
     accepted: int = 0  # observations since the start
     gated: int = 0
 
 
-class Memory(msgspec.Struct, frozen=True, gc=False):
-    """What few cycles change."""
+def updates_with_frame(
+    updates: Updates,
+    now_ns: int,
+    scope: Scope | None,
+    used: dict[str, int],
+    gated: int,
+    window: int,
+) -> Updates:
+    """After an attempt to update `scope` (None: neither type), with the objects that were used (and
+    when: now), the number of those that were gated, and the new window.
 
-    teammates: Mapping[str, tuple[Belief, ...]] = _NONE
-    glances: tuple[Glance, ...] = ()
-    evidence: tuple[Evidence, ...] = ()  # of all else
-    noted: frozenset[str] = frozenset()  # the sources of which no more is needed yet,
-    noted_until_ns: int = 0  # until then
-    lost: str = ""  # the reason, empty when the robot knows where it is
-    widened_ns: int = 0
-    sought_ns: int = -1  # the newest evidence with which it sought itself in vain
-    events: Mapping[str, int] = _NONE  # number of each other thing that is counted
+    An attempt passes the turn to the other type, an update starts the type's timer.
+    """
+    position_ns, heading_ns, is_latest, objects_ns, accepted_ns, _, accepted, before = updates
+    if used:
+        if scope is POSITION or scope is POSE:
+            position_ns = now_ns
+        if scope is HEADING or scope is POSE:
+            heading_ns = now_ns
+        objects_ns, accepted_ns = {**objects_ns, **used}, now_ns
+    if scope is not None:
+        is_latest = scope is HEADING
+    accepted, gated = accepted + len(used), before + gated
+    last = position_ns, heading_ns, is_latest, objects_ns, accepted_ns, window, accepted, gated
+    return new(Updates, last)
+
+
+class RecoveryMemory(NamedTuple):
+    """Whether the robot is lost, and what it could find itself with."""
+
+    lost: str = ""  # the reason; empty while the robot is not lost
+    inflated_ns: int = 0  # when a lost robot last inflated its covariance
+    relocalization_ns: int = -1  # the newest evidence with which it failed to relocalize
+    snapshots: tuple[LandmarkSnapshot, ...] = ()
+    evidence: tuple[Evidence, ...] = ()  # of all but plain landmarks
+    recorded: frozenset[str] = frozenset()  # sources of which no more evidence is needed yet,
+    recorded_until_ns: int = 0  # until then
+
+
+class TeammateMemory(NamedTuple):
+    """What teammates have sent, and how far each of them is trusted."""
+
+    beliefs: Mapping[str, tuple[Belief, ...]] = _NONE
+    senders: Mapping[str, Voice] = _NONE  # teammates, and the robot's own sensors
+    last_report_ns: int = _NEVER_NS
+
+
+class CalibrationMemory(NamedTuple):
+    """What a self-calibrating robot has learned, and what it compares next."""
+
     learned: Learned = Learned()
     anchors: Anchors | None = None
-    voices: Mapping[str, Voice] = _NONE  # how teammates, and the robot's own eyes, stand
-    turned_rad: float = 0.0  # by the wheels since the start, of a robot that learns
-    told_ns: int = -(2**61)  # when a teammate last said anything
+    total_turn_rad: float = 0.0  # of the odometry since the start
+
+
+class Memory(NamedTuple):
+    """What few cycles change: one record for each part of the localizer that remembers."""
+
+    recovery: RecoveryMemory = RecoveryMemory()
+    teammates: TeammateMemory = TeammateMemory()
+    calibration: CalibrationMemory = CalibrationMemory()
+    events: Mapping[str, int] = _NONE  # number of each thing but updates that is counted
 
     def counted(self, *events: str) -> "Memory":
-        return replace(self, events=Counter(self.events) + Counter(events)) if events else self
+        """The memory in which these have happened once more."""
+        return self._replace(events=Counter(self.events) + Counter(events)) if events else self
 
 
 class State(NamedTuple):
@@ -86,13 +135,57 @@ class State(NamedTuple):
     stamp_ns: int
     estimate: Estimate
     odometry_from_robot: Pose2 = Pose2(0.0, 0.0, 0.0)
-    motion: Odometry | None = None  # the piece of odometry that is being driven
-    odometry_ns: int = 0  # until when odometry is known
-    memory: Memory = Memory()
+    pending_odometry: Odometry | None = None  # the piece that the prediction has not reached yet
+    odometry_until_ns: int = 0  # until when odometry is known
     updates: Updates = Updates()
+    memory: Memory = Memory()
+
+    @property
+    def lost(self) -> str:
+        """Why the robot is lost; empty if it is not."""
+        return self.memory.recovery.lost
 
     @property
     def counts(self) -> Mapping[str, int]:
         """How often each thing has happened that has happened at all."""
         counts = {"accepted": self.updates.accepted, "gated": self.updates.gated}
         return {name: n for name, n in {**counts, **self.memory.events}.items() if n}
+
+    def counted(self, *events: str) -> "State":
+        """The state in which these have happened once more."""
+        return with_memory(self, self.memory.counted(*events)) if events else self
+
+
+# `_replace` would take a fifth of a cycle; so would methods when compiled.
+
+
+def with_odometry(state: State, piece: Odometry, until_ns: int) -> State:
+    """The state with a new pending piece of odometry."""
+    now, estimate, place, _, _, updates, memory = state
+    return new(State, (now, estimate, place, piece, until_ns, updates, memory))
+
+
+def with_motion(
+    state: State, stamp_ns: int, estimate: Estimate, place: Pose2, pending: Odometry | None
+) -> State:
+    """The predicted state; `place` is odometry_from_robot at `stamp_ns`."""
+    _, _, _, _, until_ns, updates, memory = state
+    return new(State, (stamp_ns, estimate, place, pending, until_ns, updates, memory))
+
+
+def with_memory(state: State, memory: Memory) -> State:
+    """The state with this memory."""
+    now, estimate, place, pending, until_ns, updates, _ = state
+    return new(State, (now, estimate, place, pending, until_ns, updates, memory))
+
+
+def with_recovery(state: State, recovery: RecoveryMemory) -> State:
+    """The state with this memory of the recovery."""
+    _, teammates, calibration, events = state.memory
+    return with_memory(state, new(Memory, (recovery, teammates, calibration, events)))
+
+
+def with_correction(state: State, estimate: Estimate, updates: Updates) -> State:
+    """The state with a new estimate and its bookkeeping."""
+    now, _, place, pending, until_ns, _, memory = state
+    return new(State, (now, estimate, place, pending, until_ns, updates, memory))

@@ -21,12 +21,12 @@ _PRUNE = 64
 _content = msgspec.msgpack.Encoder(enc_hook=float).encode  # numpy's numbers too; `repr` is slow
 
 _apply: dict[type, Callable[[Localizer, State, Input], State]] = {
-    Odometry: Localizer.drive,  # type: ignore[dict-item]
-    Belief: Localizer.hear,  # type: ignore[dict-item]
+    Odometry: Localizer.add_odometry,  # type: ignore[dict-item]
+    Belief: Localizer.add_teammate_belief,  # type: ignore[dict-item]
     Sightings: Localizer.cycle,  # type: ignore[dict-item]
-    Position: Localizer.position,  # type: ignore[dict-item]
-    Fix: Localizer.fix,  # type: ignore[dict-item]
-    Told: Localizer.tell,  # type: ignore[dict-item]
+    Position: Localizer.add_position,  # type: ignore[dict-item]
+    Fix: Localizer.add_fix,  # type: ignore[dict-item]
+    Told: Localizer.mark_shared,  # type: ignore[dict-item]
 }
 _rank = {kind: rank for rank, kind in enumerate(_apply)}
 
@@ -82,7 +82,7 @@ class Timeline:
 
         It does not run ahead of odometry, unless that has fallen silent.
         """
-        s, odometry_ns = self._localizer.settings.odometry, self.state.odometry_ns
+        s, odometry_ns = self._localizer.settings.odometry, self.state.odometry_until_ns
         silent = not s.moves or now_ns - odometry_ns > s.timeout_s * 1e9
         return self.at(now_ns if silent else min(now_ns, odometry_ns)) or self.state
 
@@ -92,7 +92,7 @@ class Timeline:
             return None
         after = bisect_right(self._keys, (stamp_ns, len(_rank), "", b""))
         state = self._before[after] if after < len(self._keys) else self.state
-        return self._localizer.moved(state, stamp_ns)
+        return self._localizer.predict(state, stamp_ns)
 
     def _append(self, key: Key, item: Input) -> None:
         self._keys.append(key)

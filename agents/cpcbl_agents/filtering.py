@@ -52,11 +52,11 @@ class FilterAgent:
     @property
     def learned(self) -> Learned | None:
         """What the robot has learned of its odometry and bearings; None where it does not learn."""
-        return self.timeline.state.memory.learned if self._learns else None
+        return self.timeline.state.memory.calibration.learned if self._learns else None
 
     def standings(self, now_ns: int) -> tuple[Standing, ...]:
         """How each teammate that is heard stands with this robot."""
-        return standings(self.timeline.state.memory.voices, now_ns)
+        return standings(self.timeline.state.memory.teammates.senders, now_ns)
 
     def handle(self, message: AgentMessage, now_ns: int) -> Sequence[AgentMessage]:
         match message:
@@ -115,6 +115,6 @@ class FilterAgent:
             seconds = (o.stamp_ns - o.from_ns) * 1e-9
             speed, turn_rate = o.distance_m / seconds, o.turn_rad / seconds
         if frame is not None and self._learns:
-            frame = without_bearing_bias(frame, state.memory.learned.bearing_bias_rad)
+            frame = without_bearing_bias(frame, state.memory.calibration.learned.bearing_bias_rad)
         stamp_ns = state.stamp_ns if frame is None else frame.stamp_ns
-        return Located(stamp_ns, state.estimate, state.memory.lost, speed, turn_rate, frame)
+        return Located(stamp_ns, state.estimate, state.lost, speed, turn_rate, frame)

@@ -7,7 +7,6 @@ import msgspec
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from msgspec.structs import replace
 from support.buses import (
     MS,
     SECOND,
@@ -30,6 +29,7 @@ from cpcbl_team.estimate import ZERO3, Estimate
 from cpcbl_team.information_gain import sigma_limits_m
 from cpcbl_team.inputs import Belief, Fix, Odometry, Position, Sighting, Sightings
 from cpcbl_team.self_calibration import Learned
+from cpcbl_team.state import CalibrationMemory
 from cpcbl_team.timeline import HORIZON_NS
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Publisher
@@ -725,7 +725,8 @@ def test_the_status_of_a_robot_that_learns_says_what() -> None:
     stand = TeamOnBus(with_robot(two_robots(), "me", localizer=learning))
     for robot in stand.robots.values():
         timeline = robot.filter.timeline
-        memory = replace(timeline.state.memory, learned=Learned(0.98, 0.96, 0.01))
+        calibration = CalibrationMemory(Learned(0.98, 0.96, 0.01))
+        memory = timeline.state.memory._replace(calibration=calibration)
         timeline.state = timeline.state._replace(memory=memory)
     assert stand.status("me").learned == (0.98, 0.96, 0.01)
     assert stand.status("mate").learned is None

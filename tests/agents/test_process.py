@@ -193,7 +193,7 @@ def test_a_robot_that_may_have_run_before_knows_neither_its_place_nor_what_it_sp
 ) -> None:
     clock = since(since_s, unix)
     robot = make_robot("me", LIMITED, clock, restarted)
-    assert (not robot.filter.timeline.state.memory.lost) is knows_its_place
+    assert (not robot.filter.timeline.state.lost) is knows_its_place
     now_ns = clock.now_ns()
     assert robot.collaboration.budget.admits(now_ns, 42, urgent=True) is may_send
 

@@ -32,6 +32,7 @@ from cpcbl_team.geometry import Pose2
 from cpcbl_team.geometry import step as stepped
 from cpcbl_team.inputs import Belief, Fix, Odometry, Position, Sighting, Sightings
 from cpcbl_team.self_calibration import Learned
+from cpcbl_team.state import CalibrationMemory
 from cpcbl_transport.messages import Drive, Message
 
 OAK = Sighting("oak", 4.05, 0.02)
@@ -319,7 +320,8 @@ def stood_with_bias(learns: bool) -> Robot:
     subject = robot(with_robot(TEAM, "me", localizer=rules))
     state = subject.filter.timeline.state
     known = Learned(bearing_bias_rad=0.1)
-    subject.filter.timeline.state = state._replace(memory=replace(state.memory, learned=known))
+    memory = state.memory._replace(calibration=CalibrationMemory(known))
+    subject.filter.timeline.state = state._replace(memory=memory)
     for piece in pieces(0.5, 0.0, 0.0):
         subject.handle(piece, piece.stamp_ns)
         subject.handle(Tick(), piece.stamp_ns)

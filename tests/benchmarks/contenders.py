@@ -43,7 +43,7 @@ def _ours(rules: LocalizerSettings) -> Contender:
 
     def cycle(state: State, reading: Any) -> State:
         odometry, frame = reading
-        return robot.cycle(robot.drive(state, odometry), frame)
+        return robot.cycle(robot.add_odometry(state, odometry), frame)
 
     def pose(state: State) -> Pose2:
         return state.estimate.pose

@@ -38,4 +38,4 @@ def test_its_state_is_that_of_the_interpreted_one(name: str) -> None:
     covariance = interpreted.estimate.covariance
     assert compiled.estimate.covariance == pytest.approx(covariance, rel=1e-12, abs=1e-15)
     assert compiled.updates == interpreted.updates
-    assert len(compiled.memory.evidence) == len(interpreted.memory.evidence)
+    assert len(compiled.memory.recovery.evidence) == len(interpreted.memory.recovery.evidence)

@@ -56,7 +56,7 @@ def test_every_update_of_the_localizer_really_happens(name: str) -> None:
     contender = OURS[name]
     state = contender.run(map(contender.reading, DRIVE))
     assert dict(state.counts) == {"accepted": 4 * CYCLES}
-    assert not state.memory.lost
+    assert not state.lost
 
 
 def test_every_update_of_the_gated_peer_really_happens() -> None:

@@ -101,11 +101,11 @@ def test_what_is_shared_is_a_part_of_the_covariance(
     variant: Variant, told: bool, variance: float
 ) -> None:
     robot, state = localizer(variant, odometry=STILL), state_at(ORIGIN, diagonal(0.05, 0.066))
-    state = robot.tell(state, Told(1)) if told else state
+    state = robot.mark_shared(state, Told(1)) if told else state
     sharp = variance, 0.0, variance
     for stamp_ns in range(2, 7):
         fix = Fix("me", "mate", stamp_ns, 0.01, -0.01, sharp, sharp, 0.0, 1e-4, 1e-4)
-        state = robot.fix(state, fix)
+        state = robot.add_fix(state, fix)
         whole, shared = (matrix3(c) for c in (state.estimate.covariance, state.estimate.shared))
         assert_sound(state)
         for part in (shared, whole - shared):
@@ -119,7 +119,7 @@ def test_a_position_whose_rounded_correlation_is_one_does_not_pass_the_gate(
 ) -> None:
     robot, before = localizer(odometry=STILL), state_at(ORIGIN, diagonal(0.05, 0.05))
     seen = Position(1, 50.0, -50.0, (variance, variance * (1.0 + beyond), variance))
-    after = robot.position(before, seen)
+    after = robot.add_position(before, seen)
     assert after.counts == {"gated": 1}
     assert after.estimate == before.estimate
 
@@ -133,11 +133,11 @@ def test_sharp_bearings_among_loose_positions_find_no_pose() -> None:
         x, y = rng.uniform(-4.0, 4.0), rng.uniform(-2.0, 2.0)
         state = robot.start(0)
         for stamp_ns in (1, SECOND + 1):
-            state = robot.position(state, placed_at(x, y, stamp_ns, 10.0))
+            state = robot.add_position(state, placed_at(x, y, stamp_ns, 10.0))
             bearing = Sighting("ne", None, rng.uniform(-3.0, 3.0))
             state = robot.cycle(state, Sightings(stamp_ns + 1, (bearing,)))
             assert_sound(state)
-            assert state.memory.lost
+            assert state.lost
 
 
 def test_evidence_that_drowns_in_rounding_changes_nothing() -> None:

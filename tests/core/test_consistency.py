@@ -74,10 +74,10 @@ def samples(robot: Localizer, perceive: Perceive, seed: int) -> tuple[Matrix, Ma
         turn = steered(truth, planned)
         noise = motion_noise(truth.heading, distance, turn, ODOMETRY)
         truth = displaced(step(truth, distance, turn), noise, rng)
-        state = robot.drive(state, Odometry(now, now + PIECE_NS, distance, turn))
+        state = robot.add_odometry(state, Odometry(now, now + PIECE_NS, distance, turn))
         now += PIECE_NS
         seen = look(truth, now)
-        state = robot.fix(state, seen) if isinstance(seen, Fix) else robot.cycle(state, seen)
+        state = robot.add_fix(state, seen) if isinstance(seen, Fix) else robot.cycle(state, seen)
         rows.append((state.estimate.pose, truth, state.estimate.covariance))
     estimates, truths, covariances = zip(*rows, strict=True)
     return np.array(estimates), np.array(truths), np.array(covariances)

@@ -45,8 +45,8 @@ from cpcbl_team.geometry import Pose2, step, wrap_angle
 from cpcbl_team.inputs import Fix, Odometry, Sighting, Told
 from cpcbl_team.localizer import Localizer
 from cpcbl_team.motion import motion_noise
-from cpcbl_team.state import State
-from cpcbl_team.whereabouts import by_fix, by_sensor
+from cpcbl_team.pose_observation import from_fix, from_position_sensor
+from cpcbl_team.state import State, TeammateMemory
 
 ORIGIN = Pose2(0.0, 0.0, 0.0)
 STILL = OdometrySettings(moves=False)
@@ -67,10 +67,10 @@ def test_a_heading_is_merged_as_a_scalar(variant: Variant) -> None:
     robot = localizer(variant, odometry=STILL, collaboration=naive)
     before = state_at(ORIGIN, diagonal(0.3, 0.2))
     told = fix(0.0, 0.0, 1, heading=0.3, sensor_rad=0.08, observer_rad=0.06)
-    after = robot.fix(before, told)
+    after = robot.add_fix(before, told)
     assert after.estimate.pose.heading == pytest.approx(0.24, rel=1e-3)
     assert after.estimate.heading_sigma_rad == pytest.approx(0.2 / math.sqrt(5.0), rel=1e-3)
-    plain = robot.fix(before, without_heading(told))
+    plain = robot.add_fix(before, without_heading(told))
     assert after.estimate.pose[:2] == pytest.approx(plain.estimate.pose[:2])
     assert after.estimate.position_sigma_m == pytest.approx(plain.estimate.position_sigma_m)
     assert after.counts == {"accepted": 1}
@@ -78,7 +78,7 @@ def test_a_heading_is_merged_as_a_scalar(variant: Variant) -> None:
 
 def test_the_weighted_variant_moves_by_its_static_weight() -> None:
     robot, before = localizer("weighted", odometry=STILL), state_at(ORIGIN, diagonal(0.3, 0.2))
-    after = robot.fix(before, fix(0.1, 0.0, 1, heading=0.2)).estimate
+    after = robot.add_fix(before, fix(0.1, 0.0, 1, heading=0.2)).estimate
     assert after.pose.heading == pytest.approx(0.2 * robot.settings.localizer.weights.heading)
     assert after.pose.x == pytest.approx(0.1 * robot.settings.localizer.weights.position)
 
@@ -87,15 +87,15 @@ def test_the_weighted_variant_moves_by_its_static_weight() -> None:
 def test_a_heading_is_told_the_short_way_round(own: float, told: float) -> None:
     robot = localizer("joint", odometry=STILL)
     before = state_at(Pose2(0.0, 0.0, own), diagonal(0.3, 2.0))
-    after = robot.fix(before, fix(0.0, 0.0, 1, heading=told, **SURE)).estimate
+    after = robot.add_fix(before, fix(0.0, 0.0, 1, heading=told, **SURE)).estimate
     assert abs(after.pose.heading) <= math.pi
     assert heading_error(after, Pose2(0.0, 0.0, told)) < 1e-3
 
 
 @given(angles, angles, st.floats(1.0, 10.0))
 def test_only_the_sensors_part_is_doubted(own: float, told: float, factor: float) -> None:
-    said = by_fix(fix(0.0, 0.0, heading=told, sensor_rad=0.1, observer_rad=0.2))
-    once, more = (s.of_heading(Pose2(1.0, 2.0, own)) for s in (said, said.doubted(factor)))
+    said = from_fix(fix(0.0, 0.0, heading=told, sensor_rad=0.1, observer_rad=0.2))
+    once, more = (s.of_heading(Pose2(1.0, 2.0, own)) for s in (said, said.inflated(factor)))
     assert once is not None
     assert more is not None
     assert math.remainder(once.residuals[0] + own - told, math.tau) == pytest.approx(0.0, abs=1e-9)
@@ -109,7 +109,9 @@ def test_in_the_joint_variant_a_heading_moves_the_position_through_the_cross_cov
     leaning = Covariance3(0.04, 0.0, 0.04, 0.0, 0.03, 0.04)
     robot = localizer("joint", odometry=STILL)
     vague = {"sensor_m": 50.0, "observer_m": 50.0, "sensor_rad": 0.001, "observer_rad": 0.0}
-    after = robot.fix(state_at(ORIGIN, leaning), fix(0.0, 0.0, 1, heading=0.1, **vague)).estimate
+    after = robot.add_fix(
+        state_at(ORIGIN, leaning), fix(0.0, 0.0, 1, heading=0.1, **vague)
+    ).estimate
     assert after.pose.y == pytest.approx(0.1 * 0.03 / 0.04, rel=0.01)
 
 
@@ -118,7 +120,7 @@ def test_elsewhere_it_leaves_the_position_alone(variant: Variant) -> None:
     robot = localizer(variant, odometry=STILL)
     before = state_at(ORIGIN, Covariance3(0.04, 0.0, 0.04, 0.0, 0.03, 0.04))
     told = fix(0.1, 0.2, 1, heading=0.1)
-    after, plain = (robot.fix(before, f).estimate for f in (told, without_heading(told)))
+    after, plain = (robot.add_fix(before, f).estimate for f in (told, without_heading(told)))
     assert after.pose[:2] == plain.pose[:2]
     assert after.pose.heading != plain.pose.heading == 0.0
 
@@ -126,16 +128,16 @@ def test_elsewhere_it_leaves_the_position_alone(variant: Variant) -> None:
 def test_a_heading_told_back_is_not_new() -> None:
     """What the robot itself told others (resolution c)."""
     robot = localizer("joint", odometry=STILL)
-    state = robot.tell(state_at(ORIGIN, diagonal(0.2, 0.1)), Told(0))
+    state = robot.mark_shared(state_at(ORIGIN, diagonal(0.2, 0.1)), Told(0))
     for i in range(1, 50):
         same = {"sensor_m": 0.01, "observer_m": 0.2, "sensor_rad": 0.001, "observer_rad": 0.1}
-        state = robot.fix(state, fix(0.0, 0.0, i, heading=0.0, **same))
+        state = robot.add_fix(state, fix(0.0, 0.0, i, heading=0.0, **same))
     assert state.estimate.heading_sigma_rad > 0.99 * 0.1
 
 
 def test_a_fix_without_one_and_a_position_sensor_tell_no_heading() -> None:
-    assert by_fix(fix(1.0, 2.0)).of_heading(ORIGIN) is None
-    assert by_sensor(placed_at(1.0, 2.0)).of_heading(ORIGIN) is None
+    assert from_fix(fix(1.0, 2.0)).of_heading(ORIGIN) is None
+    assert from_position_sensor(placed_at(1.0, 2.0)).of_heading(ORIGIN) is None
 
 
 # The gate -----------------------------------------------------------------------------------------
@@ -145,7 +147,7 @@ def test_a_fix_without_one_and_a_position_sensor_tell_no_heading() -> None:
 def test_a_heading_far_off_is_refused_and_counted_but_not_the_position(variant: Variant) -> None:
     robot, before = localizer(variant, odometry=STILL), state_at(ORIGIN, diagonal(0.1, 0.05))
     told = fix(0.05, 0.0, 1, heading=1.5)
-    after, plain = (robot.fix(before, f) for f in (told, without_heading(told)))
+    after, plain = (robot.add_fix(before, f) for f in (told, without_heading(told)))
     assert after.estimate == plain.estimate
     assert after.counts == {"gated": 1, "heading_gated": 1}
     assert after.updates.innovations == 0b10  # one, rejected
@@ -167,7 +169,7 @@ def test_a_position_whose_heading_is_refused_has_been_used(
     askew = plain = state_at(ORIGIN, diagonal(0.3, 0.05))
     for i in range(1, 6):
         told = fix(0.2, 0.0, i * SECOND // 100, sensor_m=0.1, observer_m=0.0, heading=1.5)
-        askew, plain = robot.fix(askew, told), robot.fix(plain, without_heading(told))
+        askew, plain = robot.add_fix(askew, told), robot.add_fix(plain, without_heading(told))
     found, due = (state.estimate.position_sigma_m for state in (askew, plain))
     assert found == pytest.approx(due, rel=1e-3)
     assert askew.counts["heading_gated"] >= 1
@@ -176,7 +178,7 @@ def test_a_position_whose_heading_is_refused_has_been_used(
 @variants
 def test_with_a_position_that_is_refused_the_heading_is_too(variant: Variant) -> None:
     robot, before = localizer(variant, odometry=STILL), state_at(ORIGIN, diagonal(0.1, 0.05))
-    after = robot.fix(before, fix(3.0, 0.0, 1, heading=0.05))
+    after = robot.add_fix(before, fix(3.0, 0.0, 1, heading=0.05))
     assert after.estimate == before.estimate
     assert after.counts == {"gated": 1}
 
@@ -186,9 +188,9 @@ def test_a_robot_that_stands_and_looks_elsewhere_than_it_thinks_finds_out(varian
     """Its place is confirmed by each fix, its heading denied."""
     robot, state = localizer(variant, odometry=STILL), state_at(ORIGIN, diagonal(0.02, 0.02))
     for i in range(1, 25):
-        state = robot.fix(state, fix(0.0, 0.0, i * SECOND // 2, heading=1.5))
+        state = robot.add_fix(state, fix(0.0, 0.0, i * SECOND // 2, heading=1.5))
     assert state.counts["lost"] == 1
-    assert state.memory.lost == ""
+    assert state.lost == ""
     assert heading_error(state.estimate, Pose2(0.0, 0.0, 1.5)) < 0.1
 
 
@@ -200,11 +202,11 @@ def test_without_noise_there_is_no_error(variant: Variant) -> None:
     robot = localizer(variant, Field(), start=UNKNOWN)
     state, errors = robot.start(0), []
     for odometry, truth in driven(LOOP_START, loop()[:200]):
-        state = robot.drive(state, odometry)
+        state = robot.add_odometry(state, odometry)
         told = fix(truth.x, truth.y, odometry.stamp_ns, heading=truth.heading, **SURE)
-        state = robot.fix(state, told)
+        state = robot.add_fix(state, told)
         errors.append((position_error(state.estimate, truth), heading_error(state.estimate, truth)))
-    assert state.memory.lost == ""
+    assert state.lost == ""
     assert set(state.counts) <= {"accepted", "found_again"}
     assert np.max(errors[20:]) < 1e-4
 
@@ -273,7 +275,7 @@ def blind(robot: Localizer, seed: int, headed: bool, off_m: float, off_deg: floa
         truth = drawn(step(truth, distance, turn), noise, rng)
         state, now = _driven_on(robot, state, i, distance, turn)
         if i % 5 == 0:
-            state = robot.fix(state, observer.sees(truth, now, headed))
+            state = robot.add_fix(state, observer.sees(truth, now, headed))
             x, y, h = state.estimate.pose
             errors.append((x - truth.x, y - truth.y, wrap_angle(h - truth.heading)))
             covariances.append(matrix3(state.estimate.covariance))
@@ -285,7 +287,7 @@ def _driven_on(
 ) -> tuple[State, int]:
     period = SECOND // 10
     now = (piece + 1) * period
-    return robot.drive(state, Odometry(now - period, now, distance, turn)), now
+    return robot.add_odometry(state, Odometry(now - period, now, distance, turn)), now
 
 
 @cache
@@ -340,13 +342,13 @@ def test_a_lost_robot_that_stands_is_found_by_what_it_is_told(variant: Variant) 
     told = [fix(1.0, 2.0, i * SECOND // 2, heading=-2.5) for i in range(1, 9)]
     state = blank = robot.start(0)
     for seen in told[:2]:
-        state, blank = robot.fix(state, seen), robot.fix(blank, without_heading(seen))
-    assert state.memory.lost == ""
+        state, blank = robot.add_fix(state, seen), robot.add_fix(blank, without_heading(seen))
+    assert state.lost == ""
     assert position_error(state.estimate, truth) < 0.1
     assert heading_error(state.estimate, truth) < 0.1
     for seen in told[2:]:
-        blank = robot.fix(blank, without_heading(seen))
-    assert blank.memory.lost.startswith("heading sigma")
+        blank = robot.add_fix(blank, without_heading(seen))
+    assert blank.lost.startswith("heading sigma")
 
 
 @pytest.mark.parametrize("variant", ["oval", "circular"])
@@ -357,10 +359,10 @@ def test_a_lost_robot_that_drives_is_found_at_the_first_fix(variant: Variant) ->
     for headed in (True, False):
         state = robot.start(0)
         for odometry, truth in driven(LOOP_START, loop()[:60]):
-            state = robot.drive(state, odometry)
+            state = robot.add_odometry(state, odometry)
             told = fix(truth.x, truth.y, odometry.stamp_ns, heading=truth.heading)
-            state = robot.fix(state, told if headed else without_heading(told))
-            if not state.memory.lost:
+            state = robot.add_fix(state, told if headed else without_heading(told))
+            if not state.lost:
                 found.setdefault(headed, odometry.stamp_ns)
                 assert not headed or heading_error(state.estimate, truth) < 0.3
     assert found[True] == SECOND // 10
@@ -370,11 +372,11 @@ def test_a_lost_robot_that_drives_is_found_at_the_first_fix(variant: Variant) ->
 def test_who_is_in_quarantine_finds_nobody() -> None:
     robot = localizer("joint", Field(), start=UNKNOWN, odometry=STILL)
     state = robot.start(0)
-    state = robot.fix(state, fix(1.0, 2.0, 1, heading=0.5))
-    voice = replace(state.memory.voices["mate"], reason="biased")
-    lost = replace(robot.start(0).memory, voices={"mate": voice})
+    state = robot.add_fix(state, fix(1.0, 2.0, 1, heading=0.5))
+    voice = replace(state.memory.teammates.senders["mate"], reason="biased")
+    lost = robot.start(0).memory._replace(teammates=TeammateMemory(senders={"mate": voice}))
     state = robot.start(0)._replace(memory=lost)
     for i in range(1, 5):
-        state = robot.fix(state, fix(1.0, 2.0, i * SECOND, heading=0.5))
-    assert state.memory.lost != ""
-    assert state.memory.evidence == ()
+        state = robot.add_fix(state, fix(1.0, 2.0, i * SECOND, heading=0.5))
+    assert state.lost != ""
+    assert state.memory.recovery.evidence == ()

@@ -31,7 +31,7 @@ from cpcbl_team.estimate import POSE, Estimate, Information, Scope, circular, me
 from cpcbl_team.geometry import Pose2, wrap_angle
 from cpcbl_team.inputs import Sighting, Sightings
 from cpcbl_team.localizer import Localizer
-from cpcbl_team.measurements import Measured, constraints_of, measured, offers, surprise
+from cpcbl_team.measurements import Measurement, constrains, constraints_of, measurement_of, nis_of
 from cpcbl_team.sensors import sighting_fault
 from cpcbl_team.state import State, Updates
 
@@ -92,14 +92,14 @@ def since(last_ns: int | None, seconds: float) -> bool:
     return last_ns is None or NOW - last_ns >= seconds * 1e9
 
 
-def turn_of(robot: Localizer, updates: Updates, seen: Sequence[Measured]) -> Scope | None:
+def turn_of(robot: Localizer, updates: Updates, seen: Sequence[Measurement]) -> Scope | None:
     """The type that waits longer, of those that have anything; None: neither."""
     r = robot.settings.localizer
     last_ns = {Scope.POSITION: updates.position_ns, Scope.HEADING: updates.heading_ns}
     ready = [
         turn
         for turn in (Scope.POSITION, Scope.HEADING)
-        if since(last_ns[turn], r.minimum_interval_s) and any(offers(m, turn, r) for m in seen)
+        if since(last_ns[turn], r.minimum_interval_s) and any(constrains(m, turn, r) for m in seen)
     ]
     if not r.alternates:
         return POSE if ready else None
@@ -112,13 +112,13 @@ def composed(robot: Localizer, state: State, frame: Sightings) -> tuple[Estimate
     """One cycle among landmarks without motion, and its counts, formula by formula."""
     r, prior, updates = robot.settings.localizer, state.estimate, state.updates
     good = [s for s in frame.sightings if not sighting_fault(s)]
-    found = (measured(s, NOW, prior.pose, robot.field, {}, robot.settings) for s in good)
+    found = (measurement_of(s, NOW, prior.pose, robot.field, {}, robot.settings) for s in good)
     seen = [m for m in found if m and since(updates.objects_ns.get(m.source), r.object_interval_s)]
     tau_s = robot.settings.sensor.correlation_s
     if tau_s:
         rho = math.exp(-0.1 / tau_s)
         seen = [
-            m.doubted((1 + rho) / (1 - rho)) if m.source in updates.objects_ns else m for m in seen
+            m.inflated((1 + rho) / (1 - rho)) if m.source in updates.objects_ns else m for m in seen
         ]
     counts = {"accepted": 0, "gated": 0}
     turn, evidence = turn_of(robot, updates, seen), Information.none()
@@ -128,7 +128,7 @@ def composed(robot: Localizer, state: State, frame: Sightings) -> tuple[Estimate
         bound = -2.0 * math.log(1.0 - r.gate_probability)
         if len(cs) == 1:
             bound = robot._gates[0]
-        if cs and surprise(prior, m, cs) > bound:
+        if cs and nis_of(prior, m, cs) > bound:
             counts["gated"] += 1
         elif cs:
             counts["accepted"] += 1
@@ -187,12 +187,12 @@ def test_new_evidence_is_that_of_a_measurement(variant: Variant, given: Gives) -
     robot = localizer(variant, field)
     seen = Sighting("post", 5.0, 0.3)  # farther than it can be
     state = state_at(LOOP_START, covariance3(0.1 * np.eye(3)), NOW)
-    (piece,) = robot.evidence(robot.cycle(state, Sightings(NOW, (seen,))).memory)
-    m = measured(seen, NOW, LOOP_START, field, {}, robot.settings)
+    (piece,) = robot.evidence(robot.cycle(state, Sightings(NOW, (seen,))).memory.recovery)
+    m = measurement_of(seen, NOW, LOOP_START, field, {}, robot.settings)
     assert m is not None
     assert (piece.source, piece.x, piece.y) == ("post", 1.0, 2.0)
     assert (piece.range_m, piece.bearing_rad) == (m.range_m, m.bearing)
-    assert not piece.told
+    assert not piece.from_teammate
     if m.range_m is not None:
         assert piece.range_sigma_m == pytest.approx(m.range_sigma, rel=1e-12)
     assert piece.bearing_sigma_rad == pytest.approx(m.bearing_sigma, rel=1e-12)
@@ -200,7 +200,7 @@ def test_new_evidence_is_that_of_a_measurement(variant: Variant, given: Gives) -
 
 def test_a_plain_landmark_is_not_measured_the_general_way(monkeypatch: pytest.MonkeyPatch) -> None:
     """Or else the test above would compare the general way with itself."""
-    monkeypatch.setattr("cpcbl_team.localizer.measured", lambda *_: pytest.fail("general"))
+    monkeypatch.setattr("cpcbl_team.localizer.measurement_of", lambda *_: pytest.fail("general"))
     for variant in PROBABILISTIC:
         state = state_at(LOOP_START, covariance3(0.1 * np.eye(3)), NOW)
         robot = localizer(variant)

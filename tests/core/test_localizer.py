@@ -176,11 +176,11 @@ def looked(robot: Localizer, state: State, stamp_ns: int) -> State:
 
 
 def was_told(robot: Localizer, state: State, stamp_ns: int) -> State:
-    return robot.fix(state, fix(HERE.x, HERE.y, stamp_ns))
+    return robot.add_fix(state, fix(HERE.x, HERE.y, stamp_ns))
 
 
 def was_placed(robot: Localizer, state: State, stamp_ns: int) -> State:
-    return robot.position(state, placed_at(HERE.x, HERE.y, stamp_ns))
+    return robot.add_position(state, placed_at(HERE.x, HERE.y, stamp_ns))
 
 
 sources = pytest.mark.parametrize("hear_of", [looked, was_told, was_placed])
@@ -254,7 +254,7 @@ def test_another_object_counts_in_full_at_any_time() -> None:
 def test_the_order_of_sightings_does_not_matter(variant: Variant) -> None:
     """All constraints come from the same prior (row 7)."""
     robot = standing(variant, MIXED)
-    prior = robot.hear(state_at(ORIGIN, diagonal(0.3, 0.2)), belief(1.0, -1.0))
+    prior = robot.add_teammate_belief(state_at(ORIGIN, diagonal(0.3, 0.2)), belief(1.0, -1.0))
     true = Pose2(0.2, -0.1, 0.1)
     mate = point_sighting(true, "mate", 1.0, -1.0)
     ends = set()
@@ -415,8 +415,8 @@ def test_the_papers_uncertainty_leaves_out_the_headings_share() -> None:
 @pytest.mark.parametrize("variant", ["oval", "circular"])
 def test_in_the_papers_uncertainty_heading_and_position_stay_apart(variant: Variant) -> None:
     robot = localizer(rules=LocalizerSettings(variant=variant, paper_uncertainty=True))
-    state = robot.drive(state_at(ORIGIN, diagonal(0.1, 0.1)), Odometry(0, TENTH, 0.1, 0.1))
-    covariance = robot.moved(state, TENTH).estimate.covariance
+    state = robot.add_odometry(state_at(ORIGIN, diagonal(0.1, 0.1)), Odometry(0, TENTH, 0.1, 0.1))
+    covariance = robot.predict(state, TENTH).estimate.covariance
     assert (covariance.xh, covariance.yh) == (0.0, 0.0)
 
 
@@ -430,7 +430,9 @@ def test_a_teammates_uncertainty_is_compounded_before_the_constraint(
 ) -> None:
     """Row 39: of a teammate that hardly knows its place, neither part of the pose is learnt."""
     robot = standing(variant, paper_uncertainty=paper)
-    state = robot.hear(state_at(ORIGIN, diagonal(0.3, 0.2)), belief(2.0, 0.5, sigma_m=30.0))
+    state = robot.add_teammate_belief(
+        state_at(ORIGIN, diagonal(0.3, 0.2)), belief(2.0, 0.5, sigma_m=30.0)
+    )
     for i in (1, 2):
         seen = point_sighting(Pose2(0.1, 0.05, 0.05), "mate", 2.0, 0.5)
         state = robot.cycle(state, Sightings(i, (seen,)))
@@ -444,7 +446,9 @@ def test_a_teammate_with_a_known_place_is_one_more_landmark(variant: Variant) ->
     post = Field(landmarks={"mate": Landmark(x_m=2.0, y_m=0.5)})
     ends = []
     for robot in (standing(variant, post), standing(variant, Field())):
-        state = robot.hear(state_at(ORIGIN, diagonal(0.3, 0.2)), belief(2.0, 0.5, sigma_m=1e-6))
+        state = robot.add_teammate_belief(
+            state_at(ORIGIN, diagonal(0.3, 0.2)), belief(2.0, 0.5, sigma_m=1e-6)
+        )
         for i in (1, 2):
             seen = point_sighting(Pose2(0.1, 0.05, 0.05), "mate", 2.0, 0.5)
             state = robot.cycle(state, Sightings(i, (seen,)))
@@ -456,7 +460,9 @@ def test_a_teammate_with_a_known_place_is_one_more_landmark(variant: Variant) ->
 @probabilistic
 def test_a_teammates_range_is_as_wide_as_sensor_and_place_together(variant: Variant) -> None:
     robot = standing(variant)
-    state = robot.hear(state_at(ORIGIN, diagonal(100.0, 0.1)), belief(3.0, 0.0, sigma_m=0.4))
+    state = robot.add_teammate_belief(
+        state_at(ORIGIN, diagonal(100.0, 0.1)), belief(3.0, 0.0, sigma_m=0.4)
+    )
     seen = Sightings(1, (Sighting("mate", 3.0, None, 0.3),))
     covariance = robot.cycle(state, seen).estimate.covariance
     if variant == "circular":
@@ -468,7 +474,7 @@ def test_a_teammates_range_is_as_wide_as_sensor_and_place_together(variant: Vari
 @variants
 def test_a_fix_moves_the_position(variant: Variant) -> None:
     robot = standing(variant)
-    state = robot.fix(state_at(ORIGIN, diagonal(0.3, 0.2)), fix(0.2, -0.1, 1))
+    state = robot.add_fix(state_at(ORIGIN, diagonal(0.3, 0.2)), fix(0.2, -0.1, 1))
     pose = state.estimate.pose
     assert 0.0 < pose.x <= 0.2
     assert pose.y == pytest.approx(-0.5 * pose.x)
@@ -481,14 +487,14 @@ LEANING = Covariance3(0.04, 0.0, 0.09, 0.0, 0.02, 0.01)
 @separated
 def test_a_fix_leaves_the_heading_alone(variant: Variant) -> None:
     before = state_at(ORIGIN, LEANING)
-    after = standing(variant).fix(before, fix(0.1, 0.2, 1))  # row 27
+    after = standing(variant).add_fix(before, fix(0.1, 0.2, 1))  # row 27
     assert moved_parts(before, after) == "position"
     assert after.estimate.covariance.hh == LEANING.hh
 
 
 def test_in_the_joint_variant_a_fix_moves_the_heading_through_the_cross_covariance() -> None:
     before = state_at(ORIGIN, LEANING)
-    after = standing("joint").fix(before, fix(0.1, 0.2, 1)).estimate
+    after = standing("joint").add_fix(before, fix(0.1, 0.2, 1)).estimate
     moved = after.pose.y / LEANING.yy * LEANING.yh
     assert after.pose.heading == pytest.approx(moved)
     assert after.covariance.hh < LEANING.hh
@@ -498,8 +504,8 @@ def test_in_the_joint_variant_a_fix_moves_the_heading_through_the_cross_covarian
 def test_a_position_sensor_places_the_robot_and_nothing_of_it_is_shared(variant: Variant) -> None:
     """Row 28: like a fix, but nobody else's error is in it."""
     robot, before = standing(variant), state_at(ORIGIN, diagonal(0.3, 0.2))
-    after = robot.position(before, placed_at(0.2, -0.1, 1, sigma_m=0.1))
-    exact = robot.fix(before, fix(0.2, -0.1, 1, sensor_m=0.1, observer_m=0.0))
+    after = robot.add_position(before, placed_at(0.2, -0.1, 1, sigma_m=0.1))
+    exact = robot.add_fix(before, fix(0.2, -0.1, 1, sensor_m=0.1, observer_m=0.0))
     assert moved_parts(before, after) == "position"
     assert after.estimate.pose == pytest.approx(exact.estimate.pose)
     assert after.estimate.shared == ZERO3
@@ -509,7 +515,7 @@ def test_a_position_sensor_places_the_robot_and_nothing_of_it_is_shared(variant:
 @variants
 def test_a_position_far_off_is_rejected_and_counted(variant: Variant) -> None:
     before = state_at(ORIGIN, diagonal(0.1, 0.05))
-    after = standing(variant).position(before, placed_at(3.0, 0.0, 1))
+    after = standing(variant).add_position(before, placed_at(3.0, 0.0, 1))
     assert after.estimate == before.estimate
     assert after.counts == {"gated": 1}
 
@@ -517,14 +523,14 @@ def test_a_position_far_off_is_rejected_and_counted(variant: Variant) -> None:
 @separated
 def test_a_position_sensor_leaves_the_heading_alone(variant: Variant) -> None:
     before = state_at(ORIGIN, LEANING)
-    assert moved_parts(before, standing(variant).position(before, placed_at(0.1, 0.2, 1))) == (
+    assert moved_parts(before, standing(variant).add_position(before, placed_at(0.1, 0.2, 1))) == (
         "position"
     )
 
 
 def test_a_fix_is_no_update_of_a_type() -> None:
     robot = standing("oval", minimum_interval_s=1.0)
-    state = robot.fix(state_at(ORIGIN, diagonal(0.3, 0.2)), fix(0.1, 0.1, 1))
+    state = robot.add_fix(state_at(ORIGIN, diagonal(0.3, 0.2)), fix(0.1, 0.1, 1))
     updates = state.updates
     assert (updates.position_ns, updates.heading_ns) == (None, None)
     assert updates.objects_ns == {"fix:mate": 1}
@@ -533,9 +539,9 @@ def test_a_fix_is_no_update_of_a_type() -> None:
 def test_what_a_told_robot_hears_back_is_not_new() -> None:
     """Its own belief, returned by a teammate, must not make it more certain (resolution c)."""
     robot = standing("joint")
-    state = robot.tell(state_at(ORIGIN, diagonal(0.2, 0.1)), Told(0))
+    state = robot.mark_shared(state_at(ORIGIN, diagonal(0.2, 0.1)), Told(0))
     for i in range(1, 50):
-        state = robot.fix(state, fix(0.0, 0.0, i, sensor_m=0.01, observer_m=0.2))
+        state = robot.add_fix(state, fix(0.0, 0.0, i, sensor_m=0.01, observer_m=0.2))
     assert state.estimate.position_sigma_m > 0.99 * 0.2
 
 
@@ -544,10 +550,10 @@ def test_what_says_nothing_new_costs_nothing(variant: Variant) -> None:
     """Merged it would widen what it says nothing of: here the heading, by 2 % of its variance each
     time."""
     robot = standing(variant)
-    before = robot.tell(state_at(ORIGIN, diagonal(0.2, 0.1)), Told(0))
+    before = robot.mark_shared(state_at(ORIGIN, diagonal(0.2, 0.1)), Told(0))
     state = before
     for i in range(1, 50):
-        state = robot.fix(state, fix(0.0, 0.0, i, observer_m=0.5))
+        state = robot.add_fix(state, fix(0.0, 0.0, i, observer_m=0.5))
     assert state.estimate == before.estimate
 
 
@@ -555,8 +561,8 @@ def test_what_says_nothing_new_costs_nothing(variant: Variant) -> None:
 def test_a_fix_does_not_cost_the_heading(variant: Variant) -> None:
     """The weight that is best for the position alone gives up what is known of the heading."""
     robot = localizer(variant)
-    state = robot.tell(state_at(ORIGIN, diagonal(0.5, 0.05)), Told(0))
-    state = robot.fix(state, fix(0.1, 0.1, 1))
+    state = robot.mark_shared(state_at(ORIGIN, diagonal(0.5, 0.05)), Told(0))
+    state = robot.add_fix(state, fix(0.1, 0.1, 1))
     assert state.estimate.position_sigma_m < 0.1
     assert state.estimate.heading_sigma_rad < 2.0 * 0.05
 
@@ -569,17 +575,17 @@ def test_what_is_shared_stays_a_part_of_the_covariance(variant: Variant, paper: 
     noise, state = sensor_noise(rng, SensorSettings()), state_at(LOOP_START, diagonal(0.05, 0.05))
     for odometry, truth in driven(LOOP_START, loop()):
         now = odometry.stamp_ns
-        state = robot.moved(robot.drive(state, odometry), now)
+        state = robot.predict(robot.add_odometry(state, odometry), now)
         match rng.integers(4):
             case 0:
-                state = robot.tell(state, Told(now))
+                state = robot.mark_shared(state, Told(now))
             case 1:
                 x, y = (truth.x, truth.y) + 0.05 * rng.normal(size=2)
-                state = robot.fix(state, fix(x, y, now))
+                state = robot.add_fix(state, fix(x, y, now))
             case 2:
                 state = robot.cycle(state, frame(truth, now, noise=noise))
             case _:
-                state = robot.hear(state, belief(1.0, 0.0, now))
+                state = robot.add_teammate_belief(state, belief(1.0, 0.0, now))
                 mate = noise(point_sighting(truth, "mate", 1.0, 0.0))
                 state = robot.cycle(state, Sightings(now, (mate,)))
         covariance, shared = matrix3(state.estimate.covariance), matrix3(state.estimate.shared)
@@ -617,7 +623,7 @@ def test_one_outlier_does_not_keep_the_others_out(variant: Variant) -> None:
 @variants
 def test_a_fix_far_off_is_rejected_and_counted(variant: Variant) -> None:
     before = state_at(ORIGIN, diagonal(0.1, 0.05))
-    after = standing(variant).fix(before, fix(3.0, 0.0, 1))
+    after = standing(variant).add_fix(before, fix(3.0, 0.0, 1))
     assert after.estimate == before.estimate
     assert after.counts == {"gated": 1}
 
@@ -686,7 +692,7 @@ def test_a_singular_fix_that_the_wire_allows_is_no_crash(
     sensor_covariance: tuple[float, float, float],
 ) -> None:
     sent = Fix("me", "mate", 1, 0.01, 0.01, sensor_covariance, (0.0, 0.0, 0.0))
-    state = standing("joint").fix(state_at(ORIGIN, diagonal(0.1, 0.05)), sent)
+    state = standing("joint").add_fix(state_at(ORIGIN, diagonal(0.1, 0.05)), sent)
     assert all(math.isfinite(v) for v in state.estimate.pose)
 
 
@@ -696,10 +702,10 @@ def test_a_singular_fix_that_the_wire_allows_is_no_crash(
 @variants
 def test_odometry_is_driven_as_time_passes(variant: Variant) -> None:
     robot = localizer(variant)
-    state = robot.drive(state_at(ORIGIN, diagonal(0.1, 0.05)), Odometry(0, 10, 1.0, 0.0))
-    assert robot.moved(state, 5).estimate.pose == pytest.approx((0.5, 0.0, 0.0))
-    assert robot.moved(state, 20).estimate.pose == pytest.approx((1.0, 0.0, 0.0))
-    halves = robot.moved(robot.moved(state, 3), 20)
+    state = robot.add_odometry(state_at(ORIGIN, diagonal(0.1, 0.05)), Odometry(0, 10, 1.0, 0.0))
+    assert robot.predict(state, 5).estimate.pose == pytest.approx((0.5, 0.0, 0.0))
+    assert robot.predict(state, 20).estimate.pose == pytest.approx((1.0, 0.0, 0.0))
+    halves = robot.predict(robot.predict(state, 3), 20)
     assert halves.estimate.pose == pytest.approx((1.0, 0.0, 0.0))
     assert halves.odometry_from_robot == pytest.approx((1.0, 0.0, 0.0))
 
@@ -715,9 +721,9 @@ def test_a_crawl_errs_with_its_time_however_it_is_cut(variant: Variant) -> None:
     robot = localizer(variant, odometry=dead_zone)
     start, at_once = state_at(ORIGIN, diagonal(0.0, 0.0)), []
     for speed in (0.02, 0.03):
-        driven = robot.drive(start, Odometry(0, 4 * SECOND, 4.0 * speed, 0.0))
-        whole = robot.moved(driven, 4 * SECOND).estimate
-        cut = robot.moved(robot.moved(driven, SECOND), 4 * SECOND).estimate
+        driven = robot.add_odometry(start, Odometry(0, 4 * SECOND, 4.0 * speed, 0.0))
+        whole = robot.predict(driven, 4 * SECOND).estimate
+        cut = robot.predict(robot.predict(driven, SECOND), 4 * SECOND).estimate
         assert cut.pose == pytest.approx(whole.pose)
         assert tuple(cut.covariance) == pytest.approx(tuple(whole.covariance))
         at_once.append(whole)
@@ -731,7 +737,7 @@ def test_a_crawl_errs_with_its_time_however_it_is_cut(variant: Variant) -> None:
 
 def test_motion_on_the_spot_is_none() -> None:
     robot, before = localizer(), state_at(ORIGIN, diagonal(0.1, 0.05))
-    after = robot.moved(robot.drive(before, Odometry(0, 10, 0.0, 0.0)), 10)
+    after = robot.predict(robot.add_odometry(before, Odometry(0, 10, 0.0, 0.0)), 10)
     assert after.estimate == before.estimate
 
 
@@ -739,22 +745,22 @@ def test_motion_on_the_spot_is_none() -> None:
 def test_without_odometry_a_robot_that_moves_doubts_its_place(variant: Variant) -> None:
     rules = OdometrySettings(timeout_s=0.5, gap_speed_m_s=0.3)
     robot, before = localizer(variant, odometry=rules), state_at(ORIGIN, diagonal(0.1, 0.05))
-    assert robot.moved(before, SECOND // 2).estimate == before.estimate
-    covariance = robot.moved(before, 2 * SECOND).estimate.covariance
+    assert robot.predict(before, SECOND // 2).estimate == before.estimate
+    covariance = robot.predict(before, 2 * SECOND).estimate.covariance
     assert covariance.xx == covariance.yy == pytest.approx(0.01 + 1.5 * 0.09)
-    whole = robot.moved(robot.moved(before, SECOND), 2 * SECOND).estimate.covariance
+    whole = robot.predict(robot.predict(before, SECOND), 2 * SECOND).estimate.covariance
     assert whole == pytest.approx(covariance)
 
 
 def test_without_odometry_a_robot_that_stands_still_does_not() -> None:
     before = state_at(ORIGIN, diagonal(0.1, 0.05))
-    assert localizer(odometry=STANDING).moved(before, 9 * SECOND).estimate == before.estimate
+    assert localizer(odometry=STANDING).predict(before, 9 * SECOND).estimate == before.estimate
 
 
 @variants
 def test_time_does_not_run_backwards(variant: Variant) -> None:
     before = state_at(ORIGIN, diagonal(0.1, 0.05), 5)
-    assert localizer(variant).moved(before, 3) == before
+    assert localizer(variant).predict(before, 3) == before
 
 
 # The start ----------------------------------------------------------------------------------------
@@ -766,11 +772,11 @@ def test_a_known_start_is_where_the_robot_is() -> None:
     assert state.stamp_ns == 7
     assert state.estimate.pose == pytest.approx((1.0, -1.0, 0.5 * math.pi))
     assert state.estimate.covariance == pytest.approx(diagonal(0.2, math.radians(10.0)))
-    assert state.memory.lost == ""
+    assert state.lost == ""
 
 
 def test_an_unknown_start_is_anywhere_on_the_field() -> None:
     state = localizer(start=Start(known=False, x_m=1.0, y_m=-1.0)).start(7)
-    assert state.memory.lost == "start pose unknown"
+    assert state.lost == "start pose unknown"
     assert (state.estimate.pose.x, state.estimate.pose.y) == (0.0, 0.0)
     assert state.estimate.position_sigma_m >= 4.5

@@ -18,11 +18,11 @@ from cpcbl_team.estimate import Scope
 from cpcbl_team.geometry import Pose2
 from cpcbl_team.inputs import Belief, Sighting
 from cpcbl_team.measurements import (
-    Measured,
+    Measurement,
     constraints_of,
-    measured,
+    measurement_of,
+    nis_of,
     observation_of,
-    surprise,
 )
 
 HERE = Pose2(0.0, 0.0, 0.0)
@@ -36,12 +36,12 @@ def seen_as(
     sensor: SensorSettings | None = None,
     passive: bool = True,
     stamp_ns: int = 0,
-) -> Measured | None:
+) -> Measurement | None:
     settings = LocalizationSettings(
         sensor=sensor or SensorSettings(),
         collaboration=CollaborationSettings(passive=passive),
     )
-    return measured(sighting, stamp_ns, HERE, field, teammates or {}, settings)
+    return measurement_of(sighting, stamp_ns, HERE, field, teammates or {}, settings)
 
 
 @pytest.mark.parametrize(
@@ -64,7 +64,7 @@ def test_a_landmark_gives_what_it_is_configured_to(
         seen = seen_as(Sighting(name, 2.0, 0.5), field)
         assert seen is not None
         assert (seen.range_m, seen.bearing) == (range_m, bearing)
-        assert seen.gives_point_bearing is (name == "post" and bearing is not None)
+        assert seen.has_point_bearing is (name == "post" and bearing is not None)
 
 
 @pytest.mark.parametrize(("range_m", "used"), [(2.9, 2.9), (3.1, None)])
@@ -85,8 +85,8 @@ def test_a_sighting_may_lack_a_quantity() -> None:
 def test_what_is_on_the_map_is_placed_exactly() -> None:
     seen = seen_as(Sighting("ne", 2.0, 0.5))
     assert seen is not None
-    assert seen.place == (4.5, 2.5, (0.0, 0.0, 0.0))
-    assert not seen.teammate
+    assert seen.position == (4.5, 2.5, (0.0, 0.0, 0.0))
+    assert not seen.is_teammate
 
 
 def test_the_range_sigma_is_that_of_the_range_to_be_expected() -> None:
@@ -109,8 +109,8 @@ def test_a_teammate_that_told_its_pose_is_one_more_landmark() -> None:
     told = {"mate": (belief(1.0, 2.0, sigma_m=0.3),)}
     seen = seen_as(Sighting("mate", 2.0, 0.5), teammates=told)
     assert seen is not None  # row 25
-    assert seen.teammate
-    assert seen.place.covariance == pytest.approx((0.09, 0.0, 0.09))
+    assert seen.is_teammate
+    assert seen.position.covariance == pytest.approx((0.09, 0.0, 0.09))
     assert seen_as(Sighting("mate", 2.0, 0.5), teammates=told, passive=False) is None
 
 
@@ -131,4 +131,4 @@ def test_the_gate_measures_the_innovation_of_the_whole_observation(name: str, tu
     whole = observation_of(prior, seen, cs, prior)
     expected = whole.normalized_innovation_squared(prior.covariance)
     assert expected > 0.0
-    assert surprise(prior, seen, cs) == pytest.approx(expected, rel=1e-12)
+    assert nis_of(prior, seen, cs) == pytest.approx(expected, rel=1e-12)

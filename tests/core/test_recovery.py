@@ -38,20 +38,20 @@ from cpcbl_team.estimate import Estimate
 from cpcbl_team.gaussian import Covariance2
 from cpcbl_team.geometry import Pose2, wrap_angle
 from cpcbl_team.inputs import Sighting, Sightings
-from cpcbl_team.measurements import Measured
+from cpcbl_team.measurements import Measurement
 from cpcbl_team.recovery import (
     MOST_PIECES,
     SPACING_NS,
     WINDOW_NS,
     Limits,
-    innovated,
+    inflate_covariance,
     lost_reason,
-    relocalized,
-    remembered,
-    widened,
-    with_seen,
+    with_evidence,
+    with_innovations,
+    with_measurements,
 )
-from cpcbl_team.state import Evidence, Memory, State, Updates
+from cpcbl_team.relocalization import relocalize
+from cpcbl_team.state import Evidence, Memory, RecoveryMemory, State, Updates
 
 ORIGIN = Pose2(0.0, 0.0, 0.0)
 RULES = LocalizerSettings()
@@ -101,30 +101,30 @@ def test_a_robot_is_lost_by_its_own_uncertainty(
 def test_a_robot_is_lost_when_most_of_what_it_sees_is_rejected(
     rejected: int, accepted: int, reason: str
 ) -> None:
-    innovations = innovated(1, accepted, rejected, 20)
+    innovations = with_innovations(1, accepted, rejected, 20)
     assert lost_reason(Estimate(ORIGIN, diagonal(0.1, 0.1)), innovations, LIMITS) == reason
 
 
 @pytest.mark.parametrize(("sigma_m", "still"), [(1.1, True), (0.9, False)])
 def test_being_lost_ends_at_half_the_limit(sigma_m: float, still: bool) -> None:
     robot = localizer(rules=RULES)
-    memory = Memory(lost="before")
+    memory = Memory(RecoveryMemory(lost="before"))
     state = state_at(ORIGIN, diagonal(sigma_m, 0.1))._replace(memory=memory)
-    assert (robot.cycle(state, Sightings(1, ())).memory.lost != "") is still
+    assert (robot.cycle(state, Sightings(1, ())).lost != "") is still
     state = state._replace(memory=Memory())
-    assert robot.cycle(state, Sightings(1, ())).memory.lost == ""
+    assert robot.cycle(state, Sightings(1, ())).lost == ""
 
 
 def test_doubt_doubles_sigma_up_to_the_limits_of_being_lost() -> None:
     estimate = Estimate(ORIGIN, diagonal(0.02, 0.01))
     sigmas = []
     for _ in range(8):
-        estimate = widened(estimate, RULES)
+        estimate = inflate_covariance(estimate, RULES)
         sigmas.append(estimate.position_sigma_m)
     assert sigmas[:4] == pytest.approx([0.1, 0.2, 0.4, 0.8])
     assert sigmas[-1] == pytest.approx(RULES.lost_position_sigma_m)
     assert math.degrees(estimate.heading_sigma_rad) < RULES.lost_heading_sigma_deg
-    assert widened(estimate, RULES).covariance == pytest.approx(estimate.covariance)
+    assert inflate_covariance(estimate, RULES).covariance == pytest.approx(estimate.covariance)
 
 
 # Evidence -----------------------------------------------------------------------------------------
@@ -164,7 +164,7 @@ def headed_piece(stamp_ns: int, robot: Pose2, sigma_rad: float = 0.05) -> Eviden
     """A fix with the heading, half of whose variance is the observer's."""
     part = sigma_rad * math.sqrt(0.5)
     told = fix_piece(stamp_ns, robot)._replace(bearing_sigma_rad=part)
-    return told._replace(heading_rad=robot.heading, place_sigma_rad=part)
+    return told._replace(heading_rad=robot.heading, teammate_sigma_rad=part)
 
 
 def seen_along(
@@ -193,7 +193,7 @@ BEGUN = Pose2(2.0, -3.0, 1.1)
 
 
 def found_at(evidence: Iterable[Evidence], truth: Pose2) -> Estimate | None:
-    found = relocalized(dead_reckoned(evidence, BEGUN), BEGUN.inverse() @ truth, CORNERS)
+    found = relocalize(dead_reckoned(evidence, BEGUN), BEGUN.inverse() @ truth, CORNERS)
     if found is not None:
         assert position_error(found, truth) < 1e-3
         assert heading_error(found, truth) < 1e-3
@@ -273,13 +273,13 @@ def test_a_few_wrong_pieces_are_left_out() -> None:
 def test_evidence_that_contradicts_itself_finds_nobody() -> None:
     evidence = seen_along(PATH[-1:], ["ne", "nw"])
     wrong = [e._replace(range_m=1.0, bearing_rad=0.1 * i) for i, e in enumerate(evidence)]
-    assert relocalized(tuple(wrong), PATH[-1], CORNERS) is None
+    assert relocalize(tuple(wrong), PATH[-1], CORNERS) is None
 
 
 def test_headings_that_contradict_each_other_find_nobody() -> None:
     one, other = (headed_piece(i * SPACING_NS, PATH[0]) for i in range(2))
     other = other._replace(heading_rad=PATH[0].heading + 1.0)
-    assert relocalized((one, other), PATH[0], CORNERS) is None
+    assert relocalize((one, other), PATH[0], CORNERS) is None
 
 
 def test_a_wrong_heading_among_right_ones_is_left_out() -> None:
@@ -293,7 +293,7 @@ def test_an_observer_that_repeats_a_heading_is_not_believed_more(times: int) -> 
     """Of its own 0.1 rad nothing is averaged away, and nothing of it by its position either."""
     told = [headed_piece(i, PATH[0], 0.1 * math.sqrt(2.0)) for i in range(2 * times)]
     sure = [e._replace(bearing_sigma_rad=0.001) for e in told]
-    found = relocalized(tuple(sure), PATH[0], CORNERS)
+    found = relocalize(tuple(sure), PATH[0], CORNERS)
     assert found is not None
     assert found.heading_sigma_rad > 0.1
     assert found.shared == found.covariance
@@ -303,8 +303,8 @@ def test_an_observer_that_repeats_a_heading_is_not_believed_more(times: int) -> 
 def test_teammates_that_repeat_themselves_are_not_believed_more(times: int) -> None:
     """Their error, of 0.1 m, may be the same each time."""
     told = [fix_piece(i, pose) for i, pose in enumerate(PATH * times)]
-    found = relocalized(tuple(told), PATH[-1], CORNERS)
-    own = relocalized(tuple(e._replace(told=False) for e in told), PATH[-1], CORNERS)
+    found = relocalize(tuple(told), PATH[-1], CORNERS)
+    own = relocalize(tuple(e._replace(from_teammate=False) for e in told), PATH[-1], CORNERS)
     assert found is not None
     assert own is not None
     assert found.position_sigma_m > 0.1
@@ -312,8 +312,8 @@ def test_teammates_that_repeat_themselves_are_not_believed_more(times: int) -> N
 
 
 def test_what_a_teammate_told_is_shared_when_one_is_found_by_it() -> None:
-    told = relocalized(tuple(fix_piece(i, pose) for i, pose in enumerate(PATH)), PATH[-1], CORNERS)
-    seen = relocalized(seen_along(PATH, ["ne", "nw"]), PATH[-1], CORNERS)
+    told = relocalize(tuple(fix_piece(i, pose) for i, pose in enumerate(PATH)), PATH[-1], CORNERS)
+    seen = relocalize(seen_along(PATH, ["ne", "nw"]), PATH[-1], CORNERS)
     assert told is not None
     assert seen is not None
     assert told.shared == told.covariance
@@ -321,15 +321,15 @@ def test_what_a_teammate_told_is_shared_when_one_is_found_by_it() -> None:
 
 
 def test_memory_keeps_little_of_each_object_and_nothing_old() -> None:
-    memory = Memory()
+    memory = RecoveryMemory()
     for i in range(200):
         now = i * SPACING_NS // 5
-        memory = remembered(memory, [piece(now, ORIGIN, n, 1.0, 2.0) for n in ("a", "b")])
+        memory = with_evidence(memory, [piece(now, ORIGIN, n, 1.0, 2.0) for n in ("a", "b")])
     stamps = [e.stamp_ns for e in memory.evidence if e.source == "a"]
     assert np.diff(stamps).min() >= SPACING_NS
     assert len(memory.evidence) <= MOST_PIECES
     later = stamps[-1] + WINDOW_NS + 1
-    memory = remembered(memory, [piece(later, ORIGIN, "c", 1.0, 2.0)])
+    memory = with_evidence(memory, [piece(later, ORIGIN, "c", 1.0, 2.0)])
     assert [e.source for e in memory.evidence] == ["c"]
 
 
@@ -338,11 +338,12 @@ def test_an_object_that_was_seen_a_short_time_ago_is_no_new_evidence(
     age_ns: int, kept: list[str]
 ) -> None:
     state = state_at(ORIGIN, diagonal(0.1, 0.1), stamp_ns=SECOND)
-    memory = Memory(evidence=(piece(SECOND - age_ns, ORIGIN, "ne", 4.5, 2.5),))
+    before = (piece(SECOND - age_ns, ORIGIN, "ne", 4.5, 2.5),)
+    memory = Memory(RecoveryMemory(evidence=before))
     state = state._replace(memory=memory)
     place, both = Place(4.5, 2.5, Covariance2(0.0, 0.0, 0.0)), (5.0, 0.5)
-    seen = [Measured(name, place, None, False, *both, 0.1, 0.1) for name in ("ne", "ne")]
-    assert [e.source for e in with_seen(state, seen).evidence] == kept
+    seen = [Measurement(name, place, None, False, *both, 0.1, 0.1) for name in ("ne", "ne")]
+    assert [e.source for e in with_measurements(state, seen).evidence] == kept
 
 
 @pytest.mark.parametrize("gives", ["none", "bearing"])
@@ -352,7 +353,9 @@ def test_a_reading_that_may_not_be_used_is_no_evidence(gives: Gives) -> None:
     seen = point_sighting(ORIGIN, "ne", 4.5, 2.5)
     ranged = Sightings(1, (Sighting("ne", seen.range_m),))
     state = robot.cycle(state_at(ORIGIN, diagonal(0.1, 0.1)), ranged)
-    assert all((e.range_m, e.bearing_rad) != (None, None) for e in robot.evidence(state.memory))
+    assert all(
+        (e.range_m, e.bearing_rad) != (None, None) for e in robot.evidence(state.memory.recovery)
+    )
 
 
 # The whole way back -------------------------------------------------------------------------------
@@ -362,7 +365,7 @@ def test_a_robot_with_an_unknown_start_finds_itself() -> None:
     robot = localizer(start=UNKNOWN)
     state = robot.start(0)
     state = robot.cycle(state, frame(PATH[0], SECOND // 10, names=["ne", "se"]))
-    assert state.memory.lost == ""
+    assert state.lost == ""
     assert state.counts["found_again"] == 1
     assert position_error(state.estimate, PATH[0]) < 1e-3
 
@@ -389,7 +392,7 @@ def test_a_kidnapped_robot_is_back_within_three_seconds(
 ) -> None:
     state, truth = kidnapped(variant, names, before_s)
     assert state.counts["lost"] >= 1
-    assert state.memory.lost == ""
+    assert state.lost == ""
     assert position_error(state.estimate, truth) < 0.5
     assert heading_error(state.estimate, truth) < 0.3
 
@@ -416,7 +419,7 @@ def test_an_overconfident_robot_that_sees_one_landmark_at_a_time_gets_right(
         names=lambda piece: [names[piece // 20 % 4]],
         noise=noise,
     )
-    assert state.memory.lost == ""
+    assert state.lost == ""
     assert position_error(state.estimate, truth) < 0.5
     assert heading_error(state.estimate, truth) < 0.3
 
@@ -440,12 +443,12 @@ def test_a_lost_robot_is_found_by_its_places_along_the_way(variant: Variant, own
     state, truth = robot.start(0), LOOP_START
     for odometry, truth in driven(LOOP_START, loop()[:60]):
         now = odometry.stamp_ns
-        state = robot.drive(state, odometry)
+        state = robot.add_odometry(state, odometry)
         if own:
-            state = robot.position(state, placed_at(truth.x, truth.y, now))
+            state = robot.add_position(state, placed_at(truth.x, truth.y, now))
         else:
-            state = robot.fix(state, fix(truth.x, truth.y, now))
-    assert state.memory.lost == ""
+            state = robot.add_fix(state, fix(truth.x, truth.y, now))
+    assert state.lost == ""
     assert "lost" not in state.counts  # not again
     assert position_error(state.estimate, truth) < 0.1
     assert heading_error(state.estimate, truth) < 0.2
@@ -454,8 +457,8 @@ def test_a_lost_robot_is_found_by_its_places_along_the_way(variant: Variant, own
 def test_a_robot_says_why_it_is_lost_now() -> None:
     """Not why it was at first: the rejections are over, its heading is still unknown."""
     robot = localizer(rules=LocalizerSettings(variant="joint"))
-    memory = Memory(lost="13 of the last 20 innovations rejected")
-    updates = Updates(innovations=innovated(1, 20, 0, 20))
+    memory = Memory(RecoveryMemory(lost="13 of the last 20 innovations rejected"))
+    updates = Updates(innovations=with_innovations(1, 20, 0, 20))
     state = state_at(ORIGIN, diagonal(0.1, 1.0))._replace(memory=memory, updates=updates)
     state = robot.cycle(state, Sightings(1, ()))
-    assert state.memory.lost == "heading sigma 57 deg"
+    assert state.lost == "heading sigma 57 deg"

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from msgspec.structs import replace
 from support.core import (
     CORNERS,
     LOOP_START,
@@ -39,7 +38,7 @@ from cpcbl_team.inputs import Odometry, Sighting
 from cpcbl_team.localizer import Localizer
 from cpcbl_team.self_calibration import LONGEST_NS, Anchor, Anchors, Learned, learned
 from cpcbl_team.sensors import without_bearing_bias
-from cpcbl_team.state import State
+from cpcbl_team.state import CalibrationMemory, Memory, RecoveryMemory, State
 
 ORIGIN = Pose2(0.0, 0.0, 0.0)
 NOISE = OdometryNoise()
@@ -223,10 +222,10 @@ def test_turns_between_two_updates_are_not_taken_for_others(turn: float) -> None
     truth, state = LOOP_START, robot.start(0)
     for i in range(30):
         from_ns, until_ns = 5 * SECOND * i, 5 * SECOND * (i + 1)
-        state = robot.drive(state, Odometry(from_ns, until_ns, 0.0, turn / true_scale))
+        state = robot.add_odometry(state, Odometry(from_ns, until_ns, 0.0, turn / true_scale))
         truth = step(truth, 0.0, turn)
         state = robot.cycle(state, frame(truth, until_ns))
-    learned_turn = state.memory.learned.turn_scale
+    learned_turn = state.memory.calibration.learned.turn_scale
     assert learned_turn == pytest.approx(true_scale if abs(turn) < 3.0 else 1.0, abs=5e-3)
 
 
@@ -279,7 +278,9 @@ def driven(robot: Localizer, seed: int) -> Drive:
     for i, (distance, turn) in enumerate(loop() * ROUNDS):
         truth, now = step(truth, distance, turn), (i + 1) * PERIOD_NS
         piece = reported(rng, distance, turn)
-        state = robot.moved(robot.drive(state, Odometry(now - PERIOD_NS, now, *piece)), now)
+        state = robot.predict(
+            robot.add_odometry(state, Odometry(now - PERIOD_NS, now, *piece)), now
+        )
         if i % 10 == 9:
             corner = corners[i // 10 % len(corners)]
             state = robot.cycle(state, frame(truth, now, names=[corner], noise=biased))
@@ -295,10 +296,10 @@ def runs() -> list[tuple[Drive, Drive]]:
 
 def test_wheels_and_camera_are_found_out_while_driving(runs: list[tuple[Drive, Drive]]) -> None:
     for on, _ in runs:
-        known = on.state.memory.learned
+        known = on.state.memory.calibration.learned
         for value, variance, true in zip(known[:3], known[3:], TRUE, strict=True):
             assert abs(value - true) <= 3.0 * math.sqrt(variance)
-    scales = np.array([on.state.memory.learned[:2] for on, _ in runs])
+    scales = np.array([on.state.memory.calibration.learned[:2] for on, _ in runs])
     off = np.abs(1.0 - np.array(TRUE[:2]))
     assert np.all(np.abs(scales - TRUE[:2]).mean(axis=0) < 0.5 * off)
 
@@ -312,15 +313,15 @@ def test_a_robot_that_does_not_learn_remembers_nothing_of_it(
     runs: list[tuple[Drive, Drive]],
 ) -> None:
     for _, off in runs:
-        assert off.state.memory.learned == Learned()
-        assert off.state.memory.anchors is None
+        assert off.state.memory.calibration.learned == Learned()
+        assert off.state.memory.calibration.anchors is None
 
 
 @pytest.mark.parametrize("variant", PROBABILISTIC)
 def test_nothing_is_learned_where_nothing_is_wrong(variant: Variant) -> None:
     robot = robot_that(True, variant)
     for state, _ in followed(robot, robot.start(0), LOOP_START, loop()):
-        found = state.memory.learned
+        found = state.memory.calibration.learned
         assert found[:3] == pytest.approx((1.0, 1.0, 0.0), abs=1e-9)
     assert all(after < 0.5 * before for after, before in zip(found[3:], Learned()[3:], strict=True))
 
@@ -329,9 +330,9 @@ def test_nothing_is_learned_where_nothing_is_wrong(variant: Variant) -> None:
 def test_what_is_known_corrects_wheels_and_bearings(learns: bool) -> None:
     known = Learned(0.9, 0.8, 0.1)
     before = state_at(ORIGIN, diagonal(0.1, 0.05))
-    before = before._replace(memory=replace(before.memory, learned=known))
+    before = before._replace(memory=Memory(calibration=CalibrationMemory(known)))
     robot = robot_that(learns)
-    moved = robot.moved(robot.drive(before, Odometry(0, SECOND, 1.0, 0.5)), SECOND)
+    moved = robot.predict(robot.add_odometry(before, Odometry(0, SECOND, 1.0, 0.5)), SECOND)
     expected = step(ORIGIN, 0.9, 0.4) if learns else step(ORIGIN, 1.0, 0.5)
     assert moved.estimate.pose == pytest.approx(expected)
     frame_with_bias = without_bearing_bias(frame(ORIGIN, 1), -0.1)
@@ -343,24 +344,27 @@ def test_a_robot_that_was_lost_compares_with_nothing_before() -> None:
     """Carried elsewhere, it finds itself by what it sees there; the way there was not driven."""
     robot, elsewhere = robot_that(True), Pose2(1.5, 1.0, 2.0)
     *_, (before, _) = followed(robot, robot.start(0), LOOP_START, loop()[:100])
-    assert before.memory.anchors is not None
-    assert before.memory.learned != Learned()
+    assert before.memory.calibration.anchors is not None
+    assert before.memory.calibration.learned != Learned()
     *_, (last, truth) = followed(robot, before, elsewhere, [(0.0, 0.0)] * 100)
     assert last.counts["found_again"] >= 1
     assert position_error(last.estimate, truth) < 0.2
-    assert last.memory.learned == before.memory.learned
-    assert last.memory.anchors is not None
-    assert all(position_error(at.estimate, elsewhere) < 0.5 for at in last.memory.anchors)
+    assert last.memory.calibration.learned == before.memory.calibration.learned
+    assert last.memory.calibration.anchors is not None
+    assert all(
+        position_error(at.estimate, elsewhere) < 0.5 for at in last.memory.calibration.anchors
+    )
 
 
 def test_while_a_robot_is_lost_it_has_no_anchors() -> None:
     robot = robot_that(True)
     at = anchor(LOOP_START, ORIGIN, 0.0)
     lost = robot.start(0)
-    memory = replace(lost.memory, lost="for the test", anchors=both(at))
+    calibration = CalibrationMemory(anchors=both(at))
+    memory = Memory(RecoveryMemory(lost="for the test"), calibration=calibration)
     seen = robot.cycle(lost._replace(memory=memory), frame(LOOP_START, SECOND // 10))
     assert seen.counts["accepted"] == len(CORNERS.landmarks)
-    assert seen.memory.anchors is None
+    assert seen.memory.calibration.anchors is None
 
 
 def test_a_robot_without_a_covariance_learns_nothing() -> None:

@@ -76,17 +76,17 @@ def by_hand(robot: Localizer, inputs: Iterable[Input]) -> State:
     for item in inputs:
         match item:
             case Odometry():
-                state = robot.drive(state, item)
+                state = robot.add_odometry(state, item)
             case Sightings():
                 state = robot.cycle(state, item)
             case Position():
-                state = robot.position(state, item)
+                state = robot.add_position(state, item)
             case Fix():
-                state = robot.fix(state, item)
+                state = robot.add_fix(state, item)
             case Belief():
-                state = robot.hear(state, item)
+                state = robot.add_teammate_belief(state, item)
             case Told():
-                state = robot.tell(state, item)
+                state = robot.mark_shared(state, item)
     return state
 
 
@@ -146,13 +146,15 @@ def test_a_robot_that_learns_gives_the_same_bits_in_any_order() -> None:
     )
     inputs, delay = history(12.0), {Sightings: 300, Fix: 900, Belief: 500}
     expected = by_hand(robot, inputs)
-    assert all(a != b for a, b in zip(expected.memory.learned, Learned(), strict=True))
+    assert all(a != b for a, b in zip(expected.memory.calibration.learned, Learned(), strict=True))
     for seed in range(3):
         rng = np.random.default_rng(seed)
         arrivals = [stamp_of(i) + rng.uniform(0.0, delay.get(type(i), 50)) * MS for i in inputs]
         late = after(robot, [inputs[i] for i in np.argsort(arrivals)])
         assert same(late.state, expected)
-        assert repr(late.state.memory.learned) == repr(expected.memory.learned)
+        assert repr(late.state.memory.calibration.learned) == repr(
+            expected.memory.calibration.learned
+        )
 
 
 @pytest.mark.parametrize("late_by_ms", [1, 300, 1000])
@@ -343,7 +345,7 @@ def test_the_state_at_a_time_knows_nothing_later() -> None:
     robot, inputs = localizer("joint", MIXED), history(1.8)
     timeline = after(robot, inputs)
     for now in (0, 400 * MS, 975 * MS, 1799 * MS):
-        known = robot.moved(by_hand(robot, [i for i in inputs if time_of(i) <= now]), now)
+        known = robot.predict(by_hand(robot, [i for i in inputs if time_of(i) <= now]), now)
         found = timeline.at(now)
         assert found is not None
         assert same(found, known)

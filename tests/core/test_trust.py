@@ -462,14 +462,14 @@ class Told:
             for item in said:
                 self.take(item)
             self.errors.append(position_error(self.state.estimate, truth))
-            self.lost.append(self.state.memory.lost)
+            self.lost.append(self.state.lost)
 
     def take(self, item: Input) -> None:
         self.inputs.append(item)
         steps: dict[type, Callable[..., State]] = {
-            Odometry: self.robot.drive,
+            Odometry: self.robot.add_odometry,
             Sightings: self.robot.cycle,
-            Fix: self.robot.fix,
+            Fix: self.robot.add_fix,
         }
         self.state = steps[type(item)](self.state, item)
 
@@ -479,7 +479,7 @@ class Told:
 
     @property
     def quarantines(self) -> dict[str, int]:
-        voices = self.state.memory.voices
+        voices = self.state.memory.teammates.senders
         return {name: v.quarantines for name, v in voices.items() if v.quarantines}
 
 
@@ -491,7 +491,7 @@ kinds = pytest.mark.parametrize("kind", KINDS)
 def test_a_liar_does_little_harm_to_a_robot_that_sees_landmarks(kind: str) -> None:
     told = Told({"liar": lying(kind)}, eyes=True)
     assert told.quarantines == {"liar": 1}
-    assert told.state.memory.voices["liar"].reason == ""  # it healed
+    assert told.state.memory.teammates.senders["liar"].reason == ""  # it healed
     assert told.rmse_m <= 1.3 * Told({}, eyes=True).rmse_m
 
 
@@ -503,7 +503,7 @@ def test_a_liar_does_little_harm_to_a_blind_robot(kind: str, others: Sequence[st
     runs = [Told({**tellers, "liar": lying(kind)}, seed=seed) for seed in (1, 2, 3)]
     for told in runs:
         assert "liar" in told.quarantines
-        assert not any(voice.reason for voice in told.state.memory.voices.values())
+        assert not any(voice.reason for voice in told.state.memory.teammates.senders.values())
     assert np.median([told.rmse_m for told in runs]) <= 1.3 * np.median(without)
 
 
@@ -515,13 +515,13 @@ def test_who_lies_about_the_heading_alone_is_found_by_the_robots_own_eyes() -> N
     state, errors = state_at(LOOP_START, diagonal(0.05, 0.05)), []
     for piece, truth in driven(LOOP_START, loop()[:200]):
         now = piece.stamp_ns
-        state = robot.cycle(robot.drive(state, piece), frame(truth, now, noise=noise))
+        state = robot.cycle(robot.add_odometry(state, piece), frame(truth, now, noise=noise))
         for name, lie in off.items():
             told = fix(truth.x, truth.y, now, heading=wrap_angle(truth.heading + lie))
-            state = robot.fix(state, replace(told, observer=name))
+            state = robot.add_fix(state, replace(told, observer=name))
         errors.append(heading_error(state.estimate, truth))
-    assert state.memory.voices["liar"].reason
-    assert not state.memory.voices["honest"].reason
+    assert state.memory.teammates.senders["liar"].reason
+    assert not state.memory.teammates.senders["honest"].reason
     assert max(errors) < 0.1
 
 
@@ -543,7 +543,7 @@ def test_the_bias_of_the_only_source_cannot_be_told() -> None:
     told = Told({"liar": lying("bias", until_s=100.0)})
     assert told.quarantines == {}
     assert told.errors[-1] == pytest.approx(0.6, abs=0.2)
-    (standing,) = standings(told.state.memory.voices, told.state.stamp_ns)
+    (standing,) = standings(told.state.memory.teammates.senders, told.state.stamp_ns)
     assert standing.unconfirmed
 
 
@@ -575,7 +575,7 @@ def test_without_a_covariance_and_when_switched_off_nobody_is_judged() -> None:
     tellers: dict[str, Teller] = {"a": honest, "liar": lying("bias")}
     off = TrustSettings(enabled=False)
     for told in (Told(tellers, variant="weighted", rounds=1), Told(tellers, rules=off, rounds=1)):
-        assert told.state.memory.voices == {}
+        assert told.state.memory.teammates.senders == {}
 
 
 def test_any_order_gives_the_same_state_and_the_same_judgement() -> None:
@@ -591,17 +591,17 @@ def test_any_order_gives_the_same_state_and_the_same_judgement() -> None:
         assert not any(timeline.add(item) for item in order)
         states.append(timeline.state)
     assert states[0] == states[1] == states[2]
-    assert states[0].memory.voices["liar"].quarantines == 1
+    assert states[0].memory.teammates.senders["liar"].quarantines == 1
 
 
 def test_a_robot_that_is_told_nothing_keeps_no_voices() -> None:
     told = Told({}, eyes=True, rounds=1)
-    assert told.state.memory.voices == {}
+    assert told.state.memory.teammates.senders == {}
 
 
 def test_what_a_sender_in_quarantine_says_is_no_evidence_for_a_lost_robot() -> None:
     told = Told({"a": honest, "b": honest, "liar": lying("bias", until_s=100.0)}, rounds=1)
-    sources = {e.source for e in told.state.memory.evidence}
+    sources = {e.source for e in told.state.memory.recovery.evidence}
     assert sources == {"fix:a", "fix:b"}
 
 
@@ -614,8 +614,10 @@ def watched(offset_m: float, age_ns: int = 0) -> tuple[Localizer, State]:
     state = state_at(Pose2(0.0, 0.0, 0.0), diagonal(0.02, 0.02))
     for i in range(1, 21):
         now = i * 100 * MS
-        state = robot.drive(state, Odometry(now - 100 * MS, now, 0.0, 0.0))
-        state = robot.hear(state, belief(2.0 + offset_m, 0.0, now - age_ns, sigma_m=0.02))
+        state = robot.add_odometry(state, Odometry(now - 100 * MS, now, 0.0, 0.0))
+        state = robot.add_teammate_belief(
+            state, belief(2.0 + offset_m, 0.0, now - age_ns, sigma_m=0.02)
+        )
         seen = frame(Pose2(0.0, 0.0, 0.0), now)
         mate = Sighting("mate", 2.0, 0.0)
         state = robot.cycle(state, Sightings(now, (*seen.sightings, mate)))
@@ -624,18 +626,18 @@ def watched(offset_m: float, age_ns: int = 0) -> tuple[Localizer, State]:
 
 def test_a_teammate_whose_belief_is_not_where_it_is_seen_is_not_used_as_a_landmark() -> None:
     _, state = watched(1.0)
-    assert state.memory.voices["mate"].reason
+    assert state.memory.teammates.senders["mate"].reason
     assert state.counts["distrusted"] > 10
     assert "mate" not in state.updates.objects_ns
 
 
 def test_an_honest_belief_is_used() -> None:
     _, state = watched(0.0)
-    assert state.memory.voices["mate"].reason == ""
+    assert state.memory.teammates.senders["mate"].reason == ""
     assert state.updates.objects_ns["mate"] == state.stamp_ns
 
 
 def test_an_old_belief_is_held_against_nobody() -> None:
     """Its robot may have turned since."""
     _, state = watched(1.0, age_ns=1_000 * MS)
-    assert state.memory.voices["mate"].reason == ""
+    assert state.memory.teammates.senders["mate"].reason == ""

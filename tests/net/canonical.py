@@ -11,7 +11,7 @@ from typing import Any
 from cpcbl_team.estimate import Estimate
 from cpcbl_team.inputs import Belief
 from cpcbl_team.localizer import Localizer
-from cpcbl_team.state import Evidence, Memory, State
+from cpcbl_team.state import CalibrationMemory, Evidence, State
 from cpcbl_team.trust import Voice
 from cpcbl_transport.messages import Track
 
@@ -25,14 +25,15 @@ def canonical_state(localizer: Localizer, state: State, with_evidence: bool) -> 
     To compute the evidence takes longer than all the rest, so not every step has it. It stays in
     the state for many steps, so a difference is found all the same.
     """
-    memory, updates, pending = state.memory, state.updates, state.motion
-    evidence = localizer.evidence(memory) if with_evidence else ()
-    learned = memory.learned
+    updates, pending, recovery = state.updates, state.pending_odometry, state.memory.recovery
+    teammates, calibration = state.memory.teammates, state.memory.calibration
+    evidence = localizer.evidence(recovery) if with_evidence else ()
+    learned = calibration.learned
     return {
         "stamp_ns": state.stamp_ns,
         "estimate": _estimate(state.estimate),
         "odometry_from_robot": list(state.odometry_from_robot),
-        "odometry_known_until_ns": state.odometry_ns,
+        "odometry_known_until_ns": state.odometry_until_ns,
         "pending_odometry": None
         if pending is None
         else [pending.from_ns, pending.stamp_ns, pending.distance_m, pending.turn_rad],
@@ -41,25 +42,25 @@ def canonical_state(localizer: Localizer, state: State, with_evidence: bool) -> 
         "last_heading_update_ns": updates.heading_ns,
         "last_update_was_heading": updates.heading_is_latest,
         "last_use_of_object_ns": dict(updates.objects_ns),
-        "last_acceptance_ns": updates.agreed_ns,
+        "last_acceptance_ns": updates.accepted_ns,
         "innovation_window": bin(updates.innovations),
-        "lost_reason": str(memory.lost),
-        "last_inflation_ns": memory.widened_ns,
-        "last_relocalization_ns": memory.sought_ns,
+        "lost_reason": str(recovery.lost),
+        "last_inflation_ns": recovery.inflated_ns,
+        "last_relocalization_ns": recovery.relocalization_ns,
         "evidence": [_evidence(piece) for piece in evidence],
-        "recently_recorded": sorted(memory.noted),
-        "recently_recorded_until_ns": memory.noted_until_ns,
-        "last_word_of_teammate_ns": memory.told_ns,
+        "recently_recorded": sorted(recovery.recorded),
+        "recently_recorded_until_ns": recovery.recorded_until_ns,
+        "last_word_of_teammate_ns": teammates.last_report_ns,
         "self_calibration": {
             "distance_scale": [learned.distance_scale, learned.distance_variance],
             "turn_scale": [learned.turn_scale, learned.turn_variance],
             "bearing_bias": [learned.bearing_bias_rad, learned.bearing_variance],
-            "total_turn_rad": memory.turned_rad,
-            "anchors": _calibration_anchors(memory),
+            "total_turn_rad": calibration.total_turn_rad,
+            "anchors": _calibration_anchors(calibration),
         },
-        "trust": {sender or "own sensors": _sender(v) for sender, v in memory.voices.items()},
+        "trust": {sender or "own sensors": _sender(v) for sender, v in teammates.senders.items()},
         "beliefs": {
-            name: [_belief(b) for b in beliefs] for name, beliefs in memory.teammates.items()
+            name: [_belief(b) for b in beliefs] for name, beliefs in teammates.beliefs.items()
         },
     }
 
@@ -91,13 +92,13 @@ def _evidence(e: Evidence) -> Canonical:
         "position": [e.x, e.y],
         "range_and_bearing": [e.range_m, e.bearing_rad],
         "sigmas_of_sensor": [e.range_sigma_m, e.bearing_sigma_rad],
-        "sigmas_of_teammate": [e.place_sigma_m, e.place_sigma_rad],
-        "from_teammate": e.told,
+        "sigmas_of_teammate": [e.teammate_sigma_m, e.teammate_sigma_rad],
+        "from_teammate": e.from_teammate,
         "heading_rad": e.heading_rad,
     }
 
 
-def _calibration_anchors(memory: Memory) -> list[list[Any]] | None:
+def _calibration_anchors(memory: CalibrationMemory) -> list[list[Any]] | None:
     if memory.anchors is None:
         return None
     pairs = memory.anchors.turned, memory.anchors.drove

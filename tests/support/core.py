@@ -124,7 +124,7 @@ def localizer(
 
 
 def state_at(pose: Pose2, covariance: Covariance3, stamp_ns: int = 0) -> State:
-    return State(stamp_ns, Estimate(pose, covariance), odometry_ns=stamp_ns)
+    return State(stamp_ns, Estimate(pose, covariance), odometry_until_ns=stamp_ns)
 
 
 def diagonal(sigma_m: float, sigma_rad: float) -> Covariance3:
@@ -218,7 +218,7 @@ def followed(
 ) -> Iterator[tuple[State, Pose2]]:
     """(state, truth) after each piece of exact odometry and the frame at its end, at 10 Hz."""
     for i, (odometry, truth) in enumerate(driven(begin, pieces, start_ns=state.stamp_ns)):
-        state = robot.drive(state, odometry)
+        state = robot.add_odometry(state, odometry)
         seen = frame(truth, odometry.stamp_ns, robot.field, names(i), noise)
         state = robot.cycle(state, seen)
         yield state, truth

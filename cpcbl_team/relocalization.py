@@ -1,0 +1,216 @@
+"""Finding oneself when one is lost: the pose from recent evidence alone.
+
+This is triangulation from what was measured and reported within the last seconds. Dead reckoning
+brings each piece of evidence to the present. A closed-form alignment gives the start where ranges
+are known, else many starts are tried. An ambiguous answer is no answer.
+"""
+
+import math
+from collections.abc import Iterator
+
+from cpcbl_team.config import Field
+from cpcbl_team.constraints import Constraint, bearing_heading, range_circle
+from cpcbl_team.estimate import SMALLEST_VARIANCE, ZERO3, Covariance3, Estimate, Information, merge
+from cpcbl_team.geometry import Pose2
+from cpcbl_team.state import Evidence
+
+DRIFT_SHARE = 0.1  # of the way: how far dead reckoning errs within the window of evidence
+MOST_STARTS = 16
+_OPEN = Covariance3(1e6, 0.0, 1e6, 0.0, 0.0, 1e3)
+_SHARPEST = 1e-6  # (1 mm)^2, (1 mrad)^2: sharper evidence drowns _OPEN in rounding
+_ENOUGH_POSITION_SIGMA_M = 0.7
+_ENOUGH_HEADING_SIGMA_RAD = 0.5
+
+
+def relocalize(
+    evidence: tuple[Evidence, ...], odometry_from_robot: Pose2, field: Field
+) -> Estimate | None:
+    """The pose from recent evidence alone, or None where the evidence does not determine one.
+
+    It needs one residual more than unknowns, a fit that the chi-square bound accepts, and no second
+    pose that fits nearly as well. What n pieces owe to teammates may be one and the same error:
+    each counts it with n times its variance (split covariance intersection of n, equal weights). A
+    fix with a heading counts as two, for one error of its observer may be in both. It is a whole
+    pose, but nothing confirms it while it is alone.
+    """
+    headed = sum(e.heading_rad is not None for e in evidence)
+    if not headed and len({(e.x, e.y) for e in evidence}) < 2:
+        return None
+    repeated = sum(e.from_teammate for e in evidence) + headed
+    pieces = [PropagatedEvidence(e, odometry_from_robot, repeated) for e in evidence]
+    if sum(p.residual_count for p in pieces) < 4:
+        return None
+    starts = sorted(_starts(pieces, field), key=lambda start: _cost(start, pieces))
+    fits = [_fit(start, pieces) for start in starts[:MOST_STARTS]]
+    found = sorted((f for f in fits if f is not None), key=lambda f: f[0])
+    if not found:
+        return None
+    cost, estimate, freedom = found[0]
+    if freedom < 1 or not _is_certain(estimate) or cost > _chi_square_bound(freedom):
+        return None
+    if any(f[0] < cost + 6.0 and _are_apart(f[1].pose, estimate.pose) for f in found[1:]):
+        return None
+    covariance = estimate.covariance.scaled(max(1.0, cost / freedom))
+    return Estimate(estimate.pose, covariance, covariance if repeated else ZERO3)
+
+
+class PropagatedEvidence:
+    """A piece of evidence that dead reckoning has brought to the present."""
+
+    def __init__(self, evidence: Evidence, odometry_from_robot: Pose2, repeated: int) -> None:
+        """`repeated`: how many pieces may have the same error of a teammate."""
+        self.evidence = evidence
+        self.now_from_then = odometry_from_robot.inverse() @ evidence.odometry_from_robot
+        way = math.hypot(self.now_from_then.x, self.now_from_then.y)
+        drift_m = DRIFT_SHARE * (way + 0.3 * abs(self.now_from_then.heading))
+        drift_rad = DRIFT_SHARE * (abs(self.now_from_then.heading) + 0.3 * way)
+        self.is_fix = evidence.range_m is None and evidence.bearing_rad is None
+        factor = math.sqrt(repeated) if evidence.from_teammate else 1.0
+        self.sigma_m = math.hypot(factor * evidence.teammate_sigma_m, drift_m)
+        self.sigma_rad = math.hypot(
+            factor * evidence.teammate_sigma_rad, drift_rad, evidence.bearing_sigma_rad
+        )
+
+    @property
+    def residual_count(self) -> int:
+        e = self.evidence
+        if self.is_fix:
+            return 2 + (e.heading_rad is not None)
+        return (e.range_m is not None) + (e.bearing_rad is not None)
+
+    def pose(self) -> Pose2 | None:
+        """The present pose (field_from_robot), if a fix holds the whole of it."""
+        e = self.evidence
+        if e.heading_rad is None:
+            return None
+        return Pose2(e.x, e.y, e.heading_rad) @ self.now_from_then.inverse()
+
+    def point(self) -> tuple[float, float] | None:
+        """The object (or the robot then) in the present robot's frame, if its range is known."""
+        if self.is_fix:
+            return self.now_from_then.x, self.now_from_then.y
+        r, a = self.evidence.range_m, self.evidence.bearing_rad
+        if r is None or a is None:
+            return None
+        return self.now_from_then.transform(r * math.cos(a), r * math.sin(a))
+
+    def rows(self, pose: Pose2) -> Iterator[tuple[tuple[float, float, float], float, float]]:
+        """(row, residual, variance) about the present pose."""
+        then = pose @ self.now_from_then
+        e = self.evidence
+        hx, hy = pose.y - then.y, then.x - pose.x  # d(position then) / d(heading now)
+        if self.is_fix:
+            variance = _variance(self.sigma_m**2 + e.range_sigma_m**2)
+            yield (1.0, 0.0, hx), e.x - then.x, variance
+            yield (0.0, 1.0, hy), e.y - then.y, variance
+            if e.heading_rad is not None:
+                off = math.remainder(e.heading_rad - then.heading, math.tau)
+                yield (0.0, 0.0, 1.0), off, _variance(self.sigma_rad**2)
+            return
+        constraints: list[Constraint | None] = []
+        if e.range_m is not None:
+            constraints.append(range_circle(then, e.x, e.y, e.range_m, e.range_sigma_m))
+        if e.bearing_rad is not None:
+            constraints.append(bearing_heading(then, e.x, e.y, e.bearing_rad, e.bearing_sigma_rad))
+        for c in constraints:
+            if c is not None:
+                x, y, a = c.row
+                spread = self.sigma_m / c.distance_m if c.on_heading else self.sigma_m
+                row = x, y, a + x * hx + y * hy
+                yield row, c.residual, _variance(c.sigma**2 + spread**2)
+
+
+def _variance(variance: float) -> float:
+    return max(variance + SMALLEST_VARIANCE, _SHARPEST)
+
+
+def _cost(pose: Pose2, pieces: list[PropagatedEvidence]) -> float:
+    return sum(e * e / v for piece in pieces for _, e, v in piece.rows(pose))
+
+
+def _starts(pieces: list[PropagatedEvidence], field: Field) -> Iterator[Pose2]:
+    """Poses (field_from_robot) from which the fit begins."""
+    reported = [pose for piece in pieces if (pose := piece.pose()) is not None]
+    aligned = _alignment(pieces)
+    if reported:
+        yield min(reported, key=lambda pose: _cost(pose, pieces))
+    if aligned is not None:
+        yield aligned
+    if reported or aligned is not None:
+        return
+    x0, y0, x1, y1 = field.bounds()
+    for i in range(5):
+        for j in range(4):
+            for k in range(8):
+                x, y = x0 + (x1 - x0) * (i + 0.5) / 5, y0 + (y1 - y0) * (j + 0.5) / 4
+                yield Pose2(x, y, math.tau * k / 8)
+
+
+def _alignment(pieces: list[PropagatedEvidence]) -> Pose2 | None:
+    """Weighted rigid alignment of points in the robot's frame to points in the field."""
+    pairs = []
+    for piece in pieces:
+        point = piece.point()
+        if point is not None:
+            sigma = math.hypot(piece.sigma_m, piece.evidence.range_sigma_m)
+            pairs.append((1.0 / (sigma * sigma + 1e-6), *point, piece.evidence.x, piece.evidence.y))
+    total = sum(p[0] for p in pairs)
+    if len(pairs) < 2:
+        return None
+    ax, ay, bx, by = (sum(p[0] * p[i] for p in pairs) / total for i in range(1, 5))
+    dot = sum(w * ((px - ax) * (qx - bx) + (py - ay) * (qy - by)) for w, px, py, qx, qy in pairs)
+    cross = sum(w * ((px - ax) * (qy - by) - (py - ay) * (qx - bx)) for w, px, py, qx, qy in pairs)
+    if math.hypot(dot, cross) < 1e-9:
+        return None
+    heading = math.atan2(cross, dot)
+    c, s = math.cos(heading), math.sin(heading)
+    return Pose2(bx - c * ax + s * ay, by - s * ax - c * ay, heading)
+
+
+def _fit(start: Pose2, pieces: list[PropagatedEvidence]) -> tuple[float, Estimate, int] | None:
+    """(chi-square, estimate, degrees of freedom) by Gauss-Newton with the worst pieces left out."""
+    used = list(pieces)
+    while True:
+        estimate = Estimate(start, _OPEN)
+        for _ in range(10):
+            evidence = Information.none()
+            for piece in used:
+                for row, residual, variance in piece.rows(estimate.pose):
+                    evidence = evidence.add(row, residual, variance)
+            if evidence.matrix.hh <= 0.0:
+                return None
+            before = estimate.pose
+            estimate = merge(Estimate(before, _OPEN), evidence)
+            change = math.hypot(estimate.pose.x - before.x, estimate.pose.y - before.y)
+            if change < 1e-4 and abs(estimate.pose.heading - before.heading) < 1e-4:
+                break
+        costs = [_cost(estimate.pose, [piece]) for piece in used]
+        freedom = sum(p.residual_count for p in used) - 3
+        worst = max(range(len(used)), key=costs.__getitem__)
+        if costs[worst] < 14.0 or len(used) - 1 < max(2, 0.75 * len(pieces)):
+            return sum(costs), estimate, freedom
+        del used[worst]
+        start = estimate.pose
+
+
+def _is_certain(estimate: Estimate) -> bool:
+    """Sharp evidence that determines no pose leaves variances that are nothing but rounding."""
+    xx, _, yy, _, _, hh = estimate.covariance
+    return (
+        min(xx, yy, hh) > 0.0
+        and 0.5 * (xx + yy) < _ENOUGH_POSITION_SIGMA_M**2
+        and hh < _ENOUGH_HEADING_SIGMA_RAD**2
+    )
+
+
+def _are_apart(a: Pose2, b: Pose2) -> bool:
+    return (
+        math.hypot(a.x - b.x, a.y - b.y) > 0.5
+        or abs(math.remainder(a.heading - b.heading, math.tau)) > 0.5
+    )
+
+
+def _chi_square_bound(freedom: int) -> float:
+    """About the 99.9 % quantile (Wilson & Hilferty 1931)."""
+    k = max(freedom, 1)
+    return k * (1.0 - 2.0 / (9.0 * k) + 3.09 * math.sqrt(2.0 / (9.0 * k))) ** 3

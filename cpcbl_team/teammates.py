@@ -1,0 +1,112 @@
+"""Screening what teammates report by the trust that they have (beyond the paper).
+
+Every report about this robot's position, and every sighting of a teammate as a landmark, is
+assessed by `trust.py`. What may not be used is left out; what followed from it before may make the
+robot doubt its own estimate.
+"""
+
+from cpcbl_team import trust
+from cpcbl_team.config import LocalizationSettings
+from cpcbl_team.fusion import Observation
+from cpcbl_team.landmarks import LandmarkUpdate
+from cpcbl_team.measurements import GatedObject, GatedObjects
+from cpcbl_team.pose_observation import PoseObservation
+from cpcbl_team.recovery import inflate_by_offset, without_senders
+from cpcbl_team.state import State, with_memory
+
+
+class TeammateScreen:
+    """Leaves out what untrusted teammates report, and keeps the trust up to date."""
+
+    def __init__(
+        self, settings: LocalizationSettings, gates: tuple[float, float], is_probabilistic: bool
+    ) -> None:
+        """`gates`: chi-square bounds of one and of two degrees of freedom. Without a covariance
+        there is no NIS, and nothing is screened."""
+        self._rules = settings.collaboration.trust
+        self._localizer_rules = settings.localizer
+        self._gates = gates
+        self.is_active = self._rules.enabled and is_probabilistic
+
+    def has_recent_reports(self, state: State, now_ns: int) -> bool:
+        """Whether a teammate has reported anything lately that is to be screened."""
+        return self.is_active and now_ns - state.memory.teammates.last_report_ns <= trust.WINDOW_NS
+
+    def screen_frame(
+        self, state: State, landmarks: LandmarkUpdate, gated: GatedObjects
+    ) -> tuple[State, GatedObjects]:
+        """The state, and the gated objects without the teammates that the robot does not trust."""
+        now, is_lost = state.stamp_ns, bool(state.memory.recovery.lost)
+        accepted, rejected = (
+            sum(not found.measurement.is_teammate for found in objects) for objects in gated
+        )
+        accepted, rejected = accepted + len(landmarks.used), rejected + landmarks.rejected
+        if (accepted or rejected) and not is_lost:
+            state = self._with_own_sensors(state, accepted, rejected)
+        distrusted = set()
+        for m, constraints, nis in (*gated.accepted, *gated.rejected):
+            if m.is_teammate:
+                beliefs = state.memory.teammates.beliefs[m.source]
+                is_fresh = any(abs(now - b.stamp_ns) <= trust.FRESH_NS for b in beliefs)
+                of_two = 2.0 * nis / len(constraints) if is_fresh and not is_lost else None
+                report = trust.Said(now, of_two)
+                state, is_trusted = self._assess(state, m.source, report, m.source)
+                if not is_trusted:
+                    distrusted.add(m.source)
+        if not distrusted:
+            return state, gated
+        return state, GatedObjects(*(_without(objects, distrusted) for objects in gated))
+
+    def screen_observation(
+        self, state: State, observation: PoseObservation, position: Observation, nis: float
+    ) -> tuple[State, bool]:
+        """The state after an observation of the robot's pose, and whether it may be used.
+
+        `position` is its position about the estimate, `nis` that position's normalized innovation
+        squared. The robot's own position sensor is always used.
+        """
+        now, is_lost = state.stamp_ns, bool(state.memory.recovery.lost)
+        if observation.observer is None:
+            if self.has_recent_reports(state, now) and not is_lost:
+                is_accepted = nis <= self._gates[1]
+                state = self._with_own_sensors(state, is_accepted, not is_accepted)
+            return state, True
+        heading = observation.of_heading(state.estimate.pose)
+        if heading is not None:  # three degrees of freedom, scaled to two
+            nis += heading.normalized_innovation_squared(state.estimate.covariance)
+            nis *= 2.0 / 3.0
+        noise, (ex, ey) = position.noise(), position.residuals
+        variance = 0.5 * (noise.xx + noise.yy)
+        where = now, observation.x, observation.y, variance, state.odometry_from_robot
+        report = trust.Said(now, None if is_lost else nis, (ex, ey), trust.Anchor(*where))
+        return self._assess(state, observation.sender, report, observation.source)
+
+    def _with_own_sensors(self, state: State, accepted: int, rejected: int) -> State:
+        """The state with how far the robot's own sensors agree with the estimate."""
+        memory = state.memory.teammates
+        own = memory.senders.get(trust.OWN, trust.Voice())
+        own = trust.seen(own, state.stamp_ns, accepted, rejected, self._rules.limit)
+        memory = memory._replace(senders={**memory.senders, trust.OWN: own})
+        return with_memory(state, state.memory._replace(teammates=memory))
+
+    def _assess(
+        self, state: State, sender: str, report: trust.Said, source: str
+    ) -> tuple[State, bool]:
+        """The state after a report of a teammate, and whether the report may be used."""
+        memory, estimate = state.memory, state.estimate
+        senders, used_ns = memory.teammates.senders, state.updates.objects_ns.get(source)
+        before_ns = trust.NEVER_NS if used_ns is None else used_ns
+        decision = trust.judged(senders, sender, report, before_ns, self._rules)
+        if decision.event:
+            recovery = without_senders(memory.recovery, decision.silenced)
+            memory = memory.counted(decision.event)._replace(recovery=recovery)
+        if not decision.trusted:
+            memory = memory.counted("distrusted")
+        if decision.doubt_m:
+            estimate = inflate_by_offset(estimate, decision.doubt_m, self._localizer_rules)
+        memory = memory._replace(teammates=memory.teammates._replace(senders=decision.voices))
+        return state._replace(estimate=estimate, memory=memory), decision.trusted
+
+
+def _without(objects: list[GatedObject], distrusted: set[str]) -> list[GatedObject]:
+    return [found for found in objects if found.measurement.source not in distrusted]

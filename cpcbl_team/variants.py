@@ -1,0 +1,164 @@
+"""What the four variants of the localizer do differently: one class each.
+
+`joint` estimates position and heading together. `oval` and `circular` keep them apart, as in the
+paper. `weighted` is the paper's non-probabilistic variant (section 3).
+"""
+
+from cpcbl_team import weighted
+from cpcbl_team.config import LocalizationSettings
+from cpcbl_team.estimate import (
+    HEADING,
+    POSE,
+    POSITION,
+    Estimate,
+    Information,
+    Scope,
+    Sums,
+    circular,
+    merge,
+)
+from cpcbl_team.fusion import Observation, merge_naive, merge_split, with_all_shared
+from cpcbl_team.landmarks import LandmarkUpdate
+from cpcbl_team.measurements import GatedObject, combine, observation_of
+from cpcbl_team.motion import move
+
+UpdateOrder = tuple[Scope | None, ...]
+
+
+class JointVariant:
+    """An extended Kalman filter over the whole pose."""
+
+    is_probabilistic = True
+
+    def __init__(self, settings: LocalizationSettings) -> None:
+        rules = settings.localizer
+        self._noise = settings.odometry
+        self.update_orders: tuple[UpdateOrder, UpdateOrder] = ((POSE, None), (POSE, None))
+        """What an update is tried for, the last (None) for nothing; after an update of the
+        position, and after one of the heading."""
+        if rules.alternates:
+            self.update_orders = ((HEADING, POSITION, None), (POSITION, HEADING, None))
+        splits = settings.collaboration.fusion == "split-ci"
+        self._merge_teammate = merge_split if splits else merge_naive
+
+    def scope(self, scope: Scope) -> Scope:
+        """What a merge may move, where measurements of this part of the pose are used."""
+        return POSE
+
+    def reduce(self, estimate: Estimate) -> Estimate:
+        """The estimate in the form that the variant keeps."""
+        return estimate
+
+    def move(self, estimate: Estimate, distance: float, turn: float, crawled_s: float) -> Estimate:
+        """Step 1: the estimate after an arc of `distance` (m) that turns by `turn` (rad)."""
+        return move(estimate, distance, turn, self._noise, crawled_s)
+
+    def merge(self, prior: Estimate, evidence: Sums, scope: Scope) -> Estimate:
+        """Step 5: the prior and the evidence as one Gaussian (equations 3 and 4)."""
+        return merge(prior, evidence, scope)
+
+    def correct(
+        self, prior: Estimate, landmarks: LandmarkUpdate, accepted: list[GatedObject], scope: Scope
+    ) -> Estimate:
+        """Steps 4 and 5: all evidence combined, then merged with the prior (equations 3 and 4).
+        The observations of teammates follow one by one."""
+        scope, evidence = self.scope(scope), landmarks.evidence.sums()
+        if not accepted:
+            return self.merge(prior, evidence, scope)
+        estimate = merge(prior, combine(Information.of(evidence), accepted), scope)
+        for found in accepted:
+            m = found.measurement
+            if m.is_teammate:
+                observation = observation_of(prior, m, found.constraints, estimate)
+                estimate = self._merge_teammate(estimate, observation, scope)
+        return self.reduce(estimate)
+
+    def correct_position(
+        self, prior: Estimate, position: Observation, by_teammate: bool
+    ) -> Estimate:
+        """The estimate after a teammate, or the position sensor, observed the position."""
+        if by_teammate:
+            return self._merge_teammate(prior, position, self.scope(POSITION))
+        return merge(prior, position.information(), self.scope(POSITION))
+
+    def correct_heading(self, prior: Estimate, heading: Observation) -> Estimate:
+        """The estimate after a teammate observed the heading."""
+        return self._merge_teammate(prior, heading, self.scope(HEADING))
+
+
+class OvalVariant(JointVariant):
+    """Position and heading apart, the position's covariance of any shape."""
+
+    def __init__(self, settings: LocalizationSettings) -> None:
+        super().__init__(settings)
+        self._uncoupled = settings.localizer.paper_uncertainty
+
+    def scope(self, scope: Scope) -> Scope:
+        return scope
+
+    def reduce(self, estimate: Estimate) -> Estimate:
+        if self._uncoupled:
+            covariance = estimate.covariance._replace(xh=0.0, yh=0.0)
+            estimate = estimate._replace(covariance=covariance)
+        return with_all_shared(estimate)
+
+    def move(self, estimate: Estimate, distance: float, turn: float, crawled_s: float) -> Estimate:
+        return self.reduce(move(estimate, distance, turn, self._noise, crawled_s))
+
+    def merge(self, prior: Estimate, evidence: Sums, scope: Scope) -> Estimate:
+        return self.reduce(merge(prior, evidence, scope))
+
+
+class CircularVariant(OvalVariant):
+    """Position and heading apart, the position's covariance a circle."""
+
+    def reduce(self, estimate: Estimate) -> Estimate:
+        if self._uncoupled:
+            estimate = super().reduce(estimate)
+        return with_all_shared(circular(estimate))
+
+    def move(self, estimate: Estimate, distance: float, turn: float, crawled_s: float) -> Estimate:
+        if self._uncoupled:
+            return super().move(estimate, distance, turn, crawled_s)
+        return with_all_shared(move(estimate, distance, turn, self._noise, crawled_s, True))
+
+    def merge(self, prior: Estimate, evidence: Sums, scope: Scope) -> Estimate:
+        if self._uncoupled:
+            return super().merge(prior, evidence, scope)
+        return with_all_shared(merge(prior, evidence, scope, as_circle=True))
+
+
+class WeightedVariant(CircularVariant):
+    """Weighted averages; the covariance is nominal."""
+
+    is_probabilistic = False
+
+    def __init__(self, settings: LocalizationSettings) -> None:
+        super().__init__(settings)
+        self._weights = settings.localizer.weights
+
+    def correct(
+        self, prior: Estimate, landmarks: LandmarkUpdate, accepted: list[GatedObject], scope: Scope
+    ) -> Estimate:
+        """Steps 4 and 5: inverse-distance weights among readings, then the static weight."""
+        constraints = [c for found in accepted for c in found.constraints]
+        return self.reduce(weighted.merged(prior, constraints, self._weights))
+
+    def correct_position(
+        self, prior: Estimate, position: Observation, by_teammate: bool
+    ) -> Estimate:
+        x, y = position.residuals
+        return weighted.averaged(prior, (x, y), None, self._weights)
+
+    def correct_heading(self, prior: Estimate, heading: Observation) -> Estimate:
+        return weighted.averaged(prior, (0.0, 0.0), heading.residuals[0], self._weights)
+
+
+def variant_of(settings: LocalizationSettings) -> JointVariant:
+    """The variant that the settings name."""
+    name = settings.localizer.variant
+    if name == "joint":
+        return JointVariant(settings)
+    if name == "oval":
+        return OvalVariant(settings)
+    return CircularVariant(settings) if name == "circular" else WeightedVariant(settings)
