@@ -1,6 +1,6 @@
-"""What the agents of one robot say to each other.
+"""The messages between the agents of one robot.
 
-An agent is an object with `handle(message, now_ns) -> messages`. It sees neither bus nor clock, so
+An agent is an object with `handle(message, now_ns) -> messages`. It knows neither bus nor clock, so
 the same object runs live, in one process with others, and in replay.
 """
 
@@ -15,51 +15,60 @@ class Tick(NamedTuple):
     """Time has passed."""
 
 
-class Located(NamedTuple):
-    """The filter's belief at a time. With `frame`: at the time of that frame, for fixes.
-
-    Its bearings are without the bias that the robot has learned, as in the belief.
-    """
+class PoseEstimate(NamedTuple):
+    """The filter's regular report: its estimate at a time."""
 
     stamp_ns: int
     estimate: Estimate
     lost: str
+    """Why the robot is lost; empty while it is not."""
     speed_m_s: float
     turn_rate_rad_s: float
-    frame: Sightings | None = None
+
+
+class FrameEstimate(NamedTuple):
+    """The filter's estimate at the time of a frame, from which fixes are made.
+
+    The frame's bearings are corrected by the bias that the robot has learned, as the estimate is.
+    """
+
+    frame: Sightings
+    estimate: Estimate
+    lost: str
 
 
 class Presence(NamedTuple):
-    """The bus knows of a teammate: the tier that it announces; None when it is gone."""
+    """The tier that a teammate's liveliness token announces; None when the teammate is gone."""
 
     robot: str
     tier: int | None
 
 
 class UnknownRobot(NamedTuple):
-    """Help has come from somebody who is neither in the team file nor known as a guest."""
+    """A fix or belief came from a robot that is neither in the team file nor known as a guest."""
 
     robot: str
 
 
 class BeliefSubscribers(NamedTuple):
-    """Whether any teammate listens to this robot's beliefs at present."""
+    """Whether any teammate subscribes to this robot's beliefs at present."""
 
     present: bool
 
 
 class FrameSubscribers(NamedTuple):
-    """Whether anybody looks at what this robot's camera sees."""
+    """Whether anybody subscribes to this robot's annotated frames at present."""
 
     present: bool
 
 
 class HelpSent(NamedTuple):
-    """Help that has left this robot, and its bytes on the wire; 0: nobody listened, it has not."""
+    """A fix or belief was passed to the bus; `size` is its bytes on the link, 0 if it was not sent
+    because nobody subscribes."""
 
     message: Belief | Fix
     size: int
 
 
 BusEvent = Presence | UnknownRobot | BeliefSubscribers | FrameSubscribers | HelpSent
-AgentMessage = Message | Tick | Located | Told | BusEvent
+AgentMessage = Message | Tick | PoseEstimate | FrameEstimate | Told | BusEvent

@@ -1,10 +1,10 @@
-"""Counts of what a robot said and heard, and of what it did not say, by kind and teammate."""
+"""Counts of the fixes and beliefs that a robot sent, received and held back, by teammate."""
 
 from cpcbl_transport.messages import Flow
 
 
 class MessageCounter:
-    """Help of one kind from or for one teammate."""
+    """Messages of one topic from or for one teammate; the names are those of `Flow`."""
 
     def __init__(self) -> None:
         self.messages = self.bytes = self.over_budget = self.worthless = self.silent = 0
@@ -18,15 +18,15 @@ class MessageCounter:
 
 
 class MessageCounters:
-    """By (topic, teammate)."""
+    """A counter for each topic and teammate."""
 
     def __init__(self) -> None:
-        self._tallies: dict[tuple[str, str], MessageCounter] = {}
+        self._counters: dict[tuple[str, str], MessageCounter] = {}
 
     def of(self, topic: str, peer: str) -> MessageCounter:
-        return self._tallies.setdefault((topic, peer), MessageCounter())
+        return self._counters.setdefault((topic, peer), MessageCounter())
 
     def flows(self) -> tuple[Flow, ...]:
-        """As they are reported; without those that counted nothing."""
-        flows = (Flow(*key, **vars(tally)) for key, tally in sorted(self._tallies.items()))
+        """The counters as they are reported, without those that counted nothing."""
+        flows = (Flow(*key, **vars(counter)) for key, counter in sorted(self._counters.items()))
         return tuple(f for f in flows if f.messages or f.over_budget or f.worthless or f.silent)

@@ -1,11 +1,11 @@
-"""What one robot has declared on the bus: its token, whom it hears, whom it watches, its keys.
+"""What one robot has declared on the bus: its liveliness token, subscriptions and publishers.
 
-A change declares the new first and then takes the old back, so that nothing is missed between.
+After a change it declares the new first and then takes the old back, so that nothing is missed.
 """
 
 from collections.abc import Callable, Iterable, Mapping
 
-from cpcbl_agents.collaboration import CollaborationAgent
+from cpcbl_agents.collaboration import Interests
 from cpcbl_team.collaboration import LOWEST_TIER, tiers_heard
 from cpcbl_team.config import CollaborationSettings
 from cpcbl_transport import topics
@@ -17,7 +17,7 @@ _BY_TIER = tuple(topic.key.split("/")[0] + "/" for topic in (topics.BELIEF, topi
 
 
 class Declarations:
-    """One robot's declarations; follows what its collaboration agent wants."""
+    """One robot's declarations; `update` fits them to what the robot is interested in."""
 
     def __init__(
         self,
@@ -25,14 +25,14 @@ class Declarations:
         incarnation: str,
         rules: CollaborationSettings,
         bus: Bus,
-        receive: MessageCallback,
-        watch: LivelinessCallback,
+        on_message: MessageCallback,
+        on_token: LivelinessCallback,
     ) -> None:
         self._robot, self._incarnation, self._rules = robot, incarnation, rules
-        self._bus, self._receive, self._watch = bus, receive, watch
+        self._bus, self._on_message, self._on_token = bus, on_message, on_token
         self._publishers: dict[str, Publisher] = {}
-        self._hearing: dict[str, Handle] = {}
-        self._watching: dict[str, Handle] = {}
+        self._subscriptions: dict[str, Handle] = {}
+        self._watched: dict[str, Handle] = {}
         self._token: Handle | None = None
         self._sources: frozenset[tuple[str, int]] = frozenset()
         self._neighbours: frozenset[str] = frozenset()
@@ -47,39 +47,41 @@ class Declarations:
             self._publishers[key] = self._bus.publisher(key, topic.qos)
         return self._publishers[key]
 
-    def update(self, agent: CollaborationAgent) -> frozenset[str]:
-        """Declares what the agent wants now. The teammates that are no longer watched."""
-        if agent.located is None:
+    def update(self, interests: Interests | None) -> frozenset[str]:
+        """Declares what is of interest now. Returns the teammates that are no longer watched."""
+        if interests is None:
             return frozenset()
-        moved, token = agent.tier != self.tier, self._token
-        if moved:
-            self.tier = agent.tier
-            key = topics.ALIVE.at(tier=agent.tier, robot=self._robot, incarnation=self._incarnation)
+        tier, neighbours, sources = interests
+        is_new_tier, old_token = tier != self.tier, self._token
+        if is_new_tier:
+            self.tier = tier
+            key = topics.ALIVE.at(tier=tier, robot=self._robot, incarnation=self._incarnation)
             self._token = self._bus.declare_token(key)
             self.announced += 1
-        if moved or agent.sources != self._sources:
-            self._sources = agent.sources
-            hear = self._bus.subscribe
-            _declare(self._hearing, self._heard(agent.tier), lambda k: hear(k, self._receive))
-        forgotten = self._neighbours - agent.neighbours
-        if agent.neighbours != self._neighbours:
-            self._neighbours = agent.neighbours
-            alive = (topics.ALIVE.at(robot=name) for name in agent.neighbours)
+        if is_new_tier or sources != self._sources:
+            self._sources = sources
+            subscribe = self._bus.subscribe
+            keys = self._subscribed_keys(tier)
+            _declare(self._subscriptions, keys, lambda k: subscribe(k, self._on_message))
+        forgotten = self._neighbours - neighbours
+        if neighbours != self._neighbours:
+            self._neighbours = neighbours
+            tokens = (topics.ALIVE.at(robot=name) for name in neighbours)
             watch = self._bus.watch_liveliness
-            _declare(self._watching, alive, lambda k: watch(k, self._watch))
-        if moved:
+            _declare(self._watched, tokens, lambda k: watch(k, self._on_token))
+        if is_new_tier:
             for key in [k for k in self._publishers if k.startswith(_BY_TIER)]:
                 self._publishers.pop(key).close()
-            if token is not None:
-                token.close()
+            if old_token is not None:
+                old_token.close()
         return forgotten
 
-    def _heard(self, tier: int) -> Iterable[str]:
+    def _subscribed_keys(self, tier: int) -> Iterable[str]:
         if self._rules.active:
             for better in tiers_heard(tier, self._rules):
                 yield topics.FIX.at(robot=self._robot, tier=better)
-        for name, theirs in self._sources:
-            yield topics.BELIEF.at(tier=theirs, robot=name)
+        for name, their_tier in self._sources:
+            yield topics.BELIEF.at(tier=their_tier, robot=name)
 
 
 def _declare(
@@ -93,13 +95,13 @@ def _declare(
 
 
 class LivelinessTokens:
-    """The liveliness tokens of teammates; one may have two for a while, the newest counts."""
+    """The tokens of teammates. A teammate may have two for a while; the newest counts."""
 
     def __init__(self) -> None:
         self._tiers: dict[str, dict[str, int]] = {}
 
     def update(self, key: str, alive: bool) -> tuple[str, int | None] | None:
-        """The teammate and its tier, None once it is gone; None for what is no robot's token."""
+        """The teammate and its tier (None once it is gone); None if the key is no robot's token."""
         names: Mapping[str, str] = topics.ALIVE.names(key) or {}
         tier = _TIERS.get(names.get("tier", ""))
         if tier is None:

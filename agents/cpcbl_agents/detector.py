@@ -1,12 +1,15 @@
 """What makes sightings of a camera's frames: the protocol, without OpenCV (`vision` has that)."""
 
-from typing import NamedTuple, Protocol
+from __future__ import annotations
 
-import numpy as np
-from numpy.typing import NDArray
+from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 from cpcbl_team.inputs import Sightings
 from cpcbl_transport.messages import AnnotatedFrame, Frame
+
+if TYPE_CHECKING:  # a robot without a camera does not load numpy
+    import numpy as np
+    from numpy.typing import NDArray
 
 NEEDS_OPENCV = "needs OpenCV: pip install 'cpcbl-team[camera]'"
 

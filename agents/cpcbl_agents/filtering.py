@@ -1,24 +1,23 @@
-"""The filter agent: inputs in any order in, beliefs out."""
+"""The filter agent: it takes inputs in any order and reports pose estimates."""
 
 from collections import Counter, deque
 from collections.abc import Sequence
 
-from cpcbl_agents.agent import AgentMessage, Located, Presence, Tick
+from cpcbl_agents.agent import AgentMessage, FrameEstimate, PoseEstimate, Presence, Tick
 from cpcbl_team.config import Field, LocalizationSettings
 from cpcbl_team.inputs import Belief, Fix, Input, Odometry, Position, Sightings, Told
 from cpcbl_team.localizer import Localizer
 from cpcbl_team.self_calibration import Learned
 from cpcbl_team.sensors import without_bearing_bias
-from cpcbl_team.state import State
 from cpcbl_team.timeline import Timeline
 from cpcbl_team.trust import Standing, standings
 
-LOCATE_NS = 100_000_000
-PATIENCE_NS = 200_000_000  # how long a frame waits for the odometry that covers it
+REPORT_INTERVAL_NS = 100_000_000
+ODOMETRY_WAIT_NS = 200_000_000  # how long a frame waits for the odometry that covers it
 
 
 class FilterAgent:
-    """Runs one localizer on its timeline. Reports where it is at 10 Hz and for each frame."""
+    """Runs one localizer on its timeline. It reports its estimate at 10 Hz and for each frame."""
 
     def __init__(
         self,
@@ -35,18 +34,18 @@ class FilterAgent:
         self._moves = settings.odometry.moves
         self._learns = settings.localizer.learns
         self._waiting: deque[Sightings] = deque()
-        self._located_ns = start_ns
+        self._reported_ns = start_ns
         self._odometry: Odometry | None = None
         self._covered_ns = start_ns
 
     @property
     def next_ns(self) -> int:
         """When the next regular report is due."""
-        return self._located_ns + LOCATE_NS
+        return self._reported_ns + REPORT_INTERVAL_NS
 
     @property
     def all_counts(self) -> Counter[str]:
-        """What was refused here, what was used and gated by the localizer."""
+        """What this agent refused, and what the localizer used and gated."""
         return self.counts + Counter(self.timeline.state.counts)
 
     @property
@@ -55,66 +54,63 @@ class FilterAgent:
         return self.timeline.state.memory.calibration.learned if self._learns else None
 
     def standings(self, now_ns: int) -> tuple[Standing, ...]:
-        """How each teammate that is heard stands with this robot."""
+        """How far this robot trusts each teammate from which it receives messages."""
         return standings(self.timeline.state.memory.teammates.senders, now_ns)
 
     def handle(self, message: AgentMessage, now_ns: int) -> Sequence[AgentMessage]:
         match message:
             case Odometry():
-                if self._take(message) and message.stamp_ns > self._covered_ns:
+                if self._add(message) and message.stamp_ns > self._covered_ns:
                     self._odometry = message
                     self._covered_ns = message.stamp_ns
-                return self._frames_located(now_ns)
+                return self._frame_estimates(now_ns)
             case Sightings():
                 for sighting in message.sightings:
                     if sighting.id not in self._known and sighting.id not in self._guests:
                         self.counts["unknown_object"] += 1
-                if self._take(message):
+                if self._add(message):
                     self._waiting.append(message)
-                return self._frames_located(now_ns)
+                return self._frame_estimates(now_ns)
             case Position() | Belief() | Fix() | Told():
-                self._take(message)
+                self._add(message)
             case Presence(name, None):
                 self._guests.discard(name)
             case Presence(name) if name not in self._known:
                 self._guests.add(name)
             case Tick() if now_ns >= self.next_ns:
-                return [*self._frames_located(now_ns), *self._regularly(now_ns)]
+                return [*self._frame_estimates(now_ns), self._regular_estimate(now_ns)]
         return ()
 
-    def _take(self, item: Input) -> bool:
-        """Whether the timeline could use it."""
-        refused = self.timeline.add(item)
-        if refused:
-            self.counts[refused] += 1
-        return not refused
+    def _add(self, item: Input) -> bool:
+        """Adds an input to the timeline; whether the timeline could use it."""
+        refusal = self.timeline.add(item)
+        if refusal:
+            self.counts[refusal] += 1
+        return not refusal
 
-    def _regularly(self, now_ns: int) -> Sequence[Located]:
-        self._located_ns = now_ns
+    def _regular_estimate(self, now_ns: int) -> PoseEstimate:
+        self._reported_ns = now_ns
         state = self.timeline.latest(now_ns)
-        return [self._located(state)]
+        speed = turn_rate = 0.0
+        o = self._odometry
+        if o is not None and state.stamp_ns - o.stamp_ns < ODOMETRY_WAIT_NS:
+            seconds = (o.stamp_ns - o.from_ns) * 1e-9
+            speed, turn_rate = o.distance_m / seconds, o.turn_rad / seconds
+        return PoseEstimate(state.stamp_ns, state.estimate, state.lost, speed, turn_rate)
 
-    def _frames_located(self, now_ns: int) -> Sequence[Located]:
-        """The belief at each frame whose time is covered by odometry (or that waited in vain)."""
+    def _frame_estimates(self, now_ns: int) -> list[FrameEstimate]:
+        """The estimate at each frame that odometry covers by now, or that waited long enough."""
         ready = []
         while self._waiting:
             stamp_ns = self._waiting[0].stamp_ns
-            covered = not self._moves or self._covered_ns >= stamp_ns
-            if not covered and now_ns - stamp_ns < PATIENCE_NS:
+            is_covered = not self._moves or self._covered_ns >= stamp_ns
+            if not is_covered and now_ns - stamp_ns < ODOMETRY_WAIT_NS:
                 break
             frame = self._waiting.popleft()
             state = self.timeline.at(stamp_ns)
-            if state is not None:
-                ready.append(self._located(state, frame))
+            if state is None:
+                continue
+            if self._learns:
+                frame = without_bearing_bias(frame, state.memory.calibration.learned.bearing_bias_rad)
+            ready.append(FrameEstimate(frame, state.estimate, state.lost))
         return ready
-
-    def _located(self, state: State, frame: Sightings | None = None) -> Located:
-        speed = turn_rate = 0.0
-        o = self._odometry
-        if o is not None and state.stamp_ns - o.stamp_ns < PATIENCE_NS:
-            seconds = (o.stamp_ns - o.from_ns) * 1e-9
-            speed, turn_rate = o.distance_m / seconds, o.turn_rad / seconds
-        if frame is not None and self._learns:
-            frame = without_bearing_bias(frame, state.memory.calibration.learned.bearing_bias_rad)
-        stamp_ns = state.stamp_ns if frame is None else frame.stamp_ns
-        return Located(stamp_ns, state.estimate, state.lost, speed, turn_rate, frame)

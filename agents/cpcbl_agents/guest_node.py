@@ -4,8 +4,8 @@ import logging
 from collections import Counter
 from collections.abc import Callable
 
+from cpcbl_agents.composition import build_robot
 from cpcbl_agents.node import Node
-from cpcbl_agents.robot import Robot
 from cpcbl_agents.sources import OwnCamera
 from cpcbl_team.config import Team
 from cpcbl_transport import topics
@@ -34,7 +34,7 @@ class GuestNode:
         speed: float = 1.0,
         camera: OwnCamera | None = None,
     ) -> None:
-        self.robot = Robot(name, team, start_ns, camera=camera)
+        self.robot = build_robot(name, team, start_ns, camera=camera)
         self._node = Node(self.robot, team, bus, start_ns, incarnation, on_arrival, speed)
         self._incarnation, self._due_ns = incarnation, start_ns
         self._warn_ns: int | None = start_ns + PATIENCE_NS

@@ -1,8 +1,8 @@
-"""A robot on a bus: which keys it hears, what it may send, what it refuses."""
+"""A robot on a bus: it takes in what arrives, refuses what must not be used, and publishes."""
 
 import logging
 from collections import Counter, deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from typing import Protocol
 
 from cpcbl_agents.agent import (
@@ -19,23 +19,19 @@ from cpcbl_agents.declarations import Declarations, LivelinessTokens
 from cpcbl_agents.robot import Robot
 from cpcbl_team.config import Team
 from cpcbl_team.inputs import Belief, Fix
-from cpcbl_team.trust import Standing
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus
-from cpcbl_transport.compact import decode_help, encode_help
+from cpcbl_transport.compact import encode_help
+from cpcbl_transport.decoding import decode_by_key
 from cpcbl_transport.link_size import received_bytes, sent_bytes
 from cpcbl_transport.messages import (
-    LARGEST_FRAME,
     LARGEST_PAYLOAD,
     AnnotatedFrame,
     Drive,
     Help,
     Message,
     Refusal,
-    Status,
     Track,
-    Trust,
-    decode_tagged,
     encode,
     refusal,
 )
@@ -49,7 +45,7 @@ ON_ARRIVAL = ("frame_skipped", "inbox_overflow", "news_overflow", "same_name_twi
 
 
 class Steppable(Protocol):
-    """A robot's node, or whatever else is stepped like one."""
+    """A robot's node, or anything else that the same loop steps."""
 
     @property
     def next_ns(self) -> int:
@@ -60,7 +56,7 @@ class Steppable(Protocol):
         """Whether something has arrived."""
 
     def step(self, now_ns: int) -> None:
-        """Does what is due and takes what has arrived."""
+        """Does what is due and handles what has arrived."""
 
 
 class Node:
@@ -85,25 +81,25 @@ class Node:
         self._team, self._passive = frozenset(team.robots), rules.passive
         self._inbox: deque[tuple[str, bytes]] = deque(maxlen=INBOX)
         self._frames: deque[tuple[str, bytes]] = deque(maxlen=1)
-        self._news: deque[tuple[str, bool]] = deque(maxlen=INBOX)
+        self._liveliness_events: deque[tuple[str, bool]] = deque(maxlen=INBOX)
         self._declarations = Declarations(
-            robot.name, incarnation, rules, bus, self._arrived, self._seen_alive
+            robot.name, incarnation, rules, bus, self._on_message, self._on_token
         )
         self._tokens = LivelinessTokens()
-        self._listened, self._looked = "", False
+        self._subscribed_key, self._has_frame_subscribers = "", False
         self._status_ns = start_ns
         # What threads of the bus count has its entry: to add one, another thread must not read
         self.counts: Counter[str] = Counter(dict.fromkeys(ON_ARRIVAL, 0))
         self.received = MessageCounters()
         self._clocks = ClockMonitor(rules.trust, speed) if rules.trust.enabled else None
         self._inputs = [
-            bus.subscribe(topic.at(robot=robot.name), self._arrived) for topic in topics.INPUTS
+            bus.subscribe(topic.at(robot=robot.name), self._on_message) for topic in topics.INPUTS
         ]
-        self._own_name = bus.watch_liveliness(topics.ALIVE.at(robot=robot.name), self._seen_my_name)
+        self._own_name = bus.watch_liveliness(topics.ALIVE.at(robot=robot.name), self._on_own_name)
 
     # On a thread of the bus ---------------------------------------------------------------------
 
-    def _arrived(self, key: str, payload: bytes) -> None:
+    def _on_message(self, key: str, payload: bytes) -> None:
         if key == self._frame_key:  # only the latest: a robot that is slow sees less, not late
             if self._frames:
                 self.counts["frame_skipped"] += 1
@@ -111,17 +107,17 @@ class Node:
         else:
             if len(self._inbox) == INBOX:
                 self.counts["inbox_overflow"] += 1
-            enough = payload[: LARGEST_PAYLOAD + 1]  # to refuse it; it may be as large as a frame
-            self._inbox.append((key, enough))
+            kept = payload[: LARGEST_PAYLOAD + 1]  # enough to refuse it; it may be a large frame
+            self._inbox.append((key, kept))
         self._on_arrival()
 
-    def _seen_alive(self, key: str, alive: bool) -> None:
-        if len(self._news) == INBOX:
+    def _on_token(self, key: str, alive: bool) -> None:
+        if len(self._liveliness_events) == INBOX:
             self.counts["news_overflow"] += 1
-        self._news.append((key, alive))
+        self._liveliness_events.append((key, alive))
         self._on_arrival()
 
-    def _seen_my_name(self, key: str, alive: bool) -> None:
+    def _on_own_name(self, key: str, alive: bool) -> None:
         if alive and not key.endswith("/" + self._incarnation):
             self.counts["same_name_twice"] += 1
 
@@ -135,72 +131,71 @@ class Node:
     @property
     def waiting(self) -> bool:
         """Whether something has arrived."""
-        return bool(self._inbox or self._news or self._frames)
+        return bool(self._inbox or self._liveliness_events or self._frames)
 
     def step(self, now_ns: int) -> None:
-        """Takes in what has arrived, lets the robot work, sends what it says.
+        """Handles what has arrived, lets the robot work, and publishes the results.
 
-        What arrives meanwhile is for the next step: under a flood there is always more.
+        What arrives meanwhile waits for the next step: a flood must not keep this one from ending.
         """
-        self._take_tokens(now_ns)
+        self._handle_liveliness(now_ns)
         for _ in range(len(self._inbox)):
-            self._take(*self._inbox.popleft(), now_ns)
+            self._handle_payload(*self._inbox.popleft(), now_ns)
         if self._frames:
-            self._take(*self._frames.popleft(), now_ns)
-        self._ask_for_listeners(now_ns)
-        self._ask_for_lookers(now_ns)
-        said = self._robot.handle(Tick(), now_ns)
-        for name in self._declarations.update(self._robot.collaboration):
+            self._handle_payload(*self._frames.popleft(), now_ns)
+        self._check_belief_subscribers(now_ns)
+        self._check_frame_subscribers(now_ns)
+        outgoing = self._robot.handle(Tick(), now_ns)
+        for name in self._declarations.update(self._robot.interests):
             self._tokens.forget(name)
             self._robot.handle(Presence(name, None), now_ns)
-        self._send(said, now_ns)  # under the tier of what is said
+        self._send(outgoing, now_ns)  # under the tier that these messages belong to
         if now_ns - self._status_ns >= STATUS_NS and self._declarations.tier is not None:
             self._status_ns = now_ns
-            self._publish(topics.STATUS, topics.STATUS.at(robot=self._name), self._status(now_ns))
+            self._publish_status(now_ns)
 
-    def _take(self, key: str, payload: bytes, now_ns: int) -> None:
-        message = self._accepted(key, payload, now_ns)
+    def _handle_payload(self, key: str, payload: bytes, now_ns: int) -> None:
+        message = self._decode(key, payload, now_ns)
         if message is not None:
             self._send(self._robot.handle(message, now_ns), now_ns)
             self._count(message, len(payload))
 
-    def _take_tokens(self, now_ns: int) -> None:
-        """What the bus knows of teammates: who is there, with which tier."""
-        for _ in range(len(self._news)):
-            presence = self._tokens.update(*self._news.popleft())
+    def _handle_liveliness(self, now_ns: int) -> None:
+        """Tells the robot which teammates are present, and with which tier."""
+        for _ in range(len(self._liveliness_events)):
+            presence = self._tokens.update(*self._liveliness_events.popleft())
             if presence is None:
                 self.counts["bad_token"] += 1
                 continue
-            guests, (name, tier) = self._robot.collaboration.guests, presence
-            known = name in guests
+            name, tier = presence
+            was_guest = self._robot.is_guest(name)
             self._robot.handle(Presence(name, tier), now_ns)
-            if known is not (name in guests):
-                log.info("%s: guest %s %s", self._name, name, "left" if known else "joined")
+            if was_guest is not self._robot.is_guest(name):
+                log.info("%s: guest %s %s", self._name, name, "left" if was_guest else "joined")
 
-    def _ask_for_listeners(self, now_ns: int) -> None:
+    def _check_belief_subscribers(self, now_ns: int) -> None:
         tier = self._declarations.tier
         if tier is None or not self._passive:
             return
         key = topics.BELIEF.at(tier=tier, robot=self._name)
-        listened = key if self._declarations.publisher(topics.BELIEF, key).matching else ""
-        if listened != self._listened:  # to another key others may listen
-            self._listened = listened
-            self._robot.handle(BeliefSubscribers(bool(listened)), now_ns)
+        subscribed = key if self._declarations.publisher(topics.BELIEF, key).matching else ""
+        if subscribed != self._subscribed_key:  # another key may have other subscribers
+            self._subscribed_key = subscribed
+            self._robot.handle(BeliefSubscribers(bool(subscribed)), now_ns)
 
-    def _ask_for_lookers(self, now_ns: int) -> None:
-        if not self._robot.sensing.has_detector:
+    def _check_frame_subscribers(self, now_ns: int) -> None:
+        if not self._robot.has_detector:
             return
         key = topics.LOOK.at(robot=self._name)
-        looked = self._declarations.publisher(topics.LOOK, key).matching
-        if looked is not self._looked:
-            self._looked = looked
-            self._robot.handle(FrameSubscribers(looked), now_ns)
+        present = self._declarations.publisher(topics.LOOK, key).matching
+        if present is not self._has_frame_subscribers:
+            self._has_frame_subscribers = present
+            self._robot.handle(FrameSubscribers(present), now_ns)
 
-    def _accepted(self, key: str, payload: bytes, now_ns: int) -> Message | None:
-        helps = key.startswith(("belief/", "fix/"))
-        largest = LARGEST_FRAME if key == self._frame_key else LARGEST_PAYLOAD
-        message = decode_help(key, payload) if helps else decode_tagged(payload, largest)
-        reason = message if isinstance(message, Refusal) else self._refused(key, message, now_ns)
+    def _decode(self, key: str, payload: bytes, now_ns: int) -> Message | None:
+        """The message; None if it is refused, which is counted."""
+        message = decode_by_key(key, payload)
+        reason = message if isinstance(message, Refusal) else self._refusal(message, now_ns)
         if reason is not None:
             self.counts[reason] += 1
             return None
@@ -208,23 +203,21 @@ class Node:
         return message
 
     def _count(self, message: Message, size: int) -> None:
-        """What was heard, once that has been used."""
+        """Counts a fix or belief that was received and used."""
         match message:
             case Fix(observer=name):  # by a subscription to all observers
                 self.received.of("fix", name).add(received_bytes(size, name), message.stamp_ns)
             case Belief(robot=name):  # by one to this key
                 self.received.of("belief", name).add(sent_bytes(size), message.stamp_ns)
 
-    def _refused(self, key: str, message: Message, now_ns: int) -> Refusal | None:
-        """What the key allows, who may say it, then the numbers and the time."""
+    def _refusal(self, message: Message, now_ns: int) -> Refusal | None:
+        """Why a message must not be used: its sender, then its clock, its numbers and its time."""
         match message:
             case Belief(robot=sender) | Fix(observer=sender):
                 pass
-            case _ if type(message) is _INPUTS.get(key.rsplit("/", 1)[-1]):
-                return refusal(message, now_ns)
             case _:
-                return Refusal.WRONG_TYPE
-        if sender not in self._team and sender not in self._robot.collaboration.guests:
+                return refusal(message, now_ns)
+        if sender not in self._team and not self._robot.is_guest(sender):
             self._robot.handle(UnknownRobot(sender), now_ns)
             return Refusal.UNKNOWN_ROBOT
         if sender == self._name:
@@ -233,14 +226,14 @@ class Node:
             return Refusal.CLOCK
         return refusal(message, now_ns)
 
-    def _send(self, said: Iterable[Message], now_ns: int) -> None:
-        for message in said:
-            topic, key = self._addressed(message)
+    def _send(self, outgoing: Iterable[Message], now_ns: int) -> None:
+        for message in outgoing:
+            topic, key = self._address(message)
             size = self._publish(topic, key, message)
             if isinstance(message, topics.COLLABORATION):
                 self._robot.handle(HelpSent(message, sent_bytes(size) if size else 0), now_ns)
 
-    def _addressed(self, message: Message) -> tuple[Topic, str]:
+    def _address(self, message: Message) -> tuple[Topic, str]:
         me, tier = self._name, self._declarations.tier
         match message:
             case Belief():
@@ -257,7 +250,7 @@ class Node:
         raise TypeError(f"robots do not send {type(message).__name__}")
 
     def _publish(self, topic: Topic, key: str, message: Message) -> int:
-        """Sends if anybody listens; the bytes of the payload."""
+        """Publishes if there is a subscriber; returns the bytes of the payload, 0 without one."""
         publisher = self._declarations.publisher(topic, key)
         if not publisher.matching:
             return 0
@@ -265,42 +258,13 @@ class Node:
         publisher.put(payload)
         return len(payload)
 
-    def _status(self, now_ns: int) -> Status:
-        located = self._robot.collaboration.located
-        assert located is not None
-        learned = self._robot.filter.learned
-        sent, heard = self._robot.collaboration.counters.flows(), self.received.flows()
-        announced = Counter(announced=self._declarations.announced)
-        return Status(
-            self._name,
-            self._incarnation,
+    def _publish_status(self, now_ns: int) -> None:
+        counts = self.counts + Counter(announced=self._declarations.announced)
+        status = self._robot.status(
             now_ns,
-            located.estimate.position_sigma_m,
-            located.estimate.heading_sigma_rad,
-            self._robot.collaboration.tier,
-            located.lost,
-            dict(self._robot.counts + self.counts + announced),
-            sum(flow.messages for flow in sent),
-            sum(flow.bytes for flow in sent),
-            sum(flow.messages for flow in heard),
-            sum(flow.bytes for flow in heard),
-            None if learned is None else learned[:3],
-            sent,
-            heard,
-            self._robot.collaboration.budget.spending(now_ns),
-            tuple(self._trust(now_ns)),
+            incarnation=self._incarnation,
+            counts=counts,
+            received=self.received.flows(),
+            clocks=self._clocks,
         )
-
-    def _trust(self, now_ns: int) -> Iterator[Trust]:
-        """How teammates stand, by what they say and by their clocks."""
-        standings = {s.robot: s for s in self._robot.filter.standings(now_ns)}
-        off = frozenset() if self._clocks is None else self._clocks.off()
-        for name in sorted(standings.keys() | off):
-            late_s = 0.0 if self._clocks is None else self._clocks.late_s(name)
-            standing = standings.get(name, Standing(name))
-            if name in off:
-                standing = standing._replace(reason="clock")
-            yield Trust(*standing, late_s)
-
-
-_INPUTS = {topic.key.rsplit("/", 1)[-1]: topic.carries for topic in topics.INPUTS}
+        self._publish(topics.STATUS, topics.STATUS.at(robot=self._name), status)

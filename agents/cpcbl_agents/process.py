@@ -13,6 +13,7 @@ from types import FrameType
 import msgspec
 
 from cpcbl_agents.clock import Clock
+from cpcbl_agents.composition import build_robot
 from cpcbl_agents.node import Node, Steppable
 from cpcbl_agents.robot import Robot
 from cpcbl_agents.sources import OwnCamera
@@ -151,7 +152,7 @@ def make_robot(
         log.warning("robot %s starts %.1f s after the team: it looks where it is", name, late_s)
         team = _not_knowing_its_start(name, team)
     spent = restarted or (late and not clock.unix)  # by its own time it waited for its router
-    return Robot(name, team, start_ns, spent, camera)
+    return build_robot(name, team, start_ns, spent, camera)
 
 
 def new_incarnation() -> str:

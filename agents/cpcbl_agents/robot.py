@@ -1,33 +1,38 @@
-"""One robot: three agents and the way of messages between them. No bus, no clock."""
+"""One robot: three agents and the way of messages between them. It knows no bus and no clock."""
 
 from collections import Counter
-from pathlib import Path
+from collections.abc import Iterator
 
 from cpcbl_agents.agent import AgentMessage, BusEvent, FrameSubscribers, HelpSent, Presence, Tick
-from cpcbl_agents.collaboration import CollaborationAgent
-from cpcbl_agents.detector import Eyes
+from cpcbl_agents.clocks import ClockMonitor
+from cpcbl_agents.collaboration import CollaborationAgent, Interests
 from cpcbl_agents.filtering import FilterAgent
 from cpcbl_agents.guests import GuestRegistry
 from cpcbl_agents.sensing import SensingAgent
-from cpcbl_agents.sources import NoSource, OwnCamera, Source
-from cpcbl_agents.sources.mrclam import MrclamSource
-from cpcbl_agents.waypoint_follower import WaypointFollower
 from cpcbl_team.config import Team
 from cpcbl_team.inputs import Belief, Fix, Odometry, Position, Sightings, Told
+from cpcbl_team.trust import Standing
 from cpcbl_transport.budget import Budget
-from cpcbl_transport.messages import AnnotatedFrame, Drive, Frame, Help, Message, Track
+from cpcbl_transport.messages import (
+    AnnotatedFrame,
+    Drive,
+    Flow,
+    Frame,
+    Help,
+    Message,
+    Status,
+    Track,
+    Trust,
+)
 
 NEVER_NS = 2**62
 _OUTGOING = (Belief, Fix, Track, Drive)
 
 
 class Robot:
-    """The agents of one robot of a team.
+    """The agents of one robot of a team; `composition.build_robot` makes one from a team file.
 
-    Raises LogError for a log that cannot be read, DependencyError for a camera without OpenCV.
-
-    `restarted`: its process ran before, and may have spent its budget then. `camera`: where frames
-    come from that nobody sends.
+    `restarted`: its process ran before, and may have spent its budget then.
     """
 
     def __init__(
@@ -35,79 +40,86 @@ class Robot:
         name: str,
         team: Team,
         start_ns: int,
+        sensing: SensingAgent,
         restarted: bool = False,
-        camera: OwnCamera | None = None,
     ) -> None:
         settings = team.robots[name]
         teammates = frozenset(team.robots) - {name}
-        marks = frozenset(team.map.landmarks) | frozenset(team.map.walls)
-        pilot = None
-        if settings.source == "simulated":
-            pilot = WaypointFollower(name, settings.waypoints_m, settings.speed_m_s)
-        source: Source = NoSource()
-        if settings.source == "mrclam":
-            source = MrclamSource(Path(team.data), name)
-            start_ns = max(start_ns, source.first_ns)
-            source.skip_to(start_ns)
         self.name = name
-        self._told_ns = start_ns
-        self.sensing = SensingAgent(settings, source, marks, pilot, _eyes(name, team), camera)
+        self._shared_ns = start_ns
+        self.sensing = sensing
         self.filter = FilterAgent(settings, team.map, teammates, start_ns)
         budget = Budget(
             settings.collaboration.budget,
             start_ns,
             team.messages_per_s(name),
-            renewed=restarted,
+            restarted=restarted,
             match_s=team.match.duration_s,
         )
-        most = team.guests.most if team.guests.allowed else 0
-        guests = GuestRegistry(marks | frozenset(team.robots), most)
+        known = frozenset(team.map.landmarks) | frozenset(team.map.walls) | frozenset(team.robots)
+        guests = GuestRegistry(known, team.guests.most if team.guests.allowed else 0)
         self.collaboration = CollaborationAgent(name, settings, teammates, start_ns, budget, guests)
 
     def handle(self, message: Message | Tick | BusEvent, now_ns: int) -> list[Message]:
-        """Everything that one message (from the bus, or a tick) makes this robot say to others.
+        """Everything that this robot publishes because of one message (from the bus, or a tick).
 
-        sensing -> filter -> collaboration; what the filter locates goes to the pilot as well.
-        After the end of its log a robot is silent.
+        Inputs go through sensing, filter and collaboration; the filter's estimates also go to the
+        waypoint follower. After the end of its log a robot publishes nothing.
         """
         if self.sensing.is_finished:
             return []
         if isinstance(message, BusEvent):
-            self.collaboration.handle(message, now_ns)
-            if isinstance(message, FrameSubscribers):
-                self.sensing.handle(message, now_ns)
-            if isinstance(message, Presence):
-                there = message.robot in self.collaboration.guests
-                self.filter.handle(message if there else message._replace(tier=None), now_ns)
-            if isinstance(message, HelpSent) and message.size:
-                self._told(message.message.stamp_ns, now_ns)
+            self._handle_event(message, now_ns)
             return []
-        if isinstance(message, Help):  # they change what is said at the next tick
+        if isinstance(message, Help):  # it changes what is published at the next tick
             self.filter.handle(message, now_ns)
             return []
         raw = isinstance(message, (Odometry, Sightings, Position, Frame))
         inputs: list[AgentMessage] = [] if raw else [message]
         inputs += self.sensing.handle(message, now_ns)
-        located = [out for m in inputs for out in self.filter.handle(m, now_ns)]
-        said = [out for m in located for out in self.collaboration.handle(m, now_ns)]
-        said += [out for m in located for out in self.sensing.handle(m, now_ns)]
-        looks = [m for m in inputs if isinstance(m, AnnotatedFrame)]
-        return [*looks, *(m for m in said if isinstance(m, _OUTGOING))]
+        estimates = [out for m in inputs for out in self.filter.handle(m, now_ns)]
+        outgoing = [out for m in estimates for out in self.collaboration.handle(m, now_ns)]
+        outgoing += [out for m in estimates for out in self.sensing.handle(m, now_ns)]
+        annotated = [m for m in inputs if isinstance(m, AnnotatedFrame)]
+        return [*annotated, *(m for m in outgoing if isinstance(m, _OUTGOING))]
 
-    def _told(self, stamp_ns: int, now_ns: int) -> None:
-        """From now on what this robot knows may be in what its teammates say."""
-        if stamp_ns > self._told_ns:
-            self._told_ns = stamp_ns
+    def _handle_event(self, event: BusEvent, now_ns: int) -> None:
+        self.collaboration.handle(event, now_ns)
+        match event:
+            case FrameSubscribers():
+                self.sensing.handle(event, now_ns)
+            case Presence(robot=name):
+                known = event if self.is_guest(name) else event._replace(tier=None)
+                self.filter.handle(known, now_ns)
+            case HelpSent(message=message, size=size) if size:
+                self._mark_shared(message.stamp_ns, now_ns)
+
+    def _mark_shared(self, stamp_ns: int, now_ns: int) -> None:
+        """From now on what this robot knows may be in what its teammates publish."""
+        if stamp_ns > self._shared_ns:
+            self._shared_ns = stamp_ns
             self.filter.handle(Told(stamp_ns), now_ns)
 
     @property
     def next_ns(self) -> int:
-        """When the next tick is worth it."""
+        """When the next tick is due."""
         if self.sensing.is_finished:
             return NEVER_NS
-        source_ns = self.sensing.next_ns
-        due_ns = self.filter.next_ns
-        return due_ns if source_ns is None else min(due_ns, source_ns)
+        source_ns, filter_ns = self.sensing.next_ns, self.filter.next_ns
+        return filter_ns if source_ns is None else min(filter_ns, source_ns)
+
+    @property
+    def interests(self) -> Interests | None:
+        """What the robot announces and subscribes to; None before its first estimate."""
+        return self.collaboration.interests
+
+    @property
+    def has_detector(self) -> bool:
+        return self.sensing.has_detector
+
+    def is_guest(self, name: str) -> bool:
+        """Whether a robot of this name is a guest at present."""
+        return name in self.collaboration.guests
 
     @property
     def counts(self) -> Counter[str]:
@@ -115,11 +127,48 @@ class Robot:
         own = self.sensing.counts + self.filter.all_counts
         return own + self.collaboration.guests.counts
 
+    def status(
+        self,
+        now_ns: int,
+        incarnation: str,
+        counts: Counter[str],
+        received: tuple[Flow, ...],
+        clocks: ClockMonitor | None,
+    ) -> Status:
+        """The robot's health for operators, after its first estimate.
 
-def _eyes(name: str, team: Team) -> Eyes | None:
-    """Of a robot with a camera; OpenCV is loaded for nobody else."""
-    if team.robots[name].sensing != "camera":
-        return None
-    from cpcbl_agents.vision.detector import CameraEyes
+        The last four are its node's: the process, what the node counted, the fixes and beliefs that
+        it received, and the teammates' clocks.
+        """
+        latest, learned = self.collaboration.latest, self.filter.learned
+        assert latest is not None
+        sent = self.collaboration.counters.flows()
+        return Status(
+            robot=self.name,
+            incarnation=incarnation,
+            stamp_ns=now_ns,
+            position_sigma_m=latest.estimate.position_sigma_m,
+            heading_sigma_rad=latest.estimate.heading_sigma_rad,
+            tier=self.collaboration.tier,
+            lost=latest.lost,
+            counts=dict(self.counts + counts),
+            messages_sent=sum(flow.messages for flow in sent),
+            bytes_sent=sum(flow.bytes for flow in sent),
+            messages_received=sum(flow.messages for flow in received),
+            bytes_received=sum(flow.bytes for flow in received),
+            learned=None if learned is None else learned[:3],
+            sent=sent,
+            heard=received,
+            spending=self.collaboration.budget.spending(now_ns),
+            trust=tuple(self._trust(now_ns, clocks)),
+        )
 
-    return CameraEyes(name, team)
+    def _trust(self, now_ns: int, clocks: ClockMonitor | None) -> Iterator[Trust]:
+        """How far each teammate is trusted, by its messages and by its clock."""
+        standings = {s.robot: s for s in self.filter.standings(now_ns)}
+        clock_off = frozenset() if clocks is None else clocks.off()
+        for name in sorted(standings.keys() | clock_off):
+            standing = standings.get(name, Standing(name))
+            if name in clock_off:
+                standing = standing._replace(reason="clock")
+            yield Trust(*standing, 0.0 if clocks is None else clocks.late_s(name))

@@ -1,11 +1,11 @@
-"""The sensing agent: from any source to corrected odometry and sightings."""
+"""The sensing agent: it takes inputs of any source and corrects odometry and sightings."""
 
 from collections import Counter
 from collections.abc import Sequence
 
 import msgspec
 
-from cpcbl_agents.agent import AgentMessage, FrameSubscribers, Located, Tick
+from cpcbl_agents.agent import AgentMessage, FrameSubscribers, PoseEstimate, Tick
 from cpcbl_agents.detector import Eyes, Picture
 from cpcbl_agents.sources import OwnCamera, Source
 from cpcbl_agents.waypoint_follower import WaypointFollower
@@ -14,33 +14,36 @@ from cpcbl_team.inputs import Odometry, Position, Sightings
 from cpcbl_team.sensors import corrected_odometry, corrected_sighting, once_each
 from cpcbl_transport.messages import Frame
 
-LOOK_NS = 500_000_000
+ANNOTATION_INTERVAL_NS = 500_000_000
 
 SensorInput = Odometry | Sightings | Position | Frame
 
 
 class SensingAgent:
-    """Polls the source and the camera, takes a driver's messages, corrects delays, blinds what is
-    blind.
+    """Polls the source and the camera, takes a driver's messages, corrects delays and scales, and
+    leaves out what the settings say the sensor cannot see.
 
-    `marks`: what the map names. Whatever else is seen is a robot: a teammate, perhaps a guest.
+    `map_names`: the names of landmarks and walls. Every other name is a robot's: a teammate's or a
+    guest's.
     """
 
     def __init__(
         self,
         settings: LocalizationSettings,
         source: Source,
-        marks: frozenset[str],
-        pilot: WaypointFollower | None = None,
-        eyes: Eyes | None = None,
+        map_names: frozenset[str],
+        follower: WaypointFollower | None = None,
+        detector: Eyes | None = None,
         camera: OwnCamera | None = None,
     ) -> None:
         self._sensor, self._odometry = settings.sensor, settings.odometry
         self._sensor_delay_ns = int(settings.sensor.delay_s * 1e9)
         own = settings.position_sensor
         self._position_delay_ns = 0 if own is None else int(own.delay_s * 1e9)
-        self._source, self._marks, self._pilot, self._eyes = source, marks, pilot, eyes
-        self._camera, self._looked, self._look_ns = camera, False, -LOOK_NS
+        self._source, self._map_names = source, map_names
+        self._follower, self._detector = follower, detector
+        self._camera, self._has_subscribers = camera, False
+        self._annotated_ns = -ANNOTATION_INTERVAL_NS
         self._counts: Counter[str] = Counter()
 
     @property
@@ -50,7 +53,7 @@ class SensingAgent:
 
     @property
     def has_detector(self) -> bool:
-        return self._eyes is not None
+        return self._detector is not None
 
     @property
     def next_ns(self) -> int | None:
@@ -66,35 +69,38 @@ class SensingAgent:
             case Tick():
                 items = list(self._source.poll(now_ns))
                 items += () if self._camera is None else self._camera.poll(now_ns)
-                return [out for item in items for out in self._sensed(item)]
+                return [out for item in items for out in self._process(item)]
             case Odometry() | Sightings() | Position() | Frame():
-                return self._sensed(message)
+                return self._process(message)
             case FrameSubscribers():
-                self._looked = message.present
-            case Located() if self._pilot is not None and message.frame is None:
-                return self._pilot.command(message)
+                self._has_subscribers = message.present
+            case PoseEstimate() if self._follower is not None:
+                return self._follower.command(message)
         return ()
 
-    def _sensed(self, item: SensorInput | Picture) -> Sequence[AgentMessage]:
+    def _process(self, item: SensorInput | Picture) -> Sequence[AgentMessage]:
         if not isinstance(item, Frame | Picture):
-            return [self._corrected(item)]
-        if self._eyes is None:
+            return [self._correct(item)]
+        if self._detector is None:
             self._counts["no_camera"] += 1
             return ()
         self._counts["frame"] += 1
-        said: list[AgentMessage] = []
-        if self._looked and not 0 <= item.stamp_ns - self._look_ns < LOOK_NS:
-            self._look_ns = item.stamp_ns
-            seen, look = self._eyes.shown(item)
-            said.append(look)
+        outgoing: list[AgentMessage] = []
+        if (
+            self._has_subscribers
+            and not 0 <= item.stamp_ns - self._annotated_ns < ANNOTATION_INTERVAL_NS
+        ):
+            self._annotated_ns = item.stamp_ns
+            sightings, annotated = self._detector.shown(item)
+            outgoing.append(annotated)
         else:
-            seen = self._eyes.seen(item)
-        if isinstance(seen, str):
-            self._counts[seen] += 1
-            return said
-        return [*said, self._corrected(seen)]
+            sightings = self._detector.seen(item)
+        if isinstance(sightings, str):
+            self._counts[sightings] += 1
+            return outgoing
+        return [*outgoing, self._correct(sightings)]
 
-    def _corrected(self, item: Odometry | Sightings | Position) -> Odometry | Sightings | Position:
+    def _correct(self, item: Odometry | Sightings | Position) -> Odometry | Sightings | Position:
         self._counts[type(item).__name__.lower()] += 1
         if isinstance(item, Odometry):
             return corrected_odometry(item, self._odometry)
@@ -104,11 +110,11 @@ class SensingAgent:
         if len(sightings) < len(item.sightings):
             self._counts["seen_twice"] += len(item.sightings) - len(sightings)
         kept = tuple(
-            corrected_sighting(s, self._sensor, s.id not in self._marks)
+            corrected_sighting(s, self._sensor, s.id not in self._map_names)
             for s in sightings
-            if self._sees(s.id)
+            if self._can_see(s.id)
         )
         return Sightings(item.stamp_ns - self._sensor_delay_ns, kept)
 
-    def _sees(self, name: str) -> bool:
-        return self._sensor.sees_landmarks if name in self._marks else self._sensor.sees_robots
+    def _can_see(self, name: str) -> bool:
+        return self._sensor.sees_landmarks if name in self._map_names else self._sensor.sees_robots

@@ -1,9 +1,9 @@
-"""Steering along waypoints by the robot's own estimate (simulated robots only)."""
+"""Drives simulated robots along waypoints by their own estimates."""
 
 import math
 from collections.abc import Sequence
 
-from cpcbl_agents.agent import Located
+from cpcbl_agents.agent import PoseEstimate
 from cpcbl_team.geometry import Pose2, wrap_angle
 from cpcbl_transport.messages import Drive
 
@@ -13,14 +13,14 @@ COMMAND_NS = 100_000_000
 
 
 def pursue(pose: Pose2, goal: tuple[float, float], speed_m_s: float) -> tuple[float, float]:
-    """(speed, turn rate) towards a goal: turns on the spot first where it lies aside."""
+    """Pursues a goal: (speed, turn rate). The robot turns on the spot if the goal is beside it."""
     bearing = wrap_angle(math.atan2(goal[1] - pose.y, goal[0] - pose.x) - pose.heading)
     turn_rate = max(-MOST_TURN_RAD_S, min(MOST_TURN_RAD_S, 2.0 * bearing))
     return speed_m_s * max(0.0, math.cos(bearing)) ** 3, turn_rate
 
 
 class WaypointFollower:
-    """Drives loops; stops while it is lost."""
+    """Drives loops through the waypoints; while the robot is lost it turns on the spot."""
 
     def __init__(
         self, robot: str, waypoints: Sequence[tuple[float, float]], speed_m_s: float
@@ -29,15 +29,15 @@ class WaypointFollower:
         self._reached = 0
         self._commanded_ns = 0
 
-    def command(self, located: Located) -> list[Drive]:
-        if not self._waypoints or located.stamp_ns < self._commanded_ns + COMMAND_NS:
+    def command(self, now: PoseEstimate) -> list[Drive]:
+        if not self._waypoints or now.stamp_ns < self._commanded_ns + COMMAND_NS:
             return []
-        self._commanded_ns = located.stamp_ns
-        if located.lost:  # looks around
-            return [Drive(self._robot, located.stamp_ns, 0.0, 0.5, self._reached)]
-        pose = located.estimate.pose
+        self._commanded_ns = now.stamp_ns
+        if now.lost:  # it turns until it sees landmarks
+            return [Drive(self._robot, now.stamp_ns, 0.0, 0.5, self._reached)]
+        pose = now.estimate.pose
         command = pursue(pose, self._goal_from(pose), self._speed)
-        return [Drive(self._robot, located.stamp_ns, *command, self._reached)]
+        return [Drive(self._robot, now.stamp_ns, *command, self._reached)]
 
     def _goal_from(self, pose: Pose2) -> tuple[float, float]:
         x, y = self._goal

@@ -11,7 +11,7 @@ from msgspec.structs import replace
 from support.buses import MS, SECOND, examples
 from support.core import diagonal
 
-from cpcbl_agents.agent import BeliefSubscribers, HelpSent, Located, Presence
+from cpcbl_agents.agent import BeliefSubscribers, FrameEstimate, HelpSent, PoseEstimate, Presence
 from cpcbl_agents.collaboration import CollaborationAgent
 from cpcbl_agents.counters import MessageCounter
 from cpcbl_team.collaboration import LOWEST_TIER, next_tier
@@ -59,10 +59,10 @@ class Alone:
         self.agent = CollaborationAgent("me", settings, MATES, 0, Budget(budget, 0))
         self.now_ns = 0
         self.heard = True
-        self.here = Located(
+        self.here = PoseEstimate(
             0, Estimate(Pose2(0.0, 0.0, 0.0), diagonal(SIGMA_M[tier], 0.02)), "", 0.0, 0.0
         )
-        self.located()
+        self.report_estimate()
         assert self.agent.tier == tier
 
     def tell(self, *presences: Presence | BeliefSubscribers) -> None:
@@ -73,7 +73,7 @@ class Alone:
         """So the robot will find itself from now on."""
         self.here = self.here._replace(**changes)
 
-    def located(self) -> list[Belief]:
+    def report_estimate(self) -> list[Belief]:
         """The agent learns where it is; its beliefs."""
         self.here = self.here._replace(stamp_ns=self.now_ns)
         track, *said = self.agent.handle(self.here, self.now_ns)
@@ -89,14 +89,14 @@ class Alone:
             x, y, heading = self.here.estimate.pose
             pose = Pose2(x + 0.1 * self.here.speed_m_s, y, heading)
             self.becomes(estimate=self.here.estimate._replace(pose=pose))
-            said += self.located()
+            said += self.report_estimate()
         return said
 
     def sees(self, *sightings: Sighting, after_ns: int = 1, late_ns: int = 0) -> list[Fix]:
         """A frame; its fixes."""
         self.now_ns += after_ns
         frame = Sightings(self.now_ns - late_ns, sightings)
-        seen = self.here._replace(stamp_ns=frame.stamp_ns, frame=frame)
+        seen = FrameEstimate(frame, self.here.estimate, self.here.lost)
         return self._sent(self.agent.handle(seen, self.now_ns), Fix)
 
     def _sent(self, said: Sequence[object], kind: type[Help]) -> list[Help]:

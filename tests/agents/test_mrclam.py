@@ -19,7 +19,7 @@ from support.logs import (
 )
 
 from cpcbl_agents.agent import Tick
-from cpcbl_agents.robot import Robot
+from cpcbl_agents.composition import build_robot
 from cpcbl_agents.sources import mrclam
 from cpcbl_agents.sources.mrclam import LogError, MrclamSource
 from cpcbl_team.config import Field
@@ -91,7 +91,7 @@ def test_a_barcode_that_nobody_carries_is_counted(tmp_path: Path) -> None:
     assert all(frame.sightings[-1] == ghost for frame in frames)
     field = Field(landmarks=mrclam.read_landmarks(tmp_path))
     team = msgspec.structs.replace(log_team("1", "2"), map=field, data=str(tmp_path))
-    robot = Robot("1", team, 0)
+    robot = build_robot("1", team, 0)
     robot.handle(Tick(), EPOCH_NS + 10 * SECOND)
     assert robot.counts["unknown_object"] == robot.counts["sightings"] == len(frames) - 1
 

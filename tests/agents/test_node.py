@@ -21,8 +21,8 @@ from support.buses import (
     written,
 )
 
+from cpcbl_agents.composition import build_robot
 from cpcbl_agents.node import INBOX, Node
-from cpcbl_agents.robot import Robot
 from cpcbl_team.collaboration import LOWEST_TIER, tier_of
 from cpcbl_team.config import BudgetSettings, LocalizerSettings, Team
 from cpcbl_team.estimate import ZERO3, Estimate
@@ -696,7 +696,7 @@ def test_a_second_robot_of_the_same_name_is_counted() -> None:
     stand = only_me()
     assert "same_name_twice" not in stand.status("me").counts
     team = stand.team
-    twin = Node(Robot("me", team, 0), team, stand.hub.session(), 0, incarnation="2")
+    twin = Node(build_robot("me", team, 0), team, stand.hub.session(), 0, incarnation="2")
     stand.odometry("me", standing(stand.now_ns))
     twin.step(stand.now_ns)
     assert stand.status("me").counts["same_name_twice"] == 1
@@ -707,7 +707,7 @@ def test_arrivals_wake_the_robots_own_loop() -> None:
     woken: list[bool] = []
     stand = TeamOnBus(two_robots(), here=[])
     node = Node(
-        Robot("me", stand.team, 0),
+        build_robot("me", stand.team, 0),
         stand.team,
         stand.hub.session(),
         0,

@@ -7,8 +7,9 @@ import pytest
 from msgspec.structs import replace
 from support.buses import MS, SECOND, robot_at, saw, team_of, with_robot
 
-from cpcbl_agents.agent import Located, Presence, Tick
-from cpcbl_agents.filtering import PATIENCE_NS
+from cpcbl_agents.agent import PoseEstimate, Presence, Tick
+from cpcbl_agents.composition import build_robot
+from cpcbl_agents.filtering import ODOMETRY_WAIT_NS
 from cpcbl_agents.robot import Robot
 from cpcbl_agents.waypoint_follower import (
     COMMAND_NS,
@@ -43,7 +44,7 @@ TEAM = team_of(me=robot_at(sigma_m=0.1), mate=robot_at(2.0))
 
 def robot(team: Team = TEAM) -> Robot:
     """It knows of a teammate that is lost."""
-    subject = Robot("me", team, 0)
+    subject = build_robot("me", team, 0)
     subject.handle(Presence("mate", LOWEST_TIER), 0)
     return subject
 
@@ -298,10 +299,10 @@ def test_a_frame_waits_for_the_odometry_that_covers_it() -> None:
 
 def test_a_frame_is_located_without_odometry_when_patience_ends() -> None:
     subject, stamp_ns = seen_ahead_of_odometry()
-    assert fixes(subject.handle(Tick(), stamp_ns + PATIENCE_NS - 1)) == []
-    (fix,) = fixes(subject.handle(Tick(), stamp_ns + PATIENCE_NS + 100 * MS))
+    assert fixes(subject.handle(Tick(), stamp_ns + ODOMETRY_WAIT_NS - 1)) == []
+    (fix,) = fixes(subject.handle(Tick(), stamp_ns + ODOMETRY_WAIT_NS + 100 * MS))
     assert fix.stamp_ns == stamp_ns
-    assert fixes(subject.handle(Tick(), stamp_ns + 2 * PATIENCE_NS + SECOND)) == []
+    assert fixes(subject.handle(Tick(), stamp_ns + 2 * ODOMETRY_WAIT_NS + SECOND)) == []
 
 
 def test_a_late_frames_fixes_are_of_its_own_time() -> None:
@@ -378,9 +379,9 @@ def test_fixes_keep_their_least_interval() -> None:
 HERE = Pose2(1.0, 2.0, math.pi / 2.0)
 
 
-def located(pose: Pose2, stamp_ns: int, lost: str = "") -> Located:
+def located(pose: Pose2, stamp_ns: int, lost: str = "") -> PoseEstimate:
     estimate = Estimate(pose, Covariance3(0.01, 0.0, 0.01, 0.0, 0.0, 0.01))
-    return Located(stamp_ns, estimate, lost, 0.0, 0.0)
+    return PoseEstimate(stamp_ns, estimate, lost, 0.0, 0.0)
 
 
 @pytest.mark.parametrize(

@@ -30,8 +30,8 @@ from support.wire_tap import Batch, Kind, Relay, most_in_window, total
 
 from cpcbl_agents.clock import Clock
 from cpcbl_agents.collaboration import CollaborationAgent
+from cpcbl_agents.composition import build_robot
 from cpcbl_agents.node import Node
-from cpcbl_agents.robot import Robot
 from cpcbl_agents.sources.mrclam import read_landmarks
 from cpcbl_launch.run.processes import PROGRAM
 from cpcbl_launch.run.supervisor import ProcessSpec, Supervisor
@@ -169,7 +169,7 @@ def wired(team: Team, *here: str) -> Iterator[Wired]:
         links = {name: stack.enter_context(Relay(endpoint)) for name in here or team.robots}
         for name, link in links.items():
             wire = stack.enter_context(open_bus(team.name, [link.endpoint]))
-            stand.robots[name] = Robot(name, team, 0)
+            stand.robots[name] = build_robot(name, team, 0)
             fed = Fed(wire, stand.hub.session())
             stand.nodes[name] = Node(stand.robots[name], team, fed, 0, "1")
         yield Wired(stand, links, endpoint)
@@ -363,7 +363,7 @@ def test_who_is_lost_is_helped_by_all_and_who_finds_itself_helps() -> None:
         def they_see_it() -> None:
             look(best=found("best"), second=found("second"))
 
-        while not (agent.located and agent.located.lost):
+        while not (agent.latest and agent.latest.lost):
             look(worst=marks[:1])  # too little to find itself by
             assert stand.now_ns < 10 * SECOND
         assert agent.tier == LOWEST_TIER

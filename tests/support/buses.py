@@ -7,8 +7,8 @@ from typing import Any
 import msgspec
 from hypothesis import settings
 
+from cpcbl_agents.composition import build_robot
 from cpcbl_agents.node import Node
-from cpcbl_agents.robot import Robot
 from cpcbl_team.config import (
     CollaborationSettings,
     Field,
@@ -137,7 +137,7 @@ class TeamOnBus:
         self.hub = hub or MemoryHub()
         self.bus = self.hub.session()
         names = team.robots if here is None else here
-        self.robots = {name: Robot(name, team, 0) for name in names}
+        self.robots = {name: build_robot(name, team, 0) for name in names}
         self.nodes = {
             name: Node(robot, team, self.hub.session(), 0, "1")
             for name, robot in self.robots.items()

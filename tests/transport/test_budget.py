@@ -132,7 +132,7 @@ def test_a_match_never_costs_more_than_was_earned_whatever_was_restarted(
     settings, sent = BudgetSettings(urgent_share=share), list[Wish]()
     begins = [0, *sorted(s * SECOND for s in restarts_s)]
     for begin, end in zip(begins, [*begins[1:], HOUR], strict=True):
-        budget = Budget(settings, begin, rate_hz, renewed=begin > 0)
+        budget = Budget(settings, begin, rate_hz, restarted=begin > 0)
         sent += granted(budget, [w for w in wishes if begin <= w.at_ns < end])
     for number, wish in enumerate(sent, start=1):
         assert number <= rate_hz * wish.at_ns * 1e-9 + 1e-6
@@ -146,13 +146,13 @@ def test_no_window_holds_more_after_a_restart_either(
     settings = BudgetSettings(bytes_per_s=bytes_per_s, messages_per_minute=per_minute)
     before = [w for w in wishes if w.at_ns <= restart_ns]
     sent = granted(Budget(settings, 0), before)
-    sent += granted(Budget(settings, restart_ns, renewed=True), wishes[len(before) :])
+    sent += granted(Budget(settings, restart_ns, restarted=True), wishes[len(before) :])
     assert most_within(10.0, sent, size_of) <= 10.0 * bytes_per_s + 1e-6
     assert most_within(60.0, sent, one) <= per_minute
 
 
 def test_after_a_restart_there_is_something_to_spend_again_one_window_later() -> None:
-    budget = Budget(BudgetSettings(bytes_per_s=100.0), 5 * SECOND, renewed=True)
+    budget = Budget(BudgetSettings(bytes_per_s=100.0), 5 * SECOND, restarted=True)
     assert not budget.admits(15 * SECOND - 1, 1, urgent=True)
     assert budget.admits(15 * SECOND, 1000, urgent=True)
 
@@ -168,7 +168,7 @@ def test_what_is_taken_back_can_be_spent_again() -> None:
     budget = Budget(settings, 0, match_rate_hz=1.0)
     for _ in range(10):
         budget.spend(5 * SECOND, FIX, LEAST)
-        budget.take_back(5 * SECOND, FIX)
+        budget.refund(5 * SECOND, FIX)
     assert budget.price(5 * SECOND, FIX) <= LEAST
     assert len(granted(budget, [Wish(5 * SECOND, FIX)] * 5)) == 3
 

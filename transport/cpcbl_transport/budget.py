@@ -75,9 +75,9 @@ class _Cost(NamedTuple):
 class Budget:
     """One robot's budget. Times are the robot's, sizes are bytes on the wire.
 
-    `match_rate_hz`: at which it earns messages of the match, for `match_s`; None without such a
-    limit. `renewed`: of a process that was restarted and cannot know what was spent before: it
-    starts with nothing.
+    `match_rate_hz`: the rate at which it earns messages of the match, for `match_s`; None without
+    such a limit. `restarted`: the process cannot know what was spent before, so it starts with
+    nothing.
     """
 
     def __init__(
@@ -85,7 +85,7 @@ class Budget:
         settings: BudgetSettings,
         start_ns: int,
         match_rate_hz: float | None = None,
-        renewed: bool = False,
+        restarted: bool = False,
         match_s: float = math.inf,
     ) -> None:
         s = settings
@@ -101,7 +101,7 @@ class Budget:
         if match_rate_hz is not None:
             self._match = Savings(start_ns, match_rate_hz, s.urgent_share, match_s)
         for window in (self._bytes, self._messages):
-            if renewed and window is not None:
+            if restarted and window is not None:
                 window.spend(start_ns, window.capacity)
         limits = self._bytes, self._messages, self._match
         self._limits = tuple(limit for limit in limits if limit is not None)
@@ -126,7 +126,7 @@ class Budget:
         for limit, amount in self._costs(size):
             limit.spend(now_ns, amount)
 
-    def take_back(self, now_ns: int, size: int) -> None:
+    def refund(self, now_ns: int, size: int) -> None:
         """A message of this size for which was spent just now has not been sent."""
         self._price *= math.exp(-1.0 / MEMORY)
         for limit, amount in self._costs(size):

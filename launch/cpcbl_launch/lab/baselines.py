@@ -21,7 +21,7 @@ from typing import NamedTuple
 import numpy as np
 
 from cpcbl_agents.agent import Tick
-from cpcbl_agents.robot import Robot
+from cpcbl_agents.composition import build_robot
 from cpcbl_launch.reporting.metrics import Floats, Trajectory, samples_with_truth, score
 from cpcbl_launch.reporting.recorder import BaselineReport, mean_score
 from cpcbl_launch.run.logged_team import LoggedTeam
@@ -52,7 +52,7 @@ def inputs_of(logged: LoggedTeam) -> dict[str, Inputs]:
     """What each robot's own sensing agent makes of its log. Raises LogError."""
     found = {}
     for name, settings in logged.team.robots.items():
-        robot = Robot(name, logged.team, logged.start_ns)
+        robot = build_robot(name, logged.team, logged.start_ns)
         begin = robot.filter.timeline.state
         said = robot.sensing.handle(Tick(), logged.end_ns)
         odometry = tuple(m for m in said if isinstance(m, Odometry))

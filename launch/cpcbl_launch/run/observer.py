@@ -205,13 +205,13 @@ def _require_unique_name(name: str, bus: Bus, stop: Callable[[], bool]) -> None:
 
 
 def _observer_report(node: GuestNode, team: Team, seconds: float) -> ObserverReport:
-    located = node.robot.collaboration.located
+    latest = node.robot.collaboration.latest
     return ObserverReport(
         name=node.robot.name,
         team=team.name,
         seconds=seconds,
-        position_sigma_m=None if located is None else located.estimate.position_sigma_m,
-        lost="" if located is None else located.lost,
+        position_sigma_m=None if latest is None else latest.estimate.position_sigma_m,
+        lost="" if latest is None else latest.lost,
         unfed=node.missing_input,
         sent=summed_flows([node.robot.collaboration.counters.flows()]),
         heard=summed_flows([node.received]),

@@ -8,8 +8,8 @@ from typing import NamedTuple, Protocol
 
 import msgspec
 
+from cpcbl_agents.composition import build_robot
 from cpcbl_agents.node import Node, Steppable
-from cpcbl_agents.robot import Robot
 from cpcbl_launch.lab.baselines import inputs_of, scored, yardsticks
 from cpcbl_launch.options import check_limit
 from cpcbl_launch.reporting.metrics import Trajectory
@@ -176,7 +176,7 @@ def robot_nodes(
         return bus_wrappers[name](bus) if name in bus_wrappers else bus
 
     return [
-        Node(Robot(name, team, start_ns), team, session(name), start_ns, "0")
+        Node(build_robot(name, team, start_ns), team, session(name), start_ns, "0")
         for name in team.robots
     ]
 

@@ -175,10 +175,11 @@ def test_without_opencv_the_extra_is_named(tmp_path: Path, words: list[str]) -> 
 
 def test_a_robot_without_a_camera_does_not_load_opencv(tmp_path: Path) -> None:
     code = (
-        "import sys; from cpcbl_agents.robot import Robot; from cpcbl_launch.run import up;"
+        "import sys; from cpcbl_agents.composition import build_robot;"
+        "from cpcbl_launch.run import up;"
         "from cpcbl_agents import process;"
         "from cpcbl_launch.team_file import builtin_path, load_team;"
-        "Robot('scout', load_team(builtin_path('demo')), 0); print('cv2' in sys.modules)"
+        "build_robot('scout', load_team(builtin_path('demo')), 0); print('cv2' in sys.modules)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "False"
