@@ -111,6 +111,8 @@ class FilterAgent:
             if state is None:
                 continue
             if self._learns:
-                frame = without_bearing_bias(frame, state.memory.calibration.learned.bearing_bias_rad)
+                frame = without_bearing_bias(
+                    frame, state.memory.calibration.learned.bearing_bias_rad
+                )
             ready.append(FrameEstimate(frame, state.estimate, state.lost))
         return ready

@@ -2,7 +2,6 @@
 
 import logging
 import os
-import secrets
 import signal
 import threading
 import time
@@ -28,13 +27,13 @@ log = logging.getLogger(__name__)
 
 LONGEST_WAIT_S = 0.2
 LATE_NS = 1_000_000_000
-SET_S = 0.25  # a clock that is set by more makes inputs late, or from the future
+MAX_CLOCK_STEP_S = 0.25  # a clock that is set by more makes inputs late, or from the future
 BUSY_NS = 1_000_000  # after a step: what comes sooner may have queued behind it
 
 
 class StopSignal:
-    """Set by SIGINT, SIGTERM and SIGHUP (a closed terminal, unless it is ignored: nohup), and when
-    the process that started this one is gone."""
+    """Becomes true with SIGINT, SIGTERM or SIGHUP (a closed terminal, ignored under nohup), or when
+    the process that started this one has ended."""
 
     def __init__(self, parent: int | None = None) -> None:
         self._event = threading.Event()
@@ -54,29 +53,29 @@ class StopSignal:
 class Loop:
     """Steps a node when something arrives or is due, one thread at a time.
 
-    What arrives is handled by the bus's thread that brings it, if nobody steps: to wake the robot's
-    own thread for it would take 50 us. What comes while another steps, or so soon after that it may
-    have queued behind that, is left to the robot's own thread, and the bus's is free to put away
-    what follows.
+    The bus's thread that delivers a message also handles it, if no other thread steps the node: to
+    wake the robot's own thread would take 50 us. A message that arrives during a step, or so soon
+    after one that it may have waited for its end, is left to the robot's own thread, so that the
+    bus's thread is free to store the messages that follow.
     """
 
     def __init__(self, clock: Clock) -> None:
         self._clock = clock
-        self._turn, self._asleep = threading.Lock(), threading.Lock()
-        self._turn.acquire()  # nobody's, but while it runs
-        self._asleep.acquire()
+        self._step_lock, self._sleep_lock = threading.Lock(), threading.Lock()
+        self._step_lock.acquire()  # no thread may step the node before `run`
+        self._sleep_lock.acquire()
         self._node: Steppable
         self._busy_ns = 0
         self._bug: BaseException | None = None
 
     def wake(self) -> None:
-        """From any thread: the robot's own steps at once."""
-        with suppress(RuntimeError):  # it was awake already
-            self._asleep.release()
+        """From any thread: the robot's own thread steps at once."""
+        with suppress(RuntimeError):  # it is awake already
+            self._sleep_lock.release()
 
     def on_arrival(self) -> None:
-        """From a thread of the bus: something has arrived and is put away."""
-        if time.monotonic_ns() < self._busy_ns or not self._turn.acquire(blocking=False):
+        """From a thread of the bus: something has arrived and is stored in the node."""
+        if time.monotonic_ns() < self._busy_ns or not self._step_lock.acquire(blocking=False):
             self.wake()
             return
         try:
@@ -86,21 +85,21 @@ class Loop:
             self.wake()
         finally:
             self._busy_ns = time.monotonic_ns() + BUSY_NS
-            self._turn.release()
+            self._step_lock.release()
 
     def run(self, node: Steppable, stop: Callable[[], bool]) -> None:
-        """Until `stop()`, or a bug: that is raised here, wherever it was."""
+        """Runs until `stop()`. An exception of any thread's step is raised here."""
         self._node = node
-        self._turn.release()
+        self._step_lock.release()
         try:
             while self._bug is None and not stop():
-                with self._turn:
+                with self._step_lock:
                     self._step()
-                self._asleep.acquire(
+                self._sleep_lock.acquire(
                     timeout=min(self._clock.seconds_until(node.next_ns), LONGEST_WAIT_S)
                 )
         finally:
-            self._turn.acquire()  # what still arrives is put away, no more
+            self._step_lock.acquire()  # what still arrives is only stored
         if self._bug is not None:
             raise self._bug
 
@@ -141,23 +140,23 @@ def run_robot(
 def make_robot(
     name: str, team: Team, clock: Clock, restarted: bool = False, camera: OwnCamera | None = None
 ) -> Robot:
-    """The robot as it starts now. After a restart it does not know where it is, nor what it spent.
+    """The robot as it starts now. After a restart it knows neither its pose nor what it spent.
 
-    Docker starts a robot again without a word: then it is late.
+    Docker restarts a robot without telling it; such a robot is recognized because it is late.
     """
     start_ns = clock.now_ns()
     late_s = (start_ns - clock.epoch_ns) * 1e-9 / clock.speed
     late = start_ns > clock.epoch_ns + LATE_NS * max(1.0, clock.speed)
     if restarted or late:
-        log.warning("robot %s starts %.1f s after the team: it looks where it is", name, late_s)
-        team = _not_knowing_its_start(name, team)
-    spent = restarted or (late and not clock.unix)  # by its own time it waited for its router
+        log.warning("robot %s starts %.1f s after the team: it has to find its pose", name, late_s)
+        team = _without_start(name, team)
+    spent = restarted or (late and not clock.unix)  # it may have waited for its router
     return build_robot(name, team, start_ns, spent, camera)
 
 
 def new_incarnation() -> str:
-    """What tells this process from any before: in containers, process ids repeat."""
-    return secrets.token_hex(4)
+    """Distinguishes this process from earlier ones: in containers, process ids repeat."""
+    return os.urandom(4).hex()
 
 
 def stop_on_clock_step(
@@ -169,7 +168,7 @@ def stop_on_clock_step(
         return stop
 
     def checked() -> bool:
-        if abs(by_s := clock.clock_step_s()) > SET_S:
+        if abs(by_s := clock.clock_step_s()) > MAX_CLOCK_STEP_S:
             raise ClockError(
                 f"robot {name}: this machine's clock was set by {by_s:+.2f} s, or it slept: start"
                 " the robot again"
@@ -202,6 +201,6 @@ def own_camera(
         camera.close()
 
 
-def _not_knowing_its_start(name: str, team: Team) -> Team:
+def _without_start(name: str, team: Team) -> Team:
     robot = msgspec.structs.replace(team.robots[name], start=None)
     return msgspec.structs.replace(team, robots={**team.robots, name: robot})

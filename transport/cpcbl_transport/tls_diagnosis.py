@@ -1,4 +1,4 @@
-"""Why a TLS link does not come about, in words: Zenoh itself says that time ran out."""
+"""Says in words why a TLS link cannot be opened. Zenoh itself only reports a time-out."""
 
 import socket
 import ssl
@@ -16,7 +16,7 @@ _ALERTS = {
 
 
 def tls_diagnosis(endpoint: str, credentials: Credentials) -> str:
-    """What stands in the way of a handshake with the router there; empty if nothing does."""
+    """Why a TLS handshake with the router at an endpoint fails; empty if it succeeds."""
     host, _, port = endpoint.partition("/")[2].rpartition(":")
     host = host.strip("[]")
     try:

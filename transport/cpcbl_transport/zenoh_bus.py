@@ -1,11 +1,12 @@
-"""The bus over Zenoh: the only file that imports it. The choices are measured ones.
+"""The bus over Zenoh: the only file that imports Zenoh. Its choices come from measurements.
 
-- One publisher a concrete key: a put without a publisher is uploaded even if nobody listens.
-- Sequence numbers of 16 bits: two bytes a message less than Zenoh's 32.
-- Whether anybody listens is asked only after it has changed: once in a while that takes 40 us.
-- No multicast: a client finds its router by the endpoint, which the launcher hands it.
-- `open` is retried here with a short time-out: a blocked open swallows SIGINT.
-- A session that is not closed hangs the interpreter at exit: `with open_bus(...)`.
+- There is one publisher for each concrete key: Zenoh uploads a put without a publisher even if
+  nobody subscribes.
+- Sequence numbers have 16 bits: this saves two bytes a message against Zenoh's 32.
+- Whether there is a subscriber is asked only after a change, for the question can take 40 us.
+- Multicast is off: a client finds its router by the endpoint that the launcher gives it.
+- `open` is retried here with a short time-out: a blocked `open` ignores SIGINT.
+- A session that is not closed hangs the interpreter at exit: write `with open_bus(...)`.
 """
 
 import json
@@ -21,7 +22,6 @@ import zenoh
 from cpcbl_team.errors import CpcblError
 from cpcbl_transport.bus import Handle, LivelinessCallback, MessageCallback, Publisher
 from cpcbl_transport.security import Credentials
-from cpcbl_transport.tls_diagnosis import tls_diagnosis
 from cpcbl_transport.topics import Qos, namespace
 from cpcbl_transport.zenoh_config import NO_GUARDS, client_config, router_config
 
@@ -48,7 +48,7 @@ def open_bus(
         try:
             return ZenohBus(_open(config, namespace(team)))
         except zenoh.ZError as error:
-            reason = _why_not(connect, credentials) or _told(error)
+            reason = _tls_reason(connect, credentials) or _one_line(error)
             log.info(
                 "no router at %s yet%s", ", ".join(connect), f": {reason}" if credentials else ""
             )
@@ -56,10 +56,12 @@ def open_bus(
     raise BusError(f"no router at {', '.join(connect)}: {reason}")
 
 
-def _why_not(connect: Sequence[str], credentials: Credentials | None) -> str:
-    """What stands in the way of TLS, of which Zenoh tells nothing; empty without credentials."""
+def _tls_reason(connect: Sequence[str], credentials: Credentials | None) -> str:
+    """Why TLS fails, which Zenoh does not say; empty without credentials."""
     if credentials is None:
         return ""
+    from cpcbl_transport.tls_diagnosis import tls_diagnosis  # only it needs ssl
+
     reasons = {endpoint: tls_diagnosis(endpoint, credentials) for endpoint in connect}
     return "; ".join(dict.fromkeys(filter(None, reasons.values())))
 
@@ -91,7 +93,7 @@ def open_plain_router(config: Mapping[str, Any]) -> "ZenohBus":
         return ZenohBus(_open(config))
     except zenoh.ZError as error:
         endpoints = ", ".join(listening_at(config))
-        raise BusError(f"cannot listen on {endpoints}: {_told(error)}") from error
+        raise BusError(f"cannot listen on {endpoints}: {_one_line(error)}") from error
 
 
 def read_router_config(path: Path) -> dict[str, Any]:
@@ -104,7 +106,7 @@ def read_router_config(path: Path) -> dict[str, Any]:
     except (OSError, UnicodeDecodeError) as error:
         raise BusError(f"{path}: cannot be read: {error}") from error
     except zenoh.ZError as error:
-        raise BusError(f"{path}: no configuration of Zenoh: {_told(error)}") from error
+        raise BusError(f"{path}: no configuration of Zenoh: {_one_line(error)}") from error
     config: dict[str, Any] = json.loads(str(read))
     config["mode"] = config["mode"] or "router"
     if config["mode"] != "router":
@@ -118,7 +120,7 @@ def listening_at(config: Mapping[str, Any]) -> list[str]:
     return list(endpoints["router"] if isinstance(endpoints, Mapping) else endpoints)
 
 
-def _told(error: "zenoh.ZError") -> str:
+def _one_line(error: "zenoh.ZError") -> str:
     """What went wrong, in one line, without the places in Zenoh's source."""
     return " ".join(re.sub(r" at \S+\.rs:\d+\.?", "", str(error)).split())
 
