@@ -5,7 +5,7 @@ from functools import lru_cache
 import numpy as np
 
 from cpcbl_agents.vision.camera import Pixels
-from cpcbl_launch.lab.experiments.eyes_frames import drawn, picture
+from cpcbl_launch.lab.experiments.rendered_frames import drawn, picture
 from cpcbl_launch.team_file import builtin_path, load_team
 
 FRAMES = 24

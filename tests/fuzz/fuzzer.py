@@ -18,7 +18,7 @@ import msgspec
 from fuzz.payloads import hypothesis_payloads, mixed_payloads, valid_payload
 
 from cpcbl_launch.lab.chaos.checks import Check
-from cpcbl_launch.lab.chaos.notes import all_counts
+from cpcbl_launch.lab.chaos.figures import all_counts
 from cpcbl_launch.lab.chaos.scenario import Found, Setting, all_is_well, they_go_on
 from cpcbl_launch.lab.chaos.team import FIELD, ChaosError, Plan, TeamUnderTest, demo_team, running
 from cpcbl_launch.reporting.recorder import Recorder

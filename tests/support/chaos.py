@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 
 from cpcbl_launch.lab.chaos.checks import Check
-from cpcbl_launch.lab.chaos.notes import Heard, Notes, Said, Token
+from cpcbl_launch.lab.chaos.run_log import Heard, Notes, Said, Token
 from cpcbl_transport.messages import Flow, Status, Track, Trust
 from support.buses import SECOND
 

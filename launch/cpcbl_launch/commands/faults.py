@@ -31,15 +31,15 @@ def chaos(
     """
     from rich.console import Console
 
-    from cpcbl_launch.lab.chaos import show
+    from cpcbl_launch.lab.chaos import tables
     from cpcbl_launch.lab.chaos.checks import as_data
-    from cpcbl_launch.lab.chaos.run import chosen, run_all
+    from cpcbl_launch.lab.chaos.runner import chosen, run_all
     from cpcbl_launch.lab.chaos.scenario import Setting
     from cpcbl_launch.lab.chaos.scenarios import SCENARIOS
     from cpcbl_launch.options import json_text, require_writable_file, write_or_reason
 
     if listed or not scenarios:
-        show.print_scenarios(SCENARIOS, Console())
+        tables.print_scenarios(SCENARIOS, Console())
         return
     for option, path in (("--report", report), ("--markdown", markdown)):
         if path is not None:
@@ -51,18 +51,18 @@ def chaos(
         if signal.getsignal(number) != signal.SIG_IGN:
             signal.signal(number, signal.default_int_handler)
     progress = Console(stderr=True)
-    with show.Progress(progress, len(todo)) as shown:
+    with tables.Progress(progress, len(todo)) as shown:
         setting = Setting(seed, soak_s, shown.doing)
         faults = run_all(todo, setting, shown.began, shown.done)
     result = as_data(faults)
     lost = write_report(report, result)
     if (page := markdown) is not None:
-        text = "\n".join(show.markdown(faults)) + "\n"
+        text = "\n".join(tables.markdown(faults)) + "\n"
         lost |= write_or_reason(page, lambda: page.write_text(text, encoding="utf-8"))
     if as_json:
         sys.stdout.write(json_text(result) + "\n")
     else:
-        show.print_faults(faults, Console())
+        tables.print_faults(faults, Console())
     print_not_written(lost)
     if not faults.held:
         raise typer.Exit(1)

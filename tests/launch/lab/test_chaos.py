@@ -17,15 +17,15 @@ import pytest
 from support.buses import Subscription, wait_until
 from support.processes import cpcbl_team, eventually, pids_of
 
-from cpcbl_launch.lab.chaos import wire
+from cpcbl_launch.lab.chaos import tun_link
 from cpcbl_launch.lab.chaos.checks import Check, Outcome
 from cpcbl_launch.lab.chaos.injectors import Echo
 from cpcbl_launch.lab.chaos.relay import Quality, Relay
-from cpcbl_launch.lab.chaos.run import chosen, outcome_of, run_all
+from cpcbl_launch.lab.chaos.runner import chosen, outcome_of, run_all
 from cpcbl_launch.lab.chaos.scenario import Found, Needs, Scenario, Setting
 from cpcbl_launch.lab.chaos.scenarios import SCENARIOS
 from cpcbl_launch.lab.chaos.team import ROUTER, ChaosError, Plan, demo_team, router_spec, running
-from cpcbl_launch.lab.chaos.wire import Weather, Wire
+from cpcbl_launch.lab.chaos.tun_link import Weather, Wire
 from cpcbl_launch.run.processes import PROGRAM
 from cpcbl_launch.run.supervisor import Supervisor
 from cpcbl_launch.run.up import free_endpoint
@@ -90,7 +90,7 @@ def test_what_fails_and_what_cannot_run_is_told_apart(monkeypatch: pytest.Monkey
     def breaks(_: Setting) -> Found:
         raise ChaosError("the team did not settle")
 
-    monkeypatch.setattr("cpcbl_launch.lab.chaos.wire.missing", lambda: "needs root")
+    monkeypatch.setattr("cpcbl_launch.lab.chaos.tun_link.missing", lambda: "needs root")
     good = Check(what="n", seen=1, at_least=1)
     table = [
         scenario_of("good", good),
@@ -208,7 +208,7 @@ def test_a_relay_hands_on_that_an_end_has_left() -> None:
             assert link.recv(10) == b""
 
 
-@pytest.mark.skipif(bool(wire.missing()), reason="needs root and /dev/net/tun")
+@pytest.mark.skipif(bool(tun_link.missing()), reason="needs root and /dev/net/tun")
 def test_a_wire_loses_packets_and_tcp_lives_with_it() -> None:
     with Wire(seed=1) as lossy, socket.create_server((lossy.here, 0)) as server:
         server.settimeout(30.0)

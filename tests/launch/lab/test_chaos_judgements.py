@@ -5,10 +5,7 @@ from msgspec.structs import replace
 from support.chaos import UNTIL_S, broken, came, notes_of, status_at, tracks_of, went
 
 from cpcbl_launch.lab.chaos.checks import Check, Faults, Outcome, as_data
-from cpcbl_launch.lab.chaos.files import Ended, judged_full, judged_read_only
-from cpcbl_launch.lab.chaos.inputs import judged_duplicates, judged_flood
-from cpcbl_launch.lab.chaos.network import judged_bad, judged_cut, judged_partition
-from cpcbl_launch.lab.chaos.notes import (
+from cpcbl_launch.lab.chaos.figures import (
     back_after_s,
     counted,
     found_after_s,
@@ -18,6 +15,9 @@ from cpcbl_launch.lab.chaos.notes import (
     lost_after_s,
     rmse_m,
 )
+from cpcbl_launch.lab.chaos.files import Ended, judged_full, judged_read_only
+from cpcbl_launch.lab.chaos.inputs import judged_duplicates, judged_flood
+from cpcbl_launch.lab.chaos.network import judged_bad, judged_cut, judged_partition
 from cpcbl_launch.lab.chaos.processes import judged_field, judged_freeze, judged_kill, judged_router
 from cpcbl_launch.lab.chaos.soak import Life, Sample, judged_soak, lives
 from cpcbl_launch.lab.chaos.world import judged_clocks, judged_hidden, judged_kidnap, judged_liar

@@ -11,9 +11,9 @@ from msgspec.structs import replace
 from support.processes import cpcbl_team
 
 from cpcbl_agents.vision.camera import Camera, Floats, Pixels
-from cpcbl_launch.lab.experiments import eyes, eyes_figures, eyes_frames
-from cpcbl_launch.lab.experiments.eyes_figures import Batch, Kind, Mistake, Record
-from cpcbl_launch.lab.experiments.eyes_frames import Drawn, Thing, judged
+from cpcbl_launch.lab.experiments import detection_figures, eyes, rendered_frames
+from cpcbl_launch.lab.experiments.detection_figures import Batch, Kind, Mistake, Record
+from cpcbl_launch.lab.experiments.rendered_frames import Drawn, Thing, judged
 from cpcbl_launch.simulation.camera.render import Light, render
 from cpcbl_launch.simulation.camera.visibility import (
     Solid,
@@ -97,8 +97,8 @@ def test_the_truth_agrees_with_pixels() -> None:
     """A landmark is there to be seen where the picture without it is another one."""
     whole = gone = part = 0
     for number in range(12):
-        frame = eyes_frames.drawn(np.random.default_rng((7, number)))
-        names, things = list(frame.scene.landmarks), eyes_frames.things(frame)
+        frame = rendered_frames.drawn(np.random.default_rng((7, number)))
+        names, things = list(frame.scene.landmarks), rendered_frames.things(frame)
         everything, nothing = picture(frame, names, True), picture(frame, [], False)
         for name in names:
             due = changed(picture(frame, [name], False), nothing)
@@ -196,7 +196,7 @@ def test_figures_count_what_they_say() -> None:
     wrong = [
         Mistake(frame=1, kind="landmark", id="a", why="wrong id", range_m=1.0, bearing_deg=0.0)
     ]
-    f = eyes_figures.figures("landmark", records, wrong, 0.0, 4.0)
+    f = detection_figures.figures("landmark", records, wrong, 0.0, 4.0)
     assert (f.due, f.found, f.reported, f.right, f.ranged) == (3, 2, 4, 3, 2)
     assert f.recall == pytest.approx(2 / 3)
     assert f.precision == pytest.approx(3 / 4)
@@ -205,12 +205,12 @@ def test_figures_count_what_they_say() -> None:
     assert f.bearing_sigma_deg == pytest.approx(math.degrees(0.01))
     assert f.range_inside == 0.5
     assert f.bearing_inside == pytest.approx(2 / 3)
-    marker = eyes_figures.figures("marker", records, wrong, 0.0, 4.0)
+    marker = detection_figures.figures("marker", records, wrong, 0.0, 4.0)
     assert (marker.recall, marker.precision, marker.heading_inside) == (1.0, 1.0, 0.0)
 
 
 def test_nothing_holds_without_figures() -> None:
-    result = eyes_figures.outcome(1, 1, [Batch([], [], {}, {"frame_blank": 1}, 0.0, 0.0)])
+    result = detection_figures.outcome(1, 1, [Batch([], [], {}, {"frame_blank": 1}, 0.0, 0.0)])
     assert [said for said, held in result.pattern.items() if held] == ["no wrong id"]
 
 
@@ -218,11 +218,11 @@ def test_nothing_holds_without_figures() -> None:
 
 
 @pytest.fixture(scope="module")
-def small() -> eyes_figures.Eyes:
+def small() -> detection_figures.Eyes:
     return eyes.measured(150, 1, 2, lambda: None)
 
 
-def test_little_is_missed_and_nothing_mistaken(small: eyes_figures.Eyes) -> None:
+def test_little_is_missed_and_nothing_mistaken(small: detection_figures.Eyes) -> None:
     assert not small.refused
     assert not [m for m in small.mistakes if m.why == "wrong id"]
     least: dict[Kind, int] = {"landmark": 90, "marker": 120}
@@ -239,7 +239,7 @@ def test_little_is_missed_and_nothing_mistaken(small: eyes_figures.Eyes) -> None
         assert known.bearing_sigma_deg < 0.6
 
 
-def test_stated_sigmas_are_honest(small: eyes_figures.Eyes) -> None:
+def test_stated_sigmas_are_honest(small: detection_figures.Eyes) -> None:
     for kind, known in small.accuracy.items():
         shares = [known.range_inside, known.bearing_inside]
         shares += [known.heading_inside] if kind == "marker" else []
@@ -256,7 +256,7 @@ def test_stated_sigmas_are_honest(small: eyes_figures.Eyes) -> None:
     ],
 )
 def test_what_was_mistaken_once_is_not_again(number: int) -> None:
-    assert eyes_frames.frames(2, number, 1).mistakes == []
+    assert rendered_frames.frames(2, number, 1).mistakes == []
 
 
 def test_the_number_of_jobs_changes_no_figure() -> None:

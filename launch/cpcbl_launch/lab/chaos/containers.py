@@ -10,8 +10,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 from cpcbl_agents.clock import Clock
+from cpcbl_launch.lab.chaos.figures import all_counts
 from cpcbl_launch.lab.chaos.network import AFTER_S, CUT_S, judged_partition
-from cpcbl_launch.lab.chaos.notes import Notes, NoteTaker, all_counts
+from cpcbl_launch.lab.chaos.run_log import Notes, NoteTaker
 from cpcbl_launch.lab.chaos.scenario import CannotRunError, Found, Setting
 from cpcbl_launch.lab.chaos.team import PATIENCE_S, ChaosError
 from cpcbl_launch.run.containers import BASE_IMAGE, BASE_VARIABLE

@@ -7,8 +7,9 @@ from collections import Counter
 from collections.abc import Sequence
 
 from cpcbl_launch.lab.chaos.checks import Check
+from cpcbl_launch.lab.chaos.figures import counted, latency_s, worst
 from cpcbl_launch.lab.chaos.injectors import Echo
-from cpcbl_launch.lab.chaos.notes import Notes, counted, latency_s, worst
+from cpcbl_launch.lab.chaos.run_log import Notes
 from cpcbl_launch.lab.chaos.scenario import (
     Found,
     Setting,

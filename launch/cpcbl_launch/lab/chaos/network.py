@@ -4,8 +4,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 
 from cpcbl_launch.lab.chaos.checks import Check
-from cpcbl_launch.lab.chaos.notes import (
-    Notes,
+from cpcbl_launch.lab.chaos.figures import (
     counted,
     found_after_s,
     gone_after_s,
@@ -17,6 +16,7 @@ from cpcbl_launch.lab.chaos.notes import (
     worst,
 )
 from cpcbl_launch.lab.chaos.relay import Quality, Relay
+from cpcbl_launch.lab.chaos.run_log import Notes
 from cpcbl_launch.lab.chaos.scenario import (
     BASELINE_S,
     FOUND_M,
@@ -29,7 +29,7 @@ from cpcbl_launch.lab.chaos.scenario import (
 )
 from cpcbl_launch.lab.chaos.sites import two_sites
 from cpcbl_launch.lab.chaos.team import Plan, TeamUnderTest, demo_team, running
-from cpcbl_launch.lab.chaos.wire import Weather, Wire
+from cpcbl_launch.lab.chaos.tun_link import Weather, Wire
 from cpcbl_launch.run.up import free_endpoint
 
 CUT_S = 10.0

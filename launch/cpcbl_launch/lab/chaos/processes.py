@@ -1,8 +1,7 @@
 """Processes that are killed or stand still."""
 
 from cpcbl_launch.lab.chaos.checks import Check
-from cpcbl_launch.lab.chaos.notes import (
-    Notes,
+from cpcbl_launch.lab.chaos.figures import (
     back_after_s,
     counted,
     found_after_s,
@@ -12,6 +11,7 @@ from cpcbl_launch.lab.chaos.notes import (
     worst,
     worst_m,
 )
+from cpcbl_launch.lab.chaos.run_log import Notes
 from cpcbl_launch.lab.chaos.scenario import (
     BASELINE_S,
     FOUND_M,

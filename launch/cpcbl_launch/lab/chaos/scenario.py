@@ -5,7 +5,8 @@ from enum import StrEnum
 from typing import NamedTuple
 
 from cpcbl_launch.lab.chaos.checks import Check
-from cpcbl_launch.lab.chaos.notes import Notes, gone_after_s, inside, longest_gap_s, rmse_m, worst
+from cpcbl_launch.lab.chaos.figures import gone_after_s, inside, longest_gap_s, rmse_m, worst
+from cpcbl_launch.lab.chaos.run_log import Notes
 from cpcbl_launch.lab.chaos.team import TeamUnderTest
 from cpcbl_team.errors import CpcblError
 

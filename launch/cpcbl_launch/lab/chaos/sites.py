@@ -4,8 +4,8 @@ from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from typing import NamedTuple
 
-from cpcbl_launch.lab.chaos.notes import Notes, NoteTaker
 from cpcbl_launch.lab.chaos.relay import Relay
+from cpcbl_launch.lab.chaos.run_log import Notes, NoteTaker
 from cpcbl_launch.lab.chaos.team import Plan, Site, TeamUnderTest, running
 from cpcbl_launch.run.up import free_endpoint
 from cpcbl_team.config import Team

@@ -9,17 +9,11 @@ from statistics import linear_regression, median
 from typing import NamedTuple
 
 from cpcbl_launch.lab.chaos.checks import Check
+from cpcbl_launch.lab.chaos.figures import found_after_s, longest_gap_s, lost_share, tiers, worst
 from cpcbl_launch.lab.chaos.injectors import Echo
 from cpcbl_launch.lab.chaos.inputs import flooding
-from cpcbl_launch.lab.chaos.notes import (
-    Notes,
-    found_after_s,
-    longest_gap_s,
-    lost_share,
-    tiers,
-    worst,
-)
 from cpcbl_launch.lab.chaos.relay import Quality, Relay
+from cpcbl_launch.lab.chaos.run_log import Notes
 from cpcbl_launch.lab.chaos.scenario import FOUND_M, Found, Setting, all_is_well
 from cpcbl_launch.lab.chaos.team import FIELD, ROUTER, Plan, TeamUnderTest, demo_team, running
 from cpcbl_launch.run.up import free_endpoint

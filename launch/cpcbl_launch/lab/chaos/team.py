@@ -13,7 +13,8 @@ from typing import NamedTuple
 import msgspec
 
 from cpcbl_agents.clock import Clock
-from cpcbl_launch.lab.chaos.notes import Notes, NoteTaker, found_after_s, latest_incarnation
+from cpcbl_launch.lab.chaos.figures import found_after_s, latest_incarnation
+from cpcbl_launch.lab.chaos.run_log import Notes, NoteTaker
 from cpcbl_launch.lab.faulty_robot import faulty_command
 from cpcbl_launch.run.processes import PROGRAM, process_table
 from cpcbl_launch.run.supervisor import ProcessSpec, Supervisor

@@ -5,8 +5,7 @@ from collections.abc import Sequence
 import msgspec
 
 from cpcbl_launch.lab.chaos.checks import Check
-from cpcbl_launch.lab.chaos.notes import (
-    Notes,
+from cpcbl_launch.lab.chaos.figures import (
     all_counts,
     distrusted,
     distrusted_after_s,
@@ -19,6 +18,7 @@ from cpcbl_launch.lab.chaos.notes import (
     rmse_m,
     worst,
 )
+from cpcbl_launch.lab.chaos.run_log import Notes
 from cpcbl_launch.lab.chaos.scenario import FOUND_M, GOOD_M, Found, Setting, all_is_well, they_go_on
 from cpcbl_launch.lab.chaos.team import Plan, demo_team, running
 from cpcbl_launch.lab.experiments import liars

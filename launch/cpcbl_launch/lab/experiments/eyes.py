@@ -1,6 +1,7 @@
 """What cameras see: rendered frames over poses, light, clutter and what stands in the way.
 
-Each frame is drawn and judged by itself (`eyes_frames.py`); `eyes_figures.py` has the figures.
+`rendered_frames.py` renders each frame and compares it with what was detected;
+`detection_figures.py` computes the figures.
 """
 
 from collections import Counter
@@ -9,7 +10,7 @@ from pathlib import Path
 
 from rich.console import RenderableType
 
-from cpcbl_launch.lab.experiments.eyes_figures import (
+from cpcbl_launch.lab.experiments.detection_figures import (
     ERRORS_WITHIN_M,
     WITHIN_M,
     Eyes,
@@ -24,7 +25,7 @@ CHUNK = 25
 
 def measured(count: int, seed: int, jobs: int, done: Callable[[], None]) -> Eyes:
     """So many frames, `jobs` processes at a time; `done` is called after each `CHUNK` of them."""
-    from cpcbl_launch.lab.experiments.eyes_frames import frames  # needs OpenCV
+    from cpcbl_launch.lab.experiments.rendered_frames import frames  # needs OpenCV
 
     starts = range(0, count, CHUNK)
     tasks = [(seed, start, min(CHUNK, count - start)) for start in starts]

@@ -8,7 +8,7 @@ from typing import Any
 import matplotlib as mpl
 
 from cpcbl_launch.lab.experiments.budget import Curve, Point
-from cpcbl_launch.lab.experiments.eyes_figures import (
+from cpcbl_launch.lab.experiments.detection_figures import (
     LEAST_RECALL,
     MOST_BEARING_DEG,
     MOST_RANGE_SHARE,

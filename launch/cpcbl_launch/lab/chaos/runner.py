@@ -10,7 +10,7 @@ from importlib.metadata import version
 
 from msgspec.structs import replace
 
-from cpcbl_launch.lab.chaos import containers, files, wire
+from cpcbl_launch.lab.chaos import containers, files, tun_link
 from cpcbl_launch.lab.chaos.checks import Faults, Outcome
 from cpcbl_launch.lab.chaos.scenario import CannotRunError, Needs, Scenario, Setting
 from cpcbl_launch.lab.chaos.scenarios import SCENARIOS
@@ -40,7 +40,7 @@ def missing(needs: Needs) -> str:
     """Why a scenario that needs this cannot run here; empty if it can."""
     match needs:
         case Needs.ROOT:
-            return wire.missing()
+            return tun_link.missing()
         case Needs.MOUNT:
             return files.missing()
         case Needs.DOCKER:

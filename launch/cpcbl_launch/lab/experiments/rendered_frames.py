@@ -27,7 +27,7 @@ import numpy as np
 from cpcbl_agents.vision.camera import Camera, Floats, Pixels
 from cpcbl_agents.vision.detector import CameraEyes
 from cpcbl_agents.vision.pictures import decoded
-from cpcbl_launch.lab.experiments.eyes_figures import Batch, Kind, Mistake, Record, Wrong, team
+from cpcbl_launch.lab.experiments.detection_figures import Batch, Kind, Mistake, Record, Wrong, team
 from cpcbl_launch.simulation.camera.cameras import off_focus, shaken
 from cpcbl_launch.simulation.camera.render import render
 from cpcbl_launch.simulation.camera.robots import SIDES, body_top_m
