@@ -5,7 +5,7 @@ from functools import lru_cache
 import numpy as np
 
 from cpcbl_agents.vision.camera import Pixels
-from cpcbl_launch.lab.experiments.rendered_frames import drawn, picture
+from cpcbl_launch.lab.experiments.rendered_frames import random_frame, render_image
 from cpcbl_launch.team_file import builtin_path, load_team
 
 FRAMES = 24
@@ -21,8 +21,8 @@ def frames() -> tuple[Pixels, ...]:
     number = 0
     while len(found) < FRAMES:
         random = np.random.default_rng((5, number))
-        frame = drawn(random)
+        frame = random_frame(random)
         if frame.viewer == VIEWER:
-            found.append(picture(frame, random))
+            found.append(render_image(frame, random))
         number += 1
     return tuple(found)

@@ -18,8 +18,8 @@ import msgspec
 from cpcbl_agents.clock import Clock
 from cpcbl_agents.node import STATUS_NS
 from cpcbl_agents.process import StopSignal
-from cpcbl_launch.lab.chaos.team import clock_in
-from cpcbl_launch.lab.scaling.swarm import swarm
+from cpcbl_launch.lab.chaos.team import clock_starting_in
+from cpcbl_launch.lab.scaling.swarm import swarm_team
 from cpcbl_launch.run.processes import process_table
 from cpcbl_launch.run.supervisor import ProcessSpec, Supervisor
 from cpcbl_launch.run.up import free_endpoint
@@ -118,12 +118,14 @@ class _Counts:
 
 def measure_start(starts: int, checkout: Path | None = None) -> Start:
     """Starts one robot so many times. Raises TimeoutError if its token does not come."""
-    team, endpoint = swarm(2, 1), free_endpoint()
+    team, endpoint = swarm_team(2, 1), free_endpoint()
     robot = next(iter(team.robots))
     seconds, resident = [], []
     with _routed(team, endpoint) as (folder, bus):
         for _ in range(starts):
-            (spec,) = _robot_specs(team, folder, endpoint, clock_in(LEAD_S), checkout, [robot])
+            (spec,) = _robot_specs(
+                team, folder, endpoint, clock_starting_in(LEAD_S), checkout, [robot]
+            )
             appeared = threading.Event()
             tokens = bus.watch_liveliness(topics.ALIVE.at(robot=robot), _setter(appeared))
             began_s = time.monotonic()
@@ -180,8 +182,8 @@ def _robot_specs(
 
 def measure_team(robots: int, seconds: float, checkout: Path | None = None) -> Load:
     """A team as `up` runs it; its robots with the code of another checkout if one is given."""
-    team, endpoint, lead_s = swarm(robots, 1), free_endpoint(), _lead_s(robots)
-    clock, names = clock_in(lead_s), list(team.robots)
+    team, endpoint, lead_s = swarm_team(robots, 1), free_endpoint(), _lead_s(robots)
+    clock, names = clock_starting_in(lead_s), list(team.robots)
     with _routed(team, endpoint) as (folder, bus), ExitStack() as stack:
         counts = _Counts(clock)
         for topic in (topics.TRACK, topics.STATUS):
@@ -199,7 +201,7 @@ def measure_team(robots: int, seconds: float, checkout: Path | None = None) -> L
 def measure_broadcast(robots: int, seconds: float) -> Load:
     """As many processes, each of which sends its belief to all others."""
     names, endpoint, lead_s = [f"r{n:04}" for n in range(robots)], free_endpoint(), _lead_s(robots)
-    clock = clock_in(lead_s)
+    clock = clock_starting_in(lead_s)
     with open_router("broadcast", [endpoint]) as bus, ExitStack() as stack:
         counts = _Counts(clock)
         for topic in (topics.BELIEF, topics.STATUS):

@@ -17,10 +17,22 @@ from typing import NamedTuple
 import msgspec
 from fuzz.payloads import hypothesis_payloads, mixed_payloads, valid_payload
 
-from cpcbl_launch.lab.chaos.checks import Check
-from cpcbl_launch.lab.chaos.figures import all_counts
-from cpcbl_launch.lab.chaos.scenario import Found, Setting, all_is_well, they_go_on
-from cpcbl_launch.lab.chaos.team import FIELD, ChaosError, Plan, TeamUnderTest, demo_team, running
+from cpcbl_launch.lab.chaos.checks import Check, at_least, equal_to
+from cpcbl_launch.lab.chaos.figures import latest_counts
+from cpcbl_launch.lab.chaos.scenario import (
+    ScenarioOptions,
+    ScenarioResult,
+    checks_recovered,
+    checks_unaffected,
+)
+from cpcbl_launch.lab.chaos.team import (
+    FIELD,
+    ChaosError,
+    RunPlan,
+    TeamUnderTest,
+    demo_team,
+    run_team_under_test,
+)
 from cpcbl_launch.reporting.recorder import Recorder
 from cpcbl_launch.run.processes import PROGRAM
 from cpcbl_launch.views.frames.ear import FrameSubscriber
@@ -107,30 +119,30 @@ def fuzz_team() -> Team:
     return msgspec.structs.replace(team, robots=robots, transport=transport)
 
 
-def fuzz(setting: Setting, per_key: int = PER_KEY) -> Found:
+def fuzz(setting: ScenarioOptions, per_key: int = PER_KEY) -> ScenarioResult:
     """Sends payloads on every key, and malformed tokens, to a running team; checks its counts."""
-    setting.say("hypothesis generates payloads")
+    setting.report_progress("hypothesis generates payloads")
     examples = hypothesis_payloads(setting.seed)
     with ExitStack() as stack:
-        plan = Plan(fuzz_team(), setting.seed, left_out=(MATE,))
-        team = stack.enter_context(running(plan))
+        plan = RunPlan(fuzz_team(), setting.seed, left_out=(MATE,))
+        team = stack.enter_context(run_team_under_test(plan))
         bus = stack.enter_context(open_bus(plan.team.name, [team.endpoint]))
         ears = stack.enter_context(open_bus(plan.team.name, [team.endpoint]))
         recorder, watcher, looks = Recorder(ears), StatusCollector(ears), FrameSubscriber(ears)
-        setting.say("starting a team")
+        setting.report_progress("starting a team")
         team.settle()
         from_s = team.now_s
         fuzzer = Fuzzer(team, bus, per_key, examples, setting)
         fuzzer.send_help()
-        team.until(lambda: _total(fuzzer.victim_counts()) >= fuzzer.to_victim, 15.0)
+        team.wait_until(lambda: _total(fuzzer.victim_counts()) >= fuzzer.to_victim, 15.0)
         after_help = fuzzer.victim_counts()
         fuzzer.send_everything_else()
         sent = fuzzer.sent()
-        team.until(lambda: _total(fuzzer.victim_counts()) >= fuzzer.to_victim, 15.0)
+        team.wait_until(lambda: _total(fuzzer.victim_counts()) >= fuzzer.to_victim, 15.0)
         recorded = sent.no_messages - sent.no_looks
-        team.until(lambda: _refusals(recorder.counts) >= recorded, 15.0)
-        team.until(lambda: looks.refused.total() >= sent.no_looks, 15.0)
-        team.until(lambda: watcher.refused.total() >= sent.no_statuses, 15.0)
+        team.wait_until(lambda: _refusals(recorder.counts) >= recorded, 15.0)
+        team.wait_until(lambda: looks.refused.total() >= sent.no_looks, 15.0)
+        team.wait_until(lambda: watcher.refused.total() >= sent.no_statuses, 15.0)
         until_s = team.now_s
         final = FinalCounts(
             after_help,
@@ -144,13 +156,13 @@ def fuzz(setting: Setting, per_key: int = PER_KEY) -> Found:
             _traffic_exit(team),
         )
         final = final._replace(field=_field_counts(team), tracebacks=team.tracebacks())
-        notes, robots = team.notes, team.robots
+        notes, robots = team.run_log, team.robots
         checks = [
             *fuzz_checks(sent, final),
-            *they_go_on(notes, robots, from_s, until_s, most_silent_s=2.0, who="team's"),
-            *all_is_well(notes, robots, from_s, until_s),
+            *checks_unaffected(notes, robots, from_s, until_s, most_silent_s=2.0, who="team's"),
+            *checks_recovered(notes, robots, from_s, until_s),
         ]
-        return Found(checks, (_by_reason(final.victim),))
+        return ScenarioResult(checks, (_by_reason(final.victim),))
 
 
 def fuzz_checks(sent: SentCounts, final: FinalCounts) -> list[Check]:
@@ -171,8 +183,8 @@ def fuzz_checks(sent: SentCounts, final: FinalCounts) -> list[Check]:
             at_most=sent.help + 10,
         ),
         # the filter counts the odd parts of an accepted message a second time
-        Check(what="inputs counted", seen=_total(victim) - help_counted, at_least=sent.inputs),
-        Check(what="malformed tokens counted", seen=victim.get("bad_token", 0), at_least=TOKENS),
+        at_least("inputs counted", _total(victim) - help_counted, sent.inputs),
+        at_least("malformed tokens counted", victim.get("bad_token", 0), TOKENS),
         _equal("commands refused by the field", refused_commands, sent.commands),
         _equal("messages refused by the recorder", refused, sent.no_messages - sent.no_looks),
         _equal("messages refused by the traffic watcher", by_watcher, sent.no_statuses),
@@ -182,7 +194,7 @@ def fuzz_checks(sent: SentCounts, final: FinalCounts) -> list[Check]:
 
 
 def _equal(what: str, seen: int, due: int) -> Check:
-    return Check(what=what, seen=seen, at_least=due, at_most=due)
+    return equal_to(what, seen, due)
 
 
 def _total(counts: Mapping[str, int]) -> int:
@@ -208,9 +220,14 @@ class Fuzzer:
         bus: Bus,
         per_key: int,
         examples: Sequence[bytes],
-        setting: Setting,
+        setting: ScenarioOptions,
     ) -> None:
-        self._team, self._bus, self._per_key, self._report = team, bus, per_key, setting.say
+        self._team, self._bus, self._per_key, self._report = (
+            team,
+            bus,
+            per_key,
+            setting.report_progress,
+        )
         self._random, self._examples = random.Random(setting.seed), examples
         self._token = bus.declare_token(topics.ALIVE.at(tier=0, robot=MATE, incarnation="1"))
         key = topics.IN_SIGHTINGS.at(robot=VICTIM)
@@ -252,7 +269,7 @@ class Fuzzer:
 
     def victim_counts(self) -> Counter[str]:
         """The victim's counts."""
-        return all_counts(self._team.notes, VICTIM)
+        return latest_counts(self._team.run_log, VICTIM)
 
     def _key(self, topic: Topic) -> str:
         robot = VICTIM if topic in (topics.FIX, *topics.INPUTS) else MATE
@@ -288,7 +305,7 @@ class Fuzzer:
             return condition()
 
         self._team.watch()
-        return met() or self._team.until(met, 15.0)
+        return met() or self._team.wait_until(met, 15.0)
 
     def _send_sighting(self) -> None:
         now_s = time.monotonic()
@@ -310,6 +327,6 @@ def _field_counts(team: TeamUnderTest) -> Counter[str]:
     """The counts of commands that the field logs when it ends."""
     pid = team.pid(FIELD)
     os.kill(pid, signal.SIGINT)
-    team.until(lambda: "what became of them" in team.log(FIELD), 10.0)
-    line = next((s for s in team.log(FIELD).splitlines() if "what became of them" in s), "")
+    team.wait_until(lambda: "what became of them" in team.process_log(FIELD), 10.0)
+    line = next((s for s in team.process_log(FIELD).splitlines() if "what became of them" in s), "")
     return Counter({name: int(n) for name, n in re.findall(r"(\w+) (\d+)(?:,|$)", line)})

@@ -17,7 +17,7 @@ from fuzz.fuzzer import (
 from fuzz.payloads import valid_payload
 from support.chaos import broken
 
-from cpcbl_launch.lab.chaos.scenario import Setting
+from cpcbl_launch.lab.chaos.scenario import ScenarioOptions
 from cpcbl_transport import topics
 
 
@@ -26,8 +26,8 @@ from cpcbl_transport import topics
     ("seed", "per_key"), [(3, 300), pytest.param(1, PER_KEY, marks=pytest.mark.long)]
 )
 def test_every_payload_is_counted_and_the_team_continues(seed: int, per_key: int) -> None:
-    checks = list(fuzz(Setting(seed=seed), per_key).checks)
-    assert [str(check) for check in checks if not check.held] == []
+    checks = list(fuzz(ScenarioOptions(seed=seed), per_key).checks)
+    assert [str(check) for check in checks if not check.is_met] == []
 
 
 def test_every_topic_with_a_payload_is_fuzzed() -> None:

@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 
 from cpcbl_launch.lab.chaos.checks import Check
-from cpcbl_launch.lab.chaos.run_log import Heard, Notes, Said, Token
+from cpcbl_launch.lab.chaos.run_log import ReceivedStatus, ReceivedTrack, RunLog, TokenEvent
 from cpcbl_transport.messages import Flow, Status, Track, Trust
 from support.buses import SECOND
 
@@ -26,10 +26,10 @@ def tracks_of(
     silent: tuple[float, float] = (0.0, 0.0),
     lost: tuple[float, float] = (0.0, 0.0),
     late_s: float = 0.01,
-) -> list[Heard]:
+) -> list[ReceivedTrack]:
     """Ten tracks a second of a robot that stands at (1, 2), but for a time of silence."""
     return [
-        Heard(
+        ReceivedTrack(
             at_s + late_s,
             Track(
                 robot,
@@ -54,7 +54,7 @@ def status_at(
     heard: Sequence[tuple[str, float]] = (),
     trust: Sequence[tuple[str, str]] = (),
     incarnation: str = "1",
-) -> Said:
+) -> ReceivedStatus:
     """`heard`: (peer, time of its latest help); `trust`: (peer, reason)."""
     stamp_ns = EPOCH_NS + round(at_s * SECOND)
     flows = tuple(
@@ -62,7 +62,7 @@ def status_at(
     )
     counted = dict(counts or {})
     received = counted.pop("messages_received", 0)
-    return Said(
+    return ReceivedStatus(
         at_s,
         Status(
             robot,
@@ -84,11 +84,11 @@ def status_at(
 
 
 def notes_of(
-    tracks: Sequence[Sequence[Heard]],
-    tokens: Sequence[Token] = (),
-    statuses: Sequence[Said] = (),
+    tracks: Sequence[Sequence[ReceivedTrack]],
+    tokens: Sequence[TokenEvent] = (),
+    statuses: Sequence[ReceivedStatus] = (),
     jump: tuple[str, float, float] | None = None,
-) -> Notes:
+) -> RunLog:
     """`jump`: (robot, time, metres) of its true place."""
     by_robot = {heard[0].track.robot: tuple(heard) for heard in tracks}
     rows = {name: np.array([(at_s, 1.0, 2.0, 0.0) for at_s in TENTHS]) for name in by_robot}
@@ -96,20 +96,20 @@ def notes_of(
         robot, at_s, metres = jump
         moved = rows[robot][:, 0] >= at_s
         rows[robot][moved, 1] += metres
-    said: dict[str, list[Said]] = {}
+    said: dict[str, list[ReceivedStatus]] = {}
     for one in statuses:
         said.setdefault(one.status.robot, []).append(one)
-    return Notes(EPOCH_NS, by_robot, said, tuple(tokens), rows)
+    return RunLog(EPOCH_NS, by_robot, said, tuple(tokens), rows)
 
 
-def came(at_s: float, robot: str, incarnation: str = "1", tier: str = "3") -> Token:
-    return Token(at_s, robot, tier, incarnation, True)
+def came(at_s: float, robot: str, incarnation: str = "1", tier: str = "3") -> TokenEvent:
+    return TokenEvent(at_s, robot, tier, incarnation, True)
 
 
-def went(at_s: float, robot: str, incarnation: str = "1", tier: str = "3") -> Token:
-    return Token(at_s, robot, tier, incarnation, False)
+def went(at_s: float, robot: str, incarnation: str = "1", tier: str = "3") -> TokenEvent:
+    return TokenEvent(at_s, robot, tier, incarnation, False)
 
 
 def broken(checks: Sequence[Check]) -> set[str]:
     """What did not hold."""
-    return {check.what for check in checks if not check.held}
+    return {check.what for check in checks if not check.is_met}

@@ -84,10 +84,10 @@ def one_way_vs_both(
     robots: Annotated[str, typer.Option(help="Sizes of the teams.")] = "2,5,10,20",
 ) -> None:
     """Accuracy against bytes in teams of 2 to 20, with observers that are wrong."""
-    from cpcbl_launch.lab.experiments.directions import of_sizes
+    from cpcbl_launch.lab.experiments.directions import experiment_of_sizes
 
     sizes = [int(s) if s.strip().isdecimal() else 0 for s in robots.split(",")]
-    conduct(of_sizes(sizes), seeds, jobs, output, as_json)
+    conduct(experiment_of_sizes(sizes), seeds, jobs, output, as_json)
 
 
 @experiment_app.command("budget")
@@ -115,7 +115,7 @@ def budget(
     )
     logged = logged._replace(team=logged_team.with_blind_robots(logged.team, parse_names(blind)))
     with _progress("budget", len(experiment.cases())) as done:
-        result = experiment.curve(logged, jobs, done)
+        result = experiment.measure_curve(logged, jobs, done)
     _written(result, experiment.tables(result), output, as_json, draw_budget)
 
 
@@ -131,7 +131,7 @@ def liars(
     require_matplotlib("experiment")
     _must_be_writable(output, "liars")
     with _progress("liars", len(experiment.cases()) * seeds) as done:
-        result = experiment.measured(seeds, jobs or os.cpu_count() or 1, done)
+        result = experiment.measure(seeds, jobs or os.cpu_count() or 1, done)
     _written(result, experiment.tables(result), output, as_json, draw_liars)
 
 
@@ -152,7 +152,7 @@ def eyes(
     from cpcbl_launch.lab.experiments import eyes as experiment
 
     with _progress("eyes", -(-frames // experiment.CHUNK), "batches") as done:
-        result = experiment.measured(frames, seed, jobs or os.cpu_count() or 1, done)
+        result = experiment.measure(frames, seed, jobs or os.cpu_count() or 1, done)
     _written(result, experiment.tables(result), output, as_json, experiment.draw)
 
 
@@ -175,8 +175,8 @@ def pictures(
     require_opencv("experiment pictures")
     from cpcbl_launch.lab.experiments import real_pictures
 
-    _must_be_writable(output, f"pictures-{real_pictures.set_named(name).stem}", drawn=False)
-    result = real_pictures.measured(name, folder)
+    _must_be_writable(output, f"pictures-{real_pictures.picture_set(name).stem}", drawn=False)
+    result = real_pictures.measure(name, folder)
     _written(result, real_pictures.tables(result), output, as_json)
 
 
@@ -198,14 +198,14 @@ def conduct(
     experiment: "Experiment", seeds: int, jobs: int | None, output: Path, as_json: bool
 ) -> None:
     """Runs, writes and shows one experiment. Raises InputError for what the user can mend."""
-    from cpcbl_launch.lab.experiments.runs import run_all
+    from cpcbl_launch.lab.experiments.runs import run_cases
     from cpcbl_launch.options import require_matplotlib
 
     require_matplotlib("experiment")
     _must_be_writable(output, experiment.name)
     cases = experiment.cases()
     with _progress(experiment.name, len(cases) * seeds) as done:
-        results = run_all(cases, range(1, seeds + 1), jobs or os.cpu_count() or 1, done)
+        results = run_cases(cases, range(1, seeds + 1), jobs or os.cpu_count() or 1, done)
     outcome = experiment.outcome(results)
     _written(outcome, experiment.tables(outcome), output, as_json, experiment.draw)
 

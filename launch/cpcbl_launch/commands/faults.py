@@ -32,9 +32,9 @@ def chaos(
     from rich.console import Console
 
     from cpcbl_launch.lab.chaos import tables
-    from cpcbl_launch.lab.chaos.checks import as_data
-    from cpcbl_launch.lab.chaos.runner import chosen, run_all
-    from cpcbl_launch.lab.chaos.scenario import Setting
+    from cpcbl_launch.lab.chaos.checks import report_data
+    from cpcbl_launch.lab.chaos.runner import run_scenarios, select_scenarios
+    from cpcbl_launch.lab.chaos.scenario import ScenarioOptions
     from cpcbl_launch.lab.chaos.scenarios import SCENARIOS
     from cpcbl_launch.options import json_text, require_writable_file, write_or_reason
 
@@ -44,7 +44,7 @@ def chaos(
     for option, path in (("--report", report), ("--markdown", markdown)):
         if path is not None:
             require_writable_file(option, path)
-    todo = chosen(scenarios)
+    todo = select_scenarios(scenarios)
     logging.getLogger("cpcbl_launch").setLevel(logging.ERROR)  # restarts are part of it
     logging.getLogger("cpcbl_transport").setLevel(logging.ERROR)
     for number in (signal.SIGTERM, signal.SIGHUP):  # each ends what it has started
@@ -52,9 +52,9 @@ def chaos(
             signal.signal(number, signal.default_int_handler)
     progress = Console(stderr=True)
     with tables.Progress(progress, len(todo)) as shown:
-        setting = Setting(seed, soak_s, shown.doing)
-        faults = run_all(todo, setting, shown.began, shown.done)
-    result = as_data(faults)
+        setting = ScenarioOptions(seed, soak_s, shown.doing)
+        faults = run_scenarios(todo, setting, shown.began, shown.done)
+    result = report_data(faults)
     lost = write_report(report, result)
     if (page := markdown) is not None:
         text = "\n".join(tables.markdown(faults)) + "\n"
@@ -64,5 +64,5 @@ def chaos(
     else:
         tables.print_faults(faults, Console())
     print_not_written(lost)
-    if not faults.held:
+    if not faults.is_met:
         raise typer.Exit(1)

@@ -209,8 +209,13 @@ def simulate(
     """
     from rich.console import Console
 
-    from cpcbl_launch.lab.scaling.measure import DURATION_S, Scale, measured, parsed_sizes
-    from cpcbl_launch.lab.scaling.show import print_scale
+    from cpcbl_launch.lab.scaling.measure import (
+        DURATION_S,
+        ScalingReport,
+        measure_sizes,
+        parse_sizes,
+    )
+    from cpcbl_launch.lab.scaling.show import print_scaling
     from cpcbl_launch.options import (
         json_text,
         require_matplotlib,
@@ -237,11 +242,11 @@ def simulate(
     if picture is not None:
         require_writable_file("--picture", picture)
         require_matplotlib("--picture", picture)
-    result: Report | Scale
+    result: Report | ScalingReport
     with progress_bar("simulating", quiet=as_json) as progress:
         if robots:
             duration = DURATION_S if duration is None else duration
-            result = measured(parsed_sizes(robots), seed, duration, progress)
+            result = measure_sizes(parse_sizes(robots), seed, duration, progress)
         else:
             team = with_overrides(find_team(file or Path("demo")), budgets)
             require_team_opencv(team, team.robots, field=True)
@@ -251,13 +256,13 @@ def simulate(
     if isinstance(result, Report):
         lost |= result.not_written
     elif (drawing := picture) is not None:
-        from cpcbl_launch.lab.scaling.picture import draw_scale
+        from cpcbl_launch.lab.scaling.picture import draw_scaling
 
-        lost |= write_or_reason(drawing, lambda: draw_scale(result, drawing))
+        lost |= write_or_reason(drawing, lambda: draw_scaling(result, drawing))
     if as_json:
         sys.stdout.write(json_text(result) + "\n")
-    elif isinstance(result, Scale):
-        print_scale(result, Console())
+    elif isinstance(result, ScalingReport):
+        print_scaling(result, Console())
     else:
         print_report(result, Console())
     print_not_written(lost)

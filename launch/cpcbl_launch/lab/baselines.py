@@ -38,7 +38,7 @@ SMALLEST_VARIANCE = 1e-12  # (1 um)^2: exact sensors must not make a matrix sing
 _TRIANGLE = ((0, 0, 1, 0, 1, 2), (0, 1, 1, 2, 2, 2))  # xx, xy, yy, xh, yh, hh
 
 
-class Inputs(NamedTuple):
+class BaselineInputs(NamedTuple):
     """What one robot's filter is told: where it starts, corrected odometry, corrected frames."""
 
     settings: LocalizationSettings
@@ -48,7 +48,7 @@ class Inputs(NamedTuple):
     frames: tuple[Sightings, ...]
 
 
-def inputs_of(logged: LoggedTeam) -> dict[str, Inputs]:
+def baseline_inputs(logged: LoggedTeam) -> dict[str, BaselineInputs]:
     """What each robot's own sensing agent makes of its log. Raises LogError."""
     found = {}
     for name, settings in logged.team.robots.items():
@@ -57,12 +57,12 @@ def inputs_of(logged: LoggedTeam) -> dict[str, Inputs]:
         said = robot.sensing.handle(Tick(), logged.end_ns)
         odometry = tuple(m for m in said if isinstance(m, Odometry))
         frames = tuple(m for m in said if isinstance(m, Sightings))
-        found[name] = Inputs(settings, begin.stamp_ns, begin.estimate, odometry, frames)
+        found[name] = BaselineInputs(settings, begin.stamp_ns, begin.estimate, odometry, frames)
     return found
 
 
-def yardsticks(
-    inputs: Mapping[str, Inputs],
+def run_baselines(
+    inputs: Mapping[str, BaselineInputs],
     field: Field,
     stamps_ns: Mapping[str, Sequence[int]],
     progress: Callable[[float], None] = lambda done: None,
@@ -74,20 +74,20 @@ def yardsticks(
     paths: dict[str, dict[str, Trajectory]] = {}
     done = 0
     for kind, told in runs:
-        paths.setdefault(kind, {}).update(filtered(told, field, stamps_ns))
+        paths.setdefault(kind, {}).update(run_ekf(told, field, stamps_ns))
         done += len(told)
         progress(done / (3 * len(inputs)))
     return paths
 
 
-def scored(paths: Mapping[str, Trajectory], truth: Mapping[str, Floats]) -> BaselineReport:
+def baseline_report(paths: Mapping[str, Trajectory], truth: Mapping[str, Floats]) -> BaselineReport:
     """One yardstick's figures, by the same metrics as the team's."""
     robots = {n: score(samples_with_truth(path, truth.get(n))[1]) for n, path in paths.items()}
     return BaselineReport(robots=robots, team=mean_score(robots.values()))
 
 
-def filtered(
-    inputs: Mapping[str, Inputs], field: Field, stamps_ns: Mapping[str, Sequence[int]]
+def run_ekf(
+    inputs: Mapping[str, BaselineInputs], field: Field, stamps_ns: Mapping[str, Sequence[int]]
 ) -> dict[str, Trajectory]:
     """The estimates of one EKF over these robots, at each robot's own times (after its frames)."""
     ekf = Ekf(inputs, field)
@@ -98,9 +98,9 @@ def filtered(
     estimates: dict[str, list[Floats]] = {name: [] for name in inputs}
     covariances: dict[str, list[Floats]] = {name: [] for name in inputs}
     for stamp_ns, _, name, frame in sorted(events, key=lambda event: event[:3]):
-        ekf.advance(name, stamp_ns)
+        ekf.predict(name, stamp_ns)
         if frame is not None:
-            ekf.see(name, frame)
+            ekf.correct(name, frame)
             continue
         mean, covariance = ekf.marginal(name)
         estimates[name].append(mean)
@@ -128,10 +128,10 @@ def expected_sighting(pose: Floats, place: Floats) -> tuple[Floats, Floats]:
     return np.array([r, wrap_angle(math.atan2(dy, dx) - pose[2])]), jacobian
 
 
-class _Member:
+class _RobotBlock:
     """One robot in the filter: its place in the state, its time, the odometry still to come."""
 
-    def __init__(self, first: int, told: Inputs) -> None:
+    def __init__(self, first: int, told: BaselineInputs) -> None:
         self.first = first  # column of its x
         self.settings = told.settings
         self.now_ns = self.covered_ns = told.start_ns
@@ -145,7 +145,7 @@ class _Member:
     def columns(self) -> list[int]:
         return [self.first, self.first + 1, self.first + 2]
 
-    def refuses(self, kind: str, accepted: bool) -> bool:
+    def rejects_most(self, kind: str, accepted: bool) -> bool:
         """Whether most of the latest innovations of a kind were rejected, this one included.
 
         Kinds are judged apart: a team that is displaced as a whole agrees about its own robots.
@@ -171,9 +171,11 @@ class Ekf:
     independent, so that the poses of the others may wait.
     """
 
-    def __init__(self, inputs: Mapping[str, Inputs], field: Field) -> None:
+    def __init__(self, inputs: Mapping[str, BaselineInputs], field: Field) -> None:
         self._field = field
-        self._robots = {name: _Member(3 * i, told) for i, (name, told) in enumerate(inputs.items())}
+        self._robots = {
+            name: _RobotBlock(3 * i, told) for i, (name, told) in enumerate(inputs.items())
+        }
         self.mean = np.array([told.start.pose for told in inputs.values()], dtype=float).ravel()
         self.covariance = np.zeros((len(self.mean), len(self.mean)))
         for name, told in inputs.items():
@@ -186,7 +188,7 @@ class Ekf:
 
     # Motion -----------------------------------------------------------------------------------
 
-    def advance(self, name: str, until_ns: int) -> None:
+    def predict(self, name: str, until_ns: int) -> None:
         """Drives a robot on along its odometry. Does nothing if it is there already."""
         robot = self._robots[name]
         if until_ns <= robot.now_ns:
@@ -202,10 +204,10 @@ class Ekf:
             if piece.stamp_ns > until_ns:
                 break
             robot.pieces.popleft()
-        self._doubt_motion(robot, until_ns)
+        self._add_gap_noise(robot, until_ns)
         robot.now_ns = until_ns
 
-    def _move(self, robot: _Member, distance: float, turn: float, seconds: float) -> None:
+    def _move(self, robot: _RobotBlock, distance: float, turn: float, seconds: float) -> None:
         if distance == 0.0 and turn == 0.0:
             return
         i, p = robot.first, self.covariance
@@ -219,7 +221,7 @@ class Ekf:
         crawled = crawled_s(distance, seconds, s)
         self._add(i, motion_noise(before.heading, distance, turn, s, crawled))
 
-    def _doubt_motion(self, robot: _Member, until_ns: int) -> None:
+    def _add_gap_noise(self, robot: _RobotBlock, until_ns: int) -> None:
         """The growth of uncertainty while odometry is missing, as in the team."""
         s = robot.settings.odometry
         silent_ns = until_ns - max(robot.now_ns, robot.covered_ns + int(s.timeout_s * 1e9))
@@ -235,7 +237,7 @@ class Ekf:
 
     # Sightings --------------------------------------------------------------------------------
 
-    def see(self, name: str, frame: Sightings) -> None:
+    def correct(self, name: str, frame: Sightings) -> None:
         """Updates by the sightings of one frame, one after the other."""
         robot = self._robots[name]
         least_ns = robot.settings.localizer.object_interval_s * 1e9
@@ -247,23 +249,23 @@ class Ekf:
                 continue
             mate = self._robots.get(sighting.id)
             if mate is not None:
-                self.advance(sighting.id, frame.stamp_ns)
-            found = self._measured(robot, mate, sighting)
+                self.predict(sighting.id, frame.stamp_ns)
+            found = self._measurement_of(robot, mate, sighting)
             if found is None:
                 continue
             seconds = None if since_ns is None else since_ns * 1e-9
             doubt = repeated_share(seconds, robot.settings.sensor.correlation_s)
             found = found._replace(noise=doubt * found.noise)
-            accepted = self._corrected(found, robot.bounds)
+            accepted = self._update(found, robot.bounds)
             if accepted:
                 robot.used_ns[sighting.id] = frame.stamp_ns
             kind, concerned = ("landmark", [robot]) if mate is None else ("robot", [robot, mate])
             for member in concerned:
-                if member.refuses(kind, accepted):
-                    self._widen(member)
+                if member.rejects_most(kind, accepted):
+                    self._inflate(member)
 
-    def _measured(
-        self, robot: _Member, mate: _Member | None, sighting: Sighting
+    def _measurement_of(
+        self, robot: _RobotBlock, mate: _RobotBlock | None, sighting: Sighting
     ) -> _Measurement | None:
         """What a sighting of a robot or a landmark says; None if there is nothing to use."""
         landmark = self._field.landmarks.get(sighting.id)
@@ -291,7 +293,7 @@ class Ekf:
         noise = np.diag(sigmas**2 + SMALLEST_VARIANCE)
         return _Measurement(columns, jacobian[rows, : len(columns)], innovation, noise)
 
-    def _corrected(self, m: _Measurement, bounds: tuple[float, float]) -> bool:
+    def _update(self, m: _Measurement, bounds: tuple[float, float]) -> bool:
         """The Kalman update, if the chi-square gate opens; whether it did."""
         cross = self.covariance[:, m.columns] @ m.jacobian.T
         weights = np.linalg.inv(m.jacobian @ cross[m.columns] + m.noise)
@@ -304,18 +306,18 @@ class Ekf:
         self.covariance = 0.5 * (self.covariance + self.covariance.T)
         return True
 
-    def _widen(self, robot: _Member) -> None:
+    def _inflate(self, robot: _RobotBlock) -> None:
         """The way back of a robot that refuses what it sees: it doubles its sigma until its gates
         open, from 0.1 m and 0.1 rad at least to the limits of being lost at most."""
         i, rules = robot.first, robot.settings.localizer
         xx, yy, hh = np.diag(self.covariance)[i : i + 3].tolist()
         most = rules.lost_position_sigma_m**2, math.radians(rules.lost_heading_sigma_deg) ** 2
-        p = _doubt(0.5 * (xx + yy), most[0])
-        self._add(i, (p, 0.0, p, 0.0, 0.0, _doubt(hh, most[1])))
+        p = _variance_to_add(0.5 * (xx + yy), most[0])
+        self._add(i, (p, 0.0, p, 0.0, 0.0, _variance_to_add(hh, most[1])))
         for window in robot.innovations.values():
             window.clear()
 
 
-def _doubt(variance: float, most: float) -> float:
+def _variance_to_add(variance: float, most: float) -> float:
     """What to add to a variance so that its sigma doubles, within bounds."""
     return max(min(max(4.0 * variance, 0.01), most) - variance, 0.0)

@@ -10,7 +10,7 @@ import msgspec
 
 from cpcbl_agents.composition import build_robot
 from cpcbl_agents.node import Node, Steppable
-from cpcbl_launch.lab.baselines import inputs_of, scored, yardsticks
+from cpcbl_launch.lab.baselines import baseline_inputs, baseline_report, run_baselines
 from cpcbl_launch.options import check_limit
 from cpcbl_launch.reporting.metrics import Trajectory
 from cpcbl_launch.reporting.recorder import Recorder, Report
@@ -94,9 +94,9 @@ def evaluate_log_with_paths(
     if not with_yardsticks:
         return LogEvaluation(report, {"estimate": own})
     stamps_ns = {name: path.stamps_ns.tolist() for name, path in own.items()}
-    inputs, field = inputs_of(logged), logged.team.map
-    others = yardsticks(inputs, field, stamps_ns, lambda done: show(half + half * done))
-    figures = {kind: scored(paths, logged.truth) for kind, paths in others.items()}
+    inputs, field = baseline_inputs(logged), logged.team.map
+    others = run_baselines(inputs, field, stamps_ns, lambda done: show(half + half * done))
+    figures = {kind: baseline_report(paths, logged.truth) for kind, paths in others.items()}
     report = msgspec.structs.replace(report, yardsticks=figures)
     return LogEvaluation(report, {"estimate": own, **others})
 

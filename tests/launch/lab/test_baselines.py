@@ -14,7 +14,14 @@ from support.logs import FRAME_MS, STEP_MS, log_team, write_log
 from support.processes import cpcbl_team
 
 from cpcbl_agents.sources.mrclam import read_table
-from cpcbl_launch.lab.baselines import Ekf, Inputs, expected_sighting, inputs_of, scored, yardsticks
+from cpcbl_launch.lab.baselines import (
+    BaselineInputs,
+    Ekf,
+    baseline_inputs,
+    baseline_report,
+    expected_sighting,
+    run_baselines,
+)
 from cpcbl_launch.reporting.metrics import Floats, Trajectory, position_errors, samples_with_truth
 from cpcbl_launch.reporting.recorder import BaselineReport
 from cpcbl_launch.run.logged_team import LoggedTeam, load_logged_team, with_blind_robots
@@ -104,11 +111,13 @@ def started(logged: LoggedTeam, dx_m: float = 0.0, dy_m: float = 0.0) -> LoggedT
 
 def paths_of(logged: LoggedTeam) -> dict[str, dict[str, Trajectory]]:
     stamps = range(logged.start_ns, logged.end_ns, 100_000_000)
-    return yardsticks(inputs_of(logged), logged.team.map, dict.fromkeys(logged.team.robots, stamps))
+    return run_baselines(
+        baseline_inputs(logged), logged.team.map, dict.fromkeys(logged.team.robots, stamps)
+    )
 
 
 def reports_of(logged: LoggedTeam) -> dict[str, BaselineReport]:
-    return {kind: scored(paths, logged.truth) for kind, paths in paths_of(logged).items()}
+    return {kind: baseline_report(paths, logged.truth) for kind, paths in paths_of(logged).items()}
 
 
 def figure(report: BaselineReport, name: str = "position_rmse_m", robot: str = "") -> float:
@@ -233,9 +242,9 @@ def test_a_filter_that_refuses_everything_comes_back(tmp_path: Path) -> None:
 # One filter, step by step ------------------------------------------------------------------------
 
 
-def told(pose: Pose2, *pieces: Odometry, sigma: float = 0.1) -> Inputs:
+def told(pose: Pose2, *pieces: Odometry, sigma: float = 0.1) -> BaselineInputs:
     settings = RobotSettings(sensor=SENSOR, odometry=ODOMETRY, source="mrclam")
-    return Inputs(settings, 0, Estimate(pose, diagonal(sigma, sigma)), pieces, ())
+    return BaselineInputs(settings, 0, Estimate(pose, diagonal(sigma, sigma)), pieces, ())
 
 
 def differences(function: Callable[[Floats], Floats], at: Floats) -> Floats:
@@ -273,7 +282,7 @@ def test_motion_shears_the_whole_covariance_by_its_jacobian(seed: int) -> None:
         lambda at: np.array(step(Pose2(*at.tolist()), distance, turn)), np.array(pose)
     )
     expected = jacobian @ ekf.covariance @ jacobian.T
-    ekf.advance("driver", 1_000_000_000)
+    ekf.predict("driver", 1_000_000_000)
     np.testing.assert_allclose(ekf.covariance, expected, atol=1e-6)
     np.testing.assert_allclose(ekf.mean, [1.0, 1.0, 0.0, *step(pose, distance, turn)])
 
@@ -281,16 +290,16 @@ def test_motion_shears_the_whole_covariance_by_its_jacobian(seed: int) -> None:
 def test_odometry_in_parts_is_odometry_in_one() -> None:
     pieces = [piece for piece, _ in driven(LOOP_START, loop()[:40])]
     whole, parts = (Ekf({"r": told(LOOP_START, *pieces)}, Field()) for _ in range(2))
-    whole.advance("r", pieces[-1].stamp_ns)
+    whole.predict("r", pieces[-1].stamp_ns)
     for stamp_ns in range(0, pieces[-1].stamp_ns + 1, 50_000_000):
-        parts.advance("r", stamp_ns)
+        parts.predict("r", stamp_ns)
     np.testing.assert_allclose(parts.marginal("r")[0], whole.marginal("r")[0], atol=1e-9)
     np.testing.assert_allclose(parts.marginal("r")[1], whole.marginal("r")[1], atol=1e-4)
 
 
 def test_doubt_grows_with_the_way_as_the_settings_say() -> None:
     ekf = Ekf({"r": told(Pose2(0.0, 0.0, 0.0), Odometry(0, 100, 0.25, 0.0), sigma=0.0)}, Field())
-    ekf.advance("r", 100)
+    ekf.predict("r", 100)
     gained = np.diag(ekf.covariance)
     assert gained[0] == pytest.approx(ODOMETRY.distance_sigma_m_per_sqrt_m**2 * 0.25)
     assert gained[2] == pytest.approx(ODOMETRY.turn_sigma_rad_per_sqrt_m**2 * 0.25)
@@ -298,14 +307,14 @@ def test_doubt_grows_with_the_way_as_the_settings_say() -> None:
 
 def test_a_bearing_straight_behind_has_no_seam() -> None:
     ekf = Ekf({"a": told(Pose2(0.0, 0.0, 0.0)), "b": told(Pose2(-2.0, 0.001, 0.0))}, Field())
-    ekf.see("a", Sightings(0, (Sighting("b", 2.0, 0.01 - math.pi),)))
+    ekf.correct("a", Sightings(0, (Sighting("b", 2.0, 0.01 - math.pi),)))
     assert ekf.mean[2] == pytest.approx(-0.01, abs=0.009)
     assert ekf.covariance[2, 2] < 0.9 * 0.1**2
 
 
 def test_one_sighting_informs_both_robots_and_ties_them() -> None:
     ekf = Ekf({"a": told(Pose2(0.0, 0.0, 0.0)), "b": told(Pose2(2.0, 0.0, 0.0))}, Field())
-    ekf.see("a", Sightings(0, (Sighting("b", 2.1, 0.0),)))
+    ekf.correct("a", Sightings(0, (Sighting("b", 2.1, 0.0),)))
     assert ekf.mean[0] == pytest.approx(-(ekf.mean[3] - 2.0))
     assert ekf.mean[3] > 2.02
     assert ekf.covariance[0, 3] > 0.003
@@ -316,16 +325,16 @@ def test_an_outlier_is_gated_and_a_fault_is_left_out() -> None:
     ekf = Ekf({"a": told(Pose2(0.0, 0.0, 0.0)), "b": told(Pose2(2.0, 0.0, 0.0))}, Field())
     mean, covariance = ekf.mean.copy(), ekf.covariance.copy()
     wrong = (Sighting("b", 4.0, 0.0), Sighting("b", math.nan, 0.0), Sighting("nobody", 1.0, 0.0))
-    ekf.see("a", Sightings(0, wrong))
+    ekf.correct("a", Sightings(0, wrong))
     np.testing.assert_array_equal(ekf.mean, mean)
     np.testing.assert_array_equal(ekf.covariance, covariance)
 
 
 def test_where_odometry_has_ended_doubt_grows() -> None:
     ekf = Ekf({"r": told(Pose2(0.0, 0.0, 0.0), Odometry(0, 100_000_000, 0.05, 0.0))}, Field())
-    ekf.advance("r", 500_000_000)
+    ekf.predict("r", 500_000_000)
     before = ekf.marginal("r")[1]
-    ekf.advance("r", 2_600_000_000)
+    ekf.predict("r", 2_600_000_000)
     gained = ekf.marginal("r")[1] - before
     np.testing.assert_allclose(gained, 2.0 * 0.3**2 * np.eye(3), atol=1e-9)
 

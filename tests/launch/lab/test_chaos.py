@@ -20,12 +20,19 @@ from support.processes import cpcbl_team, eventually, pids_of
 from cpcbl_launch.lab.chaos import tun_link
 from cpcbl_launch.lab.chaos.checks import Check, Outcome
 from cpcbl_launch.lab.chaos.injectors import Echo
-from cpcbl_launch.lab.chaos.relay import Quality, Relay
-from cpcbl_launch.lab.chaos.runner import chosen, outcome_of, run_all
-from cpcbl_launch.lab.chaos.scenario import Found, Needs, Scenario, Setting
+from cpcbl_launch.lab.chaos.relay import LinkQuality, Relay
+from cpcbl_launch.lab.chaos.runner import run_scenario, run_scenarios, select_scenarios
+from cpcbl_launch.lab.chaos.scenario import Needs, Scenario, ScenarioOptions, ScenarioResult
 from cpcbl_launch.lab.chaos.scenarios import SCENARIOS
-from cpcbl_launch.lab.chaos.team import ROUTER, ChaosError, Plan, demo_team, router_spec, running
-from cpcbl_launch.lab.chaos.tun_link import Weather, Wire
+from cpcbl_launch.lab.chaos.team import (
+    ROUTER,
+    ChaosError,
+    RunPlan,
+    demo_team,
+    router_spec,
+    run_team_under_test,
+)
+from cpcbl_launch.lab.chaos.tun_link import PacketImpairment, TunLink
 from cpcbl_launch.run.processes import PROGRAM
 from cpcbl_launch.run.supervisor import Supervisor
 from cpcbl_launch.run.up import free_endpoint
@@ -35,36 +42,38 @@ from cpcbl_transport import topics
 from cpcbl_transport.topics import Qos
 from cpcbl_transport.zenoh_bus import open_bus, open_router
 
-SETTING = Setting(seed=3, soak_s=60.0)
+SETTING = ScenarioOptions(seed=3, soak_s=60.0)
 
 
 def judged(outcome: Outcome) -> None:
     """Fails with all that was seen; skips what cannot run here."""
     if outcome.not_run:
         pytest.skip(outcome.not_run)
-    seen = "\n".join(f"{'held' if c.held else 'NOT HELD'}: {c}" for c in outcome.checks)
-    assert outcome.held, f"{outcome.failed}\n{seen}"
+    seen = "\n".join(f"{'held' if c.is_met else 'NOT HELD'}: {c}" for c in outcome.checks)
+    assert outcome.is_met, f"{outcome.failed}\n{seen}"
 
 
 @pytest.mark.timeout(300)
 @pytest.mark.parametrize("scenario", [pytest.param(s, id=s.name) for s in SCENARIOS if s.quick])
 def test_a_quick_scenario_holds(scenario: Scenario) -> None:
-    judged(outcome_of(scenario, SETTING))
+    judged(run_scenario(scenario, SETTING))
 
 
 # The table and its command ------------------------------------------------------------------------
 
 
 def scenario_of(name: str, *checks: Check, needs: Needs = Needs.NOTHING) -> Scenario:
-    return Scenario(name, "what is done", "what is expected", needs, True, lambda _: Found(checks))
+    return Scenario(
+        name, "what is done", "what is expected", needs, True, lambda _: ScenarioResult(checks)
+    )
 
 
 def test_every_scenario_has_its_own_name_and_says_what_it_expects() -> None:
     names = [s.name for s in SCENARIOS]
     assert len(set(names)) == len(names)
     assert all(s.done and s.expectation for s in SCENARIOS)
-    assert chosen(["all"]) == list(SCENARIOS)
-    assert [s.name for s in chosen([names[3], names[1]])] == [names[1], names[3]]
+    assert select_scenarios(["all"]) == list(SCENARIOS)
+    assert [s.name for s in select_scenarios([names[3], names[1]])] == [names[1], names[3]]
 
 
 def test_a_name_that_is_no_scenario_is_one_line_with_a_hint() -> None:
@@ -87,10 +96,10 @@ def test_the_scenarios_are_listed() -> None:
 
 
 def test_what_fails_and_what_cannot_run_is_told_apart(monkeypatch: pytest.MonkeyPatch) -> None:
-    def breaks(_: Setting) -> Found:
+    def breaks(_: ScenarioOptions) -> ScenarioResult:
         raise ChaosError("the team did not settle")
 
-    monkeypatch.setattr("cpcbl_launch.lab.chaos.tun_link.missing", lambda: "needs root")
+    monkeypatch.setattr("cpcbl_launch.lab.chaos.tun_link.missing_requirement", lambda: "needs root")
     good = Check(what="n", seen=1, at_least=1)
     table = [
         scenario_of("good", good),
@@ -100,12 +109,12 @@ def test_what_fails_and_what_cannot_run_is_told_apart(monkeypatch: pytest.Monkey
     ]
     began: list[str] = []
     done: list[Outcome] = []
-    faults = run_all(table, Setting(), lambda s: began.append(s.name), done.append)
-    assert [o.held for o in faults.outcomes] == [True, False, False, None]
+    faults = run_scenarios(table, ScenarioOptions(), lambda s: began.append(s.name), done.append)
+    assert [o.is_met for o in faults.outcomes] == [True, False, False, None]
     assert faults.outcomes[2].failed == "the team did not settle"
     assert faults.outcomes[3].not_run == "needs root"
     assert began == [o.scenario for o in done] == ["good", "bad", "broken", "rooted"]
-    assert not faults.held
+    assert not faults.is_met
 
 
 @pytest.mark.long
@@ -177,9 +186,9 @@ def round_trip_s(link: socket.socket, data: bytes) -> float:
 def test_a_relay_carries_delays_and_limits() -> None:
     with echoing() as server, Relay(server) as relay, dial(relay.endpoint) as link:
         assert round_trip_s(link, bytes(range(256)) * 2_000) < 5.0
-        relay.set(Quality(delay_s=0.2))
+        relay.set(LinkQuality(delay_s=0.2))
         wait_until(lambda: round_trip_s(link, b"x") >= 0.4)
-        relay.set(Quality(bytes_per_s=20_000.0))
+        relay.set(LinkQuality(bytes_per_s=20_000.0))
         wait_until(lambda: relay.quality.bytes_per_s > 0.0)
         assert round_trip_s(link, bytes(8_000)) >= 0.4
         assert relay.passed > 1_000_000
@@ -188,13 +197,13 @@ def test_a_relay_carries_delays_and_limits() -> None:
 def test_a_cut_relay_is_silent_and_loses_nothing() -> None:
     with echoing() as server, Relay(server) as relay, dial(relay.endpoint) as link:
         round_trip_s(link, b"before")
-        relay.set(Quality(cut=True))
+        relay.set(LinkQuality(cut=True))
         wait_until(lambda: relay.quality.cut)
         link.sendall(b"meanwhile")
         link.settimeout(0.5)
         with pytest.raises(TimeoutError):
             link.recv(100)
-        relay.set(Quality())
+        relay.set(LinkQuality())
         link.settimeout(10.0)
         assert link.recv(100) == b"meanwhile"
 
@@ -208,16 +217,16 @@ def test_a_relay_hands_on_that_an_end_has_left() -> None:
             assert link.recv(10) == b""
 
 
-@pytest.mark.skipif(bool(tun_link.missing()), reason="needs root and /dev/net/tun")
+@pytest.mark.skipif(bool(tun_link.missing_requirement()), reason="needs root and /dev/net/tun")
 def test_a_wire_loses_packets_and_tcp_lives_with_it() -> None:
-    with Wire(seed=1) as lossy, socket.create_server((lossy.here, 0)) as server:
+    with TunLink(seed=1) as lossy, socket.create_server((lossy.near_address, 0)) as server:
         server.settimeout(30.0)
         port = server.getsockname()[1]
         code = (
-            f"import socket; c = socket.create_connection(('{lossy.here}', {port}));"
+            f"import socket; c = socket.create_connection(('{lossy.near_address}', {port}));"
             "c.sendall(bytes(300_000)); c.shutdown(1); c.recv(1)"
         )
-        lossy.set(Weather(loss=0.2, delay_s=0.01, jitter_s=0.01))
+        lossy.set(PacketImpairment(loss=0.2, delay_s=0.01, jitter_s=0.01))
         with subprocess.Popen([*lossy.prefix, "python3", "-c", code]) as process:
             end, _ = server.accept()
             with end:
@@ -285,6 +294,6 @@ def test_an_echo_says_everything_twice_more() -> None:
 def test_a_team_that_does_not_settle_says_who_and_why() -> None:
     with (
         pytest.raises(ChaosError, match=r"did not settle: .*patrol"),
-        running(Plan(demo_team(), links={"patrol": free_endpoint()})) as team,
+        run_team_under_test(RunPlan(demo_team(), links={"patrol": free_endpoint()})) as team,
     ):
         team.settle(patience_s=8.0)

@@ -4,23 +4,33 @@ import pytest
 from msgspec.structs import replace
 from support.chaos import UNTIL_S, broken, came, notes_of, status_at, tracks_of, went
 
-from cpcbl_launch.lab.chaos.checks import Check, Faults, Outcome, as_data
+from cpcbl_launch.lab.chaos.checks import ChaosReport, Check, Outcome, report_data
 from cpcbl_launch.lab.chaos.figures import (
-    back_after_s,
-    counted,
-    found_after_s,
-    gone_after_s,
-    latency_s,
-    longest_gap_s,
-    lost_after_s,
-    rmse_m,
+    counts_between,
+    localized_after_s,
+    longest_track_gap_s,
+    position_rmse_m,
+    reported_lost_after_s,
+    restarted_after_s,
+    token_gone_after_s,
+    track_delay_s,
 )
-from cpcbl_launch.lab.chaos.files import Ended, judged_full, judged_read_only
-from cpcbl_launch.lab.chaos.inputs import judged_duplicates, judged_flood
-from cpcbl_launch.lab.chaos.network import judged_bad, judged_cut, judged_partition
-from cpcbl_launch.lab.chaos.processes import judged_field, judged_freeze, judged_kill, judged_router
-from cpcbl_launch.lab.chaos.soak import Life, Sample, judged_soak, lives
-from cpcbl_launch.lab.chaos.world import judged_clocks, judged_hidden, judged_kidnap, judged_liar
+from cpcbl_launch.lab.chaos.files import CommandResult, full_disk_checks, read_only_checks
+from cpcbl_launch.lab.chaos.inputs import duplicates_checks, flood_checks
+from cpcbl_launch.lab.chaos.network import bad_link_checks, cut_link_checks, partition_checks
+from cpcbl_launch.lab.chaos.processes import (
+    freeze_checks,
+    kill_checks,
+    kill_field_checks,
+    kill_router_checks,
+)
+from cpcbl_launch.lab.chaos.soak import ProcessLife, ProcessSample, process_lives, soak_checks
+from cpcbl_launch.lab.chaos.world import (
+    clock_checks,
+    faulty_robot_checks,
+    hidden_landmarks_checks,
+    kidnap_checks,
+)
 from cpcbl_launch.run.usage import MIB
 
 AT_S = 10.0
@@ -44,24 +54,24 @@ def outcome(*checks: Check) -> Outcome:
     ],
 )
 def test_a_check_holds_within_its_bounds_and_says_both(check: Check, held: bool, said: str) -> None:
-    assert check.held is held
+    assert check.is_met is held
     assert str(check) == said
 
 
 def test_an_outcome_without_a_check_does_not_hold() -> None:
     good = outcome(Check(what="n", seen=1, at_least=1))
-    assert good.held is True
-    assert outcome().held is False
-    assert replace(good, failed="no router").held is False
-    assert replace(outcome(), not_run="needs root").held is None
+    assert good.is_met is True
+    assert outcome().is_met is False
+    assert replace(good, failed="no router").is_met is False
+    assert replace(outcome(), not_run="needs root").is_met is None
 
 
 def test_what_was_not_run_breaks_nothing_and_is_in_the_data() -> None:
     skipped = replace(outcome(), not_run="needs root")
-    good = Faults(version="1", seed=1, machine="m", outcomes=(skipped,))
-    assert good.held
+    good = ChaosReport(version="1", seed=1, machine="m", outcomes=(skipped,))
+    assert good.is_met
     bad = outcome(Check(what="n", seen=0, at_least=1))
-    data = as_data(replace(good, outcomes=(skipped, bad)))
+    data = report_data(replace(good, outcomes=(skipped, bad)))
     assert data["held"] is False
     assert [o["held"] for o in data["outcomes"]] == [None, False]
     assert data["outcomes"][1]["checks"][0]["held"] is False
@@ -72,39 +82,41 @@ def test_what_was_not_run_breaks_nothing_and_is_in_the_data() -> None:
 
 def test_a_robot_is_gone_when_the_last_of_its_tokens_is() -> None:
     tokens = [came(0, "a"), came(9, "a", tier="4"), went(9.1, "a"), went(10.5, "a", tier="4")]
-    assert gone_after_s(notes_of([], tokens), "a", AT_S) == pytest.approx(0.5)
-    assert gone_after_s(notes_of([], tokens[:3]), "a", AT_S) is None
+    assert token_gone_after_s(notes_of([], tokens), "a", AT_S) == pytest.approx(0.5)
+    assert token_gone_after_s(notes_of([], tokens[:3]), "a", AT_S) is None
 
 
 def test_a_robot_is_back_with_another_process() -> None:
     tokens = [came(0, "a"), came(11.0, "a"), came(12.0, "a", "2"), came(11.5, "b", "2")]
-    assert back_after_s(notes_of([], tokens), "a", AT_S, "1") == pytest.approx(2.0)
-    assert back_after_s(notes_of([], tokens[:2]), "a", AT_S, "1") is None
+    assert restarted_after_s(notes_of([], tokens), "a", AT_S, "1") == pytest.approx(2.0)
+    assert restarted_after_s(notes_of([], tokens[:2]), "a", AT_S, "1") is None
 
 
 def test_a_robot_is_found_when_it_stays_right_for_a_second() -> None:
     flickers = tracks_of("a", lambda s: 1.0 if s < 12.0 or 12.5 < s < 14.0 else 0.1)
-    assert found_after_s(notes_of([flickers]), "a", AT_S, 0.3) == pytest.approx(4.0)
+    assert localized_after_s(notes_of([flickers]), "a", AT_S, 0.3) == pytest.approx(4.0)
     lost = tracks_of("a", lost=(0.0, 15.0))
-    assert found_after_s(notes_of([lost]), "a", AT_S, 0.3) == pytest.approx(5.0)
-    assert lost_after_s(notes_of([lost]), "a", AT_S) == pytest.approx(0.0)
+    assert localized_after_s(notes_of([lost]), "a", AT_S, 0.3) == pytest.approx(5.0)
+    assert reported_lost_after_s(notes_of([lost]), "a", AT_S) == pytest.approx(0.0)
     said = [status_at("a", 9.5, {"lost": 1}), status_at("a", 10.5, {"lost": 2})]
-    assert lost_after_s(notes_of([tracks_of("a")], (), said), "a", AT_S) == pytest.approx(0.5)
-    assert lost_after_s(notes_of([tracks_of("a")], (), said[:1]), "a", AT_S) is None
+    assert reported_lost_after_s(notes_of([tracks_of("a")], (), said), "a", AT_S) == pytest.approx(
+        0.5
+    )
+    assert reported_lost_after_s(notes_of([tracks_of("a")], (), said[:1]), "a", AT_S) is None
     never = tracks_of("a", lambda s: 1.0)
-    assert found_after_s(notes_of([never]), "a", AT_S, 0.3) is None
+    assert localized_after_s(notes_of([never]), "a", AT_S, 0.3) is None
 
 
 def test_silence_error_and_delay_are_those_of_the_window() -> None:
     notes = notes_of(
         [tracks_of("a", lambda s: 3.0 if s >= 20.0 else 0.3, (12.0, 15.0), late_s=0.2)]
     )
-    assert longest_gap_s(notes, "a", AT_S, 20.0) == pytest.approx(3.1, abs=0.11)
-    assert longest_gap_s(notes, "a", 16.0, 20.0) == pytest.approx(0.1, abs=0.11)
-    assert longest_gap_s(notes, "nobody", 16.0, 20.0) == pytest.approx(4.0)
-    assert rmse_m(notes, "a", AT_S, 20.0) == pytest.approx(0.3)
-    assert rmse_m(notes, "a", 20.0) == pytest.approx(3.0)
-    assert latency_s(notes, "a", AT_S, 20.0) == pytest.approx(0.2)
+    assert longest_track_gap_s(notes, "a", AT_S, 20.0) == pytest.approx(3.1, abs=0.11)
+    assert longest_track_gap_s(notes, "a", 16.0, 20.0) == pytest.approx(0.1, abs=0.11)
+    assert longest_track_gap_s(notes, "nobody", 16.0, 20.0) == pytest.approx(4.0)
+    assert position_rmse_m(notes, "a", AT_S, 20.0) == pytest.approx(0.3)
+    assert position_rmse_m(notes, "a", 20.0) == pytest.approx(3.0)
+    assert track_delay_s(notes, "a", AT_S, 20.0) == pytest.approx(0.2)
 
 
 def test_counts_are_those_of_the_window_over_all_processes() -> None:
@@ -114,7 +126,7 @@ def test_counts_are_those_of_the_window_over_all_processes() -> None:
         status_at("a", 13.0, {"garbage": 3}, incarnation="2"),
         status_at("a", 30.0, {"garbage": 99}, incarnation="2"),
     ]
-    assert counted(notes_of([], (), statuses), "a", AT_S, 20.0)["garbage"] == 2 + 3
+    assert counts_between(notes_of([], (), statuses), "a", AT_S, 20.0)["garbage"] == 2 + 3
 
 
 # Processes ----------------------------------------------------------------------------------------
@@ -124,16 +136,16 @@ KILLED = [came(0.0, "a"), came(0.0, "b"), went(10.1, "a"), came(11.0, "a", "2")]
 
 def test_a_killed_robot() -> None:
     good = notes_of([tracks_of("a", silent=(10.0, 11.0)), tracks_of("b")], KILLED)
-    assert not broken(judged_kill(good, "a", AT_S, "1", ["b"], 13.0, UNTIL_S))
+    assert not broken(kill_checks(good, "a", AT_S, "1", ["b"], 13.0, UNTIL_S))
     never_back = notes_of([tracks_of("a", silent=(10.0, 99.0)), tracks_of("b")], KILLED[:2])
-    assert broken(judged_kill(never_back, "a", AT_S, "1", ["b"], 13.0, UNTIL_S)) >= {
+    assert broken(kill_checks(never_back, "a", AT_S, "1", ["b"], 13.0, UNTIL_S)) >= {
         "its token disappeared after",
         "a new process started after",
         "from then until it was localized",
         "RMSE afterwards, worst robot",
     }
     others_stop = notes_of([tracks_of("a"), tracks_of("b", silent=(10.5, 12.5))], KILLED)
-    assert broken(judged_kill(others_stop, "a", AT_S, "1", ["b"], 13.0, UNTIL_S)) == {
+    assert broken(kill_checks(others_stop, "a", AT_S, "1", ["b"], 13.0, UNTIL_S)) == {
         "others' longest gap between tracks"
     }
 
@@ -143,9 +155,9 @@ def test_a_killed_router() -> None:
     said = [status_at("a", 13.0), status_at("a", 20.0, {"messages_received": 30})]
     tracks = [tracks_of("a", silent=(10.0, 12.0)), tracks_of("b", silent=(10.0, 12.0))]
     good = notes_of(tracks, tokens, said)
-    assert not broken(judged_router(good, ["a", "b"], AT_S, 13.0, 21.0))
+    assert not broken(kill_router_checks(good, ["a", "b"], AT_S, 13.0, 21.0))
     bad = notes_of([tracks_of("a", silent=(10.0, 18.0)), tracks[1]], tokens[:1], said[:1])
-    assert broken(judged_router(bad, ["a", "b"], AT_S, 13.0, 21.0)) == {
+    assert broken(kill_router_checks(bad, ["a", "b"], AT_S, 13.0, 21.0)) == {
         "longest gap between tracks",
         "robots with a token at the new router",
         "help received in the 8 s after",
@@ -154,10 +166,10 @@ def test_a_killed_router() -> None:
 
 def test_a_killed_field() -> None:
     wrong_for_a_while = [tracks_of(n, lambda s: 2.0 if 11.0 < s < 14.0 else 0.02) for n in "ab"]
-    good = judged_field(notes_of(wrong_for_a_while), ["a", "b"], AT_S, 11.0, 16.0, UNTIL_S)
+    good = kill_field_checks(notes_of(wrong_for_a_while), ["a", "b"], AT_S, 11.0, 16.0, UNTIL_S)
     assert not broken(good)
     stuck = notes_of([tracks_of("a"), tracks_of("b", lambda s: 2.0 if s > 11.0 else 0.02)])
-    assert broken(judged_field(stuck, ["a", "b"], AT_S, 11.0, 16.0, UNTIL_S)) >= {
+    assert broken(kill_field_checks(stuck, ["a", "b"], AT_S, 11.0, 16.0, UNTIL_S)) >= {
         "from then until all were localized",
         "RMSE afterwards, worst robot",
     }
@@ -166,11 +178,11 @@ def test_a_killed_field() -> None:
 def test_a_frozen_robot() -> None:
     tokens = [came(0.0, "a"), came(0.0, "b"), went(12.0, "a"), came(15.2, "a")]
     tracks = [tracks_of("a", silent=(10.0, 15.0)), tracks_of("b")]
-    assert not broken(judged_freeze(notes_of(tracks, tokens), "a", AT_S, 15.0, ["b"], UNTIL_S))
+    assert not broken(freeze_checks(notes_of(tracks, tokens), "a", AT_S, 15.0, ["b"], UNTIL_S))
     burst = [h._replace(at_s=15.1) if 10.0 <= h.at_s < 14.0 else h for h in tracks_of("a")]
     led_astray = tracks_of("b", lambda s: 0.8 if 15.0 < s < 17.0 else 0.02)
     bad = notes_of([sorted(burst, key=lambda h: h.at_s), led_astray], tokens[:2])
-    assert broken(judged_freeze(bad, "a", AT_S, 15.0, ["b"], UNTIL_S)) == {
+    assert broken(freeze_checks(bad, "a", AT_S, 15.0, ["b"], UNTIL_S)) == {
         "its token disappeared after",
         "tracks that arrived more than 1 s late",
         "others' largest error in the 4 s after it woke",
@@ -187,10 +199,10 @@ def test_a_partition() -> None:
     helped = [status_at("far", 21.0, heard=[("near", 20.6)])]
     near, far = notes_of(both, near_tokens), notes_of(both, far_tokens, helped)
     times = AT_S, 20.0, UNTIL_S
-    assert not broken(judged_partition(near, far, ["near"], ["far"], *times))
+    assert not broken(partition_checks(near, far, ["near"], ["far"], *times))
     late = notes_of(both, [*near_tokens[:2], came(26.0, "far")])
     stopped = notes_of([both[0], tracks_of("far", silent=(11.0, 19.0))], far_tokens)
-    assert broken(judged_partition(late, stopped, ["near"], ["far"], *times)) == {
+    assert broken(partition_checks(late, stopped, ["near"], ["far"], *times)) == {
         "far side's longest gap between tracks",
         "from healing to all tokens back",
         "from healing to the first help",
@@ -200,9 +212,9 @@ def test_a_partition() -> None:
 def test_a_cut_link() -> None:
     tokens = [came(0, "a"), went(12.0, "a"), came(20.5, "a")]
     good = notes_of([tracks_of("a", silent=(10.0, 20.0)), tracks_of("b")], tokens)
-    assert not broken(judged_cut(good, "a", ["b"], AT_S, 20.0, UNTIL_S))
+    assert not broken(cut_link_checks(good, "a", ["b"], AT_S, 20.0, UNTIL_S))
     bad = notes_of([tracks_of("a", silent=(10.0, 30.0)), tracks_of("b")], tokens[:1])
-    assert broken(judged_cut(bad, "a", ["b"], AT_S, 20.0, UNTIL_S)) == {
+    assert broken(cut_link_checks(bad, "a", ["b"], AT_S, 20.0, UNTIL_S)) == {
         "its token disappeared after",
         "from healing to its token back",
         "from healing until it was localized",
@@ -212,9 +224,9 @@ def test_a_cut_link() -> None:
 def test_a_bad_link() -> None:
     said = [status_at("a", 9.0), status_at("a", 20.0, {"messages_received": 50})]
     good = notes_of([tracks_of("a", late_s=0.5), tracks_of("b")], (), said)
-    assert not broken(judged_bad(good, "a", ["b"], AT_S, 25.0, UNTIL_S, 2.0, 1.5))
+    assert not broken(bad_link_checks(good, "a", ["b"], AT_S, 25.0, UNTIL_S, 2.0, 1.5))
     bad = notes_of([tracks_of("a", late_s=3.0), tracks_of("b", late_s=0.9)])
-    assert broken(judged_bad(bad, "a", ["b"], AT_S, 25.0, UNTIL_S, 2.0, 1.5)) == {
+    assert broken(bad_link_checks(bad, "a", ["b"], AT_S, 25.0, UNTIL_S, 2.0, 1.5)) == {
         "its tracks' delay, 99th percentile",
         "help messages that it received",
         "others' delay, 99th percentile",
@@ -227,18 +239,18 @@ def test_a_bad_link() -> None:
 def test_duplicates() -> None:
     said = [status_at("a", 9.0), status_at("a", 20.0, {"duplicate": 60, "too_late": 25})]
     good = notes_of([tracks_of("a"), tracks_of("b")], (), said)
-    assert not broken(judged_duplicates(good, ["a", "b"], AT_S, 25.0, 300))
-    assert broken(judged_duplicates(GOOD, ["a", "b"], AT_S, 25.0, 300)) == {
+    assert not broken(duplicates_checks(good, ["a", "b"], AT_S, 25.0, 300))
+    assert broken(duplicates_checks(GOOD, ["a", "b"], AT_S, 25.0, 300)) == {
         "counted as duplicate",
         "counted as too late",
     }
 
 
 def test_a_flood() -> None:
-    assert not broken(judged_flood(GOOD, ["a", "b"], AT_S, 20.0, 30.0, 50_000))
+    assert not broken(flood_checks(GOOD, ["a", "b"], AT_S, 20.0, 30.0, 50_000))
     said = [status_at("a", 9.0), status_at("a", 20.0, {"messages_received": 5000})]
     bad = notes_of([tracks_of("a", late_s=2.0), tracks_of("b")], (), said)
-    assert broken(judged_flood(bad, ["a", "b"], AT_S, 20.0, 30.0, 500)) >= {
+    assert broken(flood_checks(bad, ["a", "b"], AT_S, 20.0, 30.0, 500)) >= {
         "rate of the flood",
         "most received by one robot",
         "others' delay, 99th percentile",
@@ -249,15 +261,17 @@ def test_a_flood() -> None:
 
 TABLE = "errors of position\nnavigator 1\nobserver 1\nscout 1\npatrol 1\n"
 LOST = "".join(f"cpcbl-team: /d/{n}: not written: No space left\n" for n in ("r", "p"))
-OUTPUT = Ended(1, "", "cpcbl-team: standard output: not written: No space left on device\n")
+OUTPUT = CommandResult(1, "", "cpcbl-team: standard output: not written: No space left on device\n")
 
 
 def test_a_full_disk() -> None:
     assert not [
-        c.what for c in judged_full(Ended(1, TABLE, LOST), ("r", "p", "p"), OUTPUT) if not c.held
+        c.what
+        for c in full_disk_checks(CommandResult(1, TABLE, LOST), ("r", "p", "p"), OUTPUT)
+        if not c.is_met
     ]
-    silent = Ended(0, "", "Traceback (most recent call last)")
-    assert broken(judged_full(silent, ("r", "p", "p"), OUTPUT)) == {
+    silent = CommandResult(0, "", "Traceback (most recent call last)")
+    assert broken(full_disk_checks(silent, ("r", "p", "p"), OUTPUT)) == {
         "robots in the report on the terminal",
         "lines that name a lost file",
         "exit code",
@@ -266,10 +280,10 @@ def test_a_full_disk() -> None:
 
 
 def test_a_read_only_disk() -> None:
-    clear = Ended(2, "", "cpcbl-team: --record /d/x: Read-only file system\n")
-    assert not broken(judged_read_only({"--record": clear}))
-    thrown = Ended(1, "", "Traceback (most recent call last)\nOSError\n")
-    assert broken(judged_read_only({"--record": thrown})) == {
+    clear = CommandResult(2, "", "cpcbl-team: --record /d/x: Read-only file system\n")
+    assert not broken(read_only_checks({"--record": clear}))
+    thrown = CommandResult(1, "", "Traceback (most recent call last)\nOSError\n")
+    assert broken(read_only_checks({"--record": thrown})) == {
         "options refused with one line of error",
         "commands that ended with exit code 2",
         "tracebacks",
@@ -282,9 +296,9 @@ def test_a_read_only_disk() -> None:
 def test_a_kidnapped_robot() -> None:
     found = tracks_of("a", lambda s: 3.02 if s >= 13.0 else 0.02, lost=(10.5, 13.0))
     good = notes_of([found, tracks_of("b")], jump=("a", AT_S, 3.0))
-    assert not broken(judged_kidnap(good, "a", ["b"], UNTIL_S))
+    assert not broken(kidnap_checks(good, "a", ["b"], UNTIL_S))
     never = notes_of([tracks_of("a"), tracks_of("b")], jump=("a", AT_S, 3.0))
-    assert broken(judged_kidnap(never, "a", ["b"], UNTIL_S)) == {
+    assert broken(kidnap_checks(never, "a", ["b"], UNTIL_S)) == {
         "it reported that it was lost after",
         "it was localized after",
         "RMSE afterwards, worst robot",
@@ -292,18 +306,18 @@ def test_a_kidnapped_robot() -> None:
     }
     blamed = [status_at("b", 30.0, trust=[("a", "jumps")])]
     distrustful = notes_of([found, tracks_of("b")], (), blamed, jump=("a", AT_S, 3.0))
-    assert broken(judged_kidnap(distrustful, "a", ["b"], UNTIL_S)) == {
+    assert broken(kidnap_checks(distrustful, "a", ["b"], UNTIL_S)) == {
         "robots that trust all others at the end"
     }
-    assert "distance of the kidnapping" in broken(judged_kidnap(GOOD, "a", ["b"], UNTIL_S))
+    assert "distance of the kidnapping" in broken(kidnap_checks(GOOD, "a", ["b"], UNTIL_S))
 
 
 def test_hidden_landmarks() -> None:
     drifts = tracks_of("a", lambda s: 0.1 if 12.0 <= s < 74.0 else 0.02)
-    good = judged_hidden(notes_of([drifts, tracks_of("b")]), ["a", "b"], UNTIL_S)
+    good = hidden_landmarks_checks(notes_of([drifts, tracks_of("b")]), ["a", "b"], UNTIL_S)
     assert not broken(good)
     overconfident = tracks_of("a", lambda s: 0.6 if s >= 20.0 else 0.02)
-    bad = judged_hidden(notes_of([overconfident, tracks_of("b")]), ["a", "b"], UNTIL_S)
+    bad = hidden_landmarks_checks(notes_of([overconfident, tracks_of("b")]), ["a", "b"], UNTIL_S)
     assert broken(bad) == {
         "team's worst RMSE",
         "inside 3 σ while landmarks are hidden",
@@ -317,9 +331,9 @@ def test_clocks_that_are_off() -> None:
     found = [status_at(n, 5.0, {"clock_off": 30}, trust=[("w", "clock")]) for n in "ab"]
     tracks = [tracks_of("a"), tracks_of("b"), tracks_of("w")]
     good = notes_of(tracks, (), found)
-    assert not broken(judged_clocks(good, "w", "r", ["a", "b"], AT_S, 30.0))
+    assert not broken(clock_checks(good, "w", "r", ["a", "b"], AT_S, 30.0))
     unnoticed = notes_of(tracks, (), [status_at("a", 5.0, trust=[("r", "clock")])])
-    assert broken(judged_clocks(unnoticed, "w", "r", ["a", "b"], AT_S, 30.0)) == {
+    assert broken(clock_checks(unnoticed, "w", "r", ["a", "b"], AT_S, 30.0)) == {
         "robots that report that its clock is wrong",
         "last of these reports at",
         "refused help messages from it",
@@ -332,10 +346,10 @@ def test_a_liar() -> None:
     said = [status_at(n, 14.0, trust=[("w", "biased")]) for n in "ab"]
     healed = [status_at(n, 40.0, trust=[("w", "")]) for n in "ab"]
     good = notes_of(tracks, (), [*said, *healed])
-    assert not broken(judged_liar(good, "w", ["a", "b"], ["a", "b", "w"], AT_S, 25.0))
+    assert not broken(faulty_robot_checks(good, "w", ["a", "b"], ["a", "b", "w"], AT_S, 25.0))
     harmed = [tracks_of("a", lambda s: 0.5), *tracks[1:]]
     bad = notes_of(harmed, (), [said[0]])
-    assert broken(judged_liar(bad, "w", ["a", "b"], ["a", "b", "w"], AT_S, 25.0)) == {
+    assert broken(faulty_robot_checks(bad, "w", ["a", "b"], ["a", "b", "w"], AT_S, 25.0)) == {
         "robots that quarantined it",
         "quarantined by two robots after",
         "worst RMSE during the fault",
@@ -347,27 +361,27 @@ def test_a_liar() -> None:
 # Soak ---------------------------------------------------------------------------------------------
 
 
-def samples(process: str, mib_a_minute: float, seconds: float = 400.0) -> list[Sample]:
+def samples(process: str, mib_a_minute: float, seconds: float = 400.0) -> list[ProcessSample]:
     return [
-        Sample(5.0 * n, process, 7, int((30.0 + mib_a_minute * n / 12.0) * MIB), 20)
+        ProcessSample(5.0 * n, process, 7, int((30.0 + mib_a_minute * n / 12.0) * MIB), 20)
         for n in range(int(seconds / 5.0))
     ]
 
 
 def test_a_life_is_told_from_its_samples() -> None:
-    (life,) = lives(samples("field", 1.2))
+    (life,) = process_lives(samples("field", 1.2))
     assert life.mib_a_minute == pytest.approx(1.2, rel=0.01)
     assert life.end_mib - life.start_mib == pytest.approx(1.2 * (395 - 40) / 60, rel=0.05)
-    assert lives(samples("field", 1.2, seconds=60.0)) == []
+    assert process_lives(samples("field", 1.2, seconds=60.0)) == []
 
 
 def test_a_soak() -> None:
     times = 0.0, 20.0, 25.0, UNTIL_S
-    flat = lives([*samples("field", 0.01), *samples("router", 0.0)])
-    assert not broken(judged_soak(GOOD, ["a", "b"], flat, times, 3, 3, 0))
-    leaking = [*flat, Life("robot-a", 400.0, 30.0, 45.0, 2.0, 30)]
+    flat = process_lives([*samples("field", 0.01), *samples("router", 0.0)])
+    assert not broken(soak_checks(GOOD, ["a", "b"], flat, times, 3, 3, 0))
+    leaking = [*flat, ProcessLife("robot-a", 400.0, 30.0, 45.0, 2.0, 30)]
     stuck = notes_of([tracks_of("a"), tracks_of("b", lambda s: 2.0)])
-    assert broken(judged_soak(stuck, ["a", "b"], leaking, times, 4, 3, 1)) >= {
+    assert broken(soak_checks(stuck, ["a", "b"], leaking, times, 4, 3, 1)) >= {
         "processes that ended without being killed",
         "tracebacks in logs",
         "from the last fault until all were localized",
@@ -375,4 +389,4 @@ def test_a_soak() -> None:
         "steepest growth of a process that ran for 300 s",
         "largest growth of the number of open files",
     }
-    assert "largest growth of memory" in broken(judged_soak(GOOD, ["a"], [], times, 0, 0, 0))
+    assert "largest growth of memory" in broken(soak_checks(GOOD, ["a"], [], times, 0, 0, 0))

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from support.equal_teams import SHAPES, START_SIGMA_M, Sighted, equal_team, nees_bounds, team_nees
 
-from cpcbl_launch.lab.experiments.runs import Case, run
+from cpcbl_launch.lab.experiments.runs import Case, run_case
 from cpcbl_launch.simulation.in_process import Overrides, simulate, with_overrides
 from cpcbl_team.config import Team
 
@@ -22,7 +22,7 @@ MUTUAL_NAIVE = Overrides(direction="both-ways", fusion="naive")
 def first_and_last_third(team: Team, seeds: int, duration_s: float) -> tuple[float, float]:
     """The mean NEES of the first and of the last third of this many runs."""
     case = Case(team, tuple(team.robots), duration_s)
-    nees = team_nees(run(case, seed) for seed in range(1, seeds + 1))
+    nees = team_nees(run_case(case, seed) for seed in range(1, seeds + 1))
     third = nees.shape[1] // 3
     return float(nees[:, :third].mean()), float(nees[:, -third:].mean())
 

@@ -20,9 +20,9 @@ from cpcbl_launch.lab.experiments import (
     table1,
     variants,
 )
-from cpcbl_launch.lab.experiments.circuit import circuit, loops, with_keys
+from cpcbl_launch.lab.experiments.circuit import circuit_team, loop_case, with_settings
 from cpcbl_launch.lab.experiments.results import Experiment, Outcome, Results, accuracy, spread
-from cpcbl_launch.lab.experiments.runs import Case, run, run_all
+from cpcbl_launch.lab.experiments.runs import Case, run_case, run_cases
 from cpcbl_team.config import Team
 from cpcbl_team.errors import InputError
 
@@ -49,12 +49,12 @@ PAIR = "weighted 0.05 0.5"
 
 
 def one_loop(team: Team, **changes: Any) -> Case:
-    return loops(team, "runner")._replace(loops=1, **changes)
+    return loop_case(team, "runner")._replace(loops=1, **changes)
 
 
 @pytest.fixture
 def runner() -> Team:
-    return circuit(["runner"])
+    return circuit_team(["runner"])
 
 
 def without_noise(team: Team) -> Team:
@@ -88,7 +88,7 @@ def test_the_number_of_jobs_changes_no_figure() -> None:
     experiment = small(EVERY["figure7"])
     cases, seeds, done = experiment.cases(), (1, 2), []
     outcomes = [
-        experiment.outcome(run_all(cases, seeds, jobs, lambda: done.append(1))) for jobs in (1, 2)
+        experiment.outcome(run_cases(cases, seeds, jobs, lambda: done.append(1))) for jobs in (1, 2)
     ]
     assert len(done) == 2 * len(cases) * len(seeds)
     assert msgspec.json.encode(outcomes[0]) == msgspec.json.encode(outcomes[1])
@@ -96,11 +96,11 @@ def test_the_number_of_jobs_changes_no_figure() -> None:
 
 def test_seeds_differ(runner: Team) -> None:
     case = one_loop(runner)
-    assert not np.array_equal(run(case, 1).at_waypoints, run(case, 2).at_waypoints)
+    assert not np.array_equal(run_case(case, 1).at_waypoints, run_case(case, 2).at_waypoints)
 
 
 def test_a_run_ends_when_every_waypoint_of_its_loops_was_reached(runner: Team) -> None:
-    found = run(loops(runner, "runner")._replace(loops=2), 1)
+    found = run_case(loop_case(runner, "runner")._replace(loops=2), 1)
     assert found.finished
     assert found.at_waypoints.shape == found.odometry_at_waypoints.shape == (2 * 4, 3)
     assert found.bumps == found.restarts == 0
@@ -110,10 +110,10 @@ def test_odometry_alone_is_right_without_noise_and_drifts_with_wheels_that_are_o
     runner: Team,
 ) -> None:
     quiet = without_noise(runner)
-    exact = run(one_loop(quiet), 1).odometry_at_waypoints
+    exact = run_case(one_loop(quiet), 1).odometry_at_waypoints
     assert np.abs(exact).max() < 1e-3  # the field turns within a piece of odometry
-    crooked = with_keys(quiet, "runner", odometry={"turn_scale": 1.1})
-    drift = run(one_loop(quiet, truth=crooked), 1).odometry_at_waypoints[-1, 2]
+    crooked = with_settings(quiet, "runner", odometry={"turn_scale": 1.1})
+    drift = run_case(one_loop(quiet, truth=crooked), 1).odometry_at_waypoints[-1, 2]
     turned = 1.5 * math.pi  # three corners lie behind when the fourth is reached
     assert drift == pytest.approx(turned / 1.1 - turned, abs=0.15)
 
@@ -123,14 +123,14 @@ def test_a_bump_restarts_the_run_until_it_has_failed(
 ) -> None:
     monkeypatch.setattr(runs, "MOST_RESTARTS", 2)
     everywhere = msgspec.structs.replace(runner.simulation, bump_radius_m=9.0)
-    found = run(one_loop(msgspec.structs.replace(runner, simulation=everywhere)), 1)
+    found = run_case(one_loop(msgspec.structs.replace(runner, simulation=everywhere)), 1)
     assert (found.finished, found.bumps, found.restarts) == (False, 3, 2)
 
 
 def test_a_run_that_does_not_end_is_counted_as_failed_and_has_no_part_in_the_means(
     runner: Team,
 ) -> None:
-    through, stuck = run(one_loop(runner), 1), run(one_loop(runner, limit_s=2.0), 1)
+    through, stuck = run_case(one_loop(runner), 1), run_case(one_loop(runner, limit_s=2.0), 1)
     assert not stuck.finished
     assert stuck.bumps == 0
     both, alone = accuracy([through, stuck]), accuracy([through])
@@ -153,8 +153,8 @@ def test_quantities_of_the_table_from_known_errors() -> None:
 
 
 def test_observers_stand_where_they_do_not_believe_to_stand() -> None:
-    team = directions.crowd(10)
-    moved = directions.displaced(team, 0.2)
+    team = directions.crowd_team(10)
+    moved = directions.with_displaced_observers(team, 0.2)
     assert len(team.robots) == 10
     for name, robot in team.robots.items():
         believed, true = robot.start, moved.robots[name].start
@@ -169,7 +169,7 @@ def test_a_deaf_observer_stays_wrong_and_one_that_listens_does_not() -> None:
     errors = {}
     for direction in ("deaf", "both-ways"):
         case = cases[2, direction, "split-ci", 0.2]._replace(scored=("navigator0", "observer0"))
-        last = [run(case, seed).robots["observer0"].offset[-1] for seed in range(1, 6)]
+        last = [run_case(case, seed).robots["observer0"].offset[-1] for seed in range(1, 6)]
         errors[direction] = np.median([np.hypot(*offset[:2]) for offset in last])
     assert errors["deaf"] == pytest.approx(0.2, abs=0.01)
     assert errors["both-ways"] < 0.1
@@ -178,7 +178,7 @@ def test_a_deaf_observer_stays_wrong_and_one_that_listens_does_not() -> None:
 @pytest.mark.parametrize("sizes", [[], [1], [21], [5, 0]])
 def test_team_sizes_are_checked(sizes: list[int]) -> None:
     with pytest.raises(InputError, match="--robots: team sizes from 2 to 20"):
-        directions.of_sizes(sizes)
+        directions.experiment_of_sizes(sizes)
 
 
 def test_what_is_wrong_is_one_line(tmp_path: Path) -> None:
@@ -194,7 +194,7 @@ def test_what_is_wrong_is_one_line(tmp_path: Path) -> None:
 
 
 def outcome_of(experiment: Experiment, seeds: int, cases: Mapping[Any, Case]) -> Outcome:
-    results: Results = run_all(cases, range(1, seeds + 1), 1, lambda: None)
+    results: Results = run_cases(cases, range(1, seeds + 1), 1, lambda: None)
     return experiment.outcome(results)
 
 
@@ -239,7 +239,7 @@ def test_a_sharper_camera_helps_a_cheap_one(tmp_path: Path) -> None:
 @pytest.mark.timeout(1800)
 def test_figure_7_with_cameras_has_the_pattern_of_the_paper() -> None:
     found = figure7_cameras.EXPERIMENT.outcome(
-        run_all(figure7_cameras.cases(), range(1, 6), 2, lambda: None)
+        run_cases(figure7_cameras.cases(), range(1, 6), 2, lambda: None)
     )
     assert len(found.pattern) == 5
     assert all(found.pattern.values()), found.pattern

@@ -13,7 +13,11 @@ from support.processes import cpcbl_team
 from cpcbl_agents.vision.camera import Camera, Floats, Pixels
 from cpcbl_launch.lab.experiments import detection_figures, eyes, rendered_frames
 from cpcbl_launch.lab.experiments.detection_figures import Batch, Kind, Mistake, Record
-from cpcbl_launch.lab.experiments.rendered_frames import Drawn, Thing, judged
+from cpcbl_launch.lab.experiments.rendered_frames import (
+    NamedObject,
+    RandomFrame,
+    compare_with_truth,
+)
 from cpcbl_launch.simulation.camera.render import Light, render
 from cpcbl_launch.simulation.camera.visibility import (
     Solid,
@@ -77,7 +81,7 @@ def test_a_plate_has_the_corners_of_its_marker() -> None:
     assert in_frame(points, CAMERA).all()
 
 
-def picture(frame: Drawn, landmarks: Sequence[str], rest: bool) -> Pixels:
+def picture(frame: RandomFrame, landmarks: Sequence[str], rest: bool) -> Pixels:
     """A frame in clean light, with these landmarks; `rest`: with clutter and robots."""
     scene = replace(
         frame.scene,
@@ -97,8 +101,8 @@ def test_the_truth_agrees_with_pixels() -> None:
     """A landmark is there to be seen where the picture without it is another one."""
     whole = gone = part = 0
     for number in range(12):
-        frame = rendered_frames.drawn(np.random.default_rng((7, number)))
-        names, things = list(frame.scene.landmarks), rendered_frames.things(frame)
+        frame = rendered_frames.random_frame(np.random.default_rng((7, number)))
+        names, things = list(frame.scene.landmarks), rendered_frames.named_objects(frame)
         everything, nothing = picture(frame, names, True), picture(frame, [], False)
         for name in names:
             due = changed(picture(frame, [name], False), nothing)
@@ -123,14 +127,14 @@ def test_the_truth_agrees_with_pixels() -> None:
 LANDMARK, ROBOT = "south", "spotter"
 
 
-def thing(name: str = LANDMARK, **changes: object) -> Thing:
+def thing(name: str = LANDMARK, **changes: object) -> NamedObject:
     whole: tuple[Kind, ...] = ("landmark",)
-    return Thing(name, 2.0, 0.1, 0.5, whole, True, 0.02)._replace(**changes)  # type: ignore[arg-type]
+    return NamedObject(name, 2.0, 0.1, 0.5, whole, True, 0.02)._replace(**changes)  # type: ignore[arg-type]
 
 
-def right(*seen: Sighting, there: Thing | None = None) -> tuple[list[Record], list[Mistake]]:
+def right(*seen: Sighting, there: NamedObject | None = None) -> tuple[list[Record], list[Mistake]]:
     one = there or thing()
-    return judged(3, seen, {one.name: one})
+    return compare_with_truth(3, seen, {one.name: one})
 
 
 def test_a_right_sighting_is_found_with_its_errors() -> None:
@@ -161,7 +165,9 @@ def test_bearing_only_of_a_part_is_right() -> None:
         (Sighting(LANDMARK, 2.0, 0.1), thing(due=(), some=False)),  # there, but hidden
     ],
 )
-def test_the_name_of_what_cannot_be_seen_there_is_a_wrong_id(seen: Sighting, there: Thing) -> None:
+def test_the_name_of_what_cannot_be_seen_there_is_a_wrong_id(
+    seen: Sighting, there: NamedObject
+) -> None:
     records, (mistake,) = right(seen, there=there)
     assert (mistake.frame, mistake.id, mistake.why) == (3, seen.id, "wrong id")
     assert [r.seen_by for r in records] == ([None] if there.due else [])  # it is missed as well
@@ -210,7 +216,7 @@ def test_figures_count_what_they_say() -> None:
 
 
 def test_nothing_holds_without_figures() -> None:
-    result = detection_figures.outcome(1, 1, [Batch([], [], {}, {"frame_blank": 1}, 0.0, 0.0)])
+    result = detection_figures.summarize(1, 1, [Batch([], [], {}, {"frame_blank": 1}, 0.0, 0.0)])
     assert [said for said, held in result.pattern.items() if held] == ["no wrong id"]
 
 
@@ -219,7 +225,7 @@ def test_nothing_holds_without_figures() -> None:
 
 @pytest.fixture(scope="module")
 def small() -> detection_figures.Eyes:
-    return eyes.measured(150, 1, 2, lambda: None)
+    return eyes.measure(150, 1, 2, lambda: None)
 
 
 def test_little_is_missed_and_nothing_mistaken(small: detection_figures.Eyes) -> None:
@@ -256,11 +262,11 @@ def test_stated_sigmas_are_honest(small: detection_figures.Eyes) -> None:
     ],
 )
 def test_what_was_mistaken_once_is_not_again(number: int) -> None:
-    assert rendered_frames.frames(2, number, 1).mistakes == []
+    assert rendered_frames.evaluate_frames(2, number, 1).mistakes == []
 
 
 def test_the_number_of_jobs_changes_no_figure() -> None:
-    one, two = (eyes.measured(40, 3, jobs, lambda: None) for jobs in (1, 2))
+    one, two = (eyes.measure(40, 3, jobs, lambda: None) for jobs in (1, 2))
     assert one.within["landmark"].due > 10
     assert replace(one, cost={}) == replace(two, cost={})
 
@@ -280,5 +286,5 @@ def test_the_command_shows_targets_and_writes_json_and_picture(tmp_path: Path) -
 @pytest.mark.long
 @pytest.mark.timeout(1200)
 def test_ten_thousand_frames() -> None:
-    result = eyes.measured(10_000, 2, 2, lambda: None)
+    result = eyes.measure(10_000, 2, 2, lambda: None)
     assert not [said for said, held in result.pattern.items() if not held]

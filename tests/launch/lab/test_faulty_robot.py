@@ -137,7 +137,7 @@ CASES = [
 
 @pytest.fixture(scope="module")
 def measured() -> liars.Liars:
-    return liars.measured(1, 1, lambda: None, CASES)
+    return liars.measure(1, 1, lambda: None, CASES)
 
 
 def test_the_liar_is_found_and_taken_back_and_does_little_harm(measured: liars.Liars) -> None:
@@ -156,7 +156,7 @@ def test_the_liar_is_found_and_taken_back_and_does_little_harm(measured: liars.L
 
 
 def test_the_same_seed_gives_the_same_figures(measured: liars.Liars) -> None:
-    again = liars.measured(1, 1, lambda: None, CASES[:1])
+    again = liars.measure(1, 1, lambda: None, CASES[:1])
     assert again.rows[0] == measured.rows[0]
 
 
@@ -181,7 +181,7 @@ def test_it_is_shown_in_80_columns_and_drawn(
 @pytest.mark.timeout(1800)
 def test_every_lie_is_found_beside_two_honest_observers() -> None:
     cases = [c for c in liars.cases() if c.honest == 2 and c.trust]
-    result = liars.measured(4, 2, lambda: None, cases)
+    result = liars.measure(4, 2, lambda: None, cases)
     assert result.held
     for row in result.rows:
         assert row.false_quarantine_s < 1.0

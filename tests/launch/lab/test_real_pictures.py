@@ -13,7 +13,7 @@ from support.processes import cpcbl_team
 from cpcbl_agents.vision.camera import Camera, Pixels
 from cpcbl_agents.vision.markers import Markers
 from cpcbl_launch.lab.experiments import real_pictures
-from cpcbl_launch.lab.experiments.real_pictures import measured, set_named, truths
+from cpcbl_launch.lab.experiments.real_pictures import measure, picture_set, read_truth_table
 from cpcbl_launch.simulation.camera.render import Light, Scene, Standing, render
 from cpcbl_launch.team_file import load_team, parse_team
 from cpcbl_team.config import MarkerFamily
@@ -60,7 +60,7 @@ def own_set(tmp_path: Path) -> Path:
 
 
 def test_found_missed_unexpected_and_refused_are_told_apart(own_set: Path) -> None:
-    result = measured(str(own_set), own_set.parent)
+    result = measure(str(own_set), own_set.parent)
     mate, mark = result.lines
     assert (mate.picture, mate.id, mate.found) == ("both.png", "mate", True)
     assert mate.range_error_m == pytest.approx(0.0, abs=0.03)
@@ -73,7 +73,7 @@ def test_found_missed_unexpected_and_refused_are_told_apart(own_set: Path) -> No
 
 def test_what_is_unexpected_is_in_the_same_order_each_time(own_set: Path) -> None:
     own_set.write_text("picture,viewer,id,range_m,bearing_deg,heading_deg\nboth.png,eye,,,,\n")
-    found = measured(str(own_set), own_set.parent).unexpected
+    found = measure(str(own_set), own_set.parent).unexpected
     assert found == (("both.png", "mark"), ("both.png", "mate"))
 
 
@@ -111,8 +111,8 @@ def test_what_cannot_be_read_is_said_in_one_line(
 
 @pytest.mark.parametrize("name", SETS)
 def test_built_in_sets_are_whole(name: str) -> None:
-    path = set_named(name)
-    team, lines = load_team(path.with_suffix(".toml")), truths(path)
+    path = picture_set(name)
+    team, lines = load_team(path.with_suffix(".toml")), read_truth_table(path)
     assert lines
     assert {line.viewer for line in lines} <= team.robots.keys()
     named = team.robots.keys() | team.map.landmarks.keys()
@@ -151,7 +151,7 @@ def test_a_marker_that_is_upside_down_is_read_as_upright(family: MarkerFamily) -
 )
 def test_real_pictures(name: str, found: int, off_share: float) -> None:
     folder = name.partition("-")[0]
-    result = measured(name, Path(os.environ["CPCBL_PICTURES"]) / folder)
+    result = measure(name, Path(os.environ["CPCBL_PICTURES"]) / folder)
     assert not result.unexpected
     assert not result.refused
     assert sum(line.found for line in result.lines) >= found

@@ -10,8 +10,13 @@ import pytest
 from support.processes import cpcbl_team
 
 from cpcbl_launch.cli import main
-from cpcbl_launch.lab.scaling.measure import Size, measured, measured_team, parsed_sizes
-from cpcbl_launch.lab.scaling.swarm import SPACING_M, swarm
+from cpcbl_launch.lab.scaling.measure import (
+    TeamSizeFigures,
+    measure_sizes,
+    measure_team,
+    parse_sizes,
+)
+from cpcbl_launch.lab.scaling.swarm import SPACING_M, swarm_team
 from cpcbl_launch.simulation.in_process import simulate
 from cpcbl_launch.team_file import builtin_path, load_team, problems
 from cpcbl_team.config import (
@@ -29,10 +34,12 @@ TIMED = ("cpu_ms_per_s", "field_cpu_ms_per_s", "times_real_time")
 PNG = b"\x89PNG\r\n\x1a\n"
 
 
-def untimed(size: Size | dict[str, Any]) -> dict[str, Any]:
+def untimed(size: TeamSizeFigures | dict[str, Any]) -> dict[str, Any]:
     """The figures that are the same on every machine."""
     figures = (
-        size if isinstance(size, dict) else {n: getattr(size, n) for n in Size.__struct_fields__}
+        size
+        if isinstance(size, dict)
+        else {n: getattr(size, n) for n in TeamSizeFigures.__struct_fields__}
     )
     return {name: value for name, value in figures.items() if name not in TIMED}
 
@@ -42,7 +49,7 @@ def untimed(size: Size | dict[str, Any]) -> dict[str, Any]:
 
 @pytest.mark.parametrize("size", [2, 3, 10, 50, 200])
 def test_generated_teams_are_good_and_equally_dense(size: int) -> None:
-    team = swarm(size, 1)
+    team = swarm_team(size, 1)
     assert len(team.robots) == size
     assert list(problems(team)) == []
     x0, y0, x1, y1 = team.map.bounds()
@@ -66,11 +73,11 @@ def test_generated_teams_are_good_and_equally_dense(size: int) -> None:
 
 
 def test_a_seed_makes_one_team() -> None:
-    assert swarm(10, 1) == swarm(10, 1) != swarm(10, 2)
+    assert swarm_team(10, 1) == swarm_team(10, 1) != swarm_team(10, 2)
 
 
 def test_robots_of_a_generated_team_drive_round_their_homes() -> None:
-    team = swarm(4, 1)
+    team = swarm_team(4, 1)
     _, recorder = simulate(team, 1, 12.0)
     for name, rows in recorder.simulated_truth().items():
         way = rows[:, 1:3].tolist()
@@ -86,22 +93,22 @@ def test_robots_of_a_generated_team_drive_round_their_homes() -> None:
 @pytest.mark.parametrize("text", ["", "2,", "1", "0,5", "-2", "2,x", "2.5", "10000", "2;5"])
 def test_sizes_that_are_none_are_refused(text: str) -> None:
     with pytest.raises(InputError, match=r"--robots .*such as 2,10,50"):
-        parsed_sizes(text)
+        parse_sizes(text)
 
 
 @pytest.mark.parametrize("duration_s", [1.9, 0.0, -5.0, math.nan, math.inf])
 def test_too_short_a_time_measures_nothing(duration_s: float) -> None:
     with pytest.raises(InputError, match="--duration"):
-        measured([2], 1, duration_s)
+        measure_sizes([2], 1, duration_s)
 
 
 def test_the_same_seed_gives_the_same_figures_whatever_was_run_before() -> None:
     shown: list[float] = []
-    both = measured([2, 6], 3, 2.0, shown.append)
+    both = measure_sizes([2, 6], 3, 2.0, shown.append)
     assert shown == sorted(shown)
     assert shown[-1] == pytest.approx(1.0, abs=0.02)
-    (alone,) = measured([6], 3, 2.0).sizes
-    (other,) = measured([6], 4, 2.0).sizes
+    (alone,) = measure_sizes([6], 3, 2.0).sizes
+    (other,) = measure_sizes([6], 4, 2.0).sizes
     assert [size.robots for size in both.sizes] == [2, 6]
     assert untimed(alone) == untimed(both.sizes[1]) != untimed(other)
     for size in both.sizes:
@@ -109,8 +116,8 @@ def test_the_same_seed_gives_the_same_figures_whatever_was_run_before() -> None:
 
 
 def test_what_is_counted_is_what_the_robots_said() -> None:
-    (size,) = measured([6], 1, 3.0).sizes
-    report, recorder = simulate(swarm(6, 1), 1, 3.0)
+    (size,) = measure_sizes([6], 1, 3.0).sizes
+    report, recorder = simulate(swarm_team(6, 1), 1, 3.0)
     seconds = {name: status.stamp_ns * 1e-9 for name, status in recorder.status.items()}
     for figure, count in (
         (size.messages_sent_per_s, "messages_sent"),
@@ -137,7 +144,7 @@ def test_teammates_are_counted_that_are_in_sight(apart_m: float, in_sight: float
     }
     marks = {n: Landmark(x_m=x_m, y_m=0.5) for n, x_m in (("w", 1.5), ("e", apart_m - 1.5))}
     team = Team(name="t", robots=robots, map=Field(landmarks=marks))
-    assert measured_team(team, 1, 2.0).in_sight == in_sight
+    assert measure_team(team, 1, 2.0).in_sight == in_sight
 
 
 # The command ------------------------------------------------------------------------------------
@@ -158,7 +165,7 @@ def test_sizes_as_table_json_and_picture(tmp_path: Path) -> None:
     again = cpcbl_team("simulate", *options, "--json")
     assert again.returncode == 0, again.stderr
     sizes = json.loads(again.stdout)["sizes"]
-    assert [size.keys() for size in sizes] == [set(Size.__struct_fields__)] * 2
+    assert [size.keys() for size in sizes] == [set(TeamSizeFigures.__struct_fields__)] * 2
     assert [untimed(s) for s in sizes] == [untimed(s) for s in figures["sizes"]]
 
 

@@ -16,7 +16,7 @@ class Check(msgspec.Struct, frozen=True, kw_only=True):
     at_least: float | None = None
 
     @property
-    def held(self) -> bool:
+    def is_met(self) -> bool:
         if self.seen is None or not math.isfinite(self.seen):
             return False
         low = -math.inf if self.at_least is None else self.at_least
@@ -24,20 +24,35 @@ class Check(msgspec.Struct, frozen=True, kw_only=True):
         return low <= self.seen <= high
 
     def __str__(self) -> str:
-        seen = "not seen" if self.seen is None else figure(self.seen, self.unit)
+        seen = "not seen" if self.seen is None else format_figure(self.seen, self.unit)
         return f"{self.what} {seen} ({self.bounds})"
 
     @property
     def bounds(self) -> str:
         """Its bounds in words: `≤ 2 s`."""
         if self.at_least is not None and self.at_least == self.at_most:
-            return f"= {figure(self.at_least, self.unit)}"
-        low = "" if self.at_least is None else f"≥ {figure(self.at_least, self.unit)}"
-        high = "" if self.at_most is None else f"≤ {figure(self.at_most, self.unit)}"
+            return f"= {format_figure(self.at_least, self.unit)}"
+        low = "" if self.at_least is None else f"≥ {format_figure(self.at_least, self.unit)}"
+        high = "" if self.at_most is None else f"≤ {format_figure(self.at_most, self.unit)}"
         return " and ".join(part for part in (low, high) if part)
 
 
-def figure(value: float, unit: str) -> str:
+def at_most(what: str, seen: float | None, bound: float, unit: str = "") -> Check:
+    """A figure that must not exceed its bound."""
+    return Check(what=what, seen=seen, unit=unit, at_most=bound)
+
+
+def at_least(what: str, seen: float | None, bound: float, unit: str = "") -> Check:
+    """A figure that must reach its bound."""
+    return Check(what=what, seen=seen, unit=unit, at_least=bound)
+
+
+def equal_to(what: str, seen: float | None, value: float) -> Check:
+    """A figure that must have this value."""
+    return Check(what=what, seen=seen, at_least=value, at_most=value)
+
+
+def format_figure(value: float, unit: str) -> str:
     """Three significant digits at most, whole numbers whole, with the unit."""
     if unit == "%":
         return f"{100.0 * value:.3g} %"
@@ -62,27 +77,27 @@ class Outcome(msgspec.Struct, frozen=True, kw_only=True):
     """Figures without a bound."""
 
     @property
-    def held(self) -> bool | None:
+    def is_met(self) -> bool | None:
         """Whether every expectation held; None where it was not run."""
         if self.not_run:
             return None
-        return not self.failed and bool(self.checks) and all(c.held for c in self.checks)
+        return not self.failed and bool(self.checks) and all(c.is_met for c in self.checks)
 
 
-def as_data(faults: "Faults") -> dict[str, Any]:
+def report_data(faults: "ChaosReport") -> dict[str, Any]:
     """What `--json` and `--report` write: all fields, and whether each expectation held."""
     outcomes = [
         {
             **msgspec.structs.asdict(o),
-            "held": o.held,
-            "checks": [{**msgspec.structs.asdict(c), "held": c.held} for c in o.checks],
+            "held": o.is_met,
+            "checks": [{**msgspec.structs.asdict(c), "held": c.is_met} for c in o.checks],
         }
         for o in faults.outcomes
     ]
-    return {**msgspec.structs.asdict(faults), "held": faults.held, "outcomes": outcomes}
+    return {**msgspec.structs.asdict(faults), "held": faults.is_met, "outcomes": outcomes}
 
 
-class Faults(msgspec.Struct, frozen=True, kw_only=True):
+class ChaosReport(msgspec.Struct, frozen=True, kw_only=True):
     """What `chaos --report` writes."""
 
     version: str
@@ -91,6 +106,6 @@ class Faults(msgspec.Struct, frozen=True, kw_only=True):
     outcomes: tuple[Outcome, ...]
 
     @property
-    def held(self) -> bool:
+    def is_met(self) -> bool:
         """Whether nothing that was run went against its expectation."""
-        return all(outcome.held is not False for outcome in self.outcomes)
+        return all(outcome.is_met is not False for outcome in self.outcomes)

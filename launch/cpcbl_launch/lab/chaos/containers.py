@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import NamedTuple
 
 from cpcbl_agents.clock import Clock
-from cpcbl_launch.lab.chaos.figures import all_counts
-from cpcbl_launch.lab.chaos.network import AFTER_S, CUT_S, judged_partition
-from cpcbl_launch.lab.chaos.run_log import Notes, NoteTaker
-from cpcbl_launch.lab.chaos.scenario import CannotRunError, Found, Setting
+from cpcbl_launch.lab.chaos.figures import latest_counts
+from cpcbl_launch.lab.chaos.network import AFTER_S, CUT_S, partition_checks
+from cpcbl_launch.lab.chaos.run_log import RunLog, RunRecorder
+from cpcbl_launch.lab.chaos.scenario import CannotRunError, ScenarioOptions, ScenarioResult
 from cpcbl_launch.lab.chaos.team import PATIENCE_S, ChaosError
 from cpcbl_launch.run.containers import BASE_IMAGE, BASE_VARIABLE
 from cpcbl_launch.run.containers.docker import (
@@ -38,17 +38,17 @@ BLIND_M = 1.0  # the blind scout is far from those that know best
 
 class _Sites(NamedTuple):
     project: Project
-    west: NoteTaker
-    east: NoteTaker
+    west: RunRecorder
+    east: RunRecorder
 
     @property
-    def notes(self) -> tuple[Notes, Notes]:
-        """What was heard in the west and in the east; the truth is told in the west."""
-        west = self.west.notes()
-        return west, self.east.notes()._replace(truth=west.truth)
+    def logs(self) -> tuple[RunLog, RunLog]:
+        """The logs of the west and of the east; the truth is published in the west only."""
+        west = self.west.run_log()
+        return west, self.east.run_log()._replace(truth=west.truth)
 
 
-def missing() -> str:
+def missing_requirement() -> str:
     """Why there can be no containers here; empty if there can."""
     if checkout() is None:
         return f"needs a checkout, for {SITES} and the image's sources"
@@ -60,34 +60,34 @@ def missing() -> str:
     return ""
 
 
-def partition_containers(setting: Setting) -> Found:
+def partition_containers(setting: ScenarioOptions) -> ScenarioResult:
     """`docker network disconnect` of one site's router, and `connect` again."""
     with _sites(setting) as sites:
-        setting.say("starting a team at two sites, in containers")
-        _until(lambda: _helps(sites), "the team did not begin to help")
+        setting.report_progress("starting a team at two sites, in containers")
+        _wait_until(lambda: _helps(sites), "the team did not begin to help")
         time.sleep(BEGINS_S)
         link = f"{sites.project.name}_link"
         router = sites.project.containers()["router-east"].id
-        setting.say(f"the sites are apart for {CUT_S:g} s")
+        setting.report_progress(f"the sites are apart for {CUT_S:g} s")
         cut_s = sites.west.now_s
         command_output(["docker", "network", "disconnect", link, router])
         time.sleep(CUT_S)
         command_output(["docker", "network", "connect", link, router])
         healed_s = sites.west.now_s
-        setting.say("the link between the sites is back")
+        setting.report_progress("the link between the sites is back")
         time.sleep(5.0 + AFTER_S)
         times = cut_s, healed_s, sites.west.now_s
-        return Found(judged_partition(*sites.notes, WEST, EAST, *times, most_far_m=BLIND_M))
+        return ScenarioResult(partition_checks(*sites.logs, WEST, EAST, *times, most_far_m=BLIND_M))
 
 
 def _helps(sites: _Sites) -> bool:
     """Whether all are heard, and the scout of the east is helped."""
-    west, east = sites.notes
+    west, east = sites.logs
     heard = {*WEST, *EAST} <= west.tracks.keys() & east.tracks.keys()
-    return heard and all_counts(east, "scout")["messages_received"] > 20
+    return heard and latest_counts(east, "scout")["messages_received"] > 20
 
 
-def _until(condition: Callable[[], bool], otherwise: str) -> None:
+def _wait_until(condition: Callable[[], bool], otherwise: str) -> None:
     end_s = time.monotonic() + 2.0 * PATIENCE_S
     while not condition():
         if time.monotonic() > end_s:
@@ -96,7 +96,7 @@ def _until(condition: Callable[[], bool], otherwise: str) -> None:
 
 
 @contextmanager
-def _sites(setting: Setting) -> Iterator[_Sites]:
+def _sites(setting: ScenarioOptions) -> Iterator[_Sites]:
     top = checkout()
     assert top is not None
     with ExitStack() as stack:
@@ -113,16 +113,16 @@ def _sites(setting: Setting) -> Iterator[_Sites]:
         takers, clock = [], Clock.wall()
         for endpoint in endpoints:
             bus = stack.enter_context(open_bus("demo", [endpoint]))
-            takers.append(NoteTaker(clock))
+            takers.append(RunRecorder(clock))
             takers[-1].listen(bus)
         yield _Sites(project, *takers)
 
 
-def _image(setting: Setting) -> str:
+def _image(setting: ScenarioOptions) -> str:
     """The image of these sources. Raises CannotRunError where none can be had."""
     bases = (os.environ.get(BASE_VARIABLE), BASE_IMAGE, OWN_BASE)
     try:
         base = next((b for b in bases if b and has_image(b)), bases[0] or BASE_IMAGE)
-        return ensure_image(base, never_stop, setting.say)
+        return ensure_image(base, never_stop, setting.report_progress)
     except DockerError as error:
         raise CannotRunError(f"needs an image: {error}") from error

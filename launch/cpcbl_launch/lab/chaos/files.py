@@ -7,8 +7,8 @@ import tempfile
 from pathlib import Path
 from typing import NamedTuple
 
-from cpcbl_launch.lab.chaos.checks import Check
-from cpcbl_launch.lab.chaos.scenario import Found, Setting
+from cpcbl_launch.lab.chaos.checks import Check, at_least, equal_to
+from cpcbl_launch.lab.chaos.scenario import ScenarioOptions, ScenarioResult
 from cpcbl_launch.run.processes import PROGRAM
 
 RUN_S = 6.0
@@ -17,84 +17,86 @@ DISK = "64k"  # less than a recording, a picture or a report of a run
 READ_ONLY = ("--record", "--report", "--picture", "--logs")
 
 
-class Ended(NamedTuple):
+class CommandResult(NamedTuple):
     """How a command ended."""
 
     code: int
-    out: str
-    said: str
+    stdout: str
+    stderr: str
     """On standard error."""
 
 
-def disk_full(setting: Setting) -> Found:
+def disk_full(setting: ScenarioOptions) -> ScenarioResult:
     """`up` records, reports and draws onto a disk of 64 kB, and keeps its logs there."""
     with tempfile.TemporaryDirectory(prefix="cpcbl-chaos-") as name:
         disk, names = Path(name), ("run.mcap", "report.json", "run.png")
-        setting.say(f"running `up` on a disk of {DISK}B")
+        setting.report_progress(f"running `up` on a disk of {DISK}B")
         record, report, picture = (disk / n for n in names)
         options = ["--record", record, "--report", report, "--picture", picture]
         ended = _on_disk(f"size={DISK}", disk, "up", *_short(), *options, "--logs", disk / "logs")
-        setting.say("running `up --json` with a full device as standard output")
+        setting.report_progress("running `up --json` with a full device as standard output")
         full = _run("sh", "-c", f"{_command('up', *_short(), '--json')} > /dev/full")
-    return Found(judged_full(ended, names, full))
+    return ScenarioResult(full_disk_checks(ended, names, full))
 
 
-def judged_full(ended: Ended, names: tuple[str, ...], full: Ended) -> list[Check]:
+def full_disk_checks(
+    ended: CommandResult, names: tuple[str, ...], full: CommandResult
+) -> list[Check]:
     """The run goes on to its report; a line for each file that was lost; exit code 1."""
     lines = [
-        sum(f"{name}: not written: " in line for line in ended.said.splitlines()) for name in names
+        sum(f"{name}: not written: " in line for line in ended.stderr.splitlines())
+        for name in names
     ]
     return [
-        Check(what="robots in the report on the terminal", seen=_robots(ended.out), at_least=4),
-        Check(what="lines that name a lost file", seen=sum(lines), at_least=3, at_most=3),
+        at_least("robots in the report on the terminal", _robots(ended.stdout), 4),
+        equal_to("lines that name a lost file", sum(lines), 3),
         _exit(ended.code, 1),
         *_clean(ended),
-        Check(
-            what="lines that report the full standard output",
-            seen=full.said.count("standard output: not written: "),
-            at_least=1,
-            at_most=1,
+        equal_to(
+            "lines that report the full standard output",
+            full.stderr.count("standard output: not written: "),
+            1,
         ),
         _exit(full.code, 1),
         *_clean(full),
     ]
 
 
-def read_only(setting: Setting) -> Found:
+def read_only(setting: ScenarioOptions) -> ScenarioResult:
     """`up` and `calibrate` are to write where nothing can be written."""
     with tempfile.TemporaryDirectory(prefix="cpcbl-chaos-") as name:
         disk, ended = Path(name), {}
         for option in READ_ONLY:
-            setting.say(f"running `up {option}` on a read-only file system")
+            setting.report_progress(f"running `up {option}` on a read-only file system")
             path = disk / ("run.png" if option == "--picture" else "written")
             ended[option] = _on_disk("ro", disk, "up", *_short(), option, path)
-        setting.say("running `calibrate --output` on a read-only file system")
+        setting.report_progress("running `calibrate --output` on a read-only file system")
         words = ("calibrate", "run.mcap", "--output", disk / "new.toml")
         ended["--output"] = _on_disk("ro", disk, *words)
-    return Found(judged_read_only(ended))
+    return ScenarioResult(read_only_checks(ended))
 
 
-def judged_read_only(ended: dict[str, Ended]) -> list[Check]:
+def read_only_checks(ended: dict[str, CommandResult]) -> list[Check]:
     """One line names option and file before anything is started; exit code 2."""
     clear = [
-        sum(f"cpcbl-team: {option} " in line for line in e.said.splitlines()) == 1
+        sum(f"cpcbl-team: {option} " in line for line in e.stderr.splitlines()) == 1
         for option, e in ended.items()
     ]
     codes = [e.code == 2 for e in ended.values()]
     n = len(ended)
     return [
-        Check(what="options refused with one line of error", seen=sum(clear), at_least=n),
-        Check(what="commands that ended with exit code 2", seen=sum(codes), at_least=n),
-        *(check for e in ended.values() for check in _clean(e) if not check.held),
+        at_least("options refused with one line of error", sum(clear), n),
+        at_least("commands that ended with exit code 2", sum(codes), n),
+        *(check for e in ended.values() for check in _clean(e) if not check.is_met),
     ]
 
 
 def _exit(code: int, due: int) -> Check:
-    return Check(what="exit code", seen=code, at_least=due, at_most=due)
+    return equal_to("exit code", code, due)
 
 
-def _clean(ended: Ended) -> list[Check]:
-    return [Check(what="tracebacks", seen=ended.said.count("Traceback"), at_least=0, at_most=0)]
+def _clean(ended: CommandResult) -> list[Check]:
+    return [equal_to("tracebacks", ended.stderr.count("Traceback"), 0)]
 
 
 def _robots(out: str) -> int:
@@ -112,18 +114,18 @@ def _command(*words: object) -> str:
     return shlex.join([*PROGRAM, *map(str, words)])
 
 
-def _on_disk(options: str, at: Path, *words: object) -> Ended:
+def _on_disk(options: str, at: Path, *words: object) -> CommandResult:
     """A command that finds a small disk at a folder, in a mount namespace that ends with it."""
     mount = f"mount -t tmpfs -o {options} tmpfs {shlex.quote(str(at))}"
     return _run("unshare", "--mount", "sh", "-c", f"{mount} && exec {_command(*words)}")
 
 
-def _run(*words: str) -> Ended:
+def _run(*words: str) -> CommandResult:
     done = subprocess.run(words, capture_output=True, text=True, timeout=PATIENCE_S, check=False)
-    return Ended(done.returncode, done.stdout, done.stderr)
+    return CommandResult(done.returncode, done.stdout, done.stderr)
 
 
-def missing() -> str:
+def missing_requirement() -> str:
     """Why no disk can be mounted here; empty if it can."""
     if os.geteuid() != 0:
         return "needs root, to mount a small disk"

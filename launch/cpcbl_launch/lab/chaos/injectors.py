@@ -29,8 +29,8 @@ class Echo:
         self.copies = 0
 
     def __enter__(self) -> "Echo":
-        self._handles = [self._bus.subscribe(key, self._heard) for key in self._keys]
-        self._thread = threading.Thread(target=self._speak, daemon=True)
+        self._handles = [self._bus.subscribe(key, self._receive) for key in self._keys]
+        self._thread = threading.Thread(target=self._send_due, daemon=True)
         self._thread.start()
         return self
 
@@ -40,13 +40,13 @@ class Echo:
         self._stop.set()
         self._thread.join()
 
-    def _heard(self, key: str, payload: bytes) -> None:
+    def _receive(self, key: str, payload: bytes) -> None:
         now_s = time.monotonic()
         with self._lock:
             for late_s in (0.0, self._random.uniform(0.0, self._latest_s)):
                 heapq.heappush(self._due, (now_s + late_s, len(self._due), key, payload))
 
-    def _speak(self) -> None:
+    def _send_due(self) -> None:
         while not self._stop.wait(0.01):
             now_s = time.monotonic()
             with self._lock:
@@ -63,7 +63,7 @@ class Echo:
         self.copies += 1
 
 
-def flood(team: str, endpoint: str, robot: str, targets: list[str], stop: StopSignal) -> int:
+def send_flood(team: str, endpoint: str, robot: str, targets: list[str], stop: StopSignal) -> int:
     """Says all that a robot may say as fast as it can; how many messages.
 
     What it says is true but worthless (it does not know where it is), so that only the flood harms.
@@ -90,7 +90,7 @@ def flood(team: str, endpoint: str, robot: str, targets: list[str], stop: StopSi
 
 def main(team: str, endpoint: str, parent: str, robot: str, *targets: str) -> None:
     """`python -m cpcbl_launch.lab.chaos.injectors TEAM ENDPOINT PARENT ROBOT TARGET ...`"""
-    sent = flood(team, endpoint, robot, list(targets), StopSignal(int(parent)))
+    sent = send_flood(team, endpoint, robot, list(targets), StopSignal(int(parent)))
     sys.stdout.write(f"{sent}\n")
 
 

@@ -3,41 +3,41 @@
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 
-from cpcbl_launch.lab.chaos.checks import Check
+from cpcbl_launch.lab.chaos.checks import Check, at_least, at_most
 from cpcbl_launch.lab.chaos.figures import (
-    counted,
-    found_after_s,
-    gone_after_s,
-    helped_after_s,
-    latency_s,
-    longest_gap_s,
-    present_after_s,
-    rmse_m,
-    worst,
+    counts_between,
+    first_help_after_s,
+    localized_after_s,
+    longest_track_gap_s,
+    maximum,
+    position_rmse_m,
+    token_back_after_s,
+    token_gone_after_s,
+    track_delay_s,
 )
-from cpcbl_launch.lab.chaos.relay import Quality, Relay
-from cpcbl_launch.lab.chaos.run_log import Notes
+from cpcbl_launch.lab.chaos.relay import LinkQuality, Relay
+from cpcbl_launch.lab.chaos.run_log import RunLog
 from cpcbl_launch.lab.chaos.scenario import (
     BASELINE_S,
     FOUND_M,
-    Found,
-    Setting,
-    all_is_well,
-    it_is_missed,
-    settled,
-    they_go_on,
+    ScenarioOptions,
+    ScenarioResult,
+    check_token_gone,
+    checks_recovered,
+    checks_unaffected,
+    settle,
 )
-from cpcbl_launch.lab.chaos.sites import two_sites
-from cpcbl_launch.lab.chaos.team import Plan, TeamUnderTest, demo_team, running
-from cpcbl_launch.lab.chaos.tun_link import Weather, Wire
+from cpcbl_launch.lab.chaos.sites import run_at_two_sites
+from cpcbl_launch.lab.chaos.team import RunPlan, TeamUnderTest, demo_team, run_team_under_test
+from cpcbl_launch.lab.chaos.tun_link import PacketImpairment, TunLink
 from cpcbl_launch.run.up import free_endpoint
 
 CUT_S = 10.0
 BAD_S = 20.0
 AFTER_S = 8.0
-DELAY = Quality(delay_s=0.2, jitter_s=0.1)
-NARROW = Quality(bytes_per_s=50_000 / 8)
-LOSSY = Weather(loss=0.2)
+DELAY = LinkQuality(delay_s=0.2, jitter_s=0.1)
+NARROW = LinkQuality(bytes_per_s=50_000 / 8)
+LOSSY = PacketImpairment(loss=0.2)
 LOSSY_M = 1.0  # its odometry comes in bursts: for moments it does not know that it moves
 FAR = ("navigator", "patrol")
 
@@ -45,29 +45,29 @@ FAR = ("navigator", "patrol")
 # Partition ----------------------------------------------------------------------------------------
 
 
-def partition(setting: Setting) -> Found:
+def partition(setting: ScenarioOptions) -> ScenarioResult:
     """Two sites, a router each: the link between them is cut, and healed."""
-    with two_sites(demo_team(), setting.seed, FAR) as sites:
+    with run_at_two_sites(demo_team(), setting.seed, FAR) as sites:
         team = sites.team
-        setting.say("starting a team at two sites")
+        setting.report_progress("starting a team at two sites")
         team.settle()
         team.run_for(BASELINE_S)
-        setting.say(f"the sites are apart for {CUT_S:g} s")
+        setting.report_progress(f"the sites are apart for {CUT_S:g} s")
         cut_s = team.now_s
-        sites.link.set(Quality(cut=True))
+        sites.link.set(LinkQuality(cut=True))
         team.run_for(CUT_S)
         healed_s = team.now_s
-        sites.link.set(Quality())
-        setting.say("the link between the sites is back")
+        sites.link.set(LinkQuality())
+        setting.report_progress("the link between the sites is back")
         team.run_for(5.0 + AFTER_S)
         near = team.others(*FAR)
         times = cut_s, healed_s, team.now_s
-        return Found(judged_partition(team.notes, sites.far_notes, near, FAR, *times))
+        return ScenarioResult(partition_checks(team.run_log, sites.far_log, near, FAR, *times))
 
 
-def judged_partition(
-    near_notes: Notes,
-    far_notes: Notes,
+def partition_checks(
+    near_notes: RunLog,
+    far_notes: RunLog,
     near: Sequence[str],
     far: Sequence[str],
     cut_s: float,
@@ -76,98 +76,92 @@ def judged_partition(
     most_far_m: float = FOUND_M,
 ) -> list[Check]:
     """Each side misses the other and goes on; they are one team again within 5 s of healing."""
-    gone = [gone_after_s(near_notes, name, cut_s) for name in far]
-    gone += [gone_after_s(far_notes, name, cut_s) for name in near]
-    back = [present_after_s(near_notes, name, healed_s) for name in far]
-    back += [present_after_s(far_notes, name, healed_s) for name in near]
-    heard = [helped_after_s(far_notes, name, near, healed_s) for name in far]
+    gone = [token_gone_after_s(near_notes, name, cut_s) for name in far]
+    gone += [token_gone_after_s(far_notes, name, cut_s) for name in near]
+    back = [token_back_after_s(near_notes, name, healed_s) for name in far]
+    back += [token_back_after_s(far_notes, name, healed_s) for name in near]
+    heard = [first_help_after_s(far_notes, name, near, healed_s) for name in far]
     helped = min((s for s in heard if s is not None), default=None)
     return [
-        Check(
-            what="other side's tokens disappeared after",
-            seen=worst(gone),
-            unit="s",
-            at_most=4.0,
-        ),
-        *they_go_on(near_notes, near, cut_s, healed_s, who="near side's"),
-        *they_go_on(far_notes, far, cut_s, healed_s, most_m=most_far_m, who="far side's"),
-        Check(what="from healing to all tokens back", seen=worst(back), unit="s", at_most=5.0),
-        Check(what="from healing to the first help", seen=helped, unit="s", at_most=5.0),
-        *all_is_well(near_notes, [*near, *far], healed_s + 5.0, until_s),
+        at_most("other side's tokens disappeared after", maximum(gone), 4.0, "s"),
+        *checks_unaffected(near_notes, near, cut_s, healed_s, who="near side's"),
+        *checks_unaffected(far_notes, far, cut_s, healed_s, most_m=most_far_m, who="far side's"),
+        at_most("from healing to all tokens back", maximum(back), 5.0, "s"),
+        at_most("from healing to the first help", helped, 5.0, "s"),
+        *checks_recovered(near_notes, [*near, *far], healed_s + 5.0, until_s),
     ]
 
 
 # One robot's link ---------------------------------------------------------------------------------
 
 
-def cut_link(setting: Setting) -> Found:
+def cut_link(setting: ScenarioOptions) -> ScenarioResult:
     """The best observer's link is silent: nobody is told."""
     robot = "observer"
     with _relayed(robot, setting) as (team, link):
-        setting.say(f"the link of {robot} is silent for {CUT_S:g} s")
+        setting.report_progress(f"the link of {robot} is silent for {CUT_S:g} s")
         cut_s = team.now_s
-        link.set(Quality(cut=True))
+        link.set(LinkQuality(cut=True))
         team.run_for(CUT_S)
         healed_s = team.now_s
-        link.set(Quality())
-        setting.say("its link is back")
+        link.set(LinkQuality())
+        setting.report_progress("its link is back")
         team.run_for(5.0 + AFTER_S)
         others = team.others(robot)
-        return Found(judged_cut(team.notes, robot, others, cut_s, healed_s, team.now_s))
+        return ScenarioResult(
+            cut_link_checks(team.run_log, robot, others, cut_s, healed_s, team.now_s)
+        )
 
 
-def judged_cut(
-    notes: Notes, robot: str, others: list[str], cut_s: float, healed_s: float, until_s: float
+def cut_link_checks(
+    log: RunLog, robot: str, others: list[str], cut_s: float, healed_s: float, until_s: float
 ) -> list[Check]:
     """A robot whose link is silent is missed like a dead one, and back when its link is."""
     return [
-        it_is_missed(notes, robot, cut_s, 4.0),
-        *they_go_on(notes, others, cut_s, healed_s),
-        Check(
-            what="from healing to its token back",
-            seen=present_after_s(notes, robot, healed_s),
-            unit="s",
-            at_most=5.0,
+        check_token_gone(log, robot, cut_s, 4.0),
+        *checks_unaffected(log, others, cut_s, healed_s),
+        at_most(
+            "from healing to its token back", token_back_after_s(log, robot, healed_s), 5.0, "s"
         ),
-        Check(
-            what="from healing until it was localized",
-            seen=found_after_s(notes, robot, healed_s, FOUND_M),
-            unit="s",
-            at_most=8.0,
+        at_most(
+            "from healing until it was localized",
+            localized_after_s(log, robot, healed_s, FOUND_M),
+            8.0,
+            "s",
         ),
-        *all_is_well(notes, [robot, *others], healed_s + 5.0, until_s),
+        *checks_recovered(log, [robot, *others], healed_s + 5.0, until_s),
     ]
 
 
-def slow_link(setting: Setting) -> Found:
+def slow_link(setting: ScenarioOptions) -> ScenarioResult:
     """200 ms each way, 100 ms more or less."""
     return _bad_relay(DELAY, setting, most_silent_s=2.0, most_late_s=1.5)
 
 
-def narrow_link(setting: Setting) -> Found:
+def narrow_link(setting: ScenarioOptions) -> ScenarioResult:
     """50 kbit/s each way."""
     return _bad_relay(NARROW, setting, most_silent_s=2.0, most_late_s=1.5)
 
 
-def lossy_link(setting: Setting) -> Found:
+def lossy_link(setting: ScenarioOptions) -> ScenarioResult:
     """Every fifth packet is lost, each way, below TCP."""
     robot, port = "navigator", free_endpoint().rsplit(":", 1)[1]
-    with Wire(setting.seed) as wire:
-        own = f"tcp/{wire.here}:{port}"
-        plan = Plan(
+    with TunLink(setting.seed) as wire:
+        own = f"tcp/{wire.near_address}:{port}"
+        plan = RunPlan(
             demo_team(),
             setting.seed,
             links={robot: own},
             prefix={robot: wire.prefix},
             also_listen=(own,),
         )
-        with running(plan) as team:
-            settled(team, setting)
+        with run_team_under_test(plan) as team:
+            settle(team, setting)
             found = _bad_link(
                 team,
                 robot,
                 setting,
-                lambda bad: wire.set(LOSSY if bad else Weather()),
+                lambda bad: wire.set(LOSSY if bad else PacketImpairment()),
                 most_silent_s=8.0,
                 most_late_s=6.0,
                 most_m=LOSSY_M,
@@ -179,15 +173,15 @@ def lossy_link(setting: Setting) -> Found:
 
 
 def _bad_relay(
-    quality: Quality, setting: Setting, *, most_silent_s: float, most_late_s: float
-) -> Found:
+    quality: LinkQuality, setting: ScenarioOptions, *, most_silent_s: float, most_late_s: float
+) -> ScenarioResult:
     robot = "navigator"
     with _relayed(robot, setting) as (team, link):
         return _bad_link(
             team,
             robot,
             setting,
-            lambda bad: link.set(quality if bad else Quality()),
+            lambda bad: link.set(quality if bad else LinkQuality()),
             most_silent_s=most_silent_s,
             most_late_s=most_late_s,
         )
@@ -196,29 +190,31 @@ def _bad_relay(
 def _bad_link(
     team: TeamUnderTest,
     robot: str,
-    setting: Setting,
+    setting: ScenarioOptions,
     make_bad: Callable[[bool], None],
     *,
     most_silent_s: float,
     most_late_s: float,
     most_m: float = FOUND_M,
-) -> Found:
+) -> ScenarioResult:
     """A link over which a robot gets its inputs and its help, bad for a while."""
-    setting.say(f"the link of {robot} is bad for {BAD_S:g} s")
+    setting.report_progress(f"the link of {robot} is bad for {BAD_S:g} s")
     bad_s = team.now_s
     make_bad(True)
     team.run_for(BAD_S)
     good_s = team.now_s
     make_bad(False)
-    setting.say("its link is good again")
+    setting.report_progress("its link is good again")
     team.run_for(3.0 + AFTER_S)
     others, until_s = team.others(robot), team.now_s
     bounds = most_silent_s, most_late_s, most_m
-    return Found(judged_bad(team.notes, robot, others, bad_s, good_s, until_s, *bounds))
+    return ScenarioResult(
+        bad_link_checks(team.run_log, robot, others, bad_s, good_s, until_s, *bounds)
+    )
 
 
-def judged_bad(
-    notes: Notes,
+def bad_link_checks(
+    log: RunLog,
     robot: str,
     others: list[str],
     bad_s: float,
@@ -231,41 +227,41 @@ def judged_bad(
     """A robot with a bad link knows where it is and is helped, only later; the others do not
     notice."""
     return [
-        Check(
-            what="its longest gap between tracks",
-            seen=longest_gap_s(notes, robot, bad_s, good_s),
-            unit="s",
-            at_most=most_silent_s,
+        at_most(
+            "its longest gap between tracks",
+            longest_track_gap_s(log, robot, bad_s, good_s),
+            most_silent_s,
+            "s",
         ),
-        Check(
-            what="its tracks' delay, 99th percentile",
-            seen=latency_s(notes, robot, bad_s, good_s),
-            unit="s",
-            at_most=most_late_s,
+        at_most(
+            "its tracks' delay, 99th percentile",
+            track_delay_s(log, robot, bad_s, good_s),
+            most_late_s,
+            "s",
         ),
-        Check(what="its RMSE", seen=rmse_m(notes, robot, bad_s, good_s), unit="m", at_most=most_m),
-        Check(
-            what="help messages that it received",
-            seen=counted(notes, robot, bad_s, good_s)["messages_received"],
-            at_least=20,
+        at_most("its RMSE", position_rmse_m(log, robot, bad_s, good_s), most_m, "m"),
+        at_least(
+            "help messages that it received",
+            counts_between(log, robot, bad_s, good_s)["messages_received"],
+            20,
         ),
-        *they_go_on(notes, others, bad_s, good_s),
-        Check(
-            what="others' delay, 99th percentile",
-            seen=worst(latency_s(notes, name, bad_s, good_s) for name in others),
-            unit="s",
-            at_most=0.5,
+        *checks_unaffected(log, others, bad_s, good_s),
+        at_most(
+            "others' delay, 99th percentile",
+            maximum(track_delay_s(log, name, bad_s, good_s) for name in others),
+            0.5,
+            "s",
         ),
-        *all_is_well(notes, [robot, *others], good_s + 3.0, until_s),
+        *checks_recovered(log, [robot, *others], good_s + 3.0, until_s),
     ]
 
 
 @contextmanager
-def _relayed(robot: str, setting: Setting) -> Iterator[tuple[TeamUnderTest, Relay]]:
+def _relayed(robot: str, setting: ScenarioOptions) -> Iterator[tuple[TeamUnderTest, Relay]]:
     """A settled team, one robot of which has a relay as its link."""
     endpoint = free_endpoint()
     with Relay(endpoint, setting.seed) as link:
-        plan = Plan(demo_team(), setting.seed, endpoint=endpoint, links={robot: link.endpoint})
-        with running(plan) as team:
-            settled(team, setting)
+        plan = RunPlan(demo_team(), setting.seed, endpoint=endpoint, links={robot: link.endpoint})
+        with run_team_under_test(plan) as team:
+            settle(team, setting)
             yield team, link

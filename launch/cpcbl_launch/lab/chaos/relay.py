@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 CHUNK = 4096
 
 
-class Quality(NamedTuple):
+class LinkQuality(NamedTuple):
     """How a link is, each way."""
 
     delay_s: float = 0.0
@@ -32,7 +32,7 @@ class Relay:
     def __init__(self, endpoint: str, seed: int = 1) -> None:
         host, port = endpoint.removeprefix("tcp/").rsplit(":", 1)
         self._target, self._random = (host, int(port)), random.Random(seed)
-        self._quality = Quality()
+        self._quality = LinkQuality()
         self._loop = asyncio.new_event_loop()
         self._thread = threading.Thread(target=self._loop.run_forever, daemon=True)
         self._tasks: set[asyncio.Task[None]] = set()
@@ -57,10 +57,10 @@ class Relay:
         return f"tcp/127.0.0.1:{self._server.sockets[0].getsockname()[1]}"
 
     @property
-    def quality(self) -> Quality:
+    def quality(self) -> LinkQuality:
         return self._quality
 
-    def set(self, quality: Quality) -> None:
+    def set(self, quality: LinkQuality) -> None:
         """From any thread; in force at once, for what is on its way too if it is cut."""
 
         def changed() -> None:

@@ -4,7 +4,7 @@ All times are seconds of robot time since the run's epoch: those of stamps and t
 """
 
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import NamedTuple, TypeVar
 
@@ -24,22 +24,22 @@ TRUTH_EVERY_NS = 80_000_000
 Value = TypeVar("Value")
 
 
-class Heard(NamedTuple):
-    """A track, and when it came."""
+class ReceivedTrack(NamedTuple):
+    """A track, and when it arrived."""
 
     at_s: float
     track: Track
 
 
-class Said(NamedTuple):
-    """A status, and when it came."""
+class ReceivedStatus(NamedTuple):
+    """A status, and when it arrived."""
 
     at_s: float
     status: Status
 
 
-class Token(NamedTuple):
-    """A robot's token came or went."""
+class TokenEvent(NamedTuple):
+    """A robot's liveliness token appeared or disappeared."""
 
     at_s: float
     robot: str
@@ -48,32 +48,32 @@ class Token(NamedTuple):
     alive: bool
 
 
-class Notes(NamedTuple):
-    """What was heard in a run."""
+class RunLog(NamedTuple):
+    """What was received in a run."""
 
     epoch_ns: int
-    tracks: Mapping[str, Sequence[Heard]]
-    statuses: Mapping[str, Sequence[Said]]
-    tokens: Sequence[Token]
+    tracks: Mapping[str, Sequence[ReceivedTrack]]
+    statuses: Mapping[str, Sequence[ReceivedStatus]]
+    tokens: Sequence[TokenEvent]
     truth: Mapping[str, Floats]
     """Rows of seconds, x, y, heading, by robot."""
 
 
-class NoteTaker:
-    """Listens on one bus or several; what comes twice is put down once."""
+class RunRecorder:
+    """Records what it receives on one or several buses; a message that comes twice is kept once."""
 
     def __init__(self, clock: Clock, ahead_s: Mapping[str, float] = MappingProxyType({})) -> None:
-        """`ahead_s`: how far robots' clocks are ahead of this one; their tracks are put right."""
+        """`ahead_s`: how far each robot's clock is ahead; stamps of tracks are corrected."""
         self._clock, self._lock = clock, threading.Lock()
         self._ahead_ns = {name: int(s * 1e9) for name, s in ahead_s.items()}
-        self._tracks: dict[str, list[Heard]] = {}
-        self._statuses: dict[str, list[Said]] = {}
-        self._tokens: list[Token] = []
+        self._tracks: dict[str, list[ReceivedTrack]] = {}
+        self._statuses: dict[str, list[ReceivedStatus]] = {}
+        self._tokens: list[TokenEvent] = []
         self._rows: dict[str, list[tuple[float, float, float, float]]] = {}
         self._truth_ns = 0
 
     def listen(self, bus: Bus) -> None:
-        """To what robots and the field say for people, and to tokens."""
+        """Subscribes to tracks, statuses, the ground truth and liveliness tokens."""
         for topic in (topics.TRACK, topics.STATUS, topics.TRUTH):
             bus.subscribe(topic.at(), self._arrived)
         bus.watch_liveliness(topics.ALIVE.at(), self._seen)
@@ -85,7 +85,9 @@ class NoteTaker:
     def _seen(self, key: str, alive: bool) -> None:
         names = topics.ALIVE.names(key)
         if names is not None:
-            token = Token(self.now_s, names["robot"], names["tier"], names["incarnation"], alive)
+            token = TokenEvent(
+                self.now_s, names["robot"], names["tier"], names["incarnation"], alive
+            )
             with self._lock:
                 self._tokens.append(token)
 
@@ -96,9 +98,9 @@ class NoteTaker:
                 case Track(robot=robot, stamp_ns=stamp_ns):
                     stamp_ns -= self._ahead_ns.get(robot, 0)
                     track = msgspec.structs.replace(message, stamp_ns=stamp_ns)
-                    _add(self._tracks.setdefault(robot, []), Heard(at_s, track))
+                    _add(self._tracks.setdefault(robot, []), ReceivedTrack(at_s, track))
                 case Status(robot=robot):
-                    _add(self._statuses.setdefault(robot, []), Said(at_s, message))
+                    _add(self._statuses.setdefault(robot, []), ReceivedStatus(at_s, message))
                 case Truths() if self._is_next(message):
                     self._truth_ns = message.stamp_ns
                     stamp_s = (message.stamp_ns - self._clock.epoch_ns) * 1e-9
@@ -107,14 +109,14 @@ class NoteTaker:
                         self._rows.setdefault(t.robot, []).append(row)
 
     def _is_next(self, truths: Truths) -> bool:
-        """Of truths not so many are needed, and some may be forged."""
+        """Whether to keep it: a part is enough, and a forged one may have a stamp in the future."""
         ahead_ns = truths.stamp_ns - self._truth_ns
         return ahead_ns >= TRUTH_EVERY_NS and truths.stamp_ns <= self._clock.now_ns()
 
-    def notes(self) -> Notes:
-        """All so far."""
+    def run_log(self) -> RunLog:
+        """All that was received so far."""
         with self._lock:
-            return Notes(
+            return RunLog(
                 self._clock.epoch_ns,
                 {name: tuple(heard) for name, heard in self._tracks.items()},
                 {name: tuple(said) for name, said in self._statuses.items()},
@@ -122,15 +124,11 @@ class NoteTaker:
                 {name: np.array(rows) for name, rows in self._rows.items()},
             )
 
-    def taken(self, take: Callable[[Notes], Value]) -> Value:
-        """A figure of all so far."""
-        return take(self.notes())
 
-
-_Dated = TypeVar("_Dated", Heard, Said)
+_Dated = TypeVar("_Dated", ReceivedTrack, ReceivedStatus)
 
 
 def _add(kept: list[_Dated], new: _Dated) -> None:
-    """Two sites tell the same twice, one soon after the other."""
+    """Adds a message unless it is among the latest: two sites send each message twice."""
     if all(new[1] != old[1] for old in kept[-20:]):
         kept.append(new)

@@ -11,8 +11,8 @@ from importlib.metadata import version
 from msgspec.structs import replace
 
 from cpcbl_launch.lab.chaos import containers, files, tun_link
-from cpcbl_launch.lab.chaos.checks import Faults, Outcome
-from cpcbl_launch.lab.chaos.scenario import CannotRunError, Needs, Scenario, Setting
+from cpcbl_launch.lab.chaos.checks import ChaosReport, Outcome
+from cpcbl_launch.lab.chaos.scenario import CannotRunError, Needs, Scenario, ScenarioOptions
 from cpcbl_launch.lab.chaos.scenarios import SCENARIOS
 from cpcbl_launch.lab.chaos.team import ChaosError
 from cpcbl_launch.run.containers.docker import DockerError
@@ -23,7 +23,7 @@ ALL = "all"
 MOVED = {"fuzz": "it is a test now: run `make fuzz`, or `pytest tests/fuzz`, in a checkout"}
 
 
-def chosen(names: Sequence[str]) -> list[Scenario]:
+def select_scenarios(names: Sequence[str]) -> list[Scenario]:
     """The scenarios of these names, `all` for all; in the order of the table. Raises InputError."""
     known = {scenario.name: scenario for scenario in SCENARIOS}
     for name in names:
@@ -36,24 +36,24 @@ def chosen(names: Sequence[str]) -> list[Scenario]:
     return [s for s in SCENARIOS if ALL in names or s.name in names]
 
 
-def missing(needs: Needs) -> str:
+def missing_requirement(needs: Needs) -> str:
     """Why a scenario that needs this cannot run here; empty if it can."""
     match needs:
         case Needs.ROOT:
-            return tun_link.missing()
+            return tun_link.missing_requirement()
         case Needs.MOUNT:
-            return files.missing()
+            return files.missing_requirement()
         case Needs.DOCKER:
-            return containers.missing()
+            return containers.missing_requirement()
     return ""
 
 
-def outcome_of(scenario: Scenario, setting: Setting) -> Outcome:
+def run_scenario(scenario: Scenario, setting: ScenarioOptions) -> Outcome:
     """Runs one scenario."""
     name, done, expectation = scenario[:3]
     outcome = Outcome(scenario=name, done=done, expectation=expectation)
     began_s = time.monotonic()
-    if reason := missing(scenario.needs):
+    if reason := missing_requirement(scenario.needs):
         return replace(outcome, not_run=reason)
     try:
         found = scenario.run(setting)
@@ -69,27 +69,27 @@ def outcome_of(scenario: Scenario, setting: Setting) -> Outcome:
     )
 
 
-def run_all(
+def run_scenarios(
     scenarios: Iterable[Scenario],
-    setting: Setting,
+    setting: ScenarioOptions,
     began: Callable[[Scenario], None],
     done: Callable[[Outcome], None],
-) -> Faults:
+) -> ChaosReport:
     """Runs them all; `began` and `done` are told of each."""
     outcomes = []
     for scenario in scenarios:
         began(scenario)
-        outcomes.append(outcome_of(scenario, setting))
+        outcomes.append(run_scenario(scenario, setting))
         done(outcomes[-1])
-    return Faults(
+    return ChaosReport(
         version=version("cpcbl-team"),
         seed=setting.seed,
-        machine=machine(),
+        machine=machine_description(),
         outcomes=tuple(outcomes),
     )
 
 
-def machine() -> str:
+def machine_description() -> str:
     """What kind of machine this is, for those who read the figures."""
     cores = os.cpu_count() or 1
     load = os.getloadavg()[0]

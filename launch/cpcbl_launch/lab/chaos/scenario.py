@@ -4,9 +4,15 @@ from collections.abc import Callable, Iterable
 from enum import StrEnum
 from typing import NamedTuple
 
-from cpcbl_launch.lab.chaos.checks import Check
-from cpcbl_launch.lab.chaos.figures import gone_after_s, inside, longest_gap_s, rmse_m, worst
-from cpcbl_launch.lab.chaos.run_log import Notes
+from cpcbl_launch.lab.chaos.checks import Check, at_least, at_most
+from cpcbl_launch.lab.chaos.figures import (
+    inside_3_sigma,
+    longest_track_gap_s,
+    maximum,
+    position_rmse_m,
+    token_gone_after_s,
+)
+from cpcbl_launch.lab.chaos.run_log import RunLog
 from cpcbl_launch.lab.chaos.team import TeamUnderTest
 from cpcbl_team.errors import CpcblError
 
@@ -28,16 +34,16 @@ class CannotRunError(CpcblError):
     """A scenario found out that it lacks something here."""
 
 
-class Setting(NamedTuple):
+class ScenarioOptions(NamedTuple):
     """How scenarios are run."""
 
     seed: int = 1
     soak_s: float = 180.0
-    say: Callable[[str], None] = lambda doing: None
+    report_progress: Callable[[str], None] = lambda doing: None
     """Told what is being done."""
 
 
-class Found(NamedTuple):
+class ScenarioResult(NamedTuple):
     """What a scenario saw."""
 
     checks: Iterable[Check]
@@ -53,24 +59,24 @@ class Scenario(NamedTuple):
     needs: Needs
     quick: bool
     """Whether it is a test of the ordinary suite too."""
-    run: Callable[[Setting], Found]
+    run: Callable[[ScenarioOptions], ScenarioResult]
 
 
-def settled(team: TeamUnderTest, setting: Setting) -> None:
+def settle(team: TeamUnderTest, setting: ScenarioOptions) -> None:
     """Returns when the team knows where it is and has run for a while: as before a fault."""
-    setting.say("starting a team")
+    setting.report_progress("starting a team")
     team.settle()
     team.run_for(BASELINE_S)
 
 
-def it_is_missed(notes: Notes, robot: str, from_s: float, within_s: float) -> Check:
+def check_token_gone(log: RunLog, robot: str, from_s: float, within_s: float) -> Check:
     """Teammates hear that it is gone."""
-    seen = gone_after_s(notes, robot, from_s)
-    return Check(what="its token disappeared after", seen=seen, unit="s", at_most=within_s)
+    seen = token_gone_after_s(log, robot, from_s)
+    return at_most("its token disappeared after", seen, within_s, "s")
 
 
-def they_go_on(
-    notes: Notes,
+def checks_unaffected(
+    log: RunLog,
     robots: Iterable[str],
     from_s: float,
     until_s: float,
@@ -81,27 +87,22 @@ def they_go_on(
 ) -> list[Check]:
     """Robots report at 10 Hz all the time, and know where they are."""
     names = list(robots)
-    gaps = [longest_gap_s(notes, name, from_s, until_s) for name in names]
-    errors = [rmse_m(notes, name, from_s, until_s) for name in names]
+    gaps = [longest_track_gap_s(log, name, from_s, until_s) for name in names]
+    errors = [position_rmse_m(log, name, from_s, until_s) for name in names]
     return [
-        Check(
-            what=f"{who} longest gap between tracks",
-            seen=worst(gaps),
-            unit="s",
-            at_most=most_silent_s,
-        ),
-        Check(what=f"{who} worst RMSE", seen=worst(errors), unit="m", at_most=most_m),
+        at_most(f"{who} longest gap between tracks", maximum(gaps), most_silent_s, "s"),
+        at_most(f"{who} worst RMSE", maximum(errors), most_m, "m"),
     ]
 
 
-def all_is_well(
-    notes: Notes, robots: Iterable[str], from_s: float, until_s: float, most_m: float = GOOD_M
+def checks_recovered(
+    log: RunLog, robots: Iterable[str], from_s: float, until_s: float, most_m: float = GOOD_M
 ) -> list[Check]:
     """At the end of a scenario: as before the fault."""
     names = list(robots)
-    errors = [rmse_m(notes, name, from_s, until_s) for name in names]
-    share = inside(notes, names, from_s, until_s)
+    errors = [position_rmse_m(log, name, from_s, until_s) for name in names]
+    share = inside_3_sigma(log, names, from_s, until_s)
     return [
-        Check(what="RMSE afterwards, worst robot", seen=worst(errors), unit="m", at_most=most_m),
-        Check(what="inside 3 σ afterwards", seen=share, unit="%", at_least=0.9),
+        at_most("RMSE afterwards, worst robot", maximum(errors), most_m, "m"),
+        at_least("inside 3 σ afterwards", share, 0.9, "%"),
     ]

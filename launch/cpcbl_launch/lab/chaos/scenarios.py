@@ -13,7 +13,13 @@ from cpcbl_launch.lab.chaos.processes import (
 )
 from cpcbl_launch.lab.chaos.scenario import Needs, Scenario
 from cpcbl_launch.lab.chaos.soak import soak
-from cpcbl_launch.lab.chaos.world import clock_half_second, clock_hour, hidden, kidnap, liar
+from cpcbl_launch.lab.chaos.world import (
+    clock_half_second,
+    clock_hour,
+    faulty_robot,
+    hidden_landmarks,
+    kidnap,
+)
 
 QUICK, SLOW = True, False
 N, ROOT, MOUNT, DOCKER = Needs.NOTHING, Needs.ROOT, Needs.MOUNT, Needs.DOCKER
@@ -190,7 +196,7 @@ SCENARIOS = (
         " localized",
         N,
         SLOW,
-        hidden,
+        hidden_landmarks,
     ),
     Scenario(
         "liar",
@@ -199,7 +205,7 @@ SCENARIOS = (
         " their RMSE is at most 0.15 m; 20 s later all robots trust it again",
         N,
         SLOW,
-        liar,
+        faulty_robot,
     ),
     Scenario(
         "soak",

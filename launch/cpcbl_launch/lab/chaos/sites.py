@@ -5,8 +5,8 @@ from contextlib import ExitStack, contextmanager
 from typing import NamedTuple
 
 from cpcbl_launch.lab.chaos.relay import Relay
-from cpcbl_launch.lab.chaos.run_log import Notes, NoteTaker
-from cpcbl_launch.lab.chaos.team import Plan, Site, TeamUnderTest, running
+from cpcbl_launch.lab.chaos.run_log import RunLog, RunRecorder
+from cpcbl_launch.lab.chaos.team import RunPlan, Site, TeamUnderTest, run_team_under_test
 from cpcbl_launch.run.up import free_endpoint
 from cpcbl_team.config import Team
 from cpcbl_transport.zenoh_bus import open_bus
@@ -19,23 +19,23 @@ class TwoSites(NamedTuple):
 
     team: TeamUnderTest
     link: Relay
-    far_taker: NoteTaker
+    far_recorder: RunRecorder
 
     @property
-    def far_notes(self) -> Notes:
+    def far_log(self) -> RunLog:
         """What is heard at the far site, with the truth, which is told at the near one only."""
-        return self.far_taker.notes()._replace(truth=self.team.notes.truth)
+        return self.far_recorder.run_log()._replace(truth=self.team.run_log.truth)
 
 
 @contextmanager
-def two_sites(team: Team, seed: int, far: Sequence[str]) -> Iterator[TwoSites]:
+def run_at_two_sites(team: Team, seed: int, far: Sequence[str]) -> Iterator[TwoSites]:
     """A running team, some robots of which use another router."""
     near_at, far_at = free_endpoint(), free_endpoint()
     with ExitStack() as stack:
         link = stack.enter_context(Relay(near_at, seed))
         links, site = dict.fromkeys(far, far_at), Site(far_at, link.endpoint, far)
-        plan = Plan(team, seed, links=links, endpoint=near_at, sites={FAR: site})
-        run = stack.enter_context(running(plan))
-        far_taker = NoteTaker(run.clock)
+        plan = RunPlan(team, seed, links=links, endpoint=near_at, sites={FAR: site})
+        run = stack.enter_context(run_team_under_test(plan))
+        far_taker = RunRecorder(run.clock)
         far_taker.listen(stack.enter_context(open_bus(team.name, [far_at])))
         yield TwoSites(run, link, far_taker)

@@ -6,7 +6,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from cpcbl_launch.lab.chaos.checks import Faults, Outcome
+from cpcbl_launch.lab.chaos.checks import ChaosReport, Outcome
 from cpcbl_launch.lab.chaos.scenario import Scenario
 
 _VERDICT = {True: ("held", "green"), False: ("NOT HELD", "bold red"), None: ("not run", "yellow")}
@@ -21,7 +21,7 @@ def print_scenarios(scenarios: tuple[Scenario, ...], console: Console) -> None:
     console.print(shown)
 
 
-def print_faults(faults: Faults, console: Console) -> None:
+def print_faults(faults: ChaosReport, console: Console) -> None:
     """Scenario, expectation, what was seen, whether it held."""
     shown = _table("scenario", "expectation", "seen", "")
     for outcome in faults.outcomes:
@@ -34,14 +34,14 @@ def print_faults(faults: Faults, console: Console) -> None:
             console.print(Text(f"{outcome.scenario}: {remark}", "dim"))
     counts = {text: 0 for text, _ in _VERDICT.values()}
     for outcome in faults.outcomes:
-        counts[_VERDICT[outcome.held][0]] += 1
+        counts[_VERDICT[outcome.is_met][0]] += 1
     said = ", ".join(f"{n} {text}" for text, n in counts.items() if n)
     console.print(Text(f"{said}; {faults.machine}; seed {faults.seed}", "bold"))
 
 
 def verdict(outcome: Outcome) -> Text:
     """In a word, in its colour."""
-    return Text(*_VERDICT[outcome.held])
+    return Text(*_VERDICT[outcome.is_met])
 
 
 def _table(*columns: str) -> Table:
@@ -54,10 +54,10 @@ def _table(*columns: str) -> Table:
 def _seen(outcome: Outcome) -> Text:
     if reason := outcome.not_run or outcome.failed:
         return Text(reason, "yellow" if outcome.not_run else "red")
-    return Text("\n").join(Text(str(c), "" if c.held else "red") for c in outcome.checks)
+    return Text("\n").join(Text(str(c), "" if c.is_met else "red") for c in outcome.checks)
 
 
-def markdown(faults: Faults) -> Iterator[str]:
+def markdown(faults: ChaosReport) -> Iterator[str]:
     """The same as lines of a page."""
     yield "| scenario | what is done | expectation | seen | |"
     yield "|---|---|---|---|---|"

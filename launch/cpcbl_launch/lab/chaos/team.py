@@ -13,8 +13,8 @@ from typing import NamedTuple
 import msgspec
 
 from cpcbl_agents.clock import Clock
-from cpcbl_launch.lab.chaos.figures import found_after_s, latest_incarnation
-from cpcbl_launch.lab.chaos.run_log import Notes, NoteTaker
+from cpcbl_launch.lab.chaos.figures import latest_incarnation, localized_after_s
+from cpcbl_launch.lab.chaos.run_log import RunLog, RunRecorder
 from cpcbl_launch.lab.faulty_robot import faulty_command
 from cpcbl_launch.run.processes import PROGRAM, process_table
 from cpcbl_launch.run.supervisor import ProcessSpec, Supervisor
@@ -45,7 +45,7 @@ class Site(NamedTuple):
     """Whom the field tells there what they sense."""
 
 
-class Plan(NamedTuple):
+class RunPlan(NamedTuple):
     """How a team is run."""
 
     team: Team
@@ -87,7 +87,7 @@ class TeamUnderTest:
     """Made by `running`. Times are seconds of robot time since the run's epoch."""
 
     def __init__(
-        self, plan: Plan, folder: Path, endpoint: str, clock: Clock, supervisor: Supervisor
+        self, plan: RunPlan, folder: Path, endpoint: str, clock: Clock, supervisor: Supervisor
     ) -> None:
         self.plan, self.folder, self.endpoint = plan, folder, endpoint
         self.clock, self.supervisor = clock, supervisor
@@ -97,27 +97,27 @@ class TeamUnderTest:
             if name not in plan.left_out and robot.source == "simulated"
         ]
         """Of the simulated field, which knows where they are."""
-        self.taker = NoteTaker(clock, plan.team.simulation.clocks_ahead_s)
+        self.recorder = RunRecorder(clock, plan.team.simulation.clocks_ahead_s)
         self.seen_pids: set[int] = set()
 
     @property
     def now_s(self) -> float:
-        return self.taker.now_s
+        return self.recorder.now_s
 
     @property
-    def notes(self) -> Notes:
-        return self.taker.notes()
+    def run_log(self) -> RunLog:
+        return self.recorder.run_log()
 
     def pid(self, name: str) -> int:
         """Of a robot, the field or a router. Raises ChaosError when it does not run."""
         process = f"robot-{name}" if name in self.plan.team.robots else name
         pid = self.supervisor.pids.get(process)
         if pid is None:
-            raise ChaosError(f"{process} does not run: {self.last_words(process)}")
+            raise ChaosError(f"{process} does not run: {self.last_log_line(process)}")
         return pid
 
     def incarnation(self, robot: str) -> str:
-        return latest_incarnation(self.notes, robot)
+        return latest_incarnation(self.run_log, robot)
 
     def others(self, *names: str) -> list[str]:
         return [robot for robot in self.robots if robot not in names]
@@ -146,9 +146,9 @@ class TeamUnderTest:
         self.seen_pids.update(self.supervisor.pids.values())
 
     def run_for(self, seconds: float) -> None:
-        self.until(lambda: False, seconds)
+        self.wait_until(lambda: False, seconds)
 
-    def until(self, condition: Callable[[], bool], within_s: float = PATIENCE_S) -> bool:
+    def wait_until(self, condition: Callable[[], bool], within_s: float = PATIENCE_S) -> bool:
         """Whether a condition came true in time; the team is looked after meanwhile."""
         end_s = time.monotonic() + within_s
         while not condition():
@@ -162,23 +162,23 @@ class TeamUnderTest:
         """Waits until all robots know where they are; when. Raises ChaosError."""
 
         def unsettled() -> list[str]:
-            notes = self.notes
+            notes = self.run_log
             from_s = max(0.0, self.now_s - 4.0)
             return [
                 robot
                 for robot in self.robots
-                if found_after_s(notes, robot, from_s, within_m) is None
+                if localized_after_s(notes, robot, from_s, within_m) is None
             ]
 
-        if not self.until(lambda: self.now_s > 3.0 and not unsettled(), patience_s):
+        if not self.wait_until(lambda: self.now_s > 3.0 and not unsettled(), patience_s):
             waiting = unsettled()
             raise ChaosError(
                 f"the team did not settle: {', '.join(waiting)}: "
-                + "; ".join(self.last_words(f"robot-{name}") for name in waiting)
+                + "; ".join(self.last_log_line(f"robot-{name}") for name in waiting)
             )
         return self.now_s
 
-    def log(self, process: str) -> str:
+    def process_log(self, process: str) -> str:
         """What a process wrote."""
         path = self.folder / f"{process}.log"
         return path.read_text(errors="replace") if path.exists() else ""
@@ -188,29 +188,29 @@ class TeamUnderTest:
         logs = (path.read_text(errors="replace") for path in self.folder.glob("*.log"))
         return sum(log.count("Traceback (most recent call last)") for log in logs)
 
-    def last_words(self, process: str) -> str:
-        lines = self.log(process).splitlines()
+    def last_log_line(self, process: str) -> str:
+        lines = self.process_log(process).splitlines()
         return lines[-1] if lines else f"{process} said nothing"
 
 
-def clock_in(seconds: float) -> Clock:
+def clock_starting_in(seconds: float) -> Clock:
     """A clock whose epoch is so long from now."""
     ahead_ns = int(seconds * 1e9)
     return Clock(time.time_ns() + ahead_ns, time.monotonic_ns() + ahead_ns, 1.0)
 
 
 @contextmanager
-def running(plan: Plan) -> Iterator[TeamUnderTest]:
+def run_team_under_test(plan: RunPlan) -> Iterator[TeamUnderTest]:
     """A team with all its processes; none of them is left at the end."""
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="cpcbl-chaos-")))
         endpoint = plan.endpoint or free_endpoint()
-        clock = clock_in(LEAD_S + LEAD_S_A_PROCESS * len(plan.team.robots))
+        clock = clock_starting_in(LEAD_S + LEAD_S_A_PROCESS * len(plan.team.robots))
         table = _table(plan, folder, endpoint, clock)
         supervisor = stack.enter_context(Supervisor(table, folder))
         team = TeamUnderTest(plan, folder, endpoint, clock, supervisor)
         bus = stack.enter_context(open_bus(plan.team.name, [endpoint], _patience()))
-        team.taker.listen(bus)
+        team.recorder.listen(bus)
         yield team
     left = [pid for pid in team.seen_pids if _runs(pid)]
     if left:
@@ -230,7 +230,7 @@ def _patience() -> Callable[[], bool]:
     return lambda: time.monotonic() > end_s
 
 
-def _table(plan: Plan, folder: Path, endpoint: str, clock: Clock) -> list[ProcessSpec]:
+def _table(plan: RunPlan, folder: Path, endpoint: str, clock: Clock) -> list[ProcessSpec]:
     """The router, the field, a robot each: as `up` starts them, with links and clocks of their
     own."""
     team_file = folder / "team.json"

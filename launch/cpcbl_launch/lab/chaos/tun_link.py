@@ -22,7 +22,7 @@ _SET_INTERFACE, _TUN_WITHOUT_HEADER = 0x400454CA, 0x1001
 _MTU = 1500
 
 
-class Weather(NamedTuple):
+class PacketImpairment(NamedTuple):
     """What happens to packets, each way."""
 
     loss: float = 0.0
@@ -32,18 +32,18 @@ class Weather(NamedTuple):
     """Up to so much more or less, evenly spread: packets overtake each other."""
 
 
-class Wire:
+class TunLink:
     """A namespace whose only way out is this wire. `prefix` runs a command in it; what runs there
     finds this machine at `here`."""
 
     def __init__(self, seed: int = 1) -> None:
         self._random = random.Random(seed)
-        self._weather = Weather()
+        self._weather = PacketImpairment()
         self._stop = threading.Event()
         tag = f"{os.getpid() % 0x10000:x}"
         self._namespace, self._near, self._far = f"cpcbl{tag}", f"cn{tag}", f"cf{tag}"
         net = 2 * (os.getpid() % 16384)  # of 198.18.0.0/15, set aside for such tests (RFC 2544)
-        self.here = f"198.18.{net >> 8}.{net & 255}"
+        self.near_address = f"198.18.{net >> 8}.{net & 255}"
         self._there = f"198.18.{net >> 8}.{(net & 255) + 1}"
         self.passed = self.lost = 0
 
@@ -51,16 +51,16 @@ class Wire:
     def prefix(self) -> tuple[str, ...]:
         return ("ip", "netns", "exec", self._namespace)
 
-    def set(self, weather: Weather) -> None:
+    def set(self, weather: PacketImpairment) -> None:
         """From any thread; for packets from now on."""
         self._weather = weather
 
-    def __enter__(self) -> "Wire":
+    def __enter__(self) -> "TunLink":
         self._ends = [_interface(self._near), _interface(self._far)]
         try:
             _ip("netns", "add", self._namespace)
             _ip("link", "set", self._far, "netns", self._namespace)
-            _ip("addr", "add", f"{self.here}/31", "dev", self._near)
+            _ip("addr", "add", f"{self.near_address}/31", "dev", self._near)
             _ip("link", "set", self._near, "up", "mtu", str(_MTU))
             inside = ("-n", self._namespace)
             _ip(*inside, "addr", "add", f"{self._there}/31", "dev", self._far)
@@ -106,7 +106,7 @@ class Wire:
                 os.write(end, packet)
 
 
-def missing() -> str:
+def missing_requirement() -> str:
     """Why there can be no wire here; empty if there can."""
     if os.geteuid() != 0:
         return "needs root, for a network namespace"

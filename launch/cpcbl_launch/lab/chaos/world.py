@@ -4,23 +4,30 @@ from collections.abc import Sequence
 
 import msgspec
 
-from cpcbl_launch.lab.chaos.checks import Check
+from cpcbl_launch.lab.chaos.checks import Check, at_least, at_most, equal_to
 from cpcbl_launch.lab.chaos.figures import (
-    all_counts,
-    distrusted,
-    distrusted_after_s,
-    found_after_s,
-    heard_late_s,
-    inside,
-    jump_s,
-    lost_after_s,
-    quarantined_s,
-    rmse_m,
-    worst,
+    distrust_reported_at_s,
+    distrusted_peers,
+    first_position_jump,
+    inside_3_sigma,
+    latest_counts,
+    localized_after_s,
+    maximum,
+    position_rmse_m,
+    quarantine_reported_at_s,
+    reported_delay_s,
+    reported_lost_after_s,
 )
-from cpcbl_launch.lab.chaos.run_log import Notes
-from cpcbl_launch.lab.chaos.scenario import FOUND_M, GOOD_M, Found, Setting, all_is_well, they_go_on
-from cpcbl_launch.lab.chaos.team import Plan, demo_team, running
+from cpcbl_launch.lab.chaos.run_log import RunLog
+from cpcbl_launch.lab.chaos.scenario import (
+    FOUND_M,
+    GOOD_M,
+    ScenarioOptions,
+    ScenarioResult,
+    checks_recovered,
+    checks_unaffected,
+)
+from cpcbl_launch.lab.chaos.team import RunPlan, demo_team, run_team_under_test
 from cpcbl_launch.lab.experiments import liars
 from cpcbl_team.config import SimulationEvent, Team
 from cpcbl_transport.messages import Refusal
@@ -38,155 +45,145 @@ LIE, LIE_S = "bias:0.5,0.5", (12.0, 27.0)
 # Kidnapped ----------------------------------------------------------------------------------------
 
 
-def kidnap(setting: Setting) -> Found:
+def kidnap(setting: ScenarioOptions) -> ScenarioResult:
     """A robot is carried 3 m away; its wheels do not notice."""
     event = SimulationEvent(at_s=EVENT_S, kidnap=KIDNAPPED, to=TO)
-    with running(Plan(with_events(demo_team(), event), setting.seed)) as team:
-        setting.say("starting a team")
+    with run_team_under_test(RunPlan(with_events(demo_team(), event), setting.seed)) as team:
+        setting.report_progress("starting a team")
         team.settle()
-        setting.say(f"{KIDNAPPED} is carried away at {EVENT_S:g} s")
-        team.until(lambda: jump_s(team.notes, KIDNAPPED) is not None, 20.0)
+        setting.report_progress(f"{KIDNAPPED} is carried away at {EVENT_S:g} s")
+        team.wait_until(lambda: first_position_jump(team.run_log, KIDNAPPED) is not None, 20.0)
         team.run_for(15.0)
         others = team.others(KIDNAPPED)
-        return Found(judged_kidnap(team.notes, KIDNAPPED, others, team.now_s))
+        return ScenarioResult(kidnap_checks(team.run_log, KIDNAPPED, others, team.now_s))
 
 
-def judged_kidnap(notes: Notes, robot: str, others: Sequence[str], until_s: float) -> list[Check]:
+def kidnap_checks(log: RunLog, robot: str, others: Sequence[str], until_s: float) -> list[Check]:
     """It says that it is lost, finds itself, and nobody else is led astray."""
-    at_s, moved_m = jump_s(notes, robot) or (until_s, 0.0)
-    believed = [name for name in (robot, *others) if not distrusted(notes, name)]
+    at_s, moved_m = first_position_jump(log, robot) or (until_s, 0.0)
+    believed = [name for name in (robot, *others) if not distrusted_peers(log, name)]
     return [
-        Check(what="distance of the kidnapping", seen=moved_m, unit="m", at_least=2.9),
-        Check(
-            what="it reported that it was lost after",
-            seen=lost_after_s(notes, robot, at_s),
-            unit="s",
-            at_most=3.0,
+        at_least("distance of the kidnapping", moved_m, 2.9, "m"),
+        at_most(
+            "it reported that it was lost after", reported_lost_after_s(log, robot, at_s), 3.0, "s"
         ),
-        Check(
-            what="it was localized after",
-            seen=found_after_s(notes, robot, at_s, FOUND_M),
-            unit="s",
-            at_most=8.0,
-        ),
-        *they_go_on(notes, others, at_s, until_s),
-        *all_is_well(notes, [robot, *others], at_s + 8.0, until_s),
-        Check(
-            what="robots that trust all others at the end",
-            seen=len(believed),
-            at_least=len(others) + 1,
-        ),
+        at_most("it was localized after", localized_after_s(log, robot, at_s, FOUND_M), 8.0, "s"),
+        *checks_unaffected(log, others, at_s, until_s),
+        *checks_recovered(log, [robot, *others], at_s + 8.0, until_s),
+        at_least("robots that trust all others at the end", len(believed), len(others) + 1),
     ]
 
 
 # In the dark --------------------------------------------------------------------------------------
 
 
-def hidden(setting: Setting) -> Found:
+def hidden_landmarks(setting: ScenarioOptions) -> ScenarioResult:
     """Nobody sees a landmark for a minute; teammates are seen."""
     event = SimulationEvent(at_s=EVENT_S, hide_landmarks_s=HIDDEN_S)
-    with running(Plan(with_events(demo_team(), event), setting.seed)) as team:
-        setting.say("starting a team")
+    with run_team_under_test(RunPlan(with_events(demo_team(), event), setting.seed)) as team:
+        setting.report_progress("starting a team")
         team.settle()
-        setting.say(f"no landmark is seen for {HIDDEN_S:g} s")
-        team.until(lambda: team.now_s >= EVENT_S + HIDDEN_S, HIDDEN_S + 30.0)
+        setting.report_progress(f"no landmark is seen for {HIDDEN_S:g} s")
+        team.wait_until(lambda: team.now_s >= EVENT_S + HIDDEN_S, HIDDEN_S + 30.0)
         team.run_for(12.0)
-        return Found(judged_hidden(team.notes, team.robots, team.now_s))
+        return ScenarioResult(hidden_landmarks_checks(team.run_log, team.robots, team.now_s))
 
 
-def judged_hidden(notes: Notes, robots: Sequence[str], until_s: float) -> list[Check]:
+def hidden_landmarks_checks(log: RunLog, robots: Sequence[str], until_s: float) -> list[Check]:
     """The team lives on what it knew, says how much that is, and is well when it sees again."""
     dark_s, light_s = EVENT_S, EVENT_S + HIDDEN_S
-    back = [found_after_s(notes, name, light_s, FOUND_M) for name in robots]
+    back = [localized_after_s(log, name, light_s, FOUND_M) for name in robots]
     return [
-        *they_go_on(notes, robots, dark_s, light_s, most_m=0.5, who="team's"),
-        Check(
-            what="inside 3 σ while landmarks are hidden",
-            seen=inside(notes, robots, dark_s, light_s),
-            unit="%",
-            at_least=0.9,
+        *checks_unaffected(log, robots, dark_s, light_s, most_m=0.5, who="team's"),
+        at_least(
+            "inside 3 σ while landmarks are hidden",
+            inside_3_sigma(log, robots, dark_s, light_s),
+            0.9,
+            "%",
         ),
-        Check(what="all were localized after", seen=worst(back), unit="s", at_most=8.0),
-        *all_is_well(notes, robots, light_s + 3.0, until_s),
+        at_most("all were localized after", maximum(back), 8.0, "s"),
+        *checks_recovered(log, robots, light_s + 3.0, until_s),
     ]
 
 
 # Clocks -------------------------------------------------------------------------------------------
 
 
-def clock_half_second(setting: Setting) -> Found:
+def clock_half_second(setting: ScenarioOptions) -> ScenarioResult:
     """The best observer's clock is 0.5 s ahead, another's 0.05 s."""
     return _clocks({"observer": 0.5, "patrol": TOLERATED_S}, setting)
 
 
-def clock_hour(setting: Setting) -> Found:
+def clock_hour(setting: ScenarioOptions) -> ScenarioResult:
     """The best observer's clock is an hour ahead, another's 0.05 s."""
     return _clocks({"observer": 3600.0, "patrol": TOLERATED_S}, setting)
 
 
-def _clocks(ahead_s: dict[str, float], setting: Setting) -> Found:
-    plan = Plan(with_clocks(demo_team(), ahead_s), setting.seed)
-    with running(plan) as team:
-        setting.say(f"clocks are ahead: {ahead_s} s")
+def _clocks(ahead_s: dict[str, float], setting: ScenarioOptions) -> ScenarioResult:
+    plan = RunPlan(with_clocks(demo_team(), ahead_s), setting.seed)
+    with run_team_under_test(plan) as team:
+        setting.report_progress(f"clocks are ahead: {ahead_s} s")
         team.settle(within_m=1.5)
         from_s = team.now_s
         team.run_for(CLOCK_S)
         wrong, right = list(ahead_s)
         others = team.others(wrong)
-        checks = judged_clocks(team.notes, wrong, right, others, from_s, team.now_s)
-        late = [heard_late_s(team.notes, name, wrong) for name in others]
+        checks = clock_checks(team.run_log, wrong, right, others, from_s, team.now_s)
+        late = [reported_delay_s(team.run_log, name, wrong) for name in others]
         said = ", ".join(f"{-s:.2f} s" for s in late if s is not None)
-        return Found(checks, (f"the other robots estimate that its clock is ahead by {said}",))
+        return ScenarioResult(
+            checks, (f"the other robots estimate that its clock is ahead by {said}",)
+        )
 
 
-def judged_clocks(
-    notes: Notes, wrong: str, right: str, others: Sequence[str], from_s: float, until_s: float
+def clock_checks(
+    log: RunLog, wrong: str, right: str, others: Sequence[str], from_s: float, until_s: float
 ) -> list[Check]:
     """Help by a clock that is off is refused with that reason, and said; by one that is hardly
     off it is used; everybody goes on."""
-    found = [distrusted_after_s(notes, name, wrong, "clock") for name in others]
+    found = [distrust_reported_at_s(log, name, wrong, "clock") for name in others]
     known = [s for s in found if s is not None]
     refused = sum(
         n
         for name in others
-        for reason, n in all_counts(notes, name).items()
+        for reason, n in latest_counts(log, name).items()
         if reason in CLOCK_REASONS
     )
-    blamed = [right for name in others if distrusted(notes, name).get(right) == "clock"]
-    share = inside(notes, others, from_s, until_s)
-    own = rmse_m(notes, wrong, from_s, until_s)
+    blamed = [right for name in others if distrusted_peers(log, name).get(right) == "clock"]
+    share = inside_3_sigma(log, others, from_s, until_s)
+    own = position_rmse_m(log, wrong, from_s, until_s)
     return [
-        Check(what="robots that report that its clock is wrong", seen=len(known), at_least=1),
-        Check(
-            what="last of these reports at", seen=max(known, default=None), unit="s", at_most=15.0
-        ),
-        Check(what="refused help messages from it", seen=refused, at_least=20),
-        Check(
-            what=f"robots that report that {right}'s clock is wrong", seen=len(blamed), at_most=0
-        ),
-        *they_go_on(notes, others, from_s, until_s, most_m=1.0),
-        Check(what="others inside 3 σ", seen=share, unit="%", at_least=0.9),
-        Check(what="its own RMSE", seen=own, unit="m", at_most=FOUND_M),
+        at_least("robots that report that its clock is wrong", len(known), 1),
+        at_most("last of these reports at", max(known, default=None), 15.0, "s"),
+        at_least("refused help messages from it", refused, 20),
+        at_most(f"robots that report that {right}'s clock is wrong", len(blamed), 0),
+        *checks_unaffected(log, others, from_s, until_s, most_m=1.0),
+        at_least("others inside 3 σ", share, 0.9, "%"),
+        at_most("its own RMSE", own, FOUND_M, "m"),
     ]
 
 
 # A liar -------------------------------------------------------------------------------------------
 
 
-def liar(setting: Setting) -> Found:
+def faulty_robot(setting: ScenarioOptions) -> ScenarioResult:
     """One of three observers says everything 0.7 m away, for a while."""
     lie = f"{LIE}@{LIE_S[0]:g}-{LIE_S[1]:g}"
     crowd = liars.team(liars.Case(lie=LIE))
-    with running(Plan(crowd, setting.seed, faults={liars.LIAR: lie})) as team:
-        setting.say("starting a team")
+    with run_team_under_test(RunPlan(crowd, setting.seed, faults={liars.LIAR: lie})) as team:
+        setting.report_progress("starting a team")
         team.settle()
-        setting.say(f"{liars.LIAR} sends wrong positions from {LIE_S[0]:g} s to {LIE_S[1]:g} s")
-        team.until(lambda: team.now_s >= LIE_S[1] + 20.0, LIE_S[1] + 40.0)
-        return Found(judged_liar(team.notes, liars.LIAR, liars.DRIVERS, team.robots, *LIE_S))
+        setting.report_progress(
+            f"{liars.LIAR} sends wrong positions from {LIE_S[0]:g} s to {LIE_S[1]:g} s"
+        )
+        team.wait_until(lambda: team.now_s >= LIE_S[1] + 20.0, LIE_S[1] + 40.0)
+        return ScenarioResult(
+            faulty_robot_checks(team.run_log, liars.LIAR, liars.DRIVERS, team.robots, *LIE_S)
+        )
 
 
-def judged_liar(
-    notes: Notes,
+def faulty_robot_checks(
+    log: RunLog,
     liar: str,
     listeners: Sequence[str],
     robots: Sequence[str],
@@ -194,26 +191,23 @@ def judged_liar(
     until_s: float,
 ) -> list[Check]:
     """It is found by those that it lies to, does little harm, and is believed again later."""
-    found = [quarantined_s(notes, name, liar, from_s, until_s) for name in listeners]
+    found = [quarantine_reported_at_s(log, name, liar, from_s, until_s) for name in listeners]
     known = sorted(at_s - from_s for at_s in found if at_s is not None)
-    last = [distrusted(notes, name) for name in robots]
-    errors = [rmse_m(notes, name, from_s, until_s) for name in listeners]
+    last = [distrusted_peers(log, name) for name in robots]
+    errors = [position_rmse_m(log, name, from_s, until_s) for name in listeners]
     return [
-        Check(what="robots that quarantined it", seen=len(known), at_least=FINDERS),
-        Check(
-            what="quarantined by two robots after",
-            seen=known[FINDERS - 1] if len(known) >= FINDERS else None,
-            unit="s",
-            at_most=10.0,
+        at_least("robots that quarantined it", len(known), FINDERS),
+        at_most(
+            "quarantined by two robots after",
+            known[FINDERS - 1] if len(known) >= FINDERS else None,
+            10.0,
+            "s",
         ),
-        Check(what="worst RMSE during the fault", seen=worst(errors), unit="m", at_most=GOOD_M),
-        Check(
-            what="robots that still distrust it 20 s later",
-            seen=sum(liar in peers for peers in last),
-            at_least=0,
-            at_most=0,
+        at_most("worst RMSE during the fault", maximum(errors), GOOD_M, "m"),
+        equal_to(
+            "robots that still distrust it 20 s later", sum(liar in peers for peers in last), 0
         ),
-        *they_go_on(notes, robots, from_s, until_s),
+        *checks_unaffected(log, robots, from_s, until_s),
     ]
 
 

@@ -14,7 +14,7 @@ from typing import Any
 import msgspec
 from rich.console import RenderableType
 
-from cpcbl_launch.lab.experiments.runs import in_processes
+from cpcbl_launch.lab.experiments.runs import map_in_processes
 from cpcbl_launch.reporting.tables import number, percent, table
 from cpcbl_launch.run.logged_team import LoggedTeam
 from cpcbl_launch.simulation.in_process import evaluate_log
@@ -86,32 +86,32 @@ def cases() -> list[Case]:
     both = {**EVERYTHING, "direction": "both-ways"}
     return [
         none,
-        *(_limited("bytes_per_s", n, "B/s", {}) for n in (1, 2, 5, 10, 20, 50)),
-        *(_limited("messages_per_minute", n, "/min", RARE) for n in (2, 3, 4, 6, 8)),
-        *(_worth(least) for least in (0.4, 0.2, 0.1, 0.05, 0.02)),
-        *(_every(seconds) for seconds in (60, 30, 15, 8, 4, 2, 1, 0.5)),
+        *(_budget_case("bytes_per_s", n, "B/s", {}) for n in (1, 2, 5, 10, 20, 50)),
+        *(_budget_case("messages_per_minute", n, "/min", RARE) for n in (2, 3, 4, 6, 8)),
+        *(_least_value_case(least) for least in (0.4, 0.2, 0.1, 0.05, 0.02)),
+        *(_interval_case(seconds) for seconds in (60, 30, 15, 8, 4, 2, 1, 0.5)),
         Case(series="all, one way", setting="no limit", rules=dict(EVERYTHING)),
         Case(series="all, both ways", setting="no limit", rules=both),
     ]
 
 
-def _limited(key: str, allowed: float, unit: str, rules: Mapping[str, Any]) -> Case:
+def _budget_case(key: str, allowed: float, unit: str, rules: Mapping[str, Any]) -> Case:
     budget = {key: allowed, "urgent_share": 0.0 if unit == "/min" else 0.2}
     series = "bytes limited" if key == "bytes_per_s" else "messages limited"
     return Case(series=series, setting=f"{allowed:g} {unit}", rules=dict(rules), budget=budget)
 
 
-def _worth(least: float) -> Case:
+def _least_value_case(least: float) -> Case:
     rules = {"least_value": least, "least_use": 4.0 * least}
     return Case(series="value alone", setting=f"{least:g} nats", rules=rules)
 
 
-def _every(seconds: float) -> Case:
+def _interval_case(seconds: float) -> Case:
     rules = {**EVERYTHING, "fix_interval_s": seconds, "belief_rate_hz": 1.0 / seconds}
     return Case(series="fixed interval", setting=f"{seconds:g} s", rules=rules)
 
 
-def point(logged: LoggedTeam, case: Case) -> Point:
+def measure_point(logged: LoggedTeam, case: Case) -> Point:
     """The figures of one case. Raises InputError where there is no truth to score it by."""
     replace = msgspec.structs.replace
     robots = {}
@@ -145,10 +145,10 @@ def point(logged: LoggedTeam, case: Case) -> Point:
     )
 
 
-def curve(logged: LoggedTeam, jobs: int | None, done: Callable[[], None]) -> Curve:
+def measure_curve(logged: LoggedTeam, jobs: int | None, done: Callable[[], None]) -> Curve:
     """All points; `done` is called after each. The same log gives the same figures."""
     tasks = [(logged, case) for case in cases()]
-    points = tuple(in_processes(point, tasks, jobs or os.cpu_count() or 1, done))
+    points = tuple(map_in_processes(measure_point, tasks, jobs or os.cpu_count() or 1, done))
     return Curve(
         experiment="budget",
         version=version("cpcbl-team"),

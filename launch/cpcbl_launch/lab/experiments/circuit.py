@@ -12,7 +12,7 @@ LIMIT_S = 400.0  # five loops take 70 s
 ODOMETRY_ONLY = {"lost_position_sigma_m": 1e3, "lost_heading_sigma_deg": 1e5}  # it drives on
 
 
-def circuit(robots: Collection[str], beacons: bool = False) -> Team:
+def circuit_team(robots: Collection[str], beacons: bool = False) -> Team:
     """These robots among the four landmarks, with or without the four bearing-only beacons."""
     team = load_team(builtin_path("circuit"))
     marks = {n: m for n, m in team.map.landmarks.items() if beacons or m.gives == "both"}
@@ -23,7 +23,7 @@ def circuit(robots: Collection[str], beacons: bool = False) -> Team:
     )
 
 
-def with_keys(team: Team, robot: str, **tables: dict[str, object]) -> Team:
+def with_settings(team: Team, robot: str, **tables: dict[str, object]) -> Team:
     """The team with keys of some tables of one robot set: `sensor={"rate_hz": 5.0}`."""
     replace = msgspec.structs.replace
     old = team.robots[robot]
@@ -31,6 +31,6 @@ def with_keys(team: Team, robot: str, **tables: dict[str, object]) -> Team:
     return replace(team, robots={**team.robots, robot: replace(old, **new)})
 
 
-def loops(team: Team, driver: str, truth: Team | None = None) -> Case:
+def loop_case(team: Team, driver: str, truth: Team | None = None) -> Case:
     """Five loops of one driver."""
     return Case(team, (driver,), LIMIT_S, LOOPS, truth)

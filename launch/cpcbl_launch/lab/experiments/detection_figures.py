@@ -137,7 +137,7 @@ def team() -> Team:
     return load_team(builtin_path("eyes"))
 
 
-def outcome(count: int, seed: int, batches: Sequence[Batch]) -> Eyes:
+def summarize(count: int, seed: int, batches: Sequence[Batch]) -> Eyes:
     """The figures of all frames."""
     records = [record for batch in batches for record in batch.records]
     mistakes = tuple(mistake for batch in batches for mistake in batch.mistakes)

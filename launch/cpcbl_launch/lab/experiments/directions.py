@@ -18,7 +18,7 @@ from pathlib import Path
 import msgspec
 from rich.console import RenderableType
 
-from cpcbl_launch.lab.experiments.circuit import circuit, with_keys
+from cpcbl_launch.lab.experiments.circuit import circuit_team, with_settings
 from cpcbl_launch.lab.experiments.results import (
     Experiment,
     Outcome,
@@ -47,36 +47,36 @@ def cases(sizes: Sequence[int] = SIZES) -> Mapping[Key, Case]:
     """Teams of these sizes, alone and with every way of help."""
     every: dict[Key, Case] = {}
     for size in sizes:
-        team = crowd(size)
+        team = crowd_team(size)
         mobile = tuple(n for n, r in team.robots.items() if r.odometry.moves)
         every[size, "alone", "", 0.0] = Case(
             with_overrides(team, Overrides(collaboration="none")), mobile, DURATION_S
         )
         for (direction, fusion), offset in itertools.product(WAYS, OFFSETS_M):
             helping = with_overrides(team, Overrides(direction=direction, fusion=fusion))
-            truth = displaced(helping, offset)
+            truth = with_displaced_observers(helping, offset)
             every[size, direction, fusion, offset] = Case(helping, mobile, DURATION_S, 0, truth)
         if size == 2:
-            every |= _deaf(team, mobile)
+            every |= _deaf_cases(team, mobile)
     return every
 
 
-def _deaf(pair: Team, mobile: tuple[str, ...]) -> dict[Key, Case]:
+def _deaf_cases(pair: Team, mobile: tuple[str, ...]) -> dict[Key, Case]:
     """The robot that moves takes every fix, whatever its tier; nothing goes the other way."""
     (navigator,), (observer,) = mobile, (n for n in pair.robots if n not in mobile)
     every: dict[Key, Case] = {}
     for fusion, offset in itertools.product(("split-ci", "naive"), OFFSETS_M):
         team = with_overrides(pair, Overrides(direction="both-ways", fusion=fusion))
-        team = with_keys(team, navigator, sensor={"sees_robots": False})
-        team = with_keys(team, observer, collaboration={"passive": False})
-        truth = displaced(team, offset)
+        team = with_settings(team, navigator, sensor={"sees_robots": False})
+        team = with_settings(team, observer, collaboration={"passive": False})
+        truth = with_displaced_observers(team, offset)
         every[2, "deaf", fusion, offset] = Case(team, mobile, DURATION_S, 0, truth)
     return every
 
 
-def crowd(size: int) -> Team:
+def crowd_team(size: int) -> Team:
     """A team of so many robots: observers at their posts, the others along the rectangle."""
-    base = circuit(["navigator", "observer"])
+    base = circuit_team(["navigator", "observer"])
     posts = POSTS[: max(1, size // 5)]
     robots = {f"observer{i}": _observer(base, post) for i, post in enumerate(posts)}
     for i in range(size - len(posts)):
@@ -115,7 +115,7 @@ def _mobile(base: Team, share: float, blind: bool) -> RobotSettings:
     )
 
 
-def displaced(team: Team, offset_m: float) -> Team:
+def with_displaced_observers(team: Team, offset_m: float) -> Team:
     """The team as it is: observers stand so far from where they believe to stand, one another way
     than the next."""
     robots = dict(team.robots)
@@ -161,7 +161,7 @@ def outcome(results: Results) -> Outcome:
             }
         )
     sizes = dict.fromkeys(size for size, *_ in results)
-    teams = {str(size): Case(crowd(size), (), DURATION_S) for size in sizes}
+    teams = {str(size): Case(crowd_team(size), (), DURATION_S) for size in sizes}
     figures = {"duration_s": DURATION_S, "observer_sigma_m": CLAIMED_SIGMA_M, "rows": rows}
     return new_outcome("one-way-vs-both", results, teams, figures=figures)
 
@@ -203,7 +203,7 @@ def draw(result: Outcome, path: Path) -> None:
     draw_directions(result, path)
 
 
-def of_sizes(sizes: Sequence[int]) -> Experiment:
+def experiment_of_sizes(sizes: Sequence[int]) -> Experiment:
     """The experiment with teams of these sizes only. Raises InputError."""
     if not sizes or any(not 2 <= size <= 20 for size in sizes):
         raise InputError("--robots: team sizes from 2 to 20, such as 2,5")

@@ -15,22 +15,22 @@ from cpcbl_launch.lab.experiments.detection_figures import (
     WITHIN_M,
     Eyes,
     Figures,
-    outcome,
+    summarize,
 )
-from cpcbl_launch.lab.experiments.runs import in_processes
+from cpcbl_launch.lab.experiments.runs import map_in_processes
 from cpcbl_launch.reporting.tables import number, table
 
 CHUNK = 25
 
 
-def measured(count: int, seed: int, jobs: int, done: Callable[[], None]) -> Eyes:
+def measure(count: int, seed: int, jobs: int, done: Callable[[], None]) -> Eyes:
     """So many frames, `jobs` processes at a time; `done` is called after each `CHUNK` of them."""
-    from cpcbl_launch.lab.experiments.rendered_frames import frames  # needs OpenCV
+    from cpcbl_launch.lab.experiments.rendered_frames import evaluate_frames  # needs OpenCV
 
     starts = range(0, count, CHUNK)
     tasks = [(seed, start, min(CHUNK, count - start)) for start in starts]
-    batches = in_processes(frames, tasks, jobs, done)
-    return outcome(count, seed, batches)
+    batches = map_in_processes(evaluate_frames, tasks, jobs, done)
+    return summarize(count, seed, batches)
 
 
 def tables(result: Eyes) -> Iterable[RenderableType]:

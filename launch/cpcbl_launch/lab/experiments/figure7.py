@@ -11,7 +11,12 @@ from pathlib import Path
 
 from rich.console import RenderableType
 
-from cpcbl_launch.lab.experiments.circuit import ODOMETRY_ONLY, circuit, loops, with_keys
+from cpcbl_launch.lab.experiments.circuit import (
+    ODOMETRY_ONLY,
+    circuit_team,
+    loop_case,
+    with_settings,
+)
 from cpcbl_launch.lab.experiments.results import (
     Accuracy,
     Experiment,
@@ -33,7 +38,7 @@ CONFIGURATIONS = {
     "E": "active",
     "F": "both",
 }
-EXPLAINED = (
+LEGEND = (
     "position: mean ± σ, max; heading: mean; due: 98.9 % in 3 σ, NEES 2\n"
     "bump, rest, fail: bumps into landmarks, restarts, runs that failed"
 )
@@ -43,14 +48,14 @@ ABOUT = 0.2  # "about" is within so much of it
 def team_case(configuration: str, variant: str = "circular") -> Case:
     """One of the six configurations; `variant` is of those that are probabilistic."""
     helped = configuration in "DEF"
-    team = circuit(["navigator", "observer"] if helped else ["navigator"])
+    team = circuit_team(["navigator", "observer"] if helped else ["navigator"])
     kinds = CONFIGURATIONS[configuration] if helped else "none"
     variant = "weighted" if configuration == "B" else variant
     team = with_overrides(team, Overrides(variant=variant, collaboration=kinds))
     if configuration == "A":
         blind: dict[str, object] = {"sees_landmarks": False}
-        team = with_keys(team, "navigator", sensor=blind, localizer=dict(ODOMETRY_ONLY))
-    return loops(team, "navigator")
+        team = with_settings(team, "navigator", sensor=blind, localizer=dict(ODOMETRY_ONLY))
+    return loop_case(team, "navigator")
 
 
 def cases() -> Mapping[str, Case]:
@@ -89,7 +94,7 @@ def tables(result: Outcome, driver: str = "navigator") -> Iterable[RenderableTyp
         f"{driver}, {result.loops} loops, {result.seeds} runs each",
         {f"{c} {name}": result.figures[c] for c, name in CONFIGURATIONS.items()},
     )
-    yield EXPLAINED
+    yield LEGEND
     yield from pattern_lines(result)
 
 

@@ -50,10 +50,10 @@ CAMERAS: Mapping[str, CameraSettings] = {"navigator": NAVIGATOR, "observer": OBS
 def team_case(configuration: str) -> Case:
     """One of the six configurations. Odometry alone needs no camera."""
     case = figure7.team_case(configuration)
-    return case if configuration == "A" else case._replace(team=seeing(case.team))
+    return case if configuration == "A" else case._replace(team=with_cameras(case.team))
 
 
-def seeing(team: Team) -> Team:
+def with_cameras(team: Team) -> Team:
     """The team with cameras, and with what they know landmarks and robots by."""
     replace = msgspec.structs.replace
     marks = {

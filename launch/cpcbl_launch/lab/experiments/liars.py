@@ -18,7 +18,7 @@ import numpy as np
 from rich.console import RenderableType
 
 from cpcbl_launch.lab.experiments.results import Spread, spread
-from cpcbl_launch.lab.experiments.runs import in_processes
+from cpcbl_launch.lab.experiments.runs import map_in_processes
 from cpcbl_launch.lab.faulty_robot import Fault, FaultyBus
 from cpcbl_launch.reporting.metrics import position_errors
 from cpcbl_launch.reporting.tables import number, table
@@ -109,7 +109,7 @@ class Liars(msgspec.Struct, frozen=True, kw_only=True):
     seeds: int
     lie_s: tuple[float, float, float]
     """From, until, end of the run."""
-    team: Team
+    liars_team: Team
     rows: tuple[Row, ...]
     held: bool
     """Whether every kind's median ratio is within the target."""
@@ -184,7 +184,7 @@ class _Statuses:
                 self.found[key_] = first._replace(until_s=since_ns * 1e-9)
 
 
-def run(case: Case, seed: int) -> Run:
+def run_case(case: Case, seed: int) -> Run:
     """One run. The same case and seed give the same figures."""
     statuses, through = _Statuses(), {}
     if case.lie:
@@ -200,13 +200,13 @@ def run(case: Case, seed: int) -> Run:
     return Run(rmse_m, tuple(statuses.found.values()))
 
 
-def measured(
+def measure(
     seeds: int, jobs: int, done: Callable[[], None], chosen: Sequence[Case] | None = None
 ) -> Liars:
     """All cases (or these) with all seeds; `done` is called after each run."""
     wanted = cases() if chosen is None else list(chosen)
     tasks = [(case, seed) for case in wanted for seed in range(1, seeds + 1)]
-    runs = in_processes(run, tasks, jobs, done)
+    runs = map_in_processes(run_case, tasks, jobs, done)
     by_case = {case: runs[i * seeds : (i + 1) * seeds] for i, case in enumerate(wanted)}
     rows = tuple(
         _row(case, found, by_case.get(Case(lie="", liar=False, honest=case.honest)))
@@ -217,9 +217,9 @@ def measured(
         version=version("cpcbl-team"),
         seeds=seeds,
         lie_s=(FROM_S, UNTIL_S, END_S),
-        team=team(Case(lie="")),
+        liars_team=team(Case(lie="")),
         rows=rows,
-        held=not any(map(_missed, _judged(rows))),
+        held=not any(map(_exceeds_target, _rows_with_trust(rows))),
     )
 
 
@@ -284,7 +284,9 @@ def tables(result: Liars) -> Iterable[RenderableType]:
         "began; back: s after it ended. false: quarantine of honest ones, s a run"
     )
     missed = [
-        f"{r.case.lie} beside {r.case.honest} honest" for r in _judged(result.rows) if _missed(r)
+        f"{r.case.lie} beside {r.case.honest} honest"
+        for r in _rows_with_trust(result.rows)
+        if _exceeds_target(r)
     ]
     yield (
         f"held: no ratio is above {MOST_RATIO:g}"
@@ -293,11 +295,11 @@ def tables(result: Liars) -> Iterable[RenderableType]:
     )
 
 
-def _judged(rows: Iterable[Row]) -> list[Row]:
+def _rows_with_trust(rows: Iterable[Row]) -> list[Row]:
     return [row for row in rows if row.case.lie and row.case.trust]
 
 
-def _missed(row: Row) -> bool:
+def _exceeds_target(row: Row) -> bool:
     return row.ratio is None or row.ratio.median > MOST_RATIO
 
 

@@ -30,7 +30,7 @@ from cpcbl_team.inputs import Sighting
 COLUMNS = ("picture", "viewer", "id", "range_m", "bearing_deg", "heading_deg")
 
 
-class Truth(NamedTuple):
+class TruthLine(NamedTuple):
     """One line of the table."""
 
     picture: str
@@ -41,7 +41,7 @@ class Truth(NamedTuple):
     heading_deg: float | None
 
 
-class Compared(msgspec.Struct, frozen=True, kw_only=True):
+class LineResult(msgspec.Struct, frozen=True, kw_only=True):
     """A line beside what was seen; an error is None where there is no truth, or nothing seen."""
 
     picture: str
@@ -64,7 +64,7 @@ class RealPictures(msgspec.Struct, frozen=True, kw_only=True):
     set: str
     team: Team
     pictures: int
-    lines: tuple[Compared, ...]
+    lines: tuple[LineResult, ...]
     unexpected: tuple[tuple[str, str], ...]
     """Picture and id of what was seen and is not in the table."""
     doubted: tuple[tuple[str, str], ...]
@@ -73,7 +73,7 @@ class RealPictures(msgspec.Struct, frozen=True, kw_only=True):
     """Pictures that could not be used, with the reason."""
 
 
-def set_named(name: str) -> Path:
+def picture_set(name: str) -> Path:
     """The table of a built-in set, or one's own file; its team file is beside it. Raises
     InputError."""
     own = Path(name)
@@ -89,7 +89,7 @@ def _folder() -> Path:
     return Path(str(files("cpcbl_launch") / "picture_sets"))
 
 
-def truths(path: Path) -> list[Truth]:
+def read_truth_table(path: Path) -> list[TruthLine]:
     """The lines of a table. Raises InputError, naming file and line."""
     try:
         with path.open(newline="", encoding="utf-8") as file:
@@ -98,7 +98,7 @@ def truths(path: Path) -> list[Truth]:
         raise InputError(f"{path}: cannot be read: {error}") from error
 
 
-def _lines(path: Path, reader: "csv.DictReader[str]") -> list[Truth]:
+def _lines(path: Path, reader: "csv.DictReader[str]") -> list[TruthLine]:
     if tuple(reader.fieldnames or ()) != COLUMNS:
         raise InputError(f"{path}: line 1: the columns are {','.join(COLUMNS)}")
     lines = []
@@ -107,30 +107,30 @@ def _lines(path: Path, reader: "csv.DictReader[str]") -> list[Truth]:
             numbers = [float(row[c]) if row[c] else None for c in COLUMNS[3:]]
         except (TypeError, ValueError) as error:
             raise InputError(f"{path}: line {reader.line_num}: {error}") from error
-        lines.append(Truth(row["picture"], row["viewer"], row["id"], *numbers))
+        lines.append(TruthLine(row["picture"], row["viewer"], row["id"], *numbers))
     return lines
 
 
-def measured(name: str, folder: Path) -> RealPictures:
+def measure(name: str, folder: Path) -> RealPictures:
     """Everything in the set's pictures. Raises InputError for what the user can mend."""
-    path = set_named(name)
-    team, lines = load_team(path.with_suffix(".toml")), truths(path)
+    path = picture_set(name)
+    team, lines = load_team(path.with_suffix(".toml")), read_truth_table(path)
     viewers = {line.viewer for line in lines}
     for viewer in sorted(viewers - team.robots.keys()):
         raise InputError(f"{path}: no robot {viewer} in {path.with_suffix('.toml')}")
     eyes = {viewer: CameraEyes(viewer, team) for viewer in viewers}
-    compared: list[Compared] = []
+    compared: list[LineResult] = []
     unexpected: list[tuple[str, str]] = []
     doubted: list[tuple[str, str]] = []
     refused: dict[str, str] = {}
     for picture in dict.fromkeys(line.picture for line in lines):
         due = [line for line in lines if line.picture == picture]
-        glimpses = _seen(eyes[due[0].viewer], folder / picture)
+        glimpses = _detect(eyes[due[0].viewer], folder / picture)
         if isinstance(glimpses, str):
             refused[picture] = glimpses
             continue
         seen = {found.sighting.id: found.sighting for found in glimpses.found}
-        compared += [_compared(line, seen.get(line.id)) for line in due if line.id]
+        compared += [_line_result(line, seen.get(line.id)) for line in due if line.id]
         unexpected += [(picture, one) for one in sorted(seen.keys() - {line.id for line in due})]
         doubted += [(picture, doubt.reason) for doubt in glimpses.doubts]
     return RealPictures(
@@ -146,7 +146,7 @@ def measured(name: str, folder: Path) -> RealPictures:
     )
 
 
-def _seen(eyes: CameraEyes, path: Path) -> Glimpses | str:
+def _detect(eyes: CameraEyes, path: Path) -> Glimpses | str:
     try:
         image = path.read_bytes()
     except OSError as error:
@@ -155,27 +155,27 @@ def _seen(eyes: CameraEyes, path: Path) -> Glimpses | str:
     return pixels if isinstance(pixels, str) else eyes.glimpses(pixels)
 
 
-def _compared(line: Truth, seen: Sighting | None) -> Compared:
+def _line_result(line: TruthLine, seen: Sighting | None) -> LineResult:
     if seen is None:
-        return Compared(picture=line.picture, id=line.id, found=False)
+        return LineResult(picture=line.picture, id=line.id, found=False)
     off = None
     if line.range_m is not None and seen.range_m is not None:
         off = seen.range_m - line.range_m
-    return Compared(
+    return LineResult(
         picture=line.picture,
         id=line.id,
         found=True,
         range_m=seen.range_m,
         range_error_m=off,
         range_sigma_m=seen.range_sigma_m,
-        bearing_error_deg=_turned(seen.bearing_rad, line.bearing_deg),
+        bearing_error_deg=_angle_error_deg(seen.bearing_rad, line.bearing_deg),
         bearing_sigma_deg=_degrees(seen.bearing_sigma_rad),
-        heading_error_deg=_turned(seen.heading_rad, line.heading_deg),
+        heading_error_deg=_angle_error_deg(seen.heading_rad, line.heading_deg),
         heading_sigma_deg=_degrees(seen.heading_sigma_rad),
     )
 
 
-def _turned(seen_rad: float | None, true_deg: float | None) -> float | None:
+def _angle_error_deg(seen_rad: float | None, true_deg: float | None) -> float | None:
     if seen_rad is None or true_deg is None:
         return None
     return math.degrees(wrap_angle(seen_rad - math.radians(true_deg)))
@@ -210,7 +210,7 @@ def tables(result: RealPictures) -> Iterable[RenderableType]:
         yield f"refused: {_listed(tuple(result.refused.items()))}"
 
 
-def _inside(lines: Sequence[Compared]) -> Iterator[str]:
+def _inside(lines: Sequence[LineResult]) -> Iterator[str]:
     """Of how many errors that are known how many are within three stated sigmas."""
     for what, pairs in {
         "range": [(c.range_error_m, c.range_sigma_m) for c in lines],

@@ -51,7 +51,7 @@ WRONG_RANGE = 0.2
 QUALITY = 90  # of the JPEG that carries the frame
 
 
-class Drawn(NamedTuple):
+class RandomFrame(NamedTuple):
     """What is random about a frame."""
 
     viewer: str
@@ -63,7 +63,7 @@ class Drawn(NamedTuple):
     """As it is, not as the viewer believes."""
 
 
-class Thing(NamedTuple):
+class NamedObject(NamedTuple):
     """Something that has a name, in the viewer's frame."""
 
     name: str
@@ -77,7 +77,7 @@ class Thing(NamedTuple):
     half_width_rad: float
 
 
-def frames(seed: int, first: int, count: int) -> Batch:
+def evaluate_frames(seed: int, first: int, count: int) -> Batch:
     """These frames. The same seed and numbers give the same figures."""
     cv2.setNumThreads(1)
     batch = Batch([], [], {}, {}, 0.0, 0.0)
@@ -87,8 +87,8 @@ def frames(seed: int, first: int, count: int) -> Batch:
     for number in range(first, first + count):
         random = np.random.default_rng((seed, number))
         began_s = time.perf_counter()
-        frame = drawn(random)
-        pixels = picture(frame, random)
+        frame = random_frame(random)
+        pixels = render_image(frame, random)
         rendered_s = time.perf_counter()
         glimpses = _eyes(frame.viewer).glimpses(pixels)
         see_s += time.perf_counter() - rendered_s
@@ -98,7 +98,7 @@ def frames(seed: int, first: int, count: int) -> Batch:
             continue
         doubts.update(doubt.reason for doubt in glimpses.doubts)
         seen = [found.sighting for found in glimpses.found]
-        records, mistakes = judged(number, seen, things(frame))
+        records, mistakes = compare_with_truth(number, seen, named_objects(frame))
         batch.records.extend(records)
         batch.mistakes.extend(mistakes)
     return batch._replace(
@@ -119,7 +119,7 @@ def _eyes(viewer: str) -> CameraEyes:
 # What is random ----------------------------------------------------------------------------------
 
 
-def drawn(random: np.random.Generator) -> Drawn:
+def random_frame(random: np.random.Generator) -> RandomFrame:
     """A viewer, where everything stands, and the light."""
     names = list(team().robots)
     viewers = team().cameras
@@ -127,20 +127,20 @@ def drawn(random: np.random.Generator) -> Drawn:
     scene = _scene().with_clutter(int(random.integers(MOST_CLUTTER + 1)), random)
     posts = [*scene.landmarks.values(), *scene.clutter]
     taken = [(post.x_m, post.y_m) for post in posts]
-    pose = _free(random, taken, None)
+    pose = _free_pose(random, taken, None)
     taken.append((pose.x, pose.y))
     robots = []
     for name in names:
         if name != viewer:
             near = pose if random.random() < 0.7 else None
-            other = _free(random, taken, near)
+            other = _free_pose(random, taken, near)
             taken.append((other.x, other.y))
             robots.append(Standing(name, *other))
     camera = shaken(off_focus(team().robots[viewer].camera, 1.0, random), 1.0, random)
-    return Drawn(viewer, pose, tuple(robots), scene, _light(random), camera)
+    return RandomFrame(viewer, pose, tuple(robots), scene, _random_light(random), camera)
 
 
-def _free(
+def _free_pose(
     random: np.random.Generator, taken: Sequence[tuple[float, float]], near: Pose2 | None
 ) -> Pose2:
     """A place on the field with nothing else on it; or one that a viewer at `near` looks at."""
@@ -156,7 +156,7 @@ def _free(
             return Pose2(float(x), float(y), heading)
 
 
-def _light(random: np.random.Generator) -> Light:
+def _random_light(random: np.random.Generator) -> Light:
     """From dim to bright, warm to cold, sharp to blurred."""
     uniform = random.uniform
     blue, green, red = (float(t) for t in uniform(0.88, 1.12, 3))
@@ -169,7 +169,7 @@ def _light(random: np.random.Generator) -> Light:
     )
 
 
-def picture(frame: Drawn, random: np.random.Generator) -> Pixels:
+def render_image(frame: RandomFrame, random: np.random.Generator) -> Pixels:
     """The frame as the robot gets it: through a JPEG."""
     made = render(frame.scene, Camera(frame.camera), frame.pose, frame.robots, frame.light, random)
     _, coded = cv2.imencode(".jpg", made, (cv2.IMWRITE_JPEG_QUALITY, QUALITY))
@@ -181,7 +181,7 @@ def picture(frame: Drawn, random: np.random.Generator) -> Pixels:
 # What there is to see ----------------------------------------------------------------------------
 
 
-def things(frame: Drawn) -> dict[str, Thing]:
+def named_objects(frame: RandomFrame) -> dict[str, NamedObject]:
     """Everything with a name."""
     camera, robot_from_field = Camera(frame.camera), frame.pose.inverse()
     half_m = team().vision.marker_distance_m
@@ -202,14 +202,16 @@ Due = Mapping[Kind, float]  # how much of each kind of feature is to be seen
 Before = tuple[Sequence[Solid], Sequence[Solid]]  # what certainly hides no more; no less
 
 
-def _solids(frame: Drawn, robot_from_field: Pose2, body_m: float) -> dict[str, tuple[Solid, ...]]:
+def _solids(
+    frame: RandomFrame, robot_from_field: Pose2, body_m: float
+) -> dict[str, tuple[Solid, ...]]:
     """What hides other things, by name; the bodies of robots with this radius."""
     solids: dict[str, tuple[Solid, ...]] = {}
     clutter = {
         f"\n{i}": post for i, post in enumerate(frame.scene.clutter)
     }  # no name has a newline
     for name, post in {**frame.scene.landmarks, **clutter}.items():
-        solids[name] = (_standing(post, *robot_from_field.transform(post.x_m, post.y_m)),)
+        solids[name] = (_cylinder_solid(post, *robot_from_field.transform(post.x_m, post.y_m)),)
     vision = team().vision
     for robot in frame.robots:
         x, y = robot_from_field.transform(robot.x_m, robot.y_m)
@@ -220,7 +222,7 @@ def _solids(frame: Drawn, robot_from_field: Pose2, body_m: float) -> dict[str, t
     return solids
 
 
-def _standing(post: Post, x: float, y: float) -> Solid:
+def _cylinder_solid(post: Post, x: float, y: float) -> Solid:
     return Solid(x, y, post.radius_m, post.bands[0].from_m, post.bands[-1].to_m)
 
 
@@ -232,14 +234,14 @@ def _others(solids: Mapping[str, Sequence[Solid]], but: str) -> list[Solid]:
     return [solid for name, some in solids.items() if name != but for solid in some]
 
 
-def _landmark(name: str, solid: Solid, camera: Camera, before: Before) -> Thing:
+def _landmark(name: str, solid: Solid, camera: Camera, before: Before) -> NamedObject:
     points = cylinder_points(solid, camera.position)
     whole, some = shares_shown(points, camera, before)
     due: Due = {"landmark": whole}
-    return _thing(name, Pose2(solid.x, solid.y, 0.0), due, some, solid.radius)
+    return _named_object(name, Pose2(solid.x, solid.y, 0.0), due, some, solid.radius)
 
 
-def _teammate(name: str, seen: Pose2, camera: Camera, before: Before) -> Thing:
+def _teammate(name: str, seen: Pose2, camera: Camera, before: Before) -> NamedObject:
     robot, vision = team().robots[name], team().vision
     marker = mast = some = 0.0
     for side in robot.markers:
@@ -255,7 +257,7 @@ def _teammate(name: str, seen: Pose2, camera: Camera, before: Before) -> Thing:
         mast, part = shares_shown(points, camera, before)
         some = max(some, part)
     half_m = math.sqrt(2.0) * vision.marker_distance_m
-    return _thing(name, seen, {"marker": marker, "mast": mast}, some, half_m)
+    return _named_object(name, seen, {"marker": marker, "mast": mast}, some, half_m)
 
 
 def _marker(side: Side, seen: Pose2, camera: Camera) -> tuple[Floats, float]:
@@ -269,9 +271,9 @@ def _marker(side: Side, seen: Pose2, camera: Camera) -> tuple[Floats, float]:
     return points, abs(wrap_angle(to_lens - facing))
 
 
-def _thing(name: str, seen: Pose2, shown: Due, some: float, half_m: float) -> Thing:
+def _named_object(name: str, seen: Pose2, shown: Due, some: float, half_m: float) -> NamedObject:
     range_m = math.hypot(seen.x, seen.y)
-    return Thing(
+    return NamedObject(
         name=name,
         range_m=range_m,
         bearing_rad=math.atan2(seen.y, seen.x),
@@ -285,14 +287,14 @@ def _thing(name: str, seen: Pose2, shown: Due, some: float, half_m: float) -> Th
 # What was made of it -----------------------------------------------------------------------------
 
 
-def judged(
-    number: int, seen: Sequence[Sighting], there: Mapping[str, Thing]
+def compare_with_truth(
+    number: int, seen: Sequence[Sighting], there: Mapping[str, NamedObject]
 ) -> tuple[list[Record], list[Mistake]]:
     """Sightings beside what there was to see."""
     records, mistakes, right = [], [], set()
     for sighting in seen:
         thing = there.get(sighting.id)
-        why = _why_wrong(sighting, thing)
+        why = _mistake_reason(sighting, thing)
         if why is None:
             assert thing is not None
             right.add(thing.name)
@@ -316,13 +318,13 @@ def judged(
     return records, mistakes
 
 
-def _missed(there: Mapping[str, Thing], right: set[str]) -> Iterator[Record]:
+def _missed(there: Mapping[str, NamedObject], right: set[str]) -> Iterator[Record]:
     for name, thing in there.items():
         if thing.due and name not in right:
             yield Record(thing.due, None, thing.range_m)
 
 
-def _why_wrong(sighting: Sighting, thing: Thing | None) -> Wrong | None:
+def _mistake_reason(sighting: Sighting, thing: NamedObject | None) -> Wrong | None:
     if thing is None or not thing.some or sighting.bearing_rad is None:
         return "wrong id"
     off = abs(wrap_angle(sighting.bearing_rad - thing.bearing_rad))
@@ -338,7 +340,7 @@ def _seen_by(sighting: Sighting) -> Kind:
     return "mast" if sighting.heading_rad is None else "marker"
 
 
-def _record(sighting: Sighting, thing: Thing) -> Record:
+def _record(sighting: Sighting, thing: NamedObject) -> Record:
     assert sighting.bearing_rad is not None
     heading = None
     if sighting.heading_rad is not None:

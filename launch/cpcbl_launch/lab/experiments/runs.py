@@ -79,9 +79,9 @@ class LoopReferee:
         self._odometry = settings.odometry
         self._to_reach = case.loops * len(settings.waypoints_m) if case.loops else math.inf
         self._pose = Pose2(start.x_m, start.y_m, math.radians(start.heading_deg))
-        self.reckoned: list[tuple[float, float, float, float]] = [(0.0, *self._pose)]
+        self.odometry_track: list[tuple[float, float, float, float]] = [(0.0, *self._pose)]
         self.reached_s: list[float] = []
-        self.bumped = self.through = False
+        self.bumped = self.finished = False
 
     def attach(self, bus: Bus) -> None:
         bus.subscribe(topics.DRIVE.at(robot=self._robot), self._arrived)
@@ -91,22 +91,22 @@ class LoopReferee:
 
     @property
     def over(self) -> bool:
-        return self.bumped or self.through
+        return self.bumped or self.finished
 
     def _arrived(self, key: str, payload: bytes) -> None:
         match decode_tagged(payload):
             case Drive(stamp_ns=stamp_ns, reached=reached) if reached > len(self.reached_s):
                 self.reached_s.append(stamp_ns * 1e-9)
-                self.through = reached >= self._to_reach
+                self.finished = reached >= self._to_reach
             case Odometry() as piece:
                 done = corrected_odometry(piece, self._odometry)
                 self._pose = step(self._pose, done.distance_m, done.turn_rad)
-                self.reckoned.append((done.stamp_ns * 1e-9, *self._pose))
+                self.odometry_track.append((done.stamp_ns * 1e-9, *self._pose))
             case Truths(robots=robots):
                 self.bumped = any(t.bumps for t in robots if t.robot == self._robot)
 
 
-def run(case: Case, seed: int) -> Run:
+def run_case(case: Case, seed: int) -> Run:
     """One run: the first attempt without a bump. The same case and seed give the same figures."""
     for restarts in range(MOST_RESTARTS + 1):
         referee = LoopReferee(case)
@@ -122,11 +122,11 @@ def _figures(case: Case, recorder: Recorder, referee: LoopReferee, restarts: int
     samples = {name: recorder.samples(name, truth[name]) for name in case.scored}
     reached_s = np.array(referee.reached_s)
     driver_s, driven = recorder.timed_samples(driver, truth[driver])
-    reckoned, _ = interpolated_truth(reached_s, np.array(referee.reckoned))
+    reckoned, _ = interpolated_truth(reached_s, np.array(referee.odometry_track))
     true, _ = interpolated_truth(reached_s, truth[driver])
     sent = [s.bytes_sent / (s.stamp_ns * 1e-9) for s in recorder.status.values()]
     return Run(
-        finished=referee.through or (not case.loops and not referee.bumped),
+        finished=referee.finished or (not case.loops and not referee.bumped),
         bumps=restarts + referee.bumped,
         restarts=restarts,
         robots={name: Errors(_errors(s), position_nees(s)) for name, s in samples.items()},
@@ -141,16 +141,16 @@ def _errors(samples: Samples) -> Floats:
     return np.column_stack([offset, heading_errors(samples)])
 
 
-def run_all(
+def run_cases(
     cases: Mapping[Key, Case], seeds: Sequence[int], jobs: int, done: Callable[[], None]
 ) -> dict[Key, list[Run]]:
     """All cases with all seeds; `done` is called after each run."""
     tasks = [(case, seed) for case in cases.values() for seed in seeds]
-    runs = in_processes(run, tasks, jobs, done)
+    runs = map_in_processes(run_case, tasks, jobs, done)
     return {key: runs[i * len(seeds) : (i + 1) * len(seeds)] for i, key in enumerate(cases)}
 
 
-def in_processes(
+def map_in_processes(
     function: Callable[..., Result],
     tasks: Sequence[tuple[Any, ...]],
     jobs: int,

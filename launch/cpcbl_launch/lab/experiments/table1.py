@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from rich.console import RenderableType
 
-from cpcbl_launch.lab.experiments.circuit import circuit, loops, with_keys
+from cpcbl_launch.lab.experiments.circuit import circuit_team, loop_case, with_settings
 from cpcbl_launch.lab.experiments.results import (
     Experiment,
     Outcome,
@@ -54,11 +54,11 @@ def cases() -> Mapping[Key, Case]:
 
 
 def _case(configuration: str, localizer: Mapping[str, object]) -> Case:
-    team = circuit(["runner"], beacons=configuration == "C")
+    team = circuit_team(["runner"], beacons=configuration == "C")
     keys = {**localizer, "bearing_for_position": configuration != "A"}
-    team = with_keys(team, "runner", localizer=keys)
-    truth = with_keys(team, "runner", odometry={"turn_scale": WHEELS_TURN_SCALE})
-    return loops(team, "runner", truth)
+    team = with_settings(team, "runner", localizer=keys)
+    truth = with_settings(team, "runner", odometry={"turn_scale": WHEELS_TURN_SCALE})
+    return loop_case(team, "runner", truth)
 
 
 def quantities(errors: Floats) -> tuple[float, ...]:

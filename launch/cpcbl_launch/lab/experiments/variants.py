@@ -9,7 +9,7 @@ from pathlib import Path
 
 from rich.console import RenderableType
 
-from cpcbl_launch.lab.experiments.figure7 import EXPLAINED, accuracy_table, team_case
+from cpcbl_launch.lab.experiments.figure7 import LEGEND, accuracy_table, team_case
 from cpcbl_launch.lab.experiments.results import (
     Experiment,
     Outcome,
@@ -40,7 +40,7 @@ def tables(result: Outcome) -> Iterable[RenderableType]:
     yield accuracy_table(
         f"navigator, {result.loops} loops, {result.seeds} runs each", result.figures
     )
-    yield EXPLAINED
+    yield LEGEND
 
 
 def draw(result: Outcome, path: Path) -> None:

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 import msgspec
 
 from cpcbl_agents.node import Steppable
-from cpcbl_launch.lab.scaling.swarm import MOST_ROBOTS, swarm
+from cpcbl_launch.lab.scaling.swarm import MOST_ROBOTS, swarm_team
 from cpcbl_launch.options import check_duration
 from cpcbl_launch.reporting.recorder import Recorder
 from cpcbl_launch.simulation.field import SimulatedField
@@ -31,7 +31,7 @@ DURATION_S = 5.0
 LEAST_S = 2.0  # a robot tells once a second what it has sent
 
 
-class Size(msgspec.Struct, frozen=True, kw_only=True):
+class TeamSizeFigures(msgspec.Struct, frozen=True, kw_only=True):
     """A team's figures, means over its robots; seconds are robot time, bytes those
     on the sender's link with Zenoh's own."""
 
@@ -53,15 +53,15 @@ class Size(msgspec.Struct, frozen=True, kw_only=True):
     inside_3_sigma: float | None
 
 
-class Scale(msgspec.Struct, frozen=True, kw_only=True):
+class ScalingReport(msgspec.Struct, frozen=True, kw_only=True):
     """What `simulate --robots` writes."""
 
     duration_s: float
     seed: int
-    sizes: tuple[Size, ...]
+    sizes: tuple[TeamSizeFigures, ...]
 
 
-def parsed_sizes(text: str) -> list[int]:
+def parse_sizes(text: str) -> list[int]:
     """The sizes in `2,10,50`. Raises InputError."""
     sizes = [int(part) if part.strip().isdecimal() else 0 for part in text.split(",")]
     if not all(2 <= size <= MOST_ROBOTS for size in sizes):
@@ -69,40 +69,40 @@ def parsed_sizes(text: str) -> list[int]:
     return sizes
 
 
-def measured(
+def measure_sizes(
     sizes: Sequence[int],
     seed: int = 1,
     duration_s: float = DURATION_S,
     progress: Progress | None = None,
-) -> Scale:
+) -> ScalingReport:
     """Generated teams of these sizes, one after the other.
 
     Raises InputError for a duration that is too short to measure anything.
     """
     check_duration(duration_s, LEAST_S)
-    figures: list[Size] = []
+    figures: list[TeamSizeFigures] = []
     for i, size in enumerate(sizes):
-        part = _part(progress, sum(sizes[:i]), size, sum(sizes))
-        figures.append(measured_team(swarm(size, seed), seed, duration_s, part))
-    return Scale(duration_s=duration_s, seed=seed, sizes=tuple(figures))
+        part = _partial_progress(progress, sum(sizes[:i]), size, sum(sizes))
+        figures.append(measure_team(swarm_team(size, seed), seed, duration_s, part))
+    return ScalingReport(duration_s=duration_s, seed=seed, sizes=tuple(figures))
 
 
-def _part(progress: Progress | None, before: int, size: int, total: int) -> Progress:
+def _partial_progress(progress: Progress | None, before: int, size: int, total: int) -> Progress:
     """Shows the progress of one team as a part of all."""
     show = progress or (lambda done: None)
     return lambda done: show((before + done * size) / total)
 
 
-def measured_team(
+def measure_team(
     team: Team, seed: int, duration_s: float, progress: Progress | None = None
-) -> Size:
+) -> TeamSizeFigures:
     """A simulated team in one process over the bus in memory."""
     hub, count = MemoryHub(), len(team.robots)
-    recorder, sight = Recorder(hub.session()), Sight(hub.session(), team)
-    field = Timed(FieldNode(SimulatedField(team, seed, 0), hub.session()))
-    robots = [Timed(node) for node in robot_nodes(team, hub, 0)]
+    recorder, sight = Recorder(hub.session()), TeammateCounter(hub.session(), team)
+    field = TimedNode(FieldNode(SimulatedField(team, seed, 0), hub.session()))
+    robots = [TimedNode(node) for node in robot_nodes(team, hub, 0)]
     began_s = time.monotonic()
-    with no_collector():
+    with garbage_collector_disabled():
         run_nodes([field, *robots], 0, int(duration_s * 1e9), progress)
     took_s = time.monotonic() - began_s
     score = simulated_report(recorder, team).team
@@ -111,7 +111,7 @@ def measured_team(
     def rate(name: str) -> float:
         return sum(_per_s(status, name) for status in recorder.status.values()) / count
 
-    return Size(
+    return TeamSizeFigures(
         robots=count,
         in_sight=sight.mean,
         messages_sent_per_s=rate("messages_sent"),
@@ -131,7 +131,7 @@ def _per_s(status: Status, name: str) -> float:
 
 
 @contextmanager
-def no_collector() -> Iterator[None]:
+def garbage_collector_disabled() -> Iterator[None]:
     """Python's cycle collector looks through the robots of the whole process, which would grow with
     the team; a robot of its own has only itself. Robots leave no cycles behind."""
     gc.disable()
@@ -141,7 +141,7 @@ def no_collector() -> Iterator[None]:
         gc.enable()
 
 
-class Timed:
+class TimedNode:
     """A node, and the CPU time that its steps took."""
 
     def __init__(self, node: Steppable) -> None:
@@ -162,7 +162,7 @@ class Timed:
         self.cpu_s += time.process_time() - began_s
 
 
-class Sight:
+class TeammateCounter:
     """Counts the teammates in the robots' frames."""
 
     def __init__(self, bus: Bus, team: Team) -> None:

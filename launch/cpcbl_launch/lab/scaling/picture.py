@@ -4,14 +4,14 @@ from pathlib import Path
 
 import matplotlib as mpl
 
-from cpcbl_launch.lab.scaling.measure import Scale
+from cpcbl_launch.lab.scaling.measure import ScalingReport
 
 mpl.use("Agg")
 
 from matplotlib import pyplot as plt
 
 
-def draw_scale(scale: Scale, path: Path) -> None:
+def draw_scaling(scale: ScalingReport, path: Path) -> None:
     """Two panels: bytes a second that a robot sends and receives; CPU of its steps."""
     figure, (traffic, cpu) = plt.subplots(1, 2, figsize=(10, 4), layout="constrained")
     sizes = [s.robots for s in scale.sizes]

@@ -2,7 +2,7 @@
 
 from rich.console import Console
 
-from cpcbl_launch.lab.scaling.measure import Scale
+from cpcbl_launch.lab.scaling.measure import ScalingReport
 from cpcbl_launch.reporting.tables import number, percent, table
 
 _EXPLAINED = (
@@ -11,7 +11,7 @@ _EXPLAINED = (
 )
 
 
-def print_scale(scale: Scale, console: Console) -> None:
+def print_scaling(scale: ScalingReport, console: Console) -> None:
     """A row for each size."""
     shown = table(
         f"generated teams in one process, {scale.duration_s:g} s of robot time, seed {scale.seed}",

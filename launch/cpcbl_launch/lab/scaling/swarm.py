@@ -35,7 +35,7 @@ SCOUT = replace(NAVIGATOR, sees_landmarks=False)
 SENSORS = (OBSERVER, SCOUT, NAVIGATOR, SCOUT, NAVIGATOR)
 
 
-def swarm(size: int, seed: int) -> Team:
+def swarm_team(size: int, seed: int) -> Team:
     """A team of so many robots; the seed shuffles who lives where, and which way each one goes."""
     random = Random(f"{seed} {size}")
     columns = math.ceil(math.sqrt(size))
