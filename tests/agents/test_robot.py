@@ -1,4 +1,4 @@
-"""One robot without bus and clock: late inputs, blindness, delays, frames, driving."""
+"""One robot without bus and clock: late inputs, blind sensors, delays, frames."""
 
 import math
 from collections.abc import Sequence
@@ -7,17 +7,10 @@ import pytest
 from msgspec.structs import replace
 from support.buses import MS, SECOND, robot_at, saw, team_of, with_robot
 
-from cpcbl_agents.agent import PoseEstimate, Presence, Tick
+from cpcbl_agents.agent import Presence, Tick
 from cpcbl_agents.composition import build_robot
 from cpcbl_agents.filtering import ODOMETRY_WAIT_NS
 from cpcbl_agents.robot import Robot
-from cpcbl_agents.waypoint_follower import (
-    COMMAND_NS,
-    MOST_TURN_RAD_S,
-    REACHED_M,
-    WaypointFollower,
-    pursue,
-)
 from cpcbl_team.collaboration import LOWEST_TIER
 from cpcbl_team.config import (
     CollaborationSettings,
@@ -28,13 +21,13 @@ from cpcbl_team.config import (
     SensorSettings,
     Team,
 )
-from cpcbl_team.estimate import ZERO3, Covariance3, Estimate
+from cpcbl_team.estimate import ZERO3, Estimate
 from cpcbl_team.geometry import Pose2
 from cpcbl_team.geometry import step as stepped
 from cpcbl_team.inputs import Belief, Fix, Odometry, Position, Sighting, Sightings
 from cpcbl_team.self_calibration import Learned
 from cpcbl_team.state import CalibrationMemory
-from cpcbl_transport.messages import Drive, Message
+from cpcbl_transport.messages import Message
 
 OAK = Sighting("oak", 4.05, 0.02)
 MATE = Sighting("mate", 1.9, 0.05)
@@ -69,9 +62,6 @@ def test_a_robots_messages_of_a_match_are_its_share_and_no_more() -> None:
     match = MatchSettings(messages=100, duration_s=60.0)
     (spending,) = robot(replace(TEAM, match=match)).collaboration.budget.spending(3600 * SECOND)
     assert spending.allowed == 50.0
-
-
-# Late and out of order --------------------------------------------------------------------------
 
 
 def frame(stamp_ns: int, *names: str) -> Sightings:
@@ -155,9 +145,6 @@ def test_any_order_of_arrival_gives_the_same_belief() -> None:
     assert belief(told(forwards)) == belief(told(in_order(items)))
 
 
-# A position sensor ------------------------------------------------------------------------------
-
-
 def test_a_position_pulls_the_belief_there_as_far_as_it_is_certain() -> None:
     prior = robot().filter.timeline.state.estimate
     for sigma_m, share in ((1e-3, 1.0), (prior.position_sigma_m, 0.5), (10.0, 0.0)):
@@ -178,9 +165,6 @@ def test_the_delay_of_a_position_sensor_moves_what_it_says_to_when_it_was_so() -
             subject.handle(piece, SECOND)
         subject.handle(Position(stamp_ns, 0.3, 0.05, (0.0004, 0.0, 0.0004)), SECOND)
     assert belief(late) == belief(prompt) != belief(told(in_order(pieces(1.0))))
-
-
-# Blind robots -----------------------------------------------------------------------------------
 
 
 def after_seeing(sensor: SensorSettings, *seen: Sighting) -> Robot:
@@ -232,9 +216,6 @@ def test_an_unknown_object_is_counted_and_plays_no_part() -> None:
     assert subject.counts["unknown_object"] == 1
 
 
-# Corrections ------------------------------------------------------------------------------------
-
-
 def test_the_odometry_delay_moves_the_motion_to_when_it_happened() -> None:
     slow = OdometrySettings(delay_s=0.2)
     corrected = robot(with_robot(TEAM, "me", odometry=slow))
@@ -263,9 +244,6 @@ def test_the_sensor_delay_moves_a_frame_to_when_it_was_seen(delay_ns: int) -> No
             subject.handle(piece, piece.stamp_ns)
         subject.handle(saw(stamp_ns, OAK), SECOND)
     assert belief(late) == belief(prompt)
-
-
-# Frames wait for their odometry -----------------------------------------------------------------
 
 
 def fixes(said: list[Message]) -> list[Fix]:
@@ -372,91 +350,3 @@ def test_fixes_keep_their_least_interval() -> None:
             f.stamp_ns for f in fixes(subject.handle(saw(piece.stamp_ns, MATE), piece.stamp_ns))
         ]
     assert stamps == [(100 + 500 * n) * MS for n in range(4)]
-
-
-# Driving ----------------------------------------------------------------------------------------
-
-HERE = Pose2(1.0, 2.0, math.pi / 2.0)
-
-
-def located(pose: Pose2, stamp_ns: int, lost: str = "") -> PoseEstimate:
-    estimate = Estimate(pose, Covariance3(0.01, 0.0, 0.01, 0.0, 0.0, 0.01))
-    return PoseEstimate(stamp_ns, estimate, lost, 0.0, 0.0)
-
-
-@pytest.mark.parametrize(
-    ("goal", "speed", "turn_rate"),
-    [
-        ((1.0, 5.0), 0.5, 0.0),
-        ((0.0, 2.0), 0.0, MOST_TURN_RAD_S),
-        ((2.0, 2.0), 0.0, -MOST_TURN_RAD_S),
-        ((1.0, 0.0), 0.0, None),
-        ((1.0 - math.sin(0.1), 2.0 + math.cos(0.1)), 0.5 * math.cos(0.1) ** 3, 0.2),
-    ],
-    ids=["ahead", "left", "right", "behind", "a little left"],
-)
-def test_steering_turns_towards_the_goal(
-    goal: tuple[float, float], speed: float, turn_rate: float | None
-) -> None:
-    v, w = pursue(HERE, goal, 0.5)
-    assert v == pytest.approx(speed)
-    assert (abs(w) if turn_rate is None else w) == pytest.approx(turn_rate or abs(w))
-    assert abs(w) <= MOST_TURN_RAD_S
-    if turn_rate is None:
-        assert abs(w) == MOST_TURN_RAD_S
-
-
-def drive(pilot: WaypointFollower, pose: Pose2, stamp_ns: int, seconds: float) -> list[Pose2]:
-    """Where a pilot drives in a world without noise, at 10 Hz."""
-    way = [pose]
-    for _ in range(round(10 * seconds)):
-        stamp_ns += COMMAND_NS
-        (command,) = pilot.command(located(pose, stamp_ns))
-        pose = stepped(pose, 0.1 * command.speed_m_s, 0.1 * command.turn_rate_rad_s)
-        way.append(pose)
-    return way
-
-
-def test_a_pilot_visits_its_waypoints_in_order_and_again() -> None:
-    corners = [(2.0, 0.0), (2.0, 2.0), (0.0, 2.0), (0.0, 0.0)]
-    way = drive(WaypointFollower("me", corners, 0.5), Pose2(0.0, 0.0, 0.0), 0, 60.0)
-    visits: list[int] = []
-    for pose in way:
-        for i, (x, y) in enumerate(corners):
-            if math.hypot(x - pose.x, y - pose.y) < REACHED_M and visits[-1:] != [i]:
-                visits.append(i)
-    assert visits[0] == 3  # the start
-    assert visits[1:9] == [0, 1, 2, 3, 0, 1, 2, 3]
-
-
-def test_a_pilot_goes_for_the_next_waypoint_as_soon_as_it_is_near_one() -> None:
-    pilot = WaypointFollower("me", [(1.0, 0.0), (1.0, 9.0)], 0.5)
-    (ahead,) = pilot.command(located(Pose2(0.0, 0.0, 0.0), COMMAND_NS))
-    (aside,) = pilot.command(located(Pose2(1.1 - REACHED_M, 0.0, 0.0), 2 * COMMAND_NS))
-    assert ahead == Drive("me", COMMAND_NS, 0.5, 0.0)
-    assert aside.turn_rate_rad_s == MOST_TURN_RAD_S
-
-
-def test_a_pilot_says_how_many_waypoints_it_has_reached_over_all_loops() -> None:
-    pilot = WaypointFollower("me", [(1.0, 0.0), (0.0, 0.0)], 0.5)
-    there_and_back = [0.5, 1.0, 0.5, 0.0, 0.5, 1.0]
-    said = [
-        pilot.command(located(Pose2(x, 0.0, 0.0), (i + 1) * COMMAND_NS))[0].reached
-        for i, x in enumerate(there_and_back)
-    ]
-    assert said == [0, 1, 1, 2, 2, 3]
-
-
-def test_a_lost_pilot_looks_around_on_the_spot() -> None:
-    pilot = WaypointFollower("me", [(5.0, 0.0)], 0.5)
-    (command,) = pilot.command(located(HERE, COMMAND_NS, lost="for a test"))
-    assert command.speed_m_s == 0.0
-    assert command.turn_rate_rad_s != 0.0
-
-
-def test_commands_come_at_10_hz_at_most_and_only_with_waypoints() -> None:
-    pilot = WaypointFollower("me", [(5.0, 0.0)], 0.5)
-    stamps = range(COMMAND_NS, SECOND + COMMAND_NS, 20 * MS)
-    commands = [c for at in stamps for c in pilot.command(located(HERE, at))]
-    assert [c.stamp_ns for c in commands] == list(range(COMMAND_NS, SECOND + 1, COMMAND_NS))
-    assert WaypointFollower("me", [], 0.5).command(located(HERE, COMMAND_NS)) == []

@@ -1,11 +1,8 @@
-"""Real sessions with real certificates: who gets a link, and what a router lets each one say."""
+"""Who may publish and subscribe to what, with certified names."""
 
 import json
-from collections.abc import Iterable, Iterator
 from contextlib import closing
 from pathlib import Path
-from statistics import mode
-from typing import Any
 
 import pytest
 import zenoh
@@ -14,31 +11,21 @@ from support.buses import Subscription, wait_until
 from support.keys import (
     FIELD,
     OPERATOR,
-    PATIENCE_S,
     R1,
     R2,
-    REFUSED_S,
     ROUTER,
     TRIPOD,
-    SealedRelay,
     again,
-    lasting,
-    router_of,
     secured_team,
     session,
     shown_by,
-    with_credentials,
 )
-from support.processes import eventually
+from support.secured_team import MARK, say
 
 from cpcbl_launch.run.up import free_endpoint
 from cpcbl_team.config import Team
-from cpcbl_team.errors import InputError
 from cpcbl_transport import topics
-from cpcbl_transport.bus import Bus
-from cpcbl_transport.compact import FIX_BYTES
 from cpcbl_transport.security import (
-    Credentials,
     Identity,
     Link,
     Member,
@@ -51,132 +38,9 @@ from cpcbl_transport.security import (
     publish_keys,
     subscribe_keys,
 )
-from cpcbl_transport.topics import Permission, Qos, Role
-from cpcbl_transport.zenoh_bus import BusError, open_router
+from cpcbl_transport.topics import Qos, Role
+from cpcbl_transport.zenoh_bus import open_router
 from cpcbl_transport.zenoh_config import router_config
-
-MARK = "mark"
-
-
-@pytest.fixture(scope="module")
-def team(tmp_path_factory: pytest.TempPathFactory) -> Team:
-    return secured_team(tmp_path_factory.mktemp("keys"))
-
-
-@pytest.fixture(scope="module")
-def endpoint(team: Team) -> Iterator[str]:
-    """Where the team's router listens. All its members may also say `mark`, for the tests."""
-    where = free_endpoint("tls")
-    rules = access_control(team)
-    access = rules["access_control"]
-    mark = {**access["rules"][0], "id": MARK, "flows": ["ingress"], "messages": ["put"]}
-    mark["key_exprs"] = [f"{topics.namespace(team.name)}/{MARK}"]
-    access["rules"].append(mark)
-    access["policies"].append({"rules": [MARK], "subjects": [access["subjects"][0]["id"]]})
-    with open_router(team.name, [where], guards=rules, credentials=shown_by(team, ROUTER)):
-        yield where
-
-
-# Who gets a link --------------------------------------------------------------------------------
-
-
-def config_of(endpoint: str, **tls: Any) -> "zenoh.Config":
-    """A client that shows what it likes."""
-    config = zenoh.Config()
-    config.insert_json5("mode", '"client"')
-    connect = {"endpoints": [endpoint], "timeout_ms": 2000, "exit_on_failure": True}
-    config.insert_json5("connect", json.dumps(connect))
-    config.insert_json5("scouting/multicast/enabled", "false")
-    config.insert_json5("transport/link/tls", json.dumps(tls))
-    return config
-
-
-def test_every_member_gets_a_link(team: Team, endpoint: str) -> None:
-    for identity in (R1, R2, TRIPOD, FIELD, OPERATOR, ROUTER):
-        session(team, identity, endpoint).close()
-
-
-def test_without_a_certificate_there_is_no_session(team: Team, endpoint: str) -> None:
-    trusted = {"root_ca_certificate": shown_by(team, R1).ca}
-    shown = shown_by(team, R1)
-    own = {"connect_certificate": shown.certificate, "connect_private_key": shown.private_key}
-    zenoh.open(config_of(endpoint, **trusted, **own, enable_mtls=True)).close()  # type: ignore[no-untyped-call]
-    with pytest.raises(zenoh.ZError):
-        zenoh.open(config_of(endpoint, **trusted))
-
-
-def test_with_a_foreign_certificate_there_is_no_session(
-    team: Team, endpoint: str, tmp_path: Path
-) -> None:
-    foreign = shown_by(secured_team(tmp_path), R1)
-    for shown, reason in (
-        (foreign._replace(ca=shown_by(team, R1).ca), "refuses .*certificate.crt: .* of another"),
-        (foreign, "cannot be trusted: unable to get local issuer"),
-    ):
-        with pytest.raises(BusError, match=reason):
-            with_credentials(team, shown, endpoint)
-
-
-def test_with_an_expired_certificate_there_is_no_session(tmp_path: Path) -> None:
-    team = secured_team(tmp_path)
-    lasting(team, "r1", -1.0)
-    with router_of(team) as (_, endpoint):
-        session(team, R2, endpoint).close()
-        with pytest.raises(BusError, match=r"refuses .*certificate.crt: it has expired"):
-            with_credentials(team, shown_by(team, R1), endpoint)
-
-
-def test_plain_tcp_is_refused(team: Team, endpoint: str) -> None:
-    plain = endpoint.replace("tls/", "tcp/")
-    for credentials in (None, shown_by(team, R1)):
-        with pytest.raises(BusError):
-            with_credentials(team, credentials, plain)
-
-
-def test_a_secured_router_listens_in_no_other_way(team: Team) -> None:
-    for protocol in ("tcp", "quic", "ws"):
-        with pytest.raises(BusError), router_of(team, free_endpoint(protocol)):
-            pass
-
-
-def test_a_secured_session_dials_no_plain_router(team: Team) -> None:
-    plain = free_endpoint()
-    with open_router(team.name, [plain]):
-        with_credentials(team, None, plain).close()
-        with pytest.raises(BusError):
-            with_credentials(team, shown_by(team, R1), plain)
-        with pytest.raises(BusError, match="does not speak TLS"):
-            with_credentials(team, shown_by(team, R1), plain.replace("tcp/", "tls/"))
-
-
-def test_a_router_with_a_foreign_certificate_is_not_trusted(team: Team, tmp_path: Path) -> None:
-    with router_of(secured_team(tmp_path)) as (_, endpoint), pytest.raises(BusError):
-        with_credentials(team, shown_by(team, R1), endpoint)
-
-
-def test_a_robot_cannot_pass_for_the_router(team: Team) -> None:
-    where = free_endpoint("tls")
-    with (
-        open_router(team.name, [where], credentials=shown_by(team, R2)),
-        pytest.raises(BusError, match="cannot be trusted"),
-    ):
-        with_credentials(team, shown_by(team, R1), where)
-
-
-def test_a_router_is_trusted_where_its_certificate_says(tmp_path: Path) -> None:
-    team = secured_team(tmp_path)
-    where = free_endpoint("tls").replace("127.0.0.1", "127.0.0.2")
-    with router_of(team, where), pytest.raises(BusError, match=r"not valid for '127\.0\.0\.2'"):
-        with_credentials(team, shown_by(team, R1), where)
-    again(team, hosts=("127.0.0.2",), renew=("router",))
-    with router_of(team, where):
-        session(team, R1, where).close()
-    with router_of(team, where.replace("127.0.0.2", "0.0.0.0")):
-        for host in ("127.0.0.1", "localhost"):  # what it had before it has still
-            session(team, R1, where.replace("127.0.0.2", host)).close()
-
-
-# Who may say what -------------------------------------------------------------------------------
 
 OWN_ROBOT = {
     *("belief/3/r1", "fix/r2/3/r1", "status/r1", "track/r1", "look/r1", "field/drive/r1"),
@@ -205,12 +69,6 @@ KEYS = sorted(
     }
 )
 SAID = {R1: OWN_ROBOT, TRIPOD: OWN_OBSERVER, FIELD: OWN_FIELD, OPERATOR: set[str]()}
-
-
-def say(bus: Bus, key: str, payload: bytes = b"?") -> None:
-    publisher = bus.publisher(key, Qos.INPUT)
-    wait_until(lambda: publisher.matching)
-    publisher.put(payload)
 
 
 @pytest.mark.parametrize("who", SAID, ids=str)
@@ -281,8 +139,6 @@ def test_two_sessions_may_show_the_same_certificate(team: Team, endpoint: str) -
         wait_until(lambda: ear.payloads == [b"a piece"])
 
 
-# Who may hear what ------------------------------------------------------------------------------
-
 HEARD = {
     R2: {"belief/3/r1", "fix/r2/3/r1"},
     TRIPOD: {"belief/3/r1"},
@@ -332,9 +188,6 @@ def test_what_a_robot_may_not_hear_is_not_even_sent(team: Team, endpoint: str) -
         for key in ("fix/r3/3/r1", "status/r1", "track/r1", "in/r1/odometry"):
             assert not robot.publisher(key, Qos.FRESH).matching
         assert not any(ear.samples for ear in ears)
-
-
-# The rules are the table's ----------------------------------------------------------------------
 
 
 def test_the_rules_follow_the_table_of_topics() -> None:
@@ -424,176 +277,3 @@ def test_all_options_are_known_to_zenoh(team: Team) -> None:
         assert json.loads(config.get_json(f"transport/link/tls/{name}")) == value
     assert json.loads(config.get_json("transport/link/protocols")) == ["tls"]
     assert json.loads(config.get_json("transport/link/tx/lease")) == 2000
-
-
-# Rotation and revocation ------------------------------------------------------------------------
-
-
-def hears(bus: Bus, speaker: Bus, key: str, within_s: float = PATIENCE_S) -> bool:
-    """Whether what one session says reaches another in time."""
-    ear, publisher = Subscription(bus, key), speaker.publisher(key, Qos.INPUT)
-    eventually(lambda: publisher.matching, within_s)
-    publisher.put(b"?")
-    heard = eventually(lambda: bool(ear.samples), within_s)
-    ear.close()
-    publisher.close()
-    return heard
-
-
-def test_a_revoked_robot_neither_says_nor_hears_anything(tmp_path: Path) -> None:
-    team = secured_team(tmp_path)
-    stolen = shown_by(team, R2)
-    kept = [path.read_bytes() for path in map(Path, stolen)]
-    again(team, revoke=("r2",))
-    with (
-        router_of(team) as (_, endpoint),
-        closing(session(team, R1, endpoint)) as good,
-        closing(with_credentials(team, stolen, endpoint, PATIENCE_S)) as out,
-        closing(session(team, OPERATOR, endpoint)) as operator,
-    ):
-        assert hears(operator, good, "status/r1")
-        assert not hears(operator, out, "status/r2", REFUSED_S)
-        assert not hears(out, good, "belief/3/r1", REFUSED_S)
-    again(team, renew=("r2",))
-    old = [tmp_path / name for name in ("old-ca.crt", "old.crt", "old.key")]
-    for path, content in zip(old, kept, strict=True):
-        path.write_bytes(content)
-    with (
-        router_of(team) as (_, endpoint),
-        closing(session(team, R2, endpoint)) as back,
-        closing(with_credentials(team, type(stolen)(*map(str, old)), endpoint)) as out,
-        closing(session(team, OPERATOR, endpoint)) as operator,
-    ):
-        assert hears(operator, back, "status/r2")
-        assert not hears(operator, out, "status/r2", REFUSED_S)
-
-
-def test_a_link_ends_with_its_certificate_and_a_renewed_one_opens_the_next(
-    tmp_path: Path,
-) -> None:
-    team = secured_team(tmp_path)
-    alive: list[tuple[str, bool]] = []
-    lasting(team, "r1", 6.0)
-    with (
-        router_of(team) as (router, endpoint),
-        closing(session(team, R1, endpoint)) as robot,
-    ):
-        router.watch_liveliness("alive/**", lambda *news: alive.append(news))
-        key = topics.ALIVE.at(tier=3, robot="r1", incarnation="1")
-        robot.declare_token(key)
-        wait_until(lambda: alive == [(key, True)])
-        assert eventually(lambda: alive == [(key, True), (key, False)])
-        assert not eventually(lambda: len(alive) > 2, REFUSED_S)
-        again(team, renew=("r1",))
-        assert eventually(lambda: alive[2:] == [(key, True)])
-
-
-def test_two_authorities_overlap_until_the_old_one_is_retired(tmp_path: Path) -> None:
-    team = secured_team(tmp_path)
-    old = {identity: shown_by(team, identity) for identity in (R1, R2, OPERATOR)}
-    copies = {}
-    for identity, shown in old.items():  # as they are on machines that nobody has been to
-        paths = [tmp_path / f"{identity.role}{identity.name}{n}" for n in range(3)]
-        for path, source in zip(paths, shown, strict=True):
-            path.write_bytes(Path(source).read_bytes())
-        copies[identity] = type(shown)(*map(str, paths))
-    again(team, renew=("ca",))
-    with router_of(team) as (_, endpoint):  # it still shows a certificate of the old authority
-        with_credentials(team, copies[R1], endpoint, PATIENCE_S).close()
-    with pytest.raises(InputError, match=r"--retire-ca.*--renew all"):
-        again(team, retire_ca=True)
-    again(team, renew=("all",))
-    with router_of(team) as (_, endpoint):
-        session(team, R2, endpoint).close()
-        only_new_ca = copies[R1]._replace(ca=shown_by(team, R1).ca)
-        with_credentials(team, only_new_ca, endpoint, PATIENCE_S).close()
-    again(team, retire_ca=True)
-    with router_of(team) as (_, endpoint):
-        session(team, R2, endpoint).close()
-        with pytest.raises(BusError):
-            with_credentials(team, only_new_ca, endpoint)
-
-
-# Two sites --------------------------------------------------------------------------------------
-
-
-def test_two_routers_relay_what_each_lets_in(team: Team) -> None:
-    with (
-        router_of(team) as (_, west),
-        router_of(team, "", west) as (_, east),
-        closing(session(team, R1, west)) as r1,
-        closing(session(team, R2, east)) as r2,
-    ):
-        beliefs, fixes = Subscription(r2, "belief/3/*"), Subscription(r2, "fix/r2/3/*")
-        tokens: dict[str, bool] = {}
-        r2.watch_liveliness("alive/*/*/*", tokens.__setitem__)
-        r1.declare_token("alive/3/r1/1")
-        say(r1, "belief/3/r2", b"as another")
-        say(r1, "fix/r2/3/r1", b"as itself")
-        wait_until(lambda: fixes.payloads == [b"as itself"])
-        wait_until(lambda: tokens == {"alive/3/r1/1": True})
-        assert beliefs.payloads == []
-        assert hears(r1, r2, "belief/3/r2")
-
-
-def test_a_robot_cannot_join_a_router_as_a_router(team: Team, endpoint: str) -> None:
-    plain = free_endpoint("tls")
-    with (
-        open_router(team.name, [plain], [endpoint], credentials=shown_by(team, R2)) as false,
-        closing(session(team, OPERATOR, endpoint)) as operator,
-    ):
-        ear = Subscription(operator, "**")
-        say(false, "status/r1", b"relayed")
-        say(false, MARK, b"mark")
-        wait_until(lambda: b"mark" in ear.payloads)
-        assert ear.payloads == [b"mark"]
-
-
-# What it costs, and what is written about it ----------------------------------------------------
-
-
-def written_at_once(team: Team, secured: bool) -> int:
-    """Bytes of one fix on its sender's link.
-
-    Zenoh numbers its frames from anywhere, and numbers below 128 take a byte less than others: of
-    300 frames, most have the usual size.
-    """
-    endpoint = free_endpoint("tls" if secured else "tcp")
-
-    def shown(identity: Identity) -> Credentials | None:
-        return shown_by(team, identity) if secured else None
-
-    with (
-        open_router(team.name, [endpoint], credentials=shown(ROUTER)),
-        SealedRelay(endpoint) as link,
-        closing(with_credentials(team, shown(R1), link.endpoint, PATIENCE_S)) as robot,
-        closing(with_credentials(team, shown(R2), endpoint, PATIENCE_S)) as mate,
-    ):
-        ear = Subscription(mate, "fix/r2/3/*")
-        publisher = robot.publisher("fix/r2/3/r1", Qos.FRESH)
-        wait_until(lambda: publisher.matching)
-        before = len(link.up)
-        for n in range(300):
-            publisher.put(bytes(FIX_BYTES))
-            wait_until(lambda n=n: len(ear.samples) > n)  # type: ignore[misc]
-        return mode(len(batch.content) for batch in link.up[before:])
-
-
-def test_tls_takes_22_bytes_for_what_is_written_at_once(team: Team) -> None:
-    assert written_at_once(team, secured=True) - written_at_once(team, secured=False) == 22
-
-
-def in_words(who: Iterable[Permission]) -> str:
-    return ", ".join(f"{w.role} (`{w.own}`)" if w.own else str(w.role) for w in who)
-
-
-def test_the_table_in_the_docs_is_that_of_the_topics() -> None:
-    text = (Path(__file__).parents[2] / "docs" / "security.md").read_text()
-    rows = [
-        f"| `{topic.key}` | {in_words(topic.publishers)} | {in_words(topic.subscribers)} |"
-        for topic in topics.TOPICS
-    ]
-    table = text.partition("| key | may publish | may subscribe |\n|---|---|---|\n")[2].partition(
-        "\n\n"
-    )[0]
-    assert table.splitlines() == rows
