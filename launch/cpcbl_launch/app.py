@@ -2,7 +2,6 @@
 
 import typer
 
-from cpcbl_launch import robot
 from cpcbl_launch.commands.calibrating import calibrate_app
 from cpcbl_launch.commands.deploying import compose
 from cpcbl_launch.commands.experimenting import experiment_app
@@ -12,6 +11,7 @@ from cpcbl_launch.commands.observing import observer
 from cpcbl_launch.commands.running import check, field, router, up
 from cpcbl_launch.commands.securing import keys
 from cpcbl_launch.commands.watching import look, traffic
+from cpcbl_launch.run import robot
 
 app = typer.Typer(
     help="A team of robots that find out where they are, together.",

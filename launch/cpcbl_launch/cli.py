@@ -38,7 +38,7 @@ def main() -> None:
 def _run_command() -> None:
     """A robot's process loads neither typer nor the other commands."""
     if sys.argv[1:2] == ["robot"]:
-        from cpcbl_launch.robot import main as run_robot
+        from cpcbl_launch.run.robot import main as run_robot
 
         run_robot(sys.argv[2:])
     else:

@@ -6,7 +6,7 @@ from typing import Any
 
 from rich.console import Console, RenderableType
 
-from cpcbl_launch.options import json_text
+from cpcbl_launch.reporting.files import json_text
 
 
 def show_and_write(result: Any, tables: Iterable[RenderableType], path: Path) -> None:

@@ -11,7 +11,7 @@ from support.buses import SECOND, standing
 from support.logs import write_log
 from support.processes import cpcbl_team
 
-from cpcbl_launch.options import require_folder, require_writable_file
+from cpcbl_launch.commands.options import require_folder, require_writable_file
 from cpcbl_launch.reporting.recording import Recording, read_recording
 from cpcbl_launch.run.processes import PROGRAM
 from cpcbl_launch.run.supervisor import ProcessSpec, Supervisor
@@ -166,7 +166,8 @@ def test_a_compose_file_that_is_lost_is_named() -> None:
 
 def test_a_file_that_became_a_folder_is_one_line(tmp_path: Path) -> None:
     ends = (
-        f"from cpcbl_launch import cli; cli.app = lambda: open({str(tmp_path)!r}, 'w'); cli.main()"
+        "from cpcbl_launch import cli;"
+        f"cli._run_command = lambda: open({str(tmp_path)!r}, 'w'); cli.main()"
     )
     ran = subprocess.run([sys.executable, "-c", ends], capture_output=True, text=True, check=False)
     assert ran.returncode == 1

@@ -83,13 +83,9 @@ def camera(
     """Lens and distortion of a camera, from pictures of a printed board."""
     from rich.console import Console
 
-    from cpcbl_launch.options import (
-        json_text,
-        require_matplotlib,
-        require_opencv,
-        require_writable_file,
-        write_or_reason,
-    )
+    from cpcbl_launch.checks import require_matplotlib, require_opencv
+    from cpcbl_launch.commands.options import require_writable_file
+    from cpcbl_launch.reporting.files import json_text, write_or_reason
     from cpcbl_launch.views.run import progress_bar
 
     require_opencv("calibrate camera")
@@ -160,12 +156,9 @@ def colours(
     """Thresholds of colours, from samples of them in pictures."""
     from rich.console import Console
 
-    from cpcbl_launch.options import (
-        json_text,
-        require_opencv,
-        require_writable_file,
-        write_or_reason,
-    )
+    from cpcbl_launch.checks import require_opencv
+    from cpcbl_launch.commands.options import require_writable_file
+    from cpcbl_launch.reporting.files import json_text, write_or_reason
 
     require_opencv("calibrate colours")
     from cpcbl_launch.calibration import patches
@@ -229,7 +222,7 @@ def sensor(
     from cpcbl_launch.calibration.seeing_show import print_seeing, seeing_values
     from cpcbl_launch.calibration.sights import recorded
     from cpcbl_launch.calibration.team_edit import robot_place
-    from cpcbl_launch.options import json_text
+    from cpcbl_launch.reporting.files import json_text
 
     if bool(recordings) == (pictures is not None):
         raise InputError("calibrate sensor: name recordings, or --pictures FOLDER --poses FILE.csv")
@@ -257,7 +250,7 @@ def _photographed(
 ) -> "Looked":
     """What a robot of the team file sees in pictures. Raises InputError."""
     from cpcbl_launch.calibration.sights import photographed, viewer
-    from cpcbl_launch.options import require_opencv
+    from cpcbl_launch.checks import require_opencv
     from cpcbl_launch.views.run import progress_bar
 
     require_opencv("calibrate sensor --pictures")
@@ -274,7 +267,7 @@ def _photographed(
 def _check_target(team_file: Path | None, output: Path | None) -> None:
     """Raises InputError, TeamFileError before anything is measured in vain."""
     from cpcbl_launch.calibration.team_edit import team_source
-    from cpcbl_launch.options import require_writable_file
+    from cpcbl_launch.commands.options import require_writable_file
 
     if team_file is not None:
         require_writable_file("--output" if output else "--team", team_source(team_file, output)[1])
@@ -296,7 +289,7 @@ def _save(
         shadowed,
         team_source,
     )
-    from cpcbl_launch.options import write_or_reason
+    from cpcbl_launch.reporting.files import write_or_reason
 
     if team_file is None:
         if not quiet:

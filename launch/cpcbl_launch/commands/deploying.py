@@ -5,6 +5,7 @@ from typing import Annotated, Optional
 
 import typer
 
+from cpcbl_launch.commands import options
 from cpcbl_launch.commands.arguments import Image, TeamArgument, print_not_written
 from cpcbl_launch.team_file import find_team
 
@@ -12,17 +13,19 @@ from cpcbl_launch.team_file import find_team
 def compose(
     file: TeamArgument = None,
     image: Image = None,
-    seed: Annotated[int, typer.Option(help="Of the simulated noise.")] = 1,
+    seed: Annotated[int, typer.Option(help="Seed of the simulated noise.")] = 1,
     output: Annotated[
-        Optional[Path], typer.Option(help="Write it to this file, with paths from its folder.")
+        Optional[Path],
+        typer.Option(
+            callback=options.writable_file,
+            help="File to write, with paths relative to its folder; default: standard output.",
+        ),
     ] = None,
 ) -> None:
     """Print a team's compose file: for docker-compose, docker compose, a swarm."""
-    from cpcbl_launch.options import require_writable_file, write_or_reason
+    from cpcbl_launch.reporting.files import write_or_reason
     from cpcbl_launch.run.containers.deployment import deployment_text
 
-    if output is not None:
-        require_writable_file("--output", output)
     team = find_team(file or Path("demo"))
     folder = Path() if output is None else output.parent
     text = deployment_text(team, file or Path("demo"), folder, image, seed)

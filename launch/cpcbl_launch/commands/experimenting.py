@@ -58,8 +58,8 @@ def figure7_cameras(
     seeds: Seeds = 5, jobs: Jobs = None, output: Output = Path(), as_json: AsJson = False
 ) -> None:
     """The same from pixels: a cheap camera on the navigator, a sharper one on the observer."""
+    from cpcbl_launch.checks import require_opencv
     from cpcbl_launch.lab.experiments.figure7_cameras import EXPERIMENT
-    from cpcbl_launch.options import require_opencv
 
     require_opencv("experiment figure7-cameras")
     conduct(EXPERIMENT, seeds, jobs, output, as_json)
@@ -102,9 +102,10 @@ def budget(
     as_json: AsJson = False,
 ) -> None:
     """A real log: accuracy against bytes, by value and budget, by fixed intervals, all of it."""
+    from cpcbl_launch.checks import require_matplotlib
     from cpcbl_launch.lab.experiments import budget as experiment
     from cpcbl_launch.lab.experiments.pictures import draw_budget
-    from cpcbl_launch.options import require_matplotlib
+    from cpcbl_launch.overrides import with_blind_robots
     from cpcbl_launch.run import logged_team
     from cpcbl_launch.team_file import load_team
 
@@ -113,7 +114,7 @@ def budget(
     logged = logged_team.with_duration(
         logged_team.load_logged_team(load_team(logged_team.builtin_for(data)), data), duration
     )
-    logged = logged._replace(team=logged_team.with_blind_robots(logged.team, parse_names(blind)))
+    logged = logged._replace(team=with_blind_robots(logged.team, parse_names(blind)))
     with _progress("budget", len(experiment.cases())) as done:
         result = experiment.measure_curve(logged, jobs, done)
     _written(result, experiment.tables(result), output, as_json, draw_budget)
@@ -124,9 +125,9 @@ def liars(
     seeds: Seeds = 10, jobs: Jobs = None, output: Output = Path(), as_json: AsJson = False
 ) -> None:
     """One observer of several lies for a while: what it does to the team, and when it is found."""
+    from cpcbl_launch.checks import require_matplotlib
     from cpcbl_launch.lab.experiments import liars as experiment
     from cpcbl_launch.lab.experiments.pictures import draw_liars
-    from cpcbl_launch.options import require_matplotlib
 
     require_matplotlib("experiment")
     _must_be_writable(output, "liars")
@@ -144,7 +145,7 @@ def eyes(
     as_json: AsJson = False,
 ) -> None:
     """What cameras see of rendered frames: precision, recall, errors against stated sigmas."""
-    from cpcbl_launch.options import require_matplotlib, require_opencv
+    from cpcbl_launch.checks import require_matplotlib, require_opencv
 
     require_matplotlib("experiment")
     require_opencv("experiment eyes")
@@ -170,7 +171,7 @@ def pictures(
     as_json: AsJson = False,
 ) -> None:
     """Real pictures whose truth is known: what is found and missed of them, and by how much."""
-    from cpcbl_launch.options import require_opencv
+    from cpcbl_launch.checks import require_opencv
 
     require_opencv("experiment pictures")
     from cpcbl_launch.lab.experiments import real_pictures
@@ -198,8 +199,8 @@ def conduct(
     experiment: "Experiment", seeds: int, jobs: int | None, output: Path, as_json: bool
 ) -> None:
     """Runs, writes and shows one experiment. Raises InputError for what the user can mend."""
+    from cpcbl_launch.checks import require_matplotlib
     from cpcbl_launch.lab.experiments.runs import run_cases
-    from cpcbl_launch.options import require_matplotlib
 
     require_matplotlib("experiment")
     _must_be_writable(output, experiment.name)
@@ -212,7 +213,7 @@ def conduct(
 
 def _must_be_writable(output: Path, name: str, *, drawn: bool = True) -> None:
     """Raises InputError where the files of an experiment could not be written later on."""
-    from cpcbl_launch.options import require_folder, require_writable_file
+    from cpcbl_launch.commands.options import require_folder, require_writable_file
 
     require_folder("--output", output)
     for ending in ("json", "png") if drawn else ("json",):
@@ -229,7 +230,7 @@ def _written(
     """Writes what came out, a picture too where one is drawn, and shows it, written or not."""
     from rich.console import Console
 
-    from cpcbl_launch.options import json_text, write_or_reason
+    from cpcbl_launch.reporting.files import json_text, write_or_reason
 
     text, name = json_text(result) + "\n", output / result.experiment
     figures, picture = Path(f"{name}.json"), Path(f"{name}.png")

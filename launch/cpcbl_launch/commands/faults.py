@@ -8,6 +8,7 @@ from typing import Annotated, Optional
 
 import typer
 
+from cpcbl_launch.commands import options
 from cpcbl_launch.commands.arguments import AsJson, ReportFile, print_not_written, write_report
 
 
@@ -19,7 +20,10 @@ def chaos(
     seed: Annotated[int, typer.Option(help="Of noise and of random faults.")] = 1,
     soak_s: Annotated[float, typer.Option(min=1.0, help="Seconds that the soak takes.")] = 180.0,
     markdown: Annotated[
-        Optional[Path], typer.Option(help="Write the table into this file, as Markdown.")
+        Optional[Path],
+        typer.Option(
+            callback=options.writable_file, help="File to write the table into, as Markdown."
+        ),
     ] = None,
     report: ReportFile = None,
     as_json: AsJson = False,
@@ -36,14 +40,11 @@ def chaos(
     from cpcbl_launch.lab.chaos.runner import run_scenarios, select_scenarios
     from cpcbl_launch.lab.chaos.scenario import ScenarioOptions
     from cpcbl_launch.lab.chaos.scenarios import SCENARIOS
-    from cpcbl_launch.options import json_text, require_writable_file, write_or_reason
+    from cpcbl_launch.reporting.files import json_text, write_or_reason
 
     if listed or not scenarios:
         tables.print_scenarios(SCENARIOS, Console())
         return
-    for option, path in (("--report", report), ("--markdown", markdown)):
-        if path is not None:
-            require_writable_file(option, path)
     todo = select_scenarios(scenarios)
     logging.getLogger("cpcbl_launch").setLevel(logging.ERROR)  # restarts are part of it
     logging.getLogger("cpcbl_transport").setLevel(logging.ERROR)

@@ -1,12 +1,13 @@
 """Commands that measure: real logs, calibration, a simulated team in one process."""
 
-import sys
 from enum import StrEnum
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Optional
 
 import typer
 
+from cpcbl_launch.commands import options
 from cpcbl_launch.commands.arguments import (
     AsJson,
     Blind,
@@ -18,6 +19,7 @@ from cpcbl_launch.commands.arguments import (
     TeamArgument,
     parse_names,
     print_not_written,
+    print_result,
     write_report,
 )
 from cpcbl_launch.team_file import find_team
@@ -48,70 +50,95 @@ class DirectionName(StrEnum):
     both_ways = "both-ways"
 
 
+LogTeamFile = Annotated[
+    Optional[Path],
+    typer.Option("--team", help="Team file; default: the built-in mrclam without this log."),
+]
+Variant = Annotated[Optional[VariantName], typer.Option(help="Variant of all robots.")]
+Collaboration = Annotated[Optional[Kinds], typer.Option(help="Collaboration of all robots.")]
+Fusion = Annotated[Optional[FusionName], typer.Option(help="Fusion of all robots.")]
+Direction = Annotated[Optional[DirectionName], typer.Option(help="Direction of all robots.")]
+LogDuration = Annotated[Optional[float], typer.Option(help="Seconds of the log; default: all.")]
+WithBaselines = Annotated[
+    bool,
+    typer.Option(
+        "--yardstick", help="Also run dead reckoning, a solo EKF per robot, a centralized EKF."
+    ),
+]
+ExportFolder = Annotated[
+    Optional[Path],
+    typer.Option(
+        callback=options.folder,
+        help="Folder to write estimates and truth into (TUM files, which evo reads).",
+    ),
+]
+CalibratedTeamFile = Annotated[
+    Optional[Path],
+    typer.Option(
+        "--team",
+        help="Team file to add types to; default: the recorded team, or mrclam-uncalibrated.",
+    ),
+]
+Margin = Annotated[
+    float, typer.Option(min=0.0, help="Share by which noise is written larger: days differ.")
+]
+CorrectionMargin = Annotated[
+    float,
+    typer.Option(
+        min=0.0, help="Share of a range's, bearing's or crawl's correction added to its noise."
+    ),
+]
+OutputTeamFile = Annotated[
+    Path, typer.Option(callback=options.writable_file, help="Team file to write.")
+]
+Sizes = Annotated[
+    str, typer.Option(help="Sizes of generated teams, in place of FILE, e.g. 2,10,50,200,1000.")
+]
+SimulatedDuration = Annotated[
+    Optional[float],
+    typer.Option(help="Seconds of robot time; default: 5 with --robots, else 30."),
+]
+TeamSeed = Annotated[int, typer.Option(help="Seed of the noise, and of generated teams.")]
+
+
 def evaluate_mrclam(
     data: Annotated[Path, typer.Argument(help="Folder of one data set, e.g. MRCLAM6.")],
-    team_file: Annotated[
-        Optional[Path],
-        typer.Option("--team", help="Team file; default: the built-in mrclam without this log."),
-    ] = None,
+    team_file: LogTeamFile = None,
     blind: Blind = "",
-    variant: Annotated[Optional[VariantName], typer.Option(help="For all robots.")] = None,
-    collaboration: Annotated[Optional[Kinds], typer.Option(help="For all robots.")] = None,
-    fusion: Annotated[Optional[FusionName], typer.Option(help="For all robots.")] = None,
-    direction: Annotated[Optional[DirectionName], typer.Option(help="For all robots.")] = None,
+    variant: Variant = None,
+    collaboration: Collaboration = None,
+    fusion: Fusion = None,
+    direction: Direction = None,
     bytes_per_s: BytesPerS = None,
     messages_per_minute: MessagesPerMinute = None,
     match_messages: MatchMessages = None,
-    duration: Annotated[
-        Optional[float], typer.Option(help="Seconds of the log; default: all.")
-    ] = None,
-    yardstick: Annotated[
-        bool,
-        typer.Option(help="Also dead reckoning, a solo EKF a robot, a centralized EKF."),
-    ] = False,
-    export: Annotated[
-        Optional[Path],
-        typer.Option(help="Write estimates and truth into this folder (TUM files, as evo reads)."),
-    ] = None,
+    duration: LogDuration = None,
+    baselines: WithBaselines = False,
+    export: ExportFolder = None,
     as_json: AsJson = False,
 ) -> None:
-    """Five robots of a real log (UTIAS MRCLAM) against its ground truth."""
+    """Evaluate five robots of a real log (UTIAS MRCLAM) against its ground truth."""
     from rich.console import Console
 
-    from cpcbl_launch.options import json_text, require_folder, write_or_reason
+    from cpcbl_launch.lab.evaluation import evaluate_log
+    from cpcbl_launch.overrides import Overrides, with_blind_robots, with_overrides
+    from cpcbl_launch.reporting.files import write_or_reason
     from cpcbl_launch.reporting.tum import export_tum
-    from cpcbl_launch.run import logged_team as real_logs
-    from cpcbl_launch.simulation.in_process import (
-        Overrides,
-        evaluate_log_with_paths,
-        with_overrides,
-    )
+    from cpcbl_launch.run import logged_team
     from cpcbl_launch.views.run import print_report, progress_bar
 
-    team = find_team(team_file or real_logs.builtin_for(data))
-    choice = Overrides(
-        variant,
-        collaboration,
-        fusion,
-        direction,
-        bytes_per_s,
-        messages_per_minute,
-        match_messages,
-    )
-    logged = real_logs.load_logged_team(with_overrides(team, choice), data)
-    logged = logged._replace(team=real_logs.with_blind_robots(logged.team, parse_names(blind)))
-    logged = real_logs.with_duration(logged, duration)
-    if export is not None:
-        require_folder("--export", export)
+    budgets = bytes_per_s, messages_per_minute, match_messages
+    overrides = Overrides(variant, collaboration, fusion, direction, *budgets)
+    team = with_overrides(find_team(team_file or logged_team.builtin_for(data)), overrides)
+    logged = logged_team.load_logged_team(team, data)
+    logged = logged._replace(team=with_blind_robots(logged.team, parse_names(blind)))
+    logged = logged_team.with_duration(logged, duration)
     with progress_bar(f"{data.name}", quiet=as_json) as progress:
-        result, paths = evaluate_log_with_paths(logged, progress, with_yardsticks=yardstick)
+        result, paths = evaluate_log(logged, progress, with_baselines=baselines)
     lost: dict[str, str] = {}
-    if (folder := export) is not None:
-        lost |= write_or_reason(folder, lambda: export_tum(folder, paths, logged.truth))
-    if as_json:
-        typer.echo(json_text(result))
-    else:
-        print_report(result, Console())
+    if export is not None:
+        lost = write_or_reason(export, partial(export_tum, export, paths, logged.truth))
+    print_result(result, as_json, lambda: print_report(result, Console()))
     print_not_written(lost)
 
 
@@ -119,28 +146,11 @@ def calibrate(
     logs: Annotated[
         list[Path], typer.Argument(help="MRCLAM folders, or recordings of `up --record` (.mcap).")
     ],
-    team_file: Annotated[
-        Optional[Path],
-        typer.Option(
-            "--team",
-            help="Team file to add types to; default: the recorded team, or mrclam-uncalibrated.",
-        ),
-    ] = None,
-    output: Annotated[Path, typer.Option(help="Team file to write.")] = Path("calibrated.toml"),
-    margin: Annotated[
-        float,
-        typer.Option(min=0.0, help="Share by which noise is written larger: days differ."),
-    ] = 0.25,
-    correction_margin: Annotated[
-        float,
-        typer.Option(
-            min=0.0, help="Share of a range's, bearing's or crawl's correction added to its noise."
-        ),
-    ] = 0.5,
-    picture: Annotated[
-        Optional[Path],
-        typer.Option(help="Draw residuals into this file (PNG or SVG; extra `plot`)."),
-    ] = None,
+    team_file: CalibratedTeamFile = None,
+    output: OutputTeamFile = Path("calibrated.toml"),
+    margin: Margin = 0.25,
+    correction_margin: CorrectionMargin = 0.5,
+    picture: PictureFile = None,
     as_json: AsJson = False,
 ) -> None:
     """Estimate odometry and sensor errors from logs with truth, as types of a team file."""
@@ -150,18 +160,9 @@ def calibrate(
     from cpcbl_launch.calibration.robots import calibrated
     from cpcbl_launch.calibration.show import print_calibration
     from cpcbl_launch.calibration.team_text import base_text, team_text
-    from cpcbl_launch.options import (
-        json_text,
-        require_matplotlib,
-        require_writable_file,
-        write_or_reason,
-    )
+    from cpcbl_launch.reporting.files import write_or_reason
     from cpcbl_launch.views.run import progress_bar
 
-    require_writable_file("--output", output)
-    if picture is not None:
-        require_writable_file("--picture", picture)
-        require_matplotlib("--picture", picture)
     base, base_name = base_text(logs, team_file)
     names = [log.resolve().name for log in logs]
     robot_logs = read_logs(logs)
@@ -169,30 +170,21 @@ def calibrate(
         result = calibrated(robot_logs, names, progress)
     text = team_text(result, base, base_name, margin=margin, correction_margin=correction_margin)
     lost = write_or_reason(output, lambda: output.write_text(text, encoding="utf-8"))
-    if (drawing := picture) is not None:
+    if picture is not None:
         from cpcbl_launch.calibration.picture import draw_residuals
 
-        lost |= write_or_reason(drawing, lambda: draw_residuals(robot_logs, result, drawing))
-    if as_json:
-        typer.echo(json_text(result))
-    else:
-        print_calibration(result, Console())
-        if not lost:
-            typer.echo(f"written: {output}")
+        lost |= write_or_reason(picture, partial(draw_residuals, robot_logs, result, picture))
+    print_result(result, as_json, lambda: print_calibration(result, Console()))
+    if not as_json and not lost:
+        typer.echo(f"written: {output}")
     print_not_written(lost)
 
 
 def simulate(
     file: TeamArgument = None,
-    robots: Annotated[
-        str,
-        typer.Option(help="No FILE: generated teams of these sizes, e.g. 2,10,50,200,1000."),
-    ] = "",
-    duration: Annotated[
-        Optional[float],
-        typer.Option(help="Seconds of robot time; default: 5 with --robots, else 30."),
-    ] = None,
-    seed: Annotated[int, typer.Option(help="Of the noise, and of generated teams.")] = 1,
+    robots: Sizes = "",
+    duration: SimulatedDuration = None,
+    seed: TeamSeed = 1,
     bytes_per_s: BytesPerS = None,
     messages_per_minute: MessagesPerMinute = None,
     match_messages: MatchMessages = None,
@@ -202,30 +194,14 @@ def simulate(
 ) -> None:
     """Run a simulated team in one process, without Zenoh: deterministic for a seed.
 
-    With a team file: the report of `up`. With --robots: what a robot costs in
-    teams of each size, on a field that grows with them. Measured are the fixes
-    and beliefs that it sends and receives, and the CPU time of its own steps;
-    simulating the field is apart.
+    With a team file the command reports as `up` does. With --robots it reports
+    what a robot costs in teams of each size, on a field that grows with them:
+    the fixes and beliefs that a robot sends and receives, and the CPU time of
+    its own steps. The time that simulating the field takes does not count.
     """
-    from rich.console import Console
-
-    from cpcbl_launch.lab.scaling.measure import (
-        DURATION_S,
-        ScalingReport,
-        measure_sizes,
-        parse_sizes,
-    )
-    from cpcbl_launch.lab.scaling.show import print_scaling
-    from cpcbl_launch.options import (
-        json_text,
-        require_matplotlib,
-        require_team_opencv,
-        require_writable_file,
-        write_or_reason,
-    )
-    from cpcbl_launch.reporting.recorder import Report
+    from cpcbl_launch.checks import require_team_opencv
+    from cpcbl_launch.overrides import Overrides, with_overrides
     from cpcbl_launch.run.up import Run, simulate_run
-    from cpcbl_launch.simulation.in_process import Overrides, with_overrides
     from cpcbl_launch.views.run import print_report, progress_bar
 
     budgets = Overrides(
@@ -233,36 +209,47 @@ def simulate(
         messages_per_minute=messages_per_minute,
         match_messages=match_messages,
     )
-    if file is not None and robots:
-        raise InputError("simulate: FILE or --robots, which generates its teams; leave one out")
-    if robots and budgets != Overrides():
-        raise InputError("simulate: generated teams have no budgets; name a team file instead")
-    if report is not None:
-        require_writable_file("--report", report)
-    if picture is not None:
-        require_writable_file("--picture", picture)
-        require_matplotlib("--picture", picture)
-    result: Report | ScalingReport
+    if robots:
+        if file is not None:
+            raise InputError("simulate: FILE or --robots, which generates its teams; leave one out")
+        if budgets != Overrides():
+            raise InputError("simulate: generated teams have no budgets; name a team file instead")
+        _simulate_sizes(robots, duration, seed, report, picture, as_json)
+        return
+    from rich.console import Console
+
+    team = with_overrides(find_team(file or Path("demo")), budgets)
+    require_team_opencv(team, team.robots, field=True)
     with progress_bar("simulating", quiet=as_json) as progress:
-        if robots:
-            duration = DURATION_S if duration is None else duration
-            result = measure_sizes(parse_sizes(robots), seed, duration, progress)
-        else:
-            team = with_overrides(find_team(file or Path("demo")), budgets)
-            require_team_opencv(team, team.robots, field=True)
-            run = Run(team, duration, seed=seed, picture=picture)
-            result = simulate_run(run, progress)
+        result = simulate_run(Run(team, duration, seed=seed, picture=picture), progress)
+    lost = write_report(report, result) | result.not_written
+    print_result(result, as_json, lambda: print_report(result, Console()))
+    print_not_written(lost)
+
+
+def _simulate_sizes(
+    robots: str,
+    duration_s: float | None,
+    seed: int,
+    report: Path | None,
+    picture: Path | None,
+    as_json: bool,
+) -> None:
+    """Runs generated teams of each size, one after the other."""
+    from rich.console import Console
+
+    from cpcbl_launch.lab.scaling.measure import DURATION_S, measure_sizes, parse_sizes
+    from cpcbl_launch.lab.scaling.show import print_scaling
+    from cpcbl_launch.reporting.files import write_or_reason
+    from cpcbl_launch.views.run import progress_bar
+
+    duration_s = DURATION_S if duration_s is None else duration_s
+    with progress_bar("simulating", quiet=as_json) as progress:
+        result = measure_sizes(parse_sizes(robots), seed, duration_s, progress)
     lost = write_report(report, result)
-    if isinstance(result, Report):
-        lost |= result.not_written
-    elif (drawing := picture) is not None:
+    if picture is not None:
         from cpcbl_launch.lab.scaling.picture import draw_scaling
 
-        lost |= write_or_reason(drawing, lambda: draw_scaling(result, drawing))
-    if as_json:
-        sys.stdout.write(json_text(result) + "\n")
-    elif isinstance(result, ScalingReport):
-        print_scaling(result, Console())
-    else:
-        print_report(result, Console())
+        lost |= write_or_reason(picture, partial(draw_scaling, result, picture))
+    print_result(result, as_json, lambda: print_scaling(result, Console()))
     print_not_written(lost)

@@ -1,12 +1,13 @@
 """The command that joins a running team."""
 
-import sys
+import math
+from collections.abc import Mapping, Sequence
 from enum import StrEnum
-from pathlib import Path
 from typing import Annotated, Optional
 
 import typer
 
+from cpcbl_launch.commands import options
 from cpcbl_launch.commands.arguments import (
     BASE_IMAGE,
     AsJson,
@@ -16,9 +17,9 @@ from cpcbl_launch.commands.arguments import (
     Image,
     Parent,
     TeamFile,
+    print_result,
 )
 from cpcbl_launch.team_file import find_team
-from cpcbl_team.errors import InputError
 
 
 class SourceName(StrEnum):
@@ -26,33 +27,43 @@ class SourceName(StrEnum):
     external = "external"
 
 
+Name = Annotated[str, typer.Argument(help="Name of the observer, which no robot of the team has.")]
+At = Annotated[
+    str, typer.Option(help="Pose of the observer: X,Y[,HEADING_DEG] on the field, in metres.")
+]
+Sensor = Annotated[
+    str, typer.Option(help="survey, gps, or a TOML file with the keys of a robot's type.")
+]
+FieldOfView = Annotated[
+    Optional[float], typer.Option(help="Field of view in degrees; default: the sensor's.")
+]
+Move = Annotated[str, typer.Option(help="Waypoints of a simulated observer's loop: X,Y;X,Y...")]
+Source = Annotated[
+    Optional[SourceName],
+    typer.Option(help="external: your own driver feeds it; default: as the team's robots."),
+]
+Stay = Annotated[
+    Optional[float],
+    typer.Option(
+        "--for", callback=options.seconds_to_stay, help="Seconds to stay; default: until Ctrl-C."
+    ),
+]
+InContainer = Annotated[
+    bool, typer.Option("--container", help="Run it in a container of its own (needs Docker).")
+]
+
+
 def observer(
-    name: Annotated[str, typer.Argument(help="Its name in the team, one that nobody has.")],
+    name: Name,
     team_file: TeamFile,
-    at: Annotated[
-        str, typer.Option(help="Where it stands: X,Y[,HEADING_DEG] on the field, in metres.")
-    ],
-    sensor: Annotated[
-        str,
-        typer.Option(help="survey, gps, or a TOML file with the keys of a robot's type."),
-    ] = "survey",
-    fov: Annotated[
-        Optional[float], typer.Option(help="Field of view in degrees; default: the sensor's.")
-    ] = None,
-    move: Annotated[
-        str, typer.Option(help="Waypoints to drive loops through, simulated: X,Y;X,Y...")
-    ] = "",
-    source: Annotated[
-        Optional[SourceName],
-        typer.Option(help="external: your own driver feeds it; default: as the team's robots."),
-    ] = None,
+    at: At,
+    sensor: Sensor = "survey",
+    fov: FieldOfView = None,
+    move: Move = "",
+    source: Source = None,
     connect: Connect = None,
-    duration: Annotated[
-        Optional[float], typer.Option("--for", help="Seconds to stay; default: until Ctrl-C.")
-    ] = None,
-    container: Annotated[
-        bool, typer.Option("--container", help="In a container of its own (needs Docker).")
-    ] = False,
+    duration: Stay = None,
+    container: InContainer = False,
     image: Image = None,
     base_image: BaseImage = BASE_IMAGE,
     as_json: AsJson = False,
@@ -61,58 +72,41 @@ def observer(
 ) -> None:
     """Join a running team, from any machine, with a better sensor; leave when it is stopped.
 
-    The team file need not name it. Robots that it sees know better where they
-    are within a second. On a simulated field it gets a body at once.
+    The team file need not name the observer. Robots that it sees improve their
+    estimates within a second. On a simulated field it gets a body at once.
     """
     from rich.console import Console
 
     from cpcbl_agents.clock import Clock
     from cpcbl_agents.process import StopSignal
-    from cpcbl_launch.options import json_text
-    from cpcbl_launch.run.observer import (
-        ObserverRequest,
-        parse_pose,
-        parse_waypoints,
-        presets,
-        run_observer,
-        team_with_observer,
-    )
+    from cpcbl_launch.run import observer as run
     from cpcbl_launch.views.run import print_observer_report
 
-    if duration is not None and not duration > 0.0:
-        raise InputError(f"--for {duration:g}: more than 0 seconds")
+    kind, waypoints = None if source is None else str(source), run.parse_waypoints(move)
+    request = run.ObserverRequest(name, run.parse_pose(at), sensor, fov, waypoints, kind)
     file_team = find_team(team_file)
-    kind = None if source is None else str(source)
-    team = team_with_observer(
-        file_team, ObserverRequest(name, parse_pose(at), sensor, fov, parse_waypoints(move), kind)
-    )
+    team = run.team_with_observer(file_team, request)
     console, stop = Console(stderr=as_json), StopSignal(parent)
     endpoints = connect or team.transport.connect
     if container:
-        from cpcbl_launch.run.containers.guest import SENSOR_INSIDE, run_observer_container
+        from cpcbl_launch.run.containers.guest import run_observer_container
         from cpcbl_launch.run.containers.image import ensure_image
         from cpcbl_launch.run.containers.launch import line_printer
 
-        own = None if sensor in presets() else Path(sensor)
-        arguments = _options(
-            *(("at", at), ("sensor", SENSOR_INSIDE if own else sensor), ("fov", fov)),
-            *(("move", move), ("source", kind), ("for", duration), ("clock", clock)),
-            *(("connect", endpoint) for endpoint in endpoints),
-        )
-        arguments += ["--json"] if as_json else []
-        built = image or ensure_image(base_image, stop, line_printer(console))
-        raise typer.Exit(run_observer_container(name, file_team, arguments, own, built, stop))
-    said = f"{name} joins team {team.name} at {', '.join(endpoints)}; Ctrl-C: it leaves"
-    console.print(said, style="dim", highlight=False, soft_wrap=True)
+        given = {"at": at, "fov": fov, "move": move, "source": kind, "for": duration}
+        arguments = _arguments(given | {"clock": clock}, endpoints, as_json)
+        image = image or ensure_image(base_image, stop, line_printer(console))
+        raise typer.Exit(run_observer_container(name, file_team, sensor, arguments, image, stop))
+    text = f"{name} joins team {team.name} at {', '.join(endpoints)}; Ctrl-C: it leaves"
+    console.print(text, style="dim", highlight=False, soft_wrap=True)
     when = Clock.parse(clock) if clock else Clock.wall()
-    limit = float("inf") if duration is None else duration
-    result = run_observer(name, team, endpoints, when, stop, limit)
-    if as_json:
-        sys.stdout.write(json_text(result) + "\n")
-    else:
-        print_observer_report(result, console)
+    limit = math.inf if duration is None else duration
+    result = run.run_observer(name, team, endpoints, when, stop, limit)
+    print_result(result, as_json, lambda: print_observer_report(result, console))
 
 
-def _options(*given: tuple[str, object]) -> list[str]:
-    """As they are typed; what was not given is left out."""
-    return [f"--{name}={value}" for name, value in given if value not in (None, "")]
+def _arguments(given: Mapping[str, object], endpoints: Sequence[str], as_json: bool) -> list[str]:
+    """The options as a user types them; those that were not given are left out."""
+    texts = [f"--{name}={value}" for name, value in given.items() if value not in (None, "")]
+    texts += [f"--connect={endpoint}" for endpoint in endpoints]
+    return [*texts, "--json"] if as_json else texts

@@ -1,14 +1,14 @@
 """Commands that run a team, or a part of one."""
 
 import shlex
-import sys
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Optional
+from typing import TYPE_CHECKING, Annotated, Optional
 
 import typer
 
+from cpcbl_launch.commands import options
 from cpcbl_launch.commands.arguments import (
     BASE_IMAGE,
     AsJson,
@@ -21,23 +21,75 @@ from cpcbl_launch.commands.arguments import (
     MatchMessages,
     MessagesPerMinute,
     Parent,
+    PictureFile,
     ReportFile,
     TeamFile,
-    endpoints,
     parse_names,
     parse_robots,
     print_not_written,
+    print_result,
     write_report,
 )
 from cpcbl_launch.team_file import find_team
 from cpcbl_team.errors import InputError
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from cpcbl_launch.overrides import Overrides
+    from cpcbl_launch.run.up import Launch, Run
+
+UpFile = Annotated[
+    Optional[Path], typer.Argument(help="Team file, or a built-in one: demo (default), mrclam.")
+]
+UpDuration = Annotated[
+    Optional[float],
+    typer.Option(help="Seconds of robot time; default: 30 simulated, or the whole log."),
+]
+Speed = Annotated[
+    float, typer.Option(callback=options.speed, help="Times real time, at least 0.05.")
+]
+NoiseSeed = Annotated[int, typer.Option(help="Seed of the simulated noise.")]
+LogFolder = Annotated[
+    Optional[Path], typer.Option(help="Folder of an MRCLAM log, for source mrclam.")
+]
+Robots = Annotated[str, typer.Option(help="Robots to start on this machine; default: all.")]
+RecordFile = Annotated[
+    Optional[Path],
+    typer.Option(
+        callback=options.writable_file,
+        help="File to record inputs, tracks, images, status and truth into (MCAP).",
+    ),
+]
+ProcessLogs = Annotated[
+    Optional[Path],
+    typer.Option(callback=options.folder, help="Folder for the logs of the processes."),
+]
+InContainersOption = Annotated[
+    bool, typer.Option("--containers", help="Start one container per robot (needs Docker).")
+]
+Listen = Annotated[
+    Optional[list[str]],
+    typer.Option(
+        callback=options.endpoints,
+        help="Endpoint to listen at; default: the file's, else tcp/127.0.0.1:7447.",
+    ),
+]
+OtherSite = Annotated[
+    Optional[list[str]],
+    typer.Option(
+        callback=options.endpoints, help="Endpoint of another site's router to connect to."
+    ),
+]
+ConfigFile = Annotated[
+    Optional[Path], typer.Option(help="A configuration of Zenoh (JSON5), in place of FILE.")
+]
 
 
 def check(
     file: Annotated[Path, typer.Argument(help="Team file (TOML).")],
 ) -> None:
     """Validate a team file without starting anything."""
-
     team = find_team(file)
     marks, walls = len(team.map.landmarks), len(team.map.walls)
     typer.echo(
@@ -47,40 +99,21 @@ def check(
 
 
 def up(
-    file: Annotated[
-        Optional[Path], typer.Argument(help="Team file, or a built-in one: demo (default), mrclam.")
-    ] = None,
-    duration: Annotated[
-        Optional[float],
-        typer.Option(help="Seconds of robot time; default: 30 simulated, or the whole log."),
-    ] = None,
-    speed: Annotated[float, typer.Option(help="Times real time, from 0.05 on.")] = 1.0,
-    seed: Annotated[int, typer.Option(help="Of the simulated noise.")] = 1,
-    data: Annotated[
-        Optional[Path], typer.Option(help="Folder of an MRCLAM log, for source mrclam.")
-    ] = None,
+    file: UpFile = None,
+    duration: UpDuration = None,
+    speed: Speed = 1.0,
+    seed: NoiseSeed = 1,
+    data: LogFolder = None,
     blind: Blind = "",
-    robots: Annotated[
-        str, typer.Option(help="Robots to start on this machine; default: all.")
-    ] = "",
+    robots: Robots = "",
     bytes_per_s: BytesPerS = None,
     messages_per_minute: MessagesPerMinute = None,
     match_messages: MatchMessages = None,
     report: ReportFile = None,
-    picture: Annotated[
-        Optional[Path],
-        typer.Option(help="Draw paths and errors into this file (PNG or SVG; extra `plot`)."),
-    ] = None,
-    record: Annotated[
-        Optional[Path],
-        typer.Option(help="Record inputs, tracks, what cameras see, status and truth (MCAP)."),
-    ] = None,
-    logs: Annotated[
-        Optional[Path], typer.Option(help="Keep the processes' logs in this folder.")
-    ] = None,
-    containers: Annotated[
-        bool, typer.Option("--containers", help="A container a robot (needs Docker).")
-    ] = False,
+    picture: PictureFile = None,
+    record: RecordFile = None,
+    logs: ProcessLogs = None,
+    containers: InContainersOption = False,
     image: Image = None,
     base_image: BaseImage = BASE_IMAGE,
     as_json: AsJson = False,
@@ -89,95 +122,79 @@ def up(
     from rich.console import Console
 
     from cpcbl_agents.process import StopSignal
-    from cpcbl_launch.options import (
-        check_duration,
-        check_speed,
-        json_text,
-        require_folder,
-        require_matplotlib,
-        require_team_opencv,
-        require_writable_file,
-    )
-    from cpcbl_launch.run import logged_team as real_logs
-    from cpcbl_launch.run.up import (
-        LEAST_S,
-        SIMULATED_S,
-        Launch,
-        OnThisMachine,
-        Run,
-        local_endpoint,
-        run_team,
-        with_listen_endpoint,
-    )
-    from cpcbl_launch.simulation.in_process import Overrides, with_overrides
+    from cpcbl_launch.overrides import Overrides, with_blind_robots
+    from cpcbl_launch.run.up import local_endpoint, run_team
     from cpcbl_launch.views.run import LiveTable, print_report
 
-    check_speed(speed)
-    if duration is not None:
-        check_duration(duration, LEAST_S)
-    typed = file or Path("demo")
-    if file == Path("mrclam") and data is not None and not file.exists():
-        file = real_logs.builtin_for(data)
-    team = with_listen_endpoint(find_team(file or Path("demo")))
     budgets = Overrides(
         bytes_per_s=bytes_per_s,
         messages_per_minute=messages_per_minute,
         match_messages=match_messages,
     )
-    team = with_overrides(team, budgets)
-    for option, path in (("--report", report), ("--picture", picture), ("--record", record)):
-        if path is not None:
-            require_writable_file(option, path)
-    if picture is not None:
-        require_matplotlib("--picture", picture)
-    if logs is not None:
-        require_folder("--logs", logs)
-    run = Run(team, duration, speed, seed, folder=logs, picture=picture, record=record)
-    if any(robot.source == "mrclam" for robot in team.robots.values()):
-        logged = real_logs.load_logged_team(team, Path(data or team.data or "."))
-        logged = real_logs.with_duration(logged, duration)
-        run = run._replace(
-            team=logged.team,
-            truth=logged.truth,
-            left_out=logged.left_out,
-            epoch_ns=logged.start_ns,
-            duration_s=(logged.end_ns - logged.start_ns) * 1e-9,
-        )
-    elif duration is None:
-        run = run._replace(duration_s=SIMULATED_S)
-    run = run._replace(team=real_logs.with_blind_robots(run.team, parse_names(blind)))
+    run = _run_of(file, duration, data, budgets)._replace(
+        speed=speed, seed=seed, folder=logs, picture=picture, record=record
+    )
+    run = run._replace(team=with_blind_robots(run.team, parse_names(blind)))
     if robots:
         run = run._replace(here=parse_robots("--robots", robots, run.team))
     console = Console(stderr=as_json)
-    launch: Launch = OnThisMachine
-    if not containers:
-        require_team_opencv(run.team, run.team.robots if run.here is None else run.here, field=True)
-    else:
-        from cpcbl_launch.run.containers.launch import InContainers, line_printer
-
-        launch = partial(InContainers, image=image, base=base_image, said=line_printer(console))
-    title = f"team {team.name}, {len(run.team.robots)} robots, {speed:g} x real time"
-    watch = [
-        "cpcbl-team",
-        "traffic",
-        str(typed),
-        "--connect",
-        local_endpoint(team.transport.listen[0]),
-    ]
+    launch = _launch(run, containers, image, base_image, console)
+    endpoint = local_endpoint(run.team.transport.listen[0])
+    watch = ["cpcbl-team", "traffic", str(file or "demo"), "--connect", endpoint]
     console.print(f"watch it: {shlex.join(watch)}", style="dim", highlight=False, soft_wrap=True)
+    title = f"team {run.team.name}, {len(run.team.robots)} robots, {speed:g} x real time"
     with LiveTable(title, run.team.robots, console, quiet=as_json) as table:
         result = run_team(run, table, StopSignal(), launch)
     lost = dict(result.not_written) | write_report(report, result)
-    if as_json:
-        sys.stdout.write(json_text(result) + "\n")
-    else:
-        print_report(result, console)
+    print_result(result, as_json, lambda: print_report(result, console))
     print_not_written(lost)
+
+
+def _run_of(
+    file: Path | None, duration_s: float | None, data: Path | None, budgets: "Overrides"
+) -> "Run":
+    """The run of a simulated team, or of a team on the log that it replays."""
+    from cpcbl_launch.checks import require_duration
+    from cpcbl_launch.overrides import with_overrides
+    from cpcbl_launch.run import logged_team
+    from cpcbl_launch.run.up import LEAST_S, SIMULATED_S, Run, with_listen_endpoint
+
+    if duration_s is not None:
+        require_duration(duration_s, LEAST_S)
+    if file == Path("mrclam") and data is not None and not file.exists():
+        file = logged_team.builtin_for(data)
+    team = with_overrides(with_listen_endpoint(find_team(file or Path("demo"))), budgets)
+    if all(robot.source != "mrclam" for robot in team.robots.values()):
+        return Run(team, SIMULATED_S if duration_s is None else duration_s)
+    logged = logged_team.load_logged_team(team, Path(data or team.data or "."))
+    logged = logged_team.with_duration(logged, duration_s)
+    return Run(
+        logged.team,
+        (logged.end_ns - logged.start_ns) * 1e-9,
+        truth=logged.truth,
+        left_out=logged.left_out,
+        epoch_ns=logged.start_ns,
+    )
+
+
+def _launch(
+    run: "Run", containers: bool, image: str | None, base_image: str, console: "Console"
+) -> "Launch":
+    """What starts the processes: this machine, or Docker."""
+    if containers:
+        from cpcbl_launch.run.containers.launch import InContainers, line_printer
+
+        return partial(InContainers, image=image, base=base_image, said=line_printer(console))
+    from cpcbl_launch.checks import require_team_opencv
+    from cpcbl_launch.run.up import OnThisMachine
+
+    require_team_opencv(run.team, run.team.robots if run.here is None else run.here, field=True)
+    return OnThisMachine
 
 
 def field(
     team_file: TeamFile,
-    seed: Annotated[int, typer.Option(help="Of the noise.")] = 1,
+    seed: NoiseSeed = 1,
     connect: Connect = None,
     site: Annotated[
         Optional[list[str]],
@@ -191,7 +208,7 @@ def field(
 
     from cpcbl_agents.clock import Clock
     from cpcbl_agents.process import StopSignal
-    from cpcbl_launch.options import require_team_opencv
+    from cpcbl_launch.checks import require_team_opencv
     from cpcbl_launch.simulation.field_node import parse_sites, run_field
     from cpcbl_transport.bus import Bus
     from cpcbl_transport.security import Identity, link_of
@@ -218,20 +235,9 @@ def field(
 
 def router(
     file: Annotated[Optional[Path], typer.Argument(help="Team file.")] = None,
-    listen: Annotated[
-        Optional[list[str]],
-        typer.Option(
-            callback=endpoints,
-            help="Endpoint to listen at; default: the file's, else tcp/127.0.0.1:7447.",
-        ),
-    ] = None,
-    connect: Annotated[
-        Optional[list[str]],
-        typer.Option(callback=endpoints, help="Endpoint of another site's router to join."),
-    ] = None,
-    config: Annotated[
-        Optional[Path], typer.Option(help="No FILE: a configuration of Zenoh (JSON5).")
-    ] = None,
+    listen: Listen = None,
+    connect: OtherSite = None,
+    config: ConfigFile = None,
     speed: Annotated[float, typer.Option(hidden=True, help="Guards let more in.")] = 1.0,
     parent: Parent = None,
     print_config: Annotated[
@@ -248,15 +254,13 @@ def router(
     if config is not None and (listen or connect):
         raise InputError(f"--config {config}: says where it listens and connects; change it there")
     if config is not None:
-        title, options = f"router of {config}", read_router_config(config)
+        title, settings = f"router of {config}", read_router_config(config)
     else:
         assert file is not None
         team = find_team(file)
-        title, options = (
-            f"router of team {team.name}",
-            team_router(team, listen or (), connect or (), speed),
-        )
+        title = f"router of team {team.name}"
+        settings = team_router(team, listen or (), connect or (), speed)
     if print_config:
-        typer.echo(config_text(options, title))
+        typer.echo(config_text(settings, title))
     else:
-        run_router(options, title, StopSignal(parent))
+        run_router(settings, title, StopSignal(parent))

@@ -3,14 +3,14 @@
 import itertools
 import logging
 import math
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Optional
 
 import typer
 
-from cpcbl_launch.commands.arguments import Connect, TeamArgument, TeamFile
+from cpcbl_launch.commands import options
+from cpcbl_launch.commands.arguments import Connect, TeamArgument, TeamFile, print_result
 from cpcbl_launch.team_file import find_team
 from cpcbl_team.errors import InputError
 
@@ -26,52 +26,48 @@ def traffic(
     ] = None,
     connect: Connect = None,
     duration: Annotated[
-        Optional[float], typer.Option("--for", help="Seconds to watch; default: until Ctrl-C.")
+        Optional[float],
+        typer.Option(
+            "--for",
+            callback=options.seconds_to_stay,
+            help="Seconds to watch; default: until Ctrl-C.",
+        ),
     ] = None,
     wait: Annotated[
         float, typer.Option(min=0.1, help="Seconds to wait for the team's router.")
     ] = 5.0,
     as_json: Annotated[
-        bool, typer.Option("--json", help="Print what was seen last as JSON, at the end.")
+        bool, typer.Option("--json", help="Print the last state as JSON, at the end.")
     ] = False,
 ) -> None:
     """Watch a running team, from any machine: who helps whom, and what it costs.
 
-    Listens to the robots' status (1 Hz) only, never to fixes or beliefs: these
-    are sent where somebody listens, and watching must not cause any.
+    Subscribes to the robots' status (1 Hz) only. A subscription to fixes or
+    beliefs would make robots send them.
     """
     from rich.console import Console
 
     from cpcbl_agents.process import StopSignal
-    from cpcbl_launch.options import json_text
     from cpcbl_launch.views.traffic.show import TrafficView, traffic_view
     from cpcbl_launch.views.traffic.watch import WatchRequest, watch_team
     from cpcbl_team.config import TransportSettings
     from cpcbl_transport.security import Identity, Link, link_of
     from cpcbl_transport.topics import Role
 
-    if duration is not None and not duration > 0.0:
-        raise InputError(f"--for {duration:g}: more than 0 seconds")
     logging.getLogger("cpcbl_transport").setLevel(logging.WARNING)
-    team = None if team_name is not None and file is None else find_team(file or Path("demo"))
-    endpoints = connect or (team.transport if team is not None else TransportSettings()).connect
-    link = Link(tuple(endpoints))
-    if team is not None:
+    limit_s = math.inf if duration is None else duration
+    if team_name is not None and file is None:
+        endpoints = connect or TransportSettings().connect
+        request = WatchRequest(team_name, (), Link(tuple(endpoints)), limit_s, wait)
+    else:
+        team = find_team(file or Path("demo"))
+        endpoints = connect or team.transport.connect
         link = link_of(team, Identity(Role.OPERATOR), endpoints)
-    watch = WatchRequest(
-        team_name or (team.name if team is not None else ""),
-        () if team is None else tuple(team.robots),
-        link,
-        math.inf if duration is None else duration,
-        wait,
-    )
+        request = WatchRequest(team_name or team.name, tuple(team.robots), link, limit_s, wait)
     console, where = Console(), ", ".join(endpoints)
     with TrafficView(where, console, quiet=as_json) as view:
-        result = watch_team(watch, view, StopSignal())
-    if as_json:
-        sys.stdout.write(json_text(result) + "\n")
-    else:
-        console.print(traffic_view(result, where))
+        result = watch_team(request, view, StopSignal())
+    print_result(result, as_json, lambda: console.print(traffic_view(result, where)))
 
 
 def look(
@@ -101,12 +97,12 @@ def look(
     """
     from rich.console import Console
 
-    from cpcbl_launch.options import json_text, require_folder, require_team_opencv
+    from cpcbl_launch.checks import require_robots, require_team_opencv
+    from cpcbl_launch.commands.options import require_folder
     from cpcbl_launch.views.frames.report import LookReport, print_look, reported, written
 
     team = find_team(team_file)
-    if robot not in team.robots:
-        raise InputError(f"look {robot}: not in {team_file}; it has: {', '.join(team.robots)}")
+    require_robots(f"{team_file}", [robot], team)
     if team.robots[robot].sensing != "camera":
         raise InputError(f'look {robot}: has no camera in {team_file}; set sensing = "camera"')
     if pictures is not None:
@@ -119,8 +115,7 @@ def look(
         reports.append(reported(one, frame, written(one, folder, name)))
         if not as_json:
             print_look(reports[-1], console)
-    if as_json:
-        sys.stdout.write(json_text(reports) + "\n")
+    print_result(reports, as_json, lambda: None)
 
 
 def _looks(

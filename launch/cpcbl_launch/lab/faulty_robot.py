@@ -25,8 +25,8 @@ from typing import NamedTuple
 
 import msgspec
 
-from cpcbl_launch.robot import robot_parser, run_robot_command
 from cpcbl_launch.run.processes import PROGRAM
+from cpcbl_launch.run.robot import robot_parser, run_robot_command
 from cpcbl_team.errors import CpcblError, InputError
 from cpcbl_team.inputs import Belief, Fix
 from cpcbl_transport.bus import Bus, Publisher

@@ -26,6 +26,7 @@ from cpcbl_launch.reporting.metrics import (
     seconds,
 )
 from cpcbl_launch.reporting.trust_report import TrustReport, trust_reports
+from cpcbl_team.config import Team
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus
 from cpcbl_transport.decoding import decode
@@ -258,6 +259,11 @@ class Recorder:
             spending=summed_spending(s.spending for s in statuses),
             trust=trust_reports(statuses),
         )
+
+
+def variants_of(team: Team) -> dict[str, str]:
+    """The variant of the localizer of each robot."""
+    return {name: robot.localizer.variant for name, robot in team.robots.items()}
 
 
 def truth_rows(truths: Iterable[Truths]) -> dict[str, Floats]:

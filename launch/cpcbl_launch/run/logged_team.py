@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 
 from cpcbl_agents.sources import mrclam
-from cpcbl_launch.options import check_duration
+from cpcbl_launch.checks import require_duration
 from cpcbl_launch.reporting.metrics import Floats, interpolated_truth
 from cpcbl_launch.team_file import builtin_path
 from cpcbl_team.config import Field, Start, Team
@@ -83,7 +83,7 @@ def with_duration(logged: LoggedTeam, duration_s: float | None) -> LoggedTeam:
     """The same log, of which only so much is used; None: all of it. Raises InputError."""
     if duration_s is None:
         return logged
-    check_duration(duration_s, LEAST_S)
+    require_duration(duration_s, LEAST_S)
     return logged._replace(end_ns=min(logged.end_ns, logged.start_ns + int(duration_s * 1e9)))
 
 
@@ -117,21 +117,3 @@ def _start(folder: Path, robot: str, truth: Floats) -> Start | None:
     pose, _ = interpolated_truth(np.array([first_truth_ns * 1e-9]), truth)
     x, y, heading = Pose2(*pose[0].tolist()) @ reckoned.inverse()
     return Start(x_m=x, y_m=y, heading_deg=math.degrees(heading), sigma_m=0.05 + 0.1 * way)
-
-
-def with_blind_robots(team: Team, blind: Collection[str]) -> Team:
-    """The team with some robots blind to landmarks. Raises InputError for an unknown name."""
-    unknown = sorted(set(blind) - set(team.robots))
-    if unknown:
-        raise InputError(
-            f"no robot {', '.join(unknown)} to blind; there are {', '.join(team.robots)}"
-        )
-    robots = {
-        name: msgspec.structs.replace(
-            robot, sensor=msgspec.structs.replace(robot.sensor, sees_landmarks=False)
-        )
-        if name in blind
-        else robot
-        for name, robot in team.robots.items()
-    }
-    return msgspec.structs.replace(team, robots=robots)

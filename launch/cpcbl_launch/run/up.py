@@ -15,10 +15,11 @@ import msgspec
 import numpy as np
 
 from cpcbl_agents.clock import Clock
-from cpcbl_launch.options import check_duration, write_or_reason
+from cpcbl_launch.checks import require_duration
+from cpcbl_launch.reporting.files import write_or_reason
 from cpcbl_launch.reporting.metrics import Floats
 from cpcbl_launch.reporting.phases import Span, guest_reports, phase_report
-from cpcbl_launch.reporting.recorder import Recorder, Report
+from cpcbl_launch.reporting.recorder import Recorder, Report, variants_of
 from cpcbl_launch.reporting.recording import Recording
 from cpcbl_launch.run.logged_team import is_calibrated_on
 from cpcbl_launch.run.processes import process_table, tasks
@@ -160,7 +161,7 @@ def simulate_run(run: Run, progress: Progress | None = None) -> Report:
                 " `evaluate` for a log"
             )
     duration_s = SIMULATED_S if run.duration_s is None else run.duration_s
-    check_duration(duration_s, LEAST_S)
+    require_duration(duration_s, LEAST_S)
     _, recorder = simulate(run.team, run.seed, duration_s, progress=progress)
     return _report(run, recorder, 0.0, duration_s, {})
 
@@ -222,7 +223,6 @@ def _report(
     truth = run.truth or recorder.simulated_truth()
     after_s = max(robot.collaboration.after_s for robot in robots.values())
     helped_from_s = epoch_s + after_s if after_s else None
-    variants = {name: robot.localizer.variant for name, robot in robots.items()}
     begin_s = -np.inf if helped_from_s is None else helped_from_s
     guests = guest_reports(recorder, list(robots), truth, epoch_s, begin_s)
     lost: dict[str, str] = {}
@@ -232,7 +232,7 @@ def _report(
         present_s = {name: guest.present_s for name, guest in guests.items()}
         drawn = partial(draw_run, recorder, run.team, truth, picture, epoch_s, helped_from_s)
         lost = write_or_reason(picture, partial(drawn, present_s))
-    report = recorder.report(variants, truth, begin_s)
+    report = recorder.report(variants_of(run.team), truth, begin_s)
     alone = {}
     if helped_from_s is not None:
         until = [Span(until_s=helped_from_s)]

@@ -16,6 +16,7 @@ from msgspec.structs import replace
 
 from cpcbl_agents.clock import Clock
 from cpcbl_agents.sensing import SensorInput
+from cpcbl_launch.checks import require_robots
 from cpcbl_launch.simulation.field import SimulatedField
 from cpcbl_launch.simulation.guest_bodies import GuestBodies
 from cpcbl_launch.team_file import endpoint_problem
@@ -169,10 +170,7 @@ def parse_sites(sites: Iterable[str], team: Team) -> dict[str, list[str]]:
         if reason := endpoint_problem(endpoint):
             raise InputError(f"--site {text}: {reason}")
         found[endpoint] = [name.strip() for name in names.split(",")]
-        for name in found[endpoint]:
-            if name not in team.robots:
-                known = ", ".join(team.robots)
-                raise InputError(f"--site {text}: no robot {name!r}; there are {known}")
+        require_robots(f"--site {text}", found[endpoint], team)
     return found
 
 

@@ -4,18 +4,12 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from pathlib import Path
 from types import MappingProxyType
-from typing import NamedTuple, Protocol
-
-import msgspec
+from typing import Protocol
 
 from cpcbl_agents.composition import build_robot
 from cpcbl_agents.node import Node, Steppable
-from cpcbl_launch.lab.baselines import baseline_inputs, baseline_report, run_baselines
-from cpcbl_launch.options import check_limit
-from cpcbl_launch.reporting.metrics import Trajectory
-from cpcbl_launch.reporting.recorder import Recorder, Report
+from cpcbl_launch.reporting.recorder import Recorder, Report, variants_of
 from cpcbl_launch.reporting.recording import Recording
-from cpcbl_launch.run.logged_team import LoggedTeam, is_calibrated_on, with_duration
 from cpcbl_launch.simulation.field import SimulatedField
 from cpcbl_launch.simulation.field_node import FieldNode
 from cpcbl_launch.simulation.scheduled_guests import ScheduledGuest, ScheduledGuestNode
@@ -25,97 +19,6 @@ from cpcbl_transport.memory_bus import MemoryHub
 
 Progress = Callable[[float], None]
 BusWrapper = Callable[[Bus], Bus]
-
-
-class Overrides(NamedTuple):
-    """What a command line sets for all robots; None leaves the team file's value."""
-
-    variant: str | None = None
-    collaboration: str | None = None  # none, passive, active, both
-    fusion: str | None = None
-    direction: str | None = None
-    bytes_per_s: float | None = None  # of each robot
-    messages_per_minute: float | None = None  # of each robot
-    match_messages: int | None = None  # of the team
-
-
-def with_overrides(team: Team, choice: Overrides) -> Team:
-    """The team with these choices made for all its robots. Raises InputError for a bad limit."""
-    rules: dict[str, object] = {}
-    limits = {}
-    for name in ("bytes_per_s", "messages_per_minute"):
-        if (limit := getattr(choice, name)) is not None:
-            check_limit(f"--{name.replace('_', '-')}", limit)
-            limits[name] = limit
-    if choice.collaboration is not None:
-        rules["passive"] = choice.collaboration in ("passive", "both")
-        rules["active"] = choice.collaboration in ("active", "both")
-    for name in ("fusion", "direction"):
-        if getattr(choice, name) is not None:
-            rules[name] = str(getattr(choice, name))
-    local = {} if choice.variant is None else {"variant": str(choice.variant)}
-    replace = msgspec.structs.replace
-    robots = {
-        name: replace(
-            robot,
-            localizer=replace(robot.localizer, **local),
-            collaboration=replace(
-                robot.collaboration, budget=replace(robot.collaboration.budget, **limits), **rules
-            ),
-        )
-        for name, robot in team.robots.items()
-    }
-    match = {} if choice.match_messages is None else {"messages": choice.match_messages}
-    return replace(team, robots=robots, match=replace(team.match, **match))
-
-
-class LogEvaluation(NamedTuple):
-    """The figures of a log, and the estimates that they are about."""
-
-    report: Report
-    paths: dict[str, dict[str, Trajectory]]
-    """By filter (`estimate`: the team's, then the yardsticks'), then by robot."""
-
-
-def evaluate_log(
-    logged: LoggedTeam, duration_s: float | None = None, progress: Progress | None = None
-) -> Report:
-    """All robots of a log, scored against its truth."""
-    return evaluate_log_with_paths(with_duration(logged, duration_s), progress).report
-
-
-def evaluate_log_with_paths(
-    logged: LoggedTeam, progress: Progress | None = None, *, with_yardsticks: bool = False
-) -> LogEvaluation:
-    """The same with its paths, and if wished with yardsticks on the same inputs and times."""
-    show, half = progress or (lambda done: None), 0.5 if with_yardsticks else 1.0
-    report, recorder = _run_log(logged, lambda done: show(half * done))
-    own = {name: recorder.trajectory(name) for name in logged.team.robots}
-    if not with_yardsticks:
-        return LogEvaluation(report, {"estimate": own})
-    stamps_ns = {name: path.stamps_ns.tolist() for name, path in own.items()}
-    inputs, field = baseline_inputs(logged), logged.team.map
-    others = run_baselines(inputs, field, stamps_ns, lambda done: show(half + half * done))
-    figures = {kind: baseline_report(paths, logged.truth) for kind, paths in others.items()}
-    report = msgspec.structs.replace(report, yardsticks=figures)
-    return LogEvaluation(report, {"estimate": own, **others})
-
-
-def _run_log(logged: LoggedTeam, progress: Progress) -> tuple[Report, Recorder]:
-    team, start_ns, end_ns = logged.team, logged.start_ns, logged.end_ns
-    hub = MemoryHub()
-    recorder = Recorder(hub.session())
-    run_nodes(robot_nodes(team, hub, start_ns), start_ns, end_ns, progress)
-    variants = {name: robot.localizer.variant for name, robot in team.robots.items()}
-    report = recorder.report(variants, logged.truth)
-    duration_s = (end_ns - start_ns) * 1e-9
-    return msgspec.structs.replace(
-        report,
-        calibrated_on=team.calibrated_on,
-        seen_before=is_calibrated_on(team, Path(team.data)),
-        left_out=logged.left_out,
-        duration_s=duration_s,
-    ), recorder
 
 
 class Referee(Protocol):
@@ -159,8 +62,7 @@ def simulate(
 
 def simulated_report(recorder: Recorder, team: Team) -> Report:
     """The figures of a simulated team, from its start on."""
-    variants = {name: robot.localizer.variant for name, robot in team.robots.items()}
-    return recorder.report(variants, recorder.simulated_truth())
+    return recorder.report(variants_of(team), recorder.simulated_truth())
 
 
 def robot_nodes(

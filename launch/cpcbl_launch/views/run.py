@@ -9,7 +9,6 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 from rich.text import Text
 
-from cpcbl_launch.reporting.live import LiveView
 from cpcbl_launch.reporting.metrics import Score
 from cpcbl_launch.reporting.phases import AWAY_S
 from cpcbl_launch.reporting.recorder import (
@@ -26,6 +25,7 @@ from cpcbl_launch.reporting.trust_report import distrust_text, trust_remarks
 from cpcbl_launch.run.observer import ObserverReport
 from cpcbl_launch.run.processes import ROBOT
 from cpcbl_launch.run.supervisor import Processes
+from cpcbl_launch.views.live import LiveView
 from cpcbl_launch.views.traffic.show import COLUMNS_EXPLAINED, help_traffic_table, limits_text
 from cpcbl_team.collaboration import LOWEST_TIER
 from cpcbl_transport.messages import Status, Track, Truth

@@ -20,8 +20,9 @@ from cpcbl_launch.calibration.robots import Calibration, RobotCalibration, calib
 from cpcbl_launch.calibration.sensor import calibrate_sensor
 from cpcbl_launch.calibration.statistics import Estimate, decimals, robust_fit, told, variance_parts
 from cpcbl_launch.calibration.team_text import INTERVAL_S, changed_keys, team_text
+from cpcbl_launch.overrides import Overrides, with_overrides
 from cpcbl_launch.reporting.recording import read_recording
-from cpcbl_launch.simulation.in_process import Overrides, simulate, with_overrides
+from cpcbl_launch.simulation.in_process import simulate
 from cpcbl_launch.team_file import TeamFileError, load_team, parse_team
 from cpcbl_team.config import (
     Field,

@@ -22,10 +22,11 @@ from cpcbl_launch.lab.baselines import (
     expected_sighting,
     run_baselines,
 )
+from cpcbl_launch.lab.evaluation import evaluate_log
+from cpcbl_launch.overrides import with_blind_robots
 from cpcbl_launch.reporting.metrics import Floats, Trajectory, position_errors, samples_with_truth
 from cpcbl_launch.reporting.recorder import BaselineReport
-from cpcbl_launch.run.logged_team import LoggedTeam, load_logged_team, with_blind_robots
-from cpcbl_launch.simulation.in_process import evaluate_log_with_paths
+from cpcbl_launch.run.logged_team import LoggedTeam, load_logged_team
 from cpcbl_team.config import (
     Field,
     LocalizerSettings,
@@ -412,8 +413,8 @@ def test_an_export_that_cannot_be_written_is_one_line(tmp_path: Path) -> None:
 def test_a_team_without_yardsticks_is_what_it_was(tmp_path: Path) -> None:
     write_log(tmp_path, ROBOTS, 5.0)
     logged = load_logged_team(log_team(*ROBOTS), tmp_path)
-    plain = evaluate_log_with_paths(logged)
-    with_them = evaluate_log_with_paths(logged, with_yardsticks=True)
+    plain = evaluate_log(logged)
+    with_them = evaluate_log(logged, with_baselines=True)
     assert plain.report.yardsticks == {}
     assert msgspec.structs.replace(with_them.report, yardsticks={}) == plain.report
     assert tuple(with_them.paths) == ("estimate", *KINDS)
@@ -422,8 +423,6 @@ def test_a_team_without_yardsticks_is_what_it_was(tmp_path: Path) -> None:
 def test_progress_reaches_the_end_once(tmp_path: Path) -> None:
     write_log(tmp_path, ROBOTS, 2.0)
     shown: list[float] = []
-    evaluate_log_with_paths(
-        load_logged_team(log_team(*ROBOTS), tmp_path), shown.append, with_yardsticks=True
-    )
+    evaluate_log(load_logged_team(log_team(*ROBOTS), tmp_path), shown.append, with_baselines=True)
     assert shown == sorted(shown)
     assert shown[-1] == 1.0

@@ -355,5 +355,5 @@ def test_a_container_is_stopped_again_until_it_is_there_to_be_stopped(
 ) -> None:
     monkeypatch.setenv("PATH", str(tmp_path), prepend=os.pathsep)
     program(tmp_path, "docker", SLOW_TO_START)
-    assert run_observer_container("tripod", DEMO, [], None, "image", stop=lambda: True) == 7
+    assert run_observer_container("tripod", DEMO, "gps", [], "image", lambda: True) == 7
     assert (tmp_path / "asked").read_text().split() == ["stop"] * 3

@@ -13,17 +13,17 @@ from rich.console import Console
 from support.logs import EPOCH_MS, LANDMARKS, STARTS, STEP_MS, log_team, write_log
 
 from cpcbl_agents.sources.mrclam import LogError
+from cpcbl_launch.lab.evaluation import evaluate_log
 from cpcbl_launch.lab.experiments import budget
+from cpcbl_launch.overrides import Overrides, with_blind_robots, with_overrides
 from cpcbl_launch.reporting.recorder import LearnedReport, Report
 from cpcbl_launch.run.logged_team import (
     LoggedTeam,
     builtin_for,
     is_calibrated_on,
     load_logged_team,
-    with_blind_robots,
     with_duration,
 )
-from cpcbl_launch.simulation.in_process import Overrides, evaluate_log, with_overrides
 from cpcbl_launch.team_file import builtin_path, load_team
 from cpcbl_launch.views.run import print_report
 from cpcbl_team.config import (
@@ -50,7 +50,9 @@ def logged(folder: Path, *robots: str, **options: Any) -> LoggedTeam:
 
 def report(team: LoggedTeam, duration_s: float | None = None) -> Any:
     """The evaluation as a reader of its JSON sees it."""
-    return msgspec.json.decode(msgspec.json.encode(evaluate_log(team, duration_s)))
+    return msgspec.json.decode(
+        msgspec.json.encode(evaluate_log(with_duration(team, duration_s)).report)
+    )
 
 
 # The team on the log ----------------------------------------------------------------------------
@@ -139,7 +141,7 @@ def test_blinding_takes_landmarks_from_the_named_robots_only(tmp_path: Path) -> 
 
 
 def test_blinding_an_unknown_robot_names_it_and_those_there_are() -> None:
-    with pytest.raises(InputError, match=r"no robot 7, x to blind; there are 1, 2"):
+    with pytest.raises(InputError, match=r"has no robot 7, x; there are 1, 2"):
         with_blind_robots(log_team("1", "2"), ["x", "1", "7"])
 
 
@@ -268,7 +270,7 @@ def printed(evaluation: Report) -> list[str]:
 
 def test_what_robots_have_learned_is_in_the_report(tmp_path: Path) -> None:
     on = wrong_about_wheels(logged(tmp_path, seconds=30.0), "1")
-    evaluation = evaluate_log(on)
+    evaluation = evaluate_log(on).report
     learned = {name: robot.learned for name, robot in evaluation.robots.items()}
     found = learned["1"]
     assert learned == {"1": found, "2": None}
@@ -285,7 +287,7 @@ def test_what_robots_have_learned_is_in_the_report(tmp_path: Path) -> None:
 
 
 def test_the_remark_says_what_is_done_to_readings(tmp_path: Path) -> None:
-    evaluation = evaluate_log(logged(tmp_path, seconds=1.0))
+    evaluation = evaluate_log(logged(tmp_path, seconds=1.0)).report
     found = LearnedReport(distance_scale=0.976, turn_scale=0.96, bearing_bias_deg=0.62)
     robots = {"1": msgspec.structs.replace(evaluation.robots["1"], learned=found)}
     said = "robot 1 learned: distance × 0.98, turn × 0.96, bearings -0.6°"
@@ -307,7 +309,7 @@ def test_progress_rises_to_the_end(tmp_path: Path) -> None:
 
 def test_two_evaluations_give_equal_reports(tmp_path: Path) -> None:
     on = logged(tmp_path, *ALL, seconds=5.0, unknown_barcode=True)
-    first, second = (msgspec.json.encode(evaluate_log(on)) for _ in range(2))
+    first, second = (msgspec.json.encode(evaluate_log(on).report) for _ in range(2))
     assert first == second
 
 

@@ -9,10 +9,11 @@ import msgspec
 import pytest
 from support.processes import cpcbl_team
 
+from cpcbl_launch.lab.evaluation import evaluate_log
+from cpcbl_launch.lab.evaluation import evaluate_log as evaluated_log
+from cpcbl_launch.overrides import Overrides, with_blind_robots, with_overrides
 from cpcbl_launch.reporting.recorder import Report
-from cpcbl_launch.run.logged_team import builtin_for, load_logged_team, with_blind_robots
-from cpcbl_launch.simulation.in_process import Overrides, evaluate_log, with_overrides
-from cpcbl_launch.simulation.in_process import evaluate_log_with_paths as evaluated_log
+from cpcbl_launch.run.logged_team import builtin_for, load_logged_team
 from cpcbl_launch.team_file import builtin_path, load_team
 
 pytestmark = [pytest.mark.log, pytest.mark.timeout(900)]
@@ -33,7 +34,7 @@ def evaluated(name: str, blind: bool, choice: Overrides, calibrated: bool = True
     file = builtin_for(folder) if calibrated else builtin_path("mrclam-uncalibrated")
     logged = load_logged_team(with_overrides(load_team(file), choice), folder)
     team = with_blind_robots(logged.team, BLIND if blind else ())
-    return evaluate_log(logged._replace(team=team))
+    return evaluate_log(logged._replace(team=team)).report
 
 
 def team_rmse_m(report: Report) -> float:
@@ -87,14 +88,14 @@ def test_self_calibration_is_better_than_none_where_nothing_was_calibrated() -> 
         name: replace(robot, localizer=replace(robot.localizer, self_calibration=False))
         for name, robot in logged.team.robots.items()
     }
-    off = evaluate_log(logged._replace(team=replace(logged.team, robots=robots)))
+    off = evaluate_log(logged._replace(team=replace(logged.team, robots=robots))).report
     assert on < 0.97 * team_rmse_m(off)
 
 
 def test_the_yardsticks_are_worth_the_name() -> None:
     """Start poses and settings are the team's; the centralized filter is the ceiling."""
     logged = load_logged_team(load_team(builtin_path("mrclam-uncalibrated")), log_folder("MRCLAM6"))
-    report = evaluated_log(logged, with_yardsticks=True).report
+    report = evaluated_log(logged, with_baselines=True).report
     rmse = {kind: y.team.position_rmse_m or 0.0 for kind, y in report.yardsticks.items()}
     assert 0.0 < rmse["centralized_ekf"] < 0.15
     assert rmse["centralized_ekf"] < rmse["solo_ekf"] < 0.22

@@ -7,11 +7,13 @@ from pathlib import Path
 import msgspec
 import pytest
 
+from cpcbl_launch.lab.evaluation import evaluate_log
 from cpcbl_launch.lab.faulty_robot import Fault, FaultyBus
+from cpcbl_launch.overrides import with_blind_robots
 from cpcbl_launch.reporting.metrics import score
 from cpcbl_launch.reporting.recorder import Recorder, Report
 from cpcbl_launch.run import logged_team
-from cpcbl_launch.simulation.in_process import evaluate_log, robot_nodes, run_nodes
+from cpcbl_launch.simulation.in_process import robot_nodes, run_nodes
 from cpcbl_launch.team_file import load_team
 from cpcbl_team.config import Team, TrustSettings
 from cpcbl_transport.memory_bus import MemoryHub
@@ -34,12 +36,12 @@ def logged(name: str, enabled: bool) -> logged_team.LoggedTeam:
     found = logged_team.load_logged_team(
         judging(load_team(logged_team.builtin_for(folder)), enabled), folder
     )
-    return found._replace(team=logged_team.with_blind_robots(found.team, ["3", "4", "5"]))
+    return found._replace(team=with_blind_robots(found.team, ["3", "4", "5"]))
 
 
 @cache
 def judged(name: str) -> Report:
-    return evaluate_log(logged(name, True))
+    return evaluate_log(logged(name, True)).report
 
 
 def quarantines(report: Report) -> int:
@@ -48,7 +50,7 @@ def quarantines(report: Report) -> int:
 
 @pytest.mark.parametrize("name", ["MRCLAM2", "MRCLAM4", "MRCLAM6"])
 def test_honest_robots_are_hardly_ever_quarantined_and_nobody_gets_worse(name: str) -> None:
-    report, believing = judged(name), evaluate_log(logged(name, False))
+    report, believing = judged(name), evaluate_log(logged(name, False)).report
     assert quarantines(report) <= 1  # in five robots' quarter of an hour and more
     assert not any(trust.reason for robot in report.robots.values() for trust in robot.trust)
     assert report.team.position_rmse_m is not None

@@ -18,6 +18,7 @@ from support.logs import write_log
 from support.processes import cpcbl_team, pids_of
 
 from cpcbl_launch.cli import main
+from cpcbl_launch.overrides import Overrides, with_overrides
 from cpcbl_launch.reporting.flows import (
     SpendingReport,
     are_limits_kept,
@@ -27,7 +28,6 @@ from cpcbl_launch.reporting.flows import (
 from cpcbl_launch.reporting.recorder import Recorder, Report
 from cpcbl_launch.run.processes import PROGRAM
 from cpcbl_launch.run.up import free_endpoint
-from cpcbl_launch.simulation.in_process import Overrides, with_overrides
 from cpcbl_launch.team_file import parse_team
 from cpcbl_launch.views.run import print_report
 from cpcbl_launch.views.traffic.show import TrafficView, limit_text, traffic_view

@@ -14,10 +14,10 @@ from typing import Any
 import msgspec
 from rich.console import RenderableType
 
+from cpcbl_launch.lab.evaluation import evaluate_log
 from cpcbl_launch.lab.experiments.runs import map_in_processes
 from cpcbl_launch.reporting.tables import number, percent, table
 from cpcbl_launch.run.logged_team import LoggedTeam
-from cpcbl_launch.simulation.in_process import evaluate_log
 from cpcbl_team.errors import InputError
 
 EVERYTHING: Mapping[str, Any] = {"least_value": 0.0, "least_use": 0.0, "belief_share": 0.0}
@@ -120,7 +120,7 @@ def measure_point(logged: LoggedTeam, case: Case) -> Point:
         budget = replace(rules.budget, **case.budget)
         robots[name] = replace(robot, collaboration=replace(rules, budget=budget, **case.rules))
     run = logged._replace(team=replace(logged.team, robots=robots))
-    report = evaluate_log(run)
+    report = evaluate_log(run).report
     team, minutes = report.team, report.duration_s / 60.0 * len(robots)
     if team.position_rmse_m is None or team.heading_rmse_deg is None:
         raise InputError(

@@ -28,8 +28,8 @@ from cpcbl_launch.lab.experiments.results import (
     spread,
 )
 from cpcbl_launch.lab.experiments.runs import Case
+from cpcbl_launch.overrides import Overrides, with_overrides
 from cpcbl_launch.reporting.tables import number, percent, table
-from cpcbl_launch.simulation.in_process import Overrides, with_overrides
 from cpcbl_team.config import RobotSettings, Start, Team
 from cpcbl_team.errors import InputError
 

@@ -27,8 +27,8 @@ from cpcbl_launch.lab.experiments.results import (
     pattern_lines,
 )
 from cpcbl_launch.lab.experiments.runs import Case
+from cpcbl_launch.overrides import Overrides, with_overrides
 from cpcbl_launch.reporting.tables import number, percent, table
-from cpcbl_launch.simulation.in_process import Overrides, with_overrides
 
 CONFIGURATIONS = {
     "A": "odometry",

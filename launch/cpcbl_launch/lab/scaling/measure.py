@@ -8,17 +8,12 @@ from contextlib import contextmanager
 import msgspec
 
 from cpcbl_agents.node import Steppable
+from cpcbl_launch.checks import require_duration
 from cpcbl_launch.lab.scaling.swarm import MOST_ROBOTS, swarm_team
-from cpcbl_launch.options import check_duration
 from cpcbl_launch.reporting.recorder import Recorder
 from cpcbl_launch.simulation.field import SimulatedField
 from cpcbl_launch.simulation.field_node import FieldNode
-from cpcbl_launch.simulation.in_process import (
-    Progress,
-    robot_nodes,
-    run_nodes,
-    simulated_report,
-)
+from cpcbl_launch.simulation.in_process import Progress, robot_nodes, run_nodes, simulated_report
 from cpcbl_team.config import Team
 from cpcbl_team.errors import InputError
 from cpcbl_team.inputs import Sightings
@@ -79,7 +74,7 @@ def measure_sizes(
 
     Raises InputError for a duration that is too short to measure anything.
     """
-    check_duration(duration_s, LEAST_S)
+    require_duration(duration_s, LEAST_S)
     figures: list[TeamSizeFigures] = []
     for i, size in enumerate(sizes):
         part = _partial_progress(progress, sum(sizes[:i]), size, sum(sizes))

@@ -12,6 +12,7 @@ from cpcbl_launch.run.containers.compose import Mount
 from cpcbl_launch.run.containers.deployment import key_owner
 from cpcbl_launch.run.containers.docker import check_daemon, run_command
 from cpcbl_launch.run.containers.launch import INSIDE, KEYS_INSIDE, team_in_containers
+from cpcbl_launch.run.observer import presets
 from cpcbl_launch.team_file import save_resolved
 from cpcbl_team.config import Team
 from cpcbl_transport.security import Identity, credentials_in
@@ -24,16 +25,16 @@ POLL_S = 0.1
 def run_observer_container(
     name: str,
     team: Team,
+    sensor: str,
     arguments: Sequence[str],
-    sensor_file: Path | None,
     image: str,
     stop: Callable[[], bool],
 ) -> int:
     """Runs `cpcbl-team observer NAME ARGUMENTS` in a container until it ends or `stop()`.
 
-    It shares this machine's network, so that endpoints are what they are without it; what it says
-    goes where this process says things. Its exit code. Raises DockerError, or SecurityError without
-    the observer's keys.
+    `sensor` is a preset or a file, which the container then reads. The container shares this
+    machine's network, so that endpoints stay what they are, and this process's output. Returns its
+    exit code. Raises DockerError, or SecurityError without the observer's keys.
     """
     check_daemon()
     with tempfile.TemporaryDirectory(prefix="cpcbl-") as folder:
@@ -41,10 +42,11 @@ def run_observer_container(
         save_resolved(team_in_containers(team), team_file)
         team_file.chmod(0o644)
         mounts = [Mount(str(team_file), INSIDE), *mounts_of_keys(name, team)]
-        if sensor_file is not None:
-            mounts.append(Mount(str(sensor_file.resolve()), SENSOR_INSIDE))
+        if sensor not in presets():
+            mounts.append(Mount(str(Path(sensor).resolve()), SENSOR_INSIDE))
+            sensor = SENSOR_INSIDE
         container = f"cpcbl-{name}-{secrets.token_hex(3)}"
-        inner = ["observer", name, "--team", INSIDE, *arguments]
+        inner = ["observer", name, "--team", INSIDE, f"--sensor={sensor}", *arguments]
         user = key_owner(team, Identity(Role.OBSERVER, name))
         command = docker_run(container, image, mounts, user, inner)
         process = subprocess.Popen(command, stdin=subprocess.DEVNULL, start_new_session=True)

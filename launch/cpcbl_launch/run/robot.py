@@ -10,7 +10,8 @@ from pathlib import Path
 
 from cpcbl_agents.clock import Clock
 from cpcbl_agents.process import StopSignal, run_robot
-from cpcbl_launch.team_file import TeamFileError, endpoint_problem, find_team
+from cpcbl_launch.checks import require_robots, require_team_opencv
+from cpcbl_launch.team_file import endpoint_problem, find_team
 from cpcbl_team.config import Team
 from cpcbl_team.errors import InputError
 from cpcbl_transport.bus import Bus
@@ -82,11 +83,6 @@ def main(arguments: Sequence[str]) -> None:
 
 def _team_with(name: str, path: Path) -> Team:
     team = find_team(path)
-    if name not in team.robots:
-        known = ", ".join(team.robots)
-        raise TeamFileError(f"{path}: robots.{name}: not in the file; it has: {known}")
-    if name in team.cameras:
-        from cpcbl_launch.options import require_team_opencv
-
-        require_team_opencv(team, [name])
+    require_robots(str(path), [name], team)
+    require_team_opencv(team, [name])
     return team

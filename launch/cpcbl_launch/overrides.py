@@ -1,0 +1,63 @@
+"""A team with some of its settings changed for one run, as the command line asks for."""
+
+from collections.abc import Collection
+from typing import NamedTuple
+
+from msgspec.structs import replace
+
+from cpcbl_launch.checks import require_robots
+from cpcbl_team.config import Team
+
+
+class Overrides(NamedTuple):
+    """What a command line sets for all robots; None leaves the team file's value."""
+
+    variant: str | None = None
+    collaboration: str | None = None
+    """none, passive, active, both"""
+    fusion: str | None = None
+    direction: str | None = None
+    bytes_per_s: float | None = None
+    """Of each robot."""
+    messages_per_minute: float | None = None
+    """Of each robot."""
+    match_messages: int | None = None
+    """Of the team."""
+
+    def given(self, *names: str) -> dict[str, object]:
+        """Those of these fields that are set."""
+        values = {name: getattr(self, name) for name in names}
+        return {
+            name: str(value) if isinstance(value, str) else value
+            for name, value in values.items()
+            if value is not None
+        }
+
+
+def with_overrides(team: Team, overrides: Overrides) -> Team:
+    """The team with these settings for all its robots."""
+    rules = overrides.given("fusion", "direction")
+    if (kinds := overrides.collaboration) is not None:
+        rules |= {"passive": kinds in ("passive", "both"), "active": kinds in ("active", "both")}
+    limits = overrides.given("bytes_per_s", "messages_per_minute")
+    robots = {}
+    for name, robot in team.robots.items():
+        own = robot.collaboration
+        robots[name] = replace(
+            robot,
+            localizer=replace(robot.localizer, **overrides.given("variant")),
+            collaboration=replace(own, budget=replace(own.budget, **limits), **rules),
+        )
+    if overrides.match_messages is not None:
+        team = replace(team, match=replace(team.match, messages=overrides.match_messages))
+    return replace(team, robots=robots)
+
+
+def with_blind_robots(team: Team, blind: Collection[str]) -> Team:
+    """The team with some robots blind to landmarks. Raises InputError for an unknown name."""
+    require_robots("--blind", blind, team)
+    robots = dict(team.robots)
+    for name in blind:
+        sensor = replace(robots[name].sensor, sees_landmarks=False)
+        robots[name] = replace(robots[name], sensor=sensor)
+    return replace(team, robots=robots)
