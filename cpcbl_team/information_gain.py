@@ -9,12 +9,13 @@ It predicts it from the tier that the receiver announces and from the last fix t
 import math
 from typing import NamedTuple
 
-from cpcbl_team.collaboration import LOWEST_TIER, TIER_ZERO_SIGMA_M, carried
+from cpcbl_team.beliefs import extrapolated
 from cpcbl_team.config import CollaborationSettings, Fusion
 from cpcbl_team.estimate import SMALLEST_VARIANCE, Covariance3, Estimate
 from cpcbl_team.fusion import best_weight
 from cpcbl_team.gaussian import Covariance2
 from cpcbl_team.inputs import Belief, Fix
+from cpcbl_team.tiers import LOWEST_TIER, TIER_ZERO_SIGMA_M
 
 LOST_SIGMA_M = 2.0
 DRIFT_SHARE = 0.1  # position sigma that a teammate gains between two fixes, per metre driven
@@ -184,7 +185,7 @@ def staleness(copy: Belief | None, now: Belief) -> float:
     """
     if copy is None:
         return math.inf
-    pose = carried(copy, now.stamp_ns)
+    pose = extrapolated(copy, now.stamp_ns)
     before, after = (
         Covariance3(*copy.covariance).position(),
         Covariance3(*now.covariance).position(),

@@ -6,7 +6,7 @@
 import math
 from collections.abc import Iterable
 
-from cpcbl_team.collaboration import BELIEF_SERVES_BACK_NS
+from cpcbl_team.beliefs import BELIEF_VALID_BEFORE_NS
 from cpcbl_team.config import Field, LocalizationSettings
 from cpcbl_team.estimate import HEADING, POSE, POSITION, Covariance3, Estimate, Scope
 from cpcbl_team.fusion import chi_square_bounds, told
@@ -32,7 +32,7 @@ from cpcbl_team.recovery import (
     with_measurements,
     with_snapshot,
 )
-from cpcbl_team.self_calibration import Anchor, Anchors, learned
+from cpcbl_team.self_calibration import ReferencePose, ReferencePoses, self_calibrate
 from cpcbl_team.sensors import crawled_s, repeated_share, sighting_fault
 from cpcbl_team.state import (
     Evidence,
@@ -304,13 +304,13 @@ class Localizer:
     def _with_calibration(self, state: State) -> State:
         """The state with what the robot learns from this update of its odometry and bearings."""
         memory, place = state.memory.calibration, state.odometry_from_robot
-        here = Anchor(state.stamp_ns, state.estimate, place, memory.total_turn_rad)
+        here = ReferencePose(state.stamp_ns, state.estimate, place, memory.total_turn_rad)
         if state.memory.recovery.lost:
             memory = memory._replace(anchors=None)
         elif memory.anchors is None:
-            memory = memory._replace(anchors=Anchors(here, here))
+            memory = memory._replace(anchors=ReferencePoses(here, here))
         else:
-            known, anchors = learned(memory.learned, memory.anchors, here, self._odometry)
+            known, anchors = self_calibrate(memory.learned, memory.anchors, here, self._odometry)
             memory = memory._replace(learned=known, anchors=anchors)
         return with_memory(state, state.memory._replace(calibration=memory))
 
@@ -382,7 +382,7 @@ class Localizer:
 
     def add_teammate_belief(self, state: State, belief: Belief) -> State:
         """Passive collaboration: keeps a teammate's belief, for when the teammate is visible."""
-        now_ns = belief.stamp_ns - BELIEF_SERVES_BACK_NS
+        now_ns = belief.stamp_ns - BELIEF_VALID_BEFORE_NS
         state = self.predict(state, now_ns)
         oldest_ns = now_ns - self._belief_age_ns
         beliefs = {

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import msgspec
 
-from cpcbl_team.collaboration import Place, placed
+from cpcbl_team.beliefs import ObjectPosition, teammate_at
 from cpcbl_team.config import Field, LocalizationSettings, LocalizerSettings, Wall
 from cpcbl_team.constraints import (
     Constraint,
@@ -39,7 +39,7 @@ class Measurement(msgspec.Struct, frozen=True, gc=False):
     """A sighting of an object whose position is known; a reading is None where it is not used."""
 
     source: str
-    position: Place  # for a wall: a point of it
+    position: ObjectPosition  # for a wall: a point of it
     wall: Wall | None
     is_teammate: bool
     range_m: float | None
@@ -96,12 +96,12 @@ def measurement_of(
     name = sighting.id
     wall, landmark, gives = field.walls.get(name), field.landmarks.get(name), "both"
     if landmark is not None:
-        position: Place | None = _on_map(landmark.x_m, landmark.y_m)
+        position: ObjectPosition | None = _on_map(landmark.x_m, landmark.y_m)
         gives = landmark.gives
     elif wall is not None:
         position, gives = _on_map(*wall.from_m), wall.gives
     elif name in teammates and settings.collaboration.passive:
-        position = placed(teammates[name], stamp_ns, settings.collaboration)
+        position = teammate_at(teammates[name], stamp_ns, settings.collaboration)
     else:
         return None
     if position is None:
@@ -117,11 +117,11 @@ def measurement_of(
 
 
 @lru_cache(1024)
-def _on_map(x: float, y: float) -> Place:
-    return Place(x, y, _EXACT)
+def _on_map(x: float, y: float) -> ObjectPosition:
+    return ObjectPosition(x, y, _EXACT)
 
 
-def _expected_range(pose: Pose2, position: Place, wall: Wall | None) -> float:
+def _expected_range(pose: Pose2, position: ObjectPosition, wall: Wall | None) -> float:
     dx, dy = position.x - pose.x, position.y - pose.y
     if wall is None:
         return math.hypot(dx, dy)

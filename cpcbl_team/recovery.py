@@ -16,7 +16,7 @@ from cpcbl_team.measurements import Measurement
 from cpcbl_team.pose_observation import PoseObservation
 from cpcbl_team.relocalization import relocalize
 from cpcbl_team.state import FIX, Evidence, LandmarkSnapshot, RecoveryMemory, State, with_recovery
-from cpcbl_team.trust import forgiven
+from cpcbl_team.trust import reset_scores
 
 WINDOW_NS = 20_000_000_000
 SPACING_NS = 500_000_000  # one piece of evidence an object and so long
@@ -254,7 +254,7 @@ class Recovery:
         _, teammates, calibration, _ = memory = state.memory.counted("found_again")
         memory = memory._replace(
             recovery=recovery._replace(lost=""),
-            teammates=teammates._replace(senders=forgiven(teammates.senders)),
+            teammates=teammates._replace(senders=reset_scores(teammates.senders)),
             calibration=calibration._replace(anchors=None),
         )
         updates = state.updates._replace(innovations=1)

@@ -1,9 +1,9 @@
-"""What a robot learns of its own odometry and camera while it drives.
+"""Calibration of a robot's own odometry and bearings while it drives.
 
-Between two moments at which landmarks or teammates told it where it is, the robot compares how far
-it came and turned with what its wheels said. Three numbers are learned, each by a scalar Kalman
-filter: the scales of distance and turn, and the bias of bearings (a heading found by biased
-bearings does not point where the robot drives).
+Between two times at which landmarks or teammates gave it an accurate pose, the robot compares how
+far it moved and turned with what its odometry measured. Three numbers result, each by a scalar
+Kalman filter: the scale of distances, the scale of turns, and the bias of bearings (a heading from
+biased bearings does not point where the robot drives).
 """
 
 import math
@@ -13,17 +13,17 @@ from cpcbl_team.config import OdometryNoise
 from cpcbl_team.estimate import Estimate
 from cpcbl_team.geometry import Pose2, wrap_angle
 
-LEAST_WAY_M = 0.7
+LEAST_DISTANCE_M = 0.7
 LEAST_TURN_RAD = 1.0
-MOST_TOLD_RAD = math.radians(170.0)  # beyond half a circle two headings tell another turn
-MOST_TURN_RAD = 0.7  # beyond, a chord says little of the way
+MOST_TURN_RAD = math.radians(170.0)  # beyond half a circle two headings give another turn
+MOST_TURN_OF_CHORD_RAD = 0.7  # beyond, the chord is much shorter than the path
 LONGEST_NS = 30_000_000_000
-RENEWED_SHARE = 0.5  # of the variance that odometry alone would leave
-GATE = 9.0
+RENEWED_SHARE = 0.5  # an accurate pose has at most this share of the variance by odometry alone
+GATE = 9.0  # 3 sigma
 
 
-class Learned(NamedTuple):
-    """Values and variances; the corrected value is `scale x reading` and `reading - bias`."""
+class SelfCalibration(NamedTuple):
+    """Values and variances: a corrected value is `scale x reading`, or `reading - bias`."""
 
     distance_scale: float = 1.0
     turn_scale: float = 1.0
@@ -33,92 +33,108 @@ class Learned(NamedTuple):
     bearing_variance: float = math.radians(1.5) ** 2
 
 
-class Anchor(NamedTuple):
-    """A moment at which the robot knew its place."""
+class ReferencePose(NamedTuple):
+    """A time at which the robot's pose was updated, with which a later pose is compared."""
 
     stamp_ns: int
     estimate: Estimate
     odometry_from_robot: Pose2
-    turned_rad: float  # by the wheels since the start: more than a circle is more than none
+    total_turn_rad: float  # by odometry since the start, without wrapping
 
 
-class Anchors(NamedTuple):
-    """From where turns are compared, from where distances are."""
+class ReferencePoses(NamedTuple):
+    """The poses from which the next turn and the next distance are measured."""
 
-    turned: Anchor
-    drove: Anchor
+    turn: ReferencePose
+    distance: ReferencePose
 
 
-def learned(
-    so_far: Learned, anchors: Anchors, now: Anchor, noise: OdometryNoise
-) -> tuple[Learned, Anchors]:
-    """What is known after one more update, and the anchors of the next comparisons.
+def self_calibrate(
+    known: SelfCalibration, references: ReferencePoses, now: ReferencePose, noise: OdometryNoise
+) -> tuple[SelfCalibration, ReferencePoses]:
+    """The calibration after one more update of the pose, and the references of the next ones.
 
-    An anchor moves on when there was something to compare, or when there can be no more: it is too
-    old, or the robot has turned too far since for a chord, or to tell by how much.
+    A reference is replaced when it was compared, and when it can no longer be: because it is too
+    old, or because the robot has turned too far since for a chord, or for an unambiguous turn.
     """
-    turned, drove = anchors
-    turn = abs(now.turned_rad - turned.turned_rad)
-    if turn > MOST_TOLD_RAD:
+    turned, driven = references
+    turn = abs(now.total_turn_rad - turned.total_turn_rad)
+    if turn > MOST_TURN_RAD:
         turned = now
     elif turn >= LEAST_TURN_RAD:
-        wheels = turned.odometry_from_robot.inverse() @ now.odometry_from_robot
-        so_far, turned = _turn_compared(so_far, turned, now, wheels, noise), now
-    wheels = drove.odometry_from_robot.inverse() @ now.odometry_from_robot
-    way = math.hypot(wheels.x, wheels.y)
-    if abs(now.turned_rad - drove.turned_rad) > MOST_TURN_RAD:
-        drove = now
-    elif way >= LEAST_WAY_M:
-        so_far, drove = _way_compared(so_far, drove, now, wheels, noise), now
-    turned, drove = (now if now.stamp_ns - a.stamp_ns > LONGEST_NS else a for a in (turned, drove))
-    return so_far, Anchors(turned, drove)
+        odometry = turned.odometry_from_robot.inverse() @ now.odometry_from_robot
+        known, turned = _with_turn(known, turned, now, odometry, noise), now
+    odometry = driven.odometry_from_robot.inverse() @ now.odometry_from_robot
+    distance = math.hypot(odometry.x, odometry.y)
+    if abs(now.total_turn_rad - driven.total_turn_rad) > MOST_TURN_OF_CHORD_RAD:
+        driven = now
+    elif distance >= LEAST_DISTANCE_M:
+        known, driven = _with_distance(known, driven, now, odometry, noise), now
+    turned, driven = (
+        now if now.stamp_ns - r.stamp_ns > LONGEST_NS else r for r in (turned, driven)
+    )
+    return known, ReferencePoses(turned, driven)
 
 
-def _turn_compared(
-    so_far: Learned, then: Anchor, now: Anchor, wheels: Pose2, noise: OdometryNoise
-) -> Learned:
-    around = _turn_variance(wheels, noise)
+def _with_turn(
+    known: SelfCalibration,
+    then: ReferencePose,
+    now: ReferencePose,
+    odometry: Pose2,
+    noise: OdometryNoise,
+) -> SelfCalibration:
+    """The calibration after a turn was compared with that of odometry."""
+    odometry_variance = _turn_variance(odometry, noise)
     p, q = then.estimate.covariance.hh, now.estimate.covariance.hh
-    if q > RENEWED_SHARE * (p + around):
-        return so_far
+    if q > RENEWED_SHARE * (p + odometry_variance):
+        return known
     turn = wrap_angle(now.estimate.pose.heading - then.estimate.pose.heading)
-    excess = wrap_angle(turn - wheels.heading)
-    change, variance = _updated(so_far.turn_variance, wheels.heading, excess, p + q + around)
-    scale = so_far.turn_scale * (1.0 + change)
-    return so_far._replace(turn_scale=scale, turn_variance=variance)
+    excess = wrap_angle(turn - odometry.heading)
+    total = p + q + odometry_variance
+    change, variance = _kalman_update(known.turn_variance, odometry.heading, excess, total)
+    scale = known.turn_scale * (1.0 + change)
+    return known._replace(turn_scale=scale, turn_variance=variance)
 
 
-def _way_compared(
-    so_far: Learned, then: Anchor, now: Anchor, wheels: Pose2, noise: OdometryNoise
-) -> Learned:
-    way = math.hypot(wheels.x, wheels.y)
-    along = noise.distance_sigma_m_per_sqrt_m**2 * way
+def _with_distance(
+    known: SelfCalibration,
+    then: ReferencePose,
+    now: ReferencePose,
+    odometry: Pose2,
+    noise: OdometryNoise,
+) -> SelfCalibration:
+    """The calibration after a distance, and its direction, were compared with those of odometry."""
+    distance = math.hypot(odometry.x, odometry.y)
+    along = noise.distance_sigma_m_per_sqrt_m**2 * distance
     p, q = then.estimate, now.estimate
     before, after = p.position_sigma_m**2, q.position_sigma_m**2
-    if after > RENEWED_SHARE * (before + along + p.covariance.hh * way * way):
-        return so_far
-    found = p.pose.inverse() @ q.pose
-    # along the wheels' direction: an error across it would only ever lengthen the way
-    excess = (found.x * wheels.x + found.y * wheels.y) / way - way
-    noise_m2 = before + after + along
-    change, variance = _updated(so_far.distance_variance, way, excess, noise_m2)
-    scale = so_far.distance_scale * (1.0 + change)
-    so_far = so_far._replace(distance_scale=scale, distance_variance=variance)
-    aside = wrap_angle(math.atan2(found.y, found.x) - math.atan2(wheels.y, wheels.x))
-    doubt = p.covariance.hh + (before + after) / (way * way) + _turn_variance(wheels, noise) / 3.0
-    change, variance = _updated(so_far.bearing_variance, 1.0, aside, doubt)
-    bias = so_far.bearing_bias_rad + change
-    return so_far._replace(bearing_bias_rad=bias, bearing_variance=variance)
+    if after > RENEWED_SHARE * (before + along + p.covariance.hh * distance * distance):
+        return known
+    moved = p.pose.inverse() @ q.pose
+    # Only along odometry's direction: an error across it would always lengthen the distance.
+    excess = (moved.x * odometry.x + moved.y * odometry.y) / distance - distance
+    total = before + after + along
+    change, variance = _kalman_update(known.distance_variance, distance, excess, total)
+    scale = known.distance_scale * (1.0 + change)
+    known = known._replace(distance_scale=scale, distance_variance=variance)
+    aside = wrap_angle(math.atan2(moved.y, moved.x) - math.atan2(odometry.y, odometry.x))
+    turn_part = _turn_variance(odometry, noise) / 3.0
+    total = p.covariance.hh + (before + after) / (distance * distance) + turn_part
+    change, variance = _kalman_update(known.bearing_variance, 1.0, aside, total)
+    bias = known.bearing_bias_rad + change
+    return known._replace(bearing_bias_rad=bias, bearing_variance=variance)
 
 
-def _turn_variance(wheels: Pose2, noise: OdometryNoise) -> float:
+def _turn_variance(odometry: Pose2, noise: OdometryNoise) -> float:
+    """The variance (rad^2) of the heading of this motion."""
     return noise.turn_sigma_rad_per_sqrt_rad**2 * abs(
-        wheels.heading
-    ) + noise.turn_sigma_rad_per_sqrt_m**2 * math.hypot(wheels.x, wheels.y)
+        odometry.heading
+    ) + noise.turn_sigma_rad_per_sqrt_m**2 * math.hypot(odometry.x, odometry.y)
 
 
-def _updated(variance: float, h: float, excess: float, noise: float) -> tuple[float, float]:
-    """(change of the value, its new variance) after `excess = h x error + noise`."""
+def _kalman_update(variance: float, h: float, excess: float, noise: float) -> tuple[float, float]:
+    """(change of the value, its new variance) after `excess = h x error + noise`; none if the gate
+    rejects it."""
     total = h * h * variance + noise
     if excess * excess > GATE * total:
         return 0.0, variance

@@ -13,8 +13,8 @@ from typing import Any, NamedTuple
 from cpcbl_team.estimate import HEADING, POSE, POSITION, Estimate, Scope
 from cpcbl_team.geometry import Pose2, new
 from cpcbl_team.inputs import Belief, Odometry, Sighting
-from cpcbl_team.self_calibration import Anchors, Learned
-from cpcbl_team.trust import Voice
+from cpcbl_team.self_calibration import ReferencePoses, SelfCalibration
+from cpcbl_team.sender_record import SenderRecord
 
 FIX = "fix:"  # marks the source of an active fix, apart from a sighting of that teammate
 _NONE: Mapping[str, Any] = MappingProxyType({})
@@ -104,15 +104,15 @@ class TeammateMemory(NamedTuple):
     """What teammates have sent, and how far each of them is trusted."""
 
     beliefs: Mapping[str, tuple[Belief, ...]] = _NONE
-    senders: Mapping[str, Voice] = _NONE  # teammates, and the robot's own sensors
+    senders: Mapping[str, SenderRecord] = _NONE  # teammates, and the robot's own sensors
     last_report_ns: int = _NEVER_NS
 
 
 class CalibrationMemory(NamedTuple):
     """What a self-calibrating robot has learned, and what it compares next."""
 
-    learned: Learned = Learned()
-    anchors: Anchors | None = None
+    learned: SelfCalibration = SelfCalibration()
+    anchors: ReferencePoses | None = None
     total_turn_rad: float = 0.0  # of the odometry since the start
 
 

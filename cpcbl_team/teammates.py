@@ -12,6 +12,7 @@ from cpcbl_team.landmarks import LandmarkUpdate
 from cpcbl_team.measurements import GatedObject, GatedObjects
 from cpcbl_team.pose_observation import PoseObservation
 from cpcbl_team.recovery import inflate_by_offset, without_senders
+from cpcbl_team.sender_record import NEVER_NS, ReportedPosition, TeammateReport
 from cpcbl_team.state import State, with_memory
 
 
@@ -30,7 +31,7 @@ class TeammateScreen:
 
     def has_recent_reports(self, state: State, now_ns: int) -> bool:
         """Whether a teammate has reported anything lately that is to be screened."""
-        return self.is_active and now_ns - state.memory.teammates.last_report_ns <= trust.WINDOW_NS
+        return self.is_active and now_ns - state.memory.teammates.last_report_ns <= trust.RECENT_NS
 
     def screen_frame(
         self, state: State, landmarks: LandmarkUpdate, gated: GatedObjects
@@ -47,9 +48,9 @@ class TeammateScreen:
         for m, constraints, nis in (*gated.accepted, *gated.rejected):
             if m.is_teammate:
                 beliefs = state.memory.teammates.beliefs[m.source]
-                is_fresh = any(abs(now - b.stamp_ns) <= trust.FRESH_NS for b in beliefs)
+                is_fresh = any(abs(now - b.stamp_ns) <= trust.FRESH_BELIEF_NS for b in beliefs)
                 of_two = 2.0 * nis / len(constraints) if is_fresh and not is_lost else None
-                report = trust.Said(now, of_two)
+                report = TeammateReport(now, of_two)
                 state, is_trusted = self._assess(state, m.source, report, m.source)
                 if not is_trusted:
                     distrusted.add(m.source)
@@ -78,33 +79,32 @@ class TeammateScreen:
         noise, (ex, ey) = position.noise(), position.residuals
         variance = 0.5 * (noise.xx + noise.yy)
         where = now, observation.x, observation.y, variance, state.odometry_from_robot
-        report = trust.Said(now, None if is_lost else nis, (ex, ey), trust.Anchor(*where))
+        report = TeammateReport(now, None if is_lost else nis, (ex, ey), ReportedPosition(*where))
         return self._assess(state, observation.sender, report, observation.source)
 
     def _with_own_sensors(self, state: State, accepted: int, rejected: int) -> State:
         """The state with how far the robot's own sensors agree with the estimate."""
         memory = state.memory.teammates
-        own = memory.senders.get(trust.OWN, trust.Voice())
-        own = trust.seen(own, state.stamp_ns, accepted, rejected, self._rules.limit)
-        memory = memory._replace(senders={**memory.senders, trust.OWN: own})
+        result = state.stamp_ns, accepted, rejected, self._rules.limit
+        memory = memory._replace(senders=trust.with_own_sensor_result(memory.senders, *result))
         return with_memory(state, state.memory._replace(teammates=memory))
 
     def _assess(
-        self, state: State, sender: str, report: trust.Said, source: str
+        self, state: State, sender: str, report: TeammateReport, source: str
     ) -> tuple[State, bool]:
         """The state after a report of a teammate, and whether the report may be used."""
         memory, estimate = state.memory, state.estimate
         senders, used_ns = memory.teammates.senders, state.updates.objects_ns.get(source)
-        before_ns = trust.NEVER_NS if used_ns is None else used_ns
-        decision = trust.judged(senders, sender, report, before_ns, self._rules)
+        before_ns = NEVER_NS if used_ns is None else used_ns
+        decision = trust.assess(senders, sender, report, before_ns, self._rules)
         if decision.event:
-            recovery = without_senders(memory.recovery, decision.silenced)
+            recovery = without_senders(memory.recovery, decision.quarantined)
             memory = memory.counted(decision.event)._replace(recovery=recovery)
         if not decision.trusted:
             memory = memory.counted("distrusted")
-        if decision.doubt_m:
-            estimate = inflate_by_offset(estimate, decision.doubt_m, self._localizer_rules)
-        memory = memory._replace(teammates=memory.teammates._replace(senders=decision.voices))
+        if decision.estimate_error_m:
+            estimate = inflate_by_offset(estimate, decision.estimate_error_m, self._localizer_rules)
+        memory = memory._replace(teammates=memory.teammates._replace(senders=decision.senders))
         return state._replace(estimate=estimate, memory=memory), decision.trusted
 
 

@@ -10,7 +10,7 @@ from collections.abc import Callable
 
 import msgspec
 
-from cpcbl_team.collaboration import BELIEF_SERVES_BACK_NS
+from cpcbl_team.beliefs import BELIEF_VALID_BEFORE_NS
 from cpcbl_team.inputs import Belief, Fix, Input, Odometry, Position, Sightings, Told
 from cpcbl_team.localizer import Localizer
 from cpcbl_team.state import State
@@ -39,7 +39,7 @@ def _key(item: Input) -> Key:
     """Sorts by time, then by kind and content, so that the order of arrival plays no part."""
     time_ns = _measured_ns(item)
     if isinstance(item, Belief):
-        time_ns -= BELIEF_SERVES_BACK_NS
+        time_ns -= BELIEF_VALID_BEFORE_NS
     who = item.observer if isinstance(item, Fix) else getattr(item, "robot", "")
     return time_ns, _rank[type(item)], who, _content(item)
 

@@ -1,360 +1,283 @@
-"""Whether a teammate's words agree with all else that this robot knows: liars are found by it.
+"""Whether a teammate can be trusted: what follows when its reports fail a test.
 
-Two tests of everything that a teammate says, both without a model of the lie:
+`sender_record.py` tests each report against the estimate and against odometry. A sender whose score
+against the estimate exceeds the limit is in dispute with it. The dispute is decided against the
+sender only if somebody else supported the estimate since it began: the robot's own sensors, or at
+least as many teammates as dissent. If most dissent, the estimate is wrong, and so are the senders
+that it followed. A sender that contradicts odometry again and again is wrong without a second
+opinion.
 
-- against the estimate: the normalized innovation squared (NIS), summed above what is usual (a
-  CUSUM, Page 1954). It is held against the sender only where somebody else agreed with the estimate
-  meanwhile: the robot's own eyes, or at least as many teammates as disagree. Where most disagree it
-  is the robot that is wrong, and those that it followed are;
-- against the wheels: what two fixes say of the way between them must be the way that was driven.
-  This needs no heading and no second opinion.
-
-Who fails is quarantined: judged further, not used, taken back after it was right for some time.
+A sender that is wrong is quarantined: its reports are not used, but they are still tested. It is
+readmitted after its reports were right for some time (docs/trust.md).
 """
 
 import math
 from collections.abc import Iterator, Mapping
 from typing import NamedTuple
 
-import msgspec
 from msgspec.structs import replace
 
 from cpcbl_team.config import TrustSettings
-from cpcbl_team.geometry import Pose2
+from cpcbl_team.sender_record import (
+    CONTRADICTING_NIS,
+    MOST_NIS,
+    NEVER_NS,
+    SILENCE_NS,
+    QuarantineReason,
+    SenderRecord,
+    TeammateReport,
+    with_report,
+)
 
-OWN = ""  # the voice of the robot's own sensors; no robot has this name
-WINDOW_NS = 3_000_000_000  # a voice counts for so long after it was heard
-ALONE_NS = 10_000_000_000  # without another voice for so long, the last one is heard again
-FRESH_NS = 300_000_000  # an older belief may be wrong because its robot has turned since
-USUAL_NIS = 6.0  # of two degrees of freedom: 95 % are below it
-WRONG_NIS = 13.8  # 99.9 % are
-MOST_NIS = 20.0  # more is no more convincing
-CLEAR = 5.0  # sigmas by which a way must be wrong to be held against its teller
-STILL, STILL_SHARE = 3.0, 0.3  # or as many, where it is less than this share of the wheels'
-SLIP_SHARE = 0.1  # of the way: how far wheels err
-SLIP_M = 0.03
-STRIDE_M = 0.3  # the least way that tells whether a sender follows the robot at all
-REST_NS = 5_000_000_000  # or a time in which it has not jumped
-TIED_NS = 1_500_000_000  # one word against another: so long the wheels may decide
-CLEARLY = 0.5  # strikes
-MEMORY_S = 10.0  # strikes fade in this time
-MOST_STRIKES = 2.5
-LEAST_HEALTHY = 10  # words in agreement, and
-LEAST_STEADY = 2  # ways, before a sender is taken back
-BY_COMPARISON = ("biased", "overconfident", "outvoted")  # reasons that rest on others' words
-NEVER_NS = -(2**62)
+OWN_SENSORS = ""  # stands for the robot's own sensors among the senders; no robot has this name
+RECENT_NS = 3_000_000_000  # a sender takes part in a dispute for this long after its last report
+FRESH_BELIEF_NS = 300_000_000  # the robot of an older belief may have turned since
+TIE_NS = 1_500_000_000  # a dispute between equally many is decided for the estimate after this time
+CLEAR_CONFLICTS = 0.5  # odometry speaks against a sender with this many conflicts
+MOST_CONFLICTS = 2.5  # with more a sender is quarantined: at the third within a short time
+LEAST_AGREEMENTS = 10  # reports that must agree with the estimate before a sender is readmitted,
+LEAST_CONFIRMATIONS = 2  # or distances that must agree with odometry
+_BY_COMPARISON = (
+    QuarantineReason.BIASED,
+    QuarantineReason.OVERCONFIDENT,
+    QuarantineReason.OUTVOTED,
+)
+"""The reasons that rest on what other senders reported."""
 
-
-class Said(NamedTuple):
-    """One word of a teammate about where this robot is, or a sighting of it as a landmark."""
-
-    stamp_ns: int
-    surprise: float | None
-    """Its NIS, scaled to two degrees of freedom; None where the robot is lost: nothing to say."""
-    offset: tuple[float, float] | None = None
-    """From the estimate, metres; None for what is not a position of this robot."""
-    anchor: "Anchor | None" = None
+SenderRecords = Mapping[str, SenderRecord]
 
 
-class Anchor(NamedTuple):
-    """Where a teammate saw this robot, and its dead reckoning then."""
+class TrustDecision(NamedTuple):
+    """What follows from a report."""
 
-    stamp_ns: int
-    x: float
-    y: float
-    variance: float  # m^2, mean of the axes
-    odometry_from_robot: Pose2
-
-
-class Voice(msgspec.Struct, frozen=True, gc=False):
-    """What is kept of one sender."""
-
-    heard_ns: int = NEVER_NS
-    agreed_ns: int = NEVER_NS
-    doubted_ns: int = NEVER_NS
-    """Since when it disagrees."""
-    score: float = 0.0
-    """How much more it surprised than is usual, lately."""
-    offset: tuple[float, float] = (0.0, 0.0)
-    """Mean of its offsets since it disagrees, m; fading."""
-    spread: float = 0.0
-    """Their mean square about it, m^2."""
-    anchor: Anchor | None = None
-    compared: float = 0.0
-    """Words that were compared with the wheels, fading."""
-    strikes: float = 0.0
-    """Those that the wheels deny, fading."""
-    still: bool = False
-    """Whether the last of these was a way that it did not notice."""
-    steady: int = 0
-    """Ways in a row that the wheels confirm,"""
-    struck_ns: int = NEVER_NS
-    """since they last denied one."""
-    wrong_ns: int = NEVER_NS
-    """When it last failed a test."""
-    healthy: int = 0
-    """Words in agreement since."""
-    reason: str = ""
-    """Why it is in quarantine; empty if it is not."""
-    since_ns: int = 0
-    """When that began, or ended."""
-    quarantines: int = 0
-
-
-Voices = Mapping[str, Voice]
-
-
-class Verdict(NamedTuple):
-    """What follows from a word."""
-
-    voices: Voices
+    senders: SenderRecords
     trusted: bool
-    """Whether the word may be used."""
+    """Whether the report may be used."""
     event: str = ""
-    """quarantined, readmitted, outvoted"""
-    silenced: frozenset[str] = frozenset()
-    """The senders that have just been put into quarantine."""
-    doubt_m: float = 0.0
-    """By how much the estimate itself may be wrong by what they said before."""
+    """The count to increase: quarantined, readmitted, outvoted."""
+    quarantined: frozenset[str] = frozenset()
+    """The senders whose quarantine begins now."""
+    estimate_error_m: float = 0.0
+    """How far the estimate may be off because it followed them."""
 
 
-class Standing(NamedTuple):
-    """How a sender stands with this robot."""
+class TrustStatus(NamedTuple):
+    """How far this robot trusts a sender, for its status message."""
 
     robot: str
     reason: str = ""
     since_ns: int = 0
     quarantines: int = 0
     unconfirmed: bool = False
-    """It is the only voice: whether it is biased cannot be told."""
+    """It is the only recent sender, so a bias of it cannot be detected."""
 
 
-# What is kept of a word ---------------------------------------------------------------------------
+def with_own_sensor_result(
+    senders: SenderRecords, stamp_ns: int, accepted: int, rejected: int, limit: float
+) -> SenderRecords:
+    """The records after the gate accepted and rejected so many measurements of the robot's own
+    sensors. Their NIS is the largest one that counts, times the share that was rejected."""
+    report = TeammateReport(stamp_ns, MOST_NIS * (rejected / (accepted + rejected)))
+    record = with_report(senders.get(OWN_SENSORS, SenderRecord()), report, limit)
+    return {**senders, OWN_SENSORS: record}
 
 
-def heard(voice: Voice, said: Said, limit: float) -> Voice:
-    """The voice after one more word."""
-    if voice.score and said.stamp_ns - voice.heard_ns > ALONE_NS:
-        voice = replace(voice, score=0.0)
-    voice = _driven(_faded(voice, said.stamp_ns), said)
-    voice = replace(voice, heard_ns=max(voice.heard_ns, said.stamp_ns))
-    return voice if said.surprise is None else _agreeing(voice, said, said.surprise, limit)
+# The decision -------------------------------------------------------------------------------------
 
 
-def _faded(voice: Voice, now_ns: int) -> Voice:
-    """What the wheels said, as far as it is remembered."""
-    if not voice.compared or now_ns <= voice.heard_ns:
-        return voice
-    fade = math.exp((voice.heard_ns - now_ns) * 1e-9 / MEMORY_S)
-    return replace(voice, strikes=fade * voice.strikes, compared=fade * voice.compared)
+def assess(
+    senders: SenderRecords, name: str, report: TeammateReport, used_ns: int, rules: TrustSettings
+) -> TrustDecision:
+    """The records after a report of the sender `name`, and whether the report may be used.
 
-
-def _agreeing(voice: Voice, said: Said, surprise: float, limit: float) -> Voice:
-    now = said.stamp_ns
-    score = max(0.0, min(voice.score + min(surprise, MOST_NIS) - USUAL_NIS, 2.0 * limit))
-    if score and not voice.score and not voice.reason:  # words that cannot tell end no dispute
-        voice = replace(voice, doubted_ns=now, offset=said.offset or (0.0, 0.0), spread=0.0)
-    voice = replace(voice, score=score)
-    if surprise <= USUAL_NIS:
-        return replace(voice, agreed_ns=now, healthy=voice.healthy + 1)
-    if said.offset is not None:
-        voice = _averaged(voice, *said.offset)
-    return replace(voice, wrong_ns=now, healthy=0) if surprise > WRONG_NIS else voice
-
-
-def _averaged(voice: Voice, x: float, y: float, share: float = 0.2) -> Voice:
-    (mx, my), dx, dy = voice.offset, x - voice.offset[0], y - voice.offset[1]
-    spread = (1.0 - share) * (voice.spread + share * (dx * dx + dy * dy))
-    return replace(voice, offset=(mx + share * dx, my + share * dy), spread=spread)
-
-
-def _driven(voice: Voice, said: Said) -> Voice:
-    """Compares the way between two places that a sender named with the wheels' (its chord)."""
-    then, now = voice.anchor, said.anchor
-    if now is None:
-        return voice
-    if then is None or now.stamp_ns - then.stamp_ns > ALONE_NS:
-        return replace(voice, anchor=now)
-    if now.stamp_ns <= then.stamp_ns:
-        return voice
-    way = then.odometry_from_robot.inverse() @ now.odometry_from_robot
-    chord, told = math.hypot(way.x, way.y), math.hypot(now.x - then.x, now.y - then.y)
-    slip = SLIP_SHARE * chord + SLIP_M
-    sigma = math.sqrt(then.variance + now.variance + slip * slip)
-    far = chord >= max(STRIDE_M, (STILL + 1.0) * sigma)
-    jumped = told - chord > CLEAR * sigma
-    stayed = far and told < STILL_SHARE * chord and chord - told > STILL * sigma
-    voice = replace(voice, compared=voice.compared + 1.0)
-    if not (jumped or far or now.stamp_ns - then.stamp_ns >= REST_NS):
-        return voice
-    voice = replace(voice, anchor=now)
-    if jumped or stayed:
-        return replace(
-            voice,
-            strikes=voice.strikes + 1.0,
-            still=stayed,
-            steady=0,
-            struck_ns=now.stamp_ns,
-            healthy=0,
-            wrong_ns=now.stamp_ns,
-        )
-    followed = far or voice.reason != "frozen"  # a robot that stands cannot tell
-    return replace(voice, steady=voice.steady + 1) if followed else voice
-
-
-def seen(voice: Voice, stamp_ns: int, used: int, rejected: int, limit: float) -> Voice:
-    """The robot's own voice after so many of its sightings were used, or rejected."""
-    share = rejected / (used + rejected)
-    return heard(voice, Said(stamp_ns, MOST_NIS * share), limit)
-
-
-# What follows -------------------------------------------------------------------------------------
-
-
-def judged(voices: Voices, name: str, said: Said, used_ns: int, rules: TrustSettings) -> Verdict:
-    """The voices after a word of `name`, and whether it may be used.
-
-    `used_ns`: when a word of this sender was used last.
+    `used_ns`: when a report of this sender was last used.
     """
-    voice = heard(voices.get(name, Voice()), said, rules.limit)
-    voices = {**voices, name: voice}
-    if voice.reason:
-        return _in_quarantine(voices, name, said, rules)
-    if voice.strikes > MOST_STRIKES and not _my_wheels(voices, name, rules):
-        return _silenced(voices, name, said.stamp_ns, used_ns)
-    if said.surprise is None:
-        return Verdict(voices, True)
-    return _settled(voices, name, said.stamp_ns, used_ns, rules)
+    record = with_report(senders.get(name, SenderRecord()), report, rules.limit)
+    senders = {**senders, name: record}
+    if record.reason:
+        return _assess_quarantined(senders, name, report, rules)
+    if record.odometry_conflicts > MOST_CONFLICTS and not _is_odometry_wrong(senders, name, rules):
+        return _quarantine(senders, name, report.stamp_ns, used_ns)
+    if report.nis is None:
+        return TrustDecision(senders, True)
+    return _decide_dispute(senders, name, report.stamp_ns, used_ns, rules)
 
 
-def _settled(voices: Voices, name: str, now_ns: int, used_ns: int, rules: TrustSettings) -> Verdict:
-    """Who is wrong, where somebody disagrees with the estimate for long enough.
+def _decide_dispute(
+    senders: SenderRecords, name: str, now_ns: int, used_ns: int, rules: TrustSettings
+) -> TrustDecision:
+    """Decides who is wrong if a sender has contradicted the estimate for long enough.
 
-    The robot's own eyes decide, else the wheels, else the greater number, else what was believed
-    before; until then the robot goes by its wheels alone. Where nobody agrees it is for the robot
-    itself to find that it is lost.
+    A source supports the estimate only if it agreed with it after the dispute began. If none does,
+    no sender is blamed: the robot detects by its innovations that it is lost.
     """
-    lately = dict(_lately(voices, now_ns))
-    doubted_ns = min((v.doubted_ns for v in lately.values() if v.score > rules.limit), default=None)
-    if doubted_ns is None:
-        return Verdict(voices, True)
-    against = {n for n, v in lately.items() if v.score > 0.5 * rules.limit}
-    agreeing = {n for n, v in lately.items() if v.agreed_ns > max(doubted_ns, v.doubted_ns)}
-    beside = agreeing - against
-    if not beside:
-        return Verdict(voices, True)
-    estimate_is_right = _right(lately, against, beside, now_ns - doubted_ns)
-    if estimate_is_right is None:
-        return Verdict(voices, False)
-    if not estimate_is_right:
-        return _outvoted(voices, against, beside, name, now_ns)
-    if name in against and lately[name].score > rules.limit:
-        return _silenced(voices, name, now_ns, used_ns)
-    return Verdict(voices, name not in against)
+    recent = dict(_recent(senders, now_ns))
+    since_ns = min(
+        (r.dispute_since_ns for r in recent.values() if r.score > rules.limit), default=None
+    )
+    if since_ns is None:
+        return TrustDecision(senders, True)
+    dissenters = {n for n, r in recent.items() if r.score > 0.5 * rules.limit}
+    agreeing = {
+        n for n, r in recent.items() if r.last_agreement_ns > max(since_ns, r.dispute_since_ns)
+    }
+    supporters = agreeing - dissenters
+    if not supporters:
+        return TrustDecision(senders, True)
+    is_right = _is_estimate_right(recent, dissenters, supporters, now_ns - since_ns)
+    if is_right is None:
+        return TrustDecision(senders, False)
+    if not is_right:
+        return _quarantine_supporters(senders, dissenters, supporters, name, now_ns)
+    if name in dissenters and recent[name].score > rules.limit:
+        return _quarantine(senders, name, now_ns, used_ns)
+    return TrustDecision(senders, name not in dissenters)
 
 
-def _right(lately: Voices, against: set[str], beside: set[str], since_ns: int) -> bool | None:
-    """Whether the estimate, and those beside it, are right; None while that is open."""
-    if OWN in beside or OWN in against:
-        return OWN in beside
-    denied = {n for n in against | beside if lately[n].strikes >= CLEARLY}  # by the wheels
-    if not against | beside <= denied:
-        against, beside = against - denied, beside - denied
-    if len(beside) != len(against):
-        return len(beside) > len(against)
-    return True if since_ns >= TIED_NS else None
+def _is_estimate_right(
+    recent: SenderRecords, dissenters: set[str], supporters: set[str], dispute_ns: int
+) -> bool | None:
+    """Whether the estimate and its supporters are right; None while that is undecided.
+
+    The robot's own sensors decide, otherwise odometry, otherwise the majority, and after some time
+    the estimate before the dispute.
+    """
+    if OWN_SENSORS in supporters or OWN_SENSORS in dissenters:
+        return OWN_SENSORS in supporters
+    all_sides = dissenters | supporters
+    conflicting = {n for n in all_sides if recent[n].odometry_conflicts >= CLEAR_CONFLICTS}
+    if not all_sides <= conflicting:
+        dissenters, supporters = dissenters - conflicting, supporters - conflicting
+    if len(supporters) != len(dissenters):
+        return len(supporters) > len(dissenters)
+    return True if dispute_ns >= TIE_NS else None
 
 
-def _lately(voices: Voices, now_ns: int, without: str | None = None) -> Iterator[tuple[str, Voice]]:
-    """Whoever is believed and was heard lately."""
-    for name, voice in voices.items():
-        if name != without and not voice.reason and now_ns - voice.heard_ns <= WINDOW_NS:
-            yield name, voice
+def _recent(
+    senders: SenderRecords, now_ns: int, without: str | None = None
+) -> Iterator[tuple[str, SenderRecord]]:
+    """The senders out of quarantine that reported recently."""
+    for name, record in senders.items():
+        is_recent = now_ns - record.last_report_ns <= RECENT_NS
+        if name != without and not record.reason and is_recent:
+            yield name, record
 
 
-def _my_wheels(voices: Voices, name: str, rules: TrustSettings) -> bool:
-    """Whether the robot's wheels are to blame: another voice denies them, too."""
-    now_ns = voices[name].heard_ns
+def _is_odometry_wrong(senders: SenderRecords, name: str, rules: TrustSettings) -> bool:
+    """Whether another source contradicts odometry too, so that `name` is not to blame."""
+    now_ns = senders[name].last_report_ns
     return any(
-        voice.strikes >= 1.0 or (other == OWN and voice.score > 0.5 * rules.limit)
-        for other, voice in _lately(voices, now_ns, name)
+        record.odometry_conflicts >= 1.0
+        or (other == OWN_SENSORS and record.score > 0.5 * rules.limit)
+        for other, record in _recent(senders, now_ns, name)
     )
 
 
-def _silenced(voices: Voices, name: str, now_ns: int, used_ns: int) -> Verdict:
-    voice = voices[name]
-    polluted = bool(voice.score) and used_ns >= voice.doubted_ns
-    offsets = [math.hypot(*voice.offset)] if polluted else []
-    changed = {**voices, name: _put_away(voice, _reason(voice), now_ns)}
-    if voice.strikes > MOST_STRIKES:  # by the wheels alone: whom it contradicted may be right
-        for other, accused in voices.items():
-            if accused.reason in BY_COMPARISON and accused.since_ns > now_ns - ALONE_NS:
-                changed[other] = _freed(accused, now_ns)
-                offsets.append(math.hypot(*accused.offset))
-    return Verdict(changed, False, "quarantined", frozenset((name,)), max(offsets, default=0.0))
+# Quarantine ---------------------------------------------------------------------------------------
 
 
-def _freed(voice: Voice, now_ns: int) -> Voice:
-    return replace(voice, reason="", since_ns=now_ns, score=0.0, strikes=0.0, doubted_ns=NEVER_NS)
+def _quarantine(senders: SenderRecords, name: str, now_ns: int, used_ns: int) -> TrustDecision:
+    """The decision against one sender."""
+    record = senders[name]
+    was_followed = bool(record.score) and used_ns >= record.dispute_since_ns
+    errors_m = [math.hypot(*record.mean_offset)] if was_followed else []
+    changed = {**senders, name: _quarantined(record, _reason_of(record), now_ns)}
+    if record.odometry_conflicts > MOST_CONFLICTS:  # the senders that it contradicted may be right
+        for other, accused in senders.items():
+            if accused.reason in _BY_COMPARISON and accused.since_ns > now_ns - SILENCE_NS:
+                changed[other] = _released(accused, now_ns)
+                errors_m.append(math.hypot(*accused.mean_offset))
+    error_m = max(errors_m, default=0.0)
+    return TrustDecision(changed, False, "quarantined", frozenset((name,)), error_m)
 
 
-def _put_away(voice: Voice, reason: str, now_ns: int) -> Voice:
+def _quarantine_supporters(
+    senders: SenderRecords, dissenters: set[str], supporters: set[str], name: str, now_ns: int
+) -> TrustDecision:
+    """The decision against the senders that a wrong estimate followed."""
+    names = frozenset(supporters - {OWN_SENSORS})
+    errors_m = [math.hypot(*senders[n].mean_offset) for n in dissenters]
+    changed = {n: _quarantined(senders[n], QuarantineReason.OUTVOTED, now_ns) for n in names}
+    changed |= {n: replace(senders[n], score=0.0) for n in dissenters}
+    changed = {**senders, **changed}
+    return TrustDecision(changed, name not in names, "outvoted", names, max(errors_m))
+
+
+def _quarantined(record: SenderRecord, reason: QuarantineReason, now_ns: int) -> SenderRecord:
     return replace(
-        voice,
+        record,
         reason=reason,
         since_ns=now_ns,
-        quarantines=voice.quarantines + 1,
-        healthy=0,
-        steady=0,
+        quarantines=record.quarantines + 1,
+        agreements=0,
+        confirmations=0,
     )
 
 
-def _outvoted(
-    voices: Voices, against: set[str], beside: set[str], name: str, now_ns: int
-) -> Verdict:
-    """What the estimate followed is wrong."""
-    silenced = frozenset(beside - {OWN})
-    offsets = [math.hypot(*voices[n].offset) for n in against]
-    changed = {n: _put_away(voices[n], "outvoted", now_ns) for n in silenced}
-    changed |= {n: replace(voices[n], score=0.0) for n in against}
-    changed = {**voices, **changed}
-    return Verdict(changed, name not in silenced, "outvoted", silenced, max(offsets))
+def _released(record: SenderRecord, now_ns: int) -> SenderRecord:
+    return replace(
+        record,
+        reason=None,
+        since_ns=now_ns,
+        score=0.0,
+        odometry_conflicts=0.0,
+        dispute_since_ns=NEVER_NS,
+    )
 
 
-def _reason(voice: Voice) -> str:
-    """What kind of wrong it is, by what is known so far."""
-    if voice.still and voice.strikes >= 0.8:
-        return "frozen"
-    if voice.strikes >= 1.8:
-        return "overconfident" if voice.strikes > 0.5 * voice.compared else "jumps"
-    (x, y), spread = voice.offset, voice.spread
-    return "biased" if x * x + y * y > spread else "overconfident"
+def _reason_of(record: SenderRecord) -> QuarantineReason:
+    """The best explanation so far. Conflicts fade: nearly one, and nearly two, are 0.8 and 1.8."""
+    conflicts = record.odometry_conflicts
+    if record.missed_motion and conflicts >= 0.8:
+        return QuarantineReason.FROZEN
+    if conflicts >= 1.8:
+        often = conflicts > 0.5 * record.comparisons
+        return QuarantineReason.OVERCONFIDENT if often else QuarantineReason.JUMPS
+    (x, y), variance = record.mean_offset, record.offset_variance
+    return QuarantineReason.BIASED if x * x + y * y > variance else QuarantineReason.OVERCONFIDENT
 
 
-def _in_quarantine(voices: Voices, name: str, said: Said, rules: TrustSettings) -> Verdict:
-    voice, now = voices[name], said.stamp_ns
-    if voice.wrong_ns == now and (said.surprise is None or said.surprise > WRONG_NIS):
-        voice = replace(voice, reason=_reason(voice))
-        voices = {**voices, name: voice}
-    long_ns = int(rules.readmit_s * 1e9)
-    confirmed = any(v.agreed_ns >= now - WINDOW_NS for _, v in _lately(voices, now, name))
-    right = voice.healthy >= LEAST_HEALTHY and now - voice.wrong_ns >= long_ns and confirmed
-    alone = all(now - v.heard_ns > ALONE_NS for n, v in voices.items() if n != name)
-    steady = voice.steady >= LEAST_STEADY and now - voice.struck_ns >= long_ns
-    if not (right or (alone and steady)):
-        return Verdict(voices, False)
-    return Verdict({**voices, name: _freed(voice, now)}, True, "readmitted")
+def _assess_quarantined(
+    senders: SenderRecords, name: str, report: TeammateReport, rules: TrustSettings
+) -> TrustDecision:
+    """A report of a sender in quarantine is not used, unless it is the one that ends it.
+
+    The quarantine ends when enough reports agreed with the estimate while another source confirmed
+    the estimate, or, without any other source, when enough distances agreed with odometry.
+    """
+    record, now = senders[name], report.stamp_ns
+    contradicts = report.nis is None or report.nis > CONTRADICTING_NIS
+    if record.last_failure_ns == now and contradicts:
+        record = replace(record, reason=_reason_of(record))
+        senders = {**senders, name: record}
+    readmit_ns = int(rules.readmit_s * 1e9)
+    others = _recent(senders, now, name)
+    is_confirmed = any(r.last_agreement_ns >= now - RECENT_NS for _, r in others)
+    agrees = record.agreements >= LEAST_AGREEMENTS and now - record.last_failure_ns >= readmit_ns
+    is_alone = all(now - r.last_report_ns > SILENCE_NS for n, r in senders.items() if n != name)
+    is_consistent = (
+        record.confirmations >= LEAST_CONFIRMATIONS and now - record.last_conflict_ns >= readmit_ns
+    )
+    if not ((agrees and is_confirmed) or (is_alone and is_consistent)):
+        return TrustDecision(senders, False)
+    return TrustDecision({**senders, name: _released(record, now)}, True, "readmitted")
 
 
-def forgiven(voices: Voices) -> Voices:
-    """After the robot was lost: what it held against others was its own error."""
-    return {n: v if v.reason else replace(v, score=0.0) for n, v in voices.items()}
+def reset_scores(senders: SenderRecords) -> SenderRecords:
+    """The records after the robot was lost: its own error caused the scores of test 1."""
+    return {n: r if r.reason else replace(r, score=0.0) for n, r in senders.items()}
 
 
-def standings(voices: Voices, now_ns: int) -> tuple[Standing, ...]:
-    """How each sender stands that is heard, or is or was in quarantine."""
+def trust_statuses(senders: SenderRecords, now_ns: int) -> tuple[TrustStatus, ...]:
+    """The status of each sender that reported recently, or is or was in quarantine."""
     return tuple(
-        Standing(name, v.reason, v.since_ns, v.quarantines, not any(_lately(voices, now_ns, name)))
-        for name, v in sorted(voices.items())
-        if name != OWN and (v.quarantines or now_ns - v.heard_ns <= WINDOW_NS)
+        TrustStatus(
+            name,
+            str(r.reason or ""),
+            r.since_ns,
+            r.quarantines,
+            not any(_recent(senders, now_ns, name)),
+        )
+        for name, r in sorted(senders.items())
+        if name != OWN_SENSORS and (r.quarantines or now_ns - r.last_report_ns <= RECENT_NS)
     )

@@ -21,8 +21,8 @@ from cpcbl_agents.agent import (
 )
 from cpcbl_agents.counters import MessageCounters
 from cpcbl_agents.guests import GuestRegistry
-from cpcbl_team.collaboration import LOWEST_TIER, fix_for, hears, next_tier, without_heading
 from cpcbl_team.config import LocalizationSettings
+from cpcbl_team.fixes import fix_for, without_heading
 from cpcbl_team.gaussian import Covariance2
 from cpcbl_team.information_gain import (
     FixMemory,
@@ -37,6 +37,7 @@ from cpcbl_team.information_gain import (
     staleness,
 )
 from cpcbl_team.inputs import Belief, Fix
+from cpcbl_team.tiers import LOWEST_TIER, accepts_tier, next_tier
 from cpcbl_transport.budget import Budget
 from cpcbl_transport.compact import help_bytes
 from cpcbl_transport.link_size import sent_bytes
@@ -166,7 +167,7 @@ class CollaborationAgent:
     def _is_useful(self, seen: Fix, tier: int, now: PoseEstimate) -> bool:
         rules = self._rules
         in_sight = now.stamp_ns - seen.stamp_ns < IN_SIGHT_NS
-        if not (in_sight and hears(self.tier, tier, rules)):
+        if not (in_sight and accepts_tier(self.tier, tier, rules)):
             return False
         gain = information_gain_of_belief(seen, tier, now.estimate, rules)
         return bool(now.lost) or gain >= rules.least_use
@@ -203,7 +204,7 @@ class CollaborationAgent:
         rules = self._rules
         last_ns, _ = self._fix_memories.get(fix.robot, (None, None))
         rested = last_ns is None or fix.stamp_ns - last_ns >= max(1, rules.fix_interval_s * 1e9)
-        return rules.active and self.has_started and rested and hears(tier, self.tier, rules)
+        return rules.active and self.has_started and rested and accepts_tier(tier, self.tier, rules)
 
     def _offer(self, fix: Fix, tier: int) -> _Offer:
         """The fix with its gain; with the heading only if the heading is worth its own bytes."""

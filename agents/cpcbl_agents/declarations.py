@@ -6,8 +6,8 @@ After a change it declares the new first and then takes the old back, so that no
 from collections.abc import Callable, Iterable, Mapping
 
 from cpcbl_agents.collaboration import Interests
-from cpcbl_team.collaboration import LOWEST_TIER, tiers_heard
 from cpcbl_team.config import CollaborationSettings
+from cpcbl_team.tiers import LOWEST_TIER, accepted_tiers
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus, Handle, LivelinessCallback, MessageCallback, Publisher
 from cpcbl_transport.topics import Topic
@@ -78,7 +78,7 @@ class Declarations:
 
     def _subscribed_keys(self, tier: int) -> Iterable[str]:
         if self._rules.active:
-            for better in tiers_heard(tier, self._rules):
+            for better in accepted_tiers(tier, self._rules):
                 yield topics.FIX.at(robot=self._robot, tier=better)
         for name, their_tier in self._sources:
             yield topics.BELIEF.at(tier=their_tier, robot=name)

@@ -7,10 +7,10 @@ from cpcbl_agents.agent import AgentMessage, FrameEstimate, PoseEstimate, Presen
 from cpcbl_team.config import Field, LocalizationSettings
 from cpcbl_team.inputs import Belief, Fix, Input, Odometry, Position, Sightings, Told
 from cpcbl_team.localizer import Localizer
-from cpcbl_team.self_calibration import Learned
+from cpcbl_team.self_calibration import SelfCalibration
 from cpcbl_team.sensors import without_bearing_bias
 from cpcbl_team.timeline import Timeline
-from cpcbl_team.trust import Standing, standings
+from cpcbl_team.trust import TrustStatus, trust_statuses
 
 REPORT_INTERVAL_NS = 100_000_000
 ODOMETRY_WAIT_NS = 200_000_000  # how long a frame waits for the odometry that covers it
@@ -49,13 +49,13 @@ class FilterAgent:
         return self.counts + Counter(self.timeline.state.counts)
 
     @property
-    def learned(self) -> Learned | None:
+    def learned(self) -> SelfCalibration | None:
         """What the robot has learned of its odometry and bearings; None where it does not learn."""
         return self.timeline.state.memory.calibration.learned if self._learns else None
 
-    def standings(self, now_ns: int) -> tuple[Standing, ...]:
-        """How far this robot trusts each teammate from which it receives messages."""
-        return standings(self.timeline.state.memory.teammates.senders, now_ns)
+    def trust_statuses(self, now_ns: int) -> tuple[TrustStatus, ...]:
+        """How far this robot trusts each teammate from which it receives help."""
+        return trust_statuses(self.timeline.state.memory.teammates.senders, now_ns)
 
     def handle(self, message: AgentMessage, now_ns: int) -> Sequence[AgentMessage]:
         match message:

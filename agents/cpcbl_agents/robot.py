@@ -11,7 +11,7 @@ from cpcbl_agents.guests import GuestRegistry
 from cpcbl_agents.sensing import SensingAgent
 from cpcbl_team.config import Team
 from cpcbl_team.inputs import Belief, Fix, Odometry, Position, Sightings, Told
-from cpcbl_team.trust import Standing
+from cpcbl_team.trust import TrustStatus
 from cpcbl_transport.budget import Budget
 from cpcbl_transport.messages import (
     AnnotatedFrame,
@@ -165,10 +165,10 @@ class Robot:
 
     def _trust(self, now_ns: int, clocks: ClockMonitor | None) -> Iterator[Trust]:
         """How far each teammate is trusted, by its messages and by its clock."""
-        standings = {s.robot: s for s in self.filter.standings(now_ns)}
+        statuses = {s.robot: s for s in self.filter.trust_statuses(now_ns)}
         clock_off = frozenset() if clocks is None else clocks.off()
-        for name in sorted(standings.keys() | clock_off):
-            standing = standings.get(name, Standing(name))
+        for name in sorted(statuses.keys() | clock_off):
+            status = statuses.get(name, TrustStatus(name))
             if name in clock_off:
-                standing = standing._replace(reason="clock")
-            yield Trust(*standing, 0.0 if clocks is None else clocks.late_s(name))
+                status = status._replace(reason="clock")
+            yield Trust(*status, 0.0 if clocks is None else clocks.late_s(name))

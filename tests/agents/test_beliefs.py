@@ -9,12 +9,12 @@ from support.collaboration import GOOD, MATES, POOR, POORER, SIGMA_M, Alone, ahe
 from support.core import diagonal
 
 from cpcbl_agents.agent import BeliefSubscribers, HelpSent, Presence
-from cpcbl_team.collaboration import LOWEST_TIER
 from cpcbl_team.config import (
     BudgetSettings,
     SensorSettings,
 )
 from cpcbl_team.inputs import Belief
+from cpcbl_team.tiers import LOWEST_TIER
 from cpcbl_transport.messages import Flow
 
 LOST = "no evidence"

@@ -10,8 +10,8 @@ from support.buses import Subscription, TeamOnBus, examples, robot_at, saw, stan
 from cpcbl_agents.composition import build_robot
 from cpcbl_agents.declarations import LivelinessTokens
 from cpcbl_agents.node import Node
-from cpcbl_team.collaboration import LOWEST_TIER
 from cpcbl_team.inputs import Fix, Odometry, Sighting
+from cpcbl_team.tiers import LOWEST_TIER
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Handle, LivelinessCallback, MessageCallback, Publisher
 from cpcbl_transport.memory_bus import MemoryBus, MemoryHub

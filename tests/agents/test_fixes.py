@@ -10,12 +10,12 @@ from support.buses import MS, SECOND, examples
 from support.collaboration import GOOD, MATES, POOR, POORER, SIGMA_M, Alone, ahead, robots
 
 from cpcbl_agents.agent import BeliefSubscribers, Presence
-from cpcbl_team.collaboration import LOWEST_TIER, next_tier
 from cpcbl_team.config import (
     BudgetSettings,
     CollaborationSettings,
 )
 from cpcbl_team.inputs import Sighting
+from cpcbl_team.tiers import LOWEST_TIER, next_tier
 from cpcbl_transport.messages import Flow
 
 

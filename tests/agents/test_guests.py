@@ -9,9 +9,9 @@ from msgspec.structs import replace
 from support.buses import SECOND, TeamOnBus, examples, robot_at, saw, team_of
 
 from cpcbl_agents.guests import FORGET_NS, LOOKUP_NS, GuestRegistry
-from cpcbl_team.collaboration import LOWEST_TIER
 from cpcbl_team.config import GuestSettings, RobotSettings, SensorSettings, Team
 from cpcbl_team.inputs import Fix, Sighting
+from cpcbl_team.tiers import LOWEST_TIER
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Handle, LivelinessCallback
 from cpcbl_transport.memory_bus import MemoryBus, MemoryHub

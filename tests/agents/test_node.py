@@ -16,7 +16,7 @@ from cpcbl_agents.node import Node
 from cpcbl_team.config import LocalizerSettings
 from cpcbl_team.estimate import ZERO3
 from cpcbl_team.inputs import Sighting
-from cpcbl_team.self_calibration import Learned
+from cpcbl_team.self_calibration import SelfCalibration
 from cpcbl_team.state import CalibrationMemory
 from cpcbl_transport import topics
 from cpcbl_transport.compact import BELIEF_BYTES
@@ -110,7 +110,7 @@ def test_the_status_of_a_robot_that_learns_says_what() -> None:
     stand = TeamOnBus(with_robot(two_robots(), "me", localizer=learning))
     for robot in stand.robots.values():
         timeline = robot.filter.timeline
-        calibration = CalibrationMemory(Learned(0.98, 0.96, 0.01))
+        calibration = CalibrationMemory(SelfCalibration(0.98, 0.96, 0.01))
         memory = timeline.state.memory._replace(calibration=calibration)
         timeline.state = timeline.state._replace(memory=memory)
     assert stand.status("me").learned == (0.98, 0.96, 0.01)

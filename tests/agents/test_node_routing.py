@@ -25,10 +25,10 @@ from support.nodes import (
     two_robots,
 )
 
-from cpcbl_team.collaboration import LOWEST_TIER, tier_of
 from cpcbl_team.config import BudgetSettings
 from cpcbl_team.information_gain import sigma_limits_m
 from cpcbl_team.inputs import Belief, Fix, Odometry, Sighting
+from cpcbl_team.tiers import LOWEST_TIER, tier_of
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Publisher
 from cpcbl_transport.memory_bus import MemoryBus, MemoryHub

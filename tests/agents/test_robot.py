@@ -11,7 +11,6 @@ from cpcbl_agents.agent import Presence, Tick
 from cpcbl_agents.composition import build_robot
 from cpcbl_agents.filtering import ODOMETRY_WAIT_NS
 from cpcbl_agents.robot import Robot
-from cpcbl_team.collaboration import LOWEST_TIER
 from cpcbl_team.config import (
     CollaborationSettings,
     LocalizerSettings,
@@ -25,8 +24,9 @@ from cpcbl_team.estimate import ZERO3, Estimate
 from cpcbl_team.geometry import Pose2
 from cpcbl_team.geometry import step as stepped
 from cpcbl_team.inputs import Belief, Fix, Odometry, Position, Sighting, Sightings
-from cpcbl_team.self_calibration import Learned
+from cpcbl_team.self_calibration import SelfCalibration
 from cpcbl_team.state import CalibrationMemory
+from cpcbl_team.tiers import LOWEST_TIER
 from cpcbl_transport.messages import Message
 
 OAK = Sighting("oak", 4.05, 0.02)
@@ -298,7 +298,7 @@ def stood_with_bias(learns: bool) -> Robot:
     rules = LocalizerSettings(self_calibration=learns)
     subject = robot(with_robot(TEAM, "me", localizer=rules))
     state = subject.filter.timeline.state
-    known = Learned(bearing_bias_rad=0.1)
+    known = SelfCalibration(bearing_bias_rad=0.1)
     memory = state.memory._replace(calibration=CalibrationMemory(known))
     subject.filter.timeline.state = state._replace(memory=memory)
     for piece in pieces(0.5, 0.0, 0.0):

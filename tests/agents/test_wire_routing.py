@@ -34,7 +34,6 @@ from cpcbl_launch.run.processes import PROGRAM
 from cpcbl_launch.run.supervisor import ProcessSpec, Supervisor
 from cpcbl_launch.run.up import free_endpoint
 from cpcbl_launch.team_file import save_resolved
-from cpcbl_team.collaboration import LOWEST_TIER
 from cpcbl_team.config import (
     Direction,
     Field,
@@ -44,6 +43,7 @@ from cpcbl_team.config import (
     Team,
 )
 from cpcbl_team.inputs import Sighting
+from cpcbl_team.tiers import LOWEST_TIER
 from cpcbl_transport.guards import guard_rules
 from cpcbl_transport.zenoh_bus import open_router
 

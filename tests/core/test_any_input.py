@@ -19,9 +19,9 @@ from support.core import (
     state_at,
 )
 
-from cpcbl_team.collaboration import fix_for
 from cpcbl_team.config import Field, Landmark, OdometrySettings, SensorSettings, Start, Variant
 from cpcbl_team.estimate import POSITION, Covariance3, Estimate, Information, merge
+from cpcbl_team.fixes import fix_for
 from cpcbl_team.geometry import Pose2
 from cpcbl_team.inputs import Fix, Input, Odometry, Position, Sighting, Sightings, Told
 from cpcbl_team.state import State

@@ -16,22 +16,14 @@ from support.core import (
     random_matrix,
 )
 
-from cpcbl_team.collaboration import (
-    LOWEST_TIER,
-    TIER_ZERO_SIGMA_M,
-    Place,
-    fix_for,
-    next_tier,
-    placed,
-    tier_of,
-    tiers_heard,
-    without_heading,
-)
+from cpcbl_team.beliefs import ObjectPosition, teammate_at
 from cpcbl_team.config import CollaborationSettings, SensorSettings
 from cpcbl_team.estimate import Estimate
+from cpcbl_team.fixes import fix_for, without_heading
 from cpcbl_team.gaussian import Covariance2
 from cpcbl_team.geometry import Pose2
 from cpcbl_team.inputs import Fix, Sighting
+from cpcbl_team.tiers import LOWEST_TIER, TIER_ZERO_SIGMA_M, accepted_tiers, next_tier, tier_of
 
 SENSOR = SensorSettings(range_share=0.05, range_floor_m=0.0, bearing_sigma_deg=5.0)
 RULES = CollaborationSettings(tier_width=2.0, tier_hysteresis=1.2)
@@ -121,13 +113,13 @@ def test_a_heading_that_was_seen_is_told_in_the_fields_frame(
 # Passive ------------------------------------------------------------------------------------------
 
 
-def there(place: Place | None) -> Place:
+def there(place: ObjectPosition | None) -> ObjectPosition:
     assert place is not None
     return place
 
 
 def test_a_teammate_that_stands_is_where_it_said() -> None:
-    place = there(placed([belief(1.0, 2.0, sigma_m=0.2)], SECOND // 2, RULES))
+    place = there(teammate_at([belief(1.0, 2.0, sigma_m=0.2)], SECOND // 2, RULES))
     assert (place.x, place.y) == (1.0, 2.0)
     assert place.covariance == pytest.approx((0.04, 0.0, 0.04))
 
@@ -135,7 +127,7 @@ def test_a_teammate_that_stands_is_where_it_said() -> None:
 def test_a_teammate_that_drives_is_carried_along() -> None:
     """Resolution e: 0.5 s at 1 m/s to the north; a third of the way is added to its sigma."""
     told = belief(1.0, 2.0, heading=0.5 * math.pi, sigma_m=0.2, speed_m_s=1.0)
-    place = there(placed([told], SECOND // 2, RULES))
+    place = there(teammate_at([told], SECOND // 2, RULES))
     assert (place.x, place.y) == pytest.approx((1.0, 2.5))
     doubt = (0.5 / 3.0) ** 2
     sideways = 0.04 + (0.5 * 0.05) ** 2 + doubt  # with its heading's sigma of 0.05
@@ -144,13 +136,13 @@ def test_a_teammate_that_drives_is_carried_along() -> None:
 
 def test_a_teammate_that_turns_is_carried_along_its_arc() -> None:
     told = belief(0.0, 0.0, speed_m_s=1.0, turn_rate_rad_s=0.4)
-    place = there(placed([told], SECOND // 2, RULES))
+    place = there(teammate_at([told], SECOND // 2, RULES))
     assert (place.x, place.y) == pytest.approx((0.5 * math.cos(0.1), 0.5 * math.sin(0.1)))
 
 
 def test_a_teammate_that_was_seen_before_it_spoke_is_carried_back() -> None:
     told = belief(1.0, 2.0, SECOND, sigma_m=0.2, speed_m_s=1.0)
-    place = there(placed([told], SECOND - SECOND // 4, RULES))
+    place = there(teammate_at([told], SECOND - SECOND // 4, RULES))
     assert (place.x, place.y) == pytest.approx((0.75, 2.0))
     doubt = (0.25 / 3.0) ** 2
     sideways = 0.04 + (0.25 * 0.05) ** 2 + doubt
@@ -164,7 +156,7 @@ def test_a_teammate_that_was_seen_before_it_spoke_is_carried_back() -> None:
 def test_a_belief_is_used_from_half_a_second_before_it_up_to_its_greatest_age(
     age_s: float, used: bool
 ) -> None:
-    found = placed([belief(1.0, 2.0, 5 * SECOND)], int((5.0 + age_s) * SECOND), RULES)
+    found = teammate_at([belief(1.0, 2.0, 5 * SECOND)], int((5.0 + age_s) * SECOND), RULES)
     assert (found is not None) is used
 
 
@@ -184,7 +176,7 @@ def test_of_several_beliefs_the_nearest_that_is_of_use_is_taken(
 ) -> None:
     for ages in permutations(ages_s):
         beliefs = [belief(age, 2.0, 5 * SECOND - round(age * SECOND)) for age in ages]
-        place = placed(beliefs, 5 * SECOND, RULES)
+        place = teammate_at(beliefs, 5 * SECOND, RULES)
         assert (place.x if place else None) == nearest
 
 
@@ -203,8 +195,10 @@ def test_a_place_is_never_more_certain_for_being_farther_in_time(
     age_s: float, speed: float, turn_rate: float
 ) -> None:
     told = belief(1.0, 2.0, speed_m_s=speed, turn_rate_rad_s=turn_rate)
-    later = matrix2(there(placed([told], int(age_s * SECOND), RULES)).covariance)
-    assert least_eigenvalue(later - matrix2(there(placed([told], 0, RULES)).covariance)) > -1e-12
+    later = matrix2(there(teammate_at([told], int(age_s * SECOND), RULES)).covariance)
+    assert (
+        least_eigenvalue(later - matrix2(there(teammate_at([told], 0, RULES)).covariance)) > -1e-12
+    )
 
 
 # Tiers --------------------------------------------------------------------------------------------
@@ -263,11 +257,11 @@ def test_who_was_lost_comes_back_to_the_tier_of_its_sigma() -> None:
 @given(st.integers(0, LOWEST_TIER), st.integers(0, LOWEST_TIER))
 def test_one_way_hears_only_what_is_better(own: int, other: int) -> None:
     """Never both of two robots, so nothing goes in circles (rows 29, 30, resolution d)."""
-    heard = tiers_heard(own, CollaborationSettings(direction="one-way"))
+    heard = accepted_tiers(own, CollaborationSettings(direction="one-way"))
     assert (other in heard) is (other < own)
 
 
 @given(st.integers(0, LOWEST_TIER))
 def test_both_ways_hears_all(own: int) -> None:
-    heard = tiers_heard(own, CollaborationSettings(direction="both-ways"))
+    heard = accepted_tiers(own, CollaborationSettings(direction="both-ways"))
     assert list(heard) == list(range(LOWEST_TIER + 1))

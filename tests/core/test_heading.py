@@ -29,7 +29,6 @@ from support.core import (
     state_at,
 )
 
-from cpcbl_team.collaboration import fix_for, without_heading
 from cpcbl_team.config import (
     CollaborationSettings,
     Field,
@@ -41,11 +40,13 @@ from cpcbl_team.config import (
     Variant,
 )
 from cpcbl_team.estimate import Covariance3, Estimate
+from cpcbl_team.fixes import fix_for, without_heading
 from cpcbl_team.geometry import Pose2, step, wrap_angle
 from cpcbl_team.inputs import Fix, Odometry, Sighting, Told
 from cpcbl_team.localizer import Localizer
 from cpcbl_team.motion import motion_noise
 from cpcbl_team.pose_observation import from_fix, from_position_sensor
+from cpcbl_team.sender_record import QuarantineReason
 from cpcbl_team.state import State, TeammateMemory
 
 ORIGIN = Pose2(0.0, 0.0, 0.0)
@@ -373,7 +374,7 @@ def test_who_is_in_quarantine_finds_nobody() -> None:
     robot = localizer("joint", Field(), start=UNKNOWN, odometry=STILL)
     state = robot.start(0)
     state = robot.add_fix(state, fix(1.0, 2.0, 1, heading=0.5))
-    voice = replace(state.memory.teammates.senders["mate"], reason="biased")
+    voice = replace(state.memory.teammates.senders["mate"], reason=QuarantineReason.BIASED)
     lost = robot.start(0).memory._replace(teammates=TeammateMemory(senders={"mate": voice}))
     state = robot.start(0)._replace(memory=lost)
     for i in range(1, 5):

@@ -8,7 +8,6 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 from support.gains import NOTHING, fusions, round_covariance
 
-from cpcbl_team.collaboration import LOWEST_TIER
 from cpcbl_team.config import Fusion
 from cpcbl_team.information_gain import (
     USUAL_HEADING_SIGMA_RAD,
@@ -18,6 +17,7 @@ from cpcbl_team.information_gain import (
     predicted_teammate_heading_variance,
 )
 from cpcbl_team.inputs import Fix
+from cpcbl_team.tiers import LOWEST_TIER
 
 GOOD, USUAL = 5, USUAL_HEADING_SIGMA_RAD**2
 variances = st.floats(1e-6, math.pi**2)

@@ -22,7 +22,6 @@ from support.gains import (
     tiers,
 )
 
-from cpcbl_team.collaboration import LOWEST_TIER
 from cpcbl_team.config import CollaborationSettings, Fusion
 from cpcbl_team.estimate import SMALLEST_VARIANCE, Covariance3, Estimate
 from cpcbl_team.gaussian import Covariance2, Gaussian2
@@ -33,6 +32,7 @@ from cpcbl_team.information_gain import (
     merged_covariance,
 )
 from cpcbl_team.inputs import Fix
+from cpcbl_team.tiers import LOWEST_TIER
 
 
 @given(covariances, covariances, covariances)

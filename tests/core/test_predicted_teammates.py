@@ -16,7 +16,6 @@ from support.gains import (
     tiers,
 )
 
-from cpcbl_team.collaboration import LOWEST_TIER, TIER_ZERO_SIGMA_M, next_tier
 from cpcbl_team.config import CollaborationSettings
 from cpcbl_team.estimate import SMALLEST_VARIANCE
 from cpcbl_team.gaussian import Covariance2
@@ -26,6 +25,7 @@ from cpcbl_team.information_gain import (
     predicted_teammate_covariance,
     sigma_limits_m,
 )
+from cpcbl_team.tiers import LOWEST_TIER, TIER_ZERO_SIGMA_M, next_tier
 
 
 @given(

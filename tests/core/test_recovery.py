@@ -23,7 +23,7 @@ from support.core import (
     state_at,
 )
 
-from cpcbl_team.collaboration import Place
+from cpcbl_team.beliefs import ObjectPosition
 from cpcbl_team.config import (
     Field,
     Gives,
@@ -341,7 +341,7 @@ def test_an_object_that_was_seen_a_short_time_ago_is_no_new_evidence(
     before = (piece(SECOND - age_ns, ORIGIN, "ne", 4.5, 2.5),)
     memory = Memory(RecoveryMemory(evidence=before))
     state = state._replace(memory=memory)
-    place, both = Place(4.5, 2.5, Covariance2(0.0, 0.0, 0.0)), (5.0, 0.5)
+    place, both = ObjectPosition(4.5, 2.5, Covariance2(0.0, 0.0, 0.0)), (5.0, 0.5)
     seen = [Measurement(name, place, None, False, *both, 0.1, 0.1) for name in ("ne", "ne")]
     assert [e.source for e in with_measurements(state, seen).evidence] == kept
 

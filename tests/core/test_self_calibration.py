@@ -36,7 +36,13 @@ from cpcbl_team.estimate import Estimate
 from cpcbl_team.geometry import Pose2, step, wrap_angle
 from cpcbl_team.inputs import Odometry, Sighting
 from cpcbl_team.localizer import Localizer
-from cpcbl_team.self_calibration import LONGEST_NS, Anchor, Anchors, Learned, learned
+from cpcbl_team.self_calibration import (
+    LONGEST_NS,
+    ReferencePose,
+    ReferencePoses,
+    SelfCalibration,
+    self_calibrate,
+)
 from cpcbl_team.sensors import without_bearing_bias
 from cpcbl_team.state import CalibrationMemory, Memory, RecoveryMemory, State
 
@@ -55,14 +61,14 @@ biases = st.floats(math.radians(-3.0), math.radians(3.0))
 
 def anchor(
     pose: Pose2, wheels: Pose2, seconds: float = 1.0, sigma_m: float = 0.01, sigma: float = 0.01
-) -> Anchor:
+) -> ReferencePose:
     """A moment at which the robot was found at `pose`, and by its wheels at `wheels`."""
     estimate = Estimate(pose, diagonal(sigma_m, sigma))
-    return Anchor(round(seconds * SECOND), estimate, wheels, wheels.heading)
+    return ReferencePose(round(seconds * SECOND), estimate, wheels, wheels.heading)
 
 
-def both(at: Anchor) -> Anchors:
-    return Anchors(at, at)
+def both(at: ReferencePose) -> ReferencePoses:
+    return ReferencePoses(at, at)
 
 
 BEGIN = both(anchor(ORIGIN, ORIGIN, 0.0))
@@ -74,29 +80,29 @@ BEGIN = both(anchor(ORIGIN, ORIGIN, 0.0))
 def test_a_way_shorter_than_the_wheels_said_as_worked_by_hand() -> None:
     """1 m by the wheels, 0.95 m found: 2 x 0.01^2 of place, 0.05^2 of the way."""
     now = anchor(Pose2(0.95, 0.0, 0.0), Pose2(1.0, 0.0, 0.0))
-    found, anchors = learned(Learned(), BEGIN, now, NOISE)
+    found, anchors = self_calibrate(SelfCalibration(), BEGIN, now, NOISE)
     gain = 0.0025 / (0.0025 + 0.0002 + 0.0025)
     assert found.distance_scale == pytest.approx(1.0 - 0.05 * gain)
     assert found.distance_variance == pytest.approx((1.0 - gain) * 0.0025)
     assert found.bearing_bias_rad == 0.0
-    assert (found.turn_scale, found.turn_variance) == Learned()[1:5:3]
-    assert anchors == Anchors(BEGIN.turned, now)
+    assert (found.turn_scale, found.turn_variance) == SelfCalibration()[1:5:3]
+    assert anchors == ReferencePoses(BEGIN.turn, now)
 
 
 def test_a_turn_larger_than_the_wheels_said_as_worked_by_hand() -> None:
     now = anchor(Pose2(0.0, 0.0, 1.3), Pose2(0.0, 0.0, 1.2))
-    found, anchors = learned(Learned(), BEGIN, now, NOISE)
+    found, anchors = self_calibrate(SelfCalibration(), BEGIN, now, NOISE)
     around = 0.05**2 * 1.2
     gain = 0.0025 * 1.2 / (1.2**2 * 0.0025 + 0.0002 + around)
     assert found.turn_scale == pytest.approx(1.0 + 0.1 * gain)
     assert found.turn_variance == pytest.approx((1.0 - 1.2 * gain) * 0.0025)
-    assert anchors.turned == now
+    assert anchors.turn == now
 
 
 def test_a_way_aside_of_the_heading_is_a_bias_of_bearings_as_worked_by_hand() -> None:
     aside = math.radians(2.0)
     now = anchor(Pose2(math.cos(aside), math.sin(aside), 0.0), Pose2(1.0, 0.0, 0.0))
-    found, _ = learned(Learned(), BEGIN, now, NOISE)
+    found, _ = self_calibrate(SelfCalibration(), BEGIN, now, NOISE)
     variance = math.radians(1.5) ** 2
     gain = variance / (variance + 0.01**2 + 0.0002 + 0.05**2 / 3.0)
     assert found.bearing_bias_rad == pytest.approx(aside * gain)
@@ -108,14 +114,14 @@ def test_a_way_aside_of_the_heading_is_a_bias_of_bearings_as_worked_by_hand() ->
 def test_an_error_across_the_way_does_not_lengthen_it(across_m: float) -> None:
     """It would on average: there is one at both ends of each way."""
     now = anchor(Pose2(0.8, across_m, 0.0), Pose2(0.8, 0.0, 0.0))
-    found, _ = learned(Learned(), BEGIN, now, NOISE)
+    found, _ = self_calibrate(SelfCalibration(), BEGIN, now, NOISE)
     assert found.distance_scale == pytest.approx(1.0, abs=1e-12)
     assert found.bearing_bias_rad * across_m > 0.0
 
 
 def test_backwards_is_no_turn_about() -> None:
     now = anchor(Pose2(-0.95, 0.0, 0.0), Pose2(-1.0, 0.0, 0.0))
-    found, _ = learned(Learned(), BEGIN, now, NOISE)
+    found, _ = self_calibrate(SelfCalibration(), BEGIN, now, NOISE)
     assert found.distance_scale < 1.0
     assert found.bearing_bias_rad == pytest.approx(0.0)
 
@@ -123,21 +129,21 @@ def test_backwards_is_no_turn_about() -> None:
 @pytest.mark.parametrize("wheels", [Pose2(0.5, 0.0, 0.6), Pose2(0.0, 0.6, 0.0), ORIGIN])
 def test_too_little_motion_is_not_compared(wheels: Pose2) -> None:
     now = anchor(ORIGIN, wheels)
-    assert learned(Learned(), BEGIN, now, NOISE) == (Learned(), BEGIN)
+    assert self_calibrate(SelfCalibration(), BEGIN, now, NOISE) == (SelfCalibration(), BEGIN)
 
 
 def test_after_too_much_of_a_turn_the_way_is_compared_from_there() -> None:
     now = anchor(Pose2(0.9, 0.5, 0.9), Pose2(1.0, 0.5, 0.9))
-    found, anchors = learned(Learned(), BEGIN, now, NOISE)
-    assert (found, anchors) == (Learned(), Anchors(BEGIN.turned, now))
+    found, anchors = self_calibrate(SelfCalibration(), BEGIN, now, NOISE)
+    assert (found, anchors) == (SelfCalibration(), ReferencePoses(BEGIN.turn, now))
 
 
 @pytest.mark.parametrize("wheels", [Pose2(1.0, 0.0, 0.0), Pose2(0.0, 0.0, 1.2)])
 def test_where_nothing_was_renewed_nothing_is_learned(wheels: Pose2) -> None:
     """The robot was only found as well as odometry alone would have left it."""
     now = anchor(Pose2(0.9, 0.1, 1.0), wheels, sigma_m=0.2, sigma=0.2)
-    found, anchors = learned(Learned(), BEGIN, now, NOISE)
-    assert found == Learned()
+    found, anchors = self_calibrate(SelfCalibration(), BEGIN, now, NOISE)
+    assert found == SelfCalibration()
     assert now in anchors
 
 
@@ -151,14 +157,17 @@ def test_where_nothing_was_renewed_nothing_is_learned(wheels: Pose2) -> None:
     ids=["way", "turn", "aside"],
 )
 def test_what_is_beyond_the_gate_teaches_nothing(pose: Pose2, wheels: Pose2) -> None:
-    found, _ = learned(Learned(), BEGIN, anchor(pose, wheels), NOISE)
+    found, _ = self_calibrate(SelfCalibration(), BEGIN, anchor(pose, wheels), NOISE)
     assert found[:3] == pytest.approx((1.0, 1.0, 0.0))
 
 
 def test_anchors_move_on_when_they_are_old() -> None:
     late, later = (anchor(ORIGIN, ORIGIN, LONGEST_NS / SECOND + more) for more in (0.0, 0.01))
-    assert learned(Learned(), BEGIN, late, NOISE) == (Learned(), BEGIN)
-    assert learned(Learned(), BEGIN, later, NOISE) == (Learned(), both(later))
+    assert self_calibrate(SelfCalibration(), BEGIN, late, NOISE) == (SelfCalibration(), BEGIN)
+    assert self_calibrate(SelfCalibration(), BEGIN, later, NOISE) == (
+        SelfCalibration(),
+        both(later),
+    )
 
 
 @given(
@@ -167,10 +176,10 @@ def test_anchors_move_on_when_they_are_old() -> None:
     )
 )
 def test_variances_only_shrink(moments: list[tuple[Pose2, Pose2, float, float]]) -> None:
-    so_far, anchors = Learned(), BEGIN
+    so_far, anchors = SelfCalibration(), BEGIN
     for i, (pose, wheels, sigma_m, sigma) in enumerate(moments):
         now = anchor(pose, wheels, i + 1.0, sigma_m, sigma)
-        found, anchors = learned(so_far, anchors, now, NOISE)
+        found, anchors = self_calibrate(so_far, anchors, now, NOISE)
         for after, before in zip(found[3:], so_far[3:], strict=True):
             assert 0.0 < after <= before
         assert all(math.isfinite(v) for v in found)
@@ -182,12 +191,12 @@ def test_variances_only_shrink(moments: list[tuple[Pose2, Pose2, float, float]])
 
 def taught(
     legs: Iterable[tuple[float, float]], distance_scale: float, turn_scale: float, bias: float
-) -> Learned:
+) -> SelfCalibration:
     """After these true legs of 10 s; wheels report true / scale, bearings are too large.
 
     As in the localizer, what is known already corrects the readings that come next.
     """
-    so_far, anchors, truth, wheels = Learned(), BEGIN, ORIGIN, ORIGIN
+    so_far, anchors, truth, wheels = SelfCalibration(), BEGIN, ORIGIN, ORIGIN
     for i, (distance, turn) in enumerate([(0.0, 0.0), *legs]):
         truth = step(truth, distance, turn)
         distance *= so_far.distance_scale / distance_scale
@@ -196,7 +205,7 @@ def taught(
         now = anchor(truth._replace(heading=heading), wheels, 10.0 * i, 1e-5, 1e-5)
         if i == 0:
             anchors = both(now)
-        so_far, anchors = learned(so_far, anchors, now, EXACT)
+        so_far, anchors = self_calibrate(so_far, anchors, now, EXACT)
     return so_far
 
 
@@ -313,7 +322,7 @@ def test_a_robot_that_does_not_learn_remembers_nothing_of_it(
     runs: list[tuple[Drive, Drive]],
 ) -> None:
     for _, off in runs:
-        assert off.state.memory.calibration.learned == Learned()
+        assert off.state.memory.calibration.learned == SelfCalibration()
         assert off.state.memory.calibration.anchors is None
 
 
@@ -323,12 +332,14 @@ def test_nothing_is_learned_where_nothing_is_wrong(variant: Variant) -> None:
     for state, _ in followed(robot, robot.start(0), LOOP_START, loop()):
         found = state.memory.calibration.learned
         assert found[:3] == pytest.approx((1.0, 1.0, 0.0), abs=1e-9)
-    assert all(after < 0.5 * before for after, before in zip(found[3:], Learned()[3:], strict=True))
+    assert all(
+        after < 0.5 * before for after, before in zip(found[3:], SelfCalibration()[3:], strict=True)
+    )
 
 
 @pytest.mark.parametrize("learns", [True, False])
 def test_what_is_known_corrects_wheels_and_bearings(learns: bool) -> None:
-    known = Learned(0.9, 0.8, 0.1)
+    known = SelfCalibration(0.9, 0.8, 0.1)
     before = state_at(ORIGIN, diagonal(0.1, 0.05))
     before = before._replace(memory=Memory(calibration=CalibrationMemory(known)))
     robot = robot_that(learns)
@@ -345,7 +356,7 @@ def test_a_robot_that_was_lost_compares_with_nothing_before() -> None:
     robot, elsewhere = robot_that(True), Pose2(1.5, 1.0, 2.0)
     *_, (before, _) = followed(robot, robot.start(0), LOOP_START, loop()[:100])
     assert before.memory.calibration.anchors is not None
-    assert before.memory.calibration.learned != Learned()
+    assert before.memory.calibration.learned != SelfCalibration()
     *_, (last, truth) = followed(robot, before, elsewhere, [(0.0, 0.0)] * 100)
     assert last.counts["found_again"] >= 1
     assert position_error(last.estimate, truth) < 0.2

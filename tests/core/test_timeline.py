@@ -25,11 +25,11 @@ from support.core import (
     state_at,
 )
 
-from cpcbl_team.collaboration import BELIEF_SERVES_BACK_NS
+from cpcbl_team.beliefs import BELIEF_VALID_BEFORE_NS
 from cpcbl_team.config import LocalizerSettings, SensorSettings, Variant
 from cpcbl_team.inputs import Belief, Fix, Input, Odometry, Position, Sightings, Told
 from cpcbl_team.localizer import Localizer
-from cpcbl_team.self_calibration import Learned
+from cpcbl_team.self_calibration import SelfCalibration
 from cpcbl_team.state import State
 from cpcbl_team.timeline import HORIZON_NS, Timeline
 
@@ -67,7 +67,7 @@ def stamp_of(item: Input) -> int:
 
 def time_of(item: Input) -> int:
     """From when on it counts: a belief serves the sightings of half a second before it."""
-    return stamp_of(item) - (BELIEF_SERVES_BACK_NS if isinstance(item, Belief) else 0)
+    return stamp_of(item) - (BELIEF_VALID_BEFORE_NS if isinstance(item, Belief) else 0)
 
 
 def by_hand(robot: Localizer, inputs: Iterable[Input]) -> State:
@@ -146,7 +146,9 @@ def test_a_robot_that_learns_gives_the_same_bits_in_any_order() -> None:
     )
     inputs, delay = history(12.0), {Sightings: 300, Fix: 900, Belief: 500}
     expected = by_hand(robot, inputs)
-    assert all(a != b for a, b in zip(expected.memory.calibration.learned, Learned(), strict=True))
+    assert all(
+        a != b for a, b in zip(expected.memory.calibration.learned, SelfCalibration(), strict=True)
+    )
     for seed in range(3):
         rng = np.random.default_rng(seed)
         arrivals = [stamp_of(i) + rng.uniform(0.0, delay.get(type(i), 50)) * MS for i in inputs]
@@ -309,7 +311,7 @@ def test_what_is_older_than_the_horizon_is_refused() -> None:
 
 def test_a_belief_is_too_late_as_soon_as_the_sightings_before_it_are() -> None:
     timeline = after(localizer("joint", MIXED), history(5.0))
-    oldest = time_of(history(5.0)[-1]) - HORIZON_NS + BELIEF_SERVES_BACK_NS
+    oldest = time_of(history(5.0)[-1]) - HORIZON_NS + BELIEF_VALID_BEFORE_NS
     assert timeline.add(belief(1.0, 0.0, oldest - 1)) == "too_late"
     assert timeline.add(belief(1.0, 0.0, oldest)) == ""
 

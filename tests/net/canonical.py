@@ -11,8 +11,8 @@ from typing import Any
 from cpcbl_team.estimate import Estimate
 from cpcbl_team.inputs import Belief
 from cpcbl_team.localizer import Localizer
+from cpcbl_team.sender_record import SenderRecord
 from cpcbl_team.state import CalibrationMemory, Evidence, State
-from cpcbl_team.trust import Voice
 from cpcbl_transport.messages import Track
 
 Canonical = dict[str, Any]
@@ -101,9 +101,9 @@ def _evidence(e: Evidence) -> Canonical:
 def _calibration_anchors(memory: CalibrationMemory) -> list[list[Any]] | None:
     if memory.anchors is None:
         return None
-    pairs = memory.anchors.turned, memory.anchors.drove
+    pairs = memory.anchors.turn, memory.anchors.distance
     return [
-        [a.stamp_ns, _estimate(a.estimate), list(a.odometry_from_robot), a.turned_rad]
+        [a.stamp_ns, _estimate(a.estimate), list(a.odometry_from_robot), a.total_turn_rad]
         for a in pairs
     ]
 
@@ -113,32 +113,32 @@ def _belief(b: Belief) -> list[Any]:
     return [b.stamp_ns, *place, *b.covariance, *rates]
 
 
-def _sender(voice: Voice) -> Canonical:
-    anchor = voice.anchor
+def _sender(record: SenderRecord) -> Canonical:
+    position = record.position
     return {
-        "heard_ns": voice.heard_ns,
-        "agreed_ns": voice.agreed_ns,
-        "doubted_ns": voice.doubted_ns,
-        "score": voice.score,
-        "offset": list(voice.offset),
-        "spread": voice.spread,
+        "heard_ns": record.last_report_ns,
+        "agreed_ns": record.last_agreement_ns,
+        "doubted_ns": record.dispute_since_ns,
+        "score": record.score,
+        "offset": list(record.mean_offset),
+        "spread": record.offset_variance,
         "last_fix": None
-        if anchor is None
+        if position is None
         else [
-            anchor.stamp_ns,
-            *(anchor.x, anchor.y, anchor.variance),
-            *anchor.odometry_from_robot,
+            position.stamp_ns,
+            *(position.x, position.y, position.variance),
+            *position.odometry_from_robot,
         ],
-        "odometry_comparisons": voice.compared,
-        "odometry_conflicts": voice.strikes,
-        "missed_motion": voice.still,
-        "confirmed_in_a_row": voice.steady,
-        "last_conflict_ns": voice.struck_ns,
-        "last_failure_ns": voice.wrong_ns,
-        "agreements_since_failure": voice.healthy,
-        "reason": str(voice.reason),
-        "reason_since_ns": voice.since_ns,
-        "quarantines": voice.quarantines,
+        "odometry_comparisons": record.comparisons,
+        "odometry_conflicts": record.odometry_conflicts,
+        "missed_motion": record.missed_motion,
+        "confirmed_in_a_row": record.confirmations,
+        "last_conflict_ns": record.last_conflict_ns,
+        "last_failure_ns": record.last_failure_ns,
+        "agreements_since_failure": record.agreements,
+        "reason": str(record.reason or ""),
+        "reason_since_ns": record.since_ns,
+        "quarantines": record.quarantines,
     }
 
 

@@ -4,10 +4,10 @@ import math
 
 from hypothesis import strategies as st
 
-from cpcbl_team.collaboration import LOWEST_TIER
 from cpcbl_team.config import CollaborationSettings
 from cpcbl_team.estimate import SMALLEST_VARIANCE
 from cpcbl_team.gaussian import Covariance2, oriented
+from cpcbl_team.tiers import LOWEST_TIER
 from support.core import least_eigenvalue, matrix2
 
 RULES = CollaborationSettings()

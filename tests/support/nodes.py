@@ -3,10 +3,10 @@
 import math
 from typing import Any
 
-from cpcbl_team.collaboration import tier_of
 from cpcbl_team.config import Team
 from cpcbl_team.estimate import Estimate
 from cpcbl_team.inputs import Sighting
+from cpcbl_team.tiers import tier_of
 from cpcbl_transport import topics
 from support.buses import (
     SECOND,

@@ -6,8 +6,8 @@ import pytest
 import zenoh
 from support.buses import matches
 
-from cpcbl_team.collaboration import LOWEST_TIER, tiers_heard
 from cpcbl_team.config import CollaborationSettings
+from cpcbl_team.tiers import LOWEST_TIER, accepted_tiers
 from cpcbl_transport import topics
 from cpcbl_transport.messages import Message
 from cpcbl_transport.topics import TOPICS, Qos, Topic
@@ -87,7 +87,7 @@ def test_worked_examples_of_keys() -> None:
 
 @pytest.mark.parametrize("own", TIERS)
 def test_only_better_tiers_are_heard(own: int) -> None:
-    tiers = tiers_heard(own, CollaborationSettings())
+    tiers = accepted_tiers(own, CollaborationSettings())
     beliefs = [topics.BELIEF.at(tier=t) for t in tiers]
     fixes = [topics.FIX.at(robot="me", tier=t) for t in tiers]
     for theirs in TIERS:
@@ -98,6 +98,6 @@ def test_only_better_tiers_are_heard(own: int) -> None:
 
 
 def test_all_tiers_are_heard_both_ways() -> None:
-    tiers = tiers_heard(0, CollaborationSettings(direction="both-ways"))
+    tiers = accepted_tiers(0, CollaborationSettings(direction="both-ways"))
     patterns = [topics.BELIEF.at(tier=t) for t in tiers]
     assert all(heard(topics.BELIEF.at(tier=t, robot="r1"), patterns) for t in TIERS)

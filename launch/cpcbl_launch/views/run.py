@@ -27,7 +27,7 @@ from cpcbl_launch.run.processes import ROBOT
 from cpcbl_launch.run.supervisor import Processes
 from cpcbl_launch.views.live import LiveView
 from cpcbl_launch.views.traffic.show import COLUMNS_EXPLAINED, help_traffic_table, limits_text
-from cpcbl_team.collaboration import LOWEST_TIER
+from cpcbl_team.tiers import LOWEST_TIER
 from cpcbl_transport.messages import Status, Track, Truth
 
 FIGURES = ("RMSE m", "mean m", "max m", "deg", "in 3 σ", "NEES")

@@ -1,0 +1,186 @@
+"""The record of one sender, and the two tests that each of its reports has to pass.
+
+1. Against the estimate, an innovation test over time: the amounts by which the normalized
+   innovation squared (NIS) of the reports exceeds its usual size are added up to a score (a CUSUM;
+   E. S. Page, Biometrika 41, 1954).
+2. Against odometry: the distance between two positions of this robot that a sender reported must be
+   the distance between them by odometry. This needs neither the heading nor a second sender.
+
+`trust.py` decides what follows from the results.
+"""
+
+import math
+from enum import StrEnum
+from typing import NamedTuple
+
+import msgspec
+from msgspec.structs import replace
+
+from cpcbl_team.geometry import Pose2
+
+SILENCE_NS = 10_000_000_000  # after this long without a report, earlier reports count no longer
+USUAL_NIS = 6.0  # 95 % quantile of the chi-square distribution of two degrees of freedom
+CONTRADICTING_NIS = 13.8  # its 99.9 % quantile
+MOST_NIS = 20.0  # one report counts for no more than this
+JUMP_SIGMAS = 5.0  # a reported distance conflicts with odometry if it is longer by this,
+FROZEN_SIGMAS, FROZEN_SHARE = 3.0, 0.3  # or shorter by this and below this share of odometry's
+SLIP_SHARE, SLIP_M = 0.1, 0.03  # sigma of a distance by odometry: a share of it, and a constant
+LEAST_DISTANCE_M = 0.3  # the shortest distance that shows whether a sender follows the robot
+LONGEST_COMPARISON_NS = 5_000_000_000  # after this time without a jump any distance is a comparison
+FADING_S = 10.0  # time constant with which conflicts with odometry fade
+NEVER_NS = -(2**62)
+
+
+class QuarantineReason(StrEnum):
+    """What kind of fault explains the reports of a sender best."""
+
+    BIASED = "biased"
+    FROZEN = "frozen"
+    JUMPS = "jumps"
+    OVERCONFIDENT = "overconfident"
+    OUTVOTED = "outvoted"
+
+
+class ReportedPosition(NamedTuple):
+    """Where a sender reported this robot, in the field's frame, and its odometry at that time."""
+
+    stamp_ns: int
+    x: float
+    y: float
+    variance: float  # m^2, mean of the axes
+    odometry_from_robot: Pose2
+
+
+class TeammateReport(NamedTuple):
+    """A fix of a teammate, or a sighting of a teammate whose belief is used as a landmark."""
+
+    stamp_ns: int
+    nis: float | None
+    """Scaled to two degrees of freedom; None if the robot is lost, so that there is no test 1."""
+    offset: tuple[float, float] | None = None
+    """The reported position minus the estimated one, m; None for a sighting."""
+    position: ReportedPosition | None = None
+    """For test 2; None for a sighting."""
+
+
+class SenderRecord(msgspec.Struct, frozen=True, gc=False):
+    """What the robot remembers of one sender."""
+
+    last_report_ns: int = NEVER_NS
+    last_agreement_ns: int = NEVER_NS
+    dispute_since_ns: int = NEVER_NS
+    """When its score last left zero."""
+    score: float = 0.0
+    """The sum of test 1: NIS beyond the usual."""
+    mean_offset: tuple[float, float] = (0.0, 0.0)
+    """Exponential mean of the offsets of its reports that disagree, m."""
+    offset_variance: float = 0.0
+    """Exponential variance of these offsets, m^2."""
+    position: ReportedPosition | None = None
+    """With which the next position is compared in test 2."""
+    comparisons: float = 0.0
+    """Number of comparisons with odometry, fading."""
+    odometry_conflicts: float = 0.0
+    """Number of them that contradicted odometry, fading."""
+    missed_motion: bool = False
+    """Whether the last conflict was a motion of the robot that the sender did not report."""
+    confirmations: int = 0
+    """Distances that odometry confirmed since the last conflict."""
+    last_conflict_ns: int = NEVER_NS
+    last_failure_ns: int = NEVER_NS
+    """When a report last contradicted the estimate clearly, or odometry."""
+    agreements: int = 0
+    """Reports that agreed with the estimate since then."""
+    reason: QuarantineReason | None = None
+    """Why it is in quarantine; None if it is not."""
+    since_ns: int = 0
+    """When the quarantine began, or ended."""
+    quarantines: int = 0
+
+
+def with_report(record: SenderRecord, report: TeammateReport, limit: float) -> SenderRecord:
+    """The record after both tests of one more report."""
+    if record.score and report.stamp_ns - record.last_report_ns > SILENCE_NS:
+        record = replace(record, score=0.0)
+    record = _with_position(_with_faded_conflicts(record, report.stamp_ns), report.position)
+    record = replace(record, last_report_ns=max(record.last_report_ns, report.stamp_ns))
+    return record if report.nis is None else _with_nis(record, report, report.nis, limit)
+
+
+def _with_nis(
+    record: SenderRecord, report: TeammateReport, nis: float, limit: float
+) -> SenderRecord:
+    """Test 1: the innovation of a report against the estimate."""
+    now = report.stamp_ns
+    score = max(0.0, min(record.score + min(nis, MOST_NIS) - USUAL_NIS, 2.0 * limit))
+    if score and not record.score and not record.reason:
+        offset = report.offset or (0.0, 0.0)
+        record = replace(record, dispute_since_ns=now, mean_offset=offset, offset_variance=0.0)
+    record = replace(record, score=score)
+    if nis <= USUAL_NIS:
+        return replace(record, last_agreement_ns=now, agreements=record.agreements + 1)
+    if report.offset is not None:
+        record = _with_offset(record, *report.offset)
+    contradicts = nis > CONTRADICTING_NIS
+    return replace(record, last_failure_ns=now, agreements=0) if contradicts else record
+
+
+def _with_offset(record: SenderRecord, x: float, y: float, share: float = 0.2) -> SenderRecord:
+    """Mean and variance of the offsets, in which the last one weighs `share`."""
+    (mx, my), variance = record.mean_offset, record.offset_variance
+    dx, dy = x - mx, y - my
+    variance = (1.0 - share) * (variance + share * (dx * dx + dy * dy))
+    return replace(record, mean_offset=(mx + share * dx, my + share * dy), offset_variance=variance)
+
+
+def _with_faded_conflicts(record: SenderRecord, now_ns: int) -> SenderRecord:
+    if not record.comparisons or now_ns <= record.last_report_ns:
+        return record
+    fade = math.exp((record.last_report_ns - now_ns) * 1e-9 / FADING_S)
+    conflicts, comparisons = fade * record.odometry_conflicts, fade * record.comparisons
+    return replace(record, odometry_conflicts=conflicts, comparisons=comparisons)
+
+
+def _with_position(record: SenderRecord, now: ReportedPosition | None) -> SenderRecord:
+    """Test 2: the distance between two reported positions against that of odometry.
+
+    Both are straight distances, so neither the path nor the heading matters. The later position is
+    the next one to compare with, unless this comparison shows nothing yet.
+    """
+    then = record.position
+    if now is None:
+        return record
+    if then is None or now.stamp_ns - then.stamp_ns > SILENCE_NS:
+        return replace(record, position=now)
+    if now.stamp_ns <= then.stamp_ns:
+        return record
+    displacement = then.odometry_from_robot.inverse() @ now.odometry_from_robot
+    driven = math.hypot(displacement.x, displacement.y)
+    reported = math.hypot(now.x - then.x, now.y - then.y)
+    slip = SLIP_SHARE * driven + SLIP_M
+    sigma = math.sqrt(then.variance + now.variance + slip * slip)
+    is_far = driven >= max(LEAST_DISTANCE_M, (FROZEN_SIGMAS + 1.0) * sigma)
+    jumped = reported - driven > JUMP_SIGMAS * sigma
+    is_short = reported < FROZEN_SHARE * driven and driven - reported > FROZEN_SIGMAS * sigma
+    missed_motion = is_far and is_short
+    record = replace(record, comparisons=record.comparisons + 1.0)
+    if not (jumped or is_far or now.stamp_ns - then.stamp_ns >= LONGEST_COMPARISON_NS):
+        return record
+    record = replace(record, position=now)
+    if jumped or missed_motion:
+        return _with_conflict(record, now.stamp_ns, missed_motion)
+    # While the robot stands, a frozen sender is right: that confirms nothing.
+    confirms = is_far or record.reason is not QuarantineReason.FROZEN
+    return replace(record, confirmations=record.confirmations + 1) if confirms else record
+
+
+def _with_conflict(record: SenderRecord, now_ns: int, missed_motion: bool) -> SenderRecord:
+    return replace(
+        record,
+        odometry_conflicts=record.odometry_conflicts + 1.0,
+        missed_motion=missed_motion,
+        confirmations=0,
+        last_conflict_ns=now_ns,
+        agreements=0,
+        last_failure_ns=now_ns,
+    )
