@@ -1,4 +1,4 @@
-"""A guest's node: on a simulated field it also asks for a body, again and again."""
+"""The node of a guest. On a simulated field it also asks, again and again, to be simulated."""
 
 import logging
 from collections import Counter
@@ -16,12 +16,12 @@ from cpcbl_transport.robot_model import SimulatedRobotModel, model_from_settings
 log = logging.getLogger(__name__)
 
 ASK_NS = 500_000_000
-AGAIN_NS = 50_000_000  # while no field listens
-PATIENCE_NS = 3_000_000_000  # so long it may take until something is sensed
+RETRY_NS = 50_000_000  # while no field subscribes
+WARN_AFTER_NS = 3_000_000_000  # without any input
 
 
 class GuestNode:
-    """Runs a guest that `team` holds beside its robots, from `start_ns` until `leave`."""
+    """Runs a guest, which `team` holds beside its own robots, from `start_ns` until `leave`."""
 
     def __init__(
         self,
@@ -36,14 +36,14 @@ class GuestNode:
     ) -> None:
         self.robot = build_robot(name, team, start_ns, camera=camera)
         self._node = Node(self.robot, team, bus, start_ns, incarnation, on_arrival, speed)
-        self._incarnation, self._due_ns = incarnation, start_ns
-        self._warn_ns: int | None = start_ns + PATIENCE_NS
+        self._incarnation, self._ask_ns = incarnation, start_ns
+        self._warn_ns: int | None = start_ns + WARN_AFTER_NS
         self._model = model_from_settings(team.robots[name])
         self._join = bus.publisher(topics.JOIN.at(robot=name), topics.JOIN.qos)
 
     @property
     def next_ns(self) -> int:
-        return self._node.next_ns if self._model is None else min(self._node.next_ns, self._due_ns)
+        return self._node.next_ns if self._model is None else min(self._node.next_ns, self._ask_ns)
 
     @property
     def waiting(self) -> bool:
@@ -51,7 +51,7 @@ class GuestNode:
 
     @property
     def received(self) -> tuple[Flow, ...]:
-        """Help that others have sent it."""
+        """The fixes and beliefs that it received."""
         return self._node.received.flows()
 
     @property
@@ -61,7 +61,7 @@ class GuestNode:
 
     @property
     def missing_input(self) -> str:
-        """Why nothing has been sensed so far; empty if something has."""
+        """Why nothing has been sensed so far; empty if something has been sensed."""
         if self.robot.sensing.counts:
             return ""
         if self._model is None:
@@ -73,22 +73,22 @@ class GuestNode:
         )
 
     def step(self, now_ns: int) -> None:
-        """What a node does, and a word to the field when it is due."""
+        """Asks the field when that is due, and steps the node."""
         if self._warn_ns is not None and now_ns >= self._warn_ns:
             self._warn_ns = None
             if self.missing_input:
                 log.warning("%s %s", self.robot.name, self.missing_input)
-        if self._model is not None and now_ns >= self._due_ns:
-            self._due_ns = now_ns + (ASK_NS if self._ask(now_ns, self._model) else AGAIN_NS)
+        if self._model is not None and now_ns >= self._ask_ns:
+            self._ask_ns = now_ns + (ASK_NS if self._ask(now_ns, self._model) else RETRY_NS)
         self._node.step(now_ns)
 
     def leave(self, now_ns: int) -> None:
-        """Gives the body back. The rest goes with the session."""
+        """Tells the field that the guest leaves. All else ends with the session."""
         if self._model is not None:
             self._ask(now_ns, None)
 
     def _ask(self, now_ns: int, model: SimulatedRobotModel | None) -> bool:
-        """Whether a field listens."""
+        """Asks the field; whether a field subscribes."""
         if not self._join.matching:
             return False
         self._join.put(encode(Join(self.robot.name, self._incarnation, now_ns, model)))

@@ -1,11 +1,11 @@
-"""What a robot may still spend on messages, and what a message must be worth at present.
+"""What a robot may still spend on messages, and the information gain that a message must have.
 
-A limit is a bucket whose tokens come back one window after they were spent: so no window ever holds
-more than is allowed, and nothing has to be held back for bursts, as in a bucket that fills evenly.
-The price spreads the spending: it falls while nothing is sent, rises with each message, and so
-finds the level at which as much is worth sending as may be sent (dual ascent on the constraint).
-It does not fall while only the limits hold back what is worth it: else whatever comes first after
-each full window would be sent, however little it is worth.
+A limit is a token bucket whose tokens return one window after they were spent. So no window ever
+contains more than is allowed, and no reserve for bursts is necessary, as it is in a bucket that
+fills evenly. A price spreads the spending over time: it falls while nothing is sent and rises with
+each message, and so finds the level at which as much is worth sending as may be sent (dual ascent
+on the constraint). The price does not fall while only the limits hold back a message: otherwise the
+first message after each full window would be sent, however small its gain.
 """
 
 import math
@@ -17,12 +17,12 @@ from cpcbl_transport.messages import Spending
 
 BYTES_WINDOW_S = 10.0
 LEAST_BYTES = 500.0  # in a window, so that a small budget can be used up by whole messages
-MEMORY = 3.0  # after so many messages' time without one, the price has fallen by a factor of e
+PRICE_MEMORY = 3.0  # messages: in the time in which so many are earned, the price falls by e
 _ROUNDING = 1e-9
 
 
-class Window:
-    """At most `capacity` within any `window_s`, of it `reserve` for what is urgent."""
+class SlidingWindow:
+    """Allows at most `capacity` within any `window_s`; `reserve` of it is for urgent messages."""
 
     def __init__(self, unit: str, capacity: float, window_s: float, reserve: float) -> None:
         self.capacity, self.pace_s = capacity, window_s / capacity
@@ -45,8 +45,8 @@ class Window:
         return Spending(self._unit, self._window_s, self.capacity, self._most)
 
 
-class Savings:
-    """What is earned evenly over a match from the start on and never comes back: its messages."""
+class MatchAllowance:
+    """The messages of a match: they are earned evenly from its start and never come back."""
 
     def __init__(
         self, start_ns: int, rate_hz: float, urgent_share: float, match_s: float = math.inf
@@ -68,12 +68,12 @@ class Savings:
 
 
 class _Cost(NamedTuple):
-    limit: Window | Savings
+    limit: SlidingWindow | MatchAllowance
     amount: float
 
 
 class Budget:
-    """One robot's budget. Times are the robot's, sizes are bytes on the wire.
+    """One robot's budget. Times are in robot time, sizes are bytes on the link.
 
     `match_rate_hz`: the rate at which it earns messages of the match, for `match_s`; None without
     such a limit. `restarted`: the process cannot know what was spent before, so it starts with
@@ -93,13 +93,15 @@ class Budget:
         self._bytes = self._messages = self._match = None
         if s.bytes_per_s:
             most = max(BYTES_WINDOW_S * s.bytes_per_s, LEAST_BYTES)
-            self._bytes = Window("bytes", most, most / s.bytes_per_s, s.urgent_share * most)
+            self._bytes = SlidingWindow("bytes", most, most / s.bytes_per_s, s.urgent_share * most)
         if s.messages_per_minute:
             most = math.ceil(s.messages_per_minute)
             window_s = 60.0 * most / s.messages_per_minute
-            self._messages = Window("messages", most, window_s, math.floor(s.urgent_share * most))
+            self._messages = SlidingWindow(
+                "messages", most, window_s, math.floor(s.urgent_share * most)
+            )
         if match_rate_hz is not None:
-            self._match = Savings(start_ns, match_rate_hz, s.urgent_share, match_s)
+            self._match = MatchAllowance(start_ns, match_rate_hz, s.urgent_share, match_s)
         for window in (self._bytes, self._messages):
             if restarted and window is not None:
                 window.spend(start_ns, window.capacity)
@@ -113,35 +115,35 @@ class Budget:
         )
 
     def price(self, now_ns: int, size: int) -> float:
-        """What a message of this size should be worth, in the unit of `spend`."""
-        memory_s = MEMORY * self._earned_s(size)
+        """The least gain that a message of this size must have, in the unit of `spend`."""
+        memory_s = PRICE_MEMORY * self._earned_s(size)
         if memory_s == 0.0:
             return 0.0
         return self._price * math.exp((self._price_ns - now_ns) * 1e-9 / memory_s)
 
     def spend(self, now_ns: int, size: int, least: float) -> None:
-        """A message of this size is sent; the price was at least `least`."""
-        self._price = max(self.price(now_ns, size), least) * math.exp(1.0 / MEMORY)
+        """A message of this size is sent; its price was at least `least`."""
+        self._price = max(self.price(now_ns, size), least) * math.exp(1.0 / PRICE_MEMORY)
         self._price_ns = now_ns
         for limit, amount in self._costs(size):
             limit.spend(now_ns, amount)
 
     def refund(self, now_ns: int, size: int) -> None:
-        """A message of this size for which was spent just now has not been sent."""
-        self._price *= math.exp(-1.0 / MEMORY)
+        """Undoes the latest `spend`: the message was not sent."""
+        self._price *= math.exp(-1.0 / PRICE_MEMORY)
         for limit, amount in self._costs(size):
             limit.spend(now_ns, -amount)
 
     def refuse(self, now_ns: int, least: float) -> None:
-        """A message that was worth its price, at least `least`, is not admitted."""
+        """A message with enough gain, at least `least`, is not admitted by the limits."""
         self._price, self._price_ns = max(self._price, least), now_ns
 
     def spending(self, now_ns: int) -> tuple[Spending, ...]:
-        """Its limits, and how near it came to each."""
+        """Its limits, and the largest use of each so far."""
         return tuple(limit.spending(now_ns) for limit, _ in self._costs(0))
 
     def _earned_s(self, size: int) -> float:
-        """The time in which a message of this size is earned."""
+        """The time in which a message of this size is earned (s)."""
         return max((limit.pace_s * amount for limit, amount in self._costs(size)), default=0.0)
 
     def _costs(self, size: int) -> list[_Cost]:

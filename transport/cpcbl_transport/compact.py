@@ -1,15 +1,14 @@
-"""The wire format of help: a belief in 40 bytes, a fix in 32, with a heading in 39. Everything else
-is in `messages`.
+"""The wire format of beliefs (40 bytes) and fixes (32 bytes, 39 with a heading).
 
-One version byte, then whole numbers of fixed width, little-endian, each a count of its unit; names
-travel in the key, and the length tells whether a fix has a heading. Poses are rounded to the
-nearest count. A covariance C travels as its Cholesky factor, row by row: the sigma of each
-coordinate given those before it, rounded up on a logarithmic scale, and its slopes on those, in
-units of that sigma. Correlations would be shorter to say, but for a thin ellipse their sigmas could
-not be rounded one by one: rounding one of two correlated at 0.99995 (axes 200 : 1) up by 0.07 %
-turns the ellipse and claims 6 % too much across it. Here what is read is never less than C (in the
-order of covariances) and, down to sigmas of 1 um, at most 0.3 % more; and whatever the bytes, it is
-a covariance.
+The payload is one version byte, then whole numbers of fixed width, little-endian, each a count of
+its unit. Names travel in the key; the length tells whether a fix has a heading. Poses are rounded
+to the nearest count. A covariance C travels as its Cholesky factor, row by row: the conditional
+sigma of each coordinate given those before it, rounded up on a logarithmic scale, and its slopes on
+those coordinates, in units of that sigma. Sigmas and correlations would be shorter, but for a thin
+ellipse the sigmas could not be rounded one by one: rounding one of two sigmas with a correlation of
+0.99995 (axes 200 : 1) up by 0.07 % turns the ellipse and understates its width by 6 %. With this
+format the decoded covariance is never smaller than C (in the Loewner order) and, down to sigmas of
+1 um, at most 0.3 % larger. Any bytes decode to a valid covariance.
 """
 
 import math
@@ -25,21 +24,21 @@ from cpcbl_transport.messages import VERSION, Refusal, header_refusal
 STAMP_NS = 1_000
 PLACES = 100_000  # a metre
 HEADING_RAD = math.tau / 2**24
-SIGMA = 1e-6  # metres or radians: the least that can be said
+SIGMA = 1e-6  # metres or radians: the smallest that can be encoded
 SIGMA_STEPS = 1024  # an octave above it
 SLOPE = 2.0**-11
 RATES = 1_000  # a metre a second, a radian a second
 
-LEAST = SIGMA**2
+MIN_VARIANCE = SIGMA**2
 NOISE = 1e-10
-"""A share of a variance that may be the rounding of its double-precision factors."""
-STEEPEST = 4095.0  # slope; a thinner ellipse is sent thicker
-TURNED = math.sqrt(3.0) * SLOPE / 2.0  # norm of what rounding three slopes does to the factor
-WIDER = 1.0 / (1.0 - TURNED) / SIGMA  # so that this claims nothing
+"""The share of a variance that may be a rounding error of its double-precision factors."""
+MAX_SLOPE = 4095.0  # a thinner ellipse is sent thicker
+SLOPE_ROUNDING = math.sqrt(3.0) * SLOPE / 2.0  # norm of the factor's error by three slopes
+WIDENING_PER_SIGMA = 1.0 / (1.0 - SLOPE_ROUNDING) / SIGMA  # widened to cover that error
 
 
 class _Number(NamedTuple):
-    """One number on the wire: its width in bytes, the least and the most that it can say."""
+    """One number on the wire: its width in bytes, its least and its greatest count."""
 
     width: int
     least: int
@@ -65,11 +64,11 @@ _HEADING = _unsigned(3)
 _SIGMA = _unsigned(2)
 _SLOPE = _signed(3)  # to 4,096
 _RATE = _signed(2)  # to 32 m/s, 32 rad/s
-_AREA = (_SIGMA, _SIGMA, _SLOPE)
-_VOLUME = (*_AREA, _SIGMA, _SLOPE, _SLOPE)
-_FIX = (_STAMP, _PLACE, _PLACE, *_AREA, *_AREA)
+_COVARIANCE_2 = (_SIGMA, _SIGMA, _SLOPE)
+_COVARIANCE_3 = (*_COVARIANCE_2, _SIGMA, _SLOPE, _SLOPE)
+_FIX = (_STAMP, _PLACE, _PLACE, *_COVARIANCE_2, *_COVARIANCE_2)
 _HEADED_FIX = (*_FIX, _HEADING, _SIGMA, _SIGMA)
-_BELIEF = (_STAMP, _PLACE, _PLACE, _HEADING, *_VOLUME, _RATE, _RATE)
+_BELIEF = (_STAMP, _PLACE, _PLACE, _HEADING, *_COVARIANCE_3, _RATE, _RATE)
 
 _HEAD = bytes([VERSION])
 FIX_BYTES = 1 + sum(number.width for number in _FIX)
@@ -87,32 +86,32 @@ def help_bytes(message: Belief | Fix) -> int:
 
 
 def encode_help(message: Belief | Fix) -> bytes:
-    """The payload of a belief or a fix. What is too large is sent as the largest that can be said,
-    which no listener takes; speeds are clamped.
+    """The payload of a belief or a fix. A number that is too large becomes the largest count, which
+    every receiver refuses; speeds are clamped.
 
-    Raises ValueError for what no agent says: NaN, an infinite heading, a variance below zero, a
+    Raises ValueError for what no agent sends: NaN, an infinite heading, a negative variance, a
     stamp 1,100 years away.
     """
     x, y = _PLACE.clamped(message.x_m * PLACES), _PLACE.clamped(message.y_m * PLACES)
     start = (message.stamp_ns // STAMP_NS, x, y)
     if isinstance(message, Fix):
         sensor, observer = message.sensor_covariance, message.observer_covariance
-        counts = (*start, *_area_counts(*sensor), *_area_counts(*observer))
+        counts = (*start, *_covariance_2_counts(*sensor), *_covariance_2_counts(*observer))
         if message.heading_rad is None:
-            return _written(_FIX, counts)
+            return _pack(_FIX, counts)
         parts = message.heading_sensor_variance, message.heading_observer_variance
         heading = _heading_count(message.heading_rad)
-        return _written(_HEADED_FIX, (*counts, heading, *map(_variance_count, parts)))
+        return _pack(_HEADED_FIX, (*counts, heading, *map(_variance_count, parts)))
     heading = _heading_count(message.heading_rad)
-    factor = _volume_counts(*message.covariance)
+    factor = _covariance_3_counts(*message.covariance)
     speed = _RATE.clamped(message.speed_m_s * RATES)
     turn_rate = _RATE.clamped(message.turn_rate_rad_s * RATES)
-    return _written(_BELIEF, (*start, heading, *factor, speed, turn_rate))
+    return _pack(_BELIEF, (*start, heading, *factor, speed, turn_rate))
 
 
 def decode_help(key: str, payload: bytes) -> Belief | Fix | Refusal:
     """The belief or fix in a payload under this key, or why there is none."""
-    names = _names(key)
+    names = _names_in(key)
     if isinstance(names, Refusal):
         return names
     reason = header_refusal(payload)
@@ -121,13 +120,19 @@ def decode_help(key: str, payload: bytes) -> Belief | Fix | Refusal:
     layout = (_FIXES if "observer" in names else _BELIEFS).get(len(payload))
     if layout is None:
         return Refusal.GARBAGE
-    stamp, x, y, *rest = _read(layout, payload)
+    stamp, x, y, *rest = _unpack(layout, payload)
     place = stamp * STAMP_NS, x / PLACES, y / PLACES
     if layout is _BELIEF:
         heading, *factor, speed, turn_rate = rest
         rates = speed / RATES, turn_rate / RATES
-        return Belief(names["robot"], *place, _heading(heading), _volume(*factor), *rates)
-    fix = names["robot"], names["observer"], *place, _area(*rest[:3]), _area(*rest[3:6])
+        return Belief(names["robot"], *place, _heading(heading), _covariance_3(*factor), *rates)
+    fix = (
+        names["robot"],
+        names["observer"],
+        *place,
+        _covariance_2(*rest[:3]),
+        _covariance_2(*rest[3:6]),
+    )
     if layout is _FIX:
         return Fix(*fix)
     heading, sensor, observer = rest[6:]
@@ -138,7 +143,7 @@ _is_name = re.compile(NAME_PATTERN).fullmatch
 
 
 @lru_cache(maxsize=4096)
-def _names(key: str) -> dict[str, str] | Refusal:
+def _names_in(key: str) -> dict[str, str] | Refusal:
     """The names in the key of a belief or fix."""
     names = topics.BELIEF.names(key) or topics.FIX.names(key)
     if names is None:
@@ -146,7 +151,7 @@ def _names(key: str) -> dict[str, str] | Refusal:
     return names if all(map(_is_name, names.values())) else Refusal.UNKNOWN_ROBOT
 
 
-def _written(numbers: Sequence[_Number], counts: Sequence[int]) -> bytes:
+def _pack(numbers: Sequence[_Number], counts: Sequence[int]) -> bytes:
     try:
         return _HEAD + b"".join(
             count.to_bytes(width, "little", signed=least < 0)
@@ -156,7 +161,7 @@ def _written(numbers: Sequence[_Number], counts: Sequence[int]) -> bytes:
         raise ValueError(f"a stamp of {counts[0]} us cannot be sent") from None
 
 
-def _read(numbers: Sequence[_Number], payload: bytes) -> list[int]:
+def _unpack(numbers: Sequence[_Number], payload: bytes) -> list[int]:
     counts, at = [], 1
     for width, least, _ in numbers:
         end = at + width
@@ -174,46 +179,46 @@ def _heading(count: int) -> float:
 
 
 def _variance_count(variance: float) -> int:
-    if variance < -LEAST:
+    if variance < -MIN_VARIANCE:
         raise ValueError(f"no variance: {variance}")
-    return _rounded_up(math.sqrt(max(variance, LEAST)))[0]
+    return _rounded_up(math.sqrt(max(variance, MIN_VARIANCE)))[0]
 
 
-def _area_counts(xx: float, xy: float, yy: float) -> tuple[int, int, int]:
-    """Of C = L D L^T; what D is raised by is added to the covariance."""
-    if xx < -LEAST or yy < -LEAST:
+def _covariance_2_counts(xx: float, xy: float, yy: float) -> tuple[int, int, int]:
+    """Counts of C = L D L^T; where D is raised, the covariance grows by as much."""
+    if xx < -MIN_VARIANCE or yy < -MIN_VARIANCE:
         raise ValueError(f"no variances: {xx}, {yy}")
-    d1 = max(xx, LEAST)
+    d1 = max(xx, MIN_VARIANCE)
     l21 = xy / d1
-    d2 = max(yy - l21 * xy, NOISE * yy, LEAST)
+    d2 = max(yy - l21 * xy, NOISE * yy, MIN_VARIANCE)
     x, a = _rounded_up(math.sqrt(d1))
-    y, b = _rounded_up(max(math.sqrt(d2), abs(l21) * a / STEEPEST))
+    y, b = _rounded_up(max(math.sqrt(d2), abs(l21) * a / MAX_SLOPE))
     return x, y, _SLOPE.clamped(l21 * a / b / SLOPE)
 
 
-def _volume_counts(
+def _covariance_3_counts(
     xx: float, xy: float, yy: float, xh: float, yh: float, hh: float
 ) -> tuple[int, int, int, int, int, int]:
-    if hh < -LEAST:
+    if hh < -MIN_VARIANCE:
         raise ValueError(f"no variance: {hh}")
-    x, y, yx = _area_counts(xx, xy, yy)
+    x, y, yx = _covariance_2_counts(xx, xy, yy)
     a, b, t21 = _sigma(x), _sigma(y), yx * SLOPE
-    d1 = max(xx, LEAST)
+    d1 = max(xx, MIN_VARIANCE)
     l21, l31 = xy / d1, xh / d1
-    d2 = max(yy - l21 * xy, NOISE * yy, LEAST)
+    d2 = max(yy - l21 * xy, NOISE * yy, MIN_VARIANCE)
     l32 = (yh - l31 * xy) / d2
-    d3 = max(hh - l31 * xh - l32 * l32 * d2, NOISE * hh, LEAST)
-    least = max(abs(l31) * a, abs(l32) * b) / STEEPEST
+    d3 = max(hh - l31 * xh - l32 * l32 * d2, NOISE * hh, MIN_VARIANCE)
+    least = max(abs(l31) * a, abs(l32) * b) / MAX_SLOPE
     heading, c = _rounded_up(max(math.sqrt(d3), least))
-    # T, rounded to T (I + F): the slope on x answers for the error of y's
+    # T is rounded to T (I + F): the slope on x compensates the error of the slope on y
     t31, t32 = l31 * a / c, l32 * b / c
     hx = _SLOPE.clamped((t31 + t32 * (t21 - l21 * a / b)) / SLOPE)
     return x, y, yx, heading, hx, _SLOPE.clamped(t32 / SLOPE)
 
 
 def _rounded_up(sigma: float) -> tuple[int, float]:
-    """The count of a sigma, and what it stands for."""
-    count = math.ceil(min(SIGMA_STEPS * math.log2(sigma * WIDER), _SIGMA.most))
+    """The count of a sigma, rounded up, and the sigma that it stands for."""
+    count = math.ceil(min(SIGMA_STEPS * math.log2(sigma * WIDENING_PER_SIGMA), _SIGMA.most))
     return count, _sigma(count)
 
 
@@ -221,15 +226,15 @@ def _sigma(count: int) -> float:
     return SIGMA * math.exp2(count / SIGMA_STEPS)
 
 
-def _area(x: int, y: int, yx: int) -> tuple[float, float, float]:
+def _covariance_2(x: int, y: int, yx: int) -> tuple[float, float, float]:
     a, b, t21 = _sigma(x), _sigma(y), yx * SLOPE
     return a * a, a * b * t21, b * b * (1.0 + t21 * t21)
 
 
-def _volume(
+def _covariance_3(
     x: int, y: int, yx: int, heading: int, hx: int, hy: int
 ) -> tuple[float, float, float, float, float, float]:
     a, b, c = _sigma(x), _sigma(y), _sigma(heading)
     t21, t31, t32 = yx * SLOPE, hx * SLOPE, hy * SLOPE
     xh, yh = a * c * t31, b * c * (t21 * t31 + t32)
-    return *_area(x, y, yx), xh, yh, c * c * (1.0 + t31 * t31 + t32 * t32)
+    return *_covariance_2(x, y, yx), xh, yh, c * c * (1.0 + t31 * t31 + t32 * t32)

@@ -1,6 +1,6 @@
-"""What a router lets in from one robot, so that a faulty one cannot flood the others.
+"""Limits on what a router accepts from one robot, so that a faulty one cannot flood the others.
 
-Zenoh's own filters, as its configuration, for the router alone. They stand where a link comes in:
+They are Zenoh's own filters, as configuration of the router alone. They act where a link comes in:
 each robot has its own share, and a flood ends at the router. What was measured:
 
 - Keys in rules are whole keys, with the namespace; a rule on bare topics does nothing, silently.
@@ -9,7 +9,7 @@ each robot has its own share, and a flood ends at the router. What was measured:
   fixes have a rule a target. Rules must not overlap: which one would count is undefined.
 - `low_pass_filter` measures payloads. Its rules may overlap: the smallest limit counts. It comes
   after the rate: what is too large has used its turn.
-- The sender hears nothing of it; `matching` stays true.
+- The sender is not told; its `matching` stays true.
 
 Inputs have a limit of size but none of rate: a lost piece of odometry is a lost piece of the way,
 they come in bursts after every stall, and reach one robot only, whose inbox has a bound. Status and
@@ -57,7 +57,7 @@ def guard_rules(team: Team, speed: float = 1.0) -> dict[str, Any]:
 
 
 def _limit(topic: Topic, guards: GuardSettings) -> int:
-    """Of a payload under this topic (bytes)."""
+    """The largest payload under this topic (bytes)."""
     if topic.carries in topics.COLLABORATION:
         return guards.largest_help_bytes
     return guards.largest_frame_bytes if topic.largest > LARGEST_PAYLOAD else guards.largest_bytes

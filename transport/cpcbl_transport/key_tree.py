@@ -1,6 +1,6 @@
-"""Things that lie under keys with wildcards, found by key: a tree of chunks.
+"""A map from keys with wildcards to entries, searched by key: a tree of chunks.
 
-What it costs to find something grows with what is found, not with what is kept.
+The cost of a search grows with what is found, not with what is stored.
 """
 
 from collections.abc import Iterator

@@ -1,4 +1,4 @@
-"""What a message costs on a TCP link: its payload, and what Zenoh adds at most.
+"""The bytes of a message on a TCP link: its payload, and what Zenoh adds at most.
 
 A put alone in its batch (several may share one) of up to 32 kB, by a declared publisher with
 Zenoh's default priority, through sessions that `zenoh_bus` opened. TCP and IP add 66 bytes a
@@ -14,12 +14,12 @@ _FIXED = 2 + 1 + 2 + 1 + 2 + 1
 
 
 def sent_bytes(payload: int) -> int:
-    """At most so many on the sender's link, for a payload of so many bytes (fix or belief)."""
+    """The most bytes on the sender's link, for a payload of so many bytes (fix or belief)."""
     return _FIXED + _number_bytes(payload) + payload
 
 
 def received_bytes(payload: int, sender: str) -> int:
-    """At most so many on the link of a receiver that subscribed to all senders of a tier.
+    """The most bytes on the link of a receiver that subscribed to all senders of a tier.
 
     What stands after a subscription's first wildcard travels as text: `/` and the sender's name.
     """

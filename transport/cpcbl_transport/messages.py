@@ -1,8 +1,8 @@
-"""The closed union of messages, and the wire format of all but help: a version byte, MessagePack.
+"""All messages, and the wire format of all but fixes and beliefs: a version byte, MessagePack.
 
-Structs are written as arrays with their tag first; they grow only by defaulted fields at the end,
-so that old readers skip what they do not know. Beliefs and fixes are small: `compact`. What cannot
-be used is a `Refusal` with a reason, never an exception.
+A struct is written as an array with its tag first. Structs grow only by fields with defaults at the
+end, so that an older reader skips what it does not know. Fixes and beliefs have a compact format
+(`compact`). Decoding never raises: what cannot be used is a `Refusal` with a reason.
 """
 
 import math
@@ -32,15 +32,15 @@ class Frame(msgspec.Struct, frozen=True, array_like=True, tag="frame"):
 
 
 class UnclearObject(msgspec.Struct, frozen=True, array_like=True):
-    """Something in a frame that is not reported as a sighting, and why."""
+    """Something in a frame that is not reported as a sighting, and why not."""
 
     reason: str
     names: tuple[str, ...] = ()
-    """What it could be."""
+    """The names of what it could be."""
 
 
 class AnnotatedFrame(msgspec.Struct, frozen=True, array_like=True, tag="look"):
-    """What a robot made of a frame, with the frame: what was found is drawn into it (JPEG)."""
+    """What a robot found in a frame, and the frame with the findings drawn into it (JPEG)."""
 
     robot: Name
     stamp_ns: int
@@ -50,51 +50,52 @@ class AnnotatedFrame(msgspec.Struct, frozen=True, array_like=True, tag="look"):
 
 
 class Flow(msgspec.Struct, frozen=True, array_like=True):
-    """Help of one kind from or for one teammate, since the process started.
+    """The messages of one topic from or for one teammate, since the process started.
 
-    `topic` is fix, belief or alive; `peer` the teammate, empty where it is for all who listen.
+    `topic` is fix, belief or alive; `peer` is the teammate, empty for beliefs, which go to all
+    subscribers.
     """
 
     topic: str
     peer: str
     messages: int = 0
     bytes: int = 0
-    """On the wire, with Zenoh's own."""
+    """On the link, with Zenoh's own bytes."""
     over_budget: int = 0
-    """Not sent: the budget did not allow it, or has better use."""
+    """Not sent: the budget did not allow it, or had a better use."""
     worthless: int = 0
-    """Not sent: it would have told the teammate next to nothing."""
+    """Not sent: its information gain for the teammate was too small."""
     silent: int = 0
-    """Not sent: listeners can still tell where this robot is."""
+    """Not sent: subscribers can still predict this robot's pose from its last belief."""
     latest_ns: int = 0
 
 
 class Spending(msgspec.Struct, frozen=True, array_like=True):
-    """A limit on fixes and beliefs, and how near the robot came to it."""
+    """A limit on fixes and beliefs, and the largest use of it so far."""
 
     unit: str
     """bytes or messages"""
     window_s: float
-    """0: over all the time."""
+    """0: the limit holds for the whole match."""
     allowed: float
     most: float
     """The most that was spent within one window."""
 
 
 class Trust(msgspec.Struct, frozen=True, array_like=True):
-    """How a teammate stands with this robot."""
+    """How far this robot trusts a teammate."""
 
     peer: str
     reason: str = ""
-    """Why nothing that it says is used; empty while it is believed."""
+    """Why none of its messages is used; empty while they are used."""
     since_ns: int = 0
-    """When that began, or ended."""
+    """When the quarantine began, or ended."""
     quarantines: int = 0
     """How often it was in quarantine so far."""
     unconfirmed: bool = False
-    """Nobody else tells this robot anything: whether this one is biased cannot be told."""
+    """No other teammate sends anything, so a bias of this one cannot be recognized."""
     late_s: float = 0.0
-    """The least time from its stamps to their arrival, lately; below zero its clock is ahead."""
+    """The least delay from stamp to arrival lately; below zero the teammate's clock is ahead."""
 
 
 class Status(msgspec.Struct, frozen=True, array_like=True, tag="status"):
@@ -118,7 +119,7 @@ class Status(msgspec.Struct, frozen=True, array_like=True, tag="status"):
     heard: tuple[Flow, ...] = ()
     spending: tuple[Spending, ...] = ()
     trust: tuple[Trust, ...] = ()
-    """Teammates that are heard, or are or were in quarantine."""
+    """Teammates that send something, or that are or were in quarantine."""
 
 
 class Track(msgspec.Struct, frozen=True, array_like=True, tag="track"):
@@ -155,7 +156,7 @@ class Join(msgspec.Struct, frozen=True, array_like=True, tag="join"):
 
 
 class Truth(msgspec.Struct, frozen=True, array_like=True):
-    """Where the simulated field has a robot; bumps into landmarks so far."""
+    """The true pose of a simulated robot, and how often it has bumped into landmarks."""
 
     robot: Name
     x_m: float
@@ -205,7 +206,7 @@ class Refusal(StrEnum):
     UNKNOWN_ROBOT = "unknown_robot"
     OWN = "own_message"
     NOT_ITS_OWN = "name_of_another"
-    """Another name than its key's."""
+    """The message names another robot than its key."""
 
 
 _encoder = msgspec.msgpack.Encoder()
@@ -230,7 +231,7 @@ def decode_tagged(payload: bytes, largest: int = LARGEST_PAYLOAD) -> Tagged | Re
 
 
 def header_refusal(payload: bytes, largest: int = LARGEST_PAYLOAD) -> Refusal | None:
-    """Why a payload need not be read at all, or None."""
+    """Why a payload is refused by its size or its first byte, or None."""
     if not payload:
         return Refusal.EMPTY
     if len(payload) > largest:
@@ -241,8 +242,8 @@ def header_refusal(payload: bytes, largest: int = LARGEST_PAYLOAD) -> Refusal | 
 def refusal(message: Message, now_ns: int) -> Refusal | None:
     """Why a decoded message must not be used, or None: numbers, time, duration.
 
-    The numbers of sightings are judged one by one by the filter. Help that was read from any bytes
-    is finite and its covariance is one.
+    The filter checks the numbers of sightings one by one. Numbers of fixes and beliefs are always
+    finite, and their covariances are valid, whatever the bytes were.
     """
     if not isinstance(message, Sightings):
         numbers = _numbers(message)
@@ -268,14 +269,14 @@ def refusal(message: Message, now_ns: int) -> Refusal | None:
 
 
 def _is_covariance(xx: float, xy: float, yy: float) -> bool:
-    """Of a sensor: none is exact."""
+    """Whether this is the covariance of a sensor, whose variances are never zero."""
     return xx > 0.0 and yy > 0.0 and xy * xy <= xx * yy * (1.0 + 1e-6) + 1e-12
 
 
 def _numbers(message: Message) -> list[float]:
     """All floats in a message, however deep."""
     found, parts = [], list(msgspec.structs.astuple(message))
-    for part in parts:  # it grows on the way
+    for part in parts:  # the list grows meanwhile
         if isinstance(part, float):
             found.append(part)
         elif isinstance(part, tuple):
@@ -289,7 +290,7 @@ def _counts(message: msgspec.Struct) -> list[int]:
     """The sizes of all whole numbers in a message, however deep, that are no stamps."""
     found: list[int] = []
     parts: list[tuple[str, object]] = [("", message)]
-    for name, part in parts:  # it grows on the way
+    for name, part in parts:  # the list grows meanwhile
         if isinstance(part, int):
             found += [] if name.endswith("_ns") and abs(part) < LAST_NS else [abs(part)]
         elif isinstance(part, tuple):

@@ -1,16 +1,15 @@
-"""Mutual TLS and access control: whose keys a session shows, and what a router lets each one say.
+"""Mutual TLS and access control: which keys a session uses, and what each member may publish.
 
-Zenoh's own, as its configuration. What was measured:
+Both are Zenoh's own, as its configuration. What was measured:
 
 - The common name of a certificate is the one thing that access control knows of its owner; it is
   compared as it is, without patterns.
 - Keys in rules are whole keys, with the namespace.
-- What is denied is dropped silently: the sender hears nothing of it, `matching` stays true.
+- What is denied is dropped silently: the sender is not told, and its `matching` stays true.
 - A key file is read when a link is opened, so a renewed one counts from the next link on. The
   router's own files, and the rules, are read when it starts.
-- There are no lists of revoked certificates: who is no member any more opens a link that carries
-  nothing, until its certificate expires. Links do not outlive the certificates they were opened
-  with.
+- There are no lists of revoked certificates. A former member can open a link until its certificate
+  expires, but the link carries nothing. Links do not outlive their certificates.
 """
 
 from collections.abc import Collection, Iterable, Iterator
@@ -26,7 +25,7 @@ from cpcbl_transport.topics import Permission, Role, Topic
 
 CA, CERTIFICATE, PRIVATE_KEY, MEMBERS = "ca.crt", "certificate.crt", "private.key", "members.json"
 PROTOCOL = "tls"
-"""Not QUIC, which certifies names as well: what is said first under a new key is lost at times."""
+"""Not QUIC, which certifies names as well, but sometimes loses the first message of a new key."""
 
 
 class SecurityError(CpcblError):
@@ -34,7 +33,7 @@ class SecurityError(CpcblError):
 
 
 class Identity(NamedTuple):
-    """Who a session belongs to. Robots and observers have names, of the others there is one."""
+    """Who a session belongs to. Robots and observers have names; each other role has one member."""
 
     role: Role
     name: str = ""
@@ -74,7 +73,7 @@ class Credentials(NamedTuple):
 
 
 class Link(NamedTuple):
-    """Where a session dials or listens, and what it shows there."""
+    """Where a session dials or listens, and the keys that it uses there."""
 
     endpoints: tuple[str, ...]
     credentials: Credentials | None = None
@@ -147,9 +146,9 @@ def link_options(credentials: Credentials) -> dict[str, Any]:
     }
 
 
-_ASKS = ("declare_subscriber", "declare_liveliness_subscriber", "liveliness_query")
-_IS_TOLD = ("put", "declare_subscriber", "liveliness_token")
-_EVERYTHING = (
+_SUBSCRIBING = ("declare_subscriber", "declare_liveliness_subscriber", "liveliness_query")
+_DELIVERED = ("put", "declare_subscriber", "liveliness_token")
+_ALL_MESSAGES = (
     *("put", "delete", "query", "reply", "declare_queryable"),
     *("declare_subscriber", "declare_liveliness_subscriber"),
     *("liveliness_token", "liveliness_query"),
@@ -157,20 +156,22 @@ _EVERYTHING = (
 
 
 def access_rules(team: Team, members: Iterable[Member]) -> dict[str, Any]:
-    """The router's access control: nobody may say or ask for more than the table of topics allows.
+    """The router's access control: nobody may publish or receive more than the table allows.
 
-    Who is not among the members, was revoked, or has no place in
-    the team as its file has it now, neither says nor hears anything.
+    Whoever is not among the members, was revoked, or has no place in the present team file can
+    neither publish nor receive anything.
     """
     space = topics.namespace(team.name)
-    present = [m for m in members if not m.revoked and _belongs(m.identity, team)]
-    policies = [_policy("be told", present, _rule("be told", "egress", _IS_TOLD, [f"{space}/**"]))]
+    present = [m for m in members if not m.revoked and _is_in_team(m.identity, team)]
+    policies = [
+        _policy("deliver", present, _rule("deliver", "egress", _DELIVERED, [f"{space}/**"]))
+    ]
     for member in present:
         who = member.identity
         for messages, keys in (
             (["put"], publish_keys(who, carrying=True)),
             (["liveliness_token"], publish_keys(who, carrying=False)),
-            (_ASKS, subscribe_keys(who)),
+            (_SUBSCRIBING, subscribe_keys(who)),
         ):
             if keys:
                 name = f"{who}: {messages[0]}"
@@ -179,7 +180,7 @@ def access_rules(team: Team, members: Iterable[Member]) -> dict[str, Any]:
     routers = [m for m in present if m.role is Role.ROUTER]
     for flow in ("ingress", "egress"):
         name = f"relay: {flow}"
-        policies.append(_policy(name, routers, _rule(name, flow, _EVERYTHING, [f"{space}/**"])))
+        policies.append(_policy(name, routers, _rule(name, flow, _ALL_MESSAGES, [f"{space}/**"])))
     policies = [p for p in policies if p["subject"]["cert_common_names"]]
     return {
         "access_control": {
@@ -195,9 +196,9 @@ def access_rules(team: Team, members: Iterable[Member]) -> dict[str, Any]:
 
 
 def publish_keys(identity: Identity, carrying: bool | None = None) -> list[str]:
-    """The keys under which someone may speak, below the namespace.
+    """The keys under which a member may publish, below the namespace.
 
-    `carrying`: those of messages, or those of tokens, which carry none; None: both.
+    `carrying`: only those of messages, or only those of tokens; None: both.
     """
     return [
         key
@@ -208,7 +209,7 @@ def publish_keys(identity: Identity, carrying: bool | None = None) -> list[str]:
 
 
 def subscribe_keys(identity: Identity) -> list[str]:
-    """The keys that someone may subscribe to, with all that they include."""
+    """The keys that a member may subscribe to, with all that they include."""
     if identity.role is Role.OPERATOR:
         return ["**"]
     return [key for topic in topics.TOPICS for key in _keys(topic, topic.subscribers, identity)]
@@ -224,8 +225,8 @@ def _carries(topic: Topic) -> bool:
     return topic.carries is not None
 
 
-def _belongs(identity: Identity, team: Team) -> bool:
-    """Whether the team as its file has it now has a place for someone who had one before."""
+def _is_in_team(identity: Identity, team: Team) -> bool:
+    """Whether the present team file still has a place for a member."""
     match identity.role:
         case Role.ROBOT:
             return identity.name in team.robots
@@ -247,6 +248,6 @@ def _rule(name: str, flow: str, messages: Collection[str], keys: list[str]) -> d
 
 
 def _policy(name: str, members: Iterable[Member], rule: dict[str, Any]) -> dict[str, Any]:
-    """A rule and the one subject that it is for."""
+    """A rule and the one subject that it applies to."""
     names = [member.common_name for member in members]
     return {"rule": rule, "subject": {"id": name, "cert_common_names": names}}

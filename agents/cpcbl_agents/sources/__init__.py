@@ -14,11 +14,11 @@ class Source(Protocol):
 
     @property
     def next_ns(self) -> int | None:
-        """When there will be something; None: not known or nothing any more."""
+        """When the next input comes; None if that is not known or nothing comes any more."""
 
     @property
     def is_finished(self) -> bool:
-        """Whether there will never be anything more: the end of a log."""
+        """Whether nothing will come any more, as at the end of a log."""
 
     def poll(self, now_ns: int) -> Sequence[Odometry | Sightings | Frame | Picture]:
         """Everything up to now that was not polled yet."""
@@ -29,14 +29,14 @@ class OwnCamera(Source, Protocol):
 
     @property
     def counts(self) -> Counter[str]:
-        """What befell it, by reason."""
+        """Its events so far, by name."""
 
     def close(self) -> None:
-        """Lets the camera go."""
+        """Releases the camera."""
 
 
 class NoSource:
-    """For robots whose inputs arrive on the bus: from their own driver or the simulated field."""
+    """For robots whose inputs arrive on the bus: from a driver or the simulated field."""
 
     next_ns: int | None = None
     is_finished = False
