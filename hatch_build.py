@@ -21,10 +21,12 @@ HOT = (
     "landmarks",
     "localizer",
     "motion",
+    "object_timers",
     "recovery",
     "relocalization",
     "sensors",
     "state",
+    "teammates",
     "variants",
 )
 OPTIONS = ["--strict", "--namespace-packages", "--explicit-package-bases", "--config-file="]

@@ -18,7 +18,6 @@ from cpcbl_team.estimate import (
     POSITION,
     SMALLEST_VARIANCE,
     Covariance3,
-    Estimate,
     InformationSum,
     Row,
     Scope,
@@ -46,8 +45,10 @@ class Mark:
 class LandmarkUpdate:
     """What the plain landmarks of one frame say about the part of the pose to be updated."""
 
-    def __init__(self, stamp_ns: int) -> None:
-        self.stamp_ns = stamp_ns
+    def __init__(self, state: State) -> None:
+        self.stamp_ns = state.stamp_ns
+        self.pose, self.covariance, _ = state.estimate  # all is linearized at this prior
+        self.x, self.y, self.heading = self.pose
         self.evidence = InformationSum()
         self.used: dict[str, int] = {}  # the landmarks whose evidence was accepted, and when: now
         self.rejected = 0  # how many landmarks the gate has rejected
@@ -92,15 +93,22 @@ class Landmarks:
 
         An object that is `cooling_down` is not plain; one of `recorded` is no new evidence.
         """
-        update = LandmarkUpdate(state.stamp_ns)
-        estimate = state.estimate
+        update = LandmarkUpdate(state)
         uses_range = scope is not None and scope is not HEADING
         uses_bearing = scope is not None and (scope is not POSITION or self._uses_rays)
         for sighting in sightings:
             numbers: Numbers = astuple(sighting)
-            name, range_m, bearing = numbers[0], numbers[1], numbers[2]
+            name, range_m, bearing, range_sigma, bearing_sigma, facing, facing_sigma = numbers
             mark = self._marks.get(name)
-            if mark is None or name in cooling_down or not _is_plain(numbers):
+            if (
+                mark is None
+                or range_sigma is not None
+                or bearing_sigma is not None
+                or facing is not None
+                or facing_sigma is not None
+                or name in cooling_down
+                or not _is_sound(range_m, bearing)
+            ):
                 update.others.append(sighting)
                 continue
             if not mark.gives_range or (range_m is not None and range_m > self._farthest_m):
@@ -117,7 +125,7 @@ class Landmarks:
                 bearing = None
             if range_m is not None or bearing is not None:
                 update.constrains = True
-                self._constrain(update, name, mark, range_m, bearing, estimate, scope is POSITION)
+                self._constrain(update, name, mark, range_m, bearing, scope is POSITION)
         return update
 
     def _constrain(
@@ -127,7 +135,6 @@ class Landmarks:
         mark: Mark,
         range_m: float | None,
         bearing: float | None,
-        prior: Estimate,
         as_ray: bool,
     ) -> None:
         """Adds the constraints of one landmark, unless the gate rejects them.
@@ -135,9 +142,7 @@ class Landmarks:
         A range gives the row (u, v, 0). A bearing gives the row (m, n, 1): a heading as it is, a
         ray divided by the distance along it.
         """
-        pose, covariance, _ = prior
-        x, y, prior_heading = pose
-        dx, dy = mark.x - x, mark.y - y
+        dx, dy = mark.x - update.x, mark.y - update.y
         distance_squared = dx * dx + dy * dy
         distance = sqrt(distance_squared)
         if distance < NEAREST_M:
@@ -147,7 +152,7 @@ class Landmarks:
             u, v, range_error = circle(dx, dy, distance, range_m)
             range_weight = 1.0 / sharpest(self._range_variance(distance, range_m))
         if bearing is not None and as_ray:
-            m, n, ahead, across = ray(dx, dy, prior_heading + bearing)
+            m, n, ahead, across = ray(dx, dy, update.heading + bearing)
             if ahead >= NEAREST_M:
                 m, n, bearing_error = m / ahead, n / ahead, across / ahead
                 width_squared = sharpest(distance_squared * self._sine_squared)
@@ -155,13 +160,13 @@ class Landmarks:
             elif range_m is None:
                 return
         elif bearing is not None:
-            m, n, bearing_error = heading(dx, dy, distance_squared, bearing, prior_heading)
+            m, n, bearing_error = heading(dx, dy, distance_squared, bearing, update.heading)
             bearing_weight = self._heading_weight
         # The NIS of a prior that is certain; that of an uncertain one is smaller.
         largest_nis = range_weight * range_error * range_error
         largest_nis += bearing_weight * bearing_error * bearing_error
         if largest_nis > self._gates[0] and self._rejects(
-            covariance,
+            update.covariance,
             ((u, v, 0.0), range_error, range_weight),
             ((m, n, 1.0), bearing_error, bearing_weight),
         ):
@@ -206,15 +211,10 @@ class Landmarks:
         return pieces
 
 
-def _is_plain(numbers: Numbers) -> bool:
-    """Whether these are a sound range or bearing, or both, and nothing else."""
-    _, range_m, bearing, range_sigma, bearing_sigma, heading_seen, heading_sigma = numbers
+def _is_sound(range_m: float | None, bearing: float | None) -> bool:
+    """Whether there is a reading, and each that there is may be used (see `sighting_fault`)."""
     return (
-        range_sigma is None
-        and bearing_sigma is None
-        and heading_seen is None
-        and heading_sigma is None
-        and (range_m is None or 0.0 < range_m <= LARGEST_M)
+        (range_m is None or 0.0 < range_m <= LARGEST_M)
         and (bearing is None or -LARGEST_BEARING_RAD <= bearing <= LARGEST_BEARING_RAD)
         and not (range_m is None and bearing is None)
     )

@@ -22,6 +22,7 @@ from cpcbl_team.measurements import (
     measurement_of,
     nis_of,
 )
+from cpcbl_team.object_timers import ObjectTimers, has_passed
 from cpcbl_team.pose_observation import PoseObservation, from_fix, from_position_sensor
 from cpcbl_team.recovery import (
     Recovery,
@@ -33,14 +34,13 @@ from cpcbl_team.recovery import (
     with_snapshot,
 )
 from cpcbl_team.self_calibration import ReferencePose, ReferencePoses, self_calibrate
-from cpcbl_team.sensors import crawled_s, repeated_share, sighting_fault
+from cpcbl_team.sensors import crawled_s, sighting_fault
 from cpcbl_team.state import (
     Evidence,
     LandmarkSnapshot,
     Memory,
     RecoveryMemory,
     State,
-    Updates,
     updates_with_frame,
     with_correction,
     with_memory,
@@ -53,7 +53,6 @@ from cpcbl_team.variants import UpdateOrder, variant_of
 
 MOST_HEADING_SIGMA_RAD = math.radians(100.0)  # beyond, no bearing can be linearized
 
-_NOBODY: frozenset[str] = frozenset()
 _NO_OBJECTS = GatedObjects([], [])
 
 
@@ -68,12 +67,13 @@ class Localizer:
         self._rules = rules
         self._gates = gates
         self._minimum_interval_ns = rules.minimum_interval_s * 1e9
-        self._object_interval_ns = rules.object_interval_s * 1e9
         self._odometry = settings.odometry
         self._odometry_timeout_ns = int(settings.odometry.timeout_s * 1e9)
-        self._correlation_s = settings.sensor.correlation_s
+        self._has_dead_zone = settings.odometry.least_speed_m_s > 0.0
         self._calibrates = rules.learns
+        self._window = rules.lost_window
         self._belief_age_ns = int(settings.collaboration.max_age_s * 1e9)
+        self._timers = ObjectTimers(settings)
         self._variant = variant_of(settings)
         self._landmarks = Landmarks(field, settings, gates)
         self._recovery = Recovery(rules, field, self._landmarks, self._variant.reduce)
@@ -143,7 +143,7 @@ class Localizer:
             share = part_ns / whole_ns
             distance, turn = share * distance, share * turn
         crawled = 0.0
-        if self._odometry.least_speed_m_s:
+        if self._has_dead_zone:
             crawled = crawled_s(distance, part_ns * 1e-9, self._odometry)
         return distance, turn, crawled
 
@@ -169,9 +169,7 @@ class Localizer:
         now, stamp_ns, updates = frame.stamp_ns, state.stamp_ns, state.updates
         recovery = state.memory.recovery
         recorded = recently_recorded(recovery, stamp_ns)
-        cooling_down = _NOBODY
-        if self._object_interval_ns > 0.0 or now < stamp_ns:
-            cooling_down = self._cooling_down(updates, now)
+        cooling_down = self._timers.cooling_down(updates, stamp_ns, now)
         for scope in self._update_order(state):
             landmarks = self._landmarks.update(
                 state, frame.sightings, scope, cooling_down, recorded
@@ -180,7 +178,7 @@ class Localizer:
             faults: list[str] = []
             if landmarks.others:
                 measured, faults = self._measure_others(state, landmarks.others, now)
-            usable = self._usable(updates, measured, now) if measured else measured
+            usable = self._timers.usable(updates, measured, now) if measured else measured
             if landmarks.constrains or any(constrains(m, scope, self._rules) for m in usable):
                 break
         if landmarks.unrecorded:
@@ -195,14 +193,15 @@ class Localizer:
     def _update_order(self, state: State) -> UpdateOrder:
         """The parts of the pose that may be updated now, first the one that waits longer; each
         type has its timer. The last is None: nothing."""
-        now, updates = state.stamp_ns, state.updates
+        updates = state.updates
         if state.memory.recovery.lost and state.estimate.heading_sigma_rad > MOST_HEADING_SIGMA_RAD:
             return (None,)
         order = self._variant.update_orders[updates.heading_is_latest]
         least = self._minimum_interval_ns
         if least > 0.0:
-            position = _has_passed(updates.position_ns, now, least)
-            heading = _has_passed(updates.heading_ns, now, least)
+            now = state.stamp_ns
+            position = has_passed(updates.position_ns, now, least)
+            heading = has_passed(updates.heading_ns, now, least)
             may = {POSITION: position, HEADING: heading, POSE: position or heading}
             order = tuple(scope for scope in order if scope is None or may[scope])
         return order
@@ -223,28 +222,6 @@ class Localizer:
             if m is not None:
                 measured.append(m if bias == 0.0 else m.rotated(-bias))
         return measured, faults
-
-    def _cooling_down(self, updates: Updates, now_ns: int) -> frozenset[str]:
-        """The objects that were used too short a time ago."""
-        least, used_ns = self._object_interval_ns, updates.objects_ns.items()
-        return frozenset(name for name, ns in used_ns if not _has_passed(ns, now_ns, least))
-
-    def _usable(
-        self, updates: Updates, measured: list[Measurement], now_ns: int
-    ) -> list[Measurement]:
-        """Without those of objects that are cooling down. Those of an object that was used not long
-        ago count for less, for their errors are correlated."""
-        least, used_ns = self._object_interval_ns, updates.objects_ns.get
-        usable = [m for m in measured if _has_passed(used_ns(m.source), now_ns, least)]
-        if self._correlation_s > 0.0:
-            usable = [m.inflated(self._repeated_share(updates, m.source, now_ns)) for m in usable]
-        return usable
-
-    def _repeated_share(self, updates: Updates, source: str, now_ns: int) -> float:
-        """By how much the variance of what this source reports now is to grow."""
-        last_ns = updates.objects_ns.get(source)
-        seconds = None if last_ns is None else (now_ns - last_ns) * 1e-9
-        return repeated_share(seconds, self._correlation_s)
 
     # Steps 3 to 5 -----------------------------------------------------------------------------
 
@@ -279,10 +256,10 @@ class Localizer:
         scope: Scope,
     ) -> State:
         """The state with the estimate that a frame gave, and with the frame's bookkeeping."""
-        used = landmarks.used
-        if gated.accepted:
-            used = used | {found.measurement.source: state.stamp_ns for found in gated.accepted}
-        rejected = landmarks.rejected + len(gated.rejected)
+        used, (accepted, others_rejected) = landmarks.used, gated
+        if accepted:
+            used = used | {found.measurement.source: state.stamp_ns for found in accepted}
+        rejected = landmarks.rejected + len(others_rejected)
         return self._with_update(state, estimate, scope, used, rejected)
 
     def _with_update(
@@ -296,7 +273,7 @@ class Localizer:
         """The new estimate, with timers, window and counts of an update by what is used (when:
         now)."""
         now, updates, accepted = state.stamp_ns, state.updates, len(used)
-        window = with_innovations(updates.innovations, accepted, rejected, self._rules.lost_window)
+        window = with_innovations(updates.innovations, accepted, rejected, self._window)
         updates = updates_with_frame(updates, now, scope, used, rejected, window)
         state = with_correction(state, estimate, updates)
         return self._with_calibration(state) if accepted and self._calibrates else state
@@ -330,11 +307,10 @@ class Localizer:
     def _observe_pose(self, state: State, stamp_ns: int, observation: PoseObservation) -> State:
         state = self._record_observation(self.predict(state, stamp_ns), observation)
         updates, prior, source = state.updates, state.estimate, observation.source
-        used_ns = updates.objects_ns.get(source)
-        if not _has_passed(used_ns, stamp_ns, self._object_interval_ns):
+        if self._timers.is_cooling_down(updates, source, stamp_ns):
             return state
-        if self._correlation_s > 0.0:
-            factor = self._repeated_share(updates, source, stamp_ns)
+        if self._timers.inflates:
+            factor = self._timers.inflation(updates, source, stamp_ns)
             observation = observation.inflated(factor)
         position = observation.of_position(prior.pose)
         nis = position.normalized_innovation_squared(prior.covariance)
@@ -423,10 +399,6 @@ class Localizer:
     def evidence(self, memory: RecoveryMemory) -> tuple[Evidence, ...]:
         """What the robot can find itself with, the latest last."""
         return self._recovery.evidence(memory)
-
-
-def _has_passed(last_ns: int | None, now_ns: int, least_ns: float) -> bool:
-    return last_ns is None or now_ns - last_ns >= least_ns
 
 
 def _source(m: Measurement) -> str:

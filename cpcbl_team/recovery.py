@@ -15,7 +15,15 @@ from cpcbl_team.landmarks import Landmarks
 from cpcbl_team.measurements import Measurement
 from cpcbl_team.pose_observation import PoseObservation
 from cpcbl_team.relocalization import relocalize
-from cpcbl_team.state import FIX, Evidence, LandmarkSnapshot, RecoveryMemory, State, with_recovery
+from cpcbl_team.state import (
+    FIX,
+    Evidence,
+    LandmarkSnapshot,
+    RecoveryMemory,
+    State,
+    with_records,
+    with_recovery,
+)
 from cpcbl_team.trust import reset_scores
 
 WINDOW_NS = 20_000_000_000
@@ -54,11 +62,9 @@ def with_snapshot(memory: RecoveryMemory, snapshot: LandmarkSnapshot) -> Recover
     now, recent = snapshot.stamp_ns, _recent(memory, snapshot.stamp_ns)
     for sighting in snapshot.sightings:
         recent[sighting.id] = now
-    return memory._replace(
-        snapshots=latest((*memory.snapshots, snapshot)),
-        recorded=frozenset(recent),
-        recorded_until_ns=min(recent.values()) + SPACING_NS,
-    )
+    until_ns = min(recent.values()) + SPACING_NS
+    snapshots = latest((*memory.snapshots, snapshot))
+    return with_records(memory, snapshots, memory.evidence, frozenset(recent), until_ns)
 
 
 def with_evidence(memory: RecoveryMemory, pieces: Sequence[Evidence]) -> RecoveryMemory:
@@ -72,11 +78,9 @@ def with_evidence(memory: RecoveryMemory, pieces: Sequence[Evidence]) -> Recover
             new.append(piece)
     if not new:
         return memory
-    return memory._replace(
-        evidence=latest((*memory.evidence, *new)),
-        recorded=frozenset(recent),
-        recorded_until_ns=min(recent.values()) + SPACING_NS,
-    )
+    until_ns = min(recent.values()) + SPACING_NS
+    evidence = latest((*memory.evidence, *new))
+    return with_records(memory, memory.snapshots, evidence, frozenset(recent), until_ns)
 
 
 def with_measurements(state: State, measurements: Sequence[Measurement]) -> RecoveryMemory:

@@ -185,6 +185,19 @@ def with_recovery(state: State, recovery: RecoveryMemory) -> State:
     return with_memory(state, new(Memory, (recovery, teammates, calibration, events)))
 
 
+def with_records(
+    recovery: RecoveryMemory,
+    snapshots: tuple[LandmarkSnapshot, ...],
+    evidence: tuple[Evidence, ...],
+    recorded: frozenset[str],
+    until_ns: int,
+) -> RecoveryMemory:
+    """The recovery's memory with other evidence, and the sources of which no more is needed."""
+    lost, inflated_ns, relocalization_ns, _, _, _, _ = recovery
+    fields = lost, inflated_ns, relocalization_ns, snapshots, evidence, recorded, until_ns
+    return new(RecoveryMemory, fields)
+
+
 def with_correction(state: State, estimate: Estimate, updates: Updates) -> State:
     """The state with a new estimate and its bookkeeping."""
     now, _, place, pending, until_ns, _, memory = state
