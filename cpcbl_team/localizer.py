@@ -82,8 +82,7 @@ class Localizer:
     def cycle(self, state: State, frame: Sightings) -> State:
         """One cycle (paper, section 3, figure 1). Pure: the same inputs give the same bits.
 
-        The evidence of plain landmarks, nearly all there is, is already combined in `landmarks`;
-        `others` are walls, teammates and what else needs a record of its own.
+        `landmarks` holds the combined evidence of plain landmarks, `others` all other measurements.
         """
         state = self.predict(state, frame.stamp_ns)  # 1. differential motion
         state, scope, landmarks, others = self.measure(state, frame)  # 2. measurements
