@@ -24,7 +24,8 @@ class FlowReport(msgspec.Struct, frozen=True, kw_only=True):
 class SpendingReport(msgspec.Struct, frozen=True, kw_only=True):
     """A limit, and how near the robot came to it.
 
-    A process that was restarted takes its windows as spent, as it cannot know better.
+    A restarted process does not know what the one before it sent. It therefore assumes that all
+    windows are fully spent.
     """
 
     unit: str

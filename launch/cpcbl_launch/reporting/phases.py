@@ -76,7 +76,7 @@ def guest_reports(
     epoch_s: float,
     begin_s: float = -math.inf,
 ) -> dict[str, GuestReport]:
-    """Of those who were heard of and are none of the team's robots; of too many the most talkative.
+    """Reports of the robots that are not in the team file: of too many, those with most tracks.
 
     `begin_s`: the time at which figures begin; `epoch_s`: the start of the run.
     """

@@ -1,4 +1,4 @@
-"""Listens to what robots say of themselves, and turns it into a report against the truth."""
+"""Receives the tracks and status of robots, and makes a report against the truth."""
 
 import math
 import threading
@@ -125,13 +125,13 @@ class Report(msgspec.Struct, frozen=True, kw_only=True):
     calibrated_on: tuple[str, ...] = ()
     """The logs from which the robots' types were calibrated."""
     seen_before: bool = False
-    """Whether this log is one of them: figures flatter."""
+    """Whether this log is one of them, so that the figures are too good."""
     left_out: dict[str, str] = {}
     """Robots that could not take part, with the reason."""
     duration_s: float = 0.0
     restarts: dict[str, int] = {}
     refused: dict[str, int] = {}
-    """What the recorder heard and could not use, by reason."""
+    """Messages that the recorder could not use, by reason."""
     not_written: dict[str, str] = {}
     """Files that could not be written, with the reason."""
     alone: dict[str, Phase] = {}
@@ -151,7 +151,7 @@ class Recorder:
         self.status: dict[str, Status] = {}
         self.truths: EncodedLog[Truths] = EncodedLog()
         self.counts: Counter[str] = Counter()
-        """What was taken, by topic, and what was refused, by reason."""
+        """Accepted messages by topic, and refused ones by reason."""
         self._earlier_processes: dict[str, list[Status]] = {}
         for topic in (topics.TRACK, topics.STATUS, topics.TRUTH):
             bus.subscribe(topic.at(), self._receive)
@@ -174,7 +174,7 @@ class Recorder:
 
     @property
     def refused(self) -> dict[str, int]:
-        """What was heard and could not be used, by reason."""
+        """Messages that could not be used, by reason."""
         with self._lock:
             return {r: self.counts[r] for r in sorted(Refusal) if self.counts[r]}
 
@@ -246,7 +246,7 @@ class Recorder:
             variant=variant,
             lost_share=sum(bool(t.lost) for t in tracks) / max(len(tracks), 1),
             longest_lost_s=_longest_lost_s(tracks),
-            lost_at_end=tracks[-1].lost if tracks else "was never heard of",
+            lost_at_end=tracks[-1].lost if tracks else "no estimate was received",
             bumps=last_truth[name].bumps if name in last_truth else 0,
             messages_sent=sum(s.messages_sent for s in statuses),
             bytes_sent=sum(s.bytes_sent for s in statuses),

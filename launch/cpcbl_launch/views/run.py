@@ -41,7 +41,7 @@ class LiveTable(LiveView):
     def __init__(
         self, title: str, robots: Collection[str], console: Console, quiet: bool = False
     ) -> None:
-        """`robots`: those of the team file; who else is heard of is a guest."""
+        """`robots` are those of the team file; every other robot is a guest."""
         super().__init__(console, quiet)
         self._title, self._robots = title, robots
 
@@ -180,7 +180,7 @@ def _effects(name: str, guest: GuestReport) -> Table:
     parts = Effect.__struct_fields__
     present = ", ".join(f"{a:.1f} to {b:.1f} s" for a, b in guest.present_s)
     shown = table(
-        f"before, during, after guest {name}: there from {present}",
+        f"before, during and after guest {name}, present from {present}",
         ("robot",),
         [f"{what} {part}" for what in ("RMSE", "σ") for part in parts],
     )
@@ -194,7 +194,7 @@ def _effects(name: str, guest: GuestReport) -> Table:
 def print_observer_report(visited: ObserverReport, console: Console) -> None:
     """What an observer did while it was there."""
     sigma = number(visited.position_sigma_m)
-    said = f"{visited.name} was there for {visited.seconds:.1f} s, σ {sigma} m at the end"
+    said = f"{visited.name} took part for {visited.seconds:.1f} s, position σ {sigma} m at the end"
     console.print(said, style="bold", highlight=False)
     shown = table("", ("help",), ("messages", "B"))
     for said, flows in (("sent", visited.sent), ("heard", visited.heard)):
@@ -211,7 +211,7 @@ def print_observer_report(visited: ObserverReport, console: Console) -> None:
 
 def _baseline_table(report: Report) -> Table:
     """Plain filters beside the team: means over the robots."""
-    shown = table("yardsticks: the same data and settings, team means", ("filter",), FIGURES)
+    shown = table("baselines: the same data and settings, team means", ("filter",), FIGURES)
     for name, yardstick in report.yardsticks.items():
         shown.add_row(name.replace("_", " ").replace("ekf", "EKF"), *_figures(yardstick.team))
     shown.add_section()
@@ -233,28 +233,29 @@ def _figures(s: Score | MeanScore) -> list[str]:
 
 def _remarks(report: Report) -> Iterator[str]:
     if report.alone:
-        yield "before: RMSE before teammates began to help; the other columns are from then on"
-    yield "consistent: 98.9 % in 3 σ, NEES 2; out, B: help sent, bytes with Zenoh's own"
+        yield "Column before is the RMSE before teammates began to help, the others since then."
+    yield "Columns out and B count fixes and beliefs that were sent, and their bytes."
+    yield "For reference: a consistent filter has 98.9 % in 3 σ and a NEES of 2."
     if report.calibrated_on:
-        flattering = ": this log too, the figures flatter" if report.seen_before else ""
-        yield f"robots calibrated on {', '.join(report.calibrated_on)}{flattering}"
+        too_good = " (also on this log: the figures are too good)" if report.seen_before else ""
+        yield f"The robots were calibrated on {', '.join(report.calibrated_on)}{too_good}."
     for name, reason in report.left_out.items():
-        yield f"left out: robot {name}: {reason}"
+        yield f"Robot {name} did not take part: {reason}."
     for name, r in report.robots.items():
         if r.bumps:
-            yield f"robot {name} bumped into a landmark {r.bumps} times"
+            yield f"Robot {name} bumped into a landmark {r.bumps} times."
         if r.lost_at_end:
-            yield f"robot {name} is lost: {r.lost_at_end}"
+            yield f"Robot {name} is lost: {r.lost_at_end}."
     for name, r in report.robots.items():
         if r.learned is not None:
-            yield f"robot {name} learned: {_corrections(r.learned)}"
+            yield f"Robot {name} calibrated itself: {_corrections(r.learned)}."
     for name, r in report.robots.items():
         yield from trust_remarks(name, r.trust)
     if report.refused:
         counts = ", ".join(f"{reason} {n}" for reason, n in report.refused.items())
-        yield f"heard and of no use, by reason: {counts}"
+        yield f"Messages that could not be used, by reason: {counts}."
     for name, n in report.restarts.items():
-        yield f"{name} was restarted {n} times"
+        yield f"Process {name} was restarted {n} times."
 
 
 def _corrections(found: LearnedReport) -> str:

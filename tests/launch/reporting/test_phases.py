@@ -141,7 +141,7 @@ def test_the_report_shows_guests_beside_the_team() -> None:
     print_report(shown, Console(file=out, width=100))
     text = out.getvalue()
     assert "tripod, guest" in text
-    assert "guest tripod: there from 20.0 to 29.9 s" in text
+    assert "guest tripod, present from 20.0 to 29.9 s" in text
     for column in ("RMSE before", "RMSE during", "RMSE after", "σ before", "σ after"):
         assert column in text
     assert max(map(len, text.splitlines())) <= 80

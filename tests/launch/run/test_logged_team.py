@@ -280,9 +280,9 @@ def test_what_robots_have_learned_is_in_the_report(tmp_path: Path) -> None:
     figures = msgspec.json.decode(msgspec.json.encode(evaluation))["robots"]
     assert figures["1"]["learned"] == msgspec.structs.asdict(found)
     assert figures["2"]["learned"] is None
-    (line,) = [row for row in printed(evaluation) if "learned" in row]
+    (line,) = [row for row in printed(evaluation) if "calibrated itself" in row]
     assert re.fullmatch(
-        r"robot 1 learned: distance × 0\.9\d, turn × 0\.9\d, bearings [+-]0\.\d°", line
+        r"Robot 1 calibrated itself: distance × 0\.9\d, turn × 0\.9\d, bearings [+-]0\.\d°\.", line
     )
 
 
@@ -290,7 +290,7 @@ def test_the_remark_says_what_is_done_to_readings(tmp_path: Path) -> None:
     evaluation = evaluate_log(logged(tmp_path, seconds=1.0)).report
     found = LearnedReport(distance_scale=0.976, turn_scale=0.96, bearing_bias_deg=0.62)
     robots = {"1": msgspec.structs.replace(evaluation.robots["1"], learned=found)}
-    said = "robot 1 learned: distance × 0.98, turn × 0.96, bearings -0.6°"
+    said = "Robot 1 calibrated itself: distance × 0.98, turn × 0.96, bearings -0.6°."
     assert said in printed(msgspec.structs.replace(evaluation, robots=robots))
 
 

@@ -369,7 +369,7 @@ def test_an_observer_joins_a_running_team_and_leaves_it(
     ((said, _),) = team3.said
     assert "tripod joins team blind" in said
     if number is not signal.SIGKILL:
-        assert "tripod was there for" in said
+        assert "tripod took part for" in said
         assert "fix sent to r1" in said
     guest = report.guests["tripod"]
     assert guest.position_rmse_m is not None

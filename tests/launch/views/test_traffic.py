@@ -159,7 +159,7 @@ def test_the_report_adds_the_processes_of_a_robot_and_says_that_limits_held() ->
     text = shown(report)
     (row,) = (line.split() for line in text.splitlines() if "500 B in 10 s" in line)
     assert row[:10] == ["a", "10", "0", "42", "6", "5", "0", "500", "of", "500"]
-    assert "every limit held" in text
+    assert "Every robot kept every limit" in text
     assert max(map(len, text.splitlines())) <= 80
 
 
@@ -170,7 +170,7 @@ def test_the_report_says_which_limit_did_not_hold() -> None:
         status("b", 1, 0, spending=(Spending("messages", 60.0, 3.0, 3.0),)),
     )
     assert report.team.within_budget is False
-    assert "limits did not hold: a: 4 of 3 msg in 60 s" in shown(report)
+    assert "Limits were exceeded: a: 4 of 3 msg in 60 s" in shown(report)
 
 
 def test_a_report_without_help_or_limits_has_no_table_of_them() -> None:
@@ -250,7 +250,7 @@ gone       2  0.030  away: silent for 6 s
 patrol     4  0.050  ──▶ scout  fix
 scout      9  0.100  nobody
 adrift    16  0.170  lost: poor sigma
-spare                not heard of
+spare                no status yet
 good: most 412 of 500 B in 10 s, 4 of 3 msg in 60 s
 
 robot   key           messages    B   /s  B/s  budget  value  silence
@@ -265,8 +265,9 @@ patrol  alive                2
         fix → scout          2   84    -    -       0      0        0
 scout   alive                2
 adrift  alive                2
-not sent: over the budget; of too little value; in silence, as listeners can
-still tell. B: on the sender's link with Zenoh's own, without TCP/IP's
+Messages were not sent because the budget was spent (column budget), they were
+worth too little (value), or receivers can extrapolate the last one (silence).
+Bytes are those on the sender's link, with Zenoh's overhead, without TCP/IP's.
 """
 
 
@@ -350,8 +351,8 @@ def test_what_a_robot_says_is_not_taken_for_markup() -> None:
     report = recorded(named)
     robots = {n: msgspec.structs.replace(r, lost_at_end="[/red]") for n, r in report.robots.items()}
     text = shown(msgspec.structs.replace(report, robots=robots, refused={"garbage": 3}))
-    assert "robot a is lost: [/red]" in text
-    assert "heard and of no use, by reason: garbage 3" in text
+    assert "Robot a is lost: [/red]" in text
+    assert "Messages that could not be used, by reason: garbage 3" in text
 
 
 def test_a_recorder_counts_what_it_takes_and_what_it_refuses() -> None:
@@ -496,7 +497,7 @@ def test_a_running_team_is_watched_with_the_command_that_up_says(
         assert robot["messages_received"] == sum(f["messages"] for f in robot["heard"])
     assert report["robots"]["giver"]["messages_sent"] > 0
     assert report["team"]["within_budget"] is True
-    assert "every limit held" in text
+    assert "Every robot kept every limit" in text
     assert "of 500 B in 100 s" in text
     assert max(map(len, text.splitlines())) <= 80
 
@@ -516,7 +517,7 @@ def test_watching_ends_with_a_signal(number: signal.Signals) -> None:
                 process.kill()
             assert process.returncode == 0
     assert text.startswith(f"team nobody at {endpoint}, watched for ")
-    assert "no robot" in text
+    assert "No robot" in text
 
 
 def test_without_a_router_watching_ends_with_one_line() -> None:

@@ -16,13 +16,15 @@ from cpcbl_launch.views.traffic.watch import CURRENT_HELP_NS, RATES_NS, HelpLink
 COLOURS = {"fix": "cyan", "belief": "magenta"}
 NOT_SENT = ("budget", "value", "silence")
 COLUMNS_EXPLAINED = (
-    "not sent: over the budget; of too little value; in silence, as listeners can\n"
-    "still tell. B: on the sender's link with Zenoh's own, without TCP/IP's"
+    "Messages were not sent because the budget was spent (column budget), they were\n"
+    "worth too little (value), or receivers can extrapolate the last one (silence).\n"
+    "Bytes are those on the sender's link, with Zenoh's overhead, without TCP/IP's."
 )
 _LIVE_EXPLAINED = (
-    "alive: presence and tier, anew at each change of tier; its bytes are not counted\n"
-    f"counts: since a robot's process started; rates: over the last {RATES_NS // 10**9} s\n"
-    "heard is status/* only: watching makes nobody send a fix or belief"
+    "A robot announces itself (alive) at its start and at each change of its tier.\n"
+    "Counts begin at the start of a robot's process;"
+    f" rates are of the last {RATES_NS // 10**9} s.\n"
+    "This command receives status/* only: watching causes no fixes and no beliefs."
 )
 
 
@@ -33,7 +35,7 @@ def help_traffic_table(report: Report) -> Table:
     """What each robot sent, what it did not send and why, and how near it came to its limits."""
     limited = any(r.spending for r in report.robots.values())
     shown = table(
-        "help sent, and not sent for budget, value, silence",
+        "fixes and beliefs sent, and not sent",
         ("robot",),
         ("fixes", "beliefs", "B/s", *NOT_SENT),
     )
@@ -87,9 +89,9 @@ def limits_text(report: Report) -> Text | None:
     if held is None:
         return None
     if held:
-        return Text("every limit held: nobody spent more than is allowed in any window", "green")
+        return Text("Every robot kept every limit in every window.", "green")
     broken = (f"{name}: {limit_text(s)}" for name, s in spendings if not s.is_kept)
-    return Text(f"limits did not hold: {'; '.join(broken)}", "bold red")
+    return Text(f"Limits were exceeded: {'; '.join(broken)}", "bold red")
 
 
 # Live -------------------------------------------------------------------------------------------
@@ -115,7 +117,10 @@ def traffic_view(now: Traffic, where: str) -> Group:
         title += f"\nrefused, by reason: {reasons}"
     if not now.robots:
         return Group(
-            Text(f"{title}\nno robot of this team has been heard: is the name right?", "yellow")
+            Text(
+                f"{title}\nNo robot of this team sends its status. Is the name of the team right?",
+                "yellow",
+            )
         )
     limits = [
         Text(f"{name}: most ").append_text(Text(", ").join(map(limit_text, robot.spending)))
@@ -145,7 +150,7 @@ def help_table(now: Traffic) -> Table:
             _activity(robot, [h for h in now.help if h.helper == name]),
         )
     for name in now.never_heard:
-        shown.add_row(Text(name, "dim"), "", "", Text("not heard of", "yellow"))
+        shown.add_row(Text(name, "dim"), "", "", Text("no status yet", "yellow"))
     return shown
 
 
