@@ -203,12 +203,8 @@ def gated(watched: Watched, reading: Plain) -> Watched:
         m, n, f = dy / q, -dx / q, remainder(bearing - atan2(dy, dx) + h, tau)
         gx, gy, gh = xx * u + xy * v, xy * u + yy * v, xh * u + yh * v
         s, t = u * gx + v * gy + variance, m * gx + n * gy - gh
-        z = (
-            m * (xx * m + xy * n - xh)
-            + n * (xy * m + yy * n - yh)
-            - (xh * m + yh * n - hh)
-            + _BEARING
-        )
+        lx, ly, lh = xx * m + xy * n - xh, xy * m + yy * n - yh, xh * m + yh * n - hh
+        z = m * lx + n * ly - lh + _BEARING
         if z * e * e - 2.0 * t * e * f + s * f * f > _GATE * (s * z - t * t):
             counts["gated"] += 1
             innovations.append(False)

@@ -119,20 +119,20 @@ def fuzz_team() -> Team:
     return msgspec.structs.replace(team, robots=robots, transport=transport)
 
 
-def fuzz(setting: ScenarioOptions, per_key: int = PER_KEY) -> ScenarioResult:
+def fuzz(options: ScenarioOptions, per_key: int = PER_KEY) -> ScenarioResult:
     """Sends payloads on every key, and malformed tokens, to a running team; checks its counts."""
-    setting.report_progress("hypothesis generates payloads")
-    examples = hypothesis_payloads(setting.seed)
+    options.report_progress("hypothesis generates payloads")
+    examples = hypothesis_payloads(options.seed)
     with ExitStack() as stack:
-        plan = RunPlan(fuzz_team(), setting.seed, left_out=(MATE,))
+        plan = RunPlan(fuzz_team(), options.seed, left_out=(MATE,))
         team = stack.enter_context(run_team_under_test(plan))
         bus = stack.enter_context(open_bus(plan.team.name, [team.endpoint]))
         ears = stack.enter_context(open_bus(plan.team.name, [team.endpoint]))
         recorder, watcher, looks = Recorder(ears), StatusCollector(ears), FrameSubscriber(ears)
-        setting.report_progress("starting a team")
+        options.report_progress("starting a team")
         team.settle()
         from_s = team.now_s
-        fuzzer = Fuzzer(team, bus, per_key, examples, setting)
+        fuzzer = Fuzzer(team, bus, per_key, examples, options)
         fuzzer.send_help()
         team.wait_until(lambda: _total(fuzzer.victim_counts()) >= fuzzer.to_victim, 15.0)
         after_help = fuzzer.victim_counts()
@@ -220,15 +220,15 @@ class Fuzzer:
         bus: Bus,
         per_key: int,
         examples: Sequence[bytes],
-        setting: ScenarioOptions,
+        options: ScenarioOptions,
     ) -> None:
         self._team, self._bus, self._per_key, self._report = (
             team,
             bus,
             per_key,
-            setting.report_progress,
+            options.report_progress,
         )
-        self._random, self._examples = random.Random(setting.seed), examples
+        self._random, self._examples = random.Random(options.seed), examples
         self._token = bus.declare_token(topics.ALIVE.at(tier=0, robot=MATE, incarnation="1"))
         key = topics.IN_SIGHTINGS.at(robot=VICTIM)
         self._sightings = bus.publisher(key, topics.IN_SIGHTINGS.qos)

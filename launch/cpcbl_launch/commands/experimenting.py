@@ -102,38 +102,35 @@ def budget(
     as_json: AsJson = False,
 ) -> None:
     """A real log: accuracy against bytes, by value and budget, by fixed intervals, all of it."""
-    from cpcbl_launch.checks import require_matplotlib
     from cpcbl_launch.lab.experiments import budget as experiment
-    from cpcbl_launch.lab.experiments.pictures import draw_budget
     from cpcbl_launch.overrides import with_blind_robots
     from cpcbl_launch.run import logged_team
     from cpcbl_launch.team_file import load_team
 
-    require_matplotlib("experiment")
-    _must_be_writable(output, "budget")
     logged = logged_team.with_duration(
         logged_team.load_logged_team(load_team(logged_team.builtin_for(data)), data), duration
     )
     logged = logged._replace(team=with_blind_robots(logged.team, parse_names(blind)))
-    with _progress("budget", len(experiment.cases())) as done:
-        result = experiment.measure_curve(logged, jobs, done)
-    _written(result, experiment.tables(result), output, as_json, draw_budget)
+
+    def measure(done: Callable[[], None]) -> Any:
+        return experiment.measure_curve(logged, jobs, done)
+
+    total = len(experiment.cases())
+    _conduct("budget", measure, experiment.tables, output, as_json, total=total)
 
 
 @experiment_app.command("liars")
 def liars(
     seeds: Seeds = 10, jobs: Jobs = None, output: Output = Path(), as_json: AsJson = False
 ) -> None:
-    """One observer of several lies for a while: what it does to the team, and when it is found."""
-    from cpcbl_launch.checks import require_matplotlib
+    """An observer that sends wrong positions: the team's error, and when the fault is found."""
     from cpcbl_launch.lab.experiments import liars as experiment
-    from cpcbl_launch.lab.experiments.pictures import draw_liars
 
-    require_matplotlib("experiment")
-    _must_be_writable(output, "liars")
-    with _progress("liars", len(experiment.cases()) * seeds) as done:
-        result = experiment.measure(seeds, jobs or os.cpu_count() or 1, done)
-    _written(result, experiment.tables(result), output, as_json, draw_liars)
+    def measure(done: Callable[[], None]) -> Any:
+        return experiment.measure(seeds, jobs or os.cpu_count() or 1, done)
+
+    total = len(experiment.cases()) * seeds
+    _conduct("liars", measure, experiment.tables, output, as_json, total=total)
 
 
 @experiment_app.command("eyes")
@@ -144,17 +141,17 @@ def eyes(
     output: Output = Path(),
     as_json: AsJson = False,
 ) -> None:
-    """What cameras see of rendered frames: precision, recall, errors against stated sigmas."""
-    from cpcbl_launch.checks import require_matplotlib, require_opencv
+    """Cameras on rendered images: precision, recall, and errors against the stated sigmas."""
+    from cpcbl_launch.checks import require_opencv
 
-    require_matplotlib("experiment")
     require_opencv("experiment eyes")
-    _must_be_writable(output, "eyes")
     from cpcbl_launch.lab.experiments import eyes as experiment
 
-    with _progress("eyes", -(-frames // experiment.CHUNK), "batches") as done:
-        result = experiment.measure(frames, seed, jobs or os.cpu_count() or 1, done)
-    _written(result, experiment.tables(result), output, as_json, experiment.draw)
+    def measure(done: Callable[[], None]) -> Any:
+        return experiment.measure(frames, seed, jobs or os.cpu_count() or 1, done)
+
+    total = -(-frames // experiment.CHUNK)
+    _conduct("eyes", measure, experiment.tables, output, as_json, total=total, unit="batches")
 
 
 @experiment_app.command("pictures")
@@ -176,9 +173,11 @@ def pictures(
     require_opencv("experiment pictures")
     from cpcbl_launch.lab.experiments import real_pictures
 
-    _must_be_writable(output, f"pictures-{real_pictures.picture_set(name).stem}", drawn=False)
-    result = real_pictures.measure(name, folder)
-    _written(result, real_pictures.tables(result), output, as_json)
+    def measure(_: Callable[[], None]) -> Any:
+        return real_pictures.measure(name, folder)
+
+    title = f"pictures-{real_pictures.picture_set(name).stem}"
+    _conduct(title, measure, real_pictures.tables, output, as_json, drawn=False)
 
 
 @experiment_app.command("latency", hidden=True, context_settings=_ANY_ARGUMENTS)
@@ -198,60 +197,68 @@ def processes() -> None:
 def conduct(
     experiment: "Experiment", seeds: int, jobs: int | None, output: Path, as_json: bool
 ) -> None:
-    """Runs, writes and shows one experiment. Raises InputError for what the user can mend."""
-    from cpcbl_launch.checks import require_matplotlib
+    """Runs, writes and shows one experiment of cases and seeds. Raises CpcblError."""
     from cpcbl_launch.lab.experiments.runs import run_cases
 
-    require_matplotlib("experiment")
-    _must_be_writable(output, experiment.name)
     cases = experiment.cases()
-    with _progress(experiment.name, len(cases) * seeds) as done:
-        results = run_cases(cases, range(1, seeds + 1), jobs or os.cpu_count() or 1, done)
-    outcome = experiment.outcome(results)
-    _written(outcome, experiment.tables(outcome), output, as_json, experiment.draw)
+
+    def measure(done: Callable[[], None]) -> Any:
+        runs = run_cases(cases, range(1, seeds + 1), jobs or os.cpu_count() or 1, done)
+        return experiment.outcome(runs)
+
+    total = len(cases) * seeds
+    _conduct(experiment.name, measure, experiment.tables, output, as_json, total=total)
 
 
-def _must_be_writable(output: Path, name: str, *, drawn: bool = True) -> None:
-    """Raises InputError where the files of an experiment could not be written later on."""
-    from cpcbl_launch.commands.options import require_folder, require_writable_file
-
-    require_folder("--output", output)
-    for ending in ("json", "png") if drawn else ("json",):
-        require_writable_file("--output", output / f"{name}.{ending}")
-
-
-def _written(
-    result: Any,
-    tables: "Iterable[RenderableType]",
+def _conduct(
+    name: str,
+    measure: Callable[[Callable[[], None]], Any],
+    tables: "Callable[[Any], Iterable[RenderableType]]",
     output: Path,
     as_json: bool,
-    draw: Callable[[Any, Path], None] | None = None,
+    *,
+    total: int | None = None,
+    unit: str = "runs",
+    drawn: bool = True,
 ) -> None:
-    """Writes what came out, a picture too where one is drawn, and shows it, written or not."""
+    """Measures with a bar of progress, writes NAME.json (and NAME.png), and prints the result.
+
+    Raises CpcblError, before anything is measured, if the files cannot be written or drawn.
+    """
     from rich.console import Console
 
+    from cpcbl_launch.checks import require_matplotlib
+    from cpcbl_launch.commands.options import require_folder, require_writable_file
     from cpcbl_launch.reporting.files import json_text, write_or_reason
 
-    text, name = json_text(result) + "\n", output / result.experiment
-    figures, picture = Path(f"{name}.json"), Path(f"{name}.png")
+    figures, picture = output / f"{name}.json", output / f"{name}.png"
+    if drawn:
+        require_matplotlib("experiment")
+    require_folder("--output", output)
+    for path in (figures, picture) if drawn else (figures,):
+        require_writable_file("--output", path)
+    with _progress(name, total, unit) as done:
+        result = measure(done)
+    text = json_text(result) + "\n"
     lost = write_or_reason(figures, lambda: figures.write_text(text, encoding="utf-8"))
-    if draw is not None:
-        lost |= write_or_reason(picture, lambda: draw(result, picture))
+    if drawn:
+        from cpcbl_launch.lab.experiments.pictures import DRAWINGS
+
+        lost |= write_or_reason(picture, lambda: DRAWINGS[name](result, picture))
     if as_json:
         sys.stdout.write(text)
     else:
         console = Console()
-        for shown in tables:
+        for shown in tables(result):
             console.print(shown, highlight=False)
-        pictured = ", .png" if draw is not None else ""
         if not lost:
-            console.print(f"written: {figures}{pictured}", highlight=False)
+            console.print(f"written: {figures}{', .png' * drawn}", highlight=False)
     print_not_written(lost)
 
 
 @contextmanager
-def _progress(title: str, total: int, unit: str = "runs") -> Iterator[Callable[[], None]]:
-    """How many are done of all, on standard error."""
+def _progress(title: str, total: int | None, unit: str) -> Iterator[Callable[[], None]]:
+    """A bar on standard error; the function that it yields moves it by one."""
     from rich.console import Console
     from rich.progress import (
         BarColumn,

@@ -53,8 +53,8 @@ def chaos(
             signal.signal(number, signal.default_int_handler)
     progress = Console(stderr=True)
     with tables.Progress(progress, len(todo)) as shown:
-        setting = ScenarioOptions(seed, soak_s, shown.doing)
-        faults = run_scenarios(todo, setting, shown.began, shown.done)
+        options = ScenarioOptions(seed, soak_s, shown.doing)
+        faults = run_scenarios(todo, options, shown.began, shown.done)
     result = report_data(faults)
     lost = write_report(report, result)
     if (page := markdown) is not None:

@@ -239,7 +239,7 @@ def _simulate_sizes(
     from rich.console import Console
 
     from cpcbl_launch.lab.scaling.measure import DURATION_S, measure_sizes, parse_sizes
-    from cpcbl_launch.lab.scaling.show import print_scaling
+    from cpcbl_launch.lab.scaling.report import print_scaling
     from cpcbl_launch.reporting.files import write_or_reason
     from cpcbl_launch.views.run import progress_bar
 
@@ -248,7 +248,7 @@ def _simulate_sizes(
         result = measure_sizes(parse_sizes(robots), seed, duration_s, progress)
     lost = write_report(report, result)
     if picture is not None:
-        from cpcbl_launch.lab.scaling.picture import draw_scaling
+        from cpcbl_launch.lab.scaling.report import draw_scaling
 
         lost |= write_or_reason(picture, partial(draw_scaling, result, picture))
     print_result(result, as_json, lambda: print_scaling(result, Console()))

@@ -9,17 +9,13 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
-from support.core import LOOP_START, diagonal, driven, loop
 from support.logs import FRAME_MS, STEP_MS, log_team, write_log
 from support.processes import cpcbl_team
 
 from cpcbl_agents.sources.mrclam import read_table
 from cpcbl_launch.lab.baselines import (
-    BaselineInputs,
-    Ekf,
     baseline_inputs,
     baseline_report,
-    expected_sighting,
     run_baselines,
 )
 from cpcbl_launch.lab.evaluation import evaluate_log
@@ -28,16 +24,11 @@ from cpcbl_launch.reporting.metrics import Floats, Trajectory, position_errors, 
 from cpcbl_launch.reporting.recorder import BaselineReport
 from cpcbl_launch.run.logged_team import LoggedTeam, load_logged_team
 from cpcbl_team.config import (
-    Field,
     LocalizerSettings,
     OdometrySettings,
-    RobotSettings,
     SensorSettings,
     Team,
 )
-from cpcbl_team.estimate import Estimate
-from cpcbl_team.geometry import Pose2, step
-from cpcbl_team.inputs import Odometry, Sighting, Sightings
 
 ROBOTS = ("1", "2", "3")
 KINDS = ("dead_reckoning", "solo_ekf", "centralized_ekf")
@@ -193,7 +184,7 @@ def test_without_sightings_of_robots_the_centralized_filter_is_many_solo_filters
 # Settings ----------------------------------------------------------------------------------------
 
 
-def test_corrections_of_the_team_are_those_of_the_yardsticks(tmp_path: Path) -> None:
+def test_the_baselines_correct_inputs_as_the_team_does(tmp_path: Path) -> None:
     write_log(tmp_path, ROBOTS, 20.0)
     wheels, late = np.array([1.0, 1.25, 1.0 / 0.9]), np.array([0.1, 0.0, 0.0, 0.0])
     for robot in ROBOTS:
@@ -238,106 +229,6 @@ def test_a_filter_that_refuses_everything_comes_back(tmp_path: Path) -> None:
             errors = position_errors(samples_with_truth(path, logged.truth[name])[1])
             assert errors[0] > 1.0
             assert errors[200:].max() < 0.2, (kind, name)
-
-
-# One filter, step by step ------------------------------------------------------------------------
-
-
-def told(pose: Pose2, *pieces: Odometry, sigma: float = 0.1) -> BaselineInputs:
-    settings = RobotSettings(sensor=SENSOR, odometry=ODOMETRY, source="mrclam")
-    return BaselineInputs(settings, 0, Estimate(pose, diagonal(sigma, sigma)), pieces, ())
-
-
-def differences(function: Callable[[Floats], Floats], at: Floats) -> Floats:
-    """The Jacobian of a function by central differences."""
-    h = 1e-6
-    columns = [(function(at + h * e) - function(at - h * e)) / (2.0 * h) for e in np.eye(len(at))]
-    return np.stack(columns, axis=1)
-
-
-@pytest.mark.parametrize("seed", range(10))
-def test_the_jacobian_of_a_sighting_is_that_of_finite_differences(seed: int) -> None:
-    x = np.random.default_rng(seed).uniform(-3.0, 3.0, size=5)
-    expected = differences(lambda at: expected_sighting(at[:3], at[3:])[0], x)
-    np.testing.assert_allclose(expected_sighting(x[:3], x[3:])[1], expected, atol=1e-6)
-
-
-@pytest.mark.parametrize("seed", range(10))
-def test_motion_shears_the_whole_covariance_by_its_jacobian(seed: int) -> None:
-    """Of two robots with cross-covariance, of which one drives; without noise of its wheels."""
-    rng = np.random.default_rng(seed)
-    distance, turn = rng.uniform(0.1, 1.0), rng.uniform(-1.0, 1.0)
-    pose = Pose2(*rng.uniform(-2.0, 2.0, size=3).tolist())
-    exact = OdometrySettings(
-        distance_sigma_m_per_sqrt_m=0.0,
-        turn_sigma_rad_per_sqrt_rad=0.0,
-        turn_sigma_rad_per_sqrt_m=0.0,
-    )
-    driver = told(pose, Odometry(0, 1_000_000_000, distance, turn))
-    driver = driver._replace(settings=RobotSettings(odometry=exact))
-    ekf = Ekf({"other": told(Pose2(1.0, 1.0, 0.0)), "driver": driver}, Field())
-    root = rng.normal(size=(6, 6))
-    ekf.covariance = root @ root.T
-    jacobian = np.eye(6)
-    jacobian[3:, 3:] = differences(
-        lambda at: np.array(step(Pose2(*at.tolist()), distance, turn)), np.array(pose)
-    )
-    expected = jacobian @ ekf.covariance @ jacobian.T
-    ekf.predict("driver", 1_000_000_000)
-    np.testing.assert_allclose(ekf.covariance, expected, atol=1e-6)
-    np.testing.assert_allclose(ekf.mean, [1.0, 1.0, 0.0, *step(pose, distance, turn)])
-
-
-def test_odometry_in_parts_is_odometry_in_one() -> None:
-    pieces = [piece for piece, _ in driven(LOOP_START, loop()[:40])]
-    whole, parts = (Ekf({"r": told(LOOP_START, *pieces)}, Field()) for _ in range(2))
-    whole.predict("r", pieces[-1].stamp_ns)
-    for stamp_ns in range(0, pieces[-1].stamp_ns + 1, 50_000_000):
-        parts.predict("r", stamp_ns)
-    np.testing.assert_allclose(parts.marginal("r")[0], whole.marginal("r")[0], atol=1e-9)
-    np.testing.assert_allclose(parts.marginal("r")[1], whole.marginal("r")[1], atol=1e-4)
-
-
-def test_doubt_grows_with_the_way_as_the_settings_say() -> None:
-    ekf = Ekf({"r": told(Pose2(0.0, 0.0, 0.0), Odometry(0, 100, 0.25, 0.0), sigma=0.0)}, Field())
-    ekf.predict("r", 100)
-    gained = np.diag(ekf.covariance)
-    assert gained[0] == pytest.approx(ODOMETRY.distance_sigma_m_per_sqrt_m**2 * 0.25)
-    assert gained[2] == pytest.approx(ODOMETRY.turn_sigma_rad_per_sqrt_m**2 * 0.25)
-
-
-def test_a_bearing_straight_behind_has_no_seam() -> None:
-    ekf = Ekf({"a": told(Pose2(0.0, 0.0, 0.0)), "b": told(Pose2(-2.0, 0.001, 0.0))}, Field())
-    ekf.correct("a", Sightings(0, (Sighting("b", 2.0, 0.01 - math.pi),)))
-    assert ekf.mean[2] == pytest.approx(-0.01, abs=0.009)
-    assert ekf.covariance[2, 2] < 0.9 * 0.1**2
-
-
-def test_one_sighting_informs_both_robots_and_ties_them() -> None:
-    ekf = Ekf({"a": told(Pose2(0.0, 0.0, 0.0)), "b": told(Pose2(2.0, 0.0, 0.0))}, Field())
-    ekf.correct("a", Sightings(0, (Sighting("b", 2.1, 0.0),)))
-    assert ekf.mean[0] == pytest.approx(-(ekf.mean[3] - 2.0))
-    assert ekf.mean[3] > 2.02
-    assert ekf.covariance[0, 3] > 0.003
-    assert ekf.covariance[0, 0] < 0.008
-
-
-def test_an_outlier_is_gated_and_a_fault_is_left_out() -> None:
-    ekf = Ekf({"a": told(Pose2(0.0, 0.0, 0.0)), "b": told(Pose2(2.0, 0.0, 0.0))}, Field())
-    mean, covariance = ekf.mean.copy(), ekf.covariance.copy()
-    wrong = (Sighting("b", 4.0, 0.0), Sighting("b", math.nan, 0.0), Sighting("nobody", 1.0, 0.0))
-    ekf.correct("a", Sightings(0, wrong))
-    np.testing.assert_array_equal(ekf.mean, mean)
-    np.testing.assert_array_equal(ekf.covariance, covariance)
-
-
-def test_where_odometry_has_ended_doubt_grows() -> None:
-    ekf = Ekf({"r": told(Pose2(0.0, 0.0, 0.0), Odometry(0, 100_000_000, 0.05, 0.0))}, Field())
-    ekf.predict("r", 500_000_000)
-    before = ekf.marginal("r")[1]
-    ekf.predict("r", 2_600_000_000)
-    gained = ekf.marginal("r")[1] - before
-    np.testing.assert_allclose(gained, 2.0 * 0.3**2 * np.eye(3), atol=1e-9)
 
 
 # The command -------------------------------------------------------------------------------------
@@ -388,7 +279,7 @@ def test_evaluate_compares_and_exports(tmp_path: Path) -> None:
         assert team["nees"] == pytest.approx(np.mean(each))
 
 
-def test_the_table_of_yardsticks_fits_and_is_shown_on_demand(tmp_path: Path) -> None:
+def test_the_table_of_baselines_fits_and_is_shown_on_demand(tmp_path: Path) -> None:
     write_log(tmp_path, ROBOTS, 3.0)
     plain, compared_ = (
         cpcbl_team("evaluate", "mrclam", tmp_path, "--team", "mrclam-uncalibrated", *options)
@@ -410,7 +301,7 @@ def test_an_export_that_cannot_be_written_is_one_line(tmp_path: Path) -> None:
     assert f"--export {taken}" in line
 
 
-def test_a_team_without_yardsticks_is_what_it_was(tmp_path: Path) -> None:
+def test_baselines_do_not_change_the_teams_figures(tmp_path: Path) -> None:
     write_log(tmp_path, ROBOTS, 5.0)
     logged = load_logged_team(log_team(*ROBOTS), tmp_path)
     plain = evaluate_log(logged)

@@ -64,7 +64,7 @@ def test_a_quick_scenario_holds(scenario: Scenario) -> None:
 
 def scenario_of(name: str, *checks: Check, needs: Needs = Needs.NOTHING) -> Scenario:
     return Scenario(
-        name, "what is done", "what is expected", needs, True, lambda _: ScenarioResult(checks)
+        name, "what is done", "what is expected", lambda _: ScenarioResult(checks), needs, True
     )
 
 

@@ -60,21 +60,21 @@ def missing_requirement() -> str:
     return ""
 
 
-def partition_containers(setting: ScenarioOptions) -> ScenarioResult:
+def partition_containers(options: ScenarioOptions) -> ScenarioResult:
     """`docker network disconnect` of one site's router, and `connect` again."""
-    with _sites(setting) as sites:
-        setting.report_progress("starting a team at two sites, in containers")
+    with _sites(options) as sites:
+        options.report_progress("starting a team at two sites, in containers")
         _wait_until(lambda: _helps(sites), "the team did not begin to help")
         time.sleep(BEGINS_S)
         link = f"{sites.project.name}_link"
         router = sites.project.containers()["router-east"].id
-        setting.report_progress(f"the sites are apart for {CUT_S:g} s")
+        options.report_progress(f"the sites are apart for {CUT_S:g} s")
         cut_s = sites.west.now_s
         command_output(["docker", "network", "disconnect", link, router])
         time.sleep(CUT_S)
         command_output(["docker", "network", "connect", link, router])
         healed_s = sites.west.now_s
-        setting.report_progress("the link between the sites is back")
+        options.report_progress("the link between the sites is back")
         time.sleep(5.0 + AFTER_S)
         times = cut_s, healed_s, sites.west.now_s
         return ScenarioResult(partition_checks(*sites.logs, WEST, EAST, *times, most_far_m=BLIND_M))
@@ -96,13 +96,13 @@ def _wait_until(condition: Callable[[], bool], otherwise: str) -> None:
 
 
 @contextmanager
-def _sites(setting: ScenarioOptions) -> Iterator[_Sites]:
+def _sites(options: ScenarioOptions) -> Iterator[_Sites]:
     top = checkout()
     assert top is not None
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="cpcbl-chaos-")))
         endpoints = [free_endpoint() for _ in PORTS]
-        text = (top / SITES).read_text().replace(f"cpcbl-team:{version()}", _image(setting))
+        text = (top / SITES).read_text().replace(f"cpcbl-team:{version()}", _image(options))
         for port, endpoint in zip(PORTS, endpoints, strict=True):
             text = text.replace(f"127.0.0.1:{port}:", endpoint.removeprefix("tcp/") + ":")
         file = folder / SITES.name
@@ -118,11 +118,11 @@ def _sites(setting: ScenarioOptions) -> Iterator[_Sites]:
         yield _Sites(project, *takers)
 
 
-def _image(setting: ScenarioOptions) -> str:
+def _image(options: ScenarioOptions) -> str:
     """The image of these sources. Raises CannotRunError where none can be had."""
     bases = (os.environ.get(BASE_VARIABLE), BASE_IMAGE, OWN_BASE)
     try:
         base = next((b for b in bases if b and has_image(b)), bases[0] or BASE_IMAGE)
-        return ensure_image(base, never_stop, setting.report_progress)
+        return ensure_image(base, never_stop, options.report_progress)
     except DockerError as error:
         raise CannotRunError(f"needs an image: {error}") from error

@@ -26,15 +26,15 @@ class CommandResult(NamedTuple):
     """On standard error."""
 
 
-def disk_full(setting: ScenarioOptions) -> ScenarioResult:
+def disk_full(options: ScenarioOptions) -> ScenarioResult:
     """`up` records, reports and draws onto a disk of 64 kB, and keeps its logs there."""
     with tempfile.TemporaryDirectory(prefix="cpcbl-chaos-") as name:
         disk, names = Path(name), ("run.mcap", "report.json", "run.png")
-        setting.report_progress(f"running `up` on a disk of {DISK}B")
+        options.report_progress(f"running `up` on a disk of {DISK}B")
         record, report, picture = (disk / n for n in names)
-        options = ["--record", record, "--report", report, "--picture", picture]
-        ended = _on_disk(f"size={DISK}", disk, "up", *_short(), *options, "--logs", disk / "logs")
-        setting.report_progress("running `up --json` with a full device as standard output")
+        words = ["--record", record, "--report", report, "--picture", picture]
+        ended = _on_disk(f"size={DISK}", disk, "up", *_short(), *words, "--logs", disk / "logs")
+        options.report_progress("running `up --json` with a full device as standard output")
         full = _run("sh", "-c", f"{_command('up', *_short(), '--json')} > /dev/full")
     return ScenarioResult(full_disk_checks(ended, names, full))
 
@@ -62,15 +62,15 @@ def full_disk_checks(
     ]
 
 
-def read_only(setting: ScenarioOptions) -> ScenarioResult:
+def read_only(options: ScenarioOptions) -> ScenarioResult:
     """`up` and `calibrate` are to write where nothing can be written."""
     with tempfile.TemporaryDirectory(prefix="cpcbl-chaos-") as name:
         disk, ended = Path(name), {}
         for option in READ_ONLY:
-            setting.report_progress(f"running `up {option}` on a read-only file system")
+            options.report_progress(f"running `up {option}` on a read-only file system")
             path = disk / ("run.png" if option == "--picture" else "written")
             ended[option] = _on_disk("ro", disk, "up", *_short(), option, path)
-        setting.report_progress("running `calibrate --output` on a read-only file system")
+        options.report_progress("running `calibrate --output` on a read-only file system")
         words = ("calibrate", "run.mcap", "--output", disk / "new.toml")
         ended["--output"] = _on_disk("ro", disk, *words)
     return ScenarioResult(read_only_checks(ended))

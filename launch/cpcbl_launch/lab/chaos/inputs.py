@@ -15,9 +15,9 @@ from cpcbl_launch.lab.chaos.scenario import (
     ScenarioResult,
     checks_recovered,
     checks_unaffected,
-    settle,
+    settled_team,
 )
-from cpcbl_launch.lab.chaos.team import RunPlan, TeamUnderTest, demo_team, run_team_under_test
+from cpcbl_launch.lab.chaos.team import RunPlan, TeamUnderTest, demo_team
 from cpcbl_transport.zenoh_bus import open_bus
 
 ECHO_S = 15.0
@@ -27,17 +27,16 @@ FLOOD_S = 12.0
 # Twice and late -----------------------------------------------------------------------------------
 
 
-def duplicates(setting: ScenarioOptions) -> ScenarioResult:
+def duplicates(options: ScenarioOptions) -> ScenarioResult:
     """All help of the best observer once more at once, and once more up to 4 s late."""
-    with run_team_under_test(RunPlan(demo_team(), setting.seed)) as team:
-        settle(team, setting)
-        setting.report_progress(
+    with settled_team(options) as team:
+        options.report_progress(
             f"each help message of the observer is sent three times, for {ECHO_S:g} s"
         )
         from_s = team.now_s
         with (
             open_bus(team.plan.team.name, [team.endpoint]) as bus,
-            Echo(bus, "observer", LATEST_S, setting.seed) as echo,
+            Echo(bus, "observer", LATEST_S, options.seed) as echo,
         ):
             team.run_for(ECHO_S)
         team.run_for(2.0)
@@ -64,12 +63,11 @@ def duplicates_checks(
 # A flood ------------------------------------------------------------------------------------------
 
 
-def flood(setting: ScenarioOptions) -> ScenarioResult:
+def flood(options: ScenarioOptions) -> ScenarioResult:
     """One robot says all that it may say as fast as it can: fixes, beliefs, 60 kB for status."""
     flooder = "patrol"
-    with run_team_under_test(RunPlan(demo_team(), setting.seed, left_out=(flooder,))) as team:
-        settle(team, setting)
-        setting.report_progress(f"{flooder} floods for {FLOOD_S:g} s")
+    with settled_team(options, RunPlan(demo_team(), options.seed, left_out=(flooder,))) as team:
+        options.report_progress(f"{flooder} floods for {FLOOD_S:g} s")
         targets = team.others()
         from_s = team.now_s
         with start_flood(team, flooder, targets) as process:

@@ -25,10 +25,10 @@ from cpcbl_launch.lab.chaos.scenario import (
     check_token_gone,
     checks_recovered,
     checks_unaffected,
-    settle,
+    settled_team,
 )
 from cpcbl_launch.lab.chaos.sites import run_at_two_sites
-from cpcbl_launch.lab.chaos.team import RunPlan, TeamUnderTest, demo_team, run_team_under_test
+from cpcbl_launch.lab.chaos.team import RunPlan, TeamUnderTest, demo_team
 from cpcbl_launch.lab.chaos.tun_link import PacketImpairment, TunLink
 from cpcbl_launch.run.up import free_endpoint
 
@@ -45,20 +45,20 @@ FAR = ("navigator", "patrol")
 # Partition ----------------------------------------------------------------------------------------
 
 
-def partition(setting: ScenarioOptions) -> ScenarioResult:
+def partition(options: ScenarioOptions) -> ScenarioResult:
     """Two sites, a router each: the link between them is cut, and healed."""
-    with run_at_two_sites(demo_team(), setting.seed, FAR) as sites:
+    with run_at_two_sites(demo_team(), options.seed, FAR) as sites:
         team = sites.team
-        setting.report_progress("starting a team at two sites")
+        options.report_progress("starting a team at two sites")
         team.settle()
         team.run_for(BASELINE_S)
-        setting.report_progress(f"the sites are apart for {CUT_S:g} s")
+        options.report_progress(f"the sites are apart for {CUT_S:g} s")
         cut_s = team.now_s
         sites.link.set(LinkQuality(cut=True))
         team.run_for(CUT_S)
         healed_s = team.now_s
         sites.link.set(LinkQuality())
-        setting.report_progress("the link between the sites is back")
+        options.report_progress("the link between the sites is back")
         team.run_for(5.0 + AFTER_S)
         near = team.others(*FAR)
         times = cut_s, healed_s, team.now_s
@@ -66,8 +66,8 @@ def partition(setting: ScenarioOptions) -> ScenarioResult:
 
 
 def partition_checks(
-    near_notes: RunLog,
-    far_notes: RunLog,
+    near_log: RunLog,
+    far_log: RunLog,
     near: Sequence[str],
     far: Sequence[str],
     cut_s: float,
@@ -76,36 +76,36 @@ def partition_checks(
     most_far_m: float = FOUND_M,
 ) -> list[Check]:
     """Each side misses the other and goes on; they are one team again within 5 s of healing."""
-    gone = [token_gone_after_s(near_notes, name, cut_s) for name in far]
-    gone += [token_gone_after_s(far_notes, name, cut_s) for name in near]
-    back = [token_back_after_s(near_notes, name, healed_s) for name in far]
-    back += [token_back_after_s(far_notes, name, healed_s) for name in near]
-    heard = [first_help_after_s(far_notes, name, near, healed_s) for name in far]
+    gone = [token_gone_after_s(near_log, name, cut_s) for name in far]
+    gone += [token_gone_after_s(far_log, name, cut_s) for name in near]
+    back = [token_back_after_s(near_log, name, healed_s) for name in far]
+    back += [token_back_after_s(far_log, name, healed_s) for name in near]
+    heard = [first_help_after_s(far_log, name, near, healed_s) for name in far]
     helped = min((s for s in heard if s is not None), default=None)
     return [
         at_most("other side's tokens disappeared after", maximum(gone), 4.0, "s"),
-        *checks_unaffected(near_notes, near, cut_s, healed_s, who="near side's"),
-        *checks_unaffected(far_notes, far, cut_s, healed_s, most_m=most_far_m, who="far side's"),
+        *checks_unaffected(near_log, near, cut_s, healed_s, who="near side's"),
+        *checks_unaffected(far_log, far, cut_s, healed_s, most_m=most_far_m, who="far side's"),
         at_most("from healing to all tokens back", maximum(back), 5.0, "s"),
         at_most("from healing to the first help", helped, 5.0, "s"),
-        *checks_recovered(near_notes, [*near, *far], healed_s + 5.0, until_s),
+        *checks_recovered(near_log, [*near, *far], healed_s + 5.0, until_s),
     ]
 
 
 # One robot's link ---------------------------------------------------------------------------------
 
 
-def cut_link(setting: ScenarioOptions) -> ScenarioResult:
+def cut_link(options: ScenarioOptions) -> ScenarioResult:
     """The best observer's link is silent: nobody is told."""
     robot = "observer"
-    with _relayed(robot, setting) as (team, link):
-        setting.report_progress(f"the link of {robot} is silent for {CUT_S:g} s")
+    with _relayed(robot, options) as (team, link):
+        options.report_progress(f"the link of {robot} is silent for {CUT_S:g} s")
         cut_s = team.now_s
         link.set(LinkQuality(cut=True))
         team.run_for(CUT_S)
         healed_s = team.now_s
         link.set(LinkQuality())
-        setting.report_progress("its link is back")
+        options.report_progress("its link is back")
         team.run_for(5.0 + AFTER_S)
         others = team.others(robot)
         return ScenarioResult(
@@ -133,34 +133,33 @@ def cut_link_checks(
     ]
 
 
-def slow_link(setting: ScenarioOptions) -> ScenarioResult:
+def slow_link(options: ScenarioOptions) -> ScenarioResult:
     """200 ms each way, 100 ms more or less."""
-    return _bad_relay(DELAY, setting, most_silent_s=2.0, most_late_s=1.5)
+    return _bad_relay(DELAY, options, most_silent_s=2.0, most_late_s=1.5)
 
 
-def narrow_link(setting: ScenarioOptions) -> ScenarioResult:
+def narrow_link(options: ScenarioOptions) -> ScenarioResult:
     """50 kbit/s each way."""
-    return _bad_relay(NARROW, setting, most_silent_s=2.0, most_late_s=1.5)
+    return _bad_relay(NARROW, options, most_silent_s=2.0, most_late_s=1.5)
 
 
-def lossy_link(setting: ScenarioOptions) -> ScenarioResult:
+def lossy_link(options: ScenarioOptions) -> ScenarioResult:
     """Every fifth packet is lost, each way, below TCP."""
     robot, port = "navigator", free_endpoint().rsplit(":", 1)[1]
-    with TunLink(setting.seed) as wire:
+    with TunLink(options.seed) as wire:
         own = f"tcp/{wire.near_address}:{port}"
         plan = RunPlan(
             demo_team(),
-            setting.seed,
+            options.seed,
             links={robot: own},
             prefix={robot: wire.prefix},
             also_listen=(own,),
         )
-        with run_team_under_test(plan) as team:
-            settle(team, setting)
+        with settled_team(options, plan) as team:
             found = _bad_link(
                 team,
                 robot,
-                setting,
+                options,
                 lambda bad: wire.set(LOSSY if bad else PacketImpairment()),
                 most_silent_s=8.0,
                 most_late_s=6.0,
@@ -173,14 +172,14 @@ def lossy_link(setting: ScenarioOptions) -> ScenarioResult:
 
 
 def _bad_relay(
-    quality: LinkQuality, setting: ScenarioOptions, *, most_silent_s: float, most_late_s: float
+    quality: LinkQuality, options: ScenarioOptions, *, most_silent_s: float, most_late_s: float
 ) -> ScenarioResult:
     robot = "navigator"
-    with _relayed(robot, setting) as (team, link):
+    with _relayed(robot, options) as (team, link):
         return _bad_link(
             team,
             robot,
-            setting,
+            options,
             lambda bad: link.set(quality if bad else LinkQuality()),
             most_silent_s=most_silent_s,
             most_late_s=most_late_s,
@@ -190,7 +189,7 @@ def _bad_relay(
 def _bad_link(
     team: TeamUnderTest,
     robot: str,
-    setting: ScenarioOptions,
+    options: ScenarioOptions,
     make_bad: Callable[[bool], None],
     *,
     most_silent_s: float,
@@ -198,13 +197,13 @@ def _bad_link(
     most_m: float = FOUND_M,
 ) -> ScenarioResult:
     """A link over which a robot gets its inputs and its help, bad for a while."""
-    setting.report_progress(f"the link of {robot} is bad for {BAD_S:g} s")
+    options.report_progress(f"the link of {robot} is bad for {BAD_S:g} s")
     bad_s = team.now_s
     make_bad(True)
     team.run_for(BAD_S)
     good_s = team.now_s
     make_bad(False)
-    setting.report_progress("its link is good again")
+    options.report_progress("its link is good again")
     team.run_for(3.0 + AFTER_S)
     others, until_s = team.others(robot), team.now_s
     bounds = most_silent_s, most_late_s, most_m
@@ -257,11 +256,10 @@ def bad_link_checks(
 
 
 @contextmanager
-def _relayed(robot: str, setting: ScenarioOptions) -> Iterator[tuple[TeamUnderTest, Relay]]:
+def _relayed(robot: str, options: ScenarioOptions) -> Iterator[tuple[TeamUnderTest, Relay]]:
     """A settled team, one robot of which has a relay as its link."""
     endpoint = free_endpoint()
-    with Relay(endpoint, setting.seed) as link:
-        plan = RunPlan(demo_team(), setting.seed, endpoint=endpoint, links={robot: link.endpoint})
-        with run_team_under_test(plan) as team:
-            settle(team, setting)
+    with Relay(endpoint, options.seed) as link:
+        plan = RunPlan(demo_team(), options.seed, endpoint=endpoint, links={robot: link.endpoint})
+        with settled_team(options, plan) as team:
             yield team, link

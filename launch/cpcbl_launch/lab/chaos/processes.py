@@ -20,14 +20,12 @@ from cpcbl_launch.lab.chaos.scenario import (
     check_token_gone,
     checks_recovered,
     checks_unaffected,
+    settled_team,
 )
 from cpcbl_launch.lab.chaos.team import (
     FIELD,
     ROUTER,
-    RunPlan,
     TeamUnderTest,
-    demo_team,
-    run_team_under_test,
 )
 
 AFTER_S = 8.0
@@ -38,23 +36,20 @@ LATE_S = 1.0  # later than any track should come
 # Kill ---------------------------------------------------------------------------------------------
 
 
-def kill_robot(setting: ScenarioOptions) -> ScenarioResult:
+def kill_robot(options: ScenarioOptions) -> ScenarioResult:
     """A robot that is helped."""
-    return _kill("navigator", setting)
+    return _kill("navigator", options)
 
 
-def kill_observer(setting: ScenarioOptions) -> ScenarioResult:
+def kill_observer(options: ScenarioOptions) -> ScenarioResult:
     """The best observer, on whom the blind one depends."""
-    return _kill("observer", setting)
+    return _kill("observer", options)
 
 
-def _kill(robot: str, setting: ScenarioOptions) -> ScenarioResult:
-    with run_team_under_test(RunPlan(demo_team(), setting.seed)) as team:
-        setting.report_progress("starting a team")
-        team.settle()
-        team.run_for(BASELINE_S)
+def _kill(robot: str, options: ScenarioOptions) -> ScenarioResult:
+    with settled_team(options) as team:
         before = team.incarnation(robot)
-        setting.report_progress(f"kill -9 of {robot}")
+        options.report_progress(f"kill -9 of {robot}")
         killed_s = team.kill(robot)
         wait_until_localized(team, robot, killed_s, before)
         found_s = team.now_s
@@ -101,13 +96,10 @@ def kill_checks(
     ]
 
 
-def kill_router(setting: ScenarioOptions) -> ScenarioResult:
+def kill_router(options: ScenarioOptions) -> ScenarioResult:
     """The router, a process of its own."""
-    with run_team_under_test(RunPlan(demo_team(), setting.seed)) as team:
-        setting.report_progress("starting a team")
-        team.settle()
-        team.run_for(BASELINE_S)
-        setting.report_progress("kill -9 of the router")
+    with settled_team(options) as team:
+        options.report_progress("kill -9 of the router")
         killed_s = team.kill(ROUTER)
         team.wait_until(lambda: have_all_published(team.run_log, team.robots, killed_s + 0.5), 25.0)
         back_s = team.now_s
@@ -141,14 +133,12 @@ def kill_router_checks(
     ]
 
 
-def kill_field(setting: ScenarioOptions) -> ScenarioResult:
+def kill_field(options: ScenarioOptions) -> ScenarioResult:
     """The simulated world: no inputs, then a world in which all robots stand elsewhere."""
-    with run_team_under_test(RunPlan(demo_team(), setting.seed)) as team:
-        setting.report_progress("starting a team")
-        team.settle()
-        team.run_for(BASELINE_S + 6.0)  # so that they are far from where they started
+    far_from_start_s = BASELINE_S + 6.0
+    with settled_team(options, baseline_s=far_from_start_s) as team:
         old = team.pid(FIELD)
-        setting.report_progress("kill -9 of the field")
+        options.report_progress("kill -9 of the field")
         killed_s = team.kill(FIELD)
         team.wait_until(lambda: team.supervisor.pids.get(FIELD, old) != old, 15.0)
         anew_s = team.now_s
@@ -188,14 +178,11 @@ def kill_field_checks(
 # Freeze -------------------------------------------------------------------------------------------
 
 
-def freeze(setting: ScenarioOptions) -> ScenarioResult:
+def freeze(options: ScenarioOptions) -> ScenarioResult:
     """The best observer stands still (SIGSTOP) and goes on as if nothing had been."""
     robot = "observer"
-    with run_team_under_test(RunPlan(demo_team(), setting.seed)) as team:
-        setting.report_progress("starting a team")
-        team.settle()
-        team.run_for(BASELINE_S)
-        setting.report_progress(f"{robot} is frozen for {FROZEN_S:g} s")
+    with settled_team(options) as team:
+        options.report_progress(f"{robot} is frozen for {FROZEN_S:g} s")
         frozen_s = team.freeze(robot)
         team.run_for(FROZEN_S)
         thawed_s = team.thaw(robot)

@@ -48,7 +48,7 @@ def missing_requirement(needs: Needs) -> str:
     return ""
 
 
-def run_scenario(scenario: Scenario, setting: ScenarioOptions) -> Outcome:
+def run_scenario(scenario: Scenario, options: ScenarioOptions) -> Outcome:
     """Runs one scenario."""
     name, done, expectation = scenario[:3]
     outcome = Outcome(scenario=name, done=done, expectation=expectation)
@@ -56,7 +56,7 @@ def run_scenario(scenario: Scenario, setting: ScenarioOptions) -> Outcome:
     if reason := missing_requirement(scenario.needs):
         return replace(outcome, not_run=reason)
     try:
-        found = scenario.run(setting)
+        found = scenario.run(options)
     except CannotRunError as error:
         return replace(outcome, not_run=str(error))
     except (ChaosError, BusError, DockerError, OSError, subprocess.TimeoutExpired) as error:
@@ -71,7 +71,7 @@ def run_scenario(scenario: Scenario, setting: ScenarioOptions) -> Outcome:
 
 def run_scenarios(
     scenarios: Iterable[Scenario],
-    setting: ScenarioOptions,
+    options: ScenarioOptions,
     began: Callable[[Scenario], None],
     done: Callable[[Outcome], None],
 ) -> ChaosReport:
@@ -79,11 +79,11 @@ def run_scenarios(
     outcomes = []
     for scenario in scenarios:
         began(scenario)
-        outcomes.append(run_scenario(scenario, setting))
+        outcomes.append(run_scenario(scenario, options))
         done(outcomes[-1])
     return ChaosReport(
         version=version("cpcbl-team"),
-        seed=setting.seed,
+        seed=options.seed,
         machine=machine_description(),
         outcomes=tuple(outcomes),
     )

@@ -1,6 +1,7 @@
-"""What a scenario is made of, and the expectations that many of them share."""
+"""The parts of a scenario, and the expectations that many scenarios share."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from enum import StrEnum
 from typing import NamedTuple
 
@@ -13,7 +14,12 @@ from cpcbl_launch.lab.chaos.figures import (
     token_gone_after_s,
 )
 from cpcbl_launch.lab.chaos.run_log import RunLog
-from cpcbl_launch.lab.chaos.team import TeamUnderTest
+from cpcbl_launch.lab.chaos.team import (
+    RunPlan,
+    TeamUnderTest,
+    demo_team,
+    run_team_under_test,
+)
 from cpcbl_team.errors import CpcblError
 
 BASELINE_S = 4.0
@@ -22,7 +28,7 @@ GOOD_M = 0.15  # the demonstration has 0.03 m; the blind scout without help 0.1 
 
 
 class Needs(StrEnum):
-    """What a scenario cannot run without."""
+    """What a scenario requires of the machine."""
 
     NOTHING = ""
     ROOT = "root and /dev/net/tun"
@@ -31,46 +37,51 @@ class Needs(StrEnum):
 
 
 class CannotRunError(CpcblError):
-    """A scenario found out that it lacks something here."""
+    """This machine lacks something that a scenario requires."""
 
 
 class ScenarioOptions(NamedTuple):
-    """How scenarios are run."""
+    """The options of a run of scenarios."""
 
     seed: int = 1
     soak_s: float = 180.0
     report_progress: Callable[[str], None] = lambda doing: None
-    """Told what is being done."""
+    """Called with each step."""
 
 
 class ScenarioResult(NamedTuple):
-    """What a scenario saw."""
+    """The result of a scenario."""
 
     checks: Iterable[Check]
     remarks: tuple[str, ...] = ()
 
 
 class Scenario(NamedTuple):
-    """One row of the table."""
+    """One row of the table of scenarios."""
 
     name: str
     done: str
     expectation: str
-    needs: Needs
-    quick: bool
-    """Whether it is a test of the ordinary suite too."""
     run: Callable[[ScenarioOptions], ScenarioResult]
+    needs: Needs = Needs.NOTHING
+    quick: bool = False
+    """Whether the ordinary test suite runs it, too."""
 
 
-def settle(team: TeamUnderTest, setting: ScenarioOptions) -> None:
-    """Returns when the team knows where it is and has run for a while: as before a fault."""
-    setting.report_progress("starting a team")
-    team.settle()
-    team.run_for(BASELINE_S)
+@contextmanager
+def settled_team(
+    options: ScenarioOptions, plan: RunPlan | None = None, baseline_s: float = BASELINE_S
+) -> Iterator[TeamUnderTest]:
+    """A running team (default: the demonstration) that is localized, and has run for a while."""
+    with run_team_under_test(plan or RunPlan(demo_team(), options.seed)) as team:
+        options.report_progress("starting a team")
+        team.settle()
+        team.run_for(baseline_s)
+        yield team
 
 
 def check_token_gone(log: RunLog, robot: str, from_s: float, within_s: float) -> Check:
-    """Teammates hear that it is gone."""
+    """Teammates notice that the robot's token has disappeared."""
     seen = token_gone_after_s(log, robot, from_s)
     return at_most("its token disappeared after", seen, within_s, "s")
 
@@ -85,7 +96,7 @@ def checks_unaffected(
     most_m: float = FOUND_M,
     who: str = "others'",
 ) -> list[Check]:
-    """Robots report at 10 Hz all the time, and know where they are."""
+    """These robots publish tracks at 10 Hz all the time, and are localized."""
     names = list(robots)
     gaps = [longest_track_gap_s(log, name, from_s, until_s) for name in names]
     errors = [position_rmse_m(log, name, from_s, until_s) for name in names]
@@ -98,7 +109,7 @@ def checks_unaffected(
 def checks_recovered(
     log: RunLog, robots: Iterable[str], from_s: float, until_s: float, most_m: float = GOOD_M
 ) -> list[Check]:
-    """At the end of a scenario: as before the fault."""
+    """At the end of a scenario, these robots are as accurate and consistent as before the fault."""
     names = list(robots)
     errors = [position_rmse_m(log, name, from_s, until_s) for name in names]
     share = inside_3_sigma(log, names, from_s, until_s)

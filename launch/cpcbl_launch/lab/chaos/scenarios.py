@@ -21,25 +21,19 @@ from cpcbl_launch.lab.chaos.world import (
     kidnap,
 )
 
-QUICK, SLOW = True, False
-N, ROOT, MOUNT, DOCKER = Needs.NOTHING, Needs.ROOT, Needs.MOUNT, Needs.DOCKER
-
 SCENARIOS = (
     Scenario(
         "kill-robot",
         "a robot that receives help is killed (SIGKILL)",
         "its liveliness token disappears within 1 s; the other robots continue; a new process"
         " starts within 10 s and is localized within another 15 s",
-        N,
-        QUICK,
         kill_robot,
+        quick=True,
     ),
     Scenario(
         "kill-observer",
         "the best observer, on which a blind robot depends, is killed (SIGKILL)",
         "the same as for kill-robot",
-        N,
-        SLOW,
         kill_observer,
     ),
     Scenario(
@@ -47,8 +41,6 @@ SCENARIOS = (
         "the router is killed (SIGKILL)",
         "no robot receives anything for at most 6 s; then all robots have a liveliness token"
         " again, help each other and are localized, and no robot was restarted",
-        N,
-        SLOW,
         kill_router,
     ),
     Scenario(
@@ -57,8 +49,6 @@ SCENARIOS = (
         " world starts",
         "the robots publish their tracks all the time; 20 s after the new field started, all"
         " robots are localized",
-        N,
-        SLOW,
         kill_field,
     ),
     Scenario(
@@ -66,9 +56,8 @@ SCENARIOS = (
         "the best observer is stopped for 5 s (SIGSTOP)",
         "its liveliness token disappears within 4 s; the other robots continue; after it wakes"
         " it is localized within 5 s, and the messages that it sends late do no harm",
-        N,
-        QUICK,
         freeze,
+        quick=True,
     ),
     Scenario(
         "partition",
@@ -76,9 +65,8 @@ SCENARIOS = (
         " for 10 s",
         "each side notices within 4 s that the other is missing, and continues; within 5 s of"
         " healing they are one team again",
-        N,
-        QUICK,
         partition,
+        quick=True,
     ),
     Scenario(
         "partition-containers",
@@ -86,17 +74,14 @@ SCENARIOS = (
         " of one site off the link for 10 s",
         "the same as for partition, but the RMSE of the far site may be up to 1 m, because its"
         " blind scout is far from the robots with the best estimates",
-        DOCKER,
-        SLOW,
         partition_containers,
+        needs=Needs.DOCKER,
     ),
     Scenario(
         "cut-link",
         "the link of the best observer is silent for 10 s",
         "the other robots notice within 4 s that it is missing, and continue; its token is back"
         " within 5 s",
-        N,
-        SLOW,
         cut_link,
     ),
     Scenario(
@@ -104,8 +89,6 @@ SCENARIOS = (
         "the link of a robot delays by 200 ms in each direction, with 100 ms of jitter, for 20 s",
         "the robot publishes its tracks, receives help and stays localized; the other robots"
         " are not affected",
-        N,
-        SLOW,
         slow_link,
     ),
     Scenario(
@@ -113,8 +96,6 @@ SCENARIOS = (
         "the link of a robot, which also carries its inputs, is limited to 50 kbit/s in each"
         " direction for 20 s",
         "the same as for slow-link",
-        N,
-        SLOW,
         narrow_link,
     ),
     Scenario(
@@ -122,16 +103,13 @@ SCENARIOS = (
         "the link of a robot loses every fifth packet in each direction for 20 s",
         "the same as for slow-link, with gaps of up to 8 s and an RMSE of up to 1 m, because"
         " its odometry arrives in bursts",
-        ROOT,
-        SLOW,
         lossy_link,
+        needs=Needs.ROOT,
     ),
     Scenario(
         "duplicates",
         "each help message of the best observer is repeated at once, and again up to 4 s late",
         "the copies are counted as duplicate or too late, and change nothing",
-        N,
-        SLOW,
         duplicates,
     ),
     Scenario(
@@ -139,16 +117,12 @@ SCENARIOS = (
         "the clock of the best observer is 0.5 s ahead, that of another robot 0.05 s",
         "the other robots detect the first error within 15 s, report it and refuse the"
         " observer's help; they tolerate the second",
-        N,
-        SLOW,
         clock_half_second,
     ),
     Scenario(
         "clock-hour",
         "the clock of the best observer is one hour ahead, that of another robot 0.05 s",
         "the same as for clock-half-second",
-        N,
-        SLOW,
         clock_hour,
     ),
     Scenario(
@@ -157,8 +131,6 @@ SCENARIOS = (
         " messages of 60 kB",
         "the router lets at most 200 messages/s through to any robot; the other robots publish"
         " with gaps of at most 2 s and stay localized",
-        N,
-        SLOW,
         flood,
     ),
     Scenario(
@@ -167,25 +139,21 @@ SCENARIOS = (
         " output to a full device",
         "the run continues to its report; one line names each file that could not be written;"
         " exit code 1",
-        MOUNT,
-        SLOW,
         disk_full,
+        needs=Needs.MOUNT,
     ),
     Scenario(
         "read-only",
         "`up` and `calibrate` are told to write to a read-only file system",
         "one line names the option and the file before anything starts; exit code 2",
-        MOUNT,
-        SLOW,
         read_only,
+        needs=Needs.MOUNT,
     ),
     Scenario(
         "kidnap",
         "a robot is moved by 3 m without any odometry",
         "it reports within 3 s that it is lost, is localized within 8 s, and does not mislead"
         " any teammate",
-        N,
-        SLOW,
         kidnap,
     ),
     Scenario(
@@ -194,8 +162,6 @@ SCENARIOS = (
         "the robots continue on odometry and help each other: the RMSE is at most 0.5 m, and"
         " the stated uncertainty is consistent; within 8 s of seeing landmarks again all are"
         " localized",
-        N,
-        SLOW,
         hidden_landmarks,
     ),
     Scenario(
@@ -203,8 +169,6 @@ SCENARIOS = (
         "one of three observers reports every position 0.7 m wrong for 15 s",
         "two of the three driving robots detect it within 10 s (one may be out of its sight);"
         " their RMSE is at most 0.15 m; 20 s later all robots trust it again",
-        N,
-        SLOW,
         faulty_robot,
     ),
     Scenario(
@@ -212,8 +176,6 @@ SCENARIOS = (
         "kill, freeze, cut, slow, narrow, flood and echo faults in random order",
         "memory does not grow (6 MiB a process, 0.5 MiB/min); no robot is silent for 30 s or"
         " stays lost; no process ends without being killed; no process is left behind",
-        N,
-        SLOW,
         soak,
     ),
 )

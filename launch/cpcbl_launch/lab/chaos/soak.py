@@ -71,20 +71,20 @@ class ProcessLife(NamedTuple):
     more_files: int
 
 
-def soak(setting: ScenarioOptions) -> ScenarioResult:
+def soak(options: ScenarioOptions) -> ScenarioResult:
     """Kill, freeze, cut, slow, flood, echo, again and again."""
     require_process_usage("chaos soak")
     team_file, endpoint = demo_team(), free_endpoint()
     with ExitStack() as stack:
-        links = {n: stack.enter_context(Relay(endpoint, setting.seed)) for n in team_file.robots}
+        links = {n: stack.enter_context(Relay(endpoint, options.seed)) for n in team_file.robots}
         dialled = {name: link.endpoint for name, link in links.items()}
-        plan = RunPlan(team_file, setting.seed, endpoint=endpoint, links=dialled)
+        plan = RunPlan(team_file, options.seed, endpoint=endpoint, links=dialled)
         team = stack.enter_context(run_team_under_test(plan))
-        setting.report_progress("starting a team")
+        options.report_progress("starting a team")
         team.settle()
-        tormentor = _FaultSequence(team, links, setting)
+        tormentor = _FaultSequence(team, links, options)
         tormentor.run()
-        setting.report_progress("waiting until all robots are localized")
+        options.report_progress("waiting until all robots are localized")
         calm_s = team.now_s
         team.wait_until(lambda: _are_all_localized(team.run_log, team.robots, calm_s), STUCK_S)
         well_s = team.now_s
@@ -176,10 +176,10 @@ class _FaultSequence:
     """Does one fault after another, and samples what processes hold."""
 
     def __init__(
-        self, team: TeamUnderTest, links: Mapping[str, Relay], setting: ScenarioOptions
+        self, team: TeamUnderTest, links: Mapping[str, Relay], options: ScenarioOptions
     ) -> None:
-        self._team, self._links, self._setting = team, links, setting
-        self._dice = random.Random(setting.seed)
+        self._team, self._links, self._setting = team, links, options
+        self._dice = random.Random(options.seed)
         self._sampled_s = 0.0
         self.samples: list[ProcessSample] = []
         self.faults: Counter[str] = Counter()

@@ -26,6 +26,7 @@ from cpcbl_launch.lab.chaos.scenario import (
     ScenarioResult,
     checks_recovered,
     checks_unaffected,
+    settled_team,
 )
 from cpcbl_launch.lab.chaos.team import RunPlan, demo_team, run_team_under_test
 from cpcbl_launch.lab.experiments import liars
@@ -45,13 +46,12 @@ LIE, LIE_S = "bias:0.5,0.5", (12.0, 27.0)
 # Kidnapped ----------------------------------------------------------------------------------------
 
 
-def kidnap(setting: ScenarioOptions) -> ScenarioResult:
+def kidnap(options: ScenarioOptions) -> ScenarioResult:
     """A robot is carried 3 m away; its wheels do not notice."""
     event = SimulationEvent(at_s=EVENT_S, kidnap=KIDNAPPED, to=TO)
-    with run_team_under_test(RunPlan(with_events(demo_team(), event), setting.seed)) as team:
-        setting.report_progress("starting a team")
-        team.settle()
-        setting.report_progress(f"{KIDNAPPED} is carried away at {EVENT_S:g} s")
+    plan = RunPlan(with_events(demo_team(), event), options.seed)
+    with settled_team(options, plan, baseline_s=0.0) as team:
+        options.report_progress(f"{KIDNAPPED} is carried away at {EVENT_S:g} s")
         team.wait_until(lambda: first_position_jump(team.run_log, KIDNAPPED) is not None, 20.0)
         team.run_for(15.0)
         others = team.others(KIDNAPPED)
@@ -77,13 +77,12 @@ def kidnap_checks(log: RunLog, robot: str, others: Sequence[str], until_s: float
 # In the dark --------------------------------------------------------------------------------------
 
 
-def hidden_landmarks(setting: ScenarioOptions) -> ScenarioResult:
+def hidden_landmarks(options: ScenarioOptions) -> ScenarioResult:
     """Nobody sees a landmark for a minute; teammates are seen."""
     event = SimulationEvent(at_s=EVENT_S, hide_landmarks_s=HIDDEN_S)
-    with run_team_under_test(RunPlan(with_events(demo_team(), event), setting.seed)) as team:
-        setting.report_progress("starting a team")
-        team.settle()
-        setting.report_progress(f"no landmark is seen for {HIDDEN_S:g} s")
+    plan = RunPlan(with_events(demo_team(), event), options.seed)
+    with settled_team(options, plan, baseline_s=0.0) as team:
+        options.report_progress(f"no landmark is seen for {HIDDEN_S:g} s")
         team.wait_until(lambda: team.now_s >= EVENT_S + HIDDEN_S, HIDDEN_S + 30.0)
         team.run_for(12.0)
         return ScenarioResult(hidden_landmarks_checks(team.run_log, team.robots, team.now_s))
@@ -109,20 +108,20 @@ def hidden_landmarks_checks(log: RunLog, robots: Sequence[str], until_s: float) 
 # Clocks -------------------------------------------------------------------------------------------
 
 
-def clock_half_second(setting: ScenarioOptions) -> ScenarioResult:
+def clock_half_second(options: ScenarioOptions) -> ScenarioResult:
     """The best observer's clock is 0.5 s ahead, another's 0.05 s."""
-    return _clocks({"observer": 0.5, "patrol": TOLERATED_S}, setting)
+    return _clocks({"observer": 0.5, "patrol": TOLERATED_S}, options)
 
 
-def clock_hour(setting: ScenarioOptions) -> ScenarioResult:
+def clock_hour(options: ScenarioOptions) -> ScenarioResult:
     """The best observer's clock is an hour ahead, another's 0.05 s."""
-    return _clocks({"observer": 3600.0, "patrol": TOLERATED_S}, setting)
+    return _clocks({"observer": 3600.0, "patrol": TOLERATED_S}, options)
 
 
-def _clocks(ahead_s: dict[str, float], setting: ScenarioOptions) -> ScenarioResult:
-    plan = RunPlan(with_clocks(demo_team(), ahead_s), setting.seed)
+def _clocks(ahead_s: dict[str, float], options: ScenarioOptions) -> ScenarioResult:
+    plan = RunPlan(with_clocks(demo_team(), ahead_s), options.seed)
     with run_team_under_test(plan) as team:
-        setting.report_progress(f"clocks are ahead: {ahead_s} s")
+        options.report_progress(f"clocks are ahead: {ahead_s} s")
         team.settle(within_m=1.5)
         from_s = team.now_s
         team.run_for(CLOCK_S)
@@ -166,14 +165,13 @@ def clock_checks(
 # A liar -------------------------------------------------------------------------------------------
 
 
-def faulty_robot(setting: ScenarioOptions) -> ScenarioResult:
+def faulty_robot(options: ScenarioOptions) -> ScenarioResult:
     """One of three observers says everything 0.7 m away, for a while."""
     lie = f"{LIE}@{LIE_S[0]:g}-{LIE_S[1]:g}"
-    crowd = liars.team(liars.Case(lie=LIE))
-    with run_team_under_test(RunPlan(crowd, setting.seed, faults={liars.LIAR: lie})) as team:
-        setting.report_progress("starting a team")
-        team.settle()
-        setting.report_progress(
+    team_settings = liars.liars_team(liars.Case(lie=LIE))
+    plan = RunPlan(team_settings, options.seed, faults={liars.LIAR: lie})
+    with settled_team(options, plan, baseline_s=0.0) as team:
+        options.report_progress(
             f"{liars.LIAR} sends wrong positions from {LIE_S[0]:g} s to {LIE_S[1]:g} s"
         )
         team.wait_until(lambda: team.now_s >= LIE_S[1] + 20.0, LIE_S[1] + 40.0)

@@ -13,7 +13,6 @@ import itertools
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
-from pathlib import Path
 
 import msgspec
 from rich.console import RenderableType
@@ -197,12 +196,6 @@ def tables(result: Outcome) -> Iterable[RenderableType]:
     yield "blind: sees teammates but no landmark; B/s: help sent, mean over the robots"
 
 
-def draw(result: Outcome, path: Path) -> None:
-    from cpcbl_launch.lab.experiments.pictures import draw_directions
-
-    draw_directions(result, path)
-
-
 def experiment_of_sizes(sizes: Sequence[int]) -> Experiment:
     """The experiment with teams of these sizes only. Raises InputError."""
     if not sizes or any(not 2 <= size <= 20 for size in sizes):
@@ -210,4 +203,4 @@ def experiment_of_sizes(sizes: Sequence[int]) -> Experiment:
     return EXPERIMENT._replace(cases=partial(cases, sizes))
 
 
-EXPERIMENT = Experiment("one-way-vs-both", cases, outcome, tables, draw)
+EXPERIMENT = Experiment("one-way-vs-both", cases, outcome, tables)

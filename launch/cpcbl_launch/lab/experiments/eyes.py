@@ -6,7 +6,6 @@
 
 from collections import Counter
 from collections.abc import Callable, Iterable
-from pathlib import Path
 
 from rich.console import RenderableType
 
@@ -81,9 +80,3 @@ def _cells(f: Figures) -> tuple[str, ...]:
         number(f.bearing_inside),
         number(f.heading_inside),
     )
-
-
-def draw(result: Eyes, path: Path) -> None:
-    from cpcbl_launch.lab.experiments.pictures import draw_eyes
-
-    draw_eyes(result, path)

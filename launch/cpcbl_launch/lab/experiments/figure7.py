@@ -7,7 +7,6 @@ split covariance intersection. The navigator steers by its own estimate.
 
 import math
 from collections.abc import Iterable, Mapping
-from pathlib import Path
 
 from rich.console import RenderableType
 
@@ -120,10 +119,4 @@ def accuracy_table(title: str, rows: Mapping[str, Accuracy]) -> RenderableType:
     return shown
 
 
-def draw(result: Outcome, path: Path) -> None:
-    from cpcbl_launch.lab.experiments.pictures import draw_figure7
-
-    draw_figure7(result, path)
-
-
-EXPERIMENT = Experiment("figure7", cases, outcome, tables, draw)
+EXPERIMENT = Experiment("figure7", cases, outcome, tables)

@@ -86,4 +86,4 @@ def tables(result: Outcome) -> Iterable[RenderableType]:
     return figure7.tables(result, "navigator with a camera")
 
 
-EXPERIMENT = Experiment("figure7-cameras", cases, outcome, tables, figure7.draw)
+EXPERIMENT = Experiment("figure7-cameras", cases, outcome, tables)

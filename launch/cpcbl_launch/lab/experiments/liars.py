@@ -109,13 +109,13 @@ class Liars(msgspec.Struct, frozen=True, kw_only=True):
     seeds: int
     lie_s: tuple[float, float, float]
     """From, until, end of the run."""
-    liars_team: Team
+    team: Team
     rows: tuple[Row, ...]
     held: bool
     """Whether every kind's median ratio is within the target."""
 
 
-def team(case: Case) -> Team:
+def liars_team(case: Case) -> Team:
     """The observers at their posts and the robots that drive."""
     base, replace = load_team(builtin_path("demo")), msgspec.structs.replace
     observer, scout = base.robots["observer"], base.robots["scout"]
@@ -190,7 +190,7 @@ def run_case(case: Case, seed: int) -> Run:
     if case.lie:
         fault = Fault.parse(f"{case.lie}@{FROM_S}-{UNTIL_S}")
         through = {LIAR: partial(FaultyBus, fault=fault, name=LIAR, start_ns=0)}
-    _, recorder = simulate(team(case), seed, END_S, referee=statuses, bus_wrappers=through)
+    _, recorder = simulate(liars_team(case), seed, END_S, referee=statuses, bus_wrappers=through)
     truth = recorder.simulated_truth()
     errors = {
         name: position_errors(recorder.samples(name, truth[name], from_s=FROM_S))
@@ -217,7 +217,7 @@ def measure(
         version=version("cpcbl-team"),
         seeds=seeds,
         lie_s=(FROM_S, UNTIL_S, END_S),
-        liars_team=team(Case(lie="")),
+        team=liars_team(Case(lie="")),
         rows=rows,
         held=not any(map(_exceeds_target, _rows_with_trust(rows))),
     )

@@ -1,6 +1,7 @@
 """The experiments as pictures. Needs extra `plot`."""
 
 import math
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -216,6 +217,19 @@ def draw_eyes(result: Eyes, path: Path) -> None:
     ]
     figure.legend(handles=handles, loc="outside lower center", ncols=2)
     _save(figure, path)
+
+
+DRAWINGS: Mapping[str, Callable[[Any, Path], None]] = {
+    "table1": draw_table1,
+    "figure7": draw_figure7,
+    "figure7-cameras": draw_figure7,
+    "circular-vs-oval": draw_variants,
+    "one-way-vs-both": draw_directions,
+    "budget": draw_budget,
+    "liars": draw_liars,
+    "eyes": draw_eyes,
+}
+"""How the result of each experiment is drawn, by its name."""
 
 
 def _scattered(axes: Any, errors: list[tuple[float, float, float]], target: float) -> None:

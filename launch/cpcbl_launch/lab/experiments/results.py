@@ -3,7 +3,6 @@
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from importlib.metadata import version
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import msgspec
@@ -40,7 +39,6 @@ class Experiment(NamedTuple):
     cases: Callable[[], Mapping[Any, Case]]
     outcome: Callable[[Results], Outcome]
     tables: Callable[[Outcome], Iterable[RenderableType]]
-    draw: Callable[[Outcome, Path], None]
 
 
 class Spread(msgspec.Struct, frozen=True):

@@ -10,7 +10,6 @@ runs of A, B and C, measured like the others; the paper shows the least error of
 
 import itertools
 from collections.abc import Iterable, Mapping
-from pathlib import Path
 
 import numpy as np
 from rich.console import RenderableType
@@ -174,10 +173,4 @@ def _cell(s: Spread | None, paper: float, digits: int, judged: bool) -> str:
     return f"{s.median:.{digits}f}{mark}\n{low}-{high} "
 
 
-def draw(result: Outcome, path: Path) -> None:
-    from cpcbl_launch.lab.experiments.pictures import draw_table1
-
-    draw_table1(result, path)
-
-
-EXPERIMENT = Experiment("table1", cases, outcome, tables, draw)
+EXPERIMENT = Experiment("table1", cases, outcome, tables)

@@ -5,7 +5,6 @@ variant: accuracy and consistency. `make bench` measures what a cycle of each va
 """
 
 from collections.abc import Iterable, Mapping
-from pathlib import Path
 
 from rich.console import RenderableType
 
@@ -43,10 +42,4 @@ def tables(result: Outcome) -> Iterable[RenderableType]:
     yield LEGEND
 
 
-def draw(result: Outcome, path: Path) -> None:
-    from cpcbl_launch.lab.experiments.pictures import draw_variants
-
-    draw_variants(result, path)
-
-
-EXPERIMENT = Experiment("circular-vs-oval", cases, outcome, tables, draw)
+EXPERIMENT = Experiment("circular-vs-oval", cases, outcome, tables)
