@@ -1,9 +1,9 @@
-"""Merging what teammates say: naive, as in the paper, or split covariance intersection.
+"""Merging the help of teammates: naively, as in the paper, or by split covariance intersection.
 
-A teammate's own pose error is the same in everything that it says, and may be in this robot's
-estimate already. Split covariance intersection (Julier & Uhlmann 2001; Li & Nashashibi, ITSC 2012)
-merges such a part without counting it twice, whatever the correlation; the sensor's part of the
-noise is fresh and merged as usual.
+A teammate's own pose error is the same in all of its messages, and this robot's estimate may
+contain it already. Split covariance intersection (S. Julier, J. Uhlmann 2001; H. Li, F. Nashashibi,
+ITSC 2012) never counts this dependent part twice, whatever the correlation is. The sensor's part of
+the noise is independent and merged as usual.
 """
 
 import math
@@ -32,10 +32,10 @@ from cpcbl_team.gaussian import Covariance2
 
 
 class Observation(NamedTuple):
-    """One or two scalar measurements with one teammate's pose error in common.
+    """One or two scalar measurements that have one teammate's pose error in common.
 
-    residuals = rows . offset + noise; the noise has a part of the sensor (independent) and a part
-    of the teammate's pose (dependent: it may already be in the prior).
+    residuals = rows . offset + noise. The noise has a part of the sensor (independent) and a part
+    of the teammate's pose (dependent: the prior may contain it already).
     """
 
     rows: tuple[Row, ...]
@@ -66,7 +66,10 @@ class Observation(NamedTuple):
 
 
 def _noise(xx: float, xy: float, yy: float) -> tuple[float, float, float]:
-    """No sharper than evidence may be, along any axis: else a part of it is more than the whole."""
+    """(xx, xy, yy) no sharper than evidence may be along any axis.
+
+    Otherwise rounding could make a part of the evidence exceed the whole.
+    """
     xx = max(xx + SMALLEST_VARIANCE, SHARPEST_VARIANCE)
     return xx, xy, max(yy + SMALLEST_VARIANCE, xy * xy / xx + SHARPEST_VARIANCE)
 
@@ -99,97 +102,107 @@ def chi_square_bounds(probability: float) -> tuple[float, float]:
     return NormalDist().inv_cdf(0.5 + 0.5 * probability) ** 2, -2.0 * math.log(1.0 - probability)
 
 
-def merge_naive(prior: Estimate, seen: Observation, scope: Scope = POSE) -> Estimate:
-    """The paper's collaboration: the teammate's error is compounded and taken as fresh noise."""
-    return merge(prior, seen.information(), scope)
+def merge_naive(prior: Estimate, observation: Observation, scope: Scope = POSE) -> Estimate:
+    """The paper's collaboration: the teammate's error is treated as independent noise."""
+    return merge(prior, observation.information(), scope)
 
 
 _GOLDEN = 0.6180339887498949
 
 
-def merge_split(prior: Estimate, seen: Observation, scope: Scope = POSE) -> Estimate:
+def merge_split(prior: Estimate, observation: Observation, scope: Scope = POSE) -> Estimate:
     """Split covariance intersection: consistent for any correlation of the dependent parts.
 
-    P1 = P_d / w + P_i, R = R_d / (1 - w) + R_i, w chosen by golden section for the smallest merged
-    determinant (POSE; a trace of the position alone would give the heading away), trace of the
-    position or variance of the heading. Where none makes that smaller the prior stays: widened for
-    nothing, again and again, it would lose what only it knows. Scopes other than POSE expect a
-    prior of which nothing or all is shared.
+    P1 = P_d / w + P_i, R = R_d / (1 - w) + R_i. Golden section chooses the w with the smallest
+    determinant (POSE; a trace would neglect the heading), trace of the position, or variance of the
+    heading. If no w makes that smaller, the result is the prior, because repeated inflation without
+    a gain would lose information. Scopes other than POSE expect a prior of which nothing or all is
+    shared.
     """
-    goal = _determinant(prior, seen) if scope is POSE else _variance(prior, seen, scope)
+    goal = (
+        _determinant(prior, observation) if scope is POSE else _variance(prior, observation, scope)
+    )
     weight, extent = best_weight(goal)
-    if extent >= _extent(prior.covariance, scope):
+    if extent >= _size(prior.covariance, scope):
         return prior
-    return _merge_split_at(prior, seen, scope, weight)
+    return _merge_with_weight(prior, observation, scope, weight)
 
 
-def best_weight(goal: Callable[[float], float]) -> tuple[float, float]:
-    """The weight of covariance intersection at which the goal is smallest, by golden section, and
-    the goal there."""
+def best_weight(objective: Callable[[float], float]) -> tuple[float, float]:
+    """The weight of covariance intersection with the smallest value of `objective`, and that value.
+
+    Six steps of golden section; the weight is between 0.02 and 0.98.
+    """
     low, high = 0.02, 0.98
     left, right = high - _GOLDEN * (high - low), low + _GOLDEN * (high - low)
-    best_left, best_right = goal(left), goal(right)
+    best_left, best_right = objective(left), objective(right)
     for _ in range(6):
         if best_left <= best_right:
             high, right, best_right = right, left, best_left
             left = high - _GOLDEN * (high - low)
-            best_left = goal(left)
+            best_left = objective(left)
         else:
             low, left, best_left = left, right, best_right
             right = low + _GOLDEN * (high - low)
-            best_right = goal(right)
+            best_right = objective(right)
     return (left, best_left) if best_left <= best_right else (right, best_right)
 
 
-def _extent(covariance: Covariance3, scope: Scope) -> float:
-    """What a merge within this scope is to make small."""
+def _size(covariance: Covariance3, scope: Scope) -> float:
+    """The quantity that a merge within this scope is to make small."""
     if scope is POSE:
         return covariance.determinant()
     return covariance.hh if scope is HEADING else covariance.xx + covariance.yy
 
 
-def _widened(prior: Estimate, weight: float) -> Covariance3:
+def _inflated(prior: Estimate, weight: float) -> Covariance3:
+    """P_d / w + P_i, with P = P_d + P_i."""
     return prior.covariance.plus(prior.shared, 1.0 / weight - 1.0)
 
 
-def _variance(prior: Estimate, seen: Observation, scope: Scope) -> Callable[[float], float]:
-    """Of the merged position (its trace) or heading, by the weight."""
+def _variance(prior: Estimate, observation: Observation, scope: Scope) -> Callable[[float], float]:
+    """The trace of the merged position, or the variance of the merged heading, by the weight."""
 
     def variance(weight: float) -> float:
-        widened = _widened(prior, weight)
-        evidence = seen.information(1.0 / (1.0 - weight)).matrix
-        merged = product(survival(widened, evidence), widened)
-        return _extent(merged, scope)
+        inflated = _inflated(prior, weight)
+        evidence = observation.information(1.0 / (1.0 - weight)).matrix
+        merged = product(survival(inflated, evidence), inflated)
+        return _size(merged, scope)
 
     return variance
 
 
-def _determinant(prior: Estimate, seen: Observation) -> Callable[[float], float]:
-    """Of the merged covariance, by the weight: det (P1^-1 + H^T R^-1 H)^-1 =
-    det P1 det R / det (R + H P1 H^T), the lemma of determinants."""
-    # P1 = P + k P_d, so H P1 H^T = H P H^T + k H P_d H^T; plain numbers, for this is done often
-    p, d, alone = prior.covariance, prior.shared, len(seen.rows) == 1
+def _determinant(prior: Estimate, observation: Observation) -> Callable[[float], float]:
+    """The determinant of the merged covariance, by the weight.
+
+    det (P1^-1 + H^T R^-1 H)^-1 = det P1 det R / det (R + H P1 H^T), the matrix determinant lemma.
+    """
+    # P1 = P + k P_d, so H P1 H^T = H P H^T + k H P_d H^T. Plain floats, because this runs often.
+    p, d, alone = prior.covariance, prior.shared, len(observation.rows) == 1
     (pxx, pxy, pyy, pxh, pyh, phh), (dxx, dxy, dyy, dxh, dyh, dhh) = p, d
-    (p_xx, p_xy, p_yy), (d_xx, d_xy, d_yy) = _projected(p, seen.rows), _projected(d, seen.rows)
-    (ixx, ixy, iyy), (oxx, oxy, oyy) = seen.independent, seen.dependent
+    (p_xx, p_xy, p_yy), (d_xx, d_xy, d_yy) = (
+        _projected(p, observation.rows),
+        _projected(d, observation.rows),
+    )
+    (ixx, ixy, iyy), (oxx, oxy, oyy) = observation.independent, observation.dependent
 
     def determinant(weight: float) -> float:
         k, m = 1.0 / weight - 1.0, 1.0 / (1.0 - weight)
         xx, xy, xh = pxx + k * dxx, pxy + k * dxy, pxh + k * dxh
         yy, yh, hh = pyy + k * dyy, pyh + k * dyh, phh + k * dhh
-        widened = xx * (yy * hh - yh * yh) - xy * (xy * hh - yh * xh) + xh * (xy * yh - yy * xh)
+        inflated = xx * (yy * hh - yh * yh) - xy * (xy * hh - yh * xh) + xh * (xy * yh - yy * xh)
         rxx, rxy, ryy = _noise(ixx + m * oxx, ixy + m * oxy, iyy + m * oyy)
         sxx = rxx + p_xx + k * d_xx
         if alone:
-            return widened * rxx / sxx
+            return inflated * rxx / sxx
         sxy, syy = rxy + p_xy + k * d_xy, ryy + p_yy + k * d_yy
-        return widened * (rxx * ryy - rxy * rxy) / (sxx * syy - sxy * sxy)
+        return inflated * (rxx * ryy - rxy * rxy) / (sxx * syy - sxy * sxy)
 
     return determinant
 
 
 def _projected(p: Covariance3, rows: tuple[Row, ...]) -> tuple[float, float, float]:
-    """H P H^T as xx, xy, yy; of one row xx only."""
+    """H P H^T as (xx, xy, yy); only xx for one row."""
     x, y, a = rows[0]
     px, py, ph = p.times(rows[0])
     xx = x * px + y * py + a * ph
@@ -201,33 +214,35 @@ def _projected(p: Covariance3, rows: tuple[Row, ...]) -> tuple[float, float, flo
     return xx, xy, x * px + y * py + a * ph
 
 
-def _merge_split_at(prior: Estimate, seen: Observation, scope: Scope, weight: float) -> Estimate:
-    widened = _widened(prior, weight)
-    evidence = seen.information(1.0 / (1.0 - weight))
-    survive = survival(widened, evidence.matrix)
-    merged = product(survive, widened)
+def _merge_with_weight(
+    prior: Estimate, observation: Observation, scope: Scope, weight: float
+) -> Estimate:
+    inflated = _inflated(prior, weight)
+    evidence = observation.information(1.0 / (1.0 - weight))
+    survive = survival(inflated, evidence.matrix)
+    merged = product(survive, inflated)
     if min(merged.xx, merged.yy, merged.hh) < 0.0:  # as in `merge`
         return prior
     pose = shifted(prior.pose, merged.times(evidence.vector), scope)
     if scope is POSE:
         own = prior.covariance.plus(prior.shared, -1.0).transformed(survive)
-        fresh = _sensor_part(seen, weight, merged)
+        fresh = _sensor_part(observation, weight, merged)
         return Estimate(pose, merged, merged.plus(own, -1.0).plus(fresh, -1.0))
     _, kept_apart = scoped(survive, prior.covariance, merged, scope)
-    # The part out of scope was not widened after all, so neither is what it has in common.
+    # The part out of scope was not inflated, so its covariance with the rest is not either.
     kept = 1.0 if prior.shared is ZERO3 else weight
     kept_apart = kept_apart._replace(xh=kept * kept_apart.xh, yh=kept * kept_apart.yh)
     return Estimate(pose, kept_apart, kept_apart)
 
 
-def _sensor_part(seen: Observation, weight: float, merged: Covariance3) -> Covariance3:
-    """K R_i K^T with K = P' H^T R^-1: what of the merged covariance is fresh sensor noise."""
-    r = seen.noise(1.0 / (1.0 - weight))
-    gains = [merged.times(row) for row in seen.rows]
+def _sensor_part(observation: Observation, weight: float, merged: Covariance3) -> Covariance3:
+    """K R_i K^T with K = P' H^T R^-1: the part of the merged covariance that is sensor noise."""
+    r = observation.noise(1.0 / (1.0 - weight))
+    gains = [merged.times(row) for row in observation.rows]
     if len(gains) == 1:
-        k, (gx, gy, gh) = seen.independent.xx / (r.xx * r.xx), gains[0]
+        k, (gx, gy, gh) = observation.independent.xx / (r.xx * r.xx), gains[0]
         return Covariance3(gx * gx, gx * gy, gy * gy, gx * gh, gy * gh, gh * gh).scaled(k)
-    inverse, i = r.inverse(), seen.independent
+    inverse, i = r.inverse(), observation.independent
     wxx = inverse.xx * i.xx + inverse.xy * i.xy
     wxy = inverse.xx * i.xy + inverse.xy * i.yy
     wyx = inverse.xy * i.xx + inverse.yy * i.xy
@@ -245,12 +260,15 @@ def _sensor_part(seen: Observation, weight: float, merged: Covariance3) -> Covar
     return Covariance3(entry(0, 0), entry(0, 1), entry(1, 1), entry(0, 2), entry(1, 2), entry(2, 2))
 
 
-def told(estimate: Estimate) -> Estimate:
-    """After a belief has left the robot: all of it may be in a teammate's pose from now on."""
+def mark_shared(estimate: Estimate) -> Estimate:
+    """The estimate after a belief was sent: teammates may depend on all of it from now on."""
     return estimate._replace(shared=estimate.covariance)
 
 
 def with_all_shared(estimate: Estimate) -> Estimate:
-    """For variants that keep heading and position apart: all of the covariance is shared as soon
-    as any of it is (the split of a part that is not updated is not defined)."""
-    return estimate if estimate.shared is ZERO3 else told(estimate)
+    """The estimate with all of its covariance shared, if any of it is.
+
+    It is for the variants that update heading and position separately, because the split of a part
+    that is not updated is not defined.
+    """
+    return estimate if estimate.shared is ZERO3 else mark_shared(estimate)

@@ -1,9 +1,10 @@
-"""What a robot's filter is told: odometry, sightings, and what teammates say.
+"""The inputs of a robot's filter: odometry, sightings, positions, and the help of teammates.
 
-All are immutable, stamped with the time at which the thing was *measured* (`stamp_ns`), and are
-the same structs that travel on the wire. Metres and radians.
+All are immutable. Their `stamp_ns` is the time at which something was *measured*. They are also the
+messages on the wire, so neither tags nor the order of fields may change. Metres and radians.
 """
 
+from enum import StrEnum
 from typing import Annotated
 
 import msgspec
@@ -13,7 +14,7 @@ Name = Annotated[str, msgspec.Meta(pattern=NAME_PATTERN)]
 
 
 class Odometry(msgspec.Struct, frozen=True, array_like=True, tag="odometry"):
-    """Differential odometry: what the wheels say happened from `from_ns` to `stamp_ns`."""
+    """Differential odometry: the motion from `from_ns` to `stamp_ns`."""
 
     from_ns: int
     stamp_ns: int
@@ -22,10 +23,11 @@ class Odometry(msgspec.Struct, frozen=True, array_like=True, tag="odometry"):
 
 
 class Sighting(msgspec.Struct, frozen=True, array_like=True):
-    """One object in the robot's frame. `range_m` to a wall is the perpendicular distance, its
-    bearing the direction of that perpendicular. A sigma that is left out is the sensor model's.
+    """What the robot senses of one object, in the robot's frame.
 
-    `heading_rad`: where a teammate looks, in the robot's frame, if that was seen; with its sigma.
+    The range to a wall is the perpendicular distance, and its bearing is the direction of that
+    perpendicular. The sensor model replaces a sigma that is None. `heading_rad` is the heading of a
+    teammate in the robot's frame, if its marker shows it; it needs a sigma.
     """
 
     id: Name
@@ -37,15 +39,28 @@ class Sighting(msgspec.Struct, frozen=True, array_like=True):
     heading_sigma_rad: float | None = None
 
 
+class SightingFault(StrEnum):
+    """Why a sighting must not be used; the names of counts."""
+
+    NOT_FINITE = "not_finite"
+    IMPLAUSIBLE_NUMBER = "implausible_number"
+    EMPTY_SIGHTING = "empty_sighting"
+    RANGE_NOT_POSITIVE = "range_not_positive"
+    BEARING_OUT_OF_RANGE = "bearing_out_of_range"
+    HEADING_OUT_OF_RANGE = "heading_out_of_range"
+    HEADING_WITHOUT_SIGMA = "heading_without_sigma"
+    SIGMA_NOT_POSITIVE = "sigma_not_positive"
+
+
 class Sightings(msgspec.Struct, frozen=True, array_like=True, tag="sightings"):
-    """Everything seen at one time (one frame)."""
+    """All sightings of one time."""
 
     stamp_ns: int
     sightings: tuple[Sighting, ...]
 
 
 class Position(msgspec.Struct, frozen=True, array_like=True, tag="position"):
-    """What a position sensor says (differential GPS, ultra-wide band), in the field's frame.
+    """The position of the robot in the field's frame by its own position sensor (such as GPS).
 
     `covariance` is xx, xy, yy in m^2.
     """
@@ -57,10 +72,10 @@ class Position(msgspec.Struct, frozen=True, array_like=True, tag="position"):
 
 
 class Belief(msgspec.Struct, frozen=True, array_like=True, tag="belief"):
-    """A robot's pose Gaussian in the field's frame, for passive use by teammates.
+    """A robot's estimate in the field's frame, for passive collaboration.
 
-    `covariance` is xx, xy, yy, xh, yh, hh (m^2, m rad, rad^2). Speed and turn rate let a listener
-    place the robot at the time of its sighting.
+    `covariance` is xx, xy, yy, xh, yh, hh (m^2, m rad, rad^2). A receiver extrapolates the pose to
+    the time of its sighting by speed and turn rate.
     """
 
     robot: Name
@@ -74,11 +89,11 @@ class Belief(msgspec.Struct, frozen=True, array_like=True, tag="belief"):
 
 
 class Fix(msgspec.Struct, frozen=True, array_like=True, tag="fix"):
-    """Active observation: where `observer` saw `robot`, in the field's frame.
+    """Active collaboration: `observer` saw `robot` at this position in the field's frame.
 
-    The two parts of the covariance (xx, xy, yy; m^2) stay apart: the sensor's part is fresh noise,
-    the observer's own pose error is the same in every fix that it sends. So do the two parts of the
-    variance (rad^2) of the heading, which is None where it was not seen.
+    The covariance (xx, xy, yy; m^2) has two parts: the noise of this sighting, and the observer's
+    own pose error, which all of its fixes have in common. The variance of the heading (rad^2) has
+    the same parts. `heading_rad` is None if the observer did not see the heading.
     """
 
     robot: Name
@@ -93,10 +108,10 @@ class Fix(msgspec.Struct, frozen=True, array_like=True, tag="fix"):
     heading_observer_variance: float = 0.0
 
 
-class Told(msgspec.Struct, frozen=True, array_like=True, tag="told"):
-    """This robot's belief has left it: from now on a teammate's may hold the same information."""
+class BeliefShared(msgspec.Struct, frozen=True, array_like=True, tag="told"):
+    """This robot's belief was sent: teammates' estimates may depend on its own from now on."""
 
     stamp_ns: int
 
 
-Input = Odometry | Sightings | Position | Belief | Fix | Told
+Input = Odometry | Sightings | Position | Belief | Fix | BeliefShared

@@ -25,7 +25,7 @@ from cpcbl_team.estimate import (
 )
 from cpcbl_team.fusion import chi_square
 from cpcbl_team.inputs import Sighting
-from cpcbl_team.sensors import LARGEST_BEARING_RAD, LARGEST_M, range_to_expect
+from cpcbl_team.sensors import LARGEST_BEARING_RAD, LARGEST_M, bounded_expected_range
 from cpcbl_team.state import Evidence, LandmarkSnapshot, State
 
 Numbers = tuple[
@@ -180,7 +180,7 @@ class Landmarks:
 
     def _range_variance(self, distance_m: float, range_m: float) -> float:
         """The sensor model's variance (m^2) of a range to a landmark at this distance."""
-        expected_m = range_to_expect(distance_m, range_m)
+        expected_m = bounded_expected_range(distance_m, range_m)
         return self._share_squared * expected_m * expected_m + self._floor_squared
 
     def _rejects(self, prior: Covariance3, *constraints: tuple[Row, float, float]) -> bool:

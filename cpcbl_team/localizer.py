@@ -9,9 +9,9 @@ from collections.abc import Iterable
 from cpcbl_team.beliefs import BELIEF_VALID_BEFORE_NS
 from cpcbl_team.config import Field, LocalizationSettings
 from cpcbl_team.estimate import HEADING, POSE, POSITION, Covariance3, Estimate, Scope
-from cpcbl_team.fusion import chi_square_bounds, told
+from cpcbl_team.fusion import chi_square_bounds, mark_shared
 from cpcbl_team.geometry import Pose2, step, wrap_angle
-from cpcbl_team.inputs import Belief, Fix, Odometry, Position, Sighting, Sightings, Told
+from cpcbl_team.inputs import Belief, BeliefShared, Fix, Odometry, Position, Sighting, Sightings
 from cpcbl_team.landmarks import Landmarks, LandmarkUpdate
 from cpcbl_team.measurements import (
     GatedObject,
@@ -34,7 +34,7 @@ from cpcbl_team.recovery import (
     with_snapshot,
 )
 from cpcbl_team.self_calibration import ReferencePose, ReferencePoses, self_calibrate
-from cpcbl_team.sensors import crawled_s, sighting_fault
+from cpcbl_team.sensors import sighting_fault, time_at_min_speed_s
 from cpcbl_team.state import (
     Evidence,
     LandmarkSnapshot,
@@ -143,7 +143,7 @@ class Localizer:
             distance, turn = share * distance, share * turn
         crawled = 0.0
         if self._has_dead_zone:
-            crawled = crawled_s(distance, part_ns * 1e-9, self._odometry)
+            crawled = time_at_min_speed_s(distance, part_ns * 1e-9, self._odometry)
         return distance, turn, crawled
 
     def _unknown_motion(self, estimate: Estimate, silent_ns: int) -> Estimate:
@@ -210,7 +210,8 @@ class Localizer:
     ) -> tuple[list[Measurement], list[str]]:
         """The usable ones of these sightings, and the faults of those that have one."""
         beliefs, pose = state.memory.teammates.beliefs, state.estimate.pose
-        measured, faults = [], []
+        measured: list[Measurement] = []
+        faults: list[str] = []
         bias = state.memory.calibration.learned.bearing_bias_rad if self._calibrates else 0.0
         for sighting in sightings:
             fault = sighting_fault(sighting)
@@ -369,10 +370,10 @@ class Localizer:
         memory = state.memory.teammates._replace(beliefs=beliefs, last_report_ns=now_ns)
         return with_memory(state, state.memory._replace(teammates=memory))
 
-    def mark_shared(self, state: State, event: Told) -> State:
+    def mark_shared(self, state: State, event: BeliefShared) -> State:
         """This robot's belief goes to a teammate: its information may come back."""
         state = self.predict(state, event.stamp_ns)
-        return state._replace(estimate=told(state.estimate))
+        return state._replace(estimate=mark_shared(state.estimate))
 
     # The start, being lost --------------------------------------------------------------------
 

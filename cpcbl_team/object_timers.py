@@ -7,7 +7,7 @@ correlation time inflates their variances.
 
 from cpcbl_team.config import LocalizationSettings
 from cpcbl_team.measurements import Measurement
-from cpcbl_team.sensors import repeated_share
+from cpcbl_team.sensors import repetition_variance_factor
 from cpcbl_team.state import Updates
 
 _NOBODY: frozenset[str] = frozenset()
@@ -51,4 +51,4 @@ class ObjectTimers:
         """The factor by which the variance of what this source reports now is larger."""
         last_ns = updates.objects_ns.get(source)
         seconds = None if last_ns is None else (now_ns - last_ns) * 1e-9
-        return repeated_share(seconds, self._correlation_s)
+        return repetition_variance_factor(seconds, self._correlation_s)

@@ -1,4 +1,4 @@
-"""Readings made right by what calibration knows; what a sighting is worth."""
+"""The sensor model: systematic errors, which are corrected, and the sigmas of what remains."""
 
 import math
 from typing import Final
@@ -7,36 +7,38 @@ import msgspec
 
 from cpcbl_team.config import OdometrySettings, SensorSettings
 from cpcbl_team.geometry import wrap_angle
-from cpcbl_team.inputs import Odometry, Sighting, Sightings
+from cpcbl_team.inputs import Odometry, Sighting, SightingFault, Sightings
 
 LARGEST_M: Final = 1e6
 LARGEST_BEARING_RAD: Final = math.pi + 1e-9
-SOONEST_S = 1e-3
-SAME_SPEED: Final = 1e-6  # speeds that differ by less are one
-LEAST_COSINE = 0.1  # a depth says nothing of what is seen across the optical axis
+SHORTEST_REPETITION_S = 1e-3
+SAME_SPEED: Final = 1e-6  # relative difference of speeds that count as equal
+LEAST_COSINE = 0.1  # a depth contains no range of objects perpendicular to the optical axis
 
 
 def corrected_odometry(piece: Odometry, s: OdometrySettings) -> Odometry:
-    """What the wheels really did, and when."""
+    """The odometry without its systematic errors, at the time of the motion."""
     delay_ns = int(s.delay_s * 1e9)
-    way = s.distance_scale * abs(piece.distance_m)
-    if way:
-        way = max(way, s.least_speed_m_s * (piece.stamp_ns - piece.from_ns) * 1e-9)
-    way = max(0.0, way - s.distance_loss_m_per_rad * abs(piece.turn_rad))
-    distance = math.copysign(way, piece.distance_m)
+    distance = s.distance_scale * abs(piece.distance_m)
+    if distance:
+        distance = max(distance, s.least_speed_m_s * (piece.stamp_ns - piece.from_ns) * 1e-9)
+    distance = max(0.0, distance - s.distance_loss_m_per_rad * abs(piece.turn_rad))
+    distance = math.copysign(distance, piece.distance_m)
     turn = s.turn_scale * piece.turn_rad + s.turn_bias_rad_per_m * distance
     return Odometry(piece.from_ns + delay_ns, piece.stamp_ns + delay_ns, distance, turn)
 
 
-def crawled_s(distance_m: float, seconds: float, s: OdometrySettings) -> float:
-    """How many of these seconds a robot that truly drove so far drove at its least speed."""
+def time_at_min_speed_s(distance_m: float, seconds: float, s: OdometrySettings) -> float:
+    """For how many of these seconds a robot that moved this far (true) drove at its least speed."""
     slow = s.least_speed_m_s * seconds * (1.0 + SAME_SPEED)
     return seconds if 0.0 < abs(distance_m) <= slow else 0.0
 
 
-def once_each(sightings: tuple[Sighting, ...]) -> tuple[Sighting, ...]:
-    """Without those that read again what an earlier one of the same object has read: the same
-    error would count as two."""
+def without_duplicates(sightings: tuple[Sighting, ...]) -> tuple[Sighting, ...]:
+    """The sightings without those that repeat a reading of an earlier one of the same object.
+
+    Their errors are the same, so they must not count twice.
+    """
     if len({s.id for s in sightings}) == len(sightings):
         return sightings
     kept: list[Sighting] = []
@@ -51,9 +53,9 @@ def once_each(sightings: tuple[Sighting, ...]) -> tuple[Sighting, ...]:
 
 
 def corrected_sighting(sighting: Sighting, sensor: SensorSettings, teammate: bool) -> Sighting:
-    """The sighting without the sensor's systematic errors; a fault stays as it is.
+    """The sighting without the sensor's systematic errors; a faulty one is not changed.
 
-    A heading is seen against the line of sight, so it turns by what its bearing is corrected by.
+    A heading is measured relative to the line of sight, so it changes with the bearing.
     """
     (name, range_m, bearing, range_sigma, bearing_sigma, heading, heading_sigma) = (
         msgspec.structs.astuple(sighting)
@@ -74,14 +76,16 @@ def corrected_sighting(sighting: Sighting, sensor: SensorSettings, teammate: boo
 
 
 def without_bearing_bias(frame: Sightings, bias_rad: float) -> Sightings:
-    """The frame with this bias taken from its bearings, and from the headings that were seen with
-    them; a fault stays as it is."""
+    """The frame with this bias subtracted from its bearings and headings; faulty sightings are not
+    changed."""
     if bias_rad == 0.0:
         return frame
-    return Sightings(frame.stamp_ns, tuple(_unbiased(s, bias_rad) for s in frame.sightings))
+    return Sightings(
+        frame.stamp_ns, tuple(_sighting_without_bearing_bias(s, bias_rad) for s in frame.sightings)
+    )
 
 
-def _unbiased(sighting: Sighting, bias_rad: float) -> Sighting:
+def _sighting_without_bearing_bias(sighting: Sighting, bias_rad: float) -> Sighting:
     bearing, heading = sighting.bearing_rad, sighting.heading_rad
     if bearing is None or sighting_fault(sighting):
         return sighting
@@ -92,10 +96,10 @@ def _unbiased(sighting: Sighting, bias_rad: float) -> Sighting:
     )
 
 
-def sighting_fault(sighting: Sighting) -> str:
-    """Why a sighting must not be used (resolution i); empty if it may.
+def sighting_fault(sighting: Sighting) -> SightingFault | None:
+    """Why a sighting must not be used (resolution i); None if it may be.
 
-    A heading needs its sigma, for no model of the sensor has one.
+    A heading needs its own sigma, because the sensor model has none.
     """
     r, a, h = sighting.range_m, sighting.bearing_rad, sighting.heading_rad
     range_sigma, bearing_sigma = sighting.range_sigma_m, sighting.bearing_sigma_rad
@@ -109,12 +113,12 @@ def sighting_fault(sighting: Sighting) -> str:
         and (h is None if heading_sigma is None else 0.0 < heading_sigma <= LARGEST_M)
         and not (r is None and a is None)
     ):
-        return ""
-    return _fault(sighting)
+        return None
+    return _gravest_fault(sighting)
 
 
-def _fault(sighting: Sighting) -> str:
-    """What is wrong with a sighting, the gravest first."""
+def _gravest_fault(sighting: Sighting) -> SightingFault:
+    """The gravest fault of a sighting that has one."""
     numbers = (
         sighting.range_m,
         sighting.bearing_rad,
@@ -125,25 +129,25 @@ def _fault(sighting: Sighting) -> str:
     )
     given = [n for n in numbers if n is not None]
     if not all(math.isfinite(n) for n in given):
-        return "not_finite"
+        return SightingFault.NOT_FINITE
     if any(n > LARGEST_M for n in given):
-        return "implausible_number"
+        return SightingFault.IMPLAUSIBLE_NUMBER
     if sighting.range_m is None and sighting.bearing_rad is None:
-        return "empty_sighting"
+        return SightingFault.EMPTY_SIGHTING
     if sighting.range_m is not None and sighting.range_m <= 0.0:
-        return "range_not_positive"
+        return SightingFault.RANGE_NOT_POSITIVE
     if sighting.bearing_rad is not None and abs(sighting.bearing_rad) > LARGEST_BEARING_RAD:
-        return "bearing_out_of_range"
+        return SightingFault.BEARING_OUT_OF_RANGE
     if sighting.heading_rad is not None:
         if abs(sighting.heading_rad) > LARGEST_BEARING_RAD:
-            return "heading_out_of_range"
+            return SightingFault.HEADING_OUT_OF_RANGE
         if sighting.heading_sigma_rad is None:
-            return "heading_without_sigma"
-    return "sigma_not_positive"
+            return SightingFault.HEADING_WITHOUT_SIGMA
+    return SightingFault.SIGMA_NOT_POSITIVE
 
 
-def range_to_expect(expected_m: float, range_m: float) -> float:
-    """The expected range, within a factor of two of the reading."""
+def bounded_expected_range(expected_m: float, range_m: float) -> float:
+    """The expected range (m), limited to a factor of two of the reading."""
     least, most = 0.5 * range_m, 2.0 * range_m
     return least if expected_m < least else most if expected_m > most else expected_m
 
@@ -151,28 +155,28 @@ def range_to_expect(expected_m: float, range_m: float) -> float:
 def sighting_sigmas(
     sighting: Sighting, sensor: SensorSettings, expected_range_m: float | None = None
 ) -> tuple[float, float]:
-    """(range sigma in m, bearing sigma in rad): the sighting's own, else the sensor model's.
+    """(range sigma in m, bearing sigma in rad) of the sighting itself, or else of the sensor model.
 
-    A share of the *measured* range would trust readings that are too short more than those that
-    are too long, and so pull the robot in; a share of the expected range (within a factor of two)
-    does not.
+    The sigma of a range is a share of the *expected* range. A share of the measured one would give
+    too much weight to readings that are too short, and so pull the robot towards the landmark.
     """
     range_sigma, bearing_sigma = sighting.range_sigma_m, sighting.bearing_sigma_rad
     if range_sigma is None:
         range_m = sighting.range_m or 0.0
         if expected_range_m is not None:
-            range_m = range_to_expect(expected_range_m, range_m)
+            range_m = bounded_expected_range(expected_range_m, range_m)
         range_sigma = sensor.range_sigma_m(range_m)
     return range_sigma, sensor.bearing_sigma_rad if bearing_sigma is None else bearing_sigma
 
 
-def repeated_share(seconds: float | None, correlation_s: float) -> float:
-    """By how much the variance of a reading is to grow when the same object was used `seconds` ago.
+def repetition_variance_factor(seconds: float | None, correlation_s: float) -> float:
+    """The factor on the variance of a reading of an object that was used `seconds` ago.
 
-    Errors with autocorrelation rho from one reading to the next leave of n readings the worth of
-    n (1 - rho) / (1 + rho): the gentle form of the paper's minimum time between updates.
+    With autocorrelation rho between successive errors, n readings have the information of
+    n (1 - rho) / (1 + rho) independent ones. This is a gradual form of the paper's minimum time
+    between updates.
     """
     if seconds is None or correlation_s <= 0.0:
         return 1.0
-    rho = math.exp(-max(seconds, SOONEST_S) / correlation_s)
+    rho = math.exp(-max(seconds, SHORTEST_REPETITION_S) / correlation_s)
     return (1.0 + rho) / (1.0 - rho)

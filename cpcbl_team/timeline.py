@@ -1,24 +1,27 @@
-"""Inputs that come late or out of order give the belief that they would have given in order.
+"""Late and unordered inputs give the same estimate as the same inputs in order, bit for bit.
 
-The inputs of the last seconds are kept sorted by the time they speak of, each with the state just
-before it. A late one is put in its place and what follows is run again; states are immutable, so
-going back costs nothing.
+The timeline keeps the inputs of the last seconds, sorted by the time of their measurement, and the
+state before each of them. It inserts a late input at its time and computes all later states again.
+States are immutable, so an old state is available at no cost.
 """
 
 from bisect import bisect_left, bisect_right
 from collections.abc import Callable
+from enum import StrEnum
 
 import msgspec
 
 from cpcbl_team.beliefs import BELIEF_VALID_BEFORE_NS
-from cpcbl_team.inputs import Belief, Fix, Input, Odometry, Position, Sightings, Told
+from cpcbl_team.inputs import Belief, BeliefShared, Fix, Input, Odometry, Position, Sightings
 from cpcbl_team.localizer import Localizer
 from cpcbl_team.state import State
 
 Key = tuple[int, int, str, bytes]
 HORIZON_NS = 2_000_000_000
 _PRUNE = 64
-_content = msgspec.msgpack.Encoder(enc_hook=float).encode  # numpy's numbers too; `repr` is slow
+_content = msgspec.msgpack.Encoder(
+    enc_hook=float
+).encode  # also of numpy's numbers; faster than `repr`
 
 _apply: dict[type, Callable[[Localizer, State, Input], State]] = {
     Odometry: Localizer.add_odometry,  # type: ignore[dict-item]
@@ -26,7 +29,7 @@ _apply: dict[type, Callable[[Localizer, State, Input], State]] = {
     Sightings: Localizer.cycle,  # type: ignore[dict-item]
     Position: Localizer.add_position,  # type: ignore[dict-item]
     Fix: Localizer.add_fix,  # type: ignore[dict-item]
-    Told: Localizer.mark_shared,  # type: ignore[dict-item]
+    BeliefShared: Localizer.mark_shared,  # type: ignore[dict-item]
 }
 _rank = {kind: rank for rank, kind in enumerate(_apply)}
 
@@ -36,7 +39,7 @@ def _measured_ns(item: Input) -> int:
 
 
 def _key(item: Input) -> Key:
-    """Sorts by time, then by kind and content, so that the order of arrival plays no part."""
+    """The order of inputs by time, kind and content, so that the order of arrival has no effect."""
     time_ns = _measured_ns(item)
     if isinstance(item, Belief):
         time_ns -= BELIEF_VALID_BEFORE_NS
@@ -44,8 +47,15 @@ def _key(item: Input) -> Key:
     return time_ns, _rank[type(item)], who, _content(item)
 
 
+class TimelineRefusal(StrEnum):
+    """Why the timeline does not use an input."""
+
+    TOO_LATE = "too_late"
+    DUPLICATE = "duplicate"
+
+
 class Timeline:
-    """The state of one localizer, fed in any order."""
+    """The states of one localizer, whose inputs come in any order."""
 
     def __init__(self, localizer: Localizer, state: State, horizon_ns: int = HORIZON_NS) -> None:
         self._localizer = localizer
@@ -56,38 +66,38 @@ class Timeline:
         self.state = state
         self._start_ns = self._oldest_ns = state.stamp_ns
 
-    def add(self, item: Input) -> str:
-        """Takes an input; the reason if it cannot be used: `too_late`, `duplicate`."""
+    def add(self, item: Input) -> TimelineRefusal | None:
+        """Inserts an input at its time; the reason if it cannot be used."""
         key = _key(item)
         keys = self._keys
         if _measured_ns(item) < self._start_ns:
-            return "too_late"
+            return TimelineRefusal.TOO_LATE
         if keys and key[0] < keys[-1][0] - self._horizon_ns:
-            return "too_late"
+            return TimelineRefusal.TOO_LATE
         if not keys or key > keys[-1]:
             self._append(key, item)
-            return ""
-        place = bisect_left(keys, key)
-        if place < len(keys) and keys[place] == key:
-            return "duplicate"
-        again = [(key, item), *zip(keys[place:], self._inputs[place:], strict=True)]
-        self.state = self._before[place]
-        del keys[place:], self._inputs[place:], self._before[place:]
+            return None
+        index = bisect_left(keys, key)
+        if index < len(keys) and keys[index] == key:
+            return TimelineRefusal.DUPLICATE
+        again = [(key, item), *zip(keys[index:], self._inputs[index:], strict=True)]
+        self.state = self._before[index]
+        del keys[index:], self._inputs[index:], self._before[index:]
         for a_key, an_item in again:
             self._append(a_key, an_item)
-        return ""
+        return None
 
     def latest(self, now_ns: int) -> State:
-        """The newest state whose motion is known.
+        """The state at `now_ns`, or at the end of the known odometry if that is earlier.
 
-        It does not run ahead of odometry, unless that has fallen silent.
+        If odometry has been missing for longer than its timeout, it is the state at `now_ns`.
         """
         s, odometry_ns = self._localizer.settings.odometry, self.state.odometry_until_ns
         silent = not s.moves or now_ns - odometry_ns > s.timeout_s * 1e9
         return self.at(now_ns if silent else min(now_ns, odometry_ns)) or self.state
 
     def at(self, stamp_ns: int) -> State | None:
-        """The state at a time (after the inputs stamped with it); None if it is forgotten."""
+        """The state at a time, after the inputs of that time; None if it is no longer kept."""
         if stamp_ns < self._oldest_ns:
             return None
         after = bisect_right(self._keys, (stamp_ns, len(_rank), "", b""))

@@ -49,9 +49,11 @@ class JointVariant:
         """The estimate in the form that the variant keeps."""
         return estimate
 
-    def move(self, estimate: Estimate, distance: float, turn: float, crawled_s: float) -> Estimate:
+    def move(
+        self, estimate: Estimate, distance: float, turn: float, time_at_min_speed_s: float
+    ) -> Estimate:
         """Step 1: the estimate after an arc of `distance` (m) that turns by `turn` (rad)."""
-        return move(estimate, distance, turn, self._noise, crawled_s)
+        return move(estimate, distance, turn, self._noise, time_at_min_speed_s)
 
     def merge(self, prior: Estimate, evidence: Sums, scope: Scope) -> Estimate:
         """Step 5: the prior and the evidence as one Gaussian (equations 3 and 4)."""
@@ -102,8 +104,10 @@ class OvalVariant(JointVariant):
             estimate = estimate._replace(covariance=covariance)
         return with_all_shared(estimate)
 
-    def move(self, estimate: Estimate, distance: float, turn: float, crawled_s: float) -> Estimate:
-        return self.reduce(move(estimate, distance, turn, self._noise, crawled_s))
+    def move(
+        self, estimate: Estimate, distance: float, turn: float, time_at_min_speed_s: float
+    ) -> Estimate:
+        return self.reduce(move(estimate, distance, turn, self._noise, time_at_min_speed_s))
 
     def merge(self, prior: Estimate, evidence: Sums, scope: Scope) -> Estimate:
         return self.reduce(merge(prior, evidence, scope))
@@ -117,10 +121,14 @@ class CircularVariant(OvalVariant):
             estimate = super().reduce(estimate)
         return with_all_shared(circular(estimate))
 
-    def move(self, estimate: Estimate, distance: float, turn: float, crawled_s: float) -> Estimate:
+    def move(
+        self, estimate: Estimate, distance: float, turn: float, time_at_min_speed_s: float
+    ) -> Estimate:
         if self._uncoupled:
-            return super().move(estimate, distance, turn, crawled_s)
-        return with_all_shared(move(estimate, distance, turn, self._noise, crawled_s, True))
+            return super().move(estimate, distance, turn, time_at_min_speed_s)
+        return with_all_shared(
+            move(estimate, distance, turn, self._noise, time_at_min_speed_s, True)
+        )
 
     def merge(self, prior: Estimate, evidence: Sums, scope: Scope) -> Estimate:
         if self._uncoupled:

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 from cpcbl_agents.agent import AgentMessage, FrameEstimate, PoseEstimate, Presence, Tick
 from cpcbl_team.config import Field, LocalizationSettings
-from cpcbl_team.inputs import Belief, Fix, Input, Odometry, Position, Sightings, Told
+from cpcbl_team.inputs import Belief, BeliefShared, Fix, Input, Odometry, Position, Sightings
 from cpcbl_team.localizer import Localizer
 from cpcbl_team.self_calibration import SelfCalibration
 from cpcbl_team.sensors import without_bearing_bias
@@ -71,7 +71,7 @@ class FilterAgent:
                 if self._add(message):
                     self._waiting.append(message)
                 return self._frame_estimates(now_ns)
-            case Position() | Belief() | Fix() | Told():
+            case Position() | Belief() | Fix() | BeliefShared():
                 self._add(message)
             case Presence(name, None):
                 self._guests.discard(name)

@@ -10,7 +10,7 @@ from cpcbl_agents.filtering import FilterAgent
 from cpcbl_agents.guests import GuestRegistry
 from cpcbl_agents.sensing import SensingAgent
 from cpcbl_team.config import Team
-from cpcbl_team.inputs import Belief, Fix, Odometry, Position, Sightings, Told
+from cpcbl_team.inputs import Belief, BeliefShared, Fix, Odometry, Position, Sightings
 from cpcbl_team.trust import TrustStatus
 from cpcbl_transport.budget import Budget
 from cpcbl_transport.messages import (
@@ -98,7 +98,7 @@ class Robot:
         """From now on what this robot knows may be in what its teammates publish."""
         if stamp_ns > self._shared_ns:
             self._shared_ns = stamp_ns
-            self.filter.handle(Told(stamp_ns), now_ns)
+            self.filter.handle(BeliefShared(stamp_ns), now_ns)
 
     @property
     def next_ns(self) -> int:

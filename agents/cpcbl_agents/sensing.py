@@ -11,7 +11,7 @@ from cpcbl_agents.sources import OwnCamera, Source
 from cpcbl_agents.waypoint_follower import WaypointFollower
 from cpcbl_team.config import LocalizationSettings
 from cpcbl_team.inputs import Odometry, Position, Sightings
-from cpcbl_team.sensors import corrected_odometry, corrected_sighting, once_each
+from cpcbl_team.sensors import corrected_odometry, corrected_sighting, without_duplicates
 from cpcbl_transport.messages import Frame
 
 ANNOTATION_INTERVAL_NS = 500_000_000
@@ -106,7 +106,7 @@ class SensingAgent:
             return corrected_odometry(item, self._odometry)
         if isinstance(item, Position):
             return msgspec.structs.replace(item, stamp_ns=item.stamp_ns - self._position_delay_ns)
-        sightings = once_each(item.sightings)
+        sightings = without_duplicates(item.sightings)
         if len(sightings) < len(item.sightings):
             self._counts["seen_twice"] += len(item.sightings) - len(sightings)
         kept = tuple(

@@ -23,7 +23,7 @@ from cpcbl_team.config import Field, Landmark, OdometrySettings, SensorSettings,
 from cpcbl_team.estimate import POSITION, Covariance3, Estimate, Information, merge
 from cpcbl_team.fixes import fix_for
 from cpcbl_team.geometry import Pose2
-from cpcbl_team.inputs import Fix, Input, Odometry, Position, Sighting, Sightings, Told
+from cpcbl_team.inputs import BeliefShared, Fix, Input, Odometry, Position, Sighting, Sightings
 from cpcbl_team.state import State
 from cpcbl_team.timeline import Timeline
 
@@ -77,7 +77,7 @@ def anything(rng: random.Random, count: int) -> Iterator[Input]:
             told = belief(*place(), now)
             yield replace(told, covariance=(a, 0.0, a, 0.0, 0.0, b), speed_m_s=rng.uniform(-9, 9))
         else:
-            yield Told(now)
+            yield BeliefShared(now)
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
@@ -101,7 +101,7 @@ def test_what_is_shared_is_a_part_of_the_covariance(
     variant: Variant, told: bool, variance: float
 ) -> None:
     robot, state = localizer(variant, odometry=STILL), state_at(ORIGIN, diagonal(0.05, 0.066))
-    state = robot.mark_shared(state, Told(1)) if told else state
+    state = robot.mark_shared(state, BeliefShared(1)) if told else state
     sharp = variance, 0.0, variance
     for stamp_ns in range(2, 7):
         fix = Fix("me", "mate", stamp_ns, 0.01, -0.01, sharp, sharp, 0.0, 1e-4, 1e-4)

@@ -25,7 +25,7 @@ from cpcbl_team.estimate import (
     circular,
     merge,
 )
-from cpcbl_team.fusion import Observation, merge_naive, merge_split, told, with_all_shared
+from cpcbl_team.fusion import Observation, mark_shared, merge_naive, merge_split, with_all_shared
 from cpcbl_team.gaussian import Covariance2
 from cpcbl_team.geometry import Pose2
 from cpcbl_team.motion import move
@@ -163,7 +163,7 @@ def test_what_is_out_of_scope_keeps_its_mean_and_variance(
     kept: list[int],
 ) -> None:
     rng = np.random.default_rng(seed)
-    prior = told(Estimate(POSE, covariance3(random_matrix(rng, 3))))
+    prior = mark_shared(Estimate(POSE, covariance3(random_matrix(rng, 3))))
     seen = random_observation(rng, 2)
     seen = seen._replace(
         independent=seen.independent.scaled(1e-4), dependent=seen.dependent.scaled(1e-4)
@@ -310,7 +310,7 @@ def an_event(rng: np.random.Generator, estimate: Estimate, scope: Scope) -> Esti
         case 2:
             estimate = merge_split(estimate, seen, scope)
         case _:
-            estimate = told(estimate)
+            estimate = mark_shared(estimate)
     return estimate if scope is Scope.POSE else with_all_shared(estimate)
 
 
@@ -352,7 +352,7 @@ def test_the_same_teammates_error_counts_only_once(
 def test_a_belief_that_was_told_is_shared_as_a_whole() -> None:
     estimate = Estimate(POSE, diagonal(0.3, 0.1))
     assert with_all_shared(estimate).shared == ZERO3
-    assert told(estimate).shared == estimate.covariance
-    partly = merge(told(estimate), Information.none().add((1.0, 0.0, 0.0), 0.0, 0.01))
+    assert mark_shared(estimate).shared == estimate.covariance
+    partly = merge(mark_shared(estimate), Information.none().add((1.0, 0.0, 0.0), 0.0, 0.01))
     assert partly.shared != partly.covariance
     assert with_all_shared(partly).shared == partly.covariance

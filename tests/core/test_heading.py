@@ -42,7 +42,7 @@ from cpcbl_team.config import (
 from cpcbl_team.estimate import Covariance3, Estimate
 from cpcbl_team.fixes import fix_for, without_heading
 from cpcbl_team.geometry import Pose2, step, wrap_angle
-from cpcbl_team.inputs import Fix, Odometry, Sighting, Told
+from cpcbl_team.inputs import BeliefShared, Fix, Odometry, Sighting
 from cpcbl_team.localizer import Localizer
 from cpcbl_team.motion import motion_noise
 from cpcbl_team.pose_observation import from_fix, from_position_sensor
@@ -129,7 +129,7 @@ def test_elsewhere_it_leaves_the_position_alone(variant: Variant) -> None:
 def test_a_heading_told_back_is_not_new() -> None:
     """What the robot itself told others (resolution c)."""
     robot = localizer("joint", odometry=STILL)
-    state = robot.mark_shared(state_at(ORIGIN, diagonal(0.2, 0.1)), Told(0))
+    state = robot.mark_shared(state_at(ORIGIN, diagonal(0.2, 0.1)), BeliefShared(0))
     for i in range(1, 50):
         same = {"sensor_m": 0.01, "observer_m": 0.2, "sensor_rad": 0.001, "observer_rad": 0.1}
         state = robot.add_fix(state, fix(0.0, 0.0, i, heading=0.0, **same))

@@ -47,7 +47,7 @@ from cpcbl_team.constraints import range_circle
 from cpcbl_team.estimate import SPREAD_SHARE, ZERO3, Covariance3
 from cpcbl_team.gaussian import Covariance2, Gaussian2
 from cpcbl_team.geometry import Pose2
-from cpcbl_team.inputs import Fix, Odometry, Sighting, Sightings, Told
+from cpcbl_team.inputs import BeliefShared, Fix, Odometry, Sighting, Sightings
 from cpcbl_team.localizer import Localizer
 from cpcbl_team.state import State
 
@@ -539,7 +539,7 @@ def test_a_fix_is_no_update_of_a_type() -> None:
 def test_what_a_told_robot_hears_back_is_not_new() -> None:
     """Its own belief, returned by a teammate, must not make it more certain (resolution c)."""
     robot = standing("joint")
-    state = robot.mark_shared(state_at(ORIGIN, diagonal(0.2, 0.1)), Told(0))
+    state = robot.mark_shared(state_at(ORIGIN, diagonal(0.2, 0.1)), BeliefShared(0))
     for i in range(1, 50):
         state = robot.add_fix(state, fix(0.0, 0.0, i, sensor_m=0.01, observer_m=0.2))
     assert state.estimate.position_sigma_m > 0.99 * 0.2
@@ -550,7 +550,7 @@ def test_what_says_nothing_new_costs_nothing(variant: Variant) -> None:
     """Merged it would widen what it says nothing of: here the heading, by 2 % of its variance each
     time."""
     robot = standing(variant)
-    before = robot.mark_shared(state_at(ORIGIN, diagonal(0.2, 0.1)), Told(0))
+    before = robot.mark_shared(state_at(ORIGIN, diagonal(0.2, 0.1)), BeliefShared(0))
     state = before
     for i in range(1, 50):
         state = robot.add_fix(state, fix(0.0, 0.0, i, observer_m=0.5))
@@ -561,7 +561,7 @@ def test_what_says_nothing_new_costs_nothing(variant: Variant) -> None:
 def test_a_fix_does_not_cost_the_heading(variant: Variant) -> None:
     """The weight that is best for the position alone gives up what is known of the heading."""
     robot = localizer(variant)
-    state = robot.mark_shared(state_at(ORIGIN, diagonal(0.5, 0.05)), Told(0))
+    state = robot.mark_shared(state_at(ORIGIN, diagonal(0.5, 0.05)), BeliefShared(0))
     state = robot.add_fix(state, fix(0.1, 0.1, 1))
     assert state.estimate.position_sigma_m < 0.1
     assert state.estimate.heading_sigma_rad < 2.0 * 0.05
@@ -578,7 +578,7 @@ def test_what_is_shared_stays_a_part_of_the_covariance(variant: Variant, paper: 
         state = robot.predict(robot.add_odometry(state, odometry), now)
         match rng.integers(4):
             case 0:
-                state = robot.mark_shared(state, Told(now))
+                state = robot.mark_shared(state, BeliefShared(now))
             case 1:
                 x, y = (truth.x, truth.y) + 0.05 * rng.normal(size=2)
                 state = robot.add_fix(state, fix(x, y, now))

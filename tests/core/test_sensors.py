@@ -10,12 +10,12 @@ from cpcbl_team.inputs import Odometry, Sighting, Sightings
 from cpcbl_team.sensors import (
     corrected_odometry,
     corrected_sighting,
-    crawled_s,
-    once_each,
-    repeated_share,
+    repetition_variance_factor,
     sighting_fault,
     sighting_sigmas,
+    time_at_min_speed_s,
     without_bearing_bias,
+    without_duplicates,
 )
 
 SENSOR = SensorSettings(range_share=0.05, range_floor_m=0.0, bearing_sigma_deg=5.0)
@@ -64,7 +64,7 @@ def test_a_sighting_that_must_not_be_used_says_why(sighting: Sighting, fault: st
     ],
 )
 def test_a_sighting_may_give_either_or_both(sighting: Sighting) -> None:
-    assert sighting_fault(sighting) == ""  # row 2
+    assert sighting_fault(sighting) is None  # row 2
 
 
 def test_a_range_sigma_is_a_share_of_the_range() -> None:
@@ -130,8 +130,8 @@ def test_a_robot_crawls_at_its_least_speed(commanded: float, crawls: bool, share
     s = OdometrySettings(least_speed_m_s=0.02, distance_scale=0.97)
     driven = corrected_odometry(Odometry(0, 500_000_000, 0.5 * commanded, 0.0), s).distance_m
     seconds = share * 0.5
-    assert crawled_s(share * driven, seconds, s) == (seconds if crawls else 0.0)
-    assert crawled_s(share * driven, seconds, OdometrySettings()) == 0.0
+    assert time_at_min_speed_s(share * driven, seconds, s) == (seconds if crawls else 0.0)
+    assert time_at_min_speed_s(share * driven, seconds, OdometrySettings()) == 0.0
 
 
 @pytest.mark.parametrize("teammate", [False, True])
@@ -209,10 +209,12 @@ def test_what_one_frame_reads_twice_is_read_once() -> None:
     ranged, borne = Sighting("oak", 2.0), Sighting("oak", None, 0.3)
     whole, empty = Sighting("elm", 2.0, 0.3), Sighting("elm")
     each = (ranged, borne, whole, empty, Sighting("elm", None, None, heading_rad=1.0))
-    assert once_each(each) == each
-    assert once_each(each[:3]) == each[:3]
-    assert once_each((whole,) * 100) == (whole,)
-    assert once_each((whole, Sighting("elm", 2.1), Sighting("elm", None, 0.31))) == (whole,)
+    assert without_duplicates(each) == each
+    assert without_duplicates(each[:3]) == each[:3]
+    assert without_duplicates((whole,) * 100) == (whole,)
+    assert without_duplicates((whole, Sighting("elm", 2.1), Sighting("elm", None, 0.31))) == (
+        whole,
+    )
 
 
 def test_a_bias_is_taken_from_all_bearings_that_are_good() -> None:
@@ -231,11 +233,11 @@ def test_a_bias_is_taken_from_all_bearings_that_are_good() -> None:
 
 
 def test_what_is_read_again_soon_counts_for_less() -> None:
-    assert repeated_share(None, 3.0) == 1.0
-    assert repeated_share(0.5, 0.0) == 1.0
-    assert repeated_share(100.0, 3.0) == pytest.approx(1.0)
-    assert repeated_share(1.0, 2.0) > repeated_share(2.0, 2.0) > 1.0
-    assert math.isfinite(repeated_share(0.0, 2.0))
+    assert repetition_variance_factor(None, 3.0) == 1.0
+    assert repetition_variance_factor(0.5, 0.0) == 1.0
+    assert repetition_variance_factor(100.0, 3.0) == pytest.approx(1.0)
+    assert repetition_variance_factor(1.0, 2.0) > repetition_variance_factor(2.0, 2.0) > 1.0
+    assert math.isfinite(repetition_variance_factor(0.0, 2.0))
 
 
 def test_doubt_makes_the_mean_of_correlated_readings_consistent() -> None:
@@ -243,4 +245,4 @@ def test_doubt_makes_the_mean_of_correlated_readings_consistent() -> None:
     rho = math.exp(-dt / tau)
     lags = range(1, n)
     variance_of_mean = (n + 2.0 * sum((n - k) * rho**k for k in lags)) / n**2
-    assert repeated_share(dt, tau) / n == pytest.approx(variance_of_mean, rel=0.02)
+    assert repetition_variance_factor(dt, tau) / n == pytest.approx(variance_of_mean, rel=0.02)

@@ -27,7 +27,7 @@ from support.core import (
 
 from cpcbl_team.beliefs import BELIEF_VALID_BEFORE_NS
 from cpcbl_team.config import LocalizerSettings, SensorSettings, Variant
-from cpcbl_team.inputs import Belief, Fix, Input, Odometry, Position, Sightings, Told
+from cpcbl_team.inputs import Belief, BeliefShared, Fix, Input, Odometry, Position, Sightings
 from cpcbl_team.localizer import Localizer
 from cpcbl_team.self_calibration import SelfCalibration
 from cpcbl_team.state import State
@@ -57,7 +57,7 @@ def history(seconds: float, seed: int = 1) -> list[Input]:
         if i % 4 == 0:
             inputs.append(belief(1.0, 0.0, odometry.from_ns))
         if i % 5 == 0:
-            inputs.append(Told(inside))
+            inputs.append(BeliefShared(inside))
     return sorted(inputs, key=time_of)
 
 
@@ -85,7 +85,7 @@ def by_hand(robot: Localizer, inputs: Iterable[Input]) -> State:
                 state = robot.add_fix(state, item)
             case Belief():
                 state = robot.add_teammate_belief(state, item)
-            case Told():
+            case BeliefShared():
                 state = robot.mark_shared(state, item)
     return state
 
@@ -131,7 +131,7 @@ def test_any_order_within_the_horizon_gives_the_same_bits(
 def test_a_long_run_with_delays_gives_the_same_bits(seed: int) -> None:
     """Long enough for the timeline to forget; each kind of input has its own delay."""
     rng, robot, inputs = np.random.default_rng(seed), localizer("joint", MIXED), history(8.0)
-    delay = {Odometry: 20, Sightings: 300, Position: 50, Fix: 900, Belief: 500, Told: 100}
+    delay = {Odometry: 20, Sightings: 300, Position: 50, Fix: 900, Belief: 500, BeliefShared: 100}
     arrivals = [stamp_of(i) + rng.uniform(0.0, delay[type(i)]) * MS for i in inputs]
     late = after(robot, [inputs[i] for i in np.argsort(arrivals)])
     assert same(late.state, by_hand(robot, inputs))
@@ -165,7 +165,7 @@ def test_a_fix_that_comes_late_counts_from_when_it_was_measured(late_by_ms: int)
     late_fix = fix(-1.7, -1.0, 500 * MS, sensor_m=0.01, observer_m=0.01)
     timeline = after(robot, [i for i in inputs if time_of(i) <= (500 + late_by_ms) * MS])
     before = timeline.state
-    assert timeline.add(late_fix) == ""
+    assert timeline.add(late_fix) is None
     assert timeline.state.estimate != before.estimate
     for item in inputs:
         if time_of(item) > (500 + late_by_ms) * MS:
@@ -180,7 +180,7 @@ def test_a_frame_inside_an_older_piece_of_odometry_is_seen_from_there() -> None:
     wheels = [Odometry(i * 100 * MS, (i + 1) * 100 * MS, 0.1, 0.0) for i in range(4)]
     timeline = after(robot, wheels)
     there = LOOP_START._replace(x=LOOP_START.x + 0.15)
-    assert timeline.add(frame(there, 150 * MS, MIXED)) == ""
+    assert timeline.add(frame(there, 150 * MS, MIXED)) is None
     state = timeline.latest(400 * MS)
     assert state.estimate.pose == pytest.approx((LOOP_START.x + 0.4, LOOP_START.y, 0.0))
     assert state.estimate.position_sigma_m < 0.05
@@ -214,7 +214,7 @@ def test_a_belief_that_comes_after_the_sighting_counts_as_if_it_had_come_before(
     told = belief(1.05, 0.02, SECOND + after_ms * MS, sigma_m=0.02)
     late = after(robot, [seen])
     before = late.state
-    assert late.add(told) == ""
+    assert late.add(told) is None
     assert (late.state.counts == {"accepted": 1}) is used
     known = late.at(SECOND)
     assert known is not None
@@ -271,7 +271,7 @@ def test_beliefs_in_any_order_give_the_same_bits(
 # What is refused ----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("kind", [Odometry, Sightings, Position, Fix, Belief, Told])
+@pytest.mark.parametrize("kind", [Odometry, Sightings, Position, Fix, Belief, BeliefShared])
 def test_what_came_already_is_refused(kind: type[Input]) -> None:
     inputs = history(1.0)
     timeline = after(localizer("joint", MIXED), inputs)
@@ -287,7 +287,7 @@ def test_of_pieces_of_odometry_of_one_time_the_order_of_arrival_plays_no_part() 
     found = []
     for order in permutations(pieces):
         timeline = Timeline(localizer("joint", MIXED), START)
-        assert [timeline.add(piece) for piece in order] == ["", ""]
+        assert [timeline.add(piece) for piece in order] == [None, None]
         found.append(timeline.latest(100 * MS))
     assert found[0] == found[1]
     assert found[0].counts == {"odometry_overlap": 1}
@@ -295,8 +295,8 @@ def test_of_pieces_of_odometry_of_one_time_the_order_of_arrival_plays_no_part() 
 
 def test_two_different_frames_of_one_time_are_both_used() -> None:
     timeline = Timeline(localizer("joint", MIXED), START)
-    assert timeline.add(frame(LOOP_START, 7, MIXED, ["both"])) == ""
-    assert timeline.add(frame(LOOP_START, 7, MIXED, ["ranged"])) == ""
+    assert timeline.add(frame(LOOP_START, 7, MIXED, ["both"])) is None
+    assert timeline.add(frame(LOOP_START, 7, MIXED, ["ranged"])) is None
     assert timeline.state.counts == {"accepted": 2}
 
 
@@ -306,14 +306,14 @@ def test_what_is_older_than_the_horizon_is_refused() -> None:
     before = timeline.state
     assert timeline.add(fix(0.0, 0.0, newest - HORIZON_NS - 1)) == "too_late"
     assert timeline.state is before
-    assert timeline.add(fix(0.0, 0.0, newest - HORIZON_NS)) == ""
+    assert timeline.add(fix(0.0, 0.0, newest - HORIZON_NS)) is None
 
 
 def test_a_belief_is_too_late_as_soon_as_the_sightings_before_it_are() -> None:
     timeline = after(localizer("joint", MIXED), history(5.0))
     oldest = time_of(history(5.0)[-1]) - HORIZON_NS + BELIEF_VALID_BEFORE_NS
     assert timeline.add(belief(1.0, 0.0, oldest - 1)) == "too_late"
-    assert timeline.add(belief(1.0, 0.0, oldest)) == ""
+    assert timeline.add(belief(1.0, 0.0, oldest)) is None
 
 
 def test_what_is_older_than_the_start_is_refused() -> None:
@@ -321,15 +321,15 @@ def test_what_is_older_than_the_start_is_refused() -> None:
     timeline = Timeline(robot, state_at(LOOP_START, diagonal(0.1, 0.1), SECOND))
     assert timeline.add(frame(LOOP_START, SECOND - 1, MIXED)) == "too_late"
     assert timeline.add(belief(1.0, 0.0, SECOND - 1)) == "too_late"
-    assert timeline.add(frame(LOOP_START, SECOND, MIXED)) == ""
+    assert timeline.add(frame(LOOP_START, SECOND, MIXED)) is None
 
 
 def test_a_belief_of_the_start_is_used() -> None:
     """It stands in the timeline before the start, and is none the worse for it."""
     robot = localizer("joint", MIXED)
     timeline = Timeline(robot, state_at(LOOP_START, diagonal(0.1, 0.1), SECOND))
-    assert timeline.add(frame_of_mate(SECOND)) == ""
-    assert timeline.add(belief(1.0, 0.0, SECOND)) == ""
+    assert timeline.add(frame_of_mate(SECOND)) is None
+    assert timeline.add(belief(1.0, 0.0, SECOND)) is None
     assert timeline.state.counts == {"accepted": 1}
     assert timeline.at(SECOND - 1) is None
 

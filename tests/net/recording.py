@@ -102,7 +102,7 @@ def _drive(settings: LocalizationSettings, inputs: Iterable[Input]) -> Run:
     for step, item in enumerate(inputs):
         refusal = timeline.add(item)
         state = canonical_state(localizer, timeline.state, with_evidence=step % KEPT_STATES == 0)
-        steps.append((_label(item), {"refusal": str(refusal), **state}))
+        steps.append((_label(item), {"refusal": str(refusal or ""), **state}))
     return _run(steps, KEPT_STATES)
 
 

@@ -15,7 +15,16 @@ from msgspec.structs import replace
 
 from cpcbl_team.config import Field, Landmark, Wall
 from cpcbl_team.geometry import Pose2, step, wrap_angle
-from cpcbl_team.inputs import Belief, Fix, Input, Odometry, Position, Sighting, Sightings, Told
+from cpcbl_team.inputs import (
+    Belief,
+    BeliefShared,
+    Fix,
+    Input,
+    Odometry,
+    Position,
+    Sighting,
+    Sightings,
+)
 
 FIELD = Field(
     landmarks={
@@ -83,7 +92,7 @@ def _tick_inputs(
             late = name == "ally" and tick % 30 < 6
             yield _fix(rng, name, tick, now, truth), 250_000_000 if late else 0
     if tick > 20 and tick % 10 == 9:
-        yield Told(now), 0
+        yield BeliefShared(now), 0
     if tick > 300 and tick % 7 == 0:
         x, y = truth.x + 0.05 * rng.gauss(0.0, 1.0), truth.y + 0.05 * rng.gauss(0.0, 1.0)
         yield Position(now, x, y, (0.0025, 0.0001, 0.0036)), 0

@@ -32,7 +32,12 @@ from cpcbl_team.fusion import chi_square_bounds
 from cpcbl_team.geometry import Pose2, step, wrap_angle
 from cpcbl_team.inputs import Odometry, Sighting, Sightings
 from cpcbl_team.motion import motion_noise
-from cpcbl_team.sensors import crawled_s, repeated_share, sighting_fault, sighting_sigmas
+from cpcbl_team.sensors import (
+    repetition_variance_factor,
+    sighting_fault,
+    sighting_sigmas,
+    time_at_min_speed_s,
+)
 
 SMALLEST_VARIANCE = 1e-12  # (1 um)^2: exact sensors must not make a matrix singular
 _TRIANGLE = ((0, 0, 1, 0, 1, 2), (0, 1, 1, 2, 2, 2))  # xx, xy, yy, xh, yh, hh
@@ -218,7 +223,7 @@ class Ekf:
         p[i : i + 2] += lever[:, None] * p[i + 2]
         p[:, i : i + 2] += p[:, i + 2, None] * lever
         s = robot.settings.odometry
-        crawled = crawled_s(distance, seconds, s)
+        crawled = time_at_min_speed_s(distance, seconds, s)
         self._add(i, motion_noise(before.heading, distance, turn, s, crawled))
 
     def _add_gap_noise(self, robot: _RobotBlock, until_ns: int) -> None:
@@ -254,7 +259,7 @@ class Ekf:
             if found is None:
                 continue
             seconds = None if since_ns is None else since_ns * 1e-9
-            doubt = repeated_share(seconds, robot.settings.sensor.correlation_s)
+            doubt = repetition_variance_factor(seconds, robot.settings.sensor.correlation_s)
             found = found._replace(noise=doubt * found.noise)
             accepted = self._update(found, robot.bounds)
             if accepted:

@@ -11,7 +11,7 @@ from cpcbl_team.config import OdometrySettings, RobotSettings, SensorSettings
 from cpcbl_team.geometry import Pose2, step, wrap_angle
 from cpcbl_team.inputs import Odometry, Position, Sighting, Sightings
 from cpcbl_team.motion import motion_noise
-from cpcbl_team.sensors import LEAST_COSINE, corrected_odometry, crawled_s
+from cpcbl_team.sensors import LEAST_COSINE, corrected_odometry, time_at_min_speed_s
 from cpcbl_transport.messages import Drive, Frame
 
 COMMAND_LASTS_NS = 500_000_000
@@ -136,7 +136,7 @@ class SimulatedRobot:
         self._reported = (self._reported[0] + distance, self._reported[1] + turn)
         o = self.settings.odometry
         distance, turn = self._motion.next((actual_distance(distance, turn, seconds, o), turn))
-        crawled = crawled_s(distance, seconds, o)
+        crawled = time_at_min_speed_s(distance, seconds, o)
         in_its_direction = motion_noise(-0.5 * turn, distance, turn, o, crawled)
         along, around = math.sqrt(in_its_direction.xx), math.sqrt(in_its_direction.hh)
         self.pose = step(self.pose, distance + self._normal(along), turn + self._normal(around))
