@@ -29,15 +29,11 @@ def motion_jacobian(heading: float, distance: float, turn: float) -> Matrix3:
 
 
 def motion_noise(
-    heading: float,
-    distance: float,
-    turn: float,
-    noise: OdometryNoise,
-    time_at_min_speed_s: float = 0.0,
+    heading: float, distance: float, turn: float, noise: OdometryNoise, crawl_s: float = 0.0
 ) -> Covariance3:
     """The differential motion's covariance, rotated into the field's frame."""
     certain = Estimate(Pose2(0.0, 0.0, heading), ZERO3)
-    return move(certain, distance, turn, noise, time_at_min_speed_s).covariance
+    return move(certain, distance, turn, noise, crawl_s).covariance
 
 
 def move(
@@ -45,12 +41,12 @@ def move(
     distance: float,
     turn: float,
     noise: OdometryNoise,
-    time_at_min_speed_s: float = 0.0,
+    crawl_s: float = 0.0,
     as_circle: bool = False,
 ) -> Estimate:
     """The estimate after the wheels report an arc of `distance` metres that turns by `turn`.
 
-    F P F^T + C is written out, for it runs for every odometry step. `time_at_min_speed_s`: how many seconds
+    F P F^T + C is written out, for it runs for every odometry step. `crawl_s`: how many seconds
     of it the robot drove at its least speed. `as_circle`: the position's covariance is kept as a
     circle.
     """
@@ -62,8 +58,8 @@ def move(
     way, turned = abs(distance), abs(turn)
     per_m, per_rad = noise.distance_sigma_m_per_sqrt_m, noise.distance_sigma_m_per_sqrt_rad
     along = per_m * per_m * way
-    if time_at_min_speed_s > 0.0:
-        along = max(along, noise.crawl_sigma_m_per_sqrt_s**2 * time_at_min_speed_s)
+    if crawl_s > 0.0:
+        along = max(along, noise.crawl_sigma_m_per_sqrt_s**2 * crawl_s)
     along += per_rad * per_rad * turned
     per_m, per_rad = noise.turn_sigma_rad_per_sqrt_m, noise.turn_sigma_rad_per_sqrt_rad
     around = per_m * per_m * way + per_rad * per_rad * turned

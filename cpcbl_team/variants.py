@@ -49,11 +49,9 @@ class JointVariant:
         """The estimate in the form that the variant keeps."""
         return estimate
 
-    def move(
-        self, estimate: Estimate, distance: float, turn: float, time_at_min_speed_s: float
-    ) -> Estimate:
+    def move(self, estimate: Estimate, distance: float, turn: float, crawl_s: float) -> Estimate:
         """Step 1: the estimate after an arc of `distance` (m) that turns by `turn` (rad)."""
-        return move(estimate, distance, turn, self._noise, time_at_min_speed_s)
+        return move(estimate, distance, turn, self._noise, crawl_s)
 
     def merge(self, prior: Estimate, evidence: Sums, scope: Scope) -> Estimate:
         """Step 5: the prior and the evidence as one Gaussian (equations 3 and 4)."""
@@ -104,10 +102,8 @@ class OvalVariant(JointVariant):
             estimate = estimate._replace(covariance=covariance)
         return with_all_shared(estimate)
 
-    def move(
-        self, estimate: Estimate, distance: float, turn: float, time_at_min_speed_s: float
-    ) -> Estimate:
-        return self.reduce(move(estimate, distance, turn, self._noise, time_at_min_speed_s))
+    def move(self, estimate: Estimate, distance: float, turn: float, crawl_s: float) -> Estimate:
+        return self.reduce(move(estimate, distance, turn, self._noise, crawl_s))
 
     def merge(self, prior: Estimate, evidence: Sums, scope: Scope) -> Estimate:
         return self.reduce(merge(prior, evidence, scope))
@@ -121,14 +117,10 @@ class CircularVariant(OvalVariant):
             estimate = super().reduce(estimate)
         return with_all_shared(circular(estimate))
 
-    def move(
-        self, estimate: Estimate, distance: float, turn: float, time_at_min_speed_s: float
-    ) -> Estimate:
+    def move(self, estimate: Estimate, distance: float, turn: float, crawl_s: float) -> Estimate:
         if self._uncoupled:
-            return super().move(estimate, distance, turn, time_at_min_speed_s)
-        return with_all_shared(
-            move(estimate, distance, turn, self._noise, time_at_min_speed_s, True)
-        )
+            return super().move(estimate, distance, turn, crawl_s)
+        return with_all_shared(move(estimate, distance, turn, self._noise, crawl_s, True))
 
     def merge(self, prior: Estimate, evidence: Sums, scope: Scope) -> Estimate:
         if self._uncoupled:

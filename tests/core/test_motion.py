@@ -108,14 +108,10 @@ def test_a_turn_on_the_spot_widens_the_position_along_the_heading() -> None:
     assert move(whole, 0.0, 2.0, SILENT).covariance == ZERO3
 
 
-@pytest.mark.parametrize(
-    ("time_at_min_speed_s", "along"), [(0.0, 0.1**2 * 0.02), (4.0, 0.03**2 * 4.0)]
-)
-def test_the_way_of_a_crawl_errs_with_the_time_it_takes(
-    time_at_min_speed_s: float, along: float
-) -> None:
+@pytest.mark.parametrize(("crawl_s", "along"), [(0.0, 0.1**2 * 0.02), (4.0, 0.03**2 * 4.0)])
+def test_the_way_of_a_crawl_errs_with_the_time_it_takes(crawl_s: float, along: float) -> None:
     noise = msgspec.structs.replace(NOISE, crawl_sigma_m_per_sqrt_s=0.03)
-    c = motion_noise(0.4, 0.02, 0.0, noise, time_at_min_speed_s)
+    c = motion_noise(0.4, 0.02, 0.0, noise, crawl_s)
     assert c.position().along(math.cos(0.4), math.sin(0.4)) == pytest.approx(along)
     assert motion_noise(0.4, 2.0, 0.0, noise, 0.1) == motion_noise(0.4, 2.0, 0.0, noise)
 
