@@ -102,7 +102,9 @@ def certificate_facts(certificate: bytes) -> CertificateFacts:
     except x509.ExtensionNotFound:
         hosts = ()
     common_name = read.subject.get_attributes_for_oid(NameOID.COMMON_NAME)[0].value
-    return CertificateFacts(str(common_name), read.not_valid_before_utc, read.not_valid_after_utc, hosts)
+    return CertificateFacts(
+        str(common_name), read.not_valid_before_utc, read.not_valid_after_utc, hosts
+    )
 
 
 def is_signed_by(certificate: bytes, authority: bytes) -> bool:

@@ -17,18 +17,18 @@ from pathlib import Path
 
 import msgspec
 
-from cpcbl_team.errors import InputError
 from cpcbl_launch.keys.authority import (
     KeyPair,
-    is_matching_pair,
     certificate_facts,
+    is_matching_pair,
+    is_signed_by,
     issue_certificate,
     new_authority,
     newest_certificate,
-    is_signed_by,
 )
 from cpcbl_launch.keys.plan import AUTHORITY, KeyAction, MemberAction, hosts, plan_actions
 from cpcbl_team.config import Team
+from cpcbl_team.errors import InputError
 from cpcbl_transport.security import (
     CA,
     CERTIFICATE,
@@ -83,7 +83,11 @@ def make_keys(team: Team, folder: Path, wish: KeyRequest) -> list[KeysReport]:
         if step.action in (KeyAction.MADE, KeyAction.RENEWED):
             names = _hosts_of(step.member.identity, at, reached)
             pair = issue_certificate(
-                _signing_pair(folder, authorities), step.member.common_name, names, now, wish.lasting
+                _signing_pair(folder, authorities),
+                step.member.common_name,
+                names,
+                now,
+                wish.lasting,
             )
             _make_folder(at)
             _replace_file(at / PRIVATE_KEY, pair.private_key, SECRET)
@@ -94,8 +98,16 @@ def make_keys(team: Team, folder: Path, wish: KeyRequest) -> list[KeysReport]:
         if step.action is not KeyAction.REVOKED:
             _replace_file(folder / str(step.member.identity) / CA, authorities, PUBLIC)
     members = msgspec.json.encode([step.member for step in steps])
-    _replace_file(folder / str(Role.ROUTER) / MEMBERS, msgspec.json.format(members, indent=1), PUBLIC)
-    deed = KeyAction.MADE if not before else KeyAction.RENEWED if AUTHORITY in wish.renew else KeyAction.KEPT
+    _replace_file(
+        folder / str(Role.ROUTER) / MEMBERS, msgspec.json.format(members, indent=1), PUBLIC
+    )
+    deed = (
+        KeyAction.MADE
+        if not before
+        else KeyAction.RENEWED
+        if AUTHORITY in wish.renew
+        else KeyAction.KEPT
+    )
     said = certificate_facts(newest_certificate(authorities))
     authority = KeysReport(
         who=AUTHORITY, common_name=said.common_name, deed=deed, valid_until=said.not_after
@@ -112,7 +124,9 @@ def _with_missing_key(step: MemberAction, folder: Path) -> MemberAction:
         )
     except FileNotFoundError:
         whole = False
-    return step if whole or step.action is not KeyAction.KEPT else step._replace(action=KeyAction.MADE)
+    return (
+        step if whole or step.action is not KeyAction.KEPT else step._replace(action=KeyAction.MADE)
+    )
 
 
 def _check_hosts(steps: Iterable[MemberAction], folder: Path, named: Collection[str]) -> None:
@@ -162,12 +176,16 @@ def _signing_pair(folder: Path, authorities: bytes) -> KeyPair:
         ) from None
 
 
-def _retire_old_authorities(steps: Iterable[MemberAction], folder: Path, authorities: bytes) -> bytes:
+def _retire_old_authorities(
+    steps: Iterable[MemberAction], folder: Path, authorities: bytes
+) -> bytes:
     """Trusts the newest authority alone."""
     latest = newest_certificate(authorities)
     for step in steps:
         certificate = folder / str(step.member.identity) / CERTIFICATE
-        if step.action is not KeyAction.REVOKED and not is_signed_by(certificate.read_bytes(), latest):
+        if step.action is not KeyAction.REVOKED and not is_signed_by(
+            certificate.read_bytes(), latest
+        ):
             raise InputError(
                 f"--retire-ca: {step.member.identity} still has a certificate of the old authority;"
                 " --renew all first, and bring the new ones to their machines"

@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 import msgspec
 
-from cpcbl_team.errors import InputError
 from cpcbl_team.config import Team
+from cpcbl_team.errors import InputError
 from cpcbl_team.inputs import NAME_PATTERN
 from cpcbl_transport.security import Identity, Member
 from cpcbl_transport.topics import Role
@@ -65,7 +65,9 @@ def plan_actions(
         for name in names:
             if not any(_is_named(identity, name) for identity in everyone):
                 raise InputError(f"{option} {name}: nobody has this name; {_names(everyone)}")
-    return tuple(_member_action(identity, before.get(identity), renew, revoke) for identity in everyone)
+    return tuple(
+        _member_action(identity, before.get(identity), renew, revoke) for identity in everyone
+    )
 
 
 def hosts(team: Team, named: Collection[str]) -> tuple[str, ...]:

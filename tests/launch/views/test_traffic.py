@@ -8,31 +8,19 @@ import signal
 import subprocess
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import msgspec
 import pytest
 from rich.console import Console, RenderableType
 from support.buses import SECOND, TeamOnBus, robot_at, saw, team_of, wait_until
-from support.logs import write_log
 from support.processes import cpcbl_team, pids_of
+from support.traffic import MISER_BYTES_PER_S, TEAM, flow, recorded, seen, shown, status
 
-from cpcbl_launch.cli import main
-from cpcbl_launch.overrides import Overrides, with_overrides
-from cpcbl_launch.reporting.flows import (
-    SpendingReport,
-    are_limits_kept,
-    summed_flows,
-    summed_spending,
-)
-from cpcbl_launch.reporting.recorder import Recorder, Report
+from cpcbl_launch.reporting.recorder import Recorder
 from cpcbl_launch.run.processes import PROGRAM
 from cpcbl_launch.run.up import free_endpoint
-from cpcbl_launch.team_file import parse_team
-from cpcbl_launch.views.run import print_report
-from cpcbl_launch.views.traffic.show import TrafficView, limit_text, traffic_view
+from cpcbl_launch.views.traffic.show import TrafficView, traffic_view
 from cpcbl_launch.views.traffic.watch import (
-    Arrival,
     StatusCollector,
     Traffic,
     traffic_from_statuses,
@@ -40,40 +28,8 @@ from cpcbl_launch.views.traffic.watch import (
 from cpcbl_team.inputs import Sighting
 from cpcbl_transport import topics
 from cpcbl_transport.memory_bus import MemoryHub
-from cpcbl_transport.messages import Flow, Spending, Status, encode
+from cpcbl_transport.messages import Spending, encode
 from cpcbl_transport.zenoh_bus import open_bus, open_router
-
-MISER_BYTES_PER_S = 5.0
-TEAM = f"""
-name = "trio"
-[map.landmarks]
-a = {{ x_m = 0.0, y_m = 0.0 }}
-b = {{ x_m = 6.0, y_m = 0.0 }}
-c = {{ x_m = 3.0, y_m = 4.0 }}
-[types.watcher]
-sensor = {{ range_share = 0.005, bearing_sigma_deg = 0.5, field_of_view_deg = 180.0 }}
-odometry = {{ moves = false }}
-[robots.driver]
-start = {{ x_m = 1.0, y_m = 1.0 }}
-waypoints_m = [[5.0, 1.0], [3.0, 3.0], [1.0, 1.0]]
-sensor = {{ sees_landmarks = false }}
-[robots.giver]
-type = "watcher"
-start = {{ x_m = 3.0, y_m = 3.5, heading_deg = -90.0 }}
-[robots.miser]
-type = "watcher"
-start = {{ x_m = 2.0, y_m = 3.5, heading_deg = -90.0 }}
-collaboration = {{ budget = {{ bytes_per_s = {MISER_BYTES_PER_S} }} }}
-"""
-
-
-def status(robot: str, at_s: float, tier: int, incarnation: str = "1", **more: Any) -> Status:
-    health = (0.01 * (tier + 1), 0.1, tier, more.pop("lost", ""), {"announced": 2})
-    return Status(robot, incarnation, int(at_s * SECOND), *health, 0, 0, 0, 0, **more)
-
-
-def flow(topic: str, peer: str, messages: int, latest_s: float = 0.0, **more: int) -> Flow:
-    return Flow(topic, peer, messages, 42 * messages, latest_ns=int(latest_s * SECOND), **more)
 
 
 def rendered(what: RenderableType, width: int = 80) -> list[str]:
@@ -81,110 +37,6 @@ def rendered(what: RenderableType, width: int = 80) -> list[str]:
     with console.capture() as capture:
         console.print(what)
     return [line.rstrip() for line in capture.get().splitlines()]
-
-
-# Sums -------------------------------------------------------------------------------------------
-
-
-def test_flows_of_all_processes_are_added_by_topic_and_peer() -> None:
-    first = (flow("fix", "b", 3, over_budget=1), flow("belief", "", 2, silent=4))
-    second = (flow("fix", "b", 5, worthless=7), flow("fix", "c", 1))
-    belief, to_b, to_c = summed_flows([first, (), second])
-    assert (belief.topic, belief.peer, belief.messages, belief.silent) == ("belief", "", 2, 4)
-    assert (to_b.peer, to_b.messages, to_b.bytes) == ("b", 8, 336)
-    assert (to_b.over_budget, to_b.worthless, to_b.silent) == (1, 7, 0)
-    assert (to_c.peer, to_c.messages) == ("c", 1)
-
-
-def test_windows_report_the_fullest_one_and_a_match_its_sum() -> None:
-    first = (Spending("bytes", 10.0, 500.0, 412.0), Spending("messages", 0.0, 6.5, 4.0))
-    second = (Spending("bytes", 10.0, 500.0, 90.0), Spending("messages", 0.0, 2.5, 2.0))
-    window, match = summed_spending([first, second])
-    assert (window.unit, window.window_s, window.allowed, window.most) == ("bytes", 10, 500, 412)
-    assert (match.unit, match.window_s, match.allowed, match.most) == ("messages", 0, 9, 6)
-
-
-@pytest.mark.parametrize(
-    ("unit", "window_s", "allowed", "most", "said", "held"),
-    [
-        ("bytes", 10.0, 500.0, 412.0, "412 of 500 B in 10 s", True),
-        ("bytes", 10.0, 500.0, 500.0, "500 of 500 B in 10 s", True),
-        ("messages", 72.0, 3.0, 4.0, "4 of 3 msg in 72 s", False),
-        ("messages", 0.0, 2.5, 2.0, "2 of 2.5 msg so far", True),
-    ],
-)
-def test_a_limit_in_words(
-    unit: str, window_s: float, allowed: float, most: float, said: str, held: bool
-) -> None:
-    limit = SpendingReport(unit=unit, window_s=window_s, allowed=allowed, most=most)
-    assert (limit_text(limit).plain, limit.is_kept) == (said, held)
-    assert limit_text(limit).style == ("green" if held else "bold red")
-    assert are_limits_kept([limit]) is held
-    assert are_limits_kept([]) is None
-
-
-def recorded(*statuses: Status) -> Report:
-    """What a recorder that heard these reports after ten seconds."""
-    hub = MemoryHub()
-    recorder, speaker = Recorder(hub.session()), hub.session()
-    for said in statuses:
-        key = topics.STATUS.at(robot=said.robot)
-        speaker.publisher(key, topics.STATUS.qos).put(encode(said))
-    report = recorder.report({s.robot: "joint" for s in statuses}, {})
-    return msgspec.structs.replace(report, duration_s=10.0)
-
-
-def shown(report: Report) -> str:
-    console = Console(file=io.StringIO(), width=80)
-    with console.capture() as capture:
-        print_report(report, console)
-    return capture.get()
-
-
-def test_the_report_adds_the_processes_of_a_robot_and_says_that_limits_held() -> None:
-    spent = (Spending("bytes", 10.0, 500.0, 412.0),)
-    full = (Spending("bytes", 10.0, 500.0, 500.0),)
-    report = recorded(
-        status("a", 1, 0, "1", sent=(flow("fix", "b", 2),), spending=spent),
-        status("a", 4, 0, "1", sent=(flow("fix", "b", 9, over_budget=6),), spending=spent),
-        status("a", 8, 0, "2", sent=(flow("fix", "b", 1, worthless=5),), spending=full),
-        status("b", 8, 3, heard=(flow("fix", "a", 10),)),
-    )
-    (sent,) = report.robots["a"].sent
-    assert (sent.messages, sent.bytes, sent.over_budget, sent.worthless) == (10, 420, 6, 5)
-    (limit,) = report.robots["a"].spending
-    assert (limit.most, limit.allowed) == (500.0, 500.0)
-    assert report.robots["b"].heard[0].messages == 10
-    assert report.team.within_budget is True
-    text = shown(report)
-    (row,) = (line.split() for line in text.splitlines() if "500 B in 10 s" in line)
-    assert row[:10] == ["a", "10", "0", "42", "6", "5", "0", "500", "of", "500"]
-    assert "Every robot kept every limit" in text
-    assert max(map(len, text.splitlines())) <= 80
-
-
-def test_the_report_says_which_limit_did_not_hold() -> None:
-    broken = (Spending("messages", 60.0, 3.0, 4.0),)
-    report = recorded(
-        status("a", 1, 0, spending=broken),
-        status("b", 1, 0, spending=(Spending("messages", 60.0, 3.0, 3.0),)),
-    )
-    assert report.team.within_budget is False
-    assert "Limits were exceeded: a: 4 of 3 msg in 60 s" in shown(report)
-
-
-def test_a_report_without_help_or_limits_has_no_table_of_them() -> None:
-    report = recorded(status("a", 1, 0))
-    assert report.team.within_budget is None
-    assert "not sent" not in shown(report)
-
-
-# Live -------------------------------------------------------------------------------------------
-
-
-def seen(*statuses: Status) -> list[Arrival]:
-    """Each comes at its own time."""
-    return [Arrival(s.stamp_ns / SECOND, s) for s in statuses]
 
 
 def team_at(now_s: float) -> Traffic:
@@ -362,94 +214,6 @@ def test_a_recorder_counts_what_it_takes_and_what_it_refuses() -> None:
         speaker.publisher(key, topics.STATUS.qos).put(payload)
     assert recorder.counts == {"status": 1, "garbage": 1}
     assert recorder.report({}, {}).refused == {"garbage": 1}
-
-
-# Budgets of a command line ----------------------------------------------------------------------
-
-
-def test_budgets_of_a_command_line_are_those_of_all_robots() -> None:
-    team = parse_team(TEAM)
-    assert with_overrides(team, Overrides()) == team
-    limited = with_overrides(
-        team, Overrides(bytes_per_s=50.0, messages_per_minute=2.5, match_messages=1200)
-    )
-    for robot in limited.robots.values():
-        budget = robot.collaboration.budget
-        assert (budget.bytes_per_s, budget.messages_per_minute) == (50.0, 2.5)
-    assert limited.match.messages == 1200
-    assert limited.messages_per_s("driver") == pytest.approx(1200 / 3 / 1200)
-    free = with_overrides(limited, Overrides(bytes_per_s=0.0, match_messages=0)).robots["miser"]
-    assert free.collaboration.budget.bytes_per_s == 0.0
-    assert free.collaboration.budget.messages_per_minute == 2.5
-
-
-@pytest.mark.parametrize(
-    ("arguments", "said"),
-    [
-        (["simulate", "demo", "--bytes-per-s", "inf"], "--bytes-per-s inf"),
-        (["up", "demo", "--messages-per-minute", "inf"], "--messages-per-minute inf"),
-        (["simulate", "--robots", "2", "--match-messages", "9"], "generated teams have no budgets"),
-        (["traffic", "demo", "--for", "0"], "--for 0"),
-        (["traffic", "nowhere.toml"], "nowhere.toml: no such file"),
-    ],
-)
-def test_what_the_user_can_mend_is_one_line(
-    arguments: list[str],
-    said: str,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    monkeypatch.setattr("sys.argv", ["cpcbl-team", *arguments])
-    with pytest.raises(SystemExit) as ended:
-        main()
-    assert ended.value.code == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert said in line
-
-
-def test_a_simulated_team_keeps_to_a_tiny_budget(tmp_path: Path) -> None:
-    path = tmp_path / "trio.toml"
-    path.write_text(TEAM)
-    options = ["--bytes-per-s", 20, "--match-messages", 600, "--duration", 10]
-    ran = cpcbl_team("simulate", path, *options, "--json")
-    assert ran.returncode == 0, ran.stderr
-    report = json.loads(ran.stdout)
-    assert report["team"]["within_budget"] is True
-    for robot in report["robots"].values():
-        window, match = robot["spending"]
-        assert (window["unit"], window["allowed"], window["window_s"]) == ("bytes", 500.0, 25.0)
-        assert robot["bytes_sent"] <= window["most"] <= window["allowed"]
-        assert (match["unit"], match["window_s"]) == ("messages", 0.0)
-        assert robot["messages_sent"] <= match["most"] <= match["allowed"] <= 600 / 3 * 10 / 1200
-    for name in ("giver", "miser"):
-        assert sum(f["over_budget"] for f in report["robots"][name]["sent"]) > 50
-    assert sum(r["messages_sent"] for r in report["robots"].values()) > 0
-
-
-def test_a_log_is_evaluated_with_a_budget(tmp_path: Path) -> None:
-    write_log(tmp_path, ("1", "2"), seconds=20.0)
-    options = ["--team", "mrclam-uncalibrated", "--blind", "2", "--messages-per-minute", 2.5]
-    ran = cpcbl_team("evaluate", "mrclam", tmp_path, *options, "--json")
-    assert ran.returncode == 0, ran.stderr
-    report = json.loads(ran.stdout)
-    (limit,) = report["robots"]["1"]["spending"]
-    assert (limit["window_s"], limit["allowed"]) == (72.0, 3.0)
-    assert 0 < report["robots"]["1"]["messages_sent"] <= limit["most"] <= 3.0
-    assert sum(f["over_budget"] for f in report["robots"]["1"]["sent"]) > 0
-
-
-def test_who_is_not_in_the_team_file_is_shown_as_a_guest() -> None:
-    seen = {name: [Arrival(1.0, status(name, 1, 3))] for name in ("r1", "tripod")}
-    now = traffic_from_statuses("t", ["r1"], seen, 0.0, 1.0)
-    assert now.guests == ("tripod",)
-    console = Console(file=io.StringIO(), width=80)
-    with console.capture() as capture:
-        console.print(traffic_view(now, "here"))
-    assert "tripod, guest" in capture.get()
-    assert traffic_from_statuses("t", [], seen, 0.0, 1.0).guests == ()  # nobody knows
-
-
-# Processes --------------------------------------------------------------------------------------
 
 
 def test_a_running_team_is_watched_with_the_command_that_up_says(

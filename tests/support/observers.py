@@ -1,0 +1,14 @@
+"""The team that observers join in the tests."""
+
+from typing import Any
+
+import msgspec
+
+from cpcbl_launch.team_file import builtin_path, load_team
+from cpcbl_team.config import Team
+
+BLIND = load_team(builtin_path("blind"))
+
+
+def changed(**fields: Any) -> Team:
+    return msgspec.structs.replace(BLIND, **fields)
