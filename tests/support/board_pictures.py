@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 
 from cpcbl_agents.vision.camera import Camera, Floats, Pixels
-from cpcbl_launch.calibration.board import PRINTED_PX_PER_M, Board, drawn
+from cpcbl_launch.calibration.board import PRINTED_PX_PER_M, Board, draw_board
 from cpcbl_team.config import CameraSettings
 
 FINER = 2  # samples a pixel, across and down
@@ -26,7 +26,7 @@ def board_pictures(
 ) -> Iterator[Shot]:
     """The board near and far, in all parts of the picture, tilted by up to 40 degrees."""
     rays = undistorted_grid(settings)
-    sheet = cv2.GaussianBlur(drawn(board), (0, 0), 2.0).astype(np.uint8)
+    sheet = cv2.GaussianBlur(draw_board(board), (0, 0), 2.0).astype(np.uint8)
     width, height = (n * board.square_m for n in board.squares)
     for _ in range(count):
         size = random.uniform(0.45, 0.8)  # of the picture's width

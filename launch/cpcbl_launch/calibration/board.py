@@ -1,7 +1,8 @@
-"""The board that a camera is calibrated with: drawn to be printed, found in pictures.
+"""The board for calibrating a camera: drawn for printing, and detected in pictures.
 
-ChArUco: a chessboard with markers in its white squares, found in part too (Garrido-Jurado et al.,
-2014). A plain chessboard must be seen whole. Needs OpenCV (extra `camera`).
+A ChArUco board is a chessboard with markers in its white squares; a visible part of it is enough
+(Garrido-Jurado et al., 2014). A plain chessboard must be visible as a whole. Needs OpenCV (extra
+`camera`).
 """
 
 import re
@@ -18,9 +19,9 @@ from cpcbl_agents.vision.codes import DICTIONARIES
 from cpcbl_team.config import MARKERS, MarkerFamily
 from cpcbl_team.errors import InputError
 
-LEAST_SQUARES = 4
-LEAST_CORNERS = 8  # in a picture: fewer hardly tell a lens from a pose
-WINDOW_PX = (2, 5)  # to each side of a corner: within it there are its own edges only
+MIN_SQUARES = 4
+MIN_CORNERS = 8  # in a picture: fewer hardly separate the lens from the pose
+WINDOW_PX = (2, 5)  # to each side of a corner: it contains only the corner's own edges
 PRINTED_PX_PER_M = 300 / 0.0254  # 300 dots an inch
 
 Points = NDArray[np.float32]
@@ -32,7 +33,7 @@ class Pattern(StrEnum):
 
 
 class Board(NamedTuple):
-    """What is printed; sides in metres."""
+    """The printed board; sides in metres."""
 
     pattern: Pattern
     squares: tuple[int, int]
@@ -42,23 +43,21 @@ class Board(NamedTuple):
     family: MarkerFamily
 
 
-class Corners(NamedTuple):
+class BoardCorners(NamedTuple):
     """Inner corners of the squares: on the board (n, 3), m, and in the picture (n, 2), px."""
 
-    places: Points
+    board_points: Points
     pixels: Points
 
 
-def parsed_board(
-    pattern: str, squares: str, square_m: float, marker_m: float, family: str
-) -> Board:
-    """A board by the words of the command line. Raises InputError for one that cannot be made."""
+def parse_board(pattern: str, squares: str, square_m: float, marker_m: float, family: str) -> Board:
+    """The board that command line options describe. Raises InputError if it cannot be made."""
     match = re.fullmatch(r"(\d{1,3})x(\d{1,3})", squares.strip().lower())
     if match is None:
         raise InputError(f"--squares {squares}: write it as 7x5: squares across and down")
     across, down = int(match[1]), int(match[2])
-    if min(across, down) < LEAST_SQUARES:
-        raise InputError(f"--squares {squares}: at least {LEAST_SQUARES} across and down")
+    if min(across, down) < MIN_SQUARES:
+        raise InputError(f"--squares {squares}: at least {MIN_SQUARES} across and down")
     markers = {str(name): name for name in MARKERS}
     if family not in markers:
         raise InputError(f"--family {family}: no such family; use one of {', '.join(markers)}")
@@ -71,87 +70,92 @@ def parsed_board(
 def _check_markers(board: Board) -> None:
     if not 0.0 < board.marker_m < board.square_m:
         raise InputError(
-            f"--marker-m {board.marker_m:g}: markers are inside of squares; write less than"
+            f"--marker-m {board.marker_m:g}: markers are inside squares; use less than"
             f" --square-m {board.square_m:g}"
         )
     across, down = board.squares
-    needed, there = across * down // 2, MARKERS[board.family]
-    if needed > there:
+    needed, available = across * down // 2, MARKERS[board.family]
+    if needed > available:
         raise InputError(
-            f"--squares {across}x{down}: needs {needed} markers, {board.family} has {there};"
+            f"--squares {across}x{down}: needs {needed} markers, {board.family} has {available};"
             " use fewer squares"
         )
 
 
-def drawn(board: Board) -> Pixels:
+def draw_board(board: Board) -> Pixels:
     """The board as a grey picture (height, width), with a white margin, at 300 dots an inch."""
     side = max(round(board.square_m * PRINTED_PX_PER_M), 8)
     across, down = board.squares
     if board.pattern is Pattern.charuco:
         size = (side * (across + 1), side * (down + 1))
-        return _charuco(board).generateImage(size, marginSize=side // 2).astype(np.uint8)
+        return _charuco_board(board).generateImage(size, marginSize=side // 2).astype(np.uint8)
     rows, columns = np.indices((down, across))
     inside = np.kron((rows + columns) % 2, np.ones((side, side))) * 255
     return np.pad(inside, side // 2, constant_values=255).astype(np.uint8)
 
 
 def write_board(board: Board, path: Path) -> None:
-    """The board as a picture file. Raises InputError, OSError."""
+    """Writes the board as a picture file. Raises InputError, OSError."""
     try:
-        written, picture = cv2.imencode(path.suffix or ".png", drawn(board))
+        toml_value, picture = cv2.imencode(path.suffix or ".png", draw_board(board))
     except cv2.error:
-        written = False
-    if not written:
+        toml_value = False
+    if not toml_value:
         raise InputError(f"--print-board {path}: not a picture; end its name in .png")
     path.write_bytes(picture.tobytes())
 
 
-def found(pixels: Pixels, board: Board) -> Corners | str:
-    """The board's corners in a picture (height, width, 3), BGR; or why they cannot be used."""
+def find_corners(pixels: Pixels, board: Board) -> BoardCorners | str:
+    """The board's corners in a picture (height, width, 3), BGR, or why there are none."""
     grey = cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY).astype(np.uint8, copy=False)
     corners = (
-        _in_charuco(grey, board) if board.pattern is Pattern.charuco else _in_chess(grey, board)
+        _charuco_corners(grey, board)
+        if board.pattern is Pattern.charuco
+        else _chessboard_corners(grey, board)
     )
     n = len(corners.pixels)
     if n == 0:
         return "no board found"
-    if n < LEAST_CORNERS:
-        return f"only {n} corners; {LEAST_CORNERS} are needed"
-    if np.linalg.matrix_rank(corners.places - corners.places[0]) < 2:
+    if n < MIN_CORNERS:
+        return f"only {n} corners; {MIN_CORNERS} are needed"
+    if np.linalg.matrix_rank(corners.board_points - corners.board_points[0]) < 2:
         return "all corners in one row"
     return corners
 
 
-def _in_charuco(grey: Pixels, board: Board) -> Corners:
-    made = _charuco(board)
+def _charuco_corners(grey: Pixels, board: Board) -> BoardCorners:
+    made = _charuco_board(board)
     for old in (False, True):
-        made.setLegacyPattern(old)  # as OpenCV before 4.6 drew boards of an even number down
+        made.setLegacyPattern(
+            old
+        )  # OpenCV before 4.6 drew boards with an even number of rows differently
         pixels, ids, _, _ = cv2.aruco.CharucoDetector(made).detectBoard(grey)
         if ids is not None and len(ids):
-            places = np.asarray(made.getChessboardCorners(), np.float32)[np.ravel(ids)]
+            board_points = np.asarray(made.getChessboardCorners(), np.float32)[np.ravel(ids)]
             free = 0.4 * (1.0 - board.marker_m / board.square_m)  # markers begin at 0.5
-            return Corners(places, _sharpened(grey, np.asarray(pixels), free))
+            return BoardCorners(board_points, _refine_corners(grey, np.asarray(pixels), free))
     return _NONE
 
 
-def _in_chess(grey: Pixels, board: Board) -> Corners:
+def _chessboard_corners(grey: Pixels, board: Board) -> BoardCorners:
     across, down = board.squares[0] - 1, board.squares[1] - 1
     flags = cv2.CALIB_CB_NORMALIZE_IMAGE
     whole, pixels = cv2.findChessboardCornersSB(grey, (across, down), flags=flags)
     if not whole:
         return _NONE
     rows, columns = np.indices((down, across), np.float32)
-    places = np.stack([columns, rows, np.zeros_like(rows)], axis=-1).reshape(-1, 3)
-    return Corners(places * np.float32(board.square_m), _sharpened(grey, np.asarray(pixels), 0.4))
+    board_points = np.stack([columns, rows, np.zeros_like(rows)], axis=-1).reshape(-1, 3)
+    return BoardCorners(
+        board_points * np.float32(board.square_m), _refine_corners(grey, np.asarray(pixels), 0.4)
+    )
 
 
-def _sharpened(grey: Pixels, pixels: NDArray[np.floating], free: float) -> Points:
-    """Corners (n, 2) as the edges around each say, where nothing else is within this share of a
-    square.
+def _refine_corners(grey: Pixels, pixels: NDArray[np.floating], free: float) -> Points:
+    """Corners (n, 2) refined to sub-pixels by the edges around each.
 
-    Those of the chessboard's detector are off by more than their scatter, alike in neighbours,
-    which least squares does not expect; those of ChArUco's are off by half a pixel in OpenCV
-    4.10.
+    `free`: nothing else is within this share of a square. The chessboard detector's corners have
+    errors that are correlated between neighbours, which least squares does not expect. Those of the
+    ChArUco detector are off by half a pixel in OpenCV 4.10.
     """
     points = np.ascontiguousarray(pixels.reshape(-1, 1, 2), dtype=np.float32)
     apart = np.linalg.norm(points - points.reshape(1, -1, 2), axis=2)
@@ -161,10 +165,10 @@ def _sharpened(grey: Pixels, pixels: NDArray[np.floating], free: float) -> Point
     return np.asarray(sharp, np.float32).reshape(-1, 2)
 
 
-def _charuco(board: Board) -> cv2.aruco.CharucoBoard:
+def _charuco_board(board: Board) -> cv2.aruco.CharucoBoard:
     family = cv2.aruco.getPredefinedDictionary(DICTIONARIES[board.family])
     return cv2.aruco.CharucoBoard(board.squares, board.square_m, board.marker_m, family)
 
 
 _PRECISE = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 30, 0.01)
-_NONE = Corners(np.empty((0, 3), np.float32), np.empty((0, 2), np.float32))
+_NONE = BoardCorners(np.empty((0, 3), np.float32), np.empty((0, 2), np.float32))

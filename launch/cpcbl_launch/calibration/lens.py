@@ -1,7 +1,7 @@
-"""A camera's lens from pictures of a board: focal lengths, centre, distortion, and how well known.
+"""A camera's lens from pictures of a board: focal lengths, centre and distortion, with errors.
 
-Zhang's method (2000) as in OpenCV; the standard deviations are those of its least squares. Needs
-OpenCV (extra `camera`).
+The method is Zhang's (2000) as implemented in OpenCV; the standard deviations are those of its
+least squares. Needs OpenCV (extra `camera`).
 """
 
 import math
@@ -12,25 +12,25 @@ import cv2
 import msgspec
 import numpy as np
 
-from cpcbl_launch.calibration.board import Board, Corners, found
-from cpcbl_launch.calibration.pictures import Picture
+from cpcbl_launch.calibration.board import Board, BoardCorners, find_corners
+from cpcbl_launch.calibration.pictures import NamedPicture
 from cpcbl_launch.calibration.statistics import Estimate
 from cpcbl_launch.reporting.metrics import Floats
 from cpcbl_team.errors import InputError
 
-LEAST_PICTURES = 4
-OUTLYING, OUTLYING_PX = 3.0, 0.5  # times the median error, and by at least so much
-TOLD = 3.0  # k3 stays 0 unless it is so many of its standard deviations from 0
-MOVED_PX = 2.0  # corners that moved less are in the same place
-LEAST_FOCAL_SHARE = 0.001  # a lens warms up, and is bumped
+MIN_PICTURES = 4
+OUTLYING, OUTLYING_PX = 3.0, 0.5  # times the median error, and at least this much above it
+K3_SIGMAS = 3.0  # k3 stays 0 unless it differs from 0 by this many standard deviations
+MOVED_PX = 2.0  # corners that moved less are at the same place
+MIN_FOCAL_SHARE = 0.001  # a lens warms up, and is bumped
 WEAK_RMS_PX = 1.0  # well taken pictures leave 0.1 to 0.3
 WEAK_FOCAL_SHARE = 0.01
-FIELDS = 4  # the picture's parts, across and down, in which corners should be
+FIELDS = 4  # the picture has so many parts, across and down, that should contain corners
 INTRINSICS = ("fx_px", "fy_px", "cx_px", "cy_px")
 DISTORTION = ("k1", "k2", "p1", "p2", "k3")
 
 
-class View(msgspec.Struct, frozen=True):
+class PictureResult(msgspec.Struct, frozen=True):
     """One picture; `rms_px` is its reprojection error."""
 
     picture: str
@@ -40,7 +40,7 @@ class View(msgspec.Struct, frozen=True):
     """Why it was not used; empty if it was."""
 
 
-class Lens(msgspec.Struct, frozen=True):
+class LensCalibration(msgspec.Struct, frozen=True):
     """What `calibrate camera --json` writes. Names are those of `CameraSettings`."""
 
     width_px: int
@@ -52,24 +52,24 @@ class Lens(msgspec.Struct, frozen=True):
     focal_share: float
     covered: float
     """Share of the picture's 4 x 4 parts in which there were corners."""
-    pictures: tuple[View, ...]
+    pictures: tuple[PictureResult, ...]
     notes: tuple[str, ...] = ()
 
 
 class Residuals(NamedTuple):
-    """What is left: where corners were found (n, 2), found minus expected (n, 2); px."""
+    """Pixels of the corners (n, 2), and their errors, found minus expected (n, 2); px."""
 
     pixels: Floats
     errors: Floats
 
 
-class _Seen(NamedTuple):
+class _BoardView(NamedTuple):
     picture: str
-    corners: Corners
+    corners: BoardCorners
     size_px: tuple[int, int]
 
 
-class _Solution(NamedTuple):
+class _LensSolution(NamedTuple):
     rms_px: float
     matrix: Floats
     distortion: Floats
@@ -78,71 +78,78 @@ class _Solution(NamedTuple):
     residuals: Residuals
 
 
-def calibrated_lens(pictures: Iterable[Picture], board: Board) -> tuple[Lens, Residuals]:
-    """The lens that took these pictures. Raises InputError for what cannot be calibrated from."""
-    looked = _each_once(_looked(picture, board) for picture in pictures)
-    seen = [view for view in looked if isinstance(view, _Seen)]
-    out = [view for view in looked if isinstance(view, View)]
-    _check(seen, out)
-    size_px = _one_size(seen)
-    kept, solution, outlying = _without_outliers(seen, size_px)
+def calibrate_lens(
+    pictures: Iterable[NamedPicture], board: Board
+) -> tuple[LensCalibration, Residuals]:
+    """The lens that took these pictures. Raises InputError if they do not determine it."""
+    results = _without_repeats(_find_board(picture, board) for picture in pictures)
+    views = [view for view in results if isinstance(view, _BoardView)]
+    rejected = [view for view in results if isinstance(view, PictureResult)]
+    _require_enough_views(views, rejected)
+    size_px = _common_size(views)
+    kept, solution, outlying = _without_outliers(views, size_px)
     used = [
-        View(view.picture, len(view.corners.pixels), float(error))
+        PictureResult(view.picture, len(view.corners.pixels), float(error))
         for view, error in zip(kept, solution.each_px, strict=True)
     ]
-    return _lens(solution, size_px, (*used, *outlying, *out)), solution.residuals
+    return _lens_calibration(solution, size_px, (*used, *outlying, *rejected)), solution.residuals
 
 
-def _looked(picture: Picture, board: Board) -> _Seen | View:
-    """A picture with the board in it, or why it is left out."""
+def _find_board(picture: NamedPicture, board: Board) -> _BoardView | PictureResult:
+    """The board in a picture, or the reason why the picture is left out."""
     pixels = picture.pixels
     if isinstance(pixels, str):
-        return View(picture.name, left_out=pixels)
-    corners = found(pixels, board)
+        return PictureResult(picture.name, left_out=pixels)
+    corners = find_corners(pixels, board)
     if isinstance(corners, str):
-        return View(picture.name, left_out=corners)
-    return _Seen(picture.name, corners, (pixels.shape[1], pixels.shape[0]))
+        return PictureResult(picture.name, left_out=corners)
+    return _BoardView(picture.name, corners, (pixels.shape[1], pixels.shape[0]))
 
 
-def _each_once(looked: Iterable[_Seen | View]) -> list[_Seen | View]:
-    """Without those in which the board is where it was: they would count twice, and tell nothing
-    new."""
-    once: list[_Seen | View] = []
-    for view in looked:
-        same = next((o for o in once if _alike(view, o)), None)
+def _without_repeats(
+    results: Iterable[_BoardView | PictureResult],
+) -> list[_BoardView | PictureResult]:
+    """Leaves out pictures with the board at the place of an earlier one: they add nothing."""
+    once: list[_BoardView | PictureResult] = []
+    for view in results:
+        same = next((o for o in once if _is_repeat(view, o)), None)
         if same is not None:
-            reason = f"the board is where it is in {same.picture}"
-            view = View(view.picture, left_out=reason)
+            reason = f"the board is at the same place as in {same.picture}"
+            view = PictureResult(view.picture, left_out=reason)
         once.append(view)
     return once
 
 
-def _alike(one: _Seen | View, two: _Seen | View) -> bool:
-    if isinstance(one, View) or isinstance(two, View) or one.size_px != two.size_px:
+def _is_repeat(one: _BoardView | PictureResult, two: _BoardView | PictureResult) -> bool:
+    if (
+        isinstance(one, PictureResult)
+        or isinstance(two, PictureResult)
+        or one.size_px != two.size_px
+    ):
         return False
     a, b = one.corners, two.corners
-    same = np.array_equal(a.places, b.places)
+    same = np.array_equal(a.board_points, b.board_points)
     return same and float(np.abs(a.pixels - b.pixels).mean()) < MOVED_PX
 
 
-def _check(seen: Sequence[_Seen], out: Sequence[View]) -> None:
-    if len(seen) >= LEAST_PICTURES:
+def _require_enough_views(views: Sequence[_BoardView], rejected: Sequence[PictureResult]) -> None:
+    if len(views) >= MIN_PICTURES:
         return
-    if not seen and out and all(view.left_out == "no board found" for view in out):
+    if not views and rejected and all(view.left_out == "no board found" for view in rejected):
         raise InputError(
-            f"no board found in any of {len(out)} pictures; say the printed board by --board,"
-            " --squares and --family"
+            f"no board found in any of {len(rejected)} pictures; describe the printed board by"
+            " --board, --squares and --family"
         )
-    why = f": {out[0].picture}: {out[0].left_out}" if out else ""
+    why = f": {rejected[0].picture}: {rejected[0].left_out}" if rejected else ""
     raise InputError(
-        f"{len(seen)} of {len(seen) + len(out)} pictures show the board well enough{why}; take at"
-        f" least {LEAST_PICTURES}, better 20, with the board at all angles"
+        f"{len(views)} of {len(views) + len(rejected)} pictures show the board well enough{why};"
+        f" take at least {MIN_PICTURES}, better 20, with the board at all angles"
     )
 
 
-def _one_size(seen: Sequence[_Seen]) -> tuple[int, int]:
-    first = seen[0]
-    for view in seen:
+def _common_size(views: Sequence[_BoardView]) -> tuple[int, int]:
+    first = views[0]
+    for view in views:
         if view.size_px != first.size_px:
             (width, height), (w, h) = view.size_px, first.size_px
             raise InputError(
@@ -153,64 +160,72 @@ def _one_size(seen: Sequence[_Seen]) -> tuple[int, int]:
 
 
 def _without_outliers(
-    seen: Sequence[_Seen], size_px: tuple[int, int]
-) -> tuple[list[_Seen], _Solution, list[View]]:
-    """Pictures whose error is far beyond the usual go one by one: blurred, or a corner is wrong."""
-    kept, out = list(seen), list[View]()
+    views: Sequence[_BoardView], size_px: tuple[int, int]
+) -> tuple[list[_BoardView], _LensSolution, list[PictureResult]]:
+    """Leaves out, one by one, pictures with a far larger error than the others: they are blurred,
+    or a corner is wrong."""
+    kept, rejected = list(views), list[PictureResult]()
     while True:
-        solution = _with_told(kept, size_px)
+        solution = _solve_with_k3_if_determined(kept, size_px)
         usual, worst = float(np.median(solution.each_px)), int(np.argmax(solution.each_px))
         error = float(solution.each_px[worst])
-        if error < max(OUTLYING * usual, usual + OUTLYING_PX) or len(kept) <= LEAST_PICTURES:
-            return kept, solution, out
+        if error < max(OUTLYING * usual, usual + OUTLYING_PX) or len(kept) <= MIN_PICTURES:
+            return kept, solution, rejected
         view = kept.pop(worst)
         reason = f"errs by {error:.2f} px, the others by {usual:.2f}"
-        out.append(View(view.picture, len(view.corners.pixels), error, reason))
+        rejected.append(PictureResult(view.picture, len(view.corners.pixels), error, reason))
 
 
-def _with_told(views: Sequence[_Seen], size_px: tuple[int, int]) -> _Solution:
-    """With k3 where the pictures tell it: else it bends what is beyond the outermost corners."""
-    solution = _solved(views, size_px, 0)
-    if abs(solution.distortion[4]) < TOLD * solution.deviations[8]:
-        return _solved(views, size_px, cv2.CALIB_FIX_K3)
+def _solve_with_k3_if_determined(
+    views: Sequence[_BoardView], size_px: tuple[int, int]
+) -> _LensSolution:
+    """The lens with k3 only if the pictures determine it: a wrong k3 distorts the picture beyond
+    the outermost corners."""
+    solution = _solve_lens(views, size_px, 0)
+    if abs(solution.distortion[4]) < K3_SIGMAS * solution.deviations[8]:
+        return _solve_lens(views, size_px, cv2.CALIB_FIX_K3)
     return solution
 
 
-def _solved(views: Sequence[_Seen], size_px: tuple[int, int], flags: int) -> _Solution:
-    """Raises InputError where the views do not tell a lens."""
-    places = [view.corners.places for view in views]
+def _solve_lens(views: Sequence[_BoardView], size_px: tuple[int, int], flags: int) -> _LensSolution:
+    """Raises InputError if the views do not determine a lens."""
+    board_points = [view.corners.board_points for view in views]
     pixels = [view.corners.pixels for view in views]
     try:
         rms, matrix, distortion, turns, moves, deviations, _, _ = cv2.calibrateCameraExtended(
-            places, pixels, size_px, np.eye(3), np.zeros(5), flags=flags
+            board_points, pixels, size_px, np.eye(3), np.zeros(5), flags=flags
         )
     except cv2.error as error:
-        raise InputError(f"{_UNTOLD} ({error.err})") from error
-    lens, known = np.ravel(distortion)[:5].astype(float), np.ravel(deviations)[:9].astype(float)
-    if not (np.isfinite(matrix).all() and np.isfinite(known).all()) or matrix[0, 0] <= 0.0:
-        raise InputError(_UNTOLD)
+        raise InputError(f"{_NOT_DETERMINED} ({error.err})") from error
+    lens, estimates = np.ravel(distortion)[:5].astype(float), np.ravel(deviations)[:9].astype(float)
+    if not (np.isfinite(matrix).all() and np.isfinite(estimates).all()) or matrix[0, 0] <= 0.0:
+        raise InputError(_NOT_DETERMINED)
     errors = [
-        there - cv2.projectPoints(place, turn, move, matrix, lens)[0].reshape(-1, 2)
-        for there, place, turn, move in zip(pixels, places, turns, moves, strict=True)
+        found_pixels - cv2.projectPoints(place, turn, move, matrix, lens)[0].reshape(-1, 2)
+        for found_pixels, place, turn, move in zip(pixels, board_points, turns, moves, strict=True)
     ]
     each = [math.sqrt((e * e).sum() / len(e)) for e in errors]
     left = Residuals(np.concatenate(pixels).astype(float), np.concatenate(errors).astype(float))
-    return _Solution(rms, matrix.astype(float), lens, known, np.array(each), left)
+    return _LensSolution(rms, matrix.astype(float), lens, estimates, np.array(each), left)
 
 
-_UNTOLD = (
-    "the pictures do not tell the lens; take some with the board tilted by 30 to 45 degrees to all"
-    " sides, near and far"
+_NOT_DETERMINED = (
+    "the pictures do not determine the lens; take some with the board tilted by 30 to 45 degrees in"
+    " all directions, near and far"
 )
 
 
-def _lens(solution: _Solution, size_px: tuple[int, int], pictures: tuple[View, ...]) -> Lens:
+def _lens_calibration(
+    solution: _LensSolution, size_px: tuple[int, int], pictures: tuple[PictureResult, ...]
+) -> LensCalibration:
     m = solution.matrix
     values = (m[0, 0], m[1, 1], m[0, 2], m[1, 2], *solution.distortion)
-    known = [Estimate(float(v), float(d)) for v, d in zip(values, solution.deviations, strict=True)]
-    intrinsics = dict(zip(INTRINSICS, known[:4], strict=True))
-    share = max(known[i].standard_error / known[i].value for i in (0, 1))
-    covered = _covered(solution.residuals.pixels, size_px)
+    estimates = [
+        Estimate(float(v), float(d)) for v, d in zip(values, solution.deviations, strict=True)
+    ]
+    intrinsics = dict(zip(INTRINSICS, estimates[:4], strict=True))
+    share = max(estimates[i].standard_error / estimates[i].value for i in (0, 1))
+    covered = _covered_share(solution.residuals.pixels, size_px)
     notes = []
     if covered < 1.0:
         empty = round((1.0 - covered) * FIELDS**2)
@@ -220,25 +235,25 @@ def _lens(solution: _Solution, size_px: tuple[int, int], pictures: tuple[View, .
         )
     if solution.rms_px > WEAK_RMS_PX:
         notes.append(
-            f"errors of {solution.rms_px:.1f} px are many: blurred pictures, a board that is not"
-            " flat, or not the one that --squares says"
+            f"errors of {solution.rms_px:.1f} px are large: pictures are blurred, the board is not"
+            " flat, or it is not the one that --squares describes"
         )
     if share > WEAK_FOCAL_SHARE:
-        notes.append("focal length is hardly told: tilt the board by 30 to 45 degrees")
+        notes.append("the focal length is uncertain: tilt the board by 30 to 45 degrees")
     if solution.deviations[8] == 0.0:
-        notes.append("the pictures do not tell k3: it stays 0")
-    return Lens(
+        notes.append("the pictures do not determine k3: it stays 0")
+    return LensCalibration(
         *size_px,
         solution.rms_px,
         intrinsics,
-        dict(zip(DISTORTION, known[4:], strict=True)),
-        max(share, LEAST_FOCAL_SHARE),
+        dict(zip(DISTORTION, estimates[4:], strict=True)),
+        max(share, MIN_FOCAL_SHARE),
         covered,
         pictures,
         tuple(notes),
     )
 
 
-def _covered(pixels: Floats, size_px: tuple[int, int]) -> float:
+def _covered_share(pixels: Floats, size_px: tuple[int, int]) -> float:
     parts = np.clip(pixels / np.asarray(size_px) * FIELDS, 0, FIELDS - 1).astype(int)
     return len(np.unique(parts @ np.array([1, FIELDS]))) / FIELDS**2

@@ -1,4 +1,4 @@
-"""Logs with truth, read into arrays: MRCLAM folders and recordings of `up --record`."""
+"""Logs with ground truth as arrays: MRCLAM folders and recordings of `up --record`."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -9,17 +9,47 @@ import numpy as np
 
 from cpcbl_agents.sources import mrclam
 from cpcbl_agents.sources.mrclam import LogError
-from cpcbl_launch.calibration.robot_log import RobotLog
+from cpcbl_launch.calibration.statistics import Mask
 from cpcbl_launch.reporting.metrics import Floats
 from cpcbl_launch.reporting.recording import read_recording
 from cpcbl_team.config import Landmark
 from cpcbl_team.inputs import Odometry, Sightings
 
+LONGEST_GAP_S = 1.0  # truth is interpolated only between rows that are at most so far apart
+
+
+class RobotLog(NamedTuple):
+    """What one robot reported in one log, and the true poses. Seconds, m, rad."""
+
+    truth: Floats  # (n, 4): s, x, y, heading
+    odometry: Floats  # (n, 4): from s, until s, distance, turn
+    sightings: Floats  # (n, 4): stamp s, object (index of `objects`), range, bearing; NaN: none
+    objects: tuple[Floats, ...]  # the truth of each as (n, 3): s, x, y; one row: it does not move
+    teammates: frozenset[int] = frozenset()  # those of `objects` that are robots
+
+
+def has_truth_at(stamps: Floats, times_s: Floats) -> Mask:
+    """Whether times lie between rows of truth that are at most LONGEST_GAP_S apart."""
+    after = np.searchsorted(stamps, times_s)
+    inside = (after > 0) & (after < len(stamps))
+    after = np.clip(after, 1, len(stamps) - 1)
+    return inside & (stamps[after] - stamps[after - 1] <= LONGEST_GAP_S)
+
+
+def nan_if_none(value: float | None) -> float:
+    return math.nan if value is None else value
+
+
+def wrap_angles(angles: Floats) -> Floats:
+    """Angles (n,) in [-pi, pi), rad."""
+    return np.asarray((angles + math.pi) % math.tau - math.pi)
+
+
 RobotLogs = dict[str, list[RobotLog]]
 
 
 def read_logs(paths: Sequence[Path]) -> RobotLogs:
-    """By robot its part of every log. Raises LogError."""
+    """The parts of all logs, by robot. Raises LogError."""
     logs: RobotLogs = {}
     for path in paths:
         for name, log in read_log(path).items():
@@ -29,10 +59,10 @@ def read_logs(paths: Sequence[Path]) -> RobotLogs:
 
 def read_log(path: Path) -> dict[str, RobotLog]:
     """The robots of an MRCLAM folder, or of a recording of `up --record`. Raises LogError."""
-    return _recorded(path) if path.suffix == ".mcap" else _mrclam(path)
+    return _read_recording(path) if path.suffix == ".mcap" else _read_mrclam(path)
 
 
-def _mrclam(folder: Path) -> dict[str, RobotLog]:
+def _read_mrclam(folder: Path) -> dict[str, RobotLog]:
     names = mrclam.robots_in(folder)
     if not names:
         missing = ", ".join(mrclam.missing_files(folder, mrclam.ROBOTS[0]))
@@ -46,35 +76,35 @@ def _mrclam(folder: Path) -> dict[str, RobotLog]:
         for name in names
     }
     odometry = {name: mrclam.read_odometry(folder, name) for name in names}
-    return _logs(mrclam.read_landmarks(folder), truth, odometry, frames)
+    return _robot_logs(mrclam.read_landmarks(folder), truth, odometry, frames)
 
 
-def _recorded(path: Path) -> dict[str, RobotLog]:
+def _read_recording(path: Path) -> dict[str, RobotLog]:
     recorded = read_recording(path)
     if not recorded.truth:
         raise LogError(
             f"{path}: holds no truth; record a simulated team, or publish poses on field/truth"
         )
     inputs = recorded.inputs
-    odometry = {n: [i for i in said if isinstance(i, Odometry)] for n, said in inputs.items()}
-    frames = {n: [i for i in said if isinstance(i, Sightings)] for n, said in inputs.items()}
-    return _logs(recorded.team.map.landmarks, recorded.truth, odometry, frames)
+    odometry = {n: [i for i in items if isinstance(i, Odometry)] for n, items in inputs.items()}
+    frames = {n: [i for i in items if isinstance(i, Sightings)] for n, items in inputs.items()}
+    return _robot_logs(recorded.team.map.landmarks, recorded.truth, odometry, frames)
 
 
-def _logs(
+def _robot_logs(
     landmarks: Mapping[str, Landmark],
     truth: Mapping[str, Floats],
     odometry: Mapping[str, Any],
     frames: Mapping[str, Any],
 ) -> dict[str, RobotLog]:
-    """Arrays of what was read, for every robot with truth."""
-    truth, objects, teammates = placed(landmarks, truth)
+    """The arrays of every robot with ground truth."""
+    truth, objects, teammates = ground_truth(landmarks, truth)
     number = {name: i for i, name in enumerate(objects)}
     return {
         name: RobotLog(
             rows,
-            _pieces(odometry.get(name, ())),
-            _sightings(frames.get(name, ()), number),
+            _odometry_rows(odometry.get(name, ())),
+            _sighting_rows(frames.get(name, ()), number),
             tuple(objects.values()),
             teammates,
         )
@@ -83,38 +113,36 @@ def _logs(
     }
 
 
-class Placed(NamedTuple):
-    """Where everything truly was: the robots' poses, each stamp once, and all that can be seen."""
+class GroundTruth(NamedTuple):
+    """True poses of the robots, each stamp once, and true positions of all objects."""
 
-    truth: dict[str, Floats]
+    poses: dict[str, Floats]
     objects: dict[str, Floats]
     teammates: frozenset[int]
 
 
-def placed(landmarks: Mapping[str, Landmark], truth: Mapping[str, Floats]) -> Placed:
-    """Landmarks and robots as `RobotLog` has them: `objects` and `teammates`."""
+def ground_truth(landmarks: Mapping[str, Landmark], truth: Mapping[str, Floats]) -> GroundTruth:
+    """The landmarks and robots as `objects` and `teammates` of a `RobotLog`."""
     truth = {
         name: rows[np.unique(rows[:, 0], return_index=True)[1]] for name, rows in truth.items()
     }
-    places = {name: np.array([[0.0, mark.x_m, mark.y_m]]) for name, mark in landmarks.items()}
-    places |= {name: rows[:, :3] for name, rows in truth.items()}
-    number = {name: i for i, name in enumerate(places)}
-    return Placed(truth, places, frozenset(number[name] for name in truth))
+    objects = {name: np.array([[0.0, mark.x_m, mark.y_m]]) for name, mark in landmarks.items()}
+    objects |= {name: rows[:, :3] for name, rows in truth.items()}
+    number = {name: i for i, name in enumerate(objects)}
+    return GroundTruth(truth, objects, frozenset(number[name] for name in truth))
 
 
-def _pieces(odometry: Any) -> Floats:
+def _odometry_rows(odometry: Any) -> Floats:
     rows = [(o.from_ns * 1e-9, o.stamp_ns * 1e-9, o.distance_m, o.turn_rad) for o in odometry]
     table = np.array(sorted(rows)).reshape(-1, 4)
     ends = np.maximum.accumulate(table[:, 1]) if len(table) else table[:, 1]
     return table[np.concatenate(([True], table[1:, 0] > ends[:-1] - 1e-6))[: len(table)]]
 
 
-def _sightings(frames: Any, number: Mapping[str, int]) -> Floats:
-    def given(value: float | None) -> float:
-        return math.nan if value is None else value
+def _sighting_rows(frames: Any, number: Mapping[str, int]) -> Floats:
 
     rows = [
-        (frame.stamp_ns * 1e-9, number[s.id], given(s.range_m), given(s.bearing_rad))
+        (frame.stamp_ns * 1e-9, number[s.id], nan_if_none(s.range_m), nan_if_none(s.bearing_rad))
         for frame in frames
         for s in frame.sightings
         if s.id in number

@@ -1,6 +1,7 @@
-"""How a robot's odometry errs: windows of a drive against true poses.
+"""Errors of a robot's odometry: windows of a drive compared with true poses.
 
-Windows of a few seconds tell the corrections, longer ones how the noise grows.
+Windows of a few seconds determine the corrections, longer ones the growth of the noise. A dead zone
+of the motors shows as a least speed below which the robot does not drive.
 """
 
 import math
@@ -9,32 +10,33 @@ from typing import NamedTuple
 
 import numpy as np
 
-from cpcbl_launch.calibration.dead_zone import CRAWL_NOISE, crawl_noise, least_speed, no_slower
-from cpcbl_launch.calibration.robot_log import RobotLog
-from cpcbl_launch.calibration.statistics import (
-    GROSS,
-    LEAST_ROWS,
-    Estimate,
-    Fit,
-    Mask,
-    jackknife,
-    kept,
-    robust_fit,
-    sigmas,
-    solved,
-    told,
-    variance_parts,
-)
-from cpcbl_launch.calibration.windows import (
+from cpcbl_launch.calibration.logs import RobotLog
+from cpcbl_launch.calibration.odometry_windows import (
     NOISE_WINDOWS_S,
     WINDOW_S,
-    Corrections,
-    OdometryRows,
-    odometry_rows,
+    OdometryCorrections,
+    OdometryWindows,
+    odometry_windows,
+)
+from cpcbl_launch.calibration.statistics import (
+    MIN_ROWS,
+    OUTLIER_SIGMAS,
+    Estimate,
+    Integers,
+    LinearFit,
+    Mask,
+    RowFilter,
+    determined_coefficients,
+    jackknife,
+    robust_fit,
+    select_rows,
+    sigma_estimates,
+    solve,
+    variance_components,
 )
 from cpcbl_launch.reporting.metrics import Floats
 
-LEAST_MOTION = 0.02  # m or rad in a window; less tells nothing of scales
+MIN_MOTION = 0.02  # m or rad in a window; a smaller motion does not determine scales
 DELAYS_S = np.arange(0.0, 1.001, 0.02)
 CORRECTIONS = (
     "distance_scale",
@@ -43,7 +45,7 @@ CORRECTIONS = (
     "distance_loss_m_per_rad",
     "turn_bias_rad_per_m",
 )
-LIMITS = (0.2, 0.2, 0.2, 0.1, 0.1)  # of two that a log cannot tell apart the larger stays
+LIMITS = (0.2, 0.2, 0.2, 0.1, 0.1)  # of two that a log cannot separate the larger stays
 NOISE = (
     "distance_sigma_m_per_sqrt_m",
     "distance_sigma_m_per_sqrt_rad",
@@ -53,14 +55,17 @@ NOISE = (
 
 
 def odometry_delay_s(logs: Sequence[RobotLog]) -> float:
-    """The delay on a grid with which turns and ways fit best, each with its own scale."""
+    """The delay (s) on a grid with the best fit of turns and displacements, each with its scale."""
     costs = []
     for delay_s in DELAYS_S:
-        rows = odometry_rows(logs, float(delay_s), WINDOW_S)
+        rows = odometry_windows(logs, float(delay_s), WINDOW_S)
         cost = 0.0
-        for reading, true in ((rows.turn, rows.true_turn), (rows.way, rows.true_way)):
-            moving = np.abs(reading) > LEAST_MOTION
-            if moving.sum() >= LEAST_ROWS // 2:
+        for reading, true in (
+            (rows.turn, rows.true_turn),
+            (rows.displacement, rows.true_displacement),
+        ):
+            moving = np.abs(reading) > MIN_MOTION
+            if moving.sum() >= MIN_ROWS // 2:
                 scale = robust_fit(reading[moving, None], true[moving])[0]
                 error = float(np.abs(true[moving] - scale * reading[moving]).mean())
                 cost += moving.sum() * math.log(max(error, 1e-9))
@@ -68,130 +73,255 @@ def odometry_delay_s(logs: Sequence[RobotLog]) -> float:
     return float(DELAYS_S[int(np.argmin(costs))])
 
 
-def odometry_fit(rows: OdometryRows, now: Corrections, noise: Floats) -> Fit:
+def odometry_fit(rows: OdometryWindows, now: OdometryCorrections, noise: Floats) -> LinearFit:
     """Moving windows as rows of a fit of `CORRECTIONS`, in units of their sigma.
 
-    The scales are fitted as differences from 1, the delay as one from the present. `noise`: see
-    `odometry_noise`.
+    The scales are fitted as differences from 1, the delay as a difference from the present one.
+    `noise`: see `odometry_noise`.
     """
     way_sigma, turn_sigma = odometry_sigmas(rows, now, noise)
-    ways, turns = np.abs(rows.way) > LEAST_MOTION, np.abs(rows.turn) > LEAST_MOTION
-    turns |= np.abs(rows.drove) > LEAST_MOTION
+    ways, turns = np.abs(rows.displacement) > MIN_MOTION, np.abs(rows.turn) > MIN_MOTION
+    turns |= np.abs(rows.distance) > MIN_MOTION
     of_ways, of_turns = np.zeros((ways.sum(), 5)), np.zeros((turns.sum(), 5))
-    of_ways[:, 0], of_ways[:, 2] = rows.way[ways], now.distance_scale * rows.way_rate[ways]
+    of_ways[:, 0], of_ways[:, 2] = (
+        rows.displacement[ways],
+        now.distance_scale * rows.displacement_rate[ways],
+    )
     of_ways[:, 3] = -rows.loss[ways]
     of_turns[:, 1], of_turns[:, 2] = rows.turn[turns], now.turn_scale * rows.turn_rate[turns]
-    of_turns[:, 4] = now.drove(rows)[turns]
+    of_turns[:, 4] = now.distance(rows)[turns]
     sigma = np.concatenate([way_sigma[ways], turn_sigma[turns]])
-    values = np.concatenate([(rows.true_way - rows.way)[ways], (rows.true_turn - rows.turn)[turns]])
-    return Fit(
+    values = np.concatenate(
+        [(rows.true_displacement - rows.displacement)[ways], (rows.true_turn - rows.turn)[turns]]
+    )
+    return LinearFit(
         np.concatenate([rows.stretch[ways], rows.stretch[turns]]),
         np.concatenate([of_ways, of_turns]) / sigma[:, None],
         values / sigma,
     )
 
 
-def odometry_sigmas(rows: OdometryRows, now: Corrections, noise: Floats) -> tuple[Floats, Floats]:
-    """Sigmas (m, rad) of the ways and turns of windows."""
-    way = noise[0] * now.distance_scale * rows.along + noise[1] * now.turn_scale * rows.turned_along
-    turn = noise[2] * now.turn_scale * rows.turned + noise[3] * now.distance_scale * rows.path
+def odometry_sigmas(
+    rows: OdometryWindows, now: OdometryCorrections, noise: Floats
+) -> tuple[Floats, Floats]:
+    """Sigmas (m, rad) of the displacements and turns of windows."""
+    way = (
+        noise[0] * now.distance_scale * rows.distance_along
+        + noise[1] * now.turn_scale * rows.turn_along
+    )
+    turn = (
+        noise[2] * now.turn_scale * rows.turn_total
+        + noise[3] * now.distance_scale * rows.path_length
+    )
     return np.sqrt(np.maximum(way + noise[4], 1e-12)), np.sqrt(np.maximum(turn + noise[5], 1e-12))
 
 
-def odometry_noise(windows: Sequence[OdometryRows], now: Corrections) -> Floats:
-    """Variances by how residuals grow, shape (2, 6) as of `variance_parts`: those of `NOISE`, and
-    what is constant (m^2, rad^2): the truth's own errors. Long windows, of which there are few,
-    weigh more: what is alike for seconds tells in them.
+def odometry_noise(windows: Sequence[OdometryWindows], now: OdometryCorrections) -> Floats:
+    """Variances from the growth of the residuals, shape (2, 6) as of `variance_components`.
+
+    They are those of `NOISE`, and the constants (m^2, rad^2), which are errors of the truth. Long
+    windows are few and get a larger weight, because they show errors that are correlated for
+    seconds.
     """
 
-    def joined(name: str) -> Floats:
+    def column(name: str) -> Floats:
         return np.concatenate([getattr(w, name) for w in windows])
 
-    along, path = now.distance_scale * joined("along"), now.distance_scale * joined("path")
-    turned_along, turned = (now.turn_scale * joined(n) for n in ("turned_along", "turned"))
-    ways = np.concatenate([w.true_way - now.ways(w) for w in windows])
-    turns = np.concatenate([w.true_turn - now.turns(w) for w in windows])
+    along, path = (
+        now.distance_scale * column("distance_along"),
+        now.distance_scale * column("path_length"),
+    )
+    turned_along, turned = (now.turn_scale * column(n) for n in ("turn_along", "turn_total"))
+    ways = np.concatenate([w.true_displacement - now.displacement(w) for w in windows])
+    turns = np.concatenate([w.true_turn - now.turn(w) for w in windows])
     one = np.ones_like(path)
-    sizes = [len(w.path) for w in windows]
+    sizes = [len(w.path_length) for w in windows]
     weights = np.concatenate([np.full(n, sizes[0] / max(n, 1)) for n in sizes])
-    moving = (path > LEAST_MOTION) | (turned > LEAST_MOTION)
+    moving = (path > MIN_MOTION) | (turned > MIN_MOTION)
     of_ways, of_turns = (
-        _covering(errors[moving], np.stack(columns, axis=1)[moving], weights[moving])
+        _covering_variances(errors[moving], np.stack(columns, axis=1)[moving], weights[moving])
         for errors, columns in ((ways, (along, turned_along, one)), (turns, (turned, path, one)))
     )
     return np.concatenate([of_ways, of_turns], axis=1)[:, [0, 1, 3, 4, 2, 5]]
 
 
-def _covering(errors: Floats, columns: Floats, weights: Floats) -> Floats:
-    """Variance parts, grown where windows of one length (they share a weight) err by more: drift
-    that is alike for seconds grows faster than the root of the way, and tails are heavy."""
-    parts = variance_parts(errors, columns, weights)
+def _covering_variances(errors: Floats, columns: Floats, weights: Floats) -> Floats:
+    """Variance components, increased if windows of one length (they share a weight) have larger
+    errors: correlated drift grows faster than the root of the distance, and tails are heavy."""
+    parts = variance_components(errors, columns, weights)
     if np.isnan(parts).any():
         return parts
     unit = errors**2 / np.maximum(columns @ parts[0], 1e-12)
-    worst = max(float(np.minimum(unit[weights == w], GROSS**2).mean()) for w in np.unique(weights))
+    worst = max(
+        float(np.minimum(unit[weights == w], OUTLIER_SIGMAS**2).mean()) for w in np.unique(weights)
+    )
     return parts * max(1.0, worst)
 
 
-class _Fitted(NamedTuple):
-    """Corrections that fit best, and what they were fitted to."""
+class _OdometryFit(NamedTuple):
+    """The best corrections, and the data of their fit."""
 
-    now: Corrections
+    now: OdometryCorrections
     known: Mask  # of `CORRECTIONS`
-    fit: Fit
-    windows: Sequence[OdometryRows]  # of `NOISE_WINDOWS_S`
+    fit: LinearFit
+    windows: Sequence[OdometryWindows]  # of `NOISE_WINDOWS_S`
 
 
 def calibrate_odometry(logs: Sequence[RobotLog]) -> dict[str, Estimate]:
-    """Values by the names of `OdometrySettings`; those that the logs do not tell are missing."""
+    """Values named as in `OdometrySettings`; those that the logs do not determine are missing."""
     logs = [log for log in logs if len(log.odometry)]
     if not logs:
         return {}
-    found = _fitted(logs, Corrections(1.0, 1.0, odometry_delay_s(logs), 0.0, 0.0))
-    least = None if found is None else least_speed(logs, found.now)
-    crawl = None
-    if found is not None and least is not None:
-        speed = least.value / found.now.distance_scale
-        crawl = crawl_noise(logs, found.now, speed)
-        found = _fitted([no_slower(log, speed) for log in logs], found.now)
+    found = _fit_corrections(logs, OdometryCorrections(1.0, 1.0, odometry_delay_s(logs), 0.0, 0.0))
+    least_speed = None if found is None else estimate_least_speed(logs, found.now)
+    crawl_noise = None
+    if found is not None and least_speed is not None:
+        speed = least_speed.value / found.now.distance_scale
+        crawl_noise = estimate_crawl_noise(logs, found.now, speed)
+        found = _fit_corrections([with_least_speed(log, speed) for log in logs], found.now)
     if found is None:
         return {}
     now, known, fit, windows = found
-    changes = jackknife(lambda keep: solved(kept(fit, keep(fit.stretch)), known), fit.stretch)
+    changes = jackknife(lambda keep: solve(select_rows(fit, keep(fit.stretch)), known), fit.stretch)
     values = [Estimate(v, c.standard_error) for v, c in zip(now, changes, strict=True)]
-    grown = sigmas(
-        lambda keep: odometry_noise([kept(w, keep(w.stretch)) for w in windows], now),
+    grown = sigma_estimates(
+        lambda keep: odometry_noise([select_rows(w, keep(w.stretch)) for w in windows], now),
         windows[0].stretch,
     )
     result = {name: v for name, v, k in zip(CORRECTIONS, values, known, strict=True) if k}
-    if least is not None:
-        result["least_speed_m_s"] = least
-    if crawl is not None:
-        result[CRAWL_NOISE] = crawl
+    if least_speed is not None:
+        result["least_speed_m_s"] = least_speed
+    if crawl_noise is not None:
+        result[CRAWL_NOISE] = crawl_noise
     return result | dict(zip(NOISE, grown, strict=False))
 
 
-def _fitted(logs: Sequence[RobotLog], now: Corrections) -> _Fitted | None:
-    """None where too little moved."""
+def _fit_corrections(logs: Sequence[RobotLog], now: OdometryCorrections) -> _OdometryFit | None:
+    """The corrections that fit best; None if the robot moved too little."""
     for _ in range(4):
-        windows = [odometry_rows(logs, now.delay_s, length_s) for length_s in NOISE_WINDOWS_S]
+        windows = [odometry_windows(logs, now.delay_s, length_s) for length_s in NOISE_WINDOWS_S]
         noise = odometry_noise(windows, now)
         if np.isnan(noise).all():
             return None
-        rows = odometry_rows(logs, now.delay_s, WINDOW_S)
+        rows = odometry_windows(logs, now.delay_s, WINDOW_S)
         fit = odometry_fit(rows, now, np.nan_to_num(noise[0]))
-        known = told(fit.columns, LIMITS)
-        now = _changed(now, solved(fit, known), bool(known[2]))
-    return _Fitted(now, known, fit, windows)
+        known = determined_coefficients(fit.columns, LIMITS)
+        now = _apply_changes(now, solve(fit, known), bool(known[2]))
+    return _OdometryFit(now, known, fit, windows)
 
 
-def _changed(now: Corrections, change: Floats, tells_delay: bool) -> Corrections:
-    later_s = float(np.clip(change[2], -0.05, 0.05)) if tells_delay else -now.delay_s
+def _apply_changes(
+    now: OdometryCorrections, change: Floats, delay_is_known: bool
+) -> OdometryCorrections:
+    later_s = float(np.clip(change[2], -0.05, 0.05)) if delay_is_known else -now.delay_s
     scale, turn_scale, _, loss, bias = change.tolist()
-    return Corrections(1.0 + scale, 1.0 + turn_scale, now.delay_s + later_s, max(loss, 0.0), bias)
+    return OdometryCorrections(
+        1.0 + scale, 1.0 + turn_scale, now.delay_s + later_s, max(loss, 0.0), bias
+    )
 
 
 def turn_residuals(logs: Sequence[RobotLog], turn_scale: float) -> Floats:
     """Mean absolute error of the turn in a window, rad, for each of `DELAYS_S`."""
-    windows = [odometry_rows(logs, float(delay_s), WINDOW_S) for delay_s in DELAYS_S]
+    windows = [odometry_windows(logs, float(delay_s), WINDOW_S) for delay_s in DELAYS_S]
     return np.array([np.abs(w.true_turn - turn_scale * w.turn).mean() for w in windows])
+
+
+LEAST_SPEEDS_M_S = np.arange(0.0, 0.0501, 0.001)
+MAX_ERROR_M = (
+    0.1  # a larger error of the displacement in a window has other causes than a dead zone
+)
+SIGNIFICANT_SIGMAS = 3.0  # standard errors
+MIN_CRAWL_SHARE = 0.7  # of the time of a window that counts as slow
+MIN_CRAWL_WINDOWS = 8  # windows of one length
+CRAWL_NOISE = "crawl_sigma_m_per_sqrt_s"
+
+
+def estimate_least_speed(logs: Sequence[RobotLog], now: OdometryCorrections) -> Estimate | None:
+    """The speed (m/s) of a robot that is commanded to drive slower, if the logs determine it.
+
+    It is the speed on a grid with the best fit of the displacements.
+    """
+    commanded_speeds = [speed / now.distance_scale for speed in LEAST_SPEEDS_M_S]
+    rows = [
+        odometry_windows([with_least_speed(log, speed) for log in logs], now.delay_s, WINDOW_S)
+        for speed in commanded_speeds
+    ]
+    stretch = rows[0].stretch
+    errors = np.minimum(
+        [np.abs(r.true_displacement - now.displacement(r)) for r in rows], MAX_ERROR_M
+    )
+    slow = np.ptp(errors, axis=0) > 0.0
+    if slow.sum() < MIN_ROWS // 2:
+        return None
+
+    def best(keep: RowFilter) -> Floats:
+        cost = errors[:, keep(stretch) & slow].sum(axis=1)
+        return LEAST_SPEEDS_M_S[[int(np.argmin(cost))]]
+
+    (found,) = jackknife(best, stretch)
+    step = float(LEAST_SPEEDS_M_S[1])
+    found = Estimate(found.value, max(found.standard_error, step / math.sqrt(12.0)))
+    return found if found.value > SIGNIFICANT_SIGMAS * found.standard_error else None
+
+
+def with_least_speed(log: RobotLog, speed_m_s: float) -> RobotLog:
+    """The log with this speed in place of each lower commanded speed other than 0."""
+    odometry = log.odometry.copy()
+    slow, seconds = _slow_pieces(log, speed_m_s)
+    odometry[slow, 2] = np.copysign(speed_m_s * seconds, log.odometry[:, 2])[slow]
+    return log._replace(odometry=odometry)
+
+
+def _slow_pieces(log: RobotLog, speed_m_s: float) -> tuple[Mask, Floats]:
+    """Which pieces of odometry are slower than this but not 0, and their lengths (s)."""
+    from_s, until_s, distance, _ = log.odometry.T
+    seconds = until_s - from_s
+    return (distance != 0.0) & (np.abs(distance) < speed_m_s * seconds), seconds
+
+
+class _CrawlWindows(NamedTuple):
+    """Windows in which a robot mostly drove at its least speed. Shapes (n,)."""
+
+    stretch: Integers
+    square_m2: Floats  # of the error of the displacement
+    seconds: Floats  # at the least speed
+
+
+def estimate_crawl_noise(
+    logs: Sequence[RobotLog], now: OdometryCorrections, speed_m_s: float
+) -> Estimate | None:
+    """The error of the displacement (m per root of a second) while the robot drives at its least
+    speed, because the commanded (reported) speed is below this; None if that is rare.
+
+    The windows of the length with the largest error determine it.
+    """
+    crawl_windows = []
+    for length_s in NOISE_WINDOWS_S:
+        driven, only = (
+            odometry_windows([change(log, speed_m_s) for log in logs], now.delay_s, length_s)
+            for change in (with_least_speed, _with_slow_seconds)
+        )
+        errors_m = np.minimum(
+            np.abs(driven.true_displacement - now.displacement(driven)), MAX_ERROR_M
+        )
+        rows = _CrawlWindows(driven.stretch, errors_m**2, only.path_length)
+        rows = select_rows(rows, only.path_length > MIN_CRAWL_SHARE * length_s)
+        if len(rows.seconds) >= MIN_CRAWL_WINDOWS:
+            crawl_windows.append(rows)
+    if not crawl_windows:
+        return None
+
+    def variance(keep: RowFilter) -> Floats:
+        left = [select_rows(rows, keep(rows.stretch)) for rows in crawl_windows]
+        each = [rows.square_m2.sum() / max(rows.seconds.sum(), 1e-9) for rows in left]
+        return np.full((2, 1), max(each))
+
+    return sigma_estimates(variance, crawl_windows[0].stretch)[0]
+
+
+def _with_slow_seconds(log: RobotLog, speed_m_s: float) -> RobotLog:
+    """The log with the seconds of slow pieces in place of distances."""
+    slow, seconds = _slow_pieces(log, speed_m_s)
+    odometry = log.odometry.copy()
+    odometry[:, 2] = np.where(slow, seconds, 0.0)
+    return log._replace(odometry=odometry)

@@ -12,18 +12,18 @@ from cpcbl_team.errors import InputError
 
 PICTURES = (".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp")
 VIDEOS = (".avi", ".m4v", ".mkv", ".mov", ".mp4", ".webm")
-FRAMES_HZ = 30.0  # of a video that does not say its own
+FRAMES_HZ = 30.0  # of a video that does not state its own
 
 
-class Picture(NamedTuple):
-    """A picture (height, width, 3), BGR; a text where there is none: why."""
+class NamedPicture(NamedTuple):
+    """A picture (height, width, 3), BGR, or the reason why it cannot be read."""
 
     name: str
     pixels: Pixels | str
 
 
 def picture_files(paths: Sequence[Path]) -> list[Path]:
-    """Files, and those of folders that are pictures or videos by their names. Raises InputError."""
+    """The files, and the pictures and videos inside folders, by their names. Raises InputError."""
     files: list[Path] = []
     for path in paths:
         if path.is_dir():
@@ -40,32 +40,32 @@ def picture_files(paths: Sequence[Path]) -> list[Path]:
 
 def read_pictures(
     files: Sequence[Path], every_s: float = 0.5, progress: Callable[[float], None] = lambda d: None
-) -> Iterator[Picture]:
-    """One after the other; of a video a frame every so many seconds. What cannot be read is said.
+) -> Iterator[NamedPicture]:
+    """Reads one picture after the other; of a video, one frame every `every_s` seconds.
 
-    `progress` is told the share of the files that are done.
+    `progress` is called with the share of the files that are done.
     """
     for i, file in enumerate(files):
         if file.suffix.lower() in VIDEOS:
-            yield from _frames(file, every_s)
+            yield from _video_frames(file, every_s)
         else:
             yield read_picture(file)
         progress((i + 1) / len(files))
 
 
-def read_picture(file: Path) -> Picture:
-    """One picture, or why there is none."""
+def read_picture(file: Path) -> NamedPicture:
+    """Reads one picture; the result names the reason if that fails."""
     try:
         image = np.frombuffer(file.read_bytes(), np.uint8)
     except OSError as error:
-        return Picture(file.name, error.strerror or "cannot be read")
+        return NamedPicture(file.name, error.strerror or "cannot be read")
     pixels = cv2.imdecode(image, cv2.IMREAD_COLOR) if image.size else None
-    return Picture(
+    return NamedPicture(
         file.name, "no picture" if pixels is None else pixels.astype("uint8", copy=False)
     )
 
 
-def _frames(file: Path, every_s: float) -> Iterator[Picture]:
+def _video_frames(file: Path, every_s: float) -> Iterator[NamedPicture]:
     video = cv2.VideoCapture(str(file))
     try:
         step = max(round(every_s * (video.get(cv2.CAP_PROP_FPS) or FRAMES_HZ)), 1)
@@ -74,9 +74,11 @@ def _frames(file: Path, every_s: float) -> Iterator[Picture]:
             if number % step == 0:
                 read, pixels = video.retrieve()
                 name = f"{file.name}:{number}"
-                yield Picture(name, pixels.astype("uint8", copy=False) if read else "no picture")
+                yield NamedPicture(
+                    name, pixels.astype("uint8", copy=False) if read else "no picture"
+                )
             number += 1
         if number == 0:
-            yield Picture(file.name, "no frame in this video")
+            yield NamedPicture(file.name, "no frame in this video")
     finally:
         video.release()

@@ -157,21 +157,23 @@ def calibrate(
     from rich.console import Console
 
     from cpcbl_launch.calibration.logs import read_logs
-    from cpcbl_launch.calibration.robots import calibrated
-    from cpcbl_launch.calibration.show import print_calibration
-    from cpcbl_launch.calibration.team_text import base_text, team_text
+    from cpcbl_launch.calibration.reports import print_calibration
+    from cpcbl_launch.calibration.robots import calibrate_robots
+    from cpcbl_launch.calibration.team_types import base_team, calibrated_team
     from cpcbl_launch.reporting.files import write_or_reason
     from cpcbl_launch.views.run import progress_bar
 
-    base, base_name = base_text(logs, team_file)
+    base, base_name = base_team(logs, team_file)
     names = [log.resolve().name for log in logs]
     robot_logs = read_logs(logs)
     with progress_bar("calibrating", quiet=as_json) as progress:
-        result = calibrated(robot_logs, names, progress)
-    text = team_text(result, base, base_name, margin=margin, correction_margin=correction_margin)
+        result = calibrate_robots(robot_logs, names, progress)
+    text = calibrated_team(
+        result, base, base_name, margin=margin, correction_margin=correction_margin
+    )
     lost = write_or_reason(output, lambda: output.write_text(text, encoding="utf-8"))
     if picture is not None:
-        from cpcbl_launch.calibration.picture import draw_residuals
+        from cpcbl_launch.calibration.plots import draw_residuals
 
         lost |= write_or_reason(picture, partial(draw_residuals, robot_logs, result, picture))
     print_result(result, as_json, lambda: print_calibration(result, Console()))

@@ -10,18 +10,25 @@ import pytest
 from support.processes import cpcbl_team
 
 from cpcbl_agents.vision.camera import Pixels
+from cpcbl_launch.calibration.colour_samples import (
+    ColourSample,
+    colour_patches,
+    draw_preview,
+    label_pictures,
+    parse_sample,
+    read_samples,
+    resolve_pictures,
+    unlabelled_pixels,
+)
 from cpcbl_launch.calibration.colours import (
-    Colours,
+    ColourCalibration,
+    ColourPatch,
     Hsv,
-    Patch,
-    calibrated_colours,
-    taken,
+    calibrate_colours,
+    colour_mask,
     thresholds,
 )
-from cpcbl_launch.calibration.colours_show import colour_values, kept_colours
-from cpcbl_launch.calibration.patches import elsewhere, labelled, patches_of, preview
-from cpcbl_launch.calibration.samples import Sample, named_in, parsed_sample, read_samples
-from cpcbl_launch.calibration.team_edit import edited
+from cpcbl_launch.calibration.team_tables import colour_tables, edit_team, unsampled_colours
 from cpcbl_launch.team_file import TeamFileError, load_team, parse_team
 from cpcbl_team.config import COLOURS, Colour
 from cpcbl_team.errors import InputError
@@ -58,10 +65,10 @@ def painted(
     return pixels
 
 
-def boxes(paint: Mapping[str, object], picture: Path) -> list[Sample]:
+def boxes(paint: Mapping[str, object], picture: Path) -> list[ColourSample]:
     """The squares, without their edges."""
     at = {name: (60 * i + 13, 23, SIZE_PX - 6, SIZE_PX - 6) for i, name in enumerate(paint)}
-    return [Sample(picture, name, box) for name, box in at.items()]
+    return [ColourSample(picture, name, box) for name, box in at.items()]
 
 
 def seen(pixels: Pixels) -> Hsv:
@@ -76,10 +83,10 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def found_in(folder: Path, kept: Mapping[str, Colour] | None = None) -> Colours:
+def found_in(folder: Path, kept: Mapping[str, Colour] | None = None) -> ColourCalibration:
     files = sorted(folder.glob("?.png"))
-    pictures = labelled([s for f in files for s in boxes(PAINT, f)], [])
-    return calibrated_colours(patches_of(pictures), elsewhere(pictures), kept)
+    pictures = label_pictures([s for f in files for s in boxes(PAINT, f)], [])
+    return calibrate_colours(colour_patches(pictures), unlabelled_pixels(pictures), kept)
 
 
 def test_thresholds_take_their_colour_in_other_light_and_nothing_else(folder: Path) -> None:
@@ -96,9 +103,9 @@ def test_thresholds_take_their_colour_in_other_light_and_nothing_else(folder: Pa
     anew = painted(PAINT, 0.62, seed=9)
     for i, (name, fit) in enumerate(found.colours.items()):
         square = seen(anew)[23:57, 60 * i + 13 : 60 * i + 47]
-        assert taken(square, fit.thresholds).mean() > 0.98, name
+        assert colour_mask(square, fit.thresholds).mean() > 0.98, name
         wall = seen(anew)[:15]
-        assert taken(wall, fit.thresholds).mean() < 0.01
+        assert colour_mask(wall, fit.thresholds).mean() < 0.01
 
 
 def test_hues_go_through_red(folder: Path) -> None:
@@ -106,7 +113,7 @@ def test_hues_go_through_red(folder: Path) -> None:
     assert red.hue[0] > 160
     assert red.hue[1] < 12
     middle = np.array([[179, 200, 200], [0, 200, 200], [90, 200, 200]], np.uint8)
-    assert taken(middle, red).tolist() == [True, True, False]
+    assert colour_mask(middle, red).tolist() == [True, True, False]
 
 
 @pytest.mark.parametrize("hue", [0, 3, 60, 120, 177])
@@ -114,18 +121,18 @@ def test_a_range_of_hues_holds_its_samples_wherever_it_is(hue: int) -> None:
     random = np.random.default_rng(hue)
     hsv = np.full((2000, 3), 180, np.uint8)
     hsv[:, 0] = np.round(random.normal(hue, 2.0, 2000)) % 180
-    colour = thresholds([Patch("one", hsv)])["one"]
-    assert taken(hsv, colour).mean() > 0.99
+    colour = thresholds([ColourPatch("one", hsv)])["one"]
+    assert colour_mask(hsv, colour).mean() > 0.99
     assert (colour.hue[1] - colour.hue[0]) % 180 == pytest.approx(
         16, abs=2
     )  # 4 sigma and 4 at each end
 
 
 def test_ranges_are_widened_up_to_the_middle_between_neighbours() -> None:
-    def patch(name: str, low: int, high: int) -> Patch:
+    def patch(name: str, low: int, high: int) -> ColourPatch:
         hsv = np.full((600, 3), 200, np.uint8)
         hsv[:, 0] = np.random.default_rng(low).integers(low, high + 1, 600) % 180
-        return Patch(name, hsv)
+        return ColourPatch(name, hsv)
 
     found = thresholds([patch("a", 175, 188), patch("b", 10, 24), patch("c", 80, 90)], 0.5)
     assert found["a"].hue[1] == 8  # the gap is of one hue
@@ -138,10 +145,10 @@ def test_colours_that_overlap_are_said_with_the_fix() -> None:
     paint = {"red": (40, 30, 210), "brick": (40, 35, 200), "blue": (190, 90, 20)}
     picture = painted(paint, 0.9, 1)
     patches = [
-        Patch(s.colour, seen(picture)[23:57, s.at[0] : s.at[0] + 34].reshape(-1, 3))
+        ColourPatch(s.colour, seen(picture)[23:57, s.at[0] : s.at[0] + 34].reshape(-1, 3))
         for s in boxes(paint, Path())
     ]
-    found = calibrated_colours(patches, seen(picture).reshape(-1, 3))
+    found = calibrate_colours(patches, seen(picture).reshape(-1, 3))
     (overlap,) = found.overlaps
     assert {overlap.one, overlap.other} == {"red", "brick"}
     assert any("overlap at hues" in n and "colours farther apart" in n for n in found.notes)
@@ -157,18 +164,18 @@ def test_a_kept_colour_may_overlap_too(folder: Path) -> None:
 def test_grey_has_no_hue() -> None:
     random = np.random.default_rng(1)
     grey = np.clip(random.normal(120, 6, (40, 40, 3)), 0, 255).astype(np.uint8)
-    colour = thresholds([Patch("grey", seen(grey).reshape(-1, 3))])["grey"]
+    colour = thresholds([ColourPatch("grey", seen(grey).reshape(-1, 3))])["grey"]
     assert colour.hue == (0, 179)
-    assert taken(seen(grey), colour).mean() > 0.95
-    assert not taken(np.array([60, 200, 120], np.uint8), colour)
+    assert colour_mask(seen(grey), colour).mean() > 0.95
+    assert not colour_mask(np.array([60, 200, 120], np.uint8), colour)
 
 
 def test_light_that_no_other_sample_has_is_said(tmp_path: Path) -> None:
     paint = {"green": PAINT["green"]}
     for i, light in enumerate((1.0, 0.25)):
         cv2.imwrite(str(tmp_path / f"{i}.png"), painted(paint, light, i, gradient=0.0))
-    pictures = labelled([s for i in "01" for s in boxes(paint, tmp_path / f"{i}.png")], [])
-    found = calibrated_colours(patches_of(pictures), elsewhere(pictures))
+    pictures = label_pictures([s for i in "01" for s in boxes(paint, tmp_path / f"{i}.png")], [])
+    found = calibrate_colours(colour_patches(pictures), unlabelled_pixels(pictures))
     assert any("the light differs" in note for note in found.notes)
 
 
@@ -176,11 +183,13 @@ def test_light_that_no_other_sample_has_is_said(tmp_path: Path) -> None:
 
 
 def test_samples_are_read_from_options_and_files(tmp_path: Path) -> None:
-    assert parsed_sample("a:b.png:red=1,2,30,40") == Sample(Path("a:b.png"), "red", (1, 2, 30, 40))
-    assert parsed_sample("a.png:red=1,2,5").at == (1, 2, 5)
+    assert parse_sample("a:b.png:red=1,2,30,40") == ColourSample(
+        Path("a:b.png"), "red", (1, 2, 30, 40)
+    )
+    assert parse_sample("a.png:red=1,2,5").at == (1, 2, 5)
     expected = [
-        Sample(tmp_path / "a.png", "red", (1, 2, 30, 40)),
-        Sample(tmp_path / "b.png", "blue", (7, 8, 5)),
+        ColourSample(tmp_path / "a.png", "red", (1, 2, 30, 40)),
+        ColourSample(tmp_path / "b.png", "blue", (7, 8, 5)),
     ]
     texts = {
         "s.toml": "[[samples]]\npicture = 'a.png'\ncolour = 'red'\nat = [1, 2, 30, 40]\n"
@@ -192,15 +201,15 @@ def test_samples_are_read_from_options_and_files(tmp_path: Path) -> None:
     for name, text in texts.items():
         (tmp_path / name).write_text(text)
         assert read_samples(tmp_path / name) == expected
-    assert named_in(expected, [Path("x/b.png")]) == expected
-    loose = [Sample(Path("b.png"), "blue", (7, 8, 5))]
-    assert named_in(loose, [Path("x/b.png")])[0].picture == Path("x/b.png")
+    assert resolve_pictures(expected, [Path("x/b.png")]) == expected
+    loose = [ColourSample(Path("b.png"), "blue", (7, 8, 5))]
+    assert resolve_pictures(loose, [Path("x/b.png")])[0].picture == Path("x/b.png")
 
 
 @pytest.mark.parametrize("text", ["a.png", "a.png:red", "a.png:red=1,2", "red=1,2,3", "a:r=1,2,-3"])
 def test_samples_that_are_none_are_said(text: str) -> None:
     with pytest.raises(InputError, match="write it as PICTURE:COLOUR=X,Y,WIDTH,HEIGHT"):
-        parsed_sample(text)
+        parse_sample(text)
 
 
 @pytest.mark.parametrize(
@@ -221,30 +230,32 @@ def test_files_that_hold_no_samples_are_said(tmp_path: Path, name: str, text: st
 
 def test_samples_outside_of_their_picture_are_said(folder: Path) -> None:
     for at in ((350, 70, 20, 5), (400, 5, 3), (5, 5, 0, 9)):
-        with pytest.raises(InputError, match="is not inside of 360 x 80 px"):
-            labelled([Sample(folder / "0.png", "red", at)], [])
+        with pytest.raises(InputError, match="is not inside 360 x 80 px"):
+            label_pictures([ColourSample(folder / "0.png", "red", at)], [])
     with pytest.raises(InputError, match=r"no\.png: No such file"):
-        labelled([Sample(folder / "no.png", "red", (1, 1, 3))], [])
+        label_pictures([ColourSample(folder / "no.png", "red", (1, 1, 3))], [])
     with pytest.raises(InputError, match="red: fewer than 20 pixels"):
-        calibrated_colours([Patch("red", np.zeros((19, 3), np.uint8))], np.zeros((0, 3), np.uint8))
+        calibrate_colours(
+            [ColourPatch("red", np.zeros((19, 3), np.uint8))], np.zeros((0, 3), np.uint8)
+        )
 
 
 def test_a_point_with_a_radius_is_a_disc(folder: Path) -> None:
-    (picture,) = labelled([Sample(folder / "0.png", "red", (30, 40, 10))], [])
+    (picture,) = label_pictures([ColourSample(folder / "0.png", "red", (30, 40, 10))], [])
     ((_, mask),) = picture.samples
     assert mask.sum() == pytest.approx(np.pi * 10.5**2, rel=0.1)
-    assert len(elsewhere([picture])) == mask.size - mask.sum()
+    assert len(unlabelled_pixels([picture])) == mask.size - mask.sum()
 
 
 def test_the_preview_shows_what_is_taken_and_what_is_both(folder: Path) -> None:
-    (picture,) = labelled(boxes(PAINT, folder / "0.png"), [])
+    (picture,) = label_pictures(boxes(PAINT, folder / "0.png"), [])
     found = found_in(folder)
     colours = {name: fit.thresholds for name, fit in found.colours.items()}
-    right = preview([picture], colours)[:, 360:]
+    right = draw_preview([picture], colours)[:, 360:]
     for i, name in enumerate(colours):
         hue = int(seen(right)[40, 60 * i + 30, 0])
-        assert taken(np.array([hue, 255, 255], np.uint8), colours[name])
-    both = preview([picture], {**colours, "again": colours["blue"]})[:, 360:]
+        assert colour_mask(np.array([hue, 255, 255], np.uint8), colours[name])
+    both = draw_preview([picture], {**colours, "again": colours["blue"]})[:, 360:]
     assert both[40, 60 * 4 + 30].tolist() == [255, 255, 255]
     assert right[5, 5].max() < 60
 
@@ -255,25 +266,25 @@ def test_the_preview_shows_what_is_taken_and_what_is_both(folder: Path) -> None:
 def test_a_file_gets_all_colours_that_it_uses(folder: Path, tmp_path: Path) -> None:
     path = tmp_path / "lab.toml"
     path.write_text(TEAM)
-    kept, stays = kept_colours(path, {"red", "orange"})
+    kept, stays = unsampled_colours(path, {"red", "orange"})
     assert (sorted(kept), stays) == (["blue", "green", "yellow"], False)
     files = [folder / "0.png"]
     patches = [
         p
-        for p in patches_of(labelled([s for f in files for s in boxes(PAINT, f)], []))
+        for p in colour_patches(label_pictures([s for f in files for s in boxes(PAINT, f)], []))
         if p.colour in ("red", "orange")
     ]
-    found = calibrated_colours(patches, np.zeros((0, 3), np.uint8), kept)
-    text = edited(TEAM, "lab.toml", colour_values(found, stays))
+    found = calibrate_colours(patches, np.zeros((0, 3), np.uint8), kept)
+    text = edit_team(TEAM, "lab.toml", colour_tables(found, stays))
     assert "# by the window" in text
     colours = parse_team(text).vision.colours
     assert sorted(colours) == ["blue", "green", "orange", "red", "yellow"]
     assert colours["blue"] == COLOURS["blue"]
     assert colours["red"] == found.colours["red"].thresholds
     path.write_text(text + "\n[vision.colours.mud]\nhue = [1, 2] # seen once\n")
-    kept, stays = kept_colours(path, {"red"})
+    kept, stays = unsampled_colours(path, {"red"})
     assert (sorted(kept), stays) == (["blue", "green", "mud", "orange", "yellow"], True)
-    again = edited(path.read_text(), "lab.toml", colour_values(found, stays))
+    again = edit_team(path.read_text(), "lab.toml", colour_tables(found, stays))
     assert "# seen once" in again
     assert parse_team(again).vision.colours["mud"] == Colour(hue=(1, 2))
 
@@ -283,12 +294,12 @@ def test_a_colour_that_only_samples_know_may_be_used_by_the_file(tmp_path: Path)
     path.write_text(TEAM.replace('"red"', '"brick"'))
     with pytest.raises(TeamFileError, match="no colour 'brick'"):
         load_team(path)
-    kept, stays = kept_colours(path, {"brick"})
+    kept, stays = unsampled_colours(path, {"brick"})
     hsv = np.tile(np.array([[10, 200, 150]], np.uint8), (50, 1))
-    found = calibrated_colours([Patch("brick", hsv)], hsv, kept)
+    found = calibrate_colours([ColourPatch("brick", hsv)], hsv, kept)
     assert (
         "brick"
-        in parse_team(edited(path.read_text(), "x", colour_values(found, stays))).vision.colours
+        in parse_team(edit_team(path.read_text(), "x", colour_tables(found, stays))).vision.colours
     )
 
 
@@ -300,8 +311,8 @@ def test_a_table_of_colours_in_one_line_stays_one() -> None:
     )
     text = text.replace("[vision]\n", "")
     hsv = np.tile(np.array([[1, 200, 150]], np.uint8), (50, 1))
-    found = calibrated_colours([Patch("red", hsv)], hsv)
-    changed = edited(text, "x", colour_values(found, True))
+    found = calibrate_colours([ColourPatch("red", hsv)], hsv)
+    changed = edit_team(text, "x", colour_tables(found, True))
     assert parse_team(changed).vision.colours["red"] == found.colours["red"].thresholds
     assert "red = {" in changed
 
@@ -336,10 +347,10 @@ def test_json_and_what_is_wrong_in_one_line(folder: Path, tmp_path: Path) -> Non
     assert red["samples"] == 2
     assert red["taken"]["red"] > 0.95
     for arguments, said in (
-        ([folder], "say where colours are"),
+        ([folder], "name areas of colours"),
         ([folder, "--sample", "red"], "write it as PICTURE:COLOUR="),
         ([folder, *samples, "--preview", tmp_path / "p.txt"], "p.txt: not a picture"),
-        ([folder, *samples, "--team", "demo"], "a built-in team stays as it is"),
+        ([folder, *samples, "--team", "demo"], "a built-in team cannot be changed"),
         (["--sample", "no.png:red=1,2,3"], "no.png: No such file"),
     ):
         failed = cpcbl_team("calibrate", "colours", *arguments)

@@ -13,18 +13,21 @@ from support.processes import cpcbl_team
 
 from cpcbl_agents.sources.mrclam import LogError
 from cpcbl_agents.vision.camera import Camera
-from cpcbl_launch.calibration.agreement import Agreement, Seeing, calibrated_seeing
-from cpcbl_launch.calibration.logs import placed
-from cpcbl_launch.calibration.seeing_show import SIGMAS, seeing_values
-from cpcbl_launch.calibration.sights import (
-    Sights,
-    photographed,
-    read_poses,
-    recorded,
-    sights_of,
-    viewer,
+from cpcbl_launch.calibration.camera_accuracy import (
+    AccuracyRow,
+    CameraAccuracy,
+    measure_camera_accuracy,
 )
-from cpcbl_launch.calibration.team_edit import Place, edited
+from cpcbl_launch.calibration.camera_observations import (
+    CameraObservations,
+    camera_observations,
+    dataset_from_pictures,
+    dataset_from_recordings,
+    observer_name,
+    read_poses,
+)
+from cpcbl_launch.calibration.logs import ground_truth
+from cpcbl_launch.calibration.team_tables import CAMERA_SIGMAS, TablePath, edit_team, sensor_tables
 from cpcbl_launch.reporting.recording import Recording
 from cpcbl_launch.simulation.camera.render import Light, Scene, Standing, render
 from cpcbl_launch.team_file import load_team, parse_team
@@ -71,8 +74,8 @@ def photograph(folder: Path, camera: CameraSettings) -> Path:
         away, aside = random.uniform(0.9, 2.5), heading + random.uniform(-0.4, 0.4)
         other = x + away * math.cos(aside), y + away * math.sin(aside), random.uniform(-3.0, 3.0)
         mate = Standing("mate", *other)
-        taken = render(scene, Camera(camera), Pose2(x, y, heading), [mate], Light(), random)
-        cv2.imwrite(str(folder / f"{i:02}.png"), taken)
+        colour_mask = render(scene, Camera(camera), Pose2(x, y, heading), [mate], Light(), random)
+        cv2.imwrite(str(folder / f"{i:02}.png"), colour_mask)
         rows.append((f"{i:02}.png", x, y, math.degrees(heading), ""))
         rows.append((f"{i:02}.png", *other[:2], math.degrees(other[2]), "mate"))
     with (folder / "poses.csv").open("w", newline="") as file:
@@ -95,18 +98,18 @@ def wrong(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def seen_in(folder: Path) -> Seeing:
-    looked = photographed(folder, folder / "poses.csv", "eye", LAB)
-    return calibrated_seeing(looked.sights)
+def accuracy_of(folder: Path) -> CameraAccuracy:
+    looked = dataset_from_pictures(folder, folder / "poses.csv", "eye", LAB)
+    return measure_camera_accuracy(looked.observations)
 
 
-def whole(seeing: Seeing, kind: str) -> Agreement:
+def whole(seeing: CameraAccuracy, kind: str) -> AccuracyRow:
     (found,) = (a for a in seeing.agreements if a.kind == kind and a.to_m is None and not a.from_m)
     return found
 
 
 def test_a_camera_as_the_file_says_is_found_right_and_honest(honest: Path) -> None:
-    seeing = seen_in(honest)
+    seeing = accuracy_of(honest)
     for kind in ("landmarks", "teammates"):
         found = whole(seeing, kind)
         assert found.sightings > 0.5 * PICTURES
@@ -128,7 +131,7 @@ def test_a_camera_as_the_file_says_is_found_right_and_honest(honest: Path) -> No
 
 
 def test_a_lens_that_is_longer_and_looks_aside_is_found(wrong: Path) -> None:
-    seeing = seen_in(wrong)
+    seeing = accuracy_of(wrong)
     landmarks = whole(seeing, "landmarks")
     assert landmarks.range_share is not None
     assert landmarks.bearing_deg is not None
@@ -150,8 +153,10 @@ def test_a_lens_that_is_longer_and_looks_aside_is_found(wrong: Path) -> None:
 MARKS = {"a": Landmark(x_m=0.0, y_m=0.0), "b": Landmark(x_m=5.0, y_m=4.0)}
 
 
-def said(times: float, seconds: int = 200, told: float = 1.0) -> Sights:
-    """Sightings whose errors are so many times the stated sigmas; `told`: 0 for stating none."""
+def simulated_observations(
+    times: float, seconds: int = 200, stated_share: float = 1.0
+) -> CameraObservations:
+    """Sightings whose errors are `times` the stated sigmas; `stated_share` 0: none are stated."""
     random = np.random.default_rng(7)
     truth = np.column_stack(
         [
@@ -173,17 +178,17 @@ def said(times: float, seconds: int = 200, told: float = 1.0) -> Sights:
             )
             sigma = 0.02 * range_m, 0.01
             errors = random.normal(0.0, times, 3) * (*sigma, 0.05)
-            stated = sigma if told else (None, None)
+            stated = sigma if stated_share else (None, None)
             turned = (bearing - heading + errors[1] + math.pi) % math.tau - math.pi
             facing = (0.5 + errors[2], 0.05) if name == "mate" else (None, None)
             sightings.append(Sighting(name, range_m + errors[0], turned, *stated, *facing))
         frames.append(Sightings(int(at * 1e9), tuple(sightings)))
-    return sights_of("eye", frames, placed(MARKS, {"eye": truth, "mate": mate}))
+    return camera_observations("eye", frames, ground_truth(MARKS, {"eye": truth, "mate": mate}))
 
 
 @pytest.mark.parametrize("times", [0.5, 1.0, 2.0])
 def test_how_errors_compare_with_what_is_stated(times: float) -> None:
-    seeing = calibrated_seeing([said(times)])
+    seeing = measure_camera_accuracy([simulated_observations(times)])
     assert seeing.times is not None
     assert seeing.times.value == pytest.approx(times, rel=0.12)
     assert seeing.times.standard_error < 0.1 * times
@@ -200,7 +205,7 @@ def test_how_errors_compare_with_what_is_stated(times: float) -> None:
 
 
 def test_spans_of_ranges_are_parts_of_the_whole() -> None:
-    seeing = calibrated_seeing([said(1.0)])
+    seeing = measure_camera_accuracy([simulated_observations(1.0)])
     parts = [a for a in seeing.agreements if a.kind == "landmarks"]
     assert sum(a.sightings for a in parts[1:]) == parts[0].sightings
     assert [(a.from_m, a.to_m) for a in parts[1:]] == [(0.0, 2.0), (2.0, 4.0), (4.0, None)]
@@ -208,14 +213,16 @@ def test_spans_of_ranges_are_parts_of_the_whole() -> None:
 
 @pytest.mark.parametrize(("times", "grown"), [(0.5, False), (1.0, False), (2.0, True)])
 def test_stated_sigmas_grow_where_errors_are_larger(times: float, grown: bool) -> None:
-    camera, (sensor, eye) = (
+    camera, (sensor_path, camera_path) = (
         CameraSettings(),
-        (Place(("types", "eye", p)) for p in ("sensor", "camera")),
+        (TablePath(("types", "eye", p)) for p in ("sensor", "camera")),
     )
-    places = seeing_values(calibrated_seeing([said(times)]), camera, sensor, eye)
-    assert (eye in places) is grown
-    team = parse_team(edited(TEAM, "lab", places))
-    for key in SIGMAS:
+    tables = sensor_tables(
+        measure_camera_accuracy([simulated_observations(times)]), camera, sensor_path, camera_path
+    )
+    assert (camera_path in tables) is grown
+    team = parse_team(edit_team(TEAM, "lab", tables))
+    for key in CAMERA_SIGMAS:
         before, after = getattr(camera, key), getattr(team.robots["eye"].camera, key)
         assert after == pytest.approx((times if grown else 1.0) * before, rel=0.13)
     assert team.robots["eye"].sensor.range_share == pytest.approx(0.02 * times, rel=0.15)
@@ -223,17 +230,22 @@ def test_stated_sigmas_grow_where_errors_are_larger(times: float, grown: bool) -
 
 
 def test_ranges_that_are_no_depths_are_written_as_such() -> None:
-    place = Place(("types", "eye", "sensor"))
+    table_path = TablePath(("types", "eye", "sensor"))
     depths = TEAM.replace(
         "[types.eye.camera]", "sensor = { range_is_depth = true }\n[types.eye.camera]"
     )
     assert parse_team(depths).robots["eye"].sensor.range_is_depth
-    places = seeing_values(calibrated_seeing([said(1.0)]), CameraSettings(), place, place)
-    assert not parse_team(edited(depths, "lab", places)).robots["eye"].sensor.range_is_depth
+    tables = sensor_tables(
+        measure_camera_accuracy([simulated_observations(1.0)]),
+        CameraSettings(),
+        table_path,
+        table_path,
+    )
+    assert not parse_team(edit_team(depths, "lab", tables)).robots["eye"].sensor.range_is_depth
 
 
 def test_eyes_that_state_nothing_are_calibrated_too() -> None:
-    seeing = calibrated_seeing([said(1.0, told=0.0)])
+    seeing = measure_camera_accuracy([simulated_observations(1.0, stated_share=0.0)])
     assert seeing.times is None
     error = whole(seeing, "landmarks").range_share
     assert error is not None
@@ -242,7 +254,7 @@ def test_eyes_that_state_nothing_are_calibrated_too() -> None:
 
 def test_too_few_sightings_are_said() -> None:
     with pytest.raises(InputError, match="18 sightings with known truth; at least 40"):
-        calibrated_seeing([said(1.0, seconds=5)])
+        measure_camera_accuracy([simulated_observations(1.0, seconds=5)])
 
 
 # Files --------------------------------------------------------------------------------------------
@@ -251,7 +263,7 @@ def test_too_few_sightings_are_said() -> None:
 EYE = RobotSettings(source="external", sensing="camera")
 
 
-def record(path: Path, log: Sights, *names: str, **robots: RobotSettings) -> Team:
+def record(path: Path, log: CameraObservations, *names: str, **robots: RobotSettings) -> Team:
     """What robots of these names look at in a run of this team, all from the same places."""
     team = Team(name="lab", robots=robots)
     team = replace(team, map=replace(team.map, landmarks=MARKS))
@@ -275,42 +287,42 @@ def record(path: Path, log: Sights, *names: str, **robots: RobotSettings) -> Tea
 
 
 def test_looks_of_a_recording_are_sightings(tmp_path: Path) -> None:
-    path, log = tmp_path / "run.mcap", said(1.0, 30)
+    path, log = tmp_path / "run.mcap", simulated_observations(1.0, 30)
     team = record(path, log, "eye", eye=EYE)
-    looked = recorded([path], None)
+    looked = dataset_from_recordings([path], None)
     assert looked.robots == ("eye",)
-    (sights,) = looked.sights
+    (sights,) = looked.observations
     assert len(sights.log.sightings) == (log.log.sightings[:, 1] < 2).sum()
-    assert calibrated_seeing(looked.sights).sensor["range_scale"].value == pytest.approx(
-        1.0, abs=0.02
-    )
+    assert measure_camera_accuracy(looked.observations).sensor[
+        "range_scale"
+    ].value == pytest.approx(1.0, abs=0.02)
     with pytest.raises(InputError, match=r"run\.mcap: no sightings of other"):
-        recorded([path], "other")
+        dataset_from_recordings([path], "other")
     with pytest.raises(InputError, match="no recording of"):
-        recorded([tmp_path], None)
+        dataset_from_recordings([tmp_path], None)
     with Recording(tmp_path / "blind.mcap", team, MemoryHub().session()):
         pass
     with pytest.raises(LogError, match="holds no truth"):
-        recorded([tmp_path / "blind.mcap"], None)
+        dataset_from_recordings([tmp_path / "blind.mcap"], None)
 
 
 def test_like_cameras_are_pooled_and_unlike_ones_refused(tmp_path: Path) -> None:
-    path, log = tmp_path / "run.mcap", said(1.0, 30)
+    path, log = tmp_path / "run.mcap", simulated_observations(1.0, 30)
     at_a_device = replace(EYE, camera=CameraSettings(frames="0"))
     record(path, log, "one", "two", one=EYE, two=at_a_device)
-    assert recorded([path], None).robots == ("one", "two")
+    assert dataset_from_recordings([path], None).robots == ("one", "two")
     longer = replace(EYE, camera=CameraSettings(fx_px=500.0))
     record(path, log, "one", "two", one=EYE, two=longer)
-    with pytest.raises(InputError, match=r"one, two: unlike cameras, .* by --robot"):
-        recorded([path], None)
-    assert recorded([path], "two").camera == longer.camera
+    with pytest.raises(InputError, match=r"one, two: different cameras, .* by --robot"):
+        dataset_from_recordings([path], None)
+    assert dataset_from_recordings([path], "two").camera == longer.camera
 
 
 def test_a_guests_camera_is_not_known(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
-    record(path, said(1.0, 30), "eye", "guest", eye=EYE)
+    record(path, simulated_observations(1.0, 30), "eye", "guest", eye=EYE)
     with pytest.raises(InputError, match=r"--robot guest: a guest of .*; with a camera: eye"):
-        recorded([path], "guest")
+        dataset_from_recordings([path], "guest")
 
 
 def test_pictures_that_cannot_be_used_are_said(honest: Path, tmp_path: Path) -> None:
@@ -320,15 +332,15 @@ def test_pictures_that_cannot_be_used_are_said(honest: Path, tmp_path: Path) -> 
     (tmp_path / "00.png").write_bytes(b"")
     cv2.imwrite(str(tmp_path / "01.png"), np.zeros((480, 640, 3), np.uint8))
     (tmp_path / "poses.csv").write_text(text)
-    looked = photographed(tmp_path, tmp_path / "poses.csv", "eye", LAB)
+    looked = dataset_from_pictures(tmp_path, tmp_path / "poses.csv", "eye", LAB)
     assert looked.notes[:2] == ("00.png: no picture", "01.png: frame_black")
     (tmp_path / "poses.csv").write_text("file,x_m,y_m,heading_deg\n00.png,1,1,0\n")
     with pytest.raises(InputError, match=r"no picture can be used: 00\.png: no picture"):
-        photographed(tmp_path, tmp_path / "poses.csv", "eye", LAB)
+        dataset_from_pictures(tmp_path, tmp_path / "poses.csv", "eye", LAB)
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "message"),
     [
         ("", "no poses"),
         ("file,x_m\na.png,1\n", "its columns are file,x_m,y_m,heading_deg,robot"),
@@ -336,17 +348,17 @@ def test_pictures_that_cannot_be_used_are_said(honest: Path, tmp_path: Path) -> 
         ("file,x_m,y_m,heading_deg,robot\na.png,1,1,2,nobody\n", "no robot 'nobody'.*eye, mate"),
     ],
 )
-def test_poses_that_are_none_are_said(tmp_path: Path, text: str, said: str) -> None:
+def test_a_wrong_file_of_poses_is_refused(tmp_path: Path, text: str, message: str) -> None:
     (tmp_path / "poses.csv").write_text(text)
-    with pytest.raises(InputError, match=said):
+    with pytest.raises(InputError, match=message):
         read_poses(tmp_path / "poses.csv", LAB)
 
 
 def test_whose_camera_it_is() -> None:
-    assert viewer(LAB, None) == "eye"
+    assert observer_name(LAB, None) == "eye"
     for robot in ("mate", "nobody"):
         with pytest.raises(InputError, match="with a camera: eye"):
-            viewer(LAB, robot)
+            observer_name(LAB, robot)
 
 
 # Command line -------------------------------------------------------------------------------------
@@ -374,8 +386,8 @@ def test_what_is_wrong_is_one_line(honest: Path, tmp_path: Path) -> None:
     team.write_text(TEAM)
     for arguments, words in (
         ([], "name recordings, or --pictures FOLDER --poses"),
-        (["--pictures", honest, "--team", team], "goes with --poses"),
-        (["--pictures", honest, "--poses", honest / "poses.csv"], "goes with --team"),
+        (["--pictures", honest, "--team", team], "needs --poses"),
+        (["--pictures", honest, "--poses", honest / "poses.csv"], "needs --team"),
         (["run.mp4"], "run.mp4: no recording"),
     ):
         failed = cpcbl_team("calibrate", "sensor", *arguments)

@@ -1,15 +1,16 @@
-"""What a calibration leaves unexplained, as one picture. Needs extra `plot`."""
+"""Residuals of calibrations, drawn into a file. Needs the extra `plot`."""
 
 from pathlib import Path
 
 import matplotlib as mpl
 import numpy as np
 
-from cpcbl_launch.calibration.correlation import LAGS_S, autocorrelation
+from cpcbl_launch.calibration.lens import FIELDS, LensCalibration, Residuals
 from cpcbl_launch.calibration.logs import RobotLogs
 from cpcbl_launch.calibration.odometry import DELAYS_S, turn_residuals
 from cpcbl_launch.calibration.robots import Calibration
 from cpcbl_launch.calibration.sensor import sensor_residuals
+from cpcbl_launch.calibration.statistics import LAGS_S, autocorrelation
 
 mpl.use("Agg")
 
@@ -19,7 +20,7 @@ MOST_DOTS = 1500
 
 
 def draw_residuals(logs: RobotLogs, calibration: Calibration, path: Path) -> None:
-    """Ranges over range, bearings, turns over the delay, correlation; a colour a robot."""
+    """Draws residuals of ranges, bearings and turns, and correlations, in a colour per robot."""
     figure, ((ranges, bearings), (turns, correlation)) = plt.subplots(
         2, 2, figsize=(12, 7.5), layout="constrained"
     )
@@ -64,5 +65,47 @@ def draw_residuals(logs: RobotLogs, calibration: Calibration, path: Path) -> Non
     if not handles:
         handles, labels = turns.get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside upper center", ncols=max(len(labels), 1))
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+
+
+mpl.use("Agg")
+
+
+def draw_lens_residuals(lens: LensCalibration, left: Residuals, path: Path) -> None:
+    """Draws the errors of corners over the picture, and as a scatter plot."""
+    figure, (robust_sigma, across) = plt.subplots(1, 2, figsize=(12, 5), layout="constrained")
+    size = np.linalg.norm(left.errors, axis=1)
+    longest = max(float(np.quantile(size, 0.99)), 1e-9)
+    arrows = robust_sigma.quiver(
+        *left.pixels.T,
+        *left.errors.T,
+        size,
+        angles="xy",
+        width=0.002,
+        clim=(0.0, longest),
+        scale=longest / (0.04 * lens.width_px),
+        scale_units="xy",
+    )
+    figure.colorbar(arrows, ax=robust_sigma, label="error (px)")
+    robust_sigma.set(
+        xlim=(0, lens.width_px),
+        ylim=(lens.height_px, 0),
+        aspect="equal",
+        xticks=np.linspace(0, lens.width_px, FIELDS + 1),
+        yticks=np.linspace(0, lens.height_px, FIELDS + 1),
+        title="found minus expected, over the picture",
+        xlabel="px",
+        ylabel="px",
+    )
+    across.plot(*left.errors.T, ".", markersize=3)
+    across.set(
+        aspect="equal",
+        title=f"{lens.rms_px:.3f} px RMS, {len(size)} corners",
+        xlabel="error to the right (px)",
+        ylabel="error down (px)",
+    )
+    for axes in (robust_sigma, across):
+        axes.grid(True, alpha=0.3)
     figure.savefig(path, dpi=110)
     plt.close(figure)

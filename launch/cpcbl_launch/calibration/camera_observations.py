@@ -1,0 +1,218 @@
+"""Sightings by robots' cameras compared with the ground truth.
+
+They come from recordings of robots with cameras, or from pictures that were taken at known poses.
+"""
+
+import csv
+import math
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import msgspec
+import numpy as np
+from msgspec.structs import replace
+
+from cpcbl_agents.sources.mrclam import LogError
+from cpcbl_launch.calibration.logs import (
+    GroundTruth,
+    RobotLog,
+    ground_truth,
+    nan_if_none,
+    wrap_angles,
+)
+from cpcbl_launch.reporting.metrics import Floats
+from cpcbl_launch.reporting.recording import read_recording
+from cpcbl_team.config import CameraSettings, Team
+from cpcbl_team.errors import InputError
+from cpcbl_team.inputs import Sightings
+
+PICTURE_INTERVAL_S = 100.0  # pictures have no time; at this interval nothing is correlated
+STATIONARY_S = 0.1  # before and after a picture nothing moves for this time
+COLUMNS = ("file", "x_m", "y_m", "heading_deg")
+
+
+class CameraObservations(NamedTuple):
+    """The sightings of one robot in one log; `stated` and `headings` match `log.sightings`."""
+
+    log: RobotLog
+    stated: Floats
+    """(n, 2): sigmas of range (m) and bearing (rad) that the detector states; NaN: none."""
+    headings: Floats
+    """(n, 3): a teammate's heading in the robot's frame, its sigma, the true one (rad); NaN."""
+
+
+class CameraDataset(NamedTuple):
+    """All sightings of some robots with known ground truth, and their camera."""
+
+    robots: tuple[str, ...]
+    camera: CameraSettings
+    observations: list[CameraObservations]
+    notes: tuple[str, ...] = ()
+
+
+class _PoseRow(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A line of poses: the pose of a robot in a picture; `robot` is empty for the observer."""
+
+    file: str
+    x_m: float
+    y_m: float
+    heading_deg: float
+    robot: str = ""
+
+
+def dataset_from_recordings(paths: Sequence[Path], robot: str | None) -> CameraDataset:
+    """The sightings of this robot, or of all with a camera. Raises LogError, InputError."""
+    found: list[tuple[str, CameraSettings, CameraObservations]] = []
+    for path in paths:
+        if path.suffix != ".mcap":
+            raise InputError(f"{path}: no recording of `up --record` (.mcap)")
+        recording = read_recording(path)
+        if not recording.truth:
+            raise LogError(f"{path}: holds no truth; publish poses on field/truth")
+        truth, team = ground_truth(recording.team.map.landmarks, recording.truth), recording.team
+        for name in [robot] if robot else team.cameras:
+            frames = [i for i in recording.inputs.get(name, ()) if isinstance(i, Sightings)]
+            if frames and len(truth.poses.get(name, ())) > 1:
+                if name not in team.robots:
+                    names = ", ".join(team.cameras)
+                    raise InputError(f"--robot {name}: a guest of {path}; with a camera: {names}")
+                camera = replace(team.robots[name].camera, frames="")  # any source of images
+                found.append((name, camera, camera_observations(name, frames, truth)))
+    if not found:
+        who = robot or "robots with cameras"
+        raise InputError(f"{paths[0]}: no sightings of {who} where the truth is known")
+    robots = tuple(dict.fromkeys(name for name, _, _ in found))
+    if len({camera for _, camera, _ in found}) > 1:
+        raise InputError(
+            f"{', '.join(robots)}: different cameras, which have different errors; name one robot"
+            " by --robot, and recordings of one camera"
+        )
+    return CameraDataset(robots, found[0][1], [observations for _, _, observations in found])
+
+
+def observer_name(team: Team, robot: str | None) -> str:
+    """The named robot, or the only one with a camera. Raises InputError."""
+    robots = team.cameras
+    if robot is None and len(robots) == 1:
+        return robots[0]
+    if robot not in robots:
+        known = ", ".join(robots) or 'none; write sensing = "camera"'
+        raise InputError(f"--robot: name the robot that took the pictures; with a camera: {known}")
+    return robot
+
+
+def dataset_from_pictures(
+    folder: Path,
+    poses: Path,
+    robot: str,
+    team: Team,
+    progress: Callable[[float], None] = lambda done: None,
+) -> CameraDataset:
+    """The sightings of a robot in pictures from known poses. Raises InputError. Needs OpenCV."""
+    from cpcbl_agents.vision.detector import CameraEyes
+    from cpcbl_launch.calibration.pictures import read_picture
+
+    rows = read_poses(poses, team)
+    names = list(dict.fromkeys(row.file for row in rows))
+    eyes = CameraEyes(robot, team)
+    frames: list[Sightings] = []
+    rejected: dict[str, str] = {}
+    ambiguities: Counter[str] = Counter()
+    for i, name in enumerate(names):
+        pixels = read_picture(folder / name).pixels
+        seen = pixels if isinstance(pixels, str) else eyes.glimpses(pixels)
+        if isinstance(seen, str):
+            rejected[name] = seen
+        else:
+            ambiguities.update(doubt.reason for doubt in seen.doubts)
+            frames.append(Sightings(_stamp_ns(i), tuple(one.sighting for one in seen.found)))
+        progress((i + 1) / len(names))
+    if not frames:
+        name, reason = next(iter(rejected.items()))
+        raise InputError(f"{folder}: no picture can be used: {name}: {reason}")
+    truth = ground_truth(team.map.landmarks, _stationary_truth(rows, names, robot))
+    notes = [f"{name}: {reason}" for name, reason in rejected.items()]
+    if ambiguities:
+        reasons = ", ".join(f"{reason} {n}" for reason, n in ambiguities.most_common())
+        notes.append(f"detected, but not reported: {reasons}")
+    camera = team.robots[robot].camera
+    return CameraDataset(
+        (robot,), camera, [camera_observations(robot, frames, truth)], tuple(notes)
+    )
+
+
+def camera_observations(
+    robot: str, frames: Iterable[Sightings], truth: GroundTruth
+) -> CameraObservations:
+    """A robot's sightings as arrays."""
+    number = {name: i for i, name in enumerate(truth.objects)}
+    headings = {name: (rows[:, 0], np.unwrap(rows[:, 3])) for name, rows in truth.poses.items()}
+    rows = [
+        (
+            *(frame.stamp_ns * 1e-9, number[s.id]),
+            *map(nan_if_none, (s.range_m, s.bearing_rad, s.range_sigma_m, s.bearing_sigma_rad)),
+            *map(nan_if_none, (s.heading_rad, s.heading_sigma_rad)),
+            _true_heading(headings, robot, s.id, frame.stamp_ns * 1e-9),
+        )
+        for frame in frames
+        for s in frame.sightings
+        if s.id in number
+    ]
+    table = np.array(rows, dtype=np.float64).reshape(-1, 9)
+    objects = tuple(truth.objects.values())
+    log = RobotLog(truth.poses[robot], np.empty((0, 4)), table[:, :4], objects, truth.teammates)
+    return CameraObservations(log, table[:, 4:6], table[:, 6:])
+
+
+def read_poses(path: Path, team: Team) -> list[_PoseRow]:
+    """Reads a CSV file: file, x_m, y_m, heading_deg, and robot for teammates. Raises InputError."""
+    try:
+        lines = list(csv.DictReader(path.read_text(encoding="utf-8").splitlines()))
+        given = [{k: (v or "").strip() for k, v in line.items() if k} for line in lines]
+        rows = msgspec.convert(given, list[_PoseRow], strict=False)
+    except FileNotFoundError:
+        raise InputError(f"--poses {path}: no such file") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"--poses {path}: cannot be read: {error}") from error
+    except (csv.Error, msgspec.ValidationError) as error:
+        columns = ",".join(COLUMNS)
+        raise InputError(f"--poses {path}: {error}; its columns are {columns},robot") from error
+    if not rows:
+        raise InputError(f"--poses {path}: no poses; its columns are {','.join(COLUMNS)},robot")
+    for row in rows:
+        if row.robot and row.robot not in team.robots:
+            known = ", ".join(team.robots)
+            raise InputError(f"--poses {path}: no robot {row.robot!r} in the team; known: {known}")
+    return rows
+
+
+def _stamp_ns(picture: int) -> int:
+    return int((picture + 1) * PICTURE_INTERVAL_S * 1e9)
+
+
+def _stationary_truth(
+    rows: Sequence[_PoseRow], names: Sequence[str], observer_name: str
+) -> dict[str, Floats]:
+    """The poses as those of a log in which all robots stand still while a picture is taken."""
+    truth: dict[str, list[tuple[float, float, float, float]]] = {observer_name: []}
+    for row in rows:
+        at = _stamp_ns(names.index(row.file)) * 1e-9
+        pose = row.x_m, row.y_m, math.radians(row.heading_deg)
+        log = truth.setdefault(row.robot or observer_name, [])
+        log += [(at - STATIONARY_S, *pose), (at + STATIONARY_S, *pose)]
+    return {name: np.array(sorted(log)) for name, log in truth.items()}
+
+
+def _true_heading(
+    headings_of_robots: Mapping[str, tuple[Floats, Floats]],
+    observer_name: str,
+    seen: str,
+    at_s: float,
+) -> float:
+    """The heading of a teammate in the observer's frame (rad); NaN for a landmark."""
+    if seen not in headings_of_robots:
+        return math.nan
+    own, other = (np.interp(at_s, *headings_of_robots[name]) for name in (observer_name, seen))
+    return float(wrap_angles(np.asarray(other - own)))

@@ -1,0 +1,276 @@
+"""Calibrated values as tables of a team file. The rest of the file, with its comments, stays."""
+
+import os
+import shutil
+import tomllib
+from collections.abc import Mapping, Sequence, Set
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import msgspec
+import tomlkit
+from tomlkit.items import InlineTable, Table
+
+from cpcbl_launch.calibration.camera_accuracy import CameraAccuracy
+from cpcbl_launch.calibration.colours import ColourCalibration
+from cpcbl_launch.calibration.lens import DISTORTION, LensCalibration
+from cpcbl_launch.calibration.statistics import Estimate, decimals
+from cpcbl_launch.team_file import TeamFileError, builtin_path, parse_team
+from cpcbl_team.config import COLOURS, CameraSettings, Colour
+from cpcbl_team.errors import InputError
+
+THRESHOLDS = ("hue", "saturation", "value")
+CAMERA_SIGMAS = ("edge_sigma_px", "tilt_sigma_deg", "yaw_sigma_deg", "focal_share")
+MAX_SIGMA_ERROR = 0.1  # stated sigmas that differ from the errors by less stay
+MINIMUM = {  # a filter without any noise would trust a measurement without bounds
+    "odometry.delay_s": 0.0,
+    "distance_loss_m_per_rad": 0.0,
+    "distance_sigma_m_per_sqrt_m": 1e-3,
+    "turn_sigma_rad_per_sqrt_rad": 1e-3,
+    "turn_sigma_rad_per_sqrt_m": 1e-3,
+    "range_floor_m": 1e-3,
+    "bearing_sigma_deg": 0.01,
+}
+
+
+class TomlValue(NamedTuple):
+    """A value of a team file, and the comment behind it."""
+
+    value: Any
+    remark: str = ""
+
+
+def toml_value(estimate: Estimate) -> TomlValue:
+    """The value, rounded to what its standard error allows, with that error as the remark."""
+    if estimate.standard_error == 0.0:
+        return TomlValue(estimate.value)
+    digits = decimals(estimate.standard_error)
+    return TomlValue(round(estimate.value, digits) + 0.0, f"± {estimate.standard_error:.{digits}f}")
+
+
+class TablePath(NamedTuple):
+    """The name of a table of a team file in its parts, as in `[types.eye.camera]`."""
+
+    names: tuple[str, ...]
+
+    def __str__(self) -> str:
+        return ".".join(self.names)
+
+
+def robot_table(
+    team_file: Path | None, robot: str | None, type_name: str | None, part: str
+) -> TablePath:
+    """The table `part` of a robot or of a type; without a team file that of a type `eye`.
+
+    Raises InputError unless exactly one of `robot` and `type_name` is given.
+    """
+    if team_file is None and robot is None and type_name is None:
+        return TablePath(("types", "eye", part))
+    if (robot is None) == (type_name is None):
+        raise InputError("--team: name one table to write: --robot NAME or --type NAME")
+    return TablePath(
+        ("robots", robot, part) if robot is not None else ("types", str(type_name), part)
+    )
+
+
+def team_source(path: Path, output: Path | None) -> tuple[str, Path]:
+    """The text of a team file, or of a built-in one by its name, and the file to write.
+
+    That is `output` if it is given, else the file itself. Raises TeamFileError.
+    """
+    if not path.exists() and builtin_path(path.name).exists():
+        if output is None:
+            raise TeamFileError(f"{path}: a built-in team cannot be changed; name --output FILE")
+        path = builtin_path(path.name)
+    try:
+        return path.read_text(encoding="utf-8"), output or path
+    except FileNotFoundError:
+        raise TeamFileError(f"{path}: no such file") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise TeamFileError(f"{path}: cannot be read: {error}") from error
+
+
+def edit_team(text: str, name: str, tables: Mapping[TablePath, Mapping[str, TomlValue]]) -> str:
+    """The text of a team file with these values in these tables. Raises TeamFileError.
+
+    `name` is the file's name in errors. A robot or type must exist; other tables are added.
+    """
+    try:
+        document = tomlkit.parse(text)
+    except tomlkit.exceptions.TOMLKitError as error:
+        raise TeamFileError(f"{name}: not TOML: {error}") from error
+    for table_path, values in tables.items():
+        _require_table(document, table_path, name)
+        table: Any = document
+        for i, part in enumerate(table_path.names):
+            table = _subtable(table, part, bare=i < len(table_path.names) - 1)
+        fresh = isinstance(table, Table) and not len(table)
+        for key, value in values.items():
+            table[key] = _item(value, table)
+        if fresh:
+            table.add(tomlkit.nl())
+    changed = tomlkit.dumps(document)
+    parse_team(changed, name)
+    return changed
+
+
+def tables_text(tables: Mapping[TablePath, Mapping[str, TomlValue]]) -> str:
+    """The tables alone, as text to be copied into a team file."""
+    document = tomlkit.document()
+    for table_path, values in tables.items():
+        table: Any = document
+        for part in table_path.names[:-1]:
+            table = table.setdefault(part, tomlkit.table(is_super_table=True))
+        own = tomlkit.table()
+        for key, value in values.items():
+            own.add(key, _item(value, own))
+        table.add(table_path.names[-1], own)
+    return tomlkit.dumps(document)
+
+
+def replace_file(path: Path, text: str) -> None:
+    """Replaces the file as a whole: a full disk must not destroy the old file. Raises OSError."""
+    target = path.resolve()
+    if target.exists() and not target.is_file():
+        target.write_text(text, encoding="utf-8")
+        return
+    fresh = target.with_name(f".{target.name}.new")
+    try:
+        fresh.write_text(text, encoding="utf-8")
+        if target.exists():
+            shutil.copymode(target, fresh)
+        os.replace(fresh, target)
+    finally:
+        fresh.unlink(missing_ok=True)
+
+
+def overridden_keys(text: str, table_path: TablePath, keys: Sequence[str]) -> list[str]:
+    """The keys that robots of this type set themselves and so do not take from the type."""
+    if table_path.names[0] != "types":
+        return []
+    _, type_name, part = table_path.names
+    keys_of_robots = []
+    for robot, own in tomlkit.parse(text).get("robots", {}).items():
+        if own.get("type") == type_name:
+            keys_of_robots += [
+                f"robots.{robot}.{part}.{key}" for key in keys if key in own.get(part, {})
+            ]
+    return keys_of_robots
+
+
+def _require_table(document: Mapping[str, Any], table_path: TablePath, name: str) -> None:
+    layer, *rest = table_path.names
+    if layer not in ("robots", "types"):
+        return
+    known = document.get(layer, {})
+    if rest[0] not in known:
+        available = ", ".join(known) or "none"
+        raise TeamFileError(f"{name}: {layer}.{rest[0]}: not in the file; name one of: {available}")
+
+
+def _subtable(table: Any, part: str, bare: bool) -> Any:
+    """The table of this name within another; it is added if it is missing.
+
+    `bare`: it holds only tables.
+    """
+    if part not in table:
+        inline = isinstance(table, InlineTable)
+        table[part] = tomlkit.inline_table() if inline else tomlkit.table(is_super_table=bare)
+    return table[part]
+
+
+def _item(value: TomlValue, table: Any) -> Any:
+    item = tomlkit.item(value.value)
+    if value.remark and isinstance(table, Table):
+        item.comment(value.remark)
+    return item
+
+
+def camera_table(lens: LensCalibration) -> dict[str, TomlValue]:
+    """The keys of a team file's table `camera` that pictures of a board determine."""
+    distortion = [toml_value(lens.distortion[name]) for name in DISTORTION]
+    return {
+        "width_px": TomlValue(lens.width_px),
+        "height_px": TomlValue(lens.height_px),
+        **{name: toml_value(estimate) for name, estimate in lens.intrinsics.items()},
+        "distortion": TomlValue(
+            [item.value for item in distortion],
+            ", ".join(item.remark or "not determined" for item in distortion),
+        ),
+        "focal_share": TomlValue(round(lens.focal_share, 4)),
+    }
+
+
+def unsampled_colours(team_file: Path | None, sampled: Set[str]) -> tuple[dict[str, Colour], bool]:
+    """The colours of a team that are not sampled, and whether its file has them already.
+
+    The colours of a file replace the built-in ones, so those built-in colours that the file uses
+    are added. Raises TeamFileError.
+    """
+    if team_file is None:
+        return {}, True
+    text, _ = team_source(team_file, team_file)
+    try:
+        raw = tomllib.loads(text)
+        own = raw.get("vision", {}).get("colours")
+        known = COLOURS if own is None else msgspec.convert(own, dict[str, Colour])
+    except (tomllib.TOMLDecodeError, msgspec.ValidationError):
+        parse_team(text, str(team_file))  # its error names the key
+        raise
+    used = known.keys() if own is not None else _used_colours(raw)
+    kept = {name: known[name] for name in used if name in known and name not in sampled}
+    return kept, own is not None
+
+
+def _used_colours(raw: dict[str, Any]) -> list[str]:
+    """The colours that landmarks and robots of a team file have."""
+    tables = [raw.get("defaults", {}), *raw.get("map", {}).get("landmarks", {}).values()]
+    for layer in ("types", "robots"):
+        tables += raw.get(layer, {}).values()
+    return sorted({name for table in tables for name in table.get("colours", ())})
+
+
+def colour_tables(
+    result: ColourCalibration, file_has_kept: bool
+) -> dict[TablePath, dict[str, TomlValue]]:
+    """A table for each colour. `file_has_kept`: the file already has the colours that are kept."""
+    colours = {name: fit.thresholds for name, fit in result.colours.items()}
+    if not file_has_kept:
+        colours |= result.kept
+    return {
+        TablePath(("vision", "colours", name)): {
+            key: TomlValue(list(getattr(colour, key))) for key in THRESHOLDS
+        }
+        for name, colour in colours.items()
+    }
+
+
+def sensor_tables(
+    accuracy: CameraAccuracy, camera: CameraSettings, sensor_path: TablePath, camera_path: TablePath
+) -> dict[TablePath, Mapping[str, TomlValue]]:
+    """Corrections and noise for the table `sensor_path`, and larger sigmas for `camera_path` if
+    errors are larger than stated.
+
+    The sigmas are never reduced: an error that is the same in all of these pictures, such as that
+    of the camera's mounting, may be different on another day.
+    """
+    corrections = {
+        name: value._replace(value=max(value.value, MINIMUM.get(name, value.value)))
+        for name, value in ((n, toml_value(estimate)) for n, estimate in accuracy.sensor.items())
+    }
+    corrections["range_is_depth"] = TomlValue(accuracy.range_is_depth)
+    tables: dict[TablePath, Mapping[str, TomlValue]] = {sensor_path: corrections}
+    times = accuracy.times
+    if times is not None and times.value > 1.0 and differ_from_stated_sigmas(times):
+        tables[camera_path] = {
+            key: TomlValue(
+                float(f"{times.value * getattr(camera, key):.3g}"), f"x {times.value:.2f}"
+            )
+            for key in CAMERA_SIGMAS
+        }
+    return tables
+
+
+def differ_from_stated_sigmas(times: Estimate) -> bool:
+    """Whether errors, as a multiple of the stated sigmas, differ from 1 by more than chance."""
+    return abs(times.value - 1.0) > max(MAX_SIGMA_ERROR, 2.0 * times.standard_error)

@@ -1,0 +1,75 @@
+"""Reading logs with ground truth."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+from support.calibration_team import STANDING, TEAM, WORSE
+from support.logs import write_log
+
+from cpcbl_agents.sources.mrclam import LogError
+from cpcbl_launch.calibration.logs import read_log, read_logs
+from cpcbl_launch.calibration.robots import calibrate_robots
+from cpcbl_launch.simulation.in_process import simulate
+from cpcbl_team.config import (
+    Team,
+)
+from cpcbl_team.errors import InputError
+
+
+def test_mrclam_logs_are_read_with_all_their_faults(tmp_path: Path) -> None:
+    write_log(tmp_path, ("1", "2"), seconds=40.0, backwards=True, unknown_barcode=True)
+    logs = read_logs([tmp_path])
+    found = calibrate_robots(logs, ["MRCLAM"])
+    assert found.robots.keys() == {"1", "2"}
+    for robot in found.robots.values():
+        assert robot.odometry["distance_scale"].value == pytest.approx(1.0, abs=0.01)
+        assert robot.odometry["turn_scale"].value == pytest.approx(1.0, abs=0.01)
+        assert robot.sensor["bearing_bias_deg"].value == pytest.approx(0.0, abs=0.1)
+        assert robot.sensor["range_scale"].value == pytest.approx(1.0, abs=0.01)
+
+
+def without_truth(path: Path) -> None:
+    robots = {"r1": msgspec.structs.replace(WORSE, source="external")}
+    simulate(msgspec.structs.replace(TEAM, robots=robots), 1, 1.0, record=path)
+
+
+def no_recording(path: Path) -> None:
+    path.write_bytes(b"something else")
+
+
+def cut_short(path: Path) -> None:
+    simulate(TEAM, 1, 2.0, record=path)
+    path.write_bytes(path.read_bytes()[:-300])
+
+
+@pytest.mark.parametrize(
+    ("make", "said"),
+    [
+        (without_truth, "holds no truth"),
+        (no_recording, "not a whole recording"),
+        (cut_short, "not a whole recording"),
+        (lambda path: None, "cannot be read"),
+    ],
+    ids=["no truth", "no recording", "cut short", "not there"],
+)
+def test_a_log_that_cannot_be_used_is_one_line(
+    make: Callable[[Path], Any], said: str, tmp_path: Path
+) -> None:
+    path = tmp_path / "log.mcap"
+    make(path)
+    with pytest.raises(LogError, match=said) as raised:
+        read_log(path)
+    assert str(path) in str(raised.value)
+    assert "\n" not in str(raised.value)
+
+
+def test_a_team_that_sees_and_does_nothing_is_one_line(tmp_path: Path) -> None:
+    path = tmp_path / "blind.mcap"
+    blind = Team(name="blind", robots={"c": STANDING})
+    simulate(blind, 1, 20.0, record=path)
+    with pytest.raises(InputError, match="nothing to calibrate") as raised:
+        calibrate_robots(read_logs([path]), ["blind.mcap"])
+    assert "\n" not in str(raised.value)
