@@ -8,8 +8,8 @@ TOP = Path(__file__).parents[1]
 FOLDERS = ("cpcbl_team", "transport", "agents", "launch", "tests")
 MOST_LINES_OF_A_FILE = 400
 MOST_LINES_OF_A_FUNCTION = 50
-LONG_FILES_LEFT = 22
-LONG_FUNCTIONS_LEFT = 13
+LONG_FILES_LEFT = 5
+LONG_FUNCTIONS_LEFT = 4
 """How many are still longer. These numbers may only shrink."""
 
 

@@ -14,9 +14,8 @@ from typing import Any, get_args, get_origin, get_type_hints
 
 import msgspec
 
+from cpcbl_launch.team_checks import problems
 from cpcbl_team.config import (
-    LIKE_MIRRORED,
-    MARKERS,
     Field,
     GuestSettings,
     Landmark,
@@ -31,7 +30,6 @@ from cpcbl_team.config import (
 )
 from cpcbl_team.errors import InputError
 from cpcbl_team.inputs import NAME_PATTERN, Name
-from cpcbl_transport.security import PROTOCOL
 
 Layer = dict[str, Any]
 
@@ -82,12 +80,7 @@ def load_team(path: Path) -> Team:
 
     Raises TeamFileError.
     """
-    try:
-        text = path.read_text(encoding="utf-8")
-    except FileNotFoundError:
-        raise TeamFileError(f"{path}: no such file") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise TeamFileError(f"{path}: cannot be read: {error}") from error
+    text = _read_text(path)
     if path.suffix == ".json":
         try:
             return msgspec.json.decode(text, type=Team)
@@ -128,12 +121,7 @@ def save_resolved(team: Team, path: Path) -> None:
 
 def parse_team(text: str, name: str = "team file") -> Team:
     """The team in a TOML text; `name` is what errors call it. Raises TeamFileError."""
-    try:
-        raw = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise TeamFileError(f"{name}: not TOML: {error}") from error
-    for key in _not_finite(raw):
-        raise TeamFileError(f"{name}: {key}: not a finite number; write a finite one")
+    raw = _parse_toml(text, name)
     file = _convert(raw, _File, "", name)
     defaults = _convert(file.defaults, RobotSettings, "defaults", name)
     for kind, layer in _named_tables(file.types, "types", name):
@@ -187,17 +175,26 @@ def _transport(transport: TransportSettings, raw: Layer) -> TransportSettings:
 
 def read_layer(path: Path) -> Layer:
     """A TOML file with the keys of a robot's type, not yet checked. Raises TeamFileError."""
+    return _parse_toml(_read_text(path), str(path))
+
+
+def _read_text(path: Path) -> str:
     try:
-        layer = tomllib.loads(path.read_text(encoding="utf-8"))
+        return path.read_text(encoding="utf-8")
     except FileNotFoundError:
         raise TeamFileError(f"{path}: no such file") from None
     except (OSError, UnicodeDecodeError) as error:
         raise TeamFileError(f"{path}: cannot be read: {error}") from error
+
+
+def _parse_toml(text: str, name: str) -> Layer:
+    try:
+        table = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
-        raise TeamFileError(f"{path}: not TOML: {error}") from error
-    for key in _not_finite(layer):
-        raise TeamFileError(f"{path}: {key}: not a finite number; write a finite one")
-    return layer
+        raise TeamFileError(f"{name}: not TOML: {error}") from error
+    for key in _not_finite(table):
+        raise TeamFileError(f"{name}: {key}: not a finite number; write a finite one")
+    return table
 
 
 def with_added_robot(team: Team, name: str, layers: Sequence[Layer], source: str) -> Team:
@@ -211,126 +208,6 @@ def with_added_robot(team: Team, name: str, layers: Sequence[Layer], source: str
     for problem in problems(more):
         raise TeamFileError(f"{source}: {problem}")
     return more
-
-
-def problems(team: Team) -> Iterator[str]:
-    """What no single key is to blame for: `key: problem; fix`."""
-    if not team.robots:
-        yield "robots: there is none; add a table [robots.r1]"
-    names = [*team.map.landmarks, *team.map.walls]
-    for twice in sorted({n for n in names if names.count(n) > 1 or n in team.robots}):
-        yield f"map: {twice!r} names two things; rename one of them"
-    for name, wall in team.map.walls.items():
-        if wall.from_m == wall.to_m:
-            yield f"map.walls.{name}: has no length; move to_m away from from_m"
-    for name, robot in team.robots.items():
-        if robot.source == "simulated" and robot.start is None:
-            yield f"robots.{name}.start: a simulated robot needs one; add x_m, y_m, heading_deg"
-        if robot.localizer.variant == "joint" and robot.localizer.paper_uncertainty:
-            yield (
-                f"robots.{name}.localizer.paper_uncertainty: the joint variant cannot do"
-                " without the covariance; use variant circular or oval"
-            )
-        if robot.localizer.alternate is False and robot.localizer.variant != "joint":
-            yield (
-                f"robots.{name}.localizer.alternate: only the joint variant can update both at"
-                " once; remove the key"
-            )
-    yield from _vision_problems(team)
-    yield from _guard_problems(team)
-    yield from _event_problems(team)
-    if not team.transport.connect:
-        yield "transport.connect: is empty; name an endpoint such as tcp/192.168.1.10:7447"
-    for key in ("listen", "connect"):
-        for endpoint in getattr(team.transport, key):
-            reason = endpoint_problem(endpoint) or _insecure(endpoint, team.transport.secured)
-            if reason:
-                yield f"transport.{key}: {endpoint!r}: {reason}"
-
-
-def endpoint_problem(text: str) -> str:
-    """Why Zenoh cannot listen or connect there; empty if it can."""
-    if re.fullmatch(r"(tcp|tls|quic|udp|ws)/.+:\d{1,5}", text):
-        return ""
-    return "no endpoint; write it as tcp/192.168.1.10:7447"
-
-
-def _vision_problems(team: Team) -> Iterator[str]:
-    """Colours have thresholds, landmarks have bands of their own."""
-    known = ", ".join(team.vision.colours)
-    bands = {f"map.landmarks.{n}": m.colours for n, m in team.map.landmarks.items()}
-    bands.update({f"robots.{n}": r.colours for n, r in team.robots.items()})
-    for name, robot in team.robots.items():
-        if robot.source == "simulated" and robot.camera.frames:
-            yield f"robots.{name}.camera.frames: simulated frames are the field's; remove the key"
-    for key, colours in bands.items():
-        for colour in set(colours or ()) - team.vision.colours.keys():
-            yield f"{key}.colours: no colour {colour!r}; use one of {known}, or add its thresholds"
-        if colours is not None and colours[0] == colours[1]:
-            yield f"{key}.colours: both bands are {colours[0]}; use two colours"
-    if team.cameras:
-        marks = [m.colours for m in team.map.landmarks.values() if m.colours is not None]
-        for twice in sorted({c for c in marks if marks.count(c) > 1}):
-            yield f"map.landmarks: two have the colours {list(twice)}; give each its own"
-    yield from _marker_problems(team)
-
-
-def _marker_problems(team: Team) -> Iterator[str]:
-    """Markers are of the family, and tell a robot's sides apart. Two robots may carry the same
-    ones: that is said when they are seen."""
-    family = team.vision.family
-    mirrored = LIKE_MIRRORED.get(family, frozenset())
-    for name, robot in team.robots.items():
-        ids = list(robot.markers.values())
-        for side, number in robot.markers.items():
-            key = f"robots.{name}.markers.{side}"
-            if not 0 <= number < MARKERS[family]:
-                yield f"{key}: {family} has no marker {number}; use 0 to {MARKERS[family] - 1}"
-            elif number in mirrored:
-                yield f"{key}: marker {number} of {family} is its own mirror image; use another"
-            elif ids.count(number) > 1:
-                yield f"{key}: marker {number} is on two sides; give each side its own"
-
-
-def _insecure(endpoint: str, secured: bool) -> str:
-    """Why an endpoint does not go with the team's security; empty if it does."""
-    protocol, _, where = endpoint.partition("/")
-    if secured and protocol != PROTOCOL:
-        return f'with security = "mtls" every link is TLS; write it as {PROTOCOL}/{where}'
-    if not secured and protocol in ("tls", "quic"):
-        return f'needs certificates; add security = "mtls", or write it as tcp/{where}'
-    return ""
-
-
-def _event_problems(team: Team) -> Iterator[str]:
-    """An event is of one kind, and whole; clocks are those of robots."""
-    for name in team.simulation.clocks_ahead_s.keys() - team.robots.keys():
-        known = ", ".join(team.robots)
-        yield f"simulation.clocks_ahead_s.{name}: no robot {name!r}; name one of {known}"
-    for i, event in enumerate(team.simulation.events):
-        key = f"simulation.events[{i}]"
-        if bool(event.kidnap) == bool(event.hide_landmarks_s):
-            yield f"{key}: is of one kind; write kidnap and to, or hide_landmarks_s"
-        elif event.kidnap and event.kidnap not in team.robots:
-            known = ", ".join(team.robots)
-            yield f"{key}.kidnap: no robot {event.kidnap!r}; name one of {known}"
-        elif bool(event.kidnap) != (event.to is not None):
-            yield f"{key}.to: goes with kidnap; write to = [x_m, y_m, heading_deg]"
-
-
-def _guard_problems(team: Team) -> Iterator[str]:
-    """A guard must not bother a healthy robot, and messages come unevenly."""
-    guards = team.transport.guards
-    for name, robot in team.robots.items() if guards.enabled else ():
-        for key, allowed_hz, own_hz in (
-            ("fix_rate_hz", guards.fix_rate_hz, robot.sensor.rate_hz),
-            ("belief_rate_hz", guards.belief_rate_hz, robot.collaboration.belief_rate_hz),
-        ):
-            if allowed_hz < 2.0 * own_hz:
-                yield (
-                    f"transport.guards.{key}: robots.{name} has {own_hz:g} Hz; raise it to"
-                    f" {2.0 * own_hz:g} or more"
-                )
 
 
 def _named_tables(tables: Layer, where: str, name: str) -> Iterator[tuple[str, Layer]]:

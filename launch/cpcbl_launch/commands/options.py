@@ -81,7 +81,7 @@ def seconds_to_stay(seconds: float | None) -> float | None:
 
 def endpoints(option: typer.CallbackParam, given: list[str] | None) -> list[str] | None:
     """Callback of endpoints: Zenoh would try a wrong one again and again, and never say why."""
-    from cpcbl_launch.team_file import endpoint_problem
+    from cpcbl_launch.team_checks import endpoint_problem
 
     for endpoint in given or ():
         if reason := endpoint_problem(endpoint):

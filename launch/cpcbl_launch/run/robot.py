@@ -11,7 +11,8 @@ from pathlib import Path
 from cpcbl_agents.clock import Clock
 from cpcbl_agents.process import StopSignal, run_robot
 from cpcbl_launch.checks import require_robots, require_team_opencv
-from cpcbl_launch.team_file import endpoint_problem, find_team
+from cpcbl_launch.team_checks import endpoint_problem
+from cpcbl_launch.team_file import find_team
 from cpcbl_team.config import Team
 from cpcbl_team.errors import InputError
 from cpcbl_transport.bus import Bus

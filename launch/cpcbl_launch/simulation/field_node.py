@@ -19,7 +19,7 @@ from cpcbl_agents.sensing import SensorInput
 from cpcbl_launch.checks import require_robots
 from cpcbl_launch.simulation.field import SimulatedField
 from cpcbl_launch.simulation.guest_bodies import GuestBodies
-from cpcbl_launch.team_file import endpoint_problem
+from cpcbl_launch.team_checks import endpoint_problem
 from cpcbl_team.config import Team
 from cpcbl_team.errors import InputError
 from cpcbl_team.inputs import Odometry

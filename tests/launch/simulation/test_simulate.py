@@ -18,7 +18,8 @@ from cpcbl_launch.lab.scaling.measure import (
 )
 from cpcbl_launch.lab.scaling.swarm import SPACING_M, swarm_team
 from cpcbl_launch.simulation.in_process import simulate
-from cpcbl_launch.team_file import builtin_path, load_team, problems
+from cpcbl_launch.team_checks import problems
+from cpcbl_launch.team_file import builtin_path, load_team
 from cpcbl_team.config import (
     Field,
     Landmark,
