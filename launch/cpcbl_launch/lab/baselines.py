@@ -1,16 +1,17 @@
-"""Yardsticks: what plain filters make of the same log with the same settings.
+"""Baselines: what standard filters estimate from the same log with the same settings.
 
-Dead reckoning; a solo extended Kalman filter (EKF) a robot, which sees landmarks only; one
-centralized EKF over the poses of all robots, with everything that all of them see: the ceiling for
-a team. Smith, Self, Cheeseman (1990) for the joint state; Roumeliotis & Bekey (2002) for the team.
+Three filters: dead reckoning; a solo extended Kalman filter (EKF) per robot, which uses landmarks
+only; one centralized EKF over the poses of all robots, which uses all sightings of all robots and
+is the upper bound for a team. Sources: Smith, Self, Cheeseman (1990) for the joint state;
+Roumeliotis & Bekey (2002) for the team.
 
-Inputs come through the robots' own sensing agents, so that delays, scales, biases and blindness are
+The inputs pass the robots' own sensing agents, so that delays, scales, biases and blindness are
 those of the team, as are start poses, noise, gates, `object_interval_s` and `correlation_s`. What
-belongs to the team's method (turns of heading and position, tiers, `minimum_interval_s`) plays no
-part, and yardsticks do not learn (`self_calibration`). Inputs are taken in the order of the times
-they speak of: nothing arrives late. A filter that rejects most of what it sees doubts itself until
-its gates open; one that does not know its start begins with a Gaussian over the whole field, and no
-plain EKF is sure to find itself from there.
+belongs to the team's method (alternating updates, tiers, `minimum_interval_s`) is not used, and the
+baselines do not calibrate themselves. Inputs are taken in the order of their stamps: nothing
+arrives late. A filter that rejects most of its innovations inflates its covariance until its gates
+open. A filter without a start pose begins with a Gaussian over the whole field; a plain EKF does
+not always converge from there.
 """
 
 import math
@@ -44,7 +45,7 @@ _TRIANGLE = ((0, 0, 1, 0, 1, 2), (0, 1, 1, 2, 2, 2))  # xx, xy, yy, xh, yh, hh
 
 
 class BaselineInputs(NamedTuple):
-    """What one robot's filter is told: where it starts, corrected odometry, corrected frames."""
+    """The inputs of one robot's filter: its start, corrected odometry and corrected frames."""
 
     settings: LocalizationSettings
     start_ns: int
@@ -54,16 +55,16 @@ class BaselineInputs(NamedTuple):
 
 
 def baseline_inputs(logged: LoggedTeam) -> dict[str, BaselineInputs]:
-    """What each robot's own sensing agent makes of its log. Raises LogError."""
-    found = {}
+    """The outputs of each robot's own sensing agent on its log. Raises LogError."""
+    inputs = {}
     for name, settings in logged.team.robots.items():
         robot = build_robot(name, logged.team, logged.start_ns)
-        begin = robot.filter.timeline.state
-        said = robot.sensing.handle(Tick(), logged.end_ns)
-        odometry = tuple(m for m in said if isinstance(m, Odometry))
-        frames = tuple(m for m in said if isinstance(m, Sightings))
-        found[name] = BaselineInputs(settings, begin.stamp_ns, begin.estimate, odometry, frames)
-    return found
+        start = robot.filter.timeline.state
+        outgoing = robot.sensing.handle(Tick(), logged.end_ns)
+        odometry = tuple(m for m in outgoing if isinstance(m, Odometry))
+        frames = tuple(m for m in outgoing if isinstance(m, Sightings))
+        inputs[name] = BaselineInputs(settings, start.stamp_ns, start.estimate, odometry, frames)
+    return inputs
 
 
 def run_baselines(
@@ -72,21 +73,21 @@ def run_baselines(
     stamps_ns: Mapping[str, Sequence[int]],
     progress: Callable[[float], None] = lambda done: None,
 ) -> dict[str, dict[str, Trajectory]]:
-    """Each yardstick's estimates of each robot at these times."""
-    runs = [("dead_reckoning", {n: told._replace(frames=())}) for n, told in inputs.items()]
-    runs += [("solo_ekf", {n: told}) for n, told in inputs.items()]
+    """Each baseline's estimates of each robot at these times."""
+    runs = [("dead_reckoning", {n: own._replace(frames=())}) for n, own in inputs.items()]
+    runs += [("solo_ekf", {n: own}) for n, own in inputs.items()]
     runs += [("centralized_ekf", dict(inputs))]
     paths: dict[str, dict[str, Trajectory]] = {}
     done = 0
-    for kind, told in runs:
-        paths.setdefault(kind, {}).update(run_ekf(told, field, stamps_ns))
-        done += len(told)
+    for kind, robots in runs:
+        paths.setdefault(kind, {}).update(run_ekf(robots, field, stamps_ns))
+        done += len(robots)
         progress(done / (3 * len(inputs)))
     return paths
 
 
 def baseline_report(paths: Mapping[str, Trajectory], truth: Mapping[str, Floats]) -> BaselineReport:
-    """One yardstick's figures, by the same metrics as the team's."""
+    """One baseline's figures, by the same metrics as the team's."""
     robots = {n: score(samples_with_truth(path, truth.get(n))[1]) for n, path in paths.items()}
     return BaselineReport(robots=robots, team=mean_score(robots.values()))
 
@@ -94,11 +95,11 @@ def baseline_report(paths: Mapping[str, Trajectory], truth: Mapping[str, Floats]
 def run_ekf(
     inputs: Mapping[str, BaselineInputs], field: Field, stamps_ns: Mapping[str, Sequence[int]]
 ) -> dict[str, Trajectory]:
-    """The estimates of one EKF over these robots, at each robot's own times (after its frames)."""
+    """The estimates of one EKF over these robots, at each robot's own times, after its frames."""
     ekf = Ekf(inputs, field)
     events: list[tuple[int, int, str, Sightings | None]] = []
-    for name, told in inputs.items():
-        events += [(frame.stamp_ns, 0, name, frame) for frame in told.frames]
+    for name, robot in inputs.items():
+        events += [(frame.stamp_ns, 0, name, frame) for frame in robot.frames]
         events += [(stamp_ns, 1, name, None) for stamp_ns in stamps_ns.get(name, ())]
     estimates: dict[str, list[Floats]] = {name: [] for name in inputs}
     covariances: dict[str, list[Floats]] = {name: [] for name in inputs}
@@ -121,9 +122,9 @@ def run_ekf(
 
 
 def expected_sighting(pose: Floats, place: Floats) -> tuple[Floats, Floats]:
-    """(range m, bearing rad) of a point (x, y) seen from (x, y, heading); its Jacobian, (2, 5).
+    """Range (m) and bearing (rad) of a point seen from a pose, and their Jacobian, shape (2, 5).
 
-    Columns: robot's x, y, heading, then the point's x, y.
+    The columns are the robot's x, y, heading, then the point's x, y; all in the field's frame.
     """
     dx, dy = place[:2] - pose[:2]
     squared = dx * dx + dy * dy
@@ -134,16 +135,16 @@ def expected_sighting(pose: Floats, place: Floats) -> tuple[Floats, Floats]:
 
 
 class _RobotBlock:
-    """One robot in the filter: its place in the state, its time, the odometry still to come."""
+    """One robot in the filter: its columns of the state, its time, the odometry still to come."""
 
-    def __init__(self, first: int, told: BaselineInputs) -> None:
+    def __init__(self, first: int, inputs: BaselineInputs) -> None:
         self.first = first  # column of its x
-        self.settings = told.settings
-        self.now_ns = self.covered_ns = told.start_ns
-        self.pieces = deque(sorted(told.odometry, key=lambda piece: piece.from_ns))
+        self.settings = inputs.settings
+        self.now_ns = self.covered_ns = inputs.start_ns
+        self.pieces = deque(sorted(inputs.odometry, key=lambda piece: piece.from_ns))
         self.used_ns: dict[str, int] = {}
-        self.bounds = chi_square_bounds(told.settings.localizer.gate_probability)
-        window = told.settings.localizer.lost_window
+        self.bounds = chi_square_bounds(inputs.settings.localizer.gate_probability)
+        window = inputs.settings.localizer.lost_window
         self.innovations = {kind: deque[bool](maxlen=window) for kind in ("landmark", "robot")}
 
     @property
@@ -151,9 +152,9 @@ class _RobotBlock:
         return [self.first, self.first + 1, self.first + 2]
 
     def rejects_most(self, kind: str, accepted: bool) -> bool:
-        """Whether most of the latest innovations of a kind were rejected, this one included.
+        """Whether most of the latest innovations of a kind, with this one, were rejected.
 
-        Kinds are judged apart: a team that is displaced as a whole agrees about its own robots.
+        The kinds are counted apart: a team that is displaced as a whole accepts its own robots.
         """
         window, rules = self.innovations[kind], self.settings.localizer
         window.append(accepted)
@@ -161,7 +162,7 @@ class _RobotBlock:
 
 
 class _Measurement(NamedTuple):
-    """Innovation = Jacobian . (error of these columns of the state) + noise of this covariance."""
+    """innovation = jacobian @ (error of these columns of the state) + noise of this covariance."""
 
     columns: list[int]
     jacobian: Floats
@@ -172,19 +173,19 @@ class _Measurement(NamedTuple):
 class Ekf:
     """One EKF whose state is the poses (x, y, heading) of some robots, each at its own time.
 
-    A robot is driven on along its odometry when it sees, is seen, or is asked for; motions are
-    independent, so that the poses of the others may wait.
+    A robot's pose is predicted by its odometry when the robot sees, is seen, or its estimate is
+    asked for. The motions of robots are independent, so that the others' poses may lag behind.
     """
 
     def __init__(self, inputs: Mapping[str, BaselineInputs], field: Field) -> None:
         self._field = field
         self._robots = {
-            name: _RobotBlock(3 * i, told) for i, (name, told) in enumerate(inputs.items())
+            name: _RobotBlock(3 * i, own) for i, (name, own) in enumerate(inputs.items())
         }
-        self.mean = np.array([told.start.pose for told in inputs.values()], dtype=float).ravel()
+        self.mean = np.array([own.start.pose for own in inputs.values()], dtype=float).ravel()
         self.covariance = np.zeros((len(self.mean), len(self.mean)))
-        for name, told in inputs.items():
-            self._add(self._robots[name].first, told.start.covariance)
+        for name, own in inputs.items():
+            self._add(self._robots[name].first, own.start.covariance)
 
     def marginal(self, name: str) -> tuple[Floats, Floats]:
         """One robot's pose, shape (3,), and covariance, shape (3, 3)."""
@@ -194,7 +195,7 @@ class Ekf:
     # Motion -----------------------------------------------------------------------------------
 
     def predict(self, name: str, until_ns: int) -> None:
-        """Drives a robot on along its odometry. Does nothing if it is there already."""
+        """Predicts a robot's pose by its odometry; does nothing if the pose is that new already."""
         robot = self._robots[name]
         if until_ns <= robot.now_ns:
             return
@@ -227,7 +228,7 @@ class Ekf:
         self._add(i, motion_noise(before.heading, distance, turn, s, crawled))
 
     def _add_gap_noise(self, robot: _RobotBlock, until_ns: int) -> None:
-        """The growth of uncertainty while odometry is missing, as in the team."""
+        """Adds the uncertainty of a gap in the odometry, as the team does."""
         s = robot.settings.odometry
         silent_ns = until_ns - max(robot.now_ns, robot.covered_ns + int(s.timeout_s * 1e9))
         if silent_ns > 0 and s.moves:
@@ -243,7 +244,7 @@ class Ekf:
     # Sightings --------------------------------------------------------------------------------
 
     def correct(self, name: str, frame: Sightings) -> None:
-        """Updates by the sightings of one frame, one after the other."""
+        """Corrects by the sightings of one frame, one after the other."""
         robot = self._robots[name]
         least_ns = robot.settings.localizer.object_interval_s * 1e9
         for sighting in frame.sightings:
@@ -255,13 +256,13 @@ class Ekf:
             mate = self._robots.get(sighting.id)
             if mate is not None:
                 self.predict(sighting.id, frame.stamp_ns)
-            found = self._measurement_of(robot, mate, sighting)
-            if found is None:
+            measurement = self._measurement_of(robot, mate, sighting)
+            if measurement is None:
                 continue
             seconds = None if since_ns is None else since_ns * 1e-9
-            doubt = repetition_variance_factor(seconds, robot.settings.sensor.correlation_s)
-            found = found._replace(noise=doubt * found.noise)
-            accepted = self._update(found, robot.bounds)
+            inflation = repetition_variance_factor(seconds, robot.settings.sensor.correlation_s)
+            measurement = measurement._replace(noise=inflation * measurement.noise)
+            accepted = self._update(measurement, robot.bounds)
             if accepted:
                 robot.used_ns[sighting.id] = frame.stamp_ns
             kind, concerned = ("landmark", [robot]) if mate is None else ("robot", [robot, mate])
@@ -272,7 +273,7 @@ class Ekf:
     def _measurement_of(
         self, robot: _RobotBlock, mate: _RobotBlock | None, sighting: Sighting
     ) -> _Measurement | None:
-        """What a sighting of a robot or a landmark says; None if there is nothing to use."""
+        """The measurement of a sighting of a robot or a landmark; None if it is not usable."""
         landmark = self._field.landmarks.get(sighting.id)
         if mate is not None:
             place, gives = self.mean[mate.columns[:2]], "both"
@@ -299,7 +300,7 @@ class Ekf:
         return _Measurement(columns, jacobian[rows, : len(columns)], innovation, noise)
 
     def _update(self, m: _Measurement, bounds: tuple[float, float]) -> bool:
-        """The Kalman update, if the chi-square gate opens; whether it did."""
+        """The Kalman update, if the innovation passes the chi-square gate; whether it did."""
         cross = self.covariance[:, m.columns] @ m.jacobian.T
         weights = np.linalg.inv(m.jacobian @ cross[m.columns] + m.noise)
         if m.innovation @ weights @ m.innovation > bounds[len(m.innovation) - 1]:
@@ -312,8 +313,8 @@ class Ekf:
         return True
 
     def _inflate(self, robot: _RobotBlock) -> None:
-        """The way back of a robot that refuses what it sees: it doubles its sigma until its gates
-        open, from 0.1 m and 0.1 rad at least to the limits of being lost at most."""
+        """Doubles the sigmas of a robot that rejects its sightings, so that its gates open: to at
+        least 0.1 m and 0.1 rad, to at most the limits of being lost."""
         i, rules = robot.first, robot.settings.localizer
         xx, yy, hh = np.diag(self.covariance)[i : i + 3].tolist()
         most = rules.lost_position_sigma_m**2, math.radians(rules.lost_heading_sigma_deg) ** 2
@@ -324,5 +325,5 @@ class Ekf:
 
 
 def _variance_to_add(variance: float, most: float) -> float:
-    """What to add to a variance so that its sigma doubles, within bounds."""
+    """The increment of a variance that doubles its sigma, within bounds."""
     return max(min(max(4.0 * variance, 0.01), most) - variance, 0.0)

@@ -1,1 +1,1 @@
-"""Faults on purpose: named scenarios with stated expectations, on real processes over Zenoh."""
+"""Fault scenarios with stated expectations, on real processes over Zenoh."""

@@ -1,4 +1,4 @@
-"""What a scenario expects, what was seen, and whether it held. Plain data."""
+"""The checks of a scenario, its outcome, and the report of a run. Plain data."""
 
 import math
 from typing import Any
@@ -7,7 +7,7 @@ import msgspec
 
 
 class Check(msgspec.Struct, frozen=True, kw_only=True):
-    """One figure of a scenario beside its bounds. It does not hold when nothing was seen."""
+    """A figure of a scenario with its bounds. It is not met if the figure is missing."""
 
     what: str
     seen: float | None
@@ -29,7 +29,7 @@ class Check(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def bounds(self) -> str:
-        """Its bounds in words: `≤ 2 s`."""
+        """The bounds as text: `≤ 2 s`."""
         if self.at_least is not None and self.at_least == self.at_most:
             return f"= {format_figure(self.at_least, self.unit)}"
         low = "" if self.at_least is None else f"≥ {format_figure(self.at_least, self.unit)}"
@@ -53,7 +53,7 @@ def equal_to(what: str, seen: float | None, value: float) -> Check:
 
 
 def format_figure(value: float, unit: str) -> str:
-    """Three significant digits at most, whole numbers whole, with the unit."""
+    """The value with its unit: at most three significant digits, whole numbers without decimals."""
     if unit == "%":
         return f"{100.0 * value:.3g} %"
     whole = not math.isfinite(value) or abs(value) >= 100.0 or value == int(value)
@@ -62,30 +62,30 @@ def format_figure(value: float, unit: str) -> str:
 
 
 class Outcome(msgspec.Struct, frozen=True, kw_only=True):
-    """What came of one scenario."""
+    """The outcome of one scenario."""
 
     scenario: str
     done: str
     expectation: str
     checks: tuple[Check, ...] = ()
     not_run: str = ""
-    """Why it was not run: what it needs."""
+    """The missing requirement, if it was not run."""
     failed: str = ""
-    """Why it could not be brought to its end."""
+    """The reason, if it did not reach its end."""
     seconds: float = 0.0
     remarks: tuple[str, ...] = ()
-    """Figures without a bound."""
+    """Figures without bounds."""
 
     @property
     def is_met(self) -> bool | None:
-        """Whether every expectation held; None where it was not run."""
+        """Whether every check is met; None if the scenario was not run."""
         if self.not_run:
             return None
         return not self.failed and bool(self.checks) and all(c.is_met for c in self.checks)
 
 
 def report_data(faults: "ChaosReport") -> dict[str, Any]:
-    """What `--json` and `--report` write: all fields, and whether each expectation held."""
+    """What `--json` and `--report` write: all fields, and whether each check is met (`held`)."""
     outcomes = [
         {
             **msgspec.structs.asdict(o),
@@ -98,7 +98,7 @@ def report_data(faults: "ChaosReport") -> dict[str, Any]:
 
 
 class ChaosReport(msgspec.Struct, frozen=True, kw_only=True):
-    """What `chaos --report` writes."""
+    """The report of `chaos --report`."""
 
     version: str
     seed: int
@@ -107,5 +107,5 @@ class ChaosReport(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def is_met(self) -> bool:
-        """Whether nothing that was run went against its expectation."""
+        """Whether no scenario that was run violated a check."""
         return all(outcome.is_met is not False for outcome in self.outcomes)

@@ -1,4 +1,4 @@
-"""Two sites in containers: the network between their routers is taken away and given back."""
+"""Two sites in containers, between whose routers the network is disconnected and reconnected."""
 
 import os
 import secrets
@@ -49,7 +49,7 @@ class _Sites(NamedTuple):
 
 
 def missing_requirement() -> str:
-    """Why there can be no containers here; empty if there can."""
+    """The missing requirement of containers on this machine; empty if there is none."""
     if checkout() is None:
         return f"needs a checkout, for {SITES} and the image's sources"
     try:
@@ -61,7 +61,7 @@ def missing_requirement() -> str:
 
 
 def partition_containers(options: ScenarioOptions) -> ScenarioResult:
-    """`docker network disconnect` of one site's router, and `connect` again."""
+    """Runs `docker network disconnect` for one site's router, then `connect`."""
     with _sites(options) as sites:
         options.report_progress("starting a team at two sites, in containers")
         _wait_until(lambda: _helps(sites), "the team did not begin to help")
@@ -81,7 +81,7 @@ def partition_containers(options: ScenarioOptions) -> ScenarioResult:
 
 
 def _helps(sites: _Sites) -> bool:
-    """Whether all are heard, and the scout of the east is helped."""
+    """Whether tracks of all robots arrive, and the scout of the east receives help."""
     west, east = sites.logs
     heard = {*WEST, *EAST} <= west.tracks.keys() & east.tracks.keys()
     return heard and latest_counts(east, "scout")["messages_received"] > 20
@@ -119,7 +119,7 @@ def _sites(options: ScenarioOptions) -> Iterator[_Sites]:
 
 
 def _image(options: ScenarioOptions) -> str:
-    """The image of these sources. Raises CannotRunError where none can be had."""
+    """The image of these sources. Raises CannotRunError if it cannot be built."""
     bases = (os.environ.get(BASE_VARIABLE), BASE_IMAGE, OWN_BASE)
     try:
         base = next((b for b in bases if b and has_image(b)), bases[0] or BASE_IMAGE)

@@ -1,4 +1,4 @@
-"""Disks that are full, and file systems on which nothing can be written."""
+"""Full disks, and file systems that are read-only."""
 
 import os
 import shlex
@@ -18,7 +18,7 @@ READ_ONLY = ("--record", "--report", "--picture", "--logs")
 
 
 class CommandResult(NamedTuple):
-    """How a command ended."""
+    """How a command ended: its exit code and outputs."""
 
     code: int
     stdout: str
@@ -27,7 +27,7 @@ class CommandResult(NamedTuple):
 
 
 def disk_full(options: ScenarioOptions) -> ScenarioResult:
-    """`up` records, reports and draws onto a disk of 64 kB, and keeps its logs there."""
+    """`up` writes its recording, report, picture and logs to a disk of 64 kB."""
     with tempfile.TemporaryDirectory(prefix="cpcbl-chaos-") as name:
         disk, names = Path(name), ("run.mcap", "report.json", "run.png")
         options.report_progress(f"running `up` on a disk of {DISK}B")
@@ -42,7 +42,7 @@ def disk_full(options: ScenarioOptions) -> ScenarioResult:
 def full_disk_checks(
     ended: CommandResult, names: tuple[str, ...], full: CommandResult
 ) -> list[Check]:
-    """The run goes on to its report; a line for each file that was lost; exit code 1."""
+    """The run continues to its report; one line names each lost file; the exit code is 1."""
     lines = [
         sum(f"{name}: not written: " in line for line in ended.stderr.splitlines())
         for name in names
@@ -63,7 +63,7 @@ def full_disk_checks(
 
 
 def read_only(options: ScenarioOptions) -> ScenarioResult:
-    """`up` and `calibrate` are to write where nothing can be written."""
+    """`up` and `calibrate` are told to write to a read-only file system."""
     with tempfile.TemporaryDirectory(prefix="cpcbl-chaos-") as name:
         disk, ended = Path(name), {}
         for option in READ_ONLY:
@@ -77,7 +77,7 @@ def read_only(options: ScenarioOptions) -> ScenarioResult:
 
 
 def read_only_checks(ended: dict[str, CommandResult]) -> list[Check]:
-    """One line names option and file before anything is started; exit code 2."""
+    """One line names the option and the file before anything starts; the exit code is 2."""
     clear = [
         sum(f"cpcbl-team: {option} " in line for line in e.stderr.splitlines()) == 1
         for option, e in ended.items()
@@ -100,7 +100,7 @@ def _clean(ended: CommandResult) -> list[Check]:
 
 
 def _robots(out: str) -> int:
-    """Robots of the demonstration in the printed table of errors."""
+    """The number of robots in the printed table of errors."""
     names = ("navigator", "observer", "scout", "patrol")
     table = out.partition("errors of position")[2]
     return sum(name in table for name in names)
@@ -115,7 +115,7 @@ def _command(*words: object) -> str:
 
 
 def _on_disk(options: str, at: Path, *words: object) -> CommandResult:
-    """A command that finds a small disk at a folder, in a mount namespace that ends with it."""
+    """Runs a command that sees a small disk at a folder, in a mount namespace of its own."""
     mount = f"mount -t tmpfs -o {options} tmpfs {shlex.quote(str(at))}"
     return _run("unshare", "--mount", "sh", "-c", f"{mount} && exec {_command(*words)}")
 
@@ -126,7 +126,7 @@ def _run(*words: str) -> CommandResult:
 
 
 def missing_requirement() -> str:
-    """Why no disk can be mounted here; empty if it can."""
+    """The missing requirement for mounting a disk; empty if there is none."""
     if os.geteuid() != 0:
         return "needs root, to mount a small disk"
     tried = subprocess.run(["unshare", "--mount", "true"], capture_output=True, check=False)

@@ -1,4 +1,4 @@
-"""Those who say too much: an echo of one robot's help, late and in any order; a flood."""
+"""Senders of too many messages: an echo of one robot's help, and a flood."""
 
 import heapq
 import random
@@ -17,8 +17,8 @@ UNSURE = (25.0, 0.0, 25.0, 0.0, 0.0, 1.0)
 
 
 class Echo:
-    """A session that says again what one robot said to others: once at once, once after up to
-    `latest_s`, so that nothing keeps its order. A context manager."""
+    """Sends the help of one robot again, once at once and once up to `latest_s` later, so that
+    messages lose their order. A context manager."""
 
     def __init__(self, bus: Bus, robot: str, latest_s: float, seed: int) -> None:
         self._bus, self._latest_s, self._random = bus, latest_s, random.Random(seed)
@@ -64,9 +64,9 @@ class Echo:
 
 
 def send_flood(team: str, endpoint: str, robot: str, targets: list[str], stop: StopSignal) -> int:
-    """Says all that a robot may say as fast as it can; how many messages.
+    """Sends all that a robot may send as fast as possible; returns the number of messages.
 
-    What it says is true but worthless (it does not know where it is), so that only the flood harms.
+    The messages are true, but their uncertainty is large, so that only their number does harm.
     """
     with open_bus(team, [endpoint], stop) as bus:
         token = bus.declare_token(topics.ALIVE.at(tier=0, robot=robot, incarnation="f"))

@@ -1,4 +1,4 @@
-"""What is said twice, late, too often, or makes no sense."""
+"""Messages that come twice, late, or too often."""
 
 import os
 import subprocess
@@ -28,7 +28,7 @@ FLOOD_S = 12.0
 
 
 def duplicates(options: ScenarioOptions) -> ScenarioResult:
-    """All help of the best observer once more at once, and once more up to 4 s late."""
+    """Repeats all help of the best observer at once, and again up to 4 s late."""
     with settled_team(options) as team:
         options.report_progress(
             f"each help message of the observer is sent three times, for {ECHO_S:g} s"
@@ -47,7 +47,7 @@ def duplicates(options: ScenarioOptions) -> ScenarioResult:
 def duplicates_checks(
     log: RunLog, robots: Sequence[str], from_s: float, until_s: float, copies: int
 ) -> list[Check]:
-    """What comes again changes nothing and is counted; what comes too late too."""
+    """Copies and late messages change nothing and are counted."""
     total: Counter[str] = Counter()
     for robot in robots:
         total += counts_between(log, robot, from_s, until_s)
@@ -64,7 +64,7 @@ def duplicates_checks(
 
 
 def flood(options: ScenarioOptions) -> ScenarioResult:
-    """One robot says all that it may say as fast as it can: fixes, beliefs, 60 kB for status."""
+    """One robot sends fixes, beliefs and statuses of 60 kB as fast as possible."""
     flooder = "patrol"
     with settled_team(options, RunPlan(demo_team(), options.seed, left_out=(flooder,))) as team:
         options.report_progress(f"{flooder} floods for {FLOOD_S:g} s")
@@ -90,7 +90,7 @@ def start_flood(team: TeamUnderTest, robot: str, targets: Sequence[str]) -> "sub
 def flood_checks(
     log: RunLog, robots: Sequence[str], from_s: float, until_s: float, end_s: float, sent: int
 ) -> list[Check]:
-    """The router lets in what a robot may say and no more; the others work as before."""
+    """The router limits what a robot may send; the other robots work as before."""
     seconds = until_s - from_s
     taken = [
         counts_between(log, name, from_s, until_s)["messages_received"] / seconds for name in robots

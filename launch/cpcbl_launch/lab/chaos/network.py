@@ -46,7 +46,7 @@ FAR = ("navigator", "patrol")
 
 
 def partition(options: ScenarioOptions) -> ScenarioResult:
-    """Two sites, a router each: the link between them is cut, and healed."""
+    """The link between two sites with one router each is cut, and restored."""
     with run_at_two_sites(demo_team(), options.seed, FAR) as sites:
         team = sites.team
         options.report_progress("starting a team at two sites")
@@ -75,7 +75,8 @@ def partition_checks(
     until_s: float,
     most_far_m: float = FOUND_M,
 ) -> list[Check]:
-    """Each side misses the other and goes on; they are one team again within 5 s of healing."""
+    """Each side notices that the other is missing, and continues; within 5 s they are one team
+    again."""
     gone = [token_gone_after_s(near_log, name, cut_s) for name in far]
     gone += [token_gone_after_s(far_log, name, cut_s) for name in near]
     back = [token_back_after_s(near_log, name, healed_s) for name in far]
@@ -96,7 +97,7 @@ def partition_checks(
 
 
 def cut_link(options: ScenarioOptions) -> ScenarioResult:
-    """The best observer's link is silent: nobody is told."""
+    """The link of the best observer is silent; no connection is closed."""
     robot = "observer"
     with _relayed(robot, options) as (team, link):
         options.report_progress(f"the link of {robot} is silent for {CUT_S:g} s")
@@ -116,7 +117,7 @@ def cut_link(options: ScenarioOptions) -> ScenarioResult:
 def cut_link_checks(
     log: RunLog, robot: str, others: list[str], cut_s: float, healed_s: float, until_s: float
 ) -> list[Check]:
-    """A robot whose link is silent is missed like a dead one, and back when its link is."""
+    """A robot whose link is silent disappears, and is back when its link is."""
     return [
         check_token_gone(log, robot, cut_s, 4.0),
         *checks_unaffected(log, others, cut_s, healed_s),
@@ -134,17 +135,17 @@ def cut_link_checks(
 
 
 def slow_link(options: ScenarioOptions) -> ScenarioResult:
-    """200 ms each way, 100 ms more or less."""
+    """A delay of 200 ms in each direction, with 100 ms of jitter."""
     return _bad_relay(DELAY, options, most_silent_s=2.0, most_late_s=1.5)
 
 
 def narrow_link(options: ScenarioOptions) -> ScenarioResult:
-    """50 kbit/s each way."""
+    """50 kbit/s in each direction."""
     return _bad_relay(NARROW, options, most_silent_s=2.0, most_late_s=1.5)
 
 
 def lossy_link(options: ScenarioOptions) -> ScenarioResult:
-    """Every fifth packet is lost, each way, below TCP."""
+    """Every fifth packet is lost in each direction, below TCP."""
     robot, port = "navigator", free_endpoint().rsplit(":", 1)[1]
     with TunLink(options.seed) as wire:
         own = f"tcp/{wire.near_address}:{port}"
@@ -196,7 +197,7 @@ def _bad_link(
     most_late_s: float,
     most_m: float = FOUND_M,
 ) -> ScenarioResult:
-    """A link over which a robot gets its inputs and its help, bad for a while."""
+    """Impairs the link over which a robot receives its inputs and its help, for a while."""
     options.report_progress(f"the link of {robot} is bad for {BAD_S:g} s")
     bad_s = team.now_s
     make_bad(True)
@@ -223,8 +224,8 @@ def bad_link_checks(
     most_late_s: float,
     most_m: float = FOUND_M,
 ) -> list[Check]:
-    """A robot with a bad link knows where it is and is helped, only later; the others do not
-    notice."""
+    """A robot with an impaired link stays localized and receives help later; the others are not
+    affected."""
     return [
         at_most(
             "its longest gap between tracks",
@@ -257,7 +258,7 @@ def bad_link_checks(
 
 @contextmanager
 def _relayed(robot: str, options: ScenarioOptions) -> Iterator[tuple[TeamUnderTest, Relay]]:
-    """A settled team, one robot of which has a relay as its link."""
+    """A settled team in which one robot dials a relay instead of its router."""
     endpoint = free_endpoint()
     with Relay(endpoint, options.seed) as link:
         plan = RunPlan(demo_team(), options.seed, endpoint=endpoint, links={robot: link.endpoint})

@@ -1,4 +1,4 @@
-"""Processes that are killed or stand still."""
+"""Processes that are killed or suspended."""
 
 from cpcbl_launch.lab.chaos.checks import Check, at_least, at_most
 from cpcbl_launch.lab.chaos.figures import (
@@ -37,12 +37,12 @@ LATE_S = 1.0  # later than any track should come
 
 
 def kill_robot(options: ScenarioOptions) -> ScenarioResult:
-    """A robot that is helped."""
+    """Kills a robot that receives help."""
     return _kill("navigator", options)
 
 
 def kill_observer(options: ScenarioOptions) -> ScenarioResult:
-    """The best observer, on whom the blind one depends."""
+    """Kills the best observer, on which the blind robot depends."""
     return _kill("observer", options)
 
 
@@ -62,7 +62,8 @@ def _kill(robot: str, options: ScenarioOptions) -> ScenarioResult:
 
 
 def wait_until_localized(team: TeamUnderTest, robot: str, from_s: float, not_of: str) -> None:
-    """Until another process than `not_of` knows where it is; or not: the judgement will tell."""
+    """Waits until a process other than `not_of` is localized; if it never is, the checks report
+    it."""
 
     def found() -> bool:
         log = team.run_log
@@ -84,7 +85,8 @@ def kill_checks(
     found_s: float,
     until_s: float,
 ) -> list[Check]:
-    """A killed robot is missed at once, is back, finds itself; the others go on."""
+    """The robot's token disappears at once, it starts again and is localized; the others
+    continue."""
     back_s = restarted_after_s(log, robot, killed_s, before)
     found = None if back_s is None else localized_after_s(log, robot, killed_s + back_s, FOUND_M)
     return [
@@ -97,7 +99,7 @@ def kill_checks(
 
 
 def kill_router(options: ScenarioOptions) -> ScenarioResult:
-    """The router, a process of its own."""
+    """Kills the router, which is a process of its own."""
     with settled_team(options) as team:
         options.report_progress("kill -9 of the router")
         killed_s = team.kill(ROUTER)
@@ -110,14 +112,14 @@ def kill_router(options: ScenarioOptions) -> ScenarioResult:
 
 
 def have_all_published(log: RunLog, robots: list[str], from_s: float) -> bool:
-    """Whether every robot has been heard since."""
+    """Whether every robot has published a track since then."""
     return all(first_track_after_s(log, robot, from_s) is not None for robot in robots)
 
 
 def kill_router_checks(
     log: RunLog, robots: list[str], killed_s: float, back_s: float, until_s: float
 ) -> list[Check]:
-    """Without a router nobody hears anybody; with a new one all is as before."""
+    """Nothing arrives without a router; with the new one, all is as before."""
     gaps = [longest_track_gap_s(log, name, killed_s, until_s) for name in robots]
     helped = sum(counts_between(log, name, back_s)["messages_received"] for name in robots)
     tokens = [t for t in log.tokens if t.at_s >= killed_s and t.alive]
@@ -134,7 +136,8 @@ def kill_router_checks(
 
 
 def kill_field(options: ScenarioOptions) -> ScenarioResult:
-    """The simulated world: no inputs, then a world in which all robots stand elsewhere."""
+    """Kills the simulated field: no inputs, then a new world in which the robots stand
+    elsewhere."""
     far_from_start_s = BASELINE_S + 6.0
     with settled_team(options, baseline_s=far_from_start_s) as team:
         old = team.pid(FIELD)
@@ -164,7 +167,7 @@ def kill_field_checks(
     found_s: float,
     until_s: float,
 ) -> list[Check]:
-    """Robots without inputs stay alive, and find themselves in a world that begins anew."""
+    """The robots continue without inputs, and localize themselves in the new world."""
     gaps = [longest_track_gap_s(log, name, killed_s, found_s) for name in robots]
     found = [localized_after_s(log, name, anew_s + 1.0, FOUND_M) for name in robots]
     return [
@@ -179,7 +182,7 @@ def kill_field_checks(
 
 
 def freeze(options: ScenarioOptions) -> ScenarioResult:
-    """The best observer stands still (SIGSTOP) and goes on as if nothing had been."""
+    """Suspends the best observer (SIGSTOP), and resumes it."""
     robot = "observer"
     with settled_team(options) as team:
         options.report_progress(f"{robot} is frozen for {FROZEN_S:g} s")
@@ -200,7 +203,7 @@ def freeze_checks(
     others: list[str],
     until_s: float,
 ) -> list[Check]:
-    """A frozen robot is dropped like a dead one, and does no harm when it wakes."""
+    """A suspended robot disappears like a dead one, and does no harm when it resumes."""
     return [
         check_token_gone(log, robot, frozen_s, 4.0),
         *checks_unaffected(log, others, frozen_s, thawed_s),

@@ -1,7 +1,7 @@
-"""A link that can be made bad: a TCP relay that a client dials instead of its router.
+"""A TCP relay that a client dials instead of its router, and whose link can be impaired.
 
-It carries bytes in order, as TCP does, so what can be bad about it is silence, delay and rate. Lost
-packets are another matter: `wire.py`.
+Like TCP it carries bytes in order, so that it can be silent, slow or narrow. Lost packets are
+another matter: `tun_link.py`.
 """
 
 import asyncio
@@ -15,19 +15,19 @@ CHUNK = 4096
 
 
 class LinkQuality(NamedTuple):
-    """How a link is, each way."""
+    """The quality of a link, in each direction."""
 
     delay_s: float = 0.0
     jitter_s: float = 0.0
-    """The delay is up to so much more or less, evenly spread; nothing overtakes."""
+    """The delay varies by up to this much, evenly distributed; nothing overtakes."""
     bytes_per_s: float = 0.0
-    """0: as fast as it goes."""
+    """0: no limit."""
     cut: bool = False
-    """Nothing passes, nobody is told: as a cable that is pulled."""
+    """Nothing passes and no connection is closed, as with an unplugged cable."""
 
 
 class Relay:
-    """Listens on a free port of this machine for those who want to reach `endpoint`."""
+    """Listens on a free port of this machine for clients that want to reach `endpoint`."""
 
     def __init__(self, endpoint: str, seed: int = 1) -> None:
         host, port = endpoint.removeprefix("tcp/").rsplit(":", 1)
@@ -37,7 +37,7 @@ class Relay:
         self._thread = threading.Thread(target=self._loop.run_forever, daemon=True)
         self._tasks: set[asyncio.Task[None]] = set()
         self.passed = 0
-        """Bytes so far, both ways."""
+        """Bytes so far, in both directions."""
 
     def __enter__(self) -> "Relay":
         self._thread.start()
@@ -53,7 +53,7 @@ class Relay:
 
     @property
     def endpoint(self) -> str:
-        """Where the client is to dial."""
+        """The endpoint that the client dials."""
         return f"tcp/127.0.0.1:{self._server.sockets[0].getsockname()[1]}"
 
     @property
@@ -61,7 +61,7 @@ class Relay:
         return self._quality
 
     def set(self, quality: LinkQuality) -> None:
-        """From any thread; in force at once, for what is on its way too if it is cut."""
+        """Sets the quality, from any thread, at once; a cut also holds back what is on its way."""
 
         def changed() -> None:
             self._quality = quality
@@ -108,7 +108,7 @@ class Relay:
         self._tasks.discard(task)
 
     async def _pass_on(self, source: asyncio.StreamReader, sink: asyncio.StreamWriter) -> None:
-        """One way: a reader that stamps each piece with its time to leave, and a sender."""
+        """One direction: reads pieces and stamps each with its time to leave, for the sender."""
         pieces: asyncio.Queue[tuple[float, bytes]] = asyncio.Queue(maxsize=256)
         sender = asyncio.ensure_future(self._send(pieces, sink))
         try:

@@ -119,7 +119,7 @@ class RunRecorder:
             return RunLog(
                 self._clock.epoch_ns,
                 {name: tuple(heard) for name, heard in self._tracks.items()},
-                {name: tuple(said) for name, said in self._statuses.items()},
+                {name: tuple(statuses) for name, statuses in self._statuses.items()},
                 tuple(self._tokens),
                 {name: np.array(rows) for name, rows in self._rows.items()},
             )

@@ -1,4 +1,4 @@
-"""Running scenarios one after another, so that their figures are clean."""
+"""Runs scenarios one after another, so that they do not disturb each other."""
 
 import difflib
 import os
@@ -24,7 +24,7 @@ MOVED = {"fuzz": "it is a test now: run `make fuzz`, or `pytest tests/fuzz`, in 
 
 
 def select_scenarios(names: Sequence[str]) -> list[Scenario]:
-    """The scenarios of these names, `all` for all; in the order of the table. Raises InputError."""
+    """The scenarios with these names, or `all`, in the order of the table. Raises InputError."""
     known = {scenario.name: scenario for scenario in SCENARIOS}
     for name in names:
         if name in MOVED:
@@ -37,7 +37,7 @@ def select_scenarios(names: Sequence[str]) -> list[Scenario]:
 
 
 def missing_requirement(needs: Needs) -> str:
-    """Why a scenario that needs this cannot run here; empty if it can."""
+    """The requirement that this machine does not meet; empty if there is none."""
     match needs:
         case Needs.ROOT:
             return tun_link.missing_requirement()
@@ -75,7 +75,7 @@ def run_scenarios(
     began: Callable[[Scenario], None],
     done: Callable[[Outcome], None],
 ) -> ChaosReport:
-    """Runs them all; `began` and `done` are told of each."""
+    """Runs scenarios; calls `began` and `done` for each."""
     outcomes = []
     for scenario in scenarios:
         began(scenario)
@@ -90,7 +90,7 @@ def run_scenarios(
 
 
 def machine_description() -> str:
-    """What kind of machine this is, for those who read the figures."""
+    """A description of this machine, for readers of the figures."""
     cores = os.cpu_count() or 1
     load = os.getloadavg()[0]
     return f"{platform.system()} {platform.machine()}, {cores} cores, load {load:.1f}"

@@ -1,4 +1,4 @@
-"""Two sites, a router each, joined by a relay that can be cut; the simulated world is at both."""
+"""Two sites with one router each, joined by a relay that can be cut; the field serves both."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
@@ -23,7 +23,8 @@ class TwoSites(NamedTuple):
 
     @property
     def far_log(self) -> RunLog:
-        """What is heard at the far site, with the truth, which is told at the near one only."""
+        """The log of the far site, with the ground truth, which is published at the near site
+        only."""
         return self.far_recorder.run_log()._replace(truth=self.team.run_log.truth)
 
 

@@ -1,4 +1,4 @@
-"""A soak: faults in random order for as long as one likes, and what it leaves behind."""
+"""A soak test: faults in random order for any time, and what the processes hold afterwards."""
 
 import random
 from collections import Counter
@@ -49,7 +49,7 @@ STUCK_S = 30.0
 
 
 class ProcessSample(NamedTuple):
-    """What a process held at a time."""
+    """The memory and open files of a process at one time."""
 
     at_s: float
     process: str
@@ -64,15 +64,15 @@ class ProcessLife(NamedTuple):
     process: str
     seconds: float
     start_mib: float
-    """Median of the 20 s after its first 20 s."""
+    """The median of the 20 s after its first 20 s."""
     end_mib: float
-    """Median of its last 20 s."""
+    """The median of its last 20 s."""
     mib_a_minute: float
     more_files: int
 
 
 def soak(options: ScenarioOptions) -> ScenarioResult:
-    """Kill, freeze, cut, slow, flood, echo, again and again."""
+    """Kills, suspends, cuts, slows, floods and repeats, in random order."""
     require_process_usage("chaos soak")
     team_file, endpoint = demo_team(), free_endpoint()
     with ExitStack() as stack:
@@ -115,8 +115,8 @@ def soak_checks(
     kills: int,
     tracebacks: int,
 ) -> list[Check]:
-    """Memory is flat, nobody is stuck, nothing ended that was not killed. `times_s`: the beginning,
-    the last fault, when all were well again, the end."""
+    """Memory does not grow, no robot stays lost or silent, and no process ended without being
+    killed. `times_s`: the start, the last fault, when all were localized again, the end."""
     from_s, calm_s, well_s, until_s = times_s
     silent = [longest_track_gap_s(log, name, from_s, until_s) for name in robots]
     back = [localized_after_s(log, name, calm_s, FOUND_M) for name in robots]
@@ -145,7 +145,7 @@ def soak_checks(
 
 
 def process_lives(samples: Iterable[ProcessSample]) -> list[ProcessLife]:
-    """The processes that lived long enough to tell whether their memory is flat."""
+    """The processes that ran long enough to show whether their memory grows."""
     by_pid: dict[tuple[str, int], list[ProcessSample]] = {}
     for sample in samples:
         by_pid.setdefault((sample.process, sample.pid), []).append(sample)
@@ -173,7 +173,7 @@ def _life(process: str, samples: Sequence[ProcessSample]) -> ProcessLife:
 
 
 class _FaultSequence:
-    """Does one fault after another, and samples what processes hold."""
+    """Injects one fault after another, and samples the memory of all processes."""
 
     def __init__(
         self, team: TeamUnderTest, links: Mapping[str, Relay], options: ScenarioOptions
@@ -185,7 +185,7 @@ class _FaultSequence:
         self.faults: Counter[str] = Counter()
 
     def run(self) -> None:
-        """For `soak_s`."""
+        """Injects faults for `soak_s`."""
         kinds: dict[str, Callable[[], None]] = {
             "kill": self._kill,
             "freeze": self._freeze,

@@ -1,4 +1,4 @@
-"""What came of scenarios, for people: on a terminal, in a page."""
+"""The outcomes of scenarios for people: on a terminal and as Markdown."""
 
 from collections.abc import Iterator
 
@@ -13,7 +13,7 @@ _VERDICT = {True: ("held", "green"), False: ("NOT HELD", "bold red"), None: ("no
 
 
 def print_scenarios(scenarios: tuple[Scenario, ...], console: Console) -> None:
-    """The table of scenarios: `--list`."""
+    """Prints the table of scenarios (`--list`)."""
     shown = _table("scenario", "what is done", "expectation", "needs")
     for s in scenarios:
         name = f"{s.name} (quick)" if s.quick else s.name
@@ -22,7 +22,7 @@ def print_scenarios(scenarios: tuple[Scenario, ...], console: Console) -> None:
 
 
 def print_faults(faults: ChaosReport, console: Console) -> None:
-    """Scenario, expectation, what was seen, whether it held."""
+    """Prints each scenario with its expectation, its figures, and whether its checks are met."""
     shown = _table("scenario", "expectation", "seen", "")
     for outcome in faults.outcomes:
         shown.add_row(
@@ -35,12 +35,12 @@ def print_faults(faults: ChaosReport, console: Console) -> None:
     counts = {text: 0 for text, _ in _VERDICT.values()}
     for outcome in faults.outcomes:
         counts[_VERDICT[outcome.is_met][0]] += 1
-    said = ", ".join(f"{n} {text}" for text, n in counts.items() if n)
-    console.print(Text(f"{said}; {faults.machine}; seed {faults.seed}", "bold"))
+    summary = ", ".join(f"{n} {text}" for text, n in counts.items() if n)
+    console.print(Text(f"{summary}; {faults.machine}; seed {faults.seed}", "bold"))
 
 
 def verdict(outcome: Outcome) -> Text:
-    """In a word, in its colour."""
+    """The outcome as one coloured word."""
     return Text(*_VERDICT[outcome.is_met])
 
 
@@ -58,7 +58,7 @@ def _seen(outcome: Outcome) -> Text:
 
 
 def markdown(faults: ChaosReport) -> Iterator[str]:
-    """The same as lines of a page."""
+    """The outcomes as lines of Markdown."""
     yield "| scenario | what is done | expectation | seen | |"
     yield "|---|---|---|---|---|"
     for o in faults.outcomes:
@@ -67,8 +67,8 @@ def markdown(faults: ChaosReport) -> Iterator[str]:
 
 
 class Progress:
-    """What is going on: a moving line on a terminal, and a line for each scenario that is done. A
-    context manager."""
+    """Shows the progress: a line for the current step on a terminal, and a line for each scenario
+    that is done. A context manager."""
 
     def __init__(self, console: Console, total: int) -> None:
         self._console, self._total = console, total

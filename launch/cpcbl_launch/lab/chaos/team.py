@@ -1,4 +1,4 @@
-"""A running team under test: router, field and robots as real processes, and notes on them."""
+"""A running team under test: router, field and robots as real processes, and a log of them."""
 
 import os
 import signal
@@ -32,17 +32,17 @@ ROUTER, FIELD = "router", "field"
 
 
 class ChaosError(CpcblError):
-    """A scenario could not be brought to its fault, or to its end."""
+    """A scenario did not reach its fault, or its end."""
 
 
 class Site(NamedTuple):
-    """A router of its own, joined to the first."""
+    """Another router, joined to the first."""
 
     listen: str
     joins: str
-    """The endpoint that it dials: the first router's, or a relay's to it."""
+    """The endpoint that it dials: that of the first router, or of a relay."""
     robots: Sequence[str]
-    """Whom the field tells there what they sense."""
+    """The robots whose inputs the field publishes at this site."""
 
 
 class RunPlan(NamedTuple):
@@ -51,29 +51,29 @@ class RunPlan(NamedTuple):
     team: Team
     seed: int = 1
     links: Mapping[str, str] = MappingProxyType({})
-    """The endpoint that a robot dials, where it is not the router's."""
+    """The endpoints of robots that do not dial the router directly."""
     prefix: Mapping[str, tuple[str, ...]] = MappingProxyType({})
-    """What a robot's command begins with, such as `ip netns exec`."""
+    """The start of a robot's command, such as `ip netns exec`."""
     faults: Mapping[str, str] = MappingProxyType({})
     """The fault of a robot that sends wrong positions, such as `bias:0.5,0.5@10-30`."""
     also_listen: Sequence[str] = ()
-    """Further endpoints of the router."""
+    """Further endpoints at which the router listens."""
     sites: Mapping[str, Site] = MappingProxyType({})
-    """Routers of other sites, by the name of their process."""
+    """The routers of other sites, by the name of their process."""
     endpoint: str = ""
-    """The router's; default: a free one of this machine."""
+    """The router's endpoint; default: a free one of this machine."""
     left_out: Sequence[str] = ()
     """Robots of the file that are not started."""
 
 
 def demo_team() -> Team:
-    """The demonstration, helping from the start: navigator, observer, scout (blind), patrol."""
+    """The demonstration, with help from the start: navigator, observer, scout (blind), patrol."""
     team = load_team(builtin_path("demo"))
     return with_collaboration(team, after_s=0.0)
 
 
 def with_collaboration(team: Team, **changes: object) -> Team:
-    """The team with some settings of every robot's collaboration replaced."""
+    """The team with these settings of every robot's collaboration."""
     robots = {
         name: msgspec.structs.replace(
             robot, collaboration=msgspec.structs.replace(robot.collaboration, **changes)
@@ -84,7 +84,7 @@ def with_collaboration(team: Team, **changes: object) -> Team:
 
 
 class TeamUnderTest:
-    """Made by `running`. Times are seconds of robot time since the run's epoch."""
+    """Made by `run_team_under_test`. Times are seconds of robot time after the run's epoch."""
 
     def __init__(
         self, plan: RunPlan, folder: Path, endpoint: str, clock: Clock, supervisor: Supervisor
@@ -96,7 +96,7 @@ class TeamUnderTest:
             for name, robot in plan.team.robots.items()
             if name not in plan.left_out and robot.source == "simulated"
         ]
-        """Of the simulated field, which knows where they are."""
+        """The robots of the simulated field, whose ground truth is known."""
         self.recorder = RunRecorder(clock, plan.team.simulation.clocks_ahead_s)
         self.seen_pids: set[int] = set()
 
@@ -109,7 +109,8 @@ class TeamUnderTest:
         return self.recorder.run_log()
 
     def pid(self, name: str) -> int:
-        """Of a robot, the field or a router. Raises ChaosError when it does not run."""
+        """The process id of a robot, the field or a router. Raises ChaosError if it does not
+        run."""
         process = f"robot-{name}" if name in self.plan.team.robots else name
         pid = self.supervisor.pids.get(process)
         if pid is None:
@@ -125,7 +126,7 @@ class TeamUnderTest:
     # What is done to it -------------------------------------------------------------------------
 
     def kill(self, name: str) -> float:
-        """kill -9; when it was done."""
+        """Kills a process (SIGKILL); returns the time."""
         return self._signal(name, signal.SIGKILL)
 
     def freeze(self, name: str) -> float:
@@ -141,7 +142,7 @@ class TeamUnderTest:
     # Waiting ------------------------------------------------------------------------------------
 
     def watch(self) -> None:
-        """Restarts what died; to be called several times a second."""
+        """Restarts processes that have died; to be called several times a second."""
         self.supervisor.watch()
         self.seen_pids.update(self.supervisor.pids.values())
 
@@ -149,7 +150,8 @@ class TeamUnderTest:
         self.wait_until(lambda: False, seconds)
 
     def wait_until(self, condition: Callable[[], bool], within_s: float = PATIENCE_S) -> bool:
-        """Whether a condition came true in time; the team is looked after meanwhile."""
+        """Waits for a condition, and restarts what dies meanwhile; returns whether it was met in
+        time."""
         end_s = time.monotonic() + within_s
         while not condition():
             if time.monotonic() >= end_s:
@@ -159,7 +161,7 @@ class TeamUnderTest:
         return True
 
     def settle(self, within_m: float = SETTLED_M, patience_s: float = PATIENCE_S) -> float:
-        """Waits until all robots know where they are; when. Raises ChaosError."""
+        """Waits until all robots are localized; returns the time. Raises ChaosError."""
 
         def unsettled() -> list[str]:
             notes = self.run_log
@@ -179,29 +181,30 @@ class TeamUnderTest:
         return self.now_s
 
     def process_log(self, process: str) -> str:
-        """What a process wrote."""
+        """The output of a process."""
         path = self.folder / f"{process}.log"
         return path.read_text(errors="replace") if path.exists() else ""
 
     def tracebacks(self) -> int:
-        """How many there are in the logs of all processes."""
+        """The number of tracebacks in the logs of all processes."""
         logs = (path.read_text(errors="replace") for path in self.folder.glob("*.log"))
         return sum(log.count("Traceback (most recent call last)") for log in logs)
 
     def last_log_line(self, process: str) -> str:
         lines = self.process_log(process).splitlines()
-        return lines[-1] if lines else f"{process} said nothing"
+        return lines[-1] if lines else f"{process} wrote nothing"
 
 
 def clock_starting_in(seconds: float) -> Clock:
-    """A clock whose epoch is so long from now."""
+    """A clock whose epoch is so many seconds from now."""
     ahead_ns = int(seconds * 1e9)
     return Clock(time.time_ns() + ahead_ns, time.monotonic_ns() + ahead_ns, 1.0)
 
 
 @contextmanager
 def run_team_under_test(plan: RunPlan) -> Iterator[TeamUnderTest]:
-    """A team with all its processes; none of them is left at the end."""
+    """A team with all its processes, all of which have ended afterwards. Raises ChaosError if
+    not."""
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="cpcbl-chaos-")))
         endpoint = plan.endpoint or free_endpoint()
@@ -231,8 +234,8 @@ def _patience() -> Callable[[], bool]:
 
 
 def _table(plan: RunPlan, folder: Path, endpoint: str, clock: Clock) -> list[ProcessSpec]:
-    """The router, the field, a robot each: as `up` starts them, with links and clocks of their
-    own."""
+    """The router, the field and the robots, started as `up` does, with their own links and
+    clocks."""
     team_file = folder / "team.json"
     save_resolved(plan.team, team_file)
     rows = [router_spec(team_file, (endpoint, *plan.also_listen))]

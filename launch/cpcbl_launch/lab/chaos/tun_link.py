@@ -1,8 +1,8 @@
-"""A wire on which packets are lost: two TUN interfaces, one in a network namespace of its own.
+"""A link that loses packets: two TUN interfaces, one in a network namespace of its own.
 
-What goes into one comes out of the other, packet by packet, through this process, which loses some,
-holds some back and so reorders them, as radio does. The kernel's TCP lives with it as it can.
-Linux, as root; no traffic control, no firewall rule, nothing outside of the two interfaces.
+This process forwards each packet from one interface to the other. It drops some packets and delays
+some, so that they are reordered, as on a radio link; the kernel's TCP copes with that. It needs
+Linux and root, and changes no traffic control, firewall rule or other interface.
 """
 
 import fcntl
@@ -23,18 +23,18 @@ _MTU = 1500
 
 
 class PacketImpairment(NamedTuple):
-    """What happens to packets, each way."""
+    """What happens to packets, in each direction."""
 
     loss: float = 0.0
-    """The share that is lost."""
+    """The share of packets that are lost."""
     delay_s: float = 0.0
     jitter_s: float = 0.0
-    """Up to so much more or less, evenly spread: packets overtake each other."""
+    """The delay varies by up to this much, evenly distributed; packets overtake each other."""
 
 
 class TunLink:
-    """A namespace whose only way out is this wire. `prefix` runs a command in it; what runs there
-    finds this machine at `here`."""
+    """A namespace whose only connection is this link. `prefix` runs a command in it; the command
+    finds this machine at `near_address`."""
 
     def __init__(self, seed: int = 1) -> None:
         self._random = random.Random(seed)
@@ -52,7 +52,7 @@ class TunLink:
         return ("ip", "netns", "exec", self._namespace)
 
     def set(self, weather: PacketImpairment) -> None:
-        """From any thread; for packets from now on."""
+        """Sets the impairment of packets from now on, from any thread."""
         self._weather = weather
 
     def __enter__(self) -> "TunLink":
@@ -84,7 +84,7 @@ class TunLink:
         subprocess.run(["ip", "netns", "del", self._namespace], check=False, capture_output=True)
 
     def _carry(self) -> None:
-        """Takes packets from either end; each leaves at the other when its time has come."""
+        """Forwards packets; each leaves at the other end when its time has come."""
         waiting: list[tuple[float, int, int, bytes]] = []
         order = 0
         while not self._stop.is_set():
@@ -107,14 +107,14 @@ class TunLink:
 
 
 def missing_requirement() -> str:
-    """Why there can be no wire here; empty if there can."""
+    """The missing requirement of such a link; empty if there is none."""
     if os.geteuid() != 0:
         return "needs root, for a network namespace"
     return "" if os.access(TUN, os.R_OK | os.W_OK) else f"needs {TUN}"
 
 
 def _interface(name: str) -> int:
-    """A TUN interface, which lives as long as this descriptor is open."""
+    """A TUN interface that exists as long as this descriptor is open."""
     end = os.open(TUN, os.O_RDWR | os.O_NONBLOCK | os.O_CLOEXEC)
     request = struct.pack("16sH22x", name.encode(), _TUN_WITHOUT_HEADER)
     fcntl.ioctl(end, _SET_INTERFACE, request)
@@ -122,7 +122,7 @@ def _interface(name: str) -> int:
 
 
 def _ip(*words: str) -> None:
-    """Raises OSError."""
+    """Runs `ip`. Raises OSError."""
     done = subprocess.run(["ip", *words], check=False, capture_output=True, text=True)
     if done.returncode:
         raise OSError(f"ip {' '.join(words)}: {done.stderr.strip()}")

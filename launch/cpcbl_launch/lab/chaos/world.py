@@ -1,4 +1,5 @@
-"""The world is not as it was: a kidnapped robot, hidden landmarks, clocks that are off, a liar."""
+"""Faults of the simulated world: a kidnapped robot, hidden landmarks, wrong clocks, a faulty
+robot."""
 
 from collections.abc import Sequence
 
@@ -47,7 +48,7 @@ LIE, LIE_S = "bias:0.5,0.5", (12.0, 27.0)
 
 
 def kidnap(options: ScenarioOptions) -> ScenarioResult:
-    """A robot is carried 3 m away; its wheels do not notice."""
+    """A robot is moved by 3 m without any odometry."""
     event = SimulationEvent(at_s=EVENT_S, kidnap=KIDNAPPED, to=TO)
     plan = RunPlan(with_events(demo_team(), event), options.seed)
     with settled_team(options, plan, baseline_s=0.0) as team:
@@ -59,7 +60,7 @@ def kidnap(options: ScenarioOptions) -> ScenarioResult:
 
 
 def kidnap_checks(log: RunLog, robot: str, others: Sequence[str], until_s: float) -> list[Check]:
-    """It says that it is lost, finds itself, and nobody else is led astray."""
+    """The robot reports that it is lost, is localized again, and misleads nobody."""
     at_s, moved_m = first_position_jump(log, robot) or (until_s, 0.0)
     believed = [name for name in (robot, *others) if not distrusted_peers(log, name)]
     return [
@@ -78,7 +79,7 @@ def kidnap_checks(log: RunLog, robot: str, others: Sequence[str], until_s: float
 
 
 def hidden_landmarks(options: ScenarioOptions) -> ScenarioResult:
-    """Nobody sees a landmark for a minute; teammates are seen."""
+    """No robot sees a landmark for a minute; robots see each other."""
     event = SimulationEvent(at_s=EVENT_S, hide_landmarks_s=HIDDEN_S)
     plan = RunPlan(with_events(demo_team(), event), options.seed)
     with settled_team(options, plan, baseline_s=0.0) as team:
@@ -89,7 +90,8 @@ def hidden_landmarks(options: ScenarioOptions) -> ScenarioResult:
 
 
 def hidden_landmarks_checks(log: RunLog, robots: Sequence[str], until_s: float) -> list[Check]:
-    """The team lives on what it knew, says how much that is, and is well when it sees again."""
+    """The team's error stays small and its stated uncertainty consistent; then all are
+    localized."""
     dark_s, light_s = EVENT_S, EVENT_S + HIDDEN_S
     back = [localized_after_s(log, name, light_s, FOUND_M) for name in robots]
     return [
@@ -109,12 +111,12 @@ def hidden_landmarks_checks(log: RunLog, robots: Sequence[str], until_s: float) 
 
 
 def clock_half_second(options: ScenarioOptions) -> ScenarioResult:
-    """The best observer's clock is 0.5 s ahead, another's 0.05 s."""
+    """The clock of the best observer is 0.5 s ahead, that of another robot 0.05 s."""
     return _clocks({"observer": 0.5, "patrol": TOLERATED_S}, options)
 
 
 def clock_hour(options: ScenarioOptions) -> ScenarioResult:
-    """The best observer's clock is an hour ahead, another's 0.05 s."""
+    """The clock of the best observer is one hour ahead, that of another robot 0.05 s."""
     return _clocks({"observer": 3600.0, "patrol": TOLERATED_S}, options)
 
 
@@ -129,17 +131,17 @@ def _clocks(ahead_s: dict[str, float], options: ScenarioOptions) -> ScenarioResu
         others = team.others(wrong)
         checks = clock_checks(team.run_log, wrong, right, others, from_s, team.now_s)
         late = [reported_delay_s(team.run_log, name, wrong) for name in others]
-        said = ", ".join(f"{-s:.2f} s" for s in late if s is not None)
+        offsets = ", ".join(f"{-s:.2f} s" for s in late if s is not None)
         return ScenarioResult(
-            checks, (f"the other robots estimate that its clock is ahead by {said}",)
+            checks, (f"the other robots estimate that its clock is ahead by {offsets}",)
         )
 
 
 def clock_checks(
     log: RunLog, wrong: str, right: str, others: Sequence[str], from_s: float, until_s: float
 ) -> list[Check]:
-    """Help by a clock that is off is refused with that reason, and said; by one that is hardly
-    off it is used; everybody goes on."""
+    """The robots refuse and report help with a wrong clock; they use help with a slightly wrong
+    one."""
     found = [distrust_reported_at_s(log, name, wrong, "clock") for name in others]
     known = [s for s in found if s is not None]
     refused = sum(
@@ -166,7 +168,7 @@ def clock_checks(
 
 
 def faulty_robot(options: ScenarioOptions) -> ScenarioResult:
-    """One of three observers says everything 0.7 m away, for a while."""
+    """One of three observers sends positions that are 0.7 m wrong, for a while."""
     lie = f"{LIE}@{LIE_S[0]:g}-{LIE_S[1]:g}"
     team_settings = liars.liars_team(liars.Case(lie=LIE))
     plan = RunPlan(team_settings, options.seed, faults={liars.LIAR: lie})
@@ -188,7 +190,8 @@ def faulty_robot_checks(
     from_s: float,
     until_s: float,
 ) -> list[Check]:
-    """It is found by those that it lies to, does little harm, and is believed again later."""
+    """The robots that it misleads quarantine it, it does little harm, and is trusted again
+    later."""
     found = [quarantine_reported_at_s(log, name, liar, from_s, until_s) for name in listeners]
     known = sorted(at_s - from_s for at_s in found if at_s is not None)
     last = [distrusted_peers(log, name) for name in robots]
@@ -210,7 +213,7 @@ def faulty_robot_checks(
 
 
 def with_events(team: Team, *events: SimulationEvent) -> Team:
-    """The team on a field on which these happen."""
+    """The team on a simulated field with these events."""
     simulation = msgspec.structs.replace(team.simulation, events=events)
     return msgspec.structs.replace(team, simulation=simulation)
 

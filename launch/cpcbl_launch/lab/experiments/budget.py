@@ -27,8 +27,8 @@ RARE: Mapping[str, Any] = {
     "fix_interval_s": 10.0,
     "belief_rate_hz": 0.1,
 }
-"""For a few messages a minute: what is worth less, or comes soon again, would only delay what is
-worth more."""
+"""For a few messages a minute: messages of less value, or soon after the last, would only delay
+those of more value."""
 
 
 OURS = ("bytes limited", "messages limited", "value alone")
@@ -51,7 +51,7 @@ class Point(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Target(msgspec.Struct, frozen=True, kw_only=True):
-    """What a series has to reach, and the best that did within its cost."""
+    """The target of a series, and the best point within its cost."""
 
     said: str
     allowed_rmse_m: float
@@ -60,7 +60,7 @@ class Target(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Curve(msgspec.Struct, frozen=True, kw_only=True):
-    """What the experiment writes."""
+    """The result of the experiment."""
 
     experiment: str
     version: str
@@ -81,7 +81,7 @@ class Case(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def cases() -> list[Case]:
-    """From nothing to everything, each series from little to much."""
+    """All cases, from no help to all help; each series from little to much."""
     none = Case(series="nothing", setting="alone", rules={"active": False, "passive": False})
     both = {**EVERYTHING, "direction": "both-ways"}
     return [
@@ -112,7 +112,7 @@ def _interval_case(seconds: float) -> Case:
 
 
 def measure_point(logged: LoggedTeam, case: Case) -> Point:
-    """The figures of one case. Raises InputError where there is no truth to score it by."""
+    """The figures of one case. Raises InputError if the log has no ground truth in this time."""
     replace = msgspec.structs.replace
     robots = {}
     for name, robot in logged.team.robots.items():
@@ -161,7 +161,7 @@ def measure_curve(logged: LoggedTeam, jobs: int | None, done: Callable[[], None]
 
 
 def targets(points: Iterable[Point]) -> Iterable[Target]:
-    """Of sending by value, against everything both ways: near its RMSE for little of its cost."""
+    """Sending by value must nearly reach the RMSE of all help both ways, at a part of its cost."""
     points = list(points)
     all_of = next(p for p in points if p.series == "all, both ways")
     ours = [p for p in points if p.series in OURS]
@@ -171,10 +171,10 @@ def targets(points: Iterable[Point]) -> Iterable[Target]:
     yield _target("20 % of it at 2.5 messages a minute", 1.2 * all_of.position_rmse_m, few)
 
 
-def _target(said: str, allowed_m: float, within: list[Point]) -> Target:
+def _target(text: str, allowed_m: float, within: list[Point]) -> Target:
     best = min(within, key=lambda p: p.position_rmse_m, default=None)
     held = best is not None and best.position_rmse_m <= allowed_m
-    return Target(said=f"within {said}", allowed_rmse_m=allowed_m, best=best, held=held)
+    return Target(said=f"within {text}", allowed_rmse_m=allowed_m, best=best, held=held)
 
 
 def tables(result: Curve) -> Iterable[RenderableType]:

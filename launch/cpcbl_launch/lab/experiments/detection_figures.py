@@ -1,7 +1,7 @@
-"""The figures of rendered frames: what was found, missed and mistaken, how far off, how honest.
+"""The figures of rendered frames: detections, misses, mistakes, errors and their stated sigmas.
 
-Ranges are from the viewer's centre to that of what is seen. Spreads are about zero, not about their
-mean, so that a bias counts too.
+Ranges are from the centre of the viewer to the centre of the object. Spreads are about zero, not
+about the mean, so that they contain a bias.
 """
 
 import math
@@ -22,7 +22,7 @@ Kind = Literal["landmark", "marker", "mast"]
 Wrong = Literal["wrong id", "wrong range"]
 KINDS: tuple[Kind, ...] = ("landmark", "marker", "mast")
 WITHIN_M: dict[Kind, float] = {"landmark": 5.0, "marker": 3.0, "mast": 5.0}
-"""What recall and precision are about; masts have no target."""
+"""The ranges for which recall and precision have a target; masts have none."""
 ERRORS_WITHIN_M = 4.0
 EDGES_M = (0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 7.0, 12.0)
 DRAWN = 1500  # errors of each kind that the picture shows
@@ -35,11 +35,11 @@ LEAST_INSIDE = 0.98
 
 
 class Record(NamedTuple):
-    """Something that was due, or was reported rightly, or both."""
+    """An object that was due to be detected, or was reported correctly, or both."""
 
     due: tuple[Kind, ...]
     seen_by: Kind | None
-    """By a marker where a heading is said, else by a mast."""
+    """A marker if the sighting has a heading, else a mast."""
     range_m: float
     range_error_m: float | None = None
     range_sigma_m: float | None = None
@@ -50,7 +50,7 @@ class Record(NamedTuple):
 
 
 class Mistake(msgspec.Struct, frozen=True, kw_only=True):
-    """A sighting that is not right."""
+    """A wrong sighting."""
 
     frame: int
     kind: Kind
@@ -61,7 +61,7 @@ class Mistake(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Batch(NamedTuple):
-    """Some frames."""
+    """The results of some frames."""
 
     records: list[Record]
     mistakes: list[Mistake]
@@ -74,21 +74,21 @@ class Batch(NamedTuple):
 
 
 class Figures(msgspec.Struct, frozen=True, kw_only=True):
-    """Of one kind of thing, between two ranges; None where there is nothing."""
+    """The figures of one kind of feature between two ranges; None if there is nothing."""
 
     from_m: float
     to_m: float
     due: int
-    """All of it was to be seen."""
+    """Objects that were completely visible."""
     found: int
-    """Of these, reported rightly: by whatever, with or without a range."""
+    """Those of them that were reported correctly, by any feature, with or without a range."""
     recall: float | None
     reported: int
-    """Sightings by this kind of feature, due or not, right or not."""
+    """Sightings by this kind of feature, due or not, correct or not."""
     right: int
     precision: float | None
     ranged: int
-    """Right ones that say a range."""
+    """Correct ones with a range."""
     range_sigma_share: float | None
     range_bias_share: float | None
     bearing_sigma_deg: float | None
@@ -100,7 +100,7 @@ class Figures(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Error(msgspec.Struct, frozen=True, kw_only=True, array_like=True):
-    """One sighting, for the picture: its errors, and the sigmas that it stated."""
+    """One sighting, for the picture: its errors and its stated sigmas."""
 
     range_m: float
     range_share: float | None
@@ -110,7 +110,7 @@ class Error(msgspec.Struct, frozen=True, kw_only=True, array_like=True):
 
 
 class Eyes(msgspec.Struct, frozen=True, kw_only=True):
-    """What the experiment writes."""
+    """The result of the experiment."""
 
     experiment: str
     version: str
@@ -128,7 +128,7 @@ class Eyes(msgspec.Struct, frozen=True, kw_only=True):
     errors: dict[Kind, tuple[Error, ...]]
     pattern: dict[str, bool]
     cost: dict[str, float | str]
-    """Timing: of this machine and moment."""
+    """Measured times, of this machine."""
 
 
 @lru_cache(maxsize=1)
@@ -176,29 +176,33 @@ def pattern(
     mistakes: Sequence[Mistake],
     refused: int,
 ) -> dict[str, bool]:
-    """What has to hold; nothing holds without figures."""
-    said = {}
+    """The targets, and whether they were met; a target without figures is not met."""
+    targets = {}
     for kind in KINDS[:2]:
         seen, of = within[kind], f"{kind}s within {WITHIN_M[kind]:g} m"
-        said[f"{of}: precision at least {LEAST_PRECISION:g}"] = _least(
+        targets[f"{of}: precision at least {LEAST_PRECISION:g}"] = _least(
             seen.precision, LEAST_PRECISION
         )
-        said[f"{of}: recall at least {LEAST_RECALL:g}"] = _least(seen.recall, LEAST_RECALL)
+        targets[f"{of}: recall at least {LEAST_RECALL:g}"] = _least(seen.recall, LEAST_RECALL)
     for kind in KINDS[:2]:
         known, of = accuracy[kind], f"{kind}s within {ERRORS_WITHIN_M:g} m"
         share, bearing = known.range_sigma_share, known.bearing_sigma_deg
-        said[f"{of}: range σ at most 3 %"] = share is not None and share <= MOST_RANGE_SHARE
-        said[f"{of}: bearing σ at most 0.5°"] = bearing is not None and bearing <= MOST_BEARING_DEG
+        targets[f"{of}: range σ at most 3 %"] = share is not None and share <= MOST_RANGE_SHARE
+        targets[f"{of}: bearing σ at most 0.5°"] = (
+            bearing is not None and bearing <= MOST_BEARING_DEG
+        )
     for kind in KINDS:
         known = accuracy[kind]
         inside = {"range": known.range_inside, "bearing": known.bearing_inside}
         if kind == "marker":
             inside["heading"] = known.heading_inside
         for what, share in inside.items():
-            said[f"{kind}s: {what} inside 3 stated σ at least 98 %"] = _least(share, LEAST_INSIDE)
-    said["no wrong id"] = not any(m.why == "wrong id" for m in mistakes)
-    said["no frame refused"] = not refused
-    return said
+            targets[f"{kind}s: {what} inside 3 stated σ at least 98 %"] = _least(
+                share, LEAST_INSIDE
+            )
+    targets["no wrong id"] = not any(m.why == "wrong id" for m in mistakes)
+    targets["no frame refused"] = not refused
+    return targets
 
 
 def _least(share: float | None, bound: float) -> bool:

@@ -59,8 +59,8 @@ def tables(result: Eyes) -> Iterable[RenderableType]:
         f"cost: {result.cost['see_ms']:.1f} ms a frame to see,"
         f" {result.cost['render_ms']:.1f} ms to render"
     )
-    for said, ok in result.pattern.items():
-        yield f"target: {'held  ' if ok else 'missed'} {said}"
+    for target, ok in result.pattern.items():
+        yield f"target: {'held  ' if ok else 'missed'} {target}"
 
 
 def _listed(counts: dict[str, int]) -> str:

@@ -1,10 +1,11 @@
-"""One observer of three lies for a while: what it does to the team, when it is found, when it is
-believed again.
+"""One of three observers sends wrong positions for a while: its effect on the team, when the fault
+is detected, and when the observer is trusted again.
 
-Observers with good eyes stand round the field of the demonstration; a navigator with poor ones and
-two scouts, blind to landmarks, drive between them. From 10 s to 25 s one observer says what is not
-so (`liar.py`), then the truth again; two or only one are honest beside it. Errors are those of the
-robots that drive, from 10 s on, beside the team without the liar, and beside one that believes all.
+Observers with good sensors stand around the field of the demonstration; a navigator with poor
+sensors and two scouts, blind to landmarks, drive between them. From 10 s to 25 s one observer is
+faulty (`faulty_robot.py`), then correct again; one or two others are correct all the time. Errors
+are those of the robots that drive, from 10 s on, compared with the team without the faulty observer
+and with a team that trusts everybody.
 """
 
 import math
@@ -48,20 +49,20 @@ DRIVERS = ("navigator", "scout", "scout2")
 
 
 class Case(msgspec.Struct, frozen=True, kw_only=True):
-    """What is run."""
+    """One case of the experiment."""
 
     lie: str
     """The fault of the liar without its times; empty: it works correctly."""
     liar: bool = True
-    """Whether the liar is there at all."""
+    """Whether the faulty observer is there at all."""
     honest: int = 2
-    """Observers beside it."""
+    """The number of correct observers."""
     trust: bool = True
-    """Whether robots judge what they are told."""
+    """Whether robots assess the trust in their teammates."""
 
 
 class Quarantine(NamedTuple):
-    """Of one sender by one robot, seconds from the start."""
+    """A quarantine of one sender by one robot; seconds from the start."""
 
     by: str
     of: str
@@ -71,7 +72,7 @@ class Quarantine(NamedTuple):
 
 
 class Run(NamedTuple):
-    """One run."""
+    """The figures of one run."""
 
     rmse_m: dict[str, float]
     quarantines: tuple[Quarantine, ...]
@@ -84,39 +85,39 @@ class Row(msgspec.Struct, frozen=True, kw_only=True):
     rmse_m: Spread
     """Of the robots that drive: root of the mean over all their samples."""
     worst_m: Spread
-    """Of the robot that errs most."""
+    """Of the robot with the largest error."""
     ratio: Spread | None
-    """To the team without the liar, with the same seed."""
+    """To the team without the faulty observer, with the same seed."""
     found: int
-    """Robots that put the liar into quarantine, over all seeds."""
+    """Robots that quarantined the faulty observer, over all seeds."""
     listening: int
     """Robots that drive, over all seeds."""
     found_after_s: Spread | None
     readmitted_after_s: Spread | None
-    """After the lie ended."""
+    """After the fault ended."""
     reasons: dict[str, int]
     false_quarantines: int
-    """Of honest robots, or of the liar before it lied, over all seeds."""
+    """Of correct robots, or of the faulty observer before its fault, over all seeds."""
     false_quarantine_s: float
     """How long these lasted, seconds a run."""
 
 
 class Liars(msgspec.Struct, frozen=True, kw_only=True):
-    """What the experiment writes."""
+    """The result of the experiment."""
 
     experiment: str
     version: str
     seeds: int
     lie_s: tuple[float, float, float]
-    """From, until, end of the run."""
+    """Start and end of the fault, end of the run."""
     team: Team
     rows: tuple[Row, ...]
     held: bool
-    """Whether every kind's median ratio is within the target."""
+    """Whether the median ratio of every fault is within the target."""
 
 
 def liars_team(case: Case) -> Team:
-    """The observers at their posts and the robots that drive."""
+    """The observers at their poses and the robots that drive."""
     base, replace = load_team(builtin_path("demo")), msgspec.structs.replace
     observer, scout = base.robots["observer"], base.robots["scout"]
     assert observer.start is not None
@@ -149,7 +150,7 @@ def liars_team(case: Case) -> Team:
 
 
 def cases() -> list[Case]:
-    """Without the liar, with it while it is honest, with each kind of lie, judged or believed."""
+    """Without the faulty observer, with it but correct, and with each fault (trust on and off)."""
     every = []
     for honest in HONEST:
         every += [Case(lie="", liar=False, honest=honest), Case(lie="", honest=honest)]
@@ -160,7 +161,7 @@ def cases() -> list[Case]:
 
 
 class _Statuses:
-    """A referee that ends nothing: it keeps what robots say of each other."""
+    """A referee that never ends a run; it collects the quarantines that robots report."""
 
     over = False
 
@@ -175,7 +176,7 @@ class _Statuses:
         assert isinstance(status, Status)
         for trust in status.trust:
             key_ = status.robot, trust.peer, trust.quarantines
-            since_ns = trust.since_ns or status.stamp_ns  # of a clock it is not said
+            since_ns = trust.since_ns or status.stamp_ns  # the status has no time for a wrong clock
             first = self.found.get(key_)
             if trust.reason:
                 from_s = since_ns * 1e-9 if first is None else first.from_s
@@ -268,7 +269,7 @@ def _row(case: Case, runs: Sequence[Run], without: Sequence[Run] | None) -> Row:
 
 
 def tables(result: Liars) -> Iterable[RenderableType]:
-    """A row each lie, beside what comes of believing everything."""
+    """A row for each fault, beside the team that trusts everybody."""
     believed = {(r.case.lie, r.case.honest): r for r in result.rows if not r.case.trust}
     for honest in sorted({r.case.honest for r in result.rows}, reverse=True):
         title = f"one liar, {honest} honest: robots that drive, {result.seeds} seeds"

@@ -1,9 +1,9 @@
-"""What cameras see of real pictures whose truth is known: found, missed, errors.
+"""Detection in real pictures whose ground truth is known: detections, misses, errors.
 
 A set is a team file and a table (CSV) of the same name: a line says that in a picture a viewer of
 the team sees something, and where it is in the viewer's frame as far as that is known; a line
-without an id, that nothing of the team is in it. The pictures are somebody's else: they are fetched
-by who wants them, and stay where they are.
+without an id states that nothing of the team is in it. The pictures belong to others: the user
+downloads them, and they are not copied.
 """
 
 import csv
@@ -42,7 +42,7 @@ class TruthLine(NamedTuple):
 
 
 class LineResult(msgspec.Struct, frozen=True, kw_only=True):
-    """A line beside what was seen; an error is None where there is no truth, or nothing seen."""
+    """A line with its detection; an error is None without a ground truth or a detection."""
 
     picture: str
     id: str
@@ -57,7 +57,7 @@ class LineResult(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class RealPictures(msgspec.Struct, frozen=True, kw_only=True):
-    """What the experiment writes."""
+    """The result of the experiment."""
 
     experiment: str
     version: str
@@ -66,7 +66,7 @@ class RealPictures(msgspec.Struct, frozen=True, kw_only=True):
     pictures: int
     lines: tuple[LineResult, ...]
     unexpected: tuple[tuple[str, str], ...]
-    """Picture and id of what was seen and is not in the table."""
+    """Picture and id of detections that are not in the table."""
     doubted: tuple[tuple[str, str], ...]
     """Picture and reason."""
     refused: dict[str, str]
@@ -112,7 +112,7 @@ def _lines(path: Path, reader: "csv.DictReader[str]") -> list[TruthLine]:
 
 
 def measure(name: str, folder: Path) -> RealPictures:
-    """Everything in the set's pictures. Raises InputError for what the user can mend."""
+    """Compares the detections in the set's pictures with its table. Raises InputError."""
     path = picture_set(name)
     team, lines = load_team(path.with_suffix(".toml")), read_truth_table(path)
     viewers = {line.viewer for line in lines}
@@ -186,7 +186,7 @@ def _degrees(angle: float | None) -> float | None:
 
 
 def tables(result: RealPictures) -> Iterable[RenderableType]:
-    """A row each line of the set's table, then what should not be there."""
+    """A row for each line of the set's table, then the detections that are not in it."""
     shown = table(
         f"{result.set}: {result.pictures} pictures",
         ("picture", "id"),
@@ -211,7 +211,7 @@ def tables(result: RealPictures) -> Iterable[RenderableType]:
 
 
 def _inside(lines: Sequence[LineResult]) -> Iterator[str]:
-    """Of how many errors that are known how many are within three stated sigmas."""
+    """How many of the known errors are within three stated sigmas."""
     for what, pairs in {
         "range": [(c.range_error_m, c.range_sigma_m) for c in lines],
         "bearing": [(c.bearing_error_deg, c.bearing_sigma_deg) for c in lines],
@@ -229,9 +229,9 @@ def _pair(error: float | None, sigma: float | None, digits: int) -> tuple[str, s
 
 
 def _listed(pairs: Sequence[tuple[str, str]]) -> str:
-    """What, and in which pictures."""
+    """Each item with its pictures."""
     pictures: dict[str, list[str]] = {}
     for picture, what in pairs:
         pictures.setdefault(what, []).append(picture)
-    told = (f"{what} ({', '.join(dict.fromkeys(where))})" for what, where in pictures.items())
-    return "; ".join(told) or "nothing"
+    items = (f"{what} ({', '.join(dict.fromkeys(where))})" for what, where in pictures.items())
+    return "; ".join(items) or "nothing"

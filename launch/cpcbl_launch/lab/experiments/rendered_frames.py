@@ -1,17 +1,18 @@
-"""One rendered frame of the experiment `eyes`: what was there to see, and what was made of it.
+"""One rendered frame of the experiment `eyes`: what is visible in it, and what was detected.
 
-A viewer, its teammates and posts that are on no map stand at random on the team's field, under
-light that differs from frame to frame, and the camera is not quite mounted, nor focused, as the
-robot believes: by the sigmas that its settings state. What could be seen follows from the geometry
-(`simulation/visible.py`), not from the picture.
+A viewer, its teammates and cylinders on no map have random poses on the team's field, and the light
+is random. The camera's mounting and focal length differ from its settings by errors with the sigmas
+that the settings state. What is visible follows from the geometry
+(`simulation/camera/visibility.py`), not from the picture.
 
-- landmark: due when all of it is in the frame with nothing before it;
-- marker: a teammate is due when one of its markers is all to be seen, within 60 degrees of facing;
-- mast: a teammate is due when its bands are all to be seen.
+- landmark: due if all of it is in the frame and nothing hides it;
+- marker: a teammate is due if one of its markers is completely visible and faces the viewer within
+  60 degrees;
+- mast: a teammate is due if its bands are completely visible.
 
-A sighting is right when some of what it names is to be seen within 3 degrees of its bearing, and
-its range, where it says one, is off by at most 20 %. It has a wrong id when nothing of that name is
-to be seen there.
+A sighting is correct if a part of what it names is visible within 3 degrees of its bearing, and its
+range, if it has one, is wrong by at most 20 %. It has a wrong id if nothing of that name is visible
+there.
 """
 
 import math
@@ -52,7 +53,7 @@ QUALITY = 90  # of the JPEG that carries the frame
 
 
 class RandomFrame(NamedTuple):
-    """What is random about a frame."""
+    """The random parts of a frame."""
 
     viewer: str
     pose: Pose2
@@ -60,20 +61,20 @@ class RandomFrame(NamedTuple):
     scene: Scene
     light: Light
     camera: CameraSettings
-    """As it is, not as the viewer believes."""
+    """The true camera, not the one of the viewer's settings."""
 
 
 class NamedObject(NamedTuple):
-    """Something that has a name, in the viewer's frame."""
+    """An object with a name, in the viewer's frame."""
 
     name: str
     range_m: float
     bearing_rad: float
     heading_rad: float
     due: tuple[Kind, ...]
-    """What is all to be seen."""
+    """The features that are completely visible."""
     some: bool
-    """Whether anything of it can be seen at all."""
+    """Whether any part of it is visible."""
     half_width_rad: float
 
 
@@ -120,7 +121,7 @@ def _eyes(viewer: str) -> CameraEyes:
 
 
 def random_frame(random: np.random.Generator) -> RandomFrame:
-    """A viewer, where everything stands, and the light."""
+    """A viewer, the poses of all objects, and the light."""
     names = list(team().robots)
     viewers = team().cameras
     viewer = viewers[int(random.integers(len(viewers)))]
@@ -143,7 +144,7 @@ def random_frame(random: np.random.Generator) -> RandomFrame:
 def _free_pose(
     random: np.random.Generator, taken: Sequence[tuple[float, float]], near: Pose2 | None
 ) -> Pose2:
-    """A place on the field with nothing else on it; or one that a viewer at `near` looks at."""
+    """A free pose on the field; with `near`, one in the view of a viewer at `near`."""
     marks = np.array([(m.x_m, m.y_m) for m in team().map.landmarks.values()])
     low, high = marks.min(axis=0), marks.max(axis=0)
     while True:
@@ -170,7 +171,7 @@ def _random_light(random: np.random.Generator) -> Light:
 
 
 def render_image(frame: RandomFrame, random: np.random.Generator) -> Pixels:
-    """The frame as the robot gets it: through a JPEG."""
+    """The frame as the robot receives it: encoded as JPEG and decoded."""
     made = render(frame.scene, Camera(frame.camera), frame.pose, frame.robots, frame.light, random)
     _, coded = cv2.imencode(".jpg", made, (cv2.IMWRITE_JPEG_QUALITY, QUALITY))
     pixels = decoded(coded.tobytes())
@@ -182,7 +183,7 @@ def render_image(frame: RandomFrame, random: np.random.Generator) -> Pixels:
 
 
 def named_objects(frame: RandomFrame) -> dict[str, NamedObject]:
-    """Everything with a name."""
+    """All landmarks and teammates, by name."""
     camera, robot_from_field = Camera(frame.camera), frame.pose.inverse()
     half_m = team().vision.marker_distance_m
     # A robot hides no more than from corner to corner, and no less than from side to side.
@@ -205,7 +206,7 @@ Before = tuple[Sequence[Solid], Sequence[Solid]]  # what certainly hides no more
 def _solids(
     frame: RandomFrame, robot_from_field: Pose2, body_m: float
 ) -> dict[str, tuple[Solid, ...]]:
-    """What hides other things, by name; the bodies of robots with this radius."""
+    """The solids that hide other objects, by name; the bodies of robots have this radius."""
     solids: dict[str, tuple[Solid, ...]] = {}
     clutter = {
         f"\n{i}": post for i, post in enumerate(frame.scene.clutter)
@@ -261,7 +262,7 @@ def _teammate(name: str, seen: Pose2, camera: Camera, before: Before) -> NamedOb
 
 
 def _marker(side: Side, seen: Pose2, camera: Camera) -> tuple[Floats, float]:
-    """Points of a teammate's marker, and by how much it looks past the viewer (rad)."""
+    """The points of a teammate's marker, and the angle (rad) between its normal and the viewer."""
     vision, direction = team().vision, SIDES[side]
     away = vision.marker_distance_m
     x, y = seen.transform(away * math.cos(direction), away * math.sin(direction))
@@ -290,7 +291,7 @@ def _named_object(name: str, seen: Pose2, shown: Due, some: float, half_m: float
 def compare_with_truth(
     number: int, seen: Sequence[Sighting], there: Mapping[str, NamedObject]
 ) -> tuple[list[Record], list[Mistake]]:
-    """Sightings beside what there was to see."""
+    """The sightings compared with what is visible."""
     records, mistakes, right = [], [], set()
     for sighting in seen:
         thing = there.get(sighting.id)

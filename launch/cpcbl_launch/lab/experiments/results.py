@@ -1,4 +1,4 @@
-"""What experiments have in common: figures over seeds, what is written, how tables look."""
+"""The common parts of experiments: figures over seeds, and what is written as JSON."""
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -15,7 +15,7 @@ from cpcbl_team.config import Team
 
 
 class Outcome(msgspec.Struct, frozen=True, kw_only=True):
-    """What an experiment writes as JSON: the settings that made it, then its figures."""
+    """The result of an experiment: its settings, then its figures."""
 
     experiment: str
     version: str
@@ -26,14 +26,14 @@ class Outcome(msgspec.Struct, frozen=True, kw_only=True):
     paper: dict[str, Any] = {}
     """The paper's own figures, where it has them."""
     pattern: dict[str, bool] = {}
-    """What has to hold, and whether it did."""
+    """The expected patterns, and whether each was met."""
 
 
 Results = Mapping[Any, list[Run]]
 
 
 class Experiment(NamedTuple):
-    """One command: its cases, and what is made of their runs."""
+    """One experiment: its cases, and the functions that evaluate and show their runs."""
 
     name: str
     cases: Callable[[], Mapping[Any, Case]]
@@ -50,7 +50,7 @@ class Spread(msgspec.Struct, frozen=True):
 
 
 def spread(values: Sequence[float]) -> Spread | None:
-    """None where there is nothing."""
+    """The spread of the values; None without values."""
     if not len(values):
         return None
     low, median, high = np.percentile(values, [10.0, 50.0, 90.0])
@@ -58,7 +58,7 @@ def spread(values: Sequence[float]) -> Spread | None:
 
 
 class Accuracy(msgspec.Struct, frozen=True, kw_only=True):
-    """All samples (10 Hz) of the finished runs of one case; None where there are none."""
+    """Figures of all samples (10 Hz) of the finished runs of one case; None without samples."""
 
     position_mean_m: float | None
     position_sigma_m: float | None
@@ -74,7 +74,7 @@ class Accuracy(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def accuracy(runs: Sequence[Run], robots: Sequence[str] | None = None) -> Accuracy:
-    """Pools the runs; `robots`: only these of those that were scored."""
+    """The figures of all runs together; `robots`: only these of the scored robots."""
     good = [
         errors
         for r in runs
@@ -106,7 +106,7 @@ def _of(function: Callable[[Floats], Any], values: Floats) -> float | None:
 
 
 def new_outcome(name: str, results: Results, cases: Mapping[str, Case], **rest: Any) -> Outcome:
-    """With the settings that made it."""
+    """A result with the settings of its cases."""
     return Outcome(
         experiment=name,
         version=version("cpcbl-team"),
@@ -119,5 +119,6 @@ def new_outcome(name: str, results: Results, cases: Mapping[str, Case], **rest: 
 
 def pattern_lines(outcome: Outcome) -> Iterable[str]:
     return (
-        f"pattern: {'ok    ' if ok else 'missed'} {said}" for said, ok in outcome.pattern.items()
+        f"pattern: {'ok    ' if ok else 'missed'} {pattern}"
+        for pattern, ok in outcome.pattern.items()
     )

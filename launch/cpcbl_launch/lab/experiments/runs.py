@@ -40,7 +40,7 @@ Result = TypeVar("Result")
 
 
 class Case(NamedTuple):
-    """What is run: with `loops`, until the first scored robot has driven them; else `limit_s`."""
+    """A case: it ends when the first scored robot has driven `loops`, or else after `limit_s`."""
 
     team: Team
     scored: tuple[str, ...]
@@ -50,7 +50,7 @@ class Case(NamedTuple):
 
 
 class Errors(NamedTuple):
-    """Of one robot at 10 Hz."""
+    """The errors of one robot at 10 Hz."""
 
     offset: Floats  # rows of dx m, dy m, turn rad, estimate minus truth
     nees: Floats | None  # of the position; None where the variant knows no covariance
@@ -69,7 +69,7 @@ class Run(NamedTuple):
 
 
 class LoopReferee:
-    """Counts waypoints and bumps, and reckons the driver's odometry alone."""
+    """Counts waypoints and bumps, and integrates the driver's odometry alone."""
 
     def __init__(self, case: Case) -> None:
         self._robot = case.scored[0]
@@ -156,10 +156,12 @@ def map_in_processes(
     jobs: int,
     done: Callable[[], None],
 ) -> list[Result]:
-    """What the function makes of each task's arguments, in their order, `jobs` at a time; `done`
-    is called after each. The order in which processes come through changes nothing."""
+    """The function's results for each task's arguments, in the order of the tasks.
+
+    `jobs` processes work at a time; `done` is called after each task.
+    """
     if jobs == 1:
-        return [_told(done, function(*task)) for task in tasks]
+        return [_call_done(done, function(*task)) for task in tasks]
     with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
         futures = [pool.submit(function, *task) for task in tasks]
         try:
@@ -172,6 +174,6 @@ def map_in_processes(
         return [future.result() for future in futures]
 
 
-def _told(done: Callable[[], None], result: Result) -> Result:
+def _call_done(done: Callable[[], None], result: Result) -> Result:
     done()
     return result

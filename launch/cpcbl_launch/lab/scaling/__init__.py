@@ -1,1 +1,1 @@
-"""Teams of any size on a field that grows with them, and what a robot costs in each."""
+"""Teams of any size on a field that grows with them, and what one robot costs in each."""

@@ -27,29 +27,29 @@ LEAST_S = 2.0  # a robot tells once a second what it has sent
 
 
 class TeamSizeFigures(msgspec.Struct, frozen=True, kw_only=True):
-    """A team's figures, means over its robots; seconds are robot time, bytes those
-    on the sender's link with Zenoh's own."""
+    """The figures of a team, means over its robots. Seconds are robot time; bytes are those on the
+    sender's link, with Zenoh's own."""
 
     robots: int
     in_sight: float
-    """Teammates in one frame."""
+    """The number of teammates in one frame."""
     messages_sent_per_s: float
     bytes_sent_per_s: float
     messages_received_per_s: float
     bytes_received_per_s: float
     """Fixes and beliefs."""
     cpu_ms_per_s: float
-    """Of the robot's own steps; what it says is put into the boxes of those who hear it."""
+    """CPU of the robot's own steps; sending puts a message into the inboxes of its receivers."""
     field_cpu_ms_per_s: float
-    """Of simulating one robot: its motion, and what it sees."""
+    """CPU of the simulation of one robot: its motion and its sightings."""
     times_real_time: float
-    """Of the whole process, start-up and report apart."""
+    """Of the whole process, without start-up and report."""
     position_rmse_m: float | None
     inside_3_sigma: float | None
 
 
 class ScalingReport(msgspec.Struct, frozen=True, kw_only=True):
-    """What `simulate --robots` writes."""
+    """The report of `simulate --robots`."""
 
     duration_s: float
     seed: int
@@ -57,7 +57,7 @@ class ScalingReport(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def parse_sizes(text: str) -> list[int]:
-    """The sizes in `2,10,50`. Raises InputError."""
+    """The sizes in a text such as `2,10,50`. Raises InputError."""
     sizes = [int(part) if part.strip().isdecimal() else 0 for part in text.split(",")]
     if not all(2 <= size <= MOST_ROBOTS for size in sizes):
         raise InputError(f"--robots {text}: team sizes from 2 to {MOST_ROBOTS}, such as 2,10,50")
@@ -70,9 +70,9 @@ def measure_sizes(
     duration_s: float = DURATION_S,
     progress: Progress | None = None,
 ) -> ScalingReport:
-    """Generated teams of these sizes, one after the other.
+    """Measures generated teams of these sizes, one after the other.
 
-    Raises InputError for a duration that is too short to measure anything.
+    Raises InputError if the duration is too short.
     """
     require_duration(duration_s, LEAST_S)
     figures: list[TeamSizeFigures] = []
@@ -83,7 +83,7 @@ def measure_sizes(
 
 
 def _partial_progress(progress: Progress | None, before: int, size: int, total: int) -> Progress:
-    """Shows the progress of one team as a part of all."""
+    """The progress of one team as a part of the progress of all."""
     show = progress or (lambda done: None)
     return lambda done: show((before + done * size) / total)
 
@@ -91,7 +91,7 @@ def _partial_progress(progress: Progress | None, before: int, size: int, total: 
 def measure_team(
     team: Team, seed: int, duration_s: float, progress: Progress | None = None
 ) -> TeamSizeFigures:
-    """A simulated team in one process over the bus in memory."""
+    """Simulates a team in one process over the bus in memory."""
     hub, count = MemoryHub(), len(team.robots)
     recorder, sight = Recorder(hub.session()), TeammateCounter(hub.session(), team)
     field = TimedNode(FieldNode(SimulatedField(team, seed, 0), hub.session()))
@@ -127,8 +127,8 @@ def _per_s(status: Status, name: str) -> float:
 
 @contextmanager
 def garbage_collector_disabled() -> Iterator[None]:
-    """Python's cycle collector looks through the robots of the whole process, which would grow with
-    the team; a robot of its own has only itself. Robots leave no cycles behind."""
+    """Python's garbage collector examines the robots of the whole process, which would grow with
+    the team; in a process of its own a robot has only itself. Robots create no reference cycles."""
     gc.disable()
     try:
         yield

@@ -26,7 +26,7 @@ _LEGEND = (
 
 
 def print_scaling(scale: ScalingReport, console: Console) -> None:
-    """A row for each size."""
+    """Prints a row for each size."""
     shown = table(
         f"generated teams in one process, {scale.duration_s:g} s of robot time, seed {scale.seed}",
         (),
@@ -50,7 +50,8 @@ def print_scaling(scale: ScalingReport, console: Console) -> None:
 
 
 def draw_scaling(scale: ScalingReport, path: Path) -> None:
-    """Two panels: bytes a second that a robot sends and receives; CPU of its steps."""
+    """Draws two panels: the bytes per second that a robot sends and receives, and the CPU of its
+    steps."""
     import matplotlib as mpl
 
     mpl.use("Agg")

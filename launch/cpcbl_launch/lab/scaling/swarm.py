@@ -1,10 +1,10 @@
-"""Generated teams of any size, at the same density of robots and landmarks.
+"""Generated teams of any size, with the same density of robots and landmarks.
 
-Homes lie on a square lattice, one robot each; a landmark stands on every second corner between
-them. A robot drives round its home, so that the density stays, and sees so far all round that a
-small team already fills its neighbourhood: about seven teammates and three landmarks inside, fewer
-at the edge. One robot in five is an observer with good sensors; of the others every second one is
-a scout, blind to landmarks.
+Homes lie on a square lattice, one for each robot; a landmark stands on every second corner between
+them. A robot drives around its home, so that the density is constant. It sees so far that even a
+small team fills its view: about seven teammates and three landmarks, fewer at the edge. One robot
+in five is an observer with good sensors; every second one of the others is a scout, blind to
+landmarks.
 """
 
 import math
@@ -36,7 +36,7 @@ SENSORS = (OBSERVER, SCOUT, NAVIGATOR, SCOUT, NAVIGATOR)
 
 
 def swarm_team(size: int, seed: int) -> Team:
-    """A team of so many robots; the seed shuffles who lives where, and which way each one goes."""
+    """A team of this size; the seed determines each robot's home and direction."""
     random = Random(f"{seed} {size}")
     columns = math.ceil(math.sqrt(size))
     robots = {}
@@ -54,7 +54,7 @@ def swarm_team(size: int, seed: int) -> Team:
 
 
 def _robot(home_x: float, home_y: float, from_rad: float, sensor: SensorSettings) -> RobotSettings:
-    """A robot that drives on a square round its home, from the corner in this direction."""
+    """A robot that drives on a square around its home, from the corner in this direction."""
     directions = (from_rad + 0.5 * math.pi * k for k in range(4))
     corners = [(home_x + ROUND_M * math.cos(a), home_y + ROUND_M * math.sin(a)) for a in directions]
     (x, y), *others = corners
