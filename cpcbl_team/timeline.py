@@ -24,14 +24,16 @@ _content = msgspec.msgpack.Encoder(
 ).encode  # also of numpy's numbers; faster than `repr`
 
 _apply: dict[type, Callable[[Localizer, State, Input], State]] = {
-    Odometry: Localizer.add_odometry,  # type: ignore[dict-item]
     Belief: Localizer.add_teammate_belief,  # type: ignore[dict-item]
     Sightings: Localizer.cycle,  # type: ignore[dict-item]
     Position: Localizer.add_position,  # type: ignore[dict-item]
     Fix: Localizer.add_fix,  # type: ignore[dict-item]
     BeliefShared: Localizer.mark_shared,  # type: ignore[dict-item]
+    Odometry: Localizer.add_odometry,  # type: ignore[dict-item]
 }
 _rank = {kind: rank for rank, kind in enumerate(_apply)}
+"""The order of inputs of the same time. Odometry comes last: a piece that starts at a frame's time
+usually arrives after the frame, and does not change the pose at that time."""
 
 
 def _measured_ns(item: Input) -> int:

@@ -7,6 +7,7 @@ that (`security`). This module does not know the bus.
 """
 
 from enum import Enum, StrEnum
+from functools import lru_cache
 from typing import NamedTuple
 
 from cpcbl_team.inputs import Belief, Fix, Odometry, Position, Sightings
@@ -85,11 +86,7 @@ class Topic(NamedTuple):
 
     def at(self, **names: object) -> str:
         """The key with these names; `*` for each that is left out."""
-        chunks = []
-        for chunk in self.key.split("/"):
-            name = chunk.strip("<>")
-            chunks.append(str(names.get(name, "*")) if chunk.startswith("<") else chunk)
-        return "/".join(chunks)
+        return _filled(self.key, tuple(names.items()))
 
     def names(self, key: str) -> dict[str, str] | None:
         """The names in a key of this topic, None for any other key: the inverse of `at`."""
@@ -100,6 +97,17 @@ class Topic(NamedTuple):
         if any(own != chunk for own, chunk in pairs if not own.startswith("<")):
             return None
         return {own.strip("<>"): chunk for own, chunk in pairs if own.startswith("<")}
+
+
+@lru_cache(maxsize=4096)
+def _filled(template: str, names: tuple[tuple[str, object], ...]) -> str:
+    """The key of a template; a robot asks for few keys, but at every step."""
+    by_name = dict(names)
+    chunks = []
+    for chunk in template.split("/"):
+        name = chunk.strip("<>")
+        chunks.append(str(by_name.get(name, "*")) if chunk.startswith("<") else chunk)
+    return "/".join(chunks)
 
 
 def namespace(team: str) -> str:
