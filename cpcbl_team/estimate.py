@@ -185,7 +185,7 @@ class Information(NamedTuple):
         return Information(Covariance3(xx, xy, yy, xh, yh, hh), (ex, ey, eh))
 
 
-def survival(prior: Covariance3, information: Six) -> Matrix3:
+def posterior_factor(prior: Covariance3, information: Six) -> Matrix3:
     """(I + P A)^-1, the share of the prior's error that survives the evidence A."""
     xx, xy, yy, xh, yh, hh = prior
     axx, axy, ayy, axh, ayh, ahh = information
@@ -215,7 +215,7 @@ def survival(prior: Covariance3, information: Six) -> Matrix3:
     )
 
 
-def product(m: Matrix3, p: Covariance3) -> Covariance3:
+def symmetric_product(m: Matrix3, p: Covariance3) -> Covariance3:
     """M P where it is known to be symmetric."""
     a, b, c, d, e, f, g, h, i = m
     xx, xy, yy, xh, yh, hh = p
@@ -229,7 +229,7 @@ def product(m: Matrix3, p: Covariance3) -> Covariance3:
     )
 
 
-def scoped(
+def within_scope(
     survive: Matrix3, prior: Covariance3, posterior: Covariance3, scope: Scope
 ) -> tuple[Matrix3, Covariance3]:
     """The merge restricted to `scope`: the other part keeps its estimate and its variance."""
@@ -243,7 +243,7 @@ def scoped(
     )
 
 
-def shifted(pose: Pose2, offset: Row, scope: Scope) -> Pose2:
+def offset_pose(pose: Pose2, offset: Row, scope: Scope) -> Pose2:
     """The pose moved by an offset, within `scope`."""
     dx, dy, dh = offset
     if scope is POSITION:
@@ -267,7 +267,7 @@ def merge(
     xx, xy, yy, xh, yh, hh = covariance
     matrix, vector = evidence
     ex, ey, eh = vector
-    survive = survival(covariance, matrix)
+    survive = posterior_factor(covariance, matrix)
     a, b, c, d, e, f, g, h, i = survive
     # survive times covariance, as in `product`, of it what is in scope
     xh_after = g * xx + h * xy + i * xh
@@ -285,7 +285,7 @@ def merge(
         xx = yy = circle_variance(xx, xy, yy, xh_after, yh_after, hh)
         xy = 0.0
     if shared is not ZERO3:
-        survive, _ = scoped(survive, covariance, covariance, scope)
+        survive, _ = within_scope(survive, covariance, covariance, scope)
         shared = shared.transformed(survive)
     posterior = new(Covariance3, (xx, xy, yy, xh_after, yh_after, hh))
     return new(Estimate, (new(Pose2, (x, y, heading)), posterior, shared))
@@ -308,7 +308,7 @@ def circle_variance(xx: float, xy: float, yy: float, xh: float, yh: float, hh: f
     return variance
 
 
-def circular(estimate: Estimate) -> Estimate:
+def with_circular_position(estimate: Estimate) -> Estimate:
     """The estimate with its position's covariance reduced to a circle."""
     pose, covariance, shared = estimate
     xx, xy, yy, xh, yh, hh = covariance

@@ -23,10 +23,10 @@ from cpcbl_team.estimate import (
     Row,
     Scope,
     merge,
-    product,
-    scoped,
-    shifted,
-    survival,
+    offset_pose,
+    posterior_factor,
+    symmetric_product,
+    within_scope,
 )
 from cpcbl_team.gaussian import Covariance2
 
@@ -166,7 +166,7 @@ def _variance(prior: Estimate, observation: Observation, scope: Scope) -> Callab
     def variance(weight: float) -> float:
         inflated = _inflated(prior, weight)
         evidence = observation.information(1.0 / (1.0 - weight)).matrix
-        merged = product(survival(inflated, evidence), inflated)
+        merged = symmetric_product(posterior_factor(inflated, evidence), inflated)
         return _size(merged, scope)
 
     return variance
@@ -219,16 +219,16 @@ def _merge_with_weight(
 ) -> Estimate:
     inflated = _inflated(prior, weight)
     evidence = observation.information(1.0 / (1.0 - weight))
-    survive = survival(inflated, evidence.matrix)
-    merged = product(survive, inflated)
+    survive = posterior_factor(inflated, evidence.matrix)
+    merged = symmetric_product(survive, inflated)
     if min(merged.xx, merged.yy, merged.hh) < 0.0:  # as in `merge`
         return prior
-    pose = shifted(prior.pose, merged.times(evidence.vector), scope)
+    pose = offset_pose(prior.pose, merged.times(evidence.vector), scope)
     if scope is POSE:
         own = prior.covariance.plus(prior.shared, -1.0).transformed(survive)
         fresh = _sensor_part(observation, weight, merged)
         return Estimate(pose, merged, merged.plus(own, -1.0).plus(fresh, -1.0))
-    _, kept_apart = scoped(survive, prior.covariance, merged, scope)
+    _, kept_apart = within_scope(survive, prior.covariance, merged, scope)
     # The part out of scope was not inflated, so its covariance with the rest is not either.
     kept = 1.0 if prior.shared is ZERO3 else weight
     kept_apart = kept_apart._replace(xh=kept * kept_apart.xh, yh=kept * kept_apart.yh)

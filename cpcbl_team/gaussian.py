@@ -30,7 +30,7 @@ class Covariance2(NamedTuple):
         det = self.determinant()
         return Covariance2(self.yy / det, -self.xy / det, self.xx / det)
 
-    def possible(self) -> "Covariance2":
+    def with_possible_correlation(self) -> "Covariance2":
         """With a correlation below one: what somebody else computed and rounded may be beyond."""
         most = MOST_CORRELATION * math.sqrt(self.xx * self.yy)
         if -most <= self.xy <= most:
@@ -48,7 +48,7 @@ class Covariance2(NamedTuple):
         ) / self.determinant()
 
 
-def oriented(sigma_major: float, sigma_minor: float, angle: float) -> Covariance2:
+def oriented_covariance(sigma_major: float, sigma_minor: float, angle: float) -> Covariance2:
     """The covariance with these axes, the major one turned by `angle` (paper, figure 2)."""
     c, s = math.cos(angle), math.sin(angle)
     a, b = sigma_major * sigma_major, sigma_minor * sigma_minor
@@ -75,5 +75,5 @@ def sighting_gaussian(
     return Gaussian2(
         range_m * math.cos(bearing),
         range_m * math.sin(bearing),
-        oriented(range_sigma_m, across_m, bearing),
+        oriented_covariance(range_sigma_m, across_m, bearing),
     )

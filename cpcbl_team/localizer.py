@@ -22,6 +22,7 @@ from cpcbl_team.measurements import (
     measurement_of,
     nis_of,
 )
+from cpcbl_team.motion import inflate_by_gap, part_of_piece
 from cpcbl_team.object_timers import ObjectTimers, has_passed
 from cpcbl_team.pose_observation import PoseObservation, from_fix, from_position_sensor
 from cpcbl_team.recovery import (
@@ -69,7 +70,6 @@ class Localizer:
         self._minimum_interval_ns = rules.minimum_interval_s * 1e9
         self._odometry = settings.odometry
         self._odometry_timeout_ns = int(settings.odometry.timeout_s * 1e9)
-        self._has_dead_zone = settings.odometry.least_speed_m_s > 0.0
         self._calibrates = rules.learns
         self._window = rules.lost_window
         self._belief_age_ns = int(settings.collaboration.max_age_s * 1e9)
@@ -114,7 +114,8 @@ class Localizer:
             return state
         odometry_from_robot, pending = state.odometry_from_robot, state.pending_odometry
         if pending is not None:
-            distance, turn, crawled = self._motion(pending, stamp_ns, until_ns)
+            distance, turn, seconds = part_of_piece(pending, stamp_ns, until_ns)
+            slow_s = time_at_min_speed_s(distance, seconds, self._odometry)
             if self._calibrates:
                 memory = state.memory.calibration
                 distance *= memory.learned.distance_scale
@@ -123,37 +124,14 @@ class Localizer:
                 state = with_memory(state, state.memory._replace(calibration=memory))
             if distance != 0.0 or turn != 0.0:
                 odometry_from_robot = step(odometry_from_robot, distance, turn)
-                estimate = self._variant.move(estimate, distance, turn, crawled)
+                estimate = self._variant.move(estimate, distance, turn, slow_s)
             if pending.stamp_ns <= until_ns:
                 pending = None
         silent_ns = until_ns - state.odometry_until_ns - self._odometry_timeout_ns
-        if silent_ns > 0:
-            estimate = self._unknown_motion(estimate, min(silent_ns, until_ns - stamp_ns))
+        if silent_ns > 0 and self._odometry.moves:
+            gap_ns = min(silent_ns, until_ns - stamp_ns)
+            estimate = inflate_by_gap(estimate, gap_ns, self._odometry.gap_speed_m_s)
         return with_motion(state, until_ns, estimate, odometry_from_robot, pending)
-
-    def _motion(self, piece: Odometry, from_ns: int, until_ns: int) -> tuple[float, float, float]:
-        """The part of a piece within these times: distance (m), turn (rad), and for how many
-        seconds of it the robot drove at its least speed."""
-        distance, turn = piece.distance_m, piece.turn_rad
-        begin_ns, end_ns = piece.from_ns, piece.stamp_ns
-        part_ns = whole_ns = end_ns - begin_ns
-        if begin_ns != from_ns or end_ns > until_ns:
-            part_ns = max(0, min(end_ns, until_ns) - max(from_ns, begin_ns))
-            share = part_ns / whole_ns
-            distance, turn = share * distance, share * turn
-        crawled = 0.0
-        if self._has_dead_zone:
-            crawled = time_at_min_speed_s(distance, part_ns * 1e-9, self._odometry)
-        return distance, turn, crawled
-
-    def _unknown_motion(self, estimate: Estimate, silent_ns: int) -> Estimate:
-        """The growth of uncertainty while odometry is missing: a random walk of `gap_speed_m_s`."""
-        s = self._odometry
-        if not s.moves:
-            return estimate
-        p = s.gap_speed_m_s**2 * silent_ns * 1e-9
-        growth = Covariance3(p, 0.0, p, 0.0, 0.0, p)
-        return estimate._replace(covariance=estimate.covariance.plus(growth))
 
     # Step 2 -----------------------------------------------------------------------------------
 

@@ -10,6 +10,7 @@ from math import cos, sin
 from cpcbl_team.config import OdometryNoise
 from cpcbl_team.estimate import ZERO3, Covariance3, Estimate, Matrix3, circle_variance
 from cpcbl_team.geometry import Pose2, new, wrap_angle
+from cpcbl_team.inputs import Odometry
 
 
 def motion_jacobian(heading: float, distance: float, turn: float) -> Matrix3:
@@ -46,8 +47,8 @@ def move(
 ) -> Estimate:
     """The estimate after the wheels report an arc of `distance` metres that turns by `turn`.
 
-    F P F^T + C is written out, for it runs for every odometry step. `crawl_s`: how many seconds
-    of it the robot drove at its least speed. `as_circle`: the position's covariance is kept as a
+    F P F^T + C is written out, for it runs for every odometry step. For `crawl_s` seconds of it
+    the robot drove at its least speed. `as_circle`: the position's covariance is kept as a
     circle.
     """
     pose, covariance, shared = estimate
@@ -79,3 +80,22 @@ def move(
         shared = shared.transformed(motion_jacobian(heading, distance, turn))
     pose = new(Pose2, (x + ly, y - lx, wrap_angle(heading + turn)))
     return new(Estimate, (pose, new(Covariance3, (xx, xy, yy, xh, yh, hh)), shared))
+
+
+def part_of_piece(piece: Odometry, from_ns: int, until_ns: int) -> tuple[float, float, float]:
+    """The part of a piece of odometry within these times: distance (m), turn (rad), seconds."""
+    distance, turn = piece.distance_m, piece.turn_rad
+    begin_ns, end_ns = piece.from_ns, piece.stamp_ns
+    part_ns = whole_ns = end_ns - begin_ns
+    if begin_ns != from_ns or end_ns > until_ns:
+        part_ns = max(0, min(end_ns, until_ns) - max(from_ns, begin_ns))
+        share = part_ns / whole_ns
+        distance, turn = share * distance, share * turn
+    return distance, turn, part_ns * 1e-9
+
+
+def inflate_by_gap(estimate: Estimate, gap_ns: int, speed_m_s: float) -> Estimate:
+    """The estimate after a time without odometry: a random walk, of this speed in one second."""
+    p = speed_m_s**2 * gap_ns * 1e-9
+    growth = Covariance3(p, 0.0, p, 0.0, 0.0, p)
+    return estimate._replace(covariance=estimate.covariance.plus(growth))

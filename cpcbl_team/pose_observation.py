@@ -76,11 +76,14 @@ def from_fix(fix: Fix) -> PoseObservation:
     if fix.heading_rad is not None:
         variances = fix.heading_sensor_variance, fix.heading_observer_variance
         heading = HeadingObservation(fix.heading_rad, *variances)
-    source, parts = FIX + fix.observer, (sensor.possible(), observer.possible())
+    source, parts = (
+        FIX + fix.observer,
+        (sensor.with_possible_correlation(), observer.with_possible_correlation()),
+    )
     return PoseObservation(source, fix.x_m, fix.y_m, *parts, heading)
 
 
 def from_position_sensor(position: Position) -> PoseObservation:
     """What the robot's own position sensor measured."""
-    covariance = Covariance2(*position.covariance).possible()
+    covariance = Covariance2(*position.covariance).with_possible_correlation()
     return PoseObservation(POSITION_SENSOR, position.x_m, position.y_m, covariance, None)

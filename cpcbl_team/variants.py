@@ -14,8 +14,8 @@ from cpcbl_team.estimate import (
     Information,
     Scope,
     Sums,
-    circular,
     merge,
+    with_circular_position,
 )
 from cpcbl_team.fusion import Observation, merge_naive, merge_split, with_all_shared
 from cpcbl_team.landmarks import LandmarkUpdate
@@ -115,7 +115,7 @@ class CircularVariant(OvalVariant):
     def reduce(self, estimate: Estimate) -> Estimate:
         if self._uncoupled:
             estimate = super().reduce(estimate)
-        return with_all_shared(circular(estimate))
+        return with_all_shared(with_circular_position(estimate))
 
     def move(self, estimate: Estimate, distance: float, turn: float, crawl_s: float) -> Estimate:
         if self._uncoupled:
@@ -142,16 +142,16 @@ class WeightedVariant(CircularVariant):
     ) -> Estimate:
         """Steps 4 and 5: inverse-distance weights among readings, then the static weight."""
         constraints = [c for found in accepted for c in found.constraints]
-        return self.reduce(weighted.merged(prior, constraints, self._weights))
+        return self.reduce(weighted.merge_weighted(prior, constraints, self._weights))
 
     def correct_position(
         self, prior: Estimate, position: Observation, by_teammate: bool
     ) -> Estimate:
         x, y = position.residuals
-        return weighted.averaged(prior, (x, y), None, self._weights)
+        return weighted.weighted_average(prior, (x, y), None, self._weights)
 
     def correct_heading(self, prior: Estimate, heading: Observation) -> Estimate:
-        return weighted.averaged(prior, (0.0, 0.0), heading.residuals[0], self._weights)
+        return weighted.weighted_average(prior, (0.0, 0.0), heading.residuals[0], self._weights)
 
 
 def variant_of(settings: LocalizationSettings) -> JointVariant:

@@ -12,7 +12,7 @@ from cpcbl_team.estimate import Covariance3, Estimate
 from cpcbl_team.geometry import Pose2, wrap_angle
 
 
-def merged(prior: Estimate, accepted: list[Constraint], weights: Weights) -> Estimate:
+def merge_weighted(prior: Estimate, accepted: list[Constraint], weights: Weights) -> Estimate:
     """Steps 4 and 5 of a cycle: inverse-distance weights among the readings of one type."""
     if not accepted:
         return prior
@@ -20,10 +20,10 @@ def merged(prior: Estimate, accepted: list[Constraint], weights: Weights) -> Est
     x, y, h = (
         sum(c.residual * c.row[i] / c.distance_m for c in accepted) / total for i in range(3)
     )
-    return averaged(prior, (x, y), h if accepted[0].on_heading else None, weights)
+    return weighted_average(prior, (x, y), h if accepted[0].on_heading else None, weights)
 
 
-def averaged(
+def weighted_average(
     prior: Estimate, offset: tuple[float, float], heading: float | None, weights: Weights
 ) -> Estimate:
     """The static weighted average of estimate and sensor: of heading, if one is given, or else of

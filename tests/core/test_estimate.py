@@ -22,8 +22,8 @@ from cpcbl_team.estimate import (
     Information,
     Row,
     Scope,
-    circular,
     merge,
+    with_circular_position,
 )
 from cpcbl_team.fusion import Observation, mark_shared, merge_naive, merge_split, with_all_shared
 from cpcbl_team.gaussian import Covariance2
@@ -115,7 +115,7 @@ def test_the_three_by_three_algebra_is_that_of_matrices(seed: int) -> None:
 def test_the_circular_reduction_leaves_a_covariance() -> None:
     """The mean variance alone would be less than the heading's share along one axis."""
     drifted = Covariance3(0.01, 0.0, 1.0, 0.0, 0.99, 1.0)
-    reduced = circular(Estimate(POSE, drifted)).covariance
+    reduced = with_circular_position(Estimate(POSE, drifted)).covariance
     assert reduced.xx == reduced.yy
     assert (reduced.xh, reduced.yh, reduced.hh) == (0.0, 0.99, 1.0)
     assert least_eigenvalue(matrix3(reduced)) > -1e-12

@@ -8,12 +8,12 @@ from support.core import least_eigenvalue, matrix2, product_of
 
 from cpcbl_team import estimate
 from cpcbl_team.estimate import Covariance3, Estimate, Information
-from cpcbl_team.gaussian import Covariance2, Gaussian2, oriented, sighting_gaussian
+from cpcbl_team.gaussian import Covariance2, Gaussian2, oriented_covariance, sighting_gaussian
 from cpcbl_team.geometry import Pose2
 
 sigmas = st.floats(0.01, 3.0)
 gaussians = st.builds(
-    lambda x, y, major, minor, angle: Gaussian2(x, y, oriented(major, minor, angle)),
+    lambda x, y, major, minor, angle: Gaussian2(x, y, oriented_covariance(major, minor, angle)),
     st.floats(-5.0, 5.0),
     st.floats(-5.0, 5.0),
     sigmas,
@@ -91,7 +91,7 @@ def test_circular_gaussians_merge_by_weighted_averages(
 def test_an_oriented_covariance_has_the_axes_it_was_made_from(
     major: float, share: float, angle: float
 ) -> None:
-    covariance = oriented(major, share * major, angle)
+    covariance = oriented_covariance(major, share * major, angle)
     assert covariance.along(math.cos(angle), math.sin(angle)) == pytest.approx(major**2)
     across = covariance.along(-math.sin(angle), math.cos(angle))
     assert across == pytest.approx((share * major) ** 2, abs=1e-9)
@@ -99,9 +99,9 @@ def test_an_oriented_covariance_has_the_axes_it_was_made_from(
 
 @given(gaussians)
 def test_a_covariance_is_possible_and_what_is_beyond_becomes_so(g: Gaussian2) -> None:
-    assert g.covariance.possible() == g.covariance
+    assert g.covariance.with_possible_correlation() == g.covariance
     beyond = g.covariance._replace(xy=1.001 * math.sqrt(g.covariance.xx * g.covariance.yy))
-    assert 0.0 < beyond.possible().determinant() < 1e-5 * beyond.xx * beyond.yy
+    assert 0.0 < beyond.with_possible_correlation().determinant() < 1e-5 * beyond.xx * beyond.yy
 
 
 @given(gaussians, st.floats(-math.pi, math.pi))

@@ -19,15 +19,8 @@ from support.core import (
     state_at,
 )
 
-from cpcbl_team.config import (
-    Field,
-    Gives,
-    Landmark,
-    LocalizerSettings,
-    SensorSettings,
-    Variant,
-)
-from cpcbl_team.estimate import POSE, Estimate, Information, Scope, circular, merge
+from cpcbl_team.config import Field, Gives, Landmark, LocalizerSettings, SensorSettings, Variant
+from cpcbl_team.estimate import POSE, Estimate, Information, Scope, merge, with_circular_position
 from cpcbl_team.geometry import Pose2, wrap_angle
 from cpcbl_team.inputs import Sighting, Sightings
 from cpcbl_team.localizer import Localizer
@@ -139,7 +132,7 @@ def composed(robot: Localizer, state: State, frame: Sightings) -> tuple[Estimate
     after = merge(prior, evidence, POSE if r.variant == "joint" else turn)
     if r.paper_uncertainty and r.variant != "joint":
         after = after._replace(covariance=after.covariance._replace(xh=0.0, yh=0.0))
-    return circular(after) if r.variant == "circular" else after, counts
+    return with_circular_position(after) if r.variant == "circular" else after, counts
 
 
 @settings(max_examples=400)
@@ -156,7 +149,7 @@ def test_a_frame_says_what_its_constraints_say_one_by_one(
     true = Pose2(*rng.uniform(-3.0, 3.0, size=3))
     covariance = covariance3(10.0 ** rng.uniform(-4.0, -1.0) * random_matrix(rng, 3))
     if rules.variant == "circular":
-        covariance = circular(Estimate(true, covariance)).covariance
+        covariance = with_circular_position(Estimate(true, covariance)).covariance
     before = NOW - SECOND // 10
     updates = Updates(
         position_ns=before if rng.random() < 0.5 else None,

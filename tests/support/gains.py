@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 
 from cpcbl_team.config import CollaborationSettings
 from cpcbl_team.estimate import SMALLEST_VARIANCE
-from cpcbl_team.gaussian import Covariance2, oriented
+from cpcbl_team.gaussian import Covariance2, oriented_covariance
 from cpcbl_team.tiers import LOWEST_TIER
 from support.core import least_eigenvalue, matrix2
 
@@ -14,12 +14,12 @@ RULES = CollaborationSettings()
 SECOND = 1_000_000_000
 NOTHING = Covariance2(0.0, 0.0, 0.0)
 sigmas = st.floats(0.005, 2.0)
-covariances = st.builds(oriented, sigmas, sigmas, st.floats(-math.pi, math.pi))
+covariances = st.builds(oriented_covariance, sigmas, sigmas, st.floats(-math.pi, math.pi))
 fusions = st.sampled_from(["split-ci", "naive"])
 tiers = st.integers(0, LOWEST_TIER)
 coordinates = st.floats(-20.0, 20.0)
 exact_or_not = st.just(0.0) | st.floats(1e-9, 20.0)
-areas = st.builds(oriented, exact_or_not, exact_or_not, st.floats(-math.pi, math.pi))
+areas = st.builds(oriented_covariance, exact_or_not, exact_or_not, st.floats(-math.pi, math.pi))
 displacements = st.just(0.0) | st.floats(-20.0, 20.0)
 either_rules = CollaborationSettings(fusion="split-ci"), CollaborationSettings(fusion="naive")
 
