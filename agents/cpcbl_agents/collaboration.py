@@ -203,8 +203,15 @@ class CollaborationAgent:
     def _may_help(self, fix: Fix, tier: int) -> bool:
         rules = self._rules
         last_ns, _ = self._fix_memories.get(fix.robot, (None, None))
-        rested = last_ns is None or fix.stamp_ns - last_ns >= max(1, rules.fix_interval_s * 1e9)
-        return rules.active and self.has_started and rested and accepts_tier(tier, self.tier, rules)
+        interval_over = last_ns is None or fix.stamp_ns - last_ns >= max(
+            1, rules.fix_interval_s * 1e9
+        )
+        return (
+            rules.active
+            and self.has_started
+            and interval_over
+            and accepts_tier(tier, self.tier, rules)
+        )
 
     def _offer(self, fix: Fix, tier: int) -> _Offer:
         """The fix with its gain; with the heading only if the heading is worth its own bytes."""
@@ -235,7 +242,7 @@ class CollaborationAgent:
     # Beliefs -------------------------------------------------------------------------------
 
     def _beliefs(self, now: PoseEstimate, now_ns: int) -> list[Belief]:
-        """The belief, when it is due, has subscribers, and tells them something new."""
+        """The belief, when it is due, has subscribers, and differs enough from the last one."""
         rules, tally = self._rules, self.counters.of("belief", "")
         due = now.stamp_ns >= self._belief_ns + int(1e9 / rules.belief_rate_hz)
         if not (

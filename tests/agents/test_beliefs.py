@@ -24,13 +24,13 @@ def stamps_s(beliefs: list[Belief]) -> list[float]:
     return [b.stamp_ns / SECOND for b in beliefs]
 
 
-def test_without_a_listener_no_belief_is_said_or_thought_of() -> None:
+def test_without_a_subscriber_no_belief_is_sent_or_counted() -> None:
     alone = Alone()
     assert alone.later(3.0) == []
     assert alone.agent.counters.flows() == ()
 
 
-def test_a_new_listener_is_told_at_once() -> None:
+def test_a_new_subscriber_gets_a_belief_at_once() -> None:
     alone = Alone()
     alone.later(1.0)
     alone.tell(BeliefSubscribers(present=True))
@@ -43,7 +43,7 @@ def test_a_new_listener_is_told_at_once() -> None:
 
 @pytest.mark.parametrize("silence_s", [0.4, 1.0, 3.0])
 @pytest.mark.parametrize("speed_m_s", [0.0, 0.5])
-def test_while_the_listeners_copy_holds_there_is_silence_up_to_its_longest(
+def test_while_subscribers_can_predict_the_pose_no_belief_is_sent_up_to_the_longest_silence(
     silence_s: float, speed_m_s: float
 ) -> None:
     alone = Alone(belief_silence_s=silence_s)
@@ -56,7 +56,7 @@ def test_while_the_listeners_copy_holds_there_is_silence_up_to_its_longest(
     assert (tally.messages, tally.messages + tally.silent) == (len(stamps), 46)
 
 
-def test_a_robot_that_has_stopped_says_so() -> None:
+def test_a_robot_that_has_stopped_sends_its_belief() -> None:
     alone = Alone()
     alone.tell(BeliefSubscribers(present=True))
     alone.becomes(speed_m_s=0.5)
@@ -66,7 +66,9 @@ def test_a_robot_that_has_stopped_says_so() -> None:
 
 
 @pytest.mark.parametrize(("factor", "stamps"), [(1.2, [1.2]), (1.3, [0.4]), (1.0 / 1.3, [0.4])])
-def test_a_robot_whose_sigma_has_changed_enough_says_so(factor: float, stamps: list[float]) -> None:
+def test_a_robot_whose_sigma_has_changed_enough_sends_its_belief(
+    factor: float, stamps: list[float]
+) -> None:
     """Half a sigma is a factor of 1.28."""
     alone = Alone(POOR)
     alone.tell(BeliefSubscribers(present=True))
@@ -76,13 +78,13 @@ def test_a_robot_whose_sigma_has_changed_enough_says_so(factor: float, stamps: l
     assert stamps_s(alone.later(1.0)) == stamps
 
 
-def test_beliefs_that_are_always_news_keep_their_rate() -> None:
+def test_beliefs_that_always_change_keep_their_rate() -> None:
     alone = Alone(belief_share=0.0, belief_rate_hz=2.0)
     alone.tell(BeliefSubscribers(present=True))
     assert stamps_s(alone.later(3.0)) == [0.5, 1.0, 1.5, 2.0, 2.5, 3.0]
 
 
-def test_a_belief_beyond_the_budget_is_counted_and_said_as_soon_as_it_may_be() -> None:
+def test_a_belief_beyond_the_budget_is_counted_and_sent_as_soon_as_the_budget_allows() -> None:
     alone = Alone(
         budget=BudgetSettings(messages_per_minute=6.0, urgent_share=0.0), belief_share=0.0
     )
@@ -137,7 +139,7 @@ def test_a_source_out_of_sight_is_dropped_after_a_second() -> None:
     assert alone.agent.sources == frozenset()
 
 
-def test_a_better_teammate_that_tells_too_little_is_no_source() -> None:
+def test_a_better_teammate_with_too_little_information_gain_is_no_source() -> None:
     vague = SensorSettings(range_share=0.3, bearing_sigma_deg=20.0)
     for sensor, sources in ((vague, set()), (SensorSettings(), {("mate", GOOD)})):
         alone = looking(POOR, sensor=sensor)
@@ -146,7 +148,7 @@ def test_a_better_teammate_that_tells_too_little_is_no_source() -> None:
         assert alone.agent.sources == sources
 
 
-def test_who_knows_its_heading_badly_listens_to_whom_it_needs_for_that() -> None:
+def test_a_robot_with_a_poor_heading_subscribes_to_teammates_that_improve_it() -> None:
     alone = Alone(GOOD)
     alone.tell(Presence("mate", GOOD - 1))
     chosen = []
@@ -176,7 +178,7 @@ def test_a_neighbour_is_forgotten_after_ten_seconds() -> None:
     assert alone.agent.neighbours == frozenset()
 
 
-def test_a_robot_that_is_lost_says_nothing_and_listens_to_all_who_are_better() -> None:
+def test_a_lost_robot_sends_nothing_and_subscribes_to_all_better_teammates() -> None:
     vague = SensorSettings(range_share=0.3, bearing_sigma_deg=20.0)
     alone = looking(GOOD, sensor=vague, least_value=0.0)
     alone.tell(

@@ -45,19 +45,19 @@ def test_what_arrives_before_it_was_measured_is_refused_at_once() -> None:
     assert heard(ClockMonitor(RULES), -200 * MS, 1) == [True]
 
 
-def test_a_single_word_that_waited_is_used() -> None:
+def test_a_single_delayed_message_is_used() -> None:
     clocks = ClockMonitor(RULES)
     assert heard(clocks, 1500 * MS, 1) == [False]
     assert not any(heard(clocks, 20 * MS, 20))
 
 
-def test_a_single_word_from_far_ahead_casts_no_doubt_on_the_next() -> None:
+def test_a_single_message_from_far_ahead_does_not_affect_the_next() -> None:
     clocks = ClockMonitor(RULES)
     heard(clocks, -FUTURE_NS - 1, 1)
     assert not any(heard(clocks, 20 * MS, 20))
 
 
-def test_a_congested_link_is_not_taken_for_a_slow_clock_while_some_words_are_quick() -> None:
+def test_a_congested_link_is_not_taken_for_a_slow_clock_while_some_messages_are_quick() -> None:
     clocks = ClockMonitor(RULES)
     refused = [
         heard(clocks, late * MS, 1, NOW + i * 100 * MS) for i, late in enumerate([50, 900] * 20)
@@ -126,7 +126,7 @@ def test_a_tolerated_clock_is_reported_with_its_difference() -> None:
     assert Refusal.CLOCK not in status.counts
 
 
-def test_switched_off_nothing_is_said_of_clocks() -> None:
+def test_without_trust_clocks_are_not_reported() -> None:
     status = told(-500 * MS, TrustSettings(enabled=False))
     assert status.trust == ()
     assert Refusal.CLOCK not in status.counts

@@ -47,7 +47,7 @@ def test_when_the_newest_token_goes_the_one_before_counts() -> None:
     assert tokens.update(alive(5), False) == ("mate", 3)
 
 
-def test_a_token_that_is_told_again_is_the_newest() -> None:
+def test_a_token_that_is_declared_again_is_the_newest() -> None:
     tokens = LivelinessTokens()
     for tier in (7, 3):
         tokens.update(alive(tier), True)
@@ -69,7 +69,7 @@ def test_the_tokens_of_teammates_do_not_mix() -> None:
     assert tokens.update(alive(7), True) == ("mate", 7)
 
 
-def test_a_token_that_goes_without_having_come_says_nothing_new() -> None:
+def test_a_token_that_disappears_without_having_appeared_changes_nothing() -> None:
     tokens = LivelinessTokens()
     assert tokens.update(alive(7), False) == ("mate", None)
     tokens.update(alive(3), True)
@@ -99,7 +99,7 @@ STRANGE = [
 
 @pytest.mark.parametrize("key", STRANGE, ids=lambda key: key[:20] or "empty")
 @pytest.mark.parametrize("there", [True, False])
-def test_what_is_no_robots_token_is_none(key: str, there: bool) -> None:
+def test_a_key_that_is_no_robots_token_gives_none(key: str, there: bool) -> None:
     tokens = LivelinessTokens()
     tokens.update(alive(7), True)
     assert tokens.update(key, there) is None
@@ -131,7 +131,7 @@ def test_the_newest_of_what_is_there_counts(changes: list[tuple[str, int, bool]]
         assert tokens.update(alive(tier, robot), comes) == (robot, newest[-1] if newest else None)
 
 
-def test_strange_tokens_are_counted_and_harm_nobody() -> None:
+def test_invalid_tokens_are_counted_and_change_nothing() -> None:
     """A foreign session declares them under the name of a teammate that is in sight."""
     results = []
     for strange in ([], ["alive/x/mate/1", "alive/99/mate/1", "alive/-1/mate/7"]):
@@ -287,7 +287,7 @@ def test_exactly_the_beliefs_of_sources_are_subscribed_to() -> None:
     assert heard == [topics.BELIEF.at(tier=2, robot="mate")]
 
 
-def test_a_source_that_changes_its_tier_is_always_heard() -> None:
+def test_the_beliefs_of_a_source_that_changes_its_tier_always_arrive() -> None:
     wired = Wired()
     before, after = (topics.BELIEF.at(tier=t, robot="mate") for t in (2, 3))
     wired.announce("mate", 2)
@@ -325,7 +325,7 @@ def test_at_a_change_of_tier_the_new_is_declared_before_the_old_is_taken_back() 
     assert published == [topics.BELIEF.at(tier=new, robot="me")]
 
 
-def test_a_robot_that_gets_better_takes_back_what_it_no_longer_hears_last() -> None:
+def test_a_robot_that_gets_better_takes_its_old_subscriptions_back_last() -> None:
     wired = Wired()
     wired.gets_worse()
     worse, so_far = wired.tier, len(wired.recording.events)

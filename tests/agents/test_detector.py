@@ -50,7 +50,7 @@ def test_frames_are_shown_twice_a_second_with_what_was_seen() -> None:
     assert counts["frame"] == counts["sightings"] == 20
 
 
-def test_nothing_is_drawn_while_nobody_looks(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_frame_is_annotated_without_a_subscriber(monkeypatch: pytest.MonkeyPatch) -> None:
     drawn: list[Pixels] = []
 
     def annotated(pixels: Pixels, glimpses: Glimpses) -> Pixels:

@@ -28,7 +28,7 @@ def turned(
 
 
 @pytest.mark.parametrize("tier", range(LOWEST_TIER + 1))
-def test_a_robot_helps_who_is_worse_and_nobody_else(tier: int) -> None:
+def test_a_robot_sends_fixes_to_worse_teammates_only(tier: int) -> None:
     alone = Alone(POOR, least_value=0.0)
     alone.tell(Presence("mate", tier))
     assert robots(alone.sees(ahead())) == (["mate"] if tier > POOR else [])
@@ -51,14 +51,14 @@ def test_a_teammate_of_which_the_bus_knows_nothing_is_not_helped() -> None:
     assert alone.agent.counters.flows() == (Flow("fix", "mate", 1, 42, latest_ns=2),)
 
 
-def test_the_fix_that_is_worth_most_comes_first() -> None:
+def test_the_fix_with_the_largest_gain_comes_first() -> None:
     for names in (("mate", "other"), ("other", "mate")):
         alone = Alone()
         alone.tell(Presence("mate", POOR), Presence("other", POORER))
         assert robots(alone.sees(*map(ahead, names))) == ["other", "mate"]
 
 
-def test_a_budget_for_one_goes_to_the_fix_that_is_worth_most() -> None:
+def test_a_budget_for_one_message_goes_to_the_fix_with_the_largest_gain() -> None:
     alone = Alone(budget=BudgetSettings(messages_per_minute=1.0, urgent_share=0.0))
     alone.tell(Presence("mate", POOR), Presence("other", POORER))
     assert robots(alone.sees(ahead("mate"), ahead("other"))) == ["other"]
@@ -74,7 +74,7 @@ def test_what_a_late_frame_costs_is_of_the_time_at_which_it_is_sent() -> None:
     assert len(alone.sees(ahead())) == 1
 
 
-def test_help_that_nobody_heard_costs_nothing_and_is_offered_again() -> None:
+def test_a_fix_without_a_subscriber_costs_nothing_and_is_offered_again() -> None:
     alone = Alone(
         budget=BudgetSettings(messages_per_minute=2.0, urgent_share=0.0),
         fix_interval_s=60.0,
@@ -90,13 +90,13 @@ def test_help_that_nobody_heard_costs_nothing_and_is_offered_again() -> None:
     assert (alone.sees(ahead()), alone.later(0.2)) == ([], [])
 
 
-def test_what_is_close_by_is_seen_better_and_worth_more() -> None:
+def test_a_fix_of_a_close_teammate_has_a_larger_gain() -> None:
     alone = Alone()
     alone.tell(Presence("mate", POOR), Presence("other", POOR))
     assert robots(alone.sees(ahead("mate", 4.0), ahead("other", 1.2))) == ["other", "mate"]
 
 
-def test_who_is_lost_comes_first_whatever_it_is_worth() -> None:
+def test_a_lost_teammate_comes_first_whatever_the_gain() -> None:
     """Far away, its fix is worth less than that of a teammate close by."""
     for names in (("mate", "other"), ("other", "mate")):
         alone = Alone(tier_width=1.5)
@@ -108,7 +108,7 @@ def test_who_is_lost_comes_first_whatever_it_is_worth() -> None:
         assert sure[0] > 1000.0 * sure[1]
 
 
-def test_the_reserve_is_for_who_is_lost() -> None:
+def test_the_reserve_is_for_lost_teammates() -> None:
     alone = Alone(budget=BudgetSettings(messages_per_minute=2.0, urgent_share=0.5))
     alone.tell(Presence("mate", LOWEST_TIER), Presence("other", POOR), Presence("third", POOR))
     assert len(alone.sees(ahead("other"))) == 1
@@ -116,7 +116,7 @@ def test_the_reserve_is_for_who_is_lost() -> None:
     assert len(alone.sees(ahead("mate"))) == 1
 
 
-def test_what_is_worth_too_little_is_not_sent_and_counted() -> None:
+def test_a_fix_with_too_little_gain_is_not_sent_but_counted() -> None:
     """A teammate hardly worse off, far away."""
     alone = Alone()
     alone.tell(Presence("mate", GOOD + 1))
@@ -124,7 +124,7 @@ def test_what_is_worth_too_little_is_not_sent_and_counted() -> None:
     assert alone.agent.counters.flows() == (Flow("fix", "mate", worthless=1),)
 
 
-def test_a_message_that_is_not_worth_its_price_is_counted_as_beyond_the_budget() -> None:
+def test_a_fix_with_a_gain_below_the_price_is_counted_as_beyond_the_budget() -> None:
     alone = Alone(budget=BudgetSettings(bytes_per_s=100.0))
     alone.tell(*(Presence(name, POORER) for name in MATES))
     while alone.sees(*map(ahead, sorted(MATES)), after_ns=20 * MS):
@@ -134,7 +134,7 @@ def test_a_message_that_is_not_worth_its_price_is_counted_as_beyond_the_budget()
     assert sum(alone.tally("fix", name).over_budget for name in MATES) > 0
 
 
-def test_a_budget_just_free_again_does_not_go_to_what_is_worth_little() -> None:
+def test_a_budget_that_has_just_recovered_is_not_spent_on_small_gains() -> None:
     weak = Presence("other", GOOD + 2)
     at_first = Alone(budget=BudgetSettings(messages_per_minute=4.0, urgent_share=0.0))
     at_first.tell(weak)
@@ -159,7 +159,7 @@ def helped(alone: Alone, frames: int, range_m: float = 2.0) -> list[int]:
     return sent
 
 
-def test_fixes_for_a_teammate_soon_are_worth_nothing_until_it_has_driven_away() -> None:
+def test_repeated_fixes_for_a_teammate_have_no_gain_until_it_has_moved() -> None:
     alone = Alone()
     sent = helped(alone, 50)
     assert sent == list(range(len(sent)))
@@ -169,14 +169,14 @@ def test_fixes_for_a_teammate_soon_are_worth_nothing_until_it_has_driven_away() 
     assert len(alone.sees(ahead(range_m=4.0), after_ns=100 * MS)) == 1
 
 
-def test_a_teammate_that_stays_bad_is_told_again() -> None:
+def test_a_teammate_that_stays_poorly_localized_gets_another_fix() -> None:
     """It may not have heard, or not have believed."""
     alone = Alone()
     alone.tell(Presence("mate", POORER))
     assert all(len(alone.sees(ahead(), after_ns=100 * MS)) == 1 for _ in range(3))
 
 
-def test_within_its_tier_a_way_makes_a_fix_worth_more() -> None:
+def test_within_a_tier_motion_increases_the_gain_of_a_fix() -> None:
     """After a short and a long way at the same distance, at a least value between the two."""
     sent = []
     for bearing_rad in (0.02, 1.5):
@@ -187,7 +187,7 @@ def test_within_its_tier_a_way_makes_a_fix_worth_more() -> None:
     assert sent == [0, 1]
 
 
-def test_a_heading_is_told_with_the_fix_and_paid_for() -> None:
+def test_a_heading_is_sent_with_the_fix_and_charged() -> None:
     alone = Alone(budget=BudgetSettings(bytes_per_s=100.0))
     alone.tell(Presence("mate", POORER))
     (fix,) = alone.sees(turned())
@@ -197,7 +197,7 @@ def test_a_heading_is_told_with_the_fix_and_paid_for() -> None:
     assert spending.most == alone.tally("fix", "mate").bytes == 49
 
 
-def test_a_heading_that_nobody_heard_costs_nothing() -> None:
+def test_a_heading_without_a_subscriber_costs_nothing() -> None:
     alone = Alone(budget=BudgetSettings(bytes_per_s=50.0, urgent_share=0.0))
     alone.tell(Presence("mate", POORER))
     alone.heard = False
@@ -207,7 +207,7 @@ def test_a_heading_that_nobody_heard_costs_nothing() -> None:
     assert alone.agent.budget.admits(alone.now_ns, 500, urgent=False)
 
 
-def test_who_knows_its_place_is_told_its_heading_until_that_is_no_news() -> None:
+def test_a_teammate_with_a_known_position_gets_headings_while_they_have_a_gain() -> None:
     """Far away, its position alone would be worth too little; the same again is, too."""
     alone = Alone()
     alone.tell(Presence("mate", GOOD + 1))
@@ -218,7 +218,7 @@ def test_who_knows_its_place_is_told_its_heading_until_that_is_no_news() -> None
     assert alone.tally("fix", "mate").worthless == 1 + 20 - len(fixes)
 
 
-def test_a_heading_that_is_no_news_is_left_out_of_a_fix_that_is() -> None:
+def test_a_heading_without_gain_is_left_out_of_a_fix_with_gain() -> None:
     """Of a teammate that drives across; its heading is known by then to what this robot knows."""
     alone = Alone(tier_width=1.5)
     alone.tell(Presence("mate", POOR))
@@ -231,7 +231,7 @@ def test_a_heading_that_is_no_news_is_left_out_of_a_fix_that_is() -> None:
     assert later.heading_sensor_variance == later.heading_observer_variance == 0.0
 
 
-def test_who_is_lost_is_told_its_heading_every_time() -> None:
+def test_a_lost_teammate_gets_its_heading_every_time() -> None:
     alone = Alone()
     alone.tell(Presence("mate", LOWEST_TIER))
     for _ in range(10):
@@ -239,7 +239,7 @@ def test_who_is_lost_is_told_its_heading_every_time() -> None:
         assert fix.heading_rad is not None
 
 
-def test_without_a_covariance_every_heading_is_told() -> None:
+def test_without_a_covariance_every_heading_is_sent() -> None:
     alone = Alone(variant="weighted")
     alone.tell(Presence("mate", POOR))
     fixes = [fix for _ in range(10) for fix in alone.sees(turned())]

@@ -24,7 +24,7 @@ EXACT = SensorSettings(field_of_view_deg=360.0, range_share=0.0, range_floor_m=1
 # The guests of one robot, by themselves ---------------------------------------------------------
 
 
-def test_a_stranger_is_a_guest_while_its_token_is_there() -> None:
+def test_a_candidate_is_a_guest_while_its_token_is_there() -> None:
     guests = GuestRegistry(most=2)
     assert guests.notice("tripod", 0)
     assert guests.watched == {"tripod"}
@@ -37,7 +37,7 @@ def test_a_stranger_is_a_guest_while_its_token_is_there() -> None:
     assert guests.counts == {"guest_joined": 1, "guest_left": 1}
 
 
-def test_what_is_known_is_no_stranger_and_who_was_not_noticed_is_no_guest() -> None:
+def test_a_known_name_is_no_candidate_and_an_unnoticed_robot_is_no_guest() -> None:
     guests = GuestRegistry({"oak", "mate", "me"}, 2)
     for name in ("oak", "mate", "me"):
         assert not guests.notice(name, 0)
@@ -49,13 +49,13 @@ def test_what_is_known_is_no_stranger_and_who_was_not_noticed_is_no_guest() -> N
     assert not guests.counts
 
 
-def test_a_team_without_guests_notices_nobody() -> None:
+def test_a_team_without_guests_has_no_candidates() -> None:
     guests = GuestRegistry(most=0)
     assert not guests.notice("tripod", 0)
     assert guests.watched == frozenset()
 
 
-def test_a_stranger_without_a_token_makes_room_a_guest_does_not() -> None:
+def test_a_candidate_without_a_token_loses_its_place_a_guest_does_not() -> None:
     guests = GuestRegistry(most=2)
     guests.notice("tripod", 0)
     guests.set_presence("tripod", True)
@@ -78,7 +78,7 @@ def test_a_stranger_without_a_token_makes_room_a_guest_does_not() -> None:
     assert guests.watched == {"tripod", "late"}
 
 
-def test_everybody_who_is_seen_all_the_time_has_a_turn() -> None:
+def test_every_robot_that_is_seen_all_the_time_is_looked_up() -> None:
     guests = GuestRegistry(most=3)
     turns: set[str] = set()
     for frame in range(100):
@@ -183,7 +183,7 @@ def poor(**more: Any) -> RobotSettings:
     return robot
 
 
-def test_fixes_of_a_guest_that_nobody_named_help() -> None:
+def test_fixes_of_a_guest_that_no_file_names_are_used() -> None:
     """Also if the helped robot never sees the guest: the first fix makes it look the guest up."""
     both = WithGuest(poor())
     both.go_on(1.0, i_see=False)
@@ -308,7 +308,7 @@ class WatchedHub(MemoryHub):
         return self.sessions[-1]
 
 
-def test_nobody_is_watched_who_was_neither_seen_nor_heard() -> None:
+def test_a_robot_that_was_never_noticed_is_not_watched() -> None:
     hub = WatchedHub()
     stand = TeamOnBus(team_of(me=robot_at(), mate=robot_at(2.0)), here=["me"], hub=hub)
     for i in range(50):
@@ -337,7 +337,7 @@ def test_a_camera_full_of_garbage_makes_a_robot_watch_a_few_names_only() -> None
     assert bus.keys == [topics.ALIVE.at(robot="me"), topics.ALIVE.at(robot="tripod")]
 
 
-def test_a_token_with_an_absurd_name_or_tier_lets_nobody_in() -> None:
+def test_a_token_with_an_invalid_name_or_tier_makes_no_guest() -> None:
     stand = TeamOnBus(team_of(me=poor()), here=["me"])
     for key in ("alive/99/tripod/1", "alive/x/tripod/1"):
         stand.bus.declare_token(key)

@@ -84,7 +84,7 @@ def test_stamps_that_go_backwards_are_put_in_order(tmp_path: Path) -> None:
     assert everything(tmp_path / "backwards") == everything(tmp_path / "straight")
 
 
-def test_a_barcode_that_nobody_carries_is_counted(tmp_path: Path) -> None:
+def test_a_barcode_that_no_robot_carries_is_counted(tmp_path: Path) -> None:
     write_log(tmp_path, seconds=2.0, unknown_barcode=True)
     ghost = Sighting(f"barcode-{UNKNOWN_BARCODE}", 1.0, 0.0)
     frames = [i for i in everything(tmp_path) if isinstance(i, Sightings)]

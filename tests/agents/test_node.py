@@ -31,7 +31,7 @@ def test_status_comes_once_a_second() -> None:
     assert stamps == [n * SECOND for n in (1, 2, 3, 4, 5)]
 
 
-def test_status_tells_quality_and_traffic() -> None:
+def test_status_contains_quality_and_traffic() -> None:
     stand = TeamOnBus(two_robots(active=False))
     exchange(stand)
     mine, mates = stand.statuses().values()
@@ -48,7 +48,7 @@ def test_status_tells_quality_and_traffic() -> None:
     assert said.silent > 0
 
 
-def test_nothing_is_shared_while_nobody_listens() -> None:
+def test_nothing_is_shared_without_a_subscriber() -> None:
     stand = helper()
     stand.ear(topics.TRACK.at(robot="me"))
     exchange(stand)
@@ -66,7 +66,7 @@ def test_all_is_shared_once_help_was_really_sent(topic: topics.Topic) -> None:
     assert estimate(stand).shared == estimate(stand).covariance
 
 
-def test_a_listener_shares_only_what_it_has_used() -> None:
+def test_a_receiver_shares_only_what_it_has_used() -> None:
     stand = TeamOnBus(two_robots(passive=True, active=False))
     stand.stand_still(0.5)
     stand.sightings("me", saw(stand.now_ns, Sighting("mate", 40.0, 0.0)))  # the gate rejects it
@@ -105,7 +105,7 @@ def test_arrivals_wake_the_robots_own_loop() -> None:
     assert not node.waiting
 
 
-def test_the_status_of_a_robot_that_learns_says_what() -> None:
+def test_the_status_contains_what_self_calibration_has_learned() -> None:
     learning = LocalizerSettings(self_calibration=True)
     stand = TeamOnBus(with_robot(two_robots(), "me", localizer=learning))
     for robot in stand.robots.values():

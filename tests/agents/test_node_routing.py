@@ -47,7 +47,7 @@ def test_nothing_is_sent_uphill() -> None:
     assert worse.messages_received == better.messages_sent > 2
 
 
-def test_robots_of_the_same_tier_tell_each_other_nothing() -> None:
+def test_robots_of_the_same_tier_send_each_other_nothing() -> None:
     stand = TeamOnBus(two_robots(GOOD, GOOD))
     exchange(stand)
     assert [(s.sent, s.heard) for s in stand.statuses().values()] == [((), ())] * 2
@@ -60,7 +60,7 @@ def test_both_ways_sends_uphill_too() -> None:
         assert {flow.topic for flow in status.heard if flow.messages} == {"belief", "fix"}
 
 
-def test_a_budget_is_not_spent_on_what_nobody_hears() -> None:
+def test_a_budget_is_not_spent_without_a_subscriber() -> None:
     stand = helper(budget=BudgetSettings(messages_per_minute=1.0, urgent_share=0.0))
     exchange(stand)
     ear = stand.ear(topics.FIX.at(robot="mate"))
@@ -70,7 +70,7 @@ def test_a_budget_is_not_spent_on_what_nobody_hears() -> None:
     assert (spending.most, spending.allowed) == (1.0, 1.0)
 
 
-def test_only_teammates_in_sight_are_listened_to() -> None:
+def test_a_robot_subscribes_only_to_teammates_in_sight() -> None:
     stand = TeamOnBus(two_robots())
     stand.stand_still(2.0)
     assert [s.heard for s in stand.statuses().values()] == [(), ()]
@@ -110,7 +110,7 @@ def test_help_begins_after_the_chosen_time() -> None:
 
 
 @pytest.mark.parametrize("known", [True, False], ids=["knows where it is", "lost"])
-def test_a_lost_robot_tells_teammates_nothing(known: bool) -> None:
+def test_a_lost_robot_sends_teammates_nothing(known: bool) -> None:
     stand = TeamOnBus(
         team_of(me=robot_at(sigma_m=GOOD, known=known), mate=robot_at(2.0)), here=["me"]
     )
@@ -197,7 +197,7 @@ def test_after_a_change_of_tier_the_new_keys_are_in_force() -> None:
     assert hub.open_keys(topics.BELIEF.at(robot="me")) == set(ear.keys)
 
 
-def test_a_belief_is_said_under_the_tier_of_its_own_sigma() -> None:
+def test_a_belief_is_published_under_the_tier_of_its_own_sigma() -> None:
     """A robot that gets worse says so to none who listened to what it was before, and one that
     gets better tells all who listen to the better tier at once."""
     stand = helper()
@@ -220,7 +220,7 @@ def test_a_belief_is_said_under_the_tier_of_its_own_sigma() -> None:
     assert len(said) > 2
 
 
-def test_a_robot_that_has_become_better_no_longer_listens_to_its_equals() -> None:
+def test_a_robot_that_has_become_better_no_longer_subscribes_to_its_equals() -> None:
     stand = TeamOnBus(two_robots(POOR, GOOD), here=["me"])
     stand.stand_still(1.0)
     before = tier(stand, "me")
@@ -245,7 +245,7 @@ def test_the_belief_of_a_teammate_is_followed_to_its_next_tier() -> None:
     assert (listens(stand, second), listens(stand, third)) == (True, False)
 
 
-def test_a_robot_listens_no_more_to_a_teammate_that_is_gone() -> None:
+def test_a_robot_does_not_subscribe_to_a_teammate_that_is_gone() -> None:
     stand = TeamOnBus(two_robots(), here=["me"])
     token = stand.announce("mate", 2)
     exchange(stand, 1.0)

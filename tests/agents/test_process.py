@@ -198,7 +198,7 @@ def test_a_robot_that_may_have_run_before_knows_neither_its_place_nor_what_it_sp
     assert robot.collaboration.budget.admits(now_ns, 42, urgent=True) is may_send
 
 
-def test_processes_are_told_apart_in_containers_too() -> None:
+def test_processes_are_distinguished_in_containers_too() -> None:
     assert len({new_incarnation() for _ in range(100)}) == 100
 
 
@@ -227,7 +227,7 @@ def test_a_robot_goes_on_while_its_clock_holds_or_is_none_of_the_machine() -> No
         assert len(node.threads) == 10
 
 
-def test_a_closed_terminal_ends_a_process_unless_nohup_says_otherwise() -> None:
+def test_a_closed_terminal_ends_a_process_unless_nohup_protects_it() -> None:
     numbers = signal.SIGINT, signal.SIGTERM, signal.SIGHUP
     before = {number: signal.getsignal(number) for number in numbers}
     try:

@@ -156,7 +156,7 @@ def test_a_position_pulls_the_belief_there_as_far_as_it_is_certain() -> None:
         assert subject.counts["position"] == 1
 
 
-def test_the_delay_of_a_position_sensor_moves_what_it_says_to_when_it_was_so() -> None:
+def test_the_delay_of_a_position_sensor_moves_positions_to_the_time_of_measurement() -> None:
     sensor = PositionSensor(delay_s=0.3)
     late = robot(with_robot(TEAM, "me", position_sensor=sensor))
     prompt = robot(with_robot(TEAM, "me", position_sensor=PositionSensor()))
@@ -203,7 +203,7 @@ def test_a_blind_robot_still_helps_the_teammates_that_it_sees() -> None:
     assert [type(m) for m in said] == [Fix]
 
 
-def test_what_a_frame_says_again_is_counted_and_plays_no_part() -> None:
+def test_a_repeated_sighting_of_a_frame_is_counted_and_not_used() -> None:
     subject = after_seeing(SensorSettings(), OAK, *[OAK] * 99)
     assert belief(subject) == belief(after_seeing(SensorSettings(), OAK))
     assert subject.counts["seen_twice"] == 99
@@ -275,7 +275,7 @@ def test_a_frame_waits_for_the_odometry_that_covers_it() -> None:
     assert (fix.x_m, fix.y_m) == pytest.approx(seen, abs=1e-3)
 
 
-def test_a_frame_is_located_without_odometry_when_patience_ends() -> None:
+def test_a_frame_is_used_without_odometry_after_the_longest_wait() -> None:
     subject, stamp_ns = seen_ahead_of_odometry()
     assert fixes(subject.handle(Tick(), stamp_ns + ODOMETRY_WAIT_NS - 1)) == []
     (fix,) = fixes(subject.handle(Tick(), stamp_ns + ODOMETRY_WAIT_NS + 100 * MS))
@@ -318,7 +318,7 @@ def test_fixes_are_without_the_bias_that_the_robot_has_learned(learns: bool) -> 
 
 
 @pytest.mark.parametrize("learns", [True, False])
-def test_a_heading_is_told_without_the_learned_bias_and_used(learns: bool) -> None:
+def test_a_heading_is_sent_without_the_learned_bias_and_used(learns: bool) -> None:
     """A marker is seen against the line of sight, so it is off by as much as the bearing."""
     subject = stood_with_bias(learns)
     seen = Sighting("mate", 2.0, 0.1, None, None, 1.1, 0.05)

@@ -37,7 +37,7 @@ def located(pose: Pose2, stamp_ns: int, lost: str = "") -> PoseEstimate:
     ],
     ids=["ahead", "left", "right", "behind", "a little left"],
 )
-def test_steering_turns_towards_the_goal(
+def test_pursuit_turns_towards_the_goal(
     goal: tuple[float, float], speed: float, turn_rate: float | None
 ) -> None:
     v, w = pursue(HERE, goal, 0.5)
@@ -59,7 +59,7 @@ def drive(pilot: WaypointFollower, pose: Pose2, stamp_ns: int, seconds: float) -
     return way
 
 
-def test_a_pilot_visits_its_waypoints_in_order_and_again() -> None:
+def test_a_follower_visits_its_waypoints_in_order_and_again() -> None:
     corners = [(2.0, 0.0), (2.0, 2.0), (0.0, 2.0), (0.0, 0.0)]
     way = drive(WaypointFollower("me", corners, 0.5), Pose2(0.0, 0.0, 0.0), 0, 60.0)
     visits: list[int] = []
@@ -71,7 +71,7 @@ def test_a_pilot_visits_its_waypoints_in_order_and_again() -> None:
     assert visits[1:9] == [0, 1, 2, 3, 0, 1, 2, 3]
 
 
-def test_a_pilot_goes_for_the_next_waypoint_as_soon_as_it_is_near_one() -> None:
+def test_a_follower_pursues_the_next_waypoint_as_soon_as_it_is_near_one() -> None:
     pilot = WaypointFollower("me", [(1.0, 0.0), (1.0, 9.0)], 0.5)
     (ahead,) = pilot.command(located(Pose2(0.0, 0.0, 0.0), COMMAND_NS))
     (aside,) = pilot.command(located(Pose2(1.1 - REACHED_M, 0.0, 0.0), 2 * COMMAND_NS))
@@ -79,7 +79,7 @@ def test_a_pilot_goes_for_the_next_waypoint_as_soon_as_it_is_near_one() -> None:
     assert aside.turn_rate_rad_s == MOST_TURN_RAD_S
 
 
-def test_a_pilot_says_how_many_waypoints_it_has_reached_over_all_loops() -> None:
+def test_a_follower_counts_the_waypoints_reached_over_all_loops() -> None:
     pilot = WaypointFollower("me", [(1.0, 0.0), (0.0, 0.0)], 0.5)
     there_and_back = [0.5, 1.0, 0.5, 0.0, 0.5, 1.0]
     said = [
@@ -89,7 +89,7 @@ def test_a_pilot_says_how_many_waypoints_it_has_reached_over_all_loops() -> None
     assert said == [0, 1, 1, 2, 2, 3]
 
 
-def test_a_lost_pilot_looks_around_on_the_spot() -> None:
+def test_a_lost_robot_turns_on_the_spot() -> None:
     pilot = WaypointFollower("me", [(5.0, 0.0)], 0.5)
     (command,) = pilot.command(located(HERE, COMMAND_NS, lost="for a test"))
     assert command.speed_m_s == 0.0

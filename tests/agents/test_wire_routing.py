@@ -95,7 +95,7 @@ def test_the_robot_in_the_middle_is_helped_and_helps() -> None:
     assert received(best) == 0
 
 
-def test_without_a_worse_listener_nobody_sends_anything() -> None:
+def test_without_a_worse_subscriber_no_robot_sends_anything() -> None:
     with wired(team_with(best=GOOD, second=GOOD, worst=GOOD)) as robots:
         robots.exchange(40)
         wait_until(lambda: all(total(r.up, Kind.KEEP_ALIVE) for r in robots.links.values()))
@@ -109,7 +109,7 @@ def test_both_ways_the_same_robots_do_send() -> None:
         robots.exchange_until(lambda: all(sent(link) > 0 for link in robots.links.values()))
 
 
-def test_who_is_lost_is_helped_by_all_and_who_finds_itself_helps() -> None:
+def test_a_lost_robot_gets_fixes_from_all_and_sends_fixes_once_it_is_localized() -> None:
     """`worst` is carried away from where it knew it was."""
     here = 3.0, 3.0
     marks = [seen_between("oak", here, (4.0, 0.0)), seen_between("elm", here, (0.0, 4.0))]

@@ -241,7 +241,7 @@ def test_the_price_rises_with_each_message_and_falls_while_nothing_is_sent(
     assert later[-1] < LEAST < later[0]
 
 
-def test_the_price_does_not_fall_while_only_the_limits_hold_back_what_is_worth_it() -> None:
+def test_the_price_does_not_fall_while_only_the_limits_hold_back_messages() -> None:
     budget = Budget(BudgetSettings(messages_per_minute=4.0, urgent_share=0.0), 0)
     assert len(granted(budget, [Wish(0, FIX)] * 5)) == 4
     price = budget.price(0, FIX)
@@ -295,7 +295,7 @@ TEN_MINUTES_OF = [
 
 @pytest.mark.parametrize(("settings", "match_hz", "whole"), TEN_MINUTES_OF)
 @pytest.mark.parametrize("seed", range(3))
-def test_at_a_price_the_budget_is_used_for_what_is_worth_more(
+def test_with_a_price_the_budget_is_used_for_larger_gains(
     seed: int, settings: BudgetSettings, match_hz: float | None, whole: float
 ) -> None:
     values = np.random.default_rng(seed).exponential(1.0, 3000).tolist()
@@ -313,7 +313,7 @@ def test_at_a_price_the_budget_is_used_for_what_is_worth_more(
 
 @examples(200)
 @given(st.floats(1.0, 1000.0), st.floats(0.1, 60.0), st.floats(0.001, 5.0), WISHES)
-def test_spending_tells_how_near_the_robot_came_to_each_limit(
+def test_spending_contains_the_largest_use_of_each_limit(
     bytes_per_s: float, per_minute: float, match_hz: float, wishes: list[Wish]
 ) -> None:
     budget = Budget(

@@ -106,7 +106,7 @@ def test_a_message_reaches_the_subscriptions_that_include_its_key_and_no_other(p
     assert [ear.samples for ear in excluding] == [[]] * len(EXCLUDING)
 
 
-def test_a_session_does_not_hear_itself(pair: Pair) -> None:
+def test_a_session_does_not_receive_its_own_messages(pair: Pair) -> None:
     own, others = Subscription(pair.one, "a/*"), Subscription(pair.other, "a/*")
     deliver(pair, "a/one", b"from one")
     deliver(Pair(pair.other, pair.one), "a/other", b"from other")
@@ -129,7 +129,7 @@ def test_payloads_arrive_unchanged_and_in_order(pair: Pair) -> None:
 # Matching and closing ---------------------------------------------------------------------------
 
 
-def test_matching_tells_whether_anybody_listens(pair: Pair) -> None:
+def test_matching_is_whether_there_is_a_subscriber(pair: Pair) -> None:
     publisher = pair.one.publisher("a/b", RELIABLE)
     assert not publisher.matching
     ear = Subscription(pair.other, "a/*")
@@ -146,7 +146,7 @@ def test_the_publishers_own_session_and_other_keys_do_not_match(pair: Pair) -> N
     assert not asked.matching
 
 
-def test_a_closed_subscription_hears_nothing_more(pair: Pair) -> None:
+def test_a_closed_subscription_receives_nothing_more(pair: Pair) -> None:
     closed, witness = Subscription(pair.other, "a/*"), Subscription(pair.other, "a/b")
     closed.close()
     deliver(pair, "a/b")
@@ -154,7 +154,7 @@ def test_a_closed_subscription_hears_nothing_more(pair: Pair) -> None:
     assert closed.samples == []
 
 
-def test_a_closed_publisher_says_nothing_more(pair: Pair) -> None:
+def test_a_closed_publisher_publishes_nothing_more(pair: Pair) -> None:
     ear = Subscription(pair.other, "a/b")
     publisher = pair.one.publisher("a/b", RELIABLE)
     wait_until(lambda: publisher.matching)
@@ -166,7 +166,7 @@ def test_a_closed_publisher_says_nothing_more(pair: Pair) -> None:
     assert ear.payloads == [b"last"]
 
 
-def test_a_closed_session_says_nothing_more(pair: Pair) -> None:
+def test_a_closed_session_publishes_nothing_more(pair: Pair) -> None:
     ear = Subscription(pair.other, "a/b")
     publisher = pair.one.publisher("a/b", RELIABLE)
     wait_until(lambda: publisher.matching)
@@ -244,7 +244,7 @@ def test_a_token_and_a_watcher_outlive_their_handles(pair: Pair) -> None:
     assert [alive for key, alive in events if key == "alive/r1"] == [True]
 
 
-def test_a_watcher_hears_of_its_own_keys_only_and_until_it_is_closed(pair: Pair) -> None:
+def test_a_watcher_is_notified_of_its_own_keys_only_and_until_it_is_closed(pair: Pair) -> None:
     other_keys, closed = Watched(pair.other, "alive/r2"), Watched(pair.other, "alive/*")
     witness = Watched(pair.other, "alive/*")
     closed.close()
@@ -258,7 +258,7 @@ def test_a_watcher_hears_of_its_own_keys_only_and_until_it_is_closed(pair: Pair)
 # Zenoh ------------------------------------------------------------------------------------------
 
 
-def test_two_teams_on_one_router_do_not_hear_each_other() -> None:
+def test_two_teams_on_one_router_receive_nothing_from_each_other() -> None:
     endpoint = free_endpoint()
     with (
         open_router("red", [endpoint]),

@@ -130,7 +130,7 @@ def test_a_newer_status_may_have_new_counts() -> None:
 
 
 @of_every_help_type
-def test_an_older_reader_refuses_a_longer_fix_or_belief_and_says_so(kind: type[Help]) -> None:
+def test_an_older_reader_refuses_a_longer_fix_or_belief_with_a_reason(kind: type[Help]) -> None:
     """Fixes and beliefs have no room for more fields: another layout needs another version."""
     payload = encode_help(HELP[kind])
     assert decode_help(KEYS[kind], payload) is not Refusal.GARBAGE

@@ -161,7 +161,7 @@ class Flood:
         self._thread.join()
 
 
-def test_a_flood_is_cut_down_and_the_healthy_robot_is_heard_in_full() -> None:
+def test_a_flood_is_limited_and_all_messages_of_the_healthy_robot_arrive() -> None:
     rate_hz = 50.0
     healthy_fix = topics.FIX.at(robot="victim", tier=7, observer="healthy")
     sent = [n.to_bytes(34, "big") for n in range(40)]

@@ -95,7 +95,7 @@ def test_a_put_that_is_sent_in_fragments_is_data(links: Links) -> None:
         assert 200_000 < total(batches) < 200_500
 
 
-def test_opening_declaring_and_keeping_alive_are_told_apart(links: Links) -> None:
+def test_opening_declaring_and_keeping_alive_are_distinguished(links: Links) -> None:
     relay = links.sent
     assert {b.kind for b in relay.up + relay.down} <= {Kind.OTHER, Kind.KEEP_ALIVE}
     assert total(relay.up, Kind.OTHER) > 50
@@ -196,7 +196,7 @@ def test_a_whole_key_in_a_subscription_saves_the_senders_name(links: Links) -> N
     assert [b.size for b in data(links.received.down)] in ([48], [49])
 
 
-def test_what_robots_tell_each_other_costs_less_than_any_other_topic(links: Links) -> None:
+def test_messages_between_robots_cost_less_than_those_of_any_other_topic(links: Links) -> None:
     sizes = {}
     for qos in Qos:
         before = len(data(links.sent.up))

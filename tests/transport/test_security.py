@@ -72,7 +72,7 @@ SAID = {R1: OWN_ROBOT, TRIPOD: OWN_OBSERVER, FIELD: OWN_FIELD, OPERATOR: set[str
 
 
 @pytest.mark.parametrize("who", SAID, ids=str)
-def test_a_certificate_says_what_is_its_owners_and_nothing_else(
+def test_a_certificate_permits_to_publish_under_its_owners_keys_only(
     team: Team, endpoint: str, who: Identity
 ) -> None:
     assert who is OPERATOR or SAID[who] < set(KEYS)
@@ -152,7 +152,7 @@ ASKED = (
 
 
 @pytest.mark.parametrize("who", HEARD, ids=str)
-def test_a_certificate_hears_what_is_for_its_owner_and_nothing_else(
+def test_a_certificate_permits_to_receive_what_is_for_its_owner_only(
     team: Team, endpoint: str, who: Identity
 ) -> None:
     """Of all that r1 says, whatever is subscribed to."""
@@ -175,7 +175,7 @@ def test_a_certificate_hears_what_is_for_its_owner_and_nothing_else(
         assert set(everything.keys) == HEARD[OPERATOR]
 
 
-def test_what_a_robot_may_not_hear_is_not_even_sent(team: Team, endpoint: str) -> None:
+def test_messages_that_a_robot_may_not_receive_are_not_even_sent(team: Team, endpoint: str) -> None:
     with (
         closing(session(team, R2, endpoint)) as greedy,
         closing(session(team, R1, endpoint)) as robot,
@@ -199,11 +199,11 @@ def test_the_rules_follow_the_table_of_topics() -> None:
             assert not speaker.own or f"<{speaker.own}>" in topic.key
 
 
-def test_operators_and_routers_say_nothing_of_their_own() -> None:
+def test_operators_and_routers_publish_nothing_of_their_own() -> None:
     assert publish_keys(OPERATOR) == publish_keys(ROUTER) == []
 
 
-def test_who_may_hear_follows_the_table_too() -> None:
+def test_permitted_subscriptions_follow_the_table_too() -> None:
     me = Identity(Role.ROBOT, "me")
     assert set(subscribe_keys(me)) == {
         *("alive/*/*/*", "belief/*/*", "fix/me/*/*", "status/me", "track/me", "look/me"),

@@ -51,7 +51,7 @@ def hears(bus: Bus, speaker: Bus, key: str, within_s: float = PATIENCE_S) -> boo
     return heard
 
 
-def test_a_revoked_robot_neither_says_nor_hears_anything(tmp_path: Path) -> None:
+def test_a_revoked_robot_neither_publishes_nor_receives_anything(tmp_path: Path) -> None:
     team = secured_team(tmp_path)
     stolen = shown_by(team, R2)
     kept = [path.read_bytes() for path in map(Path, stolen)]

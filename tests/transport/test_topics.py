@@ -24,7 +24,7 @@ def test_the_table_holds_every_topic_of_the_module() -> None:
     assert set(TOPICS) == {t for t in vars(topics).values() if isinstance(t, Topic)}
 
 
-def test_no_key_of_one_topic_is_heard_under_another() -> None:
+def test_no_key_of_one_topic_belongs_to_another() -> None:
     for topic in TOPICS:
         concrete = topic.at(robot="r1", tier=3, observer="r2", incarnation="1")
         assert [other for other in TOPICS if matches(other.at(), concrete)] == [topic]
@@ -46,7 +46,7 @@ def test_every_topic_has_a_rate_and_a_reason(topic: Topic) -> None:
 
 
 @per_topic
-def test_what_robots_tell_each_other_has_the_priority_that_costs_nothing(topic: Topic) -> None:
+def test_messages_between_robots_have_the_priority_that_costs_nothing(topic: Topic) -> None:
     priority = getattr(zenoh.Priority, topic.qos.value.priority)
     helps = topic.carries in topics.COLLABORATION
     assert (priority == zenoh.Priority.DEFAULT) is helps
@@ -86,7 +86,7 @@ def test_worked_examples_of_keys() -> None:
 
 
 @pytest.mark.parametrize("own", TIERS)
-def test_only_better_tiers_are_heard(own: int) -> None:
+def test_a_robot_subscribes_only_to_better_tiers(own: int) -> None:
     tiers = accepted_tiers(own, CollaborationSettings())
     beliefs = [topics.BELIEF.at(tier=t) for t in tiers]
     fixes = [topics.FIX.at(robot="me", tier=t) for t in tiers]
@@ -97,7 +97,7 @@ def test_only_better_tiers_are_heard(own: int) -> None:
         assert not heard(topics.FIX.at(robot="you", tier=theirs, observer="r1"), fixes)
 
 
-def test_all_tiers_are_heard_both_ways() -> None:
+def test_with_both_ways_a_robot_subscribes_to_all_tiers() -> None:
     tiers = accepted_tiers(0, CollaborationSettings(direction="both-ways"))
     patterns = [topics.BELIEF.at(tier=t) for t in tiers]
     assert all(heard(topics.BELIEF.at(tier=t, robot="r1"), patterns) for t in TIERS)

@@ -1,1 +1,1 @@
-"""What robots say to each other, under which keys, and the bus that carries it."""
+"""The messages between robots, their keys, and the bus that carries them."""

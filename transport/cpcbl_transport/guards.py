@@ -13,7 +13,7 @@ each robot has its own share, and a flood ends at the router. What was measured:
 
 Inputs have a limit of size but none of rate: a lost piece of odometry is a lost piece of the way,
 they come in bursts after every stall, and reach one robot only, whose inbox has a bound. Status and
-tracks are for people; no robot hears them.
+tracks are for people; no robot subscribes to them.
 """
 
 from typing import Any

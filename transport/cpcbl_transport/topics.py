@@ -120,7 +120,7 @@ ALIVE = Topic(
     None,
     "at a change of tier",
     Qos.COMMAND,
-    "a liveliness token: the bus tells when it comes and goes; presence, not health",
+    "a liveliness token: the bus reports when it appears and disappears; presence, not health",
     publishers=_robots_and_observers("robot"),
     subscribers=_robots_and_observers(),
 )
@@ -136,7 +136,7 @@ BELIEF = Topic(
 FIX = Topic(
     "fix/<robot>/<tier>/<observer>",
     Fix,
-    "each sighting of a worse robot that listens",
+    "each sighting of a worse robot that subscribes",
     Qos.FRESH,
     "the next one is better than a late one",
     publishers=_robots_and_observers("observer"),
