@@ -6,7 +6,7 @@ a parallel line (figure 3). Every constraint is linearized at the same prior:
     residual = row . (true pose - prior pose) + noise of `sigma`
 
 `row` is the normal of the curve at its point closest to the prior (figure 1 c); where the heading
-matters, the row's third entry is its lever (docs/algorithm.md, resolution a).
+matters, the row's third entry is its lever (docs/paper.md, resolution a).
 
 `circle`, `ray` and `heading` are the formulas. They take (dx, dy), the object's position minus the
 robot's in the field's frame (m), and return plain numbers, for the loop over landmarks; the other

@@ -68,8 +68,8 @@ def sighting_gaussian(
 ) -> Gaussian2:
     """A sighting as a Gaussian in the robot's frame, the major axis along the line of sight.
 
-    x = r cos a, y = r sin a (equations 2a, 2b); sigma_maj = sigma_r, sigma_min = r sin sigma_a
-    (equations 1a, 1b), r for a bearing that is not known at all.
+    x = r cos a, y = r sin a (equation 1); sigma_maj = sigma_r, sigma_min = r sin sigma_a (equation
+    2), and r for a bearing that is not known at all.
     """
     across_m = range_m * math.sin(min(bearing_sigma, 0.5 * math.pi))
     return Gaussian2(

@@ -70,6 +70,13 @@ def test_relative_links_lead_to_a_file_and_a_heading(document: Path) -> None:
             assert anchor in anchors(page), target
 
 
+def test_pages_that_the_code_names_exist() -> None:
+    for folder in ("cpcbl_team", "transport", "agents", "launch", "tests"):
+        for source in (ROOT / folder).rglob("*.py"):
+            for page in re.findall(r"\bdocs/\w+\.md", source.read_text()):
+                assert (ROOT / page).exists(), f"{source}: {page}"
+
+
 @pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.name)
 def test_paths_and_the_names_behind_them_exist(document: Path) -> None:
     """A reference is `path` or `path: name, Class.name`, from the root of the repository."""
