@@ -67,8 +67,8 @@ def outcome(results: Results) -> Outcome:
 
 
 def pattern(figures: Mapping[str, Accuracy], most_share: float = 0.4) -> dict[str, bool]:
-    """What the paper found (docs/paper.md, row 44), with bounds; E has at most this share of C's error.
-    Nothing holds without figures."""
+    """What the paper found (docs/paper.md, row 44), with bounds; E has at most this share of
+    C's error. Nothing holds without figures."""
     mean = {c: f.position_mean_m for c, f in figures.items()}
     heading = {c: f.heading_mean_deg for c, f in figures.items()}
     inside = [figures[c].inside_3_sigma for c in "CDEF"]
