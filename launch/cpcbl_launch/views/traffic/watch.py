@@ -21,9 +21,8 @@ from cpcbl_launch.reporting.flows import (
     summed_spending,
 )
 from cpcbl_launch.reporting.trust_report import TrustReport, trust_reports
-from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus
-from cpcbl_transport.decoding import decode
+from cpcbl_transport.decoding import Received, Subscriber
 from cpcbl_transport.messages import Flow, Status
 from cpcbl_transport.security import Link
 from cpcbl_transport.zenoh_bus import BusError, open_bus
@@ -170,15 +169,11 @@ class StatusCollector:
     def __init__(self, bus: Bus, now_s: Callable[[], float] = time.monotonic) -> None:
         self._now_s, self._lock = now_s, threading.Lock()
         self._arrivals: dict[str, list[Arrival]] = {}
-        self._refused: Counter[str] = Counter()
-        bus.subscribe(topics.STATUS.at(), self._receive)
+        self._subscriber = Subscriber(bus, Status, self._receive)
 
-    def _receive(self, key: str, payload: bytes) -> None:
-        status = decode(key, payload)
+    def _receive(self, received: Received[Status]) -> None:
+        status = received.message
         with self._lock:
-            if not isinstance(status, Status):
-                self._refused[str(status)] += 1
-                return
             seen = self._arrivals.get(status.robot, [])
             kept = [a for a in seen if _is_same_process(a.status, status)]
             self._arrivals[status.robot] = [*kept, Arrival(self._now_s(), status)]
@@ -186,8 +181,7 @@ class StatusCollector:
     @property
     def refused(self) -> Counter[str]:
         """What could not be used, by reason."""
-        with self._lock:
-            return self._refused.copy()
+        return self._subscriber.refused
 
     def arrivals(self) -> dict[str, list[Arrival]]:
         """By robot: its process's statuses of the last seconds, at least the latest."""
