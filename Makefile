@@ -1,12 +1,12 @@
 # make demo: a team of robots for half a minute.   make test: format, lint, types, layers, tests.
-# make net: stores what the localizer computes now as the reference of tests/net, and prints what has
-#   moved; only for a change that is meant to move numbers.
-# make bench: what a cycle costs, beside other filters.
+# make quick: the tests of the core and of what runs in memory.   make bench: what a cycle costs.
+# CONTRIBUTING.md lists every target, with the time that it takes.
 PYTHON ?= python3
 VENV ?= .venv
 BIN = $(VENV)/bin
 
-.PHONY: setup demo test check unit test-long test-compiled test-docker chaos net compiled bench clean
+.PHONY: setup demo test quick check unit test-long test-compiled test-docker test-bench chaos net \
+  fuzz compiled bench bench-latency bench-processes clean
 
 setup: $(VENV)/ready
 
@@ -21,14 +21,22 @@ demo: setup
 
 test: check unit
 
+# The core and what runs in memory: no process, no Zenoh session, no camera, no calibration.
+quick: setup
+	$(BIN)/pytest -n 2 -q -m "$(USUAL) and not process" tests/core tests/net tests/transport \
+	  tests/agents tests/launch --ignore tests/agents/vision --ignore tests/launch/calibration
+
 check: setup
 	$(BIN)/ruff format --check
 	$(BIN)/ruff check
 	$(BIN)/mypy
 	PYTHONPATH=.:agents:transport:launch $(BIN)/lint-imports --no-cache
 
+# More workers than cores: many tests wait for the processes that they started.
 unit: setup
-	$(BIN)/pytest -n 2 -m "not long and not log and not pictures and not docker"
+	$(BIN)/pytest -n 4 --dist worksteal -m "$(USUAL)"
+
+USUAL = not long and not log and not pictures and not docker
 
 # Minutes long; with CPCBL_MRCLAM=folder also on real logs, with CPCBL_PICTURES=folder real pictures.
 test-long: setup
@@ -67,11 +75,15 @@ compiled: setup
 	cd $(COMPILED) && MYPYPATH=../../tests $(abspath $(BIN))/mypyc --namespace-packages \
 	  --explicit-package-bases --ignore-missing-imports benchmarks/float_ekf.py > mypyc.log
 
-# First that all of them compute the same. Then timed, so alone on the machine: the localizer's
-# variants and their peers in the same run, then a robot's eyes and OpenCV's marker detection.
-bench: setup compiled
+# The variants of the localizer and their peers of the extra `bench` compute the same.
+test-bench: setup compiled
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev,bench]'
-	$(BIN)/pytest -q tests/benchmarks
+	$(BIN)/pytest -q tests/benchmarks/test_contenders.py tests/benchmarks/test_compiled.py \
+	  tests/benchmarks/test_viewers.py
+
+# Timed, so alone on the machine: the localizer's variants and their peers in the same run, then a
+# robot's detector and OpenCV's marker detection.
+bench: test-bench
 	@mkdir -p build
 	$(call timed,cycle,bench)
 	$(call timed,eyes,bench_eyes)

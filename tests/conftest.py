@@ -7,6 +7,8 @@ import pytest
 from hypothesis import HealthCheck, settings
 from support.children import adopt_orphans, children, end
 
+REAL = {"subprocess", "cpcbl_team", "patient_up", "PROGRAM", "open_bus", "open_router", "running"}
+
 settings.register_profile("untimed", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("untimed")
 
@@ -21,6 +23,14 @@ def pytest_configure() -> None:
     if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:
         signal.signal(signal.SIGHUP, lambda number, frame: None)
     adopt_orphans()
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Marks the tests of modules that start processes or open Zenoh sessions: `process`."""
+    for item in items:
+        module = getattr(item, "module", None)
+        if REAL & vars(module).keys():
+            item.add_marker("process")
 
 
 @pytest.fixture(autouse=True, scope="module")
