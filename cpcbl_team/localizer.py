@@ -261,12 +261,14 @@ class Localizer:
         memory, place = state.memory.calibration, state.odometry_from_robot
         here = ReferencePose(state.stamp_ns, state.estimate, place, memory.total_turn_rad)
         if state.memory.recovery.lost:
-            memory = memory._replace(anchors=None)
-        elif memory.anchors is None:
-            memory = memory._replace(anchors=ReferencePoses(here, here))
+            memory = memory._replace(references=None)
+        elif memory.references is None:
+            memory = memory._replace(references=ReferencePoses(here, here))
         else:
-            known, anchors = self_calibrate(memory.learned, memory.anchors, here, self._odometry)
-            memory = memory._replace(learned=known, anchors=anchors)
+            known, references = self_calibrate(
+                memory.learned, memory.references, here, self._odometry
+            )
+            memory = memory._replace(learned=known, references=references)
         return with_memory(state, state.memory._replace(calibration=memory))
 
     # Teammates and the position sensor --------------------------------------------------------

@@ -259,7 +259,7 @@ class Recovery:
         memory = memory._replace(
             recovery=recovery._replace(lost=""),
             teammates=teammates._replace(senders=reset_scores(teammates.senders)),
-            calibration=calibration._replace(anchors=None),
+            calibration=calibration._replace(references=None),
         )
         updates = state.updates._replace(innovations=1)
         return state._replace(estimate=self._reduce(estimate), updates=updates, memory=memory)

@@ -112,7 +112,7 @@ class CalibrationMemory(NamedTuple):
     """What a self-calibrating robot has learned, and what it compares next."""
 
     learned: SelfCalibration = SelfCalibration()
-    anchors: ReferencePoses | None = None
+    references: ReferencePoses | None = None
     total_turn_rad: float = 0.0  # of the odometry since the start
 
 

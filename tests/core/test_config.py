@@ -16,7 +16,7 @@ from cpcbl_team.config import (
 )
 
 
-def test_a_fields_bounds_hold_its_landmarks_and_walls() -> None:
+def test_the_bounds_of_a_field_contain_its_landmarks_and_walls() -> None:
     assert CORNERS.bounds() == (-4.5, -2.5, 4.5, 2.5)
     assert MIXED.bounds() == (-5.0, -3.0, 5.0, 2.6)
     assert Field().bounds() == (0.0, 0.0, 0.0, 0.0)
@@ -37,7 +37,7 @@ def test_a_wall_has_the_direction_from_one_end_to_the_other() -> None:
         ("oval", False, False),
     ],
 )
-def test_all_variants_but_the_joint_one_alternate_unless_told(
+def test_all_variants_but_joint_alternate_by_default(
     variant: Variant, alternate: bool | None, alternates: bool
 ) -> None:
     assert LocalizerSettings(variant=variant, alternate=alternate).alternates is alternates
@@ -58,11 +58,11 @@ def test_all_variants_but_the_joint_one_alternate_unless_told(
         {"start": {"x_m": 1.0}},
     ],
 )
-def test_settings_that_make_no_sense_are_refused(table: dict[str, Any]) -> None:
+def test_invalid_settings_are_refused(table: dict[str, Any]) -> None:
     with pytest.raises(msgspec.ValidationError):
         msgspec.convert(table, LocalizationSettings)
 
 
-def test_settings_are_optional() -> None:
+def test_all_settings_have_defaults() -> None:
     assert msgspec.convert({}, RobotSettings) == RobotSettings()
     assert msgspec.convert({"x_m": 1, "y_m": 2}, Landmark).gives == "both"

@@ -1,4 +1,4 @@
-"""What a robot learns of its wheels and camera: the rule alone, then in the localizer."""
+"""What a robot learns of its odometry and camera: the rule alone, then in the localizer."""
 
 import math
 from collections.abc import Iterable
@@ -59,49 +59,49 @@ scales = st.floats(0.92, 1.08)
 biases = st.floats(math.radians(-3.0), math.radians(3.0))
 
 
-def anchor(
-    pose: Pose2, wheels: Pose2, seconds: float = 1.0, sigma_m: float = 0.01, sigma: float = 0.01
+def reference(
+    pose: Pose2, odometry: Pose2, seconds: float = 1.0, sigma_m: float = 0.01, sigma: float = 0.01
 ) -> ReferencePose:
-    """A moment at which the robot was found at `pose`, and by its wheels at `wheels`."""
+    """A time at which the estimated pose was `pose` and that by odometry `odometry`."""
     estimate = Estimate(pose, diagonal(sigma_m, sigma))
-    return ReferencePose(round(seconds * SECOND), estimate, wheels, wheels.heading)
+    return ReferencePose(round(seconds * SECOND), estimate, odometry, odometry.heading)
 
 
 def both(at: ReferencePose) -> ReferencePoses:
     return ReferencePoses(at, at)
 
 
-BEGIN = both(anchor(ORIGIN, ORIGIN, 0.0))
+BEGIN = both(reference(ORIGIN, ORIGIN, 0.0))
 
 
 # One comparison -----------------------------------------------------------------------------------
 
 
-def test_a_way_shorter_than_the_wheels_said_as_worked_by_hand() -> None:
-    """1 m by the wheels, 0.95 m found: 2 x 0.01^2 of place, 0.05^2 of the way."""
-    now = anchor(Pose2(0.95, 0.0, 0.0), Pose2(1.0, 0.0, 0.0))
-    found, anchors = self_calibrate(SelfCalibration(), BEGIN, now, NOISE)
+def test_a_distance_shorter_than_odometrys_gives_the_scale_computed_by_hand() -> None:
+    """1 m by odometry, 0.95 m by poses: variances 2 x 0.01^2 of poses, 0.05^2 of odometry."""
+    now = reference(Pose2(0.95, 0.0, 0.0), Pose2(1.0, 0.0, 0.0))
+    found, references = self_calibrate(SelfCalibration(), BEGIN, now, NOISE)
     gain = 0.0025 / (0.0025 + 0.0002 + 0.0025)
     assert found.distance_scale == pytest.approx(1.0 - 0.05 * gain)
     assert found.distance_variance == pytest.approx((1.0 - gain) * 0.0025)
     assert found.bearing_bias_rad == 0.0
     assert (found.turn_scale, found.turn_variance) == SelfCalibration()[1:5:3]
-    assert anchors == ReferencePoses(BEGIN.turn, now)
+    assert references == ReferencePoses(BEGIN.turn, now)
 
 
-def test_a_turn_larger_than_the_wheels_said_as_worked_by_hand() -> None:
-    now = anchor(Pose2(0.0, 0.0, 1.3), Pose2(0.0, 0.0, 1.2))
-    found, anchors = self_calibrate(SelfCalibration(), BEGIN, now, NOISE)
+def test_a_turn_larger_than_odometrys_gives_the_scale_computed_by_hand() -> None:
+    now = reference(Pose2(0.0, 0.0, 1.3), Pose2(0.0, 0.0, 1.2))
+    found, references = self_calibrate(SelfCalibration(), BEGIN, now, NOISE)
     around = 0.05**2 * 1.2
     gain = 0.0025 * 1.2 / (1.2**2 * 0.0025 + 0.0002 + around)
     assert found.turn_scale == pytest.approx(1.0 + 0.1 * gain)
     assert found.turn_variance == pytest.approx((1.0 - 1.2 * gain) * 0.0025)
-    assert anchors.turn == now
+    assert references.turn == now
 
 
-def test_a_way_aside_of_the_heading_is_a_bias_of_bearings_as_worked_by_hand() -> None:
+def test_a_motion_beside_the_heading_gives_the_bearing_bias_computed_by_hand() -> None:
     aside = math.radians(2.0)
-    now = anchor(Pose2(math.cos(aside), math.sin(aside), 0.0), Pose2(1.0, 0.0, 0.0))
+    now = reference(Pose2(math.cos(aside), math.sin(aside), 0.0), Pose2(1.0, 0.0, 0.0))
     found, _ = self_calibrate(SelfCalibration(), BEGIN, now, NOISE)
     variance = math.radians(1.5) ** 2
     gain = variance / (variance + 0.01**2 + 0.0002 + 0.05**2 / 3.0)
@@ -111,44 +111,44 @@ def test_a_way_aside_of_the_heading_is_a_bias_of_bearings_as_worked_by_hand() ->
 
 
 @pytest.mark.parametrize("across_m", [-0.05, 0.05])
-def test_an_error_across_the_way_does_not_lengthen_it(across_m: float) -> None:
-    """It would on average: there is one at both ends of each way."""
-    now = anchor(Pose2(0.8, across_m, 0.0), Pose2(0.8, 0.0, 0.0))
+def test_an_error_across_the_motion_does_not_change_the_scale(across_m: float) -> None:
+    """Otherwise all scales would be too large: both ends of each distance have such an error."""
+    now = reference(Pose2(0.8, across_m, 0.0), Pose2(0.8, 0.0, 0.0))
     found, _ = self_calibrate(SelfCalibration(), BEGIN, now, NOISE)
     assert found.distance_scale == pytest.approx(1.0, abs=1e-12)
     assert found.bearing_bias_rad * across_m > 0.0
 
 
-def test_backwards_is_no_turn_about() -> None:
-    now = anchor(Pose2(-0.95, 0.0, 0.0), Pose2(-1.0, 0.0, 0.0))
+def test_driving_backwards_is_not_a_turn() -> None:
+    now = reference(Pose2(-0.95, 0.0, 0.0), Pose2(-1.0, 0.0, 0.0))
     found, _ = self_calibrate(SelfCalibration(), BEGIN, now, NOISE)
     assert found.distance_scale < 1.0
     assert found.bearing_bias_rad == pytest.approx(0.0)
 
 
-@pytest.mark.parametrize("wheels", [Pose2(0.5, 0.0, 0.6), Pose2(0.0, 0.6, 0.0), ORIGIN])
-def test_too_little_motion_is_not_compared(wheels: Pose2) -> None:
-    now = anchor(ORIGIN, wheels)
+@pytest.mark.parametrize("odometry", [Pose2(0.5, 0.0, 0.6), Pose2(0.0, 0.6, 0.0), ORIGIN])
+def test_too_little_motion_is_not_compared(odometry: Pose2) -> None:
+    now = reference(ORIGIN, odometry)
     assert self_calibrate(SelfCalibration(), BEGIN, now, NOISE) == (SelfCalibration(), BEGIN)
 
 
-def test_after_too_much_of_a_turn_the_way_is_compared_from_there() -> None:
-    now = anchor(Pose2(0.9, 0.5, 0.9), Pose2(1.0, 0.5, 0.9))
-    found, anchors = self_calibrate(SelfCalibration(), BEGIN, now, NOISE)
-    assert (found, anchors) == (SelfCalibration(), ReferencePoses(BEGIN.turn, now))
+def test_after_a_large_turn_the_distance_starts_anew() -> None:
+    now = reference(Pose2(0.9, 0.5, 0.9), Pose2(1.0, 0.5, 0.9))
+    found, references = self_calibrate(SelfCalibration(), BEGIN, now, NOISE)
+    assert (found, references) == (SelfCalibration(), ReferencePoses(BEGIN.turn, now))
 
 
-@pytest.mark.parametrize("wheels", [Pose2(1.0, 0.0, 0.0), Pose2(0.0, 0.0, 1.2)])
-def test_where_nothing_was_renewed_nothing_is_learned(wheels: Pose2) -> None:
-    """The robot was only found as well as odometry alone would have left it."""
-    now = anchor(Pose2(0.9, 0.1, 1.0), wheels, sigma_m=0.2, sigma=0.2)
-    found, anchors = self_calibrate(SelfCalibration(), BEGIN, now, NOISE)
+@pytest.mark.parametrize("odometry", [Pose2(1.0, 0.0, 0.0), Pose2(0.0, 0.0, 1.2)])
+def test_an_inaccurate_pose_changes_nothing(odometry: Pose2) -> None:
+    """The pose is no more accurate than by odometry alone."""
+    now = reference(Pose2(0.9, 0.1, 1.0), odometry, sigma_m=0.2, sigma=0.2)
+    found, references = self_calibrate(SelfCalibration(), BEGIN, now, NOISE)
     assert found == SelfCalibration()
-    assert now in anchors
+    assert now in references
 
 
 @pytest.mark.parametrize(
-    ("pose", "wheels"),
+    ("pose", "odometry"),
     [
         (Pose2(0.5, 0.0, 0.0), Pose2(1.0, 0.0, 0.0)),
         (Pose2(0.0, 0.0, 2.0), Pose2(0.0, 0.0, 1.2)),
@@ -156,13 +156,13 @@ def test_where_nothing_was_renewed_nothing_is_learned(wheels: Pose2) -> None:
     ],
     ids=["way", "turn", "aside"],
 )
-def test_what_is_beyond_the_gate_teaches_nothing(pose: Pose2, wheels: Pose2) -> None:
-    found, _ = self_calibrate(SelfCalibration(), BEGIN, anchor(pose, wheels), NOISE)
+def test_a_comparison_beyond_the_gate_changes_nothing(pose: Pose2, odometry: Pose2) -> None:
+    found, _ = self_calibrate(SelfCalibration(), BEGIN, reference(pose, odometry), NOISE)
     assert found[:3] == pytest.approx((1.0, 1.0, 0.0))
 
 
-def test_anchors_move_on_when_they_are_old() -> None:
-    late, later = (anchor(ORIGIN, ORIGIN, LONGEST_NS / SECOND + more) for more in (0.0, 0.01))
+def test_old_references_are_replaced() -> None:
+    late, later = (reference(ORIGIN, ORIGIN, LONGEST_NS / SECOND + more) for more in (0.0, 0.01))
     assert self_calibrate(SelfCalibration(), BEGIN, late, NOISE) == (SelfCalibration(), BEGIN)
     assert self_calibrate(SelfCalibration(), BEGIN, later, NOISE) == (
         SelfCalibration(),
@@ -175,38 +175,38 @@ def test_anchors_move_on_when_they_are_old() -> None:
         st.tuples(poses, poses, st.floats(1e-3, 0.5), st.floats(1e-3, 0.5)), min_size=1, max_size=8
     )
 )
-def test_variances_only_shrink(moments: list[tuple[Pose2, Pose2, float, float]]) -> None:
-    so_far, anchors = SelfCalibration(), BEGIN
-    for i, (pose, wheels, sigma_m, sigma) in enumerate(moments):
-        now = anchor(pose, wheels, i + 1.0, sigma_m, sigma)
-        found, anchors = self_calibrate(so_far, anchors, now, NOISE)
-        for after, before in zip(found[3:], so_far[3:], strict=True):
+def test_variances_never_grow(moments: list[tuple[Pose2, Pose2, float, float]]) -> None:
+    known, references = SelfCalibration(), BEGIN
+    for i, (pose, odometry, sigma_m, sigma) in enumerate(moments):
+        now = reference(pose, odometry, i + 1.0, sigma_m, sigma)
+        found, references = self_calibrate(known, references, now, NOISE)
+        for after, before in zip(found[3:], known[3:], strict=True):
             assert 0.0 < after <= before
         assert all(math.isfinite(v) for v in found)
-        so_far = found
+        known = found
 
 
 # Many comparisons ---------------------------------------------------------------------------------
 
 
-def taught(
+def calibrated(
     legs: Iterable[tuple[float, float]], distance_scale: float, turn_scale: float, bias: float
 ) -> SelfCalibration:
-    """After these true legs of 10 s; wheels report true / scale, bearings are too large.
+    """After these true legs of 10 s; odometry report true / scale, bearings are too large.
 
     As in the localizer, what is known already corrects the readings that come next.
     """
-    so_far, anchors, truth, wheels = SelfCalibration(), BEGIN, ORIGIN, ORIGIN
+    known, references, truth, odometry = SelfCalibration(), BEGIN, ORIGIN, ORIGIN
     for i, (distance, turn) in enumerate([(0.0, 0.0), *legs]):
         truth = step(truth, distance, turn)
-        distance *= so_far.distance_scale / distance_scale
-        wheels = step(wheels, distance, so_far.turn_scale * turn / turn_scale)
-        heading = truth.heading - (bias - so_far.bearing_bias_rad)
-        now = anchor(truth._replace(heading=heading), wheels, 10.0 * i, 1e-5, 1e-5)
+        distance *= known.distance_scale / distance_scale
+        odometry = step(odometry, distance, known.turn_scale * turn / turn_scale)
+        heading = truth.heading - (bias - known.bearing_bias_rad)
+        now = reference(truth._replace(heading=heading), odometry, 10.0 * i, 1e-5, 1e-5)
         if i == 0:
-            anchors = both(now)
-        so_far, anchors = self_calibrate(so_far, anchors, now, EXACT)
-    return so_far
+            references = both(now)
+        known, references = self_calibrate(known, references, now, EXACT)
+    return known
 
 
 TURNS = [(0.0, 1.2), (0.0, -1.2)] * 4
@@ -217,17 +217,19 @@ STRAIGHT = [(1.0, 0.0)] * 8
 def test_scales_and_bias_are_recovered_from_exact_poses(
     distance_scale: float, turn_scale: float, bias: float
 ) -> None:
-    found = taught(STRAIGHT + TURNS, distance_scale, turn_scale, bias)
+    found = calibrated(STRAIGHT + TURNS, distance_scale, turn_scale, bias)
     assert found.distance_scale == pytest.approx(distance_scale, abs=2e-3)
     assert found.turn_scale == pytest.approx(turn_scale, abs=2e-4)
     assert found.bearing_bias_rad == pytest.approx(bias, abs=2e-4)
-    assert taught(STRAIGHT + TURNS, 1.0, 1.0, 0.0)[:3] == pytest.approx((1.0, 1.0, 0.0), abs=1e-9)
+    assert calibrated(STRAIGHT + TURNS, 1.0, 1.0, 0.0)[:3] == pytest.approx(
+        (1.0, 1.0, 0.0), abs=1e-9
+    )
 
 
 @pytest.mark.parametrize("turn", [2.0, 3.5, 5.0, 8.0, -3.5])
-def test_turns_between_two_updates_are_not_taken_for_others(turn: float) -> None:
-    """Beyond half a circle nothing is learned: the headings tell another turn than the wheels."""
-    robot, true_scale = robot_that(True), 1.05
+def test_an_ambiguous_turn_is_not_compared(turn: float) -> None:
+    """Beyond half a circle the headings give another turn than odometry."""
+    robot, true_scale = calibrating_robot(True), 1.05
     truth, state = LOOP_START, robot.start(0)
     for i in range(30):
         from_ns, until_ns = 5 * SECOND * i, 5 * SECOND * (i + 1)
@@ -254,13 +256,13 @@ class Drive(NamedTuple):
     rmse_m: float
 
 
-def robot_that(learns: bool, variant: Variant = "joint") -> Localizer:
+def calibrating_robot(learns: bool, variant: Variant = "joint") -> Localizer:
     rules = LocalizerSettings(variant=variant, self_calibration=learns)
     return localizer(rules=rules, start=START, sensor=CAMERA, odometry=WHEELS)
 
 
 def reported(rng: np.random.Generator, distance: float, turn: float) -> tuple[float, float]:
-    """What wheels that are off by the scales, and noisy as modelled, say of a true motion."""
+    """The odometry of a true motion, with wrong scales and the noise of the model."""
     along = WHEELS.distance_sigma_m_per_sqrt_m * math.sqrt(distance)
     around = math.hypot(
         WHEELS.turn_sigma_rad_per_sqrt_rad * math.sqrt(abs(turn)),
@@ -300,10 +302,13 @@ def driven(robot: Localizer, seed: int) -> Drive:
 @pytest.fixture(scope="module")
 def runs() -> list[tuple[Drive, Drive]]:
     """With self-calibration and without, on the same inputs."""
-    return [(driven(robot_that(True), s), driven(robot_that(False), s)) for s in range(SEEDS)]
+    return [
+        (driven(calibrating_robot(True), s), driven(calibrating_robot(False), s))
+        for s in range(SEEDS)
+    ]
 
 
-def test_wheels_and_camera_are_found_out_while_driving(runs: list[tuple[Drive, Drive]]) -> None:
+def test_scales_and_bias_are_estimated_while_driving(runs: list[tuple[Drive, Drive]]) -> None:
     for on, _ in runs:
         known = on.state.memory.calibration.learned
         for value, variance, true in zip(known[:3], known[3:], TRUE, strict=True):
@@ -313,22 +318,22 @@ def test_wheels_and_camera_are_found_out_while_driving(runs: list[tuple[Drive, D
     assert np.all(np.abs(scales - TRUE[:2]).mean(axis=0) < 0.5 * off)
 
 
-def test_a_robot_that_learns_knows_better_where_it_is(runs: list[tuple[Drive, Drive]]) -> None:
+def test_self_calibration_reduces_the_position_error(runs: list[tuple[Drive, Drive]]) -> None:
     on, off = (np.mean([run.rmse_m for run in side]) for side in zip(*runs, strict=True))
     assert on < 0.9 * off
 
 
-def test_a_robot_that_does_not_learn_remembers_nothing_of_it(
+def test_without_self_calibration_nothing_is_remembered(
     runs: list[tuple[Drive, Drive]],
 ) -> None:
     for _, off in runs:
         assert off.state.memory.calibration.learned == SelfCalibration()
-        assert off.state.memory.calibration.anchors is None
+        assert off.state.memory.calibration.references is None
 
 
 @pytest.mark.parametrize("variant", PROBABILISTIC)
-def test_nothing_is_learned_where_nothing_is_wrong(variant: Variant) -> None:
-    robot = robot_that(True, variant)
+def test_correct_odometry_and_bearings_stay_unchanged(variant: Variant) -> None:
+    robot = calibrating_robot(True, variant)
     for state, _ in followed(robot, robot.start(0), LOOP_START, loop()):
         found = state.memory.calibration.learned
         assert found[:3] == pytest.approx((1.0, 1.0, 0.0), abs=1e-9)
@@ -338,11 +343,11 @@ def test_nothing_is_learned_where_nothing_is_wrong(variant: Variant) -> None:
 
 
 @pytest.mark.parametrize("learns", [True, False])
-def test_what_is_known_corrects_wheels_and_bearings(learns: bool) -> None:
+def test_the_calibration_corrects_odometry_and_bearings(learns: bool) -> None:
     known = SelfCalibration(0.9, 0.8, 0.1)
     before = state_at(ORIGIN, diagonal(0.1, 0.05))
     before = before._replace(memory=Memory(calibration=CalibrationMemory(known)))
-    robot = robot_that(learns)
+    robot = calibrating_robot(learns)
     moved = robot.predict(robot.add_odometry(before, Odometry(0, SECOND, 1.0, 0.5)), SECOND)
     expected = step(ORIGIN, 0.9, 0.4) if learns else step(ORIGIN, 1.0, 0.5)
     assert moved.estimate.pose == pytest.approx(expected)
@@ -351,33 +356,35 @@ def test_what_is_known_corrects_wheels_and_bearings(learns: bool) -> None:
     assert (abs(seen.heading) < 1e-9) is learns
 
 
-def test_a_robot_that_was_lost_compares_with_nothing_before() -> None:
-    """Carried elsewhere, it finds itself by what it sees there; the way there was not driven."""
-    robot, elsewhere = robot_that(True), Pose2(1.5, 1.0, 2.0)
+def test_a_robot_that_was_lost_starts_with_new_references() -> None:
+    """The robot is carried elsewhere and finds its pose there; it did not drive this distance."""
+    robot, elsewhere = calibrating_robot(True), Pose2(1.5, 1.0, 2.0)
     *_, (before, _) = followed(robot, robot.start(0), LOOP_START, loop()[:100])
-    assert before.memory.calibration.anchors is not None
+    assert before.memory.calibration.references is not None
     assert before.memory.calibration.learned != SelfCalibration()
     *_, (last, truth) = followed(robot, before, elsewhere, [(0.0, 0.0)] * 100)
     assert last.counts["found_again"] >= 1
     assert position_error(last.estimate, truth) < 0.2
     assert last.memory.calibration.learned == before.memory.calibration.learned
-    assert last.memory.calibration.anchors is not None
+    assert last.memory.calibration.references is not None
     assert all(
-        position_error(at.estimate, elsewhere) < 0.5 for at in last.memory.calibration.anchors
+        position_error(at.estimate, elsewhere) < 0.5 for at in last.memory.calibration.references
     )
 
 
-def test_while_a_robot_is_lost_it_has_no_anchors() -> None:
-    robot = robot_that(True)
-    at = anchor(LOOP_START, ORIGIN, 0.0)
+def test_a_lost_robot_has_no_references() -> None:
+    robot = calibrating_robot(True)
+    at = reference(LOOP_START, ORIGIN, 0.0)
     lost = robot.start(0)
-    calibration = CalibrationMemory(anchors=both(at))
+    calibration = CalibrationMemory(references=both(at))
     memory = Memory(RecoveryMemory(lost="for the test"), calibration=calibration)
     seen = robot.cycle(lost._replace(memory=memory), frame(LOOP_START, SECOND // 10))
     assert seen.counts["accepted"] == len(CORNERS.landmarks)
-    assert seen.memory.calibration.anchors is None
+    assert seen.memory.calibration.references is None
 
 
-def test_a_robot_without_a_covariance_learns_nothing() -> None:
+def test_weighted_robots_do_not_calibrate_themselves() -> None:
     assert LocalizerSettings(self_calibration=True).learns
-    assert driven(robot_that(True, "weighted"), 1) == driven(robot_that(False, "weighted"), 1)
+    assert driven(calibrating_robot(True, "weighted"), 1) == driven(
+        calibrating_robot(False, "weighted"), 1
+    )

@@ -48,7 +48,7 @@ NAN = math.nan
         (Sighting("a", 1.0, 0.1, None, None, None, -0.1), "sigma_not_positive"),
     ],
 )
-def test_a_sighting_that_must_not_be_used_says_why(sighting: Sighting, fault: str) -> None:
+def test_a_faulty_sighting_has_a_reason(sighting: Sighting, fault: str) -> None:
     assert sighting_fault(sighting) == fault  # resolution i
 
 
@@ -63,7 +63,7 @@ def test_a_sighting_that_must_not_be_used_says_why(sighting: Sighting, fault: st
         Sighting("a", 1.0, 0.1, None, None, None, 0.1),
     ],
 )
-def test_a_sighting_may_give_either_or_both(sighting: Sighting) -> None:
+def test_a_sighting_may_have_range_or_bearing_or_both(sighting: Sighting) -> None:
     assert sighting_fault(sighting) is None  # row 2
 
 
@@ -80,14 +80,14 @@ def test_a_range_sigma_has_a_floor() -> None:
 
 
 @pytest.mark.parametrize(("expected_m", "sigma_m"), [(5.0, 0.25), (100.0, 0.4), (0.1, 0.1)])
-def test_the_expected_range_makes_the_sigma_within_a_factor_of_two(
+def test_the_sigma_follows_the_expected_range_within_a_factor_of_two(
     expected_m: float, sigma_m: float
 ) -> None:
-    """Readings that are too short must not weigh more than those that are too long."""
+    """Otherwise readings that are too short would have more weight than those that are too long."""
     assert sighting_sigmas(Sighting("a", 4.0), SENSOR, expected_m)[0] == pytest.approx(sigma_m)
 
 
-def test_a_sightings_own_sigmas_win() -> None:
+def test_the_sigmas_of_a_sighting_replace_those_of_the_model() -> None:
     assert sighting_sigmas(Sighting("a", 4.0, 0.0, 0.7, 0.3), SENSOR, 8.0) == (0.7, 0.3)
 
 
@@ -116,7 +116,9 @@ def test_a_turn_on_the_spot_does_not_drive_backwards() -> None:
 @pytest.mark.parametrize(
     ("commanded", "driven"), [(0.03, 0.03), (0.01, 0.02), (-0.01, -0.02), (0.0, 0.0)]
 )
-def test_nobody_drives_slower_than_his_motors_can(commanded: float, driven: float) -> None:
+def test_the_corrected_speed_is_at_least_that_of_the_motors(
+    commanded: float, driven: float
+) -> None:
     s = OdometrySettings(least_speed_m_s=0.02)
     piece = Odometry(0, 500_000_000, 0.5 * commanded, 0.0)
     assert corrected_odometry(piece, s).distance_m == pytest.approx(0.5 * driven)
@@ -126,7 +128,9 @@ def test_nobody_drives_slower_than_his_motors_can(commanded: float, driven: floa
 @pytest.mark.parametrize(
     ("commanded", "crawls"), [(0.03, False), (0.01, True), (-0.01, True), (0.0, False)]
 )
-def test_a_robot_crawls_at_its_least_speed(commanded: float, crawls: bool, share: float) -> None:
+def test_the_time_at_the_least_speed_is_counted(
+    commanded: float, crawls: bool, share: float
+) -> None:
     s = OdometrySettings(least_speed_m_s=0.02, distance_scale=0.97)
     driven = corrected_odometry(Odometry(0, 500_000_000, 0.5 * commanded, 0.0), s).distance_m
     seconds = share * 0.5
@@ -136,7 +140,7 @@ def test_a_robot_crawls_at_its_least_speed(commanded: float, crawls: bool, share
 
 @pytest.mark.parametrize("teammate", [False, True])
 @pytest.mark.parametrize("is_depth", [False, True])
-def test_readings_made_from_the_truth_are_corrected_to_it(teammate: bool, is_depth: bool) -> None:
+def test_correction_inverts_the_sensor_model(teammate: bool, is_depth: bool) -> None:
     sensor = SensorSettings(
         range_scale=0.95,
         range_bias_m=0.04,
@@ -159,10 +163,10 @@ def test_readings_made_from_the_truth_are_corrected_to_it(teammate: bool, is_dep
 @given(
     st.floats(-3.0, 3.0), st.floats(-math.pi, math.pi), st.floats(0.9, 1.1), st.floats(-20.0, 20.0)
 )
-def test_a_heading_stays_as_it_was_seen_against_the_line_of_sight(
+def test_a_heading_keeps_its_angle_to_the_line_of_sight(
     bearing: float, heading: float, scale: float, bias_deg: float
 ) -> None:
-    """A marker tells how it is turned against the ray on which it stands."""
+    """A marker shows its angle to the line of sight."""
     sensor = SensorSettings(bearing_scale=scale, bearing_bias_deg=bias_deg)
     seen = Sighting("a", 2.0, bearing, None, None, heading, 0.1)
     found = corrected_sighting(seen, sensor, True)
@@ -190,7 +194,7 @@ def test_a_neutral_correction_changes_nothing(sighting: Sighting) -> None:
     assert corrected_sighting(sighting, SensorSettings(), True) == sighting
 
 
-def test_faulty_readings_stay_faulty() -> None:
+def test_correction_keeps_faults() -> None:
     sensor = SensorSettings(range_is_depth=True, range_bias_m=0.1, bearing_bias_deg=1.0)
     for sighting, fault in (
         (Sighting("a", NAN, 0.1), "not_finite"),
@@ -204,8 +208,8 @@ def test_faulty_readings_stay_faulty() -> None:
         assert sighting_fault(corrected_sighting(sighting, sensor, False)) == fault
 
 
-def test_what_one_frame_reads_twice_is_read_once() -> None:
-    """Range and bearing of one object may come apart; a fault is for the filter to count."""
+def test_a_frame_uses_each_reading_once() -> None:
+    """Range and bearing of one object may be separate; faulty sightings stay for the filter."""
     ranged, borne = Sighting("oak", 2.0), Sighting("oak", None, 0.3)
     whole, empty = Sighting("elm", 2.0, 0.3), Sighting("elm")
     each = (ranged, borne, whole, empty, Sighting("elm", None, None, heading_rad=1.0))
@@ -217,7 +221,7 @@ def test_what_one_frame_reads_twice_is_read_once() -> None:
     )
 
 
-def test_a_bias_is_taken_from_all_bearings_that_are_good() -> None:
+def test_a_bias_is_subtracted_from_all_valid_bearings() -> None:
     good = (Sighting("a", 1.0, 0.3, 0.1, 0.2), Sighting("b", None, -3.1), Sighting("c", 1.0))
     faulty = (Sighting("d", 1.0, NAN), Sighting("e", 1.0, math.inf), Sighting("f", 1.0, 3.2))
     found = without_bearing_bias(Sightings(7, good + faulty), 0.1)
@@ -232,7 +236,7 @@ def test_a_bias_is_taken_from_all_bearings_that_are_good() -> None:
         assert after is before
 
 
-def test_what_is_read_again_soon_counts_for_less() -> None:
+def test_a_repeated_reading_has_a_larger_variance() -> None:
     assert repetition_variance_factor(None, 3.0) == 1.0
     assert repetition_variance_factor(0.5, 0.0) == 1.0
     assert repetition_variance_factor(100.0, 3.0) == pytest.approx(1.0)
@@ -240,7 +244,7 @@ def test_what_is_read_again_soon_counts_for_less() -> None:
     assert math.isfinite(repetition_variance_factor(0.0, 2.0))
 
 
-def test_doubt_makes_the_mean_of_correlated_readings_consistent() -> None:
+def test_the_variance_factor_makes_the_mean_of_correlated_readings_consistent() -> None:
     tau, dt, n = 2.0, 0.5, 400
     rho = math.exp(-dt / tau)
     lags = range(1, n)

@@ -1,3 +1,5 @@
+"""The timeline: late and unordered inputs give the same states as inputs in order."""
+
 from collections.abc import Iterable
 from itertools import permutations
 from random import Random
@@ -40,7 +42,7 @@ variants = pytest.mark.parametrize("variant", VARIANTS)
 
 
 def history(seconds: float, seed: int = 1) -> list[Input]:
-    """Wheels at 20 Hz, frames at 10 Hz within their pieces, a teammate that helps, in order."""
+    """Odometry at 20 Hz, frames at 10 Hz, and the help of a teammate, in order."""
     rng = np.random.default_rng(seed)
     noise = sensor_noise(rng, SensorSettings())
     inputs: list[Input] = []
@@ -66,7 +68,7 @@ def stamp_of(item: Input) -> int:
 
 
 def time_of(item: Input) -> int:
-    """From when on it counts: a belief serves the sightings of half a second before it."""
+    """The time of an input in the timeline: a belief also serves sightings before it."""
     return stamp_of(item) - (BELIEF_VALID_BEFORE_NS if isinstance(item, Belief) else 0)
 
 
@@ -91,7 +93,7 @@ def by_hand(robot: Localizer, inputs: Iterable[Input]) -> State:
 
 
 def after(robot: Localizer, inputs: Iterable[Input]) -> Timeline:
-    """The timeline that took them all."""
+    """The timeline after all of these inputs."""
     timeline = Timeline(robot, START)
     refused = [timeline.add(item) for item in inputs]
     assert not any(refused)
@@ -99,7 +101,7 @@ def after(robot: Localizer, inputs: Iterable[Input]) -> Timeline:
 
 
 def same(a: State, b: State) -> bool:
-    """To the last bit."""
+    """Whether two states are equal, bit for bit."""
     return a == b and repr(a.estimate) == repr(b.estimate)
 
 
@@ -107,7 +109,7 @@ def same(a: State, b: State) -> bool:
 
 
 @variants
-def test_in_order_a_timeline_does_what_the_localizer_does(variant: Variant) -> None:
+def test_inputs_in_order_give_the_states_of_the_localizer(variant: Variant) -> None:
     robot, inputs = localizer(variant, MIXED), history(5.0)
     assert same(after(robot, inputs).state, by_hand(robot, inputs))
 
@@ -115,7 +117,7 @@ def test_in_order_a_timeline_does_what_the_localizer_does(variant: Variant) -> N
 @variants
 @settings(max_examples=8)
 @given(shuffler=st.randoms(use_true_random=False))
-def test_any_order_within_the_horizon_gives_the_same_bits(
+def test_any_order_within_the_horizon_gives_the_same_state(
     variant: Variant, shuffler: Random
 ) -> None:
     robot, inputs = localizer(variant, MIXED), history(1.5)
@@ -128,8 +130,8 @@ def test_any_order_within_the_horizon_gives_the_same_bits(
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_a_long_run_with_delays_gives_the_same_bits(seed: int) -> None:
-    """Long enough for the timeline to forget; each kind of input has its own delay."""
+def test_a_long_run_with_delays_gives_the_same_state(seed: int) -> None:
+    """The run is longer than the horizon. Each kind of input has its own delay."""
     rng, robot, inputs = np.random.default_rng(seed), localizer("joint", MIXED), history(8.0)
     delay = {Odometry: 20, Sightings: 300, Position: 50, Fix: 900, Belief: 500, BeliefShared: 100}
     arrivals = [stamp_of(i) + rng.uniform(0.0, delay[type(i)]) * MS for i in inputs]
@@ -137,8 +139,8 @@ def test_a_long_run_with_delays_gives_the_same_bits(seed: int) -> None:
     assert same(late.state, by_hand(robot, inputs))
 
 
-def test_a_robot_that_learns_gives_the_same_bits_in_any_order() -> None:
-    """What it learns from an update depends on those before; late ones are put in their place."""
+def test_self_calibration_gives_the_same_values_in_any_order() -> None:
+    """Each value depends on earlier updates, so late inputs must be inserted at their time."""
     robot = localizer(
         field=MIXED,
         rules=LocalizerSettings(self_calibration=True),
@@ -160,7 +162,7 @@ def test_a_robot_that_learns_gives_the_same_bits_in_any_order() -> None:
 
 
 @pytest.mark.parametrize("late_by_ms", [1, 300, 1000])
-def test_a_fix_that_comes_late_counts_from_when_it_was_measured(late_by_ms: int) -> None:
+def test_a_late_fix_is_used_at_the_time_of_its_measurement(late_by_ms: int) -> None:
     robot, inputs = localizer("joint", MIXED), history(2.0)
     late_fix = fix(-1.7, -1.0, 500 * MS, sensor_m=0.01, observer_m=0.01)
     timeline = after(robot, [i for i in inputs if time_of(i) <= (500 + late_by_ms) * MS])
@@ -174,8 +176,8 @@ def test_a_fix_that_comes_late_counts_from_when_it_was_measured(late_by_ms: int)
     assert same(timeline.state, expected)
 
 
-def test_a_frame_inside_an_older_piece_of_odometry_is_seen_from_there() -> None:
-    """Straight on at 1 m/s: 50 ms into the second piece the robot has come 0.15 m."""
+def test_a_frame_during_a_piece_of_odometry_is_used_at_the_pose_of_that_time() -> None:
+    """At 1 m/s the robot has driven 0.15 m 50 ms after the second piece began."""
     robot = localizer("joint", MIXED)
     wheels = [Odometry(i * 100 * MS, (i + 1) * 100 * MS, 0.1, 0.0) for i in range(4)]
     timeline = after(robot, wheels)
@@ -187,7 +189,7 @@ def test_a_frame_inside_an_older_piece_of_odometry_is_seen_from_there() -> None:
     assert state.counts == {"accepted": 6}
 
 
-def test_odometry_that_comes_after_its_frame_still_carries_it() -> None:
+def test_odometry_that_arrives_after_its_frame_is_used() -> None:
     robot = localizer("joint", MIXED)
     wheels = [Odometry(i * 100 * MS, (i + 1) * 100 * MS, 0.1, 0.0) for i in range(3)]
     seen = frame(LOOP_START._replace(x=LOOP_START.x + 0.25), 250 * MS, MIXED)
@@ -207,7 +209,7 @@ def frame_of_mate(stamp_ns: int) -> Sightings:
 @pytest.mark.parametrize(
     ("after_ms", "used"), [(0, True), (1, True), (300, True), (500, True), (501, False)]
 )
-def test_a_belief_that_comes_after_the_sighting_counts_as_if_it_had_come_before(
+def test_a_belief_that_arrives_after_the_sighting_gives_the_same_state(
     variant: Variant, after_ms: int, used: bool
 ) -> None:
     robot, seen = localizer(variant, MIXED), frame_of_mate(SECOND)
@@ -224,7 +226,7 @@ def test_a_belief_that_comes_after_the_sighting_counts_as_if_it_had_come_before(
     assert same(late.state, by_hand(robot, [told, seen] if used else [seen, told]))
 
 
-def test_of_several_beliefs_in_any_order_the_nearest_is_used() -> None:
+def test_in_any_order_the_nearest_belief_is_used() -> None:
     """Ages 0.3, -0.1 and -0.4 s, and one of 0.6 s after the sighting."""
     robot, seen = localizer("joint", MIXED), frame_of_mate(SECOND)
     nearest = belief(1.05, 0.0, 1100 * MS)
@@ -255,10 +257,10 @@ told_at = st.builds(
     beliefs=st.lists(told_at, max_size=12, unique_by=repr),
     shuffler=st.randoms(use_true_random=False),
 )
-def test_beliefs_in_any_order_give_the_same_bits(
+def test_beliefs_in_any_order_give_the_same_state(
     variant: Variant, beliefs: list[Belief], shuffler: Random
 ) -> None:
-    """Some of one time and teammate that say different things."""
+    """Some beliefs of the same time and teammate differ."""
     robot = localizer(variant, MIXED)
     seen = [frame_of_mate(ms * MS) for ms in range(0, 1500, 100)]
     wheels = [Odometry(ms * MS, (ms + 50) * MS, 0.001, 0.001) for ms in range(0, 1500, 50)]
@@ -272,7 +274,7 @@ def test_beliefs_in_any_order_give_the_same_bits(
 
 
 @pytest.mark.parametrize("kind", [Odometry, Sightings, Position, Fix, Belief, BeliefShared])
-def test_what_came_already_is_refused(kind: type[Input]) -> None:
+def test_a_duplicate_is_refused(kind: type[Input]) -> None:
     inputs = history(1.0)
     timeline = after(localizer("joint", MIXED), inputs)
     before = timeline.state
@@ -281,8 +283,8 @@ def test_what_came_already_is_refused(kind: type[Input]) -> None:
     assert timeline.state is before
 
 
-def test_of_pieces_of_odometry_of_one_time_the_order_of_arrival_plays_no_part() -> None:
-    """One of them is driven, and that it is not the only one is counted."""
+def test_overlapping_odometry_gives_the_same_state_in_any_order() -> None:
+    """The robot uses one of them and counts the overlap."""
     pieces = [Odometry(0, 100 * MS, 0.1, 0.0), Odometry(0, 50 * MS, 0.5, 0.0)]
     found = []
     for order in permutations(pieces):
@@ -300,7 +302,7 @@ def test_two_different_frames_of_one_time_are_both_used() -> None:
     assert timeline.state.counts == {"accepted": 2}
 
 
-def test_what_is_older_than_the_horizon_is_refused() -> None:
+def test_an_input_older_than_the_horizon_is_refused() -> None:
     timeline = after(localizer("joint", MIXED), history(5.0))
     newest = time_of(history(5.0)[-1])
     before = timeline.state
@@ -309,14 +311,14 @@ def test_what_is_older_than_the_horizon_is_refused() -> None:
     assert timeline.add(fix(0.0, 0.0, newest - HORIZON_NS)) is None
 
 
-def test_a_belief_is_too_late_as_soon_as_the_sightings_before_it_are() -> None:
+def test_a_belief_is_too_late_when_the_sightings_before_it_are() -> None:
     timeline = after(localizer("joint", MIXED), history(5.0))
     oldest = time_of(history(5.0)[-1]) - HORIZON_NS + BELIEF_VALID_BEFORE_NS
     assert timeline.add(belief(1.0, 0.0, oldest - 1)) == "too_late"
     assert timeline.add(belief(1.0, 0.0, oldest)) is None
 
 
-def test_what_is_older_than_the_start_is_refused() -> None:
+def test_an_input_older_than_the_start_is_refused() -> None:
     robot = localizer("joint", MIXED)
     timeline = Timeline(robot, state_at(LOOP_START, diagonal(0.1, 0.1), SECOND))
     assert timeline.add(frame(LOOP_START, SECOND - 1, MIXED)) == "too_late"
@@ -324,8 +326,8 @@ def test_what_is_older_than_the_start_is_refused() -> None:
     assert timeline.add(frame(LOOP_START, SECOND, MIXED)) is None
 
 
-def test_a_belief_of_the_start_is_used() -> None:
-    """It stands in the timeline before the start, and is none the worse for it."""
+def test_a_belief_at_the_start_is_used() -> None:
+    """Its time in the timeline is before the start."""
     robot = localizer("joint", MIXED)
     timeline = Timeline(robot, state_at(LOOP_START, diagonal(0.1, 0.1), SECOND))
     assert timeline.add(frame_of_mate(SECOND)) is None
@@ -334,16 +336,16 @@ def test_a_belief_of_the_start_is_used() -> None:
     assert timeline.at(SECOND - 1) is None
 
 
-def test_a_timeline_forgets_what_is_older_than_its_horizon() -> None:
+def test_the_timeline_forgets_inputs_older_than_its_horizon() -> None:
     timeline = after(localizer("joint", MIXED), history(12.0))
     assert timeline.at(2 * SECOND) is None
     assert timeline.at(11 * SECOND) is not None
 
 
-# Looking ------------------------------------------------------------------------------------------
+# Reading states ---------------------------------------------------------------------------------
 
 
-def test_the_state_at_a_time_knows_nothing_later() -> None:
+def test_the_state_at_a_time_does_not_depend_on_later_inputs() -> None:
     robot, inputs = localizer("joint", MIXED), history(1.8)
     timeline = after(robot, inputs)
     for now in (0, 400 * MS, 975 * MS, 1799 * MS):
@@ -353,7 +355,7 @@ def test_the_state_at_a_time_knows_nothing_later() -> None:
         assert same(found, known)
 
 
-def test_looking_changes_nothing() -> None:
+def test_reading_a_state_does_not_change_the_timeline() -> None:
     robot, inputs = localizer("joint", MIXED), history(1.8)
     looked = Timeline(robot, START)
     for item in inputs:
@@ -372,7 +374,7 @@ def test_the_latest_state_does_not_run_ahead_of_odometry() -> None:
     assert ahead.estimate.pose.x == pytest.approx(LOOP_START.x + 0.1)
 
 
-def test_where_odometry_is_silent_the_latest_state_is_in_doubt() -> None:
+def test_without_odometry_the_covariance_of_the_latest_state_grows() -> None:
     timeline = after(localizer("joint", MIXED), [Odometry(0, 100 * MS, 0.1, 0.0)])
     silent = timeline.latest(3 * SECOND)
     assert silent.stamp_ns == 3 * SECOND

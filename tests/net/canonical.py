@@ -99,9 +99,9 @@ def _evidence(e: Evidence) -> Canonical:
 
 
 def _calibration_anchors(memory: CalibrationMemory) -> list[list[Any]] | None:
-    if memory.anchors is None:
+    if memory.references is None:
         return None
-    pairs = memory.anchors.turn, memory.anchors.distance
+    pairs = memory.references.turn, memory.references.distance
     return [
         [a.stamp_ns, _estimate(a.estimate), list(a.odometry_from_robot), a.total_turn_rad]
         for a in pairs

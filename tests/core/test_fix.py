@@ -1,0 +1,102 @@
+"""Active collaboration: the fix that an observer sends."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from msgspec.structs import replace
+from support.core import (
+    covariance3,
+    diagonal,
+    matrix2,
+    random_matrix,
+)
+
+from cpcbl_team.config import SensorSettings
+from cpcbl_team.estimate import Estimate
+from cpcbl_team.fixes import fix_for, without_heading
+from cpcbl_team.gaussian import Covariance2
+from cpcbl_team.geometry import Pose2
+from cpcbl_team.inputs import Fix, Sighting
+
+SENSOR = SensorSettings(range_share=0.05, range_floor_m=0.0, bearing_sigma_deg=5.0)
+
+
+def observed(sighting: Sighting, estimate: Estimate, sensor: SensorSettings = SENSOR) -> Fix | None:
+    return fix_for("me", "mate", 7, estimate, sighting, sensor)
+
+
+def an_observer(seed: int) -> Estimate:
+    rng = np.random.default_rng(seed)
+    return Estimate(Pose2(1.0, -2.0, rng.uniform(-3.0, 3.0)), covariance3(random_matrix(rng, 3)))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_fix_is_the_sighting_compounded_with_the_observers_pose(seed: int) -> None:
+    """Row 40: both parts of the covariance equal those by finite differences."""
+    observer = an_observer(seed)
+    pose = observer.pose
+    r, a = 3.0, 0.4 * seed - 0.9
+
+    def position(x: float, y: float, h: float, along: float, across: float) -> tuple[float, float]:
+        c, s = math.cos(a), math.sin(a)
+        sight = (r + along) * c - across * s, (r + along) * s + across * c
+        return Pose2(x, y, h).transform(*sight)
+
+    h = 1e-6
+    v = np.array([*pose, 0.0, 0.0])
+    J = np.stack(
+        [(np.array(position(*(v + d))) - position(*(v - d))) / (2 * h) for d in h * np.eye(5)],
+        axis=1,
+    )
+    sensor = np.diag([0.05 * r, r * math.sin(math.radians(5.0))]) ** 2
+    P = np.array(observer.covariance)[[[0, 1, 3], [1, 2, 4], [3, 4, 5]]]
+
+    sent = observed(Sighting("me", r, a), observer)
+    assert sent is not None
+    assert (sent.robot, sent.observer, sent.stamp_ns) == ("me", "mate", 7)
+    np.testing.assert_allclose((sent.x_m, sent.y_m), position(*v), atol=1e-9)
+    own = matrix2(Covariance2(*sent.sensor_covariance))
+    np.testing.assert_allclose(own, J[:, 3:] @ sensor @ J[:, 3:].T, atol=1e-6)
+    observers = matrix2(Covariance2(*sent.observer_covariance))
+    np.testing.assert_allclose(observers, J[:, :3] @ P @ J[:, :3].T, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "sighting",
+    [
+        Sighting("me", 3.0),
+        Sighting("me", None, 0.1),
+        Sighting("me", math.nan, 0.1),
+        Sighting("me", -1.0, 0.1),
+        Sighting("me", 3.0, 9.0),
+        Sighting("me", 3.0, 0.1, None, None, 0.4),
+    ],
+)
+def test_a_fix_needs_a_valid_range_and_bearing(sighting: Sighting) -> None:
+    assert observed(sighting, an_observer(0)) is None
+
+
+def test_a_range_beyond_the_limit_makes_no_fix() -> None:
+    sensor = SensorSettings(max_range_for_range_m=2.0)  # row 3
+    assert observed(Sighting("me", 1.9, 0.1), an_observer(0), sensor) is not None
+    assert observed(Sighting("me", 2.1, 0.1), an_observer(0), sensor) is None
+
+
+@given(st.floats(-math.pi, math.pi), st.floats(-math.pi, math.pi), st.floats(0.001, 1.0))
+def test_an_observed_heading_is_sent_in_the_fields_frame(
+    own: float, seen: float, sigma: float
+) -> None:
+    observer = Estimate(Pose2(1.0, -2.0, own), diagonal(0.1, 0.03))
+    sighting = Sighting("me", 3.0, 0.4)
+    plain = observed(sighting, observer)
+    sent = observed(replace(sighting, heading_rad=seen, heading_sigma_rad=sigma), observer)
+    assert sent is not None
+    assert sent.heading_rad is not None
+    assert abs(sent.heading_rad) <= math.pi
+    assert math.remainder(sent.heading_rad - own - seen, math.tau) == pytest.approx(0.0, abs=1e-9)
+    variances = sent.heading_sensor_variance, sent.heading_observer_variance
+    assert variances == pytest.approx((sigma**2, 0.03**2))
+    assert without_heading(sent) == plain
