@@ -184,7 +184,7 @@ def _launch(
     if containers:
         from cpcbl_launch.run.containers.launch import InContainers, line_printer
 
-        return partial(InContainers, image=image, base=base_image, said=line_printer(console))
+        return partial(InContainers, image=image, base=base_image, print_line=line_printer(console))
     from cpcbl_launch.checks import require_team_opencv
     from cpcbl_launch.run.up import OnThisMachine
 

@@ -63,21 +63,21 @@ class KeyRequest(msgspec.Struct, frozen=True, kw_only=True):
     retire_ca: bool = False
 
 
-def make_keys(team: Team, folder: Path, wish: KeyRequest) -> list[KeysReport]:
-    """Makes what is missing in a key folder, and what the wish names anew.
+def make_keys(team: Team, folder: Path, request: KeyRequest) -> list[KeysReport]:
+    """Makes what is missing in a key folder, and renews what the request names.
 
-    Raises InputError for a wish that cannot be met, OSError where nothing can be written.
+    Raises InputError for a request that cannot be met, OSError where nothing can be written.
     """
     now = datetime.now(UTC)
     known = members_in(folder) if (folder / str(Role.ROUTER) / MEMBERS).exists() else ()
-    steps = plan_actions(team, known, wish.observers, wish.renew, wish.revoke)
+    steps = plan_actions(team, known, request.observers, request.renew, request.revoke)
     steps = tuple(_with_missing_key(step, folder) for step in steps)
-    reached = hosts(team, wish.hosts)
-    _check_hosts(steps, folder, wish.hosts)
+    reached = hosts(team, request.hosts)
+    _check_hosts(steps, folder, request.hosts)
     _make_folder(folder)
     _replace_file(folder / ".gitignore", b"*\n", PUBLIC)
     before = (folder / AUTHORITY / CA).exists()
-    authorities = _authorities(team, folder, wish, now)
+    authorities = _authorities(team, folder, request, now)
     for step in steps:
         at = folder / str(step.member.identity)
         if step.action in (KeyAction.MADE, KeyAction.RENEWED):
@@ -87,12 +87,12 @@ def make_keys(team: Team, folder: Path, wish: KeyRequest) -> list[KeysReport]:
                 step.member.common_name,
                 names,
                 now,
-                wish.lasting,
+                request.lasting,
             )
             _make_folder(at)
             _replace_file(at / PRIVATE_KEY, pair.private_key, SECRET)
             _replace_file(at / CERTIFICATE, pair.certificate, PUBLIC)
-    if wish.retire_ca:
+    if request.retire_ca:
         authorities = _retire_old_authorities(steps, folder, authorities)
     for step in steps:
         if step.action is not KeyAction.REVOKED:
@@ -101,16 +101,16 @@ def make_keys(team: Team, folder: Path, wish: KeyRequest) -> list[KeysReport]:
     _replace_file(
         folder / str(Role.ROUTER) / MEMBERS, msgspec.json.format(members, indent=1), PUBLIC
     )
-    deed = (
+    action = (
         KeyAction.MADE
         if not before
         else KeyAction.RENEWED
-        if AUTHORITY in wish.renew
+        if AUTHORITY in request.renew
         else KeyAction.KEPT
     )
-    said = certificate_facts(newest_certificate(authorities))
+    facts = certificate_facts(newest_certificate(authorities))
     authority = KeysReport(
-        who=AUTHORITY, common_name=said.common_name, deed=deed, valid_until=said.not_after
+        who=AUTHORITY, common_name=facts.common_name, deed=action, valid_until=facts.not_after
     )
     return [authority, *(_report(step, folder) for step in steps)]
 
@@ -151,11 +151,11 @@ def _hosts_of(identity: Identity, at: Path, reached: tuple[str, ...]) -> tuple[s
     return tuple(dict.fromkeys((*before, *reached)))
 
 
-def _authorities(team: Team, folder: Path, wish: KeyRequest, now: datetime) -> bytes:
+def _authorities(team: Team, folder: Path, request: KeyRequest, now: datetime) -> bytes:
     """The certificates of all authorities that are trusted, that in use first."""
     at = folder / AUTHORITY
     trusted = (at / CA).read_bytes() if (at / CA).exists() else b""
-    if trusted and AUTHORITY not in wish.renew:
+    if trusted and AUTHORITY not in request.renew:
         return trusted
     _make_folder(at)
     authority = new_authority(team.name, now)
@@ -196,13 +196,13 @@ def _retire_old_authorities(
 
 def _report(step: MemberAction, folder: Path) -> KeysReport:
     path = folder / str(step.member.identity) / CERTIFICATE
-    said = certificate_facts(path.read_bytes()) if path.exists() else None
+    facts = certificate_facts(path.read_bytes()) if path.exists() else None
     return KeysReport(
         who=str(step.member.identity),
         common_name=step.member.common_name,
         deed=step.action,
-        valid_until=said.not_after if said else None,
-        hosts=said.hosts if said else (),
+        valid_until=facts.not_after if facts else None,
+        hosts=facts.hosts if facts else (),
     )
 
 

@@ -40,7 +40,7 @@ def plan_actions(
     renew: Collection[str] = (),
     revoke: Collection[str] = (),
 ) -> tuple[MemberAction, ...]:
-    """A step for each member that the team needs, is told to have, or had before.
+    """A step for each member that the team needs, is asked to have, or had before.
 
     Raises InputError for names that nobody has.
     """
@@ -71,7 +71,7 @@ def plan_actions(
 
 
 def hosts(team: Team, named: Collection[str]) -> tuple[str, ...]:
-    """Where the team's router is dialled: by itself, by the team file, and as told."""
+    """The hosts at which the router is reached: its own, those of the team file, and `named`."""
     endpoints = (*team.transport.connect, *team.transport.listen)
     dialled = [e.partition("/")[2].rpartition(":")[0].strip("[]") for e in endpoints]
     everywhere = ("0.0.0.0", "::")

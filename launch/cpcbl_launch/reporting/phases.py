@@ -81,8 +81,8 @@ def guest_reports(
     `begin_s`: the time at which figures begin; `epoch_s`: the start of the run.
     """
     reports = {}
-    heard = {name: len(tracks) for name, tracks in list(recorder.tracks.items())}
-    others = sorted(heard.keys() - set(robots), key=lambda name: (-heard[name], name))
+    counts = {name: len(tracks) for name, tracks in list(recorder.tracks.items())}
+    others = sorted(counts.keys() - set(robots), key=lambda name: (-counts[name], name))
     for name in sorted(others[:MOST_GUESTS]):
         present = presence_spans(seconds(recorder.trajectory(name).stamps_ns).tolist())
         parts = split_by_presence(present, begin_s)

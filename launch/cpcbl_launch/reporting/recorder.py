@@ -64,7 +64,7 @@ class RobotReport(Score, frozen=True, kw_only=True):
     spending: tuple[SpendingReport, ...] = ()
     """Its limits; empty where there are none."""
     trust: tuple[TrustReport, ...] = ()
-    """Teammates that it heard at the end, or that were in quarantine."""
+    """Teammates whose messages it received at the end, or that were in quarantine."""
 
 
 class Phase(Score, frozen=True, kw_only=True):
@@ -159,8 +159,8 @@ class Recorder:
     def _receive(self, key: str, payload: bytes) -> None:
         message = decode(key, payload)
         with self._lock:
-            taken = not isinstance(message, Refusal)
-            self.counts[key.partition("/")[0] if taken else str(message)] += 1
+            is_accepted = not isinstance(message, Refusal)
+            self.counts[key.partition("/")[0] if is_accepted else str(message)] += 1
             match message:
                 case Track():
                     self.tracks.setdefault(message.robot, EncodedLog()).append(payload)
@@ -193,8 +193,8 @@ class Recorder:
         self, robot: str, from_s: float = -np.inf, until_s: float = np.inf
     ) -> Trajectory:
         """A robot's estimates within [from_s, until_s)."""
-        heard = self.tracks.get(robot, ())
-        tracks = [t for t in heard if from_s <= t.stamp_ns * 1e-9 < until_s]
+        received = self.tracks.get(robot, ())
+        tracks = [t for t in received if from_s <= t.stamp_ns * 1e-9 < until_s]
         covariance = None
         if all(t.covariance is not None for t in tracks):
             covariance = np.array([t.covariance for t in tracks]).reshape(-1, 6)

@@ -1,4 +1,4 @@
-"""A run in one file (MCAP, mcap.dev): what robots sensed and said, the truth, the team.
+"""A run in one file (MCAP, mcap.dev): inputs and outputs of robots, the truth, the team.
 
 Messages are JSON arrays, as on the wire but readable; the team is the attachment `team.json`. The
 inputs of a robot that replays a log are not on the bus, so not in the file either. Of cameras there
@@ -42,7 +42,7 @@ _decoder: msgspec.json.Decoder[Message] = msgspec.json.Decoder(Message)
 
 
 class Recording(AbstractContextManager["Recording"]):
-    """Writes what is said on a bus into a file, until it is closed. Raises OSError at the start;
+    """Writes the messages on a bus into a file, until it is closed. Raises OSError at the start;
     later `failed` says why no more could be written."""
 
     def __init__(self, path: Path, team: Team, bus: Bus) -> None:

@@ -17,7 +17,7 @@ class TrustReport(msgspec.Struct, frozen=True, kw_only=True):
     quarantines: int
     """How often, since the robot's process started."""
     unconfirmed: bool
-    """Nobody else told the robot anything: a bias could not be told."""
+    """No other teammate confirmed or contradicted it, so that a bias could not be detected."""
     late_s: float
     """The least time from stamp to arrival; below zero the teammate's clock is ahead."""
 

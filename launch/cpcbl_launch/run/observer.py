@@ -101,12 +101,12 @@ def _numbers(text: str) -> list[float]:
     return numbers if all(map(math.isfinite, numbers)) else []
 
 
-def team_with_observer(team: Team, wish: ObserverRequest) -> Team:
+def team_with_observer(team: Team, request: ObserverRequest) -> Team:
     """The team as the observer sees it: itself beside the robots of the file.
 
-    Raises InputError or TeamFileError for a wish that cannot be granted.
+    Raises InputError or TeamFileError for a request that cannot be met.
     """
-    name = wish.name
+    name = request.name
     if not re.fullmatch(NAME_PATTERN, name):
         raise InputError(f"observer {name!r}: a name has 1 to 32 letters, digits, _, . or -")
     if name in team.robots:
@@ -123,15 +123,15 @@ def team_with_observer(team: Team, wish: ObserverRequest) -> Team:
             f"observer {name}: match.messages are divided among the robots of the file, none are"
             " left for a guest; take the limit away, or put the observer into the file"
         )
-    source = wish.source or _source_of(team)
-    shipped = wish.sensor in presets()
-    path = Path(str(_shipped() / f"{wish.sensor}.toml")) if shipped else Path(wish.sensor)
+    source = request.source or _source_of(team)
+    shipped = request.sensor in presets()
+    path = Path(str(_shipped() / f"{request.sensor}.toml")) if shipped else Path(request.sensor)
     if not shipped and not path.exists():
         raise InputError(
-            f"--sensor {wish.sensor}: no such file; write one, or {' or '.join(presets())}"
+            f"--sensor {request.sensor}: no such file; write one, or {' or '.join(presets())}"
         )
     more = with_added_robot(
-        team, name, [_PLAIN, read_layer(path), _request_layer(wish, source)], str(path)
+        team, name, [_PLAIN, read_layer(path), _request_layer(request, source)], str(path)
     )
     model = model_from_settings(more.robots[name])
     reason = "" if model is None else unsupported_delay(model)
@@ -144,13 +144,16 @@ _PLAIN = {"waypoints_m": [], "collaboration": {"after_s": 0.0}}
 """Of the team's defaults a guest does not take these."""
 
 
-def _request_layer(wish: ObserverRequest, source: str) -> dict[str, Any]:
+def _request_layer(request: ObserverRequest, source: str) -> dict[str, Any]:
     """What the command line says, as the last layer."""
-    own: dict[str, Any] = {"source": source, "start": {**wish.at._asdict(), "known": True}}
-    if wish.fov_deg is not None:
-        own["sensor"] = {"field_of_view_deg": wish.fov_deg}
-    if wish.moves:
-        own |= {"waypoints_m": [list(place) for place in wish.moves], "odometry": {"moves": True}}
+    own: dict[str, Any] = {"source": source, "start": {**request.at._asdict(), "known": True}}
+    if request.fov_deg is not None:
+        own["sensor"] = {"field_of_view_deg": request.fov_deg}
+    if request.moves:
+        own |= {
+            "waypoints_m": [list(place) for place in request.moves],
+            "odometry": {"moves": True},
+        }
     return own
 
 

@@ -75,7 +75,7 @@ class _Child:
             lines = self._log.read_text(errors="replace").splitlines()
         except OSError as error:
             return f"its log cannot be read: {error.strerror}"
-        return lines[-1] if lines else "it said nothing"
+        return lines[-1] if lines else "it printed nothing"
 
     def watch(self) -> None:
         """Restarts the process some time after it ended, longer each time that it ends early."""
@@ -86,9 +86,9 @@ class _Child:
             if now - self.started_s > HEALTHY_S:
                 self.backoff_s = FIRST_BACKOFF_S
             code = self.process.returncode
-            said = f": {self._last_line()}" if code > 0 else ""
+            last_line = f": {self._last_line()}" if code > 0 else ""
             log.warning(
-                "%s ended (%s)%s; again in %g s", self.spec.name, code, said, self.backoff_s
+                "%s ended (%s)%s; again in %g s", self.spec.name, code, last_line, self.backoff_s
             )
             self.due_s = now + self.backoff_s
             self.backoff_s = min(2.0 * self.backoff_s, LONGEST_BACKOFF_S)

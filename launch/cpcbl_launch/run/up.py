@@ -40,7 +40,7 @@ LEAD_S = 2.0
 LEAD_S_A_PROCESS = 0.3
 LEAD_S_A_CAMERA = 1.0  # OpenCV is loaded, the lens laid out
 REFRESH_S = 0.25
-SIMULATED_S = 30.0  # unless told otherwise
+SIMULATED_S = 30.0  # by default
 LEAST_S = 1.0
 
 

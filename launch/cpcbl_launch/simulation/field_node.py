@@ -37,8 +37,10 @@ NO_SITES: Mapping[str, Bus] = MappingProxyType({})
 
 
 class FieldNode:
-    """The field on a bus. Robots of other `sites` (robot -> bus) are told on the bus of theirs, so
-    that the world goes on for them while their site is cut off.
+    """The field on a bus.
+
+    Robots of other `sites` (robot -> bus) receive their inputs on the bus of their site, so that
+    the simulation continues for them while their site is cut off.
     """
 
     def __init__(
@@ -50,7 +52,7 @@ class FieldNode:
         self._refused: set[str] = set()
         self._inbox: deque[tuple[str, bytes]] = deque(maxlen=INBOX)
         self.counts: Counter[str] = Counter()
-        """What was taken (`drive`, `join`), and what was refused, by reason."""
+        """Accepted messages (`drive`, `join`), and refused ones by reason."""
         self._truth = bus.publisher(topics.TRUTH.at(), topics.TRUTH.qos)
         self._publishers: dict[tuple[str, type], Publisher] = {}
         self._drive_subscriptions: dict[str, Handle] = {}
@@ -84,7 +86,7 @@ class FieldNode:
         return False  # commands take effect with the next step
 
     def step(self, now_ns: int) -> None:
-        """Advances the field to `now_ns` and tells the robots what they sense.
+        """Advances the field to `now_ns` and publishes what the robots sense.
 
         What arrives meanwhile is for the next step: under a flood there is always more.
         """
@@ -102,23 +104,23 @@ class FieldNode:
                 self._truth.put(encode(self._field.truth()))
 
     def _handle(self, key: str, payload: bytes, now_ns: int) -> Refusal | None:
-        """Does what a robot says, by the field's clock; or why not."""
-        said = decode(key, payload)
-        if isinstance(said, Refusal):
-            return said
-        assert isinstance(said, Drive | Join)
-        if isinstance(said, Drive):
-            if said.robot not in self._field.robots:
+        """Handles a message by the clock of the field; returns the reason if it is refused."""
+        message = decode(key, payload)
+        if isinstance(message, Refusal):
+            return message
+        assert isinstance(message, Drive | Join)
+        if isinstance(message, Drive):
+            if message.robot not in self._field.robots:
                 return Refusal.UNKNOWN_ROBOT
-            said = with_clock_offset(said, -self._field.clock_offset_ns(said.robot))
-        reason = refusal(said, now_ns)
+            message = with_clock_offset(message, -self._field.clock_offset_ns(message.robot))
+        reason = refusal(message, now_ns)
         if reason is not None:
             return reason
-        self.counts[type(said).__name__.lower()] += 1
-        if isinstance(said, Drive):
-            self._field.command(said)
+        self.counts[type(message).__name__.lower()] += 1
+        if isinstance(message, Drive):
+            self._field.command(message)
         else:
-            self._request_body(said, now_ns)
+            self._request_body(message, now_ns)
         return None
 
     def _request_body(self, join: Join, now_ns: int) -> None:
@@ -190,4 +192,4 @@ def run_field(
     counts = ", ".join(f"{reason} {n}" for reason, n in sorted(node.counts.items()))
     log.info("commands, by what became of them: %s", counts or "none")
     if node.skipped_frames:
-        log.warning("frames not taken, as the field was late: %d", node.skipped_frames)
+        log.warning("frames skipped because the field was late: %d", node.skipped_frames)

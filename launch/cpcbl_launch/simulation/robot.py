@@ -35,7 +35,7 @@ class Timer:
 
 
 class VisibleObject(NamedTuple):
-    """Something on the field, at the place that is seen of it."""
+    """Something on the field, at the point that a sensor measures."""
 
     name: str
     x: float
@@ -63,7 +63,7 @@ class DelayedMotion:
 
 
 def actual_distance(distance: float, turn: float, seconds: float, o: OdometrySettings) -> float:
-    """How far wheels go that are told to go this far: no slower than their least speed."""
+    """The distance that the wheels drive when this one is commanded: they have a least speed."""
     if not o.least_speed_m_s:
         return distance
     reported = Odometry(0, round(seconds * 1e9), *reported_odometry(distance, turn, o))
@@ -71,7 +71,7 @@ def actual_distance(distance: float, turn: float, seconds: float, o: OdometrySet
 
 
 def reported_odometry(distance: float, turn: float, o: OdometrySettings) -> tuple[float, float]:
-    """What wheels report of a motion that they were told: `corrected_odometry` makes of it what
+    """The reading of the wheels for a commanded motion: `corrected_odometry` makes of it what
     is `really_driven`, and without a least speed the motion itself."""
     reported_turn = (turn - o.turn_bias_rad_per_m * distance) / o.turn_scale
     lost = o.distance_loss_m_per_rad * abs(reported_turn) if distance else 0.0
@@ -179,22 +179,22 @@ class SimulatedRobot:
             self._positions.append(Position(stamp_ns, x, y, (variance, 0.0, variance)))
         return _pop_due(self._positions, now_ns)
 
-    def _sighting(self, seen: VisibleObject, now_ns: int) -> Sighting | None:
+    def _sighting(self, visible: VisibleObject, now_ns: int) -> Sighting | None:
         sensor = self.settings.sensor
-        dx, dy = seen.x - self.pose.x, seen.y - self.pose.y
+        dx, dy = visible.x - self.pose.x, visible.y - self.pose.y
         range_m = math.hypot(dx, dy)
-        if seen.gives == "none" or not 0.05 <= range_m <= sensor.max_range_m:
+        if visible.gives == "none" or not 0.05 <= range_m <= sensor.max_range_m:
             return None
         bearing = wrap_angle(math.atan2(dy, dx) - self.pose.heading)
         if abs(bearing) > math.radians(sensor.field_of_view_deg) / 2.0:
             return None
-        range_m += self._reading_error(seen.name, "range", sensor.range_sigma_m(range_m), now_ns)
-        bearing += self._reading_error(seen.name, "bearing", sensor.bearing_sigma_rad, now_ns)
-        reading_m, reading = sensor_reading(range_m, bearing, sensor, seen.teammate)
+        range_m += self._reading_error(visible.name, "range", sensor.range_sigma_m(range_m), now_ns)
+        bearing += self._reading_error(visible.name, "bearing", sensor.bearing_sigma_rad, now_ns)
+        reading_m, reading = sensor_reading(range_m, bearing, sensor, visible.teammate)
         return Sighting(
-            seen.name,
-            max(reading_m, 0.01) if seen.gives in ("both", "range") else None,
-            reading if seen.gives in ("both", "bearing") else None,
+            visible.name,
+            max(reading_m, 0.01) if visible.gives in ("both", "range") else None,
+            reading if visible.gives in ("both", "bearing") else None,
         )
 
     def _reading_error(self, name: str, kind: str, sigma: float, now_ns: int) -> float:

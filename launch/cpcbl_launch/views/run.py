@@ -65,8 +65,8 @@ class LiveTable(LiveView):
             pid = str(pids[process]) if process in pids else "down" if name in here else "away"
             state = _state(tracks.get(name), pid, restarts.get(process, 0))
             status = statuses.get(name)
-            if status is not None and (said := distrust_text(status.trust)):
-                state.append(f", {said}", "yellow")
+            if status is not None and (text := distrust_text(status.trust)):
+                state.append(f", {text}", "yellow")
             if name not in self._robots:
                 there = newest_ns - tracks[name].stamp_ns <= AWAY_S * 1e9
                 pid, state = "guest", state if there else Text("left", "dim")
@@ -162,8 +162,8 @@ def print_report(report: Report, console: Console) -> None:
         console.print()
         console.print(help_traffic_table(report))
         console.print(COLUMNS_EXPLAINED, style="yellow", highlight=False)
-    if (said := limits_text(report)) is not None:
-        console.print(said)
+    if (text := limits_text(report)) is not None:
+        console.print(text)
     if report.yardsticks:
         console.print(_baseline_table(report))
     for line in _remarks(report):
@@ -191,22 +191,24 @@ def _effects(name: str, guest: GuestReport) -> Table:
     return shown
 
 
-def print_observer_report(visited: ObserverReport, console: Console) -> None:
+def print_observer_report(report: ObserverReport, console: Console) -> None:
     """What an observer did while it was there."""
-    sigma = number(visited.position_sigma_m)
-    said = f"{visited.name} took part for {visited.seconds:.1f} s, position σ {sigma} m at the end"
-    console.print(said, style="bold", highlight=False)
+    sigma = number(report.position_sigma_m)
+    text = f"{report.name} took part for {report.seconds:.1f} s, position σ {sigma} m at the end"
+    console.print(text, style="bold", highlight=False)
     shown = table("", ("help",), ("messages", "B"))
-    for said, flows in (("sent", visited.sent), ("heard", visited.heard)):
+    for direction, flows in (("sent", report.sent), ("heard", report.heard)):
         for flow in flows:
-            peer = f" {'to' if said == 'sent' else 'from'} {flow.peer}" if flow.peer else ""
-            shown.add_row(f"{flow.topic} {said}{peer}", short(flow.messages), short(flow.bytes))
+            peer = f" {'to' if direction == 'sent' else 'from'} {flow.peer}" if flow.peer else ""
+            shown.add_row(
+                f"{flow.topic} {direction}{peer}", short(flow.messages), short(flow.bytes)
+            )
     if shown.row_count:
         console.print(shown)
-    if visited.lost:
-        console.print(f"{visited.name} is lost: {visited.lost}", style="yellow", highlight=False)
-    if visited.unfed:
-        console.print(f"{visited.name}: {visited.unfed}", style="yellow", highlight=False)
+    if report.lost:
+        console.print(f"{report.name} is lost: {report.lost}", style="yellow", highlight=False)
+    if report.unfed:
+        console.print(f"{report.name}: {report.unfed}", style="yellow", highlight=False)
 
 
 def _baseline_table(report: Report) -> Table:

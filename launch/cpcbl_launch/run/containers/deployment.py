@@ -28,8 +28,8 @@ def deployment_text(team: Team, file: Path, folder: Path, image: str | None, see
         inside = f"/team/{file.name}"
         mounts = (Mount(_from(folder, file), inside),)
     if team.transport.secured:
-        said = parse_team(file.read_text(encoding="utf-8")).transport.keys
-        target = os.path.normpath(os.path.join("/team", said))
+        keys_folder = parse_team(file.read_text(encoding="utf-8")).transport.keys
+        target = os.path.normpath(os.path.join("/team", keys_folder))
         keys = Mount(_from(folder, Path(team.transport.keys)), target)
     top = None if image else checkout()
     return compose_text(

@@ -36,7 +36,7 @@ class CommandResult(NamedTuple):
     @property
     def last_line(self) -> str:
         lines = [line.strip() for line in self.output.splitlines() if line.strip()]
-        return lines[-1] if lines else "it said nothing"
+        return lines[-1] if lines else "it printed nothing"
 
     @property
     def problem(self) -> str:
@@ -56,25 +56,25 @@ def ignore_line(line: str) -> None:
 def run_command(
     command: Sequence[str],
     stop: Callable[[], bool] = never_stop,
-    said: PrintLine = ignore_line,
+    print_line: PrintLine = ignore_line,
     timeout_s: float = 60.0,
 ) -> CommandResult:
     """Runs a command to its end, and tells each line as it comes.
 
     Raises DockerError when there is no such program, it takes too long, or `stop()`.
     """
-    until_s, heard, told = time.monotonic() + timeout_s, b"", 0
+    until_s, received, printed = time.monotonic() + timeout_s, b"", 0
     with tempfile.TemporaryFile() as output:
         process = _start(command, output.fileno())
         try:
             running = True
             while running:
                 running = process.poll() is None
-                heard += os.pread(output.fileno(), 1 << 24, len(heard))
-                *lines, _ = heard[told:].split(b"\n")
+                received += os.pread(output.fileno(), 1 << 24, len(received))
+                *lines, _ = received[printed:].split(b"\n")
                 for line in lines:
-                    told += len(line) + 1
-                    said(line.decode(errors="replace").rstrip())
+                    printed += len(line) + 1
+                    print_line(line.decode(errors="replace").rstrip())
                 if running:
                     _check_limits(command, stop, until_s)
                     time.sleep(POLL_S)
@@ -82,17 +82,17 @@ def run_command(
             if process.poll() is None:
                 process.terminate()
                 process.wait()
-    return CommandResult(process.returncode, heard.decode(errors="replace"))
+    return CommandResult(process.returncode, received.decode(errors="replace"))
 
 
 def command_output(
     command: Sequence[str],
     stop: Callable[[], bool] = never_stop,
-    said: PrintLine = ignore_line,
+    print_line: PrintLine = ignore_line,
     timeout_s: float = 60.0,
 ) -> str:
     """What a command says. Raises DockerError also when it fails."""
-    ended = run_command(command, stop, said, timeout_s)
+    ended = run_command(command, stop, print_line, timeout_s)
     if ended.code:
         raise DockerError(f"{shlex.join(command[:4])} ...: {ended.problem}")
     return ended.output

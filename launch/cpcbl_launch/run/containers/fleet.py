@@ -69,7 +69,7 @@ class Project:
         command_output(command, timeout_s=LONGEST_START_S)
 
     def down(self) -> None:
-        """Stops and removes all containers and networks; what is left over is said."""
+        """Stops and removes all containers and networks; it logs what is left over."""
         command = [*self._compose, "down", "--timeout", "3", "--volumes", "--remove-orphans"]
         try:
             command_output(command, timeout_s=LONGEST_START_S)
@@ -96,10 +96,10 @@ class Project:
         )
 
     def save_logs(self, folder: Path) -> None:
-        """What every container said, as SERVICE.log."""
+        """The output of every container, as SERVICE.log."""
         for service, container in self.containers().items():
-            said = run_command(["docker", "logs", container.id])
-            (folder / f"{service}.log").write_text(said.output, encoding="utf-8")
+            logs = run_command(["docker", "logs", container.id])
+            (folder / f"{service}.log").write_text(logs.output, encoding="utf-8")
 
 
 class ContainerSupervisor:

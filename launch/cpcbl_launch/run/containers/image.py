@@ -42,7 +42,9 @@ def tag(top: Path, base: str, extras: str = "") -> str:
     return f"{NAME}:{version()}-{content.hexdigest()[:12]}"
 
 
-def ensure_image(base: str, stop: Callable[[], bool], said: PrintLine, extras: str = "") -> str:
+def ensure_image(
+    base: str, stop: Callable[[], bool], print_line: PrintLine, extras: str = ""
+) -> str:
     """The name of an image of this very program with these extras, built where there is none yet.
 
     Raises DockerError.
@@ -55,8 +57,8 @@ def ensure_image(base: str, stop: Callable[[], bool], said: PrintLine, extras: s
         )
     name = tag(top, base, extras)
     if not has_image(name):
-        fetch_image(base, stop, said, WITHOUT_REGISTRY)
-        said(f"building image {name} on {base}, once for these sources")
+        fetch_image(base, stop, print_line, WITHOUT_REGISTRY)
+        print_line(f"building image {name} on {base}, once for these sources")
         command = [
             "docker",
             "build",
@@ -70,12 +72,12 @@ def ensure_image(base: str, stop: Callable[[], bool], said: PrintLine, extras: s
         ]
         command += ["--file", str(top / DOCKERFILE), str(top)]
 
-        def told(line: str) -> None:
+        def print_step(line: str) -> None:
             step = build_step(line)
             if step is not None:
-                said(step)
+                print_line(step)
 
-        command_output(command, stop, told, BUILD_TIMEOUT_S)
+        command_output(command, stop, print_step, BUILD_TIMEOUT_S)
     return name
 
 
@@ -84,11 +86,13 @@ def has_image(image: str) -> bool:
     return run_command(["docker", "image", "inspect", "--format", "{{.Id}}", image]).code == 0
 
 
-def fetch_image(image: str, stop: Callable[[], bool], said: PrintLine, otherwise: str) -> None:
+def fetch_image(
+    image: str, stop: Callable[[], bool], print_line: PrintLine, otherwise: str
+) -> None:
     """Fetches an image that is not there. Raises DockerError, with what to do `otherwise`."""
     if has_image(image):
         return
-    said(f"fetching image {image}")
+    print_line(f"fetching image {image}")
     fetched = run_command(["docker", "pull", "--quiet", image], stop, timeout_s=BUILD_TIMEOUT_S)
     if fetched.code:
         raise DockerError(f"no image {image} ({fetched.problem}); {otherwise}")

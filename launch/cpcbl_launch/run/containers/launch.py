@@ -47,17 +47,17 @@ class InContainers:
         stop: Callable[[], bool],
         image: str | None,
         base: str,
-        said: PrintLine,
+        print_line: PrintLine,
     ) -> None:
         """`image`: the one to use; None: of these sources, on `base`. Raises DockerError."""
         self._here = run.team.robots if run.here is None else run.here
         require_keys(run.team, run.team.transport.listen, self._here)
         check_daemon()
         program = compose_program()
-        self._run, self._folder, self._stop, self._said = run, folder, stop, said
+        self._run, self._folder, self._stop, self._print_line = run, folder, stop, print_line
         if image is not None:
-            fetch_image(image, stop, said, "leave --image out to build one of these sources")
-        self._image = image or ensure_image(base, stop, said, extras_of(run.team))
+            fetch_image(image, stop, print_line, "leave --image out to build one of these sources")
+        self._image = image or ensure_image(base, stop, print_line, extras_of(run.team))
         self.lead_s = LEAD_S + LEAD_S_A_CONTAINER * len(self._here)
         self._file = folder / "compose.yaml"
         name = f"{_project_name(run.team)}-{secrets.token_hex(3)}"
@@ -70,7 +70,9 @@ class InContainers:
         save_resolved(team_in_containers(self._run.team), team_file)
         team_file.chmod(0o644)
         self._write("")
-        self._said(f"starting {len(self._here)} robots in containers: project {self._project.name}")
+        self._print_line(
+            f"starting {len(self._here)} robots in containers: project {self._project.name}"
+        )
         team = self._run.team
         here = [local_endpoint(team.transport.listen[0])]
         link = link_of(team, Identity(Role.OPERATOR), here)
@@ -93,8 +95,8 @@ class InContainers:
         try:
             return open_bus(self._run.team.name, link.endpoints, give_up, link.credentials)
         except BusError as error:
-            said = self._project.last_log_line("router")
-            raise DockerError(f"{error}; the router's container said: {said}") from error
+            last_line = self._project.last_log_line("router")
+            raise DockerError(f"{error}; the router's container printed: {last_line}") from error
 
     @contextmanager
     def processes(self, clock: Clock) -> Iterator[Processes]:
@@ -104,8 +106,8 @@ class InContainers:
         yield ContainerSupervisor(self._project, ["router", *(row.name for row in rows)])
 
     def _end(self) -> None:
-        try:  # also when nobody reads any more what is said
-            self._said("taking the containers down")
+        try:  # also when nobody reads the output any more
+            self._print_line("taking the containers down")
             if self._run.folder is not None:
                 self._project.save_logs(self._folder)
         finally:

@@ -160,8 +160,8 @@ def _activity(robot: LiveRobot, given: Sequence[HelpLink]) -> Text:
     if robot.lost:
         return Text(f"lost: {robot.lost}", "bold red")
     lines = list(_arrows(given)) if given else [Text("nobody", "dim")]
-    if said := distrust_text(robot.trust):
-        lines.append(Text(said, "yellow"))
+    if text := distrust_text(robot.trust):
+        lines.append(Text(text, "yellow"))
     return Text("\n").join(lines)
 
 

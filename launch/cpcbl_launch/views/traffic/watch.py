@@ -80,7 +80,7 @@ class Traffic(msgspec.Struct, frozen=True, kw_only=True):
     """Real time."""
     robots: dict[str, LiveRobot]
     never_heard: tuple[str, ...]
-    """Robots of the team file that have said nothing."""
+    """Robots of the team file that have not sent a status."""
     help: tuple[HelpLink, ...]
     guests: tuple[str, ...] = ()
     """Robots that the team file, where there is one, does not name."""
@@ -104,7 +104,7 @@ def traffic_from_statuses(
     refused: Mapping[str, int] = MappingProxyType({}),
 ) -> Traffic:
     """What the latest statuses of each robot's present process come to."""
-    now = {name: _live_robot(seen, now_s) for name, seen in arrivals.items()}
+    now = {name: _live_robot(own, now_s) for name, own in arrivals.items()}
     robots = dict(sorted(now.items(), key=lambda item: (item[1].tier, item[0])))
     return Traffic(
         team=team,
@@ -117,10 +117,10 @@ def traffic_from_statuses(
     )
 
 
-def _live_robot(seen: Sequence[Arrival], now_s: float) -> LiveRobot:
-    first, last = seen[0].status, seen[-1].status
-    pause_s = seen[-1].at_s - seen[-2].at_s if len(seen) > 1 else 0.0
-    silent_s = now_s - seen[-1].at_s
+def _live_robot(arrivals: Sequence[Arrival], now_s: float) -> LiveRobot:
+    first, last = arrivals[0].status, arrivals[-1].status
+    pause_s = arrivals[-1].at_s - arrivals[-2].at_s if len(arrivals) > 1 else 0.0
+    silent_s = now_s - arrivals[-1].at_s
     return LiveRobot(
         tier=last.tier,
         position_sigma_m=last.position_sigma_m,
@@ -174,8 +174,8 @@ class StatusCollector:
     def _receive(self, received: Received[Status]) -> None:
         status = received.message
         with self._lock:
-            seen = self._arrivals.get(status.robot, [])
-            kept = [a for a in seen if _is_same_process(a.status, status)]
+            earlier = self._arrivals.get(status.robot, [])
+            kept = [a for a in earlier if _is_same_process(a.status, status)]
             self._arrivals[status.robot] = [*kept, Arrival(self._now_s(), status)]
 
     @property
@@ -234,8 +234,8 @@ def watch_team(watch: WatchRequest, view: View, stop: Callable[[], bool]) -> Tra
         watcher, began_s = StatusCollector(bus), time.monotonic()
         while True:
             now_s = time.monotonic()
-            heard = watcher.arrivals(), began_s, now_s, watcher.refused
-            now = traffic_from_statuses(watch.team, watch.known, *heard)
+            state = watcher.arrivals(), began_s, now_s, watcher.refused
+            now = traffic_from_statuses(watch.team, watch.known, *state)
             view.show(now)
             if stop() or now_s - began_s >= watch.duration_s:
                 return now
