@@ -1,4 +1,4 @@
-"""Notes on runs that never were, to judge."""
+"""Logs of invented runs, with which the checks of scenarios are tested."""
 
 from collections.abc import Callable, Mapping, Sequence
 
@@ -15,19 +15,19 @@ TENTHS = tuple(round(0.1 * n, 1) for n in range(int(10 * UNTIL_S)))
 COVARIANCE = (0.01, 0.0, 0.01, 0.0, 0.0, 0.01)
 
 
-def error_of(_: float) -> float:
-    """Of a good robot, in metres."""
+def small_error(_: float) -> float:
+    """The error of a well localized robot, in metres."""
     return 0.02
 
 
 def tracks_of(
     robot: str,
-    error_m: Callable[[float], float] = error_of,
+    error_m: Callable[[float], float] = small_error,
     silent: tuple[float, float] = (0.0, 0.0),
     lost: tuple[float, float] = (0.0, 0.0),
     late_s: float = 0.01,
 ) -> list[ReceivedTrack]:
-    """Ten tracks a second of a robot that stands at (1, 2), but for a time of silence."""
+    """Ten tracks per second of a robot at (1, 2), except for a time of silence."""
     return [
         ReceivedTrack(
             at_s + late_s,
@@ -83,33 +83,35 @@ def status_at(
     )
 
 
-def notes_of(
+def run_log_of(
     tracks: Sequence[Sequence[ReceivedTrack]],
     tokens: Sequence[TokenEvent] = (),
     statuses: Sequence[ReceivedStatus] = (),
     jump: tuple[str, float, float] | None = None,
 ) -> RunLog:
-    """`jump`: (robot, time, metres) of its true place."""
+    """The log of a run; `jump`: (robot, time, metres) of a jump of its true position."""
     by_robot = {heard[0].track.robot: tuple(heard) for heard in tracks}
     rows = {name: np.array([(at_s, 1.0, 2.0, 0.0) for at_s in TENTHS]) for name in by_robot}
     if jump is not None:
         robot, at_s, metres = jump
         moved = rows[robot][:, 0] >= at_s
         rows[robot][moved, 1] += metres
-    said: dict[str, list[ReceivedStatus]] = {}
+    received: dict[str, list[ReceivedStatus]] = {}
     for one in statuses:
-        said.setdefault(one.status.robot, []).append(one)
-    return RunLog(EPOCH_NS, by_robot, said, tuple(tokens), rows)
+        received.setdefault(one.status.robot, []).append(one)
+    return RunLog(EPOCH_NS, by_robot, received, tuple(tokens), rows)
 
 
-def came(at_s: float, robot: str, incarnation: str = "1", tier: str = "3") -> TokenEvent:
+def token_appeared(at_s: float, robot: str, incarnation: str = "1", tier: str = "3") -> TokenEvent:
     return TokenEvent(at_s, robot, tier, incarnation, True)
 
 
-def went(at_s: float, robot: str, incarnation: str = "1", tier: str = "3") -> TokenEvent:
+def token_disappeared(
+    at_s: float, robot: str, incarnation: str = "1", tier: str = "3"
+) -> TokenEvent:
     return TokenEvent(at_s, robot, tier, incarnation, False)
 
 
-def broken(checks: Sequence[Check]) -> set[str]:
-    """What did not hold."""
+def unmet_checks(checks: Sequence[Check]) -> set[str]:
+    """The names of the checks that are not met."""
     return {check.what for check in checks if not check.is_met}

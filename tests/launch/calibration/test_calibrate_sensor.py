@@ -381,7 +381,7 @@ def test_the_command_line_writes_a_team_that_it_can_check(wrong: Path, tmp_path:
     assert json.loads(shown.stdout)["sensor"]["range_scale"]["value"] > 1.0
 
 
-def test_what_is_wrong_is_one_line(honest: Path, tmp_path: Path) -> None:
+def test_a_wrong_option_is_one_line(honest: Path, tmp_path: Path) -> None:
     team = tmp_path / "lab.toml"
     team.write_text(TEAM)
     for arguments, words in (

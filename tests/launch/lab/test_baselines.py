@@ -44,7 +44,7 @@ ODOMETRY = OdometrySettings(
 # Logs --------------------------------------------------------------------------------------------
 
 
-def rewritten(path: Path, change: Callable[[Floats], Floats], columns: int) -> None:
+def rewrite_table(path: Path, change: Callable[[Floats], Floats], columns: int) -> None:
     np.savetxt(path, change(read_table(path, columns)), fmt="%.9f")
 
 
@@ -66,26 +66,28 @@ def add_noise(folder: Path, seed: int) -> None:
         return rows
 
     for path in sorted(folder.glob("Robot*_Odometry.dat")):
-        rewritten(path, wheels, 3)
+        rewrite_table(path, wheels, 3)
     for path in sorted(folder.glob("Robot*_Measurement.dat")):
-        rewritten(path, camera, 4)
+        rewrite_table(path, camera, 4)
 
 
-def changed(team: Team, **settings: Any) -> Team:
+def with_robot_settings(team: Team, **settings: Any) -> Team:
     """All robots with other settings."""
     robots = {n: msgspec.structs.replace(r, **settings) for n, r in team.robots.items()}
     return msgspec.structs.replace(team, robots=robots)
 
 
-def noisy(folder: Path, seed: int, seconds: float = 40.0) -> LoggedTeam:
+def noisy_log(folder: Path, seed: int, seconds: float = 40.0) -> LoggedTeam:
     write_log(folder, ROBOTS, seconds)
     add_noise(folder, seed)
-    return started(
-        load_logged_team(changed(log_team(*ROBOTS), sensor=SENSOR, odometry=ODOMETRY), folder)
+    return with_start_poses(
+        load_logged_team(
+            with_robot_settings(log_team(*ROBOTS), sensor=SENSOR, odometry=ODOMETRY), folder
+        )
     )
 
 
-def started(logged: LoggedTeam, dx_m: float = 0.0, dy_m: float = 0.0) -> LoggedTeam:
+def with_start_poses(logged: LoggedTeam, dx_m: float = 0.0, dy_m: float = 0.0) -> LoggedTeam:
     """Robots that are sure of starts which are so far off."""
     robots = {}
     for name, robot in logged.team.robots.items():
@@ -122,7 +124,7 @@ def figure(report: BaselineReport, name: str = "position_rmse_m", robot: str = "
 
 
 @pytest.mark.parametrize("blind", [[], ["2"]], ids=["full map", "blind"])
-def test_no_noise_no_error(tmp_path: Path, blind: list[str]) -> None:
+def test_without_noise_there_is_no_error(tmp_path: Path, blind: list[str]) -> None:
     write_log(tmp_path, ROBOTS, 20.0, unknown_barcode=True)
     logged = load_logged_team(log_team(*ROBOTS), tmp_path)
     reports = reports_of(logged._replace(team=with_blind_robots(logged.team, blind)))
@@ -139,10 +141,10 @@ def test_no_noise_no_error(tmp_path: Path, blind: list[str]) -> None:
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory: pytest.TempPathFactory) -> list[dict[str, BaselineReport]]:
     """Five noisy logs."""
-    return [reports_of(noisy(tmp_path_factory.mktemp("log"), seed)) for seed in range(5)]
+    return [reports_of(noisy_log(tmp_path_factory.mktemp("log"), seed)) for seed in range(5)]
 
 
-def test_who_knows_more_errs_less(runs: list[dict[str, BaselineReport]]) -> None:
+def test_more_information_gives_a_smaller_error(runs: list[dict[str, BaselineReport]]) -> None:
     for run in runs:
         reckoning, solo, centralized = (figure(run[kind]) for kind in KINDS)
         assert 0.001 < centralized <= solo <= 0.7 * reckoning
@@ -158,7 +160,7 @@ def test_filters_are_consistent_on_white_noise(
 
 
 def test_a_blind_robot_has_only_the_centralized_filter(tmp_path: Path) -> None:
-    logged = noisy(tmp_path, 4, 20.0)
+    logged = noisy_log(tmp_path, 4, 20.0)
     full = reports_of(logged)
     blind = reports_of(logged._replace(team=with_blind_robots(logged.team, ["2"])))
     assert blind["solo_ekf"].robots["2"] == blind["dead_reckoning"].robots["2"]
@@ -170,9 +172,9 @@ def test_a_blind_robot_has_only_the_centralized_filter(tmp_path: Path) -> None:
 def test_without_sightings_of_robots_the_centralized_filter_is_many_solo_filters(
     tmp_path: Path,
 ) -> None:
-    logged = noisy(tmp_path, 5, 10.0)
+    logged = noisy_log(tmp_path, 5, 10.0)
     sensor = msgspec.structs.replace(SENSOR, sees_robots=False)
-    paths = paths_of(logged._replace(team=changed(logged.team, sensor=sensor)))
+    paths = paths_of(logged._replace(team=with_robot_settings(logged.team, sensor=sensor)))
     for name, alone in paths["solo_ekf"].items():
         together = paths["centralized_ekf"][name]
         np.testing.assert_allclose(together.estimate, alone.estimate, atol=1e-9)
@@ -188,14 +190,16 @@ def test_the_baselines_correct_inputs_as_the_team_does(tmp_path: Path) -> None:
     write_log(tmp_path, ROBOTS, 20.0)
     wheels, late = np.array([1.0, 1.25, 1.0 / 0.9]), np.array([0.1, 0.0, 0.0, 0.0])
     for robot in ROBOTS:
-        rewritten(tmp_path / f"Robot{robot}_Odometry.dat", lambda rows: rows * wheels, 3)
-        rewritten(tmp_path / f"Robot{robot}_Measurement.dat", lambda rows: rows + late, 4)
+        rewrite_table(tmp_path / f"Robot{robot}_Odometry.dat", lambda rows: rows * wheels, 3)
+        rewrite_table(tmp_path / f"Robot{robot}_Measurement.dat", lambda rows: rows + late, 4)
     odometry = OdometrySettings(distance_scale=0.8, turn_scale=0.9)
     plain, corrected = (
         reports_of(load_logged_team(team, tmp_path))
         for team in (
             log_team(*ROBOTS),
-            changed(log_team(*ROBOTS), odometry=odometry, sensor=SensorSettings(delay_s=0.1)),
+            with_robot_settings(
+                log_team(*ROBOTS), odometry=odometry, sensor=SensorSettings(delay_s=0.1)
+            ),
         )
     )
     for kind in KINDS:
@@ -203,14 +207,14 @@ def test_the_baselines_correct_inputs_as_the_team_does(tmp_path: Path) -> None:
         assert figure(corrected[kind]) == pytest.approx(0.0, abs=1e-4)
 
 
-def test_what_is_seen_again_soon_counts_for_nothing_or_for_less(tmp_path: Path) -> None:
+def test_a_repeated_sighting_is_ignored_or_weighted_less(tmp_path: Path) -> None:
     """Both leave a wider covariance; an interval of one frame uses every frame."""
-    logged = noisy(tmp_path, 6, 10.0)
+    logged = noisy_log(tmp_path, 6, 10.0)
 
     def spread(interval_s: float = 0.0, correlation_s: float = 0.0) -> float:
         rules = LocalizerSettings(object_interval_s=interval_s)
         sensor = msgspec.structs.replace(SENSOR, correlation_s=correlation_s)
-        team = changed(logged.team, localizer=rules, sensor=sensor)
+        team = with_robot_settings(logged.team, localizer=rules, sensor=sensor)
         covariance = paths_of(logged._replace(team=team))["solo_ekf"]["1"].covariance
         assert covariance is not None
         return float(covariance[:, 0].mean())
@@ -220,9 +224,9 @@ def test_what_is_seen_again_soon_counts_for_nothing_or_for_less(tmp_path: Path) 
     assert spread(correlation_s=2.0) > 1.5 * spread()
 
 
-def test_a_filter_that_refuses_everything_comes_back(tmp_path: Path) -> None:
+def test_a_filter_that_rejects_everything_recovers(tmp_path: Path) -> None:
     """All robots start 1 m off and are sure of it: every gate stays shut until they doubt."""
-    logged = started(noisy(tmp_path, 7, 25.0), 1.0, -0.5)
+    logged = with_start_poses(noisy_log(tmp_path, 7, 25.0), 1.0, -0.5)
     paths = paths_of(logged)
     for kind in KINDS[1:]:
         for name, path in paths[kind].items():

@@ -45,8 +45,8 @@ from cpcbl_transport.zenoh_bus import open_bus, open_router
 SETTING = ScenarioOptions(seed=3, soak_s=60.0)
 
 
-def judged(outcome: Outcome) -> None:
-    """Fails with all that was seen; skips what cannot run here."""
+def assert_checks_met(outcome: Outcome) -> None:
+    """Fails with all figures; skips a scenario whose requirements are missing."""
     if outcome.not_run:
         pytest.skip(outcome.not_run)
     seen = "\n".join(f"{'held' if c.is_met else 'NOT HELD'}: {c}" for c in outcome.checks)
@@ -55,8 +55,8 @@ def judged(outcome: Outcome) -> None:
 
 @pytest.mark.timeout(300)
 @pytest.mark.parametrize("scenario", [pytest.param(s, id=s.name) for s in SCENARIOS if s.quick])
-def test_a_quick_scenario_holds(scenario: Scenario) -> None:
-    judged(run_scenario(scenario, SETTING))
+def test_the_checks_of_a_quick_scenario_are_met(scenario: Scenario) -> None:
+    assert_checks_met(run_scenario(scenario, SETTING))
 
 
 # The table and its command ------------------------------------------------------------------------
@@ -68,7 +68,7 @@ def scenario_of(name: str, *checks: Check, needs: Needs = Needs.NOTHING) -> Scen
     )
 
 
-def test_every_scenario_has_its_own_name_and_says_what_it_expects() -> None:
+def test_every_scenario_has_a_unique_name_and_an_expectation() -> None:
     names = [s.name for s in SCENARIOS]
     assert len(set(names)) == len(names)
     assert all(s.done and s.expectation for s in SCENARIOS)
@@ -95,7 +95,9 @@ def test_the_scenarios_are_listed() -> None:
         assert scenario.name[:8] in ran.stdout
 
 
-def test_what_fails_and_what_cannot_run_is_told_apart(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_failure_and_a_missing_requirement_are_distinguished(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     def breaks(_: ScenarioOptions) -> ScenarioResult:
         raise ChaosError("the team did not settle")
 
@@ -118,7 +120,7 @@ def test_what_fails_and_what_cannot_run_is_told_apart(monkeypatch: pytest.Monkey
 
 
 @pytest.mark.long
-def test_the_command_reports_a_scenario_in_words_data_and_markdown(tmp_path: Path) -> None:
+def test_the_command_reports_a_scenario_as_table_json_and_markdown(tmp_path: Path) -> None:
     report, page = tmp_path / "chaos.json", tmp_path / "chaos.md"
     ran = cpcbl_team("chaos", "kill-robot", "--json", "--report", report, "--markdown", page)
     assert ran.returncode == 0, ran.stderr
@@ -147,8 +149,8 @@ def test_a_scenario_that_is_interrupted_leaves_no_process() -> None:
 
 
 @contextmanager
-def echoing() -> Iterator[str]:
-    """The endpoint of a server that sends back what it gets."""
+def echo_server() -> Iterator[str]:
+    """The endpoint of a server that returns what it receives."""
 
     def serve(end: socket.socket) -> None:
         with end:
@@ -184,7 +186,7 @@ def round_trip_s(link: socket.socket, data: bytes) -> float:
 
 
 def test_a_relay_carries_delays_and_limits() -> None:
-    with echoing() as server, Relay(server) as relay, dial(relay.endpoint) as link:
+    with echo_server() as server, Relay(server) as relay, dial(relay.endpoint) as link:
         assert round_trip_s(link, bytes(range(256)) * 2_000) < 5.0
         relay.set(LinkQuality(delay_s=0.2))
         wait_until(lambda: round_trip_s(link, b"x") >= 0.4)
@@ -195,7 +197,7 @@ def test_a_relay_carries_delays_and_limits() -> None:
 
 
 def test_a_cut_relay_is_silent_and_loses_nothing() -> None:
-    with echoing() as server, Relay(server) as relay, dial(relay.endpoint) as link:
+    with echo_server() as server, Relay(server) as relay, dial(relay.endpoint) as link:
         round_trip_s(link, b"before")
         relay.set(LinkQuality(cut=True))
         wait_until(lambda: relay.quality.cut)
@@ -208,8 +210,8 @@ def test_a_cut_relay_is_silent_and_loses_nothing() -> None:
         assert link.recv(100) == b"meanwhile"
 
 
-def test_a_relay_hands_on_that_an_end_has_left() -> None:
-    with echoing() as server, Relay(server) as relay:
+def test_a_relay_forwards_that_an_end_has_closed() -> None:
+    with echo_server() as server, Relay(server) as relay:
         with dial(relay.endpoint) as link:
             round_trip_s(link, b"x")
         with dial(relay.endpoint) as link:
@@ -218,7 +220,7 @@ def test_a_relay_hands_on_that_an_end_has_left() -> None:
 
 
 @pytest.mark.skipif(bool(tun_link.missing_requirement()), reason="needs root and /dev/net/tun")
-def test_a_wire_loses_packets_and_tcp_lives_with_it() -> None:
+def test_a_tun_link_loses_packets_and_tcp_copes() -> None:
     with TunLink(seed=1) as lossy, socket.create_server((lossy.near_address, 0)) as server:
         server.settimeout(30.0)
         port = server.getsockname()[1]
@@ -241,7 +243,7 @@ def test_a_wire_loses_packets_and_tcp_lives_with_it() -> None:
     assert name not in listed
 
 
-SPEAKS = """
+SENDER = """
 import sys, time
 from cpcbl_transport.topics import Qos
 from cpcbl_transport.zenoh_bus import open_bus
@@ -260,12 +262,12 @@ def test_a_router_keeps_no_memory_of_sessions_that_sent_much(tmp_path: Path) -> 
     with Supervisor([router_spec(team_file, [endpoint])], tmp_path) as supervisor:
         held = []
         for _ in range(4):
-            subprocess.run([sys.executable, "-c", SPEAKS, endpoint], check=True, timeout=60.0)
+            subprocess.run([sys.executable, "-c", SENDER, endpoint], check=True, timeout=60.0)
             held.append(process_usage(supervisor.pids[ROUTER]).own_bytes / MIB)
     assert held[-1] - held[0] < 8.0  # with shared memory 10 MiB each
 
 
-def test_an_echo_says_everything_twice_more() -> None:
+def test_an_echo_sends_every_message_twice_more() -> None:
     endpoint = free_endpoint()
     key = topics.FIX.at(robot="a", tier=0, observer="b")
     with (
@@ -291,7 +293,7 @@ def test_an_echo_says_everything_twice_more() -> None:
         assert heard != sorted(heard)
 
 
-def test_a_team_that_does_not_settle_says_who_and_why() -> None:
+def test_a_team_that_does_not_settle_raises_an_error_with_robot_and_reason() -> None:
     with (
         pytest.raises(ChaosError, match=r"did not settle: .*patrol"),
         run_team_under_test(RunPlan(demo_team(), links={"patrol": free_endpoint()})) as team,

@@ -2,7 +2,15 @@
 
 import pytest
 from msgspec.structs import replace
-from support.chaos import UNTIL_S, broken, came, notes_of, status_at, tracks_of, went
+from support.chaos import (
+    UNTIL_S,
+    run_log_of,
+    status_at,
+    token_appeared,
+    token_disappeared,
+    tracks_of,
+    unmet_checks,
+)
 
 from cpcbl_launch.lab.chaos.checks import ChaosReport, Check, Outcome, report_data
 from cpcbl_launch.lab.chaos.figures import (
@@ -34,7 +42,7 @@ from cpcbl_launch.lab.chaos.world import (
 from cpcbl_launch.run.usage import MIB
 
 AT_S = 10.0
-GOOD = notes_of([tracks_of("a"), tracks_of("b")])
+GOOD = run_log_of([tracks_of("a"), tracks_of("b")])
 
 
 def outcome(*checks: Check) -> Outcome:
@@ -53,12 +61,14 @@ def outcome(*checks: Check) -> Outcome:
         (Check(what="n", seen=4, at_least=3, at_most=3), False, "n 4 (= 3)"),
     ],
 )
-def test_a_check_holds_within_its_bounds_and_says_both(check: Check, held: bool, said: str) -> None:
+def test_a_check_is_met_within_its_bounds_and_shows_both(
+    check: Check, held: bool, said: str
+) -> None:
     assert check.is_met is held
     assert str(check) == said
 
 
-def test_an_outcome_without_a_check_does_not_hold() -> None:
+def test_an_outcome_without_a_check_is_not_met() -> None:
     good = outcome(Check(what="n", seen=1, at_least=1))
     assert good.is_met is True
     assert outcome().is_met is False
@@ -66,7 +76,7 @@ def test_an_outcome_without_a_check_does_not_hold() -> None:
     assert replace(outcome(), not_run="needs root").is_met is None
 
 
-def test_what_was_not_run_breaks_nothing_and_is_in_the_data() -> None:
+def test_a_scenario_that_was_not_run_violates_nothing_and_is_in_the_report() -> None:
     skipped = replace(outcome(), not_run="needs root")
     good = ChaosReport(version="1", seed=1, machine="m", outcomes=(skipped,))
     assert good.is_met
@@ -80,35 +90,45 @@ def test_what_was_not_run_breaks_nothing_and_is_in_the_data() -> None:
 # Figures ------------------------------------------------------------------------------------------
 
 
-def test_a_robot_is_gone_when_the_last_of_its_tokens_is() -> None:
-    tokens = [came(0, "a"), came(9, "a", tier="4"), went(9.1, "a"), went(10.5, "a", tier="4")]
-    assert token_gone_after_s(notes_of([], tokens), "a", AT_S) == pytest.approx(0.5)
-    assert token_gone_after_s(notes_of([], tokens[:3]), "a", AT_S) is None
+def test_a_robot_is_gone_when_its_last_token_is() -> None:
+    tokens = [
+        token_appeared(0, "a"),
+        token_appeared(9, "a", tier="4"),
+        token_disappeared(9.1, "a"),
+        token_disappeared(10.5, "a", tier="4"),
+    ]
+    assert token_gone_after_s(run_log_of([], tokens), "a", AT_S) == pytest.approx(0.5)
+    assert token_gone_after_s(run_log_of([], tokens[:3]), "a", AT_S) is None
 
 
 def test_a_robot_is_back_with_another_process() -> None:
-    tokens = [came(0, "a"), came(11.0, "a"), came(12.0, "a", "2"), came(11.5, "b", "2")]
-    assert restarted_after_s(notes_of([], tokens), "a", AT_S, "1") == pytest.approx(2.0)
-    assert restarted_after_s(notes_of([], tokens[:2]), "a", AT_S, "1") is None
+    tokens = [
+        token_appeared(0, "a"),
+        token_appeared(11.0, "a"),
+        token_appeared(12.0, "a", "2"),
+        token_appeared(11.5, "b", "2"),
+    ]
+    assert restarted_after_s(run_log_of([], tokens), "a", AT_S, "1") == pytest.approx(2.0)
+    assert restarted_after_s(run_log_of([], tokens[:2]), "a", AT_S, "1") is None
 
 
-def test_a_robot_is_found_when_it_stays_right_for_a_second() -> None:
+def test_a_robot_is_localized_when_it_stays_correct_for_a_second() -> None:
     flickers = tracks_of("a", lambda s: 1.0 if s < 12.0 or 12.5 < s < 14.0 else 0.1)
-    assert localized_after_s(notes_of([flickers]), "a", AT_S, 0.3) == pytest.approx(4.0)
+    assert localized_after_s(run_log_of([flickers]), "a", AT_S, 0.3) == pytest.approx(4.0)
     lost = tracks_of("a", lost=(0.0, 15.0))
-    assert localized_after_s(notes_of([lost]), "a", AT_S, 0.3) == pytest.approx(5.0)
-    assert reported_lost_after_s(notes_of([lost]), "a", AT_S) == pytest.approx(0.0)
+    assert localized_after_s(run_log_of([lost]), "a", AT_S, 0.3) == pytest.approx(5.0)
+    assert reported_lost_after_s(run_log_of([lost]), "a", AT_S) == pytest.approx(0.0)
     said = [status_at("a", 9.5, {"lost": 1}), status_at("a", 10.5, {"lost": 2})]
-    assert reported_lost_after_s(notes_of([tracks_of("a")], (), said), "a", AT_S) == pytest.approx(
-        0.5
-    )
-    assert reported_lost_after_s(notes_of([tracks_of("a")], (), said[:1]), "a", AT_S) is None
+    assert reported_lost_after_s(
+        run_log_of([tracks_of("a")], (), said), "a", AT_S
+    ) == pytest.approx(0.5)
+    assert reported_lost_after_s(run_log_of([tracks_of("a")], (), said[:1]), "a", AT_S) is None
     never = tracks_of("a", lambda s: 1.0)
-    assert localized_after_s(notes_of([never]), "a", AT_S, 0.3) is None
+    assert localized_after_s(run_log_of([never]), "a", AT_S, 0.3) is None
 
 
-def test_silence_error_and_delay_are_those_of_the_window() -> None:
-    notes = notes_of(
+def test_gap_error_and_delay_are_those_of_the_window() -> None:
+    notes = run_log_of(
         [tracks_of("a", lambda s: 3.0 if s >= 20.0 else 0.3, (12.0, 15.0), late_s=0.2)]
     )
     assert longest_track_gap_s(notes, "a", AT_S, 20.0) == pytest.approx(3.1, abs=0.11)
@@ -126,38 +146,43 @@ def test_counts_are_those_of_the_window_over_all_processes() -> None:
         status_at("a", 13.0, {"garbage": 3}, incarnation="2"),
         status_at("a", 30.0, {"garbage": 99}, incarnation="2"),
     ]
-    assert counts_between(notes_of([], (), statuses), "a", AT_S, 20.0)["garbage"] == 2 + 3
+    assert counts_between(run_log_of([], (), statuses), "a", AT_S, 20.0)["garbage"] == 2 + 3
 
 
 # Processes ----------------------------------------------------------------------------------------
 
-KILLED = [came(0.0, "a"), came(0.0, "b"), went(10.1, "a"), came(11.0, "a", "2")]
+KILLED = [
+    token_appeared(0.0, "a"),
+    token_appeared(0.0, "b"),
+    token_disappeared(10.1, "a"),
+    token_appeared(11.0, "a", "2"),
+]
 
 
 def test_a_killed_robot() -> None:
-    good = notes_of([tracks_of("a", silent=(10.0, 11.0)), tracks_of("b")], KILLED)
-    assert not broken(kill_checks(good, "a", AT_S, "1", ["b"], 13.0, UNTIL_S))
-    never_back = notes_of([tracks_of("a", silent=(10.0, 99.0)), tracks_of("b")], KILLED[:2])
-    assert broken(kill_checks(never_back, "a", AT_S, "1", ["b"], 13.0, UNTIL_S)) >= {
+    good = run_log_of([tracks_of("a", silent=(10.0, 11.0)), tracks_of("b")], KILLED)
+    assert not unmet_checks(kill_checks(good, "a", AT_S, "1", ["b"], 13.0, UNTIL_S))
+    never_back = run_log_of([tracks_of("a", silent=(10.0, 99.0)), tracks_of("b")], KILLED[:2])
+    assert unmet_checks(kill_checks(never_back, "a", AT_S, "1", ["b"], 13.0, UNTIL_S)) >= {
         "its token disappeared after",
         "a new process started after",
         "from then until it was localized",
         "RMSE afterwards, worst robot",
     }
-    others_stop = notes_of([tracks_of("a"), tracks_of("b", silent=(10.5, 12.5))], KILLED)
-    assert broken(kill_checks(others_stop, "a", AT_S, "1", ["b"], 13.0, UNTIL_S)) == {
+    others_stop = run_log_of([tracks_of("a"), tracks_of("b", silent=(10.5, 12.5))], KILLED)
+    assert unmet_checks(kill_checks(others_stop, "a", AT_S, "1", ["b"], 13.0, UNTIL_S)) == {
         "others' longest gap between tracks"
     }
 
 
 def test_a_killed_router() -> None:
-    tokens = [came(12.0, "a"), came(12.0, "b")]
+    tokens = [token_appeared(12.0, "a"), token_appeared(12.0, "b")]
     said = [status_at("a", 13.0), status_at("a", 20.0, {"messages_received": 30})]
     tracks = [tracks_of("a", silent=(10.0, 12.0)), tracks_of("b", silent=(10.0, 12.0))]
-    good = notes_of(tracks, tokens, said)
-    assert not broken(kill_router_checks(good, ["a", "b"], AT_S, 13.0, 21.0))
-    bad = notes_of([tracks_of("a", silent=(10.0, 18.0)), tracks[1]], tokens[:1], said[:1])
-    assert broken(kill_router_checks(bad, ["a", "b"], AT_S, 13.0, 21.0)) == {
+    good = run_log_of(tracks, tokens, said)
+    assert not unmet_checks(kill_router_checks(good, ["a", "b"], AT_S, 13.0, 21.0))
+    bad = run_log_of([tracks_of("a", silent=(10.0, 18.0)), tracks[1]], tokens[:1], said[:1])
+    assert unmet_checks(kill_router_checks(bad, ["a", "b"], AT_S, 13.0, 21.0)) == {
         "longest gap between tracks",
         "robots with a token at the new router",
         "help received in the 8 s after",
@@ -166,23 +191,30 @@ def test_a_killed_router() -> None:
 
 def test_a_killed_field() -> None:
     wrong_for_a_while = [tracks_of(n, lambda s: 2.0 if 11.0 < s < 14.0 else 0.02) for n in "ab"]
-    good = kill_field_checks(notes_of(wrong_for_a_while), ["a", "b"], AT_S, 11.0, 16.0, UNTIL_S)
-    assert not broken(good)
-    stuck = notes_of([tracks_of("a"), tracks_of("b", lambda s: 2.0 if s > 11.0 else 0.02)])
-    assert broken(kill_field_checks(stuck, ["a", "b"], AT_S, 11.0, 16.0, UNTIL_S)) >= {
+    good = kill_field_checks(run_log_of(wrong_for_a_while), ["a", "b"], AT_S, 11.0, 16.0, UNTIL_S)
+    assert not unmet_checks(good)
+    stuck = run_log_of([tracks_of("a"), tracks_of("b", lambda s: 2.0 if s > 11.0 else 0.02)])
+    assert unmet_checks(kill_field_checks(stuck, ["a", "b"], AT_S, 11.0, 16.0, UNTIL_S)) >= {
         "from then until all were localized",
         "RMSE afterwards, worst robot",
     }
 
 
 def test_a_frozen_robot() -> None:
-    tokens = [came(0.0, "a"), came(0.0, "b"), went(12.0, "a"), came(15.2, "a")]
+    tokens = [
+        token_appeared(0.0, "a"),
+        token_appeared(0.0, "b"),
+        token_disappeared(12.0, "a"),
+        token_appeared(15.2, "a"),
+    ]
     tracks = [tracks_of("a", silent=(10.0, 15.0)), tracks_of("b")]
-    assert not broken(freeze_checks(notes_of(tracks, tokens), "a", AT_S, 15.0, ["b"], UNTIL_S))
+    assert not unmet_checks(
+        freeze_checks(run_log_of(tracks, tokens), "a", AT_S, 15.0, ["b"], UNTIL_S)
+    )
     burst = [h._replace(at_s=15.1) if 10.0 <= h.at_s < 14.0 else h for h in tracks_of("a")]
     led_astray = tracks_of("b", lambda s: 0.8 if 15.0 < s < 17.0 else 0.02)
-    bad = notes_of([sorted(burst, key=lambda h: h.at_s), led_astray], tokens[:2])
-    assert broken(freeze_checks(bad, "a", AT_S, 15.0, ["b"], UNTIL_S)) == {
+    bad = run_log_of([sorted(burst, key=lambda h: h.at_s), led_astray], tokens[:2])
+    assert unmet_checks(freeze_checks(bad, "a", AT_S, 15.0, ["b"], UNTIL_S)) == {
         "its token disappeared after",
         "tracks that arrived more than 1 s late",
         "others' largest error in the 4 s after it woke",
@@ -193,16 +225,24 @@ def test_a_frozen_robot() -> None:
 
 
 def test_a_partition() -> None:
-    near_tokens = [came(0, "far"), went(12.0, "far"), came(20.5, "far")]
-    far_tokens = [came(0, "near"), went(12.0, "near"), came(20.5, "near")]
+    near_tokens = [
+        token_appeared(0, "far"),
+        token_disappeared(12.0, "far"),
+        token_appeared(20.5, "far"),
+    ]
+    far_tokens = [
+        token_appeared(0, "near"),
+        token_disappeared(12.0, "near"),
+        token_appeared(20.5, "near"),
+    ]
     both = [tracks_of("near"), tracks_of("far")]
     helped = [status_at("far", 21.0, heard=[("near", 20.6)])]
-    near, far = notes_of(both, near_tokens), notes_of(both, far_tokens, helped)
+    near, far = run_log_of(both, near_tokens), run_log_of(both, far_tokens, helped)
     times = AT_S, 20.0, UNTIL_S
-    assert not broken(partition_checks(near, far, ["near"], ["far"], *times))
-    late = notes_of(both, [*near_tokens[:2], came(26.0, "far")])
-    stopped = notes_of([both[0], tracks_of("far", silent=(11.0, 19.0))], far_tokens)
-    assert broken(partition_checks(late, stopped, ["near"], ["far"], *times)) == {
+    assert not unmet_checks(partition_checks(near, far, ["near"], ["far"], *times))
+    late = run_log_of(both, [*near_tokens[:2], token_appeared(26.0, "far")])
+    stopped = run_log_of([both[0], tracks_of("far", silent=(11.0, 19.0))], far_tokens)
+    assert unmet_checks(partition_checks(late, stopped, ["near"], ["far"], *times)) == {
         "far side's longest gap between tracks",
         "from healing to all tokens back",
         "from healing to the first help",
@@ -210,23 +250,23 @@ def test_a_partition() -> None:
 
 
 def test_a_cut_link() -> None:
-    tokens = [came(0, "a"), went(12.0, "a"), came(20.5, "a")]
-    good = notes_of([tracks_of("a", silent=(10.0, 20.0)), tracks_of("b")], tokens)
-    assert not broken(cut_link_checks(good, "a", ["b"], AT_S, 20.0, UNTIL_S))
-    bad = notes_of([tracks_of("a", silent=(10.0, 30.0)), tracks_of("b")], tokens[:1])
-    assert broken(cut_link_checks(bad, "a", ["b"], AT_S, 20.0, UNTIL_S)) == {
+    tokens = [token_appeared(0, "a"), token_disappeared(12.0, "a"), token_appeared(20.5, "a")]
+    good = run_log_of([tracks_of("a", silent=(10.0, 20.0)), tracks_of("b")], tokens)
+    assert not unmet_checks(cut_link_checks(good, "a", ["b"], AT_S, 20.0, UNTIL_S))
+    bad = run_log_of([tracks_of("a", silent=(10.0, 30.0)), tracks_of("b")], tokens[:1])
+    assert unmet_checks(cut_link_checks(bad, "a", ["b"], AT_S, 20.0, UNTIL_S)) == {
         "its token disappeared after",
         "from healing to its token back",
         "from healing until it was localized",
     }
 
 
-def test_a_bad_link() -> None:
+def test_an_impaired_link() -> None:
     said = [status_at("a", 9.0), status_at("a", 20.0, {"messages_received": 50})]
-    good = notes_of([tracks_of("a", late_s=0.5), tracks_of("b")], (), said)
-    assert not broken(bad_link_checks(good, "a", ["b"], AT_S, 25.0, UNTIL_S, 2.0, 1.5))
-    bad = notes_of([tracks_of("a", late_s=3.0), tracks_of("b", late_s=0.9)])
-    assert broken(bad_link_checks(bad, "a", ["b"], AT_S, 25.0, UNTIL_S, 2.0, 1.5)) == {
+    good = run_log_of([tracks_of("a", late_s=0.5), tracks_of("b")], (), said)
+    assert not unmet_checks(bad_link_checks(good, "a", ["b"], AT_S, 25.0, UNTIL_S, 2.0, 1.5))
+    bad = run_log_of([tracks_of("a", late_s=3.0), tracks_of("b", late_s=0.9)])
+    assert unmet_checks(bad_link_checks(bad, "a", ["b"], AT_S, 25.0, UNTIL_S, 2.0, 1.5)) == {
         "its tracks' delay, 99th percentile",
         "help messages that it received",
         "others' delay, 99th percentile",
@@ -238,19 +278,19 @@ def test_a_bad_link() -> None:
 
 def test_duplicates() -> None:
     said = [status_at("a", 9.0), status_at("a", 20.0, {"duplicate": 60, "too_late": 25})]
-    good = notes_of([tracks_of("a"), tracks_of("b")], (), said)
-    assert not broken(duplicates_checks(good, ["a", "b"], AT_S, 25.0, 300))
-    assert broken(duplicates_checks(GOOD, ["a", "b"], AT_S, 25.0, 300)) == {
+    good = run_log_of([tracks_of("a"), tracks_of("b")], (), said)
+    assert not unmet_checks(duplicates_checks(good, ["a", "b"], AT_S, 25.0, 300))
+    assert unmet_checks(duplicates_checks(GOOD, ["a", "b"], AT_S, 25.0, 300)) == {
         "counted as duplicate",
         "counted as too late",
     }
 
 
 def test_a_flood() -> None:
-    assert not broken(flood_checks(GOOD, ["a", "b"], AT_S, 20.0, 30.0, 50_000))
+    assert not unmet_checks(flood_checks(GOOD, ["a", "b"], AT_S, 20.0, 30.0, 50_000))
     said = [status_at("a", 9.0), status_at("a", 20.0, {"messages_received": 5000})]
-    bad = notes_of([tracks_of("a", late_s=2.0), tracks_of("b")], (), said)
-    assert broken(flood_checks(bad, ["a", "b"], AT_S, 20.0, 30.0, 500)) >= {
+    bad = run_log_of([tracks_of("a", late_s=2.0), tracks_of("b")], (), said)
+    assert unmet_checks(flood_checks(bad, ["a", "b"], AT_S, 20.0, 30.0, 500)) >= {
         "rate of the flood",
         "most received by one robot",
         "others' delay, 99th percentile",
@@ -271,7 +311,7 @@ def test_a_full_disk() -> None:
         if not c.is_met
     ]
     silent = CommandResult(0, "", "Traceback (most recent call last)")
-    assert broken(full_disk_checks(silent, ("r", "p", "p"), OUTPUT)) == {
+    assert unmet_checks(full_disk_checks(silent, ("r", "p", "p"), OUTPUT)) == {
         "robots in the report on the terminal",
         "lines that name a lost file",
         "exit code",
@@ -281,9 +321,9 @@ def test_a_full_disk() -> None:
 
 def test_a_read_only_disk() -> None:
     clear = CommandResult(2, "", "cpcbl-team: --record /d/x: Read-only file system\n")
-    assert not broken(read_only_checks({"--record": clear}))
+    assert not unmet_checks(read_only_checks({"--record": clear}))
     thrown = CommandResult(1, "", "Traceback (most recent call last)\nOSError\n")
-    assert broken(read_only_checks({"--record": thrown})) == {
+    assert unmet_checks(read_only_checks({"--record": thrown})) == {
         "options refused with one line of error",
         "commands that ended with exit code 2",
         "tracebacks",
@@ -295,30 +335,30 @@ def test_a_read_only_disk() -> None:
 
 def test_a_kidnapped_robot() -> None:
     found = tracks_of("a", lambda s: 3.02 if s >= 13.0 else 0.02, lost=(10.5, 13.0))
-    good = notes_of([found, tracks_of("b")], jump=("a", AT_S, 3.0))
-    assert not broken(kidnap_checks(good, "a", ["b"], UNTIL_S))
-    never = notes_of([tracks_of("a"), tracks_of("b")], jump=("a", AT_S, 3.0))
-    assert broken(kidnap_checks(never, "a", ["b"], UNTIL_S)) == {
+    good = run_log_of([found, tracks_of("b")], jump=("a", AT_S, 3.0))
+    assert not unmet_checks(kidnap_checks(good, "a", ["b"], UNTIL_S))
+    never = run_log_of([tracks_of("a"), tracks_of("b")], jump=("a", AT_S, 3.0))
+    assert unmet_checks(kidnap_checks(never, "a", ["b"], UNTIL_S)) == {
         "it reported that it was lost after",
         "it was localized after",
         "RMSE afterwards, worst robot",
         "inside 3 σ afterwards",
     }
     blamed = [status_at("b", 30.0, trust=[("a", "jumps")])]
-    distrustful = notes_of([found, tracks_of("b")], (), blamed, jump=("a", AT_S, 3.0))
-    assert broken(kidnap_checks(distrustful, "a", ["b"], UNTIL_S)) == {
+    distrustful = run_log_of([found, tracks_of("b")], (), blamed, jump=("a", AT_S, 3.0))
+    assert unmet_checks(kidnap_checks(distrustful, "a", ["b"], UNTIL_S)) == {
         "robots that trust all others at the end"
     }
-    assert "distance of the kidnapping" in broken(kidnap_checks(GOOD, "a", ["b"], UNTIL_S))
+    assert "distance of the kidnapping" in unmet_checks(kidnap_checks(GOOD, "a", ["b"], UNTIL_S))
 
 
 def test_hidden_landmarks() -> None:
     drifts = tracks_of("a", lambda s: 0.1 if 12.0 <= s < 74.0 else 0.02)
-    good = hidden_landmarks_checks(notes_of([drifts, tracks_of("b")]), ["a", "b"], UNTIL_S)
-    assert not broken(good)
+    good = hidden_landmarks_checks(run_log_of([drifts, tracks_of("b")]), ["a", "b"], UNTIL_S)
+    assert not unmet_checks(good)
     overconfident = tracks_of("a", lambda s: 0.6 if s >= 20.0 else 0.02)
-    bad = hidden_landmarks_checks(notes_of([overconfident, tracks_of("b")]), ["a", "b"], UNTIL_S)
-    assert broken(bad) == {
+    bad = hidden_landmarks_checks(run_log_of([overconfident, tracks_of("b")]), ["a", "b"], UNTIL_S)
+    assert unmet_checks(bad) == {
         "team's worst RMSE",
         "inside 3 σ while landmarks are hidden",
         "all were localized after",
@@ -327,13 +367,13 @@ def test_hidden_landmarks() -> None:
     }
 
 
-def test_clocks_that_are_off() -> None:
+def test_wrong_clocks() -> None:
     found = [status_at(n, 5.0, {"clock_off": 30}, trust=[("w", "clock")]) for n in "ab"]
     tracks = [tracks_of("a"), tracks_of("b"), tracks_of("w")]
-    good = notes_of(tracks, (), found)
-    assert not broken(clock_checks(good, "w", "r", ["a", "b"], AT_S, 30.0))
-    unnoticed = notes_of(tracks, (), [status_at("a", 5.0, trust=[("r", "clock")])])
-    assert broken(clock_checks(unnoticed, "w", "r", ["a", "b"], AT_S, 30.0)) == {
+    good = run_log_of(tracks, (), found)
+    assert not unmet_checks(clock_checks(good, "w", "r", ["a", "b"], AT_S, 30.0))
+    unnoticed = run_log_of(tracks, (), [status_at("a", 5.0, trust=[("r", "clock")])])
+    assert unmet_checks(clock_checks(unnoticed, "w", "r", ["a", "b"], AT_S, 30.0)) == {
         "robots that report that its clock is wrong",
         "last of these reports at",
         "refused help messages from it",
@@ -341,15 +381,15 @@ def test_clocks_that_are_off() -> None:
     }
 
 
-def test_a_liar() -> None:
+def test_a_faulty_robot() -> None:
     tracks = [tracks_of("a"), tracks_of("b"), tracks_of("w")]
     said = [status_at(n, 14.0, trust=[("w", "biased")]) for n in "ab"]
     healed = [status_at(n, 40.0, trust=[("w", "")]) for n in "ab"]
-    good = notes_of(tracks, (), [*said, *healed])
-    assert not broken(faulty_robot_checks(good, "w", ["a", "b"], ["a", "b", "w"], AT_S, 25.0))
+    good = run_log_of(tracks, (), [*said, *healed])
+    assert not unmet_checks(faulty_robot_checks(good, "w", ["a", "b"], ["a", "b", "w"], AT_S, 25.0))
     harmed = [tracks_of("a", lambda s: 0.5), *tracks[1:]]
-    bad = notes_of(harmed, (), [said[0]])
-    assert broken(faulty_robot_checks(bad, "w", ["a", "b"], ["a", "b", "w"], AT_S, 25.0)) == {
+    bad = run_log_of(harmed, (), [said[0]])
+    assert unmet_checks(faulty_robot_checks(bad, "w", ["a", "b"], ["a", "b", "w"], AT_S, 25.0)) == {
         "robots that quarantined it",
         "quarantined by two robots after",
         "worst RMSE during the fault",
@@ -368,7 +408,7 @@ def samples(process: str, mib_a_minute: float, seconds: float = 400.0) -> list[P
     ]
 
 
-def test_a_life_is_told_from_its_samples() -> None:
+def test_a_process_life_is_computed_from_its_samples() -> None:
     (life,) = process_lives(samples("field", 1.2))
     assert life.mib_a_minute == pytest.approx(1.2, rel=0.01)
     assert life.end_mib - life.start_mib == pytest.approx(1.2 * (395 - 40) / 60, rel=0.05)
@@ -378,10 +418,10 @@ def test_a_life_is_told_from_its_samples() -> None:
 def test_a_soak() -> None:
     times = 0.0, 20.0, 25.0, UNTIL_S
     flat = process_lives([*samples("field", 0.01), *samples("router", 0.0)])
-    assert not broken(soak_checks(GOOD, ["a", "b"], flat, times, 3, 3, 0))
+    assert not unmet_checks(soak_checks(GOOD, ["a", "b"], flat, times, 3, 3, 0))
     leaking = [*flat, ProcessLife("robot-a", 400.0, 30.0, 45.0, 2.0, 30)]
-    stuck = notes_of([tracks_of("a"), tracks_of("b", lambda s: 2.0)])
-    assert broken(soak_checks(stuck, ["a", "b"], leaking, times, 4, 3, 1)) >= {
+    stuck = run_log_of([tracks_of("a"), tracks_of("b", lambda s: 2.0)])
+    assert unmet_checks(soak_checks(stuck, ["a", "b"], leaking, times, 4, 3, 1)) >= {
         "processes that ended without being killed",
         "tracebacks in logs",
         "from the last fault until all were localized",
@@ -389,4 +429,4 @@ def test_a_soak() -> None:
         "steepest growth of a process that ran for 300 s",
         "largest growth of the number of open files",
     }
-    assert "largest growth of memory" in broken(soak_checks(GOOD, ["a"], [], times, 0, 0, 0))
+    assert "largest growth of memory" in unmet_checks(soak_checks(GOOD, ["a"], [], times, 0, 0, 0))

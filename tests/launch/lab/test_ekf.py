@@ -54,7 +54,7 @@ def test_the_jacobian_of_a_sighting_is_that_of_finite_differences(seed: int) -> 
 
 
 @pytest.mark.parametrize("seed", range(10))
-def test_motion_shears_the_whole_covariance_by_its_jacobian(seed: int) -> None:
+def test_motion_transforms_the_whole_covariance_by_its_jacobian(seed: int) -> None:
     """Of two robots with cross-covariance, of which one drives; without noise of its wheels."""
     rng = np.random.default_rng(seed)
     distance, turn = rng.uniform(0.1, 1.0), rng.uniform(-1.0, 1.0)
@@ -79,7 +79,7 @@ def test_motion_shears_the_whole_covariance_by_its_jacobian(seed: int) -> None:
     np.testing.assert_allclose(ekf.mean, [1.0, 1.0, 0.0, *step(pose, distance, turn)])
 
 
-def test_odometry_in_parts_is_odometry_in_one() -> None:
+def test_odometry_in_parts_gives_the_same_as_in_one_piece() -> None:
     pieces = [piece for piece, _ in driven(LOOP_START, loop()[:40])]
     whole, parts = (Ekf({"r": inputs_at(LOOP_START, *pieces)}, Field()) for _ in range(2))
     whole.predict("r", pieces[-1].stamp_ns)
@@ -89,7 +89,7 @@ def test_odometry_in_parts_is_odometry_in_one() -> None:
     np.testing.assert_allclose(parts.marginal("r")[1], whole.marginal("r")[1], atol=1e-4)
 
 
-def test_doubt_grows_with_the_way_as_the_settings_say() -> None:
+def test_the_covariance_grows_with_the_distance_as_the_settings_state() -> None:
     ekf = Ekf(
         {"r": inputs_at(Pose2(0.0, 0.0, 0.0), Odometry(0, 100, 0.25, 0.0), sigma=0.0)}, Field()
     )
@@ -99,7 +99,7 @@ def test_doubt_grows_with_the_way_as_the_settings_say() -> None:
     assert gained[2] == pytest.approx(ODOMETRY.turn_sigma_rad_per_sqrt_m**2 * 0.25)
 
 
-def test_a_bearing_straight_behind_has_no_seam() -> None:
+def test_a_bearing_straight_behind_is_wrapped() -> None:
     ekf = Ekf(
         {"a": inputs_at(Pose2(0.0, 0.0, 0.0)), "b": inputs_at(Pose2(-2.0, 0.001, 0.0))}, Field()
     )
@@ -108,7 +108,7 @@ def test_a_bearing_straight_behind_has_no_seam() -> None:
     assert ekf.covariance[2, 2] < 0.9 * 0.1**2
 
 
-def test_one_sighting_informs_both_robots_and_ties_them() -> None:
+def test_one_sighting_informs_and_correlates_both_robots() -> None:
     ekf = Ekf({"a": inputs_at(Pose2(0.0, 0.0, 0.0)), "b": inputs_at(Pose2(2.0, 0.0, 0.0))}, Field())
     ekf.correct("a", Sightings(0, (Sighting("b", 2.1, 0.0),)))
     assert ekf.mean[0] == pytest.approx(-(ekf.mean[3] - 2.0))
@@ -117,7 +117,7 @@ def test_one_sighting_informs_both_robots_and_ties_them() -> None:
     assert ekf.covariance[0, 0] < 0.008
 
 
-def test_an_outlier_is_gated_and_a_fault_is_left_out() -> None:
+def test_an_outlier_is_gated_and_a_faulty_sighting_ignored() -> None:
     ekf = Ekf({"a": inputs_at(Pose2(0.0, 0.0, 0.0)), "b": inputs_at(Pose2(2.0, 0.0, 0.0))}, Field())
     mean, covariance = ekf.mean.copy(), ekf.covariance.copy()
     wrong = (Sighting("b", 4.0, 0.0), Sighting("b", math.nan, 0.0), Sighting("nobody", 1.0, 0.0))
@@ -126,7 +126,7 @@ def test_an_outlier_is_gated_and_a_fault_is_left_out() -> None:
     np.testing.assert_array_equal(ekf.covariance, covariance)
 
 
-def test_where_odometry_has_ended_doubt_grows() -> None:
+def test_the_covariance_grows_after_the_end_of_odometry() -> None:
     ekf = Ekf({"r": inputs_at(Pose2(0.0, 0.0, 0.0), Odometry(0, 100_000_000, 0.05, 0.0))}, Field())
     ekf.predict("r", 500_000_000)
     before = ekf.marginal("r")[1]

@@ -37,7 +37,9 @@ def test_the_bounds_are_those_of_chi_square() -> None:
 @pytest.mark.parametrize(
     ("choice", "honest"), [(SPLIT, True), (MUTUAL, True), (MUTUAL_NAIVE, False)]
 )
-def test_what_goes_round_between_two_is_counted_once(choice: Overrides, honest: bool) -> None:
+def test_information_that_circulates_between_two_robots_is_used_once(
+    choice: Overrides, honest: bool
+) -> None:
     team = with_overrides(equal_team("pair", "none"), choice)
     _, last = first_and_last_third(team, 4, 40.0)
     assert (last <= nees_bounds(4)[1]) is honest

@@ -139,7 +139,7 @@ def test_a_run_that_does_not_end_is_counted_as_failed_and_has_no_part_in_the_mea
     assert accuracy([stuck]).position_mean_m is None
 
 
-def test_spread_is_the_median_and_what_80_percent_lie_in() -> None:
+def test_spread_is_the_median_and_the_range_of_80_percent() -> None:
     found = spread([float(i) for i in range(11)])
     assert found is not None
     assert (found.median, found.low, found.high) == (5.0, 1.0, 9.0)
@@ -152,7 +152,7 @@ def test_quantities_of_the_table_from_known_errors() -> None:
     assert found == pytest.approx((0.5, 0.0, 0.4, 0.5, 3.0, 4.0))
 
 
-def test_observers_stand_where_they_do_not_believe_to_stand() -> None:
+def test_observers_are_displaced_from_their_assumed_positions() -> None:
     team = directions.crowd_team(10)
     moved = directions.with_displaced_observers(team, 0.2)
     assert len(team.robots) == 10
@@ -181,7 +181,7 @@ def test_team_sizes_are_checked(sizes: list[int]) -> None:
         directions.experiment_of_sizes(sizes)
 
 
-def test_what_is_wrong_is_one_line(tmp_path: Path) -> None:
+def test_a_wrong_option_is_one_line(tmp_path: Path) -> None:
     taken = tmp_path / "taken"
     taken.write_text("")
     failed = cpcbl_team("experiment", "figure7", "--output", taken)

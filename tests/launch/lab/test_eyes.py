@@ -52,7 +52,7 @@ def share(points: Floats, *before: Solid) -> float:
         (Solid(1.0, 0.0, 0.3, 0.4, 1.0), 1.0),  # hangs above it
     ],
 )
-def test_what_stands_before_a_cylinder_hides_it(solid: Solid, shown: float) -> None:
+def test_a_solid_in_front_of_a_cylinder_hides_it(solid: Solid, shown: float) -> None:
     mark = Solid(2.0, 0.0, 0.05, 0.15, 0.4)
     assert share(cylinder_points(mark, CAMERA.position), solid) == shown
 
@@ -65,7 +65,7 @@ def test_half_of_a_cylinder_behind_something_is_half_shown() -> None:
     assert 0.4 < share(cylinder_points(mark, CAMERA.position), low) < 0.6
 
 
-def test_what_is_out_of_the_frame_or_behind_is_not_shown() -> None:
+def test_objects_outside_the_frame_or_behind_are_not_visible() -> None:
     edge = 2.0 * math.tan(math.radians(38.65))  # where the frame ends, 2 m ahead
     assert share(cylinder_points(Solid(2.0, edge + 0.1, 0.05, 0.1, 0.3), CAMERA.position)) == 0.0
     assert 0.0 < share(cylinder_points(Solid(2.0, edge, 0.05, 0.1, 0.3), CAMERA.position)) < 1.0
@@ -97,7 +97,7 @@ def changed(one: Pixels, other: Pixels) -> int:
     return int((np.abs(one.astype(int) - other).max(axis=2) > 8).sum())
 
 
-def test_the_truth_agrees_with_pixels() -> None:
+def test_the_visible_shares_agree_with_rendered_pixels() -> None:
     """A landmark is there to be seen where the picture without it is another one."""
     whole = gone = part = 0
     for number in range(12):
@@ -137,7 +137,7 @@ def right(*seen: Sighting, there: NamedObject | None = None) -> tuple[list[Recor
     return compare_with_truth(3, seen, {one.name: one})
 
 
-def test_a_right_sighting_is_found_with_its_errors() -> None:
+def test_a_correct_sighting_is_recorded_with_its_errors() -> None:
     records, mistakes = right(Sighting(LANDMARK, 2.02, 0.09, 0.01, 0.005))
     (record,) = records
     assert not mistakes
@@ -148,7 +148,7 @@ def test_a_right_sighting_is_found_with_its_errors() -> None:
     assert (record.range_sigma_m, record.bearing_sigma_rad) == (0.01, 0.005)
 
 
-def test_bearing_only_of_a_part_is_right() -> None:
+def test_a_bearing_of_a_visible_part_is_correct() -> None:
     part = thing(due=())
     records, mistakes = right(
         Sighting(LANDMARK, bearing_rad=0.1, bearing_sigma_rad=0.01), there=part
@@ -165,20 +165,18 @@ def test_bearing_only_of_a_part_is_right() -> None:
         (Sighting(LANDMARK, 2.0, 0.1), thing(due=(), some=False)),  # there, but hidden
     ],
 )
-def test_the_name_of_what_cannot_be_seen_there_is_a_wrong_id(
-    seen: Sighting, there: NamedObject
-) -> None:
+def test_the_name_of_an_invisible_object_is_a_wrong_id(seen: Sighting, there: NamedObject) -> None:
     records, (mistake,) = right(seen, there=there)
     assert (mistake.frame, mistake.id, mistake.why) == (3, seen.id, "wrong id")
     assert [r.seen_by for r in records] == ([None] if there.due else [])  # it is missed as well
 
 
-def test_a_range_that_is_far_off_is_wrong() -> None:
+def test_a_range_with_a_large_error_is_wrong() -> None:
     _, (mistake,) = right(Sighting(LANDMARK, 2.5, 0.1, 0.5, 0.01))
     assert mistake.why == "wrong range"
 
 
-def test_a_heading_tells_a_marker_from_a_mast() -> None:
+def test_a_heading_distinguishes_a_marker_from_a_mast() -> None:
     mate = thing(ROBOT, due=("marker", "mast"))
     (by_marker,), _ = right(Sighting(ROBOT, 2.0, 0.1, 0.1, 0.1, 0.4, 0.2), there=mate)
     (by_mast,), _ = right(Sighting(ROBOT, 2.0, 0.1, 0.1, 0.1), there=mate)
@@ -189,7 +187,7 @@ def test_a_heading_tells_a_marker_from_a_mast() -> None:
 # Figures -----------------------------------------------------------------------------------------
 
 
-def test_figures_count_what_they_say() -> None:
+def test_figures_count_detections_misses_and_mistakes() -> None:
     due: tuple[Kind, ...] = ("landmark",)
     records = [
         Record(due, "landmark", 2.0, 0.02, 0.02, 0.01, 0.01, None, None),
@@ -215,7 +213,7 @@ def test_figures_count_what_they_say() -> None:
     assert (marker.recall, marker.precision, marker.heading_inside) == (1.0, 1.0, 0.0)
 
 
-def test_nothing_holds_without_figures() -> None:
+def test_no_target_is_met_without_figures() -> None:
     result = detection_figures.summarize(1, 1, [Batch([], [], {}, {"frame_blank": 1}, 0.0, 0.0)])
     assert [said for said, held in result.pattern.items() if held] == ["no wrong id"]
 
@@ -224,16 +222,16 @@ def test_nothing_holds_without_figures() -> None:
 
 
 @pytest.fixture(scope="module")
-def small() -> detection_figures.Eyes:
+def small_result() -> detection_figures.Eyes:
     return eyes.measure(150, 1, 2, lambda: None)
 
 
-def test_little_is_missed_and_nothing_mistaken(small: detection_figures.Eyes) -> None:
-    assert not small.refused
-    assert not [m for m in small.mistakes if m.why == "wrong id"]
+def test_few_objects_are_missed_and_none_is_mistaken(small_result: detection_figures.Eyes) -> None:
+    assert not small_result.refused
+    assert not [m for m in small_result.mistakes if m.why == "wrong id"]
     least: dict[Kind, int] = {"landmark": 90, "marker": 120}
     for kind, due in least.items():
-        seen, known = small.within[kind], small.accuracy[kind]
+        seen, known = small_result.within[kind], small_result.accuracy[kind]
         assert seen.due > due
         assert seen.recall is not None
         assert seen.recall > 0.92
@@ -245,8 +243,8 @@ def test_little_is_missed_and_nothing_mistaken(small: detection_figures.Eyes) ->
         assert known.bearing_sigma_deg < 0.6
 
 
-def test_stated_sigmas_are_honest(small: detection_figures.Eyes) -> None:
-    for kind, known in small.accuracy.items():
+def test_stated_sigmas_are_consistent(small_result: detection_figures.Eyes) -> None:
+    for kind, known in small_result.accuracy.items():
         shares = [known.range_inside, known.bearing_inside]
         shares += [known.heading_inside] if kind == "marker" else []
         for inside in shares:
@@ -261,7 +259,7 @@ def test_stated_sigmas_are_honest(small: detection_figures.Eyes) -> None:
         pytest.param(6801, id="a sliver of a mast behind another one"),
     ],
 )
-def test_what_was_mistaken_once_is_not_again(number: int) -> None:
+def test_former_mistakes_do_not_occur_again(number: int) -> None:
     assert rendered_frames.evaluate_frames(2, number, 1).mistakes == []
 
 

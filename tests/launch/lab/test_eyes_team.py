@@ -38,7 +38,7 @@ def rmse_m(report: Report, name: str) -> float:
 
 
 @WITHIN
-def test_everybody_finds_its_place_by_its_camera_and_knows_how_well() -> None:
+def test_every_robot_is_localized_by_its_camera_with_a_consistent_covariance() -> None:
     reports = [simulated(seed) for seed in (1, 2, 3)]
     for report in reports:
         for name, robot in report.robots.items():
@@ -51,7 +51,7 @@ def test_everybody_finds_its_place_by_its_camera_and_knows_how_well() -> None:
 
 
 @WITHIN
-def test_the_follower_lives_on_its_teammates() -> None:
+def test_the_follower_is_localized_by_its_teammates() -> None:
     """It is blind to landmarks: without the others' help it does not know nearly as well."""
     team, replace = eyes(), msgspec.structs.replace
     mute = {
@@ -88,7 +88,7 @@ class Watching:
 
 
 @WITHIN
-def test_processes_with_cameras_find_their_places_over_a_real_router(tmp_path: Path) -> None:
+def test_processes_with_cameras_are_localized_over_a_real_router(tmp_path: Path) -> None:
     watching, until = Watching(), time.monotonic() + 120.0
     run = Run(eyes(), None, seed=2, folder=tmp_path)
     report = run_team(run, watching, lambda: watching.done or time.monotonic() > until)

@@ -136,12 +136,12 @@ CASES = [
 
 
 @pytest.fixture(scope="module")
-def measured() -> liars.Liars:
+def result() -> liars.Liars:
     return liars.measure(1, 1, lambda: None, CASES)
 
 
-def test_the_liar_is_found_and_taken_back_and_does_little_harm(measured: liars.Liars) -> None:
-    alone, judged, believed = measured.rows
+def test_the_faulty_robot_is_detected_readmitted_and_does_little_harm(result: liars.Liars) -> None:
+    alone, judged, believed = result.rows
     assert alone.found == alone.false_quarantines == judged.false_quarantines == 0
     assert judged.found == judged.listening == len(liars.DRIVERS)
     assert judged.reasons == {"biased": 3}
@@ -151,35 +151,35 @@ def test_the_liar_is_found_and_taken_back_and_does_little_harm(measured: liars.L
     assert 4.0 < judged.readmitted_after_s.median < 8.0
     assert judged.ratio is not None
     assert judged.ratio.median <= liars.MOST_RATIO
-    assert measured.held
+    assert result.held
     assert believed.found == 0
 
 
-def test_the_same_seed_gives_the_same_figures(measured: liars.Liars) -> None:
+def test_the_same_seed_gives_the_same_figures(result: liars.Liars) -> None:
     again = liars.measure(1, 1, lambda: None, CASES[:1])
-    assert again.rows[0] == measured.rows[0]
+    assert again.rows[0] == result.rows[0]
 
 
 def test_it_is_shown_in_80_columns_and_drawn(
-    measured: liars.Liars, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    result: liars.Liars, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     from rich.console import Console
 
     console = Console(width=80)
-    for shown in liars.tables(measured):
+    for shown in liars.tables(result):
         console.print(shown)
     text = capsys.readouterr().out
     assert "bias:0.5,0.5" in text
     assert "…" not in text
     assert all(len(line) <= 80 for line in text.splitlines())
-    draw_liars(measured, tmp_path / "liars.png")
+    draw_liars(result, tmp_path / "liars.png")
     assert (tmp_path / "liars.png").read_bytes().startswith(b"\x89PNG")
-    assert json.loads(msgspec.json.encode(measured))["experiment"] == "liars"
+    assert json.loads(msgspec.json.encode(result))["experiment"] == "liars"
 
 
 @pytest.mark.long
 @pytest.mark.timeout(1800)
-def test_every_lie_is_found_beside_two_honest_observers() -> None:
+def test_every_fault_is_detected_beside_two_correct_observers() -> None:
     cases = [c for c in liars.cases() if c.honest == 2 and c.trust]
     result = liars.measure(4, 2, lambda: None, cases)
     assert result.held

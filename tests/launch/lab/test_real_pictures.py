@@ -59,7 +59,7 @@ def own_set(tmp_path: Path) -> Path:
     return table
 
 
-def test_found_missed_unexpected_and_refused_are_told_apart(own_set: Path) -> None:
+def test_found_missed_unexpected_and_refused_are_distinguished(own_set: Path) -> None:
     result = measure(str(own_set), own_set.parent)
     mate, mark = result.lines
     assert (mate.picture, mate.id, mate.found) == ("both.png", "mate", True)
@@ -71,7 +71,7 @@ def test_found_missed_unexpected_and_refused_are_told_apart(own_set: Path) -> No
     assert result.refused == {"cut.png": "frame_wrong_size"}
 
 
-def test_what_is_unexpected_is_in_the_same_order_each_time(own_set: Path) -> None:
+def test_unexpected_detections_are_in_the_same_order_each_time(own_set: Path) -> None:
     own_set.write_text("picture,viewer,id,range_m,bearing_deg,heading_deg\nboth.png,eye,,,,\n")
     found = measure(str(own_set), own_set.parent).unexpected
     assert found == (("both.png", "mark"), ("both.png", "mate"))
@@ -96,9 +96,7 @@ def test_the_command_shows_and_writes(own_set: Path, tmp_path: Path) -> None:
         ("x.csv", ",".join(real_pictures.COLUMNS) + "\np.png,eye,mate,,,\n", "p.png"),
     ],
 )
-def test_what_cannot_be_read_is_said_in_one_line(
-    tmp_path: Path, name: str, text: str, said: str
-) -> None:
+def test_an_unreadable_set_is_one_line(tmp_path: Path, name: str, text: str, said: str) -> None:
     if text:
         (tmp_path / "x.toml").write_text(TEAM)
         (tmp_path / "x.csv").write_text(text)
@@ -110,7 +108,7 @@ def test_what_cannot_be_read_is_said_in_one_line(
 
 
 @pytest.mark.parametrize("name", SETS)
-def test_built_in_sets_are_whole(name: str) -> None:
+def test_built_in_sets_are_complete(name: str) -> None:
     path = picture_set(name)
     team, lines = load_team(path.with_suffix(".toml")), read_truth_table(path)
     assert lines
