@@ -9,7 +9,6 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from cpcbl_agents.clock import Clock
-from cpcbl_agents.process import StopSignal, run_robot
 from cpcbl_launch.checks import require_robots, require_team_opencv
 from cpcbl_launch.team_checks import endpoint_problem
 from cpcbl_launch.team_file import find_team
@@ -61,6 +60,8 @@ def run_robot_command(
     `wrap_bus` may put something between the robot of this name and clock, and its bus. Raises
     TeamFileError, InputError, and what `run_robot` raises.
     """
+    from cpcbl_agents.process import StopSignal, run_robot  # for other commands it costs 0.1 s
+
     team = _team_with(arguments.name, arguments.team)
     for endpoint in arguments.connect or ():
         if reason := endpoint_problem(endpoint):
