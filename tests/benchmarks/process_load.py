@@ -170,7 +170,9 @@ def _robot_specs(
     if checkout is None:
         return robot_specs
     path = ":".join(str(checkout.resolve() / part) for part in CHECKOUT_PATHS)
-    program = ("env", f"PYTHONPATH={path}", sys.executable, "-m", "cpcbl_launch")
+    # Without PYTHONSAFEPATH the present directory would come before the other checkout
+    environment = ("env", "PYTHONSAFEPATH=1", f"PYTHONPATH={path}")
+    program = (*environment, sys.executable, "-m", "cpcbl_launch")
     return [
         spec._replace(command=(*program, *spec.command[spec.command.index("robot") :]))
         for spec in robot_specs
