@@ -17,7 +17,7 @@ class CpcblError(Exception):
         ├── SecurityError       keys or endpoints of a secured team (cpcbl_transport.security)
         ├── DockerError         Docker refused, or did not end in time (cpcbl_launch.run.containers)
         ├── CannotRunError      a fault scenario that cannot run here (cpcbl_launch.lab.chaos)
-        └── ChaosError          a fault scenario that did not go its way (cpcbl_launch.lab.chaos)
+        └── ChaosError          a fault scenario that failed to run (cpcbl_launch.lab.chaos)
 
     Errors of an external library are converted where the file is read. A `ValueError`
     of this project reports a mistake of the programmer, such as a negative variance.

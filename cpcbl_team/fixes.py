@@ -1,4 +1,4 @@
-"""Active collaboration: a robot tells a teammate where it sees it (a fix).
+"""Active collaboration: a robot sends a teammate the position at which it sees it (a fix).
 
 As in the paper a fix has the position only; beyond the paper it has the heading too, if the
 observer saw it (by a marker of the teammate).

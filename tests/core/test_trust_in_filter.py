@@ -41,7 +41,6 @@ from cpcbl_team.trust import (
     trust_statuses,
 )
 
-BLIND = SensorSettings(sees_landmarks=False)
 NOISE = OdometrySettings(distance_sigma_m_per_sqrt_m=0.05)
 Observed = Callable[[int, Pose2, np.random.Generator], tuple[float, float] | None]
 
@@ -96,7 +95,6 @@ class Drive:
         self.state = self.robot.start(0)
         self.inputs: list[Input] = []
         self.errors: list[float] = []
-        self.lost: list[str] = []
         noise = sensor_noise(rng, self.robot.settings.sensor)
         for piece, truth in driven(LOOP_START, loop() * rounds):
             distance = piece.distance_m * (1.0 + 0.05 * rng.normal())
@@ -113,7 +111,6 @@ class Drive:
             for item in inputs:
                 self.take(item)
             self.errors.append(position_error(self.state.estimate, truth))
-            self.lost.append(self.state.lost)
 
     def take(self, item: Input) -> None:
         self.inputs.append(item)

@@ -32,7 +32,7 @@ def raising(error: BaseException) -> Callable[[], None]:
 def test_an_error_of_the_user_is_one_line_and_exit_code_2(
     kind: type[CpcblError], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(cli, "app", raising(kind("team.toml: no such file")))
+    monkeypatch.setattr(cli, "_run_command", raising(kind("team.toml: no such file")))
     with pytest.raises(SystemExit) as ended:
         cli.main()
     assert ended.value.code == 2
@@ -43,7 +43,7 @@ def test_an_error_of_the_user_is_one_line_and_exit_code_2(
 def test_a_bug_is_not_taken_for_an_error_of_the_user(
     bug: Exception, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(cli, "app", raising(bug))
+    monkeypatch.setattr(cli, "_run_command", raising(bug))
     with pytest.raises(type(bug), match="a bug"):
         cli.main()
 
