@@ -62,7 +62,8 @@ LogDuration = Annotated[Optional[float], typer.Option(help="Seconds of the log; 
 WithBaselines = Annotated[
     bool,
     typer.Option(
-        "--yardstick", help="Also run dead reckoning, a solo EKF per robot, a centralized EKF."
+        "--yardstick/--no-yardstick",
+        help="Also run dead reckoning, a solo EKF per robot, a centralized EKF.",
     ),
 ]
 ExportFolder = Annotated[
