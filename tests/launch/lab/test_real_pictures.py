@@ -81,8 +81,8 @@ def test_the_command_shows_and_writes(own_set: Path, tmp_path: Path) -> None:
     shown = cpcbl_team("experiment", "pictures", own_set, own_set.parent, "--output", tmp_path)
     assert shown.returncode == 0, shown.stderr
     assert "found 1 of 2" in shown.stdout
-    assert "inside three σ: range 1 of 1, bearing 1 of 1, heading 1 of 1" in shown.stdout
-    assert "refused: frame_wrong_size (cut.png)" in shown.stdout
+    assert "within three stated σ: range 1 of 1, bearing 1 of 1, heading 1 of 1" in shown.stdout
+    assert "unusable pictures: frame_wrong_size (cut.png)" in shown.stdout
     assert (tmp_path / "pictures-own.json").exists()
 
 

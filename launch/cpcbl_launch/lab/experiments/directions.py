@@ -191,9 +191,9 @@ def tables(result: Outcome) -> Iterable[RenderableType]:
         last = size
     yield shown
     if any(row["direction"] == "deaf" for row in result.figures["rows"]):
-        yield "deaf: nobody corrects the observer; elsewhere those that it helps do"
-    yield f"off: how wrong the observers are; they claim a σ of {CLAIMED_SIGMA_M:g} m"
-    yield "blind: sees teammates but no landmark; B/s: help sent, mean over the robots"
+        yield "deaf: nobody corrects the observer; otherwise the robots that it helps do"
+    yield f"off: true error of the observers, which state a σ of {CLAIMED_SIGMA_M:g} m"
+    yield "blind: sees teammates but no landmarks; B/s: help sent, mean over the robots"
 
 
 def experiment_of_sizes(sizes: Sequence[int]) -> Experiment:

@@ -33,11 +33,11 @@ def measure(count: int, seed: int, jobs: int, done: Callable[[], None]) -> Eyes:
 
 
 def tables(result: Eyes) -> Iterable[RenderableType]:
-    """What was found by range, what was wrong or doubted, and the targets."""
+    """Detections by range, wrong and rejected ones, and the targets."""
     shown = table(
         f"rendered frames: {result.frames}, seed {result.seed}",
         ("", "m"),
-        ("due", "recall", "said", "prec.", "r %", "b °", "h °", "3σ r", "3σ b", "3σ h"),
+        ("due", "recall", "seen", "prec.", "r %", "b °", "h °", "3σ r", "3σ b", "3σ h"),
     )
     for kind, bins in result.bins.items():
         for f in bins:
@@ -48,15 +48,15 @@ def tables(result: Eyes) -> Iterable[RenderableType]:
             shown.add_row(kind, f"< {ERRORS_WITHIN_M:g}", *_cells(result.accuracy[kind]))
     yield shown
     yield (
-        "due: all of it to be seen. said: sightings. r, b, h: errors of range, bearing,\n"
-        "heading, σ about zero; 3σ: the shares of them inside three stated ones"
+        "due: objects completely visible; seen: reported sightings; r, b, h: σ of the\n"
+        "errors of range, bearing, heading; 3σ: share of errors within 3 stated σ"
     )
-    yield f"doubted: {_listed(result.doubts)}"
+    yield f"rejected: {_listed(result.doubts)}"
     if result.refused:
-        yield f"frames refused: {_listed(result.refused)}"
-    yield f"mistakes: {_listed(Counter(f'{m.kind}, {m.why}' for m in result.mistakes))}"
+        yield f"unusable images: {_listed(result.refused)}"
+    yield f"wrong: {_listed(Counter(f'{m.kind}, {m.why}' for m in result.mistakes))}"
     yield (
-        f"cost: {result.cost['see_ms']:.1f} ms a frame to see,"
+        f"cost: {result.cost['see_ms']:.1f} ms per image to detect,"
         f" {result.cost['render_ms']:.1f} ms to render"
     )
     for target, ok in result.pattern.items():

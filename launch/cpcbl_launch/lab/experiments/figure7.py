@@ -38,7 +38,7 @@ CONFIGURATIONS = {
     "F": "both",
 }
 LEGEND = (
-    "position: mean ± σ, max; heading: mean; due: 98.9 % in 3 σ, NEES 2\n"
+    "position: mean ± σ, max; heading: mean; consistent filter: 98.9 % in 3 σ, NEES 2\n"
     "bump, rest, fail: bumps into landmarks, restarts, runs that failed"
 )
 ABOUT = 0.2  # "about" is within so much of it

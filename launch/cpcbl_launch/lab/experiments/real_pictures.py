@@ -202,12 +202,12 @@ def tables(result: RealPictures) -> Iterable[RenderableType]:
         shown.add_row(c.picture.rsplit(".", 1)[0], c.id, first, *errors)
     yield shown
     found = sum(c.found for c in result.lines)
-    yield f"found {found} of {len(result.lines)}. m: range; off: from the truth, of which σ is ours"
-    yield f"inside three σ: {', '.join(_inside(result.lines)) or 'no truth but the ids'}"
-    yield f"seen but not in the table: {_listed(result.unexpected)}"
-    yield f"doubted: {_listed(result.doubted)}"
+    yield f"found {found} of {len(result.lines)}. m: range; off: its error; ± σ: the stated σ"
+    yield f"within three stated σ: {', '.join(_inside(result.lines)) or 'only ids are known'}"
+    yield f"reported but not in the table: {_listed(result.unexpected)}"
+    yield f"rejected: {_listed(result.doubted)}"
     if result.refused:
-        yield f"refused: {_listed(tuple(result.refused.items()))}"
+        yield f"unusable pictures: {_listed(tuple(result.refused.items()))}"
 
 
 def _inside(lines: Sequence[LineResult]) -> Iterator[str]:
