@@ -123,9 +123,8 @@ def measure_start(starts: int, checkout: Path | None = None) -> Start:
     seconds, resident = [], []
     with _routed(team, endpoint) as (folder, bus):
         for _ in range(starts):
-            (spec,) = _robot_specs(
-                team, folder, endpoint, clock_starting_in(LEAD_S), checkout, [robot]
-            )
+            clock = clock_starting_in(0.0)  # a robot declares its token after the run's epoch
+            (spec,) = _robot_specs(team, folder, endpoint, clock, checkout, [robot])
             appeared = threading.Event()
             tokens = bus.watch_liveliness(topics.ALIVE.at(robot=robot), _setter(appeared))
             began_s = time.monotonic()
