@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from cpcbl_launch.lab.chaos.scenarios import SCENARIOS
+
 ROOT = Path(__file__).parents[1]
 DOCUMENTS = sorted(ROOT.glob("*.md")) + sorted(ROOT.glob("docs/*.md"))
 SOURCES = "cpcbl_team|transport|agents|launch|tests|docs|docker"
@@ -68,6 +70,13 @@ def test_relative_links_lead_to_a_file_and_a_heading(document: Path) -> None:
         assert page.exists(), target
         if anchor:
             assert anchor in anchors(page), target
+
+
+def test_the_page_on_faults_has_every_scenario_with_its_texts() -> None:
+    page = (ROOT / "docs" / "faults.md").read_text()
+    for scenario in SCENARIOS:
+        row = f"| `{scenario.name}` | {scenario.done} | {scenario.expectation} |"
+        assert row in page, scenario.name
 
 
 def test_pages_that_the_code_names_exist() -> None:

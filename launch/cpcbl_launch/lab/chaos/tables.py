@@ -14,7 +14,7 @@ _VERDICT = {True: ("held", "green"), False: ("NOT HELD", "bold red"), None: ("no
 
 def print_scenarios(scenarios: tuple[Scenario, ...], console: Console) -> None:
     """Prints the table of scenarios (`--list`)."""
-    shown = _table("scenario", "what is done", "expectation", "needs")
+    shown = _table("scenario", "fault", "expectation", "needs")
     for s in scenarios:
         name = f"{s.name} (quick)" if s.quick else s.name
         shown.add_row(Text(name), Text(s.done), Text(s.expectation), Text(s.needs.value))
@@ -23,7 +23,7 @@ def print_scenarios(scenarios: tuple[Scenario, ...], console: Console) -> None:
 
 def print_faults(faults: ChaosReport, console: Console) -> None:
     """Prints each scenario with its expectation, its figures, and whether its checks are met."""
-    shown = _table("scenario", "expectation", "seen", "")
+    shown = _table("scenario", "expectation", "measured (bound)", "")
     for outcome in faults.outcomes:
         shown.add_row(
             Text(outcome.scenario), Text(outcome.expectation), _seen(outcome), verdict(outcome)
@@ -59,7 +59,7 @@ def _seen(outcome: Outcome) -> Text:
 
 def markdown(faults: ChaosReport) -> Iterator[str]:
     """The outcomes as lines of Markdown."""
-    yield "| scenario | what is done | expectation | seen | |"
+    yield "| scenario | fault | expectation | measured (bound) | |"
     yield "|---|---|---|---|---|"
     for o in faults.outcomes:
         seen = o.not_run or o.failed or "; ".join(map(str, o.checks))
