@@ -54,7 +54,14 @@ def assert_checks_met(outcome: Outcome) -> None:
 
 
 @pytest.mark.timeout(300)
-@pytest.mark.parametrize("scenario", [pytest.param(s, id=s.name) for s in SCENARIOS if s.quick])
+@pytest.mark.parametrize(
+    "scenario",
+    [
+        pytest.param(s, id=s.name, marks=() if s.name == "kill-robot" else pytest.mark.long)
+        for s in SCENARIOS
+        if s.quick
+    ],
+)
 def test_the_checks_of_a_quick_scenario_are_met(scenario: Scenario) -> None:
     assert_checks_met(run_scenario(scenario, SETTING))
 

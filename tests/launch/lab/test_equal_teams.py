@@ -35,7 +35,12 @@ def test_the_bounds_are_those_of_chi_square() -> None:
 
 
 @pytest.mark.parametrize(
-    ("choice", "honest"), [(SPLIT, True), (MUTUAL, True), (MUTUAL_NAIVE, False)]
+    ("choice", "honest"),
+    [
+        pytest.param(SPLIT, True, marks=pytest.mark.long),
+        (MUTUAL, True),
+        pytest.param(MUTUAL_NAIVE, False, marks=pytest.mark.long),
+    ],
 )
 def test_information_that_circulates_between_two_robots_is_used_once(
     choice: Overrides, honest: bool

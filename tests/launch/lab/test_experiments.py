@@ -164,6 +164,7 @@ def test_observers_are_displaced_from_their_assumed_positions() -> None:
         assert off == pytest.approx(0.2 if name.startswith("observer") else 0.0)
 
 
+@pytest.mark.long
 def test_a_deaf_observer_stays_wrong_and_one_that_listens_does_not() -> None:
     cases = directions.cases([2])
     errors = {}
@@ -218,6 +219,7 @@ def test_figure_7_has_the_pattern_of_the_paper() -> None:
     assert found.figures["C"].failed == 0
 
 
+@pytest.mark.long
 def test_a_sharper_camera_helps_a_cheap_one(tmp_path: Path) -> None:
     experiment = figure7_cameras.EXPERIMENT
 

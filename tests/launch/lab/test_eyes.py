@@ -263,6 +263,7 @@ def test_former_mistakes_do_not_occur_again(number: int) -> None:
     assert rendered_frames.evaluate_frames(2, number, 1).mistakes == []
 
 
+@pytest.mark.long
 def test_the_number_of_jobs_changes_no_figure() -> None:
     one, two = (eyes.measure(40, 3, jobs, lambda: None) for jobs in (1, 2))
     assert one.within["landmark"].due > 10

@@ -37,6 +37,7 @@ def rmse_m(report: Report, name: str) -> float:
     return found
 
 
+@pytest.mark.long
 @WITHIN
 def test_every_robot_is_localized_by_its_camera_with_a_consistent_covariance() -> None:
     reports = [simulated(seed) for seed in (1, 2, 3)]
@@ -64,6 +65,7 @@ def test_the_follower_is_localized_by_its_teammates() -> None:
     assert rmse_m(alone, "follower") > 2.0 * rmse_m(helped, "follower")
 
 
+@pytest.mark.long
 @WITHIN
 def test_the_same_seed_gives_the_same_run() -> None:
     assert fresh(1) == simulated(1)

@@ -155,6 +155,7 @@ def test_the_faulty_robot_is_detected_readmitted_and_does_little_harm(result: li
     assert believed.found == 0
 
 
+@pytest.mark.long
 def test_the_same_seed_gives_the_same_figures(result: liars.Liars) -> None:
     again = liars.measure(1, 1, lambda: None, CASES[:1])
     assert again.rows[0] == result.rows[0]

@@ -159,7 +159,9 @@ def team_rmse_m(recorder: Recorder, span: Span) -> float:
     return sum(e for e in errors if e is not None) / len(BLIND.robots)
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize(
+    "seed", [1, *(pytest.param(seed, marks=pytest.mark.long) for seed in (2, 3))]
+)
 @pytest.mark.parametrize(
     ("wish", "share"), [(TRIPOD, 0.3), (ROVER, 0.6)], ids=["tripod camera", "GPS robot"]
 )
