@@ -47,8 +47,8 @@ class LandmarkUpdate:
 
     def __init__(self, state: State) -> None:
         self.stamp_ns = state.stamp_ns
-        self.pose, self.covariance, _ = state.estimate  # all is linearized at this prior
-        self.x, self.y, self.heading = self.pose
+        pose, self.covariance, _ = state.estimate  # all is linearized at this prior
+        self.x, self.y, self.heading = pose
         self.evidence = InformationSum()
         self.used: dict[str, int] = {}  # the landmarks whose evidence was accepted, and when: now
         self.rejected = 0  # how many landmarks the gate has rejected

@@ -70,6 +70,7 @@ class Localizer:
         self._minimum_interval_ns = rules.minimum_interval_s * 1e9
         self._odometry = settings.odometry
         self._odometry_timeout_ns = int(settings.odometry.timeout_s * 1e9)
+        self._has_dead_zone = settings.odometry.least_speed_m_s > 0.0
         self._calibrates = rules.learns
         self._window = rules.lost_window
         self._belief_age_ns = int(settings.collaboration.max_age_s * 1e9)
@@ -115,7 +116,9 @@ class Localizer:
         odometry_from_robot, pending = state.odometry_from_robot, state.pending_odometry
         if pending is not None:
             distance, turn, seconds = part_of_piece(pending, stamp_ns, until_ns)
-            slow_s = time_at_min_speed_s(distance, seconds, self._odometry)
+            crawl_s = 0.0
+            if self._has_dead_zone:
+                crawl_s = time_at_min_speed_s(distance, seconds, self._odometry)
             if self._calibrates:
                 memory = state.memory.calibration
                 distance *= memory.learned.distance_scale
@@ -124,7 +127,7 @@ class Localizer:
                 state = with_memory(state, state.memory._replace(calibration=memory))
             if distance != 0.0 or turn != 0.0:
                 odometry_from_robot = step(odometry_from_robot, distance, turn)
-                estimate = self._variant.move(estimate, distance, turn, slow_s)
+                estimate = self._variant.move(estimate, distance, turn, crawl_s)
             if pending.stamp_ns <= until_ns:
                 pending = None
         silent_ns = until_ns - state.odometry_until_ns - self._odometry_timeout_ns

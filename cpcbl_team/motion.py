@@ -45,7 +45,7 @@ def move(
     crawl_s: float = 0.0,
     as_circle: bool = False,
 ) -> Estimate:
-    """The estimate after the wheels report an arc of `distance` metres that turns by `turn`.
+    """The estimate after odometry reports an arc of `distance` metres that turns by `turn`.
 
     F P F^T + C is written out, for it runs for every odometry step. For `crawl_s` seconds of it
     the robot drove at its least speed. `as_circle`: the position's covariance is kept as a

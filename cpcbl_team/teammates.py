@@ -1,8 +1,8 @@
 """Screening what teammates report by the trust that they have (beyond the paper).
 
 Every report about this robot's position, and every sighting of a teammate as a landmark, is
-assessed by `trust.py`. What may not be used is left out; what followed from it before may make the
-robot doubt its own estimate.
+assessed by `trust.py`. What may not be used is left out; where the estimate has followed it
+before, the covariance is inflated.
 """
 
 from cpcbl_team import trust

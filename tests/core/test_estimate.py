@@ -60,11 +60,14 @@ def random_observation(
     )
 
 
-def parts(seen: Observation) -> tuple[Matrix, Matrix, Matrix, Matrix]:
+def parts(observation: Observation) -> tuple[Matrix, Matrix, Matrix, Matrix]:
     """(H, e, independent R, dependent R) as matrices."""
-    n = len(seen.rows)
-    independent, dependent = matrix2(seen.independent)[:n, :n], matrix2(seen.dependent)[:n, :n]
-    return np.array(seen.rows), np.array(seen.residuals), independent, dependent
+    n = len(observation.rows)
+    independent, dependent = (
+        matrix2(observation.independent)[:n, :n],
+        matrix2(observation.dependent)[:n, :n],
+    )
+    return np.array(observation.rows), np.array(observation.residuals), independent, dependent
 
 
 def kalman(prior: Estimate, h: Matrix, e: Matrix, r: Matrix, scope: Scope) -> tuple[Matrix, Matrix]:
@@ -76,12 +79,12 @@ def kalman(prior: Estimate, h: Matrix, e: Matrix, r: Matrix, scope: Scope) -> tu
     return vector(prior.pose) + K @ e, survive @ P @ survive.T + K @ r @ K.T
 
 
-def gain(prior: Estimate, seen: Observation, scope: Scope) -> Matrix:
+def gain(prior: Estimate, observation: Observation, scope: Scope) -> Matrix:
     """K of pose' = pose + K e of the split merge, read off by unit residuals."""
-    n = len(seen.rows)
+    n = len(observation.rows)
     columns = []
     for i in range(n):
-        unit = seen._replace(residuals=tuple(float(i == j) for j in range(n)))
+        unit = observation._replace(residuals=tuple(float(i == j) for j in range(n)))
         columns.append(vector(merge_split(prior, unit, scope).pose) - vector(prior.pose))
     return np.stack(columns, axis=1)
 
@@ -132,9 +135,9 @@ def test_a_merge_is_the_kalman_update_of_what_it_may_move(
 ) -> None:
     rng = np.random.default_rng(seed)
     prior = Estimate(POSE, covariance3(random_matrix(rng, 3)))
-    seen = random_observation(rng, rank, dependent=False)
-    merged = merge(prior, seen.information(), scope)
-    H, e, R, _ = parts(seen)
+    observation = random_observation(rng, rank, dependent=False)
+    merged = merge(prior, observation.information(), scope)
+    H, e, R, _ = parts(observation)
     pose, covariance = kalman(prior, H, e, R, scope)
     np.testing.assert_allclose(vector(merged.pose), pose, atol=1e-9)
     np.testing.assert_allclose(matrix3(merged.covariance), covariance, atol=1e-9)
@@ -144,10 +147,10 @@ def test_a_merge_is_the_kalman_update_of_what_it_may_move(
 def test_a_prior_that_is_certain_along_an_axis_stays_so(seed: int) -> None:
     rng = np.random.default_rng(seed)
     prior = Estimate(POSE, covariance3(random_matrix(rng, 3, rank=2)))
-    seen = random_observation(rng, 2, dependent=False)
-    H, e, R, _ = parts(seen)
+    observation = random_observation(rng, 2, dependent=False)
+    H, e, R, _ = parts(observation)
     _, covariance = kalman(prior, H, e, R, Scope.POSE)
-    merged = matrix3(merge(prior, seen.information()).covariance)
+    merged = matrix3(merge(prior, observation.information()).covariance)
     np.testing.assert_allclose(merged, covariance, atol=1e-9)
 
 
@@ -164,11 +167,12 @@ def test_what_is_out_of_scope_keeps_its_mean_and_variance(
 ) -> None:
     rng = np.random.default_rng(seed)
     prior = mark_shared(Estimate(POSE, covariance3(random_matrix(rng, 3))))
-    seen = random_observation(rng, 2)
-    seen = seen._replace(
-        independent=seen.independent.scaled(1e-4), dependent=seen.dependent.scaled(1e-4)
+    observation = random_observation(rng, 2)
+    observation = observation._replace(
+        independent=observation.independent.scaled(1e-4),
+        dependent=observation.dependent.scaled(1e-4),
     )
-    merged = merger(prior, seen, scope)
+    merged = merger(prior, observation, scope)
     block = np.ix_(kept, kept)
     assert [merged.pose[i] for i in kept] == [prior.pose[i] for i in kept]
     np.testing.assert_array_equal(
@@ -203,10 +207,10 @@ def test_no_evidence_changes_nothing() -> None:
 @seeds
 def test_an_observations_information_is_that_of_its_correlated_noise(seed: int, rank: int) -> None:
     rng = np.random.default_rng(seed)
-    seen = random_observation(rng, rank)
-    H, e, independent, dependent = parts(seen)
+    observation = random_observation(rng, rank)
+    H, e, independent, dependent = parts(observation)
     inverse = np.linalg.inv(independent + 3.0 * dependent)
-    evidence = seen.information(3.0)
+    evidence = observation.information(3.0)
     np.testing.assert_allclose(matrix3(evidence.matrix), H.T @ inverse @ H, rtol=1e-6, atol=1e-6)
     np.testing.assert_allclose(evidence.vector, H.T @ inverse @ e, rtol=1e-6, atol=1e-6)
 
@@ -215,10 +219,10 @@ def test_an_observations_information_is_that_of_its_correlated_noise(seed: int, 
 @seeds
 def test_the_normalized_innovation_is_the_quadratic_form(seed: int, rank: int) -> None:
     rng = np.random.default_rng(seed)
-    prior, seen = random_matrix(rng, 3), random_observation(rng, rank)
-    H, e, independent, dependent = parts(seen)
+    prior, observation = random_matrix(rng, 3), random_observation(rng, rank)
+    H, e, independent, dependent = parts(observation)
     expected = e @ np.linalg.solve(H @ prior @ H.T + independent + dependent, e)
-    assert seen.normalized_innovation_squared(covariance3(prior)) == pytest.approx(expected)
+    assert observation.normalized_innovation_squared(covariance3(prior)) == pytest.approx(expected)
 
 
 @ranks
@@ -226,10 +230,10 @@ def test_the_normalized_innovation_is_the_quadratic_form(seed: int, rank: int) -
 def test_the_naive_merge_takes_a_teammates_error_as_fresh_noise(seed: int, rank: int) -> None:
     rng = np.random.default_rng(seed)
     prior = Estimate(POSE, covariance3(random_matrix(rng, 3)))
-    seen = random_observation(rng, rank)
-    H, e, independent, dependent = parts(seen)
+    observation = random_observation(rng, rank)
+    H, e, independent, dependent = parts(observation)
     pose, covariance = kalman(prior, H, e, independent + dependent, Scope.POSE)
-    merged = merge_naive(prior, seen)
+    merged = merge_naive(prior, observation)
     np.testing.assert_allclose(vector(merged.pose), pose, atol=1e-9)
     np.testing.assert_allclose(matrix3(merged.covariance), covariance, atol=1e-9)
 
@@ -242,21 +246,21 @@ def test_the_naive_merge_takes_a_teammates_error_as_fresh_noise(seed: int, rank:
 def test_a_split_merge_of_independent_things_is_the_ordinary_one(seed: int, rank: int) -> None:
     rng = np.random.default_rng(seed)
     prior = Estimate(POSE, covariance3(random_matrix(rng, 3)))
-    seen = random_observation(rng, rank, dependent=False)
-    split, ordinary = merge_split(prior, seen), merge(prior, seen.information())
+    observation = random_observation(rng, rank, dependent=False)
+    split, ordinary = merge_split(prior, observation), merge(prior, observation.information())
     np.testing.assert_allclose(vector(split.pose), vector(ordinary.pose), atol=1e-9)
     np.testing.assert_allclose(split.covariance, ordinary.covariance, atol=1e-9)
     np.testing.assert_allclose(split.shared, ZERO3, atol=1e-9)
 
 
 def true_covariance(
-    rng: np.random.Generator, prior: Estimate, seen: Observation, scope: Scope
+    rng: np.random.Generator, prior: Estimate, observation: Observation, scope: Scope
 ) -> Matrix:
     """Of the error after a split merge, if the dependent parts are correlated somehow."""
-    H, _, independent, dependent = parts(seen)
-    K = gain(prior, seen, scope)
+    H, _, independent, dependent = parts(observation)
+    K = gain(prior, observation, scope)
     survive = np.eye(3) - K @ H
-    n = len(seen.rows)
+    n = len(observation.rows)
     cross = root(matrix3(prior.shared)) @ contraction(rng, 3, n) @ root(dependent).T
     mixed = survive @ cross @ K.T
     own = survive @ matrix3(prior.covariance) @ survive.T
@@ -276,9 +280,9 @@ def test_a_split_merge_is_consistent_whatever_is_correlated(
         private = random_matrix(rng, 3) if scope is Scope.POSE else np.zeros((3, 3))
         shared = random_matrix(rng, 3)
         prior = Estimate(POSE, covariance3(private + shared), covariance3(shared))
-        seen = random_observation(rng, rank)
-        claimed = matrix3(merge_split(prior, seen, scope).covariance)
-        true = true_covariance(rng, prior, seen, scope)
+        observation = random_observation(rng, rank)
+        claimed = matrix3(merge_split(prior, observation, scope).covariance)
+        true = true_covariance(rng, prior, observation, scope)
         assert least_eigenvalue((claimed - true)[block]) > -1e-9
 
 
@@ -287,11 +291,11 @@ def test_a_split_merge_counts_as_private_only_what_is(seed: int) -> None:
     rng = np.random.default_rng(seed)
     private, shared = random_matrix(rng, 3), random_matrix(rng, 3)
     prior = Estimate(POSE, covariance3(private + shared), covariance3(shared))
-    seen = random_observation(rng, 2)
-    H, _, independent, _ = parts(seen)
-    K = gain(prior, seen, Scope.POSE)
+    observation = random_observation(rng, 2)
+    H, _, independent, _ = parts(observation)
+    K = gain(prior, observation, Scope.POSE)
     survive = np.eye(3) - K @ H
-    merged = merge_split(prior, seen)
+    merged = merge_split(prior, observation)
     np.testing.assert_allclose(
         matrix3(merged.covariance) - matrix3(merged.shared),
         survive @ private @ survive.T + K @ independent @ K.T,
@@ -301,14 +305,14 @@ def test_a_split_merge_counts_as_private_only_what_is(seed: int) -> None:
 
 def an_event(rng: np.random.Generator, estimate: Estimate, scope: Scope) -> Estimate:
     """A step, a landmark, a teammate, or a belief that leaves."""
-    seen = random_observation(rng, int(rng.integers(1, 3)))
+    observation = random_observation(rng, int(rng.integers(1, 3)))
     match rng.integers(4):
         case 0:
             estimate = move(estimate, rng.uniform(-0.2, 0.5), rng.normal(), OdometryNoise())
         case 1:
-            estimate = merge(estimate, seen.information(), scope)
+            estimate = merge(estimate, observation.information(), scope)
         case 2:
-            estimate = merge_split(estimate, seen, scope)
+            estimate = merge_split(estimate, observation, scope)
         case _:
             estimate = mark_shared(estimate)
     return estimate if scope is Scope.POSE else with_all_shared(estimate)
@@ -336,7 +340,7 @@ def test_the_same_teammates_error_counts_only_once(
 ) -> None:
     """An observer that is off by 0.1 m may send its fix a hundred times."""
     observer = 0.1**2
-    seen = Observation(
+    observation = Observation(
         PLACE,
         (0.0, 0.0),
         Covariance2(0.05**2, 0.0, 0.05**2),
@@ -344,12 +348,12 @@ def test_the_same_teammates_error_counts_only_once(
     )
     estimate = Estimate(POSE, diagonal(30.0, 0.2))
     for _ in range(100):
-        estimate = merger(estimate, seen, scope)
+        estimate = merger(estimate, observation, scope)
     least = least_eigenvalue(matrix3(estimate.covariance)[:2, :2])
     assert (least > 0.99 * observer) is honest
 
 
-def test_a_belief_that_was_told_is_shared_as_a_whole() -> None:
+def test_a_belief_that_was_sent_is_shared_as_a_whole() -> None:
     estimate = Estimate(POSE, diagonal(0.3, 0.1))
     assert with_all_shared(estimate).shared == ZERO3
     assert mark_shared(estimate).shared == estimate.covariance

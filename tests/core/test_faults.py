@@ -29,9 +29,9 @@ def test_an_outlier_is_rejected_and_counted(variant: Variant) -> None:
 @variants
 def test_one_outlier_does_not_keep_the_others_out(variant: Variant) -> None:
     robot = standing(variant)
-    seen = frame(ORIGIN, 1).sightings
+    visible = frame(ORIGIN, 1).sightings
     wrong = Sighting("ne", 1.0, -2.0)
-    state = robot.cycle(state_at(ORIGIN, diagonal(0.1, 0.05)), Sightings(1, (wrong, *seen[1:])))
+    state = robot.cycle(state_at(ORIGIN, diagonal(0.1, 0.05)), Sightings(1, (wrong, *visible[1:])))
     assert state.counts == {"accepted": 3, "gated": 1}
 
 
@@ -66,9 +66,9 @@ def test_a_faulty_sighting_is_counted_and_nothing_else(
 @variants
 def test_a_faulty_sighting_does_not_keep_the_others_out(variant: Variant) -> None:
     robot, before = standing(variant), state_at(ORIGIN, diagonal(0.1, 0.05))
-    seen = frame(ORIGIN, 1)
-    mixed = Sightings(1, (Sighting("ne", math.nan), *seen.sightings))
-    assert robot.cycle(before, mixed).estimate == robot.cycle(before, seen).estimate
+    visible = frame(ORIGIN, 1)
+    mixed = Sightings(1, (Sighting("ne", math.nan), *visible.sightings))
+    assert robot.cycle(before, mixed).estimate == robot.cycle(before, visible).estimate
 
 
 @variants

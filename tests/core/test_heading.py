@@ -85,7 +85,7 @@ def test_the_weighted_variant_moves_by_its_static_weight() -> None:
 
 
 @given(angles, angles)
-def test_a_heading_is_told_the_short_way_round(own: float, told: float) -> None:
+def test_a_heading_residual_takes_the_shorter_way_round(own: float, told: float) -> None:
     robot = localizer("joint", odometry=STILL)
     before = state_at(Pose2(0.0, 0.0, own), diagonal(0.3, 2.0))
     after = robot.add_fix(before, fix(0.0, 0.0, 1, heading=told, **SURE)).estimate
@@ -94,7 +94,7 @@ def test_a_heading_is_told_the_short_way_round(own: float, told: float) -> None:
 
 
 @given(angles, angles, st.floats(1.0, 10.0))
-def test_only_the_sensors_part_is_doubted(own: float, told: float, factor: float) -> None:
+def test_only_the_sensors_part_is_inflated(own: float, told: float, factor: float) -> None:
     said = from_fix(fix(0.0, 0.0, heading=told, sensor_rad=0.1, observer_rad=0.2))
     once, more = (s.of_heading(Pose2(1.0, 2.0, own)) for s in (said, said.inflated(factor)))
     assert once is not None
@@ -117,7 +117,7 @@ def test_in_the_joint_variant_a_heading_moves_the_position_through_the_cross_cov
 
 
 @pytest.mark.parametrize("variant", ["oval", "circular", "weighted"])
-def test_elsewhere_it_leaves_the_position_alone(variant: Variant) -> None:
+def test_in_the_other_variants_it_leaves_the_position_alone(variant: Variant) -> None:
     robot = localizer(variant, odometry=STILL)
     before = state_at(ORIGIN, Covariance3(0.04, 0.0, 0.04, 0.0, 0.03, 0.04))
     told = fix(0.1, 0.2, 1, heading=0.1)
@@ -126,7 +126,7 @@ def test_elsewhere_it_leaves_the_position_alone(variant: Variant) -> None:
     assert after.pose.heading != plain.pose.heading == 0.0
 
 
-def test_a_heading_told_back_is_not_new() -> None:
+def test_a_shared_heading_that_comes_back_is_not_new() -> None:
     """What the robot itself told others (resolution c)."""
     robot = localizer("joint", odometry=STILL)
     state = robot.mark_shared(state_at(ORIGIN, diagonal(0.2, 0.1)), BeliefShared(0))
@@ -136,7 +136,7 @@ def test_a_heading_told_back_is_not_new() -> None:
     assert state.estimate.heading_sigma_rad > 0.99 * 0.1
 
 
-def test_a_fix_without_one_and_a_position_sensor_tell_no_heading() -> None:
+def test_a_fix_without_a_heading_and_a_position_sensor_give_no_heading() -> None:
     assert from_fix(fix(1.0, 2.0)).of_heading(ORIGIN) is None
     assert from_position_sensor(placed_at(1.0, 2.0)).of_heading(ORIGIN) is None
 
@@ -145,7 +145,7 @@ def test_a_fix_without_one_and_a_position_sensor_tell_no_heading() -> None:
 
 
 @variants
-def test_a_heading_far_off_is_refused_and_counted_but_not_the_position(variant: Variant) -> None:
+def test_a_heading_far_off_is_rejected_and_counted_but_not_the_position(variant: Variant) -> None:
     robot, before = localizer(variant, odometry=STILL), state_at(ORIGIN, diagonal(0.1, 0.05))
     told = fix(0.05, 0.0, 1, heading=1.5)
     after, plain = (robot.add_fix(before, f) for f in (told, without_heading(told)))
@@ -162,7 +162,7 @@ def test_a_heading_far_off_is_refused_and_counted_but_not_the_position(variant: 
     ],
     ids=["interval", "correlation"],
 )
-def test_a_position_whose_heading_is_refused_has_been_used(
+def test_a_position_whose_heading_is_rejected_has_been_used(
     rules: LocalizerSettings, sensor: SensorSettings
 ) -> None:
     """And is not soon used as news again."""
@@ -177,7 +177,7 @@ def test_a_position_whose_heading_is_refused_has_been_used(
 
 
 @variants
-def test_with_a_position_that_is_refused_the_heading_is_too(variant: Variant) -> None:
+def test_with_a_position_that_is_rejected_the_heading_is_too(variant: Variant) -> None:
     robot, before = localizer(variant, odometry=STILL), state_at(ORIGIN, diagonal(0.1, 0.05))
     after = robot.add_fix(before, fix(3.0, 0.0, 1, heading=0.05))
     assert after.estimate == before.estimate
@@ -185,7 +185,7 @@ def test_with_a_position_that_is_refused_the_heading_is_too(variant: Variant) ->
 
 
 @variants
-def test_a_robot_that_stands_and_looks_elsewhere_than_it_thinks_finds_out(variant: Variant) -> None:
+def test_a_standing_robot_finds_out_that_its_heading_is_wrong(variant: Variant) -> None:
     """Its place is confirmed by each fix, its heading denied."""
     robot, state = localizer(variant, odometry=STILL), state_at(ORIGIN, diagonal(0.02, 0.02))
     for i in range(1, 25):
@@ -299,7 +299,7 @@ def runs(variant: Variant, fusion: Fusion, headed: bool, off_m: float, off_deg: 
 
 
 @variants
-def test_a_blind_robot_that_is_told_its_heading_knows_it_better(variant: Variant) -> None:
+def test_fixes_with_a_heading_improve_the_heading_of_a_blind_robot(variant: Variant) -> None:
     """The same noise with and without; in the mean of the runs, and in most of them."""
     told, untold = (
         np.array([run.heading_rms_deg for run in runs(variant, "split-ci", headed, 0.02, 1.0)])
@@ -316,7 +316,7 @@ MOST_HEADING_NEES = 1.0 + 1.645 * math.sqrt(2.0 / 40.0)
 
 @pytest.mark.parametrize(("fusion", "honest"), [("split-ci", True), ("naive", False)])
 @probabilistic
-def test_an_observer_whose_heading_is_off_is_not_believed_more_than_it_may(
+def test_an_observer_whose_heading_is_off_gets_no_more_weight_than_due(
     variant: Variant, fusion: Fusion, honest: bool
 ) -> None:
     """4 degrees, in what it says of the position and of the heading alike. Of the circle only the
@@ -337,7 +337,7 @@ def test_an_observer_whose_heading_is_off_is_not_believed_more_than_it_may(
 
 
 @variants
-def test_a_lost_robot_that_stands_is_found_by_what_it_is_told(variant: Variant) -> None:
+def test_a_lost_robot_that_stands_relocalizes_by_fixes(variant: Variant) -> None:
     """Without the heading it never is."""
     robot, truth = localizer(variant, Field(), start=UNKNOWN, odometry=STILL), Pose2(1.0, 2.0, -2.5)
     told = [fix(1.0, 2.0, i * SECOND // 2, heading=-2.5) for i in range(1, 9)]
@@ -353,7 +353,7 @@ def test_a_lost_robot_that_stands_is_found_by_what_it_is_told(variant: Variant) 
 
 
 @pytest.mark.parametrize("variant", ["oval", "circular"])
-def test_a_lost_robot_that_drives_is_found_at_the_first_fix(variant: Variant) -> None:
+def test_a_lost_robot_that_drives_relocalizes_at_the_first_fix(variant: Variant) -> None:
     """Where the variant finds no heading in its places it has to wait for two."""
     robot = localizer(variant, Field(), start=UNKNOWN)
     found: dict[bool, int] = {}
@@ -370,7 +370,7 @@ def test_a_lost_robot_that_drives_is_found_at_the_first_fix(variant: Variant) ->
     assert found[False] >= 5 * SECOND // 10
 
 
-def test_who_is_in_quarantine_finds_nobody() -> None:
+def test_a_quarantined_teammate_does_not_relocalize_the_robot() -> None:
     robot = localizer("joint", Field(), start=UNKNOWN, odometry=STILL)
     state = robot.start(0)
     state = robot.add_fix(state, fix(1.0, 2.0, 1, heading=0.5))

@@ -1,4 +1,4 @@
-"""The one loop over plain landmarks says what the formulas of each constraint say, composed."""
+"""The fast path for plain landmarks gives what the general path gives."""
 
 import math
 from collections.abc import Sequence
@@ -85,14 +85,15 @@ def since(last_ns: int | None, seconds: float) -> bool:
     return last_ns is None or NOW - last_ns >= seconds * 1e9
 
 
-def turn_of(robot: Localizer, updates: Updates, seen: Sequence[Measurement]) -> Scope | None:
+def scope_of(robot: Localizer, updates: Updates, visible: Sequence[Measurement]) -> Scope | None:
     """The type that waits longer, of those that have anything; None: neither."""
     r = robot.settings.localizer
     last_ns = {Scope.POSITION: updates.position_ns, Scope.HEADING: updates.heading_ns}
     ready = [
-        turn
-        for turn in (Scope.POSITION, Scope.HEADING)
-        if since(last_ns[turn], r.minimum_interval_s) and any(constrains(m, turn, r) for m in seen)
+        scope
+        for scope in (Scope.POSITION, Scope.HEADING)
+        if since(last_ns[scope], r.minimum_interval_s)
+        and any(constrains(m, scope, r) for m in visible)
     ]
     if not r.alternates:
         return POSE if ready else None
@@ -106,18 +107,21 @@ def composed(robot: Localizer, state: State, frame: Sightings) -> tuple[Estimate
     r, prior, updates = robot.settings.localizer, state.estimate, state.updates
     good = [s for s in frame.sightings if not sighting_fault(s)]
     found = (measurement_of(s, NOW, prior.pose, robot.field, {}, robot.settings) for s in good)
-    seen = [m for m in found if m and since(updates.objects_ns.get(m.source), r.object_interval_s)]
+    visible = [
+        m for m in found if m and since(updates.objects_ns.get(m.source), r.object_interval_s)
+    ]
     tau_s = robot.settings.sensor.correlation_s
     if tau_s:
         rho = math.exp(-0.1 / tau_s)
-        seen = [
-            m.inflated((1 + rho) / (1 - rho)) if m.source in updates.objects_ns else m for m in seen
+        visible = [
+            m.inflated((1 + rho) / (1 - rho)) if m.source in updates.objects_ns else m
+            for m in visible
         ]
     counts = {"accepted": 0, "gated": 0}
-    turn, evidence = turn_of(robot, updates, seen), Information.none()
-    for m in seen if turn else ():
-        assert turn is not None
-        cs = constraints_of(prior.pose, m, turn, r)
+    scope, evidence = scope_of(robot, updates, visible), Information.none()
+    for m in visible if scope else ():
+        assert scope is not None
+        cs = constraints_of(prior.pose, m, scope, r)
         bound = -2.0 * math.log(1.0 - r.gate_probability)
         if len(cs) == 1:
             bound = robot._gates[0]
@@ -127,9 +131,9 @@ def composed(robot: Localizer, state: State, frame: Sightings) -> tuple[Estimate
             counts["accepted"] += 1
             for c in cs:
                 evidence = evidence.add(c.row, c.residual, c.sigma**2)
-    if turn is None:
+    if scope is None:
         return prior, counts
-    after = merge(prior, evidence, POSE if r.variant == "joint" else turn)
+    after = merge(prior, evidence, POSE if r.variant == "joint" else scope)
     if r.paper_uncertainty and r.variant != "joint":
         after = after._replace(covariance=after.covariance._replace(xh=0.0, yh=0.0))
     return with_circular_position(after) if r.variant == "circular" else after, counts
@@ -137,7 +141,7 @@ def composed(robot: Localizer, state: State, frame: Sightings) -> tuple[Estimate
 
 @settings(max_examples=400)
 @given(fields, readings, sensors, rules, st.integers(0, 2**32 - 1))
-def test_a_frame_says_what_its_constraints_say_one_by_one(
+def test_a_frame_gives_the_evidence_of_its_constraints_one_by_one(
     field: Field,
     kinds: list[tuple[str, float, float]],
     sensor: SensorSettings,
@@ -160,8 +164,8 @@ def test_a_frame_says_what_its_constraints_say_one_by_one(
         updates = updates._replace(heading_ns=updates.position_ns)  # there one timer is both
     state = state_at(true, covariance, NOW)._replace(updates=updates)
     exact = [point_sighting(true, n, p.x_m, p.y_m) for n, p in field.landmarks.items()]
-    seen = [read_as(s, *kind) for s, kind in zip(exact, kinds, strict=False)]
-    frame = Sightings(NOW, tuple(seen))
+    visible = [read_as(s, *kind) for s, kind in zip(exact, kinds, strict=False)]
+    frame = Sightings(NOW, tuple(visible))
 
     expected, counts = composed(robot, state, frame)
     after = robot.cycle(state, frame)
@@ -178,10 +182,10 @@ def test_a_frame_says_what_its_constraints_say_one_by_one(
 def test_new_evidence_is_that_of_a_measurement(variant: Variant, given: Gives) -> None:
     field = Field(landmarks={"post": Landmark(x_m=1.0, y_m=2.0, gives=given)})
     robot = localizer(variant, field)
-    seen = Sighting("post", 5.0, 0.3)  # farther than it can be
+    visible = Sighting("post", 5.0, 0.3)  # farther than it can be
     state = state_at(LOOP_START, covariance3(0.1 * np.eye(3)), NOW)
-    (piece,) = robot.evidence(robot.cycle(state, Sightings(NOW, (seen,))).memory.recovery)
-    m = measurement_of(seen, NOW, LOOP_START, field, {}, robot.settings)
+    (piece,) = robot.evidence(robot.cycle(state, Sightings(NOW, (visible,))).memory.recovery)
+    m = measurement_of(visible, NOW, LOOP_START, field, {}, robot.settings)
     assert m is not None
     assert (piece.source, piece.x, piece.y) == ("post", 1.0, 2.0)
     assert (piece.range_m, piece.bearing_rad) == (m.range_m, m.bearing)

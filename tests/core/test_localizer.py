@@ -40,8 +40,8 @@ def test_the_order_of_sightings_does_not_matter(variant: Variant) -> None:
     for names in permutations(["both", "ranged", "borne", "south"]):
         state = prior
         for i in (1, 2):
-            seen = frame(true, i * TENTH, MIXED, names).sightings
-            state = robot.cycle(state, Sightings(i * TENTH, (*seen[:2], mate, *seen[2:])))
+            visible = frame(true, i * TENTH, MIXED, names).sightings
+            state = robot.cycle(state, Sightings(i * TENTH, (*visible[:2], mate, *visible[2:])))
         flat = (*state.estimate.pose, *state.estimate.covariance)
         ends.add(tuple(round(v, 9) + 0.0 for v in flat))
     assert len(ends) == 1
@@ -57,11 +57,11 @@ def test_constraints_are_combined_at_the_prior_not_one_after_the_other() -> None
     )
     robot = standing("oval", field)
     state = state_at(ORIGIN, diagonal(0.5, 0.1))
-    seen = (Sighting("a", 1.5, None, 0.1), Sighting("b", 2.5, None, 0.2))
+    visible = (Sighting("a", 1.5, None, 0.1), Sighting("b", 2.5, None, 0.2))
     h = np.array([[-1.0, 0.0], [-(0.5**0.5), -(0.5**0.5)]])
     r, e = np.diag([0.1**2, 0.2**2]), np.array([1.5 - 2.0, 2.5 - 8.0**0.5])
     offset = 0.25 * h.T @ np.linalg.solve(0.25 * h @ h.T + r, e)
-    pose = robot.cycle(state, Sightings(1, seen)).estimate.pose
+    pose = robot.cycle(state, Sightings(1, visible)).estimate.pose
     assert pose == pytest.approx((*offset, 0.0), abs=1e-9)
 
 
@@ -102,8 +102,8 @@ def sideways_sigma(paper: bool, heading_sigma: float) -> float:
     state = state_at(ORIGIN, diagonal(1.0, heading_sigma))
     state = state._replace(updates=state.updates._replace(heading_is_latest=True))
     for i in range(1, 40):
-        seen = Sightings(i, (Sighting("ahead", None, 0.0, None, 0.01),))
-        state = robot.cycle(state, seen)
+        visible = Sightings(i, (Sighting("ahead", None, 0.0, None, 0.01),))
+        state = robot.cycle(state, visible)
         state = state._replace(updates=state.updates._replace(heading_is_latest=True))
     assert state.updates.heading_ns is None
     return math.sqrt(state.estimate.covariance.yy)

@@ -28,7 +28,7 @@ from cpcbl_team.measurements import (
 HERE = Pose2(0.0, 0.0, 0.0)
 
 
-def seen_as(
+def measure(
     sighting: Sighting,
     field: Field = CORNERS,
     *,
@@ -61,32 +61,34 @@ def test_a_landmark_gives_what_it_is_configured_to(
         walls={"wall": Wall(from_m=(0.0, 2.0), to_m=(1.0, 2.0), gives=gives)},
     )
     for name in ("post", "wall"):  # rows 2, 11, 19
-        seen = seen_as(Sighting(name, 2.0, 0.5), field)
-        assert seen is not None
-        assert (seen.range_m, seen.bearing) == (range_m, bearing)
-        assert seen.has_point_bearing is (name == "post" and bearing is not None)
+        measurement = measure(Sighting(name, 2.0, 0.5), field)
+        assert measurement is not None
+        assert (measurement.range_m, measurement.bearing) == (range_m, bearing)
+        assert measurement.has_point_bearing is (name == "post" and bearing is not None)
 
 
 @pytest.mark.parametrize(("range_m", "used"), [(2.9, 2.9), (3.1, None)])
 def test_a_range_beyond_the_good_ones_leaves_the_bearing(
     range_m: float, used: float | None
 ) -> None:
-    seen = seen_as(Sighting("ne", range_m, 0.5), sensor=SensorSettings(max_range_for_range_m=3.0))
-    assert seen is not None  # row 3
-    assert (seen.range_m, seen.bearing) == (used, 0.5)
+    measurement = measure(
+        Sighting("ne", range_m, 0.5), sensor=SensorSettings(max_range_for_range_m=3.0)
+    )
+    assert measurement is not None  # row 3
+    assert (measurement.range_m, measurement.bearing) == (used, 0.5)
 
 
 def test_a_sighting_may_lack_a_quantity() -> None:
-    seen = seen_as(Sighting("ne", None, 0.5))
-    assert seen is not None
-    assert seen.range_m is None
+    measurement = measure(Sighting("ne", None, 0.5))
+    assert measurement is not None
+    assert measurement.range_m is None
 
 
 def test_what_is_on_the_map_is_placed_exactly() -> None:
-    seen = seen_as(Sighting("ne", 2.0, 0.5))
-    assert seen is not None
-    assert seen.position == (4.5, 2.5, (0.0, 0.0, 0.0))
-    assert not seen.is_teammate
+    measurement = measure(Sighting("ne", 2.0, 0.5))
+    assert measurement is not None
+    assert measurement.position == (4.5, 2.5, (0.0, 0.0, 0.0))
+    assert not measurement.is_teammate
 
 
 def test_the_range_sigma_is_that_of_the_range_to_be_expected() -> None:
@@ -96,39 +98,41 @@ def test_the_range_sigma_is_that_of_the_range_to_be_expected() -> None:
         walls={"wall": Wall(from_m=(-9.0, 5.0), to_m=(0.0, 5.0))},
     )
     for name in field.landmarks | field.walls:
-        seen = seen_as(Sighting(name, 4.0, 0.0), field, sensor=sensor)
-        assert seen is not None
-        assert seen.range_sigma == pytest.approx(0.5)
+        measurement = measure(Sighting(name, 4.0, 0.0), field, sensor=sensor)
+        assert measurement is not None
+        assert measurement.range_sigma == pytest.approx(0.5)
 
 
 def test_an_unknown_object_is_not_used() -> None:
-    assert seen_as(Sighting("mate", 2.0, 0.5)) is None
+    assert measure(Sighting("mate", 2.0, 0.5)) is None
 
 
-def test_a_teammate_that_told_its_pose_is_one_more_landmark() -> None:
-    told = {"mate": (belief(1.0, 2.0, sigma_m=0.3),)}
-    seen = seen_as(Sighting("mate", 2.0, 0.5), teammates=told)
-    assert seen is not None  # row 25
-    assert seen.is_teammate
-    assert seen.position.covariance == pytest.approx((0.09, 0.0, 0.09))
-    assert seen_as(Sighting("mate", 2.0, 0.5), teammates=told, passive=False) is None
+def test_a_teammate_with_a_belief_is_one_more_landmark() -> None:
+    beliefs = {"mate": (belief(1.0, 2.0, sigma_m=0.3),)}
+    measurement = measure(Sighting("mate", 2.0, 0.5), teammates=beliefs)
+    assert measurement is not None  # row 25
+    assert measurement.is_teammate
+    assert measurement.position.covariance == pytest.approx((0.09, 0.0, 0.09))
+    assert measure(Sighting("mate", 2.0, 0.5), teammates=beliefs, passive=False) is None
 
 
 def test_a_teammate_whose_belief_is_too_old_is_not_used() -> None:
-    told = {"mate": (belief(1.0, 2.0),)}
+    beliefs = {"mate": (belief(1.0, 2.0),)}
     late = Sighting("mate", math.sqrt(5.0), 0.5)
-    assert seen_as(late, teammates=told, stamp_ns=2 * SECOND) is None
+    assert measure(late, teammates=beliefs, stamp_ns=2 * SECOND) is None
 
 
-@pytest.mark.parametrize("turn", Scope)
+@pytest.mark.parametrize("scope", Scope)
 @pytest.mark.parametrize("name", ["ne", "mate"])
-def test_the_gate_measures_the_innovation_of_the_whole_observation(name: str, turn: Scope) -> None:
+def test_the_gate_measures_the_innovation_of_the_whole_observation(name: str, scope: Scope) -> None:
     """For a landmark in a shorter way, for its place is exact."""
     prior = state_at(HERE, diagonal(0.2, 0.1)).estimate
-    seen = seen_as(Sighting(name, 3.0, 0.7), teammates={"mate": (belief(1.0, 2.0, sigma_m=0.3),)})
-    assert seen is not None
-    cs = constraints_of(HERE, seen, turn, LocalizerSettings())
-    whole = observation_of(prior, seen, cs, prior)
+    measurement = measure(
+        Sighting(name, 3.0, 0.7), teammates={"mate": (belief(1.0, 2.0, sigma_m=0.3),)}
+    )
+    assert measurement is not None
+    cs = constraints_of(HERE, measurement, scope, LocalizerSettings())
+    whole = observation_of(prior, measurement, cs, prior)
     expected = whole.normalized_innovation_squared(prior.covariance)
     assert expected > 0.0
-    assert nis_of(prior, seen, cs) == pytest.approx(expected, rel=1e-12)
+    assert nis_of(prior, measurement, cs) == pytest.approx(expected, rel=1e-12)

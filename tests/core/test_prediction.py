@@ -10,7 +10,7 @@ from cpcbl_team.inputs import Odometry
 
 
 @variants
-def test_odometry_is_driven_as_time_passes(variant: Variant) -> None:
+def test_odometry_moves_the_estimate_as_time_passes(variant: Variant) -> None:
     robot = localizer(variant)
     state = robot.add_odometry(state_at(ORIGIN, diagonal(0.1, 0.05)), Odometry(0, 10, 1.0, 0.0))
     assert robot.predict(state, 5).estimate.pose == pytest.approx((0.5, 0.0, 0.0))
@@ -52,7 +52,7 @@ def test_motion_on_the_spot_is_none() -> None:
 
 
 @variants
-def test_without_odometry_a_robot_that_moves_doubts_its_place(variant: Variant) -> None:
+def test_without_odometry_the_covariance_of_a_moving_robot_grows(variant: Variant) -> None:
     rules = OdometrySettings(timeout_s=0.5, gap_speed_m_s=0.3)
     robot, before = localizer(variant, odometry=rules), state_at(ORIGIN, diagonal(0.1, 0.05))
     assert robot.predict(before, SECOND // 2).estimate == before.estimate
@@ -62,7 +62,7 @@ def test_without_odometry_a_robot_that_moves_doubts_its_place(variant: Variant) 
     assert whole == pytest.approx(covariance)
 
 
-def test_without_odometry_a_robot_that_stands_still_does_not() -> None:
+def test_without_odometry_the_covariance_of_a_standing_robot_stays() -> None:
     before = state_at(ORIGIN, diagonal(0.1, 0.05))
     assert localizer(odometry=STANDING).predict(before, 9 * SECOND).estimate == before.estimate
 

@@ -101,7 +101,7 @@ def test_a_robot_is_lost_by_its_own_uncertainty(
         (9, 0, ""),
     ],
 )
-def test_a_robot_is_lost_when_most_of_what_it_sees_is_rejected(
+def test_a_robot_is_lost_when_most_of_its_measurements_are_rejected(
     rejected: int, accepted: int, reason: str
 ) -> None:
     innovations = with_innovations(1, accepted, rejected, 20)
@@ -118,7 +118,7 @@ def test_being_lost_ends_at_half_the_limit(sigma_m: float, still: bool) -> None:
     assert robot.cycle(state, Sightings(1, ())).lost == ""
 
 
-def test_doubt_doubles_sigma_up_to_the_limits_of_being_lost() -> None:
+def test_inflation_doubles_sigma_up_to_the_limits_of_being_lost() -> None:
     estimate = Estimate(ORIGIN, diagonal(0.02, 0.01))
     sigmas = []
     for _ in range(8):
@@ -147,7 +147,7 @@ def test_memory_keeps_little_of_each_object_and_nothing_old() -> None:
 
 
 @pytest.mark.parametrize(("age_ns", "kept"), [(SPACING_NS - 1, ["ne"]), (SPACING_NS, ["ne", "ne"])])
-def test_an_object_that_was_seen_a_short_time_ago_is_no_new_evidence(
+def test_an_object_measured_a_short_time_ago_is_no_new_evidence(
     age_ns: int, kept: list[str]
 ) -> None:
     state = state_at(ORIGIN, diagonal(0.1, 0.1), stamp_ns=SECOND)
@@ -155,16 +155,16 @@ def test_an_object_that_was_seen_a_short_time_ago_is_no_new_evidence(
     memory = Memory(RecoveryMemory(evidence=before))
     state = state._replace(memory=memory)
     place, both = ObjectPosition(4.5, 2.5, Covariance2(0.0, 0.0, 0.0)), (5.0, 0.5)
-    seen = [Measurement(name, place, None, False, *both, 0.1, 0.1) for name in ("ne", "ne")]
-    assert [e.source for e in with_measurements(state, seen).evidence] == kept
+    visible = [Measurement(name, place, None, False, *both, 0.1, 0.1) for name in ("ne", "ne")]
+    assert [e.source for e in with_measurements(state, visible).evidence] == kept
 
 
 @pytest.mark.parametrize("gives", ["none", "bearing"])
 def test_a_reading_that_may_not_be_used_is_no_evidence(gives: Gives) -> None:
     """It must not be taken for a fix, which has neither range nor bearing."""
     robot = localizer(field=giving(gives, "ne"))
-    seen = point_sighting(ORIGIN, "ne", 4.5, 2.5)
-    ranged = Sightings(1, (Sighting("ne", seen.range_m),))
+    visible = point_sighting(ORIGIN, "ne", 4.5, 2.5)
+    ranged = Sightings(1, (Sighting("ne", visible.range_m),))
     state = robot.cycle(state_at(ORIGIN, diagonal(0.1, 0.1)), ranged)
     assert all(
         (e.range_m, e.bearing_rad) != (None, None) for e in robot.evidence(state.memory.recovery)
@@ -212,13 +212,13 @@ def test_a_kidnapped_robot_is_back_within_three_seconds(
 
 @variants
 def test_a_kidnapped_robot_is_not_found_where_it_no_longer_is(variant: Variant) -> None:
-    """Being found at the old place makes it confident, and heard, while it is wrong."""
+    """Found at the old place it would be confident and wrong, and teammates would use it."""
     state, _ = kidnapped(variant, tuple(CORNERS.landmarks), 8.0)
     assert state.counts["found_again"] == 1
 
 
 @variants
-def test_an_overconfident_robot_that_sees_one_landmark_at_a_time_gets_right(
+def test_an_overconfident_robot_with_one_visible_landmark_at_a_time_recovers(
     variant: Variant,
 ) -> None:
     """In turn for 2 s each: one landmark alone does not say where the robot is."""
@@ -251,7 +251,7 @@ def test_an_overconfident_robot_with_one_landmark_does_not_reject_it_for_ever(
 
 @pytest.mark.parametrize("own", [False, True], ids=["a teammate's fixes", "its own sensor"])
 @variants
-def test_a_lost_robot_is_found_by_its_places_along_the_way(variant: Variant, own: bool) -> None:
+def test_a_lost_robot_relocalizes_by_positions_along_the_way(variant: Variant, own: bool) -> None:
     robot = localizer(variant, Field(), start=UNKNOWN)
     state, truth = robot.start(0), LOOP_START
     for odometry, truth in driven(LOOP_START, loop()[:60]):
@@ -267,7 +267,7 @@ def test_a_lost_robot_is_found_by_its_places_along_the_way(variant: Variant, own
     assert heading_error(state.estimate, truth) < 0.2
 
 
-def test_a_robot_says_why_it_is_lost_now() -> None:
+def test_the_reason_of_being_lost_is_the_present_one() -> None:
     """Not why it was at first: the rejections are over, its heading is still unknown."""
     robot = localizer(rules=LocalizerSettings(variant="joint"))
     memory = Memory(RecoveryMemory(lost="13 of the last 20 innovations rejected"))

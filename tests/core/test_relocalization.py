@@ -22,11 +22,11 @@ def fix_piece(stamp_ns: int, robot: Pose2) -> Evidence:
 def headed_piece(stamp_ns: int, robot: Pose2, sigma_rad: float = 0.05) -> Evidence:
     """A fix with the heading, half of whose variance is the observer's."""
     part = sigma_rad * math.sqrt(0.5)
-    told = fix_piece(stamp_ns, robot)._replace(bearing_sigma_rad=part)
-    return told._replace(heading_rad=robot.heading, teammate_sigma_rad=part)
+    reported = fix_piece(stamp_ns, robot)._replace(bearing_sigma_rad=part)
+    return reported._replace(heading_rad=robot.heading, teammate_sigma_rad=part)
 
 
-def seen_along(
+def measured_along(
     path: Iterable[Pose2], names: Sequence[str], gives: Gives = "both"
 ) -> tuple[Evidence, ...]:
     """What of these corners is known, from each place of a path."""
@@ -62,26 +62,28 @@ def found_at(evidence: Iterable[Evidence], truth: Pose2) -> Estimate | None:
 @pytest.mark.parametrize(
     "evidence",
     [
-        pytest.param(seen_along(PATH[-1:], ["ne", "sw"]), id="two ranges and bearings at once"),
+        pytest.param(measured_along(PATH[-1:], ["ne", "sw"]), id="two ranges and bearings at once"),
         pytest.param(
-            seen_along(PATH[:1], ["ne"]) + seen_along(PATH[1:2], ["nw"]),
+            measured_along(PATH[:1], ["ne"]) + measured_along(PATH[1:2], ["nw"]),
             id="two ranges and bearings on the way",
         ),
-        pytest.param(seen_along(PATH, ["ne", "nw", "se"], "bearing"), id="three bearings"),
-        pytest.param(seen_along(PATH, ["ne", "nw", "se"], "range"), id="three ranges on a bend"),
+        pytest.param(measured_along(PATH, ["ne", "nw", "se"], "bearing"), id="three bearings"),
+        pytest.param(
+            measured_along(PATH, ["ne", "nw", "se"], "range"), id="three ranges on a bend"
+        ),
         pytest.param(
             tuple(fix_piece(i * SPACING_NS, pose) for i, pose in enumerate(PATH)),
             id="fixes along the way",
         ),
         pytest.param(
-            (fix_piece(0, PATH[0]), *seen_along(PATH[1:], ["ne"])), id="a fix and a landmark"
+            (fix_piece(0, PATH[0]), *measured_along(PATH[1:], ["ne"])), id="a fix and a landmark"
         ),
         pytest.param(
             tuple(headed_piece(i * SPACING_NS, PATH[0]) for i in range(2)),
             id="two fixes with a heading at one place",
         ),
         pytest.param(
-            (headed_piece(0, PATH[0]), *seen_along(PATH[1:2], ["ne"], "bearing")),
+            (headed_piece(0, PATH[0]), *measured_along(PATH[1:2], ["ne"], "bearing")),
             id="a fix with a heading, and a bearing",
         ),
         pytest.param(
@@ -107,35 +109,35 @@ ON_THE_LINE = tuple(
     "evidence",
     [
         pytest.param((), id="nothing"),
-        pytest.param(seen_along(PATH[-1:], ["ne"]), id="one landmark"),
-        pytest.param(seen_along(PATH, ["ne"]), id="one landmark along the way"),
-        pytest.param(seen_along(PATH[-1:] * 3, ["ne", "nw"], "range"), id="two ranges"),
+        pytest.param(measured_along(PATH[-1:], ["ne"]), id="one landmark"),
+        pytest.param(measured_along(PATH, ["ne"]), id="one landmark along the way"),
+        pytest.param(measured_along(PATH[-1:] * 3, ["ne", "nw"], "range"), id="two ranges"),
         pytest.param(ON_THE_LINE, id="two ranges, the same on either side"),
-        pytest.param(seen_along(STRAIGHT[-1:] * 3, ["ne", "nw"], "bearing"), id="two bearings"),
+        pytest.param(measured_along(STRAIGHT[-1:] * 3, ["ne", "nw"], "bearing"), id="two bearings"),
         pytest.param(
             tuple(fix_piece(i * SPACING_NS, PATH[0]) for i in range(4)), id="fixes at one place"
         ),
         pytest.param((headed_piece(0, PATH[0]),), id="one fix with a heading: nothing confirms it"),
     ],
 )
-def test_what_is_ambiguous_finds_nobody(evidence: tuple[Evidence, ...]) -> None:
+def test_ambiguous_evidence_gives_no_pose(evidence: tuple[Evidence, ...]) -> None:
     truth = evidence[-1].odometry_from_robot if evidence else PATH[-1]
     assert found_at(evidence, truth) is None
 
 
 def test_a_few_wrong_pieces_are_left_out() -> None:
-    evidence = seen_along(PATH, ["ne", "nw", "se"])
+    evidence = measured_along(PATH, ["ne", "nw", "se"])
     wrong = evidence[4]._replace(bearing_rad=2.0, range_m=0.5)
     assert found_at((*evidence[:4], wrong, *evidence[5:]), PATH[-1]) is not None
 
 
-def test_evidence_that_contradicts_itself_finds_nobody() -> None:
-    evidence = seen_along(PATH[-1:], ["ne", "nw"])
+def test_evidence_that_contradicts_itself_gives_no_pose() -> None:
+    evidence = measured_along(PATH[-1:], ["ne", "nw"])
     wrong = [e._replace(range_m=1.0, bearing_rad=0.1 * i) for i, e in enumerate(evidence)]
     assert relocalize(tuple(wrong), PATH[-1], CORNERS) is None
 
 
-def test_headings_that_contradict_each_other_find_nobody() -> None:
+def test_headings_that_contradict_each_other_give_no_pose() -> None:
     one, other = (headed_piece(i * SPACING_NS, PATH[0]) for i in range(2))
     other = other._replace(heading_rad=PATH[0].heading + 1.0)
     assert relocalize((one, other), PATH[0], CORNERS) is None
@@ -148,10 +150,10 @@ def test_a_wrong_heading_among_right_ones_is_left_out() -> None:
 
 
 @pytest.mark.parametrize("times", [1, 6])
-def test_an_observer_that_repeats_a_heading_is_not_believed_more(times: int) -> None:
+def test_an_observer_that_repeats_a_heading_gets_no_more_weight(times: int) -> None:
     """Of its own 0.1 rad nothing is averaged away, and nothing of it by its position either."""
-    told = [headed_piece(i, PATH[0], 0.1 * math.sqrt(2.0)) for i in range(2 * times)]
-    sure = [e._replace(bearing_sigma_rad=0.001) for e in told]
+    reported = [headed_piece(i, PATH[0], 0.1 * math.sqrt(2.0)) for i in range(2 * times)]
+    sure = [e._replace(bearing_sigma_rad=0.001) for e in reported]
     found = relocalize(tuple(sure), PATH[0], CORNERS)
     assert found is not None
     assert found.heading_sigma_rad > 0.1
@@ -159,21 +161,23 @@ def test_an_observer_that_repeats_a_heading_is_not_believed_more(times: int) -> 
 
 
 @pytest.mark.parametrize("times", [1, 6])
-def test_teammates_that_repeat_themselves_are_not_believed_more(times: int) -> None:
+def test_teammates_that_repeat_themselves_get_no_more_weight(times: int) -> None:
     """Their error, of 0.1 m, may be the same each time."""
-    told = [fix_piece(i, pose) for i, pose in enumerate(PATH * times)]
-    found = relocalize(tuple(told), PATH[-1], CORNERS)
-    own = relocalize(tuple(e._replace(from_teammate=False) for e in told), PATH[-1], CORNERS)
+    reported = [fix_piece(i, pose) for i, pose in enumerate(PATH * times)]
+    found = relocalize(tuple(reported), PATH[-1], CORNERS)
+    own = relocalize(tuple(e._replace(from_teammate=False) for e in reported), PATH[-1], CORNERS)
     assert found is not None
     assert own is not None
     assert found.position_sigma_m > 0.1
     assert own.position_sigma_m < 0.14 / math.sqrt(times)
 
 
-def test_what_a_teammate_told_is_shared_when_one_is_found_by_it() -> None:
-    told = relocalize(tuple(fix_piece(i, pose) for i, pose in enumerate(PATH)), PATH[-1], CORNERS)
-    seen = relocalize(seen_along(PATH, ["ne", "nw"]), PATH[-1], CORNERS)
-    assert told is not None
-    assert seen is not None
-    assert told.shared == told.covariance
-    assert set(seen.shared) == {0.0}
+def test_a_pose_found_by_a_teammates_reports_is_shared() -> None:
+    reported = relocalize(
+        tuple(fix_piece(i, pose) for i, pose in enumerate(PATH)), PATH[-1], CORNERS
+    )
+    measured = relocalize(measured_along(PATH, ["ne", "nw"]), PATH[-1], CORNERS)
+    assert reported is not None
+    assert measured is not None
+    assert reported.shared == reported.covariance
+    assert set(measured.shared) == {0.0}

@@ -24,29 +24,29 @@ from cpcbl_team.state import State
 HERE = Pose2(0.1, 0.05, 0.05)
 
 
-def looked(robot: Localizer, state: State, stamp_ns: int) -> State:
+def add_frame(robot: Localizer, state: State, stamp_ns: int) -> State:
     return robot.cycle(state, frame(HERE, stamp_ns, names=["ne"]))
 
 
-def was_told(robot: Localizer, state: State, stamp_ns: int) -> State:
+def add_fix(robot: Localizer, state: State, stamp_ns: int) -> State:
     return robot.add_fix(state, fix(HERE.x, HERE.y, stamp_ns))
 
 
-def was_placed(robot: Localizer, state: State, stamp_ns: int) -> State:
+def add_position(robot: Localizer, state: State, stamp_ns: int) -> State:
     return robot.add_position(state, placed_at(HERE.x, HERE.y, stamp_ns))
 
 
-sources = pytest.mark.parametrize("hear_of", [looked, was_told, was_placed])
+sources = pytest.mark.parametrize("report", [add_frame, add_fix, add_position])
 
 
 def twice(
-    hear_of: Callable[[Localizer, State, int], State], correlation_s: float, after_ns: int = TENTH
+    report: Callable[[Localizer, State, int], State], correlation_s: float, after_ns: int = TENTH
 ) -> list[State]:
-    """Before, after a first and after a second time that one source says the same."""
+    """Before, after a first and after a second time that one source reports the same."""
     robot = standing("joint", sensor=SensorSettings(correlation_s=correlation_s))
     before = state_at(ORIGIN, diagonal(0.3, 0.2))
-    first = hear_of(robot, before, TENTH)
-    return [before, first, hear_of(robot, first, TENTH + after_ns)]
+    first = report(robot, before, TENTH)
+    return [before, first, report(robot, first, TENTH + after_ns)]
 
 
 def moved_by(before: State, after: State) -> float:
@@ -62,11 +62,11 @@ def alike(one: State, other: State) -> bool:
 
 
 @sources
-def test_what_a_source_says_again_soon_counts_for_less(
-    hear_of: Callable[[Localizer, State, int], State],
+def test_a_report_repeated_soon_counts_for_less(
+    report: Callable[[Localizer, State, int], State],
 ) -> None:
-    _, once, again = twice(hear_of, 2.0)
-    _, fresh, fresh_again = twice(hear_of, 0.0)
+    _, once, again = twice(report, 2.0)
+    _, fresh, fresh_again = twice(report, 0.0)
     assert alike(once, fresh)
     assert moved_by(once, again) < 0.5 * moved_by(fresh, fresh_again)
     less = matrix3(once.estimate.covariance) - matrix3(again.estimate.covariance)
@@ -76,25 +76,25 @@ def test_what_a_source_says_again_soon_counts_for_less(
 
 
 @sources
-def test_the_later_a_source_speaks_again_the_more_it_counts(
-    hear_of: Callable[[Localizer, State, int], State],
+def test_a_later_repetition_counts_for_more(
+    report: Callable[[Localizer, State, int], State],
 ) -> None:
     waits = [TENTH, SECOND, 5 * SECOND]
-    left = [twice(hear_of, 2.0, wait)[-1].estimate.covariance.determinant() for wait in waits]
+    left = [twice(report, 2.0, wait)[-1].estimate.covariance.determinant() for wait in waits]
     assert left == sorted(left, reverse=True)
     assert left[0] > 1.05 * left[-1]
 
 
 @sources
-def test_errors_that_fade_at_once_are_as_good_as_new_ones(
-    hear_of: Callable[[Localizer, State, int], State],
+def test_errors_without_correlation_count_in_full(
+    report: Callable[[Localizer, State, int], State],
 ) -> None:
-    assert all(map(alike, twice(hear_of, 1e-4), twice(hear_of, 0.0)))
+    assert all(map(alike, twice(report, 1e-4), twice(report, 0.0)))
 
 
 def test_another_object_counts_in_full_at_any_time() -> None:
     robot = standing("joint", sensor=SensorSettings(correlation_s=2.0))
     plain = standing("joint", sensor=SensorSettings())
-    once = looked(robot, state_at(ORIGIN, diagonal(0.3, 0.2)), TENTH)
+    once = add_frame(robot, state_at(ORIGIN, diagonal(0.3, 0.2)), TENTH)
     other = frame(HERE, 2 * TENTH, names=["nw"])
     assert alike(robot.cycle(once, other), plain.cycle(once, other))

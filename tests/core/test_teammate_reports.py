@@ -39,8 +39,8 @@ def test_a_teammates_uncertainty_is_compounded_before_the_constraint(
         state_at(ORIGIN, diagonal(0.3, 0.2)), belief(2.0, 0.5, sigma_m=30.0)
     )
     for i in (1, 2):
-        seen = point_sighting(Pose2(0.1, 0.05, 0.05), "mate", 2.0, 0.5)
-        state = robot.cycle(state, Sightings(i, (seen,)))
+        visible = point_sighting(Pose2(0.1, 0.05, 0.05), "mate", 2.0, 0.5)
+        state = robot.cycle(state, Sightings(i, (visible,)))
     assert state.counts == {"accepted": 2}
     assert state.estimate.pose == pytest.approx(ORIGIN, abs=1e-3)
 
@@ -55,8 +55,8 @@ def test_a_teammate_with_a_known_place_is_one_more_landmark(variant: Variant) ->
             state_at(ORIGIN, diagonal(0.3, 0.2)), belief(2.0, 0.5, sigma_m=1e-6)
         )
         for i in (1, 2):
-            seen = point_sighting(Pose2(0.1, 0.05, 0.05), "mate", 2.0, 0.5)
-            state = robot.cycle(state, Sightings(i, (seen,)))
+            visible = point_sighting(Pose2(0.1, 0.05, 0.05), "mate", 2.0, 0.5)
+            state = robot.cycle(state, Sightings(i, (visible,)))
         ends.append(state.estimate)
     assert ends[1].pose == pytest.approx(ends[0].pose, rel=0.03)
     assert math.hypot(ends[1].pose.x, ends[1].pose.y) > 0.05
@@ -68,8 +68,8 @@ def test_a_teammates_range_is_as_wide_as_sensor_and_place_together(variant: Vari
     state = robot.add_teammate_belief(
         state_at(ORIGIN, diagonal(100.0, 0.1)), belief(3.0, 0.0, sigma_m=0.4)
     )
-    seen = Sightings(1, (Sighting("mate", 3.0, None, 0.3),))
-    covariance = robot.cycle(state, seen).estimate.covariance
+    visible = Sightings(1, (Sighting("mate", 3.0, None, 0.3),))
+    covariance = robot.cycle(state, visible).estimate.covariance
     if variant == "circular":
         assert covariance.xx == pytest.approx(0.5 * (1.0 + SPREAD_SHARE) * 100.0**2, rel=0.01)
     else:
@@ -106,7 +106,7 @@ def test_in_the_joint_variant_a_fix_moves_the_heading_through_the_cross_covarian
 
 
 @variants
-def test_a_position_sensor_places_the_robot_and_nothing_of_it_is_shared(variant: Variant) -> None:
+def test_a_position_sensor_moves_the_position_and_none_of_it_is_shared(variant: Variant) -> None:
     """Row 28: like a fix, but nobody else's error is in it."""
     robot, before = standing(variant), state_at(ORIGIN, diagonal(0.3, 0.2))
     after = robot.add_position(before, placed_at(0.2, -0.1, 1, sigma_m=0.1))
@@ -141,7 +141,7 @@ def test_a_fix_is_no_update_of_a_type() -> None:
     assert updates.objects_ns == {"fix:mate": 1}
 
 
-def test_what_a_told_robot_hears_back_is_not_new() -> None:
+def test_shared_information_that_comes_back_is_not_new() -> None:
     """Its own belief, returned by a teammate, must not make it more certain (resolution c)."""
     robot = standing("joint")
     state = robot.mark_shared(state_at(ORIGIN, diagonal(0.2, 0.1)), BeliefShared(0))
@@ -151,8 +151,8 @@ def test_what_a_told_robot_hears_back_is_not_new() -> None:
 
 
 @probabilistic
-def test_what_says_nothing_new_costs_nothing(variant: Variant) -> None:
-    """Merged it would widen what it says nothing of: here the heading, by 2 % of its variance each
+def test_a_fix_without_new_information_changes_nothing(variant: Variant) -> None:
+    """Its merge would inflate the rest of the pose: here the heading, by 2 % of its variance each
     time."""
     robot = standing(variant)
     before = robot.mark_shared(state_at(ORIGIN, diagonal(0.2, 0.1)), BeliefShared(0))
@@ -174,7 +174,7 @@ def test_a_fix_does_not_cost_the_heading(variant: Variant) -> None:
 
 @pytest.mark.parametrize("paper", [False, True])
 @probabilistic
-def test_what_is_shared_stays_a_part_of_the_covariance(variant: Variant, paper: bool) -> None:
+def test_the_shared_part_stays_a_part_of_the_covariance(variant: Variant, paper: bool) -> None:
     rng = np.random.default_rng(5)
     robot = localizer(rules=LocalizerSettings(variant=variant, paper_uncertainty=paper))
     noise, state = sensor_noise(rng, SensorSettings()), state_at(LOOP_START, diagonal(0.05, 0.05))

@@ -20,7 +20,7 @@ def test_the_joint_variant_updates_both_at_once() -> None:
 
 
 @separated
-def test_where_one_type_has_nothing_the_other_runs(variant: Variant) -> None:
+def test_where_one_type_has_no_measurement_the_other_runs(variant: Variant) -> None:
     assert parts_of_cycles(standing(variant, MIXED), [1, 2, 3], ["ranged"]) == ["position"] * 3
 
 
@@ -33,7 +33,7 @@ def test_bearings_may_be_kept_for_the_heading(variant: Variant) -> None:
 
 
 @separated
-def test_where_one_type_is_refused_the_other_runs(variant: Variant) -> None:
+def test_where_one_type_is_rejected_the_other_runs(variant: Variant) -> None:
     """A wrong heading must not keep good ranges from the position (row 5)."""
     rules = LocalizerSettings(variant=variant, lost_window=1000, bearing_for_position=False)
     robot = localizer(field=CORNERS, rules=rules, odometry=STANDING)
@@ -56,7 +56,7 @@ def test_the_timer_holds_the_joint_variant_too() -> None:
     assert parts_of_cycles(robot, [i * TENTH for i in range(1, 5)]) == ["both", "", "", "both"]
 
 
-def test_an_object_rests_between_two_uses() -> None:
+def test_an_object_cools_down_between_two_uses() -> None:
     robot = standing("joint", object_interval_s=0.25)
     state = state_at(ORIGIN, diagonal(0.3, 0.2))
     used = []

@@ -26,9 +26,9 @@ WEIGHTS = Weights(position=0.25, heading=0.5)
 def test_readings_are_weighted_by_inverse_distance_then_statically() -> None:
     """Ranges of 1.2 and 3.8 m: 0.2 m to the south and 0.2 m to the east."""
     robot = standing("weighted", PAIR, weights=WEIGHTS)
-    seen = Sightings(1, (Sighting("near", 1.2), Sighting("far", 3.8)))
+    visible = Sightings(1, (Sighting("near", 1.2), Sighting("far", 3.8)))
     near, far = 1.0 / 1.2, 1.0 / 3.8  # row 14
-    pose = robot.cycle(state_at(ORIGIN, diagonal(0.3, 0.1)), seen).estimate.pose
+    pose = robot.cycle(state_at(ORIGIN, diagonal(0.3, 0.1)), visible).estimate.pose
     assert pose.x == pytest.approx(0.25 * 0.2 * far / (near + far))  # row 15
     assert pose.y == pytest.approx(-0.25 * 0.2 * near / (near + far))
     assert pose.heading == 0.0
@@ -71,8 +71,8 @@ def test_weighted_averages_are_circular_gaussians_of_constant_relative_covarianc
     expected = product_of(Gaussian2(x, y, own), sensor)
 
     robot = standing("weighted", PAIR, weights=Weights(position=weight))
-    seen = Sightings(1, tuple(Sighting(name, r) for name, r in ranges.items()))
-    found = robot.cycle(state_at(pose, diagonal(0.5, 0.1)), seen).estimate.pose
+    visible = Sightings(1, tuple(Sighting(name, r) for name, r in ranges.items()))
+    found = robot.cycle(state_at(pose, diagonal(0.5, 0.1)), visible).estimate.pose
     assert (found.x, found.y) == pytest.approx((expected.x, expected.y), abs=1e-9)
 
 

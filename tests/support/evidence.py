@@ -16,15 +16,15 @@ def piece(
     gives: Gives = "both",
 ) -> Evidence:
     """An exact sighting; dead reckoning has its origin at the field's."""
-    seen = point_sighting(robot, name, x, y)
+    exact = point_sighting(robot, name, x, y)
     return Evidence(
         stamp_ns,
         robot,
         name,
         x,
         y,
-        seen.range_m if gives in ("both", "range") else None,
-        seen.bearing_rad if gives in ("both", "bearing") else None,
+        exact.range_m if gives in ("both", "range") else None,
+        exact.bearing_rad if gives in ("both", "bearing") else None,
         0.1,
         0.03,
         0.0,

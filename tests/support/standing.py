@@ -67,11 +67,11 @@ def moved_parts(before: State, after: State) -> str:
 def parts_of_cycles(
     robot: Localizer, stamps_ns: list[int], names: list[str] | None = None
 ) -> list[str]:
-    """What each of these frames, seen from a bit aside, changes."""
+    """What each of these frames; the robot is a bit aside, changes."""
     state, changed = state_at(ORIGIN, diagonal(0.3, 0.2)), []
     for stamp_ns in stamps_ns:
-        seen = frame(Pose2(0.1, 0.05, 0.05), stamp_ns, robot.field, names)
-        after = robot.cycle(state, seen)
+        visible = frame(Pose2(0.1, 0.05, 0.05), stamp_ns, robot.field, names)
+        after = robot.cycle(state, visible)
         changed.append(moved_parts(state, after))
         state = after
     return changed
