@@ -6,7 +6,7 @@ for a log, OpenCV for a camera.
 
 from pathlib import Path
 
-from cpcbl_agents.detector import Eyes
+from cpcbl_agents.detector import Detector
 from cpcbl_agents.robot import Robot
 from cpcbl_agents.sensing import SensingAgent
 from cpcbl_agents.sources import NoSource, OwnCamera, Source
@@ -51,7 +51,7 @@ def build_sensing(
     return SensingAgent(settings, source, map_names, follower, detector, camera)
 
 
-def _build_detector(name: str, team: Team) -> Eyes:
-    from cpcbl_agents.vision.detector import CameraEyes
+def _build_detector(name: str, team: Team) -> Detector:
+    from cpcbl_agents.vision.detector import CameraDetector
 
-    return CameraEyes(name, team)
+    return CameraDetector(name, team)

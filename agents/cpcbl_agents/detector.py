@@ -1,4 +1,4 @@
-"""What makes sightings of a camera's frames: the protocol, without OpenCV (`vision` has that)."""
+"""The protocol of a detector of objects in frames, without OpenCV (`vision` implements it)."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ class Picture(NamedTuple):
     pixels: NDArray[np.uint8]
 
 
-class Eyes(Protocol):
-    """Sees landmarks and teammates in frames."""
+class Detector(Protocol):
+    """Detects landmarks and teammates in frames."""
 
-    def seen(self, frame: Frame | Picture) -> Sightings | str:
-        """What is in a frame, at its stamp; or why the frame cannot be used (`frame_...`)."""
+    def detect(self, frame: Frame | Picture) -> Sightings | str:
+        """The sightings in a frame, or the reason why it cannot be used (`frame_...`)."""
 
-    def shown(self, frame: Frame | Picture) -> tuple[Sightings | str, AnnotatedFrame]:
-        """The same, and the frame with all that drawn into it."""
+    def detect_and_annotate(self, frame: Frame | Picture) -> tuple[Sightings | str, AnnotatedFrame]:
+        """The same, and the annotated frame."""

@@ -192,9 +192,9 @@ def own_camera(
     if robot.sensing != "camera" or not robot.camera.frames:
         yield None
         return
-    from cpcbl_agents.sources.camera import opened
+    from cpcbl_agents.sources.camera import open_camera
 
-    camera = opened(name, robot.camera, robot.sensor.rate_hz, clock.now_ns, wake)
+    camera = open_camera(name, robot.camera, robot.sensor.rate_hz, clock.now_ns, wake)
     try:
         yield camera
     finally:

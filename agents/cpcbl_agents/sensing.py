@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import msgspec
 
 from cpcbl_agents.agent import AgentMessage, FrameSubscribers, PoseEstimate, Tick
-from cpcbl_agents.detector import Eyes, Picture
+from cpcbl_agents.detector import Detector, Picture
 from cpcbl_agents.sources import OwnCamera, Source
 from cpcbl_agents.waypoint_follower import WaypointFollower
 from cpcbl_team.config import LocalizationSettings
@@ -33,7 +33,7 @@ class SensingAgent:
         source: Source,
         map_names: frozenset[str],
         follower: WaypointFollower | None = None,
-        detector: Eyes | None = None,
+        detector: Detector | None = None,
         camera: OwnCamera | None = None,
     ) -> None:
         self._sensor, self._odometry = settings.sensor, settings.odometry
@@ -91,10 +91,10 @@ class SensingAgent:
             and not 0 <= item.stamp_ns - self._annotated_ns < ANNOTATION_INTERVAL_NS
         ):
             self._annotated_ns = item.stamp_ns
-            sightings, annotated = self._detector.shown(item)
+            sightings, annotated = self._detector.detect_and_annotate(item)
             outgoing.append(annotated)
         else:
-            sightings = self._detector.seen(item)
+            sightings = self._detector.detect(item)
         if isinstance(sightings, str):
             self._counts[sightings] += 1
             return outgoing

@@ -7,9 +7,16 @@ import numpy as np
 import pytest
 from support.cameras import picture
 
-from cpcbl_agents.vision.annotate import DOUBTED, FOUND, Box, annotated, labelled, labels
+from cpcbl_agents.vision.annotate import (
+    AMBIGUOUS_BGR,
+    DETECTED_BGR,
+    Box,
+    annotate,
+    place_labels,
+    sighting_lines,
+)
 from cpcbl_agents.vision.camera import Floats
-from cpcbl_agents.vision.detections import Doubt, Found, Glimpses
+from cpcbl_agents.vision.detections import Ambiguity, Detection, Detections
 from cpcbl_team.inputs import Sighting
 
 SIZE = (640, 480)
@@ -22,7 +29,7 @@ def box(left: float, top: float, right: float, bottom: float) -> Floats:
 
 
 HERE, THERE = box(200, 100, 240, 260), box(400, 220, 450, 250)
-SEEN = Glimpses((Found(OAK, HERE),), (Doubt("ambiguous", ("r2", "r3"), THERE),))
+SEEN = Detections((Detection(OAK, HERE),), (Ambiguity("ambiguous", ("r2", "r3"), THERE),))
 
 
 @pytest.mark.parametrize(
@@ -36,13 +43,13 @@ SEEN = Glimpses((Found(OAK, HERE),), (Doubt("ambiguous", ("r2", "r3"), THERE),))
     ids=lambda part: getattr(part, "id", ""),
 )
 def test_a_label_says_what_the_sighting_says(sighting: Sighting, lines: list[str]) -> None:
-    assert labelled(sighting) == lines
+    assert sighting_lines(sighting) == lines
 
 
 def test_what_was_found_and_what_was_not_reported_are_labelled() -> None:
-    found, doubt = labels(SEEN, SIZE)
-    assert (found.lines, found.colour) == (tuple(labelled(OAK)), FOUND)
-    assert (doubt.lines, doubt.colour) == (("ambiguous", "r2 or r3"), DOUBTED)
+    found, ambiguity = place_labels(SEEN, SIZE)
+    assert (found.lines, found.colour) == (tuple(sighting_lines(OAK)), DETECTED_BGR)
+    assert (ambiguity.lines, ambiguity.colour) == (("ambiguous", "r2 or r3"), AMBIGUOUS_BGR)
 
 
 def inside(one: Box) -> bool:
@@ -51,27 +58,27 @@ def inside(one: Box) -> bool:
 
 def test_labels_are_inside_and_apart_wherever_things_are() -> None:
     places = [box(x, y, x + 30, y + 60) for x in (-20, 300, 630) for y in (-40, 210, 215, 470)]
-    shown = Glimpses(tuple(Found(MATE, place) for place in places))
-    boxes = [label.box for label in labels(shown, SIZE)]
+    shown = Detections(tuple(Detection(MATE, place) for place in places))
+    boxes = [label.box for label in place_labels(shown, SIZE)]
     assert all(map(inside, boxes))
-    assert not any(a.meets(b) for a, b in itertools.combinations(boxes, 2))
+    assert not any(a.overlaps(b) for a, b in itertools.combinations(boxes, 2))
 
 
 def test_without_room_labels_are_still_inside() -> None:
-    crowd = Glimpses(tuple(Found(MATE, HERE) for _ in range(40)))
-    assert all(inside(label.box) for label in labels(crowd, SIZE))
+    crowd = Detections(tuple(Detection(MATE, HERE) for _ in range(40)))
+    assert all(inside(label.box) for label in place_labels(crowd, SIZE))
 
 
 def test_only_outlines_and_labels_are_drawn() -> None:
     before = picture(5, SIZE)
     kept = before.copy()
-    after = annotated(before, SEEN)
+    after = annotate(before, SEEN)
     assert (before == kept).all()
     changed = (after != before).any(axis=2)
     allowed = np.zeros_like(changed)
-    for left, top, right, bottom in (label.box for label in labels(SEEN, SIZE)):
+    for left, top, right, bottom in (label.box for label in place_labels(SEEN, SIZE)):
         allowed[top:bottom, left:right] = True
-    for place, colour in ((HERE, FOUND), (THERE, DOUBTED)):
+    for place, colour in ((HERE, DETECTED_BGR), (THERE, AMBIGUOUS_BGR)):
         (left, top), (right, bottom) = place[0].astype(int), place[2].astype(int)
         assert np.abs(after[top + 3 : bottom - 2, left].astype(int) - colour).max() < 30
         allowed[top - 4 : bottom + 5, left - 4 : right + 5] = True
@@ -85,14 +92,14 @@ def test_only_outlines_and_labels_are_drawn() -> None:
     ids=["nowhere", "empty", "endless", "beside the frame"],
 )
 def test_an_outline_may_be_anywhere(outline: Floats) -> None:
-    shown = annotated(picture(5, SIZE), Glimpses((Found(OAK, outline),)))
+    shown = annotate(picture(5, SIZE), Detections((Detection(OAK, outline),)))
     assert (shown != picture(5, SIZE)).any()
 
 
 @pytest.mark.parametrize("size", [(16, 16), (64, 48), (1920, 1080)], ids=str)
 def test_frames_of_any_size_are_drawn_into(size: tuple[int, int]) -> None:
-    assert annotated(picture(5, size), SEEN).shape == (size[1], size[0], 3)
+    assert annotate(picture(5, size), SEEN).shape == (size[1], size[0], 3)
 
 
 def test_nothing_found_leaves_the_frame_as_it_is() -> None:
-    assert (annotated(picture(5, SIZE), Glimpses()) == picture(5, SIZE)).all()
+    assert (annotate(picture(5, SIZE), Detections()) == picture(5, SIZE)).all()

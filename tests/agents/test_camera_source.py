@@ -15,8 +15,8 @@ from support.processes import eventually
 
 from cpcbl_agents.detector import Picture
 from cpcbl_agents.sources import OwnCamera
-from cpcbl_agents.sources.camera import LiveCamera, opened
-from cpcbl_agents.vision.pictures import fault, received
+from cpcbl_agents.sources.camera import LiveCamera, open_camera
+from cpcbl_agents.vision.pictures import decode_frame, pixel_fault
 from cpcbl_team.config import CameraSettings
 from cpcbl_team.errors import InputError
 from cpcbl_transport.messages import Frame
@@ -24,14 +24,14 @@ from cpcbl_transport.messages import Frame
 
 def camera(frames: object, rate_hz: float = 20.0) -> OwnCamera:
     settings = CameraSettings(frames=str(frames), width_px=64, height_px=48)
-    return opened("r1", settings, rate_hz, lambda: 0, lambda: None)
+    return open_camera("r1", settings, rate_hz, lambda: 0, lambda: None)
 
 
 def polled(source: OwnCamera, now_ns: int) -> list[tuple[int, int]]:
     """(stamp, number) of the pictures that are there now."""
     found = []
     for item in source.poll(now_ns):
-        pixels = item.pixels if isinstance(item, Picture) else received(image_of(item), SIZE)
+        pixels = item.pixels if isinstance(item, Picture) else decode_frame(image_of(item), SIZE)
         assert not isinstance(pixels, str)
         found.append((item.stamp_ns, number_of(pixels)))
     return found
@@ -108,7 +108,7 @@ def test_a_picture_that_is_gone_or_broken_is_a_frame_that_cannot_be_used(tmp_pat
     source = camera(tmp_path)
     (tmp_path / "a.png").unlink()
     frames = [item for now in (0, 50 * MS, 100 * MS) for item in source.poll(now)]
-    said = [received(image_of(frame), SIZE) for frame in frames]
+    said = [decode_frame(image_of(frame), SIZE) for frame in frames]
     assert said[:2] == ["frame_empty", "frame_undecodable"]
     assert not isinstance(said[2], str)
 
@@ -134,7 +134,7 @@ class Live:
     def __init__(self, frames: str, rate_hz: float = 1000.0) -> None:
         self.now_ns, self.woken = 0, threading.Event()
         settings = CameraSettings(frames=frames, width_px=64, height_px=48)
-        self.source = opened("r1", settings, rate_hz, self._tick, self.woken.set)
+        self.source = open_camera("r1", settings, rate_hz, self._tick, self.woken.set)
         assert isinstance(self.source, LiveCamera)
 
     def _tick(self) -> int:
@@ -168,7 +168,7 @@ def test_of_a_live_camera_the_newest_frame_is_taken_with_its_stamp() -> None:
     with streaming() as port, live(url(port)) as camera:
         wait_until(lambda: camera.source.counts["frame_skipped"] > 3)
         picture = camera.next_picture()
-        assert fault(picture.pixels, SIZE) == ""
+        assert pixel_fault(picture.pixels, SIZE) == ""
         assert picture.stamp_ns >= 40 * MS
         assert camera.next_picture().stamp_ns > picture.stamp_ns
         assert camera.source.next_ns is None
@@ -208,7 +208,7 @@ def test_a_camera_that_was_never_there_is_lost_once(caplog: pytest.LogCaptureFix
             assert not camera.woken.wait(0.6)
             assert +camera.source.counts == {"camera_lost": 1}
             assert not camera.source.poll(0)
-    (said,) = (r.message for r in caplog.records if "gives no frames" in r.message)
+    (said,) = (r.message for r in caplog.records if "delivers no frames" in r.message)
     assert where in said
     assert "secret" not in said
 

@@ -7,8 +7,8 @@ from support.cameras import SIZE, jpeg, number_of, picture
 
 from cpcbl_agents.vision import annotate, detector
 from cpcbl_agents.vision.camera import Pixels
-from cpcbl_agents.vision.detections import Glimpses
-from cpcbl_agents.vision.pictures import received
+from cpcbl_agents.vision.detections import Detections
+from cpcbl_agents.vision.pictures import decode_frame
 from cpcbl_team.config import CameraSettings, Team
 from cpcbl_transport import topics
 from cpcbl_transport.decoding import decode
@@ -40,10 +40,12 @@ def test_frames_are_shown_twice_a_second_with_what_was_seen() -> None:
     stand = TeamOnBus(seeing())
     ear = stand.ear(KEY)
     watches(stand, 2.0)
-    shown = looks(ear)
-    assert [look.stamp_ns // MS for look in shown] == [100, 600, 1100, 1600]
-    assert {(look.robot, look.found, look.unclear) for look in shown} == {("me", (), ())}
-    pixels = received(shown[0].image, SIZE)
+    detect_and_annotate = looks(ear)
+    assert [look.stamp_ns // MS for look in detect_and_annotate] == [100, 600, 1100, 1600]
+    assert {(look.robot, look.found, look.unclear) for look in detect_and_annotate} == {
+        ("me", (), ())
+    }
+    pixels = decode_frame(detect_and_annotate[0].image, SIZE)
     assert not isinstance(pixels, str)
     assert number_of(pixels) == 4
     counts = stand.robots["me"].counts
@@ -53,11 +55,11 @@ def test_frames_are_shown_twice_a_second_with_what_was_seen() -> None:
 def test_no_frame_is_annotated_without_a_subscriber(monkeypatch: pytest.MonkeyPatch) -> None:
     drawn: list[Pixels] = []
 
-    def annotated(pixels: Pixels, glimpses: Glimpses) -> Pixels:
-        drawn.append(annotate.annotated(pixels, glimpses))
+    def annotated(pixels: Pixels, detections: Detections) -> Pixels:
+        drawn.append(annotate.annotate(pixels, detections))
         return drawn[-1]
 
-    monkeypatch.setattr(detector, "annotated", annotated)
+    monkeypatch.setattr(detector, "annotate", annotated)
     stand = TeamOnBus(seeing())
     watches(stand, 1.0)
     assert not drawn
@@ -79,7 +81,7 @@ def test_a_frame_that_cannot_be_used_is_shown_with_its_reason() -> None:
     assert (undecodable.image, undecodable.unclear) == (b"", (UnclearObject("frame_undecodable"),))
     assert (wrong.image, wrong.unclear) == (b"", (UnclearObject("frame_wrong_size"),))
     assert black.unclear == (UnclearObject("frame_black"),)
-    assert not isinstance(received(black.image, SIZE), str)
+    assert not isinstance(decode_frame(black.image, SIZE), str)
 
 
 def test_who_looks_changes_nothing_else() -> None:

@@ -12,7 +12,14 @@ from hypothesis import strategies as st
 from support.buses import examples
 from support.cameras import SIZE, jpeg, number_of, picture, png
 
-from cpcbl_agents.vision.pictures import Header, decoded, encoded, fault, header_of, received
+from cpcbl_agents.vision.pictures import (
+    Header,
+    decode_frame,
+    decode_image,
+    encode_jpeg,
+    pixel_fault,
+    read_header,
+)
 
 GOOD = picture(7)
 GREY = cv2.cvtColor(GOOD, cv2.COLOR_BGR2GRAY).astype(np.uint8)
@@ -78,33 +85,33 @@ BAD: dict[str, tuple[str, bytes]] = {
 
 @pytest.mark.parametrize("data", [JPEG, PNG, JPEG + bytes(50)], ids=["JPEG", "PNG", "padded"])
 def test_a_good_picture_is_decoded(data: bytes) -> None:
-    pixels = received(data, SIZE)
+    pixels = decode_frame(data, SIZE)
     assert not isinstance(pixels, str)
     assert pixels.shape == GOOD.shape
     assert number_of(pixels) == 7
-    assert fault(pixels, SIZE) == ""
+    assert pixel_fault(pixels, SIZE) == ""
 
 
 @pytest.mark.parametrize("pixels", [GREY, CLEAR, LEVELS_16], ids=["grey", "clear", "16 bit"])
 def test_a_file_that_a_person_names_may_be_of_any_kind(pixels: Any) -> None:
-    made = decoded(png(pixels))
+    made = decode_image(png(pixels))
     assert not isinstance(made, str)
     assert made.shape == GOOD.shape
     assert made.dtype == np.uint8
-    assert decoded(b"") == "frame_empty"
-    assert decoded(b"no picture") == "frame_undecodable"
+    assert decode_image(b"") == "frame_empty"
+    assert decode_image(b"no picture") == "frame_undecodable"
 
 
 @pytest.mark.parametrize("what", BAD)
 def test_what_cannot_be_used_is_refused_by_its_reason(what: str) -> None:
     reason, data = BAD[what]
-    assert received(data, SIZE) == reason
+    assert decode_frame(data, SIZE) == reason
 
 
 @pytest.mark.parametrize("data", [JPEG, PNG], ids=["JPEG", "PNG"])
 def test_a_picture_that_ends_anywhere_too_soon_is_refused(data: bytes) -> None:
     for length in range(len(data)):
-        assert isinstance(received(data[:length], SIZE), str), length
+        assert isinstance(decode_frame(data[:length], SIZE), str), length
 
 
 @pytest.mark.parametrize("progressive", [0, 1])
@@ -113,14 +120,14 @@ def test_headers_of_whole_pictures(progressive: int) -> None:
     data = cv2.imencode(".jpg", GOOD, options)[1].tobytes()
     comment = b"\xff\xfe" + struct.pack(">H", 5) + b"\xff\xc0\xff"  # looks like a header inside
     for image in (data, data[:2] + comment + data[2:], data[:2] + b"\xff\xff" + data[2:]):
-        assert header_of(image) == Header(*SIZE, 3, 8)
-    assert header_of(png(LEVELS_16)) == Header(*SIZE, 3, 16)
+        assert read_header(image) == Header(*SIZE, 3, 8)
+    assert read_header(png(LEVELS_16)) == Header(*SIZE, 3, 16)
 
 
 @examples(300)
 @given(st.binary(max_size=200), st.sampled_from([b"", JPEG[:20], PNG[:20], b"\xff\xd8\xff"]))
 def test_nothing_raises(noise: bytes, head: bytes) -> None:
-    assert isinstance(received(head + noise, SIZE), str)
+    assert isinstance(decode_frame(head + noise, SIZE), str)
 
 
 def plain(*levels: float) -> "np.typing.NDArray[np.uint8]":
@@ -145,11 +152,11 @@ def plain(*levels: float) -> "np.typing.NDArray[np.uint8]":
     ],
 )
 def test_pixels_that_show_nothing_are_refused(reason: str, pixels: Any) -> None:
-    assert fault(pixels, SIZE) == reason
+    assert pixel_fault(pixels, SIZE) == reason
 
 
 def test_a_picture_for_people_is_a_jpeg_of_moderate_size() -> None:
-    small = received(encoded(GOOD), SIZE)
+    small = decode_frame(encode_jpeg(GOOD), SIZE)
     assert not isinstance(small, str)
     assert number_of(small) == 7
-    assert header_of(encoded(picture(7, (2560, 1000)))) == Header(1280, 500, 3, 8)
+    assert read_header(encode_jpeg(picture(7, (2560, 1000)))) == Header(1280, 500, 3, 8)

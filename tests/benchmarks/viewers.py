@@ -8,9 +8,9 @@ from benchmarks.frames import TEAM, VIEWER
 
 from cpcbl_agents.vision.camera import Camera, Pixels
 from cpcbl_agents.vision.codes import DICTIONARIES
-from cpcbl_agents.vision.cylinders import Cylinders
-from cpcbl_agents.vision.detector import CameraEyes
-from cpcbl_agents.vision.markers import Markers
+from cpcbl_agents.vision.cylinders import CylinderDetector
+from cpcbl_agents.vision.detector import CameraDetector
+from cpcbl_agents.vision.markers import MarkerDetector
 
 YARDSTICK = "OpenCV's marker detection"
 EYES = "eyes"
@@ -21,9 +21,9 @@ def _viewers() -> dict[str, Viewer]:
     camera = Camera(TEAM.robots[VIEWER].camera)
     dictionary = cv2.aruco.getPredefinedDictionary(DICTIONARIES[TEAM.vision.family])
     return {
-        EYES: CameraEyes(VIEWER, TEAM).glimpses,
-        "of these, markers": Markers(VIEWER, TEAM, camera).glimpses,
-        "of these, cylinders": Cylinders(VIEWER, TEAM, camera).glimpses,
+        EYES: CameraDetector(VIEWER, TEAM).detections,
+        "of these, markers": MarkerDetector(VIEWER, TEAM, camera).detections,
+        "of these, cylinders": CylinderDetector(VIEWER, TEAM, camera).detections,
         YARDSTICK: cv2.aruco.ArucoDetector(dictionary).detectMarkers,
     }
 

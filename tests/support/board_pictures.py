@@ -32,7 +32,7 @@ def board_pictures(
         size = random.uniform(0.45, 0.8)  # of the picture's width
         away = width * settings.fx_px / (size * settings.width_px)
         spot = random.uniform(0.25, 0.75, 2) * (settings.width_px, settings.height_px)
-        middle = Camera(settings).undistorted(spot[None])[0]
+        middle = Camera(settings).undistort(spot[None])[0]
         tilt = np.radians(random.uniform(-40, 40, 2))
         turn = cv2.Rodrigues(np.array([*tilt, random.uniform(-0.5, 0.5)]))[0].astype(float)
         centre = np.array([*middle, 1.0]) * away - turn @ np.array([width / 2, height / 2, 0.0])

@@ -7,10 +7,10 @@ import msgspec
 import numpy as np
 
 from cpcbl_agents.vision.camera import Camera, Pixels
-from cpcbl_agents.vision.cylinders import Cylinders
-from cpcbl_agents.vision.detections import Glimpses
-from cpcbl_launch.simulation.camera.render import Light, Scene, Standing, render
-from cpcbl_launch.simulation.camera.scene import Post, banded
+from cpcbl_agents.vision.cylinders import CylinderDetector
+from cpcbl_agents.vision.detections import Detections
+from cpcbl_launch.simulation.camera.render import Light, Scene, SceneRobot, render
+from cpcbl_launch.simulation.camera.scene import SceneCylinder, banded_cylinder
 from cpcbl_team.config import (
     Bands,
     CameraSettings,
@@ -51,9 +51,9 @@ def team_of(
 def picture(
     team: Team,
     pose: Pose2 = HERE,
-    robots: Sequence[Standing] = (),
+    robots: Sequence[SceneRobot] = (),
     light: Light = CLEAN,
-    clutter: Sequence[Post] = (),
+    clutter: Sequence[SceneCylinder] = (),
     seed: int = 0,
 ) -> Pixels:
     """What the first robot of a team sees from there."""
@@ -62,12 +62,12 @@ def picture(
     return render(scene, camera, pose, robots, light, np.random.default_rng(seed))
 
 
-def post(team: Team, x: float, y: float, colours: Bands) -> Post:
+def post(team: Team, x: float, y: float, colours: Bands) -> SceneCylinder:
     """A cylinder like a landmark that is on no map."""
-    return banded(team.vision, colours, team.vision.landmark).at(x, y)
+    return banded_cylinder(team.vision, colours, team.vision.landmark).at(x, y)
 
 
-def mirrored(real: Post, share: float = 0.6) -> Post:
+def mirrored(real: SceneCylinder, share: float = 0.6) -> SceneCylinder:
     """Its image in a glossy floor, upside down beneath it and darker."""
     bands = (
         band._replace(
@@ -80,10 +80,10 @@ def mirrored(real: Post, share: float = 0.6) -> Post:
     return real._replace(bands=tuple(bands))
 
 
-def glimpsed(team: Team, pixels: Pixels) -> Glimpses:
+def detections_in(team: Team, pixels: Pixels) -> Detections:
     """What the first robot of a team finds in a picture."""
     name, settings = next(iter(team.robots.items()))
-    return Cylinders(name, team, Camera(settings.camera)).glimpses(pixels)
+    return CylinderDetector(name, team, Camera(settings.camera)).detections(pixels)
 
 
 def polar(pose: Pose2, x: float, y: float) -> tuple[float, float]:

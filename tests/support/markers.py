@@ -8,10 +8,10 @@ from typing import NamedTuple
 import numpy as np
 
 from cpcbl_agents.vision.camera import Camera, Floats, Pixels
-from cpcbl_agents.vision.detections import Glimpses
-from cpcbl_agents.vision.markers import Markers
+from cpcbl_agents.vision.detections import Detections
+from cpcbl_agents.vision.markers import MarkerDetector
 from cpcbl_agents.vision.poses import side_corners
-from cpcbl_launch.simulation.camera.render import Light, Scene, Standing, render
+from cpcbl_launch.simulation.camera.render import Light, Scene, SceneRobot, render
 from cpcbl_team.config import (
     CameraSettings,
     MarkerFamily,
@@ -42,16 +42,16 @@ def team(
     return Team(name="t", robots={"me": RobotSettings(), **robots}, vision=vision)
 
 
-def standing(name: str, range_m: float, bearing_deg: float, heading_deg: float) -> Standing:
+def standing(name: str, range_m: float, bearing_deg: float, heading_deg: float) -> SceneRobot:
     """A teammate, placed and turned as the viewer at the origin sees it."""
     bearing = math.radians(bearing_deg)
     x, y = range_m * math.cos(bearing), range_m * math.sin(bearing)
-    return Standing(name, x, y, math.radians(heading_deg))
+    return SceneRobot(name, x, y, math.radians(heading_deg))
 
 
 def picture(
     team: Team,
-    robots: Sequence[Standing],
+    robots: Sequence[SceneRobot],
     settings: CameraSettings | None = None,
     light: Light | None = None,
     seed: int = 1,
@@ -61,9 +61,9 @@ def picture(
     return render(Scene.of(team), camera, ORIGIN, robots, light or Light(), random)
 
 
-def looked(team: Team, pixels: Pixels, settings: CameraSettings | None = None) -> Glimpses:
+def looked(team: Team, pixels: Pixels, settings: CameraSettings | None = None) -> Detections:
     """What `me` makes of a frame."""
-    return Markers("me", team, Camera(settings or CameraSettings())).glimpses(pixels)
+    return MarkerDetector("me", team, Camera(settings or CameraSettings())).detections(pixels)
 
 
 def seen_at(robot: Pose2, side: Side, vision: VisionSettings) -> Floats:
@@ -82,7 +82,7 @@ class Off(NamedTuple):
     sigmas: tuple[float, ...]
 
 
-def off(seen: Sighting, robot: Standing) -> Off:
+def off(seen: Sighting, robot: SceneRobot) -> Off:
     """How far off a sighting by the viewer at the origin is."""
     range_m = math.hypot(robot.x_m, robot.y_m)
     assert seen.range_m is not None

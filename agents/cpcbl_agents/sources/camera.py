@@ -1,9 +1,9 @@
-"""A robot's own camera: a device or a URL as it comes, a video or a folder of pictures at its rate.
+"""A robot's own camera: a live device or URL, or a video or folder of pictures played at its rate.
 
-A live camera is read by a thread, as fast as it gives frames, so that none is old when it is looked
-at; the robot gets the newest, `sensor.rate_hz` times a second at most. A camera that is silent, or
-not there, is opened again and again; the robot goes on without it. A video or a folder is played
-once, in robot time from the start on. Raises DependencyError where OpenCV is not installed.
+A thread reads a live camera as fast as it delivers frames, so that the robot gets the newest frame,
+at most `sensor.rate_hz` times a second. A camera that is missing or delivers nothing is reopened
+repeatedly, and the robot continues without it. A video or a folder is played once in robot time.
+Raises DependencyError if OpenCV is not installed.
 """
 
 import logging
@@ -32,19 +32,19 @@ from cpcbl_transport.messages import Frame
 log = logging.getLogger(__name__)
 
 SUFFIXES = frozenset({".png", ".jpg", ".jpeg"})
-TIMEOUT_S = 1  # of a camera that does not answer
+TIMEOUT_S = 1  # for a camera that does not answer
 PATIENCE_S = 1.8  # for the thread at the end: a process that ends while OpenCV waits is aborted
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.25, 4.0
 EARLY = 0.8  # of the time between two frames: rates of cameras are not exact
-COUNTED = ("camera_lost", "camera_back", "frame_skipped")
-NOTHING: Pixels = np.empty((0, 0, 3), np.uint8)
+COUNTS = ("camera_lost", "camera_back", "frame_skipped")
+NO_PIXELS: Pixels = np.empty((0, 0, 3), np.uint8)
 
-os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # what is wrong is said here, once
+os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # this module logs errors once
 os.environ.setdefault("OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT", str(TIMEOUT_S))
 cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)
 
 
-def opened(
+def open_camera(
     robot: str,
     settings: CameraSettings,
     rate_hz: float,
@@ -60,7 +60,9 @@ def opened(
     path, key = Path(settings.frames), f"robots.{robot}.camera.frames"
     if not path.exists():
         raise InputError(f"{key}: {path}: no such file or folder; correct it, or empty it")
-    return Played(Folder(path, key, rate_hz) if path.is_dir() else Video(path, key, rate_hz))
+    return RecordedCamera(
+        FolderFrames(path, key, rate_hz) if path.is_dir() else VideoFrames(path, key, rate_hz)
+    )
 
 
 class LiveCamera:
@@ -81,7 +83,7 @@ class LiveCamera:
         self._pause_ns, self._latest_ns = EARLY * 1e9 / rate_hz, -math.inf
         self._newest: deque[Picture] = deque(maxlen=1)
         self._lost = False
-        self.counts: Counter[str] = Counter(dict.fromkeys(COUNTED, 0))  # the thread adds no entry
+        self.counts: Counter[str] = Counter(dict.fromkeys(COUNTS, 0))  # the thread adds no entry
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="camera", daemon=True)
         self._thread.start()
@@ -105,15 +107,15 @@ class LiveCamera:
             if not self._lost and not self._stop.is_set():
                 self._lost = True
                 self.counts["camera_lost"] += 1
-                log.warning("camera %s gives no frames; it is tried again", self._name)
+                log.warning("camera %s delivers no frames; it will be reopened", self._name)
             self._stop.wait(pause_s)
             pause_s = min(2.0 * pause_s, LONGEST_PAUSE_S)
 
     def _read(self) -> bool:
-        """Opens the camera and takes its frames until there are no more; whether there were any."""
+        """Opens the camera and reads its frames until there are no more; true if there were any."""
         any_came = False
         with suppress(cv2.error):  # a stream that cannot be decoded: as if it had ended
-            capture = _opened(self._settings)
+            capture = _open_capture(self._settings)
             while capture is not None and not self._stop.is_set() and capture.grab():
                 self._take(capture, self._now_ns())
                 any_came = True
@@ -127,16 +129,16 @@ class LiveCamera:
         if 0 <= stamp_ns - self._latest_ns < self._pause_ns:
             return
         self._latest_ns = stamp_ns
-        picture = Picture(stamp_ns, _retrieved(capture))
+        picture = Picture(stamp_ns, _retrieve(capture))
         if self._newest:
             self.counts["frame_skipped"] += 1
         self._newest.append(picture)
         self._wake()
 
 
-def _opened(settings: CameraSettings) -> "cv2.VideoCapture | None":
-    """Perhaps in vain: then it gives no frames. None where the name of a URL's machine is unknown,
-    which OpenCV would wait for without a bound."""
+def _open_capture(settings: CameraSettings) -> "cv2.VideoCapture | None":
+    """The capture of a camera, which delivers no frames if opening failed. None if the host name of
+    a URL is unknown, because OpenCV would wait for it without a bound."""
     where = settings.frames
     if "://" in where:
         try:
@@ -154,28 +156,28 @@ def _opened(settings: CameraSettings) -> "cv2.VideoCapture | None":
     return device
 
 
-def _retrieved(capture: "cv2.VideoCapture") -> Pixels:
+def _retrieve(capture: "cv2.VideoCapture") -> Pixels:
     done, pixels = capture.retrieve()
-    return pixels.astype(np.uint8, copy=False) if done else NOTHING
+    return pixels.astype(np.uint8, copy=False) if done else NO_PIXELS
 
 
-class Film(Protocol):
-    """Frames one after the other."""
+class FrameSequence(Protocol):
+    """A sequence of frames."""
 
     rate_hz: float
 
     def skip(self) -> bool:
-        """Leaves one out; whether there was one."""
+        """Skips one frame; true if there was one."""
 
     def take(self, stamp_ns: int) -> Frame | Picture | None:
         """The next one; None after the end."""
 
 
-class Played:
-    """A film in robot time, from the first poll on. A robot that is slow sees less, not late."""
+class RecordedCamera:
+    """Frames played in robot time from the first poll on. A slow robot skips frames."""
 
-    def __init__(self, film: Film) -> None:
-        self._film, self._count, self.is_finished = film, 0, False
+    def __init__(self, frames: FrameSequence) -> None:
+        self._frames, self._count, self.is_finished = frames, 0, False
         self._from_ns: int | None = None
         self.counts: Counter[str] = Counter()
 
@@ -185,18 +187,18 @@ class Played:
 
     def _stamp_ns(self, count: int) -> int:
         assert self._from_ns is not None
-        return self._from_ns + round(count * 1e9 / self._film.rate_hz)
+        return self._from_ns + round(count * 1e9 / self._frames.rate_hz)
 
     def poll(self, now_ns: int) -> Sequence[Frame | Picture]:
         if self._from_ns is None:
             self._from_ns = now_ns
         while not self.is_finished and self._stamp_ns(self._count + 1) <= now_ns:
-            self.is_finished = not self._film.skip()
+            self.is_finished = not self._frames.skip()
             self._count += 1
             self.counts["frame_skipped"] += not self.is_finished
         if self.is_finished or self._stamp_ns(self._count) > now_ns:
             return ()
-        frame = self._film.take(self._stamp_ns(self._count))
+        frame = self._frames.take(self._stamp_ns(self._count))
         self._count += 1
         if frame is None:
             self.is_finished = True
@@ -208,8 +210,8 @@ class Played:
         self.is_finished = True
 
 
-class Video:
-    """A video file. Of one that has more frames a second than the sensor, every so many count."""
+class VideoFrames:
+    """A video file. If its frame rate exceeds the sensor's, only every n-th frame is used."""
 
     def __init__(self, path: Path, key: str, rate_hz: float) -> None:
         self._capture = cv2.VideoCapture(str(path))
@@ -229,18 +231,18 @@ class Video:
     def take(self, stamp_ns: int) -> Picture | None:
         if not self._capture.grab():
             return None
-        picture = Picture(stamp_ns, _retrieved(self._capture))
+        picture = Picture(stamp_ns, _retrieve(self._capture))
         for _ in range(self._every - 1):
             self._capture.grab()
         return picture
 
 
-class Folder:
+class FolderFrames:
     """The JPEG and PNG files of a folder, in the order of their names."""
 
     def __init__(self, path: Path, key: str, rate_hz: float) -> None:
         self.rate_hz = rate_hz
-        self._paths = deque(pictures_in(path))
+        self._paths = deque(picture_paths(path))
         if not self._paths:
             raise InputError(f"{key}: {path}: no pictures (.png, .jpg) in it; name another folder")
 
@@ -258,6 +260,6 @@ class Folder:
             return Frame(stamp_ns, b"")
 
 
-def pictures_in(folder: Path) -> list[Path]:
+def picture_paths(folder: Path) -> list[Path]:
     """The JPEG and PNG files of a folder, by name."""
     return sorted(p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES and p.is_file())

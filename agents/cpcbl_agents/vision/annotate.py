@@ -1,4 +1,4 @@
-"""Draws into a frame what was found in it, and what was not reported, with the reason."""
+"""Draws detections into a frame, and rejected objects with the reason."""
 
 import math
 from collections.abc import Sequence
@@ -8,17 +8,17 @@ import cv2
 import numpy as np
 
 from cpcbl_agents.vision.camera import Floats, Pixels
-from cpcbl_agents.vision.detections import Doubt, Glimpses
+from cpcbl_agents.vision.detections import Ambiguity, Detections
 from cpcbl_team.inputs import Sighting
 
 Colour = tuple[int, int, int]
 
-FOUND: Colour = (80, 255, 80)  # BGR
-DOUBTED: Colour = (60, 160, 255)
-PAPER: Colour = (32, 32, 32)
+DETECTED_BGR: Colour = (80, 255, 80)  # BGR
+AMBIGUOUS_BGR: Colour = (60, 160, 255)
+BACKGROUND_BGR: Colour = (32, 32, 32)
 FONT, TEXT_SCALE, LINE_PX, BASELINE_PX = cv2.FONT_HERSHEY_SIMPLEX, 0.42, 15, 4
-PLAIN_WIDTH_PX = 640  # at which text has that size
-FARTHEST_PX = 10_000.0  # outlines may reach far beyond the picture
+REFERENCE_WIDTH_PX = 640  # at which text has that size
+MAX_COORDINATE_PX = 10_000.0  # outlines may reach far beyond the picture
 
 
 class Box(NamedTuple):
@@ -29,45 +29,47 @@ class Box(NamedTuple):
     right: int
     bottom: int
 
-    def meets(self, other: "Box") -> bool:
+    def overlaps(self, other: "Box") -> bool:
         apart_x = self.right <= other.left or other.right <= self.left
         return not (apart_x or self.bottom <= other.top or other.bottom <= self.top)
 
 
 class Label(NamedTuple):
-    """What is written about something in a frame, and where."""
+    """The text of a label, and its place in the frame."""
 
     lines: tuple[str, ...]
     colour: Colour
     box: Box
 
 
-def annotated(pixels: Pixels, glimpses: Glimpses) -> Pixels:
+def annotate(pixels: Pixels, detections: Detections) -> Pixels:
     """A copy of a frame (height, width, 3) with outlines and labels."""
     drawn, scale = pixels.copy(), _scale(pixels.shape[1])
-    for found in glimpses.found:
-        _outline(drawn, found.outline, FOUND, scale)
-    for doubt in glimpses.doubts:
-        _outline(drawn, doubt.outline, DOUBTED, scale)
-    for label in labels(glimpses, (pixels.shape[1], pixels.shape[0])):
-        _write(drawn, label, scale)
+    for found in detections.found:
+        _draw_outline(drawn, found.outline, DETECTED_BGR, scale)
+    for ambiguity in detections.ambiguities:
+        _draw_outline(drawn, ambiguity.outline, AMBIGUOUS_BGR, scale)
+    for label in place_labels(detections, (pixels.shape[1], pixels.shape[0])):
+        _draw_label(drawn, label, scale)
     return drawn
 
 
-def labels(glimpses: Glimpses, size_px: tuple[int, int]) -> list[Label]:
-    """Beside what they are about, inside of a frame of this size (width, height), apart from each
-    other as long as there is room."""
-    said = [(f.outline, labelled(f.sighting), FOUND) for f in glimpses.found]
-    said += [(d.outline, doubted(d), DOUBTED) for d in glimpses.doubts]
+def place_labels(detections: Detections, size_px: tuple[int, int]) -> list[Label]:
+    """The labels beside their outlines, inside a frame of this size (width, height).
+
+    They do not overlap as long as there is room.
+    """
+    said = [(f.outline, sighting_lines(f.sighting), DETECTED_BGR) for f in detections.found]
+    said += [(d.outline, ambiguity_lines(d), AMBIGUOUS_BGR) for d in detections.ambiguities]
     placed: list[Label] = []
     for outline, lines, colour in said:
-        box = _place(size_px, outline, lines, [label.box for label in placed])
+        box = _label_box(size_px, outline, lines, [label.box for label in placed])
         placed.append(Label(tuple(lines), colour, box))
     return placed
 
 
-def labelled(sighting: Sighting) -> list[str]:
-    """What a sighting says, in ASCII as OpenCV's fonts are: its id, then a number a line."""
+def sighting_lines(sighting: Sighting) -> list[str]:
+    """The lines of a label in ASCII, as OpenCV's fonts require: the id, then one value a line."""
     lines = [sighting.id]
     s = sighting
     if s.range_m is not None:
@@ -79,10 +81,10 @@ def labelled(sighting: Sighting) -> list[str]:
     return lines
 
 
-def doubted(doubt: Doubt) -> list[str]:
-    """Why something is not reported, and what it could be."""
-    names = [" or ".join(doubt.names)] if doubt.names else []
-    return [doubt.reason, *names]
+def ambiguity_lines(ambiguity: Ambiguity) -> list[str]:
+    """The lines of a label: the reason of the rejection, and the objects that it could be."""
+    names = [" or ".join(ambiguity.names)] if ambiguity.names else []
+    return [ambiguity.reason, *names]
 
 
 def _degrees(angle: float, sigma: float | None) -> str:
@@ -93,24 +95,24 @@ def _spread(sigma: float | None, digits: int) -> str:
     return "" if sigma is None else f" +-{sigma:.{digits}f}"
 
 
-def _outline(drawn: Pixels, outline: Floats, colour: Colour, scale: float) -> None:
+def _draw_outline(drawn: Pixels, outline: Floats, colour: Colour, scale: float) -> None:
     corners = _corners(outline)
     if len(corners):
         thick = round(scale)
-        cv2.polylines(drawn, [corners], True, PAPER, 3 * thick, cv2.LINE_AA)
+        cv2.polylines(drawn, [corners], True, BACKGROUND_BGR, 3 * thick, cv2.LINE_AA)
         cv2.polylines(drawn, [corners], True, colour, thick, cv2.LINE_AA)
 
 
 def _corners(outline: Floats) -> "np.typing.NDArray[np.int32]":
-    """Whole pixels (n, 2), without corners that are nowhere."""
+    """Whole pixels (n, 2), without corners that are not finite."""
     there = outline[np.isfinite(outline).all(axis=1)]
-    return np.clip(there, -FARTHEST_PX, FARTHEST_PX).round().astype(np.int32)
+    return np.clip(there, -MAX_COORDINATE_PX, MAX_COORDINATE_PX).round().astype(np.int32)
 
 
-def _place(
+def _label_box(
     size_px: tuple[int, int], outline: Floats, lines: Sequence[str], taken: Sequence[Box]
 ) -> Box:
-    """Right of its outline or left of it, as high as it, or as near to that as there is room."""
+    """The box of a label: right or left of its outline, as near to its height as there is room."""
     (width, height), scale = size_px, _scale(size_px[0])
     sizes = [cv2.getTextSize(text, FONT, TEXT_SCALE * scale, 1)[0][0] for text in lines]
     wide, high = max(sizes) + round(6 * scale), round((LINE_PX * len(lines) + 4) * scale)
@@ -122,20 +124,20 @@ def _place(
     top = min(max(int(least[1]), 0), max(height - high, 0))
     tops = sorted({top, *range(0, height - high + 1, LINE_PX)}, key=lambda y: abs(y - top))
     places = [Box(left, y, left + wide, y + high) for y in tops for left in lefts]
-    free = (place for place in places if not any(place.meets(other) for other in taken))
+    free = (place for place in places if not any(place.overlaps(other) for other in taken))
     return next(free, places[0])
 
 
-def _write(drawn: Pixels, label: Label, scale: float) -> None:
-    """On dark paper, so that it can be read on anything."""
+def _draw_label(drawn: Pixels, label: Label, scale: float) -> None:
+    """Draws a label on a dark background, which makes it readable on anything."""
     box = label.box
     part = drawn[box.top : box.bottom, box.left : box.right]
-    part[:] = part // 4 + np.array(PAPER, np.uint8) // 2
+    part[:] = part // 4 + np.array(BACKGROUND_BGR, np.uint8) // 2
     for n, text in enumerate(label.lines, start=1):
         at = box.left + round(3 * scale), box.top + round((LINE_PX * n - BASELINE_PX + 2) * scale)
         cv2.putText(drawn, text, at, FONT, TEXT_SCALE * scale, label.colour, 1, cv2.LINE_AA)
 
 
 def _scale(width_px: int) -> float:
-    """Of text and lines in a picture of this width."""
-    return max(1.0, width_px / PLAIN_WIDTH_PX)
+    """The scale of text and lines in a picture of this width."""
+    return max(1.0, width_px / REFERENCE_WIDTH_PX)

@@ -38,12 +38,12 @@ class Camera:
         self.position = np.array([s.x_m, s.y_m, s.mounted_m])
         """Of the lens in the robot's frame (m)."""
 
-    def in_camera(self, points: Floats) -> Floats:
+    def to_camera_frame(self, points: Floats) -> Floats:
         """Points (n, 3) of the robot's frame in the camera's (m)."""
         moved: Floats = (points - self.position) @ self.robot_from_camera
         return moved
 
-    def in_robot(self, points: Floats) -> Floats:
+    def to_robot_frame(self, points: Floats) -> Floats:
         """Points (n, 3) of the camera's frame in the robot's (m)."""
         moved: Floats = points @ self.robot_from_camera.T + self.position
         return moved
@@ -53,7 +53,7 @@ class Camera:
 
         Pixels may lie outside of the picture.
         """
-        seen = self.in_camera(np.asarray(points, dtype=np.float64))
+        seen = self.to_camera_frame(np.asarray(points, dtype=np.float64))
         pixels = np.full((len(seen), 2), np.nan)
         ahead = seen[:, 2] > NEAREST_M
         if ahead.any():
@@ -62,22 +62,22 @@ class Camera:
             pixels[ahead] = found.reshape(-1, 2)
         return pixels
 
-    def undistorted(self, pixels: Floats) -> Floats:
-        """Where pixels (n, 2) lie on the plane z = 1 of the camera's frame, (n, 2)."""
+    def undistort(self, pixels: Floats) -> Floats:
+        """The points (n, 2) of pixels (n, 2) on the plane z = 1 of the camera's frame."""
         points = np.asarray(pixels, dtype=np.float64).reshape(-1, 1, 2)
         plane = cv2.undistortPoints(points, self.matrix, self.distortion)
         return plane.reshape(-1, 2).astype(np.float64)
 
     def rays(self, pixels: Floats) -> Floats:
-        """The directions (n, 3) in which pixels (n, 2) look, in the robot's frame; unit vectors."""
-        plane = self.undistorted(pixels)
+        """Unit vectors (n, 3) of the rays of pixels (n, 2), in the robot's frame."""
+        plane = self.undistort(pixels)
         directions = np.column_stack([plane, np.ones(len(plane))]) @ self.robot_from_camera.T
         unit: Floats = directions / np.linalg.norm(directions, axis=1, keepdims=True)
         return unit
 
-    def on_plane(self, pixels: Floats, height_m: float = 0.0) -> Floats:
-        """Where the rays of pixels (n, 2) meet the plane at this height: (n, 2), m, in the robot's
-        frame; NaN where they never do."""
+    def intersect_plane(self, pixels: Floats, height_m: float = 0.0) -> Floats:
+        """The intersections (n, 2) of the rays of pixels (n, 2) with the plane at this height (m),
+        in the robot's frame; NaN if there is none."""
         rays = self.rays(pixels)
         with np.errstate(divide="ignore", invalid="ignore"):
             way = (height_m - self.position[2]) / rays[:, 2]

@@ -1,7 +1,7 @@
-"""What a marker says: its bits, read cell by cell between corners that are known exactly.
+"""Reads the bits of a marker cell by cell between exact corners.
 
-OpenCV finds markers' outlines but reads them between rough corners: of those 3 m away it reads
-three in four, or fewer where the picture is not sharp.
+OpenCV reads markers between rough corners: it reads only three of four markers at 3 m, and fewer in
+blurred pictures.
 """
 
 from typing import NamedTuple
@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cpcbl_agents.vision.camera import Floats, Pixels
-from cpcbl_agents.vision.edges import sampled
+from cpcbl_agents.vision.edges import sample_grey
 from cpcbl_team.config import MarkerFamily
 
 DICTIONARIES: dict[MarkerFamily, int] = {
@@ -28,14 +28,14 @@ WRONG_SHARE = 0.25  # of the bits that a family could set right: a wrong name is
 _WITHIN = np.array([[x, y] for y in (-0.15, 0.15) for x in (-0.15, 0.15)])
 
 
-class Code(NamedTuple):
+class MarkerCode(NamedTuple):
     """A marker's number, and which of the quad's corners is its upper left one."""
 
     id: int
     first: int
 
 
-class Codes:
+class MarkerReader:
     """Reads the markers of a family."""
 
     def __init__(self, family: MarkerFamily) -> None:
@@ -44,64 +44,69 @@ class Codes:
         self.cells = self._bits + 2
         """Of a marker's side, its black border too."""
         ids = range(len(self.dictionary.bytesList))
-        shown = [cv2.aruco.generateImageMarker(self.dictionary, i, self.cells) for i in ids]
-        plain = [np.where(one[1:-1, 1:-1] > 0, 1, -1) for one in shown]
-        self._signs = np.array([np.rot90(one, turn).ravel() for one in plain for turn in range(4)])
+        images = [cv2.aruco.generateImageMarker(self.dictionary, i, self.cells) for i in ids]
+        patterns = [np.where(one[1:-1, 1:-1] > 0, 1, -1) for one in images]
+        self._signs = np.array(
+            [np.rot90(one, turn).ravel() for one in patterns for turn in range(4)]
+        )
         self._most_wrong = int(WRONG_SHARE * self.dictionary.maxCorrectionBits)
-        self._places, self._rings = _places(self.cells), _rings(self.cells)
+        self._sample_points, self._ring_numbers = (
+            _sample_points(self.cells),
+            _ring_numbers(self.cells),
+        )
 
-    def read(self, grey: Pixels, quads: Floats) -> dict[int, Code]:
+    def read(self, grey: Pixels, quads: Floats) -> dict[int, MarkerCode]:
         """What the quads (m, 4, 2) show, clockwise in the picture: by index, of those that are
         markers."""
         if not len(quads):
             return {}
         levels = (
-            sampled(grey, _laid(self._places, quads))
+            sample_grey(grey, _project_to_quads(self._sample_points, quads))
             .reshape(len(quads), -1, len(_WITHIN))
             .mean(axis=2)
         )
-        margins, borders = levels[:, self._rings == 0], levels[:, self._rings == 1]
+        margins, borders = levels[:, self._ring_numbers == 0], levels[:, self._ring_numbers == 1]
         white, black = margins.mean(axis=1), borders.mean(axis=1)
         middle = 0.5 * (white + black)
         framed = (borders.max(axis=1) < middle) & (middle < margins.min(axis=1))
         framed &= white - black > LEAST_CONTRAST
-        bits = np.where(levels[:, self._rings > 1] > middle[:, None], 1, -1)
+        bits = np.where(levels[:, self._ring_numbers > 1] > middle[:, None], 1, -1)
         wrong = (self._bits**2 - bits @ self._signs.T) // 2
         best = wrong.argmin(axis=1)
         read = framed & (wrong.min(axis=1) <= self._most_wrong)
-        return {int(i): Code(int(best[i]) // 4, -int(best[i]) % 4) for i in read.nonzero()[0]}
+        return {int(i): MarkerCode(int(best[i]) // 4, -int(best[i]) % 4) for i in read.nonzero()[0]}
 
 
-def _places(cells: int) -> Floats:
-    """Where to look in a marker whose corners are (0, 0) to (1, 1), and in a ring around it."""
+def _sample_points(cells: int) -> Floats:
+    """The points to sample in a marker with corners (0, 0) to (1, 1), and in a ring around it."""
     middles = (np.arange(-1, cells + 1) + 0.5) / cells
     x, y = np.meshgrid(middles, middles)
     cell: Floats = np.stack([x, y], axis=2).reshape(-1, 1, 2) + _WITHIN / cells
     return cell.reshape(-1, 2)
 
 
-def _laid(places: Floats, quads: Floats) -> Floats:
-    """Places (n, 2) of the unit square, seen within each of the quads: (m, n, 2). (Heckbert,
+def _project_to_quads(points: Floats, quads: Floats) -> Floats:
+    """Points (n, 2) of the unit square, projected into each of the quads: (m, n, 2). (Heckbert,
     Fundamentals of texture mapping, 1989, section 2.2.3.)"""
     a, b, c, d = quads.transpose(1, 0, 2)
     right, below, bend = b - c, d - c, a - b + c - d
-    size = _crossed(right, below)
-    across, down = _crossed(bend, below) / size, _crossed(right, bend) / size
+    size = _cross(right, below)
+    across, down = _cross(bend, below) / size, _cross(right, bend) / size
     x = b - a + across[:, None] * b
     y = d - a + down[:, None] * d
-    s, t = places.T[:, None, :, None]
+    s, t = points.T[:, None, :, None]
     deep = 1.0 + across[:, None, None] * s + down[:, None, None] * t
-    laid: Floats = (s * x[:, None] + t * y[:, None] + a[:, None]) / deep
-    return laid
+    projected: Floats = (s * x[:, None] + t * y[:, None] + a[:, None]) / deep
+    return projected
 
 
-def _crossed(a: Floats, b: Floats) -> Floats:
+def _cross(a: Floats, b: Floats) -> Floats:
     crossed: Floats = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
     return crossed
 
 
-def _rings(cells: int) -> NDArray[np.int64]:
-    """Of each cell, of the ring around the marker too, how far it is from the outside."""
+def _ring_numbers(cells: int) -> NDArray[np.int64]:
+    """The distance of each cell from the outside, including the ring around the marker."""
     along = np.arange(cells + 2)
     from_side = np.minimum(along, along[::-1])
     return np.minimum(from_side[:, None], from_side).ravel()

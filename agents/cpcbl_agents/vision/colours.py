@@ -11,14 +11,14 @@ from cpcbl_agents.vision.panorama import Panorama
 from cpcbl_team.config import Colour
 
 BITS = 8  # colours that are told apart in one go
-MOST_BLOBS = 16  # of a colour; the largest
-LEAST_PX = 2  # high and wide
+MAX_BLOBS = 16  # of a colour; the largest
+MIN_PX = 2  # high and wide
 LEAST_SHARE = 0.3  # of a patch: light and shade take some beyond the thresholds
 MOST_OTHERS = 0.3  # of other colours, as a share of its own
 STRAY = 0.04  # share of an outline that may stick out
 
 
-class Blob(NamedTuple):
+class ColourBlob(NamedTuple):
     """A patch of one colour; its extent is in columns and rows of the panorama."""
 
     colour: str
@@ -38,29 +38,31 @@ class Blob(NamedTuple):
         return self.bottom - self.top
 
 
-class Colours:
-    """Finds blobs of those colours that are looked for."""
+class ColourSegmenter:
+    """Segments a frame into blobs of the colours in use."""
 
     def __init__(self, colours: dict[str, Colour], used: Iterable[str]) -> None:
         names = sorted(set(used))
         groups = [names[i : i + BITS] for i in range(0, len(names), BITS)]
-        self._groups = [(group, _table([colours[name] for name in group])) for group in groups]
-
-    def blobs(self, pixels: Pixels, panorama: Panorama) -> list[Blob]:
-        """Of a frame (height, width, 3), BGR."""
-        hsv = cv2.cvtColor(pixels, cv2.COLOR_BGR2HSV)
-        return [
-            _blob(name, outline, panorama)
-            for names, table in self._groups
-            for name, outline in _outlines(_bits(hsv, table), names)
+        self._groups = [
+            (group, _lookup_table([colours[name] for name in group])) for group in groups
         ]
 
-    def clear(self, pixels: Pixels, colour: str) -> bool:
+    def blobs(self, pixels: Pixels, panorama: Panorama) -> list[ColourBlob]:
+        """The blobs of all colours in a frame (height, width, 3), BGR."""
+        hsv = cv2.cvtColor(pixels, cv2.COLOR_BGR2HSV)
+        return [
+            _colour_blob(name, outline, panorama)
+            for names, table in self._groups
+            for name, outline in _contours(_colour_bits(hsv, table), names)
+        ]
+
+    def has_clear_colour(self, pixels: Pixels, colour: str) -> bool:
         """Whether a patch (height, width, 3), BGR, is of this colour and of no other."""
         hsv = cv2.cvtColor(pixels, cv2.COLOR_BGR2HSV)
         own = others = 0
         for names, table in self._groups:
-            bits = _bits(hsv, table)
+            bits = _colour_bits(hsv, table)
             if colour in names:
                 of_colour = bits & np.uint8(1 << names.index(colour))
                 own = cv2.countNonZero(of_colour)
@@ -69,9 +71,11 @@ class Colours:
         return own > LEAST_SHARE * hsv.shape[0] * hsv.shape[1] and others <= MOST_OTHERS * own
 
 
-def _table(colours: Sequence[Colour]) -> Pixels:
-    """For each hue, saturation and value, (256, 1, 3), the colours that it is good for, a bit each:
-    a pixel is of those whose bit all three have."""
+def _lookup_table(colours: Sequence[Colour]) -> Pixels:
+    """For each hue, saturation and value, (256, 1, 3), a bit for each colour that accepts it.
+
+    A pixel has the colours whose bit is set for all three.
+    """
     table = np.zeros((256, 1, 3), np.uint8)
     for bit, colour in enumerate(colours):
         (first, last), *others = colour.hue, colour.saturation, colour.value
@@ -82,14 +86,14 @@ def _table(colours: Sequence[Colour]) -> Pixels:
     return table
 
 
-def _bits(hsv: cv2.typing.MatLike, table: Pixels) -> Pixels:
-    """The colours that each pixel is of."""
+def _colour_bits(hsv: cv2.typing.MatLike, table: Pixels) -> Pixels:
+    """The bits of the colours of each pixel."""
     hue, saturation, value = cv2.split(cv2.LUT(hsv, table))
     both = cv2.bitwise_and(hue, saturation)
     return cv2.bitwise_and(both, value).astype(np.uint8, copy=False)
 
 
-def _outlines(bits: Pixels, names: Sequence[str]) -> Iterator[tuple[str, cv2.typing.MatLike]]:
+def _contours(bits: Pixels, names: Sequence[str]) -> Iterator[tuple[str, cv2.typing.MatLike]]:
     """The outer contours of each colour's blobs, the largest of them."""
     left, top, width, height = cv2.boundingRect(bits)
     if not width:
@@ -100,19 +104,19 @@ def _outlines(bits: Pixels, names: Sequence[str]) -> Iterator[tuple[str, cv2.typ
         found, _ = cv2.findContours(
             mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE, offset=(left, top)
         )
-        long = [outline for outline in found if len(outline) >= 2 * LEAST_PX]
-        if len(long) > MOST_BLOBS:
-            long = sorted(long, key=len)[-MOST_BLOBS:]
-        yield from ((name, o) for o in long if min(cv2.boundingRect(o)[2:]) >= LEAST_PX)
+        long = [outline for outline in found if len(outline) >= 2 * MIN_PX]
+        if len(long) > MAX_BLOBS:
+            long = sorted(long, key=len)[-MAX_BLOBS:]
+        yield from ((name, o) for o in long if min(cv2.boundingRect(o)[2:]) >= MIN_PX)
 
 
-def _blob(colour: str, outline: cv2.typing.MatLike, panorama: Panorama) -> Blob:
+def _colour_blob(colour: str, outline: cv2.typing.MatLike, panorama: Panorama) -> ColourBlob:
     x, y = outline[:, 0, 0], outline[:, 0, 1]
     columns, rows = np.sort(panorama.columns[y, x]), np.sort(panorama.rows[y, x])
     stray = int(STRAY * len(x))
     left, top, width, height = cv2.boundingRect(outline)
     right, bottom = left + width - 1, top + height - 1
-    return Blob(
+    return ColourBlob(
         colour,
         float(columns[stray]) - 0.5,
         float(rows[stray]) - 0.5,

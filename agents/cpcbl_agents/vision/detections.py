@@ -1,4 +1,4 @@
-"""What is found in a frame: sightings with their outlines, and what is not clear, with a reason."""
+"""Detections in a frame: sightings with their outlines, and rejected objects with a reason."""
 
 from typing import NamedTuple
 
@@ -6,26 +6,26 @@ from cpcbl_agents.vision.camera import Floats
 from cpcbl_team.inputs import Sighting
 
 
-class Found(NamedTuple):
+class Detection(NamedTuple):
     """A sighting, and its outline in the frame: (n, 2) pixels."""
 
     sighting: Sighting
     outline: Floats
 
 
-class Doubt(NamedTuple):
-    """Something that is not reported, and why; `names`: what it could be."""
+class Ambiguity(NamedTuple):
+    """An object that is not reported, with the reason; `names`: the objects that it could be."""
 
     reason: str
     names: tuple[str, ...]
     outline: Floats
 
 
-class Glimpses(NamedTuple):
-    """All that one frame shows."""
+class Detections(NamedTuple):
+    """All detections and rejected objects of one frame."""
 
-    found: tuple[Found, ...] = ()
-    doubts: tuple[Doubt, ...] = ()
+    found: tuple[Detection, ...] = ()
+    ambiguities: tuple[Ambiguity, ...] = ()
 
-    def __or__(self, other: "Glimpses") -> "Glimpses":
-        return Glimpses(self.found + other.found, self.doubts + other.doubts)
+    def __or__(self, other: "Detections") -> "Detections":
+        return Detections(self.found + other.found, self.ambiguities + other.ambiguities)

@@ -1,22 +1,24 @@
-"""What is found at one place by two names, or by one name at two places, cannot be so."""
+"""Rejects one name at two places, and two names at one place."""
 
 from collections import defaultdict
 from collections.abc import Sequence
 
-from cpcbl_agents.vision.detections import Doubt, Found, Glimpses
+from cpcbl_agents.vision.detections import Ambiguity, Detection, Detections
 
 SAME_PLACE = 0.5  # share of the larger outline's box that is in the other's too
 
 
-def without_twins(glimpses: Glimpses) -> Glimpses:
-    """The same, with a doubt in place of what cannot be so; what is found twice at one place is
-    found once."""
-    found: list[Found] = []
-    doubts = list(glimpses.doubts)
-    for group in _by_place(glimpses.found):
+def without_duplicates(detections: Detections) -> Detections:
+    """The detections without contradictions, which become ambiguities.
+
+    Of several detections of one name at one place, one is kept.
+    """
+    found: list[Detection] = []
+    ambiguities = list(detections.ambiguities)
+    for group in _by_place(detections.found):
         names = tuple(sorted({one.sighting.id for one in group}))
         if len(names) > 1:
-            doubts.append(Doubt("ambiguous", names, group[0].outline))
+            ambiguities.append(Ambiguity("ambiguous", names, group[0].outline))
         else:
             found.append(min(group, key=lambda one: one.sighting.range_m is None))
     places = defaultdict(list)
@@ -24,14 +26,14 @@ def without_twins(glimpses: Glimpses) -> Glimpses:
         places[one.sighting.id].append(one)
     for name, group in places.items():
         if len(group) > 1:
-            doubts += [Doubt("seen_twice", (name,), one.outline) for one in group]
+            ambiguities += [Ambiguity("seen_twice", (name,), one.outline) for one in group]
     kept = tuple(one for one in found if len(places[one.sighting.id]) == 1)
-    return Glimpses(kept, tuple(doubts))
+    return Detections(kept, tuple(ambiguities))
 
 
-def _by_place(found: Sequence[Found]) -> list[list[Found]]:
-    """Those whose outlines are about the same, together."""
-    groups: list[list[Found]] = []
+def _by_place(found: Sequence[Detection]) -> list[list[Detection]]:
+    """The detections in groups whose outlines are about the same."""
+    groups: list[list[Detection]] = []
     for one in found:
         for group in groups:
             if any(_same_place(one, other) for other in group):
@@ -42,7 +44,7 @@ def _by_place(found: Sequence[Found]) -> list[list[Found]]:
     return groups
 
 
-def _same_place(a: Found, b: Found) -> bool:
+def _same_place(a: Detection, b: Detection) -> bool:
     low_a, high_a = a.outline.min(axis=0), a.outline.max(axis=0)
     low_b, high_b = b.outline.min(axis=0), b.outline.max(axis=0)
     common = (high_a.clip(max=high_b) - low_a.clip(min=low_b)).clip(min=0.0).prod()

@@ -1,9 +1,9 @@
-"""Where the sides of a marker are, to a fraction of a pixel.
+"""The sides of a marker to a fraction of a pixel.
 
-Each side is sought at many places, as a step from dark to bright outwards, and a straight line is
-laid through what was found; corners are where lines meet. (So are the refined edges of Wang and
-Olson's AprilTag 2, IROS 2016, section III. OpenCV's own refinement looks at the few pixels around a
-corner: on a marker of 20 pixels it errs by half a pixel, this by a twentieth.)
+The edge of each side, a step from dark to bright outwards, is located at many points, and a line is
+fitted to them. Corners are the intersections of these lines, as in the edge refinement of
+Wang and Olson's AprilTag 2 (IROS 2016, section III). OpenCV's refinement uses only a few pixels
+around a corner: on a marker of 20 pixels it errs by half a pixel, this one by a twentieth.
 """
 
 import cv2
@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 
 from cpcbl_agents.vision.camera import Floats, Pixels
 
-PLACES = 12  # along a side
+POINTS_PER_SIDE = 12  # along a side
 TAPS = 13  # across it
 SHARE = 0.8  # of a cell is looked at on either side: beyond lie the marker's bits
 LEAST_PX, MOST_PX = 1.6, 4.0
 FAINT = 0.25  # of the steepest step: less is noise
 
-_ALONG = np.linspace(0.12, 0.88, PLACES, dtype=np.float32)[
+_ALONG = np.linspace(0.12, 0.88, POINTS_PER_SIDE, dtype=np.float32)[
     :, None
 ]  # corners are round, even where no marker is
 _ACROSS = np.linspace(-1.0, 1.0, TAPS, dtype=np.float32)
@@ -27,7 +27,7 @@ _OUTWARDS = np.array([1.0, -1.0], np.float32)
 _NEXT = [1, 2, 3, 0]
 
 
-def sampled(grey: Pixels, points: Floats | NDArray[np.float32]) -> NDArray[np.float32]:
+def sample_grey(grey: Pixels, points: Floats | NDArray[np.float32]) -> NDArray[np.float32]:
     """The grey levels (...) at points (..., 2), pixels."""
     if not points.size:
         return np.zeros(points.shape[:-1], np.float32)
@@ -36,11 +36,11 @@ def sampled(grey: Pixels, points: Floats | NDArray[np.float32]) -> NDArray[np.fl
     return levels.astype(np.float32).reshape(points.shape[:-1])
 
 
-def steps(grey: Pixels, quads: Floats, cells: int) -> Floats:
-    """Places on the sides of dark quads, (m, 4, PLACES, 2), pixels.
+def side_edge_points(grey: Pixels, quads: Floats, cells: int) -> Floats:
+    """Points on the sides of dark quads, (m, 4, POINTS_PER_SIDE, 2), pixels.
 
-    `quads`: corners (m, 4, 2), clockwise in the picture, right to about two pixels; `cells`: how
-    many of them a side has.
+    `quads`: corners (m, 4, 2), clockwise in the picture, exact to about two pixels; `cells`: the
+    number of cells of a side.
     """
     quads = quads.astype(np.float32)  # as exact as is needed, in half the time
     ways = quads[:, _NEXT] - quads
@@ -49,7 +49,7 @@ def steps(grey: Pixels, quads: Floats, cells: int) -> Floats:
     outwards = ways[..., ::-1] * _OUTWARDS * (reach[:, None] / lengths)[..., None]
     places = quads[:, :, None] + _ALONG * ways[:, :, None]
     aside = _ACROSS[:, None] * outwards[:, :, None]
-    levels = sampled(grey, places[:, :, :, None] + aside[:, :, None])
+    levels = sample_grey(grey, places[:, :, :, None] + aside[:, :, None])
     slopes = levels[..., 1:] - levels[..., :-1]
     slopes -= FAINT * slopes.max(axis=3, keepdims=True)
     slopes = slopes.clip(0.0) + 1e-6
@@ -58,8 +58,8 @@ def steps(grey: Pixels, quads: Floats, cells: int) -> Floats:
     return found
 
 
-def corners(sides: Floats) -> Floats:
-    """Where lines through the points of neighbouring sides (m, 4, n, 2) meet: (m, 4, 2)."""
+def line_intersections(sides: Floats) -> Floats:
+    """Intersections (m, 4, 2) of lines through the points of neighbouring sides (m, 4, n, 2)."""
     middle = sides.mean(axis=2)
     x, y = (sides - middle[:, :, None]).transpose(3, 0, 1, 2)
     angle = 0.5 * np.arctan2(2.0 * (x * y).sum(axis=2), (x * x - y * y).sum(axis=2))

@@ -1,5 +1,4 @@
-"""Two bands, one on the other: which blobs may be such a cylinder, and its outline to a part of a
-pixel."""
+"""Pairs of blobs that may be the two bands of a cylinder, and its outline to sub-pixels."""
 
 import itertools
 import math
@@ -10,7 +9,7 @@ import cv2
 import numpy as np
 
 from cpcbl_agents.vision.camera import Floats, Pixels
-from cpcbl_agents.vision.colours import Blob
+from cpcbl_agents.vision.colours import ColourBlob
 from cpcbl_agents.vision.panorama import Panorama
 from cpcbl_agents.vision.profiles import Profile
 from cpcbl_agents.vision.silhouette import FOOT, TOP, WIDTH
@@ -34,8 +33,8 @@ APART_PX = 1.5  # the sides of two bands
 class Candidate(NamedTuple):
     """An upper blob and a lower one."""
 
-    upper: Blob
-    lower: Blob
+    upper: ColourBlob
+    lower: ColourBlob
 
     @property
     def colours(self) -> Bands:
@@ -54,9 +53,12 @@ class Candidate(NamedTuple):
 
 
 class Outline(NamedTuple):
-    """Columns and rows of the panorama. `hidden`: which of `TOP`, `FOOT`, `WIDTH` are not where an
-    edge of it is, but where the frame ends (`cut`) or its colour does; `unsure`: at which of them
-    its colour goes on beyond the edge, as in its reflection."""
+    """The outline in columns and rows of the panorama.
+
+    `hidden`: which of `TOP`, `FOOT`, `WIDTH` are not at an edge of the cylinder but at the border
+    of the frame (`cut`) or at the end of its colour. `unsure`: where the colour continues
+    beyond the edge, as in a reflection.
+    """
 
     left: float
     right: float
@@ -75,37 +77,39 @@ class Patch(NamedTuple):
     left: int
     top: int
 
-    def inside(self, left: float, right: float, top: float, bottom: float) -> Pixels:
-        """What is between these columns and rows; a pixel at least."""
+    def region(self, left: float, right: float, top: float, bottom: float) -> Pixels:
+        """The pixels between these columns and rows; at least one."""
         rows, columns = self.pixels.shape[:2]
         return self.pixels[
             _from_to(top - self.top, bottom - self.top, rows),
             _from_to(left - self.left, right - self.left, columns),
         ]
 
-    def down(self, left: float, right: float) -> Profile:
+    def vertical_profile(self, left: float, right: float) -> Profile:
         """The mean of the columns between these, row by row."""
         part = self.pixels[:, _from_to(left - self.left, right - self.left, self.pixels.shape[1])]
         return Profile(_mean(part, 1), self.top)
 
-    def across(self, top: float, bottom: float) -> Profile:
+    def horizontal_profile(self, top: float, bottom: float) -> Profile:
         """The mean of the rows between these, column by column."""
         part = self.pixels[_from_to(top - self.top, bottom - self.top, self.pixels.shape[0])]
         return Profile(_mean(part, 0), self.left)
 
 
-def candidates(blobs: Sequence[Blob]) -> list[Candidate]:
-    """The pairs of touching blobs of two colours that might be the bands of a cylinder; of very
-    many the highest, so that no picture takes for ever."""
+def candidates(blobs: Sequence[ColourBlob]) -> list[Candidate]:
+    """The pairs of touching blobs of two colours that may be the bands of a cylinder.
+
+    Only the highest are used if there are very many, which bounds the time for a picture.
+    """
     pairs = [
         Candidate(upper, lower)
         for upper, lower in itertools.permutations(blobs, 2)
-        if upper.colour != lower.colour and _stacked(upper, lower)
+        if upper.colour != lower.colour and _is_stacked(upper, lower)
     ]
     return sorted(pairs, key=lambda pair: -pair.height)[:MOST_CANDIDATES]
 
 
-def _stacked(upper: Blob, lower: Blob) -> bool:
+def _is_stacked(upper: ColourBlob, lower: ColourBlob) -> bool:
     heights = sorted((upper.height, lower.height))
     gap = lower.top - upper.bottom
     if not -OVERLAP_SHARE * heights[0] < gap < GAP_PX + GAP_SHARE * heights[0]:
@@ -119,36 +123,38 @@ def _stacked(upper: Blob, lower: Blob) -> bool:
     )
 
 
-def patch_of(pixels: Pixels, panorama: Panorama, candidate: Candidate) -> Patch | None:
-    """The panorama about a candidate; None if there is next to nothing."""
+def panorama_patch(pixels: Pixels, panorama: Panorama, candidate: Candidate) -> Patch | None:
+    """The panorama around a candidate; None if it is too small."""
     upper, lower = candidate
     left, right = min(upper.left, lower.left), max(upper.right, lower.right)
-    margin = _reach(right - left) + REST_PX
-    box = panorama.clipped(left - margin, upper.top - margin, right + margin, lower.bottom + margin)
+    margin = _search_range(right - left) + REST_PX
+    box = panorama.clip_box(
+        left - margin, upper.top - margin, right + margin, lower.bottom + margin
+    )
     if box.right - box.left < LEAST_PATCH_PX or box.bottom - box.top < LEAST_PATCH_PX:
         return None
-    return Patch(panorama.cut(pixels, box), box.left, box.top)
+    return Patch(panorama.crop(pixels, box), box.left, box.top)
 
 
-def outlined(patch: Patch, panorama: Panorama, candidate: Candidate) -> list[Outline]:
-    """What the outline of a candidate may be; empty if there is no line between its bands.
+def possible_outlines(patch: Patch, panorama: Panorama, candidate: Candidate) -> list[Outline]:
+    """The possible outlines of a candidate; empty if there is no edge between its bands.
 
-    A blob may go on in something of its colour beside or behind it: where the sides of the two
+    A blob may continue in an object of its colour beside or behind it. If the sides of the two
     bands are not one above the other, either may be the true one.
     """
     upper, lower = candidate
     left, right = max(upper.left, lower.left), min(upper.right, lower.right)
     middle, quarter = 0.5 * (left + right), 0.25 * (right - left)
-    rows = patch.down(middle - quarter, middle + quarter)
-    mid = _mid(rows, upper, lower)
+    rows = patch.vertical_profile(middle - quarter, middle + quarter)
+    mid = _band_boundary(rows, upper, lower)
     if not upper.top < mid < lower.bottom:  # NaN too
         return []
-    top, foot = _ends(rows, upper.top, mid, lower.bottom)
+    top, foot = _top_and_foot(rows, upper.top, mid, lower.bottom)
     inset = INSET * min(mid - upper.top, lower.bottom - mid)
     lost: frozenset[int] = frozenset()
-    found = _choices(
-        _sides(patch.across(upper.top + inset, mid - inset), upper),
-        _sides(patch.across(mid + inset, lower.bottom - inset), lower),
+    found = _possible_sides(
+        _sides(patch.horizontal_profile(upper.top + inset, mid - inset), upper),
+        _sides(patch.horizontal_profile(mid + inset, lower.bottom - inset), lower),
     )
     if not found:
         lost, found = lost | {WIDTH}, [(min(upper.left, lower.left), max(upper.right, lower.right))]
@@ -160,18 +166,18 @@ def outlined(patch: Patch, panorama: Panorama, candidate: Candidate) -> list[Out
     goes_on = {TOP: top - upper.top > beyond, FOOT: lower.bottom - foot > beyond}
     unsure = frozenset(i for i, so in goes_on.items() if so)
     outlines = (Outline(left, right, top, mid, foot, lost, unsure=unsure) for left, right in found)
-    return [_with_cuts(panorama, outline) for outline in outlines]
+    return [_with_frame_cuts(panorama, outline) for outline in outlines]
 
 
 Sides = tuple[float, float]
 
 
-def _sides(columns: Profile, band: Blob) -> Sides:
+def _sides(columns: Profile, band: ColourBlob) -> Sides:
     return _edge(columns, band.left, band.width), _edge(columns, band.right, band.width)
 
 
-def _choices(upper: Sides, lower: Sides) -> list[Sides]:
-    """The mean sides of both bands if they are one above the other; else all there may be."""
+def _possible_sides(upper: Sides, lower: Sides) -> list[Sides]:
+    """The mean sides of both bands if they are one above the other, else all combinations."""
     if all(abs(a - b) <= APART_PX for a, b in zip(upper, lower, strict=True)):
         return [(0.5 * (upper[0] + lower[0]), 0.5 * (upper[1] + lower[1]))]
     pairs = itertools.product((upper[0], lower[0]), (upper[1], lower[1]))
@@ -179,12 +185,12 @@ def _choices(upper: Sides, lower: Sides) -> list[Sides]:
 
 
 def _edge(line: Profile, guess: float, size: float) -> float:
-    """The edge about there, of something so large; NaN if there is none."""
-    return line.edge(guess, 0.45 * size, _reach(size))
+    """The edge near `guess` of a part of this size; NaN if there is none."""
+    return line.edge(guess, 0.45 * size, _search_range(size))
 
 
-def _mid(rows: Profile, upper: Blob, lower: Blob) -> float:
-    """The line between the bands: where they meet, or where either ends; NaN if there is none."""
+def _band_boundary(rows: Profile, upper: ColourBlob, lower: ColourBlob) -> float:
+    """The edge between the bands, near the end of either blob; NaN if there is none."""
     size = 0.5 * min(upper.height, lower.height)
     guesses = lower.top, upper.bottom
     if abs(lower.top - upper.bottom) <= GAP_PX:
@@ -193,9 +199,9 @@ def _mid(rows: Profile, upper: Blob, lower: Blob) -> float:
     return _edge(rows, guesses[1], size) if math.isnan(found) else found
 
 
-def _ends(rows: Profile, top: float, mid: float, foot: float) -> tuple[float, float]:
-    """Top and foot. A band that is much higher than the other may go on in something of the same
-    colour, such as its own reflection: its end is first looked for where it ought to be."""
+def _top_and_foot(rows: Profile, top: float, mid: float, foot: float) -> tuple[float, float]:
+    """Top and foot. A band that is much higher than the other may continue in an object of the same
+    colour, such as its reflection, so its end is first searched at the expected place."""
     above, below = mid - top, foot - mid
     tops, feet = (top, mid - below), (foot, mid + above)
     if above > UNEVEN * below + SLACK_PX:
@@ -210,8 +216,8 @@ def _ends(rows: Profile, top: float, mid: float, foot: float) -> tuple[float, fl
     return first, second
 
 
-def _with_cuts(panorama: Panorama, outline: Outline) -> Outline:
-    """With those edges that are the frame's border, or beyond it."""
+def _with_frame_cuts(panorama: Panorama, outline: Outline) -> Outline:
+    """The outline with those edges marked as hidden that are at the border of the frame."""
     left, right, top, mid, foot, hidden, *_ = outline
     middle, rows = 0.5 * (left + right), (0.5 * (top + mid), 0.5 * (mid + foot))
     places = {
@@ -222,13 +228,13 @@ def _with_cuts(panorama: Panorama, outline: Outline) -> Outline:
     cut = {
         what
         for what, points in places.items()
-        if any(panorama.at_border(column, row, BORDER_PX) for column, row in points)
+        if any(panorama.is_at_border(column, row, BORDER_PX) for column, row in points)
     }
     return outline._replace(hidden=hidden | cut, cut=bool(cut))
 
 
-def _reach(size: float) -> float:
-    """How far the edge of something so large may be from where its colour ends."""
+def _search_range(size: float) -> float:
+    """How far (px) an edge may be from the end of the colour of a part of this size."""
     return min(max(0.25 * size, 2.5), 8.0)
 
 

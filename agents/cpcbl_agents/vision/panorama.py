@@ -1,7 +1,7 @@
-"""The frame, unrolled: columns are azimuths, rows are slopes, whatever the tilt, roll and lens.
+"""The panorama of a frame: columns are azimuths, rows are slopes, for any tilt, roll and lens.
 
-What stands upright is upright here: the sides of a cylinder are columns, and a height z at the
-distance d from the lens is the row (lens - z) / d. So edges can be averaged along columns and rows.
+Vertical lines are columns: the sides of a cylinder are columns, and a height z at the distance d
+from the lens is the row (lens - z) / d. So edges can be averaged along columns and rows.
 """
 
 import math
@@ -52,38 +52,38 @@ class Panorama:
         self._yaw = math.radians(camera.settings.yaw_deg)
         self.step = 1.0 / camera.settings.fx_px
         width, height = camera.size_px
-        azimuths, slopes = self._unrolled(_grid(width, height))
+        azimuths, slopes = self._panorama_angles(_grid(width, height))
         seen = (np.abs(slopes) < STEEPEST) & (np.abs(azimuths) < WIDEST_RAD)
         self.first_azimuth = float(azimuths[seen].min())
         self.first_slope = float(slopes[seen].min())
-        self.columns = self._placed(azimuths - self.first_azimuth, height, width)
+        self.columns = self._index_map(azimuths - self.first_azimuth, height, width)
         """Of each pixel (height, width)."""
-        self.rows = self._placed(slopes - self.first_slope, height, width)
+        self.rows = self._index_map(slopes - self.first_slope, height, width)
         last_column = math.ceil(float(azimuths[seen].max() - self.first_azimuth) / self.step)
         last_row = math.ceil(float(slopes[seen].max() - self.first_slope) / self.step)
         self.size = last_column + 1, last_row + 1
         """(columns, rows)."""
-        self.x, self.y = self._pixels()
+        self.x, self.y = self._pixel_maps()
 
     def azimuth(self, column: float) -> float:
         """Rad, to the right of the camera's yaw."""
         return self.first_azimuth + column * self.step
 
     def slope(self, row: float) -> float:
-        """Way down by way ahead."""
+        """Distance down per distance ahead."""
         return self.first_slope + row * self.step
 
     def bearing(self, azimuth: float) -> float:
         """Rad, to the left of the robot's front, not wrapped."""
         return self._yaw - azimuth
 
-    def cut(self, pixels: Pixels, box: Box) -> Pixels:
+    def crop(self, pixels: Pixels, box: Box) -> Pixels:
         """A part of the panorama, (rows, columns, 3); black outside of the frame."""
         part = slice(box.top, box.bottom), slice(box.left, box.right)
         cut = cv2.remap(pixels, self.x[part], self.y[part], cv2.INTER_LINEAR)
         return cut.astype(np.uint8, copy=False)
 
-    def clipped(self, left: float, top: float, right: float, bottom: float) -> Box:
+    def clip_box(self, left: float, top: float, right: float, bottom: float) -> Box:
         """The box around these columns and rows, as far as there is a panorama."""
         columns, rows = self.size
         return Box(
@@ -103,8 +103,8 @@ class Panorama:
         pixels = np.column_stack([self.x[i, j], self.y[i, j]]).astype(np.float64)
         return pixels.clip(0.0, (width - 1.0, height - 1.0))
 
-    def at_border(self, column: float, row: float, margin_px: float) -> bool:
-        """Whether a place of the panorama is at the frame's border, or beyond it."""
+    def is_at_border(self, column: float, row: float, margin_px: float) -> bool:
+        """Whether a place of the panorama is at the border of the frame or beyond it."""
         columns, rows = self.size
         if not (0.0 <= row <= rows - 1 and 0.0 <= column <= columns - 1):
             return True  # NaN too
@@ -115,7 +115,7 @@ class Panorama:
         )
 
     def scale(self, column: float, row: float) -> Scale:
-        """How large the frame is about a place."""
+        """The scale of the frame around a place of the panorama."""
         columns, rows = self.size
         i = min(max(round(row), 1), rows - 2)
         j = min(max(round(column), 1), columns - 2)
@@ -124,17 +124,17 @@ class Panorama:
         along = math.hypot(x[i + 1, j] - x[i - 1, j], y[i + 1, j] - y[i - 1, j])
         return Scale(max(0.5 * across, LEAST_SCALE), max(0.5 * along, LEAST_SCALE))
 
-    def _unrolled(self, pixels: Floats) -> tuple[Floats, Floats]:
+    def _panorama_angles(self, pixels: Floats) -> tuple[Floats, Floats]:
         """Azimuths and slopes (n,) of pixels (n, 2)."""
         rays = self._camera.rays(pixels)
         azimuths = self._yaw - np.arctan2(rays[:, 1], rays[:, 0])
         azimuths = np.remainder(azimuths + math.pi, math.tau) - math.pi
         return azimuths, -rays[:, 2] / np.maximum(np.hypot(rays[:, 0], rays[:, 1]), 1e-9)
 
-    def _placed(self, angles: Floats, height: int, width: int) -> Map:
+    def _index_map(self, angles: Floats, height: int, width: int) -> Map:
         return (angles / self.step).reshape(height, width).astype(np.float32)
 
-    def _pixels(self) -> tuple[Map, Map]:
+    def _pixel_maps(self) -> tuple[Map, Map]:
         """The pixel (x, y) of each place of the panorama, each (rows, columns)."""
         columns, rows = self.size
         places = _grid(columns, rows)
@@ -149,7 +149,7 @@ class Panorama:
             & (pixels[:, 1] < height + MARGIN_PX)
         )
         pixels[outside] = -9.0
-        azimuths, slopes = self._unrolled(pixels)
+        azimuths, slopes = self._panorama_angles(pixels)
         off = np.hypot(
             (azimuths - self.first_azimuth) / self.step - places[:, 0],
             (slopes - self.first_slope) / self.step - places[:, 1],
@@ -160,8 +160,8 @@ class Panorama:
 
 
 @lru_cache(maxsize=4)
-def panorama_of(settings: CameraSettings) -> Panorama:
-    """The panorama of a camera; it takes a while to make, and is the same for all alike."""
+def panorama_for(settings: CameraSettings) -> Panorama:
+    """The panorama of a camera, cached because it is slow to make and depends only on settings."""
     return Panorama(Camera(settings))
 
 

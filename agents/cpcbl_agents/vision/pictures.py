@@ -1,8 +1,8 @@
-"""Pictures as bytes and as pixels, and what is wrong with those that cannot be used.
+"""Encoding and decoding of pictures, and the reasons why a picture cannot be used.
 
-What a frame says of itself (its header) is judged before it is decoded: a few bytes may claim
-gigabytes of pixels, and OpenCV would turn grey, transparent or 16-bit pictures into others that
-look right. One that ends too soon is refused by its missing end: some decoders fill it up.
+The header of a frame is checked before it is decoded: a few bytes may claim gigabytes, and
+OpenCV would convert grey, transparent or 16-bit pictures into others that look right. A truncated
+picture is refused because its end is missing: some decoders fill it up.
 """
 
 import struct
@@ -26,7 +26,7 @@ _JPEG_BARE = frozenset({0x01, *range(0xD0, 0xD8)})  # markers without a segment
 
 
 class Header(NamedTuple):
-    """What a picture says of itself."""
+    """The header of a picture."""
 
     width_px: int
     height_px: int
@@ -35,29 +35,31 @@ class Header(NamedTuple):
     """Of each channel."""
 
 
-def decoded(image: bytes) -> Pixels | str:
-    """The pixels of a picture of any kind that OpenCV reads, made colour, BGR; or why there are
-    none. For files that a person names; a camera's frames are `received`."""
+def decode_image(image: bytes) -> Pixels | str:
+    """The pixels, BGR, of any kind of picture that OpenCV reads; or why there are none.
+
+    It is for files that a person names; `decode_frame` is for frames of cameras.
+    """
     if not image:
         return "frame_empty"
     pixels = cv2.imdecode(np.frombuffer(image, np.uint8), cv2.IMREAD_COLOR)
     return "frame_undecodable" if pixels is None else pixels.astype(np.uint8, copy=False)
 
 
-def received(image: bytes, size_px: tuple[int, int]) -> Pixels | str:
+def decode_frame(image: bytes, size_px: tuple[int, int]) -> Pixels | str:
     """The pixels of a frame, BGR: a JPEG or PNG in colour, of this size (width, height); or why
     there are none. No other is decoded, however large it claims to be."""
     if not image:
         return "frame_empty"
-    header = header_of(image)
+    header = read_header(image)
     if header is None:
         return "frame_undecodable"
-    reason = _unfit(header, size_px) or ("" if _whole(image) else "frame_truncated")
-    return reason or decoded(image)
+    reason = _header_fault(header, size_px) or ("" if _is_complete(image) else "frame_truncated")
+    return reason or decode_image(image)
 
 
-def header_of(image: bytes) -> Header | None:
-    """What a JPEG or PNG says of itself; None for what is neither, or ends before."""
+def read_header(image: bytes) -> Header | None:
+    """The header of a JPEG or PNG; None for other data, or if it is truncated."""
     if image.startswith(_PNG):
         if len(image) < 26:
             return None
@@ -80,7 +82,7 @@ def header_of(image: bytes) -> Header | None:
     return None
 
 
-def _unfit(header: Header, size_px: tuple[int, int]) -> str:
+def _header_fault(header: Header, size_px: tuple[int, int]) -> str:
     if not header.width_px or not header.height_px:
         return "frame_empty"
     if header.channels != 3:
@@ -90,13 +92,13 @@ def _unfit(header: Header, size_px: tuple[int, int]) -> str:
     return "" if (header.width_px, header.height_px) == size_px else "frame_wrong_size"
 
 
-def _whole(image: bytes) -> bool:
-    """Whether the end is there; some cameras fill their buffer up with zeros after it."""
+def _is_complete(image: bytes) -> bool:
+    """Whether the end is present; some cameras append zeros to it."""
     end = _PNG_END if image.startswith(_PNG) else _JPEG_END
     return image.endswith(end) or image.rstrip(b"\0").endswith(end)
 
 
-def fault(pixels: Pixels, size_px: tuple[int, int]) -> str:
+def pixel_fault(pixels: Pixels, size_px: tuple[int, int]) -> str:
     """Why a picture cannot be used by a camera of this size (width, height); empty if it can."""
     if pixels.size == 0:
         return "frame_empty"
@@ -115,7 +117,7 @@ def fault(pixels: Pixels, size_px: tuple[int, int]) -> str:
     return "frame_white" if level > BRIGHT else "frame_blank"
 
 
-def encoded(pixels: Pixels) -> bytes:
+def encode_jpeg(pixels: Pixels) -> bytes:
     """A JPEG for people, of at most 1280 pixels' width."""
     shrunk = WIDEST_SHOWN_PX / pixels.shape[1]
     if shrunk < 1.0:

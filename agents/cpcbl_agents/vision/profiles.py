@@ -1,7 +1,7 @@
-"""Where colour changes along a line, to a part of a pixel.
+"""The place of a colour edge along a line, to sub-pixels.
 
-At half of the way from the colour on the one side to that on the other: neither dim light nor blur
-moves that, as they would the place where a threshold is passed.
+An edge lies halfway between the colours of its two sides. Neither dim light nor blur moves that
+place, as they would move the place where a threshold is crossed.
 """
 
 import math

@@ -1,7 +1,7 @@
-"""How an upright cylinder of two bands looks from a camera, and how far away it is by its looks.
+"""The silhouette of an upright cylinder of two bands, and its distance from a camera.
 
-Four numbers tell: the slopes at which its top, the line between its bands and its foot are seen,
-and half of its width as an angle. Slopes are downwards (way down by way ahead), from the lens.
+Four angles determine the distance: the slopes of its top, of the line between its bands and of its
+foot, and half of its width. Slopes are downwards from the lens (distance down per distance ahead).
 """
 
 import math
@@ -19,14 +19,14 @@ SETTLED = 1e-7
 
 
 class Shape(NamedTuple):
-    """A cylinder as a camera's height makes it: heights are below the lens (m)."""
+    """The shape of a cylinder with heights below the lens (m)."""
 
     radius: float
     top: float
     mid: float
     foot: float
     rim: float = 0.0
-    """How far what it stands on may reach from its axis: seen from below, that hides its foot."""
+    """How far (m) its base may extend from its axis: seen from below, that hides its foot."""
 
     @staticmethod
     def of(cylinder: Cylinder, lens_m: float, rim_m: float = 0.0) -> "Shape":
@@ -38,81 +38,79 @@ class Shape(NamedTuple):
         return self.foot - self.top
 
 
-class Fit(NamedTuple):
-    """The distance of the axis from the lens along the floor, and how well the looks agree."""
+class DistanceFit(NamedTuple):
+    """The distance of the axis from the lens along the floor, its sigma (m), and chi-square."""
 
     distance: float
     sigma: float
     chi2: float
 
 
-def looks(shape: Shape, distance: float) -> tuple[float, float, float, float]:
-    """(top, mid, foot, half width) of a cylinder at this distance, more than its radius.
+def expected_angles(shape: Shape, distance: float) -> tuple[float, float, float, float]:
+    """(top, mid, foot, half width) of a cylinder at this distance (m), which exceeds its radius.
 
-    All three lines are on the side that is near: a lid that is seen from above, or what is seen of
-    it from below, is not of the colour of the bands.
+    All three lines are on the near side: the top and bottom faces do not have the bands' colours.
     """
     near = distance - LEVEL * shape.radius
     return (
         shape.top / near,
         shape.mid / near,
-        shape.foot / near + _hidden(shape, distance),
+        shape.foot / near + _hidden_foot(shape, distance),
         math.asin(min(1.0, shape.radius / distance)),
     )
 
 
-def _hidden(shape: Shape, distance: float) -> float:
-    """Half of what may be hidden of the foot, as a slope: the foot is expected there, give or take
-    as much."""
+def _hidden_foot(shape: Shape, distance: float) -> float:
+    """Half of the possibly hidden part of the foot, as a slope: its expected value and sigma."""
     if shape.foot >= 0.0 or shape.rim <= shape.radius:
         return 0.0
     near = distance - LEVEL * shape.radius
     return 0.5 * (shape.foot / max(distance - shape.rim, 0.5 * near) - shape.foot / near)
 
 
-def fit(
+def fit_distance(
     shape: Shape,
-    seen: Sequence[float],
+    angles: Sequence[float],
     sigmas: Sequence[float],
     tilt_sigma: float,
     use: Sequence[int],
-) -> Fit:
+) -> DistanceFit:
     """Least squares over those of the four numbers that are used.
 
     An error of the tilt moves all slopes alike: heights are free of it, foot points are not. That
     covariance weighs them against each other.
     """
-    shared = [tilt_sigma * (1.0 + seen[i] ** 2) if i != WIDTH else 0.0 for i in use]
+    shared = [tilt_sigma * (1.0 + angles[i] ** 2) if i != WIDTH else 0.0 for i in use]
     least = 1.01 * shape.radius
-    distance = max(least, _first_guess(shape, seen, use))
+    distance = max(least, _first_guess(shape, angles, use))
     for _ in range(ROUNDS):
-        expected = looks(shape, distance)
-        a_little = looks(shape, distance * 1.0001)
+        expected = expected_angles(shape, distance)
+        a_little = expected_angles(shape, distance * 1.0001)
         slopes = [(a_little[i] - expected[i]) / (1e-4 * distance) for i in use]
-        errors = [seen[i] - expected[i] for i in use]
-        unsure = [_hidden(shape, distance) if i == FOOT else 0.0 for i in use]
+        errors = [angles[i] - expected[i] for i in use]
+        unsure = [_hidden_foot(shape, distance) if i == FOOT else 0.0 for i in use]
         own = [math.hypot(sigmas[i], more) for i, more in zip(use, unsure, strict=True)]
         weigh = _Weights(own, shared)
         information = weigh(slopes, slopes)
         if information <= 0.0:
-            return Fit(distance, math.inf, math.inf)
+            return DistanceFit(distance, math.inf, math.inf)
         change = weigh(slopes, errors) / information
         distance = max(least, distance + min(max(change, -0.5 * distance), distance))
         if abs(change) < SETTLED * distance:
             break
-    errors = [seen[i] - e for i, e in enumerate(looks(shape, distance)) if i in use]
-    return Fit(distance, 1.0 / math.sqrt(information), weigh(errors, errors))
+    errors = [angles[i] - e for i, e in enumerate(expected_angles(shape, distance)) if i in use]
+    return DistanceFit(distance, 1.0 / math.sqrt(information), weigh(errors, errors))
 
 
-def _first_guess(shape: Shape, seen: Sequence[float], use: Sequence[int]) -> float:
-    """By the height of what is used, else by the width."""
+def _first_guess(shape: Shape, angles: Sequence[float], use: Sequence[int]) -> float:
+    """The distance from the height of the used part, else from the width."""
     heights = (shape.top, shape.mid, shape.foot)
     rows = [i for i in use if i != WIDTH]
     if len(rows) > 1:
-        height = seen[rows[-1]] - seen[rows[0]]
+        height = angles[rows[-1]] - angles[rows[0]]
         if height > 0.0:
             return (heights[rows[-1]] - heights[rows[0]]) / height + shape.radius
-    return shape.radius / max(math.sin(min(seen[WIDTH], 0.5 * math.pi)), 1e-6)
+    return shape.radius / max(math.sin(min(angles[WIDTH], 0.5 * math.pi)), 1e-6)
 
 
 class _Weights:

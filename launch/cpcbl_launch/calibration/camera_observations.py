@@ -111,22 +111,22 @@ def dataset_from_pictures(
     progress: Callable[[float], None] = lambda done: None,
 ) -> CameraDataset:
     """The sightings of a robot in pictures from known poses. Raises InputError. Needs OpenCV."""
-    from cpcbl_agents.vision.detector import CameraEyes
+    from cpcbl_agents.vision.detector import CameraDetector
     from cpcbl_launch.calibration.pictures import read_picture
 
     rows = read_poses(poses, team)
     names = list(dict.fromkeys(row.file for row in rows))
-    eyes = CameraEyes(robot, team)
+    eyes = CameraDetector(robot, team)
     frames: list[Sightings] = []
     rejected: dict[str, str] = {}
     ambiguities: Counter[str] = Counter()
     for i, name in enumerate(names):
         pixels = read_picture(folder / name).pixels
-        seen = pixels if isinstance(pixels, str) else eyes.glimpses(pixels)
+        seen = pixels if isinstance(pixels, str) else eyes.detections(pixels)
         if isinstance(seen, str):
             rejected[name] = seen
         else:
-            ambiguities.update(doubt.reason for doubt in seen.doubts)
+            ambiguities.update(ambiguity.reason for ambiguity in seen.ambiguities)
             frames.append(Sightings(_stamp_ns(i), tuple(one.sighting for one in seen.found)))
         progress((i + 1) / len(names))
     if not frames:

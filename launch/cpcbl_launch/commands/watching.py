@@ -99,7 +99,12 @@ def look(
 
     from cpcbl_launch.checks import require_robots, require_team_opencv
     from cpcbl_launch.commands.options import require_folder
-    from cpcbl_launch.views.frames.report import LookReport, print_look, reported, written
+    from cpcbl_launch.views.frames.report import (
+        FrameReport,
+        frame_report,
+        print_frame_report,
+        save_picture,
+    )
 
     team = find_team(team_file)
     require_robots(f"{team_file}", [robot], team)
@@ -108,40 +113,46 @@ def look(
     if pictures is not None:
         require_team_opencv(team, [robot])
     folder = require_folder("--save", save)
-    looks = _looks(robot, team, connect, wait) if pictures is None else _at(robot, team, pictures)
-    most = 1 if count is None and pictures is None else count
-    console, reports = Console(), list[LookReport]()
-    for frame, name, one in itertools.islice(looks, most):
-        reports.append(reported(one, frame, written(one, folder, name)))
+    frames = (
+        _live_frames(robot, team, connect, wait)
+        if pictures is None
+        else _frames_of_pictures(robot, team, pictures)
+    )
+    max_frames = 1 if count is None and pictures is None else count
+    console, reports = Console(), list[FrameReport]()
+    for frame, name, annotated in itertools.islice(frames, max_frames):
+        reports.append(frame_report(annotated, frame, save_picture(annotated, folder, name)))
         if not as_json:
-            print_look(reports[-1], console)
+            print_frame_report(reports[-1], console)
     print_result(reports, as_json, lambda: None)
 
 
-def _looks(
+def _live_frames(
     robot: str, team: "Team", connect: list[str] | None, wait_s: float
 ) -> Iterator[tuple[str, str, "AnnotatedFrame"]]:
-    """The frames of a running robot: as they are called, as their files are called, themselves."""
+    """Annotated frames of a running robot, each with its name and the name of its file."""
     from cpcbl_agents.process import StopSignal
-    from cpcbl_launch.views.frames.watch import looks_of
+    from cpcbl_launch.views.frames.watch import live_frames
     from cpcbl_transport.security import Identity, link_of
     from cpcbl_transport.topics import Role
 
     logging.getLogger("cpcbl_transport").setLevel(logging.WARNING)
     link = link_of(team, Identity(Role.OPERATOR), connect or team.transport.connect)
-    for one in looks_of(robot, team.name, link, StopSignal(), wait_s):
-        yield str(one.stamp_ns), f"{robot}_{one.stamp_ns}", one
+    for annotated in live_frames(robot, team.name, link, StopSignal(), wait_s):
+        yield str(annotated.stamp_ns), f"{robot}_{annotated.stamp_ns}", annotated
 
 
-def _at(robot: str, team: "Team", pictures: Path) -> Iterator[tuple[str, str, "AnnotatedFrame"]]:
-    """The same of picture files."""
-    from cpcbl_agents.sources.camera import pictures_in
-    from cpcbl_launch.views.frames.watch import looks_at
+def _frames_of_pictures(
+    robot: str, team: "Team", pictures: Path
+) -> Iterator[tuple[str, str, "AnnotatedFrame"]]:
+    """Annotated frames of picture files, each with its name and the name of its file."""
+    from cpcbl_agents.sources.camera import picture_paths
+    from cpcbl_launch.views.frames.watch import frames_of_pictures
 
     if not pictures.exists():
         raise InputError(f"--pictures {pictures}: no such file or folder")
-    paths = pictures_in(pictures) if pictures.is_dir() else [pictures]
+    paths = picture_paths(pictures) if pictures.is_dir() else [pictures]
     if not paths:
         raise InputError(f"--pictures {pictures}: no pictures (.png, .jpg) in it")
-    for path, one in looks_at(paths, robot, team):
-        yield path.name, f"{robot}_{path.stem}", one
+    for path, annotated in frames_of_pictures(paths, robot, team):
+        yield path.name, f"{robot}_{path.stem}", annotated

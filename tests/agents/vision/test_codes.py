@@ -6,14 +6,16 @@ import cv2
 import numpy as np
 import pytest
 
-from cpcbl_agents.vision.codes import Code, Codes
+from cpcbl_agents.vision.codes import MarkerCode, MarkerReader
 from cpcbl_team.config import LIKE_MIRRORED, MARKERS, MarkerFamily
 
 FAMILIES: list[MarkerFamily] = list(get_args(MarkerFamily))
 SQUARE = np.array([[20, 20], [80, 20], [80, 80], [20, 80]]) - 0.5
 
 
-def shown(codes: Codes, number: int) -> np.ndarray[tuple[int, ...], np.dtype[np.uint8]]:
+def detect_and_annotate(
+    codes: MarkerReader, number: int
+) -> np.ndarray[tuple[int, ...], np.dtype[np.uint8]]:
     """A marker of 60 pixels in a white picture of 100."""
     small = cv2.aruco.generateImageMarker(codes.dictionary, number, codes.cells)
     marker = cv2.resize(small, (60, 60), interpolation=cv2.INTER_NEAREST)
@@ -26,19 +28,19 @@ def shown(codes: Codes, number: int) -> np.ndarray[tuple[int, ...], np.dtype[np.
 def test_every_marker_is_read_from_any_corner_on_and_the_table_says_how_many(
     family: MarkerFamily,
 ) -> None:
-    codes = Codes(family)
+    codes = MarkerReader(family)
     assert len(codes.dictionary.bytesList) == MARKERS[family]
     turned = np.array([np.roll(SQUARE, turn, axis=0) for turn in range(4)])
     for number in range(0, MARKERS[family], 7):
-        read = codes.read(shown(codes, number), turned)
-        assert read == {turn: Code(number, turn) for turn in range(4)}
+        read = codes.read(detect_and_annotate(codes, number), turned)
+        assert read == {turn: MarkerCode(number, turn) for turn in range(4)}
 
 
 @pytest.mark.parametrize("family", FAMILIES)
 def test_of_mirrored_markers_only_those_of_the_table_are_read(family: MarkerFamily) -> None:
-    codes, alike = Codes(family), set()
+    codes, alike = MarkerReader(family), set()
     for number in range(MARKERS[family]):
-        mirrored = np.ascontiguousarray(shown(codes, number)[:, ::-1])
+        mirrored = np.ascontiguousarray(detect_and_annotate(codes, number)[:, ::-1])
         for code in codes.read(mirrored, SQUARE[None]).values():
             assert code.id == number
             alike.add(number)
@@ -46,10 +48,10 @@ def test_of_mirrored_markers_only_those_of_the_table_are_read(family: MarkerFami
 
 
 def test_a_square_without_a_marker_and_one_without_its_border_say_nothing() -> None:
-    codes = Codes("aruco_4x4_50")
+    codes = MarkerReader("aruco_4x4_50")
     grey = np.full((100, 100), 128, np.uint8)
     black = cv2.rectangle(np.full((100, 100), 255, np.uint8), (20, 20), (79, 79), (0,), -1)
-    bitten = shown(codes, 3)
+    bitten = detect_and_annotate(codes, 3)
     bitten[20:30, 40:50] = 255
     for pixels in (grey, black.astype(np.uint8), bitten):
         assert codes.read(pixels, SQUARE[None]) == {}

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from cpcbl_agents.vision.camera import Camera, Pixels
-from cpcbl_agents.vision.colours import MOST_BLOBS, Colours
+from cpcbl_agents.vision.colours import MAX_BLOBS, ColourSegmenter
 from cpcbl_agents.vision.panorama import Panorama
 from cpcbl_team.config import COLOURS, CameraSettings, Colour
 
@@ -31,7 +31,7 @@ def frame(*boxes: tuple[int, int, int, int, int]) -> Pixels:
 
 def test_hue_through_red() -> None:
     pixels = frame((20, 20, 30, 40, 177), (60, 20, 70, 40, 3), (100, 20, 110, 40, 60))
-    blobs = Colours(dict(COLOURS), ["red"]).blobs(pixels, PANORAMA)
+    blobs = ColourSegmenter(dict(COLOURS), ["red"]).blobs(pixels, PANORAMA)
     assert [blob.colour for blob in blobs] == ["red", "red"]
     assert sorted(blob.outline[0, 0] for blob in blobs) == [20.0, 60.0]
 
@@ -40,7 +40,7 @@ def test_hue_through_red() -> None:
 def test_any_number_of_colours(count: int) -> None:
     colours = {f"c{i}": Colour(hue=(10 * i, 10 * i + 5)) for i in range(count)}
     boxes = [(10 * i + 2, 20, 10 * i + 8, 40, 10 * i + 2) for i in range(count)]
-    blobs = Colours(colours, colours).blobs(frame(*boxes), PANORAMA)
+    blobs = ColourSegmenter(colours, colours).blobs(frame(*boxes), PANORAMA)
     assert sorted((blob.outline[0, 0], blob.colour) for blob in blobs) == [
         (10.0 * i + 2.0, f"c{i}") for i in range(count)
     ]
@@ -48,29 +48,29 @@ def test_any_number_of_colours(count: int) -> None:
 
 def test_only_colours_in_use_and_no_specks() -> None:
     pixels = frame((95, 65, 105, 85, 60), (60, 20, 70, 40, 110), (150, 20, 151, 21, 60))
-    (blob,) = Colours(dict(COLOURS), ["green"]).blobs(pixels, PANORAMA)
+    (blob,) = ColourSegmenter(dict(COLOURS), ["green"]).blobs(pixels, PANORAMA)
     assert blob.colour == "green"
     assert blob.width == pytest.approx(10.0, abs=1.0)
     assert blob.height == pytest.approx(20.0, abs=1.0)
 
 
 def test_nothing_in_sight() -> None:
-    assert Colours(dict(COLOURS), COLOURS).blobs(frame(), PANORAMA) == []
+    assert ColourSegmenter(dict(COLOURS), COLOURS).blobs(frame(), PANORAMA) == []
 
 
 def test_very_many_blobs_are_cut_to_the_largest() -> None:
     boxes = [(4 * i, 4 * j, 4 * i + 2, 4 * j + 2, 60) for i in range(30) for j in range(20)]
-    blobs = Colours(dict(COLOURS), ["green"]).blobs(
+    blobs = ColourSegmenter(dict(COLOURS), ["green"]).blobs(
         frame(*boxes, (150, 100, 190, 140, 60)), PANORAMA
     )
-    assert len(blobs) == MOST_BLOBS
+    assert len(blobs) == MAX_BLOBS
     assert max(blob.width for blob in blobs) > 30.0
 
 
 def test_clear_is_of_one_colour() -> None:
-    colours = Colours(dict(COLOURS), ["yellow", "orange"])
+    colours = ColourSegmenter(dict(COLOURS), ["yellow", "orange"])
     yellow, half = frame((0, 0, 40, 40, 28)), frame((0, 0, 20, 40, 28), (20, 0, 40, 40, 15))
-    assert colours.clear(yellow[:40, :40], "yellow")
-    assert not colours.clear(yellow[:40, :40], "orange")
-    assert not colours.clear(half[:40, :40], "yellow")
-    assert not colours.clear(yellow[60:100, :40], "yellow")
+    assert colours.has_clear_colour(yellow[:40, :40], "yellow")
+    assert not colours.has_clear_colour(yellow[:40, :40], "orange")
+    assert not colours.has_clear_colour(half[:40, :40], "yellow")
+    assert not colours.has_clear_colour(yellow[60:100, :40], "yellow")

@@ -2,19 +2,19 @@
 
 import numpy as np
 
-from cpcbl_agents.vision.detections import Found, Glimpses
-from cpcbl_agents.vision.duplicates import without_twins
+from cpcbl_agents.vision.detections import Detection, Detections
+from cpcbl_agents.vision.duplicates import without_duplicates
 from cpcbl_team.inputs import Sighting
 
 
-def found(name: str, left: float, range_m: float | None = 1.0) -> Found:
+def found(name: str, left: float, range_m: float | None = 1.0) -> Detection:
     box = np.array([[left, 10.0], [left + 20.0, 10.0], [left + 20.0, 60.0], [left, 60.0]])
-    return Found(Sighting(name, range_m, 0.1), box)
+    return Detection(Sighting(name, range_m, 0.1), box)
 
 
-def told(*seen: Found) -> tuple[list[str], list[tuple[str, tuple[str, ...]]]]:
-    kept = without_twins(Glimpses(seen))
-    return [f.sighting.id for f in kept.found], [(d.reason, d.names) for d in kept.doubts]
+def told(*seen: Detection) -> tuple[list[str], list[tuple[str, tuple[str, ...]]]]:
+    kept = without_duplicates(Detections(seen))
+    return [f.sighting.id for f in kept.found], [(d.reason, d.names) for d in kept.ambiguities]
 
 
 def test_different_things_at_different_places_stay() -> None:
@@ -33,6 +33,6 @@ def test_two_names_at_one_place() -> None:
 
 
 def test_one_name_twice_at_one_place_is_found_once() -> None:
-    kept = without_twins(Glimpses((found("A", 0.0, None), found("A", 1.0))))
+    kept = without_duplicates(Detections((found("A", 0.0, None), found("A", 1.0))))
     assert [one.sighting.range_m for one in kept.found] == [1.0]
-    assert kept.doubts == ()
+    assert kept.ambiguities == ()

@@ -9,8 +9,8 @@ import pytest
 from msgspec.structs import replace
 from support.markers import CARRIED, looked, off, picture, standing, team
 
-from cpcbl_agents.vision.detections import Glimpses
-from cpcbl_launch.simulation.camera.render import Light, Standing
+from cpcbl_agents.vision.detections import Detections
+from cpcbl_launch.simulation.camera.render import Light, SceneRobot
 from cpcbl_team.config import CameraSettings, MarkerFamily
 
 CAMERA = CameraSettings()
@@ -29,7 +29,7 @@ FAMILIES: list[MarkerFamily] = [
 ]
 
 
-def three(random: np.random.Generator, most_m: float = 3.0) -> list[Standing]:
+def three(random: np.random.Generator, most_m: float = 3.0) -> list[SceneRobot]:
     """Three teammates side by side, in any heading: one marker or two of each can be read."""
     bearings = np.array([-24.0, 0.0, 24.0]) + random.uniform(-4.0, 4.0, 3)
     ranges, headings = random.uniform(0.9, most_m, 3), random.uniform(-180.0, 180.0, 3)
@@ -49,12 +49,12 @@ def any_light(random: np.random.Generator) -> Light:
     )
 
 
-def reasons(glimpses: Glimpses) -> set[tuple[str, tuple[str, ...]]]:
-    return {(doubt.reason, doubt.names) for doubt in glimpses.doubts}
+def reasons(detections: Detections) -> set[tuple[str, tuple[str, ...]]]:
+    return {(ambiguity.reason, ambiguity.names) for ambiguity in detections.ambiguities}
 
 
-def names(glimpses: Glimpses) -> set[str]:
-    return {found.sighting.id for found in glimpses.found}
+def names(detections: Detections) -> set[str]:
+    return {found.sighting.id for found in detections.found}
 
 
 # What is seen ------------------------------------------------------------------------------------
@@ -67,10 +67,10 @@ def test_teammates_within_three_metres_are_found_placed_and_their_headings_told(
     for seed in range(frames):
         robots = three(random)
         pixels = picture(TEAM, robots, settings, any_light(random), seed)
-        glimpses = looked(TEAM, pixels, settings)
-        assert names(glimpses) <= {"r1", "r2", "r3"}
-        assert {reason for reason, _ in reasons(glimpses)} <= {"heading_ambiguous"}
-        found = {one.sighting.id: one.sighting for one in glimpses.found}
+        detections = looked(TEAM, pixels, settings)
+        assert names(detections) <= {"r1", "r2", "r3"}
+        assert {reason for reason, _ in reasons(detections)} <= {"heading_ambiguous"}
+        found = {one.sighting.id: one.sighting for one in detections.found}
         missed += sum(robot.name not in found for robot in robots)
         headings += sum(one.heading_rad is not None for one in found.values())
         errors += [off(found[robot.name], robot) for robot in robots if robot.name in found]
@@ -95,8 +95,8 @@ def test_sigmas_hold_with_a_camera_that_is_not_quite_as_calibrated() -> None:
             fy_px=float(CAMERA.fy_px * stretch),
         )
         robots = {robot.name: robot for robot in three(random)}
-        glimpses = looked(TEAM, picture(TEAM, list(robots.values()), true, seed=seed))
-        seen = [found.sighting for found in glimpses.found]
+        detections = looked(TEAM, picture(TEAM, list(robots.values()), true, seed=seed))
+        seen = [found.sighting for found in detections.found]
         sigmas += [off(one, robots[one.id]).sigmas[:2] for one in seen]
     assert np.mean(np.array(sigmas) < 3.0) >= 0.98
     # No idle words: the errors are of the size that is stated.
@@ -106,9 +106,9 @@ def test_sigmas_hold_with_a_camera_that_is_not_quite_as_calibrated() -> None:
 @pytest.mark.parametrize("family", FAMILIES)
 def test_every_family_is_read(family: MarkerFamily) -> None:
     tagged, robots = team(CARRIED, family), three(np.random.default_rng(4), 1.8)
-    glimpses = looked(tagged, picture(tagged, robots))
-    assert names(glimpses) == {"r1", "r2", "r3"}
-    for found in glimpses.found:
+    detections = looked(tagged, picture(tagged, robots))
+    assert names(detections) == {"r1", "r2", "r3"}
+    for found in detections.found:
         robot = next(robot for robot in robots if robot.name == found.sighting.id)
         assert max(off(found.sighting, robot).sigmas) < 3.0
 
@@ -138,9 +138,9 @@ def test_sigmas_grow_with_the_range() -> None:
 
 def test_nothing_is_seen_in_noise_or_of_a_team_without_markers() -> None:
     noise = np.random.default_rng(6).integers(0, 256, (480, 640, 3)).astype(np.uint8)
-    assert looked(TEAM, noise) == Glimpses()
+    assert looked(TEAM, noise) == Detections()
     bare = team({"r1": {}})
-    assert looked(bare, picture(TEAM, [standing("r1", 1.0, 0.0, 180.0)])) == Glimpses()
+    assert looked(bare, picture(TEAM, [standing("r1", 1.0, 0.0, 180.0)])) == Detections()
 
 
 def test_nothing_is_seen_in_a_heap_of_papers_and_lines() -> None:
@@ -164,67 +164,72 @@ def test_a_heading_that_may_be_either_of_two_is_left_out_and_the_place_covers_bo
     single, doubted = team({"r1": {"front": 4}}), 0
     for seed, turn in enumerate((-35.0, -25.0, 25.0, 35.0)):
         robot = standing("r1", 3.3, 0.0, 180.0 + turn)
-        glimpses = looked(single, picture(single, [robot], seed=seed))
-        (found,) = glimpses.found
+        detections = looked(single, picture(single, [robot], seed=seed))
+        (found,) = detections.found
         assert max(off(found.sighting, robot).sigmas) < 3.0
         left_out = found.sighting.heading_rad is None
-        assert left_out == (reasons(glimpses) == {("heading_ambiguous", ("r1",))})
+        assert left_out == (reasons(detections) == {("heading_ambiguous", ("r1",))})
         doubted += left_out
     assert doubted
 
 
 def test_a_marker_that_two_robots_carry_tells_neither() -> None:
     twins = team({"r1": {"front": 4, "left": 5}, "r2": {"front": 4}})
-    glimpses = looked(twins, picture(twins, [standing("r2", 1.5, 0.0, 180.0)]))
-    assert glimpses.found == ()
-    assert reasons(glimpses) == {("ambiguous", ("r1", "r2"))}
+    detections = looked(twins, picture(twins, [standing("r2", 1.5, 0.0, 180.0)]))
+    assert detections.found == ()
+    assert reasons(detections) == {("ambiguous", ("r1", "r2"))}
 
 
 def test_a_robot_is_still_told_by_a_marker_of_its_own_beside_one_that_is_not() -> None:
     twins = team({"r1": {"front": 4, "left": 5}, "r2": {"front": 4}})
-    glimpses = looked(twins, picture(twins, [standing("r1", 1.5, 0.0, 135.0)]))
-    assert names(glimpses) == {"r1"}
-    assert ("ambiguous", ("r1", "r2")) in reasons(glimpses)
+    detections = looked(twins, picture(twins, [standing("r1", 1.5, 0.0, 135.0)]))
+    assert names(detections) == {"r1"}
+    assert ("ambiguous", ("r1", "r2")) in reasons(detections)
 
 
 def test_a_marker_that_is_in_two_places_tells_nothing() -> None:
     alike = team({"r1": {"front": 4}, "copy": {"front": 4}})
     robots = [standing("r1", 1.5, -15.0, 170.0), standing("copy", 1.5, 15.0, -170.0)]
-    glimpses = looked(team({"r1": {"front": 4}}), picture(alike, robots))
-    assert glimpses.found == ()
-    assert [doubt.reason for doubt in glimpses.doubts] == ["seen_twice", "seen_twice"]
-    assert {doubt.names for doubt in glimpses.doubts} == {("r1",)}
-    left, right = sorted(float(doubt.outline[:, 0].mean()) for doubt in glimpses.doubts)
+    detections = looked(team({"r1": {"front": 4}}), picture(alike, robots))
+    assert detections.found == ()
+    assert [ambiguity.reason for ambiguity in detections.ambiguities] == [
+        "seen_twice",
+        "seen_twice",
+    ]
+    assert {ambiguity.names for ambiguity in detections.ambiguities} == {("r1",)}
+    left, right = sorted(
+        float(ambiguity.outline[:, 0].mean()) for ambiguity in detections.ambiguities
+    )
     assert right - left > 150.0
 
 
 def test_sides_of_a_robot_in_two_places_contradict_each_other() -> None:
-    shown = team({"a": {"front": 4}, "b": {"front": 5}})
+    detect_and_annotate = team({"a": {"front": 4}, "b": {"front": 5}})
     robots = [standing("a", 1.5, -15.0, 170.0), standing("b", 1.5, 15.0, -170.0)]
-    glimpses = looked(team({"r1": {"front": 4, "left": 5}}), picture(shown, robots))
-    assert glimpses.found == ()
-    assert reasons(glimpses) == {("contradiction", ("r1",))}
+    detections = looked(team({"r1": {"front": 4, "left": 5}}), picture(detect_and_annotate, robots))
+    assert detections.found == ()
+    assert reasons(detections) == {("contradiction", ("r1",))}
 
 
 def test_a_guests_marker_is_unknown() -> None:
     guest = team({"guest": {"front": 40}})
-    glimpses = looked(TEAM, picture(guest, [standing("guest", 1.5, 0.0, 180.0)]))
-    assert glimpses.found == ()
-    assert reasons(glimpses) == {("unknown_marker", ())}
+    detections = looked(TEAM, picture(guest, [standing("guest", 1.5, 0.0, 180.0)]))
+    assert detections.found == ()
+    assert reasons(detections) == {("unknown_marker", ())}
 
 
 def test_ones_own_marker_is_no_teammate() -> None:
     mine = team({"me": {"front": 4}, "r1": {"front": 5}})
-    glimpses = looked(mine, picture(mine, [standing("me", 1.5, 0.0, 180.0)]))
-    assert glimpses.found == ()
-    assert reasons(glimpses) == {("own_marker", ("me",))}
+    detections = looked(mine, picture(mine, [standing("me", 1.5, 0.0, 180.0)]))
+    assert detections.found == ()
+    assert reasons(detections) == {("own_marker", ("me",))}
 
 
 def test_a_marker_that_is_not_where_robots_carry_theirs_is_a_bad_fit() -> None:
     high = team(CARRIED, mounted_m=0.3)
-    glimpses = looked(TEAM, picture(high, [standing("r1", 1.2, 0.0, 180.0)]))
-    assert glimpses.found == ()
-    assert reasons(glimpses) == {("bad_fit", ("r1",))}
+    detections = looked(TEAM, picture(high, [standing("r1", 1.2, 0.0, 180.0)]))
+    assert detections.found == ()
+    assert reasons(detections) == {("bad_fit", ("r1",))}
 
 
 def test_nothing_is_seen_in_a_mirror() -> None:
@@ -233,10 +238,10 @@ def test_nothing_is_seen_in_a_mirror() -> None:
         pixels = picture(TEAM, three(random), seed=seed)
         mirrored = np.ascontiguousarray(pixels[:, ::-1])
         assert names(looked(TEAM, pixels))
-        assert looked(TEAM, mirrored) == Glimpses()
+        assert looked(TEAM, mirrored) == Detections()
 
 
 def test_a_marker_that_the_frame_cuts_is_not_seen() -> None:
     settings = replace(CAMERA, cx_px=0.0)
     robot = [standing("r1", 1.0, 0.0, 180.0)]
-    assert looked(TEAM, picture(TEAM, robot, settings), settings) == Glimpses()
+    assert looked(TEAM, picture(TEAM, robot, settings), settings) == Detections()

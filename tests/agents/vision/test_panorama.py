@@ -30,7 +30,7 @@ def test_there_and_back(settings: CameraSettings) -> None:
         scale = panorama.scale(column, row)
         assert abs(panorama.x[i, j] - x) < 1.2 * max(scale)
         assert abs(panorama.y[i, j] - y) < 1.2 * max(scale)
-        assert not panorama.at_border(column, row, 2.0)
+        assert not panorama.is_at_border(column, row, 2.0)
 
 
 @pytest.mark.parametrize("settings", CAMERAS)
@@ -54,16 +54,16 @@ def test_what_is_upright_is_a_column_and_heights_are_rows(settings: CameraSettin
 def test_outside_of_the_frame_is_at_its_border() -> None:
     panorama = Panorama(Camera(CAMERAS[1]))
     _, rows = panorama.size
-    assert panorama.at_border(-5.0, 10.0, 1.0)
-    assert panorama.at_border(10.0, rows + 3.0, 1.0)
-    assert panorama.at_border(math.nan, 10.0, 1.0)
-    assert panorama.at_border(0.0, 0.0, 1.0)  # rolled: no pixel is there
+    assert panorama.is_at_border(-5.0, 10.0, 1.0)
+    assert panorama.is_at_border(10.0, rows + 3.0, 1.0)
+    assert panorama.is_at_border(math.nan, 10.0, 1.0)
+    assert panorama.is_at_border(0.0, 0.0, 1.0)  # rolled: no pixel is there
 
 
 def test_cut_is_the_frame_where_nothing_is_tilted() -> None:
     panorama = Panorama(Camera(CAMERAS[0]))
     frame = np.random.default_rng(1).integers(0, 256, (120, 160, 3)).astype(np.uint8)
     column, row = round(float(panorama.columns[60, 79])), round(float(panorama.rows[60, 79]))
-    cut = panorama.cut(frame, panorama.clipped(column, row, column, row))
+    cut = panorama.crop(frame, panorama.clip_box(column, row, column, row))
     assert np.abs(cut[0, 0].astype(int) - frame[60, 79]).max() < 40
     assert cut.shape == (2, 2, 3) or cut.shape == (1, 1, 3)

@@ -10,7 +10,7 @@ from msgspec.structs import replace
 from support.markers import SIDES, seen_at
 
 from cpcbl_agents.vision.camera import Camera, Floats
-from cpcbl_agents.vision.poses import ANGLES, CORNER_SHARE, NARROW, fitted
+from cpcbl_agents.vision.poses import CORNER_SHARE, NARROW, SIDE_ANGLES, fit_pose
 from cpcbl_team.config import CameraSettings, Side, VisionSettings
 from cpcbl_team.geometry import Pose2, wrap_angle
 
@@ -25,13 +25,13 @@ CAMERAS = [
 
 def plane(camera: Camera, robot: Pose2, side: Side) -> Floats:
     """Where a marker's corners are on the plane z = 1, by way of its pixels."""
-    return camera.undistorted(camera.project(seen_at(robot, side, VISION)))
+    return camera.undistort(camera.project(seen_at(robot, side, VISION)))
 
 
 def facing(camera: Camera, robot: Pose2, side: Side) -> float:
     """The angle between where a side looks and the way to the lens, in the plane."""
     way = math.atan2(camera.position[1] - robot.y, camera.position[0] - robot.x)
-    return wrap_angle(robot.heading + ANGLES[side] - way)
+    return wrap_angle(robot.heading + SIDE_ANGLES[side] - way)
 
 
 @given(
@@ -51,7 +51,7 @@ def test_exact_corners_tell_the_pose(
         for side in SIDES
         if abs(facing(camera, robot, side)) < math.radians(65.0)
     }
-    fit = fitted(seen, VISION, camera)
+    fit = fit_pose(seen, VISION, camera)
     assert fit.misfit < 1e-2
     x, y = fit.pose.x - robot.x, fit.pose.y - robot.y
     turn = wrap_angle(fit.pose.heading - robot.heading)
@@ -74,7 +74,7 @@ def test_three_sigma_hold_what_noise_does(range_m: float, turn_deg: float) -> No
     noise_px = CORNER_SHARE * settings.edge_sigma_px * random.standard_normal((200, 4, 2))
     off = []
     for noise in noise_px:
-        fit = fitted({"front": camera.undistorted(exact + noise)}, VISION, camera)
+        fit = fit_pose({"front": camera.undistort(exact + noise)}, VISION, camera)
         x, y, heading = fit.pose
         error = np.array([x - robot.x, y - robot.y, wrap_angle(heading - robot.heading)])
         off.append(error / np.sqrt(np.diag(fit.covariance)))
@@ -86,5 +86,5 @@ def test_corners_that_no_pose_shows_are_misfits() -> None:
     camera = Camera(CAMERAS[0])
     corners = plane(camera, Pose2(1.5, 0.0, math.pi), "front")
     bent = corners + np.array([[0.0, 0.0], [0.0, 0.0], [0.02, 0.02], [0.0, 0.0]])
-    assert fitted({"front": corners}, VISION, camera).misfit < 1e-3
-    assert fitted({"front": bent}, VISION, camera).misfit > 20.0
+    assert fit_pose({"front": corners}, VISION, camera).misfit < 1e-3
+    assert fit_pose({"front": bent}, VISION, camera).misfit > 20.0

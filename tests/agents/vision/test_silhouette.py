@@ -7,7 +7,16 @@ import pytest
 
 from cpcbl_agents.vision.camera import Camera
 from cpcbl_agents.vision.panorama import Panorama
-from cpcbl_agents.vision.silhouette import FOOT, LEVEL, MID, TOP, WIDTH, Shape, fit, looks
+from cpcbl_agents.vision.silhouette import (
+    FOOT,
+    LEVEL,
+    MID,
+    TOP,
+    WIDTH,
+    Shape,
+    expected_angles,
+    fit_distance,
+)
 from cpcbl_team.config import CameraSettings, Cylinder
 
 LANDMARK = Shape.of(Cylinder(), 0.2)
@@ -20,7 +29,7 @@ TILT = math.radians(0.2)
 
 def test_worked_example() -> None:
     # 0.4 m high, 5 cm thick, from 0.2 m above the floor; the near side is 2 - 0.957 * 0.05 m away
-    top, mid, foot, half_width = looks(LANDMARK, 2.0)
+    top, mid, foot, half_width = expected_angles(LANDMARK, 2.0)
     assert top == pytest.approx(-0.2 / 1.95215)
     assert mid == 0.0
     assert foot == pytest.approx(0.2 / 1.95215)
@@ -33,7 +42,7 @@ def test_worked_example() -> None:
 @pytest.mark.parametrize("distance", [0.2, 0.5, 1.0, 3.0, 8.0, 30.0])
 @pytest.mark.parametrize("use", [ALL, (TOP, MID, FOOT), (TOP, MID, WIDTH), (MID, FOOT, WIDTH)])
 def test_distance_of_exact_looks(shape: Shape, distance: float, use: tuple[int, ...]) -> None:
-    found = fit(shape, looks(shape, distance), SIGMAS, TILT, use)
+    found = fit_distance(shape, expected_angles(shape, distance), SIGMAS, TILT, use)
     assert found.distance == pytest.approx(distance, rel=1e-6)
     assert found.chi2 == pytest.approx(0.0, abs=1e-6)
 
@@ -44,12 +53,12 @@ def test_sigma_is_honest() -> None:
         errors, chi2 = [], []
         for _ in range(1000):
             tilt = random.normal(0.0, TILT)
-            seen = [
+            angles = [
                 a + random.normal(0.0, s)
-                for a, s in zip(looks(LANDMARK, distance), SIGMAS, strict=True)
+                for a, s in zip(expected_angles(LANDMARK, distance), SIGMAS, strict=True)
             ]
-            seen = [a + tilt * (1.0 + a * a) if i != WIDTH else a for i, a in enumerate(seen)]
-            found = fit(LANDMARK, seen, SIGMAS, TILT, ALL)
+            angles = [a + tilt * (1.0 + a * a) if i != WIDTH else a for i, a in enumerate(angles)]
+            found = fit_distance(LANDMARK, angles, SIGMAS, TILT, ALL)
             errors.append((found.distance - distance) / found.sigma)
             chi2.append(found.chi2)
         assert np.std(errors) == pytest.approx(1.0, abs=0.1)
@@ -59,7 +68,8 @@ def test_sigma_is_honest() -> None:
 
 def test_near_is_better_than_far() -> None:
     shares = [
-        fit(LANDMARK, looks(LANDMARK, d), SIGMAS, TILT, ALL).sigma / d for d in (1.0, 2.0, 4.0)
+        fit_distance(LANDMARK, expected_angles(LANDMARK, d), SIGMAS, TILT, ALL).sigma / d
+        for d in (1.0, 2.0, 4.0)
     ]
     assert shares == sorted(shares)
     assert shares[2] < 0.03
@@ -67,10 +77,14 @@ def test_near_is_better_than_far() -> None:
 
 def test_heights_are_free_of_the_tilt_and_foot_points_are_not() -> None:
     high = Shape.of(Cylinder(), 0.8)
-    seen = looks(high, 2.0)
-    one_foot = [fit(high, seen, SIGMAS, tilt, (FOOT,)).sigma for tilt in (0.0, 0.01, 0.02)]
-    heights = [fit(high, seen, SIGMAS, tilt, (TOP, FOOT)).sigma for tilt in (0.01, 0.02, 10.0)]
-    both = fit(high, seen, SIGMAS, 0.0, (TOP, FOOT)).sigma
+    angles = expected_angles(high, 2.0)
+    one_foot = [
+        fit_distance(high, angles, SIGMAS, tilt, (FOOT,)).sigma for tilt in (0.0, 0.01, 0.02)
+    ]
+    heights = [
+        fit_distance(high, angles, SIGMAS, tilt, (TOP, FOOT)).sigma for tilt in (0.01, 0.02, 10.0)
+    ]
+    both = fit_distance(high, angles, SIGMAS, 0.0, (TOP, FOOT)).sigma
     assert one_foot[0] < one_foot[1] < one_foot[2]
     assert heights[2] == pytest.approx(heights[1], rel=0.5)
     assert both < min(*heights, *one_foot)
@@ -78,12 +92,12 @@ def test_heights_are_free_of_the_tilt_and_foot_points_are_not() -> None:
 
 def test_hidden_foot_of_a_mast_costs_certainty() -> None:
     bare = MAST._replace(rim=0.0)
-    assert fit(MAST, looks(MAST, 0.7), SIGMAS, TILT, ALL).sigma > (
-        fit(bare, looks(bare, 0.7), SIGMAS, TILT, ALL).sigma
+    assert fit_distance(MAST, expected_angles(MAST, 0.7), SIGMAS, TILT, ALL).sigma > (
+        fit_distance(bare, expected_angles(bare, 0.7), SIGMAS, TILT, ALL).sigma
     )
-    wide = looks(MAST._replace(rim=0.2), 0.7)
-    assert abs(fit(MAST, wide, SIGMAS, TILT, ALL).distance - 0.7) < 3.0 * (
-        fit(MAST, wide, SIGMAS, TILT, ALL).sigma
+    wide = expected_angles(MAST._replace(rim=0.2), 0.7)
+    assert abs(fit_distance(MAST, wide, SIGMAS, TILT, ALL).distance - 0.7) < 3.0 * (
+        fit_distance(MAST, wide, SIGMAS, TILT, ALL).sigma
     )
 
 
@@ -107,7 +121,7 @@ def test_a_projected_cylinder_looks_as_said(settings: CameraSettings) -> None:
         pixels = camera.project(np.column_stack([rim, np.full(len(rim), cylinder.height_m)]))
         rays = camera.rays(pixels)
         azimuths = math.radians(settings.yaw_deg) - np.arctan2(rays[:, 1], rays[:, 0])
-        top, _, _, half_width = looks(shape, distance)
+        top, _, _, half_width = expected_angles(shape, distance)
         assert azimuths.max() - azimuths.min() == pytest.approx(2.0 * half_width, abs=1e-4)
         assert 0.5 * (azimuths.max() + azimuths.min()) == pytest.approx(-off_axis, abs=1e-4)
         slopes = -rays[:, 2] / np.hypot(rays[:, 0], rays[:, 1])

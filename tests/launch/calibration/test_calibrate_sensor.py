@@ -29,7 +29,7 @@ from cpcbl_launch.calibration.camera_observations import (
 from cpcbl_launch.calibration.logs import ground_truth
 from cpcbl_launch.calibration.team_tables import CAMERA_SIGMAS, TablePath, edit_team, sensor_tables
 from cpcbl_launch.reporting.recording import Recording
-from cpcbl_launch.simulation.camera.render import Light, Scene, Standing, render
+from cpcbl_launch.simulation.camera.render import Light, Scene, SceneRobot, render
 from cpcbl_launch.team_file import load_team, parse_team
 from cpcbl_team.config import CameraSettings, Landmark, RobotSettings, Team
 from cpcbl_team.errors import InputError
@@ -73,7 +73,7 @@ def photograph(folder: Path, camera: CameraSettings) -> Path:
         heading = math.atan2(mark.y_m - y, mark.x_m - x) + random.uniform(-0.3, 0.3)
         away, aside = random.uniform(0.9, 2.5), heading + random.uniform(-0.4, 0.4)
         other = x + away * math.cos(aside), y + away * math.sin(aside), random.uniform(-3.0, 3.0)
-        mate = Standing("mate", *other)
+        mate = SceneRobot("mate", *other)
         colour_mask = render(scene, Camera(camera), Pose2(x, y, heading), [mate], Light(), random)
         cv2.imwrite(str(folder / f"{i:02}.png"), colour_mask)
         rows.append((f"{i:02}.png", x, y, math.degrees(heading), ""))

@@ -22,9 +22,9 @@ from cpcbl_launch.simulation.camera.render import Light, render
 from cpcbl_launch.simulation.camera.visibility import (
     Solid,
     cylinder_points,
-    in_frame,
+    is_in_frame,
     plate_points,
-    shares_shown,
+    visible_shares,
 )
 from cpcbl_team.config import CameraSettings
 from cpcbl_team.inputs import Sighting
@@ -35,7 +35,7 @@ CLEAN = Light(gradient=0.0, blur_px=0.0, noise=0.0)
 
 
 def share(points: Floats, *before: Solid) -> float:
-    return shares_shown(points, CAMERA, [before])[0]
+    return visible_shares(points, CAMERA, [before])[0]
 
 
 # What can be seen --------------------------------------------------------------------------------
@@ -78,7 +78,7 @@ def test_a_plate_has_the_corners_of_its_marker() -> None:
     assert points.shape == (25, 3)
     np.testing.assert_allclose(points.min(axis=0), [2.0, 0.45, 0.07])
     np.testing.assert_allclose(points.max(axis=0), [2.0, 0.55, 0.17])
-    assert in_frame(points, CAMERA).all()
+    assert is_in_frame(points, CAMERA).all()
 
 
 def picture(frame: RandomFrame, landmarks: Sequence[str], rest: bool) -> Pixels:

@@ -11,10 +11,10 @@ from msgspec.structs import replace
 from support.processes import cpcbl_team
 
 from cpcbl_agents.vision.camera import Camera, Pixels
-from cpcbl_agents.vision.markers import Markers
+from cpcbl_agents.vision.markers import MarkerDetector
 from cpcbl_launch.lab.experiments import real_pictures
 from cpcbl_launch.lab.experiments.real_pictures import measure, picture_set, read_truth_table
-from cpcbl_launch.simulation.camera.render import Light, Scene, Standing, render
+from cpcbl_launch.simulation.camera.render import Light, Scene, SceneRobot, render
 from cpcbl_launch.team_file import load_team, parse_team
 from cpcbl_team.config import MarkerFamily
 from cpcbl_team.geometry import Pose2
@@ -33,7 +33,7 @@ markers = { front = 1, left = 2, back = 3, right = 4 }
 SETS = ("duckiebot", "frc-speaker", "frc-amp", "nao")
 
 
-def picture(*robots: Standing, landmarks: bool = True) -> Pixels:
+def picture(*robots: SceneRobot, landmarks: bool = True) -> Pixels:
     """From the field's origin, along x."""
     team = parse_team(TEAM)
     scene = Scene.of(team) if landmarks else Scene.of(team).without_landmarks()
@@ -44,7 +44,7 @@ def picture(*robots: Standing, landmarks: bool = True) -> Pixels:
 @pytest.fixture
 def own_set(tmp_path: Path) -> Path:
     (tmp_path / "own.toml").write_text(TEAM)
-    both = picture(Standing("mate", 1.5, -0.4, 3.0))
+    both = picture(SceneRobot("mate", 1.5, -0.4, 3.0))
     cv2.imwrite(str(tmp_path / "both.png"), both)
     cv2.imwrite(str(tmp_path / "none.png"), picture(landmarks=False))
     cv2.imwrite(str(tmp_path / "cut.png"), both[:100])
@@ -122,17 +122,22 @@ def test_a_marker_that_is_upside_down_is_read_as_upright(family: MarkerFamily) -
     team = parse_team(TEAM)
     team = replace(team, vision=replace(team.vision, family=family))
     camera, random = Camera(team.robots["eye"].camera), np.random.default_rng(1)
-    stand = Standing("mate", 1.0, 0.0, math.pi)  # its marker turns into itself
+    with_stand = SceneRobot("mate", 1.0, 0.0, math.pi)  # its marker turns into itself
     upright = render(
-        Scene.of(team).without_landmarks(), camera, Pose2(0.0, 0.0, 0.0), [stand], Light(), random
+        Scene.of(team).without_landmarks(),
+        camera,
+        Pose2(0.0, 0.0, 0.0),
+        [with_stand],
+        Light(),
+        random,
     )
-    markers = Markers("eye", team, camera)
-    (mark,) = markers.glimpses(upright).found
+    markers = MarkerDetector("eye", team, camera)
+    (mark,) = markers.detections(upright).found
     half, (x, y) = 34, np.round(mark.outline.mean(axis=0)).astype(int)
     turned = upright.copy()
     window = slice(y - half, y + half + 1), slice(x - half, x + half + 1)
     turned[window] = upright[window][::-1, ::-1]
-    (again,) = markers.glimpses(turned).found
+    (again,) = markers.detections(turned).found
     assert again.sighting.id == "mate"
     assert again.sighting.range_m == pytest.approx(mark.sighting.range_m, rel=0.02)
 

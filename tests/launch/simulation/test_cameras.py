@@ -12,9 +12,9 @@ from support.buses import MS, SECOND, Subscription
 
 from cpcbl_agents.sensing import SensorInput
 from cpcbl_agents.vision.camera import Camera, Pixels
-from cpcbl_agents.vision.pictures import decoded
-from cpcbl_launch.simulation.camera.cameras import QUALITIES, Cameras, encoded
-from cpcbl_launch.simulation.camera.render import Scene, Standing, render
+from cpcbl_agents.vision.pictures import decode_image
+from cpcbl_launch.simulation.camera.cameras import QUALITIES, Cameras, encode_jpeg_within
+from cpcbl_launch.simulation.camera.render import Scene, SceneRobot, render
 from cpcbl_launch.simulation.field import SimulatedField
 from cpcbl_launch.simulation.field_node import PICTURES_LATE_NS, FieldNode
 from cpcbl_launch.team_file import builtin_path, load_team, parse_team
@@ -66,7 +66,7 @@ def frames(field: SimulatedField, steps: int, robot: str = "eye") -> list[Frame]
 
 
 def pixels_of(frame: Frame) -> Pixels:
-    pixels = decoded(frame.image)
+    pixels = decode_image(frame.image)
     assert not isinstance(pixels, str)
     return pixels
 
@@ -108,7 +108,7 @@ def test_a_frame_shows_the_field_at_the_time_of_exposure() -> None:
     assert there["eye"].x > 0.2
     light = replace(subject.simulation.light, noise=0.0)
     camera, random = Camera(subject.robots["eye"].camera), np.random.default_rng(9)
-    others = [Standing(name, *pose) for name, pose in there.items() if name != "eye"]
+    others = [SceneRobot(name, *pose) for name, pose in there.items() if name != "eye"]
     expected = render(Scene.of(subject), camera, there["eye"], others, light, random)
     assert off(pixels_of(frame), expected) < 1.5  # a JPEG's own
     later = poses[frame.stamp_ns]["eye"]
@@ -162,8 +162,8 @@ def test_a_picture_is_made_to_fit_through_the_guards() -> None:
     assert len(encode(small)) <= 25_000 < len(large.image)
     assert off(pixels_of(small), pixels_of(large)) < 6.0
     noise = np.random.default_rng(1).integers(0, 255, (480, 640, 3)).astype(np.uint8)
-    sizes = [len(encoded(noise, 10**9, [quality])) for quality in QUALITIES]
-    assert len(encoded(noise, sizes[2])) == sizes[2]
+    sizes = [len(encode_jpeg_within(noise, 10**9, [quality])) for quality in QUALITIES]
+    assert len(encode_jpeg_within(noise, sizes[2])) == sizes[2]
 
 
 class Late:

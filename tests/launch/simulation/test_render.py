@@ -1,141 +1,38 @@
 """Pictures of the simulated field: all is where the camera model says, to a tenth of a pixel,
 and looks as it does to OpenCV."""
 
-import math
-from collections.abc import Sequence
-
 import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from support.rendered_pictures import (
+    CAMERAS,
+    CLEAN,
+    MARKED,
+    POSE,
+    SHAPE,
+    detected,
+    landmark_shares,
+    mate,
+    off_by,
+    picture,
+    post,
+    tangent_points,
+    team,
+)
 
-from cpcbl_agents.vision.camera import Camera, Floats, Pixels
-from cpcbl_launch.simulation.camera.render import Light, Scene, Standing, render
-from cpcbl_launch.simulation.camera.robots import quiet
-from cpcbl_launch.simulation.camera.scene import PAINTS
+from cpcbl_agents.vision.camera import Camera, Pixels
+from cpcbl_launch.simulation.camera.render import Light, Scene
+from cpcbl_launch.simulation.camera.scene import PAINT_BGR
 from cpcbl_launch.simulation.camera.view import NEAREST_M, View
 from cpcbl_team.config import (
     COLOURS,
-    Bands,
     CameraSettings,
     Colour,
-    Cylinder,
-    Field,
-    Landmark,
-    MarkerFamily,
     RobotSettings,
-    Side,
-    Team,
     VisionSettings,
     Wall,
 )
-from cpcbl_team.geometry import Pose2
-
-CLEAN = Light(gradient=0.0, blur_px=0.0, noise=0.0)
-LENS = (-0.28, 0.09, 0.002, -0.001, 0.0)
-CAMERAS = [
-    CameraSettings(),
-    CameraSettings(tilt_deg=12.0, roll_deg=9.0, yaw_deg=15.0, x_m=0.1, y_m=-0.05, mounted_m=0.6),
-    CameraSettings(distortion=LENS, tilt_deg=4.0),
-    CameraSettings(roll_deg=90.0, mounted_m=0.31),
-]
-POSE = Pose2(1.0, 2.0, 0.7)
-SHAPE = Cylinder()
-
-
-def team(
-    landmarks: dict[str, Landmark] | None = None,
-    robots: dict[str, RobotSettings] | None = None,
-    vision: VisionSettings | None = None,
-    walls: dict[str, Wall] | None = None,
-) -> Team:
-    return Team(
-        name="t",
-        robots=robots or {},
-        map=Field(landmarks=landmarks or {}, walls=walls or {}),
-        vision=vision or VisionSettings(),
-    )
-
-
-def post(ahead_m: float, left_m: float, colours: Bands = ("red", "yellow")) -> Landmark:
-    """A landmark that stands so before a robot at POSE."""
-    x, y = POSE.transform(ahead_m, left_m)
-    return Landmark(x_m=x, y_m=y, colours=colours)
-
-
-def mate(name: str, ahead_m: float, left_m: float, turned_deg: float = 180.0) -> Standing:
-    x, y = POSE.transform(ahead_m, left_m)
-    return Standing(name, x, y, POSE.heading + math.radians(turned_deg))
-
-
-def picture(
-    subject: Team | Scene,
-    camera: CameraSettings | None = None,
-    robots: Sequence[Standing] = (),
-    light: Light = CLEAN,
-    seed: int = 1,
-) -> Pixels:
-    scene = Scene.of(subject) if isinstance(subject, Team) else subject
-    eye = Camera(camera or CameraSettings())
-    return render(scene, eye, POSE, robots, light, np.random.default_rng(seed))
-
-
-def profile(pixels: Pixels | Floats, start: Floats, end: Floats) -> Floats:
-    """The colours (n, channels) on the way from one pixel to another, four a pixel."""
-    length = float(np.hypot(*(end - start)))
-    along = np.arange(0.125, length, 0.25)
-    ways = start + along[:, None] * (end - start) / length
-    found = cv2.remap(
-        pixels.astype(np.float32),
-        ways[None, :, 0].astype(np.float32),
-        ways[None, :, 1].astype(np.float32),
-        cv2.INTER_LINEAR,
-    )
-    return found.reshape(len(along), -1).astype(np.float64)
-
-
-def off_by(pixels: Pixels | Floats, edge: Floats, inwards: Floats, reach_px: float = 2.0) -> float:
-    """How far (px, positive inwards) an edge is from where it should be: along a way across it,
-    the colour changes from one to another, half of it on either side."""
-    direction = inwards / np.hypot(*inwards)
-    colours = profile(pixels, edge - reach_px * direction, edge + reach_px * direction)
-    outer, inner = colours[:3].mean(axis=0), colours[-3:].mean(axis=0)
-    change = (colours - outer) @ (inner - outer) / float((inner - outer) @ (inner - outer))
-    return float(reach_px - np.clip(change, -0.2, 1.2).sum() * 0.25)
-
-
-def covered(settings: CameraSettings, ahead_m: float, left_m: float) -> Floats:
-    """The share of each pixel that a landmark's lower band covers (h, w, 1), whatever its shade:
-    from pictures with two paints, and without it."""
-    first, second = "yellow", "blue"
-    a, b = (
-        picture(team({"m": post(ahead_m, left_m, ("red", lower))}), settings).astype(float)
-        for lower in (first, second)
-    )
-    bare = picture(team(), settings).astype(float)
-    change = np.array(PAINTS[first]) - PAINTS[second]
-    shaded = (a - b) @ change / (change @ change)
-    under = a - shaded[..., None] * PAINTS[first]
-    shares: Floats = 1.0 - under.sum(axis=2, keepdims=True) / bare.sum(axis=2, keepdims=True)
-    return shares
-
-
-def tangent_points(camera: Camera, ahead_m: float, left_m: float, height_m: float) -> Floats:
-    """Where the silhouette of a landmark touches it: left and right (2, 3), robot frame."""
-    dx, dy = ahead_m - camera.position[0], left_m - camera.position[1]
-    away, towards = math.hypot(dx, dy), math.atan2(dy, dx)
-    half = math.asin(SHAPE.radius_m / away)
-    way = math.sqrt(away**2 - SHAPE.radius_m**2)
-    return np.array(
-        [
-            [
-                camera.position[0] + way * math.cos(a),
-                camera.position[1] + way * math.sin(a),
-                height_m,
-            ]
-            for a in (towards + half, towards - half)
-        ]
-    )
 
 
 @pytest.mark.parametrize("settings", CAMERAS, ids=["plain", "tilted", "bent", "upright"])
@@ -144,7 +41,7 @@ def test_a_landmark_ends_where_the_camera_model_says(
     settings: CameraSettings, ahead_m: float, left_m: float
 ) -> None:
     camera = Camera(settings)
-    shares = covered(settings, ahead_m, left_m)
+    shares = landmark_shares(settings, ahead_m, left_m)
     for height in (0.05, 0.15):
         left, right = camera.project(tangent_points(camera, ahead_m, left_m, height))
         assert abs(off_by(shares, left, right - left)) < 0.05
@@ -170,103 +67,6 @@ def test_its_bands_meet_and_end_at_their_heights(
     assert abs(off_by(pixels, at[0.0], up)) < 0.1
     assert abs(off_by(pixels, at[0.2], up)) < 0.1
     assert abs(off_by(pixels, at[0.4], -up)) < 0.15
-
-
-SIDES: dict[Side, float] = {"front": 180.0, "left": 90.0, "back": 0.0, "right": -90.0}
-MARKED = RobotSettings(markers={"front": 4, "left": 5, "back": 6, "right": 7})
-
-
-def detected(pixels: Pixels, family: MarkerFamily = "aruco_4x4_50") -> dict[int, Floats]:
-    """Marker -> its corners (4, 2), as OpenCV finds them."""
-    name = f"DICT_{family.removeprefix('aruco_').upper()}"
-    rules = cv2.aruco.DetectorParameters()
-    rules.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
-    rules.cornerRefinementWinSize = 3  # so that the edge of the white around is not in it
-    dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
-    corners, numbers, _ = cv2.aruco.ArucoDetector(dictionary, rules).detectMarkers(pixels)
-    if numbers is None:
-        return {}
-    return {
-        int(number): found.reshape(4, 2).astype(np.float64)
-        for number, found in zip(numbers.ravel(), corners, strict=True)
-    }
-
-
-def marker_corners(camera: Camera, robot: Standing, side: Side, vision: VisionSettings) -> Floats:
-    """Upper left, upper right, lower right, lower left of a marker (4, 2), px."""
-    return marker_points(camera, robot, side, vision, ((-1, 1), (1, 1), (1, -1), (-1, -1)))
-
-
-def marker_points(
-    camera: Camera,
-    robot: Standing,
-    side: Side,
-    vision: VisionSettings,
-    places: Sequence[tuple[float, float]],
-) -> Floats:
-    """Places on a marker, to the right and up in halves of its side (n, 2), px."""
-    angle = {"front": 0.0, "left": 90.0, "back": 180.0, "right": -90.0}[side]
-    out = robot.heading_rad + math.radians(angle)
-    half = vision.marker_m / 2.0
-    points = []
-    for right, up in (half * np.array(places)).tolist():
-        x = robot.x_m + vision.marker_distance_m * math.cos(out) - right * math.sin(out)
-        y = robot.y_m + vision.marker_distance_m * math.sin(out) + right * math.cos(out)
-        points.append([*POSE.inverse().transform(x, y), vision.marker_mounted_m + up])
-    return camera.project(np.array(points))
-
-
-@pytest.mark.parametrize("side", SIDES)
-@pytest.mark.parametrize("ahead_m", [0.6, 1.5, 3.0])
-def test_opencv_reads_the_marker_of_the_side_that_is_turned_to_it(
-    side: Side, ahead_m: float
-) -> None:
-    robot = mate("r2", ahead_m, 0.1, SIDES[side])
-    found = detected(picture(team(robots={"r2": MARKED}), robots=[robot], light=Light()))
-    assert set(found) == {MARKED.markers[side]}
-
-
-@pytest.mark.parametrize(
-    "family", ["aruco_4x4_50", "aruco_5x5_50", "aruco_6x6_50", "apriltag_16h5", "apriltag_36h11"]
-)
-@pytest.mark.parametrize("turned_deg", [180.0, 140.0, 225.0])
-def test_a_marker_of_any_family_is_read_and_is_where_the_camera_model_says(
-    family: MarkerFamily, turned_deg: float
-) -> None:
-    vision = VisionSettings(family=family)
-    robot = mate("r2", 1.0, -0.1, turned_deg)
-    settings = CameraSettings(tilt_deg=5.0, distortion=LENS)
-    subject = team(robots={"r2": RobotSettings(markers={"front": 11})}, vision=vision)
-    found = detected(picture(subject, settings, [robot]), family)
-    expected = marker_corners(Camera(settings), robot, "front", vision)
-    assert found[11] == pytest.approx(expected, abs=0.6)  # the detector's own; edges: below
-
-
-@pytest.mark.parametrize("settings", CAMERAS, ids=["plain", "tilted", "bent", "upright"])
-@pytest.mark.parametrize("ahead_m", [0.5, 1.0, 2.0])
-@pytest.mark.parametrize("turned_deg", [180.0, 150.0, 215.0])
-def test_the_edges_of_a_marker_are_where_the_camera_model_says(
-    settings: CameraSettings, ahead_m: float, turned_deg: float
-) -> None:
-    vision = VisionSettings()
-    robot = mate("r2", ahead_m, 0.05, turned_deg)
-    pixels = picture(team(robots={"r2": MARKED}), settings, [robot])
-    camera = Camera(settings)
-    corners = marker_corners(camera, robot, "front", vision)
-    middle = corners.mean(axis=0)
-    module = float(np.hypot(*(corners[0] - corners[3]))) / 6.0
-    edges = marker_points(camera, robot, "front", vision, ((0, 1), (1, 0), (0, -1), (-1, 0)))
-    for edge, a, b in zip(edges, corners, np.roll(corners, -1, axis=0), strict=True):
-        if not (10.0 < edge[0] < 629.0 and 10.0 < edge[1] < 469.0):
-            continue
-        across = np.array([a[1] - b[1], b[0] - a[0]])
-        across *= np.sign(across @ (middle - edge))
-        assert abs(off_by(pixels, edge, across, reach_px=min(2.0, 0.6 * module))) < 0.1
-
-
-def test_the_white_around_a_marker_is_one_module_wide() -> None:
-    assert quiet("aruco_4x4_50") == pytest.approx(8 / 6)
-    assert quiet("apriltag_36h11") == pytest.approx(10 / 8)
 
 
 def matches(pixels: Pixels, colour: Colour) -> NDArray[np.bool_]:
@@ -297,7 +97,7 @@ def test_paints_are_within_the_thresholds_of_their_colours_and_no_others(
 
 
 def test_a_colour_of_the_file_is_painted_in_the_middle_of_its_thresholds() -> None:
-    assert COLOURS.keys() == PAINTS.keys()
+    assert COLOURS.keys() == PAINT_BGR.keys()
     violet = Colour(hue=(125, 140))
     vision = VisionSettings(colours={"violet": violet, **COLOURS})
     pixels = picture(team({"m": post(1.0, 0.0, ("violet", "red"))}, vision=vision))
@@ -328,9 +128,9 @@ def test_what_is_nearer_hides_what_is_farther() -> None:
 
 
 def test_a_mast_stands_on_its_robot() -> None:
-    banded = RobotSettings(colours=("green", "pink"), markers={"front": 1})
+    banded_cylinder = RobotSettings(colours=("green", "pink"), markers={"front": 1})
     vision, camera = VisionSettings(), Camera(CameraSettings())
-    pixels = picture(team(robots={"r2": banded}), robots=[mate("r2", 1.5, 0.2)])
+    pixels = picture(team(robots={"r2": banded_cylinder}), robots=[mate("r2", 1.5, 0.2)])
     mast = vision.mast
     for height, colour in ((0.75, "green"), (0.25, "pink")):
         at = [[1.5 - mast.radius_m, 0.2, mast.foot_m + height * mast.height_m]]

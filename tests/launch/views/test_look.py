@@ -15,11 +15,11 @@ from mcap.reader import make_reader
 from support.processes import cpcbl_team, eventually
 
 from cpcbl_agents.vision.camera import Camera
-from cpcbl_agents.vision.pictures import header_of
+from cpcbl_agents.vision.pictures import read_header
 from cpcbl_launch.reporting.recording import read_recording
 from cpcbl_launch.run.processes import PROGRAM
 from cpcbl_launch.run.up import free_endpoint
-from cpcbl_launch.simulation.camera.render import Light, Scene, Standing, render
+from cpcbl_launch.simulation.camera.render import Light, Scene, SceneRobot, render
 from cpcbl_launch.team_file import load_team
 from cpcbl_team.geometry import Pose2
 from cpcbl_team.inputs import Sightings
@@ -53,7 +53,7 @@ def pictures(team_file: Path) -> Path:
     team, folder = load_team(team_file), team_file.parent / "pictures"
     scene, camera = Scene.of(team), Camera(team.robots["looker"].camera)
     folder.mkdir()
-    for name, robots in (("seen", [Standing("seen", 1.5, 0.3, -0.5)]), ("nobody", [])):
+    for name, robots in (("seen", [SceneRobot("seen", 1.5, 0.3, -0.5)]), ("nobody", [])):
         random = np.random.default_rng(1)
         pixels = render(scene, camera, Pose2(0.0, 0.0, 0.0), robots, Light(), random)
         cv2.imwrite(str(folder / f"{name}.png"), pixels)
@@ -90,7 +90,7 @@ def test_eyes_are_shown_pictures(team_file: Path, pictures: Path) -> None:
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (("nobody",), "look nobody: not in .*it has: looker, seen"),
+        (("nobody",), ".*: team looked has no robot nobody; there are looker, seen"),
         (("seen",), 'look seen: has no camera in .*; set sensing = "camera"'),
         (("looker", "--pictures", "gone"), "--pictures gone: no such file or folder"),
         (("looker", "--pictures", "."), r"--pictures \.: no pictures"),
@@ -121,13 +121,13 @@ def test_a_running_robot_shows_what_it_sees_and_a_recording_holds_it(team_file: 
         finally:
             team.send_signal(signal.SIGINT)
             assert eventually(lambda: team.poll() is not None)
-    shown = json.loads(ran.stdout)
-    assert len(shown) == 3
-    stamps = [int(one["frame"]) for one in shown]
+    detect_and_annotate = json.loads(ran.stdout)
+    assert len(detect_and_annotate) == 3
+    stamps = [int(one["frame"]) for one in detect_and_annotate]
     assert all(later - stamp >= 5e8 for stamp, later in pairwise(stamps))
-    for one in shown:
+    for one in detect_and_annotate:
         assert [found["id"] for found in one["found"]] == ["seen"]
-        header = header_of(Path(one["picture"]).read_bytes())
+        header = read_header(Path(one["picture"]).read_bytes())
         assert header is not None
         assert (header.width_px, header.height_px) == (640, 480)
     sightings = [s for s in read_recording(record).inputs["looker"] if isinstance(s, Sightings)]
@@ -148,6 +148,6 @@ def pictures_in_recording(path: Path) -> int:
             assert picture.keys() == json.loads(schema.data)["properties"].keys()
             time = picture["timestamp"]
             assert time["sec"] * 10**9 + time["nsec"] == message.log_time
-            assert header_of(base64.b64decode(picture["data"])) is not None
+            assert read_header(base64.b64decode(picture["data"])) is not None
             count += 1
     return count

@@ -17,9 +17,9 @@ from typing import NamedTuple
 import msgspec
 from rich.console import RenderableType
 
-from cpcbl_agents.vision.detections import Glimpses
-from cpcbl_agents.vision.detector import CameraEyes
-from cpcbl_agents.vision.pictures import decoded
+from cpcbl_agents.vision.detections import Detections
+from cpcbl_agents.vision.detector import CameraDetector
+from cpcbl_agents.vision.pictures import decode_image
 from cpcbl_launch.reporting.tables import table
 from cpcbl_launch.team_file import load_team
 from cpcbl_team.config import Team
@@ -118,21 +118,21 @@ def measure(name: str, folder: Path) -> RealPictures:
     viewers = {line.viewer for line in lines}
     for viewer in sorted(viewers - team.robots.keys()):
         raise InputError(f"{path}: no robot {viewer} in {path.with_suffix('.toml')}")
-    eyes = {viewer: CameraEyes(viewer, team) for viewer in viewers}
+    eyes = {viewer: CameraDetector(viewer, team) for viewer in viewers}
     compared: list[LineResult] = []
     unexpected: list[tuple[str, str]] = []
     doubted: list[tuple[str, str]] = []
     refused: dict[str, str] = {}
     for picture in dict.fromkeys(line.picture for line in lines):
         due = [line for line in lines if line.picture == picture]
-        glimpses = _detect(eyes[due[0].viewer], folder / picture)
-        if isinstance(glimpses, str):
-            refused[picture] = glimpses
+        detections = _detect(eyes[due[0].viewer], folder / picture)
+        if isinstance(detections, str):
+            refused[picture] = detections
             continue
-        seen = {found.sighting.id: found.sighting for found in glimpses.found}
+        seen = {found.sighting.id: found.sighting for found in detections.found}
         compared += [_line_result(line, seen.get(line.id)) for line in due if line.id]
         unexpected += [(picture, one) for one in sorted(seen.keys() - {line.id for line in due})]
-        doubted += [(picture, doubt.reason) for doubt in glimpses.doubts]
+        doubted += [(picture, ambiguity.reason) for ambiguity in detections.ambiguities]
     return RealPictures(
         experiment=f"pictures-{path.stem}",
         version=version("cpcbl-team"),
@@ -146,13 +146,13 @@ def measure(name: str, folder: Path) -> RealPictures:
     )
 
 
-def _detect(eyes: CameraEyes, path: Path) -> Glimpses | str:
+def _detect(eyes: CameraDetector, path: Path) -> Detections | str:
     try:
         image = path.read_bytes()
     except OSError as error:
         raise InputError(f"{path}: {error.strerror}; name the folder of the pictures") from error
-    pixels = decoded(image)
-    return pixels if isinstance(pixels, str) else eyes.glimpses(pixels)
+    pixels = decode_image(image)
+    return pixels if isinstance(pixels, str) else eyes.detections(pixels)
 
 
 def _line_result(line: TruthLine, seen: Sighting | None) -> LineResult:

@@ -26,18 +26,18 @@ import cv2
 import numpy as np
 
 from cpcbl_agents.vision.camera import Camera, Floats, Pixels
-from cpcbl_agents.vision.detector import CameraEyes
-from cpcbl_agents.vision.pictures import decoded
+from cpcbl_agents.vision.detector import CameraDetector
+from cpcbl_agents.vision.pictures import decode_image
 from cpcbl_launch.lab.experiments.detection_figures import Batch, Kind, Mistake, Record, Wrong, team
-from cpcbl_launch.simulation.camera.cameras import off_focus, shaken
+from cpcbl_launch.simulation.camera.cameras import with_focal_error, with_mount_error
 from cpcbl_launch.simulation.camera.render import render
 from cpcbl_launch.simulation.camera.robots import SIDES, body_top_m
-from cpcbl_launch.simulation.camera.scene import Post, Scene, Standing
+from cpcbl_launch.simulation.camera.scene import Scene, SceneCylinder, SceneRobot
 from cpcbl_launch.simulation.camera.visibility import (
     Solid,
     cylinder_points,
     plate_points,
-    shares_shown,
+    visible_shares,
 )
 from cpcbl_team.config import CameraSettings, Cylinder, Light, Side
 from cpcbl_team.geometry import Pose2, wrap_angle
@@ -57,7 +57,7 @@ class RandomFrame(NamedTuple):
 
     viewer: str
     pose: Pose2
-    robots: tuple[Standing, ...]
+    robots: tuple[SceneRobot, ...]
     scene: Scene
     light: Light
     camera: CameraSettings
@@ -82,7 +82,7 @@ def evaluate_frames(seed: int, first: int, count: int) -> Batch:
     """These frames. The same seed and numbers give the same figures."""
     cv2.setNumThreads(1)
     batch = Batch([], [], {}, {}, 0.0, 0.0)
-    doubts: Counter[str] = Counter()
+    ambiguities: Counter[str] = Counter()
     refused: Counter[str] = Counter()
     see_s = render_s = 0.0
     for number in range(first, first + count):
@@ -91,19 +91,19 @@ def evaluate_frames(seed: int, first: int, count: int) -> Batch:
         frame = random_frame(random)
         pixels = render_image(frame, random)
         rendered_s = time.perf_counter()
-        glimpses = _eyes(frame.viewer).glimpses(pixels)
+        detections = _eyes(frame.viewer).detections(pixels)
         see_s += time.perf_counter() - rendered_s
         render_s += rendered_s - began_s
-        if isinstance(glimpses, str):
-            refused[glimpses] += 1
+        if isinstance(detections, str):
+            refused[detections] += 1
             continue
-        doubts.update(doubt.reason for doubt in glimpses.doubts)
-        seen = [found.sighting for found in glimpses.found]
+        ambiguities.update(ambiguity.reason for ambiguity in detections.ambiguities)
+        seen = [found.sighting for found in detections.found]
         records, mistakes = compare_with_truth(number, seen, named_objects(frame))
         batch.records.extend(records)
         batch.mistakes.extend(mistakes)
     return batch._replace(
-        doubts=dict(doubts), refused=dict(refused), see_s=see_s, render_s=render_s
+        doubts=dict(ambiguities), refused=dict(refused), see_s=see_s, render_s=render_s
     )
 
 
@@ -113,8 +113,8 @@ def _scene() -> Scene:
 
 
 @lru_cache(maxsize=16)
-def _eyes(viewer: str) -> CameraEyes:
-    return CameraEyes(viewer, team())
+def _eyes(viewer: str) -> CameraDetector:
+    return CameraDetector(viewer, team())
 
 
 # What is random ----------------------------------------------------------------------------------
@@ -136,8 +136,10 @@ def random_frame(random: np.random.Generator) -> RandomFrame:
             near = pose if random.random() < 0.7 else None
             other = _free_pose(random, taken, near)
             taken.append((other.x, other.y))
-            robots.append(Standing(name, *other))
-    camera = shaken(off_focus(team().robots[viewer].camera, 1.0, random), 1.0, random)
+            robots.append(SceneRobot(name, *other))
+    camera = with_mount_error(
+        with_focal_error(team().robots[viewer].camera, 1.0, random), 1.0, random
+    )
     return RandomFrame(viewer, pose, tuple(robots), scene, _random_light(random), camera)
 
 
@@ -174,7 +176,7 @@ def render_image(frame: RandomFrame, random: np.random.Generator) -> Pixels:
     """The frame as the robot receives it: encoded as JPEG and decoded."""
     made = render(frame.scene, Camera(frame.camera), frame.pose, frame.robots, frame.light, random)
     _, coded = cv2.imencode(".jpg", made, (cv2.IMWRITE_JPEG_QUALITY, QUALITY))
-    pixels = decoded(coded.tobytes())
+    pixels = decode_image(coded.tobytes())
     assert not isinstance(pixels, str)
     return pixels
 
@@ -223,7 +225,7 @@ def _solids(
     return solids
 
 
-def _cylinder_solid(post: Post, x: float, y: float) -> Solid:
+def _cylinder_solid(post: SceneCylinder, x: float, y: float) -> Solid:
     return Solid(x, y, post.radius_m, post.bands[0].from_m, post.bands[-1].to_m)
 
 
@@ -237,7 +239,7 @@ def _others(solids: Mapping[str, Sequence[Solid]], but: str) -> list[Solid]:
 
 def _landmark(name: str, solid: Solid, camera: Camera, before: Before) -> NamedObject:
     points = cylinder_points(solid, camera.position)
-    whole, some = shares_shown(points, camera, before)
+    whole, some = visible_shares(points, camera, before)
     due: Due = {"landmark": whole}
     return _named_object(name, Pose2(solid.x, solid.y, 0.0), due, some, solid.radius)
 
@@ -248,14 +250,14 @@ def _teammate(name: str, seen: Pose2, camera: Camera, before: Before) -> NamedOb
     for side in robot.markers:
         points, angle = _marker(side, seen, camera)
         if angle < 0.5 * math.pi:
-            whole, part = shares_shown(points, camera, before)
+            whole, part = visible_shares(points, camera, before)
             some = max(some, part)
             marker = max(marker, whole if angle <= math.radians(FACING_DEG) else 0.0)
     if robot.colours is not None:
         shape = vision.mast
         solid = Solid(seen.x, seen.y, shape.radius_m, shape.foot_m, _top_m(shape))
         points = cylinder_points(solid, camera.position)
-        mast, part = shares_shown(points, camera, before)
+        mast, part = visible_shares(points, camera, before)
         some = max(some, part)
     half_m = math.sqrt(2.0) * vision.marker_distance_m
     return _named_object(name, seen, {"marker": marker, "mast": mast}, some, half_m)

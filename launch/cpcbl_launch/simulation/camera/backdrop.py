@@ -1,4 +1,4 @@
-"""What stands behind everything in a picture: a speckled floor, a hall, the field's walls."""
+"""The background of a picture: a speckled floor, a hall, the field's walls."""
 
 from functools import lru_cache
 
@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from cpcbl_agents.vision.camera import Floats, Pixels
-from cpcbl_launch.simulation.camera.scene import Bgr, Plane, Scene
+from cpcbl_launch.simulation.camera.scene import Bgr, Scene, WallSegment
 from cpcbl_launch.simulation.camera.view import NEAREST_M, View
 
 SPECKLE = 7.0  # grey levels
@@ -26,7 +26,7 @@ def backdrop(view: View, scene: Scene) -> Pixels:
     return picture
 
 
-def wall_corners(wall: Plane, height_m: float) -> Floats:
+def wall_corners(wall: WallSegment, height_m: float) -> Floats:
     """(4, 3), in the field's frame."""
     (ax, ay), (bx, by) = wall
     return np.array([[ax, ay, 0.0], [bx, by, 0.0], [bx, by, height_m], [ax, ay, height_m]])
@@ -56,7 +56,7 @@ def _floor_and_hall(view: View, floor: Bgr) -> Pixels:
     return np.ascontiguousarray(full[: view.size_px[1], : view.size_px[0]], np.uint8)
 
 
-def _draw_wall(view: View, wall: Plane, height_m: float, picture: Pixels) -> None:
+def _draw_wall(view: View, wall: WallSegment, height_m: float, picture: Pixels) -> None:
     corners = (wall_corners(wall, height_m) - view.lens) @ view.field_from_camera
     seen = _ahead(corners)
     if len(seen) < 3:
@@ -81,7 +81,7 @@ def _ahead(corners: Floats) -> Floats:
     return np.array(kept).reshape(-1, 3)
 
 
-def _distance_m(view: View, wall: Plane) -> float:
+def _distance_m(view: View, wall: WallSegment) -> float:
     """From the lens to the wall's nearest point."""
     a, b, lens = np.array(wall.a), np.array(wall.b), view.lens[:2]
     along = float((lens - a) @ (b - a)) / max(float((b - a) @ (b - a)), 1e-9)
@@ -90,7 +90,7 @@ def _distance_m(view: View, wall: Plane) -> float:
 
 @lru_cache(maxsize=1)
 def _tile() -> Pixels:
-    """Speckles of the floor around the grey of 128; it goes on where it ends."""
+    """Speckles of the floor around a grey of 128; the tile repeats without seams."""
     noise = np.random.default_rng(5).normal(0.0, 1.0, (TILE_PX, TILE_PX)).astype(np.float32)
     coarse = cv2.GaussianBlur(np.tile(noise, (2, 2)), (0, 0), 6.0)
     half = TILE_PX // 2
@@ -111,7 +111,7 @@ def _shades(floor: Bgr) -> Pixels:
 
 @lru_cache(maxsize=1)
 def _hall() -> Pixels:
-    """The hall's colour by the height at which one looks, (256, 1, 3)."""
+    """The hall's colour by the elevation of the ray, (256, 1, 3)."""
     rise = np.minimum(np.arange(256.0), 60.0)[:, None, None] / 60.0
     shades: Pixels = np.clip(HALL + 50.0 * rise, 0.0, 255.0).astype(np.uint8)
     return shades

@@ -8,7 +8,7 @@ from msgspec.structs import replace
 
 from cpcbl_agents.vision.camera import Camera, Pixels
 from cpcbl_launch.simulation.camera.render import render
-from cpcbl_launch.simulation.camera.scene import Scene, Standing
+from cpcbl_launch.simulation.camera.scene import Scene, SceneRobot
 from cpcbl_team.config import CameraSettings, Team
 from cpcbl_team.geometry import Pose2
 from cpcbl_transport.messages import LARGEST_FRAME, Frame
@@ -23,7 +23,7 @@ cv2.setNumThreads(1)
 class Cameras:
     """Takes pictures of the field. The same seed and the same calls give the same pictures.
 
-    Cameras are as badly known as their settings say, times the simulation's noise.
+    The errors of the cameras have the sigmas of their settings times the simulation's noise.
     """
 
     def __init__(self, team: Team, seed: int) -> None:
@@ -35,7 +35,7 @@ class Cameras:
         light, self._noise = team.simulation.light, team.simulation.noise
         self._light = replace(light, noise=light.noise * self._noise)
         self._cameras = {
-            name: off_focus(team.robots[name].camera, self._noise, random)
+            name: with_focal_error(team.robots[name].camera, self._noise, random)
             for name, random in self._random.items()
         }
         guards = team.transport.guards
@@ -47,29 +47,32 @@ class Cameras:
     def frame(self, viewer: str, stamp_ns: int, poses: Mapping[str, Pose2], bare: bool) -> Frame:
         """What a robot's camera sees now, from among all that stand on the field; `bare`: no
         landmark can be seen."""
-        others = [Standing(name, *pose) for name, pose in poses.items() if name != viewer]
+        others = [SceneRobot(name, *pose) for name, pose in poses.items() if name != viewer]
         scene = self._bare if bare else self._scene
         pixels = render(
             scene,
-            Camera(shaken(self._cameras[viewer], self._noise, self._random[viewer])),
+            Camera(with_mount_error(self._cameras[viewer], self._noise, self._random[viewer])),
             poses[viewer],
             others,
             self._light,
             self._random[viewer],
         )
-        return Frame(stamp_ns, encoded(pixels, self._largest))
+        return Frame(stamp_ns, encode_jpeg_within(pixels, self._largest))
 
 
-def off_focus(camera: CameraSettings, noise: float, random: np.random.Generator) -> CameraSettings:
-    """With the focal length that it may well have, by what the settings say of how well it is
-    known; `noise`: times that."""
+def with_focal_error(
+    camera: CameraSettings, noise: float, random: np.random.Generator
+) -> CameraSettings:
+    """The settings with a random error of the focal length; its sigma is scaled by `noise`."""
     share = 1.0 + noise * camera.focal_share * float(random.normal())
     return replace(camera, fx_px=camera.fx_px * share, fy_px=camera.fy_px * share)
 
 
-def shaken(camera: CameraSettings, noise: float, random: np.random.Generator) -> CameraSettings:
-    """As it looks on a floor that is not even, by its sigmas of tilt and yaw; `noise`: times
-    these."""
+def with_mount_error(
+    camera: CameraSettings, noise: float, random: np.random.Generator
+) -> CameraSettings:
+    """The settings with random errors of tilt and yaw, as on an uneven floor; their sigmas are
+    scaled by `noise`."""
     tilt, yaw = (noise * float(draw) for draw in random.normal(size=2))
     return replace(
         camera,
@@ -78,8 +81,8 @@ def shaken(camera: CameraSettings, noise: float, random: np.random.Generator) ->
     )
 
 
-def encoded(pixels: Pixels, largest: int, qualities: Sequence[int] = QUALITIES) -> bytes:
-    """A picture as a JPEG of at most so many bytes, if any of the qualities does that."""
+def encode_jpeg_within(pixels: Pixels, largest: int, qualities: Sequence[int] = QUALITIES) -> bytes:
+    """A picture as a JPEG of at most this size (bytes), if any of the qualities allows it."""
     image = b""
     for quality in qualities:
         _, buffer = cv2.imencode(".jpg", pixels, (cv2.IMWRITE_JPEG_QUALITY, quality))

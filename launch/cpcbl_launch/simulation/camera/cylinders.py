@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from cpcbl_agents.vision.camera import Floats
-from cpcbl_launch.simulation.camera.scene import Post
+from cpcbl_launch.simulation.camera.scene import SceneCylinder
 from cpcbl_launch.simulation.camera.view import Box, Grey, View
 
 CAP = (52.0, 52.0, 52.0)
@@ -15,42 +15,47 @@ _ROUND = np.linspace(0.0, math.tau, 8, endpoint=False)
 _CIRCLE = np.column_stack([np.cos(_ROUND), np.sin(_ROUND)]) / math.cos(math.pi / 8)
 
 
-def post_box(view: View, post: Post) -> Box | None:
-    """The pixels that a post may cover; None if there are none, or the lens is inside it."""
-    if math.hypot(post.x_m - view.lens[0], post.y_m - view.lens[1]) <= 1.05 * post.radius_m:
+def cylinder_box(view: View, cylinder: SceneCylinder) -> Box | None:
+    """The pixels that a cylinder may cover; None if there are none, or the lens is inside it."""
+    if (
+        math.hypot(cylinder.x_m - view.lens[0], cylinder.y_m - view.lens[1])
+        <= 1.05 * cylinder.radius_m
+    ):
         return None
-    return view.box(_around(post))
+    return view.box(_bounding_prism(cylinder))
 
 
-def draw_post(view: View, post: Post, box: Box) -> tuple[Grey, Grey]:
+def draw_cylinder(view: View, cylinder: SceneCylinder, box: Box) -> tuple[Grey, Grey]:
     """The colours (h, w, 3) and the covered shares (h, w) of a box's pixels."""
-    lens, (low, *_), (*_, high) = view.lens, post.bands, post.bands
-    ex, ey = post.x_m - lens[0], post.y_m - lens[1]
-    dx, dy, dz = view.look(box)
+    lens, (low, *_), (*_, high) = view.lens, cylinder.bands, cylinder.bands
+    ex, ey = cylinder.x_m - lens[0], cylinder.y_m - lens[1]
+    dx, dy, dz = view.ray_directions(box)
     level = np.maximum(np.sqrt(dx * dx + dy * dy), np.float32(1e-6))
     ux, uy, slope = dx / level, dy / level, dz / level
     middle, across = ex * ux + ey * uy, ex * uy - ey * ux
-    half = np.sqrt(np.maximum(post.radius_m**2 - across * across, 0.0))
+    half = np.sqrt(np.maximum(cylinder.radius_m**2 - across * across, 0.0))
     front = middle - half
     heights = lens[2] + front * slope
     backs = lens[2] + (middle + half) * slope
-    per_pixel = _per_pixel(heights)
+    per_pixel = _change_per_pixel(heights)
 
-    shares = view.beyond(_tangents(ex, ey, post.radius_m), box)
+    shares = view.shares_inside(_tangent_planes(ex, ey, cylinder.radius_m), box)
     if lens[2] > high.to_m:  # its top is seen, or its bottom below
-        shares *= np.clip(0.5 + (high.to_m - backs) / _per_pixel(backs), 0.0, 1.0)
+        shares *= np.clip(0.5 + (high.to_m - backs) / _change_per_pixel(backs), 0.0, 1.0)
         shares *= np.clip(0.5 + (heights - low.from_m) / per_pixel, 0.0, 1.0)
     elif lens[2] < low.from_m:
-        shares *= np.clip(0.5 + (backs - low.from_m) / _per_pixel(backs), 0.0, 1.0)
+        shares *= np.clip(0.5 + (backs - low.from_m) / _change_per_pixel(backs), 0.0, 1.0)
         shares *= np.clip(0.5 + (high.to_m - heights) / per_pixel, 0.0, 1.0)
     else:
         shares *= np.clip(0.5 + (heights - low.from_m) / per_pixel, 0.0, 1.0)
         shares *= np.clip(0.5 + (high.to_m - heights) / per_pixel, 0.0, 1.0)
 
-    lit = ((front * ux - ex) * LIGHT[0] + (front * uy - ey) * LIGHT[1]) / post.radius_m
+    lit = ((front * ux - ex) * LIGHT[0] + (front * uy - ey) * LIGHT[1]) / cylinder.radius_m
     lit = (1.0 - SHADE) + SHADE * lit
     edges = [(low.from_m, CAP, low.bgr)]
-    edges += [(b.from_m, a.bgr, b.bgr) for a, b in zip(post.bands, post.bands[1:], strict=False)]
+    edges += [
+        (b.from_m, a.bgr, b.bgr) for a, b in zip(cylinder.bands, cylinder.bands[1:], strict=False)
+    ]
     edges += [(high.to_m, high.bgr, CAP)]
     colours = np.empty((*heights.shape, 3), np.float32)
     colours[:] = CAP
@@ -62,8 +67,8 @@ def draw_post(view: View, post: Post, box: Box) -> tuple[Grey, Grey]:
     return colours, shares
 
 
-def _per_pixel(heights: Grey) -> Grey:
-    """By how much heights differ from one pixel to the next."""
+def _change_per_pixel(heights: Grey) -> Grey:
+    """The difference of heights from one pixel to the next."""
     if min(heights.shape) < 2:
         return np.full_like(heights, 1e-3)
     down, right = np.gradient(heights)
@@ -71,7 +76,7 @@ def _per_pixel(heights: Grey) -> Grey:
     return steepness
 
 
-def _tangents(ex: float, ey: float, radius_m: float) -> list[Floats]:
+def _tangent_planes(ex: float, ey: float, radius_m: float) -> list[Floats]:
     """The planes through the lens on either side of a cylinder: normals that point to it."""
     towards, half = math.atan2(ey, ex), math.asin(radius_m / math.hypot(ex, ey))
     left, right = towards + half, towards - half
@@ -81,8 +86,8 @@ def _tangents(ex: float, ey: float, radius_m: float) -> list[Floats]:
     ]
 
 
-def _around(post: Post) -> Floats:
-    """Corners of a prism around a post (16, 3)."""
-    circle = _CIRCLE * post.radius_m + (post.x_m, post.y_m)
-    ends = post.bands[0].from_m, post.bands[-1].to_m
+def _bounding_prism(cylinder: SceneCylinder) -> Floats:
+    """Corners of a prism around a cylinder (16, 3)."""
+    circle = _CIRCLE * cylinder.radius_m + (cylinder.x_m, cylinder.y_m)
+    ends = cylinder.bands[0].from_m, cylinder.bands[-1].to_m
     return np.vstack([np.column_stack([circle, np.full(8, z)]) for z in ends])

@@ -1,4 +1,4 @@
-"""From a clean picture to what a camera gives: uneven light, blur, and the sensor's noise."""
+"""The errors of a camera's exposure: uneven light, blur, and the sensor's noise."""
 
 from functools import lru_cache
 
@@ -12,14 +12,14 @@ from cpcbl_team.config import Light
 MARGIN_PX = 256  # the noise of a frame is a window of a larger piece, here or there
 
 
-def exposed(picture: Pixels, light: Light, random: np.random.Generator) -> Pixels:
-    """The picture (h, w, 3) in this light; the generator decides on the noise alone."""
+def expose(picture: Pixels, light: Light, random: np.random.Generator) -> Pixels:
+    """The picture (h, w, 3) in this light; only the noise depends on the generator."""
     height, width = picture.shape[:2]
     if light.brightness != 1.0 or light.gradient or light.tint != (1.0, 1.0, 1.0):
         gain = _gain(width, height, light.brightness, light.gradient, light.tint)
         picture = cv2.multiply(picture, gain, dtype=cv2.CV_8U).astype(np.uint8, copy=False)
     if light.blur_px:
-        picture = _blurred(picture, light.blur_px)
+        picture = _blur(picture, light.blur_px)
     if light.noise:
         left, top = (int(start) for start in random.integers(0, MARGIN_PX, 2))
         window = slice(top, top + height), slice(left, left + width)
@@ -30,7 +30,7 @@ def exposed(picture: Pixels, light: Light, random: np.random.Generator) -> Pixel
     return picture
 
 
-def _blurred(picture: Pixels, sigma_px: float) -> Pixels:
+def _blur(picture: Pixels, sigma_px: float) -> Pixels:
     """With a Gaussian that is cut off beyond three sigma."""
     side = 2 * max(1, round(3.0 * sigma_px)) + 1
     return cv2.GaussianBlur(picture, (side, side), sigma_px).astype(np.uint8, copy=False)

@@ -1,7 +1,7 @@
-"""Pictures of the simulated field, as a robot's camera sees it from its true pose.
+"""Pictures of the simulated field from the true pose of a robot's camera.
 
-Drawn far to near through a pinhole, each pixel by the share of it that a thing covers; then bent
-by the lens's distortion, lit, blurred and made noisy. The same generator gives the same picture.
+Objects are drawn from far to near with a pinhole model, each pixel by its covered share. Then the
+picture gets the lens's distortion, light, blur and noise. Equal generators give equal pictures.
 """
 
 import math
@@ -15,15 +15,22 @@ from msgspec.structs import replace
 
 from cpcbl_agents.vision.camera import Camera, Floats, Pixels
 from cpcbl_launch.simulation.camera.backdrop import backdrop, wall_corners
-from cpcbl_launch.simulation.camera.cylinders import draw_post, post_box
-from cpcbl_launch.simulation.camera.exposure import exposed
-from cpcbl_launch.simulation.camera.robots import body_top_m, draw_face, faces
-from cpcbl_launch.simulation.camera.scene import Looks, Plane, Post, Scene, Standing, stand
+from cpcbl_launch.simulation.camera.cylinders import cylinder_box, draw_cylinder
+from cpcbl_launch.simulation.camera.exposure import expose
+from cpcbl_launch.simulation.camera.robots import body_top_m, draw_face, robot_faces
+from cpcbl_launch.simulation.camera.scene import (
+    RobotAppearance,
+    Scene,
+    SceneCylinder,
+    SceneRobot,
+    WallSegment,
+    with_stand,
+)
 from cpcbl_launch.simulation.camera.view import Box, Grey, View
 from cpcbl_team.config import CameraSettings, Light
 from cpcbl_team.geometry import Pose2
 
-__all__ = ["Light", "Scene", "Standing", "render"]
+__all__ = ["Light", "Scene", "SceneRobot", "render"]
 
 WIDEST = 4.0  # a picture before distortion, over one after it
 
@@ -32,74 +39,89 @@ def render(
     scene: Scene,
     camera: Camera,
     pose: Pose2,
-    robots: Sequence[Standing],
+    robots: Sequence[SceneRobot],
     light: Light,
     random: np.random.Generator,
 ) -> Pixels:
-    """What a camera on a robot at `pose` (`field_from_robot`) sees: (h, w, 3), BGR.
+    """The picture of a camera on a robot at `pose` (`field_from_robot`): (h, w, 3), BGR.
 
-    `robots` are the others; the viewer does not see itself.
+    `robots` are the other robots; a robot does not see itself.
     """
     pinhole = _pinhole(camera.settings)
-    picture = _drawn(scene, View(camera if pinhole is None else pinhole.camera, pose), robots)
+    picture = _draw_scene(scene, View(camera if pinhole is None else pinhole.camera, pose), robots)
     if pinhole is not None:
         picture = cv2.remap(picture, *pinhole.maps, cv2.INTER_LINEAR).astype(np.uint8, copy=False)
-    return exposed(picture, light, random)
+    return expose(picture, light, random)
 
 
-def _drawn(scene: Scene, view: View, robots: Sequence[Standing]) -> Pixels:
+def _draw_scene(scene: Scene, view: View, robots: Sequence[SceneRobot]) -> Pixels:
     picture = backdrop(view, scene)
-    posts = [*scene.landmarks.values(), *scene.clutter]
-    things: list[Post | Standing] = [*posts, *robots]
-    things.sort(key=lambda thing: -math.hypot(thing.x_m - view.lens[0], thing.y_m - view.lens[1]))
-    for thing in things:
-        walls = [wall_corners(w, scene.wall_m) for w in scene.walls if _hides(w, view, thing)]
+    cylinders = [*scene.landmarks.values(), *scene.clutter]
+    objects: list[SceneCylinder | SceneRobot] = [*cylinders, *robots]
+    objects.sort(
+        key=lambda scene_object: (
+            -math.hypot(scene_object.x_m - view.lens[0], scene_object.y_m - view.lens[1])
+        )
+    )
+    for scene_object in objects:
+        walls = [
+            wall_corners(w, scene.wall_m)
+            for w in scene.walls
+            if _is_hidden_by(w, view, scene_object)
+        ]
         pieces = (
-            _post(view, stand(thing, 0.0))
-            if isinstance(thing, Post)
-            else _robot(view, thing, scene)
+            _cylinder_pieces(view, with_stand(scene_object, 0.0))
+            if isinstance(scene_object, SceneCylinder)
+            else _robot_pieces(view, scene_object, scene)
         )
         for box, colours, shares in pieces:
             for wall in walls:
-                shares = shares * (1.0 - view.covered(wall, box))
-            _paint(picture, box, colours, shares)
+                shares = shares * (1.0 - view.polygon_shares(wall, box))
+            _blend(picture, box, colours, shares)
     return picture
 
 
 Piece = tuple[Box, Grey, Grey]  # where, colours, covered shares
 
 
-def _post(view: View, post: Post) -> Iterator[Piece]:
-    box = post_box(view, post)
+def _cylinder_pieces(view: View, cylinder: SceneCylinder) -> Iterator[Piece]:
+    box = cylinder_box(view, cylinder)
     if box is not None:
-        yield box, *draw_post(view, post, box)
+        yield box, *draw_cylinder(view, cylinder, box)
 
 
-def _robot(view: View, robot: Standing, scene: Scene) -> Iterator[Piece]:
+def _robot_pieces(view: View, robot: SceneRobot, scene: Scene) -> Iterator[Piece]:
     """Its body and its mast, the nearer to the lens last."""
-    looks, top_m = scene.looks.get(robot.name, Looks()), body_top_m(scene.vision)
+    appearance, top_m = (
+        scene.appearances.get(robot.name, RobotAppearance()),
+        body_top_m(scene.vision),
+    )
     above = view.lens[2] > top_m
-    if looks.mast is not None and not above:
-        yield from _post(view, stand(looks.mast.at(robot.x_m, robot.y_m), top_m))
-    for face in faces(robot, looks, scene.vision):
-        box = view.box(face.corners) if face.seen_from(view.lens) else None
+    if appearance.mast is not None and not above:
+        yield from _cylinder_pieces(
+            view, with_stand(appearance.mast.at(robot.x_m, robot.y_m), top_m)
+        )
+    for face in robot_faces(robot, appearance, scene.vision):
+        box = view.box(face.corners) if face.is_facing(view.lens) else None
         if box is not None:
             yield box, *draw_face(view, face, box)
-    if looks.mast is not None and above:
-        yield from _post(view, stand(looks.mast.at(robot.x_m, robot.y_m), top_m))
+    if appearance.mast is not None and above:
+        yield from _cylinder_pieces(
+            view, with_stand(appearance.mast.at(robot.x_m, robot.y_m), top_m)
+        )
 
 
-def _paint(picture: Pixels, box: Box, colours: Grey, shares: Grey) -> None:
-    """Lays colours over what is there, by the share of each pixel that they cover."""
+def _blend(picture: Pixels, box: Box, colours: Grey, shares: Grey) -> None:
+    """Blends colours into the picture by the covered share of each pixel."""
     under = picture[box.slices]
     mixed = under + (colours - under) * shares[..., None]
     under[:] = np.clip(mixed + 0.5, 0.0, 255.0)
 
 
-def _hides(wall: Plane, view: View, thing: Post | Standing) -> bool:
-    """Whether the way from the lens to a thing's middle passes through a wall."""
+def _is_hidden_by(wall: WallSegment, view: View, scene_object: SceneCylinder | SceneRobot) -> bool:
+    """Whether the line from the lens to the middle of an object crosses a wall."""
     a, b, lens = np.array(wall.a), np.array(wall.b), view.lens[:2]
-    there, margin_m = np.array([thing.x_m, thing.y_m]), 0.12
+    there, margin_m = np.array([scene_object.x_m, scene_object.y_m]), 0.12
     along, way = b - a, there - lens
     length = float(np.hypot(*along))
     if length == 0.0:
@@ -113,7 +135,7 @@ def _hides(wall: Plane, view: View, thing: Post | Standing) -> bool:
 
 
 class _Pinhole(NamedTuple):
-    """A camera without distortion that sees all that one with it does, and the way back."""
+    """A camera without distortion that covers the whole picture, and the maps to that picture."""
 
     camera: Camera
     maps: tuple[Floats, Floats]
@@ -126,7 +148,7 @@ def _pinhole(settings: CameraSettings) -> _Pinhole | None:
         return None
     camera, (width, height) = Camera(settings), (settings.width_px, settings.height_px)
     u, v = np.meshgrid(np.arange(width, dtype=np.float64), np.arange(height, dtype=np.float64))
-    plane = camera.undistorted(np.column_stack([u.ravel(), v.ravel()]))
+    plane = camera.undistort(np.column_stack([u.ravel(), v.ravel()]))
     x = settings.fx_px * plane[:, 0]
     y = settings.fy_px * plane[:, 1]
     left, top = (max(math.floor(k.min()) - 2, -WIDEST * s) for k, s in ((x, width), (y, height)))

@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 
 from cpcbl_agents.vision.camera import Floats, Pixels
-from cpcbl_launch.simulation.camera.scene import Looks, Standing
-from cpcbl_launch.simulation.camera.view import Box, Grey, View, crossed
+from cpcbl_launch.simulation.camera.scene import RobotAppearance, SceneRobot
+from cpcbl_launch.simulation.camera.view import Box, Grey, View, cross_products
 from cpcbl_team.config import MarkerFamily, Side, VisionSettings
 
 BODY = (70.0, 66.0, 64.0)
@@ -35,9 +35,9 @@ class Face(NamedTuple):
     bgr: tuple[float, float, float]
     picture: tuple[MarkerFamily, int] | None = None
 
-    def seen_from(self, lens: Floats) -> bool:
+    def is_facing(self, lens: Floats) -> bool:
         a, b, c = self.corners[:3]
-        (normal,) = crossed((b - a)[None], (c - a)[None])
+        (normal,) = cross_products((b - a)[None], (c - a)[None])
         return float(normal @ (lens - a)) > 0.0
 
 
@@ -46,10 +46,12 @@ def body_top_m(vision: VisionSettings) -> float:
     return max(vision.mast.foot_m, vision.marker_mounted_m + 0.7 * vision.marker_m)
 
 
-def faces(robot: Standing, looks: Looks, vision: VisionSettings) -> Iterator[Face]:
+def robot_faces(
+    robot: SceneRobot, appearance: RobotAppearance, vision: VisionSettings
+) -> Iterator[Face]:
     """A robot's outside, its markers after the sides that they are on."""
     half, top_m = vision.marker_distance_m, body_top_m(vision)
-    numbers = {marker.side: marker.number for marker in looks.markers}
+    numbers = {marker.side: marker.number for marker in appearance.markers}
     centre = np.array([robot.x_m, robot.y_m, 0.0])
     lid = []
     for side, direction in SIDES.items():
@@ -60,7 +62,7 @@ def faces(robot: Standing, looks: Looks, vision: VisionSettings) -> Iterator[Fac
         yield Face(_upright(wall, along, half, 0.0, top_m), BODY)
         lid.append(wall + half * along + top_m * _UP)
         if side in numbers:
-            size = vision.marker_m / 2.0 * quiet(vision.family)
+            size = vision.marker_m / 2.0 * quiet_zone_ratio(vision.family)
             low, high = vision.marker_mounted_m - size, vision.marker_mounted_m + size
             picture = vision.family, numbers[side]
             yield Face(_upright(wall, along, size, low, high), (PAPER,) * 3, picture)
@@ -69,10 +71,10 @@ def faces(robot: Standing, looks: Looks, vision: VisionSettings) -> Iterator[Fac
 
 def draw_face(view: View, face: Face, box: Box) -> tuple[Grey, Grey]:
     """The colours (h, w, 3) or (3,), and the covered shares (h, w), of a box's pixels."""
-    shares = view.covered(face.corners, box)
+    shares = view.polygon_shares(face.corners, box)
     if face.picture is None:
         return np.array(face.bgr, np.float32), shares
-    return _picture(view, face, box)[..., None], shares
+    return _render_picture(view, face, box)[..., None], shares
 
 
 def _upright(wall: Floats, along: Floats, half: float, low_m: float, high_m: float) -> Floats:
@@ -82,14 +84,14 @@ def _upright(wall: Floats, along: Floats, half: float, low_m: float, high_m: flo
                      left + high_m * _UP])  # fmt: skip
 
 
-def _picture(view: View, face: Face, box: Box) -> Grey:
-    """A face's picture as the pixels of a box see it, each as the mean over its area."""
+def _render_picture(view: View, face: Face, box: Box) -> Grey:
+    """A face's picture in the pixels of a box, each the mean over its area."""
     assert face.picture is not None
     low_left, low_right, _, high_left = face.corners
     plane = view.homography(high_left, low_right - low_left, low_left - high_left)
     width, height = box.size
     finer = 4 if width * height <= 160 * 160 else 2
-    paper = _printed(*face.picture, _detail(plane, finer))
+    paper = _marker_image(*face.picture, _pixels_per_module(plane, finer))
     n = len(paper)
     unit_from_paper = np.array([[1.0 / n, 0.0, 0.5 / n], [0.0, 1.0 / n, 0.5 / n], [0.0, 0.0, 1.0]])
     shift_x, shift_y = ((0.5 - start) * finer - 0.5 for start in (box.left, box.top))
@@ -105,8 +107,8 @@ def _picture(view: View, face: Face, box: Box) -> Grey:
     return shades.astype(np.float32)
 
 
-def _detail(plane: Floats, finer: int) -> int:
-    """Pixels a module that suit how large the picture is seen: its edges are then as sharp as the
+def _pixels_per_module(plane: Floats, finer: int) -> int:
+    """Pixels per module for the size of the picture in the frame: edges are then as sharp as the
     finer grid, and none is missed."""
     corners = plane @ np.array([[0.0, 1.0, 1.0, 0.0], [0.0, 0.0, 1.0, 1.0], [1.0] * 4])
     if (corners[2] <= 0.0).any():
@@ -118,7 +120,7 @@ def _detail(plane: Floats, finer: int) -> int:
 
 
 @lru_cache(maxsize=256)
-def _printed(family: MarkerFamily, number: int, detail: int) -> Pixels:
+def _marker_image(family: MarkerFamily, number: int, detail: int) -> Pixels:
     """A marker with a quiet zone of one module around, grey, `detail` pixels a module."""
     modules = _dictionary(family).markerSize + 2
     ink = cv2.aruco.generateImageMarker(_dictionary(family), number, modules * detail)
@@ -127,7 +129,7 @@ def _printed(family: MarkerFamily, number: int, detail: int) -> Pixels:
     return shades
 
 
-def quiet(family: MarkerFamily) -> float:
+def quiet_zone_ratio(family: MarkerFamily) -> float:
     """The side of a marker with its quiet zone, over that of the marker."""
     modules = _dictionary(family).markerSize + 2
     return (modules + 2) / modules

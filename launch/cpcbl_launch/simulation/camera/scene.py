@@ -1,4 +1,4 @@
-"""What a camera could see of the simulated field: posts, walls and robots, and how they look."""
+"""The scene that simulated cameras render: cylinders, walls and robots with their appearance."""
 
 from collections.abc import Mapping
 from typing import NamedTuple
@@ -11,7 +11,7 @@ from cpcbl_team.config import Bands, Colour, Cylinder, Side, Team, VisionSetting
 
 Bgr = tuple[float, float, float]
 
-PAINTS: Mapping[str, Bgr] = {
+PAINT_BGR: Mapping[str, Bgr] = {
     "red": (38.0, 34.0, 206.0),
     "orange": (30.0, 118.0, 222.0),
     "yellow": (36.0, 204.0, 214.0),
@@ -25,7 +25,7 @@ GREY: Bgr = (96.0, 96.0, 96.0)
 CARPET: Bgr = (112.0, 108.0, 104.0)
 
 
-class Standing(NamedTuple):
+class SceneRobot(NamedTuple):
     """A robot on the field (field frame)."""
 
     name: str
@@ -35,14 +35,14 @@ class Standing(NamedTuple):
 
 
 class Band(NamedTuple):
-    """One colour of a post, between two heights above the floor."""
+    """One colour of a cylinder, between two heights above the floor."""
 
     from_m: float
     to_m: float
     bgr: Bgr
 
 
-class Post(NamedTuple):
+class SceneCylinder(NamedTuple):
     """An upright cylinder, banded from its foot up."""
 
     x_m: float
@@ -50,11 +50,11 @@ class Post(NamedTuple):
     radius_m: float
     bands: tuple[Band, ...]
 
-    def at(self, x_m: float, y_m: float) -> "Post":
+    def at(self, x_m: float, y_m: float) -> "SceneCylinder":
         return self._replace(x_m=x_m, y_m=y_m)
 
 
-class Plane(NamedTuple):
+class WallSegment(NamedTuple):
     """A wall's two ends (x, y), metres."""
 
     a: tuple[float, float]
@@ -68,23 +68,23 @@ class Marker(NamedTuple):
     number: int
 
 
-class Looks(NamedTuple):
-    """How a robot is known: its markers, and its mast where it has one (at the origin)."""
+class RobotAppearance(NamedTuple):
+    """The markers of a robot, and its mast if it has one (at the origin)."""
 
     markers: tuple[Marker, ...] = ()
-    mast: Post | None = None
+    mast: SceneCylinder | None = None
 
 
 class Scene(msgspec.Struct, frozen=True):
-    """Everything but the light, and where robots stand."""
+    """Everything except the light and the poses of robots."""
 
     vision: VisionSettings
-    landmarks: Mapping[str, Post] = {}
-    walls: tuple[Plane, ...] = ()
-    looks: Mapping[str, Looks] = {}
-    """Robots that are not here stand without markers."""
-    clutter: tuple[Post, ...] = ()
-    """What is on no map."""
+    landmarks: Mapping[str, SceneCylinder] = {}
+    walls: tuple[WallSegment, ...] = ()
+    appearances: Mapping[str, RobotAppearance] = {}
+    """Robots that are missing here have no markers."""
+    clutter: tuple[SceneCylinder, ...] = ()
+    """Cylinders that are on no map."""
     floor: Bgr = CARPET
     wall_m: float = 0.3
     """Height of the walls."""
@@ -96,15 +96,17 @@ class Scene(msgspec.Struct, frozen=True):
         return Scene(
             vision=vision,
             landmarks={
-                name: banded(vision, mark.colours, vision.landmark).at(mark.x_m, mark.y_m)
+                name: banded_cylinder(vision, mark.colours, vision.landmark).at(mark.x_m, mark.y_m)
                 for name, mark in field.landmarks.items()
                 if mark.colours is not None
             },
-            walls=tuple(Plane(wall.from_m, wall.to_m) for wall in field.walls.values()),
-            looks={
-                name: Looks(
+            walls=tuple(WallSegment(wall.from_m, wall.to_m) for wall in field.walls.values()),
+            appearances={
+                name: RobotAppearance(
                     tuple(Marker(side, number) for side, number in robot.markers.items()),
-                    None if robot.colours is None else banded(vision, robot.colours, vision.mast),
+                    None
+                    if robot.colours is None
+                    else banded_cylinder(vision, robot.colours, vision.mast),
                 )
                 for name, robot in team.robots.items()
             },
@@ -114,33 +116,39 @@ class Scene(msgspec.Struct, frozen=True):
         return msgspec.structs.replace(self, landmarks={})
 
     def with_clutter(self, count: int, random: np.random.Generator) -> "Scene":
-        """With posts at random about the map that no map has: of the landmarks' shape with one
-        band, with the bands of one of them swapped, or of other shapes in the team's colours.
+        """The scene with cylinders at random places that are on no map.
+
+        They have the landmarks' shape with one band, the bands of a landmark exchanged, or other
+        shapes in the team's colours.
         """
-        posts = [_clutter(self, random) for _ in range(count)]
-        return msgspec.structs.replace(self, clutter=(*self.clutter, *posts))
+        cylinders = [_random_cylinder(self, random) for _ in range(count)]
+        return msgspec.structs.replace(self, clutter=(*self.clutter, *cylinders))
 
 
-def paint(vision: VisionSettings, name: str) -> Bgr:
+def colour_bgr(vision: VisionSettings, name: str) -> Bgr:
     """A colour by its name, BGR."""
-    return PAINTS[name] if name in PAINTS else _middle(vision.colours[name])
+    return PAINT_BGR[name] if name in PAINT_BGR else _threshold_bgr(vision.colours[name])
 
 
-def banded(vision: VisionSettings, colours: Bands, shape: Cylinder) -> Post:
-    """A cylinder with these bands at the origin; a grey stand where it has no foot on the floor."""
-    upper, lower = (paint(vision, name) for name in colours)
+def banded_cylinder(vision: VisionSettings, colours: Bands, shape: Cylinder) -> SceneCylinder:
+    """A cylinder with these bands at the origin."""
+    upper, lower = (colour_bgr(vision, name) for name in colours)
     foot, half = shape.foot_m, shape.height_m / 2.0
     bands = (Band(foot, foot + half, lower), Band(foot + half, foot + 2.0 * half, upper))
-    return Post(0.0, 0.0, shape.radius_m, bands)
+    return SceneCylinder(0.0, 0.0, shape.radius_m, bands)
 
 
-def stand(post: Post, from_m: float) -> Post:
-    """The post on a grey stand that begins at this height."""
-    foot = post.bands[0].from_m
-    return post._replace(bands=(Band(from_m, foot, GREY), *post.bands)) if foot > from_m else post
+def with_stand(cylinder: SceneCylinder, from_m: float) -> SceneCylinder:
+    """The cylinder on a grey stand that begins at this height."""
+    foot = cylinder.bands[0].from_m
+    return (
+        cylinder._replace(bands=(Band(from_m, foot, GREY), *cylinder.bands))
+        if foot > from_m
+        else cylinder
+    )
 
 
-def _middle(colour: Colour) -> Bgr:
+def _threshold_bgr(colour: Colour) -> Bgr:
     low, high = colour.hue
     hue = (low + ((high - low) % 180) / 2.0) % 180.0
     values = (0.25 * low + 0.75 * high for low, high in (colour.saturation, colour.value))
@@ -148,24 +156,24 @@ def _middle(colour: Colour) -> Bgr:
     return float(bgr[0]), float(bgr[1]), float(bgr[2])
 
 
-def _clutter(scene: Scene, random: np.random.Generator) -> Post:
-    """One post that is no landmark."""
-    paints = [paint(scene.vision, name) for name in scene.vision.colours]
+def _random_cylinder(scene: Scene, random: np.random.Generator) -> SceneCylinder:
+    """One cylinder that is no landmark."""
+    paints = [colour_bgr(scene.vision, name) for name in scene.vision.colours]
     shape, kind = scene.vision.landmark, random.integers(3)
-    places = [(post.x_m, post.y_m) for post in scene.landmarks.values()] or [(0.0, 0.0)]
+    places = [(cylinder.x_m, cylinder.y_m) for cylinder in scene.landmarks.values()] or [(0.0, 0.0)]
     low, high = np.min(places, axis=0) - 1.0, np.max(places, axis=0) + 1.0
     x_m, y_m = (float(v) for v in random.uniform(low, high))
     colour = paints[int(random.integers(len(paints)))]
     foot, height = shape.foot_m, shape.height_m
     if kind == 0:
         bands: tuple[Band, ...] = (Band(foot, foot + height, colour),)
-        return Post(x_m, y_m, shape.radius_m, bands)
+        return SceneCylinder(x_m, y_m, shape.radius_m, bands)
     if kind == 1 and scene.landmarks:
-        posts = list(scene.landmarks.values())
-        lower, upper = posts[int(random.integers(len(posts)))].bands
+        cylinders = list(scene.landmarks.values())
+        lower, upper = cylinders[int(random.integers(len(cylinders)))].bands
         swapped = lower._replace(bgr=upper.bgr), upper._replace(bgr=lower.bgr)
-        if not any(swapped == post.bands for post in posts):
-            return Post(x_m, y_m, shape.radius_m, swapped)
+        if not any(swapped == cylinder.bands for cylinder in cylinders):
+            return SceneCylinder(x_m, y_m, shape.radius_m, swapped)
     radius_m = shape.radius_m * float(random.uniform(0.3, 4.0))
     top_m = height * float(random.uniform(0.1, 0.6))
-    return Post(x_m, y_m, radius_m, (Band(0.0, top_m, colour),))
+    return SceneCylinder(x_m, y_m, radius_m, (Band(0.0, top_m, colour),))

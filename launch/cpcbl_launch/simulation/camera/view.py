@@ -1,7 +1,7 @@
-"""One look at the field: from points of the field to pixels, and from pixels to rays.
+"""A pinhole camera at a pose of the field: points of the field to pixels, and pixels to rays.
 
-A pinhole. Pixel centres have whole coordinates, as in OpenCV; what is said of a pixel is said of
-its centre, and how much of it is covered follows from the distance to the edge.
+Pixel centres have integer coordinates, as in OpenCV. Values of a pixel are those at its centre; its
+covered share follows from the distance of the centre to the edge.
 """
 
 import math
@@ -46,22 +46,22 @@ class Box(NamedTuple):
         return np.arange(self.top, self.bottom, dtype=np.float32)[:, None]
 
 
-def _cut(ahead: Floats, behind: Floats) -> Floats:
-    """Points (n, 3) of the camera's frame around what is ahead of a thing whose corners are on both
-    sides of its nearest plane."""
+def _clip_to_near_plane(ahead: Floats, behind: Floats) -> Floats:
+    """Points (n, 3) of the camera's frame that bound the part of an object in front of the near
+    plane, from corners on both sides of that plane."""
     way = behind[None] - ahead[:, None]
     share = (NEAREST_M - ahead[:, None, 2]) / way[..., 2]
     return np.concatenate([ahead, (ahead[:, None] + share[..., None] * way).reshape(-1, 3)])
 
 
-def crossed(a: Floats, b: Floats) -> Floats:
+def cross_products(a: Floats, b: Floats) -> Floats:
     """Cross products of rows (n, 3); numpy's own takes ten times as long for a few."""
     (ax, ay, az), (bx, by, bz) = a.T, b.T
     return np.column_stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])
 
 
 class View:
-    """A pinhole camera at a place of the field."""
+    """A pinhole camera at a pose of the field."""
 
     def __init__(self, camera: Camera, pose: Pose2) -> None:
         self.size_px, self.matrix = camera.size_px, camera.matrix
@@ -83,7 +83,7 @@ class View:
         if not ahead.any():
             return None
         if not ahead.all():
-            seen = _cut(seen[ahead], seen[~ahead])
+            seen = _clip_to_near_plane(seen[ahead], seen[~ahead])
         pixels = seen @ self.matrix.T
         pixels = pixels[:, :2] / pixels[:, 2:]
         left, top = np.floor(np.clip(pixels.min(axis=0), -2.0, 1e5)).astype(int) - 1
@@ -91,13 +91,13 @@ class View:
         found = Box(max(left, 0), max(top, 0), min(right, width), min(bottom, height))
         return found if found.left < found.right and found.top < found.bottom else None
 
-    def look(self, box: Box) -> tuple[Grey, Grey, Grey]:
+    def ray_directions(self, box: Box) -> tuple[Grey, Grey, Grey]:
         """The directions of the rays of all pixels in a box: x, y, z of the field frame."""
         u, v = box.columns, box.rows
         x, y, z = ((np.float32(a) * u + np.float32(c)) + np.float32(b) * v for a, b, c in self.rays)
         return x, y, z
 
-    def beyond(self, normals: Sequence[Floats], box: Box) -> Grey:
+    def shares_inside(self, normals: Sequence[Floats], box: Box) -> Grey:
         """The share of each pixel that is inside all the planes through the lens with these
         normals (3,), which point inwards."""
         u, v = box.columns, box.rows
@@ -111,13 +111,13 @@ class View:
             shares *= np.clip((a * u + (c + np.float32(0.5))) + b * v, 0.0, 1.0)
         return shares
 
-    def covered(self, corners: Floats, box: Box) -> Grey:
+    def polygon_shares(self, corners: Floats, box: Box) -> Grey:
         """The share of each pixel that a convex polygon (n, 3) of the field covers."""
         sides = corners - self.lens
         middle = sides.mean(axis=0)
-        normals = crossed(sides, np.concatenate([sides[1:], sides[:1]]))
+        normals = cross_products(sides, np.concatenate([sides[1:], sides[:1]]))
         normals *= np.where(normals @ middle < 0.0, -1.0, 1.0)[:, None]
-        return self.beyond(list(normals), box)
+        return self.shares_inside(list(normals), box)
 
     def homography(self, origin: Floats, across: Floats, down: Floats) -> Floats:
         """From the coordinates on a plane, origin + s across + t down, to pixels: (3, 3)."""

@@ -1,7 +1,7 @@
-"""How much of a thing a camera can see: what lies in the frame with nothing before it.
+"""The visible share of an object: the part inside the frame with nothing in front of it.
 
-By geometry alone, apart from the renderer: points on the side of a thing that faces the lens, and
-rays from them to the lens. What stands on the field hides like an upright cylinder.
+It follows from geometry alone, independent of the renderer: rays to the lens from points on the
+side of an object that faces the lens. Every object hides others like an upright cylinder.
 """
 
 import math
@@ -28,20 +28,20 @@ class Solid(NamedTuple):
     high: float
 
 
-def shares_shown(
+def visible_shares(
     points: Floats, camera: Camera, before: Sequence[Sequence[Solid]]
 ) -> tuple[float, ...]:
     """The share of points (n, 3) of the robot's frame that lie in the frame, with none of the
     solids before them: for each of some sets of solids."""
-    inside = in_frame(points, camera)
+    inside = is_in_frame(points, camera)
     if not inside.any():
         return (0.0,) * len(before)
     return tuple(
-        float(np.mean(inside & ~hidden(points, camera.position, solids))) for solids in before
+        float(np.mean(inside & ~is_hidden(points, camera.position, solids))) for solids in before
     )
 
 
-def in_frame(points: Floats, camera: Camera) -> Mask:
+def is_in_frame(points: Floats, camera: Camera) -> Mask:
     """Which of the points (n, 3) of the robot's frame fall on a pixel."""
     width, height = camera.size_px
     u, v = camera.project(points).T
@@ -50,29 +50,29 @@ def in_frame(points: Floats, camera: Camera) -> Mask:
     return inside
 
 
-def hidden(points: Floats, lens: Floats, before: Sequence[Solid]) -> Mask:
-    """Which of the points (n, 3) have one of the solids between them and the lens (3,)."""
+def is_hidden(points: Floats, lens: Floats, before: Sequence[Solid]) -> Mask:
+    """Which of the points (n, 3) have one of the solids between themselves and the lens (3,)."""
     covered = np.zeros(len(points), dtype=np.bool_)
     x, y, _ = (float(v) for v in points.mean(axis=0) - lens)
     far, spread = math.hypot(x, y), float(np.abs(points - points.mean(axis=0)).max()) * 1.5
     for solid in before:
-        if _between(
+        if _may_hide(
             solid.x - float(lens[0]), solid.y - float(lens[1]), solid.radius, x, y, far, spread
         ):
-            covered |= _crossed(points, lens, solid)
+            covered |= _is_crossed(points, lens, solid)
     return covered
 
 
-def _between(
+def _may_hide(
     a: float, b: float, radius: float, x: float, y: float, far: float, spread: float
 ) -> bool:
-    """Whether a circle about (a, b) may touch the way to what lies within `spread` of (x, y)."""
+    """Whether a circle around (a, b) may touch the line to a point within `spread` of (x, y)."""
     along, across = (a * x + b * y) / far, abs(a * y - b * x) / far
     return -radius <= along <= far + spread + radius and across <= spread + radius
 
 
-def _crossed(points: Floats, lens: Floats, solid: Solid) -> Mask:
-    """Whether the way from the lens to each point goes through the solid."""
+def _is_crossed(points: Floats, lens: Floats, solid: Solid) -> Mask:
+    """Whether the line from the lens to each point crosses the solid."""
     way = points - lens
     start = lens[:2] - (solid.x, solid.y)
     a = np.sum(way[:, :2] ** 2, axis=1)

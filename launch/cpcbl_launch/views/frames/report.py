@@ -1,4 +1,4 @@
-"""What is in a frame, as it is printed and as `look --json` writes it."""
+"""The detections of a frame, as they are printed and as `look --json` writes them."""
 
 import math
 from pathlib import Path
@@ -12,9 +12,9 @@ from cpcbl_team.inputs import Sighting
 from cpcbl_transport.messages import AnnotatedFrame, UnclearObject
 
 
-class FoundReport(msgspec.Struct, frozen=True, kw_only=True):
-    """A sighting in degrees; None for what it does not say. As the eyes say it, before the sensor's
-    systematic errors are taken out."""
+class SightingReport(msgspec.Struct, frozen=True, kw_only=True):
+    """A sighting in degrees as the detector reports it, before the corrections of the sensor; None
+    for values that it does not have."""
 
     id: str
     range_m: float | None
@@ -22,11 +22,11 @@ class FoundReport(msgspec.Struct, frozen=True, kw_only=True):
     bearing_deg: float | None
     bearing_sigma_deg: float | None
     heading_deg: float | None
-    """Where a teammate looks, in the robot's frame."""
+    """Heading of a teammate in the robot's frame."""
     heading_sigma_deg: float | None
 
 
-class LookReport(msgspec.Struct, frozen=True, kw_only=True):
+class FrameReport(msgspec.Struct, frozen=True, kw_only=True):
     """One frame of a robot."""
 
     robot: str
@@ -34,20 +34,20 @@ class LookReport(msgspec.Struct, frozen=True, kw_only=True):
     """Its stamp (ns), or the picture's file."""
     picture: str
     """The annotated picture that was written; empty if there is none."""
-    found: tuple[FoundReport, ...]
+    found: tuple[SightingReport, ...]
     unclear: tuple[UnclearObject, ...]
 
 
-def reported(look: AnnotatedFrame, frame: str, picture: str) -> LookReport:
-    """A look in words."""
-    found = tuple(_found(sighting) for sighting in look.found)
-    return LookReport(
-        robot=look.robot, frame=frame, picture=picture, found=found, unclear=look.unclear
+def frame_report(annotated: AnnotatedFrame, frame: str, picture: str) -> FrameReport:
+    """The report of an annotated frame."""
+    found = tuple(_sighting_report(sighting) for sighting in annotated.found)
+    return FrameReport(
+        robot=annotated.robot, frame=frame, picture=picture, found=found, unclear=annotated.unclear
     )
 
 
-def _found(s: Sighting) -> FoundReport:
-    return FoundReport(
+def _sighting_report(s: Sighting) -> SightingReport:
+    return SightingReport(
         id=s.id,
         range_m=s.range_m,
         range_sigma_m=s.range_sigma_m,
@@ -62,18 +62,18 @@ def _deg(angle: float | None) -> float | None:
     return None if angle is None else math.degrees(angle)
 
 
-def written(look: AnnotatedFrame, folder: Path, name: str) -> str:
+def save_picture(annotated: AnnotatedFrame, folder: Path, name: str) -> str:
     """Writes the annotated picture; its path, empty if there is no picture. Raises OSError."""
-    if not look.image:
+    if not annotated.image:
         return ""
     path = folder / f"{name}.jpg"
-    path.write_bytes(look.image)
+    path.write_bytes(annotated.image)
     return str(path)
 
 
-def print_look(report: LookReport, console: Console) -> None:
-    """What was found, what was not reported with the reason, and where the picture is."""
-    console.print(look_table(report))
+def print_frame_report(report: FrameReport, console: Console) -> None:
+    """Prints the sightings, the rejected objects with the reason, and the path of the picture."""
+    console.print(sighting_table(report))
     for unclear in report.unclear:
         names = f": {' or '.join(unclear.names)}" if unclear.names else ""
         console.print(f"{unclear.reason}{names}", style="yellow", highlight=False)
@@ -82,18 +82,18 @@ def print_look(report: LookReport, console: Console) -> None:
     console.print()
 
 
-def look_table(report: LookReport) -> Table:
-    """A row for each thing that was found."""
+def sighting_table(report: FrameReport) -> Table:
+    """A table with a row for each sighting."""
     columns = ("range m", "σ", "bearing °", "σ", "heading °", "σ")
-    shown = table(f"{report.robot}, frame {report.frame}", ("seen",), columns)
+    rows = table(f"{report.robot}, frame {report.frame}", ("seen",), columns)
     for f in report.found:
         ranges = _cell(f.range_m, 2), _cell(f.range_sigma_m, 3)
         bearings = _cell(f.bearing_deg, 1), _cell(f.bearing_sigma_deg, 2)
         headings = _cell(f.heading_deg, 1), _cell(f.heading_sigma_deg, 1)
-        shown.add_row(f.id, *ranges, *bearings, *headings)
+        rows.add_row(f.id, *ranges, *bearings, *headings)
     if not report.found:
-        shown.add_row("nothing", style="dim")
-    return shown
+        rows.add_row("nothing", style="dim")
+    return rows
 
 
 def _cell(value: float | None, digits: int) -> str:

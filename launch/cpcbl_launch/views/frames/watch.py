@@ -1,10 +1,10 @@
-"""Looks through the eyes of a robot: one that runs, or one that is shown picture files."""
+"""Annotated frames of a running robot, or of the detector of a robot for picture files."""
 
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
-from cpcbl_launch.views.frames.ear import FrameSubscriber
+from cpcbl_launch.views.frames.subscriber import FrameSubscriber
 from cpcbl_team.config import Team
 from cpcbl_team.errors import InputError
 from cpcbl_transport.messages import AnnotatedFrame, Frame
@@ -14,10 +14,10 @@ from cpcbl_transport.zenoh_bus import BusError, open_bus
 REFRESH_S = 0.02
 
 
-def looks_of(
+def live_frames(
     robot: str, team: str, link: Link, stop: Callable[[], bool], wait_s: float
 ) -> Iterator[AnnotatedFrame]:
-    """What a running robot says of its frames, until `stop()`; twice a second at most.
+    """The annotated frames of a running robot until `stop()`, at most two a second.
 
     Raises BusError without a router, InputError when it says nothing for `wait_s`.
     """
@@ -38,13 +38,13 @@ def looks_of(
             " --connect takes the endpoint that `cpcbl-team up` says"
         ) from None
     with bus:
-        ear = FrameSubscriber(bus, robot)
+        subscriber = FrameSubscriber(bus, robot)
         until_s = time.monotonic() + wait_s
         while not stop():
-            looks = ear.take()
-            yield from looks
+            frames = subscriber.take()
+            yield from frames
             now_s = time.monotonic()
-            until_s = now_s + wait_s if looks else until_s
+            until_s = now_s + wait_s if frames else until_s
             if now_s > until_s:
                 raise InputError(
                     f"look {robot}: no frame of {robot} in team {team} at {endpoints} for"
@@ -53,13 +53,13 @@ def looks_of(
             time.sleep(REFRESH_S)
 
 
-def looks_at(
+def frames_of_pictures(
     paths: Sequence[Path], robot: str, team: Team
 ) -> Iterator[tuple[Path, AnnotatedFrame]]:
-    """What the eyes of a robot make of picture files. Raises OSError, InputError without OpenCV."""
-    from cpcbl_agents.vision.detector import CameraEyes
+    """Picture files, annotated by the detector of a robot. Raises OSError, DependencyError."""
+    from cpcbl_agents.vision.detector import CameraDetector
 
-    eyes = CameraEyes(robot, team)
+    detector = CameraDetector(robot, team)
     for path in paths:
-        _, look = eyes.shown(Frame(0, path.read_bytes()))
-        yield path, look
+        _, annotated = detector.detect_and_annotate(Frame(0, path.read_bytes()))
+        yield path, annotated
