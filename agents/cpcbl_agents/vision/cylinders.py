@@ -37,7 +37,7 @@ from cpcbl_team.inputs import Sighting
 
 LEAST_PX = 6.0  # high, both bands
 LEAST_PART_PX = 3.0  # wide
-LEAST_BAND_PX = 6.0  # high and wide: what a single band must be to be worth a doubt
+LEAST_BAND_PX = 6.0  # high and wide: a smaller single band is ignored
 NARROW_PX = 4.0
 """At this width the sigma of the range is doubled: blur mixes the middle of a narrow cylinder with
 its surroundings and moves its edges outwards. The increased sigma does not decide what an object

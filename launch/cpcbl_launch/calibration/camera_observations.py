@@ -116,18 +116,18 @@ def dataset_from_pictures(
 
     rows = read_poses(poses, team)
     names = list(dict.fromkeys(row.file for row in rows))
-    eyes = CameraDetector(robot, team)
+    detector = CameraDetector(robot, team)
     frames: list[Sightings] = []
     rejected: dict[str, str] = {}
     ambiguities: Counter[str] = Counter()
     for i, name in enumerate(names):
         pixels = read_picture(folder / name).pixels
-        seen = pixels if isinstance(pixels, str) else eyes.detections(pixels)
-        if isinstance(seen, str):
-            rejected[name] = seen
+        detections = pixels if isinstance(pixels, str) else detector.detections(pixels)
+        if isinstance(detections, str):
+            rejected[name] = detections
         else:
-            ambiguities.update(ambiguity.reason for ambiguity in seen.ambiguities)
-            frames.append(Sightings(_stamp_ns(i), tuple(one.sighting for one in seen.found)))
+            ambiguities.update(ambiguity.reason for ambiguity in detections.ambiguities)
+            frames.append(Sightings(_stamp_ns(i), tuple(one.sighting for one in detections.found)))
         progress((i + 1) / len(names))
     if not frames:
         name, reason = next(iter(rejected.items()))

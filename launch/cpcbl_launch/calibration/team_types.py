@@ -145,8 +145,8 @@ def _with_margin(
     result = dict(values)
     for name in noise:
         if name in result:
-            doubt = correction_margin * abs(_correction_size(values, name))
-            sigma = math.hypot((1.0 + margin) * result[name].value, doubt)
+            uncertainty = correction_margin * abs(_correction_size(values, name))
+            sigma = math.hypot((1.0 + margin) * result[name].value, uncertainty)
             result[name] = Estimate(sigma, result[name].standard_error)
     return result
 

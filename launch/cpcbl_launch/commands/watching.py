@@ -70,30 +70,33 @@ def traffic(
     print_result(result, as_json, lambda: console.print(traffic_view(result, where)))
 
 
+Pictures = Annotated[
+    Optional[Path],
+    typer.Option(help="Detect in this picture, or folder of pictures; no team need run."),
+]
+FrameCount = Annotated[
+    Optional[int], typer.Option(min=1, help="Frames to look at; default: one, or all pictures.")
+]
+
+
 def look(
     robot: Annotated[str, typer.Argument(help="The robot whose camera it is.")],
     team_file: TeamFile,
-    pictures: Annotated[
-        Optional[Path],
-        typer.Option(help="Show its eyes this picture, or folder of pictures; no team need run."),
-    ] = None,
+    pictures: Pictures = None,
     connect: Connect = None,
     save: Annotated[
         Path, typer.Option(help="Folder for the annotated pictures, made if need be.")
     ] = Path("looks"),
-    count: Annotated[
-        Optional[int],
-        typer.Option(min=1, help="Frames to look at; default: one, or all pictures."),
-    ] = None,
+    count: FrameCount = None,
     wait: Annotated[
         float, typer.Option(min=0.1, help="Seconds to wait for the router, and for a frame.")
     ] = 10.0,
     as_json: Annotated[bool, typer.Option("--json", help="Print what is seen as JSON.")] = False,
 ) -> None:
-    """Look through a robot's camera: what it finds in its frames, and what it rejects and why.
+    """Annotated frames of a robot's camera: what it detects, and what it rejects and why.
 
-    Prints a table a frame and saves the frames with all that drawn in. A running
-    robot draws them, twice a second at most, only while somebody looks.
+    Prints a table for each frame and saves the annotated frames. A running robot
+    annotates at most two frames a second, and only while this command runs.
     """
     from rich.console import Console
 
