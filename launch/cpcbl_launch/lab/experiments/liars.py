@@ -280,9 +280,11 @@ def tables(result: Liars) -> Iterable[RenderableType]:
                 shown.add_row(*_cells(row, believed.get((row.case.lie, honest))))
         yield shown
     yield (
-        "m: RMSE. ratio: to the team without the liar; where 80 % of the seeds lie;\n"
-        "believed: where nobody judges. found: robots that found it; s: after the lie\n"
-        "began; back: s after it ended. false: quarantine of honest ones, s a run"
+        "Column m is the RMSE; ratio is relative to the team without the liar, and 80 %\n"
+        "the range of 80 % of the seeds; believed is the ratio with trust switched off.\n"
+        "Column found counts the robots that detected the liar, s is the time after the\n"
+        "lie began, and back the time after its end until they used it again, in s.\n"
+        "Column false is the time that honest robots spent in quarantine, s per run."
     )
     missed = [
         f"{r.case.lie} beside {r.case.honest} honest"
@@ -290,9 +292,9 @@ def tables(result: Liars) -> Iterable[RenderableType]:
         if _exceeds_target(r)
     ]
     yield (
-        f"held: no ratio is above {MOST_RATIO:g}"
+        f"The aim holds: no ratio is above {MOST_RATIO:g}."
         if not missed
-        else f"above {MOST_RATIO:g}: {'; '.join(missed)}"
+        else f"The ratio is above {MOST_RATIO:g} for {'; '.join(missed)}."
     )
 
 
