@@ -11,27 +11,28 @@ import typer
 from cpcbl_launch.commands import options
 from cpcbl_launch.commands.arguments import AsJson, ReportFile, print_not_written, write_report
 
+Scenarios = Annotated[
+    Optional[list[str]], typer.Argument(help="Names of scenarios, or all.", metavar="SCENARIO")
+]
+MarkdownFile = Annotated[
+    Optional[Path],
+    typer.Option(callback=options.writable_file, help="File to write the table into, as Markdown."),
+]
+
 
 def chaos(
-    scenarios: Annotated[
-        Optional[list[str]], typer.Argument(help="Names of scenarios, or all.", metavar="SCENARIO")
-    ] = None,
+    scenarios: Scenarios = None,
     listed: Annotated[bool, typer.Option("--list", help="Show the scenarios.")] = False,
-    seed: Annotated[int, typer.Option(help="Of noise and of random faults.")] = 1,
+    seed: Annotated[int, typer.Option(help="The seed of noise and of random faults.")] = 1,
     soak_s: Annotated[float, typer.Option(min=1.0, help="Seconds that the soak takes.")] = 180.0,
-    markdown: Annotated[
-        Optional[Path],
-        typer.Option(
-            callback=options.writable_file, help="File to write the table into, as Markdown."
-        ),
-    ] = None,
+    markdown: MarkdownFile = None,
     report: ReportFile = None,
     as_json: AsJson = False,
 ) -> None:
-    """Faults on purpose, on real processes: what was expected, what was seen, whether it held.
+    """Inject faults into real processes, and compare what happens with what is expected.
 
-    Exit code 1 if an expectation did not hold. What cannot run here (root, for
-    lost packets and full disks) is said, and neither held nor not.
+    The exit code is 1 if an expectation was not met. A scenario that cannot run here (lost
+    packets and full disks need root) is named, and counts as neither met nor not met.
     """
     from rich.console import Console
 

@@ -1,7 +1,6 @@
 """What scenarios make of what was recorded: expectations that hold, and that do not."""
 
 import pytest
-from msgspec.structs import replace
 from support.chaos import (
     UNTIL_S,
     run_log_of,
@@ -12,17 +11,6 @@ from support.chaos import (
     unmet_checks,
 )
 
-from cpcbl_launch.lab.chaos.checks import ChaosReport, Check, Outcome, report_data
-from cpcbl_launch.lab.chaos.figures import (
-    counts_between,
-    localized_after_s,
-    longest_track_gap_s,
-    position_rmse_m,
-    reported_lost_after_s,
-    restarted_after_s,
-    token_gone_after_s,
-    track_delay_s,
-)
 from cpcbl_launch.lab.chaos.files import CommandResult, full_disk_checks, read_only_checks
 from cpcbl_launch.lab.chaos.inputs import duplicates_checks, flood_checks
 from cpcbl_launch.lab.chaos.network import bad_link_checks, cut_link_checks, partition_checks
@@ -43,110 +31,6 @@ from cpcbl_launch.run.usage import MIB
 
 AT_S = 10.0
 GOOD = run_log_of([tracks_of("a"), tracks_of("b")])
-
-
-def outcome(*checks: Check) -> Outcome:
-    return Outcome(scenario="s", done="d", expectation="e", checks=checks)
-
-
-@pytest.mark.parametrize(
-    ("check", "held", "said"),
-    [
-        (Check(what="gap", seen=0.5, unit="s", at_most=1.0), True, "gap 0.5 s (≤ 1 s)"),
-        (Check(what="gap", seen=1.5, unit="s", at_most=1.0), False, "gap 1.5 s (≤ 1 s)"),
-        (Check(what="gap", seen=None, unit="s", at_most=1.0), False, "gap not seen (≤ 1 s)"),
-        (Check(what="gap", seen=float("nan"), at_most=1.0), False, "gap nan (≤ 1)"),
-        (Check(what="in", seen=0.95, unit="%", at_least=0.9), True, "in 95 % (≥ 90 %)"),
-        (Check(what="n", seen=3, at_least=3, at_most=3), True, "n 3 (= 3)"),
-        (Check(what="n", seen=4, at_least=3, at_most=3), False, "n 4 (= 3)"),
-    ],
-)
-def test_a_check_is_met_within_its_bounds_and_shows_both(
-    check: Check, held: bool, said: str
-) -> None:
-    assert check.is_met is held
-    assert str(check) == said
-
-
-def test_an_outcome_without_a_check_is_not_met() -> None:
-    good = outcome(Check(what="n", seen=1, at_least=1))
-    assert good.is_met is True
-    assert outcome().is_met is False
-    assert replace(good, failed="no router").is_met is False
-    assert replace(outcome(), not_run="needs root").is_met is None
-
-
-def test_a_scenario_that_was_not_run_violates_nothing_and_is_in_the_report() -> None:
-    skipped = replace(outcome(), not_run="needs root")
-    good = ChaosReport(version="1", seed=1, machine="m", outcomes=(skipped,))
-    assert good.is_met
-    bad = outcome(Check(what="n", seen=0, at_least=1))
-    data = report_data(replace(good, outcomes=(skipped, bad)))
-    assert data["held"] is False
-    assert [o["held"] for o in data["outcomes"]] == [None, False]
-    assert data["outcomes"][1]["checks"][0]["held"] is False
-
-
-# Figures ------------------------------------------------------------------------------------------
-
-
-def test_a_robot_is_gone_when_its_last_token_is() -> None:
-    tokens = [
-        token_appeared(0, "a"),
-        token_appeared(9, "a", tier="4"),
-        token_disappeared(9.1, "a"),
-        token_disappeared(10.5, "a", tier="4"),
-    ]
-    assert token_gone_after_s(run_log_of([], tokens), "a", AT_S) == pytest.approx(0.5)
-    assert token_gone_after_s(run_log_of([], tokens[:3]), "a", AT_S) is None
-
-
-def test_a_robot_is_back_with_another_process() -> None:
-    tokens = [
-        token_appeared(0, "a"),
-        token_appeared(11.0, "a"),
-        token_appeared(12.0, "a", "2"),
-        token_appeared(11.5, "b", "2"),
-    ]
-    assert restarted_after_s(run_log_of([], tokens), "a", AT_S, "1") == pytest.approx(2.0)
-    assert restarted_after_s(run_log_of([], tokens[:2]), "a", AT_S, "1") is None
-
-
-def test_a_robot_is_localized_when_it_stays_correct_for_a_second() -> None:
-    flickers = tracks_of("a", lambda s: 1.0 if s < 12.0 or 12.5 < s < 14.0 else 0.1)
-    assert localized_after_s(run_log_of([flickers]), "a", AT_S, 0.3) == pytest.approx(4.0)
-    lost = tracks_of("a", lost=(0.0, 15.0))
-    assert localized_after_s(run_log_of([lost]), "a", AT_S, 0.3) == pytest.approx(5.0)
-    assert reported_lost_after_s(run_log_of([lost]), "a", AT_S) == pytest.approx(0.0)
-    said = [status_at("a", 9.5, {"lost": 1}), status_at("a", 10.5, {"lost": 2})]
-    assert reported_lost_after_s(
-        run_log_of([tracks_of("a")], (), said), "a", AT_S
-    ) == pytest.approx(0.5)
-    assert reported_lost_after_s(run_log_of([tracks_of("a")], (), said[:1]), "a", AT_S) is None
-    never = tracks_of("a", lambda s: 1.0)
-    assert localized_after_s(run_log_of([never]), "a", AT_S, 0.3) is None
-
-
-def test_gap_error_and_delay_are_those_of_the_window() -> None:
-    notes = run_log_of(
-        [tracks_of("a", lambda s: 3.0 if s >= 20.0 else 0.3, (12.0, 15.0), late_s=0.2)]
-    )
-    assert longest_track_gap_s(notes, "a", AT_S, 20.0) == pytest.approx(3.1, abs=0.11)
-    assert longest_track_gap_s(notes, "a", 16.0, 20.0) == pytest.approx(0.1, abs=0.11)
-    assert longest_track_gap_s(notes, "nobody", 16.0, 20.0) == pytest.approx(4.0)
-    assert position_rmse_m(notes, "a", AT_S, 20.0) == pytest.approx(0.3)
-    assert position_rmse_m(notes, "a", 20.0) == pytest.approx(3.0)
-    assert track_delay_s(notes, "a", AT_S, 20.0) == pytest.approx(0.2)
-
-
-def test_counts_are_those_of_the_window_over_all_processes() -> None:
-    statuses = [
-        status_at("a", 9.0, {"garbage": 5}),
-        status_at("a", 11.0, {"garbage": 7}),
-        status_at("a", 13.0, {"garbage": 3}, incarnation="2"),
-        status_at("a", 30.0, {"garbage": 99}, incarnation="2"),
-    ]
-    assert counts_between(run_log_of([], (), statuses), "a", AT_S, 20.0)["garbage"] == 2 + 3
 
 
 # Processes ----------------------------------------------------------------------------------------
