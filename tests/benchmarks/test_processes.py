@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from benchmarks import process_load, processes
 from benchmarks.process_load import Load, Start
-from support.processes import cpcbl_team
+from support.processes import command_line
 from support.tables import assert_fits
 
 from cpcbl_launch.run.usage import MIB, process_usage
@@ -73,7 +73,7 @@ def test_the_robots_of_another_checkout_are_started() -> None:
 
 @pytest.mark.parametrize("name", ["latency", "processes"])
 def test_the_former_command_is_one_line_that_names_the_target(name: str) -> None:
-    ran = cpcbl_team("experiment", name, "--robots", "4")
+    ran = command_line("experiment", name, "--robots", "4")
     assert ran.returncode == 2
     (line,) = ran.stderr.splitlines()
     assert f"make bench-{name}" in line

@@ -21,10 +21,9 @@ from cpcbl_launch.lab.chaos.scenario import ScenarioOptions
 from cpcbl_transport import topics
 
 
+@pytest.mark.long
 @pytest.mark.timeout(900)
-@pytest.mark.parametrize(
-    ("seed", "per_key"), [(3, 300), pytest.param(1, PER_KEY, marks=pytest.mark.long)]
-)
+@pytest.mark.parametrize(("seed", "per_key"), [(3, 300), (1, PER_KEY)])
 def test_every_payload_is_counted_and_the_team_continues(seed: int, per_key: int) -> None:
     checks = list(fuzz(ScenarioOptions(seed=seed), per_key).checks)
     assert [str(check) for check in checks if not check.is_met] == []

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 from support.logs import write_log
-from support.processes import cpcbl_team, eventually, patient_up, pids_of
+from support.processes import command_line, cpcbl_team, eventually, patient_up, pids_of
 
 from cpcbl_launch.run.processes import PROGRAM
 from cpcbl_launch.run.up import free_endpoint
@@ -60,14 +60,14 @@ odometry = { moves = false }
     ],
 )
 def test_every_command_explains_itself(command: list[str]) -> None:
-    shown = cpcbl_team(*command, "--help")
+    shown = command_line(*command, "--help")
     assert shown.returncode == 0
     assert "Usage" in shown.stdout
 
 
 def test_check_accepts_the_built_in_teams() -> None:
     for name in ("demo", "mrclam", PLAIN):
-        checked = cpcbl_team("check", name)
+        checked = command_line("check", name)
         assert checked.returncode == 0, checked.stderr
         assert f"team '{name.removesuffix('-uncalibrated')}'" in checked.stdout
 
@@ -75,7 +75,7 @@ def test_check_accepts_the_built_in_teams() -> None:
 def test_check_names_file_key_and_fix_in_one_line(tmp_path: Path) -> None:
     path = tmp_path / "team.toml"
     path.write_text(PAIR.replace("range_share", "range_shar"))
-    checked = cpcbl_team("check", path)
+    checked = command_line("check", path)
     assert checked.returncode == 2
     assert checked.stdout == ""
     (line,) = checked.stderr.splitlines()
@@ -103,7 +103,7 @@ def test_check_names_file_key_and_fix_in_one_line(tmp_path: Path) -> None:
     ],
 )
 def test_what_the_user_can_mend_is_one_line(arguments: list[str], said: str) -> None:
-    ended = cpcbl_team(*arguments)
+    ended = command_line(*arguments)
     assert ended.returncode == 2
     (line,) = ended.stderr.splitlines()
     assert said in line

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from support.buses import SECOND, standing
 from support.logs import write_log
-from support.processes import cpcbl_team
+from support.processes import command_line, cpcbl_team
 
 from cpcbl_launch.commands.options import require_folder, require_writable_file
 from cpcbl_launch.reporting.recording import Recording, read_recording
@@ -82,7 +82,7 @@ def test_a_full_standard_output_is_one_line() -> None:
 def test_a_file_that_cannot_be_made_is_refused_before_anything_starts(
     option: str, tmp_path: Path
 ) -> None:
-    ran = cpcbl_team("up", "--duration", 2, option, tmp_path / "nowhere" / "run.png")
+    ran = command_line("up", "--duration", 2, option, tmp_path / "nowhere" / "run.png")
     assert ran.returncode == 2
     assert ran.stderr.splitlines()[-1].startswith(f"cpcbl-team: {option} ")
     assert "watch it" not in ran.stdout
@@ -120,6 +120,7 @@ def test_a_simulation_whose_picture_is_lost_still_reports(tmp_path: Path) -> Non
     assert json.loads(ran.stdout)["not_written"] == {str(path): NO_SPACE}
 
 
+@pytest.mark.long
 def test_an_experiment_whose_files_are_lost_still_shows_its_figures(tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
     files = [tmp_path / f"one-way-vs-both.{ending}" for ending in ("json", "png")]

@@ -1,10 +1,14 @@
 """Starting the command line as a user would, and looking at processes."""
 
+import io
+import logging
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Sequence
+from contextlib import redirect_stderr, redirect_stdout
 
+from cpcbl_launch.cli import main
 from cpcbl_launch.run.processes import PROGRAM
 
 
@@ -17,6 +21,22 @@ def cpcbl_team(*arguments: object, timeout_s: float = 90.0) -> "subprocess.Compl
         timeout=timeout_s,
         check=False,
     )
+
+
+def command_line(*arguments: object) -> "subprocess.CompletedProcess[str]":
+    """What `cpcbl-team ARGUMENTS` prints and its exit code, run in this process: for commands that
+    end before they start anything."""
+    words, output, errors = [*map(str, arguments)], io.StringIO(), io.StringIO()
+    handlers, argv, code = logging.root.handlers[:], sys.argv, 0
+    try:
+        sys.argv = ["cpcbl-team", *words]
+        with redirect_stdout(output), redirect_stderr(errors):
+            main()
+    except SystemExit as end:
+        code = end.code if isinstance(end.code, int) else int(end.code is not None)
+    finally:
+        sys.argv, logging.root.handlers[:] = argv, handlers
+    return subprocess.CompletedProcess(words, code, output.getvalue(), errors.getvalue())
 
 
 PATIENT = """

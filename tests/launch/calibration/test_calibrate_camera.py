@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import tomlkit
 from support.board_pictures import Shot, board_pictures
-from support.processes import cpcbl_team
+from support.processes import command_line, cpcbl_team
 
 from cpcbl_agents.vision.camera import Camera, Floats, Pixels
 from cpcbl_launch.calibration.board import (
@@ -360,11 +360,11 @@ def test_the_command_line_writes_a_team_that_it_can_check(folder: Path, tmp_path
 
 
 def test_json_and_boards_and_what_is_wrong(folder: Path, tmp_path: Path) -> None:
-    ran = cpcbl_team("calibrate", "camera", folder, "--json")
+    ran = command_line("calibrate", "camera", folder, "--json")
     assert ran.returncode == 0, ran.stderr
     assert json.loads(ran.stdout)["intrinsics"]["cx_px"]["value"] == pytest.approx(247.6, abs=2.0)
     board = tmp_path / "board.png"
-    assert cpcbl_team("calibrate", "camera", "--print-board", board).returncode == 0
+    assert command_line("calibrate", "camera", "--print-board", board).returncode == 0
     assert len(_corners(_pixels(read_picture(board))).pixels) == 24
     for arguments, said in (
         (["camera"], "name pictures of the board"),
@@ -375,18 +375,18 @@ def test_json_and_boards_and_what_is_wrong(folder: Path, tmp_path: Path) -> None
         ),
         (["camera", folder, "--board", "chessboard", "--squares", "9x9"], "no board found in any"),
     ):
-        failed = cpcbl_team("calibrate", *arguments)
+        failed = command_line("calibrate", *arguments)
         assert failed.returncode == 2
         (line,) = failed.stderr.splitlines()
         assert said in line
 
 
 def test_help_lists_every_calibration_and_logs_need_no_word() -> None:
-    shown = cpcbl_team("calibrate", "--help")
+    shown = command_line("calibrate", "--help")
     assert shown.returncode == 0
     for word in ("log", "camera", "colours", "sensor"):
         assert f" {word} " in shown.stdout
     for words in ((), ("log",)):
-        failed = cpcbl_team("calibrate", *words, "--json", "nowhere")
+        failed = command_line("calibrate", *words, "--json", "nowhere")
         assert failed.returncode == 2
         assert "nowhere: no MRCLAM log here" in failed.stderr

@@ -7,7 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from support.processes import cpcbl_team
+from support.processes import command_line, cpcbl_team
 
 from cpcbl_agents.vision.camera import Pixels
 from cpcbl_launch.calibration.colour_samples import (
@@ -341,7 +341,7 @@ def test_the_command_line_writes_a_team_that_it_can_check(folder: Path, tmp_path
 
 def test_json_and_what_is_wrong_in_one_line(folder: Path, tmp_path: Path) -> None:
     samples = ["--sample", "0.png:red=13,23,34,34", "--sample", "1.png:red=30,40,15"]
-    ran = cpcbl_team("calibrate", "colours", folder, *samples, "--json")
+    ran = command_line("calibrate", "colours", folder, *samples, "--json")
     assert ran.returncode == 0, ran.stderr
     red = json.loads(ran.stdout)["colours"]["red"]
     assert red["samples"] == 2
@@ -353,7 +353,7 @@ def test_json_and_what_is_wrong_in_one_line(folder: Path, tmp_path: Path) -> Non
         ([folder, *samples, "--team", "demo"], "a built-in team cannot be changed"),
         (["--sample", "no.png:red=1,2,3"], "no.png: No such file"),
     ):
-        failed = cpcbl_team("calibrate", "colours", *arguments)
+        failed = command_line("calibrate", "colours", *arguments)
         assert failed.returncode == 2
         (line,) = failed.stderr.splitlines()
         assert said in line

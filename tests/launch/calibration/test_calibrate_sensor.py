@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 from msgspec.structs import replace
-from support.processes import cpcbl_team
+from support.processes import command_line, cpcbl_team
 
 from cpcbl_agents.sources.mrclam import LogError
 from cpcbl_agents.vision.camera import Camera
@@ -390,7 +390,7 @@ def test_a_wrong_option_is_one_line(honest: Path, tmp_path: Path) -> None:
         (["--pictures", honest, "--poses", honest / "poses.csv"], "needs --team"),
         (["run.mp4"], "run.mp4: no recording"),
     ):
-        failed = cpcbl_team("calibrate", "sensor", *arguments)
+        failed = command_line("calibrate", "sensor", *arguments)
         assert failed.returncode == 2
         (line,) = failed.stderr.splitlines()
         assert words in line

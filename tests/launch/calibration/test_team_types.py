@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 from support.logs import write_log
-from support.processes import cpcbl_team
+from support.processes import command_line
 
 from cpcbl_launch.calibration.robots import Calibration, RobotCalibration
 from cpcbl_launch.calibration.statistics import (
@@ -143,7 +143,7 @@ def test_values_are_rounded_to_what_their_error_allows(standard_error: float, pl
 def test_calibrate_prints_json_and_says_what_is_wrong_in_one_line(tmp_path: Path) -> None:
     write_log(tmp_path / "log", ("1",), seconds=30.0)
     type_text = tmp_path / "out.toml"
-    ran = cpcbl_team("calibrate", tmp_path / "log", "--output", type_text, "--json")
+    ran = command_line("calibrate", tmp_path / "log", "--output", type_text, "--json")
     assert ran.returncode == 0, ran.stderr
     scale = json.loads(ran.stdout)["robots"]["1"]["odometry"]["turn_scale"]
     assert scale["value"] == pytest.approx(1.0, abs=0.02)
@@ -152,7 +152,7 @@ def test_calibrate_prints_json_and_says_what_is_wrong_in_one_line(tmp_path: Path
         ([tmp_path], "no MRCLAM log here"),
         ([tmp_path / "log", "--team", tmp_path / "no.toml"], "no.toml: no such file"),
     ):
-        failed = cpcbl_team("calibrate", *arguments)
+        failed = command_line("calibrate", *arguments)
         assert failed.returncode == 2
         (line,) = failed.stderr.splitlines()
         assert said in line

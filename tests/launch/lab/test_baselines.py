@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 import pytest
 from support.logs import FRAME_MS, STEP_MS, log_team, write_log
-from support.processes import cpcbl_team
+from support.processes import command_line, cpcbl_team
 
 from cpcbl_agents.sources.mrclam import read_table
 from cpcbl_launch.lab.baselines import (
@@ -299,7 +299,7 @@ def test_an_export_that_cannot_be_written_is_one_line(tmp_path: Path) -> None:
     write_log(tmp_path / "log", ROBOTS, 2.0)
     taken = tmp_path / "file"
     taken.write_text("")
-    ran = cpcbl_team("evaluate", "mrclam", tmp_path / "log", "--export", taken)
+    ran = command_line("evaluate", "mrclam", tmp_path / "log", "--export", taken)
     assert ran.returncode == 2
     (line,) = ran.stderr.splitlines()
     assert f"--export {taken}" in line

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 from support.buses import Subscription, wait_until
-from support.processes import cpcbl_team, eventually, pids_of
+from support.processes import command_line, cpcbl_team, eventually, pids_of
 
 from cpcbl_launch.lab.chaos import tun_link
 from cpcbl_launch.lab.chaos.checks import Check, Outcome
@@ -84,19 +84,19 @@ def test_every_scenario_has_a_unique_name_and_an_expectation() -> None:
 
 
 def test_a_name_that_is_no_scenario_is_one_line_with_a_hint() -> None:
-    ran = cpcbl_team("chaos", "kill-robto")
+    ran = command_line("chaos", "kill-robto")
     assert ran.returncode == 2
     assert "no scenario 'kill-robto'; did you mean kill-robot?" in ran.stderr
 
 
 def test_fuzz_is_one_line_that_names_the_test() -> None:
-    ran = cpcbl_team("chaos", "fuzz")
+    ran = command_line("chaos", "fuzz")
     assert ran.returncode == 2
     assert ran.stderr.startswith("cpcbl-team: chaos: fuzz: it is a test now: run `make fuzz`")
 
 
 def test_the_scenarios_are_listed() -> None:
-    ran = cpcbl_team("chaos", "--list")
+    ran = command_line("chaos", "--list")
     assert ran.returncode == 0
     for scenario in SCENARIOS:
         assert scenario.name[:8] in ran.stdout

@@ -9,7 +9,7 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
-from support.processes import cpcbl_team
+from support.processes import command_line
 
 from cpcbl_launch.commands.experimenting import conduct
 from cpcbl_launch.lab.experiments import (
@@ -185,13 +185,13 @@ def test_team_sizes_are_checked(sizes: list[int]) -> None:
 def test_a_wrong_option_is_one_line(tmp_path: Path) -> None:
     taken = tmp_path / "taken"
     taken.write_text("")
-    failed = cpcbl_team("experiment", "figure7", "--output", taken)
+    failed = command_line("experiment", "figure7", "--output", taken)
     assert failed.returncode == 2
     (line,) = failed.stderr.splitlines()
     assert f"--output {taken}" in line
     assert "name a folder" in line
-    assert cpcbl_team("experiment", "figure7", "--seeds", "0").returncode == 2
-    assert "one-way-vs-both" in cpcbl_team("experiment", "--help").stdout
+    assert command_line("experiment", "figure7", "--seeds", "0").returncode == 2
+    assert "one-way-vs-both" in command_line("experiment", "--help").stdout
 
 
 def outcome_of(experiment: Experiment, seeds: int, cases: Mapping[Any, Case]) -> Outcome:

@@ -226,6 +226,7 @@ def small_result() -> detection_figures.Eyes:
     return eyes.measure(150, 1, 2, lambda: None)
 
 
+@pytest.mark.long
 def test_few_objects_are_missed_and_none_is_mistaken(small_result: detection_figures.Eyes) -> None:
     assert not small_result.refused
     assert not [m for m in small_result.mistakes if m.why == "wrong id"]
@@ -243,6 +244,7 @@ def test_few_objects_are_missed_and_none_is_mistaken(small_result: detection_fig
         assert known.bearing_sigma_deg < 0.6
 
 
+@pytest.mark.long
 def test_stated_sigmas_are_consistent(small_result: detection_figures.Eyes) -> None:
     for kind, known in small_result.accuracy.items():
         shares = [known.range_inside, known.bearing_inside]

@@ -51,6 +51,7 @@ def test_every_robot_is_localized_by_its_camera_with_a_consistent_covariance() -
     assert sum(shares) / len(shares) >= 0.97
 
 
+@pytest.mark.long
 @WITHIN
 def test_the_follower_is_localized_by_its_teammates() -> None:
     """It is blind to landmarks: without the others' help it does not know nearly as well."""

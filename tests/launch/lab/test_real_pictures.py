@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 from msgspec.structs import replace
-from support.processes import cpcbl_team
+from support.processes import command_line, cpcbl_team
 
 from cpcbl_agents.vision.camera import Camera, Pixels
 from cpcbl_agents.vision.markers import MarkerDetector
@@ -101,7 +101,7 @@ def test_an_unreadable_set_is_one_line(tmp_path: Path, name: str, text: str, sai
         (tmp_path / "x.toml").write_text(TEAM)
         (tmp_path / "x.csv").write_text(text)
         name = str(tmp_path / name)
-    shown = cpcbl_team("experiment", "pictures", name, tmp_path, "--output", tmp_path)
+    shown = command_line("experiment", "pictures", name, tmp_path, "--output", tmp_path)
     assert shown.returncode != 0
     assert said in shown.stderr
     assert len(shown.stderr.strip().splitlines()) == 1

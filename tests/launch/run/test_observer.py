@@ -6,7 +6,7 @@ from pathlib import Path
 import msgspec
 import pytest
 from support.observers import BLIND, changed
-from support.processes import cpcbl_team
+from support.processes import command_line
 
 from cpcbl_launch.reporting.phases import Span, guest_reports, phase_report
 from cpcbl_launch.reporting.recorder import Recorder
@@ -237,7 +237,7 @@ def test_a_team_that_lets_no_guest_in_does_as_if_there_were_none() -> None:
     ],
 )
 def test_a_refusal_is_one_line(arguments: list[str], said: str) -> None:
-    ran = cpcbl_team("observer", *arguments, "--team", "blind")
+    ran = command_line("observer", *arguments, "--team", "blind")
     assert ran.returncode == 2
     (line,) = ran.stderr.splitlines()
     assert said in line

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 from support.buses import Subscription, wait_until
-from support.processes import cpcbl_team, eventually
+from support.processes import command_line, cpcbl_team, eventually
 
 from cpcbl_launch.run.processes import PROGRAM
 from cpcbl_launch.run.up import free_endpoint
@@ -237,7 +237,7 @@ def test_what_is_no_configuration_of_a_router_is_refused(
     ],
 )
 def test_what_the_user_can_mend_is_one_line(arguments: list[str], said: str) -> None:
-    ended = cpcbl_team("router", *arguments)
+    ended = command_line("router", *arguments)
     assert ended.returncode == 2
     (line,) = ended.stderr.splitlines()
     assert said in line

@@ -167,6 +167,7 @@ def test_the_same_generator_gives_the_same_picture() -> None:
     assert (clean == also).all()
 
 
+@pytest.mark.long
 def test_light_is_as_it_says() -> None:
     subject = team()
     plain = picture(subject).astype(float)

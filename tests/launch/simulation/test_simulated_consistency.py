@@ -40,7 +40,7 @@ def inside_3_sigma(team: Team) -> float:
     return float(np.mean([report.team.inside_3_sigma for report in reports]))
 
 
-@VARIANTS
+@pytest.mark.parametrize("variant", ["joint", pytest.param("circular", marks=pytest.mark.long)])
 def test_a_robot_alone_is_consistent(variant: str) -> None:
     assert inside_3_sigma(demo_team(variant, "split-ci", ["navigator"])) >= 0.98
 

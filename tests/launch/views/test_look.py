@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import pytest
 from mcap.reader import make_reader
-from support.processes import cpcbl_team, eventually
+from support.processes import command_line, cpcbl_team, eventually
 
 from cpcbl_agents.vision.camera import Camera
 from cpcbl_agents.vision.pictures import read_header
@@ -102,7 +102,7 @@ def test_what_cannot_be_looked_at_is_one_line(
     team_file: Path, words: tuple[str, ...], said: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(team_file.parent)
-    ran = cpcbl_team("look", *words, "--team", team_file)
+    ran = command_line("look", *words, "--team", team_file)
     assert ran.returncode == 2
     assert not ran.stdout
     assert re.search(f"^cpcbl-team: {said}", ran.stderr.splitlines()[-1])
