@@ -18,6 +18,7 @@ def with_path() -> dict[str, str]:
     return {**os.environ, "PYTHONPATH": ":".join(sys.path)}
 
 
+@pytest.mark.long
 def test_sightings_change_the_teammates_belief_and_every_stage_is_measured(tmp_path: Path) -> None:
     words = (sys.executable, "-m", "benchmarks.latency", "--sightings", "10", "--output", tmp_path)
     ran = run(words, env=with_path(), capture_output=True, text=True, timeout=90.0, check=False)

@@ -15,6 +15,7 @@ from cpcbl_team.errors import InputError
 from cpcbl_transport.compact import BELIEF_BYTES
 
 
+@pytest.mark.long
 def test_a_team_and_a_broadcast_of_the_same_size_are_measured(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

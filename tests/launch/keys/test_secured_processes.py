@@ -86,6 +86,7 @@ def running(*command: object) -> Iterator["subprocess.Popen[str]"]:
             process.stdout.close()
 
 
+@pytest.mark.long
 def test_a_secured_team_does_as_well_as_one_without_a_network(tmp_path: Path) -> None:
     """Both with the same noise; an operator watches the secured one."""
     plain, secured = demo(tmp_path, "none"), demo(tmp_path, "mtls")

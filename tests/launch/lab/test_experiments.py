@@ -84,6 +84,7 @@ def test_as_json_prints_what_is_written(tmp_path: Path, capsys: pytest.CaptureFi
     assert printed == (tmp_path / "one-way-vs-both.json").read_text()
 
 
+@pytest.mark.long
 def test_the_number_of_jobs_changes_no_figure() -> None:
     experiment = small(EVERY["figure7"])
     cases, seeds, done = experiment.cases(), (1, 2), []

@@ -90,6 +90,7 @@ class Watching:
         )
 
 
+@pytest.mark.long
 @WITHIN
 def test_processes_with_cameras_are_localized_over_a_real_router(tmp_path: Path) -> None:
     watching, until = Watching(), time.monotonic() + 120.0
