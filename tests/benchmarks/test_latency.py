@@ -7,6 +7,7 @@ from pathlib import Path
 from subprocess import run
 
 import msgspec
+import pytest
 from benchmarks import latency
 from support.tables import assert_fits
 
