@@ -49,7 +49,7 @@ class FilterAgent:
         return self.counts + Counter(self.timeline.state.counts)
 
     @property
-    def learned(self) -> SelfCalibration | None:
+    def self_calibration(self) -> SelfCalibration | None:
         """What the robot has learned of its odometry and bearings; None where it does not learn."""
         return self.timeline.state.memory.calibration.learned if self._learns else None
 

@@ -140,7 +140,7 @@ class Robot:
         The last four are its node's: the process, what the node counted, the fixes and beliefs that
         it received, and the teammates' clocks.
         """
-        latest, learned = self.collaboration.latest, self.filter.learned
+        latest, learned = self.collaboration.latest, self.filter.self_calibration
         assert latest is not None
         sent = self.collaboration.counters.flows()
         return Status(

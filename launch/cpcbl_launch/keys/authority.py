@@ -65,7 +65,7 @@ def issue_certificate(
 
     Raises InputError for hosts that are none, and for an authority that ends sooner.
     """
-    with _reading("ca/private.key"):
+    with _convert_read_errors("ca/private.key"):
         signer = serialization.load_pem_private_key(authority.private_key, None)
     assert isinstance(signer, ec.EllipticCurvePrivateKey)
     above = x509.load_pem_x509_certificate(authority.certificate)
@@ -94,7 +94,7 @@ def issue_certificate(
 
 def certificate_facts(certificate: bytes) -> CertificateFacts:
     """What a certificate says. Raises SecurityError for one that cannot be read."""
-    with _reading(CERTIFICATE):
+    with _convert_read_errors(CERTIFICATE):
         read = x509.load_pem_x509_certificate(certificate)
     try:
         names = read.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
@@ -133,13 +133,13 @@ def newest_certificate(bundle: bytes) -> bytes:
 
     Raises SecurityError for a text that holds none.
     """
-    with _reading("ca/ca.crt"):
+    with _convert_read_errors("ca/ca.crt"):
         first, *_ = x509.load_pem_x509_certificates(bundle)
     return first.public_bytes(serialization.Encoding.PEM)
 
 
 @contextmanager
-def _reading(file: str) -> Iterator[None]:
+def _convert_read_errors(file: str) -> Iterator[None]:
     """Raises SecurityError where the text of a file of keys cannot be read."""
     try:
         yield

@@ -102,7 +102,7 @@ def _start(folder: Path, robot: str, truth: Floats) -> Start | None:
     Where truth begins a little later, its first row is carried back along the odometry, and a
     tenth of that way is added to sigma.
     """
-    reckoned, way = Pose2(0.0, 0.0, 0.0), 0.0
+    odometry_from_robot, way = Pose2(0.0, 0.0, 0.0), 0.0
     first_ns, _ = mrclam.odometry_span_ns(folder, robot)
     first_truth_ns = max(first_ns, int(truth[0, 0] * 1e9))
     if first_truth_ns - first_ns > LATEST_TRUTH_NS:
@@ -112,8 +112,10 @@ def _start(folder: Path, robot: str, truth: Floats) -> Start | None:
             break
         whole_ns = piece.stamp_ns - piece.from_ns
         share = min(first_truth_ns - piece.from_ns, whole_ns) / whole_ns
-        reckoned = step(reckoned, share * piece.distance_m, share * piece.turn_rad)
+        odometry_from_robot = step(
+            odometry_from_robot, share * piece.distance_m, share * piece.turn_rad
+        )
         way += abs(share * piece.distance_m)
     pose, _ = interpolated_truth(np.array([first_truth_ns * 1e-9]), truth)
-    x, y, heading = Pose2(*pose[0].tolist()) @ reckoned.inverse()
+    x, y, heading = Pose2(*pose[0].tolist()) @ odometry_from_robot.inverse()
     return Start(x_m=x, y_m=y, heading_deg=math.degrees(heading), sigma_m=0.05 + 0.1 * way)

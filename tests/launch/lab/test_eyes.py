@@ -222,12 +222,14 @@ def test_no_target_is_met_without_figures() -> None:
 
 
 @pytest.fixture(scope="module")
-def small_result() -> detection_figures.Eyes:
+def small_result() -> detection_figures.DetectionReport:
     return eyes.measure(150, 1, 2, lambda: None)
 
 
 @pytest.mark.long
-def test_few_objects_are_missed_and_none_is_mistaken(small_result: detection_figures.Eyes) -> None:
+def test_few_objects_are_missed_and_none_is_mistaken(
+    small_result: detection_figures.DetectionReport,
+) -> None:
     assert not small_result.refused
     assert not [m for m in small_result.mistakes if m.why == "wrong id"]
     least: dict[Kind, int] = {"landmark": 90, "marker": 120}
@@ -245,7 +247,7 @@ def test_few_objects_are_missed_and_none_is_mistaken(small_result: detection_fig
 
 
 @pytest.mark.long
-def test_stated_sigmas_are_consistent(small_result: detection_figures.Eyes) -> None:
+def test_stated_sigmas_are_consistent(small_result: detection_figures.DetectionReport) -> None:
     for kind, known in small_result.accuracy.items():
         shares = [known.range_inside, known.bearing_inside]
         shares += [known.heading_inside] if kind == "marker" else []

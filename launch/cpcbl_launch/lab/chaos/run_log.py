@@ -76,13 +76,13 @@ class RunRecorder:
         """Subscribes to tracks, statuses, the ground truth and liveliness tokens."""
         for topic in (topics.TRACK, topics.STATUS, topics.TRUTH):
             bus.subscribe(topic.at(), self._arrived)
-        bus.watch_liveliness(topics.ALIVE.at(), self._seen)
+        bus.watch_liveliness(topics.ALIVE.at(), self._record_token)
 
     @property
     def now_s(self) -> float:
         return (self._clock.now_ns() - self._clock.epoch_ns) * 1e-9
 
-    def _seen(self, key: str, alive: bool) -> None:
+    def _record_token(self, key: str, alive: bool) -> None:
         names = topics.ALIVE.names(key)
         if names is not None:
             token = TokenEvent(

@@ -26,7 +26,10 @@ def print_faults(faults: ChaosReport, console: Console) -> None:
     shown = _table("scenario", "expectation", "measured (bound)", "")
     for outcome in faults.outcomes:
         shown.add_row(
-            Text(outcome.scenario), Text(outcome.expectation), _seen(outcome), verdict(outcome)
+            Text(outcome.scenario),
+            Text(outcome.expectation),
+            _measured_text(outcome),
+            verdict(outcome),
         )
     console.print(shown)
     for outcome in faults.outcomes:
@@ -51,7 +54,7 @@ def _table(*columns: str) -> Table:
     return shown
 
 
-def _seen(outcome: Outcome) -> Text:
+def _measured_text(outcome: Outcome) -> Text:
     if reason := outcome.not_run or outcome.failed:
         return Text(reason, "yellow" if outcome.not_run else "red")
     return Text("\n").join(Text(str(c), "" if c.is_met else "red") for c in outcome.checks)

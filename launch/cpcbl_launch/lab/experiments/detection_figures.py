@@ -109,7 +109,7 @@ class Error(msgspec.Struct, frozen=True, kw_only=True, array_like=True):
     bearing_sigma_deg: float | None
 
 
-class Eyes(msgspec.Struct, frozen=True, kw_only=True):
+class DetectionReport(msgspec.Struct, frozen=True, kw_only=True):
     """The result of the experiment."""
 
     experiment: str
@@ -137,7 +137,7 @@ def team() -> Team:
     return load_team(builtin_path("eyes"))
 
 
-def summarize(count: int, seed: int, batches: Sequence[Batch]) -> Eyes:
+def summarize(count: int, seed: int, batches: Sequence[Batch]) -> DetectionReport:
     """The figures of all frames."""
     records = [record for batch in batches for record in batch.records]
     mistakes = tuple(mistake for batch in batches for mistake in batch.mistakes)
@@ -145,7 +145,7 @@ def summarize(count: int, seed: int, batches: Sequence[Batch]) -> Eyes:
     refused = sum((Counter(batch.refused) for batch in batches), Counter[str]())
     within = {k: figures(k, records, mistakes, 0.0, WITHIN_M[k]) for k in KINDS}
     accuracy = {k: figures(k, records, mistakes, 0.0, ERRORS_WITHIN_M) for k in KINDS}
-    return Eyes(
+    return DetectionReport(
         experiment="eyes",
         version=version("cpcbl-team"),
         seed=seed,

@@ -12,7 +12,7 @@ from rich.console import RenderableType
 from cpcbl_launch.lab.experiments.detection_figures import (
     ERRORS_WITHIN_M,
     WITHIN_M,
-    Eyes,
+    DetectionReport,
     Figures,
     summarize,
 )
@@ -22,7 +22,7 @@ from cpcbl_launch.reporting.tables import number, table
 CHUNK = 25
 
 
-def measure(count: int, seed: int, jobs: int, done: Callable[[], None]) -> Eyes:
+def measure(count: int, seed: int, jobs: int, done: Callable[[], None]) -> DetectionReport:
     """So many frames, `jobs` processes at a time; `done` is called after each `CHUNK` of them."""
     from cpcbl_launch.lab.experiments.rendered_frames import evaluate_frames  # needs OpenCV
 
@@ -32,7 +32,7 @@ def measure(count: int, seed: int, jobs: int, done: Callable[[], None]) -> Eyes:
     return summarize(count, seed, batches)
 
 
-def tables(result: Eyes) -> Iterable[RenderableType]:
+def tables(result: DetectionReport) -> Iterable[RenderableType]:
     """Detections by range, wrong and rejected ones, and the targets."""
     shown = table(
         f"rendered frames: {result.frames}, seed {result.seed}",

@@ -13,7 +13,7 @@ from cpcbl_launch.lab.experiments.detection_figures import (
     LEAST_RECALL,
     MOST_BEARING_DEG,
     MOST_RANGE_SHARE,
-    Eyes,
+    DetectionReport,
 )
 from cpcbl_launch.lab.experiments.liars import Liars
 from cpcbl_launch.lab.experiments.results import Accuracy, Outcome, Spread
@@ -182,7 +182,7 @@ def draw_liars(result: Liars, path: Path) -> None:
     _save(figure, path)
 
 
-def draw_eyes(result: Eyes, path: Path) -> None:
+def draw_eyes(result: DetectionReport, path: Path) -> None:
     """A column a kind of thing: errors against range with three stated sigmas, and recall."""
     kinds = [kind for kind, errors in result.errors.items() if errors]
     figure, panels = plt.subplots(

@@ -126,8 +126,8 @@ def random_frame(random: np.random.Generator) -> RandomFrame:
     viewers = team().cameras
     viewer = viewers[int(random.integers(len(viewers)))]
     scene = _scene().with_clutter(int(random.integers(MOST_CLUTTER + 1)), random)
-    posts = [*scene.landmarks.values(), *scene.clutter]
-    taken = [(post.x_m, post.y_m) for post in posts]
+    cylinders = [*scene.landmarks.values(), *scene.clutter]
+    taken = [(post.x_m, post.y_m) for post in cylinders]
     pose = _free_pose(random, taken, None)
     taken.append((pose.x, pose.y))
     robots = []

@@ -122,7 +122,7 @@ def _figures(case: Case, recorder: Recorder, referee: LoopReferee, restarts: int
     samples = {name: recorder.samples(name, truth[name]) for name in case.scored}
     reached_s = np.array(referee.reached_s)
     driver_s, driven = recorder.timed_samples(driver, truth[driver])
-    reckoned, _ = interpolated_truth(reached_s, np.array(referee.odometry_track))
+    odometry_m, _ = interpolated_truth(reached_s, np.array(referee.odometry_track))
     true, _ = interpolated_truth(reached_s, truth[driver])
     sent = [s.bytes_sent / (s.stamp_ns * 1e-9) for s in recorder.status.values()]
     return Run(
@@ -131,7 +131,7 @@ def _figures(case: Case, recorder: Recorder, referee: LoopReferee, restarts: int
         restarts=restarts,
         robots={name: Errors(_errors(s), position_nees(s)) for name, s in samples.items()},
         at_waypoints=_errors(driven)[np.isin(driver_s, reached_s)],
-        odometry_at_waypoints=_errors(Samples(reckoned, true, None)),
+        odometry_at_waypoints=_errors(Samples(odometry_m, true, None)),
         bytes_per_s=sum(sent) / len(case.team.robots),
     )
 
