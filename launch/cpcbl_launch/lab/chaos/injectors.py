@@ -13,6 +13,7 @@ from cpcbl_transport.bus import Bus, Publisher
 from cpcbl_transport.compact import encode_help
 from cpcbl_transport.zenoh_bus import open_bus
 
+FLOOD_RATE_HZ = 2500.0
 UNSURE = (25.0, 0.0, 25.0, 0.0, 0.0, 1.0)
 
 
@@ -64,7 +65,10 @@ class Echo:
 
 
 def send_flood(team: str, endpoint: str, robot: str, targets: list[str], stop: StopSignal) -> int:
-    """Sends all that a robot may send as fast as possible; returns the number of messages.
+    """Sends all that a robot may send, far more often than it may; returns the number of messages.
+
+    The rate is bounded, because the flood of a robot on another machine would not take the
+    processor from the router and the robots of this one.
 
     The messages are true, but their uncertainty is large, so that only their number does harm.
     """
@@ -74,8 +78,9 @@ def send_flood(team: str, endpoint: str, robot: str, targets: list[str], stop: S
         fixes = [bus.publisher(key, topics.FIX.qos) for key in keys]
         belief = bus.publisher(topics.BELIEF.at(tier=0, robot=robot), topics.BELIEF.qos)
         status = bus.publisher(topics.STATUS.at(robot=robot), topics.STATUS.qos)
-        sent = 0
+        sent, begin_s = 0, time.monotonic()
         while not stop():
+            time.sleep(max(0.0, sent / FLOOD_RATE_HZ - (time.monotonic() - begin_s)))
             now_ns = time.time_ns()
             belief.put(encode_help(Belief(robot, now_ns, 4.5, 2.5, 0.0, UNSURE)))
             for name, publisher in zip(targets, fixes, strict=True):

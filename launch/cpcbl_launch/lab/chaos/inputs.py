@@ -64,7 +64,7 @@ def duplicates_checks(
 
 
 def flood(options: ScenarioOptions) -> ScenarioResult:
-    """One robot sends fixes, beliefs and statuses of 60 kB as fast as possible."""
+    """One robot sends fixes, beliefs and statuses of 60 kB, far more often than it may."""
     flooder = "patrol"
     with settled_team(options, RunPlan(demo_team(), options.seed, left_out=(flooder,))) as team:
         options.report_progress(f"{flooder} floods for {FLOOD_S:g} s")

@@ -127,7 +127,7 @@ SCENARIOS = (
     ),
     Scenario(
         "flood",
-        "one robot sends everything that it may send as fast as it can: fixes, beliefs, status"
+        "one robot sends everything that it may send 2,500 times a second: fixes, beliefs, status"
         " messages of 60 kB",
         "the router lets at most 200 messages/s through to any robot; the other robots publish"
         " with gaps of at most 2 s and stay localized",
