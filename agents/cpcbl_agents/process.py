@@ -119,7 +119,7 @@ def run_robot(
 ) -> None:
     """Runs a robot until `stop()`. One that is restarted, or late, does not know where it is.
 
-    `through` is what stands between the robot and its bus.
+    `wrap_bus` may put something between the robot and its bus.
 
     Raises BusError when stopped before a router answered, LogError for an unreadable log,
     SecurityError without the keys of a secured team, InputError for a camera that cannot be used,
