@@ -18,14 +18,7 @@ from cpcbl_team.constraints import (
     wall_heading,
     wall_line,
 )
-from cpcbl_team.estimate import (
-    HEADING,
-    POSITION,
-    SMALLEST_VARIANCE,
-    Estimate,
-    Information,
-    Scope,
-)
+from cpcbl_team.estimate import HEADING, POSITION, SMALLEST_VARIANCE, Estimate, Information, Scope
 from cpcbl_team.fusion import Observation, chi_square
 from cpcbl_team.gaussian import Covariance2
 from cpcbl_team.geometry import Pose2, wrap_angle

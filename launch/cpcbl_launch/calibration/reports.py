@@ -33,11 +33,7 @@ _CALIBRATED_KEYS = (
     (
         "way, true = scale x reported - loss x |turn|",
         "odometry",
-        {
-            "distance_scale": "scale",
-            "distance_loss_m_per_rad": "loss m/rad",
-            "delay_s": "delay s",
-        },
+        {"distance_scale": "scale", "distance_loss_m_per_rad": "loss m/rad", "delay_s": "delay s"},
     ),
     (
         "turn, true = scale x reported + bias x way",

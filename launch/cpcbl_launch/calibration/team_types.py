@@ -136,10 +136,7 @@ def _companion_settings(toml_value: RobotCalibration) -> dict[str, dict[str, boo
 
 
 def _with_margin(
-    values: Mapping[str, Estimate],
-    noise: Sequence[str],
-    margin: float,
-    correction_margin: float,
+    values: Mapping[str, Estimate], noise: Sequence[str], margin: float, correction_margin: float
 ) -> dict[str, Estimate]:
     """The values with larger sigmas, which include a share of each correction."""
     result = dict(values)

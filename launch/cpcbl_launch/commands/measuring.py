@@ -96,8 +96,7 @@ Sizes = Annotated[
     str, typer.Option(help="Sizes of generated teams, in place of FILE, e.g. 2,10,50,200,1000.")
 ]
 SimulatedDuration = Annotated[
-    Optional[float],
-    typer.Option(help="Seconds of robot time; default: 5 with --robots, else 30."),
+    Optional[float], typer.Option(help="Seconds of robot time; default: 5 with --robots, else 30.")
 ]
 TeamSeed = Annotated[int, typer.Option(help="Seed of the noise, and of generated teams.")]
 

@@ -86,9 +86,7 @@ ConfigFile = Annotated[
 ]
 
 
-def check(
-    file: Annotated[Path, typer.Argument(help="Team file (TOML).")],
-) -> None:
+def check(file: Annotated[Path, typer.Argument(help="Team file (TOML).")]) -> None:
     """Validate a team file without starting anything."""
     team = find_team(file)
     marks, walls = len(team.map.landmarks), len(team.map.walls)
@@ -197,8 +195,7 @@ def field(
     seed: NoiseSeed = 1,
     connect: Connect = None,
     site: Annotated[
-        Optional[list[str]],
-        typer.Option(help="Robots at another router: tcp/10.0.0.2:7447=r3,r4."),
+        Optional[list[str]], typer.Option(help="Robots at another router: tcp/10.0.0.2:7447=r3,r4.")
     ] = None,
     clock: ClockText = "",
     parent: Parent = None,

@@ -29,14 +29,7 @@ from cpcbl_launch.keys.authority import (
 from cpcbl_launch.keys.plan import AUTHORITY, KeyAction, MemberAction, hosts, plan_actions
 from cpcbl_team.config import Team
 from cpcbl_team.errors import InputError
-from cpcbl_transport.security import (
-    CA,
-    CERTIFICATE,
-    MEMBERS,
-    PRIVATE_KEY,
-    Identity,
-    members_in,
-)
+from cpcbl_transport.security import CA, CERTIFICATE, MEMBERS, PRIVATE_KEY, Identity, members_in
 from cpcbl_transport.topics import Role
 
 SECRET, PUBLIC = 0o600, 0o644

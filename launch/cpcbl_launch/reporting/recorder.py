@@ -218,10 +218,7 @@ class Recorder:
         return seconds(stamps_ns), samples
 
     def report(
-        self,
-        variants: Mapping[str, str],
-        truth: Mapping[str, Floats],
-        from_s: float = -np.inf,
+        self, variants: Mapping[str, str], truth: Mapping[str, Floats], from_s: float = -np.inf
     ) -> Report:
         """The figures of all robots from `from_s` on."""
         robots = {

@@ -29,12 +29,7 @@ class Task(NamedTuple):
 def tasks(team: Team, common: tuple[str, ...], seed: int, here: Collection[str]) -> list[Task]:
     """name | arguments | when: the field if any robot is simulated, one process a robot."""
     rows = [
-        Task(
-            ROBOT + name,
-            ("robot", name, *common),
-            Identity(Role.ROBOT, name),
-            ("--restarted",),
-        )
+        Task(ROBOT + name, ("robot", name, *common), Identity(Role.ROBOT, name), ("--restarted",))
         for name in team.robots
         if name in here
     ]

@@ -14,9 +14,6 @@ def key_table(members: Iterable[KeysReport]) -> Table:
     for member in members:
         until = member.valid_until
         shown.add_row(
-            member.who,
-            member.common_name,
-            f"{until:%Y-%m-%d %H:%M}" if until else "-",
-            member.deed,
+            member.who, member.common_name, f"{until:%Y-%m-%d %H:%M}" if until else "-", member.deed
         )
     return shown

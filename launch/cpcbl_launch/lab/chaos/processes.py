@@ -22,11 +22,7 @@ from cpcbl_launch.lab.chaos.scenario import (
     checks_unaffected,
     settled_team,
 )
-from cpcbl_launch.lab.chaos.team import (
-    FIELD,
-    ROUTER,
-    TeamUnderTest,
-)
+from cpcbl_launch.lab.chaos.team import FIELD, ROUTER, TeamUnderTest
 
 AFTER_S = 8.0
 FROZEN_S = 5.0
@@ -160,12 +156,7 @@ def kill_field(options: ScenarioOptions) -> ScenarioResult:
 
 
 def kill_field_checks(
-    log: RunLog,
-    robots: list[str],
-    killed_s: float,
-    anew_s: float,
-    found_s: float,
-    until_s: float,
+    log: RunLog, robots: list[str], killed_s: float, anew_s: float, found_s: float, until_s: float
 ) -> list[Check]:
     """The robots continue without inputs, and localize themselves in the new world."""
     gaps = [longest_track_gap_s(log, name, killed_s, found_s) for name in robots]
@@ -196,12 +187,7 @@ def freeze(options: ScenarioOptions) -> ScenarioResult:
 
 
 def freeze_checks(
-    log: RunLog,
-    robot: str,
-    frozen_s: float,
-    thawed_s: float,
-    others: list[str],
-    until_s: float,
+    log: RunLog, robot: str, frozen_s: float, thawed_s: float, others: list[str], until_s: float
 ) -> list[Check]:
     """A suspended robot disappears like a dead one, and does no harm when it resumes."""
     return [

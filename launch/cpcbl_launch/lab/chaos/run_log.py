@@ -12,9 +12,7 @@ import msgspec
 import numpy as np
 
 from cpcbl_agents.clock import Clock
-from cpcbl_launch.reporting.metrics import (
-    Floats,
-)
+from cpcbl_launch.reporting.metrics import Floats
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus
 from cpcbl_transport.decoding import decode

@@ -14,12 +14,7 @@ from cpcbl_launch.lab.chaos.figures import (
     token_gone_after_s,
 )
 from cpcbl_launch.lab.chaos.run_log import RunLog
-from cpcbl_launch.lab.chaos.team import (
-    RunPlan,
-    TeamUnderTest,
-    demo_team,
-    run_team_under_test,
-)
+from cpcbl_launch.lab.chaos.team import RunPlan, TeamUnderTest, demo_team, run_team_under_test
 from cpcbl_team.errors import CpcblError
 
 BASELINE_S = 4.0

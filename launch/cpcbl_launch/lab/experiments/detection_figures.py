@@ -210,11 +210,7 @@ def _least(share: float | None, bound: float) -> bool:
 
 
 def figures(
-    kind: Kind,
-    records: Sequence[Record],
-    mistakes: Sequence[Mistake],
-    from_m: float,
-    to_m: float,
+    kind: Kind, records: Sequence[Record], mistakes: Sequence[Mistake], from_m: float, to_m: float
 ) -> Figures:
     """Of one kind, between two ranges. A mistake is as far away as it says; without a range it
     counts wherever it may be: from 0 up."""

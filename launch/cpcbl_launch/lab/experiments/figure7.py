@@ -99,9 +99,7 @@ def tables(result: Outcome, driver: str = "navigator") -> Iterable[RenderableTyp
 
 def accuracy_table(title: str, rows: Mapping[str, Accuracy]) -> RenderableType:
     shown = table(
-        title,
-        ("",),
-        ("mean m", "± σ m", "max m", "deg", "in 3 σ", "NEES", "bump", "rest", "fail"),
+        title, ("",), ("mean m", "± σ m", "max m", "deg", "in 3 σ", "NEES", "bump", "rest", "fail")
     )
     for name, a in rows.items():
         shown.add_row(

@@ -9,13 +9,7 @@ from collections.abc import Iterable, Mapping
 from rich.console import RenderableType
 
 from cpcbl_launch.lab.experiments.figure7 import LEGEND, accuracy_table, team_case
-from cpcbl_launch.lab.experiments.results import (
-    Experiment,
-    Outcome,
-    Results,
-    accuracy,
-    new_outcome,
-)
+from cpcbl_launch.lab.experiments.results import Experiment, Outcome, Results, accuracy, new_outcome
 from cpcbl_launch.lab.experiments.runs import Case
 
 VARIANTS = ("joint", "oval", "circular", "weighted")

@@ -25,10 +25,7 @@ def live_frames(
     endpoints = ", ".join(link.endpoints)
     try:
         bus = open_bus(
-            team,
-            link.endpoints,
-            lambda: stop() or time.monotonic() > until_s,
-            link.credentials,
+            team, link.endpoints, lambda: stop() or time.monotonic() > until_s, link.credentials
         )
     except BusError:
         if stop():

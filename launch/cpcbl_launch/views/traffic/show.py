@@ -35,9 +35,7 @@ def help_traffic_table(report: Report) -> Table:
     """What each robot sent, what it did not send and why, and how near it came to its limits."""
     limited = any(r.spending for r in report.robots.values())
     shown = table(
-        "fixes and beliefs sent, and not sent",
-        ("robot",),
-        ("fixes", "beliefs", "B/s", *NOT_SENT),
+        "fixes and beliefs sent, and not sent", ("robot",), ("fixes", "beliefs", "B/s", *NOT_SENT)
     )
     if limited:
         shown.add_column("most", no_wrap=True)

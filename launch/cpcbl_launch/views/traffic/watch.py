@@ -14,12 +14,7 @@ from typing import NamedTuple, Protocol
 
 import msgspec
 
-from cpcbl_launch.reporting.flows import (
-    FlowReport,
-    SpendingReport,
-    summed_flows,
-    summed_spending,
-)
+from cpcbl_launch.reporting.flows import FlowReport, SpendingReport, summed_flows, summed_spending
 from cpcbl_launch.reporting.trust_report import TrustReport, trust_reports
 from cpcbl_transport.bus import Bus
 from cpcbl_transport.decoding import Received, Subscriber
