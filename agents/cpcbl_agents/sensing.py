@@ -12,11 +12,9 @@ from cpcbl_agents.waypoint_follower import WaypointFollower
 from cpcbl_team.config import LocalizationSettings
 from cpcbl_team.inputs import Odometry, Position, Sightings
 from cpcbl_team.sensors import corrected_odometry, corrected_sighting, without_duplicates
-from cpcbl_transport.messages import Frame
+from cpcbl_transport.messages import Frame, SensorInput
 
 ANNOTATION_INTERVAL_NS = 500_000_000
-
-SensorInput = Odometry | Sightings | Position | Frame
 
 
 class SensingAgent:

@@ -29,8 +29,7 @@ from cpcbl_team.config import (
 )
 from cpcbl_team.inputs import Fix, Odometry, Sighting, Sightings
 from cpcbl_transport import topics
-from cpcbl_transport.bus import Bus, Handle, MessageCallback, Publisher
-from cpcbl_transport.bus_proxy import BusProxy, PublisherProxy
+from cpcbl_transport.bus import Bus, BusProxy, Handle, MessageCallback, Publisher, PublisherProxy
 from cpcbl_transport.compact import FIX_BYTES
 from cpcbl_transport.messages import Message, encode
 from cpcbl_transport.topics import Qos

@@ -40,12 +40,6 @@ def test_a_robots_inputs_are_the_topics_below_in() -> None:
 
 
 @per_topic
-def test_every_topic_has_a_rate_and_a_reason(topic: Topic) -> None:
-    assert topic.rate.strip()
-    assert topic.reason.strip()
-
-
-@per_topic
 def test_messages_between_robots_have_the_priority_that_costs_nothing(topic: Topic) -> None:
     priority = getattr(zenoh.Priority, topic.qos.value.priority)
     helps = topic.carries in topics.COLLABORATION

@@ -10,7 +10,6 @@ first message after each full window would be sent, however small its gain.
 
 import math
 from collections import deque
-from typing import NamedTuple
 
 from cpcbl_team.config import BudgetSettings
 from cpcbl_transport.messages import Spending
@@ -26,7 +25,7 @@ class SlidingWindow:
 
     def __init__(self, unit: str, capacity: float, window_s: float, reserve: float) -> None:
         self.capacity, self.pace_s = capacity, window_s / capacity
-        self._unit, self._window_s, self._reserve = unit, window_s, reserve
+        self.unit, self._window_s, self._reserve = unit, window_s, reserve
         self._spent: deque[tuple[int, float]] = deque()
         self._sum = self._most = 0.0
 
@@ -42,11 +41,13 @@ class SlidingWindow:
         self._most = max(self._most, self._sum)
 
     def spending(self, now_ns: int) -> Spending:
-        return Spending(self._unit, self._window_s, self.capacity, self._most)
+        return Spending(self.unit, self._window_s, self.capacity, self._most)
 
 
 class MatchAllowance:
     """The messages of a match: they are earned evenly from its start and never come back."""
+
+    unit = "messages"
 
     def __init__(
         self, start_ns: int, rate_hz: float, urgent_share: float, match_s: float = math.inf
@@ -64,12 +65,7 @@ class MatchAllowance:
         self._spent += amount
 
     def spending(self, now_ns: int) -> Spending:
-        return Spending("messages", 0.0, self.room(now_ns, urgent=True) + self._spent, self._spent)
-
-
-class _Cost(NamedTuple):
-    limit: SlidingWindow | MatchAllowance
-    amount: float
+        return Spending(self.unit, 0.0, self.room(now_ns, urgent=True) + self._spent, self._spent)
 
 
 class Budget:
@@ -90,23 +86,24 @@ class Budget:
     ) -> None:
         s = settings
         self._price, self._price_ns = 0.0, start_ns
-        self._bytes = self._messages = self._match = None
+        windows = []
         if s.bytes_per_s:
             most = max(BYTES_WINDOW_S * s.bytes_per_s, LEAST_BYTES)
-            self._bytes = SlidingWindow("bytes", most, most / s.bytes_per_s, s.urgent_share * most)
+            reserve = s.urgent_share * most
+            windows.append(SlidingWindow("bytes", most, most / s.bytes_per_s, reserve))
         if s.messages_per_minute:
             most = math.ceil(s.messages_per_minute)
-            window_s = 60.0 * most / s.messages_per_minute
-            self._messages = SlidingWindow(
-                "messages", most, window_s, math.floor(s.urgent_share * most)
+            reserve, window_s = (
+                math.floor(s.urgent_share * most),
+                60.0 * most / s.messages_per_minute,
             )
+            windows.append(SlidingWindow("messages", most, window_s, reserve))
+        for window in windows if restarted else ():
+            window.spend(start_ns, window.capacity)
+        self._limits: list[SlidingWindow | MatchAllowance] = [*windows]
         if match_rate_hz is not None:
-            self._match = MatchAllowance(start_ns, match_rate_hz, s.urgent_share, match_s)
-        for window in (self._bytes, self._messages):
-            if restarted and window is not None:
-                window.spend(start_ns, window.capacity)
-        limits = self._bytes, self._messages, self._match
-        self._limits = tuple(limit for limit in limits if limit is not None)
+            match = MatchAllowance(start_ns, match_rate_hz, s.urgent_share, match_s)
+            self._limits.append(match)
 
     def admits(self, now_ns: int, size: int, urgent: bool) -> bool:
         """Whether every limit has room for a message of this size now."""
@@ -116,9 +113,10 @@ class Budget:
 
     def price(self, now_ns: int, size: int) -> float:
         """The least gain that a message of this size must have, in the unit of `spend`."""
-        memory_s = PRICE_MEMORY * self._earned_s(size)
-        if memory_s == 0.0:
+        earned_s = max((limit.pace_s * amount for limit, amount in self._costs(size)), default=0.0)
+        if earned_s == 0.0:
             return 0.0
+        memory_s = PRICE_MEMORY * earned_s
         return self._price * math.exp((self._price_ns - now_ns) * 1e-9 / memory_s)
 
     def spend(self, now_ns: int, size: int, least: float) -> None:
@@ -140,11 +138,7 @@ class Budget:
 
     def spending(self, now_ns: int) -> tuple[Spending, ...]:
         """Its limits, and the largest use of each so far."""
-        return tuple(limit.spending(now_ns) for limit, _ in self._costs(0))
+        return tuple(limit.spending(now_ns) for limit in self._limits)
 
-    def _earned_s(self, size: int) -> float:
-        """The time in which a message of this size is earned (s)."""
-        return max((limit.pace_s * amount for limit, amount in self._costs(size)), default=0.0)
-
-    def _costs(self, size: int) -> list[_Cost]:
-        return [_Cost(limit, size if limit is self._bytes else 1.0) for limit in self._limits]
+    def _costs(self, size: int) -> list[tuple[SlidingWindow | MatchAllowance, float]]:
+        return [(limit, size if limit.unit == "bytes" else 1.0) for limit in self._limits]

@@ -7,8 +7,7 @@ A session does not receive what it publishes itself.
 """
 
 from collections.abc import Callable
-from contextlib import AbstractContextManager
-from typing import Protocol
+from typing import Protocol, Self
 
 from cpcbl_transport.topics import Qos
 
@@ -35,7 +34,7 @@ class Publisher(Handle, Protocol):
     def put(self, payload: bytes) -> None: ...
 
 
-class Bus(AbstractContextManager["Bus"], Protocol):
+class Bus(Protocol):
     """A session of one process (or, in memory, of one robot). Closing it closes all it declared."""
 
     def publisher(self, key: str, qos: Qos) -> Publisher: ...
@@ -49,3 +48,48 @@ class Bus(AbstractContextManager["Bus"], Protocol):
         """Calls `on_change` for tokens that are there already and for every change."""
 
     def close(self) -> None: ...
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+class PublisherProxy(Publisher):
+    """Stands before a publisher and passes everything on, for those that change what passes."""
+
+    def __init__(self, publisher: Publisher) -> None:
+        self._publisher = publisher
+
+    @property
+    def matching(self) -> bool:
+        return self._publisher.matching
+
+    def put(self, payload: bytes) -> None:
+        self._publisher.put(payload)
+
+    def close(self) -> None:
+        self._publisher.close()
+
+
+class BusProxy(Bus):
+    """Stands before a bus and passes everything on, for those that change or note what passes."""
+
+    def __init__(self, bus: Bus) -> None:
+        self._bus = bus
+
+    def publisher(self, key: str, qos: Qos) -> Publisher:
+        return self._bus.publisher(key, qos)
+
+    def subscribe(self, keys: str, on_message: MessageCallback) -> Handle:
+        return self._bus.subscribe(keys, on_message)
+
+    def declare_token(self, key: str) -> Handle:
+        return self._bus.declare_token(key)
+
+    def watch_liveliness(self, keys: str, on_change: LivelinessCallback) -> Handle:
+        return self._bus.watch_liveliness(keys, on_change)
+
+    def close(self) -> None:
+        self._bus.close()

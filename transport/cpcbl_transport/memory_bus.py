@@ -1,20 +1,21 @@
 """The bus inside one process: deterministic, for simulations in one process and for tests."""
 
-from typing import TypeVar
+from typing import Generic, TypeVar
 
-from cpcbl_transport.bus import Handle, LivelinessCallback, MessageCallback, Publisher
+from cpcbl_transport.bus import Bus, Handle, LivelinessCallback, MessageCallback, Publisher
 from cpcbl_transport.key_tree import KeyTree
 from cpcbl_transport.topics import Qos
 
 HandleT = TypeVar("HandleT", bound=Handle)
+CallbackT = TypeVar("CallbackT")
 
 
 class MemoryHub:
     """Connects the sessions of one process; delivers in the order of declaration."""
 
     def __init__(self) -> None:
-        self.subscribers: KeyTree[_Subscriber] = KeyTree()
-        self.watchers: KeyTree[_LivelinessWatcher] = KeyTree()
+        self.subscribers: KeyTree[_Listener[MessageCallback]] = KeyTree()
+        self.watchers: KeyTree[_Listener[LivelinessCallback]] = KeyTree()
         self.tokens: KeyTree[_Token] = KeyTree()
 
     def session(self) -> "MemoryBus":
@@ -22,29 +23,24 @@ class MemoryHub:
 
     def notify_watchers(self, key: str, alive: bool) -> None:
         for watcher in self.watchers.find(key):
-            watcher.on_change(key, alive)
+            watcher.callback(key, alive)
 
 
-class _Subscriber:
+class _Listener(Generic[CallbackT]):
+    """A subscription, or who watches tokens: it lies in a tree of the hub until it is closed."""
+
     def __init__(
-        self, hub: MemoryHub, session: object, keys: str, on_message: MessageCallback
+        self,
+        tree: "KeyTree[_Listener[CallbackT]]",
+        session: object,
+        keys: str,
+        callback: CallbackT,
     ) -> None:
-        self._hub, self.session, self._keys, self.on_message = hub, session, keys, on_message
-        hub.subscribers.add(keys, self)
+        self._tree, self.session, self._keys, self.callback = tree, session, keys, callback
+        tree.add(keys, self)
 
     def close(self) -> None:
-        self._hub.subscribers.remove(self._keys, self)
-
-
-class _LivelinessWatcher:
-    def __init__(self, hub: MemoryHub, keys: str, on_change: LivelinessCallback) -> None:
-        self._hub, self._keys, self.on_change = hub, keys, on_change
-        hub.watchers.add(keys, self)
-        for token in hub.tokens.find(keys):
-            on_change(token.key, True)
-
-    def close(self) -> None:
-        self._hub.watchers.remove(self._keys, self)
+        self._tree.remove(self._keys, self)
 
 
 class _Token:
@@ -69,9 +65,9 @@ class _MemoryPublisher:
     def put(self, payload: bytes) -> None:
         if self._open:
             for subscriber in self._others():
-                subscriber.on_message(self._key, payload)
+                subscriber.callback(self._key, payload)
 
-    def _others(self) -> list[_Subscriber]:
+    def _others(self) -> list[_Listener[MessageCallback]]:
         """The subscribers of other sessions."""
         found = self._hub.subscribers.find(self._key)
         return [s for s in found if s.session is not self._session]
@@ -80,7 +76,7 @@ class _MemoryPublisher:
         self._open = False
 
 
-class MemoryBus:
+class MemoryBus(Bus):
     """One session on a hub."""
 
     def __init__(self, hub: MemoryHub) -> None:
@@ -91,23 +87,20 @@ class MemoryBus:
         return self._keep(_MemoryPublisher(self._hub, self, key))
 
     def subscribe(self, keys: str, on_message: MessageCallback) -> Handle:
-        return self._keep(_Subscriber(self._hub, self, keys, on_message))
+        return self._keep(_Listener(self._hub.subscribers, self, keys, on_message))
 
     def declare_token(self, key: str) -> Handle:
         return self._keep(_Token(self._hub, key))
 
     def watch_liveliness(self, keys: str, on_change: LivelinessCallback) -> Handle:
-        return self._keep(_LivelinessWatcher(self._hub, keys, on_change))
+        watcher = self._keep(_Listener(self._hub.watchers, self, keys, on_change))
+        for token in self._hub.tokens.find(keys):
+            on_change(token.key, True)
+        return watcher
 
     def close(self) -> None:
         while self._declared:
             self._declared.pop().close()
-
-    def __enter__(self) -> "MemoryBus":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def _keep(self, handle: HandleT) -> HandleT:
         self._declared.append(handle)

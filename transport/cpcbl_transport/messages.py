@@ -173,18 +173,8 @@ class Truths(msgspec.Struct, frozen=True, array_like=True, tag="truth"):
 
 
 Help = Belief | Fix
-Tagged = (
-    Odometry
-    | Sightings
-    | Position
-    | Frame
-    | AnnotatedFrame
-    | Status
-    | Track
-    | Drive
-    | Join
-    | Truths
-)
+SensorInput = Odometry | Sightings | Position | Frame
+Tagged = SensorInput | AnnotatedFrame | Status | Track | Drive | Join | Truths
 Message = Tagged | Help
 Telemetry = Status | Track | Drive | Truths
 
@@ -256,21 +246,16 @@ def refusal(message: Message, now_ns: int) -> Refusal | None:
         return Refusal.IMPLAUSIBLE
     if message.stamp_ns > now_ns + FUTURE_NS:
         return Refusal.FUTURE
-    match message:
-        case Odometry():
-            if not 0 < message.stamp_ns - message.from_ns <= LONGEST_ODOMETRY_NS:
-                return Refusal.DURATION
-            if max(abs(message.distance_m), abs(message.turn_rad)) > LARGEST_PIECE:
-                return Refusal.IMPLAUSIBLE
-        case Position():
-            if not _is_covariance(*message.covariance):
-                return Refusal.NOT_A_COVARIANCE
+    if isinstance(message, Odometry):
+        if not 0 < message.stamp_ns - message.from_ns <= LONGEST_ODOMETRY_NS:
+            return Refusal.DURATION
+        if max(abs(message.distance_m), abs(message.turn_rad)) > LARGEST_PIECE:
+            return Refusal.IMPLAUSIBLE
+    if isinstance(message, Position):  # the variances of a sensor are never zero
+        xx, xy, yy = message.covariance
+        if not (xx > 0.0 and yy > 0.0 and xy * xy <= xx * yy * (1.0 + 1e-6) + 1e-12):
+            return Refusal.NOT_A_COVARIANCE
     return None
-
-
-def _is_covariance(xx: float, xy: float, yy: float) -> bool:
-    """Whether this is the covariance of a sensor, whose variances are never zero."""
-    return xx > 0.0 and yy > 0.0 and xy * xy <= xx * yy * (1.0 + 1e-6) + 1e-12
 
 
 def _numbers(message: Message) -> list[float]:

@@ -10,13 +10,7 @@ from typing import Annotated
 
 import msgspec
 
-from cpcbl_team.config import (
-    OdometrySettings,
-    PositionSensor,
-    RobotSettings,
-    SensorSettings,
-    Start,
-)
+from cpcbl_team.config import RobotSettings
 
 _Positive = Annotated[float, msgspec.Meta(gt=0.0)]
 _NotNegative = Annotated[float, msgspec.Meta(ge=0.0)]
@@ -97,10 +91,4 @@ def model_from_settings(settings: RobotSettings) -> SimulatedRobotModel | None:
 
 def settings_from_model(model: SimulatedRobotModel) -> RobotSettings:
     """The settings by which the field simulates a guest; what it does not need has defaults."""
-    own = model.position_sensor
-    return RobotSettings(
-        start=Start(**msgspec.structs.asdict(model.start)),
-        sensor=SensorSettings(**msgspec.structs.asdict(model.sensor)),
-        odometry=OdometrySettings(**msgspec.structs.asdict(model.odometry)),
-        position_sensor=None if own is None else PositionSensor(**msgspec.structs.asdict(own)),
-    )
+    return msgspec.convert(model, RobotSettings, from_attributes=True)

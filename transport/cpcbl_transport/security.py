@@ -12,7 +12,7 @@ Both are Zenoh's own, as its configuration. What was measured:
   expires, but the link carries nothing. Links do not outlive their certificates.
 """
 
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -148,11 +148,31 @@ def link_options(credentials: Credentials) -> dict[str, Any]:
 
 _SUBSCRIBING = ("declare_subscriber", "declare_liveliness_subscriber", "liveliness_query")
 _DELIVERED = ("put", "declare_subscriber", "liveliness_token")
+_FLOWS = ("ingress", "egress")
 _ALL_MESSAGES = (
     *("put", "delete", "query", "reply", "declare_queryable"),
     *("declare_subscriber", "declare_liveliness_subscriber"),
     *("liveliness_token", "liveliness_query"),
 )
+
+
+class _Rule(NamedTuple):
+    """What these members may send (ingress) or receive (egress), and under which keys."""
+
+    name: str
+    members: list[Member]
+    flow: str
+    messages: tuple[str, ...]
+    keys: Sequence[str] = ("**",)
+
+    def as_config(self, space: str) -> dict[str, Any]:
+        return {
+            "id": self.name,
+            "permission": "allow",
+            "flows": [self.flow],
+            "messages": list(self.messages),
+            "key_exprs": [f"{space}/{key}" for key in self.keys],
+        }
 
 
 def access_rules(team: Team, members: Iterable[Member]) -> dict[str, Any]:
@@ -163,34 +183,29 @@ def access_rules(team: Team, members: Iterable[Member]) -> dict[str, Any]:
     """
     space = topics.namespace(team.name)
     present = [m for m in members if not m.revoked and _is_in_team(m.identity, team)]
-    policies = [
-        _policy("deliver", present, _rule("deliver", "egress", _DELIVERED, [f"{space}/**"]))
-    ]
+    routers = [m for m in present if m.role is Role.ROUTER]
+    rules: list[_Rule] = [_Rule("deliver", present, "egress", _DELIVERED)]
     for member in present:
         who = member.identity
         for messages, keys in (
-            (["put"], publish_keys(who, carrying=True)),
-            (["liveliness_token"], publish_keys(who, carrying=False)),
+            (("put",), publish_keys(who, carrying=True)),
+            (("liveliness_token",), publish_keys(who, carrying=False)),
             (_SUBSCRIBING, subscribe_keys(who)),
         ):
             if keys:
-                name = f"{who}: {messages[0]}"
-                whole = [f"{space}/{key}" for key in keys]
-                policies.append(_policy(name, [member], _rule(name, "ingress", messages, whole)))
-    routers = [m for m in present if m.role is Role.ROUTER]
-    for flow in ("ingress", "egress"):
-        name = f"relay: {flow}"
-        policies.append(_policy(name, routers, _rule(name, flow, _ALL_MESSAGES, [f"{space}/**"])))
-    policies = [p for p in policies if p["subject"]["cert_common_names"]]
+                rules.append(_Rule(f"{who}: {messages[0]}", [member], "ingress", messages, keys))
+    rules += [_Rule(f"relay: {flow}", routers, flow, _ALL_MESSAGES) for flow in _FLOWS]
+    rules = [rule for rule in rules if rule.members]
     return {
         "access_control": {
             "enabled": True,
             "default_permission": "deny",
-            "rules": [p["rule"] for p in policies],
-            "subjects": [p["subject"] for p in policies],
-            "policies": [
-                {"rules": [p["rule"]["id"]], "subjects": [p["subject"]["id"]]} for p in policies
+            "rules": [rule.as_config(space) for rule in rules],
+            "subjects": [
+                {"id": rule.name, "cert_common_names": [m.common_name for m in rule.members]}
+                for rule in rules
             ],
+            "policies": [{"rules": [rule.name], "subjects": [rule.name]} for rule in rules],
         }
     }
 
@@ -203,7 +218,7 @@ def publish_keys(identity: Identity, carrying: bool | None = None) -> list[str]:
     return [
         key
         for topic in topics.TOPICS
-        if carrying is None or carrying is _carries(topic)
+        if carrying is None or carrying is (topic.carries is not None)
         for key in _keys(topic, topic.publishers, identity)
     ]
 
@@ -221,10 +236,6 @@ def _keys(topic: Topic, allowed: Iterable[Permission], identity: Identity) -> It
             yield topic.at(**{who.own: identity.name} if who.own else {})
 
 
-def _carries(topic: Topic) -> bool:
-    return topic.carries is not None
-
-
 def _is_in_team(identity: Identity, team: Team) -> bool:
     """Whether the present team file still has a place for a member."""
     match identity.role:
@@ -235,19 +246,3 @@ def _is_in_team(identity: Identity, team: Team) -> bool:
         case Role.FIELD:  # a simulated one must not feed real robots
             return team.simulated
     return True
-
-
-def _rule(name: str, flow: str, messages: Collection[str], keys: list[str]) -> dict[str, Any]:
-    return {
-        "id": name,
-        "permission": "allow",
-        "flows": [flow],
-        "messages": list(messages),
-        "key_exprs": keys,
-    }
-
-
-def _policy(name: str, members: Iterable[Member], rule: dict[str, Any]) -> dict[str, Any]:
-    """A rule and the one subject that it applies to."""
-    names = [member.common_name for member in members]
-    return {"rule": rule, "subject": {"id": name, "cert_common_names": names}}

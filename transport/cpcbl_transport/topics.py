@@ -31,23 +31,23 @@ class QosProfile(NamedTuple):
     priority: str  # before or after the other messages that wait for the same link
     when_full: str  # what a put does when the link's queue is full: DROP or BLOCK
     reliable: bool  # on links that can lose messages
-    express: bool  # sent at once, without waiting for other messages of the same batch
 
 
 class Qos(Enum):
-    """The profiles in use, highest priority first; each row of the table has the reason.
+    """The profiles in use, highest priority first; the table gives the reason of each choice.
 
     DATA is Zenoh's default: a message of another priority, or one that blocks, costs 2 to 4 bytes
     more. So messages between robots are DATA, and everything else has a priority around it. Nothing
-    is express: it costs 2 bytes more and is no faster (batches form only where a link is busy), and
-    on a busy processor messages were lost.
+    is express (sent at once, without waiting for other messages of the same batch): it costs 2
+    bytes more and is no faster, for batches form only where a link is busy, and on a busy processor
+    messages were lost.
     """
 
-    COMMAND = QosProfile("INTERACTIVE_HIGH", "BLOCK", reliable=True, express=False)
-    FRESH = QosProfile("DATA", "DROP", reliable=False, express=False)
-    INPUT = QosProfile("DATA_LOW", "BLOCK", reliable=True, express=False)
-    FRAME = QosProfile("DATA_LOW", "DROP", reliable=False, express=False)
-    TELEMETRY = QosProfile("BACKGROUND", "DROP", reliable=False, express=False)
+    COMMAND = QosProfile("INTERACTIVE_HIGH", "BLOCK", reliable=True)
+    FRESH = QosProfile("DATA", "DROP", reliable=False)
+    INPUT = QosProfile("DATA_LOW", "BLOCK", reliable=True)
+    FRAME = QosProfile("DATA_LOW", "DROP", reliable=False)
+    TELEMETRY = QosProfile("BACKGROUND", "DROP", reliable=False)
 
 
 class Role(StrEnum):
@@ -68,8 +68,12 @@ class Permission(NamedTuple):
     """The placeholder of the key that must be the member's own name; empty: any name is allowed."""
 
 
-def _robots_and_observers(own: str = "") -> tuple[Permission, ...]:
-    return Permission(Role.ROBOT, own), Permission(Role.OBSERVER, own)
+_MEMBERS = Permission(Role.ROBOT), Permission(Role.OBSERVER)
+_OWNER = Permission(Role.ROBOT, "robot"), Permission(Role.OBSERVER, "robot")
+_OBSERVER = Permission(Role.ROBOT, "observer"), Permission(Role.OBSERVER, "observer")
+_GUEST = (Permission(Role.OBSERVER, "robot"),)
+_FIELD = (Permission(Role.FIELD),)
+_SENSING = (*_OWNER, *_FIELD)  # the robot's own driver, or the simulated field
 
 
 class Topic(NamedTuple):
@@ -77,11 +81,9 @@ class Topic(NamedTuple):
 
     key: str  # `at` fills in each <placeholder>, or `*` for a subscription
     carries: type[Message] | None  # None: the key of a liveliness token
-    rate: str
     qos: Qos
-    reason: str
-    publishers: tuple[Permission, ...] = ()  # where names are certified
-    subscribers: tuple[Permission, ...] = ()  # besides operators, who may subscribe to everything
+    publishers: tuple[Permission, ...] = _OWNER  # where names are certified
+    subscribers: tuple[Permission, ...] = _OWNER  # and operators, who may subscribe to everything
     largest: int = LARGEST_PAYLOAD  # a larger payload is refused unread (bytes)
 
     def at(self, **names: object) -> str:
@@ -115,128 +117,34 @@ def namespace(team: str) -> str:
     return f"cpcbl/{team}"
 
 
-ALIVE = Topic(
-    "alive/<tier>/<robot>/<incarnation>",
-    None,
-    "at a change of tier",
-    Qos.COMMAND,
-    "a liveliness token: the bus reports when it appears and disappears; presence, not health",
-    publishers=_robots_and_observers("robot"),
-    subscribers=_robots_and_observers(),
-)
-BELIEF = Topic(
-    "belief/<tier>/<robot>",
-    Belief,
-    "5 Hz while a worse robot subscribes",
-    Qos.FRESH,
-    "the next one is better than a late one",
-    publishers=_robots_and_observers("robot"),
-    subscribers=_robots_and_observers(),
-)
-FIX = Topic(
-    "fix/<robot>/<tier>/<observer>",
-    Fix,
-    "each sighting of a worse robot that subscribes",
-    Qos.FRESH,
-    "the next one is better than a late one",
-    publishers=_robots_and_observers("observer"),
-    subscribers=_robots_and_observers("robot"),
-)
-STATUS = Topic(
-    "status/<robot>",
-    Status,
-    "1 Hz",
-    Qos.TELEMETRY,
-    "for people; must never delay a fix",
-    publishers=_robots_and_observers("robot"),
-    subscribers=_robots_and_observers("robot"),
-)
-TRACK = Topic(
-    "track/<robot>",
-    Track,
-    "10 Hz while somebody records",
-    Qos.TELEMETRY,
-    "for reports; costs nothing without a subscriber",
-    publishers=_robots_and_observers("robot"),
-    subscribers=_robots_and_observers("robot"),
-)
-_SENSING = (
-    *_robots_and_observers("robot"),
-    Permission(Role.FIELD),
-)  # its own driver, or the simulated field
-IN_ODOMETRY = Topic(
-    "in/<robot>/odometry",
-    Odometry,
-    "the driver's",
-    Qos.INPUT,
-    "a lost piece of odometry is a lost piece of the way",
-    publishers=_SENSING,
-    subscribers=_robots_and_observers("robot"),
-)
-IN_SIGHTINGS = Topic(
-    "in/<robot>/sightings",
-    Sightings,
-    "the driver's",
-    Qos.INPUT,
-    "inputs are not dropped",
-    publishers=_SENSING,
-    subscribers=_robots_and_observers("robot"),
-)
-IN_POSITION = Topic(
-    "in/<robot>/position",
-    Position,
-    "the driver's",
-    Qos.INPUT,
-    "inputs are not dropped",
-    publishers=_SENSING,
-    subscribers=_robots_and_observers("robot"),
-)
-IN_FRAME = Topic(
-    "in/<robot>/frame",
-    Frame,
-    "the camera's",
-    Qos.FRAME,
-    "the next frame is better than a late one",
-    publishers=_SENSING,
-    subscribers=_robots_and_observers("robot"),
-    largest=LARGEST_FRAME,
-)
-LOOK = Topic(
-    "look/<robot>",
-    AnnotatedFrame,
-    "2 Hz while somebody subscribes",
-    Qos.TELEMETRY,
-    "for people; costs nothing without a subscriber",
-    publishers=_robots_and_observers("robot"),
-    subscribers=_robots_and_observers("robot"),
-    largest=LARGEST_FRAME,
-)
-DRIVE = Topic(
-    "field/drive/<robot>",
-    Drive,
-    "10 Hz, simulation only",
-    Qos.COMMAND,
-    "a late command is a collision",
-    publishers=_robots_and_observers("robot"),
-    subscribers=(Permission(Role.FIELD),),
-)
-JOIN = Topic(
-    "field/join/<robot>",
-    Join,
-    "2 Hz of a guest, simulation only",
-    Qos.COMMAND,
-    "without it the field removes the guest; a restarted field needs it again",
-    publishers=(Permission(Role.OBSERVER, "robot"),),
-    subscribers=(Permission(Role.FIELD),),
-)
-TRUTH = Topic(
-    "field/truth",
-    Truths,
-    "every step, simulation only",
-    Qos.TELEMETRY,
-    "for reports only",
-    publishers=(Permission(Role.FIELD),),
-)
+# THE table. Above each row: how often it is sent, and the reason of its quality of service.
+
+# At a change of tier. A liveliness token: the bus reports when it appears and disappears; it shows
+# presence, not health
+ALIVE = Topic("alive/<tier>/<robot>/<incarnation>", None, Qos.COMMAND, subscribers=_MEMBERS)
+# 5 Hz while a worse robot subscribes. The next one is better than a late one
+BELIEF = Topic("belief/<tier>/<robot>", Belief, Qos.FRESH, subscribers=_MEMBERS)
+# Each sighting of a worse robot that subscribes. The next one is better than a late one
+FIX = Topic("fix/<robot>/<tier>/<observer>", Fix, Qos.FRESH, publishers=_OBSERVER)
+# 1 Hz. For people; it must never delay a fix
+STATUS = Topic("status/<robot>", Status, Qos.TELEMETRY)
+# 10 Hz while somebody records. For reports; it costs nothing without a subscriber
+TRACK = Topic("track/<robot>", Track, Qos.TELEMETRY)
+# At the driver's rate. Inputs are not dropped: a lost piece of odometry is a lost piece of the way
+IN_ODOMETRY = Topic("in/<robot>/odometry", Odometry, Qos.INPUT, publishers=_SENSING)
+IN_SIGHTINGS = Topic("in/<robot>/sightings", Sightings, Qos.INPUT, publishers=_SENSING)
+IN_POSITION = Topic("in/<robot>/position", Position, Qos.INPUT, publishers=_SENSING)
+# At the camera's rate. The next frame is better than a late one
+IN_FRAME = Topic("in/<robot>/frame", Frame, Qos.FRAME, publishers=_SENSING, largest=LARGEST_FRAME)
+# 2 Hz while somebody subscribes. For people; it costs nothing without a subscriber
+LOOK = Topic("look/<robot>", AnnotatedFrame, Qos.TELEMETRY, largest=LARGEST_FRAME)
+# 10 Hz, simulation only. A late command is a collision
+DRIVE = Topic("field/drive/<robot>", Drive, Qos.COMMAND, subscribers=_FIELD)
+# 2 Hz of a guest, simulation only. Without it the field removes the guest; a restarted field needs
+# it again
+JOIN = Topic("field/join/<robot>", Join, Qos.COMMAND, publishers=_GUEST, subscribers=_FIELD)
+# Every step, simulation only. For reports only
+TRUTH = Topic("field/truth", Truths, Qos.TELEMETRY, publishers=_FIELD, subscribers=())
 
 TOPICS = (
     *(ALIVE, BELIEF, FIX, STATUS, TRACK),

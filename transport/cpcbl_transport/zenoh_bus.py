@@ -20,7 +20,7 @@ from typing import Any
 import zenoh
 
 from cpcbl_team.errors import CpcblError
-from cpcbl_transport.bus import Handle, LivelinessCallback, MessageCallback, Publisher
+from cpcbl_transport.bus import Bus, Handle, LivelinessCallback, MessageCallback, Publisher
 from cpcbl_transport.security import Credentials
 from cpcbl_transport.topics import Qos, namespace
 from cpcbl_transport.zenoh_config import NO_GUARDS, client_config, router_config
@@ -49,9 +49,8 @@ def open_bus(
             return ZenohBus(_open(config, namespace(team)))
         except zenoh.ZError as error:
             reason = _tls_reason(connect, credentials) or _one_line(error)
-            log.info(
-                "no router at %s yet%s", ", ".join(connect), f": {reason}" if credentials else ""
-            )
+            shown = f": {reason}" if credentials else ""
+            log.info("no router at %s yet%s", ", ".join(connect), shown)
             time.sleep(0.2)
     raise BusError(f"no router at {', '.join(connect)}: {reason}")
 
@@ -77,20 +76,14 @@ def open_router(
 
     `guards`: what `guard_rules` and `access_rules` say; none, and everything is let in.
     """
-    config = router_config(listen, connect, guards, credentials)
+    return open_plain_router(router_config(listen, connect, guards, credentials), namespace(team))
+
+
+def open_plain_router(config: Mapping[str, Any], space: str | None = None) -> "ZenohBus":
+    """A session that is a router for all teams, as its configuration says. Without a namespace its
+    own keys are whole ones. Raises BusError when it cannot listen there."""
     try:
-        return ZenohBus(_open(config, namespace(team)))
-    except zenoh.ZError as error:
-        raise BusError(f"cannot listen on {', '.join(listen)}: {error}") from error
-
-
-def open_plain_router(config: Mapping[str, Any]) -> "ZenohBus":
-    """A session that is a router for all teams, as its configuration says, with keys in full.
-
-    Raises BusError when it cannot listen there.
-    """
-    try:
-        return ZenohBus(_open(config))
+        return ZenohBus(_open(config, space))
     except zenoh.ZError as error:
         endpoints = ", ".join(listening_at(config))
         raise BusError(f"cannot listen on {endpoints}: {_one_line(error)}") from error
@@ -173,7 +166,7 @@ class _ZenohPublisher(_Declared):
             self._publisher.put(payload)
 
 
-class ZenohBus:
+class ZenohBus(Bus):
     """One Zenoh session."""
 
     def __init__(self, session: "zenoh.Session") -> None:
@@ -181,19 +174,16 @@ class ZenohBus:
         self.declared: set[_Declared] = set()
 
     def publisher(self, key: str, qos: Qos) -> Publisher:
-        priority, when_full, reliable, express = qos.value
+        priority, when_full, reliable = qos.value
         kind = zenoh.Reliability.RELIABLE if reliable else zenoh.Reliability.BEST_EFFORT
-        return _ZenohPublisher(
-            self,
-            self._session.declare_publisher(
-                key,
-                allowed_destination=zenoh.Locality.REMOTE,
-                priority=getattr(zenoh.Priority, priority),
-                congestion_control=getattr(zenoh.CongestionControl, when_full),
-                reliability=kind,
-                express=express,
-            ),
+        publisher = self._session.declare_publisher(
+            key,
+            allowed_destination=zenoh.Locality.REMOTE,
+            priority=getattr(zenoh.Priority, priority),
+            congestion_control=getattr(zenoh.CongestionControl, when_full),
+            reliability=kind,
         )
+        return _ZenohPublisher(self, publisher)
 
     def subscribe(self, keys: str, on_message: MessageCallback) -> Handle:
         def on_sample(sample: "zenoh.Sample") -> None:
@@ -226,9 +216,3 @@ class ZenohBus:
         self.declared.clear()
         if not self._session.is_closed():
             self._session.close()  # type: ignore[no-untyped-call]
-
-    def __enter__(self) -> "ZenohBus":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()

@@ -29,8 +29,7 @@ from cpcbl_launch.run.processes import PROGRAM
 from cpcbl_launch.run.robot import robot_parser, run_robot_command
 from cpcbl_team.errors import CpcblError, InputError
 from cpcbl_team.inputs import Belief, Fix
-from cpcbl_transport.bus import Bus, Publisher
-from cpcbl_transport.bus_proxy import BusProxy, PublisherProxy
+from cpcbl_transport.bus import Bus, BusProxy, Publisher, PublisherProxy
 from cpcbl_transport.compact import decode_help, encode_help
 from cpcbl_transport.messages import Refusal
 from cpcbl_transport.topics import Qos

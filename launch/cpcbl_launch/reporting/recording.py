@@ -19,7 +19,6 @@ from mcap.exceptions import McapError
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
-from cpcbl_agents.sensing import SensorInput
 from cpcbl_agents.sources.mrclam import LogError
 from cpcbl_launch.reporting.foxglove import PICTURE, PICTURE_SCHEMA, foxglove_image
 from cpcbl_launch.reporting.metrics import Floats
@@ -29,7 +28,7 @@ from cpcbl_team.inputs import Odometry, Position, Sightings
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus
 from cpcbl_transport.decoding import decode
-from cpcbl_transport.messages import AnnotatedFrame, Message, Refusal, Truths
+from cpcbl_transport.messages import AnnotatedFrame, Message, Refusal, SensorInput, Truths
 
 log = logging.getLogger(__name__)
 

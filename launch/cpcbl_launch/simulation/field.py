@@ -9,13 +9,12 @@ from collections.abc import Iterable
 from functools import partial
 from typing import TYPE_CHECKING
 
-from cpcbl_agents.sensing import SensorInput
 from cpcbl_launch.simulation.grid import Grid
 from cpcbl_launch.simulation.robot import SimulatedRobot, VisibleObject
 from cpcbl_team.config import SimulationEvent, Team
 from cpcbl_team.geometry import Pose2, wrap_angle
 from cpcbl_team.inputs import Sightings
-from cpcbl_transport.messages import Drive, Frame, Truth, Truths
+from cpcbl_transport.messages import Drive, Frame, SensorInput, Truth, Truths
 from cpcbl_transport.robot_model import SimulatedRobotModel, settings_from_model
 
 if TYPE_CHECKING:

@@ -15,7 +15,6 @@ from typing import TypeVar
 from msgspec.structs import replace
 
 from cpcbl_agents.clock import Clock
-from cpcbl_agents.sensing import SensorInput
 from cpcbl_launch.checks import require_robots
 from cpcbl_launch.simulation.field import SimulatedField
 from cpcbl_launch.simulation.guest_bodies import GuestBodies
@@ -26,7 +25,7 @@ from cpcbl_team.inputs import Odometry
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus, Handle, Publisher
 from cpcbl_transport.decoding import decode
-from cpcbl_transport.messages import Drive, Join, Refusal, encode, refusal
+from cpcbl_transport.messages import Drive, Join, Refusal, SensorInput, encode, refusal
 
 log = logging.getLogger(__name__)
 
