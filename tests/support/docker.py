@@ -13,10 +13,13 @@ from cpcbl_launch.run.containers.docker import (
     DockerError,
     command_output,
     compose_program,
+    ensure_image,
+    fetch_image,
+    has_image,
     never_stop,
+    version,
 )
 from cpcbl_launch.run.containers.fleet import Project
-from cpcbl_launch.run.containers.image import ensure_image, fetch_image, has_image, version
 from cpcbl_launch.run.up import free_endpoint
 
 TOP = Path(__file__).parents[2]

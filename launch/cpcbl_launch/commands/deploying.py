@@ -24,7 +24,7 @@ def compose(
 ) -> None:
     """Print a team's compose file: for docker-compose, docker compose, a swarm."""
     from cpcbl_launch.reporting.files import write_or_reason
-    from cpcbl_launch.run.containers.deployment import deployment_text
+    from cpcbl_launch.run.containers.compose import deployment_text
 
     team = find_team(file or Path("demo"))
     folder = Path() if output is None else output.parent

@@ -89,9 +89,8 @@ def observer(
     console, stop = Console(stderr=as_json), StopSignal(parent)
     endpoints = connect or team.transport.connect
     if container:
-        from cpcbl_launch.run.containers.guest import run_observer_container
-        from cpcbl_launch.run.containers.image import ensure_image
-        from cpcbl_launch.run.containers.launch import line_printer
+        from cpcbl_launch.run.containers.docker import ensure_image
+        from cpcbl_launch.run.containers.launch import line_printer, run_observer_container
 
         given = {"at": at, "fov": fov, "move": move, "source": kind, "for": duration}
         arguments = _arguments(given | {"clock": clock}, endpoints, as_json)

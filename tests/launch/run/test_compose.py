@@ -13,18 +13,23 @@ from support.buses import robot_at, team_of
 from support.docker import TOP
 from support.processes import cpcbl_team
 
-from cpcbl_launch.run.containers.compose import Deployment, Mount, compose_text
-from cpcbl_launch.run.containers.deployment import deployment_text
+from cpcbl_launch.run.containers.compose import Deployment, Mount, compose_text, deployment_text
 from cpcbl_launch.run.containers.docker import (
+    SOURCES,
     DockerError,
+    build_step,
     command_output,
     compose_program,
     run_command,
+    tag,
+    version,
 )
 from cpcbl_launch.run.containers.fleet import Container, containers_by_service, restarts_between
-from cpcbl_launch.run.containers.guest import run_observer_container
-from cpcbl_launch.run.containers.image import SOURCES, build_step, tag, version
-from cpcbl_launch.run.containers.launch import published_port, team_in_containers
+from cpcbl_launch.run.containers.launch import (
+    published_port,
+    run_observer_container,
+    team_in_containers,
+)
 from cpcbl_launch.run.processes import PROGRAM
 from cpcbl_launch.team_file import builtin_path, load_team
 from cpcbl_team.config import Team

@@ -20,8 +20,7 @@ from cpcbl_launch.reporting.metrics import seconds
 from cpcbl_launch.reporting.phases import presence_spans
 from cpcbl_launch.reporting.recorder import Recorder, Report
 from cpcbl_launch.run.containers.compose import Mount
-from cpcbl_launch.run.containers.guest import docker_run, mounts_of_keys
-from cpcbl_launch.run.containers.launch import KEYS_INSIDE
+from cpcbl_launch.run.containers.launch import KEYS_INSIDE, docker_run, mounts_of_keys
 from cpcbl_launch.run.processes import PROGRAM
 from cpcbl_launch.run.up import Run, free_endpoint, run_team
 from cpcbl_launch.team_file import save_resolved

@@ -19,12 +19,15 @@ from cpcbl_launch.run.containers import BASE_IMAGE, BASE_VARIABLE
 from cpcbl_launch.run.containers.docker import (
     DockerError,
     check_daemon,
+    checkout,
     command_output,
     compose_program,
+    ensure_image,
+    has_image,
     never_stop,
+    version,
 )
 from cpcbl_launch.run.containers.fleet import Project
-from cpcbl_launch.run.containers.image import checkout, ensure_image, has_image, version
 from cpcbl_launch.run.up import free_endpoint
 from cpcbl_transport.zenoh_bus import open_bus
 

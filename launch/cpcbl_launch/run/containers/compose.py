@@ -3,19 +3,23 @@
 Nothing here is measured or started; what is written is decided by the team and a `Deployment`.
 """
 
+import os
 from collections.abc import Collection
+from pathlib import Path
 from typing import NamedTuple
 
 import yaml
 
 from cpcbl_launch.run.containers import BASE_IMAGE, BASE_VARIABLE
-from cpcbl_launch.run.processes import tasks
+from cpcbl_launch.run.containers.docker import NAME, checkout, version
+from cpcbl_launch.run.processes import Task, tasks
+from cpcbl_launch.team_file import parse_team
 from cpcbl_team.config import Team
-from cpcbl_transport.security import Identity
+from cpcbl_team.errors import InputError
+from cpcbl_transport.security import Identity, credentials_in
 from cpcbl_transport.topics import Role
 
-PORT = 7447
-"""Where the router listens, inside."""
+PORT = 7447  # where the router listens, inside
 
 
 class Mount(NamedTuple):
@@ -38,64 +42,58 @@ class Deployment(NamedTuple):
     mounts: tuple[Mount, ...] = ()
     keys: Mount | None = None
     """The key folder of a secured team: of it each container may read its own part."""
-    user: str = ""
-    """uid:gid of all containers, where the image's will not do."""
+    user: str = ""  # uid:gid of all containers, where the image's will not do
     seed: int = 1
     speed: float = 1.0
     clock: str = ""
-    here: Collection[str] | None = None
-    """The robots to start; None: all."""
+    here: Collection[str] | None = None  # the robots to start; None: all
 
 
-def compose_text(team: Team, how: Deployment) -> str:
-    """The whole compose file: the router, the field if anything is simulated, a service a robot."""
-    here = team.robots if how.here is None else how.here
-    clock = ("--clock", how.clock) if how.clock else ()
-    common = ("--team", how.team_file, "--connect", f"{_scheme(how)}/router:{PORT}", *clock)
-    rows = tasks(team, common, how.seed, here)
-    parts = [
-        _HEAD.format(
-            title=_title(team, here),
-            image=_flow(how.image),
-            user=_user(how.user),
-            mounts="" if how.keys else _mounts(how.mounts, ""),
-            to=_flow(["CMD", "linked", "to", str(PORT)]),
-        ),
-        _ROUTER.format(
-            build=_build(how.context, extras_of(team)),
-            command=_flow(_router(how)),
-            keys=_own_mounts(how, Identity(Role.ROUTER)),
-            ports=_flow([f"{outside}:{PORT}" for outside in how.published]),
-            at=_flow(["CMD", "linked", "at", str(PORT)]),
-        ),
-        *(
-            _SERVICE.format(
-                name=row.name, command=_flow(row.arguments), keys=_own_mounts(how, row.identity)
+def deployment_text(team: Team, file: Path, folder: Path, image: str | None, seed: int) -> str:
+    """What `cpcbl-team compose` prints: the compose file of the team in `file`, to lie in `folder`.
+
+    `file` is mounted into the containers unless it is a built-in team's name. Without `image` the
+    file tells how to build one from the checkout. Raises InputError for robots that replay a log.
+    """
+    for name, robot in team.robots.items():
+        if robot.source == "mrclam":
+            raise InputError(
+                f"robots.{name}.source: mrclam: a log is replayed by `up --containers --data DIR`"
             )
-            for row in rows
-        ),
-    ]
-    return "".join(parts)
-
-
-def _title(team: Team, here: Collection[str]) -> str:
-    return f"Team {team.name}: a router,{' the simulated field,' if team.simulated else ''} and" + (
-        " one robot" if len(here) == 1 else f" {len(here)} robots"
+    top = None if image else checkout()
+    how = Deployment(
+        str(file),
+        image or f"{NAME}:{version()}",
+        None if top is None else _from(folder, top),
+        user=key_owner(team, Identity(Role.ROUTER)),
+        seed=seed,
     )
+    if file.exists():
+        inside = f"/team/{file.name}"
+        how = how._replace(team_file=inside, mounts=(Mount(_from(folder, file), inside),))
+    if team.transport.secured:
+        keys_folder = parse_team(file.read_text(encoding="utf-8")).transport.keys
+        target = os.path.normpath(os.path.join("/team", keys_folder))
+        how = how._replace(keys=Mount(_from(folder, Path(team.transport.keys)), target))
+    return compose_text(team, how)
 
 
-def _router(how: Deployment) -> list[str]:
-    command = ["router", how.team_file, "--listen", f"{_scheme(how)}/0.0.0.0:{PORT}"]
-    return command if how.speed == 1.0 else [*command, "--speed", f"{how.speed:g}"]
+def key_owner(team: Team, identity: Identity) -> str:
+    """uid:gid of who alone can read somebody's keys of a secured team; empty for another team.
 
-
-def _build(context: str | None, extras: str) -> str:
-    if context is None:
+    Raises SecurityError without the keys.
+    """
+    if not team.transport.secured:
         return ""
-    base = f"${{{BASE_VARIABLE}:-{BASE_IMAGE}}}"
-    return _BUILD.format(
-        context=_flow(context), base=base, extras=f", EXTRAS: {extras}" if extras else ""
-    )
+    credentials = credentials_in(Path(team.transport.keys), identity)
+    whose = Path(credentials.private_key).stat()
+    return f"{whose.st_uid}:{whose.st_gid}"
+
+
+def _from(folder: Path, path: Path) -> str:
+    """A path from a folder, as compose files want it."""
+    relative = os.path.relpath(path.resolve(), folder.resolve())
+    return relative if relative.startswith(".") else f"./{relative}"
 
 
 def extras_of(team: Team) -> str:
@@ -103,14 +101,44 @@ def extras_of(team: Team) -> str:
     return "camera" if team.cameras else ""
 
 
-def _scheme(how: Deployment) -> str:
-    return "tcp" if how.keys is None else "tls"
-
-
-def _user(user: str) -> str:
-    return (
-        f"  user: {_flow(user)} # whose the keys are; nobody else can read them\n" if user else ""
+def compose_text(team: Team, how: Deployment) -> str:
+    """The whole compose file: the router, the field if anything is simulated, a service a robot."""
+    here = team.robots if how.here is None else how.here
+    field = " the simulated field," if team.simulated else ""
+    robots = "one robot" if len(here) == 1 else f"{len(here)} robots"
+    user = f"  user: {_flow(how.user)} # whose the keys are; nobody else can read them\n"
+    protocol = "tcp" if how.keys is None else "tls"
+    speed = () if how.speed == 1.0 else ("--speed", f"{how.speed:g}")
+    router = ("router", how.team_file, "--listen", f"{protocol}/0.0.0.0:{PORT}", *speed)
+    clock = ("--clock", how.clock) if how.clock else ()
+    common = ("--team", how.team_file, "--connect", f"{protocol}/router:{PORT}", *clock)
+    head = _HEAD.format(
+        title=f"Team {team.name}: a router,{field} and {robots}",
+        image=_flow(how.image),
+        user=user if how.user else "",
+        mounts="" if how.keys else _mounts(how.mounts, ""),
+        to=_flow(["CMD", "linked", "to", str(PORT)]),
     )
+    router_service = _ROUTER.format(
+        build="" if how.context is None else _build(how.context, extras_of(team)),
+        command=_flow(router),
+        keys=_own_mounts(how, Identity(Role.ROUTER)),
+        ports=_flow([f"{outside}:{PORT}" for outside in how.published]),
+        at=_flow(["CMD", "linked", "at", str(PORT)]),
+    )
+    services = (_service(how, task) for task in tasks(team, common, how.seed, here))
+    return "".join([head, router_service, *services])
+
+
+def _service(how: Deployment, task: Task) -> str:
+    keys = _own_mounts(how, task.identity)
+    return _SERVICE.format(name=task.name, command=_flow(task.arguments), keys=keys)
+
+
+def _build(context: str, extras: str) -> str:
+    base = f"${{{BASE_VARIABLE}:-{BASE_IMAGE}}}"
+    more = f", EXTRAS: {extras}" if extras else ""
+    return _BUILD.format(context=_flow(context), base=base, extras=more)
 
 
 def _own_mounts(how: Deployment, identity: Identity) -> str:
@@ -122,21 +150,16 @@ def _own_mounts(how: Deployment, identity: Identity) -> str:
 
 
 def _mounts(mounts: Collection[Mount], indent: str) -> str:
-    if not mounts:
-        return ""
-    lines = [
-        _flow({"type": "bind", "source": m.source, "target": m.target, "read_only": True})
-        for m in mounts
-    ]
     head = f"{indent}  volumes: # on every machine of a swarm\n"
-    return head + "".join(f"{indent}    - {line}\n" for line in lines)
+    binds = ({"type": "bind", **m._asdict(), "read_only": True} for m in mounts)
+    lines = [f"{indent}    - {_flow(bind)}\n" for bind in binds]
+    return "".join([head, *lines]) if lines else ""
 
 
 def _flow(value: object) -> str:
     """A value on one line, quoted where YAML needs it; compose's own `$` is escaped."""
-    text = yaml.safe_dump(
-        _plain(value), default_flow_style=True, sort_keys=False, width=float("inf")
-    )
+    plain = _plain(value)
+    text = yaml.safe_dump(plain, default_flow_style=True, sort_keys=False, width=float("inf"))
     return text.removesuffix("\n").removesuffix("\n...")
 
 

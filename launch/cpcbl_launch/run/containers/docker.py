@@ -1,9 +1,10 @@
-"""Docker's command line: which there is, whether a daemon answers, one command at a time.
+"""Docker's command line and the image that all containers of a team use.
 
 Commands are started in sessions of their own, so that Ctrl-C reaches only us, and are ended when
 they take too long or the user wants to stop.
 """
 
+import hashlib
 import os
 import platform
 import re
@@ -11,13 +12,24 @@ import shlex
 import subprocess
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from importlib import metadata
+from pathlib import Path
 from typing import NamedTuple
 
+from cpcbl_launch.run.containers import BASE_VARIABLE
 from cpcbl_team.errors import CpcblError
 
 ON_DEBIAN = "docker/dockerd.sh start installs and starts what is missing on Debian"
 POLL_S = 0.05
+NAME = "cpcbl-team"
+DOCKERFILE = Path("docker/Dockerfile")
+SOURCES = (
+    *("pyproject.toml", "README.md", "LICENSE", "docker/Dockerfile", "docker/linked"),
+    *("cpcbl_team", "transport", "agents", "launch"),
+)
+"""What goes into the image, from the top of the checkout; .dockerignore lets in the same."""
+BUILD_TIMEOUT_S = 1800.0
 
 PrintLine = Callable[[str], None]
 
@@ -30,13 +42,12 @@ class CommandResult(NamedTuple):
     """A command that has ended."""
 
     code: int
-    output: str
-    """Standard output and standard error, as they came."""
+    output: str  # standard output and standard error, as they came
 
     @property
     def last_line(self) -> str:
-        lines = [line.strip() for line in self.output.splitlines() if line.strip()]
-        return lines[-1] if lines else "it printed nothing"
+        lines = self.output.strip().splitlines()
+        return lines[-1].strip() if lines else "it printed nothing"
 
     @property
     def problem(self) -> str:
@@ -49,14 +60,10 @@ def never_stop() -> bool:
     return False
 
 
-def ignore_line(line: str) -> None:
-    """For those who do not want to hear what a command says."""
-
-
 def run_command(
     command: Sequence[str],
     stop: Callable[[], bool] = never_stop,
-    print_line: PrintLine = ignore_line,
+    print_line: PrintLine = lambda line: None,
     timeout_s: float = 60.0,
 ) -> CommandResult:
     """Runs a command to its end, and tells each line as it comes.
@@ -76,7 +83,11 @@ def run_command(
                     printed += len(line) + 1
                     print_line(line.decode(errors="replace").rstrip())
                 if running:
-                    _check_limits(command, stop, until_s)
+                    began = f"{shlex.join(command[:4])} ..."
+                    if stop():
+                        raise DockerError(f"stopped during {began}")
+                    if time.monotonic() > until_s:
+                        raise DockerError(f"no end of {began} in time; is Docker well?")
                     time.sleep(POLL_S)
         finally:
             if process.poll() is None:
@@ -85,10 +96,26 @@ def run_command(
     return CommandResult(process.returncode, received.decode(errors="replace"))
 
 
+def _start(command: Sequence[str], output: int) -> "subprocess.Popen[bytes]":
+    try:
+        return subprocess.Popen(
+            command,
+            stdin=subprocess.DEVNULL,
+            stdout=output,
+            stderr=subprocess.STDOUT,
+            start_new_session=True,
+        )
+    except FileNotFoundError:
+        raise DockerError(
+            f"no program {command[0]} here: install Docker, docs.docker.com/engine/install;"
+            f" {ON_DEBIAN}"
+        ) from None
+
+
 def command_output(
     command: Sequence[str],
     stop: Callable[[], bool] = never_stop,
-    print_line: PrintLine = ignore_line,
+    print_line: PrintLine = lambda line: None,
     timeout_s: float = 60.0,
 ) -> str:
     """What a command says. Raises DockerError also when it fails."""
@@ -125,24 +152,83 @@ def compose_program() -> tuple[str, ...]:
     )
 
 
-def _start(command: Sequence[str], output: int) -> "subprocess.Popen[bytes]":
-    try:
-        return subprocess.Popen(
-            command,
-            stdin=subprocess.DEVNULL,
-            stdout=output,
-            stderr=subprocess.STDOUT,
-            start_new_session=True,
-        )
-    except FileNotFoundError:
+# The image: named after what it is built from ---------------------------------------------------
+
+
+def version() -> str:
+    return metadata.version(NAME)
+
+
+def checkout() -> Path | None:
+    """The top of the checkout that this program runs from; None: it was installed without one."""
+    top = Path(__file__).parents[4]
+    return top if (top / DOCKERFILE).exists() else None
+
+
+def tag(top: Path, base: str, extras: str = "") -> str:
+    """cpcbl-team:VERSION-HASH, of the sources, the recipe, the base's name and the extras."""
+    content = hashlib.sha256(f"{base} {extras}".encode())
+    for path in _source_files(top):
+        content.update(f"\n{path.relative_to(top)}\n".encode())
+        content.update(path.read_bytes())
+    return f"{NAME}:{version()}-{content.hexdigest()[:12]}"
+
+
+def _source_files(top: Path) -> Iterator[Path]:
+    for source in SOURCES:
+        for path in (top / source, *sorted((top / source).rglob("*"))):
+            if path.is_file() and "__pycache__" not in path.parts:
+                yield path
+
+
+def ensure_image(
+    base: str, stop: Callable[[], bool], print_line: PrintLine, extras: str = ""
+) -> str:
+    """The name of an image of this very program with these extras, built where there is none yet.
+
+    Raises DockerError.
+    """
+    top = checkout()
+    if top is None:
         raise DockerError(
-            f"no program {command[0]} here: install Docker, docs.docker.com/engine/install;"
-            f" {ON_DEBIAN}"
-        ) from None
+            "the image is built from a checkout, and this program was installed without one; name"
+            " one that you have: --image NAME"
+        )
+    name = tag(top, base, extras)
+    if not has_image(name):
+        without_registry = f"docker/base-image.sh, then {BASE_VARIABLE}=cpcbl-base"
+        fetch_image(base, stop, print_line, f"without a registry of images: {without_registry}")
+        print_line(f"building image {name} on {base}, once for these sources")
+        arguments = ("--build-arg", f"BASE_IMAGE={base}", "--build-arg", f"EXTRAS={extras}")
+        command = ["docker", "build", "--force-rm", "--tag", name, *arguments]
+        command += ["--file", str(top / DOCKERFILE), str(top)]
+
+        def print_step(line: str) -> None:
+            if step := build_step(line):
+                print_line(step)
+
+        command_output(command, stop, print_step, BUILD_TIMEOUT_S)
+    return name
 
 
-def _check_limits(command: Sequence[str], stop: Callable[[], bool], until_s: float) -> None:
-    if stop():
-        raise DockerError(f"stopped during {shlex.join(command[:4])} ...")
-    if time.monotonic() > until_s:
-        raise DockerError(f"no end of {shlex.join(command[:4])} ... in time; is Docker well?")
+def has_image(image: str) -> bool:
+    """Whether the daemon has an image."""
+    return run_command(["docker", "image", "inspect", "--format", "{{.Id}}", image]).code == 0
+
+
+def fetch_image(
+    image: str, stop: Callable[[], bool], print_line: PrintLine, otherwise: str
+) -> None:
+    """Fetches an image that is not there. Raises DockerError, with what to do `otherwise`."""
+    if has_image(image):
+        return
+    print_line(f"fetching image {image}")
+    fetched = run_command(["docker", "pull", "--quiet", image], stop, timeout_s=BUILD_TIMEOUT_S)
+    if fetched.code:
+        raise DockerError(f"no image {image} ({fetched.problem}); {otherwise}")
+
+
+def build_step(line: str) -> str | None:
+    """Of all that a builder says (the classic one, or BuildKit) the lines that begin a step."""
+    step = re.match(r"(?:Step (\d+/\d+) :|#\d+ \[.*?(\d+/\d+)\]) (.+)", line)
+    return f"  {step[1] or step[2]} {step[3]}"[:78] if step else None

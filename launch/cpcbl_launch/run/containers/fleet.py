@@ -3,6 +3,7 @@
 import json
 import logging
 import time
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -22,14 +23,11 @@ class Container(NamedTuple):
 
     id: str
     running: bool
-    restarting: bool
-    """Docker waits a moment before it starts it again."""
-    pid: int
-    """On this machine; of its init."""
+    restarting: bool  # Docker waits a moment before it starts it again
+    pid: int  # on this machine; of its init
     code: int
     started_at: str
-    restarts: int
-    """By Docker itself, since it was last started by hand."""
+    restarts: int  # by Docker itself, since it was last started by hand
 
 
 def containers_by_service(inspected: Sequence[Mapping[str, Any]]) -> dict[str, Container]:
@@ -37,14 +35,10 @@ def containers_by_service(inspected: Sequence[Mapping[str, Any]]) -> dict[str, C
     found = {}
     for c in inspected:
         state = c["State"]
+        running, restarting = state["Running"], state["Restarting"]
+        process = state["Pid"], state["ExitCode"], state["StartedAt"]
         found[c["Config"]["Labels"][SERVICE_LABEL]] = Container(
-            c["Id"],
-            state["Running"] and not state["Restarting"],
-            state["Restarting"],
-            state["Pid"],
-            state["ExitCode"],
-            state["StartedAt"],
-            c["RestartCount"],
+            c["Id"], running and not restarting, restarting, *process, c["RestartCount"]
         )
     return found
 
@@ -79,21 +73,17 @@ class Project:
     def containers(self) -> dict[str, Container]:
         """Service -> container, those that stand still too. Raises DockerError."""
         label = f"label={PROJECT_LABEL}={self.name}"
-        ids = command_output(
-            ["docker", "ps", "--all", "--quiet", "--no-trunc", "--filter", label]
-        ).split()
-        if not ids:
-            return {}
-        return containers_by_service(json.loads(command_output(["docker", "inspect", *ids])))
+        command = ["docker", "ps", "--all", "--quiet", "--no-trunc", "--filter", label]
+        ids = command_output(command).split()
+        inspected = json.loads(command_output(["docker", "inspect", *ids])) if ids else []
+        return containers_by_service(inspected)
 
     def last_log_line(self, service: str) -> str:
         """The last line that a container wrote."""
         container = self.containers().get(service)
-        return (
-            "nothing"
-            if container is None
-            else run_command(["docker", "logs", container.id]).last_line
-        )
+        if container is None:
+            return "nothing"
+        return run_command(["docker", "logs", container.id]).last_line
 
     def save_logs(self, folder: Path) -> None:
         """The output of every container, as SERVICE.log."""
@@ -107,16 +97,12 @@ class ContainerSupervisor:
     hand it leaves, so that is done here.
     """
 
-    def __init__(self, project: Project, services: Sequence[str]) -> None:
-        self._project, self._services = project, services
+    def __init__(self, project: Project, names: Sequence[str]) -> None:
+        self._project, self.names = project, list(names)
         self._now: dict[str, Container] = {}
         self._last: dict[str, Container] = {}
-        self._restarts: dict[str, int] = {}
+        self._restarts: Counter[str] = Counter()
         self._next_s = 0.0
-
-    @property
-    def names(self) -> list[str]:
-        return list(self._services)
 
     @property
     def pids(self) -> dict[str, int]:
@@ -124,7 +110,7 @@ class ContainerSupervisor:
 
     @property
     def restarts(self) -> dict[str, int]:
-        return {name: n for name, n in self._restarts.items() if n}
+        return dict(self._restarts)
 
     def watch(self) -> None:
         """To be called several times a second; looks once a second."""
@@ -139,12 +125,11 @@ class ContainerSupervisor:
     def _look(self) -> None:
         self._now = self._project.containers()
         for name, container in self._now.items():
-            new = restarts_between(self._last.get(name, container), container)
-            self._restarts[name] = self._restarts.get(name, 0) + new
-            if new:
+            if new := restarts_between(self._last.get(name, container), container):
+                self._restarts[name] += new
                 log.warning("container %s was started again", name)
         self._last |= self._now
-        down = [name for name in self._services if self._is_down(name)]
+        down = [name for name in self.names if self._is_down(name)]
         if down:
             self._project.up(*down)
 
@@ -152,8 +137,8 @@ class ContainerSupervisor:
         container = self._now.get(name)
         if container is None:
             log.warning("container %s is gone", name)
-        elif not container.running and not container.restarting:
+            return True
+        down = not container.running and not container.restarting
+        if down:
             log.warning("container %s ended (%d)", name, container.code)
-        else:
-            return False
-        return True
+        return down

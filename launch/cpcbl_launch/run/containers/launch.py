@@ -1,21 +1,39 @@
-"""Starts a team in containers for `up`, which follows it as it follows processes."""
+"""Starts a team in containers for `up`, which follows it as it follows processes; or an observer.
+
+An observer has a container of its own, beside a team that runs anywhere.
+"""
 
 import re
 import secrets
+import subprocess
+import tempfile
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import msgspec
 from rich.console import Console
 
 from cpcbl_agents.clock import Clock
-from cpcbl_launch.run.containers.compose import Deployment, Mount, compose_text, extras_of
-from cpcbl_launch.run.containers.deployment import key_owner
-from cpcbl_launch.run.containers.docker import DockerError, PrintLine, check_daemon, compose_program
+from cpcbl_launch.run.containers.compose import (
+    Deployment,
+    Mount,
+    compose_text,
+    extras_of,
+    key_owner,
+)
+from cpcbl_launch.run.containers.docker import (
+    DockerError,
+    PrintLine,
+    check_daemon,
+    compose_program,
+    ensure_image,
+    fetch_image,
+    run_command,
+)
 from cpcbl_launch.run.containers.fleet import ContainerSupervisor, Project
-from cpcbl_launch.run.containers.image import ensure_image, fetch_image
+from cpcbl_launch.run.observer import presets
 from cpcbl_launch.run.processes import tasks
 from cpcbl_launch.run.supervisor import Processes
 from cpcbl_launch.run.up import Run, local_endpoint, require_keys
@@ -23,7 +41,7 @@ from cpcbl_launch.team_file import save_resolved
 from cpcbl_team.config import Team
 from cpcbl_team.errors import InputError
 from cpcbl_transport.bus import Bus
-from cpcbl_transport.security import Identity, Link, link_of
+from cpcbl_transport.security import Identity, Link, credentials_in, link_of
 from cpcbl_transport.topics import Role
 from cpcbl_transport.zenoh_bus import BusError, ZenohBus, open_bus
 
@@ -35,6 +53,8 @@ ROUTER_WITHIN_S = 60.0
 INSIDE = "/team/team.json"
 DATA_INSIDE = "/team/data"
 KEYS_INSIDE = "/team/keys"
+SENSOR_INSIDE = "/team/sensor.toml"
+POLL_S = 0.1
 
 
 class InContainers:
@@ -60,8 +80,8 @@ class InContainers:
         self._image = image or ensure_image(base, stop, print_line, extras_of(run.team))
         self.lead_s = LEAD_S + LEAD_S_A_CONTAINER * len(self._here)
         self._file = folder / "compose.yaml"
-        name = f"{_project_name(run.team)}-{secrets.token_hex(3)}"
-        self._project = Project(program, name, self._file)
+        name = re.sub(r"[^a-z0-9_-]", "-", run.team.name.lower())
+        self._project = Project(program, f"cpcbl-{name}-{secrets.token_hex(3)}", self._file)
 
     @contextmanager
     def router(self) -> Iterator[Bus]:
@@ -70,12 +90,10 @@ class InContainers:
         save_resolved(team_in_containers(self._run.team), team_file)
         team_file.chmod(0o644)
         self._write("")
-        self._print_line(
-            f"starting {len(self._here)} robots in containers: project {self._project.name}"
-        )
-        team = self._run.team
-        here = [local_endpoint(team.transport.listen[0])]
-        link = link_of(team, Identity(Role.OPERATOR), here)
+        number, project = len(self._here), self._project.name
+        self._print_line(f"starting {number} robots in containers: project {project}")
+        here = [local_endpoint(self._run.team.transport.listen[0])]
+        link = link_of(self._run.team, Identity(Role.OPERATOR), here)
         try:
             began_s = time.monotonic()
             self._project.up("router")
@@ -114,20 +132,23 @@ class InContainers:
             self._project.down()
 
     def _write(self, clock: str) -> None:
-        run, endpoints = self._run, self._run.team.transport.listen
+        run, team = self._run, self._run.team
+        mounts = [Mount(str((self._folder / "team.json").resolve()), INSIDE)]
+        if _replays(team):
+            mounts.append(Mount(str(Path(team.data).resolve()), DATA_INSIDE))
         how = Deployment(
             INSIDE,
             self._image,
-            published=tuple(published_port(endpoint) for endpoint in endpoints),
-            mounts=(Mount(str((self._folder / "team.json").resolve()), INSIDE), *_data(run.team)),
-            keys=_keys(run.team),
-            user=key_owner(run.team, Identity(Role.ROUTER)),
+            published=tuple(map(published_port, team.transport.listen)),
+            mounts=tuple(mounts),
+            keys=Mount(team.transport.keys, KEYS_INSIDE) if team.transport.secured else None,
+            user=key_owner(team, Identity(Role.ROUTER)),
             seed=run.seed,
             speed=run.speed,
             clock=clock,
             here=self._here,
         )
-        self._file.write_text(compose_text(run.team, how), encoding="utf-8")
+        self._file.write_text(compose_text(team, how), encoding="utf-8")
 
 
 def line_printer(console: Console) -> PrintLine:
@@ -163,17 +184,77 @@ def published_port(endpoint: str) -> str:
     return f"{address}:{port}"
 
 
-def _data(team: Team) -> tuple[Mount, ...]:
-    return (Mount(str(Path(team.data).resolve()), DATA_INSIDE),) if _replays(team) else ()
-
-
-def _keys(team: Team) -> Mount | None:
-    return Mount(team.transport.keys, KEYS_INSIDE) if team.transport.secured else None
-
-
 def _replays(team: Team) -> bool:
     return any(robot.source == "mrclam" for robot in team.robots.values())
 
 
-def _project_name(team: Team) -> str:
-    return "cpcbl-" + re.sub(r"[^a-z0-9_-]", "-", team.name.lower())
+# An observer ------------------------------------------------------------------------------------
+
+
+def run_observer_container(
+    name: str,
+    team: Team,
+    sensor: str,
+    arguments: Sequence[str],
+    image: str,
+    stop: Callable[[], bool],
+) -> int:
+    """Runs `cpcbl-team observer NAME ARGUMENTS` in a container until it ends or `stop()`.
+
+    `sensor` is a preset or a file, which the container then reads. The container shares this
+    machine's network, so that endpoints stay what they are, and this process's output. Returns its
+    exit code. Raises DockerError, or SecurityError without the observer's keys.
+    """
+    check_daemon()
+    with tempfile.TemporaryDirectory(prefix="cpcbl-") as folder:
+        team_file = Path(folder) / "team.json"
+        save_resolved(team_in_containers(team), team_file)
+        team_file.chmod(0o644)
+        mounts = [Mount(str(team_file), INSIDE), *mounts_of_keys(name, team)]
+        if sensor not in presets():
+            mounts.append(Mount(str(Path(sensor).resolve()), SENSOR_INSIDE))
+            sensor = SENSOR_INSIDE
+        container = f"cpcbl-{name}-{secrets.token_hex(3)}"
+        inner = ["observer", name, "--team", INSIDE, f"--sensor={sensor}", *arguments]
+        user = key_owner(team, Identity(Role.OBSERVER, name))
+        command = docker_run(container, image, mounts, user, inner)
+        process = subprocess.Popen(command, stdin=subprocess.DEVNULL, start_new_session=True)
+        try:
+            while process.poll() is None and not stop():
+                time.sleep(POLL_S)
+        finally:
+            _stop_container(process, container)
+        return process.returncode
+
+
+def _stop_container(process: "subprocess.Popen[bytes]", container: str) -> None:
+    """Stops the container until it ends: what is not there yet cannot be stopped."""
+    while process.poll() is None:
+        run_command(["docker", "stop", "--time", "3", container])
+        with suppress(subprocess.TimeoutExpired):
+            process.wait(POLL_S)
+
+
+def docker_run(
+    container: str, image: str, mounts: Sequence[Mount], user: str, inner: Sequence[str]
+) -> list[str]:
+    """The command: read-only, without rights, gone when it ends."""
+    return [
+        *("docker", "run", "--rm", "--init", "--name", container, "--network", "host"),
+        *("--read-only", "--tmpfs", "/tmp", "--cap-drop", "ALL"),
+        *("--security-opt", "no-new-privileges:true"),
+        *(("--user", user) if user else ()),
+        *(part for m in mounts for part in ("--volume", f"{m.source}:{m.target}:ro")),
+        image,
+        *inner,
+    ]
+
+
+def mounts_of_keys(name: str, team: Team) -> list[Mount]:
+    """The observer's own, and nobody else's. Raises SecurityError without them."""
+    if not team.transport.secured:
+        return []
+    identity = Identity(Role.OBSERVER, name)
+    credentials_in(Path(team.transport.keys), identity)
+    own = Path(team.transport.keys).resolve() / str(identity)
+    return [Mount(str(own), f"{KEYS_INSIDE}/{identity}")]
