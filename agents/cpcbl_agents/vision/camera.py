@@ -5,6 +5,7 @@ frame: x forward, y left, z up, from the floor below the robot's centre.
 """
 
 import math
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -20,6 +21,24 @@ _FORWARD = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 NEAREST_M = 1e-3
 
 
+class Box(NamedTuple):
+    """Pixels from (left, top) up to, not with, (right, bottom)."""
+
+    left: int
+    top: int
+    right: int
+    bottom: int
+
+    @property
+    def slices(self) -> tuple[slice, slice]:
+        return slice(self.top, self.bottom), slice(self.left, self.right)
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width, height."""
+        return self.right - self.left, self.bottom - self.top
+
+
 class Camera:
     """One camera on its robot."""
 
@@ -28,11 +47,9 @@ class Camera:
         self.size_px = s.width_px, s.height_px
         self.matrix = np.array([[s.fx_px, 0.0, s.cx_px], [0.0, s.fy_px, s.cy_px], [0.0, 0.0, 1.0]])
         self.distortion = np.array(s.distortion)
+        yaw, tilt, roll = (math.radians(a) for a in (s.yaw_deg, s.tilt_deg, s.roll_deg))
         self.robot_from_camera = (
-            _about_z(math.radians(s.yaw_deg))
-            @ _about_y(math.radians(s.tilt_deg))
-            @ _about_x(math.radians(s.roll_deg))
-            @ _FORWARD
+            _rotation(2, yaw) @ _rotation(1, tilt) @ _rotation(0, roll) @ _FORWARD
         )
         """Rotation (3, 3)."""
         self.position = np.array([s.x_m, s.y_m, s.mounted_m])
@@ -86,16 +103,10 @@ class Camera:
         return met
 
 
-def _about_x(angle: float) -> Floats:
-    c, s = math.cos(angle), math.sin(angle)
-    return np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]])
-
-
-def _about_y(angle: float) -> Floats:
-    c, s = math.cos(angle), math.sin(angle)
-    return np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
-
-
-def _about_z(angle: float) -> Floats:
-    c, s = math.cos(angle), math.sin(angle)
-    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+def _rotation(axis: int, angle: float) -> Floats:
+    """The rotation (3, 3) about one of the axes x, y, z."""
+    rotation, i, j = np.eye(3), (axis + 1) % 3, (axis + 2) % 3
+    rotation[i, i] = rotation[j, j] = math.cos(angle)
+    rotation[j, i] = math.sin(angle)
+    rotation[i, j] = -rotation[j, i]
+    return rotation

@@ -4,6 +4,7 @@ OpenCV reads markers between rough corners: it reads only three of four markers 
 blurred pictures.
 """
 
+from functools import lru_cache
 from typing import NamedTuple
 
 import cv2
@@ -14,18 +15,17 @@ from cpcbl_agents.vision.camera import Floats, Pixels
 from cpcbl_agents.vision.edges import sample_grey
 from cpcbl_team.config import MarkerFamily
 
-DICTIONARIES: dict[MarkerFamily, int] = {
-    "aruco_4x4_50": cv2.aruco.DICT_4X4_50,
-    "aruco_5x5_50": cv2.aruco.DICT_5X5_50,
-    "aruco_6x6_50": cv2.aruco.DICT_6X6_50,
-    "apriltag_16h5": cv2.aruco.DICT_APRILTAG_16h5,
-    "apriltag_25h9": cv2.aruco.DICT_APRILTAG_25h9,
-    "apriltag_36h11": cv2.aruco.DICT_APRILTAG_36h11,
-}
 LEAST_CONTRAST = 12.0  # grey levels between a marker's black and its margin's white
 WRONG_SHARE = 0.25  # of the bits that a family could set right: a wrong name is worse than none
 
 _WITHIN = np.array([[x, y] for y in (-0.15, 0.15) for x in (-0.15, 0.15)])
+
+
+@lru_cache(maxsize=8)
+def marker_dictionary(family: MarkerFamily) -> cv2.aruco.Dictionary:
+    """OpenCV's dictionary of a family."""
+    name = f"DICT_{family.removeprefix('aruco_').upper()}"
+    return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
 
 
 class MarkerCode(NamedTuple):
@@ -39,7 +39,7 @@ class MarkerReader:
     """Reads the markers of a family."""
 
     def __init__(self, family: MarkerFamily) -> None:
-        self.dictionary = cv2.aruco.getPredefinedDictionary(DICTIONARIES[family])
+        self.dictionary = marker_dictionary(family)
         self._bits = self.dictionary.markerSize
         self.cells = self._bits + 2
         """Of a marker's side, its black border too."""

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cpcbl_agents.vision.camera import Pixels
-from cpcbl_agents.vision.codes import DICTIONARIES
+from cpcbl_agents.vision.codes import marker_dictionary
 from cpcbl_team.config import MARKERS, MarkerFamily
 from cpcbl_team.errors import InputError
 
@@ -166,7 +166,7 @@ def _refine_corners(grey: Pixels, pixels: NDArray[np.floating], free: float) -> 
 
 
 def _charuco_board(board: Board) -> cv2.aruco.CharucoBoard:
-    family = cv2.aruco.getPredefinedDictionary(DICTIONARIES[board.family])
+    family = marker_dictionary(board.family)
     return cv2.aruco.CharucoBoard(board.squares, board.square_m, board.marker_m, family)
 
 

@@ -18,8 +18,8 @@ from support.rendered_pictures import (
 )
 
 from cpcbl_agents.vision.camera import Camera, Floats
+from cpcbl_launch.simulation.camera.objects import quiet_zone_ratio
 from cpcbl_launch.simulation.camera.render import Light, SceneRobot
-from cpcbl_launch.simulation.camera.robots import quiet_zone_ratio
 from cpcbl_team.config import (
     CameraSettings,
     MarkerFamily,

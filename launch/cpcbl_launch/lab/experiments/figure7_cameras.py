@@ -3,7 +3,7 @@
 The field, its circuit, the odometry and what helps whom are those of `figure7`; landmarks are
 cylinders of two colours, robots carry markers and masts. The navigator's camera is a cheap one of a
 wide angle that shakes, its focal length not well known; the observer's is a sharper one. Both
-are as badly known as their settings say (`simulation/cameras.py`).
+are as badly known as their settings say (`simulation/camera/cameras.py`).
 """
 
 from collections.abc import Iterable, Mapping

@@ -28,10 +28,11 @@ import numpy as np
 from cpcbl_agents.vision.camera import Camera, Floats, Pixels
 from cpcbl_agents.vision.detector import CameraDetector
 from cpcbl_agents.vision.pictures import decode_image
+from cpcbl_agents.vision.poses import SIDE_ANGLES
 from cpcbl_launch.lab.experiments.detection_figures import Batch, Kind, Mistake, Record, Wrong, team
 from cpcbl_launch.simulation.camera.cameras import with_focal_error, with_mount_error
+from cpcbl_launch.simulation.camera.objects import body_top_m
 from cpcbl_launch.simulation.camera.render import render
-from cpcbl_launch.simulation.camera.robots import SIDES, body_top_m
 from cpcbl_launch.simulation.camera.scene import Scene, SceneCylinder, SceneRobot
 from cpcbl_launch.simulation.camera.visibility import (
     Solid,
@@ -265,7 +266,7 @@ def _teammate(name: str, seen: Pose2, camera: Camera, before: Before) -> NamedOb
 
 def _marker(side: Side, seen: Pose2, camera: Camera) -> tuple[Floats, float]:
     """The points of a teammate's marker, and the angle (rad) between its normal and the viewer."""
-    vision, direction = team().vision, SIDES[side]
+    vision, direction = team().vision, SIDE_ANGLES[side]
     away = vision.marker_distance_m
     x, y = seen.transform(away * math.cos(direction), away * math.sin(direction))
     facing = wrap_angle(seen.heading + direction)

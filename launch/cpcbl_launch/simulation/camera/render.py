@@ -1,11 +1,12 @@
 """Pictures of the simulated field from the true pose of a robot's camera.
 
 Objects are drawn from far to near with a pinhole model, each pixel by its covered share. Then the
-picture gets the lens's distortion, light, blur and noise. Equal generators give equal pictures.
+picture gets the lens's distortion, and the light, blur and noise of an exposure. Equal generators
+give equal pictures.
 """
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -15,24 +16,17 @@ from msgspec.structs import replace
 
 from cpcbl_agents.vision.camera import Camera, Floats, Pixels
 from cpcbl_launch.simulation.camera.backdrop import backdrop, wall_corners
-from cpcbl_launch.simulation.camera.cylinders import cylinder_box, draw_cylinder
-from cpcbl_launch.simulation.camera.exposure import expose
-from cpcbl_launch.simulation.camera.robots import body_top_m, draw_face, robot_faces
-from cpcbl_launch.simulation.camera.scene import (
-    RobotAppearance,
-    Scene,
-    SceneCylinder,
-    SceneRobot,
-    WallSegment,
-    with_stand,
-)
-from cpcbl_launch.simulation.camera.view import Box, Grey, View
-from cpcbl_team.config import CameraSettings, Light
+from cpcbl_launch.simulation.camera.objects import cylinder_pieces, robot_pieces
+from cpcbl_launch.simulation.camera.scene import Scene, SceneCylinder, SceneRobot, with_stand
+from cpcbl_launch.simulation.camera.view import Grey, View
+from cpcbl_team.config import CameraSettings, Light, Wall
 from cpcbl_team.geometry import Pose2
 
 __all__ = ["Light", "Scene", "SceneRobot", "render"]
 
 WIDEST = 4.0  # a picture before distortion, over one after it
+WALL_MARGIN_M = 0.12  # an object so near to a wall is not behind it
+NOISE_MARGIN_PX = 256  # the noise of a frame is a window of a larger piece, here or there
 
 
 def render(
@@ -51,86 +45,40 @@ def render(
     picture = _draw_scene(scene, View(camera if pinhole is None else pinhole.camera, pose), robots)
     if pinhole is not None:
         picture = cv2.remap(picture, *pinhole.maps, cv2.INTER_LINEAR).astype(np.uint8, copy=False)
-    return expose(picture, light, random)
+    return _expose(picture, light, random)
 
 
 def _draw_scene(scene: Scene, view: View, robots: Sequence[SceneRobot]) -> Pixels:
     picture = backdrop(view, scene)
-    cylinders = [*scene.landmarks.values(), *scene.clutter]
-    objects: list[SceneCylinder | SceneRobot] = [*cylinders, *robots]
-    objects.sort(
-        key=lambda scene_object: (
-            -math.hypot(scene_object.x_m - view.lens[0], scene_object.y_m - view.lens[1])
-        )
-    )
+    objects: list[SceneCylinder | SceneRobot] = [*scene.landmarks.values(), *scene.clutter, *robots]
+    objects.sort(key=lambda it: -math.hypot(it.x_m - view.lens[0], it.y_m - view.lens[1]))
     for scene_object in objects:
-        walls = [
-            wall_corners(w, scene.wall_m)
-            for w in scene.walls
-            if _is_hidden_by(w, view, scene_object)
-        ]
-        pieces = (
-            _cylinder_pieces(view, with_stand(scene_object, 0.0))
-            if isinstance(scene_object, SceneCylinder)
-            else _robot_pieces(view, scene_object, scene)
-        )
+        place = np.array([scene_object.x_m, scene_object.y_m])
+        walls = [wall_corners(w) for w in scene.walls if _is_behind(place, w, view.lens[:2])]
+        if isinstance(scene_object, SceneCylinder):
+            pieces = cylinder_pieces(view, with_stand(scene_object, 0.0))
+        else:
+            pieces = robot_pieces(view, scene_object, scene)
         for box, colours, shares in pieces:
             for wall in walls:
                 shares = shares * (1.0 - view.polygon_shares(wall, box))
-            _blend(picture, box, colours, shares)
+            under = picture[box.slices]
+            mixed = under + (colours - under) * shares[..., None]
+            under[:] = np.clip(mixed + 0.5, 0.0, 255.0)
     return picture
 
 
-Piece = tuple[Box, Grey, Grey]  # where, colours, covered shares
-
-
-def _cylinder_pieces(view: View, cylinder: SceneCylinder) -> Iterator[Piece]:
-    box = cylinder_box(view, cylinder)
-    if box is not None:
-        yield box, *draw_cylinder(view, cylinder, box)
-
-
-def _robot_pieces(view: View, robot: SceneRobot, scene: Scene) -> Iterator[Piece]:
-    """Its body and its mast, the nearer to the lens last."""
-    appearance, top_m = (
-        scene.appearances.get(robot.name, RobotAppearance()),
-        body_top_m(scene.vision),
-    )
-    above = view.lens[2] > top_m
-    if appearance.mast is not None and not above:
-        yield from _cylinder_pieces(
-            view, with_stand(appearance.mast.at(robot.x_m, robot.y_m), top_m)
-        )
-    for face in robot_faces(robot, appearance, scene.vision):
-        box = view.box(face.corners) if face.is_facing(view.lens) else None
-        if box is not None:
-            yield box, *draw_face(view, face, box)
-    if appearance.mast is not None and above:
-        yield from _cylinder_pieces(
-            view, with_stand(appearance.mast.at(robot.x_m, robot.y_m), top_m)
-        )
-
-
-def _blend(picture: Pixels, box: Box, colours: Grey, shares: Grey) -> None:
-    """Blends colours into the picture by the covered share of each pixel."""
-    under = picture[box.slices]
-    mixed = under + (colours - under) * shares[..., None]
-    under[:] = np.clip(mixed + 0.5, 0.0, 255.0)
-
-
-def _is_hidden_by(wall: WallSegment, view: View, scene_object: SceneCylinder | SceneRobot) -> bool:
-    """Whether the line from the lens to the middle of an object crosses a wall."""
-    a, b, lens = np.array(wall.a), np.array(wall.b), view.lens[:2]
-    there, margin_m = np.array([scene_object.x_m, scene_object.y_m]), 0.12
-    along, way = b - a, there - lens
+def _is_behind(place: Floats, wall: Wall, lens: Floats) -> bool:
+    """Whether the line from the lens (2,) to a place (2,) crosses a wall."""
+    a, along = np.array(wall.from_m), np.subtract(wall.to_m, wall.from_m)
     length = float(np.hypot(*along))
     if length == 0.0:
         return False
     normal = np.array([-along[1], along[0]]) / length
-    before, after = float(normal @ (lens - a)), float(normal @ (there - a))
-    if before * after >= 0.0 or abs(after) < margin_m:
+    before, after = float(normal @ (lens - a)), float(normal @ (place - a))
+    if before * after >= 0.0 or abs(after) < WALL_MARGIN_M:
         return False
-    crossing = lens + way * (before / (before - after))
+    crossing = lens + (place - lens) * (before / (before - after))
     return bool(0.0 <= float(along @ (crossing - a)) <= length**2)
 
 
@@ -165,3 +113,49 @@ def _pinhole(settings: CameraSettings) -> _Pinhole | None:
         (k - start).reshape(height, width).astype(np.float32) for k, start in ((x, left), (y, top))
     )
     return _Pinhole(Camera(straight), cv2.convertMaps(maps[0], maps[1], cv2.CV_16SC2))
+
+
+def _expose(picture: Pixels, light: Light, random: np.random.Generator) -> Pixels:
+    """The picture (h, w, 3) in this light; only the noise depends on the generator."""
+    height, width = picture.shape[:2]
+    if light.brightness != 1.0 or light.gradient or light.tint != (1.0, 1.0, 1.0):
+        gain = _gain(width, height, light.brightness, light.gradient, light.tint)
+        picture = cv2.multiply(picture, gain, dtype=cv2.CV_8U).astype(np.uint8, copy=False)
+    if light.blur_px:
+        picture = _blur(picture, light.blur_px)
+    if light.noise:
+        left, top = (int(start) for start in random.integers(0, NOISE_MARGIN_PX, 2))
+        window = slice(top, top + height), slice(left, left + width)
+        above, below = _grain(width, height, light.noise)
+        picture = cv2.subtract(cv2.add(picture, above[window]), below[window]).astype(
+            np.uint8, copy=False
+        )
+    return picture
+
+
+def _blur(picture: Pixels, sigma_px: float) -> Pixels:
+    """With a Gaussian that is cut off beyond three sigma."""
+    side = 2 * max(1, round(3.0 * sigma_px)) + 1
+    return cv2.GaussianBlur(picture, (side, side), sigma_px).astype(np.uint8, copy=False)
+
+
+@lru_cache(maxsize=4)
+def _gain(
+    width: int, height: int, brightness: float, gradient: float, tint: tuple[float, float, float]
+) -> Grey:
+    """What each pixel's colours are multiplied by, (h, w, 3)."""
+    across = 1.0 + gradient * (0.5 - (np.arange(width) + 0.5) / width)
+    gain = brightness * np.maximum(across, 0.0)[None, :, None] * np.array(tint)
+    return np.ascontiguousarray(np.broadcast_to(gain, (height, width, 3)), np.float32)
+
+
+@lru_cache(maxsize=4)
+def _grain(width: int, height: int, sigma: float) -> tuple[Pixels, Pixels]:
+    """Noise around zero: what is added to pixels, and what is taken from them."""
+    size = height + NOISE_MARGIN_PX, width + NOISE_MARGIN_PX, 3
+    noise = np.random.default_rng(7).standard_normal(size, np.float32) * sigma
+    noise = np.round(noise)
+    return (
+        np.clip(noise, 0.0, 255.0).astype(np.uint8),
+        np.clip(-noise, 0.0, 255.0).astype(np.uint8),
+    )

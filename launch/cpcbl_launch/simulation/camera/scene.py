@@ -7,7 +7,7 @@ import cv2
 import msgspec
 import numpy as np
 
-from cpcbl_team.config import Bands, Colour, Cylinder, Side, Team, VisionSettings
+from cpcbl_team.config import Bands, Cylinder, Side, Team, VisionSettings, Wall
 
 Bgr = tuple[float, float, float]
 
@@ -22,7 +22,6 @@ PAINT_BGR: Mapping[str, Bgr] = {
 }
 """Under fair light; a colour that a team file adds is painted in the middle of its thresholds."""
 GREY: Bgr = (96.0, 96.0, 96.0)
-CARPET: Bgr = (112.0, 108.0, 104.0)
 
 
 class SceneRobot(NamedTuple):
@@ -54,61 +53,36 @@ class SceneCylinder(NamedTuple):
         return self._replace(x_m=x_m, y_m=y_m)
 
 
-class WallSegment(NamedTuple):
-    """A wall's two ends (x, y), metres."""
-
-    a: tuple[float, float]
-    b: tuple[float, float]
-
-
-class Marker(NamedTuple):
-    """The picture on one side of a robot."""
-
-    side: Side
-    number: int
-
-
-class RobotAppearance(NamedTuple):
-    """The markers of a robot, and its mast if it has one (at the origin)."""
-
-    markers: tuple[Marker, ...] = ()
-    mast: SceneCylinder | None = None
-
-
 class Scene(msgspec.Struct, frozen=True):
     """Everything except the light and the poses of robots."""
 
     vision: VisionSettings
     landmarks: Mapping[str, SceneCylinder] = {}
-    walls: tuple[WallSegment, ...] = ()
-    appearances: Mapping[str, RobotAppearance] = {}
-    """Robots that are missing here have no markers."""
+    walls: tuple[Wall, ...] = ()
+    markers: Mapping[str, Mapping[Side, int]] = {}
+    """Of robots, by name."""
+    masts: Mapping[str, SceneCylinder] = {}
+    """Of those robots that have one, at the origin."""
     clutter: tuple[SceneCylinder, ...] = ()
     """Cylinders that are on no map."""
-    floor: Bgr = CARPET
-    wall_m: float = 0.3
-    """Height of the walls."""
 
     @staticmethod
     def of(team: Team) -> "Scene":
         """The team's map, and its robots as their settings say."""
-        vision, field = team.vision, team.map
+        vision = team.vision
         return Scene(
             vision=vision,
             landmarks={
                 name: banded_cylinder(vision, mark.colours, vision.landmark).at(mark.x_m, mark.y_m)
-                for name, mark in field.landmarks.items()
+                for name, mark in team.map.landmarks.items()
                 if mark.colours is not None
             },
-            walls=tuple(WallSegment(wall.from_m, wall.to_m) for wall in field.walls.values()),
-            appearances={
-                name: RobotAppearance(
-                    tuple(Marker(side, number) for side, number in robot.markers.items()),
-                    None
-                    if robot.colours is None
-                    else banded_cylinder(vision, robot.colours, vision.mast),
-                )
+            walls=tuple(team.map.walls.values()),
+            markers={name: robot.markers for name, robot in team.robots.items()},
+            masts={
+                name: banded_cylinder(vision, robot.colours, vision.mast)
                 for name, robot in team.robots.items()
+                if robot.colours is not None
             },
         )
 
@@ -126,8 +100,14 @@ class Scene(msgspec.Struct, frozen=True):
 
 
 def colour_bgr(vision: VisionSettings, name: str) -> Bgr:
-    """A colour by its name, BGR."""
-    return PAINT_BGR[name] if name in PAINT_BGR else _threshold_bgr(vision.colours[name])
+    if name in PAINT_BGR:
+        return PAINT_BGR[name]
+    colour = vision.colours[name]
+    low, high = colour.hue
+    hue = (low + ((high - low) % 180) / 2.0) % 180.0
+    values = (0.25 * low + 0.75 * high for low, high in (colour.saturation, colour.value))
+    bgr = cv2.cvtColor(np.array([[[hue, *values]]], np.uint8), cv2.COLOR_HSV2BGR)[0, 0]
+    return float(bgr[0]), float(bgr[1]), float(bgr[2])
 
 
 def banded_cylinder(vision: VisionSettings, colours: Bands, shape: Cylinder) -> SceneCylinder:
@@ -141,23 +121,12 @@ def banded_cylinder(vision: VisionSettings, colours: Bands, shape: Cylinder) -> 
 def with_stand(cylinder: SceneCylinder, from_m: float) -> SceneCylinder:
     """The cylinder on a grey stand that begins at this height."""
     foot = cylinder.bands[0].from_m
-    return (
-        cylinder._replace(bands=(Band(from_m, foot, GREY), *cylinder.bands))
-        if foot > from_m
-        else cylinder
-    )
-
-
-def _threshold_bgr(colour: Colour) -> Bgr:
-    low, high = colour.hue
-    hue = (low + ((high - low) % 180) / 2.0) % 180.0
-    values = (0.25 * low + 0.75 * high for low, high in (colour.saturation, colour.value))
-    bgr = cv2.cvtColor(np.array([[[hue, *values]]], np.uint8), cv2.COLOR_HSV2BGR)[0, 0]
-    return float(bgr[0]), float(bgr[1]), float(bgr[2])
+    if foot <= from_m:
+        return cylinder
+    return cylinder._replace(bands=(Band(from_m, foot, GREY), *cylinder.bands))
 
 
 def _random_cylinder(scene: Scene, random: np.random.Generator) -> SceneCylinder:
-    """One cylinder that is no landmark."""
     paints = [colour_bgr(scene.vision, name) for name in scene.vision.colours]
     shape, kind = scene.vision.landmark, random.integers(3)
     places = [(cylinder.x_m, cylinder.y_m) for cylinder in scene.landmarks.values()] or [(0.0, 0.0)]

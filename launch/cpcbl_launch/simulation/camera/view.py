@@ -6,44 +6,15 @@ covered share follows from the distance of the centre to the edge.
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cpcbl_agents.vision.camera import Camera, Floats
+from cpcbl_agents.vision.camera import Box, Camera, Floats
 from cpcbl_team.geometry import Pose2
 
 Grey = NDArray[np.float32]
 NEAREST_M = 0.02  # what is nearer to the lens has no pixels of its own
-
-
-class Box(NamedTuple):
-    """Pixels from (left, top) up to, not with, (right, bottom)."""
-
-    left: int
-    top: int
-    right: int
-    bottom: int
-
-    @property
-    def slices(self) -> tuple[slice, slice]:
-        return slice(self.top, self.bottom), slice(self.left, self.right)
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """Width, height."""
-        return self.right - self.left, self.bottom - self.top
-
-    @property
-    def columns(self) -> Grey:
-        """Of its pixels, (1, width)."""
-        return np.arange(self.left, self.right, dtype=np.float32)[None, :]
-
-    @property
-    def rows(self) -> Grey:
-        """Of its pixels, (height, 1)."""
-        return np.arange(self.top, self.bottom, dtype=np.float32)[:, None]
 
 
 def _clip_to_near_plane(ahead: Floats, behind: Floats) -> Floats:
@@ -52,6 +23,12 @@ def _clip_to_near_plane(ahead: Floats, behind: Floats) -> Floats:
     way = behind[None] - ahead[:, None]
     share = (NEAREST_M - ahead[:, None, 2]) / way[..., 2]
     return np.concatenate([ahead, (ahead[:, None] + share[..., None] * way).reshape(-1, 3)])
+
+
+def _pixel_centres(box: Box) -> tuple[Grey, Grey]:
+    """The columns (1, width) and the rows (height, 1) of the pixels of a box."""
+    columns = np.arange(box.left, box.right, dtype=np.float32)[None, :]
+    return columns, np.arange(box.top, box.bottom, dtype=np.float32)[:, None]
 
 
 def cross_products(a: Floats, b: Floats) -> Floats:
@@ -89,18 +66,18 @@ class View:
         left, top = np.floor(np.clip(pixels.min(axis=0), -2.0, 1e5)).astype(int) - 1
         right, bottom = np.ceil(np.clip(pixels.max(axis=0), -2.0, 1e5)).astype(int) + 2
         found = Box(max(left, 0), max(top, 0), min(right, width), min(bottom, height))
-        return found if found.left < found.right and found.top < found.bottom else None
+        return found if min(found.size) > 0 else None
 
     def ray_directions(self, box: Box) -> tuple[Grey, Grey, Grey]:
         """The directions of the rays of all pixels in a box: x, y, z of the field frame."""
-        u, v = box.columns, box.rows
+        u, v = _pixel_centres(box)
         x, y, z = ((np.float32(a) * u + np.float32(c)) + np.float32(b) * v for a, b, c in self.rays)
         return x, y, z
 
     def shares_inside(self, normals: Sequence[Floats], box: Box) -> Grey:
         """The share of each pixel that is inside all the planes through the lens with these
         normals (3,), which point inwards."""
-        u, v = box.columns, box.rows
+        u, v = _pixel_centres(box)
         shares = np.ones((box.bottom - box.top, box.right - box.left), np.float32)
         for normal in normals:
             across, down, offset = normal @ self.rays

@@ -1,7 +1,9 @@
-"""The visible share of an object: the part inside the frame with nothing in front of it.
+"""The visible share of an object: the part that lies in the frame and that nothing occludes.
 
-It follows from geometry alone, independent of the renderer: rays to the lens from points on the
-side of an object that faces the lens. Every object hides others like an upright cylinder.
+It follows from geometry alone, independently of the renderer. Line segments from points on the
+side of the object that faces the lens to the lens are tested for intersection with the solids of
+other objects, and each solid is an upright cylinder. Coordinates are metres in the viewer's robot
+frame.
 """
 
 import math
@@ -15,11 +17,11 @@ from cpcbl_agents.vision.camera import Camera, Floats
 
 Mask = NDArray[np.bool_]
 
-_SPREAD = np.radians(np.linspace(-75.0, 75.0, 7))  # of the side that faces the lens
+_SPREAD = np.radians(np.linspace(-75.0, 75.0, 7))  # azimuths of points, seen from the axis
 
 
 class Solid(NamedTuple):
-    """An upright cylinder, in the viewer's frame (m)."""
+    """An upright cylinder between two heights above the floor."""
 
     x: float
     y: float
@@ -29,20 +31,19 @@ class Solid(NamedTuple):
 
 
 def visible_shares(
-    points: Floats, camera: Camera, before: Sequence[Sequence[Solid]]
+    points: Floats, camera: Camera, solid_sets: Sequence[Sequence[Solid]]
 ) -> tuple[float, ...]:
-    """The share of points (n, 3) of the robot's frame that lie in the frame, with none of the
-    solids before them: for each of some sets of solids."""
+    """For each set of solids, the share of the points (n, 3) that are in the frame and that none
+    of these solids occludes."""
     inside = is_in_frame(points, camera)
     if not inside.any():
-        return (0.0,) * len(before)
-    return tuple(
-        float(np.mean(inside & ~is_hidden(points, camera.position, solids))) for solids in before
-    )
+        return (0.0,) * len(solid_sets)
+    lens = camera.position
+    return tuple(float(np.mean(inside & ~is_occluded(points, lens, s))) for s in solid_sets)
 
 
 def is_in_frame(points: Floats, camera: Camera) -> Mask:
-    """Which of the points (n, 3) of the robot's frame fall on a pixel."""
+    """Whether each of the points (n, 3) is projected to a pixel of the frame."""
     width, height = camera.size_px
     u, v = camera.project(points).T
     with np.errstate(invalid="ignore"):
@@ -50,52 +51,29 @@ def is_in_frame(points: Floats, camera: Camera) -> Mask:
     return inside
 
 
-def is_hidden(points: Floats, lens: Floats, before: Sequence[Solid]) -> Mask:
-    """Which of the points (n, 3) have one of the solids between themselves and the lens (3,)."""
-    covered = np.zeros(len(points), dtype=np.bool_)
-    x, y, _ = (float(v) for v in points.mean(axis=0) - lens)
-    far, spread = math.hypot(x, y), float(np.abs(points - points.mean(axis=0)).max()) * 1.5
-    for solid in before:
-        if _may_hide(
-            solid.x - float(lens[0]), solid.y - float(lens[1]), solid.radius, x, y, far, spread
-        ):
-            covered |= _is_crossed(points, lens, solid)
-    return covered
+def is_occluded(points: Floats, lens: Floats, solids: Sequence[Solid]) -> Mask:
+    """Whether a solid intersects the line segment from the lens (3,) to each point (n, 3).
 
-
-def _may_hide(
-    a: float, b: float, radius: float, x: float, y: float, far: float, spread: float
-) -> bool:
-    """Whether a circle around (a, b) may touch the line to a point within `spread` of (x, y)."""
-    along, across = (a * x + b * y) / far, abs(a * y - b * x) / far
-    return -radius <= along <= far + spread + radius and across <= spread + radius
-
-
-def _is_crossed(points: Floats, lens: Floats, solid: Solid) -> Mask:
-    """Whether the line from the lens to each point crosses the solid."""
-    way = points - lens
-    start = lens[:2] - (solid.x, solid.y)
-    a = np.sum(way[:, :2] ** 2, axis=1)
-    b = way[:, :2] @ start
-    c = float(start @ start) - solid.radius**2
-    root = b * b - a * c
-    if not (root > 0.0).any():
-        return np.zeros(len(points), dtype=np.bool_)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        half = np.sqrt(root)
-        enters, leaves = np.maximum((-b - half) / a, 0.0), np.minimum((-b + half) / a, 1.0)
-        heights = lens[2] + np.stack([enters, leaves]) * way[:, 2]
-        met: Mask = (
-            (root > 0.0)
-            & (enters < leaves)
-            & (heights.max(axis=0) >= solid.low)
-            & (heights.min(axis=0) <= solid.high)
-        )
-    return met
+    The segment is lens + t * ray with 0 <= t <= 1. Within a solid's radius, t lies between the
+    roots of a quadratic equation; there, the segment must pass between its base and its top.
+    """
+    x, y, radius, low, high = np.array(solids).reshape(-1, 5).T[:, :, None]
+    ray_x, ray_y, ray_z = (points - lens).T
+    from_axis_x, from_axis_y = lens[0] - x, lens[1] - y
+    a = ray_x**2 + ray_y**2
+    b = ray_x * from_axis_x + ray_y * from_axis_y
+    c = from_axis_x**2 + from_axis_y**2 - radius**2
+    with np.errstate(invalid="ignore", divide="ignore"):  # NaN if there is no root
+        root = np.sqrt(b * b - a * c)
+        enters, leaves = np.maximum((-b - root) / a, 0.0), np.minimum((-b + root) / a, 1.0)
+        heights = lens[2] + np.stack([enters, leaves]) * ray_z
+        between = (heights.max(axis=0) >= low) & (heights.min(axis=0) <= high)
+        occluded: Mask = ((enters < leaves) & between).any(axis=0)
+    return occluded
 
 
 def cylinder_points(solid: Solid, lens: Floats) -> Floats:
-    """Points (63, 3) on the side of a cylinder that faces the lens, from edge to edge."""
+    """Points (63, 3) of a grid on the side of a cylinder that faces the lens."""
     facing = math.atan2(lens[1] - solid.y, lens[0] - solid.x)
     angles, heights = np.meshgrid(facing + _SPREAD, np.linspace(solid.low, solid.high, 9))
     x = solid.x + solid.radius * np.cos(angles)
@@ -104,7 +82,8 @@ def cylinder_points(solid: Solid, lens: Floats) -> Floats:
 
 
 def plate_points(x: float, y: float, height: float, facing: float, side: float) -> Floats:
-    """Points (25, 3) of an upright square plate that looks into direction `facing` (rad)."""
+    """Points (25, 3) of a grid on an upright square plate with this side length, whose centre is
+    at (x, y, height) and whose normal has the azimuth `facing` (rad)."""
     across, up = np.meshgrid(np.linspace(-0.5, 0.5, 5) * side, np.linspace(-0.5, 0.5, 5) * side)
     points = [x - across * math.sin(facing), y + across * math.cos(facing), height + up]
     return np.column_stack([p.ravel() for p in points])
