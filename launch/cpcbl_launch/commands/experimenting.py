@@ -1,29 +1,29 @@
 """`cpcbl-team experiment ...`."""
 
-import os
 import sys
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from functools import partial
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Optional
 
 import typer
 
+from cpcbl_launch.checks import require_matplotlib, require_opencv
 from cpcbl_launch.commands.arguments import parse_names, print_not_written
 from cpcbl_team.errors import InputError
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
 
-    from cpcbl_launch.lab.experiments.results import Experiment
+    from cpcbl_launch.lab.experiments.runs import Experiment
 
 experiment_app = typer.Typer(
     help="The paper's experiments and others: each prints a table and writes NAME.json; most of"
     " them draw NAME.png.",
     no_args_is_help=True,
 )
-
-_ANY_ARGUMENTS = {"allow_extra_args": True, "ignore_unknown_options": True}
 
 Seeds = Annotated[int, typer.Option(min=1, help="Runs of each case, each with its own noise.")]
 Jobs = Annotated[
@@ -33,46 +33,43 @@ Output = Annotated[Path, typer.Option(help="Folder for NAME.json and NAME.png.")
 AsJson = Annotated[bool, typer.Option("--json", help="Print the JSON instead of tables.")]
 
 
-@experiment_app.command("table1")
-def table1(
-    seeds: Seeds = 20, jobs: Jobs = None, output: Output = Path(), as_json: AsJson = False
-) -> None:
-    """One robot, odometry alone and landmarks A, B, C, beside table 1 of the paper."""
-    from cpcbl_launch.lab.experiments.table1 import EXPERIMENT
+def _add_command(name: str, where: str, runs: int, text: str) -> None:
+    """Adds the command of an experiment whose only options are seeds, jobs and output."""
 
-    conduct(EXPERIMENT, seeds, jobs, output, as_json)
+    def command(
+        seeds: Seeds = runs, jobs: Jobs = None, output: Output = Path(), as_json: AsJson = False
+    ) -> None:
+        module, attribute = where.split(":")
+        experiment = getattr(import_module(f"cpcbl_launch.lab.experiments.{module}"), attribute)
+        conduct(experiment, seeds, jobs, output, as_json)
 
-
-@experiment_app.command("figure7")
-def figure7(
-    seeds: Seeds = 5, jobs: Jobs = None, output: Output = Path(), as_json: AsJson = False
-) -> None:
-    """A navigator, alone and helped by an observer, A-F, beside figure 7 of the paper."""
-    from cpcbl_launch.lab.experiments.figure7 import EXPERIMENT
-
-    conduct(EXPERIMENT, seeds, jobs, output, as_json)
+    experiment_app.command(name, help=text)(command)
 
 
-@experiment_app.command("figure7-cameras")
-def figure7_cameras(
-    seeds: Seeds = 5, jobs: Jobs = None, output: Output = Path(), as_json: AsJson = False
-) -> None:
-    """The same from pixels: a cheap camera on the navigator, a sharper one on the observer."""
-    from cpcbl_launch.checks import require_opencv
-    from cpcbl_launch.lab.experiments.figure7_cameras import EXPERIMENT
-
-    require_opencv("experiment figure7-cameras")
-    conduct(EXPERIMENT, seeds, jobs, output, as_json)
-
-
-@experiment_app.command("circular-vs-oval")
-def circular_vs_oval(
-    seeds: Seeds = 10, jobs: Jobs = None, output: Output = Path(), as_json: AsJson = False
-) -> None:
-    """All four variants: accuracy and consistency."""
-    from cpcbl_launch.lab.experiments.variants import EXPERIMENT
-
-    conduct(EXPERIMENT, seeds, jobs, output, as_json)
+_add_command(
+    "table1",
+    "table1:EXPERIMENT",
+    20,
+    "One robot, odometry alone and landmarks A, B, C, beside table 1 of the paper.",
+)
+_add_command(
+    "figure7",
+    "figure7:EXPERIMENT",
+    5,
+    "A navigator, alone and helped by an observer, A-F, beside figure 7 of the paper.",
+)
+_add_command(
+    "figure7-cameras",
+    "figure7:WITH_CAMERAS",
+    5,
+    "The same from pixels: a cheap camera on the navigator, a sharper one on the observer.",
+)
+_add_command(
+    "circular-vs-oval",
+    "figure7:OF_VARIANTS",
+    10,
+    "All four variants: accuracy and consistency.",
+)
 
 
 @experiment_app.command("one-way-vs-both")
@@ -112,25 +109,17 @@ def budget(
     )
     logged = logged._replace(team=with_blind_robots(logged.team, parse_names(blind)))
 
-    def measure(done: Callable[[], None]) -> Any:
-        return experiment.measure_curve(logged, jobs, done)
-
+    measure = partial(experiment.measure_curve, logged, jobs)
     total = len(experiment.cases())
     _conduct("budget", measure, experiment.tables, output, as_json, total=total)
 
 
-@experiment_app.command("liars")
-def liars(
-    seeds: Seeds = 10, jobs: Jobs = None, output: Output = Path(), as_json: AsJson = False
-) -> None:
-    """An observer that sends wrong positions: the team's error, and when the fault is found."""
-    from cpcbl_launch.lab.experiments import liars as experiment
-
-    def measure(done: Callable[[], None]) -> Any:
-        return experiment.measure(seeds, jobs or os.cpu_count() or 1, done)
-
-    total = len(experiment.cases()) * seeds
-    _conduct("liars", measure, experiment.tables, output, as_json, total=total)
+_add_command(
+    "liars",
+    "liars:EXPERIMENT",
+    10,
+    "An observer that sends wrong positions: the team's error, and when the fault is found.",
+)
 
 
 @experiment_app.command("eyes")
@@ -142,14 +131,10 @@ def eyes(
     as_json: AsJson = False,
 ) -> None:
     """Cameras on rendered images: precision, recall, and errors against the stated sigmas."""
-    from cpcbl_launch.checks import require_opencv
-
     require_opencv("experiment eyes")
     from cpcbl_launch.lab.experiments import eyes as experiment
 
-    def measure(done: Callable[[], None]) -> Any:
-        return experiment.measure(frames, seed, jobs or os.cpu_count() or 1, done)
-
+    measure = partial(experiment.measure, frames, seed, jobs)
     total = -(-frames // experiment.CHUNK)
     _conduct("eyes", measure, experiment.tables, output, as_json, total=total, unit="batches")
 
@@ -168,8 +153,6 @@ def pictures(
     as_json: AsJson = False,
 ) -> None:
     """Real pictures whose truth is known: what is found and missed of them, and by how much."""
-    from cpcbl_launch.checks import require_opencv
-
     require_opencv("experiment pictures")
     from cpcbl_launch.lab.experiments import real_pictures
 
@@ -180,31 +163,27 @@ def pictures(
     _conduct(title, measure, real_pictures.tables, output, as_json, drawn=False)
 
 
-@experiment_app.command("latency", hidden=True, context_settings=_ANY_ARGUMENTS)
-def latency() -> None:
-    """Moved to `make bench-latency`."""
-    raise InputError("experiment latency: it is a benchmark now: make bench-latency, in a checkout")
+def _moved(context: typer.Context) -> None:
+    name = context.info_name
+    raise InputError(f"experiment {name}: it is a benchmark now: make bench-{name}, in a checkout")
 
 
-@experiment_app.command("processes", hidden=True, context_settings=_ANY_ARGUMENTS)
-def processes() -> None:
-    """Moved to `make bench-processes`."""
-    raise InputError(
-        "experiment processes: it is a benchmark now: make bench-processes, in a checkout"
-    )
+for _name in ("latency", "processes"):
+    _any_arguments = {"allow_extra_args": True, "ignore_unknown_options": True}
+    _help = f"Moved to `make bench-{_name}`."
+    experiment_app.command(_name, hidden=True, context_settings=_any_arguments, help=_help)(_moved)
 
 
 def conduct(
     experiment: "Experiment", seeds: int, jobs: int | None, output: Path, as_json: bool
 ) -> None:
     """Runs, writes and shows one experiment of cases and seeds. Raises CpcblError."""
-    from cpcbl_launch.lab.experiments.runs import run_cases
-
+    if experiment.needs_opencv:
+        require_opencv(f"experiment {experiment.name}")
     cases = experiment.cases()
 
     def measure(done: Callable[[], None]) -> Any:
-        runs = run_cases(cases, range(1, seeds + 1), jobs or os.cpu_count() or 1, done)
-        return experiment.outcome(runs)
+        return experiment.outcome(experiment.results(cases, seeds, jobs, done))
 
     total = len(cases) * seeds
     _conduct(experiment.name, measure, experiment.tables, output, as_json, total=total)
@@ -227,7 +206,6 @@ def _conduct(
     """
     from rich.console import Console
 
-    from cpcbl_launch.checks import require_matplotlib
     from cpcbl_launch.commands.options import require_folder, require_writable_file
     from cpcbl_launch.reporting.files import json_text, write_or_reason
 

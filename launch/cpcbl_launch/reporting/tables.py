@@ -1,6 +1,6 @@
 """Tables on a terminal: one look for all."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 from rich import box
 from rich.table import Table
@@ -20,6 +20,17 @@ def table(title: str, left: Sequence[str], right: Sequence[str]) -> Table:
         result.add_column(column, no_wrap=True, overflow="ellipsis")
     for column in right:
         result.add_column(column, justify="right", no_wrap=True)
+    return result
+
+
+def cells(record: object, fields: str) -> list[str]:
+    """Cells of a row, from fields of a record or keys of a mapping with their formats, such as
+    `"robots rmse_m:.3f inside_3_sigma:.1%"`. None gives a dash."""
+    result = []
+    for field in fields.split():
+        name, _, form = field.partition(":")
+        value = record[name] if isinstance(record, Mapping) else getattr(record, name)
+        result.append("-" if value is None else format(value, form))
     return result
 
 

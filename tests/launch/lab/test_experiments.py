@@ -12,21 +12,23 @@ import pytest
 from support.processes import command_line
 
 from cpcbl_launch.commands.experimenting import conduct
-from cpcbl_launch.lab.experiments import (
-    directions,
-    figure7,
-    figure7_cameras,
-    runs,
-    table1,
-    variants,
+from cpcbl_launch.lab.experiments import directions, figure7, runs, table1
+from cpcbl_launch.lab.experiments.runs import (
+    Case,
+    Experiment,
+    Outcome,
+    accuracy,
+    circuit_team,
+    loop_case,
+    run_case,
+    spread,
+    with_settings,
 )
-from cpcbl_launch.lab.experiments.circuit import circuit_team, loop_case, with_settings
-from cpcbl_launch.lab.experiments.results import Experiment, Outcome, Results, accuracy, spread
-from cpcbl_launch.lab.experiments.runs import Case, run_case, run_cases
 from cpcbl_team.config import Team
 from cpcbl_team.errors import InputError
 
-EVERY = {e.name: e for e in (m.EXPERIMENT for m in (table1, figure7, variants, directions))}
+DRAWN = (table1.EXPERIMENT, figure7.EXPERIMENT, figure7.OF_VARIANTS, directions.EXPERIMENT)
+EVERY = {experiment.name: experiment for experiment in DRAWN}
 KEYS = {"experiment", "version", "seeds", "loops", "teams", "figures", "paper", "pattern"}
 PNG = b"\x89PNG\r\n\x1a\n"
 
@@ -87,11 +89,12 @@ def test_as_json_prints_what_is_written(tmp_path: Path, capsys: pytest.CaptureFi
 @pytest.mark.long
 def test_the_number_of_jobs_changes_no_figure() -> None:
     experiment = small(EVERY["figure7"])
-    cases, seeds, done = experiment.cases(), (1, 2), []
+    cases, done = experiment.cases(), []
     outcomes = [
-        experiment.outcome(run_cases(cases, seeds, jobs, lambda: done.append(1))) for jobs in (1, 2)
+        experiment.outcome(experiment.results(cases, 2, jobs, lambda: done.append(1)))
+        for jobs in (1, 2)
     ]
-    assert len(done) == 2 * len(cases) * len(seeds)
+    assert len(done) == 2 * len(cases) * 2
     assert msgspec.json.encode(outcomes[0]) == msgspec.json.encode(outcomes[1])
 
 
@@ -195,9 +198,12 @@ def test_a_wrong_option_is_one_line(tmp_path: Path) -> None:
     assert "one-way-vs-both" in command_line("experiment", "--help").stdout
 
 
-def outcome_of(experiment: Experiment, seeds: int, cases: Mapping[Any, Case]) -> Outcome:
-    results: Results = run_cases(cases, range(1, seeds + 1), 1, lambda: None)
-    return experiment.outcome(results)
+def outcome_of(
+    experiment: Experiment, seeds: int, cases: Mapping[Any, Case], jobs: int = 1
+) -> Outcome:
+    found = experiment.outcome(experiment.results(cases, seeds, jobs, lambda: None))
+    assert isinstance(found, Outcome)
+    return found
 
 
 @pytest.mark.long
@@ -222,7 +228,7 @@ def test_figure_7_has_the_pattern_of_the_paper() -> None:
 
 @pytest.mark.long
 def test_a_sharper_camera_helps_a_cheap_one(tmp_path: Path) -> None:
-    experiment = figure7_cameras.EXPERIMENT
+    experiment = figure7.WITH_CAMERAS
 
     def cases() -> Mapping[Any, Case]:
         return {c: case._replace(loops=1) for c, case in experiment.cases().items()}
@@ -241,9 +247,7 @@ def test_a_sharper_camera_helps_a_cheap_one(tmp_path: Path) -> None:
 @pytest.mark.long
 @pytest.mark.timeout(1800)
 def test_figure_7_with_cameras_has_the_pattern_of_the_paper() -> None:
-    found = figure7_cameras.EXPERIMENT.outcome(
-        run_cases(figure7_cameras.cases(), range(1, 6), 2, lambda: None)
-    )
+    found = outcome_of(figure7.WITH_CAMERAS, 5, figure7.WITH_CAMERAS.cases(), jobs=2)
     assert len(found.pattern) == 5
     assert all(found.pattern.values()), found.pattern
     assert found.figures["C"].failed == 0

@@ -2,6 +2,7 @@
 
 import json
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from subprocess import run
 
@@ -135,9 +136,14 @@ CASES = [
 ]
 
 
+def result_of(seeds: int, jobs: int, cases: Sequence[liars.Case]) -> liars.Liars:
+    runs = liars.EXPERIMENT.results({case: case for case in cases}, seeds, jobs, lambda: None)
+    return liars.outcome(runs)
+
+
 @pytest.fixture(scope="module")
 def result() -> liars.Liars:
-    return liars.measure(1, 1, lambda: None, CASES)
+    return result_of(1, 1, CASES)
 
 
 def test_the_faulty_robot_is_detected_readmitted_and_does_little_harm(result: liars.Liars) -> None:
@@ -157,7 +163,7 @@ def test_the_faulty_robot_is_detected_readmitted_and_does_little_harm(result: li
 
 @pytest.mark.long
 def test_the_same_seed_gives_the_same_figures(result: liars.Liars) -> None:
-    again = liars.measure(1, 1, lambda: None, CASES[:1])
+    again = result_of(1, 1, CASES[:1])
     assert again.rows[0] == result.rows[0]
 
 
@@ -182,7 +188,7 @@ def test_it_is_shown_in_80_columns_and_drawn(
 @pytest.mark.timeout(1800)
 def test_every_fault_is_detected_beside_two_correct_observers() -> None:
     cases = [c for c in liars.cases() if c.honest == 2 and c.trust]
-    result = liars.measure(4, 2, lambda: None, cases)
+    result = result_of(4, 2, cases)
     assert result.held
     for row in result.rows:
         assert row.false_quarantine_s < 1.0

@@ -5,7 +5,6 @@ not what was allowed. Everything: a fix of each sighting of a teammate, beliefs 
 sees the robot.
 """
 
-import os
 from collections.abc import Callable, Iterable, Mapping
 from importlib.metadata import version
 from pathlib import Path
@@ -148,7 +147,7 @@ def measure_point(logged: LoggedTeam, case: Case) -> Point:
 def measure_curve(logged: LoggedTeam, jobs: int | None, done: Callable[[], None]) -> Curve:
     """All points; `done` is called after each. The same log gives the same figures."""
     tasks = [(logged, case) for case in cases()]
-    points = tuple(map_in_processes(measure_point, tasks, jobs or os.cpu_count() or 1, done))
+    points = tuple(map_in_processes(measure_point, tasks, jobs, done))
     return Curve(
         experiment="budget",
         version=version("cpcbl-team"),

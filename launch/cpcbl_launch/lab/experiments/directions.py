@@ -14,21 +14,22 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
 
-import msgspec
+from msgspec.structs import replace
 from rich.console import RenderableType
 
-from cpcbl_launch.lab.experiments.circuit import circuit_team, with_settings
-from cpcbl_launch.lab.experiments.results import (
+from cpcbl_launch.lab.experiments.runs import (
+    Case,
     Experiment,
     Outcome,
     Results,
     accuracy,
+    circuit_team,
     new_outcome,
     spread,
+    with_settings,
 )
-from cpcbl_launch.lab.experiments.runs import Case
 from cpcbl_launch.overrides import Overrides, with_overrides
-from cpcbl_launch.reporting.tables import number, percent, table
+from cpcbl_launch.reporting.tables import cells, table
 from cpcbl_team.config import RobotSettings, Start, Team
 from cpcbl_team.errors import InputError
 
@@ -48,9 +49,8 @@ def cases(sizes: Sequence[int] = SIZES) -> Mapping[Key, Case]:
     for size in sizes:
         team = crowd_team(size)
         mobile = tuple(n for n, r in team.robots.items() if r.odometry.moves)
-        every[size, "alone", "", 0.0] = Case(
-            with_overrides(team, Overrides(collaboration="none")), mobile, DURATION_S
-        )
+        alone = with_overrides(team, Overrides(collaboration="none"))
+        every[size, "alone", "", 0.0] = Case(alone, mobile, DURATION_S)
         for (direction, fusion), offset in itertools.product(WAYS, OFFSETS_M):
             helping = with_overrides(team, Overrides(direction=direction, fusion=fusion))
             truth = with_displaced_observers(helping, offset)
@@ -77,23 +77,20 @@ def crowd_team(size: int) -> Team:
     """A team of so many robots: observers at their posts, the others along the rectangle."""
     base = circuit_team(["navigator", "observer"])
     posts = POSTS[: max(1, size // 5)]
-    robots = {f"observer{i}": _observer(base, post) for i, post in enumerate(posts)}
+    robots = {f"observer{i}": _observer(base, *post) for i, post in enumerate(posts)}
     for i in range(size - len(posts)):
         name = f"scout{i}" if i % 2 else f"navigator{i}"
         robots[name] = _mobile(base, i / (size - len(posts)), blind=bool(i % 2))
-    return msgspec.structs.replace(base, name="crowd", robots=robots)
+    return replace(base, name="crowd", robots=robots)
 
 
-def _observer(base: Team, post: tuple[float, float, float]) -> RobotSettings:
-    x, y, heading_deg = post
+def _observer(base: Team, x: float, y: float, heading_deg: float) -> RobotSettings:
     settings = base.robots["observer"]
-    return msgspec.structs.replace(
-        settings,
-        sensor=msgspec.structs.replace(settings.sensor, sees_landmarks=False, max_range_m=10.0),
-        start=Start(
-            x_m=x, y_m=y, heading_deg=heading_deg, sigma_m=CLAIMED_SIGMA_M, heading_sigma_deg=0.5
-        ),
+    sensor = replace(settings.sensor, sees_landmarks=False, max_range_m=10.0)
+    start = Start(
+        x_m=x, y_m=y, heading_deg=heading_deg, sigma_m=CLAIMED_SIGMA_M, heading_sigma_deg=0.5
     )
+    return replace(settings, sensor=sensor, start=start)
 
 
 def _mobile(base: Team, share: float, blind: bool) -> RobotSettings:
@@ -101,16 +98,13 @@ def _mobile(base: Team, share: float, blind: bool) -> RobotSettings:
     corner, rest = divmod(4.0 * share, 1.0)
     last = int(corner)
     (ax, ay), (bx, by) = CORNERS[last - 1], CORNERS[last]
+    x, y, heading = ax + rest * (bx - ax), ay + rest * (by - ay), math.atan2(by - ay, bx - ax)
     settings = base.robots["navigator"]
-    return msgspec.structs.replace(
+    return replace(
         settings,
-        sensor=msgspec.structs.replace(settings.sensor, sees_landmarks=not blind),
+        sensor=replace(settings.sensor, sees_landmarks=not blind),
         waypoints_m=CORNERS[last:] + CORNERS[:last],
-        start=Start(
-            x_m=ax + rest * (bx - ax),
-            y_m=ay + rest * (by - ay),
-            heading_deg=math.degrees(math.atan2(by - ay, bx - ax)),
-        ),
+        start=Start(x_m=x, y_m=y, heading_deg=math.degrees(heading)),
     )
 
 
@@ -120,29 +114,18 @@ def with_displaced_observers(team: Team, offset_m: float) -> Team:
     robots = dict(team.robots)
     for i, (name, settings) in enumerate(team.robots.items()):
         start = settings.start
-        if settings.odometry.moves or start is None:
-            continue
-        away = math.radians(30.0 + 137.5 * i)  # the golden angle
-        robots[name] = msgspec.structs.replace(
-            settings,
-            start=msgspec.structs.replace(
-                start,
-                x_m=start.x_m + offset_m * math.cos(away),
-                y_m=start.y_m + offset_m * math.sin(away),
-                sigma_m=0.0,
-            ),
-        )
-    return msgspec.structs.replace(team, robots=robots)
+        if not settings.odometry.moves and start is not None:
+            away = math.radians(30.0 + 137.5 * i)  # the golden angle
+            x = start.x_m + offset_m * math.cos(away)
+            y = start.y_m + offset_m * math.sin(away)
+            robots[name] = replace(settings, start=replace(start, x_m=x, y_m=y, sigma_m=0.0))
+    return replace(team, robots=robots)
 
 
 def outcome(results: Results) -> Outcome:
     rows = []
     for (size, direction, fusion, offset), runs in results.items():
-        names = list(runs[0].robots)
-        all_of, sighted, blind = (
-            accuracy(runs, [n for n in names if n.startswith(prefix)])
-            for prefix in ("", "navigator", "scout")
-        )
+        all_of, sighted, blind = (accuracy(runs, kind) for kind in ("", "navigator", "scout"))
         rows.append(
             {
                 "robots": size,
@@ -166,31 +149,22 @@ def outcome(results: Results) -> Outcome:
 
 
 def tables(result: Outcome) -> Iterable[RenderableType]:
+    rows = result.figures["rows"]
     shown = table(
         f"robots that move: position RMSE, {DURATION_S:g} s, {result.seeds} seeds",
         ("", "help", "merging"),
         ("off m", "all m", "sighted m", "in 3 σ", "blind m", "in 3 σ", "B/s"),
     )
-    last = None
-    for row in result.figures["rows"]:
-        size = row["robots"]
-        if last not in (None, size):
-            shown.add_section()
-        shown.add_row(
-            str(size) if size != last else "",
-            row["direction"],
-            row["fusion"],
-            "" if row["direction"] == "alone" else f"{row['observer_off_m']:g}",
-            number(row["position_rmse_m"]),
-            number(row["navigators_rmse_m"]),
-            percent(row["navigators_inside_3_sigma"]),
-            number(row["scouts_rmse_m"]),
-            percent(row["scouts_inside_3_sigma"]),
-            f"{row['bytes_per_s']:.0f}",
-        )
-        last = size
+    quantities = "position_rmse_m:.3f navigators_rmse_m:.3f navigators_inside_3_sigma:.1%"
+    quantities += " scouts_rmse_m:.3f scouts_inside_3_sigma:.1% bytes_per_s:.0f"
+    for size, same in itertools.groupby(rows, lambda row: row["robots"]):
+        for i, row in enumerate(same):
+            off = "" if row["direction"] == "alone" else f"{row['observer_off_m']:g}"
+            first = (str(size) if i == 0 else "", row["direction"], row["fusion"], off)
+            shown.add_row(*first, *cells(row, quantities))
+        shown.add_section()
     yield shown
-    if any(row["direction"] == "deaf" for row in result.figures["rows"]):
+    if any(row["direction"] == "deaf" for row in rows):
         yield "deaf: nobody corrects the observer; otherwise the robots that it helps do"
     yield f"off: true error of the observers, which state a σ of {CLAIMED_SIGMA_M:g} m"
     yield "blind: sees teammates but no landmarks; B/s: help sent, mean over the robots"

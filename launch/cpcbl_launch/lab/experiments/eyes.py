@@ -22,7 +22,7 @@ from cpcbl_launch.reporting.tables import number, table
 CHUNK = 25
 
 
-def measure(count: int, seed: int, jobs: int, done: Callable[[], None]) -> DetectionReport:
+def measure(count: int, seed: int, jobs: int | None, done: Callable[[], None]) -> DetectionReport:
     """So many frames, `jobs` processes at a time; `done` is called after each `CHUNK` of them."""
     from cpcbl_launch.lab.experiments.rendered_frames import evaluate_frames  # needs OpenCV
 

@@ -9,17 +9,18 @@ and with a team that trusts everybody.
 """
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
 from importlib.metadata import version
 from typing import NamedTuple
 
-import msgspec
 import numpy as np
+from msgspec import Struct
+from msgspec.structs import replace
 from rich.console import RenderableType
 
-from cpcbl_launch.lab.experiments.results import Spread, spread
-from cpcbl_launch.lab.experiments.runs import map_in_processes
+from cpcbl_launch.lab.experiments.runs import Experiment, Results, Spread, spread
 from cpcbl_launch.lab.faulty_robot import Fault, FaultyBus
 from cpcbl_launch.reporting.metrics import position_errors
 from cpcbl_launch.reporting.tables import number, table
@@ -33,7 +34,7 @@ from cpcbl_transport.messages import Status, decode_tagged
 FROM_S, UNTIL_S, END_S = 10.0, 25.0, 45.0
 MOST_RATIO = 1.3
 LIAR = "west"
-KINDS = (
+FAULTS = (
     "bias:0.5,0.5",
     "bias:0.2,0.0",
     "frozen",
@@ -42,13 +43,11 @@ KINDS = (
     "clock:-0.3",
     "clock:-0.5",
 )
-HONEST = (2, 1)
-HONEST_POSTS = ("north", "south")
-POSTS = {"north": (4.5, 5.0, -90.0), "south": (4.5, 0.0, 90.0), LIAR: (0.0, 2.5, 0.0)}
+HONEST = ("north", "south")
 DRIVERS = ("navigator", "scout", "scout2")
 
 
-class Case(msgspec.Struct, frozen=True, kw_only=True):
+class Case(Struct, frozen=True, kw_only=True):
     """One case of the experiment."""
 
     lie: str
@@ -78,13 +77,13 @@ class Run(NamedTuple):
     quarantines: tuple[Quarantine, ...]
 
 
-class Row(msgspec.Struct, frozen=True, kw_only=True):
+class Row(Struct, frozen=True, kw_only=True):
     """One case over its seeds."""
 
     case: Case
-    rmse_m: Spread
+    rmse_m: Spread | None
     """Of the robots that drive: root of the mean over all their samples."""
-    worst_m: Spread
+    worst_m: Spread | None
     """Of the robot with the largest error."""
     ratio: Spread | None
     """To the team without the faulty observer, with the same seed."""
@@ -102,7 +101,7 @@ class Row(msgspec.Struct, frozen=True, kw_only=True):
     """How long these lasted, seconds a run."""
 
 
-class Liars(msgspec.Struct, frozen=True, kw_only=True):
+class Liars(Struct, frozen=True, kw_only=True):
     """The result of the experiment."""
 
     experiment: str
@@ -117,47 +116,27 @@ class Liars(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def liars_team(case: Case) -> Team:
-    """The observers at their poses and the robots that drive."""
-    base, replace = load_team(builtin_path("demo")), msgspec.structs.replace
-    observer, scout = base.robots["observer"], base.robots["scout"]
-    assert observer.start is not None
-    assert scout.start is not None
-    sensor = replace(observer.sensor, range_share=0.01, bearing_sigma_deg=1.0, max_range_m=10.0)
-    posts = [*list(HONEST_POSTS)[: case.honest], *([LIAR] if case.liar else [])]
-    robots = {}
-    for name in posts:
-        x, y, heading_deg = POSTS[name]
-        robots[name] = replace(
-            observer,
-            sensor=replace(sensor, field_of_view_deg=120.0),
-            start=replace(observer.start, x_m=x, y_m=y, heading_deg=heading_deg),
-        )
-    robots |= {
-        "navigator": base.robots["navigator"],
-        "scout": scout,
-        "scout2": replace(
-            scout,
-            waypoints_m=(*scout.waypoints_m[3:], *scout.waypoints_m[:3]),
-            start=replace(scout.start, x_m=6.0, y_m=1.0, heading_deg=0.0),
-        ),
-    }
+    """The observers at their posts and the robots that drive (`teams/liars.toml`)."""
+    team = load_team(builtin_path("liars"))
+    absent = {*HONEST[case.honest :], *(() if case.liar else (LIAR,))}
     trust = TrustSettings(enabled=case.trust)
     robots = {
-        name: replace(robot, collaboration=replace(robot.collaboration, after_s=0.0, trust=trust))
-        for name, robot in robots.items()
+        name: replace(robot, collaboration=replace(robot.collaboration, trust=trust))
+        for name, robot in team.robots.items()
+        if name not in absent
     }
-    return replace(base, name="liars", robots=robots)
+    return replace(team, robots=robots)
 
 
-def cases() -> list[Case]:
+def cases() -> Mapping[Case, Case]:
     """Without the faulty observer, with it but correct, and with each fault (trust on and off)."""
     every = []
-    for honest in HONEST:
+    for honest in (2, 1):
         every += [Case(lie="", liar=False, honest=honest), Case(lie="", honest=honest)]
         every += [
-            Case(lie=kind, honest=honest, trust=trust) for kind in KINDS for trust in (True, False)
+            Case(lie=f, honest=honest, trust=trust) for f in FAULTS for trust in (True, False)
         ]
-    return every
+    return {case: case for case in every}
 
 
 class _Statuses:
@@ -201,27 +180,25 @@ def run_case(case: Case, seed: int) -> Run:
     return Run(rmse_m, tuple(statuses.found.values()))
 
 
-def measure(
-    seeds: int, jobs: int, done: Callable[[], None], chosen: Sequence[Case] | None = None
-) -> Liars:
-    """All cases (or these) with all seeds; `done` is called after each run."""
-    wanted = cases() if chosen is None else list(chosen)
-    tasks = [(case, seed) for case in wanted for seed in range(1, seeds + 1)]
-    runs = map_in_processes(run_case, tasks, jobs, done)
-    by_case = {case: runs[i * seeds : (i + 1) * seeds] for i, case in enumerate(wanted)}
+def outcome(results: Results) -> Liars:
     rows = tuple(
-        _row(case, found, by_case.get(Case(lie="", liar=False, honest=case.honest)))
-        for case, found in by_case.items()
+        _row(case, runs, results.get(Case(lie="", liar=False, honest=case.honest)))
+        for case, runs in results.items()
     )
     return Liars(
         experiment="liars",
         version=version("cpcbl-team"),
-        seeds=seeds,
+        seeds=len(next(iter(results.values()))),
         lie_s=(FROM_S, UNTIL_S, END_S),
         team=liars_team(Case(lie="")),
         rows=rows,
-        held=not any(map(_exceeds_target, _rows_with_trust(rows))),
+        held=not _rows_above_target(rows),
     )
+
+
+def _rows_above_target(rows: Iterable[Row]) -> list[Row]:
+    judged = [row for row in rows if row.case.lie and row.case.trust]
+    return [row for row in judged if row.ratio is None or row.ratio.median > MOST_RATIO]
 
 
 def _team_rmse_m(one: Run) -> float:
@@ -229,40 +206,30 @@ def _team_rmse_m(one: Run) -> float:
 
 
 def _row(case: Case, runs: Sequence[Run], without: Sequence[Run] | None) -> Row:
-    quarantines = [q for one in runs for q in one.quarantines]
     began_s = FROM_S - 1.0  # by the stamps of a clock that is behind
-    deserved = [q for q in quarantines if case.lie and q.of == LIAR and q.from_s >= began_s]
-    false = [q for q in quarantines if q not in deserved]
     first: dict[tuple[int, str], Quarantine] = {}
     last: dict[tuple[int, str], Quarantine] = {}
-    for i, one in enumerate(runs):
-        for q in one.quarantines:
-            if q in deserved:
+    false: list[Quarantine] = []
+    for i, run in enumerate(runs):
+        for q in run.quarantines:
+            if case.lie and q.of == LIAR and q.from_s >= began_s:
                 first.setdefault((i, q.by), q)
                 last[i, q.by] = q
+            else:
+                false.append(q)
     healed = [q.until_s - UNTIL_S for q in last.values() if q.until_s is not None]
-    ratio = None
-    if without is not None:
-        ratio = spread(
-            [_team_rmse_m(a) / _team_rmse_m(b) for a, b in zip(runs, without, strict=True)]
-        )
-    rmse, worst = (
-        spread([_team_rmse_m(r) for r in runs]),
-        spread([max(r.rmse_m.values()) for r in runs]),
-    )
-    assert rmse is not None
-    assert worst is not None
-    reasons = [q.reason for q in last.values()]
+    rmse_m = [_team_rmse_m(run) for run in runs]
+    others_m = [] if without is None else [_team_rmse_m(run) for run in without]
     return Row(
         case=case,
-        rmse_m=rmse,
-        worst_m=worst,
-        ratio=ratio,
+        rmse_m=spread(rmse_m),
+        worst_m=spread([max(run.rmse_m.values()) for run in runs]),
+        ratio=spread([a / b for a, b in zip(rmse_m, others_m, strict=False)]),
         found=len(first),
         listening=len(runs) * len(DRIVERS),
         found_after_s=spread([q.from_s - FROM_S for q in first.values()]),
         readmitted_after_s=spread(healed),
-        reasons={r: reasons.count(r) for r in sorted(set(reasons))},
+        reasons=dict(sorted(Counter(q.reason for q in last.values()).items())),
         false_quarantines=len(false),
         false_quarantine_s=sum((q.until_s or END_S) - q.from_s for q in false) / len(runs),
     )
@@ -287,43 +254,31 @@ def tables(result: Liars) -> Iterable[RenderableType]:
         "Column false is the time that honest robots spent in quarantine, s per run."
     )
     missed = [
-        f"{r.case.lie} beside {r.case.honest} honest"
-        for r in _rows_with_trust(result.rows)
-        if _exceeds_target(r)
+        f"{row.case.lie} beside {row.case.honest} honest" for row in _rows_above_target(result.rows)
     ]
-    yield (
-        f"The aim holds: no ratio is above {MOST_RATIO:g}."
-        if not missed
-        else f"The ratio is above {MOST_RATIO:g} for {'; '.join(missed)}."
-    )
-
-
-def _rows_with_trust(rows: Iterable[Row]) -> list[Row]:
-    return [row for row in rows if row.case.lie and row.case.trust]
-
-
-def _exceeds_target(row: Row) -> bool:
-    return row.ratio is None or row.ratio.median > MOST_RATIO
+    if missed:
+        yield f"The ratio is above {MOST_RATIO:g} for {'; '.join(missed)}."
+    else:
+        yield f"The aim holds: no ratio is above {MOST_RATIO:g}."
 
 
 def _cells(row: Row, believed: Row | None) -> list[str]:
-    name = row.case.lie or ("honest" if row.case.liar else "not there")
-    found = [f"{row.found}/{row.listening}", *_seconds(row)] if row.case.lie else [""] * 3
-    ratio = row.ratio
+    def median(found: Spread | None, digits: int) -> str:
+        return number(None if found is None else found.median, digits)
+
+    ratio, found = row.ratio, [""] * 3
+    if row.case.lie:
+        times = median(row.found_after_s, 1), median(row.readmitted_after_s, 1)
+        found = [f"{row.found}/{row.listening}", *times]
     return [
-        name,
-        number(row.rmse_m.median),
-        number(_median(ratio), 2),
+        row.case.lie or ("honest" if row.case.liar else "not there"),
+        median(row.rmse_m, 3),
+        median(ratio, 2),
         "-" if ratio is None else f"{ratio.low:.2f}-{ratio.high:.2f}",
-        number(_median(believed.ratio), 2) if believed is not None else "",
+        median(believed.ratio, 2) if believed is not None else "",
         *found,
         f"{row.false_quarantine_s:.1f}",
     ]
 
 
-def _seconds(row: Row) -> tuple[str, str]:
-    return number(_median(row.found_after_s), 1), number(_median(row.readmitted_after_s), 1)
-
-
-def _median(found: Spread | None) -> float | None:
-    return None if found is None else found.median
+EXPERIMENT = Experiment("liars", cases, outcome, tables, run_case)

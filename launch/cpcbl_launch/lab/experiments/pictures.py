@@ -16,7 +16,7 @@ from cpcbl_launch.lab.experiments.detection_figures import (
     DetectionReport,
 )
 from cpcbl_launch.lab.experiments.liars import Liars
-from cpcbl_launch.lab.experiments.results import Accuracy, Outcome, Spread
+from cpcbl_launch.lab.experiments.runs import Accuracy, Outcome, Spread
 from cpcbl_team.config import RobotSettings, Team
 
 mpl.use("Agg")

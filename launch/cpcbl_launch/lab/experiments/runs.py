@@ -1,4 +1,4 @@
-"""One run of an experiment, with its restarts, and many of them on all cores.
+"""Cases of experiments, their runs with restarts, and the figures over many runs.
 
 A run ends when the driver believes to have reached every waypoint of all its loops (it steers by
 its own estimate, so that is what a loop is). When it bumps into a landmark the attempt is given up
@@ -8,12 +8,17 @@ restarts, failed: it is counted as such, and has no part in the other figures.
 """
 
 import math
-from collections.abc import Callable, Hashable, Mapping, Sequence
+import os
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from importlib.metadata import version
 from multiprocessing import get_context
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
+from msgspec import Struct
+from msgspec.structs import replace
+from rich.console import RenderableType
 
 from cpcbl_launch.reporting.metrics import (
     Floats,
@@ -24,6 +29,7 @@ from cpcbl_launch.reporting.metrics import (
 )
 from cpcbl_launch.reporting.recorder import Recorder
 from cpcbl_launch.simulation.in_process import simulate
+from cpcbl_launch.team_file import builtin_path, load_team
 from cpcbl_team.config import Team
 from cpcbl_team.geometry import Pose2, step
 from cpcbl_team.inputs import Odometry
@@ -35,12 +41,12 @@ from cpcbl_transport.messages import Drive, Truths, decode_tagged
 LOOPS = 5
 MOST_RESTARTS = 30
 OTHER_NOISE = 1_000_003  # from the seed of one attempt to that of the next
-Key = TypeVar("Key", bound=Hashable)
+LOOPS_LIMIT_S = 400.0  # five loops take 70 s
 Result = TypeVar("Result")
 
 
 class Case(NamedTuple):
-    """A case: it ends when the first scored robot has driven `loops`, or else after `limit_s`."""
+    """It ends when the first scored robot has driven `loops`, or else after `limit_s`."""
 
     team: Team
     scored: tuple[str, ...]
@@ -141,27 +147,23 @@ def _errors(samples: Samples) -> Floats:
     return np.column_stack([offset, heading_errors(samples)])
 
 
-def run_cases(
-    cases: Mapping[Key, Case], seeds: Sequence[int], jobs: int, done: Callable[[], None]
-) -> dict[Key, list[Run]]:
-    """All cases with all seeds; `done` is called after each run."""
-    tasks = [(case, seed) for case in cases.values() for seed in seeds]
-    runs = map_in_processes(run_case, tasks, jobs, done)
-    return {key: runs[i * len(seeds) : (i + 1) * len(seeds)] for i, key in enumerate(cases)}
-
-
 def map_in_processes(
     function: Callable[..., Result],
     tasks: Sequence[tuple[Any, ...]],
-    jobs: int,
+    jobs: int | None,
     done: Callable[[], None],
 ) -> list[Result]:
     """The function's results for each task's arguments, in the order of the tasks.
 
-    `jobs` processes work at a time; `done` is called after each task.
+    `jobs` processes work at a time (None: one a core); `done` is called after each task.
     """
+    jobs = jobs or os.cpu_count() or 1
     if jobs == 1:
-        return [_call_done(done, function(*task)) for task in tasks]
+        results = []
+        for task in tasks:
+            results.append(function(*task))
+            done()
+        return results
     with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
         futures = [pool.submit(function, *task) for task in tasks]
         try:
@@ -174,6 +176,139 @@ def map_in_processes(
         return [future.result() for future in futures]
 
 
-def _call_done(done: Callable[[], None], result: Result) -> Result:
-    done()
-    return result
+# Teams on the circuit (`teams/circuit.toml`) ------------------------------------------------------
+
+
+def circuit_team(robots: Collection[str], beacons: bool = False) -> Team:
+    """These robots among the four landmarks, with or without the four bearing-only beacons."""
+    team = load_team(builtin_path("circuit"))
+    marks = {n: m for n, m in team.map.landmarks.items() if beacons or m.gives == "both"}
+    chosen = {name: team.robots[name] for name in robots}
+    return replace(team, robots=chosen, map=replace(team.map, landmarks=marks))
+
+
+def with_settings(team: Team, robot: str, **tables: Mapping[str, object]) -> Team:
+    """The team with keys of some tables of one robot set: `sensor={"rate_hz": 5.0}`."""
+    old = team.robots[robot]
+    new = {name: replace(getattr(old, name), **keys) for name, keys in tables.items()}
+    return replace(team, robots={**team.robots, robot: replace(old, **new)})
+
+
+def loop_case(team: Team, driver: str, truth: Team | None = None) -> Case:
+    """Five loops of one driver."""
+    return Case(team, (driver,), LOOPS_LIMIT_S, LOOPS, truth)
+
+
+# Experiments and their figures --------------------------------------------------------------------
+
+Results = Mapping[Any, list[Any]]
+
+
+class Experiment(NamedTuple):
+    """One experiment: its cases, what evaluates and shows their runs, and what one run is."""
+
+    name: str
+    cases: Callable[[], Mapping[Any, Any]]
+    outcome: Callable[[Results], Any]
+    tables: Callable[[Any], Iterable[RenderableType]]
+    run: Callable[[Any, int], Any] = run_case
+    needs_opencv: bool = False
+
+    def results(
+        self, cases: Mapping[Any, Any], seeds: int, jobs: int | None, done: Callable[[], None]
+    ) -> Results:
+        """These cases with seeds from 1 to `seeds`; `done` is called after each run."""
+        tasks = [(case, seed) for case in cases.values() for seed in range(1, seeds + 1)]
+        runs = map_in_processes(self.run, tasks, jobs, done)
+        return {key: runs[i * seeds : (i + 1) * seeds] for i, key in enumerate(cases)}
+
+
+class Outcome(Struct, frozen=True, kw_only=True):
+    """The result of an experiment: its settings, then its figures."""
+
+    experiment: str
+    version: str
+    seeds: int
+    loops: int
+    teams: dict[str, Team]
+    figures: dict[str, Any]
+    paper: dict[str, Any] = {}
+    """The paper's own figures, where it has them."""
+    pattern: dict[str, bool] = {}
+    """The expected patterns, and whether each was met."""
+
+
+class Spread(Struct, frozen=True):
+    """Over seeds: median, and the range that 80 % of them lie in."""
+
+    median: float
+    low: float
+    high: float
+
+
+def spread(values: Sequence[float]) -> Spread | None:
+    """The spread of the values; None without values."""
+    if not len(values):
+        return None
+    low, median, high = np.percentile(values, [10.0, 50.0, 90.0])
+    return Spread(float(median), float(low), float(high))
+
+
+class Accuracy(Struct, frozen=True, kw_only=True):
+    """Figures of all samples (10 Hz) of the finished runs of one case; None without samples."""
+
+    position_mean_m: float | None
+    position_sigma_m: float | None
+    position_rmse_m: float | None
+    position_max_m: float | None
+    heading_mean_deg: float | None
+    inside_3_sigma: float | None
+    nees: float | None
+    bumps: int
+    restarts: int
+    failed: int
+    runs: int
+
+
+def accuracy(runs: Sequence[Run], prefix: str = "") -> Accuracy:
+    """The figures of all runs together, of the scored robots whose names begin so."""
+    robots = [named for run in runs if run.finished for named in run.robots.items()]
+    good = [errors for name, errors in robots if name.startswith(prefix)]
+    offset = np.concatenate([e.offset for e in good]) if good else np.empty((0, 3))
+    nees = [e.nees for e in good if e.nees is not None]
+    squares = np.concatenate(nees) if nees else np.empty(0)
+    errors = np.hypot(offset[:, 0], offset[:, 1])
+    return Accuracy(
+        position_mean_m=_of(np.mean, errors),
+        position_sigma_m=_of(np.std, errors),
+        position_rmse_m=_of(lambda e: math.sqrt(np.mean(e * e)), errors),
+        position_max_m=_of(np.max, errors),
+        heading_mean_deg=_of(lambda h: math.degrees(np.mean(np.abs(h))), offset[:, 2]),
+        inside_3_sigma=_of(lambda n: np.mean(n <= 9.0), squares),
+        nees=_of(np.mean, squares),
+        bumps=sum(r.bumps for r in runs),
+        restarts=sum(r.restarts for r in runs),
+        failed=sum(not r.finished for r in runs),
+        runs=len(runs),
+    )
+
+
+def _of(function: Callable[[Floats], Any], values: Floats) -> float | None:
+    return float(function(values)) if len(values) else None
+
+
+def new_outcome(name: str, results: Results, cases: Mapping[str, Case], **rest: Any) -> Outcome:
+    """A result with the settings of its cases."""
+    return Outcome(
+        experiment=name,
+        version=version("cpcbl-team"),
+        seeds=len(next(iter(results.values()))),
+        loops=LOOPS if any(case.loops for case in cases.values()) else 0,
+        teams={key: case.team for key, case in cases.items()},
+        **rest,
+    )
+
+
+def pattern_lines(outcome: Outcome) -> Iterable[str]:
+    for pattern, ok in outcome.pattern.items():
+        yield f"pattern: {'ok    ' if ok else 'missed'} {pattern}"

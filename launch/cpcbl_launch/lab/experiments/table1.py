@@ -9,22 +9,25 @@ runs of A, B and C, measured like the others; the paper shows the least error of
 """
 
 import itertools
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 
 import numpy as np
 from rich.console import RenderableType
 
-from cpcbl_launch.lab.experiments.circuit import circuit_team, loop_case, with_settings
-from cpcbl_launch.lab.experiments.results import (
+from cpcbl_launch.lab.experiments.runs import (
+    Case,
     Experiment,
     Outcome,
     Results,
+    Run,
     Spread,
+    circuit_team,
+    loop_case,
     new_outcome,
     pattern_lines,
     spread,
+    with_settings,
 )
-from cpcbl_launch.lab.experiments.runs import Case, Run
 from cpcbl_launch.reporting.metrics import Floats
 from cpcbl_launch.reporting.tables import table
 from cpcbl_team.config import Weights
@@ -72,12 +75,15 @@ def quantities(errors: Floats) -> tuple[float, ...]:
 def outcome(results: Results) -> Outcome:
     merging = list(dict.fromkeys(how for how, _ in results))
     rows = {how: _rows({c: results[how, c] for c in "ABC"}) for how in merging}
-    swept = {
-        how: score for how in merging if how.startswith("weighted") and (score := _ratio(rows[how]))
-    }
+    ratios = {how: _ratio(rows[how]) for how in merging if how.startswith("weighted")}
+    swept = {how: ratio for how, ratio in ratios.items() if ratio}
     best = min(swept, key=lambda how: swept[how]) if swept else merging[-1]
     shown = [*PROBABILISTIC, best]
     known = cases()
+
+    def sums(of: Callable[[Run], int]) -> dict[str, int]:
+        return {f"{how} {c}": sum(map(of, results[how, c])) for how in shown for c in "ABC"}
+
     return new_outcome(
         "table1",
         results,
@@ -88,57 +94,47 @@ def outcome(results: Results) -> Outcome:
             "best_weighted": best,
             "weights_ratio_to_paper": swept,
             "rows": {how: rows[how] for how in shown},
-            "bumps": {
-                f"{h} {c}": sum(r.bumps for r in results[h, c]) for h in shown for c in "ABC"
-            },
-            "restarts": {
-                f"{h} {c}": sum(r.restarts for r in results[h, c]) for h in shown for c in "ABC"
-            },
-            "failed": {
-                f"{h} {c}": sum(not r.finished for r in results[h, c]) for h in shown for c in "ABC"
-            },
+            "bumps": sums(lambda run: run.bumps),
+            "restarts": sums(lambda run: run.restarts),
+            "failed": sums(lambda run: not run.finished),
         },
         paper=dict(PAPER),
         pattern={
-            f"{how}: every cell of A, B, C at or below the paper's": not _above(rows[how])
+            f"{how}: every cell of A, B, C at or below the paper's": not _is_above(rows[how])
             for how in PROBABILISTIC
         },
     )
 
 
 def _rows(runs: Mapping[str, list[Run]]) -> dict[str, list[Spread | None]]:
-    measured = {
-        c: [quantities(r.at_waypoints) for r in some if r.finished] for c, some in runs.items()
-    }
-    drifted = [
-        quantities(r.odometry_at_waypoints) for some in runs.values() for r in some if r.finished
-    ]
+    finished = {c: [run for run in some if run.finished] for c, some in runs.items()}
+    measured = {c: [quantities(r.at_waypoints) for r in some] for c, some in finished.items()}
+    drifted = [quantities(r.odometry_at_waypoints) for some in finished.values() for r in some]
     return {
         c: [spread([q[i] for q in of]) for i in range(len(QUANTITIES))]
         for c, of in {"odometry": drifted, **measured}.items()
     }
 
 
+def _beside_paper(rows: Mapping[str, list[Spread | None]]) -> list[tuple[Spread | None, float]]:
+    """The cells of A, B, C, ours and the paper's."""
+    return [pair for c in "ABC" for pair in zip(rows[c], PAPER[c], strict=True)]
+
+
 def _ratio(rows: Mapping[str, list[Spread | None]]) -> float | None:
     """Mean over the cells of A, B, C of the median as a share of the paper's."""
-    shares = [
-        s.median / p for c in "ABC" for s, p in zip(rows[c], PAPER[c], strict=True) if s is not None
-    ]
+    shares = [s.median / p for s, p in _beside_paper(rows) if s is not None]
     return float(np.mean(shares)) if shares else None
 
 
-def _above(rows: Mapping[str, list[Spread | None]]) -> list[str]:
-    """The cells of A, B, C that are missing or above the paper's."""
-    return [
-        f"{c} {q}"
-        for c in "ABC"
-        for q, s, p in zip(QUANTITIES, rows[c], PAPER[c], strict=True)
-        if s is None or s.median > p
-    ]
+def _is_above(rows: Mapping[str, list[Spread | None]]) -> bool:
+    """Whether a cell of A, B, C is missing or above the paper's."""
+    return any(s is None or s.median > p for s, p in _beside_paper(rows))
 
 
 def tables(result: Outcome) -> Iterable[RenderableType]:
-    rows, best = result.figures["rows"], result.figures["best_weighted"]
+    figures = result.figures
+    best, tried = figures["best_weighted"], len(figures["weights_ratio_to_paper"])
     shown = table(
         f"errors at waypoints, {result.loops} loops, {result.seeds} seeds: median, 10-90 %",
         ("", ""),
@@ -147,21 +143,19 @@ def tables(result: Outcome) -> Iterable[RenderableType]:
     for c, paper in PAPER.items():
         for i, (quantity, theirs) in enumerate(zip(QUANTITIES, paper, strict=True)):
             digits = 1 if quantity.endswith("deg") else 4
-            cells = [_cell(of[c][i], theirs, digits, c != "odometry") for of in rows.values()]
+            cells = [
+                _cell(of[c][i], theirs, digits, c != "odometry") for of in figures["rows"].values()
+            ]
             shown.add_row(c if i == 0 else "", quantity, f"{theirs:.{digits}f}", *cells)
         shown.add_section()
     yield shown
     yield "* above the paper's figure"
-    yield f"{best} (weights of position and heading): best of {_swept(result)} pairs tried"
+    yield f"{best} (weights of position and heading): best of {tried} pairs tried"
     yield from pattern_lines(result)
-    for how, count in result.figures["failed"].items():
-        if count or result.figures["restarts"][how]:
-            restarts, bumps = result.figures["restarts"][how], result.figures["bumps"][how]
-            yield f"{how}: {bumps} bumps, {restarts} restarts, {count} runs failed"
-
-
-def _swept(result: Outcome) -> int:
-    return len(result.figures["weights_ratio_to_paper"])
+    for how, failed in figures["failed"].items():
+        restarts, bumps = figures["restarts"][how], figures["bumps"][how]
+        if failed or restarts:
+            yield f"{how}: {bumps} bumps, {restarts} restarts, {failed} runs failed"
 
 
 def _cell(s: Spread | None, paper: float, digits: int, judged: bool) -> str:
