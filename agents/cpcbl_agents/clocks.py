@@ -46,12 +46,8 @@ class ClockMonitor:
         if now_ns - last.since_ns >= SPAN_NS:
             fresh = Span(now_ns)
             last, before = fresh, last if now_ns - last.since_ns < 2 * SPAN_NS else fresh
-        last = Span(
-            last.since_ns,
-            min(last.least_ns, late_ns),
-            last.messages + 1,
-            last.ahead + (late_ns < -self._ahead_ns),
-        )
+        least_ns, ahead = min(last.least_ns, late_ns), last.ahead + (late_ns < -self._ahead_ns)
+        last = Span(last.since_ns, least_ns, last.messages + 1, ahead)
         self._spans[sender] = last, before
         return self._is_off(last, before) or -FUTURE_NS <= late_ns < -self._ahead_ns
 

@@ -21,21 +21,11 @@ from cpcbl_agents.agent import (
 )
 from cpcbl_agents.counters import MessageCounters
 from cpcbl_agents.guests import GuestRegistry
+from cpcbl_team import information_gain as gains
 from cpcbl_team.config import LocalizationSettings
 from cpcbl_team.fixes import fix_for, without_heading
 from cpcbl_team.gaussian import Covariance2
-from cpcbl_team.information_gain import (
-    FixMemory,
-    HeadingMemory,
-    heading_information_gain,
-    information_gain,
-    information_gain_of_belief,
-    merged_covariance,
-    merged_heading_variance,
-    predicted_teammate_covariance,
-    predicted_teammate_heading_variance,
-    staleness,
-)
+from cpcbl_team.information_gain import FixMemory, HeadingMemory
 from cpcbl_team.inputs import Belief, Fix
 from cpcbl_team.tiers import LOWEST_TIER, accepts_tier, next_tier
 from cpcbl_transport.budget import Budget
@@ -86,9 +76,7 @@ class CollaborationAgent:
         self._robot, self._settings, self._teammates = robot, settings, teammates
         self.guests = guests or GuestRegistry()
         self._rules, self.budget = settings.collaboration, budget
-        if (
-            settings.localizer.variant == "weighted"
-        ):  # it has no covariance from which a gain could be computed
+        if settings.localizer.variant == "weighted":  # without a covariance there is no gain
             self._rules = replace(self._rules, least_value=0.0, least_use=0.0, belief_share=0.0)
         self._from_ns = start_ns + int(self._rules.after_s * 1e9)
         self._belief_ns = start_ns
@@ -136,10 +124,8 @@ class CollaborationAgent:
         return ()
 
     def _handle_estimate(self, now: PoseEstimate, now_ns: int) -> Sequence[AgentMessage]:
-        first = self.latest is None
-        self.latest = now
-        self._track_ns = now.stamp_ns
-        sigma, present = now.estimate.position_sigma_m, None if first else self.tier
+        sigma, present = now.estimate.position_sigma_m, None if self.latest is None else self.tier
+        self.latest, self._track_ns = now, now.stamp_ns
         self.tier = next_tier(present, sigma, bool(now.lost), self._rules)
         self._select_sources(now)
         return [self._track(now), *self._beliefs(now, now_ns)]
@@ -165,11 +151,10 @@ class CollaborationAgent:
             )
 
     def _is_useful(self, seen: Fix, tier: int, now: PoseEstimate) -> bool:
-        rules = self._rules
-        in_sight = now.stamp_ns - seen.stamp_ns < IN_SIGHT_NS
+        rules, in_sight = self._rules, now.stamp_ns - seen.stamp_ns < IN_SIGHT_NS
         if not (in_sight and accepts_tier(self.tier, tier, rules)):
             return False
-        gain = information_gain_of_belief(seen, tier, now.estimate, rules)
+        gain = gains.information_gain_of_belief(seen, tier, now.estimate, rules)
         return bool(now.lost) or gain >= rules.least_use
 
     # Fixes --------------------------------------------------------------------------------
@@ -201,30 +186,25 @@ class CollaborationAgent:
         return [fix for fix in fixes if fix is not None]
 
     def _may_help(self, fix: Fix, tier: int) -> bool:
-        rules = self._rules
+        rules, interval_ns = self._rules, max(1, self._rules.fix_interval_s * 1e9)
         last_ns, _ = self._fix_memories.get(fix.robot, (None, None))
-        interval_over = last_ns is None or fix.stamp_ns - last_ns >= max(
-            1, rules.fix_interval_s * 1e9
-        )
-        return (
-            rules.active
-            and self.has_started
-            and interval_over
-            and accepts_tier(tier, self.tier, rules)
-        )
+        if last_ns is not None and fix.stamp_ns - last_ns < interval_ns:
+            return False
+        return rules.active and self.has_started and accepts_tier(tier, self.tier, rules)
 
     def _offer(self, fix: Fix, tier: int) -> _Offer:
         """The fix with its gain; with the heading only if the heading is worth its own bytes."""
         _, before = self._fix_memories.get(fix.robot, (0, None))
         rules, place = self._rules, (fix.x_m, fix.y_m)
-        prior = predicted_teammate_covariance(tier, before, *place, rules)
+        prior = gains.predicted_teammate_covariance(tier, before, *place, rules)
         parts = Covariance2(*fix.sensor_covariance), Covariance2(*fix.observer_covariance)
-        after = merged_covariance(prior, *parts, rules.fusion)
-        value, turned = information_gain(prior, after), None if before is None else before.heading
+        after = gains.merged_covariance(prior, *parts, rules.fusion)
+        value = gains.information_gain(prior, after)
+        turned = None if before is None else before.heading
         if fix.heading_rad is not None:
-            variance = predicted_teammate_heading_variance(tier, turned, fix)
-            left = merged_heading_variance(variance, fix, rules.fusion)
-            gained = heading_information_gain(variance, left)
+            variance = gains.predicted_teammate_heading_variance(tier, turned, fix)
+            left = gains.merged_heading_variance(variance, fix, rules.fusion)
+            gained = gains.heading_information_gain(variance, left)
             if gained >= rules.least_value:
                 value, turned = value + gained, HeadingMemory(*place, left)
             else:
@@ -245,17 +225,17 @@ class CollaborationAgent:
         """The belief, when it is due, has subscribers, and differs enough from the last one."""
         rules, tally = self._rules, self.counters.of("belief", "")
         due = now.stamp_ns >= self._belief_ns + int(1e9 / rules.belief_rate_hz)
-        if not (
-            due and self.has_started and rules.passive and self._has_subscribers and not now.lost
-        ):
+        is_wanted = self.has_started and rules.passive and self._has_subscribers
+        if not due or not is_wanted or now.lost:
             return []
         self._belief_ns = now.stamp_ns
-        belief = self._belief(now)
-        stale = staleness(self._last_belief, belief)
-        silence_ns = rules.belief_silence_s * 1e9
-        is_recent = (
-            self._last_belief is not None and now.stamp_ns - self._last_belief.stamp_ns < silence_ns
+        (pose, covariance, _), rates = now.estimate, (now.speed_m_s, now.turn_rate_rad_s)
+        belief, last = (
+            Belief(self._robot, now.stamp_ns, *pose, covariance, *rates),
+            self._last_belief,
         )
+        stale, silence_ns = gains.staleness(last, belief), rules.belief_silence_s * 1e9
+        is_recent = last is not None and now.stamp_ns - last.stamp_ns < silence_ns
         if is_recent and stale < rules.belief_share:
             tally.silent += 1
             return []
@@ -265,12 +245,6 @@ class CollaborationAgent:
             return []
         self._last_belief = belief
         return [belief]
-
-    def _belief(self, now: PoseEstimate) -> Belief:
-        pose, covariance, _ = now.estimate
-        return Belief(
-            self._robot, now.stamp_ns, *pose, covariance, now.speed_m_s, now.turn_rate_rad_s
-        )
 
     # Budget, and what was really sent ----------------------------------------------------
 
@@ -288,29 +262,18 @@ class CollaborationAgent:
 
     def _record_sent(self, sent: HelpSent, now_ns: int) -> None:
         message = sent.message
-        if not sent.size:
-            self._undo_unsent(message, now_ns)
+        topic, to = ("fix", message.robot) if isinstance(message, Fix) else ("belief", "")
+        if sent.size:
+            self.counters.of(topic, to).add(sent.size, message.stamp_ns)
             return
-        to = message.robot if isinstance(message, Fix) else ""
-        topic = "fix" if isinstance(message, Fix) else "belief"
-        self.counters.of(topic, to).add(sent.size, message.stamp_ns)
-
-    def _undo_unsent(self, message: Belief | Fix, now_ns: int) -> None:
-        """A new key often has no subscriber yet: the next frame may repeat the message."""
+        # A new key often has no subscriber yet: the next frame may repeat the message
+        self.budget.refund(now_ns, _size(message))
         if isinstance(message, Fix):
             self._fix_memories.pop(message.robot, None)
         else:
             self._last_belief = None
-        self.budget.refund(now_ns, _size(message))
 
     def _track(self, now: PoseEstimate) -> Track:
         pose, covariance, _ = now.estimate
-        weighted = self._settings.localizer.variant == "weighted"
-        return Track(
-            self._robot,
-            now.stamp_ns,
-            *pose,
-            None if weighted else covariance,
-            self.tier,
-            now.lost,
-        )
+        known = None if self._settings.localizer.variant == "weighted" else covariance
+        return Track(self._robot, now.stamp_ns, *pose, known, self.tier, now.lost)

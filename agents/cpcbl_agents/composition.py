@@ -15,11 +15,7 @@ from cpcbl_team.config import Team
 
 
 def build_robot(
-    name: str,
-    team: Team,
-    start_ns: int,
-    restarted: bool = False,
-    camera: OwnCamera | None = None,
+    name: str, team: Team, start_ns: int, restarted: bool = False, camera: OwnCamera | None = None
 ) -> Robot:
     """The robot, with all that its settings ask for.
 
@@ -47,11 +43,9 @@ def build_sensing(
     follower = None
     if settings.source == "simulated":
         follower = WaypointFollower(name, settings.waypoints_m, settings.speed_m_s)
-    detector = _build_detector(name, team) if settings.sensing == "camera" else None
+    detector: Detector | None = None
+    if settings.sensing == "camera":
+        from cpcbl_agents.vision.detector import CameraDetector
+
+        detector = CameraDetector(name, team)
     return SensingAgent(settings, source, map_names, follower, detector, camera)
-
-
-def _build_detector(name: str, team: Team) -> Detector:
-    from cpcbl_agents.vision.detector import CameraDetector
-
-    return CameraDetector(name, team)

@@ -20,11 +20,7 @@ class FilterAgent:
     """Runs one localizer on its timeline. It reports its estimate at 10 Hz and for each frame."""
 
     def __init__(
-        self,
-        settings: LocalizationSettings,
-        field: Field,
-        teammates: frozenset[str],
-        start_ns: int,
+        self, settings: LocalizationSettings, field: Field, teammates: frozenset[str], start_ns: int
     ) -> None:
         localizer = Localizer(settings, field)
         self.timeline = Timeline(localizer, localizer.start(start_ns))
@@ -61,8 +57,7 @@ class FilterAgent:
         match message:
             case Odometry():
                 if self._add(message) and message.stamp_ns > self._covered_ns:
-                    self._odometry = message
-                    self._covered_ns = message.stamp_ns
+                    self._odometry, self._covered_ns = message, message.stamp_ns
                 return self._frame_estimates(now_ns)
             case Sightings():
                 for sighting in message.sightings:
@@ -111,8 +106,7 @@ class FilterAgent:
             if state is None:
                 continue
             if self._learns:
-                frame = without_bearing_bias(
-                    frame, state.memory.calibration.learned.bearing_bias_rad
-                )
+                learned = state.memory.calibration.learned
+                frame = without_bearing_bias(frame, learned.bearing_bias_rad)
             ready.append(FrameEstimate(frame, state.estimate, state.lost))
         return ready

@@ -16,7 +16,7 @@ from cpcbl_agents.agent import (
 from cpcbl_agents.clocks import ClockMonitor
 from cpcbl_agents.counters import MessageCounters
 from cpcbl_agents.declarations import Declarations, LivelinessTokens
-from cpcbl_agents.robot import Robot
+from cpcbl_agents.robot import Outgoing, Robot
 from cpcbl_team.config import Team
 from cpcbl_team.inputs import Belief, Fix
 from cpcbl_transport import topics
@@ -26,16 +26,14 @@ from cpcbl_transport.decoding import decode_by_key
 from cpcbl_transport.link_size import received_bytes, sent_bytes
 from cpcbl_transport.messages import (
     LARGEST_PAYLOAD,
-    AnnotatedFrame,
-    Drive,
     Help,
     Message,
     Refusal,
-    Track,
+    Status,
     encode,
     refusal,
 )
-from cpcbl_transport.topics import Topic
+from cpcbl_transport.topics import Topic, topic_of
 
 log = logging.getLogger(__name__)
 
@@ -73,9 +71,8 @@ class Node:
         speed: float = 1.0,
     ) -> None:
         """`speed`: robot time beside real time."""
-        self._robot, self._incarnation = robot, incarnation
+        self._robot, self._incarnation, self._name = robot, incarnation, robot.name
         self._on_arrival = on_arrival
-        self._name = robot.name
         self._frame_key = topics.IN_FRAME.at(robot=robot.name)
         rules = team.robots[robot.name].collaboration
         self._team, self._passive = frozenset(team.robots), rules.passive
@@ -86,7 +83,7 @@ class Node:
             robot.name, incarnation, rules, bus, self._on_message, self._on_token
         )
         self._tokens = LivelinessTokens()
-        self._subscribed_key, self._has_frame_subscribers = "", False
+        self._subscribed: dict[object, str] = {BeliefSubscribers: "", FrameSubscribers: ""}
         self._status_ns = start_ns
         # What threads of the bus count has its entry: to add one, another thread must not read
         self.counts: Counter[str] = Counter(dict.fromkeys(ON_ARRIVAL, 0))
@@ -143,10 +140,12 @@ class Node:
             self._handle_payload(*self._inbox.popleft(), now_ns)
         if self._frames:
             self._handle_payload(*self._frames.popleft(), now_ns)
-        self._check_belief_subscribers(now_ns)
-        self._check_frame_subscribers(now_ns)
+        if self._passive and self._declarations.tier is not None:
+            self._check_subscribers(topics.BELIEF, BeliefSubscribers, now_ns)
+        if self._robot.sensing.has_detector:
+            self._check_subscribers(topics.LOOK, FrameSubscribers, now_ns)
         outgoing = self._robot.handle(Tick(), now_ns)
-        for name in self._declarations.update(self._robot.interests):
+        for name in self._declarations.update(self._robot.collaboration.interests):
             self._tokens.forget(name)
             self._robot.handle(Presence(name, None), now_ns)
         self._send(outgoing, now_ns)  # under the tier that these messages belong to
@@ -156,9 +155,35 @@ class Node:
 
     def _handle_payload(self, key: str, payload: bytes, now_ns: int) -> None:
         message = self._decode(key, payload, now_ns)
-        if message is not None:
-            self._send(self._robot.handle(message, now_ns), now_ns)
-            self._count(message, len(payload))
+        if isinstance(message, Refusal):
+            self.counts[message] += 1
+            return
+        self._send(self._robot.handle(message, now_ns), now_ns)
+        match message:
+            case Fix(observer=name):  # by a subscription to all observers
+                size = received_bytes(len(payload), name)
+                self.received.of("fix", name).add(size, message.stamp_ns)
+            case Belief(robot=name):  # by one to this key
+                size = sent_bytes(len(payload))
+                self.received.of("belief", name).add(size, message.stamp_ns)
+
+    def _decode(self, key: str, payload: bytes, now_ns: int) -> Message | Refusal:
+        """The message, or why it must not be used: its bytes, its sender, then its clock, its
+        numbers and its time."""
+        message = decode_by_key(key, payload)
+        match message:
+            case Refusal():
+                return message
+            case Belief(robot=sender) | Fix(observer=sender):
+                if sender not in self._team and not self._robot.is_guest(sender):
+                    self._robot.handle(UnknownRobot(sender), now_ns)
+                    return Refusal.UNKNOWN_ROBOT
+                if sender == self._name:
+                    return Refusal.OWN
+                clocks = self._clocks
+                if clocks is not None and clocks.rejects(sender, message.stamp_ns, now_ns):
+                    return Refusal.CLOCK
+        return refusal(message, now_ns) or message
 
     def _handle_liveliness(self, now_ns: int) -> None:
         """Tells the robot which teammates are present, and with which tier."""
@@ -173,84 +198,27 @@ class Node:
             if was_guest is not self._robot.is_guest(name):
                 log.info("%s: guest %s %s", self._name, name, "left" if was_guest else "joined")
 
-    def _check_belief_subscribers(self, now_ns: int) -> None:
-        tier = self._declarations.tier
-        if tier is None or not self._passive:
-            return
-        key = topics.BELIEF.at(tier=tier, robot=self._name)
-        subscribed = key if self._declarations.publisher(topics.BELIEF, key).matching else ""
-        if subscribed != self._subscribed_key:  # another key may have other subscribers
-            self._subscribed_key = subscribed
-            self._robot.handle(BeliefSubscribers(bool(subscribed)), now_ns)
+    def _check_subscribers(
+        self, topic: Topic, event: type[BeliefSubscribers | FrameSubscribers], now_ns: int
+    ) -> None:
+        """Tells the robot when the subscribers to what it publishes under a topic come or go."""
+        key = topic.at(tier=self._declarations.tier, robot=self._name)
+        subscribed = key if self._declarations.publisher(topic, key).matching else ""
+        if subscribed != self._subscribed[event]:  # another key may have other subscribers
+            self._subscribed[event] = subscribed
+            self._robot.handle(event(bool(subscribed)), now_ns)
 
-    def _check_frame_subscribers(self, now_ns: int) -> None:
-        if not self._robot.has_detector:
-            return
-        key = topics.LOOK.at(robot=self._name)
-        present = self._declarations.publisher(topics.LOOK, key).matching
-        if present is not self._has_frame_subscribers:
-            self._has_frame_subscribers = present
-            self._robot.handle(FrameSubscribers(present), now_ns)
-
-    def _decode(self, key: str, payload: bytes, now_ns: int) -> Message | None:
-        """The message; None if it is refused, which is counted."""
-        message = decode_by_key(key, payload)
-        reason = message if isinstance(message, Refusal) else self._refusal(message, now_ns)
-        if reason is not None:
-            self.counts[reason] += 1
-            return None
-        assert not isinstance(message, Refusal)
-        return message
-
-    def _count(self, message: Message, size: int) -> None:
-        """Counts a fix or belief that was received and used."""
-        match message:
-            case Fix(observer=name):  # by a subscription to all observers
-                self.received.of("fix", name).add(received_bytes(size, name), message.stamp_ns)
-            case Belief(robot=name):  # by one to this key
-                self.received.of("belief", name).add(sent_bytes(size), message.stamp_ns)
-
-    def _refusal(self, message: Message, now_ns: int) -> Refusal | None:
-        """Why a message must not be used: its sender, then its clock, its numbers and its time."""
-        match message:
-            case Belief(robot=sender) | Fix(observer=sender):
-                pass
-            case _:
-                return refusal(message, now_ns)
-        if sender not in self._team and not self._robot.is_guest(sender):
-            self._robot.handle(UnknownRobot(sender), now_ns)
-            return Refusal.UNKNOWN_ROBOT
-        if sender == self._name:
-            return Refusal.OWN
-        if self._clocks is not None and self._clocks.rejects(sender, message.stamp_ns, now_ns):
-            return Refusal.CLOCK
-        return refusal(message, now_ns)
-
-    def _send(self, outgoing: Iterable[Message], now_ns: int) -> None:
+    def _send(self, outgoing: Iterable[Outgoing], now_ns: int) -> None:
         for message in outgoing:
-            topic, key = self._address(message)
-            size = self._publish(topic, key, message)
-            if isinstance(message, topics.COLLABORATION):
+            size = self._publish(message)
+            if isinstance(message, Help):
                 self._robot.handle(HelpSent(message, sent_bytes(size) if size else 0), now_ns)
 
-    def _address(self, message: Message) -> tuple[Topic, str]:
-        me, tier = self._name, self._declarations.tier
-        match message:
-            case Belief():
-                return topics.BELIEF, topics.BELIEF.at(tier=tier, robot=me)
-            case Fix():
-                key = topics.FIX.at(robot=message.robot, tier=tier, observer=me)
-                return topics.FIX, key
-            case Track():
-                return topics.TRACK, topics.TRACK.at(robot=me)
-            case AnnotatedFrame():
-                return topics.LOOK, topics.LOOK.at(robot=me)
-            case Drive():
-                return topics.DRIVE, topics.DRIVE.at(robot=me)
-        raise TypeError(f"robots do not send {type(message).__name__}")
-
-    def _publish(self, topic: Topic, key: str, message: Message) -> int:
+    def _publish(self, message: Outgoing | Status) -> int:
         """Publishes if there is a subscriber; returns the bytes of the payload, 0 without one."""
+        topic = topic_of(type(message))
+        tier, target = self._declarations.tier, message.robot
+        key = topic.at(tier=tier, robot=target, observer=self._name)
         publisher = self._declarations.publisher(topic, key)
         if not publisher.matching:
             return 0
@@ -260,11 +228,5 @@ class Node:
 
     def _publish_status(self, now_ns: int) -> None:
         counts = self.counts + Counter(announced=self._declarations.announced)
-        status = self._robot.status(
-            now_ns,
-            incarnation=self._incarnation,
-            counts=counts,
-            received=self.received.flows(),
-            clocks=self._clocks,
-        )
-        self._publish(topics.STATUS, topics.STATUS.at(robot=self._name), status)
+        received = self.received.flows()
+        self._publish(self._robot.status(now_ns, self._incarnation, counts, received, self._clocks))

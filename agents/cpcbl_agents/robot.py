@@ -5,28 +5,28 @@ from collections.abc import Iterator
 
 from cpcbl_agents.agent import AgentMessage, BusEvent, FrameSubscribers, HelpSent, Presence, Tick
 from cpcbl_agents.clocks import ClockMonitor
-from cpcbl_agents.collaboration import CollaborationAgent, Interests
+from cpcbl_agents.collaboration import CollaborationAgent
 from cpcbl_agents.filtering import FilterAgent
 from cpcbl_agents.guests import GuestRegistry
 from cpcbl_agents.sensing import SensingAgent
 from cpcbl_team.config import Team
-from cpcbl_team.inputs import Belief, BeliefShared, Fix, Odometry, Position, Sightings
+from cpcbl_team.inputs import Belief, BeliefShared, Fix
 from cpcbl_team.trust import TrustStatus
 from cpcbl_transport.budget import Budget
 from cpcbl_transport.messages import (
     AnnotatedFrame,
     Drive,
     Flow,
-    Frame,
     Help,
     Message,
+    SensorInput,
     Status,
     Track,
     Trust,
 )
 
 NEVER_NS = 2**62
-_OUTGOING = (Belief, Fix, Track, Drive)
+Outgoing = AnnotatedFrame | Belief | Fix | Track | Drive
 
 
 class Robot:
@@ -36,18 +36,11 @@ class Robot:
     """
 
     def __init__(
-        self,
-        name: str,
-        team: Team,
-        start_ns: int,
-        sensing: SensingAgent,
-        restarted: bool = False,
+        self, name: str, team: Team, start_ns: int, sensing: SensingAgent, restarted: bool = False
     ) -> None:
-        settings = team.robots[name]
-        teammates = frozenset(team.robots) - {name}
-        self.name = name
+        settings, teammates = team.robots[name], frozenset(team.robots) - {name}
+        self.name, self.sensing = name, sensing
         self._shared_ns = start_ns
-        self.sensing = sensing
         self.filter = FilterAgent(settings, team.map, teammates, start_ns)
         budget = Budget(
             settings.collaboration.budget,
@@ -60,7 +53,7 @@ class Robot:
         guests = GuestRegistry(known, team.guests.most if team.guests.allowed else 0)
         self.collaboration = CollaborationAgent(name, settings, teammates, start_ns, budget, guests)
 
-    def handle(self, message: Message | Tick | BusEvent, now_ns: int) -> list[Message]:
+    def handle(self, message: Message | Tick | BusEvent, now_ns: int) -> list[Outgoing]:
         """Everything that this robot publishes because of one message (from the bus, or a tick).
 
         Inputs go through sensing, filter and collaboration; the filter's estimates also go to the
@@ -74,14 +67,12 @@ class Robot:
         if isinstance(message, Help):  # it changes what is published at the next tick
             self.filter.handle(message, now_ns)
             return []
-        raw = isinstance(message, (Odometry, Sightings, Position, Frame))
-        inputs: list[AgentMessage] = [] if raw else [message]
+        inputs: list[AgentMessage] = [] if isinstance(message, SensorInput) else [message]
         inputs += self.sensing.handle(message, now_ns)
         estimates = [out for m in inputs for out in self.filter.handle(m, now_ns)]
         outgoing = [out for m in estimates for out in self.collaboration.handle(m, now_ns)]
         outgoing += [out for m in estimates for out in self.sensing.handle(m, now_ns)]
-        annotated = [m for m in inputs if isinstance(m, AnnotatedFrame)]
-        return [*annotated, *(m for m in outgoing if isinstance(m, _OUTGOING))]
+        return [m for m in (*inputs, *outgoing) if isinstance(m, Outgoing)]
 
     def _handle_event(self, event: BusEvent, now_ns: int) -> None:
         self.collaboration.handle(event, now_ns)
@@ -91,14 +82,10 @@ class Robot:
             case Presence(robot=name):
                 known = event if self.is_guest(name) else event._replace(tier=None)
                 self.filter.handle(known, now_ns)
-            case HelpSent(message=message, size=size) if size:
-                self._mark_shared(message.stamp_ns, now_ns)
-
-    def _mark_shared(self, stamp_ns: int, now_ns: int) -> None:
-        """From now on what this robot knows may be in what its teammates publish."""
-        if stamp_ns > self._shared_ns:
-            self._shared_ns = stamp_ns
-            self.filter.handle(BeliefShared(stamp_ns), now_ns)
+            case HelpSent(message=sent, size=size) if size and sent.stamp_ns > self._shared_ns:
+                # From now on what this robot knows may be in what its teammates publish
+                self._shared_ns = sent.stamp_ns
+                self.filter.handle(BeliefShared(sent.stamp_ns), now_ns)
 
     @property
     def next_ns(self) -> int:
@@ -108,15 +95,6 @@ class Robot:
         source_ns, filter_ns = self.sensing.next_ns, self.filter.next_ns
         return filter_ns if source_ns is None else min(filter_ns, source_ns)
 
-    @property
-    def interests(self) -> Interests | None:
-        """What the robot announces and subscribes to; None before its first estimate."""
-        return self.collaboration.interests
-
-    @property
-    def has_detector(self) -> bool:
-        return self.sensing.has_detector
-
     def is_guest(self, name: str) -> bool:
         """Whether a robot of this name is a guest at present."""
         return name in self.collaboration.guests
@@ -124,8 +102,8 @@ class Robot:
     @property
     def counts(self) -> Counter[str]:
         """What was used and what was refused so far, by reason."""
-        own = self.sensing.counts + self.filter.all_counts
-        return own + self.collaboration.guests.counts
+        guests = self.collaboration.guests
+        return self.sensing.counts + self.filter.all_counts + guests.counts
 
     def status(
         self,

@@ -84,10 +84,8 @@ class SensingAgent:
             return ()
         self._counts["frame"] += 1
         outgoing: list[AgentMessage] = []
-        if (
-            self._has_subscribers
-            and not 0 <= item.stamp_ns - self._annotated_ns < ANNOTATION_INTERVAL_NS
-        ):
+        is_recent = 0 <= item.stamp_ns - self._annotated_ns < ANNOTATION_INTERVAL_NS
+        if self._has_subscribers and not is_recent:
             self._annotated_ns = item.stamp_ns
             sightings, annotated = self._detector.detect_and_annotate(item)
             outgoing.append(annotated)
@@ -107,12 +105,9 @@ class SensingAgent:
         sightings = without_duplicates(item.sightings)
         if len(sightings) < len(item.sightings):
             self._counts["seen_twice"] += len(item.sightings) - len(sightings)
-        kept = tuple(
-            corrected_sighting(s, self._sensor, s.id not in self._map_names)
-            for s in sightings
-            if self._can_see(s.id)
-        )
-        return Sightings(item.stamp_ns - self._sensor_delay_ns, kept)
-
-    def _can_see(self, name: str) -> bool:
-        return self._sensor.sees_landmarks if name in self._map_names else self._sensor.sees_robots
+        sensor, map_names, kept = self._sensor, self._map_names, []
+        for sighting in sightings:
+            is_robot = sighting.id not in map_names
+            if sensor.sees_robots if is_robot else sensor.sees_landmarks:
+                kept.append(corrected_sighting(sighting, sensor, is_robot))
+        return Sightings(item.stamp_ns - self._sensor_delay_ns, tuple(kept))

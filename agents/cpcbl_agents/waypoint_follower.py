@@ -35,16 +35,9 @@ class WaypointFollower:
         self._commanded_ns = now.stamp_ns
         if now.lost:  # it turns until it sees landmarks
             return [Drive(self._robot, now.stamp_ns, 0.0, 0.5, self._reached)]
-        pose = now.estimate.pose
-        command = pursue(pose, self._goal_from(pose), self._speed)
-        return [Drive(self._robot, now.stamp_ns, *command, self._reached)]
-
-    def _goal_from(self, pose: Pose2) -> tuple[float, float]:
-        x, y = self._goal
+        pose, goals = now.estimate.pose, self._waypoints
+        x, y = goals[self._reached % len(goals)]
         if math.hypot(x - pose.x, y - pose.y) < REACHED_M:
             self._reached += 1
-        return self._goal
-
-    @property
-    def _goal(self) -> tuple[float, float]:
-        return self._waypoints[self._reached % len(self._waypoints)]
+        command = pursue(pose, goals[self._reached % len(goals)], self._speed)
+        return [Drive(self._robot, now.stamp_ns, *command, self._reached)]

@@ -28,6 +28,7 @@ from support.nodes import (
 )
 
 from cpcbl_agents.node import INBOX
+from cpcbl_agents.robot import Outgoing
 from cpcbl_team.inputs import Belief, Fix, Odometry, Position, Sighting, Sightings
 from cpcbl_team.timeline import HORIZON_NS
 from cpcbl_transport import topics
@@ -302,7 +303,7 @@ def test_a_step_ends_although_more_and_more_arrives(monkeypatch: pytest.MonkeyPa
     robot = stand.robots["me"]
     handle = robot.handle
 
-    def answered_at_once(message: Any, now_ns: int) -> list[Message]:
+    def answered_at_once(message: Any, now_ns: int) -> list[Outgoing]:
         nonlocal answered
         if isinstance(message, Position) and answered < 100:
             answered += 1

@@ -246,7 +246,7 @@ def test_the_sensor_delay_moves_a_frame_to_when_it_was_seen(delay_ns: int) -> No
     assert belief(late) == belief(prompt)
 
 
-def fixes(said: list[Message]) -> list[Fix]:
+def fixes(said: Sequence[Message]) -> list[Fix]:
     return [m for m in said if isinstance(m, Fix)]
 
 

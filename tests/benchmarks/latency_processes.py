@@ -17,7 +17,7 @@ from cpcbl_agents.clock import Clock
 from cpcbl_agents.composition import build_sensing
 from cpcbl_agents.node import Node
 from cpcbl_agents.process import Loop, StopSignal
-from cpcbl_agents.robot import Robot
+from cpcbl_agents.robot import Outgoing, Robot
 from cpcbl_agents.sources import NoSource
 from cpcbl_team.config import (
     CollaborationSettings,
@@ -86,7 +86,7 @@ class TimingRobot(Robot):
         self.changed_ns: dict[int, int] = {}
         """When the belief changed, by the stamp of the fix."""
 
-    def handle(self, message: Message | Tick | BusEvent, now_ns: int) -> list[Message]:
+    def handle(self, message: Message | Tick | BusEvent, now_ns: int) -> list[Outgoing]:
         before = self.filter.timeline.state
         outgoing = super().handle(message, now_ns)
         if isinstance(message, Fix):

@@ -153,9 +153,9 @@ TOPICS = (
 )
 INPUTS = (IN_ODOMETRY, IN_SIGHTINGS, IN_POSITION, IN_FRAME)
 COLLABORATION = (Belief, Fix)
+_BY_TYPE: dict[type[object] | None, Topic] = {topic.carries: topic for topic in TOPICS}
 
 
 def topic_of(kind: type[object]) -> Topic:
     """The one topic that carries messages of this type."""
-    (topic,) = (topic for topic in TOPICS if topic.carries is kind)
-    return topic
+    return _BY_TYPE[kind]
