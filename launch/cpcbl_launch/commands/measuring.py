@@ -123,7 +123,7 @@ def evaluate_mrclam(
     from cpcbl_launch.lab.evaluation import evaluate_log
     from cpcbl_launch.overrides import Overrides, with_blind_robots, with_overrides
     from cpcbl_launch.reporting.files import write_or_reason
-    from cpcbl_launch.reporting.tum import export_tum
+    from cpcbl_launch.reporting.metrics import export_tum
     from cpcbl_launch.run import logged_team
     from cpcbl_launch.views.run import print_report, progress_bar
 

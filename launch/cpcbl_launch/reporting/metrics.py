@@ -1,6 +1,11 @@
-"""How good an estimate was: errors, the share inside 3 sigma, NEES."""
+"""How good an estimate was: errors, the share inside 3 sigma, NEES; trajectories as TUM files.
+
+A TUM file, which evo reads, has a line a pose: `timestamp tx ty tz qx qy qz qw`.
+"""
 
 import math
+from collections.abc import Mapping
+from pathlib import Path
 from typing import NamedTuple
 
 import msgspec
@@ -15,13 +20,13 @@ class Score(msgspec.Struct, frozen=True, kw_only=True):
     """One robot's figures over the samples that could be compared with truth."""
 
     samples: int
-    position_rmse_m: float | None
-    position_mean_m: float | None
-    position_max_m: float | None
-    heading_rmse_deg: float | None
-    inside_3_sigma: float | None
+    position_rmse_m: float | None = None
+    position_mean_m: float | None = None
+    position_max_m: float | None = None
+    heading_rmse_deg: float | None = None
+    inside_3_sigma: float | None = None
     """Share of samples with a Mahalanobis distance of the position of at most 3 (98.9 % due)."""
-    nees: float | None
+    nees: float | None = None
     """Mean normalized estimation error squared of the position (2 is consistent)."""
 
 
@@ -31,6 +36,11 @@ class Trajectory(NamedTuple):
     stamps_ns: Stamps  # shape (n,)
     estimate: Floats  # shape (n, 3): x m, y m, heading rad
     covariance: Floats | None  # shape (n, 6): xx, xy, yy, xh, yh, hh; None: there is none
+
+    def part(self, chosen: NDArray[np.bool_]) -> "Trajectory":
+        """The estimates that are chosen, by a mask of shape (n,)."""
+        covariance = None if self.covariance is None else self.covariance[chosen]
+        return Trajectory(self.stamps_ns[chosen], self.estimate[chosen], covariance)
 
 
 class Samples(NamedTuple):
@@ -47,13 +57,12 @@ def seconds(stamps_ns: Stamps) -> Floats:
 
 def samples_with_truth(trajectory: Trajectory, truth: Floats | None) -> tuple[Stamps, Samples]:
     """A trajectory beside the truth (rows: s, x, y, heading), where it counts; with its stamps."""
-    stamps_ns, estimate, covariance = trajectory
     if truth is None or len(truth) == 0:
         nothing = np.empty((0, 3))
-        return stamps_ns[:0], Samples(nothing, nothing, None)
-    at, counts = interpolated_truth(seconds(stamps_ns), truth)
-    covariance = None if covariance is None else covariance[counts]
-    return stamps_ns[counts], Samples(estimate[counts], at[counts], covariance)
+        return trajectory.stamps_ns[:0], Samples(nothing, nothing, None)
+    at, counts = interpolated_truth(seconds(trajectory.stamps_ns), truth)
+    stamps_ns, estimate, covariance = trajectory.part(counts)
+    return stamps_ns, Samples(estimate, at[counts], covariance)
 
 
 def position_errors(samples: Samples) -> Floats:
@@ -83,21 +92,11 @@ def position_nees(samples: Samples) -> Floats | None:
 
 def score(samples: Samples) -> Score:
     """The figures of one robot; None where there was nothing to compare."""
-    n = len(samples.estimate)
-    if n == 0:
-        return Score(
-            samples=0,
-            position_rmse_m=None,
-            position_mean_m=None,
-            position_max_m=None,
-            heading_rmse_deg=None,
-            inside_3_sigma=None,
-            nees=None,
-        )
-    errors = position_errors(samples)
-    nees = position_nees(samples)
+    if not len(samples.estimate):
+        return Score(samples=0)
+    errors, nees = position_errors(samples), position_nees(samples)
     return Score(
-        samples=n,
+        samples=len(errors),
         position_rmse_m=_rms(errors),
         position_mean_m=float(errors.mean()),
         position_max_m=float(errors.max()),
@@ -123,3 +122,27 @@ def interpolated_truth(
     last = np.minimum(after, len(stamps) - 1)
     gap = np.minimum(np.abs(times_s - stamps[after - 1]), np.abs(times_s - stamps[last]))
     return np.stack(columns, axis=1), gap <= nearest_s
+
+
+def export_tum(
+    folder: Path, paths: Mapping[str, Mapping[str, Trajectory]], truth: Mapping[str, Floats]
+) -> None:
+    """`ROBOT_KIND.tum` for each kind of estimate, and `ROBOT_truth.tum` at the same times.
+
+    Truth is interpolated at the times of the estimates that are scored, so that an association by
+    time compares just those.
+    """
+    for kind, robots in paths.items():
+        for name, path in robots.items():
+            _write_tum(folder / f"{name}_{kind}.tum", path.stamps_ns, path.estimate)
+            stamps_ns, samples = samples_with_truth(path, truth.get(name))
+            _write_tum(folder / f"{name}_truth.tum", stamps_ns, samples.truth)
+
+
+def _write_tum(path: Path, stamps_ns: Stamps, poses: Floats) -> None:
+    lines = [
+        f"{ns // 10**9}.{ns % 10**9:09d} {x:.9f} {y:.9f} 0 0 0"
+        f" {math.sin(0.5 * heading):.9f} {math.cos(0.5 * heading):.9f}\n"
+        for ns, (x, y, heading) in zip(stamps_ns.tolist(), poses.tolist(), strict=True)
+    ]
+    path.write_text("".join(lines), encoding="ascii")

@@ -7,10 +7,9 @@ from typing import NamedTuple
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from cpcbl_launch.reporting.metrics import Floats, Trajectory, samples_with_truth, score, seconds
-from cpcbl_launch.reporting.recorder import Effect, GuestReport, Phase, Recorder, RobotReport
+from cpcbl_launch.reporting.recorder import Effect, GuestReport, Phase, Recorder
 
 AWAY_S = 2.0  # who says nothing of itself for longer was away
 MOST_GUESTS = 100  # as many as a team may let in; more is garbage
@@ -28,18 +27,13 @@ def phase_report(
 ) -> Phase:
     """A robot's figures in some parts of a run."""
     path = recorder.trajectory(robot)
-    inside = _inside(seconds(path.stamps_ns), spans)
-    covariance = None if path.covariance is None else path.covariance[inside]
-    part = Trajectory(path.stamps_ns[inside], path.estimate[inside], covariance)
-    figures = score(samples_with_truth(part, truth)[1])
-    return Phase(**msgspec.structs.asdict(figures), position_sigma_m=_sigma_m(part))
-
-
-def _inside(times_s: Floats, spans: Sequence[Span]) -> NDArray[np.bool_]:
+    times_s = seconds(path.stamps_ns)
     inside = np.zeros(len(times_s), dtype=np.bool_)
     for span in spans:
         inside |= (span.from_s <= times_s) & (times_s < span.until_s)
-    return inside
+    part = path.part(inside)
+    figures = score(samples_with_truth(part, truth)[1])
+    return Phase(**msgspec.structs.asdict(figures), position_sigma_m=_sigma_m(part))
 
 
 def _sigma_m(path: Trajectory) -> float | None:
@@ -85,20 +79,20 @@ def guest_reports(
     others = sorted(counts.keys() - set(robots), key=lambda name: (-counts[name], name))
     for name in sorted(others[:MOST_GUESTS]):
         present = presence_spans(seconds(recorder.trajectory(name).stamps_ns).tolist())
-        parts = split_by_presence(present, begin_s)
-        effects = {
-            robot: Effect(
-                **{
-                    part: phase_report(recorder, robot, truth.get(robot), spans)
-                    for part, spans in zip(Effect.__struct_fields__, parts, strict=True)
-                }
-            )
-            for robot in robots
-        }
+        spans = dict(
+            zip(Effect.__struct_fields__, split_by_presence(present, begin_s), strict=True)
+        )
         own = recorder.robot_report(name, "", truth.get(name))
         reports[name] = GuestReport(
-            **{key: getattr(own, key) for key in RobotReport.__struct_fields__},
+            **msgspec.structs.asdict(own),
             present_s=tuple((p.from_s - epoch_s, p.until_s - epoch_s) for p in present),
-            robots=effects,
+            robots={robot: _effect(recorder, robot, truth.get(robot), spans) for robot in robots},
         )
     return reports
+
+
+def _effect(
+    recorder: Recorder, robot: str, truth: Floats | None, spans: Mapping[str, Sequence[Span]]
+) -> Effect:
+    phases = {part: phase_report(recorder, robot, truth, inside) for part, inside in spans.items()}
+    return Effect(**phases)

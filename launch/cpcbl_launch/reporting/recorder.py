@@ -3,19 +3,12 @@
 import math
 import threading
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Generic, TypeVar, cast
 
 import msgspec
 import numpy as np
 
-from cpcbl_launch.reporting.encoded_log import EncodedLog
-from cpcbl_launch.reporting.flows import (
-    FlowReport,
-    SpendingReport,
-    are_limits_kept,
-    summed_flows,
-    summed_spending,
-)
 from cpcbl_launch.reporting.metrics import (
     Floats,
     Samples,
@@ -25,12 +18,20 @@ from cpcbl_launch.reporting.metrics import (
     score,
     seconds,
 )
-from cpcbl_launch.reporting.trust_report import TrustReport, trust_reports
+from cpcbl_launch.reporting.statuses import (
+    FlowReport,
+    SpendingReport,
+    TrustReport,
+    are_limits_kept,
+    summed_flows,
+    summed_spending,
+    trust_reports,
+)
 from cpcbl_team.config import Team
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus
 from cpcbl_transport.decoding import decode
-from cpcbl_transport.messages import Refusal, Status, Track, Truth, Truths
+from cpcbl_transport.messages import Refusal, Status, Tagged, Track, Truth, Truths, decode_tagged
 
 
 class LearnedReport(msgspec.Struct, frozen=True, kw_only=True):
@@ -57,12 +58,10 @@ class RobotReport(Score, frozen=True, kw_only=True):
     messages_received: int
     bytes_received: int
     counts: dict[str, int]
-    learned: LearnedReport | None = None
-    """None where self-calibration is off."""
+    learned: LearnedReport | None = None  # None where self-calibration is off
     sent: tuple[FlowReport, ...] = ()
     heard: tuple[FlowReport, ...] = ()
-    spending: tuple[SpendingReport, ...] = ()
-    """Its limits; empty where there are none."""
+    spending: tuple[SpendingReport, ...] = ()  # its limits; empty where there are none
     trust: tuple[TrustReport, ...] = ()
     """Teammates whose messages it received at the end, or that were in quarantine."""
 
@@ -85,8 +84,7 @@ class Effect(msgspec.Struct, frozen=True, kw_only=True):
 class GuestReport(RobotReport, frozen=True, kw_only=True):
     """A guest's own figures, when it was there, and what that did to the robots of the team."""
 
-    present_s: tuple[tuple[float, float], ...]
-    """From when until when, since the start of the run."""
+    present_s: tuple[tuple[float, float], ...]  # from when until when, since the start of the run
     robots: dict[str, Effect]
 
 
@@ -122,24 +120,44 @@ class Report(msgspec.Struct, frozen=True, kw_only=True):
 
     robots: dict[str, RobotReport]
     team: TeamReport
-    calibrated_on: tuple[str, ...] = ()
-    """The logs from which the robots' types were calibrated."""
-    seen_before: bool = False
-    """Whether this log is one of them, so that the figures are too good."""
-    left_out: dict[str, str] = {}
-    """Robots that could not take part, with the reason."""
+    calibrated_on: tuple[str, ...] = ()  # the logs from which the robots' types were calibrated
+    seen_before: bool = False  # whether this log is one of them, so that the figures are too good
+    left_out: dict[str, str] = {}  # robots that could not take part, with the reason
     duration_s: float = 0.0
     restarts: dict[str, int] = {}
-    refused: dict[str, int] = {}
-    """Messages that the recorder could not use, by reason."""
-    not_written: dict[str, str] = {}
-    """Files that could not be written, with the reason."""
-    alone: dict[str, Phase] = {}
-    """Before collaboration began, where it began late."""
+    refused: dict[str, int] = {}  # messages that the recorder could not use, by reason
+    not_written: dict[str, str] = {}  # files that could not be written, with the reason
+    alone: dict[str, Phase] = {}  # before collaboration began, where it began late
     guests: dict[str, GuestReport] = {}
     """Robots that the team file does not name; no part of the team's figures."""
     yardsticks: dict[str, BaselineReport] = {}
     """dead_reckoning, solo_ekf, centralized_ekf, where they were asked for."""
+
+
+M = TypeVar("M", bound=Tagged)
+
+
+class EncodedLog(Generic[M]):
+    """Messages of one type in the order of their arrival, as they came, for runs of days.
+
+    Decoded, each is many objects: a track takes 440 bytes, 150 as it came; the truth of four robots
+    920 and 200.
+    """
+
+    def __init__(self) -> None:
+        self._payloads: list[bytes] = []
+        self.append = self._payloads.append
+
+    def __len__(self) -> int:
+        return len(self._payloads)
+
+    def __iter__(self) -> Iterator[M]:
+        """Those that have come by now."""
+        return (cast(M, decode_tagged(payload)) for payload in tuple(self._payloads))
+
+    @property
+    def last(self) -> M:
+        return cast(M, decode_tagged(self._payloads[-1]))
 
 
 class Recorder:
@@ -189,12 +207,9 @@ class Recorder:
         """Rows of seconds, x, y, heading for every robot of the simulated field."""
         return truth_rows(self.truths)
 
-    def trajectory(
-        self, robot: str, from_s: float = -np.inf, until_s: float = np.inf
-    ) -> Trajectory:
-        """A robot's estimates within [from_s, until_s)."""
-        received = self.tracks.get(robot, ())
-        tracks = [t for t in received if from_s <= t.stamp_ns * 1e-9 < until_s]
+    def trajectory(self, robot: str, from_s: float = -np.inf) -> Trajectory:
+        """A robot's estimates from `from_s` on."""
+        tracks = [t for t in self.tracks.get(robot, ()) if from_s <= t.stamp_ns * 1e-9]
         covariance = None
         if all(t.covariance is not None for t in tracks):
             covariance = np.array([t.covariance for t in tracks]).reshape(-1, 6)
@@ -204,17 +219,13 @@ class Recorder:
             covariance,
         )
 
-    def samples(
-        self, robot: str, truth: Floats | None, from_s: float = -np.inf, until_s: float = np.inf
-    ) -> Samples:
-        """A robot's estimates within [from_s, until_s), beside the truth, where there is one."""
-        return samples_with_truth(self.trajectory(robot, from_s, until_s), truth)[1]
+    def samples(self, robot: str, truth: Floats | None, from_s: float = -np.inf) -> Samples:
+        """A robot's estimates from `from_s` on, beside the truth, where there is one."""
+        return samples_with_truth(self.trajectory(robot, from_s), truth)[1]
 
-    def timed_samples(
-        self, robot: str, truth: Floats, from_s: float = -np.inf, until_s: float = np.inf
-    ) -> tuple[Floats, Samples]:
-        """The same with its times (s)."""
-        stamps_ns, samples = samples_with_truth(self.trajectory(robot, from_s, until_s), truth)
+    def timed_samples(self, robot: str, truth: Floats) -> tuple[Floats, Samples]:
+        """A robot's estimates beside the truth, and their times (s)."""
+        stamps_ns, samples = samples_with_truth(self.trajectory(robot), truth)
         return seconds(stamps_ns), samples
 
     def report(
@@ -234,10 +245,9 @@ class Recorder:
         _, _, last_truth = self.latest()
         figures = score(self.samples(name, truth, from_s))
         tracks = list(self.tracks.get(name, ()))
-        statuses = [
-            *self._earlier_processes.get(name, ()),
-            *([self.status[name]] if name in self.status else []),
-        ]
+        statuses = list(self._earlier_processes.get(name, ()))
+        if name in self.status:
+            statuses.append(self.status[name])
         return RobotReport(
             **msgspec.structs.asdict(figures),
             variant=variant,
@@ -284,10 +294,9 @@ def _longest_lost_s(tracks: list[Track]) -> float:
 
 
 def _summed_counts(statuses: list[Status]) -> dict[str, int]:
-    total: dict[str, int] = {}
+    total = Counter[str]()
     for status in statuses:
-        for reason, n in status.counts.items():
-            total[reason] = total.get(reason, 0) + n
+        total.update(status.counts)
     return dict(sorted(total.items()))
 
 

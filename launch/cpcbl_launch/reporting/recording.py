@@ -3,9 +3,11 @@
 Messages are JSON arrays, as on the wire but readable; the team is the attachment `team.json`. The
 inputs of a robot that replays a log are not on the bus, so not in the file either. Of cameras there
 is what robots show while somebody looks, twice a second: what was found under `look/<robot>`, the
-annotated frame under `picture/<robot>`, as Foxglove shows pictures.
+annotated frame under `picture/<robot>`, as Foxglove shows pictures (in JSON:
+docs.foxglove.dev/docs/visualization/message-schemas/compressed-image).
 """
 
+import base64
 import logging
 import struct
 import threading
@@ -20,7 +22,6 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 
 from cpcbl_agents.sources.mrclam import LogError
-from cpcbl_launch.reporting.foxglove import PICTURE, PICTURE_SCHEMA, foxglove_image
 from cpcbl_launch.reporting.metrics import Floats
 from cpcbl_launch.reporting.recorder import truth_rows
 from cpcbl_team.config import Team
@@ -37,6 +38,18 @@ RECORDED = (
     *(topics.TRACK, topics.STATUS, topics.TRUTH, topics.LOOK),
 )
 TEAM = "team.json"
+PICTURE = "foxglove.CompressedImage"
+_TIME = {"sec": {"type": "integer"}, "nsec": {"type": "integer"}}
+_PICTURE_SCHEMA = {
+    "title": PICTURE,
+    "type": "object",
+    "properties": {
+        "timestamp": {"type": "object", "title": "time", "properties": _TIME},
+        "frame_id": {"type": "string"},
+        "data": {"type": "string", "contentEncoding": "base64"},
+        "format": {"type": "string"},
+    },
+}
 _decoder: msgspec.json.Decoder[Message] = msgspec.json.Decoder(Message)
 
 
@@ -70,21 +83,19 @@ class Recording(AbstractContextManager["Recording"]):
     def _write(self, writer: Writer, key: str, message: Message) -> None:
         if isinstance(message, AnnotatedFrame):
             if message.image:
-                self._write_picture(writer, message)
+                if not self._schema:
+                    schema = msgspec.json.encode(_PICTURE_SCHEMA)
+                    self._schema = writer.register_schema(PICTURE, "jsonschema", schema)
+                picture = _foxglove_image(message)
+                self._add(writer, f"picture/{message.robot}", message.stamp_ns, picture)
             message = msgspec.structs.replace(message, image=b"")
-        if key not in self._channels:
-            self._channels[key] = writer.register_channel(key, "json", 0)
-        at_ns, data = message.stamp_ns, msgspec.json.encode(message)
-        writer.add_message(self._channels[key], at_ns, data, at_ns)
+        self._add(writer, key, message.stamp_ns, message)
 
-    def _write_picture(self, writer: Writer, look: AnnotatedFrame) -> None:
-        key, at_ns = f"picture/{look.robot}", look.stamp_ns
+    def _add(self, writer: Writer, key: str, at_ns: int, content: object) -> None:
         if key not in self._channels:
-            if not self._schema:
-                self._schema = writer.register_schema(PICTURE, "jsonschema", PICTURE_SCHEMA)
-            self._channels[key] = writer.register_channel(key, "json", self._schema)
-        data = foxglove_image(look.robot, at_ns, look.image)
-        writer.add_message(self._channels[key], at_ns, data, at_ns)
+            schema = self._schema if key.startswith("picture/") else 0
+            self._channels[key] = writer.register_channel(key, "json", schema)
+        writer.add_message(self._channels[key], at_ns, msgspec.json.encode(content), at_ns)
 
     def _give_up(self, error: OSError) -> None:
         self.failed = error.strerror or str(error)
@@ -105,6 +116,16 @@ class Recording(AbstractContextManager["Recording"]):
                 self._file.close()
             except OSError as error:
                 self._give_up(error)
+
+
+def _foxglove_image(look: AnnotatedFrame) -> dict[str, object]:
+    sec, nsec = divmod(look.stamp_ns, 10**9)
+    return {
+        "timestamp": {"sec": sec, "nsec": nsec},
+        "frame_id": look.robot,
+        "data": base64.b64encode(look.image).decode(),
+        "format": "jpeg",
+    }
 
 
 class RecordedRun(NamedTuple):

@@ -13,7 +13,7 @@ import msgspec
 from cpcbl_agents.clock import Clock
 from cpcbl_agents.guest_node import GuestNode
 from cpcbl_agents.process import Loop, new_incarnation, own_camera, stop_on_clock_step
-from cpcbl_launch.reporting.flows import FlowReport, summed_flows
+from cpcbl_launch.reporting.statuses import FlowReport, summed_flows
 from cpcbl_launch.simulation.guest_bodies import unsupported_delay
 from cpcbl_launch.team_file import read_layer, with_added_robot
 from cpcbl_team.config import Team
@@ -42,13 +42,10 @@ class ObserverRequest(NamedTuple):
 
     name: str
     at: ObserverPose
-    sensor: str = "survey"
-    """A preset, or a TOML file with the keys of a robot's type."""
+    sensor: str = "survey"  # a preset, or a TOML file with the keys of a robot's type
     fov_deg: float | None = None
-    moves: tuple[tuple[float, float], ...] = ()
-    """Waypoints; none: as the sensor's file has it."""
-    source: str | None = None
-    """simulated or external; None: what the team's robots are."""
+    moves: tuple[tuple[float, float], ...] = ()  # waypoints; none: as the sensor's file has it
+    source: str | None = None  # simulated or external; None: what the team's robots are
 
 
 class ObserverReport(msgspec.Struct, frozen=True, kw_only=True):
@@ -57,11 +54,9 @@ class ObserverReport(msgspec.Struct, frozen=True, kw_only=True):
     name: str
     team: str
     seconds: float
-    position_sigma_m: float | None
-    """At the end; None when it was over before it began."""
+    position_sigma_m: float | None  # at the end; None when it was over before it began
     lost: str
-    unfed: str
-    """Why it has sensed nothing, if so."""
+    unfed: str  # why it has sensed nothing, if so
     sent: tuple[FlowReport, ...]
     heard: tuple[FlowReport, ...]
     counts: dict[str, int]

@@ -21,8 +21,7 @@ class Task(NamedTuple):
 
     name: str
     arguments: tuple[str, ...]
-    identity: Identity
-    """Whose keys it needs in a secured team."""
+    identity: Identity  # whose keys it needs in a secured team
     on_restart: tuple[str, ...] = ()
 
 

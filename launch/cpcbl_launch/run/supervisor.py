@@ -22,8 +22,7 @@ class ProcessSpec(NamedTuple):
 
     name: str
     command: tuple[str, ...]
-    on_restart: tuple[str, ...] = ()
-    """Added to the command from the second start on."""
+    on_restart: tuple[str, ...] = ()  # added to the command from the second start on
 
 
 class Processes(Protocol):

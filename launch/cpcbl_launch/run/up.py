@@ -51,18 +51,13 @@ class Run(NamedTuple):
     duration_s: float | None
     speed: float = 1.0
     seed: int = 1
-    here: Collection[str] | None = None
-    """The robots to start on this machine; None: all."""
+    here: Collection[str] | None = None  # the robots to start on this machine; None: all
     truth: Mapping[str, Floats] = MappingProxyType({})
     left_out: Mapping[str, str] = MappingProxyType({})
-    epoch_ns: int | None = None
-    """Robot time at the start; None: now."""
-    folder: Path | None = None
-    """Where processes write their logs; None: a temporary folder."""
-    picture: Path | None = None
-    """The picture of the run to write (PNG or SVG)."""
-    record: Path | None = None
-    """The recording of the run to write (MCAP)."""
+    epoch_ns: int | None = None  # robot time at the start; None: now
+    folder: Path | None = None  # where processes write their logs; None: a temporary folder
+    picture: Path | None = None  # the picture of the run to write (PNG or SVG)
+    record: Path | None = None  # the recording of the run to write (MCAP)
 
 
 class View(Protocol):

@@ -43,8 +43,7 @@ class SimulatedField:
             if settings.source == "simulated"
         }
         self._cameras = _cameras(team, seed)
-        self.skipped_frames = 0
-        """Frames that were due in steps without pictures."""
+        self.skipped_frames = 0  # frames that were due in steps without pictures
         self._landmarks = [
             VisibleObject(n, m.x_m, m.y_m, m.gives) for n, m in team.map.landmarks.items()
         ]

@@ -20,8 +20,8 @@ from cpcbl_launch.reporting.recorder import (
     Report,
     RobotReport,
 )
+from cpcbl_launch.reporting.statuses import distrust_text, trust_remarks
 from cpcbl_launch.reporting.tables import number, percent, short, table
-from cpcbl_launch.reporting.trust_report import distrust_text, trust_remarks
 from cpcbl_launch.run.observer import ObserverReport
 from cpcbl_launch.run.processes import ROBOT
 from cpcbl_launch.run.supervisor import Processes

@@ -7,7 +7,7 @@ import pytest
 from rich.console import Console
 
 from cpcbl_launch.reporting.recorder import Recorder, Report
-from cpcbl_launch.reporting.trust_report import (
+from cpcbl_launch.reporting.statuses import (
     TrustReport,
     distrust_text,
     trust_remarks,

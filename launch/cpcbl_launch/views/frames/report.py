@@ -21,8 +21,7 @@ class SightingReport(msgspec.Struct, frozen=True, kw_only=True):
     range_sigma_m: float | None
     bearing_deg: float | None
     bearing_sigma_deg: float | None
-    heading_deg: float | None
-    """Heading of a teammate in the robot's frame."""
+    heading_deg: float | None  # heading of a teammate in the robot's frame
     heading_sigma_deg: float | None
 
 
@@ -30,10 +29,8 @@ class FrameReport(msgspec.Struct, frozen=True, kw_only=True):
     """One frame of a robot."""
 
     robot: str
-    frame: str
-    """Its stamp (ns), or the picture's file."""
-    picture: str
-    """The annotated picture that was written; empty if there is none."""
+    frame: str  # its stamp (ns), or the picture's file
+    picture: str  # the annotated picture that was written; empty if there is none
     found: tuple[SightingReport, ...]
     unclear: tuple[UnclearObject, ...]
 

@@ -6,10 +6,14 @@ from rich.console import Console, Group
 from rich.table import Table
 from rich.text import Text
 
-from cpcbl_launch.reporting.flows import FlowReport, SpendingReport, are_limits_kept
 from cpcbl_launch.reporting.recorder import Report, RobotReport
+from cpcbl_launch.reporting.statuses import (
+    FlowReport,
+    SpendingReport,
+    are_limits_kept,
+    distrust_text,
+)
 from cpcbl_launch.reporting.tables import number, short, table
-from cpcbl_launch.reporting.trust_report import distrust_text
 from cpcbl_launch.views.live import LiveView
 from cpcbl_launch.views.traffic.watch import CURRENT_HELP_NS, RATES_NS, HelpLink, LiveRobot, Traffic
 

@@ -14,8 +14,14 @@ from typing import NamedTuple, Protocol
 
 import msgspec
 
-from cpcbl_launch.reporting.flows import FlowReport, SpendingReport, summed_flows, summed_spending
-from cpcbl_launch.reporting.trust_report import TrustReport, trust_reports
+from cpcbl_launch.reporting.statuses import (
+    FlowReport,
+    SpendingReport,
+    TrustReport,
+    summed_flows,
+    summed_spending,
+    trust_reports,
+)
 from cpcbl_transport.bus import Bus
 from cpcbl_transport.decoding import Received, Subscriber
 from cpcbl_transport.messages import Flow, Status
@@ -35,8 +41,7 @@ class LiveFlow(FlowReport, frozen=True, kw_only=True):
 
     messages_per_s: float | None
     bytes_per_s: float | None
-    at_present: bool
-    """Whether the latest message is no older than 3 s."""
+    at_present: bool  # whether the latest message is no older than 3 s
 
 
 class LiveRobot(msgspec.Struct, frozen=True, kw_only=True):
@@ -45,16 +50,13 @@ class LiveRobot(msgspec.Struct, frozen=True, kw_only=True):
     tier: int
     position_sigma_m: float
     lost: str
-    silent_s: float
-    """Real time since that status."""
+    silent_s: float  # real time since that status
     away: bool
-    announced: int
-    """Tokens on `alive/*`: one at first, one a change of tier."""
+    announced: int  # tokens on `alive/*`: one at first, one a change of tier
     sent: tuple[LiveFlow, ...]
     heard: tuple[LiveFlow, ...]
     spending: tuple[SpendingReport, ...]
-    trust: tuple[TrustReport, ...] = ()
-    """What it makes of teammates."""
+    trust: tuple[TrustReport, ...] = ()  # what it makes of teammates
 
 
 class HelpLink(msgspec.Struct, frozen=True, kw_only=True):
@@ -62,8 +64,7 @@ class HelpLink(msgspec.Struct, frozen=True, kw_only=True):
 
     helper: str
     helped: str
-    topic: str
-    """fix or belief"""
+    topic: str  # fix or belief
     messages_per_s: float | None
 
 
@@ -71,16 +72,12 @@ class Traffic(msgspec.Struct, frozen=True, kw_only=True):
     """What `traffic --json` writes. Robots are in the order of their tiers, the best first."""
 
     team: str
-    watched_s: float
-    """Real time."""
+    watched_s: float  # real time
     robots: dict[str, LiveRobot]
-    never_heard: tuple[str, ...]
-    """Robots of the team file that have not sent a status."""
+    never_heard: tuple[str, ...]  # robots of the team file that have not sent a status
     help: tuple[HelpLink, ...]
-    guests: tuple[str, ...] = ()
-    """Robots that the team file, where there is one, does not name."""
-    refused: dict[str, int] = {}
-    """What came on `status/*` and could not be used, by reason."""
+    guests: tuple[str, ...] = ()  # robots that the team file, where there is one, does not name
+    refused: dict[str, int] = {}  # what came on `status/*` and could not be used, by reason
 
 
 class Arrival(NamedTuple):
@@ -200,12 +197,10 @@ class WatchRequest(NamedTuple):
     """Which team is watched, and how long."""
 
     team: str
-    known: Collection[str]
-    """The robots that should be there, as far as one knows."""
+    known: Collection[str]  # the robots that should be there, as far as one knows
     link: Link
     duration_s: float = math.inf
-    wait_s: float = 5.0
-    """For the router."""
+    wait_s: float = 5.0  # for the router
 
 
 def watch_team(watch: WatchRequest, view: View, stop: Callable[[], bool]) -> Traffic:

@@ -3,7 +3,7 @@
 import pytest
 from support.traffic import flow, recorded, shown, status
 
-from cpcbl_launch.reporting.flows import (
+from cpcbl_launch.reporting.statuses import (
     SpendingReport,
     are_limits_kept,
     summed_flows,

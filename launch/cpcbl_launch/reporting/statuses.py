@@ -1,0 +1,120 @@
+"""What the statuses of a robot's processes come to, for reports and people: traffic and trust."""
+
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import chain
+
+import msgspec
+
+from cpcbl_transport.messages import Flow, Spending, Status, Trust
+
+
+class FlowReport(msgspec.Struct, frozen=True, kw_only=True):
+    """Help of one kind from or for one teammate; bytes are those on the sender's link."""
+
+    topic: str  # fix or belief
+    peer: str  # empty where it is for all who listen
+    messages: int
+    bytes: int
+    over_budget: int
+    worthless: int
+    silent: int
+
+
+class SpendingReport(msgspec.Struct, frozen=True, kw_only=True):
+    """A limit, and how near the robot came to it.
+
+    A restarted process does not know what the one before it sent. It therefore assumes that all
+    windows are fully spent.
+    """
+
+    unit: str  # bytes or messages
+    window_s: float  # 0: of the match, earned so far
+    allowed: float
+    most: float  # the most within one window
+
+    @property
+    def is_kept(self) -> bool:
+        return self.most <= self.allowed * (1.0 + 1e-9)
+
+
+class TrustReport(msgspec.Struct, frozen=True, kw_only=True):
+    """What a robot makes of a teammate, by the robot's last status."""
+
+    peer: str
+    reason: str
+    """Why nothing that it says is used: biased, frozen, jumps, overconfident, outvoted, clock;
+    empty while it is believed."""
+    quarantines: int  # how often, since the robot's process started
+    unconfirmed: bool
+    """No other teammate confirmed or contradicted it, so that a bias could not be detected."""
+    late_s: float  # the least time from stamp to arrival; below zero the teammate's clock is ahead
+
+
+COUNTS = ("messages", "bytes", "over_budget", "worthless", "silent")
+
+
+def summed_flows(processes: Iterable[Iterable[Flow]]) -> tuple[FlowReport, ...]:
+    """By topic and peer, over the processes that a robot has had."""
+    sums: defaultdict[tuple[str, str], Counter[str]] = defaultdict(Counter)
+    for flow in chain.from_iterable(processes):
+        sums[flow.topic, flow.peer].update({name: getattr(flow, name) for name in COUNTS})
+    return tuple(
+        FlowReport(topic=topic, peer=peer, **total) for (topic, peer), total in sorted(sums.items())
+    )
+
+
+def summed_spending(processes: Iterable[Iterable[Spending]]) -> tuple[SpendingReport, ...]:
+    """Of windows the fullest one, of a match's messages the sum."""
+    limits: dict[tuple[str, float], tuple[float, float]] = {}
+    for s in chain.from_iterable(processes):
+        key = (s.unit, s.window_s)
+        allowed, most = limits.get(key, (0.0, 0.0))
+        if s.window_s:
+            limits[key] = max(allowed, s.allowed), max(most, s.most)
+        else:
+            limits[key] = allowed + s.allowed, most + s.most
+    return tuple(
+        SpendingReport(unit=unit, window_s=window_s, allowed=allowed, most=most)
+        for (unit, window_s), (allowed, most) in limits.items()
+    )
+
+
+def are_limits_kept(spendings: Iterable[SpendingReport]) -> bool | None:
+    """Whether every limit held; None where there is none."""
+    held = [s.is_kept for s in spendings]
+    return all(held) if held else None
+
+
+def trust_reports(statuses: Sequence[Status]) -> tuple[TrustReport, ...]:
+    """By the last status of the robot's last process; quarantines of all of them."""
+    quarantines = Counter[str]()
+    for trust in chain.from_iterable(status.trust for status in statuses):
+        quarantines[trust.peer] += trust.quarantines
+    last = [
+        msgspec.convert(trust, TrustReport, from_attributes=True)
+        for trust in (statuses[-1].trust if statuses else ())
+    ]
+    return tuple(msgspec.structs.replace(t, quarantines=quarantines[t.peer]) for t in last)
+
+
+def distrust_text(trust: Iterable[Trust | TrustReport]) -> str:
+    """`distrusts west (biased), r4 (clock 0.45 s ahead)`; empty where all are believed."""
+    named = [f"{t.peer} ({_reason_text(t)})" for t in trust if t.reason]
+    return f"distrusts {', '.join(named)}" if named else ""
+
+
+def _reason_text(t: Trust | TrustReport) -> str:
+    if t.reason != "clock":
+        return t.reason
+    return f"clock {-t.late_s:.2f} s ahead" if t.late_s < 0.0 else f"{t.late_s:.2f} s late"
+
+
+def trust_remarks(robot: str, trust: Iterable[TrustReport]) -> Iterator[str]:
+    """What a report says of it, in words."""
+    for t in trust:
+        times = f"{t.quarantines} times" if t.quarantines != 1 else "once"
+        if t.reason:
+            yield f"robot {robot} does not believe {t.peer}: {_reason_text(t)}"
+        elif t.quarantines:
+            yield f"robot {robot} did not believe {t.peer} for a time ({times})"
