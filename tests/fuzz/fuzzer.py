@@ -18,8 +18,8 @@ import msgspec
 from fuzz.payloads import hypothesis_payloads, mixed_payloads, valid_payload
 
 from cpcbl_launch.lab.chaos.checks import Check, at_least, equal_to
-from cpcbl_launch.lab.chaos.figures import latest_counts
 from cpcbl_launch.lab.chaos.scenario import (
+    FaultRun,
     ScenarioOptions,
     ScenarioResult,
     checks_recovered,
@@ -156,11 +156,12 @@ def fuzz(options: ScenarioOptions, per_key: int = PER_KEY) -> ScenarioResult:
             _traffic_exit(team),
         )
         final = final._replace(field=_field_counts(team), tracebacks=team.tracebacks())
-        notes, robots = team.run_log, team.robots
+        run = FaultRun(team.run_log, team.robots, "", from_s, until_s, until_s)
+        window = run.log, run.robots, from_s, until_s
         checks = [
             *fuzz_checks(sent, final),
-            *checks_unaffected(notes, robots, from_s, until_s, most_silent_s=2.0, who="team's"),
-            *checks_recovered(notes, robots, from_s, until_s),
+            *checks_unaffected(*window, most_silent_s=2.0, who="team's"),
+            *checks_recovered(run, from_s),
         ]
         return ScenarioResult(checks, (_by_reason(final.victim),))
 
@@ -269,7 +270,7 @@ class Fuzzer:
 
     def victim_counts(self) -> Counter[str]:
         """The victim's counts."""
-        return latest_counts(self._team.run_log, VICTIM)
+        return self._team.run_log.latest_counts(VICTIM)
 
     def _key(self, topic: Topic) -> str:
         robot = VICTIM if topic in (topics.FIX, *topics.INPUTS) else MATE

@@ -1,16 +1,18 @@
 """Logs of invented runs, with which the checks of scenarios are tested."""
 
 from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
 from cpcbl_launch.lab.chaos.checks import Check
 from cpcbl_launch.lab.chaos.run_log import ReceivedStatus, ReceivedTrack, RunLog, TokenEvent
+from cpcbl_launch.lab.chaos.scenario import FaultRun
 from cpcbl_transport.messages import Flow, Status, Track, Trust
 from support.buses import SECOND
 
 EPOCH_NS = 1_000_000 * SECOND
-UNTIL_S = 85.0
+FAULT_S, UNTIL_S = 10.0, 85.0
 TENTHS = tuple(round(0.1 * n, 1) for n in range(int(10 * UNTIL_S)))
 COVARIANCE = (0.01, 0.0, 0.01, 0.0, 0.0, 0.01)
 
@@ -31,6 +33,7 @@ def tracks_of(
     return [
         ReceivedTrack(
             at_s + late_s,
+            at_s,
             Track(
                 robot,
                 EPOCH_NS + round(at_s * SECOND),
@@ -100,6 +103,18 @@ def run_log_of(
     for one in statuses:
         received.setdefault(one.status.robot, []).append(one)
     return RunLog(EPOCH_NS, by_robot, received, tuple(tokens), rows)
+
+
+def run_of(
+    log: RunLog,
+    robot: str,
+    healed_s: float,
+    end_s: float = UNTIL_S,
+    fault_s: float = FAULT_S,
+    **more: Any,
+) -> FaultRun:
+    """A run with these times whose robots are those of the log; `more`: its other fields."""
+    return FaultRun(log, list(log.tracks), robot, fault_s, healed_s, end_s, **more)
 
 
 def token_appeared(at_s: float, robot: str, incarnation: str = "1", tier: str = "3") -> TokenEvent:

@@ -1,9 +1,8 @@
 """Teams with keys, and sessions that show them."""
 
-import socket
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from datetime import timedelta
 from pathlib import Path
 
@@ -75,19 +74,6 @@ def with_credentials(
 class SealedRelay(Relay):
     """Between a client and a router like any relay; cannot tell what passes, only how much."""
 
-    def __init__(self, endpoint: str) -> None:
-        self._protocol, where = endpoint.split("/")
-        super().__init__(f"tcp/{where}")
-
-    @property
-    def endpoint(self) -> str:
-        return super().endpoint.replace("tcp/", f"{self._protocol}/")
-
-    def _pass_on(self, source: socket.socket, sink: socket.socket, seen: list[Batch]) -> None:
-        with suppress(OSError):  # either side may leave at any time
-            while data := source.recv(65_536):
-                seen.append(Batch(time.monotonic(), Kind.OTHER, data))
-                sink.sendall(data)
-        for end in (source, sink):
-            with suppress(OSError):
-                end.shutdown(socket.SHUT_RDWR)
+    def observer(self, upward: bool) -> Callable[[bytes], None]:
+        seen = self.up if upward else self.down
+        return lambda data: seen.append(Batch(time.monotonic(), Kind.OTHER, data))

@@ -1,4 +1,4 @@
-"""What is on the wire: a TCP relay that a client dials instead of its router, and that counts.
+"""What is on the wire: the TCP relay of the fault scenarios, here with a count of what passes.
 
 Zenoh's stream is batches, each after its length in two bytes (little endian). A batch is one
 transport message, or a frame: header, sequence number, extensions, then network messages. Read
@@ -7,13 +7,12 @@ network/mod.rs). Network messages of different kinds do not share a batch: decla
 priority that no topic has. Links are not compressed.
 """
 
-import socket
-import threading
 import time
 from collections.abc import Callable, Iterable, Sequence
-from contextlib import suppress
 from enum import StrEnum
 from typing import NamedTuple
+
+from cpcbl_launch.lab.chaos import links
 
 
 class Kind(StrEnum):
@@ -91,64 +90,25 @@ def most_in_window(batches: Sequence[Batch], window_s: float, *kinds: Kind) -> i
     return most
 
 
-class Relay:
+class Relay(links.Relay):
     """Between one client and the router at `endpoint`; what passed is in `up` and `down`.
 
     A batch is put down before it is passed on: who has received something finds it here.
     """
 
-    def __init__(self, endpoint: str) -> None:
-        host, port = endpoint.removeprefix("tcp/").rsplit(":", 1)
-        self._router = (host, int(port))
+    def __init__(self, router: str) -> None:
+        super().__init__(router)
         self.up: list[Batch] = []
         self.down: list[Batch] = []
-        self._open: list[socket.socket] = []
-        self._threads: list[threading.Thread] = []
 
-    @property
-    def endpoint(self) -> str:
-        """Where the client is to dial."""
-        return f"tcp/127.0.0.1:{self._listener.getsockname()[1]}"
+    def observer(self, upward: bool) -> Callable[[bytes], None]:
+        seen, rest = (self.up if upward else self.down), b""
 
-    def __enter__(self) -> "Relay":
-        self._listener = socket.create_server(("127.0.0.1", 0))
-        self._start(self._accept)
-        return self
+        def observe(data: bytes) -> None:
+            nonlocal rest
+            rest = put_down(rest + data, seen)
 
-    def __exit__(self, *_: object) -> None:
-        for end in (self._listener, *self._open):
-            with suppress(OSError):  # its other side may be gone
-                end.shutdown(socket.SHUT_RDWR)
-        for thread in self._threads:
-            thread.join()
-        for end in (self._listener, *self._open):
-            end.close()
-
-    def _start(self, target: Callable[..., None], *arguments: object) -> None:
-        thread = threading.Thread(target=target, args=arguments, daemon=True)
-        self._threads.append(thread)
-        thread.start()
-
-    def _accept(self) -> None:
-        with suppress(OSError):  # the listener is shut down at the end
-            while True:
-                client, _ = self._listener.accept()
-                router = socket.create_connection(self._router)
-                self._open += (client, router)
-                for end in (client, router):
-                    end.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-                self._start(self._pass_on, client, router, self.up)
-                self._start(self._pass_on, router, client, self.down)
-
-    def _pass_on(self, source: socket.socket, sink: socket.socket, seen: list[Batch]) -> None:
-        rest = b""
-        with suppress(OSError):  # either side may leave at any time
-            while data := source.recv(65_536):
-                rest = put_down(rest + data, seen)
-                sink.sendall(data)
-        for end in (source, sink):
-            with suppress(OSError):
-                end.shutdown(socket.SHUT_RDWR)
+        return observe
 
 
 def put_down(stream: bytes, seen: list[Batch]) -> bytes:

@@ -11,16 +11,6 @@ from support.chaos import (
 )
 
 from cpcbl_launch.lab.chaos.checks import ChaosReport, Check, Outcome, report_data
-from cpcbl_launch.lab.chaos.figures import (
-    counts_between,
-    localized_after_s,
-    longest_track_gap_s,
-    position_rmse_m,
-    reported_lost_after_s,
-    restarted_after_s,
-    token_gone_after_s,
-    track_delay_s,
-)
 
 AT_S = 10.0
 GOOD = run_log_of([tracks_of("a"), tracks_of("b")])
@@ -78,8 +68,8 @@ def test_a_robot_is_gone_when_its_last_token_is() -> None:
         token_disappeared(9.1, "a"),
         token_disappeared(10.5, "a", tier="4"),
     ]
-    assert token_gone_after_s(run_log_of([], tokens), "a", AT_S) == pytest.approx(0.5)
-    assert token_gone_after_s(run_log_of([], tokens[:3]), "a", AT_S) is None
+    assert run_log_of([], tokens).token_gone_after_s("a", AT_S) == pytest.approx(0.5)
+    assert run_log_of([], tokens[:3]).token_gone_after_s("a", AT_S) is None
 
 
 def test_a_robot_is_back_with_another_process() -> None:
@@ -89,35 +79,35 @@ def test_a_robot_is_back_with_another_process() -> None:
         token_appeared(12.0, "a", "2"),
         token_appeared(11.5, "b", "2"),
     ]
-    assert restarted_after_s(run_log_of([], tokens), "a", AT_S, "1") == pytest.approx(2.0)
-    assert restarted_after_s(run_log_of([], tokens[:2]), "a", AT_S, "1") is None
+    assert run_log_of([], tokens).token_back_after_s("a", AT_S, "1") == pytest.approx(2.0)
+    assert run_log_of([], tokens[:2]).token_back_after_s("a", AT_S, "1") is None
 
 
 def test_a_robot_is_localized_when_it_stays_correct_for_a_second() -> None:
     flickers = tracks_of("a", lambda s: 1.0 if s < 12.0 or 12.5 < s < 14.0 else 0.1)
-    assert localized_after_s(run_log_of([flickers]), "a", AT_S, 0.3) == pytest.approx(4.0)
+    assert run_log_of([flickers]).localized_after_s("a", AT_S, 0.3) == pytest.approx(4.0)
     lost = tracks_of("a", lost=(0.0, 15.0))
-    assert localized_after_s(run_log_of([lost]), "a", AT_S, 0.3) == pytest.approx(5.0)
-    assert reported_lost_after_s(run_log_of([lost]), "a", AT_S) == pytest.approx(0.0)
+    assert run_log_of([lost]).localized_after_s("a", AT_S, 0.3) == pytest.approx(5.0)
+    assert run_log_of([lost]).reported_lost_after_s("a", AT_S) == pytest.approx(0.0)
     said = [status_at("a", 9.5, {"lost": 1}), status_at("a", 10.5, {"lost": 2})]
-    assert reported_lost_after_s(
-        run_log_of([tracks_of("a")], (), said), "a", AT_S
-    ) == pytest.approx(0.5)
-    assert reported_lost_after_s(run_log_of([tracks_of("a")], (), said[:1]), "a", AT_S) is None
+    assert run_log_of([tracks_of("a")], (), said).reported_lost_after_s("a", AT_S) == pytest.approx(
+        0.5
+    )
+    assert run_log_of([tracks_of("a")], (), said[:1]).reported_lost_after_s("a", AT_S) is None
     never = tracks_of("a", lambda s: 1.0)
-    assert localized_after_s(run_log_of([never]), "a", AT_S, 0.3) is None
+    assert run_log_of([never]).localized_after_s("a", AT_S, 0.3) is None
 
 
 def test_gap_error_and_delay_are_those_of_the_window() -> None:
     notes = run_log_of(
         [tracks_of("a", lambda s: 3.0 if s >= 20.0 else 0.3, (12.0, 15.0), late_s=0.2)]
     )
-    assert longest_track_gap_s(notes, "a", AT_S, 20.0) == pytest.approx(3.1, abs=0.11)
-    assert longest_track_gap_s(notes, "a", 16.0, 20.0) == pytest.approx(0.1, abs=0.11)
-    assert longest_track_gap_s(notes, "nobody", 16.0, 20.0) == pytest.approx(4.0)
-    assert position_rmse_m(notes, "a", AT_S, 20.0) == pytest.approx(0.3)
-    assert position_rmse_m(notes, "a", 20.0) == pytest.approx(3.0)
-    assert track_delay_s(notes, "a", AT_S, 20.0) == pytest.approx(0.2)
+    assert notes.longest_track_gap_s("a", AT_S, 20.0) == pytest.approx(3.1, abs=0.11)
+    assert notes.longest_track_gap_s("a", 16.0, 20.0) == pytest.approx(0.1, abs=0.11)
+    assert notes.longest_track_gap_s("nobody", 16.0, 20.0) == pytest.approx(4.0)
+    assert notes.position_rmse_m("a", AT_S, 20.0) == pytest.approx(0.3)
+    assert notes.position_rmse_m("a", 20.0) == pytest.approx(3.0)
+    assert notes.track_delay_s("a", AT_S, 20.0) == pytest.approx(0.2)
 
 
 def test_counts_are_those_of_the_window_over_all_processes() -> None:
@@ -127,4 +117,4 @@ def test_counts_are_those_of_the_window_over_all_processes() -> None:
         status_at("a", 13.0, {"garbage": 3}, incarnation="2"),
         status_at("a", 30.0, {"garbage": 99}, incarnation="2"),
     ]
-    assert counts_between(run_log_of([], (), statuses), "a", AT_S, 20.0)["garbage"] == 2 + 3
+    assert run_log_of([], (), statuses).counts_between("a", AT_S, 20.0)["garbage"] == 2 + 3

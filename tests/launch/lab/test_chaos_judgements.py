@@ -2,8 +2,8 @@
 
 import pytest
 from support.chaos import (
-    UNTIL_S,
     run_log_of,
+    run_of,
     status_at,
     token_appeared,
     token_disappeared,
@@ -12,8 +12,13 @@ from support.chaos import (
 )
 
 from cpcbl_launch.lab.chaos.files import CommandResult, full_disk_checks, read_only_checks
-from cpcbl_launch.lab.chaos.inputs import duplicates_checks, flood_checks
-from cpcbl_launch.lab.chaos.network import bad_link_checks, cut_link_checks, partition_checks
+from cpcbl_launch.lab.chaos.network import (
+    bad_link_checks,
+    cut_link_checks,
+    duplicates_checks,
+    flood_checks,
+    partition_checks,
+)
 from cpcbl_launch.lab.chaos.processes import (
     freeze_checks,
     kill_checks,
@@ -45,16 +50,16 @@ KILLED = [
 
 def test_a_killed_robot() -> None:
     good = run_log_of([tracks_of("a", silent=(10.0, 11.0)), tracks_of("b")], KILLED)
-    assert not unmet_checks(kill_checks(good, "a", AT_S, "1", ["b"], 13.0, UNTIL_S))
+    assert not unmet_checks(kill_checks(run_of(good, "a", 13.0, incarnation="1")))
     never_back = run_log_of([tracks_of("a", silent=(10.0, 99.0)), tracks_of("b")], KILLED[:2])
-    assert unmet_checks(kill_checks(never_back, "a", AT_S, "1", ["b"], 13.0, UNTIL_S)) >= {
+    assert unmet_checks(kill_checks(run_of(never_back, "a", 13.0, incarnation="1"))) >= {
         "its token disappeared after",
         "a new process started after",
         "from then until it was localized",
         "RMSE afterwards, worst robot",
     }
     others_stop = run_log_of([tracks_of("a"), tracks_of("b", silent=(10.5, 12.5))], KILLED)
-    assert unmet_checks(kill_checks(others_stop, "a", AT_S, "1", ["b"], 13.0, UNTIL_S)) == {
+    assert unmet_checks(kill_checks(run_of(others_stop, "a", 13.0, incarnation="1"))) == {
         "others' longest gap between tracks"
     }
 
@@ -64,9 +69,9 @@ def test_a_killed_router() -> None:
     said = [status_at("a", 13.0), status_at("a", 20.0, {"messages_received": 30})]
     tracks = [tracks_of("a", silent=(10.0, 12.0)), tracks_of("b", silent=(10.0, 12.0))]
     good = run_log_of(tracks, tokens, said)
-    assert not unmet_checks(kill_router_checks(good, ["a", "b"], AT_S, 13.0, 21.0))
+    assert not unmet_checks(kill_router_checks(run_of(good, "router", 13.0, 21.0)))
     bad = run_log_of([tracks_of("a", silent=(10.0, 18.0)), tracks[1]], tokens[:1], said[:1])
-    assert unmet_checks(kill_router_checks(bad, ["a", "b"], AT_S, 13.0, 21.0)) == {
+    assert unmet_checks(kill_router_checks(run_of(bad, "router", 13.0, 21.0))) == {
         "longest gap between tracks",
         "robots with a token at the new router",
         "help received in the 8 s after",
@@ -75,10 +80,10 @@ def test_a_killed_router() -> None:
 
 def test_a_killed_field() -> None:
     wrong_for_a_while = [tracks_of(n, lambda s: 2.0 if 11.0 < s < 14.0 else 0.02) for n in "ab"]
-    good = kill_field_checks(run_log_of(wrong_for_a_while), ["a", "b"], AT_S, 11.0, 16.0, UNTIL_S)
+    good = kill_field_checks(run_of(run_log_of(wrong_for_a_while), "field", 16.0, restarted_s=11.0))
     assert not unmet_checks(good)
     stuck = run_log_of([tracks_of("a"), tracks_of("b", lambda s: 2.0 if s > 11.0 else 0.02)])
-    assert unmet_checks(kill_field_checks(stuck, ["a", "b"], AT_S, 11.0, 16.0, UNTIL_S)) >= {
+    assert unmet_checks(kill_field_checks(run_of(stuck, "field", 16.0, restarted_s=11.0))) >= {
         "from then until all were localized",
         "RMSE afterwards, worst robot",
     }
@@ -92,13 +97,11 @@ def test_a_frozen_robot() -> None:
         token_appeared(15.2, "a"),
     ]
     tracks = [tracks_of("a", silent=(10.0, 15.0)), tracks_of("b")]
-    assert not unmet_checks(
-        freeze_checks(run_log_of(tracks, tokens), "a", AT_S, 15.0, ["b"], UNTIL_S)
-    )
+    assert not unmet_checks(freeze_checks(run_of(run_log_of(tracks, tokens), "a", 15.0)))
     burst = [h._replace(at_s=15.1) if 10.0 <= h.at_s < 14.0 else h for h in tracks_of("a")]
     led_astray = tracks_of("b", lambda s: 0.8 if 15.0 < s < 17.0 else 0.02)
     bad = run_log_of([sorted(burst, key=lambda h: h.at_s), led_astray], tokens[:2])
-    assert unmet_checks(freeze_checks(bad, "a", AT_S, 15.0, ["b"], UNTIL_S)) == {
+    assert unmet_checks(freeze_checks(run_of(bad, "a", 15.0))) == {
         "its token disappeared after",
         "tracks that arrived more than 1 s late",
         "others' largest error in the 4 s after it woke",
@@ -122,11 +125,14 @@ def test_a_partition() -> None:
     both = [tracks_of("near"), tracks_of("far")]
     helped = [status_at("far", 21.0, heard=[("near", 20.6)])]
     near, far = run_log_of(both, near_tokens), run_log_of(both, far_tokens, helped)
-    times = AT_S, 20.0, UNTIL_S
-    assert not unmet_checks(partition_checks(near, far, ["near"], ["far"], *times))
+    assert not unmet_checks(
+        partition_checks(run_of(near, "far-router", 20.0, far=["far"], far_log=far))
+    )
     late = run_log_of(both, [*near_tokens[:2], token_appeared(26.0, "far")])
     stopped = run_log_of([both[0], tracks_of("far", silent=(11.0, 19.0))], far_tokens)
-    assert unmet_checks(partition_checks(late, stopped, ["near"], ["far"], *times)) == {
+    assert unmet_checks(
+        partition_checks(run_of(late, "far-router", 20.0, far=["far"], far_log=stopped))
+    ) == {
         "far side's longest gap between tracks",
         "from healing to all tokens back",
         "from healing to the first help",
@@ -136,9 +142,9 @@ def test_a_partition() -> None:
 def test_a_cut_link() -> None:
     tokens = [token_appeared(0, "a"), token_disappeared(12.0, "a"), token_appeared(20.5, "a")]
     good = run_log_of([tracks_of("a", silent=(10.0, 20.0)), tracks_of("b")], tokens)
-    assert not unmet_checks(cut_link_checks(good, "a", ["b"], AT_S, 20.0, UNTIL_S))
+    assert not unmet_checks(cut_link_checks(run_of(good, "a", 20.0)))
     bad = run_log_of([tracks_of("a", silent=(10.0, 30.0)), tracks_of("b")], tokens[:1])
-    assert unmet_checks(cut_link_checks(bad, "a", ["b"], AT_S, 20.0, UNTIL_S)) == {
+    assert unmet_checks(cut_link_checks(run_of(bad, "a", 20.0))) == {
         "its token disappeared after",
         "from healing to its token back",
         "from healing until it was localized",
@@ -148,9 +154,9 @@ def test_a_cut_link() -> None:
 def test_an_impaired_link() -> None:
     said = [status_at("a", 9.0), status_at("a", 20.0, {"messages_received": 50})]
     good = run_log_of([tracks_of("a", late_s=0.5), tracks_of("b")], (), said)
-    assert not unmet_checks(bad_link_checks(good, "a", ["b"], AT_S, 25.0, UNTIL_S, 2.0, 1.5))
+    assert not unmet_checks(bad_link_checks(run_of(good, "a", 25.0)))
     bad = run_log_of([tracks_of("a", late_s=3.0), tracks_of("b", late_s=0.9)])
-    assert unmet_checks(bad_link_checks(bad, "a", ["b"], AT_S, 25.0, UNTIL_S, 2.0, 1.5)) == {
+    assert unmet_checks(bad_link_checks(run_of(bad, "a", 25.0))) == {
         "its tracks' delay, 99th percentile",
         "help messages that it received",
         "others' delay, 99th percentile",
@@ -163,18 +169,18 @@ def test_an_impaired_link() -> None:
 def test_duplicates() -> None:
     said = [status_at("a", 9.0), status_at("a", 20.0, {"duplicate": 60, "too_late": 25})]
     good = run_log_of([tracks_of("a"), tracks_of("b")], (), said)
-    assert not unmet_checks(duplicates_checks(good, ["a", "b"], AT_S, 25.0, 300))
-    assert unmet_checks(duplicates_checks(GOOD, ["a", "b"], AT_S, 25.0, 300)) == {
+    assert not unmet_checks(duplicates_checks(run_of(good, "a", 23.0, 25.0, sent=300)))
+    assert unmet_checks(duplicates_checks(run_of(GOOD, "a", 23.0, 25.0, sent=300))) == {
         "counted as duplicate",
         "counted as too late",
     }
 
 
 def test_a_flood() -> None:
-    assert not unmet_checks(flood_checks(GOOD, ["a", "b"], AT_S, 20.0, 30.0, 50_000))
+    assert not unmet_checks(flood_checks(run_of(GOOD, "c", 20.0, 30.0, sent=50_000)))
     said = [status_at("a", 9.0), status_at("a", 20.0, {"messages_received": 5000})]
     bad = run_log_of([tracks_of("a", late_s=2.0), tracks_of("b")], (), said)
-    assert unmet_checks(flood_checks(bad, ["a", "b"], AT_S, 20.0, 30.0, 500)) >= {
+    assert unmet_checks(flood_checks(run_of(bad, "c", 20.0, 30.0, sent=500))) >= {
         "rate of the flood",
         "most received by one robot",
         "others' delay, 99th percentile",
@@ -185,16 +191,18 @@ def test_a_flood() -> None:
 
 TABLE = "errors of position\nnavigator 1\nobserver 1\nscout 1\npatrol 1\n"
 LOST = "".join(f"cpcbl-team: /d/{n}: not written: No space left\n" for n in ("r", "p"))
-OUTPUT = CommandResult(1, "", "cpcbl-team: standard output: not written: No space left on device\n")
+OUTPUT = CommandResult(
+    (), 1, "", "cpcbl-team: standard output: not written: No space left on device\n"
+)
 
 
 def test_a_full_disk() -> None:
     assert not [
         c.what
-        for c in full_disk_checks(CommandResult(1, TABLE, LOST), ("r", "p", "p"), OUTPUT)
+        for c in full_disk_checks(CommandResult((), 1, TABLE, LOST), ("r", "p", "p"), OUTPUT)
         if not c.is_met
     ]
-    silent = CommandResult(0, "", "Traceback (most recent call last)")
+    silent = CommandResult((), 0, "", "Traceback (most recent call last)")
     assert unmet_checks(full_disk_checks(silent, ("r", "p", "p"), OUTPUT)) == {
         "robots in the report on the terminal",
         "lines that name a lost file",
@@ -204,9 +212,9 @@ def test_a_full_disk() -> None:
 
 
 def test_a_read_only_disk() -> None:
-    clear = CommandResult(2, "", "cpcbl-team: --record /d/x: Read-only file system\n")
+    clear = CommandResult((), 2, "", "cpcbl-team: --record /d/x: Read-only file system\n")
     assert not unmet_checks(read_only_checks({"--record": clear}))
-    thrown = CommandResult(1, "", "Traceback (most recent call last)\nOSError\n")
+    thrown = CommandResult((), 1, "", "Traceback (most recent call last)\nOSError\n")
     assert unmet_checks(read_only_checks({"--record": thrown})) == {
         "options refused with one line of error",
         "commands that ended with exit code 2",
@@ -220,9 +228,9 @@ def test_a_read_only_disk() -> None:
 def test_a_kidnapped_robot() -> None:
     found = tracks_of("a", lambda s: 3.02 if s >= 13.0 else 0.02, lost=(10.5, 13.0))
     good = run_log_of([found, tracks_of("b")], jump=("a", AT_S, 3.0))
-    assert not unmet_checks(kidnap_checks(good, "a", ["b"], UNTIL_S))
+    assert not unmet_checks(kidnap_checks(run_of(good, "a", AT_S)))
     never = run_log_of([tracks_of("a"), tracks_of("b")], jump=("a", AT_S, 3.0))
-    assert unmet_checks(kidnap_checks(never, "a", ["b"], UNTIL_S)) == {
+    assert unmet_checks(kidnap_checks(run_of(never, "a", AT_S))) == {
         "it reported that it was lost after",
         "it was localized after",
         "RMSE afterwards, worst robot",
@@ -230,18 +238,22 @@ def test_a_kidnapped_robot() -> None:
     }
     blamed = [status_at("b", 30.0, trust=[("a", "jumps")])]
     distrustful = run_log_of([found, tracks_of("b")], (), blamed, jump=("a", AT_S, 3.0))
-    assert unmet_checks(kidnap_checks(distrustful, "a", ["b"], UNTIL_S)) == {
+    assert unmet_checks(kidnap_checks(run_of(distrustful, "a", AT_S))) == {
         "robots that trust all others at the end"
     }
-    assert "distance of the kidnapping" in unmet_checks(kidnap_checks(GOOD, "a", ["b"], UNTIL_S))
+    assert "distance of the kidnapping" in unmet_checks(kidnap_checks(run_of(GOOD, "a", AT_S)))
 
 
 def test_hidden_landmarks() -> None:
     drifts = tracks_of("a", lambda s: 0.1 if 12.0 <= s < 74.0 else 0.02)
-    good = hidden_landmarks_checks(run_log_of([drifts, tracks_of("b")]), ["a", "b"], UNTIL_S)
+    good = hidden_landmarks_checks(
+        run_of(run_log_of([drifts, tracks_of("b")]), "", 72.0, fault_s=12.0)
+    )
     assert not unmet_checks(good)
     overconfident = tracks_of("a", lambda s: 0.6 if s >= 20.0 else 0.02)
-    bad = hidden_landmarks_checks(run_log_of([overconfident, tracks_of("b")]), ["a", "b"], UNTIL_S)
+    bad = hidden_landmarks_checks(
+        run_of(run_log_of([overconfident, tracks_of("b")]), "", 72.0, fault_s=12.0)
+    )
     assert unmet_checks(bad) == {
         "team's worst RMSE",
         "inside 3 σ while landmarks are hidden",
@@ -255,9 +267,9 @@ def test_wrong_clocks() -> None:
     found = [status_at(n, 5.0, {"clock_off": 30}, trust=[("w", "clock")]) for n in "ab"]
     tracks = [tracks_of("a"), tracks_of("b"), tracks_of("w")]
     good = run_log_of(tracks, (), found)
-    assert not unmet_checks(clock_checks(good, "w", "r", ["a", "b"], AT_S, 30.0))
+    assert not unmet_checks(clock_checks(run_of(good, "w", 30.0, 30.0), "r"))
     unnoticed = run_log_of(tracks, (), [status_at("a", 5.0, trust=[("r", "clock")])])
-    assert unmet_checks(clock_checks(unnoticed, "w", "r", ["a", "b"], AT_S, 30.0)) == {
+    assert unmet_checks(clock_checks(run_of(unnoticed, "w", 30.0, 30.0), "r")) == {
         "robots that report that its clock is wrong",
         "last of these reports at",
         "refused help messages from it",
@@ -270,10 +282,10 @@ def test_a_faulty_robot() -> None:
     said = [status_at(n, 14.0, trust=[("w", "biased")]) for n in "ab"]
     healed = [status_at(n, 40.0, trust=[("w", "")]) for n in "ab"]
     good = run_log_of(tracks, (), [*said, *healed])
-    assert not unmet_checks(faulty_robot_checks(good, "w", ["a", "b"], ["a", "b", "w"], AT_S, 25.0))
+    assert not unmet_checks(faulty_robot_checks(run_of(good, "w", 25.0), ["a", "b"]))
     harmed = [tracks_of("a", lambda s: 0.5), *tracks[1:]]
     bad = run_log_of(harmed, (), [said[0]])
-    assert unmet_checks(faulty_robot_checks(bad, "w", ["a", "b"], ["a", "b", "w"], AT_S, 25.0)) == {
+    assert unmet_checks(faulty_robot_checks(run_of(bad, "w", 25.0), ["a", "b"])) == {
         "robots that quarantined it",
         "quarantined by two robots after",
         "worst RMSE during the fault",
@@ -300,12 +312,11 @@ def test_a_process_life_is_computed_from_its_samples() -> None:
 
 
 def test_a_soak() -> None:
-    times = 0.0, 20.0, 25.0, UNTIL_S
     flat = process_lives([*samples("field", 0.01), *samples("router", 0.0)])
-    assert not unmet_checks(soak_checks(GOOD, ["a", "b"], flat, times, 3, 3, 0))
+    assert not unmet_checks(soak_checks(run_of(GOOD, "", 25.0, fault_s=20.0), flat, 0, 0))
     leaking = [*flat, ProcessLife("robot-a", 400.0, 30.0, 45.0, 2.0, 30)]
     stuck = run_log_of([tracks_of("a"), tracks_of("b", lambda s: 2.0)])
-    assert unmet_checks(soak_checks(stuck, ["a", "b"], leaking, times, 4, 3, 1)) >= {
+    assert unmet_checks(soak_checks(run_of(stuck, "", 25.0, fault_s=20.0), leaking, 1, 1)) >= {
         "processes that ended without being killed",
         "tracebacks in logs",
         "from the last fault until all were localized",
@@ -313,4 +324,6 @@ def test_a_soak() -> None:
         "steepest growth of a process that ran for 300 s",
         "largest growth of the number of open files",
     }
-    assert "largest growth of memory" in unmet_checks(soak_checks(GOOD, ["a"], [], times, 0, 0, 0))
+    assert "largest growth of memory" in unmet_checks(
+        soak_checks(run_of(GOOD, "", 25.0, fault_s=20.0), [], 0, 0)
+    )

@@ -4,16 +4,19 @@ import os
 import secrets
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import NamedTuple
 
 from cpcbl_agents.clock import Clock
-from cpcbl_launch.lab.chaos.figures import latest_counts
-from cpcbl_launch.lab.chaos.network import AFTER_S, CUT_S, partition_checks
+from cpcbl_launch.lab.chaos.network import AFTER_HEALING_S, CUT_S, HEALING_S, partition_checks
 from cpcbl_launch.lab.chaos.run_log import RunLog, RunRecorder
-from cpcbl_launch.lab.chaos.scenario import CannotRunError, ScenarioOptions, ScenarioResult
+from cpcbl_launch.lab.chaos.scenario import (
+    CannotRunError,
+    FaultRun,
+    ScenarioOptions,
+    ScenarioResult,
+)
 from cpcbl_launch.lab.chaos.team import PATIENCE_S, ChaosError
 from cpcbl_launch.run.containers import BASE_IMAGE, BASE_VARIABLE
 from cpcbl_launch.run.containers.docker import (
@@ -39,19 +42,7 @@ BEGINS_S = 20.0  # the demonstration's robots help from 10 s on
 BLIND_M = 1.0  # the blind scout is far from those that know best
 
 
-class _Sites(NamedTuple):
-    project: Project
-    west: RunRecorder
-    east: RunRecorder
-
-    @property
-    def logs(self) -> tuple[RunLog, RunLog]:
-        """The logs of the west and of the east; the truth is published in the west only."""
-        west = self.west.run_log()
-        return west, self.east.run_log()._replace(truth=west.truth)
-
-
-def missing_requirement() -> str:
+def missing_docker() -> str:
     """The missing requirement of containers on this machine; empty if there is none."""
     if checkout() is None:
         return f"needs a checkout, for {SITES} and the image's sources"
@@ -65,41 +56,37 @@ def missing_requirement() -> str:
 
 def partition_containers(options: ScenarioOptions) -> ScenarioResult:
     """Runs `docker network disconnect` for one site's router, then `connect`."""
-    with _sites(options) as sites:
+    with _sites(options) as (project, west, east):
         options.report_progress("starting a team at two sites, in containers")
-        _wait_until(lambda: _helps(sites), "the team did not begin to help")
+        end_s = time.monotonic() + 2.0 * PATIENCE_S
+        while not _helps(west.run_log(), east.run_log()):
+            if time.monotonic() > end_s:
+                raise ChaosError("the team did not begin to help")
+            time.sleep(0.2)
         time.sleep(BEGINS_S)
-        link = f"{sites.project.name}_link"
-        router = sites.project.containers()["router-east"].id
         options.report_progress(f"the sites are apart for {CUT_S:g} s")
-        cut_s = sites.west.now_s
-        command_output(["docker", "network", "disconnect", link, router])
+        ends = [f"{project.name}_link", project.containers()["router-east"].id]
+        cut_s = west.now_s
+        command_output(["docker", "network", "disconnect", *ends])
         time.sleep(CUT_S)
-        command_output(["docker", "network", "connect", link, router])
-        healed_s = sites.west.now_s
+        command_output(["docker", "network", "connect", *ends])
+        healed_s = west.now_s
         options.report_progress("the link between the sites is back")
-        time.sleep(5.0 + AFTER_S)
-        times = cut_s, healed_s, sites.west.now_s
-        return ScenarioResult(partition_checks(*sites.logs, WEST, EAST, *times, most_far_m=BLIND_M))
+        time.sleep(HEALING_S + AFTER_HEALING_S)
+        run = FaultRun(west.run_log(), (*WEST, *EAST), "", cut_s, healed_s, west.now_s, far=EAST)
+        run.far_log = east.run_log()._replace(truth=run.log.truth)  # it is published in the west
+        return ScenarioResult(partition_checks(run, most_far_m=BLIND_M))
 
 
-def _helps(sites: _Sites) -> bool:
+def _helps(west: RunLog, east: RunLog) -> bool:
     """Whether tracks of all robots arrive, and the scout of the east receives help."""
-    west, east = sites.logs
-    heard = {*WEST, *EAST} <= west.tracks.keys() & east.tracks.keys()
-    return heard and latest_counts(east, "scout")["messages_received"] > 20
-
-
-def _wait_until(condition: Callable[[], bool], otherwise: str) -> None:
-    end_s = time.monotonic() + 2.0 * PATIENCE_S
-    while not condition():
-        if time.monotonic() > end_s:
-            raise ChaosError(otherwise)
-        time.sleep(0.2)
+    arrive = {*WEST, *EAST} <= west.tracks.keys() & east.tracks.keys()
+    return arrive and east.latest_counts("scout")["messages_received"] > 20
 
 
 @contextmanager
-def _sites(options: ScenarioOptions) -> Iterator[_Sites]:
+def _sites(options: ScenarioOptions) -> Iterator[tuple[Project, RunRecorder, RunRecorder]]:
+    """(the running containers, what is received in the west, and in the east)."""
     top = checkout()
     assert top is not None
     with ExitStack() as stack:
@@ -113,12 +100,11 @@ def _sites(options: ScenarioOptions) -> Iterator[_Sites]:
         project = Project(compose_program(), f"cpcbl-chaos-{secrets.token_hex(3)}", file)
         stack.callback(project.down)
         project.up()
-        takers, clock = [], Clock.wall()
-        for endpoint in endpoints:
-            bus = stack.enter_context(open_bus("demo", [endpoint]))
-            takers.append(RunRecorder(clock))
-            takers[-1].listen(bus)
-        yield _Sites(project, *takers)
+        clock = Clock.wall()
+        west, east = RunRecorder(clock), RunRecorder(clock)
+        for recorder, endpoint in zip((west, east), endpoints, strict=True):
+            recorder.listen(stack.enter_context(open_bus("demo", [endpoint])))
+        yield project, west, east
 
 
 def _image(options: ScenarioOptions) -> str:

@@ -5,25 +5,17 @@ import shlex
 import subprocess
 import tempfile
 from pathlib import Path
-from typing import NamedTuple
 
 from cpcbl_launch.lab.chaos.checks import Check, at_least, equal_to
 from cpcbl_launch.lab.chaos.scenario import ScenarioOptions, ScenarioResult
 from cpcbl_launch.run.processes import PROGRAM
 
-RUN_S = 6.0
 PATIENCE_S = 120.0
 DISK = "64k"  # less than a recording, a picture or a report of a run
+UP = ("up", "--duration", 6.0)
 READ_ONLY = ("--record", "--report", "--picture", "--logs")
 
-
-class CommandResult(NamedTuple):
-    """How a command ended: its exit code and outputs."""
-
-    code: int
-    stdout: str
-    stderr: str
-    """On standard error."""
+CommandResult = subprocess.CompletedProcess[str]
 
 
 def disk_full(options: ScenarioOptions) -> ScenarioResult:
@@ -33,9 +25,9 @@ def disk_full(options: ScenarioOptions) -> ScenarioResult:
         options.report_progress(f"running `up` on a disk of {DISK}B")
         record, report, picture = (disk / n for n in names)
         words = ["--record", record, "--report", report, "--picture", picture]
-        ended = _on_disk(f"size={DISK}", disk, "up", *_short(), *words, "--logs", disk / "logs")
+        ended = _on_disk(f"size={DISK}", disk, *UP, *words, "--logs", disk / "logs")
         options.report_progress("running `up --json` with a full device as standard output")
-        full = _run("sh", "-c", f"{_command('up', *_short(), '--json')} > /dev/full")
+        full = _run("sh", "-c", f"{_command(*UP, '--json')} > /dev/full")
     return ScenarioResult(full_disk_checks(ended, names, full))
 
 
@@ -43,22 +35,18 @@ def full_disk_checks(
     ended: CommandResult, names: tuple[str, ...], full: CommandResult
 ) -> list[Check]:
     """The run continues to its report; one line names each lost file; the exit code is 1."""
-    lines = [
-        sum(f"{name}: not written: " in line for line in ended.stderr.splitlines())
-        for name in names
-    ]
+    lost = sum(
+        f"{name}: not written: " in line for name in names for line in ended.stderr.splitlines()
+    )
+    full_lines = full.stderr.count("standard output: not written: ")
     return [
         at_least("robots in the report on the terminal", _robots(ended.stdout), 4),
-        equal_to("lines that name a lost file", sum(lines), 3),
-        _exit(ended.code, 1),
-        *_clean(ended),
-        equal_to(
-            "lines that report the full standard output",
-            full.stderr.count("standard output: not written: "),
-            1,
-        ),
-        _exit(full.code, 1),
-        *_clean(full),
+        equal_to("lines that name a lost file", lost, 3),
+        equal_to("exit code", ended.returncode, 1),
+        _no_traceback(ended),
+        equal_to("lines that report the full standard output", full_lines, 1),
+        equal_to("exit code", full.returncode, 1),
+        _no_traceback(full),
     ]
 
 
@@ -69,7 +57,7 @@ def read_only(options: ScenarioOptions) -> ScenarioResult:
         for option in READ_ONLY:
             options.report_progress(f"running `up {option}` on a read-only file system")
             path = disk / ("run.png" if option == "--picture" else "written")
-            ended[option] = _on_disk("ro", disk, "up", *_short(), option, path)
+            ended[option] = _on_disk("ro", disk, *UP, option, path)
         options.report_progress("running `calibrate --output` on a read-only file system")
         words = ("calibrate", "run.mcap", "--output", disk / "new.toml")
         ended["--output"] = _on_disk("ro", disk, *words)
@@ -78,36 +66,26 @@ def read_only(options: ScenarioOptions) -> ScenarioResult:
 
 def read_only_checks(ended: dict[str, CommandResult]) -> list[Check]:
     """One line names the option and the file before anything starts; the exit code is 2."""
-    clear = [
+    clear = sum(
         sum(f"cpcbl-team: {option} " in line for line in e.stderr.splitlines()) == 1
         for option, e in ended.items()
-    ]
-    codes = [e.code == 2 for e in ended.values()]
-    n = len(ended)
+    )
+    refused = sum(e.returncode == 2 for e in ended.values())
     return [
-        at_least("options refused with one line of error", sum(clear), n),
-        at_least("commands that ended with exit code 2", sum(codes), n),
-        *(check for e in ended.values() for check in _clean(e) if not check.is_met),
+        at_least("options refused with one line of error", clear, len(ended)),
+        at_least("commands that ended with exit code 2", refused, len(ended)),
+        *(check for check in map(_no_traceback, ended.values()) if not check.is_met),
     ]
 
 
-def _exit(code: int, due: int) -> Check:
-    return equal_to("exit code", code, due)
-
-
-def _clean(ended: CommandResult) -> list[Check]:
-    return [equal_to("tracebacks", ended.stderr.count("Traceback"), 0)]
+def _no_traceback(ended: CommandResult) -> Check:
+    return equal_to("tracebacks", ended.stderr.count("Traceback"), 0)
 
 
 def _robots(out: str) -> int:
     """The number of robots in the printed table of errors."""
-    names = ("navigator", "observer", "scout", "patrol")
     table = out.partition("errors of position")[2]
-    return sum(name in table for name in names)
-
-
-def _short() -> tuple[object, ...]:
-    return ("--duration", RUN_S)
+    return sum(name in table for name in ("navigator", "observer", "scout", "patrol"))
 
 
 def _command(*words: object) -> str:
@@ -121,11 +99,10 @@ def _on_disk(options: str, at: Path, *words: object) -> CommandResult:
 
 
 def _run(*words: str) -> CommandResult:
-    done = subprocess.run(words, capture_output=True, text=True, timeout=PATIENCE_S, check=False)
-    return CommandResult(done.returncode, done.stdout, done.stderr)
+    return subprocess.run(words, capture_output=True, text=True, timeout=PATIENCE_S, check=False)
 
 
-def missing_requirement() -> str:
+def missing_mount() -> str:
     """The missing requirement for mounting a disk; empty if there is none."""
     if os.geteuid() != 0:
         return "needs root, to mount a small disk"

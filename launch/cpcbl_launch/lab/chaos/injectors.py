@@ -27,7 +27,7 @@ class Echo:
         self._publishers: dict[str, Publisher] = {}
         self._due: list[tuple[float, int, str, bytes]] = []
         self._lock, self._stop = threading.Lock(), threading.Event()
-        self.copies = 0
+        self.sent = 0
 
     def __enter__(self) -> "Echo":
         self._handles = [self._bus.subscribe(key, self._receive) for key in self._keys]
@@ -49,19 +49,15 @@ class Echo:
 
     def _send_due(self) -> None:
         while not self._stop.wait(0.01):
-            now_s = time.monotonic()
+            due = []
             with self._lock:
-                due = []
-                while self._due and self._due[0][0] <= now_s:
+                while self._due and self._due[0][0] <= time.monotonic():
                     due.append(heapq.heappop(self._due))
             for _, _, key, payload in due:
-                self._put(key, payload)
-
-    def _put(self, key: str, payload: bytes) -> None:
-        if key not in self._publishers:
-            self._publishers[key] = self._bus.publisher(key, topics.Qos.FRESH)
-        self._publishers[key].put(payload)
-        self.copies += 1
+                if key not in self._publishers:
+                    self._publishers[key] = self._bus.publisher(key, topics.Qos.FRESH)
+                self._publishers[key].put(payload)
+                self.sent += 1
 
 
 def send_flood(team: str, endpoint: str, robot: str, targets: list[str], stop: StopSignal) -> int:

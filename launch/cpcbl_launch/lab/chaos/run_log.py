@@ -1,31 +1,40 @@
-"""The log of a team that runs under faults: tracks, statuses, tokens and the ground truth.
+"""The log of a team that runs under faults, and the figures that are computed from it.
 
 All times are seconds of robot time since the run's epoch: those of stamps and those of arrivals.
 """
 
 import threading
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from itertools import pairwise
 from types import MappingProxyType
 from typing import NamedTuple, TypeVar
 
-import msgspec
 import numpy as np
 
 from cpcbl_agents.clock import Clock
-from cpcbl_launch.reporting.metrics import Floats
+from cpcbl_launch.reporting.metrics import (
+    Floats,
+    Samples,
+    interpolated_truth,
+    position_errors,
+    position_nees,
+    score,
+)
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus
 from cpcbl_transport.decoding import decode
 from cpcbl_transport.messages import Status, Track, Truths
 
+FOUND_M = 0.3
 TRUTH_EVERY_NS = 80_000_000
-Value = TypeVar("Value")
 
 
 class ReceivedTrack(NamedTuple):
-    """A track, and when it arrived."""
+    """A track, when it arrived, and its stamp."""
 
     at_s: float
+    stamp_s: float
     track: Track
 
 
@@ -47,7 +56,8 @@ class TokenEvent(NamedTuple):
 
 
 class RunLog(NamedTuple):
-    """What was received in a run."""
+    """What was received in a run. A figure `..._after_s` is a time after `from_s`, or None if what
+    it measures did not happen."""
 
     epoch_ns: int
     tracks: Mapping[str, Sequence[ReceivedTrack]]
@@ -56,6 +66,201 @@ class RunLog(NamedTuple):
     truth: Mapping[str, Floats]
     """Rows of seconds, x, y, heading, by robot."""
 
+    # Tokens -------------------------------------------------------------------------------------
+
+    def token_gone_after_s(self, robot: str, from_s: float) -> float | None:
+        """The last token of a robot disappeared."""
+        alive: set[tuple[str, str]] = set()
+        for token in self.tokens:
+            if token.robot != robot:
+                continue
+            key = token.tier, token.incarnation
+            (alive.add if token.alive else alive.discard)(key)
+            if token.at_s >= from_s and not alive:
+                return token.at_s - from_s
+        return None
+
+    def token_back_after_s(self, robot: str, from_s: float, not_of: str = "") -> float | None:
+        """A token of the robot appeared, declared by another process than `not_of`."""
+        mine = (t for t in self.tokens if t.robot == robot and t.alive and t.incarnation != not_of)
+        return _first((t.at_s for t in mine), from_s)
+
+    def latest_incarnation(self, robot: str) -> str:
+        """The process that declared the robot's last token; empty if there was none."""
+        mine = [t.incarnation for t in self.tokens if t.robot == robot and t.alive]
+        return mine[-1] if mine else ""
+
+    # Tracks -------------------------------------------------------------------------------------
+
+    def first_track_after_s(self, robot: str, from_s: float) -> float | None:
+        """The first track with a later stamp arrived."""
+        return _first((t.at_s for t in self.tracks.get(robot, ()) if t.stamp_s >= from_s), from_s)
+
+    def longest_track_gap_s(self, robot: str, from_s: float, until_s: float) -> float:
+        """The longest time within [from_s, until_s] in which no track of the robot arrived."""
+        arrivals = [t.at_s for t in self.tracks.get(robot, ()) if from_s < t.at_s < until_s]
+        return max(b - a for a, b in pairwise([from_s, *arrivals, until_s]))
+
+    def track_delay_s(self, robot: str, from_s: float, until_s: float) -> float | None:
+        """The 99th percentile of the delay of a robot's tracks: arrival minus stamp."""
+        arrived = (t for t in self.tracks.get(robot, ()) if from_s <= t.at_s < until_s)
+        delays = [t.at_s - t.stamp_s for t in arrived]
+        return float(np.quantile(delays, 0.99)) if delays else None
+
+    def late_track_count(self, robot: str, from_s: float, late_s: float) -> int:
+        """How many tracks arrived after `from_s`, each more than `late_s` after its stamp."""
+        arrived = (t for t in self.tracks.get(robot, ()) if t.at_s >= from_s)
+        return sum(t.at_s - t.stamp_s > late_s for t in arrived)
+
+    # Positions ----------------------------------------------------------------------------------
+
+    def localized_after_s(
+        self, robot: str, from_s: float, within_m: float = FOUND_M
+    ) -> float | None:
+        """The robot was within `within_m` of the truth and not lost, from then on for 1 s."""
+        stamps_s, samples = self._samples(robot, from_s)
+        lost = {t.stamp_s for t in self.tracks.get(robot, ()) if t.track.lost}
+        since_s: float | None = None
+        for stamp_s, error_m in zip(stamps_s.tolist(), position_errors(samples), strict=True):
+            if error_m <= within_m and stamp_s not in lost:
+                since_s = stamp_s if since_s is None else since_s
+                if stamp_s - since_s >= 1.0:
+                    return since_s - from_s
+            else:
+                since_s = None
+        return None
+
+    def position_rmse_m(self, robot: str, from_s: float, until_s: float = np.inf) -> float | None:
+        """Root mean square of the position error over the tracks stamped in [from_s, until_s)."""
+        return score(self._samples(robot, from_s, until_s)[1]).position_rmse_m
+
+    def largest_position_error_m(self, robot: str, from_s: float, until_s: float) -> float | None:
+        """The largest position error of the tracks stamped in [from_s, until_s)."""
+        return score(self._samples(robot, from_s, until_s)[1]).position_max_m
+
+    def inside_3_sigma(
+        self, robots: Iterable[str], from_s: float, until_s: float = np.inf
+    ) -> float | None:
+        """The share of tracks within 3 sigma of the truth (a consistent filter: 98.9 %)."""
+        parts = [position_nees(self._samples(name, from_s, until_s)[1]) for name in robots]
+        nees = np.concatenate([part for part in parts if part is not None] or [np.empty(0)])
+        return float(np.mean(nees <= 9.0)) if len(nees) else None
+
+    def first_position_jump(self, robot: str) -> tuple[float, float] | None:
+        """(time, metres) of the first jump of a robot's true position by at least 1 m."""
+        rows = self.truth.get(robot)
+        if rows is None:
+            return None
+        steps = np.hypot(*np.diff(rows[:, 1:3], axis=0).T)
+        jumps = np.flatnonzero(steps >= 1.0)
+        return (float(rows[jumps[0] + 1, 0]), float(steps[jumps[0]])) if len(jumps) else None
+
+    def _samples(
+        self, robot: str, from_s: float, until_s: float = np.inf
+    ) -> tuple[Floats, Samples]:
+        """(stamps s, estimates beside truths) of the tracks stamped in [from_s, until_s)."""
+        received = self.tracks.get(robot, ()) if robot in self.truth else ()
+        chosen = [t for t in received if from_s <= t.stamp_s < until_s and t.track.covariance]
+        if not chosen:
+            return np.empty(0), Samples(np.empty((0, 3)), np.empty((0, 3)), np.empty((0, 6)))
+        stamps_s = np.array([t.stamp_s for t in chosen])
+        estimate = np.array([(t.track.x_m, t.track.y_m, t.track.heading_rad) for t in chosen])
+        covariance = np.array([t.track.covariance for t in chosen])
+        truth, known = interpolated_truth(stamps_s, self.truth[robot])
+        return stamps_s[known], Samples(estimate[known], truth[known], covariance[known])
+
+    # Statuses -----------------------------------------------------------------------------------
+
+    def reported_lost_after_s(self, robot: str, from_s: float) -> float | None:
+        """The robot first reported that it is lost: in a track, or in a count of its status if it
+        was localized again before its next track."""
+        times_s, known = [t.stamp_s for t in self.tracks.get(robot, ()) if t.track.lost], 0
+        for at_s, status in self.statuses.get(robot, ()):
+            count = status.counts.get("lost", 0)
+            times_s += [at_s] if count > known else []
+            known = count
+        return _first(sorted(times_s), from_s)
+
+    def first_help_after_s(
+        self, robot: str, helpers: Collection[str], from_s: float
+    ) -> float | None:
+        """The robot first reported later help of these; it received the help up to a second
+        earlier."""
+        from_ns = self.epoch_ns + int(from_s * 1e9)
+        helped = (
+            at_s
+            for at_s, status in self.statuses.get(robot, ())
+            if any(f.peer in helpers and f.latest_ns >= from_ns for f in status.heard)
+        )
+        return _first(helped, from_s)
+
+    def counts_between(self, robot: str, from_s: float, until_s: float = np.inf) -> Counter[str]:
+        """The robot's counts between its statuses of [from_s, until_s], over all its processes."""
+        before: dict[str, Counter[str]] = {}
+        after: dict[str, Counter[str]] = {}
+        for at_s, status in self.statuses.get(robot, ()):
+            if at_s <= until_s:
+                (before if at_s <= from_s else after)[status.incarnation] = _counts(status)
+        changes = (counts - before.get(process, Counter()) for process, counts in after.items())
+        return sum(changes, Counter())
+
+    def latest_counts(self, robot: str) -> Counter[str]:
+        """The counts of the robot's latest process, by its latest status."""
+        received = self.statuses.get(robot)
+        return _counts(received[-1].status) if received else Counter()
+
+    def distrust_reported_at_s(
+        self,
+        robot: str,
+        peer: str,
+        from_s: float = -np.inf,
+        until_s: float = np.inf,
+        reason: str = "",
+    ) -> float | None:
+        """When, within [from_s, until_s), a robot first reported that it distrusts a teammate, for
+        this reason (default: for any)."""
+        for at_s, status in self.statuses.get(robot, ()):
+            reasons = {t.reason for t in status.trust if t.peer == peer} - {""}
+            if from_s <= at_s < until_s and (reason in reasons if reason else reasons):
+                return at_s
+        return None
+
+    def distrusted_peers(self, robot: str) -> dict[str, str]:
+        """The teammates that a robot distrusts by its latest status, and why."""
+        received = self.statuses.get(robot)
+        return {t.peer: t.reason for t in received[-1].status.trust if t.reason} if received else {}
+
+    def reported_delay_s(self, robot: str, peer: str) -> float | None:
+        """The least delay with which a teammate's messages reach a robot, by its latest status; it
+        is negative if the teammate's clock is ahead."""
+        received = self.statuses.get(robot)
+        trust = received[-1].status.trust if received else ()
+        return next((t.late_s for t in trust if t.peer == peer), None)
+
+
+def maximum(values: Iterable[float | None]) -> float | None:
+    """The largest of the figures; None if one is missing or there are none."""
+    known = list(values)
+    return max((v for v in known if v is not None), default=None) if None not in known else None
+
+
+def worst(
+    figure: Callable[..., float | None], robots: Iterable[str], *times_s: float
+) -> float | None:
+    """The largest of these robots' figures; None if one is missing or there are none."""
+    return maximum(figure(name, *times_s) for name in robots)
+
+
+def _first(times_s: Iterable[float], from_s: float) -> float | None:
+    return next((at_s - from_s for at_s in times_s if at_s >= from_s), None)
+
+
+def _counts(status: Status) -> Counter[str]:
+    return Counter(status.counts) + Counter(messages_received=status.messages_received)
+
+
+# Recording ----------------------------------------------------------------------------------------
+
 
 class RunRecorder:
     """Records what it receives on one or several buses; a message that comes twice is kept once."""
@@ -63,7 +268,7 @@ class RunRecorder:
     def __init__(self, clock: Clock, ahead_s: Mapping[str, float] = MappingProxyType({})) -> None:
         """`ahead_s`: how far each robot's clock is ahead; stamps of tracks are corrected."""
         self._clock, self._lock = clock, threading.Lock()
-        self._ahead_ns = {name: int(s * 1e9) for name, s in ahead_s.items()}
+        self._ahead_s = ahead_s
         self._tracks: dict[str, list[ReceivedTrack]] = {}
         self._statuses: dict[str, list[ReceivedStatus]] = {}
         self._tokens: list[TokenEvent] = []
@@ -78,30 +283,32 @@ class RunRecorder:
 
     @property
     def now_s(self) -> float:
-        return (self._clock.now_ns() - self._clock.epoch_ns) * 1e-9
+        return self._robot_time_s(self._clock.now_ns())
+
+    def _robot_time_s(self, stamp_ns: int) -> float:
+        return (stamp_ns - self._clock.epoch_ns) * 1e-9
 
     def _record_token(self, key: str, alive: bool) -> None:
         names = topics.ALIVE.names(key)
         if names is not None:
-            token = TokenEvent(
-                self.now_s, names["robot"], names["tier"], names["incarnation"], alive
-            )
+            event = names["robot"], names["tier"], names["incarnation"], alive
             with self._lock:
-                self._tokens.append(token)
+                self._tokens.append(TokenEvent(self.now_s, *event))
 
     def _arrived(self, key: str, payload: bytes) -> None:
         at_s, message = self.now_s, decode(key, payload)
         with self._lock:
             match message:
-                case Track(robot=robot, stamp_ns=stamp_ns):
-                    stamp_ns -= self._ahead_ns.get(robot, 0)
-                    track = msgspec.structs.replace(message, stamp_ns=stamp_ns)
-                    _add(self._tracks.setdefault(robot, []), ReceivedTrack(at_s, track))
+                case Track(robot=robot):
+                    ahead_ns = int(self._ahead_s.get(robot, 0.0) * 1e9)
+                    stamp_s = self._robot_time_s(message.stamp_ns - ahead_ns)
+                    track = ReceivedTrack(at_s, stamp_s, message)
+                    _add(self._tracks.setdefault(robot, []), track)
                 case Status(robot=robot):
                     _add(self._statuses.setdefault(robot, []), ReceivedStatus(at_s, message))
                 case Truths() if self._is_next(message):
                     self._truth_ns = message.stamp_ns
-                    stamp_s = (message.stamp_ns - self._clock.epoch_ns) * 1e-9
+                    stamp_s = self._robot_time_s(message.stamp_ns)
                     for t in message.robots:
                         row = (stamp_s, t.x_m, t.y_m, t.heading_rad)
                         self._rows.setdefault(t.robot, []).append(row)
@@ -116,17 +323,17 @@ class RunRecorder:
         with self._lock:
             return RunLog(
                 self._clock.epoch_ns,
-                {name: tuple(heard) for name, heard in self._tracks.items()},
-                {name: tuple(statuses) for name, statuses in self._statuses.items()},
+                {name: tuple(received) for name, received in self._tracks.items()},
+                {name: tuple(received) for name, received in self._statuses.items()},
                 tuple(self._tokens),
                 {name: np.array(rows) for name, rows in self._rows.items()},
             )
 
 
-_Dated = TypeVar("_Dated", ReceivedTrack, ReceivedStatus)
+_Received = TypeVar("_Received", ReceivedTrack, ReceivedStatus)
 
 
-def _add(kept: list[_Dated], new: _Dated) -> None:
+def _add(kept: list[_Received], new: _Received) -> None:
     """Adds a message unless it is among the latest: two sites send each message twice."""
-    if all(new[1] != old[1] for old in kept[-20:]):
+    if all(new[-1] != old[-1] for old in kept[-20:]):
         kept.append(new)

@@ -10,9 +10,8 @@ from importlib.metadata import version
 
 from msgspec.structs import replace
 
-from cpcbl_launch.lab.chaos import containers, files, tun_link
 from cpcbl_launch.lab.chaos.checks import ChaosReport, Outcome
-from cpcbl_launch.lab.chaos.scenario import CannotRunError, Needs, Scenario, ScenarioOptions
+from cpcbl_launch.lab.chaos.scenario import CannotRunError, Scenario, ScenarioOptions
 from cpcbl_launch.lab.chaos.scenarios import SCENARIOS
 from cpcbl_launch.lab.chaos.team import ChaosError
 from cpcbl_launch.run.containers.docker import DockerError
@@ -36,37 +35,21 @@ def select_scenarios(names: Sequence[str]) -> list[Scenario]:
     return [s for s in SCENARIOS if ALL in names or s.name in names]
 
 
-def missing_requirement(needs: Needs) -> str:
-    """The requirement that this machine does not meet; empty if there is none."""
-    match needs:
-        case Needs.ROOT:
-            return tun_link.missing_requirement()
-        case Needs.MOUNT:
-            return files.missing_requirement()
-        case Needs.DOCKER:
-            return containers.missing_requirement()
-    return ""
-
-
 def run_scenario(scenario: Scenario, options: ScenarioOptions) -> Outcome:
     """Runs one scenario."""
     name, done, expectation = scenario[:3]
     outcome = Outcome(scenario=name, done=done, expectation=expectation)
-    began_s = time.monotonic()
-    if reason := missing_requirement(scenario.needs):
+    if reason := scenario.needs.missing():
         return replace(outcome, not_run=reason)
+    began_s = time.monotonic()
     try:
         found = scenario.run(options)
+        outcome = replace(outcome, checks=tuple(found.checks), remarks=found.remarks)
     except CannotRunError as error:
         return replace(outcome, not_run=str(error))
     except (ChaosError, BusError, DockerError, OSError, subprocess.TimeoutExpired) as error:
-        return replace(outcome, failed=str(error), seconds=time.monotonic() - began_s)
-    return replace(
-        outcome,
-        checks=tuple(found.checks),
-        remarks=found.remarks,
-        seconds=time.monotonic() - began_s,
-    )
+        outcome = replace(outcome, failed=str(error))
+    return replace(outcome, seconds=time.monotonic() - began_s)
 
 
 def run_scenarios(
@@ -81,16 +64,7 @@ def run_scenarios(
         began(scenario)
         outcomes.append(run_scenario(scenario, options))
         done(outcomes[-1])
-    return ChaosReport(
-        version=version("cpcbl-team"),
-        seed=options.seed,
-        machine=machine_description(),
-        outcomes=tuple(outcomes),
-    )
-
-
-def machine_description() -> str:
-    """A description of this machine, for readers of the figures."""
-    cores = os.cpu_count() or 1
-    load = os.getloadavg()[0]
-    return f"{platform.system()} {platform.machine()}, {cores} cores, load {load:.1f}"
+    cores, load = os.cpu_count() or 1, os.getloadavg()[0]
+    machine = f"{platform.system()} {platform.machine()}, {cores} cores, load {load:.1f}"
+    own = version("cpcbl-team")
+    return ChaosReport(version=own, seed=options.seed, machine=machine, outcomes=tuple(outcomes))

@@ -1,5 +1,6 @@
 """The outcomes of scenarios for people: on a terminal and as Markdown."""
 
+from collections import Counter
 from collections.abc import Iterator
 
 from rich.console import Console
@@ -17,7 +18,7 @@ def print_scenarios(scenarios: tuple[Scenario, ...], console: Console) -> None:
     shown = _table("scenario", "fault", "expectation", "needs")
     for s in scenarios:
         name = f"{s.name} (quick)" if s.quick else s.name
-        shown.add_row(Text(name), Text(s.done), Text(s.expectation), Text(s.needs.value))
+        shown.add_row(Text(name), Text(s.done), Text(s.expectation), Text(s.needs.what))
     console.print(shown)
 
 
@@ -25,20 +26,14 @@ def print_faults(faults: ChaosReport, console: Console) -> None:
     """Prints each scenario with its expectation, its figures, and whether its checks are met."""
     shown = _table("scenario", "expectation", "measured (bound)", "")
     for outcome in faults.outcomes:
-        shown.add_row(
-            Text(outcome.scenario),
-            Text(outcome.expectation),
-            _measured_text(outcome),
-            verdict(outcome),
-        )
+        told = Text(outcome.scenario), Text(outcome.expectation)
+        shown.add_row(*told, _measured_text(outcome), verdict(outcome))
     console.print(shown)
     for outcome in faults.outcomes:
         for remark in outcome.remarks:
             console.print(Text(f"{outcome.scenario}: {remark}", "dim"))
-    counts = {text: 0 for text, _ in _VERDICT.values()}
-    for outcome in faults.outcomes:
-        counts[_VERDICT[outcome.is_met][0]] += 1
-    summary = ", ".join(f"{n} {text}" for text, n in counts.items() if n)
+    counts = Counter(verdict(outcome).plain for outcome in faults.outcomes)
+    summary = ", ".join(f"{counts[text]} {text}" for text, _ in _VERDICT.values() if counts[text])
     console.print(Text(f"{summary}; {faults.machine}; seed {faults.seed}", "bold"))
 
 

@@ -10,10 +10,10 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import NamedTuple
 
-import msgspec
+from msgspec.structs import replace
 
 from cpcbl_agents.clock import Clock
-from cpcbl_launch.lab.chaos.figures import latest_incarnation, localized_after_s
+from cpcbl_launch.lab.chaos.links import Relay, TunLink
 from cpcbl_launch.lab.chaos.run_log import RunLog, RunRecorder
 from cpcbl_launch.lab.faulty_robot import faulty_command
 from cpcbl_launch.run.processes import PROGRAM, process_table
@@ -27,22 +27,13 @@ from cpcbl_transport.zenoh_bus import open_bus
 LEAD_S, LEAD_S_A_PROCESS = 2.0, 0.4
 SETTLED_M = 0.4
 PATIENCE_S = 60.0
+RESTART_S = 20.0
 POLL_S = 0.05
-ROUTER, FIELD = "router", "field"
+ROUTER, FIELD, FAR_ROUTER = "router", "field", "far-router"
 
 
 class ChaosError(CpcblError):
     """A scenario did not reach its fault, or its end."""
-
-
-class Site(NamedTuple):
-    """Another router, joined to the first."""
-
-    listen: str
-    joins: str
-    """The endpoint that it dials: that of the first router, or of a relay."""
-    robots: Sequence[str]
-    """The robots whose inputs the field publishes at this site."""
 
 
 class RunPlan(NamedTuple):
@@ -50,18 +41,14 @@ class RunPlan(NamedTuple):
 
     team: Team
     seed: int = 1
-    links: Mapping[str, str] = MappingProxyType({})
-    """The endpoints of robots that do not dial the router directly."""
-    prefix: Mapping[str, tuple[str, ...]] = MappingProxyType({})
-    """The start of a robot's command, such as `ip netns exec`."""
+    relayed: Sequence[str] = ()
+    """Robots that dial a relay instead of the router."""
+    lossy: Sequence[str] = ()
+    """Robots (at most one) whose only link is a `TunLink`."""
+    far: Sequence[str] = ()
+    """Robots at another site with a router of its own, which dials the first over a relay."""
     faults: Mapping[str, str] = MappingProxyType({})
     """The fault of a robot that sends wrong positions, such as `bias:0.5,0.5@10-30`."""
-    also_listen: Sequence[str] = ()
-    """Further endpoints at which the router listens."""
-    sites: Mapping[str, Site] = MappingProxyType({})
-    """The routers of other sites, by the name of their process."""
-    endpoint: str = ""
-    """The router's endpoint; default: a free one of this machine."""
     left_out: Sequence[str] = ()
     """Robots of the file that are not started."""
 
@@ -69,75 +56,91 @@ class RunPlan(NamedTuple):
 def demo_team() -> Team:
     """The demonstration, with help from the start: navigator, observer, scout (blind), patrol."""
     team = load_team(builtin_path("demo"))
-    return with_collaboration(team, after_s=0.0)
-
-
-def with_collaboration(team: Team, **changes: object) -> Team:
-    """The team with these settings of every robot's collaboration."""
     robots = {
-        name: msgspec.structs.replace(
-            robot, collaboration=msgspec.structs.replace(robot.collaboration, **changes)
-        )
+        name: replace(robot, collaboration=replace(robot.collaboration, after_s=0.0))
         for name, robot in team.robots.items()
     }
-    return msgspec.structs.replace(team, robots=robots)
+    return replace(team, robots=robots)
 
 
 class TeamUnderTest:
     """Made by `run_team_under_test`. Times are seconds of robot time after the run's epoch."""
 
-    def __init__(
-        self, plan: RunPlan, folder: Path, endpoint: str, clock: Clock, supervisor: Supervisor
-    ) -> None:
-        self.plan, self.folder, self.endpoint = plan, folder, endpoint
-        self.clock, self.supervisor = clock, supervisor
+    def __init__(self, plan: RunPlan, folder: Path, stack: ExitStack) -> None:
+        """Starts all processes; `stack` ends them."""
+        team = plan.team
+        self.plan, self.folder = plan, folder
+        self.endpoint, self.far_endpoint = free_endpoint(), free_endpoint()
+        self.clock = clock_starting_in(LEAD_S + LEAD_S_A_PROCESS * len(team.robots))
         self.robots = [
             name
-            for name, robot in plan.team.robots.items()
+            for name, robot in team.robots.items()
             if name not in plan.left_out and robot.source == "simulated"
         ]
         """The robots of the simulated field, whose ground truth is known."""
-        self.recorder = RunRecorder(clock, plan.team.simulation.clocks_ahead_s)
+        relayed = [*plan.relayed, *([FAR_ROUTER] if plan.far else [])]
+        self.links: dict[str, Relay | TunLink] = {
+            **{name: stack.enter_context(Relay(self.endpoint, plan.seed)) for name in relayed},
+            **{name: stack.enter_context(TunLink(plan.seed)) for name in plan.lossy},
+        }
+        """The links that can be impaired, by the robot or router that uses them."""
+        self.supervisor = stack.enter_context(Supervisor(self._process_table(), folder))
         self.seen_pids: set[int] = set()
+        self._recorders = []
+        for endpoint in (self.endpoint, self.far_endpoint) if plan.far else (self.endpoint,):
+            self._recorders.append(RunRecorder(self.clock, team.simulation.clocks_ahead_s))
+            bus = stack.enter_context(open_bus(team.name, [endpoint], _patience()))
+            self._recorders[-1].listen(bus)
+
+    def _process_table(self) -> list[ProcessSpec]:
+        """The routers, the field and the robots, started as `up` does, with their own links and
+        clocks."""
+        plan, team_file = self.plan, self.folder / "team.json"
+        save_resolved(plan.team, team_file)
+        settings, seed = (plan.team, team_file), plan.seed
+        lossy = [self.links[name].endpoint for name in plan.lossy]
+        rows = [router_spec(team_file, [self.endpoint, *lossy])]
+        (field,) = process_table(*settings, self.endpoint, self.clock, seed, here=())
+        if plan.far:
+            joins = [self.links[FAR_ROUTER].endpoint]
+            rows.append(router_spec(team_file, [self.far_endpoint], joins, FAR_ROUTER))
+            site = f"{self.far_endpoint}={','.join(plan.far)}"
+            field = field._replace(command=(*field.command, "--site", site))
+        rows.append(field)
+        for name in (name for name in plan.team.robots if name not in plan.left_out):
+            link = self.links.get(name)
+            endpoint = self.far_endpoint if name in plan.far else self.endpoint
+            endpoint = link.endpoint if link else endpoint
+            own = process_table(*settings, endpoint, self.clock, seed, here=(name,))[-1]
+            fault = plan.faults.get(name)
+            command = faulty_command(own.command, fault) if fault else own.command
+            rows.append(own._replace(command=(*(link.prefix if link else ()), *command)))
+        return rows
 
     @property
     def now_s(self) -> float:
-        return self.recorder.now_s
+        return self._recorders[0].now_s
 
     @property
     def run_log(self) -> RunLog:
-        return self.recorder.run_log()
+        return self._recorders[0].run_log()
+
+    @property
+    def far_log(self) -> RunLog:
+        """The log of the far site if there is one, with the ground truth, which is published at
+        the near site only."""
+        return self._recorders[-1].run_log()._replace(truth=self.run_log.truth)
 
     def pid(self, name: str) -> int:
-        """The process id of a robot, the field or a router. Raises ChaosError if it does not
-        run."""
+        """The process id of a robot, the field or a router; waits while it is restarted. Raises
+        ChaosError if it does not run."""
         process = f"robot-{name}" if name in self.plan.team.robots else name
-        pid = self.supervisor.pids.get(process)
-        if pid is None:
+        if not self.wait_until(lambda: process in self.supervisor.pids, RESTART_S):
             raise ChaosError(f"{process} does not run: {self.last_log_line(process)}")
-        return pid
+        return self.supervisor.pids[process]
 
-    def incarnation(self, robot: str) -> str:
-        return latest_incarnation(self.run_log, robot)
-
-    def others(self, *names: str) -> list[str]:
-        return [robot for robot in self.robots if robot not in names]
-
-    # What is done to it -------------------------------------------------------------------------
-
-    def kill(self, name: str) -> float:
-        """Kills a process (SIGKILL); returns the time."""
-        return self._signal(name, signal.SIGKILL)
-
-    def freeze(self, name: str) -> float:
-        return self._signal(name, signal.SIGSTOP)
-
-    def thaw(self, name: str) -> float:
-        return self._signal(name, signal.SIGCONT)
-
-    def _signal(self, name: str, number: signal.Signals) -> float:
+    def signal(self, name: str, number: signal.Signals) -> None:
         os.kill(self.pid(name), number)
-        return self.now_s
 
     # Waiting ------------------------------------------------------------------------------------
 
@@ -160,25 +163,20 @@ class TeamUnderTest:
             time.sleep(POLL_S)
         return True
 
-    def settle(self, within_m: float = SETTLED_M, patience_s: float = PATIENCE_S) -> float:
-        """Waits until all robots are localized; returns the time. Raises ChaosError."""
+    def settle(self, within_m: float = SETTLED_M, patience_s: float = PATIENCE_S) -> None:
+        """Waits until all robots are localized. Raises ChaosError."""
 
         def unsettled() -> list[str]:
-            notes = self.run_log
-            from_s = max(0.0, self.now_s - 4.0)
-            return [
-                robot
-                for robot in self.robots
-                if localized_after_s(notes, robot, from_s, within_m) is None
-            ]
+            log, from_s = self.run_log, max(0.0, self.now_s - 4.0)
+            found = {name: log.localized_after_s(name, from_s, within_m) for name in self.robots}
+            return [name for name, after_s in found.items() if after_s is None]
 
         if not self.wait_until(lambda: self.now_s > 3.0 and not unsettled(), patience_s):
             waiting = unsettled()
-            raise ChaosError(
-                f"the team did not settle: {', '.join(waiting)}: "
-                + "; ".join(self.last_log_line(f"robot-{name}") for name in waiting)
-            )
-        return self.now_s
+            lines = "; ".join(self.last_log_line(f"robot-{name}") for name in waiting)
+            raise ChaosError(f"the team did not settle: {', '.join(waiting)}: {lines}")
+
+    # Logs ---------------------------------------------------------------------------------------
 
     def process_log(self, process: str) -> str:
         """The output of a process."""
@@ -207,17 +205,11 @@ def run_team_under_test(plan: RunPlan) -> Iterator[TeamUnderTest]:
     not."""
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="cpcbl-chaos-")))
-        endpoint = plan.endpoint or free_endpoint()
-        clock = clock_starting_in(LEAD_S + LEAD_S_A_PROCESS * len(plan.team.robots))
-        table = _table(plan, folder, endpoint, clock)
-        supervisor = stack.enter_context(Supervisor(table, folder))
-        team = TeamUnderTest(plan, folder, endpoint, clock, supervisor)
-        bus = stack.enter_context(open_bus(plan.team.name, [endpoint], _patience()))
-        team.recorder.listen(bus)
+        team = TeamUnderTest(plan, folder, stack)
         yield team
-    left = [pid for pid in team.seen_pids if _runs(pid)]
+    left = [str(pid) for pid in team.seen_pids if _runs(pid)]
     if left:
-        raise ChaosError(f"left running: pids {', '.join(map(str, left))}")
+        raise ChaosError(f"left running: pids {', '.join(left)}")
 
 
 def _runs(pid: int) -> bool:
@@ -231,31 +223,6 @@ def _runs(pid: int) -> bool:
 def _patience() -> Callable[[], bool]:
     end_s = time.monotonic() + PATIENCE_S
     return lambda: time.monotonic() > end_s
-
-
-def _table(plan: RunPlan, folder: Path, endpoint: str, clock: Clock) -> list[ProcessSpec]:
-    """The router, the field and the robots, started as `up` does, with their own links and
-    clocks."""
-    team_file = folder / "team.json"
-    save_resolved(plan.team, team_file)
-    rows = [router_spec(team_file, (endpoint, *plan.also_listen))]
-    rows += [
-        router_spec(team_file, (site.listen,), (site.joins,), name)
-        for name, site in plan.sites.items()
-    ]
-    for field in process_table(plan.team, team_file, endpoint, clock, plan.seed, here=()):
-        there = (f"{site.listen}={','.join(site.robots)}" for site in plan.sites.values())
-        words = [word for at in there for word in ("--site", at)]
-        rows.append(field._replace(command=(*field.command, *words)))
-    for name in plan.team.robots:
-        if name in plan.left_out:
-            continue
-        link = plan.links.get(name, endpoint)
-        own = process_table(plan.team, team_file, link, clock, plan.seed, here=(name,))[-1]
-        fault = plan.faults.get(name, "")
-        command = faulty_command(own.command, fault) if fault else own.command
-        rows.append(own._replace(command=(*plan.prefix.get(name, ()), *command)))
-    return rows
 
 
 def router_spec(
