@@ -3,14 +3,12 @@
 import typer
 
 from cpcbl_launch.commands.calibrating import calibrate_app
-from cpcbl_launch.commands.deploying import compose
 from cpcbl_launch.commands.experimenting import experiment_app
 from cpcbl_launch.commands.faults import chaos
 from cpcbl_launch.commands.measuring import evaluate_mrclam, simulate
-from cpcbl_launch.commands.observing import observer
-from cpcbl_launch.commands.running import check, field, router, up
-from cpcbl_launch.commands.securing import keys
-from cpcbl_launch.commands.watching import look, traffic
+from cpcbl_launch.commands.preparing import check, compose, keys
+from cpcbl_launch.commands.running import field, router, up
+from cpcbl_launch.commands.watching import look, observer, traffic
 from cpcbl_launch.run import robot
 
 app = typer.Typer(

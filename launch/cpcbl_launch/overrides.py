@@ -12,26 +12,22 @@ from cpcbl_team.config import Team
 class Overrides(NamedTuple):
     """What a command line sets for all robots; None leaves the team file's value."""
 
-    variant: str | None = None
-    collaboration: str | None = None
-    """none, passive, active, both"""
-    fusion: str | None = None
-    direction: str | None = None
     bytes_per_s: float | None = None
     """Of each robot."""
     messages_per_minute: float | None = None
     """Of each robot."""
     match_messages: int | None = None
     """Of the team."""
+    variant: str | None = None
+    collaboration: str | None = None
+    """none, passive, active, both"""
+    fusion: str | None = None
+    direction: str | None = None
 
     def given(self, *names: str) -> dict[str, object]:
         """Those of these fields that are set."""
         values = {name: getattr(self, name) for name in names}
-        return {
-            name: str(value) if isinstance(value, str) else value
-            for name, value in values.items()
-            if value is not None
-        }
+        return {name: value for name, value in values.items() if value is not None}
 
 
 def with_overrides(team: Team, overrides: Overrides) -> Team:

@@ -9,9 +9,15 @@ from typing import TYPE_CHECKING, Annotated, Any, Optional
 import typer
 from typer.core import TyperGroup
 
-from cpcbl_launch.commands.arguments import AsJson, print_not_written, print_result
 from cpcbl_launch.commands.measuring import calibrate
-from cpcbl_launch.commands.options import require_writable_file, writable_file, writable_picture
+from cpcbl_launch.commands.options import (
+    AsJson,
+    print_not_written,
+    print_result,
+    require_writable_file,
+    writable_file,
+    writable_picture,
+)
 from cpcbl_launch.team_file import find_team
 from cpcbl_team.errors import InputError
 

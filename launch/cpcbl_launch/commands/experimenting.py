@@ -11,7 +11,12 @@ from typing import TYPE_CHECKING, Annotated, Any, Optional
 import typer
 
 from cpcbl_launch.checks import require_matplotlib, require_opencv
-from cpcbl_launch.commands.arguments import parse_names, print_not_written
+from cpcbl_launch.commands.options import (
+    parse_names,
+    print_not_written,
+    require_folder,
+    require_writable_file,
+)
 from cpcbl_team.errors import InputError
 
 if TYPE_CHECKING:
@@ -206,7 +211,6 @@ def _conduct(
     """
     from rich.console import Console
 
-    from cpcbl_launch.commands.options import require_folder, require_writable_file
     from cpcbl_launch.reporting.files import json_text, write_or_reason
 
     figures, picture = output / f"{name}.json", output / f"{name}.png"

@@ -9,7 +9,7 @@ from typing import Annotated, Optional
 import typer
 
 from cpcbl_launch.commands import options
-from cpcbl_launch.commands.arguments import AsJson, ReportFile, print_not_written, write_report
+from cpcbl_launch.commands.options import AsJson, ReportFile, print_not_written, write_report
 
 Scenarios = Annotated[
     Optional[list[str]], typer.Argument(help="Names of scenarios, or all.", metavar="SCENARIO")

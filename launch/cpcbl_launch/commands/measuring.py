@@ -1,14 +1,16 @@
 """Commands that measure: real logs, calibration, a simulated team in one process."""
 
-from enum import StrEnum
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Optional
+from typing import Annotated, Literal
 
 import typer
+from rich.console import Console
+from typer import Argument, Option
 
+from cpcbl_launch.checks import require_team_opencv
 from cpcbl_launch.commands import options
-from cpcbl_launch.commands.arguments import (
+from cpcbl_launch.commands.options import (
     AsJson,
     Blind,
     BytesPerS,
@@ -18,94 +20,50 @@ from cpcbl_launch.commands.arguments import (
     ReportFile,
     TeamArgument,
     parse_names,
-    print_not_written,
     print_result,
     write_report,
 )
+from cpcbl_launch.overrides import Overrides, with_blind_robots, with_overrides
+from cpcbl_launch.reporting.files import write_or_reason
 from cpcbl_launch.team_file import find_team
+from cpcbl_team.config import Variant
 from cpcbl_team.errors import InputError
 
-
-class VariantName(StrEnum):
-    joint = "joint"
-    oval = "oval"
-    circular = "circular"
-    weighted = "weighted"
-
-
-class Kinds(StrEnum):
-    none = "none"
-    passive = "passive"
-    active = "active"
-    both = "both"
-
-
-class FusionName(StrEnum):
-    naive = "naive"
-    split_ci = "split-ci"
-
-
-class DirectionName(StrEnum):
-    one_way = "one-way"
-    both_ways = "both-ways"
-
-
 LogTeamFile = Annotated[
-    Optional[Path],
-    typer.Option("--team", help="Team file; default: the built-in mrclam without this log."),
+    Path | None,
+    Option("--team", help="Team file; default: the built-in mrclam without this log."),
 ]
-Variant = Annotated[Optional[VariantName], typer.Option(help="Variant of all robots.")]
-Collaboration = Annotated[Optional[Kinds], typer.Option(help="Collaboration of all robots.")]
-Fusion = Annotated[Optional[FusionName], typer.Option(help="Fusion of all robots.")]
-Direction = Annotated[Optional[DirectionName], typer.Option(help="Direction of all robots.")]
-LogDuration = Annotated[Optional[float], typer.Option(help="Seconds of the log; default: all.")]
+VariantOption = Annotated[Variant | None, Option(help="Variant of all robots.")]
+Collaboration = Annotated[
+    Literal["none", "passive", "active", "both"] | None,
+    Option(help="Collaboration of all robots."),
+]
+Fusion = Annotated[Literal["naive", "split-ci"] | None, Option(help="Fusion of all robots.")]
+Direction = Annotated[
+    Literal["one-way", "both-ways"] | None, Option(help="Direction of all robots.")
+]
+LogDuration = Annotated[float | None, Option(help="Seconds of the log; default: all.")]
 WithBaselines = Annotated[
     bool,
-    typer.Option(
+    Option(
         "--yardstick/--no-yardstick",
         help="Also run dead reckoning, a solo EKF per robot, a centralized EKF.",
     ),
 ]
 ExportFolder = Annotated[
-    Optional[Path],
-    typer.Option(
+    Path | None,
+    Option(
         callback=options.folder,
         help="Folder to write estimates and truth into (TUM files, which evo reads).",
     ),
 ]
-CalibratedTeamFile = Annotated[
-    Optional[Path],
-    typer.Option(
-        "--team",
-        help="Team file to add types to; default: the recorded team, or mrclam-uncalibrated.",
-    ),
-]
-Margin = Annotated[
-    float, typer.Option(min=0.0, help="Share by which noise is written larger: days differ.")
-]
-CorrectionMargin = Annotated[
-    float,
-    typer.Option(
-        min=0.0, help="Share of a range's, bearing's or crawl's correction added to its noise."
-    ),
-]
-OutputTeamFile = Annotated[
-    Path, typer.Option(callback=options.writable_file, help="Team file to write.")
-]
-Sizes = Annotated[
-    str, typer.Option(help="Sizes of generated teams, in place of FILE, e.g. 2,10,50,200,1000.")
-]
-SimulatedDuration = Annotated[
-    Optional[float], typer.Option(help="Seconds of robot time; default: 5 with --robots, else 30.")
-]
-TeamSeed = Annotated[int, typer.Option(help="Seed of the noise, and of generated teams.")]
 
 
 def evaluate_mrclam(
-    data: Annotated[Path, typer.Argument(help="Folder of one data set, e.g. MRCLAM6.")],
+    data: Annotated[Path, Argument(help="Folder of one data set, e.g. MRCLAM6.")],
     team_file: LogTeamFile = None,
     blind: Blind = "",
-    variant: Variant = None,
+    variant: VariantOption = None,
     collaboration: Collaboration = None,
     fusion: Fusion = None,
     direction: Direction = None,
@@ -118,17 +76,13 @@ def evaluate_mrclam(
     as_json: AsJson = False,
 ) -> None:
     """Evaluate five robots of a real log (UTIAS MRCLAM) against its ground truth."""
-    from rich.console import Console
-
     from cpcbl_launch.lab.evaluation import evaluate_log
-    from cpcbl_launch.overrides import Overrides, with_blind_robots, with_overrides
-    from cpcbl_launch.reporting.files import write_or_reason
     from cpcbl_launch.reporting.metrics import export_tum
     from cpcbl_launch.run import logged_team
     from cpcbl_launch.views.run import print_report, progress_bar
 
     budgets = bytes_per_s, messages_per_minute, match_messages
-    overrides = Overrides(variant, collaboration, fusion, direction, *budgets)
+    overrides = Overrides(*budgets, variant, collaboration, fusion, direction)
     team = with_overrides(find_team(team_file or logged_team.builtin_for(data)), overrides)
     logged = logged_team.load_logged_team(team, data)
     logged = logged._replace(team=with_blind_robots(logged.team, parse_names(blind)))
@@ -138,36 +92,46 @@ def evaluate_mrclam(
     lost: dict[str, str] = {}
     if export is not None:
         lost = write_or_reason(export, partial(export_tum, export, paths, logged.truth))
-    print_result(result, as_json, lambda: print_report(result, Console()))
-    print_not_written(lost)
+    print_result(result, as_json, lambda: print_report(result, Console()), lost)
 
 
 def calibrate(
     logs: Annotated[
-        list[Path], typer.Argument(help="MRCLAM folders, or recordings of `up --record` (.mcap).")
+        list[Path], Argument(help="MRCLAM folders, or recordings of `up --record` (.mcap).")
     ],
-    team_file: CalibratedTeamFile = None,
-    output: OutputTeamFile = Path("calibrated.toml"),
-    margin: Margin = 0.25,
-    correction_margin: CorrectionMargin = 0.5,
+    team_file: Annotated[
+        Path | None,
+        Option(
+            "--team",
+            help="Team file to add types to; default: the recorded team, or mrclam-uncalibrated.",
+        ),
+    ] = None,
+    output: Annotated[
+        Path, Option(callback=options.writable_file, help="Team file to write.")
+    ] = Path("calibrated.toml"),
+    margin: Annotated[
+        float, Option(min=0.0, help="Share by which noise is written larger: days differ.")
+    ] = 0.25,
+    correction_margin: Annotated[
+        float,
+        Option(
+            min=0.0, help="Share of a range's, bearing's or crawl's correction added to its noise."
+        ),
+    ] = 0.5,
     picture: PictureFile = None,
     as_json: AsJson = False,
 ) -> None:
     """Estimate odometry and sensor errors from logs with truth, as types of a team file."""
-    from rich.console import Console
-
     from cpcbl_launch.calibration.logs import read_logs
     from cpcbl_launch.calibration.reports import print_calibration
     from cpcbl_launch.calibration.robots import calibrate_robots
     from cpcbl_launch.calibration.team_types import base_team, calibrated_team
-    from cpcbl_launch.reporting.files import write_or_reason
     from cpcbl_launch.views.run import progress_bar
 
     base, base_name = base_team(logs, team_file)
-    names = [log.resolve().name for log in logs]
     robot_logs = read_logs(logs)
     with progress_bar("calibrating", quiet=as_json) as progress:
-        result = calibrate_robots(robot_logs, names, progress)
+        result = calibrate_robots(robot_logs, [log.resolve().name for log in logs], progress)
     text = calibrated_team(
         result, base, base_name, margin=margin, correction_margin=correction_margin
     )
@@ -176,17 +140,20 @@ def calibrate(
         from cpcbl_launch.calibration.plots import draw_residuals
 
         lost |= write_or_reason(picture, partial(draw_residuals, robot_logs, result, picture))
-    print_result(result, as_json, lambda: print_calibration(result, Console()))
-    if not as_json and not lost:
+    print_result(result, as_json, lambda: print_calibration(result, Console()), lost)
+    if not as_json:
         typer.echo(f"written: {output}")
-    print_not_written(lost)
 
 
 def simulate(
     file: TeamArgument = None,
-    robots: Sizes = "",
-    duration: SimulatedDuration = None,
-    seed: TeamSeed = 1,
+    robots: Annotated[
+        str, Option(help="Sizes of generated teams, in place of FILE, e.g. 2,10,50,200,1000.")
+    ] = "",
+    duration: Annotated[
+        float | None, Option(help="Seconds of robot time; default: 5 with --robots, else 30.")
+    ] = None,
+    seed: Annotated[int, Option(help="Seed of the noise, and of generated teams.")] = 1,
     bytes_per_s: BytesPerS = None,
     messages_per_minute: MessagesPerMinute = None,
     match_messages: MatchMessages = None,
@@ -201,16 +168,10 @@ def simulate(
     the fixes and beliefs that a robot sends and receives, and the CPU time of
     its own steps. The time that simulating the field takes does not count.
     """
-    from cpcbl_launch.checks import require_team_opencv
-    from cpcbl_launch.overrides import Overrides, with_overrides
     from cpcbl_launch.run.up import Run, simulate_run
     from cpcbl_launch.views.run import print_report, progress_bar
 
-    budgets = Overrides(
-        bytes_per_s=bytes_per_s,
-        messages_per_minute=messages_per_minute,
-        match_messages=match_messages,
-    )
+    budgets = Overrides(bytes_per_s, messages_per_minute, match_messages)
     if robots:
         if file is not None:
             raise InputError("simulate: FILE or --robots, which generates its teams; leave one out")
@@ -218,15 +179,12 @@ def simulate(
             raise InputError("simulate: generated teams have no budgets; name a team file instead")
         _simulate_sizes(robots, duration, seed, report, picture, as_json)
         return
-    from rich.console import Console
-
     team = with_overrides(find_team(file or Path("demo")), budgets)
     require_team_opencv(team, team.robots, field=True)
     with progress_bar("simulating", quiet=as_json) as progress:
         result = simulate_run(Run(team, duration, seed=seed, picture=picture), progress)
     lost = write_report(report, result) | result.not_written
-    print_result(result, as_json, lambda: print_report(result, Console()))
-    print_not_written(lost)
+    print_result(result, as_json, lambda: print_report(result, Console()), lost)
 
 
 def _simulate_sizes(
@@ -238,11 +196,8 @@ def _simulate_sizes(
     as_json: bool,
 ) -> None:
     """Runs generated teams of each size, one after the other."""
-    from rich.console import Console
-
     from cpcbl_launch.lab.scaling.measure import DURATION_S, measure_sizes, parse_sizes
-    from cpcbl_launch.lab.scaling.report import print_scaling
-    from cpcbl_launch.reporting.files import write_or_reason
+    from cpcbl_launch.lab.scaling.report import draw_scaling, print_scaling
     from cpcbl_launch.views.run import progress_bar
 
     duration_s = DURATION_S if duration_s is None else duration_s
@@ -250,8 +205,5 @@ def _simulate_sizes(
         result = measure_sizes(parse_sizes(robots), seed, duration_s, progress)
     lost = write_report(report, result)
     if picture is not None:
-        from cpcbl_launch.lab.scaling.report import draw_scaling
-
         lost |= write_or_reason(picture, partial(draw_scaling, result, picture))
-    print_result(result, as_json, lambda: print_scaling(result, Console()))
-    print_not_written(lost)
+    print_result(result, as_json, lambda: print_scaling(result, Console()), lost)

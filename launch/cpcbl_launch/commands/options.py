@@ -1,14 +1,19 @@
-"""Checks of the values of options, for the command line."""
+"""Options that several commands share, the checks of their values, and what ends every command."""
 
 import math
 import os
+import sys
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Annotated
 
-import typer
+from typer import Argument, CallbackParam, Exit, Option, secho
 
+from cpcbl_launch.checks import require_matplotlib
+from cpcbl_launch.reporting.files import json_text, write_or_reason
+from cpcbl_launch.run.containers import BASE_VARIABLE
+from cpcbl_launch.team_checks import endpoint_problem
 from cpcbl_team.errors import InputError
-
-LEAST_SPEED, MOST_SPEED = 0.05, 1000.0
 
 
 def require_folder(option: str, folder: Path) -> Path:
@@ -35,55 +40,127 @@ def _require_writable(option: str, path: Path, existing: Path) -> None:
         raise InputError(f"{option} {path}: {existing} cannot be written; name another place")
 
 
-def writable_file(option: typer.CallbackParam, path: Path | None) -> Path | None:
+def writable_file(option: CallbackParam, path: Path | None) -> Path | None:
     """Callback of an option that names a file to write."""
     if path is not None:
-        require_writable_file(f"--{option.name}", path)
+        require_writable_file(option.opts[0], path)
     return path
 
 
-def writable_picture(option: typer.CallbackParam, path: Path | None) -> Path | None:
+def writable_picture(option: CallbackParam, path: Path | None) -> Path | None:
     """Callback of an option that names a picture to draw."""
-    from cpcbl_launch.checks import require_matplotlib
-
-    if path is not None:
-        require_writable_file(f"--{option.name}", path)
-        require_matplotlib(f"--{option.name}", path)
+    if writable_file(option, path) is not None:
+        require_matplotlib(option.opts[0], path)
     return path
 
 
-def folder(option: typer.CallbackParam, path: Path | None) -> Path | None:
+def folder(option: CallbackParam, path: Path | None) -> Path | None:
     """Callback of an option that names a folder to write into; the folder is made."""
-    return None if path is None else require_folder(f"--{option.name}", path)
+    return None if path is None else require_folder(option.opts[0], path)
 
 
-def finite_limit(option: typer.CallbackParam, limit: float | None) -> float | None:
-    """Callback of a budget, which must be a finite number."""
-    if limit is not None and not 0.0 <= limit < math.inf:
-        name = str(option.name).replace("_", "-")
-        raise InputError(f"--{name} {limit:g}: no limit; write a number, 0 for as much as it likes")
-    return limit
-
-
-def speed(speed: float) -> float:
-    """Callback of `--speed`: at an extreme pace no process could run."""
-    if not LEAST_SPEED <= speed <= MOST_SPEED:
-        raise InputError(f"--speed {speed:g}: from {LEAST_SPEED:g} to {MOST_SPEED:g} x real time")
-    return speed
-
-
-def seconds_to_stay(seconds: float | None) -> float | None:
-    """Callback of `--for`."""
-    if seconds is not None and not seconds > 0.0:
-        raise InputError(f"--for {seconds:g}: more than 0 seconds")
-    return seconds
-
-
-def endpoints(option: typer.CallbackParam, given: list[str] | None) -> list[str] | None:
+def endpoints(option: CallbackParam, given: list[str] | None) -> list[str] | None:
     """Callback of endpoints: Zenoh would try a wrong one again and again, and never say why."""
-    from cpcbl_launch.team_checks import endpoint_problem
-
     for endpoint in given or ():
         if reason := endpoint_problem(endpoint):
-            raise InputError(f"--{option.name} {endpoint}: {reason}")
+            raise InputError(f"{option.opts[0]} {endpoint}: {reason}")
     return given
+
+
+def number_that(
+    is_good: Callable[[float], bool], problem: str
+) -> Callable[[CallbackParam, float | None], float | None]:
+    """Callback of an option whose number must be good; `problem` also says how to mend it."""
+
+    def check(option: CallbackParam, number: float | None) -> float | None:
+        if number is not None and not is_good(number):
+            raise InputError(f"{option.opts[0]} {number:g}: {problem}")
+        return number
+
+    return check
+
+
+more_than_no_time = number_that(lambda seconds: seconds > 0.0, "more than 0 seconds")
+_finite_limit = number_that(math.isfinite, "no limit; write a number, 0 for as much as it likes")
+
+TeamFile = Annotated[Path, Option("--team", help="Team file (TOML).")]
+TeamArgument = Annotated[
+    Path | None, Argument(help="Team file, or a built-in one: demo (default).")
+]
+Blind = Annotated[str, Option(help="Robots that cannot see landmarks, e.g. 3,4,5.")]
+BytesPerS = Annotated[
+    float | None,
+    Option(
+        min=0.0,
+        callback=_finite_limit,
+        help="Bytes per second of fixes and beliefs that each robot may send; 0: no limit.",
+    ),
+]
+MessagesPerMinute = Annotated[
+    float | None,
+    Option(
+        min=0.0,
+        callback=_finite_limit,
+        help="Fixes and beliefs per minute that each robot may send; 0: no limit.",
+    ),
+]
+MatchMessages = Annotated[
+    int | None,
+    Option(min=0, help="Fixes and beliefs that the team may send in a match; 0: no limit."),
+]
+NoiseSeed = Annotated[int, Option(help="Seed of the simulated noise.")]
+ReportFile = Annotated[
+    Path | None, Option(callback=writable_file, help="File to write the report into, as JSON.")
+]
+PictureFile = Annotated[
+    Path | None,
+    Option(
+        callback=writable_picture, help="File to draw the result into (PNG or SVG; extra `plot`)."
+    ),
+]
+Image = Annotated[
+    str | None,
+    Option(help="Image of cpcbl-team to use; default: built from the checkout, when needed."),
+]
+BaseImage = Annotated[str, Option(envvar=BASE_VARIABLE, help="What the image is built on.")]
+AsJson = Annotated[bool, Option("--json", help="Print the report as JSON.")]
+Connect = Annotated[
+    list[str] | None,
+    Option(
+        callback=endpoints,
+        help="Endpoint of the router, e.g. tcp/192.168.1.10:7447; default: the file's.",
+    ),
+]
+ClockText = Annotated[str, Option("--clock", hidden=True)]
+Parent = Annotated[int | None, Option(hidden=True)]
+
+
+def write_report(path: Path | None, result: object) -> dict[str, str]:
+    """Writes what `--report` asks for. Returns the file and the reason where that failed."""
+    if path is None:
+        return {}
+    return write_or_reason(path, lambda: path.write_text(json_text(result), encoding="utf-8"))
+
+
+def print_result(
+    result: object, as_json: bool, show: Callable[[], None], lost: Mapping[str, str] = {}
+) -> None:
+    """Prints a result as JSON on standard output, or shows it to a person; then what was lost."""
+    if as_json:
+        sys.stdout.write(json_text(result) + "\n")
+    else:
+        show()
+    print_not_written(lost)
+
+
+def print_not_written(lost: Mapping[str, str]) -> None:
+    """Prints a line for each file that could not be written; with any, the exit code is 1."""
+    for name, reason in lost.items():
+        secho(f"cpcbl-team: {name}: not written: {reason}", fg="red", err=True)
+    if lost:
+        raise Exit(1)
+
+
+def parse_names(text: str) -> list[str]:
+    """The names of a list with commas."""
+    return [name.strip() for name in text.split(",") if name.strip()]

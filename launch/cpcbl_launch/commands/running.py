@@ -1,16 +1,19 @@
 """Commands that run a team, or a part of one."""
 
 import shlex
-from collections.abc import Sequence
+from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Optional
+from typing import TYPE_CHECKING, Annotated
 
 import typer
+from rich.console import Console
+from typer import Argument, Option
 
+from cpcbl_agents.clock import Clock
+from cpcbl_launch.checks import require_duration, require_robots, require_team_opencv
 from cpcbl_launch.commands import options
-from cpcbl_launch.commands.arguments import (
-    BASE_IMAGE,
+from cpcbl_launch.commands.options import (
     AsJson,
     BaseImage,
     Blind,
@@ -20,80 +23,59 @@ from cpcbl_launch.commands.arguments import (
     Image,
     MatchMessages,
     MessagesPerMinute,
+    NoiseSeed,
     Parent,
     PictureFile,
     ReportFile,
     TeamFile,
     parse_names,
-    parse_robots,
-    print_not_written,
     print_result,
     write_report,
 )
+from cpcbl_launch.overrides import Overrides, with_blind_robots, with_overrides
+from cpcbl_launch.run.containers import BASE_IMAGE
 from cpcbl_launch.team_file import find_team
+from cpcbl_team.config import Team
 from cpcbl_team.errors import InputError
+from cpcbl_transport.security import Identity, link_of
+from cpcbl_transport.topics import Role
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
-    from cpcbl_launch.overrides import Overrides
     from cpcbl_launch.run.up import Launch, Run
 
+LEAST_SPEED, MOST_SPEED = 0.05, 1000.0  # at an extreme pace no process could run
+
 UpFile = Annotated[
-    Optional[Path], typer.Argument(help="Team file, or a built-in one: demo (default), mrclam.")
+    Path | None, Argument(help="Team file, or a built-in one: demo (default), mrclam.")
 ]
 UpDuration = Annotated[
-    Optional[float],
-    typer.Option(help="Seconds of robot time; default: 30 simulated, or the whole log."),
+    float | None, Option(help="Seconds of robot time; default: 30 simulated, or the whole log.")
 ]
 Speed = Annotated[
-    float, typer.Option(callback=options.speed, help="Times real time, at least 0.05.")
+    float,
+    Option(
+        callback=options.number_that(
+            lambda speed: LEAST_SPEED <= speed <= MOST_SPEED,
+            f"from {LEAST_SPEED:g} to {MOST_SPEED:g} x real time",
+        ),
+        help="Times real time, at least 0.05.",
+    ),
 ]
-NoiseSeed = Annotated[int, typer.Option(help="Seed of the simulated noise.")]
-LogFolder = Annotated[
-    Optional[Path], typer.Option(help="Folder of an MRCLAM log, for source mrclam.")
-]
-Robots = Annotated[str, typer.Option(help="Robots to start on this machine; default: all.")]
+LogFolder = Annotated[Path | None, Option(help="Folder of an MRCLAM log, for source mrclam.")]
+Robots = Annotated[str, Option(help="Robots to start on this machine; default: all.")]
 RecordFile = Annotated[
-    Optional[Path],
-    typer.Option(
+    Path | None,
+    Option(
         callback=options.writable_file,
         help="File to record inputs, tracks, images, status and truth into (MCAP).",
     ),
 ]
 ProcessLogs = Annotated[
-    Optional[Path],
-    typer.Option(callback=options.folder, help="Folder for the logs of the processes."),
+    Path | None, Option(callback=options.folder, help="Folder for the logs of the processes.")
 ]
 InContainersOption = Annotated[
-    bool, typer.Option("--containers", help="Start one container per robot (needs Docker).")
+    bool, Option("--containers", help="Start one container per robot (needs Docker).")
 ]
-Listen = Annotated[
-    Optional[list[str]],
-    typer.Option(
-        callback=options.endpoints,
-        help="Endpoint to listen at; default: the file's, else tcp/127.0.0.1:7447.",
-    ),
-]
-OtherSite = Annotated[
-    Optional[list[str]],
-    typer.Option(
-        callback=options.endpoints, help="Endpoint of another site's router to connect to."
-    ),
-]
-ConfigFile = Annotated[
-    Optional[Path], typer.Option(help="A configuration of Zenoh (JSON5), in place of FILE.")
-]
-
-
-def check(file: Annotated[Path, typer.Argument(help="Team file (TOML).")]) -> None:
-    """Validate a team file without starting anything."""
-    team = find_team(file)
-    marks, walls = len(team.map.landmarks), len(team.map.walls)
-    typer.echo(
-        f"{file}: good: team {team.name!r}, {len(team.robots)} robots"
-        f" ({', '.join(team.robots)}), {marks} landmarks, {walls} walls"
-    )
 
 
 def up(
@@ -117,24 +99,16 @@ def up(
     as_json: AsJson = False,
 ) -> None:
     """Start a team: the field, a process per robot, a live table, a report at the end."""
-    from rich.console import Console
-
     from cpcbl_agents.process import StopSignal
-    from cpcbl_launch.overrides import Overrides, with_blind_robots
     from cpcbl_launch.run.up import local_endpoint, run_team
     from cpcbl_launch.views.run import LiveTable, print_report
 
-    budgets = Overrides(
-        bytes_per_s=bytes_per_s,
-        messages_per_minute=messages_per_minute,
-        match_messages=match_messages,
-    )
-    run = _run_of(file, duration, data, budgets)._replace(
-        speed=speed, seed=seed, folder=logs, picture=picture, record=record
-    )
+    budgets = Overrides(bytes_per_s, messages_per_minute, match_messages)
+    run = _run_of(file, duration, data, budgets)
+    run = run._replace(speed=speed, seed=seed, folder=logs, picture=picture, record=record)
     run = run._replace(team=with_blind_robots(run.team, parse_names(blind)))
     if robots:
-        run = run._replace(here=parse_robots("--robots", robots, run.team))
+        run = run._replace(here=_robots_here(robots, run.team))
     console = Console(stderr=as_json)
     launch = _launch(run, containers, image, base_image, console)
     endpoint = local_endpoint(run.team.transport.listen[0])
@@ -144,16 +118,13 @@ def up(
     with LiveTable(title, run.team.robots, console, quiet=as_json) as table:
         result = run_team(run, table, StopSignal(), launch)
     lost = dict(result.not_written) | write_report(report, result)
-    print_result(result, as_json, lambda: print_report(result, console))
-    print_not_written(lost)
+    print_result(result, as_json, lambda: print_report(result, console), lost)
 
 
 def _run_of(
-    file: Path | None, duration_s: float | None, data: Path | None, budgets: "Overrides"
+    file: Path | None, duration_s: float | None, data: Path | None, budgets: Overrides
 ) -> "Run":
     """The run of a simulated team, or of a team on the log that it replays."""
-    from cpcbl_launch.checks import require_duration
-    from cpcbl_launch.overrides import with_overrides
     from cpcbl_launch.run import logged_team
     from cpcbl_launch.run.up import LEAST_S, SIMULATED_S, Run, with_listen_endpoint
 
@@ -166,24 +137,26 @@ def _run_of(
         return Run(team, SIMULATED_S if duration_s is None else duration_s)
     logged = logged_team.load_logged_team(team, Path(data or team.data or "."))
     logged = logged_team.with_duration(logged, duration_s)
-    return Run(
-        logged.team,
-        (logged.end_ns - logged.start_ns) * 1e-9,
-        truth=logged.truth,
-        left_out=logged.left_out,
-        epoch_ns=logged.start_ns,
-    )
+    run = Run(logged.team, (logged.end_ns - logged.start_ns) * 1e-9, epoch_ns=logged.start_ns)
+    return run._replace(truth=logged.truth, left_out=logged.left_out)
+
+
+def _robots_here(text: str, team: Team) -> list[str]:
+    """The robots of `--robots`. Raises InputError for one that the team does not have."""
+    if not (names := parse_names(text)):
+        raise InputError(f"--robots {text}: names no robot; there are {', '.join(team.robots)}")
+    require_robots(f"--robots {text}", names, team)
+    return names
 
 
 def _launch(
-    run: "Run", containers: bool, image: str | None, base_image: str, console: "Console"
+    run: "Run", containers: bool, image: str | None, base_image: str, console: Console
 ) -> "Launch":
     """What starts the processes: this machine, or Docker."""
     if containers:
         from cpcbl_launch.run.containers.launch import InContainers, line_printer
 
         return partial(InContainers, image=image, base=base_image, print_line=line_printer(console))
-    from cpcbl_launch.checks import require_team_opencv
     from cpcbl_launch.run.up import OnThisMachine
 
     require_team_opencv(run.team, run.team.robots if run.here is None else run.here, field=True)
@@ -195,22 +168,15 @@ def field(
     seed: NoiseSeed = 1,
     connect: Connect = None,
     site: Annotated[
-        Optional[list[str]], typer.Option(help="Robots at another router: tcp/10.0.0.2:7447=r3,r4.")
+        list[str] | None, Option(help="Robots at another router: tcp/10.0.0.2:7447=r3,r4.")
     ] = None,
     clock: ClockText = "",
     parent: Parent = None,
 ) -> None:
     """Run the simulated field until SIGINT, SIGTERM or SIGHUP."""
-    from contextlib import ExitStack
-
-    from cpcbl_agents.clock import Clock
     from cpcbl_agents.process import StopSignal
-    from cpcbl_launch.checks import require_team_opencv
     from cpcbl_launch.simulation.field_node import parse_sites, run_field
-    from cpcbl_transport.bus import Bus
-    from cpcbl_transport.security import Identity, link_of
-    from cpcbl_transport.topics import Role
-    from cpcbl_transport.zenoh_bus import open_bus
+    from cpcbl_transport.zenoh_bus import ZenohBus, open_bus
 
     team = find_team(team_file)
     require_team_opencv(team, field=True)
@@ -218,12 +184,12 @@ def field(
     stop = StopSignal(parent)
     with ExitStack() as stack:
 
-        def session(endpoints: Sequence[str]) -> Bus:
+        def session(endpoints: list[str] | tuple[str, ...]) -> ZenohBus:
             link = link_of(team, Identity(Role.FIELD), endpoints)
             return stack.enter_context(open_bus(team.name, link.endpoints, stop, link.credentials))
 
         bus = session(connect or team.transport.connect)
-        sites: dict[str, Bus] = {}
+        sites: dict[str, ZenohBus] = {}
         for endpoint, names in elsewhere.items():
             sites |= dict.fromkeys(names, session([endpoint]))
         when = Clock.parse(clock) if clock else Clock.wall()
@@ -231,14 +197,25 @@ def field(
 
 
 def router(
-    file: Annotated[Optional[Path], typer.Argument(help="Team file.")] = None,
-    listen: Listen = None,
-    connect: OtherSite = None,
-    config: ConfigFile = None,
-    speed: Annotated[float, typer.Option(hidden=True, help="Guards let more in.")] = 1.0,
+    file: Annotated[Path | None, Argument(help="Team file.")] = None,
+    listen: Annotated[
+        list[str] | None,
+        Option(
+            callback=options.endpoints,
+            help="Endpoint to listen at; default: the file's, else tcp/127.0.0.1:7447.",
+        ),
+    ] = None,
+    connect: Annotated[
+        list[str] | None,
+        Option(callback=options.endpoints, help="Endpoint of another site's router to connect to."),
+    ] = None,
+    config: Annotated[
+        Path | None, Option(help="A configuration of Zenoh (JSON5), in place of FILE.")
+    ] = None,
+    speed: Annotated[float, Option(hidden=True, help="Guards let more in.")] = 1.0,
     parent: Parent = None,
     print_config: Annotated[
-        bool, typer.Option(help="Print the configuration, for zenohd or --config.")
+        bool, Option(help="Print the configuration, for zenohd or --config.")
     ] = False,
 ) -> None:
     """Run the team's Zenoh router, on any machine, until SIGINT, SIGTERM or SIGHUP."""
@@ -246,17 +223,18 @@ def router(
     from cpcbl_launch.run.router import config_text, run_router, team_router
     from cpcbl_transport.zenoh_bus import read_router_config
 
-    if (file is None) == (config is None):
-        raise InputError("router: a team FILE, or --config FILE; one of them")
-    if config is not None and (listen or connect):
-        raise InputError(f"--config {config}: says where it listens and connects; change it there")
-    if config is not None:
+    if config is not None and file is None:
+        if listen or connect:
+            raise InputError(
+                f"--config {config}: says where it listens and connects; change it there"
+            )
         title, settings = f"router of {config}", read_router_config(config)
-    else:
-        assert file is not None
+    elif file is not None and config is None:
         team = find_team(file)
         title = f"router of team {team.name}"
         settings = team_router(team, listen or (), connect or (), speed)
+    else:
+        raise InputError("router: a team FILE, or --config FILE; one of them")
     if print_config:
         typer.echo(config_text(settings, title))
     else:

@@ -1,43 +1,130 @@
-"""Commands that watch a running team."""
+"""Commands that join or watch a running team."""
 
-import itertools
 import logging
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Optional
+from typing import TYPE_CHECKING, Annotated, Literal
 
-import typer
+from rich.console import Console
+from typer import Argument, Exit, Option
 
-from cpcbl_launch.commands import options
-from cpcbl_launch.commands.arguments import Connect, TeamArgument, TeamFile, print_result
+from cpcbl_agents.clock import Clock
+from cpcbl_launch.checks import require_robots, require_team_opencv
+from cpcbl_launch.commands.options import (
+    AsJson,
+    BaseImage,
+    ClockText,
+    Connect,
+    Image,
+    Parent,
+    TeamArgument,
+    TeamFile,
+    more_than_no_time,
+    print_result,
+    require_folder,
+)
+from cpcbl_launch.run.containers import BASE_IMAGE
 from cpcbl_launch.team_file import find_team
+from cpcbl_team.config import Team, TransportSettings
 from cpcbl_team.errors import InputError
+from cpcbl_transport.security import Identity, Link, link_of
+from cpcbl_transport.topics import Role
 
 if TYPE_CHECKING:
-    from cpcbl_team.config import Team
     from cpcbl_transport.messages import AnnotatedFrame
+
+Name = Annotated[str, Argument(help="Name of the observer, which no robot of the team has.")]
+At = Annotated[str, Option(help="Pose of the observer: X,Y[,HEADING_DEG] on the field, in metres.")]
+Sensor = Annotated[str, Option(help="survey, gps, or a TOML file with the keys of a robot's type.")]
+FieldOfView = Annotated[
+    float | None, Option(help="Field of view in degrees; default: the sensor's.")
+]
+Move = Annotated[str, Option(help="Waypoints of a simulated observer's loop: X,Y;X,Y...")]
+Source = Annotated[
+    Literal["simulated", "external"] | None,
+    Option(help="external: your own driver feeds it; default: as the team's robots."),
+]
+Stay = Annotated[
+    float | None,
+    Option("--for", callback=more_than_no_time, help="Seconds to stay; default: until Ctrl-C."),
+]
+InContainer = Annotated[
+    bool, Option("--container", help="Run it in a container of its own (needs Docker).")
+]
+
+
+def observer(
+    name: Name,
+    team_file: TeamFile,
+    at: At,
+    sensor: Sensor = "survey",
+    fov: FieldOfView = None,
+    move: Move = "",
+    source: Source = None,
+    connect: Connect = None,
+    duration: Stay = None,
+    container: InContainer = False,
+    image: Image = None,
+    base_image: BaseImage = BASE_IMAGE,
+    as_json: AsJson = False,
+    clock: ClockText = "",
+    parent: Parent = None,
+) -> None:
+    """Join a running team, from any machine, with a better sensor; leave when it is stopped.
+
+    The team file need not name the observer. Robots that it sees improve their
+    estimates within a second. On a simulated field it gets a body at once.
+    """
+    from cpcbl_agents.process import StopSignal
+    from cpcbl_launch.run import observer as run
+    from cpcbl_launch.views.run import print_observer_report
+
+    waypoints = run.parse_waypoints(move)
+    request = run.ObserverRequest(name, run.parse_pose(at), sensor, fov, waypoints, source)
+    file_team = find_team(team_file)
+    team = run.team_with_observer(file_team, request)
+    console, stop = Console(stderr=as_json), StopSignal(parent)
+    endpoints = connect or team.transport.connect
+    if container:
+        from cpcbl_launch.run.containers.docker import ensure_image
+        from cpcbl_launch.run.containers.launch import line_printer, run_observer_container
+
+        given = {"at": at, "fov": fov, "move": move, "source": source, "for": duration}
+        arguments = _arguments(given | {"clock": clock}, endpoints, as_json)
+        image = image or ensure_image(base_image, stop, line_printer(console))
+        raise Exit(run_observer_container(name, file_team, sensor, arguments, image, stop))
+    text = f"{name} joins team {team.name} at {', '.join(endpoints)}; Ctrl-C: it leaves"
+    console.print(text, style="dim", highlight=False, soft_wrap=True)
+    when = Clock.parse(clock) if clock else Clock.wall()
+    limit_s = math.inf if duration is None else duration
+    result = run.run_observer(name, team, endpoints, when, stop, limit_s)
+    print_result(result, as_json, lambda: print_observer_report(result, console))
+
+
+def _arguments(given: Mapping[str, object], endpoints: Sequence[str], as_json: bool) -> list[str]:
+    """The options as a user types them; those that were not given are left out."""
+    texts = [f"--{name}={value}" for name, value in given.items() if value not in (None, "")]
+    texts += [f"--connect={endpoint}" for endpoint in endpoints]
+    return [*texts, "--json"] if as_json else texts
 
 
 def traffic(
     file: TeamArgument = None,
     team_name: Annotated[
-        Optional[str], typer.Option(help="The running team's name, where its file is not at hand.")
+        str | None, Option(help="The running team's name, where its file is not at hand.")
     ] = None,
     connect: Connect = None,
     duration: Annotated[
-        Optional[float],
-        typer.Option(
-            "--for",
-            callback=options.seconds_to_stay,
-            help="Seconds to watch; default: until Ctrl-C.",
+        float | None,
+        Option(
+            "--for", callback=more_than_no_time, help="Seconds to watch; default: until Ctrl-C."
         ),
     ] = None,
-    wait: Annotated[
-        float, typer.Option(min=0.1, help="Seconds to wait for the team's router.")
-    ] = 5.0,
+    wait: Annotated[float, Option(min=0.1, help="Seconds to wait for the team's router.")] = 5.0,
     as_json: Annotated[
-        bool, typer.Option("--json", help="Print the last state as JSON, at the end.")
+        bool, Option("--json", help="Print the last state as JSON, at the end.")
     ] = False,
 ) -> None:
     """Watch a running team, from any machine: who helps whom, and what it costs.
@@ -45,14 +132,9 @@ def traffic(
     Subscribes to the robots' status (1 Hz) only. A subscription to fixes or
     beliefs would make robots send them.
     """
-    from rich.console import Console
-
     from cpcbl_agents.process import StopSignal
     from cpcbl_launch.views.traffic.show import TrafficView, traffic_view
     from cpcbl_launch.views.traffic.watch import WatchRequest, watch_team
-    from cpcbl_team.config import TransportSettings
-    from cpcbl_transport.security import Identity, Link, link_of
-    from cpcbl_transport.topics import Role
 
     logging.getLogger("cpcbl_transport").setLevel(logging.WARNING)
     limit_s = math.inf if duration is None else duration
@@ -70,44 +152,31 @@ def traffic(
     print_result(result, as_json, lambda: console.print(traffic_view(result, where)))
 
 
-Pictures = Annotated[
-    Optional[Path],
-    typer.Option(help="Detect in this picture, or folder of pictures; no team need run."),
-]
-FrameCount = Annotated[
-    Optional[int], typer.Option(min=1, help="Frames to look at; default: one, or all pictures.")
-]
-
-
 def look(
-    robot: Annotated[str, typer.Argument(help="The robot whose camera it is.")],
+    robot: Annotated[str, Argument(help="The robot whose camera it is.")],
     team_file: TeamFile,
-    pictures: Pictures = None,
+    pictures: Annotated[
+        Path | None,
+        Option(help="Detect in this picture, or folder of pictures; no team need run."),
+    ] = None,
     connect: Connect = None,
     save: Annotated[
-        Path, typer.Option(help="Folder for the annotated pictures, made if need be.")
+        Path, Option(help="Folder for the annotated pictures, made if need be.")
     ] = Path("looks"),
-    count: FrameCount = None,
+    count: Annotated[
+        int | None, Option(min=1, help="Frames to look at; default: one, or all pictures.")
+    ] = None,
     wait: Annotated[
-        float, typer.Option(min=0.1, help="Seconds to wait for the router, and for a frame.")
+        float, Option(min=0.1, help="Seconds to wait for the router, and for a frame.")
     ] = 10.0,
-    as_json: Annotated[bool, typer.Option("--json", help="Print what is seen as JSON.")] = False,
+    as_json: Annotated[bool, Option("--json", help="Print what is seen as JSON.")] = False,
 ) -> None:
     """Annotated frames of a robot's camera: what it detects, and what it rejects and why.
 
     Prints a table for each frame and saves the annotated frames. A running robot
     annotates at most two frames a second, and only while this command runs.
     """
-    from rich.console import Console
-
-    from cpcbl_launch.checks import require_robots, require_team_opencv
-    from cpcbl_launch.commands.options import require_folder
-    from cpcbl_launch.views.frames.report import (
-        FrameReport,
-        frame_report,
-        print_frame_report,
-        save_picture,
-    )
+    from cpcbl_launch.views.frames import report
 
     team = find_team(team_file)
     require_robots(f"{team_file}", [robot], team)
@@ -116,39 +185,36 @@ def look(
     if pictures is not None:
         require_team_opencv(team, [robot])
     folder = require_folder("--save", save)
-    frames = (
-        _live_frames(robot, team, connect, wait)
-        if pictures is None
-        else _frames_of_pictures(robot, team, pictures)
-    )
-    max_frames = 1 if count is None and pictures is None else count
-    console, reports = Console(), list[FrameReport]()
-    for frame, name, annotated in itertools.islice(frames, max_frames):
-        reports.append(frame_report(annotated, frame, save_picture(annotated, folder, name)))
+    if pictures is None:
+        frames, count = _live_frames(robot, team, connect, wait), count or 1
+    else:
+        frames = _frames_of_pictures(robot, team, pictures)
+    console, reports = Console(), list[report.FrameReport]()
+    for name, file, annotated in islice(frames, count):
+        saved = report.save_picture(annotated, folder, f"{robot}_{file}")
+        reports.append(report.frame_report(annotated, name, saved))
         if not as_json:
-            print_frame_report(reports[-1], console)
+            report.print_frame_report(reports[-1], console)
     print_result(reports, as_json, lambda: None)
 
 
 def _live_frames(
-    robot: str, team: "Team", connect: list[str] | None, wait_s: float
-) -> Iterator[tuple[str, str, "AnnotatedFrame"]]:
-    """Annotated frames of a running robot, each with its name and the name of its file."""
+    robot: str, team: Team, connect: list[str] | None, wait_s: float
+) -> "Iterator[tuple[str, str, AnnotatedFrame]]":
+    """Annotated frames of a running robot, each with its name and that of its file."""
     from cpcbl_agents.process import StopSignal
     from cpcbl_launch.views.frames.watch import live_frames
-    from cpcbl_transport.security import Identity, link_of
-    from cpcbl_transport.topics import Role
 
     logging.getLogger("cpcbl_transport").setLevel(logging.WARNING)
     link = link_of(team, Identity(Role.OPERATOR), connect or team.transport.connect)
     for annotated in live_frames(robot, team.name, link, StopSignal(), wait_s):
-        yield str(annotated.stamp_ns), f"{robot}_{annotated.stamp_ns}", annotated
+        yield str(annotated.stamp_ns), str(annotated.stamp_ns), annotated
 
 
 def _frames_of_pictures(
-    robot: str, team: "Team", pictures: Path
-) -> Iterator[tuple[str, str, "AnnotatedFrame"]]:
-    """Annotated frames of picture files, each with its name and the name of its file."""
+    robot: str, team: Team, pictures: Path
+) -> "Iterator[tuple[str, str, AnnotatedFrame]]":
+    """Annotated frames of picture files, each with its name and that of its file."""
     from cpcbl_agents.sources.camera import picture_paths
     from cpcbl_launch.views.frames.watch import frames_of_pictures
 
@@ -158,4 +224,4 @@ def _frames_of_pictures(
     if not paths:
         raise InputError(f"--pictures {pictures}: no pictures (.png, .jpg) in it")
     for path, annotated in frames_of_pictures(paths, robot, team):
-        yield path.name, f"{robot}_{path.stem}", annotated
+        yield path.name, path.stem, annotated

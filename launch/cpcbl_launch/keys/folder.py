@@ -11,7 +11,7 @@ Folders are 0700 and private keys 0600 from the first byte on. A file is replace
 
 import os
 import secrets
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Sequence
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
@@ -45,14 +45,14 @@ class KeysReport(msgspec.Struct, frozen=True, kw_only=True):
     hosts: tuple[str, ...] = ()
 
 
-class KeyRequest(msgspec.Struct, frozen=True, kw_only=True):
+class KeyRequest(msgspec.Struct, frozen=True):
     """What `keys` is asked for."""
 
-    observers: tuple[str, ...] = ()
-    hosts: tuple[str, ...] = ()
+    observers: Sequence[str] = ()
+    hosts: Sequence[str] = ()
     lasting: timedelta = timedelta(days=365)
-    renew: tuple[str, ...] = ()
-    revoke: tuple[str, ...] = ()
+    renew: Sequence[str] = ()
+    revoke: Sequence[str] = ()
     retire_ca: bool = False
 
 

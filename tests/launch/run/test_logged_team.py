@@ -148,7 +148,8 @@ def test_blinding_an_unknown_robot_names_it_and_those_there_are() -> None:
 def test_choices_are_made_for_all_robots_and_nothing_else() -> None:
     team = log_team("1", "2")
     assert with_overrides(team, Overrides()) == team
-    picked = with_overrides(team, Overrides("oval", "passive", "naive", "both-ways"))
+    choice = Overrides(None, None, None, "oval", "passive", "naive", "both-ways")
+    picked = with_overrides(team, choice)
     for robot in picked.robots.values():
         rules = robot.collaboration
         assert robot.localizer.variant == "oval"

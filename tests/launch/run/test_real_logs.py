@@ -123,7 +123,8 @@ def test_no_divergence_lasts(name: str, variant: str, collaboration: str, fusion
     a covariance, as `weighted` has none, that may take 25 min: what it is told is worth little."""
     if collaboration == "none" and fusion == "naive":
         fusion = "split-ci"  # nothing is merged: the same run
-    report = evaluated(name, True, Overrides(variant, collaboration, fusion), calibrated=False)
+    choice = Overrides(variant=variant, collaboration=collaboration, fusion=fusion)
+    report = evaluated(name, True, choice, calibrated=False)
     for robot, r in report.robots.items():
         assert r.position_rmse_m is not None
         if robot not in BLIND:
