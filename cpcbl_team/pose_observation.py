@@ -71,16 +71,13 @@ class PoseObservation(NamedTuple):
 
 def from_fix(fix: Fix) -> PoseObservation:
     """What a teammate observed."""
-    sensor, observer = Covariance2(*fix.sensor_covariance), Covariance2(*fix.observer_covariance)
+    sensor = Covariance2(*fix.sensor_covariance).with_possible_correlation()
+    observer = Covariance2(*fix.observer_covariance).with_possible_correlation()
     heading = None
     if fix.heading_rad is not None:
         variances = fix.heading_sensor_variance, fix.heading_observer_variance
         heading = HeadingObservation(fix.heading_rad, *variances)
-    source, parts = (
-        FIX + fix.observer,
-        (sensor.with_possible_correlation(), observer.with_possible_correlation()),
-    )
-    return PoseObservation(source, fix.x_m, fix.y_m, *parts, heading)
+    return PoseObservation(FIX + fix.observer, fix.x_m, fix.y_m, sensor, observer, heading)
 
 
 def from_position_sensor(position: Position) -> PoseObservation:

@@ -59,8 +59,7 @@ class TeammateReport(NamedTuple):
     """Scaled to two degrees of freedom; None if the robot is lost, so that there is no test 1."""
     offset: tuple[float, float] | None = None
     """The reported position minus the estimated one, m; None for a sighting."""
-    position: ReportedPosition | None = None
-    """For test 2; None for a sighting."""
+    position: ReportedPosition | None = None  # for test 2; None for a sighting
 
 
 class SenderRecord(msgspec.Struct, frozen=True, gc=False):
@@ -68,33 +67,23 @@ class SenderRecord(msgspec.Struct, frozen=True, gc=False):
 
     last_report_ns: int = NEVER_NS
     last_agreement_ns: int = NEVER_NS
-    dispute_since_ns: int = NEVER_NS
-    """When its score last left zero."""
-    score: float = 0.0
-    """The sum of test 1: NIS beyond the usual."""
+    dispute_since_ns: int = NEVER_NS  # when its score last left zero
+    score: float = 0.0  # the sum of test 1: NIS beyond the usual
     mean_offset: tuple[float, float] = (0.0, 0.0)
     """Exponential mean of the offsets of its reports that disagree, m."""
-    offset_variance: float = 0.0
-    """Exponential variance of these offsets, m^2."""
-    position: ReportedPosition | None = None
-    """With which the next position is compared in test 2."""
-    comparisons: float = 0.0
-    """Number of comparisons with odometry, fading."""
-    odometry_conflicts: float = 0.0
-    """Number of them that contradicted odometry, fading."""
+    offset_variance: float = 0.0  # exponential variance of these offsets, m^2
+    position: ReportedPosition | None = None  # with which the next position is compared in test 2
+    comparisons: float = 0.0  # number of comparisons with odometry, fading
+    odometry_conflicts: float = 0.0  # number of them that contradicted odometry, fading
     missed_motion: bool = False
     """Whether the last conflict was a motion of the robot that the sender did not report."""
-    confirmations: int = 0
-    """Distances that odometry confirmed since the last conflict."""
+    confirmations: int = 0  # distances that odometry confirmed since the last conflict
     last_conflict_ns: int = NEVER_NS
     last_failure_ns: int = NEVER_NS
     """When a report last contradicted the estimate clearly, or odometry."""
-    agreements: int = 0
-    """Reports that agreed with the estimate since then."""
-    reason: QuarantineReason | None = None
-    """Why it is in quarantine; None if it is not."""
-    since_ns: int = 0
-    """When the quarantine began, or ended."""
+    agreements: int = 0  # reports that agreed with the estimate since then
+    reason: QuarantineReason | None = None  # why it is in quarantine; None if it is not
+    since_ns: int = 0  # when the quarantine began, or ended
     quarantines: int = 0
 
 
@@ -168,19 +157,10 @@ def _with_position(record: SenderRecord, now: ReportedPosition | None) -> Sender
         return record
     record = replace(record, position=now)
     if jumped or missed_motion:
-        return _with_conflict(record, now.stamp_ns, missed_motion)
+        conflicts, at_ns = record.odometry_conflicts + 1.0, now.stamp_ns
+        record = replace(record, odometry_conflicts=conflicts, missed_motion=missed_motion)
+        record = replace(record, last_conflict_ns=at_ns, last_failure_ns=at_ns)
+        return replace(record, confirmations=0, agreements=0)
     # While the robot stands, a frozen sender is right: that confirms nothing.
     confirms = is_far or record.reason is not QuarantineReason.FROZEN
     return replace(record, confirmations=record.confirmations + 1) if confirms else record
-
-
-def _with_conflict(record: SenderRecord, now_ns: int, missed_motion: bool) -> SenderRecord:
-    return replace(
-        record,
-        odometry_conflicts=record.odometry_conflicts + 1.0,
-        missed_motion=missed_motion,
-        confirmations=0,
-        last_conflict_ns=now_ns,
-        agreements=0,
-        last_failure_ns=now_ns,
-    )

@@ -57,9 +57,8 @@ def corrected_sighting(sighting: Sighting, sensor: SensorSettings, teammate: boo
 
     A heading is measured relative to the line of sight, so it changes with the bearing.
     """
-    (name, range_m, bearing, range_sigma, bearing_sigma, heading, heading_sigma) = (
-        msgspec.structs.astuple(sighting)
-    )
+    parts = msgspec.structs.astuple(sighting)
+    name, range_m, bearing, range_sigma, bearing_sigma, heading, heading_sigma = parts
     if any(angle is not None and abs(angle) > math.pi for angle in (bearing, heading)):
         return sighting
     if range_m is not None:
@@ -80,20 +79,15 @@ def without_bearing_bias(frame: Sightings, bias_rad: float) -> Sightings:
     changed."""
     if bias_rad == 0.0:
         return frame
-    return Sightings(
-        frame.stamp_ns, tuple(_sighting_without_bearing_bias(s, bias_rad) for s in frame.sightings)
-    )
-
-
-def _sighting_without_bearing_bias(sighting: Sighting, bias_rad: float) -> Sighting:
-    bearing, heading = sighting.bearing_rad, sighting.heading_rad
-    if bearing is None or sighting_fault(sighting):
-        return sighting
-    return msgspec.structs.replace(
-        sighting,
-        bearing_rad=wrap_angle(bearing - bias_rad),
-        heading_rad=None if heading is None else wrap_angle(heading - bias_rad),
-    )
+    sightings = []
+    for s in frame.sightings:
+        bearing, heading = s.bearing_rad, s.heading_rad
+        if bearing is not None and not sighting_fault(s):
+            bearing = wrap_angle(bearing - bias_rad)
+            heading = None if heading is None else wrap_angle(heading - bias_rad)
+            s = msgspec.structs.replace(s, bearing_rad=bearing, heading_rad=heading)
+        sightings.append(s)
+    return Sightings(frame.stamp_ns, tuple(sightings))
 
 
 def sighting_fault(sighting: Sighting) -> SightingFault | None:
@@ -119,30 +113,22 @@ def sighting_fault(sighting: Sighting) -> SightingFault | None:
 
 def _gravest_fault(sighting: Sighting) -> SightingFault:
     """The gravest fault of a sighting that has one."""
-    numbers = (
-        sighting.range_m,
-        sighting.bearing_rad,
-        sighting.range_sigma_m,
-        sighting.bearing_sigma_rad,
-        sighting.heading_rad,
-        sighting.heading_sigma_rad,
-    )
-    given = [n for n in numbers if n is not None]
-    if not all(math.isfinite(n) for n in given):
+    given = [n for n in msgspec.structs.astuple(sighting)[1:] if n is not None]
+    if not all(map(math.isfinite, given)):
         return SightingFault.NOT_FINITE
     if any(n > LARGEST_M for n in given):
         return SightingFault.IMPLAUSIBLE_NUMBER
-    if sighting.range_m is None and sighting.bearing_rad is None:
+    r, a, h = sighting.range_m, sighting.bearing_rad, sighting.heading_rad
+    if r is None and a is None:
         return SightingFault.EMPTY_SIGHTING
-    if sighting.range_m is not None and sighting.range_m <= 0.0:
+    if r is not None and r <= 0.0:
         return SightingFault.RANGE_NOT_POSITIVE
-    if sighting.bearing_rad is not None and abs(sighting.bearing_rad) > LARGEST_BEARING_RAD:
+    if a is not None and abs(a) > LARGEST_BEARING_RAD:
         return SightingFault.BEARING_OUT_OF_RANGE
-    if sighting.heading_rad is not None:
-        if abs(sighting.heading_rad) > LARGEST_BEARING_RAD:
-            return SightingFault.HEADING_OUT_OF_RANGE
-        if sighting.heading_sigma_rad is None:
-            return SightingFault.HEADING_WITHOUT_SIGMA
+    if h is not None and abs(h) > LARGEST_BEARING_RAD:
+        return SightingFault.HEADING_OUT_OF_RANGE
+    if h is not None and sighting.heading_sigma_rad is None:
+        return SightingFault.HEADING_WITHOUT_SIGMA
     return SightingFault.SIGMA_NOT_POSITIVE
 
 

@@ -19,9 +19,8 @@ from cpcbl_team.state import State
 Key = tuple[int, int, str, bytes]
 HORIZON_NS = 2_000_000_000
 _PRUNE = 64
-_content = msgspec.msgpack.Encoder(
-    enc_hook=float
-).encode  # also of numpy's numbers; faster than `repr`
+# Also of numpy's numbers; faster than `repr`
+_content = msgspec.msgpack.Encoder(enc_hook=float).encode
 
 _apply: dict[type, Callable[[Localizer, State, Input], State]] = {
     Belief: Localizer.add_teammate_belief,  # type: ignore[dict-item]
@@ -60,8 +59,7 @@ class Timeline:
     """The states of one localizer, whose inputs come in any order."""
 
     def __init__(self, localizer: Localizer, state: State, horizon_ns: int = HORIZON_NS) -> None:
-        self._localizer = localizer
-        self._horizon_ns = horizon_ns
+        self._localizer, self._horizon_ns = localizer, horizon_ns
         self._inputs: list[Input] = []
         self._keys: list[Key] = []
         self._before: list[State] = []
@@ -70,11 +68,9 @@ class Timeline:
 
     def add(self, item: Input) -> TimelineRefusal | None:
         """Inserts an input at its time; the reason if it cannot be used."""
-        key = _key(item)
-        keys = self._keys
-        if _measured_ns(item) < self._start_ns:
-            return TimelineRefusal.TOO_LATE
-        if keys and key[0] < keys[-1][0] - self._horizon_ns:
+        key, keys = _key(item), self._keys
+        is_beyond_horizon = bool(keys) and key[0] < keys[-1][0] - self._horizon_ns
+        if is_beyond_horizon or _measured_ns(item) < self._start_ns:
             return TimelineRefusal.TOO_LATE
         if not keys or key > keys[-1]:
             self._append(key, item)

@@ -37,12 +37,8 @@ CLEAR_CONFLICTS = 0.5  # odometry speaks against a sender with this many conflic
 MOST_CONFLICTS = 2.5  # with more a sender is quarantined: at the third within a short time
 LEAST_AGREEMENTS = 10  # reports that must agree with the estimate before a sender is readmitted,
 LEAST_CONFIRMATIONS = 2  # or distances that must agree with odometry
-_BY_COMPARISON = (
-    QuarantineReason.BIASED,
-    QuarantineReason.OVERCONFIDENT,
-    QuarantineReason.OUTVOTED,
-)
-"""The reasons that rest on what other senders reported."""
+# The reasons that rest on what other senders reported
+_BY_COMPARISON = QuarantineReason.BIASED, QuarantineReason.OVERCONFIDENT, QuarantineReason.OUTVOTED
 
 SenderRecords = Mapping[str, SenderRecord]
 
@@ -51,14 +47,10 @@ class TrustDecision(NamedTuple):
     """What follows from a report."""
 
     senders: SenderRecords
-    trusted: bool
-    """Whether the report may be used."""
-    event: str = ""
-    """The count to increase: quarantined, readmitted, outvoted."""
-    quarantined: frozenset[str] = frozenset()
-    """The senders whose quarantine begins now."""
-    estimate_error_m: float = 0.0
-    """How far the estimate may be off because it followed them."""
+    trusted: bool  # whether the report may be used
+    event: str = ""  # the count to increase: quarantined, readmitted, outvoted
+    quarantined: frozenset[str] = frozenset()  # the senders whose quarantine begins now
+    estimate_error_m: float = 0.0  # how far the estimate may be off because it followed them
 
 
 class TrustStatus(NamedTuple):
@@ -68,8 +60,7 @@ class TrustStatus(NamedTuple):
     reason: str = ""
     since_ns: int = 0
     quarantines: int = 0
-    unconfirmed: bool = False
-    """It is the only recent sender, so a bias of it cannot be detected."""
+    unconfirmed: bool = False  # it is the only recent sender, so a bias of it cannot be detected
 
 
 def with_own_sensor_result(
@@ -112,16 +103,16 @@ def _decide_dispute(
     no sender is blamed: the robot detects by its innovations that it is lost.
     """
     recent = dict(_recent(senders, now_ns))
-    since_ns = min(
-        (r.dispute_since_ns for r in recent.values() if r.score > rules.limit), default=None
-    )
-    if since_ns is None:
+    disputes_ns = [r.dispute_since_ns for r in recent.values() if r.score > rules.limit]
+    if not disputes_ns:
         return TrustDecision(senders, True)
+    since_ns = min(disputes_ns)
     dissenters = {n for n, r in recent.items() if r.score > 0.5 * rules.limit}
-    agreeing = {
-        n for n, r in recent.items() if r.last_agreement_ns > max(since_ns, r.dispute_since_ns)
+    supporters = {
+        n
+        for n, r in recent.items()
+        if n not in dissenters and r.last_agreement_ns > max(since_ns, r.dispute_since_ns)
     }
-    supporters = agreeing - dissenters
     if not supporters:
         return TrustDecision(senders, True)
     is_right = _is_estimate_right(recent, dissenters, supporters, now_ns - since_ns)
@@ -165,11 +156,9 @@ def _recent(
 
 def _is_odometry_wrong(senders: SenderRecords, name: str, rules: TrustSettings) -> bool:
     """Whether another source contradicts odometry too, so that `name` is not to blame."""
-    now_ns = senders[name].last_report_ns
     return any(
-        record.odometry_conflicts >= 1.0
-        or (other == OWN_SENSORS and record.score > 0.5 * rules.limit)
-        for other, record in _recent(senders, now_ns, name)
+        r.odometry_conflicts >= 1.0 or (other == OWN_SENSORS and r.score > 0.5 * rules.limit)
+        for other, r in _recent(senders, senders[name].last_report_ns, name)
     )
 
 
@@ -204,25 +193,13 @@ def _quarantine_supporters(
 
 
 def _quarantined(record: SenderRecord, reason: QuarantineReason, now_ns: int) -> SenderRecord:
-    return replace(
-        record,
-        reason=reason,
-        since_ns=now_ns,
-        quarantines=record.quarantines + 1,
-        agreements=0,
-        confirmations=0,
-    )
+    record = replace(record, agreements=0, confirmations=0)
+    return replace(record, reason=reason, since_ns=now_ns, quarantines=record.quarantines + 1)
 
 
 def _released(record: SenderRecord, now_ns: int) -> SenderRecord:
-    return replace(
-        record,
-        reason=None,
-        since_ns=now_ns,
-        score=0.0,
-        odometry_conflicts=0.0,
-        dispute_since_ns=NEVER_NS,
-    )
+    record = replace(record, score=0.0, odometry_conflicts=0.0, dispute_since_ns=NEVER_NS)
+    return replace(record, reason=None, since_ns=now_ns)
 
 
 def _reason_of(record: SenderRecord) -> QuarantineReason:
@@ -255,9 +232,8 @@ def _assess_quarantined(
     is_confirmed = any(r.last_agreement_ns >= now - RECENT_NS for _, r in others)
     agrees = record.agreements >= LEAST_AGREEMENTS and now - record.last_failure_ns >= readmit_ns
     is_alone = all(now - r.last_report_ns > SILENCE_NS for n, r in senders.items() if n != name)
-    is_consistent = (
-        record.confirmations >= LEAST_CONFIRMATIONS and now - record.last_conflict_ns >= readmit_ns
-    )
+    has_confirmations = record.confirmations >= LEAST_CONFIRMATIONS
+    is_consistent = has_confirmations and now - record.last_conflict_ns >= readmit_ns
     if not ((agrees and is_confirmed) or (is_alone and is_consistent)):
         return TrustDecision(senders, False)
     return TrustDecision({**senders, name: _released(record, now)}, True, "readmitted")
@@ -270,14 +246,10 @@ def reset_scores(senders: SenderRecords) -> SenderRecords:
 
 def trust_statuses(senders: SenderRecords, now_ns: int) -> tuple[TrustStatus, ...]:
     """The status of each sender that reported recently, or is or was in quarantine."""
-    return tuple(
-        TrustStatus(
-            name,
-            str(r.reason or ""),
-            r.since_ns,
-            r.quarantines,
-            not any(_recent(senders, now_ns, name)),
-        )
-        for name, r in sorted(senders.items())
-        if name != OWN_SENSORS and (r.quarantines or now_ns - r.last_report_ns <= RECENT_NS)
-    )
+    statuses = []
+    for name, r in sorted(senders.items()):
+        if name != OWN_SENSORS and (r.quarantines or now_ns - r.last_report_ns <= RECENT_NS):
+            is_only = not any(_recent(senders, now_ns, name))
+            reason = str(r.reason or "")
+            statuses.append(TrustStatus(name, reason, r.since_ns, r.quarantines, is_only))
+    return tuple(statuses)

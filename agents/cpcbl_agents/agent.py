@@ -20,8 +20,7 @@ class PoseEstimate(NamedTuple):
 
     stamp_ns: int
     estimate: Estimate
-    lost: str
-    """Why the robot is lost; empty while it is not."""
+    lost: str  # why the robot is lost; empty while it is not
     speed_m_s: float
     turn_rate_rad_s: float
 

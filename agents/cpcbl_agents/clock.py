@@ -12,8 +12,7 @@ class Clock(NamedTuple):
     epoch_ns: int
     from_ns: int
     speed: float
-    unix: bool = False
-    """Whether it is the machine's own time, which may be set."""
+    unix: bool = False  # whether it is the machine's own time, which may be set
 
     def now_ns(self) -> int:
         elapsed = max(0, time.monotonic_ns() - self.from_ns)

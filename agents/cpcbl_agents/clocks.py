@@ -23,8 +23,7 @@ class Span(NamedTuple):
     least_ns: int = NEVER_LATE_NS
     """The least time from stamp to arrival; below zero it arrived before it was measured."""
     messages: int = 0
-    ahead: int = 0
-    """How many arrived before they were measured, by more than is tolerated."""
+    ahead: int = 0  # how many arrived before they were measured, by more than is tolerated
 
 
 class ClockMonitor:

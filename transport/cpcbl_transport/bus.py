@@ -11,8 +11,7 @@ from typing import Protocol, Self
 
 from cpcbl_transport.topics import Qos
 
-MessageCallback = Callable[[str, bytes], None]
-"""Called with the key and the payload of a message."""
+MessageCallback = Callable[[str, bytes], None]  # called with the key and the payload of a message
 LivelinessCallback = Callable[[str, bool], None]
 """Called with the key of a token, and whether the token is there."""
 

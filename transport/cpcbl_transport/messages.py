@@ -35,8 +35,7 @@ class UnclearObject(msgspec.Struct, frozen=True, array_like=True):
     """Something in a frame that is not reported as a sighting, and why not."""
 
     reason: str
-    names: tuple[str, ...] = ()
-    """The names of what it could be."""
+    names: tuple[str, ...] = ()  # the names of what it could be
 
 
 class AnnotatedFrame(msgspec.Struct, frozen=True, array_like=True, tag="look"):
@@ -59,12 +58,9 @@ class Flow(msgspec.Struct, frozen=True, array_like=True):
     topic: str
     peer: str
     messages: int = 0
-    bytes: int = 0
-    """On the link, with Zenoh's own bytes."""
-    over_budget: int = 0
-    """Not sent: the budget did not allow it, or had a better use."""
-    worthless: int = 0
-    """Not sent: its information gain for the teammate was too small."""
+    bytes: int = 0  # on the link, with Zenoh's own bytes
+    over_budget: int = 0  # not sent: the budget did not allow it, or had a better use
+    worthless: int = 0  # not sent: its information gain for the teammate was too small
     silent: int = 0
     """Not sent: subscribers can still predict this robot's pose from its last belief."""
     latest_ns: int = 0
@@ -73,25 +69,19 @@ class Flow(msgspec.Struct, frozen=True, array_like=True):
 class Spending(msgspec.Struct, frozen=True, array_like=True):
     """A limit on fixes and beliefs, and the largest use of it so far."""
 
-    unit: str
-    """bytes or messages"""
-    window_s: float
-    """0: the limit holds for the whole match."""
+    unit: str  # bytes or messages
+    window_s: float  # 0: the limit holds for the whole match
     allowed: float
-    most: float
-    """The most that was spent within one window."""
+    most: float  # the most that was spent within one window
 
 
 class Trust(msgspec.Struct, frozen=True, array_like=True):
     """How far this robot trusts a teammate."""
 
     peer: str
-    reason: str = ""
-    """Why none of its messages is used; empty while they are used."""
-    since_ns: int = 0
-    """When the quarantine began, or ended."""
-    quarantines: int = 0
-    """How often it was in quarantine so far."""
+    reason: str = ""  # why none of its messages is used; empty while they are used
+    since_ns: int = 0  # when the quarantine began, or ended
+    quarantines: int = 0  # how often it was in quarantine so far
     unconfirmed: bool = False
     """No other teammate sends anything, so a bias of this one cannot be recognized."""
     late_s: float = 0.0
@@ -142,8 +132,7 @@ class Drive(msgspec.Struct, frozen=True, array_like=True, tag="drive"):
     stamp_ns: int
     speed_m_s: float
     turn_rate_rad_s: float
-    reached: int = 0
-    """Waypoints that the robot believes to have reached so far."""
+    reached: int = 0  # waypoints that the robot believes to have reached so far
 
 
 class Join(msgspec.Struct, frozen=True, array_like=True, tag="join"):
@@ -195,8 +184,7 @@ class Refusal(StrEnum):
     DURATION = "impossible_duration"
     UNKNOWN_ROBOT = "unknown_robot"
     OWN = "own_message"
-    NOT_ITS_OWN = "name_of_another"
-    """The message names another robot than its key."""
+    NOT_ITS_OWN = "name_of_another"  # the message names another robot than its key
 
 
 _encoder = msgspec.msgpack.Encoder()

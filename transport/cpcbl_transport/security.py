@@ -66,8 +66,7 @@ class Member(msgspec.Struct, frozen=True, kw_only=True):
 class Credentials(NamedTuple):
     """Key files of one session."""
 
-    ca: str
-    """Certificates of the authorities that are trusted."""
+    ca: str  # certificates of the authorities that are trusted
     certificate: str
     private_key: str
 
