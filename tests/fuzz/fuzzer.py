@@ -35,8 +35,8 @@ from cpcbl_launch.lab.chaos.team import (
 )
 from cpcbl_launch.reporting.recorder import Recorder
 from cpcbl_launch.run.processes import PROGRAM
-from cpcbl_launch.views.frames.subscriber import FrameSubscriber
-from cpcbl_launch.views.traffic.watch import StatusCollector
+from cpcbl_launch.views.frames import FrameSubscriber
+from cpcbl_launch.views.traffic import StatusCollector
 from cpcbl_team.config import (
     CollaborationSettings,
     GuardSettings,

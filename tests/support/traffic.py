@@ -8,7 +8,7 @@ from rich.console import Console
 
 from cpcbl_launch.reporting.recorder import Recorder, Report
 from cpcbl_launch.views.run import print_report
-from cpcbl_launch.views.traffic.watch import (
+from cpcbl_launch.views.traffic import (
     Arrival,
 )
 from cpcbl_transport import topics

@@ -87,9 +87,13 @@ def keys(
 
 
 def _print_keys(made: "list[KeysReport]", folder: Path) -> None:
-    from cpcbl_launch.views.keys import key_table
+    from cpcbl_launch.reporting.tables import table
 
-    Console().print(key_table(made))
+    shown = table("", ("who", "certificate says", "valid until (UTC)", ""), ())
+    for member in made:
+        until = f"{member.valid_until:%Y-%m-%d %H:%M}" if member.valid_until else "-"
+        shown.add_row(member.who, member.common_name, until, member.deed)
+    Console().print(shown)
     router = next(member for member in made if member.hosts)
     typer.echo(f"robots reach the router at {', '.join(router.hosts)}")
     typer.echo(

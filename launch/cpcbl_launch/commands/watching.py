@@ -133,8 +133,8 @@ def traffic(
     beliefs would make robots send them.
     """
     from cpcbl_agents.process import StopSignal
-    from cpcbl_launch.views.traffic.show import TrafficView, traffic_view
-    from cpcbl_launch.views.traffic.watch import WatchRequest, watch_team
+    from cpcbl_launch.views.traffic import WatchRequest, watch_team
+    from cpcbl_launch.views.traffic_tables import TrafficView, traffic_view
 
     logging.getLogger("cpcbl_transport").setLevel(logging.WARNING)
     limit_s = math.inf if duration is None else duration
@@ -148,7 +148,7 @@ def traffic(
         request = WatchRequest(team_name or team.name, tuple(team.robots), link, limit_s, wait)
     console, where = Console(), ", ".join(endpoints)
     with TrafficView(where, console, quiet=as_json) as view:
-        result = watch_team(request, view, StopSignal())
+        result = watch_team(request, view.show, StopSignal())
     print_result(result, as_json, lambda: console.print(traffic_view(result, where)))
 
 
@@ -176,7 +176,7 @@ def look(
     Prints a table for each frame and saves the annotated frames. A running robot
     annotates at most two frames a second, and only while this command runs.
     """
-    from cpcbl_launch.views.frames import report
+    from cpcbl_launch.views import frames as view
 
     team = find_team(team_file)
     require_robots(f"{team_file}", [robot], team)
@@ -189,12 +189,12 @@ def look(
         frames, count = _live_frames(robot, team, connect, wait), count or 1
     else:
         frames = _frames_of_pictures(robot, team, pictures)
-    console, reports = Console(), list[report.FrameReport]()
+    console, reports = Console(), list[view.FrameReport]()
     for name, file, annotated in islice(frames, count):
-        saved = report.save_picture(annotated, folder, f"{robot}_{file}")
-        reports.append(report.frame_report(annotated, name, saved))
+        saved = view.save_picture(annotated, folder, f"{robot}_{file}")
+        reports.append(view.frame_report(annotated, name, saved))
         if not as_json:
-            report.print_frame_report(reports[-1], console)
+            view.print_frame_report(reports[-1], console)
     print_result(reports, as_json, lambda: None)
 
 
@@ -203,7 +203,7 @@ def _live_frames(
 ) -> "Iterator[tuple[str, str, AnnotatedFrame]]":
     """Annotated frames of a running robot, each with its name and that of its file."""
     from cpcbl_agents.process import StopSignal
-    from cpcbl_launch.views.frames.watch import live_frames
+    from cpcbl_launch.views.frames import live_frames
 
     logging.getLogger("cpcbl_transport").setLevel(logging.WARNING)
     link = link_of(team, Identity(Role.OPERATOR), connect or team.transport.connect)
@@ -216,12 +216,15 @@ def _frames_of_pictures(
 ) -> "Iterator[tuple[str, str, AnnotatedFrame]]":
     """Annotated frames of picture files, each with its name and that of its file."""
     from cpcbl_agents.sources.camera import picture_paths
-    from cpcbl_launch.views.frames.watch import frames_of_pictures
+    from cpcbl_agents.vision.detector import CameraDetector
+    from cpcbl_transport.messages import Frame
 
     if not pictures.exists():
         raise InputError(f"--pictures {pictures}: no such file or folder")
     paths = picture_paths(pictures) if pictures.is_dir() else [pictures]
     if not paths:
         raise InputError(f"--pictures {pictures}: no pictures (.png, .jpg) in it")
-    for path, annotated in frames_of_pictures(paths, robot, team):
+    detector = CameraDetector(robot, team)
+    for path in paths:
+        _, annotated = detector.detect_and_annotate(Frame(0, path.read_bytes()))
         yield path.name, path.stem, annotated

@@ -14,7 +14,7 @@ from cpcbl_agents.clock import Clock
 from cpcbl_agents.guest_node import GuestNode
 from cpcbl_agents.process import Loop, new_incarnation, own_camera, stop_on_clock_step
 from cpcbl_launch.reporting.statuses import FlowReport, summed_flows
-from cpcbl_launch.simulation.guest_bodies import unsupported_delay
+from cpcbl_launch.simulation.guests import unsupported_delay
 from cpcbl_launch.team_file import read_layer, with_added_robot
 from cpcbl_team.config import Team
 from cpcbl_team.errors import InputError

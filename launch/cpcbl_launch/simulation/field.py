@@ -7,9 +7,9 @@ import math
 from collections import deque
 from collections.abc import Iterable
 from functools import partial
+from itertools import product
 from typing import TYPE_CHECKING
 
-from cpcbl_launch.simulation.grid import Grid
 from cpcbl_launch.simulation.robot import SimulatedRobot, VisibleObject
 from cpcbl_team.config import SimulationEvent, Team
 from cpcbl_team.geometry import Pose2, wrap_angle
@@ -21,6 +21,27 @@ if TYPE_CHECKING:
     from cpcbl_launch.simulation.camera.cameras import Cameras
 
 _GUEST_SEED = 2**31  # no robot of a team file has this number
+_MARGIN_M = 1e-3  # so that rounding moves nothing beyond the next cell of a grid
+
+
+class Grid:
+    """Objects by square cell, which is as wide as anybody can reach, so that nine are enough."""
+
+    def __init__(self, reach_m: float, objects: Iterable[VisibleObject]) -> None:
+        self._side_m = reach_m + _MARGIN_M
+        self._cells: dict[tuple[int, int], list[tuple[int, VisibleObject]]] = {}
+        for number, seen in enumerate(objects):
+            self._cells.setdefault(self._cell(seen.x, seen.y), []).append((number, seen))
+
+    def near(self, x: float, y: float) -> list[VisibleObject]:
+        """All within reach of a place (metres) and some beyond, in the order they were given."""
+        column, row = self._cell(x, y)
+        cells = product((column - 1, column, column + 1), (row - 1, row, row + 1))
+        found = [numbered for cell in cells for numbered in self._cells.get(cell, ())]
+        return [seen for _, seen in sorted(found)]  # by number: no two are the same
+
+    def _cell(self, x: float, y: float) -> tuple[int, int]:
+        return math.floor(x / self._side_m), math.floor(y / self._side_m)
 
 
 class SimulatedField:
@@ -30,23 +51,23 @@ class SimulatedField:
         self.team, self._seed = team, seed
         self._step_ns = int(1e9 / team.simulation.step_rate_hz)
         self.now_ns = start_ns
+        noise, first_ns = team.simulation.noise, start_ns + self._step_ns
         self.robots = {
             name: SimulatedRobot(
-                settings,
-                team.simulation.noise,
+                robot,
+                noise,
                 (seed, i),
                 start_ns,
                 self._step_ns,
-                _first_frame_ns(team, name, start_ns + self._step_ns),
+                _first_frame_ns(team, name, first_ns),
             )
-            for i, (name, settings) in enumerate(team.robots.items())
-            if settings.source == "simulated"
+            for i, (name, robot) in enumerate(team.robots.items())
+            if robot.source == "simulated"
         }
         self._cameras = _cameras(team, seed)
         self.skipped_frames = 0  # frames that were due in steps without pictures
-        self._landmarks = [
-            VisibleObject(n, m.x_m, m.y_m, m.gives) for n, m in team.map.landmarks.items()
-        ]
+        landmarks = team.map.landmarks.items()
+        self._landmarks = [VisibleObject(name, m.x_m, m.y_m, m.gives) for name, m in landmarks]
         self._landmarks_to_bump = Grid(team.simulation.bump_radius_m, self._landmarks)
         self._start_ns = start_ns
         self._events = deque(sorted(team.simulation.events, key=lambda event: event.at_s))
@@ -93,10 +114,7 @@ class SimulatedField:
             self._count_bumps(robot)
         mates = Grid(
             self._reach_m,
-            (
-                VisibleObject(n, r.pose.x, r.pose.y, "both", teammate=True)
-                for n, r in self.robots.items()
-            ),
+            [VisibleObject(n, *r.pose[:2], "both", teammate=True) for n, r in self.robots.items()],
         )
         sensed: list[tuple[str, SensorInput]] = []
         for name, robot in self.robots.items():
@@ -122,7 +140,7 @@ class SimulatedField:
             self.robots[event.kidnap].pose = Pose2(x, y, wrap_angle(math.radians(heading_deg)))
 
     def _take_frame(
-        self, name: str, mates: Grid[VisibleObject], pictures: bool, stamp_ns: int
+        self, name: str, mates: Grid, pictures: bool, stamp_ns: int
     ) -> Sightings | Frame | None:
         """What a robot sees now: a picture, if it has a camera."""
         robot = self.robots[name]
@@ -132,17 +150,14 @@ class SimulatedField:
                 return None
             poses = {other: r.pose for other, r in self.robots.items()}
             return self._cameras.frame(name, stamp_ns, poses, self._are_landmarks_hidden)
-        return robot.sightings(
-            self.now_ns, stamp_ns, self._visible_objects(name, robot.pose, mates)
-        )
+        seen = self._visible_objects(name, robot.pose, mates)
+        return robot.sightings(self.now_ns, stamp_ns, seen)
 
     @property
     def _are_landmarks_hidden(self) -> bool:
         return self.now_ns < self._hidden_until_ns
 
-    def _visible_objects(
-        self, viewer: str, pose: Pose2, mates: Grid[VisibleObject]
-    ) -> Iterable[VisibleObject]:
+    def _visible_objects(self, viewer: str, pose: Pose2, mates: Grid) -> Iterable[VisibleObject]:
         if not self._are_landmarks_hidden:
             yield from self._landmarks_to_see.near(pose.x, pose.y)
             yield from self._nearest_wall_points(pose)

@@ -17,7 +17,7 @@ from msgspec.structs import replace
 from cpcbl_agents.clock import Clock
 from cpcbl_launch.checks import require_robots
 from cpcbl_launch.simulation.field import SimulatedField
-from cpcbl_launch.simulation.guest_bodies import GuestBodies
+from cpcbl_launch.simulation.guests import GuestBodies
 from cpcbl_launch.team_checks import endpoint_problem
 from cpcbl_team.config import Team
 from cpcbl_team.errors import InputError
@@ -53,7 +53,7 @@ class FieldNode:
         self.counts: Counter[str] = Counter()
         """Accepted messages (`drive`, `join`), and refused ones by reason."""
         self._truth = bus.publisher(topics.TRUTH.at(), topics.TRUTH.qos)
-        self._publishers: dict[tuple[str, type], Publisher] = {}
+        self._publishers: dict[str, dict[type[object] | None, Publisher]] = {}
         self._drive_subscriptions: dict[str, Handle] = {}
         for name in field.robots:
             self._declare(name)
@@ -61,10 +61,9 @@ class FieldNode:
 
     def _declare(self, name: str) -> None:
         bus = self._sites.get(name, self._bus)
-        for topic in topics.INPUTS:
-            assert topic.carries is not None
-            publisher = bus.publisher(topic.at(robot=name), topic.qos)
-            self._publishers[name, topic.carries] = publisher
+        self._publishers[name] = {
+            topic.carries: bus.publisher(topic.at(robot=name), topic.qos) for topic in topics.INPUTS
+        }
         self._drive_subscriptions[name] = bus.subscribe(topics.DRIVE.at(robot=name), self._receive)
 
     def _receive(self, key: str, payload: bytes) -> None:
@@ -98,7 +97,7 @@ class FieldNode:
             in_time = now_ns - self._field.next_ns <= PICTURES_LATE_NS
             for name, sensed in self._field.advance(in_time):
                 stamped = with_clock_offset(sensed, self._field.clock_offset_ns(name))
-                self._publishers[name, type(sensed)].put(encode(stamped))
+                self._publishers[name][type(sensed)].put(encode(stamped))
             if self._truth.matching:
                 self._truth.put(encode(self._field.truth()))
 
@@ -112,21 +111,17 @@ class FieldNode:
             if message.robot not in self._field.robots:
                 return Refusal.UNKNOWN_ROBOT
             message = with_clock_offset(message, -self._field.clock_offset_ns(message.robot))
-        reason = refusal(message, now_ns)
-        if reason is not None:
+        if reason := refusal(message, now_ns):
             return reason
         self.counts[type(message).__name__.lower()] += 1
         if isinstance(message, Drive):
             self._field.command(message)
-        else:
-            self._request_body(message, now_ns)
+        elif (why := self._guest_bodies.request(message, now_ns)) and (
+            len(self._refused) < MOST_REFUSED and message.robot not in self._refused
+        ):
+            self._refused.add(message.robot)
+            log.warning("guest %s gets no body: %s", message.robot, why)
         return None
-
-    def _request_body(self, join: Join, now_ns: int) -> None:
-        reason = self._guest_bodies.request(join, now_ns)
-        if reason and len(self._refused) < MOST_REFUSED and join.robot not in self._refused:
-            self._refused.add(join.robot)
-            log.warning("guest %s gets no body: %s", join.robot, reason)
 
     def _update_guests(self, now_ns: int) -> None:
         """Guests that ask for a body get it, those that leave or are silent lose it."""
@@ -144,9 +139,8 @@ class FieldNode:
     def _remove_guest(self, name: str) -> None:
         del self._guests[name]
         self._field.remove_guest(name)
-        for topic in topics.INPUTS:
-            assert topic.carries is not None
-            self._publishers.pop((name, topic.carries)).close()
+        for publisher in self._publishers.pop(name).values():
+            publisher.close()
         self._drive_subscriptions.pop(name).close()
         log.info("guest %s left the field", name)
 

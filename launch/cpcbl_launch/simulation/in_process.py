@@ -12,7 +12,7 @@ from cpcbl_launch.reporting.recorder import Recorder, Report, variants_of
 from cpcbl_launch.reporting.recording import Recording
 from cpcbl_launch.simulation.field import SimulatedField
 from cpcbl_launch.simulation.field_node import FieldNode
-from cpcbl_launch.simulation.scheduled_guests import ScheduledGuest, ScheduledGuestNode
+from cpcbl_launch.simulation.guests import ScheduledGuest, ScheduledGuestNode
 from cpcbl_team.config import Team
 from cpcbl_transport.bus import Bus
 from cpcbl_transport.memory_bus import MemoryHub

@@ -1,4 +1,4 @@
-"""What is redrawn while something runs: on a terminal, else a snapshot every few seconds."""
+"""What is drawn again and again while a team runs, and the bus on which it is watched."""
 
 import time
 from collections.abc import Callable
@@ -7,11 +7,38 @@ from typing import Self
 from rich.console import Console, RenderableType
 from rich.live import Live
 
+from cpcbl_transport.security import Link
+from cpcbl_transport.zenoh_bus import BusError, ZenohBus, open_bus
+
 SNAPSHOT_S = 5.0
 
 
+def open_bus_within(
+    wait_s: float, team: str, link: Link, stop: Callable[[], bool]
+) -> ZenohBus | None:
+    """A session at a running team's router; None where `stop()` came first.
+
+    Raises BusError when no router answers for `wait_s`.
+    """
+    until_s = time.monotonic() + wait_s
+    try:
+        return open_bus(
+            team, link.endpoints, lambda: stop() or time.monotonic() > until_s, link.credentials
+        )
+    except BusError:
+        if stop():
+            return None
+        raise BusError(
+            f"no router at {', '.join(link.endpoints)} within {wait_s:g} s;"
+            " --connect takes the endpoint that `cpcbl-team up` says"
+        ) from None
+
+
 class LiveView:
-    """A context manager; what it drew is gone from a terminal when it ends."""
+    """Redrawn on a terminal, else a snapshot every few seconds; nothing where it is quiet.
+
+    A context manager; what it drew is gone from a terminal when it ends.
+    """
 
     def __init__(self, console: Console, quiet: bool = False) -> None:
         self._console, self._quiet = console, quiet

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
+from statistics import fmean
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
@@ -26,7 +27,7 @@ from cpcbl_launch.run.observer import ObserverReport
 from cpcbl_launch.run.processes import ROBOT
 from cpcbl_launch.run.supervisor import Processes
 from cpcbl_launch.views.live import LiveView
-from cpcbl_launch.views.traffic.show import COLUMNS_EXPLAINED, help_traffic_table, limits_text
+from cpcbl_launch.views.traffic_tables import COLUMNS_EXPLAINED, help_traffic_table, limits_text
 from cpcbl_team.tiers import LOWEST_TIER
 from cpcbl_transport.messages import Status, Track, Truth
 
@@ -70,13 +71,8 @@ class LiveTable(LiveView):
             if name not in self._robots:
                 there = newest_ns - tracks[name].stamp_ns <= AWAY_S * 1e9
                 pid, state = "guest", state if there else Text("left", "dim")
-            shown.add_row(
-                name,
-                pid,
-                *_pose_cells(tracks.get(name), truths.get(name)),
-                *_traffic_cells(status),
-                state,
-            )
+            pose = _pose_cells(tracks.get(name), truths.get(name))
+            shown.add_row(name, pid, *pose, *_traffic_cells(status), state)
         if not self.fits(shown):
             shown.padding = (0, 0)  # closer together, before a state is folded
         return shown
@@ -98,63 +94,27 @@ def _state(track: Track | None, pid: str, restarts: int) -> Text:
 def _pose_cells(track: Track | None, truth: Truth | None) -> list[Cell]:
     if track is None:
         return [""] * 6
-    c = track.covariance
-    error = None if truth is None else math.hypot(truth.x_m - track.x_m, truth.y_m - track.y_m)
+    x, y, heading = f"{track.x_m:.2f}", f"{track.y_m:.2f}", f"{math.degrees(track.heading_rad):.0f}"
+    c, error_cell = track.covariance, Text("-")
+    if truth is not None:
+        error = math.hypot(truth.x_m - track.x_m, truth.y_m - track.y_m)
+        colour = "green" if error < 0.15 else "yellow" if error < 0.5 else "red"
+        error_cell = Text(f"{error:.3f}", colour)
     tier = Text(str(track.tier), "green" if track.tier < LOWEST_TIER // 2 else "yellow")
-    return [
-        f"{track.x_m:.2f}",
-        f"{track.y_m:.2f}",
-        f"{math.degrees(track.heading_rad):.0f}",
-        "-" if c is None else f"{math.sqrt(0.5 * (c[0] + c[2])):.3f}",
-        _coloured_error(error),
-        tier,
-    ]
+    sigma = number(None if c is None else math.sqrt(0.5 * (c[0] + c[2])))
+    return [x, y, heading, sigma, error_cell, tier]
 
 
-def _traffic_cells(status: Status | None) -> list[Cell]:
-    if status is None:
+def _traffic_cells(s: Status | None) -> list[Cell]:
+    if s is None:
         return [""] * 4
-    s = status
-    return [
-        short(n) for n in (s.messages_sent, s.bytes_sent, s.messages_received, s.bytes_received)
-    ]
-
-
-def _coloured_error(error: float | None) -> Text:
-    if error is None:
-        return Text("-")
-    return Text(f"{error:.3f}", "green" if error < 0.15 else "yellow" if error < 0.5 else "red")
+    counts = s.messages_sent, s.bytes_sent, s.messages_received, s.bytes_received
+    return [short(n) for n in counts]
 
 
 def print_report(report: Report, console: Console) -> None:
     """The figures of a run as a table with units."""
-    before = ("before m",) if report.alone else ()
-    figures = table(
-        "errors of position and heading (deg, RMSE)",
-        ("robot",),
-        (*before, *FIGURES, "lost", "out", "B"),
-    )
-    for name, r in report.robots.items():
-        alone = report.alone.get(name)
-        before_m = [] if alone is None else [number(alone.position_rmse_m)]
-        figures.add_row(name, *before_m, *_robot_cells(r))
-    t = report.team
-    known = [s.position_rmse_m for s in report.alone.values() if s.position_rmse_m is not None]
-    figures.add_section()
-    figures.add_row(
-        "team",
-        *([number(sum(known) / len(known) if known else None)] if report.alone else []),
-        *_figures(t),
-        "",
-        short(t.messages_sent),
-        short(t.bytes_sent),
-        style="bold",
-    )
-    if report.guests:
-        figures.add_section()
-    for name, guest in report.guests.items():
-        figures.add_row(f"{name}, guest", *("-" for _ in before), *_robot_cells(guest))
-    console.print(figures)
+    console.print(_figures_table(report))
     for name, guest in report.guests.items():
         console.print()
         console.print(_effects(name, guest))
@@ -168,6 +128,27 @@ def print_report(report: Report, console: Console) -> None:
         console.print(_baseline_table(report))
     for line in _remarks(report):
         console.print(line, style="yellow", highlight=False, markup=False)  # robots may say [/b]
+
+
+def _figures_table(report: Report) -> Table:
+    """The robots, the team, and its guests."""
+    before = ("before m",) if report.alone else ()
+    columns = (*before, *FIGURES, "lost", "out", "B")
+    shown = table("errors of position and heading (deg, RMSE)", ("robot",), columns)
+    for name, r in report.robots.items():
+        alone = report.alone.get(name)
+        before_m = [] if alone is None else [number(alone.position_rmse_m)]
+        shown.add_row(name, *before_m, *_robot_cells(r))
+    known = [s.position_rmse_m for s in report.alone.values() if s.position_rmse_m is not None]
+    before_m = [number(fmean(known) if known else None) for _ in before]
+    sent = short(report.team.messages_sent), short(report.team.bytes_sent)
+    shown.add_section()
+    shown.add_row("team", *before_m, *_figures(report.team), "", *sent, style="bold")
+    if report.guests:
+        shown.add_section()
+    for name, guest in report.guests.items():
+        shown.add_row(f"{name}, guest", *("-" for _ in before), *_robot_cells(guest))
+    return shown
 
 
 def _robot_cells(r: RobotReport) -> list[str]:
@@ -200,9 +181,8 @@ def print_observer_report(report: ObserverReport, console: Console) -> None:
     for direction, flows in (("sent", report.sent), ("heard", report.heard)):
         for flow in flows:
             peer = f" {'to' if direction == 'sent' else 'from'} {flow.peer}" if flow.peer else ""
-            shown.add_row(
-                f"{flow.topic} {direction}{peer}", short(flow.messages), short(flow.bytes)
-            )
+            figures = short(flow.messages), short(flow.bytes)
+            shown.add_row(f"{flow.topic} {direction}{peer}", *figures)
     if shown.row_count:
         console.print(shown)
     if report.lost:
@@ -223,14 +203,9 @@ def _baseline_table(report: Report) -> Table:
 
 def _figures(s: Score | MeanScore) -> list[str]:
     """The cells below FIGURES."""
-    return [
-        number(s.position_rmse_m),
-        number(s.position_mean_m),
-        number(s.position_max_m),
-        number(s.heading_rmse_deg, 1),
-        percent(s.inside_3_sigma),
-        number(s.nees, 1),
-    ]
+    errors_m = s.position_rmse_m, s.position_mean_m, s.position_max_m
+    heading, inside = number(s.heading_rmse_deg, 1), percent(s.inside_3_sigma)
+    return [*map(number, errors_m), heading, inside, number(s.nees, 1)]
 
 
 def _remarks(report: Report) -> Iterator[str]:

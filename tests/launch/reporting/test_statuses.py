@@ -9,7 +9,7 @@ from cpcbl_launch.reporting.statuses import (
     summed_flows,
     summed_spending,
 )
-from cpcbl_launch.views.traffic.show import limit_text
+from cpcbl_launch.views.traffic_tables import limit_text
 from cpcbl_transport.messages import Spending
 
 

@@ -14,8 +14,8 @@ from cpcbl_launch.reporting.statuses import (
     trust_reports,
 )
 from cpcbl_launch.views.run import print_report
-from cpcbl_launch.views.traffic.show import traffic_view
-from cpcbl_launch.views.traffic.watch import Arrival, traffic_from_statuses
+from cpcbl_launch.views.traffic import Arrival, traffic_from_statuses
+from cpcbl_launch.views.traffic_tables import traffic_view
 from cpcbl_transport import topics
 from cpcbl_transport.memory_bus import MemoryHub
 from cpcbl_transport.messages import Status, Trust, encode

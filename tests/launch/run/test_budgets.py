@@ -13,11 +13,11 @@ from support.traffic import TEAM, status
 from cpcbl_launch.cli import main
 from cpcbl_launch.overrides import Overrides, with_overrides
 from cpcbl_launch.team_file import parse_team
-from cpcbl_launch.views.traffic.show import traffic_view
-from cpcbl_launch.views.traffic.watch import (
+from cpcbl_launch.views.traffic import (
     Arrival,
     traffic_from_statuses,
 )
+from cpcbl_launch.views.traffic_tables import traffic_view
 
 
 def test_budgets_of_a_command_line_are_those_of_all_robots() -> None:

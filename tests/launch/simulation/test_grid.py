@@ -1,20 +1,18 @@
 """A grid leaves nothing out that is within reach, and little of the rest in."""
 
 import math
-from typing import NamedTuple
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from support.buses import examples
 
-from cpcbl_launch.simulation.grid import Grid
+from cpcbl_launch.simulation.field import Grid
+from cpcbl_launch.simulation.robot import VisibleObject
 
 
-class Post(NamedTuple):
-    number: int
-    x: float
-    y: float
+def post(number: int, x: float, y: float) -> VisibleObject:
+    return VisibleObject(f"{number:04d}", x, y, "both")
 
 
 COORDINATE = st.integers(-40, 40).map(float) | st.floats(-40.0, 40.0)
@@ -26,13 +24,13 @@ PLACE = st.tuples(COORDINATE, COORDINATE)
 def test_all_within_reach_are_found_in_their_order(
     places: list[tuple[float, float]], place: tuple[float, float], reach_m: float
 ) -> None:
-    posts = [Post(i, *at) for i, at in enumerate(places)]
+    posts = [post(i, *at) for i, at in enumerate(places)]
     found = Grid(reach_m, posts).near(*place)
     assert found == sorted(set(found))
-    assert {p for p in posts if math.dist(p[1:], place) <= reach_m} <= set(found)
+    assert {p for p in posts if math.dist((p.x, p.y), place) <= reach_m} <= set(found)
 
 
 @pytest.mark.parametrize("size", [10, 40])
 def test_what_is_found_does_not_grow_with_the_field(size: int) -> None:
-    posts = [Post(i, i % size, i // size) for i in range(size * size)]
+    posts = [post(i, i % size, i // size) for i in range(size * size)]
     assert len(Grid(1.5, posts).near(size / 2, size / 2)) <= 25

@@ -19,12 +19,12 @@ from support.traffic import MISER_BYTES_PER_S, TEAM, flow, recorded, seen, shown
 from cpcbl_launch.reporting.recorder import Recorder
 from cpcbl_launch.run.processes import PROGRAM
 from cpcbl_launch.run.up import free_endpoint
-from cpcbl_launch.views.traffic.show import TrafficView, traffic_view
-from cpcbl_launch.views.traffic.watch import (
+from cpcbl_launch.views.traffic import (
     StatusCollector,
     Traffic,
     traffic_from_statuses,
 )
+from cpcbl_launch.views.traffic_tables import TrafficView, traffic_view
 from cpcbl_team.inputs import Sighting
 from cpcbl_transport import topics
 from cpcbl_transport.memory_bus import MemoryHub

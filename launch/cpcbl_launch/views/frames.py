@@ -1,6 +1,9 @@
-"""The detections of a frame, as they are printed and as `look --json` writes them."""
+"""Annotated frames of a robot's camera: received, saved, and printed as `look` does."""
 
 import math
+import time
+from collections import Counter, deque
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import msgspec
@@ -8,8 +11,65 @@ from rich.console import Console
 from rich.table import Table
 
 from cpcbl_launch.reporting.tables import table
+from cpcbl_launch.views.live import open_bus_within
+from cpcbl_team.errors import InputError
 from cpcbl_team.inputs import Sighting
+from cpcbl_transport.bus import Bus
+from cpcbl_transport.decoding import Subscriber
 from cpcbl_transport.messages import AnnotatedFrame, UnclearObject
+from cpcbl_transport.security import Link
+
+MOST = 50  # some 100 kB each
+REFRESH_S = 0.02
+
+
+class FrameSubscriber:
+    """Keeps the annotated frames of one robot, or of all, until they are taken; the latest 50.
+
+    A robot annotates frames only for subscribers.
+    """
+
+    def __init__(self, bus: Bus, robot: str = "*") -> None:
+        self._frames: deque[AnnotatedFrame] = deque(maxlen=MOST)
+        self._subscriber = Subscriber(
+            bus, AnnotatedFrame, lambda received: self._frames.append(received.message), robot=robot
+        )
+
+    @property
+    def refused(self) -> Counter[str]:
+        """How many messages could not be used, by reason."""
+        return self._subscriber.refused
+
+    def take(self) -> list[AnnotatedFrame]:
+        """What has come since the last call, in order."""
+        return [self._frames.popleft() for _ in range(len(self._frames))]
+
+
+def live_frames(
+    robot: str, team: str, link: Link, stop: Callable[[], bool], wait_s: float
+) -> Iterator[AnnotatedFrame]:
+    """The annotated frames of a running robot until `stop()`, at most two a second.
+
+    Raises BusError without a router, InputError when it says nothing for `wait_s`.
+    """
+    bus = open_bus_within(wait_s, team, link, stop)
+    if bus is None:
+        return
+    with bus:
+        subscriber = FrameSubscriber(bus, robot)
+        until_s = time.monotonic() + wait_s
+        while not stop():
+            frames = subscriber.take()
+            yield from frames
+            now_s = time.monotonic()
+            until_s = now_s + wait_s if frames else until_s
+            if now_s > until_s:
+                raise InputError(
+                    f"look {robot}: no frame of {robot} in team {team} at"
+                    f" {', '.join(link.endpoints)} for {wait_s:g} s: does it run, and does its"
+                    " camera?"
+                )
+            time.sleep(REFRESH_S)
 
 
 class SightingReport(msgspec.Struct, frozen=True, kw_only=True):
@@ -70,7 +130,7 @@ def save_picture(annotated: AnnotatedFrame, folder: Path, name: str) -> str:
 
 def print_frame_report(report: FrameReport, console: Console) -> None:
     """Prints the sightings, the rejected objects with the reason, and the path of the picture."""
-    console.print(sighting_table(report))
+    console.print(_sighting_table(report))
     for unclear in report.unclear:
         names = f": {' or '.join(unclear.names)}" if unclear.names else ""
         console.print(f"{unclear.reason}{names}", style="yellow", highlight=False)
@@ -79,19 +139,14 @@ def print_frame_report(report: FrameReport, console: Console) -> None:
     console.print()
 
 
-def sighting_table(report: FrameReport) -> Table:
-    """A table with a row for each sighting."""
+def _sighting_table(report: FrameReport) -> Table:
     columns = ("range m", "σ", "bearing °", "σ", "heading °", "σ")
     rows = table(f"{report.robot}, frame {report.frame}", ("seen",), columns)
-    for f in report.found:
-        ranges = _cell(f.range_m, 2), _cell(f.range_sigma_m, 3)
-        bearings = _cell(f.bearing_deg, 1), _cell(f.bearing_sigma_deg, 2)
-        headings = _cell(f.heading_deg, 1), _cell(f.heading_sigma_deg, 1)
-        rows.add_row(f.id, *ranges, *bearings, *headings)
+    for found in report.found:
+        seen, *values = msgspec.structs.astuple(found)
+        decimals = (2, 3, 1, 2, 1, 1)
+        cells = ("" if v is None else f"{v:.{n}f}" for v, n in zip(values, decimals, strict=True))
+        rows.add_row(seen, *cells)
     if not report.found:
         rows.add_row("nothing", style="dim")
     return rows
-
-
-def _cell(value: float | None, digits: int) -> str:
-    return "" if value is None else f"{value:.{digits}f}"

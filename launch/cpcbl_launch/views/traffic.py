@@ -10,7 +10,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from types import MappingProxyType
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import msgspec
 
@@ -22,17 +22,15 @@ from cpcbl_launch.reporting.statuses import (
     summed_spending,
     trust_reports,
 )
+from cpcbl_launch.views.live import open_bus_within
 from cpcbl_transport.bus import Bus
 from cpcbl_transport.decoding import Received, Subscriber
 from cpcbl_transport.messages import Flow, Status
 from cpcbl_transport.security import Link
-from cpcbl_transport.zenoh_bus import BusError, open_bus
 
 CURRENT_HELP_NS = 3_000_000_000  # help is given at present whose latest message is no older
 RATES_NS = 5_000_000_000  # rates are over the last so many seconds of robot time
-SILENT_AWAY_S = (
-    3.0  # a robot is away that is silent for longer, and for longer than three of its pauses
-)
+SILENT_AWAY_S = 3.0  # so long, and three of its pauses, a robot is silent before it is away
 REFRESH_S = 0.25
 
 
@@ -164,11 +162,15 @@ class StatusCollector:
         self._subscriber = Subscriber(bus, Status, self._receive)
 
     def _receive(self, received: Received[Status]) -> None:
-        status = received.message
+        now = received.message
         with self._lock:
-            earlier = self._arrivals.get(status.robot, [])
-            kept = [a for a in earlier if _is_same_process(a.status, status)]
-            self._arrivals[status.robot] = [*kept, Arrival(self._now_s(), status)]
+            kept = [  # of the same process, and not too old for its rates
+                earlier
+                for earlier in self._arrivals.get(now.robot, ())
+                if earlier.status.incarnation == now.incarnation
+                and 0 < now.stamp_ns - earlier.status.stamp_ns <= RATES_NS
+            ]
+            self._arrivals[now.robot] = [*kept, Arrival(self._now_s(), now)]
 
     @property
     def refused(self) -> Counter[str]:
@@ -181,18 +183,6 @@ class StatusCollector:
             return dict(self._arrivals)
 
 
-def _is_same_process(before: Status, now: Status) -> bool:
-    """Whether a status is of the same process, earlier, and not too old for its rates."""
-    same = before.incarnation == now.incarnation
-    return same and 0 < now.stamp_ns - before.stamp_ns <= RATES_NS
-
-
-class View(Protocol):
-    """Shows traffic to a person."""
-
-    def show(self, now: Traffic) -> None: ...
-
-
 class WatchRequest(NamedTuple):
     """Which team is watched, and how long."""
 
@@ -203,30 +193,20 @@ class WatchRequest(NamedTuple):
     wait_s: float = 5.0  # for the router
 
 
-def watch_team(watch: WatchRequest, view: View, stop: Callable[[], bool]) -> Traffic:
+def watch_team(
+    watch: WatchRequest, show: Callable[[Traffic], None], stop: Callable[[], bool]
+) -> Traffic:
     """Watches until the time is over or `stop()`. Raises BusError without a router."""
-    began_s = time.monotonic()
-    try:
-        bus = open_bus(
-            watch.team,
-            watch.link.endpoints,
-            lambda: stop() or time.monotonic() > began_s + watch.wait_s,
-            watch.link.credentials,
-        )
-    except BusError:
-        if stop():
-            return traffic_from_statuses(watch.team, watch.known, {}, began_s, time.monotonic())
-        raise BusError(
-            f"no router at {', '.join(watch.link.endpoints)} within {watch.wait_s:g} s;"
-            " --connect takes the endpoint that `cpcbl-team up` says"
-        ) from None
+    bus, began_s = open_bus_within(watch.wait_s, watch.team, watch.link, stop), time.monotonic()
+    if bus is None:
+        return traffic_from_statuses(watch.team, watch.known, {}, began_s, began_s)
     with bus:
-        watcher, began_s = StatusCollector(bus), time.monotonic()
+        watcher = StatusCollector(bus)
         while True:
             now_s = time.monotonic()
             state = watcher.arrivals(), began_s, now_s, watcher.refused
             now = traffic_from_statuses(watch.team, watch.known, *state)
-            view.show(now)
+            show(now)
             if stop() or now_s - began_s >= watch.duration_s:
                 return now
             time.sleep(REFRESH_S)

@@ -1,6 +1,6 @@
 """Traffic on a terminal: what a run spent, and live who helps whom. Fits 80 columns."""
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 
 from rich.console import Console, Group
 from rich.table import Table
@@ -15,10 +15,10 @@ from cpcbl_launch.reporting.statuses import (
 )
 from cpcbl_launch.reporting.tables import number, short, table
 from cpcbl_launch.views.live import LiveView
-from cpcbl_launch.views.traffic.watch import CURRENT_HELP_NS, RATES_NS, HelpLink, LiveRobot, Traffic
+from cpcbl_launch.views.traffic import CURRENT_HELP_NS, RATES_NS, HelpLink, LiveRobot, Traffic
 
 COLOURS = {"fix": "cyan", "belief": "magenta"}
-NOT_SENT = ("budget", "value", "silence")
+NOT_SENT = {"budget": "over_budget", "value": "worthless", "silence": "silent"}
 COLUMNS_EXPLAINED = (
     "Messages were not sent because the budget was spent (column budget), they were\n"
     "worth too little (value), or receivers can extrapolate the last one (silence).\n"
@@ -37,13 +37,12 @@ _LIVE_EXPLAINED = (
 
 def help_traffic_table(report: Report) -> Table:
     """What each robot sent, what it did not send and why, and how near it came to its limits."""
-    limited = any(r.spending for r in report.robots.values())
+    robots = list(report.robots.values())
     shown = table(
         "fixes and beliefs sent, and not sent", ("robot",), ("fixes", "beliefs", "B/s", *NOT_SENT)
     )
-    if limited:
+    if any(robot.spending for robot in robots):
         shown.add_column("most", no_wrap=True)
-    robots = list(report.robots.values())
     for name, robot in report.robots.items():
         _add_traffic_row(shown, name, robot, report.duration_s)
     shown.add_section()
@@ -70,10 +69,11 @@ def _traffic_cells(robots: Sequence[RobotReport], duration_s: float) -> list[str
     ]
 
 
-def _not_sent(flows: Iterable[FlowReport]) -> list[str]:
+def _not_sent(flows: Sequence[FlowReport]) -> list[str]:
     """The cells below NOT_SENT."""
-    rows = [(f.over_budget, f.worthless, f.silent) for f in flows]
-    return [short(sum(column)) for column in zip(*rows, strict=True)] or ["0", "0", "0"]
+    return [
+        short(sum(getattr(f, n) for f in flows)) for n in ("over_budget", "worthless", "silent")
+    ]
 
 
 def limit_text(s: SpendingReport) -> Text:
@@ -100,7 +100,7 @@ def limits_text(report: Report) -> Text | None:
 
 
 class TrafficView(LiveView):
-    """Redrawn on a terminal, else a snapshot every few seconds."""
+    """The traffic of a team while it runs."""
 
     def __init__(self, where: str, console: Console, quiet: bool = False) -> None:
         super().__init__(console, quiet)
@@ -118,12 +118,8 @@ def traffic_view(now: Traffic, where: str) -> Group:
         reasons = ", ".join(f"{reason} {n}" for reason, n in now.refused.items())
         title += f"\nrefused, by reason: {reasons}"
     if not now.robots:
-        return Group(
-            Text(
-                f"{title}\nNo robot of this team sends its status. Is the name of the team right?",
-                "yellow",
-            )
-        )
+        hint = "No robot of this team sends its status. Is the name of the team right?"
+        return Group(Text(f"{title}\n{hint}", "yellow"))
     limits = [
         Text(f"{name}: most ").append_text(Text(", ").join(map(limit_text, robot.spending)))
         for name, robot in now.robots.items()
@@ -189,14 +185,8 @@ def flow_table(now: Traffic) -> Table:
         shown.add_row(name, "alive", str(robot.announced), style=style)
         for flow in robot.sent:
             key = f"{flow.topic} → {flow.peer}" if flow.peer else flow.topic
-            shown.add_row(
-                "",
-                Text(key, COLOURS[flow.topic]),
-                short(flow.messages),
-                short(flow.bytes),
-                number(None if robot.away else flow.messages_per_s, 1),
-                number(None if robot.away else flow.bytes_per_s, 0),
-                *_not_sent([flow]),
-                style=style,
-            )
+            counts = short(flow.messages), short(flow.bytes)
+            rates = (None, None) if robot.away else (flow.messages_per_s, flow.bytes_per_s)
+            figures = *counts, number(rates[0], 1), number(rates[1], 0), *_not_sent([flow])
+            shown.add_row("", Text(key, COLOURS[flow.topic]), *figures, style=style)
     return shown

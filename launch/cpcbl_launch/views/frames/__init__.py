@@ -1,1 +1,0 @@
-"""What robots see, for people: annotated frames."""

@@ -1,1 +1,0 @@
-"""Who helps whom, what it costs, and what was not sent: live, and in reports."""
