@@ -137,7 +137,7 @@ def eyes(
 ) -> None:
     """Cameras on rendered images: precision, recall, and errors against the stated sigmas."""
     require_opencv("experiment eyes")
-    from cpcbl_launch.lab.experiments import eyes as experiment
+    from cpcbl_launch.lab.experiments import detection_figures as experiment
 
     measure = partial(experiment.measure, frames, seed, jobs)
     total = -(-frames // experiment.CHUNK)

@@ -11,7 +11,7 @@ from msgspec.structs import replace
 from support.processes import cpcbl_team
 
 from cpcbl_agents.vision.camera import Camera, Floats, Pixels
-from cpcbl_launch.lab.experiments import detection_figures, eyes, rendered_frames
+from cpcbl_launch.lab.experiments import detection_figures, rendered_frames
 from cpcbl_launch.lab.experiments.detection_figures import Batch, Kind, Mistake, Record
 from cpcbl_launch.lab.experiments.rendered_frames import (
     NamedObject,
@@ -223,7 +223,7 @@ def test_no_target_is_met_without_figures() -> None:
 
 @pytest.fixture(scope="module")
 def small_result() -> detection_figures.DetectionReport:
-    return eyes.measure(150, 1, 2, lambda: None)
+    return detection_figures.measure(150, 1, 2, lambda: None)
 
 
 @pytest.mark.long
@@ -269,7 +269,7 @@ def test_former_mistakes_do_not_occur_again(number: int) -> None:
 
 @pytest.mark.long
 def test_the_number_of_jobs_changes_no_figure() -> None:
-    one, two = (eyes.measure(40, 3, jobs, lambda: None) for jobs in (1, 2))
+    one, two = (detection_figures.measure(40, 3, jobs, lambda: None) for jobs in (1, 2))
     assert one.within["landmark"].due > 10
     assert replace(one, cost={}) == replace(two, cost={})
 
@@ -289,5 +289,5 @@ def test_the_command_shows_targets_and_writes_json_and_picture(tmp_path: Path) -
 @pytest.mark.long
 @pytest.mark.timeout(1200)
 def test_ten_thousand_frames() -> None:
-    result = eyes.measure(10_000, 2, 2, lambda: None)
+    result = detection_figures.measure(10_000, 2, 2, lambda: None)
     assert not [said for said, held in result.pattern.items() if not held]

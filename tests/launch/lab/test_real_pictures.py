@@ -30,6 +30,7 @@ sensing = "camera"
 source = "external"
 markers = { front = 1, left = 2, back = 3, right = 4 }
 """
+COLUMNS = real_pictures.TruthLine._fields
 SETS = ("duckiebot", "frc-speaker", "frc-amp", "nao")
 
 
@@ -91,9 +92,9 @@ def test_the_command_shows_and_writes(own_set: Path, tmp_path: Path) -> None:
     [
         ("nobody", "", "duckiebot"),
         ("x.csv", "a,b\n", "line 1"),
-        ("x.csv", ",".join(real_pictures.COLUMNS) + "\np,eye,mate,far,,\n", "line 2"),
-        ("x.csv", ",".join(real_pictures.COLUMNS) + "\np,ear,mate,,,\n", "no robot ear"),
-        ("x.csv", ",".join(real_pictures.COLUMNS) + "\np.png,eye,mate,,,\n", "p.png"),
+        ("x.csv", ",".join(COLUMNS) + "\np,eye,mate,far,,\n", "line 2"),
+        ("x.csv", ",".join(COLUMNS) + "\np,ear,mate,,,\n", "no robot ear"),
+        ("x.csv", ",".join(COLUMNS) + "\np.png,eye,mate,,,\n", "p.png"),
     ],
 )
 def test_an_unreadable_set_is_one_line(tmp_path: Path, name: str, text: str, said: str) -> None:

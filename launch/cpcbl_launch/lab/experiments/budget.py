@@ -5,35 +5,30 @@ not what was allowed. Everything: a fix of each sighting of a teammate, beliefs 
 sees the robot.
 """
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from importlib.metadata import version
+from itertools import groupby
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-import msgspec
+from msgspec import Struct
+from msgspec.structs import replace
 from rich.console import RenderableType
 
 from cpcbl_launch.lab.evaluation import evaluate_log
 from cpcbl_launch.lab.experiments.runs import map_in_processes
-from cpcbl_launch.reporting.tables import number, percent, table
+from cpcbl_launch.reporting.tables import cells, table
 from cpcbl_launch.run.logged_team import LoggedTeam
 from cpcbl_team.errors import InputError
 
 EVERYTHING: Mapping[str, Any] = {"least_value": 0.0, "least_use": 0.0, "belief_share": 0.0}
-RARE: Mapping[str, Any] = {
-    "least_value": 0.2,
-    "least_use": 0.9,
-    "fix_interval_s": 10.0,
-    "belief_rate_hz": 0.1,
-}
-"""For a few messages a minute: messages of less value, or soon after the last, would only delay
-those of more value."""
-
-
+# For a few messages a minute: messages of less value, or soon after the last, would only delay
+# those of more value.
+RARE = {"least_value": 0.2, "least_use": 0.9, "fix_interval_s": 10.0, "belief_rate_hz": 0.1}
 OURS = ("bytes limited", "messages limited", "value alone")
 
 
-class Point(msgspec.Struct, frozen=True, kw_only=True):
+class Point(Struct, frozen=True, kw_only=True):
     """One run. Bytes are those on the senders' links, without TCP/IP's; means over the robots."""
 
     series: str
@@ -49,7 +44,7 @@ class Point(msgspec.Struct, frozen=True, kw_only=True):
     within_budget: bool
 
 
-class Target(msgspec.Struct, frozen=True, kw_only=True):
+class Target(Struct, frozen=True, kw_only=True):
     """The target of a series, and the best point within its cost."""
 
     said: str
@@ -58,7 +53,7 @@ class Target(msgspec.Struct, frozen=True, kw_only=True):
     held: bool
 
 
-class Curve(msgspec.Struct, frozen=True, kw_only=True):
+class Curve(Struct, frozen=True, kw_only=True):
     """The result of the experiment."""
 
     experiment: str
@@ -70,49 +65,37 @@ class Curve(msgspec.Struct, frozen=True, kw_only=True):
     targets: tuple[Target, ...]
 
 
-class Case(msgspec.Struct, frozen=True, kw_only=True):
+class Case(NamedTuple):
     """The settings of one point: keys of all robots' collaboration, and of its budget."""
 
     series: str
     setting: str
-    rules: dict[str, Any]
-    budget: dict[str, float] = {}
+    rules: Mapping[str, Any]
+    budget: Mapping[str, float] = {}
 
 
 def cases() -> list[Case]:
     """All cases, from no help to all help; each series from little to much."""
-    none = Case(series="nothing", setting="alone", rules={"active": False, "passive": False})
-    both = {**EVERYTHING, "direction": "both-ways"}
-    return [
-        none,
-        *(_budget_case("bytes_per_s", n, "B/s", {}) for n in (1, 2, 5, 10, 20, 50)),
-        *(_budget_case("messages_per_minute", n, "/min", RARE) for n in (2, 3, 4, 6, 8)),
-        *(_least_value_case(least) for least in (0.4, 0.2, 0.1, 0.05, 0.02)),
-        *(_interval_case(seconds) for seconds in (60, 30, 15, 8, 4, 2, 1, 0.5)),
-        Case(series="all, one way", setting="no limit", rules=dict(EVERYTHING)),
-        Case(series="all, both ways", setting="no limit", rules=both),
-    ]
-
-
-def _budget_case(key: str, allowed: float, unit: str, rules: Mapping[str, Any]) -> Case:
-    budget = {key: allowed, "urgent_share": 0.0 if unit == "/min" else 0.2}
-    series = "bytes limited" if key == "bytes_per_s" else "messages limited"
-    return Case(series=series, setting=f"{allowed:g} {unit}", rules=dict(rules), budget=budget)
-
-
-def _least_value_case(least: float) -> Case:
-    rules = {"least_value": least, "least_use": 4.0 * least}
-    return Case(series="value alone", setting=f"{least:g} nats", rules=rules)
-
-
-def _interval_case(seconds: float) -> Case:
-    rules = {**EVERYTHING, "fix_interval_s": seconds, "belief_rate_hz": 1.0 / seconds}
-    return Case(series="fixed interval", setting=f"{seconds:g} s", rules=rules)
+    every = [Case("nothing", "alone", {"active": False, "passive": False})]
+    for limit in (1, 2, 5, 10, 20, 50):
+        budget = {"bytes_per_s": limit, "urgent_share": 0.2}
+        every.append(Case("bytes limited", f"{limit} B/s", {}, budget))
+    for limit in (2, 3, 4, 6, 8):
+        budget = {"messages_per_minute": limit, "urgent_share": 0.0}
+        every.append(Case("messages limited", f"{limit} /min", RARE, budget))
+    for least in (0.4, 0.2, 0.1, 0.05, 0.02):
+        rules = {"least_value": least, "least_use": 4.0 * least}
+        every.append(Case("value alone", f"{least:g} nats", rules))
+    for interval_s in (60, 30, 15, 8, 4, 2, 1, 0.5):
+        rules = {**EVERYTHING, "fix_interval_s": interval_s, "belief_rate_hz": 1.0 / interval_s}
+        every.append(Case("fixed interval", f"{interval_s:g} s", rules))
+    every.append(Case("all, one way", "no limit", EVERYTHING))
+    every.append(Case("all, both ways", "no limit", {**EVERYTHING, "direction": "both-ways"}))
+    return every
 
 
 def measure_point(logged: LoggedTeam, case: Case) -> Point:
     """The figures of one case. Raises InputError if the log has no ground truth in this time."""
-    replace = msgspec.structs.replace
     robots = {}
     for name, robot in logged.team.robots.items():
         rules = robot.collaboration
@@ -128,7 +111,7 @@ def measure_point(logged: LoggedTeam, case: Case) -> Point:
     blind = [
         r.position_rmse_m
         for name, r in report.robots.items()
-        if not robots[name].sensor.sees_landmarks and r.position_rmse_m is not None
+        if name in _blind(logged) and r.position_rmse_m is not None
     ]
     return Point(
         series=case.series,
@@ -144,6 +127,10 @@ def measure_point(logged: LoggedTeam, case: Case) -> Point:
     )
 
 
+def _blind(logged: LoggedTeam) -> tuple[str, ...]:
+    return tuple(n for n, r in logged.team.robots.items() if not r.sensor.sees_landmarks)
+
+
 def measure_curve(logged: LoggedTeam, jobs: int | None, done: Callable[[], None]) -> Curve:
     """All points; `done` is called after each. The same log gives the same figures."""
     tasks = [(logged, case) for case in cases()]
@@ -152,56 +139,48 @@ def measure_curve(logged: LoggedTeam, jobs: int | None, done: Callable[[], None]
         experiment="budget",
         version=version("cpcbl-team"),
         log=Path(logged.team.data).name,
-        blind=tuple(n for n, r in logged.team.robots.items() if not r.sensor.sees_landmarks),
+        blind=_blind(logged),
         duration_s=(logged.end_ns - logged.start_ns) * 1e-9,
         points=points,
-        targets=tuple(targets(points)),
+        targets=targets(points),
     )
 
 
-def targets(points: Iterable[Point]) -> Iterable[Target]:
+def targets(points: Sequence[Point]) -> tuple[Target, ...]:
     """Sending by value must nearly reach the RMSE of all help both ways, at a part of its cost."""
-    points = list(points)
-    all_of = next(p for p in points if p.series == "all, both ways")
+    everything = next(p for p in points if p.series == "all, both ways")
     ours = [p for p in points if p.series in OURS]
-    quarter = [p for p in ours if p.bytes_per_s <= 0.25 * all_of.bytes_per_s]
+    quarter = [p for p in ours if p.bytes_per_s <= 0.25 * everything.bytes_per_s]
     few = [p for p in ours if p.messages_per_minute <= 2.5]
-    yield _target("10 % of it at a quarter of its bytes", 1.1 * all_of.position_rmse_m, quarter)
-    yield _target("20 % of it at 2.5 messages a minute", 1.2 * all_of.position_rmse_m, few)
 
+    def target(text: str, ratio: float, within: list[Point]) -> Target:
+        allowed_m = ratio * everything.position_rmse_m
+        best = min(within, key=lambda p: p.position_rmse_m, default=None)
+        held = best is not None and best.position_rmse_m <= allowed_m
+        return Target(said=f"within {text}", allowed_rmse_m=allowed_m, best=best, held=held)
 
-def _target(text: str, allowed_m: float, within: list[Point]) -> Target:
-    best = min(within, key=lambda p: p.position_rmse_m, default=None)
-    held = best is not None and best.position_rmse_m <= allowed_m
-    return Target(said=f"within {text}", allowed_rmse_m=allowed_m, best=best, held=held)
+    return (
+        target("10 % of it at a quarter of its bytes", 1.1, quarter),
+        target("20 % of it at 2.5 messages a minute", 1.2, few),
+    )
 
 
 def tables(result: Curve) -> Iterable[RenderableType]:
     title = f"{result.log}, blind: {', '.join(result.blind) or 'none'}; a robot"
     shown = table(title, ("sent", ""), ("B/s", "/min", "RMSE m", "blind", "deg", "in 3 σ", "NEES"))
-    last = None
-    for p in result.points:
-        if last not in (None, p.series):
-            shown.add_section()
-        shown.add_row(
-            p.series if p.series != last else "",
-            p.setting,
-            f"{p.bytes_per_s:.1f}",
-            f"{p.messages_per_minute:.1f}",
-            number(p.position_rmse_m),
-            number(p.blind_rmse_m),
-            number(p.heading_rmse_deg, 1),
-            percent(p.inside_3_sigma),
-            number(p.nees, 1),
-        )
-        last = p.series
+    quantities = "bytes_per_s:.1f messages_per_minute:.1f position_rmse_m:.3f blind_rmse_m:.3f"
+    quantities += " heading_rmse_deg:.1f inside_3_sigma:.1% nees:.1f"
+    for series, points in groupby(result.points, lambda point: point.series):
+        for i, p in enumerate(points):
+            shown.add_row("" if i else series, p.setting, *cells(p, quantities))
+        shown.add_section()
     yield shown
     for t in result.targets:
-        verdict = "held" if t.held else "missed"
-        best = "nothing was" if t.best is None else f"{t.best.position_rmse_m:.3f} m"
-        off = ""
+        best, off = "nothing was", ""
         if t.best is not None:
+            best = f"{t.best.position_rmse_m:.3f} m"
             off = f" ({t.best.setting}: {t.best.bytes_per_s:.1f} B/s)"
+        verdict = "held" if t.held else "missed"
         yield f"{verdict}: {t.said}: {best}{off}, allowed {t.allowed_rmse_m:.3f} m"
     if not all(p.within_budget for p in result.points):
         yield "a budget was exceeded"

@@ -1,23 +1,29 @@
-"""The figures of rendered frames: detections, misses, mistakes, errors and their stated sigmas.
+"""What cameras see: rendered frames over poses, light, clutter and what stands in the way.
 
-Ranges are from the centre of the viewer to the centre of the object. Spreads are about zero, not
-about the mean, so that they contain a bias.
+`rendered_frames.py` renders each frame and compares it with what was detected; here are the
+figures: detections, misses, mistakes, errors and their stated sigmas. Ranges are from the centre of
+the viewer to the centre of the object. Spreads are about zero, not about the mean, so that they
+contain a bias.
 """
 
 import math
 import platform
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import lru_cache
 from importlib.metadata import version
 from itertools import pairwise
 from typing import Literal, NamedTuple
 
-import msgspec
+from msgspec import Struct
+from rich.console import RenderableType
 
+from cpcbl_launch.lab.experiments.runs import map_in_processes
+from cpcbl_launch.reporting.tables import cells, number, table
 from cpcbl_launch.team_file import builtin_path, load_team
 from cpcbl_team.config import Team
 
+CHUNK = 25  # frames of one task
 Kind = Literal["landmark", "marker", "mast"]
 Wrong = Literal["wrong id", "wrong range"]
 KINDS: tuple[Kind, ...] = ("landmark", "marker", "mast")
@@ -49,7 +55,7 @@ class Record(NamedTuple):
     heading_sigma_rad: float | None = None
 
 
-class Mistake(msgspec.Struct, frozen=True, kw_only=True):
+class Mistake(Struct, frozen=True, kw_only=True):
     """A wrong sighting."""
 
     frame: int
@@ -65,15 +71,15 @@ class Batch(NamedTuple):
 
     records: list[Record]
     mistakes: list[Mistake]
-    doubts: dict[str, int]
-    refused: dict[str, int]
+    doubts: Mapping[str, int]
+    refused: Mapping[str, int]
     """Frames that could not be used."""
     see_s: float
     """In all, from JPEG to sightings."""
     render_s: float
 
 
-class Figures(msgspec.Struct, frozen=True, kw_only=True):
+class Figures(Struct, frozen=True, kw_only=True):
     """The figures of one kind of feature between two ranges; None if there is nothing."""
 
     from_m: float
@@ -99,7 +105,7 @@ class Figures(msgspec.Struct, frozen=True, kw_only=True):
     heading_inside: float | None
 
 
-class Error(msgspec.Struct, frozen=True, kw_only=True, array_like=True):
+class Error(Struct, frozen=True, kw_only=True, array_like=True):
     """One sighting, for the picture: its errors and its stated sigmas."""
 
     range_m: float
@@ -109,7 +115,7 @@ class Error(msgspec.Struct, frozen=True, kw_only=True, array_like=True):
     bearing_sigma_deg: float | None
 
 
-class DetectionReport(msgspec.Struct, frozen=True, kw_only=True):
+class DetectionReport(Struct, frozen=True, kw_only=True):
     """The result of the experiment."""
 
     experiment: str
@@ -137,14 +143,27 @@ def team() -> Team:
     return load_team(builtin_path("eyes"))
 
 
+def measure(count: int, seed: int, jobs: int | None, done: Callable[[], None]) -> DetectionReport:
+    """So many frames, `jobs` processes at a time; `done` is called after each `CHUNK` of them."""
+    from cpcbl_launch.lab.experiments.rendered_frames import evaluate_frames  # needs OpenCV
+
+    starts = range(0, count, CHUNK)
+    tasks = [(seed, start, min(CHUNK, count - start)) for start in starts]
+    return summarize(count, seed, map_in_processes(evaluate_frames, tasks, jobs, done))
+
+
 def summarize(count: int, seed: int, batches: Sequence[Batch]) -> DetectionReport:
     """The figures of all frames."""
     records = [record for batch in batches for record in batch.records]
     mistakes = tuple(mistake for batch in batches for mistake in batch.mistakes)
     doubts = sum((Counter(batch.doubts) for batch in batches), Counter[str]())
     refused = sum((Counter(batch.refused) for batch in batches), Counter[str]())
-    within = {k: figures(k, records, mistakes, 0.0, WITHIN_M[k]) for k in KINDS}
-    accuracy = {k: figures(k, records, mistakes, 0.0, ERRORS_WITHIN_M) for k in KINDS}
+
+    def between(kind: Kind, low_m: float, high_m: float) -> Figures:
+        return figures(kind, records, mistakes, low_m, high_m)
+
+    within = {k: between(k, 0.0, WITHIN_M[k]) for k in KINDS}
+    accuracy = {k: between(k, 0.0, ERRORS_WITHIN_M) for k in KINDS}
     return DetectionReport(
         experiment="eyes",
         version=version("cpcbl-team"),
@@ -153,10 +172,7 @@ def summarize(count: int, seed: int, batches: Sequence[Batch]) -> DetectionRepor
         team=team(),
         within=within,
         accuracy=accuracy,
-        bins={
-            k: tuple(figures(k, records, mistakes, low, high) for low, high in pairwise(EDGES_M))
-            for k in KINDS
-        },
+        bins={k: tuple(between(k, *edges) for edges in pairwise(EDGES_M)) for k in KINDS},
         mistakes=mistakes,
         doubts=dict(doubts.most_common()),
         refused=dict(refused.most_common()),
@@ -171,42 +187,36 @@ def summarize(count: int, seed: int, batches: Sequence[Batch]) -> DetectionRepor
 
 
 def pattern(
-    within: dict[Kind, Figures],
-    accuracy: dict[Kind, Figures],
+    within: Mapping[Kind, Figures],
+    accuracy: Mapping[Kind, Figures],
     mistakes: Sequence[Mistake],
     refused: int,
 ) -> dict[str, bool]:
     """The targets, and whether they were met; a target without figures is not met."""
+
+    def least(share: float | None, bound: float) -> bool:
+        return share is not None and share >= bound
+
+    def most(sigma: float | None, bound: float) -> bool:
+        return sigma is not None and sigma <= bound
+
     targets = {}
     for kind in KINDS[:2]:
         seen, of = within[kind], f"{kind}s within {WITHIN_M[kind]:g} m"
-        targets[f"{of}: precision at least {LEAST_PRECISION:g}"] = _least(
-            seen.precision, LEAST_PRECISION
-        )
-        targets[f"{of}: recall at least {LEAST_RECALL:g}"] = _least(seen.recall, LEAST_RECALL)
+        precise = least(seen.precision, LEAST_PRECISION)
+        targets[f"{of}: precision at least {LEAST_PRECISION:g}"] = precise
+        targets[f"{of}: recall at least {LEAST_RECALL:g}"] = least(seen.recall, LEAST_RECALL)
     for kind in KINDS[:2]:
         known, of = accuracy[kind], f"{kind}s within {ERRORS_WITHIN_M:g} m"
-        share, bearing = known.range_sigma_share, known.bearing_sigma_deg
-        targets[f"{of}: range σ at most 3 %"] = share is not None and share <= MOST_RANGE_SHARE
-        targets[f"{of}: bearing σ at most 0.5°"] = (
-            bearing is not None and bearing <= MOST_BEARING_DEG
-        )
+        targets[f"{of}: range σ at most 3 %"] = most(known.range_sigma_share, MOST_RANGE_SHARE)
+        targets[f"{of}: bearing σ at most 0.5°"] = most(known.bearing_sigma_deg, MOST_BEARING_DEG)
     for kind in KINDS:
-        known = accuracy[kind]
-        inside = {"range": known.range_inside, "bearing": known.bearing_inside}
-        if kind == "marker":
-            inside["heading"] = known.heading_inside
-        for what, share in inside.items():
-            targets[f"{kind}s: {what} inside 3 stated σ at least 98 %"] = _least(
-                share, LEAST_INSIDE
-            )
+        for what in ("range", "bearing", *(("heading",) if kind == "marker" else ())):
+            inside = least(getattr(accuracy[kind], f"{what}_inside"), LEAST_INSIDE)
+            targets[f"{kind}s: {what} inside 3 stated σ at least 98 %"] = inside
     targets["no wrong id"] = not any(m.why == "wrong id" for m in mistakes)
     targets["no frame refused"] = not refused
     return targets
-
-
-def _least(share: float | None, bound: float) -> bool:
-    return share is not None and share >= bound
 
 
 def figures(
@@ -218,9 +228,10 @@ def figures(
     due = [r for r in near if kind in r.due]
     found = sum(r.seen_by is not None for r in due)
     right = [r for r in near if r.seen_by == kind]
-    wrong = sum(m.kind == kind and from_m <= (m.range_m or 0.0) < to_m for m in mistakes)
-    ranged = [r for r in right if r.range_error_m is not None]
-    shares = [(r.range_error_m or 0.0) / r.range_m for r in ranged]
+    reported = len(right) + sum(
+        m.kind == kind and from_m <= (m.range_m or 0.0) < to_m for m in mistakes
+    )
+    shares = [r.range_error_m / r.range_m for r in right if r.range_error_m is not None]
     bearings = [(r.bearing_error_rad, r.bearing_sigma_rad) for r in right]
     headings = [(r.heading_error_rad, r.heading_sigma_rad) for r in right]
     return Figures(
@@ -228,38 +239,38 @@ def figures(
         to_m=to_m,
         due=len(due),
         found=found,
-        recall=_share(found, len(due)),
-        reported=len(right) + wrong,
+        recall=found / len(due) if due else None,
+        reported=reported,
         right=len(right),
-        precision=_share(len(right), len(right) + wrong),
-        ranged=len(ranged),
+        precision=len(right) / reported if reported else None,
+        ranged=len(shares),
         range_sigma_share=_rms(shares),
         range_bias_share=math.fsum(shares) / len(shares) if shares else None,
-        bearing_sigma_deg=_degrees(_rms([e for e, _ in bearings if e is not None])),
-        heading_sigma_deg=_degrees(_rms([e for e, _ in headings if e is not None])),
-        range_inside=_inside([(r.range_error_m, r.range_sigma_m) for r in ranged]),
+        bearing_sigma_deg=degrees(_rms([e for e, _ in bearings if e is not None])),
+        heading_sigma_deg=degrees(_rms([e for e, _ in headings if e is not None])),
+        range_inside=_inside([(r.range_error_m, r.range_sigma_m) for r in right]),
         bearing_inside=_inside(bearings),
         heading_inside=_inside(headings),
     )
-
-
-def _share(part: int, whole: int) -> float | None:
-    return part / whole if whole else None
 
 
 def _rms(values: Sequence[float]) -> float | None:
     return math.sqrt(math.fsum(v * v for v in values) / len(values)) if values else None
 
 
-def _degrees(angle: float | None) -> float | None:
-    return None if angle is None else math.degrees(angle)
+def degrees(angle_rad: float | None) -> float | None:
+    return None if angle_rad is None else math.degrees(angle_rad)
+
+
+def within_3_sigma(pairs: Iterable[tuple[float | None, float | None]]) -> list[bool]:
+    """Which of the known errors are within three of their sigmas; one whose sigma is not stated
+    is outside."""
+    return [abs(error) <= 3.0 * (sigma or 0.0) for error, sigma in pairs if error is not None]
 
 
 def _inside(pairs: Sequence[tuple[float | None, float | None]]) -> float | None:
-    """The share of errors within three of their sigmas; an error whose sigma is not stated is
-    outside."""
-    known = [(e, s or 0.0) for e, s in pairs if e is not None]
-    return _share(sum(abs(e) <= 3.0 * s for e, s in known), len(known))
+    within = within_3_sigma(pairs)
+    return sum(within) / len(within) if within else None
 
 
 def _errors(kind: Kind, records: Sequence[Record]) -> Iterator[Error]:
@@ -269,6 +280,49 @@ def _errors(kind: Kind, records: Sequence[Record]) -> Iterator[Error]:
             range_m=r.range_m,
             range_share=(r.range_error_m or 0.0) / r.range_m if ranged else None,
             range_sigma_share=(r.range_sigma_m or 0.0) / r.range_m if ranged else None,
-            bearing_deg=_degrees(r.bearing_error_rad),
-            bearing_sigma_deg=_degrees(r.bearing_sigma_rad),
+            bearing_deg=degrees(r.bearing_error_rad),
+            bearing_sigma_deg=degrees(r.bearing_sigma_rad),
         )
+
+
+def tables(result: DetectionReport) -> Iterable[RenderableType]:
+    """Detections by range, wrong and rejected ones, and the targets."""
+    shown = table(
+        f"rendered frames: {result.frames}, seed {result.seed}",
+        ("", "m"),
+        ("due", "recall", "seen", "prec.", "r %", "b °", "h °", "3σ r", "3σ b", "3σ h"),
+    )
+    for kind, bins in result.bins.items():
+        for f in bins:
+            if f.due or f.reported:
+                shown.add_row(kind, f"{f.from_m:g}-{f.to_m:g}", *_cells(f))
+        shown.add_row(kind, f"< {WITHIN_M[kind]:g}", *_cells(result.within[kind]))
+        if WITHIN_M[kind] != ERRORS_WITHIN_M:
+            shown.add_row(kind, f"< {ERRORS_WITHIN_M:g}", *_cells(result.accuracy[kind]))
+    yield shown
+    yield (
+        "due: objects completely visible; seen: reported sightings; r, b, h: σ of the\n"
+        "errors of range, bearing, heading; 3σ: share of errors within 3 stated σ"
+    )
+    yield f"rejected: {_listed(result.doubts)}"
+    if result.refused:
+        yield f"unusable images: {_listed(result.refused)}"
+    yield f"wrong: {_listed(Counter(f'{m.kind}, {m.why}' for m in result.mistakes))}"
+    see_ms, render_ms = result.cost["see_ms"], result.cost["render_ms"]
+    yield f"cost: {see_ms:.1f} ms per image to detect, {render_ms:.1f} ms to render"
+    for target, ok in result.pattern.items():
+        yield f"target: {'held  ' if ok else 'missed'} {target}"
+
+
+def _listed(counts: dict[str, int]) -> str:
+    return ", ".join(f"{name} {count}" for name, count in counts.items()) or "nothing"
+
+
+def _cells(f: Figures) -> list[str]:
+    share = f.range_sigma_share
+    return [
+        *cells(f, "due recall:.3f reported precision:.3f"),
+        number(None if share is None else 100.0 * share, 1),
+        *cells(f, "bearing_sigma_deg:.2f heading_sigma_deg:.1f"),
+        *cells(f, "range_inside:.3f bearing_inside:.3f heading_inside:.3f"),
+    ]

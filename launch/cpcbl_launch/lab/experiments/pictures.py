@@ -1,14 +1,18 @@
 """The experiments as pictures. Needs extra `plot`."""
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from itertools import groupby
 from pathlib import Path
 from statistics import median
 from typing import Any
 
 import matplotlib as mpl
+from matplotlib import pyplot as plt
+from matplotlib.lines import Line2D
+from matplotlib.patches import Wedge
 
-from cpcbl_launch.lab.experiments.budget import Curve, Point
+from cpcbl_launch.lab.experiments.budget import Curve
 from cpcbl_launch.lab.experiments.detection_figures import (
     LEAST_RECALL,
     MOST_BEARING_DEG,
@@ -16,21 +20,16 @@ from cpcbl_launch.lab.experiments.detection_figures import (
     DetectionReport,
 )
 from cpcbl_launch.lab.experiments.liars import Liars
-from cpcbl_launch.lab.experiments.runs import Accuracy, Outcome, Spread
+from cpcbl_launch.lab.experiments.runs import Outcome, Spread
 from cpcbl_team.config import RobotSettings, Team
 
 mpl.use("Agg")
-
-from matplotlib import pyplot as plt
-from matplotlib.lines import Line2D
-from matplotlib.patches import Wedge
-
-DPI = 90
+mpl.rcParams.update({"figure.constrained_layout.use": True, "savefig.dpi": 90})
 
 
 def draw_table1(result: Outcome, path: Path) -> None:
     """Field, then a panel a quantity: the paper's as bars, ours as points with 10-90 %."""
-    figure = plt.figure(figsize=(13, 7), layout="constrained")
+    figure = plt.figure(figsize=(13, 7))
     panels = figure.subplot_mosaic("FFabc\nFFdef", width_ratios=(1, 1, 1.2, 1.2, 1.2))
     _field(panels["F"], result.teams["joint C"])
     for i, quantity in enumerate(result.figures["quantities"]):
@@ -40,13 +39,8 @@ def draw_table1(result: Outcome, path: Path) -> None:
         for k, (how, rows) in enumerate(result.figures["rows"].items()):
             for x, c in enumerate("ABC"):
                 s = rows[c][i]
-                if s is not None:
-                    bars = [[s.median - s.low], [s.high - s.median]]
-                    at = x - 0.24 + 0.16 * k
-                    label = how if x == 0 else None
-                    axes.errorbar(
-                        at, s.median, bars, fmt="o", ms=4, capsize=2, color=f"C{k}", label=label
-                    )
+                at, label = x - 0.24 + 0.16 * k, how if x == 0 else None
+                _bar(axes, at, s, f"C{k}", capsize=2, label=label)
         axes.set(title=quantity, xticks=range(3), xticklabels="ABC", ylim=(0, None))
     figure.legend(*panels["a"].get_legend_handles_labels(), loc="outside lower right", ncols=5)
     _save(figure, path)
@@ -54,21 +48,22 @@ def draw_table1(result: Outcome, path: Path) -> None:
 
 def draw_figure7(result: Outcome, path: Path) -> None:
     """The field, and as figure 7 of the paper: mean position error, bars of one sigma."""
-    figure, (field, errors) = plt.subplots(
-        1, 2, figsize=(12, 4.4), width_ratios=(3, 2), layout="constrained"
-    )
+    figure, (field, errors) = plt.subplots(1, 2, figsize=(12, 4.4), width_ratios=(3, 2))
     _field(field, result.teams["F"])
     names = list(result.figures)
     for x, a in enumerate(result.figures.values()):
-        if a.position_mean_m is not None:
-            errors.errorbar(
-                x, a.position_mean_m, a.position_sigma_m, fmt="o", capsize=5, color="C0"
-            )
-            at, text = (x, a.position_mean_m), f"{a.position_mean_m:.3f}"
-            errors.annotate(text, at, (8, 0), textcoords="offset points", annotation_clip=True)
+        mean = a.position_mean_m
+        if mean is not None:
+            errors.errorbar(x, mean, a.position_sigma_m, fmt="o", capsize=5, color="C0")
+            near = {"textcoords": "offset points", "annotation_clip": True}
+            errors.annotate(f"{mean:.3f}", (x, mean), (8, 0), **near)
     errors.set(xticks=range(len(names)), xticklabels=names, ylabel="position error (m)")
     errors.set(title="mean, and one σ (A is off the scale where cut)")
-    rest = [_top(a) for c, a in result.figures.items() if c != "A"]
+    rest = [
+        (a.position_mean_m or 0.0) + (a.position_sigma_m or 0.0)
+        for c, a in result.figures.items()
+        if c != "A"
+    ]
     errors.set_ylim(0.0, 1.6 * max(rest, default=0.0) or 1.0)
     errors.set_xlim(-0.6, len(names) - 0.2)
     errors.grid(True, axis="y", alpha=0.3)
@@ -77,7 +72,7 @@ def draw_figure7(result: Outcome, path: Path) -> None:
 
 def draw_variants(result: Outcome, path: Path) -> None:
     """Accuracy and consistency of the variants."""
-    figure, (errors, inside) = plt.subplots(1, 2, figsize=(8, 3.8), layout="constrained")
+    figure, (errors, inside) = plt.subplots(1, 2, figsize=(8, 3.8))
     variants = list(dict.fromkeys(case.split()[0] for case in result.figures))
     for k, help_ in enumerate(("alone", "helped")):
         for x, variant in enumerate(variants):
@@ -101,11 +96,9 @@ def draw_variants(result: Outcome, path: Path) -> None:
 
 def draw_budget(result: Curve, path: Path) -> None:
     """Team RMSE against bytes; lines to the left and below are better."""
-    figure, axes = plt.subplots(figsize=(8.5, 5.0), layout="constrained")
-    series: dict[str, list[Point]] = {}
-    for point in result.points:
-        series.setdefault(point.series, []).append(point)
-    for name, points in series.items():
+    figure, axes = plt.subplots(figsize=(8.5, 5.0))
+    for name, same in groupby(result.points, lambda point: point.series):
+        points = list(same)
         cost = [p.bytes_per_s for p in points]
         errors = [p.position_rmse_m for p in points]
         if name == "nothing":
@@ -129,22 +122,19 @@ def draw_directions(result: Outcome, path: Path) -> None:
     rows = [row for row in result.figures["rows"] if row["direction"] != "deaf"]
     offsets = sorted({row["observer_off_m"] for row in rows})
     ways = list(dict.fromkeys((r["direction"], r["fusion"]) for r in rows if r["fusion"]))
-    figure, panels = plt.subplots(
-        1, len(offsets), figsize=(12, 4), sharey=True, layout="constrained", squeeze=False
-    )
+    figure, panels = plt.subplots(1, len(offsets), figsize=(12, 4), sharey=True, squeeze=False)
     for axes, offset in zip(panels[0], offsets, strict=True):
         for k, way in enumerate(ways):
             line = [
-                r
+                (r["bytes_per_s"], r["position_rmse_m"], r["robots"])
                 for r in rows
                 if (r["direction"], r["fusion"], r["observer_off_m"]) == (*way, offset)
             ]
-            bytes_, rmse = [r["bytes_per_s"] for r in line], [r["position_rmse_m"] for r in line]
             style = "o-" if way[0] == "one-way" else "s--"
+            bytes_, rmse, _ = zip(*line, strict=True)
             axes.plot(bytes_, rmse, style, ms=4, color=f"C{k}", label=" ".join(way))
-            for r in line:
-                at = r["bytes_per_s"], r["position_rmse_m"]
-                axes.annotate(str(r["robots"]), at, (3, 3), textcoords="offset points", fontsize=7)
+            for x, y, robots in line:
+                axes.annotate(str(robots), (x, y), (3, 3), textcoords="offset points", fontsize=7)
         axes.set(title=f"observers off by {offset:g} m", xlabel="bytes/s a robot", xscale="symlog")
         axes.set_yscale("log")
         axes.grid(True, which="both", alpha=0.3)
@@ -157,20 +147,17 @@ def draw_directions(result: Outcome, path: Path) -> None:
 def draw_liars(result: Liars, path: Path) -> None:
     """The team's error beside that without the liar, judged and believed; when it was found."""
     sizes = sorted({row.case.honest for row in result.rows}, reverse=True)
-    figure, panels = plt.subplots(
-        2, len(sizes), figsize=(12, 6.5), sharex=True, squeeze=False, layout="constrained"
-    )
+    figure, panels = plt.subplots(2, len(sizes), figsize=(12, 6.5), sharex=True, squeeze=False)
     kinds = list(dict.fromkeys(row.case.lie for row in result.rows if row.case.lie))
     for (ratios, times), honest in zip(panels.T, sizes, strict=True):
         lies = [row for row in result.rows if row.case.lie and row.case.honest == honest]
         for row in lies:
-            if row.ratio is not None:
-                at = kinds.index(row.case.lie) + (-0.1 if row.case.trust else 0.1)
-                _bar(ratios, at, row.ratio, "C0" if row.case.trust else "C3")
-            if row.case.trust:
-                for found, colour in ((row.found_after_s, "C1"), (row.readmitted_after_s, "C2")):
-                    if found is not None:
-                        _bar(times, kinds.index(row.case.lie), found, colour)
+            at, judged = kinds.index(row.case.lie), row.case.trust
+            colour, shift = ("C0", -0.1) if judged else ("C3", 0.1)
+            _bar(ratios, at + shift, row.ratio, colour, capsize=3)
+            if judged:
+                _bar(times, at, row.found_after_s, "C1", capsize=3)
+                _bar(times, at, row.readmitted_after_s, "C2", capsize=3)
         ratios.axhline(1.3, color="0.5", linestyle="--")
         ratios.set(title=f"one liar, {honest} honest", yscale="log")
         times.set_xticks(range(len(kinds)), kinds, rotation=30, ha="right")
@@ -186,22 +173,13 @@ def draw_eyes(result: DetectionReport, path: Path) -> None:
     """A column a kind of thing: errors against range with three stated sigmas, and recall."""
     kinds = [kind for kind, errors in result.errors.items() if errors]
     figure, panels = plt.subplots(
-        3, max(1, len(kinds)), figsize=(12, 8), sharex=True, squeeze=False, layout="constrained"
+        3, max(1, len(kinds)), figsize=(12, 8), sharex=True, squeeze=False
     )
     for (ranges, bearings, recall), kind in zip(panels.T, kinds, strict=False):
-        errors = result.errors[kind]
-        shares = [
-            (e.range_m, 100.0 * e.range_share, 100.0 * e.range_sigma_share)
-            for e in errors
-            if e.range_share is not None and e.range_sigma_share is not None
-        ]
-        angles = [
-            (e.range_m, e.bearing_deg, e.bearing_sigma_deg)
-            for e in errors
-            if e.bearing_deg is not None and e.bearing_sigma_deg is not None
-        ]
-        _scattered(ranges, shares, 100.0 * MOST_RANGE_SHARE)
-        _scattered(bearings, angles, MOST_BEARING_DEG)
+        errors = [(e.range_m, e.range_share, e.range_sigma_share) for e in result.errors[kind]]
+        _scattered(ranges, errors, 100.0, MOST_RANGE_SHARE)
+        errors = [(e.range_m, e.bearing_deg, e.bearing_sigma_deg) for e in result.errors[kind]]
+        _scattered(bearings, errors, 1.0, MOST_BEARING_DEG)
         bins = [f for f in result.bins[kind] if f.recall is not None]
         middles = [0.5 * (f.from_m + f.to_m) for f in bins]
         recall.plot(middles, [100.0 * (f.recall or 0.0) for f in bins], "o-", color="C0")
@@ -219,6 +197,7 @@ def draw_eyes(result: DetectionReport, path: Path) -> None:
     _save(figure, path)
 
 
+# How the result of each experiment is drawn, by its name
 DRAWINGS: Mapping[str, Callable[[Any, Path], None]] = {
     "table1": draw_table1,
     "figure7": draw_figure7,
@@ -229,11 +208,18 @@ DRAWINGS: Mapping[str, Callable[[Any, Path], None]] = {
     "liars": draw_liars,
     "eyes": draw_eyes,
 }
-"""How the result of each experiment is drawn, by its name."""
 
 
-def _scattered(axes: Any, errors: list[tuple[float, float, float]], target: float) -> None:
-    """Errors against range, with the band of three stated sigmas and that of one allowed."""
+def _scattered(
+    axes: Any,
+    readings: Sequence[tuple[float, float | None, float | None]],
+    scale: float,
+    target: float,
+) -> None:
+    """Errors against range, with the band of three stated sigmas and that of one allowed; those
+    whose sigma is not stated are left out."""
+    errors = [(r, scale * e, scale * s) for r, e, s in readings if e is not None and s is not None]
+    target *= scale
     axes.plot([e[0] for e in errors], [e[1] for e in errors], ".", ms=2, alpha=0.5, color="C0")
     halves: dict[int, list[float]] = {}
     for range_m, _, sigma in errors:
@@ -248,9 +234,10 @@ def _scattered(axes: Any, errors: list[tuple[float, float, float]], target: floa
     axes.grid(True, alpha=0.3)
 
 
-def _bar(axes: Any, at: float, found: Spread, colour: str) -> None:
-    bars = [[found.median - found.low], [found.high - found.median]]
-    axes.errorbar(at, found.median, bars, fmt="o", ms=4, capsize=3, color=colour)
+def _bar(axes: Any, at: float, found: Spread | None, colour: str, **style: Any) -> None:
+    if found is not None:
+        bars = [[found.median - found.low], [found.high - found.median]]
+        axes.errorbar(at, found.median, bars, fmt="o", ms=4, color=colour, **style)
 
 
 def _field(axes: Any, team: Team) -> None:
@@ -284,10 +271,6 @@ def _half_view_deg(robot: RobotSettings) -> float:
     return math.degrees(math.atan(0.5 * robot.camera.width_px / robot.camera.fx_px))
 
 
-def _top(a: Accuracy) -> float:
-    return (a.position_mean_m or 0.0) + (a.position_sigma_m or 0.0)
-
-
 def _save(figure: Any, path: Path) -> None:
-    figure.savefig(path, dpi=DPI)
+    figure.savefig(path)
     plt.close(figure)

@@ -8,30 +8,31 @@ downloads them, and they are not copied.
 
 import csv
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from importlib.metadata import version
 from importlib.resources import files
 from pathlib import Path
 from typing import NamedTuple
 
-import msgspec
+from msgspec import Struct
 from rich.console import RenderableType
 
 from cpcbl_agents.vision.detections import Detections
 from cpcbl_agents.vision.detector import CameraDetector
 from cpcbl_agents.vision.pictures import decode_image
-from cpcbl_launch.reporting.tables import table
+from cpcbl_launch.lab.experiments.detection_figures import degrees, within_3_sigma
+from cpcbl_launch.reporting.tables import number, table
 from cpcbl_launch.team_file import load_team
 from cpcbl_team.config import Team
 from cpcbl_team.errors import InputError
 from cpcbl_team.geometry import wrap_angle
 from cpcbl_team.inputs import Sighting
 
-COLUMNS = ("picture", "viewer", "id", "range_m", "bearing_deg", "heading_deg")
+UNITS = {"range": "m", "bearing": "deg", "heading": "deg"}
 
 
 class TruthLine(NamedTuple):
-    """One line of the table."""
+    """One line of the table, by its columns."""
 
     picture: str
     viewer: str
@@ -41,7 +42,7 @@ class TruthLine(NamedTuple):
     heading_deg: float | None
 
 
-class LineResult(msgspec.Struct, frozen=True, kw_only=True):
+class LineResult(Struct, frozen=True, kw_only=True):
     """A line with its detection; an error is None without a ground truth or a detection."""
 
     picture: str
@@ -56,7 +57,7 @@ class LineResult(msgspec.Struct, frozen=True, kw_only=True):
     heading_sigma_deg: float | None = None
 
 
-class RealPictures(msgspec.Struct, frozen=True, kw_only=True):
+class RealPictures(Struct, frozen=True, kw_only=True):
     """The result of the experiment."""
 
     experiment: str
@@ -91,23 +92,21 @@ def _folder() -> Path:
 
 def read_truth_table(path: Path) -> list[TruthLine]:
     """The lines of a table. Raises InputError, naming file and line."""
+    lines = []
     try:
         with path.open(newline="", encoding="utf-8") as file:
-            return _lines(path, csv.DictReader(file))
+            reader = csv.DictReader(file)
+            if tuple(reader.fieldnames or ()) != TruthLine._fields:
+                columns = ",".join(TruthLine._fields)
+                raise InputError(f"{path}: line 1: the columns are {columns}")
+            for row in reader:
+                try:
+                    numbers = [float(row[c]) if row[c] else None for c in TruthLine._fields[3:]]
+                except (TypeError, ValueError) as error:
+                    raise InputError(f"{path}: line {reader.line_num}: {error}") from error
+                lines.append(TruthLine(row["picture"], row["viewer"], row["id"], *numbers))
     except (csv.Error, UnicodeDecodeError) as error:
         raise InputError(f"{path}: cannot be read: {error}") from error
-
-
-def _lines(path: Path, reader: "csv.DictReader[str]") -> list[TruthLine]:
-    if tuple(reader.fieldnames or ()) != COLUMNS:
-        raise InputError(f"{path}: line 1: the columns are {','.join(COLUMNS)}")
-    lines = []
-    for row in reader:
-        try:
-            numbers = [float(row[c]) if row[c] else None for c in COLUMNS[3:]]
-        except (TypeError, ValueError) as error:
-            raise InputError(f"{path}: line {reader.line_num}: {error}") from error
-        lines.append(TruthLine(row["picture"], row["viewer"], row["id"], *numbers))
     return lines
 
 
@@ -169,9 +168,9 @@ def _line_result(line: TruthLine, seen: Sighting | None) -> LineResult:
         range_error_m=off,
         range_sigma_m=seen.range_sigma_m,
         bearing_error_deg=_angle_error_deg(seen.bearing_rad, line.bearing_deg),
-        bearing_sigma_deg=_degrees(seen.bearing_sigma_rad),
+        bearing_sigma_deg=degrees(seen.bearing_sigma_rad),
         heading_error_deg=_angle_error_deg(seen.heading_rad, line.heading_deg),
-        heading_sigma_deg=_degrees(seen.heading_sigma_rad),
+        heading_sigma_deg=degrees(seen.heading_sigma_rad),
     )
 
 
@@ -181,10 +180,6 @@ def _angle_error_deg(seen_rad: float | None, true_deg: float | None) -> float | 
     return math.degrees(wrap_angle(seen_rad - math.radians(true_deg)))
 
 
-def _degrees(angle: float | None) -> float | None:
-    return None if angle is None else math.degrees(angle)
-
-
 def tables(result: RealPictures) -> Iterable[RenderableType]:
     """A row for each line of the set's table, then the detections that are not in it."""
     shown = table(
@@ -192,40 +187,29 @@ def tables(result: RealPictures) -> Iterable[RenderableType]:
         ("picture", "id"),
         ("m", "off m", "± σ", "b. off°", "± σ", "h. off°", "± σ"),
     )
-    for c in result.lines:
-        errors = (
-            *_pair(c.range_error_m, c.range_sigma_m, 3),
-            *_pair(c.bearing_error_deg, c.bearing_sigma_deg, 1),
-            *_pair(c.heading_error_deg, c.heading_sigma_deg, 1),
-        )
-        first = "missed" if not c.found else "-" if c.range_m is None else f"{c.range_m:.2f}"
-        shown.add_row(c.picture.rsplit(".", 1)[0], c.id, first, *errors)
+    for line in result.lines:
+        first = number(line.range_m, 2) if line.found else "missed"
+        row = [line.picture.rsplit(".", 1)[0], line.id, first]
+        for what, digits in (("range", 3), ("bearing", 1), ("heading", 1)):
+            ((error, sigma),) = _errors([line], what)
+            row += ["", ""] if error is None else [f"{error:+.{digits}f}", number(sigma, digits)]
+        shown.add_row(*row)
     yield shown
-    found = sum(c.found for c in result.lines)
+    known = {what: within_3_sigma(_errors(result.lines, what)) for what in UNITS}
+    inside = [f"{what} {sum(within)} of {len(within)}" for what, within in known.items() if within]
+    found = sum(line.found for line in result.lines)
     yield f"found {found} of {len(result.lines)}. m: range; off: its error; ± σ: the stated σ"
-    yield f"within three stated σ: {', '.join(_inside(result.lines)) or 'only ids are known'}"
+    yield f"within three stated σ: {', '.join(inside) or 'only ids are known'}"
     yield f"reported but not in the table: {_listed(result.unexpected)}"
     yield f"rejected: {_listed(result.doubted)}"
     if result.refused:
         yield f"unusable pictures: {_listed(tuple(result.refused.items()))}"
 
 
-def _inside(lines: Sequence[LineResult]) -> Iterator[str]:
-    """How many of the known errors are within three stated sigmas."""
-    for what, pairs in {
-        "range": [(c.range_error_m, c.range_sigma_m) for c in lines],
-        "bearing": [(c.bearing_error_deg, c.bearing_sigma_deg) for c in lines],
-        "heading": [(c.heading_error_deg, c.heading_sigma_deg) for c in lines],
-    }.items():
-        known = [(e, s or 0.0) for e, s in pairs if e is not None]
-        if known:
-            yield f"{what} {sum(abs(e) <= 3.0 * s for e, s in known)} of {len(known)}"
-
-
-def _pair(error: float | None, sigma: float | None, digits: int) -> tuple[str, str]:
-    if error is None:
-        return "", ""
-    return f"{error:+.{digits}f}", "-" if sigma is None else f"{sigma:.{digits}f}"
+def _errors(lines: Iterable[LineResult], what: str) -> list[tuple[float | None, float | None]]:
+    """Errors and stated sigmas of a quantity."""
+    error, sigma = f"{what}_error_{UNITS[what]}", f"{what}_sigma_{UNITS[what]}"
+    return [(getattr(line, error), getattr(line, sigma)) for line in lines]
 
 
 def _listed(pairs: Sequence[tuple[str, str]]) -> str:

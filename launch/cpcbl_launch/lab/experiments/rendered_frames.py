@@ -18,7 +18,7 @@ there.
 import math
 import time
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -29,18 +29,26 @@ from cpcbl_agents.vision.camera import Camera, Floats, Pixels
 from cpcbl_agents.vision.detector import CameraDetector
 from cpcbl_agents.vision.pictures import decode_image
 from cpcbl_agents.vision.poses import SIDE_ANGLES
-from cpcbl_launch.lab.experiments.detection_figures import Batch, Kind, Mistake, Record, Wrong, team
+from cpcbl_launch.lab.experiments.detection_figures import (
+    Batch,
+    Kind,
+    Mistake,
+    Record,
+    Wrong,
+    degrees,
+    team,
+)
 from cpcbl_launch.simulation.camera.cameras import with_focal_error, with_mount_error
 from cpcbl_launch.simulation.camera.objects import body_top_m
 from cpcbl_launch.simulation.camera.render import render
-from cpcbl_launch.simulation.camera.scene import Scene, SceneCylinder, SceneRobot
+from cpcbl_launch.simulation.camera.scene import Scene, SceneRobot
 from cpcbl_launch.simulation.camera.visibility import (
     Solid,
     cylinder_points,
     plate_points,
     visible_shares,
 )
-from cpcbl_team.config import CameraSettings, Cylinder, Light, Side
+from cpcbl_team.config import CameraSettings, Light, Side
 from cpcbl_team.geometry import Pose2, wrap_angle
 from cpcbl_team.inputs import Sighting
 
@@ -82,9 +90,9 @@ class NamedObject(NamedTuple):
 def evaluate_frames(seed: int, first: int, count: int) -> Batch:
     """These frames. The same seed and numbers give the same figures."""
     cv2.setNumThreads(1)
-    batch = Batch([], [], {}, {}, 0.0, 0.0)
-    ambiguities: Counter[str] = Counter()
-    refused: Counter[str] = Counter()
+    records: list[Record] = []
+    mistakes: list[Mistake] = []
+    doubts, refused = Counter[str](), Counter[str]()
     see_s = render_s = 0.0
     for number in range(first, first + count):
         random = np.random.default_rng((seed, number))
@@ -98,14 +106,12 @@ def evaluate_frames(seed: int, first: int, count: int) -> Batch:
         if isinstance(detections, str):
             refused[detections] += 1
             continue
-        ambiguities.update(ambiguity.reason for ambiguity in detections.ambiguities)
+        doubts.update(ambiguity.reason for ambiguity in detections.ambiguities)
         seen = [found.sighting for found in detections.found]
-        records, mistakes = compare_with_truth(number, seen, named_objects(frame))
-        batch.records.extend(records)
-        batch.mistakes.extend(mistakes)
-    return batch._replace(
-        doubts=dict(ambiguities), refused=dict(refused), see_s=see_s, render_s=render_s
-    )
+        right, wrong = compare_with_truth(number, seen, named_objects(frame))
+        records += right
+        mistakes += wrong
+    return Batch(records, mistakes, doubts, refused, see_s, render_s)
 
 
 @lru_cache(maxsize=1)
@@ -123,24 +129,21 @@ def _eyes(viewer: str) -> CameraDetector:
 
 def random_frame(random: np.random.Generator) -> RandomFrame:
     """A viewer, the poses of all objects, and the light."""
-    names = list(team().robots)
     viewers = team().cameras
     viewer = viewers[int(random.integers(len(viewers)))]
     scene = _scene().with_clutter(int(random.integers(MOST_CLUTTER + 1)), random)
-    cylinders = [*scene.landmarks.values(), *scene.clutter]
-    taken = [(post.x_m, post.y_m) for post in cylinders]
+    taken = [(post.x_m, post.y_m) for post in (*scene.landmarks.values(), *scene.clutter)]
     pose = _free_pose(random, taken, None)
     taken.append((pose.x, pose.y))
     robots = []
-    for name in names:
+    for name in team().robots:
         if name != viewer:
             near = pose if random.random() < 0.7 else None
             other = _free_pose(random, taken, near)
             taken.append((other.x, other.y))
             robots.append(SceneRobot(name, *other))
-    camera = with_mount_error(
-        with_focal_error(team().robots[viewer].camera, 1.0, random), 1.0, random
-    )
+    camera = with_focal_error(team().robots[viewer].camera, 1.0, random)
+    camera = with_mount_error(camera, 1.0, random)
     return RandomFrame(viewer, pose, tuple(robots), scene, _random_light(random), camera)
 
 
@@ -211,27 +214,23 @@ def _solids(
 ) -> dict[str, tuple[Solid, ...]]:
     """The solids that hide other objects, by name; the bodies of robots have this radius."""
     solids: dict[str, tuple[Solid, ...]] = {}
-    clutter = {
-        f"\n{i}": post for i, post in enumerate(frame.scene.clutter)
-    }  # no name has a newline
+    clutter = {f"\n{i}": post for i, post in enumerate(frame.scene.clutter)}  # no name has "\n"
     for name, post in {**frame.scene.landmarks, **clutter}.items():
-        solids[name] = (_cylinder_solid(post, *robot_from_field.transform(post.x_m, post.y_m)),)
-    vision = team().vision
+        x, y = robot_from_field.transform(post.x_m, post.y_m)
+        solids[name] = (Solid(x, y, post.radius_m, post.bands[0].from_m, post.bands[-1].to_m),)
     for robot in frame.robots:
         x, y = robot_from_field.transform(robot.x_m, robot.y_m)
-        body = Solid(x, y, body_m, 0.0, body_top_m(vision))
-        mast = Solid(x, y, vision.mast.radius_m, body.high, _top_m(vision.mast))
+        top_m, mast = body_top_m(team().vision), _mast(x, y)
+        body = Solid(x, y, body_m, 0.0, top_m)
         has_mast = team().robots[robot.name].colours is not None
-        solids[robot.name] = (body, mast) if has_mast else (body,)
+        solids[robot.name] = (body, mast._replace(low=top_m)) if has_mast else (body,)
     return solids
 
 
-def _cylinder_solid(post: SceneCylinder, x: float, y: float) -> Solid:
-    return Solid(x, y, post.radius_m, post.bands[0].from_m, post.bands[-1].to_m)
-
-
-def _top_m(shape: Cylinder) -> float:
-    return shape.foot_m + shape.height_m
+def _mast(x: float, y: float) -> Solid:
+    """The bands of a mast."""
+    shape = team().vision.mast
+    return Solid(x, y, shape.radius_m, shape.foot_m, shape.foot_m + shape.height_m)
 
 
 def _others(solids: Mapping[str, Sequence[Solid]], but: str) -> list[Solid]:
@@ -241,8 +240,9 @@ def _others(solids: Mapping[str, Sequence[Solid]], but: str) -> list[Solid]:
 def _landmark(name: str, solid: Solid, camera: Camera, before: Before) -> NamedObject:
     points = cylinder_points(solid, camera.position)
     whole, some = visible_shares(points, camera, before)
-    due: Due = {"landmark": whole}
-    return _named_object(name, Pose2(solid.x, solid.y, 0.0), due, some, solid.radius)
+    return _named_object(
+        name, Pose2(solid.x, solid.y, 0.0), {"landmark": whole}, some, solid.radius
+    )
 
 
 def _teammate(name: str, seen: Pose2, camera: Camera, before: Before) -> NamedObject:
@@ -255,9 +255,7 @@ def _teammate(name: str, seen: Pose2, camera: Camera, before: Before) -> NamedOb
             some = max(some, part)
             marker = max(marker, whole if angle <= math.radians(FACING_DEG) else 0.0)
     if robot.colours is not None:
-        shape = vision.mast
-        solid = Solid(seen.x, seen.y, shape.radius_m, shape.foot_m, _top_m(shape))
-        points = cylinder_points(solid, camera.position)
+        points = cylinder_points(_mast(seen.x, seen.y), camera.position)
         mast, part = visible_shares(points, camera, before)
         some = max(some, part)
     half_m = math.sqrt(2.0) * vision.marker_distance_m
@@ -276,16 +274,10 @@ def _marker(side: Side, seen: Pose2, camera: Camera) -> tuple[Floats, float]:
 
 
 def _named_object(name: str, seen: Pose2, shown: Due, some: float, half_m: float) -> NamedObject:
-    range_m = math.hypot(seen.x, seen.y)
-    return NamedObject(
-        name=name,
-        range_m=range_m,
-        bearing_rad=math.atan2(seen.y, seen.x),
-        heading_rad=seen.heading,
-        due=tuple(kind for kind, share in shown.items() if share >= ALL_OF_IT),
-        some=some > 0.0,
-        half_width_rad=math.asin(min(1.0, half_m / range_m)),
-    )
+    range_m, bearing_rad = math.hypot(seen.x, seen.y), math.atan2(seen.y, seen.x)
+    due = tuple(kind for kind, share in shown.items() if share >= ALL_OF_IT)
+    half_width_rad = math.asin(min(1.0, half_m / range_m))
+    return NamedObject(name, range_m, bearing_rad, seen.heading, due, some > 0.0, half_width_rad)
 
 
 # What was made of it -----------------------------------------------------------------------------
@@ -299,33 +291,21 @@ def compare_with_truth(
     for sighting in seen:
         thing = there.get(sighting.id)
         why = _mistake_reason(sighting, thing)
-        if why is None:
-            assert thing is not None
+        if why is None and thing is not None:
             right.add(thing.name)
             records.append(_record(sighting, thing))
-        else:
-            bearing_deg = (
-                None if sighting.bearing_rad is None else math.degrees(sighting.bearing_rad)
+        elif why is not None:
+            mistake = Mistake(
+                frame=number,
+                kind=_seen_by(sighting),
+                id=sighting.id,
+                why=why,
+                range_m=sighting.range_m,
+                bearing_deg=degrees(sighting.bearing_rad),
             )
-            kind = _seen_by(sighting)
-            mistakes.append(
-                Mistake(
-                    frame=number,
-                    kind=kind,
-                    id=sighting.id,
-                    why=why,
-                    range_m=sighting.range_m,
-                    bearing_deg=bearing_deg,
-                )
-            )
-    records += _missed(there, right)
-    return records, mistakes
-
-
-def _missed(there: Mapping[str, NamedObject], right: set[str]) -> Iterator[Record]:
-    for name, thing in there.items():
-        if thing.due and name not in right:
-            yield Record(thing.due, None, thing.range_m)
+            mistakes.append(mistake)
+    missed = [thing for name, thing in there.items() if thing.due and name not in right]
+    return records + [Record(thing.due, None, thing.range_m) for thing in missed], mistakes
 
 
 def _mistake_reason(sighting: Sighting, thing: NamedObject | None) -> Wrong | None:
@@ -346,9 +326,7 @@ def _seen_by(sighting: Sighting) -> Kind:
 
 def _record(sighting: Sighting, thing: NamedObject) -> Record:
     assert sighting.bearing_rad is not None
-    heading = None
-    if sighting.heading_rad is not None:
-        heading = wrap_angle(sighting.heading_rad - thing.heading_rad)
+    heading = sighting.heading_rad
     ranged = sighting.range_m is not None
     return Record(
         due=thing.due,
@@ -358,6 +336,6 @@ def _record(sighting: Sighting, thing: NamedObject) -> Record:
         range_sigma_m=sighting.range_sigma_m if ranged else None,
         bearing_error_rad=wrap_angle(sighting.bearing_rad - thing.bearing_rad),
         bearing_sigma_rad=sighting.bearing_sigma_rad,
-        heading_error_rad=heading,
+        heading_error_rad=None if heading is None else wrap_angle(heading - thing.heading_rad),
         heading_sigma_rad=sighting.heading_sigma_rad,
     )
