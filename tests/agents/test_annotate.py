@@ -10,12 +10,11 @@ from support.cameras import picture
 from cpcbl_agents.vision.annotate import (
     AMBIGUOUS_BGR,
     DETECTED_BGR,
-    Box,
     annotate,
     place_labels,
     sighting_lines,
 )
-from cpcbl_agents.vision.camera import Floats
+from cpcbl_agents.vision.camera import Box, Floats
 from cpcbl_agents.vision.detections import Ambiguity, Detection, Detections
 from cpcbl_team.inputs import Sighting
 

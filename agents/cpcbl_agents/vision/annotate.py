@@ -7,7 +7,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from cpcbl_agents.vision.camera import Floats, Pixels
+from cpcbl_agents.vision.camera import Box, Floats, Pixels
 from cpcbl_agents.vision.detections import Ambiguity, Detections
 from cpcbl_team.inputs import Sighting
 
@@ -21,35 +21,22 @@ REFERENCE_WIDTH_PX = 640  # at which text has that size
 MAX_COORDINATE_PX = 10_000.0  # outlines may reach far beyond the picture
 
 
-class Box(NamedTuple):
-    """Left, top, right and bottom edges (px)."""
-
-    left: int
-    top: int
-    right: int
-    bottom: int
-
-    def overlaps(self, other: "Box") -> bool:
-        apart_x = self.right <= other.left or other.right <= self.left
-        return not (apart_x or self.bottom <= other.top or other.bottom <= self.top)
-
-
 class Label(NamedTuple):
-    """The text of a label, and its place in the frame."""
+    """The text of a label, its place in the frame, and the outline (n, 2) of its object."""
 
     lines: tuple[str, ...]
     colour: Colour
     box: Box
+    outline: Floats
 
 
 def annotate(pixels: Pixels, detections: Detections) -> Pixels:
     """A copy of a frame (height, width, 3) with outlines and labels."""
     drawn, scale = pixels.copy(), _scale(pixels.shape[1])
-    for found in detections.found:
-        _draw_outline(drawn, found.outline, DETECTED_BGR, scale)
-    for ambiguity in detections.ambiguities:
-        _draw_outline(drawn, ambiguity.outline, AMBIGUOUS_BGR, scale)
-    for label in place_labels(detections, (pixels.shape[1], pixels.shape[0])):
+    labels = place_labels(detections, (pixels.shape[1], pixels.shape[0]))
+    for label in labels:
+        _draw_outline(drawn, label.outline, label.colour, round(scale))
+    for label in labels:
         _draw_label(drawn, label, scale)
     return drawn
 
@@ -59,19 +46,18 @@ def place_labels(detections: Detections, size_px: tuple[int, int]) -> list[Label
 
     They do not overlap as long as there is room.
     """
-    said = [(f.outline, sighting_lines(f.sighting), DETECTED_BGR) for f in detections.found]
-    said += [(d.outline, ambiguity_lines(d), AMBIGUOUS_BGR) for d in detections.ambiguities]
+    texts = [(f.outline, sighting_lines(f.sighting), DETECTED_BGR) for f in detections.found]
+    texts += [(a.outline, ambiguity_lines(a), AMBIGUOUS_BGR) for a in detections.ambiguities]
     placed: list[Label] = []
-    for outline, lines, colour in said:
+    for outline, lines, colour in texts:
         box = _label_box(size_px, outline, lines, [label.box for label in placed])
-        placed.append(Label(tuple(lines), colour, box))
+        placed.append(Label(tuple(lines), colour, box, outline))
     return placed
 
 
 def sighting_lines(sighting: Sighting) -> list[str]:
     """The lines of a label in ASCII, as OpenCV's fonts require: the id, then one value a line."""
-    lines = [sighting.id]
-    s = sighting
+    s, lines = sighting, [sighting.id]
     if s.range_m is not None:
         lines.append(f"{s.range_m:.2f}{_spread(s.range_sigma_m, 2)} m")
     if s.bearing_rad is not None:
@@ -95,10 +81,9 @@ def _spread(sigma: float | None, digits: int) -> str:
     return "" if sigma is None else f" +-{sigma:.{digits}f}"
 
 
-def _draw_outline(drawn: Pixels, outline: Floats, colour: Colour, scale: float) -> None:
+def _draw_outline(drawn: Pixels, outline: Floats, colour: Colour, thick: int) -> None:
     corners = _corners(outline)
     if len(corners):
-        thick = round(scale)
         cv2.polylines(drawn, [corners], True, BACKGROUND_BGR, 3 * thick, cv2.LINE_AA)
         cv2.polylines(drawn, [corners], True, colour, thick, cv2.LINE_AA)
 
@@ -130,8 +115,7 @@ def _label_box(
 
 def _draw_label(drawn: Pixels, label: Label, scale: float) -> None:
     """Draws a label on a dark background, which makes it readable on anything."""
-    box = label.box
-    part = drawn[box.top : box.bottom, box.left : box.right]
+    part, box = drawn[label.box.slices], label.box
     part[:] = part // 4 + np.array(BACKGROUND_BGR, np.uint8) // 2
     for n, text in enumerate(label.lines, start=1):
         at = box.left + round(3 * scale), box.top + round((LINE_PX * n - BASELINE_PX + 2) * scale)

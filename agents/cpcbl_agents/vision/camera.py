@@ -19,6 +19,7 @@ Pixels = NDArray[np.uint8]
 # Columns: the camera's x, y, z axes in the frame of a robot that it looks forward from.
 _FORWARD = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 NEAREST_M = 1e-3
+NO_PIXELS: Pixels = np.empty((0, 0, 3), np.uint8)
 
 
 class Box(NamedTuple):
@@ -37,6 +38,10 @@ class Box(NamedTuple):
     def size(self) -> tuple[int, int]:
         """Width, height."""
         return self.right - self.left, self.bottom - self.top
+
+    def overlaps(self, other: "Box") -> bool:
+        apart_x = self.right <= other.left or other.right <= self.left
+        return not (apart_x or self.bottom <= other.top or other.bottom <= self.top)
 
 
 class Camera:

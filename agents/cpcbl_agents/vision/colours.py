@@ -44,9 +44,7 @@ class ColourSegmenter:
     def __init__(self, colours: dict[str, Colour], used: Iterable[str]) -> None:
         names = sorted(set(used))
         groups = [names[i : i + BITS] for i in range(0, len(names), BITS)]
-        self._groups = [
-            (group, _lookup_table([colours[name] for name in group])) for group in groups
-        ]
+        self._groups = [(group, _lookup_table([colours[n] for n in group])) for group in groups]
 
     def blobs(self, pixels: Pixels, panorama: Panorama) -> list[ColourBlob]:
         """The blobs of all colours in a frame (height, width, 3), BGR."""
@@ -78,9 +76,9 @@ def _lookup_table(colours: Sequence[Colour]) -> Pixels:
     """
     table = np.zeros((256, 1, 3), np.uint8)
     for bit, colour in enumerate(colours):
-        (first, last), *others = colour.hue, colour.saturation, colour.value
-        parts = [(first, last)] if first <= last else [(first, 179), (0, last)]
-        for channel, ranges in enumerate((parts, *([other] for other in others))):
+        first, last = colour.hue
+        hues = [(first, last)] if first <= last else [(first, 179), (0, last)]
+        for channel, ranges in enumerate((hues, [colour.saturation], [colour.value])):
             for low, high in ranges:
                 table[low : high + 1, 0, channel] |= 1 << bit
     return table
@@ -100,10 +98,8 @@ def _contours(bits: Pixels, names: Sequence[str]) -> Iterator[tuple[str, cv2.typ
         return
     bits = bits[top : top + height, left : left + width]
     for bit, name in enumerate(names):
-        mask = np.bitwise_and(bits, np.uint8(1 << bit), dtype=np.uint8)
-        found, _ = cv2.findContours(
-            mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE, offset=(left, top)
-        )
+        mask, mode = np.bitwise_and(bits, np.uint8(1 << bit), dtype=np.uint8), cv2.RETR_EXTERNAL
+        found, _ = cv2.findContours(mask, mode, cv2.CHAIN_APPROX_NONE, offset=(left, top))
         long = [outline for outline in found if len(outline) >= 2 * MIN_PX]
         if len(long) > MAX_BLOBS:
             long = sorted(long, key=len)[-MAX_BLOBS:]

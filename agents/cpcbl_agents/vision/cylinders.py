@@ -5,21 +5,25 @@ other and with the floor. So mirror images, other objects of the same colours an
 objects are not mistaken for it.
 """
 
+import itertools
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import NamedTuple
 
 from cpcbl_agents.vision.camera import Camera, Pixels
 from cpcbl_agents.vision.colours import ColourBlob, ColourSegmenter
 from cpcbl_agents.vision.cylinder_fit import (
+    FOOT,
+    TOP,
+    WIDTH,
     AngularOutline,
     CylinderFit,
+    Shape,
     best_fit,
     fit_cylinder,
     rejection_reason,
 )
-from cpcbl_agents.vision.detections import Ambiguity, Detection, Detections
-from cpcbl_agents.vision.duplicates import without_duplicates
+from cpcbl_agents.vision.detections import Ambiguity, Detection, Detections, without_duplicates
 from cpcbl_agents.vision.outlines import (
     GAP_PX,
     Candidate,
@@ -30,7 +34,6 @@ from cpcbl_agents.vision.outlines import (
     possible_outlines,
 )
 from cpcbl_agents.vision.panorama import panorama_for
-from cpcbl_agents.vision.silhouette import FOOT, TOP, WIDTH, Shape
 from cpcbl_team.config import Bands, Team
 from cpcbl_team.geometry import wrap_angle
 from cpcbl_team.inputs import Sighting
@@ -44,12 +47,7 @@ its surroundings and moves its edges outwards. The increased sigma does not deci
 is, because a wrong name is worse than none."""
 RIVAL_LENIENCY = 3.0  # a cylinder whose fit is so much worse is still possible
 UNSURE_FACTOR = 4.0  # factor of the sigma of an edge beyond which the colour continues
-REASONS = (
-    "cut_by_frame",
-    "mirror_image",
-    "ranges_disagree",
-    "wrong_shape",
-)  # the most specific first
+REASONS = ("cut_by_frame", "mirror_image", "ranges_disagree", "wrong_shape")  # specific ones first
 
 
 class CylinderKind(NamedTuple):
@@ -78,9 +76,8 @@ class CylinderDetector:
         identified = [self._identify(pixels, pair) for pair in pairs]
         found = tuple(one for one in identified if isinstance(one, Detection))
         ambiguities = tuple(one for one in identified if isinstance(one, Ambiguity))
-        return without_duplicates(
-            Detections(found, ambiguities + tuple(self._single_bands(blobs, pairs)))
-        )
+        ambiguities += tuple(self._single_bands(blobs, pairs))
+        return without_duplicates(Detections(found, ambiguities))
 
     def _identify(self, pixels: Pixels, pair: Candidate) -> Detection | Ambiguity:
         """The cylinder that a pair of blobs is, or why it is rejected."""
@@ -91,31 +88,21 @@ class CylinderDetector:
         if pair.height < LEAST_PX:
             return Ambiguity("too_small", names, pair.outline)
         outlines = self._angular_outlines(pixels, pair)
-        fits = {
-            kind: best_fit(fit_cylinder(kind.shape, outline) for outline in outlines)
-            for kind in kinds
-        }
-        accepted = [one for one in fits.values() if one is not None]
+        fits = {kind: _best_fit(kind.shape, outlines) for kind in kinds}
+        accepted = [fit for fit in fits.values() if fit is not None]
         if not accepted:
             return Ambiguity(self._rejection_reason(kinds, outlines), names, pair.outline)
-        names = _names(
-            [
-                kind
-                for kind, one in fits.items()
-                if one
-                or best_fit(
-                    fit_cylinder(kind.shape, outline, RIVAL_LENIENCY) for outline in outlines
-                )
-            ]
+        rivals = (
+            k for k, fit in fits.items() if fit or _best_fit(k.shape, outlines, RIVAL_LENIENCY)
         )
+        names = _names(rivals)
         if len(names) > 1:
             return Ambiguity("ambiguous", names, pair.outline)
-        (one,) = accepted
-        if one.hidden is not None and not self._is_usable_part(pair, one):
-            return Ambiguity(
-                "cut_by_frame" if one.outline.cut else "wrong_shape", names, pair.outline
-            )
-        return Detection(self._sighting(names[0], one), one.outline.corners)
+        (fit,) = accepted
+        if fit.hidden is not None and not self._is_usable_part(pair, fit):
+            reason = "cut_by_frame" if fit.outline.cut else "wrong_shape"
+            return Ambiguity(reason, names, pair.outline)
+        return Detection(self._sighting(names[0], fit), fit.outline.corners)
 
     def _is_usable_part(self, pair: Candidate, part: CylinderFit) -> bool:
         """Whether a part is wide enough, and nothing is visible between its bands."""
@@ -139,27 +126,22 @@ class CylinderDetector:
         for blob in blobs:
             if id(blob) not in paired and min(blob.height, blob.width) >= LEAST_BAND_PX:
                 kinds = (k for bands, ks in self._kinds.items() if blob.colour in bands for k in ks)
-                yield Ambiguity("one_band_only", _names(tuple(kinds)), blob.outline)
+                yield Ambiguity("one_band_only", _names(kinds), blob.outline)
 
     def _angular_outlines(self, pixels: Pixels, pair: Candidate) -> list[AngularOutline]:
         patch = panorama_patch(pixels, self._panorama, pair)
         if patch is None:
             return []
         outlines = possible_outlines(patch, self._panorama, pair)
-        return [
-            self._angular_outline(outline)
-            for outline in outlines
-            if self._has_clear_colours(patch, pair, outline)
-        ]
+        clear = (one for one in outlines if self._has_clear_colours(patch, pair, one))
+        return [self._angular_outline(one) for one in clear]
 
     def _has_clear_colours(self, patch: Patch, pair: Candidate, o: Outline) -> bool:
         """Whether both bands are of their colours throughout, and of no other."""
         upper = patch.region(o.left + 1.0, o.right - 1.0, o.top + 1.0, o.mid - 1.0)
         lower = patch.region(o.left + 1.0, o.right - 1.0, o.mid + 1.0, o.foot - 1.0)
-        has_clear_colour = self._colours.has_clear_colour
-        return has_clear_colour(upper, pair.upper.colour) and has_clear_colour(
-            lower, pair.lower.colour
-        )
+        bands = (upper, pair.upper.colour), (lower, pair.lower.colour)
+        return all(self._colours.has_clear_colour(band, colour) for band, colour in bands)
 
     def _angular_outline(self, o: Outline) -> AngularOutline:
         """The outline as angles."""
@@ -185,35 +167,28 @@ class CylinderDetector:
         self, kinds: Sequence[CylinderKind], outlines: Sequence[AngularOutline]
     ) -> str:
         """Why the outlines are none of these cylinders."""
-        lens_m = self._settings.mounted_m
-        reasons = {
-            rejection_reason(kind.shape, lens_m, outline) for kind in kinds for outline in outlines
-        }
+        lens_m, pairs = self._settings.mounted_m, itertools.product(kinds, outlines)
+        reasons = {rejection_reason(kind.shape, lens_m, outline) for kind, outline in pairs}
         return min(reasons, key=REASONS.index, default="wrong_shape")
 
-    def _sighting(self, name: str, accepted: CylinderFit) -> Sighting:
+    def _sighting(self, name: str, fit: CylinderFit) -> Sighting:
         """Range and bearing from the robot's centre; the bearing only if something is hidden."""
-        s, outline = self._settings, accepted.outline
+        s, outline = self._settings, fit.outline
         azimuth = outline.azimuth
         oblique = s.focal_share * math.sin(azimuth) * math.cos(azimuth)
         azimuth_sigma = math.hypot(outline.sigmas[WIDTH], oblique)
-        if accepted.hidden == WIDTH:  # the axis is within the radius of the middle of what is seen
-            azimuth_sigma += accepted.half_width
+        if fit.hidden == WIDTH:  # the axis is within the radius of the middle of what is seen
+            azimuth_sigma += fit.half_width
         narrow = NARROW_PX * self._panorama.step / max(2.0 * outline.angles[WIDTH], 1e-6)
-        range_sigma = accepted.sigma * (1.0 + narrow * narrow)
-        angles = from_robot_centre(
-            (s.x_m, s.y_m),
-            PolarPosition(
-                accepted.distance,
-                self._panorama.bearing(azimuth),
-                math.hypot(range_sigma, s.focal_share * accepted.distance),
-                azimuth_sigma,
-            ),
-        )
-        bearing_sigma = math.hypot(angles.bearing_sigma, math.radians(s.yaw_sigma_deg))
-        if accepted.hidden is not None:
-            return Sighting(name, bearing_rad=angles.bearing, bearing_sigma_rad=bearing_sigma)
-        return Sighting(name, angles.range, angles.bearing, angles.range_sigma, bearing_sigma)
+        range_sigma = fit.sigma * (1.0 + narrow * narrow)
+        bearing = self._panorama.bearing(azimuth)
+        range_sigma = math.hypot(range_sigma, s.focal_share * fit.distance)
+        from_lens = PolarPosition(fit.distance, bearing, range_sigma, azimuth_sigma)
+        seen = from_robot_centre((s.x_m, s.y_m), from_lens)
+        bearing_sigma = math.hypot(seen.bearing_sigma, math.radians(s.yaw_sigma_deg))
+        if fit.hidden is not None:
+            return Sighting(name, bearing_rad=seen.bearing, bearing_sigma_rad=bearing_sigma)
+        return Sighting(name, seen.range, seen.bearing, seen.range_sigma, bearing_sigma)
 
 
 def known_cylinders(robot: str, team: Team, lens_m: float) -> dict[Bands, tuple[CylinderKind, ...]]:
@@ -249,13 +224,15 @@ def from_robot_centre(lens: tuple[float, float], angles: PolarPosition) -> Polar
     turn = wrap_angle(angles.bearing - bearing)
     along, across = angles.range_sigma, angles.range * angles.bearing_sigma
     c, s = math.cos(turn), math.sin(turn)
-    return PolarPosition(
-        range_m,
-        bearing,
-        math.hypot(c * along, s * across),
-        math.hypot(s * along, c * across) / max(range_m, 1e-6),
-    )
+    bearing_sigma = math.hypot(s * along, c * across) / max(range_m, 1e-6)
+    return PolarPosition(range_m, bearing, math.hypot(c * along, s * across), bearing_sigma)
 
 
-def _names(kinds: Sequence[CylinderKind]) -> tuple[str, ...]:
+def _names(kinds: Iterable[CylinderKind]) -> tuple[str, ...]:
     return tuple(name for kind in kinds for name in kind.names)
+
+
+def _best_fit(
+    shape: Shape, outlines: Sequence[AngularOutline], leniency: float = 1.0
+) -> CylinderFit | None:
+    return best_fit(fit_cylinder(shape, outline, leniency) for outline in outlines)

@@ -6,7 +6,7 @@ or, farther away, by the bands of their masts.
 
 from cpcbl_agents.detector import Picture
 from cpcbl_agents.vision.annotate import annotate
-from cpcbl_agents.vision.camera import Camera, Pixels
+from cpcbl_agents.vision.camera import NO_PIXELS, Camera, Pixels
 from cpcbl_agents.vision.cylinders import CylinderDetector
 from cpcbl_agents.vision.detections import Detections
 from cpcbl_agents.vision.markers import MarkerDetector
@@ -26,42 +26,33 @@ class CameraDetector:
 
     def detect(self, frame: Frame | Picture) -> Sightings | str:
         """The sightings in a frame, or the reason why it cannot be used (`frame_...`)."""
-        pixels = self._decode(frame)
-        detections = pixels if isinstance(pixels, str) else self.detections(pixels)
-        if isinstance(detections, str):
-            return detections
-        return Sightings(frame.stamp_ns, tuple(found.sighting for found in detections.found))
+        _, found = self._decode_and_detect(frame)
+        return found if isinstance(found, str) else Sightings(frame.stamp_ns, found.sightings)
 
     def detect_and_annotate(self, frame: Frame | Picture) -> tuple[Sightings | str, AnnotatedFrame]:
         """The same, and the annotated frame; it has no picture if the frame cannot be decoded."""
-        pixels = self._decode(frame)
-        if isinstance(pixels, str):
-            return pixels, AnnotatedFrame(
-                self.robot, frame.stamp_ns, b"", (), (UnclearObject(pixels),)
-            )
-        detections = self.detections(pixels)
-        if isinstance(detections, str):
+        pixels, found = self._decode_and_detect(frame)
+        if isinstance(found, str):
             image = encode_jpeg(pixels) if pixels.size else b""
-            return detections, AnnotatedFrame(
-                self.robot, frame.stamp_ns, image, (), (UnclearObject(detections),)
-            )
-        found = tuple(found.sighting for found in detections.found)
-        unclear = tuple(
-            UnclearObject(ambiguity.reason, ambiguity.names) for ambiguity in detections.ambiguities
-        )
-        image = encode_jpeg(annotate(pixels, detections))
-        look = AnnotatedFrame(self.robot, frame.stamp_ns, image, found, unclear)
-        return Sightings(frame.stamp_ns, found), look
+            unclear: tuple[UnclearObject, ...] = (UnclearObject(found),)
+            return found, AnnotatedFrame(self.robot, frame.stamp_ns, image, (), unclear)
+        image, sightings = encode_jpeg(annotate(pixels, found)), found.sightings
+        unclear = tuple(UnclearObject(one.reason, one.names) for one in found.ambiguities)
+        annotated = AnnotatedFrame(self.robot, frame.stamp_ns, image, sightings, unclear)
+        return Sightings(frame.stamp_ns, sightings), annotated
 
-    def _decode(self, frame: Frame | Picture) -> Pixels | str:
+    def _decode_and_detect(self, frame: Frame | Picture) -> tuple[Pixels, Detections | str]:
+        """The pixels, empty if the frame cannot be decoded, and its detections or the reason."""
         if isinstance(frame, Picture):
-            return frame.pixels
-        return decode_frame(frame.image, self.camera.size_px)
+            return frame.pixels, self.detections(frame.pixels)
+        pixels = decode_frame(frame.image, self.camera.size_px)
+        if isinstance(pixels, str):
+            return NO_PIXELS, pixels
+        return pixels, self.detections(pixels)
 
     def detections(self, pixels: Pixels) -> Detections | str:
         """All detections in a picture (height, width, 3), BGR, or why it cannot be used."""
-        reason = pixel_fault(pixels, self.camera.size_px)
-        if reason:
+        if reason := pixel_fault(pixels, self.camera.size_px):
             return reason
         return merge_detections(
             self._markers.detections(pixels), self._cylinders.detections(pixels)

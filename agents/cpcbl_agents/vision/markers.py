@@ -9,9 +9,8 @@ import cv2
 import numpy as np
 
 from cpcbl_agents.vision.camera import Camera, Floats, Pixels
-from cpcbl_agents.vision.codes import MarkerReader
+from cpcbl_agents.vision.codes import MarkerReader, line_intersections, side_edge_points
 from cpcbl_agents.vision.detections import Ambiguity, Detection, Detections
-from cpcbl_agents.vision.edges import line_intersections, side_edge_points
 from cpcbl_agents.vision.poses import PoseFit, fit_pose
 from cpcbl_team.config import Side, Team
 from cpcbl_team.inputs import Sighting
@@ -84,19 +83,15 @@ class MarkerDetector:
         rough = quads[list(codes)]
         sides = side_edge_points(grey, rough, self._codes.cells)
         exact = line_intersections(sides)
-        plane = line_intersections(
-            self._camera.undistort(sides.reshape(-1, 2)).reshape(sides.shape)
-        )
-        detected_markers = []
-        for code, quad, flat in zip(codes.values(), exact, plane, strict=True):
-            first = code.first + self._upside_down(np.roll(flat, -code.first, axis=0))
-            detected_markers.append(
-                DetectedMarker(
-                    code.id, *(np.roll(points, -first, axis=0) for points in (quad, flat))
-                )
-            )
+        undistorted = self._camera.undistort(sides.reshape(-1, 2)).reshape(sides.shape)
+        planes = line_intersections(undistorted)
+        markers = []
+        for code, outline, plane in zip(codes.values(), exact, planes, strict=True):
+            turn = -code.first - self._upside_down(np.roll(plane, -code.first, axis=0))
+            outline, plane = np.roll(outline, turn, axis=0), np.roll(plane, turn, axis=0)
+            markers.append(DetectedMarker(code.id, outline, plane))
         moved = np.abs(exact - rough).max(axis=(1, 2))
-        return [detected_markers[i] for i in moved.argsort() if moved[i] < FAR_PX]
+        return [markers[i] for i in moved.argsort() if moved[i] < FAR_PX]
 
     def _upside_down(self, plane: Floats) -> int:
         """The number of corners by which a marker must be turned to be upright: 2 or 0.
@@ -127,37 +122,30 @@ class MarkerDetector:
 
 
 def assign_markers(
-    detected_markers: Iterable[DetectedMarker],
-    mounts: Mapping[int, Sequence[MarkerMount]],
-    own: str,
+    markers: Iterable[DetectedMarker], mounts: Mapping[int, Sequence[MarkerMount]], own: str
 ) -> tuple[dict[str, dict[Side, DetectedMarker]], tuple[Ambiguity, ...]]:
     """The markers by teammate and side, and rejected ones that identify no teammate or several.
 
     `own`: the observing robot.
     """
     seen: dict[int, list[DetectedMarker]] = defaultdict(list)
-    for mark in detected_markers:
+    for mark in markers:
         if not any(_is_same_outline(mark, other) for other in seen[mark.id]):
             seen[mark.id].append(mark)
-    ambiguities = [
-        Ambiguity(reason, tuple(dict.fromkeys(c.robot for c in mounts.get(i, ()))), mark.outline)
-        for i, alike in seen.items()
-        if (reason := _rejection_reason(len(alike), mounts.get(i, ()), own))
-        for mark in alike
-    ]
-    twice = {
-        name
-        for ambiguity in ambiguities
-        if ambiguity.reason == "seen_twice"
-        for name in ambiguity.names
-    }
+    reasons = {i: _rejection_reason(len(seen[i]), mounts.get(i, ()), own) for i in seen}
+    ambiguities = tuple(
+        Ambiguity(reason, tuple(dict.fromkeys(m.robot for m in mounts.get(i, ()))), mark.outline)
+        for i, reason in reasons.items()
+        if reason
+        for mark in seen[i]
+    )
+    twice = {name for one in ambiguities if one.reason == "seen_twice" for name in one.names}
     sides: dict[str, dict[Side, DetectedMarker]] = defaultdict(dict)
-    for i, alike in seen.items():
-        if not _rejection_reason(len(alike), mounts.get(i, ()), own):
+    for i, reason in reasons.items():
+        if not reason and mounts[i][0].robot not in twice:
             robot, side = mounts[i][0]
-            if robot not in twice:
-                sides[robot][side] = alike[0]
-    return sides, tuple(ambiguities)
+            sides[robot][side] = seen[i][0]
+    return sides, ambiguities
 
 
 def _rejection_reason(count: int, mounts: Sequence[MarkerMount], own: str) -> str:
@@ -174,21 +162,14 @@ def _rejection_reason(count: int, mounts: Sequence[MarkerMount], own: str) -> st
 def sighting(name: str, fit: PoseFit) -> Sighting:
     """Range and bearing of a teammate's centre, and its heading if its sigma is small."""
     x, y, heading = fit.pose
-    range_m = math.hypot(x, y)
-    along = np.array([x, y]) / range_m
-    across = np.array([-y, x]) / range_m**2
+    range_m, bearing = math.hypot(x, y), math.atan2(y, x)
+    along, across = np.array([x, y]) / range_m, np.array([-y, x]) / range_m**2
     place = fit.covariance[:2, :2]
+    range_sigma, bearing_sigma = (math.sqrt(way @ place @ way) for way in (along, across))
     heading_sigma = math.sqrt(fit.covariance[2, 2])
-    clear = heading_sigma <= CLEAR_RAD
-    return Sighting(
-        name,
-        range_m,
-        math.atan2(y, x),
-        math.sqrt(along @ place @ along),
-        math.sqrt(across @ place @ across),
-        heading if clear else None,
-        heading_sigma if clear else None,
-    )
+    if heading_sigma > CLEAR_RAD:
+        return Sighting(name, range_m, bearing, range_sigma, bearing_sigma)
+    return Sighting(name, range_m, bearing, range_sigma, bearing_sigma, heading, heading_sigma)
 
 
 def _detector_parameters() -> cv2.aruco.DetectorParameters:
@@ -211,7 +192,7 @@ def _is_same_outline(one: DetectedMarker, other: DetectedMarker) -> bool:
     return bool(apart < 0.5 * _shortest_sides(one.outline[None])[0])
 
 
-def _hull(detected_markers: Iterable[DetectedMarker]) -> Floats:
-    """The outline of all marks together, (n, 2) pixels."""
-    points = np.concatenate([mark.outline for mark in detected_markers]).astype(np.float32)
+def _hull(markers: Iterable[DetectedMarker]) -> Floats:
+    """The outline of all markers together, (n, 2) pixels."""
+    points = np.concatenate([mark.outline for mark in markers]).astype(np.float32)
     return cv2.convexHull(points).reshape(-1, 2).astype(np.float64)

@@ -1,4 +1,8 @@
-"""Pairs of blobs that may be the two bands of a cylinder, and its outline to sub-pixels."""
+"""Pairs of blobs that may be the two bands of a cylinder, and its outline to sub-pixels.
+
+An edge lies halfway between the colours of its two sides. Neither dim light nor blur moves that
+place, as they would move the place where a threshold is crossed.
+"""
 
 import itertools
 import math
@@ -10,9 +14,8 @@ import numpy as np
 
 from cpcbl_agents.vision.camera import Floats, Pixels
 from cpcbl_agents.vision.colours import ColourBlob
+from cpcbl_agents.vision.cylinder_fit import FOOT, TOP, WIDTH
 from cpcbl_agents.vision.panorama import Panorama
-from cpcbl_agents.vision.profiles import Profile
-from cpcbl_agents.vision.silhouette import FOOT, TOP, WIDTH
 from cpcbl_team.config import Bands
 
 MOST_CANDIDATES = 32
@@ -28,6 +31,10 @@ LEAST_PATCH_PX = 3
 LEAST_WIDTH = 1.0
 INSET = 0.2  # of a band, above and below the rows that tell its sides
 APART_PX = 1.5  # the sides of two bands
+LEAST_CONTRAST = 10.0  # grey levels, over the three channels
+NEAREST_PX, FARTHEST_PX = 1.5, 3.0  # from an edge: where the colour of its side is taken
+ROUNDS = 4  # until an edge is found
+SETTLED_PX = 0.1
 
 
 class Candidate(NamedTuple):
@@ -70,6 +77,53 @@ class Outline(NamedTuple):
     unsure: frozenset[int] = frozenset()
 
 
+class Profile:
+    """Colours (n, 3) along a line, the first one at `start`, the next a step farther on."""
+
+    def __init__(self, colours: Floats, start: float) -> None:
+        self._colours, self._start = colours, start
+        self._sums = np.zeros((len(colours) + 1, 3))
+        np.cumsum(colours, axis=0, out=self._sums[1:])
+
+    def edge(self, guess: float, farthest: float, reach: float) -> float:
+        """The edge near `guess`, within `reach`; NaN if there is none.
+
+        The colour of either side is taken no farther from the edge than `farthest`.
+        """
+        first = at = guess - self._start
+        farthest = min(max(farthest, NEAREST_PX), FARTHEST_PX)
+        for _ in range(ROUNDS):
+            last, at = at, self._crossing(at, farthest, reach)
+            if not abs(at - first) <= reach:  # NaN too
+                return math.nan
+            if abs(at - last) < SETTLED_PX:
+                break
+        return at + self._start
+
+    def _crossing(self, at: float, farthest: float, reach: float) -> float:
+        """The place nearest to `at` where it is halfway between its colours at both sides."""
+        before = self._mean(at - farthest, at - NEAREST_PX)
+        behind = self._mean(at + NEAREST_PX, at + farthest)
+        way = behind - before
+        contrast = float(way @ way)
+        if not contrast >= LEAST_CONTRAST**2:  # NaN too
+            return math.nan
+        first = max(0, int(at - reach - 1.0))
+        part = self._colours[first : int(at + reach + 3.0)]
+        shares = ((part - before) @ way / contrast).tolist()
+        steps = enumerate(itertools.pairwise(shares), start=first)
+        places = [i + (0.5 - a) / (b - a) for i, (a, b) in steps if a < 0.5 <= b]
+        return min(places, key=lambda place: abs(place - at), default=math.nan)
+
+    def _mean(self, start: float, end: float) -> Floats:
+        """The mean colour of the samples between two places, at least one; NaN beyond the ends."""
+        first, last = max(round(start), 0), min(round(end) + 1, len(self._colours))
+        if last <= first:
+            return np.full(3, math.nan)
+        mean: Floats = (self._sums[last] - self._sums[first]) / (last - first)
+        return mean
+
+
 class Patch(NamedTuple):
     """A part of the panorama, (rows, columns, 3), and where it begins."""
 
@@ -79,21 +133,21 @@ class Patch(NamedTuple):
 
     def region(self, left: float, right: float, top: float, bottom: float) -> Pixels:
         """The pixels between these columns and rows; at least one."""
-        rows, columns = self.pixels.shape[:2]
-        return self.pixels[
-            _from_to(top - self.top, bottom - self.top, rows),
-            _from_to(left - self.left, right - self.left, columns),
-        ]
+        return self.pixels[self._rows(top, bottom), self._columns(left, right)]
 
     def vertical_profile(self, left: float, right: float) -> Profile:
         """The mean of the columns between these, row by row."""
-        part = self.pixels[:, _from_to(left - self.left, right - self.left, self.pixels.shape[1])]
-        return Profile(_mean(part, 1), self.top)
+        return Profile(_mean(self.pixels[:, self._columns(left, right)], 1), self.top)
 
     def horizontal_profile(self, top: float, bottom: float) -> Profile:
         """The mean of the rows between these, column by column."""
-        part = self.pixels[_from_to(top - self.top, bottom - self.top, self.pixels.shape[0])]
-        return Profile(_mean(part, 0), self.left)
+        return Profile(_mean(self.pixels[self._rows(top, bottom)], 0), self.left)
+
+    def _rows(self, top: float, bottom: float) -> slice:
+        return _from_to(top - self.top, bottom - self.top, self.pixels.shape[0])
+
+    def _columns(self, left: float, right: float) -> slice:
+        return _from_to(left - self.left, right - self.left, self.pixels.shape[1])
 
 
 def candidates(blobs: Sequence[ColourBlob]) -> list[Candidate]:
@@ -128,10 +182,9 @@ def panorama_patch(pixels: Pixels, panorama: Panorama, candidate: Candidate) -> 
     upper, lower = candidate
     left, right = min(upper.left, lower.left), max(upper.right, lower.right)
     margin = _search_range(right - left) + REST_PX
-    box = panorama.clip_box(
-        left - margin, upper.top - margin, right + margin, lower.bottom + margin
-    )
-    if box.right - box.left < LEAST_PATCH_PX or box.bottom - box.top < LEAST_PATCH_PX:
+    top, bottom = upper.top - margin, lower.bottom + margin
+    box = panorama.clip_box(left - margin, top, right + margin, bottom)
+    if min(box.size) < LEAST_PATCH_PX:
         return None
     return Patch(panorama.crop(pixels, box), box.left, box.top)
 
@@ -151,21 +204,19 @@ def possible_outlines(patch: Patch, panorama: Panorama, candidate: Candidate) ->
         return []
     top, foot = _top_and_foot(rows, upper.top, mid, lower.bottom)
     inset = INSET * min(mid - upper.top, lower.bottom - mid)
-    lost: frozenset[int] = frozenset()
     found = _possible_sides(
         _sides(patch.horizontal_profile(upper.top + inset, mid - inset), upper),
         _sides(patch.horizontal_profile(mid + inset, lower.bottom - inset), lower),
     )
-    if not found:
-        lost, found = lost | {WIDTH}, [(min(upper.left, lower.left), max(upper.right, lower.right))]
-    if math.isnan(top):
-        lost, top = lost | {TOP}, upper.top
-    if math.isnan(foot):
-        lost, foot = lost | {FOOT}, lower.bottom
+    missing = {TOP: math.isnan(top), FOOT: math.isnan(foot), WIDTH: not found}
+    hidden = frozenset(part for part, is_missing in missing.items() if is_missing)
+    found = found or [(min(upper.left, lower.left), max(upper.right, lower.right))]
+    top = upper.top if TOP in hidden else top
+    foot = lower.bottom if FOOT in hidden else foot
     beyond = GAP_PX + GAP_SHARE * min(mid - top, foot - mid)
     goes_on = {TOP: top - upper.top > beyond, FOOT: lower.bottom - foot > beyond}
-    unsure = frozenset(i for i, so in goes_on.items() if so)
-    outlines = (Outline(left, right, top, mid, foot, lost, unsure=unsure) for left, right in found)
+    unsure = frozenset(part for part, does_go_on in goes_on.items() if does_go_on)
+    outlines = (Outline(*sides, top, mid, foot, hidden, unsure=unsure) for sides in found)
     return [_with_frame_cuts(panorama, outline) for outline in outlines]
 
 
@@ -220,16 +271,9 @@ def _with_frame_cuts(panorama: Panorama, outline: Outline) -> Outline:
     """The outline with those edges marked as hidden that are at the border of the frame."""
     left, right, top, mid, foot, hidden, *_ = outline
     middle, rows = 0.5 * (left + right), (0.5 * (top + mid), 0.5 * (mid + foot))
-    places = {
-        TOP: [(middle, top)],
-        FOOT: [(middle, foot)],
-        WIDTH: [(column, row) for column in (left, right) for row in rows],
-    }
-    cut = {
-        what
-        for what, points in places.items()
-        if any(panorama.is_at_border(column, row, BORDER_PX) for column, row in points)
-    }
+    sides = [(WIDTH, column, row) for column in (left, right) for row in rows]
+    edges = [(TOP, middle, top), (FOOT, middle, foot), *sides]
+    cut = {part for part, x, y in edges if panorama.is_at_border(x, y, BORDER_PX)}
     return outline._replace(hidden=hidden | cut, cut=bool(cut))
 
 

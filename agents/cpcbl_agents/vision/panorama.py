@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cpcbl_agents.vision.camera import Camera, Floats, Pixels
+from cpcbl_agents.vision.camera import Box, Camera, Floats, Pixels
 from cpcbl_team.config import CameraSettings
 
 STEEPEST = 4.0  # slopes: what is farther below or above than this is not unrolled
@@ -22,15 +22,6 @@ LEAST_SCALE = 0.1
 FOLD_PX = 0.5  # a lens model that folds back does not come back to its pixel
 
 Map = NDArray[np.float32]
-
-
-class Box(NamedTuple):
-    """A part of the panorama: columns and rows, first and behind the last."""
-
-    left: int
-    top: int
-    right: int
-    bottom: int
 
 
 class Scale(NamedTuple):
@@ -56,12 +47,11 @@ class Panorama:
         seen = (np.abs(slopes) < STEEPEST) & (np.abs(azimuths) < WIDEST_RAD)
         self.first_azimuth = float(azimuths[seen].min())
         self.first_slope = float(slopes[seen].min())
-        self.columns = self._index_map(azimuths - self.first_azimuth, height, width)
+        columns, rows = self._columns_and_rows(azimuths, slopes)
+        self.columns: Map = columns.reshape(height, width).astype(np.float32)
         """Of each pixel (height, width)."""
-        self.rows = self._index_map(slopes - self.first_slope, height, width)
-        last_column = math.ceil(float(azimuths[seen].max() - self.first_azimuth) / self.step)
-        last_row = math.ceil(float(slopes[seen].max() - self.first_slope) / self.step)
-        self.size = last_column + 1, last_row + 1
+        self.rows: Map = rows.reshape(height, width).astype(np.float32)
+        self.size = math.ceil(columns[seen].max()) + 1, math.ceil(rows[seen].max()) + 1
         """(columns, rows)."""
         self.x, self.y = self._pixel_maps()
 
@@ -79,8 +69,7 @@ class Panorama:
 
     def crop(self, pixels: Pixels, box: Box) -> Pixels:
         """A part of the panorama, (rows, columns, 3); black outside of the frame."""
-        part = slice(box.top, box.bottom), slice(box.left, box.right)
-        cut = cv2.remap(pixels, self.x[part], self.y[part], cv2.INTER_LINEAR)
+        cut = cv2.remap(pixels, self.x[box.slices], self.y[box.slices], cv2.INTER_LINEAR)
         return cut.astype(np.uint8, copy=False)
 
     def clip_box(self, left: float, top: float, right: float, bottom: float) -> Box:
@@ -96,9 +85,8 @@ class Panorama:
     def corners(self, left: float, top: float, right: float, bottom: float) -> Floats:
         """The pixels (4, 2) of a box of the panorama, as far as they are in the frame."""
         columns, rows = self.size
-        places = ((left, top), (right, top), (right, bottom), (left, bottom))
-        i = [min(max(round(row), 0), rows - 1) for _, row in places]
-        j = [min(max(round(column), 0), columns - 1) for column, _ in places]
+        i = [min(max(round(row), 0), rows - 1) for row in (top, top, bottom, bottom)]
+        j = [min(max(round(column), 0), columns - 1) for column in (left, right, right, left)]
         width, height = self._camera.size_px
         pixels = np.column_stack([self.x[i, j], self.y[i, j]]).astype(np.float64)
         return pixels.clip(0.0, (width - 1.0, height - 1.0))
@@ -110,9 +98,8 @@ class Panorama:
             return True  # NaN too
         x, y = self.x[round(row), round(column)], self.y[round(row), round(column)]
         width, height = self._camera.size_px
-        return not (
-            margin_px <= x + 0.5 <= width - margin_px and margin_px <= y + 0.5 <= height - margin_px
-        )
+        inside_x = margin_px <= x + 0.5 <= width - margin_px
+        return not (inside_x and margin_px <= y + 0.5 <= height - margin_px)
 
     def scale(self, column: float, row: float) -> Scale:
         """The scale of the frame around a place of the panorama."""
@@ -131,8 +118,10 @@ class Panorama:
         azimuths = np.remainder(azimuths + math.pi, math.tau) - math.pi
         return azimuths, -rays[:, 2] / np.maximum(np.hypot(rays[:, 0], rays[:, 1]), 1e-9)
 
-    def _index_map(self, angles: Floats, height: int, width: int) -> Map:
-        return (angles / self.step).reshape(height, width).astype(np.float32)
+    def _columns_and_rows(self, azimuths: Floats, slopes: Floats) -> tuple[Floats, Floats]:
+        columns: Floats = (azimuths - self.first_azimuth) / self.step
+        rows: Floats = (slopes - self.first_slope) / self.step
+        return columns, rows
 
     def _pixel_maps(self) -> tuple[Map, Map]:
         """The pixel (x, y) of each place of the panorama, each (rows, columns)."""
@@ -142,19 +131,10 @@ class Panorama:
         down = self.first_slope + places[:, 1] * self.step
         points = np.column_stack([np.cos(bearings), np.sin(bearings), -down])
         pixels = self._camera.project(points + self._camera.position)
-        width, height = self._camera.size_px
-        outside = ~(
-            (pixels > -MARGIN_PX).all(axis=1)
-            & (pixels[:, 0] < width + MARGIN_PX)
-            & (pixels[:, 1] < height + MARGIN_PX)
-        )
-        pixels[outside] = -9.0
-        azimuths, slopes = self._panorama_angles(pixels)
-        off = np.hypot(
-            (azimuths - self.first_azimuth) / self.step - places[:, 0],
-            (slopes - self.first_slope) / self.step - places[:, 1],
-        )
-        pixels[off > FOLD_PX] = -9.0
+        last = np.add(self._camera.size_px, MARGIN_PX)
+        pixels[~((pixels > -MARGIN_PX) & (pixels < last)).all(axis=1)] = -9.0  # NaN too
+        back = np.column_stack(self._columns_and_rows(*self._panorama_angles(pixels)))
+        pixels[np.hypot(*(back - places).T) > FOLD_PX] = -9.0
         x, y = pixels.astype(np.float32).T.reshape(2, rows, columns)
         return np.ascontiguousarray(x), np.ascontiguousarray(y)
 

@@ -6,12 +6,16 @@ import numpy as np
 import pytest
 
 from cpcbl_agents.vision.cylinder_fit import (
+    FOOT,
+    TOP,
+    WIDTH,
     AngularOutline,
+    Shape,
     best_fit,
+    expected_angles,
     fit_cylinder,
     rejection_reason,
 )
-from cpcbl_agents.vision.silhouette import FOOT, TOP, WIDTH, Shape, expected_angles
 from cpcbl_team.config import Cylinder
 
 LENS_M = 0.2

@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from cpcbl_agents.vision.detections import Detection, Detections
-from cpcbl_agents.vision.duplicates import without_duplicates
+from cpcbl_agents.vision.detections import Detection, Detections, without_duplicates
 from cpcbl_team.inputs import Sighting
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from cpcbl_agents.vision.camera import Floats
-from cpcbl_agents.vision.profiles import Profile
+from cpcbl_agents.vision.outlines import Profile
 
 WALL, RED = np.array([140.0, 142.0, 138.0]), np.array([40.0, 35.0, 205.0])
 

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from cpcbl_agents.vision.camera import Camera
-from cpcbl_agents.vision.panorama import Panorama
-from cpcbl_agents.vision.silhouette import (
+from cpcbl_agents.vision.cylinder_fit import (
     FOOT,
     LEVEL,
     MID,
@@ -17,6 +16,7 @@ from cpcbl_agents.vision.silhouette import (
     expected_angles,
     fit_distance,
 )
+from cpcbl_agents.vision.panorama import Panorama
 from cpcbl_team.config import CameraSettings, Cylinder
 
 LANDMARK = Shape.of(Cylinder(), 0.2)
