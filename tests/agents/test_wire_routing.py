@@ -44,8 +44,8 @@ from cpcbl_team.config import (
 )
 from cpcbl_team.inputs import Sighting
 from cpcbl_team.tiers import LOWEST_TIER
-from cpcbl_transport.guards import guard_rules
 from cpcbl_transport.zenoh_bus import open_router
+from cpcbl_transport.zenoh_config import guard_rules
 
 
 def sent(link: Relay) -> int:

@@ -15,10 +15,10 @@ from cpcbl_launch.run.up import free_endpoint
 from cpcbl_team.config import GuardSettings, Team, TransportSettings
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus
-from cpcbl_transport.guards import guard_rules
 from cpcbl_transport.messages import LARGEST_FRAME, LARGEST_PAYLOAD
 from cpcbl_transport.topics import Qos
 from cpcbl_transport.zenoh_bus import open_bus, open_router
+from cpcbl_transport.zenoh_config import guard_rules
 
 FIX = topics.FIX.at(robot="victim", tier=7, observer="faulty")
 TOO_SELDOM_HZ, ANY_RATE_HZ = 0.01, 1e9

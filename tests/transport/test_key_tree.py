@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support.buses import examples, matches
 
-from cpcbl_transport.key_tree import KeyTree
+from cpcbl_transport.memory_bus import KeyTree
 
 CHUNK = st.sampled_from(["a", "b", "belief", "3", "r1"])
 KEY = st.lists(CHUNK, min_size=1, max_size=4).map("/".join)

@@ -7,11 +7,10 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from cpcbl_team.config import Team
-from cpcbl_transport.guards import guard_rules
 from cpcbl_transport.security import Identity, access_control, link_of
 from cpcbl_transport.topics import Role
 from cpcbl_transport.zenoh_bus import listening_at, open_plain_router
-from cpcbl_transport.zenoh_config import router_config
+from cpcbl_transport.zenoh_config import guard_rules, router_config
 
 log = logging.getLogger(__name__)
 

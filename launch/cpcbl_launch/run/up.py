@@ -29,10 +29,10 @@ from cpcbl_launch.team_file import save_resolved
 from cpcbl_team.config import Team
 from cpcbl_team.errors import InputError
 from cpcbl_transport.bus import Bus
-from cpcbl_transport.guards import guard_rules
 from cpcbl_transport.security import Identity, access_control, link_of
 from cpcbl_transport.topics import Role
 from cpcbl_transport.zenoh_bus import open_router
+from cpcbl_transport.zenoh_config import guard_rules
 
 log = logging.getLogger(__name__)
 

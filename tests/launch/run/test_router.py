@@ -17,9 +17,9 @@ from cpcbl_launch.run.up import free_endpoint
 from cpcbl_launch.team_file import builtin_path, load_team
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus
-from cpcbl_transport.guards import guard_rules
 from cpcbl_transport.topics import Qos
 from cpcbl_transport.zenoh_bus import BusError, open_bus, read_router_config
+from cpcbl_transport.zenoh_config import guard_rules
 
 TEAM = """
 name = "lab"
