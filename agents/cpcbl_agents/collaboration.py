@@ -29,8 +29,7 @@ from cpcbl_team.information_gain import FixMemory, HeadingMemory
 from cpcbl_team.inputs import Belief, Fix
 from cpcbl_team.tiers import LOWEST_TIER, accepts_tier, next_tier
 from cpcbl_transport.budget import Budget
-from cpcbl_transport.compact import help_bytes
-from cpcbl_transport.link_size import sent_bytes
+from cpcbl_transport.compact import help_bytes, sent_bytes
 from cpcbl_transport.messages import Track
 
 NEIGHBOUR_NS = 10_000_000_000  # a teammate's tier is watched for so long after it was seen
@@ -173,7 +172,14 @@ class CollaborationAgent:
             else:
                 self.counters.of("fix", fix.robot).worthless += 1
         offers.sort(key=lambda offer: (offer.urgent, offer.value), reverse=True)
-        return [offer.fix for offer in offers if self._pay_for(offer, now_ns)]
+        sent = []
+        for value, urgent, after, fix in offers:
+            if self._affords(now_ns, _size(fix), value, urgent):
+                self._fix_memories[fix.robot] = fix.stamp_ns, after
+                sent.append(fix)
+            else:
+                self.counters.of("fix", fix.robot).over_budget += 1
+        return sent
 
     def _candidates(self, seen: FrameEstimate) -> list[Fix]:
         """The fix of each teammate, or possible guest, in a frame."""
@@ -210,14 +216,6 @@ class CollaborationAgent:
             else:
                 fix = without_heading(fix)
         return _Offer(value, tier == LOWEST_TIER, FixMemory(*place, after, turned), fix)
-
-    def _pay_for(self, offer: _Offer, now_ns: int) -> bool:
-        fix = offer.fix
-        if not self._affords(now_ns, _size(fix), offer.value, offer.urgent):
-            self.counters.of("fix", fix.robot).over_budget += 1
-            return False
-        self._fix_memories[fix.robot] = fix.stamp_ns, offer.after
-        return True
 
     # Beliefs -------------------------------------------------------------------------------
 

@@ -1,7 +1,6 @@
 """The node of a guest. On a simulated field it also asks, again and again, to be simulated."""
 
 import logging
-from collections import Counter
 from collections.abc import Callable
 
 from cpcbl_agents.composition import build_robot
@@ -10,7 +9,7 @@ from cpcbl_agents.sources import OwnCamera
 from cpcbl_team.config import Team
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus
-from cpcbl_transport.messages import Flow, Join, encode
+from cpcbl_transport.messages import Join, encode
 from cpcbl_transport.robot_model import SimulatedRobotModel, model_from_settings
 
 log = logging.getLogger(__name__)
@@ -20,7 +19,7 @@ RETRY_NS = 50_000_000  # while no field subscribes
 WARN_AFTER_NS = 3_000_000_000  # without any input
 
 
-class GuestNode:
+class GuestNode(Node):
     """Runs a guest, which `team` holds beside its own robots, from `start_ns` until `leave`."""
 
     def __init__(
@@ -34,30 +33,16 @@ class GuestNode:
         speed: float = 1.0,
         camera: OwnCamera | None = None,
     ) -> None:
-        self.robot = build_robot(name, team, start_ns, camera=camera)
-        self._node = Node(self.robot, team, bus, start_ns, incarnation, on_arrival, speed)
-        self._incarnation, self._ask_ns = incarnation, start_ns
+        robot = build_robot(name, team, start_ns, camera=camera)
+        super().__init__(robot, team, bus, start_ns, incarnation, on_arrival, speed)
+        self._ask_ns = start_ns
         self._warn_ns: int | None = start_ns + WARN_AFTER_NS
         self._model = model_from_settings(team.robots[name])
         self._join = bus.publisher(topics.JOIN.at(robot=name), topics.JOIN.qos)
 
     @property
     def next_ns(self) -> int:
-        return self._node.next_ns if self._model is None else min(self._node.next_ns, self._ask_ns)
-
-    @property
-    def waiting(self) -> bool:
-        return self._node.waiting
-
-    @property
-    def received(self) -> tuple[Flow, ...]:
-        """The fixes and beliefs that it received."""
-        return self._node.received.flows()
-
-    @property
-    def counts(self) -> Counter[str]:
-        """What was used and what was refused so far, by reason."""
-        return self.robot.counts + self._node.counts
+        return super().next_ns if self._model is None else min(super().next_ns, self._ask_ns)
 
     @property
     def missing_input(self) -> str:
@@ -80,7 +65,7 @@ class GuestNode:
                 log.warning("%s %s", self.robot.name, self.missing_input)
         if self._model is not None and now_ns >= self._ask_ns:
             self._ask_ns = now_ns + (ASK_NS if self._ask(now_ns, self._model) else RETRY_NS)
-        self._node.step(now_ns)
+        super().step(now_ns)
 
     def leave(self, now_ns: int) -> None:
         """Tells the field that the guest leaves. All else ends with the session."""

@@ -21,9 +21,8 @@ from cpcbl_team.config import Team
 from cpcbl_team.inputs import Belief, Fix
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus
-from cpcbl_transport.compact import encode_help
+from cpcbl_transport.compact import encode_help, received_bytes, sent_bytes
 from cpcbl_transport.decoding import decode_by_key
-from cpcbl_transport.link_size import received_bytes, sent_bytes
 from cpcbl_transport.messages import (
     LARGEST_PAYLOAD,
     Help,
@@ -71,7 +70,7 @@ class Node:
         speed: float = 1.0,
     ) -> None:
         """`speed`: robot time beside real time."""
-        self._robot, self._incarnation, self._name = robot, incarnation, robot.name
+        self.robot, self._incarnation, self._name = robot, incarnation, robot.name
         self._on_arrival = on_arrival
         self._frame_key = topics.IN_FRAME.at(robot=robot.name)
         rules = team.robots[robot.name].collaboration
@@ -123,7 +122,7 @@ class Node:
     @property
     def next_ns(self) -> int:
         """When there is something to do even if nothing arrives."""
-        return self._robot.next_ns
+        return self.robot.next_ns
 
     @property
     def waiting(self) -> bool:
@@ -142,12 +141,12 @@ class Node:
             self._handle_payload(*self._frames.popleft(), now_ns)
         if self._passive and self._declarations.tier is not None:
             self._check_subscribers(topics.BELIEF, BeliefSubscribers, now_ns)
-        if self._robot.sensing.has_detector:
+        if self.robot.sensing.has_detector:
             self._check_subscribers(topics.LOOK, FrameSubscribers, now_ns)
-        outgoing = self._robot.handle(Tick(), now_ns)
-        for name in self._declarations.update(self._robot.collaboration.interests):
+        outgoing = self.robot.handle(Tick(), now_ns)
+        for name in self._declarations.update(self.robot.collaboration.interests):
             self._tokens.forget(name)
-            self._robot.handle(Presence(name, None), now_ns)
+            self.robot.handle(Presence(name, None), now_ns)
         self._send(outgoing, now_ns)  # under the tier that these messages belong to
         if now_ns - self._status_ns >= STATUS_NS and self._declarations.tier is not None:
             self._status_ns = now_ns
@@ -158,7 +157,7 @@ class Node:
         if isinstance(message, Refusal):
             self.counts[message] += 1
             return
-        self._send(self._robot.handle(message, now_ns), now_ns)
+        self._send(self.robot.handle(message, now_ns), now_ns)
         match message:
             case Fix(observer=name):  # by a subscription to all observers
                 size = received_bytes(len(payload), name)
@@ -175,8 +174,8 @@ class Node:
             case Refusal():
                 return message
             case Belief(robot=sender) | Fix(observer=sender):
-                if sender not in self._team and not self._robot.is_guest(sender):
-                    self._robot.handle(UnknownRobot(sender), now_ns)
+                if sender not in self._team and not self.robot.is_guest(sender):
+                    self.robot.handle(UnknownRobot(sender), now_ns)
                     return Refusal.UNKNOWN_ROBOT
                 if sender == self._name:
                     return Refusal.OWN
@@ -193,9 +192,9 @@ class Node:
                 self.counts["bad_token"] += 1
                 continue
             name, tier = presence
-            was_guest = self._robot.is_guest(name)
-            self._robot.handle(Presence(name, tier), now_ns)
-            if was_guest is not self._robot.is_guest(name):
+            was_guest = self.robot.is_guest(name)
+            self.robot.handle(Presence(name, tier), now_ns)
+            if was_guest is not self.robot.is_guest(name):
                 log.info("%s: guest %s %s", self._name, name, "left" if was_guest else "joined")
 
     def _check_subscribers(
@@ -206,13 +205,13 @@ class Node:
         subscribed = key if self._declarations.publisher(topic, key).matching else ""
         if subscribed != self._subscribed[event]:  # another key may have other subscribers
             self._subscribed[event] = subscribed
-            self._robot.handle(event(bool(subscribed)), now_ns)
+            self.robot.handle(event(bool(subscribed)), now_ns)
 
     def _send(self, outgoing: Iterable[Outgoing], now_ns: int) -> None:
         for message in outgoing:
             size = self._publish(message)
             if isinstance(message, Help):
-                self._robot.handle(HelpSent(message, sent_bytes(size) if size else 0), now_ns)
+                self.robot.handle(HelpSent(message, sent_bytes(size) if size else 0), now_ns)
 
     def _publish(self, message: Outgoing | Status) -> int:
         """Publishes if there is a subscriber; returns the bytes of the payload, 0 without one."""
@@ -229,4 +228,4 @@ class Node:
     def _publish_status(self, now_ns: int) -> None:
         counts = self.counts + Counter(announced=self._declarations.announced)
         received = self.received.flows()
-        self._publish(self._robot.status(now_ns, self._incarnation, counts, received, self._clocks))
+        self._publish(self.robot.status(now_ns, self._incarnation, counts, received, self._clocks))

@@ -5,8 +5,8 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, closing, nullcontext, suppress
 from types import FrameType
 
 import msgspec
@@ -149,7 +149,8 @@ def make_robot(
     late = start_ns > clock.epoch_ns + LATE_NS * max(1.0, clock.speed)
     if restarted or late:
         log.warning("robot %s starts %.1f s after the team: it has to find its pose", name, late_s)
-        team = _without_start(name, team)
+        robot = msgspec.structs.replace(team.robots[name], start=None)
+        team = msgspec.structs.replace(team, robots={**team.robots, name: robot})
     spent = restarted or (late and not clock.unix)  # it may have waited for its router
     return build_robot(name, team, start_ns, spent, camera)
 
@@ -178,10 +179,9 @@ def stop_on_clock_step(
     return checked
 
 
-@contextmanager
 def own_camera(
     name: str, team: Team, clock: Clock, wake: Callable[[], None]
-) -> Iterator[OwnCamera | None]:
+) -> AbstractContextManager[OwnCamera | None]:
     """The camera that a robot reads itself, until the end; None where nobody or a driver does.
 
     Raises InputError for a camera that cannot be used, DependencyError without OpenCV.
@@ -190,17 +190,7 @@ def own_camera(
     if robot.sensing == "camera":
         import cpcbl_agents.vision  # noqa: F401  it says what is missing
     if robot.sensing != "camera" or not robot.camera.frames:
-        yield None
-        return
+        return nullcontext()
     from cpcbl_agents.sources.camera import open_camera
 
-    camera = open_camera(name, robot.camera, robot.sensor.rate_hz, clock.now_ns, wake)
-    try:
-        yield camera
-    finally:
-        camera.close()
-
-
-def _without_start(name: str, team: Team) -> Team:
-    robot = msgspec.structs.replace(team.robots[name], start=None)
-    return msgspec.structs.replace(team, robots={**team.robots, name: robot})
+    return closing(open_camera(name, robot.camera, robot.sensor.rate_hz, clock.now_ns, wake))

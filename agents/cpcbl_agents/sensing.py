@@ -38,9 +38,9 @@ class SensingAgent:
         self._sensor_delay_ns = int(settings.sensor.delay_s * 1e9)
         own = settings.position_sensor
         self._position_delay_ns = 0 if own is None else int(own.delay_s * 1e9)
-        self._source, self._map_names = source, map_names
-        self._follower, self._detector = follower, detector
-        self._camera, self._has_subscribers = camera, False
+        self._source, self._camera, self._map_names = source, camera, map_names
+        self._sources = (source,) if camera is None else (source, camera)
+        self._follower, self._detector, self._has_subscribers = follower, detector, False
         self._annotated_ns = -ANNOTATION_INTERVAL_NS
         self._counts: Counter[str] = Counter()
 
@@ -55,8 +55,7 @@ class SensingAgent:
 
     @property
     def next_ns(self) -> int | None:
-        sources = (self._source,) if self._camera is None else (self._source, self._camera)
-        return min((s.next_ns for s in sources if s.next_ns is not None), default=None)
+        return min((s.next_ns for s in self._sources if s.next_ns is not None), default=None)
 
     @property
     def is_finished(self) -> bool:
@@ -65,8 +64,7 @@ class SensingAgent:
     def handle(self, message: AgentMessage, now_ns: int) -> Sequence[AgentMessage]:
         match message:
             case Tick():
-                items = list(self._source.poll(now_ns))
-                items += () if self._camera is None else self._camera.poll(now_ns)
+                items = [item for source in self._sources for item in source.poll(now_ns)]
                 return [out for item in items for out in self._process(item)]
             case Odometry() | Sightings() | Position() | Frame():
                 return self._process(message)

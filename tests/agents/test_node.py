@@ -19,8 +19,7 @@ from cpcbl_team.inputs import Sighting
 from cpcbl_team.self_calibration import SelfCalibration
 from cpcbl_team.state import CalibrationMemory
 from cpcbl_transport import topics
-from cpcbl_transport.compact import BELIEF_BYTES
-from cpcbl_transport.link_size import sent_bytes
+from cpcbl_transport.compact import BELIEF_BYTES, sent_bytes
 
 
 def test_status_comes_once_a_second() -> None:

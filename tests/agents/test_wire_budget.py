@@ -21,8 +21,7 @@ from cpcbl_team.config import (
 from cpcbl_team.geometry import wrap_angle
 from cpcbl_team.inputs import Sighting, Sightings
 from cpcbl_transport import topics
-from cpcbl_transport.compact import BELIEF_BYTES, FIX_BYTES
-from cpcbl_transport.link_size import received_bytes, sent_bytes
+from cpcbl_transport.compact import BELIEF_BYTES, FIX_BYTES, received_bytes, sent_bytes
 from cpcbl_transport.messages import Spending
 from cpcbl_transport.zenoh_bus import open_bus
 

@@ -18,8 +18,7 @@ from cpcbl_team.estimate import Estimate
 from cpcbl_team.geometry import Pose2
 from cpcbl_team.inputs import Belief, Fix, Sighting, Sightings
 from cpcbl_transport.budget import Budget
-from cpcbl_transport.compact import help_bytes
-from cpcbl_transport.link_size import sent_bytes
+from cpcbl_transport.compact import help_bytes, sent_bytes
 from cpcbl_transport.messages import Track
 from support.buses import MS
 from support.core import diagonal

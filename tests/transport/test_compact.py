@@ -30,8 +30,8 @@ from cpcbl_transport.compact import (
     HEADED_FIX_BYTES,
     encode_help,
     help_bytes,
+    sent_bytes,
 )
-from cpcbl_transport.link_size import sent_bytes
 from cpcbl_transport.messages import (
     Help,
     Refusal,

@@ -14,8 +14,13 @@ from support.wire_tap import Batch, Kind, Relay, kind_of, most_in_window, put_do
 from cpcbl_launch.run.up import free_endpoint
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus
-from cpcbl_transport.compact import BELIEF_BYTES, FIX_BYTES, HEADED_FIX_BYTES
-from cpcbl_transport.link_size import received_bytes, sent_bytes
+from cpcbl_transport.compact import (
+    BELIEF_BYTES,
+    FIX_BYTES,
+    HEADED_FIX_BYTES,
+    received_bytes,
+    sent_bytes,
+)
 from cpcbl_transport.topics import Qos
 from cpcbl_transport.zenoh_bus import open_bus, open_router
 

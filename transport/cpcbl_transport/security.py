@@ -122,9 +122,8 @@ def access_control(team: Team) -> dict[str, Any]:
 
     Raises SecurityError without the list of members.
     """
-    if not team.transport.secured:
-        return {}
-    return access_rules(team, members_in(Path(team.transport.keys)))
+    secured, folder = team.transport.secured, Path(team.transport.keys)
+    return access_rules(team, members_in(folder)) if secured else {}
 
 
 def link_options(credentials: Credentials) -> dict[str, Any]:
@@ -147,31 +146,11 @@ def link_options(credentials: Credentials) -> dict[str, Any]:
 
 _SUBSCRIBING = ("declare_subscriber", "declare_liveliness_subscriber", "liveliness_query")
 _DELIVERED = ("put", "declare_subscriber", "liveliness_token")
-_FLOWS = ("ingress", "egress")
 _ALL_MESSAGES = (
     *("put", "delete", "query", "reply", "declare_queryable"),
     *("declare_subscriber", "declare_liveliness_subscriber"),
     *("liveliness_token", "liveliness_query"),
 )
-
-
-class _Rule(NamedTuple):
-    """What these members may send (ingress) or receive (egress), and under which keys."""
-
-    name: str
-    members: list[Member]
-    flow: str
-    messages: tuple[str, ...]
-    keys: Sequence[str] = ("**",)
-
-    def as_config(self, space: str) -> dict[str, Any]:
-        return {
-            "id": self.name,
-            "permission": "allow",
-            "flows": [self.flow],
-            "messages": list(self.messages),
-            "key_exprs": [f"{space}/{key}" for key in self.keys],
-        }
 
 
 def access_rules(team: Team, members: Iterable[Member]) -> dict[str, Any]:
@@ -183,7 +162,10 @@ def access_rules(team: Team, members: Iterable[Member]) -> dict[str, Any]:
     space = topics.namespace(team.name)
     present = [m for m in members if not m.revoked and _is_in_team(m.identity, team)]
     routers = [m for m in present if m.role is Role.ROUTER]
-    rules: list[_Rule] = [_Rule("deliver", present, "egress", _DELIVERED)]
+    # Of each rule: its name, to whom it applies, where, to which messages, under which keys
+    rules: list[tuple[str, list[Member], str, Sequence[str], Sequence[str]]] = [
+        ("deliver", present, "egress", _DELIVERED, ["**"])
+    ]
     for member in present:
         who = member.identity
         for messages, keys in (
@@ -192,19 +174,29 @@ def access_rules(team: Team, members: Iterable[Member]) -> dict[str, Any]:
             (_SUBSCRIBING, subscribe_keys(who)),
         ):
             if keys:
-                rules.append(_Rule(f"{who}: {messages[0]}", [member], "ingress", messages, keys))
-    rules += [_Rule(f"relay: {flow}", routers, flow, _ALL_MESSAGES) for flow in _FLOWS]
-    rules = [rule for rule in rules if rule.members]
+                rules.append((f"{who}: {messages[0]}", [member], "ingress", messages, keys))
+    both_ways = "ingress", "egress"
+    rules += [(f"relay: {flow}", routers, flow, _ALL_MESSAGES, ["**"]) for flow in both_ways]
+    rules = [rule for rule in rules if rule[1]]
     return {
         "access_control": {
             "enabled": True,
             "default_permission": "deny",
-            "rules": [rule.as_config(space) for rule in rules],
-            "subjects": [
-                {"id": rule.name, "cert_common_names": [m.common_name for m in rule.members]}
-                for rule in rules
+            "rules": [
+                {
+                    "id": name,
+                    "permission": "allow",
+                    "flows": [flow],
+                    "messages": list(messages),
+                    "key_exprs": [f"{space}/{key}" for key in keys],
+                }
+                for name, _, flow, messages, keys in rules
             ],
-            "policies": [{"rules": [rule.name], "subjects": [rule.name]} for rule in rules],
+            "subjects": [
+                {"id": name, "cert_common_names": [member.common_name for member in members]}
+                for name, members, *_ in rules
+            ],
+            "policies": [{"rules": [name], "subjects": [name]} for name, *_ in rules],
         }
     }
 

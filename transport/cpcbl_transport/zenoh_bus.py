@@ -23,7 +23,7 @@ from cpcbl_team.errors import CpcblError
 from cpcbl_transport.bus import Bus, Handle, LivelinessCallback, MessageCallback, Publisher
 from cpcbl_transport.security import Credentials
 from cpcbl_transport.topics import Qos, namespace
-from cpcbl_transport.zenoh_config import NO_GUARDS, client_config, router_config
+from cpcbl_transport.zenoh_config import client_config, router_config
 
 log = logging.getLogger(__name__)
 
@@ -69,7 +69,7 @@ def open_router(
     team: str,
     listen: Sequence[str],
     connect: Sequence[str] = (),
-    guards: Mapping[str, Any] = NO_GUARDS,
+    guards: Mapping[str, Any] | None = None,
     credentials: Credentials | None = None,
 ) -> "ZenohBus":
     """A session that is the team's router. Raises BusError when it cannot listen there.

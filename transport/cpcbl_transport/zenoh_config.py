@@ -22,7 +22,6 @@ tracks are for people; no robot subscribes to them.
 """
 
 from collections.abc import Mapping, Sequence
-from types import MappingProxyType
 from typing import Any
 
 from cpcbl_team.config import GuardSettings, Team
@@ -33,15 +32,29 @@ from cpcbl_transport.topics import Topic
 
 OPEN_TIMEOUT_MS = 2000
 LEASE_MS = 2000
-NO_GUARDS: Mapping[str, Any] = MappingProxyType({})
 
 _RETRY = {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 2}
 _PUTS = {"flows": ["ingress"], "messages": ["put", "delete"]}
 _TX = {"sequence_number_resolution": "16bit", "lease": LEASE_MS, "keep_alive": 4}
 
 
-def _everybody(credentials: Credentials | None) -> dict[str, Any]:
+def _config(
+    mode: str,
+    connect: Sequence[str],
+    timeout_ms: int,
+    credentials: Credentials | None,
+    **listen: Mapping[str, Any],
+) -> dict[str, Any]:
+    """`timeout_ms`: after it `open` fails if nobody was found; -1: the session goes on looking."""
     return {
+        "mode": mode,
+        **listen,
+        "connect": {
+            "endpoints": list(connect),
+            "timeout_ms": timeout_ms,
+            "exit_on_failure": timeout_ms >= 0,
+            "retry": _RETRY,
+        },
         "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
         "timestamping": {"enabled": False},
         "transport": {
@@ -54,22 +67,13 @@ def _everybody(credentials: Credentials | None) -> dict[str, Any]:
 
 def client_config(connect: Sequence[str], credentials: Credentials | None = None) -> dict[str, Any]:
     """Of a session that looks for a router at these endpoints, once."""
-    return {
-        "mode": "client",
-        "connect": {
-            "endpoints": list(connect),
-            "timeout_ms": OPEN_TIMEOUT_MS,
-            "exit_on_failure": True,
-            "retry": _RETRY,
-        },
-        **_everybody(credentials),
-    }
+    return _config("client", connect, OPEN_TIMEOUT_MS, credentials)
 
 
 def router_config(
     listen: Sequence[str],
     connect: Sequence[str] = (),
-    guards: Mapping[str, Any] = NO_GUARDS,
+    guards: Mapping[str, Any] | None = None,
     credentials: Credentials | None = None,
 ) -> dict[str, Any]:
     """Of a router that listens at all of `listen` and joins the routers at `connect`.
@@ -77,18 +81,8 @@ def router_config(
     It looks for these as long as it lives, again after a link broke. `guards`: what `guard_rules`
     and `access_control` say; none, and everything is let in.
     """
-    return {
-        "mode": "router",
-        "listen": {"endpoints": list(listen), "exit_on_failure": True},
-        "connect": {
-            "endpoints": list(connect),
-            "timeout_ms": -1,
-            "exit_on_failure": False,
-            "retry": _RETRY,
-        },
-        **_everybody(credentials),
-        **guards,
-    }
+    here = {"endpoints": list(listen), "exit_on_failure": True}
+    return {**_config("router", connect, -1, credentials, listen=here), **(guards or {})}
 
 
 def guard_rules(team: Team, speed: float = 1.0) -> dict[str, Any]:
@@ -104,16 +98,9 @@ def guard_rules(team: Team, speed: float = 1.0) -> dict[str, Any]:
     rates[topics.BELIEF.at()] = guards.belief_rate_hz
     limits = {topic.at(): _limit(topic, guards) for topic in topics.TOPICS if topic.carries}
     limits["**"] = max(limits.values())
+    rules = [{"key_expr": f"{space}/{keys}", "freq": hz * faster} for keys, hz in rates.items()]
     return {
-        "downsampling": [
-            {
-                **_PUTS,
-                "rules": [
-                    {"key_expr": f"{space}/{keys}", "freq": rate_hz * faster}
-                    for keys, rate_hz in rates.items()
-                ],
-            }
-        ],
+        "downsampling": [{**_PUTS, "rules": rules}],
         "low_pass_filter": [
             {**_PUTS, "key_exprs": [f"{space}/{keys}"], "size_limit": size}
             for keys, size in limits.items()

@@ -212,6 +212,6 @@ def _observer_report(node: GuestNode, team: Team, seconds: float) -> ObserverRep
         lost="" if latest is None else latest.lost,
         unfed=node.missing_input,
         sent=summed_flows([node.robot.collaboration.counters.flows()]),
-        heard=summed_flows([node.received]),
-        counts=dict(node.counts),
+        heard=summed_flows([node.received.flows()]),
+        counts=dict(node.robot.counts + node.counts),
     )

@@ -34,8 +34,7 @@ from cpcbl_team.config import (
     Start,
 )
 from cpcbl_team.errors import InputError
-from cpcbl_transport.compact import BELIEF_BYTES, FIX_BYTES
-from cpcbl_transport.link_size import sent_bytes
+from cpcbl_transport.compact import BELIEF_BYTES, FIX_BYTES, sent_bytes
 
 MILLIMETRE = 1e-3
 TURNING_MATE_M = 0.03  # a teammate that stops is believed to drive on until that is half a sigma

@@ -10,7 +10,6 @@ import pytest
 from msgspec.structs import replace
 from support.buses import MS, SECOND, Subscription
 
-from cpcbl_agents.sensing import SensorInput
 from cpcbl_agents.vision.camera import Camera, Pixels
 from cpcbl_agents.vision.pictures import decode_image
 from cpcbl_launch.simulation.camera.cameras import QUALITIES, Cameras, encode_jpeg_within
@@ -23,7 +22,7 @@ from cpcbl_team.geometry import Pose2
 from cpcbl_team.inputs import Sightings
 from cpcbl_transport import topics
 from cpcbl_transport.memory_bus import MemoryHub
-from cpcbl_transport.messages import Drive, Frame, encode
+from cpcbl_transport.messages import Drive, Frame, SensorInput, encode
 
 TEXT = """
 name = "t"

@@ -8,7 +8,6 @@ import pytest
 from support.buses import SECOND
 from support.fields import ALL_ROUND, STEP_NS, drive, field, frame, marks, robot
 
-from cpcbl_agents.sensing import SensorInput
 from cpcbl_launch.simulation.in_process import simulate
 from cpcbl_launch.simulation.robot import COMMAND_LASTS_NS
 from cpcbl_launch.team_file import builtin_path, load_team
@@ -24,7 +23,7 @@ from cpcbl_team.config import (
 from cpcbl_team.geometry import Pose2, step
 from cpcbl_team.inputs import Odometry, Position, Sightings
 from cpcbl_team.sensors import corrected_odometry
-from cpcbl_transport.messages import Drive
+from cpcbl_transport.messages import Drive, SensorInput
 
 # Without noise ----------------------------------------------------------------------------------
 
