@@ -13,23 +13,12 @@ from pathlib import Path
 from typing import Any, get_args, get_origin, get_type_hints
 
 import msgspec
+from msgspec.structs import replace
 
 from cpcbl_launch.team_checks import problems
-from cpcbl_team.config import (
-    Field,
-    GuestSettings,
-    Landmark,
-    MatchSettings,
-    RobotSettings,
-    SimulationSettings,
-    Table,
-    Team,
-    TransportSettings,
-    VisionSettings,
-    Wall,
-)
+from cpcbl_team.config import Field, Landmark, RobotSettings, Team, Wall
 from cpcbl_team.errors import InputError
-from cpcbl_team.inputs import NAME_PATTERN, Name
+from cpcbl_team.inputs import NAME_PATTERN
 
 Layer = dict[str, Any]
 
@@ -38,25 +27,16 @@ class TeamFileError(InputError):
     """A team file that cannot be used; the text names file, key and fix."""
 
 
-class _Map(Table, frozen=True, kw_only=True):
+class _NamedTables(Field, frozen=True, kw_only=True):
     landmarks: Layer = msgspec.field(default_factory=dict)
     walls: Layer = msgspec.field(default_factory=dict)
 
 
-class _File(Table, frozen=True, kw_only=True):
-    """The file's own tables; what has names of its own is converted name by name."""
+class _File(Team, frozen=True, kw_only=True):
+    """The file's own tables; what has names of the user's own is converted name by name."""
 
-    name: Name
     robots: Layer
-    map: _Map = _Map()
-    transport: TransportSettings = TransportSettings()
-    vision: VisionSettings = VisionSettings()
-    match: MatchSettings = MatchSettings()
-    simulation: SimulationSettings = SimulationSettings()
-    guests: GuestSettings = GuestSettings()
-    calibrated_on: tuple[str, ...] = ()
-    data: str = ""
-    defaults: Layer = msgspec.field(default_factory=dict)
+    map: _NamedTables = _NamedTables()
     types: Layer = msgspec.field(default_factory=dict)
 
 
@@ -86,23 +66,15 @@ def load_team(path: Path) -> Team:
             return msgspec.json.decode(text, type=Team)
         except msgspec.MsgspecError as error:
             raise TeamFileError(f"{path}: {error}") from error
-    team = _with_frames_beside(parse_team(text, str(path)), path)
-    if not team.transport.secured:
-        return team
-    transport = msgspec.structs.replace(team.transport, keys=str(key_folder(team, path)))
-    return msgspec.structs.replace(team, transport=transport)
-
-
-def _with_frames_beside(team: Team, path: Path) -> Team:
-    """The videos and folders of cameras are relative to the file."""
+    team = parse_team(text, str(path))
     robots = dict(team.robots)
     for name, robot in team.robots.items():
-        camera = robot.camera
-        if camera.frames and not camera.live:
-            there = str((path.parent / camera.frames).absolute())
-            camera = msgspec.structs.replace(camera, frames=there)
-            robots[name] = msgspec.structs.replace(robot, camera=camera)
-    return msgspec.structs.replace(team, robots=robots)
+        if robot.camera.frames and not robot.camera.live:  # relative to the file
+            frames = str((path.parent / robot.camera.frames).absolute())
+            robots[name] = replace(robot, camera=replace(robot.camera, frames=frames))
+    if team.transport.secured:
+        team = replace(team, transport=replace(team.transport, keys=str(key_folder(team, path))))
+    return replace(team, robots=robots)
 
 
 def key_folder(team: Team, path: Path) -> Path:
@@ -123,10 +95,8 @@ def parse_team(text: str, name: str = "team file") -> Team:
     """The team in a TOML text; `name` is what errors call it. Raises TeamFileError."""
     raw = _parse_toml(text, name)
     file = _convert(raw, _File, "", name)
-    defaults = _convert(file.defaults, RobotSettings, "defaults", name)
-    for kind, layer in _named_tables(file.types, "types", name):
-        _convert(layer, RobotSettings, f"types.{kind}", name)
-    robots = {}
+    _convert_named(file.types, RobotSettings, "types", name)
+    layers: dict[str, Layer] = {}
     for robot, layer in _named_tables(file.robots, "robots", name):
         kind = layer.pop("type", None)
         if kind is not None and not (isinstance(kind, str) and kind in file.types):
@@ -136,41 +106,20 @@ def parse_team(text: str, name: str = "team file") -> Team:
                 f" [types.NAME], here: {known}"
             )
         _convert(layer, RobotSettings, f"robots.{robot}", name)
-        merged = _merge(file.defaults, file.types.get(kind, {}), layer)
-        robots[robot] = _convert(merged, RobotSettings, f"robots.{robot}", name)
-    field = Field(
-        landmarks={
-            mark: _convert(table, Landmark, f"map.landmarks.{mark}", name)
-            for mark, table in _named_tables(file.map.landmarks, "map.landmarks", name)
-        },
-        walls={
-            wall: _convert(table, Wall, f"map.walls.{wall}", name)
-            for wall, table in _named_tables(file.map.walls, "map.walls", name)
-        },
+        layers[robot] = _merge(raw.get("defaults", {}), file.types.get(kind, {}), layer)
+    whole = msgspec.structs.asdict(file)
+    del whole["types"]
+    whole["robots"] = _convert_named(layers, RobotSettings, "robots", name)
+    whole["map"] = Field(
+        landmarks=_convert_named(file.map.landmarks, Landmark, "map.landmarks", name),
+        walls=_convert_named(file.map.walls, Wall, "map.walls", name),
     )
-    team = Team(
-        name=file.name,
-        robots=robots,
-        map=field,
-        vision=file.vision,
-        transport=_transport(file.transport, raw),
-        match=file.match,
-        simulation=file.simulation,
-        guests=file.guests,
-        defaults=defaults,
-        calibrated_on=file.calibrated_on,
-        data=file.data,
-    )
+    if "connect" not in raw.get("transport", {}):  # the endpoint that is usual
+        whole["transport"] = replace(file.transport, connect=file.transport.usual)
+    team = Team(**whole)
     for problem in problems(team):
         raise TeamFileError(f"{name}: {problem}")
     return team
-
-
-def _transport(transport: TransportSettings, raw: Layer) -> TransportSettings:
-    """With the endpoint that is usual, where the file does not name one."""
-    if "connect" in raw.get("transport", {}):
-        return transport
-    return msgspec.structs.replace(transport, connect=transport.usual)
 
 
 def read_layer(path: Path) -> Layer:
@@ -204,7 +153,7 @@ def with_added_robot(team: Team, name: str, layers: Sequence[Layer], source: str
     """
     merged = _merge(msgspec.to_builtins(team.defaults), *layers)
     robot = _convert(merged, RobotSettings, "", source)
-    more = msgspec.structs.replace(team, robots={**team.robots, name: robot})
+    more = replace(team, robots={**team.robots, name: robot})
     for problem in problems(more):
         raise TeamFileError(f"{source}: {problem}")
     return more
@@ -220,6 +169,11 @@ def _named_tables(tables: Layer, where: str, name: str) -> Iterator[tuple[str, L
         if not isinstance(table, dict):
             raise TeamFileError(f"{name}: {where}.{own}: is no table; write [{where}.{own}]")
         yield own, table
+
+
+def _convert_named(tables: Layer, kind: type[Any], where: str, name: str) -> dict[str, Any]:
+    named = _named_tables(tables, where, name)
+    return {own: _convert(table, kind, f"{where}.{own}", name) for own, table in named}
 
 
 def _merge(*layers: Mapping[str, Any]) -> Layer:
@@ -244,15 +198,14 @@ def _error_text(error: str, kind: type[Any], prefix: str) -> str:
     problem, _, where = error.partition(" - at `")
     path = where.removeprefix("key` in `").rstrip("`").removeprefix("$").lstrip(".")
     key = ".".join(part for part in (prefix, path) if part)
-    unknown = re.search(r"unknown field `(.+)`", problem)
-    if unknown:
-        field, known = unknown.group(1), _fields_at(kind, path)
+    if about := re.search(r"(unknown|missing required) field `(.+)`", problem):
+        field, known = about[2], _fields_at(kind, path)
+        key = f"{key}.{field}" if key else field
+        if about[1] != "unknown":
+            return f"{key}: missing; add it"
         close = difflib.get_close_matches(field, known, n=1)
         fix = f"did you mean {close[0]!r}?" if close else f"known here: {', '.join(known)}"
-        return f"{'.'.join(p for p in (key, field) if p)}: unknown key; {fix}"
-    missing = re.search(r"missing required field `(.+)`", problem)
-    if missing:
-        return f"{'.'.join(p for p in (key, missing.group(1)) if p)}: missing; add it"
+        return f"{key}: unknown key; {fix}"
     return f"{key}: {problem[:1].lower()}{problem[1:]}; correct the value"
 
 

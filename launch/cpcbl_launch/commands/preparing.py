@@ -18,6 +18,7 @@ from cpcbl_launch.commands.options import (
     print_result,
 )
 from cpcbl_launch.reporting.files import write_or_reason
+from cpcbl_launch.reporting.tables import table
 from cpcbl_launch.team_file import find_team, key_folder
 from cpcbl_team.errors import InputError
 
@@ -87,8 +88,7 @@ def keys(
 
 
 def _print_keys(made: "list[KeysReport]", folder: Path) -> None:
-    from cpcbl_launch.reporting.tables import table
-
+    """Who has which name in certificates, until when, and what was done about it."""
     shown = table("", ("who", "certificate says", "valid until (UTC)", ""), ())
     for member in made:
         until = f"{member.valid_until:%Y-%m-%d %H:%M}" if member.valid_until else "-"

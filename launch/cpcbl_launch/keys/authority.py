@@ -4,6 +4,7 @@ Raises DependencyError where `cryptography` is not installed.
 """
 
 import ipaddress
+import secrets
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from datetime import datetime, timedelta
@@ -22,6 +23,10 @@ except ImportError as error:
 
 CLOCKS_APART = timedelta(days=1)  # a machine whose clock is late takes a new certificate too
 AUTHORITY_DAYS = 3650
+OTHER_USAGES = (
+    *("content_commitment", "key_encipherment", "data_encipherment", "key_agreement"),
+    *("encipher_only", "decipher_only"),
+)
 
 
 class KeyPair(NamedTuple):
@@ -35,7 +40,6 @@ class CertificateFacts(NamedTuple):
     """What a certificate says."""
 
     common_name: str
-    not_before: datetime
     not_after: datetime
     hosts: tuple[str, ...]
 
@@ -43,19 +47,12 @@ class CertificateFacts(NamedTuple):
 def new_authority(team: str, now: datetime) -> KeyPair:
     """An authority that signs the certificates of members, and no other authority's."""
     key = ec.generate_private_key(ec.SECP256R1())
-    serial = x509.random_serial_number()
     # Two authorities of a team have two names: a verifier looks for the signer by its name.
-    name = _name(f"{team} authority {serial % 2**32:08x}")
-    lasting = timedelta(days=AUTHORITY_DAYS)
-    certificate = (
-        _certificate_builder(name, name, key.public_key(), now, lasting)
-        .serial_number(serial)
-        .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
-        .add_extension(_usage(signs=True), critical=True)
-        .add_extension(x509.SubjectKeyIdentifier.from_public_key(key.public_key()), critical=False)
-        .sign(key, hashes.SHA256())
-    )
-    return _pem(key, certificate)
+    name = _name(f"{team} authority {secrets.token_hex(4)}")
+    until = now + timedelta(days=AUTHORITY_DAYS)
+    builder = _certificate_builder(name, name, key.public_key(), now, until, is_authority=True)
+    of_key = x509.SubjectKeyIdentifier.from_public_key(key.public_key())
+    return _pem(key, builder.add_extension(of_key, critical=False).sign(key, hashes.SHA256()))
 
 
 def issue_certificate(
@@ -68,23 +65,18 @@ def issue_certificate(
     with _convert_read_errors("ca/private.key"):
         signer = serialization.load_pem_private_key(authority.private_key, None)
     assert isinstance(signer, ec.EllipticCurvePrivateKey)
-    above = x509.load_pem_x509_certificate(authority.certificate)
-    if now + lasting > above.not_valid_after_utc:
+    above, until = x509.load_pem_x509_certificate(authority.certificate), now + lasting
+    if until > above.not_valid_after_utc:
         raise InputError(
             f"--days: the authority ends {above.not_valid_after_utc:%Y-%m-%d}; ask for fewer days,"
             " or make a new one with --renew ca"
         )
     key = ec.generate_private_key(ec.SECP256R1())
+    of_signer = x509.AuthorityKeyIdentifier.from_issuer_public_key(signer.public_key())
     usages, names = [ExtendedKeyUsageOID.CLIENT_AUTH], [_host(host) for host in hosts]
-    builder = (
-        _certificate_builder(_name(common_name), above.subject, key.public_key(), now, lasting)
-        .serial_number(x509.random_serial_number())
-        .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
-        .add_extension(_usage(signs=False), critical=True)
-        .add_extension(
-            x509.AuthorityKeyIdentifier.from_issuer_public_key(signer.public_key()), critical=False
-        )
-    )
+    builder = _certificate_builder(
+        _name(common_name), above.subject, key.public_key(), now, until, is_authority=False
+    ).add_extension(of_signer, critical=False)
     if names:
         usages.append(ExtendedKeyUsageOID.SERVER_AUTH)
         builder = builder.add_extension(x509.SubjectAlternativeName(names), critical=False)
@@ -102,17 +94,14 @@ def certificate_facts(certificate: bytes) -> CertificateFacts:
     except x509.ExtensionNotFound:
         hosts = ()
     common_name = read.subject.get_attributes_for_oid(NameOID.COMMON_NAME)[0].value
-    return CertificateFacts(
-        str(common_name), read.not_valid_before_utc, read.not_valid_after_utc, hosts
-    )
+    return CertificateFacts(str(common_name), read.not_valid_after_utc, hosts)
 
 
 def is_signed_by(certificate: bytes, authority: bytes) -> bool:
     """Whether an authority signed a certificate."""
+    signer = x509.load_pem_x509_certificate(authority)
     try:
-        x509.load_pem_x509_certificate(certificate).verify_directly_issued_by(
-            x509.load_pem_x509_certificate(authority)
-        )
+        x509.load_pem_x509_certificate(certificate).verify_directly_issued_by(signer)
     except Exception:
         return False
     return True
@@ -148,27 +137,40 @@ def _convert_read_errors(file: str) -> Iterator[None]:
 
 
 def _certificate_builder(
-    subject: "x509.Name",
-    issuer: "x509.Name",
-    key: "ec.EllipticCurvePublicKey",
+    subject: x509.Name,
+    issuer: x509.Name,
+    key: ec.EllipticCurvePublicKey,
     now: datetime,
-    lasting: timedelta,
-) -> "x509.CertificateBuilder":
+    until: datetime,
+    *,
+    is_authority: bool,
+) -> x509.CertificateBuilder:
+    """What all certificates have in common."""
+    path_length = 0 if is_authority else None
+    usage = x509.KeyUsage(
+        digital_signature=not is_authority,
+        key_cert_sign=is_authority,
+        crl_sign=is_authority,
+        **dict.fromkeys(OTHER_USAGES, False),
+    )
     return (
         x509.CertificateBuilder()
         .subject_name(subject)
         .issuer_name(issuer)
         .public_key(key)
+        .serial_number(x509.random_serial_number())
         .not_valid_before(now - CLOCKS_APART)
-        .not_valid_after(now + lasting)
+        .not_valid_after(until)
+        .add_extension(x509.BasicConstraints(is_authority, path_length), critical=True)
+        .add_extension(usage, critical=True)
     )
 
 
-def _name(common_name: str) -> "x509.Name":
+def _name(common_name: str) -> x509.Name:
     return x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, common_name)])
 
 
-def _host(host: str) -> "x509.GeneralName":
+def _host(host: str) -> x509.GeneralName:
     try:
         return x509.IPAddress(ipaddress.ip_address(host.strip("[]")))
     except ValueError:
@@ -179,26 +181,7 @@ def _host(host: str) -> "x509.GeneralName":
         raise InputError(f"--host {host!r}: neither an address nor a name in ASCII") from error
 
 
-def _usage(signs: bool) -> "x509.KeyUsage":
-    return x509.KeyUsage(
-        digital_signature=not signs,
-        key_cert_sign=signs,
-        crl_sign=signs,
-        content_commitment=False,
-        key_encipherment=False,
-        data_encipherment=False,
-        key_agreement=False,
-        encipher_only=False,
-        decipher_only=False,
-    )
-
-
-def _pem(key: "ec.EllipticCurvePrivateKey", certificate: "x509.Certificate") -> KeyPair:
-    return KeyPair(
-        key.private_bytes(
-            serialization.Encoding.PEM,
-            serialization.PrivateFormat.PKCS8,
-            serialization.NoEncryption(),
-        ),
-        certificate.public_bytes(serialization.Encoding.PEM),
-    )
+def _pem(key: ec.EllipticCurvePrivateKey, certificate: x509.Certificate) -> KeyPair:
+    pem, plain = serialization.Encoding.PEM, serialization.NoEncryption()
+    private_key = key.private_bytes(pem, serialization.PrivateFormat.PKCS8, plain)
+    return KeyPair(private_key, certificate.public_bytes(pem))

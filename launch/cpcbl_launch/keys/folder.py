@@ -10,10 +10,12 @@ Folders are 0700 and private keys 0600 from the first byte on. A file is replace
 """
 
 import os
+import re
 import secrets
 from collections.abc import Collection, Iterable, Sequence
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from typing import Literal
 
 import msgspec
 
@@ -26,22 +28,34 @@ from cpcbl_launch.keys.authority import (
     new_authority,
     newest_certificate,
 )
-from cpcbl_launch.keys.plan import AUTHORITY, KeyAction, MemberAction, hosts, plan_actions
 from cpcbl_team.config import Team
 from cpcbl_team.errors import InputError
-from cpcbl_transport.security import CA, CERTIFICATE, MEMBERS, PRIVATE_KEY, Identity, members_in
+from cpcbl_team.inputs import NAME_PATTERN
+from cpcbl_transport.security import (
+    CA,
+    CERTIFICATE,
+    MEMBERS,
+    PRIVATE_KEY,
+    Identity,
+    Member,
+    members_in,
+)
 from cpcbl_transport.topics import Role
 
+ALL, AUTHORITY = "all", "ca"
+SELF_NAMED = ("localhost", "127.0.0.1", "::1", "router")
 SECRET, PUBLIC = 0o600, 0o644
+KeyAction = Literal["made", "kept", "renewed", "revoked"]
+"""What is done to one member."""
 
 
-class KeysReport(msgspec.Struct, frozen=True, kw_only=True):
+class KeysReport(msgspec.Struct, frozen=True):
     """One row of what `keys` says."""
 
     who: str
     common_name: str
-    deed: str
-    valid_until: datetime | None
+    deed: KeyAction
+    valid_until: datetime | None = None
     hosts: tuple[str, ...] = ()
 
 
@@ -62,100 +76,148 @@ def make_keys(team: Team, folder: Path, request: KeyRequest) -> list[KeysReport]
     Raises InputError for a request that cannot be met, OSError where nothing can be written.
     """
     now = datetime.now(UTC)
-    known = members_in(folder) if (folder / str(Role.ROUTER) / MEMBERS).exists() else ()
-    steps = plan_actions(team, known, request.observers, request.renew, request.revoke)
-    steps = tuple(_with_missing_key(step, folder) for step in steps)
-    reached = hosts(team, request.hosts)
-    _check_hosts(steps, folder, request.hosts)
+    router = folder / str(Role.ROUTER)
+    plan = plan_actions(team, members_in(folder) if (router / MEMBERS).exists() else (), request)
+    for member, action in plan.items():
+        if action == "kept" and not _has_key(folder / str(member.identity)):
+            plan[member] = "made"
+    kept = any(m.role is Role.ROUTER and action == "kept" for m, action in plan.items())
+    reached = _reached_hosts(team, router / CERTIFICATE, request.hosts, kept)
     _make_folder(folder)
     _replace_file(folder / ".gitignore", b"*\n", PUBLIC)
-    before = (folder / AUTHORITY / CA).exists()
-    authorities = _authorities(team, folder, request, now)
-    for step in steps:
-        at = folder / str(step.member.identity)
-        if step.action in (KeyAction.MADE, KeyAction.RENEWED):
-            names = _hosts_of(step.member.identity, at, reached)
+    authorities, action_of_authority = _authorities(team, folder, request, now)
+    for member, action in plan.items():
+        if action in ("made", "renewed"):
             pair = issue_certificate(
                 _signing_pair(folder, authorities),
-                step.member.common_name,
-                names,
+                member.common_name,
+                reached if member.role is Role.ROUTER else (),  # only routers are dialled
                 now,
                 request.lasting,
             )
+            at = folder / str(member.identity)
             _make_folder(at)
             _replace_file(at / PRIVATE_KEY, pair.private_key, SECRET)
             _replace_file(at / CERTIFICATE, pair.certificate, PUBLIC)
+    present = [folder / str(m.identity) for m, action in plan.items() if action != "revoked"]
     if request.retire_ca:
-        authorities = _retire_old_authorities(steps, folder, authorities)
-    for step in steps:
-        if step.action is not KeyAction.REVOKED:
-            _replace_file(folder / str(step.member.identity) / CA, authorities, PUBLIC)
-    members = msgspec.json.encode([step.member for step in steps])
-    _replace_file(
-        folder / str(Role.ROUTER) / MEMBERS, msgspec.json.format(members, indent=1), PUBLIC
-    )
-    action = (
-        KeyAction.MADE
-        if not before
-        else KeyAction.RENEWED
-        if AUTHORITY in request.renew
-        else KeyAction.KEPT
-    )
+        authorities = _retire_old_authorities(present, folder, authorities)
+    for at in present:
+        _replace_file(at / CA, authorities, PUBLIC)
+    members = msgspec.json.format(msgspec.json.encode(list(plan)), indent=1)
+    _replace_file(router / MEMBERS, members, PUBLIC)
     facts = certificate_facts(newest_certificate(authorities))
-    authority = KeysReport(
-        who=AUTHORITY, common_name=facts.common_name, deed=action, valid_until=facts.not_after
+    authority = KeysReport(AUTHORITY, facts.common_name, action_of_authority, facts.not_after)
+    return [authority, *(_report(member, action, folder) for member, action in plan.items())]
+
+
+def plan_actions(
+    team: Team, known: Sequence[Member], request: KeyRequest
+) -> dict[Member, KeyAction]:
+    """What is done to each member that the team needs, is asked to have, or had before.
+
+    Raises InputError for names that nobody has.
+    """
+    for name in request.observers:
+        if not re.fullmatch(NAME_PATTERN, name):
+            raise InputError(
+                f"--observer {name}: a name has 1 to 32 letters, digits, _, . or -; rename it"
+            )
+        if name in team.robots:
+            raise InputError(f"--observer {name}: is a robot of the team; name it otherwise")
+    for member in known:
+        gone = member.revoked or str(member.identity) in request.revoke
+        if member.role is Role.OBSERVER and not gone and member.name in team.robots:
+            raise InputError(
+                f"robots.{member.name}: an observer has this name; name the robot otherwise, or"
+                f" --revoke {member.identity}"
+            )
+    before = {member.identity: member for member in known}
+    wanted = [Identity(role) for role in (Role.ROUTER, Role.OPERATOR)]
+    wanted += [Identity(Role.FIELD)] if team.simulated else []
+    wanted += [Identity(Role.ROBOT, name) for name in team.robots]
+    wanted += [Identity(Role.OBSERVER, name) for name in request.observers]
+    everyone = list(dict.fromkeys([*wanted, *before]))
+    renewed = {*request.renew} - {ALL, AUTHORITY}
+    for option, names in (("--renew", renewed), ("--revoke", request.revoke)):
+        for name in names:
+            if not any(_is_named(identity, (name,)) for identity in everyone):
+                there = ", ".join(map(str, everyone))
+                raise InputError(f"{option} {name}: nobody has this name; there are: {there}")
+    return dict(
+        _member_action(before[identity], request)
+        if identity in before
+        else (Member(role=identity.role, name=identity.name), "made")
+        for identity in everyone
     )
-    return [authority, *(_report(step, folder) for step in steps)]
 
 
-def _with_missing_key(step: MemberAction, folder: Path) -> MemberAction:
-    """A member whose key is gone, or not that of its certificate, gets another."""
-    at = folder / str(step.member.identity)
-    try:
-        whole = is_matching_pair(
-            KeyPair((at / PRIVATE_KEY).read_bytes(), (at / CERTIFICATE).read_bytes())
+def _member_action(before: Member, request: KeyRequest) -> tuple[Member, KeyAction]:
+    """A member that was there before, as it is from now on, and what is done to it."""
+    if _is_named(before.identity, request.revoke):
+        return msgspec.structs.replace(before, revoked=True), "revoked"
+    by_name = _is_named(before.identity, request.renew)
+    if before.revoked and by_name:
+        again = before.generation + 1
+        return msgspec.structs.replace(before, revoked=False, generation=again), "made"
+    if before.revoked:
+        return before, "revoked"
+    return before, "renewed" if by_name or ALL in request.renew else "kept"
+
+
+def _is_named(identity: Identity, names: Collection[str]) -> bool:
+    """Whether it is among these: `r1`, or `robot/r1` where a name alone would not do."""
+    return str(identity) in names or (identity.name or str(identity.role)) in names
+
+
+def hosts(team: Team, named: Iterable[str]) -> tuple[str, ...]:
+    """The hosts at which the router is reached: its own, those of the team file, and `named`."""
+    endpoints = (*team.transport.connect, *team.transport.listen)
+    dialled = [e.partition("/")[2].rpartition(":")[0].strip("[]") for e in endpoints]
+    everywhere = ("0.0.0.0", "::")
+    return tuple(dict.fromkeys(h for h in (*SELF_NAMED, *dialled, *named) if h not in everywhere))
+
+
+def _reached_hosts(
+    team: Team, certificate: Path, named: Sequence[str], kept: bool
+) -> tuple[str, ...]:
+    """The hosts of the router's certificate, and those of the next one.
+
+    A router that keeps its certificate cannot be dialled at another host. Raises InputError.
+    """
+    before = certificate_facts(certificate.read_bytes()).hosts if certificate.exists() else ()
+    lacking = [host for host in named if host not in before]
+    if kept and lacking:
+        raise InputError(
+            f"--host {lacking[0]}: not in the router's certificate, which has"
+            f" {', '.join(before)}; add --renew router"
         )
+    return tuple(dict.fromkeys((*before, *hosts(team, named))))
+
+
+def _has_key(at: Path) -> bool:
+    """Whether a member has a key, and it is that of its certificate."""
+    try:
+        pair = KeyPair((at / PRIVATE_KEY).read_bytes(), (at / CERTIFICATE).read_bytes())
     except FileNotFoundError:
-        whole = False
-    return (
-        step if whole or step.action is not KeyAction.KEPT else step._replace(action=KeyAction.MADE)
-    )
+        return False
+    return is_matching_pair(pair)
 
 
-def _check_hosts(steps: Iterable[MemberAction], folder: Path, named: Collection[str]) -> None:
-    """A router that keeps its certificate cannot be dialled at another host."""
-    for step in steps:
-        if step.member.role is Role.ROUTER and step.action is KeyAction.KEPT:
-            has = certificate_facts((folder / str(Role.ROUTER) / CERTIFICATE).read_bytes()).hosts
-            lacking = [host for host in named if host not in has]
-            if lacking:
-                raise InputError(
-                    f"--host {lacking[0]}: not in the router's certificate, which has"
-                    f" {', '.join(has)}; add --renew router"
-                )
-
-
-def _hosts_of(identity: Identity, at: Path, reached: tuple[str, ...]) -> tuple[str, ...]:
-    """Only routers are dialled; a renewed one wherever it was before."""
-    if identity.role is not Role.ROUTER:
-        return ()
-    old = at / CERTIFICATE
-    before = certificate_facts(old.read_bytes()).hosts if old.exists() else ()
-    return tuple(dict.fromkeys((*before, *reached)))
-
-
-def _authorities(team: Team, folder: Path, request: KeyRequest, now: datetime) -> bytes:
-    """The certificates of all authorities that are trusted, that in use first."""
+def _authorities(
+    team: Team, folder: Path, request: KeyRequest, now: datetime
+) -> tuple[bytes, KeyAction]:
+    """The certificates of all authorities that are trusted, that in use first; what was done."""
     at = folder / AUTHORITY
     trusted = (at / CA).read_bytes() if (at / CA).exists() else b""
     if trusted and AUTHORITY not in request.renew:
-        return trusted
+        return trusted, "kept"
     _make_folder(at)
     authority = new_authority(team.name, now)
     # The certificate first: a key without it could sign what nobody trusts.
     _replace_file(at / CA, authority.certificate + trusted, PUBLIC)
     _replace_file(at / PRIVATE_KEY, authority.private_key, SECRET)
-    return authority.certificate + trusted
+    return authority.certificate + trusted, "renewed" if trusted else "made"
 
 
 def _signing_pair(folder: Path, authorities: bytes) -> KeyPair:
@@ -169,34 +231,24 @@ def _signing_pair(folder: Path, authorities: bytes) -> KeyPair:
         ) from None
 
 
-def _retire_old_authorities(
-    steps: Iterable[MemberAction], folder: Path, authorities: bytes
-) -> bytes:
-    """Trusts the newest authority alone."""
+def _retire_old_authorities(present: Iterable[Path], folder: Path, authorities: bytes) -> bytes:
+    """Trusts the newest authority alone. `present`: the folders of all members."""
     latest = newest_certificate(authorities)
-    for step in steps:
-        certificate = folder / str(step.member.identity) / CERTIFICATE
-        if step.action is not KeyAction.REVOKED and not is_signed_by(
-            certificate.read_bytes(), latest
-        ):
+    for at in present:
+        if not is_signed_by((at / CERTIFICATE).read_bytes(), latest):
             raise InputError(
-                f"--retire-ca: {step.member.identity} still has a certificate of the old authority;"
-                " --renew all first, and bring the new ones to their machines"
+                f"--retire-ca: {at.relative_to(folder)} still has a certificate of the old"
+                " authority; --renew all first, and bring the new ones to their machines"
             )
     _replace_file(folder / AUTHORITY / CA, latest, PUBLIC)
     return latest
 
 
-def _report(step: MemberAction, folder: Path) -> KeysReport:
-    path = folder / str(step.member.identity) / CERTIFICATE
+def _report(member: Member, action: KeyAction, folder: Path) -> KeysReport:
+    path = folder / str(member.identity) / CERTIFICATE
     facts = certificate_facts(path.read_bytes()) if path.exists() else None
-    return KeysReport(
-        who=str(step.member.identity),
-        common_name=step.member.common_name,
-        deed=step.action,
-        valid_until=facts.not_after if facts else None,
-        hosts=facts.hosts if facts else (),
-    )
+    certified = (facts.not_after, facts.hosts) if facts else ()
+    return KeysReport(str(member.identity), member.common_name, action, *certified)
 
 
 def _make_folder(path: Path) -> None:

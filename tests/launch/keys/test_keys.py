@@ -15,7 +15,7 @@ from support.keys import again, secured_team
 from support.processes import cpcbl_team
 
 from cpcbl_launch.keys.authority import certificate_facts, issue_certificate, new_authority
-from cpcbl_launch.keys.plan import KeyAction, hosts, plan_actions
+from cpcbl_launch.keys.folder import KeyRequest, hosts, plan_actions
 from cpcbl_launch.team_file import builtin_path, parse_team
 from cpcbl_team.errors import InputError
 from cpcbl_transport.security import Member
@@ -209,16 +209,17 @@ def test_a_table_says_what_was_made(team_file: Path) -> None:
 def test_no_robot_takes_the_name_of_an_observer() -> None:
     team, tripod = parse_team(TEAM), Member(role=Role.OBSERVER, name="r1")
     with pytest.raises(InputError, match=r"robots\.r1: an observer has this name.*--revoke"):
-        plan_actions(team, [tripod])
-    steps = plan_actions(team, [tripod], revoke=["observer/r1"])
-    deeds = {str(step.member.identity): step.action for step in steps}
-    assert (deeds["observer/r1"], deeds["robot/r1"]) == (KeyAction.REVOKED, KeyAction.MADE)
+        plan_actions(team, [tripod], KeyRequest())
+    plan = plan_actions(team, [tripod], KeyRequest(revoke=["observer/r1"]))
+    actions = {str(member.identity): action for member, action in plan.items()}
+    assert (actions["observer/r1"], actions["robot/r1"]) == ("revoked", "made")
 
 
 def test_a_plan_names_all_that_the_team_needs_and_had() -> None:
     team = parse_team(TEAM)
     known = [Member(role=Role.ROBOT, name="gone"), Member(role=Role.ROBOT, name="r1")]
-    deeds = {str(step.member.identity): step.action for step in plan_actions(team, known)}
-    assert deeds["robot/gone"] is deeds["robot/r1"] is KeyAction.KEPT
-    assert deeds["robot/r2"] is deeds["router"] is KeyAction.MADE
+    plan = plan_actions(team, known, KeyRequest())
+    actions = {str(member.identity): action for member, action in plan.items()}
+    assert actions["robot/gone"] == actions["robot/r1"] == "kept"
+    assert actions["robot/r2"] == actions["router"] == "made"
     assert "0.0.0.0" not in hosts(team, ("0.0.0.0",))
