@@ -4,7 +4,7 @@ from typing import Annotated, Literal
 
 import msgspec
 
-from cpcbl_team.config.table import NotNegative, Positive, Table
+from cpcbl_team.config.robot import NotNegative, Positive, Table
 
 Side = Literal["front", "left", "back", "right"]
 MarkerFamily = Literal[
