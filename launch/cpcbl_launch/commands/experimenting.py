@@ -168,7 +168,7 @@ def pictures(
     _conduct(title, measure, real_pictures.tables, output, as_json, drawn=False)
 
 
-def _moved(context: typer.Context) -> None:
+def _refuse_benchmark(context: typer.Context) -> None:
     name = context.info_name
     raise InputError(f"experiment {name}: it is a benchmark now: make bench-{name}, in a checkout")
 
@@ -176,7 +176,9 @@ def _moved(context: typer.Context) -> None:
 for _name in ("latency", "processes"):
     _any_arguments = {"allow_extra_args": True, "ignore_unknown_options": True}
     _help = f"Moved to `make bench-{_name}`."
-    experiment_app.command(_name, hidden=True, context_settings=_any_arguments, help=_help)(_moved)
+    experiment_app.command(_name, hidden=True, context_settings=_any_arguments, help=_help)(
+        _refuse_benchmark
+    )
 
 
 def conduct(
