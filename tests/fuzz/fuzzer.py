@@ -18,13 +18,8 @@ import msgspec
 from fuzz.payloads import hypothesis_payloads, mixed_payloads, valid_payload
 
 from cpcbl_launch.lab.chaos.checks import Check, at_least, equal_to
-from cpcbl_launch.lab.chaos.scenario import (
-    FaultRun,
-    ScenarioOptions,
-    ScenarioResult,
-    checks_recovered,
-    checks_unaffected,
-)
+from cpcbl_launch.lab.chaos.expectations import checks_recovered, checks_unaffected
+from cpcbl_launch.lab.chaos.scenario import FaultRun, ScenarioOptions, ScenarioResult
 from cpcbl_launch.lab.chaos.team import (
     FIELD,
     ChaosError,

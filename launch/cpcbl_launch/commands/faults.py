@@ -36,35 +36,34 @@ def chaos(
     """
     from rich.console import Console
 
-    from cpcbl_launch.lab.chaos import tables
+    from cpcbl_launch.lab.chaos import runner
     from cpcbl_launch.lab.chaos.checks import report_data
-    from cpcbl_launch.lab.chaos.runner import run_scenarios, select_scenarios
     from cpcbl_launch.lab.chaos.scenario import ScenarioOptions
     from cpcbl_launch.lab.chaos.scenarios import SCENARIOS
     from cpcbl_launch.reporting.files import json_text, write_or_reason
 
     if listed or not scenarios:
-        tables.print_scenarios(SCENARIOS, Console())
+        runner.print_scenarios(SCENARIOS, Console())
         return
-    todo = select_scenarios(scenarios)
+    todo = runner.select_scenarios(scenarios)
     logging.getLogger("cpcbl_launch").setLevel(logging.ERROR)  # restarts are part of it
     logging.getLogger("cpcbl_transport").setLevel(logging.ERROR)
     for number in (signal.SIGTERM, signal.SIGHUP):  # each ends what it has started
         if signal.getsignal(number) != signal.SIG_IGN:
             signal.signal(number, signal.default_int_handler)
     progress = Console(stderr=True)
-    with tables.Progress(progress, len(todo)) as shown:
+    with runner.Progress(progress, len(todo)) as shown:
         options = ScenarioOptions(seed, soak_s, shown.doing)
-        faults = run_scenarios(todo, options, shown.began, shown.done)
+        faults = runner.run_scenarios(todo, options, shown.began, shown.done)
     result = report_data(faults)
     lost = write_report(report, result)
     if (page := markdown) is not None:
-        text = "\n".join(tables.markdown(faults)) + "\n"
+        text = "\n".join(runner.markdown(faults)) + "\n"
         lost |= write_or_reason(page, lambda: page.write_text(text, encoding="utf-8"))
     if as_json:
         sys.stdout.write(json_text(result) + "\n")
     else:
-        tables.print_faults(faults, Console())
+        runner.print_faults(faults, Console())
     print_not_written(lost)
     if not faults.is_met:
         raise typer.Exit(1)

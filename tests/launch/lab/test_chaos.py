@@ -233,7 +233,7 @@ def test_a_tun_link_loses_packets_and_tcp_copes() -> None:
             f"import socket; c = socket.create_connection(('{lossy.near_address}', {port}));"
             "c.sendall(bytes(300_000)); c.shutdown(1); c.recv(1)"
         )
-        lossy.quality = LinkQuality(loss=0.2, delay_s=0.01, jitter_s=0.01)
+        lossy.quality = LinkQuality(loss=0.2)
         with subprocess.Popen([*lossy.prefix, "python3", "-c", code]) as process:
             end, _ = server.accept()
             with end:

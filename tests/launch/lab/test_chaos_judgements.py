@@ -11,28 +11,9 @@ from support.chaos import (
     unmet_checks,
 )
 
+from cpcbl_launch.lab.chaos import expectations as expect
 from cpcbl_launch.lab.chaos.files import CommandResult, full_disk_checks, read_only_checks
-from cpcbl_launch.lab.chaos.network import (
-    bad_link_checks,
-    cut_link_checks,
-    duplicates_checks,
-    flood_checks,
-    partition_checks,
-)
-from cpcbl_launch.lab.chaos.processes import (
-    freeze_checks,
-    kill_checks,
-    kill_field_checks,
-    kill_router_checks,
-)
 from cpcbl_launch.lab.chaos.soak import ProcessLife, ProcessSample, process_lives, soak_checks
-from cpcbl_launch.lab.chaos.world import (
-    clock_checks,
-    faulty_robot_checks,
-    hidden_landmarks_checks,
-    kidnap_checks,
-)
-from cpcbl_launch.run.usage import MIB
 
 AT_S = 10.0
 GOOD = run_log_of([tracks_of("a"), tracks_of("b")])
@@ -50,16 +31,16 @@ KILLED = [
 
 def test_a_killed_robot() -> None:
     good = run_log_of([tracks_of("a", silent=(10.0, 11.0)), tracks_of("b")], KILLED)
-    assert not unmet_checks(kill_checks(run_of(good, "a", 13.0, incarnation="1")))
+    assert not unmet_checks(expect.kill(run_of(good, "a", 13.0, incarnation="1")))
     never_back = run_log_of([tracks_of("a", silent=(10.0, 99.0)), tracks_of("b")], KILLED[:2])
-    assert unmet_checks(kill_checks(run_of(never_back, "a", 13.0, incarnation="1"))) >= {
+    assert unmet_checks(expect.kill(run_of(never_back, "a", 13.0, incarnation="1"))) >= {
         "its token disappeared after",
         "a new process started after",
         "from then until it was localized",
         "RMSE afterwards, worst robot",
     }
     others_stop = run_log_of([tracks_of("a"), tracks_of("b", silent=(10.5, 12.5))], KILLED)
-    assert unmet_checks(kill_checks(run_of(others_stop, "a", 13.0, incarnation="1"))) == {
+    assert unmet_checks(expect.kill(run_of(others_stop, "a", 13.0, incarnation="1"))) == {
         "others' longest gap between tracks"
     }
 
@@ -69,9 +50,9 @@ def test_a_killed_router() -> None:
     said = [status_at("a", 13.0), status_at("a", 20.0, {"messages_received": 30})]
     tracks = [tracks_of("a", silent=(10.0, 12.0)), tracks_of("b", silent=(10.0, 12.0))]
     good = run_log_of(tracks, tokens, said)
-    assert not unmet_checks(kill_router_checks(run_of(good, "router", 13.0, 21.0)))
+    assert not unmet_checks(expect.kill_router(run_of(good, "router", 13.0, 21.0)))
     bad = run_log_of([tracks_of("a", silent=(10.0, 18.0)), tracks[1]], tokens[:1], said[:1])
-    assert unmet_checks(kill_router_checks(run_of(bad, "router", 13.0, 21.0))) == {
+    assert unmet_checks(expect.kill_router(run_of(bad, "router", 13.0, 21.0))) == {
         "longest gap between tracks",
         "robots with a token at the new router",
         "help received in the 8 s after",
@@ -80,10 +61,10 @@ def test_a_killed_router() -> None:
 
 def test_a_killed_field() -> None:
     wrong_for_a_while = [tracks_of(n, lambda s: 2.0 if 11.0 < s < 14.0 else 0.02) for n in "ab"]
-    good = kill_field_checks(run_of(run_log_of(wrong_for_a_while), "field", 16.0, restarted_s=11.0))
+    good = expect.kill_field(run_of(run_log_of(wrong_for_a_while), "field", 16.0, restarted_s=11.0))
     assert not unmet_checks(good)
     stuck = run_log_of([tracks_of("a"), tracks_of("b", lambda s: 2.0 if s > 11.0 else 0.02)])
-    assert unmet_checks(kill_field_checks(run_of(stuck, "field", 16.0, restarted_s=11.0))) >= {
+    assert unmet_checks(expect.kill_field(run_of(stuck, "field", 16.0, restarted_s=11.0))) >= {
         "from then until all were localized",
         "RMSE afterwards, worst robot",
     }
@@ -97,11 +78,11 @@ def test_a_frozen_robot() -> None:
         token_appeared(15.2, "a"),
     ]
     tracks = [tracks_of("a", silent=(10.0, 15.0)), tracks_of("b")]
-    assert not unmet_checks(freeze_checks(run_of(run_log_of(tracks, tokens), "a", 15.0)))
+    assert not unmet_checks(expect.freeze(run_of(run_log_of(tracks, tokens), "a", 15.0)))
     burst = [h._replace(at_s=15.1) if 10.0 <= h.at_s < 14.0 else h for h in tracks_of("a")]
     led_astray = tracks_of("b", lambda s: 0.8 if 15.0 < s < 17.0 else 0.02)
     bad = run_log_of([sorted(burst, key=lambda h: h.at_s), led_astray], tokens[:2])
-    assert unmet_checks(freeze_checks(run_of(bad, "a", 15.0))) == {
+    assert unmet_checks(expect.freeze(run_of(bad, "a", 15.0))) == {
         "its token disappeared after",
         "tracks that arrived more than 1 s late",
         "others' largest error in the 4 s after it woke",
@@ -126,12 +107,12 @@ def test_a_partition() -> None:
     helped = [status_at("far", 21.0, heard=[("near", 20.6)])]
     near, far = run_log_of(both, near_tokens), run_log_of(both, far_tokens, helped)
     assert not unmet_checks(
-        partition_checks(run_of(near, "far-router", 20.0, far=["far"], far_log=far))
+        expect.partition(run_of(near, "far-router", 20.0, far=["far"], far_log=far))
     )
     late = run_log_of(both, [*near_tokens[:2], token_appeared(26.0, "far")])
     stopped = run_log_of([both[0], tracks_of("far", silent=(11.0, 19.0))], far_tokens)
     assert unmet_checks(
-        partition_checks(run_of(late, "far-router", 20.0, far=["far"], far_log=stopped))
+        expect.partition(run_of(late, "far-router", 20.0, far=["far"], far_log=stopped))
     ) == {
         "far side's longest gap between tracks",
         "from healing to all tokens back",
@@ -142,9 +123,9 @@ def test_a_partition() -> None:
 def test_a_cut_link() -> None:
     tokens = [token_appeared(0, "a"), token_disappeared(12.0, "a"), token_appeared(20.5, "a")]
     good = run_log_of([tracks_of("a", silent=(10.0, 20.0)), tracks_of("b")], tokens)
-    assert not unmet_checks(cut_link_checks(run_of(good, "a", 20.0)))
+    assert not unmet_checks(expect.cut_link(run_of(good, "a", 20.0)))
     bad = run_log_of([tracks_of("a", silent=(10.0, 30.0)), tracks_of("b")], tokens[:1])
-    assert unmet_checks(cut_link_checks(run_of(bad, "a", 20.0))) == {
+    assert unmet_checks(expect.cut_link(run_of(bad, "a", 20.0))) == {
         "its token disappeared after",
         "from healing to its token back",
         "from healing until it was localized",
@@ -154,9 +135,9 @@ def test_a_cut_link() -> None:
 def test_an_impaired_link() -> None:
     said = [status_at("a", 9.0), status_at("a", 20.0, {"messages_received": 50})]
     good = run_log_of([tracks_of("a", late_s=0.5), tracks_of("b")], (), said)
-    assert not unmet_checks(bad_link_checks(run_of(good, "a", 25.0)))
+    assert not unmet_checks(expect.bad_link(run_of(good, "a", 25.0)))
     bad = run_log_of([tracks_of("a", late_s=3.0), tracks_of("b", late_s=0.9)])
-    assert unmet_checks(bad_link_checks(run_of(bad, "a", 25.0))) == {
+    assert unmet_checks(expect.bad_link(run_of(bad, "a", 25.0))) == {
         "its tracks' delay, 99th percentile",
         "help messages that it received",
         "others' delay, 99th percentile",
@@ -169,18 +150,18 @@ def test_an_impaired_link() -> None:
 def test_duplicates() -> None:
     said = [status_at("a", 9.0), status_at("a", 20.0, {"duplicate": 60, "too_late": 25})]
     good = run_log_of([tracks_of("a"), tracks_of("b")], (), said)
-    assert not unmet_checks(duplicates_checks(run_of(good, "a", 23.0, 25.0, sent=300)))
-    assert unmet_checks(duplicates_checks(run_of(GOOD, "a", 23.0, 25.0, sent=300))) == {
+    assert not unmet_checks(expect.duplicates(run_of(good, "a", 23.0, 25.0, sent=300)))
+    assert unmet_checks(expect.duplicates(run_of(GOOD, "a", 23.0, 25.0, sent=300))) == {
         "counted as duplicate",
         "counted as too late",
     }
 
 
 def test_a_flood() -> None:
-    assert not unmet_checks(flood_checks(run_of(GOOD, "c", 20.0, 30.0, sent=50_000)))
+    assert not unmet_checks(expect.flood(run_of(GOOD, "c", 20.0, 30.0, sent=50_000)))
     said = [status_at("a", 9.0), status_at("a", 20.0, {"messages_received": 5000})]
     bad = run_log_of([tracks_of("a", late_s=2.0), tracks_of("b")], (), said)
-    assert unmet_checks(flood_checks(run_of(bad, "c", 20.0, 30.0, sent=500))) >= {
+    assert unmet_checks(expect.flood(run_of(bad, "c", 20.0, 30.0, sent=500))) >= {
         "rate of the flood",
         "most received by one robot",
         "others' delay, 99th percentile",
@@ -228,9 +209,9 @@ def test_a_read_only_disk() -> None:
 def test_a_kidnapped_robot() -> None:
     found = tracks_of("a", lambda s: 3.02 if s >= 13.0 else 0.02, lost=(10.5, 13.0))
     good = run_log_of([found, tracks_of("b")], jump=("a", AT_S, 3.0))
-    assert not unmet_checks(kidnap_checks(run_of(good, "a", AT_S)))
+    assert not unmet_checks(expect.kidnap(run_of(good, "a", AT_S)))
     never = run_log_of([tracks_of("a"), tracks_of("b")], jump=("a", AT_S, 3.0))
-    assert unmet_checks(kidnap_checks(run_of(never, "a", AT_S))) == {
+    assert unmet_checks(expect.kidnap(run_of(never, "a", AT_S))) == {
         "it reported that it was lost after",
         "it was localized after",
         "RMSE afterwards, worst robot",
@@ -238,20 +219,20 @@ def test_a_kidnapped_robot() -> None:
     }
     blamed = [status_at("b", 30.0, trust=[("a", "jumps")])]
     distrustful = run_log_of([found, tracks_of("b")], (), blamed, jump=("a", AT_S, 3.0))
-    assert unmet_checks(kidnap_checks(run_of(distrustful, "a", AT_S))) == {
+    assert unmet_checks(expect.kidnap(run_of(distrustful, "a", AT_S))) == {
         "robots that trust all others at the end"
     }
-    assert "distance of the kidnapping" in unmet_checks(kidnap_checks(run_of(GOOD, "a", AT_S)))
+    assert "distance of the kidnapping" in unmet_checks(expect.kidnap(run_of(GOOD, "a", AT_S)))
 
 
 def test_hidden_landmarks() -> None:
     drifts = tracks_of("a", lambda s: 0.1 if 12.0 <= s < 74.0 else 0.02)
-    good = hidden_landmarks_checks(
+    good = expect.hidden_landmarks(
         run_of(run_log_of([drifts, tracks_of("b")]), "", 72.0, fault_s=12.0)
     )
     assert not unmet_checks(good)
     overconfident = tracks_of("a", lambda s: 0.6 if s >= 20.0 else 0.02)
-    bad = hidden_landmarks_checks(
+    bad = expect.hidden_landmarks(
         run_of(run_log_of([overconfident, tracks_of("b")]), "", 72.0, fault_s=12.0)
     )
     assert unmet_checks(bad) == {
@@ -267,9 +248,9 @@ def test_wrong_clocks() -> None:
     found = [status_at(n, 5.0, {"clock_off": 30}, trust=[("w", "clock")]) for n in "ab"]
     tracks = [tracks_of("a"), tracks_of("b"), tracks_of("w")]
     good = run_log_of(tracks, (), found)
-    assert not unmet_checks(clock_checks(run_of(good, "w", 30.0, 30.0), "r"))
+    assert not unmet_checks(expect.clock(run_of(good, "w", 30.0, 30.0), "r"))
     unnoticed = run_log_of(tracks, (), [status_at("a", 5.0, trust=[("r", "clock")])])
-    assert unmet_checks(clock_checks(run_of(unnoticed, "w", 30.0, 30.0), "r")) == {
+    assert unmet_checks(expect.clock(run_of(unnoticed, "w", 30.0, 30.0), "r")) == {
         "robots that report that its clock is wrong",
         "last of these reports at",
         "refused help messages from it",
@@ -282,10 +263,10 @@ def test_a_faulty_robot() -> None:
     said = [status_at(n, 14.0, trust=[("w", "biased")]) for n in "ab"]
     healed = [status_at(n, 40.0, trust=[("w", "")]) for n in "ab"]
     good = run_log_of(tracks, (), [*said, *healed])
-    assert not unmet_checks(faulty_robot_checks(run_of(good, "w", 25.0), ["a", "b"]))
+    assert not unmet_checks(expect.faulty_robot(run_of(good, "w", 25.0), ["a", "b"]))
     harmed = [tracks_of("a", lambda s: 0.5), *tracks[1:]]
     bad = run_log_of(harmed, (), [said[0]])
-    assert unmet_checks(faulty_robot_checks(run_of(bad, "w", 25.0), ["a", "b"])) == {
+    assert unmet_checks(expect.faulty_robot(run_of(bad, "w", 25.0), ["a", "b"])) == {
         "robots that quarantined it",
         "quarantined by two robots after",
         "worst RMSE during the fault",
@@ -297,11 +278,11 @@ def test_a_faulty_robot() -> None:
 # Soak ---------------------------------------------------------------------------------------------
 
 
-def samples(process: str, mib_a_minute: float, seconds: float = 400.0) -> list[ProcessSample]:
-    return [
-        ProcessSample(5.0 * n, process, 7, int((30.0 + mib_a_minute * n / 12.0) * MIB), 20)
-        for n in range(int(seconds / 5.0))
-    ]
+def samples(
+    process: str, mib_a_minute: float, seconds: float = 400.0
+) -> dict[tuple[str, int], list[ProcessSample]]:
+    times_s = [5.0 * n for n in range(int(seconds / 5.0))]
+    return {(process, 7): [ProcessSample(s, 30.0 + mib_a_minute * s / 60.0, 20) for s in times_s]}
 
 
 def test_a_process_life_is_computed_from_its_samples() -> None:
@@ -312,7 +293,7 @@ def test_a_process_life_is_computed_from_its_samples() -> None:
 
 
 def test_a_soak() -> None:
-    flat = process_lives([*samples("field", 0.01), *samples("router", 0.0)])
+    flat = process_lives(samples("field", 0.01) | samples("router", 0.0))
     assert not unmet_checks(soak_checks(run_of(GOOD, "", 25.0, fault_s=20.0), flat, 0, 0))
     leaking = [*flat, ProcessLife("robot-a", 400.0, 30.0, 45.0, 2.0, 30)]
     stuck = run_log_of([tracks_of("a"), tracks_of("b", lambda s: 2.0)])

@@ -24,17 +24,15 @@ class Check(msgspec.Struct, frozen=True, kw_only=True):
         return low <= self.seen <= high
 
     def __str__(self) -> str:
+        """With its bounds: `gap 0.5 s (≤ 2 s)`."""
         seen = "not seen" if self.seen is None else format_figure(self.seen, self.unit)
-        return f"{self.what} {seen} ({self.bounds})"
-
-    @property
-    def bounds(self) -> str:
-        """The bounds as text: `≤ 2 s`."""
-        if self.at_least is not None and self.at_least == self.at_most:
-            return f"= {format_figure(self.at_least, self.unit)}"
-        low = "" if self.at_least is None else f"≥ {format_figure(self.at_least, self.unit)}"
-        high = "" if self.at_most is None else f"≤ {format_figure(self.at_most, self.unit)}"
-        return " and ".join(part for part in (low, high) if part)
+        bounds = {"≥": self.at_least, "≤": self.at_most}
+        if self.at_least == self.at_most:
+            bounds = {"=": self.at_least}
+        known = (
+            f"{sign} {format_figure(b, self.unit)}" for sign, b in bounds.items() if b is not None
+        )
+        return f"{self.what} {seen} ({' and '.join(known)})"
 
 
 def at_most(what: str, seen: float | None, bound: float, unit: str = "") -> Check:
@@ -84,19 +82,6 @@ class Outcome(msgspec.Struct, frozen=True, kw_only=True):
         return not self.failed and bool(self.checks) and all(c.is_met for c in self.checks)
 
 
-def report_data(faults: "ChaosReport") -> dict[str, Any]:
-    """What `--json` and `--report` write: all fields, and whether each check is met (`held`)."""
-    outcomes = [
-        {
-            **msgspec.structs.asdict(o),
-            "held": o.is_met,
-            "checks": [{**msgspec.structs.asdict(c), "held": c.is_met} for c in o.checks],
-        }
-        for o in faults.outcomes
-    ]
-    return {**msgspec.structs.asdict(faults), "held": faults.is_met, "outcomes": outcomes}
-
-
 class ChaosReport(msgspec.Struct, frozen=True, kw_only=True):
     """The report of `chaos --report`."""
 
@@ -109,3 +94,13 @@ class ChaosReport(msgspec.Struct, frozen=True, kw_only=True):
     def is_met(self) -> bool:
         """Whether no scenario that was run violated a check."""
         return all(outcome.is_met is not False for outcome in self.outcomes)
+
+
+def report_data(faults: ChaosReport) -> dict[str, Any]:
+    """What `--json` and `--report` write: all fields, and whether each check is met (`held`)."""
+    outcomes = [_data(o, checks=[_data(c) for c in o.checks]) for o in faults.outcomes]
+    return _data(faults, outcomes=outcomes)
+
+
+def _data(record: ChaosReport | Outcome | Check, **inner: object) -> dict[str, Any]:
+    return {**msgspec.structs.asdict(record), "held": record.is_met, **inner}

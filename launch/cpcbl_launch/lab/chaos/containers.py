@@ -9,7 +9,7 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 from cpcbl_agents.clock import Clock
-from cpcbl_launch.lab.chaos.network import AFTER_HEALING_S, CUT_S, HEALING_S, partition_checks
+from cpcbl_launch.lab.chaos.expectations import partition
 from cpcbl_launch.lab.chaos.run_log import RunLog, RunRecorder
 from cpcbl_launch.lab.chaos.scenario import (
     CannotRunError,
@@ -38,6 +38,7 @@ SITES = Path("docker/two-sites.yaml")
 OWN_BASE = "cpcbl-base"
 WEST, EAST = ("navigator", "observer"), ("scout", "patrol")
 PORTS = ("7447", "7448")
+CUT_S, AFTER_S = 10.0, 13.0
 BEGINS_S = 20.0  # the demonstration's robots help from 10 s on
 BLIND_M = 1.0  # the blind scout is far from those that know best
 
@@ -72,10 +73,10 @@ def partition_containers(options: ScenarioOptions) -> ScenarioResult:
         command_output(["docker", "network", "connect", *ends])
         healed_s = west.now_s
         options.report_progress("the link between the sites is back")
-        time.sleep(HEALING_S + AFTER_HEALING_S)
+        time.sleep(AFTER_S)
         run = FaultRun(west.run_log(), (*WEST, *EAST), "", cut_s, healed_s, west.now_s, far=EAST)
         run.far_log = east.run_log()._replace(truth=run.log.truth)  # it is published in the west
-        return ScenarioResult(partition_checks(run, most_far_m=BLIND_M))
+        return ScenarioResult(partition(run, most_far_m=BLIND_M))
 
 
 def _helps(west: RunLog, east: RunLog) -> bool:

@@ -1,20 +1,91 @@
-"""Senders of too many messages: an echo of one robot's help, and a flood."""
+"""How faults are made. An injector's context lasts as long as its fault."""
 
-import heapq
+import os
 import random
+import sched
+import signal
+import subprocess
 import sys
 import threading
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 
-from cpcbl_agents.process import StopSignal
-from cpcbl_team.inputs import Belief, Fix
+from cpcbl_launch.lab.chaos.links import LinkQuality
+from cpcbl_launch.lab.chaos.scenario import FaultRun, Injector
+from cpcbl_launch.lab.chaos.team import FIELD, TeamUnderTest
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus, Publisher
-from cpcbl_transport.compact import encode_help
 from cpcbl_transport.zenoh_bus import open_bus
 
-FLOOD_RATE_HZ = 2500.0
-UNSURE = (25.0, 0.0, 25.0, 0.0, 0.0, 1.0)
+LATEST_S = 4.0  # twice what a robot's timeline goes back
+
+
+@contextmanager
+def kill(team: TeamUnderTest, run: FaultRun) -> Iterator[None]:
+    """SIGKILL; the supervisor starts the process again."""
+    team.signal(run.robot, signal.SIGKILL)
+    yield
+
+
+@contextmanager
+def freeze(team: TeamUnderTest, run: FaultRun) -> Iterator[None]:
+    team.signal(run.robot, signal.SIGSTOP)
+    yield
+    team.signal(run.robot, signal.SIGCONT)
+
+
+@contextmanager
+def kill_field(team: TeamUnderTest, run: FaultRun) -> Iterator[None]:
+    """SIGKILL; a new world starts, in which the robots stand elsewhere."""
+    old = team.pid(FIELD)
+    team.signal(FIELD, signal.SIGKILL)
+    team.wait_until(lambda: team.supervisor.pids.get(FIELD, old) != old, 15.0)
+    run.restarted_s = team.now_s
+    yield
+
+
+def impair(quality: LinkQuality) -> Injector:
+    """The link of a robot or router, over which it receives all that it receives."""
+
+    @contextmanager
+    def inject(team: TeamUnderTest, run: FaultRun) -> Iterator[None]:
+        team.links[run.robot].quality = quality
+        yield
+        team.links[run.robot].quality = LinkQuality()
+
+    return inject
+
+
+cut = impair(LinkQuality(cut=True))
+slow = impair(LinkQuality(delay_s=0.2, jitter_s=0.1))
+narrow = impair(LinkQuality(bytes_per_s=50_000 / 8))
+lossy = impair(LinkQuality(loss=0.2))
+
+
+@contextmanager
+def flood(team: TeamUnderTest, run: FaultRun) -> Iterator[None]:
+    """A process that sends fixes, beliefs and statuses of 60 kB in the name of a robot, far more
+    often than the robot may."""
+    module = (sys.executable, "-m", "cpcbl_launch.lab.chaos.flooder")
+    words = (team.plan.team.name, team.endpoint, str(os.getpid()), run.robot, *run.others)
+    with subprocess.Popen([*module, *words], stdout=subprocess.PIPE, text=True) as process:
+        try:
+            yield
+        finally:
+            process.terminate()
+            run.sent = int(process.communicate(timeout=20.0)[0] or 0)
+
+
+@contextmanager
+def echo(team: TeamUnderTest, run: FaultRun) -> Iterator[None]:
+    """Repeats all help of a robot at once, and again up to 4 s late."""
+    with (
+        open_bus(team.plan.team.name, [team.endpoint]) as bus,
+        Echo(bus, run.robot, LATEST_S, team.plan.seed) as copies,
+    ):
+        yield
+    run.sent = copies.sent
 
 
 class Echo:
@@ -25,8 +96,7 @@ class Echo:
         self._bus, self._latest_s, self._random = bus, latest_s, random.Random(seed)
         self._keys = (topics.FIX.at(observer=robot), topics.BELIEF.at(robot=robot))
         self._publishers: dict[str, Publisher] = {}
-        self._due: list[tuple[float, int, str, bytes]] = []
-        self._lock, self._stop = threading.Lock(), threading.Event()
+        self._due, self._stop = sched.scheduler(time.monotonic), threading.Event()
         self.sent = 0
 
     def __enter__(self) -> "Echo":
@@ -42,58 +112,15 @@ class Echo:
         self._thread.join()
 
     def _receive(self, key: str, payload: bytes) -> None:
-        now_s = time.monotonic()
-        with self._lock:
-            for late_s in (0.0, self._random.uniform(0.0, self._latest_s)):
-                heapq.heappush(self._due, (now_s + late_s, len(self._due), key, payload))
+        for late_s in (0.0, self._random.uniform(0.0, self._latest_s)):
+            self._due.enter(late_s, 0, self._send, (key, payload))
 
     def _send_due(self) -> None:
         while not self._stop.wait(0.01):
-            due = []
-            with self._lock:
-                while self._due and self._due[0][0] <= time.monotonic():
-                    due.append(heapq.heappop(self._due))
-            for _, _, key, payload in due:
-                if key not in self._publishers:
-                    self._publishers[key] = self._bus.publisher(key, topics.Qos.FRESH)
-                self._publishers[key].put(payload)
-                self.sent += 1
+            self._due.run(blocking=False)
 
-
-def send_flood(team: str, endpoint: str, robot: str, targets: list[str], stop: StopSignal) -> int:
-    """Sends all that a robot may send, far more often than it may; returns the number of messages.
-
-    The rate is bounded, because the flood of a robot on another machine would not take the
-    processor from the router and the robots of this one.
-
-    The messages are true, but their uncertainty is large, so that only their number does harm.
-    """
-    with open_bus(team, [endpoint], stop) as bus:
-        token = bus.declare_token(topics.ALIVE.at(tier=0, robot=robot, incarnation="f"))
-        keys = [topics.FIX.at(robot=name, tier=0, observer=robot) for name in targets]
-        fixes = [bus.publisher(key, topics.FIX.qos) for key in keys]
-        belief = bus.publisher(topics.BELIEF.at(tier=0, robot=robot), topics.BELIEF.qos)
-        status = bus.publisher(topics.STATUS.at(robot=robot), topics.STATUS.qos)
-        sent, begin_s = 0, time.monotonic()
-        while not stop():
-            time.sleep(max(0.0, sent / FLOOD_RATE_HZ - (time.monotonic() - begin_s)))
-            now_ns = time.time_ns()
-            belief.put(encode_help(Belief(robot, now_ns, 4.5, 2.5, 0.0, UNSURE)))
-            for name, publisher in zip(targets, fixes, strict=True):
-                area = (25.0, 0.0, 25.0)
-                publisher.put(encode_help(Fix(name, robot, now_ns, 4.5, 2.5, area, area)))
-            sent += 1 + len(fixes)
-            if sent % 100 == 0:
-                status.put(bytes(60_000))
-        token.close()
-    return sent
-
-
-def main(team: str, endpoint: str, parent: str, robot: str, *targets: str) -> None:
-    """`python -m cpcbl_launch.lab.chaos.injectors TEAM ENDPOINT PARENT ROBOT TARGET ...`"""
-    sent = send_flood(team, endpoint, robot, list(targets), StopSignal(int(parent)))
-    sys.stdout.write(f"{sent}\n")
-
-
-if __name__ == "__main__":
-    main(*sys.argv[1:])
+    def _send(self, key: str, payload: bytes) -> None:
+        if key not in self._publishers:
+            self._publishers[key] = self._bus.publisher(key, topics.Qos.FRESH)
+        self._publishers[key].put(payload)
+        self.sent += 1

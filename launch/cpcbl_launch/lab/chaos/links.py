@@ -2,7 +2,6 @@
 
 import asyncio
 import fcntl
-import heapq
 import os
 import random
 import select
@@ -10,7 +9,6 @@ import socket
 import struct
 import subprocess
 import threading
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple, Self
@@ -23,36 +21,29 @@ TUN = Path("/dev/net/tun")
 _SET_INTERFACE, _TUN_WITHOUT_HEADER = 0x400454CA, 0x1001
 _MTU = 1500
 
-Pieces = asyncio.Queue[tuple[float, bytes]]
-"""Bytes, each with its time to leave."""
+Pieces = asyncio.Queue[tuple[float, bytes]]  # bytes, each with its time to leave
 
 
 class LinkQuality(NamedTuple):
     """The quality of a link, in each direction."""
 
+    loss: float = 0.0
+    """The share of packets that are lost; for a `TunLink`, all else for a `Relay`."""
+    cut: bool = False
+    """Nothing passes and no connection is closed, as with an unplugged cable."""
+    bytes_per_s: float = 0.0
+    """0: no limit."""
     delay_s: float = 0.0
     jitter_s: float = 0.0
-    """The delay varies by up to this much, evenly distributed."""
-    bytes_per_s: float = 0.0
-    """0: no limit. Only a `Relay` has one."""
-    cut: bool = False
-    """Nothing passes a `Relay` and no connection is closed, as with an unplugged cable."""
-    loss: float = 0.0
-    """The share of packets that a `TunLink` loses."""
-
-    def delay(self, dice: random.Random) -> float:
-        """Draws a delay."""
-        return max(0.0, self.delay_s + dice.uniform(-self.jitter_s, self.jitter_s))
+    """The delay varies by up to this much, evenly distributed; nothing overtakes."""
 
 
 class Relay:
     """A TCP relay, which a client dials at `endpoint` instead of its router. Like TCP it carries
-    bytes in order, so that it can be silent, slow or narrow.
-    `quality` may be set from any thread, at any time; a cut also holds back what is on its way.
-    """
+    bytes in order, so that it can be silent, slow or narrow. `quality` may be set from
+    any thread, at any time; a cut also holds back what is on its way."""
 
-    prefix: tuple[str, ...] = ()
-    """What the client's command begins with."""
+    prefix: tuple[str, ...] = ()  # of the client's command
 
     def __init__(self, router: str, seed: int = 1) -> None:
         self._protocol, address = router.split("/")
@@ -110,7 +101,9 @@ class Relay:
         leaves_s, data = 0.0, b"?"
         while data:
             data = await source.read(CHUNK)
-            leaves_s = max(leaves_s, self._loop.time() + self.quality.delay(self._random))
+            jitter_s = self._random.uniform(-self.quality.jitter_s, self.quality.jitter_s)
+            delay_s = max(0.0, self.quality.delay_s + jitter_s)
+            leaves_s = max(leaves_s, self._loop.time() + delay_s)
             await pieces.put((leaves_s, data))
 
     async def _send(self, pieces: Pieces, sink: asyncio.StreamWriter, upward: bool) -> None:
@@ -135,9 +128,9 @@ class TunLink:
     only connection it is. `prefix` runs a command in it; the command finds what listens at
     `endpoint` on this machine.
 
-    This process forwards each packet from one interface to the other. It drops some packets and
-    delays some, so that they overtake each other, as on a radio link; the kernel's TCP copes with
-    that. It needs Linux and root, and changes no traffic control, firewall rule or other interface.
+    This process forwards packets from one interface to the other, and drops some; the kernel's TCP
+    copes with that. It needs Linux and root, and changes no traffic control, firewall rule or other
+    interface.
     """
 
     def __init__(self, seed: int = 1) -> None:
@@ -182,23 +175,15 @@ class TunLink:
         subprocess.run(["ip", "netns", "del", self._namespace], check=False, capture_output=True)
 
     def _carry(self) -> None:
-        """Forwards packets; each leaves at the other end when its time has come."""
-        waiting: list[tuple[float, int, int, bytes]] = []
+        other = dict(zip(self._ends, reversed(self._ends), strict=True))
         while not self._stop.is_set():
-            next_s = waiting[0][0] - time.monotonic() if waiting else 0.1
-            ready, _, _ = select.select(self._ends, [], [], min(max(next_s, 0.0), 0.1))
-            for end in ready:
-                packet, quality = os.read(end, 65_536), self.quality
-                if self._random.random() < quality.loss:
+            for end in select.select(self._ends, [], [], 0.1)[0]:
+                packet = os.read(end, 65_536)
+                if self._random.random() < self.quality.loss:
                     self.lost += 1
-                    continue
-                self.passed += 1
-                other = self._ends[1 - self._ends.index(end)]
-                leaves_s = time.monotonic() + quality.delay(self._random)
-                heapq.heappush(waiting, (leaves_s, self.passed, other, packet))
-            while waiting and waiting[0][0] <= time.monotonic():
-                _, _, end, packet = heapq.heappop(waiting)
-                os.write(end, packet)
+                else:
+                    self.passed += 1
+                    os.write(other[end], packet)
 
 
 def missing_tun() -> str:

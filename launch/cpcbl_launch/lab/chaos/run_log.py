@@ -24,7 +24,7 @@ from cpcbl_launch.reporting.metrics import (
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus
 from cpcbl_transport.decoding import decode
-from cpcbl_transport.messages import Status, Track, Truths
+from cpcbl_transport.messages import Status, Track, Trust, Truths
 
 FOUND_M = 0.3
 TRUTH_EVERY_NS = 80_000_000
@@ -227,15 +227,16 @@ class RunLog(NamedTuple):
 
     def distrusted_peers(self, robot: str) -> dict[str, str]:
         """The teammates that a robot distrusts by its latest status, and why."""
-        received = self.statuses.get(robot)
-        return {t.peer: t.reason for t in received[-1].status.trust if t.reason} if received else {}
+        return {trust.peer: trust.reason for trust in self._latest_trust(robot) if trust.reason}
 
     def reported_delay_s(self, robot: str, peer: str) -> float | None:
         """The least delay with which a teammate's messages reach a robot, by its latest status; it
         is negative if the teammate's clock is ahead."""
+        return next((t.late_s for t in self._latest_trust(robot) if t.peer == peer), None)
+
+    def _latest_trust(self, robot: str) -> Sequence[Trust]:
         received = self.statuses.get(robot)
-        trust = received[-1].status.trust if received else ()
-        return next((t.late_s for t in trust if t.peer == peer), None)
+        return received[-1].status.trust if received else ()
 
 
 def maximum(values: Iterable[float | None]) -> float | None:

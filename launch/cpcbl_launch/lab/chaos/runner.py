@@ -1,14 +1,18 @@
-"""Runs scenarios one after another, so that they do not disturb each other."""
+"""Runs scenarios one after another, so that they do not disturb each other; shows the outcomes."""
 
 import difflib
 import os
 import platform
 import subprocess
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from importlib.metadata import version
 
 from msgspec.structs import replace
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
 
 from cpcbl_launch.lab.chaos.checks import ChaosReport, Outcome
 from cpcbl_launch.lab.chaos.scenario import CannotRunError, Scenario, ScenarioOptions
@@ -19,6 +23,7 @@ from cpcbl_team.errors import InputError
 from cpcbl_transport.zenoh_bus import BusError
 
 ALL = "all"
+_VERDICT = {True: ("held", "green"), False: ("NOT HELD", "bold red"), None: ("not run", "yellow")}
 MOVED = {"fuzz": "it is a test now: run `make fuzz`, or `pytest tests/fuzz`, in a checkout"}
 
 
@@ -43,7 +48,7 @@ def run_scenario(scenario: Scenario, options: ScenarioOptions) -> Outcome:
         return replace(outcome, not_run=reason)
     began_s = time.monotonic()
     try:
-        found = scenario.run(options)
+        found = scenario.run(options._replace(fault=done))
         outcome = replace(outcome, checks=tuple(found.checks), remarks=found.remarks)
     except CannotRunError as error:
         return replace(outcome, not_run=str(error))
@@ -68,3 +73,86 @@ def run_scenarios(
     machine = f"{platform.system()} {platform.machine()}, {cores} cores, load {load:.1f}"
     own = version("cpcbl-team")
     return ChaosReport(version=own, seed=options.seed, machine=machine, outcomes=tuple(outcomes))
+
+
+# For people ---------------------------------------------------------------------------------------
+
+
+def print_scenarios(scenarios: tuple[Scenario, ...], console: Console) -> None:
+    """Prints the table of scenarios (`--list`)."""
+    shown = _table("scenario", "fault", "expectation", "needs")
+    for s in scenarios:
+        name = f"{s.name} (quick)" if s.quick else s.name
+        shown.add_row(Text(name), Text(s.done), Text(s.expectation), Text(s.needs.what))
+    console.print(shown)
+
+
+def print_faults(faults: ChaosReport, console: Console) -> None:
+    """Prints each scenario with its expectation, its figures, and whether its checks are met."""
+    shown = _table("scenario", "expectation", "measured (bound)", "")
+    for outcome in faults.outcomes:
+        told = Text(outcome.scenario), Text(outcome.expectation)
+        shown.add_row(*told, _measured_text(outcome), verdict(outcome))
+    console.print(shown)
+    for outcome in faults.outcomes:
+        for remark in outcome.remarks:
+            console.print(Text(f"{outcome.scenario}: {remark}", "dim"))
+    counts = Counter(verdict(outcome).plain for outcome in faults.outcomes)
+    summary = ", ".join(f"{counts[text]} {text}" for text, _ in _VERDICT.values() if counts[text])
+    console.print(Text(f"{summary}; {faults.machine}; seed {faults.seed}", "bold"))
+
+
+def verdict(outcome: Outcome) -> Text:
+    """The outcome as one coloured word."""
+    return Text(*_VERDICT[outcome.is_met])
+
+
+def _table(*columns: str) -> Table:
+    shown = Table(show_lines=True)
+    for column in columns:
+        shown.add_column(column, overflow="fold")
+    return shown
+
+
+def _measured_text(outcome: Outcome) -> Text:
+    if reason := outcome.not_run or outcome.failed:
+        return Text(reason, "yellow" if outcome.not_run else "red")
+    return Text("\n").join(Text(str(c), "" if c.is_met else "red") for c in outcome.checks)
+
+
+def markdown(faults: ChaosReport) -> Iterator[str]:
+    """The outcomes as lines of Markdown."""
+    yield "| scenario | fault | expectation | measured (bound) | |"
+    yield "|---|---|---|---|---|"
+    for o in faults.outcomes:
+        seen = o.not_run or o.failed or "; ".join(map(str, o.checks))
+        yield f"| `{o.scenario}` | {o.done} | {o.expectation} | {seen} | {verdict(o).plain} |"
+
+
+class Progress:
+    """Shows the progress: a line for the current step on a terminal, and a line for each scenario
+    that is done. A context manager."""
+
+    def __init__(self, console: Console, total: int) -> None:
+        self._console, self._total = console, total
+        self._status = console.status("")
+        self._name, self._count = "", 0
+
+    def __enter__(self) -> "Progress":
+        if self._console.is_terminal:
+            self._status.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._status.stop()
+
+    def began(self, scenario: Scenario) -> None:
+        self._name, self._count = scenario.name, self._count + 1
+        self.doing("starting")
+
+    def doing(self, what: str) -> None:
+        self._status.update(Text(f"{self._count}/{self._total} {self._name}: {what}"))
+
+    def done(self, outcome: Outcome) -> None:
+        line = Text(f"{self._count}/{self._total} {outcome.scenario}, {outcome.seconds:.0f} s: ")
+        self._console.print(line.append_text(verdict(outcome)))

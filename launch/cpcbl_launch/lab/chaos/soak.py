@@ -1,23 +1,17 @@
 """A soak test: faults in random order for any time, and what the processes hold afterwards."""
 
 import random
-from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from statistics import linear_regression, mean, median
 from typing import NamedTuple
 
+from cpcbl_launch.lab.chaos import injectors
 from cpcbl_launch.lab.chaos.checks import Check, at_most, equal_to
-from cpcbl_launch.lab.chaos.network import CUT, NARROW, SLOW, echo, flood, impair
-from cpcbl_launch.lab.chaos.processes import freeze, kill
+from cpcbl_launch.lab.chaos.expectations import checks_recovered
 from cpcbl_launch.lab.chaos.run_log import worst
-from cpcbl_launch.lab.chaos.scenario import (
-    FaultRun,
-    Injector,
-    ScenarioOptions,
-    ScenarioResult,
-    checks_recovered,
-)
+from cpcbl_launch.lab.chaos.scenario import FaultRun, ScenarioOptions, ScenarioResult
 from cpcbl_launch.lab.chaos.team import (
     FIELD,
     ROUTER,
@@ -28,14 +22,14 @@ from cpcbl_launch.lab.chaos.team import (
 )
 from cpcbl_launch.run.usage import MIB, process_usage, require_process_usage
 
-FAULTS: dict[str, Injector] = {
-    "kill": kill,
-    "freeze": freeze,
-    "cut": impair(CUT),
-    "slow": impair(SLOW),
-    "narrow": impair(NARROW),
-    "flood": flood,
-    "echo": echo,
+FAULTS = {
+    "kill": injectors.kill,
+    "freeze": injectors.freeze,
+    "cut": injectors.cut,
+    "slow": injectors.slow,
+    "narrow": injectors.narrow,
+    "flood": injectors.flood,
+    "echo": injectors.echo,
 }
 SAMPLE_S = 5.0
 REST_S = (3.0, 9.0)
@@ -48,12 +42,10 @@ STUCK_S = 30.0
 
 
 class ProcessSample(NamedTuple):
-    """The memory and open files of a process at one time."""
+    """The memory and the number of open files of a process at one time."""
 
     at_s: float
-    process: str
-    pid: int
-    own_bytes: int
+    mib: float
     files: int
 
 
@@ -119,14 +111,11 @@ def soak_checks(
     ]
 
 
-def process_lives(samples: Iterable[ProcessSample]) -> list[ProcessLife]:
-    """The processes that ran long enough to show whether their memory grows."""
-    by_pid: dict[tuple[str, int], list[ProcessSample]] = {}
-    for sample in samples:
-        by_pid.setdefault((sample.process, sample.pid), []).append(sample)
+def process_lives(samples: Mapping[tuple[str, int], Sequence[ProcessSample]]) -> list[ProcessLife]:
+    """The processes that ran long enough to show whether their memory grows, by their samples."""
     return [
         _life(process, kept)
-        for (process, _), kept in by_pid.items()
+        for (process, _), kept in samples.items()
         if kept[-1].at_s - kept[0].at_s >= LEAST_LIFE_S
     ]
 
@@ -136,13 +125,12 @@ def _life(process: str, samples: Sequence[ProcessSample]) -> ProcessLife:
     warm = [s for s in samples if s.at_s >= begin_s + WARM_S]
     first = [s for s in warm if s.at_s <= begin_s + WARM_S + SPAN_S]
     last = [s for s in warm if s.at_s >= end_s - SPAN_S]
-    mib = [s.own_bytes / MIB for s in warm]
     return ProcessLife(
         process,
         end_s - begin_s,
-        median(s.own_bytes for s in first) / MIB,
-        median(s.own_bytes for s in last) / MIB,
-        60.0 * linear_regression([s.at_s for s in warm], mib).slope,
+        median(s.mib for s in first),
+        median(s.mib for s in last),
+        60.0 * linear_regression([s.at_s for s in warm], [s.mib for s in warm]).slope,
         int(median(s.files for s in last) - median(s.files for s in first)),
     )
 
@@ -154,7 +142,8 @@ class _FaultSequence:
         self._team, self._options = team, options
         self._random = random.Random(options.seed)
         self._sampled_s = 0.0
-        self.samples: list[ProcessSample] = []
+        self.samples = defaultdict[tuple[str, int], list[ProcessSample]](list)
+        """By name and id of the process."""
         self.counts: Counter[str] = Counter()
 
     def run(self) -> None:
@@ -186,10 +175,10 @@ class _FaultSequence:
             for process, pid in self._team.supervisor.pids.items():
                 try:
                     files = len(list(Path(f"/proc/{pid}/fd").iterdir()))
-                    own_bytes = process_usage(pid).own_bytes
+                    mib = process_usage(pid).own_bytes / MIB
                 except (OSError, KeyError):  # it ends just now
                     continue
-                self.samples.append(ProcessSample(now_s, process, pid, own_bytes, files))
+                self.samples[process, pid].append(ProcessSample(now_s, mib, files))
         return False
 
 

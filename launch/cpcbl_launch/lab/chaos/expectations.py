@@ -1,0 +1,288 @@
+"""What is expected of a team with a fault: the checks of each scenario."""
+
+from collections.abc import Sequence
+
+from cpcbl_launch.lab.chaos.checks import Check, at_least, at_most, equal_to
+from cpcbl_launch.lab.chaos.run_log import FOUND_M, RunLog, maximum, worst
+from cpcbl_launch.lab.chaos.scenario import FaultRun
+from cpcbl_transport.messages import Refusal
+
+GOOD_M = 0.15  # the demonstration has 0.03 m; the blind scout without help 0.1 m after some seconds
+LATE_S = 1.0  # later than any track should come
+FINDERS = 2  # of three that drive; one may be out of the liar's sight for long
+
+
+def check_token_gone(run: FaultRun, within_s: float) -> Check:
+    """Teammates notice that the robot's token has disappeared."""
+    gone_s = run.log.token_gone_after_s(run.robot, run.fault_s)
+    return at_most("its token disappeared after", gone_s, within_s, "s")
+
+
+def checks_unaffected(
+    log: RunLog,
+    robots: Sequence[str],
+    from_s: float,
+    until_s: float,
+    *,
+    most_silent_s: float = 1.0,
+    most_m: float = FOUND_M,
+    who: str = "others'",
+) -> list[Check]:
+    """These robots publish tracks at 10 Hz all the time, and are localized."""
+    gap_s = worst(log.longest_track_gap_s, robots, from_s, until_s)
+    rmse_m = worst(log.position_rmse_m, robots, from_s, until_s)
+    return [
+        at_most(f"{who} longest gap between tracks", gap_s, most_silent_s, "s"),
+        at_most(f"{who} worst RMSE", rmse_m, most_m, "m"),
+    ]
+
+
+def checks_recovered(run: FaultRun, from_s: float) -> list[Check]:
+    """From then on to the end, all robots are as accurate and consistent as before the fault."""
+    rmse_m = worst(run.log.position_rmse_m, run.robots, from_s, run.end_s)
+    share = run.log.inside_3_sigma(run.robots, from_s, run.end_s)
+    return [
+        at_most("RMSE afterwards, worst robot", rmse_m, GOOD_M, "m"),
+        at_least("inside 3 σ afterwards", share, 0.9, "%"),
+    ]
+
+
+# Processes ----------------------------------------------------------------------------------------
+
+
+def _back_after_s(run: FaultRun) -> tuple[float | None, float | None]:
+    """(from the fault until a new process of the robot started, from then until it was
+    localized)."""
+    back_s = run.log.token_back_after_s(run.robot, run.fault_s, run.incarnation)
+    if back_s is None:
+        return None, None
+    return back_s, run.log.localized_after_s(run.robot, run.fault_s + back_s)
+
+
+def is_back(run: FaultRun) -> bool:
+    """Whether a new process of the robot is localized."""
+    return _back_after_s(run)[1] is not None
+
+
+def kill(run: FaultRun) -> list[Check]:
+    """The robot's token disappears at once, it starts again and is localized; the others
+    continue."""
+    back_s, found_s = _back_after_s(run)
+    return [
+        check_token_gone(run, 1.0),
+        at_most("a new process started after", back_s, 10.0, "s"),
+        at_most("from then until it was localized", found_s, 15.0, "s"),
+        *checks_unaffected(run.log, run.others, *run.window_s),
+        *checks_recovered(run, run.healed_s),
+    ]
+
+
+def freeze(run: FaultRun) -> list[Check]:
+    """A suspended robot disappears like a dead one, and does no harm when it resumes."""
+    log, woke_s = run.log, run.healed_s
+    track_s = log.first_track_after_s(run.robot, woke_s)
+    found_s = log.localized_after_s(run.robot, woke_s)
+    late = log.late_track_count(run.robot, woke_s, LATE_S)
+    error_m = worst(log.largest_position_error_m, run.others, woke_s, woke_s + 4.0)
+    return [
+        check_token_gone(run, 4.0),
+        *checks_unaffected(log, run.others, *run.window_s),
+        at_most("from waking to its first new track", track_s, 3.0, "s"),
+        at_most("from waking until it was localized", found_s, 5.0, "s"),
+        at_most(f"tracks that arrived more than {LATE_S:g} s late", late, 10),
+        at_most("others' largest error in the 4 s after it woke", error_m, 0.5, "m"),
+        *checks_recovered(run, woke_s + 4.0),
+    ]
+
+
+def have_all_published(run: FaultRun) -> bool:
+    """Whether every robot has published a track since the fault."""
+    return worst(run.log.first_track_after_s, run.robots, run.fault_s + 0.5) is not None
+
+
+def kill_router(run: FaultRun) -> list[Check]:
+    """Nothing arrives without a router; with the new one, all is as before."""
+    log, robots = run.log, run.robots
+    gap_s = worst(log.longest_track_gap_s, robots, run.fault_s, run.end_s)
+    back = {t.robot for t in log.tokens if t.at_s >= run.fault_s and t.alive} & set(robots)
+    helped = sum(log.counts_between(name, run.healed_s)["messages_received"] for name in robots)
+    return [
+        at_most("longest gap between tracks", gap_s, 6.0, "s"),
+        at_least("robots with a token at the new router", len(back), len(robots)),
+        at_least(f"help received in the {run.end_s - run.healed_s:.0f} s after", helped, 20),
+        *checks_recovered(run, run.healed_s),
+    ]
+
+
+def _all_found_after_s(run: FaultRun) -> float | None:
+    return worst(run.log.localized_after_s, run.robots, run.restarted_s + 1.0)
+
+
+def all_are_back(run: FaultRun) -> bool:
+    """Whether all robots are localized in the new world."""
+    return _all_found_after_s(run) is not None
+
+
+def kill_field(run: FaultRun) -> list[Check]:
+    """The robots continue without inputs, and localize themselves in the new world."""
+    gap_s = worst(run.log.longest_track_gap_s, run.robots, *run.window_s)
+    return [
+        at_most("longest gap between tracks", gap_s, 1.5, "s"),
+        at_most("a new field started after", run.restarted_s - run.fault_s, 10.0, "s"),
+        at_most("from then until all were localized", _all_found_after_s(run), 20.0, "s"),
+        *checks_recovered(run, run.healed_s),
+    ]
+
+
+# Links and messages -------------------------------------------------------------------------------
+
+
+def partition(run: FaultRun, most_far_m: float = FOUND_M) -> list[Check]:
+    """Each side notices that the other is missing, and continues; within 5 s they are one team
+    again."""
+    assert run.far_log is not None
+    near_log, far_log, far = run.log, run.far_log, run.far
+    near = [name for name in run.robots if name not in far]
+    sides = ((near_log, far), (far_log, near))
+    gone_s = maximum(worst(log.token_gone_after_s, away, run.fault_s) for log, away in sides)
+    back_s = maximum(worst(log.token_back_after_s, away, run.healed_s) for log, away in sides)
+    helped = [far_log.first_help_after_s(name, near, run.healed_s) for name in far]
+    helped_s = min((s for s in helped if s is not None), default=None)
+    return [
+        at_most("other side's tokens disappeared after", gone_s, 4.0, "s"),
+        *checks_unaffected(near_log, near, *run.window_s, who="near side's"),
+        *checks_unaffected(far_log, far, *run.window_s, most_m=most_far_m, who="far side's"),
+        at_most("from healing to all tokens back", back_s, 5.0, "s"),
+        at_most("from healing to the first help", helped_s, 5.0, "s"),
+        *checks_recovered(run, run.healed_s + 5.0),
+    ]
+
+
+def cut_link(run: FaultRun) -> list[Check]:
+    """A robot whose link is silent disappears, and is back when its link is."""
+    back_s = run.log.token_back_after_s(run.robot, run.healed_s)
+    found_s = run.log.localized_after_s(run.robot, run.healed_s)
+    return [
+        check_token_gone(run, 4.0),
+        *checks_unaffected(run.log, run.others, run.fault_s, run.healed_s),
+        at_most("from healing to its token back", back_s, 5.0, "s"),
+        at_most("from healing until it was localized", found_s, 8.0, "s"),
+        *checks_recovered(run, run.healed_s + 5.0),
+    ]
+
+
+def bad_link(
+    run: FaultRun, most_silent_s: float = 2.0, most_late_s: float = 1.5, most_m: float = FOUND_M
+) -> list[Check]:
+    """A robot with an impaired link stays localized and receives help later; the others are not
+    affected."""
+    log = run.log
+    gap_s = log.longest_track_gap_s(run.robot, *run.window_s)
+    delay_s = log.track_delay_s(run.robot, *run.window_s)
+    helped = log.counts_between(run.robot, *run.window_s)["messages_received"]
+    others_delay_s = worst(log.track_delay_s, run.others, *run.window_s)
+    return [
+        at_most("its longest gap between tracks", gap_s, most_silent_s, "s"),
+        at_most("its tracks' delay, 99th percentile", delay_s, most_late_s, "s"),
+        at_most("its RMSE", log.position_rmse_m(run.robot, *run.window_s), most_m, "m"),
+        at_least("help messages that it received", helped, 20),
+        *checks_unaffected(log, run.others, *run.window_s),
+        at_most("others' delay, 99th percentile", others_delay_s, 0.5, "s"),
+        *checks_recovered(run, run.healed_s + 3.0),
+    ]
+
+
+def duplicates(run: FaultRun) -> list[Check]:
+    """Copies and late messages change nothing and are counted."""
+    counts = [run.log.counts_between(name, run.fault_s, run.end_s) for name in run.robots]
+    return [
+        at_least("copies sent", run.sent, 200),
+        at_least("counted as duplicate", sum(c["duplicate"] for c in counts), 50),
+        at_least("counted as too late", sum(c["too_late"] for c in counts), 20),
+        *checks_unaffected(run.log, run.robots, run.fault_s, run.end_s, who="team's"),
+        *checks_recovered(run, run.fault_s),
+    ]
+
+
+def flood(run: FaultRun) -> list[Check]:
+    """The router limits what a robot may send; the other robots work as before."""
+    log, seconds = run.log, run.healed_s - run.fault_s
+    received = max(log.counts_between(r, *run.window_s)["messages_received"] for r in run.others)
+    delay_s = worst(log.track_delay_s, run.others, *run.window_s)
+    return [
+        at_least("rate of the flood", run.sent / seconds, 1000.0, "messages/s"),
+        at_most("most received by one robot", received / seconds, 200.0, "messages/s"),
+        *checks_unaffected(log, run.others, *run.window_s, most_silent_s=2.0),
+        at_most("others' delay, 99th percentile", delay_s, 1.0, "s"),
+        *checks_recovered(run, run.healed_s + 1.0),
+    ]
+
+
+# The simulated world ------------------------------------------------------------------------------
+
+
+def kidnap(run: FaultRun) -> list[Check]:
+    """The robot reports that it is lost, is localized again, and misleads nobody."""
+    log, robot = run.log, run.robot
+    at_s, moved_m = log.first_position_jump(robot) or (run.end_s, 0.0)
+    lost_s = log.reported_lost_after_s(robot, at_s)
+    believed = [name for name in run.robots if not log.distrusted_peers(name)]
+    return [
+        at_least("distance of the kidnapping", moved_m, 2.9, "m"),
+        at_most("it reported that it was lost after", lost_s, 3.0, "s"),
+        at_most("it was localized after", log.localized_after_s(robot, at_s), 8.0, "s"),
+        *checks_unaffected(log, run.others, at_s, run.end_s),
+        *checks_recovered(run, at_s + 8.0),
+        at_least("robots that trust all others at the end", len(believed), len(run.robots)),
+    ]
+
+
+def hidden_landmarks(run: FaultRun) -> list[Check]:
+    """The team's error stays small and its stated uncertainty consistent; then all are
+    localized."""
+    share = run.log.inside_3_sigma(run.robots, *run.window_s)
+    back_s = worst(run.log.localized_after_s, run.robots, run.healed_s)
+    return [
+        *checks_unaffected(run.log, run.robots, *run.window_s, most_m=0.5, who="team's"),
+        at_least("inside 3 σ while landmarks are hidden", share, 0.9, "%"),
+        at_most("all were localized after", back_s, 8.0, "s"),
+        *checks_recovered(run, run.healed_s + 3.0),
+    ]
+
+
+def clock(run: FaultRun, tolerated: str) -> list[Check]:
+    """The robots refuse and report help with a wrong clock; they use help with a slightly wrong
+    one."""
+    log, others = run.log, run.others
+    found = [log.distrust_reported_at_s(name, run.robot, reason="clock") for name in others]
+    known = [at_s for at_s in found if at_s is not None]
+    counts = [log.latest_counts(name) for name in others]
+    refused = sum(count[Refusal.CLOCK] + count[Refusal.FUTURE] for count in counts)
+    blamed = [name for name in others if log.distrusted_peers(name).get(tolerated) == "clock"]
+    return [
+        at_least("robots that report that its clock is wrong", len(known), 1),
+        at_most("last of these reports at", max(known, default=None), 15.0, "s"),
+        at_least("refused help messages from it", refused, 20),
+        at_most(f"robots that report that {tolerated}'s clock is wrong", len(blamed), 0),
+        *checks_unaffected(log, others, *run.window_s, most_m=1.0),
+        at_least("others inside 3 σ", log.inside_3_sigma(others, *run.window_s), 0.9, "%"),
+        at_most("its own RMSE", log.position_rmse_m(run.robot, *run.window_s), FOUND_M, "m"),
+    ]
+
+
+def faulty_robot(run: FaultRun, listeners: Sequence[str]) -> list[Check]:
+    """The robots that it misleads quarantine it, it does little harm, and is trusted again
+    later."""
+    log, liar = run.log, run.robot
+    found = [log.distrust_reported_at_s(name, liar, *run.window_s) for name in listeners]
+    known = sorted(at_s - run.fault_s for at_s in found if at_s is not None)
+    last_s = known[FINDERS - 1] if len(known) >= FINDERS else None
+    rmse_m = worst(log.position_rmse_m, listeners, *run.window_s)
+    distrust = sum(liar in log.distrusted_peers(name) for name in run.robots)
+    return [
+        at_least("robots that quarantined it", len(known), FINDERS),
+        at_most("quarantined by two robots after", last_s, 10.0, "s"),
+        at_most("worst RMSE during the fault", rmse_m, GOOD_M, "m"),
+        equal_to("robots that still distrust it 20 s later", distrust, 0),
+        *checks_unaffected(log, run.robots, *run.window_s),
+    ]
