@@ -6,11 +6,12 @@ from typing import Any
 import numpy as np
 
 from cpcbl_launch.lab.chaos.checks import Check
-from cpcbl_launch.lab.chaos.run_log import ReceivedStatus, ReceivedTrack, RunLog, TokenEvent
+from cpcbl_launch.lab.chaos.run_log import ReceivedTrack, RunLog, TokenEvent
 from cpcbl_launch.lab.chaos.scenario import FaultRun
 from cpcbl_transport.messages import Flow, Status, Track, Trust
 from support.buses import SECOND
 
+StatusAt = tuple[float, Status]
 EPOCH_NS = 1_000_000 * SECOND
 FAULT_S, UNTIL_S = 10.0, 85.0
 TENTHS = tuple(round(0.1 * n, 1) for n in range(int(10 * UNTIL_S)))
@@ -57,7 +58,7 @@ def status_at(
     heard: Sequence[tuple[str, float]] = (),
     trust: Sequence[tuple[str, str]] = (),
     incarnation: str = "1",
-) -> ReceivedStatus:
+) -> StatusAt:
     """`heard`: (peer, time of its latest help); `trust`: (peer, reason)."""
     stamp_ns = EPOCH_NS + round(at_s * SECOND)
     flows = tuple(
@@ -65,7 +66,7 @@ def status_at(
     )
     counted = dict(counts or {})
     received = counted.pop("messages_received", 0)
-    return ReceivedStatus(
+    return (
         at_s,
         Status(
             robot,
@@ -89,7 +90,7 @@ def status_at(
 def run_log_of(
     tracks: Sequence[Sequence[ReceivedTrack]],
     tokens: Sequence[TokenEvent] = (),
-    statuses: Sequence[ReceivedStatus] = (),
+    statuses: Sequence[StatusAt] = (),
     jump: tuple[str, float, float] | None = None,
 ) -> RunLog:
     """The log of a run; `jump`: (robot, time, metres) of a jump of its true position."""
@@ -99,9 +100,9 @@ def run_log_of(
         robot, at_s, metres = jump
         moved = rows[robot][:, 0] >= at_s
         rows[robot][moved, 1] += metres
-    received: dict[str, list[ReceivedStatus]] = {}
+    received: dict[str, list[StatusAt]] = {}
     for one in statuses:
-        received.setdefault(one.status.robot, []).append(one)
+        received.setdefault(one[1].robot, []).append(one)
     return RunLog(EPOCH_NS, by_robot, received, tuple(tokens), rows)
 
 

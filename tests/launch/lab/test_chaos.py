@@ -18,7 +18,7 @@ from support.buses import Subscription, wait_until
 from support.processes import command_line, cpcbl_team, eventually, pids_of
 
 from cpcbl_launch.lab.chaos.checks import Check, Outcome
-from cpcbl_launch.lab.chaos.injectors import Echo
+from cpcbl_launch.lab.chaos.injectors import echoes
 from cpcbl_launch.lab.chaos.links import LinkQuality, Relay, TunLink, missing_tun
 from cpcbl_launch.lab.chaos.runner import run_scenario, run_scenarios, select_scenarios
 from cpcbl_launch.lab.chaos.scenario import (
@@ -279,15 +279,15 @@ def test_an_echo_sends_every_message_twice_more() -> None:
         open_router("tests", [endpoint]),
         open_bus("tests", [endpoint]) as speaker,
         open_bus("tests", [endpoint]) as listener,
-        open_bus("tests", [endpoint]) as echoes,
+        open_bus("tests", [endpoint]) as echo_bus,
     ):
         ear, publisher = Subscription(listener, key), speaker.publisher(key, Qos.INPUT)
         wait_until(lambda: publisher.matching)
-        with Echo(echoes, "b", latest_s=0.5, seed=1) as echo:
+        with echoes(echo_bus, "b", latest_s=0.5, seed=1) as copies:
 
             def echoed() -> bool:  # its subscription cannot be told from the listener's
                 publisher.put(b"")
-                return echo.sent > 0
+                return copies.total() > 0
 
             wait_until(echoed)
             for n in range(20):

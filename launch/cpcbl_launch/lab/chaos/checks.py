@@ -36,17 +36,14 @@ class Check(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def at_most(what: str, seen: float | None, bound: float, unit: str = "") -> Check:
-    """A figure that must not exceed its bound."""
     return Check(what=what, seen=seen, unit=unit, at_most=bound)
 
 
 def at_least(what: str, seen: float | None, bound: float, unit: str = "") -> Check:
-    """A figure that must reach its bound."""
     return Check(what=what, seen=seen, unit=unit, at_least=bound)
 
 
 def equal_to(what: str, seen: float | None, value: float) -> Check:
-    """A figure that must have this value."""
     return Check(what=what, seen=seen, at_least=value, at_most=value)
 
 

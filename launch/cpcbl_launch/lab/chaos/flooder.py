@@ -13,13 +13,15 @@ FLOOD_RATE_HZ = 2500.0
 UNSURE = (25.0, 0.0, 25.0, 0.0, 0.0, 1.0)
 
 
-def send_flood(team: str, endpoint: str, robot: str, targets: list[str], stop: StopSignal) -> int:
-    """Sends all that a robot may send, far more often than it may; returns the number of messages.
+def main(team: str, endpoint: str, parent: str, robot: str, *targets: str) -> None:
+    """`python -m cpcbl_launch.lab.chaos.flooder TEAM ENDPOINT PARENT ROBOT TARGET ...`
 
-    The rate is bounded, because the flood of a robot on another machine would not take the
-    processor from the router and the robots of this one. The messages are true, but their
-    uncertainty is large, so that only their number does harm.
+    Sends all that a robot may send, far more often than it may; prints the number of messages. The
+    rate is bounded, because the flood of a robot on another machine would not take the processor
+    from the router and the robots of this one. The messages are true, but their uncertainty is
+    large, so that only their number does harm.
     """
+    stop = StopSignal(int(parent))
     with open_bus(team, [endpoint], stop) as bus:
         token = bus.declare_token(topics.ALIVE.at(tier=0, robot=robot, incarnation="f"))
         keys = [topics.FIX.at(robot=name, tier=0, observer=robot) for name in targets]
@@ -38,12 +40,6 @@ def send_flood(team: str, endpoint: str, robot: str, targets: list[str], stop: S
             if sent % 100 == 0:
                 status.put(bytes(60_000))
         token.close()
-    return sent
-
-
-def main(team: str, endpoint: str, parent: str, robot: str, *targets: str) -> None:
-    """`python -m cpcbl_launch.lab.chaos.flooder TEAM ENDPOINT PARENT ROBOT TARGET ...`"""
-    sent = send_flood(team, endpoint, robot, list(targets), StopSignal(int(parent)))
     sys.stdout.write(f"{sent}\n")
 
 

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import threading
 import time
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -82,45 +83,42 @@ def echo(team: TeamUnderTest, run: FaultRun) -> Iterator[None]:
     """Repeats all help of a robot at once, and again up to 4 s late."""
     with (
         open_bus(team.plan.team.name, [team.endpoint]) as bus,
-        Echo(bus, run.robot, LATEST_S, team.plan.seed) as copies,
+        echoes(bus, run.robot, LATEST_S, team.plan.seed) as sent,
     ):
         yield
-    run.sent = copies.sent
+    run.sent = sent.total()
 
 
-class Echo:
+@contextmanager
+def echoes(bus: Bus, robot: str, latest_s: float, seed: int) -> Iterator[Counter[str]]:
     """Sends the help of one robot again, once at once and once up to `latest_s` later, so that
-    messages lose their order. A context manager."""
+    messages lose their order. Counts the copies by their key."""
+    dice, due, stop = random.Random(seed), sched.scheduler(time.monotonic), threading.Event()
+    publishers: dict[str, Publisher] = {}
+    sent: Counter[str] = Counter()
 
-    def __init__(self, bus: Bus, robot: str, latest_s: float, seed: int) -> None:
-        self._bus, self._latest_s, self._random = bus, latest_s, random.Random(seed)
-        self._keys = (topics.FIX.at(observer=robot), topics.BELIEF.at(robot=robot))
-        self._publishers: dict[str, Publisher] = {}
-        self._due, self._stop = sched.scheduler(time.monotonic), threading.Event()
-        self.sent = 0
+    def receive(key: str, payload: bytes) -> None:
+        for late_s in (0.0, dice.uniform(0.0, latest_s)):
+            due.enter(late_s, 0, send, (key, payload))
 
-    def __enter__(self) -> "Echo":
-        self._handles = [self._bus.subscribe(key, self._receive) for key in self._keys]
-        self._thread = threading.Thread(target=self._send_due, daemon=True)
-        self._thread.start()
-        return self
+    def send(key: str, payload: bytes) -> None:
+        if key not in publishers:
+            publishers[key] = bus.publisher(key, topics.Qos.FRESH)
+        publishers[key].put(payload)
+        sent[key] += 1
 
-    def __exit__(self, *_: object) -> None:
-        for handle in self._handles:
+    def send_due() -> None:
+        while not stop.wait(0.01):
+            due.run(blocking=False)
+
+    keys = (topics.FIX.at(observer=robot), topics.BELIEF.at(robot=robot))
+    handles = [bus.subscribe(key, receive) for key in keys]
+    thread = threading.Thread(target=send_due, daemon=True)
+    thread.start()
+    try:
+        yield sent
+    finally:
+        for handle in handles:
             handle.close()
-        self._stop.set()
-        self._thread.join()
-
-    def _receive(self, key: str, payload: bytes) -> None:
-        for late_s in (0.0, self._random.uniform(0.0, self._latest_s)):
-            self._due.enter(late_s, 0, self._send, (key, payload))
-
-    def _send_due(self) -> None:
-        while not self._stop.wait(0.01):
-            self._due.run(blocking=False)
-
-    def _send(self, key: str, payload: bytes) -> None:
-        if key not in self._publishers:
-            self._publishers[key] = self._bus.publisher(key, topics.Qos.FRESH)
-        self._publishers[key].put(payload)
-        self.sent += 1
+        stop.set()
+        thread.join()

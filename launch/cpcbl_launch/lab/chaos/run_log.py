@@ -38,13 +38,6 @@ class ReceivedTrack(NamedTuple):
     track: Track
 
 
-class ReceivedStatus(NamedTuple):
-    """A status, and when it arrived."""
-
-    at_s: float
-    status: Status
-
-
 class TokenEvent(NamedTuple):
     """A robot's liveliness token appeared or disappeared."""
 
@@ -61,7 +54,8 @@ class RunLog(NamedTuple):
 
     epoch_ns: int
     tracks: Mapping[str, Sequence[ReceivedTrack]]
-    statuses: Mapping[str, Sequence[ReceivedStatus]]
+    statuses: Mapping[str, Sequence[tuple[float, Status]]]
+    """Each with the time at which it arrived."""
     tokens: Sequence[TokenEvent]
     truth: Mapping[str, Floats]
     """Rows of seconds, x, y, heading, by robot."""
@@ -207,7 +201,7 @@ class RunLog(NamedTuple):
     def latest_counts(self, robot: str) -> Counter[str]:
         """The counts of the robot's latest process, by its latest status."""
         received = self.statuses.get(robot)
-        return _counts(received[-1].status) if received else Counter()
+        return _counts(received[-1][1]) if received else Counter()
 
     def distrust_reported_at_s(
         self,
@@ -227,16 +221,12 @@ class RunLog(NamedTuple):
 
     def distrusted_peers(self, robot: str) -> dict[str, str]:
         """The teammates that a robot distrusts by its latest status, and why."""
-        return {trust.peer: trust.reason for trust in self._latest_trust(robot) if trust.reason}
+        return {trust.peer: trust.reason for trust in self.latest_trust(robot) if trust.reason}
 
-    def reported_delay_s(self, robot: str, peer: str) -> float | None:
-        """The least delay with which a teammate's messages reach a robot, by its latest status; it
-        is negative if the teammate's clock is ahead."""
-        return next((t.late_s for t in self._latest_trust(robot) if t.peer == peer), None)
-
-    def _latest_trust(self, robot: str) -> Sequence[Trust]:
+    def latest_trust(self, robot: str) -> Sequence[Trust]:
+        """What a robot makes of its teammates by its latest status."""
         received = self.statuses.get(robot)
-        return received[-1].status.trust if received else ()
+        return received[-1][1].trust if received else ()
 
 
 def maximum(values: Iterable[float | None]) -> float | None:
@@ -271,7 +261,7 @@ class RunRecorder:
         self._clock, self._lock = clock, threading.Lock()
         self._ahead_s = ahead_s
         self._tracks: dict[str, list[ReceivedTrack]] = {}
-        self._statuses: dict[str, list[ReceivedStatus]] = {}
+        self._statuses: dict[str, list[tuple[float, Status]]] = {}
         self._tokens: list[TokenEvent] = []
         self._rows: dict[str, list[tuple[float, float, float, float]]] = {}
         self._truth_ns = 0
@@ -306,7 +296,7 @@ class RunRecorder:
                     track = ReceivedTrack(at_s, stamp_s, message)
                     _add(self._tracks.setdefault(robot, []), track)
                 case Status(robot=robot):
-                    _add(self._statuses.setdefault(robot, []), ReceivedStatus(at_s, message))
+                    _add(self._statuses.setdefault(robot, []), (at_s, message))
                 case Truths() if self._is_next(message):
                     self._truth_ns = message.stamp_ns
                     stamp_s = self._robot_time_s(message.stamp_ns)
@@ -331,7 +321,7 @@ class RunRecorder:
             )
 
 
-_Received = TypeVar("_Received", ReceivedTrack, ReceivedStatus)
+_Received = TypeVar("_Received", ReceivedTrack, tuple[float, Status])
 
 
 def _add(kept: list[_Received], new: _Received) -> None:

@@ -24,15 +24,15 @@ from cpcbl_transport.zenoh_bus import BusError
 
 ALL = "all"
 _VERDICT = {True: ("held", "green"), False: ("NOT HELD", "bold red"), None: ("not run", "yellow")}
-MOVED = {"fuzz": "it is a test now: run `make fuzz`, or `pytest tests/fuzz`, in a checkout"}
+FUZZ = "chaos: fuzz: it is a test now: run `make fuzz`, or `pytest tests/fuzz`, in a checkout"
 
 
 def select_scenarios(names: Sequence[str]) -> list[Scenario]:
     """The scenarios with these names, or `all`, in the order of the table. Raises InputError."""
     known = {scenario.name: scenario for scenario in SCENARIOS}
     for name in names:
-        if name in MOVED:
-            raise InputError(f"chaos: {name}: {MOVED[name]}")
+        if name == "fuzz":
+            raise InputError(FUZZ)
         if name not in known and name != ALL:
             close = difflib.get_close_matches(name, known, 1)
             hint = f"did you mean {close[0]}?" if close else f"one of {', '.join(known)}, {ALL}"

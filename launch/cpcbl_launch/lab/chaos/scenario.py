@@ -148,5 +148,6 @@ class TeamFault(msgspec.Struct, frozen=True):
 
 
 def _updated(run: FaultRun, team: TeamUnderTest) -> FaultRun:
-    run.log, run.far_log, run.end_s = team.run_log, team.far_log, team.now_s
+    run.log, run.end_s = team.run_log, team.now_s
+    run.far_log = team.far_log if run.far else None
     return run

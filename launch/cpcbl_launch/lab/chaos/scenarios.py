@@ -55,8 +55,8 @@ def packets(team: TeamUnderTest, run: FaultRun) -> str:
 
 
 def clock_offsets(team: TeamUnderTest, run: FaultRun) -> str:
-    delays_s = [run.log.reported_delay_s(name, run.robot) for name in run.others]
-    offsets = ", ".join(f"{-s:.2f} s" for s in delays_s if s is not None)
+    trust = (trust for name in run.others for trust in run.log.latest_trust(name))
+    offsets = ", ".join(f"{-t.late_s:.2f} s" for t in trust if t.peer == run.robot)
     return f"the other robots estimate that its clock is ahead by {offsets}"
 
 
