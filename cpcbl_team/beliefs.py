@@ -32,6 +32,16 @@ def extrapolated(belief: Belief, at_ns: int) -> Pose2:
     return step(pose, belief.speed_m_s * age, belief.turn_rate_rad_s * age)
 
 
+def nearest_belief(
+    beliefs: Iterable[Belief], at_ns: int, settings: CollaborationSettings
+) -> tuple[float, Belief] | None:
+    """The belief nearest to a time, and its age then (s); None if all are too old, or too late."""
+    before_s = BELIEF_VALID_BEFORE_NS * 1e-9
+    ages = (((at_ns - b.stamp_ns) * 1e-9, b) for b in beliefs)
+    usable = [(age, b) for age, b in ages if -before_s <= age <= settings.max_age_s]
+    return min(usable, key=lambda pair: abs(pair[0])) if usable else None
+
+
 def teammate_at(
     beliefs: Iterable[Belief], at_ns: int, settings: CollaborationSettings
 ) -> ObjectPosition | None:
@@ -40,12 +50,10 @@ def teammate_at(
     A third of the extrapolated distance is added to its sigma, because it may have stopped or
     turned. None if all of its beliefs are too old, or too late.
     """
-    before_s = BELIEF_VALID_BEFORE_NS * 1e-9
-    ages = (((at_ns - b.stamp_ns) * 1e-9, b) for b in beliefs)
-    usable = [(age, b) for age, b in ages if -before_s <= age <= settings.max_age_s]
-    if not usable:
+    nearest = nearest_belief(beliefs, at_ns, settings)
+    if nearest is None:
         return None
-    age, belief = min(usable, key=lambda pair: abs(pair[0]))
+    age, belief = nearest
     pose = extrapolated(belief, at_ns)
     covariance = Covariance3(*belief.covariance)
     jacobian = (1.0, 0.0, belief.y_m - pose.y, 0.0, 1.0, pose.x - belief.x_m, 0.0, 0.0, 1.0)

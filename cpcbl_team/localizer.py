@@ -78,7 +78,7 @@ class Localizer:
         self._variant = variant_of(settings)
         self._landmarks = Landmarks(field, settings, gates)
         self._recovery = Recovery(rules, field, self._landmarks, self._variant.reduce)
-        self._screen = TeammateScreen(settings, gates, self._variant.is_probabilistic)
+        self.screen = TeammateScreen(settings, gates, self._variant.is_probabilistic)
 
     def cycle(self, state: State, frame: Sightings) -> State:
         """One cycle (paper, section 3, figure 1). Pure: the same inputs give the same bits.
@@ -90,8 +90,8 @@ class Localizer:
         if scope is None:  # nothing may be updated
             return self.check_lost(state)
         gated = self.constrain(state.estimate, others, scope) if others else _NO_OBJECTS  # 3.
-        if self._screen.has_recent_reports(state, frame.stamp_ns):  # beyond the paper: trust
-            state, gated = self._screen.screen_frame(state, landmarks, gated)
+        if self.screen.has_recent_reports(state, frame.stamp_ns):  # beyond the paper: trust
+            state, gated = self.screen.screen_frame(state, landmarks, gated)
         estimate = self.correct(state.estimate, landmarks, gated, scope)  # 4. combine, 5. merge
         return self.check_lost(self._with_frame(state, estimate, landmarks, gated, scope))
 
@@ -297,8 +297,8 @@ class Localizer:
             observation = observation.inflated(factor)
         position = observation.of_position(prior.pose)
         nis = position.normalized_innovation_squared(prior.covariance)
-        if self._screen.is_active:
-            state, is_trusted = self._screen.screen_observation(state, observation, position, nis)
+        if self.screen.is_active:
+            state, is_trusted = self.screen.screen_observation(state, observation, position, nis)
             if not is_trusted or state.estimate is not prior:
                 return self.check_lost(state)
         if nis > self._gates[1]:

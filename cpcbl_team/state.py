@@ -179,6 +179,14 @@ def with_memory(state: State, memory: Memory) -> State:
     return new(State, (now, estimate, place, pending, until_ns, updates, memory))
 
 
+def with_beliefs(state: State, beliefs_of: State) -> State:
+    """The state with the beliefs of another one, and when the latest report of both came."""
+    recovery, (_, senders, last_ns), calibration, events = state.memory
+    beliefs, _, other_ns = beliefs_of.memory.teammates
+    teammates = TeammateMemory(beliefs, senders, max(last_ns, other_ns))
+    return with_memory(state, Memory(recovery, teammates, calibration, events))
+
+
 def with_recovery(state: State, recovery: RecoveryMemory) -> State:
     """The state with this memory of the recovery."""
     _, teammates, calibration, events = state.memory

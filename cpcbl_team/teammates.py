@@ -5,9 +5,13 @@ assessed by `trust.py`. What may not be used is left out; where the estimate has
 before, the covariance is inflated.
 """
 
+from collections.abc import Iterable
+
 from cpcbl_team import trust
+from cpcbl_team.beliefs import nearest_belief
 from cpcbl_team.config import LocalizationSettings
 from cpcbl_team.fusion import Observation
+from cpcbl_team.inputs import Belief, Input, Position, Sightings
 from cpcbl_team.landmarks import LandmarkUpdate
 from cpcbl_team.measurements import GatedObject, GatedObjects
 from cpcbl_team.pose_observation import PoseObservation
@@ -24,7 +28,7 @@ class TeammateScreen:
     ) -> None:
         """`gates`: chi-square bounds of one and of two degrees of freedom. Without a covariance
         there is no NIS, and nothing is screened."""
-        self._rules = settings.collaboration.trust
+        self._collaboration, self._rules = settings.collaboration, settings.collaboration.trust
         self._localizer_rules = settings.localizer
         self._gates = gates
         self.is_active = self._rules.enabled and is_probabilistic
@@ -47,8 +51,7 @@ class TeammateScreen:
         distrusted = set()
         for m, constraints, nis in (*gated.accepted, *gated.rejected):
             if m.is_teammate:
-                beliefs = state.memory.teammates.beliefs[m.source]
-                is_fresh = any(abs(now - b.stamp_ns) <= trust.FRESH_BELIEF_NS for b in beliefs)
+                is_fresh = _has_fresh(state.memory.teammates.beliefs[m.source], now)
                 of_two = 2.0 * nis / len(constraints) if is_fresh and not is_lost else None
                 report = TeammateReport(now, of_two)
                 state, is_trusted = self._assess(state, m.source, report, m.source)
@@ -82,6 +85,21 @@ class TeammateScreen:
         report = TeammateReport(now, None if is_lost else nis, (ex, ey), ReportedPosition(*where))
         return self._assess(state, observation.sender, report, observation.source)
 
+    def is_changed_by_beliefs(self, item: Input, before: State, after: State, robot: str) -> bool:
+        """Whether an input gives another result in `after` than in `before`, which differ in
+        nothing but the beliefs of `robot`, in forgotten beliefs, and in when teammates reported."""
+        if not isinstance(item, Sightings | Position):
+            return False
+        now_ns, rules = item.stamp_ns, self._collaboration
+        if self.is_active and not self.has_recent_reports(before, now_ns):
+            return True
+        if isinstance(item, Position) or all(s.id != robot for s in item.sightings):
+            return False
+        old, new = (state.memory.teammates.beliefs.get(robot, ()) for state in (before, after))
+        if nearest_belief(old, now_ns, rules) != nearest_belief(new, now_ns, rules):
+            return True
+        return _has_fresh(old, now_ns) is not _has_fresh(new, now_ns)
+
     def _with_own_sensors(self, state: State, accepted: int, rejected: int) -> State:
         """The state with how far the robot's own sensors agree with the estimate."""
         memory = state.memory.teammates
@@ -110,3 +128,8 @@ class TeammateScreen:
 
 def _without(objects: list[GatedObject], distrusted: set[str]) -> list[GatedObject]:
     return [found for found in objects if found.measurement.source not in distrusted]
+
+
+def _has_fresh(beliefs: Iterable[Belief], now_ns: int) -> bool:
+    """Whether one of these beliefs is fresh enough to test its robot's reports by it."""
+    return any(abs(now_ns - b.stamp_ns) <= trust.FRESH_BELIEF_NS for b in beliefs)

@@ -8,13 +8,14 @@ States are immutable, so an old state is available at no cost.
 from bisect import bisect_left, bisect_right
 from collections.abc import Callable
 from enum import StrEnum
+from itertools import pairwise
 
 import msgspec
 
 from cpcbl_team.beliefs import BELIEF_VALID_BEFORE_NS
 from cpcbl_team.inputs import Belief, BeliefShared, Fix, Input, Odometry, Position, Sightings
 from cpcbl_team.localizer import Localizer
-from cpcbl_team.state import State
+from cpcbl_team.state import State, with_beliefs
 
 Key = tuple[int, int, str, bytes]
 HORIZON_NS = 2_000_000_000
@@ -78,12 +79,23 @@ class Timeline:
         index = bisect_left(keys, key)
         if index < len(keys) and keys[index] == key:
             return TimelineRefusal.DUPLICATE
-        again = [(key, item), *zip(keys[index:], self._inputs[index:], strict=True)]
-        self.state = self._before[index]
-        del keys[index:], self._inputs[index:], self._before[index:]
-        for a_key, an_item in again:
-            self._append(a_key, an_item)
+        self._insert(index, key, item)
         return None
+
+    def _insert(self, index: int, key: Key, item: Input) -> None:
+        """Inserts a late input. A belief, which is always late, changes only the frames to which it
+        is the nearest one; what comes before these is not computed again."""
+        states = [*self._before[index:], self.state]
+        again = [*zip(self._keys[index:], self._inputs[index:], pairwise(states), strict=True)]
+        del self._keys[index:], self._inputs[index:], self._before[index:]
+        self.state = states[0]
+        self._append(key, item)
+        # Between the times of two inputs a belief divides a motion, which changes the last bits
+        is_same = isinstance(item, Belief) and states[1].stamp_ns == key[0]
+        is_changed = self._localizer.screen.is_changed_by_beliefs
+        for a_key, an_item, (before, after) in again:
+            is_same = is_same and not is_changed(an_item, before, self.state, key[2])
+            self._append(a_key, an_item, after if is_same else None)
 
     def latest(self, now_ns: int) -> State:
         """The state at `now_ns`, or at the end of the known odometry if that is earlier.
@@ -102,11 +114,15 @@ class Timeline:
         state = self._before[after] if after < len(self._keys) else self.state
         return self._localizer.predict(state, stamp_ns)
 
-    def _append(self, key: Key, item: Input) -> None:
+    def _append(self, key: Key, item: Input, known: State | None = None) -> None:
+        """`known`: the state after this input, but for what other beliefs change."""
         self._keys.append(key)
         self._inputs.append(item)
         self._before.append(self.state)
-        self.state = _apply[type(item)](self._localizer, self.state, item)
+        if known is None or isinstance(item, Belief):
+            self.state = _apply[type(item)](self._localizer, self.state, item)
+        else:
+            self.state = with_beliefs(known, self.state)
         if len(self._keys) >= 2 * _PRUNE:
             self._forget()
 
