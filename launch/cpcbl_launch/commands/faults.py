@@ -51,8 +51,7 @@ def chaos(
     for number in (signal.SIGTERM, signal.SIGHUP):  # each ends what it has started
         if signal.getsignal(number) != signal.SIG_IGN:
             signal.signal(number, signal.default_int_handler)
-    progress = Console(stderr=True)
-    with runner.Progress(progress, len(todo)) as shown:
+    with runner.Progress(Console(stderr=True), len(todo)) as shown:
         options = ScenarioOptions(seed, soak_s, shown.doing)
         faults = runner.run_scenarios(todo, options, shown.began, shown.done)
     result = report_data(faults)

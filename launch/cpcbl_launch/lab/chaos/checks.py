@@ -63,13 +63,10 @@ class Outcome(msgspec.Struct, frozen=True, kw_only=True):
     done: str
     expectation: str
     checks: tuple[Check, ...] = ()
-    not_run: str = ""
-    """The missing requirement, if it was not run."""
-    failed: str = ""
-    """The reason, if it did not reach its end."""
+    not_run: str = ""  # the missing requirement, if it was not run
+    failed: str = ""  # the reason, if it did not reach its end
     seconds: float = 0.0
-    remarks: tuple[str, ...] = ()
-    """Figures without bounds."""
+    remarks: tuple[str, ...] = ()  # figures without bounds
 
     @property
     def is_met(self) -> bool | None:

@@ -50,28 +50,20 @@ def checks_recovered(run: FaultRun, from_s: float) -> list[Check]:
 # Processes ----------------------------------------------------------------------------------------
 
 
-def _back_after_s(run: FaultRun) -> tuple[float | None, float | None]:
-    """(from the fault until a new process of the robot started, from then until it was
-    localized)."""
+def found_after_s(run: FaultRun) -> float | None:
+    """From the start of a new process of the robot until it was localized."""
     back_s = run.log.token_back_after_s(run.robot, run.fault_s, run.incarnation)
-    if back_s is None:
-        return None, None
-    return back_s, run.log.localized_after_s(run.robot, run.fault_s + back_s)
-
-
-def is_back(run: FaultRun) -> bool:
-    """Whether a new process of the robot is localized."""
-    return _back_after_s(run)[1] is not None
+    return None if back_s is None else run.log.localized_after_s(run.robot, run.fault_s + back_s)
 
 
 def kill(run: FaultRun) -> list[Check]:
     """The robot's token disappears at once, it starts again and is localized; the others
     continue."""
-    back_s, found_s = _back_after_s(run)
+    back_s = run.log.token_back_after_s(run.robot, run.fault_s, run.incarnation)
     return [
         check_token_gone(run, 1.0),
         at_most("a new process started after", back_s, 10.0, "s"),
-        at_most("from then until it was localized", found_s, 15.0, "s"),
+        at_most("from then until it was localized", found_after_s(run), 15.0, "s"),
         *checks_unaffected(run.log, run.others, *run.window_s),
         *checks_recovered(run, run.healed_s),
     ]
@@ -95,9 +87,9 @@ def freeze(run: FaultRun) -> list[Check]:
     ]
 
 
-def have_all_published(run: FaultRun) -> bool:
-    """Whether every robot has published a track since the fault."""
-    return worst(run.log.first_track_after_s, run.robots, run.fault_s + 0.5) is not None
+def published_after_s(run: FaultRun) -> float | None:
+    """Until every robot had published a track with a stamp of after the fault."""
+    return worst(run.log.first_track_after_s, run.robots, run.fault_s + 0.5)
 
 
 def kill_router(run: FaultRun) -> list[Check]:
@@ -114,13 +106,9 @@ def kill_router(run: FaultRun) -> list[Check]:
     ]
 
 
-def _all_found_after_s(run: FaultRun) -> float | None:
+def all_found_after_s(run: FaultRun) -> float | None:
+    """From the start of a new world until all robots were localized in it."""
     return worst(run.log.localized_after_s, run.robots, run.restarted_s + 1.0)
-
-
-def all_are_back(run: FaultRun) -> bool:
-    """Whether all robots are localized in the new world."""
-    return _all_found_after_s(run) is not None
 
 
 def kill_field(run: FaultRun) -> list[Check]:
@@ -129,7 +117,7 @@ def kill_field(run: FaultRun) -> list[Check]:
     return [
         at_most("longest gap between tracks", gap_s, 1.5, "s"),
         at_most("a new field started after", run.restarted_s - run.fault_s, 10.0, "s"),
-        at_most("from then until all were localized", _all_found_after_s(run), 20.0, "s"),
+        at_most("from then until all were localized", all_found_after_s(run), 20.0, "s"),
         *checks_recovered(run, run.healed_s),
     ]
 

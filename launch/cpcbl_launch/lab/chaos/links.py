@@ -27,12 +27,9 @@ Pieces = asyncio.Queue[tuple[float, bytes]]  # bytes, each with its time to leav
 class LinkQuality(NamedTuple):
     """The quality of a link, in each direction."""
 
-    loss: float = 0.0
-    """The share of packets that are lost; for a `TunLink`, all else for a `Relay`."""
-    cut: bool = False
-    """Nothing passes and no connection is closed, as with an unplugged cable."""
-    bytes_per_s: float = 0.0
-    """0: no limit."""
+    loss: float = 0.0  # the share of packets that are lost; for a `TunLink`, all else for a `Relay`
+    cut: bool = False  # nothing passes and no connection is closed, as with an unplugged cable
+    bytes_per_s: float = 0.0  # 0: no limit
     delay_s: float = 0.0
     jitter_s: float = 0.0
     """The delay varies by up to this much, evenly distributed; nothing overtakes."""

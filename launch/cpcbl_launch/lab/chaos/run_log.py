@@ -4,11 +4,11 @@ All times are seconds of robot time since the run's epoch: those of stamps and t
 """
 
 import threading
-from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from itertools import pairwise
 from types import MappingProxyType
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 import numpy as np
 
@@ -54,11 +54,9 @@ class RunLog(NamedTuple):
 
     epoch_ns: int
     tracks: Mapping[str, Sequence[ReceivedTrack]]
-    statuses: Mapping[str, Sequence[tuple[float, Status]]]
-    """Each with the time at which it arrived."""
+    statuses: Mapping[str, Sequence[tuple[float, Status]]]  # each with the time at which it arrived
     tokens: Sequence[TokenEvent]
-    truth: Mapping[str, Floats]
-    """Rows of seconds, x, y, heading, by robot."""
+    truth: Mapping[str, Floats]  # rows of seconds, x, y, heading, by robot
 
     # Tokens -------------------------------------------------------------------------------------
 
@@ -112,7 +110,7 @@ class RunLog(NamedTuple):
         self, robot: str, from_s: float, within_m: float = FOUND_M
     ) -> float | None:
         """The robot was within `within_m` of the truth and not lost, from then on for 1 s."""
-        stamps_s, samples = self._samples(robot, from_s)
+        stamps_s, samples = self._samples(robot, from_s, np.inf)
         lost = {t.stamp_s for t in self.tracks.get(robot, ()) if t.track.lost}
         since_s: float | None = None
         for stamp_s, error_m in zip(stamps_s.tolist(), position_errors(samples), strict=True):
@@ -132,9 +130,7 @@ class RunLog(NamedTuple):
         """The largest position error of the tracks stamped in [from_s, until_s)."""
         return score(self._samples(robot, from_s, until_s)[1]).position_max_m
 
-    def inside_3_sigma(
-        self, robots: Iterable[str], from_s: float, until_s: float = np.inf
-    ) -> float | None:
+    def inside_3_sigma(self, robots: Iterable[str], from_s: float, until_s: float) -> float | None:
         """The share of tracks within 3 sigma of the truth (a consistent filter: 98.9 %)."""
         parts = [position_nees(self._samples(name, from_s, until_s)[1]) for name in robots]
         nees = np.concatenate([part for part in parts if part is not None] or [np.empty(0)])
@@ -149,9 +145,7 @@ class RunLog(NamedTuple):
         jumps = np.flatnonzero(steps >= 1.0)
         return (float(rows[jumps[0] + 1, 0]), float(steps[jumps[0]])) if len(jumps) else None
 
-    def _samples(
-        self, robot: str, from_s: float, until_s: float = np.inf
-    ) -> tuple[Floats, Samples]:
+    def _samples(self, robot: str, from_s: float, until_s: float) -> tuple[Floats, Samples]:
         """(stamps s, estimates beside truths) of the tracks stamped in [from_s, until_s)."""
         received = self.tracks.get(robot, ()) if robot in self.truth else ()
         chosen = [t for t in received if from_s <= t.stamp_s < until_s and t.track.covariance]
@@ -175,9 +169,7 @@ class RunLog(NamedTuple):
             known = count
         return _first(sorted(times_s), from_s)
 
-    def first_help_after_s(
-        self, robot: str, helpers: Collection[str], from_s: float
-    ) -> float | None:
+    def first_help_after_s(self, robot: str, helpers: Sequence[str], from_s: float) -> float | None:
         """The robot first reported later help of these; it received the help up to a second
         earlier."""
         from_ns = self.epoch_ns + int(from_s * 1e9)
@@ -254,16 +246,15 @@ def _counts(status: Status) -> Counter[str]:
 
 
 class RunRecorder:
-    """Records what it receives on one or several buses; a message that comes twice is kept once."""
+    """Records what it receives on a bus."""
 
     def __init__(self, clock: Clock, ahead_s: Mapping[str, float] = MappingProxyType({})) -> None:
         """`ahead_s`: how far each robot's clock is ahead; stamps of tracks are corrected."""
-        self._clock, self._lock = clock, threading.Lock()
-        self._ahead_s = ahead_s
-        self._tracks: dict[str, list[ReceivedTrack]] = {}
-        self._statuses: dict[str, list[tuple[float, Status]]] = {}
+        self._clock, self._ahead_s, self._lock = clock, ahead_s, threading.Lock()
+        self._tracks = defaultdict[str, list[ReceivedTrack]](list)
+        self._statuses = defaultdict[str, list[tuple[float, Status]]](list)
         self._tokens: list[TokenEvent] = []
-        self._rows: dict[str, list[tuple[float, float, float, float]]] = {}
+        self._rows = defaultdict[str, list[tuple[float, float, float, float]]](list)
         self._truth_ns = 0
 
     def listen(self, bus: Bus) -> None:
@@ -293,16 +284,14 @@ class RunRecorder:
                 case Track(robot=robot):
                     ahead_ns = int(self._ahead_s.get(robot, 0.0) * 1e9)
                     stamp_s = self._robot_time_s(message.stamp_ns - ahead_ns)
-                    track = ReceivedTrack(at_s, stamp_s, message)
-                    _add(self._tracks.setdefault(robot, []), track)
+                    self._tracks[robot].append(ReceivedTrack(at_s, stamp_s, message))
                 case Status(robot=robot):
-                    _add(self._statuses.setdefault(robot, []), (at_s, message))
+                    self._statuses[robot].append((at_s, message))
                 case Truths() if self._is_next(message):
                     self._truth_ns = message.stamp_ns
                     stamp_s = self._robot_time_s(message.stamp_ns)
                     for t in message.robots:
-                        row = (stamp_s, t.x_m, t.y_m, t.heading_rad)
-                        self._rows.setdefault(t.robot, []).append(row)
+                        self._rows[t.robot].append((stamp_s, t.x_m, t.y_m, t.heading_rad))
 
     def _is_next(self, truths: Truths) -> bool:
         """Whether to keep it: a part is enough, and a forged one may have a stamp in the future."""
@@ -319,12 +308,3 @@ class RunRecorder:
                 tuple(self._tokens),
                 {name: np.array(rows) for name, rows in self._rows.items()},
             )
-
-
-_Received = TypeVar("_Received", ReceivedTrack, tuple[float, Status])
-
-
-def _add(kept: list[_Received], new: _Received) -> None:
-    """Adds a message unless it is among the latest: two sites send each message twice."""
-    if all(new[-1] != old[-1] for old in kept[-20:]):
-        kept.append(new)

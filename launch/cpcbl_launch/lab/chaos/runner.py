@@ -134,9 +134,8 @@ class Progress:
     that is done. A context manager."""
 
     def __init__(self, console: Console, total: int) -> None:
-        self._console, self._total = console, total
-        self._status = console.status("")
-        self._name, self._count = "", 0
+        self._console, self._total, self._count = console, total, 0
+        self._step, self._status = "", console.status("")
 
     def __enter__(self) -> "Progress":
         if self._console.is_terminal:
@@ -147,12 +146,13 @@ class Progress:
         self._status.stop()
 
     def began(self, scenario: Scenario) -> None:
-        self._name, self._count = scenario.name, self._count + 1
+        self._count += 1
+        self._step = f"{self._count}/{self._total} {scenario.name}"
         self.doing("starting")
 
     def doing(self, what: str) -> None:
-        self._status.update(Text(f"{self._count}/{self._total} {self._name}: {what}"))
+        self._status.update(Text(f"{self._step}: {what}"))
 
     def done(self, outcome: Outcome) -> None:
-        line = Text(f"{self._count}/{self._total} {outcome.scenario}, {outcome.seconds:.0f} s: ")
+        line = Text(f"{self._step}, {outcome.seconds:.0f} s: ")
         self._console.print(line.append_text(verdict(outcome)))

@@ -17,8 +17,6 @@ from cpcbl_launch.lab.chaos.team import (
 )
 from cpcbl_team.errors import CpcblError
 
-BASELINE_S, AFTER_S = 4.0, 8.0
-
 
 class CannotRunError(CpcblError):
     """This machine lacks something that a scenario requires."""
@@ -29,10 +27,8 @@ class ScenarioOptions(NamedTuple):
 
     seed: int = 1
     soak_s: float = 180.0
-    report_progress: Callable[[str], None] = lambda doing: None
-    """Called with each step."""
-    fault: str = ""
-    """The step of the fault: what the scenario does."""
+    report_progress: Callable[[str], None] = lambda doing: None  # called with each step
+    fault: str = ""  # the step of the fault: what the scenario does
 
 
 class ScenarioResult(NamedTuple):
@@ -46,8 +42,7 @@ class Requirement(NamedTuple):
     """What a scenario requires of the machine."""
 
     what: str = ""
-    missing: Callable[[], str] = lambda: ""
-    """What is missing here; empty if nothing is."""
+    missing: Callable[[], str] = lambda: ""  # what is missing here; empty if nothing is
 
 
 NOTHING = Requirement()
@@ -61,8 +56,7 @@ class Scenario(NamedTuple):
     expectation: str
     run: Callable[[ScenarioOptions], ScenarioResult]
     needs: Requirement = NOTHING
-    quick: bool = False
-    """Whether the ordinary test suite runs it, too."""
+    quick: bool = False  # whether the ordinary test suite runs it, too
 
 
 # A fault of a team --------------------------------------------------------------------------------
@@ -72,23 +66,17 @@ class FaultRun(msgspec.Struct):
     """A run with a fault, for its checks. Times are seconds of robot time after the epoch."""
 
     log: RunLog
-    robots: Sequence[str]
-    """Those that run and whose truth is known."""
-    robot: str = ""
-    """The robot or process that the fault concerns."""
+    robots: Sequence[str]  # those that run and whose truth is known
+    robot: str = ""  # the robot or process that the fault concerns
     fault_s: float = 0.0
     healed_s: float = 0.0
     """When the fault ended; of a process that was killed: when it, or what needs it, was back."""
     end_s: float = 0.0
-    incarnation: str = ""
-    """The robot's process before the fault."""
-    restarted_s: float = 0.0
-    """When a new field had started."""
-    sent: int = 0
-    """Messages that the fault sent."""
+    incarnation: str = ""  # the robot's process before the fault
+    restarted_s: float = 0.0  # when a new field had started
+    sent: int = 0  # messages that the fault sent
     far: Sequence[str] = ()
-    far_log: RunLog | None = None
-    """What was received at the site of the far robots."""
+    far_log: RunLog | None = None  # what was received at the site of the far robots
 
     @property
     def window_s(self) -> tuple[float, float]:
@@ -110,20 +98,17 @@ class TeamFault(msgspec.Struct, frozen=True):
     checks: Callable[[FaultRun], list[Check]]
     inject: Injector = lambda team, run: nullcontext()
     """Nothing is injected if the plan contains the fault."""
-    robot: str = ""
-    """The robot or process that the fault concerns."""
+    robot: str = ""  # the robot or process that the fault concerns
     plan: Callable[[], RunPlan] = lambda: RunPlan(demo_team())
     settled_m: float = SETTLED_M
-    baseline_s: float = BASELINE_S
-    """How long the settled team runs before the fault."""
+    baseline_s: float = 4.0  # how long the settled team runs before the fault
     simulated_s: tuple[float, float] | None = None
     """When the simulation begins and ends the fault, in robot time."""
     lasts_s: float = 0.0
-    until: Callable[[FaultRun], bool] = lambda run: False
-    """Ends the fault earlier than after `lasts_s`."""
-    after_s: float = AFTER_S
-    remark: Callable[[TeamUnderTest, FaultRun], str] | None = None
-    """Adds figures without bounds."""
+    until: Callable[[FaultRun], float | None] = lambda run: None
+    """Ends the fault earlier than after `lasts_s`, as soon as this figure is known."""
+    after_s: float = 8.0
+    remark: Callable[[TeamUnderTest, FaultRun], str] | None = None  # adds figures without bounds
 
     def __call__(self, options: ScenarioOptions) -> ScenarioResult:
         """Runs the team, injects the fault, and checks what happened."""
@@ -139,12 +124,15 @@ class TeamFault(msgspec.Struct, frozen=True):
                 team.run_for(run.healed_s - team.now_s)
             else:
                 with self.inject(team, run):
-                    team.wait_until(lambda: self.until(_updated(run, team)), self.lasts_s)
+                    team.wait_until(lambda: self._is_over(run, team), self.lasts_s)
                     run.healed_s = team.now_s
             options.report_progress("the team recovers")
             team.run_for(self.after_s)
             checks = self.checks(_updated(run, team))
             return ScenarioResult(checks, (self.remark(team, run),) if self.remark else ())
+
+    def _is_over(self, run: FaultRun, team: TeamUnderTest) -> bool:
+        return self.until(_updated(run, team)) is not None
 
 
 def _updated(run: FaultRun, team: TeamUnderTest) -> FaultRun:

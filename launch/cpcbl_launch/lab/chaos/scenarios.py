@@ -60,7 +60,7 @@ def clock_offsets(team: TeamUnderTest, run: FaultRun) -> str:
     return f"the other robots estimate that its clock is ahead by {offsets}"
 
 
-KILL = TeamFault(expect.kill, inject.kill, "navigator", lasts_s=25.0, until=expect.is_back)
+KILL = TeamFault(expect.kill, inject.kill, "navigator", lasts_s=25.0, until=expect.found_after_s)
 BAD_LINK = TeamFault(
     expect.bad_link,
     inject.slow,
@@ -101,7 +101,7 @@ SCENARIOS = (
         "no robot receives anything for at most 6 s; then all robots have a liveliness token"
         " again, help each other and are localized, and no robot was restarted",
         TeamFault(
-            expect.kill_router, inject.kill, ROUTER, lasts_s=25.0, until=expect.have_all_published
+            expect.kill_router, inject.kill, ROUTER, lasts_s=25.0, until=expect.published_after_s
         ),
     ),
     Scenario(
@@ -115,7 +115,7 @@ SCENARIOS = (
             inject.kill_field,
             baseline_s=10.0,  # until the robots are far from where they start
             lasts_s=30.0,
-            until=expect.all_are_back,
+            until=expect.all_found_after_s,
         ),
     ),
     Scenario(

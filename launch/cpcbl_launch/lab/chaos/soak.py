@@ -54,10 +54,8 @@ class ProcessLife(NamedTuple):
 
     process: str
     seconds: float
-    start_mib: float
-    """The median of the 20 s after its first 20 s."""
-    end_mib: float
-    """The median of its last 20 s."""
+    start_mib: float  # the median of the 20 s after its first 20 s
+    end_mib: float  # the median of its last 20 s
     mib_a_minute: float
     more_files: int
 
@@ -74,11 +72,10 @@ def soak(options: ScenarioOptions) -> ScenarioResult:
         faults.run()
         options.report_progress("waiting until all robots are localized")
         run = FaultRun(team.run_log, team.robots, fault_s=team.now_s)
-
-        def localized_after_s() -> float | None:
-            return worst(team.run_log.localized_after_s, team.robots, run.fault_s)
-
-        team.wait_until(lambda: localized_after_s() is not None, STUCK_S)
+        team.wait_until(
+            lambda: worst(team.run_log.localized_after_s, team.robots, run.fault_s) is not None,
+            STUCK_S,
+        )
         run.healed_s = team.now_s
         team.run_for(8.0)
         run.log, run.end_s = team.run_log, team.now_s

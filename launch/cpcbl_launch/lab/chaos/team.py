@@ -41,16 +41,13 @@ class RunPlan(NamedTuple):
 
     team: Team
     seed: int = 1
-    relayed: Sequence[str] = ()
-    """Robots that dial a relay instead of the router."""
-    lossy: Sequence[str] = ()
-    """Robots (at most one) whose only link is a `TunLink`."""
+    relayed: Sequence[str] = ()  # robots that dial a relay instead of the router
+    lossy: Sequence[str] = ()  # robots (at most one) whose only link is a `TunLink`
     far: Sequence[str] = ()
     """Robots at another site with a router of its own, which dials the first over a relay."""
     faults: Mapping[str, str] = MappingProxyType({})
     """The fault of a robot that sends wrong positions, such as `bias:0.5,0.5@10-30`."""
-    left_out: Sequence[str] = ()
-    """Robots of the file that are not started."""
+    left_out: Sequence[str] = ()  # robots of the file that are not started
 
 
 def demo_team() -> Team:
