@@ -19,7 +19,7 @@ from cpcbl_agents.clock import Clock
 from cpcbl_agents.node import STATUS_NS
 from cpcbl_agents.process import StopSignal
 from cpcbl_launch.lab.chaos.team import clock_starting_in
-from cpcbl_launch.lab.scaling.swarm import swarm_team
+from cpcbl_launch.lab.scaling import swarm_team
 from cpcbl_launch.run.processes import process_table
 from cpcbl_launch.run.supervisor import ProcessSpec, Supervisor
 from cpcbl_launch.run.up import free_endpoint

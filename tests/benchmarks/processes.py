@@ -26,7 +26,7 @@ from benchmarks.process_load import (
 from benchmarks.report import show_and_write
 from rich.console import RenderableType
 
-from cpcbl_launch.lab.scaling.swarm import MOST_ROBOTS
+from cpcbl_launch.lab.scaling import MOST_ROBOTS
 from cpcbl_launch.reporting.tables import number, table
 from cpcbl_launch.run.usage import require_process_usage
 from cpcbl_team.errors import InputError

@@ -226,9 +226,9 @@ def _conduct(
     text = json_text(result) + "\n"
     lost = write_or_reason(figures, lambda: figures.write_text(text, encoding="utf-8"))
     if drawn:
-        from cpcbl_launch.lab.experiments.pictures import DRAWINGS
+        from cpcbl_launch.lab.experiments.pictures import draw
 
-        lost |= write_or_reason(picture, lambda: DRAWINGS[name](result, picture))
+        lost |= write_or_reason(picture, lambda: draw(result, picture))
     if as_json:
         sys.stdout.write(text)
     else:

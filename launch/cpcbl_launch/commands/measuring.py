@@ -196,14 +196,13 @@ def _simulate_sizes(
     as_json: bool,
 ) -> None:
     """Runs generated teams of each size, one after the other."""
-    from cpcbl_launch.lab.scaling.measure import DURATION_S, measure_sizes, parse_sizes
-    from cpcbl_launch.lab.scaling.report import draw_scaling, print_scaling
+    from cpcbl_launch.lab import scaling
     from cpcbl_launch.views.run import progress_bar
 
-    duration_s = DURATION_S if duration_s is None else duration_s
+    duration_s = scaling.DURATION_S if duration_s is None else duration_s
     with progress_bar("simulating", quiet=as_json) as progress:
-        result = measure_sizes(parse_sizes(robots), seed, duration_s, progress)
+        result = scaling.measure_sizes(scaling.parse_sizes(robots), seed, duration_s, progress)
     lost = write_report(report, result)
     if picture is not None:
-        lost |= write_or_reason(picture, partial(draw_scaling, result, picture))
-    print_result(result, as_json, lambda: print_scaling(result, Console()), lost)
+        lost |= write_or_reason(picture, partial(scaling.draw_scaling, result, picture))
+    print_result(result, as_json, lambda: scaling.print_scaling(result, Console()), lost)

@@ -32,7 +32,7 @@ from cpcbl_team.estimate import Estimate
 from cpcbl_team.fusion import chi_square_bounds
 from cpcbl_team.geometry import Pose2, step, wrap_angle
 from cpcbl_team.inputs import Odometry, Sighting, Sightings
-from cpcbl_team.motion import motion_noise
+from cpcbl_team.motion import motion_noise, part_of_piece
 from cpcbl_team.sensors import (
     repetition_variance_factor,
     sighting_fault,
@@ -78,11 +78,9 @@ def run_baselines(
     runs += [("solo_ekf", {n: own}) for n, own in inputs.items()]
     runs += [("centralized_ekf", dict(inputs))]
     paths: dict[str, dict[str, Trajectory]] = {}
-    done = 0
     for kind, robots in runs:
         paths.setdefault(kind, {}).update(run_ekf(robots, field, stamps_ns))
-        done += len(robots)
-        progress(done / (3 * len(inputs)))
+        progress(sum(map(len, paths.values())) / (3 * len(inputs)))
     return paths
 
 
@@ -101,23 +99,20 @@ def run_ekf(
     for name, robot in inputs.items():
         events += [(frame.stamp_ns, 0, name, frame) for frame in robot.frames]
         events += [(stamp_ns, 1, name, None) for stamp_ns in stamps_ns.get(name, ())]
-    estimates: dict[str, list[Floats]] = {name: [] for name in inputs}
-    covariances: dict[str, list[Floats]] = {name: [] for name in inputs}
+    estimates: dict[str, list[tuple[int, Floats, Floats]]] = {name: [] for name in inputs}
     for stamp_ns, _, name, frame in sorted(events, key=lambda event: event[:3]):
         ekf.predict(name, stamp_ns)
         if frame is not None:
             ekf.correct(name, frame)
-            continue
-        mean, covariance = ekf.marginal(name)
-        estimates[name].append(mean)
-        covariances[name].append(covariance[_TRIANGLE])
+        else:
+            estimates[name].append((stamp_ns, *ekf.marginal(name)))
     return {
         name: Trajectory(
-            np.array(sorted(stamps_ns.get(name, ())), dtype=np.int64),
-            np.array(estimates[name]).reshape(-1, 3),
-            np.array(covariances[name]).reshape(-1, 6),
+            np.array([stamp_ns for stamp_ns, _, _ in found], dtype=np.int64),
+            np.array([mean for _, mean, _ in found]).reshape(-1, 3),
+            np.array([covariance[_TRIANGLE] for _, _, covariance in found]).reshape(-1, 6),
         )
-        for name in inputs
+        for name, found in estimates.items()
     }
 
 
@@ -138,7 +133,8 @@ class _RobotBlock:
     """One robot in the filter: its columns of the state, its time, the odometry still to come."""
 
     def __init__(self, first: int, inputs: BaselineInputs) -> None:
-        self.first = first  # column of its x
+        self.columns = [first, first + 1, first + 2]  # of x, y, heading
+        self.block = slice(first, first + 3)
         self.settings = inputs.settings
         self.now_ns = self.covered_ns = inputs.start_ns
         self.pieces = deque(sorted(inputs.odometry, key=lambda piece: piece.from_ns))
@@ -146,10 +142,6 @@ class _RobotBlock:
         self.bounds = chi_square_bounds(inputs.settings.localizer.gate_probability)
         window = inputs.settings.localizer.lost_window
         self.innovations = {kind: deque[bool](maxlen=window) for kind in ("landmark", "robot")}
-
-    @property
-    def columns(self) -> list[int]:
-        return [self.first, self.first + 1, self.first + 2]
 
     def rejects_most(self, kind: str, accepted: bool) -> bool:
         """Whether most of the latest innovations of a kind, with this one, were rejected.
@@ -185,12 +177,12 @@ class Ekf:
         self.mean = np.array([own.start.pose for own in inputs.values()], dtype=float).ravel()
         self.covariance = np.zeros((len(self.mean), len(self.mean)))
         for name, own in inputs.items():
-            self._add(self._robots[name].first, own.start.covariance)
+            self._add(self._robots[name], own.start.covariance)
 
     def marginal(self, name: str) -> tuple[Floats, Floats]:
         """One robot's pose, shape (3,), and covariance, shape (3, 3)."""
-        i = self._robots[name].first
-        return self.mean[i : i + 3].copy(), self.covariance[i : i + 3, i : i + 3].copy()
+        block = self._robots[name].block
+        return self.mean[block].copy(), self.covariance[block, block].copy()
 
     # Motion -----------------------------------------------------------------------------------
 
@@ -201,45 +193,38 @@ class Ekf:
             return
         while robot.pieces and robot.pieces[0].from_ns < until_ns:
             piece = robot.pieces[0]
-            end_ns = min(piece.stamp_ns, until_ns)
-            whole_ns = piece.stamp_ns - piece.from_ns
-            driven_ns = max(0, end_ns - max(robot.now_ns, piece.from_ns))
-            share = driven_ns / whole_ns
-            self._move(robot, share * piece.distance_m, share * piece.turn_rad, driven_ns * 1e-9)
+            self._move(robot, *part_of_piece(piece, robot.now_ns, until_ns))
             robot.covered_ns = max(robot.covered_ns, piece.stamp_ns)
             if piece.stamp_ns > until_ns:
                 break
             robot.pieces.popleft()
-        self._add_gap_noise(robot, until_ns)
+        # The uncertainty of a gap in the odometry, as the team has it.
+        s = robot.settings.odometry
+        silent_ns = until_ns - max(robot.now_ns, robot.covered_ns + int(s.timeout_s * 1e9))
+        if silent_ns > 0 and s.moves:
+            q = s.gap_speed_m_s**2 * silent_ns * 1e-9
+            self._add(robot, (q, 0.0, q, 0.0, 0.0, q))
         robot.now_ns = until_ns
 
     def _move(self, robot: _RobotBlock, distance: float, turn: float, seconds: float) -> None:
         if distance == 0.0 and turn == 0.0:
             return
-        i, p = robot.first, self.covariance
-        before = Pose2(*self.mean[i : i + 3].tolist())
+        i, p = robot.block.start, self.covariance
+        before = Pose2(*self.mean[robot.block].tolist())
         after = step(before, distance, turn)
-        self.mean[i : i + 3] = after
+        self.mean[robot.block] = after
         lever = np.array([before.y - after.y, after.x - before.x])  # d(x, y) / d(heading)
         p[i : i + 2] += lever[:, None] * p[i + 2]
         p[:, i : i + 2] += p[:, i + 2, None] * lever
         s = robot.settings.odometry
         crawled = time_at_min_speed_s(distance, seconds, s)
-        self._add(i, motion_noise(before.heading, distance, turn, s, crawled))
+        self._add(robot, motion_noise(before.heading, distance, turn, s, crawled))
 
-    def _add_gap_noise(self, robot: _RobotBlock, until_ns: int) -> None:
-        """Adds the uncertainty of a gap in the odometry, as the team does."""
-        s = robot.settings.odometry
-        silent_ns = until_ns - max(robot.now_ns, robot.covered_ns + int(s.timeout_s * 1e9))
-        if silent_ns > 0 and s.moves:
-            q = s.gap_speed_m_s**2 * silent_ns * 1e-9
-            self._add(robot.first, (q, 0.0, q, 0.0, 0.0, q))
-
-    def _add(self, first: int, noise: Iterable[float]) -> None:
+    def _add(self, robot: _RobotBlock, noise: Iterable[float]) -> None:
         """Adds xx, xy, yy, xh, yh, hh to a robot's own block."""
         xx, xy, yy, xh, yh, hh = noise
         block = np.array(((xx, xy, xh), (xy, yy, yh), (xh, yh, hh)))
-        self.covariance[first : first + 3, first : first + 3] += block
+        self.covariance[robot.block, robot.block] += block
 
     # Sightings --------------------------------------------------------------------------------
 
@@ -250,8 +235,8 @@ class Ekf:
         for sighting in frame.sightings:
             last_ns = robot.used_ns.get(sighting.id)
             since_ns = None if last_ns is None else frame.stamp_ns - last_ns
-            fresh = since_ns is None or since_ns >= least_ns
-            if not fresh or sighting_fault(sighting):
+            repeated = since_ns is not None and since_ns < least_ns
+            if repeated or sighting_fault(sighting):
                 continue
             mate = self._robots.get(sighting.id)
             if mate is not None:
@@ -261,8 +246,7 @@ class Ekf:
                 continue
             seconds = None if since_ns is None else since_ns * 1e-9
             inflation = repetition_variance_factor(seconds, robot.settings.sensor.correlation_s)
-            measurement = measurement._replace(noise=inflation * measurement.noise)
-            accepted = self._update(measurement, robot.bounds)
+            accepted = self._update(measurement, inflation, robot.bounds)
             if accepted:
                 robot.used_ns[sighting.id] = frame.stamp_ns
             kind, concerned = ("landmark", [robot]) if mate is None else ("robot", [robot, mate])
@@ -299,10 +283,10 @@ class Ekf:
         noise = np.diag(sigmas**2 + SMALLEST_VARIANCE)
         return _Measurement(columns, jacobian[rows, : len(columns)], innovation, noise)
 
-    def _update(self, m: _Measurement, bounds: tuple[float, float]) -> bool:
+    def _update(self, m: _Measurement, inflation: float, bounds: tuple[float, float]) -> bool:
         """The Kalman update, if the innovation passes the chi-square gate; whether it did."""
         cross = self.covariance[:, m.columns] @ m.jacobian.T
-        weights = np.linalg.inv(m.jacobian @ cross[m.columns] + m.noise)
+        weights = np.linalg.inv(m.jacobian @ cross[m.columns] + inflation * m.noise)
         if m.innovation @ weights @ m.innovation > bounds[len(m.innovation) - 1]:
             return False
         gain = cross @ weights
@@ -315,15 +299,14 @@ class Ekf:
     def _inflate(self, robot: _RobotBlock) -> None:
         """Doubles the sigmas of a robot that rejects its sightings, so that its gates open: to at
         least 0.1 m and 0.1 rad, to at most the limits of being lost."""
-        i, rules = robot.first, robot.settings.localizer
-        xx, yy, hh = np.diag(self.covariance)[i : i + 3].tolist()
-        most = rules.lost_position_sigma_m**2, math.radians(rules.lost_heading_sigma_deg) ** 2
-        p = _variance_to_add(0.5 * (xx + yy), most[0])
-        self._add(i, (p, 0.0, p, 0.0, 0.0, _variance_to_add(hh, most[1])))
+        rules = robot.settings.localizer
+        xx, yy, hh = np.diag(self.covariance)[robot.block].tolist()
+
+        def increment(variance: float, most: float) -> float:
+            return max(min(max(4.0 * variance, 0.01), most) - variance, 0.0)
+
+        p = increment(0.5 * (xx + yy), rules.lost_position_sigma_m**2)
+        h = increment(hh, math.radians(rules.lost_heading_sigma_deg) ** 2)
+        self._add(robot, (p, 0.0, p, 0.0, 0.0, h))
         for window in robot.innovations.values():
             window.clear()
-
-
-def _variance_to_add(variance: float, most: float) -> float:
-    """The increment of a variance that doubles its sigma, within bounds."""
-    return max(min(max(4.0 * variance, 0.01), most) - variance, 0.0)

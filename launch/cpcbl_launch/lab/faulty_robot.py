@@ -23,7 +23,7 @@ import sys
 from collections.abc import Sequence
 from typing import NamedTuple
 
-import msgspec
+from msgspec.structs import replace
 
 from cpcbl_launch.run.processes import PROGRAM
 from cpcbl_launch.run.robot import robot_parser, run_robot_command
@@ -84,7 +84,6 @@ class FaultInjector:
             return self._freeze(message, is_active)
         if not is_active:
             return message
-        replace = msgspec.structs.replace
         if self._fault.kind == "clock":
             return replace(message, stamp_ns=message.stamp_ns + int(self._fault.values[0] * 1e9))
         dx, dy = self._offset(message.stamp_ns)
@@ -107,11 +106,11 @@ class FaultInjector:
         if not is_active or key not in self._last_xy_m:
             self._last_xy_m[key] = message.x_m, message.y_m
         x, y = self._last_xy_m[key]
-        return msgspec.structs.replace(message, x_m=x, y_m=y)
+        return replace(message, x_m=x, y_m=y)
 
 
 def _with_tiny_covariance(message: Help) -> Help:
-    variance, replace = STATED_SIGMA_M**2, msgspec.structs.replace
+    variance = STATED_SIGMA_M**2
     if isinstance(message, Fix):
         position = (variance, 0.0, variance)
         return replace(message, sensor_covariance=position, observer_covariance=position)
@@ -147,14 +146,8 @@ def faulty_command(command: Sequence[str], fault: str) -> tuple[str, ...]:
     """The command of a faulty robot, made from that of the robot (`cpcbl-team robot ...`)."""
     after = len(PROGRAM)
     assert tuple(command[: after + 1]) == (*PROGRAM, "robot")
-    return (
-        sys.executable,
-        "-m",
-        "cpcbl_launch.lab.faulty_robot",
-        *command[after + 1 :],
-        "--fault",
-        fault,
-    )
+    program = (sys.executable, "-m", "cpcbl_launch.lab.faulty_robot")
+    return (*program, *command[after + 1 :], "--fault", fault)
 
 
 def main() -> None:

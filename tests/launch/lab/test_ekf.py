@@ -6,32 +6,14 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 from support.core import LOOP_START, diagonal, driven, loop
+from support.noisy_logs import ODOMETRY, SENSOR
 
-from cpcbl_launch.lab.baselines import (
-    BaselineInputs,
-    Ekf,
-    expected_sighting,
-)
+from cpcbl_launch.lab.baselines import BaselineInputs, Ekf, expected_sighting
 from cpcbl_launch.reporting.metrics import Floats
-from cpcbl_team.config import (
-    Field,
-    OdometrySettings,
-    RobotSettings,
-    SensorSettings,
-)
+from cpcbl_team.config import Field, OdometrySettings, RobotSettings
 from cpcbl_team.estimate import Estimate
 from cpcbl_team.geometry import Pose2, step
 from cpcbl_team.inputs import Odometry, Sighting, Sightings
-
-ROBOTS = ("1", "2", "3")
-KINDS = ("dead_reckoning", "solo_ekf", "centralized_ekf")
-SENSOR = SensorSettings(range_share=0.05, range_floor_m=0.02, bearing_sigma_deg=2.0)
-# Noise of turns by the way only: noise by the turn would itself be a turn, and so count twice.
-ODOMETRY = OdometrySettings(
-    distance_sigma_m_per_sqrt_m=0.08,
-    turn_sigma_rad_per_sqrt_rad=0.0,
-    turn_sigma_rad_per_sqrt_m=0.08,
-)
 
 
 def inputs_at(pose: Pose2, *pieces: Odometry, sigma: float = 0.1) -> BaselineInputs:

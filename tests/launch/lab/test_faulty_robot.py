@@ -11,7 +11,7 @@ import pytest
 from support.buses import MS, SECOND, Subscription
 
 from cpcbl_launch.lab.experiments import liars
-from cpcbl_launch.lab.experiments.pictures import draw_liars
+from cpcbl_launch.lab.experiments.pictures import draw
 from cpcbl_launch.lab.faulty_robot import (
     STATED_SIGMA_M,
     Fault,
@@ -179,7 +179,7 @@ def test_it_is_shown_in_80_columns_and_drawn(
     assert "bias:0.5,0.5" in text
     assert "…" not in text
     assert all(len(line) <= 80 for line in text.splitlines())
-    draw_liars(result, tmp_path / "liars.png")
+    draw(result, tmp_path / "liars.png")
     assert (tmp_path / "liars.png").read_bytes().startswith(b"\x89PNG")
     assert json.loads(msgspec.json.encode(result))["experiment"] == "liars"
 

@@ -10,13 +10,14 @@ import pytest
 from support.processes import cpcbl_team
 
 from cpcbl_launch.cli import main
-from cpcbl_launch.lab.scaling.measure import (
+from cpcbl_launch.lab.scaling import (
+    SPACING_M,
     TeamSizeFigures,
     measure_sizes,
     measure_team,
     parse_sizes,
+    swarm_team,
 )
-from cpcbl_launch.lab.scaling.swarm import SPACING_M, swarm_team
 from cpcbl_launch.simulation.in_process import simulate
 from cpcbl_launch.team_checks import problems
 from cpcbl_launch.team_file import builtin_path, load_team

@@ -5,10 +5,7 @@ The navigator has 5 % of range and 5 degrees, and odometry of inflated noise; th
 split covariance intersection. The navigator steers by its own estimate.
 
 - `figure7`: as in the paper.
-- `figure7-cameras`: pixels in place of simulated sightings. Landmarks are cylinders of two colours,
-  robots carry markers and masts. The navigator's camera is a cheap one of a wide angle that shakes,
-  its focal length not well known; the observer's is a sharper one. Both are as badly known as their
-  settings say (`simulation/camera/cameras.py`).
+- `figure7-cameras`: pixels in place of simulated sightings (`teams/circuit-cameras.toml`).
 - `circular-vs-oval`, which the paper announced: the navigator alone (C) and helped in both
   directions (F), with every variant. `make bench` measures what a cycle of each variant costs.
 """
@@ -17,7 +14,6 @@ import math
 from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 
-from msgspec.structs import replace
 from rich.console import RenderableType
 
 from cpcbl_launch.lab.experiments.runs import (
@@ -35,7 +31,6 @@ from cpcbl_launch.lab.experiments.runs import (
 )
 from cpcbl_launch.overrides import Overrides, with_overrides
 from cpcbl_launch.reporting.tables import cells, table
-from cpcbl_team.config import Bands, CameraSettings, Side, Team
 
 CONFIGURATIONS = {
     "A": "odometry",
@@ -49,14 +44,15 @@ LEGEND = (
     "position: mean ± σ, max; heading: mean; consistent filter: 98.9 % in 3 σ, NEES 2\n"
     "bump, rest, fail: bumps into landmarks, restarts, runs that failed"
 )
+VARIANTS = ("joint", "oval", "circular", "weighted")
 ABOUT = 0.2  # "about" is within so much of it
 ODOMETRY_ONLY = {"lost_position_sigma_m": 1e3, "lost_heading_sigma_deg": 1e5}  # it drives on
 
 
-def team_case(configuration: str, variant: str = "circular") -> Case:
+def team_case(configuration: str, variant: str = "circular", field: str = "circuit") -> Case:
     """One of the six configurations; `variant` is of those that are probabilistic."""
     helped = configuration in "DEF"
-    team = circuit_team(["navigator", "observer"] if helped else ["navigator"])
+    team = circuit_team(["navigator", "observer"] if helped else ["navigator"], field=field)
     kinds = CONFIGURATIONS[configuration] if helped else "none"
     variant = "weighted" if configuration == "B" else variant
     team = with_overrides(team, Overrides(variant=variant, collaboration=kinds))
@@ -113,58 +109,11 @@ def tables(result: Outcome, driver: str = "navigator") -> Iterable[RenderableTyp
     yield from pattern_lines(result)
 
 
-# With cameras -------------------------------------------------------------------------------------
-
-CAMERAS: Mapping[str, CameraSettings] = {
-    "navigator": CameraSettings(
-        width_px=320,
-        height_px=240,
-        fx_px=135.0,
-        fy_px=135.0,
-        cx_px=159.5,
-        cy_px=119.5,
-        edge_sigma_px=1.0,
-        tilt_sigma_deg=2.0,
-        yaw_sigma_deg=4.0,
-        focal_share=0.03,
-    ),
-    "observer": CameraSettings(
-        fx_px=600.0, fy_px=600.0, tilt_sigma_deg=0.2, yaw_sigma_deg=0.3, focal_share=0.003
-    ),
-}
-LANDMARKS: Mapping[str, Bands] = {
-    "southwest": ("yellow", "blue"),
-    "southeast": ("blue", "yellow"),
-    "northeast": ("green", "pink"),
-    "northwest": ("pink", "green"),
-}
-MARKERS: Mapping[str, dict[Side, int]] = {
-    "navigator": {"front": 0, "left": 1, "back": 2, "right": 3},
-    "observer": {"front": 4, "left": 5, "back": 6, "right": 7},
-}
-MASTS: Mapping[str, Bands] = {"navigator": ("pink", "yellow"), "observer": ("yellow", "green")}
-
-
 def cases_with_cameras() -> Mapping[str, Case]:
     """The six configurations. Odometry alone needs no camera."""
-    teams = {c: case.team if c == "A" else with_cameras(case.team) for c, case in cases().items()}
-    return {c: loop_case(team, "navigator") for c, team in teams.items()}
-
-
-def with_cameras(team: Team) -> Team:
-    """The team with cameras, and with what they know landmarks and robots by."""
-    field = team.map
-    marks = {n: replace(m, colours=LANDMARKS[n]) for n, m in field.landmarks.items()}
-    robots = {
-        n: replace(r, sensing="camera", camera=CAMERAS[n], markers=MARKERS[n], colours=MASTS[n])
-        for n, r in team.robots.items()
+    return {
+        c: team_case(c, field="circuit" if c == "A" else "circuit-cameras") for c in CONFIGURATIONS
     }
-    return replace(team, robots=robots, map=replace(field, landmarks=marks))
-
-
-# All variants -------------------------------------------------------------------------------------
-
-VARIANTS = ("joint", "oval", "circular", "weighted")
 
 
 def cases_of_variants() -> Mapping[str, Case]:

@@ -9,6 +9,7 @@ from typing import Any
 
 import matplotlib as mpl
 from matplotlib import pyplot as plt
+from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Wedge
 
@@ -27,7 +28,7 @@ mpl.use("Agg")
 mpl.rcParams.update({"figure.constrained_layout.use": True, "savefig.dpi": 90})
 
 
-def draw_table1(result: Outcome, path: Path) -> None:
+def draw_table1(result: Outcome) -> Figure:
     """Field, then a panel a quantity: the paper's as bars, ours as points with 10-90 %."""
     figure = plt.figure(figsize=(13, 7))
     panels = figure.subplot_mosaic("FFabc\nFFdef", width_ratios=(1, 1, 1.2, 1.2, 1.2))
@@ -43,10 +44,10 @@ def draw_table1(result: Outcome, path: Path) -> None:
                 _bar(axes, at, s, f"C{k}", capsize=2, label=label)
         axes.set(title=quantity, xticks=range(3), xticklabels="ABC", ylim=(0, None))
     figure.legend(*panels["a"].get_legend_handles_labels(), loc="outside lower right", ncols=5)
-    _save(figure, path)
+    return figure
 
 
-def draw_figure7(result: Outcome, path: Path) -> None:
+def draw_figure7(result: Outcome) -> Figure:
     """The field, and as figure 7 of the paper: mean position error, bars of one sigma."""
     figure, (field, errors) = plt.subplots(1, 2, figsize=(12, 4.4), width_ratios=(3, 2))
     _field(field, result.teams["F"])
@@ -67,10 +68,10 @@ def draw_figure7(result: Outcome, path: Path) -> None:
     errors.set_ylim(0.0, 1.6 * max(rest, default=0.0) or 1.0)
     errors.set_xlim(-0.6, len(names) - 0.2)
     errors.grid(True, axis="y", alpha=0.3)
-    _save(figure, path)
+    return figure
 
 
-def draw_variants(result: Outcome, path: Path) -> None:
+def draw_variants(result: Outcome) -> Figure:
     """Accuracy and consistency of the variants."""
     figure, (errors, inside) = plt.subplots(1, 2, figsize=(8, 3.8))
     variants = list(dict.fromkeys(case.split()[0] for case in result.figures))
@@ -91,10 +92,10 @@ def draw_variants(result: Outcome, path: Path) -> None:
         axes.set_xlim(-0.5, len(variants) - 0.5)
         axes.grid(True, axis="y", alpha=0.3)
     errors.legend()
-    _save(figure, path)
+    return figure
 
 
-def draw_budget(result: Curve, path: Path) -> None:
+def draw_budget(result: Curve) -> Figure:
     """Team RMSE against bytes; lines to the left and below are better."""
     figure, axes = plt.subplots(figsize=(8.5, 5.0))
     for name, same in groupby(result.points, lambda point: point.series):
@@ -114,10 +115,10 @@ def draw_budget(result: Curve, path: Path) -> None:
     axes.yaxis.set_minor_formatter(lambda value, _: f"{value:g}")
     axes.grid(True, which="both", alpha=0.3)
     axes.legend()
-    _save(figure, path)
+    return figure
 
 
-def draw_directions(result: Outcome, path: Path) -> None:
+def draw_directions(result: Outcome) -> Figure:
     """RMSE against bytes, a panel for each error of the observers; a line through team sizes."""
     rows = [row for row in result.figures["rows"] if row["direction"] != "deaf"]
     offsets = sorted({row["observer_off_m"] for row in rows})
@@ -141,10 +142,10 @@ def draw_directions(result: Outcome, path: Path) -> None:
     panels[0][0].set(ylabel="position RMSE (m); numbers: robots")
     handles, labels = panels[0][0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=len(ways))
-    _save(figure, path)
+    return figure
 
 
-def draw_liars(result: Liars, path: Path) -> None:
+def draw_liars(result: Liars) -> Figure:
     """The team's error beside that without the liar, judged and believed; when it was found."""
     sizes = sorted({row.case.honest for row in result.rows}, reverse=True)
     figure, panels = plt.subplots(2, len(sizes), figsize=(12, 6.5), sharex=True, squeeze=False)
@@ -166,10 +167,10 @@ def draw_liars(result: Liars, path: Path) -> None:
     colours = {"judged": "C0", "believed": "C3", "found": "C1", "taken back": "C2"}
     handles = [Line2D([], [], marker="o", color=c, label=n) for n, c in colours.items()]
     figure.legend(handles=handles, loc="outside lower center", ncols=len(colours))
-    _save(figure, path)
+    return figure
 
 
-def draw_eyes(result: DetectionReport, path: Path) -> None:
+def draw_eyes(result: DetectionReport) -> Figure:
     """A column a kind of thing: errors against range with three stated sigmas, and recall."""
     kinds = [kind for kind, errors in result.errors.items() if errors]
     figure, panels = plt.subplots(
@@ -194,11 +195,11 @@ def draw_eyes(result: DetectionReport, path: Path) -> None:
         Line2D([], [], color="0.5", linestyle="--", label="targets: one σ, recall"),
     ]
     figure.legend(handles=handles, loc="outside lower center", ncols=2)
-    _save(figure, path)
+    return figure
 
 
 # How the result of each experiment is drawn, by its name
-DRAWINGS: Mapping[str, Callable[[Any, Path], None]] = {
+DRAWINGS: Mapping[str, Callable[[Any], Figure]] = {
     "table1": draw_table1,
     "figure7": draw_figure7,
     "figure7-cameras": draw_figure7,
@@ -208,6 +209,13 @@ DRAWINGS: Mapping[str, Callable[[Any, Path], None]] = {
     "liars": draw_liars,
     "eyes": draw_eyes,
 }
+
+
+def draw(result: Any, path: Path) -> None:
+    """Draws the result of an experiment into a file."""
+    figure = DRAWINGS[result.experiment](result)
+    figure.savefig(path)
+    plt.close(figure)
 
 
 def _scattered(
@@ -269,8 +277,3 @@ def _half_view_deg(robot: RobotSettings) -> float:
     if robot.sensing != "camera":
         return 0.5 * robot.sensor.field_of_view_deg
     return math.degrees(math.atan(0.5 * robot.camera.width_px / robot.camera.fx_px))
-
-
-def _save(figure: Any, path: Path) -> None:
-    figure.savefig(path)
-    plt.close(figure)

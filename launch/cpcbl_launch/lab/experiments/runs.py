@@ -179,9 +179,9 @@ def map_in_processes(
 # Teams on the circuit (`teams/circuit.toml`) ------------------------------------------------------
 
 
-def circuit_team(robots: Collection[str], beacons: bool = False) -> Team:
+def circuit_team(robots: Collection[str], beacons: bool = False, field: str = "circuit") -> Team:
     """These robots among the four landmarks, with or without the four bearing-only beacons."""
-    team = load_team(builtin_path("circuit"))
+    team = load_team(builtin_path(field))
     marks = {n: m for n, m in team.map.landmarks.items() if beacons or m.gives == "both"}
     chosen = {name: team.robots[name] for name in robots}
     return replace(team, robots=chosen, map=replace(team.map, landmarks=marks))

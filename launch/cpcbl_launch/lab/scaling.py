@@ -1,0 +1,264 @@
+"""Generated teams of any size: what one robot costs in each, beside its accuracy.
+
+Homes lie on a square lattice, one for each robot; a landmark stands on every second corner between
+them. A robot drives around its home, so that the density is constant. It sees so far that even a
+small team fills its view: about seven teammates and three landmarks, fewer at the edge. One robot
+in five is an observer with good sensors; every second one of the others is a scout, blind to
+landmarks.
+"""
+
+import gc
+import math
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from random import Random
+
+from msgspec import Struct
+from msgspec.structs import replace
+from rich.console import Console
+
+from cpcbl_agents.node import Steppable
+from cpcbl_launch.checks import require_duration
+from cpcbl_launch.reporting.recorder import Recorder
+from cpcbl_launch.reporting.tables import cells, table
+from cpcbl_launch.simulation.field import SimulatedField
+from cpcbl_launch.simulation.field_node import FieldNode
+from cpcbl_launch.simulation.in_process import Progress, robot_nodes, run_nodes, simulated_report
+from cpcbl_team.config import (
+    Field,
+    Landmark,
+    OdometrySettings,
+    RobotSettings,
+    SensorSettings,
+    Start,
+    Team,
+)
+from cpcbl_team.errors import InputError
+from cpcbl_team.inputs import Sightings
+from cpcbl_transport import topics
+from cpcbl_transport.memory_bus import MemoryHub
+from cpcbl_transport.messages import decode_tagged
+
+DURATION_S = 5.0
+LEAST_S = 2.0  # a robot tells once a second what it has sent
+MOST_ROBOTS = 9999
+SPACING_M = 2.45  # of homes: one robot on 6 m²
+ROUND_M = 0.7  # radius of the way round a home
+STRAY_M = 0.2  # how far a home lies off its place on the lattice, at most
+SPEED_M_S = 0.3
+NAVIGATOR = SensorSettings(
+    range_share=0.05, bearing_sigma_deg=4.0, field_of_view_deg=360.0, max_range_m=3.7
+)
+OBSERVER = replace(NAVIGATOR, range_share=0.01, bearing_sigma_deg=1.0)
+SCOUT = replace(NAVIGATOR, sees_landmarks=False)
+SENSORS = (OBSERVER, SCOUT, NAVIGATOR, SCOUT, NAVIGATOR)
+LEGEND = (
+    "Means over the robots. in sight: teammates in a frame; out, in: fixes and beliefs,\n"
+    "and their bytes on the link; CPU: of a robot's own steps, per second of its time."
+)
+
+
+class TeamSizeFigures(Struct, frozen=True, kw_only=True):
+    """The figures of a team, means over its robots. Seconds are robot time; bytes are those on the
+    sender's link, with Zenoh's own."""
+
+    robots: int
+    in_sight: float
+    """The number of teammates in one frame."""
+    messages_sent_per_s: float
+    bytes_sent_per_s: float
+    messages_received_per_s: float
+    bytes_received_per_s: float
+    """Fixes and beliefs."""
+    cpu_ms_per_s: float
+    """CPU of the robot's own steps; sending puts a message into the inboxes of its receivers."""
+    field_cpu_ms_per_s: float
+    """CPU of the simulation of one robot: its motion and its sightings."""
+    times_real_time: float
+    """Of the whole process, without start-up and report."""
+    position_rmse_m: float | None
+    inside_3_sigma: float | None
+
+
+class ScalingReport(Struct, frozen=True, kw_only=True):
+    """The report of `simulate --robots`."""
+
+    duration_s: float
+    seed: int
+    sizes: tuple[TeamSizeFigures, ...]
+
+
+def swarm_team(size: int, seed: int) -> Team:
+    """A team of this size; the seed determines each robot's home and direction."""
+    random = Random(f"{seed} {size}")
+    columns = math.ceil(math.sqrt(size))
+    robots = {}
+    for i, place in enumerate(random.sample(range(size), size)):
+        row, column = divmod(place, columns)
+        x, y = (SPACING_M * (k + 0.5) + random.uniform(-STRAY_M, STRAY_M) for k in (column, row))
+        robots[f"r{i:04}"] = _robot(x, y, random.uniform(0.0, math.tau), SENSORS[i % len(SENSORS)])
+    rows = math.ceil(size / columns)
+    marks = {
+        f"m{column}-{row}": Landmark(x_m=SPACING_M * column, y_m=SPACING_M * row)
+        for row in range(rows + 1)
+        for column in range(row % 2, columns + 1, 2)
+    }
+    return Team(name=f"swarm{size}", robots=robots, map=Field(landmarks=marks))
+
+
+def _robot(home_x: float, home_y: float, from_rad: float, sensor: SensorSettings) -> RobotSettings:
+    """A robot that drives on a square around its home, from the corner in this direction."""
+    directions = (from_rad + 0.5 * math.pi * k for k in range(4))
+    corners = [(home_x + ROUND_M * math.cos(a), home_y + ROUND_M * math.sin(a)) for a in directions]
+    (x, y), *others = corners
+    return RobotSettings(
+        start=Start(x_m=x, y_m=y, heading_deg=math.degrees(from_rad) + 135.0),
+        sensor=sensor,
+        odometry=OdometrySettings(distance_sigma_m_per_sqrt_m=0.1),
+        waypoints_m=(*others, (x, y)),
+        speed_m_s=SPEED_M_S,
+    )
+
+
+def parse_sizes(text: str) -> list[int]:
+    """The sizes in a text such as `2,10,50`. Raises InputError."""
+    sizes = [int(part) if part.strip().isdecimal() else 0 for part in text.split(",")]
+    if not all(2 <= size <= MOST_ROBOTS for size in sizes):
+        raise InputError(f"--robots {text}: team sizes from 2 to {MOST_ROBOTS}, such as 2,10,50")
+    return sizes
+
+
+def measure_sizes(
+    sizes: Sequence[int],
+    seed: int = 1,
+    duration_s: float = DURATION_S,
+    progress: Progress | None = None,
+) -> ScalingReport:
+    """Measures generated teams of these sizes, one after the other.
+
+    Raises InputError if the duration is too short.
+    """
+    require_duration(duration_s, LEAST_S)
+    figures: list[TeamSizeFigures] = []
+    for i, size in enumerate(sizes):
+        part = _partial_progress(progress, sum(sizes[:i]), size, sum(sizes))
+        figures.append(measure_team(swarm_team(size, seed), seed, duration_s, part))
+    return ScalingReport(duration_s=duration_s, seed=seed, sizes=tuple(figures))
+
+
+def _partial_progress(progress: Progress | None, before: int, size: int, total: int) -> Progress:
+    """The progress of one team as a part of the progress of all."""
+    show = progress or (lambda done: None)
+    return lambda done: show((before + done * size) / total)
+
+
+def measure_team(
+    team: Team, seed: int, duration_s: float, progress: Progress | None = None
+) -> TeamSizeFigures:
+    """Simulates a team in one process over the bus in memory."""
+    hub, count = MemoryHub(), len(team.robots)
+    recorder = Recorder(hub.session())
+    in_sight: list[int] = []  # teammates, of each frame
+
+    def count_teammates(key: str, payload: bytes) -> None:
+        frame = decode_tagged(payload)
+        if isinstance(frame, Sightings):
+            in_sight.append(sum(seen.id in team.robots for seen in frame.sightings))
+
+    hub.session().subscribe(topics.IN_SIGHTINGS.at(), count_teammates)
+    field = TimedNode(FieldNode(SimulatedField(team, seed, 0), hub.session()))
+    robots = [TimedNode(node) for node in robot_nodes(team, hub, 0)]
+    began_s = time.monotonic()
+    # Python's garbage collector examines the robots of the whole process, which would grow with the
+    # team; in a process of its own a robot has only itself. Robots create no reference cycles.
+    gc.disable()
+    try:
+        run_nodes([field, *robots], 0, int(duration_s * 1e9), progress)
+    finally:
+        gc.enable()
+    took_s = time.monotonic() - began_s
+    score = simulated_report(recorder, team).team
+    ms_per_s = 1e3 / (count * duration_s)
+
+    def rate(name: str) -> float:
+        reports = recorder.status.values()
+        return sum(float(getattr(r, name)) / (r.stamp_ns * 1e-9) for r in reports) / count
+
+    return TeamSizeFigures(
+        robots=count,
+        in_sight=sum(in_sight) / max(len(in_sight), 1),
+        messages_sent_per_s=rate("messages_sent"),
+        bytes_sent_per_s=rate("bytes_sent"),
+        messages_received_per_s=rate("messages_received"),
+        bytes_received_per_s=rate("bytes_received"),
+        cpu_ms_per_s=ms_per_s * sum(robot.cpu_s for robot in robots),
+        field_cpu_ms_per_s=ms_per_s * field.cpu_s,
+        times_real_time=duration_s / took_s,
+        position_rmse_m=score.position_rmse_m,
+        inside_3_sigma=score.inside_3_sigma,
+    )
+
+
+class TimedNode:
+    """A node, and the CPU time that its steps took."""
+
+    def __init__(self, node: Steppable) -> None:
+        self._node = node
+        self.cpu_s = 0.0
+
+    @property
+    def next_ns(self) -> int:
+        return self._node.next_ns
+
+    @property
+    def waiting(self) -> bool:
+        return self._node.waiting
+
+    def step(self, now_ns: int) -> None:
+        began_s = time.process_time()
+        self._node.step(now_ns)
+        self.cpu_s += time.process_time() - began_s
+
+
+def print_scaling(scale: ScalingReport, console: Console) -> None:
+    """Prints a row for each size."""
+    title = f"generated teams in one process, {scale.duration_s:g} s of robot time"
+    rates = ("out/s", "B/s", "in/s", "B/s", "CPU ms/s", "x real")
+    columns = ("robots", "in sight", *rates, "RMSE m", "in 3 σ")
+    shown = table(f"{title}, seed {scale.seed}", (), columns)
+    quantities = "robots in_sight:.1f messages_sent_per_s:.1f bytes_sent_per_s:.0f"
+    quantities += " messages_received_per_s:.1f bytes_received_per_s:.0f cpu_ms_per_s:.1f"
+    quantities += " times_real_time:.3g position_rmse_m:.3f inside_3_sigma:.1%"
+    for size in scale.sizes:
+        shown.add_row(*cells(size, quantities))
+    console.print(shown)
+    console.print(LEGEND, style="yellow", highlight=False)
+
+
+def draw_scaling(scale: ScalingReport, path: Path) -> None:
+    """Draws two panels: the bytes per second that a robot sends and receives, and the CPU of its
+    steps."""
+    import matplotlib as mpl
+
+    mpl.use("Agg")
+    from matplotlib import pyplot as plt
+
+    figure, (traffic, cpu) = plt.subplots(1, 2, figsize=(10, 4), layout="constrained")
+    sizes = [s.robots for s in scale.sizes]
+    for label, rates in (
+        ("sent", [s.bytes_sent_per_s for s in scale.sizes]),
+        ("received", [s.bytes_received_per_s for s in scale.sizes]),
+    ):
+        traffic.plot(sizes, rates, "o-", label=label)
+    cpu.plot(sizes, [s.cpu_ms_per_s for s in scale.sizes], "o-", color="C2")
+    traffic.set(title="fixes and beliefs of a robot", ylabel="bytes a second on their link")
+    traffic.legend()
+    cpu.set(title="CPU of a robot", ylabel="ms in a second of robot time")
+    for axes in (traffic, cpu):
+        axes.set(xlabel="robots in the team", xscale="log", ylim=(0, None))
+        axes.set_xticks(sizes, labels=[str(size) for size in sizes], minor=False)
+        axes.minorticks_off()
+        axes.grid(True, alpha=0.3)
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
