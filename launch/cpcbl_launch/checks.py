@@ -2,9 +2,10 @@
 
 import importlib.util
 import math
-from collections.abc import Collection
+from collections.abc import Collection, Iterable
 from pathlib import Path
 
+from cpcbl_launch.team_checks import endpoint_problem
 from cpcbl_team.config import Team
 from cpcbl_team.errors import DependencyError, InputError
 
@@ -24,6 +25,13 @@ def require_duration(duration_s: float, least_s: float) -> None:
     """Raises InputError for seconds of robot time that are too few, or not a finite number."""
     if not least_s <= duration_s < math.inf:
         raise InputError(f"--duration {duration_s:g}: at least {least_s:g} seconds of robot time")
+
+
+def require_endpoints(option: str, endpoints: Iterable[str]) -> None:
+    """Raises InputError: Zenoh would try a wrong one again and again, and never say why."""
+    for endpoint in endpoints:
+        if reason := endpoint_problem(endpoint):
+            raise InputError(f"{option} {endpoint}: {reason}")
 
 
 def require_matplotlib(what: str, path: Path | None = None) -> None:

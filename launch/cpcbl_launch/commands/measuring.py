@@ -10,19 +10,6 @@ from typer import Argument, Option
 
 from cpcbl_launch.checks import require_team_opencv
 from cpcbl_launch.commands import options
-from cpcbl_launch.commands.options import (
-    AsJson,
-    Blind,
-    BytesPerS,
-    MatchMessages,
-    MessagesPerMinute,
-    PictureFile,
-    ReportFile,
-    TeamArgument,
-    parse_names,
-    print_result,
-    write_report,
-)
 from cpcbl_launch.overrides import Overrides, with_blind_robots, with_overrides
 from cpcbl_launch.reporting.files import write_or_reason
 from cpcbl_launch.team_file import find_team
@@ -62,18 +49,18 @@ ExportFolder = Annotated[
 def evaluate_mrclam(
     data: Annotated[Path, Argument(help="Folder of one data set, e.g. MRCLAM6.")],
     team_file: LogTeamFile = None,
-    blind: Blind = "",
+    blind: options.Blind = "",
     variant: VariantOption = None,
     collaboration: Collaboration = None,
     fusion: Fusion = None,
     direction: Direction = None,
-    bytes_per_s: BytesPerS = None,
-    messages_per_minute: MessagesPerMinute = None,
-    match_messages: MatchMessages = None,
+    bytes_per_s: options.BytesPerS = None,
+    messages_per_minute: options.MessagesPerMinute = None,
+    match_messages: options.MatchMessages = None,
     duration: LogDuration = None,
     baselines: WithBaselines = False,
     export: ExportFolder = None,
-    as_json: AsJson = False,
+    as_json: options.AsJson = False,
 ) -> None:
     """Evaluate five robots of a real log (UTIAS MRCLAM) against its ground truth."""
     from cpcbl_launch.lab.evaluation import evaluate_log
@@ -85,14 +72,14 @@ def evaluate_mrclam(
     overrides = Overrides(*budgets, variant, collaboration, fusion, direction)
     team = with_overrides(find_team(team_file or logged_team.builtin_for(data)), overrides)
     logged = logged_team.load_logged_team(team, data)
-    logged = logged._replace(team=with_blind_robots(logged.team, parse_names(blind)))
+    logged = logged._replace(team=with_blind_robots(logged.team, options.parse_names(blind)))
     logged = logged_team.with_duration(logged, duration)
     with progress_bar(f"{data.name}", quiet=as_json) as progress:
         result, paths = evaluate_log(logged, progress, with_baselines=baselines)
     lost: dict[str, str] = {}
     if export is not None:
         lost = write_or_reason(export, partial(export_tum, export, paths, logged.truth))
-    print_result(result, as_json, lambda: print_report(result, Console()), lost)
+    options.print_result(result, as_json, lambda: print_report(result, Console()), lost)
 
 
 def calibrate(
@@ -118,8 +105,8 @@ def calibrate(
             min=0.0, help="Share of a range's, bearing's or crawl's correction added to its noise."
         ),
     ] = 0.5,
-    picture: PictureFile = None,
-    as_json: AsJson = False,
+    picture: options.PictureFile = None,
+    as_json: options.AsJson = False,
 ) -> None:
     """Estimate odometry and sensor errors from logs with truth, as types of a team file."""
     from cpcbl_launch.calibration.logs import read_logs
@@ -140,13 +127,13 @@ def calibrate(
         from cpcbl_launch.calibration.plots import draw_residuals
 
         lost |= write_or_reason(picture, partial(draw_residuals, robot_logs, result, picture))
-    print_result(result, as_json, lambda: print_calibration(result, Console()), lost)
+    options.print_result(result, as_json, lambda: print_calibration(result, Console()), lost)
     if not as_json:
         typer.echo(f"written: {output}")
 
 
 def simulate(
-    file: TeamArgument = None,
+    file: options.TeamArgument = None,
     robots: Annotated[
         str, Option(help="Sizes of generated teams, in place of FILE, e.g. 2,10,50,200,1000.")
     ] = "",
@@ -154,12 +141,12 @@ def simulate(
         float | None, Option(help="Seconds of robot time; default: 5 with --robots, else 30.")
     ] = None,
     seed: Annotated[int, Option(help="Seed of the noise, and of generated teams.")] = 1,
-    bytes_per_s: BytesPerS = None,
-    messages_per_minute: MessagesPerMinute = None,
-    match_messages: MatchMessages = None,
-    report: ReportFile = None,
-    picture: PictureFile = None,
-    as_json: AsJson = False,
+    bytes_per_s: options.BytesPerS = None,
+    messages_per_minute: options.MessagesPerMinute = None,
+    match_messages: options.MatchMessages = None,
+    report: options.ReportFile = None,
+    picture: options.PictureFile = None,
+    as_json: options.AsJson = False,
 ) -> None:
     """Run a simulated team in one process, without Zenoh: deterministic for a seed.
 
@@ -183,8 +170,8 @@ def simulate(
     require_team_opencv(team, team.robots, field=True)
     with progress_bar("simulating", quiet=as_json) as progress:
         result = simulate_run(Run(team, duration, seed=seed, picture=picture), progress)
-    lost = write_report(report, result) | result.not_written
-    print_result(result, as_json, lambda: print_report(result, Console()), lost)
+    lost = options.write_report(report, result) | result.not_written
+    options.print_result(result, as_json, lambda: print_report(result, Console()), lost)
 
 
 def _simulate_sizes(
@@ -202,7 +189,7 @@ def _simulate_sizes(
     duration_s = scaling.DURATION_S if duration_s is None else duration_s
     with progress_bar("simulating", quiet=as_json) as progress:
         result = scaling.measure_sizes(scaling.parse_sizes(robots), seed, duration_s, progress)
-    lost = write_report(report, result)
+    lost = options.write_report(report, result)
     if picture is not None:
         lost |= write_or_reason(picture, partial(scaling.draw_scaling, result, picture))
-    print_result(result, as_json, lambda: scaling.print_scaling(result, Console()), lost)
+    options.print_result(result, as_json, lambda: scaling.print_scaling(result, Console()), lost)

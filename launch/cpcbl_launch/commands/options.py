@@ -5,25 +5,23 @@ import os
 import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from typer import Argument, CallbackParam, Exit, Option, secho
 
-from cpcbl_launch.checks import require_matplotlib
+from cpcbl_launch.checks import require_endpoints, require_matplotlib
 from cpcbl_launch.reporting.files import json_text, write_or_reason
 from cpcbl_launch.run.containers import BASE_VARIABLE
-from cpcbl_launch.team_checks import endpoint_problem
 from cpcbl_team.errors import InputError
 
 
-def require_folder(option: str, folder: Path) -> Path:
-    """A folder to write into, made if it was not there. Raises InputError."""
+def require_folder(option: str, folder: Path) -> None:
+    """Makes a folder to write into, if it is not there. Raises InputError."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"{option} {folder}: {error.strerror}; name a folder") from error
     _require_writable(option, folder, folder)
-    return folder
 
 
 def require_writable_file(option: str, path: Path) -> None:
@@ -40,48 +38,35 @@ def _require_writable(option: str, path: Path, existing: Path) -> None:
         raise InputError(f"{option} {path}: {existing} cannot be written; name another place")
 
 
-def writable_file(option: CallbackParam, path: Path | None) -> Path | None:
-    """Callback of an option that names a file to write."""
-    if path is not None:
-        require_writable_file(option.opts[0], path)
-    return path
+def _require_picture(option: str, path: Path) -> None:
+    require_writable_file(option, path)
+    require_matplotlib(option, path)
 
 
-def writable_picture(option: CallbackParam, path: Path | None) -> Path | None:
-    """Callback of an option that names a picture to draw."""
-    if writable_file(option, path) is not None:
-        require_matplotlib(option.opts[0], path)
-    return path
+def _require_limit(option: str, limit: float) -> None:
+    if not math.isfinite(limit):
+        raise InputError(f"{option} {limit:g}: no limit; write a number, 0 for as much as it likes")
 
 
-def folder(option: CallbackParam, path: Path | None) -> Path | None:
-    """Callback of an option that names a folder to write into; the folder is made."""
-    return None if path is None else require_folder(option.opts[0], path)
+def _require_time(option: str, seconds: float) -> None:
+    if not seconds > 0.0:
+        raise InputError(f"{option} {seconds:g}: more than 0 seconds")
 
 
-def endpoints(option: CallbackParam, given: list[str] | None) -> list[str] | None:
-    """Callback of endpoints: Zenoh would try a wrong one again and again, and never say why."""
-    for endpoint in given or ():
-        if reason := endpoint_problem(endpoint):
-            raise InputError(f"{option.opts[0]} {endpoint}: {reason}")
-    return given
+def checked(require: Callable[[str, Any], object]) -> Callable[[CallbackParam, Any], Any]:
+    """A callback: `require` gets the option as it is typed, and its value where it was given."""
+
+    def callback(option: CallbackParam, value: Any) -> Any:
+        if value is not None:
+            require(option.opts[0], value)
+        return value
+
+    return callback
 
 
-def number_that(
-    is_good: Callable[[float], bool], problem: str
-) -> Callable[[CallbackParam, float | None], float | None]:
-    """Callback of an option whose number must be good; `problem` also says how to mend it."""
-
-    def check(option: CallbackParam, number: float | None) -> float | None:
-        if number is not None and not is_good(number):
-            raise InputError(f"{option.opts[0]} {number:g}: {problem}")
-        return number
-
-    return check
-
-
-more_than_no_time = number_that(lambda seconds: seconds > 0.0, "more than 0 seconds")
-_finite_limit = number_that(math.isfinite, "no limit; write a number, 0 for as much as it likes")
+writable_file, writable_picture = checked(require_writable_file), checked(_require_picture)
+folder, endpoints = checked(require_folder), checked(require_endpoints)
+duration = checked(_require_time)
 
 TeamFile = Annotated[Path, Option("--team", help="Team file (TOML).")]
 TeamArgument = Annotated[
@@ -92,7 +77,7 @@ BytesPerS = Annotated[
     float | None,
     Option(
         min=0.0,
-        callback=_finite_limit,
+        callback=checked(_require_limit),
         help="Bytes per second of fixes and beliefs that each robot may send; 0: no limit.",
     ),
 ]
@@ -100,7 +85,7 @@ MessagesPerMinute = Annotated[
     float | None,
     Option(
         min=0.0,
-        callback=_finite_limit,
+        callback=checked(_require_limit),
         help="Fixes and beliefs per minute that each robot may send; 0: no limit.",
     ),
 ]

@@ -9,14 +9,6 @@ from rich.console import Console
 from typer import Argument, Option
 
 from cpcbl_launch.commands import options
-from cpcbl_launch.commands.options import (
-    AsJson,
-    Image,
-    NoiseSeed,
-    TeamArgument,
-    print_not_written,
-    print_result,
-)
 from cpcbl_launch.reporting.files import write_or_reason
 from cpcbl_launch.reporting.tables import table
 from cpcbl_launch.team_file import find_team, key_folder
@@ -62,7 +54,7 @@ def keys(
         Option(help="Whose certificate becomes invalid, from the next start of the router on."),
     ] = None,
     retire_ca: Annotated[bool, Option(help="Trust only the newest authority.")] = False,
-    as_json: AsJson = False,
+    as_json: options.AsJson = False,
 ) -> None:
     """Make the keys of a team: its authority, and a certificate for each member.
 
@@ -82,7 +74,7 @@ def keys(
         made = make_keys(team, folder, request)
     except OSError as error:
         raise InputError(f"{error.filename or folder}: {error.strerror}; name a folder") from error
-    print_result(made, as_json, lambda: _print_keys(made, folder))
+    options.print_result(made, as_json, lambda: _print_keys(made, folder))
     if not as_json and not team.transport.secured:
         typer.echo(f'{file}: write [transport] security = "mtls", and the team uses these keys')
 
@@ -102,9 +94,9 @@ def _print_keys(made: "list[KeysReport]", folder: Path) -> None:
 
 
 def compose(
-    file: TeamArgument = None,
-    image: Image = None,
-    seed: NoiseSeed = 1,
+    file: options.TeamArgument = None,
+    image: options.Image = None,
+    seed: options.NoiseSeed = 1,
     output: Annotated[
         Path | None,
         Option(
@@ -123,4 +115,4 @@ def compose(
         typer.echo(text, nl=False)
     else:
         lost = write_or_reason(output, lambda: output.write_text(text, encoding="utf-8"))
-        print_not_written(lost)
+        options.print_not_written(lost)

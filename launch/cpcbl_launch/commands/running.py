@@ -13,25 +13,6 @@ from typer import Argument, Option
 from cpcbl_agents.clock import Clock
 from cpcbl_launch.checks import require_duration, require_robots, require_team_opencv
 from cpcbl_launch.commands import options
-from cpcbl_launch.commands.options import (
-    AsJson,
-    BaseImage,
-    Blind,
-    BytesPerS,
-    ClockText,
-    Connect,
-    Image,
-    MatchMessages,
-    MessagesPerMinute,
-    NoiseSeed,
-    Parent,
-    PictureFile,
-    ReportFile,
-    TeamFile,
-    parse_names,
-    print_result,
-    write_report,
-)
 from cpcbl_launch.overrides import Overrides, with_blind_robots, with_overrides
 from cpcbl_launch.run.containers import BASE_IMAGE
 from cpcbl_launch.team_file import find_team
@@ -43,7 +24,11 @@ from cpcbl_transport.topics import Role
 if TYPE_CHECKING:
     from cpcbl_launch.run.up import Launch, Run
 
-LEAST_SPEED, MOST_SPEED = 0.05, 1000.0  # at an extreme pace no process could run
+
+def _require_speed(option: str, speed: float) -> None:
+    if not 0.05 <= speed <= 1000.0:  # at an extreme pace no process could run
+        raise InputError(f"{option} {speed:g}: from 0.05 to 1000 x real time")
+
 
 UpFile = Annotated[
     Path | None, Argument(help="Team file, or a built-in one: demo (default), mrclam.")
@@ -53,13 +38,7 @@ UpDuration = Annotated[
 ]
 Speed = Annotated[
     float,
-    Option(
-        callback=options.number_that(
-            lambda speed: LEAST_SPEED <= speed <= MOST_SPEED,
-            f"from {LEAST_SPEED:g} to {MOST_SPEED:g} x real time",
-        ),
-        help="Times real time, at least 0.05.",
-    ),
+    Option(callback=options.checked(_require_speed), help="Times real time, at least 0.05."),
 ]
 LogFolder = Annotated[Path | None, Option(help="Folder of an MRCLAM log, for source mrclam.")]
 Robots = Annotated[str, Option(help="Robots to start on this machine; default: all.")]
@@ -82,21 +61,21 @@ def up(
     file: UpFile = None,
     duration: UpDuration = None,
     speed: Speed = 1.0,
-    seed: NoiseSeed = 1,
+    seed: options.NoiseSeed = 1,
     data: LogFolder = None,
-    blind: Blind = "",
+    blind: options.Blind = "",
     robots: Robots = "",
-    bytes_per_s: BytesPerS = None,
-    messages_per_minute: MessagesPerMinute = None,
-    match_messages: MatchMessages = None,
-    report: ReportFile = None,
-    picture: PictureFile = None,
+    bytes_per_s: options.BytesPerS = None,
+    messages_per_minute: options.MessagesPerMinute = None,
+    match_messages: options.MatchMessages = None,
+    report: options.ReportFile = None,
+    picture: options.PictureFile = None,
     record: RecordFile = None,
     logs: ProcessLogs = None,
     containers: InContainersOption = False,
-    image: Image = None,
-    base_image: BaseImage = BASE_IMAGE,
-    as_json: AsJson = False,
+    image: options.Image = None,
+    base_image: options.BaseImage = BASE_IMAGE,
+    as_json: options.AsJson = False,
 ) -> None:
     """Start a team: the field, a process per robot, a live table, a report at the end."""
     from cpcbl_agents.process import StopSignal
@@ -106,7 +85,7 @@ def up(
     budgets = Overrides(bytes_per_s, messages_per_minute, match_messages)
     run = _run_of(file, duration, data, budgets)
     run = run._replace(speed=speed, seed=seed, folder=logs, picture=picture, record=record)
-    run = run._replace(team=with_blind_robots(run.team, parse_names(blind)))
+    run = run._replace(team=with_blind_robots(run.team, options.parse_names(blind)))
     if robots:
         run = run._replace(here=_robots_here(robots, run.team))
     console = Console(stderr=as_json)
@@ -117,8 +96,8 @@ def up(
     title = f"team {run.team.name}, {len(run.team.robots)} robots, {speed:g} x real time"
     with LiveTable(title, run.team.robots, console, quiet=as_json) as table:
         result = run_team(run, table, StopSignal(), launch)
-    lost = dict(result.not_written) | write_report(report, result)
-    print_result(result, as_json, lambda: print_report(result, console), lost)
+    lost = dict(result.not_written) | options.write_report(report, result)
+    options.print_result(result, as_json, lambda: print_report(result, console), lost)
 
 
 def _run_of(
@@ -143,7 +122,7 @@ def _run_of(
 
 def _robots_here(text: str, team: Team) -> list[str]:
     """The robots of `--robots`. Raises InputError for one that the team does not have."""
-    if not (names := parse_names(text)):
+    if not (names := options.parse_names(text)):
         raise InputError(f"--robots {text}: names no robot; there are {', '.join(team.robots)}")
     require_robots(f"--robots {text}", names, team)
     return names
@@ -164,14 +143,14 @@ def _launch(
 
 
 def field(
-    team_file: TeamFile,
-    seed: NoiseSeed = 1,
-    connect: Connect = None,
+    team_file: options.TeamFile,
+    seed: options.NoiseSeed = 1,
+    connect: options.Connect = None,
     site: Annotated[
         list[str] | None, Option(help="Robots at another router: tcp/10.0.0.2:7447=r3,r4.")
     ] = None,
-    clock: ClockText = "",
-    parent: Parent = None,
+    clock: options.ClockText = "",
+    parent: options.Parent = None,
 ) -> None:
     """Run the simulated field until SIGINT, SIGTERM or SIGHUP."""
     from cpcbl_agents.process import StopSignal
@@ -213,7 +192,7 @@ def router(
         Path | None, Option(help="A configuration of Zenoh (JSON5), in place of FILE.")
     ] = None,
     speed: Annotated[float, Option(hidden=True, help="Guards let more in.")] = 1.0,
-    parent: Parent = None,
+    parent: options.Parent = None,
     print_config: Annotated[
         bool, Option(help="Print the configuration, for zenohd or --config.")
     ] = False,

@@ -12,19 +12,7 @@ from typer import Argument, Exit, Option
 
 from cpcbl_agents.clock import Clock
 from cpcbl_launch.checks import require_robots, require_team_opencv
-from cpcbl_launch.commands.options import (
-    AsJson,
-    BaseImage,
-    ClockText,
-    Connect,
-    Image,
-    Parent,
-    TeamArgument,
-    TeamFile,
-    more_than_no_time,
-    print_result,
-    require_folder,
-)
+from cpcbl_launch.commands import options
 from cpcbl_launch.run.containers import BASE_IMAGE
 from cpcbl_launch.team_file import find_team
 from cpcbl_team.config import Team, TransportSettings
@@ -48,7 +36,7 @@ Source = Annotated[
 ]
 Stay = Annotated[
     float | None,
-    Option("--for", callback=more_than_no_time, help="Seconds to stay; default: until Ctrl-C."),
+    Option("--for", callback=options.duration, help="Seconds to stay; default: until Ctrl-C."),
 ]
 InContainer = Annotated[
     bool, Option("--container", help="Run it in a container of its own (needs Docker).")
@@ -57,20 +45,20 @@ InContainer = Annotated[
 
 def observer(
     name: Name,
-    team_file: TeamFile,
+    team_file: options.TeamFile,
     at: At,
     sensor: Sensor = "survey",
     fov: FieldOfView = None,
     move: Move = "",
     source: Source = None,
-    connect: Connect = None,
+    connect: options.Connect = None,
     duration: Stay = None,
     container: InContainer = False,
-    image: Image = None,
-    base_image: BaseImage = BASE_IMAGE,
-    as_json: AsJson = False,
-    clock: ClockText = "",
-    parent: Parent = None,
+    image: options.Image = None,
+    base_image: options.BaseImage = BASE_IMAGE,
+    as_json: options.AsJson = False,
+    clock: options.ClockText = "",
+    parent: options.Parent = None,
 ) -> None:
     """Join a running team, from any machine, with a better sensor; leave when it is stopped.
 
@@ -100,7 +88,7 @@ def observer(
     when = Clock.parse(clock) if clock else Clock.wall()
     limit_s = math.inf if duration is None else duration
     result = run.run_observer(name, team, endpoints, when, stop, limit_s)
-    print_result(result, as_json, lambda: print_observer_report(result, console))
+    options.print_result(result, as_json, lambda: print_observer_report(result, console))
 
 
 def _arguments(given: Mapping[str, object], endpoints: Sequence[str], as_json: bool) -> list[str]:
@@ -111,15 +99,17 @@ def _arguments(given: Mapping[str, object], endpoints: Sequence[str], as_json: b
 
 
 def traffic(
-    file: TeamArgument = None,
+    file: options.TeamArgument = None,
     team_name: Annotated[
         str | None, Option(help="The running team's name, where its file is not at hand.")
     ] = None,
-    connect: Connect = None,
+    connect: options.Connect = None,
     duration: Annotated[
         float | None,
         Option(
-            "--for", callback=more_than_no_time, help="Seconds to watch; default: until Ctrl-C."
+            "--for",
+            callback=options.duration,
+            help="Seconds to watch; default: until Ctrl-C.",
         ),
     ] = None,
     wait: Annotated[float, Option(min=0.1, help="Seconds to wait for the team's router.")] = 5.0,
@@ -149,17 +139,17 @@ def traffic(
     console, where = Console(), ", ".join(endpoints)
     with TrafficView(where, console, quiet=as_json) as view:
         result = watch_team(request, view.show, StopSignal())
-    print_result(result, as_json, lambda: console.print(traffic_view(result, where)))
+    options.print_result(result, as_json, lambda: console.print(traffic_view(result, where)))
 
 
 def look(
     robot: Annotated[str, Argument(help="The robot whose camera it is.")],
-    team_file: TeamFile,
+    team_file: options.TeamFile,
     pictures: Annotated[
         Path | None,
         Option(help="Detect in this picture, or folder of pictures; no team need run."),
     ] = None,
-    connect: Connect = None,
+    connect: options.Connect = None,
     save: Annotated[
         Path, Option(help="Folder for the annotated pictures, made if need be.")
     ] = Path("looks"),
@@ -184,18 +174,18 @@ def look(
         raise InputError(f'look {robot}: has no camera in {team_file}; set sensing = "camera"')
     if pictures is not None:
         require_team_opencv(team, [robot])
-    folder = require_folder("--save", save)
+    options.require_folder("--save", save)
     if pictures is None:
         frames, count = _live_frames(robot, team, connect, wait), count or 1
     else:
         frames = _frames_of_pictures(robot, team, pictures)
     console, reports = Console(), list[view.FrameReport]()
     for name, file, annotated in islice(frames, count):
-        saved = view.save_picture(annotated, folder, f"{robot}_{file}")
+        saved = view.save_picture(annotated, save, f"{robot}_{file}")
         reports.append(view.frame_report(annotated, name, saved))
         if not as_json:
             view.print_frame_report(reports[-1], console)
-    print_result(reports, as_json, lambda: None)
+    options.print_result(reports, as_json, lambda: None)
 
 
 def _live_frames(

@@ -9,11 +9,9 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from cpcbl_agents.clock import Clock
-from cpcbl_launch.checks import require_robots, require_team_opencv
-from cpcbl_launch.team_checks import endpoint_problem
+from cpcbl_launch.checks import require_endpoints, require_robots, require_team_opencv
 from cpcbl_launch.team_file import find_team
 from cpcbl_team.config import Team
-from cpcbl_team.errors import InputError
 from cpcbl_transport.bus import Bus
 
 DESCRIPTION = "Run one robot, on any machine, until SIGINT, SIGTERM or SIGHUP."
@@ -63,9 +61,7 @@ def run_robot_command(
     from cpcbl_agents.process import StopSignal, run_robot  # for other commands it costs 0.1 s
 
     team = _team_with(arguments.name, arguments.team)
-    for endpoint in arguments.connect or ():
-        if reason := endpoint_problem(endpoint):
-            raise InputError(f"--connect {endpoint}: {reason}")
+    require_endpoints("--connect", arguments.connect or ())
     clock = Clock.parse(arguments.clock) if arguments.clock else Clock.wall()
     run_robot(
         arguments.name,
