@@ -35,10 +35,8 @@ def time_at_min_speed_s(distance_m: float, seconds: float, s: OdometrySettings) 
 
 
 def without_duplicates(sightings: tuple[Sighting, ...]) -> tuple[Sighting, ...]:
-    """The sightings without those that repeat a reading of an earlier one of the same object.
-
-    Their errors are the same, so they must not count twice.
-    """
+    """The sightings without those that repeat a reading of an earlier one of the same object. Their
+    errors are the same, so they must not count twice."""
     if len({s.id for s in sightings}) == len(sightings):
         return sightings
     kept: list[Sighting] = []
@@ -53,10 +51,8 @@ def without_duplicates(sightings: tuple[Sighting, ...]) -> tuple[Sighting, ...]:
 
 
 def corrected_sighting(sighting: Sighting, sensor: SensorSettings, teammate: bool) -> Sighting:
-    """The sighting without the sensor's systematic errors; a faulty one is not changed.
-
-    A heading is measured relative to the line of sight, so it changes with the bearing.
-    """
+    """The sighting without the sensor's systematic errors; a faulty one is not changed. A heading
+    is measured relative to the line of sight, so it changes with the bearing."""
     parts = msgspec.structs.astuple(sighting)
     name, range_m, bearing, range_sigma, bearing_sigma, heading, heading_sigma = parts
     if any(angle is not None and abs(angle) > math.pi for angle in (bearing, heading)):
@@ -91,10 +87,8 @@ def without_bearing_bias(frame: Sightings, bias_rad: float) -> Sightings:
 
 
 def sighting_fault(sighting: Sighting) -> SightingFault | None:
-    """Why a sighting must not be used (resolution i); None if it may be.
-
-    A heading needs its own sigma, because the sensor model has none.
-    """
+    """Why a sighting must not be used (resolution i); None if it may be. A heading needs its own
+    sigma, because the sensor model has none."""
     r, a, h = sighting.range_m, sighting.bearing_rad, sighting.heading_rad
     range_sigma, bearing_sigma = sighting.range_sigma_m, sighting.bearing_sigma_rad
     heading_sigma = sighting.heading_sigma_rad

@@ -26,10 +26,8 @@ class PoseEstimate(NamedTuple):
 
 
 class FrameEstimate(NamedTuple):
-    """The filter's estimate at the time of a frame, from which fixes are made.
-
-    The frame's bearings are corrected by the bias that the robot has learned, as the estimate is.
-    """
+    """The filter's estimate at the time of a frame, from which fixes are made. The frame's bearings
+    are corrected by the bias that the robot has learned, as the estimate is."""
 
     frame: Sightings
     estimate: Estimate

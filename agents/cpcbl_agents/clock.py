@@ -24,10 +24,8 @@ class Clock(NamedTuple):
         return max(0.0, (self.from_ns + ahead - time.monotonic_ns()) * 1e-9)
 
     def clock_step_s(self) -> float:
-        """By how much the machine's time was set since the start, or ran on while it slept (s).
-
-        0 for a clock that does not follow the machine's time.
-        """
+        """By how much the machine's time was set since the start, or ran on while it slept (s). 0
+        for a clock that does not follow the machine's time."""
         before, machine_ns, after = self.now_ns(), time.time_ns(), self.now_ns()
         between = min(max(before, machine_ns), after)  # reading the clock may have taken long
         return (machine_ns - between) * 1e-9 if self.unix else 0.0

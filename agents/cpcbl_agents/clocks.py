@@ -36,10 +36,8 @@ class ClockMonitor:
         self._spans: dict[str, tuple[Span, Span]] = {}
 
     def rejects(self, sender: str, stamp_ns: int, now_ns: int) -> bool:
-        """Whether a message of this sender that arrives now has the stamp of a clock that is off.
-
-        A single message from far ahead is left to `messages.refusal`.
-        """
+        """Whether a message of this sender that arrives now has the stamp of a clock that is off. A
+        single message from far ahead is left to `messages.refusal`."""
         late_ns = now_ns - stamp_ns
         last, before = self._spans.get(sender, (Span(now_ns), Span(now_ns)))
         if now_ns - last.since_ns >= SPAN_NS:

@@ -12,9 +12,8 @@ from types import FrameType
 import msgspec
 
 from cpcbl_agents.clock import Clock
-from cpcbl_agents.composition import build_robot
 from cpcbl_agents.node import Node, Steppable
-from cpcbl_agents.robot import Robot
+from cpcbl_agents.robot import Robot, build_robot
 from cpcbl_agents.sources import OwnCamera
 from cpcbl_team.config import Team
 from cpcbl_team.errors import ClockError
@@ -141,9 +140,7 @@ def make_robot(
     name: str, team: Team, clock: Clock, restarted: bool = False, camera: OwnCamera | None = None
 ) -> Robot:
     """The robot as it starts now. After a restart it knows neither its pose nor what it spent.
-
-    Docker restarts a robot without telling it; such a robot is recognized because it is late.
-    """
+    Docker restarts a robot without telling it; such a robot is recognized because it is late."""
     start_ns = clock.now_ns()
     late_s = (start_ns - clock.epoch_ns) * 1e-9 / clock.speed
     late = start_ns > clock.epoch_ns + LATE_NS * max(1.0, clock.speed)
@@ -183,9 +180,7 @@ def own_camera(
     name: str, team: Team, clock: Clock, wake: Callable[[], None]
 ) -> AbstractContextManager[OwnCamera | None]:
     """The camera that a robot reads itself, until the end; None where nobody or a driver does.
-
-    Raises InputError for a camera that cannot be used, DependencyError without OpenCV.
-    """
+    Raises InputError for a camera that cannot be used, DependencyError without OpenCV."""
     robot = team.robots[name]
     if robot.sensing == "camera":
         import cpcbl_agents.vision  # noqa: F401  it says what is missing

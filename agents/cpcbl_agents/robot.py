@@ -1,36 +1,33 @@
-"""One robot: three agents and the way of messages between them. It knows no bus and no clock."""
+"""One robot: three agents and the way of messages between them. It knows no bus and no clock.
+
+`build_robot` makes one from a team file: it alone opens a robot's files. What a robot does not need
+is not imported: numpy for a log, OpenCV for a camera.
+"""
 
 from collections import Counter
 from collections.abc import Iterator
+from pathlib import Path
 
 from cpcbl_agents.agent import AgentMessage, BusEvent, FrameSubscribers, HelpSent, Presence, Tick
 from cpcbl_agents.clocks import ClockMonitor
 from cpcbl_agents.collaboration import CollaborationAgent
+from cpcbl_agents.detector import Detector
 from cpcbl_agents.filtering import FilterAgent
 from cpcbl_agents.guests import GuestRegistry
 from cpcbl_agents.sensing import SensingAgent
+from cpcbl_agents.sources import NoSource, OwnCamera, Source
+from cpcbl_agents.waypoint_follower import WaypointFollower
 from cpcbl_team.config import Team
-from cpcbl_team.inputs import Belief, BeliefShared, Fix
+from cpcbl_team.inputs import BeliefShared
 from cpcbl_team.trust import TrustStatus
 from cpcbl_transport.budget import Budget
-from cpcbl_transport.messages import (
-    AnnotatedFrame,
-    Drive,
-    Flow,
-    Help,
-    Message,
-    SensorInput,
-    Status,
-    Track,
-    Trust,
-)
+from cpcbl_transport.messages import Flow, Help, Message, Outgoing, SensorInput, Status, Trust
 
 NEVER_NS = 2**62
-Outgoing = AnnotatedFrame | Belief | Fix | Track | Drive
 
 
 class Robot:
-    """The agents of one robot of a team; `composition.build_robot` makes one from a team file.
+    """The agents of one robot of a team; `build_robot` makes one from a team file.
 
     `restarted`: its process ran before, and may have spent its budget then.
     """
@@ -150,3 +147,40 @@ class Robot:
             if name in clock_off:
                 status = status._replace(reason="clock")
             yield Trust(*status, 0.0 if clocks is None else clocks.late_s(name))
+
+
+def build_robot(
+    name: str, team: Team, start_ns: int, restarted: bool = False, camera: OwnCamera | None = None
+) -> Robot:
+    """The robot, with all that its settings ask for.
+
+    `restarted`: its process ran before, and may have spent its budget then. `camera`: a source of
+    frames beside the messages of a driver. Raises LogError for a log that cannot be read,
+    InputError for a robot with a camera without OpenCV.
+    """
+    source: Source = NoSource()
+    if team.robots[name].source == "mrclam":
+        from cpcbl_agents.sources.mrclam import MrclamSource
+
+        log = MrclamSource(Path(team.data), name)
+        start_ns = max(start_ns, log.first_ns)
+        log.skip_to(start_ns)
+        source = log
+    return Robot(name, team, start_ns, build_sensing(name, team, source, camera), restarted)
+
+
+def build_sensing(
+    name: str, team: Team, source: Source, camera: OwnCamera | None = None
+) -> SensingAgent:
+    """The sensing agent of a robot that reads this source and this camera."""
+    settings = team.robots[name]
+    map_names = frozenset(team.map.landmarks) | frozenset(team.map.walls)
+    follower = None
+    if settings.source == "simulated":
+        follower = WaypointFollower(name, settings.waypoints_m, settings.speed_m_s)
+    detector: Detector | None = None
+    if settings.sensing == "camera":
+        from cpcbl_agents.vision.detector import CameraDetector
+
+        detector = CameraDetector(name, team)
+    return SensingAgent(settings, source, map_names, follower, detector, camera)

@@ -7,9 +7,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support.buses import Subscription, TeamOnBus, examples, robot_at, saw, standing, team_of
 
-from cpcbl_agents.composition import build_robot
 from cpcbl_agents.declarations import LivelinessTokens
 from cpcbl_agents.node import Node
+from cpcbl_agents.robot import build_robot
 from cpcbl_team.inputs import Fix, Odometry, Sighting
 from cpcbl_team.tiers import LOWEST_TIER
 from cpcbl_transport import topics

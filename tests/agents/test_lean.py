@@ -10,7 +10,7 @@ HEAVY = ("cv2", "matplotlib", "numpy", "pydantic", "rich", "typer")
 CODE = """
 import json, sys
 import cpcbl_agents.process
-from cpcbl_agents.composition import build_robot
+from cpcbl_agents.robot import build_robot
 from cpcbl_team.config import RobotSettings, Start, Team
 
 robot = RobotSettings(source=sys.argv[1], start=Start(x_m=0.0, y_m=0.0))

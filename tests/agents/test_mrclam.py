@@ -19,7 +19,7 @@ from support.logs import (
 )
 
 from cpcbl_agents.agent import Tick
-from cpcbl_agents.composition import build_robot
+from cpcbl_agents.robot import build_robot
 from cpcbl_agents.sources import mrclam
 from cpcbl_agents.sources.mrclam import LogError, MrclamSource
 from cpcbl_team.config import Field

@@ -11,8 +11,8 @@ from support.buses import (
 )
 from support.nodes import estimate, exchange, helper, only_me, tier, two_robots
 
-from cpcbl_agents.composition import build_robot
 from cpcbl_agents.node import Node
+from cpcbl_agents.robot import build_robot
 from cpcbl_team.config import LocalizerSettings
 from cpcbl_team.estimate import ZERO3
 from cpcbl_team.inputs import Sighting

@@ -28,7 +28,6 @@ from support.nodes import (
 )
 
 from cpcbl_agents.node import INBOX
-from cpcbl_agents.robot import Outgoing
 from cpcbl_team.inputs import Belief, Fix, Odometry, Position, Sighting, Sightings
 from cpcbl_team.timeline import HORIZON_NS
 from cpcbl_transport import topics
@@ -38,6 +37,7 @@ from cpcbl_transport.messages import (
     VERSION,
     Frame,
     Message,
+    Outgoing,
     Refusal,
     Track,
 )

@@ -8,9 +8,8 @@ from msgspec.structs import replace
 from support.buses import MS, SECOND, robot_at, saw, team_of, with_robot
 
 from cpcbl_agents.agent import Presence, Tick
-from cpcbl_agents.composition import build_robot
 from cpcbl_agents.filtering import ODOMETRY_WAIT_NS
-from cpcbl_agents.robot import Robot
+from cpcbl_agents.robot import Robot, build_robot
 from cpcbl_team.config import (
     CollaborationSettings,
     LocalizerSettings,

@@ -14,10 +14,9 @@ import numpy as np
 
 from cpcbl_agents.agent import BusEvent, Tick
 from cpcbl_agents.clock import Clock
-from cpcbl_agents.composition import build_sensing
 from cpcbl_agents.node import Node
 from cpcbl_agents.process import Loop, StopSignal
-from cpcbl_agents.robot import Outgoing, Robot
+from cpcbl_agents.robot import Robot, build_sensing
 from cpcbl_agents.sources import NoSource
 from cpcbl_team.config import (
     CollaborationSettings,
@@ -31,7 +30,7 @@ from cpcbl_team.inputs import Fix, Odometry, Sighting, Sightings
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus, BusProxy, Handle, MessageCallback, Publisher, PublisherProxy
 from cpcbl_transport.compact import FIX_BYTES
-from cpcbl_transport.messages import Message, encode
+from cpcbl_transport.messages import Message, Outgoing, encode
 from cpcbl_transport.topics import Qos
 from cpcbl_transport.zenoh_bus import open_bus
 

@@ -7,8 +7,8 @@ from typing import Any
 import msgspec
 from hypothesis import settings
 
-from cpcbl_agents.composition import build_robot
 from cpcbl_agents.node import Node
+from cpcbl_agents.robot import build_robot
 from cpcbl_team.config import (
     CollaborationSettings,
     Field,

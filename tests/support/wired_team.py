@@ -7,8 +7,8 @@ from contextlib import ExitStack, contextmanager
 from typing import NamedTuple
 
 from cpcbl_agents.collaboration import CollaborationAgent
-from cpcbl_agents.composition import build_robot
 from cpcbl_agents.node import Node
+from cpcbl_agents.robot import build_robot
 from cpcbl_launch.run.up import free_endpoint
 from cpcbl_team.config import (
     Team,

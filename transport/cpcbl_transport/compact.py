@@ -49,21 +49,17 @@ class _Number(NamedTuple):
         return round(min(max(value, self.least), self.most))
 
 
-def _signed(width: int) -> _Number:
-    half = 1 << (8 * width - 1)
-    return _Number(width, -half, half - 1)
+def _number(width: int, signed: bool) -> _Number:
+    least = -(1 << (8 * width - 1)) if signed else 0
+    return _Number(width, least, least + (1 << (8 * width)) - 1)
 
 
-def _unsigned(width: int) -> _Number:
-    return _Number(width, 0, (1 << (8 * width)) - 1)
-
-
-_STAMP = _signed(7)  # to the year 3111
-_PLACE = _signed(5)  # to 5,497 km
-_HEADING = _unsigned(3)
-_SIGMA = _unsigned(2)
-_SLOPE = _signed(3)  # to 4,096
-_RATE = _signed(2)  # to 32 m/s, 32 rad/s
+_STAMP = _number(7, signed=True)  # to the year 3111
+_PLACE = _number(5, signed=True)  # to 5,497 km
+_HEADING = _number(3, signed=False)
+_SIGMA = _number(2, signed=False)
+_SLOPE = _number(3, signed=True)  # to 4,096
+_RATE = _number(2, signed=True)  # to 32 m/s, 32 rad/s
 _COVARIANCE_2 = (_SIGMA, _SIGMA, _SLOPE)
 _COVARIANCE_3 = (*_COVARIANCE_2, _SIGMA, _SLOPE, _SLOPE)
 _FIX = (_STAMP, _PLACE, _PLACE, *_COVARIANCE_2, *_COVARIANCE_2)
@@ -126,13 +122,8 @@ def decode_help(key: str, payload: bytes) -> Belief | Fix | Refusal:
         heading, *factor, speed, turn_rate = rest
         rates = speed / RATES, turn_rate / RATES
         return Belief(names["robot"], *place, _heading(heading), _covariance_3(*factor), *rates)
-    fix = (
-        names["robot"],
-        names["observer"],
-        *place,
-        _covariance_2(*rest[:3]),
-        _covariance_2(*rest[3:6]),
-    )
+    covariances = _covariance_2(*rest[:3]), _covariance_2(*rest[3:6])
+    fix = names["robot"], names["observer"], *place, *covariances
     if layout is _FIX:
         return Fix(*fix)
     heading, sensor, observer = rest[6:]
@@ -164,9 +155,8 @@ def _pack(numbers: Sequence[_Number], counts: Sequence[int]) -> bytes:
 def _unpack(numbers: Sequence[_Number], payload: bytes) -> list[int]:
     counts, at = [], 1
     for width, least, _ in numbers:
-        end = at + width
-        counts.append(int.from_bytes(payload[at:end], "little", signed=least < 0))
-        at = end
+        counts.append(int.from_bytes(payload[at : at + width], "little", signed=least < 0))
+        at += width
     return counts
 
 
@@ -259,8 +249,6 @@ def sent_bytes(payload: int) -> int:
 
 
 def received_bytes(payload: int, sender: str) -> int:
-    """The most bytes on the link of a receiver that subscribed to all senders of a tier.
-
-    What stands after a subscription's first wildcard travels as text: `/` and the sender's name.
-    """
+    """The most bytes on the link of a receiver that subscribed to all senders of a tier. What
+    stands after a subscription's first wildcard travels as text: `/` and the sender's name."""
     return sent_bytes(payload) + 2 + len(sender)

@@ -123,10 +123,8 @@ class _Branch(Generic[Thing]):
 
 
 class KeyTree(Generic[Thing]):
-    """Each thing lies under one key or pattern and is found in the order in which it was added.
-
-    It is a tree of chunks: a search costs as much as it finds, however much is stored.
-    """
+    """Each thing lies under one key or pattern and is found in the order in which it was added. It
+    is a tree of chunks: a search costs as much as it finds, however much is stored."""
 
     def __init__(self) -> None:
         self._root: _Branch[Thing] = _Branch()

@@ -165,6 +165,7 @@ Help = Belief | Fix
 SensorInput = Odometry | Sightings | Position | Frame
 Tagged = SensorInput | AnnotatedFrame | Status | Track | Drive | Join | Truths
 Message = Tagged | Help
+Outgoing = AnnotatedFrame | Track | Drive | Help  # what a robot sends besides its status
 Telemetry = Status | Track | Drive | Truths
 
 

@@ -11,10 +11,7 @@ from typing import Annotated
 import msgspec
 
 from cpcbl_team.config import RobotSettings
-
-_Positive = Annotated[float, msgspec.Meta(gt=0.0)]
-_NotNegative = Annotated[float, msgspec.Meta(ge=0.0)]
-_FieldOfView = Annotated[float, msgspec.Meta(gt=0.0, le=360.0)]
+from cpcbl_team.config.table import NotNegative, Positive
 
 
 class StartModel(msgspec.Struct, frozen=True, kw_only=True):
@@ -23,54 +20,54 @@ class StartModel(msgspec.Struct, frozen=True, kw_only=True):
     x_m: float
     y_m: float
     heading_deg: float = 0.0
-    sigma_m: _NotNegative = 0.05
-    heading_sigma_deg: _NotNegative = 3.0
+    sigma_m: NotNegative = 0.05
+    heading_sigma_deg: NotNegative = 3.0
 
 
 class SensorModel(msgspec.Struct, frozen=True, kw_only=True):
     """The sensor for landmarks and teammates."""
 
-    range_share: _NotNegative = 0.03
-    range_floor_m: _NotNegative = 0.01
-    bearing_sigma_deg: _NotNegative = 2.0
-    field_of_view_deg: _FieldOfView = 100.0
-    max_range_m: _Positive = 8.0
-    rate_hz: _Positive = 10.0
+    range_share: NotNegative = 0.03
+    range_floor_m: NotNegative = 0.01
+    bearing_sigma_deg: NotNegative = 2.0
+    field_of_view_deg: Annotated[float, msgspec.Meta(gt=0.0, le=360.0)] = 100.0
+    max_range_m: Positive = 8.0
+    rate_hz: Positive = 10.0
     delay_s: float = 0.0
-    range_scale: _Positive = 1.0
+    range_scale: Positive = 1.0
     range_bias_m: float = 0.0
     robot_range_bias_m: float = 0.0
     range_is_depth: bool = False
     optical_axis_deg: float = 0.0
-    bearing_scale: _Positive = 1.0
+    bearing_scale: Positive = 1.0
     bearing_bias_deg: float = 0.0
-    correlation_s: _NotNegative = 0.0
+    correlation_s: NotNegative = 0.0
 
 
 class OdometryModel(msgspec.Struct, frozen=True, kw_only=True):
     """The wheels: their noise, and how what they report differs from what they do."""
 
-    distance_sigma_m_per_sqrt_m: _NotNegative = 0.05
-    distance_sigma_m_per_sqrt_rad: _NotNegative = 0.0
-    turn_sigma_rad_per_sqrt_rad: _NotNegative = 0.05
-    turn_sigma_rad_per_sqrt_m: _NotNegative = 0.05
-    crawl_sigma_m_per_sqrt_s: _NotNegative = 0.0
-    distance_scale: _Positive = 1.0
-    distance_loss_m_per_rad: _NotNegative = 0.0
-    least_speed_m_s: _NotNegative = 0.0
-    turn_scale: _Positive = 1.0
+    distance_sigma_m_per_sqrt_m: NotNegative = 0.05
+    distance_sigma_m_per_sqrt_rad: NotNegative = 0.0
+    turn_sigma_rad_per_sqrt_rad: NotNegative = 0.05
+    turn_sigma_rad_per_sqrt_m: NotNegative = 0.05
+    crawl_sigma_m_per_sqrt_s: NotNegative = 0.0
+    distance_scale: Positive = 1.0
+    distance_loss_m_per_rad: NotNegative = 0.0
+    least_speed_m_s: NotNegative = 0.0
+    turn_scale: Positive = 1.0
     turn_bias_rad_per_m: float = 0.0
-    delay_s: _NotNegative = 0.0
-    rate_hz: _Positive = 20.0
+    delay_s: NotNegative = 0.0
+    rate_hz: Positive = 20.0
     moves: bool = True
 
 
 class PositionSensorModel(msgspec.Struct, frozen=True, kw_only=True):
     """A sensor of the position on the field, such as differential GPS."""
 
-    sigma_m: _Positive = 0.02
-    rate_hz: _Positive = 5.0
-    delay_s: _NotNegative = 0.0
+    sigma_m: Positive = 0.02
+    rate_hz: Positive = 5.0
+    delay_s: NotNegative = 0.0
 
 
 class SimulatedRobotModel(msgspec.Struct, frozen=True, array_like=True):

@@ -118,10 +118,8 @@ def members_in(folder: Path) -> tuple[Member, ...]:
 
 
 def access_control(team: Team) -> dict[str, Any]:
-    """What a router of this team adds to its guards; nothing for a team that is not secured.
-
-    Raises SecurityError without the list of members.
-    """
+    """What a router of this team adds to its guards; nothing for a team that is not secured. Raises
+    SecurityError without the list of members."""
     secured, folder = team.transport.secured, Path(team.transport.keys)
     return access_rules(team, members_in(folder)) if secured else {}
 

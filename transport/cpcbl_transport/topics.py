@@ -11,18 +11,8 @@ from functools import lru_cache
 from typing import NamedTuple
 
 from cpcbl_team.inputs import Belief, Fix, Odometry, Position, Sightings
-from cpcbl_transport.messages import (
-    LARGEST_FRAME,
-    LARGEST_PAYLOAD,
-    AnnotatedFrame,
-    Drive,
-    Frame,
-    Join,
-    Message,
-    Status,
-    Track,
-    Truths,
-)
+from cpcbl_transport import messages
+from cpcbl_transport.messages import LARGEST_FRAME, LARGEST_PAYLOAD, Message
 
 
 class QosProfile(NamedTuple):
@@ -127,24 +117,28 @@ BELIEF = Topic("belief/<tier>/<robot>", Belief, Qos.FRESH, subscribers=_MEMBERS)
 # Each sighting of a worse robot that subscribes. The next one is better than a late one
 FIX = Topic("fix/<robot>/<tier>/<observer>", Fix, Qos.FRESH, publishers=_OBSERVER)
 # 1 Hz. For people; it must never delay a fix
-STATUS = Topic("status/<robot>", Status, Qos.TELEMETRY)
+STATUS = Topic("status/<robot>", messages.Status, Qos.TELEMETRY)
 # 10 Hz while somebody records. For reports; it costs nothing without a subscriber
-TRACK = Topic("track/<robot>", Track, Qos.TELEMETRY)
+TRACK = Topic("track/<robot>", messages.Track, Qos.TELEMETRY)
 # At the driver's rate. Inputs are not dropped: a lost piece of odometry is a lost piece of the way
 IN_ODOMETRY = Topic("in/<robot>/odometry", Odometry, Qos.INPUT, publishers=_SENSING)
 IN_SIGHTINGS = Topic("in/<robot>/sightings", Sightings, Qos.INPUT, publishers=_SENSING)
 IN_POSITION = Topic("in/<robot>/position", Position, Qos.INPUT, publishers=_SENSING)
 # At the camera's rate. The next frame is better than a late one
-IN_FRAME = Topic("in/<robot>/frame", Frame, Qos.FRAME, publishers=_SENSING, largest=LARGEST_FRAME)
+IN_FRAME = Topic(
+    "in/<robot>/frame", messages.Frame, Qos.FRAME, publishers=_SENSING, largest=LARGEST_FRAME
+)
 # 2 Hz while somebody subscribes. For people; it costs nothing without a subscriber
-LOOK = Topic("look/<robot>", AnnotatedFrame, Qos.TELEMETRY, largest=LARGEST_FRAME)
+LOOK = Topic("look/<robot>", messages.AnnotatedFrame, Qos.TELEMETRY, largest=LARGEST_FRAME)
 # 10 Hz, simulation only. A late command is a collision
-DRIVE = Topic("field/drive/<robot>", Drive, Qos.COMMAND, subscribers=_FIELD)
+DRIVE = Topic("field/drive/<robot>", messages.Drive, Qos.COMMAND, subscribers=_FIELD)
 # 2 Hz of a guest, simulation only. Without it the field removes the guest; a restarted field needs
 # it again
-JOIN = Topic("field/join/<robot>", Join, Qos.COMMAND, publishers=_GUEST, subscribers=_FIELD)
+JOIN = Topic(
+    "field/join/<robot>", messages.Join, Qos.COMMAND, publishers=_GUEST, subscribers=_FIELD
+)
 # Every step, simulation only. For reports only
-TRUTH = Topic("field/truth", Truths, Qos.TELEMETRY, publishers=_FIELD, subscribers=())
+TRUTH = Topic("field/truth", messages.Truths, Qos.TELEMETRY, publishers=_FIELD, subscribers=())
 
 TOPICS = (
     *(ALIVE, BELIEF, FIX, STATUS, TRACK),

@@ -38,10 +38,8 @@ def open_bus(
     give_up: Callable[[], bool] = lambda: False,
     credentials: Credentials | None = None,
 ) -> "ZenohBus":
-    """A client's session below the team's namespace; waits for a router until `give_up()`.
-
-    With credentials every link is mutual TLS. Raises BusError when it gave up.
-    """
+    """A client's session below the team's namespace; waits for a router until `give_up()`. With
+    credentials every link is mutual TLS. Raises BusError when it gave up."""
     config = client_config(connect, credentials)
     reason = "stopped before a router answered"
     while not give_up():
@@ -90,10 +88,8 @@ def open_plain_router(config: Mapping[str, Any], space: str | None = None) -> "Z
 
 
 def read_router_config(path: Path) -> dict[str, Any]:
-    """A router's whole configuration from a file (JSON5), with Zenoh's defaults filled in.
-
-    Raises BusError for a file that is none.
-    """
+    """A router's whole configuration from a file (JSON5), with Zenoh's defaults filled in. Raises
+    BusError for a file that is none."""
     try:
         read = zenoh.Config.from_json5(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError) as error:

@@ -22,7 +22,7 @@ from typing import NamedTuple
 import numpy as np
 
 from cpcbl_agents.agent import Tick
-from cpcbl_agents.composition import build_robot
+from cpcbl_agents.robot import build_robot
 from cpcbl_launch.reporting.metrics import Floats, Trajectory, samples_with_truth, score
 from cpcbl_launch.reporting.recorder import BaselineReport, mean_score
 from cpcbl_launch.run.logged_team import LoggedTeam

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import msgspec
 
 from cpcbl_agents.clock import Clock
-from cpcbl_agents.guest_node import GuestNode
+from cpcbl_agents.node import GuestNode
 from cpcbl_agents.process import Loop, new_incarnation, own_camera, stop_on_clock_step
 from cpcbl_launch.reporting.statuses import FlowReport, summed_flows
 from cpcbl_launch.simulation.guests import unsupported_delay

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 from msgspec.structs import replace
 
-from cpcbl_agents.guest_node import GuestNode
+from cpcbl_agents.node import GuestNode
 from cpcbl_agents.robot import NEVER_NS
 from cpcbl_team.config import RobotSettings, Team
 from cpcbl_transport.bus import Bus

@@ -6,8 +6,8 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Protocol
 
-from cpcbl_agents.composition import build_robot
 from cpcbl_agents.node import Node, Steppable
+from cpcbl_agents.robot import build_robot
 from cpcbl_launch.reporting.recorder import Recorder, Report, variants_of
 from cpcbl_launch.reporting.recording import Recording
 from cpcbl_launch.simulation.field import SimulatedField

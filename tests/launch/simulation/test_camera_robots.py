@@ -175,7 +175,7 @@ def test_without_opencv_the_extra_is_named(tmp_path: Path, words: list[str]) -> 
 
 def test_a_robot_without_a_camera_does_not_load_opencv(tmp_path: Path) -> None:
     code = (
-        "import sys; from cpcbl_agents.composition import build_robot;"
+        "import sys; from cpcbl_agents.robot import build_robot;"
         "from cpcbl_launch.run import up;"
         "from cpcbl_agents import process;"
         "from cpcbl_launch.team_file import builtin_path, load_team;"
