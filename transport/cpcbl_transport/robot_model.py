@@ -11,7 +11,7 @@ from typing import Annotated
 import msgspec
 
 from cpcbl_team.config import RobotSettings
-from cpcbl_team.config.table import NotNegative, Positive
+from cpcbl_team.config.robot import NotNegative, Positive
 
 
 class StartModel(msgspec.Struct, frozen=True, kw_only=True):
