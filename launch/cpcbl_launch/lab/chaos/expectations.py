@@ -57,8 +57,7 @@ def found_after_s(run: FaultRun) -> float | None:
 
 
 def kill(run: FaultRun) -> list[Check]:
-    """The robot's token disappears at once, it starts again and is localized; the others
-    continue."""
+    """The robot's token disappears, it starts again and is localized; the others continue."""
     back_s = run.log.token_back_after_s(run.robot, run.fault_s, run.incarnation)
     return [
         check_token_gone(run, 1.0),
@@ -126,8 +125,7 @@ def kill_field(run: FaultRun) -> list[Check]:
 
 
 def partition(run: FaultRun, most_far_m: float = FOUND_M) -> list[Check]:
-    """Each side notices that the other is missing, and continues; within 5 s they are one team
-    again."""
+    """Each side notices that the other is missing, and continues; then they are one team again."""
     assert run.far_log is not None
     near_log, far_log, far = run.log, run.far_log, run.far
     near = [name for name in run.robots if name not in far]
@@ -162,8 +160,7 @@ def cut_link(run: FaultRun) -> list[Check]:
 def bad_link(
     run: FaultRun, most_silent_s: float = 2.0, most_late_s: float = 1.5, most_m: float = FOUND_M
 ) -> list[Check]:
-    """A robot with an impaired link stays localized and receives help later; the others are not
-    affected."""
+    """A robot with an impaired link stays localized and gets help; the others are not affected."""
     log = run.log
     gap_s = log.longest_track_gap_s(run.robot, *run.window_s)
     delay_s = log.track_delay_s(run.robot, *run.window_s)
@@ -226,8 +223,7 @@ def kidnap(run: FaultRun) -> list[Check]:
 
 
 def hidden_landmarks(run: FaultRun) -> list[Check]:
-    """The team's error stays small and its stated uncertainty consistent; then all are
-    localized."""
+    """The team's error stays small, its stated uncertainty consistent; then all are localized."""
     share = run.log.inside_3_sigma(run.robots, *run.window_s)
     back_s = worst(run.log.localized_after_s, run.robots, run.healed_s)
     return [
@@ -239,8 +235,7 @@ def hidden_landmarks(run: FaultRun) -> list[Check]:
 
 
 def clock(run: FaultRun, tolerated: str) -> list[Check]:
-    """The robots refuse and report help with a wrong clock; they use help with a slightly wrong
-    one."""
+    """The robots refuse and report help with a wrong clock, and tolerate a slightly wrong one."""
     log, others = run.log, run.others
     found = [log.distrust_reported_at_s(name, run.robot, reason="clock") for name in others]
     known = [at_s for at_s in found if at_s is not None]
@@ -259,8 +254,7 @@ def clock(run: FaultRun, tolerated: str) -> list[Check]:
 
 
 def faulty_robot(run: FaultRun, listeners: Sequence[str]) -> list[Check]:
-    """The robots that it misleads quarantine it, it does little harm, and is trusted again
-    later."""
+    """Those that it misleads quarantine it, it does little harm, and is trusted again later."""
     log, liar = run.log, run.robot
     found = [log.distrust_reported_at_s(name, liar, *run.window_s) for name in listeners]
     known = sorted(at_s - run.fault_s for at_s in found if at_s is not None)

@@ -13,7 +13,6 @@ from cpcbl_launch.run.processes import PROGRAM
 PATIENCE_S = 120.0
 DISK = "64k"  # less than a recording, a picture or a report of a run
 UP = ("up", "--duration", 6.0)
-READ_ONLY = ("--record", "--report", "--picture", "--logs")
 
 CommandResult = subprocess.CompletedProcess[str]
 
@@ -54,7 +53,7 @@ def read_only(options: ScenarioOptions) -> ScenarioResult:
     """`up` and `calibrate` are told to write to a read-only file system."""
     with tempfile.TemporaryDirectory(prefix="cpcbl-chaos-") as name:
         disk, ended = Path(name), {}
-        for option in READ_ONLY:
+        for option in ("--record", "--report", "--picture", "--logs"):
             options.report_progress(f"running `up {option}` on a read-only file system")
             path = disk / ("run.png" if option == "--picture" else "written")
             ended[option] = _on_disk("ro", disk, *UP, option, path)

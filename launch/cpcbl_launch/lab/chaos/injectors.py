@@ -66,8 +66,7 @@ lossy = impair(LinkQuality(loss=0.2))
 
 @contextmanager
 def flood(team: TeamUnderTest, run: FaultRun) -> Iterator[None]:
-    """A process that sends fixes, beliefs and statuses of 60 kB in the name of a robot, far more
-    often than the robot may."""
+    """A process sends fixes, beliefs and statuses in the name of a robot, far too often."""
     module = (sys.executable, "-m", "cpcbl_launch.lab.chaos.flooder")
     words = (team.plan.team.name, team.endpoint, str(os.getpid()), run.robot, *run.others)
     with subprocess.Popen([*module, *words], stdout=subprocess.PIPE, text=True) as process:

@@ -31,8 +31,7 @@ class LinkQuality(NamedTuple):
     cut: bool = False  # nothing passes and no connection is closed, as with an unplugged cable
     bytes_per_s: float = 0.0  # 0: no limit
     delay_s: float = 0.0
-    jitter_s: float = 0.0
-    """The delay varies by up to this much, evenly distributed; nothing overtakes."""
+    jitter_s: float = 0.0  # the delay varies by up to this much, evenly; nothing overtakes
 
 
 class Relay:

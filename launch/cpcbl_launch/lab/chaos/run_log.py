@@ -170,8 +170,7 @@ class RunLog(NamedTuple):
         return _first(sorted(times_s), from_s)
 
     def first_help_after_s(self, robot: str, helpers: Sequence[str], from_s: float) -> float | None:
-        """The robot first reported later help of these; it received the help up to a second
-        earlier."""
+        """The robot first reported later help of these, up to a second after it received it."""
         from_ns = self.epoch_ns + int(from_s * 1e9)
         helped = (
             at_s
@@ -271,11 +270,9 @@ class RunRecorder:
         return (stamp_ns - self._clock.epoch_ns) * 1e-9
 
     def _record_token(self, key: str, alive: bool) -> None:
-        names = topics.ALIVE.names(key)
-        if names is not None:
-            event = names["robot"], names["tier"], names["incarnation"], alive
+        if names := topics.ALIVE.names(key):
             with self._lock:
-                self._tokens.append(TokenEvent(self.now_s, *event))
+                self._tokens.append(TokenEvent(self.now_s, alive=alive, **names))
 
     def _arrived(self, key: str, payload: bytes) -> None:
         at_s, message = self.now_s, decode(key, payload)

@@ -96,8 +96,7 @@ class TeamFault(msgspec.Struct, frozen=True):
     """A scenario of the usual shape: a fault of a settled team for a while, then its recovery."""
 
     checks: Callable[[FaultRun], list[Check]]
-    inject: Injector = lambda team, run: nullcontext()
-    """Nothing is injected if the plan contains the fault."""
+    inject: Injector = lambda team, run: nullcontext()  # if the plan contains the fault
     robot: str = ""  # the robot or process that the fault concerns
     plan: Callable[[], RunPlan] = lambda: RunPlan(demo_team())
     settled_m: float = SETTLED_M
@@ -124,18 +123,16 @@ class TeamFault(msgspec.Struct, frozen=True):
                 team.run_for(run.healed_s - team.now_s)
             else:
                 with self.inject(team, run):
-                    team.wait_until(lambda: self._is_over(run, team), self.lasts_s)
+                    team.wait_until(lambda: self.until(latest(run, team)) is not None, self.lasts_s)
                     run.healed_s = team.now_s
             options.report_progress("the team recovers")
             team.run_for(self.after_s)
-            checks = self.checks(_updated(run, team))
+            checks = self.checks(latest(run, team))
             return ScenarioResult(checks, (self.remark(team, run),) if self.remark else ())
 
-    def _is_over(self, run: FaultRun, team: TeamUnderTest) -> bool:
-        return self.until(_updated(run, team)) is not None
 
-
-def _updated(run: FaultRun, team: TeamUnderTest) -> FaultRun:
+def latest(run: FaultRun, team: TeamUnderTest) -> FaultRun:
+    """The run with all that is known of the team by now."""
     run.log, run.end_s = team.run_log, team.now_s
     run.far_log = team.far_log if run.far else None
     return run

@@ -11,7 +11,7 @@ from cpcbl_launch.lab.chaos import injectors
 from cpcbl_launch.lab.chaos.checks import Check, at_most, equal_to
 from cpcbl_launch.lab.chaos.expectations import checks_recovered
 from cpcbl_launch.lab.chaos.run_log import worst
-from cpcbl_launch.lab.chaos.scenario import FaultRun, ScenarioOptions, ScenarioResult
+from cpcbl_launch.lab.chaos.scenario import FaultRun, ScenarioOptions, ScenarioResult, latest
 from cpcbl_launch.lab.chaos.team import (
     FIELD,
     ROUTER,
@@ -72,17 +72,17 @@ def soak(options: ScenarioOptions) -> ScenarioResult:
         faults.run()
         options.report_progress("waiting until all robots are localized")
         run = FaultRun(team.run_log, team.robots, fault_s=team.now_s)
-        team.wait_until(
-            lambda: worst(team.run_log.localized_after_s, team.robots, run.fault_s) is not None,
-            STUCK_S,
-        )
+        team.wait_until(lambda: _back_after_s(latest(run, team)) is not None, STUCK_S)
         run.healed_s = team.now_s
         team.run_for(8.0)
-        run.log, run.end_s = team.run_log, team.now_s
         lives = process_lives(faults.samples)
         unasked = sum(team.supervisor.restarts.values()) - faults.counts["kill"]
-        checks = soak_checks(run, lives, unasked, team.tracebacks())
+        checks = soak_checks(latest(run, team), lives, unasked, team.tracebacks())
         return ScenarioResult(checks, tuple(_figures(faults.counts, lives, run)))
+
+
+def _back_after_s(run: FaultRun) -> float | None:
+    return worst(run.log.localized_after_s, run.robots, run.fault_s)
 
 
 def soak_checks(
@@ -91,7 +91,6 @@ def soak_checks(
     """Memory does not grow, no robot stays lost or silent, and no process ended without being
     killed. `run`: from the last fault until all robots were localized again, and to the end."""
     gap_s = worst(run.log.longest_track_gap_s, run.robots, 0.0, run.end_s)
-    back_s = worst(run.log.localized_after_s, run.robots, run.fault_s)
     growth_mib = max((life.end_mib - life.start_mib for life in lives), default=None)
     slopes = [life.mib_a_minute for life in lives if life.seconds >= LONG_LIFE_S]
     steepest = f"steepest growth of a process that ran for {LONG_LIFE_S:g} s"
@@ -100,7 +99,7 @@ def soak_checks(
         equal_to("processes that ended without being killed", unasked_restarts, 0),
         equal_to("tracebacks in logs", tracebacks, 0),
         at_most("longest gap between tracks", gap_s, STUCK_S, "s"),
-        at_most("from the last fault until all were localized", back_s, STUCK_S, "s"),
+        at_most("from the last fault until all were localized", _back_after_s(run), STUCK_S, "s"),
         at_most("largest growth of memory", growth_mib, GROWTH_MIB, "MiB"),
         *([at_most(steepest, max(slopes), SLOPE_MIB_A_MINUTE, "MiB/min")] if slopes else []),
         at_most("largest growth of the number of open files", more_files, MORE_FILES),

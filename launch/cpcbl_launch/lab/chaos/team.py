@@ -5,7 +5,7 @@ import signal
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from types import MappingProxyType
 from typing import NamedTuple
@@ -27,7 +27,6 @@ from cpcbl_transport.zenoh_bus import open_bus
 LEAD_S, LEAD_S_A_PROCESS = 2.0, 0.4
 SETTLED_M = 0.4
 PATIENCE_S = 60.0
-RESTART_S = 20.0
 POLL_S = 0.05
 ROUTER, FIELD, FAR_ROUTER = "router", "field", "far-router"
 
@@ -69,11 +68,8 @@ class TeamUnderTest:
         self.plan, self.folder = plan, folder
         self.endpoint, self.far_endpoint = free_endpoint(), free_endpoint()
         self.clock = clock_starting_in(LEAD_S + LEAD_S_A_PROCESS * len(team.robots))
-        self.robots = [
-            name
-            for name, robot in team.robots.items()
-            if name not in plan.left_out and robot.source == "simulated"
-        ]
+        simulated = [name for name, robot in team.robots.items() if robot.source == "simulated"]
+        self.robots = [name for name in simulated if name not in plan.left_out]
         """The robots of the simulated field, whose ground truth is known."""
         relayed = [*plan.relayed, *([FAR_ROUTER] if plan.far else [])]
         self.links: dict[str, Relay | TunLink] = {
@@ -84,10 +80,11 @@ class TeamUnderTest:
         self.supervisor = stack.enter_context(Supervisor(self._process_table(), folder))
         self.seen_pids: set[int] = set()
         self._recorders = []
+        end_s = time.monotonic() + PATIENCE_S
         for endpoint in (self.endpoint, self.far_endpoint) if plan.far else (self.endpoint,):
+            bus = open_bus(team.name, [endpoint], lambda: time.monotonic() > end_s)
             self._recorders.append(RunRecorder(self.clock, team.simulation.clocks_ahead_s))
-            bus = stack.enter_context(open_bus(team.name, [endpoint], _patience()))
-            self._recorders[-1].listen(bus)
+            self._recorders[-1].listen(stack.enter_context(bus))
 
     def _process_table(self) -> list[ProcessSpec]:
         """The routers, the field and the robots, started as `up` does, with their own links and
@@ -124,15 +121,13 @@ class TeamUnderTest:
 
     @property
     def far_log(self) -> RunLog:
-        """The log of the far site if there is one, with the ground truth, which is published at
-        the near site only."""
+        """The far site's log, with the ground truth, which is published at the near site only."""
         return self._recorders[-1].run_log()._replace(truth=self.run_log.truth)
 
     def pid(self, name: str) -> int:
-        """The process id of a robot, the field or a router; waits while it is restarted. Raises
-        ChaosError if it does not run."""
+        """The process id of a robot, the field or a router, once it runs. Raises ChaosError."""
         process = f"robot-{name}" if name in self.plan.team.robots else name
-        if not self.wait_until(lambda: process in self.supervisor.pids, RESTART_S):
+        if not self.wait_until(lambda: process in self.supervisor.pids, 20.0):
             raise ChaosError(f"{process} does not run: {self.last_log_line(process)}")
         return self.supervisor.pids[process]
 
@@ -150,8 +145,7 @@ class TeamUnderTest:
         self.wait_until(lambda: False, seconds)
 
     def wait_until(self, condition: Callable[[], bool], within_s: float = PATIENCE_S) -> bool:
-        """Waits for a condition, and restarts what dies meanwhile; returns whether it was met in
-        time."""
+        """Waits for a condition, and restarts what dies meanwhile; whether it was met in time."""
         end_s = time.monotonic() + within_s
         while not condition():
             if time.monotonic() >= end_s:
@@ -198,28 +192,18 @@ def clock_starting_in(seconds: float) -> Clock:
 
 @contextmanager
 def run_team_under_test(plan: RunPlan) -> Iterator[TeamUnderTest]:
-    """A team with all its processes, all of which have ended afterwards. Raises ChaosError if
-    not."""
+    """A team with all its processes. Raises ChaosError if one of them has not ended afterwards."""
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="cpcbl-chaos-")))
         team = TeamUnderTest(plan, folder, stack)
         yield team
-    left = [str(pid) for pid in team.seen_pids if _runs(pid)]
+    left = []
+    for pid in team.seen_pids:
+        with suppress(ProcessLookupError):
+            os.kill(pid, 0)
+            left.append(str(pid))
     if left:
         raise ChaosError(f"left running: pids {', '.join(left)}")
-
-
-def _runs(pid: int) -> bool:
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    return True
-
-
-def _patience() -> Callable[[], bool]:
-    end_s = time.monotonic() + PATIENCE_S
-    return lambda: time.monotonic() > end_s
 
 
 def router_spec(
