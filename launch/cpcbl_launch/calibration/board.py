@@ -52,8 +52,7 @@ class BoardCorners(NamedTuple):
 
 def parse_board(pattern: str, squares: str, square_m: float, marker_m: float, family: str) -> Board:
     """The board that command line options describe. Raises InputError if it cannot be made."""
-    match = re.fullmatch(r"(\d{1,3})x(\d{1,3})", squares.strip().lower())
-    if match is None:
+    if not (match := re.fullmatch(r"(\d{1,3})x(\d{1,3})", squares.strip().lower())):
         raise InputError(f"--squares {squares}: write it as 7x5: squares across and down")
     across, down = int(match[1]), int(match[2])
     if min(across, down) < MIN_SQUARES:
@@ -62,24 +61,18 @@ def parse_board(pattern: str, squares: str, square_m: float, marker_m: float, fa
     if family not in markers:
         raise InputError(f"--family {family}: no such family; use one of {', '.join(markers)}")
     board = Board(Pattern(pattern), (across, down), square_m, marker_m, markers[family])
-    if board.pattern is Pattern.charuco:
-        _check_markers(board)
-    return board
-
-
-def _check_markers(board: Board) -> None:
-    if not 0.0 < board.marker_m < board.square_m:
+    if board.pattern is Pattern.charuco and not 0.0 < marker_m < square_m:
         raise InputError(
-            f"--marker-m {board.marker_m:g}: markers are inside squares; use less than"
-            f" --square-m {board.square_m:g}"
+            f"--marker-m {marker_m:g}: markers are inside squares; use less than"
+            f" --square-m {square_m:g}"
         )
-    across, down = board.squares
     needed, available = across * down // 2, MARKERS[board.family]
-    if needed > available:
+    if board.pattern is Pattern.charuco and needed > available:
         raise InputError(
-            f"--squares {across}x{down}: needs {needed} markers, {board.family} has {available};"
+            f"--squares {across}x{down}: needs {needed} markers, {family} has {available};"
             " use fewer squares"
         )
+    return board
 
 
 def draw_board(board: Board) -> Pixels:
@@ -97,10 +90,10 @@ def draw_board(board: Board) -> Pixels:
 def write_board(board: Board, path: Path) -> None:
     """Writes the board as a picture file. Raises InputError, OSError."""
     try:
-        toml_value, picture = cv2.imencode(path.suffix or ".png", draw_board(board))
+        encoded, picture = cv2.imencode(path.suffix or ".png", draw_board(board))
     except cv2.error:
-        toml_value = False
-    if not toml_value:
+        encoded = False
+    if not encoded:
         raise InputError(f"--print-board {path}: not a picture; end its name in .png")
     path.write_bytes(picture.tobytes())
 
@@ -108,46 +101,39 @@ def write_board(board: Board, path: Path) -> None:
 def find_corners(pixels: Pixels, board: Board) -> BoardCorners | str:
     """The board's corners in a picture (height, width, 3), BGR, or why there are none."""
     grey = cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY).astype(np.uint8, copy=False)
-    corners = (
-        _charuco_corners(grey, board)
-        if board.pattern is Pattern.charuco
-        else _chessboard_corners(grey, board)
-    )
-    n = len(corners.pixels)
-    if n == 0:
+    is_charuco = board.pattern is Pattern.charuco
+    corners = (_charuco_corners if is_charuco else _chessboard_corners)(grey, board)
+    if corners is None:
         return "no board found"
-    if n < MIN_CORNERS:
+    if (n := len(corners.pixels)) < MIN_CORNERS:
         return f"only {n} corners; {MIN_CORNERS} are needed"
     if np.linalg.matrix_rank(corners.board_points - corners.board_points[0]) < 2:
         return "all corners in one row"
     return corners
 
 
-def _charuco_corners(grey: Pixels, board: Board) -> BoardCorners:
+def _charuco_corners(grey: Pixels, board: Board) -> BoardCorners | None:
     made = _charuco_board(board)
-    for old in (False, True):
-        made.setLegacyPattern(
-            old
-        )  # OpenCV before 4.6 drew boards with an even number of rows differently
+    for old in (False, True):  # OpenCV before 4.6 drew boards with even rows differently
+        made.setLegacyPattern(old)
         pixels, ids, _, _ = cv2.aruco.CharucoDetector(made).detectBoard(grey)
         if ids is not None and len(ids):
             board_points = np.asarray(made.getChessboardCorners(), np.float32)[np.ravel(ids)]
             free = 0.4 * (1.0 - board.marker_m / board.square_m)  # markers begin at 0.5
             return BoardCorners(board_points, _refine_corners(grey, np.asarray(pixels), free))
-    return _NONE
+    return None
 
 
-def _chessboard_corners(grey: Pixels, board: Board) -> BoardCorners:
+def _chessboard_corners(grey: Pixels, board: Board) -> BoardCorners | None:
     across, down = board.squares[0] - 1, board.squares[1] - 1
     flags = cv2.CALIB_CB_NORMALIZE_IMAGE
     whole, pixels = cv2.findChessboardCornersSB(grey, (across, down), flags=flags)
     if not whole:
-        return _NONE
+        return None
     rows, columns = np.indices((down, across), np.float32)
-    board_points = np.stack([columns, rows, np.zeros_like(rows)], axis=-1).reshape(-1, 3)
-    return BoardCorners(
-        board_points * np.float32(board.square_m), _refine_corners(grey, np.asarray(pixels), 0.4)
-    )
+    squares = np.stack([columns, rows, np.zeros_like(rows)], axis=-1).reshape(-1, 3)
+    board_points = squares * np.float32(board.square_m)
+    return BoardCorners(board_points, _refine_corners(grey, np.asarray(pixels), 0.4))
 
 
 def _refine_corners(grey: Pixels, pixels: NDArray[np.floating], free: float) -> Points:
@@ -161,14 +147,11 @@ def _refine_corners(grey: Pixels, pixels: NDArray[np.floating], free: float) -> 
     apart = np.linalg.norm(points - points.reshape(1, -1, 2), axis=2)
     gap = np.min(apart[apart > 0.0], initial=np.inf)
     half = int(np.clip(free * gap, *WINDOW_PX))
-    sharp = cv2.cornerSubPix(grey, points, (half, half), (-1, -1), _PRECISE)
+    precise = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 30, 0.01)
+    sharp = cv2.cornerSubPix(grey, points, (half, half), (-1, -1), precise)
     return np.asarray(sharp, np.float32).reshape(-1, 2)
 
 
 def _charuco_board(board: Board) -> cv2.aruco.CharucoBoard:
     family = marker_dictionary(board.family)
     return cv2.aruco.CharucoBoard(board.squares, board.square_m, board.marker_m, family)
-
-
-_PRECISE = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 30, 0.01)
-_NONE = BoardCorners(np.empty((0, 3), np.float32), np.empty((0, 2), np.float32))

@@ -1,38 +1,237 @@
-"""Errors of a camera's sightings compared with the sigmas that the detector states."""
+"""Errors of cameras' sightings, compared with the ground truth and with the stated sigmas.
 
+The sightings come from recordings of robots with cameras, or from pictures that were taken at known
+poses.
+"""
+
+import csv
 import math
-from collections.abc import Callable, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from itertools import pairwise
+from pathlib import Path
 from typing import NamedTuple
 
 import msgspec
 import numpy as np
+from msgspec.structs import replace
 
-from cpcbl_launch.calibration.camera_observations import CameraObservations
-from cpcbl_launch.calibration.logs import wrap_angles
-from cpcbl_launch.calibration.sensor import (
-    SensorCorrections,
-    SightingRows,
-    calibrate_sensor,
-    sensor_corrections,
-    true_measurements,
+from cpcbl_agents.sources.mrclam import LogError
+from cpcbl_launch.calibration.logs import (
+    GroundTruth,
+    RobotLog,
+    ground_truth,
+    nan_if_none,
+    wrap_angles,
 )
+from cpcbl_launch.calibration.sensor import SensorCorrections, all_sighting_rows, calibrate_sensor
 from cpcbl_launch.calibration.statistics import (
     MIN_ROWS,
     OUTLIER_SIGMAS,
     Estimate,
     Integers,
     Mask,
+    RowFilter,
     jackknife,
     robust_sigma,
     select_rows,
-    stretch_numbers,
 )
 from cpcbl_launch.reporting.metrics import Floats
+from cpcbl_launch.reporting.recording import read_recording
+from cpcbl_team.config import CameraSettings, Team
 from cpcbl_team.errors import InputError
+from cpcbl_team.inputs import Sightings
 
 BINS_M = (0.0, 2.0, 4.0, math.inf)
 MIN_IN_BIN = 10
+PICTURE_INTERVAL_S = 100.0  # pictures have no time; at this interval nothing is correlated
+STATIONARY_S = 0.1  # before and after a picture nothing moves for this time
+COLUMNS = ("file", "x_m", "y_m", "heading_deg")
+
+
+class CameraObservations(NamedTuple):
+    """The sightings of one robot in one log; `stated` and `headings` match `log.sightings`."""
+
+    log: RobotLog
+    stated: Floats
+    """(n, 2): sigmas of range (m) and bearing (rad) that the detector states; NaN: none."""
+    headings: Floats
+    """(n, 3): a teammate's heading in the robot's frame, its sigma, the true one (rad); NaN."""
+
+
+class CameraDataset(NamedTuple):
+    """All sightings of some robots with known ground truth, and their camera."""
+
+    robots: tuple[str, ...]
+    camera: CameraSettings
+    observations: list[CameraObservations]
+    notes: tuple[str, ...] = ()
+
+
+class _PoseRow(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A line of poses: the pose of a robot in a picture; `robot` is empty for the observer."""
+
+    file: str
+    x_m: float
+    y_m: float
+    heading_deg: float
+    robot: str = ""
+
+
+def dataset_from_recordings(paths: Sequence[Path], robot: str | None) -> CameraDataset:
+    """The sightings of this robot, or of all with a camera. Raises LogError, InputError."""
+    found: list[tuple[str, CameraSettings, CameraObservations]] = []
+    for path in paths:
+        if path.suffix != ".mcap":
+            raise InputError(f"{path}: no recording of `up --record` (.mcap)")
+        recording = read_recording(path)
+        if not recording.truth:
+            raise LogError(f"{path}: holds no truth; publish poses on field/truth")
+        truth, team = ground_truth(recording.team.map.landmarks, recording.truth), recording.team
+        for name in [robot] if robot else team.cameras:
+            frames = [i for i in recording.inputs.get(name, ()) if isinstance(i, Sightings)]
+            if frames and len(truth.poses.get(name, ())) > 1:
+                if name not in team.robots:
+                    names = ", ".join(team.cameras)
+                    raise InputError(f"--robot {name}: a guest of {path}; with a camera: {names}")
+                camera = replace(team.robots[name].camera, frames="")  # any source of images
+                found.append((name, camera, camera_observations(name, frames, truth)))
+    if not found:
+        who = robot or "robots with cameras"
+        raise InputError(f"{paths[0]}: no sightings of {who} where the truth is known")
+    robots = tuple(dict.fromkeys(name for name, _, _ in found))
+    if len({camera for _, camera, _ in found}) > 1:
+        raise InputError(
+            f"{', '.join(robots)}: different cameras, which have different errors; name one robot"
+            " by --robot, and recordings of one camera"
+        )
+    return CameraDataset(robots, found[0][1], [observations for _, _, observations in found])
+
+
+def observer_name(team: Team, robot: str | None) -> str:
+    """The named robot, or the only one with a camera. Raises InputError."""
+    robots = team.cameras
+    if robot is None and len(robots) == 1:
+        return robots[0]
+    if robot not in robots:
+        known = ", ".join(robots) or 'none; write sensing = "camera"'
+        raise InputError(f"--robot: name the robot that took the pictures; with a camera: {known}")
+    return robot
+
+
+def dataset_from_pictures(
+    folder: Path,
+    poses: Path,
+    robot: str,
+    team: Team,
+    progress: Callable[[float], None] = lambda done: None,
+) -> CameraDataset:
+    """The sightings of a robot in pictures from known poses. Raises InputError. Needs OpenCV."""
+    from cpcbl_agents.vision.detector import CameraDetector
+    from cpcbl_launch.calibration.pictures import read_picture
+
+    rows = read_poses(poses, team)
+    names = list(dict.fromkeys(row.file for row in rows))
+    detector = CameraDetector(robot, team)
+    frames: list[Sightings] = []
+    rejected: dict[str, str] = {}
+    ambiguities: Counter[str] = Counter()
+    for i, name in enumerate(names):
+        pixels = read_picture(folder / name).pixels
+        detections = pixels if isinstance(pixels, str) else detector.detections(pixels)
+        if isinstance(detections, str):
+            rejected[name] = detections
+        else:
+            ambiguities.update(ambiguity.reason for ambiguity in detections.ambiguities)
+            frames.append(Sightings(_stamp_ns(i), tuple(one.sighting for one in detections.found)))
+        progress((i + 1) / len(names))
+    if not frames:
+        name, reason = next(iter(rejected.items()))
+        raise InputError(f"{folder}: no picture can be used: {name}: {reason}")
+    truth = ground_truth(team.map.landmarks, _stationary_truth(rows, names, robot))
+    notes = [f"{name}: {reason}" for name, reason in rejected.items()]
+    if ambiguities:
+        reasons = ", ".join(f"{reason} {n}" for reason, n in ambiguities.most_common())
+        notes.append(f"detected, but not reported: {reasons}")
+    camera = team.robots[robot].camera
+    return CameraDataset(
+        (robot,), camera, [camera_observations(robot, frames, truth)], tuple(notes)
+    )
+
+
+def camera_observations(
+    robot: str, frames: Iterable[Sightings], truth: GroundTruth
+) -> CameraObservations:
+    """A robot's sightings as arrays."""
+    number = {name: i for i, name in enumerate(truth.objects)}
+    headings = {name: (rows[:, 0], np.unwrap(rows[:, 3])) for name, rows in truth.poses.items()}
+    rows = [
+        (
+            *(frame.stamp_ns * 1e-9, number[s.id]),
+            *map(nan_if_none, (s.range_m, s.bearing_rad, s.range_sigma_m, s.bearing_sigma_rad)),
+            *map(nan_if_none, (s.heading_rad, s.heading_sigma_rad)),
+            _true_heading(headings, robot, s.id, frame.stamp_ns * 1e-9),
+        )
+        for frame in frames
+        for s in frame.sightings
+        if s.id in number
+    ]
+    table = np.array(rows, dtype=np.float64).reshape(-1, 9)
+    objects = tuple(truth.objects.values())
+    log = RobotLog(truth.poses[robot], np.empty((0, 4)), table[:, :4], objects, truth.teammates)
+    return CameraObservations(log, table[:, 4:6], table[:, 6:])
+
+
+def read_poses(path: Path, team: Team) -> list[_PoseRow]:
+    """Reads a CSV file: file, x_m, y_m, heading_deg, and robot for teammates. Raises InputError."""
+    try:
+        lines = list(csv.DictReader(path.read_text(encoding="utf-8").splitlines()))
+        given = [{k: (v or "").strip() for k, v in line.items() if k} for line in lines]
+        rows = msgspec.convert(given, list[_PoseRow], strict=False)
+    except FileNotFoundError:
+        raise InputError(f"--poses {path}: no such file") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"--poses {path}: cannot be read: {error}") from error
+    except (csv.Error, msgspec.ValidationError) as error:
+        columns = ",".join(COLUMNS)
+        raise InputError(f"--poses {path}: {error}; its columns are {columns},robot") from error
+    if not rows:
+        raise InputError(f"--poses {path}: no poses; its columns are {','.join(COLUMNS)},robot")
+    for row in rows:
+        if row.robot and row.robot not in team.robots:
+            known = ", ".join(team.robots)
+            raise InputError(f"--poses {path}: no robot {row.robot!r} in the team; known: {known}")
+    return rows
+
+
+def _stamp_ns(picture: int) -> int:
+    return int((picture + 1) * PICTURE_INTERVAL_S * 1e9)
+
+
+def _stationary_truth(
+    rows: Sequence[_PoseRow], names: Sequence[str], observer_name: str
+) -> dict[str, Floats]:
+    """The poses as those of a log in which all robots stand still while a picture is taken."""
+    truth: dict[str, list[tuple[float, float, float, float]]] = {observer_name: []}
+    for row in rows:
+        at = _stamp_ns(names.index(row.file)) * 1e-9
+        pose = row.x_m, row.y_m, math.radians(row.heading_deg)
+        log = truth.setdefault(row.robot or observer_name, [])
+        log += [(at - STATIONARY_S, *pose), (at + STATIONARY_S, *pose)]
+    return {name: np.array(sorted(log)) for name, log in truth.items()}
+
+
+def _true_heading(
+    headings_of_robots: Mapping[str, tuple[Floats, Floats]],
+    observer_name: str,
+    seen: str,
+    at_s: float,
+) -> float:
+    """The heading of a teammate in the observer's frame (rad); NaN for a landmark."""
+    if seen not in headings_of_robots:
+        return math.nan
+    own, other = (np.interp(at_s, *headings_of_robots[name]) for name in (observer_name, seen))
+    return float(wrap_angles(np.asarray(other - own)))
 
 
 class ErrorStatistics(msgspec.Struct, frozen=True):
@@ -74,113 +273,76 @@ class CameraAccuracy(msgspec.Struct, frozen=True):
 
 
 class _ErrorRows(NamedTuple):
-    """Errors of sightings with known ground truth. Shapes (n,); NaN: no such reading."""
+    """Errors of sightings with known ground truth, and the stated sigmas.
+
+    Both have columns for range (m), bearing and heading (rad); NaN: no such reading.
+    """
 
     stretch: Integers
     teammate: Mask
     true_range: Floats
-    range_error: Floats
-    range_sigma: Floats
-    bearing_error: Floats
-    bearing_sigma: Floats
-    heading_error: Floats
-    heading_sigma: Floats
+    errors: Floats
+    sigmas: Floats
 
 
 def measure_camera_accuracy(observations: Sequence[CameraObservations]) -> CameraAccuracy:
     """The errors of a camera's sightings. Raises InputError with too few of them."""
-    logs = [observed.log for observed in observations]
     rows = _error_rows(observations, SensorCorrections())
     if len(rows.stretch) < MIN_ROWS:
         raise InputError(
             f"{len(rows.stretch)} sightings with known truth; at least {MIN_ROWS} are needed:"
             " more pictures or a longer drive, near and far, all over the picture"
         )
-    values, is_depth = calibrate_sensor(logs)
-    left = _error_rows(observations, sensor_corrections(logs))
-    return CameraAccuracy(
-        tuple(_accuracy_rows(rows)), values, is_depth, _remaining_error_factor(left)
-    )
+    values, corrections = calibrate_sensor([observed.log for observed in observations])
+    times = _remaining_error_factor(_error_rows(observations, corrections))
+    return CameraAccuracy(tuple(_accuracy_rows(rows)), values, corrections.is_depth, times)
 
 
 def _error_rows(observations: Sequence[CameraObservations], now: SensorCorrections) -> _ErrorRows:
-    parts = [_errors_of_robot(observed, now, i) for i, observed in enumerate(observations)]
-    return _ErrorRows(*map(np.concatenate, zip(*parts, strict=True)))
-
-
-def _errors_of_robot(
-    observed: CameraObservations, now: SensorCorrections, number: int
-) -> _ErrorRows:
     """Corrected minus true readings."""
-    stamp_s, which, ranges, bearings = observed.log.sightings.T
-    objects = which.astype(np.int64)
-    true_range, true_bearing, has_truth = true_measurements(
-        observed.log, objects, stamp_s - now.delay_s
-    )
-    readings = SightingRows(
-        stretch_numbers(stamp_s, observed.log.truth[:, 0], number),
-        stamp_s,
-        objects,
-        np.isin(objects, list(observed.log.teammates)),
-        ranges,
-        bearings,
-        true_range,
-        true_bearing,
-        *np.full((2, len(stamp_s)), math.nan),  # rates: errors do not take them
-    )
-    heading, heading_sigma, true_heading = observed.headings.T
-    rows = _ErrorRows(
-        readings.stretch,
-        readings.teammate,
-        true_range,
-        now.range_errors(readings),
-        observed.stated[:, 0],
-        now.bearing_errors(readings),
-        observed.stated[:, 1],
-        wrap_angles(heading - true_heading),
-        heading_sigma,
-    )
-    return select_rows(rows, has_truth & (true_range > 0.05))
+    parts = []
+    for i, observed in enumerate(observations):
+        rows = all_sighting_rows(observed.log, i, now.delay_s)
+        heading, heading_sigma, true_heading = observed.headings.T
+        heading_error = wrap_angles(heading - true_heading)
+        errors = (now.range_errors(rows), now.bearing_errors(rows), heading_error)
+        sigmas = np.column_stack([observed.stated, heading_sigma])
+        part = _ErrorRows(
+            rows.stretch, rows.teammate, rows.true_range, np.column_stack(errors), sigmas
+        )
+        parts.append(select_rows(part, rows.true_range > 0.05))
+    return _ErrorRows(*map(np.concatenate, zip(*parts, strict=True)))
 
 
 def _accuracy_rows(rows: _ErrorRows) -> list[AccuracyRow]:
     """One row for all sightings of a kind, then one for each span of ranges."""
     found = []
     for kind, mine in (("landmarks", ~rows.teammate), ("teammates", rows.teammate)):
-        spans = [(0.0, math.inf), *pairwise(BINS_M)]
-        for i, (low, high) in enumerate(spans):
+        for i, (low, high) in enumerate([(0.0, math.inf), *pairwise(BINS_M)]):
             part = select_rows(rows, mine & (rows.true_range >= low) & (rows.true_range < high))
-            if len(part.stretch) >= (MIN_IN_BIN if i else 1):
-                found.append(_accuracy_row(kind, low, high, part))
+            if (n := len(part.stretch)) >= (MIN_IN_BIN if i else 1):
+                to_m = None if high == math.inf else high
+                found.append(AccuracyRow(kind, low, to_m, n, *_error_statistics(part)))
     return found
 
 
-def _accuracy_row(kind: str, low: float, high: float, rows: _ErrorRows) -> AccuracyRow:
-    r, degrees = rows.true_range, math.degrees(1.0)
-    return AccuracyRow(
-        kind,
-        low,
-        None if high == math.inf else high,
-        len(r),
-        _error_statistics(rows.range_error / r, rows.range_sigma / r, 1.0),
-        _error_statistics(rows.bearing_error, rows.bearing_sigma, degrees),
-        _error_statistics(rows.heading_error, rows.heading_sigma, degrees),
-    )
-
-
-def _error_statistics(error: Floats, sigma: Floats, unit: float) -> ErrorStatistics | None:
-    there = np.isfinite(error)
-    error, sigma = error[there], sigma[there]
-    if not len(error):
-        return None
-    stated = np.isfinite(sigma) & (sigma > 0.0)
-    unitless = error[stated] / sigma[stated]
-    return ErrorStatistics(
-        unit * float(error.mean()),
-        unit * float(error.std()),
-        float((np.abs(unitless) <= 3.0).mean()) if stated.any() else None,
-        _rms_without_outliers(unitless) if stated.any() else None,
-    )
+def _error_statistics(rows: _ErrorRows) -> Iterator[ErrorStatistics | None]:
+    """Of ranges, bearings and headings, in the units of `AccuracyRow`."""
+    in_units = (rows.true_range, 1.0), (1.0, math.degrees(1.0)), (1.0, math.degrees(1.0))
+    for errors, sigmas, (divisor, unit) in zip(rows.errors.T, rows.sigmas.T, in_units, strict=True):
+        there = np.isfinite(errors)
+        if not there.any():
+            yield None
+            continue
+        error, sigma = (errors / divisor)[there], (sigmas / divisor)[there]
+        stated = np.isfinite(sigma) & (sigma > 0.0)
+        unitless = error[stated] / sigma[stated]
+        yield ErrorStatistics(
+            unit * float(error.mean()),
+            unit * float(error.std()),
+            float((np.abs(unitless) <= 3.0).mean()) if stated.any() else None,
+            _rms_without_outliers(unitless) if stated.any() else None,
+        )
 
 
 def _rms_without_outliers(unitless: Floats) -> float:
@@ -191,21 +353,13 @@ def _rms_without_outliers(unitless: Floats) -> float:
 
 def _remaining_error_factor(rows: _ErrorRows) -> Estimate | None:
     """The factor for ranges or for bearings, whichever is larger."""
-    if not (np.isfinite(rows.range_sigma) | np.isfinite(rows.bearing_sigma)).any():
+    if not np.isfinite(rows.sigmas[:, :2]).any():
         return None
-    units = [
-        error / sigma
-        for error, sigma in (
-            (rows.range_error, rows.range_sigma),
-            (rows.bearing_error, rows.bearing_sigma),
-        )
-    ]
+    in_sigmas = (rows.errors / rows.sigmas)[:, :2].T
 
-    def largest(keep: Callable[[Integers], Mask]) -> Floats:
+    def largest(keep: RowFilter) -> Floats:
         some = keep(rows.stretch)
-        return np.array(
-            [max(_rms_without_outliers(unit[some & np.isfinite(unit)]) for unit in units)]
-        )
+        return np.array([max(_rms_without_outliers(e[some & np.isfinite(e)]) for e in in_sigmas)])
 
     (times,) = jackknife(largest, rows.stretch)
     return times

@@ -29,6 +29,11 @@ FIELDS = 4  # the picture has so many parts, across and down, that should contai
 INTRINSICS = ("fx_px", "fy_px", "cx_px", "cy_px")
 DISTORTION = ("k1", "k2", "p1", "p2", "k3")
 
+_NOT_DETERMINED = (
+    "the pictures do not determine the lens; take some with the board tilted by 30 to 45 degrees in"
+    " all directions, near and far"
+)
+
 
 class PictureResult(msgspec.Struct, frozen=True):
     """One picture; `rms_px` is its reprojection error."""
@@ -82,91 +87,79 @@ def calibrate_lens(
     pictures: Iterable[NamedPicture], board: Board
 ) -> tuple[LensCalibration, Residuals]:
     """The lens that took these pictures. Raises InputError if they do not determine it."""
-    results = _without_repeats(_find_board(picture, board) for picture in pictures)
-    views = [view for view in results if isinstance(view, _BoardView)]
-    rejected = [view for view in results if isinstance(view, PictureResult)]
+    views: list[_BoardView] = []
+    rejected: list[PictureResult] = []
+    for picture in pictures:
+        view = _find_board(picture, board, views)
+        if isinstance(view, str):
+            rejected.append(PictureResult(picture.name, left_out=view))
+        else:
+            views.append(view)
     _require_enough_views(views, rejected)
-    size_px = _common_size(views)
-    kept, solution, outlying = _without_outliers(views, size_px)
+    kept, solution, outlying = _without_outliers(views)
     used = [
         PictureResult(view.picture, len(view.corners.pixels), float(error))
         for view, error in zip(kept, solution.each_px, strict=True)
     ]
-    return _lens_calibration(solution, size_px, (*used, *outlying, *rejected)), solution.residuals
+    results = (*used, *outlying, *rejected)
+    return _lens_calibration(solution, views[0].size_px, results), solution.residuals
 
 
-def _find_board(picture: NamedPicture, board: Board) -> _BoardView | PictureResult:
-    """The board in a picture, or the reason why the picture is left out."""
-    pixels = picture.pixels
-    if isinstance(pixels, str):
-        return PictureResult(picture.name, left_out=pixels)
-    corners = find_corners(pixels, board)
+def _find_board(
+    picture: NamedPicture, board: Board, earlier: Iterable[_BoardView]
+) -> _BoardView | str:
+    """The board in a picture, or why the picture is left out. One with the board at the place of an
+    earlier one adds nothing."""
+    if isinstance(picture.pixels, str):
+        return picture.pixels
+    corners = find_corners(picture.pixels, board)
     if isinstance(corners, str):
-        return PictureResult(picture.name, left_out=corners)
-    return _BoardView(picture.name, corners, (pixels.shape[1], pixels.shape[0]))
+        return corners
+    height, width = picture.pixels.shape[:2]
+    view = _BoardView(picture.name, corners, (width, height))
+    same = next((other for other in earlier if _is_repeat(view, other)), None)
+    return f"the board is at the same place as in {same.picture}" if same else view
 
 
-def _without_repeats(
-    results: Iterable[_BoardView | PictureResult],
-) -> list[_BoardView | PictureResult]:
-    """Leaves out pictures with the board at the place of an earlier one: they add nothing."""
-    once: list[_BoardView | PictureResult] = []
-    for view in results:
-        same = next((o for o in once if _is_repeat(view, o)), None)
-        if same is not None:
-            reason = f"the board is at the same place as in {same.picture}"
-            view = PictureResult(view.picture, left_out=reason)
-        once.append(view)
-    return once
-
-
-def _is_repeat(one: _BoardView | PictureResult, two: _BoardView | PictureResult) -> bool:
-    if (
-        isinstance(one, PictureResult)
-        or isinstance(two, PictureResult)
-        or one.size_px != two.size_px
-    ):
-        return False
+def _is_repeat(one: _BoardView, two: _BoardView) -> bool:
     a, b = one.corners, two.corners
-    same = np.array_equal(a.board_points, b.board_points)
+    same = one.size_px == two.size_px and np.array_equal(a.board_points, b.board_points)
     return same and float(np.abs(a.pixels - b.pixels).mean()) < MOVED_PX
 
 
 def _require_enough_views(views: Sequence[_BoardView], rejected: Sequence[PictureResult]) -> None:
-    if len(views) >= MIN_PICTURES:
-        return
+    """Raises InputError for too few views, or views of several sizes."""
     if not views and rejected and all(view.left_out == "no board found" for view in rejected):
         raise InputError(
             f"no board found in any of {len(rejected)} pictures; describe the printed board by"
             " --board, --squares and --family"
         )
-    why = f": {rejected[0].picture}: {rejected[0].left_out}" if rejected else ""
-    raise InputError(
-        f"{len(views)} of {len(views) + len(rejected)} pictures show the board well enough{why};"
-        f" take at least {MIN_PICTURES}, better 20, with the board at all angles"
-    )
-
-
-def _common_size(views: Sequence[_BoardView]) -> tuple[int, int]:
-    first = views[0]
+    if len(views) < MIN_PICTURES:
+        why = f": {rejected[0].picture}: {rejected[0].left_out}" if rejected else ""
+        raise InputError(
+            f"{len(views)} of {len(views) + len(rejected)} pictures show the board well enough"
+            f"{why}; take at least {MIN_PICTURES}, better 20, with the board at all angles"
+        )
     for view in views:
-        if view.size_px != first.size_px:
-            (width, height), (w, h) = view.size_px, first.size_px
+        if view.size_px != views[0].size_px:
+            (width, height), (w, h) = view.size_px, views[0].size_px
             raise InputError(
-                f"{view.picture} has {width} x {height} pixels, {first.picture} has {w} x {h}: a"
+                f"{view.picture} has {width} x {height} pixels, {views[0].picture} has {w} x {h}: a"
                 " camera has one size; leave out the others"
             )
-    return first.size_px
 
 
 def _without_outliers(
-    views: Sequence[_BoardView], size_px: tuple[int, int]
+    views: Sequence[_BoardView],
 ) -> tuple[list[_BoardView], _LensSolution, list[PictureResult]]:
     """Leaves out, one by one, pictures with a far larger error than the others: they are blurred,
-    or a corner is wrong."""
+    or a corner is wrong. A k3 that the pictures do not determine stays 0: a wrong one distorts the
+    picture beyond the outermost corners."""
     kept, rejected = list(views), list[PictureResult]()
     while True:
-        solution = _solve_with_k3_if_determined(kept, size_px)
+        solution = _solve_lens(kept, 0)
+        if abs(solution.distortion[4]) < K3_SIGMAS * solution.deviations[8]:
+            solution = _solve_lens(kept, cv2.CALIB_FIX_K3)
         usual, worst = float(np.median(solution.each_px)), int(np.argmax(solution.each_px))
         error = float(solution.each_px[worst])
         if error < max(OUTLYING * usual, usual + OUTLYING_PX) or len(kept) <= MIN_PICTURES:
@@ -176,24 +169,13 @@ def _without_outliers(
         rejected.append(PictureResult(view.picture, len(view.corners.pixels), error, reason))
 
 
-def _solve_with_k3_if_determined(
-    views: Sequence[_BoardView], size_px: tuple[int, int]
-) -> _LensSolution:
-    """The lens with k3 only if the pictures determine it: a wrong k3 distorts the picture beyond
-    the outermost corners."""
-    solution = _solve_lens(views, size_px, 0)
-    if abs(solution.distortion[4]) < K3_SIGMAS * solution.deviations[8]:
-        return _solve_lens(views, size_px, cv2.CALIB_FIX_K3)
-    return solution
-
-
-def _solve_lens(views: Sequence[_BoardView], size_px: tuple[int, int], flags: int) -> _LensSolution:
+def _solve_lens(views: Sequence[_BoardView], flags: int) -> _LensSolution:
     """Raises InputError if the views do not determine a lens."""
     board_points = [view.corners.board_points for view in views]
     pixels = [view.corners.pixels for view in views]
     try:
         rms, matrix, distortion, turns, moves, deviations, _, _ = cv2.calibrateCameraExtended(
-            board_points, pixels, size_px, np.eye(3), np.zeros(5), flags=flags
+            board_points, pixels, views[0].size_px, np.eye(3), np.zeros(5), flags=flags
         )
     except cv2.error as error:
         raise InputError(f"{_NOT_DETERMINED} ({error.err})") from error
@@ -209,12 +191,6 @@ def _solve_lens(views: Sequence[_BoardView], size_px: tuple[int, int], flags: in
     return _LensSolution(rms, matrix.astype(float), lens, estimates, np.array(each), left)
 
 
-_NOT_DETERMINED = (
-    "the pictures do not determine the lens; take some with the board tilted by 30 to 45 degrees in"
-    " all directions, near and far"
-)
-
-
 def _lens_calibration(
     solution: _LensSolution, size_px: tuple[int, int], pictures: tuple[PictureResult, ...]
 ) -> LensCalibration:
@@ -223,9 +199,9 @@ def _lens_calibration(
     estimates = [
         Estimate(float(v), float(d)) for v, d in zip(values, solution.deviations, strict=True)
     ]
-    intrinsics = dict(zip(INTRINSICS, estimates[:4], strict=True))
-    share = max(estimates[i].standard_error / estimates[i].value for i in (0, 1))
-    covered = _covered_share(solution.residuals.pixels, size_px)
+    share = max(focal.standard_error / focal.value for focal in estimates[:2])
+    parts = np.clip(solution.residuals.pixels / np.asarray(size_px) * FIELDS, 0, FIELDS - 1)
+    covered = len(np.unique(parts.astype(int), axis=0)) / FIELDS**2
     notes = []
     if covered < 1.0:
         empty = round((1.0 - covered) * FIELDS**2)
@@ -245,15 +221,10 @@ def _lens_calibration(
     return LensCalibration(
         *size_px,
         solution.rms_px,
-        intrinsics,
+        dict(zip(INTRINSICS, estimates[:4], strict=True)),
         dict(zip(DISTORTION, estimates[4:], strict=True)),
         max(share, MIN_FOCAL_SHARE),
         covered,
         pictures,
         tuple(notes),
     )
-
-
-def _covered_share(pixels: Floats, size_px: tuple[int, int]) -> float:
-    parts = np.clip(pixels / np.asarray(size_px) * FIELDS, 0, FIELDS - 1).astype(int)
-    return len(np.unique(parts @ np.array([1, FIELDS]))) / FIELDS**2

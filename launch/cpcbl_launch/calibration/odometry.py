@@ -22,7 +22,6 @@ from cpcbl_launch.calibration.statistics import (
     MIN_ROWS,
     OUTLIER_SIGMAS,
     Estimate,
-    Integers,
     LinearFit,
     Mask,
     RowFilter,
@@ -38,14 +37,13 @@ from cpcbl_launch.reporting.metrics import Floats
 
 MIN_MOTION = 0.02  # m or rad in a window; a smaller motion does not determine scales
 DELAYS_S = np.arange(0.0, 1.001, 0.02)
-CORRECTIONS = (
-    "distance_scale",
-    "turn_scale",
-    "delay_s",
-    "distance_loss_m_per_rad",
-    "turn_bias_rad_per_m",
-)
-LIMITS = (0.2, 0.2, 0.2, 0.1, 0.1)  # of two that a log cannot separate the larger stays
+CORRECTIONS = {  # with their limits; of two that a log cannot separate the larger stays
+    "distance_scale": 0.2,
+    "turn_scale": 0.2,
+    "delay_s": 0.2,
+    "distance_loss_m_per_rad": 0.1,
+    "turn_bias_rad_per_m": 0.1,
+}
 NOISE = (
     "distance_sigma_m_per_sqrt_m",
     "distance_sigma_m_per_sqrt_rad",
@@ -59,11 +57,8 @@ def odometry_delay_s(logs: Sequence[RobotLog]) -> float:
     costs = []
     for delay_s in DELAYS_S:
         rows = odometry_windows(logs, float(delay_s), WINDOW_S)
-        cost = 0.0
-        for reading, true in (
-            (rows.turn, rows.true_turn),
-            (rows.displacement, rows.true_displacement),
-        ):
+        ways, cost = (rows.displacement, rows.true_displacement), 0.0
+        for reading, true in ((rows.turn, rows.true_turn), ways):
             moving = np.abs(reading) > MIN_MOTION
             if moving.sum() >= MIN_ROWS // 2:
                 scale = robust_fit(reading[moving, None], true[moving])[0]
@@ -83,21 +78,17 @@ def odometry_fit(rows: OdometryWindows, now: OdometryCorrections, noise: Floats)
     ways, turns = np.abs(rows.displacement) > MIN_MOTION, np.abs(rows.turn) > MIN_MOTION
     turns |= np.abs(rows.distance) > MIN_MOTION
     of_ways, of_turns = np.zeros((ways.sum(), 5)), np.zeros((turns.sum(), 5))
-    of_ways[:, 0], of_ways[:, 2] = (
-        rows.displacement[ways],
-        now.distance_scale * rows.displacement_rate[ways],
-    )
+    of_ways[:, 0] = rows.displacement[ways]
+    of_ways[:, 2] = now.distance_scale * rows.displacement_rate[ways]
     of_ways[:, 3] = -rows.loss[ways]
     of_turns[:, 1], of_turns[:, 2] = rows.turn[turns], now.turn_scale * rows.turn_rate[turns]
     of_turns[:, 4] = now.distance(rows)[turns]
     sigma = np.concatenate([way_sigma[ways], turn_sigma[turns]])
-    values = np.concatenate(
-        [(rows.true_displacement - rows.displacement)[ways], (rows.true_turn - rows.turn)[turns]]
-    )
+    way_errors, turn_errors = rows.true_displacement - rows.displacement, rows.true_turn - rows.turn
     return LinearFit(
         np.concatenate([rows.stretch[ways], rows.stretch[turns]]),
         np.concatenate([of_ways, of_turns]) / sigma[:, None],
-        values / sigma,
+        np.concatenate([way_errors[ways], turn_errors[turns]]) / sigma,
     )
 
 
@@ -105,14 +96,10 @@ def odometry_sigmas(
     rows: OdometryWindows, now: OdometryCorrections, noise: Floats
 ) -> tuple[Floats, Floats]:
     """Sigmas (m, rad) of the displacements and turns of windows."""
-    way = (
-        noise[0] * now.distance_scale * rows.distance_along
-        + noise[1] * now.turn_scale * rows.turn_along
-    )
-    turn = (
-        noise[2] * now.turn_scale * rows.turn_total
-        + noise[3] * now.distance_scale * rows.path_length
-    )
+    way = noise[0] * now.distance_scale * rows.distance_along
+    way += noise[1] * now.turn_scale * rows.turn_along
+    turn = noise[2] * now.turn_scale * rows.turn_total
+    turn += noise[3] * now.distance_scale * rows.path_length
     return np.sqrt(np.maximum(way + noise[4], 1e-12)), np.sqrt(np.maximum(turn + noise[5], 1e-12))
 
 
@@ -123,26 +110,18 @@ def odometry_noise(windows: Sequence[OdometryWindows], now: OdometryCorrections)
     windows are few and get a larger weight, because they show errors that are correlated for
     seconds.
     """
-
-    def column(name: str) -> Floats:
-        return np.concatenate([getattr(w, name) for w in windows])
-
-    along, path = (
-        now.distance_scale * column("distance_along"),
-        now.distance_scale * column("path_length"),
-    )
-    turned_along, turned = (now.turn_scale * column(n) for n in ("turn_along", "turn_total"))
-    ways = np.concatenate([w.true_displacement - now.displacement(w) for w in windows])
-    turns = np.concatenate([w.true_turn - now.turn(w) for w in windows])
-    one = np.ones_like(path)
-    sizes = [len(w.path_length) for w in windows]
-    weights = np.concatenate([np.full(n, sizes[0] / max(n, 1)) for n in sizes])
+    rows = OdometryWindows(*map(np.concatenate, zip(*windows, strict=True)))
+    along, path = now.distance_scale * rows.distance_along, now.distance_scale * rows.path_length
+    turned_along, turned = now.turn_scale * rows.turn_along, now.turn_scale * rows.turn_total
+    ways, turns = rows.true_displacement - now.displacement(rows), rows.true_turn - now.turn(rows)
+    sizes, one = [len(w.path_length) for w in windows], np.ones_like(path)
+    weights = np.repeat([sizes[0] / max(n, 1) for n in sizes], sizes)
     moving = (path > MIN_MOTION) | (turned > MIN_MOTION)
     of_ways, of_turns = (
         _covering_variances(errors[moving], np.stack(columns, axis=1)[moving], weights[moving])
         for errors, columns in ((ways, (along, turned_along, one)), (turns, (turned, path, one)))
     )
-    return np.concatenate([of_ways, of_turns], axis=1)[:, [0, 1, 3, 4, 2, 5]]
+    return np.hstack([of_ways, of_turns])[:, [0, 1, 3, 4, 2, 5]]
 
 
 def _covering_variances(errors: Floats, columns: Floats, weights: Floats) -> Floats:
@@ -151,11 +130,8 @@ def _covering_variances(errors: Floats, columns: Floats, weights: Floats) -> Flo
     parts = variance_components(errors, columns, weights)
     if np.isnan(parts).any():
         return parts
-    unit = errors**2 / np.maximum(columns @ parts[0], 1e-12)
-    worst = max(
-        float(np.minimum(unit[weights == w], OUTLIER_SIGMAS**2).mean()) for w in np.unique(weights)
-    )
-    return parts * max(1.0, worst)
+    unit = np.minimum(errors**2 / np.maximum(columns @ parts[0], 1e-12), OUTLIER_SIGMAS**2)
+    return parts * max(1.0, *(float(unit[weights == w].mean()) for w in np.unique(weights)))
 
 
 class _OdometryFit(NamedTuple):
@@ -173,11 +149,11 @@ def calibrate_odometry(logs: Sequence[RobotLog]) -> dict[str, Estimate]:
     if not logs:
         return {}
     found = _fit_corrections(logs, OdometryCorrections(1.0, 1.0, odometry_delay_s(logs), 0.0, 0.0))
-    least_speed = None if found is None else estimate_least_speed(logs, found.now)
-    crawl_noise = None
-    if found is not None and least_speed is not None:
+    crawling: dict[str, Estimate | None] = {}
+    if found and (least_speed := estimate_least_speed(logs, found.now)):
         speed = least_speed.value / found.now.distance_scale
         crawl_noise = estimate_crawl_noise(logs, found.now, speed)
+        crawling = {"least_speed_m_s": least_speed, CRAWL_NOISE: crawl_noise}
         found = _fit_corrections([with_least_speed(log, speed) for log in logs], found.now)
     if found is None:
         return {}
@@ -189,10 +165,7 @@ def calibrate_odometry(logs: Sequence[RobotLog]) -> dict[str, Estimate]:
         windows[0].stretch,
     )
     result = {name: v for name, v, k in zip(CORRECTIONS, values, known, strict=True) if k}
-    if least_speed is not None:
-        result["least_speed_m_s"] = least_speed
-    if crawl_noise is not None:
-        result[CRAWL_NOISE] = crawl_noise
+    result |= {name: estimate for name, estimate in crawling.items() if estimate is not None}
     return result | dict(zip(NOISE, grown, strict=False))
 
 
@@ -205,19 +178,11 @@ def _fit_corrections(logs: Sequence[RobotLog], now: OdometryCorrections) -> _Odo
             return None
         rows = odometry_windows(logs, now.delay_s, WINDOW_S)
         fit = odometry_fit(rows, now, np.nan_to_num(noise[0]))
-        known = determined_coefficients(fit.columns, LIMITS)
-        now = _apply_changes(now, solve(fit, known), bool(known[2]))
+        known = determined_coefficients(fit.columns, CORRECTIONS.values())
+        scale, turn_scale, later_s, loss, bias = solve(fit, known).tolist()
+        delay_s = now.delay_s + min(max(later_s, -0.05), 0.05) if known[2] else 0.0
+        now = OdometryCorrections(1.0 + scale, 1.0 + turn_scale, delay_s, max(loss, 0.0), bias)
     return _OdometryFit(now, known, fit, windows)
-
-
-def _apply_changes(
-    now: OdometryCorrections, change: Floats, delay_is_known: bool
-) -> OdometryCorrections:
-    later_s = float(np.clip(change[2], -0.05, 0.05)) if delay_is_known else -now.delay_s
-    scale, turn_scale, _, loss, bias = change.tolist()
-    return OdometryCorrections(
-        1.0 + scale, 1.0 + turn_scale, now.delay_s + later_s, max(loss, 0.0), bias
-    )
 
 
 def turn_residuals(logs: Sequence[RobotLog], turn_scale: float) -> Floats:
@@ -227,9 +192,7 @@ def turn_residuals(logs: Sequence[RobotLog], turn_scale: float) -> Floats:
 
 
 LEAST_SPEEDS_M_S = np.arange(0.0, 0.0501, 0.001)
-MAX_ERROR_M = (
-    0.1  # a larger error of the displacement in a window has other causes than a dead zone
-)
+MAX_ERROR_M = 0.1  # a larger error of a displacement has other causes than a dead zone
 SIGNIFICANT_SIGMAS = 3.0  # standard errors
 MIN_CRAWL_SHARE = 0.7  # of the time of a window that counts as slow
 MIN_CRAWL_WINDOWS = 8  # windows of one length
@@ -241,15 +204,12 @@ def estimate_least_speed(logs: Sequence[RobotLog], now: OdometryCorrections) -> 
 
     It is the speed on a grid with the best fit of the displacements.
     """
-    commanded_speeds = [speed / now.distance_scale for speed in LEAST_SPEEDS_M_S]
-    rows = [
-        odometry_windows([with_least_speed(log, speed) for log in logs], now.delay_s, WINDOW_S)
-        for speed in commanded_speeds
-    ]
-    stretch = rows[0].stretch
-    errors = np.minimum(
-        [np.abs(r.true_displacement - now.displacement(r)) for r in rows], MAX_ERROR_M
-    )
+    each = []
+    for speed in LEAST_SPEEDS_M_S / now.distance_scale:
+        driven = [with_least_speed(log, speed) for log in logs]
+        rows = odometry_windows(driven, now.delay_s, WINDOW_S)
+        each.append(_displacement_errors_m(rows, now))
+    stretch, errors = rows.stretch, np.array(each)
     slow = np.ptp(errors, axis=0) > 0.0
     if slow.sum() < MIN_ROWS // 2:
         return None
@@ -279,12 +239,8 @@ def _slow_pieces(log: RobotLog, speed_m_s: float) -> tuple[Mask, Floats]:
     return (distance != 0.0) & (np.abs(distance) < speed_m_s * seconds), seconds
 
 
-class _CrawlWindows(NamedTuple):
-    """Windows in which a robot mostly drove at its least speed. Shapes (n,)."""
-
-    stretch: Integers
-    square_m2: Floats  # of the error of the displacement
-    seconds: Floats  # at the least speed
+def _displacement_errors_m(rows: OdometryWindows, now: OdometryCorrections) -> Floats:
+    return np.minimum(np.abs(rows.true_displacement - now.displacement(rows)), MAX_ERROR_M)
 
 
 def estimate_crawl_noise(
@@ -295,28 +251,27 @@ def estimate_crawl_noise(
 
     The windows of the length with the largest error determine it.
     """
-    crawl_windows = []
+    crawl_windows = []  # of each length: stretches, squares of errors, seconds at the least speed
     for length_s in NOISE_WINDOWS_S:
         driven, only = (
             odometry_windows([change(log, speed_m_s) for log in logs], now.delay_s, length_s)
             for change in (with_least_speed, _with_slow_seconds)
         )
-        errors_m = np.minimum(
-            np.abs(driven.true_displacement - now.displacement(driven)), MAX_ERROR_M
-        )
-        rows = _CrawlWindows(driven.stretch, errors_m**2, only.path_length)
-        rows = select_rows(rows, only.path_length > MIN_CRAWL_SHARE * length_s)
-        if len(rows.seconds) >= MIN_CRAWL_WINDOWS:
-            crawl_windows.append(rows)
+        slow = only.path_length > MIN_CRAWL_SHARE * length_s
+        if slow.sum() >= MIN_CRAWL_WINDOWS:
+            square_m2 = _displacement_errors_m(driven, now) ** 2
+            crawl_windows.append((driven.stretch[slow], square_m2[slow], only.path_length[slow]))
     if not crawl_windows:
         return None
 
     def variance(keep: RowFilter) -> Floats:
-        left = [select_rows(rows, keep(rows.stretch)) for rows in crawl_windows]
-        each = [rows.square_m2.sum() / max(rows.seconds.sum(), 1e-9) for rows in left]
+        each = []
+        for stretch, square_m2, seconds in crawl_windows:
+            kept = keep(stretch)
+            each.append(square_m2[kept].sum() / max(seconds[kept].sum(), 1e-9))
         return np.full((2, 1), max(each))
 
-    return sigma_estimates(variance, crawl_windows[0].stretch)[0]
+    return sigma_estimates(variance, crawl_windows[0][0])[0]
 
 
 def _with_slow_seconds(log: RobotLog, speed_m_s: float) -> RobotLog:

@@ -132,12 +132,8 @@ def _commanded_motion(
     """
     from_s, until_s, distance, turn = odometry.T
     direction = np.interp(0.5 * (from_s + until_s) + delay_s, stamps, heading)
-    c, s, displacement, turn_total = (
-        np.cos(direction),
-        np.sin(direction),
-        np.abs(distance),
-        np.abs(turn),
-    )
+    c, s = np.cos(direction), np.sin(direction)
+    displacement, turn_total = np.abs(distance), np.abs(turn)
     cos2, sin2 = np.cos(2.0 * direction), np.sin(2.0 * direction)
     lost = np.sign(distance) * turn_total
     distance_along = [distance * c, distance * s, lost * c, lost * s]

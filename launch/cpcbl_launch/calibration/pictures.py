@@ -60,9 +60,7 @@ def read_picture(file: Path) -> NamedPicture:
     except OSError as error:
         return NamedPicture(file.name, error.strerror or "cannot be read")
     pixels = cv2.imdecode(image, cv2.IMREAD_COLOR) if image.size else None
-    return NamedPicture(
-        file.name, "no picture" if pixels is None else pixels.astype("uint8", copy=False)
-    )
+    return NamedPicture(file.name, "no picture" if pixels is None else pixels.astype(np.uint8))
 
 
 def _video_frames(file: Path, every_s: float) -> Iterator[NamedPicture]:
@@ -73,10 +71,8 @@ def _video_frames(file: Path, every_s: float) -> Iterator[NamedPicture]:
         while video.grab():
             if number % step == 0:
                 read, pixels = video.retrieve()
-                name = f"{file.name}:{number}"
-                yield NamedPicture(
-                    name, pixels.astype("uint8", copy=False) if read else "no picture"
-                )
+                frame = pixels.astype(np.uint8) if read else "no picture"
+                yield NamedPicture(f"{file.name}:{number}", frame)
             number += 1
         if number == 0:
             yield NamedPicture(file.name, "no frame in this video")

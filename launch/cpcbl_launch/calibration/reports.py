@@ -4,94 +4,74 @@ from collections.abc import Iterable
 
 from rich.console import Console
 
-from cpcbl_launch.calibration.camera_accuracy import AccuracyRow, CameraAccuracy, ErrorStatistics
-from cpcbl_launch.calibration.camera_observations import CameraDataset
+from cpcbl_launch.calibration.camera_accuracy import CameraAccuracy, CameraDataset
 from cpcbl_launch.calibration.colours import ColourCalibration
 from cpcbl_launch.calibration.lens import LensCalibration
-from cpcbl_launch.calibration.robots import Calibration
 from cpcbl_launch.calibration.statistics import Estimate, decimals
 from cpcbl_launch.calibration.team_tables import (
     CAMERA_SIGMAS,
     THRESHOLDS,
     differ_from_stated_sigmas,
 )
+from cpcbl_launch.calibration.team_types import Calibration
 from cpcbl_launch.reporting.tables import number, percent, table
 from cpcbl_team.config import Colour
 
-UNITS = {
-    "range_share": "of range",
-    "range_floor_m": "m",
-    "range_bias_m": "m",
-    "robot_range_bias_m": "m",
-    "bearing_sigma_deg": "deg",
-    "bearing_bias_deg": "deg",
-    "optical_axis_deg": "deg",
-    "delay_s": "s",
-    "correlation_s": "s",
-}
-_CALIBRATED_KEYS = (
-    (
-        "way, true = scale x reported - loss x |turn|",
-        "odometry",
-        {"distance_scale": "scale", "distance_loss_m_per_rad": "loss m/rad", "delay_s": "delay s"},
-    ),
-    (
-        "turn, true = scale x reported + bias x way",
-        "odometry",
-        {"turn_scale": "scale", "turn_bias_rad_per_m": "bias rad/m"},
-    ),
-    (
-        "least speed, and σ by root of time there",
-        "odometry",
-        {"least_speed_m_s": "least m/s", "crawl_sigma_m_per_sqrt_s": "σ m/√s"},
-    ),
-    (
-        "odometry noise, σ by root of way and turn",
-        "odometry",
-        {
+UNITS = {"m": "m", "deg": "deg", "s": "s", "share": "of range"}  # by the end of a name
+_CALIBRATED_KEYS = {  # for each table: the headings of its columns
+    "odometry": {
+        "way, true = scale x reported - loss x |turn|": {
+            "distance_scale": "scale",
+            "distance_loss_m_per_rad": "loss m/rad",
+            "delay_s": "delay s",
+        },
+        "turn, true = scale x reported + bias x way": {
+            "turn_scale": "scale",
+            "turn_bias_rad_per_m": "bias rad/m",
+        },
+        "least speed, and σ by root of time there": {
+            "least_speed_m_s": "least m/s",
+            "crawl_sigma_m_per_sqrt_s": "σ m/√s",
+        },
+        "odometry noise, σ by root of way and turn": {
             "distance_sigma_m_per_sqrt_m": "way m/√m",
             "distance_sigma_m_per_sqrt_rad": "m/√rad",
             "turn_sigma_rad_per_sqrt_rad": "turn rad/√rad",
             "turn_sigma_rad_per_sqrt_m": "turn rad/√m",
         },
-    ),
-    (
-        "ranges, true = scale x reading - bias",
-        "sensor",
-        {
+    },
+    "sensor": {
+        "ranges, true = scale x reading - bias": {
             "range_scale": "scale",
             "range_bias_m": "bias m",
             "robot_range_bias_m": "robots' bias m",
             "optical_axis_deg": "axis deg",
         },
-    ),
-    (
-        "range noise, time in which errors fade",
-        "sensor",
-        {"range_share": "share", "range_floor_m": "floor m", "correlation_s": "fade s"},
-    ),
-    (
-        "bearings, true = scale x reading - bias; camera",
-        "sensor",
-        {
+        "range noise, time in which errors fade": {
+            "range_share": "share",
+            "range_floor_m": "floor m",
+            "correlation_s": "fade s",
+        },
+        "bearings, true = scale x reading - bias; camera": {
             "bearing_scale": "scale",
             "bearing_bias_deg": "bias deg",
             "bearing_sigma_deg": "σ deg",
             "delay_s": "delay s",
         },
-    ),
-)
+    },
+}
 
 
 def print_calibration(calibration: Calibration, console: Console) -> None:
     """Prints values ± standard errors in tables with a row for each robot."""
-    for title, part, names in _CALIBRATED_KEYS:
-        rows = table(title, ("robot",), tuple(names.values()))
-        for robot, result in calibration.robots.items():
-            values = getattr(result, part)
-            rows.add_row(robot, *(format_estimate(values.get(name)) for name in names))
-        console.print(rows)
-        console.print()
+    for part, tables in _CALIBRATED_KEYS.items():
+        for title, names in tables.items():
+            rows = table(title, ("robot",), tuple(names.values()))
+            for robot, result in calibration.robots.items():
+                values = getattr(result, part)
+                rows.add_row(robot, *(format_estimate(values.get(name)) for name in names))
+            console.print(rows)
+            console.print()
     _print_notes(["± standard error; -: the logs do not determine this value"], console)
     for robot, result in calibration.robots.items():
         _print_notes((f"robot {robot}: {note}" for note in result.notes), console)
@@ -110,12 +90,9 @@ def print_lens(lens: LensCalibration, console: Console) -> None:
     title = f"{lens.width_px} x {lens.height_px}, {used} pictures, {lens.rms_px:.3f} px RMS"
     values = table(title, ("lens",), ("value", "± standard deviation"))
     for name, estimate in (lens.intrinsics | lens.distortion).items():
-        if estimate.standard_error == 0.0:
+        if estimate.standard_error == 0.0:  # k3 stayed 0
             continue
-        digits = decimals(estimate.standard_error)
-        values.add_row(
-            name, f"{estimate.value:.{digits}f}", f"{estimate.standard_error:.{digits}f}"
-        )
+        values.add_row(name, *format_estimate(estimate).split(" ± "))
     values.add_section()
     values.add_row("focal_share", f"{lens.focal_share:.4f}", "")
     values.add_row("covered", percent(lens.covered), "")
@@ -139,10 +116,10 @@ def print_colours(result: ColourCalibration, console: Console) -> None:
         accepted = (*(fit.taken[other] for other in names), fit.unseen, fit.elsewhere)
         shares.add_row(name, *(percent(share).rstrip("%") for share in accepted))
     console.print(shares)
-    explanation = (
+    explained = (
         "unseen: of its worst sample, by thresholds from the others; elsewhere: not labelled"
     )
-    _print_notes([explanation, *result.notes], console)
+    _print_notes([explained, *result.notes], console)
 
 
 def _ranges(colour: Colour) -> list[str]:
@@ -161,16 +138,18 @@ def print_camera_accuracy(
         measured = [(a, e) for a in accuracy.agreements if (e := getattr(a, part)) is not None]
         if not measured:
             continue
-        rows = table(
-            title, ("seen",), ("from m", "to m", "sightings", "bias", "σ", "in 3 σ", "x stated σ")
-        )
+        columns = "from m", "to m", "sightings", "bias", "σ", "in 3 σ", "x stated σ"
+        rows = table(title, ("seen",), columns)
         for row, error in measured:
-            rows.add_row(*_span_cells(row), *_error_cells(error, digits, scale))
+            to_m = "" if row.to_m is None else f"{row.to_m:g}"
+            errors = (number(scale * value, digits) for value in (error.bias, error.sigma))
+            shares = percent(error.inside_3_sigma), number(error.times, 2)
+            rows.add_row(row.kind, f"{row.from_m:g}", to_m, str(row.sightings), *errors, *shares)
         console.print(rows)
         console.print()
     corrected = table("true = scale x reading - bias; what is left", ("sensor",), ("value", "unit"))
     for name, value in accuracy.sensor.items():
-        corrected.add_row(name, format_estimate(value), UNITS.get(name, ""))
+        corrected.add_row(name, format_estimate(value), UNITS.get(name.rsplit("_")[-1], ""))
     if accuracy.times is not None:
         corrected.add_section()
         corrected.add_row("errors left, of the stated σ", format_estimate(accuracy.times), "times")
@@ -179,25 +158,11 @@ def print_camera_accuracy(
     _print_notes((*sigma_notes, *dataset.notes), console)
 
 
-def _span_cells(row: AccuracyRow) -> tuple[str, str, str, str]:
-    to_m = "" if row.to_m is None else f"{row.to_m:g}"
-    return row.kind, f"{row.from_m:g}", to_m, str(row.sightings)
-
-
-def _error_cells(error: ErrorStatistics, digits: int, scale: float) -> tuple[str, ...]:
-    return (
-        f"{scale * error.bias:.{digits}f}",
-        f"{scale * error.sigma:.{digits}f}",
-        percent(error.inside_3_sigma),
-        number(error.times, 2),
-    )
-
-
 def _sigma_note(times: Estimate) -> str:
     """Whether the stated sigmas are right, and what follows."""
-    names = ", ".join(CAMERA_SIGMAS)
     if not differ_from_stated_sigmas(times):
         return "the stated sigmas are right"
+    names = ", ".join(CAMERA_SIGMAS)
     if times.value > 1.0:
         return f"errors are larger than stated: increase {names}"
     return (

@@ -23,7 +23,6 @@ from cpcbl_launch.calibration.statistics import (
     error_pairs,
     jackknife,
     robust_sigma,
-    scale_estimate,
     select_rows,
     sigma_estimates,
     solve,
@@ -35,21 +34,20 @@ from cpcbl_team.sensors import LEAST_COSINE
 
 NUDGE_S = 0.01
 DEPTH_SPREAD = 0.8  # readings are depths if that reduces the errors below this share
-CORRECTIONS = (
-    "range_scale",
-    "range_bias_m",
-    "robot_range_bias_m",
-    "optical_axis_deg",
-    "bearing_scale",
-    "bearing_bias_deg",
-    "delay_s",
-)
-LIMITS = (0.2, 0.3, 0.3, 0.1, 0.05, 0.1, 0.1)
+CORRECTIONS = {  # with their limits; of two that a log cannot separate the larger stays
+    "range_scale": 0.2,
+    "range_bias_m": 0.3,
+    "robot_range_bias_m": 0.3,
+    "optical_axis_deg": 0.1,  # rad, as the bearing
+    "bearing_scale": 0.05,
+    "bearing_bias_deg": 0.1,
+    "delay_s": 0.1,
+}
 NOISE = ("range_share", "range_floor_m", "bearing_sigma_deg")
 
 
 class SightingRows(NamedTuple):
-    """Sightings with their true values. Shapes (n,)."""
+    """Sightings with their true values; NaN: not measured, or not known. Shapes (n,)."""
 
     stretch: Integers
     stamp_s: Floats
@@ -89,50 +87,46 @@ class SensorCorrections(NamedTuple):
     def range_errors(self, rows: SightingRows) -> Floats:
         """Corrected minus true range."""
         bias = np.where(rows.teammate, self.robot_range_bias_m, self.range_bias_m)
-        return np.asarray(
-            self.range_scale * self.line_of_sight_range(rows) - bias - rows.true_range
-        )
+        corrected = self.range_scale * self.line_of_sight_range(rows) - bias
+        return np.asarray(corrected - rows.true_range)
 
     def bearing_errors(self, rows: SightingRows) -> Floats:
         """Corrected minus true bearing."""
-        corrections_from_fit = self.bearing_scale * rows.bearing - self.bearing_bias
-        return wrap_angles(corrections_from_fit - rows.true_bearing)
+        corrected = self.bearing_scale * rows.bearing - self.bearing_bias
+        return wrap_angles(corrected - rows.true_bearing)
 
 
 def sighting_rows(logs: Sequence[RobotLog], delay_s: float) -> SightingRows:
-    """The sightings for which observer and object have ground truth at the exposure."""
-    parts = [_rows_of_log(log, i, delay_s) for i, log in enumerate(logs)]
-    return SightingRows(*map(np.concatenate, zip(*parts, strict=True)))
+    """The plausible sightings for which observer and object have ground truth at the exposure."""
+    parts = [all_sighting_rows(log, i, delay_s) for i, log in enumerate(logs)]
+    rows = SightingRows(*map(np.concatenate, zip(*parts, strict=True)))
+    plausible = np.isnan(rows.range_m) | (rows.range_m > 0.0)
+    plausible &= np.isnan(rows.bearing) | (np.abs(rows.bearing) <= math.pi)
+    return select_rows(rows, plausible & (rows.true_range > 0.05) & np.isfinite(rows.range_rate))
 
 
-def _rows_of_log(log: RobotLog, number: int, delay_s: float) -> SightingRows:
+def all_sighting_rows(log: RobotLog, number: int, delay_s: float) -> SightingRows:
+    """A row for each sighting of a log. `number`: of the log."""
     stamp_s, which = log.sightings[:, 0], log.sightings[:, 1].astype(np.int64)
-    readings, bearings = log.sightings[:, 2], log.sightings[:, 3]
-    (range_m, bearing, has_truth), earlier, later = (
-        true_measurements(log, which, stamp_s - delay_s + nudge)
+    now, earlier, later = (
+        _true_measurements(log, which, stamp_s - delay_s + nudge)
         for nudge in (0.0, -NUDGE_S, NUDGE_S)
     )
-    rows = SightingRows(
+    return SightingRows(
         stretch_numbers(stamp_s, log.truth[:, 0], number),
         stamp_s,
         which + 1000 * number,
         np.isin(which, list(log.teammates)),
-        readings,
-        bearings,
-        range_m,
-        bearing,
+        log.sightings[:, 2],
+        log.sightings[:, 3],
+        *now,
         (later[0] - earlier[0]) / (2.0 * NUDGE_S),
         wrap_angles(later[1] - earlier[1]) / (2.0 * NUDGE_S),
     )
-    plausible = (np.isnan(readings) | (readings > 0.0)) & (range_m > 0.05)
-    plausible &= np.isnan(bearings) | (np.abs(bearings) <= math.pi)
-    return select_rows(rows, has_truth & earlier[2] & later[2] & plausible)
 
 
-def true_measurements(
-    log: RobotLog, which: Integers, times_s: Floats
-) -> tuple[Floats, Floats, Mask]:
-    """True ranges (m) and bearings (rad) of objects at times, and whether the truth is known."""
+def _true_measurements(log: RobotLog, which: Integers, times_s: Floats) -> tuple[Floats, Floats]:
+    """True ranges (m) and bearings (rad) of objects at times; NaN where the truth is not known."""
     stamps = log.truth[:, 0]
     has_truth = has_truth_at(stamps, times_s)
     x, y = np.empty_like(times_s), np.empty_like(times_s)
@@ -143,8 +137,8 @@ def true_measurements(
             has_truth[mine] &= has_truth_at(place[:, 0], times_s[mine])
     own = [np.interp(times_s, stamps, c) for c in (log.truth[:, 1], log.truth[:, 2])]
     heading = np.interp(times_s, stamps, np.unwrap(log.truth[:, 3]))
-    dx, dy = x - own[0], y - own[1]
-    return np.hypot(dx, dy), wrap_angles(np.arctan2(dy, dx) - heading), has_truth
+    dx, dy = np.where(has_truth, (x - own[0], y - own[1]), math.nan)
+    return np.hypot(dx, dy), wrap_angles(np.arctan2(dy, dx) - heading)
 
 
 def sensor_fit(
@@ -195,13 +189,8 @@ def sensor_noise(rows: SightingRows, now: SensorCorrections) -> Floats:
     ranges, bearings = now.range_errors(rows), now.bearing_errors(rows)
     r, b = np.isfinite(ranges), np.isfinite(bearings)
     columns = np.stack([rows.true_range**2, np.ones_like(ranges)], axis=1)
-    return np.concatenate(
-        [
-            variance_components(ranges[r], columns[r]),
-            variance_components(bearings[b], np.ones((b.sum(), 1))),
-        ],
-        axis=1,
-    )
+    of_ranges = variance_components(ranges[r], columns[r])
+    return np.hstack([of_ranges, variance_components(bearings[b], np.ones((b.sum(), 1)))])
 
 
 def sensor_sigmas(rows: SightingRows, noise: Floats) -> tuple[Floats, float]:
@@ -211,15 +200,17 @@ def sensor_sigmas(rows: SightingRows, noise: Floats) -> tuple[Floats, float]:
     return np.maximum(ranges, 1e-9), max(math.sqrt(bearing), 1e-9)
 
 
-class _SensorFit(NamedTuple):
+class SensorFit(NamedTuple):
+    """The best corrections, and the data of their fit."""
+
     rows: SightingRows
     before: SensorCorrections  # the fit gives differences from these
     fit: LinearFit
-    has_truth_at: Mask
+    known: Mask  # of `CORRECTIONS`
     after: SensorCorrections
 
 
-def _fit_corrections(logs: Sequence[RobotLog], is_depth: bool) -> _SensorFit | None:
+def _fit_corrections(logs: Sequence[RobotLog], is_depth: bool) -> SensorFit | None:
     """The corrections, weighted by the noise of the residuals; None with too few sightings."""
     now = SensorCorrections(is_depth=is_depth)
     for _ in range(5):
@@ -227,12 +218,12 @@ def _fit_corrections(logs: Sequence[RobotLog], is_depth: bool) -> _SensorFit | N
         if len(rows.stamp_s) < MIN_ROWS:
             return None
         fit = sensor_fit(rows, now, *sensor_sigmas(rows, sensor_noise(rows, now)))
-        determined = determined_coefficients(fit.columns, LIMITS)
-        before, now = now, corrections_from_fit(now, solve(fit, determined))
-    return _SensorFit(rows, before, fit, determined, now)
+        known = determined_coefficients(fit.columns, CORRECTIONS.values())
+        before, now = now, corrections_from_fit(now, solve(fit, known))
+    return SensorFit(rows, before, fit, known, now)
 
 
-def _best_fit(logs: Sequence[RobotLog]) -> _SensorFit | None:
+def fit_sensor(logs: Sequence[RobotLog]) -> SensorFit | None:
     """The fit with ranges or with depths, whichever is better; None with too few sightings."""
     plain, depth = _fit_corrections(logs, False), _fit_corrections(logs, True)
     if plain is None or depth is None:
@@ -240,50 +231,41 @@ def _best_fit(logs: Sequence[RobotLog]) -> _SensorFit | None:
     return depth if _range_error_sigma(depth) < DEPTH_SPREAD * _range_error_sigma(plain) else plain
 
 
-def _range_error_sigma(found: _SensorFit) -> float:
+def _range_error_sigma(found: SensorFit) -> float:
     errors = found.after.range_errors(found.rows) / found.rows.true_range
     return robust_sigma(np.abs(errors[np.isfinite(errors)]))
 
 
-def sensor_corrections(logs: Sequence[RobotLog]) -> SensorCorrections:
-    """The corrections of `calibrate_sensor`; neutral ones with too few sightings."""
-    best = _best_fit(logs)
-    return SensorCorrections() if best is None else best.after
-
-
-def calibrate_sensor(logs: Sequence[RobotLog]) -> tuple[dict[str, Estimate], bool]:
-    """Values named as in `SensorSettings`, and whether ranges are depths.
-
-    Values that the logs do not determine are missing.
-    """
-    best = _best_fit(logs)
+def calibrate_sensor(logs: Sequence[RobotLog]) -> tuple[dict[str, Estimate], SensorCorrections]:
+    """Values named as in `SensorSettings`, without those that the logs do not determine, and all
+    corrections (neutral ones with too few sightings)."""
+    best = fit_sensor(logs)
     if best is None:
-        return {}, False
-    rows, before, fit, determined, now = best
-    values = jackknife(
+        return {}, SensorCorrections()
+    rows, before, fit, known, now = best
+    corrections = jackknife(
         lambda keep: np.array(
-            corrections_from_fit(before, solve(select_rows(fit, keep(fit.stretch)), determined))[:7]
+            corrections_from_fit(before, solve(select_rows(fit, keep(fit.stretch)), known))[:7]
         ),
         fit.stretch,
     )
-    in_degrees = (3, 5)
-    values = [
-        scale_estimate(math.degrees(1.0), v) if i in in_degrees else v for i, v in enumerate(values)
-    ]
-    result = {name: v for name, v, k in zip(CORRECTIONS, values, determined, strict=True) if k}
-    if not now.is_depth:
-        result.pop("optical_axis_deg", None)
     noise = sigma_estimates(
         lambda keep: sensor_noise(select_rows(rows, keep(rows.stretch)), now), rows.stretch
     )
-    noise[2] = scale_estimate(math.degrees(1.0), noise[2])
     pairs = sensor_error_pairs(rows, now)
     correlation_time = jackknife(
         lambda keep: np.array([correlation_time_s(select_rows(pairs, keep(pairs.stretch)))]),
         rows.stretch,
     )
-    more = dict(zip((*NOISE, "correlation_s"), (*noise, *correlation_time), strict=True))
-    return result | {name: v for name, v in more.items() if math.isfinite(v.value)}, now.is_depth
+    result = {name: v for name, v, k in zip(CORRECTIONS, corrections, known, strict=True) if k}
+    if not now.is_depth:
+        result.pop("optical_axis_deg", None)
+    result |= zip((*NOISE, "correlation_s"), (*noise, *correlation_time), strict=True)
+    for name in result:
+        if name.endswith("_deg"):
+            value, error = result[name].value, result[name].standard_error
+            result[name] = Estimate(math.degrees(value), math.degrees(error))
+    return {name: v for name, v in result.items() if math.isfinite(v.value)}, now
 
 
 def sensor_error_pairs(rows: SightingRows, now: SensorCorrections) -> ErrorPairs:
@@ -291,26 +273,3 @@ def sensor_error_pairs(rows: SightingRows, now: SensorCorrections) -> ErrorPairs
     range_sigma, bearing_sigma = sensor_sigmas(rows, sensor_noise(rows, now))
     errors = now.range_errors(rows) / range_sigma, now.bearing_errors(rows) / bearing_sigma
     return error_pairs(rows.stretch, rows.stamp_s, rows.object, errors)
-
-
-class SensorResiduals(NamedTuple):
-    """Errors of a calibrated sensor; see `SightingRows`."""
-
-    true_range: Floats
-    range_m: Floats
-    bearing: Floats
-    pairs: ErrorPairs
-
-
-def sensor_residuals(logs: Sequence[RobotLog]) -> SensorResiduals | None:
-    """Corrected minus true readings of a robot; None with too few sightings."""
-    best = _best_fit(logs)
-    if best is None:
-        return None
-    rows, now = best.rows, best.after
-    return SensorResiduals(
-        rows.true_range,
-        now.range_errors(rows),
-        now.bearing_errors(rows),
-        sensor_error_pairs(rows, now),
-    )

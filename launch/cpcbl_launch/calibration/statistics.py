@@ -5,7 +5,7 @@ The fits are robust (Huber 1964). Standard errors are those of a jackknife over 
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from itertools import pairwise
 from typing import Any, NamedTuple, TypeVar
 
@@ -60,15 +60,15 @@ def robust_fit(columns: Floats, values: Floats) -> Floats:
     return coefficients
 
 
-def determined_coefficients(columns: Floats, limits: Sequence[float]) -> Mask:
+def determined_coefficients(columns: Floats, limits: Iterable[float]) -> Mask:
     """Which coefficients (k,) the rows (in units of their sigma) determine well within the limits.
 
     The worst one is removed and keeps its neutral value until the others are good: ranges at one
     distance, for example, determine either the scale or the bias, not both.
     """
-    known = np.ones(columns.shape[1], bool)
+    known, in_limits = np.ones(columns.shape[1], bool), columns * np.array([*limits])
     while known.any():
-        scaled = (columns * np.asarray(limits))[:, known]
+        scaled = in_limits[:, known]
         error = np.sqrt(np.diag(np.linalg.inv(scaled.T @ scaled + np.eye(known.sum()))))
         if error.max() < DETERMINED_SHARE:
             break
@@ -152,11 +152,6 @@ def stretch_numbers(times_s: Floats, stamps: Floats, number: int) -> Integers:
     return np.asarray(STRETCHES[1] * number + within, dtype=np.int64)
 
 
-def scale_estimate(factor: float, estimate: Estimate) -> Estimate:
-    """The estimate in another unit."""
-    return Estimate(factor * estimate.value, factor * estimate.standard_error)
-
-
 def robust_sigma(errors: Floats) -> float:
     """A standard deviation from the median of absolute errors."""
     return max(1.4826 * float(np.median(np.abs(errors))), 1e-9) if len(errors) else 1.0
@@ -187,15 +182,13 @@ def error_pairs(
     stretch: Integers, stamp_s: Floats, name: Integers, errors: Sequence[Floats]
 ) -> ErrorPairs:
     """All pairs of one object and one kind of error (in units of sigma), up to the longest lag."""
-    parts = []
+    parts = [ErrorPairs(np.empty(0, np.int64), *np.empty((3, 0)))]
     for unit in errors:
         error = np.where(np.abs(unit) < OUTLIER_SIGMAS, unit, np.nan)
-        for object_id in np.unique(name):
-            mine = np.flatnonzero((name == object_id) & np.isfinite(error))
+        for one in np.unique(name):
+            mine = np.flatnonzero((name == one) & np.isfinite(error))
             mine = mine[np.argsort(stamp_s[mine], kind="stable")]
             parts += _pairs_of_object(stretch[mine], stamp_s[mine], error[mine])
-    if not parts:
-        return ErrorPairs(np.empty(0, np.int64), *(np.empty(0) for _ in range(3)))
     return ErrorPairs(*map(np.concatenate, zip(*parts, strict=True)))
 
 
@@ -206,9 +199,9 @@ def _pairs_of_object(stretch: Integers, stamp_s: Floats, error: Floats) -> list[
         near = (lag <= LAGS_S[-1]) & (lag > 0.0)
         if not near.any():
             break
-        object_id, two = error[:-ahead][near], error[ahead:][near]
-        square = 0.5 * (object_id * object_id + two * two)
-        parts.append(ErrorPairs(stretch[:-ahead][near], lag[near], object_id * two, square))
+        one, two = error[:-ahead][near], error[ahead:][near]
+        square = 0.5 * (one * one + two * two)
+        parts.append(ErrorPairs(stretch[:-ahead][near], lag[near], one * two, square))
     return parts
 
 

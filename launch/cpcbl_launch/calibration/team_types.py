@@ -1,7 +1,7 @@
-"""Calibrated values of robots as robot types of a team file."""
+"""All robots of some logs, calibrated one by one, and written as robot types of a team file."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +12,8 @@ from tomlkit.items import Table
 from tomlkit.toml_document import TOMLDocument
 
 from cpcbl_launch.calibration import odometry, sensor
+from cpcbl_launch.calibration.logs import RobotLog, RobotLogs
 from cpcbl_launch.calibration.odometry_windows import WINDOW_S
-from cpcbl_launch.calibration.robots import Calibration, RobotCalibration
 from cpcbl_launch.calibration.statistics import Estimate, decimals
 from cpcbl_launch.calibration.team_tables import MINIMUM, team_source
 from cpcbl_launch.reporting.recording import read_recording
@@ -21,6 +21,66 @@ from cpcbl_launch.team_file import builtin_path, parse_team
 from cpcbl_team.errors import InputError
 
 INTERVAL_S = 0.5  # with correlation_s known, more frequent sightings of an object add little
+_CORRECTED = {  # the noise of a reading: its correction, the neutral value, the unit of the noise
+    "range_share": ("range_scale", 1.0, 1.0),
+    "range_floor_m": ("range_bias_m", 0.0, 1.0),
+    "bearing_sigma_deg": ("bearing_bias_deg", 0.0, 1.0),
+    odometry.CRAWL_NOISE: ("least_speed_m_s", 0.0, math.sqrt(WINDOW_S)),  # for a window
+}
+
+
+class RobotCalibration(msgspec.Struct, frozen=True):
+    """The values of one robot; those that the logs do not determine are missing, with a note."""
+
+    odometry: dict[str, Estimate]
+    sensor: dict[str, Estimate]
+    notes: tuple[str, ...] = ()
+    range_is_depth: bool = False
+
+
+class Calibration(msgspec.Struct, frozen=True):
+    """What `calibrate --json` writes."""
+
+    logs: tuple[str, ...]
+    robots: dict[str, RobotCalibration]
+
+
+def calibrate_robots(
+    logs: RobotLogs, names: Sequence[str], progress: Callable[[float], None] = lambda done: None
+) -> Calibration:
+    """All robots of the logs with these names, each over all its logs. Raises InputError."""
+    robots = {}
+    for i, (robot, parts) in enumerate(logs.items()):
+        robots[robot] = _calibrate_robot(parts)
+        progress((i + 1) / len(logs))
+    if not any(robot.odometry or robot.sensor for robot in robots.values()):
+        raise InputError(
+            f"{', '.join(names)}: nothing to calibrate: no robot drives, and none sees landmarks or"
+            " robots with known ground truth"
+        )
+    return Calibration(tuple(names), robots)
+
+
+def _calibrate_robot(logs: Sequence[RobotLog]) -> RobotCalibration:
+    """One robot, from all its logs."""
+    odometry_values = odometry.calibrate_odometry(logs)
+    sensor_values, corrections = sensor.calibrate_sensor(logs)
+    notes = []
+    if not odometry_values:
+        notes.append("does not drive: odometry stays as it is")
+    if not sensor_values:
+        notes.append("too few sightings with ground truth: the sensor stays as it is")
+    if corrections.is_depth:
+        notes.append("ranges are depths along the optical axis")
+    axis = () if corrections.is_depth else ("optical_axis_deg",)
+    for part, found, names in (
+        ("odometry", odometry_values, (*odometry.CORRECTIONS, *odometry.NOISE)),
+        ("sensor", sensor_values, (*sensor.CORRECTIONS, *sensor.NOISE, "correlation_s")),
+    ):
+        missing = [name for name in names if name not in found and name not in axis]
+        if found and missing:
+            notes.append(f"not determined by the logs: {part} {', '.join(missing)}")
+    return RobotCalibration(odometry_values, sensor_values, tuple(notes), corrections.is_depth)
 
 
 def base_team(logs: Sequence[Path], team_file: Path | None) -> tuple[str, str]:
@@ -86,25 +146,25 @@ def calibrated_team(
     return text
 
 
-def _add_type(document: TOMLDocument, robot: str, toml_value: RobotCalibration) -> None:
+def _add_type(document: TOMLDocument, robot: str, found: RobotCalibration) -> None:
     own: Any = document["robots"][robot]
     types: Any = document.setdefault("types", tomlkit.table(is_super_table=True))
     former = dict(types.get(own.get("type", ""), {}))
     type_name = _type_name(document, robot)
     table = tomlkit.table()
-    calibrate_robots = {"odometry": toml_value.odometry, "sensor": toml_value.sensor}
-    companions = _companion_settings(toml_value)
+    calibrated = {"odometry": found.odometry, "sensor": found.sensor}
+    companions = _companion_settings(found)
     for part, settings in companions.items():
         former[part] = {**former.get(part, {}), **settings}
     for key, value in former.items():
-        if key not in calibrate_robots:
+        if key not in calibrated:
             table.add(key, value)
-    for part, values in calibrate_robots.items():
+    for part, values in calibrated.items():
         kept = {k: v for k, v in former.get(part, {}).items() if k not in values}
         if kept or values:
             table.add(part, _toml_table(part, kept, values))
     for part in ("odometry", "sensor", "localizer"):
-        for key in (*calibrate_robots.get(part, ()), *companions.get(part, ())):
+        for key in (*calibrated.get(part, ()), *companions.get(part, ())):
             own.get(part, {}).pop(key, None)
     types[type_name] = table
     own["type"] = type_name
@@ -123,14 +183,14 @@ def _type_name(document: TOMLDocument, robot: str) -> str:
     return type_name
 
 
-def _companion_settings(toml_value: RobotCalibration) -> dict[str, dict[str, bool | float]]:
+def _companion_settings(found: RobotCalibration) -> dict[str, dict[str, bool | float]]:
     """Settings that go with calibrated values: the meaning of a range, how often an object is used,
     and no self-calibration."""
     parts: dict[str, dict[str, bool | float]] = {}
-    if toml_value.sensor:
-        parts["sensor"] = {"range_is_depth": toml_value.range_is_depth}
+    if found.sensor:
+        parts["sensor"] = {"range_is_depth": found.range_is_depth}
         parts["localizer"] = {"object_interval_s": INTERVAL_S}
-    if toml_value.odometry:
+    if found.odometry:
         parts.setdefault("localizer", {})["self_calibration"] = False
     return parts
 
@@ -142,24 +202,12 @@ def _with_margin(
     result = dict(values)
     for name in noise:
         if name in result:
-            uncertainty = correction_margin * abs(_correction_size(values, name))
+            correction, neutral, unit = _CORRECTED.get(name, ("", 0.0, 0.0))
+            size = values[correction].value - neutral if correction in values else 0.0
+            uncertainty = correction_margin * abs(size * unit)
             sigma = math.hypot((1.0 + margin) * result[name].value, uncertainty)
             result[name] = Estimate(sigma, result[name].standard_error)
     return result
-
-
-def _correction_size(values: Mapping[str, Estimate], noise: str) -> float:
-    """The size of the correction of a reading, in the unit of this noise."""
-    match noise:
-        case "range_share" if "range_scale" in values:
-            return 1.0 - values["range_scale"].value
-        case "range_floor_m" if "range_bias_m" in values:
-            return values["range_bias_m"].value
-        case "bearing_sigma_deg" if "bearing_bias_deg" in values:
-            return values["bearing_bias_deg"].value
-        case odometry.CRAWL_NOISE if "least_speed_m_s" in values:
-            return values["least_speed_m_s"].value * math.sqrt(WINDOW_S)  # for a window
-    return 0.0
 
 
 def _toml_table(part: str, kept: Mapping[str, Any], values: Mapping[str, Estimate]) -> Table:
@@ -169,8 +217,7 @@ def _toml_table(part: str, kept: Mapping[str, Any], values: Mapping[str, Estimat
     for key, estimate in values.items():
         digits = decimals(estimate.standard_error)
         least = MINIMUM.get(key, MINIMUM.get(f"{part}.{key}", -math.inf))
-        number = round(estimate.value, digits)
-        toml_value = tomlkit.item(max(number, least) + 0.0)
-        toml_value.comment(f"± {estimate.standard_error:.{digits}f}")
-        table.add(key, toml_value)
+        item = tomlkit.item(max(round(estimate.value, digits), least) + 0.0)
+        item.comment(f"± {estimate.standard_error:.{digits}f}")
+        table.add(key, item)
     return table

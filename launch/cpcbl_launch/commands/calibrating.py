@@ -23,7 +23,7 @@ from cpcbl_team.errors import InputError
 
 if TYPE_CHECKING:
     from cpcbl_launch.calibration.board import Board
-    from cpcbl_launch.calibration.camera_observations import CameraDataset
+    from cpcbl_launch.calibration.camera_accuracy import CameraDataset
     from cpcbl_launch.calibration.colour_samples import ColourSample
     from cpcbl_launch.calibration.team_tables import TablePath, TomlValue
 
@@ -245,8 +245,10 @@ def sensor(
     """Range and bearing noise of cameras against known poses, and whether their σ are right."""
     from rich.console import Console
 
-    from cpcbl_launch.calibration.camera_accuracy import measure_camera_accuracy
-    from cpcbl_launch.calibration.camera_observations import dataset_from_recordings
+    from cpcbl_launch.calibration.camera_accuracy import (
+        dataset_from_recordings,
+        measure_camera_accuracy,
+    )
     from cpcbl_launch.calibration.reports import print_camera_accuracy
     from cpcbl_launch.calibration.team_tables import robot_table, sensor_tables
 
@@ -272,7 +274,7 @@ def _dataset_from_pictures(
     pictures: Path, poses: Path | None, team_file: Path | None, robot: str | None, quiet: bool
 ) -> "CameraDataset":
     """Sightings of a robot of the team file in pictures. Raises InputError."""
-    from cpcbl_launch.calibration.camera_observations import dataset_from_pictures, observer_name
+    from cpcbl_launch.calibration.camera_accuracy import dataset_from_pictures, observer_name
     from cpcbl_launch.checks import require_opencv
     from cpcbl_launch.views.run import progress_bar
 

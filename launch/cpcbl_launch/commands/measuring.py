@@ -111,8 +111,7 @@ def calibrate(
     """Estimate odometry and sensor errors from logs with truth, as types of a team file."""
     from cpcbl_launch.calibration.logs import read_logs
     from cpcbl_launch.calibration.reports import print_calibration
-    from cpcbl_launch.calibration.robots import calibrate_robots
-    from cpcbl_launch.calibration.team_types import base_team, calibrated_team
+    from cpcbl_launch.calibration.team_types import base_team, calibrate_robots, calibrated_team
     from cpcbl_launch.views.run import progress_bar
 
     base, base_name = base_team(logs, team_file)

@@ -16,13 +16,11 @@ from cpcbl_agents.vision.camera import Camera
 from cpcbl_launch.calibration.camera_accuracy import (
     AccuracyRow,
     CameraAccuracy,
-    measure_camera_accuracy,
-)
-from cpcbl_launch.calibration.camera_observations import (
     CameraObservations,
     camera_observations,
     dataset_from_pictures,
     dataset_from_recordings,
+    measure_camera_accuracy,
     observer_name,
     read_poses,
 )

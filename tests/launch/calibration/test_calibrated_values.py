@@ -9,8 +9,7 @@ from support.processes import cpcbl_team
 
 from cpcbl_launch.calibration.logs import read_log, read_logs
 from cpcbl_launch.calibration.odometry import calibrate_odometry
-from cpcbl_launch.calibration.robots import Calibration, calibrate_robots
-from cpcbl_launch.calibration.team_types import non_default_settings
+from cpcbl_launch.calibration.team_types import Calibration, calibrate_robots, non_default_settings
 from cpcbl_launch.reporting.recording import read_recording
 from cpcbl_launch.simulation.in_process import simulate
 from cpcbl_launch.team_file import load_team

@@ -11,7 +11,7 @@ from support.logs import write_log
 
 from cpcbl_agents.sources.mrclam import LogError
 from cpcbl_launch.calibration.logs import read_log, read_logs
-from cpcbl_launch.calibration.robots import calibrate_robots
+from cpcbl_launch.calibration.team_types import calibrate_robots
 from cpcbl_launch.simulation.in_process import simulate
 from cpcbl_team.config import (
     Team,

@@ -8,12 +8,16 @@ import pytest
 from support.logs import write_log
 from support.processes import command_line
 
-from cpcbl_launch.calibration.robots import Calibration, RobotCalibration
 from cpcbl_launch.calibration.statistics import (
     Estimate,
     decimals,
 )
-from cpcbl_launch.calibration.team_types import INTERVAL_S, calibrated_team
+from cpcbl_launch.calibration.team_types import (
+    INTERVAL_S,
+    Calibration,
+    RobotCalibration,
+    calibrated_team,
+)
 from cpcbl_launch.team_file import TeamFileError, load_team, parse_team
 from cpcbl_team.config import (
     OdometrySettings,
