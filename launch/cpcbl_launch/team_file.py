@@ -60,7 +60,7 @@ def load_team(path: Path) -> Team:
 
     Raises TeamFileError.
     """
-    text = _read_text(path)
+    text = read_text(path)
     if path.suffix == ".json":
         try:
             return msgspec.json.decode(text, type=Team)
@@ -124,10 +124,11 @@ def parse_team(text: str, name: str = "team file") -> Team:
 
 def read_layer(path: Path) -> Layer:
     """A TOML file with the keys of a robot's type, not yet checked. Raises TeamFileError."""
-    return _parse_toml(_read_text(path), str(path))
+    return _parse_toml(read_text(path), str(path))
 
 
-def _read_text(path: Path) -> str:
+def read_text(path: Path) -> str:
+    """The text of a team file. Raises TeamFileError."""
     try:
         return path.read_text(encoding="utf-8")
     except FileNotFoundError:

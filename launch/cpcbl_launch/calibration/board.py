@@ -6,9 +6,8 @@ A ChArUco board is a chessboard with markers in its white squares; a visible par
 """
 
 import re
-from enum import StrEnum
 from pathlib import Path
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import cv2
 import numpy as np
@@ -25,11 +24,7 @@ WINDOW_PX = (2, 5)  # to each side of a corner: it contains only the corner's ow
 PRINTED_PX_PER_M = 300 / 0.0254  # 300 dots an inch
 
 Points = NDArray[np.float32]
-
-
-class Pattern(StrEnum):
-    charuco = "charuco"
-    chessboard = "chessboard"
+Pattern = Literal["charuco", "chessboard"]
 
 
 class Board(NamedTuple):
@@ -50,7 +45,9 @@ class BoardCorners(NamedTuple):
     pixels: Points
 
 
-def parse_board(pattern: str, squares: str, square_m: float, marker_m: float, family: str) -> Board:
+def parse_board(
+    pattern: Pattern, squares: str, square_m: float, marker_m: float, family: str
+) -> Board:
     """The board that command line options describe. Raises InputError if it cannot be made."""
     if not (match := re.fullmatch(r"(\d{1,3})x(\d{1,3})", squares.strip().lower())):
         raise InputError(f"--squares {squares}: write it as 7x5: squares across and down")
@@ -60,14 +57,14 @@ def parse_board(pattern: str, squares: str, square_m: float, marker_m: float, fa
     markers = {str(name): name for name in MARKERS}
     if family not in markers:
         raise InputError(f"--family {family}: no such family; use one of {', '.join(markers)}")
-    board = Board(Pattern(pattern), (across, down), square_m, marker_m, markers[family])
-    if board.pattern is Pattern.charuco and not 0.0 < marker_m < square_m:
+    board = Board(pattern, (across, down), square_m, marker_m, markers[family])
+    if board.pattern == "charuco" and not 0.0 < marker_m < square_m:
         raise InputError(
             f"--marker-m {marker_m:g}: markers are inside squares; use less than"
             f" --square-m {square_m:g}"
         )
     needed, available = across * down // 2, MARKERS[board.family]
-    if board.pattern is Pattern.charuco and needed > available:
+    if board.pattern == "charuco" and needed > available:
         raise InputError(
             f"--squares {across}x{down}: needs {needed} markers, {family} has {available};"
             " use fewer squares"
@@ -79,7 +76,7 @@ def draw_board(board: Board) -> Pixels:
     """The board as a grey picture (height, width), with a white margin, at 300 dots an inch."""
     side = max(round(board.square_m * PRINTED_PX_PER_M), 8)
     across, down = board.squares
-    if board.pattern is Pattern.charuco:
+    if board.pattern == "charuco":
         size = (side * (across + 1), side * (down + 1))
         return _charuco_board(board).generateImage(size, marginSize=side // 2).astype(np.uint8)
     rows, columns = np.indices((down, across))
@@ -101,7 +98,7 @@ def write_board(board: Board, path: Path) -> None:
 def find_corners(pixels: Pixels, board: Board) -> BoardCorners | str:
     """The board's corners in a picture (height, width, 3), BGR, or why there are none."""
     grey = cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY).astype(np.uint8, copy=False)
-    is_charuco = board.pattern is Pattern.charuco
+    is_charuco = board.pattern == "charuco"
     corners = (_charuco_corners if is_charuco else _chessboard_corners)(grey, board)
     if corners is None:
         return "no board found"

@@ -7,7 +7,7 @@ poses.
 import csv
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
@@ -21,7 +21,7 @@ from cpcbl_launch.calibration.logs import (
     GroundTruth,
     RobotLog,
     ground_truth,
-    nan_if_none,
+    sighting_table,
     wrap_angles,
 )
 from cpcbl_launch.calibration.sensor import SensorCorrections, all_sighting_rows, calibrate_sensor
@@ -33,6 +33,7 @@ from cpcbl_launch.calibration.statistics import (
     Mask,
     RowFilter,
     jackknife,
+    join_rows,
     robust_sigma,
     select_rows,
 )
@@ -46,7 +47,7 @@ BINS_M = (0.0, 2.0, 4.0, math.inf)
 MIN_IN_BIN = 10
 PICTURE_INTERVAL_S = 100.0  # pictures have no time; at this interval nothing is correlated
 STATIONARY_S = 0.1  # before and after a picture nothing moves for this time
-COLUMNS = ("file", "x_m", "y_m", "heading_deg")
+COLUMNS = "file,x_m,y_m,heading_deg,robot"
 
 
 class CameraObservations(NamedTuple):
@@ -153,33 +154,26 @@ def dataset_from_pictures(
     if ambiguities:
         reasons = ", ".join(f"{reason} {n}" for reason, n in ambiguities.most_common())
         notes.append(f"detected, but not reported: {reasons}")
-    camera = team.robots[robot].camera
-    return CameraDataset(
-        (robot,), camera, [camera_observations(robot, frames, truth)], tuple(notes)
-    )
+    observations = [camera_observations(robot, frames, truth)]
+    return CameraDataset((robot,), team.robots[robot].camera, observations, tuple(notes))
 
 
 def camera_observations(
     robot: str, frames: Iterable[Sightings], truth: GroundTruth
 ) -> CameraObservations:
     """A robot's sightings as arrays."""
-    number = {name: i for i, name in enumerate(truth.objects)}
+    table = sighting_table(frames, truth.objects)
+    at_s, true_headings = table[:, 0], np.full(len(table), math.nan)
     headings = {name: (rows[:, 0], np.unwrap(rows[:, 3])) for name, rows in truth.poses.items()}
-    rows = [
-        (
-            *(frame.stamp_ns * 1e-9, number[s.id]),
-            *map(nan_if_none, (s.range_m, s.bearing_rad, s.range_sigma_m, s.bearing_sigma_rad)),
-            *map(nan_if_none, (s.heading_rad, s.heading_sigma_rad)),
-            _true_heading(headings, robot, s.id, frame.stamp_ns * 1e-9),
-        )
-        for frame in frames
-        for s in frame.sightings
-        if s.id in number
-    ]
-    table = np.array(rows, dtype=np.float64).reshape(-1, 9)
+    own = np.interp(at_s, *headings[robot])
+    for i, name in enumerate(truth.objects):
+        if name in headings:
+            mine = table[:, 1] == i
+            true_headings[mine] = np.interp(at_s[mine], *headings[name]) - own[mine]
     objects = tuple(truth.objects.values())
     log = RobotLog(truth.poses[robot], np.empty((0, 4)), table[:, :4], objects, truth.teammates)
-    return CameraObservations(log, table[:, 4:6], table[:, 6:])
+    relative = np.column_stack([table[:, 6:], wrap_angles(true_headings)])
+    return CameraObservations(log, table[:, 4:6], relative)
 
 
 def read_poses(path: Path, team: Team) -> list[_PoseRow]:
@@ -193,10 +187,9 @@ def read_poses(path: Path, team: Team) -> list[_PoseRow]:
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"--poses {path}: cannot be read: {error}") from error
     except (csv.Error, msgspec.ValidationError) as error:
-        columns = ",".join(COLUMNS)
-        raise InputError(f"--poses {path}: {error}; its columns are {columns},robot") from error
+        raise InputError(f"--poses {path}: {error}; its columns are {COLUMNS}") from error
     if not rows:
-        raise InputError(f"--poses {path}: no poses; its columns are {','.join(COLUMNS)},robot")
+        raise InputError(f"--poses {path}: no poses; its columns are {COLUMNS}")
     for row in rows:
         if row.robot and row.robot not in team.robots:
             known = ", ".join(team.robots)
@@ -219,19 +212,6 @@ def _stationary_truth(
         log = truth.setdefault(row.robot or observer_name, [])
         log += [(at - STATIONARY_S, *pose), (at + STATIONARY_S, *pose)]
     return {name: np.array(sorted(log)) for name, log in truth.items()}
-
-
-def _true_heading(
-    headings_of_robots: Mapping[str, tuple[Floats, Floats]],
-    observer_name: str,
-    seen: str,
-    at_s: float,
-) -> float:
-    """The heading of a teammate in the observer's frame (rad); NaN for a landmark."""
-    if seen not in headings_of_robots:
-        return math.nan
-    own, other = (np.interp(at_s, *headings_of_robots[name]) for name in (observer_name, seen))
-    return float(wrap_angles(np.asarray(other - own)))
 
 
 class ErrorStatistics(msgspec.Struct, frozen=True):
@@ -311,7 +291,7 @@ def _error_rows(observations: Sequence[CameraObservations], now: SensorCorrectio
             rows.stretch, rows.teammate, rows.true_range, np.column_stack(errors), sigmas
         )
         parts.append(select_rows(part, rows.true_range > 0.05))
-    return _ErrorRows(*map(np.concatenate, zip(*parts, strict=True)))
+    return join_rows(parts)
 
 
 def _accuracy_rows(rows: _ErrorRows) -> list[AccuracyRow]:

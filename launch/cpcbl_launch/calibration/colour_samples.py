@@ -24,11 +24,11 @@ from cpcbl_team.errors import InputError
 from cpcbl_team.inputs import Name
 
 SAMPLE_FORMAT = "write it as PICTURE:COLOUR=X,Y,WIDTH,HEIGHT or PICTURE:COLOUR=X,Y,RADIUS"
+WIDEST_PX = 640  # a picture in the preview
+AMBIGUOUS_BGR = (255, 255, 255)  # pixels that two colours take
+DARKER = 4
 
-
-At = Annotated[
-    tuple[Annotated[int, msgspec.Meta(ge=0)], ...], msgspec.Meta(min_length=3, max_length=4)
-]
+Pixel = Annotated[int, msgspec.Meta(ge=0)]
 
 
 class ColourSample(NamedTuple):
@@ -44,7 +44,7 @@ class _SampleRow(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     picture: str
     colour: Name
-    at: At
+    at: Annotated[tuple[Pixel, ...], msgspec.Meta(min_length=3, max_length=4)]
 
 
 class _SampleRows(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -62,8 +62,7 @@ def parse_sample(text: str) -> ColourSample:
 def read_samples(path: Path) -> list[ColourSample]:
     """The samples of a TOML, JSON or CSV file. Raises InputError."""
     try:
-        text = path.read_text(encoding="utf-8")
-        rows = _rows(path.suffix.lower(), text)
+        rows = _rows(path.suffix.lower(), path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise InputError(f"--samples {path}: no such file") from None
     except (OSError, UnicodeDecodeError) as error:
@@ -91,18 +90,11 @@ def resolve_pictures(
     samples: Iterable[ColourSample], pictures: Sequence[Path]
 ) -> list[ColourSample]:
     """The samples, with pictures that are given by their name alone looked up in `pictures`."""
-    known: Mapping[str, Path] = {path.name: path for path in pictures}
+    known = {path.name: path for path in pictures}
     return [
-        sample
-        if sample.picture.exists()
-        else sample._replace(picture=known.get(str(sample.picture), sample.picture))
-        for sample in samples
+        s if s.picture.exists() else s._replace(picture=known.get(str(s.picture), s.picture))
+        for s in samples
     ]
-
-
-WIDEST_PX = 640  # a picture in the preview
-AMBIGUOUS_BGR = (255, 255, 255)  # pixels that two colours take
-DARKER = 4
 
 
 class LabelledPicture(NamedTuple):
@@ -116,8 +108,15 @@ class LabelledPicture(NamedTuple):
 
 def label_pictures(samples: Sequence[ColourSample], more: Iterable[Path]) -> list[LabelledPicture]:
     """The pictures of the samples, then those without samples. Raises InputError."""
-    files = dict.fromkeys([*(sample.picture for sample in samples), *more])
-    return [_label_picture(file, [s for s in samples if s.picture == file]) for file in files]
+    labelled = []
+    for file in dict.fromkeys([*(sample.picture for sample in samples), *more]):
+        pixels = read_picture(file).pixels
+        if isinstance(pixels, str):
+            raise InputError(f"{file}: {pixels}; name a picture")
+        hsv = cv2.cvtColor(pixels, cv2.COLOR_BGR2HSV).astype(np.uint8, copy=False)
+        masks = tuple((s, _sample_mask(s, hsv)) for s in samples if s.picture == file)
+        labelled.append(LabelledPicture(file.name, pixels, hsv, masks))
+    return labelled
 
 
 def colour_patches(pictures: Iterable[LabelledPicture]) -> list[ColourPatch]:
@@ -128,10 +127,10 @@ def unlabelled_pixels(pictures: Iterable[LabelledPicture]) -> Hsv:
     """All pixels that are not labelled, (n, 3), HSV."""
     parts = [np.empty((0, 3), np.uint8)]
     for picture in pictures:
-        free = np.ones(picture.hsv.shape[:2], bool)
+        labelled = np.zeros(picture.hsv.shape[:2], bool)
         for _, mask in picture.samples:
-            free &= ~mask
-        parts.append(picture.hsv[free])
+            labelled |= mask
+        parts.append(picture.hsv[~labelled])
     return np.concatenate(parts)
 
 
@@ -153,16 +152,6 @@ def require_picture_name(path: Path) -> None:
 def write_preview(path: Path, picture: Pixels) -> None:
     """Raises OSError."""
     path.write_bytes(cv2.imencode(path.suffix, picture)[1].tobytes())
-
-
-def _label_picture(file: Path, samples: Sequence[ColourSample]) -> LabelledPicture:
-    pixels = read_picture(file).pixels
-    if isinstance(pixels, str):
-        raise InputError(f"{file}: {pixels}; name a picture")
-    hsv = cv2.cvtColor(pixels, cv2.COLOR_BGR2HSV).astype(np.uint8, copy=False)
-    return LabelledPicture(
-        file.name, pixels, hsv, tuple((s, _sample_mask(s, pixels)) for s in samples)
-    )
 
 
 def _sample_mask(sample: ColourSample, pixels: Pixels) -> Mask:

@@ -19,9 +19,7 @@ from cpcbl_team.config import Colour
 from cpcbl_team.errors import InputError
 
 HUES = 180
-IGNORED_SHARE = (
-    0.02  # share of the pixels at each end of a range that is ignored: edges, reflections
-)
+IGNORED_SHARE = 0.02  # of the pixels, at each end of a range: edges, reflections
 MIN_PX = 20
 GREY_HUE_SPREAD = 0.5 * HUES  # a colour whose hues spread over more than this is a grey
 MIN_HUE_MARGIN = 4.0  # a range of hues is widened by at least this
@@ -94,12 +92,11 @@ def calibrate_colours(
     `elsewhere` (n, 3), HSV: the pixels that are not labelled. `kept`: the colours that are not
     calibrated.
     """
-    kept = dict(kept or {})
-    for name in {patch.colour for patch in patches}:
-        if sum(len(p.hsv) for p in patches if p.colour == name) < MIN_PX:
+    kept, pooled = dict(kept or {}), _pixels_by_colour(patches)
+    for name, hsv in pooled.items():
+        if len(hsv) < MIN_PX:
             raise InputError(f"{name}: fewer than {MIN_PX} pixels; take larger samples")
     found = thresholds(patches, margin)
-    pooled = _pixels_by_colour(patches)
     fits = {
         name: ColourFit(
             colour,
@@ -111,7 +108,7 @@ def calibrate_colours(
         )
         for name, colour in found.items()
     }
-    overlaps = tuple(_overlaps(found | kept, found))
+    overlaps = tuple(_overlaps(found, kept))
     return ColourCalibration(fits, kept, overlaps, tuple(_notes(fits, overlaps)))
 
 
@@ -119,19 +116,18 @@ def thresholds(patches: Sequence[ColourPatch], margin: float = MARGIN) -> dict[s
     """The thresholds of each colour, from its samples and those of its neighbours in hue."""
     ranges = {name: _colour_range(hsv) for name, hsv in _pixels_by_colour(patches).items()}
     return {
-        name: _widen(colour_range, [other for n, other in ranges.items() if n != name], margin)
-        for name, colour_range in ranges.items()
+        name: _widen(mine, [other for n, other in ranges.items() if n != name], margin)
+        for name, mine in ranges.items()
     }
 
 
 def colour_mask(hsv: Hsv, colour: Colour) -> Mask:
     """Which of the pixels (..., 3), HSV, a colour's thresholds accept: (...)."""
-    hue, saturation, value = hsv[..., 0], hsv[..., 1], hsv[..., 2]
-    first, last = colour.hue
+    (first, last), hue = colour.hue, hsv[..., 0]
     after, before = hue >= first, hue <= last
     mask = after & before if first <= last else after | before
-    for channel, (low, high) in ((saturation, colour.saturation), (value, colour.value)):
-        mask &= (channel >= low) & (channel <= high)
+    for i, (low, high) in ((1, colour.saturation), (2, colour.value)):
+        mask &= (hsv[..., i] >= low) & (hsv[..., i] <= high)
     return np.asarray(mask)
 
 
@@ -156,29 +152,23 @@ def _central_range(values: Floats) -> tuple[float, float]:
     return float(low), float(high)
 
 
-def _widen(colour_range: _ColourRange, others: Sequence[_ColourRange], margin: float) -> Colour:
-    dull, dark = (int((1.0 - margin) * c[0]) for c in (colour_range.saturation, colour_range.value))
-    if colour_range.grey:
-        bright, light = (
-            min(math.ceil((1.0 + margin) * c[1]), 255)
-            for c in (colour_range.saturation, colour_range.value)
-        )
+def _widen(mine: _ColourRange, others: Sequence[_ColourRange], margin: float) -> Colour:
+    dull, dark = (int((1.0 - margin) * low) for low, _ in (mine.saturation, mine.value))
+    if mine.grey:
+        ends = (math.ceil((1.0 + margin) * high) for _, high in (mine.saturation, mine.value))
+        bright, light = (min(end, 255) for end in ends)
         return Colour(hue=(0, HUES - 1), saturation=(0, bright), value=(dark, light))
-    first, last = colour_range.hue
+    first, last = mine.hue
     more = max(margin * (last - first), MIN_HUE_MARGIN)
     before, after = more, more
     for other in others:
         gap_after, gap_before = (other.hue[0] - last) % HUES, (first - other.hue[1]) % HUES
         widths = (last - first) + (other.hue[1] - other.hue[0])
         if abs(gap_after + gap_before + widths - HUES) < 1e-6:  # they do not overlap
-            after, before = min(after, _half_gap(gap_after)), min(before, _half_gap(gap_before))
+            after = min(after, max(gap_after - 1.0, 0.0) / 2.0)  # both may grow into the gap
+            before = min(before, max(gap_before - 1.0, 0.0) / 2.0)
     hue = math.ceil(first - before) % HUES, math.floor(last + after) % HUES
     return Colour(hue=hue, saturation=(dull, 255), value=(dark, 255))
-
-
-def _half_gap(gap: float) -> float:
-    """How far two ranges may both grow into the gap between them without touching."""
-    return max(gap - 1.0, 0.0) / 2.0
 
 
 def _accepted_share(hsv: Hsv, colour: Colour) -> float:
@@ -195,9 +185,9 @@ def _leave_one_out_share(name: str, patches: Sequence[ColourPatch], margin: floa
     return min(shares, default=None)
 
 
-def _overlaps(colours: Mapping[str, Colour], sampled: Mapping[str, Colour]) -> list[Overlap]:
+def _overlaps(sampled: dict[str, Colour], kept: dict[str, Colour]) -> list[Overlap]:
     found = []
-    for (one, a), (other, b) in combinations(colours.items(), 2):
+    for (one, a), (other, b) in combinations((sampled | kept).items(), 2):
         both = np.flatnonzero(_accepted_hues(a) & _accepted_hues(b))
         apart = any(
             max(x[0], y[0]) > min(x[1], y[1])
@@ -209,7 +199,7 @@ def _overlaps(colours: Mapping[str, Colour], sampled: Mapping[str, Colour]) -> l
 
 
 def _accepted_hues(colour: Colour) -> Mask:
-    every = np.full((HUES, 3), 0, np.uint8)
+    every = np.zeros((HUES, 3), np.uint8)
     every[:, 0] = np.arange(HUES)
     return colour_mask(every, Colour(hue=colour.hue, saturation=(0, 255), value=(0, 255)))
 

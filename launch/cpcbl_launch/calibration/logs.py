@@ -1,9 +1,9 @@
 """Logs with ground truth as arrays: MRCLAM folders and recordings of `up --record`."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -28,6 +28,9 @@ class RobotLog(NamedTuple):
     teammates: frozenset[int] = frozenset()  # those of `objects` that are robots
 
 
+RobotLogs = dict[str, list[RobotLog]]
+
+
 def has_truth_at(stamps: Floats, times_s: Floats) -> Mask:
     """Whether times lie between rows of truth that are at most LONGEST_GAP_S apart."""
     after = np.searchsorted(stamps, times_s)
@@ -36,16 +39,9 @@ def has_truth_at(stamps: Floats, times_s: Floats) -> Mask:
     return inside & (stamps[after] - stamps[after - 1] <= LONGEST_GAP_S)
 
 
-def nan_if_none(value: float | None) -> float:
-    return math.nan if value is None else value
-
-
 def wrap_angles(angles: Floats) -> Floats:
     """Angles (n,) in [-pi, pi), rad."""
     return np.asarray((angles + math.pi) % math.tau - math.pi)
-
-
-RobotLogs = dict[str, list[RobotLog]]
 
 
 def read_logs(paths: Sequence[Path]) -> RobotLogs:
@@ -69,12 +65,8 @@ def _read_mrclam(folder: Path) -> dict[str, RobotLog]:
         raise LogError(f"{folder}: no robot has all files; robot 1 lacks {missing}")
     subjects = {int(b): str(int(s)) for s, b in mrclam.read_table(folder / "Barcodes.dat", 2)}
     truth = {name: mrclam.read_truth(folder, name) for name in names}
-    frames = {
-        name: mrclam.frames(
-            mrclam.read_table(folder / f"Robot{name}_Measurement.dat", 4), subjects, name
-        )
-        for name in names
-    }
+    measured = {n: mrclam.read_table(folder / f"Robot{n}_Measurement.dat", 4) for n in names}
+    frames = {name: mrclam.frames(rows, subjects, name) for name, rows in measured.items()}
     odometry = {name: mrclam.read_odometry(folder, name) for name in names}
     return _robot_logs(mrclam.read_landmarks(folder), truth, odometry, frames)
 
@@ -94,23 +86,18 @@ def _read_recording(path: Path) -> dict[str, RobotLog]:
 def _robot_logs(
     landmarks: Mapping[str, Landmark],
     truth: Mapping[str, Floats],
-    odometry: Mapping[str, Any],
-    frames: Mapping[str, Any],
+    odometry: Mapping[str, Iterable[Odometry]],
+    frames: Mapping[str, Iterable[Sightings]],
 ) -> dict[str, RobotLog]:
     """The arrays of every robot with ground truth."""
     truth, objects, teammates = ground_truth(landmarks, truth)
-    number = {name: i for i, name in enumerate(objects)}
-    return {
-        name: RobotLog(
-            rows,
-            _odometry_rows(odometry.get(name, ())),
-            _sighting_rows(frames.get(name, ()), number),
-            tuple(objects.values()),
-            teammates,
-        )
-        for name, rows in truth.items()
-        if len(rows) > 1
-    }
+    logs = {}
+    for name, rows in truth.items():
+        if len(rows) > 1:
+            motion = _odometry_rows(odometry.get(name, ()))
+            seen = sighting_table(frames.get(name, ()), objects)
+            logs[name] = RobotLog(rows, motion, seen[:, :4], tuple(objects.values()), teammates)
+    return logs
 
 
 class GroundTruth(NamedTuple):
@@ -123,28 +110,30 @@ class GroundTruth(NamedTuple):
 
 def ground_truth(landmarks: Mapping[str, Landmark], truth: Mapping[str, Floats]) -> GroundTruth:
     """The landmarks and robots as `objects` and `teammates` of a `RobotLog`."""
-    truth = {
-        name: rows[np.unique(rows[:, 0], return_index=True)[1]] for name, rows in truth.items()
-    }
+    poses = {n: rows[np.unique(rows[:, 0], return_index=True)[1]] for n, rows in truth.items()}
     objects = {name: np.array([[0.0, mark.x_m, mark.y_m]]) for name, mark in landmarks.items()}
-    objects |= {name: rows[:, :3] for name, rows in truth.items()}
-    number = {name: i for i, name in enumerate(objects)}
-    return GroundTruth(truth, objects, frozenset(number[name] for name in truth))
+    objects |= {name: rows[:, :3] for name, rows in poses.items()}
+    return GroundTruth(poses, objects, frozenset(i for i, n in enumerate(objects) if n in poses))
 
 
-def _odometry_rows(odometry: Any) -> Floats:
+def _odometry_rows(odometry: Iterable[Odometry]) -> Floats:
     rows = [(o.from_ns * 1e-9, o.stamp_ns * 1e-9, o.distance_m, o.turn_rad) for o in odometry]
     table = np.array(sorted(rows)).reshape(-1, 4)
     ends = np.maximum.accumulate(table[:, 1]) if len(table) else table[:, 1]
     return table[np.concatenate(([True], table[1:, 0] > ends[:-1] - 1e-6))[: len(table)]]
 
 
-def _sighting_rows(frames: Any, number: Mapping[str, int]) -> Floats:
-
+def sighting_table(frames: Iterable[Sightings], objects: Iterable[str]) -> Floats:
+    """The sightings of these objects (n, 8): stamp s, index of the object, range, bearing, sigmas
+    of both, heading of the object, its sigma; NaN: none."""
+    number = {name: i for i, name in enumerate(objects)}
     rows = [
-        (frame.stamp_ns * 1e-9, number[s.id], nan_if_none(s.range_m), nan_if_none(s.bearing_rad))
+        (
+            *(frame.stamp_ns * 1e-9, number[s.id], s.range_m, s.bearing_rad),
+            *(s.range_sigma_m, s.bearing_sigma_rad, s.heading_rad, s.heading_sigma_rad),
+        )
         for frame in frames
         for s in frame.sightings
         if s.id in number
     ]
-    return np.array(rows, dtype=float).reshape(-1, 4)
+    return np.array(rows, dtype=np.float64).reshape(-1, 8)

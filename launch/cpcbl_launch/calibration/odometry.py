@@ -27,6 +27,7 @@ from cpcbl_launch.calibration.statistics import (
     RowFilter,
     determined_coefficients,
     jackknife,
+    join_rows,
     robust_fit,
     select_rows,
     sigma_estimates,
@@ -83,13 +84,14 @@ def odometry_fit(rows: OdometryWindows, now: OdometryCorrections, noise: Floats)
     of_ways[:, 3] = -rows.loss[ways]
     of_turns[:, 1], of_turns[:, 2] = rows.turn[turns], now.turn_scale * rows.turn_rate[turns]
     of_turns[:, 4] = now.distance(rows)[turns]
-    sigma = np.concatenate([way_sigma[ways], turn_sigma[turns]])
-    way_errors, turn_errors = rows.true_displacement - rows.displacement, rows.true_turn - rows.turn
-    return LinearFit(
-        np.concatenate([rows.stretch[ways], rows.stretch[turns]]),
-        np.concatenate([of_ways, of_turns]) / sigma[:, None],
-        np.concatenate([way_errors[ways], turn_errors[turns]]) / sigma,
-    )
+    parts = []
+    for moving, sigma, columns, errors in (
+        (ways, way_sigma, of_ways, rows.true_displacement - rows.displacement),
+        (turns, turn_sigma, of_turns, rows.true_turn - rows.turn),
+    ):
+        unitless = columns / sigma[moving, None], (errors / sigma)[moving]
+        parts.append(LinearFit(rows.stretch[moving], *unitless))
+    return join_rows(parts)
 
 
 def odometry_sigmas(
@@ -110,7 +112,7 @@ def odometry_noise(windows: Sequence[OdometryWindows], now: OdometryCorrections)
     windows are few and get a larger weight, because they show errors that are correlated for
     seconds.
     """
-    rows = OdometryWindows(*map(np.concatenate, zip(*windows, strict=True)))
+    rows = join_rows(windows)
     along, path = now.distance_scale * rows.distance_along, now.distance_scale * rows.path_length
     turned_along, turned = now.turn_scale * rows.turn_along, now.turn_scale * rows.turn_total
     ways, turns = rows.true_displacement - now.displacement(rows), rows.true_turn - now.turn(rows)

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from cpcbl_launch.calibration.logs import LONGEST_GAP_S, RobotLog
-from cpcbl_launch.calibration.statistics import Integers, stretch_numbers
+from cpcbl_launch.calibration.statistics import Integers, join_rows, stretch_numbers
 from cpcbl_launch.reporting.metrics import Floats
 
 WINDOW_S = 2.0
@@ -57,8 +57,7 @@ class OdometryCorrections(NamedTuple):
 
 def odometry_windows(logs: Sequence[RobotLog], delay_s: float, length_s: float) -> OdometryWindows:
     """Windows of about `length_s` that lie between rows of truth without long gaps."""
-    parts = [_windows_of_log(log, i, delay_s, length_s) for i, log in enumerate(logs)]
-    return OdometryWindows(*map(np.concatenate, zip(*parts, strict=True)))
+    return join_rows([_windows_of_log(log, i, delay_s, length_s) for i, log in enumerate(logs)])
 
 
 def _windows_of_log(log: RobotLog, number: int, delay_s: float, length_s: float) -> OdometryWindows:

@@ -22,6 +22,7 @@ from cpcbl_launch.calibration.statistics import (
     determined_coefficients,
     error_pairs,
     jackknife,
+    join_rows,
     robust_sigma,
     select_rows,
     sigma_estimates,
@@ -98,8 +99,7 @@ class SensorCorrections(NamedTuple):
 
 def sighting_rows(logs: Sequence[RobotLog], delay_s: float) -> SightingRows:
     """The plausible sightings for which observer and object have ground truth at the exposure."""
-    parts = [all_sighting_rows(log, i, delay_s) for i, log in enumerate(logs)]
-    rows = SightingRows(*map(np.concatenate, zip(*parts, strict=True)))
+    rows = join_rows([all_sighting_rows(log, i, delay_s) for i, log in enumerate(logs)])
     plausible = np.isnan(rows.range_m) | (rows.range_m > 0.0)
     plausible &= np.isnan(rows.bearing) | (np.abs(rows.bearing) <= math.pi)
     return select_rows(rows, plausible & (rows.true_range > 0.05) & np.isfinite(rows.range_rate))
@@ -157,14 +157,13 @@ def sensor_fit(
     of_ranges[:, 3] = (now.line_of_sight_range(rows) * np.tan(now.angle_from_axis(rows)))[r]
     of_bearings[:, 4], of_bearings[:, 5] = rows.true_bearing[b], 1.0
     of_ranges[:, 6], of_bearings[:, 6] = -rows.range_rate[r], -rows.bearing_rate[b]
-    values = [
-        (now.line_of_sight_range(rows) - rows.true_range)[r] / range_sigma[r],
-        wrap_angles(rows.bearing - rows.true_bearing)[b] / bearing_sigma,
-    ]
-    return LinearFit(
-        np.concatenate([rows.stretch[r], rows.stretch[b]]),
-        np.concatenate([of_ranges / range_sigma[r, None], of_bearings / bearing_sigma]),
-        np.concatenate(values),
+    sigma, ranges = range_sigma[r], now.line_of_sight_range(rows) - rows.true_range
+    bearings = wrap_angles(rows.bearing - rows.true_bearing)[b] / bearing_sigma
+    return join_rows(
+        [
+            LinearFit(rows.stretch[r], of_ranges / sigma[:, None], ranges[r] / sigma),
+            LinearFit(rows.stretch[b], of_bearings / bearing_sigma, bearings),
+        ]
     )
 
 

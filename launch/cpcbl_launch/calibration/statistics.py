@@ -162,6 +162,11 @@ def select_rows(rows: Rows, keep: Mask) -> Rows:
     return type(rows)(*(column[keep] for column in rows))
 
 
+def join_rows(parts: Sequence[Rows]) -> Rows:
+    """One record of columns with the rows of all parts."""
+    return type(parts[0])(*map(np.concatenate, zip(*parts, strict=True)))
+
+
 def decimals(standard_error: float) -> int:
     """The decimals to print of a value: rounding adds at most a sixth of the standard error."""
     if not 0.0 < standard_error < math.inf:
@@ -189,7 +194,7 @@ def error_pairs(
             mine = np.flatnonzero((name == one) & np.isfinite(error))
             mine = mine[np.argsort(stamp_s[mine], kind="stable")]
             parts += _pairs_of_object(stretch[mine], stamp_s[mine], error[mine])
-    return ErrorPairs(*map(np.concatenate, zip(*parts, strict=True)))
+    return join_rows(parts)
 
 
 def _pairs_of_object(stretch: Integers, stamp_s: Floats, error: Floats) -> list[ErrorPairs]:

@@ -15,7 +15,7 @@ from cpcbl_launch.calibration.camera_accuracy import CameraAccuracy
 from cpcbl_launch.calibration.colours import ColourCalibration
 from cpcbl_launch.calibration.lens import DISTORTION, LensCalibration
 from cpcbl_launch.calibration.statistics import Estimate, decimals
-from cpcbl_launch.team_file import TeamFileError, builtin_path, parse_team
+from cpcbl_launch.team_file import TeamFileError, builtin_path, parse_team, read_text
 from cpcbl_team.config import COLOURS, CameraSettings, Colour
 from cpcbl_team.errors import InputError
 
@@ -68,9 +68,8 @@ def robot_table(
         return TablePath(("types", "eye", part))
     if (robot is None) == (type_name is None):
         raise InputError("--team: name one table to write: --robot NAME or --type NAME")
-    return TablePath(
-        ("robots", robot, part) if robot is not None else ("types", str(type_name), part)
-    )
+    owner = ("robots", robot) if robot is not None else ("types", str(type_name))
+    return TablePath((*owner, part))
 
 
 def team_source(path: Path, output: Path | None) -> tuple[str, Path]:
@@ -82,12 +81,7 @@ def team_source(path: Path, output: Path | None) -> tuple[str, Path]:
         if output is None:
             raise TeamFileError(f"{path}: a built-in team cannot be changed; name --output FILE")
         path = builtin_path(path.name)
-    try:
-        return path.read_text(encoding="utf-8"), output or path
-    except FileNotFoundError:
-        raise TeamFileError(f"{path}: no such file") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise TeamFileError(f"{path}: cannot be read: {error}") from error
+    return read_text(path), output or path
 
 
 def edit_team(text: str, name: str, tables: Mapping[TablePath, Mapping[str, TomlValue]]) -> str:
@@ -149,23 +143,17 @@ def overridden_keys(text: str, table_path: TablePath, keys: Sequence[str]) -> li
     if table_path.names[0] != "types":
         return []
     _, type_name, part = table_path.names
-    keys_of_robots = []
-    for robot, own in tomlkit.parse(text).get("robots", {}).items():
-        if own.get("type") == type_name:
-            keys_of_robots += [
-                f"robots.{robot}.{part}.{key}" for key in keys if key in own.get(part, {})
-            ]
-    return keys_of_robots
+    robots = tomlkit.parse(text).get("robots", {})
+    own = {robot: t.get(part, {}) for robot, t in robots.items() if t.get("type") == type_name}
+    return [f"robots.{robot}.{part}.{key}" for robot in own for key in keys if key in own[robot]]
 
 
 def _require_table(document: Mapping[str, Any], table_path: TablePath, name: str) -> None:
-    layer, *rest = table_path.names
-    if layer not in ("robots", "types"):
-        return
+    layer, owner, *_ = table_path.names
     known = document.get(layer, {})
-    if rest[0] not in known:
+    if layer in ("robots", "types") and owner not in known:
         available = ", ".join(known) or "none"
-        raise TeamFileError(f"{name}: {layer}.{rest[0]}: not in the file; name one of: {available}")
+        raise TeamFileError(f"{name}: {layer}.{owner}: not in the file; name one of: {available}")
 
 
 def _subtable(table: Any, part: str, bare: bool) -> Any:
@@ -225,8 +213,7 @@ def unsampled_colours(team_file: Path | None, sampled: Set[str]) -> tuple[dict[s
 def _used_colours(raw: dict[str, Any]) -> list[str]:
     """The colours that landmarks and robots of a team file have."""
     tables = [raw.get("defaults", {}), *raw.get("map", {}).get("landmarks", {}).values()]
-    for layer in ("types", "robots"):
-        tables += raw.get(layer, {}).values()
+    tables += [*raw.get("types", {}).values(), *raw.get("robots", {}).values()]
     return sorted({name for table in tables for name in table.get("colours", ())})
 
 
@@ -254,20 +241,17 @@ def sensor_tables(
     The sigmas are never reduced: an error that is the same in all of these pictures, such as that
     of the camera's mounting, may be different on another day.
     """
-    corrections = {
-        name: value._replace(value=max(value.value, MINIMUM.get(name, value.value)))
-        for name, value in ((n, toml_value(estimate)) for n, estimate in accuracy.sensor.items())
-    }
+    corrections = {name: toml_value(estimate) for name, estimate in accuracy.sensor.items()}
+    for name in corrections.keys() & MINIMUM.keys():
+        value, remark = corrections[name]
+        corrections[name] = TomlValue(max(value, MINIMUM[name]), remark)
     corrections["range_is_depth"] = TomlValue(accuracy.range_is_depth)
     tables: dict[TablePath, Mapping[str, TomlValue]] = {sensor_path: corrections}
     times = accuracy.times
     if times is not None and times.value > 1.0 and differ_from_stated_sigmas(times):
-        tables[camera_path] = {
-            key: TomlValue(
-                float(f"{times.value * getattr(camera, key):.3g}"), f"x {times.value:.2f}"
-            )
-            for key in CAMERA_SIGMAS
-        }
+        larger = {key: f"{times.value * getattr(camera, key):.3g}" for key in CAMERA_SIGMAS}
+        remark = f"x {times.value:.2f}"
+        tables[camera_path] = {key: TomlValue(float(v), remark) for key, v in larger.items()}
     return tables
 
 

@@ -46,7 +46,9 @@ class Calibration(msgspec.Struct, frozen=True):
 
 
 def calibrate_robots(
-    logs: RobotLogs, names: Sequence[str], progress: Callable[[float], None] = lambda done: None
+    logs: RobotLogs,
+    names: Sequence[str],
+    progress: Callable[[float], None] = lambda done: None,
 ) -> Calibration:
     """All robots of the logs with these names, each over all its logs. Raises InputError."""
     robots = {}

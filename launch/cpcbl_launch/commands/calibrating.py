@@ -1,14 +1,15 @@
 """`cpcbl-team calibrate ...`: errors of robots' odometry, sensors and cameras."""
 
 from collections.abc import Mapping
-from enum import StrEnum
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Optional
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-import typer
+from rich.console import Console
+from typer import Argument, Option, Typer, echo
 from typer.core import TyperGroup
 
+from cpcbl_launch.checks import require_opencv
 from cpcbl_launch.commands.measuring import calibrate
 from cpcbl_launch.commands.options import (
     AsJson,
@@ -18,21 +19,15 @@ from cpcbl_launch.commands.options import (
     writable_file,
     writable_picture,
 )
+from cpcbl_launch.reporting.files import write_or_reason
 from cpcbl_launch.team_file import find_team
 from cpcbl_team.errors import InputError
 
 if TYPE_CHECKING:
-    from cpcbl_launch.calibration.board import Board
     from cpcbl_launch.calibration.camera_accuracy import CameraDataset
-    from cpcbl_launch.calibration.colour_samples import ColourSample
     from cpcbl_launch.calibration.team_tables import TablePath, TomlValue
 
 LOG = "log"
-
-
-class BoardName(StrEnum):
-    charuco = "charuco"
-    chessboard = "chessboard"
 
 
 class LogByDefault(TyperGroup):
@@ -44,7 +39,7 @@ class LogByDefault(TyperGroup):
         return super().parse_args(ctx, args)
 
 
-calibrate_app = typer.Typer(
+calibrate_app = Typer(
     cls=LogByDefault,
     no_args_is_help=True,
     help="Errors of odometry, sensors and cameras, as tables of a team file. `calibrate LOG` is"
@@ -52,74 +47,64 @@ calibrate_app = typer.Typer(
 )
 calibrate_app.command(LOG)(calibrate)
 
-ToTeam = Annotated[
-    Optional[Path], typer.Option("--team", help="Team file to write into; default: print.")
-]
-OfRobot = Annotated[Optional[str], typer.Option(help="Into this robot's table, or")]
-OfType = Annotated[Optional[str], typer.Option("--type", help="into this robot type's.")]
-ToFile = Annotated[
-    Optional[Path], typer.Option(help="Write the team here; default: into the --team file.")
-]
+ToTeam = Annotated[Path | None, Option("--team", help="Team file to write into; default: print.")]
+OfRobot = Annotated[str | None, Option(help="Into this robot's table, or")]
+OfType = Annotated[str | None, Option("--type", help="into this robot type's.")]
+ToFile = Annotated[Path | None, Option(help="Write the team here; default: into the --team file.")]
 Residuals = Annotated[
-    Optional[Path],
-    typer.Option(
+    Path | None,
+    Option(
         help="Draw residuals into this file (PNG or SVG; extra `plot`).", callback=writable_picture
     ),
 ]
 BoardPictures = Annotated[
-    Optional[list[Path]], typer.Argument(help="Pictures of the board, folders of them, or videos.")
+    list[Path] | None, Argument(help="Pictures of the board, folders of them, or videos.")
 ]
-BoardOption = Annotated[BoardName, typer.Option(help="Kind of the printed board.")]
-Squares = Annotated[str, typer.Option(help="Across and down, black and white.")]
-SquareSide = Annotated[float, typer.Option(min=0.001, help="Side of a square.")]
-MarkerSide = Annotated[float, typer.Option(help="Side of a marker (charuco).")]
-Family = Annotated[str, typer.Option(help="Of the markers (charuco).")]
-Every = Annotated[float, typer.Option(min=0.0, help="Seconds between two frames of a video.")]
+BoardOption = Annotated[Literal["charuco", "chessboard"], Option(help="Kind of the printed board.")]
+Squares = Annotated[str, Option(help="Across and down, black and white.")]
+SquareSide = Annotated[float, Option(min=0.001, help="Side of a square.")]
+MarkerSide = Annotated[float, Option(help="Side of a marker (charuco).")]
+Family = Annotated[str, Option(help="Of the markers (charuco).")]
+Every = Annotated[float, Option(min=0.0, help="Seconds between two frames of a video.")]
 PrintBoard = Annotated[
-    Optional[Path],
-    typer.Option(help="Write the board into this file (PNG), to be printed at 300 dpi."),
+    Path | None, Option(help="Write the board into this file (PNG), to be printed at 300 dpi.")
 ]
 ColourPictures = Annotated[
-    Optional[list[Path]],
-    typer.Argument(help="Pictures, or folders of them, with samples or without any colour."),
+    list[Path] | None,
+    Argument(help="Pictures, or folders of them, with samples or without any colour."),
 ]
 Samples = Annotated[
-    Optional[list[str]],
-    typer.Option(help="PICTURE:COLOUR=X,Y,WIDTH,HEIGHT, or X,Y,RADIUS; any number of them."),
+    list[str] | None,
+    Option(help="PICTURE:COLOUR=X,Y,WIDTH,HEIGHT, or X,Y,RADIUS; any number of them."),
 ]
 SampleFile = Annotated[
-    Optional[Path], typer.Option(help="File of samples (TOML, JSON, CSV): picture, colour, at.")
+    Path | None, Option(help="File of samples (TOML, JSON, CSV): picture, colour, at.")
 ]
-Margin = Annotated[float, typer.Option(min=0.0, max=0.9, help="Share by which ranges are widened.")]
+Margin = Annotated[float, Option(min=0.0, max=0.9, help="Share by which ranges are widened.")]
 Preview = Annotated[
-    Optional[Path],
-    typer.Option(
+    Path | None,
+    Option(
         help="Draw samples, and accepted pixels, into this file (PNG, JPG).", callback=writable_file
     ),
 ]
 Recordings = Annotated[
-    Optional[list[Path]],
-    typer.Argument(help="Recordings with truth (`up --record`, .mcap) of robots with cameras."),
+    list[Path] | None,
+    Argument(help="Recordings with truth (`up --record`, .mcap) of robots with cameras."),
 ]
-PoseFolder = Annotated[
-    Optional[Path], typer.Option(help="Or a folder of pictures that a robot took.")
-]
+PoseFolder = Annotated[Path | None, Option(help="Or a folder of pictures that a robot took.")]
 Poses = Annotated[
-    Optional[Path],
-    typer.Option(help="Where (CSV): file, x_m, y_m, heading_deg, and robot for teammates."),
+    Path | None, Option(help="Where (CSV): file, x_m, y_m, heading_deg, and robot for teammates.")
 ]
 Observer = Annotated[
-    Optional[str], typer.Option(help="Robot whose camera it is; default: all with a camera.")
+    str | None, Option(help="Robot whose camera it is; default: all with a camera.")
 ]
-IntoType = Annotated[
-    Optional[str], typer.Option("--type", help="Write into this type, not into the robot.")
-]
+IntoType = Annotated[str | None, Option("--type", help="Write into this type, not into the robot.")]
 
 
 @calibrate_app.command("camera")
 def camera(
     pictures: BoardPictures = None,
-    board: BoardOption = BoardName.charuco,
+    board: BoardOption = "charuco",
     squares: Squares = "7x5",
     square_m: SquareSide = 0.03,
     marker_m: MarkerSide = 0.022,
@@ -134,13 +119,8 @@ def camera(
     as_json: AsJson = False,
 ) -> None:
     """Lens and distortion of a camera, from pictures of a printed board."""
-    from rich.console import Console
-
-    from cpcbl_launch.checks import require_opencv
-    from cpcbl_launch.reporting.files import write_or_reason
-
     require_opencv("calibrate camera")
-    from cpcbl_launch.calibration.board import parse_board
+    from cpcbl_launch.calibration.board import parse_board, write_board
     from cpcbl_launch.calibration.lens import calibrate_lens
     from cpcbl_launch.calibration.pictures import picture_files, read_pictures
     from cpcbl_launch.calibration.reports import print_lens
@@ -149,7 +129,10 @@ def camera(
 
     printed = parse_board(board, squares, square_m, marker_m, family)
     if print_board is not None:
-        _write_board(printed, print_board, as_json)
+        require_writable_file("--print-board", print_board)
+        write_board(printed, print_board)
+        measure = "measure a square of it when it is printed"
+        echo(f"written: {print_board}; {measure}", err=as_json)
         if not pictures:
             return
     if not pictures:
@@ -168,15 +151,6 @@ def camera(
     print_not_written(lost | _save({table: camera_table(lens)}, team_file, output, as_json))
 
 
-def _write_board(board: "Board", path: Path, to_stderr: bool) -> None:
-    """Writes the board for printing. Raises InputError, OSError."""
-    from cpcbl_launch.calibration.board import write_board
-
-    require_writable_file("--print-board", path)
-    write_board(board, path)
-    typer.echo(f"written: {path}; measure a square of it when it is printed", err=to_stderr)
-
-
 @calibrate_app.command("colours")
 def colours(
     pictures: ColourPictures = None,
@@ -189,11 +163,6 @@ def colours(
     as_json: AsJson = False,
 ) -> None:
     """Thresholds of colours, from samples of them in pictures."""
-    from rich.console import Console
-
-    from cpcbl_launch.checks import require_opencv
-    from cpcbl_launch.reporting.files import write_or_reason
-
     require_opencv("calibrate colours")
     from cpcbl_launch.calibration import colour_samples
     from cpcbl_launch.calibration.colours import calibrate_colours
@@ -201,7 +170,10 @@ def colours(
     from cpcbl_launch.calibration.reports import print_colours
     from cpcbl_launch.calibration.team_tables import colour_tables, unsampled_colours
 
-    chosen = _chosen_samples(sample or [], samples)
+    chosen = [colour_samples.parse_sample(text) for text in sample or ()]
+    chosen += colour_samples.read_samples(samples) if samples is not None else []
+    if not chosen:
+        raise InputError("calibrate colours: name areas of colours by --sample or --samples")
     if preview is not None:
         colour_samples.require_picture_name(preview)
     _check_target(team_file, output)
@@ -220,17 +192,6 @@ def colours(
     print_not_written(lost)
 
 
-def _chosen_samples(texts: list[str], file: Path | None) -> "list[ColourSample]":
-    """The samples of the command line and of a file. Raises InputError."""
-    from cpcbl_launch.calibration.colour_samples import parse_sample, read_samples
-
-    chosen = [parse_sample(text) for text in texts]
-    chosen += read_samples(file) if file is not None else []
-    if not chosen:
-        raise InputError("calibrate colours: name areas of colours by --sample or --samples")
-    return chosen
-
-
 @calibrate_app.command("sensor")
 def sensor(
     recordings: Recordings = None,
@@ -243,8 +204,6 @@ def sensor(
     as_json: AsJson = False,
 ) -> None:
     """Range and bearing noise of cameras against known poses, and whether their σ are right."""
-    from rich.console import Console
-
     from cpcbl_launch.calibration.camera_accuracy import (
         dataset_from_recordings,
         measure_camera_accuracy,
@@ -275,7 +234,6 @@ def _dataset_from_pictures(
 ) -> "CameraDataset":
     """Sightings of a robot of the team file in pictures. Raises InputError."""
     from cpcbl_launch.calibration.camera_accuracy import dataset_from_pictures, observer_name
-    from cpcbl_launch.checks import require_opencv
     from cpcbl_launch.views.run import progress_bar
 
     require_opencv("calibrate sensor --pictures")
@@ -306,25 +264,18 @@ def _save(
     quiet: bool,
 ) -> dict[str, str]:
     """Writes the tables into the team file or prints them; files not written, with the reason."""
-    from cpcbl_launch.calibration.team_tables import (
-        edit_team,
-        overridden_keys,
-        replace_file,
-        tables_text,
-        team_source,
-    )
-    from cpcbl_launch.reporting.files import write_or_reason
+    from cpcbl_launch.calibration import team_tables
 
     if team_file is None:
         if not quiet:
-            typer.echo(f"\n{tables_text(tables)}", nl=False)
+            echo(f"\n{team_tables.tables_text(tables)}", nl=False)
         return {}
-    text, target = team_source(team_file, output)
-    changed = edit_team(text, str(team_file), tables)
-    lost = write_or_reason(target, lambda: replace_file(target, changed))
+    text, target = team_tables.team_source(team_file, output)
+    changed = team_tables.edit_team(text, str(team_file), tables)
+    lost = write_or_reason(target, lambda: team_tables.replace_file(target, changed))
     for table, values in tables.items() if not quiet else ():
-        for own in overridden_keys(changed, table, list(values)):
-            typer.echo(f"{own} stays, and overrides {table}")
+        for own in team_tables.overridden_keys(changed, table, list(values)):
+            echo(f"{own} stays, and overrides {table}")
     if not lost and not quiet:
-        typer.echo(f"written: {target}")
+        echo(f"written: {target}")
     return lost

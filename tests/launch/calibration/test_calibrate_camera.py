@@ -51,7 +51,7 @@ LENS = CameraSettings(
     distortion=(-0.28, 0.09, 0.0012, -0.0008, 0.0),
 )
 CHARUCO = parse_board("charuco", "7x5", 0.03, 0.022, "aruco_4x4_50")
-CHESS = CHARUCO._replace(pattern=Pattern.chessboard)
+CHESS = CHARUCO._replace(pattern="chessboard")
 BOARDS = {"charuco": CHARUCO, "chessboard": CHESS}
 TEAM = """# The lab's team.
 name = "lab"
@@ -137,7 +137,7 @@ def _off(shot: Shot, board: Board) -> Floats:
     corners = find_corners(shot.pixels, board)
     if isinstance(corners, str):
         return np.empty((0, 2))
-    chess = board.pattern is Pattern.chessboard
+    chess = board.pattern == "chessboard"
     board_points = corners.board_points + np.float32(board.square_m * chess) * np.array(
         [1, 1, 0], np.float32
     )
@@ -227,7 +227,7 @@ def _only_left(pixels: Pixels) -> Pixels:
     ],
 )
 def test_boards_that_cannot_be_are_said(
-    words: tuple[str, str, float, float, str], said: str
+    words: tuple[Pattern, str, float, float, str], said: str
 ) -> None:
     with pytest.raises(InputError, match=said):
         parse_board(*words)
@@ -236,7 +236,7 @@ def test_boards_that_cannot_be_are_said(
 @pytest.mark.parametrize("family", ["aruco_5x5_50", "apriltag_36h11"])
 def test_a_printed_board_is_found_again(family: str) -> None:
     board = parse_board("charuco", "8x6", 0.02, 0.015, family)
-    for printed in (board, board._replace(pattern=Pattern.chessboard)):
+    for printed in (board, board._replace(pattern="chessboard")):
         picture = cv2.cvtColor(draw_board(printed), cv2.COLOR_GRAY2BGR).astype(np.uint8)
         corners = _corners(picture, printed)
         assert len(corners.pixels) == 35
