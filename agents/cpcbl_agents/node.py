@@ -128,12 +128,10 @@ class Node:
 
     @property
     def next_ns(self) -> int:
-        """When there is something to do even if nothing arrives."""
         return self.robot.next_ns
 
     @property
     def waiting(self) -> bool:
-        """Whether something has arrived."""
         return bool(self._inbox or self._liveliness_events or self._frames)
 
     def step(self, now_ns: int) -> None:

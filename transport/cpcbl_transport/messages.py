@@ -224,15 +224,18 @@ def refusal(message: Message, now_ns: int) -> Refusal | None:
     The filter checks the numbers of sightings one by one. Numbers of fixes and beliefs are always
     finite, and their covariances are valid, whatever the bytes were.
     """
-    if not isinstance(message, Sightings):
-        numbers = _numbers(message)
-        if not all(abs(n) <= LARGEST_NUMBER for n in numbers):
-            finite = all(map(math.isfinite, numbers))
-            return Refusal.IMPLAUSIBLE if finite else Refusal.NOT_FINITE
+    leaves = [] if isinstance(message, Sightings) else _leaves(message)
+    numbers = [n for _, n in leaves if isinstance(n, float)]
+    if not all(abs(n) <= LARGEST_NUMBER for n in numbers):
+        finite = all(map(math.isfinite, numbers))
+        return Refusal.IMPLAUSIBLE if finite else Refusal.NOT_FINITE
     if abs(message.stamp_ns) >= LAST_NS:
         return Refusal.IMPLAUSIBLE
-    if isinstance(message, Telemetry) and any(n > LARGEST_COUNT for n in _counts(message)):
-        return Refusal.IMPLAUSIBLE
+    if isinstance(message, Telemetry):
+        for name, n in leaves:
+            is_stamp = name.endswith("_ns")
+            if isinstance(n, int) and abs(n) > (LAST_NS - 1 if is_stamp else LARGEST_COUNT):
+                return Refusal.IMPLAUSIBLE
     if message.stamp_ns > now_ns + FUTURE_NS:
         return Refusal.FUTURE
     if isinstance(message, Odometry):
@@ -247,31 +250,18 @@ def refusal(message: Message, now_ns: int) -> Refusal | None:
     return None
 
 
-def _numbers(message: Message) -> list[float]:
-    """All floats in a message, however deep."""
-    found, parts = [], list(msgspec.structs.astuple(message))
-    for part in parts:  # the list grows meanwhile
-        if isinstance(part, float):
-            found.append(part)
-        elif isinstance(part, tuple):
-            parts.extend(part)
-        elif isinstance(part, msgspec.Struct):
-            parts.extend(msgspec.structs.astuple(part))
-    return found
-
-
-def _counts(message: msgspec.Struct) -> list[int]:
-    """The sizes of all whole numbers in a message, however deep, that are no stamps."""
-    found: list[int] = []
+def _leaves(message: msgspec.Struct) -> list[tuple[str, object]]:
+    """All numbers and texts in a message, however deep, with the names of their fields."""
+    found: list[tuple[str, object]] = []
     parts: list[tuple[str, object]] = [("", message)]
     for name, part in parts:  # the list grows meanwhile
-        if isinstance(part, int):
-            found += [] if name.endswith("_ns") and abs(part) < LAST_NS else [abs(part)]
-        elif isinstance(part, tuple):
+        if isinstance(part, tuple):
             parts.extend((name, item) for item in part)
         elif isinstance(part, dict):
             parts.extend(part.items())
         elif isinstance(part, msgspec.Struct):
             values = msgspec.structs.astuple(part)
             parts.extend(zip(part.__struct_fields__, values, strict=True))
+        else:
+            found.append((name, part))
     return found

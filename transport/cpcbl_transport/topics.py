@@ -6,6 +6,7 @@ a better robot. The table also says who may publish and who may subscribe; a sec
 that (`security`). This module does not know the bus.
 """
 
+import re
 from enum import Enum, StrEnum
 from functools import lru_cache
 from typing import NamedTuple
@@ -82,24 +83,20 @@ class Topic(NamedTuple):
 
     def names(self, key: str) -> dict[str, str] | None:
         """The names in a key of this topic, None for any other key: the inverse of `at`."""
-        template, chunks = self.key.split("/"), key.split("/")
-        if len(template) != len(chunks):
-            return None
-        pairs = list(zip(template, chunks, strict=True))
-        if any(own != chunk for own, chunk in pairs if not own.startswith("<")):
-            return None
-        return {own.strip("<>"): chunk for own, chunk in pairs if own.startswith("<")}
+        found = _pattern(self.key).fullmatch(key)
+        return found.groupdict() if found else None
 
 
 @lru_cache(maxsize=4096)
 def _filled(template: str, names: tuple[tuple[str, object], ...]) -> str:
     """The key of a template; a robot asks for few keys, but at every step."""
     by_name = dict(names)
-    chunks = []
-    for chunk in template.split("/"):
-        name = chunk.strip("<>")
-        chunks.append(str(by_name.get(name, "*")) if chunk.startswith("<") else chunk)
-    return "/".join(chunks)
+    return re.sub(r"<(\w+)>", lambda found: str(by_name.get(found[1], "*")), template)
+
+
+@lru_cache
+def _pattern(template: str) -> re.Pattern[str]:
+    return re.compile(re.sub(r"<(\w+)>", r"(?P<\1>[^/]*)", template))
 
 
 def namespace(team: str) -> str:
