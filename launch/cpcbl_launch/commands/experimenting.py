@@ -243,17 +243,11 @@ def _conduct(
 @contextmanager
 def _progress(title: str, total: int | None, unit: str) -> Iterator[Callable[[], None]]:
     """A bar on standard error; the function that it yields moves it by one."""
+    from rich import progress
     from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TextColumn,
-        TimeRemainingColumn,
-    )
 
-    columns = (TextColumn(title), BarColumn(), MofNCompleteColumn(), TextColumn(unit))
-    console = Console(stderr=True)
-    with Progress(*columns, TimeRemainingColumn(), console=console, transient=True) as progress:
-        task = progress.add_task(title, total=total)
-        yield lambda: progress.advance(task)
+    done = progress.BarColumn(), progress.MofNCompleteColumn(), progress.TextColumn(unit)
+    columns = (progress.TextColumn(title), *done, progress.TimeRemainingColumn())
+    with progress.Progress(*columns, console=Console(stderr=True), transient=True) as shown:
+        task = shown.add_task(title, total=total)
+        yield lambda: shown.advance(task)

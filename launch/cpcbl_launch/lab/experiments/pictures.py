@@ -19,6 +19,7 @@ from cpcbl_launch.lab.experiments.detection_figures import (
     MOST_BEARING_DEG,
     MOST_RANGE_SHARE,
     DetectionReport,
+    Error,
 )
 from cpcbl_launch.lab.experiments.liars import Liars
 from cpcbl_launch.lab.experiments.runs import Outcome, Spread
@@ -60,11 +61,8 @@ def draw_figure7(result: Outcome) -> Figure:
             errors.annotate(f"{mean:.3f}", (x, mean), (8, 0), **near)
     errors.set(xticks=range(len(names)), xticklabels=names, ylabel="position error (m)")
     errors.set(title="mean, and one σ (A is off the scale where cut)")
-    rest = [
-        (a.position_mean_m or 0.0) + (a.position_sigma_m or 0.0)
-        for c, a in result.figures.items()
-        if c != "A"
-    ]
+    others = [a for c, a in result.figures.items() if c != "A"]
+    rest = [(a.position_mean_m or 0.0) + (a.position_sigma_m or 0.0) for a in others]
     errors.set_ylim(0.0, 1.6 * max(rest, default=0.0) or 1.0)
     errors.set_xlim(-0.6, len(names) - 0.2)
     errors.grid(True, axis="y", alpha=0.3)
@@ -151,8 +149,7 @@ def draw_liars(result: Liars) -> Figure:
     figure, panels = plt.subplots(2, len(sizes), figsize=(12, 6.5), sharex=True, squeeze=False)
     kinds = list(dict.fromkeys(row.case.lie for row in result.rows if row.case.lie))
     for (ratios, times), honest in zip(panels.T, sizes, strict=True):
-        lies = [row for row in result.rows if row.case.lie and row.case.honest == honest]
-        for row in lies:
+        for row in [r for r in result.rows if r.case.lie and r.case.honest == honest]:
             at, judged = kinds.index(row.case.lie), row.case.trust
             colour, shift = ("C0", -0.1) if judged else ("C3", 0.1)
             _bar(ratios, at + shift, row.ratio, colour, capsize=3)
@@ -177,10 +174,9 @@ def draw_eyes(result: DetectionReport) -> Figure:
         3, max(1, len(kinds)), figsize=(12, 8), sharex=True, squeeze=False
     )
     for (ranges, bearings, recall), kind in zip(panels.T, kinds, strict=False):
-        errors = [(e.range_m, e.range_share, e.range_sigma_share) for e in result.errors[kind]]
-        _scattered(ranges, errors, 100.0, MOST_RANGE_SHARE)
-        errors = [(e.range_m, e.bearing_deg, e.bearing_sigma_deg) for e in result.errors[kind]]
-        _scattered(bearings, errors, 1.0, MOST_BEARING_DEG)
+        seen = result.errors[kind]
+        _scattered(ranges, seen, "range_share", "range_sigma_share", 100.0, MOST_RANGE_SHARE)
+        _scattered(bearings, seen, "bearing_deg", "bearing_sigma_deg", 1.0, MOST_BEARING_DEG)
         bins = [f for f in result.bins[kind] if f.recall is not None]
         middles = [0.5 * (f.from_m + f.to_m) for f in bins]
         recall.plot(middles, [100.0 * (f.recall or 0.0) for f in bins], "o-", color="C0")
@@ -219,19 +215,17 @@ def draw(result: Any, path: Path) -> None:
 
 
 def _scattered(
-    axes: Any,
-    readings: Sequence[tuple[float, float | None, float | None]],
-    scale: float,
-    target: float,
+    axes: Any, seen: Sequence[Error], error: str, sigma: str, scale: float, target: float
 ) -> None:
     """Errors against range, with the band of three stated sigmas and that of one allowed; those
     whose sigma is not stated are left out."""
+    readings = [(one.range_m, getattr(one, error), getattr(one, sigma)) for one in seen]
     errors = [(r, scale * e, scale * s) for r, e, s in readings if e is not None and s is not None]
     target *= scale
     axes.plot([e[0] for e in errors], [e[1] for e in errors], ".", ms=2, alpha=0.5, color="C0")
     halves: dict[int, list[float]] = {}
-    for range_m, _, sigma in errors:
-        halves.setdefault(int(range_m / 0.5), []).append(sigma)
+    for range_m, _, stated in errors:
+        halves.setdefault(int(range_m / 0.5), []).append(stated)
     middles = [0.5 * half + 0.25 for half in sorted(halves)]
     sigmas = [3.0 * median(halves[half]) for half in sorted(halves)]
     for sign in (1.0, -1.0):

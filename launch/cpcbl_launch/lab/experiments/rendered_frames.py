@@ -18,7 +18,7 @@ there.
 import math
 import time
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -48,7 +48,7 @@ from cpcbl_launch.simulation.camera.visibility import (
     plate_points,
     visible_shares,
 )
-from cpcbl_team.config import CameraSettings, Light, Side
+from cpcbl_team.config import CameraSettings, Light
 from cpcbl_team.geometry import Pose2, wrap_angle
 from cpcbl_team.inputs import Sighting
 
@@ -194,19 +194,23 @@ def named_objects(frame: RandomFrame) -> dict[str, NamedObject]:
     half_m = team().vision.marker_distance_m
     # A robot hides no more than from corner to corner, and no less than from side to side.
     most, least = (_solids(frame, robot_from_field, f * half_m) for f in (math.sqrt(2.0), 1.0))
-    found = {}
-    for name in frame.scene.landmarks:
-        before = _others(most, name), _others(least, name)
-        found[name] = _landmark(name, most[name][0], camera, before)
+    poses = {name: Pose2(most[name][0].x, most[name][0].y, 0.0) for name in frame.scene.landmarks}
     for robot in frame.robots:
-        seen = robot_from_field @ Pose2(robot.x_m, robot.y_m, robot.heading_rad)
-        before = _others(most, robot.name), _others(least, robot.name)
-        found[robot.name] = _teammate(robot.name, seen, camera, before)
+        poses[robot.name] = robot_from_field @ Pose2(robot.x_m, robot.y_m, robot.heading_rad)
+    found = {}
+    for name, seen in poses.items():
+        before = _others(most, name), _others(least, name)  # hide no less; no more
+        shares: dict[Kind, float] = {}  # how much of each kind of feature is to be seen
+        some = 0.0
+        for kind, points, is_due in _features(name, seen, most[name][0], camera):
+            whole, part = visible_shares(points, camera, before)
+            shares[kind] = max(shares.get(kind, 0.0), whole if is_due else 0.0)
+            some = max(some, part)
+        due = tuple(kind for kind, share in shares.items() if share >= ALL_OF_IT)
+        range_m, bearing = math.hypot(seen.x, seen.y), math.atan2(seen.y, seen.x)
+        half = math.asin(min(1.0, most[name][0].radius / range_m))
+        found[name] = NamedObject(name, range_m, bearing, seen.heading, due, some > 0.0, half)
     return found
-
-
-Due = Mapping[Kind, float]  # how much of each kind of feature is to be seen
-Before = tuple[Sequence[Solid], Sequence[Solid]]  # what certainly hides no more; no less
 
 
 def _solids(
@@ -220,10 +224,10 @@ def _solids(
         solids[name] = (Solid(x, y, post.radius_m, post.bands[0].from_m, post.bands[-1].to_m),)
     for robot in frame.robots:
         x, y = robot_from_field.transform(robot.x_m, robot.y_m)
-        top_m, mast = body_top_m(team().vision), _mast(x, y)
-        body = Solid(x, y, body_m, 0.0, top_m)
-        has_mast = team().robots[robot.name].colours is not None
-        solids[robot.name] = (body, mast._replace(low=top_m)) if has_mast else (body,)
+        body = Solid(x, y, body_m, 0.0, body_top_m(team().vision))
+        solids[robot.name] = (body,)
+        if team().robots[robot.name].colours is not None:
+            solids[robot.name] += (_mast(x, y)._replace(low=body.high),)
     return solids
 
 
@@ -237,47 +241,26 @@ def _others(solids: Mapping[str, Sequence[Solid]], but: str) -> list[Solid]:
     return [solid for name, some in solids.items() if name != but for solid in some]
 
 
-def _landmark(name: str, solid: Solid, camera: Camera, before: Before) -> NamedObject:
-    points = cylinder_points(solid, camera.position)
-    whole, some = visible_shares(points, camera, before)
-    return _named_object(
-        name, Pose2(solid.x, solid.y, 0.0), {"landmark": whole}, some, solid.radius
-    )
-
-
-def _teammate(name: str, seen: Pose2, camera: Camera, before: Before) -> NamedObject:
-    robot, vision = team().robots[name], team().vision
-    marker = mast = some = 0.0
-    for side in robot.markers:
-        points, angle = _marker(side, seen, camera)
-        if angle < 0.5 * math.pi:
-            whole, part = visible_shares(points, camera, before)
-            some = max(some, part)
-            marker = max(marker, whole if angle <= math.radians(FACING_DEG) else 0.0)
-    if robot.colours is not None:
-        points = cylinder_points(_mast(seen.x, seen.y), camera.position)
-        mast, part = visible_shares(points, camera, before)
-        some = max(some, part)
-    half_m = math.sqrt(2.0) * vision.marker_distance_m
-    return _named_object(name, seen, {"marker": marker, "mast": mast}, some, half_m)
-
-
-def _marker(side: Side, seen: Pose2, camera: Camera) -> tuple[Floats, float]:
-    """The points of a teammate's marker, and the angle (rad) between its normal and the viewer."""
-    vision, direction = team().vision, SIDE_ANGLES[side]
+def _features(
+    name: str, seen: Pose2, solid: Solid, camera: Camera
+) -> Iterator[tuple[Kind, Floats, bool]]:
+    """What an object can be detected by: points, and whether it is due if all are visible."""
+    robot, vision = team().robots.get(name), team().vision
+    if robot is None:
+        yield "landmark", cylinder_points(solid, camera.position), True
+        return
     away = vision.marker_distance_m
-    x, y = seen.transform(away * math.cos(direction), away * math.sin(direction))
-    facing = wrap_angle(seen.heading + direction)
-    to_lens = math.atan2(camera.position[1] - y, camera.position[0] - x)
-    points = plate_points(x, y, vision.marker_mounted_m, facing, vision.marker_m)
-    return points, abs(wrap_angle(to_lens - facing))
-
-
-def _named_object(name: str, seen: Pose2, shown: Due, some: float, half_m: float) -> NamedObject:
-    range_m, bearing_rad = math.hypot(seen.x, seen.y), math.atan2(seen.y, seen.x)
-    due = tuple(kind for kind, share in shown.items() if share >= ALL_OF_IT)
-    half_width_rad = math.asin(min(1.0, half_m / range_m))
-    return NamedObject(name, range_m, bearing_rad, seen.heading, due, some > 0.0, half_width_rad)
+    for side in robot.markers:
+        direction = SIDE_ANGLES[side]
+        x, y = seen.transform(away * math.cos(direction), away * math.sin(direction))
+        facing = wrap_angle(seen.heading + direction)
+        to_lens = math.atan2(camera.position[1] - y, camera.position[0] - x)
+        angle = abs(wrap_angle(to_lens - facing))  # between the marker's normal and the viewer
+        if angle < 0.5 * math.pi:
+            points = plate_points(x, y, vision.marker_mounted_m, facing, vision.marker_m)
+            yield "marker", points, angle <= math.radians(FACING_DEG)
+    if robot.colours is not None:
+        yield "mast", cylinder_points(_mast(seen.x, seen.y), camera.position), True
 
 
 # What was made of it -----------------------------------------------------------------------------
