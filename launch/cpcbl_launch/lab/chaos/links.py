@@ -36,10 +36,10 @@ class LinkQuality(NamedTuple):
 
 class Relay:
     """A TCP relay, which a client dials at `endpoint` instead of its router. Like TCP it carries
-    bytes in order, so that it can be silent, slow or narrow. `quality` may be set from
-    any thread, at any time; a cut also holds back what is on its way."""
+    bytes in order, so that it can be silent, slow or narrow. `quality` may be set from any thread,
+    at any time; a cut also holds back what is on its way."""
 
-    prefix: tuple[str, ...] = ()  # of the client's command
+    prefix: tuple[str, ...] = ()  # what the client's command begins with
 
     def __init__(self, router: str, seed: int = 1) -> None:
         self._protocol, address = router.split("/")
