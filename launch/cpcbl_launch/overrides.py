@@ -13,14 +13,10 @@ class Overrides(NamedTuple):
     """What a command line sets for all robots; None leaves the team file's value."""
 
     bytes_per_s: float | None = None
-    """Of each robot."""
     messages_per_minute: float | None = None
-    """Of each robot."""
-    match_messages: int | None = None
-    """Of the team."""
+    match_messages: int | None = None  # of the team; the two above are each robot's
     variant: str | None = None
-    collaboration: str | None = None
-    """none, passive, active, both"""
+    collaboration: str | None = None  # none, passive, active, both
     fusion: str | None = None
     direction: str | None = None
 

@@ -20,16 +20,13 @@ def problems(team: Team) -> Iterator[str]:
     for name, robot in team.robots.items():
         if robot.source == "simulated" and robot.start is None:
             yield f"robots.{name}.start: a simulated robot needs one; add x_m, y_m, heading_deg"
-        if robot.localizer.variant == "joint" and robot.localizer.paper_uncertainty:
-            yield (
-                f"robots.{name}.localizer.paper_uncertainty: the joint variant cannot do"
-                " without the covariance; use variant circular or oval"
-            )
-        if robot.localizer.alternate is False and robot.localizer.variant != "joint":
-            yield (
-                f"robots.{name}.localizer.alternate: only the joint variant can update both at"
-                " once; remove the key"
-            )
+        is_joint, key = robot.localizer.variant == "joint", f"robots.{name}.localizer"
+        if is_joint and robot.localizer.paper_uncertainty:
+            reason = "the joint variant cannot do without the covariance"
+            yield f"{key}.paper_uncertainty: {reason}; use variant circular or oval"
+        if not is_joint and robot.localizer.alternate is False:
+            reason = "only the joint variant can update both at once"
+            yield f"{key}.alternate: {reason}; remove the key"
     yield from _vision_problems(team)
     yield from _guard_problems(team)
     yield from _event_problems(team)
@@ -120,7 +117,5 @@ def _guard_problems(team: Team) -> Iterator[str]:
             ("belief_rate_hz", guards.belief_rate_hz, robot.collaboration.belief_rate_hz),
         ):
             if allowed_hz < 2.0 * own_hz:
-                yield (
-                    f"transport.guards.{key}: robots.{name} has {own_hz:g} Hz; raise it to"
-                    f" {2.0 * own_hz:g} or more"
-                )
+                least = f"raise it to {2.0 * own_hz:g} or more"
+                yield f"transport.guards.{key}: robots.{name} has {own_hz:g} Hz; {least}"

@@ -4,6 +4,7 @@ import math
 import os
 import sys
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -73,21 +74,14 @@ TeamArgument = Annotated[
     Path | None, Argument(help="Team file, or a built-in one: demo (default).")
 ]
 Blind = Annotated[str, Option(help="Robots that cannot see landmarks, e.g. 3,4,5.")]
+_limit = partial(Option, min=0.0, callback=checked(_require_limit))
 BytesPerS = Annotated[
     float | None,
-    Option(
-        min=0.0,
-        callback=checked(_require_limit),
-        help="Bytes per second of fixes and beliefs that each robot may send; 0: no limit.",
-    ),
+    _limit(help="Bytes per second of fixes and beliefs that each robot may send; 0: no limit."),
 ]
 MessagesPerMinute = Annotated[
     float | None,
-    Option(
-        min=0.0,
-        callback=checked(_require_limit),
-        help="Fixes and beliefs per minute that each robot may send; 0: no limit.",
-    ),
+    _limit(help="Fixes and beliefs per minute that each robot may send; 0: no limit."),
 ]
 MatchMessages = Annotated[
     int | None,
