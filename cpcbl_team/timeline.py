@@ -1,7 +1,7 @@
 """Late and unordered inputs give the same estimate as the same inputs in order, bit for bit.
 
 The timeline keeps the inputs of the last seconds, sorted by the time of their measurement, and the
-state before each of them. It inserts a late input at its time and computes all later states again.
+state before each of them. It inserts a late input at its time and computes later states again.
 States are immutable, so an old state is available at no cost.
 """
 
@@ -63,39 +63,53 @@ class Timeline:
         self._localizer, self._horizon_ns = localizer, horizon_ns
         self._inputs: list[Input] = []
         self._keys: list[Key] = []
-        self._before: list[State] = []
-        self.state = state
+        self._states = [state]
+        """The state before each input, as far as they have been computed."""
         self._start_ns = self._oldest_ns = state.stamp_ns
 
+    @property
+    def state(self) -> State:
+        """The state after all inputs."""
+        return self._state_before(len(self._inputs))
+
     def add(self, item: Input) -> TimelineRefusal | None:
-        """Inserts an input at its time; the reason if it cannot be used."""
-        key, keys = _key(item), self._keys
+        """Inserts an input at its time; the reason if it cannot be used.
+
+        The states after it are computed when they are asked for: often several inputs arrive late.
+        """
+        key, keys, states = _key(item), self._keys, self._states
         is_beyond_horizon = bool(keys) and key[0] < keys[-1][0] - self._horizon_ns
         if is_beyond_horizon or _measured_ns(item) < self._start_ns:
             return TimelineRefusal.TOO_LATE
-        if not keys or key > keys[-1]:
-            self._append(key, item)
-            return None
         index = bisect_left(keys, key)
         if index < len(keys) and keys[index] == key:
             return TimelineRefusal.DUPLICATE
-        self._insert(index, key, item)
+        known = states[index:]
+        del states[index + 1 :]
+        keys.insert(index, key)
+        self._inputs.insert(index, item)
+        if isinstance(item, Belief):
+            self._keep_states(index, item, known)
+        if len(keys) >= 2 * _PRUNE:
+            self._forget()
         return None
 
-    def _insert(self, index: int, key: Key, item: Input) -> None:
-        """Inserts a late input. A belief, which is always late, changes only the frames to which it
-        is the nearest one; what comes before these is not computed again."""
-        states = [*self._before[index:], self.state]
-        again = [*zip(self._keys[index:], self._inputs[index:], pairwise(states), strict=True)]
-        del self._keys[index:], self._inputs[index:], self._before[index:]
-        self.state = states[0]
-        self._append(key, item)
-        # Between the times of two inputs a belief divides a motion, which changes the last bits
-        is_same = isinstance(item, Belief) and states[1].stamp_ns == key[0]
-        is_changed = self._localizer.screen.is_changed_by_beliefs
-        for a_key, an_item, (before, after) in again:
-            is_same = is_same and not is_changed(an_item, before, self.state, key[2])
-            self._append(a_key, an_item, after if is_same else None)
+    def _keep_states(self, index: int, belief: Belief, known: list[State]) -> None:
+        """Keeps what was known after a belief. It is always late, but does not change the states
+        before the first frame to which it is its robot's nearest belief.
+
+        Between the times of two inputs it divides a motion, which changes the last bits.
+        """
+        if len(known) < 2 or known[1].stamp_ns != self._keys[index][0]:
+            return
+        screen, states = self._localizer.screen, self._states
+        state = self._state_before(index + 1)
+        for item, (before, after) in zip(self._inputs[index + 1 :], pairwise(known), strict=False):
+            if screen.is_changed_by_beliefs(item, before, state, belief.robot):
+                return
+            is_belief = isinstance(item, Belief)
+            state = self._applied(item, state) if is_belief else with_beliefs(after, state)
+            states.append(state)
 
     def latest(self, now_ns: int) -> State:
         """The state at `now_ns`, or at the end of the known odometry if that is earlier.
@@ -111,24 +125,21 @@ class Timeline:
         if stamp_ns < self._oldest_ns:
             return None
         after = bisect_right(self._keys, (stamp_ns, len(_rank), "", b""))
-        state = self._before[after] if after < len(self._keys) else self.state
-        return self._localizer.predict(state, stamp_ns)
+        return self._localizer.predict(self._state_before(after), stamp_ns)
 
-    def _append(self, key: Key, item: Input, known: State | None = None) -> None:
-        """`known`: the state after this input, but for what other beliefs change."""
-        self._keys.append(key)
-        self._inputs.append(item)
-        self._before.append(self.state)
-        if known is None or isinstance(item, Belief):
-            self.state = _apply[type(item)](self._localizer, self.state, item)
-        else:
-            self.state = with_beliefs(known, self.state)
-        if len(self._keys) >= 2 * _PRUNE:
-            self._forget()
+    def _state_before(self, index: int) -> State:
+        states = self._states
+        for item in self._inputs[len(states) - 1 : index]:
+            states.append(self._applied(item, states[-1]))
+        return states[index]
+
+    def _applied(self, item: Input, state: State) -> State:
+        return _apply[type(item)](self._localizer, state, item)
 
     def _forget(self) -> None:
         oldest_ns = self._keys[-1][0] - self._horizon_ns
         oldest = bisect_left(self._keys, (oldest_ns,))
         if oldest >= _PRUNE:
             self._oldest_ns = max(self._start_ns, oldest_ns)
-            del self._keys[:oldest], self._inputs[:oldest], self._before[:oldest]
+            self._state_before(oldest)
+            del self._keys[:oldest], self._inputs[:oldest], self._states[:oldest]

@@ -111,6 +111,6 @@ def test_the_status_contains_what_self_calibration_has_learned() -> None:
         timeline = robot.filter.timeline
         calibration = CalibrationMemory(SelfCalibration(0.98, 0.96, 0.01))
         memory = timeline.state.memory._replace(calibration=calibration)
-        timeline.state = timeline.state._replace(memory=memory)
+        timeline._states[-1] = timeline.state._replace(memory=memory)
     assert stand.status("me").learned == (0.98, 0.96, 0.01)
     assert stand.status("mate").learned is None

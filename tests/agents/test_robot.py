@@ -299,7 +299,7 @@ def stood_with_bias(learns: bool) -> Robot:
     state = subject.filter.timeline.state
     known = SelfCalibration(bearing_bias_rad=0.1)
     memory = state.memory._replace(calibration=CalibrationMemory(known))
-    subject.filter.timeline.state = state._replace(memory=memory)
+    subject.filter.timeline._states[-1] = state._replace(memory=memory)
     for piece in pieces(0.5, 0.0, 0.0):
         subject.handle(piece, piece.stamp_ns)
         subject.handle(Tick(), piece.stamp_ns)

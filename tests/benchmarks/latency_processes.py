@@ -89,8 +89,9 @@ class TimingRobot(Robot):
         before = self.filter.timeline.state
         outgoing = super().handle(message, now_ns)
         if isinstance(message, Fix):
+            after = self.filter.timeline.state  # which computes it
             at_ns = time.monotonic_ns()
-            if self.filter.timeline.state.estimate != before.estimate:
+            if after.estimate != before.estimate:
                 self.changed_ns[message.stamp_ns] = at_ns
         return outgoing
 
