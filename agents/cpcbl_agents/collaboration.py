@@ -19,7 +19,6 @@ from cpcbl_agents.agent import (
     Presence,
     UnknownRobot,
 )
-from cpcbl_agents.counters import MessageCounters
 from cpcbl_agents.guests import GuestRegistry
 from cpcbl_team import information_gain as gains
 from cpcbl_team.config import LocalizationSettings
@@ -30,7 +29,7 @@ from cpcbl_team.inputs import Belief, Fix
 from cpcbl_team.tiers import LOWEST_TIER, accepts_tier, next_tier
 from cpcbl_transport.budget import Budget
 from cpcbl_transport.compact import help_bytes, sent_bytes
-from cpcbl_transport.messages import Track
+from cpcbl_transport.messages import Flow, Track
 
 NEIGHBOUR_NS = 10_000_000_000  # a teammate's tier is watched for so long after it was seen
 IN_SIGHT_NS = 1_000_000_000  # its beliefs are useful for so long after it was seen
@@ -58,6 +57,35 @@ class Interests(NamedTuple):
     """Teammates seen not long ago, and possible guests: the robot watches their tiers."""
     sources: frozenset[tuple[str, int]]
     """Teammates, with their tiers, whose beliefs are useful to this robot."""
+
+
+class MessageCounter:
+    """Messages of one topic from or for one teammate; the names are those of `Flow`."""
+
+    def __init__(self) -> None:
+        self.messages = self.bytes = self.over_budget = self.worthless = self.silent = 0
+        self.latest_ns = 0
+
+    def add(self, size: int, stamp_ns: int) -> None:
+        """One more message of so many bytes on the wire."""
+        self.messages += 1
+        self.bytes += size
+        self.latest_ns = max(self.latest_ns, stamp_ns)
+
+
+class MessageCounters:
+    """Counts of the fixes and beliefs that a robot sent, received and held back, by teammate."""
+
+    def __init__(self) -> None:
+        self._counters: dict[tuple[str, str], MessageCounter] = {}
+
+    def of(self, topic: str, peer: str) -> MessageCounter:
+        return self._counters.setdefault((topic, peer), MessageCounter())
+
+    def flows(self) -> tuple[Flow, ...]:
+        """The counters as they are reported, without those that counted nothing."""
+        flows = (Flow(*key, **vars(counter)) for key, counter in sorted(self._counters.items()))
+        return tuple(f for f in flows if f.messages or f.over_budget or f.worthless or f.silent)
 
 
 class CollaborationAgent:

@@ -14,7 +14,7 @@ from cpcbl_agents.agent import (
     UnknownRobot,
 )
 from cpcbl_agents.clocks import ClockMonitor
-from cpcbl_agents.counters import MessageCounters
+from cpcbl_agents.collaboration import MessageCounters
 from cpcbl_agents.declarations import Declarations, LivelinessTokens
 from cpcbl_agents.robot import Robot, build_robot
 from cpcbl_agents.sources import OwnCamera

@@ -4,8 +4,7 @@ from collections.abc import Sequence
 from typing import Any, TypeVar
 
 from cpcbl_agents.agent import BeliefSubscribers, FrameEstimate, HelpSent, PoseEstimate, Presence
-from cpcbl_agents.collaboration import CollaborationAgent
-from cpcbl_agents.counters import MessageCounter
+from cpcbl_agents.collaboration import CollaborationAgent, MessageCounter
 from cpcbl_team.config import (
     BudgetSettings,
     CollaborationSettings,

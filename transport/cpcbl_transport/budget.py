@@ -92,11 +92,8 @@ class Budget:
             reserve = s.urgent_share * most
             windows.append(SlidingWindow("bytes", most, most / s.bytes_per_s, reserve))
         if s.messages_per_minute:
-            most = math.ceil(s.messages_per_minute)
-            reserve, window_s = (
-                math.floor(s.urgent_share * most),
-                60.0 * most / s.messages_per_minute,
-            )
+            most, rate = math.ceil(s.messages_per_minute), s.messages_per_minute
+            reserve, window_s = math.floor(s.urgent_share * most), 60.0 * most / rate
             windows.append(SlidingWindow("messages", most, window_s, reserve))
         for window in windows if restarted else ():
             window.spend(start_ns, window.capacity)

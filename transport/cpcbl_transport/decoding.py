@@ -66,7 +66,8 @@ class Received(NamedTuple, Generic[MessageT]):
 class Subscriber(Generic[MessageT]):
     """Subscribes to messages of one type, decodes what arrives, and counts what must not be used.
 
-    `on_message` is called on a thread of the bus.
+    `on_message` is called on a thread of the bus. `names`: placeholders of the topic's key; those
+    that are left out may be anything.
     """
 
     def __init__(
@@ -76,7 +77,6 @@ class Subscriber(Generic[MessageT]):
         on_message: Callable[[Received[MessageT]], None],
         **names: str,
     ) -> None:
-        """`names`: placeholders of the topic's key; those that are left out may be anything."""
         self._on_message, self._lock = on_message, threading.Lock()
         self._refused: Counter[str] = Counter()
         self._handle = bus.subscribe(topic_of(kind).at(**names), self._on_payload)

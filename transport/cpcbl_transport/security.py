@@ -110,11 +110,9 @@ def members_in(folder: Path) -> tuple[Member, ...]:
     path = folder / str(Role.ROUTER) / MEMBERS
     try:
         return msgspec.json.decode(path.read_bytes(), type=tuple[Member, ...])
-    except OSError as error:
-        reason = error.strerror
-    except msgspec.MsgspecError as error:
-        reason = str(error)
-    raise SecurityError(f"transport.keys: {path}: {reason}; `cpcbl-team keys FILE` writes it")
+    except (OSError, msgspec.MsgspecError) as error:
+        why = error.strerror if isinstance(error, OSError) else error
+    raise SecurityError(f"transport.keys: {path}: {why}; `cpcbl-team keys FILE` writes it")
 
 
 def access_control(team: Team) -> dict[str, Any]:
