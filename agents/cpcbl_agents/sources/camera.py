@@ -13,10 +13,10 @@ import re
 import socket
 import threading
 from collections import Counter, deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
-from typing import Protocol
 from urllib.parse import urlsplit
 
 import cv2
@@ -24,7 +24,7 @@ import numpy as np
 
 from cpcbl_agents.detector import Picture
 from cpcbl_agents.sources import OwnCamera
-from cpcbl_agents.vision.camera import Pixels
+from cpcbl_agents.vision.camera import NO_PIXELS, Pixels
 from cpcbl_team.config import CameraSettings
 from cpcbl_team.errors import InputError
 from cpcbl_transport.messages import Frame
@@ -37,7 +37,6 @@ PATIENCE_S = 1.8  # for the thread at the end: a process that ends while OpenCV 
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.25, 4.0
 EARLY = 0.8  # of the time between two frames: rates of cameras are not exact
 COUNTS = ("camera_lost", "camera_back", "frame_skipped")
-NO_PIXELS: Pixels = np.empty((0, 0, 3), np.uint8)
 
 os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # this module logs errors once
 os.environ.setdefault("OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT", str(TIMEOUT_S))
@@ -60,9 +59,12 @@ def open_camera(
     path, key = Path(settings.frames), f"robots.{robot}.camera.frames"
     if not path.exists():
         raise InputError(f"{key}: {path}: no such file or folder; correct it, or empty it")
-    return RecordedCamera(
-        FolderFrames(path, key, rate_hz) if path.is_dir() else VideoFrames(path, key, rate_hz)
-    )
+    if not path.is_dir():
+        return _video(path, key, rate_hz)
+    paths = picture_paths(path)
+    if not paths:
+        raise InputError(f"{key}: {path}: no pictures (.png, .jpg) in it; name another folder")
+    return RecordedCamera((partial(_read_file, path) for path in paths), rate_hz)
 
 
 class LiveCamera:
@@ -161,23 +163,17 @@ def _retrieve(capture: "cv2.VideoCapture") -> Pixels:
     return pixels.astype(np.uint8, copy=False) if done else NO_PIXELS
 
 
-class FrameSequence(Protocol):
-    """A sequence of frames."""
-
-    rate_hz: float
-
-    def skip(self) -> bool:
-        """Skips one frame; true if there was one."""
-
-    def take(self, stamp_ns: int) -> Frame | Picture | None:
-        """The next one; None after the end."""
+FrameReader = Callable[
+    [int], Frame | Picture
+]  # makes a frame with this stamp; may be left uncalled
 
 
 class RecordedCamera:
     """Frames played in robot time from the first poll on. A slow robot skips frames."""
 
-    def __init__(self, frames: FrameSequence) -> None:
-        self._frames, self._count, self.is_finished = frames, 0, False
+    def __init__(self, readers: Iterator[FrameReader], rate_hz: float) -> None:
+        self._readers, self._rate_hz, self._count = readers, rate_hz, 0
+        self.is_finished = False
         self._from_ns: int | None = None
         self.counts: Counter[str] = Counter()
 
@@ -187,77 +183,56 @@ class RecordedCamera:
 
     def _stamp_ns(self, count: int) -> int:
         assert self._from_ns is not None
-        return self._from_ns + round(count * 1e9 / self._frames.rate_hz)
+        return self._from_ns + round(count * 1e9 / self._rate_hz)
+
+    def _next_reader(self) -> FrameReader | None:
+        reader = next(self._readers, None)
+        self._count += 1
+        self.is_finished = reader is None
+        return reader
 
     def poll(self, now_ns: int) -> Sequence[Frame | Picture]:
         if self._from_ns is None:
             self._from_ns = now_ns
         while not self.is_finished and self._stamp_ns(self._count + 1) <= now_ns:
-            self.is_finished = not self._frames.skip()
-            self._count += 1
-            self.counts["frame_skipped"] += not self.is_finished
-        if self.is_finished or self._stamp_ns(self._count) > now_ns:
+            self.counts["frame_skipped"] += self._next_reader() is not None
+        stamp_ns = self._stamp_ns(self._count)
+        if self.is_finished or stamp_ns > now_ns:
             return ()
-        frame = self._frames.take(self._stamp_ns(self._count))
-        self._count += 1
-        if frame is None:
-            self.is_finished = True
+        reader = self._next_reader()
+        if reader is None:
             log.info("the last frame was played; the robot goes on without a camera")
             return ()
-        return [frame]
+        return [reader(stamp_ns)]
 
     def close(self) -> None:
         self.is_finished = True
 
 
-class VideoFrames:
+def _video(path: Path, key: str, rate_hz: float) -> RecordedCamera:
     """A video file. If its frame rate exceeds the sensor's, only every n-th frame is used."""
-
-    def __init__(self, path: Path, key: str, rate_hz: float) -> None:
-        self._capture = cv2.VideoCapture(str(path))
-        if not self._capture.isOpened():
-            raise InputError(f"{key}: {path}: not a video that OpenCV can play; name another one")
-        own_hz = self._capture.get(cv2.CAP_PROP_FPS)
-        own_hz = own_hz if math.isfinite(own_hz) and own_hz > 0.0 else rate_hz
-        self._every = max(1, round(own_hz / rate_hz))
-        self.rate_hz = own_hz / self._every
-
-    def skip(self) -> bool:
-        there = self._capture.grab()
-        for _ in range(self._every - 1):
-            self._capture.grab()
-        return bool(there)
-
-    def take(self, stamp_ns: int) -> Picture | None:
-        if not self._capture.grab():
-            return None
-        picture = Picture(stamp_ns, _retrieve(self._capture))
-        for _ in range(self._every - 1):
-            self._capture.grab()
-        return picture
+    capture = cv2.VideoCapture(str(path))
+    if not capture.isOpened():
+        raise InputError(f"{key}: {path}: not a video that OpenCV can play; name another one")
+    own_hz = capture.get(cv2.CAP_PROP_FPS)
+    own_hz = own_hz if math.isfinite(own_hz) and own_hz > 0.0 else rate_hz
+    every = max(1, round(own_hz / rate_hz))
+    return RecordedCamera(_video_readers(capture, every), own_hz / every)
 
 
-class FolderFrames:
-    """The JPEG and PNG files of a folder, in the order of their names."""
+def _video_readers(capture: "cv2.VideoCapture", every: int) -> Iterator[FrameReader]:
+    while capture.grab():
+        yield lambda stamp_ns: Picture(stamp_ns, _retrieve(capture))
+        for _ in range(every - 1):
+            capture.grab()
 
-    def __init__(self, path: Path, key: str, rate_hz: float) -> None:
-        self.rate_hz = rate_hz
-        self._paths = deque(picture_paths(path))
-        if not self._paths:
-            raise InputError(f"{key}: {path}: no pictures (.png, .jpg) in it; name another folder")
 
-    def skip(self) -> bool:
-        return bool(self._paths and self._paths.popleft())
-
-    def take(self, stamp_ns: int) -> Frame | None:
-        if not self._paths:
-            return None
-        path = self._paths.popleft()
-        try:
-            return Frame(stamp_ns, path.read_bytes())
-        except OSError as error:  # an empty frame is counted
-            log.warning("%s: cannot be read: %s", path, error.strerror)
-            return Frame(stamp_ns, b"")
+def _read_file(path: Path, stamp_ns: int) -> Frame:
+    try:
+        return Frame(stamp_ns, path.read_bytes())
+    except OSError as error:  # an empty frame is counted
+        log.warning("%s: cannot be read: %s", path, error.strerror)
+        return Frame(stamp_ns, b"")
 
 
 def picture_paths(folder: Path) -> list[Path]:

@@ -5,7 +5,9 @@ comment, Unix seconds, metres, radians. A sighting names a barcode; subjects 1-5
 """
 
 import warnings
+from bisect import bisect_right
 from collections.abc import Iterator, Sequence
+from itertools import groupby
 from pathlib import Path
 
 import numpy as np
@@ -99,18 +101,11 @@ def read_odometry(folder: Path, robot: str) -> Iterator[Odometry]:
 
 def frames(table: NDArray[np.float64], names: dict[int, str], robot: str) -> Iterator[Sightings]:
     """The sightings of each time; a barcode that nobody carries keeps its number."""
-    seen: list[Sighting] = []
-    at_ns = 0
-    for t, barcode, range_m, bearing in table.tolist():
-        if _ns(t) != at_ns and seen:
-            yield Sightings(at_ns, tuple(seen))
-            seen = []
-        at_ns = _ns(t)
-        name = names.get(int(barcode), f"barcode-{int(barcode)}")
-        if name != robot:
-            seen.append(Sighting(name, range_m, bearing))
-    if seen:
-        yield Sightings(at_ns, tuple(seen))
+    for stamp_ns, rows in groupby(table.tolist(), key=lambda row: _ns(row[0])):
+        named = ((names.get(int(row[1]), f"barcode-{int(row[1])}"), row) for row in rows)
+        seen = tuple(Sighting(name, row[2], row[3]) for name, row in named if name != robot)
+        if seen:
+            yield Sightings(stamp_ns, seen)
 
 
 class MrclamSource:
@@ -137,8 +132,7 @@ class MrclamSource:
 
     def poll(self, now_ns: int) -> Sequence[Odometry | Sightings]:
         first = self._next
-        while self._next < len(self._items) and self._items[self._next].stamp_ns <= now_ns:
-            self._next += 1
+        self._next = bisect_right(self._items, now_ns, lo=first, key=lambda item: item.stamp_ns)
         return self._items[first : self._next]
 
     def skip_to(self, now_ns: int) -> None:

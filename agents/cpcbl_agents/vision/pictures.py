@@ -54,7 +54,10 @@ def decode_frame(image: bytes, size_px: tuple[int, int]) -> Pixels | str:
     header = read_header(image)
     if header is None:
         return "frame_undecodable"
-    reason = _header_fault(header, size_px) or ("" if _is_complete(image) else "frame_truncated")
+    # Some cameras append zeros to a picture.
+    end = _PNG_END if image.startswith(_PNG) else _JPEG_END
+    is_complete = image.endswith(end) or image.rstrip(b"\0").endswith(end)
+    reason = _header_fault(header, size_px) or ("" if is_complete else "frame_truncated")
     return reason or decode_image(image)
 
 
@@ -90,12 +93,6 @@ def _header_fault(header: Header, size_px: tuple[int, int]) -> str:
     if header.bits != 8:
         return "frame_wrong_depth"
     return "" if (header.width_px, header.height_px) == size_px else "frame_wrong_size"
-
-
-def _is_complete(image: bytes) -> bool:
-    """Whether the end is present; some cameras append zeros to it."""
-    end = _PNG_END if image.startswith(_PNG) else _JPEG_END
-    return image.endswith(end) or image.rstrip(b"\0").endswith(end)
 
 
 def pixel_fault(pixels: Pixels, size_px: tuple[int, int]) -> str:

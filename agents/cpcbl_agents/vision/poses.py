@@ -1,10 +1,12 @@
-"""The pose of a robot from its detected markers, with its covariance.
+"""The pose of a robot from the corners of its detected markers, with its covariance.
 
-Robots stand on the floor and their markers are upright at a known height, so x, y and heading in
-the observer's frame are fitted to the corners by least squares (Levenberg-Marquardt). A small
-flat marker looks almost the same turned to the left and to the right (Schweighofer and Pinz, Robust
-pose estimation from a planar target, PAMI 2006), so both solutions are tried. If both are possible,
-the covariance covers both.
+A robot stands on the floor, and its markers are upright at a known height. So the pose has three
+parameters: x, y (m) and heading (rad) in the robot frame of the viewer. They minimize the squared
+reprojection errors of the corners, weighted with the inverse of their covariance
+(Levenberg-Marquardt). A small planar marker looks almost the same turned to the left and to the
+right (Schweighofer and Pinz, Robust pose estimation from a planar target, PAMI 2006). Therefore the
+optimization starts from both sides. If the errors exclude neither solution, the covariance is that
+of all headings between them.
 """
 
 import math
@@ -24,17 +26,18 @@ SIDE_ANGLES: dict[Side, float] = {
     "right": -0.5 * math.pi,
 }
 CORNER_SHARE = 0.5
-"""A marker's corner is where two lines through many places meet: this much of `edge_sigma_px`."""
-LEAST_TURN = math.radians(15.0)
+"""The sigma of a corner as a share of `edge_sigma_px`: a corner is the intersection of two lines,
+each of which is fitted to many edge points."""
+LEAST_TURN = math.radians(15.0)  # between the normal of a marker and its ray, in the initial poses
 STEPS = 12
-SMALL = 1e-3  # squared error (in sigmas): a step that gains less no longer matters
+SMALL = 1e-3  # Levenberg-Marquardt stops when a step reduces the weighted squared error by less
 RIVAL = 12.0
-"""The other solution is excluded if its squared error (in sigmas) is larger by this."""
+"""A pose is excluded if its weighted squared error exceeds that of the best pose by this."""
 LEAST_WEIGHT = 0.1
 """The least weight of a possible heading relative to the best: three sigma then include it."""
 NARROW = math.radians(1.5)
-"""Within this angle the picture changes linearly with the heading; beyond it, all headings are
-averaged."""
+"""Within this angle, the projection of the corners is linear in the heading, and the inverse of the
+information matrix is the covariance. Beyond it, the covariance is computed over all headings."""
 HEADINGS = 31
 MOST_SIGMA = math.radians(20.0)
 
@@ -42,7 +45,7 @@ _DIAGONAL = np.eye(3)
 
 
 class PoseFit(NamedTuple):
-    """`viewer_from_mate`, its covariance (3, 3; m, rad), the mean squared error in sigmas."""
+    """`viewer_from_mate`, its covariance (3, 3; m, rad), and the mean squared error in sigmas."""
 
     pose: Pose2
     covariance: Floats
@@ -50,26 +53,24 @@ class PoseFit(NamedTuple):
 
 
 def side_corners(side: Side, vision: VisionSettings) -> Floats:
-    """The corners (4, 3) of the marker on a side, in its robot's frame: upper left, upper right,
-    lower right, lower left, as whoever looks at it sees them."""
+    """The corners (4, 3) of the marker on a side, in its robot's frame (m): upper left, upper
+    right, lower right and lower left, as an observer sees them who faces the marker."""
     half, angle = 0.5 * vision.marker_m, SIDE_ANGLES[side]
     outwards = np.array([math.cos(angle), math.sin(angle), 0.0])
     right = np.array([-math.sin(angle), math.cos(angle), 0.0])
     up = np.array([0.0, 0.0, 1.0])
     middle = vision.marker_distance_m * outwards + vision.marker_mounted_m * up
-    corners: Floats = middle + half * np.stack(
-        [up - right, up + right, right - up, -right - up],
-    )
+    corners: Floats = middle + half * np.stack([up - right, up + right, right - up, -right - up])
     return corners
 
 
 def fit_pose(
     corners_by_side: Mapping[Side, Floats], vision: VisionSettings, camera: Camera
 ) -> PoseFit:
-    """The pose with the best fit to these sides.
+    """The pose with the least reprojection errors of all markers of a robot.
 
-    `seen`: corners (4, 2) by side, in the order of `side_corners`, on the plane z = 1 of the
-    camera's frame.
+    `corners_by_side`: the detected corners (4, 2) of each marker in the order of `side_corners`,
+    on the plane z = 1 of the camera frame.
     """
     shape = np.concatenate([side_corners(side, vision) for side in corners_by_side])
     plane = np.concatenate(list(corners_by_side.values()))
@@ -92,27 +93,26 @@ def _inverse(matrices: Floats) -> Floats:
     return np.linalg.inv(matrices).astype(np.float64, copy=False)
 
 
-def _noise(plane: Floats, s: CameraSettings) -> Floats:
-    """The covariance (2n, 2n) of points (n, 2): each errs on its own, and tilt, yaw and focal
-    length move all of them together."""
+def _corner_covariance(plane: Floats, s: CameraSettings) -> Floats:
+    """The covariance (2n, 2n) of corners (n, 2) on the plane z = 1. Each corner has an independent
+    error; the errors of tilt, yaw and focal length are common to all corners."""
     u, v = plane[:, 0], plane[:, 1]
     own = CORNER_SHARE * s.edge_sigma_px / np.array([s.fx_px, s.fy_px])
-    common = np.stack(
-        [
-            math.radians(s.tilt_sigma_deg) * np.stack([u * v, 1.0 + v * v], axis=1),
-            math.radians(s.yaw_sigma_deg) * np.stack([1.0 + u * u, u * v], axis=1),
-            s.focal_share * plane,
-        ]
-    ).reshape(3, -1)
-    noise: Floats = np.diag(np.tile(own * own, len(plane))) + common.T @ common
-    return noise
+    tilt = math.radians(s.tilt_sigma_deg) * np.stack([u * v, 1.0 + v * v], axis=1)
+    yaw = math.radians(s.yaw_sigma_deg) * np.stack([1.0 + u * u, u * v], axis=1)
+    common = np.stack([tilt, yaw, s.focal_share * plane]).reshape(3, -1)
+    covariance: Floats = np.diag(np.tile(own * own, len(plane))) + common.T @ common
+    return covariance
 
 
 def _initial_poses(
     corners_by_side: Mapping[Side, Floats], vision: VisionSettings, camera: Camera
 ) -> Floats:
-    """Two guesses (2, 3), turned to the left and to the right: from a marker's size, and by how
-    much it is narrower than high."""
+    """Two initial poses (2, 3), in which the first marker is turned to the left and to the right.
+
+    The distance follows from the height of the marker, the turn from the ratio of its width to its
+    height.
+    """
     side, corners = next(iter(corners_by_side.items()))
     above, right, below, left = np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1)
     narrow = min(1.0, (above + below) / (left + right))
@@ -121,26 +121,21 @@ def _initial_poses(
     ray = np.append(corners.mean(axis=0), 1.0)
     x, y, _ = camera.to_robot_frame(depth * ray[None])[0]
     back = math.atan2(camera.position[1] - y, camera.position[0] - x)
+    out, facings = vision.marker_distance_m, (back - turn, back + turn)
     return np.array(
-        [
-            [
-                x - vision.marker_distance_m * math.cos(facing),
-                y - vision.marker_distance_m * math.sin(facing),
-                facing - SIDE_ANGLES[side],
-            ]
-            for facing in (back - turn, back + turn)
-        ]
+        [(x - out * math.cos(a), y - out * math.sin(a), a - SIDE_ANGLES[side]) for a in facings]
     )
 
 
 class _Reprojection:
-    """The reprojection errors of poses of the shape (n, 3) against points of the plane (n, 2)."""
+    """The reprojection errors of a robot with corners `shape` (n, 3; m, its robot frame) against
+    the detected corners `plane` (n, 2) on the plane z = 1 of the camera frame."""
 
     def __init__(self, shape: Floats, plane: Floats, camera: Camera) -> None:
         axes = camera.robot_from_camera
         ahead, aside, up = shape.T
         self._plane = plane
-        self._weights = _inverse(_noise(plane, camera.settings))
+        self._weights = _inverse(_corner_covariance(plane, camera.settings))
         self._still = np.outer(up, axes[2]) - camera.position @ axes
         along = np.outer(ahead, axes[0]) + np.outer(aside, axes[1])
         across = np.outer(ahead, axes[1]) - np.outer(aside, axes[0])
@@ -148,28 +143,33 @@ class _Reprojection:
         self._axes = axes[:2].copy()
 
     def normal_equations(self, poses: Floats) -> Floats:
-        """Of each of the poses (k, 3), (4, 4): products of the slopes by x, y, heading and of what
-        is off, in sigmas. The first three are the information, the last is the squared error."""
+        """The products J' W J (k, 4, 4) for poses (k, 3).
+
+        The columns of J are the derivatives of the projected corners by x, y and heading, and the
+        residuals. W is the inverse of the covariance of the corners. So the upper left (3, 3) is
+        the information matrix, the last column its right-hand side, and the last element the
+        weighted squared error.
+        """
         cos, sin = np.cos(poses[:, 2]), np.sin(poses[:, 2])
-        turns = (
-            np.array([[cos, sin], [-sin, cos]]).transpose(0, 2, 1) @ self._rotated_point
-        ).reshape(2, len(poses), -1, 3)
+        turns = np.array([[cos, sin], [-sin, cos]]).transpose(0, 2, 1) @ self._rotated_point
+        turns = turns.reshape(2, len(poses), -1, 3)
         points = turns[0] + self._still + (poses[:, :2] @ self._axes)[:, None]
-        deep = np.maximum(points[..., 2:], NEAREST_M)
-        shown = points[..., :2] / deep
-        moves = np.empty((*shown.shape, 4))
-        moves[..., 0] = self._axes[0, :2] - shown * self._axes[0, 2]
-        moves[..., 1] = self._axes[1, :2] - shown * self._axes[1, 2]
-        moves[..., 2] = turns[1, ..., :2] - shown * turns[1, ..., 2:]
-        moves[..., :3] /= deep[..., None]
-        moves[..., 3] = self._plane - shown
-        flat = moves.reshape(len(poses), -1, 4)
+        depth = np.maximum(points[..., 2:], NEAREST_M)
+        projected = points[..., :2] / depth
+        jacobian = np.empty((*projected.shape, 4))
+        jacobian[..., 0] = self._axes[0, :2] - projected * self._axes[0, 2]
+        jacobian[..., 1] = self._axes[1, :2] - projected * self._axes[1, 2]
+        jacobian[..., 2] = turns[1, ..., :2] - projected * turns[1, ..., 2:]
+        jacobian[..., :3] /= depth[..., None]
+        jacobian[..., 3] = self._plane - projected
+        flat = jacobian.reshape(len(poses), -1, 4)
         normal_equations: Floats = flat.transpose(0, 2, 1) @ self._weights @ flat
         return normal_equations
 
 
 def _refine(poses: Floats, view: _Reprojection) -> tuple[Floats, Floats]:
-    """The results of Levenberg-Marquardt from each of the poses (k, 3), with their sums."""
+    """The poses (k, 3) after Levenberg-Marquardt from each of these, with their normal equations
+    (k, 4, 4)."""
     normal_equations, damping = view.normal_equations(poses), np.full(len(poses), 1e-3)
     for _ in range(STEPS):
         damped = normal_equations[:, :3, :3] * (1.0 + damping[:, None, None] * _DIAGONAL)
@@ -188,8 +188,12 @@ def _refine(poses: Floats, view: _Reprojection) -> tuple[Floats, Floats]:
 def _average_over_headings(
     poses: Floats, sigmas: Floats, pivot: Floats, view: _Reprojection
 ) -> tuple[Floats, Floats]:
-    """Mean (3) and covariance (3, 3) over all headings about those of the poses (k, 3), each with
-    the place that suits it best; `pivot`: a marker's middle in its robot's frame."""
+    """The mean (3,) and covariance (3, 3) of the pose over a grid of headings, which covers those
+    of the poses (k, 3) with their sigmas (k,).
+
+    For each heading, x and y minimize the error. `pivot` is the middle (2,) of a marker in its
+    robot's frame; its position barely depends on the heading.
+    """
     headings = poses[0, 2] + _wrap(poses[:, 2] - poses[0, 2])
     reach = 4.0 * np.minimum(sigmas, MOST_SIGMA)
     turns = np.linspace((headings - reach).min(), (headings + reach).max(), HEADINGS)
@@ -197,9 +201,8 @@ def _average_over_headings(
     tried = np.column_stack([middle - _rotated_point(pivot, turns), turns])
     for _ in range(2):
         normal_equations = view.normal_equations(tried)
-        tried[:, :2] += np.linalg.solve(normal_equations[:, :2, :2], normal_equations[:, :2, 3:])[
-            ..., 0
-        ]
+        matrices, sides = normal_equations[:, :2, :2], normal_equations[:, :2, 3:]
+        tried[:, :2] += np.linalg.solve(matrices, sides)[..., 0]
     normal_equations = view.normal_equations(tried)
     errors = normal_equations[:, 3, 3] - normal_equations[:, 3, 3].min()
     likely = np.where(errors < RIVAL, np.maximum(np.exp(-0.5 * errors), LEAST_WEIGHT), 0.0)
@@ -212,7 +215,7 @@ def _average_over_headings(
 
 
 def _rotated_point(point: Floats, angles: Floats) -> Floats:
-    """A point (2) of a robot's frame, seen from robots with these headings (n): (n, 2)."""
+    """A point (2,) of a robot's frame, rotated by each of these angles (n,): (n, 2)."""
     cos, sin = np.cos(angles), np.sin(angles)
     return np.column_stack([cos * point[0] - sin * point[1], sin * point[0] + cos * point[1]])
 

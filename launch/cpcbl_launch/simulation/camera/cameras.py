@@ -29,9 +29,8 @@ class Cameras:
     def __init__(self, team: Team, seed: int) -> None:
         self._scene = Scene.of(team)
         self._bare = self._scene.without_landmarks()
-        self._random = {
-            name: np.random.default_rng((seed, _SEED, i)) for i, name in enumerate(team.cameras)
-        }
+        names = enumerate(team.cameras)
+        self._random = {name: np.random.default_rng((seed, _SEED, i)) for i, name in names}
         light, self._noise = team.simulation.light, team.simulation.noise
         self._light = replace(light, noise=light.noise * self._noise)
         self._cameras = {
@@ -39,24 +38,16 @@ class Cameras:
             for name, random in self._random.items()
         }
         guards = team.transport.guards
-        largest = min(
-            guards.largest_frame_bytes if guards.enabled else LARGEST_FRAME, LARGEST_FRAME
-        )
-        self._largest = largest - HEAD_BYTES
+        allowed = guards.largest_frame_bytes if guards.enabled else LARGEST_FRAME
+        self._largest = min(allowed, LARGEST_FRAME) - HEAD_BYTES
 
     def frame(self, viewer: str, stamp_ns: int, poses: Mapping[str, Pose2], bare: bool) -> Frame:
         """What a robot's camera sees now, from among all that stand on the field; `bare`: no
         landmark can be seen."""
         others = [SceneRobot(name, *pose) for name, pose in poses.items() if name != viewer]
-        scene = self._bare if bare else self._scene
-        pixels = render(
-            scene,
-            Camera(with_mount_error(self._cameras[viewer], self._noise, self._random[viewer])),
-            poses[viewer],
-            others,
-            self._light,
-            self._random[viewer],
-        )
+        scene, random = self._bare if bare else self._scene, self._random[viewer]
+        camera = Camera(with_mount_error(self._cameras[viewer], self._noise, random))
+        pixels = render(scene, camera, poses[viewer], others, self._light, random)
         return Frame(stamp_ns, encode_jpeg_within(pixels, self._largest))
 
 

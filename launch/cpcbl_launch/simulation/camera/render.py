@@ -97,8 +97,7 @@ def _pinhole(settings: CameraSettings) -> _Pinhole | None:
     camera, (width, height) = Camera(settings), (settings.width_px, settings.height_px)
     u, v = np.meshgrid(np.arange(width, dtype=np.float64), np.arange(height, dtype=np.float64))
     plane = camera.undistort(np.column_stack([u.ravel(), v.ravel()]))
-    x = settings.fx_px * plane[:, 0]
-    y = settings.fy_px * plane[:, 1]
+    x, y = settings.fx_px * plane[:, 0], settings.fy_px * plane[:, 1]
     left, top = (max(math.floor(k.min()) - 2, -WIDEST * s) for k, s in ((x, width), (y, height)))
     right, bottom = (min(math.ceil(k.max()) + 2, WIDEST * s) for k, s in ((x, width), (y, height)))
     straight = replace(
@@ -109,10 +108,8 @@ def _pinhole(settings: CameraSettings) -> _Pinhole | None:
         cy_px=-float(top),
         distortion=(0.0,) * 5,
     )
-    maps = tuple(
-        (k - start).reshape(height, width).astype(np.float32) for k, start in ((x, left), (y, top))
-    )
-    return _Pinhole(Camera(straight), cv2.convertMaps(maps[0], maps[1], cv2.CV_16SC2))
+    map_x, map_y = (k.reshape(height, width).astype(np.float32) for k in (x - left, y - top))
+    return _Pinhole(Camera(straight), cv2.convertMaps(map_x, map_y, cv2.CV_16SC2))
 
 
 def _expose(picture: Pixels, light: Light, random: np.random.Generator) -> Pixels:
@@ -121,22 +118,17 @@ def _expose(picture: Pixels, light: Light, random: np.random.Generator) -> Pixel
     if light.brightness != 1.0 or light.gradient or light.tint != (1.0, 1.0, 1.0):
         gain = _gain(width, height, light.brightness, light.gradient, light.tint)
         picture = cv2.multiply(picture, gain, dtype=cv2.CV_8U).astype(np.uint8, copy=False)
-    if light.blur_px:
-        picture = _blur(picture, light.blur_px)
+    if light.blur_px:  # a Gaussian that is cut off beyond three sigma
+        side = 2 * max(1, round(3.0 * light.blur_px)) + 1
+        blurred = cv2.GaussianBlur(picture, (side, side), light.blur_px)
+        picture = blurred.astype(np.uint8, copy=False)
     if light.noise:
         left, top = (int(start) for start in random.integers(0, NOISE_MARGIN_PX, 2))
         window = slice(top, top + height), slice(left, left + width)
         above, below = _grain(width, height, light.noise)
-        picture = cv2.subtract(cv2.add(picture, above[window]), below[window]).astype(
-            np.uint8, copy=False
-        )
+        noisy = cv2.subtract(cv2.add(picture, above[window]), below[window])
+        picture = noisy.astype(np.uint8, copy=False)
     return picture
-
-
-def _blur(picture: Pixels, sigma_px: float) -> Pixels:
-    """With a Gaussian that is cut off beyond three sigma."""
-    side = 2 * max(1, round(3.0 * sigma_px)) + 1
-    return cv2.GaussianBlur(picture, (side, side), sigma_px).astype(np.uint8, copy=False)
 
 
 @lru_cache(maxsize=4)
@@ -153,9 +145,6 @@ def _gain(
 def _grain(width: int, height: int, sigma: float) -> tuple[Pixels, Pixels]:
     """Noise around zero: what is added to pixels, and what is taken from them."""
     size = height + NOISE_MARGIN_PX, width + NOISE_MARGIN_PX, 3
-    noise = np.random.default_rng(7).standard_normal(size, np.float32) * sigma
-    noise = np.round(noise)
-    return (
-        np.clip(noise, 0.0, 255.0).astype(np.uint8),
-        np.clip(-noise, 0.0, 255.0).astype(np.uint8),
-    )
+    noise = np.round(np.random.default_rng(7).standard_normal(size, np.float32) * sigma)
+    above, below = (np.clip(part, 0.0, 255.0).astype(np.uint8) for part in (noise, -noise))
+    return above, below
