@@ -20,10 +20,8 @@ from cpcbl_agents.node import STATUS_NS
 from cpcbl_agents.process import StopSignal
 from cpcbl_launch.lab.chaos.team import clock_starting_in
 from cpcbl_launch.lab.scaling import swarm_team
-from cpcbl_launch.run.processes import process_table
-from cpcbl_launch.run.supervisor import ProcessSpec, Supervisor
+from cpcbl_launch.run.processes import MIB, ProcessSpec, Supervisor, process_table, process_usage
 from cpcbl_launch.run.up import free_endpoint
-from cpcbl_launch.run.usage import MIB, process_usage
 from cpcbl_launch.team_file import save_resolved
 from cpcbl_team.config import CollaborationSettings, Team
 from cpcbl_team.inputs import Belief, Odometry

@@ -28,7 +28,7 @@ from rich.console import RenderableType
 
 from cpcbl_launch.lab.scaling import MOST_ROBOTS
 from cpcbl_launch.reporting.tables import number, table
-from cpcbl_launch.run.usage import require_process_usage
+from cpcbl_launch.run.processes import require_process_usage
 from cpcbl_team.errors import InputError
 
 KEPT = 0.95

@@ -10,7 +10,7 @@ from benchmarks.process_load import Load, Start
 from support.processes import command_line
 from support.tables import assert_fits
 
-from cpcbl_launch.run.usage import MIB, process_usage
+from cpcbl_launch.run.processes import MIB, process_usage
 from cpcbl_team.errors import InputError
 from cpcbl_transport.compact import BELIEF_BYTES
 

@@ -13,8 +13,7 @@ from support.processes import command_line, cpcbl_team
 
 from cpcbl_launch.commands.options import require_folder, require_writable_file
 from cpcbl_launch.reporting.recording import Recording, read_recording
-from cpcbl_launch.run.processes import PROGRAM
-from cpcbl_launch.run.supervisor import ProcessSpec, Supervisor
+from cpcbl_launch.run.processes import PROGRAM, ProcessSpec, Supervisor
 from cpcbl_launch.simulation.in_process import simulate
 from cpcbl_launch.team_file import TeamFileError, builtin_path, load_team, save_resolved
 from cpcbl_team.config import RobotSettings, Team

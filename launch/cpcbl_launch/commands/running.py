@@ -95,7 +95,7 @@ def up(
     console.print(f"watch it: {shlex.join(watch)}", style="dim", highlight=False, soft_wrap=True)
     title = f"team {run.team.name}, {len(run.team.robots)} robots, {speed:g} x real time"
     with LiveTable(title, run.team.robots, console, quiet=as_json) as table:
-        result = run_team(run, table, StopSignal(), launch)
+        result = run_team(run, table.show, StopSignal(), launch)
     lost = dict(result.not_written) | options.write_report(report, result)
     options.print_result(result, as_json, lambda: print_report(result, console), lost)
 

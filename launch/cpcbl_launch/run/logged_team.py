@@ -2,7 +2,6 @@
 
 import math
 import re
-from collections.abc import Collection
 from pathlib import Path
 from typing import NamedTuple
 
@@ -62,19 +61,19 @@ def load_logged_team(team: Team, folder: Path) -> LoggedTeam:
     names = [name for name in team.robots if name in there]
     if not names:
         raise mrclam.LogError(f"{folder}: has files for none of the robots {', '.join(left_out)}")
-    _require_log_source(team, names)
+    for name in names:
+        if (source := team.robots[name].source) != "mrclam":
+            raise InputError(
+                f'robots.{name}.source: {source}: reads no log; write source = "mrclam"'
+            )
     truth = {name: mrclam.read_truth(folder, name) for name in names}
     spans = {name: mrclam.odometry_span_ns(folder, name) for name in names}
     robots = {
         name: msgspec.structs.replace(team.robots[name], start=_start(folder, name, truth[name]))
         for name in names
     }
-    ready = msgspec.structs.replace(
-        team,
-        robots=robots,
-        map=Field(landmarks=mrclam.read_landmarks(folder)),
-        data=str(folder.resolve()),
-    )
+    field = Field(landmarks=mrclam.read_landmarks(folder))
+    ready = msgspec.structs.replace(team, robots=robots, map=field, data=str(folder.resolve()))
     start_ns = min(first for first, _ in spans.values())
     return LoggedTeam(ready, truth, left_out, start_ns, max(last for _, last in spans.values()))
 
@@ -85,15 +84,6 @@ def with_duration(logged: LoggedTeam, duration_s: float | None) -> LoggedTeam:
         return logged
     require_duration(duration_s, LEAST_S)
     return logged._replace(end_ns=min(logged.end_ns, logged.start_ns + int(duration_s * 1e9)))
-
-
-def _require_log_source(team: Team, names: Collection[str]) -> None:
-    for name in names:
-        source = team.robots[name].source
-        if source != "mrclam":
-            raise InputError(
-                f'robots.{name}.source: {source}: reads no log; write source = "mrclam"'
-            )
 
 
 def _start(folder: Path, robot: str, truth: Floats) -> Start | None:
@@ -112,10 +102,9 @@ def _start(folder: Path, robot: str, truth: Floats) -> Start | None:
             break
         whole_ns = piece.stamp_ns - piece.from_ns
         share = min(first_truth_ns - piece.from_ns, whole_ns) / whole_ns
-        odometry_from_robot = step(
-            odometry_from_robot, share * piece.distance_m, share * piece.turn_rad
-        )
-        way += abs(share * piece.distance_m)
+        distance_m, turn_rad = share * piece.distance_m, share * piece.turn_rad
+        odometry_from_robot = step(odometry_from_robot, distance_m, turn_rad)
+        way += abs(distance_m)
     pose, _ = interpolated_truth(np.array([first_truth_ns * 1e-9]), truth)
     x, y, heading = Pose2(*pose[0].tolist()) @ odometry_from_robot.inverse()
     return Start(x_m=x, y_m=y, heading_deg=math.degrees(heading), sigma_m=0.05 + 0.1 * way)

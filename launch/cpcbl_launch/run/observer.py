@@ -119,18 +119,16 @@ def team_with_observer(team: Team, request: ObserverRequest) -> Team:
             " left for a guest; take the limit away, or put the observer into the file"
         )
     source = request.source or _source_of(team)
-    shipped = request.sensor in presets()
-    path = Path(str(_shipped() / f"{request.sensor}.toml")) if shipped else Path(request.sensor)
-    if not shipped and not path.exists():
-        raise InputError(
-            f"--sensor {request.sensor}: no such file; write one, or {' or '.join(presets())}"
-        )
-    more = with_added_robot(
-        team, name, [_PLAIN, read_layer(path), _request_layer(request, source)], str(path)
-    )
+    path = Path(request.sensor)
+    if request.sensor in presets():
+        path = Path(str(_shipped() / f"{request.sensor}.toml"))
+    elif not path.exists():
+        known = " or ".join(presets())
+        raise InputError(f"--sensor {request.sensor}: no such file; write one, or {known}")
+    layers = [_PLAIN, read_layer(path), _request_layer(request, source)]
+    more = with_added_robot(team, name, layers, str(path))
     model = model_from_settings(more.robots[name])
-    reason = "" if model is None else unsupported_delay(model)
-    if reason:
+    if model is not None and (reason := unsupported_delay(model)):
         raise InputError(f"{path}: {reason}")
     return more
 
@@ -145,10 +143,8 @@ def _request_layer(request: ObserverRequest, source: str) -> dict[str, Any]:
     if request.fov_deg is not None:
         own["sensor"] = {"field_of_view_deg": request.fov_deg}
     if request.moves:
-        own |= {
-            "waypoints_m": [list(place) for place in request.moves],
-            "odometry": {"moves": True},
-        }
+        waypoints_m = [list(place) for place in request.moves]
+        own |= {"waypoints_m": waypoints_m, "odometry": {"moves": True}}
     return own
 
 

@@ -1,19 +1,31 @@
-"""THE table of processes of a run, on one machine or in containers."""
+"""The processes of a run: THE table of them, who starts and stops them, and what each has used."""
 
+import logging
 import os
+import signal
+import subprocess
 import sys
-from collections.abc import Collection
+import time
+from collections.abc import Collection, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import BinaryIO, NamedTuple, Protocol
 
 from cpcbl_agents.clock import Clock
-from cpcbl_launch.run.supervisor import ProcessSpec
 from cpcbl_team.config import Team
+from cpcbl_team.errors import DependencyError
 from cpcbl_transport.security import Identity
 from cpcbl_transport.topics import Role
 
+log = logging.getLogger(__name__)
+
 PROGRAM = (sys.executable, "-m", "cpcbl_launch")
 ROBOT = "robot-"
+FIRST_BACKOFF_S = 0.5
+LONGEST_BACKOFF_S = 8.0
+HEALTHY_S = 10.0
+PATIENCE_S = 3.0
+MIB = 2**20
+_PROC = Path("/proc")
 
 
 class Task(NamedTuple):
@@ -38,6 +50,14 @@ def tasks(team: Team, common: tuple[str, ...], seed: int, here: Collection[str])
     return rows
 
 
+class ProcessSpec(NamedTuple):
+    """A row of the table as a process of this machine."""
+
+    name: str
+    command: tuple[str, ...]
+    on_restart: tuple[str, ...] = ()  # added to the command from the second start on
+
+
 def process_table(
     team: Team, team_file: Path, endpoint: str, clock: Clock, seed: int, here: Collection[str]
 ) -> list[ProcessSpec]:
@@ -51,8 +71,162 @@ def process_table(
         for name, s in team.simulation.clocks_ahead_s.items()
     }
     return [
-        ProcessSpec(
-            task.name, (*PROGRAM, *task.arguments, *clocks.get(task.name, ())), task.on_restart
-        )
-        for task in tasks(team, common, seed, here)
+        ProcessSpec(name, (*PROGRAM, *arguments, *clocks.get(name, ())), on_restart)
+        for name, arguments, _, on_restart in tasks(team, common, seed, here)
     ]
+
+
+# Starting, watching and stopping them --------------------------------------------------------
+
+
+class Processes(Protocol):
+    """What runs a team's robots and field: processes of this machine, or containers."""
+
+    @property
+    def names(self) -> list[str]:
+        """All of them, in the order of the table."""
+
+    @property
+    def pids(self) -> dict[str, int]:
+        """Those that run at present."""
+
+    @property
+    def restarts(self) -> dict[str, int]:
+        """Those that were started again, and how often."""
+
+    def watch(self) -> None:
+        """To be called several times a second: starts again what has ended."""
+
+
+class _Child:
+    def __init__(self, spec: ProcessSpec, folder: Path) -> None:
+        self.spec, self.restarts, self.backoff_s = spec, 0, FIRST_BACKOFF_S
+        self.due_s: float | None = None
+        self._log = folder / f"{spec.name}.log"
+        self.process = self._start(())
+
+    def _start(self, more: tuple[str, ...]) -> "subprocess.Popen[bytes]":
+        self.started_s = time.monotonic()
+        with self._open_log() as output:
+            return subprocess.Popen(
+                [*self.spec.command, *more],
+                stdin=subprocess.DEVNULL,
+                stdout=output,
+                stderr=subprocess.STDOUT,
+                start_new_session=True,  # Ctrl-C reaches the supervisor only
+            )
+
+    def _open_log(self) -> BinaryIO:
+        try:
+            return self._log.open("ab")
+        except OSError as error:  # better a process without a log than none
+            log.warning("%s: not written: %s", self._log, error.strerror)
+            return Path(os.devnull).open("wb")
+
+    def _last_line(self) -> str:
+        try:
+            lines = self._log.read_text(errors="replace").splitlines()
+        except OSError as error:
+            return f"its log cannot be read: {error.strerror}"
+        return lines[-1] if lines else "it printed nothing"
+
+    def watch(self) -> None:
+        """Restarts the process some time after it ended, longer each time that it ends early."""
+        if self.process.poll() is None:
+            return
+        now = time.monotonic()
+        if self.due_s is None:
+            if now - self.started_s > HEALTHY_S:
+                self.backoff_s = FIRST_BACKOFF_S
+            name, code, wait_s = self.spec.name, self.process.returncode, self.backoff_s
+            last_line = f": {self._last_line()}" if code > 0 else ""
+            log.warning("%s ended (%s)%s; again in %g s", name, code, last_line, wait_s)
+            self.due_s = now + self.backoff_s
+            self.backoff_s = min(2.0 * self.backoff_s, LONGEST_BACKOFF_S)
+        elif now >= self.due_s:
+            self.due_s = None
+            self.restarts += 1
+            self.process = self._start(self.spec.on_restart)
+
+
+class Supervisor:
+    """The processes of a run; a context manager that leaves none behind."""
+
+    def __init__(self, table: Sequence[ProcessSpec], folder: Path) -> None:
+        self._table, self._folder = table, folder
+        self._children: dict[str, _Child] = {}
+
+    def __enter__(self) -> "Supervisor":
+        try:
+            for spec in self._table:
+                self._children[spec.name] = _Child(spec, self._folder)
+        except BaseException:
+            self.stop()
+            raise
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.stop()
+
+    def watch(self) -> None:
+        """To be called several times a second."""
+        for child in self._children.values():
+            child.watch()
+
+    @property
+    def names(self) -> list[str]:
+        """All processes, in the order of the table."""
+        return list(self._children)
+
+    @property
+    def pids(self) -> dict[str, int]:
+        """The processes that run at present."""
+        children = self._children.items()
+        return {name: c.process.pid for name, c in children if c.process.poll() is None}
+
+    @property
+    def restarts(self) -> dict[str, int]:
+        return {n: c.restarts for n, c in self._children.items() if c.restarts}
+
+    def stop(self) -> None:
+        """SIGINT to all, a bounded wait, then SIGKILL."""
+        running = [c.process for c in self._children.values() if c.process.poll() is None]
+        for process in running:
+            process.send_signal(signal.SIGINT)
+        until = time.monotonic() + PATIENCE_S
+        for process in running:
+            try:
+                process.wait(max(0.0, until - time.monotonic()))
+            except subprocess.TimeoutExpired:
+                log.warning("pid %d did not stop within %.0f s", process.pid, PATIENCE_S)
+                process.kill()
+                process.wait()
+
+
+# What a process has used, from /proc (Linux) -----------------------------------------------------
+
+
+class Usage(NamedTuple):
+    """Of one process, up to now."""
+
+    cpu_s: float  # user and system
+    resident_bytes: int
+    proportional_bytes: int  # pages that n processes share count 1 / n
+    own_bytes: int  # no file's pages: heap and stacks, whoever else runs
+
+
+def require_process_usage(what: str) -> None:
+    """Raises DependencyError where processes cannot be measured."""
+    if not (_PROC / "self" / "smaps_rollup").exists():
+        raise DependencyError(f"{what} needs /proc/PID/smaps_rollup: run it on Linux")
+
+
+def process_usage(pid: int) -> Usage:
+    """Raises OSError when there is no such process."""
+    stat = (_PROC / str(pid) / "stat").read_text()
+    fields = stat.rpartition(")")[2].split()  # the name before it may hold anything
+    user, system = int(fields[11]), int(fields[12])
+    lines = (_PROC / str(pid) / "smaps_rollup").read_text().splitlines()[1:]
+    kib = {name: int(rest.split()[0]) for name, rest in (line.split(":") for line in lines)}
+    resident, proportional, own = (kib[name] * 1024 for name in ("Rss", "Pss", "Anonymous"))
+    return Usage((user + system) / os.sysconf("SC_CLK_TCK"), resident, proportional, own)

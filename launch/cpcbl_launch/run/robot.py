@@ -11,7 +11,6 @@ from pathlib import Path
 from cpcbl_agents.clock import Clock
 from cpcbl_launch.checks import require_endpoints, require_robots, require_team_opencv
 from cpcbl_launch.team_file import find_team
-from cpcbl_team.config import Team
 from cpcbl_transport.bus import Bus
 
 DESCRIPTION = "Run one robot, on any machine, until SIGINT, SIGTERM or SIGHUP."
@@ -60,7 +59,9 @@ def run_robot_command(
     """
     from cpcbl_agents.process import StopSignal, run_robot  # for other commands it costs 0.1 s
 
-    team = _team_with(arguments.name, arguments.team)
+    team = find_team(arguments.team)
+    require_robots(str(arguments.team), [arguments.name], team)
+    require_team_opencv(team, [arguments.name])
     require_endpoints("--connect", arguments.connect or ())
     clock = Clock.parse(arguments.clock) if arguments.clock else Clock.wall()
     run_robot(
@@ -77,10 +78,3 @@ def run_robot_command(
 def main(arguments: Sequence[str]) -> None:
     """Parses the arguments that follow `robot`, and runs the robot."""
     run_robot_command(robot_parser().parse_args(arguments))
-
-
-def _team_with(name: str, path: Path) -> Team:
-    team = find_team(path)
-    require_robots(str(path), [name], team)
-    require_team_opencv(team, [name])
-    return team

@@ -34,9 +34,8 @@ def team_router(
 
 def config_text(config: Mapping[str, Any], title: str) -> str:
     """The configuration as a JSON5 file."""
-    return f"// {title}\n// zenohd -c FILE, or cpcbl-team router --config FILE\n" + json.dumps(
-        config, indent=2
-    )
+    head = f"// {title}\n// zenohd -c FILE, or cpcbl-team router --config FILE\n"
+    return head + json.dumps(config, indent=2)
 
 
 def run_router(config: Mapping[str, Any], title: str, stop: Callable[[], bool]) -> None:

@@ -5,7 +5,7 @@ import socket
 import tempfile
 import time
 from collections.abc import Callable, Collection, Mapping, Sequence
-from contextlib import AbstractContextManager, ExitStack
+from contextlib import AbstractContextManager, nullcontext
 from functools import partial
 from pathlib import Path
 from types import MappingProxyType
@@ -22,8 +22,7 @@ from cpcbl_launch.reporting.phases import Span, guest_reports, phase_report
 from cpcbl_launch.reporting.recorder import Recorder, Report, variants_of
 from cpcbl_launch.reporting.recording import Recording
 from cpcbl_launch.run.logged_team import is_calibrated_on
-from cpcbl_launch.run.processes import process_table, tasks
-from cpcbl_launch.run.supervisor import Processes, Supervisor
+from cpcbl_launch.run.processes import Processes, Supervisor, process_table, tasks
 from cpcbl_launch.simulation.in_process import Progress, simulate
 from cpcbl_launch.team_file import save_resolved
 from cpcbl_team.config import Team
@@ -43,6 +42,9 @@ REFRESH_S = 0.25
 SIMULATED_S = 30.0  # by default
 LEAST_S = 1.0
 
+Stop = Callable[[], bool]
+Show = Callable[[Recorder, Processes, float], None]  # of a run to a person, and its seconds so far
+
 
 class Run(NamedTuple):
     """What is to be run."""
@@ -58,16 +60,6 @@ class Run(NamedTuple):
     folder: Path | None = None  # where processes write their logs; None: a temporary folder
     picture: Path | None = None  # the picture of the run to write (PNG or SVG)
     record: Path | None = None  # the recording of the run to write (MCAP)
-
-
-class View(Protocol):
-    """Shows a run to a person."""
-
-    def show(self, recorder: Recorder, processes: Processes, elapsed_s: float) -> None: ...
-
-
-class Stopping(Protocol):
-    def __call__(self) -> bool: ...
 
 
 class Launcher(Protocol):
@@ -87,7 +79,7 @@ class Launcher(Protocol):
 class OnThisMachine:
     """The router in this process, everybody else in a process of its own."""
 
-    def __init__(self, run: Run, folder: Path, stop: Stopping) -> None:
+    def __init__(self, run: Run, folder: Path, stop: Stop) -> None:
         self._run, self._folder = run, folder
         self._here = run.team.robots if run.here is None else run.here
         cameras = sum(name in self._here for name in run.team.cameras)
@@ -108,7 +100,7 @@ class OnThisMachine:
         return Supervisor(table, self._folder)
 
 
-Launch = Callable[[Run, Path, Stopping], Launcher]
+Launch = Callable[[Run, Path, Stop], Launcher]
 
 
 def require_keys(team: Team, listen: Sequence[str], here: Collection[str]) -> None:
@@ -138,10 +130,10 @@ def local_endpoint(listen: str) -> str:
     return listen.replace("/0.0.0.0:", "/127.0.0.1:").replace("/[::]:", "/[::1]:")
 
 
-def run_team(run: Run, view: View, stop: Stopping, launch: Launch = OnThisMachine) -> Report:
+def run_team(run: Run, show: Show, stop: Stop, launch: Launch = OnThisMachine) -> Report:
     """Runs a team until its time is over or `stop()`. Raises BusError without a router."""
     with tempfile.TemporaryDirectory(prefix="cpcbl-") as temporary:
-        return _run_in(run, view, stop, run.folder or Path(temporary), launch)
+        return _run_in(run, show, stop, run.folder or Path(temporary), launch)
 
 
 def simulate_run(run: Run, progress: Progress | None = None) -> Report:
@@ -161,16 +153,14 @@ def simulate_run(run: Run, progress: Progress | None = None) -> Report:
     return _report(run, recorder, 0.0, duration_s, {})
 
 
-def _run_in(run: Run, view: View, stop: Stopping, folder: Path, launch: Launch) -> Report:
+def _run_in(run: Run, show: Show, stop: Stop, folder: Path, launch: Launch) -> Report:
     run = run._replace(team=with_listen_endpoint(run.team))
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"{folder}: {error.strerror}; robots read their team there") from error
-    launcher, recording = launch(run, folder, stop), None
-    with launcher.router() as bus, ExitStack() as stack:
-        if run.record is not None:
-            recording = stack.enter_context(_recording(run, run.record, bus))
+    launcher = launch(run, folder, stop)
+    with launcher.router() as bus, _recording(run, bus) as recording:
         recorder = Recorder(bus)
         clock = _clock(run, launcher.lead_s)
         with launcher.processes(clock) as processes:
@@ -180,7 +170,7 @@ def _run_in(run: Run, view: View, stop: Stopping, folder: Path, launch: Launch) 
                 if end_ns is not None and elapsed_ns >= end_ns:
                     break
                 processes.watch()
-                view.show(recorder, processes, elapsed_ns * 1e-9)
+                show(recorder, processes, elapsed_ns * 1e-9)
                 time.sleep(REFRESH_S)
             elapsed_s = (clock.now_ns() - clock.epoch_ns) * 1e-9
             restarts = processes.restarts
@@ -197,18 +187,17 @@ def _clock(run: Run, lead_s: float) -> Clock:
     return Clock(epoch_ns, time.monotonic_ns() + lead_ns, run.speed)
 
 
-def _recording(run: Run, path: Path, bus: Bus) -> Recording:
+def _recording(run: Run, bus: Bus) -> AbstractContextManager[Recording | None]:
+    if run.record is None:
+        return nullcontext()
     replayed = [name for name, robot in run.team.robots.items() if robot.source == "mrclam"]
     if replayed:
-        log.warning(
-            "%s: without the inputs of %s: robots that replay a log do not publish them",
-            path,
-            ", ".join(replayed),
-        )
+        what = f"{run.record}: without the inputs of {', '.join(replayed)}"
+        log.warning("%s: robots that replay a log do not publish them", what)
     try:
-        return Recording(path, run.team, bus)
+        return Recording(run.record, run.team, bus)
     except OSError as error:
-        raise InputError(f"--record {path}: {error.strerror}; name another file") from error
+        raise InputError(f"--record {run.record}: {error.strerror}; name another file") from error
 
 
 def _report(
@@ -221,12 +210,13 @@ def _report(
     begin_s = -np.inf if helped_from_s is None else helped_from_s
     guests = guest_reports(recorder, list(robots), truth, epoch_s, begin_s)
     lost: dict[str, str] = {}
-    if (picture := run.picture) is not None:
+    if run.picture is not None:
         from cpcbl_launch.reporting.picture import draw_run
 
         present_s = {name: guest.present_s for name, guest in guests.items()}
-        drawn = partial(draw_run, recorder, run.team, truth, picture, epoch_s, helped_from_s)
-        lost = write_or_reason(picture, partial(drawn, present_s))
+        times = epoch_s, helped_from_s, present_s
+        drawn = partial(draw_run, recorder, run.team, truth, run.picture, *times)
+        lost = write_or_reason(run.picture, drawn)
     report = recorder.report(variants_of(run.team), truth, begin_s)
     alone = {}
     if helped_from_s is not None:

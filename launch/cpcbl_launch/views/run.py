@@ -24,8 +24,7 @@ from cpcbl_launch.reporting.recorder import (
 from cpcbl_launch.reporting.statuses import distrust_text, trust_remarks
 from cpcbl_launch.reporting.tables import number, percent, short, table
 from cpcbl_launch.run.observer import ObserverReport
-from cpcbl_launch.run.processes import ROBOT
-from cpcbl_launch.run.supervisor import Processes
+from cpcbl_launch.run.processes import ROBOT, Processes
 from cpcbl_launch.views.live import LiveView
 from cpcbl_launch.views.traffic_tables import COLUMNS_EXPLAINED, help_traffic_table, limits_text
 from cpcbl_team.tiers import LOWEST_TIER

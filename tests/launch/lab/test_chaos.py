@@ -37,10 +37,8 @@ from cpcbl_launch.lab.chaos.team import (
     router_spec,
     run_team_under_test,
 )
-from cpcbl_launch.run.processes import PROGRAM
-from cpcbl_launch.run.supervisor import Supervisor
+from cpcbl_launch.run.processes import MIB, PROGRAM, Supervisor, process_usage
 from cpcbl_launch.run.up import free_endpoint
-from cpcbl_launch.run.usage import MIB, process_usage
 from cpcbl_launch.team_file import save_resolved
 from cpcbl_transport import topics
 from cpcbl_transport.topics import Qos

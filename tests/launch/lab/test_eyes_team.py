@@ -8,7 +8,7 @@ import msgspec
 import pytest
 
 from cpcbl_launch.reporting.recorder import Recorder, Report
-from cpcbl_launch.run.supervisor import Processes
+from cpcbl_launch.run.processes import Processes
 from cpcbl_launch.run.up import Run, run_team, with_listen_endpoint
 from cpcbl_launch.simulation.in_process import simulate
 from cpcbl_launch.team_file import builtin_path, load_team
@@ -95,7 +95,7 @@ class Watching:
 def test_processes_with_cameras_are_localized_over_a_real_router(tmp_path: Path) -> None:
     watching, until = Watching(), time.monotonic() + 120.0
     run = Run(eyes(), None, seed=2, folder=tmp_path)
-    report = run_team(run, watching, lambda: watching.done or time.monotonic() > until)
+    report = run_team(run, watching.show, lambda: watching.done or time.monotonic() > until)
     logs = "".join(f"\n{p.name}:\n{p.read_text()}" for p in tmp_path.glob("*.log"))
     assert watching.done, f"{watching.frames}{logs}"
     for name, robot in report.robots.items():

@@ -22,7 +22,7 @@ from cpcbl_launch.reporting.phases import (
     split_by_presence,
 )
 from cpcbl_launch.reporting.recorder import MeanScore, Recorder, Report, TeamReport
-from cpcbl_launch.run.supervisor import Supervisor
+from cpcbl_launch.run.processes import Supervisor
 from cpcbl_launch.views.run import LiveTable, print_report
 from cpcbl_transport import topics
 from cpcbl_transport.memory_bus import MemoryHub

@@ -90,7 +90,7 @@ class Team3:
         view = View(*steps)
         try:
             report = run_team(
-                Run(self.team, limit_s, seed=3, folder=self.folder / "logs"), view, view.done
+                Run(self.team, limit_s, seed=3, folder=self.folder / "logs"), view.show, view.done
             )
         finally:
             for process in self.observers:

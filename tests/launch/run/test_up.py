@@ -14,8 +14,7 @@ from support.buses import Subscription, robot_at, team_of, wait_until
 from support.processes import command_of, eventually
 
 from cpcbl_launch.reporting.recorder import Recorder, Report
-from cpcbl_launch.run.processes import PROGRAM
-from cpcbl_launch.run.supervisor import Processes, ProcessSpec, Supervisor
+from cpcbl_launch.run.processes import PROGRAM, Processes, ProcessSpec, Supervisor
 from cpcbl_launch.run.up import Run, free_endpoint, run_team
 from cpcbl_launch.team_file import builtin_path, load_team, save_resolved
 from cpcbl_team.config import GuardSettings, Team, TransportSettings
@@ -57,7 +56,7 @@ def run(script: Script, team: Team, folder: Path, limit_s: float = 60.0) -> Repo
     until = time.monotonic() + limit_s
     report = run_team(
         Run(team, None, seed=3, folder=folder),
-        script,
+        script.show,
         lambda: script.done() or time.monotonic() > until,
     )
     logs = "".join(f"\n{p.name}:\n{p.read_text()}" for p in folder.glob("*.log"))
@@ -222,5 +221,5 @@ def test_the_router_of_a_run_has_the_teams_guards(tmp_path: Path) -> None:
         return True
 
     script = Script(flooded)
-    run_team(Run(team, None, folder=tmp_path, here=()), script, script.done)
+    run_team(Run(team, None, folder=tmp_path, here=()), script.show, script.done)
     assert script.done()

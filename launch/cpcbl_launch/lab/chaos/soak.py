@@ -20,7 +20,7 @@ from cpcbl_launch.lab.chaos.team import (
     demo_team,
     run_team_under_test,
 )
-from cpcbl_launch.run.usage import MIB, process_usage, require_process_usage
+from cpcbl_launch.run.processes import MIB, process_usage, require_process_usage
 
 FAULTS = {
     "kill": injectors.kill,

@@ -16,8 +16,7 @@ from cpcbl_agents.clock import Clock
 from cpcbl_launch.lab.chaos.links import Relay, TunLink
 from cpcbl_launch.lab.chaos.run_log import RunLog, RunRecorder
 from cpcbl_launch.lab.faulty_robot import faulty_command
-from cpcbl_launch.run.processes import PROGRAM, process_table
-from cpcbl_launch.run.supervisor import ProcessSpec, Supervisor
+from cpcbl_launch.run.processes import PROGRAM, ProcessSpec, Supervisor, process_table
 from cpcbl_launch.run.up import free_endpoint
 from cpcbl_launch.team_file import builtin_path, load_team, save_resolved
 from cpcbl_team.config import Team

@@ -34,8 +34,7 @@ from cpcbl_launch.run.containers.docker import (
 )
 from cpcbl_launch.run.containers.fleet import ContainerSupervisor, Project
 from cpcbl_launch.run.observer import presets
-from cpcbl_launch.run.processes import tasks
-from cpcbl_launch.run.supervisor import Processes
+from cpcbl_launch.run.processes import Processes, tasks
 from cpcbl_launch.run.up import Run, local_endpoint, require_keys
 from cpcbl_launch.team_file import save_resolved
 from cpcbl_team.config import Team
