@@ -170,7 +170,7 @@ class Recorder:
         self.truths: EncodedLog[Truths] = EncodedLog()
         self.counts: Counter[str] = Counter()
         """Accepted messages by topic, and refused ones by reason."""
-        self._earlier_processes: dict[str, list[Status]] = {}
+        self._processes: dict[str, dict[str, Status]] = {}  # the last status by incarnation
         for topic in (topics.TRACK, topics.STATUS, topics.TRUTH):
             bus.subscribe(topic.at(), self._receive)
 
@@ -183,10 +183,8 @@ class Recorder:
                 case Track():
                     self.tracks.setdefault(message.robot, EncodedLog()).append(payload)
                 case Status():
-                    before = self.status.get(message.robot)
-                    if before is not None and before.incarnation != message.incarnation:
-                        self._earlier_processes.setdefault(message.robot, []).append(before)
                     self.status[message.robot] = message
+                    self._processes.setdefault(message.robot, {})[message.incarnation] = message
                 case Truths():
                     self.truths.append(payload)
 
@@ -245,9 +243,10 @@ class Recorder:
         _, _, last_truth = self.latest()
         figures = score(self.samples(name, truth, from_s))
         tracks = list(self.tracks.get(name, ()))
-        statuses = list(self._earlier_processes.get(name, ()))
-        if name in self.status:
-            statuses.append(self.status[name])
+        statuses = list(self._processes.get(name, {}).values())
+        counts = Counter[str]()
+        for status in statuses:
+            counts.update(status.counts)
         return RobotReport(
             **msgspec.structs.asdict(figures),
             variant=variant,
@@ -259,7 +258,7 @@ class Recorder:
             bytes_sent=sum(s.bytes_sent for s in statuses),
             messages_received=sum(s.messages_received for s in statuses),
             bytes_received=sum(s.bytes_received for s in statuses),
-            counts=_summed_counts(statuses),
+            counts=dict(sorted(counts.items())),
             learned=_learned_report(statuses),
             sent=summed_flows(s.sent for s in statuses),
             heard=summed_flows(s.heard for s in statuses),
@@ -291,13 +290,6 @@ def _longest_lost_s(tracks: list[Track]) -> float:
         since_ns = track.stamp_ns if since_ns is None else since_ns
         longest_ns = max(longest_ns, track.stamp_ns - since_ns)
     return longest_ns * 1e-9
-
-
-def _summed_counts(statuses: list[Status]) -> dict[str, int]:
-    total = Counter[str]()
-    for status in statuses:
-        total.update(status.counts)
-    return dict(sorted(total.items()))
 
 
 def _learned_report(statuses: Sequence[Status]) -> LearnedReport | None:

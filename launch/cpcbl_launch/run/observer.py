@@ -175,8 +175,7 @@ def run_observer(
         open_bus(team.name, link.endpoints, stop, link.credentials) as bus,
     ):
         _require_unique_name(name, bus, stop)
-        start_ns = clock.now_ns()
-        incarnation = new_incarnation()
+        start_ns, incarnation = clock.now_ns(), new_incarnation()
         node = GuestNode(
             name, team, bus, start_ns, incarnation, loop.on_arrival, clock.speed, camera
         )
@@ -184,7 +183,18 @@ def run_observer(
         loop.run(node, lambda: over() or clock.now_ns() - start_ns >= duration_s * 1e9)
         end_ns = clock.now_ns()
         node.leave(end_ns)
-    return _observer_report(node, team, (end_ns - start_ns) * 1e-9)
+    latest = node.robot.collaboration.latest
+    return ObserverReport(
+        name=name,
+        team=team.name,
+        seconds=(end_ns - start_ns) * 1e-9,
+        position_sigma_m=None if latest is None else latest.estimate.position_sigma_m,
+        lost="" if latest is None else latest.lost,
+        unfed=node.missing_input,
+        sent=summed_flows([node.robot.collaboration.counters.flows()]),
+        heard=summed_flows([node.received.flows()]),
+        counts=dict(node.robot.counts + node.counts),
+    )
 
 
 def _require_unique_name(name: str, bus: Bus, stop: Callable[[], bool]) -> None:
@@ -196,18 +206,3 @@ def _require_unique_name(name: str, bus: Bus, stop: Callable[[], bool]) -> None:
     watch.close()
     if found:
         raise InputError(f"observer {name}: the team has one of this name; choose another one")
-
-
-def _observer_report(node: GuestNode, team: Team, seconds: float) -> ObserverReport:
-    latest = node.robot.collaboration.latest
-    return ObserverReport(
-        name=node.robot.name,
-        team=team.name,
-        seconds=seconds,
-        position_sigma_m=None if latest is None else latest.estimate.position_sigma_m,
-        lost="" if latest is None else latest.lost,
-        unfed=node.missing_input,
-        sent=summed_flows([node.robot.collaboration.counters.flows()]),
-        heard=summed_flows([node.received.flows()]),
-        counts=dict(node.robot.counts + node.counts),
-    )

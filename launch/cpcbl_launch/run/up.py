@@ -161,8 +161,9 @@ def _run_in(run: Run, show: Show, stop: Stop, folder: Path, launch: Launch) -> R
         raise InputError(f"{folder}: {error.strerror}; robots read their team there") from error
     launcher = launch(run, folder, stop)
     with launcher.router() as bus, _recording(run, bus) as recording:
-        recorder = Recorder(bus)
-        clock = _clock(run, launcher.lead_s)
+        recorder, lead_ns = Recorder(bus), int(launcher.lead_s * 1e9)
+        epoch_ns = time.time_ns() + lead_ns if run.epoch_ns is None else run.epoch_ns
+        clock = Clock(epoch_ns, time.monotonic_ns() + lead_ns, run.speed)
         with launcher.processes(clock) as processes:
             end_ns = None if run.duration_s is None else int(run.duration_s * 1e9)
             while not stop():
@@ -179,12 +180,6 @@ def _run_in(run: Run, show: Show, stop: Stop, folder: Path, launch: Launch) -> R
         lost = {**report.not_written, str(run.record): recording.failed}
         report = msgspec.structs.replace(report, not_written=lost)
     return report
-
-
-def _clock(run: Run, lead_s: float) -> Clock:
-    lead_ns = int(lead_s * 1e9)
-    epoch_ns = time.time_ns() + lead_ns if run.epoch_ns is None else run.epoch_ns
-    return Clock(epoch_ns, time.monotonic_ns() + lead_ns, run.speed)
 
 
 def _recording(run: Run, bus: Bus) -> AbstractContextManager[Recording | None]:

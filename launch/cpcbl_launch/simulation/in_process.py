@@ -44,8 +44,8 @@ def simulate(
     """A simulated team, field and robots in one process, with guests that come and go.
 
     `truth` is the team as it really is, where that is not what its robots believe; a `referee` may
-    end the run before its time; `record` is the file to record it into; `through` is what stands
-    between a robot and its bus.
+    end the run before its time; `record` is the file to record it into; `bus_wrappers`
+    put something between a robot and its bus.
     """
     hub, end_ns = MemoryHub(), int(duration_s * 1e9)
     recorder = Recorder(hub.session())

@@ -60,7 +60,10 @@ class LiveTable(LiveView):
         pids, restarts = processes.pids, processes.restarts
         here = [n.removeprefix(ROBOT) for n in processes.names if n.startswith(ROBOT)]
         newest_ns = max((t.stamp_ns for t in tracks.values()), default=0)
-        for name in [*here, *sorted(tracks.keys() - set(here), key=self._guests_last)]:
+        others = sorted(
+            tracks.keys() - set(here), key=lambda name: (name not in self._robots, name)
+        )
+        for name in [*here, *others]:  # guests last
             process = f"{ROBOT}{name}"
             pid = str(pids[process]) if process in pids else "down" if name in here else "away"
             state = _state(tracks.get(name), pid, restarts.get(process, 0))
@@ -75,9 +78,6 @@ class LiveTable(LiveView):
         if not self.fits(shown):
             shown.padding = (0, 0)  # closer together, before a state is folded
         return shown
-
-    def _guests_last(self, name: str) -> tuple[bool, str]:
-        return name not in self._robots, name
 
 
 def _state(track: Track | None, pid: str, restarts: int) -> Text:

@@ -71,9 +71,7 @@ def _traffic_cells(robots: Sequence[RobotReport], duration_s: float) -> list[str
 
 def _not_sent(flows: Sequence[FlowReport]) -> list[str]:
     """The cells below NOT_SENT."""
-    return [
-        short(sum(getattr(f, n) for f in flows)) for n in ("over_budget", "worthless", "silent")
-    ]
+    return [short(sum(getattr(flow, name) for flow in flows)) for name in NOT_SENT.values()]
 
 
 def limit_text(s: SpendingReport) -> Text:

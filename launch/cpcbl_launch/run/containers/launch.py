@@ -8,7 +8,7 @@ import secrets
 import subprocess
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -35,7 +35,7 @@ from cpcbl_launch.run.containers.docker import (
 from cpcbl_launch.run.containers.fleet import ContainerSupervisor, Project
 from cpcbl_launch.run.observer import presets
 from cpcbl_launch.run.processes import Processes, tasks
-from cpcbl_launch.run.up import Run, local_endpoint, require_keys
+from cpcbl_launch.run.up import Run, Stop, local_endpoint, require_keys
 from cpcbl_launch.team_file import save_resolved
 from cpcbl_team.config import Team
 from cpcbl_team.errors import InputError
@@ -63,7 +63,7 @@ class InContainers:
         self,
         run: Run,
         folder: Path,
-        stop: Callable[[], bool],
+        stop: Stop,
         image: str | None,
         base: str,
         print_line: PrintLine,
@@ -191,12 +191,7 @@ def _replays(team: Team) -> bool:
 
 
 def run_observer_container(
-    name: str,
-    team: Team,
-    sensor: str,
-    arguments: Sequence[str],
-    image: str,
-    stop: Callable[[], bool],
+    name: str, team: Team, sensor: str, arguments: Sequence[str], image: str, stop: Stop
 ) -> int:
     """Runs `cpcbl-team observer NAME ARGUMENTS` in a container until it ends or `stop()`.
 
