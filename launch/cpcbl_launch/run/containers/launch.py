@@ -16,22 +16,7 @@ import msgspec
 from rich.console import Console
 
 from cpcbl_agents.clock import Clock
-from cpcbl_launch.run.containers.compose import (
-    Deployment,
-    Mount,
-    compose_text,
-    extras_of,
-    key_owner,
-)
-from cpcbl_launch.run.containers.docker import (
-    DockerError,
-    PrintLine,
-    check_daemon,
-    compose_program,
-    ensure_image,
-    fetch_image,
-    run_command,
-)
+from cpcbl_launch.run.containers import compose, docker
 from cpcbl_launch.run.containers.fleet import ContainerSupervisor, Project
 from cpcbl_launch.run.observer import presets
 from cpcbl_launch.run.processes import Processes, tasks
@@ -66,17 +51,21 @@ class InContainers:
         stop: Stop,
         image: str | None,
         base: str,
-        print_line: PrintLine,
+        print_line: docker.PrintLine,
     ) -> None:
         """`image`: the one to use; None: of these sources, on `base`. Raises DockerError."""
         self._here = run.team.robots if run.here is None else run.here
         require_keys(run.team, run.team.transport.listen, self._here)
-        check_daemon()
-        program = compose_program()
+        docker.check_daemon()
+        program = docker.compose_program()
         self._run, self._folder, self._stop, self._print_line = run, folder, stop, print_line
         if image is not None:
-            fetch_image(image, stop, print_line, "leave --image out to build one of these sources")
-        self._image = image or ensure_image(base, stop, print_line, extras_of(run.team))
+            docker.fetch_image(
+                image, stop, print_line, "leave --image out to build one of these sources"
+            )
+        self._image = image or docker.ensure_image(
+            base, stop, print_line, compose.extras_of(run.team)
+        )
         self.lead_s = LEAD_S + LEAD_S_A_CONTAINER * len(self._here)
         self._file = folder / "compose.yaml"
         name = re.sub(r"[^a-z0-9_-]", "-", run.team.name.lower())
@@ -113,7 +102,9 @@ class InContainers:
             return open_bus(self._run.team.name, link.endpoints, give_up, link.credentials)
         except BusError as error:
             last_line = self._project.last_log_line("router")
-            raise DockerError(f"{error}; the router's container printed: {last_line}") from error
+            raise docker.DockerError(
+                f"{error}; the router's container printed: {last_line}"
+            ) from error
 
     @contextmanager
     def processes(self, clock: Clock) -> Iterator[Processes]:
@@ -132,25 +123,27 @@ class InContainers:
 
     def _write(self, clock: str) -> None:
         run, team = self._run, self._run.team
-        mounts = [Mount(str((self._folder / "team.json").resolve()), INSIDE)]
+        mounts = [compose.Mount(str((self._folder / "team.json").resolve()), INSIDE)]
         if _replays(team):
-            mounts.append(Mount(str(Path(team.data).resolve()), DATA_INSIDE))
-        how = Deployment(
+            mounts.append(compose.Mount(str(Path(team.data).resolve()), DATA_INSIDE))
+        how = compose.Deployment(
             INSIDE,
             self._image,
             published=tuple(map(published_port, team.transport.listen)),
             mounts=tuple(mounts),
-            keys=Mount(team.transport.keys, KEYS_INSIDE) if team.transport.secured else None,
-            user=key_owner(team, Identity(Role.ROUTER)),
+            keys=compose.Mount(team.transport.keys, KEYS_INSIDE)
+            if team.transport.secured
+            else None,
+            user=compose.key_owner(team, Identity(Role.ROUTER)),
             seed=run.seed,
             speed=run.speed,
             clock=clock,
             here=self._here,
         )
-        self._file.write_text(compose_text(team, how), encoding="utf-8")
+        self._file.write_text(compose.compose_text(team, how), encoding="utf-8")
 
 
-def line_printer(console: Console) -> PrintLine:
+def line_printer(console: Console) -> docker.PrintLine:
     """Says what is being done, for people."""
     return lambda line: console.print(
         line, style="dim", markup=False, highlight=False, soft_wrap=True
@@ -199,18 +192,18 @@ def run_observer_container(
     machine's network, so that endpoints stay what they are, and this process's output. Returns its
     exit code. Raises DockerError, or SecurityError without the observer's keys.
     """
-    check_daemon()
+    docker.check_daemon()
     with tempfile.TemporaryDirectory(prefix="cpcbl-") as folder:
         team_file = Path(folder) / "team.json"
         save_resolved(team_in_containers(team), team_file)
         team_file.chmod(0o644)
-        mounts = [Mount(str(team_file), INSIDE), *mounts_of_keys(name, team)]
+        mounts = [compose.Mount(str(team_file), INSIDE), *mounts_of_keys(name, team)]
         if sensor not in presets():
-            mounts.append(Mount(str(Path(sensor).resolve()), SENSOR_INSIDE))
+            mounts.append(compose.Mount(str(Path(sensor).resolve()), SENSOR_INSIDE))
             sensor = SENSOR_INSIDE
         container = f"cpcbl-{name}-{secrets.token_hex(3)}"
         inner = ["observer", name, "--team", INSIDE, f"--sensor={sensor}", *arguments]
-        user = key_owner(team, Identity(Role.OBSERVER, name))
+        user = compose.key_owner(team, Identity(Role.OBSERVER, name))
         command = docker_run(container, image, mounts, user, inner)
         process = subprocess.Popen(command, stdin=subprocess.DEVNULL, start_new_session=True)
         try:
@@ -224,13 +217,13 @@ def run_observer_container(
 def _stop_container(process: "subprocess.Popen[bytes]", container: str) -> None:
     """Stops the container until it ends: what is not there yet cannot be stopped."""
     while process.poll() is None:
-        run_command(["docker", "stop", "--time", "3", container])
+        docker.run_command(["docker", "stop", "--time", "3", container])
         with suppress(subprocess.TimeoutExpired):
             process.wait(POLL_S)
 
 
 def docker_run(
-    container: str, image: str, mounts: Sequence[Mount], user: str, inner: Sequence[str]
+    container: str, image: str, mounts: Sequence[compose.Mount], user: str, inner: Sequence[str]
 ) -> list[str]:
     """The command: read-only, without rights, gone when it ends."""
     return [
@@ -244,11 +237,11 @@ def docker_run(
     ]
 
 
-def mounts_of_keys(name: str, team: Team) -> list[Mount]:
+def mounts_of_keys(name: str, team: Team) -> list[compose.Mount]:
     """The observer's own, and nobody else's. Raises SecurityError without them."""
     if not team.transport.secured:
         return []
     identity = Identity(Role.OBSERVER, name)
     credentials_in(Path(team.transport.keys), identity)
     own = Path(team.transport.keys).resolve() / str(identity)
-    return [Mount(str(own), f"{KEYS_INSIDE}/{identity}")]
+    return [compose.Mount(str(own), f"{KEYS_INSIDE}/{identity}")]
