@@ -60,12 +60,10 @@ class InContainers:
         program = docker.compose_program()
         self._run, self._folder, self._stop, self._print_line = run, folder, stop, print_line
         if image is not None:
-            docker.fetch_image(
-                image, stop, print_line, "leave --image out to build one of these sources"
-            )
-        self._image = image or docker.ensure_image(
-            base, stop, print_line, compose.extras_of(run.team)
-        )
+            otherwise = "leave --image out to build one of these sources"
+            docker.fetch_image(image, stop, print_line, otherwise)
+        extras = compose.extras_of(run.team)
+        self._image = image or docker.ensure_image(base, stop, print_line, extras)
         self.lead_s = LEAD_S + LEAD_S_A_CONTAINER * len(self._here)
         self._file = folder / "compose.yaml"
         name = re.sub(r"[^a-z0-9_-]", "-", run.team.name.lower())
@@ -101,10 +99,8 @@ class InContainers:
         try:
             return open_bus(self._run.team.name, link.endpoints, give_up, link.credentials)
         except BusError as error:
-            last_line = self._project.last_log_line("router")
-            raise docker.DockerError(
-                f"{error}; the router's container printed: {last_line}"
-            ) from error
+            printed = f"the router's container printed: {self._project.last_log_line('router')}"
+            raise docker.DockerError(f"{error}; {printed}") from error
 
     @contextmanager
     def processes(self, clock: Clock) -> Iterator[Processes]:
@@ -122,18 +118,16 @@ class InContainers:
             self._project.down()
 
     def _write(self, clock: str) -> None:
-        run, team = self._run, self._run.team
+        run, team, transport = self._run, self._run.team, self._run.team.transport
         mounts = [compose.Mount(str((self._folder / "team.json").resolve()), INSIDE)]
         if _replays(team):
             mounts.append(compose.Mount(str(Path(team.data).resolve()), DATA_INSIDE))
         how = compose.Deployment(
             INSIDE,
             self._image,
-            published=tuple(map(published_port, team.transport.listen)),
+            published=tuple(map(published_port, transport.listen)),
             mounts=tuple(mounts),
-            keys=compose.Mount(team.transport.keys, KEYS_INSIDE)
-            if team.transport.secured
-            else None,
+            keys=compose.Mount(transport.keys, KEYS_INSIDE) if transport.secured else None,
             user=compose.key_owner(team, Identity(Role.ROUTER)),
             seed=run.seed,
             speed=run.speed,
