@@ -10,11 +10,11 @@ import pytest
 from support.buses import SECOND, standing
 from support.logs import write_log
 from support.processes import command_line, cpcbl_team
+from support.simulated import simulate_recorded
 
 from cpcbl_launch.commands.options import require_folder, require_writable_file
 from cpcbl_launch.reporting.recording import Recording, read_recording
 from cpcbl_launch.run.processes import PROGRAM, ProcessSpec, Supervisor
-from cpcbl_launch.simulation.in_process import simulate
 from cpcbl_launch.team_file import TeamFileError, builtin_path, load_team, save_resolved
 from cpcbl_team.config import RobotSettings, Team
 from cpcbl_team.errors import InputError
@@ -176,5 +176,5 @@ def test_a_file_that_became_a_folder_is_one_line(tmp_path: Path) -> None:
 
 def test_recording_a_simulation_onto_a_good_disk_loses_nothing(tmp_path: Path) -> None:
     team = load_team(builtin_path("demo"))
-    report, _ = simulate(team, 1, 2.0, record=tmp_path / "run.mcap")
+    report, _ = simulate_recorded(team, 1, 2.0, tmp_path / "run.mcap")
     assert report.not_written == {}

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 Stamps = NDArray[np.int64]
+NEAR_S = 2.5  # truth counts so near one of its rows
 
 
 class Score(msgspec.Struct, frozen=True, kw_only=True):
@@ -110,18 +111,16 @@ def _rms(values: Floats) -> float:
     return float(np.sqrt(np.mean(values * values)))
 
 
-def interpolated_truth(
-    times_s: Floats, truth: Floats, nearest_s: float = 2.5
-) -> tuple[Floats, NDArray[np.bool_]]:
+def interpolated_truth(times_s: Floats, truth: Floats) -> tuple[Floats, NDArray[np.bool_]]:
     """Truth (rows: s, x, y, heading) interpolated at times, shape (n, 3), and where it counts:
-    within `nearest_s` of a row."""
+    near a row."""
     stamps = truth[:, 0]
     heading = np.unwrap(truth[:, 3])
     columns = [np.interp(times_s, stamps, c) for c in (truth[:, 1], truth[:, 2], heading)]
     after = np.clip(np.searchsorted(stamps, times_s), 1, max(len(stamps) - 1, 1))
     last = np.minimum(after, len(stamps) - 1)
     gap = np.minimum(np.abs(times_s - stamps[after - 1]), np.abs(times_s - stamps[last]))
-    return np.stack(columns, axis=1), gap <= nearest_s
+    return np.stack(columns, axis=1), gap <= NEAR_S
 
 
 def export_tum(

@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from types import MappingProxyType
 
 import matplotlib as mpl
 
@@ -24,8 +23,8 @@ def draw_run(
     truth: Mapping[str, Floats],
     path: Path,
     begin_s: float,
-    helped_from_s: float | None = None,
-    guests_s: Mapping[str, Spans] = MappingProxyType({}),
+    helped_from_s: float | None,
+    guests_s: Mapping[str, Spans],
 ) -> None:
     """Paths on the field (true: black) beside position errors over time; a colour a robot.
 

@@ -1,15 +1,8 @@
-"""Guests of a simulated team: who has a body on the field, and who comes and goes at set times."""
+"""Which guests have a body on the simulated field: those that ask for one, and ask again."""
 
 from collections.abc import Mapping
-from typing import NamedTuple
 
-from msgspec.structs import replace
-
-from cpcbl_agents.node import GuestNode
-from cpcbl_agents.robot import NEVER_NS
-from cpcbl_team.config import RobotSettings, Team
-from cpcbl_transport.bus import Bus
-from cpcbl_transport.memory_bus import MemoryHub
+from cpcbl_team.config import Team
 from cpcbl_transport.messages import Join
 from cpcbl_transport.robot_model import SimulatedRobotModel
 
@@ -59,46 +52,3 @@ def unsupported_delay(model: SimulatedRobotModel) -> str:
         if device is not None and abs(device.delay_s) > LONGEST_DELAY_S:
             return f"{key}.delay_s: {device.delay_s:g} s; at most {LONGEST_DELAY_S:g} s"
     return ""
-
-
-class ScheduledGuest(NamedTuple):
-    """A guest, and when it is there (seconds of robot time)."""
-
-    name: str
-    settings: RobotSettings
-    from_s: float
-    until_s: float
-
-
-class ScheduledGuestNode:
-    """A visitor's node, with a session of its own from its coming to its going."""
-
-    def __init__(self, visitor: ScheduledGuest, team: Team, hub: MemoryHub) -> None:
-        self._name, self._hub = visitor.name, hub
-        self._team = replace(team, robots={**team.robots, visitor.name: visitor.settings})
-        self._from_ns, self._until_ns = (round(s * 1e9) for s in visitor[2:])
-        self._visit: GuestNode | None = None
-        self._bus: Bus | None = None
-
-    @property
-    def next_ns(self) -> int:
-        if self._visit is not None:
-            return min(self._visit.next_ns, self._until_ns)
-        return self._from_ns if self._bus is None else NEVER_NS
-
-    @property
-    def waiting(self) -> bool:
-        return self._visit is not None and self._visit.waiting
-
-    def step(self, now_ns: int) -> None:
-        if self._bus is None:
-            self._bus = self._hub.session()
-            self._visit = GuestNode(self._name, self._team, self._bus, now_ns, "1")
-        if self._visit is None:
-            return
-        if now_ns < self._until_ns:
-            self._visit.step(now_ns)
-            return
-        self._visit.leave(now_ns)
-        self._visit = None
-        self._bus.close()

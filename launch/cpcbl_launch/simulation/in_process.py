@@ -1,18 +1,14 @@
 """A team in one process over the bus in memory: deterministic, as fast as the machine is."""
 
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import nullcontext
-from pathlib import Path
 from types import MappingProxyType
 from typing import Protocol
 
 from cpcbl_agents.node import Node, Steppable
 from cpcbl_agents.robot import build_robot
 from cpcbl_launch.reporting.recorder import Recorder, Report, variants_of
-from cpcbl_launch.reporting.recording import Recording
 from cpcbl_launch.simulation.field import SimulatedField
 from cpcbl_launch.simulation.field_node import FieldNode
-from cpcbl_launch.simulation.guests import ScheduledGuest, ScheduledGuestNode
 from cpcbl_team.config import Team
 from cpcbl_transport.bus import Bus
 from cpcbl_transport.memory_bus import MemoryHub
@@ -36,27 +32,21 @@ def simulate(
     duration_s: float,
     truth: Team | None = None,
     referee: Referee | None = None,
-    record: Path | None = None,
     progress: Progress | None = None,
-    guests: Sequence[ScheduledGuest] = (),
     bus_wrappers: Mapping[str, BusWrapper] = MappingProxyType({}),
 ) -> tuple[Report, Recorder]:
-    """A simulated team, field and robots in one process, with guests that come and go.
+    """A simulated team, field and robots in one process.
 
     `truth` is the team as it really is, where that is not what its robots believe; a `referee` may
-    end the run before its time; `record` is the file to record it into; `bus_wrappers`
-    put something between a robot and its bus.
+    end the run before its time; `bus_wrappers` put something between a robot and its bus.
     """
     hub, end_ns = MemoryHub(), int(duration_s * 1e9)
     recorder = Recorder(hub.session())
     if referee is not None:
         referee.attach(hub.session())
     over = (lambda: False) if referee is None else (lambda: referee.over)
-    with Recording(record, team, hub.session()) if record is not None else nullcontext():
-        field = FieldNode(SimulatedField(truth or team, seed, 0), hub.session())
-        guest_nodes = [ScheduledGuestNode(visitor, team, hub) for visitor in guests]
-        nodes = [field, *robot_nodes(team, hub, 0, bus_wrappers), *guest_nodes]
-        run_nodes(nodes, 0, end_ns, progress, over)
+    field = FieldNode(SimulatedField(truth or team, seed, 0), hub.session())
+    run_nodes([field, *robot_nodes(team, hub, 0, bus_wrappers)], 0, end_ns, progress, over)
     return simulated_report(recorder, team), recorder
 
 

@@ -6,6 +6,7 @@ import msgspec
 import pytest
 from support.calibration_team import MAP, SECONDS, STANDING, TEAM
 from support.processes import cpcbl_team
+from support.simulated import simulate_recorded
 
 from cpcbl_launch.calibration.logs import read_log, read_logs
 from cpcbl_launch.calibration.odometry import calibrate_odometry
@@ -48,7 +49,7 @@ SIGMAS = 5.0
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("recorded") / "trio.mcap"
-    simulate(TEAM, 1, SECONDS, record=path)
+    simulate_recorded(TEAM, 1, SECONDS, path)
     return path
 
 

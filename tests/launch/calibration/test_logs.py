@@ -8,11 +8,11 @@ import msgspec
 import pytest
 from support.calibration_team import STANDING, TEAM, WORSE
 from support.logs import write_log
+from support.simulated import simulate_recorded
 
 from cpcbl_agents.sources.mrclam import LogError
 from cpcbl_launch.calibration.logs import read_log, read_logs
 from cpcbl_launch.calibration.team_types import calibrate_robots
-from cpcbl_launch.simulation.in_process import simulate
 from cpcbl_team.config import (
     Team,
 )
@@ -33,7 +33,7 @@ def test_mrclam_logs_are_read_with_all_their_faults(tmp_path: Path) -> None:
 
 def without_truth(path: Path) -> None:
     robots = {"r1": msgspec.structs.replace(WORSE, source="external")}
-    simulate(msgspec.structs.replace(TEAM, robots=robots), 1, 1.0, record=path)
+    simulate_recorded(msgspec.structs.replace(TEAM, robots=robots), 1, 1.0, path)
 
 
 def no_recording(path: Path) -> None:
@@ -41,7 +41,7 @@ def no_recording(path: Path) -> None:
 
 
 def cut_short(path: Path) -> None:
-    simulate(TEAM, 1, 2.0, record=path)
+    simulate_recorded(TEAM, 1, 2.0, path)
     path.write_bytes(path.read_bytes()[:-300])
 
 
@@ -69,7 +69,7 @@ def test_a_log_that_cannot_be_used_is_one_line(
 def test_a_team_that_sees_and_does_nothing_is_one_line(tmp_path: Path) -> None:
     path = tmp_path / "blind.mcap"
     blind = Team(name="blind", robots={"c": STANDING})
-    simulate(blind, 1, 20.0, record=path)
+    simulate_recorded(blind, 1, 20.0, path)
     with pytest.raises(InputError, match="nothing to calibrate") as raised:
         calibrate_robots(read_logs([path]), ["blind.mcap"])
     assert "\n" not in str(raised.value)

@@ -7,6 +7,7 @@ import pytest
 from support.buses import SECOND, saw, standing
 from support.logs import write_log
 from support.processes import cpcbl_team
+from support.simulated import simulate_recorded
 
 from cpcbl_launch.reporting.recording import Recording, read_recording
 from cpcbl_launch.simulation.in_process import simulate
@@ -72,7 +73,7 @@ def test_nothing_is_written_after_the_end(tmp_path: Path) -> None:
 def test_recording_does_not_change_a_run(tmp_path: Path) -> None:
     team, path = load_team(builtin_path("demo")), tmp_path / "demo.mcap"
     alone, _ = simulate(team, 3, 4.0)
-    watched, recorder = simulate(team, 3, 4.0, record=path)
+    watched, recorder = simulate_recorded(team, 3, 4.0, path)
     assert watched == alone
     recorded = read_recording(path)
     assert recorded.team == team

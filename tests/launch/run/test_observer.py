@@ -7,6 +7,7 @@ import msgspec
 import pytest
 from support.observers import BLIND, changed
 from support.processes import command_line
+from support.simulated import ScheduledGuest, simulate_with_guests
 
 from cpcbl_launch.reporting.phases import Span, guest_reports, phase_report
 from cpcbl_launch.reporting.recorder import Recorder
@@ -18,7 +19,6 @@ from cpcbl_launch.run.observer import (
     presets,
     team_with_observer,
 )
-from cpcbl_launch.simulation.guests import ScheduledGuest
 from cpcbl_launch.simulation.in_process import simulate
 from cpcbl_launch.team_file import builtin_path, load_team, parse_team, save_resolved
 from cpcbl_team.config import GuestSettings, MatchSettings, Team
@@ -150,7 +150,7 @@ def visited(
         )
         for wish in wishes
     ]
-    return simulate(BLIND, seed, 60.0, guests=guests)[1]
+    return simulate_with_guests(BLIND, seed, 60.0, guests)
 
 
 def team_rmse_m(recorder: Recorder, span: Span) -> float:
@@ -207,7 +207,7 @@ def test_without_noise_guests_and_robots_agree_with_the_truth() -> None:
     quiet = msgspec.structs.replace(BLIND.simulation, noise=0.0)
     team = msgspec.structs.replace(BLIND, simulation=quiet)
     guest = ScheduledGuest("tripod", team_with_observer(team, TRIPOD).robots["tripod"], 2.0, 8.0)
-    _, recorder = simulate(team, 1, 10.0, guests=[guest])
+    recorder = simulate_with_guests(team, 1, 10.0, [guest])
     truth = recorder.simulated_truth()
     assert recorder.status["r1"].counts["guest_left"] == 1
     for name in [*team.robots, "tripod"]:
@@ -219,7 +219,7 @@ def test_without_noise_guests_and_robots_agree_with_the_truth() -> None:
 def test_a_team_that_lets_no_guest_in_does_as_if_there_were_none() -> None:
     closed = changed(guests=GuestSettings(allowed=False))
     guest = ScheduledGuest("tripod", team_with_observer(BLIND, TRIPOD).robots["tripod"], 2.0, 8.0)
-    with_guest = simulate(closed, 1, 10.0, guests=[guest])[1]
+    with_guest = simulate_with_guests(closed, 1, 10.0, [guest])
     without = simulate(closed, 1, 10.0)[1]
     for name in closed.robots:
         assert list(with_guest.tracks[name]) == list(without.tracks[name])
