@@ -218,9 +218,8 @@ class Node:
 
     def _publish(self, message: Outgoing | Status) -> int:
         """Publishes if there is a subscriber; returns the bytes of the payload, 0 without one."""
-        topic = topic_of(type(message))
-        tier, target = self._declarations.tier, message.robot
-        key = topic.at(tier=tier, robot=target, observer=self._name)
+        topic, tier = topic_of(type(message)), self._declarations.tier
+        key = topic.at(tier=tier, robot=message.robot, observer=self._name)
         publisher = self._declarations.publisher(topic, key)
         if not publisher.matching:
             return 0

@@ -27,17 +27,13 @@ NEVER_NS = 2**62
 
 
 class Robot:
-    """The agents of one robot of a team; `build_robot` makes one from a team file.
-
-    `restarted`: its process ran before, and may have spent its budget then.
-    """
+    """The agents of one robot of a team; `build_robot` makes one from a team file."""
 
     def __init__(
         self, name: str, team: Team, start_ns: int, sensing: SensingAgent, restarted: bool = False
     ) -> None:
         settings, teammates = team.robots[name], frozenset(team.robots) - {name}
-        self.name, self.sensing = name, sensing
-        self._shared_ns = start_ns
+        self.name, self.sensing, self._shared_ns = name, sensing, start_ns
         self.filter = FilterAgent(settings, team.map, teammates, start_ns)
         budget = Budget(
             settings.collaboration.budget,

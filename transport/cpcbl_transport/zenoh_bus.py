@@ -70,10 +70,7 @@ def open_router(
     guards: Mapping[str, Any] | None = None,
     credentials: Credentials | None = None,
 ) -> "ZenohBus":
-    """A session that is the team's router. Raises BusError when it cannot listen there.
-
-    `guards`: what `guard_rules` and `access_rules` say; none, and everything is let in.
-    """
+    """The session of a team's router (`router_config`). Raises BusError when it cannot listen."""
     return open_plain_router(router_config(listen, connect, guards, credentials), namespace(team))
 
 
