@@ -118,8 +118,8 @@ def run_robot(
 ) -> None:
     """Runs a robot until `stop()`. One that is restarted, or late, does not know where it is.
 
-    `wrap_bus` may put something between the robot and its bus. Raises BusError when stopped before a
-    router answered, LogError for an unreadable log, SecurityError without the keys of a secured
+    `wrap_bus` may put something between the robot and its bus. Raises BusError when stopped before
+    a router answered, LogError for an unreadable log, SecurityError without the keys of a secured
     team, InputError for a camera that cannot be used, DependencyError without OpenCV, ClockError
     when this machine's clock was set.
     """
