@@ -123,15 +123,16 @@ def observer_name(team: Team, robot: str | None) -> str:
 def dataset_from_pictures(
     folder: Path,
     poses: Path,
-    robot: str,
+    observer: str | None,
     team: Team,
     progress: Callable[[float], None] = lambda done: None,
 ) -> CameraDataset:
-    """The sightings of a robot in pictures from known poses. Raises InputError. Needs OpenCV."""
+    """The sightings of a robot (default: the only one with a camera) in pictures from known poses.
+    Raises InputError. Needs OpenCV."""
     from cpcbl_agents.vision.detector import CameraDetector
     from cpcbl_launch.calibration.pictures import read_picture
 
-    rows = read_poses(poses, team)
+    robot, rows = observer_name(team, observer), read_poses(poses, team)
     names = list(dict.fromkeys(row.file for row in rows))
     detector = CameraDetector(robot, team)
     frames: list[Sightings] = []

@@ -57,6 +57,9 @@ class TablePath(NamedTuple):
         return ".".join(self.names)
 
 
+Tables = Mapping[TablePath, Mapping[str, TomlValue]]
+
+
 def robot_table(
     team_file: Path | None, robot: str | None, type_name: str | None, part: str
 ) -> TablePath:
@@ -84,7 +87,7 @@ def team_source(path: Path, output: Path | None) -> tuple[str, Path]:
     return read_text(path), output or path
 
 
-def edit_team(text: str, name: str, tables: Mapping[TablePath, Mapping[str, TomlValue]]) -> str:
+def edit_team(text: str, name: str, tables: Tables) -> str:
     """The text of a team file with these values in these tables. Raises TeamFileError.
 
     `name` is the file's name in errors. A robot or type must exist; other tables are added.
@@ -96,8 +99,11 @@ def edit_team(text: str, name: str, tables: Mapping[TablePath, Mapping[str, Toml
     for table_path, values in tables.items():
         _require_table(document, table_path, name)
         table: Any = document
-        for i, part in enumerate(table_path.names):
-            table = _subtable(table, part, bare=i < len(table_path.names) - 1)
+        for i, part in enumerate(table_path.names, 1):
+            if part not in table:
+                empty = tomlkit.table(is_super_table=i < len(table_path.names))
+                table[part] = tomlkit.inline_table() if isinstance(table, InlineTable) else empty
+            table = table[part]
         fresh = isinstance(table, Table) and not len(table)
         for key, value in values.items():
             table[key] = _item(value, table)
@@ -108,7 +114,7 @@ def edit_team(text: str, name: str, tables: Mapping[TablePath, Mapping[str, Toml
     return changed
 
 
-def tables_text(tables: Mapping[TablePath, Mapping[str, TomlValue]]) -> str:
+def tables_text(tables: Tables) -> str:
     """The tables alone, as text to be copied into a team file."""
     document = tomlkit.document()
     for table_path, values in tables.items():
@@ -154,17 +160,6 @@ def _require_table(document: Mapping[str, Any], table_path: TablePath, name: str
     if layer in ("robots", "types") and owner not in known:
         available = ", ".join(known) or "none"
         raise TeamFileError(f"{name}: {layer}.{owner}: not in the file; name one of: {available}")
-
-
-def _subtable(table: Any, part: str, bare: bool) -> Any:
-    """The table of this name within another; it is added if it is missing.
-
-    `bare`: it holds only tables.
-    """
-    if part not in table:
-        inline = isinstance(table, InlineTable)
-        table[part] = tomlkit.inline_table() if inline else tomlkit.table(is_super_table=bare)
-    return table[part]
 
 
 def _item(value: TomlValue, table: Any) -> Any:
@@ -217,9 +212,7 @@ def _used_colours(raw: dict[str, Any]) -> list[str]:
     return sorted({name for table in tables for name in table.get("colours", ())})
 
 
-def colour_tables(
-    result: ColourCalibration, file_has_kept: bool
-) -> dict[TablePath, dict[str, TomlValue]]:
+def colour_tables(result: ColourCalibration, file_has_kept: bool) -> Tables:
     """A table for each colour. `file_has_kept`: the file already has the colours that are kept."""
     colours = {name: fit.thresholds for name, fit in result.colours.items()}
     if not file_has_kept:
@@ -234,7 +227,7 @@ def colour_tables(
 
 def sensor_tables(
     accuracy: CameraAccuracy, camera: CameraSettings, sensor_path: TablePath, camera_path: TablePath
-) -> dict[TablePath, Mapping[str, TomlValue]]:
+) -> Tables:
     """Corrections and noise for the table `sensor_path`, and larger sigmas for `camera_path` if
     errors are larger than stated.
 

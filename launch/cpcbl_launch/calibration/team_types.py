@@ -46,9 +46,7 @@ class Calibration(msgspec.Struct, frozen=True):
 
 
 def calibrate_robots(
-    logs: RobotLogs,
-    names: Sequence[str],
-    progress: Callable[[float], None] = lambda done: None,
+    logs: RobotLogs, names: Sequence[str], progress: Callable[[float], None] = lambda done: None
 ) -> Calibration:
     """All robots of the logs with these names, each over all its logs. Raises InputError."""
     robots = {}
@@ -116,12 +114,7 @@ def _plain(value: Any) -> Any:
 
 
 def calibrated_team(
-    calibration: Calibration,
-    base: str,
-    name: str = "team file",
-    *,
-    margin: float,
-    correction_margin: float,
+    calibration: Calibration, base: str, name: str, *, margin: float, correction_margin: float
 ) -> str:
     """The base team file with a type for each calibrated robot. Raises TeamFileError, InputError.
 

@@ -1,6 +1,5 @@
 """`cpcbl-team calibrate ...`: errors of robots' odometry, sensors and cameras."""
 
-from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -10,22 +9,16 @@ from typer import Argument, Option, Typer, echo
 from typer.core import TyperGroup
 
 from cpcbl_launch.checks import require_opencv
+from cpcbl_launch.commands import options
 from cpcbl_launch.commands.measuring import calibrate
-from cpcbl_launch.commands.options import (
-    AsJson,
-    print_not_written,
-    print_result,
-    require_writable_file,
-    writable_file,
-    writable_picture,
-)
+from cpcbl_launch.commands.options import AsJson, print_not_written, print_result
 from cpcbl_launch.reporting.files import write_or_reason
 from cpcbl_launch.team_file import find_team
 from cpcbl_team.errors import InputError
 
 if TYPE_CHECKING:
     from cpcbl_launch.calibration.camera_accuracy import CameraDataset
-    from cpcbl_launch.calibration.team_tables import TablePath, TomlValue
+    from cpcbl_launch.calibration.team_tables import Tables
 
 LOG = "log"
 
@@ -54,7 +47,8 @@ ToFile = Annotated[Path | None, Option(help="Write the team here; default: into 
 Residuals = Annotated[
     Path | None,
     Option(
-        help="Draw residuals into this file (PNG or SVG; extra `plot`).", callback=writable_picture
+        help="Draw residuals into this file (PNG or SVG; extra `plot`).",
+        callback=options.writable_picture,
     ),
 ]
 BoardPictures = Annotated[
@@ -84,7 +78,8 @@ Margin = Annotated[float, Option(min=0.0, max=0.9, help="Share by which ranges a
 Preview = Annotated[
     Path | None,
     Option(
-        help="Draw samples, and accepted pixels, into this file (PNG, JPG).", callback=writable_file
+        help="Draw samples, and accepted pixels, into this file (PNG, JPG).",
+        callback=options.writable_file,
     ),
 ]
 Recordings = Annotated[
@@ -129,7 +124,7 @@ def camera(
 
     printed = parse_board(board, squares, square_m, marker_m, family)
     if print_board is not None:
-        require_writable_file("--print-board", print_board)
+        options.require_writable_file("--print-board", print_board)
         write_board(printed, print_board)
         measure = "measure a square of it when it is printed"
         echo(f"written: {print_board}; {measure}", err=as_json)
@@ -233,7 +228,7 @@ def _dataset_from_pictures(
     pictures: Path, poses: Path | None, team_file: Path | None, robot: str | None, quiet: bool
 ) -> "CameraDataset":
     """Sightings of a robot of the team file in pictures. Raises InputError."""
-    from cpcbl_launch.calibration.camera_accuracy import dataset_from_pictures, observer_name
+    from cpcbl_launch.calibration.camera_accuracy import dataset_from_pictures
     from cpcbl_launch.views.run import progress_bar
 
     require_opencv("calibrate sensor --pictures")
@@ -242,9 +237,8 @@ def _dataset_from_pictures(
     if team_file is None:
         raise InputError("--pictures: needs --team FILE, which names landmarks and robots")
     team = find_team(team_file)
-    name = observer_name(team, robot)
     with progress_bar("detecting", quiet) as progress:
-        return dataset_from_pictures(pictures, poses, name, team, progress)
+        return dataset_from_pictures(pictures, poses, robot, team, progress)
 
 
 def _check_target(team_file: Path | None, output: Path | None) -> None:
@@ -252,16 +246,15 @@ def _check_target(team_file: Path | None, output: Path | None) -> None:
     from cpcbl_launch.calibration.team_tables import team_source
 
     if team_file is not None:
-        require_writable_file("--output" if output else "--team", team_source(team_file, output)[1])
+        options.require_writable_file(
+            "--output" if output else "--team", team_source(team_file, output)[1]
+        )
     elif output is not None:
         raise InputError("--output: needs --team FILE, the team to write")
 
 
 def _save(
-    tables: "Mapping[TablePath, Mapping[str, TomlValue]]",
-    team_file: Path | None,
-    output: Path | None,
-    quiet: bool,
+    tables: "Tables", team_file: Path | None, output: Path | None, quiet: bool
 ) -> dict[str, str]:
     """Writes the tables into the team file or prints them; files not written, with the reason."""
     from cpcbl_launch.calibration import team_tables

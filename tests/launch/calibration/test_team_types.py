@@ -52,7 +52,8 @@ source = "external"
 def type_text(
     found: Calibration, base: str, margin: float = 0.0, correction_margin: float = 0.0
 ) -> str:
-    return calibrated_team(found, base, margin=margin, correction_margin=correction_margin)
+    margins = {"margin": margin, "correction_margin": correction_margin}
+    return calibrated_team(found, base, "team file", **margins)
 
 
 def test_types_are_added_to_the_base_team_file() -> None:
