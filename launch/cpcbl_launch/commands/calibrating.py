@@ -183,8 +183,8 @@ def colours(
         pixels = colour_samples.draw_preview(labelled, every)
         lost |= write_or_reason(preview, partial(colour_samples.write_preview, preview, pixels))
     print_result(result, as_json, lambda: print_colours(result, Console()))
-    lost |= _save(colour_tables(result, file_has_kept), team_file, output, as_json)
-    print_not_written(lost)
+    tables = colour_tables(result, file_has_kept)
+    print_not_written(lost | _save(tables, team_file, output, as_json))
 
 
 @calibrate_app.command("sensor")
@@ -213,14 +213,12 @@ def sensor(
         dataset = dataset_from_recordings(recordings or [], robot)
     else:
         dataset = _dataset_from_pictures(pictures, poses, team_file, robot, as_json)
-    only_robot = dataset.robots[0] if len(dataset.robots) == 1 else None
-    sensor_path, camera_path = (
-        robot_table(team_file, None if kind or team_file is None else only_robot, kind, part)
-        for part in ("sensor", "camera")
-    )
+    is_robots_own = team_file is not None and not kind and len(dataset.robots) == 1
+    owner = dataset.robots[0] if is_robots_own else None
+    paths = [robot_table(team_file, owner, kind, part) for part in ("sensor", "camera")]
     accuracy = measure_camera_accuracy(dataset.observations)
     print_result(accuracy, as_json, lambda: print_camera_accuracy(accuracy, dataset, Console()))
-    tables = sensor_tables(accuracy, dataset.camera, sensor_path, camera_path)
+    tables = sensor_tables(accuracy, dataset.camera, *paths)
     print_not_written(_save(tables, team_file, output, as_json))
 
 
@@ -246,9 +244,8 @@ def _check_target(team_file: Path | None, output: Path | None) -> None:
     from cpcbl_launch.calibration.team_tables import team_source
 
     if team_file is not None:
-        options.require_writable_file(
-            "--output" if output else "--team", team_source(team_file, output)[1]
-        )
+        option, target = "--output" if output else "--team", team_source(team_file, output)[1]
+        options.require_writable_file(option, target)
     elif output is not None:
         raise InputError("--output: needs --team FILE, the team to write")
 
