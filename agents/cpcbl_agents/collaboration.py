@@ -122,9 +122,7 @@ class CollaborationAgent:
     @property
     def interests(self) -> Interests | None:
         """What the robot announces and subscribes to; None before its first estimate."""
-        if self.latest is None:
-            return None
-        return Interests(self.tier, self.neighbours, self.sources)
+        return Interests(self.tier, self.neighbours, self.sources) if self.latest else None
 
     @property
     def has_started(self) -> bool:

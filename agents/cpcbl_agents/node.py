@@ -78,7 +78,7 @@ class Node:
     ) -> None:
         """`speed`: robot time beside real time."""
         self.robot, self._incarnation, self._name = robot, incarnation, robot.name
-        self._on_arrival = on_arrival
+        self._on_arrival, self._status_ns = on_arrival, start_ns
         self._frame_key = topics.IN_FRAME.at(robot=robot.name)
         rules = team.robots[robot.name].collaboration
         self._team, self._passive = frozenset(team.robots), rules.passive
@@ -90,7 +90,6 @@ class Node:
         )
         self._tokens = LivelinessTokens()
         self._subscribed: dict[object, str] = {BeliefSubscribers: "", FrameSubscribers: ""}
-        self._status_ns = start_ns
         # What threads of the bus count has its entry: to add one, another thread must not read
         self.counts: Counter[str] = Counter(dict.fromkeys(ON_ARRIVAL, 0))
         self.received = MessageCounters()
