@@ -114,6 +114,7 @@ HEADING: Final = Scope.HEADING
 Six = tuple[float, float, float, float, float, float]
 Sums = tuple[Six, Row]
 """The numbers of an `Information`, which is one."""
+_NO_SUMS: Final[Sums] = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
 
 
 def sharpest(variance: float) -> float:
@@ -123,11 +124,10 @@ def sharpest(variance: float) -> float:
 
 
 class InformationSum:
-    """Adds up the evidence of one frame, about the offset from the prior."""
+    """Adds up evidence about the offset from a prior (step 4)."""
 
-    def __init__(self) -> None:
-        self.xx = self.xy = self.yy = self.xh = self.yh = self.hh = 0.0
-        self.x = self.y = self.h = 0.0
+    def __init__(self, start: Sums = _NO_SUMS) -> None:
+        (self.xx, self.xy, self.yy, self.xh, self.yh, self.hh), (self.x, self.y, self.h) = start
 
     def add(self, u: float, v: float, a: float, residual: float, weight: float) -> None:
         """Adds a scalar measurement with row (u, v, a); `weight` is the inverse of its variance."""
@@ -169,20 +169,10 @@ class Information(NamedTuple):
 
     def with_all(self, measurements: Iterable[tuple[Row, float, float]]) -> "Information":
         """With these (row, residual, variance) of scalar measurements."""
-        (xx, xy, yy, xh, yh, hh), (ex, ey, eh) = self
+        total = InformationSum(self)
         for (x, y, a), residual, variance in measurements:
-            w = 1.0 / sharpest(variance)
-            r, wx, wy = residual * w, w * x, w * y
-            xx += wx * x
-            xy += wx * y
-            yy += wy * y
-            xh += wx * a
-            yh += wy * a
-            hh += w * a * a
-            ex += r * x
-            ey += r * y
-            eh += r * a
-        return Information(Covariance3(xx, xy, yy, xh, yh, hh), (ex, ey, eh))
+            total.add(x, y, a, residual, 1.0 / sharpest(variance))
+        return Information.of(total.sums())
 
 
 def posterior_factor(prior: Covariance3, information: Six) -> Matrix3:

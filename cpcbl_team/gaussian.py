@@ -63,15 +63,21 @@ class Gaussian2(NamedTuple):
     covariance: Covariance2
 
 
+def width_per_m(bearing_sigma: float) -> float:
+    """The sigma across the line of sight, in metres a metre of range: sin(sigma_a) (equations 1b
+    and 2); 1 for a bearing that is not known at all."""
+    return math.sin(min(bearing_sigma, 0.5 * math.pi))
+
+
 def sighting_gaussian(
     range_m: float, bearing: float, range_sigma_m: float, bearing_sigma: float
 ) -> Gaussian2:
     """A sighting as a Gaussian in the robot's frame, the major axis along the line of sight.
 
     x = r cos a, y = r sin a (equation 1); sigma_maj = sigma_r, sigma_min = r sin sigma_a (equation
-    2), and r for a bearing that is not known at all.
+    2).
     """
-    across_m = range_m * math.sin(min(bearing_sigma, 0.5 * math.pi))
+    across_m = range_m * width_per_m(bearing_sigma)
     return Gaussian2(
         range_m * math.cos(bearing),
         range_m * math.sin(bearing),

@@ -5,16 +5,21 @@ A pose is written `a_from_b`: it maps coordinates of frame b into frame a. A rob
 """
 
 import math
-from math import cos, remainder, sin, tau
+from math import copysign, cos, remainder, sin
 from typing import Final, NamedTuple
 
 PI: Final = math.pi
+TAU: Final = math.tau
 new: Final = tuple.__new__  # new(Pose2, (x, y, h)) takes half the time of Pose2(x, y, h)
 
 
 def wrap_angle(angle: float) -> float:
     """The same angle within [-pi, pi]."""
-    return angle if -PI <= angle <= PI else remainder(angle, tau)
+    if -PI <= angle <= PI:
+        return angle
+    if -9.0 < angle < 9.0:  # within 3 pi the difference is exact, as the remainder is
+        return angle - copysign(TAU, angle)
+    return remainder(angle, TAU)
 
 
 class Pose2(NamedTuple):

@@ -8,8 +8,9 @@ with faults) are left to `measurements.py`. `tests/core/test_landmarks.py` compa
 
 import math
 from math import sqrt
+from typing import Final
 
-from msgspec.structs import astuple
+import msgspec
 
 from cpcbl_team.config import Field, LocalizationSettings
 from cpcbl_team.constraints import NEAREST_M, circle, heading, ray
@@ -24,10 +25,17 @@ from cpcbl_team.estimate import (
     sharpest,
 )
 from cpcbl_team.fusion import chi_square
+from cpcbl_team.gaussian import width_per_m
 from cpcbl_team.inputs import Sighting
-from cpcbl_team.sensors import LARGEST_BEARING_RAD, LARGEST_M, bounded_expected_range
+from cpcbl_team.sensors import (
+    LARGEST_BEARING_RAD,
+    LARGEST_M,
+    bounded_expected_range,
+    range_variance,
+)
 from cpcbl_team.state import Evidence, LandmarkSnapshot, State
 
+_astuple: Final = msgspec.structs.astuple  # see `constraints._atan2`
 Numbers = tuple[
     str, float | None, float | None, float | None, float | None, float | None, float | None
 ]  # of a sighting, in its order
@@ -78,7 +86,7 @@ class Landmarks:
         self._floor_squared = s.range_floor_m**2
         self._farthest_m = s.max_range_for_range_m
         self._heading_weight = 1.0 / sharpest(s.bearing_sigma_rad**2)
-        self._sine_squared = math.sin(min(s.bearing_sigma_rad, 0.5 * math.pi)) ** 2
+        self._width_squared_per_m2 = width_per_m(s.bearing_sigma_rad) ** 2
         self._bearing_sigma_rad = s.bearing_sigma_rad
 
     def update(
@@ -97,7 +105,7 @@ class Landmarks:
         uses_range = scope is not None and scope is not HEADING
         uses_bearing = scope is not None and (scope is not POSITION or self._uses_rays)
         for sighting in sightings:
-            numbers: Numbers = astuple(sighting)
+            numbers: Numbers = _astuple(sighting)
             name, range_m, bearing, range_sigma, bearing_sigma, facing, facing_sigma = numbers
             mark = self._marks.get(name)
             if (
@@ -155,7 +163,7 @@ class Landmarks:
             m, n, ahead, across = ray(dx, dy, update.heading + bearing)
             if ahead >= NEAREST_M:
                 m, n, bearing_error = m / ahead, n / ahead, across / ahead
-                width_squared = sharpest(distance_squared * self._sine_squared)
+                width_squared = sharpest(distance_squared * self._width_squared_per_m2)
                 bearing_weight = ahead * ahead / width_squared
             elif range_m is None:
                 return
@@ -181,7 +189,7 @@ class Landmarks:
     def _range_variance(self, distance_m: float, range_m: float) -> float:
         """The sensor model's variance (m^2) of a range to a landmark at this distance."""
         expected_m = bounded_expected_range(distance_m, range_m)
-        return self._share_squared * expected_m * expected_m + self._floor_squared
+        return range_variance(expected_m, self._share_squared, self._floor_squared)
 
     def _rejects(self, prior: Covariance3, *constraints: tuple[Row, float, float]) -> bool:
         """Whether the chi-square bound rejects an object's (row, residual, weight)."""

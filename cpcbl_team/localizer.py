@@ -5,12 +5,13 @@
 
 import math
 from collections.abc import Iterable
+from typing import Final
 
 from cpcbl_team.beliefs import BELIEF_VALID_BEFORE_NS
 from cpcbl_team.config import Field, LocalizationSettings
 from cpcbl_team.estimate import HEADING, POSE, POSITION, Covariance3, Estimate, Scope
 from cpcbl_team.fusion import chi_square_bounds, mark_shared
-from cpcbl_team.geometry import Pose2, step, wrap_angle
+from cpcbl_team.geometry import Pose2, new, step, wrap_angle
 from cpcbl_team.inputs import Belief, BeliefShared, Fix, Odometry, Position, Sighting, Sightings
 from cpcbl_team.landmarks import Landmarks, LandmarkUpdate
 from cpcbl_team.measurements import (
@@ -54,7 +55,7 @@ from cpcbl_team.variants import UpdateOrder, variant_of
 
 MOST_HEADING_SIGMA_RAD = math.radians(100.0)  # beyond, no bearing can be linearized
 
-_NO_OBJECTS = GatedObjects([], [])
+_NO_OBJECTS: Final = GatedObjects([], [])
 
 
 class Localizer:
@@ -164,7 +165,8 @@ class Localizer:
         if landmarks.unrecorded:
             sightings = tuple(landmarks.unrecorded)
             pose = state.estimate.pose
-            snapshot = LandmarkSnapshot(stamp_ns, state.odometry_from_robot, pose, sightings)
+            fields = stamp_ns, state.odometry_from_robot, pose, sightings
+            snapshot = new(LandmarkSnapshot, fields)
             state = with_recovery(state, with_snapshot(recovery, snapshot))
         if measured or faults:
             state = with_recovery(state, with_measurements(state, measured)).counted(*faults)
@@ -237,7 +239,8 @@ class Localizer:
         scope: Scope,
     ) -> State:
         """The state with the estimate that a frame gave, and with the frame's bookkeeping."""
-        used, (accepted, others_rejected) = landmarks.used, gated
+        used = landmarks.used
+        accepted, others_rejected = gated
         if accepted:
             used = used | {found.measurement.source: state.stamp_ns for found in accepted}
         rejected = landmarks.rejected + len(others_rejected)

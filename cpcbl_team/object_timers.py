@@ -5,12 +5,14 @@ hold less information than two of different objects. A minimum interval leaves t
 correlation time inflates their variances.
 """
 
+from typing import Final
+
 from cpcbl_team.config import LocalizationSettings
 from cpcbl_team.measurements import Measurement
 from cpcbl_team.sensors import repetition_variance_factor
 from cpcbl_team.state import Updates
 
-_NOBODY: frozenset[str] = frozenset()
+_NOBODY: Final[frozenset[str]] = frozenset()
 
 
 def has_passed(last_ns: int | None, now_ns: int, least_ns: float) -> bool:

@@ -7,7 +7,7 @@ what it measures, it inflates its covariance step by step until its gates open.
 
 import math
 from collections.abc import Callable, Collection, Sequence
-from typing import NamedTuple, TypeVar
+from typing import Final, NamedTuple, TypeVar
 
 from cpcbl_team.config import Field, LocalizerSettings
 from cpcbl_team.estimate import Covariance3, Estimate
@@ -26,10 +26,10 @@ from cpcbl_team.state import (
 )
 from cpcbl_team.trust import reset_scores
 
-WINDOW_NS = 20_000_000_000
-SPACING_NS = 500_000_000  # one piece of evidence an object and so long
-MOST_PIECES = 30
-INFLATION_NS = 1_000_000_000
+WINDOW_NS: Final = 20_000_000_000
+SPACING_NS: Final = 500_000_000  # one piece of evidence an object and so long
+MOST_PIECES: Final = 30
+INFLATION_NS: Final = 1_000_000_000
 _LEVER_M = 2.0  # over such a way an error of position has become one of heading
 Stamped = TypeVar("Stamped", Evidence, LandmarkSnapshot)
 
@@ -60,9 +60,9 @@ def evidence_from_observation(state: State, observation: PoseObservation) -> Evi
 def with_snapshot(memory: RecoveryMemory, snapshot: LandmarkSnapshot) -> RecoveryMemory:
     """The memory with landmarks that were not `recorded` recently, without what is too old."""
     now, recent = snapshot.stamp_ns, _recent(memory, snapshot.stamp_ns)
+    until_ns = (min(recent.values()) if recent else now) + SPACING_NS
     for sighting in snapshot.sightings:
         recent[sighting.id] = now
-    until_ns = min(recent.values()) + SPACING_NS
     snapshots = latest((*memory.snapshots, snapshot))
     return with_records(memory, snapshots, memory.evidence, frozenset(recent), until_ns)
 
@@ -173,6 +173,8 @@ def lost_reason(estimate: Estimate, innovations: int, limits: Limits) -> str:
         return f"position sigma {estimate.position_sigma_m:.2f} m"
     if hh > heading_variance:
         return f"heading sigma {math.degrees(estimate.heading_sigma_rad):.0f} deg"
+    if innovations & innovations + 1 == 0:  # all bits are set: none was rejected
+        return ""
     digits = innovations.bit_length()
     rejected = digits - innovations.bit_count()
     if rejected > most and digits > least:

@@ -132,6 +132,16 @@ def bounded_expected_range(expected_m: float, range_m: float) -> float:
     return least if expected_m < least else most if expected_m > most else expected_m
 
 
+def range_variance(range_m: float, share_squared: float, floor_squared: float) -> float:
+    """The sensor model's variance (m^2) of a range; `floor_squared` in m^2."""
+    return share_squared * range_m * range_m + floor_squared
+
+
+def range_sigma_m(sensor: SensorSettings, range_m: float) -> float:
+    """The sensor model's sigma of a range."""
+    return math.sqrt(range_variance(range_m, sensor.range_share**2, sensor.range_floor_m**2))
+
+
 def sighting_sigmas(
     sighting: Sighting, sensor: SensorSettings, expected_range_m: float | None = None
 ) -> tuple[float, float]:
@@ -145,7 +155,7 @@ def sighting_sigmas(
         range_m = sighting.range_m or 0.0
         if expected_range_m is not None:
             range_m = bounded_expected_range(expected_range_m, range_m)
-        range_sigma = sensor.range_sigma_m(range_m)
+        range_sigma = range_sigma_m(sensor, range_m)
     return range_sigma, sensor.bearing_sigma_rad if bearing_sigma is None else bearing_sigma
 
 

@@ -13,7 +13,7 @@ readmitted after its reports were right for some time (docs/trust.md).
 
 import math
 from collections.abc import Iterator, Mapping
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 from msgspec.structs import replace
 
@@ -30,8 +30,10 @@ from cpcbl_team.sender_record import (
 )
 
 OWN_SENSORS = ""  # stands for the robot's own sensors among the senders; no robot has this name
-RECENT_NS = 3_000_000_000  # a sender takes part in a dispute for this long after its last report
-FRESH_BELIEF_NS = 300_000_000  # the robot of an older belief may have turned since
+RECENT_NS: Final = (
+    3_000_000_000  # after its last report, a sender takes part in disputes for so long
+)
+FRESH_BELIEF_NS: Final = 300_000_000  # the robot of an older belief may have turned since
 TIE_NS = 1_500_000_000  # a dispute between equally many is decided for the estimate after this time
 CLEAR_CONFLICTS = 0.5  # odometry speaks against a sender with this many conflicts
 MOST_CONFLICTS = 2.5  # with more a sender is quarantined: at the third within a short time

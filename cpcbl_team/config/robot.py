@@ -138,10 +138,6 @@ class SensorSettings(Table, frozen=True, kw_only=True):
     sees_landmarks: bool = True
     sees_robots: bool = True
 
-    def range_sigma_m(self, range_m: float) -> float:
-        """The sigma of a range (both in metres)."""
-        return math.hypot(self.range_share * range_m, self.range_floor_m)
-
     @property
     def bearing_sigma_rad(self) -> float:
         return math.radians(self.bearing_sigma_deg)

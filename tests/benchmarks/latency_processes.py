@@ -27,6 +27,7 @@ from cpcbl_team.config import (
     Team,
 )
 from cpcbl_team.inputs import Fix, Odometry, Sighting, Sightings
+from cpcbl_team.sensors import range_sigma_m
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus, BusProxy, Handle, MessageCallback, Publisher, PublisherProxy
 from cpcbl_transport.compact import FIX_BYTES
@@ -210,7 +211,7 @@ class Driver:
         sensor = self._team.robots["observer"].sensor
         seen = Sighting(
             "teammate",
-            RADIUS_M + sensor.range_sigma_m(RADIUS_M) * self._normal(),
+            RADIUS_M + range_sigma_m(sensor, RADIUS_M) * self._normal(),
             math.remainder(bearing + sensor.bearing_sigma_rad * self._normal(), math.tau),
         )
         payload = encode(Sightings(stamp_ns, (seen,)))

@@ -47,6 +47,7 @@ from cpcbl_team.localizer import Localizer
 from cpcbl_team.motion import motion_noise
 from cpcbl_team.pose_observation import from_fix, from_position_sensor
 from cpcbl_team.sender_record import QuarantineReason
+from cpcbl_team.sensors import range_sigma_m
 from cpcbl_team.state import State, TeammateMemory
 
 ORIGIN = Pose2(0.0, 0.0, 0.0)
@@ -249,7 +250,7 @@ class Observer:
         exact, noise = point_sighting(WATCH, "me", truth.x, truth.y), self._rng.normal
         assert exact.range_m is not None
         assert exact.bearing_rad is not None
-        sigma_m = SENSOR.range_sigma_m(exact.range_m)
+        sigma_m = range_sigma_m(SENSOR, exact.range_m)
         seen = Sighting(
             "me",
             exact.range_m + sigma_m * noise(),

@@ -10,6 +10,7 @@ from cpcbl_team.inputs import Odometry, Sighting, Sightings
 from cpcbl_team.sensors import (
     corrected_odometry,
     corrected_sighting,
+    range_sigma_m,
     repetition_variance_factor,
     sighting_fault,
     sighting_sigmas,
@@ -75,8 +76,8 @@ def test_a_range_sigma_is_a_share_of_the_range() -> None:
 
 def test_a_range_sigma_has_a_floor() -> None:
     sensor = SensorSettings(range_share=0.03, range_floor_m=0.04)
-    assert sensor.range_sigma_m(1.0) == pytest.approx(0.05)
-    assert sensor.range_sigma_m(0.0) == pytest.approx(0.04)
+    assert range_sigma_m(sensor, 1.0) == pytest.approx(0.05)
+    assert range_sigma_m(sensor, 0.0) == pytest.approx(0.04)
 
 
 @pytest.mark.parametrize(("expected_m", "sigma_m"), [(5.0, 0.25), (100.0, 0.4), (0.1, 0.1)])

@@ -24,6 +24,7 @@ from cpcbl_team.gaussian import Covariance2, Gaussian2
 from cpcbl_team.geometry import Pose2, step, wrap_angle
 from cpcbl_team.inputs import Belief, Fix, Odometry, Position, Sighting, Sightings
 from cpcbl_team.localizer import Localizer
+from cpcbl_team.sensors import range_sigma_m
 from cpcbl_team.state import State
 
 Matrix = NDArray[np.float64]
@@ -170,7 +171,7 @@ def sensor_noise(rng: np.random.Generator, sensor: SensorSettings) -> Noise:
         assert a is not None
         return Sighting(
             exact.id,
-            r + sensor.range_sigma_m(r) * rng.normal(),
+            r + range_sigma_m(sensor, r) * rng.normal(),
             wrap_angle(a + sensor.bearing_sigma_rad * rng.normal()),
         )
 

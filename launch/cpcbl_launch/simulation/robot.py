@@ -11,7 +11,12 @@ from cpcbl_team.config import OdometrySettings, RobotSettings, SensorSettings
 from cpcbl_team.geometry import Pose2, step, wrap_angle
 from cpcbl_team.inputs import Odometry, Position, Sighting, Sightings
 from cpcbl_team.motion import motion_noise
-from cpcbl_team.sensors import LEAST_COSINE, corrected_odometry, time_at_min_speed_s
+from cpcbl_team.sensors import (
+    LEAST_COSINE,
+    corrected_odometry,
+    range_sigma_m,
+    time_at_min_speed_s,
+)
 from cpcbl_transport.messages import Drive, Frame
 
 COMMAND_LASTS_NS = 500_000_000
@@ -188,7 +193,9 @@ class SimulatedRobot:
         bearing = wrap_angle(math.atan2(dy, dx) - self.pose.heading)
         if abs(bearing) > math.radians(sensor.field_of_view_deg) / 2.0:
             return None
-        range_m += self._reading_error(visible.name, "range", sensor.range_sigma_m(range_m), now_ns)
+        range_m += self._reading_error(
+            visible.name, "range", range_sigma_m(sensor, range_m), now_ns
+        )
         bearing += self._reading_error(visible.name, "bearing", sensor.bearing_sigma_rad, now_ns)
         reading_m, reading = sensor_reading(range_m, bearing, sensor, visible.teammate)
         return Sighting(
