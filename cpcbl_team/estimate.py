@@ -114,7 +114,6 @@ HEADING: Final = Scope.HEADING
 Six = tuple[float, float, float, float, float, float]
 Sums = tuple[Six, Row]
 """The numbers of an `Information`, which is one."""
-_NO_SUMS: Final[Sums] = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
 
 
 def sharpest(variance: float) -> float:
@@ -126,8 +125,13 @@ def sharpest(variance: float) -> float:
 class InformationSum:
     """Adds up evidence about the offset from a prior (step 4)."""
 
-    def __init__(self, start: Sums = _NO_SUMS) -> None:
-        (self.xx, self.xy, self.yy, self.xh, self.yh, self.hh), (self.x, self.y, self.h) = start
+    def __init__(self, start: Sums | None = None) -> None:
+        self.xx = self.xy = self.yy = self.xh = self.yh = self.hh = 0.0
+        self.x = self.y = self.h = 0.0
+        if start is not None:
+            matrix, vector = start
+            self.xx, self.xy, self.yy, self.xh, self.yh, self.hh = matrix
+            self.x, self.y, self.h = vector
 
     def add(self, u: float, v: float, a: float, residual: float, weight: float) -> None:
         """Adds a scalar measurement with row (u, v, a); `weight` is the inverse of its variance."""
