@@ -53,6 +53,8 @@ def _compiled(files: list[str], folder: str) -> dict[str, str]:
     wheel."""
     options = [*OPTIONS, f"--cache-dir={folder}/cache"]
     modules = mypycify([*options, *files], target_dir=f"{folder}/c")
+    for module in modules:  # so that the C compiler may inline calls between the files
+        module.extra_compile_args.append("-fvisibility=hidden")
     command = build_ext(Distribution({"ext_modules": modules}))
     command.build_lib, command.build_temp = f"{folder}/lib", f"{folder}/o"
     command.ensure_finalized()
