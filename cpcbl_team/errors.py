@@ -16,7 +16,7 @@ class CpcblError(Exception):
         ├── BusError            no router, or a router that cannot listen (cpcbl_transport)
         ├── SecurityError       keys or endpoints of a secured team (cpcbl_transport.security)
         ├── DockerError         Docker refused, or did not end in time (cpcbl_launch.run.containers)
-        ├── CannotRunError      a fault scenario that cannot run here (cpcbl_launch.lab.chaos)
+        ├── MissingError        a fault scenario that cannot run here (cpcbl_launch.lab.chaos)
         └── ChaosError          a fault scenario that failed to run (cpcbl_launch.lab.chaos)
 
     Errors of an external library are converted where the file is read. A `ValueError`

@@ -26,7 +26,7 @@ from cpcbl_launch.lab.chaos.team import (
     RunPlan,
     TeamUnderTest,
     demo_team,
-    run_team_under_test,
+    run_team,
 )
 from cpcbl_launch.reporting.recorder import Recorder
 from cpcbl_launch.run.processes import PROGRAM
@@ -120,7 +120,7 @@ def fuzz(options: ScenarioOptions, per_key: int = PER_KEY) -> ScenarioResult:
     examples = hypothesis_payloads(options.seed)
     with ExitStack() as stack:
         plan = RunPlan(fuzz_team(), options.seed, left_out=(MATE,))
-        team = stack.enter_context(run_team_under_test(plan))
+        team = stack.enter_context(run_team(plan))
         bus = stack.enter_context(open_bus(plan.team.name, [team.endpoint]))
         ears = stack.enter_context(open_bus(plan.team.name, [team.endpoint]))
         recorder, watcher, looks = Recorder(ears), StatusCollector(ears), FrameSubscriber(ears)

@@ -70,10 +70,7 @@ _add_command(
     "The same from pixels: a cheap camera on the navigator, a sharper one on the observer.",
 )
 _add_command(
-    "circular-vs-oval",
-    "figure7:OF_VARIANTS",
-    10,
-    "All four variants: accuracy and consistency.",
+    "circular-vs-oval", "figure7:OF_VARIANTS", 10, "All four variants: accuracy and consistency."
 )
 
 

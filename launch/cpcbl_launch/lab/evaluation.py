@@ -17,8 +17,7 @@ class LogEvaluation(NamedTuple):
     """The figures of a log, and the estimates that they are about."""
 
     report: Report
-    paths: dict[str, dict[str, Trajectory]]
-    """By filter (`estimate`: the team's; then the baselines'), then by robot."""
+    paths: dict[str, dict[str, Trajectory]]  # by filter (the team's is `estimate`), then by robot
 
 
 def evaluate_log(

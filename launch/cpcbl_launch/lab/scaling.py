@@ -64,19 +64,15 @@ class TeamSizeFigures(Struct, frozen=True, kw_only=True):
     sender's link, with Zenoh's own."""
 
     robots: int
-    in_sight: float
-    """The number of teammates in one frame."""
+    in_sight: float  # the number of teammates in one frame
     messages_sent_per_s: float
     bytes_sent_per_s: float
     messages_received_per_s: float
-    bytes_received_per_s: float
-    """Fixes and beliefs."""
+    bytes_received_per_s: float  # fixes and beliefs
     cpu_ms_per_s: float
     """CPU of the robot's own steps; sending puts a message into the inboxes of its receivers."""
-    field_cpu_ms_per_s: float
-    """CPU of the simulation of one robot: its motion and its sightings."""
-    times_real_time: float
-    """Of the whole process, without start-up and report."""
+    field_cpu_ms_per_s: float  # CPU of the simulation of one robot: its motion and its sightings
+    times_real_time: float  # of the whole process, without start-up and report
     position_rmse_m: float | None
     inside_3_sigma: float | None
 

@@ -35,7 +35,7 @@ from cpcbl_launch.lab.chaos.team import (
     RunPlan,
     demo_team,
     router_spec,
-    run_team_under_test,
+    run_team,
 )
 from cpcbl_launch.run.processes import MIB, PROGRAM, Supervisor, process_usage
 from cpcbl_launch.run.up import free_endpoint
@@ -297,7 +297,7 @@ def test_an_echo_sends_every_message_twice_more() -> None:
 
 
 def test_a_team_that_does_not_settle_raises_an_error_with_robot_and_reason() -> None:
-    with run_team_under_test(RunPlan(demo_team(), relayed=("patrol",))) as team:
+    with run_team(RunPlan(demo_team(), relayed=("patrol",))) as team:
         team.links["patrol"].quality = LinkQuality(cut=True)
         with pytest.raises(ChaosError, match=r"did not settle: .*patrol"):
             team.settle(patience_s=8.0)

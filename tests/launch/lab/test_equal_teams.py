@@ -22,7 +22,7 @@ MUTUAL_NAIVE = Overrides(direction="both-ways", fusion="naive")
 
 def first_and_last_third(team: Team, seeds: int, duration_s: float) -> tuple[float, float]:
     """The mean NEES of the first and of the last third of this many runs."""
-    case = Case(team, tuple(team.robots), duration_s)
+    case = Case(team, tuple(team.robots), duration_s, loops=0)
     nees = team_nees(run_case(case, seed) for seed in range(1, seeds + 1))
     third = nees.shape[1] // 3
     return float(nees[:, :third].mean()), float(nees[:, -third:].mean())

@@ -19,7 +19,6 @@ from cpcbl_launch.lab.experiments.runs import (
     Outcome,
     accuracy,
     circuit_team,
-    loop_case,
     run_case,
     spread,
     with_settings,
@@ -51,7 +50,7 @@ PAIR = "weighted 0.05 0.5"
 
 
 def one_loop(team: Team, **changes: Any) -> Case:
-    return loop_case(team, "runner")._replace(loops=1, **changes)
+    return Case(team, ("runner",), loops=1)._replace(**changes)
 
 
 @pytest.fixture
@@ -104,7 +103,7 @@ def test_seeds_differ(runner: Team) -> None:
 
 
 def test_a_run_ends_when_every_waypoint_of_its_loops_was_reached(runner: Team) -> None:
-    found = run_case(loop_case(runner, "runner")._replace(loops=2), 1)
+    found = run_case(Case(runner, ("runner",), loops=2), 1)
     assert found.finished
     assert found.at_waypoints.shape == found.odometry_at_waypoints.shape == (2 * 4, 3)
     assert found.bumps == found.restarts == 0

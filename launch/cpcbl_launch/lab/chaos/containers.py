@@ -11,25 +11,9 @@ from pathlib import Path
 from cpcbl_agents.clock import Clock
 from cpcbl_launch.lab.chaos.expectations import partition
 from cpcbl_launch.lab.chaos.run_log import RunLog, RunRecorder
-from cpcbl_launch.lab.chaos.scenario import (
-    CannotRunError,
-    FaultRun,
-    ScenarioOptions,
-    ScenarioResult,
-)
+from cpcbl_launch.lab.chaos.scenario import FaultRun, MissingError, ScenarioOptions, ScenarioResult
 from cpcbl_launch.lab.chaos.team import PATIENCE_S, ChaosError
-from cpcbl_launch.run.containers import BASE_IMAGE, BASE_VARIABLE
-from cpcbl_launch.run.containers.docker import (
-    DockerError,
-    check_daemon,
-    checkout,
-    command_output,
-    compose_program,
-    ensure_image,
-    has_image,
-    never_stop,
-    version,
-)
+from cpcbl_launch.run.containers import BASE_IMAGE, BASE_VARIABLE, docker
 from cpcbl_launch.run.containers.fleet import Project
 from cpcbl_launch.run.up import free_endpoint
 from cpcbl_transport.zenoh_bus import open_bus
@@ -45,12 +29,12 @@ BLIND_M = 1.0  # the blind scout is far from those that know best
 
 def missing_docker() -> str:
     """The missing requirement of containers on this machine; empty if there is none."""
-    if checkout() is None:
+    if docker.checkout() is None:
         return f"needs a checkout, for {SITES} and the image's sources"
     try:
-        check_daemon()
-        compose_program()
-    except DockerError as error:
+        docker.check_daemon()
+        docker.compose_program()
+    except docker.DockerError as error:
         return f"needs Docker: {error}"
     return ""
 
@@ -68,9 +52,9 @@ def partition_containers(options: ScenarioOptions) -> ScenarioResult:
         options.report_progress(f"the sites are apart for {CUT_S:g} s")
         ends = [f"{project.name}_link", project.containers()["router-east"].id]
         cut_s = west.now_s
-        command_output(["docker", "network", "disconnect", *ends])
+        docker.command_output(["docker", "network", "disconnect", *ends])
         time.sleep(CUT_S)
-        command_output(["docker", "network", "connect", *ends])
+        docker.command_output(["docker", "network", "connect", *ends])
         healed_s = west.now_s
         options.report_progress("the link between the sites is back")
         time.sleep(AFTER_S)
@@ -88,17 +72,17 @@ def _helps(west: RunLog, east: RunLog) -> bool:
 @contextmanager
 def _sites(options: ScenarioOptions) -> Iterator[tuple[Project, RunRecorder, RunRecorder]]:
     """(the running containers, what is received in the west, and in the east)."""
-    top = checkout()
+    top = docker.checkout()
     assert top is not None
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="cpcbl-chaos-")))
         endpoints = [free_endpoint() for _ in PORTS]
-        text = (top / SITES).read_text().replace(f"cpcbl-team:{version()}", _image(options))
+        text = (top / SITES).read_text().replace(f"cpcbl-team:{docker.version()}", _image(options))
         for port, endpoint in zip(PORTS, endpoints, strict=True):
             text = text.replace(f"127.0.0.1:{port}:", endpoint.removeprefix("tcp/") + ":")
         file = folder / SITES.name
         file.write_text(text)
-        project = Project(compose_program(), f"cpcbl-chaos-{secrets.token_hex(3)}", file)
+        project = Project(docker.compose_program(), f"cpcbl-chaos-{secrets.token_hex(3)}", file)
         stack.callback(project.down)
         project.up()
         clock = Clock.wall()
@@ -112,7 +96,7 @@ def _image(options: ScenarioOptions) -> str:
     """The image of these sources. Raises CannotRunError if it cannot be built."""
     bases = (os.environ.get(BASE_VARIABLE), BASE_IMAGE, OWN_BASE)
     try:
-        base = next((b for b in bases if b and has_image(b)), bases[0] or BASE_IMAGE)
-        return ensure_image(base, never_stop, options.report_progress)
-    except DockerError as error:
-        raise CannotRunError(f"needs an image: {error}") from error
+        base = next((b for b in bases if b and docker.has_image(b)), bases[0] or BASE_IMAGE)
+        return docker.ensure_image(base, docker.never_stop, options.report_progress)
+    except docker.DockerError as error:
+        raise MissingError(f"needs an image: {error}") from error

@@ -15,7 +15,7 @@ from rich.table import Table
 from rich.text import Text
 
 from cpcbl_launch.lab.chaos.checks import ChaosReport, Outcome
-from cpcbl_launch.lab.chaos.scenario import CannotRunError, Scenario, ScenarioOptions
+from cpcbl_launch.lab.chaos.scenario import MissingError, Scenario, ScenarioOptions
 from cpcbl_launch.lab.chaos.scenarios import SCENARIOS
 from cpcbl_launch.lab.chaos.team import ChaosError
 from cpcbl_launch.run.containers.docker import DockerError
@@ -50,7 +50,7 @@ def run_scenario(scenario: Scenario, options: ScenarioOptions) -> Outcome:
     try:
         found = scenario.run(options._replace(fault=done))
         outcome = replace(outcome, checks=tuple(found.checks), remarks=found.remarks)
-    except CannotRunError as error:
+    except MissingError as error:
         return replace(outcome, not_run=str(error))
     except (ChaosError, BusError, DockerError, OSError, subprocess.TimeoutExpired) as error:
         outcome = replace(outcome, failed=str(error))

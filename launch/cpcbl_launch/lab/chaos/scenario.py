@@ -8,17 +8,11 @@ import msgspec
 
 from cpcbl_launch.lab.chaos.checks import Check
 from cpcbl_launch.lab.chaos.run_log import RunLog
-from cpcbl_launch.lab.chaos.team import (
-    SETTLED_M,
-    RunPlan,
-    TeamUnderTest,
-    demo_team,
-    run_team_under_test,
-)
+from cpcbl_launch.lab.chaos.team import SETTLED_M, RunPlan, TeamUnderTest, demo_team, run_team
 from cpcbl_team.errors import CpcblError
 
 
-class CannotRunError(CpcblError):
+class MissingError(CpcblError):
     """This machine lacks something that a scenario requires."""
 
 
@@ -45,9 +39,6 @@ class Requirement(NamedTuple):
     missing: Callable[[], str] = lambda: ""  # what is missing here; empty if nothing is
 
 
-NOTHING = Requirement()
-
-
 class Scenario(NamedTuple):
     """One row of the table of scenarios."""
 
@@ -55,7 +46,7 @@ class Scenario(NamedTuple):
     done: str
     expectation: str
     run: Callable[[ScenarioOptions], ScenarioResult]
-    needs: Requirement = NOTHING
+    needs: Requirement = Requirement()
     quick: bool = False  # whether the ordinary test suite runs it, too
 
 
@@ -69,8 +60,7 @@ class FaultRun(msgspec.Struct):
     robots: Sequence[str]  # those that run and whose truth is known
     robot: str = ""  # the robot or process that the fault concerns
     fault_s: float = 0.0
-    healed_s: float = 0.0
-    """When the fault ended; of a process that was killed: when it, or what needs it, was back."""
+    healed_s: float = 0.0  # its end; of a killed process: when it, or what needs it, was back
     end_s: float = 0.0
     incarnation: str = ""  # the robot's process before the fault
     restarted_s: float = 0.0  # when a new field had started
@@ -101,8 +91,9 @@ class TeamFault(msgspec.Struct, frozen=True):
     plan: Callable[[], RunPlan] = lambda: RunPlan(demo_team())
     settled_m: float = SETTLED_M
     baseline_s: float = 4.0  # how long the settled team runs before the fault
-    simulated_s: tuple[float, float] | None = None
-    """When the simulation begins and ends the fault, in robot time."""
+    simulated_s: tuple[float, float] | None = (
+        None  # the times of a simulated fault
+    )
     lasts_s: float = 0.0
     until: Callable[[FaultRun], float | None] = lambda run: None
     """Ends the fault earlier than after `lasts_s`, as soon as this figure is known."""
@@ -112,7 +103,7 @@ class TeamFault(msgspec.Struct, frozen=True):
     def __call__(self, options: ScenarioOptions) -> ScenarioResult:
         """Runs the team, injects the fault, and checks what happened."""
         options.report_progress("starting a team")
-        with run_team_under_test(self.plan()._replace(seed=options.seed)) as team:
+        with run_team(self.plan()._replace(seed=options.seed)) as team:
             team.settle(self.settled_m)
             team.run_for(0.0 if self.simulated_s else self.baseline_s)
             run = FaultRun(team.run_log, team.robots, self.robot, team.now_s, far=team.plan.far)

@@ -12,14 +12,7 @@ from cpcbl_launch.lab.chaos.checks import Check, at_most, equal_to
 from cpcbl_launch.lab.chaos.expectations import checks_recovered
 from cpcbl_launch.lab.chaos.run_log import worst
 from cpcbl_launch.lab.chaos.scenario import FaultRun, ScenarioOptions, ScenarioResult, latest
-from cpcbl_launch.lab.chaos.team import (
-    FIELD,
-    ROUTER,
-    RunPlan,
-    TeamUnderTest,
-    demo_team,
-    run_team_under_test,
-)
+from cpcbl_launch.lab.chaos.team import FIELD, ROUTER, RunPlan, TeamUnderTest, demo_team, run_team
 from cpcbl_launch.run.processes import MIB, process_usage, require_process_usage
 
 FAULTS = {
@@ -66,7 +59,7 @@ def soak(options: ScenarioOptions) -> ScenarioResult:
     settings = demo_team()
     plan = RunPlan(settings, options.seed, relayed=list(settings.robots))
     options.report_progress("starting a team")
-    with run_team_under_test(plan) as team:
+    with run_team(plan) as team:
         team.settle()
         faults = _FaultSequence(team, options)
         faults.run()
@@ -138,8 +131,7 @@ class _FaultSequence:
         self._team, self._options = team, options
         self._random = random.Random(options.seed)
         self._sampled_s = 0.0
-        self.samples = defaultdict[tuple[str, int], list[ProcessSample]](list)
-        """By name and id of the process."""
+        self.samples = defaultdict[tuple[str, int], list[ProcessSample]](list)  # by name and pid
         self.counts: Counter[str] = Counter()
 
     def run(self) -> None:

@@ -41,10 +41,8 @@ class RunPlan(NamedTuple):
     seed: int = 1
     relayed: Sequence[str] = ()  # robots that dial a relay instead of the router
     lossy: Sequence[str] = ()  # robots (at most one) whose only link is a `TunLink`
-    far: Sequence[str] = ()
-    """Robots at another site with a router of its own, which dials the first over a relay."""
-    faults: Mapping[str, str] = MappingProxyType({})
-    """The fault of a robot that sends wrong positions, such as `bias:0.5,0.5@10-30`."""
+    far: Sequence[str] = ()  # robots at a site whose own router dials the first over a relay
+    faults: Mapping[str, str] = MappingProxyType({})  # such as `bias:0.5,0.5@10-30`, by robot
     left_out: Sequence[str] = ()  # robots of the file that are not started
 
 
@@ -190,7 +188,7 @@ def clock_starting_in(seconds: float) -> Clock:
 
 
 @contextmanager
-def run_team_under_test(plan: RunPlan) -> Iterator[TeamUnderTest]:
+def run_team(plan: RunPlan) -> Iterator[TeamUnderTest]:
     """A team with all its processes. Raises ChaosError if one of them has not ended afterwards."""
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="cpcbl-chaos-")))

@@ -6,7 +6,6 @@ sees the robot.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from importlib.metadata import version
 from itertools import groupby
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -16,7 +15,7 @@ from msgspec.structs import replace
 from rich.console import RenderableType
 
 from cpcbl_launch.lab.evaluation import evaluate_log
-from cpcbl_launch.lab.experiments.runs import map_in_processes
+from cpcbl_launch.lab.experiments.runs import ExperimentResult, map_in_processes
 from cpcbl_launch.reporting.tables import cells, table
 from cpcbl_launch.run.logged_team import LoggedTeam
 from cpcbl_team.errors import InputError
@@ -36,8 +35,7 @@ class Point(Struct, frozen=True, kw_only=True):
     bytes_per_s: float
     messages_per_minute: float
     position_rmse_m: float
-    blind_rmse_m: float | None
-    """Of the robots that see no landmark."""
+    blind_rmse_m: float | None  # of the robots that see no landmark
     heading_rmse_deg: float
     inside_3_sigma: float | None
     nees: float | None
@@ -53,11 +51,9 @@ class Target(Struct, frozen=True, kw_only=True):
     held: bool
 
 
-class Curve(Struct, frozen=True, kw_only=True):
+class Curve(ExperimentResult, frozen=True, kw_only=True):
     """The result of the experiment."""
 
-    experiment: str
-    version: str
     log: str
     blind: tuple[str, ...]
     duration_s: float
@@ -137,7 +133,6 @@ def measure_curve(logged: LoggedTeam, jobs: int | None, done: Callable[[], None]
     points = tuple(map_in_processes(measure_point, tasks, jobs, done))
     return Curve(
         experiment="budget",
-        version=version("cpcbl-team"),
         log=Path(logged.team.data).name,
         blind=_blind(logged),
         duration_s=(logged.end_ns - logged.start_ns) * 1e-9,

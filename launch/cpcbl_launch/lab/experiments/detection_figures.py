@@ -11,14 +11,13 @@ import platform
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import lru_cache
-from importlib.metadata import version
 from itertools import pairwise
 from typing import Literal, NamedTuple
 
 from msgspec import Struct
 from rich.console import RenderableType
 
-from cpcbl_launch.lab.experiments.runs import map_in_processes
+from cpcbl_launch.lab.experiments.runs import ExperimentResult, map_in_processes
 from cpcbl_launch.reporting.tables import cells, number, table
 from cpcbl_launch.team_file import builtin_path, load_team
 from cpcbl_team.config import Team
@@ -44,8 +43,7 @@ class Record(NamedTuple):
     """An object that was due to be detected, or was reported correctly, or both."""
 
     due: tuple[Kind, ...]
-    seen_by: Kind | None
-    """A marker if the sighting has a heading, else a mast."""
+    seen_by: Kind | None  # a marker if the sighting has a heading, else a mast
     range_m: float
     range_error_m: float | None = None
     range_sigma_m: float | None = None
@@ -72,10 +70,8 @@ class Batch(NamedTuple):
     records: list[Record]
     mistakes: list[Mistake]
     doubts: Mapping[str, int]
-    refused: Mapping[str, int]
-    """Frames that could not be used."""
-    see_s: float
-    """In all, from JPEG to sightings."""
+    refused: Mapping[str, int]  # frames that could not be used
+    see_s: float  # in all, from JPEG to sightings
     render_s: float
 
 
@@ -84,23 +80,18 @@ class Figures(Struct, frozen=True, kw_only=True):
 
     from_m: float
     to_m: float
-    due: int
-    """Objects that were completely visible."""
-    found: int
-    """Those of them that were reported correctly, by any feature, with or without a range."""
+    due: int  # objects that were completely visible
+    found: int  # those of them that were reported correctly, by any feature, even without a range
     recall: float | None
-    reported: int
-    """Sightings by this kind of feature, due or not, correct or not."""
+    reported: int  # sightings by this kind of feature, due or not, correct or not
     right: int
     precision: float | None
-    ranged: int
-    """Correct ones with a range."""
+    ranged: int  # correct ones with a range
     range_sigma_share: float | None
     range_bias_share: float | None
     bearing_sigma_deg: float | None
     heading_sigma_deg: float | None
-    range_inside: float | None
-    """Share inside three stated sigmas."""
+    range_inside: float | None  # share inside three stated sigmas
     bearing_inside: float | None
     heading_inside: float | None
 
@@ -115,26 +106,21 @@ class Error(Struct, frozen=True, kw_only=True, array_like=True):
     bearing_sigma_deg: float | None
 
 
-class DetectionReport(Struct, frozen=True, kw_only=True):
+class DetectionReport(ExperimentResult, frozen=True, kw_only=True):
     """The result of the experiment."""
 
-    experiment: str
-    version: str
     seed: int
     frames: int
     team: Team
-    within: dict[Kind, Figures]
-    """Up to the range that recall and precision are about."""
-    accuracy: dict[Kind, Figures]
-    """Up to the range that errors are about."""
+    within: dict[Kind, Figures]  # up to the range that recall and precision are about
+    accuracy: dict[Kind, Figures]  # up to the range that errors are about
     bins: dict[Kind, tuple[Figures, ...]]
     mistakes: tuple[Mistake, ...]
     doubts: dict[str, int]
     refused: dict[str, int]
     errors: dict[Kind, tuple[Error, ...]]
     pattern: dict[str, bool]
-    cost: dict[str, float | str]
-    """Measured times, of this machine."""
+    cost: dict[str, float | str]  # measured times, of this machine
 
 
 @lru_cache(maxsize=1)
@@ -166,7 +152,6 @@ def summarize(count: int, seed: int, batches: Sequence[Batch]) -> DetectionRepor
     accuracy = {k: between(k, 0.0, ERRORS_WITHIN_M) for k in KINDS}
     return DetectionReport(
         experiment="eyes",
-        version=version("cpcbl-team"),
         seed=seed,
         frames=count,
         team=team(),

@@ -50,7 +50,7 @@ def cases(sizes: Sequence[int] = SIZES) -> Mapping[Key, Case]:
         team = crowd_team(size)
         mobile = tuple(n for n, r in team.robots.items() if r.odometry.moves)
         alone = with_overrides(team, Overrides(collaboration="none"))
-        every[size, "alone", "", 0.0] = Case(alone, mobile, DURATION_S)
+        every[size, "alone", "", 0.0] = Case(alone, mobile, DURATION_S, 0)
         for (direction, fusion), offset in itertools.product(WAYS, OFFSETS_M):
             helping = with_overrides(team, Overrides(direction=direction, fusion=fusion))
             truth = with_displaced_observers(helping, offset)
@@ -87,9 +87,8 @@ def crowd_team(size: int) -> Team:
 def _observer(base: Team, x: float, y: float, heading_deg: float) -> RobotSettings:
     settings = base.robots["observer"]
     sensor = replace(settings.sensor, sees_landmarks=False, max_range_m=10.0)
-    start = Start(
-        x_m=x, y_m=y, heading_deg=heading_deg, sigma_m=CLAIMED_SIGMA_M, heading_sigma_deg=0.5
-    )
+    sigmas = {"sigma_m": CLAIMED_SIGMA_M, "heading_sigma_deg": 0.5}
+    start = Start(x_m=x, y_m=y, heading_deg=heading_deg, **sigmas)
     return replace(settings, sensor=sensor, start=start)
 
 
@@ -143,7 +142,7 @@ def outcome(results: Results) -> Outcome:
             }
         )
     sizes = dict.fromkeys(size for size, *_ in results)
-    teams = {str(size): Case(crowd_team(size), (), DURATION_S) for size in sizes}
+    teams = {str(size): Case(crowd_team(size), (), DURATION_S, 0) for size in sizes}
     figures = {"duration_s": DURATION_S, "observer_sigma_m": CLAIMED_SIGMA_M, "rows": rows}
     return new_outcome("one-way-vs-both", results, teams, figures=figures)
 

@@ -24,7 +24,6 @@ from cpcbl_launch.lab.experiments.runs import (
     Results,
     accuracy,
     circuit_team,
-    loop_case,
     new_outcome,
     pattern_lines,
     with_settings,
@@ -59,7 +58,7 @@ def team_case(configuration: str, variant: str = "circular", field: str = "circu
     if configuration == "A":
         blind = {"sees_landmarks": False}
         team = with_settings(team, "navigator", sensor=blind, localizer=ODOMETRY_ONLY)
-    return loop_case(team, "navigator")
+    return Case(team, ("navigator",))
 
 
 def cases() -> Mapping[str, Case]:

@@ -12,7 +12,6 @@ import math
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
-from importlib.metadata import version
 from typing import NamedTuple
 
 import numpy as np
@@ -20,7 +19,7 @@ from msgspec import Struct
 from msgspec.structs import replace
 from rich.console import RenderableType
 
-from cpcbl_launch.lab.experiments.runs import Experiment, Results, Spread, spread
+from cpcbl_launch.lab.experiments.runs import Experiment, ExperimentResult, Results, Spread, spread
 from cpcbl_launch.lab.faulty_robot import Fault, FaultyBus
 from cpcbl_launch.reporting.metrics import position_errors
 from cpcbl_launch.reporting.tables import number, table
@@ -43,14 +42,10 @@ DRIVERS = ("navigator", "scout", "scout2")
 class Case(Struct, frozen=True, kw_only=True):
     """One case of the experiment."""
 
-    lie: str
-    """The fault of the liar without its times; empty: it works correctly."""
-    liar: bool = True
-    """Whether the faulty observer is there at all."""
-    honest: int = 2
-    """The number of correct observers."""
-    trust: bool = True
-    """Whether robots assess the trust in their teammates."""
+    lie: str  # the fault of the liar without its times; empty: it works correctly
+    liar: bool = True  # whether the faulty observer is there at all
+    honest: int = 2  # the number of correct observers
+    trust: bool = True  # whether robots assess the trust in their teammates
 
 
 class Quarantine(NamedTuple):
@@ -74,38 +69,26 @@ class Row(Struct, frozen=True, kw_only=True):
     """One case over its seeds."""
 
     case: Case
-    rmse_m: Spread | None
-    """Of the robots that drive: root of the mean over all their samples."""
-    worst_m: Spread | None
-    """Of the robot with the largest error."""
-    ratio: Spread | None
-    """To the team without the faulty observer, with the same seed."""
-    found: int
-    """Robots that quarantined the faulty observer, over all seeds."""
-    listening: int
-    """Robots that drive, over all seeds."""
+    rmse_m: Spread | None  # of the robots that drive: root of the mean over all their samples
+    worst_m: Spread | None  # of the robot with the largest error
+    ratio: Spread | None  # to the team without the faulty observer, with the same seed
+    found: int  # robots that quarantined the faulty observer, over all seeds
+    listening: int  # robots that drive, over all seeds
     found_after_s: Spread | None
-    readmitted_after_s: Spread | None
-    """After the fault ended."""
+    readmitted_after_s: Spread | None  # after the fault ended
     reasons: dict[str, int]
-    false_quarantines: int
-    """Of correct robots, or of the faulty observer before its fault, over all seeds."""
-    false_quarantine_s: float
-    """How long these lasted, seconds a run."""
+    false_quarantines: int  # of correct robots, or of the liar before its fault, over all seeds
+    false_quarantine_s: float  # how long these lasted, seconds a run
 
 
-class Liars(Struct, frozen=True, kw_only=True):
+class Liars(ExperimentResult, frozen=True, kw_only=True):
     """The result of the experiment."""
 
-    experiment: str
-    version: str
     seeds: int
-    lie_s: tuple[float, float, float]
-    """Start and end of the fault, end of the run."""
+    lie_s: tuple[float, float, float]  # start and end of the fault, end of the run
     team: Team
     rows: tuple[Row, ...]
-    held: bool
-    """Whether the median ratio of every fault is within the target."""
+    held: bool  # whether the median ratio of every fault is within the target
 
 
 def liars_team(case: Case) -> Team:
@@ -179,7 +162,6 @@ def outcome(results: Results) -> Liars:
     )
     return Liars(
         experiment="liars",
-        version=version("cpcbl-team"),
         seeds=len(next(iter(results.values()))),
         lie_s=(FROM_S, UNTIL_S, END_S),
         team=liars_team(Case(lie="")),

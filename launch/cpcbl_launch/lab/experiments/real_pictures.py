@@ -9,7 +9,6 @@ downloads them, and they are not copied.
 import csv
 import math
 from collections.abc import Iterable, Sequence
-from importlib.metadata import version
 from importlib.resources import files
 from pathlib import Path
 from typing import NamedTuple
@@ -21,6 +20,7 @@ from cpcbl_agents.vision.detections import Detections
 from cpcbl_agents.vision.detector import CameraDetector
 from cpcbl_agents.vision.pictures import decode_image
 from cpcbl_launch.lab.experiments.detection_figures import degrees, within_3_sigma
+from cpcbl_launch.lab.experiments.runs import ExperimentResult
 from cpcbl_launch.reporting.tables import number, table
 from cpcbl_launch.team_file import load_team
 from cpcbl_team.config import Team
@@ -57,21 +57,16 @@ class LineResult(Struct, frozen=True, kw_only=True):
     heading_sigma_deg: float | None = None
 
 
-class RealPictures(Struct, frozen=True, kw_only=True):
+class RealPictures(ExperimentResult, frozen=True, kw_only=True):
     """The result of the experiment."""
 
-    experiment: str
-    version: str
     set: str
     team: Team
     pictures: int
     lines: tuple[LineResult, ...]
-    unexpected: tuple[tuple[str, str], ...]
-    """Picture and id of detections that are not in the table."""
-    doubted: tuple[tuple[str, str], ...]
-    """Picture and reason."""
-    refused: dict[str, str]
-    """Pictures that could not be used, with the reason."""
+    unexpected: tuple[tuple[str, str], ...]  # picture and id of what is seen, but not in the table
+    doubted: tuple[tuple[str, str], ...]  # picture and reason
+    refused: dict[str, str]  # pictures that could not be used, with the reason
 
 
 def picture_set(name: str) -> Path:
@@ -134,7 +129,6 @@ def measure(name: str, folder: Path) -> RealPictures:
         doubted += [(picture, ambiguity.reason) for ambiguity in detections.ambiguities]
     return RealPictures(
         experiment=f"pictures-{path.stem}",
-        version=version("cpcbl-team"),
         set=path.stem,
         team=team,
         pictures=len({line.picture for line in lines}),

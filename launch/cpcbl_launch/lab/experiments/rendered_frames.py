@@ -69,8 +69,7 @@ class RandomFrame(NamedTuple):
     robots: tuple[SceneRobot, ...]
     scene: Scene
     light: Light
-    camera: CameraSettings
-    """The true camera, not the one of the viewer's settings."""
+    camera: CameraSettings  # the true camera, not the one of the viewer's settings
 
 
 class NamedObject(NamedTuple):
@@ -80,10 +79,8 @@ class NamedObject(NamedTuple):
     range_m: float
     bearing_rad: float
     heading_rad: float
-    due: tuple[Kind, ...]
-    """The features that are completely visible."""
-    some: bool
-    """Whether any part of it is visible."""
+    due: tuple[Kind, ...]  # the features that are completely visible
+    some: bool  # whether any part of it is visible
     half_width_rad: float
 
 

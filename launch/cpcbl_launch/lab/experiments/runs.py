@@ -16,17 +16,12 @@ from multiprocessing import get_context
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
-from msgspec import Struct
+from msgspec import Struct, field
 from msgspec.structs import replace
 from rich.console import RenderableType
 
-from cpcbl_launch.reporting.metrics import (
-    Floats,
-    Samples,
-    heading_errors,
-    interpolated_truth,
-    position_nees,
-)
+from cpcbl_launch.reporting import metrics
+from cpcbl_launch.reporting.metrics import Floats, Samples
 from cpcbl_launch.reporting.recorder import Recorder
 from cpcbl_launch.simulation.in_process import simulate
 from cpcbl_launch.team_file import builtin_path, load_team
@@ -50,8 +45,8 @@ class Case(NamedTuple):
 
     team: Team
     scored: tuple[str, ...]
-    limit_s: float
-    loops: int = 0
+    limit_s: float = LOOPS_LIMIT_S
+    loops: int = LOOPS
     truth: Team | None = None  # the team as it is, where its robots believe something else
 
 
@@ -128,14 +123,14 @@ def _figures(case: Case, recorder: Recorder, referee: LoopReferee, restarts: int
     samples = {name: recorder.samples(name, truth[name]) for name in case.scored}
     reached_s = np.array(referee.reached_s)
     driver_s, driven = recorder.timed_samples(driver, truth[driver])
-    odometry_m, _ = interpolated_truth(reached_s, np.array(referee.odometry_track))
-    true, _ = interpolated_truth(reached_s, truth[driver])
+    odometry_m, _ = metrics.interpolated_truth(reached_s, np.array(referee.odometry_track))
+    true, _ = metrics.interpolated_truth(reached_s, truth[driver])
     sent = [s.bytes_sent / (s.stamp_ns * 1e-9) for s in recorder.status.values()]
     return Run(
         finished=referee.finished or (not case.loops and not referee.bumped),
         bumps=restarts + referee.bumped,
         restarts=restarts,
-        robots={name: Errors(_errors(s), position_nees(s)) for name, s in samples.items()},
+        robots={name: Errors(_errors(s), metrics.position_nees(s)) for name, s in samples.items()},
         at_waypoints=_errors(driven)[np.isin(driver_s, reached_s)],
         odometry_at_waypoints=_errors(Samples(odometry_m, true, None)),
         bytes_per_s=sum(sent) / len(case.team.robots),
@@ -144,7 +139,7 @@ def _figures(case: Case, recorder: Recorder, referee: LoopReferee, restarts: int
 
 def _errors(samples: Samples) -> Floats:
     offset = samples.estimate[:, :2] - samples.truth[:, :2]
-    return np.column_stack([offset, heading_errors(samples)])
+    return np.column_stack([offset, metrics.heading_errors(samples)])
 
 
 def map_in_processes(
@@ -194,11 +189,6 @@ def with_settings(team: Team, robot: str, **tables: Mapping[str, object]) -> Tea
     return replace(team, robots={**team.robots, robot: replace(old, **new)})
 
 
-def loop_case(team: Team, driver: str, truth: Team | None = None) -> Case:
-    """Five loops of one driver."""
-    return Case(team, (driver,), LOOPS_LIMIT_S, LOOPS, truth)
-
-
 # Experiments and their figures --------------------------------------------------------------------
 
 Results = Mapping[Any, list[Any]]
@@ -223,19 +213,22 @@ class Experiment(NamedTuple):
         return {key: runs[i * seeds : (i + 1) * seeds] for i, key in enumerate(cases)}
 
 
-class Outcome(Struct, frozen=True, kw_only=True):
-    """The result of an experiment: its settings, then its figures."""
+class ExperimentResult(Struct, frozen=True, kw_only=True):
+    """What the result of every experiment begins with."""
 
     experiment: str
-    version: str
+    version: str = field(default_factory=lambda: version("cpcbl-team"))
+
+
+class Outcome(ExperimentResult, frozen=True, kw_only=True):
+    """The result of an experiment: its settings, then its figures."""
+
     seeds: int
     loops: int
     teams: dict[str, Team]
     figures: dict[str, Any]
-    paper: dict[str, Any] = {}
-    """The paper's own figures, where it has them."""
-    pattern: dict[str, bool] = {}
-    """The expected patterns, and whether each was met."""
+    paper: dict[str, Any] = {}  # the paper's own figures, where it has them
+    pattern: dict[str, bool] = {}  # the expected patterns, and whether each was met
 
 
 class Spread(Struct, frozen=True):
@@ -301,7 +294,6 @@ def new_outcome(name: str, results: Results, cases: Mapping[str, Case], **rest: 
     """A result with the settings of its cases."""
     return Outcome(
         experiment=name,
-        version=version("cpcbl-team"),
         seeds=len(next(iter(results.values()))),
         loops=LOOPS if any(case.loops for case in cases.values()) else 0,
         teams={key: case.team for key, case in cases.items()},

@@ -22,7 +22,6 @@ from cpcbl_launch.lab.experiments.runs import (
     Run,
     Spread,
     circuit_team,
-    loop_case,
     new_outcome,
     pattern_lines,
     spread,
@@ -60,7 +59,7 @@ def _case(configuration: str, localizer: Mapping[str, object]) -> Case:
     keys = {**localizer, "bearing_for_position": configuration != "A"}
     team = with_settings(team, "runner", localizer=keys)
     truth = with_settings(team, "runner", odometry={"turn_scale": WHEELS_TURN_SCALE})
-    return loop_case(team, "runner", truth)
+    return Case(team, ("runner",), truth=truth)
 
 
 def quantities(errors: Floats) -> tuple[float, ...]:
