@@ -106,11 +106,9 @@ def budget(
     from cpcbl_launch.run import logged_team
     from cpcbl_launch.team_file import load_team
 
-    logged = logged_team.with_duration(
-        logged_team.load_logged_team(load_team(logged_team.builtin_for(data)), data), duration
-    )
+    team = load_team(logged_team.builtin_for(data))
+    logged = logged_team.with_duration(logged_team.load_logged_team(team, data), duration)
     logged = logged._replace(team=with_blind_robots(logged.team, parse_names(blind)))
-
     measure = partial(experiment.measure_curve, logged, jobs)
     total = len(experiment.cases())
     _conduct("budget", measure, experiment.tables, output, as_json, total=total)
@@ -158,11 +156,9 @@ def pictures(
     require_opencv("experiment pictures")
     from cpcbl_launch.lab.experiments import real_pictures
 
-    def measure(_: Callable[[], None]) -> Any:
-        return real_pictures.measure(name, folder)
-
     title = f"pictures-{real_pictures.picture_set(name).stem}"
-    _conduct(title, measure, real_pictures.tables, output, as_json, drawn=False)
+    measure = partial(real_pictures.measure, name, folder)
+    _conduct(title, lambda _: measure(), real_pictures.tables, output, as_json, drawn=False)
 
 
 def _refuse_benchmark(context: typer.Context) -> None:

@@ -190,5 +190,7 @@ def _simulate_sizes(
         result = scaling.measure_sizes(scaling.parse_sizes(robots), seed, duration_s, progress)
     lost = options.write_report(report, result)
     if picture is not None:
-        lost |= write_or_reason(picture, partial(scaling.draw_scaling, result, picture))
+        from cpcbl_launch.lab.experiments.pictures import draw_scaling
+
+        lost |= write_or_reason(picture, partial(draw_scaling, result, picture))
     options.print_result(result, as_json, lambda: scaling.print_scaling(result, Console()), lost)

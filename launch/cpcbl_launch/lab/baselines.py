@@ -26,6 +26,7 @@ from cpcbl_agents.robot import build_robot
 from cpcbl_launch.reporting.metrics import Floats, Trajectory, samples_with_truth, score
 from cpcbl_launch.reporting.recorder import BaselineReport, mean_score
 from cpcbl_launch.run.logged_team import LoggedTeam
+from cpcbl_team import sensors
 from cpcbl_team.config import Field, LocalizationSettings
 from cpcbl_team.constraints import NEAREST_M
 from cpcbl_team.estimate import Estimate
@@ -33,12 +34,6 @@ from cpcbl_team.fusion import chi_square_bounds
 from cpcbl_team.geometry import Pose2, step, wrap_angle
 from cpcbl_team.inputs import Odometry, Sighting, Sightings
 from cpcbl_team.motion import motion_noise, part_of_piece
-from cpcbl_team.sensors import (
-    repetition_variance_factor,
-    sighting_fault,
-    sighting_sigmas,
-    time_at_min_speed_s,
-)
 
 SMALLEST_VARIANCE = 1e-12  # (1 um)^2: exact sensors must not make a matrix singular
 _TRIANGLE = ((0, 0, 1, 0, 1, 2), (0, 1, 1, 2, 2, 2))  # xx, xy, yy, xh, yh, hh
@@ -217,7 +212,7 @@ class Ekf:
         p[i : i + 2] += lever[:, None] * p[i + 2]
         p[:, i : i + 2] += p[:, i + 2, None] * lever
         s = robot.settings.odometry
-        crawled = time_at_min_speed_s(distance, seconds, s)
+        crawled = sensors.time_at_min_speed_s(distance, seconds, s)
         self._add(robot, motion_noise(before.heading, distance, turn, s, crawled))
 
     def _add(self, robot: _RobotBlock, noise: Iterable[float]) -> None:
@@ -236,7 +231,7 @@ class Ekf:
             last_ns = robot.used_ns.get(sighting.id)
             since_ns = None if last_ns is None else frame.stamp_ns - last_ns
             repeated = since_ns is not None and since_ns < least_ns
-            if repeated or sighting_fault(sighting):
+            if repeated or sensors.sighting_fault(sighting):
                 continue
             mate = self._robots.get(sighting.id)
             if mate is not None:
@@ -245,7 +240,8 @@ class Ekf:
             if measurement is None:
                 continue
             seconds = None if since_ns is None else since_ns * 1e-9
-            inflation = repetition_variance_factor(seconds, robot.settings.sensor.correlation_s)
+            correlation_s = robot.settings.sensor.correlation_s
+            inflation = sensors.repetition_variance_factor(seconds, correlation_s)
             accepted = self._update(measurement, inflation, robot.bounds)
             if accepted:
                 robot.used_ns[sighting.id] = frame.stamp_ns
@@ -279,7 +275,7 @@ class Ekf:
         if 1 in rows:
             innovation[-1] = wrap_angle(innovation[-1])
         columns = robot.columns + (mate.columns[:2] if mate is not None else [])
-        sigmas = np.array(sighting_sigmas(sighting, sensor, expected[0]))[rows]
+        sigmas = np.array(sensors.sighting_sigmas(sighting, sensor, expected[0]))[rows]
         noise = np.diag(sigmas**2 + SMALLEST_VARIANCE)
         return _Measurement(columns, jacobian[rows, : len(columns)], innovation, noise)
 

@@ -11,7 +11,7 @@ import gc
 import math
 import time
 from collections.abc import Sequence
-from pathlib import Path
+from functools import partial
 from random import Random
 
 from msgspec import Struct
@@ -25,15 +25,8 @@ from cpcbl_launch.reporting.tables import cells, table
 from cpcbl_launch.simulation.field import SimulatedField
 from cpcbl_launch.simulation.field_node import FieldNode
 from cpcbl_launch.simulation.in_process import Progress, robot_nodes, run_nodes, simulated_report
-from cpcbl_team.config import (
-    Field,
-    Landmark,
-    OdometrySettings,
-    RobotSettings,
-    SensorSettings,
-    Start,
-    Team,
-)
+from cpcbl_team import config
+from cpcbl_team.config import RobotSettings, SensorSettings, Team
 from cpcbl_team.errors import InputError
 from cpcbl_team.inputs import Sightings
 from cpcbl_transport import topics
@@ -69,8 +62,7 @@ class TeamSizeFigures(Struct, frozen=True, kw_only=True):
     bytes_sent_per_s: float
     messages_received_per_s: float
     bytes_received_per_s: float  # fixes and beliefs
-    cpu_ms_per_s: float
-    """CPU of the robot's own steps; sending puts a message into the inboxes of its receivers."""
+    cpu_ms_per_s: float  # CPU of the robot's own steps; to send is to fill its receivers' inboxes
     field_cpu_ms_per_s: float  # CPU of the simulation of one robot: its motion and its sightings
     times_real_time: float  # of the whole process, without start-up and report
     position_rmse_m: float | None
@@ -96,11 +88,11 @@ def swarm_team(size: int, seed: int) -> Team:
         robots[f"r{i:04}"] = _robot(x, y, random.uniform(0.0, math.tau), SENSORS[i % len(SENSORS)])
     rows = math.ceil(size / columns)
     marks = {
-        f"m{column}-{row}": Landmark(x_m=SPACING_M * column, y_m=SPACING_M * row)
+        f"m{column}-{row}": config.Landmark(x_m=SPACING_M * column, y_m=SPACING_M * row)
         for row in range(rows + 1)
         for column in range(row % 2, columns + 1, 2)
     }
-    return Team(name=f"swarm{size}", robots=robots, map=Field(landmarks=marks))
+    return Team(name=f"swarm{size}", robots=robots, map=config.Field(landmarks=marks))
 
 
 def _robot(home_x: float, home_y: float, from_rad: float, sensor: SensorSettings) -> RobotSettings:
@@ -109,9 +101,9 @@ def _robot(home_x: float, home_y: float, from_rad: float, sensor: SensorSettings
     corners = [(home_x + ROUND_M * math.cos(a), home_y + ROUND_M * math.sin(a)) for a in directions]
     (x, y), *others = corners
     return RobotSettings(
-        start=Start(x_m=x, y_m=y, heading_deg=math.degrees(from_rad) + 135.0),
+        start=config.Start(x_m=x, y_m=y, heading_deg=math.degrees(from_rad) + 135.0),
         sensor=sensor,
-        odometry=OdometrySettings(distance_sigma_m_per_sqrt_m=0.1),
+        odometry=config.OdometrySettings(distance_sigma_m_per_sqrt_m=0.1),
         waypoints_m=(*others, (x, y)),
         speed_m_s=SPEED_M_S,
     )
@@ -137,16 +129,15 @@ def measure_sizes(
     """
     require_duration(duration_s, LEAST_S)
     figures: list[TeamSizeFigures] = []
+
+    def show_part(before: int, size: int, done: float) -> None:
+        if progress is not None:
+            progress((before + done * size) / sum(sizes))
+
     for i, size in enumerate(sizes):
-        part = _partial_progress(progress, sum(sizes[:i]), size, sum(sizes))
+        part = partial(show_part, sum(sizes[:i]), size)
         figures.append(measure_team(swarm_team(size, seed), seed, duration_s, part))
     return ScalingReport(duration_s=duration_s, seed=seed, sizes=tuple(figures))
-
-
-def _partial_progress(progress: Progress | None, before: int, size: int, total: int) -> Progress:
-    """The progress of one team as a part of the progress of all."""
-    show = progress or (lambda done: None)
-    return lambda done: show((before + done * size) / total)
 
 
 def measure_team(
@@ -230,31 +221,3 @@ def print_scaling(scale: ScalingReport, console: Console) -> None:
         shown.add_row(*cells(size, quantities))
     console.print(shown)
     console.print(LEGEND, style="yellow", highlight=False)
-
-
-def draw_scaling(scale: ScalingReport, path: Path) -> None:
-    """Draws two panels: the bytes per second that a robot sends and receives, and the CPU of its
-    steps."""
-    import matplotlib as mpl
-
-    mpl.use("Agg")
-    from matplotlib import pyplot as plt
-
-    figure, (traffic, cpu) = plt.subplots(1, 2, figsize=(10, 4), layout="constrained")
-    sizes = [s.robots for s in scale.sizes]
-    for label, rates in (
-        ("sent", [s.bytes_sent_per_s for s in scale.sizes]),
-        ("received", [s.bytes_received_per_s for s in scale.sizes]),
-    ):
-        traffic.plot(sizes, rates, "o-", label=label)
-    cpu.plot(sizes, [s.cpu_ms_per_s for s in scale.sizes], "o-", color="C2")
-    traffic.set(title="fixes and beliefs of a robot", ylabel="bytes a second on their link")
-    traffic.legend()
-    cpu.set(title="CPU of a robot", ylabel="ms in a second of robot time")
-    for axes in (traffic, cpu):
-        axes.set(xlabel="robots in the team", xscale="log", ylim=(0, None))
-        axes.set_xticks(sizes, labels=[str(size) for size in sizes], minor=False)
-        axes.minorticks_off()
-        axes.grid(True, alpha=0.3)
-    figure.savefig(path, dpi=110)
-    plt.close(figure)

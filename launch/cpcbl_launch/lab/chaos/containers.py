@@ -93,7 +93,7 @@ def _sites(options: ScenarioOptions) -> Iterator[tuple[Project, RunRecorder, Run
 
 
 def _image(options: ScenarioOptions) -> str:
-    """The image of these sources. Raises CannotRunError if it cannot be built."""
+    """The image of these sources. Raises MissingError if it cannot be built."""
     bases = (os.environ.get(BASE_VARIABLE), BASE_IMAGE, OWN_BASE)
     try:
         base = next((b for b in bases if b and docker.has_image(b)), bases[0] or BASE_IMAGE)

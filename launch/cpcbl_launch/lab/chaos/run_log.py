@@ -13,14 +13,8 @@ from typing import NamedTuple
 import numpy as np
 
 from cpcbl_agents.clock import Clock
-from cpcbl_launch.reporting.metrics import (
-    Floats,
-    Samples,
-    interpolated_truth,
-    position_errors,
-    position_nees,
-    score,
-)
+from cpcbl_launch.reporting import metrics
+from cpcbl_launch.reporting.metrics import Floats, Samples
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus
 from cpcbl_transport.decoding import decode
@@ -113,7 +107,8 @@ class RunLog(NamedTuple):
         stamps_s, samples = self._samples(robot, from_s, np.inf)
         lost = {t.stamp_s for t in self.tracks.get(robot, ()) if t.track.lost}
         since_s: float | None = None
-        for stamp_s, error_m in zip(stamps_s.tolist(), position_errors(samples), strict=True):
+        errors_m = metrics.position_errors(samples)
+        for stamp_s, error_m in zip(stamps_s.tolist(), errors_m, strict=True):
             if error_m <= within_m and stamp_s not in lost:
                 since_s = stamp_s if since_s is None else since_s
                 if stamp_s - since_s >= 1.0:
@@ -124,15 +119,16 @@ class RunLog(NamedTuple):
 
     def position_rmse_m(self, robot: str, from_s: float, until_s: float = np.inf) -> float | None:
         """Root mean square of the position error over the tracks stamped in [from_s, until_s)."""
-        return score(self._samples(robot, from_s, until_s)[1]).position_rmse_m
+        return metrics.score(self._samples(robot, from_s, until_s)[1]).position_rmse_m
 
     def largest_position_error_m(self, robot: str, from_s: float, until_s: float) -> float | None:
         """The largest position error of the tracks stamped in [from_s, until_s)."""
-        return score(self._samples(robot, from_s, until_s)[1]).position_max_m
+        return metrics.score(self._samples(robot, from_s, until_s)[1]).position_max_m
 
     def inside_3_sigma(self, robots: Iterable[str], from_s: float, until_s: float) -> float | None:
         """The share of tracks within 3 sigma of the truth (a consistent filter: 98.9 %)."""
-        parts = [position_nees(self._samples(name, from_s, until_s)[1]) for name in robots]
+        samples = (self._samples(name, from_s, until_s)[1] for name in robots)
+        parts = map(metrics.position_nees, samples)
         nees = np.concatenate([part for part in parts if part is not None] or [np.empty(0)])
         return float(np.mean(nees <= 9.0)) if len(nees) else None
 
@@ -154,7 +150,7 @@ class RunLog(NamedTuple):
         stamps_s = np.array([t.stamp_s for t in chosen])
         estimate = np.array([(t.track.x_m, t.track.y_m, t.track.heading_rad) for t in chosen])
         covariance = np.array([t.track.covariance for t in chosen])
-        truth, known = interpolated_truth(stamps_s, self.truth[robot])
+        truth, known = metrics.interpolated_truth(stamps_s, self.truth[robot])
         return stamps_s[known], Samples(estimate[known], truth[known], covariance[known])
 
     # Statuses -----------------------------------------------------------------------------------
@@ -226,11 +222,9 @@ def maximum(values: Iterable[float | None]) -> float | None:
     return max((v for v in known if v is not None), default=None) if None not in known else None
 
 
-def worst(
-    figure: Callable[..., float | None], robots: Iterable[str], *times_s: float
-) -> float | None:
+def worst(of: Callable[..., float | None], robots: Iterable[str], *times_s: float) -> float | None:
     """The largest of these robots' figures; None if one is missing or there are none."""
-    return maximum(figure(name, *times_s) for name in robots)
+    return maximum(of(name, *times_s) for name in robots)
 
 
 def _first(times_s: Iterable[float], from_s: float) -> float | None:

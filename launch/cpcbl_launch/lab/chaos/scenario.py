@@ -17,8 +17,6 @@ class MissingError(CpcblError):
 
 
 class ScenarioOptions(NamedTuple):
-    """The options of a run of scenarios."""
-
     seed: int = 1
     soak_s: float = 180.0
     report_progress: Callable[[str], None] = lambda doing: None  # called with each step
@@ -26,8 +24,6 @@ class ScenarioOptions(NamedTuple):
 
 
 class ScenarioResult(NamedTuple):
-    """The result of a scenario."""
-
     checks: Iterable[Check]
     remarks: tuple[str, ...] = ()
 
@@ -91,9 +87,7 @@ class TeamFault(msgspec.Struct, frozen=True):
     plan: Callable[[], RunPlan] = lambda: RunPlan(demo_team())
     settled_m: float = SETTLED_M
     baseline_s: float = 4.0  # how long the settled team runs before the fault
-    simulated_s: tuple[float, float] | None = (
-        None  # the times of a simulated fault
-    )
+    simulated_s: tuple[float, float] | None = None  # the times of a simulated fault
     lasts_s: float = 0.0
     until: Callable[[FaultRun], float | None] = lambda run: None
     """Ends the fault earlier than after `lasts_s`, as soon as this figure is known."""

@@ -20,9 +20,6 @@ from cpcbl_team.config import SimulationEvent
 TUN = Requirement("root and /dev/net/tun", missing_tun)
 MOUNT = Requirement("root, to mount a small disk", missing_mount)
 DOCKER = Requirement("docker", missing_docker)
-# 3 m from where its round has taken it by then
-KIDNAPPING = SimulationEvent(at_s=12.0, kidnap="patrol", to=(6.0, 3.5, 180.0))
-DARKNESS = SimulationEvent(at_s=12.0, hide_landmarks_s=60.0)
 LIE, LIE_S = "bias:0.5,0.5", (12.0, 27.0)
 
 
@@ -60,14 +57,15 @@ def clock_offsets(team: TeamUnderTest, run: FaultRun) -> str:
     return f"the other robots estimate that its clock is ahead by {offsets}"
 
 
+TWO_SITES = demo(far=["navigator", "patrol"])
+RELAYED_NAVIGATOR, RELAYED_OBSERVER = demo(relayed=["navigator"]), demo(relayed=["observer"])
+# 3 m from where its round has taken it by then
+KIDNAPPED = simulated(events=(SimulationEvent(at_s=12.0, kidnap="patrol", to=(6.0, 3.5, 180.0)),))
+DARK = simulated(events=(SimulationEvent(at_s=12.0, hide_landmarks_s=60.0),))
+
 KILL = TeamFault(expect.kill, inject.kill, "navigator", lasts_s=25.0, until=expect.found_after_s)
 BAD_LINK = TeamFault(
-    expect.bad_link,
-    inject.slow,
-    "navigator",
-    demo(relayed=["navigator"]),
-    lasts_s=20.0,
-    after_s=11.0,
+    expect.bad_link, inject.slow, "navigator", RELAYED_NAVIGATOR, lasts_s=20.0, after_s=11.0
 )
 WRONG_CLOCK = TeamFault(
     partial(expect.clock, tolerated="patrol"),
@@ -132,14 +130,7 @@ SCENARIOS = (
         " for 10 s",
         "each side notices within 4 s that the other is missing, and continues; within 5 s of"
         " healing they are one team again",
-        TeamFault(
-            expect.partition,
-            inject.cut,
-            FAR_ROUTER,
-            demo(far=["navigator", "patrol"]),
-            lasts_s=10.0,
-            after_s=13.0,
-        ),
+        TeamFault(expect.partition, inject.cut, FAR_ROUTER, TWO_SITES, lasts_s=10.0, after_s=13.0),
         quick=True,
     ),
     Scenario(
@@ -157,12 +148,7 @@ SCENARIOS = (
         "the other robots notice within 4 s that it is missing, and continue; its token is back"
         " within 5 s",
         TeamFault(
-            expect.cut_link,
-            inject.cut,
-            "observer",
-            demo(relayed=["observer"]),
-            lasts_s=10.0,
-            after_s=13.0,
+            expect.cut_link, inject.cut, "observer", RELAYED_OBSERVER, lasts_s=10.0, after_s=13.0
         ),
     ),
     Scenario(
@@ -257,11 +243,7 @@ SCENARIOS = (
         "it reports within 3 s that it is lost, is localized within 8 s, and does not mislead"
         " any teammate",
         TeamFault(
-            expect.kidnap,
-            robot="patrol",
-            plan=simulated(events=(KIDNAPPING,)),
-            simulated_s=(12.0, 12.0),
-            after_s=15.0,
+            expect.kidnap, robot="patrol", plan=KIDNAPPED, simulated_s=(12.0, 12.0), after_s=15.0
         ),
     ),
     Scenario(
@@ -270,12 +252,7 @@ SCENARIOS = (
         "the robots continue on odometry and help each other: the RMSE is at most 0.5 m, and"
         " the stated uncertainty is consistent; within 8 s of seeing landmarks again all are"
         " localized",
-        TeamFault(
-            expect.hidden_landmarks,
-            plan=simulated(events=(DARKNESS,)),
-            simulated_s=(12.0, 72.0),
-            after_s=12.0,
-        ),
+        TeamFault(expect.hidden_landmarks, plan=DARK, simulated_s=(12.0, 72.0), after_s=12.0),
     ),
     Scenario(
         "liar",

@@ -35,8 +35,6 @@ class ChaosError(CpcblError):
 
 
 class RunPlan(NamedTuple):
-    """How a team is run."""
-
     team: Team
     seed: int = 1
     relayed: Sequence[str] = ()  # robots that dial a relay instead of the router
@@ -57,7 +55,7 @@ def demo_team() -> Team:
 
 
 class TeamUnderTest:
-    """Made by `run_team_under_test`. Times are seconds of robot time after the run's epoch."""
+    """Made by `run_team`. Times are seconds of robot time after the run's epoch."""
 
     def __init__(self, plan: RunPlan, folder: Path, stack: ExitStack) -> None:
         """Starts all processes; `stack` ends them."""
@@ -167,7 +165,6 @@ class TeamUnderTest:
     # Logs ---------------------------------------------------------------------------------------
 
     def process_log(self, process: str) -> str:
-        """The output of a process."""
         path = self.folder / f"{process}.log"
         return path.read_text(errors="replace") if path.exists() else ""
 

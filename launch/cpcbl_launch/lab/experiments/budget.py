@@ -52,8 +52,6 @@ class Target(Struct, frozen=True, kw_only=True):
 
 
 class Curve(ExperimentResult, frozen=True, kw_only=True):
-    """The result of the experiment."""
-
     log: str
     blind: tuple[str, ...]
     duration_s: float

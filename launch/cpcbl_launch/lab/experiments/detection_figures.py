@@ -107,8 +107,6 @@ class Error(Struct, frozen=True, kw_only=True, array_like=True):
 
 
 class DetectionReport(ExperimentResult, frozen=True, kw_only=True):
-    """The result of the experiment."""
-
     seed: int
     frames: int
     team: Team

@@ -87,9 +87,8 @@ def crowd_team(size: int) -> Team:
 def _observer(base: Team, x: float, y: float, heading_deg: float) -> RobotSettings:
     settings = base.robots["observer"]
     sensor = replace(settings.sensor, sees_landmarks=False, max_range_m=10.0)
-    sigmas = {"sigma_m": CLAIMED_SIGMA_M, "heading_sigma_deg": 0.5}
-    start = Start(x_m=x, y_m=y, heading_deg=heading_deg, **sigmas)
-    return replace(settings, sensor=sensor, start=start)
+    start = Start(x_m=x, y_m=y, heading_deg=heading_deg, heading_sigma_deg=0.5)
+    return replace(settings, sensor=sensor, start=replace(start, sigma_m=CLAIMED_SIGMA_M))
 
 
 def _mobile(base: Team, share: float, blind: bool) -> RobotSettings:

@@ -82,8 +82,6 @@ class Row(Struct, frozen=True, kw_only=True):
 
 
 class Liars(ExperimentResult, frozen=True, kw_only=True):
-    """The result of the experiment."""
-
     seeds: int
     lie_s: tuple[float, float, float]  # start and end of the fault, end of the run
     team: Team

@@ -13,16 +13,11 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Wedge
 
+from cpcbl_launch.lab.experiments import detection_figures as eyes
 from cpcbl_launch.lab.experiments.budget import Curve
-from cpcbl_launch.lab.experiments.detection_figures import (
-    LEAST_RECALL,
-    MOST_BEARING_DEG,
-    MOST_RANGE_SHARE,
-    DetectionReport,
-    Error,
-)
 from cpcbl_launch.lab.experiments.liars import Liars
 from cpcbl_launch.lab.experiments.runs import Outcome, Spread
+from cpcbl_launch.lab.scaling import ScalingReport
 from cpcbl_team.config import RobotSettings, Team
 
 mpl.use("Agg")
@@ -167,20 +162,19 @@ def draw_liars(result: Liars) -> Figure:
     return figure
 
 
-def draw_eyes(result: DetectionReport) -> Figure:
+def draw_eyes(result: eyes.DetectionReport) -> Figure:
     """A column a kind of thing: errors against range with three stated sigmas, and recall."""
     kinds = [kind for kind, errors in result.errors.items() if errors]
-    figure, panels = plt.subplots(
-        3, max(1, len(kinds)), figsize=(12, 8), sharex=True, squeeze=False
-    )
+    shape = 3, max(1, len(kinds))
+    figure, panels = plt.subplots(*shape, figsize=(12, 8), sharex=True, squeeze=False)
     for (ranges, bearings, recall), kind in zip(panels.T, kinds, strict=False):
         seen = result.errors[kind]
-        _scattered(ranges, seen, "range_share", "range_sigma_share", 100.0, MOST_RANGE_SHARE)
-        _scattered(bearings, seen, "bearing_deg", "bearing_sigma_deg", 1.0, MOST_BEARING_DEG)
+        _scattered(ranges, seen, "range_share", "range_sigma_share", 100.0, eyes.MOST_RANGE_SHARE)
+        _scattered(bearings, seen, "bearing_deg", "bearing_sigma_deg", 1.0, eyes.MOST_BEARING_DEG)
         bins = [f for f in result.bins[kind] if f.recall is not None]
         middles = [0.5 * (f.from_m + f.to_m) for f in bins]
         recall.plot(middles, [100.0 * (f.recall or 0.0) for f in bins], "o-", color="C0")
-        recall.axhline(100.0 * LEAST_RECALL, color="0.5", linestyle="--")
+        recall.axhline(100.0 * eyes.LEAST_RECALL, color="0.5", linestyle="--")
         recall.set(ylim=(0.0, 103.0), xlabel="range (m)")
         ranges.set_title(f"{kind}s: {result.within[kind].right} seen")
     labels = ("range error (%)", "bearing error (°)", "found of what was due (%)")
@@ -192,6 +186,25 @@ def draw_eyes(result: DetectionReport) -> Figure:
     ]
     figure.legend(handles=handles, loc="outside lower center", ncols=2)
     return figure
+
+
+def draw_scaling(scale: ScalingReport, path: Path) -> None:
+    """The bytes per second that a robot sends and receives, and the CPU of its steps."""
+    figure, (traffic, cpu) = plt.subplots(1, 2, figsize=(10, 4))
+    sizes = [s.robots for s in scale.sizes]
+    traffic.plot(sizes, [s.bytes_sent_per_s for s in scale.sizes], "o-", label="sent")
+    traffic.plot(sizes, [s.bytes_received_per_s for s in scale.sizes], "o-", label="received")
+    traffic.set(title="fixes and beliefs of a robot", ylabel="bytes a second on their link")
+    traffic.legend()
+    cpu.plot(sizes, [s.cpu_ms_per_s for s in scale.sizes], "o-", color="C2")
+    cpu.set(title="CPU of a robot", ylabel="ms in a second of robot time")
+    for axes in (traffic, cpu):
+        axes.set(xlabel="robots in the team", xscale="log", ylim=(0, None))
+        axes.set_xticks(sizes, labels=[str(size) for size in sizes], minor=False)
+        axes.minorticks_off()
+        axes.grid(True, alpha=0.3)
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
 
 
 # How the result of each experiment is drawn, by its name
@@ -215,7 +228,7 @@ def draw(result: Any, path: Path) -> None:
 
 
 def _scattered(
-    axes: Any, seen: Sequence[Error], error: str, sigma: str, scale: float, target: float
+    axes: Any, seen: Sequence[eyes.Error], error: str, sigma: str, scale: float, target: float
 ) -> None:
     """Errors against range, with the band of three stated sigmas and that of one allowed; those
     whose sigma is not stated are left out."""

@@ -58,8 +58,6 @@ class LineResult(Struct, frozen=True, kw_only=True):
 
 
 class RealPictures(ExperimentResult, frozen=True, kw_only=True):
-    """The result of the experiment."""
-
     set: str
     team: Team
     pictures: int

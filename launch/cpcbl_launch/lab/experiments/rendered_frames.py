@@ -38,16 +38,12 @@ from cpcbl_launch.lab.experiments.detection_figures import (
     degrees,
     team,
 )
+from cpcbl_launch.simulation.camera import visibility
 from cpcbl_launch.simulation.camera.cameras import with_focal_error, with_mount_error
 from cpcbl_launch.simulation.camera.objects import body_top_m
 from cpcbl_launch.simulation.camera.render import render
 from cpcbl_launch.simulation.camera.scene import Scene, SceneRobot
-from cpcbl_launch.simulation.camera.visibility import (
-    Solid,
-    cylinder_points,
-    plate_points,
-    visible_shares,
-)
+from cpcbl_launch.simulation.camera.visibility import Solid
 from cpcbl_team.config import CameraSettings, Light
 from cpcbl_team.geometry import Pose2, wrap_angle
 from cpcbl_team.inputs import Sighting
@@ -200,7 +196,7 @@ def named_objects(frame: RandomFrame) -> dict[str, NamedObject]:
         shares: dict[Kind, float] = {}  # how much of each kind of feature is to be seen
         some = 0.0
         for kind, points, is_due in _features(name, seen, most[name][0], camera):
-            whole, part = visible_shares(points, camera, before)
+            whole, part = visibility.visible_shares(points, camera, before)
             shares[kind] = max(shares.get(kind, 0.0), whole if is_due else 0.0)
             some = max(some, part)
         due = tuple(kind for kind, share in shares.items() if share >= ALL_OF_IT)
@@ -244,7 +240,7 @@ def _features(
     """What an object can be detected by: points, and whether it is due if all are visible."""
     robot, vision = team().robots.get(name), team().vision
     if robot is None:
-        yield "landmark", cylinder_points(solid, camera.position), True
+        yield "landmark", visibility.cylinder_points(solid, camera.position), True
         return
     away = vision.marker_distance_m
     for side in robot.markers:
@@ -254,10 +250,10 @@ def _features(
         to_lens = math.atan2(camera.position[1] - y, camera.position[0] - x)
         angle = abs(wrap_angle(to_lens - facing))  # between the marker's normal and the viewer
         if angle < 0.5 * math.pi:
-            points = plate_points(x, y, vision.marker_mounted_m, facing, vision.marker_m)
+            points = visibility.plate_points(x, y, vision.marker_mounted_m, facing, vision.marker_m)
             yield "marker", points, angle <= math.radians(FACING_DEG)
     if robot.colours is not None:
-        yield "mast", cylinder_points(_mast(seen.x, seen.y), camera.position), True
+        yield "mast", visibility.cylinder_points(_mast(seen.x, seen.y), camera.position), True
 
 
 # What was made of it -----------------------------------------------------------------------------
