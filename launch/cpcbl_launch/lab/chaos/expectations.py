@@ -256,7 +256,7 @@ def clock(run: FaultRun, tolerated: str) -> list[Check]:
 def faulty_robot(run: FaultRun, listeners: Sequence[str]) -> list[Check]:
     """Those that it misleads quarantine it, it does little harm, and is trusted again later."""
     log, liar = run.log, run.robot
-    found = [log.distrust_reported_at_s(name, liar, *run.window_s) for name in listeners]
+    found = [log.distrust_reported_at_s(name, liar, run.window_s) for name in listeners]
     known = sorted(at_s - run.fault_s for at_s in found if at_s is not None)
     last_s = known[FINDERS - 1] if len(known) >= FINDERS else None
     rmse_m = worst(log.position_rmse_m, listeners, *run.window_s)

@@ -22,6 +22,7 @@ from cpcbl_transport.messages import Status, Track, Trust, Truths
 
 FOUND_M = 0.3
 TRUTH_EVERY_NS = 80_000_000
+EVER_S = (-np.inf, np.inf)
 
 
 class ReceivedTrack(NamedTuple):
@@ -191,18 +192,13 @@ class RunLog(NamedTuple):
         return _counts(received[-1][1]) if received else Counter()
 
     def distrust_reported_at_s(
-        self,
-        robot: str,
-        peer: str,
-        from_s: float = -np.inf,
-        until_s: float = np.inf,
-        reason: str = "",
+        self, robot: str, peer: str, window_s: tuple[float, float] = EVER_S, reason: str = ""
     ) -> float | None:
-        """When, within [from_s, until_s), a robot first reported that it distrusts a teammate, for
-        this reason (default: for any)."""
+        """When, within the window, a robot first reported that it distrusts a teammate, for this
+        reason (default: for any)."""
         for at_s, status in self.statuses.get(robot, ()):
             reasons = {t.reason for t in status.trust if t.peer == peer} - {""}
-            if from_s <= at_s < until_s and (reason in reasons if reason else reasons):
+            if window_s[0] <= at_s < window_s[1] and (reason in reasons if reason else reasons):
                 return at_s
         return None
 

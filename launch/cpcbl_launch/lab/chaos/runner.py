@@ -41,7 +41,6 @@ def select_scenarios(names: Sequence[str]) -> list[Scenario]:
 
 
 def run_scenario(scenario: Scenario, options: ScenarioOptions) -> Outcome:
-    """Runs one scenario."""
     name, done, expectation = scenario[:3]
     outcome = Outcome(scenario=name, done=done, expectation=expectation)
     if reason := scenario.needs.missing():

@@ -15,15 +15,7 @@ from cpcbl_launch.lab.chaos.scenario import FaultRun, ScenarioOptions, ScenarioR
 from cpcbl_launch.lab.chaos.team import FIELD, ROUTER, RunPlan, TeamUnderTest, demo_team, run_team
 from cpcbl_launch.run.processes import MIB, process_usage, require_process_usage
 
-FAULTS = {
-    "kill": injectors.kill,
-    "freeze": injectors.freeze,
-    "cut": injectors.cut,
-    "slow": injectors.slow,
-    "narrow": injectors.narrow,
-    "flood": injectors.flood,
-    "echo": injectors.echo,
-}
+FAULTS = ("kill", "freeze", "cut", "slow", "narrow", "flood", "echo")  # names of injectors
 SAMPLE_S = 5.0
 REST_S = (3.0, 9.0)
 FAULT_S = (2.0, 6.0)
@@ -136,22 +128,19 @@ class _FaultSequence:
 
     def run(self) -> None:
         """Injects faults for `soak_s`."""
-        end_s = self._team.now_s + self._options.soak_s
+        robots, end_s = self._team.robots, self._team.now_s + self._options.soak_s
+        targets = {"echo": ["observer"], "kill": [*robots, FIELD, ROUTER]}
         while self._team.now_s < end_s:
             self._wait(*REST_S)
-            name = self._random.choice(list(FAULTS))
+            name = self._random.choice(FAULTS)
             self.counts[name] += 1
             left_s = max(end_s - self._team.now_s, 0.0)
             self._options.report_progress(f"{name}; {left_s:.0f} s left")
-            fault = FaultRun(self._team.run_log, self._team.robots, self._target(name))
-            with FAULTS[name](self._team, fault):
+            robot = self._random.choice(targets.get(name, robots))
+            fault = FaultRun(self._team.run_log, robots, robot)
+            with getattr(injectors, name)(self._team, fault):
                 if name != "kill":
                     self._wait(*FAULT_S)
-
-    def _target(self, fault: str) -> str:
-        robots = self._team.robots
-        targets = {"echo": ["observer"], "kill": [*robots, FIELD, ROUTER]}
-        return self._random.choice(targets.get(fault, robots))
 
     def _wait(self, least_s: float, most_s: float) -> None:
         self._team.wait_until(self._sample, self._random.uniform(least_s, most_s))

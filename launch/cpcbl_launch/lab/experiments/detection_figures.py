@@ -177,26 +177,23 @@ def pattern(
 ) -> dict[str, bool]:
     """The targets, and whether they were met; a target without figures is not met."""
 
-    def least(share: float | None, bound: float) -> bool:
-        return share is not None and share >= bound
-
     def most(sigma: float | None, bound: float) -> bool:
         return sigma is not None and sigma <= bound
 
     targets = {}
     for kind in KINDS[:2]:
         seen, of = within[kind], f"{kind}s within {WITHIN_M[kind]:g} m"
-        precise = least(seen.precision, LEAST_PRECISION)
-        targets[f"{of}: precision at least {LEAST_PRECISION:g}"] = precise
-        targets[f"{of}: recall at least {LEAST_RECALL:g}"] = least(seen.recall, LEAST_RECALL)
+        precision, recall = seen.precision or 0.0, seen.recall or 0.0
+        targets[f"{of}: precision at least {LEAST_PRECISION:g}"] = precision >= LEAST_PRECISION
+        targets[f"{of}: recall at least {LEAST_RECALL:g}"] = recall >= LEAST_RECALL
     for kind in KINDS[:2]:
         known, of = accuracy[kind], f"{kind}s within {ERRORS_WITHIN_M:g} m"
         targets[f"{of}: range σ at most 3 %"] = most(known.range_sigma_share, MOST_RANGE_SHARE)
         targets[f"{of}: bearing σ at most 0.5°"] = most(known.bearing_sigma_deg, MOST_BEARING_DEG)
     for kind in KINDS:
         for what in ("range", "bearing", *(("heading",) if kind == "marker" else ())):
-            inside = least(getattr(accuracy[kind], f"{what}_inside"), LEAST_INSIDE)
-            targets[f"{kind}s: {what} inside 3 stated σ at least 98 %"] = inside
+            inside = getattr(accuracy[kind], f"{what}_inside") or 0.0
+            targets[f"{kind}s: {what} inside 3 stated σ at least 98 %"] = inside >= LEAST_INSIDE
     targets["no wrong id"] = not any(m.why == "wrong id" for m in mistakes)
     targets["no frame refused"] = not refused
     return targets

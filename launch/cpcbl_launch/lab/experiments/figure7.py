@@ -31,14 +31,8 @@ from cpcbl_launch.lab.experiments.runs import (
 from cpcbl_launch.overrides import Overrides, with_overrides
 from cpcbl_launch.reporting.tables import cells, table
 
-CONFIGURATIONS = {
-    "A": "odometry",
-    "B": "weighted",
-    "C": "landmarks",
-    "D": "passive",
-    "E": "active",
-    "F": "both",
-}
+KINDS = ("odometry", "weighted", "landmarks", "passive", "active", "both")
+CONFIGURATIONS = dict(zip("ABCDEF", KINDS, strict=True))
 LEGEND = (
     "position: mean ± σ, max; heading: mean; consistent filter: 98.9 % in 3 σ, NEES 2\n"
     "bump, rest, fail: bumps into landmarks, restarts, runs that failed"
@@ -66,7 +60,7 @@ def cases() -> Mapping[str, Case]:
 
 
 def outcome(
-    results: Results, name: str, cases: Callable[[], Mapping[str, Case]], most_share: float = 0.0
+    name: str, cases: Callable[[], Mapping[str, Case]], most_share: float, results: Results
 ) -> Outcome:
     """The accuracy of each case; with `most_share`, also whether the paper's pattern is met."""
     figures = {case: accuracy(runs) for case, runs in results.items()}
@@ -120,19 +114,14 @@ def cases_of_variants() -> Mapping[str, Case]:
     return {f"{v} {how}": team_case(c, v) for how, c in helped.items() for v in VARIANTS}
 
 
-EXPERIMENT = Experiment(
-    "figure7", cases, partial(outcome, name="figure7", cases=cases, most_share=0.4), tables
-)
-WITH_CAMERAS = Experiment(
-    "figure7-cameras",
-    cases_with_cameras,
-    partial(outcome, name="figure7-cameras", cases=cases_with_cameras, most_share=0.5),
-    partial(tables, driver="navigator with a camera"),
-    needs_opencv=True,
-)
-OF_VARIANTS = Experiment(
-    "circular-vs-oval",
-    cases_of_variants,
-    partial(outcome, name="circular-vs-oval", cases=cases_of_variants),
-    tables,
+def experiment(
+    name: str, cases: Callable[[], Mapping[str, Case]], most_share: float = 0.0
+) -> Experiment:
+    return Experiment(name, cases, partial(outcome, name, cases, most_share), tables)
+
+
+EXPERIMENT = experiment("figure7", cases, 0.4)
+OF_VARIANTS = experiment("circular-vs-oval", cases_of_variants)
+WITH_CAMERAS = experiment("figure7-cameras", cases_with_cameras, 0.5)._replace(
+    tables=partial(tables, driver="navigator with a camera"), needs_opencv=True
 )

@@ -272,15 +272,11 @@ def _robot(axes: Any, robot: RobotSettings) -> None:
     assert start is not None
     if robot.waypoints_m:
         axes.plot(*zip(*robot.waypoints_m, robot.waypoints_m[0], strict=True), "o-", color="C0")
-    half, heading = _half_view_deg(robot), start.heading_deg
+    half, heading = 0.5 * robot.sensor.field_of_view_deg, start.heading_deg
+    if robot.sensing == "camera":
+        half = math.degrees(math.atan(0.5 * robot.camera.width_px / robot.camera.fx_px))
     reach = 1.0 if robot.waypoints_m else 4.0
     centre = (start.x_m, start.y_m)
     axes.add_patch(Wedge(centre, reach, heading - half, heading + half, color="C2", alpha=0.15))
     tip = (math.cos(math.radians(heading)), math.sin(math.radians(heading)))
     axes.quiver(*centre, *tip, color="C2", scale=18)
-
-
-def _half_view_deg(robot: RobotSettings) -> float:
-    if robot.sensing != "camera":
-        return 0.5 * robot.sensor.field_of_view_deg
-    return math.degrees(math.atan(0.5 * robot.camera.width_px / robot.camera.fx_px))

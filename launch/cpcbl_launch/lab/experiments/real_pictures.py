@@ -199,7 +199,6 @@ def tables(result: RealPictures) -> Iterable[RenderableType]:
 
 
 def _errors(lines: Iterable[LineResult], what: str) -> list[tuple[float | None, float | None]]:
-    """Errors and stated sigmas of a quantity."""
     error, sigma = f"{what}_error_{UNITS[what]}", f"{what}_sigma_{UNITS[what]}"
     return [(getattr(line, error), getattr(line, sigma)) for line in lines]
 

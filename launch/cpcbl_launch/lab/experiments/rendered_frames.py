@@ -225,7 +225,6 @@ def _solids(
 
 
 def _mast(x: float, y: float) -> Solid:
-    """The bands of a mast."""
     shape = team().vision.mast
     return Solid(x, y, shape.radius_m, shape.foot_m, shape.foot_m + shape.height_m)
 

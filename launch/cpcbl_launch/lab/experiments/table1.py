@@ -99,7 +99,9 @@ def outcome(results: Results) -> Outcome:
         },
         paper=dict(PAPER),
         pattern={
-            f"{how}: every cell of A, B, C at or below the paper's": not _is_above(rows[how])
+            f"{how}: every cell of A, B, C at or below the paper's": all(
+                s is not None and s.median <= p for s, p in _beside_paper(rows[how])
+            )
             for how in PROBABILISTIC
         },
     )
@@ -124,11 +126,6 @@ def _ratio(rows: Mapping[str, list[Spread | None]]) -> float | None:
     """Mean over the cells of A, B, C of the median as a share of the paper's."""
     shares = [s.median / p for s, p in _beside_paper(rows) if s is not None]
     return float(np.mean(shares)) if shares else None
-
-
-def _is_above(rows: Mapping[str, list[Spread | None]]) -> bool:
-    """Whether a cell of A, B, C is missing or above the paper's."""
-    return any(s is None or s.median > p for s, p in _beside_paper(rows))
 
 
 def tables(result: Outcome) -> Iterable[RenderableType]:
