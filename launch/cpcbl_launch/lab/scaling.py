@@ -209,7 +209,6 @@ class TimedNode:
 
 
 def print_scaling(scale: ScalingReport, console: Console) -> None:
-    """Prints a row for each size."""
     title = f"generated teams in one process, {scale.duration_s:g} s of robot time"
     rates = ("out/s", "B/s", "in/s", "B/s", "CPU ms/s", "x real")
     columns = ("robots", "in sight", *rates, "RMSE m", "in 3 σ")

@@ -14,12 +14,12 @@ from support.noisy_logs import KINDS, ODOMETRY, ROBOTS, SENSOR
 from support.processes import command_line, cpcbl_team
 
 from cpcbl_agents.sources.mrclam import read_table
-from cpcbl_launch.lab.baselines import (
+from cpcbl_launch.lab.evaluation import (
     baseline_inputs,
     baseline_report,
+    evaluate_log,
     run_baselines,
 )
-from cpcbl_launch.lab.evaluation import evaluate_log
 from cpcbl_launch.overrides import with_blind_robots
 from cpcbl_launch.reporting.metrics import Floats, Trajectory, position_errors, samples_with_truth
 from cpcbl_launch.reporting.recorder import BaselineReport

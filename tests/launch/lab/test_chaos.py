@@ -22,7 +22,6 @@ from cpcbl_launch.lab.chaos.injectors import echoes
 from cpcbl_launch.lab.chaos.links import LinkQuality, Relay, TunLink, missing_tun
 from cpcbl_launch.lab.chaos.runner import run_scenario, run_scenarios, select_scenarios
 from cpcbl_launch.lab.chaos.scenario import (
-    NOTHING,
     Requirement,
     Scenario,
     ScenarioOptions,
@@ -44,6 +43,7 @@ from cpcbl_transport import topics
 from cpcbl_transport.topics import Qos
 from cpcbl_transport.zenoh_bus import open_bus, open_router
 
+NOTHING = Requirement()
 SETTING = ScenarioOptions(seed=3, soak_s=60.0)
 
 

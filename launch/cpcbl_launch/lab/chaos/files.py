@@ -37,9 +37,11 @@ def full_disk_checks(
     lost = sum(
         f"{name}: not written: " in line for name in names for line in ended.stderr.splitlines()
     )
+    errors = ended.stdout.partition("errors of position")[2]  # the printed table
+    robots = sum(name in errors for name in ("navigator", "observer", "scout", "patrol"))
     full_lines = full.stderr.count("standard output: not written: ")
     return [
-        at_least("robots in the report on the terminal", _robots(ended.stdout), 4),
+        at_least("robots in the report on the terminal", robots, 4),
         equal_to("lines that name a lost file", lost, 3),
         equal_to("exit code", ended.returncode, 1),
         _no_traceback(ended),
@@ -79,12 +81,6 @@ def read_only_checks(ended: dict[str, CommandResult]) -> list[Check]:
 
 def _no_traceback(ended: CommandResult) -> Check:
     return equal_to("tracebacks", ended.stderr.count("Traceback"), 0)
-
-
-def _robots(out: str) -> int:
-    """The number of robots in the printed table of errors."""
-    table = out.partition("errors of position")[2]
-    return sum(name in table for name in ("navigator", "observer", "scout", "patrol"))
 
 
 def _command(*words: object) -> str:
