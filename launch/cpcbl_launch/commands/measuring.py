@@ -17,13 +17,11 @@ from cpcbl_team.config import Variant
 from cpcbl_team.errors import InputError
 
 LogTeamFile = Annotated[
-    Path | None,
-    Option("--team", help="Team file; default: the built-in mrclam without this log."),
+    Path | None, Option("--team", help="Team file; default: the built-in mrclam without this log.")
 ]
 VariantOption = Annotated[Variant | None, Option(help="Variant of all robots.")]
 Collaboration = Annotated[
-    Literal["none", "passive", "active", "both"] | None,
-    Option(help="Collaboration of all robots."),
+    Literal["none", "passive", "active", "both"] | None, Option(help="Collaboration of all robots.")
 ]
 Fusion = Annotated[Literal["naive", "split-ci"] | None, Option(help="Fusion of all robots.")]
 Direction = Annotated[

@@ -80,8 +80,7 @@ BytesPerS = Annotated[
     _limit(help="Bytes per second of fixes and beliefs that each robot may send; 0: no limit."),
 ]
 MessagesPerMinute = Annotated[
-    float | None,
-    _limit(help="Fixes and beliefs per minute that each robot may send; 0: no limit."),
+    float | None, _limit(help="Fixes and beliefs per minute that each robot may send; 0: no limit.")
 ]
 MatchMessages = Annotated[
     int | None,

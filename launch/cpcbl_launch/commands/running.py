@@ -37,8 +37,7 @@ UpDuration = Annotated[
     float | None, Option(help="Seconds of robot time; default: 30 simulated, or the whole log.")
 ]
 Speed = Annotated[
-    float,
-    Option(callback=options.checked(_require_speed), help="Times real time, at least 0.05."),
+    float, Option(callback=options.checked(_require_speed), help="Times real time, at least 0.05.")
 ]
 LogFolder = Annotated[Path | None, Option(help="Folder of an MRCLAM log, for source mrclam.")]
 Robots = Annotated[str, Option(help="Robots to start on this machine; default: all.")]

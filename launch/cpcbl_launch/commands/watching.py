@@ -106,11 +106,7 @@ def traffic(
     connect: options.Connect = None,
     duration: Annotated[
         float | None,
-        Option(
-            "--for",
-            callback=options.duration,
-            help="Seconds to watch; default: until Ctrl-C.",
-        ),
+        Option("--for", callback=options.duration, help="Seconds to watch; default: until Ctrl-C."),
     ] = None,
     wait: Annotated[float, Option(min=0.1, help="Seconds to wait for the team's router.")] = 5.0,
     as_json: Annotated[
@@ -146,8 +142,7 @@ def look(
     robot: Annotated[str, Argument(help="The robot whose camera it is.")],
     team_file: options.TeamFile,
     pictures: Annotated[
-        Path | None,
-        Option(help="Detect in this picture, or folder of pictures; no team need run."),
+        Path | None, Option(help="Detect in this picture, or folder of pictures; no team need run.")
     ] = None,
     connect: options.Connect = None,
     save: Annotated[

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 
-from cpcbl_launch.reporting.metrics import Floats, Trajectory, samples_with_truth, score, seconds
+from cpcbl_launch.reporting.metrics import Floats, samples_with_truth, score, seconds
 from cpcbl_launch.reporting.recorder import Effect, GuestReport, Phase, Recorder
 
 AWAY_S = 2.0  # who says nothing of itself for longer was away
@@ -32,14 +32,11 @@ def phase_report(
     for span in spans:
         inside |= (span.from_s <= times_s) & (times_s < span.until_s)
     part = path.part(inside)
-    figures = score(samples_with_truth(part, truth)[1])
-    return Phase(**msgspec.structs.asdict(figures), position_sigma_m=_sigma_m(part))
-
-
-def _sigma_m(path: Trajectory) -> float | None:
-    if path.covariance is None or not len(path.covariance):
-        return None
-    return float(np.sqrt(0.5 * np.mean(path.covariance[:, 0] + path.covariance[:, 2])))
+    figures, covariance = score(samples_with_truth(part, truth)[1]), part.covariance
+    sigma_m = None
+    if covariance is not None and len(covariance):
+        sigma_m = float(np.sqrt(0.5 * np.mean(covariance[:, 0] + covariance[:, 2])))
+    return Phase(**msgspec.structs.asdict(figures), position_sigma_m=sigma_m)
 
 
 def presence_spans(times_s: Sequence[float]) -> list[Span]:
@@ -79,20 +76,15 @@ def guest_reports(
     others = sorted(counts.keys() - set(robots), key=lambda name: (-counts[name], name))
     for name in sorted(others[:MOST_GUESTS]):
         present = presence_spans(seconds(recorder.trajectory(name).stamps_ns).tolist())
-        spans = dict(
-            zip(Effect.__struct_fields__, split_by_presence(present, begin_s), strict=True)
-        )
+        spans = split_by_presence(present, begin_s)
+        effects = {}
+        for robot in robots:
+            phases = [phase_report(recorder, robot, truth.get(robot), part) for part in spans]
+            effects[robot] = Effect(before=phases[0], during=phases[1], after=phases[2])
         own = recorder.robot_report(name, "", truth.get(name))
         reports[name] = GuestReport(
             **msgspec.structs.asdict(own),
             present_s=tuple((p.from_s - epoch_s, p.until_s - epoch_s) for p in present),
-            robots={robot: _effect(recorder, robot, truth.get(robot), spans) for robot in robots},
+            robots=effects,
         )
     return reports
-
-
-def _effect(
-    recorder: Recorder, robot: str, truth: Floats | None, spans: Mapping[str, Sequence[Span]]
-) -> Effect:
-    phases = {part: phase_report(recorder, robot, truth, inside) for part, inside in spans.items()}
-    return Effect(**phases)

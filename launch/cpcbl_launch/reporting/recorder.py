@@ -234,7 +234,13 @@ class Recorder:
             name: self.robot_report(name, variant, truth.get(name), from_s)
             for name, variant in variants.items()
         }
-        return Report(robots=robots, team=_team_report(robots), refused=self.refused)
+        team = TeamReport(
+            **msgspec.structs.asdict(mean_score(robots.values())),
+            messages_sent=sum(r.messages_sent for r in robots.values()),
+            bytes_sent=sum(r.bytes_sent for r in robots.values()),
+            within_budget=are_limits_kept(s for r in robots.values() for s in r.spending),
+        )
+        return Report(robots=robots, team=team, refused=self.refused)
 
     def robot_report(
         self, name: str, variant: str, truth: Floats | None, from_s: float = -np.inf
@@ -310,12 +316,3 @@ def mean_score(scores: Iterable[Score]) -> MeanScore:
         return float(np.mean(values)) if values else None
 
     return MeanScore(**{name: mean(name) for name in MeanScore.__struct_fields__})
-
-
-def _team_report(robots: Mapping[str, RobotReport]) -> TeamReport:
-    return TeamReport(
-        **msgspec.structs.asdict(mean_score(robots.values())),
-        messages_sent=sum(r.messages_sent for r in robots.values()),
-        bytes_sent=sum(r.bytes_sent for r in robots.values()),
-        within_budget=are_limits_kept(s for r in robots.values() for s in r.spending),
-    )

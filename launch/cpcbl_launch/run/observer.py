@@ -125,7 +125,13 @@ def team_with_observer(team: Team, request: ObserverRequest) -> Team:
     elif not path.exists():
         known = " or ".join(presets())
         raise InputError(f"--sensor {request.sensor}: no such file; write one, or {known}")
-    layers = [_PLAIN, read_layer(path), _request_layer(request, source)]
+    own: dict[str, Any] = {"source": source, "start": {**request.at._asdict(), "known": True}}
+    if request.fov_deg is not None:
+        own["sensor"] = {"field_of_view_deg": request.fov_deg}
+    if request.moves:
+        waypoints_m = [list(place) for place in request.moves]
+        own |= {"waypoints_m": waypoints_m, "odometry": {"moves": True}}
+    layers = [_PLAIN, read_layer(path), own]
     more = with_added_robot(team, name, layers, str(path))
     model = model_from_settings(more.robots[name])
     if model is not None and (reason := unsupported_delay(model)):
@@ -135,17 +141,6 @@ def team_with_observer(team: Team, request: ObserverRequest) -> Team:
 
 _PLAIN = {"waypoints_m": [], "collaboration": {"after_s": 0.0}}
 """Of the team's defaults a guest does not take these."""
-
-
-def _request_layer(request: ObserverRequest, source: str) -> dict[str, Any]:
-    """What the command line says, as the last layer."""
-    own: dict[str, Any] = {"source": source, "start": {**request.at._asdict(), "known": True}}
-    if request.fov_deg is not None:
-        own["sensor"] = {"field_of_view_deg": request.fov_deg}
-    if request.moves:
-        waypoints_m = [list(place) for place in request.moves]
-        own |= {"waypoints_m": waypoints_m, "odometry": {"moves": True}}
-    return own
 
 
 def _source_of(team: Team) -> str:

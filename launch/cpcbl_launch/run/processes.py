@@ -169,18 +169,15 @@ class Supervisor:
         self.stop()
 
     def watch(self) -> None:
-        """To be called several times a second."""
         for child in self._children.values():
             child.watch()
 
     @property
     def names(self) -> list[str]:
-        """All processes, in the order of the table."""
         return list(self._children)
 
     @property
     def pids(self) -> dict[str, int]:
-        """The processes that run at present."""
         children = self._children.items()
         return {name: c.process.pid for name, c in children if c.process.poll() is None}
 

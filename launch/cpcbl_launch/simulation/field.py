@@ -8,7 +8,6 @@ from collections import deque
 from collections.abc import Iterable
 from functools import partial
 from itertools import product
-from typing import TYPE_CHECKING
 
 from cpcbl_launch.simulation.robot import SimulatedRobot, VisibleObject
 from cpcbl_team.config import SimulationEvent, Team
@@ -16,9 +15,6 @@ from cpcbl_team.geometry import Pose2, wrap_angle
 from cpcbl_team.inputs import Sightings
 from cpcbl_transport.messages import Drive, Frame, SensorInput, Truth, Truths
 from cpcbl_transport.robot_model import SimulatedRobotModel, settings_from_model
-
-if TYPE_CHECKING:
-    from cpcbl_launch.simulation.camera.cameras import Cameras
 
 _GUEST_SEED = 2**31  # no robot of a team file has this number
 _MARGIN_M = 1e-3  # so that rounding moves nothing beyond the next cell of a grid
@@ -64,7 +60,11 @@ class SimulatedField:
             for i, (name, robot) in enumerate(team.robots.items())
             if robot.source == "simulated"
         }
-        self._cameras = _cameras(team, seed)
+        self._cameras = None
+        if team.renders:  # OpenCV is loaded for nobody else
+            from cpcbl_launch.simulation.camera.cameras import Cameras
+
+            self._cameras = Cameras(team, seed)
         self.skipped_frames = 0  # frames that were due in steps without pictures
         landmarks = team.map.landmarks.items()
         self._landmarks = [VisibleObject(name, m.x_m, m.y_m, m.gives) for name, m in landmarks]
@@ -107,7 +107,8 @@ class SimulatedField:
     def advance(self, pictures: bool = True) -> list[tuple[str, SensorInput]]:
         """One step; what each robot senses at its end, with or without its camera."""
         self.now_ns += self._step_ns
-        while self._events and self._elapsed_s >= self._events[0].at_s:
+        elapsed_s = (self.now_ns - self._start_ns) * 1e-9
+        while self._events and elapsed_s >= self._events[0].at_s:
             self._apply_event(self._events.popleft())
         for robot in self.robots.values():
             robot.move(self.now_ns, self._step_ns * 1e-9)
@@ -128,10 +129,6 @@ class SimulatedField:
         robots = tuple(Truth(n, *r.pose, r.bumps) for n, r in self.robots.items())
         return Truths(self.now_ns, robots)
 
-    @property
-    def _elapsed_s(self) -> float:
-        return (self.now_ns - self._start_ns) * 1e-9
-
     def _apply_event(self, event: SimulationEvent) -> None:
         hidden_ns = self._start_ns + int((event.at_s + event.hide_landmarks_s) * 1e9)
         self._hidden_until_ns = max(self._hidden_until_ns, hidden_ns)
@@ -150,14 +147,14 @@ class SimulatedField:
                 return None
             poses = {other: r.pose for other, r in self.robots.items()}
             return self._cameras.frame(name, stamp_ns, poses, self._are_landmarks_hidden)
-        seen = self._visible_objects(name, robot.pose, mates)
-        return robot.sightings(self.now_ns, stamp_ns, seen)
+        return robot.sightings(self.now_ns, stamp_ns, self._visible_objects(name, mates))
 
     @property
     def _are_landmarks_hidden(self) -> bool:
         return self.now_ns < self._hidden_until_ns
 
-    def _visible_objects(self, viewer: str, pose: Pose2, mates: Grid) -> Iterable[VisibleObject]:
+    def _visible_objects(self, viewer: str, mates: Grid) -> Iterable[VisibleObject]:
+        pose = self.robots[viewer].pose
         if not self._are_landmarks_hidden:
             yield from self._landmarks_to_see.near(pose.x, pose.y)
             yield from self._nearest_wall_points(pose)
@@ -181,15 +178,6 @@ class SimulatedField:
         )
         robot.bumps += len(touching - robot.touching)
         robot.touching = touching
-
-
-def _cameras(team: Team, seed: int) -> "Cameras | None":
-    """Of the team's simulated robots; OpenCV is loaded for nobody else."""
-    if not team.renders:
-        return None
-    from cpcbl_launch.simulation.camera.cameras import Cameras
-
-    return Cameras(team, seed)
 
 
 def _first_frame_ns(team: Team, name: str, from_ns: int) -> int | None:

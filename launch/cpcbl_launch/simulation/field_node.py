@@ -128,21 +128,18 @@ class FieldNode:
         present = self._guest_bodies.present(now_ns)
         for name, incarnation in list(self._guests.items()):
             if name not in present or present[name].incarnation != incarnation:
-                self._remove_guest(name)
+                del self._guests[name]
+                self._field.remove_guest(name)
+                for publisher in self._publishers.pop(name).values():
+                    publisher.close()
+                self._drive_subscriptions.pop(name).close()
+                log.info("guest %s left the field", name)
         for name, join in present.items():
             if name not in self._guests and join.model is not None:
                 self._guests[name] = join.incarnation
                 self._field.add_guest(name, join.model)
                 self._declare(name)
                 log.info("guest %s joined the field", name)
-
-    def _remove_guest(self, name: str) -> None:
-        del self._guests[name]
-        self._field.remove_guest(name)
-        for publisher in self._publishers.pop(name).values():
-            publisher.close()
-        self._drive_subscriptions.pop(name).close()
-        log.info("guest %s left the field", name)
 
 
 Stamped = TypeVar("Stamped", bound=SensorInput | Drive)

@@ -19,21 +19,19 @@ class GuestBodies:
 
     def request(self, join: Join, now_ns: int) -> str:
         """Takes a guest's word; the reason if it is refused."""
+        name = join.robot
         if join.model is None:
-            self._requests.pop(join.robot, None)
+            self._requests.pop(name, None)
             return ""
-        reason = self._refusal(join.robot) or unsupported_delay(join.model)
-        if not reason:
-            self._requests[join.robot] = now_ns, join
-        return reason
-
-    def _refusal(self, name: str) -> str:
         if not self._rules.allowed:
             return "guests.allowed is false"
         if name in self._robots:
             return "a robot of the team has this name"
-        full = len(self._requests) >= self._rules.most and name not in self._requests
-        return f"there are {self._rules.most} guests, guests.most" if full else ""
+        if len(self._requests) >= self._rules.most and name not in self._requests:
+            return f"there are {self._rules.most} guests, guests.most"
+        if not (reason := unsupported_delay(join.model)):
+            self._requests[name] = now_ns, join
+        return reason
 
     def present(self, now_ns: int) -> Mapping[str, Join]:
         """The guests that have a body now, with what each asked for last."""

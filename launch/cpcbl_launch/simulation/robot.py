@@ -11,12 +11,7 @@ from cpcbl_team.config import OdometrySettings, RobotSettings, SensorSettings
 from cpcbl_team.geometry import Pose2, step, wrap_angle
 from cpcbl_team.inputs import Odometry, Position, Sighting, Sightings
 from cpcbl_team.motion import motion_noise
-from cpcbl_team.sensors import (
-    LEAST_COSINE,
-    corrected_odometry,
-    range_sigma_m,
-    time_at_min_speed_s,
-)
+from cpcbl_team.sensors import LEAST_COSINE, corrected_odometry, range_sigma_m, time_at_min_speed_s
 from cpcbl_transport.messages import Drive, Frame
 
 COMMAND_LASTS_NS = 500_000_000

@@ -8,12 +8,10 @@ from pathlib import Path
 
 import msgspec
 from rich.console import Console
-from rich.table import Table
 
 from cpcbl_launch.reporting.tables import table
 from cpcbl_launch.views.live import open_bus_within
 from cpcbl_team.errors import InputError
-from cpcbl_team.inputs import Sighting
 from cpcbl_transport.bus import Bus
 from cpcbl_transport.decoding import Subscriber
 from cpcbl_transport.messages import AnnotatedFrame, UnclearObject
@@ -97,21 +95,20 @@ class FrameReport(msgspec.Struct, frozen=True, kw_only=True):
 
 def frame_report(annotated: AnnotatedFrame, frame: str, picture: str) -> FrameReport:
     """The report of an annotated frame."""
-    found = tuple(_sighting_report(sighting) for sighting in annotated.found)
+    found = tuple(
+        SightingReport(
+            id=s.id,
+            range_m=s.range_m,
+            range_sigma_m=s.range_sigma_m,
+            bearing_deg=_deg(s.bearing_rad),
+            bearing_sigma_deg=_deg(s.bearing_sigma_rad),
+            heading_deg=_deg(s.heading_rad),
+            heading_sigma_deg=_deg(s.heading_sigma_rad),
+        )
+        for s in annotated.found
+    )
     return FrameReport(
         robot=annotated.robot, frame=frame, picture=picture, found=found, unclear=annotated.unclear
-    )
-
-
-def _sighting_report(s: Sighting) -> SightingReport:
-    return SightingReport(
-        id=s.id,
-        range_m=s.range_m,
-        range_sigma_m=s.range_sigma_m,
-        bearing_deg=_deg(s.bearing_rad),
-        bearing_sigma_deg=_deg(s.bearing_sigma_rad),
-        heading_deg=_deg(s.heading_rad),
-        heading_sigma_deg=_deg(s.heading_sigma_rad),
     )
 
 
@@ -130,23 +127,18 @@ def save_picture(annotated: AnnotatedFrame, folder: Path, name: str) -> str:
 
 def print_frame_report(report: FrameReport, console: Console) -> None:
     """Prints the sightings, the rejected objects with the reason, and the path of the picture."""
-    console.print(_sighting_table(report))
+    columns, decimals = ("range m", "σ", "bearing °", "σ", "heading °", "σ"), (2, 3, 1, 2, 1, 1)
+    rows = table(f"{report.robot}, frame {report.frame}", ("seen",), columns)
+    for found in report.found:
+        seen, *values = msgspec.structs.astuple(found)
+        cells = ("" if v is None else f"{v:.{n}f}" for v, n in zip(values, decimals, strict=True))
+        rows.add_row(seen, *cells)
+    if not report.found:
+        rows.add_row("nothing", style="dim")
+    console.print(rows)
     for unclear in report.unclear:
         names = f": {' or '.join(unclear.names)}" if unclear.names else ""
         console.print(f"{unclear.reason}{names}", style="yellow", highlight=False)
     if report.picture:
         console.print(report.picture, style="dim", highlight=False, soft_wrap=True)
     console.print()
-
-
-def _sighting_table(report: FrameReport) -> Table:
-    columns = ("range m", "σ", "bearing °", "σ", "heading °", "σ")
-    rows = table(f"{report.robot}, frame {report.frame}", ("seen",), columns)
-    for found in report.found:
-        seen, *values = msgspec.structs.astuple(found)
-        decimals = (2, 3, 1, 2, 1, 1)
-        cells = ("" if v is None else f"{v:.{n}f}" for v, n in zip(values, decimals, strict=True))
-        rows.add_row(seen, *cells)
-    if not report.found:
-        rows.add_row("nothing", style="dim")
-    return rows

@@ -12,7 +12,7 @@ import yaml
 
 from cpcbl_launch.run.containers import BASE_IMAGE, BASE_VARIABLE
 from cpcbl_launch.run.containers.docker import NAME, checkout, version
-from cpcbl_launch.run.processes import Task, tasks
+from cpcbl_launch.run.processes import tasks
 from cpcbl_launch.team_file import parse_team
 from cpcbl_team.config import Team
 from cpcbl_team.errors import InputError
@@ -126,13 +126,11 @@ def compose_text(team: Team, how: Deployment) -> str:
         ports=_flow([f"{outside}:{PORT}" for outside in how.published]),
         at=_flow(["CMD", "linked", "at", str(PORT)]),
     )
-    services = (_service(how, task) for task in tasks(team, common, how.seed, here))
+    services = []
+    for name, arguments, identity, _ in tasks(team, common, how.seed, here):
+        keys = _own_mounts(how, identity)
+        services.append(_SERVICE.format(name=name, command=_flow(arguments), keys=keys))
     return "".join([head, router_service, *services])
-
-
-def _service(how: Deployment, task: Task) -> str:
-    keys = _own_mounts(how, task.identity)
-    return _SERVICE.format(name=task.name, command=_flow(task.arguments), keys=keys)
 
 
 def _build(context: str, extras: str) -> str:

@@ -129,16 +129,13 @@ class ContainerSupervisor:
                 self._restarts[name] += new
                 log.warning("container %s was started again", name)
         self._last |= self._now
-        down = [name for name in self.names if self._is_down(name)]
+        down = []
+        for name in self.names:
+            if (now := self._now.get(name)) is None:
+                log.warning("container %s is gone", name)
+                down.append(name)
+            elif not now.running and not now.restarting:
+                log.warning("container %s ended (%d)", name, now.code)
+                down.append(name)
         if down:
             self._project.up(*down)
-
-    def _is_down(self, name: str) -> bool:
-        container = self._now.get(name)
-        if container is None:
-            log.warning("container %s is gone", name)
-            return True
-        down = not container.running and not container.restarting
-        if down:
-            log.warning("container %s ended (%d)", name, container.code)
-        return down

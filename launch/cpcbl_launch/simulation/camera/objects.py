@@ -56,18 +56,15 @@ class Face(NamedTuple):
 
 def cylinder_pieces(view: View, cylinder: SceneCylinder) -> list[Piece]:
     """A cylinder; empty if it is not in the frame or the lens is inside it."""
-    ex, ey = cylinder.x_m - view.lens[0], cylinder.y_m - view.lens[1]
+    lens, (low, *_), (*_, high) = view.lens, cylinder.bands, cylinder.bands
+    ex, ey = cylinder.x_m - lens[0], cylinder.y_m - lens[1]
     if math.hypot(ex, ey) <= 1.05 * cylinder.radius_m:
         return []
     circle = _CIRCLE * cylinder.radius_m + (cylinder.x_m, cylinder.y_m)
-    ends = cylinder.bands[0].from_m, cylinder.bands[-1].to_m
+    ends = low.from_m, high.to_m
     box = view.box(np.vstack([np.column_stack([circle, np.full(8, z)]) for z in ends]))
-    return [] if box is None else [_cylinder_piece(view, cylinder, box)]
-
-
-def _cylinder_piece(view: View, cylinder: SceneCylinder, box: Box) -> Piece:
-    lens, (low, *_), (*_, high) = view.lens, cylinder.bands, cylinder.bands
-    ex, ey = cylinder.x_m - lens[0], cylinder.y_m - lens[1]
+    if box is None:
+        return []
     dx, dy, dz = view.ray_directions(box)
     level = np.maximum(np.sqrt(dx * dx + dy * dy), np.float32(1e-6))
     ux, uy, slope = dx / level, dy / level, dz / level
@@ -99,7 +96,7 @@ def _cylinder_piece(view: View, cylinder: SceneCylinder, box: Box) -> Piece:
         if step.any():
             colours += _share_above(heights - height, per_pixel)[..., None] * step
     colours *= lit[..., None]
-    return Piece(box, colours, shares)
+    return [Piece(box, colours, shares)]
 
 
 def _share_above(heights: Grey, per_pixel: Grey) -> Grey:
@@ -134,11 +131,13 @@ def body_top_m(vision: VisionSettings) -> float:
 
 def robot_pieces(view: View, robot: SceneRobot, scene: Scene) -> list[Piece]:
     """A robot's body and its mast, the nearer to the lens last."""
-    body = [
-        _face_piece(view, face, box)
-        for face in _robot_faces(robot, scene)
-        if face.is_facing(view.lens) and (box := view.box(face.corners)) is not None
-    ]
+    body = []
+    for face in _robot_faces(robot, scene):
+        if face.is_facing(view.lens) and (box := view.box(face.corners)) is not None:
+            colours = np.array(face.bgr, np.float32)
+            if face.marker is not None:
+                colours = _render_marker(view, face.corners, *face.marker, box)[..., None]
+            body.append(Piece(box, colours, view.polygon_shares(face.corners, box)))
     if robot.name not in scene.masts:
         return body
     top_m = body_top_m(scene.vision)
@@ -172,13 +171,6 @@ def _upright(wall: Floats, along: Floats, half: float, low_m: float, high_m: flo
     """Corners of a rectangle whose middle stands on a place of the floor."""
     left, right, low, high = wall - half * along, wall + half * along, low_m * _UP, high_m * _UP
     return np.array([left + low, right + low, right + high, left + high])
-
-
-def _face_piece(view: View, face: Face, box: Box) -> Piece:
-    colours = np.array(face.bgr, np.float32)
-    if face.marker is not None:
-        colours = _render_marker(view, face.corners, *face.marker, box)[..., None]
-    return Piece(box, colours, view.polygon_shares(face.corners, box))
 
 
 def _render_marker(
