@@ -25,10 +25,7 @@ def run_robot(context: typer.Context) -> None:
     robot.main(context.args)
 
 
-for command in (
-    *(check, keys, up, traffic, look, observer, router, field, compose),
-    *(simulate, chaos),
-):
+for command in (check, keys, up, traffic, look, observer, router, field, compose, simulate, chaos):
     app.command()(command)
 app.command("robot", help=robot.DESCRIPTION, context_settings=_PASSED_ON)(run_robot)
 

@@ -11,7 +11,6 @@ import base64
 import logging
 import struct
 import threading
-from collections.abc import Iterable
 from contextlib import AbstractContextManager, suppress
 from pathlib import Path
 from typing import NamedTuple
@@ -86,7 +85,13 @@ class Recording(AbstractContextManager["Recording"]):
                 if not self._schema:
                     schema = msgspec.json.encode(_PICTURE_SCHEMA)
                     self._schema = writer.register_schema(PICTURE, "jsonschema", schema)
-                picture = _foxglove_image(message)
+                sec, nsec = divmod(message.stamp_ns, 10**9)
+                picture = {
+                    "timestamp": {"sec": sec, "nsec": nsec},
+                    "frame_id": message.robot,
+                    "data": base64.b64encode(message.image).decode(),
+                    "format": "jpeg",
+                }
                 self._add(writer, f"picture/{message.robot}", message.stamp_ns, picture)
             message = msgspec.structs.replace(message, image=b"")
         self._add(writer, key, message.stamp_ns, message)
@@ -116,16 +121,6 @@ class Recording(AbstractContextManager["Recording"]):
                 self._file.close()
             except OSError as error:
                 self._give_up(error)
-
-
-def _foxglove_image(look: AnnotatedFrame) -> dict[str, object]:
-    sec, nsec = divmod(look.stamp_ns, 10**9)
-    return {
-        "timestamp": {"sec": sec, "nsec": nsec},
-        "frame_id": look.robot,
-        "data": base64.b64encode(look.image).decode(),
-        "format": "jpeg",
-    }
 
 
 class RecordedRun(NamedTuple):
@@ -158,14 +153,10 @@ def read_recording(path: Path) -> RecordedRun:
     except (McapError, struct.error, msgspec.MsgspecError, ValueError) as error:
         raise LogError(f"{path}: not a whole recording: {error}") from error
     truths = [message for _, message in messages if isinstance(message, Truths)]
-    return RecordedRun(team, _inputs(messages), truth_rows(truths))
-
-
-def _inputs(messages: Iterable[tuple[str, Message]]) -> dict[str, list[SensorInput]]:
     inputs: dict[str, list[SensorInput]] = {}
     for key, message in messages:
         if isinstance(message, AnnotatedFrame):  # what the robot's eyes found in a frame
             message = Sightings(message.stamp_ns, message.found)
         if isinstance(message, Odometry | Sightings | Position):
             inputs.setdefault(key.split("/")[1], []).append(message)
-    return inputs
+    return RecordedRun(team, inputs, truth_rows(truths))

@@ -27,6 +27,7 @@ from cpcbl_transport.topics import Role
 from cpcbl_transport.zenoh_bus import open_bus
 
 NAMESAKE_S = 0.3  # so long a token of the same name is waited for
+_SHIPPED = Path(str(resources.files("cpcbl_launch") / "observers"))
 
 
 class ObserverPose(NamedTuple):
@@ -64,11 +65,7 @@ class ObserverReport(msgspec.Struct, frozen=True, kw_only=True):
 
 def presets() -> list[str]:
     """The names of the sensors that come with the package."""
-    return sorted(p.name[:-5] for p in _shipped().iterdir() if p.name.endswith(".toml"))
-
-
-def _shipped() -> Any:
-    return resources.files("cpcbl_launch") / "observers"
+    return sorted(path.stem for path in _SHIPPED.glob("*.toml"))
 
 
 def parse_pose(text: str) -> ObserverPose:
@@ -118,10 +115,13 @@ def team_with_observer(team: Team, request: ObserverRequest) -> Team:
             f"observer {name}: match.messages are divided among the robots of the file, none are"
             " left for a guest; take the limit away, or put the observer into the file"
         )
-    source = request.source or _source_of(team)
+    sources = {robot.source for robot in team.robots.values()}
+    if not request.source and sources == {"mrclam"}:
+        raise InputError(f"team {team.name} replays a log: nobody can join it")
+    source = request.source or ("simulated" if "simulated" in sources else "external")
     path = Path(request.sensor)
     if request.sensor in presets():
-        path = Path(str(_shipped() / f"{request.sensor}.toml"))
+        path = _SHIPPED / f"{request.sensor}.toml"
     elif not path.exists():
         known = " or ".join(presets())
         raise InputError(f"--sensor {request.sensor}: no such file; write one, or {known}")
@@ -131,23 +131,13 @@ def team_with_observer(team: Team, request: ObserverRequest) -> Team:
     if request.moves:
         waypoints_m = [list(place) for place in request.moves]
         own |= {"waypoints_m": waypoints_m, "odometry": {"moves": True}}
-    layers = [_PLAIN, read_layer(path), own]
+    plain = {"waypoints_m": [], "collaboration": {"after_s": 0.0}}  # not as the team's defaults
+    layers = [plain, read_layer(path), own]
     more = with_added_robot(team, name, layers, str(path))
     model = model_from_settings(more.robots[name])
     if model is not None and (reason := unsupported_delay(model)):
         raise InputError(f"{path}: {reason}")
     return more
-
-
-_PLAIN = {"waypoints_m": [], "collaboration": {"after_s": 0.0}}
-"""Of the team's defaults a guest does not take these."""
-
-
-def _source_of(team: Team) -> str:
-    sources = {robot.source for robot in team.robots.values()}
-    if sources == {"mrclam"}:
-        raise InputError(f"team {team.name} replays a log: nobody can join it")
-    return "simulated" if "simulated" in sources else "external"
 
 
 def run_observer(

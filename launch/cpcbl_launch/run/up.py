@@ -2,12 +2,12 @@
 
 import logging
 import socket
-import tempfile
 import time
 from collections.abc import Callable, Collection, Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager, ExitStack, nullcontext
 from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from types import MappingProxyType
 from typing import NamedTuple, Protocol
 
@@ -132,35 +132,16 @@ def local_endpoint(listen: str) -> str:
 
 def run_team(run: Run, show: Show, stop: Stop, launch: Launch = OnThisMachine) -> Report:
     """Runs a team until its time is over or `stop()`. Raises BusError without a router."""
-    with tempfile.TemporaryDirectory(prefix="cpcbl-") as temporary:
-        return _run_in(run, show, stop, run.folder or Path(temporary), launch)
-
-
-def simulate_run(run: Run, progress: Progress | None = None) -> Report:
-    """The same in one process over the bus in memory, as fast as the machine is.
-
-    Raises InputError for a robot that is not simulated, or too short a duration.
-    """
-    for name, robot in run.team.robots.items():
-        if robot.source != "simulated":
-            raise InputError(
-                f"robots.{name}.source: {robot.source}: cannot be simulated; use `up`, or"
-                " `evaluate` for a log"
-            )
-    duration_s = SIMULATED_S if run.duration_s is None else run.duration_s
-    require_duration(duration_s, LEAST_S)
-    _, recorder = simulate(run.team, run.seed, duration_s, progress=progress)
-    return _report(run, recorder, 0.0, duration_s, {})
-
-
-def _run_in(run: Run, show: Show, stop: Stop, folder: Path, launch: Launch) -> Report:
     run = run._replace(team=with_listen_endpoint(run.team))
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"{folder}: {error.strerror}; robots read their team there") from error
-    launcher = launch(run, folder, stop)
-    with launcher.router() as bus, _recording(run, bus) as recording:
+    with ExitStack() as stack:
+        folder = run.folder or Path(stack.enter_context(TemporaryDirectory(prefix="cpcbl-")))
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise InputError(f"{folder}: {error.strerror}; robots read their team there") from error
+        launcher = launch(run, folder, stop)
+        bus = stack.enter_context(launcher.router())
+        recording = stack.enter_context(_recording(run, bus))
         recorder, lead_ns = Recorder(bus), int(launcher.lead_s * 1e9)
         epoch_ns = time.time_ns() + lead_ns if run.epoch_ns is None else run.epoch_ns
         clock = Clock(epoch_ns, time.monotonic_ns() + lead_ns, run.speed)
@@ -180,6 +161,23 @@ def _run_in(run: Run, show: Show, stop: Stop, folder: Path, launch: Launch) -> R
         lost = {**report.not_written, str(run.record): recording.failed}
         report = msgspec.structs.replace(report, not_written=lost)
     return report
+
+
+def simulate_run(run: Run, progress: Progress | None = None) -> Report:
+    """The same in one process over the bus in memory, as fast as the machine is.
+
+    Raises InputError for a robot that is not simulated, or too short a duration.
+    """
+    for name, robot in run.team.robots.items():
+        if robot.source != "simulated":
+            raise InputError(
+                f"robots.{name}.source: {robot.source}: cannot be simulated; use `up`, or"
+                " `evaluate` for a log"
+            )
+    duration_s = SIMULATED_S if run.duration_s is None else run.duration_s
+    require_duration(duration_s, LEAST_S)
+    _, recorder = simulate(run.team, run.seed, duration_s, progress=progress)
+    return _report(run, recorder, 0.0, duration_s, {})
 
 
 def _recording(run: Run, bus: Bus) -> AbstractContextManager[Recording | None]:

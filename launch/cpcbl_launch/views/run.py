@@ -15,7 +15,6 @@ from cpcbl_launch.reporting.phases import AWAY_S
 from cpcbl_launch.reporting.recorder import (
     Effect,
     GuestReport,
-    LearnedReport,
     MeanScore,
     Recorder,
     Report,
@@ -28,7 +27,7 @@ from cpcbl_launch.run.processes import ROBOT, Processes
 from cpcbl_launch.views.live import LiveView
 from cpcbl_launch.views.traffic_tables import COLUMNS_EXPLAINED, help_traffic_table, limits_text
 from cpcbl_team.tiers import LOWEST_TIER
-from cpcbl_transport.messages import Status, Track, Truth
+from cpcbl_transport.messages import Track, Truth
 
 FIGURES = ("RMSE m", "mean m", "max m", "deg", "in 3 σ", "NEES")
 ProgressSetter = Callable[[float], None]
@@ -74,7 +73,11 @@ class LiveTable(LiveView):
                 there = newest_ns - tracks[name].stamp_ns <= AWAY_S * 1e9
                 pid, state = "guest", state if there else Text("left", "dim")
             pose = _pose_cells(tracks.get(name), truths.get(name))
-            shown.add_row(name, pid, *pose, *_traffic_cells(status), state)
+            traffic = [""] * 4
+            if (s := status) is not None:
+                counts = s.messages_sent, s.bytes_sent, s.messages_received, s.bytes_received
+                traffic = [short(n) for n in counts]
+            shown.add_row(name, pid, *pose, *traffic, state)
         if not self.fits(shown):
             shown.padding = (0, 0)  # closer together, before a state is folded
         return shown
@@ -104,13 +107,6 @@ def _pose_cells(track: Track | None, truth: Truth | None) -> list[Cell]:
     return [x, y, heading, sigma, error_cell, tier]
 
 
-def _traffic_cells(s: Status | None) -> list[Cell]:
-    if s is None:
-        return [""] * 4
-    counts = s.messages_sent, s.bytes_sent, s.messages_received, s.bytes_received
-    return [short(n) for n in counts]
-
-
 def print_report(report: Report, console: Console) -> None:
     """The figures of a run as a table with units."""
     console.print(_figures_table(report))
@@ -130,7 +126,6 @@ def print_report(report: Report, console: Console) -> None:
 
 
 def _figures_table(report: Report) -> Table:
-    """The robots, the team, and its guests."""
     before = ("before m",) if report.alone else ()
     columns = (*before, *FIGURES, "lost", "out", "B")
     shown = table("errors of position and heading (deg, RMSE)", ("robot",), columns)
@@ -223,8 +218,10 @@ def _remarks(report: Report) -> Iterator[str]:
         if r.lost_at_end:
             yield f"Robot {name} is lost: {r.lost_at_end}."
     for name, r in report.robots.items():
-        if r.learned is not None:
-            yield f"Robot {name} calibrated itself: {_corrections(r.learned)}."
+        if (own := r.learned) is not None:  # what is done to readings
+            scales = f"distance × {own.distance_scale:.2f}, turn × {own.turn_scale:.2f}"
+            turned = f"bearings {-own.bearing_bias_deg:+z.1f}°"
+            yield f"Robot {name} calibrated itself: {scales}, {turned}."
     for name, r in report.robots.items():
         yield from trust_remarks(name, r.trust)
     if report.refused:
@@ -232,12 +229,6 @@ def _remarks(report: Report) -> Iterator[str]:
         yield f"Messages that could not be used, by reason: {counts}."
     for name, n in report.restarts.items():
         yield f"Process {name} was restarted {n} times."
-
-
-def _corrections(found: LearnedReport) -> str:
-    """What is done to readings: `distance × 0.98, turn × 0.96, bearings -0.6°`."""
-    distance, turn, turned = found.distance_scale, found.turn_scale, -found.bearing_bias_deg
-    return f"distance × {distance:.2f}, turn × {turn:.2f}, bearings {turned:+z.1f}°"
 
 
 @contextmanager

@@ -88,7 +88,12 @@ class InContainers:
                 self.lead_s = max(self.lead_s, routers * (time.monotonic() - began_s))
                 yield bus
         finally:
-            self._end()
+            try:  # also when nobody reads the output any more
+                self._print_line("taking the containers down")
+                if self._run.folder is not None:
+                    self._project.save_logs(self._folder)
+            finally:
+                self._project.down()
 
     def _open_session(self, link: Link) -> ZenohBus:
         until_s = time.monotonic() + ROUTER_WITHIN_S
@@ -108,14 +113,6 @@ class InContainers:
         self._project.up()
         rows = tasks(self._run.team, (), self._run.seed, self._here)
         yield ContainerSupervisor(self._project, ["router", *(row.name for row in rows)])
-
-    def _end(self) -> None:
-        try:  # also when nobody reads the output any more
-            self._print_line("taking the containers down")
-            if self._run.folder is not None:
-                self._project.save_logs(self._folder)
-        finally:
-            self._project.down()
 
     def _write(self, clock: str) -> None:
         run, team, transport = self._run, self._run.team, self._run.team.transport

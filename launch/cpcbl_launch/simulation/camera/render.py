@@ -8,7 +8,6 @@ give equal pictures.
 import math
 from collections.abc import Sequence
 from functools import lru_cache
-from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -41,10 +40,10 @@ def render(
 
     `robots` are the other robots; a robot does not see itself.
     """
-    pinhole = _pinhole(camera.settings)
-    picture = _draw_scene(scene, View(camera if pinhole is None else pinhole.camera, pose), robots)
-    if pinhole is not None:
-        picture = cv2.remap(picture, *pinhole.maps, cv2.INTER_LINEAR).astype(np.uint8, copy=False)
+    pinhole, maps = _pinhole(camera.settings) or (camera, None)
+    picture = _draw_scene(scene, View(pinhole, pose), robots)
+    if maps is not None:
+        picture = cv2.remap(picture, *maps, cv2.INTER_LINEAR).astype(np.uint8, copy=False)
     return _expose(picture, light, random)
 
 
@@ -82,16 +81,10 @@ def _is_behind(place: Floats, wall: Wall, lens: Floats) -> bool:
     return bool(0.0 <= float(along @ (crossing - a)) <= length**2)
 
 
-class _Pinhole(NamedTuple):
-    """A camera without distortion that covers the whole picture, and the maps to that picture."""
-
-    camera: Camera
-    maps: tuple[Floats, Floats]
-
-
 @lru_cache(maxsize=32)
-def _pinhole(settings: CameraSettings) -> _Pinhole | None:
-    """None for a camera without distortion."""
+def _pinhole(settings: CameraSettings) -> tuple[Camera, tuple[Floats, Floats]] | None:
+    """A camera without distortion that covers the whole picture, and the maps to that picture;
+    None for a camera without distortion."""
     if not any(settings.distortion):
         return None
     camera, (width, height) = Camera(settings), (settings.width_px, settings.height_px)
@@ -109,7 +102,7 @@ def _pinhole(settings: CameraSettings) -> _Pinhole | None:
         distortion=(0.0,) * 5,
     )
     map_x, map_y = (k.reshape(height, width).astype(np.float32) for k in (x - left, y - top))
-    return _Pinhole(Camera(straight), cv2.convertMaps(map_x, map_y, cv2.CV_16SC2))
+    return Camera(straight), cv2.convertMaps(map_x, map_y, cv2.CV_16SC2)
 
 
 def _expose(picture: Pixels, light: Light, random: np.random.Generator) -> Pixels:
