@@ -28,6 +28,7 @@ def problems(team: Team) -> Iterator[str]:
             reason = "only the joint variant can update both at once"
             yield f"{key}.alternate: {reason}; remove the key"
     yield from _vision_problems(team)
+    yield from _marker_problems(team)
     yield from _guard_problems(team)
     yield from _event_problems(team)
     if not team.transport.connect:
@@ -63,7 +64,6 @@ def _vision_problems(team: Team) -> Iterator[str]:
         marks = [m.colours for m in team.map.landmarks.values() if m.colours is not None]
         for twice in sorted({c for c in marks if marks.count(c) > 1}):
             yield f"map.landmarks: two have the colours {list(twice)}; give each its own"
-    yield from _marker_problems(team)
 
 
 def _marker_problems(team: Team) -> Iterator[str]:

@@ -211,7 +211,6 @@ def _error_text(error: str, kind: type[Any], prefix: str) -> str:
 
 
 def _fields_at(kind: Any, path: str) -> list[str]:
-    """The keys that a table at `path` knows."""
     for part in filter(None, re.sub(r"\[[^]]*\]", "", path).split(".")):
         kind = get_type_hints(kind)[part]
         if type(None) in get_args(kind) or get_origin(kind) is tuple:

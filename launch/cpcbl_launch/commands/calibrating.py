@@ -41,8 +41,6 @@ calibrate_app = Typer(
 calibrate_app.command(LOG)(calibrate)
 
 ToTeam = Annotated[Path | None, Option("--team", help="Team file to write into; default: print.")]
-OfRobot = Annotated[str | None, Option(help="Into this robot's table, or")]
-OfType = Annotated[str | None, Option("--type", help="into this robot type's.")]
 ToFile = Annotated[Path | None, Option(help="Write the team here; default: into the --team file.")]
 Residuals = Annotated[
     Path | None,
@@ -55,11 +53,6 @@ BoardPictures = Annotated[
     list[Path] | None, Argument(help="Pictures of the board, folders of them, or videos.")
 ]
 BoardOption = Annotated[Literal["charuco", "chessboard"], Option(help="Kind of the printed board.")]
-Squares = Annotated[str, Option(help="Across and down, black and white.")]
-SquareSide = Annotated[float, Option(min=0.001, help="Side of a square.")]
-MarkerSide = Annotated[float, Option(help="Side of a marker (charuco).")]
-Family = Annotated[str, Option(help="Of the markers (charuco).")]
-Every = Annotated[float, Option(min=0.0, help="Seconds between two frames of a video.")]
 PrintBoard = Annotated[
     Path | None, Option(help="Write the board into this file (PNG), to be printed at 300 dpi.")
 ]
@@ -100,15 +93,15 @@ IntoType = Annotated[str | None, Option("--type", help="Write into this type, no
 def camera(
     pictures: BoardPictures = None,
     board: BoardOption = "charuco",
-    squares: Squares = "7x5",
-    square_m: SquareSide = 0.03,
-    marker_m: MarkerSide = 0.022,
-    family: Family = "aruco_4x4_50",
-    every: Every = 0.5,
+    squares: Annotated[str, Option(help="Across and down, black and white.")] = "7x5",
+    square_m: Annotated[float, Option(min=0.001, help="Side of a square.")] = 0.03,
+    marker_m: Annotated[float, Option(help="Side of a marker (charuco).")] = 0.022,
+    family: Annotated[str, Option(help="Of the markers (charuco).")] = "aruco_4x4_50",
+    every: Annotated[float, Option(min=0.0, help="Seconds between two frames of a video.")] = 0.5,
     print_board: PrintBoard = None,
     team_file: ToTeam = None,
-    robot: OfRobot = None,
-    kind: OfType = None,
+    robot: Annotated[str | None, Option(help="Into this robot's table, or")] = None,
+    kind: Annotated[str | None, Option("--type", help="into this robot type's.")] = None,
     output: ToFile = None,
     picture: Residuals = None,
     as_json: AsJson = False,

@@ -19,7 +19,6 @@ from cpcbl_team.errors import InputError
 LogTeamFile = Annotated[
     Path | None, Option("--team", help="Team file; default: the built-in mrclam without this log.")
 ]
-VariantOption = Annotated[Variant | None, Option(help="Variant of all robots.")]
 Collaboration = Annotated[
     Literal["none", "passive", "active", "both"] | None, Option(help="Collaboration of all robots.")
 ]
@@ -27,7 +26,6 @@ Fusion = Annotated[Literal["naive", "split-ci"] | None, Option(help="Fusion of a
 Direction = Annotated[
     Literal["one-way", "both-ways"] | None, Option(help="Direction of all robots.")
 ]
-LogDuration = Annotated[float | None, Option(help="Seconds of the log; default: all.")]
 WithBaselines = Annotated[
     bool,
     Option(
@@ -48,14 +46,14 @@ def evaluate_mrclam(
     data: Annotated[Path, Argument(help="Folder of one data set, e.g. MRCLAM6.")],
     team_file: LogTeamFile = None,
     blind: options.Blind = "",
-    variant: VariantOption = None,
+    variant: Annotated[Variant | None, Option(help="Variant of all robots.")] = None,
     collaboration: Collaboration = None,
     fusion: Fusion = None,
     direction: Direction = None,
     bytes_per_s: options.BytesPerS = None,
     messages_per_minute: options.MessagesPerMinute = None,
     match_messages: options.MatchMessages = None,
-    duration: LogDuration = None,
+    duration: Annotated[float | None, Option(help="Seconds of the log; default: all.")] = None,
     baselines: WithBaselines = False,
     export: ExportFolder = None,
     as_json: options.AsJson = False,
@@ -179,7 +177,6 @@ def _simulate_sizes(
     picture: Path | None,
     as_json: bool,
 ) -> None:
-    """Runs generated teams of each size, one after the other."""
     from cpcbl_launch.lab import scaling
     from cpcbl_launch.views.run import progress_bar
 

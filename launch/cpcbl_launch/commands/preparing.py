@@ -80,7 +80,6 @@ def keys(
 
 
 def _print_keys(made: "list[KeysReport]", folder: Path) -> None:
-    """Who has which name in certificates, until when, and what was done about it."""
     shown = table("", ("who", "certificate says", "valid until (UTC)", ""), ())
     for member in made:
         until = f"{member.valid_until:%Y-%m-%d %H:%M}" if member.valid_until else "-"

@@ -1,5 +1,6 @@
 """Commands that run a team, or a part of one."""
 
+import json
 import shlex
 from contextlib import ExitStack
 from functools import partial
@@ -39,7 +40,6 @@ UpDuration = Annotated[
 Speed = Annotated[
     float, Option(callback=options.checked(_require_speed), help="Times real time, at least 0.05.")
 ]
-LogFolder = Annotated[Path | None, Option(help="Folder of an MRCLAM log, for source mrclam.")]
 Robots = Annotated[str, Option(help="Robots to start on this machine; default: all.")]
 RecordFile = Annotated[
     Path | None,
@@ -61,7 +61,7 @@ def up(
     duration: UpDuration = None,
     speed: Speed = 1.0,
     seed: options.NoiseSeed = 1,
-    data: LogFolder = None,
+    data: Annotated[Path | None, Option(help="Folder of an MRCLAM log, for source mrclam.")] = None,
     blind: options.Blind = "",
     robots: Robots = "",
     bytes_per_s: options.BytesPerS = None,
@@ -102,7 +102,6 @@ def up(
 def _run_of(
     file: Path | None, duration_s: float | None, data: Path | None, budgets: Overrides
 ) -> "Run":
-    """The run of a simulated team, or of a team on the log that it replays."""
     from cpcbl_launch.run import logged_team
     from cpcbl_launch.run.up import LEAST_S, SIMULATED_S, Run, with_listen_endpoint
 
@@ -130,7 +129,6 @@ def _robots_here(text: str, team: Team) -> list[str]:
 def _launch(
     run: "Run", containers: bool, image: str | None, base_image: str, console: Console
 ) -> "Launch":
-    """What starts the processes: this machine, or Docker."""
     if containers:
         from cpcbl_launch.run.containers.launch import InContainers, line_printer
 
@@ -198,7 +196,7 @@ def router(
 ) -> None:
     """Run the team's Zenoh router, on any machine, until SIGINT, SIGTERM or SIGHUP."""
     from cpcbl_agents.process import StopSignal
-    from cpcbl_launch.run.router import config_text, run_router, team_router
+    from cpcbl_launch.run.router import run_router, team_router
     from cpcbl_transport.zenoh_bus import read_router_config
 
     if config is not None and file is None:
@@ -214,6 +212,7 @@ def router(
     else:
         raise InputError("router: a team FILE, or --config FILE; one of them")
     if print_config:
-        typer.echo(config_text(settings, title))
+        typer.echo(f"// {title}\n// zenohd -c FILE, or cpcbl-team router --config FILE")
+        typer.echo(json.dumps(settings, indent=2))
     else:
         run_router(settings, title, StopSignal(parent))

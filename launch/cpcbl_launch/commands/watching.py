@@ -29,7 +29,6 @@ Sensor = Annotated[str, Option(help="survey, gps, or a TOML file with the keys o
 FieldOfView = Annotated[
     float | None, Option(help="Field of view in degrees; default: the sensor's.")
 ]
-Move = Annotated[str, Option(help="Waypoints of a simulated observer's loop: X,Y;X,Y...")]
 Source = Annotated[
     Literal["simulated", "external"] | None,
     Option(help="external: your own driver feeds it; default: as the team's robots."),
@@ -49,7 +48,7 @@ def observer(
     at: At,
     sensor: Sensor = "survey",
     fov: FieldOfView = None,
-    move: Move = "",
+    move: Annotated[str, Option(help="Waypoints of a simulated observer's loop: X,Y;X,Y...")] = "",
     source: Source = None,
     connect: options.Connect = None,
     duration: Stay = None,

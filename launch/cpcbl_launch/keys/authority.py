@@ -145,7 +145,6 @@ def _certificate_builder(
     *,
     is_authority: bool,
 ) -> x509.CertificateBuilder:
-    """What all certificates have in common."""
     path_length = 0 if is_authority else None
     usage = x509.KeyUsage(
         digital_signature=not is_authority,

@@ -196,7 +196,6 @@ def _reached_hosts(
 
 
 def _has_key(at: Path) -> bool:
-    """Whether a member has a key, and it is that of its certificate."""
     try:
         pair = KeyPair((at / PRIVATE_KEY).read_bytes(), (at / CERTIFICATE).read_bytes())
     except FileNotFoundError:

@@ -73,7 +73,6 @@ def _draw_guest(
 
 
 def _annotate_time(errors: Axes, time_s: float, text: str) -> None:
-    """At the top, just after a time."""
     errors.annotate(
         text,
         (time_s, 1.0),

@@ -152,7 +152,6 @@ class EncodedLog(Generic[M]):
         return len(self._payloads)
 
     def __iter__(self) -> Iterator[M]:
-        """Those that have come by now."""
         return (cast(M, decode_tagged(payload)) for payload in tuple(self._payloads))
 
     @property

@@ -1,6 +1,5 @@
 """`cpcbl-team router`: a team's Zenoh router on a machine of its own."""
 
-import json
 import logging
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -30,12 +29,6 @@ def team_router(
     _, credentials = link_of(team, Identity(Role.ROUTER), [*here, *connect])
     guards = guard_rules(team, speed) | access_control(team)
     return router_config(here, connect, guards, credentials)
-
-
-def config_text(config: Mapping[str, Any], title: str) -> str:
-    """The configuration as a JSON5 file."""
-    head = f"// {title}\n// zenohd -c FILE, or cpcbl-team router --config FILE\n"
-    return head + json.dumps(config, indent=2)
 
 
 def run_router(config: Mapping[str, Any], title: str, stop: Callable[[], bool]) -> None:

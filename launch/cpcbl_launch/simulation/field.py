@@ -75,7 +75,6 @@ class SimulatedField:
         self._update_sensing_range()
 
     def _update_sensing_range(self) -> None:
-        """How far anybody sees, and what there is to see so far around."""
         ranges_m = [robot.settings.sensor.max_range_m for robot in self.robots.values()]
         self._reach_m = max(ranges_m, default=0.0)
         self._landmarks_to_see = Grid(self._reach_m, self._landmarks)

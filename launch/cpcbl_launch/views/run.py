@@ -151,7 +151,6 @@ def _robot_cells(r: RobotReport) -> list[str]:
 
 
 def _effects(name: str, guest: GuestReport) -> Table:
-    """What a guest's presence did to each robot."""
     parts = Effect.__struct_fields__
     present = ", ".join(f"{a:.1f} to {b:.1f} s" for a, b in guest.present_s)
     shown = table(
@@ -186,7 +185,6 @@ def print_observer_report(report: ObserverReport, console: Console) -> None:
 
 
 def _baseline_table(report: Report) -> Table:
-    """Plain filters beside the team: means over the robots."""
     shown = table("baselines: the same data and settings, team means", ("filter",), FIGURES)
     for name, yardstick in report.yardsticks.items():
         shown.add_row(name.replace("_", " ").replace("ekf", "EKF"), *_figures(yardstick.team))

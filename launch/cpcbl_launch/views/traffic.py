@@ -128,7 +128,6 @@ def _live_robot(arrivals: Sequence[Arrival], now_s: float) -> LiveRobot:
 def _live_flows(
     first: Status, last: Status, before: Sequence[Flow], after: Sequence[Flow]
 ) -> Iterator[LiveFlow]:
-    """The flows of a status, with rates since the first one."""
     elapsed_s = (last.stamp_ns - first.stamp_ns) * 1e-9
     for flow in after:
         key = flow.topic, flow.peer

@@ -109,7 +109,7 @@ def _expose(picture: Pixels, light: Light, random: np.random.Generator) -> Pixel
     """The picture (h, w, 3) in this light; only the noise depends on the generator."""
     height, width = picture.shape[:2]
     if light.brightness != 1.0 or light.gradient or light.tint != (1.0, 1.0, 1.0):
-        gain = _gain(width, height, light.brightness, light.gradient, light.tint)
+        gain = _gain(width, height, light)
         picture = cv2.multiply(picture, gain, dtype=cv2.CV_8U).astype(np.uint8, copy=False)
     if light.blur_px:  # a Gaussian that is cut off beyond three sigma
         side = 2 * max(1, round(3.0 * light.blur_px)) + 1
@@ -125,12 +125,10 @@ def _expose(picture: Pixels, light: Light, random: np.random.Generator) -> Pixel
 
 
 @lru_cache(maxsize=4)
-def _gain(
-    width: int, height: int, brightness: float, gradient: float, tint: tuple[float, float, float]
-) -> Grey:
+def _gain(width: int, height: int, light: Light) -> Grey:
     """What each pixel's colours are multiplied by, (h, w, 3)."""
-    across = 1.0 + gradient * (0.5 - (np.arange(width) + 0.5) / width)
-    gain = brightness * np.maximum(across, 0.0)[None, :, None] * np.array(tint)
+    across = 1.0 + light.gradient * (0.5 - (np.arange(width) + 0.5) / width)
+    gain = light.brightness * np.maximum(across, 0.0)[None, :, None] * np.array(light.tint)
     return np.ascontiguousarray(np.broadcast_to(gain, (height, width, 3)), np.float32)
 
 
