@@ -91,7 +91,10 @@ def print_faults(faults: ChaosReport, console: Console) -> None:
     shown = _table("scenario", "expectation", "measured (bound)", "")
     for outcome in faults.outcomes:
         told = Text(outcome.scenario), Text(outcome.expectation)
-        shown.add_row(*told, _measured_text(outcome), verdict(outcome))
+        measured = Text("\n").join(Text(str(c), "" if c.is_met else "red") for c in outcome.checks)
+        if reason := outcome.not_run or outcome.failed:
+            measured = Text(reason, "yellow" if outcome.not_run else "red")
+        shown.add_row(*told, measured, verdict(outcome))
     console.print(shown)
     for outcome in faults.outcomes:
         for remark in outcome.remarks:
@@ -111,12 +114,6 @@ def _table(*columns: str) -> Table:
     for column in columns:
         shown.add_column(column, overflow="fold")
     return shown
-
-
-def _measured_text(outcome: Outcome) -> Text:
-    if reason := outcome.not_run or outcome.failed:
-        return Text(reason, "yellow" if outcome.not_run else "red")
-    return Text("\n").join(Text(str(c), "" if c.is_met else "red") for c in outcome.checks)
 
 
 def markdown(faults: ChaosReport) -> Iterator[str]:

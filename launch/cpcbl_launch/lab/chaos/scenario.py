@@ -29,8 +29,6 @@ class ScenarioResult(NamedTuple):
 
 
 class Requirement(NamedTuple):
-    """What a scenario requires of the machine."""
-
     what: str = ""
     missing: Callable[[], str] = lambda: ""  # what is missing here; empty if nothing is
 

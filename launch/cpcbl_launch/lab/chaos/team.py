@@ -169,7 +169,6 @@ class TeamUnderTest:
         return path.read_text(errors="replace") if path.exists() else ""
 
     def tracebacks(self) -> int:
-        """The number of tracebacks in the logs of all processes."""
         logs = (path.read_text(errors="replace") for path in self.folder.glob("*.log"))
         return sum(log.count("Traceback (most recent call last)") for log in logs)
 

@@ -59,8 +59,6 @@ class Quarantine(NamedTuple):
 
 
 class Run(NamedTuple):
-    """The figures of one run."""
-
     rmse_m: dict[str, float]
     quarantines: tuple[Quarantine, ...]
 

@@ -65,7 +65,6 @@ def draw_figure7(result: Outcome) -> Figure:
 
 
 def draw_variants(result: Outcome) -> Figure:
-    """Accuracy and consistency of the variants."""
     figure, (errors, inside) = plt.subplots(1, 2, figsize=(8, 3.8))
     variants = list(dict.fromkeys(case.split()[0] for case in result.figures))
     for k, help_ in enumerate(("alone", "helped")):

@@ -58,8 +58,6 @@ QUALITY = 90  # of the JPEG that carries the frame
 
 
 class RandomFrame(NamedTuple):
-    """The random parts of a frame."""
-
     viewer: str
     pose: Pose2
     robots: tuple[SceneRobot, ...]

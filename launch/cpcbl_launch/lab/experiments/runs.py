@@ -58,8 +58,6 @@ class Errors(NamedTuple):
 
 
 class Run(NamedTuple):
-    """The figures of one run."""
-
     finished: bool
     bumps: int
     restarts: int
