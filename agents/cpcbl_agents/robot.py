@@ -160,7 +160,7 @@ def build_robot(
 
         log = MrclamSource(Path(team.data), name)
         start_ns = max(start_ns, log.first_ns)
-        log.skip_to(start_ns)
+        log.poll(start_ns)  # a robot that starts late leaves out what was before
         source = log
     return Robot(name, team, start_ns, build_sensing(name, team, source, camera), restarted)
 

@@ -137,7 +137,7 @@ def test_a_log_is_replayed_in_its_own_time(tmp_path: Path) -> None:
 def test_a_robot_that_starts_late_leaves_out_what_was_before(tmp_path: Path) -> None:
     write_log(tmp_path, seconds=4.0)
     source, start_ns = MrclamSource(tmp_path, "1"), EPOCH_NS + 2 * SECOND
-    source.skip_to(start_ns)
+    source.poll(start_ns)
     items = source.poll(FOREVER_NS)
     assert items
     assert items == [i for i in everything(tmp_path) if i.stamp_ns > start_ns]

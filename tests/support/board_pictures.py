@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 
 from cpcbl_agents.vision.camera import Camera, Floats, Pixels
-from cpcbl_launch.calibration.board import PRINTED_PX_PER_M, Board, draw_board
+from cpcbl_launch.calibration.lens import PRINTED_PX_PER_M, Board, draw_board
 from cpcbl_team.config import CameraSettings
 
 FINER = 2  # samples a pixel, across and down

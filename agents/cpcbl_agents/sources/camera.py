@@ -51,9 +51,7 @@ def open_camera(
     wake: Callable[[], None],
 ) -> OwnCamera:
     """The camera that a team file names. `wake` is called, from another thread, for each frame.
-
-    Raises InputError for a file or folder that cannot be played.
-    """
+    Raises InputError for a file or folder that cannot be played."""
     if settings.live:
         return LiveCamera(settings, rate_hz, now_ns, wake)
     path, key = Path(settings.frames), f"robots.{robot}.camera.frames"
@@ -163,9 +161,8 @@ def _retrieve(capture: "cv2.VideoCapture") -> Pixels:
     return pixels.astype(np.uint8, copy=False) if done else NO_PIXELS
 
 
-FrameReader = Callable[
-    [int], Frame | Picture
-]  # makes a frame with this stamp; may be left uncalled
+# Makes a frame with this stamp; may be left uncalled.
+FrameReader = Callable[[int], Frame | Picture]
 
 
 class RecordedCamera:

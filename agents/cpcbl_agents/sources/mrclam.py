@@ -134,7 +134,3 @@ class MrclamSource:
         first = self._next
         self._next = bisect_right(self._items, now_ns, lo=first, key=lambda item: item.stamp_ns)
         return self._items[first : self._next]
-
-    def skip_to(self, now_ns: int) -> None:
-        """Leaves out what was before: for a robot that starts late."""
-        self.poll(now_ns)

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from cpcbl_agents.vision.camera import Box, Floats, Pixels
-from cpcbl_agents.vision.detections import Ambiguity, Detections
+from cpcbl_agents.vision.detections import Detections
 from cpcbl_team.inputs import Sighting
 
 Colour = tuple[int, int, int]
@@ -42,12 +42,12 @@ def annotate(pixels: Pixels, detections: Detections) -> Pixels:
 
 
 def place_labels(detections: Detections, size_px: tuple[int, int]) -> list[Label]:
-    """The labels beside their outlines, inside a frame of this size (width, height).
-
-    They do not overlap as long as there is room.
-    """
+    """The labels beside their outlines, inside a frame of this size (width, height). They do not
+    overlap as long as there is room."""
     texts = [(f.outline, sighting_lines(f.sighting), DETECTED_BGR) for f in detections.found]
-    texts += [(a.outline, ambiguity_lines(a), AMBIGUOUS_BGR) for a in detections.ambiguities]
+    for a in detections.ambiguities:  # the reason, and the objects that it could be
+        lines = [a.reason, " or ".join(a.names)] if a.names else [a.reason]
+        texts.append((a.outline, lines, AMBIGUOUS_BGR))
     placed: list[Label] = []
     for outline, lines, colour in texts:
         box = _label_box(size_px, outline, lines, [label.box for label in placed])
@@ -65,12 +65,6 @@ def sighting_lines(sighting: Sighting) -> list[str]:
     if s.heading_rad is not None:
         lines.append(f"looks {_degrees(s.heading_rad, s.heading_sigma_rad)} deg")
     return lines
-
-
-def ambiguity_lines(ambiguity: Ambiguity) -> list[str]:
-    """The lines of a label: the reason of the rejection, and the objects that it could be."""
-    names = [" or ".join(ambiguity.names)] if ambiguity.names else []
-    return [ambiguity.reason, *names]
 
 
 def _degrees(angle: float, sigma: float | None) -> str:

@@ -6,8 +6,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from cpcbl_agents.vision.camera import Floats, Pixels
-from cpcbl_agents.vision.panorama import Panorama
+from cpcbl_agents.vision.camera import Floats, Panorama, Pixels
 from cpcbl_team.config import Colour
 
 BITS = 8  # colours that are told apart in one go
@@ -70,10 +69,8 @@ class ColourSegmenter:
 
 
 def _lookup_table(colours: Sequence[Colour]) -> Pixels:
-    """For each hue, saturation and value, (256, 1, 3), a bit for each colour that accepts it.
-
-    A pixel has the colours whose bit is set for all three.
-    """
+    """For each hue, saturation and value, (256, 1, 3), a bit for each colour that accepts it. A
+    pixel has the colours whose bit is set for all three."""
     table = np.zeros((256, 1, 3), np.uint8)
     for bit, colour in enumerate(colours):
         first, last = colour.hue

@@ -87,10 +87,8 @@ class CylinderFit(NamedTuple):
 def fit_cylinder(
     shape: Shape, outline: AngularOutline, leniency: float = 1.0
 ) -> CylinderFit | None:
-    """The fit if the outline has this shape; None if it has not, or if that is uncertain.
-
-    A leniency above 1 also accepts outlines that only might have this shape.
-    """
+    """The fit if the outline has this shape; None if it has not, or if that is uncertain. A
+    leniency above 1 also accepts outlines that only might have this shape."""
     for use, hidden, limit in FITS:
         if outline.hidden.isdisjoint(use):
             fit = fit_distance(shape, outline.angles, outline.sigmas, outline.tilt_sigma, use)

@@ -10,7 +10,7 @@ import math
 from collections.abc import Iterable, Iterator, Sequence
 from typing import NamedTuple
 
-from cpcbl_agents.vision.camera import Camera, Pixels
+from cpcbl_agents.vision.camera import Camera, Pixels, panorama_for
 from cpcbl_agents.vision.colours import ColourBlob, ColourSegmenter
 from cpcbl_agents.vision.cylinder_fit import (
     FOOT,
@@ -33,7 +33,6 @@ from cpcbl_agents.vision.outlines import (
     panorama_patch,
     possible_outlines,
 )
-from cpcbl_agents.vision.panorama import panorama_for
 from cpcbl_team.config import Bands, Team
 from cpcbl_team.geometry import wrap_angle
 from cpcbl_team.inputs import Sighting

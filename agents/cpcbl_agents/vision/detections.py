@@ -40,10 +40,8 @@ class Detections(NamedTuple):
 
 
 def without_duplicates(detections: Detections) -> Detections:
-    """The detections, but one name at two places and two names at one place become ambiguities.
-
-    Of several detections of one name at one place, one is kept.
-    """
+    """The detections, but one name at two places and two names at one place become ambiguities. Of
+    several detections of one name at one place, one is kept."""
     found: list[Detection] = []
     ambiguities = list(detections.ambiguities)
     for group in _by_place(detections.found):

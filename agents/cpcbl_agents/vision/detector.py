@@ -54,14 +54,9 @@ class CameraDetector:
         """All detections in a picture (height, width, 3), BGR, or why it cannot be used."""
         if reason := pixel_fault(pixels, self.camera.size_px):
             return reason
-        return merge_detections(
-            self._markers.detections(pixels), self._cylinders.detections(pixels)
-        )
-
-
-def merge_detections(near: Detections, far: Detections) -> Detections:
-    """Both, without those by colours of objects that markers detected or rejected."""
-    known = {found.sighting.id for found in near.found}
-    known.update(name for ambiguity in near.ambiguities for name in ambiguity.names)
-    kept = tuple(found for found in far.found if found.sighting.id not in known)
-    return Detections(near.found + kept, near.ambiguities + far.ambiguities)
+        near, far = self._markers.detections(pixels), self._cylinders.detections(pixels)
+        # What markers detected or rejected, colours need not detect.
+        known = {found.sighting.id for found in near.found}
+        known.update(name for ambiguity in near.ambiguities for name in ambiguity.names)
+        kept = tuple(found for found in far.found if found.sighting.id not in known)
+        return Detections(near.found + kept, near.ambiguities + far.ambiguities)

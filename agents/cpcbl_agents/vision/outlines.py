@@ -12,10 +12,9 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from cpcbl_agents.vision.camera import Floats, Pixels
+from cpcbl_agents.vision.camera import Floats, Panorama, Pixels
 from cpcbl_agents.vision.colours import ColourBlob
 from cpcbl_agents.vision.cylinder_fit import FOOT, TOP, WIDTH
-from cpcbl_agents.vision.panorama import Panorama
 from cpcbl_team.config import Bands
 
 MOST_CANDIDATES = 32
@@ -86,10 +85,8 @@ class Profile:
         np.cumsum(colours, axis=0, out=self._sums[1:])
 
     def edge(self, guess: float, farthest: float, reach: float) -> float:
-        """The edge near `guess`, within `reach`; NaN if there is none.
-
-        The colour of either side is taken no farther from the edge than `farthest`.
-        """
+        """The edge near `guess`, within `reach`; NaN if there is none. The colour of either side is
+        taken no farther from the edge than `farthest`."""
         first = at = guess - self._start
         farthest = min(max(farthest, NEAREST_PX), FARTHEST_PX)
         for _ in range(ROUNDS):
@@ -120,8 +117,7 @@ class Profile:
         first, last = max(round(start), 0), min(round(end) + 1, len(self._colours))
         if last <= first:
             return np.full(3, math.nan)
-        mean: Floats = (self._sums[last] - self._sums[first]) / (last - first)
-        return mean
+        return np.asarray((self._sums[last] - self._sums[first]) / (last - first))
 
 
 class Patch(NamedTuple):
@@ -151,10 +147,8 @@ class Patch(NamedTuple):
 
 
 def candidates(blobs: Sequence[ColourBlob]) -> list[Candidate]:
-    """The pairs of touching blobs of two colours that may be the bands of a cylinder.
-
-    Only the highest are used if there are very many, which bounds the time for a picture.
-    """
+    """The pairs of touching blobs of two colours that may be the bands of a cylinder. Only the
+    highest are used if there are very many, which bounds the time for a picture."""
     pairs = [
         Candidate(upper, lower)
         for upper, lower in itertools.permutations(blobs, 2)

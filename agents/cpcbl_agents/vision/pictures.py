@@ -36,10 +36,8 @@ class Header(NamedTuple):
 
 
 def decode_image(image: bytes) -> Pixels | str:
-    """The pixels, BGR, of any kind of picture that OpenCV reads; or why there are none.
-
-    It is for files that a person names; `decode_frame` is for frames of cameras.
-    """
+    """The pixels, BGR, of any kind of picture that OpenCV reads; or why there are none. It is for
+    files that a person names; `decode_frame` is for frames of cameras."""
     if not image:
         return "frame_empty"
     pixels = cv2.imdecode(np.frombuffer(image, np.uint8), cv2.IMREAD_COLOR)

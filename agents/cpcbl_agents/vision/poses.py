@@ -60,8 +60,7 @@ def side_corners(side: Side, vision: VisionSettings) -> Floats:
     right = np.array([-math.sin(angle), math.cos(angle), 0.0])
     up = np.array([0.0, 0.0, 1.0])
     middle = vision.marker_distance_m * outwards + vision.marker_mounted_m * up
-    corners: Floats = middle + half * np.stack([up - right, up + right, right - up, -right - up])
-    return corners
+    return np.asarray(middle + half * np.stack([up - right, up + right, right - up, -right - up]))
 
 
 def fit_pose(
@@ -101,8 +100,7 @@ def _corner_covariance(plane: Floats, s: CameraSettings) -> Floats:
     tilt = math.radians(s.tilt_sigma_deg) * np.stack([u * v, 1.0 + v * v], axis=1)
     yaw = math.radians(s.yaw_sigma_deg) * np.stack([1.0 + u * u, u * v], axis=1)
     common = np.stack([tilt, yaw, s.focal_share * plane]).reshape(3, -1)
-    covariance: Floats = np.diag(np.tile(own * own, len(plane))) + common.T @ common
-    return covariance
+    return np.asarray(np.diag(np.tile(own * own, len(plane))) + common.T @ common)
 
 
 def _initial_poses(
@@ -163,8 +161,7 @@ class _Reprojection:
         jacobian[..., :3] /= depth[..., None]
         jacobian[..., 3] = self._plane - projected
         flat = jacobian.reshape(len(poses), -1, 4)
-        normal_equations: Floats = flat.transpose(0, 2, 1) @ self._weights @ flat
-        return normal_equations
+        return np.asarray(flat.transpose(0, 2, 1) @ self._weights @ flat)
 
 
 def _refine(poses: Floats, view: _Reprojection) -> tuple[Floats, Floats]:
@@ -221,5 +218,4 @@ def _rotated_point(point: Floats, angles: Floats) -> Floats:
 
 
 def _wrap(angles: Floats) -> Floats:
-    wrapped: Floats = (angles + np.pi) % (2.0 * np.pi) - np.pi
-    return wrapped
+    return np.asarray((angles + np.pi) % (2.0 * np.pi) - np.pi)

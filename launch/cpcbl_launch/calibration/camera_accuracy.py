@@ -228,10 +228,8 @@ class ErrorStatistics(msgspec.Struct, frozen=True):
 
 
 class AccuracyRow(msgspec.Struct, frozen=True):
-    """Errors of sightings of one kind in one span of ranges, before any correction.
-
-    Errors of ranges are shares of the range, those of bearings and headings are in degrees.
-    """
+    """Errors of sightings of one kind in one span of ranges, before any correction. Errors of
+    ranges are shares of the range, those of bearings and headings are in degrees."""
 
     kind: str
     from_m: float
@@ -254,10 +252,8 @@ class CameraAccuracy(msgspec.Struct, frozen=True):
 
 
 class _ErrorRows(NamedTuple):
-    """Errors of sightings with known ground truth, and the stated sigmas.
-
-    Both have columns for range (m), bearing and heading (rad); NaN: no such reading.
-    """
+    """Errors of sightings with known ground truth, and the stated sigmas. Both have columns for
+    range (m), bearing and heading (rad); NaN: no such reading."""
 
     stretch: Integers
     teammate: Mask
@@ -286,11 +282,9 @@ def _error_rows(observations: Sequence[CameraObservations], now: SensorCorrectio
         rows = all_sighting_rows(observed.log, i, now.delay_s)
         heading, heading_sigma, true_heading = observed.headings.T
         heading_error = wrap_angles(heading - true_heading)
-        errors = (now.range_errors(rows), now.bearing_errors(rows), heading_error)
+        errors = np.column_stack([now.range_errors(rows), now.bearing_errors(rows), heading_error])
         sigmas = np.column_stack([observed.stated, heading_sigma])
-        part = _ErrorRows(
-            rows.stretch, rows.teammate, rows.true_range, np.column_stack(errors), sigmas
-        )
+        part = _ErrorRows(rows.stretch, rows.teammate, rows.true_range, errors, sigmas)
         parts.append(select_rows(part, rows.true_range > 0.05))
     return join_rows(parts)
 

@@ -87,11 +87,8 @@ def calibrate_colours(
     kept: Mapping[str, Colour] | None = None,
     margin: float = MARGIN,
 ) -> ColourCalibration:
-    """The thresholds of all colours that were sampled. Raises InputError.
-
-    `elsewhere` (n, 3), HSV: the pixels that are not labelled. `kept`: the colours that are not
-    calibrated.
-    """
+    """The thresholds of all colours that were sampled. Raises InputError. `elsewhere` (n, 3), HSV:
+    the pixels that are not labelled. `kept`: the colours that are not calibrated."""
     kept, pooled = dict(kept or {}), _pixels_by_colour(patches)
     for name, hsv in pooled.items():
         if len(hsv) < MIN_PX:

@@ -1,5 +1,6 @@
 """Errors of a robot's odometry: windows of a drive compared with true poses.
 
+The conventions are those of `OdometrySettings`. A displacement is compared along its own direction.
 Windows of a few seconds determine the corrections, longer ones the growth of the noise. A dead zone
 of the motors shows as a least speed below which the robot does not drive.
 """
@@ -10,18 +11,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from cpcbl_launch.calibration.logs import RobotLog
-from cpcbl_launch.calibration.odometry_windows import (
-    NOISE_WINDOWS_S,
-    WINDOW_S,
-    OdometryCorrections,
-    OdometryWindows,
-    odometry_windows,
-)
+from cpcbl_launch.calibration.logs import LONGEST_GAP_S, RobotLog
 from cpcbl_launch.calibration.statistics import (
     MIN_ROWS,
     OUTLIER_SIGMAS,
     Estimate,
+    Integers,
     LinearFit,
     Mask,
     RowFilter,
@@ -32,10 +27,14 @@ from cpcbl_launch.calibration.statistics import (
     select_rows,
     sigma_estimates,
     solve,
+    stretch_numbers,
     variance_components,
 )
 from cpcbl_launch.reporting.metrics import Floats
 
+WINDOW_S = 2.0
+NOISE_WINDOWS_S = (1.0, 2.0, 4.0, 8.0, 16.0)
+NUDGE_S = 0.01
 MIN_MOTION = 0.02  # m or rad in a window; a smaller motion does not determine scales
 DELAYS_S = np.arange(0.0, 1.001, 0.02)
 CORRECTIONS = {  # with their limits; of two that a log cannot separate the larger stays
@@ -51,6 +50,133 @@ NOISE = (
     "turn_sigma_rad_per_sqrt_rad",
     "turn_sigma_rad_per_sqrt_m",
 )
+
+
+class OdometryWindows(NamedTuple):
+    """Commanded and true motion in windows of a drive. Shapes (n,); m, rad."""
+
+    stretch: Integers
+    turn: Floats  # commanded
+    turn_rate: Floats  # decrease of `turn` for a second of delay
+    true_turn: Floats
+    displacement: Floats  # commanded, along the true headings
+    displacement_rate: Floats
+    true_displacement: Floats  # its part along `displacement`
+    loss: Floats  # |turn| while driving, its part along `displacement`
+    distance: Floats  # sum of distances
+    turn_while_driving: Floats  # sum of |turn| while driving
+    distance_along: Floats  # sum of |distance| x cos^2 of the angle to `displacement`
+    turn_along: Floats  # sum of |turn| x the same
+    path_length: Floats  # sum of |distance|
+    turn_total: Floats  # sum of |turn|
+
+
+class OdometryCorrections(NamedTuple):
+    """Present values, named as in `OdometrySettings`."""
+
+    distance_scale: float
+    turn_scale: float
+    delay_s: float
+    loss: float
+    bias: float
+
+    def displacement(self, rows: OdometryWindows) -> Floats:
+        return np.asarray(self.distance_scale * rows.displacement - self.loss * rows.loss)
+
+    def turn(self, rows: OdometryWindows) -> Floats:
+        return np.asarray(self.turn_scale * rows.turn + self.bias * self.distance(rows))
+
+    def distance(self, rows: OdometryWindows) -> Floats:
+        return np.asarray(self.distance_scale * rows.distance - self.loss * rows.turn_while_driving)
+
+
+def odometry_windows(logs: Sequence[RobotLog], delay_s: float, length_s: float) -> OdometryWindows:
+    """Windows of about `length_s` that lie between rows of truth without long gaps."""
+    return join_rows([_windows_of_log(log, i, delay_s, length_s) for i, log in enumerate(logs)])
+
+
+def _windows_of_log(log: RobotLog, number: int, delay_s: float, length_s: float) -> OdometryWindows:
+    stamps = log.truth[:, 0]
+    x, y, heading = log.truth[:, 1], log.truth[:, 2], np.unwrap(log.truth[:, 3])
+    first, last = _window_rows(stamps, log.odometry, delay_s, length_s)
+    a, b = stamps[first], stamps[last]
+    before, now, after = (
+        _commanded_motion(log.odometry, stamps, heading, delay_s + nudge, a, b)
+        for nudge in (-NUDGE_S, 0.0, NUDGE_S)
+    )
+    turn, px, py, lx, ly, distance, turn_while_driving, path_length, turn_total, *doubled = now.T
+    displacement = np.hypot(px, py)
+    still = displacement < 1e-3
+    ux = np.where(still, np.cos(heading[first]), px / np.maximum(displacement, 1e-9))
+    uy = np.where(still, np.sin(heading[first]), py / np.maximum(displacement, 1e-9))
+    rate = (after - before) / (2.0 * NUDGE_S)
+    cos2, sin2 = ux * ux - uy * uy, 2.0 * ux * uy
+    return OdometryWindows(
+        stretch_numbers(a, stamps, number),
+        turn,
+        rate[:, 0],
+        heading[last] - heading[first],
+        ux * px + uy * py,
+        ux * rate[:, 1] + uy * rate[:, 2],
+        ux * (x[last] - x[first]) + uy * (y[last] - y[first]),
+        ux * lx + uy * ly,
+        distance,
+        turn_while_driving,
+        0.5 * (path_length + cos2 * doubled[0] + sin2 * doubled[1]),
+        0.5 * (turn_total + cos2 * doubled[2] + sin2 * doubled[3]),
+        path_length,
+        turn_total,
+    )
+
+
+def _window_rows(
+    stamps: Floats, odometry: Floats, delay_s: float, length_s: float
+) -> tuple[Integers, Integers]:
+    """The first and last row of truth of each window; windows do not overlap."""
+    begin, end = max(stamps[0], odometry[0, 0]) + 1.0, min(stamps[-1], odometry[-1, 1]) - 1.0
+    grid = np.arange(begin, end - length_s, length_s)
+    ends = odometry[:, 1] + delay_s
+    first = _row_near_odometry_end(stamps, ends, grid)
+    last = _row_near_odometry_end(stamps, ends, stamps[first] + length_s)
+    gaps = np.concatenate(([0], np.cumsum(np.diff(stamps) > LONGEST_GAP_S)))
+    seconds = stamps[last] - stamps[first]
+    good = (gaps[first] == gaps[last]) & (stamps[first] - grid < 0.5 * length_s)
+    good &= (seconds > 0.75 * length_s) & (seconds < 1.5 * length_s)
+    return first[good], last[good]
+
+
+def _row_near_odometry_end(stamps: Floats, ends: Floats, times_s: Floats) -> Integers:
+    """Of the next rows of truth, the one nearest to the end of a piece of odometry: inside a piece
+    only the mean speed is known."""
+    rows = np.searchsorted(stamps, times_s)[:, None] + np.arange(6)
+    rows = np.minimum(rows, len(stamps) - 1)
+    after = np.clip(np.searchsorted(ends, stamps[rows]), 1, len(ends) - 1)
+    aside = np.minimum(np.abs(ends[after] - stamps[rows]), np.abs(stamps[rows] - ends[after - 1]))
+    late = stamps[rows] - stamps[rows[:, :1]] > 0.12
+    return np.asarray(rows[np.arange(len(rows)), np.argmin(np.where(late, 9.0, aside), axis=1)])
+
+
+def _commanded_motion(
+    odometry: Floats, stamps: Floats, heading: Floats, delay_s: float, a: Floats, b: Floats
+) -> Floats:
+    """The commanded motion from a to b, shape (n, 13): turn; distance, and |turn| while driving, in
+    x and y along the true headings; distance; |turn| while driving; |distance|; |turn|; the last
+    two times cos and sin of twice the heading.
+    """
+    from_s, until_s, distance, turn = odometry.T
+    direction = np.interp(0.5 * (from_s + until_s) + delay_s, stamps, heading)
+    c, s = np.cos(direction), np.sin(direction)
+    displacement, turn_total = np.abs(distance), np.abs(turn)
+    cos2, sin2 = np.cos(2.0 * direction), np.sin(2.0 * direction)
+    lost = np.sign(distance) * turn_total
+    distance_along = [distance * c, distance * s, lost * c, lost * s]
+    doubled = [displacement * cos2, displacement * sin2, turn_total * cos2, turn_total * sin2]
+    pieces = np.stack([turn, *distance_along, distance, lost, displacement, turn_total, *doubled])
+    knots = np.stack([from_s, until_s], axis=1).ravel() + delay_s
+    totals = np.cumsum(pieces, axis=1)
+    levels = np.stack([totals - pieces, totals], axis=2).reshape(len(pieces), -1)
+    sums = [np.interp(b, knots, level) - np.interp(a, knots, level) for level in levels]
+    return np.stack(sums, axis=1)
 
 
 def odometry_delay_s(logs: Sequence[RobotLog]) -> float:
@@ -75,7 +201,12 @@ def odometry_fit(rows: OdometryWindows, now: OdometryCorrections, noise: Floats)
     The scales are fitted as differences from 1, the delay as a difference from the present one.
     `noise`: see `odometry_noise`.
     """
-    way_sigma, turn_sigma = odometry_sigmas(rows, now, noise)
+    way = noise[0] * now.distance_scale * rows.distance_along
+    way += noise[1] * now.turn_scale * rows.turn_along
+    turn = noise[2] * now.turn_scale * rows.turn_total
+    turn += noise[3] * now.distance_scale * rows.path_length
+    way_sigma = np.sqrt(np.maximum(way + noise[4], 1e-12))
+    turn_sigma = np.sqrt(np.maximum(turn + noise[5], 1e-12))
     ways, turns = np.abs(rows.displacement) > MIN_MOTION, np.abs(rows.turn) > MIN_MOTION
     turns |= np.abs(rows.distance) > MIN_MOTION
     of_ways, of_turns = np.zeros((ways.sum(), 5)), np.zeros((turns.sum(), 5))
@@ -84,25 +215,11 @@ def odometry_fit(rows: OdometryWindows, now: OdometryCorrections, noise: Floats)
     of_ways[:, 3] = -rows.loss[ways]
     of_turns[:, 1], of_turns[:, 2] = rows.turn[turns], now.turn_scale * rows.turn_rate[turns]
     of_turns[:, 4] = now.distance(rows)[turns]
-    parts = []
-    for moving, sigma, columns, errors in (
-        (ways, way_sigma, of_ways, rows.true_displacement - rows.displacement),
-        (turns, turn_sigma, of_turns, rows.true_turn - rows.turn),
-    ):
-        unitless = columns / sigma[moving, None], (errors / sigma)[moving]
-        parts.append(LinearFit(rows.stretch[moving], *unitless))
-    return join_rows(parts)
-
-
-def odometry_sigmas(
-    rows: OdometryWindows, now: OdometryCorrections, noise: Floats
-) -> tuple[Floats, Floats]:
-    """Sigmas (m, rad) of the displacements and turns of windows."""
-    way = noise[0] * now.distance_scale * rows.distance_along
-    way += noise[1] * now.turn_scale * rows.turn_along
-    turn = noise[2] * now.turn_scale * rows.turn_total
-    turn += noise[3] * now.distance_scale * rows.path_length
-    return np.sqrt(np.maximum(way + noise[4], 1e-12)), np.sqrt(np.maximum(turn + noise[5], 1e-12))
+    way_errors = ((rows.true_displacement - rows.displacement) / way_sigma)[ways]
+    turn_errors = ((rows.true_turn - rows.turn) / turn_sigma)[turns]
+    way_fit = LinearFit(rows.stretch[ways], of_ways / way_sigma[ways, None], way_errors)
+    turn_fit = LinearFit(rows.stretch[turns], of_turns / turn_sigma[turns, None], turn_errors)
+    return join_rows([way_fit, turn_fit])
 
 
 def odometry_noise(windows: Sequence[OdometryWindows], now: OdometryCorrections) -> Floats:
@@ -202,10 +319,8 @@ CRAWL_NOISE = "crawl_sigma_m_per_sqrt_s"
 
 
 def estimate_least_speed(logs: Sequence[RobotLog], now: OdometryCorrections) -> Estimate | None:
-    """The speed (m/s) of a robot that is commanded to drive slower, if the logs determine it.
-
-    It is the speed on a grid with the best fit of the displacements.
-    """
+    """The speed (m/s) of a robot that is commanded to drive slower, if the logs determine it. It is
+    the speed on a grid with the best fit of the displacements."""
     each = []
     for speed in LEAST_SPEEDS_M_S / now.distance_scale:
         driven = [with_least_speed(log, speed) for log in logs]

@@ -41,10 +41,8 @@ def picture_files(paths: Sequence[Path]) -> list[Path]:
 def read_pictures(
     files: Sequence[Path], every_s: float = 0.5, progress: Callable[[float], None] = lambda d: None
 ) -> Iterator[NamedPicture]:
-    """Reads one picture after the other; of a video, one frame every `every_s` seconds.
-
-    `progress` is called with the share of the files that are done.
-    """
+    """Reads one picture after the other; of a video, one frame every `every_s` seconds. `progress`
+    is called with the share of the files that are done."""
     for i, file in enumerate(files):
         if file.suffix.lower() in VIDEOS:
             yield from _video_frames(file, every_s)

@@ -159,28 +159,19 @@ def sensor_fit(
     of_ranges[:, 6], of_bearings[:, 6] = -rows.range_rate[r], -rows.bearing_rate[b]
     sigma, ranges = range_sigma[r], now.line_of_sight_range(rows) - rows.true_range
     bearings = wrap_angles(rows.bearing - rows.true_bearing)[b] / bearing_sigma
-    return join_rows(
-        [
-            LinearFit(rows.stretch[r], of_ranges / sigma[:, None], ranges[r] / sigma),
-            LinearFit(rows.stretch[b], of_bearings / bearing_sigma, bearings),
-        ]
-    )
+    range_fit = LinearFit(rows.stretch[r], of_ranges / sigma[:, None], ranges[r] / sigma)
+    return join_rows([range_fit, LinearFit(rows.stretch[b], of_bearings / bearing_sigma, bearings)])
 
 
 def corrections_from_fit(now: SensorCorrections, fitted: Floats) -> SensorCorrections:
     """The corrections that undo fitted slopes, offsets and differences."""
     slope, offset, robot_offset, axis, bearing_slope, bearing_offset, later_s = fitted.tolist()
     scale, bearing_scale = 1.0 / max(1.0 + slope, 0.1), 1.0 / max(1.0 + bearing_slope, 0.1)
-    return SensorCorrections(
-        scale,
-        scale * offset,
-        scale * robot_offset,
-        now.optical_axis + min(max(axis, -0.1), 0.1),
-        bearing_scale,
-        bearing_scale * bearing_offset,
-        now.delay_s + min(max(later_s, -0.1), 0.1),
-        now.is_depth,
-    )
+    optical_axis = now.optical_axis + min(max(axis, -0.1), 0.1)
+    delay_s = now.delay_s + min(max(later_s, -0.1), 0.1)
+    ranges = scale, scale * offset, scale * robot_offset
+    bearings = bearing_scale, bearing_scale * bearing_offset
+    return SensorCorrections(*ranges, optical_axis, *bearings, delay_s, now.is_depth)
 
 
 def sensor_noise(rows: SightingRows, now: SensorCorrections) -> Floats:

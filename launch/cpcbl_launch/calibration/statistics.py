@@ -43,10 +43,8 @@ class LinearFit(NamedTuple):
 
 
 def robust_fit(columns: Floats, values: Floats) -> Floats:
-    """Coefficients (k,) with values ~ columns (n, k) @ coefficients.
-
-    The weights are Huber's, iterated. Residuals beyond OUTLIER_SIGMAS have no weight.
-    """
+    """Coefficients (k,) with values ~ columns (n, k) @ coefficients. The weights are Huber's,
+    iterated. Residuals beyond OUTLIER_SIGMAS have no weight."""
     weight = np.ones(len(values))
     coefficients: Floats = np.zeros(columns.shape[1])
     for _ in range(12):
@@ -120,9 +118,7 @@ RowFilter = Callable[[Integers], Mask]
 
 def jackknife(estimate: Callable[[RowFilter], Floats], stretch_numbers: Integers) -> list[Estimate]:
     """Each value over all data, with a standard error from leaving out one stretch after another.
-
-    `estimate` receives a function from the rows' stretch numbers to the mask of rows to use.
-    """
+    `estimate` receives a function from the rows' stretch numbers to the mask of rows to use."""
     whole = estimate(lambda s: np.ones(len(s), bool))
     names = np.unique(stretch_numbers)
     each = np.array([estimate(lambda s, n=n: s != n) for n in names])  # type: ignore[misc]

@@ -1,5 +1,6 @@
 """Calibrated values as tables of a team file. The rest of the file, with its comments, stays."""
 
+import math
 import os
 import shutil
 import tomllib
@@ -40,12 +41,13 @@ class TomlValue(NamedTuple):
     remark: str = ""
 
 
-def toml_value(estimate: Estimate) -> TomlValue:
+def toml_value(estimate: Estimate, least: float = -math.inf) -> TomlValue:
     """The value, rounded to what its standard error allows, with that error as the remark."""
     if estimate.standard_error == 0.0:
-        return TomlValue(estimate.value)
+        return TomlValue(max(estimate.value, least))
     digits = decimals(estimate.standard_error)
-    return TomlValue(round(estimate.value, digits) + 0.0, f"± {estimate.standard_error:.{digits}f}")
+    value = max(round(estimate.value, digits) + 0.0, least)
+    return TomlValue(value, f"± {estimate.standard_error:.{digits}f}")
 
 
 class TablePath(NamedTuple):
@@ -63,10 +65,8 @@ Tables = Mapping[TablePath, Mapping[str, TomlValue]]
 def robot_table(
     team_file: Path | None, robot: str | None, type_name: str | None, part: str
 ) -> TablePath:
-    """The table `part` of a robot or of a type; without a team file that of a type `eye`.
-
-    Raises InputError unless exactly one of `robot` and `type_name` is given.
-    """
+    """The table `part` of a robot or of a type; without a team file that of a type `eye`. Raises
+    InputError unless exactly one of `robot` and `type_name` is given."""
     if team_file is None and robot is None and type_name is None:
         return TablePath(("types", "eye", part))
     if (robot is None) == (type_name is None):
@@ -76,10 +76,8 @@ def robot_table(
 
 
 def team_source(path: Path, output: Path | None) -> tuple[str, Path]:
-    """The text of a team file, or of a built-in one by its name, and the file to write.
-
-    That is `output` if it is given, else the file itself. Raises TeamFileError.
-    """
+    """The text of a team file, or of a built-in one by its name, and the file to write. That is
+    `output` if it is given, else the file itself. Raises TeamFileError."""
     if not path.exists() and builtin_path(path.name).exists():
         if output is None:
             raise TeamFileError(f"{path}: a built-in team cannot be changed; name --output FILE")
@@ -88,16 +86,20 @@ def team_source(path: Path, output: Path | None) -> tuple[str, Path]:
 
 
 def edit_team(text: str, name: str, tables: Tables) -> str:
-    """The text of a team file with these values in these tables. Raises TeamFileError.
-
-    `name` is the file's name in errors. A robot or type must exist; other tables are added.
-    """
+    """The text of a team file with these values in these tables. Raises TeamFileError. `name` is
+    the file's name in errors. A robot or type must exist; other tables are added."""
     try:
         document = tomlkit.parse(text)
     except tomlkit.exceptions.TOMLKitError as error:
         raise TeamFileError(f"{name}: not TOML: {error}") from error
     for table_path, values in tables.items():
-        _require_table(document, table_path, name)
+        layer, owner, *_ = table_path.names
+        known = document.get(layer, {})
+        if layer in ("robots", "types") and owner not in known:
+            available = ", ".join(known) or "none"
+            raise TeamFileError(
+                f"{name}: {layer}.{owner}: not in the file; name one of: {available}"
+            )
         table: Any = document
         for i, part in enumerate(table_path.names, 1):
             if part not in table:
@@ -152,14 +154,6 @@ def overridden_keys(text: str, table_path: TablePath, keys: Sequence[str]) -> li
     robots = tomlkit.parse(text).get("robots", {})
     own = {robot: t.get(part, {}) for robot, t in robots.items() if t.get("type") == type_name}
     return [f"robots.{robot}.{part}.{key}" for robot in own for key in keys if key in own[robot]]
-
-
-def _require_table(document: Mapping[str, Any], table_path: TablePath, name: str) -> None:
-    layer, owner, *_ = table_path.names
-    known = document.get(layer, {})
-    if layer in ("robots", "types") and owner not in known:
-        available = ", ".join(known) or "none"
-        raise TeamFileError(f"{name}: {layer}.{owner}: not in the file; name one of: {available}")
 
 
 def _item(value: TomlValue, table: Any) -> Any:
@@ -234,10 +228,8 @@ def sensor_tables(
     The sigmas are never reduced: an error that is the same in all of these pictures, such as that
     of the camera's mounting, may be different on another day.
     """
-    corrections = {name: toml_value(estimate) for name, estimate in accuracy.sensor.items()}
-    for name in corrections.keys() & MINIMUM.keys():
-        value, remark = corrections[name]
-        corrections[name] = TomlValue(max(value, MINIMUM[name]), remark)
+    found = accuracy.sensor.items()
+    corrections = {name: toml_value(value, MINIMUM.get(name, -math.inf)) for name, value in found}
     corrections["range_is_depth"] = TomlValue(accuracy.range_is_depth)
     tables: dict[TablePath, Mapping[str, TomlValue]] = {sensor_path: corrections}
     times = accuracy.times

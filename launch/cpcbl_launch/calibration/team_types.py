@@ -13,7 +13,6 @@ from tomlkit.toml_document import TOMLDocument
 
 from cpcbl_launch.calibration import odometry, sensor
 from cpcbl_launch.calibration.logs import RobotLog, RobotLogs
-from cpcbl_launch.calibration.odometry_windows import WINDOW_S
 from cpcbl_launch.calibration.statistics import Estimate, decimals
 from cpcbl_launch.calibration.team_tables import MINIMUM, team_source
 from cpcbl_launch.reporting.recording import read_recording
@@ -25,7 +24,7 @@ _CORRECTED = {  # the noise of a reading: its correction, the neutral value, the
     "range_share": ("range_scale", 1.0, 1.0),
     "range_floor_m": ("range_bias_m", 0.0, 1.0),
     "bearing_sigma_deg": ("bearing_bias_deg", 0.0, 1.0),
-    odometry.CRAWL_NOISE: ("least_speed_m_s", 0.0, math.sqrt(WINDOW_S)),  # for a window
+    odometry.CRAWL_NOISE: ("least_speed_m_s", 0.0, math.sqrt(odometry.WINDOW_S)),  # for a window
 }
 
 

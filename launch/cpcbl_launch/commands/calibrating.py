@@ -108,8 +108,7 @@ def camera(
 ) -> None:
     """Lens and distortion of a camera, from pictures of a printed board."""
     require_opencv("calibrate camera")
-    from cpcbl_launch.calibration.board import parse_board, write_board
-    from cpcbl_launch.calibration.lens import calibrate_lens
+    from cpcbl_launch.calibration.lens import calibrate_lens, parse_board, write_board
     from cpcbl_launch.calibration.pictures import picture_files, read_pictures
     from cpcbl_launch.calibration.reports import print_lens
     from cpcbl_launch.calibration.team_tables import camera_table, robot_table

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from cpcbl_agents.vision.codes import MarkerCode, MarkerReader
+from cpcbl_agents.vision.markers import MarkerCode, MarkerReader
 from cpcbl_team.config import LIKE_MIRRORED, MARKERS, MarkerFamily
 
 FAMILIES: list[MarkerFamily] = list(get_args(MarkerFamily))

@@ -4,9 +4,8 @@ import cv2
 import numpy as np
 import pytest
 
-from cpcbl_agents.vision.camera import Camera, Pixels
+from cpcbl_agents.vision.camera import Camera, Panorama, Pixels
 from cpcbl_agents.vision.colours import MAX_BLOBS, ColourSegmenter
-from cpcbl_agents.vision.panorama import Panorama
 from cpcbl_team.config import COLOURS, CameraSettings, Colour
 
 SETTINGS = CameraSettings(

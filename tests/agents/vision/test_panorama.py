@@ -6,8 +6,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from cpcbl_agents.vision.camera import Camera
-from cpcbl_agents.vision.panorama import Panorama
+from cpcbl_agents.vision.camera import Camera, Panorama
 from cpcbl_team.config import CameraSettings
 
 SMALL = CameraSettings(

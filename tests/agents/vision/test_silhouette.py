@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from cpcbl_agents.vision.camera import Camera
+from cpcbl_agents.vision.camera import Camera, Panorama
 from cpcbl_agents.vision.cylinder_fit import (
     FOOT,
     LEVEL,
@@ -16,7 +16,6 @@ from cpcbl_agents.vision.cylinder_fit import (
     expected_angles,
     fit_distance,
 )
-from cpcbl_agents.vision.panorama import Panorama
 from cpcbl_team.config import CameraSettings, Cylinder
 
 LANDMARK = Shape.of(Cylinder(), 0.2)

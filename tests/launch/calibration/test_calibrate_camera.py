@@ -11,15 +11,18 @@ from support.board_pictures import Shot, board_pictures
 from support.processes import command_line, cpcbl_team
 
 from cpcbl_agents.vision.camera import Camera, Floats, Pixels
-from cpcbl_launch.calibration.board import (
+from cpcbl_launch.calibration.lens import (
+    DISTORTION,
+    INTRINSICS,
     Board,
     BoardCorners,
+    LensCalibration,
     Pattern,
+    calibrate_lens,
     draw_board,
     find_corners,
     parse_board,
 )
-from cpcbl_launch.calibration.lens import DISTORTION, INTRINSICS, LensCalibration, calibrate_lens
 from cpcbl_launch.calibration.pictures import (
     NamedPicture,
     picture_files,
