@@ -98,15 +98,12 @@ class CylinderDetector:
         if len(names) > 1:
             return Ambiguity("ambiguous", names, pair.outline)
         (fit,) = accepted
-        if fit.hidden is not None and not self._is_usable_part(pair, fit):
+        width = 2.0 * fit.outline.angles[WIDTH] / self._panorama.step
+        gap = pair.lower.top - pair.upper.bottom
+        if fit.hidden is not None and (width < LEAST_PART_PX or gap > GAP_PX):
             reason = "cut_by_frame" if fit.outline.cut else "wrong_shape"
             return Ambiguity(reason, names, pair.outline)
         return Detection(self._sighting(names[0], fit), fit.outline.corners)
-
-    def _is_usable_part(self, pair: Candidate, part: CylinderFit) -> bool:
-        """Whether a part is wide enough, and nothing is visible between its bands."""
-        width = 2.0 * part.outline.angles[WIDTH] / self._panorama.step
-        return width >= LEAST_PART_PX and pair.lower.top - pair.upper.bottom <= GAP_PX
 
     def _unknown_pair(self, pixels: Pixels, pair: Candidate) -> Ambiguity:
         """Rejects a pair of colours that no cylinder has: it may be a mirror image."""
@@ -143,7 +140,6 @@ class CylinderDetector:
         return all(self._colours.has_clear_colour(band, colour) for band, colour in bands)
 
     def _angular_outline(self, o: Outline) -> AngularOutline:
-        """The outline as angles."""
         panorama = self._panorama
         edge_sigma = self._settings.edge_sigma_px * panorama.step
         middle, rows = 0.5 * (o.left + o.right), (o.top, o.mid, o.foot)
@@ -172,16 +168,14 @@ class CylinderDetector:
 
     def _sighting(self, name: str, fit: CylinderFit) -> Sighting:
         """Range and bearing from the robot's centre; the bearing only if something is hidden."""
-        s, outline = self._settings, fit.outline
-        azimuth = outline.azimuth
+        s, outline, azimuth = self._settings, fit.outline, fit.outline.azimuth
         oblique = s.focal_share * math.sin(azimuth) * math.cos(azimuth)
         azimuth_sigma = math.hypot(outline.sigmas[WIDTH], oblique)
         if fit.hidden == WIDTH:  # the axis is within the radius of the middle of what is seen
             azimuth_sigma += fit.half_width
         narrow = NARROW_PX * self._panorama.step / max(2.0 * outline.angles[WIDTH], 1e-6)
-        range_sigma = fit.sigma * (1.0 + narrow * narrow)
+        range_sigma = math.hypot(fit.sigma * (1.0 + narrow * narrow), s.focal_share * fit.distance)
         bearing = self._panorama.bearing(azimuth)
-        range_sigma = math.hypot(range_sigma, s.focal_share * fit.distance)
         from_lens = PolarPosition(fit.distance, bearing, range_sigma, azimuth_sigma)
         seen = from_robot_centre((s.x_m, s.y_m), from_lens)
         bearing_sigma = math.hypot(seen.bearing_sigma, math.radians(s.yaw_sigma_deg))

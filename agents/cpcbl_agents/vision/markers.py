@@ -76,7 +76,10 @@ class MarkerReader:
         self._signs = np.array([np.rot90(p, turn).ravel() for p in patterns for turn in range(4)])
         self._most_wrong = int(WRONG_SHARE * self.dictionary.maxCorrectionBits)
         self._sample_points = _sample_points(self.cells)
-        self._ring_numbers = _ring_numbers(self.cells)
+        along = np.arange(self.cells + 2)
+        from_side = np.minimum(along, along[::-1])
+        self._ring_numbers = np.minimum(from_side[:, None], from_side).ravel()
+        """The distance of each cell from the outside, including the ring around the marker."""
 
     def read(self, grey: Pixels, quads: Floats) -> dict[int, MarkerCode]:
         """What the quads (m, 4, 2) show, clockwise in the picture: by index, of those that are
@@ -121,13 +124,6 @@ def _project_to_quads(points: Floats, quads: Floats) -> Floats:
 
 def _cross(a: Floats, b: Floats) -> Floats:
     return np.asarray(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
-
-
-def _ring_numbers(cells: int) -> NDArray[np.int64]:
-    """The distance of each cell from the outside, including the ring around the marker."""
-    along = np.arange(cells + 2)
-    from_side = np.minimum(along, along[::-1])
-    return np.minimum(from_side[:, None], from_side).ravel()
 
 
 def side_edge_points(grey: Pixels, quads: Floats, cells: int) -> Floats:
@@ -201,7 +197,11 @@ class MarkerDetector:
             for side, number in settings.markers.items():
                 self._mounts[number].append(MarkerMount(name, side))
         self._codes = MarkerReader(team.vision.family)
-        self._detector = cv2.aruco.ArucoDetector(self._codes.dictionary, _detector_parameters())
+        chosen = cv2.aruco.DetectorParameters()  # finds outlines fast, small ones too
+        chosen.adaptiveThreshWinSizeMin = chosen.adaptiveThreshWinSizeMax = WINDOW_PX
+        chosen.polygonalApproxAccuracyRate = 0.08
+        chosen.minMarkerDistanceRate = 0.05
+        self._detector = cv2.aruco.ArucoDetector(self._codes.dictionary, chosen)
 
     def detections(self, pixels: Pixels) -> Detections:
         """The teammates whose markers are in a picture, and the markers that identify none."""
@@ -255,7 +255,8 @@ class MarkerDetector:
 
     def _locate(self, name: str, sides: Mapping[Side, DetectedMarker]) -> Detections:
         """The pose of a teammate from its detected markers."""
-        outline = _hull(sides.values())
+        corners = np.concatenate([mark.outline for mark in sides.values()]).astype(np.float32)
+        outline = cv2.convexHull(corners).reshape(-1, 2).astype(np.float64)
         fit = self._fit(sides)
         if fit.misfit > MOST_MISFIT:
             alone = [self._fit({side: mark}).misfit for side, mark in sides.items()]
@@ -321,15 +322,6 @@ def sighting(name: str, fit: PoseFit) -> Sighting:
     return Sighting(name, range_m, bearing, range_sigma, bearing_sigma, heading, heading_sigma)
 
 
-def _detector_parameters() -> cv2.aruco.DetectorParameters:
-    """Parameters for finding outlines fast, small ones too; `codes` reads the bits."""
-    chosen = cv2.aruco.DetectorParameters()
-    chosen.adaptiveThreshWinSizeMin = chosen.adaptiveThreshWinSizeMax = WINDOW_PX
-    chosen.polygonalApproxAccuracyRate = 0.08
-    chosen.minMarkerDistanceRate = 0.05
-    return chosen
-
-
 def _shortest_sides(quads: Floats) -> Floats:
     return np.asarray(np.linalg.norm(quads[:, _NEXT] - quads, axis=2).min(axis=1))
 
@@ -338,9 +330,3 @@ def _is_same_outline(one: DetectedMarker, other: DetectedMarker) -> bool:
     """Whether both are the same outline, detected twice."""
     apart = np.linalg.norm(one.outline.mean(axis=0) - other.outline.mean(axis=0))
     return bool(apart < 0.5 * _shortest_sides(one.outline[None])[0])
-
-
-def _hull(markers: Iterable[DetectedMarker]) -> Floats:
-    """The outline of all markers together, (n, 2) pixels."""
-    points = np.concatenate([mark.outline for mark in markers]).astype(np.float32)
-    return cv2.convexHull(points).reshape(-1, 2).astype(np.float64)

@@ -198,10 +198,9 @@ def possible_outlines(patch: Patch, panorama: Panorama, candidate: Candidate) ->
         return []
     top, foot = _top_and_foot(rows, upper.top, mid, lower.bottom)
     inset = INSET * min(mid - upper.top, lower.bottom - mid)
-    found = _possible_sides(
-        _sides(patch.horizontal_profile(upper.top + inset, mid - inset), upper),
-        _sides(patch.horizontal_profile(mid + inset, lower.bottom - inset), lower),
-    )
+    upper_columns = patch.horizontal_profile(upper.top + inset, mid - inset)
+    lower_columns = patch.horizontal_profile(mid + inset, lower.bottom - inset)
+    found = _possible_sides(_sides(upper_columns, upper), _sides(lower_columns, lower))
     missing = {TOP: math.isnan(top), FOOT: math.isnan(foot), WIDTH: not found}
     hidden = frozenset(part for part, is_missing in missing.items() if is_missing)
     found = found or [(min(upper.left, lower.left), max(upper.right, lower.right))]

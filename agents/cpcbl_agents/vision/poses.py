@@ -41,8 +41,6 @@ information matrix is the covariance. Beyond it, the covariance is computed over
 HEADINGS = 31
 MOST_SIGMA = math.radians(20.0)
 
-_DIAGONAL = np.eye(3)
-
 
 class PoseFit(NamedTuple):
     """`viewer_from_mate`, its covariance (3, 3; m, rad), and the mean squared error in sigmas."""
@@ -169,7 +167,7 @@ def _refine(poses: Floats, view: _Reprojection) -> tuple[Floats, Floats]:
     (k, 4, 4)."""
     normal_equations, damping = view.normal_equations(poses), np.full(len(poses), 1e-3)
     for _ in range(STEPS):
-        damped = normal_equations[:, :3, :3] * (1.0 + damping[:, None, None] * _DIAGONAL)
+        damped = normal_equations[:, :3, :3] * (1.0 + damping[:, None, None] * np.eye(3))
         slope = normal_equations[:, :3, 3]
         step = np.linalg.solve(damped, slope[..., None])[..., 0]
         if (step * slope).sum(axis=1).max() < SMALL:

@@ -257,14 +257,11 @@ def _find_board(
         return corners
     height, width = picture.pixels.shape[:2]
     view = _BoardView(picture.name, corners, (width, height))
-    same = next((other for other in earlier if _is_repeat(view, other)), None)
-    return f"the board is at the same place as in {same.picture}" if same else view
-
-
-def _is_repeat(one: _BoardView, two: _BoardView) -> bool:
-    a, b = one.corners, two.corners
-    same = one.size_px == two.size_px and np.array_equal(a.board_points, b.board_points)
-    return same and float(np.abs(a.pixels - b.pixels).mean()) < MOVED_PX
+    for name, (board_points, pixels), size_px in earlier:
+        same = size_px == view.size_px and np.array_equal(board_points, corners.board_points)
+        if same and np.abs(pixels - corners.pixels).mean() < MOVED_PX:
+            return f"the board is at the same place as in {name}"
+    return view
 
 
 def _require_enough_views(views: Sequence[_BoardView], rejected: Sequence[PictureResult]) -> None:

@@ -141,15 +141,23 @@ def calibrated_team(
 
 
 def _add_type(document: TOMLDocument, robot: str, found: RobotCalibration) -> None:
-    own: Any = document["robots"][robot]
+    """Raises InputError if another robot has a type with the name of this robot's new type."""
+    robots: Any = document["robots"]
+    own = robots[robot]
+    type_name = f"robot-{robot}" if len(robot) < 26 else robot
+    for other, settings in robots.items():
+        if other != robot and settings.get("type") == type_name:
+            raise InputError(
+                f"robots.{other}.type: {type_name}: robot {robot} gets a type of that name; rename"
+                " the present one"
+            )
     types: Any = document.setdefault("types", tomlkit.table(is_super_table=True))
     former = dict(types.get(own.get("type", ""), {}))
-    type_name = _type_name(document, robot)
     table = tomlkit.table()
     calibrated = {"odometry": found.odometry, "sensor": found.sensor}
     companions = _companion_settings(found)
-    for part, settings in companions.items():
-        former[part] = {**former.get(part, {}), **settings}
+    for part, added in companions.items():
+        former[part] = {**former.get(part, {}), **added}
     for key, value in former.items():
         if key not in calibrated:
             table.add(key, value)
@@ -162,19 +170,6 @@ def _add_type(document: TOMLDocument, robot: str, found: RobotCalibration) -> No
             own.get(part, {}).pop(key, None)
     types[type_name] = table
     own["type"] = type_name
-
-
-def _type_name(document: TOMLDocument, robot: str) -> str:
-    """The name of a robot's new type. Raises InputError if another robot has a type so named."""
-    type_name = f"robot-{robot}" if len(robot) < 26 else robot
-    robots: Any = document["robots"]
-    for other, own in robots.items():
-        if other != robot and own.get("type") == type_name:
-            raise InputError(
-                f"robots.{other}.type: {type_name}: robot {robot} gets a type of that name; rename"
-                " the present one"
-            )
-    return type_name
 
 
 def _companion_settings(found: RobotCalibration) -> dict[str, dict[str, bool | float]]:
