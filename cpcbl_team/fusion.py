@@ -66,10 +66,8 @@ class Observation(NamedTuple):
 
 
 def _noise(xx: float, xy: float, yy: float) -> tuple[float, float, float]:
-    """(xx, xy, yy) no sharper than evidence may be along any axis.
-
-    Otherwise rounding could make a part of the evidence exceed the whole.
-    """
+    """(xx, xy, yy) no sharper than evidence may be along any axis. Otherwise rounding could make a
+    part of the evidence exceed the whole."""
     xx = max(xx + SMALLEST_VARIANCE, SHARPEST_VARIANCE)
     return xx, xy, max(yy + SMALLEST_VARIANCE, xy * xy / xx + SHARPEST_VARIANCE)
 
@@ -130,9 +128,7 @@ def merge_split(prior: Estimate, observation: Observation, scope: Scope = POSE) 
 
 def best_weight(objective: Callable[[float], float]) -> tuple[float, float]:
     """The weight of covariance intersection with the smallest value of `objective`, and that value.
-
-    Six steps of golden section; the weight is between 0.02 and 0.98.
-    """
+    Six steps of golden section; the weight is between 0.02 and 0.98."""
     low, high = 0.02, 0.98
     left, right = high - _GOLDEN * (high - low), low + _GOLDEN * (high - low)
     best_left, best_right = objective(left), objective(right)
@@ -173,10 +169,8 @@ def _variance(prior: Estimate, observation: Observation, scope: Scope) -> Callab
 
 
 def _determinant(prior: Estimate, observation: Observation) -> Callable[[float], float]:
-    """The determinant of the merged covariance, by the weight.
-
-    det (P1^-1 + H^T R^-1 H)^-1 = det P1 det R / det (R + H P1 H^T), the matrix determinant lemma.
-    """
+    """The determinant of the merged covariance, by the weight. det (P1^-1 + H^T R^-1 H)^-1 = det P1
+    det R / det (R + H P1 H^T), the matrix determinant lemma."""
     # P1 = P + k P_d, so H P1 H^T = H P H^T + k H P_d H^T. Plain floats, because this runs often.
     p, d, alone = prior.covariance, prior.shared, len(observation.rows) == 1
     (pxx, pxy, pyy, pxh, pyh, phh), (dxx, dxy, dyy, dxh, dyh, dhh) = p, d

@@ -72,11 +72,8 @@ def width_per_m(bearing_sigma: float) -> float:
 def sighting_gaussian(
     range_m: float, bearing: float, range_sigma_m: float, bearing_sigma: float
 ) -> Gaussian2:
-    """A sighting as a Gaussian in the robot's frame, the major axis along the line of sight.
-
-    x = r cos a, y = r sin a (equation 1); sigma_maj = sigma_r, sigma_min = r sin sigma_a (equation
-    2).
-    """
+    """A sighting as a Gaussian in the robot's frame, the major axis along the line of sight. x = r
+    cos a, y = r sin a (equation 1); sigma_maj = sigma_r, sigma_min = r sin sigma_a (equation 2)."""
     across_m = range_m * width_per_m(bearing_sigma)
     return Gaussian2(
         range_m * math.cos(bearing),

@@ -53,10 +53,8 @@ def sigma_limits_m(tier: int, settings: CollaborationSettings) -> tuple[float, f
 def predicted_teammate_covariance(
     tier: int, last_fix: FixMemory | None, x_m: float, y_m: float, settings: CollaborationSettings
 ) -> Covariance2:
-    """The predicted position covariance (m^2) of a teammate at (x, y).
-
-    It is that after the last fix plus the drift since then, within the limits of its tier.
-    """
+    """The predicted position covariance (m^2) of a teammate at (x, y). It is that after the last
+    fix plus the drift since then, within the limits of its tier."""
     least, most = sigma_limits_m(tier, settings)
     if last_fix is None:
         variance = (most if tier == LOWEST_TIER else math.sqrt(max(least, 0.5 * most) * most)) ** 2
@@ -137,10 +135,8 @@ def _determinant(
 
 
 def information_gain(prior: Covariance2, after: Covariance2) -> float:
-    """The information gain (nats) from `prior` to `after`.
-
-    Nothing is gained below `SMALLEST_VARIANCE`.
-    """
+    """The information gain (nats) from `prior` to `after`. Nothing is gained below
+    `SMALLEST_VARIANCE`."""
     left = max(after.determinant(), SMALLEST_VARIANCE**2)
     return 0.5 * math.log(_regularized(prior).determinant() / left)
 

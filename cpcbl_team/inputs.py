@@ -61,9 +61,7 @@ class Sightings(msgspec.Struct, frozen=True, array_like=True, tag="sightings"):
 
 class Position(msgspec.Struct, frozen=True, array_like=True, tag="position"):
     """The position of the robot in the field's frame by its own position sensor (such as GPS).
-
-    `covariance` is xx, xy, yy in m^2.
-    """
+    `covariance` is xx, xy, yy in m^2."""
 
     stamp_ns: int
     x_m: float

@@ -97,10 +97,8 @@ class Landmarks:
         cooling_down: frozenset[str],
         recorded: frozenset[str],
     ) -> LandmarkUpdate:
-        """What the landmarks among `sightings` say about position or heading, or about both.
-
-        An object that is `cooling_down` is not plain; one of `recorded` is no new evidence.
-        """
+        """What the landmarks among `sightings` say about position or heading, or about both. An
+        object that is `cooling_down` is not plain; one of `recorded` is no new evidence."""
         update = LandmarkUpdate(state)
         uses_range = scope is not None and scope is not HEADING
         uses_bearing = scope is not None and (scope is not POSITION or self._uses_rays)

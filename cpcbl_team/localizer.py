@@ -280,10 +280,8 @@ class Localizer:
     # Teammates and the position sensor --------------------------------------------------------
 
     def add_fix(self, state: State, fix: Fix) -> State:
-        """Active collaboration: a teammate observes this robot's position, perhaps its heading.
-
-        The heading is merged as evidence of its own, after the position.
-        """
+        """Active collaboration: a teammate observes this robot's position, perhaps its heading. The
+        heading is merged as evidence of its own, after the position."""
         return self._observe_pose(state, fix.stamp_ns, from_fix(fix))
 
     def add_position(self, state: State, position: Position) -> State:

@@ -138,9 +138,7 @@ def recently_recorded(memory: RecoveryMemory, now_ns: int) -> frozenset[str]:
 
 def with_innovations(window: int, accepted: int, rejected: int, length: int) -> int:
     """The window of innovations after these more: the last `length`, the latest in the lowest bit.
-
-    A bit each, set for an accepted one, after a leading bit that is always set: 1 is empty.
-    """
+    A bit each, set for an accepted one, after a leading bit that is always set: 1 is empty."""
     window = ((window + 1 << accepted) - 1) << rejected
     full = 1 << length
     return window if window < full else full | window & full - 1
@@ -183,10 +181,8 @@ def lost_reason(estimate: Estimate, innovations: int, limits: Limits) -> str:
 
 
 def inflate_covariance(estimate: Estimate, settings: LocalizerSettings) -> Estimate:
-    """For a robot that rejects what it measures: its sigmas double, so that its gates open.
-
-    They become 0.1 m and 0.1 rad at least, and the limits of being lost at most.
-    """
+    """For a robot that rejects what it measures: its sigmas double, so that its gates open. They
+    become 0.1 m and 0.1 rad at least, and the limits of being lost at most."""
     c = estimate.covariance
     position = 0.5 * (c.xx + c.yy)
     position_goal = min(max(4.0 * position, 0.01), settings.lost_position_sigma_m**2)

@@ -73,10 +73,8 @@ class Timeline:
         return self._state_before(len(self._inputs))
 
     def add(self, item: Input) -> TimelineRefusal | None:
-        """Inserts an input at its time; the reason if it cannot be used.
-
-        The states after it are computed when they are asked for: often several inputs arrive late.
-        """
+        """Inserts an input at its time; the reason if it cannot be used. The states after it are
+        computed when they are asked for: often several inputs arrive late."""
         key, keys, states = _key(item), self._keys, self._states
         is_beyond_horizon = bool(keys) and key[0] < keys[-1][0] - self._horizon_ns
         if is_beyond_horizon or _measured_ns(item) < self._start_ns:
@@ -112,10 +110,8 @@ class Timeline:
             states.append(state)
 
     def latest(self, now_ns: int) -> State:
-        """The state at `now_ns`, or at the end of the known odometry if that is earlier.
-
-        If odometry has been missing for longer than its timeout, it is the state at `now_ns`.
-        """
+        """The state at `now_ns`, or at the end of the known odometry if that is earlier. If
+        odometry has been missing for longer than its timeout, it is the state at `now_ns`."""
         s, odometry_ns = self._localizer.settings.odometry, self.state.odometry_until_ns
         silent = not s.moves or now_ns - odometry_ns > s.timeout_s * 1e9
         return self.at(now_ns if silent else min(now_ns, odometry_ns)) or self.state

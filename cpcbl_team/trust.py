@@ -82,9 +82,7 @@ def assess(
     senders: SenderRecords, name: str, report: TeammateReport, used_ns: int, rules: TrustSettings
 ) -> TrustDecision:
     """The records after a report of the sender `name`, and whether the report may be used.
-
-    `used_ns`: when a report of this sender was last used.
-    """
+    `used_ns`: when a report of this sender was last used."""
     record = with_report(senders.get(name, SenderRecord()), report, rules.limit)
     senders = {**senders, name: record}
     if record.reason:

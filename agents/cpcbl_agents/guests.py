@@ -13,10 +13,8 @@ MAX_REMEMBERED = 64  # names that found no place, and names that were looked up 
 
 
 class GuestRegistry:
-    """The guests and candidates of one robot: at most `most` of both together.
-
-    `known`: names of the map and of the team file, which are never guests.
-    """
+    """The guests and candidates of one robot: at most `most` of both together. `known`: names of
+    the map and of the team file, which are never guests."""
 
     def __init__(self, known: Collection[str] = (), most: int = 0) -> None:
         self._known, self._most = known, most

@@ -21,9 +21,7 @@ MessageT = TypeVar("MessageT", bound=Message)
 
 def decode(key: str, payload: bytes, now_ns: int | None = None) -> Message | Refusal:
     """The message in a payload under this key, with plausible numbers; or why there is none.
-
-    `now_ns`: a message from the future of it is refused; None for a reader without a clock.
-    """
+    `now_ns`: a message from the future of it is refused; None for a reader without a clock."""
     message = decode_by_key(key, payload)
     if isinstance(message, Refusal):
         return message

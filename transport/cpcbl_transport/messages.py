@@ -49,11 +49,8 @@ class AnnotatedFrame(msgspec.Struct, frozen=True, array_like=True, tag="look"):
 
 
 class Flow(msgspec.Struct, frozen=True, array_like=True):
-    """The messages of one topic from or for one teammate, since the process started.
-
-    `topic` is fix, belief or alive; `peer` is the teammate, empty for beliefs, which go to all
-    subscribers.
-    """
+    """The messages of one topic from or for one teammate, since the process started. `topic` is
+    fix, belief or alive; `peer` is the teammate, empty for beliefs, which go to all subscribers."""
 
     topic: str
     peer: str

@@ -198,10 +198,8 @@ def access_rules(team: Team, members: Iterable[Member]) -> dict[str, Any]:
 
 
 def publish_keys(identity: Identity, carrying: bool | None = None) -> list[str]:
-    """The keys under which a member may publish, below the namespace.
-
-    `carrying`: only those of messages, or only those of tokens; None: both.
-    """
+    """The keys under which a member may publish, below the namespace. `carrying`: only those of
+    messages, or only those of tokens; None: both."""
     return [
         key
         for topic in topics.TOPICS

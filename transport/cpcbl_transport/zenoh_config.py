@@ -87,9 +87,7 @@ def router_config(
 
 def guard_rules(team: Team, speed: float = 1.0) -> dict[str, Any]:
     """The top-level keys of the router's configuration; none when the team wants no guards.
-
-    `speed`: robot time over real time; in a run that is faster, robots may send more often.
-    """
+    `speed`: robot time over real time; in a run that is faster, robots may send more often."""
     guards = team.transport.guards
     if not guards.enabled:
         return {}
