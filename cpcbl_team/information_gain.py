@@ -9,12 +9,12 @@ It predicts it from the tier that the receiver announces and from the last fix t
 import math
 from typing import NamedTuple
 
-from cpcbl_team.beliefs import extrapolated
 from cpcbl_team.config import CollaborationSettings, Fusion
 from cpcbl_team.estimate import SMALLEST_VARIANCE, Covariance3, Estimate
 from cpcbl_team.fusion import best_weight
 from cpcbl_team.gaussian import Covariance2
 from cpcbl_team.inputs import Belief, Fix
+from cpcbl_team.measurements import extrapolated
 from cpcbl_team.tiers import LOWEST_TIER, TIER_ZERO_SIGMA_M
 
 LOST_SIGMA_M = 2.0
@@ -166,10 +166,9 @@ def information_gain_of_belief(
     position = information_gain(prior, merged_covariance(prior, sensor, teammate, settings.fusion))
     dx, dy = fix.x_m - estimate.pose.x, fix.y_m - estimate.pose.y
     direction = math.atan2(dy, dx)
-    across = _regularized(sensor + teammate + prior).along(
-        -math.sin(direction), math.cos(direction)
-    )
-    heading = 0.5 * math.log1p(estimate.covariance.hh * (dx * dx + dy * dy) / across)
+    across = -math.sin(direction), math.cos(direction)
+    variance = _regularized(sensor + teammate + prior).along(*across)
+    heading = 0.5 * math.log1p(estimate.covariance.hh * (dx * dx + dy * dy) / variance)
     return max(position, heading)
 
 
@@ -183,10 +182,8 @@ def staleness(copy: Belief | None, now: Belief) -> float:
         return math.inf
     pose = extrapolated(copy, now.stamp_ns)
     before, after = (
-        Covariance3(*copy.covariance).position(),
-        Covariance3(*now.covariance).position(),
+        _regularized(Covariance3(*belief.covariance).position()) for belief in (copy, now)
     )
-    before, after = _regularized(before), _regularized(after)
     off = math.sqrt(after.mahalanobis_squared(now.x_m - pose.x, now.y_m - pose.y))
     ratio = 0.5 * math.log(after.determinant() / before.determinant())
     return max(off, abs(ratio))

@@ -7,14 +7,15 @@ import math
 from collections.abc import Iterable
 from typing import Final
 
-from cpcbl_team.beliefs import BELIEF_VALID_BEFORE_NS
 from cpcbl_team.config import Field, LocalizationSettings
 from cpcbl_team.estimate import HEADING, POSE, POSITION, Covariance3, Estimate, Scope
+from cpcbl_team.fixes import PoseObservation, from_fix, from_position_sensor
 from cpcbl_team.fusion import chi_square_bounds, mark_shared
 from cpcbl_team.geometry import Pose2, new, step, wrap_angle
 from cpcbl_team.inputs import Belief, BeliefShared, Fix, Odometry, Position, Sighting, Sightings
 from cpcbl_team.landmarks import Landmarks, LandmarkUpdate
 from cpcbl_team.measurements import (
+    BELIEF_VALID_BEFORE_NS,
     GatedObject,
     GatedObjects,
     Measurement,
@@ -25,7 +26,6 @@ from cpcbl_team.measurements import (
 )
 from cpcbl_team.motion import inflate_by_gap, part_of_piece
 from cpcbl_team.object_timers import ObjectTimers, has_passed
-from cpcbl_team.pose_observation import PoseObservation, from_fix, from_position_sensor
 from cpcbl_team.recovery import (
     Recovery,
     evidence_from_observation,

@@ -11,9 +11,9 @@ from typing import Final, NamedTuple, TypeVar
 
 from cpcbl_team.config import Field, LocalizerSettings
 from cpcbl_team.estimate import Covariance3, Estimate
+from cpcbl_team.fixes import PoseObservation
 from cpcbl_team.landmarks import Landmarks
 from cpcbl_team.measurements import Measurement
-from cpcbl_team.pose_observation import PoseObservation
 from cpcbl_team.relocalization import relocalize
 from cpcbl_team.state import (
     FIX,

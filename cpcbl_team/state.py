@@ -14,7 +14,7 @@ from cpcbl_team.estimate import HEADING, POSE, POSITION, Estimate, Scope
 from cpcbl_team.geometry import Pose2, new
 from cpcbl_team.inputs import Belief, Odometry, Sighting
 from cpcbl_team.self_calibration import ReferencePoses, SelfCalibration
-from cpcbl_team.sender_record import SenderRecord
+from cpcbl_team.trust import SenderRecord
 
 FIX = "fix:"  # marks the source of an active fix, apart from a sighting of that teammate
 _NONE: Mapping[str, Any] = MappingProxyType({})

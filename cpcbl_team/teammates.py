@@ -8,16 +8,15 @@ before, the covariance is inflated.
 from collections.abc import Iterable
 
 from cpcbl_team import trust
-from cpcbl_team.beliefs import nearest_belief
 from cpcbl_team.config import LocalizationSettings
+from cpcbl_team.fixes import PoseObservation
 from cpcbl_team.fusion import Observation
 from cpcbl_team.inputs import Belief, Input, Position, Sightings
 from cpcbl_team.landmarks import LandmarkUpdate
-from cpcbl_team.measurements import GatedObject, GatedObjects
-from cpcbl_team.pose_observation import PoseObservation
+from cpcbl_team.measurements import GatedObject, GatedObjects, nearest_belief
 from cpcbl_team.recovery import inflate_by_offset, without_senders
-from cpcbl_team.sender_record import NEVER_NS, ReportedPosition, TeammateReport
 from cpcbl_team.state import State, with_memory
+from cpcbl_team.trust import NEVER_NS, ReportedPosition, TeammateReport
 
 
 class TeammateScreen:

@@ -10,15 +10,7 @@ from typing import NamedTuple
 
 from msgspec.structs import replace
 
-from cpcbl_agents.agent import (
-    AgentMessage,
-    BeliefSubscribers,
-    FrameEstimate,
-    HelpSent,
-    PoseEstimate,
-    Presence,
-    UnknownRobot,
-)
+from cpcbl_agents import agent
 from cpcbl_agents.guests import GuestRegistry
 from cpcbl_team import information_gain as gains
 from cpcbl_team.config import LocalizationSettings
@@ -115,7 +107,7 @@ class CollaborationAgent:
         self._has_subscribers = False
         self.counters = MessageCounters()
         self.tier = LOWEST_TIER
-        self.latest: PoseEstimate | None = None
+        self.latest: agent.PoseEstimate | None = None
         self.neighbours: frozenset[str] = frozenset()
         self.sources: frozenset[tuple[str, int]] = frozenset()
 
@@ -129,26 +121,26 @@ class CollaborationAgent:
         """Whether the time has come at which collaboration starts."""
         return self.latest is not None and self.latest.stamp_ns >= self._from_ns
 
-    def handle(self, message: AgentMessage, now_ns: int) -> Sequence[AgentMessage]:
+    def handle(self, message: agent.AgentMessage, now_ns: int) -> Sequence[agent.AgentMessage]:
         match message:
-            case PoseEstimate() if message.stamp_ns > self._track_ns:
+            case agent.PoseEstimate() if message.stamp_ns > self._track_ns:
                 return self._handle_estimate(message, now_ns)
-            case FrameEstimate():
+            case agent.FrameEstimate():
                 return self._fixes(message, now_ns)
-            case Presence(name, tier):
+            case agent.Presence(name, tier):
                 self.guests.set_presence(name, tier is not None)
                 self._tiers.pop(name, None)
                 if tier is not None and (name in self._teammates or name in self.guests):
                     self._tiers[name] = tier
-            case UnknownRobot(name):
+            case agent.UnknownRobot(name):
                 self.guests.notice(name, now_ns)
-            case BeliefSubscribers():
+            case agent.BeliefSubscribers():
                 self._has_subscribers, self._last_belief = message.present, None
-            case HelpSent():
+            case agent.HelpSent():
                 self._record_sent(message, now_ns)
         return ()
 
-    def _handle_estimate(self, now: PoseEstimate, now_ns: int) -> Sequence[AgentMessage]:
+    def _handle_estimate(self, now: agent.PoseEstimate, now_ns: int) -> list[Track | Belief]:
         sigma, present = now.estimate.position_sigma_m, None if self.latest is None else self.tier
         self.latest, self._track_ns = now, now.stamp_ns
         self.tier = next_tier(present, sigma, bool(now.lost), self._rules)
@@ -157,7 +149,7 @@ class CollaborationAgent:
 
     # Whose beliefs to use ----------------------------------------------------------------------
 
-    def _select_sources(self, now: PoseEstimate) -> None:
+    def _select_sources(self, now: agent.PoseEstimate) -> None:
         """Selects the teammates whose tiers are watched, and those whose beliefs are useful."""
         forgotten_ns = now.stamp_ns - NEIGHBOUR_NS
         self.guests.forget(now.stamp_ns)
@@ -175,7 +167,7 @@ class CollaborationAgent:
                 if name in self._tiers and self._is_useful(fix, self._tiers[name], now)
             )
 
-    def _is_useful(self, seen: Fix, tier: int, now: PoseEstimate) -> bool:
+    def _is_useful(self, seen: Fix, tier: int, now: agent.PoseEstimate) -> bool:
         rules, in_sight = self._rules, now.stamp_ns - seen.stamp_ns < IN_SIGHT_NS
         if not (in_sight and accepts_tier(self.tier, tier, rules)):
             return False
@@ -184,10 +176,15 @@ class CollaborationAgent:
 
     # Fixes --------------------------------------------------------------------------------
 
-    def _fixes(self, seen: FrameEstimate, now_ns: int) -> list[Fix]:
+    def _fixes(self, seen: agent.FrameEstimate, now_ns: int) -> list[Fix]:
         """The fixes of a frame that are worth sending, the one with the largest gain first."""
-        offers = []
-        for fix in self._candidates(seen):
+        offers, stamp_ns, sensor = [], seen.frame.stamp_ns, self._settings.sensor
+        for s in seen.frame.sightings:
+            if s.id not in self._teammates and not self.guests.notice(s.id, stamp_ns):
+                continue
+            fix = fix_for(s.id, self._robot, stamp_ns, seen.estimate, s, sensor)
+            if fix is None:
+                continue
             self._latest_fixes[fix.robot] = fix
             tier = self._tiers.get(fix.robot)
             if tier is None or seen.lost or not self._may_help(fix, tier):
@@ -206,16 +203,6 @@ class CollaborationAgent:
             else:
                 self.counters.of("fix", fix.robot).over_budget += 1
         return sent
-
-    def _candidates(self, seen: FrameEstimate) -> list[Fix]:
-        """The fix of each teammate, or possible guest, in a frame."""
-        stamp_ns, sensor = seen.frame.stamp_ns, self._settings.sensor
-        fixes = (
-            fix_for(s.id, self._robot, stamp_ns, seen.estimate, s, sensor)
-            for s in seen.frame.sightings
-            if s.id in self._teammates or self.guests.notice(s.id, stamp_ns)
-        )
-        return [fix for fix in fixes if fix is not None]
 
     def _may_help(self, fix: Fix, tier: int) -> bool:
         rules, interval_ns = self._rules, max(1, self._rules.fix_interval_s * 1e9)
@@ -245,7 +232,7 @@ class CollaborationAgent:
 
     # Beliefs -------------------------------------------------------------------------------
 
-    def _beliefs(self, now: PoseEstimate, now_ns: int) -> list[Belief]:
+    def _beliefs(self, now: agent.PoseEstimate, now_ns: int) -> list[Belief]:
         """The belief, when it is due, has subscribers, and differs enough from the last one."""
         rules, tally = self._rules, self.counters.of("belief", "")
         due = now.stamp_ns >= self._belief_ns + int(1e9 / rules.belief_rate_hz)
@@ -254,10 +241,8 @@ class CollaborationAgent:
             return []
         self._belief_ns = now.stamp_ns
         (pose, covariance, _), rates = now.estimate, (now.speed_m_s, now.turn_rate_rad_s)
-        belief, last = (
-            Belief(self._robot, now.stamp_ns, *pose, covariance, *rates),
-            self._last_belief,
-        )
+        belief = Belief(self._robot, now.stamp_ns, *pose, covariance, *rates)
+        last = self._last_belief
         stale, silence_ns = gains.staleness(last, belief), rules.belief_silence_s * 1e9
         is_recent = last is not None and now.stamp_ns - last.stamp_ns < silence_ns
         if is_recent and stale < rules.belief_share:
@@ -284,7 +269,7 @@ class CollaborationAgent:
             budget.refuse(now_ns, least)
         return admitted
 
-    def _record_sent(self, sent: HelpSent, now_ns: int) -> None:
+    def _record_sent(self, sent: agent.HelpSent, now_ns: int) -> None:
         message = sent.message
         topic, to = ("fix", message.robot) if isinstance(message, Fix) else ("belief", "")
         if sent.size:
@@ -297,7 +282,7 @@ class CollaborationAgent:
         else:
             self._last_belief = None
 
-    def _track(self, now: PoseEstimate) -> Track:
+    def _track(self, now: agent.PoseEstimate) -> Track:
         pose, covariance, _ = now.estimate
         known = None if self._settings.localizer.variant == "weighted" else covariance
         return Track(self._robot, now.stamp_ns, *pose, known, self.tier, now.lost)

@@ -5,14 +5,8 @@ from collections import Counter, deque
 from collections.abc import Callable, Iterable
 from typing import Protocol
 
-from cpcbl_agents.agent import (
-    BeliefSubscribers,
-    FrameSubscribers,
-    HelpSent,
-    Presence,
-    Tick,
-    UnknownRobot,
-)
+from cpcbl_agents import agent
+from cpcbl_agents.agent import BeliefSubscribers, FrameSubscribers
 from cpcbl_agents.clocks import ClockMonitor
 from cpcbl_agents.collaboration import MessageCounters
 from cpcbl_agents.declarations import Declarations, LivelinessTokens
@@ -20,22 +14,11 @@ from cpcbl_agents.robot import Robot, build_robot
 from cpcbl_agents.sources import OwnCamera
 from cpcbl_team.config import Team
 from cpcbl_team.inputs import Belief, Fix
-from cpcbl_transport import topics
+from cpcbl_transport import messages, topics
 from cpcbl_transport.bus import Bus
 from cpcbl_transport.compact import encode_help, received_bytes, sent_bytes
 from cpcbl_transport.decoding import decode_by_key
-from cpcbl_transport.messages import (
-    LARGEST_PAYLOAD,
-    Help,
-    Join,
-    Message,
-    Outgoing,
-    Refusal,
-    Status,
-    encode,
-    refusal,
-)
-from cpcbl_transport.robot_model import SimulatedRobotModel, model_from_settings
+from cpcbl_transport.messages import Help, Message, Outgoing, Refusal, Status, refusal
 from cpcbl_transport.topics import Topic, topic_of
 
 log = logging.getLogger(__name__)
@@ -109,8 +92,8 @@ class Node:
         else:
             if len(self._inbox) == INBOX:
                 self.counts["inbox_overflow"] += 1
-            kept = payload[: LARGEST_PAYLOAD + 1]  # enough to refuse it; it may be a large frame
-            self._inbox.append((key, kept))
+            # Enough to refuse it: it may be a large frame
+            self._inbox.append((key, payload[: messages.LARGEST_PAYLOAD + 1]))
         self._on_arrival()
 
     def _on_token(self, key: str, alive: bool) -> None:
@@ -145,10 +128,10 @@ class Node:
             self._check_subscribers(topics.BELIEF, BeliefSubscribers, now_ns)
         if self.robot.sensing.has_detector:
             self._check_subscribers(topics.LOOK, FrameSubscribers, now_ns)
-        outgoing = self.robot.handle(Tick(), now_ns)
+        outgoing = self.robot.handle(agent.Tick(), now_ns)
         for name in self._declarations.update(self.robot.collaboration.interests):
             self._tokens.forget(name)
-            self.robot.handle(Presence(name, None), now_ns)
+            self.robot.handle(agent.Presence(name, None), now_ns)
         self._send(outgoing, now_ns)  # under the tier that these messages belong to
         if now_ns - self._status_ns >= STATUS_NS and self._declarations.tier is not None:
             self._status_ns = now_ns
@@ -177,7 +160,7 @@ class Node:
                 return message
             case Belief(robot=sender) | Fix(observer=sender):
                 if sender not in self._team and not self.robot.is_guest(sender):
-                    self.robot.handle(UnknownRobot(sender), now_ns)
+                    self.robot.handle(agent.UnknownRobot(sender), now_ns)
                     return Refusal.UNKNOWN_ROBOT
                 if sender == self._name:
                     return Refusal.OWN
@@ -195,7 +178,7 @@ class Node:
                 continue
             name, tier = presence
             was_guest = self.robot.is_guest(name)
-            self.robot.handle(Presence(name, tier), now_ns)
+            self.robot.handle(agent.Presence(name, tier), now_ns)
             if was_guest is not self.robot.is_guest(name):
                 log.info("%s: guest %s %s", self._name, name, "left" if was_guest else "joined")
 
@@ -213,7 +196,7 @@ class Node:
         for message in outgoing:
             size = self._publish(message)
             if isinstance(message, Help):
-                self.robot.handle(HelpSent(message, sent_bytes(size) if size else 0), now_ns)
+                self.robot.handle(agent.HelpSent(message, sent_bytes(size) if size else 0), now_ns)
 
     def _publish(self, message: Outgoing | Status) -> int:
         """Publishes if there is a subscriber; returns the bytes of the payload, 0 without one."""
@@ -222,7 +205,7 @@ class Node:
         publisher = self._declarations.publisher(topic, key)
         if not publisher.matching:
             return 0
-        payload = encode_help(message) if isinstance(message, Help) else encode(message)
+        payload = encode_help(message) if isinstance(message, Help) else messages.encode(message)
         publisher.put(payload)
         return len(payload)
 
@@ -251,7 +234,7 @@ class GuestNode(Node):
         super().__init__(robot, team, bus, start_ns, incarnation, on_arrival, speed)
         self._ask_ns = start_ns
         self._warn_ns: int | None = start_ns + WARN_AFTER_NS
-        self._model = model_from_settings(team.robots[name])
+        self._model = messages.model_from_settings(team.robots[name])
         self._join = bus.publisher(topics.JOIN.at(robot=name), topics.JOIN.qos)
 
     @property
@@ -286,9 +269,10 @@ class GuestNode(Node):
         if self._model is not None:
             self._ask(now_ns, None)
 
-    def _ask(self, now_ns: int, model: SimulatedRobotModel | None) -> bool:
+    def _ask(self, now_ns: int, model: messages.SimulatedRobotModel | None) -> bool:
         """Asks the field; whether a field subscribes."""
         if not self._join.matching:
             return False
-        self._join.put(encode(Join(self.robot.name, self._incarnation, now_ns, model)))
+        join = messages.Join(self.robot.name, self._incarnation, now_ns, model)
+        self._join.put(messages.encode(join))
         return True

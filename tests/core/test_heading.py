@@ -40,15 +40,14 @@ from cpcbl_team.config import (
     Variant,
 )
 from cpcbl_team.estimate import Covariance3, Estimate
-from cpcbl_team.fixes import fix_for, without_heading
+from cpcbl_team.fixes import fix_for, from_fix, from_position_sensor, without_heading
 from cpcbl_team.geometry import Pose2, step, wrap_angle
 from cpcbl_team.inputs import BeliefShared, Fix, Odometry, Sighting
 from cpcbl_team.localizer import Localizer
 from cpcbl_team.motion import motion_noise
-from cpcbl_team.pose_observation import from_fix, from_position_sensor
-from cpcbl_team.sender_record import QuarantineReason
 from cpcbl_team.sensors import range_sigma_m
 from cpcbl_team.state import State, TeammateMemory
+from cpcbl_team.trust import QuarantineReason
 
 ORIGIN = Pose2(0.0, 0.0, 0.0)
 STILL = OdometrySettings(moves=False)

@@ -12,14 +12,12 @@ from support.core import (
 from support.trust import AGREES, CONTRADICTS, MS, RULES, Receiver
 
 from cpcbl_team.geometry import Pose2
-from cpcbl_team.sender_record import (
+from cpcbl_team.trust import (
     ReportedPosition,
     SenderRecord,
     TeammateReport,
-    with_report,
-)
-from cpcbl_team.trust import (
     assess,
+    with_report,
 )
 
 Reported = Callable[[float], tuple[float, float]]

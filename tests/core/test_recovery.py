@@ -26,7 +26,6 @@ from support.core import (
 )
 from support.evidence import piece
 
-from cpcbl_team.beliefs import ObjectPosition
 from cpcbl_team.config import (
     Field,
     Gives,
@@ -41,7 +40,7 @@ from cpcbl_team.estimate import Estimate
 from cpcbl_team.gaussian import Covariance2
 from cpcbl_team.geometry import Pose2, wrap_angle
 from cpcbl_team.inputs import Sighting, Sightings
-from cpcbl_team.measurements import Measurement
+from cpcbl_team.measurements import Measurement, ObjectPosition
 from cpcbl_team.recovery import (
     MOST_PIECES,
     SPACING_NS,

@@ -13,8 +13,8 @@ from support.core import (
     matrix2,
 )
 
-from cpcbl_team.beliefs import ObjectPosition, teammate_at
 from cpcbl_team.config import CollaborationSettings
+from cpcbl_team.measurements import ObjectPosition, teammate_at
 
 RULES = CollaborationSettings(tier_width=2.0, tier_hysteresis=1.2)
 

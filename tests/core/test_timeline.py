@@ -27,10 +27,10 @@ from support.core import (
     state_at,
 )
 
-from cpcbl_team.beliefs import BELIEF_VALID_BEFORE_NS
 from cpcbl_team.config import LocalizerSettings, SensorSettings, Variant
 from cpcbl_team.inputs import Belief, BeliefShared, Fix, Input, Odometry, Position, Sightings
 from cpcbl_team.localizer import Localizer
+from cpcbl_team.measurements import BELIEF_VALID_BEFORE_NS
 from cpcbl_team.self_calibration import SelfCalibration
 from cpcbl_team.state import State
 from cpcbl_team.timeline import HORIZON_NS, Timeline

@@ -9,7 +9,10 @@ from cpcbl_transport.messages import (
     Flow,
     Frame,
     Join,
+    PositionSensorModel,
+    SimulatedRobotModel,
     Spending,
+    StartModel,
     Status,
     Track,
     Trust,
@@ -17,7 +20,6 @@ from cpcbl_transport.messages import (
     Truths,
     UnclearObject,
 )
-from cpcbl_transport.robot_model import PositionSensorModel, SimulatedRobotModel, StartModel
 from support.buses import SECOND
 
 NOW = 5 * SECOND

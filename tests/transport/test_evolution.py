@@ -23,8 +23,9 @@ from cpcbl_transport.messages import (
     Tagged,
     decode_tagged,
     encode,
+    model_from_settings,
+    settings_from_model,
 )
-from cpcbl_transport.robot_model import model_from_settings, settings_from_model
 
 BY_TYPE: dict[Any, Tagged] = {type(m): m for m in samples.VALID}
 HELP: dict[Any, Help] = {Belief: samples.BELIEF, Fix: samples.FIX}

@@ -35,8 +35,13 @@ from cpcbl_transport.messages import (
     Flow,
     Frame,
     Join,
+    OdometryModel,
+    PositionSensorModel,
     Refusal,
+    SensorModel,
+    SimulatedRobotModel,
     Spending,
+    StartModel,
     Status,
     Tagged,
     Track,
@@ -47,13 +52,6 @@ from cpcbl_transport.messages import (
     decode_tagged,
     encode,
     refusal,
-)
-from cpcbl_transport.robot_model import (
-    OdometryModel,
-    PositionSensorModel,
-    SensorModel,
-    SimulatedRobotModel,
-    StartModel,
 )
 
 KINDS = [type(m).__name__ for m in VALID]

@@ -21,7 +21,7 @@ from cpcbl_team.errors import InputError
 from cpcbl_team.inputs import NAME_PATTERN
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus
-from cpcbl_transport.robot_model import model_from_settings
+from cpcbl_transport.messages import model_from_settings
 from cpcbl_transport.security import Identity, link_of
 from cpcbl_transport.topics import Role
 from cpcbl_transport.zenoh_bus import open_bus

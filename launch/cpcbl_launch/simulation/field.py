@@ -13,8 +13,15 @@ from cpcbl_launch.simulation.robot import SimulatedRobot, VisibleObject
 from cpcbl_team.config import SimulationEvent, Team
 from cpcbl_team.geometry import Pose2, wrap_angle
 from cpcbl_team.inputs import Sightings
-from cpcbl_transport.messages import Drive, Frame, SensorInput, Truth, Truths
-from cpcbl_transport.robot_model import SimulatedRobotModel, settings_from_model
+from cpcbl_transport.messages import (
+    Drive,
+    Frame,
+    SensorInput,
+    SimulatedRobotModel,
+    Truth,
+    Truths,
+    settings_from_model,
+)
 
 _GUEST_SEED = 2**31  # no robot of a team file has this number
 _MARGIN_M = 1e-3  # so that rounding moves nothing beyond the next cell of a grid

@@ -3,8 +3,7 @@
 from collections.abc import Mapping
 
 from cpcbl_team.config import Team
-from cpcbl_transport.messages import Join
-from cpcbl_transport.robot_model import SimulatedRobotModel
+from cpcbl_transport.messages import Join, SimulatedRobotModel
 
 REQUEST_LASTS_NS = 2_000_000_000  # who has not asked again for so long is gone
 LONGEST_DELAY_S = 10.0  # what is sensed with a delay is kept so long

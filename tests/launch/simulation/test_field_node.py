@@ -25,8 +25,15 @@ from cpcbl_team.geometry import Pose2
 from cpcbl_team.inputs import Odometry, Position, Sighting, Sightings
 from cpcbl_transport import topics
 from cpcbl_transport.memory_bus import MemoryHub
-from cpcbl_transport.messages import Drive, Join, Refusal, Truths, encode
-from cpcbl_transport.robot_model import SimulatedRobotModel, model_from_settings
+from cpcbl_transport.messages import (
+    Drive,
+    Join,
+    Refusal,
+    SimulatedRobotModel,
+    Truths,
+    encode,
+    model_from_settings,
+)
 
 
 class OnBus:
