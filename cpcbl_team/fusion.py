@@ -174,10 +174,8 @@ def _determinant(prior: Estimate, observation: Observation) -> Callable[[float],
     # P1 = P + k P_d, so H P1 H^T = H P H^T + k H P_d H^T. Plain floats, because this runs often.
     p, d, alone = prior.covariance, prior.shared, len(observation.rows) == 1
     (pxx, pxy, pyy, pxh, pyh, phh), (dxx, dxy, dyy, dxh, dyh, dhh) = p, d
-    (p_xx, p_xy, p_yy), (d_xx, d_xy, d_yy) = (
-        _projected(p, observation.rows),
-        _projected(d, observation.rows),
-    )
+    p_xx, p_xy, p_yy = _projected(p, observation.rows)
+    d_xx, d_xy, d_yy = _projected(d, observation.rows)
     (ixx, ixy, iyy), (oxx, oxy, oyy) = observation.independent, observation.dependent
 
     def determinant(weight: float) -> float:

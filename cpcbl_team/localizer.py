@@ -38,7 +38,6 @@ from cpcbl_team.recovery import (
 from cpcbl_team.self_calibration import ReferencePose, ReferencePoses, self_calibrate
 from cpcbl_team.sensors import sighting_fault, time_at_min_speed_s
 from cpcbl_team.state import (
-    Evidence,
     LandmarkSnapshot,
     Memory,
     RecoveryMemory,
@@ -78,7 +77,7 @@ class Localizer:
         self._timers = ObjectTimers(settings)
         self._variant = variant_of(settings)
         self._landmarks = Landmarks(field, settings, gates)
-        self._recovery = Recovery(rules, field, self._landmarks, self._variant.reduce)
+        self.recovery = Recovery(rules, field, self._landmarks, self._variant.reduce)
         self.screen = TeammateScreen(settings, gates, self._variant.is_probabilistic)
 
     def cycle(self, state: State, frame: Sightings) -> State:
@@ -89,12 +88,12 @@ class Localizer:
         state = self.predict(state, frame.stamp_ns)  # 1. differential motion
         state, scope, landmarks, others = self.measure(state, frame)  # 2. measurements
         if scope is None:  # nothing may be updated
-            return self.check_lost(state)
+            return self.recovery.check(state)
         gated = self.constrain(state.estimate, others, scope) if others else _NO_OBJECTS  # 3.
         if self.screen.has_recent_reports(state, frame.stamp_ns):  # beyond the paper: trust
             state, gated = self.screen.screen_frame(state, landmarks, gated)
         estimate = self.correct(state.estimate, landmarks, gated, scope)  # 4. combine, 5. merge
-        return self.check_lost(self._with_frame(state, estimate, landmarks, gated, scope))
+        return self.recovery.check(self._with_frame(state, estimate, landmarks, gated, scope))
 
     # Step 1 -----------------------------------------------------------------------------------
 
@@ -301,9 +300,9 @@ class Localizer:
         if self.screen.is_active:
             state, is_trusted = self.screen.screen_observation(state, observation, position, nis)
             if not is_trusted or state.estimate is not prior:
-                return self.check_lost(state)
+                return self.recovery.check(state)
         if nis > self._gates[1]:
-            return self.check_lost(self._with_update(state, prior, None, {}, 1))
+            return self.recovery.check(self._with_update(state, prior, None, {}, 1))
         by_teammate = observation.observer is not None
         estimate = self._variant.correct_position(prior, position, by_teammate)
         return self._observe_heading(state, estimate, observation)
@@ -326,7 +325,7 @@ class Localizer:
                 state = state.counted("heading_gated")._replace(updates=updates)
                 used, rejected = {}, 1
         estimate = self._variant.reduce(estimate)
-        return self.check_lost(self._with_update(state, estimate, None, used, rejected))
+        return self.recovery.check(self._with_update(state, estimate, None, used, rejected))
 
     def _record_observation(self, state: State, observation: PoseObservation) -> State:
         """With this as evidence of where the robot is, unless its sender is in quarantine."""
@@ -359,7 +358,7 @@ class Localizer:
         state = self.predict(state, event.stamp_ns)
         return state._replace(estimate=mark_shared(state.estimate))
 
-    # The start, being lost --------------------------------------------------------------------
+    # The start --------------------------------------------------------------------------------
 
     def start(self, stamp_ns: int) -> State:
         """The state at the start: at the configured pose, or lost somewhere on the field."""
@@ -375,14 +374,6 @@ class Localizer:
         estimate = Estimate(Pose2(0.5 * (x0 + x1), 0.5 * (y0 + y1), 0.0), anywhere)
         memory = Memory(RecoveryMemory(lost="start pose unknown", inflated_ns=stamp_ns))
         return State(stamp_ns, estimate, odometry_until_ns=stamp_ns, memory=memory)
-
-    def check_lost(self, state: State) -> State:
-        """The state, marked as lost or not; a lost robot may be found again."""
-        return self._recovery.check(state)
-
-    def evidence(self, memory: RecoveryMemory) -> tuple[Evidence, ...]:
-        """What the robot can find itself with, the latest last."""
-        return self._recovery.evidence(memory)
 
 
 def _source(m: Measurement) -> str:

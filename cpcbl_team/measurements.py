@@ -8,13 +8,7 @@ from typing import NamedTuple
 
 import msgspec
 
-from cpcbl_team.config import (
-    CollaborationSettings,
-    Field,
-    LocalizationSettings,
-    LocalizerSettings,
-    Wall,
-)
+from cpcbl_team import config
 from cpcbl_team.constraints import (
     Constraint,
     bearing_heading,
@@ -63,7 +57,7 @@ def extrapolated(belief: Belief, at_ns: int) -> Pose2:
 
 
 def nearest_belief(
-    beliefs: Iterable[Belief], at_ns: int, settings: CollaborationSettings
+    beliefs: Iterable[Belief], at_ns: int, settings: config.CollaborationSettings
 ) -> tuple[float, Belief] | None:
     """The belief nearest to a time, and its age then (s); None if all are too old, or too late."""
     before_s = BELIEF_VALID_BEFORE_NS * 1e-9
@@ -73,7 +67,7 @@ def nearest_belief(
 
 
 def teammate_at(
-    beliefs: Iterable[Belief], at_ns: int, settings: CollaborationSettings
+    beliefs: Iterable[Belief], at_ns: int, settings: config.CollaborationSettings
 ) -> ObjectPosition | None:
     """The position of a teammate at the time of a sighting, from its belief nearest to that time.
 
@@ -100,7 +94,7 @@ class Measurement(msgspec.Struct, frozen=True, gc=False):
 
     source: str
     position: ObjectPosition  # for a wall: a point of it
-    wall: Wall | None
+    wall: config.Wall | None
     is_teammate: bool
     range_m: float | None
     bearing: float | None  # rad, in the robot's frame
@@ -148,9 +142,9 @@ def measurement_of(
     sighting: Sighting,
     stamp_ns: int,
     pose: Pose2,
-    field: Field,
+    field: config.Field,
     teammates: Mapping[str, tuple[Belief, ...]],
-    settings: LocalizationSettings,
+    settings: config.LocalizationSettings,
 ) -> Measurement | None:
     """The sighting, from about `pose`, with its object's position; None if that is not known."""
     name = sighting.id
@@ -181,7 +175,7 @@ def _on_map(x: float, y: float) -> ObjectPosition:
     return ObjectPosition(x, y, _EXACT)
 
 
-def _expected_range(pose: Pose2, position: ObjectPosition, wall: Wall | None) -> float:
+def _expected_range(pose: Pose2, position: ObjectPosition, wall: config.Wall | None) -> float:
     dx, dy = position.x - pose.x, position.y - pose.y
     if wall is None:
         return math.hypot(dx, dy)
@@ -189,7 +183,7 @@ def _expected_range(pose: Pose2, position: ObjectPosition, wall: Wall | None) ->
     return abs(dy * math.cos(direction) - dx * math.sin(direction))
 
 
-def constrains(m: Measurement, scope: Scope | None, rules: LocalizerSettings) -> bool:
+def constrains(m: Measurement, scope: Scope | None, rules: config.LocalizerSettings) -> bool:
     """Whether an object says anything about the part of the pose that is to be updated."""
     if scope is POSITION:
         return m.range_m is not None or (rules.bearing_for_position and m.has_point_bearing)
@@ -199,7 +193,7 @@ def constrains(m: Measurement, scope: Scope | None, rules: LocalizerSettings) ->
 
 
 def constraints_of(
-    pose: Pose2, m: Measurement, scope: Scope, rules: LocalizerSettings
+    pose: Pose2, m: Measurement, scope: Scope, rules: config.LocalizerSettings
 ) -> list[Constraint]:
     """Step 3: what one object says about position or heading; about both, each reading once."""
     x, y, _ = m.position
@@ -262,13 +256,6 @@ def observation_of(
     sensor = [c.sigma * c.sigma for c in cs]
     place = m.position.covariance
     (ax, ay), (bx, by) = cs[0].place_row, cs[-1].place_row
-    return Observation(
-        rows,
-        residuals,
-        Covariance2(sensor[0], 0.0, sensor[-1]),
-        Covariance2(
-            place.along(ax, ay),
-            place.xx * ax * bx + place.xy * (ax * by + ay * bx) + place.yy * ay * by,
-            place.along(bx, by),
-        ),
-    )
+    common = place.xx * ax * bx + place.xy * (ax * by + ay * bx) + place.yy * ay * by
+    dependent = Covariance2(place.along(ax, ay), common, place.along(bx, by))
+    return Observation(rows, residuals, Covariance2(sensor[0], 0.0, sensor[-1]), dependent)

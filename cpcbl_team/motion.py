@@ -16,17 +16,8 @@ from cpcbl_team.inputs import Odometry
 def motion_jacobian(heading: float, distance: float, turn: float) -> Matrix3:
     """d(pose after) / d(pose before)."""
     direction = heading + 0.5 * turn
-    return (
-        1.0,
-        0.0,
-        -distance * math.sin(direction),
-        0.0,
-        1.0,
-        distance * math.cos(direction),
-        0.0,
-        0.0,
-        1.0,
-    )
+    lx, ly = -distance * math.sin(direction), distance * math.cos(direction)
+    return 1.0, 0.0, lx, 0.0, 1.0, ly, 0.0, 0.0, 1.0
 
 
 def motion_noise(

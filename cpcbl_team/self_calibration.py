@@ -62,28 +62,28 @@ def self_calibrate(
     if turn > MOST_TURN_RAD:
         turned = now
     elif turn >= LEAST_TURN_RAD:
-        odometry = turned.odometry_from_robot.inverse() @ now.odometry_from_robot
-        known, turned = _with_turn(known, turned, now, odometry, noise), now
-    odometry = driven.odometry_from_robot.inverse() @ now.odometry_from_robot
-    distance = math.hypot(odometry.x, odometry.y)
+        known, turned = _with_turn(known, turned, now, noise), now
+    x, y, _ = _motion(driven, now)
     if abs(now.total_turn_rad - driven.total_turn_rad) > MOST_TURN_OF_CHORD_RAD:
         driven = now
-    elif distance >= LEAST_DISTANCE_M:
-        known, driven = _with_distance(known, driven, now, odometry, noise), now
+    elif math.hypot(x, y) >= LEAST_DISTANCE_M:
+        known, driven = _with_distance(known, driven, now, noise), now
     turned, driven = (
         now if now.stamp_ns - r.stamp_ns > LONGEST_NS else r for r in (turned, driven)
     )
     return known, ReferencePoses(turned, driven)
 
 
+def _motion(then: ReferencePose, now: ReferencePose) -> Pose2:
+    """The motion between two times by odometry, in the robot's frame then."""
+    return then.odometry_from_robot.inverse() @ now.odometry_from_robot
+
+
 def _with_turn(
-    known: SelfCalibration,
-    then: ReferencePose,
-    now: ReferencePose,
-    odometry: Pose2,
-    noise: OdometryNoise,
+    known: SelfCalibration, then: ReferencePose, now: ReferencePose, noise: OdometryNoise
 ) -> SelfCalibration:
     """The calibration after a turn was compared with that of odometry."""
+    odometry = _motion(then, now)
     odometry_variance = _turn_variance(odometry, noise)
     p, q = then.estimate.covariance.hh, now.estimate.covariance.hh
     if q > RENEWED_SHARE * (p + odometry_variance):
@@ -97,13 +97,10 @@ def _with_turn(
 
 
 def _with_distance(
-    known: SelfCalibration,
-    then: ReferencePose,
-    now: ReferencePose,
-    odometry: Pose2,
-    noise: OdometryNoise,
+    known: SelfCalibration, then: ReferencePose, now: ReferencePose, noise: OdometryNoise
 ) -> SelfCalibration:
     """The calibration after a distance, and its direction, were compared with those of odometry."""
+    odometry = _motion(then, now)
     distance = math.hypot(odometry.x, odometry.y)
     along = noise.distance_sigma_m_per_sqrt_m**2 * distance
     p, q = then.estimate, now.estimate
@@ -127,9 +124,8 @@ def _with_distance(
 
 def _turn_variance(odometry: Pose2, noise: OdometryNoise) -> float:
     """The variance (rad^2) of the heading of this motion."""
-    return noise.turn_sigma_rad_per_sqrt_rad**2 * abs(
-        odometry.heading
-    ) + noise.turn_sigma_rad_per_sqrt_m**2 * math.hypot(odometry.x, odometry.y)
+    by_turn = noise.turn_sigma_rad_per_sqrt_rad**2 * abs(odometry.heading)
+    return by_turn + noise.turn_sigma_rad_per_sqrt_m**2 * math.hypot(odometry.x, odometry.y)
 
 
 def _kalman_update(variance: float, h: float, excess: float, noise: float) -> tuple[float, float]:

@@ -35,13 +35,8 @@ class Robot:
         settings, teammates = team.robots[name], frozenset(team.robots) - {name}
         self.name, self.sensing, self._shared_ns = name, sensing, start_ns
         self.filter = FilterAgent(settings, team.map, teammates, start_ns)
-        budget = Budget(
-            settings.collaboration.budget,
-            start_ns,
-            team.messages_per_s(name),
-            restarted=restarted,
-            match_s=team.match.duration_s,
-        )
+        match = team.messages_per_s(name), restarted, team.match.duration_s
+        budget = Budget(settings.collaboration.budget, start_ns, *match)
         known = frozenset(team.map.landmarks) | frozenset(team.map.walls) | frozenset(team.robots)
         guests = GuestRegistry(known, team.guests.most if team.guests.allowed else 0)
         self.collaboration = CollaborationAgent(name, settings, teammates, start_ns, budget, guests)

@@ -184,7 +184,9 @@ def test_new_evidence_is_that_of_a_measurement(variant: Variant, given: Gives) -
     robot = localizer(variant, field)
     visible = Sighting("post", 5.0, 0.3)  # farther than it can be
     state = state_at(LOOP_START, covariance3(0.1 * np.eye(3)), NOW)
-    (piece,) = robot.evidence(robot.cycle(state, Sightings(NOW, (visible,))).memory.recovery)
+    (piece,) = robot.recovery.evidence(
+        robot.cycle(state, Sightings(NOW, (visible,))).memory.recovery
+    )
     m = measurement_of(visible, NOW, LOOP_START, field, {}, robot.settings)
     assert m is not None
     assert (piece.source, piece.x, piece.y) == ("post", 1.0, 2.0)

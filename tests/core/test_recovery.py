@@ -166,7 +166,8 @@ def test_a_reading_that_may_not_be_used_is_no_evidence(gives: Gives) -> None:
     ranged = Sightings(1, (Sighting("ne", visible.range_m),))
     state = robot.cycle(state_at(ORIGIN, diagonal(0.1, 0.1)), ranged)
     assert all(
-        (e.range_m, e.bearing_rad) != (None, None) for e in robot.evidence(state.memory.recovery)
+        (e.range_m, e.bearing_rad) != (None, None)
+        for e in robot.recovery.evidence(state.memory.recovery)
     )
 
 

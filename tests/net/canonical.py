@@ -27,7 +27,7 @@ def canonical_state(localizer: Localizer, state: State, with_evidence: bool) -> 
     """
     updates, pending, recovery = state.updates, state.pending_odometry, state.memory.recovery
     teammates, calibration = state.memory.teammates, state.memory.calibration
-    evidence = localizer.evidence(recovery) if with_evidence else ()
+    evidence = localizer.recovery.evidence(recovery) if with_evidence else ()
     learned = calibration.learned
     return {
         "stamp_ns": state.stamp_ns,

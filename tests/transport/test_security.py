@@ -195,12 +195,15 @@ def test_the_rules_follow_the_table_of_topics() -> None:
         assert topic.publishers, topic.key
         for speaker in topic.publishers:
             own = {speaker.own: "me"} if speaker.own else {}
-            assert topic.at(**own) in publish_keys(Identity(speaker.role, "me"))
+            assert topic.at(**own) in publish_keys(
+                Identity(speaker.role, "me"), topic.carries is not None
+            )
             assert not speaker.own or f"<{speaker.own}>" in topic.key
 
 
 def test_operators_and_routers_publish_nothing_of_their_own() -> None:
-    assert publish_keys(OPERATOR) == publish_keys(ROUTER) == []
+    for carrying in (True, False):
+        assert publish_keys(OPERATOR, carrying) == publish_keys(ROUTER, carrying) == []
 
 
 def test_permitted_subscriptions_follow_the_table_too() -> None:

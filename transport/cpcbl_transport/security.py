@@ -197,13 +197,12 @@ def access_rules(team: Team, members: Iterable[Member]) -> dict[str, Any]:
     }
 
 
-def publish_keys(identity: Identity, carrying: bool | None = None) -> list[str]:
-    """The keys under which a member may publish, below the namespace. `carrying`: only those of
-    messages, or only those of tokens; None: both."""
+def publish_keys(identity: Identity, carrying: bool) -> list[str]:
+    """The keys of messages (`carrying`), or of tokens, that a member may publish."""
     return [
         key
         for topic in topics.TOPICS
-        if carrying is None or carrying is (topic.carries is not None)
+        if carrying is (topic.carries is not None)
         for key in _keys(topic, topic.publishers, identity)
     ]
 
