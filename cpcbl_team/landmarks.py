@@ -143,11 +143,9 @@ class Landmarks:
         bearing: float | None,
         as_ray: bool,
     ) -> None:
-        """Adds the constraints of one landmark, unless the gate rejects them.
-
-        A range gives the row (u, v, 0). A bearing gives the row (m, n, 1): a heading as it is, a
-        ray divided by the distance along it.
-        """
+        """Adds the constraints of one landmark, unless the gate rejects them. A range gives the row
+        (u, v, 0). A bearing gives the row (m, n, 1): a heading as it is, a ray divided by the
+        distance along it."""
         dx, dy = mark.x - update.x, mark.y - update.y
         distance_squared = dx * dx + dy * dy
         distance = sqrt(distance_squared)

@@ -35,11 +35,6 @@ def next_tier(
     return max(settings.best_tier, min(max(present, best), worst))
 
 
-def accepts_tier(own: int, other: int, settings: CollaborationSettings) -> bool:
-    """Whether a robot of tier `own` accepts help from one of tier `other`."""
-    return other < own or settings.direction == "both-ways"
-
-
 def accepted_tiers(own: int, settings: CollaborationSettings) -> range:
     """The tiers from which a robot accepts help: all better than its own, or all there are."""
     return range(LOWEST_TIER + 1 if settings.direction == "both-ways" else own)

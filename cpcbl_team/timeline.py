@@ -94,10 +94,8 @@ class Timeline:
 
     def _keep_states(self, index: int, belief: Belief, known: list[State]) -> None:
         """Keeps what was known after a belief. It is always late, but does not change the states
-        before the first frame to which it is its robot's nearest belief.
-
-        Between the times of two inputs it divides a motion, which changes the last bits.
-        """
+        before the first frame to which it is its robot's nearest belief. Between the times of two
+        inputs it divides a motion, which changes the last bits."""
         if len(known) < 2 or known[1].stamp_ns != self._keys[index][0]:
             return
         screen, states = self._localizer.screen, self._states

@@ -150,11 +150,9 @@ def _with_faded_conflicts(record: SenderRecord, now_ns: int) -> SenderRecord:
 
 
 def _with_position(record: SenderRecord, now: ReportedPosition | None) -> SenderRecord:
-    """Test 2: the distance between two reported positions against that of odometry.
-
-    Both are straight distances, so neither the path nor the heading matters. The later position is
-    the next one to compare with, unless this comparison shows nothing yet.
-    """
+    """Test 2: the distance between two reported positions against that of odometry. Both are
+    straight distances, so neither the path nor the heading matters. The later position is the next
+    one to compare with, unless this comparison shows nothing yet."""
     then = record.position
     if now is None:
         return record
@@ -241,11 +239,9 @@ def assess(
 def _decide_dispute(
     senders: SenderRecords, name: str, now_ns: int, used_ns: int, rules: TrustSettings
 ) -> TrustDecision:
-    """Decides who is wrong if a sender has contradicted the estimate for long enough.
-
-    A source supports the estimate only if it agreed with it after the dispute began. If none does,
-    no sender is blamed: the robot detects by its innovations that it is lost.
-    """
+    """Decides who is wrong if a sender has contradicted the estimate for long enough. A source
+    supports the estimate only if it agreed with it after the dispute began. If none does, no sender
+    is blamed: the robot detects by its innovations that it is lost."""
     recent = dict(_recent(senders, now_ns))
     disputes_ns = [r.dispute_since_ns for r in recent.values() if r.score > rules.limit]
     if not disputes_ns:
@@ -272,11 +268,9 @@ def _decide_dispute(
 def _is_estimate_right(
     recent: SenderRecords, dissenters: set[str], supporters: set[str], dispute_ns: int
 ) -> bool | None:
-    """Whether the estimate and its supporters are right; None while that is undecided.
-
-    The robot's own sensors decide, otherwise odometry, otherwise the majority, and after some time
-    the estimate before the dispute.
-    """
+    """Whether the estimate and its supporters are right; None while that is undecided. The robot's
+    own sensors decide, otherwise odometry, otherwise the majority, and after some time the estimate
+    before the dispute."""
     if OWN_SENSORS in supporters or OWN_SENSORS in dissenters:
         return OWN_SENSORS in supporters
     all_sides = dissenters | supporters
@@ -359,11 +353,9 @@ def _reason_of(record: SenderRecord) -> QuarantineReason:
 def _assess_quarantined(
     senders: SenderRecords, name: str, report: TeammateReport, rules: TrustSettings
 ) -> TrustDecision:
-    """A report of a sender in quarantine is not used, unless it is the one that ends it.
-
-    The quarantine ends when enough reports agreed with the estimate while another source confirmed
-    the estimate, or, without any other source, when enough distances agreed with odometry.
-    """
+    """A report of a sender in quarantine is not used, unless it is the one that ends it. The
+    quarantine ends when enough reports agreed with the estimate while another source confirmed the
+    estimate, or, without any other source, when enough distances agreed with odometry."""
     record, now = senders[name], report.stamp_ns
     contradicts = report.nis is None or report.nis > CONTRADICTING_NIS
     if record.last_failure_ns == now and contradicts:

@@ -4,12 +4,15 @@
 paper. `weighted` is the paper's non-probabilistic variant (section 3).
 """
 
-from cpcbl_team import weighted
-from cpcbl_team.config import LocalizationSettings
+import math
+
+from cpcbl_team.config import LocalizationSettings, Weights
+from cpcbl_team.constraints import Constraint
 from cpcbl_team.estimate import (
     HEADING,
     POSE,
     POSITION,
+    Covariance3,
     Estimate,
     Information,
     Scope,
@@ -18,6 +21,7 @@ from cpcbl_team.estimate import (
     with_circular_position,
 )
 from cpcbl_team.fusion import Observation, merge_naive, merge_split, with_all_shared
+from cpcbl_team.geometry import Pose2, wrap_angle
 from cpcbl_team.landmarks import LandmarkUpdate
 from cpcbl_team.measurements import GatedObject, combine, observation_of
 from cpcbl_team.motion import move
@@ -129,7 +133,9 @@ class CircularVariant(OvalVariant):
 
 
 class WeightedVariant(CircularVariant):
-    """Weighted averages; the covariance is nominal."""
+    """Weighted averages. The covariance is nominal, for the variant has no estimate of its quality,
+    but gates and tiers need a number. It is what the last disagreement with a sensor left over, and
+    a configured value at least."""
 
     is_probabilistic = False
 
@@ -142,16 +148,44 @@ class WeightedVariant(CircularVariant):
     ) -> Estimate:
         """Steps 4 and 5: inverse-distance weights among readings, then the static weight."""
         constraints = [c for found in accepted for c in found.constraints]
-        return self.reduce(weighted.merge_weighted(prior, constraints, self._weights))
+        return self.reduce(merge_weighted(prior, constraints, self._weights))
 
     def correct_position(
         self, prior: Estimate, position: Observation, by_teammate: bool
     ) -> Estimate:
         x, y = position.residuals
-        return weighted.weighted_average(prior, (x, y), None, self._weights)
+        return weighted_average(prior, (x, y), None, self._weights)
 
     def correct_heading(self, prior: Estimate, heading: Observation) -> Estimate:
-        return weighted.weighted_average(prior, (0.0, 0.0), heading.residuals[0], self._weights)
+        return weighted_average(prior, (0.0, 0.0), heading.residuals[0], self._weights)
+
+
+def merge_weighted(prior: Estimate, accepted: list[Constraint], weights: Weights) -> Estimate:
+    """Steps 4 and 5 of a cycle: inverse-distance weights among the readings of one type."""
+    if not accepted:
+        return prior
+    total = sum(1.0 / c.distance_m for c in accepted)
+    x, y, h = (
+        sum(c.residual * c.row[i] / c.distance_m for c in accepted) / total for i in range(3)
+    )
+    return weighted_average(prior, (x, y), h if accepted[0].on_heading else None, weights)
+
+
+def weighted_average(
+    prior: Estimate, offset: tuple[float, float], heading: float | None, weights: Weights
+) -> Estimate:
+    """The static weighted average of estimate and sensor: of heading, if one is given, or else of
+    position."""
+    (x, y, h), c = prior.pose, prior.covariance
+    if heading is not None:
+        nominal = math.radians(weights.nominal_heading_sigma_deg) ** 2
+        variance = max(nominal, ((1.0 - weights.heading) * heading) ** 2)
+        pose = Pose2(x, y, wrap_angle(h + weights.heading * heading))
+        return Estimate(pose, Covariance3(c.xx, 0.0, c.yy, 0.0, 0.0, variance))
+    left_over = (1.0 - weights.position) * math.hypot(*offset)
+    p = max(weights.nominal_sigma_m, left_over) ** 2
+    pose = Pose2(x + weights.position * offset[0], y + weights.position * offset[1], h)
+    return Estimate(pose, Covariance3(p, 0.0, p, 0.0, 0.0, c.hh))
 
 
 def variant_of(settings: LocalizationSettings) -> JointVariant:

@@ -18,7 +18,7 @@ from cpcbl_team.fixes import fix_for, without_heading
 from cpcbl_team.gaussian import Covariance2
 from cpcbl_team.information_gain import FixMemory, HeadingMemory
 from cpcbl_team.inputs import Belief, Fix
-from cpcbl_team.tiers import LOWEST_TIER, accepts_tier, next_tier
+from cpcbl_team.tiers import LOWEST_TIER, accepted_tiers, next_tier
 from cpcbl_transport.budget import Budget
 from cpcbl_transport.compact import help_bytes, sent_bytes
 from cpcbl_transport.messages import Flow, Track
@@ -169,7 +169,7 @@ class CollaborationAgent:
 
     def _is_useful(self, seen: Fix, tier: int, now: agent.PoseEstimate) -> bool:
         rules, in_sight = self._rules, now.stamp_ns - seen.stamp_ns < IN_SIGHT_NS
-        if not (in_sight and accepts_tier(self.tier, tier, rules)):
+        if not (in_sight and tier in accepted_tiers(self.tier, rules)):
             return False
         gain = gains.information_gain_of_belief(seen, tier, now.estimate, rules)
         return bool(now.lost) or gain >= rules.least_use
@@ -209,7 +209,7 @@ class CollaborationAgent:
         last_ns, _ = self._fix_memories.get(fix.robot, (None, None))
         if last_ns is not None and fix.stamp_ns - last_ns < interval_ns:
             return False
-        return rules.active and self.has_started and accepts_tier(tier, self.tier, rules)
+        return rules.active and self.has_started and self.tier in accepted_tiers(tier, rules)
 
     def _offer(self, fix: Fix, tier: int) -> _Offer:
         """The fix with its gain; with the heading only if the heading is worth its own bytes."""

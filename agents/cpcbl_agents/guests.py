@@ -45,11 +45,9 @@ class GuestRegistry:
         return True
 
     def _has_room(self, name: str, now_ns: int) -> bool:
-        """Whether there is a place for this name.
-
-        A candidate that was looked up for long enough gives its place to a name that appears again
-        (random garbage hardly repeats) and was not itself looked up without success lately.
-        """
+        """Whether there is a place for this name. A candidate that was looked up for long enough
+        gives its place to a name that appears again (random garbage hardly repeats) and was not
+        itself looked up without success lately."""
         if len(self._noticed) < self._most:
             return True
         candidates = {n: first for n, (first, _) in self._noticed.items() if n not in self._present}

@@ -158,10 +158,19 @@ def access_rules(team: Team, members: Iterable[Member]) -> dict[str, Any]:
     space = topics.namespace(team.name)
     present = [m for m in members if not m.revoked and _is_in_team(m.identity, team)]
     routers = [m for m in present if m.role is Role.ROUTER]
-    # Of each rule: its name, to whom it applies, where, to which messages, under which keys
-    rules: list[tuple[str, list[Member], str, Sequence[str], Sequence[str]]] = [
-        ("deliver", present, "egress", _DELIVERED, ["**"])
-    ]
+    rules: list[dict[str, Any]] = []
+    subjects: list[dict[str, Any]] = []
+
+    def allow(
+        name: str, who: list[Member], flow: str, messages: Sequence[str], keys: Sequence[str]
+    ) -> None:
+        if who and keys:
+            whole = [f"{space}/{key}" for key in keys]
+            rule = {"id": name, "permission": "allow", "flows": [flow], "messages": list(messages)}
+            rules.append({**rule, "key_exprs": whole})
+            subjects.append({"id": name, "cert_common_names": [m.common_name for m in who]})
+
+    allow("deliver", present, "egress", _DELIVERED, ["**"])
     for member in present:
         who = member.identity
         for messages, keys in (
@@ -169,32 +178,12 @@ def access_rules(team: Team, members: Iterable[Member]) -> dict[str, Any]:
             (("liveliness_token",), publish_keys(who, carrying=False)),
             (_SUBSCRIBING, subscribe_keys(who)),
         ):
-            if keys:
-                rules.append((f"{who}: {messages[0]}", [member], "ingress", messages, keys))
-    both_ways = "ingress", "egress"
-    rules += [(f"relay: {flow}", routers, flow, _ALL_MESSAGES, ["**"]) for flow in both_ways]
-    rules = [rule for rule in rules if rule[1]]
-    return {
-        "access_control": {
-            "enabled": True,
-            "default_permission": "deny",
-            "rules": [
-                {
-                    "id": name,
-                    "permission": "allow",
-                    "flows": [flow],
-                    "messages": list(messages),
-                    "key_exprs": [f"{space}/{key}" for key in keys],
-                }
-                for name, _, flow, messages, keys in rules
-            ],
-            "subjects": [
-                {"id": name, "cert_common_names": [member.common_name for member in members]}
-                for name, members, *_ in rules
-            ],
-            "policies": [{"rules": [name], "subjects": [name]} for name, *_ in rules],
-        }
-    }
+            allow(f"{who}: {messages[0]}", [member], "ingress", messages, keys)
+    for flow in ("ingress", "egress"):
+        allow(f"relay: {flow}", routers, flow, _ALL_MESSAGES, ["**"])
+    policies = [{"rules": [rule["id"]], "subjects": [rule["id"]]} for rule in rules]
+    control = {"enabled": True, "default_permission": "deny", "rules": rules}
+    return {"access_control": {**control, "subjects": subjects, "policies": policies}}
 
 
 def publish_keys(identity: Identity, carrying: bool) -> list[str]:
