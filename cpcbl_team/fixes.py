@@ -76,6 +76,11 @@ def without_heading(fix: Fix) -> Fix:
 
 
 # At the teammate: an observation of its pose ------------------------------------------------------
+#
+# Position and heading are merged one after the other. Both hold the observer's heading error, so
+# they are not independent, but split covariance intersection takes the observer's parts as
+# correlated with the prior in any way. So that correlation need not be known, and is not sent.
+# Naive fusion neglects it, as it neglects all correlation.
 
 
 class HeadingObservation(NamedTuple):

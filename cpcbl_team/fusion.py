@@ -239,15 +239,13 @@ def _sensor_part(observation: Observation, weight: float, merged: Covariance3) -
     wxy = inverse.xx * i.xy + inverse.xy * i.yy
     wyx = inverse.xy * i.xx + inverse.yy * i.xy
     wyy = inverse.xy * i.xy + inverse.yy * i.yy
-    c = Covariance2(
-        wxx * inverse.xx + wxy * inverse.xy,
-        wxx * inverse.xy + wxy * inverse.yy,
-        wyx * inverse.xy + wyy * inverse.yy,
-    )
+    xx = wxx * inverse.xx + wxy * inverse.xy
+    xy = wxx * inverse.xy + wxy * inverse.yy
+    yy = wyx * inverse.xy + wyy * inverse.yy
     f, g = gains
 
     def entry(a: int, b: int) -> float:
-        return c.xx * f[a] * f[b] + c.xy * (f[a] * g[b] + g[a] * f[b]) + c.yy * g[a] * g[b]
+        return xx * f[a] * f[b] + xy * (f[a] * g[b] + g[a] * f[b]) + yy * g[a] * g[b]
 
     return Covariance3(entry(0, 0), entry(0, 1), entry(1, 1), entry(0, 2), entry(1, 2), entry(2, 2))
 

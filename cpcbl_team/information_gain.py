@@ -89,9 +89,8 @@ def predicted_teammate_heading_variance(
 
 def merged_heading_variance(prior: float, fix: Fix, fusion: Fusion) -> float:
     """The heading variance (rad^2) of a teammate after it merged `fix`; see `merged_covariance`."""
-    prior += SMALLEST_VARIANCE
-    fresh, dependent = fix.heading_sensor_variance, fix.heading_observer_variance
-    fresh += SMALLEST_VARIANCE
+    prior, fresh = prior + SMALLEST_VARIANCE, fix.heading_sensor_variance + SMALLEST_VARIANCE
+    dependent = fix.heading_observer_variance
     if fusion == "naive":
         return 1.0 / (1.0 / prior + 1.0 / (fresh + dependent))
 

@@ -196,18 +196,14 @@ def _fit(start: Pose2, pieces: list[PropagatedEvidence]) -> tuple[float, Estimat
 def _is_certain(estimate: Estimate) -> bool:
     """Sharp evidence that determines no pose leaves variances that are nothing but rounding."""
     xx, _, yy, _, _, hh = estimate.covariance
-    return (
-        min(xx, yy, hh) > 0.0
-        and 0.5 * (xx + yy) < _ENOUGH_POSITION_SIGMA_M**2
-        and hh < _ENOUGH_HEADING_SIGMA_RAD**2
-    )
+    if min(xx, yy, hh) <= 0.0:
+        return False
+    return 0.5 * (xx + yy) < _ENOUGH_POSITION_SIGMA_M**2 and hh < _ENOUGH_HEADING_SIGMA_RAD**2
 
 
 def _are_apart(a: Pose2, b: Pose2) -> bool:
-    return (
-        math.hypot(a.x - b.x, a.y - b.y) > 0.5
-        or abs(math.remainder(a.heading - b.heading, math.tau)) > 0.5
-    )
+    turn = math.remainder(a.heading - b.heading, math.tau)
+    return math.hypot(a.x - b.x, a.y - b.y) > 0.5 or abs(turn) > 0.5
 
 
 def _chi_square_bound(freedom: int) -> float:

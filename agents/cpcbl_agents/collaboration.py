@@ -145,7 +145,10 @@ class CollaborationAgent:
         self.latest, self._track_ns = now, now.stamp_ns
         self.tier = next_tier(present, sigma, bool(now.lost), self._rules)
         self._select_sources(now)
-        return [self._track(now), *self._beliefs(now, now_ns)]
+        pose, covariance, _ = now.estimate
+        known = None if self._settings.localizer.variant == "weighted" else covariance
+        track = Track(self._robot, now.stamp_ns, *pose, known, self.tier, now.lost)
+        return [track, *self._beliefs(now, now_ns)]
 
     # Whose beliefs to use ----------------------------------------------------------------------
 
@@ -281,8 +284,3 @@ class CollaborationAgent:
             self._fix_memories.pop(message.robot, None)
         else:
             self._last_belief = None
-
-    def _track(self, now: agent.PoseEstimate) -> Track:
-        pose, covariance, _ = now.estimate
-        known = None if self._settings.localizer.variant == "weighted" else covariance
-        return Track(self._robot, now.stamp_ns, *pose, known, self.tier, now.lost)
