@@ -25,14 +25,9 @@ _HEADING = ((0.0, 0.0, 1.0),)
 
 
 def fix_for(
-    robot: str,
-    observer: str,
-    stamp_ns: int,
-    estimate: Estimate,
-    sighting: Sighting,
-    sensor: SensorSettings,
+    observer: str, stamp_ns: int, estimate: Estimate, sighting: Sighting, sensor: SensorSettings
 ) -> Fix | None:
-    """The fix of `robot` by `observer`; None if range or bearing is missing or not usable.
+    """The fix of the robot that `observer` saw; None if range or bearing is missing or unusable.
 
     The sighting as a Gaussian (equations 1-2) is rotated into the field's frame and compounded with
     the observer's pose covariance before it is sent: J C J^T, J the Jacobian of the composition of
@@ -56,7 +51,7 @@ def fix_for(
     )
     jacobian = (1.0, 0.0, pose.y - y, 0.0, 1.0, x - pose.x, 0.0, 0.0, 0.0)
     observer_part = covariance.transformed(jacobian).position()
-    fix = Fix(robot, observer, stamp_ns, x, y, rotated, observer_part)
+    fix = Fix(sighting.id, observer, stamp_ns, x, y, rotated, observer_part)
     heading, heading_sigma = sighting.heading_rad, sighting.heading_sigma_rad
     if heading is None or heading_sigma is None:
         return fix

@@ -59,8 +59,8 @@ class TimelineRefusal(StrEnum):
 class Timeline:
     """The states of one localizer, whose inputs come in any order."""
 
-    def __init__(self, localizer: Localizer, state: State) -> None:
-        self._localizer = localizer
+    def __init__(self, localizer: Localizer, state: State, horizon_ns: int = HORIZON_NS) -> None:
+        self._localizer, self._horizon_ns = localizer, horizon_ns
         self._inputs: list[Input] = []
         self._keys: list[Key] = []
         self._states = [state]
@@ -76,7 +76,7 @@ class Timeline:
         """Inserts an input at its time; the reason if it cannot be used. The states after it are
         computed when they are asked for: often several inputs arrive late."""
         key, keys, states = _key(item), self._keys, self._states
-        is_beyond_horizon = bool(keys) and key[0] < keys[-1][0] - HORIZON_NS
+        is_beyond_horizon = bool(keys) and key[0] < keys[-1][0] - self._horizon_ns
         if is_beyond_horizon or _measured_ns(item) < self._start_ns:
             return TimelineRefusal.TOO_LATE
         index = bisect_left(keys, key)
@@ -131,7 +131,7 @@ class Timeline:
         return _apply[type(item)](self._localizer, state, item)
 
     def _forget(self) -> None:
-        oldest_ns = self._keys[-1][0] - HORIZON_NS
+        oldest_ns = self._keys[-1][0] - self._horizon_ns
         oldest = bisect_left(self._keys, (oldest_ns,))
         if oldest >= _PRUNE:
             self._oldest_ns = max(self._start_ns, oldest_ns)

@@ -185,7 +185,7 @@ class CollaborationAgent:
         for s in seen.frame.sightings:
             if s.id not in self._teammates and not self.guests.notice(s.id, stamp_ns):
                 continue
-            fix = fix_for(s.id, self._robot, stamp_ns, seen.estimate, s, sensor)
+            fix = fix_for(self._robot, stamp_ns, seen.estimate, s, sensor)
             if fix is None:
                 continue
             self._latest_fixes[fix.robot] = fix

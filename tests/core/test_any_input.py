@@ -155,6 +155,6 @@ def test_a_bearing_that_is_not_known_says_nothing_across_the_line_of_sight(
     sigma_rad: float,
 ) -> None:
     certain = Estimate(ORIGIN, diagonal(0.0, 0.0))
-    fix = fix_for("a", "b", 1, certain, Sighting("a", 3.0, 0.0, 0.1, sigma_rad), SensorSettings())
+    fix = fix_for("b", 1, certain, Sighting("a", 3.0, 0.0, 0.1, sigma_rad), SensorSettings())
     assert fix is not None
     assert fix.sensor_covariance[2] == pytest.approx(9.0)

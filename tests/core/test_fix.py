@@ -25,7 +25,7 @@ SENSOR = SensorSettings(range_share=0.05, range_floor_m=0.0, bearing_sigma_deg=5
 
 
 def observed(sighting: Sighting, estimate: Estimate, sensor: SensorSettings = SENSOR) -> Fix | None:
-    return fix_for("me", "mate", 7, estimate, sighting, sensor)
+    return fix_for("mate", 7, estimate, sighting, sensor)
 
 
 def an_observer(seed: int) -> Estimate:

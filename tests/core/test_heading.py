@@ -259,7 +259,7 @@ class Observer:
             wrap_angle(truth.heading - WATCH.heading + MARKER_RAD * noise()),
             MARKER_RAD,
         )
-        sent = fix_for("me", "mate", stamp_ns, self._believed, seen, SENSOR)
+        sent = fix_for("mate", stamp_ns, self._believed, seen, SENSOR)
         assert sent is not None
         return sent if headed else without_heading(sent)
 
