@@ -4,266 +4,43 @@ Every setting is typed and has a default; its unit is in its name. The reader of
 team file refuses unknown keys. docs/team_file.md describes all of them.
 """
 
-import math
-from typing import Annotated, Literal
-
-import msgspec
-
-from cpcbl_team.config.robot import COLOURS as COLOURS
-from cpcbl_team.config.robot import LIKE_MIRRORED as LIKE_MIRRORED
-from cpcbl_team.config.robot import MARKERS as MARKERS
-from cpcbl_team.config.robot import BudgetSettings as BudgetSettings
-from cpcbl_team.config.robot import CameraSettings as CameraSettings
-from cpcbl_team.config.robot import CollaborationSettings as CollaborationSettings
-from cpcbl_team.config.robot import Colour as Colour
-from cpcbl_team.config.robot import Cylinder as Cylinder
-from cpcbl_team.config.robot import Direction as Direction
-from cpcbl_team.config.robot import Fusion as Fusion
-from cpcbl_team.config.robot import LocalizerSettings as LocalizerSettings
-from cpcbl_team.config.robot import MarkerFamily as MarkerFamily
-from cpcbl_team.config.robot import NotNegative, Positive, Table
-from cpcbl_team.config.robot import OdometryNoise as OdometryNoise
-from cpcbl_team.config.robot import OdometrySettings as OdometrySettings
-from cpcbl_team.config.robot import PositionSensor as PositionSensor
-from cpcbl_team.config.robot import SensorSettings as SensorSettings
-from cpcbl_team.config.robot import Side as Side
-from cpcbl_team.config.robot import TrustSettings as TrustSettings
-from cpcbl_team.config.robot import Variant as Variant
-from cpcbl_team.config.robot import VisionSettings as VisionSettings
-from cpcbl_team.config.robot import Weights as Weights
-from cpcbl_team.inputs import Name
-
-Security = Literal["none", "mtls"]
-Source = Literal["simulated", "mrclam", "external"]
-Sensing = Literal["sightings", "camera"]
-Gives = Literal["both", "range", "bearing", "none"]
-Bands = tuple[str, str]
-"""The names of two colours, the upper one first."""
-
-
-# The field: what is known of it before the robots start, and how it is simulated -----------------
-
-
-class Landmark(Table, frozen=True, kw_only=True):
-    """A point whose position in the field's frame is known beforehand."""
-
-    x_m: float
-    y_m: float
-    gives: Gives = "both"
-    """Which measurements of it the robots use."""
-    colours: Bands | None = None
-    """The colour bands of the cylinder that stands there, by which a camera recognises it."""
-
-
-class Wall(Table, frozen=True, kw_only=True):
-    """A straight surface from one point of the field to another."""
-
-    from_m: tuple[float, float]
-    to_m: tuple[float, float]
-    gives: Gives = "both"
-
-    @property
-    def direction_rad(self) -> float:
-        """The direction from the first point to the second, in the field's frame."""
-        return math.atan2(self.to_m[1] - self.from_m[1], self.to_m[0] - self.from_m[0])
-
-
-class Field(Table, frozen=True, kw_only=True):
-    """The map: all landmarks and walls by their names."""
-
-    landmarks: dict[str, Landmark] = msgspec.field(default_factory=dict)
-    walls: dict[str, Wall] = msgspec.field(default_factory=dict)
-
-    def bounds(self) -> tuple[float, float, float, float]:
-        """(least x, least y, greatest x, greatest y) in metres of what is on the map; zeros for an
-        empty map."""
-        points = [(p.x_m, p.y_m) for p in self.landmarks.values()]
-        points += [end for wall in self.walls.values() for end in (wall.from_m, wall.to_m)]
-        if not points:
-            return 0.0, 0.0, 0.0, 0.0
-        xs, ys = [p[0] for p in points], [p[1] for p in points]
-        return min(xs), min(ys), max(xs), max(ys)
-
-
-class SimulationEvent(Table, frozen=True, kw_only=True):
-    """Something that happens on the simulated field: a robot is carried away, or landmarks are
-    hidden."""
-
-    at_s: NotNegative
-    """Robot time since the start of the field."""
-    kidnap: str = ""
-    """The robot that is carried away; its odometry does not notice."""
-    to: tuple[float, float, float] | None = None
-    """Where it is put down: x m, y m, heading deg."""
-    hide_landmarks_s: NotNegative = 0.0
-    """For this time no robot sees a landmark or wall."""
-
-
-class Light(Table, frozen=True, kw_only=True):
-    """The light in the rendered images of the simulated cameras."""
-
-    brightness: Positive = 1.0
-    gradient: Annotated[float, msgspec.Meta(ge=-2.0, le=2.0)] = 0.2
-    """By how much the left of an image is brighter than its right, as a share of the middle."""
-    tint: tuple[Positive, Positive, Positive] = (1.0, 1.0, 1.0)
-    """The factors of blue, green and red."""
-    blur_px: NotNegative = 0.6
-    """The standard deviation of a Gaussian."""
-    noise: NotNegative = 3.0
-    """The standard deviation, in 255 grey levels."""
-
-
-class SimulationSettings(Table, frozen=True, kw_only=True):
-    """The simulated field."""
-
-    step_rate_hz: Positive = 50.0
-    noise: NotNegative = 1.0
-    """The true noise as a multiple of what the robots assume; 0 for none."""
-    bump_radius_m: NotNegative = 0.15
-    light: Light = Light()
-    events: tuple[SimulationEvent, ...] = ()
-    clocks_ahead_s: dict[str, float] = msgspec.field(default_factory=dict)
-    """By how much the clocks of these robots are ahead of the field's. What such a robot senses has
-    time stamps of its own clock."""
-
-
-# The team ---------------------------------------------------------------------------------------
-
-
-class GuardSettings(Table, frozen=True, kw_only=True):
-    """Limits in the router on what one robot sends, so that it cannot flood the others."""
-
-    enabled: bool = True
-    fix_rate_hz: Positive = 100.0
-    """Of fixes for one teammate. The router drops a fix that follows the last one sooner than
-    1 / rate, and messages come unevenly, so this must be at least twice the sensor's rate."""
-    belief_rate_hz: Positive = 50.0
-    largest_help_bytes: Annotated[int, msgspec.Meta(ge=1)] = 256
-    """The largest payload of a fix or belief."""
-    largest_bytes: Annotated[int, msgspec.Meta(ge=1)] = 65_536
-    """The largest payload of any other message; robots refuse larger ones too."""
-    largest_frame_bytes: Annotated[int, msgspec.Meta(ge=1)] = 1_048_576
-    """The largest payload of a camera's image, plain or annotated."""
-
-
-class TransportSettings(Table, frozen=True, kw_only=True):
-    """The team's Zenoh router."""
-
-    listen: tuple[str, ...] = ()
-    """The endpoints at which `up` opens its router; default: a free port of 127.0.0.1."""
-    connect: tuple[str, ...] = ("tcp/127.0.0.1:7447",)
-    """The endpoints at which a robot looks for the router."""
-    guards: GuardSettings = GuardSettings()
-    security: Security = "none"
-    """mtls: every link is mutual TLS, and a certificate permits only what its owner may do."""
-    keys: Annotated[str, msgspec.Meta(min_length=1)] = "keys"
-    """The folder of the keys that `cpcbl-team keys` makes, relative to the team file."""
-
-    @property
-    def secured(self) -> bool:
-        return self.security == "mtls"
-
-    @property
-    def usual(self) -> tuple[str, ...]:
-        """The endpoints of this machine's router, unless the file names others."""
-        return ("tls/127.0.0.1:7447",) if self.secured else ("tcp/127.0.0.1:7447",)
-
-
-class Start(Table, frozen=True, kw_only=True):
-    """The pose of a robot at the start, in the field's frame. A robot without one searches for its
-    pose."""
-
-    known: bool = True
-    """False: only the simulated field knows it, and the robot searches for its pose."""
-    x_m: float
-    y_m: float
-    heading_deg: float = 0.0
-    sigma_m: NotNegative = 0.05
-    heading_sigma_deg: NotNegative = 3.0
-
-
-class LocalizationSettings(Table, frozen=True, kw_only=True):
-    """The settings that the filter of one robot needs."""
-
-    localizer: LocalizerSettings = LocalizerSettings()
-    sensor: SensorSettings = SensorSettings()
-    position_sensor: PositionSensor | None = None
-    odometry: OdometrySettings = OdometrySettings()
-    collaboration: CollaborationSettings = CollaborationSettings()
-    start: Start | None = None
-
-
-class RobotSettings(LocalizationSettings, frozen=True, kw_only=True):
-    """One robot of a team: the keys of its type and its own, over the team's defaults."""
-
-    source: Source = "simulated"
-    sensing: Sensing = "sightings"
-    """camera: the robot finds its sightings in images; otherwise they come as messages."""
-    camera: CameraSettings = CameraSettings()
-    markers: dict[Side, int] = msgspec.field(default_factory=dict)
-    """The markers that it carries, by which teammates' cameras recognise it."""
-    colours: Bands | None = None
-    """Colour bands on a mast: they are visible from farther away, but without the heading."""
-    waypoints_m: tuple[tuple[float, float], ...] = ()
-    """Simulated robots drive loops through these points, and steer by their own estimates."""
-    speed_m_s: NotNegative = 0.5
-
-
-class MatchSettings(Table, frozen=True, kw_only=True):
-    """A limit for a whole match, as in RoboCup: 1,200 messages a team."""
-
-    messages: Annotated[int, msgspec.Meta(ge=0)] = 0
-    """Fixes and beliefs of all robots; 0: no limit. Each robot gets its share beforehand."""
-    duration_s: Positive = 1200.0
-    """The messages are earned evenly over this time."""
-
-
-class GuestSettings(Table, frozen=True, kw_only=True):
-    """Robots that are not in the file but may join the team while it runs, such as observers."""
-
-    allowed: bool = True
-    most: Annotated[int, msgspec.Meta(ge=1, le=100)] = 8
-    """A robot, and the simulated field, accept this many at a time."""
-
-
-class Team(Table, frozen=True, kw_only=True):
-    """A team file with its layers merged."""
-
-    name: Name
-    robots: dict[str, RobotSettings]
-    map: Field = Field()
-    vision: VisionSettings = VisionSettings()
-    transport: TransportSettings = TransportSettings()
-    match: MatchSettings = MatchSettings()
-    simulation: SimulationSettings = SimulationSettings()
-    guests: GuestSettings = GuestSettings()
-    defaults: RobotSettings = RobotSettings()
-    """The settings of a robot that the file does not name, with which a guest begins."""
-    calibrated_on: tuple[str, ...] = ()
-    """The logs from which `calibrate` estimated the robots' types. Results on these logs do not
-    show how good a calibration is."""
-    data: str = ""
-    """The folder of the log, for robots whose source is `mrclam`."""
-
-    @property
-    def simulated(self) -> bool:
-        """Whether the team needs a simulated field."""
-        return any(robot.source == "simulated" for robot in self.robots.values())
-
-    @property
-    def cameras(self) -> tuple[str, ...]:
-        """The robots that find their sightings in images."""
-        return tuple(name for name, robot in self.robots.items() if robot.sensing == "camera")
-
-    @property
-    def renders(self) -> bool:
-        """Whether the simulated field must render images."""
-        return any(self.robots[name].source == "simulated" for name in self.cameras)
-
-    def messages_per_s(self, robot: str) -> float | None:
-        """The rate at which a robot earns its share of the match's messages; None: no limit."""
-        if not self.match.messages:
-            return None
-        weights = {name: r.collaboration.budget.match_share for name, r in self.robots.items()}
-        share = weights[robot] / (sum(weights.values()) or 1.0)
-        return share * self.match.messages / self.match.duration_s
+from cpcbl_team.config.camera import COLOURS as COLOURS
+from cpcbl_team.config.camera import LIKE_MIRRORED as LIKE_MIRRORED
+from cpcbl_team.config.camera import MARKERS as MARKERS
+from cpcbl_team.config.camera import CameraSettings as CameraSettings
+from cpcbl_team.config.camera import Colour as Colour
+from cpcbl_team.config.camera import Cylinder as Cylinder
+from cpcbl_team.config.camera import MarkerFamily as MarkerFamily
+from cpcbl_team.config.camera import Side as Side
+from cpcbl_team.config.camera import VisionSettings as VisionSettings
+from cpcbl_team.config.collaboration import BudgetSettings as BudgetSettings
+from cpcbl_team.config.collaboration import CollaborationSettings as CollaborationSettings
+from cpcbl_team.config.collaboration import Direction as Direction
+from cpcbl_team.config.collaboration import Fusion as Fusion
+from cpcbl_team.config.collaboration import TrustSettings as TrustSettings
+from cpcbl_team.config.field import Bands as Bands
+from cpcbl_team.config.field import Field as Field
+from cpcbl_team.config.field import Gives as Gives
+from cpcbl_team.config.field import Landmark as Landmark
+from cpcbl_team.config.field import Light as Light
+from cpcbl_team.config.field import SimulationEvent as SimulationEvent
+from cpcbl_team.config.field import SimulationSettings as SimulationSettings
+from cpcbl_team.config.field import Wall as Wall
+from cpcbl_team.config.localizer import LocalizerSettings as LocalizerSettings
+from cpcbl_team.config.localizer import Variant as Variant
+from cpcbl_team.config.localizer import Weights as Weights
+from cpcbl_team.config.sensors import OdometryNoise as OdometryNoise
+from cpcbl_team.config.sensors import OdometrySettings as OdometrySettings
+from cpcbl_team.config.sensors import PositionSensor as PositionSensor
+from cpcbl_team.config.sensors import SensorSettings as SensorSettings
+from cpcbl_team.config.team import GuardSettings as GuardSettings
+from cpcbl_team.config.team import GuestSettings as GuestSettings
+from cpcbl_team.config.team import LocalizationSettings as LocalizationSettings
+from cpcbl_team.config.team import MatchSettings as MatchSettings
+from cpcbl_team.config.team import RobotSettings as RobotSettings
+from cpcbl_team.config.team import Security as Security
+from cpcbl_team.config.team import Sensing as Sensing
+from cpcbl_team.config.team import Source as Source
+from cpcbl_team.config.team import Start as Start
+from cpcbl_team.config.team import Team as Team
+from cpcbl_team.config.team import TransportSettings as TransportSettings

@@ -12,7 +12,7 @@ from typing import Annotated
 import msgspec
 
 from cpcbl_team.config import RobotSettings
-from cpcbl_team.config.robot import NotNegative, Positive
+from cpcbl_team.config.table import NotNegative, Positive
 from cpcbl_team.inputs import Belief, Fix, Name, Odometry, Position, Sighting, Sightings
 
 VERSION = 2

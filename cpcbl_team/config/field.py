@@ -1,0 +1,95 @@
+"""The field: what is known of it before the robots start, and how it is simulated."""
+
+import math
+from typing import Annotated, Literal
+
+import msgspec
+
+from cpcbl_team.config.table import NotNegative, Positive, Table
+
+Gives = Literal["both", "range", "bearing", "none"]
+Bands = tuple[str, str]
+"""The names of two colours, the upper one first."""
+
+
+class Landmark(Table, frozen=True, kw_only=True):
+    """A point whose position in the field's frame is known beforehand."""
+
+    x_m: float
+    y_m: float
+    gives: Gives = "both"
+    """Which measurements of it the robots use."""
+    colours: Bands | None = None
+    """The colour bands of the cylinder that stands there, by which a camera recognises it."""
+
+
+class Wall(Table, frozen=True, kw_only=True):
+    """A straight surface from one point of the field to another."""
+
+    from_m: tuple[float, float]
+    to_m: tuple[float, float]
+    gives: Gives = "both"
+
+    @property
+    def direction_rad(self) -> float:
+        """The direction from the first point to the second, in the field's frame."""
+        return math.atan2(self.to_m[1] - self.from_m[1], self.to_m[0] - self.from_m[0])
+
+
+class Field(Table, frozen=True, kw_only=True):
+    """The map: all landmarks and walls by their names."""
+
+    landmarks: dict[str, Landmark] = msgspec.field(default_factory=dict)
+    walls: dict[str, Wall] = msgspec.field(default_factory=dict)
+
+    def bounds(self) -> tuple[float, float, float, float]:
+        """(least x, least y, greatest x, greatest y) in metres of what is on the map; zeros for an
+        empty map."""
+        points = [(p.x_m, p.y_m) for p in self.landmarks.values()]
+        points += [end for wall in self.walls.values() for end in (wall.from_m, wall.to_m)]
+        if not points:
+            return 0.0, 0.0, 0.0, 0.0
+        xs, ys = [p[0] for p in points], [p[1] for p in points]
+        return min(xs), min(ys), max(xs), max(ys)
+
+
+class SimulationEvent(Table, frozen=True, kw_only=True):
+    """Something that happens on the simulated field: a robot is carried away, or landmarks are
+    hidden."""
+
+    at_s: NotNegative
+    """Robot time since the start of the field."""
+    kidnap: str = ""
+    """The robot that is carried away; its odometry does not notice."""
+    to: tuple[float, float, float] | None = None
+    """Where it is put down: x m, y m, heading deg."""
+    hide_landmarks_s: NotNegative = 0.0
+    """For this time no robot sees a landmark or wall."""
+
+
+class Light(Table, frozen=True, kw_only=True):
+    """The light in the rendered images of the simulated cameras."""
+
+    brightness: Positive = 1.0
+    gradient: Annotated[float, msgspec.Meta(ge=-2.0, le=2.0)] = 0.2
+    """By how much the left of an image is brighter than its right, as a share of the middle."""
+    tint: tuple[Positive, Positive, Positive] = (1.0, 1.0, 1.0)
+    """The factors of blue, green and red."""
+    blur_px: NotNegative = 0.6
+    """The standard deviation of a Gaussian."""
+    noise: NotNegative = 3.0
+    """The standard deviation, in 255 grey levels."""
+
+
+class SimulationSettings(Table, frozen=True, kw_only=True):
+    """The simulated field."""
+
+    step_rate_hz: Positive = 50.0
+    noise: NotNegative = 1.0
+    """The true noise as a multiple of what the robots assume; 0 for none."""
+    bump_radius_m: NotNegative = 0.15
+    light: Light = Light()
+    events: tuple[SimulationEvent, ...] = ()
+    clocks_ahead_s: dict[str, float] = msgspec.field(default_factory=dict)
+    """By how much the clocks of these robots are ahead of the field's. What such a robot senses has
+    time stamps of its own clock."""

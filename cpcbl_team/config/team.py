@@ -1,0 +1,156 @@
+"""A team: its robots and what they share."""
+
+from typing import Annotated, Literal
+
+import msgspec
+
+from cpcbl_team.config.camera import CameraSettings, Side, VisionSettings
+from cpcbl_team.config.collaboration import CollaborationSettings
+from cpcbl_team.config.field import Bands, Field, SimulationSettings
+from cpcbl_team.config.localizer import LocalizerSettings
+from cpcbl_team.config.sensors import OdometrySettings, PositionSensor, SensorSettings
+from cpcbl_team.config.table import NotNegative, Positive, Table
+from cpcbl_team.inputs import Name
+
+Security = Literal["none", "mtls"]
+Source = Literal["simulated", "mrclam", "external"]
+Sensing = Literal["sightings", "camera"]
+
+
+class GuardSettings(Table, frozen=True, kw_only=True):
+    """Limits in the router on what one robot sends, so that it cannot flood the others."""
+
+    enabled: bool = True
+    fix_rate_hz: Positive = 100.0
+    """Of fixes for one teammate. The router drops a fix that follows the last one sooner than
+    1 / rate, and messages come unevenly, so this must be at least twice the sensor's rate."""
+    belief_rate_hz: Positive = 50.0
+    largest_help_bytes: Annotated[int, msgspec.Meta(ge=1)] = 256
+    """The largest payload of a fix or belief."""
+    largest_bytes: Annotated[int, msgspec.Meta(ge=1)] = 65_536
+    """The largest payload of any other message; robots refuse larger ones too."""
+    largest_frame_bytes: Annotated[int, msgspec.Meta(ge=1)] = 1_048_576
+    """The largest payload of a camera's image, plain or annotated."""
+
+
+class TransportSettings(Table, frozen=True, kw_only=True):
+    """The team's Zenoh router."""
+
+    listen: tuple[str, ...] = ()
+    """The endpoints at which `up` opens its router; default: a free port of 127.0.0.1."""
+    connect: tuple[str, ...] = ("tcp/127.0.0.1:7447",)
+    """The endpoints at which a robot looks for the router."""
+    guards: GuardSettings = GuardSettings()
+    security: Security = "none"
+    """mtls: every link is mutual TLS, and a certificate permits only what its owner may do."""
+    keys: Annotated[str, msgspec.Meta(min_length=1)] = "keys"
+    """The folder of the keys that `cpcbl-team keys` makes, relative to the team file."""
+
+    @property
+    def secured(self) -> bool:
+        return self.security == "mtls"
+
+    @property
+    def usual(self) -> tuple[str, ...]:
+        """The endpoints of this machine's router, unless the file names others."""
+        return ("tls/127.0.0.1:7447",) if self.secured else ("tcp/127.0.0.1:7447",)
+
+
+class Start(Table, frozen=True, kw_only=True):
+    """The pose of a robot at the start, in the field's frame. A robot without one searches for its
+    pose."""
+
+    known: bool = True
+    """False: only the simulated field knows it, and the robot searches for its pose."""
+    x_m: float
+    y_m: float
+    heading_deg: float = 0.0
+    sigma_m: NotNegative = 0.05
+    heading_sigma_deg: NotNegative = 3.0
+
+
+class LocalizationSettings(Table, frozen=True, kw_only=True):
+    """The settings that the filter of one robot needs."""
+
+    localizer: LocalizerSettings = LocalizerSettings()
+    sensor: SensorSettings = SensorSettings()
+    position_sensor: PositionSensor | None = None
+    odometry: OdometrySettings = OdometrySettings()
+    collaboration: CollaborationSettings = CollaborationSettings()
+    start: Start | None = None
+
+
+class RobotSettings(LocalizationSettings, frozen=True, kw_only=True):
+    """One robot of a team: the keys of its type and its own, over the team's defaults."""
+
+    source: Source = "simulated"
+    sensing: Sensing = "sightings"
+    """camera: the robot finds its sightings in images; otherwise they come as messages."""
+    camera: CameraSettings = CameraSettings()
+    markers: dict[Side, int] = msgspec.field(default_factory=dict)
+    """The markers that it carries, by which teammates' cameras recognise it."""
+    colours: Bands | None = None
+    """Colour bands on a mast: they are visible from farther away, but without the heading."""
+    waypoints_m: tuple[tuple[float, float], ...] = ()
+    """Simulated robots drive loops through these points, and steer by their own estimates."""
+    speed_m_s: NotNegative = 0.5
+
+
+class MatchSettings(Table, frozen=True, kw_only=True):
+    """A limit for a whole match, as in RoboCup: 1,200 messages a team."""
+
+    messages: Annotated[int, msgspec.Meta(ge=0)] = 0
+    """Fixes and beliefs of all robots; 0: no limit. Each robot gets its share beforehand."""
+    duration_s: Positive = 1200.0
+    """The messages are earned evenly over this time."""
+
+
+class GuestSettings(Table, frozen=True, kw_only=True):
+    """Robots that are not in the file but may join the team while it runs, such as observers."""
+
+    allowed: bool = True
+    most: Annotated[int, msgspec.Meta(ge=1, le=100)] = 8
+    """A robot, and the simulated field, accept this many at a time."""
+
+
+class Team(Table, frozen=True, kw_only=True):
+    """A team file with its layers merged."""
+
+    name: Name
+    robots: dict[str, RobotSettings]
+    map: Field = Field()
+    vision: VisionSettings = VisionSettings()
+    transport: TransportSettings = TransportSettings()
+    match: MatchSettings = MatchSettings()
+    simulation: SimulationSettings = SimulationSettings()
+    guests: GuestSettings = GuestSettings()
+    defaults: RobotSettings = RobotSettings()
+    """The settings of a robot that the file does not name, with which a guest begins."""
+    calibrated_on: tuple[str, ...] = ()
+    """The logs from which `calibrate` estimated the robots' types. Results on these logs do not
+    show how good a calibration is."""
+    data: str = ""
+    """The folder of the log, for robots whose source is `mrclam`."""
+
+    @property
+    def simulated(self) -> bool:
+        """Whether the team needs a simulated field."""
+        return any(robot.source == "simulated" for robot in self.robots.values())
+
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        """The robots that find their sightings in images."""
+        return tuple(name for name, robot in self.robots.items() if robot.sensing == "camera")
+
+    @property
+    def renders(self) -> bool:
+        """Whether the simulated field must render images."""
+        return any(self.robots[name].source == "simulated" for name in self.cameras)
+
+    def messages_per_s(self, robot: str) -> float | None:
+        """The rate at which a robot earns its share of the match's messages; None: no limit."""
+        if not self.match.messages:
+            return None
+        weights = {name: r.collaboration.budget.match_share for name, r in self.robots.items()}
+        share = weights[robot] / (sum(weights.values()) or 1.0)
+        return share * self.match.messages / self.match.duration_s
