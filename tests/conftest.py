@@ -6,6 +6,7 @@ from collections.abc import Iterator
 import pytest
 from hypothesis import HealthCheck, settings
 from support.children import adopt_orphans, children, end
+from support.processes import eventually
 
 REAL = {"subprocess", "cpcbl_team", "patient_up", "PROGRAM", "open_bus", "open_router", "running"}
 
@@ -38,6 +39,11 @@ def no_process_outlives_its_module() -> Iterator[None]:
     """Ends the processes that are left after the tests and fixtures of a module, and says so."""
     before = set(children())
     yield
-    left = {pid: command for pid, command in children().items() if pid not in before}
-    end(left)
-    assert not left, f"processes that outlived their tests: {left}"
+
+    def left() -> dict[int, str]:
+        return {pid: command for pid, command in children().items() if pid not in before}
+
+    eventually(lambda: not left(), 5.0)  # a process that is ending may still be closing its session
+    outlived = left()
+    end(outlived)
+    assert not outlived, f"processes that outlived their tests: {outlived}"
