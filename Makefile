@@ -24,8 +24,7 @@ test: check unit
 # The core and what runs in memory: no process, no Zenoh session, no camera, no experiment.
 quick: setup
 	$(BIN)/pytest -n 2 -q -m "$(USUAL) and not process" tests/core tests/net tests/transport \
-	  tests/agents tests/launch/simulation tests/launch/reporting --ignore tests/agents/vision \
-	  --ignore tests/launch/simulation/test_simulated_consistency.py
+	  tests/agents tests/launch/reporting --ignore tests/agents/vision
 
 check: setup
 	$(BIN)/ruff format --check
