@@ -43,8 +43,9 @@ class Covariance2(NamedTuple):
 
     def mahalanobis_squared(self, dx: float, dy: float) -> float:
         """d^T C^-1 d. Raises ZeroDivisionError when singular."""
-        adjugate = self.yy * dx * dx - 2.0 * self.xy * dx * dy + self.xx * dy * dy
-        return adjugate / self.determinant()
+        return (
+            self.yy * dx * dx - 2.0 * self.xy * dx * dy + self.xx * dy * dy
+        ) / self.determinant()
 
 
 def oriented_covariance(sigma_major: float, sigma_minor: float, angle: float) -> Covariance2:
@@ -71,8 +72,11 @@ def width_per_m(bearing_sigma: float) -> float:
 def sighting_gaussian(
     range_m: float, bearing: float, range_sigma_m: float, bearing_sigma: float
 ) -> Gaussian2:
-    """A sighting as a Gaussian in the robot's frame, the major axis along the line of sight. x = r
-    cos a, y = r sin a (equation 1); sigma_maj = sigma_r, sigma_min = r sin sigma_a (equation 2)."""
+    """A sighting as a Gaussian in the robot's frame, the major axis along the line of sight.
+
+    x = r cos a, y = r sin a (equation 1); sigma_maj = sigma_r, sigma_min = r sin sigma_a (equation
+    2).
+    """
     across_m = range_m * width_per_m(bearing_sigma)
     x, y = range_m * math.cos(bearing), range_m * math.sin(bearing)
     return Gaussian2(x, y, oriented_covariance(range_sigma_m, across_m, bearing))
