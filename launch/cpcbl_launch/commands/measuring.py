@@ -33,6 +33,13 @@ WithBaselines = Annotated[
         help="Also run dead reckoning, a solo EKF per robot, a centralized EKF.",
     ),
 ]
+WithBatch = Annotated[
+    bool,
+    Option(
+        "--batch",
+        help="The same, and batch least squares over the whole log: the ceiling of any filter.",
+    ),
+]
 ExportFolder = Annotated[
     Path | None,
     Option(
@@ -55,6 +62,7 @@ def evaluate_mrclam(
     match_messages: options.MatchMessages = None,
     duration: Annotated[float | None, Option(help="Seconds of the log; default: all.")] = None,
     baselines: WithBaselines = False,
+    batch: WithBatch = False,
     export: ExportFolder = None,
     as_json: options.AsJson = False,
 ) -> None:
@@ -71,7 +79,7 @@ def evaluate_mrclam(
     logged = logged._replace(team=with_blind_robots(logged.team, options.parse_names(blind)))
     logged = logged_team.with_duration(logged, duration)
     with progress_bar(f"{data.name}", quiet=as_json) as progress:
-        result, paths = evaluate_log(logged, progress, with_baselines=baselines)
+        result, paths = evaluate_log(logged, progress, with_baselines=baselines, with_batch=batch)
     lost: dict[str, str] = {}
     if export is not None:
         lost = write_or_reason(export, partial(export_tum, export, paths, logged.truth))

@@ -131,7 +131,7 @@ class Report(msgspec.Struct, frozen=True, kw_only=True):
     guests: dict[str, GuestReport] = {}
     """Robots that the team file does not name; no part of the team's figures."""
     yardsticks: dict[str, BaselineReport] = {}
-    """dead_reckoning, solo_ekf, centralized_ekf, where they were asked for."""
+    """dead_reckoning, solo_ekf, centralized_ekf, batch_least_squares, where they were asked for."""
 
 
 M = TypeVar("M", bound=Tagged)

@@ -14,8 +14,9 @@ from support.noisy_logs import KINDS, ODOMETRY, ROBOTS, SENSOR
 from support.processes import command_line, cpcbl_team
 
 from cpcbl_agents.sources.mrclam import read_table
+from cpcbl_launch.lab.baselines import baseline_inputs
+from cpcbl_launch.lab.batch import smooth
 from cpcbl_launch.lab.evaluation import (
-    baseline_inputs,
     baseline_report,
     evaluate_log,
     run_baselines,
@@ -173,6 +174,54 @@ def test_without_sightings_of_robots_the_centralized_filter_is_many_solo_filters
         np.testing.assert_allclose(together.covariance, alone.covariance, atol=1e-9)
 
 
+# Batch least squares -----------------------------------------------------------------------------
+
+
+def batch_of(logged: LoggedTeam) -> dict[str, BaselineReport]:
+    """The report of the batch, at the times of the filters."""
+    stamps = range(logged.start_ns, logged.end_ns, 100_000_000)
+    names = dict.fromkeys(logged.team.robots, stamps)
+    paths = smooth(baseline_inputs(logged), logged.team.map, names)
+    return {"batch_least_squares": baseline_report(paths, logged.truth)}
+
+
+def test_the_batch_has_no_error_without_noise(tmp_path: Path) -> None:
+    write_log(tmp_path, ROBOTS, 20.0)
+    logged = load_logged_team(log_team(*ROBOTS), tmp_path)
+    report = batch_of(logged._replace(team=with_blind_robots(logged.team, ["2"])))
+    for robot in report["batch_least_squares"].robots.values():
+        assert robot.samples == 200
+        assert robot.position_max_m == pytest.approx(0.0, abs=1e-6)
+
+
+def test_the_batch_is_the_ceiling_and_consistent(
+    tmp_path: Path, runs: list[dict[str, BaselineReport]]
+) -> None:
+    """It knows the future: better than the centralized EKF in each run, with a NEES of 2."""
+    batches = []
+    for seed in range(5):
+        (tmp_path / str(seed)).mkdir()
+        batches.append(batch_of(noisy_log(tmp_path / str(seed), seed))["batch_least_squares"])
+    for batch, run in zip(batches, runs, strict=True):
+        assert figure(batch) < 0.9 * figure(run["centralized_ekf"])
+    assert np.mean([figure(batch, "nees") for batch in batches]) == pytest.approx(2.0, abs=0.4)
+
+
+def test_the_batch_bears_wrong_sightings(tmp_path: Path) -> None:
+    """Every twentieth range is 3 m too long: the error stays below that of the filter."""
+    logged = noisy_log(tmp_path, 9, 20.0)
+
+    def lengthened(rows: Floats) -> Floats:
+        rows[::20, 2] += 3.0
+        return rows
+
+    for robot in ROBOTS:
+        rewrite_table(tmp_path / f"Robot{robot}_Measurement.dat", lengthened, 4)
+    wrong = with_start_poses(load_logged_team(logged.team, tmp_path))
+    clean = figure(batch_of(logged)["batch_least_squares"])
+    assert figure(batch_of(wrong)["batch_least_squares"]) < 1.5 * clean
+
+
 # Settings ----------------------------------------------------------------------------------------
 
 
@@ -277,9 +326,12 @@ def test_the_table_of_baselines_fits_and_is_shown_on_demand(tmp_path: Path) -> N
     write_log(tmp_path, ROBOTS, 3.0)
     plain, compared_ = (
         cpcbl_team("evaluate", "mrclam", tmp_path, "--team", "mrclam-uncalibrated", *options)
-        for options in ((), ("--yardstick",))
+        for options in ((), ("--batch",))
     )
-    for words in ("dead reckoning", "solo EKF", "centralized EKF", "this team"):
+    for words in (
+        *("dead reckoning", "solo EKF", "centralized EKF"),
+        *("batch least squares", "this team"),
+    ):
         assert words in compared_.stdout
         assert words not in plain.stdout
     assert max(map(len, compared_.stdout.splitlines())) <= 80

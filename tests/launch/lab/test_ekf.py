@@ -8,7 +8,7 @@ import pytest
 from support.core import LOOP_START, diagonal, driven, loop
 from support.noisy_logs import ODOMETRY, SENSOR
 
-from cpcbl_launch.lab.evaluation import BaselineInputs, Ekf, expected_sighting
+from cpcbl_launch.lab.baselines import BaselineInputs, Ekf, expected_sighting
 from cpcbl_launch.reporting.metrics import Floats
 from cpcbl_team.config import Field, OdometrySettings, RobotSettings
 from cpcbl_team.estimate import Estimate
