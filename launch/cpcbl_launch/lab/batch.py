@@ -45,13 +45,14 @@ class _Used(NamedTuple):
 
 
 class _Filtered(NamedTuple):
-    """One step of the forward pass: before and after its sightings, and the motion's Jacobian."""
+    """One step of the forward pass: before and after its sightings, and the motion before it."""
 
     predicted: Floats
     predicted_covariance: Floats
     mean: Floats
     covariance: Floats
-    jacobian: Floats
+    jacobian: Floats  # of the motion
+    noise: Floats  # of the motion
 
 
 def smooth(
@@ -154,7 +155,7 @@ def _filter_forwards(
         predicted, around = (mean, covariance), path[k]
         for sighting in frame:
             mean, covariance = _update(inputs, field, sighting, around, mean, covariance)
-        steps.append(_Filtered(*predicted, mean, covariance, jacobian))
+        steps.append(_Filtered(*predicted, mean, covariance, jacobian, noise))
     return steps
 
 
@@ -181,7 +182,10 @@ def _update(
     cross = covariance[:, columns] @ m.jacobian.T
     gain = cross @ np.linalg.inv(m.jacobian @ cross[columns] + np.diag(noise))
     innovation = m.innovation - m.jacobian @ (mean - around.ravel())[columns]
-    return mean + gain @ innovation, covariance - gain @ cross.T
+    rest = np.eye(len(mean))
+    rest[:, columns] -= gain @ m.jacobian
+    covariance = rest @ covariance @ rest.T + gain * noise @ gain.T  # never indefinite (Joseph)
+    return mean + gain @ innovation, covariance
 
 
 def _smooth_backwards(steps: Sequence[_Filtered]) -> tuple[Floats, Floats]:
@@ -191,7 +195,8 @@ def _smooth_backwards(steps: Sequence[_Filtered]) -> tuple[Floats, Floats]:
     for now, then in zip(steps[-2::-1], steps[:0:-1], strict=True):
         gain = np.linalg.solve(then.predicted_covariance, then.jacobian @ now.covariance).T
         mean = now.mean + gain @ (mean - then.predicted)
-        covariance = now.covariance + gain @ (covariance - then.predicted_covariance) @ gain.T
+        rest = np.eye(len(mean)) - gain @ then.jacobian  # never indefinite, as Joseph's form
+        covariance = rest @ now.covariance @ rest.T + gain @ (covariance + then.noise) @ gain.T
         means.append(mean)
         covariances.append(covariance)
     return np.array(means[::-1]), np.array(covariances[::-1])
