@@ -45,8 +45,10 @@ def with_overrides(team: Team, overrides: Overrides) -> Team:
     return replace(team, robots=robots)
 
 
-def with_blind_robots(team: Team, blind: Collection[str]) -> Team:
-    """The team with some robots blind to landmarks. Raises InputError for an unknown name."""
+def with_blind_robots(team: Team, blind: Collection[str], absent: Collection[str] = ()) -> Team:
+    """The team with some robots blind to landmarks; `absent` robots may be among them. Raises
+    InputError for an unknown name."""
+    blind = [name for name in blind if name not in absent]
     require_robots("--blind", blind, team)
     robots = dict(team.robots)
     for name in blind:

@@ -61,6 +61,9 @@ def evaluate_mrclam(
     messages_per_minute: options.MessagesPerMinute = None,
     match_messages: options.MatchMessages = None,
     duration: Annotated[float | None, Option(help="Seconds of the log; default: all.")] = None,
+    unknown_starts: Annotated[
+        bool, Option("--unknown-starts", help="Robots do not know where they start.")
+    ] = False,
     baselines: WithBaselines = False,
     batch: WithBatch = False,
     export: ExportFolder = None,
@@ -76,8 +79,10 @@ def evaluate_mrclam(
     overrides = Overrides(*budgets, variant, collaboration, fusion, direction)
     team = with_overrides(find_team(team_file or logged_team.builtin_for(data)), overrides)
     logged = logged_team.load_logged_team(team, data)
-    logged = logged._replace(team=with_blind_robots(logged.team, options.parse_names(blind)))
-    logged = logged_team.with_duration(logged, duration)
+    blind_team = with_blind_robots(logged.team, options.parse_names(blind), logged.left_out)
+    logged = logged_team.with_duration(logged._replace(team=blind_team), duration)
+    if unknown_starts:
+        logged = logged_team.with_unknown_starts(logged)
     with progress_bar(f"{data.name}", quiet=as_json) as progress:
         result, paths = evaluate_log(logged, progress, with_baselines=baselines, with_batch=batch)
     lost: dict[str, str] = {}

@@ -84,7 +84,8 @@ def up(
     budgets = Overrides(bytes_per_s, messages_per_minute, match_messages)
     run = _run_of(file, duration, data, budgets)
     run = run._replace(speed=speed, seed=seed, folder=logs, picture=picture, record=record)
-    run = run._replace(team=with_blind_robots(run.team, options.parse_names(blind)))
+    blind_team = with_blind_robots(run.team, options.parse_names(blind), run.left_out)
+    run = run._replace(team=blind_team)
     if robots:
         run = run._replace(here=_robots_here(robots, run.team))
     console = Console(stderr=as_json)

@@ -24,7 +24,7 @@ from cpcbl_launch.reporting.recorder import (
 )
 from cpcbl_launch.run.logged_team import LoggedTeam, is_calibrated_on
 from cpcbl_launch.simulation.in_process import Progress, robot_nodes, run_nodes
-from cpcbl_team.config import Field
+from cpcbl_team.config import Field, Team
 from cpcbl_transport.memory_bus import MemoryHub
 
 
@@ -59,6 +59,7 @@ def evaluate_log(
         calibrated_on=team.calibrated_on,
         seen_before=is_calibrated_on(team, Path(team.data)),
         left_out=logged.left_out,
+        starts=starts_text(team),
         duration_s=(end_ns - start_ns) * 1e-9,
     )
     own = {name: recorder.trajectory(name) for name in team.robots}
@@ -76,6 +77,17 @@ def evaluate_log(
         others["batch_least_squares"] = batch
     figures = {kind: baseline_report(paths, logged.truth) for kind, paths in others.items()}
     return LogEvaluation(replace(report, yardsticks=figures), {"estimate": own, **others})
+
+
+def starts_text(team: Team) -> str:
+    """What the robots know of their start poses."""
+    known = [robot.start for robot in team.robots.values() if robot.start is not None]
+    if not known:
+        return "no robot knew where it started"
+    sigmas_m = sorted({round(start.sigma_m, 2) for start in known})
+    sigma = " to ".join(f"{s:.2f}" for s in {sigmas_m[0]: 0, sigmas_m[-1]: 0})
+    some = "robots" if len(known) == len(team.robots) else f"{len(known)} robots"
+    return f"{some} started at the true pose, with a σ of {sigma} m"
 
 
 def run_baselines(

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 Stamps = NDArray[np.int64]
-NEAR_S = 2.5  # truth counts so near one of its rows
+NEAR_S = 0.15  # truth counts so near one of its rows
 
 
 class Score(msgspec.Struct, frozen=True, kw_only=True):
@@ -29,6 +29,10 @@ class Score(msgspec.Struct, frozen=True, kw_only=True):
     """Share of samples with a Mahalanobis distance of the position of at most 3 (98.9 % due)."""
     nees: float | None = None
     """Mean normalized estimation error squared of the position (2 is consistent)."""
+    heading_nees: float | None = None
+    """The same of the heading (1 is consistent)."""
+    scored_share: float | None = None
+    """Of the estimates, those with truth near enough in time."""
 
 
 class Trajectory(NamedTuple):
@@ -50,6 +54,7 @@ class Samples(NamedTuple):
     estimate: Floats
     truth: Floats
     covariance: Floats | None  # xx, xy, yy, xh, yh, hh; None: the variant has none
+    share: float | None = None  # of the estimates: those that have truth
 
 
 def seconds(stamps_ns: Stamps) -> Floats:
@@ -63,7 +68,8 @@ def samples_with_truth(trajectory: Trajectory, truth: Floats | None) -> tuple[St
         return trajectory.stamps_ns[:0], Samples(nothing, nothing, None)
     at, counts = interpolated_truth(seconds(trajectory.stamps_ns), truth)
     stamps_ns, estimate, covariance = trajectory.part(counts)
-    return stamps_ns, Samples(estimate, at[counts], covariance)
+    share = float(np.mean(counts)) if len(counts) else None
+    return stamps_ns, Samples(estimate, at[counts], covariance, share)
 
 
 def position_errors(samples: Samples) -> Floats:
@@ -91,11 +97,19 @@ def position_nees(samples: Samples) -> Floats | None:
     return np.asarray(top / det)
 
 
+def heading_nees(samples: Samples) -> Floats | None:
+    """Squared errors of the heading over their variance, shape (n,); None without covariance."""
+    if samples.covariance is None:
+        return None
+    return np.asarray(heading_errors(samples) ** 2 / (samples.covariance[:, 5] + 1e-12))
+
+
 def score(samples: Samples) -> Score:
     """The figures of one robot; None where there was nothing to compare."""
     if not len(samples.estimate):
-        return Score(samples=0)
+        return Score(samples=0, scored_share=samples.share)
     errors, nees = position_errors(samples), position_nees(samples)
+    of_heading = heading_nees(samples)
     return Score(
         samples=len(errors),
         position_rmse_m=_rms(errors),
@@ -104,6 +118,8 @@ def score(samples: Samples) -> Score:
         heading_rmse_deg=math.degrees(_rms(heading_errors(samples))),
         inside_3_sigma=None if nees is None else float(np.mean(nees <= 9.0)),
         nees=None if nees is None else float(nees.mean()),
+        heading_nees=None if of_heading is None else float(of_heading.mean()),
+        scored_share=samples.share,
     )
 
 

@@ -89,14 +89,19 @@ class GuestReport(RobotReport, frozen=True, kw_only=True):
 
 
 class MeanScore(msgspec.Struct, frozen=True, kw_only=True):
-    """Means over the robots that could be scored."""
+    """Means over the robots that could be scored, but for what says otherwise."""
 
     position_rmse_m: float | None
     position_mean_m: float | None
     position_max_m: float | None
+    """The largest of all."""
     heading_rmse_deg: float | None
     inside_3_sigma: float | None
     nees: float | None
+    heading_nees: float | None
+    scored_share: float | None
+    pooled_rmse_m: float | None
+    """Of the positions of all robots together: a robot with more samples counts for more."""
 
 
 class TeamReport(MeanScore, frozen=True, kw_only=True):
@@ -124,6 +129,7 @@ class Report(msgspec.Struct, frozen=True, kw_only=True):
     seen_before: bool = False  # whether this log is one of them, so that the figures are too good
     left_out: dict[str, str] = {}  # robots that could not take part, with the reason
     duration_s: float = 0.0
+    starts: str = ""  # what robots knew of their start poses, on a log
     restarts: dict[str, int] = {}
     refused: dict[str, int] = {}  # messages that the recorder could not use, by reason
     not_written: dict[str, str] = {}  # files that could not be written, with the reason
@@ -307,11 +313,17 @@ def _learned_report(statuses: Sequence[Status]) -> LearnedReport | None:
 
 
 def mean_score(scores: Iterable[Score]) -> MeanScore:
-    """Figures of a team: the mean of those of its robots."""
-    known = list(scores)
+    """Figures of a team: the mean of those of its robots, their maximum, the pooled RMSE."""
+    known = [s for s in scores if s.position_rmse_m is not None]
 
     def mean(name: str) -> float | None:
         values = [value for s in known if (value := getattr(s, name)) is not None]
         return float(np.mean(values)) if values else None
 
-    return MeanScore(**{name: mean(name) for name in MeanScore.__struct_fields__})
+    means = {n: mean(n) for n in MeanScore.__struct_fields__ if n != "pooled_rmse_m"}
+    if known:
+        squares = [(s.position_rmse_m or 0.0) ** 2 for s in known]
+        pooled = float(np.average(squares, weights=[s.samples for s in known]))
+        means["position_max_m"] = max(s.position_max_m or 0.0 for s in known)
+        return MeanScore(**means, pooled_rmse_m=math.sqrt(pooled))
+    return MeanScore(**means, pooled_rmse_m=None)

@@ -86,6 +86,15 @@ def with_duration(logged: LoggedTeam, duration_s: float | None) -> LoggedTeam:
     return logged._replace(end_ns=min(logged.end_ns, logged.start_ns + int(duration_s * 1e9)))
 
 
+def with_unknown_starts(logged: LoggedTeam) -> LoggedTeam:
+    """The same log, on which no robot knows where it starts."""
+    robots = {
+        name: msgspec.structs.replace(robot, start=None)
+        for name, robot in logged.team.robots.items()
+    }
+    return logged._replace(team=msgspec.structs.replace(logged.team, robots=robots))
+
+
 def _start(folder: Path, robot: str, truth: Floats) -> Start | None:
     """The true pose at the start of a robot's odometry, or None where truth begins long after it.
 

@@ -205,6 +205,15 @@ def _remarks(report: Report) -> Iterator[str]:
         yield "Column before is the RMSE before teammates began to help, the others since then."
     yield "Columns out and B count fixes and beliefs that were sent, and their bytes."
     yield "For reference: a consistent filter has 98.9 % in 3 σ and a NEES of 2."
+    team = report.team
+    if team.pooled_rmse_m is not None:
+        pooled = f"All samples together: RMSE {team.pooled_rmse_m:.3f} m"
+        nees = f"; NEES of the heading {number(team.heading_nees, 1)} (1 is due)"
+        yield f"{pooled}{nees if team.heading_nees is not None else ''}."
+    if team.scored_share is not None and team.scored_share < 0.995:
+        yield f"Truth is known for {team.scored_share:.0%} of the estimates; the rest has no score."
+    if report.starts:
+        yield f"At the start: {report.starts}."
     if report.calibrated_on:
         too_good = " (also on this log: the figures are too good)" if report.seen_before else ""
         yield f"The robots were calibrated on {', '.join(report.calibrated_on)}{too_good}."

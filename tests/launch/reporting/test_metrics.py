@@ -4,7 +4,16 @@ import numpy as np
 import pytest
 from support.core import Matrix
 
-from cpcbl_launch.reporting.metrics import Samples, interpolated_truth, position_nees, score
+from cpcbl_launch.reporting.metrics import (
+    Samples,
+    Score,
+    Trajectory,
+    interpolated_truth,
+    position_nees,
+    samples_with_truth,
+    score,
+)
+from cpcbl_launch.reporting.recorder import mean_score
 
 TRUTH = np.array([[0.0, 0.0, 0.0], [1.0, 2.0, 3.1], [2.0, 2.0, -1.0]])
 OFFSETS = np.array([[0.3, 0.4, 0.1], [0.0, 0.0, 0.1], [0.0, -0.6, -0.2]])
@@ -23,7 +32,25 @@ def test_a_score_is_what_its_fields_say() -> None:
     assert found.position_max_m == pytest.approx(0.6)
     assert found.heading_rmse_deg == pytest.approx(math.degrees(math.sqrt(0.06 / 3)))
     assert found.nees == pytest.approx((0.25 + 0.36) / 0.09 / 3)
+    assert found.heading_nees == pytest.approx(0.06 / 3 / 0.01)
     assert found.inside_3_sigma == 1.0
+
+
+@pytest.mark.parametrize(("off", "inside"), [(2.999, 1.0), (3.001, 0.0)])
+def test_three_sigma_are_three(off: float, inside: float) -> None:
+    """Not the 3.44 that hold 99.7 % of a Gaussian in the plane."""
+    beside = np.array([[0.1 * off, 0.0, 0.0]])
+    assert score(Samples(beside, 0.0 * beside, SIGMA_01[:1])).inside_3_sigma == inside
+
+
+def test_a_team_has_the_largest_error_of_all_and_the_rmse_of_all_samples() -> None:
+    one = Score(samples=1, position_rmse_m=0.5, position_max_m=0.5, nees=1.0)
+    many = Score(samples=3, position_rmse_m=0.1, position_max_m=0.3, nees=2.0)
+    team = mean_score([one, many, Score(samples=0)])
+    assert (team.position_max_m, team.nees) == (0.5, 1.5)
+    assert team.position_rmse_m == pytest.approx(0.3)
+    assert team.pooled_rmse_m == pytest.approx(math.sqrt((0.25 + 3 * 0.01) / 4))
+    assert mean_score([Score(samples=0)]).pooled_rmse_m is None
 
 
 def test_the_share_inside_3_sigma_is_by_mahalanobis_distance() -> None:
@@ -68,20 +95,28 @@ def test_the_nees_is_the_quadratic_form(xy: float) -> None:
 
 def test_truth_is_interpolated_the_short_way_round() -> None:
     truth = np.array([[0.0, 0.0, 0.0, 3.0], [2.0, 4.0, -2.0, -3.0]])
-    at, counts = interpolated_truth(np.array([1.0]), truth)
-    assert counts.all()
+    at, _ = interpolated_truth(np.array([1.0]), truth)
     np.testing.assert_allclose(at[0, :2], [2.0, -1.0])
     assert math.remainder(at[0, 2] - math.pi, math.tau) == pytest.approx(0.0)
 
 
-def test_truth_counts_within_two_and_a_half_seconds_of_a_row() -> None:
+def test_truth_counts_near_a_row() -> None:
+    """Between rows that are far apart a robot may have been anywhere."""
     truth = np.array([[10.0, 1.0, 2.0, 0.0], [30.0, 1.0, 2.0, 0.0]])
-    times = np.array([7.4, 7.6, 10.0, 12.4, 12.6, 20.0, 27.6, 32.4, 32.6])
+    times = np.array([9.8, 9.9, 10.0, 10.1, 10.2, 20.0, 29.9, 30.1, 30.2])
     _, counts = interpolated_truth(times, truth)
     assert counts.tolist() == [False, True, True, True, False, False, True, True, False]
 
 
+def test_a_score_says_how_much_of_it_has_truth() -> None:
+    truth = np.array([[10.0, 0.0, 0.0, 0.0]])
+    stamps_ns = np.array([10.0, 10.1, 11.0, 12.0]) * 1e9
+    path = Trajectory(stamps_ns.astype(np.int64), np.zeros((4, 3)), None)
+    found = score(samples_with_truth(path, truth)[1])
+    assert (found.samples, found.scored_share) == (2, 0.5)
+
+
 def test_one_row_of_truth_is_enough_near_it() -> None:
-    at, counts = interpolated_truth(np.array([0.5, 4.0]), np.array([[1.0, 5.0, 6.0, 0.1]]))
+    at, counts = interpolated_truth(np.array([0.9, 4.0]), np.array([[1.0, 5.0, 6.0, 0.1]]))
     np.testing.assert_allclose(at[0], [5.0, 6.0, 0.1])
     assert counts.tolist() == [True, False]

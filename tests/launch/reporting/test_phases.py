@@ -49,7 +49,7 @@ class Said:
 
 
 def standing_at_origin() -> Floats:
-    return np.array([(t, 0.0, 0.0, 0.0) for t in range(101)])
+    return np.array([(0.1 * t, 0.0, 0.0, 0.0) for t in range(1001)])
 
 
 @pytest.mark.parametrize(

@@ -23,6 +23,7 @@ from cpcbl_launch.run.logged_team import (
     is_calibrated_on,
     load_logged_team,
     with_duration,
+    with_unknown_starts,
 )
 from cpcbl_launch.team_file import builtin_path, load_team
 from cpcbl_launch.views.run import print_report
@@ -75,6 +76,24 @@ def test_robots_without_a_log_are_left_out_by_name(tmp_path: Path) -> None:
         "2": "no Robot2_Odometry.dat, Robot2_Measurement.dat, Robot2_Groundtruth.dat"
     }
     assert report(on, 1.0)["left_out"] == on.left_out
+
+
+def test_a_robot_that_is_left_out_may_be_blind(tmp_path: Path) -> None:
+    on = logged(tmp_path, "1", "3", "4", "5")
+    team = with_blind_robots(on.team, ["2", "3"], on.left_out)
+    assert [n for n, r in team.robots.items() if not r.sensor.sees_landmarks] == ["3"]
+    with pytest.raises(InputError, match="has no robot 9"):
+        with_blind_robots(on.team, ["2", "9"], on.left_out)
+
+
+def test_robots_find_themselves_on_a_log_whose_starts_they_do_not_know(tmp_path: Path) -> None:
+    on = logged(tmp_path)
+    assert report(on, 1.0)["starts"] == "robots started at the true pose, with a σ of 0.05 m"
+    figures = report(with_unknown_starts(on))
+    assert figures["starts"] == "no robot knew where it started"
+    for robot in figures["robots"].values():
+        assert robot["lost_at_end"] == ""
+        assert robot["counts"]["found_again"] == 1
 
 
 def start_with_truth_after(folder: Path, seconds: float) -> Start | None:
@@ -205,7 +224,9 @@ def test_times_far_from_any_truth_are_not_scored(tmp_path: Path) -> None:
     truth = {name: rows[rows[:, 0] < EPOCH_MS * 1e-3 + 2.0] for name, rows in on.truth.items()}
     everywhere, scored = (report(x)["robots"]["1"] for x in (on, on._replace(truth=truth)))
     assert everywhere["samples"] == pytest.approx(100, abs=2)
-    assert scored["samples"] == pytest.approx(45, abs=2)
+    assert scored["samples"] == pytest.approx(21, abs=2)
+    assert everywhere["scored_share"] == pytest.approx(1.0, abs=0.02)
+    assert scored["scored_share"] == pytest.approx(0.21, abs=0.02)
 
 
 def test_the_report_has_the_promised_keys(tmp_path: Path) -> None:
