@@ -8,7 +8,7 @@ a parallel line (figure 3). Every constraint is linearized at the same prior:
 `row` is the normal of the curve at its point closest to the prior (figure 1 c); where the heading
 matters, the row's third entry is its lever (docs/paper.md, resolution a).
 
-`circle`, `ray` and `heading` are the formulas. They take (dx, dy), the object's position minus the
+`circle` and `heading` are the formulas. They take (dx, dy), the object's position minus the
 robot's in the field's frame (m), and return plain numbers, for the loop over landmarks; the other
 functions return a `Constraint`.
 """
@@ -17,27 +17,18 @@ import math
 from math import cos, sin
 from typing import Final, NamedTuple
 
-from cpcbl_team.estimate import Row
+from cpcbl_team.estimate import Covariance3, Row
 from cpcbl_team.gaussian import width_per_m
 from cpcbl_team.geometry import Pose2, wrap_angle
 
 _atan2: Final = math.atan2  # compiled code finds a constant faster than a global name
 NEAREST_M: Final = 1e-3  # nearer than this a direction means nothing
+FARTHEST_RAD: Final = 0.5 * math.pi  # the object of a ray is not behind the robot
 
 
 def circle(dx: float, dy: float, distance_m: float, range_m: float) -> Row:
     """The circle of a range: its unit normal (u, v), and the residual (m)."""
     return -dx / distance_m, -dy / distance_m, range_m - distance_m
-
-
-def ray(dx: float, dy: float, direction: float) -> tuple[float, float, float, float]:
-    """The ray to an object that is visible in this direction of the field (rad).
-
-    Returns its unit normal (u, v), the object's distance along the ray (m; negative: the object is
-    behind the robot, and no ray passes there), and the residual (m).
-    """
-    c, s = cos(direction), sin(direction)
-    return -s, c, c * dx + s * dy, c * dy - s * dx
 
 
 def heading(dx: float, dy: float, distance_squared: float, bearing: float, prior: float) -> Row:
@@ -50,6 +41,43 @@ def heading(dx: float, dy: float, distance_squared: float, bearing: float, prior
     return -dy / distance_squared, dx / distance_squared, residual
 
 
+CURVED_SHARE: Final = 1e-3
+"""Below this ratio of the position's variance to the squared distance, curves count as straight."""
+
+
+def curvature(prior: Covariance3, dx: float, dy: float) -> tuple[float, float]:
+    """The mean squares of what a linear range (m^2) and a linear bearing (rad^2) leave out.
+
+    With the prior's errors a across and r along the line of sight, and the distance d, these are
+    a^2 / 2 d and a r / d^2: the second-order terms (Jazwinski 1970, section 9.3).
+    """
+    xx, xy, yy, _, _, _ = prior
+    squared = dx * dx + dy * dy
+    along = (dx * dx * xx + 2.0 * dx * dy * xy + dy * dy * yy) / squared
+    across = xx + yy - along
+    common = (dx * dy * (yy - xx) + (dx * dx - dy * dy) * xy) / squared
+    of_range = 0.75 * across * across / squared
+    of_bearing = (along * across + 2.0 * common * common) / (squared * squared)
+    return of_range, of_bearing
+
+
+def curved_variance(variance: float, predicted: float, curvature: float) -> float:
+    """The variance with which a measurement counts whose linear form is wrong within the prior.
+
+    `predicted` is the variance of the measurement that the prior predicts, H P H^T. What the linear
+    form leaves out is the same in each repetition while the robot stands, so that part of the
+    prior's variance stays (as that of a considered state; Schmidt 1966), and only the rest is
+    reduced. Infinite if there is no rest.
+    """
+    if curvature <= 0.01 * predicted:
+        return variance
+    rest = predicted - curvature
+    if rest <= 0.0:
+        return math.inf
+    after = curvature + rest * variance / (rest + variance)
+    return after * predicted / (predicted - after)
+
+
 class Constraint(NamedTuple):
     """One scalar constraint on a pose, relative to an object: if that moves, the curve moves."""
 
@@ -59,6 +87,11 @@ class Constraint(NamedTuple):
     distance_m: float  # robot to object; non-probabilistic weights are its inverse
     on_heading: bool
     place_row: tuple[float, float]  # how the residual follows an error in the object's position
+
+    @property
+    def is_bearing(self) -> bool:
+        """Whether the heading matters: not for ranges and distances, nor where it is ignored."""
+        return self.row[2] != 0.0
 
     def uncoupled(self) -> "Constraint":
         """As the paper prints it: heading and position ignore each other's error."""
@@ -85,15 +118,30 @@ def range_circle(
 
 
 def bearing_ray(pose: Pose2, x: float, y: float, bearing: float, sigma: float) -> Constraint | None:
-    """A bearing to the point (x, y), the heading taken as right. Its width is d sin(sigma_a)
-    (equation 1b). None where the estimate is on the other side of the point."""
+    """A bearing to the point (x, y), the heading taken as right: the ray as the paper draws it. Its
+    width is d sin(sigma_a) (equation 1b). None where the estimate is on the other side of the
+    point."""
     dx, dy = x - pose.x, y - pose.y
-    u, v, ahead, residual = ray(dx, dy, pose.heading + bearing)
+    c, s = cos(pose.heading + bearing), sin(pose.heading + bearing)
+    ahead, residual = c * dx + s * dy, c * dy - s * dx
     if ahead < NEAREST_M:
         return None
     distance = math.hypot(dx, dy)
     width = distance * width_per_m(sigma)
-    return Constraint((u, v, ahead), residual, width, distance, False, (u, v))
+    return Constraint((-s, c, ahead), residual, width, distance, False, (-s, c))
+
+
+def bearing_position(
+    pose: Pose2, x: float, y: float, bearing: float, sigma: float
+) -> Constraint | None:
+    """The same, but linear at the estimate: the normal of a ray errs as its bearing does, and so
+    does the heading. It is the constraint on the heading, in metres across the line of sight."""
+    c = bearing_heading(pose, x, y, bearing, sigma)
+    if c is None or abs(c.residual) > FARTHEST_RAD:
+        return None
+    d = c.distance_m
+    u, v = d * c.row[0], d * c.row[1]
+    return Constraint((u, v, d), d * c.residual, d * width_per_m(sigma), d, False, (u, v))
 
 
 def bearing_heading(

@@ -75,7 +75,6 @@ class Covariance3(NamedTuple):
 
 SMALLEST_VARIANCE: Final = 1e-10  # (10 um)^2, (10 urad)^2: what is called exact
 SHARPEST_VARIANCE: Final = 1e-8  # of a measurement: sharper ones drown I + P A in rounding
-SPREAD_SHARE: Final = 0.25  # of an ellipse's spread that its circle keeps
 ZERO3: Final = Covariance3(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 Row = tuple[float, float, float]
 
@@ -276,7 +275,7 @@ def merge(
     if xx < 0.0 or yy < 0.0 or hh < 0.0:
         return prior
     if as_circle:
-        xx = yy = circle_variance(xx, xy, yy, xh_after, yh_after, hh)
+        xx = yy = circle_variance(xx, xy, yy)
         xy = 0.0
     if shared is not ZERO3:
         survive, _ = within_scope(survive, covariance, covariance, scope)
@@ -285,20 +284,16 @@ def merge(
     return new(Estimate, (new(Pose2, (x, y, heading)), posterior, shared))
 
 
-def circle_variance(xx: float, xy: float, yy: float, xh: float, yh: float, hh: float) -> float:
-    """The variance of the circle that stands for an ellipse: the mean, and a part of the spread.
+def circle_variance(xx: float, xy: float, yy: float) -> float:
+    """The variance of the circle that stands for an ellipse: that of its major axis.
 
-    The mean alone claims too much along the major axis (98.0 % inside 3 sigma where 98.9 % are due,
-    99.3 % so). Never less than what the drift alone explains.
+    A smaller circle makes certainty of nothing: each reduction shortens the major axis, of which
+    one range says nothing however often it comes.
     """
     variance = 0.5 * (xx + yy)
     if xy != 0.0 or xx != yy:
         half = 0.5 * (xx - yy)
-        variance += SPREAD_SHARE * sqrt(half * half + xy * xy)
-    if hh > 0.0:
-        drift = (xh * xh + yh * yh) / hh
-        if drift > variance:
-            return drift
+        variance += sqrt(half * half + xy * xy)
     return variance
 
 
@@ -306,5 +301,5 @@ def with_circular_position(estimate: Estimate) -> Estimate:
     """The estimate with its position's covariance reduced to a circle."""
     pose, covariance, shared = estimate
     xx, xy, yy, xh, yh, hh = covariance
-    variance = circle_variance(xx, xy, yy, xh, yh, hh)
+    variance = circle_variance(xx, xy, yy)
     return new(Estimate, (pose, new(Covariance3, (variance, 0.0, variance, xh, yh, hh)), shared))

@@ -19,28 +19,40 @@ from cpcbl_team.sensors import sighting_fault, sighting_sigmas
 from cpcbl_team.state import FIX
 
 POSITION_SENSOR = "position sensor"
+EARLIER_NS = 1_000_000_000  # since an earlier fix, in which a teammate does not get far
 _NOTHING = Covariance2(0.0, 0.0, 0.0)
 _AXES = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
 _HEADING = ((0.0, 0.0, 1.0),)
 
 
 def fix_for(
-    observer: str, stamp_ns: int, estimate: Estimate, sighting: Sighting, sensor: SensorSettings
+    observer: str,
+    stamp_ns: int,
+    estimate: Estimate,
+    sighting: Sighting,
+    sensor: SensorSettings,
+    earlier: Fix | None = None,
 ) -> Fix | None:
     """The fix of the robot that `observer` saw; None if range or bearing is missing or unusable.
 
     The sighting as a Gaussian (equations 1-2) is rotated into the field's frame and compounded with
     the observer's pose covariance before it is sent: J C J^T, J the Jacobian of the composition of
-    field_from_observer with the sighting. A heading of the teammate is the observer's heading plus
-    the one in its frame, and so are their variances.
+    field_from_observer with the sighting. An uncertain heading bends the line of sight to an arc,
+    which J does not know: its variance along the line of sight is added to the observer's part. A
+    heading of the teammate is the observer's plus the one in its frame, and so are their variances.
+    The sigma is a share of the range to an `earlier` fix: that one errs apart from this reading.
     """
     range_m, bearing = sighting.range_m, sighting.bearing_rad
     if range_m is None or bearing is None or sighting_fault(sighting):
         return None
-    if range_m > sensor.max_range_for_range_m:
+    if range_m > sensor.max_range_for_range_m:  # only its bearing is good enough
         return None
     pose, covariance = estimate.pose, estimate.covariance
-    sighted = sighting_gaussian(range_m, bearing, *sighting_sigmas(sighting, sensor))
+    expected_m = None
+    if earlier is not None and stamp_ns - earlier.stamp_ns <= EARLIER_NS:
+        expected_m = math.hypot(earlier.x_m - pose.x, earlier.y_m - pose.y)
+    sigmas = sighting_sigmas(sighting, sensor, expected_m)
+    sighted = sighting_gaussian(range_m, bearing, *sigmas)
     x, y = pose.transform(sighted.x, sighted.y)
     c, s = math.cos(pose.heading), math.sin(pose.heading)
     own = sighted.covariance
@@ -50,7 +62,9 @@ def fix_for(
         s * s * own.xx + 2.0 * c * s * own.xy + c * c * own.yy,
     )
     jacobian = (1.0, 0.0, pose.y - y, 0.0, 1.0, x - pose.x, 0.0, 0.0, 0.0)
+    arc, dx, dy = arc_variance(covariance.hh), x - pose.x, y - pose.y
     observer_part = covariance.transformed(jacobian).position()
+    observer_part += Covariance2(arc * dx * dx, arc * dx * dy, arc * dy * dy)
     fix = Fix(sighting.id, observer, stamp_ns, x, y, rotated, observer_part)
     heading, heading_sigma = sighting.heading_rad, sighting.heading_sigma_rad
     if heading is None or heading_sigma is None:
@@ -61,6 +75,15 @@ def fix_for(
         heading_sensor_variance=heading_sigma * heading_sigma,
         heading_observer_variance=covariance.hh,
     )
+
+
+def arc_variance(heading_variance: float) -> float:
+    """The mean square by which a point at distance 1 comes nearer when its direction turns.
+
+    E[(1 - cos e)^2] of a Gaussian e, by E[cos n e] = exp(-n^2 variance / 2); about 3/4 of the
+    square of the variance while that is small.
+    """
+    return -2.0 * math.expm1(-0.5 * heading_variance) + 0.5 * math.expm1(-2.0 * heading_variance)
 
 
 def without_heading(fix: Fix) -> Fix:

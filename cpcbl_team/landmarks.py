@@ -13,7 +13,15 @@ from typing import Final
 import msgspec
 
 from cpcbl_team.config import Field, LocalizationSettings
-from cpcbl_team.constraints import NEAREST_M, circle, heading, ray
+from cpcbl_team.constraints import (
+    CURVED_SHARE,
+    FARTHEST_RAD,
+    NEAREST_M,
+    circle,
+    curvature,
+    curved_variance,
+    heading,
+)
 from cpcbl_team.estimate import (
     HEADING,
     POSITION,
@@ -144,8 +152,7 @@ class Landmarks:
         as_ray: bool,
     ) -> None:
         """Adds the constraints of one landmark, unless the gate rejects them. A range gives the row
-        (u, v, 0). A bearing gives the row (m, n, 1): a heading as it is, a ray divided by the
-        distance along it."""
+        (u, v, 0), a bearing (m, n, 1)."""
         dx, dy = mark.x - update.x, mark.y - update.y
         distance_squared = dx * dx + dy * dy
         distance = sqrt(distance_squared)
@@ -155,22 +162,26 @@ class Landmarks:
         if range_m is not None:
             u, v, range_error = circle(dx, dy, distance, range_m)
             range_weight = 1.0 / sharpest(self._range_variance(distance, range_m))
-        if bearing is not None and as_ray:
-            m, n, ahead, across = ray(dx, dy, update.heading + bearing)
-            if ahead >= NEAREST_M:
-                m, n, bearing_error = m / ahead, n / ahead, across / ahead
-                width_squared = sharpest(distance_squared * self._width_squared_per_m2)
-                bearing_weight = ahead * ahead / width_squared
-            elif range_m is None:
-                return
-        elif bearing is not None:
+        if bearing is not None:
             m, n, bearing_error = heading(dx, dy, distance_squared, bearing, update.heading)
             bearing_weight = self._heading_weight
+            if as_ray:
+                width_squared = sharpest(distance_squared * self._width_squared_per_m2)
+                bearing_weight = distance_squared / width_squared
+                if not -FARTHEST_RAD <= bearing_error <= FARTHEST_RAD:
+                    bearing_weight = 0.0
+                    if range_m is None:
+                        return
+        prior = update.covariance
+        if prior.xx + prior.yy > CURVED_SHARE * distance_squared:
+            of_range, of_bearing = curvature(prior, dx, dy)
+            range_weight = _curved_weight(range_weight, prior, (u, v, 0.0), of_range)
+            bearing_weight = _curved_weight(bearing_weight, prior, (m, n, 1.0), of_bearing)
         # The NIS of a prior that is certain; that of an uncertain one is smaller.
         largest_nis = range_weight * range_error * range_error
         largest_nis += bearing_weight * bearing_error * bearing_error
         if largest_nis > self._gates[0] and self._rejects(
-            update.covariance,
+            prior,
             ((u, v, 0.0), range_error, range_weight),
             ((m, n, 1.0), bearing_error, bearing_weight),
         ):
@@ -213,6 +224,15 @@ class Landmarks:
             sigmas = sigma_m, self._bearing_sigma_rad
             pieces.append(Evidence(*where, range_m, bearing, *sigmas))
         return pieces
+
+
+def _curved_weight(weight: float, prior: Covariance3, row: Row, curvature: float) -> float:
+    """The weight of a measurement whose linear form leaves out `curvature`."""
+    if weight == 0.0:
+        return 0.0
+    px, py, ph = prior.times(row)
+    predicted = row[0] * px + row[1] * py + row[2] * ph
+    return 1.0 / curved_variance(1.0 / weight, predicted, curvature)
 
 
 def _is_sound(range_m: float | None, bearing: float | None) -> bool:

@@ -8,10 +8,10 @@ from collections.abc import Iterable
 from typing import Final
 
 from cpcbl_team.config import Field, LocalizationSettings
-from cpcbl_team.estimate import HEADING, POSE, POSITION, Covariance3, Estimate, Scope
+from cpcbl_team.estimate import HEADING, POSE, POSITION, Estimate, Scope
 from cpcbl_team.fixes import PoseObservation, from_fix, from_position_sensor
 from cpcbl_team.fusion import chi_square_bounds, mark_shared
-from cpcbl_team.geometry import Pose2, new, step, wrap_angle
+from cpcbl_team.geometry import new, step
 from cpcbl_team.inputs import Belief, BeliefShared, Fix, Odometry, Position, Sighting, Sightings
 from cpcbl_team.landmarks import Landmarks, LandmarkUpdate
 from cpcbl_team.measurements import (
@@ -21,10 +21,11 @@ from cpcbl_team.measurements import (
     Measurement,
     constrains,
     constraints_of,
+    curved,
     measurement_of,
     nis_of,
 )
-from cpcbl_team.motion import inflate_by_gap, part_of_piece
+from cpcbl_team.motion import NO_VARIANCE, bridge, inflate_by_gap, is_gap, part_of_piece
 from cpcbl_team.object_timers import ObjectTimers, has_passed
 from cpcbl_team.recovery import (
     Recovery,
@@ -39,9 +40,8 @@ from cpcbl_team.self_calibration import ReferencePose, ReferencePoses, self_cali
 from cpcbl_team.sensors import sighting_fault, time_at_min_speed_s
 from cpcbl_team.state import (
     LandmarkSnapshot,
-    Memory,
-    RecoveryMemory,
     State,
+    state_at_start,
     updates_with_frame,
     with_correction,
     with_memory,
@@ -72,12 +72,13 @@ class Localizer:
         self._odometry_timeout_ns = int(settings.odometry.timeout_s * 1e9)
         self._has_dead_zone = settings.odometry.least_speed_m_s > 0.0
         self._calibrates = rules.learns
+        self._widens = rules.variant != "weighted" and not rules.paper_uncertainty
         self._window = rules.lost_window
         self._belief_age_ns = int(settings.collaboration.max_age_s * 1e9)
         self._timers = ObjectTimers(settings)
         self._variant = variant_of(settings)
         self._landmarks = Landmarks(field, settings, gates)
-        self.recovery = Recovery(rules, field, self._landmarks, self._variant.reduce)
+        self.recovery = Recovery(settings, field, self._landmarks, self._variant.reduce)
         self.screen = TeammateScreen(settings, gates, self._variant.is_probabilistic)
 
     def cycle(self, state: State, frame: Sightings) -> State:
@@ -102,39 +103,58 @@ class Localizer:
         from_ns, until_ns = odometry.from_ns, odometry.stamp_ns
         if until_ns <= from_ns:
             return state.counted("impossible_duration")
+        before = state.odometry
+        if before is not None and from_ns > state.odometry_until_ns:
+            if is_gap(from_ns - state.odometry_until_ns, before, odometry):
+                state = state.counted("odometry_gap")
+            else:
+                state = with_odometry(state, before, from_ns)
         if from_ns > state.stamp_ns:
-            state = self.predict(state, from_ns)
-        if state.pending_odometry is not None:  # an earlier piece lasts longer
+            state = self.predict(state, from_ns, odometry)
+        if before is not None and before.stamp_ns > state.stamp_ns:
             state = state.counted("odometry_overlap")
         return with_odometry(state, odometry, max(state.odometry_until_ns, until_ns))
 
-    def predict(self, state: State, until_ns: int) -> State:
-        """Step 1: the state at `until_ns`, moved along the known odometry (J C J^T, section 4)."""
+    def predict(self, state: State, until_ns: int, following: Odometry | None = None) -> State:
+        """Step 1: the state at `until_ns`, moved along the known odometry (J C J^T, section 4).
+
+        Where odometry was lost the robot drives on as before; `following` is the piece that begins
+        at `until_ns`, if one does.
+        """
         stamp_ns, estimate = state.stamp_ns, state.estimate
         if until_ns <= stamp_ns:
             return state
-        odometry_from_robot, pending = state.odometry_from_robot, state.pending_odometry
-        if pending is not None:
-            distance, turn, seconds = part_of_piece(pending, stamp_ns, until_ns)
+        odometry_from_robot, piece = state.odometry_from_robot, state.odometry
+        if piece is not None and piece.stamp_ns > stamp_ns:
+            distance, turn, seconds = part_of_piece(piece, stamp_ns, until_ns)
             crawl_s = 0.0
             if self._has_dead_zone:
                 crawl_s = time_at_min_speed_s(distance, seconds, self._odometry)
             if self._calibrates:
-                memory = state.memory.calibration
-                distance *= memory.learned.distance_scale
-                turn *= memory.learned.turn_scale
-                memory = memory._replace(total_turn_rad=memory.total_turn_rad + turn)
-                state = with_memory(state, state.memory._replace(calibration=memory))
+                state, distance, turn = _with_learned_scales(state, distance, turn)
             if distance != 0.0 or turn != 0.0:
                 odometry_from_robot = step(odometry_from_robot, distance, turn)
                 estimate = self._variant.move(estimate, distance, turn, crawl_s)
-            if pending.stamp_ns <= until_ns:
-                pending = None
-        silent_ns = until_ns - state.odometry_until_ns - self._odometry_timeout_ns
-        if silent_ns > 0 and self._odometry.moves:
-            gap_ns = min(silent_ns, until_ns - stamp_ns)
-            estimate = inflate_by_gap(estimate, gap_ns, self._odometry.gap_speed_m_s)
-        return with_motion(state, until_ns, estimate, odometry_from_robot, pending)
+        state = with_motion(state, until_ns, estimate, odometry_from_robot)
+        if until_ns > state.odometry_until_ns and self._odometry.moves:
+            return self._across_gap(state, stamp_ns, following)
+        return state
+
+    def _across_gap(self, state: State, from_ns: int, following: Odometry | None) -> State:
+        """The state after the part of a gap in the odometry since `from_ns`."""
+        until_ns, estimate, place, before, begin_ns, _, _ = state
+        gap_ns = until_ns - begin_ns
+        from_s = max(from_ns - begin_ns, 0) * 1e-9
+        distance, turn, extra = bridge(before, following, from_s, gap_ns * 1e-9, self._odometry)
+        if self._calibrates:
+            state, distance, turn = _with_learned_scales(state, distance, turn)
+        if distance != 0.0 or turn != 0.0 or extra != NO_VARIANCE:
+            place = step(place, distance, turn)
+            estimate = self._variant.move(estimate, distance, turn, 0.0, extra)
+        silent_ns = min(gap_ns - self._odometry_timeout_ns, until_ns - from_ns)
+        if silent_ns > 0:
+            estimate = inflate_by_gap(estimate, silent_ns, before, self._odometry.gap_speed_m_s)
+        return with_motion(state, until_ns, estimate, place)
 
     # Step 2 -----------------------------------------------------------------------------------
 
@@ -215,6 +235,8 @@ class Localizer:
         gated = GatedObjects([], [])
         for m in sorted(measurements, key=_source):
             constraints = constraints_of(prior.pose, m, scope, self._rules)
+            if self._widens and not m.is_teammate:
+                constraints = curved(prior, m, constraints)
             if constraints:
                 nis = nis_of(prior, m, constraints)
                 is_accepted = nis <= self._gates[len(constraints) - 1]
@@ -362,18 +384,16 @@ class Localizer:
 
     def start(self, stamp_ns: int) -> State:
         """The state at the start: at the configured pose, or lost somewhere on the field."""
-        s = self.settings.start
-        if s is not None and s.known:
-            p, h = s.sigma_m**2, math.radians(s.heading_sigma_deg) ** 2
-            pose = Pose2(s.x_m, s.y_m, wrap_angle(math.radians(s.heading_deg)))
-            estimate = Estimate(pose, Covariance3(p, 0.0, p, 0.0, 0.0, h))
-            return State(stamp_ns, estimate, odometry_until_ns=stamp_ns)
-        x0, y0, x1, y1 = self.field.bounds()
-        p = max(0.25 * (x1 - x0) ** 2, 0.25 * (y1 - y0) ** 2, 4.0)
-        anywhere = Covariance3(p, 0.0, p, 0.0, 0.0, math.pi**2)
-        estimate = Estimate(Pose2(0.5 * (x0 + x1), 0.5 * (y0 + y1), 0.0), anywhere)
-        memory = Memory(RecoveryMemory(lost="start pose unknown", inflated_ns=stamp_ns))
-        return State(stamp_ns, estimate, odometry_until_ns=stamp_ns, memory=memory)
+        return state_at_start(stamp_ns, self.settings.start, self.field)
+
+
+def _with_learned_scales(state: State, distance: float, turn: float) -> tuple[State, float, float]:
+    """A motion by the scales that the robot has learned, and the state that counts its turn."""
+    memory = state.memory.calibration
+    distance *= memory.learned.distance_scale
+    turn *= memory.learned.turn_scale
+    memory = memory._replace(total_turn_rad=memory.total_turn_rad + turn)
+    return with_memory(state, state.memory._replace(calibration=memory)), distance, turn
 
 
 def _source(m: Measurement) -> str:

@@ -10,9 +10,13 @@ import msgspec
 
 from cpcbl_team import config
 from cpcbl_team.constraints import (
+    CURVED_SHARE,
     Constraint,
     bearing_heading,
+    bearing_position,
     bearing_ray,
+    curvature,
+    curved_variance,
     range_circle,
     wall_heading,
     wall_line,
@@ -199,6 +203,7 @@ def constraints_of(
     x, y, _ = m.position
     range_m, bearing, wall = m.range_m, m.bearing, m.wall
     by_range = by_bearing = None
+    as_drawn = rules.paper_uncertainty or rules.variant == "weighted"
     if range_m is not None and scope is not HEADING:
         if wall is None:
             by_range = range_circle(pose, x, y, range_m, m.range_sigma)
@@ -210,10 +215,32 @@ def constraints_of(
         else:
             by_bearing = wall_heading(pose, x, y, wall.direction_rad, bearing, m.bearing_sigma)
     elif bearing is not None and wall is None and rules.bearing_for_position:
-        by_bearing = bearing_ray(pose, x, y, bearing, m.bearing_sigma)
+        on_position = bearing_ray if as_drawn else bearing_position
+        by_bearing = on_position(pose, x, y, bearing, m.bearing_sigma)
     found = [c for c in (by_range, by_bearing) if c is not None]
-    if rules.paper_uncertainty or rules.variant == "weighted":
-        return [c.uncoupled() for c in found]
+    return [c.uncoupled() for c in found] if as_drawn else found
+
+
+def left_out(prior: Estimate, m: Measurement, cs: list[Constraint]) -> list[float]:
+    """The mean square of what each linear constraint leaves out (see `curvature`); 0 where that
+    does not matter."""
+    place = m.position.covariance
+    p = prior.covariance.plus(Covariance3(*place, 0.0, 0.0, 0.0))
+    dx, dy = m.position.x - prior.pose.x, m.position.y - prior.pose.y
+    if m.wall is not None or p.xx + p.yy <= CURVED_SHARE * (dx * dx + dy * dy):
+        return [0.0] * len(cs)
+    of_range, of_bearing = curvature(p, dx, dy)
+    return [of_bearing * c.row[2] ** 2 if c.is_bearing else of_range for c in cs]
+
+
+def curved(prior: Estimate, m: Measurement, cs: list[Constraint]) -> list[Constraint]:
+    """The constraints on an object of the map, each as wide as its linear form is right."""
+    found = []
+    for c, square in zip(cs, left_out(prior, m, cs), strict=True):
+        px, py, ph = prior.covariance.times(c.row)
+        predicted = c.row[0] * px + c.row[1] * py + c.row[2] * ph
+        variance = curved_variance(c.sigma * c.sigma, predicted, square)
+        found.append(c if square == 0.0 else c._replace(sigma=math.sqrt(variance)))
     return found
 
 
@@ -257,5 +284,7 @@ def observation_of(
     place = m.position.covariance
     (ax, ay), (bx, by) = cs[0].place_row, cs[-1].place_row
     common = place.xx * ax * bx + place.xy * (ax * by + ay * bx) + place.yy * ay * by
-    dependent = Covariance2(place.along(ax, ay), common, place.along(bx, by))
+    first, last = place.along(ax, ay), place.along(bx, by)
+    curves = left_out(prior, m, cs)  # the same in each repetition, as the teammate's error is
+    dependent = Covariance2(first + curves[0], common, last + curves[-1])
     return Observation(rows, residuals, Covariance2(sensor[0], 0.0, sensor[-1]), dependent)

@@ -6,11 +6,23 @@ compounding with respect to both. Motion noise is white, so its variance grows w
 
 import math
 from math import cos, sin
+from typing import Final, NamedTuple
 
-from cpcbl_team.config import OdometryNoise
+from cpcbl_team.config import OdometryNoise, OdometrySettings
 from cpcbl_team.estimate import ZERO3, Covariance3, Estimate, Matrix3, circle_variance
 from cpcbl_team.geometry import Pose2, new, wrap_angle
 from cpcbl_team.inputs import Odometry
+
+
+class MotionVariance(NamedTuple):
+    """How far a motion may be wrong beyond the odometry's noise: variances."""
+
+    distance: float  # m^2
+    turn: float  # rad^2
+
+
+NO_VARIANCE: Final = MotionVariance(0.0, 0.0)
+FASTEST: Final = 50.0  # m/s and rad/s: a piece of odometry that is faster is too short to tell
 
 
 def motion_jacobian(heading: float, distance: float, turn: float) -> Matrix3:
@@ -34,13 +46,14 @@ def move(
     turn: float,
     noise: OdometryNoise,
     crawl_s: float = 0.0,
+    extra: MotionVariance = NO_VARIANCE,
     as_circle: bool = False,
 ) -> Estimate:
     """The estimate after odometry reports an arc of `distance` metres that turns by `turn`.
 
     F P F^T + C is written out, for it runs for every odometry step. For `crawl_s` seconds of it
-    the robot drove at its least speed. `as_circle`: the position's covariance is kept as a
-    circle.
+    the robot drove at its least speed; `extra` is of odometry that was lost. `as_circle`: the
+    position's covariance is kept as a circle.
     """
     pose, covariance, shared = estimate
     x, y, heading = pose
@@ -52,9 +65,9 @@ def move(
     along = per_m * per_m * way
     if crawl_s > 0.0:
         along = max(along, noise.crawl_sigma_m_per_sqrt_s**2 * crawl_s)
-    along += per_rad * per_rad * turned
+    along += per_rad * per_rad * turned + extra[0]
     per_m, per_rad = noise.turn_sigma_rad_per_sqrt_m, noise.turn_sigma_rad_per_sqrt_rad
-    around = per_m * per_m * way + per_rad * per_rad * turned
+    around = per_m * per_m * way + per_rad * per_rad * turned + extra[1]
     # where a heading error of one radian leads, in metres: the last column of F
     lx, ly = -distance * s, distance * c
     # where a turn error leads: half of it; and its covariance with the position
@@ -65,7 +78,7 @@ def move(
     yy += ly * (yh + nyh + 0.5 * wy) + along * s * s
     xh, yh, hh = nxh + wx, nyh + wy, hh + around
     if as_circle:
-        xx = yy = circle_variance(xx, xy, yy, xh, yh, hh)
+        xx = yy = circle_variance(xx, xy, yy)
         xy = 0.0
     if shared is not ZERO3:
         shared = shared.transformed(motion_jacobian(heading, distance, turn))
@@ -85,8 +98,61 @@ def part_of_piece(piece: Odometry, from_ns: int, until_ns: int) -> tuple[float, 
     return distance, turn, part_ns * 1e-9
 
 
-def inflate_by_gap(estimate: Estimate, gap_ns: int, speed_m_s: float) -> Estimate:
-    """The estimate after a time without odometry: a random walk, of this speed in one second."""
-    p = speed_m_s**2 * gap_ns * 1e-9
-    growth = Covariance3(p, 0.0, p, 0.0, 0.0, p)
+def is_gap(pause_ns: int, before: Odometry, after: Odometry) -> bool:
+    """Whether odometry was lost in a pause; else stamps are inexact: it is short against both
+    pieces."""
+    shorter_ns = min(before.stamp_ns - before.from_ns, after.stamp_ns - after.from_ns)
+    return 2 * pause_ns >= shorter_ns
+
+
+def bridge(
+    before: Odometry | None,
+    after: Odometry | None,
+    from_s: float,
+    until_s: float,
+    settings: OdometrySettings,
+) -> tuple[float, float, MotionVariance]:
+    """The motion in a part of a gap between two pieces of odometry, if a part was lost: distance
+    (m), turn (rad), and how far they may be wrong.
+
+    The times are since the end of `before`. The robot drives on as before, for `timeout_s` at most.
+    If `after` is known in that time, the change of speed took place at any time within the gap. The
+    sigma grows with the time, by `gap_speed_m_s` but not faster than the robot drove; half of that
+    if both ends are known.
+    """
+    if until_s > settings.timeout_s:
+        until_s, after = settings.timeout_s, None
+    if before is None or until_s <= from_s:
+        return 0.0, 0.0, NO_VARIANCE
+    seconds, squared = until_s - from_s, until_s * until_s - from_s * from_s
+    speed, rate = _speeds(before)
+    if after is None:
+        slowest = min(settings.gap_speed_m_s, max(abs(speed), abs(rate)))
+        growth = slowest * slowest * squared
+        return speed * seconds, rate * seconds, MotionVariance(growth, growth)
+    then, then_rate = _speeds(after)
+    slowest = min(settings.gap_speed_m_s, max(map(abs, (speed, rate, then, then_rate))))
+    growth = 0.25 * slowest * slowest
+    of_distance = growth + (then - speed) ** 2 / 12.0
+    of_turn = growth + (then_rate - rate) ** 2 / 12.0
+    distance, turn = 0.5 * (speed + then) * seconds, 0.5 * (rate + then_rate) * seconds
+    return distance, turn, MotionVariance(of_distance * squared, of_turn * squared)
+
+
+def _speeds(piece: Odometry) -> tuple[float, float]:
+    """The speed (m/s) and the turn rate (rad/s) of a piece of odometry; 0 if that cannot be."""
+    seconds = (piece.stamp_ns - piece.from_ns) * 1e-9
+    speed, rate = piece.distance_m / seconds, piece.turn_rad / seconds
+    return (speed, rate) if abs(speed) < FASTEST and abs(rate) < FASTEST else (0.0, 0.0)
+
+
+def inflate_by_gap(
+    estimate: Estimate, gap_ns: int, before: Odometry | None, gap_speed_m_s: float
+) -> Estimate:
+    """The estimate after a long time without odometry: a random walk. In one second it leads as far
+    as `gap_speed_m_s` and the last speed do, each for a second."""
+    speed, rate = (0.0, 0.0) if before is None else _speeds(before)
+    seconds, least = gap_ns * 1e-9, gap_speed_m_s * gap_speed_m_s
+    p, h = (least + speed * speed) * seconds, (least + rate * rate) * seconds
+    growth = Covariance3(p, 0.0, p, 0.0, 0.0, h)
     return estimate._replace(covariance=estimate.covariance.plus(growth))

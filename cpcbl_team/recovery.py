@@ -6,10 +6,10 @@ what it measures, it inflates its covariance step by step until its gates open.
 """
 
 import math
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Final, NamedTuple, TypeVar
 
-from cpcbl_team.config import Field, LocalizerSettings
+from cpcbl_team.config import Field, LocalizationSettings, LocalizerSettings
 from cpcbl_team.estimate import Covariance3, Estimate
 from cpcbl_team.fixes import PoseObservation
 from cpcbl_team.landmarks import Landmarks
@@ -202,18 +202,35 @@ def inflate_by_offset(estimate: Estimate, offset_m: float, settings: LocalizerSe
     return estimate._replace(covariance=grown)
 
 
+def undetermined(
+    evidence: Sequence[Evidence], objects_ns: Mapping[str, int], kidnapped_ns: int
+) -> str:
+    """Why a robot that may have been kidnapped does not know its pose, though its gates accept what
+    it measures now; empty if it does, and without evidence (walls are none).
+
+    `objects_ns`: when each object was last accepted.
+    """
+    accepted = [e for e in evidence if objects_ns.get(e.source, kidnapped_ns) > kidnapped_ns]
+    is_determined = len({(e.x, e.y) for e in accepted}) > 1
+    if not evidence or is_determined or any(e.heading_rad is not None for e in accepted):
+        return ""
+    names = sorted({e.source for e in accepted})
+    return f"only {names[0] if names else 'one object'} agrees: no turn about it can be observed"
+
+
 class Recovery:
     """Finds out that the robot is lost, and brings it back."""
 
     def __init__(
         self,
-        settings: LocalizerSettings,
+        localization: LocalizationSettings,
         field: Field,
         landmarks: Landmarks,
         reduce: Callable[[Estimate], Estimate],
     ) -> None:
         """`reduce` gives an estimate the form that the variant keeps."""
-        self._settings = settings
+        self._settings = settings = localization.localizer
+        self._noise = localization.odometry
         self._field = field
         self._landmarks = landmarks
         self._reduce = reduce
@@ -226,9 +243,14 @@ class Recovery:
         memory = state.memory.recovery
         limits = self._limits_when_lost if memory.lost else self._limits
         reason = lost_reason(state.estimate, state.updates.innovations, limits)
+        if memory.kidnapped_ns >= 0 and not reason:
+            evidence = self._evidence_since(memory, memory.kidnapped_ns)
+            reason = undetermined(evidence, state.updates.objects_ns, memory.kidnapped_ns)
         if reason:
             return self._recover(state, reason)
-        return with_recovery(state, memory._replace(lost="")) if memory.lost else state
+        if not memory.lost:
+            return state
+        return with_recovery(state, memory._replace(lost="", kidnapped_ns=-1))
 
     def _recover(self, state: State, reason: str) -> State:
         """The next state of a robot that is lost for this reason."""
@@ -238,24 +260,30 @@ class Recovery:
         memory = memory._replace(lost=reason)
         is_rejecting = updates.innovations & 1 == 0
         # What was measured before the rejections began may have been measured elsewhere.
-        since_ns = updates.accepted_ns if is_rejecting else 0
-        evidence = tuple(e for e in self.evidence(memory) if e.stamp_ns > since_ns)
+        since_ns = memory.kidnapped_ns
+        if since_ns < 0 and is_rejecting:
+            since_ns = updates.accepted_ns
+        evidence = self._evidence_since(memory, since_ns)
         if evidence and evidence[-1].stamp_ns > memory.relocalization_ns:
             memory = memory._replace(relocalization_ns=evidence[-1].stamp_ns)
-            found = relocalize(evidence, state.odometry_from_robot, self._field)
+            place = state.odometry_from_robot
+            found = relocalize(evidence, place, self._field, self._noise)
             if found is not None:
                 return self._found(state, found, memory)
         estimate = state.estimate
         if is_rejecting and now - memory.inflated_ns >= INFLATION_NS:
             estimate = inflate_covariance(estimate, self._settings)
-            memory = memory._replace(inflated_ns=now)
+            kidnapped_ns = memory.kidnapped_ns
+            if kidnapped_ns < 0 or now - updates.accepted_ns > INFLATION_NS:
+                kidnapped_ns = updates.accepted_ns
+            memory = memory._replace(inflated_ns=now, kidnapped_ns=kidnapped_ns)
         return with_recovery(state, memory)._replace(estimate=estimate)
 
     def _found(self, state: State, estimate: Estimate, recovery: RecoveryMemory) -> State:
         """The state of a robot that is found again: here everything begins anew."""
         _, teammates, calibration, _ = memory = state.memory.counted("found_again")
         memory = memory._replace(
-            recovery=recovery._replace(lost=""),
+            recovery=recovery._replace(lost="", kidnapped_ns=-1),
             teammates=teammates._replace(senders=reset_scores(teammates.senders)),
             calibration=calibration._replace(references=None),
         )
@@ -267,6 +295,9 @@ class Recovery:
         snapshots = (self._landmarks.evidence_of(snapshot) for snapshot in memory.snapshots)
         pieces = [piece for snapshot in snapshots for piece in snapshot]
         return latest(tuple(sorted((*pieces, *memory.evidence), key=_stamp)))
+
+    def _evidence_since(self, memory: RecoveryMemory, stamp_ns: int) -> tuple[Evidence, ...]:
+        return tuple(e for e in self.evidence(memory) if e.stamp_ns > stamp_ns)
 
 
 def _stamp(piece: Evidence) -> int:

@@ -2,19 +2,32 @@
 
 This is triangulation from what was measured and reported within the last seconds. Dead reckoning
 brings each piece of evidence to the present. A closed-form alignment gives the start where ranges
-are known, else many starts are tried. An ambiguous answer is no answer.
+are known, else many starts are tried. An ambiguous answer is no answer. The pose that fits best is
+estimated again by a Kalman filter from the oldest piece to the present, for what dead reckoning
+errs between two pieces is in all that are older.
 """
 
 import math
 from collections.abc import Iterator
+from typing import NamedTuple
 
-from cpcbl_team.config import Field
+from cpcbl_team.config import Field, OdometryNoise
 from cpcbl_team.constraints import Constraint, bearing_heading, range_circle
-from cpcbl_team.estimate import SMALLEST_VARIANCE, ZERO3, Covariance3, Estimate, Information, merge
-from cpcbl_team.geometry import Pose2
+from cpcbl_team.estimate import (
+    SMALLEST_VARIANCE,
+    ZERO3,
+    Covariance3,
+    Estimate,
+    Information,
+    Row,
+    merge,
+)
+from cpcbl_team.geometry import Pose2, wrap_angle
+from cpcbl_team.motion import motion_noise
 from cpcbl_team.state import Evidence
 
-DRIFT_SHARE = 0.1  # of the way: how far dead reckoning errs within the window of evidence
+DRIFT_SHARE = 0.1  # of the way: how far dead reckoning errs, while a pose is looked for
+DRIFT_FACTOR = 1.0  # on the variance of the odometry's noise
 MOST_STARTS = 16
 _OPEN = Covariance3(1e6, 0.0, 1e6, 0.0, 0.0, 1e3)
 _SHARPEST = 1e-6  # (1 mm)^2, (1 mrad)^2: sharper evidence drowns _OPEN in rounding
@@ -23,7 +36,10 @@ _ENOUGH_HEADING_SIGMA_RAD = 0.5
 
 
 def relocalize(
-    evidence: tuple[Evidence, ...], odometry_from_robot: Pose2, field: Field
+    evidence: tuple[Evidence, ...],
+    odometry_from_robot: Pose2,
+    field: Field,
+    noise: OdometryNoise,
 ) -> Estimate | None:
     """The pose from recent evidence alone, or None where the evidence does not determine one.
 
@@ -42,13 +58,15 @@ def relocalize(
         return None
     starts = sorted(_starts(pieces, field), key=lambda start: _cost(start, pieces))
     fits = [_fit(start, pieces) for start in starts[:MOST_STARTS]]
-    found = sorted((f for f in fits if f is not None), key=lambda f: f[0])
+    found = sorted((f for f in fits if f is not None), key=lambda f: f.cost)
     if not found:
         return None
-    cost, estimate, freedom = found[0]
-    if freedom < 1 or not _is_certain(estimate) or cost > _chi_square_bound(freedom):
+    best = found[0]
+    if any(f.cost < best.cost + 6.0 and _are_apart(f.pose, best.pose) for f in found[1:]):
         return None
-    if any(f[0] < cost + 6.0 and _are_apart(f[1].pose, estimate.pose) for f in found[1:]):
+    cost, estimate = _with_drift(best, noise)
+    freedom = sum(piece.residual_count for piece in best.used) - 3
+    if freedom < 1 or not _is_certain(estimate) or cost > _chi_square_bound(freedom):
         return None
     covariance = estimate.covariance.scaled(max(1.0, cost / freedom))
     return Estimate(estimate.pose, covariance, covariance if repeated else ZERO3)
@@ -66,10 +84,10 @@ class PropagatedEvidence:
         drift_rad = DRIFT_SHARE * (abs(self.now_from_then.heading) + 0.3 * way)
         self.is_fix = evidence.range_m is None and evidence.bearing_rad is None
         factor = math.sqrt(repeated) if evidence.from_teammate else 1.0
-        self.sigma_m = math.hypot(factor * evidence.teammate_sigma_m, drift_m)
-        self.sigma_rad = math.hypot(
-            factor * evidence.teammate_sigma_rad, drift_rad, evidence.bearing_sigma_rad
-        )
+        self._teammate_m = factor * evidence.teammate_sigma_m
+        self._teammate_rad = factor * evidence.teammate_sigma_rad
+        self.sigma_m = math.hypot(self._teammate_m, drift_m)
+        self._sigma_rad = math.hypot(self._teammate_rad, drift_rad)
 
     @property
     def residual_count(self) -> int:
@@ -94,18 +112,29 @@ class PropagatedEvidence:
             return None
         return self.now_from_then.transform(r * math.cos(a), r * math.sin(a))
 
-    def rows(self, pose: Pose2) -> Iterator[tuple[tuple[float, float, float], float, float]]:
+    def rows(self, pose: Pose2) -> Iterator[tuple[Row, float, float]]:
         """(row, residual, variance) about the present pose."""
         then = pose @ self.now_from_then
-        e = self.evidence
         hx, hy = pose.y - then.y, then.x - pose.x  # d(position then) / d(heading now)
+        for (x, y, a), residual, variance in self.rows_then(then, self.sigma_m, self._sigma_rad):
+            yield (x, y, a + x * hx + y * hy), residual, variance
+
+    def rows_without_drift(self, then: Pose2) -> Iterator[tuple[Row, float, float]]:
+        """(row, residual, variance) about the pose of that time."""
+        return self.rows_then(then, self._teammate_m, self._teammate_rad)
+
+    def rows_then(
+        self, then: Pose2, sigma_m: float, sigma_rad: float
+    ) -> Iterator[tuple[Row, float, float]]:
+        """The same, with these sigmas beside the sensor's."""
+        e = self.evidence
         if self.is_fix:
-            variance = _variance(self.sigma_m**2 + e.range_sigma_m**2)
-            yield (1.0, 0.0, hx), e.x - then.x, variance
-            yield (0.0, 1.0, hy), e.y - then.y, variance
+            variance = _variance(sigma_m**2 + e.range_sigma_m**2)
+            yield (1.0, 0.0, 0.0), e.x - then.x, variance
+            yield (0.0, 1.0, 0.0), e.y - then.y, variance
             if e.heading_rad is not None:
                 off = math.remainder(e.heading_rad - then.heading, math.tau)
-                yield (0.0, 0.0, 1.0), off, _variance(self.sigma_rad**2)
+                yield (0.0, 0.0, 1.0), off, _variance(sigma_rad**2 + e.bearing_sigma_rad**2)
             return
         constraints: list[Constraint | None] = []
         if e.range_m is not None:
@@ -114,10 +143,10 @@ class PropagatedEvidence:
             constraints.append(bearing_heading(then, e.x, e.y, e.bearing_rad, e.bearing_sigma_rad))
         for c in constraints:
             if c is not None:
-                x, y, a = c.row
-                spread = self.sigma_m / c.distance_m if c.on_heading else self.sigma_m
-                row = x, y, a + x * hx + y * hy
-                yield row, c.residual, _variance(c.sigma**2 + spread**2)
+                spread = sigma_m
+                if c.on_heading:
+                    spread = math.hypot(sigma_m / c.distance_m, sigma_rad)
+                yield c.row, c.residual, _variance(c.sigma**2 + spread**2)
 
 
 def _variance(variance: float) -> float:
@@ -167,8 +196,16 @@ def _alignment(pieces: list[PropagatedEvidence]) -> Pose2 | None:
     return Pose2(bx - c * ax + s * ay, by - s * ax - c * ay, heading)
 
 
-def _fit(start: Pose2, pieces: list[PropagatedEvidence]) -> tuple[float, Estimate, int] | None:
-    """(chi-square, estimate, degrees of freedom) by Gauss-Newton with the worst pieces left out."""
+class Fit(NamedTuple):
+    """A pose that fits some pieces of evidence, and their chi-square."""
+
+    cost: float
+    pose: Pose2
+    used: list[PropagatedEvidence]
+
+
+def _fit(start: Pose2, pieces: list[PropagatedEvidence]) -> Fit | None:
+    """By Gauss-Newton with the worst pieces left out."""
     used = list(pieces)
     while True:
         estimate = Estimate(start, _OPEN)
@@ -185,12 +222,40 @@ def _fit(start: Pose2, pieces: list[PropagatedEvidence]) -> tuple[float, Estimat
             if change < 1e-4 and abs(estimate.pose.heading - before.heading) < 1e-4:
                 break
         costs = [_cost(estimate.pose, [piece]) for piece in used]
-        freedom = sum(p.residual_count for p in used) - 3
         worst = max(range(len(used)), key=costs.__getitem__)
         if costs[worst] < 14.0 or len(used) - 1 < max(2, 0.75 * len(pieces)):
-            return sum(costs), estimate, freedom
+            return Fit(sum(costs), estimate.pose, used)
         del used[worst]
         start = estimate.pose
+
+
+def _with_drift(fit: Fit, noise: OdometryNoise) -> tuple[float, Estimate]:
+    """(chi-square, estimate) by a Kalman filter over the pieces that a fit used, linear around its
+    path, and around the better one."""
+    pose, cost = fit.pose, 0.0
+    for _ in range(2):
+        cost, (x, y, heading), covariance = 0.0, (0.0, 0.0, 0.0), _OPEN
+        last = None
+        for piece in (*fit.used, None):
+            then = pose if piece is None else pose @ piece.now_from_then
+            if last is not None:
+                dx, dy, turn = then.x - last.x, then.y - last.y, then.heading - last.heading
+                x, y = x - dy * heading, y + dx * heading
+                covariance = covariance.transformed((1.0, 0.0, -dy, 0.0, 1.0, dx, 0.0, 0.0, 1.0))
+                way = math.hypot(dx, dy)
+                drift = motion_noise(last.heading, way, wrap_angle(turn), noise)
+                covariance = covariance.plus(drift, DRIFT_FACTOR)
+            last = then
+            for row, residual, variance in () if piece is None else piece.rows_without_drift(then):
+                px, py, ph = covariance.times(row)
+                k = 1.0 / (row[0] * px + row[1] * py + row[2] * ph + variance)
+                off = residual - row[0] * x - row[1] * y - row[2] * heading
+                cost += k * off * off
+                x, y, heading = x + k * off * px, y + k * off * py, heading + k * off * ph
+                gained = px * px, px * py, py * py, px * ph, py * ph, ph * ph
+                covariance = covariance.plus(Covariance3(*gained), -k)
+        pose = Pose2(pose.x + x, pose.y + y, wrap_angle(pose.heading + heading))
+    return cost, Estimate(pose, covariance)
 
 
 def _is_certain(estimate: Estimate) -> bool:

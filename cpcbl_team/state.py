@@ -5,13 +5,15 @@ of the recovery, the trust in teammates and the self-calibration. Only this file
 their fields.
 """
 
+import math
 from collections import Counter
 from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
-from cpcbl_team.estimate import HEADING, POSE, POSITION, Estimate, Scope
-from cpcbl_team.geometry import Pose2, new
+from cpcbl_team.config import Field, Start
+from cpcbl_team.estimate import HEADING, POSE, POSITION, Covariance3, Estimate, Scope
+from cpcbl_team.geometry import Pose2, new, wrap_angle
 from cpcbl_team.inputs import Belief, Odometry, Sighting
 from cpcbl_team.self_calibration import ReferencePoses, SelfCalibration
 from cpcbl_team.trust import SenderRecord
@@ -98,6 +100,7 @@ class RecoveryMemory(NamedTuple):
     evidence: tuple[Evidence, ...] = ()  # of all but plain landmarks
     recorded: frozenset[str] = frozenset()  # sources of which no more evidence is needed yet,
     recorded_until_ns: int = 0  # until then
+    kidnapped_ns: int = -1  # since when the robot may be elsewhere; -1: it is where it was
 
 
 class TeammateMemory(NamedTuple):
@@ -135,7 +138,7 @@ class State(NamedTuple):
     stamp_ns: int
     estimate: Estimate
     odometry_from_robot: Pose2 = Pose2(0.0, 0.0, 0.0)
-    pending_odometry: Odometry | None = None  # the piece that the prediction has not reached yet
+    odometry: Odometry | None = None  # the latest piece; its end may be in the future
     odometry_until_ns: int = 0  # until when odometry is known
     updates: Updates = Updates()
     memory: Memory = Memory()
@@ -156,27 +159,40 @@ class State(NamedTuple):
         return with_memory(self, self.memory.counted(*events)) if events else self
 
 
+def state_at_start(stamp_ns: int, start: Start | None, field: Field) -> State:
+    """The state at the start: at the configured pose, or lost somewhere on the field."""
+    if start is not None and start.known:
+        p, h = start.sigma_m**2, math.radians(start.heading_sigma_deg) ** 2
+        pose = Pose2(start.x_m, start.y_m, wrap_angle(math.radians(start.heading_deg)))
+        estimate = Estimate(pose, Covariance3(p, 0.0, p, 0.0, 0.0, h))
+        return State(stamp_ns, estimate, odometry_until_ns=stamp_ns)
+    x0, y0, x1, y1 = field.bounds()
+    p = max(0.25 * (x1 - x0) ** 2, 0.25 * (y1 - y0) ** 2, 4.0)
+    anywhere = Covariance3(p, 0.0, p, 0.0, 0.0, math.pi**2)
+    estimate = Estimate(Pose2(0.5 * (x0 + x1), 0.5 * (y0 + y1), 0.0), anywhere)
+    memory = Memory(RecoveryMemory(lost="start pose unknown", inflated_ns=stamp_ns))
+    return State(stamp_ns, estimate, odometry_until_ns=stamp_ns, memory=memory)
+
+
 # `_replace` would take a fifth of a cycle; so would methods when compiled.
 
 
 def with_odometry(state: State, piece: Odometry, until_ns: int) -> State:
-    """The state with a new pending piece of odometry."""
+    """The state with a new latest piece of odometry."""
     now, estimate, place, _, _, updates, memory = state
     return new(State, (now, estimate, place, piece, until_ns, updates, memory))
 
 
-def with_motion(
-    state: State, stamp_ns: int, estimate: Estimate, place: Pose2, pending: Odometry | None
-) -> State:
+def with_motion(state: State, stamp_ns: int, estimate: Estimate, place: Pose2) -> State:
     """The predicted state; `place` is odometry_from_robot at `stamp_ns`."""
-    _, _, _, _, until_ns, updates, memory = state
-    return new(State, (stamp_ns, estimate, place, pending, until_ns, updates, memory))
+    _, _, _, odometry, until_ns, updates, memory = state
+    return new(State, (stamp_ns, estimate, place, odometry, until_ns, updates, memory))
 
 
 def with_memory(state: State, memory: Memory) -> State:
     """The state with this memory."""
-    now, estimate, place, pending, until_ns, updates, _ = state
-    return new(State, (now, estimate, place, pending, until_ns, updates, memory))
+    now, estimate, place, odometry, until_ns, updates, _ = state
+    return new(State, (now, estimate, place, odometry, until_ns, updates, memory))
 
 
 def with_beliefs(state: State, beliefs_of: State) -> State:
@@ -201,12 +217,21 @@ def with_records(
     until_ns: int,
 ) -> RecoveryMemory:
     """The recovery's memory with other evidence, and the sources of which no more is needed."""
-    lost, inflated_ns, relocalization_ns, _, _, _, _ = recovery
-    fields = lost, inflated_ns, relocalization_ns, snapshots, evidence, recorded, until_ns
+    lost, inflated_ns, relocalization_ns, _, _, _, _, kidnapped_ns = recovery
+    fields = (
+        lost,
+        inflated_ns,
+        relocalization_ns,
+        snapshots,
+        evidence,
+        recorded,
+        until_ns,
+        kidnapped_ns,
+    )
     return new(RecoveryMemory, fields)
 
 
 def with_correction(state: State, estimate: Estimate, updates: Updates) -> State:
     """The state with a new estimate and its bookkeeping."""
-    now, _, place, pending, until_ns, _, memory = state
-    return new(State, (now, estimate, place, pending, until_ns, updates, memory))
+    now, _, place, odometry, until_ns, _, memory = state
+    return new(State, (now, estimate, place, odometry, until_ns, updates, memory))

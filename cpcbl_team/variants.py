@@ -24,7 +24,7 @@ from cpcbl_team.fusion import Observation, merge_naive, merge_split, with_all_sh
 from cpcbl_team.geometry import Pose2, wrap_angle
 from cpcbl_team.landmarks import LandmarkUpdate
 from cpcbl_team.measurements import GatedObject, combine, observation_of
-from cpcbl_team.motion import move
+from cpcbl_team.motion import NO_VARIANCE, MotionVariance, move
 
 UpdateOrder = tuple[Scope | None, ...]
 
@@ -53,9 +53,16 @@ class JointVariant:
         """The estimate in the form that the variant keeps."""
         return estimate
 
-    def move(self, estimate: Estimate, distance: float, turn: float, crawl_s: float) -> Estimate:
+    def move(
+        self,
+        estimate: Estimate,
+        distance: float,
+        turn: float,
+        crawl_s: float,
+        extra: MotionVariance = NO_VARIANCE,
+    ) -> Estimate:
         """Step 1: the estimate after an arc of `distance` (m) that turns by `turn` (rad)."""
-        return move(estimate, distance, turn, self._noise, crawl_s)
+        return move(estimate, distance, turn, self._noise, crawl_s, extra)
 
     def merge(self, prior: Estimate, evidence: Sums, scope: Scope) -> Estimate:
         """Step 5: the prior and the evidence as one Gaussian (equations 3 and 4)."""
@@ -106,8 +113,15 @@ class OvalVariant(JointVariant):
             estimate = estimate._replace(covariance=covariance)
         return with_all_shared(estimate)
 
-    def move(self, estimate: Estimate, distance: float, turn: float, crawl_s: float) -> Estimate:
-        return self.reduce(move(estimate, distance, turn, self._noise, crawl_s))
+    def move(
+        self,
+        estimate: Estimate,
+        distance: float,
+        turn: float,
+        crawl_s: float,
+        extra: MotionVariance = NO_VARIANCE,
+    ) -> Estimate:
+        return self.reduce(move(estimate, distance, turn, self._noise, crawl_s, extra))
 
     def merge(self, prior: Estimate, evidence: Sums, scope: Scope) -> Estimate:
         return self.reduce(merge(prior, evidence, scope))
@@ -121,10 +135,17 @@ class CircularVariant(OvalVariant):
             estimate = super().reduce(estimate)
         return with_all_shared(with_circular_position(estimate))
 
-    def move(self, estimate: Estimate, distance: float, turn: float, crawl_s: float) -> Estimate:
+    def move(
+        self,
+        estimate: Estimate,
+        distance: float,
+        turn: float,
+        crawl_s: float,
+        extra: MotionVariance = NO_VARIANCE,
+    ) -> Estimate:
         if self._uncoupled:
-            return super().move(estimate, distance, turn, crawl_s)
-        return with_all_shared(move(estimate, distance, turn, self._noise, crawl_s, True))
+            return super().move(estimate, distance, turn, crawl_s, extra)
+        return with_all_shared(move(estimate, distance, turn, self._noise, crawl_s, extra, True))
 
     def merge(self, prior: Estimate, evidence: Sums, scope: Scope) -> Estimate:
         if self._uncoupled:

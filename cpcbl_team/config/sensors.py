@@ -40,10 +40,10 @@ class OdometrySettings(OdometryNoise, frozen=True, kw_only=True):
     moves: bool = True
     """False for a robot that stands still and reports no odometry."""
     timeout_s: Positive = 0.5
-    """If no odometry has come for longer, the variances of the pose grow with time."""
+    """If odometry is missing, the robot is assumed to drive on as before, but for no longer."""
     gap_speed_m_s: NotNegative = 0.3
-    """The sigma that the pose (m, and rad) gains in a second without odometry; it grows with the
-    root of the time."""
+    """The sigma that the pose (m, and rad) gains in a second without odometry: with the time while
+    the robot is assumed to drive on, then with its root, and there more if it drove fast."""
 
 
 class SensorSettings(Table, frozen=True, kw_only=True):

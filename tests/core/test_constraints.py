@@ -1,21 +1,38 @@
 import math
 from collections.abc import Callable
 
+import numpy as np
 import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
-from support.core import angles, coordinates, point_sighting, poses, wall_sighting
+from support.core import (
+    PROBABILISTIC,
+    SECOND,
+    angles,
+    coordinates,
+    diagonal,
+    localizer,
+    point_sighting,
+    poses,
+    state_at,
+    wall_sighting,
+)
 
-from cpcbl_team.config import Wall
+from cpcbl_team.config import Field, Landmark, OdometrySettings, Variant, Wall
 from cpcbl_team.constraints import (
     Constraint,
     bearing_heading,
+    bearing_position,
     bearing_ray,
+    curvature,
+    curved_variance,
     range_circle,
     wall_heading,
     wall_line,
 )
+from cpcbl_team.estimate import Covariance3
 from cpcbl_team.geometry import Pose2, wrap_angle
+from cpcbl_team.inputs import Sighting, Sightings
 
 POST = (3.0, 1.0)
 WALL = Wall(from_m=(-2.0, 4.0), to_m=(5.0, 3.0))
@@ -46,6 +63,10 @@ def _ray(prior: Pose2, true: Pose2) -> Constraint | None:
     return bearing_ray(prior, *POST, post(true)[1], 0.05)
 
 
+def _bearing_position(prior: Pose2, true: Pose2) -> Constraint | None:
+    return bearing_position(prior, *POST, post(true)[1], 0.05)
+
+
 def _heading(prior: Pose2, true: Pose2) -> Constraint | None:
     return bearing_heading(prior, *POST, post(true)[1], 0.05)
 
@@ -58,7 +79,7 @@ def _wall_heading(prior: Pose2, true: Pose2) -> Constraint | None:
     return wall_heading(prior, *WALL.from_m, WALL.direction_rad, wall(true)[1], 0.05)
 
 
-KINDS = [_circle, _ray, _heading, _wall_line, _wall_heading]
+KINDS = [_circle, _ray, _bearing_position, _heading, _wall_line, _wall_heading]
 kinds = pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.__name__.strip("_"))
 
 
@@ -86,6 +107,16 @@ def test_a_bearing_is_a_line_through_the_point() -> None:
     assert c.sigma == pytest.approx(math.hypot(2.0, 0.5) * math.sin(math.radians(5.0)))  # row 36
     assert c.row == pytest.approx((0.0, 1.0, 2.0))  # resolution a: the heading's share
     assert c.uncoupled().row == pytest.approx((0.0, 1.0, 0.0))
+
+
+def test_the_normal_of_a_bearing_does_not_err_with_its_reading() -> None:
+    """It is across the line of sight from the estimate; that of a ray turns with the reading."""
+    pose = Pose2(-2.0, 0.0, 0.0)
+    c = given_(bearing_position(pose, 0.0, 0.0, 0.3, math.radians(5.0)))
+    assert c.row == pytest.approx((0.0, 1.0, 2.0))
+    assert c.residual == pytest.approx(2.0 * -0.3)
+    assert c.sigma == pytest.approx(2.0 * math.sin(math.radians(5.0)))
+    assert given_(bearing_ray(pose, 0.0, 0.0, 0.3, 0.1)).row[0] == pytest.approx(-math.sin(0.3))
 
 
 def test_a_bearing_is_one_heading() -> None:
@@ -208,6 +239,7 @@ def test_on_the_landmark_there_is_no_constraint(offset_m: float) -> None:
 def test_no_ray_passes_behind_its_landmark() -> None:
     """Ahead by its bearing, behind by the estimate (row 9)."""
     assert bearing_ray(Pose2(1.0, 0.1, 0.0), 0.0, 0.0, 0.0, 0.1) is None
+    assert bearing_position(Pose2(1.0, 0.1, 0.0), 0.0, 0.0, 0.0, 0.1) is None
 
 
 @pytest.mark.parametrize("make", [range_circle, wall_line])
@@ -224,3 +256,66 @@ def test_on_the_wall_there_are_still_two_sides_and_a_heading() -> None:
     heading = wall_heading(pose, 0.0, 0.0, 0.0, 0.0, 0.1)
     assert abs(wrap_angle(pose.heading + heading.residual)) == pytest.approx(0.5 * math.pi)
     assert math.isfinite(1.0 / heading.distance_m)
+
+
+# Where a curve is not straight --------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("direction", [0.0, 0.7, 2.5])
+@pytest.mark.parametrize(("across_m", "along_m"), [(0.6, 0.1), (0.4, 0.4), (0.1, 0.8)])
+def test_what_a_linear_reading_leaves_out(
+    direction: float, across_m: float, along_m: float
+) -> None:
+    """By sampling robots of a Gaussian prior, 6 m from a post."""
+    c, s = math.cos(direction), math.sin(direction)
+    turn = np.array([[c, -s], [s, c]])
+    covariance = turn @ np.diag([along_m**2, across_m**2]) @ turn.T
+    rng = np.random.default_rng(3)
+    along, across = rng.normal(size=(2, 200_000)) * [[along_m], [across_m]]
+    of_range = np.hypot(6.0 - along, across) - (6.0 - along)
+    of_bearing = np.arctan2(-across, 6.0 - along) + across / 6.0
+    prior = Covariance3(covariance[0, 0], covariance[0, 1], covariance[1, 1], 0.0, 0.0, 0.1)
+    found = curvature(prior, 6.0 * c, 6.0 * s)
+    assert found == pytest.approx(
+        (np.mean(of_range**2), np.mean(of_bearing**2)), rel=0.25, abs=2e-6
+    )
+
+
+@given(st.floats(1e-6, 1.0), st.floats(1e-6, 1.0), st.floats(0.0, 0.99))
+def test_a_curved_reading_leaves_what_its_linear_form_leaves_out(
+    variance: float, predicted: float, share: float
+) -> None:
+    """However often it comes: that part of the prior's variance is not reduced."""
+    curved = share * predicted
+    as_if = curved_variance(variance, predicted, curved)
+    assert as_if >= variance * (1.0 - 1e-9)
+    after = predicted * as_if / (predicted + as_if)
+    if share > 0.01:
+        rest = predicted - curved
+        assert after == pytest.approx(curved + rest * variance / (rest + variance), rel=1e-6)
+    else:
+        assert as_if == variance
+
+
+def test_a_reading_that_is_all_curve_says_nothing() -> None:
+    assert curved_variance(0.01, 0.1, 0.1) == math.inf
+    assert curved_variance(0.01, 0.1, 0.2) == math.inf
+
+
+@pytest.mark.parametrize("variant", PROBABILISTIC)
+@pytest.mark.parametrize("general", [False, True], ids=["fast path", "general path"])
+def test_a_range_repeated_beside_its_landmark_makes_no_certainty(
+    variant: Variant, general: bool
+) -> None:
+    """The robot stands 1.5 m from a post, 1 m off across the line of sight: the circle bends by
+    0.3 m, which no repetition averages away."""
+    field = Field(landmarks={"post": Landmark(x_m=1.5, y_m=0.0, gives="range")})
+    robot = localizer(variant, field, odometry=OdometrySettings(moves=False))
+    state = state_at(Pose2(0.0, 0.0, 0.0), diagonal(1.0, 0.1))
+    reading = Sighting("post", math.hypot(1.5, 1.0), None, 0.02 if general else None)
+    for i in range(20):
+        state = robot.cycle(state, Sightings((i + 1) * SECOND // 10, (reading,)))
+    xx, xy, yy, *_ = state.estimate.covariance
+    off = np.array([state.estimate.pose.x, state.estimate.pose.y - 1.0])
+    assert yy > 0.9  # one range says nothing along its circle
+    assert off @ np.linalg.solve([[xx, xy], [xy, yy]], off) < 9.0

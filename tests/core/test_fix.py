@@ -16,7 +16,7 @@ from support.core import (
 
 from cpcbl_team.config import SensorSettings
 from cpcbl_team.estimate import Estimate
-from cpcbl_team.fixes import fix_for, without_heading
+from cpcbl_team.fixes import arc_variance, fix_for, without_heading
 from cpcbl_team.gaussian import Covariance2
 from cpcbl_team.geometry import Pose2
 from cpcbl_team.inputs import Fix, Sighting
@@ -35,7 +35,8 @@ def an_observer(seed: int) -> Estimate:
 
 @pytest.mark.parametrize("seed", range(4))
 def test_a_fix_is_the_sighting_compounded_with_the_observers_pose(seed: int) -> None:
-    """Row 40: both parts of the covariance equal those by finite differences."""
+    """Row 40: both parts of the covariance equal those by finite differences, and the observer's
+    heading, along the line of sight, bends it to an arc."""
     observer = an_observer(seed)
     pose = observer.pose
     r, a = 3.0, 0.4 * seed - 0.9
@@ -61,7 +62,28 @@ def test_a_fix_is_the_sighting_compounded_with_the_observers_pose(seed: int) -> 
     own = matrix2(Covariance2(*sent.sensor_covariance))
     np.testing.assert_allclose(own, J[:, 3:] @ sensor @ J[:, 3:].T, atol=1e-6)
     observers = matrix2(Covariance2(*sent.observer_covariance))
-    np.testing.assert_allclose(observers, J[:, :3] @ P @ J[:, :3].T, atol=1e-6)
+    sight = np.array([sent.x_m - pose.x, sent.y_m - pose.y])
+    arc = arc_variance(P[2, 2]) * np.outer(sight, sight)
+    np.testing.assert_allclose(observers, J[:, :3] @ P @ J[:, :3].T + arc, atol=1e-6)
+
+
+@pytest.mark.parametrize("sigma_deg", [0.1, 10.0, 30.0, 60.0, 300.0])
+def test_an_arc_shortens_the_line_of_sight_by_this_mean_square(sigma_deg: float) -> None:
+    sigma = math.radians(sigma_deg)
+    turns = np.linspace(-8.0, 8.0, 20_001)
+    weights = np.exp(-0.5 * turns**2) / math.sqrt(math.tau)
+    expected = np.trapezoid(weights * (1.0 - np.cos(sigma * turns)) ** 2, turns)
+    assert arc_variance(sigma**2) == pytest.approx(expected, rel=1e-6)
+
+
+def test_a_fix_from_a_turned_observer_is_within_its_sigma() -> None:
+    """It is off by 2 of the 20 deg that it doubts its heading: by the arc, also along its sight."""
+    observer = Estimate(Pose2(0.0, 0.0, math.radians(40.0)), diagonal(0.0, math.radians(20.0)))
+    sent = observed(Sighting("me", 4.0, 0.0), observer)
+    assert sent is not None
+    whole = Covariance2(*sent.sensor_covariance) + Covariance2(*sent.observer_covariance)
+    off = np.array([4.0 - sent.x_m, -sent.y_m])
+    assert off @ np.linalg.solve(matrix2(whole), off) < 9.0
 
 
 @pytest.mark.parametrize(

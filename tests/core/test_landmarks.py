@@ -24,7 +24,14 @@ from cpcbl_team.estimate import POSE, Estimate, Information, Scope, merge, with_
 from cpcbl_team.geometry import Pose2, wrap_angle
 from cpcbl_team.inputs import Sighting, Sightings
 from cpcbl_team.localizer import Localizer
-from cpcbl_team.measurements import Measurement, constrains, constraints_of, measurement_of, nis_of
+from cpcbl_team.measurements import (
+    Measurement,
+    constrains,
+    constraints_of,
+    curved,
+    measurement_of,
+    nis_of,
+)
 from cpcbl_team.sensors import sighting_fault
 from cpcbl_team.state import State, Updates
 
@@ -122,6 +129,8 @@ def composed(robot: Localizer, state: State, frame: Sightings) -> tuple[Estimate
     for m in visible if scope else ():
         assert scope is not None
         cs = constraints_of(prior.pose, m, scope, r)
+        if not r.paper_uncertainty:
+            cs = curved(prior, m, cs)
         bound = -2.0 * math.log(1.0 - r.gate_probability)
         if len(cs) == 1:
             bound = robot._gates[0]

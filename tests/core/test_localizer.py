@@ -56,11 +56,11 @@ def test_constraints_are_combined_at_the_prior_not_one_after_the_other() -> None
         }
     )
     robot = standing("oval", field)
-    state = state_at(ORIGIN, diagonal(0.5, 0.1))
-    visible = (Sighting("a", 1.5, None, 0.1), Sighting("b", 2.5, None, 0.2))
+    state = state_at(ORIGIN, diagonal(0.04, 0.1))
+    visible = (Sighting("a", 1.9, None, 0.1), Sighting("b", 2.6, None, 0.2))
     h = np.array([[-1.0, 0.0], [-(0.5**0.5), -(0.5**0.5)]])
-    r, e = np.diag([0.1**2, 0.2**2]), np.array([1.5 - 2.0, 2.5 - 8.0**0.5])
-    offset = 0.25 * h.T @ np.linalg.solve(0.25 * h @ h.T + r, e)
+    r, e = np.diag([0.1**2, 0.2**2]), np.array([1.9 - 2.0, 2.6 - 8.0**0.5])
+    offset = 0.0016 * h.T @ np.linalg.solve(0.0016 * h @ h.T + r, e)
     pose = robot.cycle(state, Sightings(1, visible)).estimate.pose
     assert pose == pytest.approx((*offset, 0.0), abs=1e-9)
 

@@ -126,7 +126,7 @@ def test_a_teammate_whose_belief_is_too_old_is_not_used() -> None:
 @pytest.mark.parametrize("name", ["ne", "mate"])
 def test_the_gate_measures_the_innovation_of_the_whole_observation(name: str, scope: Scope) -> None:
     """For a landmark in a shorter way, for its place is exact."""
-    prior = state_at(HERE, diagonal(0.2, 0.1)).estimate
+    prior = state_at(HERE, diagonal(0.02, 0.1)).estimate
     measurement = measure(
         Sighting(name, 3.0, 0.7), teammates={"mate": (belief(1.0, 2.0, sigma_m=0.3),)}
     )

@@ -1,12 +1,16 @@
 """Step 1: motion along the known odometry, and missing odometry."""
 
+from collections.abc import Sequence
+
 import pytest
+from msgspec.structs import replace
 from support.core import SECOND, diagonal, localizer, state_at
 from support.standing import ORIGIN, STANDING, probabilistic, variants
 
 from cpcbl_team.config import OdometrySettings, Variant
-from cpcbl_team.estimate import SPREAD_SHARE
 from cpcbl_team.inputs import Odometry
+from cpcbl_team.localizer import Localizer
+from cpcbl_team.state import State
 
 
 @variants
@@ -39,8 +43,7 @@ def test_a_crawl_errs_with_its_time_however_it_is_cut(variant: Variant) -> None:
         at_once.append(whole)
     crawled, drove = at_once
     assert crawled.pose.x == pytest.approx(0.08)
-    of_circle = 0.5 * (1.0 + SPREAD_SHARE)
-    along = 0.05**2 * 4.0 * (of_circle if variant == "circular" else 1.0)
+    along = 0.05**2 * 4.0
     assert crawled.covariance.xx == pytest.approx(along)
     assert drove.covariance.xx == 0.0
 
@@ -71,3 +74,101 @@ def test_without_odometry_the_covariance_of_a_standing_robot_stays() -> None:
 def test_time_does_not_run_backwards(variant: Variant) -> None:
     before = state_at(ORIGIN, diagonal(0.1, 0.05), 5)
     assert localizer(variant).predict(before, 3) == before
+
+
+# Lost odometry ------------------------------------------------------------------------------------
+
+PIECE_NS = SECOND // 20
+EXACT = OdometrySettings(
+    distance_sigma_m_per_sqrt_m=0.0,
+    turn_sigma_rad_per_sqrt_m=0.0,
+    turn_sigma_rad_per_sqrt_rad=0.0,
+    timeout_s=0.5,
+    gap_speed_m_s=0.3,
+)
+
+
+def driven(robot: Localizer, speeds: Sequence[tuple[float, float] | None]) -> State:
+    """The state after pieces of odometry with these speeds and turn rates; None: it was lost."""
+    state = state_at(ORIGIN, diagonal(0.0, 0.0))
+    for i, piece in enumerate(speeds):
+        if piece is not None:
+            motion = (0.05 * v for v in piece)
+            state = robot.add_odometry(state, Odometry(i * PIECE_NS, (i + 1) * PIECE_NS, *motion))
+    return robot.predict(state, len(speeds) * PIECE_NS)
+
+
+@pytest.mark.parametrize("lost", [(3,), (3, 4, 5), (1, 3, 5, 7, 9, 11), (6, 7, 8, 10)])
+@probabilistic
+def test_lost_odometry_of_a_steady_drive_costs_certainty_but_no_error(
+    variant: Variant, lost: tuple[int, ...]
+) -> None:
+    robot, steady = localizer(variant, odometry=EXACT), [(0.5, 0.8)] * 14
+    whole = driven(robot, steady)
+    gaps = driven(robot, [None if i in lost else v for i, v in enumerate(steady)])
+    assert gaps.estimate.pose == pytest.approx(whole.estimate.pose, abs=1e-3)
+    assert gaps.odometry_from_robot == pytest.approx(whole.odometry_from_robot, abs=1e-3)
+    assert whole.estimate.heading_sigma_rad == 0.0
+    assert gaps.estimate.heading_sigma_rad > 0.005
+    assert gaps.estimate.position_sigma_m > 0.005
+    runs = sum(i - 1 not in lost for i in lost)
+    assert (whole.counts, gaps.counts) == ({}, {"odometry_gap": runs})
+
+
+def test_speeds_before_and_after_a_gap_say_how_far_the_robot_came() -> None:
+    """It may have changed its speed at any time of the gap: uniform, hence the root of 12."""
+    robot = localizer(odometry=replace(EXACT, gap_speed_m_s=0.0))
+    gap = driven(robot, [(1.0, 0.0), None, None, (0.0, 0.0)]).estimate
+    assert gap.pose == pytest.approx((0.1, 0.0, 0.0))
+    assert gap.covariance.xx == pytest.approx(0.1**2 / 12.0)
+    turned = driven(robot, [(0.0, 0.0), None, (0.0, 2.0)]).estimate
+    assert turned.pose.heading == pytest.approx(0.05 + 0.1)
+    assert turned.covariance.hh == pytest.approx(0.1**2 / 12.0)
+
+
+def test_doubt_grows_with_the_time_until_it_grows_with_the_root() -> None:
+    robot = localizer(odometry=EXACT)
+    sigmas = [
+        driven(robot, [(1.0, 0.0), *(steps * (None,))]).estimate.covariance.xx ** 0.5
+        for steps in (2, 4, 10, 30)
+    ]
+    assert sigmas == pytest.approx([0.03, 0.06, 0.15, (0.15**2 + 0.09 + 1.0) ** 0.5])
+
+
+def test_a_gap_is_the_same_however_it_is_cut() -> None:
+    robot = localizer(odometry=EXACT)
+    before = robot.add_odometry(
+        state_at(ORIGIN, diagonal(0.0, 0.0)), Odometry(0, PIECE_NS, 0.05, 0.0)
+    )
+    whole = robot.predict(before, SECOND).estimate
+    cut = before
+    for stamp_ns in range(PIECE_NS // 2, SECOND + 1, PIECE_NS // 2):
+        cut = robot.predict(cut, stamp_ns)
+    assert cut.estimate.pose == pytest.approx(whole.pose)
+    assert cut.estimate.covariance.xx == pytest.approx(whole.covariance.xx)
+    assert cut.estimate.covariance.hh == pytest.approx(whole.covariance.hh)
+
+
+def test_a_robot_that_stood_has_not_moved_in_a_gap() -> None:
+    still = driven(localizer(odometry=EXACT), [(0.0, 0.0), None, None, (0.0, 0.0)])
+    assert still.estimate == state_at(ORIGIN, diagonal(0.0, 0.0)).estimate
+    assert still.counts == {"odometry_gap": 1}
+
+
+@pytest.mark.parametrize("pause_ns", [1, PIECE_NS // 10, PIECE_NS // 3])
+def test_inexact_stamps_are_no_gap(pause_ns: int) -> None:
+    robot, state = localizer(odometry=EXACT), state_at(ORIGIN, diagonal(0.0, 0.0))
+    for i in range(10):
+        begin_ns = i * (PIECE_NS + pause_ns)
+        state = robot.add_odometry(state, Odometry(begin_ns, begin_ns + PIECE_NS, 0.1, 0.0))
+    state = robot.predict(state, state.odometry_until_ns)
+    assert state.counts == {}
+    assert state.estimate.pose == pytest.approx((1.0, 0.0, 0.0))
+    assert state.estimate.covariance == state_at(ORIGIN, diagonal(0.0, 0.0)).estimate.covariance
+
+
+def test_a_speed_that_cannot_be_is_not_extrapolated() -> None:
+    """A millimetre in a nanosecond says nothing about the next half second."""
+    robot, state = localizer(odometry=EXACT), state_at(ORIGIN, diagonal(0.0, 0.0))
+    state = robot.add_odometry(state, Odometry(0, 1, 1e-3, 0.0))
+    assert robot.predict(state, SECOND // 2).estimate.pose.x == pytest.approx(1e-3)

@@ -183,8 +183,10 @@ def test_a_robot_with_an_unknown_start_finds_itself() -> None:
     assert position_error(state.estimate, HERE) < 1e-3
 
 
-def kidnapped(variant: Variant, names: Sequence[str], before_s: float) -> tuple[State, Pose2]:
-    """Carried off 3 m and turned after so long; then 3 s of frames at 10 Hz."""
+def kidnapped(
+    variant: Variant, names: Sequence[str], before_s: float, after_s: float = 3.0
+) -> tuple[State, Pose2]:
+    """Carried off 3 m and turned after so long; then frames at 10 Hz."""
     robot, noise = localizer(variant), sensor_noise(np.random.default_rng(7), SENSOR)
     begin, way = state_at(LOOP_START, diagonal(0.05, 0.05)), loop()[: int(before_s * 10)]
     before = followed(robot, begin, LOOP_START, way, names=lambda _: names, noise=noise)
@@ -192,7 +194,7 @@ def kidnapped(variant: Variant, names: Sequence[str], before_s: float) -> tuple[
     assert not state.counts.get("lost")
     away = math.copysign(3.0, -truth.x)
     elsewhere = Pose2(truth.x + away, truth.y, wrap_angle(truth.heading + 1.2))
-    on = [(0.03, 0.02)] * 30
+    on = [(0.03, 0.02)] * int(after_s * 10)
     *_, end = followed(robot, state, elsewhere, on, names=lambda _: names, noise=noise)
     return end
 
@@ -215,6 +217,39 @@ def test_a_kidnapped_robot_is_not_found_where_it_no_longer_is(variant: Variant) 
     """Found at the old place it would be confident and wrong, and teammates would use it."""
     state, _ = kidnapped(variant, tuple(CORNERS.landmarks), 8.0)
     assert state.counts["found_again"] == 1
+
+
+@pytest.mark.parametrize("variant", ["joint", "oval"])
+def test_a_kidnapped_robot_that_sees_one_landmark_stays_lost_and_says_why(
+    variant: Variant,
+) -> None:
+    """It cannot know where on the circle about the landmark it stands."""
+    state, _ = kidnapped(variant, ("ne",), 8.0, 20.0)
+    assert "ne agrees: no turn about it can be observed" in state.lost
+    assert "found_again" not in state.counts
+
+
+def test_a_second_landmark_ends_that() -> None:
+    state, truth = kidnapped("joint", ("ne",), 8.0, 20.0)
+    robot, noise = localizer(), sensor_noise(np.random.default_rng(8), SENSOR)
+    both = {"names": lambda _: ("ne", "sw")}
+    *_, (state, truth) = followed(robot, state, truth, [(0.03, 0.02)] * 10, noise=noise, **both)
+    assert state.lost == ""
+    assert position_error(state.estimate, truth) < 0.5
+
+
+def test_a_landmark_that_disagrees_for_a_moment_does_not_make_it_lost_for_good() -> None:
+    """Half a second of a wrong bearing: the robot is where it was."""
+    robot = localizer(field=Field(landmarks={"post": CORNERS.landmarks["ne"]}))
+    state = state_at(HERE, diagonal(0.03, 0.03))
+    for i in range(60):
+        (seen,) = frame(HERE, 1, names=["ne"]).sightings
+        assert seen.bearing_rad is not None
+        off = 1.5 if 20 <= i < 33 else 0.0
+        wrong = Sighting("post", seen.range_m, wrap_angle(seen.bearing_rad + off))
+        state = robot.cycle(state, Sightings((i + 1) * SECOND // 20, (wrong,)))
+    assert state.counts["lost"] == 1
+    assert state.lost == ""
 
 
 @variants

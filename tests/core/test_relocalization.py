@@ -3,13 +3,14 @@
 import math
 from collections.abc import Iterable, Sequence
 
+import numpy as np
 import pytest
 from support.core import CORNERS, heading_error, position_error
 from support.evidence import piece
 
-from cpcbl_team.config import Gives
+from cpcbl_team.config import Gives, OdometrySettings
 from cpcbl_team.estimate import Estimate
-from cpcbl_team.geometry import Pose2
+from cpcbl_team.geometry import Pose2, step
 from cpcbl_team.recovery import SPACING_NS
 from cpcbl_team.relocalization import relocalize
 from cpcbl_team.state import Evidence
@@ -47,12 +48,13 @@ def dead_reckoned(evidence: Iterable[Evidence], field_from_odometry: Pose2) -> t
     )
 
 
+NOISE = OdometrySettings()
 PATH = [Pose2(-1.0, 0.4, 0.3), Pose2(-0.5, 0.6, 0.5), Pose2(0.0, 1.0, 0.9)]
 BEGUN = Pose2(2.0, -3.0, 1.1)
 
 
 def found_at(evidence: Iterable[Evidence], truth: Pose2) -> Estimate | None:
-    found = relocalize(dead_reckoned(evidence, BEGUN), BEGUN.inverse() @ truth, CORNERS)
+    found = relocalize(dead_reckoned(evidence, BEGUN), BEGUN.inverse() @ truth, CORNERS, NOISE)
     if found is not None:
         assert position_error(found, truth) < 1e-3
         assert heading_error(found, truth) < 1e-3
@@ -134,13 +136,13 @@ def test_a_few_wrong_pieces_are_left_out() -> None:
 def test_evidence_that_contradicts_itself_gives_no_pose() -> None:
     evidence = measured_along(PATH[-1:], ["ne", "nw"])
     wrong = [e._replace(range_m=1.0, bearing_rad=0.1 * i) for i, e in enumerate(evidence)]
-    assert relocalize(tuple(wrong), PATH[-1], CORNERS) is None
+    assert relocalize(tuple(wrong), PATH[-1], CORNERS, NOISE) is None
 
 
 def test_headings_that_contradict_each_other_give_no_pose() -> None:
     one, other = (headed_piece(i * SPACING_NS, PATH[0]) for i in range(2))
     other = other._replace(heading_rad=PATH[0].heading + 1.0)
-    assert relocalize((one, other), PATH[0], CORNERS) is None
+    assert relocalize((one, other), PATH[0], CORNERS, NOISE) is None
 
 
 def test_a_wrong_heading_among_right_ones_is_left_out() -> None:
@@ -154,7 +156,7 @@ def test_an_observer_that_repeats_a_heading_gets_no_more_weight(times: int) -> N
     """Of its own 0.1 rad nothing is averaged away, and nothing of it by its position either."""
     reported = [headed_piece(i, PATH[0], 0.1 * math.sqrt(2.0)) for i in range(2 * times)]
     sure = [e._replace(bearing_sigma_rad=0.001) for e in reported]
-    found = relocalize(tuple(sure), PATH[0], CORNERS)
+    found = relocalize(tuple(sure), PATH[0], CORNERS, NOISE)
     assert found is not None
     assert found.heading_sigma_rad > 0.1
     assert found.shared == found.covariance
@@ -163,9 +165,16 @@ def test_an_observer_that_repeats_a_heading_gets_no_more_weight(times: int) -> N
 @pytest.mark.parametrize("times", [1, 6])
 def test_teammates_that_repeat_themselves_get_no_more_weight(times: int) -> None:
     """Their error, of 0.1 m, may be the same each time."""
+    exact = OdometrySettings(
+        distance_sigma_m_per_sqrt_m=0.0,
+        turn_sigma_rad_per_sqrt_m=0.0,
+        turn_sigma_rad_per_sqrt_rad=0.0,
+    )
     reported = [fix_piece(i, pose) for i, pose in enumerate(PATH * times)]
-    found = relocalize(tuple(reported), PATH[-1], CORNERS)
-    own = relocalize(tuple(e._replace(from_teammate=False) for e in reported), PATH[-1], CORNERS)
+    found = relocalize(tuple(reported), PATH[-1], CORNERS, exact)
+    own = relocalize(
+        tuple(e._replace(from_teammate=False) for e in reported), PATH[-1], CORNERS, exact
+    )
     assert found is not None
     assert own is not None
     assert found.position_sigma_m > 0.1
@@ -174,10 +183,59 @@ def test_teammates_that_repeat_themselves_get_no_more_weight(times: int) -> None
 
 def test_a_pose_found_by_a_teammates_reports_is_shared() -> None:
     reported = relocalize(
-        tuple(fix_piece(i, pose) for i, pose in enumerate(PATH)), PATH[-1], CORNERS
+        tuple(fix_piece(i, pose) for i, pose in enumerate(PATH)), PATH[-1], CORNERS, NOISE
     )
-    measured = relocalize(measured_along(PATH, ["ne", "nw"]), PATH[-1], CORNERS)
+    measured = relocalize(measured_along(PATH, ["ne", "nw"]), PATH[-1], CORNERS, NOISE)
     assert reported is not None
     assert measured is not None
     assert reported.shared == reported.covariance
     assert set(measured.shared) == {0.0}
+
+
+# Dead reckoning drifts ----------------------------------------------------------------------------
+
+
+def drifted_evidence(seed: int, names: Sequence[str], gives: Gives) -> tuple[Evidence, ...]:
+    """One corner at a time along 3.5 m of noisy dead reckoning, by noisy readings."""
+    rng = np.random.default_rng(seed)
+    true, reckoned, pieces = Pose2(-1.5, -1.0, 0.4), Pose2(0.0, 0.0, 0.0), []
+    for i in range(14):
+        corner = CORNERS.landmarks[names[i % len(names)]]
+        exact = piece(i * SPACING_NS, true, names[i % len(names)], corner.x_m, corner.y_m)
+        assert exact.range_m is not None
+        assert exact.bearing_rad is not None
+        pieces.append(
+            exact._replace(
+                odometry_from_robot=reckoned,
+                range_m=exact.range_m + 0.1 * rng.normal() if gives == "both" else None,
+                bearing_rad=exact.bearing_rad + 0.03 * rng.normal(),
+            )
+        )
+        reckoned = step(reckoned, 0.25, 0.2)
+        distance = 0.25 + 0.05 * math.sqrt(0.25) * rng.normal()
+        around = NOISE.turn_sigma_rad_per_sqrt_m**2 * 0.25
+        around += NOISE.turn_sigma_rad_per_sqrt_rad**2 * 0.2
+        true = step(true, distance, 0.2 + math.sqrt(around) * rng.normal())
+    # the pieces say where the robot was; the truth is wanted in their frame
+    return (*pieces, pieces[-1]._replace(odometry_from_robot=reckoned, x=true.x, y=true.y))
+
+
+@pytest.mark.parametrize(
+    ("names", "gives"),
+    [(("ne", "sw"), "both"), (("ne", "nw", "se"), "bearing")],
+    ids=["two landmarks", "three bearings"],
+)
+def test_a_found_pose_errs_as_far_as_it_claims(names: Sequence[str], gives: Gives) -> None:
+    """Where drift counts for each piece alone, the NEES is three times as large."""
+    nees = []
+    for seed in range(40):
+        *pieces, end = drifted_evidence(seed, names, gives)
+        found = relocalize(tuple(pieces), end.odometry_from_robot, CORNERS, NOISE)
+        if found is None:
+            continue
+        error = np.array([found.pose.x - end.x, found.pose.y - end.y])
+        xx, xy, yy, *_ = found.covariance
+        nees.append(error @ np.linalg.solve([[xx, xy], [xy, yy]], error))
+    assert len(nees) > 30
+    assert 1.3 < np.mean(nees) < 3.0
+    assert max(nees) < 13.8  # the bound of 99.9 %

@@ -25,7 +25,7 @@ def canonical_state(localizer: Localizer, state: State, with_evidence: bool) -> 
     To compute the evidence takes longer than all the rest, so not every step has it. It stays in
     the state for many steps, so a difference is found all the same.
     """
-    updates, pending, recovery = state.updates, state.pending_odometry, state.memory.recovery
+    updates, latest, recovery = state.updates, state.odometry, state.memory.recovery
     teammates, calibration = state.memory.teammates, state.memory.calibration
     evidence = localizer.recovery.evidence(recovery) if with_evidence else ()
     learned = calibration.learned
@@ -34,9 +34,9 @@ def canonical_state(localizer: Localizer, state: State, with_evidence: bool) -> 
         "estimate": _estimate(state.estimate),
         "odometry_from_robot": list(state.odometry_from_robot),
         "odometry_known_until_ns": state.odometry_until_ns,
-        "pending_odometry": None
-        if pending is None
-        else [pending.from_ns, pending.stamp_ns, pending.distance_m, pending.turn_rad],
+        "latest_odometry": None
+        if latest is None
+        else [latest.from_ns, latest.stamp_ns, latest.distance_m, latest.turn_rad],
         "counts": dict(state.counts),
         "last_position_update_ns": updates.position_ns,
         "last_heading_update_ns": updates.heading_ns,

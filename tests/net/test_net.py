@@ -26,13 +26,13 @@ WHAT_HAPPENS = {
     "impossible_duration",
     "lost",
     "not_finite",
+    "odometry_gap",
     "odometry_overlap",
-    "outvoted",
     "quarantined",
     "range_not_positive",
     "readmitted",
 }
-REASONS = {"biased", "frozen", "jumps", "outvoted", "overconfident"}
+REASONS = {"biased", "frozen", "jumps", "overconfident"}  # "outvoted": core/test_trust.py
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -29,7 +29,7 @@ from cpcbl_team.estimate import ZERO3, Covariance3, Estimate
 from cpcbl_team.fusion import chi_square_bounds
 from cpcbl_team.geometry import Pose2, wrap_angle
 from cpcbl_team.inputs import Odometry, Sighting, Sightings
-from cpcbl_team.motion import inflate_by_gap, move, part_of_piece
+from cpcbl_team.motion import bridge, inflate_by_gap, is_gap, move, part_of_piece
 
 SMALLEST_VARIANCE = 1e-12  # (1 um)^2: exact sensors must not make a matrix singular
 _TRIANGLE = ((0, 0, 1, 0, 1, 2), (0, 1, 1, 2, 2, 2))  # xx, xy, yy, xh, yh, hh
@@ -106,28 +106,42 @@ class OdometryTrack:
         self._settings = inputs.settings.odometry
         self.now_ns = self._covered_ns = inputs.start_ns
         self._pieces = deque(sorted(inputs.odometry, key=lambda piece: piece.from_ns))
+        self._last: Odometry | None = None
 
     def until(self, until_ns: int) -> Estimate:
         """The motion since the last call: the new pose in the frame of the old one (m, rad).
 
-        A gap in the odometry adds the uncertainty that the team has of it.
+        A gap in the odometry is bridged as the team does it.
         """
         motion, s = Estimate(Pose2(0.0, 0.0, 0.0), ZERO3), self._settings
         if until_ns <= self.now_ns:
             return motion
         while self._pieces and self._pieces[0].from_ns < until_ns:
             piece = self._pieces[0]
+            motion = self._across_gap(motion, piece.from_ns, piece)
             distance, turn, seconds = part_of_piece(piece, self.now_ns, until_ns)
             slow_s = sensors.time_at_min_speed_s(distance, seconds, s)
             motion = move(motion, distance, turn, s, slow_s)
             self._covered_ns = max(self._covered_ns, piece.stamp_ns)
             if piece.stamp_ns > until_ns:
                 break
-            self._pieces.popleft()
-        silent_ns = until_ns - max(self.now_ns, self._covered_ns + int(s.timeout_s * 1e9))
-        if silent_ns > 0 and s.moves:
-            motion = inflate_by_gap(motion, silent_ns, s.gap_speed_m_s)
+            self._last = self._pieces.popleft()
+        motion = self._across_gap(motion, until_ns, None)
         self.now_ns = until_ns
+        return motion
+
+    def _across_gap(self, motion: Estimate, until_ns: int, after: Odometry | None) -> Estimate:
+        """The motion, with that from `now_ns` to a time in which no odometry is known."""
+        s, gap_ns, begin_ns = self._settings, until_ns - self._covered_ns, self._covered_ns
+        if gap_ns <= 0 or not s.moves:
+            return motion
+        if self._last is None or after is None or is_gap(gap_ns, self._last, after):
+            from_s = max(self.now_ns - begin_ns, 0) * 1e-9
+            distance, turn, extra = bridge(self._last, after, from_s, gap_ns * 1e-9, s)
+            motion = move(motion, distance, turn, s, 0.0, extra)
+        silent_ns = until_ns - max(self.now_ns, begin_ns + int(s.timeout_s * 1e9))
+        if silent_ns > 0:
+            motion = inflate_by_gap(motion, silent_ns, self._last, s.gap_speed_m_s)
         return motion
 
 
