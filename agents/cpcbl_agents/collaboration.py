@@ -25,6 +25,7 @@ from cpcbl_transport.messages import Flow, Track
 
 NEIGHBOUR_NS = 10_000_000_000  # a teammate's tier is watched for so long after it was seen
 IN_SIGHT_NS = 1_000_000_000  # its beliefs are useful for so long after it was seen
+EARLY_NS = 1_500_000_000  # a fix waits so long for its robot's tier
 
 
 def _size(message: Belief | Fix) -> int:
@@ -101,6 +102,7 @@ class CollaborationAgent:
         self._belief_ns = start_ns
         self._track_ns = -1
         self._latest_fixes: dict[str, Fix] = {}
+        self._early_fixes: dict[str, Fix] = {}  # of robots whose tier is not known yet
         self._tiers: dict[str, int] = {}
         self._fix_memories: dict[str, tuple[int, FixMemory]] = {}
         self._last_belief: Belief | None = None
@@ -140,7 +142,7 @@ class CollaborationAgent:
                 self._record_sent(message, now_ns)
         return ()
 
-    def _handle_estimate(self, now: agent.PoseEstimate, now_ns: int) -> list[Track | Belief]:
+    def _handle_estimate(self, now: agent.PoseEstimate, now_ns: int) -> list[Track | Belief | Fix]:
         sigma, present = now.estimate.position_sigma_m, None if self.latest is None else self.tier
         self.latest, self._track_ns = now, now.stamp_ns
         self.tier = next_tier(present, sigma, bool(now.lost), self._rules)
@@ -148,7 +150,8 @@ class CollaborationAgent:
         pose, covariance, _ = now.estimate
         known = None if self._settings.localizer.variant == "weighted" else covariance
         track = Track(self._robot, now.stamp_ns, *pose, known, self.tier, now.lost)
-        return [track, *self._beliefs(now, now_ns)]
+        early = self._sent_early(now_ns) if self._early_fixes and not now.lost else ()
+        return [track, *self._beliefs(now, now_ns), *early]
 
     # Whose beliefs to use ----------------------------------------------------------------------
 
@@ -180,23 +183,50 @@ class CollaborationAgent:
     # Fixes --------------------------------------------------------------------------------
 
     def _fixes(self, seen: agent.FrameEstimate, now_ns: int) -> list[Fix]:
-        """The fixes of a frame that are worth sending, the one with the largest gain first."""
+        """The fixes of a frame that are worth sending."""
         offers, stamp_ns, sensor = [], seen.frame.stamp_ns, self._settings.sensor
         for s in seen.frame.sightings:
             if s.id not in self._teammates and not self.guests.notice(s.id, stamp_ns):
                 continue
-            fix = fix_for(self._robot, stamp_ns, seen.estimate, s, sensor)
+            earlier = self._latest_fixes.get(s.id)
+            fix = fix_for(self._robot, stamp_ns, seen.estimate, s, sensor, earlier)
             if fix is None:
                 continue
             self._latest_fixes[fix.robot] = fix
-            tier = self._tiers.get(fix.robot)
-            if tier is None or seen.lost or not self._may_help(fix, tier):
+            if seen.lost:
                 continue
-            offer = self._offer(fix, tier)
-            if offer.value >= self._rules.least_value:
-                offers.append(offer)
+            if fix.robot in self._tiers:
+                self._early_fixes.pop(fix.robot, None)
+                offers += self._worth_sending(fix)
             else:
-                self.counters.of("fix", fix.robot).worthless += 1
+                self._early_fixes[fix.robot] = fix
+        return self._affordable(offers, now_ns)
+
+    def _sent_early(self, now_ns: int) -> list[Fix]:
+        """The fixes of robots that were seen shortly before their tier became known, or before they
+        were subscribed. Tiers are watched only of teammates that are seen, so at a rare meeting
+        there may be no other fix."""
+        ready = [fix for name, fix in self._early_fixes.items() if name in self._tiers]
+        for fix in ready:
+            del self._early_fixes[fix.robot]
+        young = (fix for fix in ready if now_ns - fix.stamp_ns <= EARLY_NS)
+        return self._affordable(
+            [offer for fix in young for offer in self._worth_sending(fix)], now_ns
+        )
+
+    def _worth_sending(self, fix: Fix) -> list[_Offer]:
+        """The fix, if it may be sent now and is worth it."""
+        tier = self._tiers[fix.robot]
+        if not self._may_help(fix, tier):
+            return []
+        offer = self._offer(fix, tier)
+        if offer.value >= self._rules.least_value:
+            return [offer]
+        self.counters.of("fix", fix.robot).worthless += 1
+        return []
+
+    def _affordable(self, offers: list[_Offer], now_ns: int) -> list[Fix]:
+        """The fixes that the budget admits, the one with the largest gain first."""
         offers.sort(key=lambda offer: (offer.urgent, offer.value), reverse=True)
         sent = []
         for value, urgent, after, fix in offers:
@@ -278,9 +308,10 @@ class CollaborationAgent:
         if sent.size:
             self.counters.of(topic, to).add(sent.size, message.stamp_ns)
             return
-        # A new key often has no subscriber yet: the next frame may repeat the message
+        # A new key often has no subscriber yet: the message is tried again
         self.budget.refund(now_ns, _size(message))
         if isinstance(message, Fix):
             self._fix_memories.pop(message.robot, None)
+            self._early_fixes.setdefault(message.robot, message)
         else:
             self._last_belief = None

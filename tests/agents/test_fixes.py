@@ -51,6 +51,54 @@ def test_a_teammate_of_which_the_bus_knows_nothing_is_not_helped() -> None:
     assert alone.agent.counters.flows() == (Flow("fix", "mate", 1, 42, latest_ns=2),)
 
 
+@pytest.mark.parametrize(("wait_s", "is_sent"), [(0.3, True), (1.3, True), (2.0, False)])
+def test_a_fix_waits_for_the_tier_of_its_robot(wait_s: float, is_sent: bool) -> None:
+    """At a rare meeting there is no second sighting."""
+    alone = Alone()
+    assert alone.sees(ahead()) == []
+    alone.later(wait_s)
+    assert alone.early == []
+    alone.tell(Presence("mate", POOR))
+    alone.later(0.1)
+    assert robots(alone.early) == (["mate"] if is_sent else [])
+    alone.later(3.0)
+    assert len(alone.early) == is_sent
+
+
+def test_a_fix_waits_for_its_subscriber() -> None:
+    alone = Alone()
+    alone.tell(Presence("mate", POOR))
+    alone.heard = False
+    (fix,) = alone.sees(ahead())
+    alone.later(0.2)
+    alone.early.clear()
+    alone.heard = True
+    alone.later(1.0)
+    assert alone.early == [fix]
+
+
+def test_a_newer_fix_takes_the_place_of_one_that_waits() -> None:
+    alone = Alone()
+    alone.sees(ahead(range_m=2.0))
+    alone.sees(ahead(range_m=3.0), after_ns=SECOND // 10)
+    alone.tell(Presence("mate", POOR))
+    (fix,) = alone.sees(ahead(range_m=4.0), after_ns=SECOND // 10)
+    alone.later(1.0)
+    assert fix.x_m == pytest.approx(4.0)
+    assert alone.early == []
+
+
+def test_the_sigma_of_a_range_does_not_follow_its_own_error() -> None:
+    """A short reading would count for more than a long one, and pull the teammate nearer."""
+    alone = Alone(least_value=0.0, fix_interval_s=0.0)
+    alone.tell(Presence("mate", POORER))
+    alone.sees(ahead(range_m=4.0))
+    short, long = (alone.sees(ahead(range_m=r))[0].sensor_covariance[0] for r in (3.5, 4.5))
+    assert long == pytest.approx((3.5 / 4.0) ** 2 * short, rel=0.01)
+    late = alone.sees(ahead(range_m=4.5), after_ns=2 * SECOND)[0].sensor_covariance[0]
+    assert late == pytest.approx((4.5 / 3.5) ** 2 * long, rel=0.01)
+
+
 def test_the_fix_with_the_largest_gain_comes_first() -> None:
     for names in (("mate", "other"), ("other", "mate")):
         alone = Alone()

@@ -49,6 +49,7 @@ class Alone:
         self.agent = CollaborationAgent("me", settings, MATES, 0, Budget(budget, 0))
         self.now_ns = 0
         self.heard = True
+        self.early: list[Fix] = []  # fixes that waited for something
         self.here = PoseEstimate(
             0, Estimate(Pose2(0.0, 0.0, 0.0), diagonal(SIGMA_M[tier], 0.02)), "", 0.0, 0.0
         )
@@ -69,7 +70,9 @@ class Alone:
         track, *said = self.agent.handle(self.here, self.now_ns)
         assert isinstance(track, Track)
         assert track.tier == self.agent.tier
-        return self._sent(said, Belief)
+        early = [message for message in said if isinstance(message, Fix)]
+        self.early += self._sent(early, Fix)
+        return self._sent([message for message in said if message not in early], Belief)
 
     def later(self, seconds: float) -> list[Belief]:
         """Time passes, the robot goes on as it said; its beliefs, at most ten a second."""
