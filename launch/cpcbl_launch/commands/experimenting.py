@@ -108,7 +108,9 @@ def budget(
 
     team = load_team(logged_team.builtin_for(data))
     logged = logged_team.with_duration(logged_team.load_logged_team(team, data), duration)
-    logged = logged._replace(team=with_blind_robots(logged.team, parse_names(blind)))
+    logged = logged._replace(
+        team=with_blind_robots(logged.team, parse_names(blind), logged.left_out)
+    )
     measure = partial(experiment.measure_curve, logged, jobs)
     total = len(experiment.cases())
     _conduct("budget", measure, experiment.tables, output, as_json, total=total)
@@ -120,6 +122,31 @@ _add_command(
     10,
     "An observer that sends wrong positions: the team's error, and when the fault is found.",
 )
+
+
+@experiment_app.command("worlds")
+def worlds(
+    seeds: Seeds = 60,
+    names: Annotated[
+        str, typer.Option("--worlds", help='Words in the names of worlds: "landmark,helper".')
+    ] = "",
+    variants: Annotated[str, typer.Option(help="Variants to compare.")] = "joint,oval,circular",
+    jobs: Jobs = None,
+    output: Output = Path(),
+    as_json: AsJson = False,
+) -> None:
+    """Consistency outside the usual case: few landmarks, lost odometry, unknown starts, ..."""
+    from cpcbl_launch.lab.experiments import worlds as experiment
+
+    cases = experiment.cases(parse_names(names), parse_names(variants))
+
+    def measure(done: Callable[[], None]) -> Any:
+        return experiment.EXPERIMENT.outcome(
+            experiment.EXPERIMENT.results(cases, seeds, jobs, done)
+        )
+
+    total = len(cases) * seeds
+    _conduct("worlds", measure, experiment.tables, output, as_json, total=total, drawn=False)
 
 
 @experiment_app.command("eyes")

@@ -1,0 +1,129 @@
+"""The table of worlds: what a world does to a team, and that estimates hold in each of them."""
+
+import math
+
+import pytest
+from support.processes import command_line
+
+from cpcbl_launch.lab.experiments import worlds
+from cpcbl_launch.lab.experiments.runs import map_in_processes
+from cpcbl_launch.lab.experiments.worlds import (
+    LossyBus,
+    WorldRun,
+    cases,
+    row,
+    run_world,
+    verdict,
+)
+from cpcbl_team.errors import InputError
+from cpcbl_transport import topics
+from cpcbl_transport.memory_bus import MemoryHub
+
+GOOD = WorldRun(rmse_m=0.1, nees=2.0, heading_nees=1.0, inside_3_sigma=0.99, lost_share=0.0)
+CONSISTENT = ("consistent", "conservative")
+QUICK = (  # the worlds of the findings, each as short as it may be
+    "1 landmark bearing-only",
+    "1 landmark range-only, standing",
+    "20% of odometry lost, 2 landmarks",
+    "50% of odometry lost, 4 landmarks",
+    "carried away, 1 landmark",
+    "carried away, 2 landmarks",
+    "helper with heading σ 20 deg",
+    "landmarks 1 s in 10",
+    "start unknown",
+)
+
+
+@pytest.mark.parametrize(
+    ("nees", "inside", "word"),
+    [
+        ((2.2, 0.3), (0.99, 0.01), "consistent"),
+        ((2.4, 0.3), (0.99, 0.01), "overconfident"),
+        ((2.0, 0.3), (0.96, 0.01), "overconfident"),
+        ((2.0, 0.3), (0.975, 0.01), "consistent"),
+        ((1.5, 0.3), (1.0, 0.0), "conservative"),
+    ],
+)
+def test_the_verdict_is_that_of_the_bounds(
+    nees: tuple[float, float], inside: tuple[float, float], word: str
+) -> None:
+    assert verdict(nees, inside) == word
+
+
+def test_a_lost_robot_has_no_figures_but_that() -> None:
+    lost = WorldRun(math.nan, math.nan, math.nan, math.nan, 1.0)
+    nothing = row("w", "joint", [[lost], [lost]])
+    assert (nothing["verdict"], nothing["nees"], nothing["lost_share"]) == (
+        "always lost",
+        None,
+        1.0,
+    )
+    some = row("w", "joint", [[GOOD], [lost], [GOOD._replace(nees=4.0)]])
+    assert (some["nees"], some["runs"]) == (3.0, 3)
+    assert some["lost_share"] == pytest.approx(1 / 3)
+
+
+def test_worlds_are_chosen_by_words() -> None:
+    chosen = cases(["2 landmarks range", "ring,"], ["joint", "oval"])
+    assert list(chosen) == [
+        ("2 landmarks range-only", "joint"),
+        ("2 landmarks range-only", "oval"),
+        ("ring, landmarks 1 s in 10", "joint"),
+        ("ring, landmarks 1 s in 10", "oval"),
+    ]
+    assert chosen["2 landmarks range-only", "oval"].team.robots["r"].localizer.variant == "oval"
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [(("--worlds", "moon"), "moon: no world"), (("--variants", "weighted"), "not one of joint")],
+)
+def test_an_unknown_world_or_variant_is_one_line(options: tuple[str, ...], text: str) -> None:
+    ran = command_line("experiment", "worlds", *options)
+    assert ran.returncode == 2
+    assert text in ran.stderr
+    with pytest.raises(InputError):
+        cases(["moon"])
+
+
+@pytest.mark.parametrize(("lost", "silent_s"), [(0.5, 0.0), (0.0, 2.0)])
+def test_as_much_odometry_is_lost_as_a_world_says(lost: float, silent_s: float) -> None:
+    hub, arrived = MemoryHub(), [0]
+    world = worlds.worlds()["walls"]._replace(odometry_lost=lost, silent_s=silent_s)
+    bus = LossyBus(hub.session(), "r", world, 1)
+
+    def count(key: str, payload: bytes) -> None:
+        arrived[0] += 1
+
+    bus.subscribe(topics.IN_ODOMETRY.at(robot="r"), count)
+    driver = hub.session().publisher(topics.IN_ODOMETRY.at(robot="r"), topics.IN_ODOMETRY.qos)
+    for _ in range(1000):
+        driver.put(b"")
+    assert arrived[0] == pytest.approx(1000 * (1.0 - lost) - 20 * silent_s, abs=50 * (lost > 0.0))
+
+
+def figures(names: tuple[str, ...], variants: tuple[str, ...], seeds: int) -> dict[str, object]:
+    """The verdict of each world and variant."""
+    chosen = cases(names, variants)
+    tasks = [(world, seed) for world in chosen.values() for seed in range(1, seeds + 1)]
+    runs = map_in_processes(run_world, tasks, 1 if seeds < 10 else None, lambda: None)
+    return {
+        f"{world}, {variant}": row(world, variant, runs[i * seeds : (i + 1) * seeds])["verdict"]
+        for i, (world, variant) in enumerate(chosen)
+    }
+
+
+@pytest.mark.parametrize("world", QUICK)
+def test_a_robot_knows_how_far_it_errs_outside_the_usual_case(world: str) -> None:
+    """A few seeds of the worlds in which it once did not; the same noise every time."""
+    found = figures((world,), ("joint",), 5)
+    expected = ("always lost",) if world == "carried away, 1 landmark" else CONSISTENT
+    assert {name for name, word in found.items() if word not in expected} == set()
+
+
+@pytest.mark.long
+def test_no_variant_is_overconfident_in_any_world() -> None:
+    found = figures((), worlds.VARIANTS, 60)
+    lost = {name for name, word in found.items() if word == "always lost"}
+    assert lost == {f"carried away, 1 landmark, {variant}" for variant in worlds.VARIANTS}
+    assert {n for n, word in found.items() if n not in lost and word not in CONSISTENT} == set()
