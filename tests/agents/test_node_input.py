@@ -151,12 +151,13 @@ def test_a_duplicate_is_counted_and_changes_nothing_else(
 
 def test_a_duplicate_frame_does_not_repeat_its_fixes() -> None:
     stand = helper(least_value=0.0)
-    exchange(stand, 1.0)
     ear = stand.ear(topics.FIX.at(robot="mate"))
+    exchange(stand, 1.0)
     stand.stand_still(0.1)
+    before = len(ear.messages)
     for _ in range(2):
         look(stand)
-    assert len(ear.messages) == 1
+    assert len(ear.messages) == before + 1
 
 
 FINITE = st.floats(allow_nan=False, allow_infinity=False)

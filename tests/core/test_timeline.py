@@ -274,6 +274,17 @@ def test_beliefs_in_any_order_give_the_same_state(
         assert same(asked.state, after(robot, shuffled[: len(asked._inputs)]).state)
 
 
+def test_a_belief_at_the_end_of_a_gap_gives_the_same_state_in_any_order() -> None:
+    """Odometry that ends a gap bridges it, unless an input of that very time comes before it."""
+    robot = localizer("joint", MIXED)
+    wheels = [Odometry(ms * MS, (ms + 50) * MS, d, 0.02) for ms, d in ((0, 0.05), (250, 0.01))]
+    told = belief(1.0, 0.0, 750 * MS)
+    asked = after(robot, wheels)
+    assert asked.state.counts == {"odometry_gap": 1}
+    assert asked.add(told) is None
+    assert same(asked.state, after(robot, [*wheels, told]).state)
+
+
 # What is refused ----------------------------------------------------------------------------------
 
 
