@@ -86,6 +86,18 @@ def arc_variance(heading_variance: float) -> float:
     return -2.0 * math.expm1(-0.5 * heading_variance) + 0.5 * math.expm1(-2.0 * heading_variance)
 
 
+def with_sensor_factor(fix: Fix, factor: float) -> Fix:
+    """The fix with the sensor's parts of its variances times this factor."""
+    if factor == 1.0:
+        return fix
+    xx, xy, yy = fix.sensor_covariance
+    return replace(
+        fix,
+        sensor_covariance=(factor * xx, factor * xy, factor * yy),
+        heading_sensor_variance=factor * fix.heading_sensor_variance,
+    )
+
+
 def without_heading(fix: Fix) -> Fix:
     """The fix without the heading."""
     return replace(

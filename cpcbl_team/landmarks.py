@@ -64,10 +64,13 @@ class LandmarkUpdate:
     def __init__(self, state: State) -> None:
         self.stamp_ns = state.stamp_ns
         pose, self.covariance, _ = state.estimate  # all is linearized at this prior
-        self.x, self.y, self.heading = pose
+        calibration = state.memory.calibration
+        self.x, self.y, heading = pose
+        self.heading = heading - calibration.bearing_bias_rad  # the direction of bearing 0
+        self.weight = 1.0 / calibration.adaptation.sensor_factor
         self.evidence = InformationSum()
         self.used: dict[str, int] = {}  # the landmarks whose evidence was accepted, and when: now
-        self.rejected = 0  # how many landmarks the gate has rejected
+        self.rejected: list[str] = []  # the landmarks that the gate has rejected
         self.constrains = False  # whether any reading speaks of the part, accepted or not
         self.unrecorded: list[Sighting] = []  # sightings that are new evidence for recovery
         self.others: list[Sighting] = []  # sightings that are not plain
@@ -161,13 +164,13 @@ class Landmarks:
         u = v = m = n = range_error = bearing_error = range_weight = bearing_weight = 0.0
         if range_m is not None:
             u, v, range_error = circle(dx, dy, distance, range_m)
-            range_weight = 1.0 / sharpest(self._range_variance(distance, range_m))
+            range_weight = update.weight / sharpest(self._range_variance(distance, range_m))
         if bearing is not None:
             m, n, bearing_error = heading(dx, dy, distance_squared, bearing, update.heading)
-            bearing_weight = self._heading_weight
+            bearing_weight = update.weight * self._heading_weight
             if as_ray:
                 width_squared = sharpest(distance_squared * self._width_squared_per_m2)
-                bearing_weight = distance_squared / width_squared
+                bearing_weight = update.weight * distance_squared / width_squared
                 if not -FARTHEST_RAD <= bearing_error <= FARTHEST_RAD:
                     bearing_weight = 0.0
                     if range_m is None:
@@ -185,7 +188,7 @@ class Landmarks:
             ((u, v, 0.0), range_error, range_weight),
             ((m, n, 1.0), bearing_error, bearing_weight),
         ):
-            update.rejected += 1
+            update.rejected.append(name)
             return
         update.used[name] = update.stamp_ns
         if range_m is not None:

@@ -25,8 +25,15 @@ from cpcbl_team.measurements import (
     measurement_of,
     nis_of,
 )
-from cpcbl_team.motion import NO_VARIANCE, bridge, inflate_by_gap, is_gap, part_of_piece
+from cpcbl_team.motion import (
+    NO_VARIANCE,
+    bridge,
+    inflate_by_gap,
+    is_gap,
+    part_of_piece,
+)
 from cpcbl_team.object_timers import ObjectTimers, has_passed
+from cpcbl_team.own_calibration import OwnCalibration
 from cpcbl_team.recovery import (
     Recovery,
     evidence_from_observation,
@@ -36,7 +43,6 @@ from cpcbl_team.recovery import (
     with_measurements,
     with_snapshot,
 )
-from cpcbl_team.self_calibration import ReferencePose, ReferencePoses, self_calibrate
 from cpcbl_team.sensors import sighting_fault, time_at_min_speed_s
 from cpcbl_team.state import (
     LandmarkSnapshot,
@@ -71,7 +77,7 @@ class Localizer:
         self._odometry = settings.odometry
         self._odometry_timeout_ns = int(settings.odometry.timeout_s * 1e9)
         self._has_dead_zone = settings.odometry.least_speed_m_s > 0.0
-        self._calibrates = rules.learns
+        self._calibration = OwnCalibration(settings)
         self._widens = rules.variant != "weighted" and not rules.paper_uncertainty
         self._window = rules.lost_window
         self._belief_age_ns = int(settings.collaboration.max_age_s * 1e9)
@@ -130,11 +136,13 @@ class Localizer:
             crawl_s = 0.0
             if self._has_dead_zone:
                 crawl_s = time_at_min_speed_s(distance, seconds, self._odometry)
-            if self._calibrates:
-                state, distance, turn = _with_learned_scales(state, distance, turn)
+            extra, own = NO_VARIANCE, self._calibration
+            if own.is_known(state):
+                state, distance, turn = own.corrected_motion(state, distance, turn)
+                extra = own.extra_variance(state, distance, turn, crawl_s)
             if distance != 0.0 or turn != 0.0:
                 odometry_from_robot = step(odometry_from_robot, distance, turn)
-                estimate = self._variant.move(estimate, distance, turn, crawl_s)
+                estimate = self._variant.move(estimate, distance, turn, crawl_s, extra)
         state = with_motion(state, until_ns, estimate, odometry_from_robot)
         if until_ns > state.odometry_until_ns and self._odometry.moves:
             return self._across_gap(state, stamp_ns, following)
@@ -146,8 +154,8 @@ class Localizer:
         gap_ns = until_ns - begin_ns
         from_s = max(from_ns - begin_ns, 0) * 1e-9
         distance, turn, extra = bridge(before, following, from_s, gap_ns * 1e-9, self._odometry)
-        if self._calibrates:
-            state, distance, turn = _with_learned_scales(state, distance, turn)
+        if self._calibration.is_known(state):
+            state, distance, turn = self._calibration.corrected_motion(state, distance, turn)
         if distance != 0.0 or turn != 0.0 or extra != NO_VARIANCE:
             place = step(place, distance, turn)
             estimate = self._variant.move(estimate, distance, turn, 0.0, extra)
@@ -214,7 +222,8 @@ class Localizer:
         beliefs, pose = state.memory.teammates.beliefs, state.estimate.pose
         measured: list[Measurement] = []
         faults: list[str] = []
-        bias = state.memory.calibration.learned.bearing_bias_rad if self._calibrates else 0.0
+        calibration = state.memory.calibration
+        bias, factor = calibration.bearing_bias_rad, calibration.adaptation.sensor_factor
         for sighting in sightings:
             fault = sighting_fault(sighting)
             if fault:
@@ -222,7 +231,8 @@ class Localizer:
                 continue
             m = measurement_of(sighting, now_ns, pose, self.field, beliefs, self.settings)
             if m is not None:
-                measured.append(m if bias == 0.0 else m.rotated(-bias))
+                m = m if bias == 0.0 else m.rotated(-bias)
+                measured.append(m if factor == 1.0 else m.inflated(factor))
         return measured, faults
 
     # Steps 3 to 5 -----------------------------------------------------------------------------
@@ -264,7 +274,9 @@ class Localizer:
         accepted, others_rejected = gated
         if accepted:
             used = used | {found.measurement.source: state.stamp_ns for found in accepted}
-        rejected = landmarks.rejected + len(others_rejected)
+        rejected = len(landmarks.rejected) + len(others_rejected)
+        if rejected:
+            state = self._calibration.after_rejections(state, landmarks, others_rejected)
         return self._with_update(state, estimate, scope, used, rejected)
 
     def _with_update(
@@ -281,22 +293,7 @@ class Localizer:
         window = with_innovations(updates.innovations, accepted, rejected, self._window)
         updates = updates_with_frame(updates, now, scope, used, rejected, window)
         state = with_correction(state, estimate, updates)
-        return self._with_calibration(state) if accepted and self._calibrates else state
-
-    def _with_calibration(self, state: State) -> State:
-        """The state with what the robot learns from this update of its odometry and bearings."""
-        memory, place = state.memory.calibration, state.odometry_from_robot
-        here = ReferencePose(state.stamp_ns, state.estimate, place, memory.total_turn_rad)
-        if state.memory.recovery.lost:
-            memory = memory._replace(references=None)
-        elif memory.references is None:
-            memory = memory._replace(references=ReferencePoses(here, here))
-        else:
-            known, references = self_calibrate(
-                memory.learned, memory.references, here, self._odometry
-            )
-            memory = memory._replace(learned=known, references=references)
-        return with_memory(state, state.memory._replace(calibration=memory))
+        return self._calibration.after_update(state) if accepted else state
 
     # Teammates and the position sensor --------------------------------------------------------
 
@@ -385,15 +382,6 @@ class Localizer:
     def start(self, stamp_ns: int) -> State:
         """The state at the start: at the configured pose, or lost somewhere on the field."""
         return state_at_start(stamp_ns, self.settings.start, self.field)
-
-
-def _with_learned_scales(state: State, distance: float, turn: float) -> tuple[State, float, float]:
-    """A motion by the scales that the robot has learned, and the state that counts its turn."""
-    memory = state.memory.calibration
-    distance *= memory.learned.distance_scale
-    turn *= memory.learned.turn_scale
-    memory = memory._replace(total_turn_rad=memory.total_turn_rad + turn)
-    return with_memory(state, state.memory._replace(calibration=memory)), distance, turn
 
 
 def _source(m: Measurement) -> str:

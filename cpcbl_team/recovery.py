@@ -285,7 +285,9 @@ class Recovery:
         memory = memory._replace(
             recovery=recovery._replace(lost="", kidnapped_ns=-1),
             teammates=teammates._replace(senders=reset_scores(teammates.senders)),
-            calibration=calibration._replace(references=None),
+            calibration=calibration._replace(
+                references=None, check=calibration.check.restarted(state.updates.accepted)
+            ),
         )
         updates = state.updates._replace(innovations=1)
         return state._replace(estimate=self._reduce(estimate), updates=updates, memory=memory)

@@ -15,6 +15,7 @@ from cpcbl_team.config import Field, Start
 from cpcbl_team.estimate import HEADING, POSE, POSITION, Covariance3, Estimate, Scope
 from cpcbl_team.geometry import Pose2, new, wrap_angle
 from cpcbl_team.inputs import Belief, Odometry, Sighting
+from cpcbl_team.miscalibration import AS_CONFIGURED, Adaptation, ModelCheck
 from cpcbl_team.self_calibration import ReferencePoses, SelfCalibration
 from cpcbl_team.trust import SenderRecord
 
@@ -112,11 +113,29 @@ class TeammateMemory(NamedTuple):
 
 
 class CalibrationMemory(NamedTuple):
-    """What a self-calibrating robot has learned, and what it compares next."""
+    """What a self-calibrating robot has learned, and what it compares next; what every robot
+    notices of its calibration, and what it changes."""
 
     learned: SelfCalibration = SelfCalibration()
     references: ReferencePoses | None = None
     total_turn_rad: float = 0.0  # of the odometry since the start
+    check: ModelCheck = ModelCheck()
+    adaptation: Adaptation = AS_CONFIGURED
+
+    @property
+    def corrected(self) -> SelfCalibration:
+        """All that the robot knows of the scales of its odometry and the bias of its bearings."""
+        adapted = self.adaptation
+        return self.learned._replace(
+            distance_scale=self.learned.distance_scale * adapted.distance_scale,
+            turn_scale=self.learned.turn_scale * adapted.turn_scale,
+            bearing_bias_rad=self.bearing_bias_rad,
+        )
+
+    @property
+    def bearing_bias_rad(self) -> float:
+        """What bearings are too large by, as far as the robot knows."""
+        return self.learned.bearing_bias_rad + self.adaptation.bearing_bias_rad
 
 
 class Memory(NamedTuple):

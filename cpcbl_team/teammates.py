@@ -44,7 +44,7 @@ class TeammateScreen:
         accepted, rejected = (
             sum(not found.measurement.is_teammate for found in objects) for objects in gated
         )
-        accepted, rejected = accepted + len(landmarks.used), rejected + landmarks.rejected
+        accepted, rejected = accepted + len(landmarks.used), rejected + len(landmarks.rejected)
         if (accepted or rejected) and not is_lost:
             state = self._with_own_sensors(state, accepted, rejected)
         distrusted = set()

@@ -27,11 +27,13 @@ class PoseEstimate(NamedTuple):
 
 class FrameEstimate(NamedTuple):
     """The filter's estimate at the time of a frame, from which fixes are made. The frame's bearings
-    are corrected by the bias that the robot has learned, as the estimate is."""
+    are corrected by the bias that the robot has learned, as the estimate is; the sensor's variances
+    are so many times those of the settings."""
 
     frame: Sightings
     estimate: Estimate
     lost: str
+    sensor_factor: float = 1.0
 
 
 class Presence(NamedTuple):

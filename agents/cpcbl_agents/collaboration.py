@@ -14,7 +14,7 @@ from cpcbl_agents import agent
 from cpcbl_agents.guests import GuestRegistry
 from cpcbl_team import information_gain as gains
 from cpcbl_team.config import LocalizationSettings
-from cpcbl_team.fixes import fix_for, without_heading
+from cpcbl_team.fixes import fix_for, with_sensor_factor, without_heading
 from cpcbl_team.gaussian import Covariance2
 from cpcbl_team.information_gain import FixMemory, HeadingMemory
 from cpcbl_team.inputs import Belief, Fix
@@ -192,6 +192,7 @@ class CollaborationAgent:
             fix = fix_for(self._robot, stamp_ns, seen.estimate, s, sensor, earlier)
             if fix is None:
                 continue
+            fix = with_sensor_factor(fix, seen.sensor_factor)
             self._latest_fixes[fix.robot] = fix
             if seen.lost:
                 continue

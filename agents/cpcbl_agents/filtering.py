@@ -7,6 +7,7 @@ from cpcbl_agents.agent import AgentMessage, FrameEstimate, PoseEstimate, Presen
 from cpcbl_team.config import Field, LocalizationSettings
 from cpcbl_team.inputs import Belief, BeliefShared, Fix, Input, Odometry, Position, Sightings
 from cpcbl_team.localizer import Localizer
+from cpcbl_team.miscalibration import sigma_percentages
 from cpcbl_team.self_calibration import SelfCalibration
 from cpcbl_team.sensors import without_bearing_bias
 from cpcbl_team.timeline import Timeline
@@ -42,12 +43,15 @@ class FilterAgent:
     @property
     def all_counts(self) -> Counter[str]:
         """What this agent refused, and what the localizer used and gated."""
-        return self.counts + Counter(self.timeline.state.counts)
+        calibration = self.timeline.state.memory.calibration
+        factors = sigma_percentages(calibration.adaptation)
+        return self.counts + Counter(self.timeline.state.counts) + Counter(factors)
 
     @property
     def self_calibration(self) -> SelfCalibration | None:
-        """What the robot has learned of its odometry and bearings; None where it does not learn."""
-        return self.timeline.state.memory.calibration.learned if self._learns else None
+        """What the robot has learned of its odometry and bearings; None where there is nothing."""
+        known = self.timeline.state.memory.calibration.corrected
+        return known if self._learns or known != SelfCalibration() else None
 
     def trust_statuses(self, now_ns: int) -> tuple[TrustStatus, ...]:
         """How far this robot trusts each teammate from which it receives help."""
@@ -105,8 +109,8 @@ class FilterAgent:
             state = self.timeline.at(stamp_ns)
             if state is None:
                 continue
-            if self._learns:
-                learned = state.memory.calibration.learned
-                frame = without_bearing_bias(frame, learned.bearing_bias_rad)
-            ready.append(FrameEstimate(frame, state.estimate, state.lost))
+            calibration = state.memory.calibration
+            frame = without_bearing_bias(frame, calibration.bearing_bias_rad)
+            factor = calibration.adaptation.sensor_factor
+            ready.append(FrameEstimate(frame, state.estimate, state.lost, factor))
         return ready

@@ -16,6 +16,7 @@ from cpcbl_agents.robot import build_robot
 from cpcbl_team.config import LocalizerSettings
 from cpcbl_team.estimate import ZERO3
 from cpcbl_team.inputs import Sighting
+from cpcbl_team.miscalibration import Adaptation
 from cpcbl_team.self_calibration import SelfCalibration
 from cpcbl_team.state import CalibrationMemory
 from cpcbl_transport import topics
@@ -104,13 +105,23 @@ def test_arrivals_wake_the_robots_own_loop() -> None:
     assert not node.waiting
 
 
-def test_the_status_contains_what_self_calibration_has_learned() -> None:
+def test_the_status_contains_what_a_robot_knows_of_its_calibration() -> None:
+    """Also of one that does not calibrate itself, but noticed that its settings are wrong."""
     learning = LocalizerSettings(self_calibration=True)
     stand = TeamOnBus(with_robot(two_robots(), "me", localizer=learning))
-    for robot in stand.robots.values():
-        timeline = robot.filter.timeline
-        calibration = CalibrationMemory(SelfCalibration(0.98, 0.96, 0.01))
+    assert stand.status("me").learned == (1.0, 1.0, 0.0)
+    assert stand.status("mate").learned is None
+    known = SelfCalibration(0.98, 0.96, 0.01)
+    changed = Adaptation(1.2, motion_factor=4.0, sensor_factor=2.25)
+    for name, calibration in (
+        ("me", CalibrationMemory(known)),
+        ("mate", CalibrationMemory(adaptation=changed)),
+    ):
+        timeline = stand.robots[name].filter.timeline
         memory = timeline.state.memory._replace(calibration=calibration)
         timeline._states[-1] = timeline.state._replace(memory=memory)
     assert stand.status("me").learned == (0.98, 0.96, 0.01)
-    assert stand.status("mate").learned is None
+    mate = stand.status("mate")
+    assert mate.learned == (1.2, 1.0, 0.0)
+    assert mate.counts["odometry_sigma_percent"] == 200
+    assert mate.counts["sensor_sigma_percent"] == 150

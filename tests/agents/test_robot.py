@@ -12,7 +12,6 @@ from cpcbl_agents.filtering import ODOMETRY_WAIT_NS
 from cpcbl_agents.robot import Robot, build_robot
 from cpcbl_team.config import (
     CollaborationSettings,
-    LocalizerSettings,
     MatchSettings,
     OdometrySettings,
     PositionSensor,
@@ -23,6 +22,7 @@ from cpcbl_team.estimate import ZERO3, Estimate
 from cpcbl_team.geometry import Pose2
 from cpcbl_team.geometry import step as stepped
 from cpcbl_team.inputs import Belief, Fix, Odometry, Position, Sighting, Sightings
+from cpcbl_team.miscalibration import Adaptation
 from cpcbl_team.self_calibration import SelfCalibration
 from cpcbl_team.state import CalibrationMemory
 from cpcbl_team.tiers import LOWEST_TIER
@@ -292,13 +292,11 @@ def test_a_late_frames_fixes_are_of_its_own_time() -> None:
     assert (fix.x_m, fix.y_m) == pytest.approx((2.03, 0.0), abs=0.02)
 
 
-def stood_with_bias(learns: bool) -> Robot:
-    """Half a second; its bearings are 0.1 rad too large, as it has learned if it learns."""
-    rules = LocalizerSettings(self_calibration=learns)
-    subject = robot(with_robot(TEAM, "me", localizer=rules))
+def stood_with_bias(known: CalibrationMemory) -> Robot:
+    """Half a second; its bearings are 0.1 rad too large, as it may know."""
+    subject = robot()
     state = subject.filter.timeline.state
-    known = SelfCalibration(bearing_bias_rad=0.1)
-    memory = state.memory._replace(calibration=CalibrationMemory(known))
+    memory = state.memory._replace(calibration=known)
     subject.filter.timeline._states[-1] = state._replace(memory=memory)
     for piece in pieces(0.5, 0.0, 0.0):
         subject.handle(piece, piece.stamp_ns)
@@ -306,24 +304,52 @@ def stood_with_bias(learns: bool) -> Robot:
     return subject
 
 
-@pytest.mark.parametrize("learns", [True, False])
-def test_fixes_are_without_the_bias_that_the_robot_has_learned(learns: bool) -> None:
+with_bias = pytest.mark.parametrize(
+    ("known", "bearing"),
+    [
+        (CalibrationMemory(SelfCalibration(bearing_bias_rad=0.1)), 0.0),
+        (CalibrationMemory(adaptation=Adaptation(bearing_bias_rad=0.1)), 0.0),
+        (CalibrationMemory(), 0.1),
+    ],
+    ids=["learned", "adapted", "unknown"],
+)
+
+
+@with_bias
+def test_fixes_are_without_the_bias_that_the_robot_knows(
+    known: CalibrationMemory, bearing: float
+) -> None:
     """Bearings are 0.1 rad too large: the mate is 2 m ahead all the same."""
-    subject = stood_with_bias(learns)
+    subject = stood_with_bias(known)
     (fix,) = fixes(subject.handle(saw(400 * MS, Sighting("mate", 2.0, 0.1)), 500 * MS))
-    bearing = 0.0 if learns else 0.1
     expected = 2.0 * math.cos(bearing), 2.0 * math.sin(bearing)
     assert (fix.x_m, fix.y_m) == pytest.approx(expected, abs=1e-9)
 
 
-@pytest.mark.parametrize("learns", [True, False])
-def test_a_heading_is_sent_without_the_learned_bias_and_used(learns: bool) -> None:
+def test_a_fix_by_a_worse_sensor_than_configured_says_so() -> None:
+    sighting = Sighting("mate", 2.0, 0.1)
+    usual, worse = (
+        fixes(stood_with_bias(known).handle(saw(400 * MS, sighting), 500 * MS))[0]
+        for known in (
+            CalibrationMemory(),
+            CalibrationMemory(adaptation=Adaptation(sensor_factor=1.5)),
+        )
+    )
+    scaled = [1.5 * c for c in usual.sensor_covariance]
+    assert worse.sensor_covariance == pytest.approx(scaled)
+    assert worse.observer_covariance == usual.observer_covariance
+
+
+@with_bias
+def test_a_heading_is_sent_without_the_known_bias_and_used(
+    known: CalibrationMemory, bearing: float
+) -> None:
     """A marker is seen against the line of sight, so it is off by as much as the bearing."""
-    subject = stood_with_bias(learns)
+    subject = stood_with_bias(known)
     seen = Sighting("mate", 2.0, 0.1, None, None, 1.1, 0.05)
     (fix,) = fixes(subject.handle(saw(400 * MS, seen), 500 * MS))
     own = subject.filter.timeline.state.estimate.pose.heading
-    assert fix.heading_rad == pytest.approx(own + (1.0 if learns else 1.1), abs=1e-9)
+    assert fix.heading_rad == pytest.approx(own + 1.0 + bearing, abs=1e-9)
     helped = robot()
     here = {"x_m": 0.0, "y_m": 0.0, "heading_rad": 0.05}
     helped.handle(replace(fix, robot="me", observer="mate", **here), 500 * MS)

@@ -17,12 +17,14 @@ from support.core import (
     SECOND,
     Matrix,
     covariance2,
+    displaced,
     frame,
     localizer,
     loop,
     matrix3,
     point_sighting,
     sensor_noise,
+    steered,
 )
 
 from cpcbl_launch.reporting.metrics import Samples, Score, score
@@ -47,19 +49,6 @@ PIECE_NS = SECOND // 10
 FADE_S = 2.0
 
 Perceive = Callable[[np.random.Generator], Callable[[Pose2, int], Sightings | Fix]]
-
-
-def displaced(pose: Pose2, covariance: Covariance3, rng: np.random.Generator) -> Pose2:
-    """The pose with an error drawn from this covariance (of any rank)."""
-    values, vectors = np.linalg.eigh(matrix3(covariance))
-    x, y, h = vectors @ (np.sqrt(np.maximum(values, 0.0)) * rng.normal(size=3))
-    return Pose2(pose.x + x, pose.y + y, wrap_angle(pose.heading + h))
-
-
-def steered(truth: Pose2, planned: Pose2) -> float:
-    """The turn that keeps the robot on its path, whatever its estimate."""
-    ahead = truth.inverse() @ planned
-    return max(-0.3, min(0.3, math.atan2(ahead.y, max(ahead.x, 0.0) + 0.5)))
 
 
 def samples(robot: Localizer, perceive: Perceive, seed: int) -> tuple[Matrix, Matrix, Matrix]:

@@ -225,6 +225,19 @@ def followed(
         yield state, truth
 
 
+def displaced(pose: Pose2, covariance: Covariance3, rng: np.random.Generator) -> Pose2:
+    """The pose with an error drawn from this covariance (of any rank)."""
+    values, vectors = np.linalg.eigh(matrix3(covariance))
+    x, y, h = vectors @ (np.sqrt(np.maximum(values, 0.0)) * rng.normal(size=3))
+    return Pose2(pose.x + x, pose.y + y, wrap_angle(pose.heading + h))
+
+
+def steered(truth: Pose2, planned: Pose2) -> float:
+    """The turn that keeps the robot on its path, whatever its estimate."""
+    ahead = truth.inverse() @ planned
+    return max(-0.3, min(0.3, math.atan2(ahead.y, max(ahead.x, 0.0) + 0.5)))
+
+
 # Errors ------------------------------------------------------------------------------------------
 
 

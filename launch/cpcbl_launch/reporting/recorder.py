@@ -258,6 +258,8 @@ class Recorder:
         counts = Counter[str]()
         for status in statuses:
             counts.update(status.counts)
+        latest = statuses[-1].counts if statuses else {}
+        percentages = {name: n for name, n in latest.items() if name.endswith("_percent")}
         return RobotReport(
             **msgspec.structs.asdict(figures),
             variant=variant,
@@ -269,7 +271,7 @@ class Recorder:
             bytes_sent=sum(s.bytes_sent for s in statuses),
             messages_received=sum(s.messages_received for s in statuses),
             bytes_received=sum(s.bytes_received for s in statuses),
-            counts=dict(sorted(counts.items())),
+            counts=dict(sorted({**counts, **percentages}.items())),
             learned=_learned_report(statuses),
             sent=summed_flows(s.sent for s in statuses),
             heard=summed_flows(s.heard for s in statuses),

@@ -1,7 +1,7 @@
 """What the statuses of a robot's processes come to, for reports and people: traffic and trust."""
 
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import chain
 
 import msgspec
@@ -102,6 +102,24 @@ def distrust_text(trust: Iterable[Trust | TrustReport]) -> str:
     """`distrusts west (biased), r4 (clock 0.45 s ahead)`; empty where all are believed."""
     named = [f"{t.peer} ({_reason_text(t)})" for t in trust if t.reason]
     return f"distrusts {', '.join(named)}" if named else ""
+
+
+def miscalibration_text(counts: Mapping[str, int]) -> str:
+    """`σ of its odometry × 2.1, 13 % of sightings rejected`: why a robot is called miscalibrated;
+    empty if it is not."""
+    if not counts.get("miscalibrated"):
+        return ""
+    texts = [
+        f"σ of its {what} × {counts[name] / 100.0:.1f}"
+        for what, name in (
+            ("odometry", "odometry_sigma_percent"),
+            ("sensor", "sensor_sigma_percent"),
+        )
+        if name in counts
+    ]
+    used, rejected = counts.get("accepted", 0), counts.get("gated", 0)
+    texts.append(f"{rejected / max(used + rejected, 1):.1%} of observations rejected")
+    return ", ".join(texts)
 
 
 def _reason_text(t: Trust | TrustReport) -> str:

@@ -20,7 +20,11 @@ from cpcbl_launch.reporting.recorder import (
     Report,
     RobotReport,
 )
-from cpcbl_launch.reporting.statuses import distrust_text, trust_remarks
+from cpcbl_launch.reporting.statuses import (
+    distrust_text,
+    miscalibration_text,
+    trust_remarks,
+)
 from cpcbl_launch.reporting.tables import number, percent, short, table
 from cpcbl_launch.run.observer import ObserverReport
 from cpcbl_launch.run.processes import ROBOT, Processes
@@ -69,6 +73,8 @@ class LiveTable(LiveView):
             status = statuses.get(name)
             if status is not None and (text := distrust_text(status.trust)):
                 state.append(f", {text}", "yellow")
+            if status is not None and status.counts.get("miscalibrated"):
+                state.append(", miscalibrated", "yellow")
             if name not in self._robots:
                 there = newest_ns - tracks[name].stamp_ns <= AWAY_S * 1e9
                 pid, state = "guest", state if there else Text("left", "dim")
@@ -229,6 +235,8 @@ def _remarks(report: Report) -> Iterator[str]:
             scales = f"distance × {own.distance_scale:.2f}, turn × {own.turn_scale:.2f}"
             turned = f"bearings {-own.bearing_bias_deg:+z.1f}°"
             yield f"Robot {name} calibrated itself: {scales}, {turned}."
+        if text := miscalibration_text(r.counts):
+            yield f"Robot {name} is miscalibrated: {text}. Run `cpcbl-team calibrate`."
     for name, r in report.robots.items():
         yield from trust_remarks(name, r.trust)
     if report.refused:

@@ -122,8 +122,11 @@ def test_a_robot_knows_how_far_it_errs_outside_the_usual_case(world: str) -> Non
 
 
 @pytest.mark.long
+@pytest.mark.timeout(4 * 3600)
 def test_no_variant_is_overconfident_in_any_world() -> None:
-    found = figures((), worlds.VARIANTS, 60)
+    """But where its settings are wrong: there it comes near (docs/experiments.md)."""
+    right = tuple(name for name, world in worlds.worlds().items() if world.truth is None)
+    found = figures(right, worlds.VARIANTS, 60)
     lost = {name for name, word in found.items() if word == "always lost"}
     assert lost == {f"carried away, 1 landmark, {variant}" for variant in worlds.VARIANTS}
     assert {n for n, word in found.items() if n not in lost and word not in CONSISTENT} == set()

@@ -315,6 +315,18 @@ def test_the_remark_says_what_is_done_to_readings(tmp_path: Path) -> None:
     assert said in printed(msgspec.structs.replace(evaluation, robots=robots))
 
 
+def test_the_remark_says_what_is_wrong_with_the_settings(tmp_path: Path) -> None:
+    evaluation = evaluate_log(logged(tmp_path, seconds=1.0)).report
+    counts = {"accepted": 985, "gated": 15, "miscalibrated": 2, "odometry_sigma_percent": 210}
+    robots = {"1": msgspec.structs.replace(evaluation.robots["1"], counts=counts)}
+    text = (
+        "Robot 1 is miscalibrated: σ of its odometry × 2.1, 1.5% of observations rejected."
+        " Run `cpcbl-team calibrate`."
+    )
+    shown = " ".join(printed(msgspec.structs.replace(evaluation, robots=robots)))
+    assert text in " ".join(shown.split())
+
+
 def test_an_evaluation_can_stop_early(tmp_path: Path) -> None:
     figures = report(logged(tmp_path), 2.0)
     assert figures["duration_s"] == pytest.approx(2.0)

@@ -42,6 +42,7 @@ from cpcbl_transport.bus import Bus, BusProxy, Handle, MessageCallback
 
 DURATION_S = 40.0
 LEAST_INSIDE = 0.98  # of 3 sigma
+LEARNING_S = 60.0  # for a robot whose settings are wrong
 VARIANTS = ("joint", "oval", "circular")
 CORNERS = ((0.0, 0.0), (8.0, 6.0), (8.0, 0.0), (0.0, 6.0))
 PLACES = (*CORNERS, (4.0, 0.0), (4.0, 6.0), (0.0, 3.0), (8.0, 3.0))
@@ -61,6 +62,7 @@ class World(NamedTuple):
     silent_s: float = 0.0  # from the tenth second on, none arrives for so long
     duration_s: float = DURATION_S
     scored_from_s: float = 5.0
+    truth: Team | None = None  # the team as it really is, where its settings are wrong
 
 
 class WorldRun(NamedTuple):
@@ -196,8 +198,7 @@ def worlds() -> dict[str, World]:
         away = SimulationEvent(at_s=10.0, kidnap="r", to=(5.5, 4.0, 200.0))
         name = f"carried away, {count} landmark{'s' if count > 1 else ''}"
         found[name] = World(_alone(_field(count), away), ("r",), scored_from_s=20.0)
-    found |= _team_worlds()
-    return found
+    return found | _team_worlds() | _miscalibrated_worlds()
 
 
 def _team_worlds() -> dict[str, World]:
@@ -214,6 +215,34 @@ def _team_worlds() -> dict[str, World]:
     found["clique, two see landmarks"] = _seeing("ac")
     found["clique, landmarks 1 s in 10"] = _seeing("abcd", *rare)
     found["ring, landmarks 1 s in 10"] = _seeing("abcd", *rare, ahead=True)
+    return found
+
+
+def _miscalibrated_worlds() -> dict[str, World]:
+    """Robots whose settings are wrong; they have a minute to notice it."""
+    motion = {
+        name: 3.0 * getattr(OdometrySettings(), name)
+        for name in (
+            "distance_sigma_m_per_sqrt_m",
+            "turn_sigma_rad_per_sqrt_m",
+            "turn_sigma_rad_per_sqrt_rad",
+        )
+    }
+    noisy = {"range_share": 2.0 * SENSOR.range_share, "bearing_sigma_deg": 6.0}
+    odometry, sensor = OdometrySettings(), SENSOR
+    truths = {
+        "drives 1.2 × what its odometry says": replace(odometry, distance_scale=1.2),
+        "turns 1.4 × what its odometry says": replace(odometry, turn_scale=1.4),
+        "odometry with 3 × its σ": replace(odometry, **motion),
+        "sensor with 2 × its σ": replace(sensor, **noisy),
+        "bearings 5 deg off": replace(sensor, bearing_bias_deg=5.0),
+    }
+    field, found = _field(4), {}
+    for name, part in truths.items():
+        is_odometry = isinstance(part, OdometrySettings)
+        truth = _alone(field, **{"odometry" if is_odometry else "sensor": part})
+        times = {"duration_s": 2.0 * LEARNING_S, "scored_from_s": LEARNING_S}
+        found[name] = World(_alone(field), ("r",), truth=truth, **times)
     return found
 
 
@@ -242,7 +271,7 @@ def run_world(world: World, seed: int) -> list[WorldRun]:
     wrappers = {
         name: lambda bus, name=name: LossyBus(bus, name, world, seed) for name in world.team.robots
     }
-    truth = with_true_starts(world.team, seed)
+    truth = with_true_starts(world.truth or world.team, seed)
     _, recorder = simulate(world.team, seed, world.duration_s, truth, bus_wrappers=wrappers)
     true_paths = recorder.simulated_truth()
     runs = []

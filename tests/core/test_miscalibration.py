@@ -1,0 +1,257 @@
+"""A robot whose settings are wrong notices it by itself, corrects them, and stays consistent."""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+from support.core import (
+    CORNERS,
+    LOOP_START,
+    SECOND,
+    belief,
+    diagonal,
+    displaced,
+    frame,
+    localizer,
+    loop,
+    matrix3,
+    sensor_noise,
+    state_at,
+    steered,
+    wall_sighting,
+)
+
+from cpcbl_team.config import (
+    Field,
+    OdometryNoise,
+    OdometrySettings,
+    SensorSettings,
+    Start,
+    Variant,
+    Wall,
+)
+from cpcbl_team.geometry import Pose2, step
+from cpcbl_team.inputs import Odometry, Sightings
+from cpcbl_team.localizer import Localizer
+from cpcbl_team.miscalibration import (
+    AS_CONFIGURED,
+    Adaptation,
+    ModelCheck,
+    Regression,
+    adapted,
+    noise_with_factor,
+    sigma_percentages,
+)
+from cpcbl_team.motion import motion_noise
+from cpcbl_team.sensors import without_bearing_bias
+from cpcbl_team.state import CalibrationMemory, Memory, State
+
+START = Start(x_m=LOOP_START.x, y_m=LOOP_START.y, sigma_m=0.05, heading_sigma_deg=3.0)
+SENSOR = SensorSettings(range_share=0.05, bearing_sigma_deg=3.0, field_of_view_deg=360.0)
+NOISE = OdometryNoise()
+PIECE_NS = SECOND // 10
+ROUNDS = 8
+
+
+class Truth(NamedTuple):
+    """What a robot with the settings above is really like."""
+
+    distance_scale: float = 1.0
+    turn_scale: float = 1.0
+    bearing_bias_rad: float = 0.0
+    motion_sigmas: float = 1.0  # in those of the settings
+    sensor_sigmas: float = 1.0
+
+
+def robot_of(variant: Variant = "joint") -> Localizer:
+    return localizer(variant, CORNERS, start=START, sensor=SENSOR, odometry=OdometrySettings())
+
+
+def run(truth: Truth, seed: int, variant: Variant = "joint") -> tuple[State, float]:
+    """The state after some minutes on the loop, and the NEES of the position in the last third."""
+    rng, robot = np.random.default_rng(seed), robot_of(variant)
+    sensor = SensorSettings(
+        range_share=truth.sensor_sigmas * SENSOR.range_share,
+        bearing_sigma_deg=truth.sensor_sigmas * SENSOR.bearing_sigma_deg,
+    )
+    errors, factor = sensor_noise(rng, sensor), truth.motion_sigmas**2
+    state, planned, now = robot.start(0), LOOP_START, 0
+    pose = displaced(state.estimate.pose, state.estimate.covariance, rng)
+    nees = []
+    for distance, turn in loop() * ROUNDS:
+        planned = step(planned, distance, turn)
+        turn = steered(pose, planned)
+        noise = motion_noise(pose.heading, distance, turn, NOISE).scaled(factor)
+        pose = displaced(step(pose, distance, turn), noise, rng)
+        reading = distance / truth.distance_scale, turn / truth.turn_scale
+        state = robot.add_odometry(state, Odometry(now, now + PIECE_NS, *reading))
+        now += PIECE_NS
+        seen = frame(pose, now, noise=errors)
+        state = robot.cycle(state, without_bearing_bias(seen, -truth.bearing_bias_rad))
+        off = np.array([state.estimate.pose.x - pose.x, state.estimate.pose.y - pose.y])
+        nees.append(off @ np.linalg.solve(matrix3(state.estimate.covariance)[:2, :2], off))
+    return state, float(np.mean(nees[-len(nees) // 3 :]))
+
+
+def adaptation_of(state: State) -> Adaptation:
+    return state.memory.calibration.adaptation
+
+
+@pytest.mark.parametrize(
+    ("truth", "name", "low", "high"),
+    [
+        (Truth(distance_scale=1.2), "distance_scale", 1.12, 1.28),
+        (Truth(distance_scale=0.8), "distance_scale", 0.72, 0.88),
+        (Truth(turn_scale=1.3), "turn_scale", 1.2, 1.4),
+        (Truth(bearing_bias_rad=0.1), "bearing_bias_rad", 0.05, 0.15),
+        (Truth(motion_sigmas=4.0), "motion_factor", 2.0, 64.0),
+        (Truth(sensor_sigmas=3.0), "sensor_factor", 2.0, 40.0),
+    ],
+    ids=lambda part: "" if isinstance(part, Truth | float) else part,
+)
+def test_what_is_wrong_is_found_and_the_estimate_becomes_consistent(
+    truth: Truth, name: str, low: float, high: float
+) -> None:
+    found = [run(truth, seed) for seed in range(3)]
+    assert all(low < getattr(adaptation_of(state), name) < high for state, _ in found)
+    assert all(state.counts["miscalibrated"] for state, _ in found)
+    assert np.mean([nees for _, nees in found]) < 5.0  # 9 to 90 without
+
+
+@pytest.mark.parametrize("variant", ["joint", "oval"])
+def test_right_settings_are_left_alone(variant: Variant) -> None:
+    found = [run(Truth(), seed, variant) for seed in range(6)]
+    assert all(adaptation_of(state) is AS_CONFIGURED for state, _ in found)
+    assert 1.4 < np.mean([nees for _, nees in found]) < 2.8
+
+
+@pytest.mark.parametrize("variant", ["circular", "weighted"])
+def test_a_variant_without_the_covariance_of_its_errors_does_not_judge(variant: Variant) -> None:
+    state, _ = run(Truth(distance_scale=1.2), 0, variant)
+    assert adaptation_of(state) is AS_CONFIGURED
+    assert state.memory.calibration.check == ModelCheck()
+
+
+def test_an_adaptation_is_what_the_right_settings_would_be() -> None:
+    """The same numbers from a robot whose settings say so, on both paths of the core."""
+    wall = Wall(from_m=(0.0, 0.0), to_m=(8.0, 0.0))
+    field = Field(landmarks=CORNERS.landmarks, walls={"wall": wall})
+    change = Adaptation(1.1, 0.9, 0.1, motion_factor=4.0, sensor_factor=9.0)
+    odometry = OdometrySettings(
+        distance_sigma_m_per_sqrt_m=2.0 * NOISE.distance_sigma_m_per_sqrt_m,
+        turn_sigma_rad_per_sqrt_rad=2.0 * NOISE.turn_sigma_rad_per_sqrt_rad,
+        turn_sigma_rad_per_sqrt_m=2.0 * NOISE.turn_sigma_rad_per_sqrt_m,
+    )
+    sensor = SensorSettings(
+        range_share=3.0 * SENSOR.range_share,
+        range_floor_m=3.0 * SENSOR.range_floor_m,
+        bearing_sigma_deg=3.0 * SENSOR.bearing_sigma_deg,
+    )
+    wrong = localizer("joint", field, sensor=SENSOR, odometry=OdometrySettings())
+    right = localizer("joint", field, sensor=sensor, odometry=odometry)
+    before = state_at(LOOP_START, diagonal(0.1, 0.05))
+    memory = Memory(calibration=CalibrationMemory(adaptation=change))
+    truth = step(LOOP_START, 1.1, 0.18)
+    seen = frame(truth, SECOND)
+    seen = Sightings(SECOND, (*seen.sightings, wall_sighting(truth, "wall", wall)))
+    adapting = wrong.add_odometry(before._replace(memory=memory), Odometry(0, SECOND, 1.0, 0.2))
+    adapting = wrong.cycle(adapting, without_bearing_bias(seen, -0.1))
+    expected = right.cycle(right.add_odometry(before, Odometry(0, SECOND, 1.1, 0.18)), seen)
+    assert len(expected.updates.objects_ns) == 5
+    assert adapting.estimate.pose == pytest.approx(expected.estimate.pose, abs=1e-12)
+    assert adapting.estimate.covariance == pytest.approx(expected.estimate.covariance, rel=1e-9)
+
+
+# What does not count ------------------------------------------------------------------------------
+
+
+def blocks_after(robot: Localizer, state: State, seconds: int, **also: object) -> float:
+    """The number of blocks of driving ahead, each second with a frame."""
+    x, y, heading = state.estimate.pose
+    for second in range(1, seconds + 1):
+        now, odometry = second * SECOND, Odometry((second - 1) * SECOND, second * SECOND, 0.1, 0.0)
+        if "gap" in also:
+            odometry = Odometry(now - SECOND // 2, now, 0.05, 0.0)
+        state = robot.add_odometry(state, odometry)
+        if "report" in also:
+            state = robot.add_teammate_belief(state, belief(1.0, 0.0, now))
+        pose = Pose2(
+            x + 0.1 * second * math.cos(heading), y + 0.1 * second * math.sin(heading), heading
+        )
+        state = robot.cycle(state, frame(pose, now))
+    return state.memory.calibration.check.along.blocks
+
+
+def test_a_block_with_a_gap_or_a_report_does_not_count() -> None:
+    robot = robot_of()
+    assert blocks_after(robot, robot.start(0), 6) > 4.0
+    assert blocks_after(robot, robot.start(0), 6, gap=True) == 0.0
+    assert blocks_after(robot, robot.start(0), 6, report=True) == 0.0
+
+
+def test_an_object_that_is_rejected_again_and_again_says_nothing() -> None:
+    moved = ModelCheck()
+    for _ in range(50):
+        moved = moved.with_rejections(["sw"])
+    assert moved.rejections == 1
+    for name in ("ne", "sw", "ne"):
+        moved = moved.with_rejections([name])
+    assert moved.rejections == 4
+    assert moved.restarted(7) == ModelCheck(rejected="ne", accepted=7)
+
+
+# The statistics -----------------------------------------------------------------------------------
+
+
+def test_corrections_in_proportion_to_the_motion_have_this_slope() -> None:
+    regression = Regression()
+    for motion in (0.1, 0.3, 0.2, 0.4) * 5:
+        regression = regression.plus(motion, 0.25 * motion, 1e-3, 1e-3)
+    assert regression.slope == pytest.approx(0.25)
+    assert regression.residual == pytest.approx(0.0, abs=1e-9)
+    assert regression.sigmas > 4.0
+    assert Regression().plus(0.1, 0.1, 0.1e-4, 1e-4) == Regression()  # hardly anything was taken
+
+
+def scattered(size: float, alternating: bool) -> ModelCheck:
+    """Corrections of so many sigmas, in pairs of one sign or of both."""
+    regression = Regression()
+    for i in range(40):
+        sign = (-1.0) ** (i if alternating else i // 4)
+        regression = regression.plus(0.2, sign * size * 1e-2, 1e-4, 1e-4)
+    return ModelCheck(along=regression, aside=regression, turn=regression)
+
+
+def test_scattered_corrections_widen_what_they_point_at() -> None:
+    due = 0.999
+    assert adapted(scattered(1.0, alternating=True), AS_CONFIGURED, 0, due) is None
+    by_sensor = adapted(scattered(2.0, alternating=True), AS_CONFIGURED, 0, due)
+    assert by_sensor is not None
+    assert by_sensor == pytest.approx(Adaptation(sensor_factor=4.0), rel=0.05)
+    by_motion = adapted(scattered(2.0, alternating=False), AS_CONFIGURED, 0, due)
+    assert by_motion is not None
+    assert by_motion == pytest.approx(Adaptation(motion_factor=4.0), rel=0.05)
+    again = adapted(scattered(0.5, alternating=True), by_sensor, 0, due)
+    assert again is not None
+    assert again.sensor_factor == pytest.approx(1.0, rel=0.05)
+
+
+def test_a_persistent_share_of_rejections_widens_too() -> None:
+    check = scattered(1.0, alternating=True)._replace(rejections=20)
+    assert adapted(check, AS_CONFIGURED, 2000, 0.999) is None  # 1.0 %
+    found = adapted(check, AS_CONFIGURED, 980, 0.999)  # 2.0 %
+    assert found is not None
+    assert found.sensor_factor > 1.5
+    assert adapted(check, AS_CONFIGURED, 980, 0.99) is None  # here 1 % is due
+
+
+def test_noise_that_is_said_to_be_zero_can_be_widened() -> None:
+    exact = OdometryNoise(
+        distance_sigma_m_per_sqrt_m=0.0,
+        turn_sigma_rad_per_sqrt_rad=0.0,
+        turn_sigma_rad_per_sqrt_m=0.0,
+    )
+    assert noise_with_factor(exact, 4.0).distance_sigma_m_per_sqrt_m == pytest.approx(0.02)
+    assert sigma_percentages(Adaptation(motion_factor=4.0)) == {"odometry_sigma_percent": 200}
+    assert sigma_percentages(AS_CONFIGURED) == {}
