@@ -35,6 +35,7 @@ from cpcbl_team.estimate import (
 from cpcbl_team.fusion import chi_square
 from cpcbl_team.gaussian import width_per_m
 from cpcbl_team.inputs import Sighting
+from cpcbl_team.miscalibration import AS_CONFIGURED
 from cpcbl_team.sensors import (
     LARGEST_BEARING_RAD,
     LARGEST_M,
@@ -64,10 +65,12 @@ class LandmarkUpdate:
     def __init__(self, state: State) -> None:
         self.stamp_ns = state.stamp_ns
         pose, self.covariance, _ = state.estimate  # all is linearized at this prior
-        calibration = state.memory.calibration
-        self.x, self.y, heading = pose
-        self.heading = heading - calibration.bearing_bias_rad  # the direction of bearing 0
-        self.weight = 1.0 / calibration.adaptation.sensor_factor
+        self.x, self.y, self.heading = pose
+        self.weight = 1.0  # of what the sensor model says
+        adaptation = state.memory.calibration.adaptation
+        if adaptation is not AS_CONFIGURED:
+            self.heading -= adaptation.bearing_bias_rad  # the direction of bearing 0
+            self.weight = 1.0 / adaptation.sensor_factor
         self.evidence = InformationSum()
         self.used: dict[str, int] = {}  # the landmarks whose evidence was accepted, and when: now
         self.rejected: list[str] = []  # the landmarks that the gate has rejected

@@ -20,30 +20,31 @@ from typing import Final, NamedTuple
 
 from cpcbl_team.config import OdometryNoise
 from cpcbl_team.estimate import Covariance3, Estimate
-from cpcbl_team.geometry import Pose2, wrap_angle
+from cpcbl_team.geometry import Pose2, new, wrap_angle
 from cpcbl_team.motion import move
 
-BLOCK_NS: Final = 1_000_000_000
-LONGEST_NS: Final = 3_000_000_000
-MOST_TURN_RAD: Final = 2.0  # beyond, the chord of a block is much shorter than its path
+BLOCK_NS: Final = 2_000_000_000
+LONGEST_NS: Final = 5_000_000_000
+MOST_TURN_RAD: Final = 2.5  # beyond, the chord of a block is much shorter than its path
 LEAST_DISTANCE_M: Final = 0.02
 LEAST_TURN_RAD: Final = 0.02
 LEAST_SIGMA: Final = 0.01
 LEAST_SHARE: Final = 0.25  # of the variance that a block adds is taken away, or it tells little
-LARGEST: Final = 5.0  # normalized correction: a bump is no calibration
-FADING: Final = 1.0 - 1.0 / 60.0  # a block
-LEAST_BLOCKS: Final = 10.0
+LARGEST: Final = 7.0  # normalized correction: a bump is no calibration
+FADING: Final = 1.0 - 1.0 / 30.0  # a block
+LEAST_BLOCKS: Final = 5.0
 SIGMAS: Final = 4.0
 LEAST_SCALE: Final = 0.03  # of the first change: what is smaller is not worth one
 LEAST_BIAS_RAD: Final = math.radians(2.0)
 MOST_SLOPE: Final = 0.5  # that is believed at once
-LARGE: Final = 1.8  # a scatter
+LARGE: Final = 1.8  # factor of a variance, for a robot that rejects too much
+SCATTER_SIGMAS: Final = 3.7  # a mean square of so many is larger than due
 SMALL: Final = 0.6
 MOTION_LAG: Final = 0.1  # correlation of each correction with the one before
 LEAST_REJECTED: Final = 0.01  # share of objects of the map
 LEAST_REJECTIONS: Final = 3
 MOST_DUE: Final = 5.0
-LARGEST_FACTOR: Final = 400.0
+MOST_FACTOR: Final = 400.0
 
 
 class Corrected(NamedTuple):
@@ -77,28 +78,30 @@ class Regression(NamedTuple):
 
     @property
     def sigmas(self) -> float:
-        """By how many of its sigmas the slope differs from zero."""
-        if self.blocks < LEAST_BLOCKS or self.squares <= 0.0:
+        """By how many of its sigmas the slope differs from zero; 0 if it is not many."""
+        products, squares, total, _, _, blocks = self
+        if blocks < LEAST_BLOCKS or products * products <= SIGMAS * SIGMAS * squares:
             return 0.0
-        scatter = max(self.residual / self.blocks, 1.0)
-        return abs(self.products) / math.sqrt(self.squares * scatter)
+        scatter = max((total - products * products / squares) / blocks, 1.0)
+        return abs(products) / math.sqrt(squares * scatter)
 
     def plus(self, motion: float, correction: float, taken: float, added: float) -> "Regression":
         """With one more block, of this motion and correction. Its updates have `taken` so much of
         the variance, to which the motion had `added` some."""
         if taken <= LEAST_SHARE * abs(added):
             return self
-        products, squares, total, lagged, _, blocks = (FADING * sum_ for sum_ in self)
+        products, squares, total, lagged, last, blocks = self
         sigma = math.sqrt(taken)
         normalized, motion = min(max(correction / sigma, -LARGEST), LARGEST), motion / sigma
-        return Regression(
-            products + motion * normalized,
-            squares + motion * motion,
-            total + normalized * normalized,
-            lagged + normalized * self.last,
+        sums = (
+            FADING * products + motion * normalized,
+            FADING * squares + motion * motion,
+            FADING * total + normalized * normalized,
+            FADING * lagged + normalized * last,
             normalized,
-            blocks + 1.0,
+            FADING * blocks + 1.0,
         )
+        return new(Regression, sums)
 
 
 class ModelCheck(NamedTuple):
@@ -138,31 +141,32 @@ AS_CONFIGURED: Final = Adaptation()
 
 def check_models(check: ModelCheck, now: Corrected, noise: OdometryNoise) -> ModelCheck:
     """The check after the block that ends now; the next one begins."""
-    begin, along, aside, turned, *_ = check
-    restarted = check._replace(begin=now)
+    begin, along, aside, turned, rejections, rejected, accepted = check
     if begin is None or now.gaps > begin.gaps or now.stamp_ns - begin.stamp_ns > LONGEST_NS:
-        return restarted
-    x, y, turn = begin.odometry_from_robot.inverse() @ now.odometry_from_robot
-    distance, course = math.hypot(x, y), math.atan2(y, x)
+        return check._replace(begin=now)
+    _, (pose, before, _), place, _ = begin
+    _, (pose_now, after, _), place_now, _ = now
+    x, y, turn = place_now.x - place.x, place_now.y - place.y, place_now.heading - place.heading
+    distance, turn = math.sqrt(x * x + y * y), wrap_angle(turn)
     if abs(turn) > MOST_TURN_RAD or (distance < LEAST_DISTANCE_M and abs(turn) < LEAST_TURN_RAD):
-        return restarted
-    pose, before, _ = begin.estimate
-    course += pose.heading
+        return check._replace(begin=now)
+    course = math.atan2(y, x) - place.heading + pose.heading
     start = Estimate(Pose2(pose.x, pose.y, course - 0.5 * turn), before)
     predicted = move(start, distance, turn, noise)
-    added = predicted.covariance.plus(before, -1.0)
-    taken = predicted.covariance.plus(now.estimate.covariance, -1.0)
-    c, s = math.cos(course), math.sin(course)
-    dx, dy = now.estimate.pose.x - predicted.pose.x, now.estimate.pose.y - predicted.pose.y
     if distance >= LEAST_DISTANCE_M:
-        variances = _along(taken, c, s), _along(added, c, s)
-        along = along.plus(distance, c * dx + s * dy, *variances)
-        variances = _along(taken, -s, c), _along(added, -s, c)
-        aside = aside.plus(distance, c * dy - s * dx, *variances)
+        c, s = math.cos(course), math.sin(course)
+        dx, dy = pose_now.x - predicted.pose.x, pose_now.y - predicted.pose.y
+        due = _along(predicted.covariance, c, s)
+        taken, added = due - _along(after, c, s), due - _along(before, c, s)
+        along = along.plus(distance, c * dx + s * dy, taken, added)
+        due = _along(predicted.covariance, -s, c)
+        taken, added = due - _along(after, -s, c), due - _along(before, -s, c)
+        aside = aside.plus(distance, c * dy - s * dx, taken, added)
     if abs(turn) >= LEAST_TURN_RAD:
-        excess = wrap_angle(now.estimate.pose.heading - pose.heading - turn)
-        turned = turned.plus(turn, excess, taken.hh, added.hh)
-    return restarted._replace(along=along, aside=aside, turn=turned)
+        excess = wrap_angle(pose_now.heading - pose.heading - turn)
+        due = predicted.covariance.hh
+        turned = turned.plus(turn, excess, due - after.hh, due - before.hh)
+    return new(ModelCheck, (now, along, aside, turned, rejections, rejected, accepted))
 
 
 def _along(covariance: Covariance3, x: float, y: float) -> float:
@@ -177,45 +181,55 @@ def adapted(
     """What the settings should be changed to; None if they fit. So many observations have been
     `accepted` since the start."""
     along, aside, turn = check.along, check.aside, check.turn
-    least = 1.0 if present == AS_CONFIGURED else 0.0
-    biased = (
-        (along.sigmas, abs(along.slope) > least * LEAST_SCALE, "distance_scale"),
-        (turn.sigmas, abs(turn.slope) > least * LEAST_SCALE, "turn_scale"),
-        (aside.sigmas, abs(aside.slope) > least * LEAST_BIAS_RAD, "bearing_bias_rad"),
-    )
-    sigmas, is_large, name = max(biased)
-    if is_large and sigmas > SIGMAS:
-        slope = {"distance_scale": along, "turn_scale": turn}.get(name, aside).slope
-        slope = min(max(slope, -MOST_SLOPE), MOST_SLOPE)
-        before = getattr(present, name)
-        after = before + slope if name == "bearing_bias_rad" else before * (1.0 + slope)
-        return present._replace(**{name: after})
+    sigmas = max(along.sigmas, aside.sigmas, turn.sigmas)
+    if sigmas > SIGMAS:
+        least = 1.0 if present == AS_CONFIGURED else 0.0
+        for part, name, least_slope in (
+            (along, "distance_scale", LEAST_SCALE),
+            (aside, "bearing_bias_rad", LEAST_BIAS_RAD),
+            (turn, "turn_scale", LEAST_SCALE),
+        ):
+            if part.sigmas == sigmas and abs(part.slope) > least * least_slope:
+                return _with_slope(present, name, part.slope)
+    blocks = along.blocks + aside.blocks + turn.blocks
+    if blocks < 3.0 * LEAST_BLOCKS:
+        return None
     all_of_them = max(check.rejections + accepted - check.accepted, 1)
     due = LEAST_REJECTED + MOST_DUE * (1.0 - gate_probability)
-    rejects = check.rejections > max(due * all_of_them, LEAST_REJECTIONS)
-    return _with_factors((along, aside, turn), rejects, present)
+    is_rejecting = check.rejections > max(due * all_of_them, LEAST_REJECTIONS)
+    scatter = (along.residual + aside.residual + turn.residual) / blocks
+    lagged, total = (
+        (along.lagged + aside.lagged + turn.lagged),
+        (along.total + aside.total + turn.total),
+    )
+    # chi-square; the corrections aside and of the heading have much in common
+    is_large = scatter > 1.0 + SCATTER_SIGMAS * math.sqrt(3.0 / blocks)
+    if is_large or is_rejecting:
+        return _with_larger_sigma(present, max(scatter, LARGE), lagged > MOTION_LAG * total)
+    if scatter < SMALL and present is not AS_CONFIGURED:
+        return _with_smaller_sigmas(present, scatter)
+    return None
 
 
-def _with_factors(
-    parts: Sequence[Regression], rejects: bool, present: Adaptation
-) -> Adaptation | None:
-    """The adaptation with variances as the scatter of the corrections tells, and whether the robot
-    `rejects` too much."""
-    blocks = sum(part.blocks for part in parts)
-    if blocks < len(parts) * LEAST_BLOCKS:
-        return None
-    scatter = sum(part.residual for part in parts) / blocks
-    lag = sum(part.lagged for part in parts) / sum(part.total for part in parts)
-    motion, sensor = present.motion_factor, present.sensor_factor
-    if scatter > LARGE or rejects:
-        scatter = max(scatter, LARGE)
-        if lag > MOTION_LAG:
-            motion = min(scatter * motion, LARGEST_FACTOR)
-        else:
-            sensor = min(scatter * sensor, LARGEST_FACTOR)
-    elif scatter < SMALL:
-        motion, sensor = max(scatter * motion, 1.0), max(scatter * sensor, 1.0)
-    if (motion, sensor) == (present.motion_factor, present.sensor_factor):
+def _with_slope(present: Adaptation, name: str, slope: float) -> Adaptation:
+    """The adaptation in which the bias or scale of this name differs by `slope`."""
+    slope, before = min(max(slope, -MOST_SLOPE), MOST_SLOPE), getattr(present, name)
+    after = before + slope if name == "bearing_bias_rad" else before * (1.0 + slope)
+    return present._replace(**{name: after})
+
+
+def _with_larger_sigma(present: Adaptation, scatter: float, of_motion: bool) -> Adaptation:
+    """With larger variances of the motion, or else of the sensor."""
+    if of_motion:
+        return present._replace(motion_factor=min(scatter * present.motion_factor, MOST_FACTOR))
+    return present._replace(sensor_factor=min(scatter * present.sensor_factor, MOST_FACTOR))
+
+
+def _with_smaller_sigmas(present: Adaptation, scatter: float) -> Adaptation | None:
+    """With smaller variances, where they are larger than those of the settings."""
+    motion = max(scatter * present.motion_factor, 1.0)
+    sensor = max(scatter * present.sensor_factor, 1.0)
+    if motion == present.motion_factor and sensor == present.sensor_factor:
         return None
     return present._replace(motion_factor=motion, sensor_factor=sensor)
 
