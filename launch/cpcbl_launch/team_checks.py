@@ -3,7 +3,7 @@
 import re
 from collections.abc import Iterator
 
-from cpcbl_team.config import LIKE_MIRRORED, MARKERS, Team
+from cpcbl_team.config import LIKE_MIRRORED, MARKERS, Landmark, Team, Wall
 from cpcbl_transport.security import PROTOCOL
 
 
@@ -38,6 +38,26 @@ def problems(team: Team) -> Iterator[str]:
             reason = endpoint_problem(endpoint) or _insecure(endpoint, team.transport.secured)
             if reason:
                 yield f"transport.{key}: {endpoint!r}: {reason}"
+
+
+def warnings(team: Team) -> Iterator[str]:
+    """What is no contradiction, but will disappoint, each as `key: what; fix`."""
+    objects: list[Landmark | Wall] = [*team.map.landmarks.values(), *team.map.walls.values()]
+    only_ranges = bool(objects) and all(o.gives in ("range", "none") for o in objects)
+    for name, robot in team.robots.items():
+        if not robot.sensor.sees_landmarks or robot.position_sensor is not None:
+            continue
+        variant = robot.localizer.variant
+        if only_ranges and variant != "joint":
+            yield (
+                f"robots.{name}.localizer.variant: {variant} never learns its heading from ranges"
+                " alone, and becomes too certain; use variant joint"
+            )
+        if len(objects) == 1:
+            yield (
+                f"robots.{name}: one object on the map does not determine a pose; if the robot is"
+                " carried away it stays lost; add a landmark"
+            )
 
 
 def endpoint_problem(text: str) -> str:

@@ -11,6 +11,7 @@ from typer import Argument, Option
 from cpcbl_launch.commands import options
 from cpcbl_launch.reporting.files import write_or_reason
 from cpcbl_launch.reporting.tables import table
+from cpcbl_launch.team_checks import warnings
 from cpcbl_launch.team_file import find_team, key_folder
 from cpcbl_team.errors import InputError
 
@@ -26,6 +27,8 @@ def check(file: Annotated[Path, Argument(help="Team file (TOML).")]) -> None:
         f"{file}: good: team {team.name!r}, {len(team.robots)} robots"
         f" ({', '.join(team.robots)}), {marks} landmarks, {walls} walls"
     )
+    for warning in warnings(team):
+        typer.echo(f"{file}: warning: {warning}", err=True)
 
 
 def keys(

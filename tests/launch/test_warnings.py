@@ -1,0 +1,64 @@
+"""What `check` warns of: teams that are valid and will disappoint."""
+
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from cpcbl_launch.app import app
+from cpcbl_launch.team_checks import warnings
+from cpcbl_launch.team_file import builtin_path, load_team
+from cpcbl_team.config import (
+    Field,
+    Landmark,
+    LocalizerSettings,
+    PositionSensor,
+    RobotSettings,
+    SensorSettings,
+    Team,
+    Variant,
+)
+
+MARKS = {"oak": Landmark(x_m=0.0, y_m=0.0), "elm": Landmark(x_m=4.0, y_m=0.0)}
+RANGES = {n: Landmark(x_m=m.x_m, y_m=m.y_m, gives="range") for n, m in MARKS.items()}
+
+
+def team_of(marks: dict[str, Landmark], robot: RobotSettings) -> Team:
+    return Team(name="tests", map=Field(landmarks=marks), robots={"r1": robot})
+
+
+@pytest.mark.parametrize("variant", ["oval", "circular", "weighted"])
+def test_ranges_alone_give_these_variants_no_heading(variant: Variant) -> None:
+    robot = RobotSettings(localizer=LocalizerSettings(variant=variant))
+    (line,) = warnings(team_of(RANGES, robot))
+    assert line.startswith("robots.r1.localizer.variant: ")
+    assert line.endswith("use variant joint")
+    assert list(warnings(team_of(RANGES | {"elm": MARKS["elm"]}, robot))) == []
+    assert list(warnings(team_of(RANGES, RobotSettings()))) == []
+
+
+def test_one_object_determines_no_pose() -> None:
+    one = {"oak": MARKS["oak"]}
+    (line,) = warnings(team_of(one, RobotSettings()))
+    assert "stays lost" in line
+    blind = RobotSettings(sensor=SensorSettings(sees_landmarks=False))
+    with_gps = RobotSettings(position_sensor=PositionSensor())
+    assert list(warnings(team_of(one, blind))) == list(warnings(team_of(one, with_gps))) == []
+
+
+TEAMS = sorted(path.stem for path in builtin_path("demo").parent.glob("*.toml"))
+
+
+@pytest.mark.parametrize("name", TEAMS)
+def test_no_team_of_the_package_has_a_warning(name: str) -> None:
+    assert list(warnings(load_team(builtin_path(name)))) == []
+
+
+def test_check_prints_them_and_finds_the_team_good(tmp_path: Path) -> None:
+    path = tmp_path / "one.toml"
+    path.write_text(
+        'name = "one"\n[map.landmarks]\noak = { x_m = 0.0, y_m = 0.0 }\n[robots.r1.start]\nx_m = 1.0\ny_m = 0.0\n'
+    )
+    result = CliRunner().invoke(app, ["check", str(path)])
+    assert result.exit_code == 0, result.output
+    assert "warning: robots.r1: one object on the map" in result.output
