@@ -56,9 +56,12 @@ def test_no_team_of_the_package_has_a_warning(name: str) -> None:
 
 def test_check_prints_them_and_finds_the_team_good(tmp_path: Path) -> None:
     path = tmp_path / "one.toml"
-    path.write_text(
-        'name = "one"\n[map.landmarks]\noak = { x_m = 0.0, y_m = 0.0 }\n[robots.r1.start]\nx_m = 1.0\ny_m = 0.0\n'
+    lines = (
+        'name = "one"',
+        "map.landmarks.oak = { x_m = 0.0, y_m = 0.0 }",
+        "robots.r1.start = { x_m = 1.0, y_m = 0.0 }",
     )
+    path.write_text("\n".join(lines))
     result = CliRunner().invoke(app, ["check", str(path)])
     assert result.exit_code == 0, result.output
     assert "warning: robots.r1: one object on the map" in result.output
