@@ -38,7 +38,7 @@ LEAST_SCALE: Final = 0.03  # of the first change: what is smaller is not worth o
 LEAST_BIAS_RAD: Final = math.radians(2.0)
 MOST_SLOPE: Final = 0.5  # that is believed at once
 LARGE: Final = 1.8  # factor of a variance, for a robot that rejects too much
-SCATTER_SIGMAS: Final = 3.7  # a mean square of so many is larger than due
+SCATTER_SIGMAS: Final = 4.0  # a mean square of so many is larger than due
 SMALL: Final = 0.6
 MOTION_LAG: Final = 0.1  # correlation of each correction with the one before
 LEAST_REJECTED: Final = 0.01  # share of objects of the map
@@ -176,10 +176,14 @@ def _along(covariance: Covariance3, x: float, y: float) -> float:
 
 
 def adapted(
-    check: ModelCheck, present: Adaptation, accepted: int, gate_probability: float
+    check: ModelCheck,
+    present: Adaptation,
+    accepted: int,
+    gate_probability: float,
+    independent_share: float = 1.0,
 ) -> Adaptation | None:
     """What the settings should be changed to; None if they fit. So many observations have been
-    `accepted` since the start."""
+    `accepted` since the start; this share of the blocks has errors of its own."""
     along, aside, turn = check.along, check.aside, check.turn
     sigmas = max(along.sigmas, aside.sigmas, turn.sigmas)
     if sigmas > SIGMAS:
@@ -203,7 +207,7 @@ def adapted(
         (along.total + aside.total + turn.total),
     )
     # chi-square; the corrections aside and of the heading have much in common
-    is_large = scatter > 1.0 + SCATTER_SIGMAS * math.sqrt(3.0 / blocks)
+    is_large = scatter > 1.0 + SCATTER_SIGMAS * math.sqrt(3.0 / (independent_share * blocks))
     if is_large or is_rejecting:
         return _with_larger_sigma(present, max(scatter, LARGE), lagged > MOTION_LAG * total)
     if scatter < SMALL and present is not AS_CONFIGURED:

@@ -34,6 +34,8 @@ class OwnCalibration:
         # The others do not know how large a correction should be
         knows_covariance = rules.variant in ("joint", "oval") and not rules.paper_uncertainty
         self._is_checked = knows_covariance and not rules.learns
+        block_s = BLOCK_NS * 1e-9
+        self._independent_share = block_s / (block_s + 2.0 * settings.sensor.correlation_s)
 
     def is_known(self, state: State) -> bool:
         """Whether the robot knows anything of its calibration that its settings do not say."""
@@ -107,7 +109,8 @@ class OwnCalibration:
             if present.motion_factor > 1.0:
                 noise = noise_with_factor(noise, present.motion_factor)
             check = check_models(check, now, noise)
-            changed = adapted(check, present, accepted, self._gate_probability)
+            rules = self._gate_probability, self._independent_share
+            changed = adapted(check, present, accepted, *rules)
             if changed is not None:
                 check = ModelCheck(now, accepted=accepted)
                 state, present = state.counted("miscalibrated"), changed

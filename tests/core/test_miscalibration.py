@@ -105,7 +105,7 @@ def adaptation_of(state: State) -> Adaptation:
         (Truth(distance_scale=0.8), "distance_scale", 0.72, 0.88),
         (Truth(turn_scale=1.3), "turn_scale", 1.2, 1.4),
         (Truth(bearing_bias_rad=0.1), "bearing_bias_rad", 0.05, 0.15),
-        (Truth(motion_sigmas=4.0), "motion_factor", 2.0, 64.0),
+        (Truth(motion_sigmas=3.0), "motion_factor", 2.0, 40.0),
         (Truth(sensor_sigmas=3.0), "sensor_factor", 2.0, 40.0),
     ],
     ids=lambda part: "" if isinstance(part, Truth | float) else part,
@@ -230,6 +230,7 @@ def test_scattered_corrections_widen_what_they_point_at() -> None:
     by_sensor = adapted(scattered(2.0, alternating=True), AS_CONFIGURED, 0, due)
     assert by_sensor is not None
     assert by_sensor == pytest.approx(Adaptation(sensor_factor=4.0), rel=0.05)
+    assert adapted(scattered(2.0, alternating=True), AS_CONFIGURED, 0, due, 0.05) is None
     by_motion = adapted(scattered(2.0, alternating=False), AS_CONFIGURED, 0, due)
     assert by_motion is not None
     assert by_motion == pytest.approx(Adaptation(motion_factor=4.0), rel=0.05)
