@@ -41,6 +41,7 @@ def heading(dx: float, dy: float, distance_squared: float, bearing: float, prior
     return -dy / distance_squared, dx / distance_squared, residual
 
 
+TELLS_NOTHING: Final = 1e12  # m^2, rad^2
 CURVED_SHARE: Final = 1e-3
 """Below this ratio of the position's variance to the squared distance, curves count as straight."""
 
@@ -67,15 +68,15 @@ def curved_variance(variance: float, predicted: float, curvature: float) -> floa
     `predicted` is the variance of the measurement that the prior predicts, H P H^T. What the linear
     form leaves out is the same in each repetition while the robot stands, so that part of the
     prior's variance stays (as that of a considered state; Schmidt 1966), and only the rest is
-    reduced. Infinite if there is no rest.
+    reduced. If there is no rest the measurement tells nothing.
     """
     if curvature <= 0.01 * predicted:
         return variance
     rest = predicted - curvature
     if rest <= 0.0:
-        return math.inf
+        return TELLS_NOTHING
     after = curvature + rest * variance / (rest + variance)
-    return after * predicted / (predicted - after)
+    return min(after * predicted / (predicted - after), TELLS_NOTHING)
 
 
 class Constraint(NamedTuple):

@@ -1,5 +1,6 @@
 """What fixes and beliefs take on real links, with and without a budget."""
 
+import time
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -124,17 +125,17 @@ def test_a_fix_and_a_belief_are_small_on_both_links(kinds: dict[str, Any], paylo
     )
     with wired(team) as robots:
         better, worse = robots.links.values()
-        agent = robots.stand.robots["observer"].collaboration
 
         def step() -> None:
             robots.exchange()
-            wait_until(lambda: len(data(worse.down)) == said(agent))
+            time.sleep(0.2)  # so that no two are in one batch
 
-        repeat_until(step, lambda: len(data(worse.down)) >= 10)
+        repeat_until(step, lambda: len(data(worse.down)) >= 12)
     assert payload <= 40
     for batches, most in (
         (data(better.up), sent_bytes(payload)),
         (data(worse.down), received_bytes(payload, "observer")),
     ):
-        assert len(batches) >= 10
-        assert all(payload < batch.size <= min(60, most) for batch in batches)
+        assert len(batches) >= 12
+        batches = batches[2:]  # the first may hold a fix that waited for the subscription, too
+        assert [batch.size for batch in batches if not payload < batch.size <= min(60, most)] == []

@@ -20,6 +20,7 @@ from support.core import (
 
 from cpcbl_team.config import Field, Landmark, OdometrySettings, Variant, Wall
 from cpcbl_team.constraints import (
+    TELLS_NOTHING,
     Constraint,
     bearing_heading,
     bearing_position,
@@ -298,8 +299,8 @@ def test_a_curved_reading_leaves_what_its_linear_form_leaves_out(
 
 
 def test_a_reading_that_is_all_curve_says_nothing() -> None:
-    assert curved_variance(0.01, 0.1, 0.1) == math.inf
-    assert curved_variance(0.01, 0.1, 0.2) == math.inf
+    assert curved_variance(0.01, 0.1, 0.1) == TELLS_NOTHING
+    assert curved_variance(0.01, 0.1, 0.2) == TELLS_NOTHING
 
 
 @pytest.mark.parametrize("variant", PROBABILISTIC)

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from support.buses import MS, SECOND, examples
 
 from cpcbl_team.config import BudgetSettings
-from cpcbl_transport.budget import BYTES_WINDOW_S, LEAST_BYTES, Budget
+from cpcbl_transport.budget import Budget, bytes_window
 from cpcbl_transport.messages import Spending
 
 FIX, BELIEF = 42, 50
@@ -84,8 +84,21 @@ def test_no_window_holds_more_bytes_than_allowed(
 ) -> None:
     budget = Budget(BudgetSettings(bytes_per_s=bytes_per_s, urgent_share=share), 0)
     sent = granted(budget, wishes)
-    window_s = max(BYTES_WINDOW_S, LEAST_BYTES / bytes_per_s)
+    _, window_s = bytes_window(bytes_per_s)
     assert most_within(window_s, sent, size_of) <= window_s * bytes_per_s + 1e-6
+
+
+@pytest.mark.parametrize(
+    ("bytes_per_s", "most", "window_s"),
+    [
+        *((1.0, 120.0, 120.0), (2.0, 120.0, 60.0), (5.0, 300.0, 60.0)),
+        *((20.0, 500.0, 25.0), (50.0, 500.0, 10.0), (200.0, 2000.0, 10.0)),
+    ],
+)
+def test_a_small_budget_has_a_longer_window(
+    bytes_per_s: float, most: float, window_s: float
+) -> None:
+    assert bytes_window(bytes_per_s) == pytest.approx((most, window_s))
 
 
 @examples(200)
@@ -321,8 +334,7 @@ def test_spending_contains_the_largest_use_of_each_limit(
     )
     sent = granted(budget, wishes)
     in_bytes, in_messages, in_match = budget.spending(HOUR)
-    window_s = max(BYTES_WINDOW_S, LEAST_BYTES / bytes_per_s)
-    allowed = max(BYTES_WINDOW_S * bytes_per_s, LEAST_BYTES)
+    allowed, window_s = bytes_window(bytes_per_s)
     spent = most_within(window_s, sent, size_of)
     assert in_bytes == Spending("bytes", in_bytes.window_s, allowed, spent)
     assert in_bytes.window_s == pytest.approx(window_s)

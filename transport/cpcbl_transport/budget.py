@@ -14,10 +14,22 @@ from collections import deque
 from cpcbl_team.config import BudgetSettings
 from cpcbl_transport.messages import Spending
 
-BYTES_WINDOW_S = 10.0
-LEAST_BYTES = 500.0  # in a window, so that a small budget can be used up by whole messages
+SHORTEST_WINDOW_S, LONGEST_WINDOW_S = 10.0, 60.0
+LEAST_BYTES = 120.0  # in a window, so that a small budget can be used up by whole messages
+USUAL_BYTES = 500.0
 PRICE_MEMORY = 3.0  # messages: in the time in which so many are earned, the price falls by e
 _ROUNDING = 1e-9
+
+
+def bytes_window(bytes_per_s: float) -> tuple[float, float]:
+    """The window of a limit in bytes: what may be spent in it, and its seconds.
+
+    A short one spreads the messages: after many at once a small budget would be silent for minutes.
+    A long one lets robots that meet say more.
+    """
+    most = min(max(LONGEST_WINDOW_S * bytes_per_s, LEAST_BYTES), USUAL_BYTES)
+    most = max(most, SHORTEST_WINDOW_S * bytes_per_s)
+    return most, most / bytes_per_s
 
 
 class SlidingWindow:
@@ -88,9 +100,8 @@ class Budget:
         self._price, self._price_ns = 0.0, start_ns
         windows = []
         if s.bytes_per_s:
-            most = max(BYTES_WINDOW_S * s.bytes_per_s, LEAST_BYTES)
-            reserve = s.urgent_share * most
-            windows.append(SlidingWindow("bytes", most, most / s.bytes_per_s, reserve))
+            most, window_s = bytes_window(s.bytes_per_s)
+            windows.append(SlidingWindow("bytes", most, window_s, s.urgent_share * most))
         if s.messages_per_minute:
             most, rate = math.ceil(s.messages_per_minute), s.messages_per_minute
             reserve, window_s = math.floor(s.urgent_share * most), 60.0 * most / rate
