@@ -369,3 +369,12 @@ def test_a_robot_of_which_nothing_is_known_declares_no_tier() -> None:
     TeamOnBus(TEAM, here=[], hub=hub).odometry("me", standing(100 * MS))
     node.step(100 * MS)
     assert len(recording.open("declare_token")) == 1
+
+
+def test_a_robot_without_active_help_subscribes_to_no_fixes() -> None:
+    """Else teammates would send it what it does not use."""
+    for active in (True, False):
+        rules = {"active": active}
+        stand = TeamOnBus(team_of(me=robot_at(sigma_m=0.3, **rules), mate=robot_at(2.0)))
+        stand.stand_still(0.5)
+        assert bool(stand.nodes["me"]._declarations._subscriptions) is active

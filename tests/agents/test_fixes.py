@@ -156,6 +156,19 @@ def test_a_lost_teammate_comes_first_whatever_the_gain() -> None:
         assert sure[0] > 1000.0 * sure[1]
 
 
+def test_a_lost_teammate_gets_a_fix_that_is_not_worth_its_price() -> None:
+    """Far away, right after the price has risen."""
+    alone = Alone(budget=BudgetSettings(bytes_per_s=1000.0))
+    alone.tell(Presence("mate", LOWEST_TIER), Presence("other", POORER))
+    far = ahead("mate", 60.0)
+    for _ in range(40):
+        alone.sees(ahead("other", 1.0), after_ns=20 * MS)
+    price = alone.agent.budget.price(alone.now_ns, 42)
+    assert alone.agent.budget.admits(alone.now_ns, 42, urgent=True)
+    assert robots(alone.sees(far)) == ["mate"]
+    assert price > 3.0
+
+
 def test_the_reserve_is_for_lost_teammates() -> None:
     alone = Alone(budget=BudgetSettings(messages_per_minute=2.0, urgent_share=0.5))
     alone.tell(Presence("mate", LOWEST_TIER), Presence("other", POOR), Presence("third", POOR))

@@ -93,6 +93,37 @@ def test_a_sender_that_began_to_dissent_does_not_support_the_estimate() -> None:
     assert not any(record.reason for record in decision.senders.values())
 
 
+def disputed(**scores: float) -> dict[str, SenderRecord]:
+    """Senders of the last moment: those with a score (in limits) dispute the estimate for two
+    seconds, the others have just agreed with it."""
+    now_ns = 10 * SECOND
+    return {
+        name: SenderRecord(
+            last_report_ns=now_ns - 1,
+            last_agreement_ns=now_ns - 1 if not score else 0,
+            dispute_since_ns=8 * SECOND if score else 0,
+            score=score * RULES.limit,
+        )
+        for name, score in scores.items()
+    }
+
+
+def test_a_sender_that_is_only_suspected_is_not_used_and_not_quarantined() -> None:
+    senders = disputed(west=1.2, east=0.7, a=0.0, b=0.0, c=0.0)
+    suspected = assess(senders, "east", TeammateReport(10 * SECOND, USUAL_NIS), 0, RULES)
+    assert not suspected.trusted
+    assert suspected.quarantined == frozenset()
+    found = assess(senders, "west", TeammateReport(10 * SECOND, CONTRADICTS), 0, RULES)
+    assert found.quarantined == {"west"}
+
+
+def test_a_sender_that_is_suspected_votes_against_the_estimate() -> None:
+    senders = disputed(west=1.2, east=0.7, a=0.0)
+    decision = assess(senders, "a", TeammateReport(10 * SECOND, AGREES), 0, RULES)
+    assert decision.quarantined == {"a"}
+    assert decision.event == "outvoted"
+
+
 def test_of_two_contradicting_senders_neither_is_used_until_the_tie_ends(
     receiver: Receiver,
 ) -> None:

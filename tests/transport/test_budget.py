@@ -88,6 +88,15 @@ def test_no_window_holds_more_bytes_than_allowed(
     assert most_within(window_s, sent, size_of) <= window_s * bytes_per_s + 1e-6
 
 
+def test_of_several_limits_the_tightest_makes_the_price() -> None:
+    """It falls by e in the time in which three messages are earned: here 3 minutes."""
+    limits = BudgetSettings(bytes_per_s=1000.0, messages_per_minute=1.0)
+    budget = Budget(limits, 0)
+    budget.spend(0, 42, 0.1)
+    at_once, later = budget.price(0, 42), budget.price(10 * 1_000_000_000, 42)
+    assert later == pytest.approx(at_once * math.exp(-10.0 / 180.0))
+
+
 @pytest.mark.parametrize(
     ("bytes_per_s", "most", "window_s"),
     [

@@ -342,4 +342,6 @@ def test_a_flipped_bit_never_raises(message: Tagged, data: st.DataObject) -> Non
     payload[bit // 8] ^= 1 << bit % 8
     read = decode_tagged(bytes(payload))
     if not isinstance(read, Refusal):
-        assert refusal(read, NOW) is None or isinstance(refusal(read, NOW), Refusal)
+        assert type(read) in get_args(Tagged)
+        refused = refusal(read, NOW)
+        assert refused is None or refused in set(Refusal)
