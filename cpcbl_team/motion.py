@@ -40,18 +40,19 @@ def motion_noise(
     return move(certain, distance, turn, noise, crawl_s).covariance
 
 
-def motion_variance(
-    distance: float, turn: float, noise: OdometryNoise, crawl_s: float
-) -> tuple[float, float]:
-    """The variances of an arc of `distance` metres (m^2) that turns by `turn` (rad^2)."""
-    way, turned = abs(distance), abs(turn)
+def distance_variance(distance: float, turn: float, noise: OdometryNoise, crawl_s: float) -> float:
+    """The variance (m^2) of the distance of an arc that turns by `turn`."""
     per_m, per_rad = noise.distance_sigma_m_per_sqrt_m, noise.distance_sigma_m_per_sqrt_rad
-    along = per_m * per_m * way
+    along = per_m * per_m * abs(distance)
     if crawl_s > 0.0:
         along = max(along, noise.crawl_sigma_m_per_sqrt_s**2 * crawl_s)
-    along += per_rad * per_rad * turned
+    return along + per_rad * per_rad * abs(turn)
+
+
+def turn_variance(distance: float, turn: float, noise: OdometryNoise) -> float:
+    """The variance (rad^2) of the turn of an arc of `distance` metres."""
     per_m, per_rad = noise.turn_sigma_rad_per_sqrt_m, noise.turn_sigma_rad_per_sqrt_rad
-    return along, per_m * per_m * way + per_rad * per_rad * turned
+    return per_m * per_m * abs(distance) + per_rad * per_rad * abs(turn)
 
 
 def move(
@@ -74,8 +75,8 @@ def move(
     xx, xy, yy, xh, yh, hh = covariance
     direction = heading + 0.5 * turn
     c, s = cos(direction), sin(direction)
-    along, around = motion_variance(distance, turn, noise, crawl_s)
-    along, around = along + extra[0], around + extra[1]
+    along = distance_variance(distance, turn, noise, crawl_s) + extra[0]
+    around = turn_variance(distance, turn, noise) + extra[1]
     # where a heading error of one radian leads, in metres: the last column of F
     lx, ly = -distance * s, distance * c
     # where a turn error leads: half of it; and its covariance with the position

@@ -7,6 +7,7 @@ other one changes its settings only where they are wrong (`miscalibration.py`).
 from collections.abc import Sequence
 
 from cpcbl_team.config import LocalizationSettings, OdometryNoise
+from cpcbl_team.geometry import new
 from cpcbl_team.landmarks import LandmarkUpdate
 from cpcbl_team.measurements import GatedObject
 from cpcbl_team.miscalibration import (
@@ -18,9 +19,9 @@ from cpcbl_team.miscalibration import (
     check_models,
     noise_with_factor,
 )
-from cpcbl_team.motion import NO_VARIANCE, MotionVariance, motion_variance
+from cpcbl_team.motion import NO_VARIANCE, MotionVariance, distance_variance, turn_variance
 from cpcbl_team.self_calibration import ReferencePose, ReferencePoses, self_calibrate
-from cpcbl_team.state import CalibrationMemory, State, with_memory
+from cpcbl_team.state import CalibrationMemory, Memory, State, with_memory
 
 
 class OwnCalibration:
@@ -58,10 +59,13 @@ class OwnCalibration:
         factor = state.memory.calibration.adaptation.motion_factor
         if factor == 1.0:
             return NO_VARIANCE
-        noise = noise_with_factor(self._noise, factor)
-        along, around = motion_variance(distance, turn, noise, crawl_s)
-        of_distance, of_turn = motion_variance(distance, turn, self._noise, crawl_s)
-        return MotionVariance(along - of_distance, around - of_turn)
+        usual, noise = self._noise, noise_with_factor(self._noise, factor)
+        along = distance_variance(distance, turn, noise, crawl_s)
+        around = turn_variance(distance, turn, noise)
+        return MotionVariance(
+            along - distance_variance(distance, turn, usual, crawl_s),
+            around - turn_variance(distance, turn, usual),
+        )
 
     def after_rejections(
         self, state: State, landmarks: LandmarkUpdate, others: Sequence[GatedObject]
@@ -114,8 +118,11 @@ class OwnCalibration:
             if changed is not None:
                 check = ModelCheck(now, accepted=accepted)
                 state, present = state.counted("miscalibrated"), changed
-        return _with_calibration(state, memory._replace(check=check, adaptation=present))
+        learned, references, total_turn_rad, _, _ = memory
+        parts = learned, references, total_turn_rad, check, present
+        return _with_calibration(state, new(CalibrationMemory, parts))
 
 
 def _with_calibration(state: State, memory: CalibrationMemory) -> State:
-    return with_memory(state, state.memory._replace(calibration=memory))
+    recovery, teammates, _, events = state.memory
+    return with_memory(state, new(Memory, (recovery, teammates, memory, events)))
