@@ -25,13 +25,7 @@ from cpcbl_team.measurements import (
     measurement_of,
     nis_of,
 )
-from cpcbl_team.motion import (
-    NO_VARIANCE,
-    bridge,
-    inflate_by_gap,
-    is_gap,
-    part_of_piece,
-)
+from cpcbl_team.motion import NO_VARIANCE, bridge, inflate_by_gap, is_gap, part_of_piece
 from cpcbl_team.object_timers import ObjectTimers, has_passed
 from cpcbl_team.own_calibration import OwnCalibration
 from cpcbl_team.recovery import (

@@ -19,7 +19,7 @@ from collections.abc import Sequence
 from typing import Final, NamedTuple
 
 from cpcbl_team.config import OdometryNoise
-from cpcbl_team.estimate import Covariance3, Estimate
+from cpcbl_team.estimate import Estimate
 from cpcbl_team.geometry import Pose2, new, wrap_angle
 from cpcbl_team.motion import move
 
@@ -28,23 +28,23 @@ LONGEST_NS: Final = 5_000_000_000
 MOST_TURN_RAD: Final = 2.5  # beyond, the chord of a block is much shorter than its path
 LEAST_DISTANCE_M: Final = 0.02
 LEAST_TURN_RAD: Final = 0.02
-LEAST_SIGMA: Final = 0.01
+LEAST_SIGMA: Final = 0.01  # of odometry whose noise grows, per root of a metre or radian
 LEAST_SHARE: Final = 0.25  # of the variance that a block adds is taken away, or it tells little
 LARGEST: Final = 7.0  # normalized correction: a bump is no calibration
-FADING: Final = 1.0 - 1.0 / 30.0  # a block
+FADING: Final = 1.0 - 1.0 / 30.0  # of all sums, a block
 LEAST_BLOCKS: Final = 5.0
-SIGMAS: Final = 4.0
+SIGMAS: Final = 4.0  # of a slope that is believed
 LEAST_SCALE: Final = 0.03  # of the first change: what is smaller is not worth one
 LEAST_BIAS_RAD: Final = math.radians(2.0)
 MOST_SLOPE: Final = 0.5  # that is believed at once
 LARGE: Final = 1.8  # factor of a variance, for a robot that rejects too much
 SCATTER_SIGMAS: Final = 4.0  # a mean square of so many is larger than due
-SMALL: Final = 0.6
+SMALL: Final = 0.6  # a mean square below it makes larger sigmas smaller again
 MOTION_LAG: Final = 0.1  # correlation of each correction with the one before
 LEAST_REJECTED: Final = 0.01  # share of objects of the map
 LEAST_REJECTIONS: Final = 3
-MOST_DUE: Final = 5.0
-MOST_FACTOR: Final = 400.0
+MOST_DUE: Final = 5.0  # times the share that the gate rejects of correct measurements
+MOST_FACTOR: Final = 400.0  # of a variance
 
 
 class Corrected(NamedTuple):
@@ -79,11 +79,10 @@ class Regression(NamedTuple):
     @property
     def sigmas(self) -> float:
         """By how many of its sigmas the slope differs from zero; 0 if it is not many."""
-        products, squares, total, _, _, blocks = self
+        products, squares, _, _, _, blocks = self
         if blocks < LEAST_BLOCKS or products * products <= SIGMAS * SIGMAS * squares:
             return 0.0
-        scatter = max((total - products * products / squares) / blocks, 1.0)
-        return abs(products) / math.sqrt(squares * scatter)
+        return abs(products) / math.sqrt(squares * max(self.residual / blocks, 1.0))
 
     def plus(self, motion: float, correction: float, taken: float, added: float) -> "Regression":
         """With one more block, of this motion and correction. Its updates have `taken` so much of
@@ -156,23 +155,18 @@ def check_models(check: ModelCheck, now: Corrected, noise: OdometryNoise) -> Mod
     if distance >= LEAST_DISTANCE_M:
         c, s = math.cos(course), math.sin(course)
         dx, dy = pose_now.x - predicted.pose.x, pose_now.y - predicted.pose.y
-        due = _along(predicted.covariance, c, s)
-        taken, added = due - _along(after, c, s), due - _along(before, c, s)
-        along = along.plus(distance, c * dx + s * dy, taken, added)
-        due = _along(predicted.covariance, -s, c)
-        taken, added = due - _along(after, -s, c), due - _along(before, -s, c)
-        aside = aside.plus(distance, c * dy - s * dx, taken, added)
+        old, due, left = before.position(), predicted.covariance.position(), after.position()
+        variance = due.along(c, s)
+        variances = variance - left.along(c, s), variance - old.along(c, s)
+        along = along.plus(distance, c * dx + s * dy, *variances)
+        variance = due.along(-s, c)
+        variances = variance - left.along(-s, c), variance - old.along(-s, c)
+        aside = aside.plus(distance, c * dy - s * dx, *variances)
     if abs(turn) >= LEAST_TURN_RAD:
         excess = wrap_angle(pose_now.heading - pose.heading - turn)
-        due = predicted.covariance.hh
-        turned = turned.plus(turn, excess, due - after.hh, due - before.hh)
+        variance = predicted.covariance.hh
+        turned = turned.plus(turn, excess, variance - after.hh, variance - before.hh)
     return new(ModelCheck, (now, along, aside, turned, rejections, rejected, accepted))
-
-
-def _along(covariance: Covariance3, x: float, y: float) -> float:
-    """The variance of the position in a direction."""
-    xx, xy, yy, _, _, _ = covariance
-    return x * x * xx + 2.0 * x * y * xy + y * y * yy
 
 
 def adapted(
@@ -202,17 +196,13 @@ def adapted(
     due = LEAST_REJECTED + MOST_DUE * (1.0 - gate_probability)
     is_rejecting = check.rejections > max(due * all_of_them, LEAST_REJECTIONS)
     scatter = (along.residual + aside.residual + turn.residual) / blocks
-    lagged, total = (
-        (along.lagged + aside.lagged + turn.lagged),
-        (along.total + aside.total + turn.total),
-    )
+    lagged = along.lagged + aside.lagged + turn.lagged
+    total = along.total + aside.total + turn.total
     # chi-square; the corrections aside and of the heading have much in common
     is_large = scatter > 1.0 + SCATTER_SIGMAS * math.sqrt(3.0 / (independent_share * blocks))
     if is_large or is_rejecting:
         return _with_larger_sigma(present, max(scatter, LARGE), lagged > MOTION_LAG * total)
-    if scatter < SMALL and present is not AS_CONFIGURED:
-        return _with_smaller_sigmas(present, scatter)
-    return None
+    return _with_smaller_sigmas(present, scatter) if scatter < SMALL else None
 
 
 def _with_slope(present: Adaptation, name: str, slope: float) -> Adaptation:
@@ -241,6 +231,8 @@ def _with_smaller_sigmas(present: Adaptation, scatter: float) -> Adaptation | No
 def noise_with_factor(noise: OdometryNoise, factor: float) -> OdometryNoise:
     """The noise of odometry with variances times this factor; noise that is said to be (nearly)
     zero can be larger, too."""
+    if factor == 1.0:
+        return noise
     k = math.sqrt(factor)
     return OdometryNoise(
         distance_sigma_m_per_sqrt_m=k * max(noise.distance_sigma_m_per_sqrt_m, LEAST_SIGMA),

@@ -109,9 +109,7 @@ class OwnCalibration:
         elif begin is None or state.memory.teammates.last_report_ns >= begin.stamp_ns:
             check = check._replace(begin=now)
         else:
-            noise = self._noise
-            if present.motion_factor > 1.0:
-                noise = noise_with_factor(noise, present.motion_factor)
+            noise = noise_with_factor(self._noise, present.motion_factor)
             check = check_models(check, now, noise)
             rules = self._gate_probability, self._independent_share
             changed = adapted(check, present, accepted, *rules)

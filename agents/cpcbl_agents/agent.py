@@ -27,13 +27,12 @@ class PoseEstimate(NamedTuple):
 
 class FrameEstimate(NamedTuple):
     """The filter's estimate at the time of a frame, from which fixes are made. The frame's bearings
-    are corrected by the bias that the robot has learned, as the estimate is; the sensor's variances
-    are so many times those of the settings."""
+    are corrected by the bias that the robot knows, as the estimate is."""
 
     frame: Sightings
     estimate: Estimate
     lost: str
-    sensor_factor: float = 1.0
+    sensor_factor: float = 1.0  # the sensor's variances are so many times those of the settings
 
 
 class Presence(NamedTuple):

@@ -51,7 +51,7 @@ def warnings(team: Team) -> Iterator[str]:
         if only_ranges and variant != "joint":
             yield (
                 f"robots.{name}.localizer.variant: {variant} never learns its heading from ranges"
-                " alone, and becomes too certain; use variant joint"
+                " alone; use variant joint"
             )
         if len(objects) == 1:
             yield (

@@ -16,7 +16,7 @@ from cpcbl_transport.messages import Spending
 
 SHORTEST_WINDOW_S, LONGEST_WINDOW_S = 10.0, 60.0
 LEAST_BYTES = 120.0  # in a window, so that a small budget can be used up by whole messages
-USUAL_BYTES = 500.0
+USUAL_BYTES = 500.0  # in a window whose time is between these two
 PRICE_MEMORY = 3.0  # messages: in the time in which so many are earned, the price falls by e
 _ROUNDING = 1e-9
 

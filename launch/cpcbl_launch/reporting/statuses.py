@@ -105,8 +105,8 @@ def distrust_text(trust: Iterable[Trust | TrustReport]) -> str:
 
 
 def miscalibration_text(counts: Mapping[str, int]) -> str:
-    """`σ of its odometry × 2.1, 13 % of sightings rejected`: why a robot is called miscalibrated;
-    empty if it is not."""
+    """`σ of its odometry × 2.1, 13.0% of observations rejected`: why a robot is called
+    miscalibrated; empty if it is not."""
     if not counts.get("miscalibrated"):
         return ""
     texts = [

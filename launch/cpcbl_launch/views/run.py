@@ -20,11 +20,7 @@ from cpcbl_launch.reporting.recorder import (
     Report,
     RobotReport,
 )
-from cpcbl_launch.reporting.statuses import (
-    distrust_text,
-    miscalibration_text,
-    trust_remarks,
-)
+from cpcbl_launch.reporting.statuses import distrust_text, miscalibration_text, trust_remarks
 from cpcbl_launch.reporting.tables import number, percent, short, table
 from cpcbl_launch.run.observer import ObserverReport
 from cpcbl_launch.run.processes import ROBOT, Processes
