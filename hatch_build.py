@@ -17,6 +17,7 @@ HOT = (
     "constraints",
     "estimate",
     "fusion",
+    "gaussian",
     "geometry",
     "landmarks",
     "localizer",

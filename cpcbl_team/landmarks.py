@@ -45,9 +45,8 @@ from cpcbl_team.sensors import (
 from cpcbl_team.state import Evidence, LandmarkSnapshot, State
 
 _astuple: Final = msgspec.structs.astuple  # see `constraints._atan2`
-Numbers = tuple[
-    str, float | None, float | None, float | None, float | None, float | None, float | None
-]  # of a sighting, in its order
+Numbers = tuple[str, float | None, float | None, object, object, object, object]
+"""Of a sighting, in its order; of a plain one the last four are None."""
 
 
 class Mark:
@@ -113,20 +112,21 @@ class Landmarks:
     ) -> LandmarkUpdate:
         """What the landmarks among `sightings` say about position or heading, or about both. An
         object that is `cooling_down` is not plain; one of `recorded` is no new evidence."""
-        update = LandmarkUpdate(state)
+        update, marks = LandmarkUpdate(state), self._marks
+        if cooling_down:
+            marks = {name: mark for name, mark in marks.items() if name not in cooling_down}
         uses_range = scope is not None and scope is not HEADING
         uses_bearing = scope is not None and (scope is not POSITION or self._uses_rays)
         for sighting in sightings:
             numbers: Numbers = _astuple(sighting)
             name, range_m, bearing, range_sigma, bearing_sigma, facing, facing_sigma = numbers
-            mark = self._marks.get(name)
+            mark = marks.get(name)
             if (
                 mark is None
                 or range_sigma is not None
                 or bearing_sigma is not None
                 or facing is not None
                 or facing_sigma is not None
-                or name in cooling_down
                 or not _is_sound(range_m, bearing)
             ):
                 update.others.append(sighting)

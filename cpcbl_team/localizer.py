@@ -69,6 +69,7 @@ class Localizer:
         self._gates = gates
         self._minimum_interval_ns = rules.minimum_interval_s * 1e9
         self._odometry = settings.odometry
+        self._moves = settings.odometry.moves
         self._odometry_timeout_ns = int(settings.odometry.timeout_s * 1e9)
         self._has_dead_zone = settings.odometry.least_speed_m_s > 0.0
         self._calibration = OwnCalibration(settings)
@@ -86,12 +87,13 @@ class Localizer:
 
         `landmarks` holds the combined evidence of plain landmarks, `others` all other measurements.
         """
-        state = self.predict(state, frame.stamp_ns)  # 1. differential motion
+        now = frame.stamp_ns
+        state = self.predict(state, now)  # 1. differential motion
         state, scope, landmarks, others = self.measure(state, frame)  # 2. measurements
         if scope is None:  # nothing may be updated
             return self.recovery.check(state)
         gated = self.constrain(state.estimate, others, scope) if others else _NO_OBJECTS  # 3.
-        if self.screen.has_recent_reports(state, frame.stamp_ns):  # beyond the paper: trust
+        if self.screen.has_recent_reports(state, now):  # beyond the paper: trust
             state, gated = self.screen.screen_frame(state, landmarks, gated)
         estimate = self.correct(state.estimate, landmarks, gated, scope)  # 4. combine, 5. merge
         return self.recovery.check(self._with_frame(state, estimate, landmarks, gated, scope))
@@ -138,7 +140,7 @@ class Localizer:
                 odometry_from_robot = step(odometry_from_robot, distance, turn)
                 estimate = self._variant.move(estimate, distance, turn, crawl_s, extra)
         state = with_motion(state, until_ns, estimate, odometry_from_robot)
-        if until_ns > state.odometry_until_ns and self._odometry.moves:
+        if self._moves and until_ns > state.odometry_until_ns:
             return self._across_gap(state, stamp_ns, following)
         return state
 

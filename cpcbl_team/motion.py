@@ -8,10 +8,14 @@ import math
 from math import cos, sin
 from typing import Final, NamedTuple
 
+import msgspec
+
 from cpcbl_team.config import OdometryNoise, OdometrySettings
 from cpcbl_team.estimate import ZERO3, Covariance3, Estimate, Matrix3, circle_variance
 from cpcbl_team.geometry import Pose2, new, wrap_angle
 from cpcbl_team.inputs import Odometry
+
+_astuple: Final = msgspec.structs.astuple  # see `constraints._atan2`
 
 
 class MotionVariance(NamedTuple):
@@ -97,8 +101,8 @@ def move(
 
 def part_of_piece(piece: Odometry, from_ns: int, until_ns: int) -> tuple[float, float, float]:
     """The part of a piece of odometry within these times: distance (m), turn (rad), seconds."""
-    distance, turn = piece.distance_m, piece.turn_rad
-    begin_ns, end_ns = piece.from_ns, piece.stamp_ns
+    numbers: tuple[int, int, float, float] = _astuple(piece)
+    begin_ns, end_ns, distance, turn = numbers
     part_ns = whole_ns = end_ns - begin_ns
     if begin_ns != from_ns or end_ns > until_ns:
         part_ns = max(0, min(end_ns, until_ns) - max(from_ns, begin_ns))
