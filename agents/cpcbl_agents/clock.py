@@ -43,6 +43,20 @@ class Clock(NamedTuple):
             raise InputError(f"--clock {text}: write EPOCH_NS:FROM_NS:SPEED") from None
 
     @staticmethod
+    def starting_in(seconds: float, epoch_ns: int | None = None, speed: float = 1.0) -> "Clock":
+        """A clock that starts to run so many real seconds from now, at `epoch_ns`, or else at the
+        Unix time of then.
+
+        That is a whole microsecond, as the stamps of fixes and beliefs are. Else a fix would be
+        before the simulated frame of the same time, and the teammate would compute that frame
+        again.
+        """
+        ahead_ns = int(seconds * 1e9)
+        if epoch_ns is None:
+            epoch_ns = (time.time_ns() + ahead_ns) // 1_000 * 1_000
+        return Clock(epoch_ns, time.monotonic_ns() + ahead_ns, speed)
+
+    @staticmethod
     def wall() -> "Clock":
         """Unix time at its own speed."""
         return Clock(time.time_ns(), time.monotonic_ns(), 1.0, unix=True)

@@ -15,6 +15,7 @@ from cpcbl_agents.clock import Clock
 from cpcbl_agents.process import Loop, StopSignal, make_robot, new_incarnation, stop_on_clock_step
 from cpcbl_team.config import BudgetSettings
 from cpcbl_team.errors import ClockError
+from cpcbl_transport.compact import STAMP_NS
 
 
 class Counting:
@@ -171,6 +172,14 @@ def test_nothing_is_stepped_before_it_runs_or_after() -> None:
 # When it starts, and when its time is another ----------------------------------------------------
 
 LIMITED = team_of(me=robot_at(budget=BudgetSettings(messages_per_minute=6.0)))
+
+
+def test_a_team_starts_at_a_time_that_fixes_and_beliefs_can_carry() -> None:
+    clock = Clock.starting_in(60.0)
+    assert clock.now_ns() == clock.epoch_ns  # it stands until then
+    assert clock.epoch_ns % STAMP_NS == 0
+    assert abs(clock.epoch_ns - time.time_ns() - 60_000_000_000) < 10_000_000_000
+    assert Clock.starting_in(0.0, epoch_ns=1_234_567, speed=2.0).epoch_ns == 1_234_567
 
 
 def since(seconds: float, unix: bool = False) -> Clock:

@@ -18,7 +18,6 @@ import msgspec
 from cpcbl_agents.clock import Clock
 from cpcbl_agents.node import STATUS_NS
 from cpcbl_agents.process import StopSignal
-from cpcbl_launch.lab.chaos.team import clock_starting_in
 from cpcbl_launch.lab.scaling import swarm_team
 from cpcbl_launch.run.processes import MIB, ProcessSpec, Supervisor, process_table, process_usage
 from cpcbl_launch.run.up import free_endpoint
@@ -121,7 +120,7 @@ def measure_start(starts: int, checkout: Path | None = None) -> Start:
     seconds, resident = [], []
     with _routed(team, endpoint) as (folder, bus):
         for _ in range(starts):
-            clock = clock_starting_in(0.0)  # a robot declares its token after the run's epoch
+            clock = Clock.starting_in(0.0)  # a robot declares its token after the run's epoch
             (spec,) = _robot_specs(team, folder, endpoint, clock, checkout, [robot])
             appeared = threading.Event()
             tokens = bus.watch_liveliness(topics.ALIVE.at(robot=robot), _setter(appeared))
@@ -182,7 +181,7 @@ def _robot_specs(
 def measure_team(robots: int, seconds: float, checkout: Path | None = None) -> Load:
     """A team as `up` runs it; its robots with the code of another checkout if one is given."""
     team, endpoint, lead_s = swarm_team(robots, 1), free_endpoint(), _lead_s(robots)
-    clock, names = clock_starting_in(lead_s), list(team.robots)
+    clock, names = Clock.starting_in(lead_s), list(team.robots)
     with _routed(team, endpoint) as (folder, bus), ExitStack() as stack:
         counts = _Counts(clock)
         for topic in (topics.TRACK, topics.STATUS):
@@ -200,7 +199,7 @@ def measure_team(robots: int, seconds: float, checkout: Path | None = None) -> L
 def measure_broadcast(robots: int, seconds: float) -> Load:
     """As many processes, each of which sends its belief to all others."""
     names, endpoint, lead_s = [f"r{n:04}" for n in range(robots)], free_endpoint(), _lead_s(robots)
-    clock = clock_starting_in(lead_s)
+    clock = Clock.starting_in(lead_s)
     with open_router("broadcast", [endpoint]) as bus, ExitStack() as stack:
         counts = _Counts(clock)
         for topic in (topics.BELIEF, topics.STATUS):

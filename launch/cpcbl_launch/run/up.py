@@ -142,9 +142,8 @@ def run_team(run: Run, show: Show, stop: Stop, launch: Launch = OnThisMachine) -
         launcher = launch(run, folder, stop)
         bus = stack.enter_context(launcher.router())
         recording = stack.enter_context(_recording(run, bus))
-        recorder, lead_ns = Recorder(bus), int(launcher.lead_s * 1e9)
-        epoch_ns = time.time_ns() + lead_ns if run.epoch_ns is None else run.epoch_ns
-        clock = Clock(epoch_ns, time.monotonic_ns() + lead_ns, run.speed)
+        recorder = Recorder(bus)
+        clock = Clock.starting_in(launcher.lead_s, run.epoch_ns, run.speed)
         with launcher.processes(clock) as processes:
             end_ns = None if run.duration_s is None else int(run.duration_s * 1e9)
             while not stop():

@@ -62,7 +62,7 @@ class TeamUnderTest:
         team = plan.team
         self.plan, self.folder = plan, folder
         self.endpoint, self.far_endpoint = free_endpoint(), free_endpoint()
-        self.clock = clock_starting_in(LEAD_S + LEAD_S_A_PROCESS * len(team.robots))
+        self.clock = Clock.starting_in(LEAD_S + LEAD_S_A_PROCESS * len(team.robots))
         simulated = [name for name, robot in team.robots.items() if robot.source == "simulated"]
         self.robots = [name for name in simulated if name not in plan.left_out]
         """The robots of the simulated field, whose ground truth is known."""
@@ -175,12 +175,6 @@ class TeamUnderTest:
     def last_log_line(self, process: str) -> str:
         lines = self.process_log(process).splitlines()
         return lines[-1] if lines else f"{process} wrote nothing"
-
-
-def clock_starting_in(seconds: float) -> Clock:
-    """A clock whose epoch is so many seconds from now."""
-    ahead_ns = int(seconds * 1e9)
-    return Clock(time.time_ns() + ahead_ns, time.monotonic_ns() + ahead_ns, 1.0)
 
 
 @contextmanager
