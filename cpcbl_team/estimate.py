@@ -37,9 +37,8 @@ class Covariance3(NamedTuple):
     def plus(self, other: "Covariance3", factor: float = 1.0) -> "Covariance3":
         xx, xy, yy, xh, yh, hh = self
         k, (oxx, oxy, oyy, oxh, oyh, ohh) = factor, other
-        return Covariance3(
-            xx + k * oxx, xy + k * oxy, yy + k * oyy, xh + k * oxh, yh + k * oyh, hh + k * ohh
-        )
+        plus = xx + k * oxx, xy + k * oxy, yy + k * oyy, xh + k * oxh, yh + k * oyh, hh + k * ohh
+        return new(Covariance3, plus)
 
     def scaled(self, factor: float) -> "Covariance3":
         return Covariance3(*(factor * a for a in self))
@@ -47,11 +46,8 @@ class Covariance3(NamedTuple):
     def times(self, h: "Row") -> tuple[float, float, float]:
         """C h."""
         x, y, a = h
-        return (
-            self.xx * x + self.xy * y + self.xh * a,
-            self.xy * x + self.yy * y + self.yh * a,
-            self.xh * x + self.yh * y + self.hh * a,
-        )
+        xx, xy, yy, xh, yh, hh = self
+        return xx * x + xy * y + xh * a, xy * x + yy * y + yh * a, xh * x + yh * y + hh * a
 
     def determinant(self) -> float:
         a, b, d, c, e, f = self
@@ -63,7 +59,7 @@ class Covariance3(NamedTuple):
         ax, ay, ah = self.times((a, b, c))
         dx, dy, dh = self.times((d, e, f))
         gx, gy, gh = self.times((g, h, i))
-        return Covariance3(
+        product = (
             a * ax + b * ay + c * ah,
             d * ax + e * ay + f * ah,
             d * dx + e * dy + f * dh,
@@ -71,6 +67,7 @@ class Covariance3(NamedTuple):
             g * dx + h * dy + i * dh,
             g * gx + h * gy + i * gh,
         )
+        return new(Covariance3, product)
 
 
 SMALLEST_VARIANCE: Final = 1e-10  # (10 um)^2, (10 urad)^2: what is called exact

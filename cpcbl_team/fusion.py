@@ -25,6 +25,7 @@ from cpcbl_team.estimate import (
     merge,
     offset_pose,
     posterior_factor,
+    sharpest,
     symmetric_product,
     within_scope,
 )
@@ -68,8 +69,9 @@ class Observation(NamedTuple):
 def _noise(xx: float, xy: float, yy: float) -> tuple[float, float, float]:
     """(xx, xy, yy) no sharper than evidence may be along any axis. Otherwise rounding could make a
     part of the evidence exceed the whole."""
-    xx = max(xx + SMALLEST_VARIANCE, SHARPEST_VARIANCE)
-    return xx, xy, max(yy + SMALLEST_VARIANCE, xy * xy / xx + SHARPEST_VARIANCE)
+    xx, yy = sharpest(xx + SMALLEST_VARIANCE), yy + SMALLEST_VARIANCE
+    least = xy * xy / xx + SHARPEST_VARIANCE
+    return xx, xy, yy if yy > least else least
 
 
 def chi_square(

@@ -44,10 +44,10 @@ from cpcbl_team.state import (
     state_at_start,
     updates_with_frame,
     with_correction,
-    with_memory,
     with_motion,
     with_odometry,
     with_recovery,
+    with_teammates,
 )
 from cpcbl_team.teammates import TeammateScreen
 from cpcbl_team.variants import UpdateOrder, variant_of
@@ -350,8 +350,7 @@ class Localizer:
             evidence = evidence_from_observation(state, observation)
             state = with_recovery(state, with_evidence(state.memory.recovery, [evidence]))
         if observation.observer is not None:
-            memory = memory._replace(last_report_ns=state.stamp_ns)
-            state = with_memory(state, state.memory._replace(teammates=memory))
+            state = with_teammates(state, memory._replace(last_report_ns=state.stamp_ns))
         return state
 
     def add_teammate_belief(self, state: State, belief: Belief) -> State:
@@ -366,7 +365,7 @@ class Localizer:
         }
         beliefs[belief.robot] = (*beliefs.get(belief.robot, ()), belief)
         memory = state.memory.teammates._replace(beliefs=beliefs, last_report_ns=now_ns)
-        return with_memory(state, state.memory._replace(teammates=memory))
+        return with_teammates(state, memory)
 
     def mark_shared(self, state: State, event: BeliefShared) -> State:
         """This robot's belief goes to a teammate: its information may come back."""

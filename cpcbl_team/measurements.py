@@ -224,12 +224,12 @@ def constraints_of(
 def left_out(prior: Estimate, m: Measurement, cs: list[Constraint]) -> list[float]:
     """The mean square of what each linear constraint leaves out (see `curvature`); 0 where that
     does not matter."""
-    place = m.position.covariance
-    p = prior.covariance.plus(Covariance3(*place, 0.0, 0.0, 0.0))
-    dx, dy = m.position.x - prior.pose.x, m.position.y - prior.pose.y
-    if m.wall is not None or p.xx + p.yy <= CURVED_SHARE * (dx * dx + dy * dy):
+    x, y, place = m.position
+    (own_x, own_y, _), own, _ = prior
+    dx, dy, variances = x - own_x, y - own_y, own.xx + place.xx + (own.yy + place.yy)
+    if m.wall is not None or variances <= CURVED_SHARE * (dx * dx + dy * dy):
         return [0.0] * len(cs)
-    of_range, of_bearing = curvature(p, dx, dy)
+    of_range, of_bearing = curvature(own.plus(Covariance3(*place, 0.0, 0.0, 0.0)), dx, dy)
     return [of_bearing * c.row[2] ** 2 if c.is_bearing else of_range for c in cs]
 
 

@@ -216,10 +216,22 @@ def with_memory(state: State, memory: Memory) -> State:
 
 def with_beliefs(state: State, beliefs_of: State) -> State:
     """The state with the beliefs of another one, and when the latest report of both came."""
-    recovery, (_, senders, last_ns), calibration, events = state.memory
+    _, senders, last_ns = state.memory.teammates
     beliefs, _, other_ns = beliefs_of.memory.teammates
-    teammates = TeammateMemory(beliefs, senders, max(last_ns, other_ns))
-    return with_memory(state, Memory(recovery, teammates, calibration, events))
+    last_ns = other_ns if other_ns > last_ns else last_ns
+    return with_teammates(state, new(TeammateMemory, (beliefs, senders, last_ns)))
+
+
+def with_teammates(state: State, teammates: TeammateMemory) -> State:
+    """The state with this memory of teammates."""
+    recovery, _, calibration, events = state.memory
+    return with_memory(state, new(Memory, (recovery, teammates, calibration, events)))
+
+
+def with_senders(teammates: TeammateMemory, senders: Mapping[str, SenderRecord]) -> TeammateMemory:
+    """The memory of teammates with these records of senders."""
+    beliefs, _, last_ns = teammates
+    return new(TeammateMemory, (beliefs, senders, last_ns))
 
 
 def with_recovery(state: State, recovery: RecoveryMemory) -> State:

@@ -15,7 +15,7 @@ from cpcbl_team.inputs import Belief, Input, Position, Sightings
 from cpcbl_team.landmarks import LandmarkUpdate
 from cpcbl_team.measurements import GatedObject, GatedObjects, nearest_belief
 from cpcbl_team.recovery import inflate_by_offset, without_senders
-from cpcbl_team.state import State, with_memory
+from cpcbl_team.state import State, with_memory, with_senders, with_teammates
 from cpcbl_team.trust import NEVER_NS, ReportedPosition, TeammateReport
 
 
@@ -103,8 +103,8 @@ class TeammateScreen:
         """The state with how far the robot's own sensors agree with the estimate."""
         memory = state.memory.teammates
         result = state.stamp_ns, accepted, rejected, self._rules.limit
-        memory = memory._replace(senders=trust.with_own_sensor_result(memory.senders, *result))
-        return with_memory(state, state.memory._replace(teammates=memory))
+        senders = trust.with_own_sensor_result(memory.senders, *result)
+        return with_teammates(state, with_senders(memory, senders))
 
     def _assess(
         self, state: State, sender: str, report: TeammateReport, source: str
@@ -119,10 +119,12 @@ class TeammateScreen:
             memory = memory.counted(decision.event)._replace(recovery=recovery)
         if not decision.trusted:
             memory = memory.counted("distrusted")
+        state = with_memory(state, memory)
         if decision.estimate_error_m:
             estimate = inflate_by_offset(estimate, decision.estimate_error_m, self._localizer_rules)
-        memory = memory._replace(teammates=memory.teammates._replace(senders=decision.senders))
-        return state._replace(estimate=estimate, memory=memory), decision.trusted
+            state = state._replace(estimate=estimate)
+        teammates = with_senders(memory.teammates, decision.senders)
+        return with_teammates(state, teammates), decision.trusted
 
 
 def _without(objects: list[GatedObject], distrusted: set[str]) -> list[GatedObject]:
