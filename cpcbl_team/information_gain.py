@@ -126,9 +126,9 @@ def _determinant(
 ) -> float:
     """|A| |B| / |A + B|, as of (A^-1 + B^-1)^-1; A = prior / w, B = fresh + dependent / (1 - w)."""
     k, m = 1.0 / weight, 1.0 / (1.0 - weight)
-    axx, axy, ayy = k * prior.xx, k * prior.xy, k * prior.yy
-    bxx, bxy = fresh.xx + m * dependent.xx, fresh.xy + m * dependent.xy
-    byy = fresh.yy + m * dependent.yy
+    (pxx, pxy, pyy), (fxx, fxy, fyy), (dxx, dxy, dyy) = prior, fresh, dependent
+    axx, axy, ayy = k * pxx, k * pxy, k * pyy
+    bxx, bxy, byy = fxx + m * dxx, fxy + m * dxy, fyy + m * dyy
     both = (axx + bxx) * (ayy + byy) - (axy + bxy) ** 2
     return (axx * ayy - axy * axy) * (bxx * byy - bxy * bxy) / both
 

@@ -308,15 +308,14 @@ def refusal(message: Message, now_ns: int) -> Refusal | None:
     The filter checks the numbers of sightings one by one. Numbers of fixes and beliefs are always
     finite, and their covariances are valid, whatever the bytes were.
     """
-    leaves = [] if isinstance(message, Sightings) else _leaves(message)
-    numbers = [n for _, n in leaves if isinstance(n, float)]
-    if not all(abs(n) <= LARGEST_NUMBER for n in numbers):
+    numbers = [] if isinstance(message, Sightings) else _numbers(message)
+    if not all(-LARGEST_NUMBER <= n <= LARGEST_NUMBER for n in numbers):
         finite = all(map(math.isfinite, numbers))
         return Refusal.IMPLAUSIBLE if finite else Refusal.NOT_FINITE
     if abs(message.stamp_ns) >= LAST_NS:
         return Refusal.IMPLAUSIBLE
     if isinstance(message, Telemetry):
-        for name, n in leaves:
+        for name, n in _leaves(message):
             is_stamp = name.endswith("_ns")
             if isinstance(n, int) and abs(n) > (LAST_NS - 1 if is_stamp else LARGEST_COUNT):
                 return Refusal.IMPLAUSIBLE
@@ -332,6 +331,22 @@ def refusal(message: Message, now_ns: int) -> Refusal | None:
         if not (xx > 0.0 and yy > 0.0 and xy * xy <= xx * yy * (1.0 + 1e-6) + 1e-12):
             return Refusal.NOT_A_COVARIANCE
     return None
+
+
+def _numbers(message: msgspec.Struct) -> list[float]:
+    """All numbers in a message that are no integers, however deep."""
+    found: list[float] = []
+    parts: list[object] = [message]
+    for part in parts:  # the list grows meanwhile
+        if isinstance(part, float):
+            found.append(part)
+        elif isinstance(part, tuple):
+            parts.extend(part)
+        elif isinstance(part, msgspec.Struct):
+            parts.extend(msgspec.structs.astuple(part))
+        elif isinstance(part, dict):
+            parts.extend(part.values())
+    return found
 
 
 def _leaves(message: msgspec.Struct) -> list[tuple[str, object]]:
