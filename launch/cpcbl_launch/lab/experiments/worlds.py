@@ -11,6 +11,7 @@ the mean over runs (95 %). A consistent filter has a NEES of 2 and 98.9 % inside
 
 import math
 from collections.abc import Iterable, Mapping
+from functools import lru_cache
 from random import Random
 from typing import Any, NamedTuple
 
@@ -18,24 +19,20 @@ import numpy as np
 from msgspec.structs import replace
 from rich.console import RenderableType
 
-from cpcbl_launch.lab.experiments.runs import Experiment, Outcome, Results, new_outcome
-from cpcbl_launch.overrides import Overrides, with_overrides
-from cpcbl_launch.reporting.metrics import Floats, heading_errors, position_errors, position_nees
+from cpcbl_launch.lab.experiments.runs import (
+    Experiment,
+    Outcome,
+    Results,
+    new_outcome,
+    with_settings,
+)
+from cpcbl_launch.overrides import Overrides, with_blind_robots, with_overrides
+from cpcbl_launch.reporting.metrics import Floats, samples_with_truth, score
+from cpcbl_launch.reporting.recorder import Recorder
 from cpcbl_launch.reporting.tables import cells, table
 from cpcbl_launch.simulation.in_process import simulate
-from cpcbl_team.config import (
-    Field,
-    Landmark,
-    OdometrySettings,
-    PositionSensor,
-    RobotSettings,
-    SensorSettings,
-    SimulationEvent,
-    SimulationSettings,
-    Start,
-    Team,
-    Wall,
-)
+from cpcbl_launch.team_file import builtin_path, load_team
+from cpcbl_team.config import Field, OdometrySettings, RobotSettings, SimulationEvent, Start, Team
 from cpcbl_team.errors import InputError
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus, BusProxy, Handle, MessageCallback
@@ -44,13 +41,7 @@ DURATION_S = 40.0
 LEAST_INSIDE = 0.98  # of 3 sigma
 LEARNING_S = 60.0  # for a robot whose settings are wrong
 VARIANTS = ("joint", "oval", "circular")
-CORNERS = ((0.0, 0.0), (8.0, 6.0), (8.0, 0.0), (0.0, 6.0))
-PLACES = (*CORNERS, (4.0, 0.0), (4.0, 6.0), (0.0, 3.0), (8.0, 3.0))
-PATH = ((6.0, 1.5), (6.0, 4.5), (2.0, 4.5), (2.0, 1.5))
 ZIGZAG = ((3.0, 2.5), (3.4, 3.5), (3.8, 2.5), (4.2, 3.5), (4.6, 2.5), (4.2, 3.6))
-SENSOR = SensorSettings(
-    range_share=0.05, bearing_sigma_deg=3.0, field_of_view_deg=360.0, max_range_m=12.0, rate_hz=5.0
-)
 
 
 class World(NamedTuple):
@@ -101,36 +92,26 @@ class LossyBus(BusProxy):
 # Teams --------------------------------------------------------------------------------------------
 
 
+@lru_cache(maxsize=1)
+def all_robots() -> Team:
+    """All landmarks and walls, and every robot that is in a world (`teams/worlds.toml`)."""
+    return load_team(builtin_path("worlds"))
+
+
 def _field(places: int, gives: str = "both") -> Field:
-    marks = {f"m{i}": Landmark(x_m=x, y_m=y) for i, (x, y) in enumerate(PLACES[:places])}
-    return Field(landmarks={name: replace(m, gives=gives) for name, m in marks.items()})
-
-
-def _walls() -> Field:
-    corners = ((0.0, 0.0), (8.0, 0.0), (8.0, 6.0), (0.0, 6.0))
-    ends = zip(corners, corners[1:] + corners[:1], strict=True)
-    return Field(walls={f"w{i}": Wall(from_m=a, to_m=b) for i, (a, b) in enumerate(ends)})
-
-
-def _robot(index: int = 0, **changes: Any) -> RobotSettings:
-    """A robot that drives round the field from one of the corners of its path."""
-    x, y = PATH[index % 4 - 1]
-    start = Start(x_m=x, y_m=y, heading_deg=90.0 * (index % 4))
-    path = PATH[index % 4 :] + PATH[: index % 4]
-    return replace(RobotSettings(sensor=SENSOR, waypoints_m=path, start=start), **changes)
-
-
-def _blind(index: int, sensor: SensorSettings = SENSOR) -> RobotSettings:
-    return _robot(index, sensor=replace(sensor, sees_landmarks=False))
+    """So many of the landmarks."""
+    marks = list(all_robots().map.landmarks.items())[:places]
+    return Field(landmarks={name: replace(m, gives=gives) for name, m in marks})
 
 
 def _alone(field: Field, *events: SimulationEvent, **changes: Any) -> Team:
-    return _team({"r": _robot(**changes)}, field, *events)
+    return _team({"r": replace(all_robots().robots["a"], **changes)}, field, *events)
 
 
 def _team(robots: Mapping[str, RobotSettings], field: Field, *events: SimulationEvent) -> Team:
-    simulation = SimulationSettings(step_rate_hz=20.0, bump_radius_m=0.0, events=events)
-    return Team(name="worlds", map=field, robots=dict(robots), simulation=simulation)
+    base = all_robots()
+    simulation = replace(base.simulation, events=events)
+    return replace(base, map=field, robots=dict(robots), simulation=simulation)
 
 
 def _hidden(every_s: float, duration_s: float) -> list[SimulationEvent]:
@@ -139,34 +120,15 @@ def _hidden(every_s: float, duration_s: float) -> list[SimulationEvent]:
     return [SimulationEvent(at_s=t, hide_landmarks_s=every_s - 1.0) for t in times]
 
 
-def _helper(heading_sigma_deg: float) -> RobotSettings:
-    """It stands, knows its position by a position sensor, and hardly knows its heading."""
-    return RobotSettings(
-        sensor=replace(SENSOR, sees_landmarks=False, range_share=0.03),
-        odometry=OdometrySettings(moves=False),
-        position_sensor=PositionSensor(sigma_m=0.02),
-        start=Start(
-            x_m=4.0, y_m=3.0, heading_deg=30.0, sigma_m=0.02, heading_sigma_deg=heading_sigma_deg
-        ),
-    )
-
-
-def _standing_blind() -> RobotSettings:
-    return RobotSettings(
-        sensor=replace(SENSOR, sees_landmarks=False),
-        start=Start(x_m=7.0, y_m=4.5, heading_deg=0.0, sigma_m=0.4, heading_sigma_deg=10.0),
-    )
-
-
 def _seeing(seeing: str, *events: SimulationEvent, ahead: bool = False) -> World:
     """Robots a, b, c, d on one circuit among four landmarks, of which some see landmarks. With
     `ahead` each sees only the teammate ahead of it."""
-    sensor = replace(SENSOR, field_of_view_deg=60.0) if ahead else SENSOR
-    robots = {
-        name: _robot(i, sensor=sensor) if name in seeing else _blind(i, sensor)
-        for i, name in enumerate("abcd")
-    }
-    return World(_team(robots, _field(4), *events), tuple("abcd"))
+    robots = {name: all_robots().robots[name] for name in "abcd"}
+    if ahead:
+        for name, robot in robots.items():
+            robots[name] = replace(robot, sensor=replace(robot.sensor, field_of_view_deg=60.0))
+    blind = [name for name in robots if name not in seeing]
+    return World(with_blind_robots(_team(robots, _field(4), *events), blind), tuple(robots))
 
 
 # Worlds -------------------------------------------------------------------------------------------
@@ -182,7 +144,7 @@ def worlds() -> dict[str, World]:
     found["1 landmark, standing"] = World(_alone(_field(1), waypoints_m=()), ("r",))
     still = _alone(_field(1, "range"), waypoints_m=())
     found["1 landmark range-only, standing"] = World(still, ("r",))
-    found["walls"] = World(_alone(_walls()), ("r",))
+    found["walls"] = World(_alone(Field(walls=all_robots().map.walls)), ("r",))
     found["fast turns"] = World(_alone(_field(2), waypoints_m=ZIGZAG, speed_m_s=1.0), ("r",))
     for share in (0.05, 0.2, 0.5):
         for count in (0, 2, 4):
@@ -204,11 +166,16 @@ def worlds() -> dict[str, World]:
 def _team_worlds() -> dict[str, World]:
     """Worlds of several robots, which help each other."""
     found: dict[str, World] = {}
+    helper, blind, driver = (all_robots().robots[name] for name in ("helper", "blind", "a"))
+    driver = replace(driver, sensor=blind.sensor)
     for sigma_deg in (10.0, 20.0, 30.0, 60.0):
-        team = _team({"helper": _helper(sigma_deg), "r": _standing_blind()}, Field())
-        found[f"helper with heading σ {sigma_deg:g} deg"] = World(team, ("r",))
-        team = _team({"helper": _helper(sigma_deg), "r": _blind(0)}, Field())
-        found[f"the same, {sigma_deg:g} deg, helped robot drives"] = World(team, ("r",))
+        start = {"heading_sigma_deg": sigma_deg}
+        for name, helped in (
+            (f"helper with heading σ {sigma_deg:g} deg", blind),
+            (f"the same, {sigma_deg:g} deg, helped robot drives", driver),
+        ):
+            team = _team({"helper": helper, "r": helped}, Field())
+            found[name] = World(with_settings(team, "helper", start=start), ("r",))
     rare = _hidden(10.0, DURATION_S)
     found["chain, the first sees landmarks"] = _seeing("a", ahead=True)
     found["clique, one sees landmarks"] = _seeing("a")
@@ -220,16 +187,14 @@ def _team_worlds() -> dict[str, World]:
 
 def _miscalibrated_worlds() -> dict[str, World]:
     """Robots whose settings are wrong; they have a minute to notice it."""
-    motion = {
-        name: 3.0 * getattr(OdometrySettings(), name)
-        for name in (
-            "distance_sigma_m_per_sqrt_m",
-            "turn_sigma_rad_per_sqrt_m",
-            "turn_sigma_rad_per_sqrt_rad",
-        )
-    }
-    noisy = {"range_share": 2.0 * SENSOR.range_share, "bearing_sigma_deg": 6.0}
-    odometry, sensor = OdometrySettings(), SENSOR
+    odometry, sensor = OdometrySettings(), all_robots().robots["a"].sensor
+    sigmas = (
+        "distance_sigma_m_per_sqrt_m",
+        "turn_sigma_rad_per_sqrt_m",
+        "turn_sigma_rad_per_sqrt_rad",
+    )
+    motion = {name: 3.0 * getattr(odometry, name) for name in sigmas}
+    noisy = {"range_share": 2.0 * sensor.range_share, "bearing_sigma_deg": 6.0}
     truths = {
         "drives 1.2 × what its odometry says": replace(odometry, distance_scale=1.2),
         "turns 1.4 × what its odometry says": replace(odometry, turn_scale=1.4),
@@ -274,28 +239,18 @@ def run_world(world: World, seed: int) -> list[WorldRun]:
     truth = with_true_starts(world.truth or world.team, seed)
     _, recorder = simulate(world.team, seed, world.duration_s, truth, bus_wrappers=wrappers)
     true_paths = recorder.simulated_truth()
-    runs = []
-    for name in world.scored:
-        times_s, samples = recorder.timed_samples(name, true_paths[name])
-        lost = {t.stamp_ns * 1e-9 for t in recorder.tracks[name] if t.lost}
-        settled = times_s >= world.scored_from_s
-        counts = settled & ~np.isin(times_s, list(lost))
-        lost_share = 1.0 - float(counts.sum() / settled.sum()) if settled.any() else 1.0
-        nees, variance = position_nees(samples), samples.covariance
-        if not counts.any() or nees is None or variance is None:
-            runs.append(WorldRun(math.nan, math.nan, math.nan, math.nan, lost_share))
-            continue
-        heading = heading_errors(samples)[counts] ** 2 / np.maximum(variance[counts, 5], 1e-12)
-        runs.append(
-            WorldRun(
-                math.sqrt(float(np.mean(position_errors(samples)[counts] ** 2))),
-                float(np.mean(nees[counts])),
-                float(np.mean(heading)),
-                float(np.mean(nees[counts] <= 9.0)),
-                lost_share,
-            )
-        )
-    return runs
+    return [_figures(world, name, recorder, true_paths[name]) for name in world.scored]
+
+
+def _figures(world: World, robot: str, recorder: Recorder, truth: Floats) -> WorldRun:
+    path = recorder.trajectory(robot, world.scored_from_s)
+    lost_ns = [track.stamp_ns for track in recorder.tracks[robot] if track.lost]
+    counts = ~np.isin(path.stamps_ns, lost_ns)
+    lost_share = 1.0 - float(np.mean(counts)) if len(counts) else 1.0
+    s = score(samples_with_truth(path.part(counts), truth)[1])
+    figures = s.position_rmse_m, s.nees, s.heading_nees, s.inside_3_sigma
+    rmse_m, nees, heading_nees, inside = (math.nan if f is None else f for f in figures)
+    return WorldRun(rmse_m, nees, heading_nees, inside, lost_share)
 
 
 # The experiment -----------------------------------------------------------------------------------
