@@ -1,4 +1,4 @@
-"""How faults are made. An injector's context lasts as long as its fault."""
+"""How faults are made. An injector's context lasts as long as its fault. Remarks on faults."""
 
 import os
 import random
@@ -12,7 +12,7 @@ from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from cpcbl_launch.lab.chaos.links import LinkQuality
+from cpcbl_launch.lab.chaos.links import LinkQuality, TunLink
 from cpcbl_launch.lab.chaos.scenario import FaultRun, Injector
 from cpcbl_launch.lab.chaos.team import FIELD, TeamUnderTest
 from cpcbl_transport import topics
@@ -121,3 +121,27 @@ def echoes(bus: Bus, robot: str, latest_s: float, seed: int) -> Iterator[Counter
             handle.close()
         stop.set()
         thread.join()
+
+
+# Remarks: figures of a fault without bounds -------------------------------------------------------
+
+
+def packets(team: TeamUnderTest, run: FaultRun) -> str:
+    link = team.links[run.robot]
+    assert isinstance(link, TunLink)
+    share = link.lost / max(link.lost + link.passed, 1)
+    return f"{link.lost} packets lost of {link.passed} ({share:.0%} in all)"
+
+
+def clock_offsets(team: TeamUnderTest, run: FaultRun) -> str:
+    trust = (trust for name in run.others for trust in run.log.latest_trust(name))
+    offsets = ", ".join(f"{-t.late_s:.2f} s" for t in trust if t.peer == run.robot)
+    return f"the other robots estimate that its clock is ahead by {offsets}"
+
+
+def copies(team: TeamUnderTest, run: FaultRun) -> str:
+    return f"{run.sent} copies"
+
+
+def flood_rate(team: TeamUnderTest, run: FaultRun) -> str:
+    return f"{run.sent / (run.healed_s - run.fault_s):.0f} messages/s sent"

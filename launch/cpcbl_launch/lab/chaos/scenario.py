@@ -85,7 +85,7 @@ class TeamFault(msgspec.Struct, frozen=True):
     plan: Callable[[], RunPlan] = lambda: RunPlan(demo_team())
     settled_m: float = SETTLED_M
     baseline_s: float = 4.0  # how long the settled team runs before the fault
-    simulated_s: tuple[float, float] | None = None  # the times of a simulated fault
+    simulated_s: Sequence[float] | None = None  # the times of a simulated fault
     lasts_s: float = 0.0
     until: Callable[[FaultRun], float | None] = lambda run: None
     """Ends the fault earlier than after `lasts_s`, as soon as this figure is known."""
