@@ -17,6 +17,7 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
+from msgspec.structs import replace
 
 from cpcbl_agents.agent import Tick
 from cpcbl_agents.robot import build_robot
@@ -29,7 +30,9 @@ from cpcbl_team.estimate import ZERO3, Covariance3, Estimate
 from cpcbl_team.fusion import chi_square_bounds
 from cpcbl_team.geometry import Pose2, wrap_angle
 from cpcbl_team.inputs import Odometry, Sighting, Sightings
-from cpcbl_team.motion import bridge, inflate_by_gap, is_gap, move, part_of_piece
+from cpcbl_team.localizer import Localizer
+from cpcbl_team.object_timers import ObjectTimers
+from cpcbl_team.state import Updates
 
 SMALLEST_VARIANCE = 1e-12  # (1 um)^2: exact sensors must not make a matrix singular
 _TRIANGLE = ((0, 0, 1, 0, 1, 2), (0, 1, 1, 2, 2, 2))  # xx, xy, yy, xh, yh, hh
@@ -100,49 +103,24 @@ def expected_sighting(pose: Floats, place: Floats) -> tuple[Floats, Floats]:
 
 
 class OdometryTrack:
-    """One robot's odometry, read once from the start to the end."""
+    """One robot's odometry, read once from the start to the end.
+
+    The team's localizer moves along it: gaps are bridged as the team does it.
+    """
 
     def __init__(self, inputs: BaselineInputs) -> None:
-        self._settings = inputs.settings.odometry
-        self.now_ns = self._covered_ns = inputs.start_ns
+        rules = replace(inputs.settings.localizer, variant="joint", self_calibration=False)
+        self._localizer = Localizer(replace(inputs.settings, localizer=rules), Field())
+        self._state = self._localizer.start(inputs.start_ns)
         self._pieces = deque(sorted(inputs.odometry, key=lambda piece: piece.from_ns))
-        self._last: Odometry | None = None
 
     def until(self, until_ns: int) -> Estimate:
-        """The motion since the last call: the new pose in the frame of the old one (m, rad).
-
-        A gap in the odometry is bridged as the team does it.
-        """
-        motion, s = Estimate(Pose2(0.0, 0.0, 0.0), ZERO3), self._settings
-        if until_ns <= self.now_ns:
-            return motion
+        """The motion since the last call: the new pose in the frame of the old one (m, rad)."""
+        state = self._state._replace(estimate=Estimate(Pose2(0.0, 0.0, 0.0), ZERO3))
         while self._pieces and self._pieces[0].from_ns < until_ns:
-            piece = self._pieces[0]
-            motion = self._across_gap(motion, piece.from_ns, piece)
-            distance, turn, seconds = part_of_piece(piece, self.now_ns, until_ns)
-            slow_s = sensors.time_at_min_speed_s(distance, seconds, s)
-            motion = move(motion, distance, turn, s, slow_s)
-            self._covered_ns = max(self._covered_ns, piece.stamp_ns)
-            if piece.stamp_ns > until_ns:
-                break
-            self._last = self._pieces.popleft()
-        motion = self._across_gap(motion, until_ns, None)
-        self.now_ns = until_ns
-        return motion
-
-    def _across_gap(self, motion: Estimate, until_ns: int, after: Odometry | None) -> Estimate:
-        """The motion, with that from `now_ns` to a time in which no odometry is known."""
-        s, gap_ns, begin_ns = self._settings, until_ns - self._covered_ns, self._covered_ns
-        if gap_ns <= 0 or not s.moves:
-            return motion
-        if self._last is None or after is None or is_gap(gap_ns, self._last, after):
-            from_s = max(self.now_ns - begin_ns, 0) * 1e-9
-            distance, turn, extra = bridge(self._last, after, from_s, gap_ns * 1e-9, s)
-            motion = move(motion, distance, turn, s, 0.0, extra)
-        silent_ns = until_ns - max(self.now_ns, begin_ns + int(s.timeout_s * 1e9))
-        if silent_ns > 0:
-            motion = inflate_by_gap(motion, silent_ns, self._last, s.gap_speed_m_s)
-        return motion
+            state = self._localizer.add_odometry(state, self._pieces.popleft())
+        self._state = self._localizer.predict(state, until_ns)
+        return self._state.estimate
 
 
 def compose(pose: Floats, motion: Estimate) -> tuple[Floats, Floats, Floats]:
@@ -209,7 +187,9 @@ class _RobotBlock:
         self.block = slice(first, first + 3)
         self.settings = inputs.settings
         self.odometry = OdometryTrack(inputs)
+        self.timers = ObjectTimers(inputs.settings)
         self.used_ns: dict[str, int] = {}
+        self.uses = Updates(objects_ns=self.used_ns)
         self.bounds = chi_square_bounds(inputs.settings.localizer.gate_probability)
         window = inputs.settings.localizer.lost_window
         self.innovations = {kind: deque[bool](maxlen=window) for kind in ("landmark", "robot")}
@@ -250,10 +230,8 @@ class Ekf:
     # Motion -----------------------------------------------------------------------------------
 
     def predict(self, name: str, until_ns: int) -> None:
-        """Predicts a robot's pose by its odometry; does nothing if the pose is that new already."""
+        """Predicts a robot's pose by its odometry."""
         robot, p = self._robots[name], self.covariance
-        if until_ns <= robot.odometry.now_ns:
-            return
         block, motion = robot.block, robot.odometry.until(until_ns)
         pose, jacobian, noise = compose(self.mean[block], motion)
         self.mean[block] = pose[0], pose[1], wrap_angle(pose[2])
@@ -266,12 +244,9 @@ class Ekf:
     def correct(self, name: str, frame: Sightings) -> None:
         """Corrects by the sightings of one frame, one after the other."""
         robot = self._robots[name]
-        least_ns = robot.settings.localizer.object_interval_s * 1e9
         for sighting in frame.sightings:
-            last_ns = robot.used_ns.get(sighting.id)
-            since_ns = None if last_ns is None else frame.stamp_ns - last_ns
-            repeated = since_ns is not None and since_ns < least_ns
-            if repeated or sensors.sighting_fault(sighting):
+            use = sighting.id, frame.stamp_ns
+            if robot.timers.is_cooling_down(robot.uses, *use) or sensors.sighting_fault(sighting):
                 continue
             mate = self._robots.get(sighting.id)
             if mate is not None:
@@ -282,9 +257,7 @@ class Ekf:
             if measurement is None:
                 continue
             columns = robot.columns + (mate.columns[:2] if mate is not None else [])
-            seconds = None if since_ns is None else since_ns * 1e-9
-            correlation_s = robot.settings.sensor.correlation_s
-            inflation = sensors.repetition_variance_factor(seconds, correlation_s)
+            inflation = robot.timers.inflation(robot.uses, *use)
             accepted = self._update(measurement, columns, inflation, robot.bounds)
             if accepted:
                 robot.used_ns[sighting.id] = frame.stamp_ns

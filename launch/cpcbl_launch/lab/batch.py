@@ -25,11 +25,13 @@ from cpcbl_launch.lab.baselines import (
 )
 from cpcbl_launch.reporting.metrics import Floats, Trajectory
 from cpcbl_launch.simulation.in_process import Progress
-from cpcbl_team import sensors
 from cpcbl_team.config import Field
 from cpcbl_team.estimate import Estimate
 from cpcbl_team.fusion import chi_square_bounds
 from cpcbl_team.inputs import Sighting
+from cpcbl_team.object_timers import ObjectTimers
+from cpcbl_team.sensors import sighting_fault
+from cpcbl_team.state import Updates
 
 LONGEST_STEP_NS = 500_000_000  # between two times whose poses are estimated
 PASSES = 10
@@ -96,21 +98,15 @@ def _used_sightings(inputs: Mapping[str, BaselineInputs]) -> dict[int, list[_Use
     """The sightings of all robots by stamp; one object at most every `object_interval_s`."""
     used: dict[int, list[_Used]] = {}
     for i, robot in enumerate(inputs.values()):
-        last_ns: dict[str, int] = {}
-        least_ns = robot.settings.localizer.object_interval_s * 1e9
+        timers, last_ns = ObjectTimers(robot.settings), dict[str, int]()
+        uses = Updates(objects_ns=last_ns)
         for frame in sorted(robot.frames, key=lambda frame: frame.stamp_ns):
             for sighting in frame.sightings:
-                then = last_ns.get(sighting.id)
-                since_ns = None if then is None else frame.stamp_ns - then
-                if since_ns is not None and since_ns < least_ns:
+                use = sighting.id, frame.stamp_ns
+                if timers.is_cooling_down(uses, *use) or sighting_fault(sighting):
                     continue
-                if sensors.sighting_fault(sighting):
-                    continue
+                inflation = timers.inflation(uses, *use)
                 last_ns[sighting.id] = frame.stamp_ns
-                inflation = sensors.repetition_variance_factor(
-                    None if since_ns is None else since_ns * 1e-9,
-                    robot.settings.sensor.correlation_s,
-                )
                 used.setdefault(frame.stamp_ns, []).append(_Used(i, sighting, inflation))
     return used
 
