@@ -4,7 +4,6 @@ The sightings come from recordings of robots with cameras, or from pictures that
 poses.
 """
 
-import csv
 import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -37,6 +36,7 @@ from cpcbl_launch.calibration.statistics import (
     robust_sigma,
     select_rows,
 )
+from cpcbl_launch.reporting.files import read_csv
 from cpcbl_launch.reporting.metrics import Floats
 from cpcbl_launch.reporting.recording import read_recording
 from cpcbl_team.config import CameraSettings, Team
@@ -47,7 +47,6 @@ BINS_M = (0.0, 2.0, 4.0, math.inf)
 MIN_IN_BIN = 10
 PICTURE_INTERVAL_S = 100.0  # pictures have no time; at this interval nothing is correlated
 STATIONARY_S = 0.1  # before and after a picture nothing moves for this time
-COLUMNS = "file,x_m,y_m,heading_deg,robot"
 
 
 class CameraObservations(NamedTuple):
@@ -179,18 +178,7 @@ def camera_observations(
 
 def read_poses(path: Path, team: Team) -> list[_PoseRow]:
     """Reads a CSV file: file, x_m, y_m, heading_deg, and robot for teammates. Raises InputError."""
-    try:
-        lines = list(csv.DictReader(path.read_text(encoding="utf-8").splitlines()))
-        given = [{k: (v or "").strip() for k, v in line.items() if k} for line in lines]
-        rows = msgspec.convert(given, list[_PoseRow], strict=False)
-    except FileNotFoundError:
-        raise InputError(f"--poses {path}: no such file") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"--poses {path}: cannot be read: {error}") from error
-    except (csv.Error, msgspec.ValidationError) as error:
-        raise InputError(f"--poses {path}: {error}; its columns are {COLUMNS}") from error
-    if not rows:
-        raise InputError(f"--poses {path}: no poses; its columns are {COLUMNS}")
+    rows = read_csv(path, _PoseRow, "--poses")
     for row in rows:
         if row.robot and row.robot not in team.robots:
             known = ", ".join(team.robots)

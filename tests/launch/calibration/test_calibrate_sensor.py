@@ -340,7 +340,7 @@ def test_pictures_that_cannot_be_used_are_said(honest: Path, tmp_path: Path) -> 
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("", "no poses"),
+        ("", "no lines; its columns are file,x_m"),
         ("file,x_m\na.png,1\n", "its columns are file,x_m,y_m,heading_deg,robot"),
         ("file,x_m,y_m,heading_deg\na.png,1,one,2\n", "its columns are"),
         ("file,x_m,y_m,heading_deg,robot\na.png,1,1,2,nobody\n", "no robot 'nobody'.*eye, mate"),

@@ -13,7 +13,8 @@ from support.processes import command_line, cpcbl_team
 from cpcbl_agents.vision.camera import Camera, Pixels
 from cpcbl_agents.vision.markers import MarkerDetector
 from cpcbl_launch.lab.experiments import real_pictures
-from cpcbl_launch.lab.experiments.real_pictures import measure, picture_set, read_truth_table
+from cpcbl_launch.lab.experiments.real_pictures import TruthLine, measure, picture_set
+from cpcbl_launch.reporting.files import read_csv
 from cpcbl_launch.simulation.camera.render import Light, Scene, SceneRobot, render
 from cpcbl_launch.team_file import load_team, parse_team
 from cpcbl_team.config import MarkerFamily
@@ -30,7 +31,7 @@ sensing = "camera"
 source = "external"
 markers = { front = 1, left = 2, back = 3, right = 4 }
 """
-COLUMNS = real_pictures.TruthLine._fields
+COLUMNS = real_pictures.TruthLine.__struct_fields__
 SETS = ("duckiebot", "frc-speaker", "frc-amp", "nao")
 
 
@@ -91,7 +92,7 @@ def test_the_command_shows_and_writes(own_set: Path, tmp_path: Path) -> None:
     ("name", "text", "said"),
     [
         ("nobody", "", "duckiebot"),
-        ("x.csv", "a,b\n", "line 1"),
+        ("x.csv", "a,b\n", "its columns are picture,viewer,id"),
         ("x.csv", ",".join(COLUMNS) + "\np,eye,mate,far,,\n", "line 2"),
         ("x.csv", ",".join(COLUMNS) + "\np,ear,mate,,,\n", "no robot ear"),
         ("x.csv", ",".join(COLUMNS) + "\np.png,eye,mate,,,\n", "p.png"),
@@ -111,7 +112,7 @@ def test_an_unreadable_set_is_one_line(tmp_path: Path, name: str, text: str, sai
 @pytest.mark.parametrize("name", SETS)
 def test_built_in_sets_are_complete(name: str) -> None:
     path = picture_set(name)
-    team, lines = load_team(path.with_suffix(".toml")), read_truth_table(path)
+    team, lines = load_team(path.with_suffix(".toml")), read_csv(path, TruthLine)
     assert lines
     assert {line.viewer for line in lines} <= team.robots.keys()
     named = team.robots.keys() | team.map.landmarks.keys()

@@ -6,12 +6,10 @@ without an id states that nothing of the team is in it. The pictures belong to o
 downloads them, and they are not copied.
 """
 
-import csv
 import math
 from collections.abc import Iterable, Sequence
 from importlib.resources import files
 from pathlib import Path
-from typing import NamedTuple
 
 from msgspec import Struct
 from rich.console import RenderableType
@@ -21,6 +19,7 @@ from cpcbl_agents.vision.detector import CameraDetector
 from cpcbl_agents.vision.pictures import decode_image
 from cpcbl_launch.lab.experiments.detection_figures import degrees, within_3_sigma
 from cpcbl_launch.lab.experiments.runs import ExperimentResult
+from cpcbl_launch.reporting.files import read_csv
 from cpcbl_launch.reporting.tables import number, table
 from cpcbl_launch.team_file import load_team
 from cpcbl_team.config import Team
@@ -31,15 +30,15 @@ from cpcbl_team.inputs import Sighting
 UNITS = {"range": "m", "bearing": "deg", "heading": "deg"}
 
 
-class TruthLine(NamedTuple):
+class TruthLine(Struct, frozen=True, forbid_unknown_fields=True):
     """One line of the table, by its columns."""
 
     picture: str
     viewer: str
-    id: str
-    range_m: float | None
-    bearing_deg: float | None
-    heading_deg: float | None
+    id: str = ""
+    range_m: float | None = None
+    bearing_deg: float | None = None
+    heading_deg: float | None = None
 
 
 class LineResult(Struct, frozen=True, kw_only=True):
@@ -83,30 +82,10 @@ def _folder() -> Path:
     return Path(str(files("cpcbl_launch") / "picture_sets"))
 
 
-def read_truth_table(path: Path) -> list[TruthLine]:
-    """The lines of a table. Raises InputError, naming file and line."""
-    lines = []
-    try:
-        with path.open(newline="", encoding="utf-8") as file:
-            reader = csv.DictReader(file)
-            if tuple(reader.fieldnames or ()) != TruthLine._fields:
-                columns = ",".join(TruthLine._fields)
-                raise InputError(f"{path}: line 1: the columns are {columns}")
-            for row in reader:
-                try:
-                    numbers = [float(row[c]) if row[c] else None for c in TruthLine._fields[3:]]
-                except (TypeError, ValueError) as error:
-                    raise InputError(f"{path}: line {reader.line_num}: {error}") from error
-                lines.append(TruthLine(row["picture"], row["viewer"], row["id"], *numbers))
-    except (csv.Error, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: cannot be read: {error}") from error
-    return lines
-
-
 def measure(name: str, folder: Path) -> RealPictures:
     """Compares the detections in the set's pictures with its table. Raises InputError."""
     path = picture_set(name)
-    team, lines = load_team(path.with_suffix(".toml")), read_truth_table(path)
+    team, lines = load_team(path.with_suffix(".toml")), read_csv(path, TruthLine)
     viewers = {line.viewer for line in lines}
     for viewer in sorted(viewers - team.robots.keys()):
         raise InputError(f"{path}: no robot {viewer} in {path.with_suffix('.toml')}")
