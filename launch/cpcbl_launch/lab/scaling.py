@@ -29,9 +29,8 @@ from cpcbl_team import config
 from cpcbl_team.config import RobotSettings, SensorSettings, Team
 from cpcbl_team.errors import InputError
 from cpcbl_team.inputs import Sightings
-from cpcbl_transport import topics
+from cpcbl_transport.decoding import Received, Subscriber
 from cpcbl_transport.memory_bus import MemoryHub
-from cpcbl_transport.messages import decode_tagged
 
 DURATION_S = 5.0
 LEAST_S = 2.0  # a robot tells once a second what it has sent
@@ -148,12 +147,10 @@ def measure_team(
     recorder = Recorder(hub.session())
     in_sight: list[int] = []  # teammates, of each frame
 
-    def count_teammates(key: str, payload: bytes) -> None:
-        frame = decode_tagged(payload)
-        if isinstance(frame, Sightings):
-            in_sight.append(sum(seen.id in team.robots for seen in frame.sightings))
+    def count_teammates(frame: Received[Sightings]) -> None:
+        in_sight.append(sum(seen.id in team.robots for seen in frame.message.sightings))
 
-    hub.session().subscribe(topics.IN_SIGHTINGS.at(), count_teammates)
+    Subscriber(hub.session(), Sightings, count_teammates)
     field = TimedNode(FieldNode(SimulatedField(team, seed, 0), hub.session()))
     robots = [TimedNode(node) for node in robot_nodes(team, hub, 0)]
     began_s = time.monotonic()

@@ -17,10 +17,9 @@ Stamps = NDArray[np.int64]
 NEAR_S = 0.15  # truth counts so near one of its rows
 
 
-class Score(msgspec.Struct, frozen=True, kw_only=True):
-    """One robot's figures over the samples that could be compared with truth."""
+class ErrorFigures(msgspec.Struct, frozen=True, kw_only=True):
+    """Figures of estimates beside the truth; None where there is nothing to compare."""
 
-    samples: int
     position_rmse_m: float | None = None
     position_mean_m: float | None = None
     position_max_m: float | None = None
@@ -33,6 +32,12 @@ class Score(msgspec.Struct, frozen=True, kw_only=True):
     """The same of the heading (1 is consistent)."""
     scored_share: float | None = None
     """Of the estimates, those with truth near enough in time."""
+
+
+class Score(ErrorFigures, frozen=True, kw_only=True):
+    """One robot's figures over the samples that could be compared with truth."""
+
+    samples: int
 
 
 class Trajectory(NamedTuple):

@@ -10,6 +10,7 @@ import msgspec
 import numpy as np
 
 from cpcbl_launch.reporting.metrics import (
+    ErrorFigures,
     Floats,
     Samples,
     Score,
@@ -88,19 +89,10 @@ class GuestReport(RobotReport, frozen=True, kw_only=True):
     robots: dict[str, Effect]
 
 
-class MeanScore(msgspec.Struct, frozen=True, kw_only=True):
-    """Means over the robots that could be scored, but for what says otherwise."""
+class MeanScore(ErrorFigures, frozen=True, kw_only=True):
+    """Means over the robots that could be scored; of the largest errors the largest."""
 
-    position_rmse_m: float | None
-    position_mean_m: float | None
-    position_max_m: float | None
-    """The largest of all."""
-    heading_rmse_deg: float | None
-    inside_3_sigma: float | None
-    nees: float | None
-    heading_nees: float | None
-    scored_share: float | None
-    pooled_rmse_m: float | None
+    pooled_rmse_m: float | None = None
     """Of the positions of all robots together: a robot with more samples counts for more."""
 
 
@@ -322,10 +314,10 @@ def mean_score(scores: Iterable[Score]) -> MeanScore:
         values = [value for s in known if (value := getattr(s, name)) is not None]
         return float(np.mean(values)) if values else None
 
-    means = {n: mean(n) for n in MeanScore.__struct_fields__ if n != "pooled_rmse_m"}
-    if known:
-        squares = [(s.position_rmse_m or 0.0) ** 2 for s in known]
-        pooled = float(np.average(squares, weights=[s.samples for s in known]))
-        means["position_max_m"] = max(s.position_max_m or 0.0 for s in known)
-        return MeanScore(**means, pooled_rmse_m=math.sqrt(pooled))
-    return MeanScore(**means, pooled_rmse_m=None)
+    if not known:
+        return MeanScore()
+    means = {name: mean(name) for name in ErrorFigures.__struct_fields__}
+    means["position_max_m"] = max(s.position_max_m or 0.0 for s in known)
+    squares = [(s.position_rmse_m or 0.0) ** 2 for s in known]
+    pooled = float(np.average(squares, weights=[s.samples for s in known]))
+    return MeanScore(**means, pooled_rmse_m=math.sqrt(pooled))

@@ -10,16 +10,9 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 from rich.text import Text
 
-from cpcbl_launch.reporting.metrics import Score
+from cpcbl_launch.reporting.metrics import ErrorFigures
 from cpcbl_launch.reporting.phases import AWAY_S
-from cpcbl_launch.reporting.recorder import (
-    Effect,
-    GuestReport,
-    MeanScore,
-    Recorder,
-    Report,
-    RobotReport,
-)
+from cpcbl_launch.reporting.recorder import Effect, GuestReport, Recorder, Report, RobotReport
 from cpcbl_launch.reporting.statuses import distrust_text, miscalibration_text, trust_remarks
 from cpcbl_launch.reporting.tables import number, percent, short, table
 from cpcbl_launch.run.observer import ObserverReport
@@ -195,7 +188,7 @@ def _baseline_table(report: Report) -> Table:
     return shown
 
 
-def _figures(s: Score | MeanScore) -> list[str]:
+def _figures(s: ErrorFigures) -> list[str]:
     """The cells below FIGURES."""
     errors_m = s.position_rmse_m, s.position_mean_m, s.position_max_m
     heading, inside = number(s.heading_rmse_deg, 1), percent(s.inside_3_sigma)

@@ -10,11 +10,10 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import NamedTuple
 
-from msgspec.structs import replace
-
 from cpcbl_agents.clock import Clock
 from cpcbl_launch.lab.chaos.links import Relay, TunLink
 from cpcbl_launch.lab.chaos.run_log import RunLog, RunRecorder
+from cpcbl_launch.lab.experiments.runs import with_settings
 from cpcbl_launch.lab.faulty_robot import faulty_command
 from cpcbl_launch.run.processes import PROGRAM, ProcessSpec, Supervisor, process_table
 from cpcbl_launch.run.up import free_endpoint
@@ -46,12 +45,7 @@ class RunPlan(NamedTuple):
 
 def demo_team() -> Team:
     """The demonstration, with help from the start: navigator, observer, scout (blind), patrol."""
-    team = load_team(builtin_path("demo"))
-    robots = {
-        name: replace(robot, collaboration=replace(robot.collaboration, after_s=0.0))
-        for name, robot in team.robots.items()
-    }
-    return replace(team, robots=robots)
+    return with_settings(load_team(builtin_path("demo")), None, collaboration={"after_s": 0.0})
 
 
 class TeamUnderTest:

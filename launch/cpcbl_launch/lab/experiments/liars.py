@@ -14,21 +14,27 @@ from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
 from typing import NamedTuple
 
-import numpy as np
 from msgspec import Struct
 from msgspec.structs import replace
 from rich.console import RenderableType
 
-from cpcbl_launch.lab.experiments.runs import Experiment, ExperimentResult, Results, Spread, spread
+from cpcbl_launch.lab.experiments.runs import (
+    Experiment,
+    ExperimentResult,
+    Results,
+    Spread,
+    spread,
+    with_settings,
+)
 from cpcbl_launch.lab.faulty_robot import Fault, FaultyBus
-from cpcbl_launch.reporting.metrics import position_errors
+from cpcbl_launch.reporting.metrics import score
 from cpcbl_launch.reporting.tables import number, table
 from cpcbl_launch.simulation.in_process import simulate
 from cpcbl_launch.team_file import builtin_path, load_team
 from cpcbl_team.config import Team, TrustSettings
-from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus
-from cpcbl_transport.messages import Status, decode_tagged
+from cpcbl_transport.decoding import Received, Subscriber
+from cpcbl_transport.messages import Status
 
 FROM_S, UNTIL_S, END_S = 10.0, 25.0, 45.0
 MOST_RATIO = 1.3
@@ -91,13 +97,9 @@ def liars_team(case: Case) -> Team:
     """The observers at their posts and the robots that drive (`teams/liars.toml`)."""
     team = load_team(builtin_path("liars"))
     absent = {*HONEST[case.honest :], *(() if case.liar else (LIAR,))}
+    robots = {name: robot for name, robot in team.robots.items() if name not in absent}
     trust = TrustSettings(enabled=case.trust)
-    robots = {
-        name: replace(robot, collaboration=replace(robot.collaboration, trust=trust))
-        for name, robot in team.robots.items()
-        if name not in absent
-    }
-    return replace(team, robots=robots)
+    return with_settings(replace(team, robots=robots), None, collaboration={"trust": trust})
 
 
 def cases() -> Mapping[Case, Case]:
@@ -120,11 +122,10 @@ class _Statuses:
         self.found: dict[tuple[str, str, int], Quarantine] = {}
 
     def attach(self, bus: Bus) -> None:
-        bus.subscribe(topics.STATUS.at(), self._arrived)
+        self._subscriber = Subscriber(bus, Status, self._arrived)
 
-    def _arrived(self, key: str, payload: bytes) -> None:
-        status = decode_tagged(payload)
-        assert isinstance(status, Status)
+    def _arrived(self, received: Received[Status]) -> None:
+        status = received.message
         for trust in status.trust:
             key_ = status.robot, trust.peer, trust.quarantines
             since_ns = trust.since_ns or status.stamp_ns  # the status has no time for a wrong clock
@@ -144,10 +145,8 @@ def run_case(case: Case, seed: int) -> Run:
         through = {LIAR: partial(FaultyBus, fault=fault, name=LIAR, start_ns=0)}
     _, recorder = simulate(liars_team(case), seed, END_S, referee=statuses, bus_wrappers=through)
     truth = recorder.simulated_truth()
-    rmse_m = {}
-    for name in DRIVERS:
-        errors = position_errors(recorder.samples(name, truth[name], from_s=FROM_S))
-        rmse_m[name] = float(np.sqrt(np.mean(errors * errors)))
+    scores = {name: score(recorder.samples(name, truth[name], FROM_S)) for name in DRIVERS}
+    rmse_m = {name: s.position_rmse_m or 0.0 for name, s in scores.items()}
     return Run(rmse_m, tuple(statuses.found.values()))
 
 

@@ -10,8 +10,9 @@ restarts, failed: it is counted as such, and has no part in the other figures.
 import math
 import os
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import ProcessPoolExecutor
 from importlib.metadata import version
+from itertools import starmap
 from multiprocessing import get_context
 from typing import Any, NamedTuple, TypeVar
 
@@ -150,23 +151,14 @@ def map_in_processes(
 
     `jobs` processes work at a time (None: one a core); `done` is called after each task.
     """
-    jobs = jobs or os.cpu_count() or 1
-    if jobs == 1:
-        results = []
-        for task in tasks:
-            results.append(function(*task))
-            done()
-        return results
+    results = []
     with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
-        futures = [pool.submit(function, *task) for task in tasks]
-        try:
-            for future in as_completed(futures):
-                future.result()
-                done()
-        except BaseException:
-            pool.shutdown(cancel_futures=True)
-            raise
-        return [future.result() for future in futures]
+        alone = jobs == 1 or os.cpu_count() == 1  # then in this process
+        each = starmap(function, tasks) if alone else pool.map(function, *zip(*tasks, strict=True))
+        for result in each:
+            results.append(result)
+            done()
+    return results
 
 
 # Teams on the circuit (`teams/circuit.toml`) ------------------------------------------------------
@@ -180,11 +172,14 @@ def circuit_team(robots: Collection[str], beacons: bool = False, field: str = "c
     return replace(team, robots=chosen, map=replace(team.map, landmarks=marks))
 
 
-def with_settings(team: Team, robot: str, **tables: Mapping[str, object]) -> Team:
-    """The team with keys of some tables of one robot set: `sensor={"rate_hz": 5.0}`."""
-    old = team.robots[robot]
-    new = {name: replace(getattr(old, name), **keys) for name, keys in tables.items()}
-    return replace(team, robots={**team.robots, robot: replace(old, **new)})
+def with_settings(team: Team, robot: str | None, **tables: Mapping[str, object]) -> Team:
+    """The team with keys of some tables of a robot (None: of all) set: `sensor={"rate_hz": 5}`."""
+    robots = dict(team.robots)
+    for name in robots if robot is None else [robot]:
+        old = robots[name]
+        new = {table: replace(getattr(old, table), **keys) for table, keys in tables.items()}
+        robots[name] = replace(old, **new)
+    return replace(team, robots=robots)
 
 
 # Experiments and their figures --------------------------------------------------------------------

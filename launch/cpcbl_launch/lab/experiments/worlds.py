@@ -124,11 +124,11 @@ def _seeing(seeing: str, *events: SimulationEvent, ahead: bool = False) -> World
     """Robots a, b, c, d on one circuit among four landmarks, of which some see landmarks. With
     `ahead` each sees only the teammate ahead of it."""
     robots = {name: all_robots().robots[name] for name in "abcd"}
+    team = _team(robots, _field(4), *events)
     if ahead:
-        for name, robot in robots.items():
-            robots[name] = replace(robot, sensor=replace(robot.sensor, field_of_view_deg=60.0))
+        team = with_settings(team, None, sensor={"field_of_view_deg": 60.0})
     blind = [name for name in robots if name not in seeing]
-    return World(with_blind_robots(_team(robots, _field(4), *events), blind), tuple(robots))
+    return World(with_blind_robots(team, blind), tuple(robots))
 
 
 # Worlds -------------------------------------------------------------------------------------------
