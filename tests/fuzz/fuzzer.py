@@ -30,7 +30,6 @@ from cpcbl_launch.lab.chaos.team import (
 )
 from cpcbl_launch.reporting.recorder import Recorder
 from cpcbl_launch.run.processes import PROGRAM
-from cpcbl_launch.views.frames import FrameSubscriber
 from cpcbl_launch.views.traffic import StatusCollector
 from cpcbl_team.config import (
     CollaborationSettings,
@@ -43,8 +42,8 @@ from cpcbl_team.config import (
 from cpcbl_team.inputs import Sighting, Sightings
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus
-from cpcbl_transport.decoding import decode
-from cpcbl_transport.messages import Refusal, encode
+from cpcbl_transport.decoding import Subscriber, decode
+from cpcbl_transport.messages import AnnotatedFrame, Refusal, encode
 from cpcbl_transport.topics import Topic
 from cpcbl_transport.zenoh_bus import open_bus
 
@@ -123,7 +122,8 @@ def fuzz(options: ScenarioOptions, per_key: int = PER_KEY) -> ScenarioResult:
         team = stack.enter_context(run_team(plan))
         bus = stack.enter_context(open_bus(plan.team.name, [team.endpoint]))
         ears = stack.enter_context(open_bus(plan.team.name, [team.endpoint]))
-        recorder, watcher, looks = Recorder(ears), StatusCollector(ears), FrameSubscriber(ears)
+        recorder, watcher = Recorder(ears), StatusCollector(ears)
+        looks = Subscriber(ears, AnnotatedFrame, lambda frame: None)
         options.report_progress("starting a team")
         team.settle()
         from_s = team.now_s

@@ -3,15 +3,15 @@
 Messages are JSON arrays, as on the wire but readable; the team is the attachment `team.json`. The
 inputs of a robot that replays a log are not on the bus, so not in the file either. Of cameras there
 is what robots show while somebody looks, twice a second: what was found under `look/<robot>`, the
-annotated frame under `picture/<robot>`, as Foxglove shows pictures (in JSON:
+annotated frame under `picture/<robot>`, as Foxglove shows pictures (`compressed_image.json`, of
 docs.foxglove.dev/docs/visualization/message-schemas/compressed-image).
 """
 
-import base64
 import logging
 import struct
 import threading
 from contextlib import AbstractContextManager, suppress
+from importlib.resources import files
 from pathlib import Path
 from typing import NamedTuple
 
@@ -38,17 +38,6 @@ RECORDED = (
 )
 TEAM = "team.json"
 PICTURE = "foxglove.CompressedImage"
-_TIME = {"sec": {"type": "integer"}, "nsec": {"type": "integer"}}
-_PICTURE_SCHEMA = {
-    "title": PICTURE,
-    "type": "object",
-    "properties": {
-        "timestamp": {"type": "object", "title": "time", "properties": _TIME},
-        "frame_id": {"type": "string"},
-        "data": {"type": "string", "contentEncoding": "base64"},
-        "format": {"type": "string"},
-    },
-}
 _decoder: msgspec.json.Decoder[Message] = msgspec.json.Decoder(Message)
 
 
@@ -83,13 +72,13 @@ class Recording(AbstractContextManager["Recording"]):
         if isinstance(message, AnnotatedFrame):
             if message.image:
                 if not self._schema:
-                    schema = msgspec.json.encode(_PICTURE_SCHEMA)
+                    schema = (files(__package__) / "compressed_image.json").read_bytes()
                     self._schema = writer.register_schema(PICTURE, "jsonschema", schema)
                 sec, nsec = divmod(message.stamp_ns, 10**9)
                 picture = {
                     "timestamp": {"sec": sec, "nsec": nsec},
                     "frame_id": message.robot,
-                    "data": base64.b64encode(message.image).decode(),
+                    "data": message.image,
                     "format": "jpeg",
                 }
                 self._add(writer, f"picture/{message.robot}", message.stamp_ns, picture)

@@ -111,11 +111,8 @@ def miscalibration_text(counts: Mapping[str, int]) -> str:
         return ""
     texts = [
         f"σ of its {what} × {counts[name] / 100.0:.1f}"
-        for what, name in (
-            ("odometry", "odometry_sigma_percent"),
-            ("sensor", "sensor_sigma_percent"),
-        )
-        if name in counts
+        for what in ("odometry", "sensor")
+        if (name := f"{what}_sigma_percent") in counts
     ]
     used, rejected = counts.get("accepted", 0), counts.get("gated", 0)
     texts.append(f"{rejected / max(used + rejected, 1):.1%} of observations rejected")

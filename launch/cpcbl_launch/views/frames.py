@@ -2,7 +2,7 @@
 
 import math
 import time
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -12,35 +12,12 @@ from rich.console import Console
 from cpcbl_launch.reporting.tables import table
 from cpcbl_launch.views.live import open_bus_within
 from cpcbl_team.errors import InputError
-from cpcbl_transport.bus import Bus
 from cpcbl_transport.decoding import Subscriber
 from cpcbl_transport.messages import AnnotatedFrame, UnclearObject
 from cpcbl_transport.security import Link
 
-MOST = 50  # some 100 kB each
+MOST = 50  # frames that wait, some 100 kB each; the latest
 REFRESH_S = 0.02
-
-
-class FrameSubscriber:
-    """Keeps the annotated frames of one robot, or of all, until they are taken; the latest 50.
-
-    A robot annotates frames only for subscribers.
-    """
-
-    def __init__(self, bus: Bus, robot: str = "*") -> None:
-        self._frames: deque[AnnotatedFrame] = deque(maxlen=MOST)
-        self._subscriber = Subscriber(
-            bus, AnnotatedFrame, lambda received: self._frames.append(received.message), robot=robot
-        )
-
-    @property
-    def refused(self) -> Counter[str]:
-        """How many messages could not be used, by reason."""
-        return self._subscriber.refused
-
-    def take(self) -> list[AnnotatedFrame]:
-        """What has come since the last call, in order."""
-        return [self._frames.popleft() for _ in range(len(self._frames))]
 
 
 def live_frames(
@@ -54,14 +31,15 @@ def live_frames(
     if bus is None:
         return
     with bus:
-        subscriber = FrameSubscriber(bus, robot)
+        arrived: deque[AnnotatedFrame] = deque(maxlen=MOST)
+        Subscriber(bus, AnnotatedFrame, lambda frame: arrived.append(frame.message), robot=robot)
         until_s = time.monotonic() + wait_s
         while not stop():
-            frames = subscriber.take()
-            yield from frames
-            now_s = time.monotonic()
-            until_s = now_s + wait_s if frames else until_s
-            if now_s > until_s:
+            if arrived:
+                yield arrived.popleft()
+                until_s = time.monotonic() + wait_s
+                continue
+            if time.monotonic() > until_s:
                 raise InputError(
                     f"look {robot}: no frame of {robot} in team {team} at"
                     f" {', '.join(link.endpoints)} for {wait_s:g} s: does it run, and does its"

@@ -11,6 +11,7 @@ from importlib.metadata import version
 
 from msgspec.structs import replace
 from rich.console import Console
+from rich.status import Status
 from rich.table import Table
 from rich.text import Text
 
@@ -125,21 +126,13 @@ def markdown(faults: ChaosReport) -> Iterator[str]:
         yield f"| `{o.scenario}` | {o.done} | {o.expectation} | {seen} | {verdict(o).plain} |"
 
 
-class Progress:
+class Progress(Status):
     """Shows the progress: a line for the current step on a terminal, and a line for each scenario
     that is done. A context manager."""
 
     def __init__(self, console: Console, total: int) -> None:
-        self._console, self._total, self._count = console, total, 0
-        self._step, self._status = "", console.status("")
-
-    def __enter__(self) -> "Progress":
-        if self._console.is_terminal:
-            self._status.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._status.stop()
+        super().__init__("", console=console)
+        self._step, self._total, self._count = "", total, 0
 
     def began(self, scenario: Scenario) -> None:
         self._count += 1
@@ -147,8 +140,8 @@ class Progress:
         self.doing("starting")
 
     def doing(self, what: str) -> None:
-        self._status.update(Text(f"{self._step}: {what}"))
+        self.update(Text(f"{self._step}: {what}"))
 
     def done(self, outcome: Outcome) -> None:
         line = Text(f"{self._step}, {outcome.seconds:.0f} s: ")
-        self._console.print(line.append_text(verdict(outcome)))
+        self.console.print(line.append_text(verdict(outcome)))

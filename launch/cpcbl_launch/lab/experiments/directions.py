@@ -37,7 +37,7 @@ DURATION_S = 20.0
 SIZES = (2, 5, 10, 20)
 OFFSETS_M = (0.0, 0.1, 0.2)
 CLAIMED_SIGMA_M = 0.1
-WAYS = tuple(itertools.product(("one-way", "both-ways"), ("split-ci", "naive")))
+FUSIONS = ("split-ci", "naive")
 CORNERS = ((7.5, 1.0), (7.5, 4.0), (1.5, 4.0), (1.5, 1.0))
 POSTS = ((4.5, 5.0, -90.0), (4.5, 0.0, 90.0), (0.0, 2.5, 0.0), (9.0, 2.5, 180.0))
 Key = tuple[int, str, str, float]  # size, direction (or "alone"), fusion, offset of the observers
@@ -51,26 +51,21 @@ def cases(sizes: Sequence[int] = SIZES) -> Mapping[Key, Case]:
         mobile = tuple(n for n, r in team.robots.items() if r.odometry.moves)
         alone = with_overrides(team, Overrides(collaboration="none"))
         every[size, "alone", "", 0.0] = Case(alone, mobile, DURATION_S, 0)
-        for (direction, fusion), offset in itertools.product(WAYS, OFFSETS_M):
-            helping = with_overrides(team, Overrides(direction=direction, fusion=fusion))
+        directions = ("one-way", "both-ways", "deaf") if size == 2 else ("one-way", "both-ways")
+        for direction, fusion, offset in itertools.product(directions, FUSIONS, OFFSETS_M):
+            helping = _with_help(team, direction, fusion)
             truth = with_displaced_observers(helping, offset)
             every[size, direction, fusion, offset] = Case(helping, mobile, DURATION_S, 0, truth)
-        if size == 2:
-            every |= _deaf_cases(team, mobile)
     return every
 
 
-def _deaf_cases(pair: Team, mobile: tuple[str, ...]) -> dict[Key, Case]:
-    """The robot that moves takes every fix, whatever its tier; nothing goes the other way."""
-    (navigator,), (observer,) = mobile, (n for n in pair.robots if n not in mobile)
-    every: dict[Key, Case] = {}
-    for fusion, offset in itertools.product(("split-ci", "naive"), OFFSETS_M):
-        team = with_overrides(pair, Overrides(direction="both-ways", fusion=fusion))
-        team = with_settings(team, navigator, sensor={"sees_robots": False})
-        team = with_settings(team, observer, collaboration={"passive": False})
-        truth = with_displaced_observers(team, offset)
-        every[2, "deaf", fusion, offset] = Case(team, mobile, DURATION_S, 0, truth)
-    return every
+def _with_help(team: Team, direction: str, fusion: str) -> Team:
+    """Of a pair with a deaf observer the robot that moves takes every fix, whatever its tier."""
+    if direction != "deaf":
+        return with_overrides(team, Overrides(direction=direction, fusion=fusion))
+    team = with_overrides(team, Overrides(direction="both-ways", fusion=fusion))
+    team = with_settings(team, "navigator0", sensor={"sees_robots": False})
+    return with_settings(team, "observer0", collaboration={"passive": False})
 
 
 def crowd_team(size: int) -> Team:

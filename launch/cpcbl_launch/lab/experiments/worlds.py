@@ -220,13 +220,9 @@ def with_true_starts(team: Team, seed: int) -> Team:
     random, robots = Random(seed), dict(team.robots)
     for name, settings in team.robots.items():
         if settings.start is None:
-            start = Start(
-                x_m=random.uniform(2.0, 6.0),
-                y_m=random.uniform(1.5, 4.5),
-                heading_deg=random.uniform(-180.0, 180.0),
-                sigma_m=0.0,
-                heading_sigma_deg=0.0,
-            )
+            x, y = random.uniform(2.0, 6.0), random.uniform(1.5, 4.5)
+            pose = Start(x_m=x, y_m=y, heading_deg=random.uniform(-180.0, 180.0))
+            start = replace(pose, sigma_m=0.0, heading_sigma_deg=0.0)
             robots[name] = replace(settings, start=start)
     return replace(team, robots=robots)
 
