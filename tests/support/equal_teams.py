@@ -13,7 +13,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from cpcbl_launch.lab.experiments.runs import Run
-from cpcbl_launch.reporting.metrics import Floats
+from cpcbl_launch.reporting.metrics import Floats, position_nees
 from cpcbl_team.config import (
     Field,
     Landmark,
@@ -87,7 +87,8 @@ def team_nees(runs: Iterable[Run]) -> Floats:
     """Position NEES, mean over the robots of a team; shape (runs, times)."""
     teams = []
     for run in runs:
-        robots = [errors.nees for errors in run.robots.values() if errors.nees is not None]
+        every = [position_nees(samples) for samples in run.robots.values()]
+        robots = [nees for nees in every if nees is not None]
         assert len(robots) == len(run.robots)
         teams.append(np.mean(robots, axis=0))
     return np.array(teams)

@@ -4,7 +4,7 @@ A TUM file, which evo reads, has a line a pose: `timestamp tx ty tz qx qy qz qw`
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -77,10 +77,27 @@ def samples_with_truth(trajectory: Trajectory, truth: Floats | None) -> tuple[St
     return stamps_ns, Samples(estimate, at[counts], covariance, share)
 
 
+def pooled(parts: Sequence[Samples]) -> Samples:
+    """The samples of all parts together; without covariances where a part has none."""
+    estimates, truths = [part.estimate for part in parts], [part.truth for part in parts]
+    covariances = [part.covariance for part in parts if part.covariance is not None]
+    return Samples(
+        np.concatenate([np.empty((0, 3)), *estimates]),
+        np.concatenate([np.empty((0, 3)), *truths]),
+        np.concatenate(covariances) if parts and len(covariances) == len(parts) else None,
+    )
+
+
+def pose_errors(samples: Samples) -> Floats:
+    """Estimate minus truth: rows of dx m, dy m, turn rad, shape (n, 3)."""
+    offset = samples.estimate[:, :2] - samples.truth[:, :2]
+    return np.column_stack([offset, heading_errors(samples)])
+
+
 def position_errors(samples: Samples) -> Floats:
     """Distances in metres, shape (n,)."""
-    offset = samples.estimate[:, :2] - samples.truth[:, :2]
-    return np.asarray(np.hypot(offset[:, 0], offset[:, 1]))
+    dx, dy, _ = pose_errors(samples).T
+    return np.asarray(np.hypot(dx, dy))
 
 
 def heading_errors(samples: Samples) -> Floats:
@@ -93,8 +110,7 @@ def position_nees(samples: Samples) -> Floats | None:
     """Squared Mahalanobis distances of the position, shape (n,); None without covariance."""
     if samples.covariance is None:
         return None
-    offset = samples.truth[:, :2] - samples.estimate[:, :2]
-    dx, dy = offset[:, 0], offset[:, 1]
+    dx, dy, _ = pose_errors(samples).T
     xx, xy, yy = samples.covariance[:, :3].T
     floor = 1e-12  # (1 um)^2: a noise-free run has no covariance to divide by
     det = np.maximum((xx + floor) * (yy + floor) - xy * xy, floor * floor)

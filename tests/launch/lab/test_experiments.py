@@ -23,6 +23,7 @@ from cpcbl_launch.lab.experiments.runs import (
     spread,
     with_settings,
 )
+from cpcbl_launch.reporting.metrics import pose_errors
 from cpcbl_team.config import Team
 from cpcbl_team.errors import InputError
 
@@ -173,7 +174,8 @@ def test_a_deaf_observer_stays_wrong_and_one_that_listens_does_not() -> None:
     errors = {}
     for direction in ("deaf", "both-ways"):
         case = cases[2, direction, "split-ci", 0.2]._replace(scored=("navigator0", "observer0"))
-        last = [run_case(case, seed).robots["observer0"].offset[-1] for seed in range(1, 6)]
+        runs = [run_case(case, seed).robots["observer0"] for seed in range(1, 6)]
+        last = [pose_errors(samples)[-1] for samples in runs]
         errors[direction] = np.median([np.hypot(*offset[:2]) for offset in last])
     assert errors["deaf"] == pytest.approx(0.2, abs=0.01)
     assert errors["both-ways"] < 0.1

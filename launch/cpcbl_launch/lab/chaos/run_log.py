@@ -128,10 +128,8 @@ class RunLog(NamedTuple):
 
     def inside_3_sigma(self, robots: Iterable[str], from_s: float, until_s: float) -> float | None:
         """The share of tracks within 3 sigma of the truth (a consistent filter: 98.9 %)."""
-        samples = (self._samples(name, from_s, until_s)[1] for name in robots)
-        parts = map(metrics.position_nees, samples)
-        nees = np.concatenate([part for part in parts if part is not None] or [np.empty(0)])
-        return float(np.mean(nees <= 9.0)) if len(nees) else None
+        parts = [self._samples(name, from_s, until_s)[1] for name in robots]
+        return metrics.score(metrics.pooled(parts)).inside_3_sigma
 
     def first_position_jump(self, robot: str) -> tuple[float, float] | None:
         """(time, metres) of the first jump of a robot's true position by at least 1 m."""

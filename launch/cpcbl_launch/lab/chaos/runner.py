@@ -8,6 +8,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from importlib.metadata import version
+from typing import Self
 
 from msgspec.structs import replace
 from rich.console import Console
@@ -133,6 +134,10 @@ class Progress(Status):
     def __init__(self, console: Console, total: int) -> None:
         super().__init__("", console=console)
         self._step, self._total, self._count = "", total, 0
+
+    def __enter__(self) -> Self:
+        self.start()
+        return self
 
     def began(self, scenario: Scenario) -> None:
         self._count += 1

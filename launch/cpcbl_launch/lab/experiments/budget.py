@@ -16,6 +16,7 @@ from rich.console import RenderableType
 
 from cpcbl_launch.lab.evaluation import evaluate_log
 from cpcbl_launch.lab.experiments.runs import ExperimentResult, map_in_processes
+from cpcbl_launch.reporting.recorder import mean_score
 from cpcbl_launch.reporting.tables import cells, table
 from cpcbl_launch.run.logged_team import LoggedTeam
 from cpcbl_team.errors import InputError
@@ -102,18 +103,14 @@ def measure_point(logged: LoggedTeam, case: Case) -> Point:
         raise InputError(
             f"{logged.team.data}: no truth in these {report.duration_s:g} s; take more of the log"
         )
-    blind = [
-        r.position_rmse_m
-        for name, r in report.robots.items()
-        if name in _blind(logged) and r.position_rmse_m is not None
-    ]
+    blind = mean_score(r for name, r in report.robots.items() if name in _blind(logged))
     return Point(
         series=case.series,
         setting=case.setting,
         bytes_per_s=team.bytes_sent / 60.0 / minutes,
         messages_per_minute=team.messages_sent / minutes,
         position_rmse_m=team.position_rmse_m,
-        blind_rmse_m=sum(blind) / len(blind) if blind else None,
+        blind_rmse_m=blind.position_rmse_m,
         heading_rmse_deg=team.heading_rmse_deg,
         inside_3_sigma=team.inside_3_sigma,
         nees=team.nees,

@@ -18,11 +18,11 @@ from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from msgspec import Struct, field
-from msgspec.structs import replace
+from msgspec.structs import asdict, replace
 from rich.console import RenderableType
 
 from cpcbl_launch.reporting import metrics
-from cpcbl_launch.reporting.metrics import Floats, Samples
+from cpcbl_launch.reporting.metrics import Floats, Samples, Score
 from cpcbl_launch.reporting.recorder import Recorder
 from cpcbl_launch.simulation.in_process import simulate
 from cpcbl_launch.team_file import builtin_path, load_team
@@ -51,19 +51,12 @@ class Case(NamedTuple):
     truth: Team | None = None  # the team as it is, where its robots believe something else
 
 
-class Errors(NamedTuple):
-    """The errors of one robot at 10 Hz."""
-
-    offset: Floats  # rows of dx m, dy m, turn rad, estimate minus truth
-    nees: Floats | None  # of the position; None where the variant knows no covariance
-
-
 class Run(NamedTuple):
     finished: bool
     bumps: int
     restarts: int
-    robots: dict[str, Errors]  # the scored ones
-    at_waypoints: Floats  # rows like `offset`: of the first scored robot, when it reached one
+    robots: dict[str, Samples]  # the scored ones, at 10 Hz
+    at_waypoints: Floats  # pose errors of the first scored robot, when it reached one
     odometry_at_waypoints: Floats  # of its odometry alone, at the same times
     bytes_per_s: float  # of beliefs and fixes that a robot sent, mean over the team
 
@@ -119,7 +112,6 @@ def run_case(case: Case, seed: int) -> Run:
 
 def _figures(case: Case, recorder: Recorder, referee: LoopReferee, restarts: int) -> Run:
     truth, driver = recorder.simulated_truth(), case.scored[0]
-    samples = {name: recorder.samples(name, truth[name]) for name in case.scored}
     reached_s = np.array(referee.reached_s)
     driver_s, driven = recorder.timed_samples(driver, truth[driver])
     odometry_m, _ = metrics.interpolated_truth(reached_s, np.array(referee.odometry_track))
@@ -129,16 +121,11 @@ def _figures(case: Case, recorder: Recorder, referee: LoopReferee, restarts: int
         finished=referee.finished or (not case.loops and not referee.bumped),
         bumps=restarts + referee.bumped,
         restarts=restarts,
-        robots={name: Errors(_errors(s), metrics.position_nees(s)) for name, s in samples.items()},
-        at_waypoints=_errors(driven)[np.isin(driver_s, reached_s)],
-        odometry_at_waypoints=_errors(Samples(odometry_m, true, None)),
+        robots={name: recorder.samples(name, truth[name]) for name in case.scored},
+        at_waypoints=metrics.pose_errors(driven)[np.isin(driver_s, reached_s)],
+        odometry_at_waypoints=metrics.pose_errors(Samples(odometry_m, true, None)),
         bytes_per_s=sum(sent) / len(case.team.robots),
     )
-
-
-def _errors(samples: Samples) -> Floats:
-    offset = samples.estimate[:, :2] - samples.truth[:, :2]
-    return np.column_stack([offset, metrics.heading_errors(samples)])
 
 
 def map_in_processes(
@@ -240,16 +227,11 @@ def spread(values: Sequence[float]) -> Spread | None:
     return Spread(float(median), float(low), float(high))
 
 
-class Accuracy(Struct, frozen=True, kw_only=True):
+class Accuracy(Score, frozen=True, kw_only=True):
     """Figures of all samples (10 Hz) of the finished runs of one case; None without samples."""
 
-    position_mean_m: float | None
     position_sigma_m: float | None
-    position_rmse_m: float | None
-    position_max_m: float | None
     heading_mean_deg: float | None
-    inside_3_sigma: float | None
-    nees: float | None
     bumps: int
     restarts: int
     failed: int
@@ -259,28 +241,17 @@ class Accuracy(Struct, frozen=True, kw_only=True):
 def accuracy(runs: Sequence[Run], prefix: str = "") -> Accuracy:
     """The figures of all runs together, of the scored robots whose names begin so."""
     robots = [named for run in runs if run.finished for named in run.robots.items()]
-    good = [errors for name, errors in robots if name.startswith(prefix)]
-    offset = np.concatenate([e.offset for e in good]) if good else np.empty((0, 3))
-    nees = [e.nees for e in good if e.nees is not None]
-    squares = np.concatenate(nees) if nees else np.empty(0)
-    errors = np.hypot(offset[:, 0], offset[:, 1])
+    pooled = metrics.pooled([samples for name, samples in robots if name.startswith(prefix)])
+    errors_m, turns = metrics.position_errors(pooled), np.abs(metrics.heading_errors(pooled))
     return Accuracy(
-        position_mean_m=_of(np.mean, errors),
-        position_sigma_m=_of(np.std, errors),
-        position_rmse_m=_of(lambda e: math.sqrt(np.mean(e * e)), errors),
-        position_max_m=_of(np.max, errors),
-        heading_mean_deg=_of(lambda h: math.degrees(np.mean(np.abs(h))), offset[:, 2]),
-        inside_3_sigma=_of(lambda n: np.mean(n <= 9.0), squares),
-        nees=_of(np.mean, squares),
+        **asdict(metrics.score(pooled)),
+        position_sigma_m=float(errors_m.std()) if len(errors_m) else None,
+        heading_mean_deg=math.degrees(turns.mean()) if len(turns) else None,
         bumps=sum(r.bumps for r in runs),
         restarts=sum(r.restarts for r in runs),
         failed=sum(not r.finished for r in runs),
         runs=len(runs),
     )
-
-
-def _of(function: Callable[[Floats], Any], values: Floats) -> float | None:
-    return float(function(values)) if len(values) else None
 
 
 def new_outcome(name: str, results: Results, cases: Mapping[str, Case], **rest: Any) -> Outcome:
