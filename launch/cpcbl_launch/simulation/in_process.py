@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
-from typing import Protocol
 
 from cpcbl_agents.node import Node, Steppable
 from cpcbl_agents.robot import build_robot
@@ -17,34 +16,25 @@ Progress = Callable[[float], None]
 BusWrapper = Callable[[Bus], Bus]
 
 
-class Referee(Protocol):
-    """Watches a simulated run and says when it is over."""
-
-    @property
-    def over(self) -> bool: ...
-
-    def attach(self, bus: Bus) -> None: ...
-
-
 def simulate(
     team: Team,
     seed: int,
     duration_s: float,
     truth: Team | None = None,
-    referee: Referee | None = None,
+    watch: Callable[[Bus], None] = lambda bus: None,
+    over: Callable[[], bool] = lambda: False,
     progress: Progress | None = None,
     bus_wrappers: Mapping[str, BusWrapper] = MappingProxyType({}),
 ) -> tuple[Report, Recorder]:
     """A simulated team, field and robots in one process.
 
-    `truth` is the team as it really is, where that is not what its robots believe; a `referee` may
-    end the run before its time; `bus_wrappers` put something between a robot and its bus.
+    `truth` is the team as it really is, where that is not what its robots believe. `watch` may
+    subscribe to the run, and `over` end it before its time; `bus_wrappers` put something between a
+    robot and its bus.
     """
     hub, end_ns = MemoryHub(), int(duration_s * 1e9)
     recorder = Recorder(hub.session())
-    if referee is not None:
-        referee.attach(hub.session())
-    over = (lambda: False) if referee is None else (lambda: referee.over)
+    watch(hub.session())
     field = FieldNode(SimulatedField(truth or team, seed, 0), hub.session())
     run_nodes([field, *robot_nodes(team, hub, 0, bus_wrappers)], 0, end_ns, progress, over)
     return simulated_report(recorder, team), recorder

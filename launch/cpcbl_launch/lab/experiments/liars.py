@@ -114,9 +114,7 @@ def cases() -> Mapping[Case, Case]:
 
 
 class _Statuses:
-    """A referee that never ends a run; it collects the quarantines that robots report."""
-
-    over = False
+    """Collects the quarantines that robots report in a run."""
 
     def __init__(self) -> None:
         self.found: dict[tuple[str, str, int], Quarantine] = {}
@@ -143,7 +141,8 @@ def run_case(case: Case, seed: int) -> Run:
     if case.lie:
         fault = Fault.parse(f"{case.lie}@{FROM_S}-{UNTIL_S}")
         through = {LIAR: partial(FaultyBus, fault=fault, name=LIAR, start_ns=0)}
-    _, recorder = simulate(liars_team(case), seed, END_S, referee=statuses, bus_wrappers=through)
+    watch, team = statuses.attach, liars_team(case)
+    _, recorder = simulate(team, seed, END_S, watch=watch, bus_wrappers=through)
     truth = recorder.simulated_truth()
     scores = {name: score(recorder.samples(name, truth[name], FROM_S)) for name in DRIVERS}
     rmse_m = {name: s.position_rmse_m or 0.0 for name, s in scores.items()}

@@ -82,8 +82,7 @@ class LoopReferee:
         if self._to_reach < math.inf:
             bus.subscribe(topics.TRUTH.at(), self._arrived)
 
-    @property
-    def over(self) -> bool:
+    def is_over(self) -> bool:
         return self.bumped or self.finished
 
     def _arrived(self, key: str, payload: bytes) -> None:
@@ -104,7 +103,8 @@ def run_case(case: Case, seed: int) -> Run:
     for restarts in range(MOST_RESTARTS + 1):
         referee = LoopReferee(case)
         seeded = seed + OTHER_NOISE * restarts
-        _, recorder = simulate(case.team, seeded, case.limit_s, case.truth, referee)
+        ends = referee.attach, referee.is_over
+        _, recorder = simulate(case.team, seeded, case.limit_s, case.truth, *ends)
         if not referee.bumped:
             break
     return _figures(case, recorder, referee, restarts)
