@@ -62,6 +62,10 @@ class Samples(NamedTuple):
     share: float | None = None  # of the estimates: those that have truth
 
 
+def degrees(angle_rad: float | None) -> float | None:
+    return None if angle_rad is None else math.degrees(angle_rad)
+
+
 def seconds(stamps_ns: Stamps) -> Floats:
     return np.asarray(stamps_ns * 1e-9, dtype=np.float64)
 

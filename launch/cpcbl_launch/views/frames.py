@@ -1,6 +1,5 @@
 """Annotated frames of a robot's camera: received, saved, and printed as `look` does."""
 
-import math
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
@@ -9,6 +8,7 @@ from pathlib import Path
 import msgspec
 from rich.console import Console
 
+from cpcbl_launch.reporting.metrics import degrees
 from cpcbl_launch.reporting.tables import table
 from cpcbl_launch.views.live import open_bus_within
 from cpcbl_team.errors import InputError
@@ -78,20 +78,16 @@ def frame_report(annotated: AnnotatedFrame, frame: str, picture: str) -> FrameRe
             id=s.id,
             range_m=s.range_m,
             range_sigma_m=s.range_sigma_m,
-            bearing_deg=_deg(s.bearing_rad),
-            bearing_sigma_deg=_deg(s.bearing_sigma_rad),
-            heading_deg=_deg(s.heading_rad),
-            heading_sigma_deg=_deg(s.heading_sigma_rad),
+            bearing_deg=degrees(s.bearing_rad),
+            bearing_sigma_deg=degrees(s.bearing_sigma_rad),
+            heading_deg=degrees(s.heading_rad),
+            heading_sigma_deg=degrees(s.heading_sigma_rad),
         )
         for s in annotated.found
     )
     return FrameReport(
         robot=annotated.robot, frame=frame, picture=picture, found=found, unclear=annotated.unclear
     )
-
-
-def _deg(angle: float | None) -> float | None:
-    return None if angle is None else math.degrees(angle)
 
 
 def save_picture(annotated: AnnotatedFrame, folder: Path, name: str) -> str:

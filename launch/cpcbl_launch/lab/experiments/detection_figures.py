@@ -18,6 +18,7 @@ from msgspec import Struct
 from rich.console import RenderableType
 
 from cpcbl_launch.lab.experiments.runs import ExperimentResult, map_in_processes
+from cpcbl_launch.reporting.metrics import degrees
 from cpcbl_launch.reporting.tables import cells, number, table
 from cpcbl_launch.team_file import builtin_path, load_team
 from cpcbl_team.config import Team
@@ -236,10 +237,6 @@ def figures(
 
 def _rms(values: Sequence[float]) -> float | None:
     return math.sqrt(math.fsum(v * v for v in values) / len(values)) if values else None
-
-
-def degrees(angle_rad: float | None) -> float | None:
-    return None if angle_rad is None else math.degrees(angle_rad)
 
 
 def within_3_sigma(pairs: Iterable[tuple[float | None, float | None]]) -> list[bool]:

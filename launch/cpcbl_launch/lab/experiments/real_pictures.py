@@ -17,9 +17,10 @@ from rich.console import RenderableType
 from cpcbl_agents.vision.detections import Detections
 from cpcbl_agents.vision.detector import CameraDetector
 from cpcbl_agents.vision.pictures import decode_image
-from cpcbl_launch.lab.experiments.detection_figures import degrees, within_3_sigma
+from cpcbl_launch.lab.experiments.detection_figures import within_3_sigma
 from cpcbl_launch.lab.experiments.runs import ExperimentResult
 from cpcbl_launch.reporting.files import read_csv
+from cpcbl_launch.reporting.metrics import degrees
 from cpcbl_launch.reporting.tables import number, table
 from cpcbl_launch.team_file import load_team
 from cpcbl_team.config import Team

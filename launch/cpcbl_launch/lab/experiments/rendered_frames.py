@@ -29,15 +29,8 @@ from cpcbl_agents.vision.camera import Camera, Floats, Pixels
 from cpcbl_agents.vision.detector import CameraDetector
 from cpcbl_agents.vision.pictures import decode_image
 from cpcbl_agents.vision.poses import SIDE_ANGLES
-from cpcbl_launch.lab.experiments.detection_figures import (
-    Batch,
-    Kind,
-    Mistake,
-    Record,
-    Wrong,
-    degrees,
-    team,
-)
+from cpcbl_launch.lab.experiments.detection_figures import Batch, Kind, Mistake, Record, Wrong, team
+from cpcbl_launch.reporting.metrics import degrees
 from cpcbl_launch.simulation.camera import visibility
 from cpcbl_launch.simulation.camera.cameras import with_focal_error, with_mount_error
 from cpcbl_launch.simulation.camera.objects import body_top_m
