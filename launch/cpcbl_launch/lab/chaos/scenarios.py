@@ -1,6 +1,5 @@
 """All fault scenarios, from their table `scenarios.toml`, whose first lines explain its keys."""
 
-import tomllib
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from importlib.resources import files
@@ -66,16 +65,24 @@ def team_fault(
     )
 
 
+class _Row(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    fault: str
+    expectation: str
+    quick: bool = False
+    needs: str = ""
+    like: str = ""
+    run: dict[str, Any] = {}
+
+
 def _scenarios() -> Iterator[Scenario]:
-    text = (files("cpcbl_launch.lab.chaos") / "scenarios.toml").read_text(encoding="utf-8")
-    rows: dict[str, Any] = tomllib.loads(text)
+    text = (files("cpcbl_launch.lab.chaos") / "scenarios.toml").read_bytes()
+    rows = msgspec.toml.decode(text, type=dict[str, _Row])
     for name, row in rows.items():
-        needs = REQUIREMENTS[row.get("needs", "")]
         if (run := OWN_SHAPE.get(name)) is None:
-            like = rows.get(row.get("like", ""), {})
-            run = team_fault(**{**like.get("run", {}), **row.get("run", {})})
-        quick = row.get("quick", False)
-        yield Scenario(name, row["fault"], row["expectation"], run, needs, quick)
+            usual = rows[row.like].run if row.like else {}
+            run = team_fault(**usual | row.run)
+        needs = REQUIREMENTS[row.needs]
+        yield Scenario(name, row.fault, row.expectation, run, needs, row.quick)
 
 
 SCENARIOS = tuple(_scenarios())
