@@ -1,14 +1,20 @@
-"""Odometry and sensors of one robot: how readings are corrected, and the noise that remains."""
+"""Odometry and sensors of one robot: how readings are corrected, and the noise that remains.
+
+A model is what a guest tells the simulated field, so the names of its fields belong to the wire and
+must not change. A reader of models ignores keys that it does not know and fills in those that are
+missing, so a new key never separates a guest from an older field. The settings add what only the
+robot itself needs; the reader of a team file refuses keys that it does not know.
+"""
 
 import math
 from typing import Annotated
 
 import msgspec
 
-from cpcbl_team.config.table import NotNegative, Positive, Table
+from cpcbl_team.config.table import NotNegative, Positive
 
 
-class OdometryNoise(Table, frozen=True, kw_only=True):
+class OdometryNoise(msgspec.Struct, frozen=True, kw_only=True):
     """White noise whose variance grows with the distance and with the turn."""
 
     distance_sigma_m_per_sqrt_m: NotNegative = 0.05
@@ -21,8 +27,8 @@ class OdometryNoise(Table, frozen=True, kw_only=True):
     the root of the time, because motors in their dead zone do not keep a speed."""
 
 
-class OdometrySettings(OdometryNoise, frozen=True, kw_only=True):
-    """Odometry of one robot: its correction and its noise."""
+class OdometryModel(OdometryNoise, frozen=True, kw_only=True):
+    """The wheels: their noise, and how what they report differs from what they do."""
 
     distance_scale: Positive = 1.0
     distance_loss_m_per_rad: NotNegative = 0.0
@@ -39,6 +45,11 @@ class OdometrySettings(OdometryNoise, frozen=True, kw_only=True):
     rate_hz: Positive = 20.0
     moves: bool = True
     """False for a robot that stands still and reports no odometry."""
+
+
+class OdometrySettings(OdometryModel, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Odometry of one robot: its correction, its noise, and what is done without it."""
+
     timeout_s: Positive = 0.5
     """If odometry is missing, the robot is assumed to drive on as before, but for no longer."""
     gap_speed_m_s: NotNegative = 0.3
@@ -46,7 +57,7 @@ class OdometrySettings(OdometryNoise, frozen=True, kw_only=True):
     the robot is assumed to drive on, then with its root, and there more if it drove fast."""
 
 
-class SensorSettings(Table, frozen=True, kw_only=True):
+class SensorModel(msgspec.Struct, frozen=True, kw_only=True):
     """The sensor of landmarks and teammates: ranges and bearings in the robot's frame."""
 
     range_share: NotNegative = 0.03
@@ -56,8 +67,6 @@ class SensorSettings(Table, frozen=True, kw_only=True):
     field_of_view_deg: Annotated[float, msgspec.Meta(gt=0.0, le=360.0)] = 100.0
     max_range_m: Positive = 8.0
     """The sensor sees nothing that is farther away."""
-    max_range_for_range_m: Positive = 1000.0
-    """Of an object that is farther away only the bearing is good enough to be used."""
     rate_hz: Positive = 10.0
     delay_s: float = 0.0
     """Time stamps are this much later than the measurement."""
@@ -76,6 +85,13 @@ class SensorSettings(Table, frozen=True, kw_only=True):
     correlation_s: NotNegative = 0.0
     """The time constant with which errors to the same object fade; 0: errors are independent.
     An object that is seen again before that counts for less."""
+
+
+class SensorSettings(SensorModel, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """The sensor, and what the robot uses of it."""
+
+    max_range_for_range_m: Positive = 1000.0
+    """Of an object that is farther away only the bearing is good enough to be used."""
     sees_landmarks: bool = True
     sees_robots: bool = True
 
@@ -84,10 +100,14 @@ class SensorSettings(Table, frozen=True, kw_only=True):
         return math.radians(self.bearing_sigma_deg)
 
 
-class PositionSensor(Table, frozen=True, kw_only=True):
+class PositionSensorModel(msgspec.Struct, frozen=True, kw_only=True):
     """A sensor that measures the position in the field's frame, such as differential GPS."""
 
     sigma_m: Positive = 0.02
     rate_hz: Positive = 5.0
     delay_s: NotNegative = 0.0
     """Time stamps are this much later than the measurement."""
+
+
+class PositionSensor(PositionSensorModel, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """The sensor as a team file has it."""

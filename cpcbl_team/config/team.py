@@ -56,17 +56,22 @@ class TransportSettings(Table, frozen=True, kw_only=True):
         return ("tls/127.0.0.1:7447",) if self.secured else ("tcp/127.0.0.1:7447",)
 
 
-class Start(Table, frozen=True, kw_only=True):
-    """The pose of a robot at the start, in the field's frame. A robot without one searches for its
-    pose."""
+class StartModel(msgspec.Struct, frozen=True, kw_only=True):
+    """The stated pose at the start, in the field's frame. The simulated field draws the true one
+    around it. It is a model as those of `sensors` are."""
 
-    known: bool = True
-    """False: only the simulated field knows it, and the robot searches for its pose."""
     x_m: float
     y_m: float
     heading_deg: float = 0.0
     sigma_m: NotNegative = 0.05
     heading_sigma_deg: NotNegative = 3.0
+
+
+class Start(StartModel, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """The start of a robot. A robot without one searches for its pose."""
+
+    known: bool = True
+    """False: only the simulated field knows it, and the robot searches for its pose."""
 
 
 class LocalizationSettings(Table, frozen=True, kw_only=True):

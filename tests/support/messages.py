@@ -2,6 +2,8 @@
 
 import msgspec
 
+from cpcbl_team.config.sensors import PositionSensorModel
+from cpcbl_team.config.team import StartModel
 from cpcbl_team.inputs import Belief, Fix, Odometry, Position, Sighting, Sightings
 from cpcbl_transport.messages import (
     AnnotatedFrame,
@@ -9,10 +11,8 @@ from cpcbl_transport.messages import (
     Flow,
     Frame,
     Join,
-    PositionSensorModel,
     SimulatedRobotModel,
     Spending,
-    StartModel,
     Status,
     Track,
     Trust,

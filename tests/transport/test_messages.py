@@ -21,6 +21,8 @@ from support.messages import (
     VALID,
 )
 
+from cpcbl_team.config.sensors import OdometryModel, PositionSensorModel, SensorModel
+from cpcbl_team.config.team import StartModel
 from cpcbl_team.inputs import Odometry, Position, Sighting, Sightings
 from cpcbl_transport.messages import (
     FUTURE_NS,
@@ -35,13 +37,9 @@ from cpcbl_transport.messages import (
     Flow,
     Frame,
     Join,
-    OdometryModel,
-    PositionSensorModel,
     Refusal,
-    SensorModel,
     SimulatedRobotModel,
     Spending,
-    StartModel,
     Status,
     Tagged,
     Track,

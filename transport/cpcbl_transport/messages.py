@@ -7,12 +7,11 @@ end, so that an older reader skips what it does not know. Fixes and beliefs have
 
 import math
 from enum import StrEnum
-from typing import Annotated
 
 import msgspec
 
-from cpcbl_team.config import RobotSettings
-from cpcbl_team.config.table import NotNegative, Positive
+from cpcbl_team.config.sensors import OdometryModel, PositionSensorModel, SensorModel
+from cpcbl_team.config.team import RobotSettings, StartModel
 from cpcbl_team.inputs import Belief, Fix, Name, Odometry, Position, Sighting, Sightings
 
 VERSION = 2
@@ -134,72 +133,8 @@ class Drive(msgspec.Struct, frozen=True, array_like=True, tag="drive"):
     reached: int = 0  # waypoints that the robot believes to have reached so far
 
 
-# What a guest tells the simulated field: the model by which it is simulated -----------------------
-#
-# These structs belong to the wire, not to the team file, and hold only what a field needs; their
-# names must not change. A reader ignores keys that it does not know and fills in those that are
-# missing, so a new key of the team file never separates a guest from an older field.
-# `cpcbl_team.config` explains each value.
-
-
-class StartModel(msgspec.Struct, frozen=True, kw_only=True):
-    """The stated start. The field draws the true pose around it, as it does for all robots."""
-
-    x_m: float
-    y_m: float
-    heading_deg: float = 0.0
-    sigma_m: NotNegative = 0.05
-    heading_sigma_deg: NotNegative = 3.0
-
-
-class SensorModel(msgspec.Struct, frozen=True, kw_only=True):
-    """The sensor for landmarks and teammates."""
-
-    range_share: NotNegative = 0.03
-    range_floor_m: NotNegative = 0.01
-    bearing_sigma_deg: NotNegative = 2.0
-    field_of_view_deg: Annotated[float, msgspec.Meta(gt=0.0, le=360.0)] = 100.0
-    max_range_m: Positive = 8.0
-    rate_hz: Positive = 10.0
-    delay_s: float = 0.0
-    range_scale: Positive = 1.0
-    range_bias_m: float = 0.0
-    robot_range_bias_m: float = 0.0
-    range_is_depth: bool = False
-    optical_axis_deg: float = 0.0
-    bearing_scale: Positive = 1.0
-    bearing_bias_deg: float = 0.0
-    correlation_s: NotNegative = 0.0
-
-
-class OdometryModel(msgspec.Struct, frozen=True, kw_only=True):
-    """The wheels: their noise, and how what they report differs from what they do."""
-
-    distance_sigma_m_per_sqrt_m: NotNegative = 0.05
-    distance_sigma_m_per_sqrt_rad: NotNegative = 0.0
-    turn_sigma_rad_per_sqrt_rad: NotNegative = 0.05
-    turn_sigma_rad_per_sqrt_m: NotNegative = 0.05
-    crawl_sigma_m_per_sqrt_s: NotNegative = 0.0
-    distance_scale: Positive = 1.0
-    distance_loss_m_per_rad: NotNegative = 0.0
-    least_speed_m_s: NotNegative = 0.0
-    turn_scale: Positive = 1.0
-    turn_bias_rad_per_m: float = 0.0
-    delay_s: NotNegative = 0.0
-    rate_hz: Positive = 20.0
-    moves: bool = True
-
-
-class PositionSensorModel(msgspec.Struct, frozen=True, kw_only=True):
-    """A sensor of the position on the field, such as differential GPS."""
-
-    sigma_m: Positive = 0.02
-    rate_hz: Positive = 5.0
-    delay_s: NotNegative = 0.0
-
-
 class SimulatedRobotModel(msgspec.Struct, frozen=True, array_like=True):
-    """All that the simulated field must know of a guest."""
+    """All that the simulated field must know of a guest, which tells it (`Join`)."""
 
     start: StartModel
     sensor: SensorModel = SensorModel()
