@@ -1,6 +1,7 @@
 """The bus inside one process: deterministic, for simulations in one process and for tests."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable
+from functools import lru_cache
 from itertools import count
 from typing import Generic, TypeVar
 
@@ -16,49 +17,50 @@ class MemoryHub:
     """Connects the sessions of one process; delivers in the order of declaration."""
 
     def __init__(self) -> None:
-        self.subscribers: KeyTree[_Listener[MessageCallback]] = KeyTree()
-        self.watchers: KeyTree[_Listener[LivelinessCallback]] = KeyTree()
-        self.tokens: KeyTree[_Token] = KeyTree()
+        self.subscribers: PatternIndex[_Listener[MessageCallback]] = PatternIndex()
+        self.watchers: PatternIndex[_Listener[LivelinessCallback]] = PatternIndex()
+        self.tokens: PatternIndex[_Token] = PatternIndex()
 
     def session(self) -> "MemoryBus":
         return MemoryBus(self)
 
     def notify_watchers(self, key: str, alive: bool) -> None:
-        for watcher in self.watchers.find(key):
+        for watcher in self.watchers.find(patterns_of(key)):
             watcher.callback(key, alive)
 
 
 class _Listener(Generic[CallbackT]):
-    """A subscription, or who watches tokens: it lies in a tree of the hub until it is closed."""
+    """A subscription, or who watches tokens: it lies in an index of the hub until it is closed."""
 
     def __init__(
         self,
-        tree: "KeyTree[_Listener[CallbackT]]",
+        index: "PatternIndex[_Listener[CallbackT]]",
         session: object,
         keys: str,
         callback: CallbackT,
     ) -> None:
-        self._tree, self.session, self._keys, self.callback = tree, session, keys, callback
-        tree.add(keys, self)
+        self._index, self.session, self._keys, self.callback = index, session, keys, callback
+        index.add([keys], self)
 
     def close(self) -> None:
-        self._tree.remove(self._keys, self)
+        self._index.remove([self._keys], self)
 
 
 class _Token:
     def __init__(self, hub: MemoryHub, key: str) -> None:
         self._hub, self.key = hub, key
-        hub.tokens.add(key, self)
+        hub.tokens.add(patterns_of(key), self)
         hub.notify_watchers(key, True)
 
     def close(self) -> None:
-        if self._hub.tokens.remove(self.key, self):
+        if self._hub.tokens.remove(patterns_of(self.key), self):
             self._hub.notify_watchers(self.key, False)
 
 
 class _MemoryPublisher:
     def __init__(self, hub: MemoryHub, session: object, key: str) -> None:
         self._hub, self._session, self._key, self._open = hub, session, key, True
+        self._patterns = patterns_of(key)
 
     @property
     def matching(self) -> bool:
@@ -71,7 +73,7 @@ class _MemoryPublisher:
 
     def _others(self) -> list[_Listener[MessageCallback]]:
         """The subscribers of other sessions."""
-        found = self._hub.subscribers.find(self._key)
+        found = self._hub.subscribers.find(self._patterns)
         return [s for s in found if s.session is not self._session]
 
     def close(self) -> None:
@@ -96,7 +98,7 @@ class MemoryBus(Bus):
 
     def watch_liveliness(self, keys: str, on_change: LivelinessCallback) -> Handle:
         watcher = self._keep(_Listener(self._hub.watchers, self, keys, on_change))
-        for token in self._hub.tokens.find(keys):
+        for token in self._hub.tokens.find([keys]):
             on_change(token.key, True)
         return watcher
 
@@ -112,80 +114,43 @@ class MemoryBus(Bus):
 # Keys with wildcards ------------------------------------------------------------------------------
 
 
-class _Branch(Generic[Thing]):
-    """What lies under the chunks so far, with its number, and the chunks that may follow."""
+@lru_cache(maxsize=4096)
+def patterns_of(key: str) -> tuple[str, ...]:
+    """All patterns that include a key, the key itself too: 47 for a key of four chunks."""
+    beginnings, patterns = [""], ["**"]
+    for chunk in key.split("/"):
+        beginnings = [f"{b}{part}/" for b in beginnings for part in (chunk, "*")]
+        patterns += [f"{b}**" for b in beginnings]
+    return (*patterns, *(b.removesuffix("/") for b in beginnings))
 
-    __slots__ = ("here", "next")
+
+class PatternIndex(Generic[Thing]):
+    """Each thing lies under one or more patterns and is found in the order in which it was added. A
+    search costs as much as it looks up and finds, however much is stored."""
 
     def __init__(self) -> None:
-        self.here: dict[Thing, int] = {}
-        self.next: dict[str, _Branch[Thing]] = {}
-
-
-class KeyTree(Generic[Thing]):
-    """Each thing lies under one key or pattern and is found in the order in which it was added. It
-    is a tree of chunks: a search costs as much as it finds, however much is stored."""
-
-    def __init__(self) -> None:
-        self._root: _Branch[Thing] = _Branch()
+        self._things: dict[str, dict[Thing, int]] = {}
         self._numbers = count()
 
-    def add(self, keys: str, thing: Thing) -> None:
-        branch = self._root
-        for chunk in keys.split("/"):
-            branch = branch.next.setdefault(chunk, _Branch())
-        branch.here[thing] = next(self._numbers)
+    def add(self, patterns: Iterable[str], thing: Thing) -> None:
+        number = next(self._numbers)
+        for pattern in patterns:
+            self._things.setdefault(pattern, {})[thing] = number
 
-    def remove(self, keys: str, thing: Thing) -> bool:
-        """Takes a thing back; whether it was there. Branches that bear nothing more go too."""
-        way, branch = [], self._root
-        for chunk in keys.split("/"):
-            way.append((branch, chunk))
-            if chunk not in branch.next:
-                return False
-            branch = branch.next[chunk]
-        if branch.here.pop(thing, None) is None:
-            return False
-        for before, chunk in reversed(way):
-            if branch.here or branch.next:
-                break
-            del before.next[chunk]
-            branch = before
-        return True
+    def remove(self, patterns: Iterable[str], thing: Thing) -> bool:
+        """Takes a thing back; whether it was there."""
+        was_there = False
+        for pattern in patterns:
+            here = self._things.get(pattern, {})
+            was_there |= here.pop(thing, None) is not None
+            if not here:
+                self._things.pop(pattern, None)
+        return was_there
 
-    def find(self, keys: str) -> list[Thing]:
-        """For a key, what lies under it and under the patterns that include it; for a pattern,
-        what lies under the keys that it includes."""
+    def find(self, patterns: Iterable[str]) -> list[Thing]:
+        """What lies under any of these patterns."""
         found: dict[Thing, int] = {}
-        for branch in self._branches(keys.split("/")):
-            found.update(branch.here)
+        for pattern in patterns:
+            if pattern in self._things:
+                found.update(self._things[pattern])
         return sorted(found, key=found.__getitem__) if len(found) > 1 else list(found)
-
-    def _branches(self, chunks: list[str]) -> Iterator[_Branch[Thing]]:
-        level = [self._root]
-        for chunk in chunks:
-            if chunk == "**":
-                for branch in level:
-                    yield from _with_all_beyond(branch)
-                return
-            following: list[_Branch[Thing]] = []
-            for branch in level:
-                if "**" in branch.next:
-                    yield branch.next["**"]
-                if chunk == "*":
-                    following += branch.next.values()
-                    continue
-                for name in (chunk, "*"):
-                    if name in branch.next:
-                        following.append(branch.next[name])
-            level = following
-        for branch in level:
-            yield branch
-            if "**" in branch.next:
-                yield branch.next["**"]
-
-
-def _with_all_beyond(branch: _Branch[Thing]) -> Iterator[_Branch[Thing]]:
-    yield branch
-    for further in branch.next.values():
-        yield from _with_all_beyond(further)
