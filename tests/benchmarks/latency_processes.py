@@ -17,7 +17,6 @@ from cpcbl_agents.clock import Clock
 from cpcbl_agents.node import Node
 from cpcbl_agents.process import Loop, StopSignal
 from cpcbl_agents.robot import Robot, build_sensing
-from cpcbl_agents.sources import NoSource
 from cpcbl_team.config import (
     CollaborationSettings,
     OdometrySettings,
@@ -82,7 +81,7 @@ class TimingRobot(Robot):
     """A robot that records when a fix has changed its belief."""
 
     def __init__(self, name: str, team: Team, start_ns: int) -> None:
-        super().__init__(name, team, start_ns, build_sensing(name, team, NoSource()))
+        super().__init__(name, team, start_ns, build_sensing(name, team))
         self.changed_ns: dict[int, int] = {}
         """When the belief changed, by the stamp of the fix."""
 

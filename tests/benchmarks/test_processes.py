@@ -7,10 +7,11 @@ from pathlib import Path
 import pytest
 from benchmarks import process_load, processes
 from benchmarks.process_load import Load, Start
+from support.process_usage import MIB, process_usage
 from support.processes import command_line
 from support.tables import assert_fits
 
-from cpcbl_launch.run.processes import MIB, process_usage
+from cpcbl_launch.run.processes import own_memory_mib
 from cpcbl_team.errors import InputError
 from cpcbl_transport.compact import BELIEF_BYTES
 
@@ -87,5 +88,6 @@ def test_the_use_of_a_process_is_its_own() -> None:
     after = process_usage(os.getpid())
     assert after.cpu_s - before.cpu_s >= 0.1
     assert 10 * MIB < after.proportional_bytes <= after.resident_bytes
+    assert 5.0 < own_memory_mib(os.getpid()) < after.resident_bytes / MIB
     with pytest.raises(OSError, match="No such"):
         process_usage(2**30)

@@ -138,15 +138,8 @@ def worlds(
     """Consistency outside the usual case: few landmarks, lost odometry, unknown starts, ..."""
     from cpcbl_launch.lab.experiments import worlds as experiment
 
-    cases = experiment.cases(parse_names(names), parse_names(variants))
-
-    def measure(done: Callable[[], None]) -> Any:
-        return experiment.EXPERIMENT.outcome(
-            experiment.EXPERIMENT.results(cases, seeds, jobs, done)
-        )
-
-    total = len(cases) * seeds
-    _conduct("worlds", measure, experiment.tables, output, as_json, total=total, drawn=False)
+    cases = partial(experiment.cases, parse_names(names), parse_names(variants))
+    conduct(experiment.EXPERIMENT._replace(cases=cases), seeds, jobs, output, as_json)
 
 
 @experiment_app.command("eyes")
@@ -212,8 +205,8 @@ def conduct(
     def measure(done: Callable[[], None]) -> Any:
         return experiment.outcome(experiment.results(cases, seeds, jobs, done))
 
-    total = len(cases) * seeds
-    _conduct(experiment.name, measure, experiment.tables, output, as_json, total=total)
+    name, tables, drawn = experiment.name, experiment.tables, experiment.drawn
+    _conduct(name, measure, tables, output, as_json, total=len(cases) * seeds, drawn=drawn)
 
 
 def _conduct(

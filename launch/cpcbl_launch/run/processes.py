@@ -2,6 +2,7 @@
 
 import logging
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -24,7 +25,6 @@ FIRST_BACKOFF_S = 0.5
 LONGEST_BACKOFF_S = 8.0
 HEALTHY_S = 10.0
 PATIENCE_S = 3.0
-MIB = 2**20
 _PROC = Path("/proc")
 
 
@@ -200,16 +200,7 @@ class Supervisor:
                 process.wait()
 
 
-# What a process has used, from /proc (Linux) -----------------------------------------------------
-
-
-class Usage(NamedTuple):
-    """Of one process, up to now."""
-
-    cpu_s: float  # user and system
-    resident_bytes: int
-    proportional_bytes: int  # pages that n processes share count 1 / n
-    own_bytes: int  # no file's pages: heap and stacks, whoever else runs
+# What a process uses, from /proc (Linux) ---------------------------------------------------------
 
 
 def require_process_usage(what: str) -> None:
@@ -218,12 +209,8 @@ def require_process_usage(what: str) -> None:
         raise DependencyError(f"{what} needs /proc/PID/smaps_rollup: run it on Linux")
 
 
-def process_usage(pid: int) -> Usage:
-    """Raises OSError when there is no such process."""
-    stat = (_PROC / str(pid) / "stat").read_text()
-    fields = stat.rpartition(")")[2].split()  # the name before it may hold anything
-    user, system = int(fields[11]), int(fields[12])
-    lines = (_PROC / str(pid) / "smaps_rollup").read_text().splitlines()[1:]
-    kib = {name: int(rest.split()[0]) for name, rest in (line.split(":") for line in lines)}
-    resident, proportional, own = (kib[name] * 1024 for name in ("Rss", "Pss", "Anonymous"))
-    return Usage((user + system) / os.sysconf("SC_CLK_TCK"), resident, proportional, own)
+def own_memory_mib(pid: int) -> float:
+    """Heap and stacks of a process, without pages of files. Raises OSError for no process."""
+    rollup = (_PROC / str(pid) / "smaps_rollup").read_text()
+    (kib,) = re.findall(r"^Anonymous: +(\d+) kB$", rollup, re.MULTILINE)
+    return int(kib) / 1024

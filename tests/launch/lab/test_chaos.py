@@ -36,7 +36,7 @@ from cpcbl_launch.lab.chaos.team import (
     router_spec,
     run_team,
 )
-from cpcbl_launch.run.processes import MIB, PROGRAM, Supervisor, process_usage
+from cpcbl_launch.run.processes import PROGRAM, Supervisor, own_memory_mib
 from cpcbl_launch.run.up import free_endpoint
 from cpcbl_launch.team_file import save_resolved
 from cpcbl_transport import topics
@@ -266,7 +266,7 @@ def test_a_router_keeps_no_memory_of_sessions_that_sent_much(tmp_path: Path) -> 
         held = []
         for _ in range(4):
             subprocess.run([sys.executable, "-c", SENDER, endpoint], check=True, timeout=60.0)
-            held.append(process_usage(supervisor.pids[ROUTER]).own_bytes / MIB)
+            held.append(own_memory_mib(supervisor.pids[ROUTER]))
     assert held[-1] - held[0] < 8.0  # with shared memory 10 MiB each
 
 

@@ -13,7 +13,7 @@ from cpcbl_launch.lab.chaos.expectations import checks_recovered
 from cpcbl_launch.lab.chaos.run_log import worst
 from cpcbl_launch.lab.chaos.scenario import FaultRun, ScenarioOptions, ScenarioResult, latest
 from cpcbl_launch.lab.chaos.team import FIELD, ROUTER, RunPlan, TeamUnderTest, demo_team, run_team
-from cpcbl_launch.run.processes import MIB, process_usage, require_process_usage
+from cpcbl_launch.run.processes import own_memory_mib, require_process_usage
 
 FAULTS = ("kill", "freeze", "cut", "slow", "narrow", "flood", "echo")  # names of injectors
 SAMPLE_S = 5.0
@@ -152,7 +152,7 @@ class _FaultSequence:
             for process, pid in self._team.supervisor.pids.items():
                 try:
                     files = len(list(Path(f"/proc/{pid}/fd").iterdir()))
-                    mib = process_usage(pid).own_bytes / MIB
+                    mib = own_memory_mib(pid)
                 except (OSError, KeyError):  # it ends just now
                     continue
                 self.samples[process, pid].append(ProcessSample(now_s, mib, files))

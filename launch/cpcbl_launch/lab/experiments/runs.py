@@ -183,6 +183,7 @@ class Experiment(NamedTuple):
     tables: Callable[[Any], Iterable[RenderableType]]
     run: Callable[[Any, int], Any] = run_case
     needs_opencv: bool = False
+    drawn: bool = True
 
     def results(
         self, cases: Mapping[Any, Any], seeds: int, jobs: int | None, done: Callable[[], None]

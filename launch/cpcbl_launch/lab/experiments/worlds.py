@@ -345,4 +345,4 @@ def tables(result: Outcome) -> Iterable[RenderableType]:
     yield "overconfident: the bounds exclude a NEES of 2, or 98 % in 3 σ"
 
 
-EXPERIMENT = Experiment("worlds", cases, outcome, tables, run_world)
+EXPERIMENT = Experiment("worlds", cases, outcome, tables, run_world, drawn=False)
