@@ -1,11 +1,8 @@
-"""The protocol of a detector of objects in frames, without OpenCV (`vision` implements it)."""
+"""What robots without a camera know of frames: no OpenCV and no numpy (`vision` detects)."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple, Protocol
-
-from cpcbl_team.inputs import Sightings
-from cpcbl_transport.messages import AnnotatedFrame, Frame
+from typing import TYPE_CHECKING, NamedTuple
 
 if TYPE_CHECKING:  # a robot without a camera does not load numpy
     import numpy as np
@@ -19,13 +16,3 @@ class Picture(NamedTuple):
 
     stamp_ns: int
     pixels: NDArray[np.uint8]
-
-
-class Detector(Protocol):
-    """Detects landmarks and teammates in frames."""
-
-    def detect(self, frame: Frame | Picture) -> Sightings | str:
-        """The sightings in a frame, or the reason why it cannot be used (`frame_...`)."""
-
-    def detect_and_annotate(self, frame: Frame | Picture) -> tuple[Sightings | str, AnnotatedFrame]:
-        """The same, and the annotated frame."""

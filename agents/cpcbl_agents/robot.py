@@ -11,11 +11,10 @@ from pathlib import Path
 from cpcbl_agents.agent import AgentMessage, BusEvent, FrameSubscribers, HelpSent, Presence, Tick
 from cpcbl_agents.clocks import ClockMonitor
 from cpcbl_agents.collaboration import CollaborationAgent
-from cpcbl_agents.detector import Detector
 from cpcbl_agents.filtering import FilterAgent
 from cpcbl_agents.guests import GuestRegistry
 from cpcbl_agents.sensing import SensingAgent
-from cpcbl_agents.sources import NoSource, OwnCamera, Source
+from cpcbl_agents.sources import OwnCamera, Source
 from cpcbl_agents.waypoint_follower import WaypointFollower
 from cpcbl_team.config import Team
 from cpcbl_team.inputs import BeliefShared
@@ -149,7 +148,7 @@ def build_robot(
     frames beside the messages of a driver. Raises LogError for a log that cannot be read,
     InputError for a robot with a camera without OpenCV.
     """
-    source: Source = NoSource()
+    source: Source | None = None
     if team.robots[name].source == "mrclam":
         from cpcbl_agents.sources.mrclam import MrclamSource
 
@@ -161,7 +160,7 @@ def build_robot(
 
 
 def build_sensing(
-    name: str, team: Team, source: Source, camera: OwnCamera | None = None
+    name: str, team: Team, source: Source | None = None, camera: OwnCamera | None = None
 ) -> SensingAgent:
     """The sensing agent of a robot that reads this source and this camera."""
     settings = team.robots[name]
@@ -169,7 +168,7 @@ def build_sensing(
     follower = None
     if settings.source == "simulated":
         follower = WaypointFollower(name, settings.waypoints_m, settings.speed_m_s)
-    detector: Detector | None = None
+    detector = None
     if settings.sensing == "camera":
         from cpcbl_agents.vision.detector import CameraDetector
 

@@ -2,17 +2,21 @@
 
 from collections import Counter
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import msgspec
 
 from cpcbl_agents.agent import AgentMessage, FrameSubscribers, PoseEstimate, Tick
-from cpcbl_agents.detector import Detector, Picture
+from cpcbl_agents.detector import Picture
 from cpcbl_agents.sources import OwnCamera, Source
 from cpcbl_agents.waypoint_follower import WaypointFollower
 from cpcbl_team.config import LocalizationSettings
 from cpcbl_team.inputs import Odometry, Position, Sightings
 from cpcbl_team.sensors import corrected_odometry, corrected_sighting, without_duplicates
 from cpcbl_transport.messages import Frame, SensorInput
+
+if TYPE_CHECKING:  # it needs OpenCV
+    from cpcbl_agents.vision.detector import CameraDetector
 
 ANNOTATION_INTERVAL_NS = 500_000_000
 
@@ -21,17 +25,17 @@ class SensingAgent:
     """Polls the source and the camera, takes a driver's messages, corrects delays and scales, and
     leaves out what the settings say the sensor cannot see.
 
-    `map_names`: the names of landmarks and walls. Every other name is a robot's: a teammate's or a
-    guest's.
+    `source`: a log; None where inputs arrive on the bus. `map_names`: the names of landmarks and
+    walls. Every other name is a robot's: a teammate's or a guest's.
     """
 
     def __init__(
         self,
         settings: LocalizationSettings,
-        source: Source,
+        source: Source | None,
         map_names: frozenset[str],
         follower: WaypointFollower | None = None,
-        detector: Detector | None = None,
+        detector: "CameraDetector | None" = None,
         camera: OwnCamera | None = None,
     ) -> None:
         self._sensor, self._odometry = settings.sensor, settings.odometry
@@ -39,7 +43,7 @@ class SensingAgent:
         own = settings.position_sensor
         self._position_delay_ns = 0 if own is None else int(own.delay_s * 1e9)
         self._source, self._camera, self._map_names = source, camera, map_names
-        self._sources = (source,) if camera is None else (source, camera)
+        self._sources = [s for s in (source, camera) if s is not None]
         self._follower, self._detector, self._has_subscribers = follower, detector, False
         self._annotated_ns = -ANNOTATION_INTERVAL_NS
         self._counts: Counter[str] = Counter()
@@ -59,7 +63,7 @@ class SensingAgent:
 
     @property
     def is_finished(self) -> bool:
-        return self._source.is_finished
+        return self._source is not None and self._source.is_finished
 
     def handle(self, message: AgentMessage, now_ns: int) -> Sequence[AgentMessage]:
         match message:

@@ -33,13 +33,3 @@ class OwnCamera(Source, Protocol):
 
     def close(self) -> None:
         """Releases the camera."""
-
-
-class NoSource:
-    """For robots whose inputs arrive on the bus: from a driver or the simulated field."""
-
-    next_ns: int | None = None
-    is_finished = False
-
-    def poll(self, now_ns: int) -> Sequence[Odometry | Sightings | Frame | Picture]:
-        return ()

@@ -64,9 +64,9 @@ class Camera:
         self.matrix = np.array([[s.fx_px, 0.0, s.cx_px], [0.0, s.fy_px, s.cy_px], [0.0, 0.0, 1.0]])
         self.distortion = np.array(s.distortion)
         yaw, tilt, roll = (math.radians(a) for a in (s.yaw_deg, s.tilt_deg, s.roll_deg))
-        self.robot_from_camera = (
-            _rotation(2, yaw) @ _rotation(1, tilt) @ _rotation(0, roll) @ _FORWARD
-        )
+        turns = ((0.0, 0.0, yaw), (0.0, tilt, 0.0), (roll, 0.0, 0.0))
+        about_z, about_y, about_x = (cv2.Rodrigues(np.array(turn))[0] for turn in turns)
+        self.robot_from_camera: Floats = about_z @ about_y @ about_x @ _FORWARD
         """Rotation (3, 3)."""
         self.position = np.array([s.x_m, s.y_m, s.mounted_m])
         """Of the lens in the robot's frame (m)."""
@@ -102,15 +102,6 @@ class Camera:
         plane = self.undistort(pixels)
         directions = np.column_stack([plane, np.ones(len(plane))]) @ self.robot_from_camera.T
         return np.asarray(directions / np.linalg.norm(directions, axis=1, keepdims=True))
-
-
-def _rotation(axis: int, angle: float) -> Floats:
-    """The rotation (3, 3) about one of the axes x, y, z."""
-    rotation, i, j = np.eye(3), (axis + 1) % 3, (axis + 2) % 3
-    rotation[i, i] = rotation[j, j] = math.cos(angle)
-    rotation[j, i] = math.sin(angle)
-    rotation[i, j] = -rotation[j, i]
-    return rotation
 
 
 class Scale(NamedTuple):

@@ -45,6 +45,7 @@ _ACROSS = np.linspace(-1.0, 1.0, TAPS, dtype=np.float32)
 _BETWEEN = 0.5 * (_ACROSS[1:] + _ACROSS[:-1])
 _OUTWARDS = np.array([1.0, -1.0], np.float32)
 _NEXT = [1, 2, 3, 0]
+_SQUARE = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]], np.float32)
 _WITHIN = np.array([[x, y] for y in (-0.15, 0.15) for x in (-0.15, 0.15)])
 
 
@@ -109,21 +110,9 @@ def _sample_points(cells: int) -> Floats:
 
 
 def _project_to_quads(points: Floats, quads: Floats) -> Floats:
-    """Points (n, 2) of the unit square, projected into each of the quads: (m, n, 2). (Heckbert,
-    Fundamentals of texture mapping, 1989, section 2.2.3.)"""
-    a, b, c, d = quads.transpose(1, 0, 2)
-    right, below, bend = b - c, d - c, a - b + c - d
-    size = _cross(right, below)
-    across, down = _cross(bend, below) / size, _cross(right, bend) / size
-    x = b - a + across[:, None] * b
-    y = d - a + down[:, None] * d
-    s, t = points.T[:, None, :, None]
-    deep = 1.0 + across[:, None, None] * s + down[:, None, None] * t
-    return np.asarray((s * x[:, None] + t * y[:, None] + a[:, None]) / deep)
-
-
-def _cross(a: Floats, b: Floats) -> Floats:
-    return np.asarray(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
+    """Points (n, 2) of the unit square, projected into each of the quads: (m, n, 2)."""
+    maps = (cv2.getPerspectiveTransform(_SQUARE, quad) for quad in quads.astype(np.float32))
+    return np.stack([cv2.perspectiveTransform(points[None], one)[0] for one in maps])
 
 
 def side_edge_points(grey: Pixels, quads: Floats, cells: int) -> Floats:

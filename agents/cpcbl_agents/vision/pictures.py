@@ -95,14 +95,9 @@ def _header_fault(header: Header, size_px: tuple[int, int]) -> str:
 
 def pixel_fault(pixels: Pixels, size_px: tuple[int, int]) -> str:
     """Why a picture cannot be used by a camera of this size (width, height); empty if it can."""
-    if pixels.size == 0:
-        return "frame_empty"
-    if pixels.ndim != 3 or pixels.shape[2] != 3:
-        return "frame_wrong_channels"
-    if pixels.dtype != np.uint8:
-        return "frame_wrong_depth"
-    if (pixels.shape[1], pixels.shape[0]) != size_px:
-        return "frame_wrong_size"
+    height, width, channels = (*pixels.shape, 1)[:3]
+    if reason := _header_fault(Header(width, height, channels, 8 * pixels.itemsize), size_px):
+        return reason
     means, spreads = cv2.meanStdDev(np.ascontiguousarray(pixels[::8, ::8]))
     if spreads.max() >= LEAST_CONTRAST:
         return ""
