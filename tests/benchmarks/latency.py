@@ -31,6 +31,7 @@ from benchmarks.latency_processes import (
 )
 from benchmarks.report import show_and_write
 from rich.console import RenderableType
+from support.routers import open_router
 
 from cpcbl_agents.clock import Clock
 from cpcbl_launch.reporting.tables import table
@@ -39,7 +40,7 @@ from cpcbl_team.inputs import Fix, Sightings
 from cpcbl_transport.bus import Bus
 from cpcbl_transport.compact import FIX_BYTES, decode_help
 from cpcbl_transport.messages import decode_tagged
-from cpcbl_transport.zenoh_bus import open_bus, open_router
+from cpcbl_transport.zenoh_bus import open_bus
 
 PERIOD_NS = 103_000_000  # no multiple of the filter's 100 ms, so that every phase of it occurs
 UNMEASURED = 10  # sightings at the start, while code and caches warm up

@@ -15,6 +15,7 @@ from statistics import mean, median
 
 import msgspec
 from support.process_usage import MIB, process_usage
+from support.routers import open_router
 
 from cpcbl_agents.clock import Clock
 from cpcbl_agents.node import STATUS_NS
@@ -29,7 +30,7 @@ from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus
 from cpcbl_transport.compact import BELIEF_BYTES, decode_help, encode_help
 from cpcbl_transport.messages import Status, Track, decode_tagged, encode
-from cpcbl_transport.zenoh_bus import open_bus, open_router
+from cpcbl_transport.zenoh_bus import open_bus
 
 LATE_NS = 100_000_000
 TRACKS_HZ = 10.0

@@ -9,12 +9,12 @@ from pathlib import Path
 import pytest
 from support.logs import write_log
 from support.processes import command_line, cpcbl_team, eventually, patient_up, pids_of
+from support.routers import open_router
 
 from cpcbl_launch.run.processes import PROGRAM
 from cpcbl_launch.run.up import free_endpoint
 from cpcbl_transport import topics
 from cpcbl_transport.messages import Status, decode_tagged
-from cpcbl_transport.zenoh_bus import open_router
 
 DRIVER = Path(__file__).parents[2] / "docs" / "external_driver.py"
 FIGURES = {

@@ -14,8 +14,9 @@ from cpcbl_team.config import Field, RobotSettings, Start, Team, TransportSettin
 from cpcbl_transport.bus import Bus
 from cpcbl_transport.security import Credentials, Identity, access_control, credentials_in
 from cpcbl_transport.topics import Role
-from cpcbl_transport.zenoh_bus import open_bus, open_router
+from cpcbl_transport.zenoh_bus import open_bus
 from cpcbl_transport.zenoh_config import guard_rules
+from support.routers import open_router
 from support.wire_tap import Batch, Kind, Relay
 
 R1, R2 = Identity(Role.ROBOT, "r1"), Identity(Role.ROBOT, "r2")

@@ -17,12 +17,13 @@ from cpcbl_team.inputs import Sighting
 from cpcbl_transport.bus import Bus, Handle, LivelinessCallback, MessageCallback, Publisher
 from cpcbl_transport.memory_bus import MemoryBus
 from cpcbl_transport.topics import Qos
-from cpcbl_transport.zenoh_bus import ZenohBus, open_bus, open_router
+from cpcbl_transport.zenoh_bus import ZenohBus, open_bus
 from support.buses import (
     PATIENCE_S,
     TeamOnBus,
     saw,
 )
+from support.routers import open_router
 from support.wire_tap import Relay
 
 GOOD, MIDDLING, POOR = 0.02, 0.15, 0.6

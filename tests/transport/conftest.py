@@ -8,6 +8,7 @@ from support.keys import (
     secured_team,
     shown_by,
 )
+from support.routers import open_router
 from support.secured_team import MARK
 
 from cpcbl_launch.run.up import free_endpoint
@@ -16,7 +17,6 @@ from cpcbl_transport import topics
 from cpcbl_transport.security import (
     access_control,
 )
-from cpcbl_transport.zenoh_bus import open_router
 
 
 @pytest.fixture(scope="module")

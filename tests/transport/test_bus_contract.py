@@ -11,12 +11,13 @@ import zenoh
 from hypothesis import given
 from hypothesis import strategies as st
 from support.buses import Subscription, examples, matches, wait_until
+from support.routers import open_router
 
 from cpcbl_launch.run.up import free_endpoint
 from cpcbl_transport.bus import Bus
 from cpcbl_transport.memory_bus import MemoryHub
 from cpcbl_transport.topics import Qos
-from cpcbl_transport.zenoh_bus import BusError, open_bus, open_router
+from cpcbl_transport.zenoh_bus import BusError, open_bus
 
 RELIABLE = Qos.INPUT
 

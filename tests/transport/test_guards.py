@@ -10,6 +10,7 @@ import pytest
 import zenoh
 from msgspec.structs import replace
 from support.buses import Subscription, robot_at, team_of, wait_until
+from support.routers import open_router
 
 from cpcbl_launch.run.up import free_endpoint
 from cpcbl_team.config import GuardSettings, Team, TransportSettings
@@ -17,7 +18,7 @@ from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus
 from cpcbl_transport.messages import LARGEST_FRAME, LARGEST_PAYLOAD
 from cpcbl_transport.topics import Qos
-from cpcbl_transport.zenoh_bus import open_bus, open_router
+from cpcbl_transport.zenoh_bus import open_bus
 from cpcbl_transport.zenoh_config import guard_rules
 
 FIX = topics.FIX.at(robot="victim", tier=7, observer="faulty")

@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from support.buses import Subscription, examples, wait_until
+from support.routers import open_router
 from support.wire_tap import Batch, Kind, Relay, kind_of, most_in_window, put_down, total
 
 from cpcbl_launch.run.up import free_endpoint
@@ -22,7 +23,7 @@ from cpcbl_transport.compact import (
     sent_bytes,
 )
 from cpcbl_transport.topics import Qos
-from cpcbl_transport.zenoh_bus import open_bus, open_router
+from cpcbl_transport.zenoh_bus import open_bus
 
 LONG_NAME = "observer-one"
 

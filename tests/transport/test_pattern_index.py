@@ -38,12 +38,14 @@ def indices(
     left."""
     index: PatternIndex[Kept] = PatternIndex()
     kept: list[Kept] = []
+    removals: list[Callable[[], bool]] = []
     for number, a_key in enumerate(draw(st.lists(keys, max_size=12))):
         kept.append(Kept(number, a_key))
-        index.add(patterns(a_key), kept[-1])
+        removals.append(index.add(patterns(a_key), kept[-1]))
         if draw(st.integers(0, 2)) == 0:
-            taken = kept.pop(draw(st.integers(0, len(kept) - 1)))
-            assert index.remove(patterns(taken.keys), taken)
+            taken = draw(st.integers(0, len(kept) - 1))
+            del kept[taken]
+            assert removals.pop(taken)()
     return index, kept
 
 
@@ -68,22 +70,18 @@ def test_a_pattern_finds_the_keys_that_it_includes(
 @pytest.mark.parametrize("keys", ["a/b", "a/*", "a/**", "**"])
 def test_what_is_taken_back_is_gone_and_can_be_taken_back_once(keys: str) -> None:
     index: PatternIndex[str] = PatternIndex()
-    for thing in ("first", "second"):
-        index.add([keys], thing)
-    assert not index.remove(["a/c"], "first")
-    assert not index.remove(["c/b"], "first")
-    assert [index.remove([keys], "first") for _ in range(2)] == [True, False]
-    assert index.find(patterns_of("a/b")) == ["second"]
-    assert index.remove([keys], "second")
+    remove_first, remove_second = (index.add([keys], thing) for thing in ("same", "same"))
+    assert index.find(patterns_of("a/b")) == ["same", "same"]
+    assert [remove_first(), remove_first()] == [True, False]
+    assert index.find(patterns_of("a/b")) == ["same"]
+    assert remove_second()
     assert index.find(patterns_of("a/b")) == []
 
 
 def test_nothing_is_left_of_keys_that_come_and_go() -> None:
     index: PatternIndex[int] = PatternIndex()
     keys = [f"alive/3/r{i}/{i}" for i in range(50)]
-    for number, a_key in enumerate(keys):
-        index.add(patterns_of(a_key), number)
+    removals = [index.add(patterns_of(a_key), number) for number, a_key in enumerate(keys)]
     assert len(index._things) > 50
-    for number, a_key in enumerate(keys):
-        assert index.remove(patterns_of(a_key), number)
+    assert all(remove() for remove in removals)
     assert not index._things

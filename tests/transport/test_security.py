@@ -20,6 +20,7 @@ from support.keys import (
     session,
     shown_by,
 )
+from support.routers import open_router
 from support.secured_team import MARK, say
 
 from cpcbl_launch.run.up import free_endpoint
@@ -39,7 +40,6 @@ from cpcbl_transport.security import (
     subscribe_keys,
 )
 from cpcbl_transport.topics import Qos, Role
-from cpcbl_transport.zenoh_bus import open_router
 from cpcbl_transport.zenoh_config import router_config
 
 OWN_ROBOT = {

@@ -24,6 +24,7 @@ from support.keys import (
     with_credentials,
 )
 from support.processes import eventually
+from support.routers import open_router
 from support.secured_team import MARK, say
 
 from cpcbl_launch.run.up import free_endpoint
@@ -37,7 +38,7 @@ from cpcbl_transport.security import (
     Identity,
 )
 from cpcbl_transport.topics import Permission, Qos
-from cpcbl_transport.zenoh_bus import BusError, open_router
+from cpcbl_transport.zenoh_bus import BusError
 
 
 def hears(bus: Bus, speaker: Bus, key: str, within_s: float = PATIENCE_S) -> bool:

@@ -21,10 +21,11 @@ from support.keys import (
     shown_by,
     with_credentials,
 )
+from support.routers import open_router
 
 from cpcbl_launch.run.up import free_endpoint
 from cpcbl_team.config import Team
-from cpcbl_transport.zenoh_bus import BusError, open_router
+from cpcbl_transport.zenoh_bus import BusError
 
 
 def config_of(endpoint: str, **tls: Any) -> "zenoh.Config":

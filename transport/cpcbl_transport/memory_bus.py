@@ -1,60 +1,44 @@
 """The bus inside one process: deterministic, for simulations in one process and for tests."""
 
-from collections.abc import Iterable
-from functools import lru_cache
+from collections.abc import Callable, Collection, Iterable
+from functools import lru_cache, partial
 from itertools import count
-from typing import Generic, TypeVar
+from typing import Generic, NamedTuple, TypeVar
 
 from cpcbl_transport.bus import Bus, Handle, LivelinessCallback, MessageCallback, Publisher
 from cpcbl_transport.topics import Qos
 
-HandleT = TypeVar("HandleT", bound=Handle)
-CallbackT = TypeVar("CallbackT")
 Thing = TypeVar("Thing")
+HandleT = TypeVar("HandleT", bound=Handle)
+
+
+class _Subscriber(NamedTuple):
+    session: object
+    on_message: MessageCallback
+
+
+class _Handle:
+    def __init__(self, undeclare: Callable[[], object]) -> None:
+        self._undeclare = undeclare
+
+    def close(self) -> None:
+        self._undeclare()
 
 
 class MemoryHub:
     """Connects the sessions of one process; delivers in the order of declaration."""
 
     def __init__(self) -> None:
-        self.subscribers: PatternIndex[_Listener[MessageCallback]] = PatternIndex()
-        self.watchers: PatternIndex[_Listener[LivelinessCallback]] = PatternIndex()
-        self.tokens: PatternIndex[_Token] = PatternIndex()
+        self.subscribers: PatternIndex[_Subscriber] = PatternIndex()
+        self.watchers: PatternIndex[LivelinessCallback] = PatternIndex()
+        self.tokens: PatternIndex[str] = PatternIndex()
 
     def session(self) -> "MemoryBus":
         return MemoryBus(self)
 
     def notify_watchers(self, key: str, alive: bool) -> None:
-        for watcher in self.watchers.find(patterns_of(key)):
-            watcher.callback(key, alive)
-
-
-class _Listener(Generic[CallbackT]):
-    """A subscription, or who watches tokens: it lies in an index of the hub until it is closed."""
-
-    def __init__(
-        self,
-        index: "PatternIndex[_Listener[CallbackT]]",
-        session: object,
-        keys: str,
-        callback: CallbackT,
-    ) -> None:
-        self._index, self.session, self._keys, self.callback = index, session, keys, callback
-        index.add([keys], self)
-
-    def close(self) -> None:
-        self._index.remove([self._keys], self)
-
-
-class _Token:
-    def __init__(self, hub: MemoryHub, key: str) -> None:
-        self._hub, self.key = hub, key
-        hub.tokens.add(patterns_of(key), self)
-        hub.notify_watchers(key, True)
-
-    def close(self) -> None:
-        if self._hub.tokens.remove(patterns_of(self.key), self):
-            self._hub.notify_watchers(self.key, False)
+        for on_change in self.watchers.find(patterns_of(key)):
+            on_change(key, alive)
 
 
 class _MemoryPublisher:
@@ -69,9 +53,9 @@ class _MemoryPublisher:
     def put(self, payload: bytes) -> None:
         if self._open:
             for subscriber in self._others():
-                subscriber.callback(self._key, payload)
+                subscriber.on_message(self._key, payload)
 
-    def _others(self) -> list[_Listener[MessageCallback]]:
+    def _others(self) -> list[_Subscriber]:
         """The subscribers of other sessions."""
         found = self._hub.subscribers.find(self._patterns)
         return [s for s in found if s.session is not self._session]
@@ -91,15 +75,22 @@ class MemoryBus(Bus):
         return self._keep(_MemoryPublisher(self._hub, self, key))
 
     def subscribe(self, keys: str, on_message: MessageCallback) -> Handle:
-        return self._keep(_Listener(self._hub.subscribers, self, keys, on_message))
+        return self._keep(_Handle(self._hub.subscribers.add([keys], _Subscriber(self, on_message))))
 
     def declare_token(self, key: str) -> Handle:
-        return self._keep(_Token(self._hub, key))
+        remove = self._hub.tokens.add(patterns_of(key), key)
+        self._hub.notify_watchers(key, True)
+
+        def close() -> None:
+            if remove():
+                self._hub.notify_watchers(key, False)
+
+        return self._keep(_Handle(close))
 
     def watch_liveliness(self, keys: str, on_change: LivelinessCallback) -> Handle:
-        watcher = self._keep(_Listener(self._hub.watchers, self, keys, on_change))
-        for token in self._hub.tokens.find([keys]):
-            on_change(token.key, True)
+        watcher = self._keep(_Handle(self._hub.watchers.add([keys], on_change)))
+        for key in self._hub.tokens.find([keys]):
+            on_change(key, True)
         return watcher
 
     def close(self) -> None:
@@ -129,28 +120,29 @@ class PatternIndex(Generic[Thing]):
     search costs as much as it looks up and finds, however much is stored."""
 
     def __init__(self) -> None:
-        self._things: dict[str, dict[Thing, int]] = {}
+        self._things: dict[str, dict[int, Thing]] = {}
         self._numbers = count()
 
-    def add(self, patterns: Iterable[str], thing: Thing) -> None:
+    def add(self, patterns: Collection[str], thing: Thing) -> Callable[[], bool]:
+        """Adds a thing. What it returns takes it back, and says whether it was there."""
         number = next(self._numbers)
         for pattern in patterns:
-            self._things.setdefault(pattern, {})[thing] = number
+            self._things.setdefault(pattern, {})[number] = thing
+        return partial(self._remove, patterns, number)
 
-    def remove(self, patterns: Iterable[str], thing: Thing) -> bool:
-        """Takes a thing back; whether it was there."""
+    def _remove(self, patterns: Collection[str], number: int) -> bool:
         was_there = False
         for pattern in patterns:
             here = self._things.get(pattern, {})
-            was_there |= here.pop(thing, None) is not None
+            was_there |= here.pop(number, None) is not None
             if not here:
                 self._things.pop(pattern, None)
         return was_there
 
     def find(self, patterns: Iterable[str]) -> list[Thing]:
         """What lies under any of these patterns."""
-        found: dict[Thing, int] = {}
+        found: dict[int, Thing] = {}
         for pattern in patterns:
             if pattern in self._things:
                 found.update(self._things[pattern])
-        return sorted(found, key=found.__getitem__) if len(found) > 1 else list(found)
+        return [found[number] for number in sorted(found)]

@@ -23,7 +23,7 @@ from cpcbl_team.errors import CpcblError
 from cpcbl_transport.bus import Bus, Handle, LivelinessCallback, MessageCallback, Publisher
 from cpcbl_transport.security import Credentials
 from cpcbl_transport.topics import Qos, namespace
-from cpcbl_transport.zenoh_config import client_config, router_config
+from cpcbl_transport.zenoh_config import client_config
 
 log = logging.getLogger(__name__)
 
@@ -63,18 +63,7 @@ def _tls_reason(connect: Sequence[str], credentials: Credentials | None) -> str:
     return "; ".join(dict.fromkeys(filter(None, reasons.values())))
 
 
-def open_router(
-    team: str,
-    listen: Sequence[str],
-    connect: Sequence[str] = (),
-    guards: Mapping[str, Any] | None = None,
-    credentials: Credentials | None = None,
-) -> "ZenohBus":
-    """The session of a team's router (`router_config`). Raises BusError when it cannot listen."""
-    return open_plain_router(router_config(listen, connect, guards, credentials), namespace(team))
-
-
-def open_plain_router(config: Mapping[str, Any], space: str | None = None) -> "ZenohBus":
+def open_router(config: Mapping[str, Any], space: str | None = None) -> "ZenohBus":
     """A session that is a router for all teams, as its configuration says. Without a namespace its
     own keys are whole ones. Raises BusError when it cannot listen there."""
     try:

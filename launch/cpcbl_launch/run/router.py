@@ -8,7 +8,7 @@ from typing import Any
 from cpcbl_team.config import Team
 from cpcbl_transport.security import Identity, access_control, link_of
 from cpcbl_transport.topics import Role
-from cpcbl_transport.zenoh_bus import listening_at, open_plain_router
+from cpcbl_transport.zenoh_bus import listening_at, open_router
 from cpcbl_transport.zenoh_config import guard_rules, router_config
 
 log = logging.getLogger(__name__)
@@ -33,7 +33,7 @@ def team_router(
 
 def run_router(config: Mapping[str, Any], title: str, stop: Callable[[], bool]) -> None:
     """Routes until `stop()`; logs where it listens, and who comes and goes. Raises BusError."""
-    with open_plain_router(config) as bus:
+    with open_router(config) as bus:
         log.info("%s listens at %s", title, ", ".join(listening_at(config)))
         known: dict[str, str] = {}
         while not stop():

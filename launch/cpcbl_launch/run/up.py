@@ -23,15 +23,15 @@ from cpcbl_launch.reporting.recorder import Recorder, Report, variants_of
 from cpcbl_launch.reporting.recording import Recording
 from cpcbl_launch.run.logged_team import is_calibrated_on
 from cpcbl_launch.run.processes import Processes, Supervisor, process_table, tasks
+from cpcbl_launch.run.router import team_router
 from cpcbl_launch.simulation.in_process import Progress, simulate
 from cpcbl_launch.team_file import save_resolved
 from cpcbl_team.config import Team
 from cpcbl_team.errors import InputError
 from cpcbl_transport.bus import Bus
-from cpcbl_transport.security import Identity, access_control, link_of
-from cpcbl_transport.topics import Role
+from cpcbl_transport.security import link_of
+from cpcbl_transport.topics import namespace
 from cpcbl_transport.zenoh_bus import open_router
-from cpcbl_transport.zenoh_config import guard_rules
 
 log = logging.getLogger(__name__)
 
@@ -88,9 +88,7 @@ class OnThisMachine:
     def router(self) -> AbstractContextManager[Bus]:
         team, listen = self._run.team, self._run.team.transport.listen
         require_keys(team, listen, self._here)
-        guards = guard_rules(team, self._run.speed) | access_control(team)
-        _, credentials = link_of(team, Identity(Role.ROUTER), listen)
-        return open_router(team.name, listen, guards=guards, credentials=credentials)
+        return open_router(team_router(team, listen, (), self._run.speed), namespace(team.name))
 
     def processes(self, clock: Clock) -> AbstractContextManager[Processes]:
         team, path = self._run.team, self._folder / "team.json"

@@ -16,6 +16,7 @@ from pathlib import Path
 import pytest
 from support.buses import Subscription, wait_until
 from support.processes import command_line, cpcbl_team, eventually, pids_of
+from support.routers import open_router
 
 from cpcbl_launch.lab.chaos.checks import Check, Outcome
 from cpcbl_launch.lab.chaos.injectors import echoes
@@ -41,7 +42,7 @@ from cpcbl_launch.run.up import free_endpoint
 from cpcbl_launch.team_file import save_resolved
 from cpcbl_transport import topics
 from cpcbl_transport.topics import Qos
-from cpcbl_transport.zenoh_bus import open_bus, open_router
+from cpcbl_transport.zenoh_bus import open_bus
 
 NOTHING = Requirement()
 SETTING = ScenarioOptions(seed=3, soak_s=60.0)

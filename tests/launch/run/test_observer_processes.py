@@ -14,6 +14,7 @@ from support.buses import PATIENCE_S
 from support.docker import image, left_of
 from support.observers import BLIND, changed
 from support.processes import eventually, pids_of
+from support.routers import open_router
 
 import cpcbl_launch
 from cpcbl_launch.reporting.metrics import seconds
@@ -28,7 +29,6 @@ from cpcbl_team.config import TransportSettings
 from cpcbl_transport import topics
 from cpcbl_transport.messages import Status, decode_tagged
 from cpcbl_transport.security import CA, CERTIFICATE, PRIVATE_KEY, SecurityError
-from cpcbl_transport.zenoh_bus import open_router
 
 SHIPPED = Path(cpcbl_launch.__file__).parent / "observers"
 

@@ -12,6 +12,7 @@ import msgspec
 import pytest
 from support.buses import Subscription, robot_at, team_of, wait_until
 from support.processes import command_of, eventually
+from support.routers import open_router
 
 from cpcbl_launch.reporting.recorder import Recorder, Report
 from cpcbl_launch.run.processes import PROGRAM, Processes, ProcessSpec, Supervisor
@@ -20,7 +21,7 @@ from cpcbl_launch.team_file import builtin_path, load_team, save_resolved
 from cpcbl_team.config import GuardSettings, Team, TransportSettings
 from cpcbl_transport import topics
 from cpcbl_transport.topics import Qos
-from cpcbl_transport.zenoh_bus import open_bus, open_router
+from cpcbl_transport.zenoh_bus import open_bus
 
 ROBOTS = ("navigator", "observer", "scout", "patrol")
 

@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 from support.cameras import jpeg, picture, png, streaming, url
 from support.processes import eventually
+from support.routers import open_router
 
 from cpcbl_launch.run.processes import PROGRAM
 from cpcbl_launch.run.up import free_endpoint
@@ -20,7 +21,6 @@ from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus
 from cpcbl_transport.decoding import decode
 from cpcbl_transport.messages import Frame, Refusal, Status, encode
-from cpcbl_transport.zenoh_bus import open_router
 
 PATIENCE_S = 60.0
 TEAM = """

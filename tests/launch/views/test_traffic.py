@@ -14,6 +14,7 @@ import pytest
 from rich.console import Console, RenderableType
 from support.buses import SECOND, TeamOnBus, robot_at, saw, team_of, wait_until
 from support.processes import cpcbl_team, pids_of
+from support.routers import open_router
 from support.traffic import MISER_BYTES_PER_S, TEAM, flow, recorded, seen, shown, status
 
 from cpcbl_launch.reporting.recorder import Recorder
@@ -30,7 +31,7 @@ from cpcbl_transport import topics
 from cpcbl_transport.budget import bytes_window
 from cpcbl_transport.memory_bus import MemoryHub
 from cpcbl_transport.messages import Spending, encode
-from cpcbl_transport.zenoh_bus import open_bus, open_router
+from cpcbl_transport.zenoh_bus import open_bus
 
 
 def rendered(what: RenderableType, width: int = 80) -> list[str]:
