@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING
 import msgspec
 
 from cpcbl_agents.agent import AgentMessage, FrameSubscribers, PoseEstimate, Tick
-from cpcbl_agents.detector import Picture
-from cpcbl_agents.sources import OwnCamera, Source
+from cpcbl_agents.sources import OwnCamera, Picture, Source
 from cpcbl_agents.waypoint_follower import WaypointFollower
 from cpcbl_team.config import LocalizationSettings
 from cpcbl_team.inputs import Odometry, Position, Sightings

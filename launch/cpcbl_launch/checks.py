@@ -46,7 +46,7 @@ def require_matplotlib(what: str, path: Path | None = None) -> None:
 def require_opencv(what: str) -> None:
     """Raises DependencyError where OpenCV is not installed."""
     if importlib.util.find_spec("cv2") is None:
-        from cpcbl_agents.detector import NEEDS_OPENCV
+        from cpcbl_agents.sources import NEEDS_OPENCV
 
         raise DependencyError(f"{what} {NEEDS_OPENCV}")
 

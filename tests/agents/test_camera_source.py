@@ -13,8 +13,7 @@ from support.buses import MS, SECOND, wait_until
 from support.cameras import SIZE, jpeg, number_of, picture, png, streaming, url, write_video
 from support.processes import eventually
 
-from cpcbl_agents.detector import Picture
-from cpcbl_agents.sources import OwnCamera
+from cpcbl_agents.sources import OwnCamera, Picture
 from cpcbl_agents.sources.camera import LiveCamera, open_camera
 from cpcbl_agents.vision.pictures import decode_frame, pixel_fault
 from cpcbl_team.config import CameraSettings

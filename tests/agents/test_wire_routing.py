@@ -15,6 +15,7 @@ from support.buses import (
 )
 from support.logs import EPOCH_MS, STARTS, write_log
 from support.processes import eventually
+from support.routers import open_router
 from support.wire_tap import Kind, Relay, total
 from support.wired_team import (
     GOOD,
@@ -43,7 +44,6 @@ from cpcbl_team.config import (
 )
 from cpcbl_team.inputs import Sighting
 from cpcbl_team.tiers import LOWEST_TIER
-from cpcbl_transport.zenoh_bus import open_router
 from cpcbl_transport.zenoh_config import guard_rules
 
 

@@ -1,12 +1,26 @@
 """Where inputs come from: a driver on the bus, the simulated field, a camera, a real log."""
 
+from __future__ import annotations
+
 from collections import Counter
 from collections.abc import Sequence
-from typing import Protocol
+from typing import TYPE_CHECKING, NamedTuple, Protocol
 
-from cpcbl_agents.detector import Picture
 from cpcbl_team.inputs import Odometry, Sightings
 from cpcbl_transport.messages import Frame
+
+if TYPE_CHECKING:  # a robot without a camera does not load numpy
+    import numpy as np
+    from numpy.typing import NDArray
+
+NEEDS_OPENCV = "needs OpenCV: pip install 'cpcbl-team[camera]'"
+
+
+class Picture(NamedTuple):
+    """A frame that needs no decoding: pixels (height, width, 3), BGR, at the time of exposure."""
+
+    stamp_ns: int
+    pixels: NDArray[np.uint8]
 
 
 class Source(Protocol):

@@ -22,8 +22,7 @@ from urllib.parse import urlsplit
 import cv2
 import numpy as np
 
-from cpcbl_agents.detector import Picture
-from cpcbl_agents.sources import OwnCamera
+from cpcbl_agents.sources import OwnCamera, Picture
 from cpcbl_agents.vision.camera import NO_PIXELS, Pixels
 from cpcbl_team.config import CameraSettings
 from cpcbl_team.errors import InputError

@@ -1,6 +1,6 @@
 """Landmarks and teammates in camera frames. Raises DependencyError without OpenCV."""
 
-from cpcbl_agents.detector import NEEDS_OPENCV
+from cpcbl_agents.sources import NEEDS_OPENCV
 from cpcbl_team.errors import DependencyError
 
 try:

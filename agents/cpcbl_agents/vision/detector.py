@@ -4,7 +4,7 @@ It detects landmarks by their colour bands (`cylinders`), and teammates by their
 or, farther away, by the bands of their masts.
 """
 
-from cpcbl_agents.detector import Picture
+from cpcbl_agents.sources import Picture
 from cpcbl_agents.vision.annotate import annotate
 from cpcbl_agents.vision.camera import NO_PIXELS, Camera, Pixels
 from cpcbl_agents.vision.cylinders import CylinderDetector
