@@ -38,8 +38,6 @@ from cpcbl_team.config.team import GuestSettings as GuestSettings
 from cpcbl_team.config.team import LocalizationSettings as LocalizationSettings
 from cpcbl_team.config.team import MatchSettings as MatchSettings
 from cpcbl_team.config.team import RobotSettings as RobotSettings
-from cpcbl_team.config.team import Security as Security
-from cpcbl_team.config.team import Sensing as Sensing
 from cpcbl_team.config.team import Source as Source
 from cpcbl_team.config.team import Start as Start
 from cpcbl_team.config.team import Team as Team

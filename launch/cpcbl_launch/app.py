@@ -4,8 +4,7 @@ import typer
 
 from cpcbl_launch.commands.calibrating import calibrate_app
 from cpcbl_launch.commands.experimenting import experiment_app
-from cpcbl_launch.commands.faults import chaos
-from cpcbl_launch.commands.measuring import evaluate_mrclam, simulate
+from cpcbl_launch.commands.measuring import chaos, evaluate_mrclam, simulate
 from cpcbl_launch.commands.preparing import check, compose, keys
 from cpcbl_launch.commands.running import field, router, up
 from cpcbl_launch.commands.watching import look, observer, traffic

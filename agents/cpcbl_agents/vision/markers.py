@@ -71,11 +71,6 @@ class MarkerReader:
         self._bits = self.dictionary.markerSize
         self.cells = self._bits + 2
         """Of a marker's side, its black border too."""
-        ids = range(len(self.dictionary.bytesList))
-        images = [cv2.aruco.generateImageMarker(self.dictionary, i, self.cells) for i in ids]
-        patterns = [np.where(one[1:-1, 1:-1] > 0, 1, -1) for one in images]
-        self._signs = np.array([np.rot90(p, turn).ravel() for p in patterns for turn in range(4)])
-        self._most_wrong = int(WRONG_SHARE * self.dictionary.maxCorrectionBits)
         self._sample_points = _sample_points(self.cells)
         along = np.arange(self.cells + 2)
         from_side = np.minimum(along, along[::-1])
@@ -94,11 +89,14 @@ class MarkerReader:
         middle = 0.5 * (white + black)
         framed = (borders.max(axis=1) < middle) & (middle < margins.min(axis=1))
         framed &= white - black > LEAST_CONTRAST
-        bits = np.where(levels[:, self._ring_numbers > 1] > middle[:, None], 1, -1)
-        wrong = (self._bits**2 - bits @ self._signs.T) // 2
-        best = wrong.argmin(axis=1)
-        read = framed & (wrong.min(axis=1) <= self._most_wrong)
-        return {int(i): MarkerCode(int(best[i]) // 4, -int(best[i]) % 4) for i in read.nonzero()[0]}
+        bits = (levels[:, self._ring_numbers > 1] > middle[:, None]).astype(np.uint8)
+        codes = {}
+        for i in framed.nonzero()[0].tolist():
+            square = bits[i].reshape(self._bits, self._bits)
+            is_known, number, turns = self.dictionary.identify(square, WRONG_SHARE)
+            if is_known:
+                codes[i] = MarkerCode(number, -turns % 4)
+        return codes
 
 
 def _sample_points(cells: int) -> Floats:

@@ -1,5 +1,7 @@
-"""Commands that measure: real logs, calibration, a simulated team in one process."""
+"""Commands that measure: real logs, calibration, a simulated team in one process, faults."""
 
+import logging
+import signal
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
@@ -46,6 +48,13 @@ ExportFolder = Annotated[
         callback=options.folder,
         help="Folder to write estimates and truth into (TUM files, which evo reads).",
     ),
+]
+Scenarios = Annotated[
+    list[str] | None, Argument(help="Names of scenarios, or all.", metavar="SCENARIO")
+]
+MarkdownFile = Annotated[
+    Path | None,
+    Option(callback=options.writable_file, help="File to write the table into, as Markdown."),
 ]
 
 
@@ -202,3 +211,44 @@ def _simulate_sizes(
 
         lost |= write_or_reason(picture, partial(draw_scaling, result, picture))
     options.print_result(result, as_json, lambda: scaling.print_scaling(result, Console()), lost)
+
+
+def chaos(
+    scenarios: Scenarios = None,
+    listed: Annotated[bool, Option("--list", help="Show the scenarios.")] = False,
+    seed: Annotated[int, Option(help="The seed of noise and of random faults.")] = 1,
+    soak_s: Annotated[float, Option(min=1.0, help="Seconds that the soak takes.")] = 180.0,
+    markdown: MarkdownFile = None,
+    report: options.ReportFile = None,
+    as_json: options.AsJson = False,
+) -> None:
+    """Inject faults into real processes, and compare what happens with what is expected.
+
+    The exit code is 1 if an expectation was not met. A scenario that cannot run here (lost
+    packets and full disks need root) is named, and counts as neither met nor not met.
+    """
+    from cpcbl_launch.lab.chaos import runner
+    from cpcbl_launch.lab.chaos.checks import report_data
+    from cpcbl_launch.lab.chaos.scenario import ScenarioOptions
+    from cpcbl_launch.lab.chaos.scenarios import SCENARIOS
+
+    if listed or not scenarios:
+        runner.print_scenarios(SCENARIOS, Console())
+        return
+    todo = runner.select_scenarios(scenarios)
+    logging.getLogger("cpcbl_launch").setLevel(logging.ERROR)  # restarts are part of it
+    logging.getLogger("cpcbl_transport").setLevel(logging.ERROR)
+    for number in (signal.SIGTERM, signal.SIGHUP):  # each ends what it has started
+        if signal.getsignal(number) != signal.SIG_IGN:
+            signal.signal(number, signal.default_int_handler)
+    with runner.Progress(Console(stderr=True), len(todo)) as shown:
+        chosen = ScenarioOptions(seed, soak_s, shown.doing)
+        faults = runner.run_scenarios(todo, chosen, shown.began, shown.done)
+    result = report_data(faults)
+    lost = options.write_report(report, result)
+    if (page := markdown) is not None:
+        text = "\n".join(runner.markdown(faults)) + "\n"
+        lost |= write_or_reason(page, lambda: page.write_text(text, encoding="utf-8"))
+    options.print_result(result, as_json, lambda: runner.print_faults(faults, Console()), lost)
+    if not faults.is_met:
+        raise typer.Exit(1)
