@@ -50,7 +50,6 @@ GOOD: dict[str, Tagged] = {
 @pytest.mark.parametrize("key", GOOD)
 def test_what_the_key_allows_is_taken(key: str) -> None:
     assert decode(key, encode(GOOD[key])) == GOOD[key]
-    assert decode(key, encode(GOOD[key]), NOW) == GOOD[key]
 
 
 @pytest.mark.parametrize(
@@ -92,11 +91,6 @@ def test_what_the_key_allows_is_taken(key: str) -> None:
 )
 def test_what_it_does_not_allow_is_refused(key: str, message: Tagged, reason: Refusal) -> None:
     assert decode(key, encode(message)) is reason
-
-
-def test_the_future_is_refused_by_those_with_a_clock() -> None:
-    assert decode("track/r1", encode(TRACK), NOW - 2 * SECOND) is Refusal.FUTURE
-    assert decode("track/r1", encode(TRACK)) == TRACK
 
 
 @given(st.sampled_from(sorted(GOOD)), st.binary(max_size=300))

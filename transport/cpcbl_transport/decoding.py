@@ -19,13 +19,13 @@ from cpcbl_transport.topics import Topic, topic_of
 MessageT = TypeVar("MessageT", bound=Message)
 
 
-def decode(key: str, payload: bytes, now_ns: int | None = None) -> Message | Refusal:
-    """The message in a payload under this key, with plausible numbers; or why there is none.
-    `now_ns`: a message from the future of it is refused; None for a reader without a clock."""
+def decode(key: str, payload: bytes) -> Message | Refusal:
+    """The message in a payload under this key, with plausible numbers; or why there is none. For
+    readers without a clock: a message may have any time stamp."""
     message = decode_by_key(key, payload)
     if isinstance(message, Refusal):
         return message
-    return refusal(message, message.stamp_ns if now_ns is None else now_ns) or message
+    return refusal(message, message.stamp_ns) or message
 
 
 def decode_by_key(key: str, payload: bytes) -> Message | Refusal:

@@ -2,7 +2,7 @@
 
 import math
 import re
-import time
+import threading
 from collections.abc import Callable, Sequence
 from importlib import resources
 from pathlib import Path
@@ -159,7 +159,7 @@ def run_observer(
         own_camera(name, team, clock, loop.wake) as camera,
         open_bus(team.name, link.endpoints, stop, link.credentials) as bus,
     ):
-        _require_unique_name(name, bus, stop)
+        _require_unique_name(name, bus)
         start_ns, incarnation = clock.now_ns(), new_incarnation()
         node = GuestNode(
             name, team, bus, start_ns, incarnation, loop.on_arrival, clock.speed, camera
@@ -182,12 +182,10 @@ def run_observer(
     )
 
 
-def _require_unique_name(name: str, bus: Bus, stop: Callable[[], bool]) -> None:
-    found: list[str] = []
-    watch = bus.watch_liveliness(topics.ALIVE.at(robot=name), lambda key, alive: found.append(key))
-    until = time.monotonic() + NAMESAKE_S
-    while time.monotonic() < until and not found and not stop():
-        time.sleep(0.02)
+def _require_unique_name(name: str, bus: Bus) -> None:
+    taken = threading.Event()
+    watch = bus.watch_liveliness(topics.ALIVE.at(robot=name), lambda key, alive: taken.set())
+    taken.wait(NAMESAKE_S)
     watch.close()
-    if found:
+    if taken.is_set():
         raise InputError(f"observer {name}: the team has one of this name; choose another one")
