@@ -14,6 +14,7 @@ from setuptools import Distribution
 from setuptools.command.build_ext import build_ext
 
 HOT = (
+    "constant_errors",
     "constraints",
     "estimate",
     "fusion",

@@ -53,6 +53,14 @@ class Covariance3(NamedTuple):
         a, b, d, c, e, f = self
         return a * (d * f - e * e) - b * (b * f - e * c) + c * (b * e - d * c)
 
+    def inverse(self) -> "Covariance3":
+        """Raises ZeroDivisionError when singular."""
+        xx, xy, yy, xh, yh, hh = self
+        a, b, c = yy * hh - yh * yh, xh * yh - xy * hh, xy * yh - xh * yy
+        k = 1.0 / (xx * a + xy * b + xh * c)
+        d, e, f = xx * hh - xh * xh, xy * xh - xx * yh, xx * yy - xy * xy
+        return Covariance3(k * a, k * b, k * d, k * c, k * e, k * f)
+
     def transformed(self, m: Matrix3) -> "Covariance3":
         """M C M^T."""
         a, b, c, d, e, f, g, h, i = m

@@ -7,6 +7,8 @@ other one changes its settings only where they are wrong (`miscalibration.py`).
 from collections.abc import Sequence
 
 from cpcbl_team.config import LocalizationSettings, OdometryNoise
+from cpcbl_team.constant_errors import NO_ERRORS, Evidence, pose_offset
+from cpcbl_team.estimate import POSE, offset_pose
 from cpcbl_team.geometry import new
 from cpcbl_team.landmarks import LandmarkUpdate
 from cpcbl_team.measurements import GatedObject
@@ -17,6 +19,7 @@ from cpcbl_team.miscalibration import (
     ModelCheck,
     adapted,
     check_models,
+    errors_between,
     noise_with_factor,
 )
 from cpcbl_team.motion import NO_VARIANCE, MotionVariance, distance_variance, turn_variance
@@ -114,7 +117,15 @@ class OwnCalibration:
             rules = self._gate_probability, self._independent_share
             changed = adapted(check, present, accepted, *rules)
             if changed is not None:
-                check = ModelCheck(now, accepted=accepted)
+                errors = errors_between(present, changed)
+                pose = offset_pose(
+                    state.estimate.pose, pose_offset(check.sensitivity, errors), POSE
+                )
+                state = state._replace(estimate=state.estimate._replace(pose=pose))
+                now = now._replace(estimate=state.estimate)
+                is_scale = errors != NO_ERRORS
+                evidence = check.evidence.without(errors) if is_scale else Evidence()
+                check = ModelCheck(now, check.sensitivity, evidence, accepted=accepted)
                 state, present = state.counted("miscalibrated"), changed
         learned, references, total_turn_rad, _, _ = memory
         parts = learned, references, total_turn_rad, check, present
