@@ -9,13 +9,14 @@ large by (rad).
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from math import sqrt
 from typing import Final, NamedTuple
 
 from cpcbl_team.estimate import Covariance3, Matrix3, Row
+from cpcbl_team.geometry import new
 
 LARGEST: Final = 7.0  # normalized correction: a bump is no calibration
-FADING: Final = 1.0 - 1.0 / 60.0  # of all sums, a block
+FADING: Final = 1.0 - 1.0 / 40.0  # of all sums, a block
 LEAST_SHARE: Final = 0.25  # of the variance that a block adds is taken away, or it tells little
 PRIOR: Final = Covariance3(4.0, 0.0, 4.0, 0.0, 0.0, 4.0)  # information: sigmas of 0.5
 NO_ERRORS: Final[Row] = (0.0, 0.0, 0.0)
@@ -45,46 +46,14 @@ def matrix_product(m: Matrix3, n: Matrix3) -> Matrix3:
     )
 
 
+def difference(m: Matrix3, n: Matrix3) -> Matrix3:
+    a, b, c, d, e, f, g, h, i = m
+    xx, xy, xz, yx, yy, yz, zx, zy, zz = n
+    return a - xx, b - xy, c - xz, d - yx, e - yy, f - yz, g - zx, h - zy, i - zz
+
+
 def matrix_of(c: Covariance3) -> Matrix3:
     return c.xx, c.xy, c.xh, c.xy, c.yy, c.yh, c.xh, c.yh, c.hh
-
-
-class Whitened(NamedTuple):
-    """One of the independent parts of a block's correction, divided by its sigma."""
-
-    value: float
-    row: Row  # what an error of one in each of the constant errors adds to it
-
-
-def whiten(
-    correction: Row, rows: Sequence[Row], taken: Covariance3, added: Covariance3
-) -> dict[int, Whitened]:
-    """The correction of a block in independent parts, by the axis that each begins with (Cholesky).
-
-    All is in the frame of the block's course. The correction has the covariance `taken`, the motion
-    had `added` some to the pose's. A part of which little of that was taken away tells little.
-    """
-    xx, xy, yy, xh, yh, hh = taken
-    of_axes = ((xx, xy, xh), (xy, yy, yh), (xh, yh, hh))
-    found: dict[int, Whitened] = {}
-    shares: dict[int, list[float]] = {}
-    for axis, most in enumerate((added.xx, added.yy, added.hh)):
-        value, (u, v, w), variance = correction[axis], rows[axis], of_axes[axis][axis]
-        own: list[float] = []
-        for other, (before, (p, q, r)) in found.items():
-            common = of_axes[axis][other] - sum(
-                a * b for a, b in zip(own, shares[other], strict=False)
-            )
-            share = common / shares[other][-1]
-            own.append(share)
-            value, variance = value - share * before, variance - share * share
-            u, v, w = u - share * p, v - share * q, w - share * r
-        if variance > LEAST_SHARE * abs(most) and variance > 0.0:
-            sigma = math.sqrt(variance)
-            normalized = min(max(value / sigma, -LARGEST), LARGEST)
-            found[axis] = Whitened(normalized, (u / sigma, v / sigma, w / sigma))
-            shares[axis] = [*own, sigma]
-    return found
 
 
 def pose_offset(sensitivity: Matrix3, errors: Row) -> Row:
@@ -99,58 +68,118 @@ def pose_offset(sensitivity: Matrix3, errors: Row) -> Row:
     )
 
 
+class Whitened(NamedTuple):
+    """A part of a block's correction that is independent of the others, divided by its sigma. It is
+    zero where the block tells nothing of it."""
+
+    value: float = 0.0
+    distance: float = 0.0  # what an error of one in each of the constant errors adds to it
+    turn: float = 0.0
+    bias: float = 0.0
+
+
+NOTHING: Final = Whitened()
+
+
+def whiten(
+    correction: Row, due: Matrix3, taken: Covariance3, added: Covariance3
+) -> tuple[Whitened, Whitened, Whitened]:
+    """The correction of a block in independent parts: along, aside and of the heading (Cholesky).
+
+    All is in the frame of the block's course. The correction has the covariance `taken`, of which
+    the motion had `added` some; constant errors of one (columns) add `due` to it. A part of which
+    little of that was taken away tells little.
+    """
+    value, aside, heading = correction
+    xx, xy, yy, xh, yh, hh = taken
+    a, b, c, d, e, f, g, h, i = due
+    first = second = third = NOTHING
+    if xx > max(LEAST_SHARE * added.xx, 0.0):
+        k = 1.0 / sqrt(xx)
+        first = _whitened(k * value, k * a, k * b, k * c)
+        p, q = k * xy, k * xh
+        _, u, v, w = first
+        aside, d, e, f = aside - p * k * value, d - p * u, e - p * v, f - p * w
+        heading, g, h, i = heading - q * k * value, g - q * u, h - q * v, i - q * w
+        yy, yh, hh = yy - p * p, yh - p * q, hh - q * q
+    if yy > max(LEAST_SHARE * added.yy, 0.0):
+        k = 1.0 / sqrt(yy)
+        second = _whitened(k * aside, k * d, k * e, k * f)
+        q = k * yh
+        _, u, v, w = second
+        heading, g, h, i = heading - q * k * aside, g - q * u, h - q * v, i - q * w
+        hh -= q * q
+    if hh > max(LEAST_SHARE * added.hh, 0.0):
+        k = 1.0 / sqrt(hh)
+        third = _whitened(k * heading, k * g, k * h, k * i)
+    return first, second, third
+
+
+def _whitened(value: float, distance: float, turn: float, bias: float) -> Whitened:
+    return new(Whitened, (min(max(value, -LARGEST), LARGEST), distance, turn, bias))
+
+
+class Fit(NamedTuple):
+    """The constant errors, with their sigmas, and the mean square of what they leave unexplained (1
+    is due), by which the sigmas are wider if it is more."""
+
+    errors: Row
+    sigmas: Row
+    scatter: float
+
+
 class Evidence(NamedTuple):
-    """What blocks tell of three constant errors: of the scale of distances, of the scale of turns,
-    and the bias of bearings (rad). Sums of a least-squares fit to whitened corrections."""
+    """What blocks tell of the three constant errors: the sums of a least-squares fit to whitened
+    corrections."""
 
     information: Covariance3 = PRIOR
-    vector: Row = (0.0, 0.0, 0.0)
+    vector: Row = NO_ERRORS
     total: float = 0.0  # of squares
-    lagged: float = 0.0  # of products of what is unexplained with that of the block before
-    last: Row = (0.0, 0.0, 0.0)  # what was unexplained along, aside, and of the heading
+    lagged: float = 0.0  # of products with the same part of the block before
+    last: Row = (0.0, 0.0, 0.0)  # the parts of the last block
     parts: float = 0.0  # of corrections
 
-    @property
-    def errors(self) -> Row:
-        """The constant errors by least squares."""
-        return self.information.inverse().times(self.vector)
+    def fit(self) -> Fit:
+        """The errors that explain the corrections."""
+        covariance = self.information.inverse()
+        errors = covariance.times(self.vector)
+        scatter = (self.total - _dot(errors, self.vector)) / max(self.parts, 1.0)
+        k, (xx, _, yy, _, _, hh) = sqrt(max(scatter, 1.0)), covariance
+        return new(Fit, (errors, (k * sqrt(xx), k * sqrt(yy), k * sqrt(hh)), scatter))
 
-    @property
-    def scatter(self) -> float:
-        """The mean square of what the constant errors leave unexplained; 1 is due."""
-        explained = _product(self.errors, self.vector)
-        return (self.total - explained) / self.parts
-
-    def sigmas(self) -> Row:
-        """The sigma of each constant error, wider where corrections scatter more than is due."""
-        covariance, widening = self.information.inverse(), max(self.scatter, 1.0)
-        xx, _, yy, _, _, hh = covariance
-        return math.sqrt(widening * xx), math.sqrt(widening * yy), math.sqrt(widening * hh)
-
-    def plus(self, whitened: Mapping[int, Whitened]) -> "Evidence":
-        """With one more block: its correction along, aside, and of the heading (0, 1, 2), where it
-        tells anything."""
-        information = self.information.scaled(FADING).plus(PRIOR, 1.0 - FADING)
-        (x, y, z), errors = self.vector, self.errors
-        x, y, z, last = FADING * x, FADING * y, FADING * z, [0.0, 0.0, 0.0]
-        total, lagged = FADING * self.total, FADING * self.lagged
-        for axis, (value, (u, v, w)) in whitened.items():
-            square = Covariance3(u * u, u * v, v * v, u * w, v * w, w * w)
-            information = information.plus(square)
+    def plus(self, correction: tuple[Whitened, Whitened, Whitened]) -> "Evidence":
+        """With the correction of one more block."""
+        xx, xy, yy, xh, yh, hh = self.information
+        (x, y, z), old, k = self.vector, self.last, FADING
+        prior, pxy, pyy, pxh, pyh, phh = PRIOR
+        m = 1.0 - FADING
+        xx, xy, yy = k * xx + m * prior, k * xy + m * pxy, k * yy + m * pyy
+        xh, yh, hh = k * xh + m * pxh, k * yh + m * pyh, k * hh + m * phh
+        x, y, z, total, lagged = k * x, k * y, k * z, k * self.total, k * self.lagged
+        parts = k * self.parts
+        for part in correction:
+            value, u, v, w = part
+            xx, xy, yy = xx + u * u, xy + u * v, yy + v * v
+            xh, yh, hh = xh + u * w, yh + v * w, hh + w * w
             x, y, z = x + u * value, y + v * value, z + w * value
             total += value * value
-            last[axis] = value - _product(errors, (u, v, w))
-            lagged += last[axis] * self.last[axis]
-        parts = FADING * self.parts + len(whitened)
-        return Evidence(information, (x, y, z), total, lagged, (last[0], last[1], last[2]), parts)
+            if part is not NOTHING:
+                parts += 1.0
+        first, second, third = correction
+        now = first[0], second[0], third[0]
+        lagged += _dot(now, old)
+        information = new(Covariance3, (xx, xy, yy, xh, yh, hh))
+        return new(Evidence, (information, (x, y, z), total, lagged, now, parts))
 
     def without(self, errors: Row) -> "Evidence":
         """As if the settings had been without these errors all the time."""
         x, y, z = self.vector
         u, v, w = self.information.times(errors)
-        explained = 2.0 * _product(errors, self.vector) - _product(errors, (u, v, w))
+        explained = 2.0 * _dot(errors, self.vector) - _dot(errors, (u, v, w))
         return self._replace(vector=(x - u, y - v, z - w), total=self.total - explained)
 
 
-def _product(a: Row, b: Row) -> float:
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+def _dot(a: Row, b: Row) -> float:
+    ax, ay, az = a
+    bx, by, bz = b
+    return ax * bx + ay * by + az * bz

@@ -22,6 +22,8 @@ from cpcbl_team.constant_errors import (
     INSENSITIVE,
     NO_ERRORS,
     Evidence,
+    Fit,
+    difference,
     matrix_of,
     matrix_product,
     sensitivity_after,
@@ -31,7 +33,7 @@ from cpcbl_team.estimate import SMALLEST_VARIANCE, Estimate, Matrix3, Row
 from cpcbl_team.geometry import Pose2, new, wrap_angle
 from cpcbl_team.motion import move
 
-BLOCK_NS: Final = 1_000_000_000
+BLOCK_NS: Final = 1_500_000_000
 LONGEST_NS: Final = 5_000_000_000
 MOST_TURN_RAD: Final = 2.5  # beyond, the chord of a block is much shorter than its path
 LEAST_DISTANCE_M: Final = 0.02
@@ -40,12 +42,14 @@ LEAST_SIGMA: Final = 0.01  # of odometry whose noise grows, per root of a metre 
 LEAST_PARTS: Final = 30.0  # of corrections
 SIGMAS: Final = 4.0  # of an error that is believed,
 AGAIN_SIGMAS: Final = 2.5  # and of others beside it, and after it
-LEAST: Final = 0.03, 0.03, math.radians(2.0)  # of the first change: less is not worth one
+LEAST_SCALE: Final = 0.03  # of the first change: what is smaller is not worth one
+LEAST_BIAS_RAD: Final = math.radians(2.0)
 MOST: Final = 0.5  # of an error that is believed at once
 LARGE: Final = 1.8  # factor of a variance, for a robot that rejects too much
 SCATTER_SIGMAS: Final = 4.0  # a mean square of so many is larger than due
 SMALL: Final = 0.6  # a mean square below it makes larger sigmas smaller again
-MOTION_LAG: Final = 0.1  # correlation of each correction with the one before
+MOTION_LAG: Final = 0.1  # correlation of each correction with the one before; for a robot that
+REJECTING_LAG: Final = 0.3  # rejects too much it is more, for a wrong sensor is the usual cause
 LEAST_REJECTED: Final = 0.01  # share of objects of the map
 LEAST_REJECTIONS: Final = 3
 MOST_DUE: Final = 5.0  # times the share that the gate rejects of correct measurements
@@ -132,15 +136,13 @@ def check_models(check: ModelCheck, now: Corrected, noise: OdometryNoise) -> Mod
     sensitivity = sensitivity_after(sensitivity, distance, turn, course)
     gain = matrix_product(matrix_of(taken), matrix_of(due.inverse()))
     corrected = matrix_product(gain, sensitivity)
-    a, b, d, e, f, g, h, i, j = matrix_product(to_course, corrected)
     whitened = whiten(
         correction,
-        ((a, b, d), (e, f, g), (h, i, j)),
+        matrix_product(to_course, corrected),
         taken.transformed(to_course),
         added.transformed(to_course),
     )
-    u = tuple(v - w for v, w in zip(sensitivity, corrected, strict=True))
-    sensitivity = (u[0], u[1], u[2], u[3], u[4], u[5], u[6], u[7], u[8])
+    sensitivity = difference(sensitivity, corrected)
     evidence = evidence.plus(whitened)
     return new(ModelCheck, (now, sensitivity, evidence, rejections, rejected, accepted))
 
@@ -157,34 +159,46 @@ def adapted(
     evidence = check.evidence
     if evidence.parts < LEAST_PARTS:
         return None
-    by_errors = _with_errors(present, evidence)
+    fit = evidence.fit()
+    by_errors = _with_errors(present, fit, independent_share)
     if by_errors is not None:
         return by_errors
     all_of_them = max(check.rejections + accepted - check.accepted, 1)
     due = LEAST_REJECTED + MOST_DUE * (1.0 - gate_probability)
     is_rejecting = check.rejections > max(due * all_of_them, LEAST_REJECTIONS)
-    scatter, parts = evidence.scatter, independent_share * evidence.parts
+    scatter, parts = fit.scatter, independent_share * evidence.parts
     if scatter > 1.0 + SCATTER_SIGMAS * math.sqrt(2.0 / parts) or is_rejecting:  # chi-square
-        of_motion = evidence.lagged > MOTION_LAG * scatter * evidence.parts
+        least_lag = REJECTING_LAG if is_rejecting else MOTION_LAG
+        of_motion = evidence.lagged > least_lag * scatter * evidence.parts
         return _with_larger_sigma(present, max(scatter, LARGE), of_motion)
     return _with_smaller_sigmas(present, scatter) if scatter < SMALL else None
 
 
-def _with_errors(present: Adaptation, evidence: Evidence) -> Adaptation | None:
+def _with_errors(present: Adaptation, fit: Fit, independent_share: float) -> Adaptation | None:
     """The adaptation without the constant errors, where one of them is clear."""
-    is_first = present == AS_CONFIGURED
-    least, sigmas = (LEAST, SIGMAS) if is_first else (NO_ERRORS, AGAIN_SIGMAS)
-    parts = list(zip(evidence.errors, evidence.sigmas(), least, strict=True))
-    if not any(abs(e) > max(sigmas * sigma, small) for e, sigma, small in parts):
+    (distance, turn, bias), sigmas, _ = fit
+    of_distance, of_turn, of_bias = (sigma / math.sqrt(independent_share) for sigma in sigmas)
+    clear = max(abs(distance) / of_distance, abs(turn) / of_turn, abs(bias) / of_bias)
+    is_first = errors_between(AS_CONFIGURED, present) == NO_ERRORS
+    if clear <= (SIGMAS if is_first else AGAIN_SIGMAS):
         return None
     distance, turn, bias = (
-        min(max(e, -MOST), MOST) if abs(e) > AGAIN_SIGMAS * sigma else 0.0 for e, sigma, _ in parts
+        _believed(distance, of_distance),
+        _believed(turn, of_turn),
+        _believed(bias, of_bias),
     )
+    if is_first and max(abs(distance), abs(turn)) < LEAST_SCALE and abs(bias) < LEAST_BIAS_RAD:
+        return None
     return present._replace(
         distance_scale=present.distance_scale * (1.0 + distance),
         turn_scale=present.turn_scale * (1.0 + turn),
         bearing_bias_rad=present.bearing_bias_rad + bias,
     )
+
+
+def _believed(error: float, sigma: float) -> float:
+    """An error that is clear, or else none."""
+    return min(max(error, -MOST), MOST) if abs(error) > AGAIN_SIGMAS * sigma else 0.0
 
 
 def errors_between(before: Adaptation, after: Adaptation) -> Row:
