@@ -19,8 +19,8 @@ LARGEST: Final = 7.0  # normalized correction: a bump is no calibration
 FADING: Final = 1.0 - 1.0 / 40.0  # of all sums, a block
 LEAST_SHARE: Final = 0.25  # of the variance that a block adds is taken away, or it tells little
 PRIOR: Final = Covariance3(4.0, 0.0, 4.0, 0.0, 0.0, 4.0)  # information: sigmas of 0.5
-NO_ERRORS: Final[Row] = (0.0, 0.0, 0.0)
-INSENSITIVE: Final[Matrix3] = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+NO_ERRORS: Row = (0.0, 0.0, 0.0)
+INSENSITIVE: Matrix3 = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 """The sensitivity of a pose is its error for an error of one in each of the three (columns)."""
 
 
