@@ -156,19 +156,32 @@ def information_gain_of_belief(
     """The information gain (nats) of a teammate's belief for the robot that sees the teammate.
 
     `fix` is where the robot sees the teammate, and `tier` is the teammate's. Together with its
-    belief the sighting constrains the position and, by its bearing, the heading (unless both are at
-    the same point). The larger of the two gains counts.
+    belief the sighting constrains the position and, by its bearing, the heading. The larger of the
+    two gains counts.
     """
-    prior = estimate.covariance.position()
-    sensor, sigma = Covariance2(*fix.sensor_covariance), sum(sigma_limits_m(tier, settings)) / 2.0
-    teammate = Covariance2(sigma * sigma, 0.0, sigma * sigma)
+    prior, sensor = estimate.covariance.position(), Covariance2(*fix.sensor_covariance)
+    teammate = _teammate_covariance(tier, settings)
     position = information_gain(prior, merged_covariance(prior, sensor, teammate, settings.fusion))
+    return max(position, heading_information_gain_of_belief(fix, tier, estimate, settings))
+
+
+def heading_information_gain_of_belief(
+    fix: Fix, tier: int, estimate: Estimate, settings: CollaborationSettings
+) -> float:
+    """The same for the heading alone, by the bearing: none if both are at the same point."""
+    prior, sensor = estimate.covariance.position(), Covariance2(*fix.sensor_covariance)
+    teammate = _teammate_covariance(tier, settings)
     dx, dy = fix.x_m - estimate.pose.x, fix.y_m - estimate.pose.y
     direction = math.atan2(dy, dx)
     across = -math.sin(direction), math.cos(direction)
     variance = _regularized(sensor + teammate + prior).along(*across)
-    heading = 0.5 * math.log1p(estimate.covariance.hh * (dx * dx + dy * dy) / variance)
-    return max(position, heading)
+    return 0.5 * math.log1p(estimate.covariance.hh * (dx * dx + dy * dy) / variance)
+
+
+def _teammate_covariance(tier: int, settings: CollaborationSettings) -> Covariance2:
+    """The position covariance (m^2) that a robot assumes of a teammate of this tier."""
+    sigma = sum(sigma_limits_m(tier, settings)) / 2.0
+    return Covariance2(sigma * sigma, 0.0, sigma * sigma)
 
 
 def staleness(copy: Belief | None, now: Belief) -> float:

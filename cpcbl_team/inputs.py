@@ -86,6 +86,10 @@ class Belief(msgspec.Struct, frozen=True, array_like=True, tag="belief"):
     turn_rate_rad_s: float = 0.0
 
 
+class HeadingBelief(Belief, frozen=True, array_like=True, tag="heading_belief"):
+    """A belief that its receiver uses for its own heading alone. On the wire it is a `Belief`."""
+
+
 class Fix(msgspec.Struct, frozen=True, array_like=True, tag="fix"):
     """Active collaboration: `observer` saw `robot` at this position in the field's frame.
 

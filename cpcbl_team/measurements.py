@@ -33,7 +33,7 @@ from cpcbl_team.estimate import (
 from cpcbl_team.fusion import Observation, chi_square
 from cpcbl_team.gaussian import Covariance2
 from cpcbl_team.geometry import Pose2, step, wrap_angle
-from cpcbl_team.inputs import Belief, Sighting
+from cpcbl_team.inputs import Belief, HeadingBelief, Sighting
 from cpcbl_team.sensors import sighting_sigmas
 
 _EXACT = Covariance2(0.0, 0.0, 0.0)
@@ -104,6 +104,8 @@ class Measurement(msgspec.Struct, frozen=True, gc=False):
     bearing: float | None  # rad, in the robot's frame
     range_sigma: float
     bearing_sigma: float
+    is_for_heading: bool = False
+    """Whether it may change the heading alone; it has no range then."""
 
     @property
     def has_reading(self) -> bool:
@@ -151,7 +153,7 @@ def measurement_of(
     settings: config.LocalizationSettings,
 ) -> Measurement | None:
     """The sighting, from about `pose`, with its object's position; None if that is not known."""
-    name = sighting.id
+    name, is_for_heading = sighting.id, False
     wall, landmark, gives = field.walls.get(name), field.landmarks.get(name), "both"
     if landmark is not None:
         position: ObjectPosition | None = _on_map(landmark.x_m, landmark.y_m)
@@ -160,6 +162,9 @@ def measurement_of(
         position, gives = _on_map(*wall.from_m), wall.gives
     elif name in teammates and settings.collaboration.passive:
         position = teammate_at(teammates[name], stamp_ns, settings.collaboration)
+        nearest = nearest_belief(teammates[name], stamp_ns, settings.collaboration)
+        if nearest is not None and isinstance(nearest[1], HeadingBelief):
+            gives, is_for_heading = "bearing", True
     else:
         return None
     if position is None:
@@ -171,7 +176,8 @@ def measurement_of(
         bearing = None
     sigmas = sighting_sigmas(sighting, sensor, _expected_range(pose, position, wall))
     is_teammate = landmark is None and wall is None
-    return Measurement(name, position, wall, is_teammate, range_m, bearing, *sigmas)
+    read = range_m, bearing, *sigmas
+    return Measurement(name, position, wall, is_teammate, *read, is_for_heading)
 
 
 @lru_cache(1024)
@@ -190,6 +196,8 @@ def _expected_range(pose: Pose2, position: ObjectPosition, wall: config.Wall | N
 def constrains(m: Measurement, scope: Scope | None, rules: config.LocalizerSettings) -> bool:
     """Whether an object says anything about the part of the pose that is to be updated."""
     if scope is POSITION:
+        if m.is_for_heading:
+            return False
         return m.range_m is not None or (rules.bearing_for_position and m.has_point_bearing)
     if scope is HEADING:
         return m.bearing is not None
@@ -203,6 +211,8 @@ def constraints_of(
     x, y, _ = m.position
     range_m, bearing, wall = m.range_m, m.bearing, m.wall
     by_range = by_bearing = None
+    if m.is_for_heading and scope is POSITION:
+        return []
     as_drawn = rules.paper_uncertainty or rules.variant == "weighted"
     if range_m is not None and scope is not HEADING:
         if wall is None:

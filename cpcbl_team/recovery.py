@@ -87,7 +87,8 @@ def with_measurements(state: State, measurements: Sequence[Measurement]) -> Reco
     """The memory with those of a frame's measurements that are not too alike to what it holds."""
     memory = state.memory.recovery
     recent = recently_recorded(memory, state.stamp_ns)
-    new = [m for m in measurements if m.source not in recent and m.has_reading and m.wall is None]
+    usable = [m for m in measurements if m.has_reading and m.wall is None and not m.is_for_heading]
+    new = [m for m in usable if m.source not in recent]
     if not new:
         return memory
     return with_evidence(memory, [evidence_from_measurement(state, m) for m in new])

@@ -12,7 +12,16 @@ from itertools import pairwise
 
 import msgspec
 
-from cpcbl_team.inputs import Belief, BeliefShared, Fix, Input, Odometry, Position, Sightings
+from cpcbl_team.inputs import (
+    Belief,
+    BeliefShared,
+    Fix,
+    HeadingBelief,
+    Input,
+    Odometry,
+    Position,
+    Sightings,
+)
 from cpcbl_team.localizer import Localizer
 from cpcbl_team.measurements import BELIEF_VALID_BEFORE_NS
 from cpcbl_team.state import State, with_beliefs
@@ -25,6 +34,7 @@ _content = msgspec.msgpack.Encoder(enc_hook=float).encode
 
 _apply: dict[type, Callable[[Localizer, State, Input], State]] = {
     Belief: Localizer.add_teammate_belief,  # type: ignore[dict-item]
+    HeadingBelief: Localizer.add_teammate_belief,  # type: ignore[dict-item]
     Sightings: Localizer.cycle,  # type: ignore[dict-item]
     Position: Localizer.add_position,  # type: ignore[dict-item]
     Fix: Localizer.add_fix,  # type: ignore[dict-item]

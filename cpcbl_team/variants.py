@@ -81,7 +81,10 @@ class JointVariant:
             m = found.measurement
             if m.is_teammate:
                 observation = observation_of(prior, m, found.constraints, estimate)
-                estimate = self._merge_teammate(estimate, observation, scope)
+                within = scope
+                if m.is_for_heading:
+                    within, estimate = HEADING, with_all_shared(estimate)
+                estimate = self._merge_teammate(estimate, observation, within)
         return self.reduce(estimate)
 
     def correct_position(

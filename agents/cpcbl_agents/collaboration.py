@@ -5,10 +5,11 @@ that it sees, and a belief when its subscribers can no longer predict its pose f
 never encodes a message that gives too little or exceeds the budget. A lost robot sends neither.
 """
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from msgspec.structs import replace
+from msgspec.structs import astuple, replace
 
 from cpcbl_agents import agent
 from cpcbl_agents.guests import GuestRegistry
@@ -17,11 +18,11 @@ from cpcbl_team.config import LocalizationSettings
 from cpcbl_team.fixes import fix_for, with_sensor_factor, without_heading
 from cpcbl_team.gaussian import Covariance2
 from cpcbl_team.information_gain import FixMemory, HeadingMemory
-from cpcbl_team.inputs import Belief, Fix
+from cpcbl_team.inputs import Belief, Fix, HeadingBelief
 from cpcbl_team.tiers import LOWEST_TIER, accepted_tiers, next_tier
 from cpcbl_transport.budget import Budget
 from cpcbl_transport.compact import help_bytes, sent_bytes
-from cpcbl_transport.messages import Flow, Track
+from cpcbl_transport.messages import Flow, Help, Track
 
 NEIGHBOUR_NS = 10_000_000_000  # a teammate's tier is watched for so long after it was seen
 IN_SIGHT_NS = 1_000_000_000  # its beliefs are useful for so long after it was seen
@@ -112,6 +113,11 @@ class CollaborationAgent:
         self.latest: agent.PoseEstimate | None = None
         self.neighbours: frozenset[str] = frozenset()
         self.sources: frozenset[tuple[str, int]] = frozenset()
+        self._heading_sources: frozenset[str] = frozenset()
+        """Those of them whose beliefs may change this robot's heading alone."""
+        # In motion an error of the heading becomes one of the position, which could come back
+        is_weighted = settings.localizer.variant == "weighted"
+        self._listens_to_equals = not settings.odometry.moves and not is_weighted
 
     @property
     def interests(self) -> Interests | None:
@@ -172,13 +178,26 @@ class CollaborationAgent:
                 for name, fix in self._latest_fixes.items()
                 if name in self._tiers and self._is_useful(fix, self._tiers[name], now)
             )
+            better = accepted_tiers(self.tier, self._rules)
+            self._heading_sources = frozenset(n for n, tier in self.sources if tier not in better)
 
     def _is_useful(self, seen: Fix, tier: int, now: agent.PoseEstimate) -> bool:
         rules, in_sight = self._rules, now.stamp_ns - seen.stamp_ns < IN_SIGHT_NS
-        if not (in_sight and tier in accepted_tiers(self.tier, rules)):
+        if not in_sight:
             return False
-        gain = gains.information_gain_of_belief(seen, tier, now.estimate, rules)
-        return bool(now.lost) or gain >= rules.least_use
+        if tier in accepted_tiers(self.tier, rules):
+            gain = gains.information_gain_of_belief(seen, tier, now.estimate, rules)
+            return bool(now.lost) or gain >= rules.least_use
+        if tier != self.tier or now.lost or not self._listens_to_equals:
+            return False
+        gain = gains.heading_information_gain_of_belief(seen, tier, now.estimate, rules)
+        return gain >= math.log(rules.tier_width)
+
+    def as_used(self, help_: Help) -> Help:
+        """The message as this robot uses it: the belief of an equal for its heading alone."""
+        if isinstance(help_, Belief) and help_.robot in self._heading_sources:
+            return HeadingBelief(*astuple(help_))
+        return help_
 
     # Fixes --------------------------------------------------------------------------------
 

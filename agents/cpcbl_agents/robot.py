@@ -52,7 +52,7 @@ class Robot:
             self._handle_event(message, now_ns)
             return []
         if isinstance(message, Help):  # it changes what is published at the next tick
-            self.filter.handle(message, now_ns)
+            self.filter.handle(self.collaboration.as_used(message), now_ns)
             return []
         inputs: list[AgentMessage] = [] if isinstance(message, SensorInput) else [message]
         inputs += self.sensing.handle(message, now_ns)

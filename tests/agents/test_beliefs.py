@@ -1,9 +1,10 @@
 """When a robot sends its belief, and whose beliefs it uses."""
 
+import math
 from typing import Any
 
 import pytest
-from msgspec.structs import replace
+from msgspec.structs import astuple, replace
 from support.buses import SECOND
 from support.collaboration import GOOD, MATES, POOR, POORER, SIGMA_M, Alone, ahead, robots
 from support.core import diagonal
@@ -13,7 +14,7 @@ from cpcbl_team.config import (
     BudgetSettings,
     SensorSettings,
 )
-from cpcbl_team.inputs import Belief
+from cpcbl_team.inputs import Belief, HeadingBelief
 from cpcbl_team.tiers import LOWEST_TIER
 from cpcbl_transport.messages import Flow
 
@@ -159,6 +160,59 @@ def test_a_robot_with_a_poor_heading_subscribes_to_teammates_that_improve_it() -
         alone.later(0.1)
         chosen.append(alone.agent.sources)
     assert chosen == [frozenset(), {("mate", GOOD - 1)}]
+
+
+def unsure_of_its_heading(tier: int = GOOD, **settings: Any) -> Alone:
+    """A robot that stands and does not know its heading; it sees the teammate `mate`."""
+    alone = Alone(tier, moves=False, **settings)
+    covariance = diagonal(SIGMA_M[tier], math.radians(20.0))
+    alone.becomes(estimate=alone.here.estimate._replace(covariance=covariance))
+    alone.sees(ahead(range_m=6.0))
+    return alone
+
+
+@pytest.mark.parametrize(("tier", "is_source"), [(GOOD, True), (GOOD + 1, False)])
+def test_a_standing_robot_takes_its_heading_from_equals_but_not_from_worse_ones(
+    tier: int, is_source: bool
+) -> None:
+    alone = unsure_of_its_heading()
+    alone.tell(Presence("mate", tier))
+    alone.later(0.1)
+    assert alone.agent.sources == ({("mate", tier)} if is_source else set())
+    belief = Belief("mate", 0, 6.0, 0.0, 0.0, diagonal(0.02, 0.1))
+    used = alone.agent.as_used(belief)
+    assert isinstance(used, HeadingBelief) is is_source
+    assert astuple(used) == astuple(belief)
+
+
+def test_the_belief_of_a_better_teammate_is_used_whole() -> None:
+    alone = unsure_of_its_heading()
+    alone.tell(Presence("mate", GOOD - 1))
+    alone.later(0.1)
+    assert alone.agent.sources == {("mate", GOOD - 1)}
+    belief = Belief("mate", 0, 6.0, 0.0, 0.0, diagonal(0.02, 0.1))
+    assert alone.agent.as_used(belief) is belief
+
+
+def test_only_a_robot_that_stands_and_hardly_knows_its_heading_listens_to_equals() -> None:
+    """The heading of a robot that drives becomes a position, and could come back as one."""
+    sure = diagonal(SIGMA_M[GOOD], 0.005)
+    for moves, covariance, variant, lost, sources in (
+        (False, None, "joint", "", {("mate", GOOD)}),
+        (True, None, "joint", "", set()),
+        (False, sure, "joint", "", set()),
+        (False, None, "weighted", "", set()),
+        (False, None, "joint", LOST, set()),
+    ):
+        alone = Alone(GOOD, moves=moves, variant=variant)
+        covariance = covariance or diagonal(SIGMA_M[GOOD], math.radians(20.0))
+        alone.becomes(estimate=alone.here.estimate._replace(covariance=covariance), lost=lost)
+        alone.tell(Presence("mate", GOOD))
+        alone.sees(ahead(range_m=6.0))
+        alone.later(0.1)
+        alone.tell(Presence("mate", alone.agent.tier))
+        alone.later(0.1)
+        assert alone.agent.sources == sources
 
 
 def test_a_robot_without_passive_help_has_no_sources() -> None:

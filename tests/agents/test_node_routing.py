@@ -12,11 +12,13 @@ from support.buses import (
     robot_at,
     saw,
     team_of,
+    with_robot,
 )
 from support.nodes import (
     BELIEF_KEY,
     GOOD,
     POOR,
+    estimate,
     exchange,
     helper,
     look,
@@ -25,7 +27,7 @@ from support.nodes import (
     two_robots,
 )
 
-from cpcbl_team.config import BudgetSettings
+from cpcbl_team.config import BudgetSettings, OdometrySettings, Start
 from cpcbl_team.information_gain import sigma_limits_m
 from cpcbl_team.inputs import Belief, Fix, Odometry, Sighting
 from cpcbl_team.tiers import LOWEST_TIER, tier_of
@@ -51,6 +53,30 @@ def test_robots_of_the_same_tier_send_each_other_nothing() -> None:
     stand = TeamOnBus(two_robots(GOOD, GOOD))
     exchange(stand)
     assert [(s.sent, s.heard) for s in stand.statuses().values()] == [((), ())] * 2
+
+
+def test_a_standing_robot_gets_its_heading_and_nothing_else_from_an_equal() -> None:
+    """Its mate drives, and gets nothing. Alone the robot's heading stays 0.3 rad off."""
+    start = Start(x_m=0.0, y_m=0.0, heading_deg=0.0, sigma_m=GOOD, heading_sigma_deg=20.0)
+    ends = []
+    for moves in (True, False):
+        odometry = OdometrySettings(moves=moves)
+        team = with_robot(two_robots(GOOD, GOOD), "me", start=start, odometry=odometry)
+        stand = TeamOnBus(team)
+        for _ in range(10):
+            stand.stand_still(0.2)
+            stand.sightings("me", saw(stand.now_ns, Sighting("mate", 2.5, -0.3)))
+            look(stand, "mate")
+        ends.append(estimate(stand))
+        statuses = stand.statuses()
+        assert statuses["mate"].heard == ()
+        assert {f.topic for f in statuses["me"].heard} == (set() if moves else {"belief"})
+    alone, helped = ends
+    assert alone.pose == (0.0, 0.0, 0.0)
+    assert helped.pose == pytest.approx((0.0, 0.0, 0.3), abs=0.01)
+    assert helped.pose[:2] == alone.pose[:2]
+    assert helped.covariance.position() == alone.covariance.position()
+    assert helped.heading_sigma_rad < math.radians(3.0)
 
 
 def test_both_ways_sends_uphill_too() -> None:

@@ -10,6 +10,7 @@ from cpcbl_team.config import (
     CollaborationSettings,
     LocalizationSettings,
     LocalizerSettings,
+    OdometrySettings,
     SensorSettings,
     Variant,
 )
@@ -38,12 +39,14 @@ class Alone:
         sensor: SensorSettings | None = None,
         budget: BudgetSettings | None = None,
         variant: Variant = "joint",
+        moves: bool = True,
         **rules: Any,
     ) -> None:
         budget = budget or BudgetSettings()
         settings = LocalizationSettings(
             localizer=LocalizerSettings(variant=variant),
             sensor=sensor or SensorSettings(),
+            odometry=OdometrySettings(moves=moves),
             collaboration=CollaborationSettings(budget=budget, **rules),
         )
         self.agent = CollaborationAgent("me", settings, MATES, 0, Budget(budget, 0))
