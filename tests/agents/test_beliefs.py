@@ -13,6 +13,7 @@ from cpcbl_agents.agent import BeliefSubscribers, HelpSent, Presence
 from cpcbl_team.config import (
     BudgetSettings,
     SensorSettings,
+    Variant,
 )
 from cpcbl_team.inputs import Belief, HeadingBelief
 from cpcbl_team.tiers import LOWEST_TIER
@@ -194,25 +195,28 @@ def test_the_belief_of_a_better_teammate_is_used_whole() -> None:
     assert alone.agent.as_used(belief) is belief
 
 
-def test_only_a_robot_that_stands_and_hardly_knows_its_heading_listens_to_equals() -> None:
+@pytest.mark.parametrize(
+    ("moves", "heading_sigma", "variant", "lost", "is_source"),
+    [
+        (False, 0.35, "joint", "", True),
+        (True, 0.35, "joint", "", False),
+        (False, 0.005, "joint", "", False),
+        (False, 0.35, "weighted", "", False),
+        (False, 0.35, "joint", LOST, False),
+    ],
+)
+def test_only_a_robot_that_stands_and_hardly_knows_its_heading_listens_to_equals(
+    moves: bool, heading_sigma: float, variant: Variant, lost: str, is_source: bool
+) -> None:
     """The heading of a robot that drives becomes a position, and could come back as one."""
-    sure = diagonal(SIGMA_M[GOOD], 0.005)
-    for moves, covariance, variant, lost, sources in (
-        (False, None, "joint", "", {("mate", GOOD)}),
-        (True, None, "joint", "", set()),
-        (False, sure, "joint", "", set()),
-        (False, None, "weighted", "", set()),
-        (False, None, "joint", LOST, set()),
-    ):
-        alone = Alone(GOOD, moves=moves, variant=variant)
-        covariance = covariance or diagonal(SIGMA_M[GOOD], math.radians(20.0))
-        alone.becomes(estimate=alone.here.estimate._replace(covariance=covariance), lost=lost)
-        alone.tell(Presence("mate", GOOD))
-        alone.sees(ahead(range_m=6.0))
-        alone.later(0.1)
-        alone.tell(Presence("mate", alone.agent.tier))
-        alone.later(0.1)
-        assert alone.agent.sources == sources
+    alone = Alone(GOOD, moves=moves, variant=variant)
+    covariance = diagonal(SIGMA_M[GOOD], heading_sigma)
+    alone.becomes(estimate=alone.here.estimate._replace(covariance=covariance), lost=lost)
+    alone.later(0.1)
+    alone.tell(Presence("mate", alone.agent.tier))
+    alone.sees(ahead(range_m=6.0))
+    alone.later(0.1)
+    assert bool(alone.agent.sources) is is_source
 
 
 def test_a_robot_without_passive_help_has_no_sources() -> None:

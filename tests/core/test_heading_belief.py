@@ -14,7 +14,7 @@ from cpcbl_team.information_gain import (
     heading_information_gain_of_belief,
     information_gain_of_belief,
 )
-from cpcbl_team.inputs import Fix, HeadingBelief, Sighting, Sightings
+from cpcbl_team.inputs import Fix, HeadingBelief, Input, Sighting, Sightings
 from cpcbl_team.state import State
 from cpcbl_team.timeline import Timeline
 
@@ -86,7 +86,7 @@ def test_the_order_of_arrival_has_no_effect() -> None:
     for late in (False, True):
         robot = localizer(field=CORNERS, odometry=STANDING)
         timeline = Timeline(robot, state_at(ORIGIN, PRIOR, -SECOND))
-        inputs = [MATE, *(Sightings(i * TENTH, (SEEN,)) for i in range(1, 5))]
+        inputs: list[Input] = [MATE, *(Sightings(i * TENTH, (SEEN,)) for i in range(1, 5))]
         for item in reversed(inputs) if late else inputs:
             assert timeline.add(item) is None
         states.append(timeline.state.estimate)
