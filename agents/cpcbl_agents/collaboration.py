@@ -114,7 +114,7 @@ class CollaborationAgent:
         self.neighbours: frozenset[str] = frozenset()
         self.sources: frozenset[tuple[str, int]] = frozenset()
         self._heading_sources: frozenset[str] = frozenset()
-        """Those of them whose beliefs may change this robot's heading alone."""
+        """Teammates whose beliefs may change this robot's heading alone."""
         # In motion an error of the heading becomes one of the position, which could come back
         is_weighted = settings.localizer.variant == "weighted"
         self._listens_to_equals = not settings.odometry.moves and not is_weighted
@@ -179,7 +179,10 @@ class CollaborationAgent:
                 if name in self._tiers and self._is_useful(fix, self._tiers[name], now)
             )
             better = accepted_tiers(self.tier, self._rules)
-            self._heading_sources = frozenset(n for n, tier in self.sources if tier not in better)
+            equals = frozenset(name for name, tier in self.sources if tier not in better)
+            whole = frozenset(name for name, tier in self.sources if tier in better)
+            # Also those of before: their last beliefs may be on the way
+            self._heading_sources = (self._heading_sources & self.neighbours | equals) - whole
 
     def _is_useful(self, seen: Fix, tier: int, now: agent.PoseEstimate) -> bool:
         rules, in_sight = self._rules, now.stamp_ns - seen.stamp_ns < IN_SIGHT_NS

@@ -184,6 +184,11 @@ def test_a_standing_robot_takes_its_heading_from_equals_but_not_from_worse_ones(
     used = alone.agent.as_used(belief)
     assert isinstance(used, HeadingBelief) is is_source
     assert astuple(used) == astuple(belief)
+    alone.tell(Presence("mate", LOWEST_TIER))
+    alone.later(0.1)
+    assert alone.agent.sources == set()
+    late = alone.agent.as_used(belief)  # it was on the way meanwhile
+    assert isinstance(late, HeadingBelief) is is_source
 
 
 def test_the_belief_of_a_better_teammate_is_used_whole() -> None:
