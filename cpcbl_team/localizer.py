@@ -354,9 +354,9 @@ class Localizer:
         return state
 
     def add_teammate_belief(self, state: State, belief: Belief) -> State:
-        """Passive collaboration: keeps a teammate's belief, for when the teammate is visible."""
+        """Passive collaboration: keeps a teammate's belief, for when the teammate is visible. The
+        state's time stays, for to divide a motion would change the last bits of later poses."""
         now_ns = belief.stamp_ns - BELIEF_VALID_BEFORE_NS
-        state = self.predict(state, now_ns)
         oldest_ns = now_ns - self._belief_age_ns
         beliefs = {
             name: fresh

@@ -104,14 +104,7 @@ class Timeline:
 
     def _keep_states(self, index: int, belief: Belief, known: list[State]) -> None:
         """Keeps what was known after a belief. It is always late, but does not change the states
-        before the first frame to which it is its robot's nearest belief. Between the times of two
-        inputs it divides a motion, which changes the last bits; and the motion in a gap is another
-        one if the odometry that ends the gap is not the next input."""
-        time_ns = self._keys[index][0]
-        if len(known) < 2 or known[1].stamp_ns != time_ns:
-            return
-        if isinstance(self._inputs[index + 1], Odometry) and known[0].odometry_until_ns < time_ns:
-            return
+        before the first frame to which it is its robot's nearest belief."""
         screen, states = self._localizer.screen, self._states
         state = self._state_before(index + 1)
         for item, (before, after) in zip(self._inputs[index + 1 :], pairwise(known), strict=False):
