@@ -12,7 +12,7 @@ from cpcbl_launch.cli import main
 from cpcbl_launch.run.processes import PROGRAM
 
 
-def cpcbl_team(*arguments: object, timeout_s: float = 90.0) -> "subprocess.CompletedProcess[str]":
+def cpcbl_team(*arguments: object, timeout_s: float = 300.0) -> "subprocess.CompletedProcess[str]":
     """Runs `cpcbl-team ARGUMENTS` to its end."""
     return subprocess.run(
         [*PROGRAM, *map(str, arguments)],
