@@ -4,6 +4,9 @@ Gains are in nats: the logarithm of the factor by which the 1 sigma ellipse of t
 (half the logarithm of the ratio of determinants, the mutual information of Gaussians), and of the
 factor by which the sigma of the heading shrinks. A sender does not know the receiver's covariance.
 It predicts it from the tier that the receiver announces and from the last fix that it sent.
+
+Gains say whether a message is worth its bytes now. To choose among messages that compete for one
+budget there is a value: what counts then is the error in metres, and how long it stays away.
 """
 
 import math
@@ -22,6 +25,9 @@ DRIFT_SHARE = 0.1  # position sigma that a teammate gains between two fixes, per
 LOST_HEADING_SIGMA_RAD = math.pi / math.sqrt(3.0)  # of a uniform distribution
 USUAL_HEADING_SIGMA_RAD = math.radians(10.0)  # assumed: a tier describes the position only
 HEADING_DRIFT_RAD_PER_SQRT_M = 0.1  # heading sigma that a teammate gains, a random walk
+SUBSCRIBER_DRIFT_M_S = 0.005  # error that a subscriber is assumed to gain between two beliefs
+UNKNOWN_AGE_S = 60.0  # since the last help for a teammate, as long as there was none
+LEAST_VALUE = 0.17  # m sqrt(s): 3 cm after half a minute
 
 
 class HeadingMemory(NamedTuple):
@@ -138,6 +144,29 @@ def information_gain(prior: Covariance2, after: Covariance2) -> float:
     `SMALLEST_VARIANCE`."""
     left = max(after.determinant(), SMALLEST_VARIANCE**2)
     return 0.5 * math.log(_regularized(prior).determinant() / left)
+
+
+def value_of_help(removed_m: float, age_s: float) -> float:
+    """The value (m sqrt(s)) of a message that removes a position error `age_s` after the last one.
+
+    It is the root of variance times time. If the variance grows by q in a second and a message
+    costs c, a message each T seconds costs q T / 2 + c / T, which is least where c = q T^2 / 2:
+    a message is due when half the variance that it removes, times its age, has reached its price.
+    """
+    return removed_m * math.sqrt(max(0.0, age_s))
+
+
+def value_of_fix(prior: Covariance2, after: Covariance2, age_s: float) -> float:
+    """The value (m sqrt(s)) of a fix that changes a teammate's covariance from `prior` to `after`
+    when the last one for it is `age_s` old."""
+    removed = prior.xx + prior.yy - after.xx - after.yy
+    return value_of_help(math.sqrt(max(0.0, removed)), age_s)
+
+
+def value_of_belief(age_s: float) -> float:
+    """The value (m sqrt(s)) of a belief when the last one is `age_s` old. The sender does not know
+    its subscribers, so it assumes that their error has grown since then."""
+    return value_of_help(min(SUBSCRIBER_DRIFT_M_S * age_s, LOST_SIGMA_M), age_s)
 
 
 def _regularized(c: Covariance2) -> Covariance2:

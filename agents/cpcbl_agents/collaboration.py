@@ -35,8 +35,10 @@ def _size(message: Belief | Fix) -> int:
 
 
 class _Offer(NamedTuple):
-    """A fix that could be sent, its information gain, and what its robot knows after it."""
+    """A fix that could be sent, its information gain (nats), its value (m sqrt(s)), and what its
+    robot knows after it."""
 
+    gain: float
     value: float
     urgent: bool
     after: FixMemory
@@ -107,6 +109,8 @@ class CollaborationAgent:
         self._tiers: dict[str, int] = {}
         self._fix_memories: dict[str, tuple[int, FixMemory]] = {}
         self._last_belief: Belief | None = None
+        self._never_ns = self._from_ns - int(gains.UNKNOWN_AGE_S * 1e9)  # in place of a last help
+        self._belief_sent_ns = self._never_ns
         self._has_subscribers = False
         self.counters = MessageCounters()
         self.tier = LOWEST_TIER
@@ -243,16 +247,21 @@ class CollaborationAgent:
         if not self._may_help(fix, tier):
             return []
         offer = self._offer(fix, tier)
-        if offer.value >= self._rules.least_value:
+        if offer.gain >= self._least_gain(fix):
             return [offer]
         self.counters.of("fix", fix.robot).worthless += 1
         return []
 
+    def _least_gain(self, fix: Fix) -> float:
+        """The information gain from which on the fix is sent; 0 sends all, whatever the budget."""
+        least = self._rules.least_value
+        return max(least, self.budget.least_gain(_size(fix))) if least else 0.0
+
     def _affordable(self, offers: list[_Offer], now_ns: int) -> list[Fix]:
-        """The fixes that the budget admits, the one with the largest gain first."""
+        """The fixes that the budget admits, the one with the largest value first."""
         offers.sort(key=lambda offer: (offer.urgent, offer.value), reverse=True)
         sent = []
-        for value, urgent, after, fix in offers:
+        for _, value, urgent, after, fix in offers:
             if self._affords(now_ns, _size(fix), value, urgent):
                 self._fix_memories[fix.robot] = fix.stamp_ns, after
                 sent.append(fix)
@@ -269,22 +278,24 @@ class CollaborationAgent:
 
     def _offer(self, fix: Fix, tier: int) -> _Offer:
         """The fix with its gain; with the heading only if the heading is worth its own bytes."""
-        _, before = self._fix_memories.get(fix.robot, (0, None))
+        last_ns, before = self._fix_memories.get(fix.robot, (self._never_ns, None))
         rules, place = self._rules, (fix.x_m, fix.y_m)
         prior = gains.predicted_teammate_covariance(tier, before, *place, rules)
         parts = Covariance2(*fix.sensor_covariance), Covariance2(*fix.observer_covariance)
         after = gains.merged_covariance(prior, *parts, rules.fusion)
-        value = gains.information_gain(prior, after)
+        gain = gains.information_gain(prior, after)
+        value = gains.value_of_fix(prior, after, (fix.stamp_ns - last_ns) * 1e-9)
         turned = None if before is None else before.heading
         if fix.heading_rad is not None:
             variance = gains.predicted_teammate_heading_variance(tier, turned, fix)
             left = gains.merged_heading_variance(variance, fix, rules.fusion)
             gained = gains.heading_information_gain(variance, left)
             if gained >= rules.least_value:
-                value, turned = value + gained, HeadingMemory(*place, left)
+                gain, turned = gain + gained, HeadingMemory(*place, left)
             else:
                 fix = without_heading(fix)
-        return _Offer(value, tier == LOWEST_TIER, FixMemory(*place, after, turned), fix)
+        memory = FixMemory(*place, after, turned)
+        return _Offer(gain, value, tier == LOWEST_TIER, memory, fix)
 
     # Beliefs -------------------------------------------------------------------------------
 
@@ -304,8 +315,8 @@ class CollaborationAgent:
         if is_recent and stale < rules.belief_share:
             tally.silent += 1
             return []
-        # The error of the last belief in sigmas, as the nats of correcting it
-        if not self._affords(now_ns, _size(belief), 0.5 * stale * stale, urgent=False):
+        value = gains.value_of_belief((now.stamp_ns - self._belief_sent_ns) * 1e-9)
+        if not self._affords(now_ns, _size(belief), value, urgent=False):
             tally.over_budget += 1
             return []
         self._last_belief = belief
@@ -314,8 +325,8 @@ class CollaborationAgent:
     # Budget, and what was really sent ----------------------------------------------------
 
     def _affords(self, now_ns: int, size: int, value: float, urgent: bool) -> bool:
-        """Whether a message of this gain may be sent; if so, the budget is charged at once."""
-        budget, least = self.budget, self._rules.least_value
+        """Whether a message of this value may be sent; if so, the budget is charged at once."""
+        budget, least = self.budget, gains.LEAST_VALUE if self._rules.least_value else 0.0
         if not urgent and value < budget.price(now_ns, size):
             return False
         admitted = budget.admits(now_ns, size, urgent)
@@ -330,6 +341,8 @@ class CollaborationAgent:
         topic, to = ("fix", message.robot) if isinstance(message, Fix) else ("belief", "")
         if sent.size:
             self.counters.of(topic, to).add(sent.size, message.stamp_ns)
+            if isinstance(message, Belief):
+                self._belief_sent_ns = message.stamp_ns
             return
         # A new key often has no subscriber yet: the message is tried again
         self.budget.refund(now_ns, _size(message))

@@ -14,6 +14,7 @@ from cpcbl_team.config import (
     BudgetSettings,
     CollaborationSettings,
 )
+from cpcbl_team.information_gain import LEAST_VALUE
 from cpcbl_team.inputs import Sighting
 from cpcbl_team.tiers import LOWEST_TIER, next_tier
 from cpcbl_transport.messages import Flow
@@ -114,6 +115,26 @@ def test_a_budget_for_one_message_goes_to_the_fix_with_the_largest_gain() -> Non
     assert [alone.tally("fix", name).messages for name in ("mate", "other")] == [0, 1]
 
 
+def test_a_budget_for_one_message_goes_to_the_teammate_that_was_not_helped_for_longer() -> None:
+    alone = Alone(budget=BudgetSettings(messages_per_minute=1.0, urgent_share=0.0))
+    alone.tell(Presence("mate", POORER), Presence("other", POORER))
+    first = robots(alone.sees(ahead("mate"), ahead("other")))
+    second = robots(alone.sees(ahead("mate"), ahead("other"), after_ns=60 * SECOND))
+    third = robots(alone.sees(ahead("mate"), ahead("other"), after_ns=60 * SECOND))
+    assert sorted(first + second) == ["mate", "other"]
+    assert third == first
+
+
+def test_with_a_tight_budget_a_fix_must_nearly_halve_the_ellipse() -> None:
+    sent = []
+    for per_minute in (0.0, 4.0):
+        alone = Alone(budget=BudgetSettings(messages_per_minute=per_minute, urgent_share=0.0))
+        alone.tell(Presence("mate", GOOD + 2))
+        sent.append(len(alone.sees(ahead(range_m=1.2))))
+    assert sent == [1, 0]
+    assert alone.tally("fix", "mate").worthless == 1
+
+
 def test_what_a_late_frame_costs_is_of_the_time_at_which_it_is_sent() -> None:
     alone = Alone(budget=BudgetSettings(messages_per_minute=1.0, urgent_share=0.0))
     alone.tell(Presence("mate", POORER))
@@ -159,14 +180,12 @@ def test_a_lost_teammate_comes_first_whatever_the_gain() -> None:
 def test_a_lost_teammate_gets_a_fix_that_is_not_worth_its_price() -> None:
     """Far away, right after the price has risen."""
     alone = Alone(budget=BudgetSettings(bytes_per_s=1000.0))
-    alone.tell(Presence("mate", LOWEST_TIER), Presence("other", POORER))
-    far = ahead("mate", 60.0)
-    for _ in range(40):
-        alone.sees(ahead("other", 1.0), after_ns=20 * MS)
-    price = alone.agent.budget.price(alone.now_ns, 42)
-    assert alone.agent.budget.admits(alone.now_ns, 42, urgent=True)
-    assert robots(alone.sees(far)) == ["mate"]
-    assert price > 3.0
+    alone.tell(Presence("mate", LOWEST_TIER), Presence("other", LOWEST_TIER - 1))
+    for _ in range(20):
+        alone.agent.budget.spend(alone.now_ns, 42, LEAST_VALUE)
+    assert alone.agent.budget.admits(alone.now_ns, 42, urgent=False)
+    assert alone.sees(ahead("other", 1.0)) == []
+    assert robots(alone.sees(ahead("mate", 60.0))) == ["mate"]
 
 
 def test_the_reserve_is_for_lost_teammates() -> None:
@@ -199,12 +218,12 @@ def test_a_budget_that_has_just_recovered_is_not_spent_on_small_gains() -> None:
     weak = Presence("other", GOOD + 2)
     at_first = Alone(budget=BudgetSettings(messages_per_minute=4.0, urgent_share=0.0))
     at_first.tell(weak)
-    assert robots(at_first.sees(ahead("other", 1.2))) == ["other"]
+    assert robots(at_first.sees(ahead("other", 0.2))) == ["other"]
     alone = Alone(budget=BudgetSettings(messages_per_minute=4.0, urgent_share=0.0))
     alone.tell(Presence("mate", POORER), weak)
     sent = [bool(alone.sees(ahead(), after_ns=SECOND)) for _ in range(60)]
     assert sent == [True] * 4 + [False] * 56
-    assert alone.sees(ahead("other", 1.2), after_ns=SECOND) == []
+    assert alone.sees(ahead("other", 0.2), after_ns=SECOND) == []
     assert len(alone.sees(ahead())) == 1
 
 

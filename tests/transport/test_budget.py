@@ -237,6 +237,21 @@ def test_a_match_has_no_more_messages_however_early_the_robot_is_switched_on(fir
     assert (spending.most, spending.allowed) == (300.0, 300.0)
 
 
+# The least gain ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("bytes_per_s", "least"),
+    [(0.0, 0.0), (42.0, math.log(1.2)), (8.4, math.log(2.0)), (0.5, math.log(2.0))],
+    [(0.0, 0.0), (42.0, math.log(1.2)), (8.4, math.log(2.0)), (0.5, 0.693)],
+)
+def test_the_slower_a_fix_is_earned_the_more_it_must_gain_up_to_half_the_ellipse(
+    bytes_per_s: float, least: float
+) -> None:
+    budget = Budget(BudgetSettings(bytes_per_s=bytes_per_s), 0)
+    assert budget.least_gain(FIX) == pytest.approx(least, abs=1e-3)
+
+
 # The price --------------------------------------------------------------------------------------
 
 LIMITED = [

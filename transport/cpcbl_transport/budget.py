@@ -1,4 +1,4 @@
-"""What a robot may still spend on messages, and the information gain that a message must have.
+"""What a robot may still spend on messages, and the gain and value that a message must have.
 
 A limit is a token bucket whose tokens return one window after they were spent. So no window ever
 contains more than is allowed, and no reserve for bursts is necessary, as it is in a bucket that
@@ -17,6 +17,7 @@ from cpcbl_transport.messages import Spending
 SHORTEST_WINDOW_S, LONGEST_WINDOW_S = 10.0, 60.0
 LEAST_BYTES = 120.0  # in a window, so that a small budget can be used up by whole messages
 USUAL_BYTES = 500.0  # in a window whose time is between these two
+DOUBLING_S = 5.0  # in which the error ellipse of a robot without help is assumed to double
 PRICE_MEMORY = 3.0  # messages: in the time in which so many are earned, the price falls by e
 _ROUNDING = 1e-9
 
@@ -120,12 +121,17 @@ class Budget:
         )
 
     def price(self, now_ns: int, size: int) -> float:
-        """The least gain that a message of this size must have, in the unit of `spend`."""
-        earned_s = max((limit.pace_s * amount for limit, amount in self._costs(size)), default=0.0)
+        """The least value that a message of this size must have, in the unit of `spend`."""
+        earned_s = self._earned_s(size)
         if earned_s == 0.0:
             return 0.0
         memory_s = PRICE_MEMORY * earned_s
         return self._price * math.exp((self._price_ns - now_ns) * 1e-9 / memory_s)
+
+    def least_gain(self, size: int) -> float:
+        """The least information gain (nats) that a fix of this size must have: it shrinks the
+        ellipse by at least as much as that grows while the fix is earned, at most to half."""
+        return math.log1p(min(1.0, self._earned_s(size) / DOUBLING_S))
 
     def spend(self, now_ns: int, size: int, least: float) -> None:
         """A message of this size is sent; its price was at least `least`."""
@@ -141,12 +147,16 @@ class Budget:
             limit.spend(now_ns, -amount)
 
     def refuse(self, now_ns: int, least: float) -> None:
-        """A message with enough gain, at least `least`, is not admitted by the limits."""
+        """A message with enough value, at least `least`, is not admitted by the limits."""
         self._price, self._price_ns = max(self._price, least), now_ns
 
     def spending(self, now_ns: int) -> tuple[Spending, ...]:
         """Its limits, and the largest use of each so far."""
         return tuple(limit.spending(now_ns) for limit in self._limits)
+
+    def _earned_s(self, size: int) -> float:
+        """The seconds in which a message of this size is earned; 0 without limits."""
+        return max((limit.pace_s * amount for limit, amount in self._costs(size)), default=0.0)
 
     def _costs(self, size: int) -> list[tuple[SlidingWindow | MatchAllowance, float]]:
         return [(limit, size if limit.unit == "bytes" else 1.0) for limit in self._limits]
