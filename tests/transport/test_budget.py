@@ -243,7 +243,6 @@ def test_a_match_has_no_more_messages_however_early_the_robot_is_switched_on(fir
 @pytest.mark.parametrize(
     ("bytes_per_s", "least"),
     [(0.0, 0.0), (42.0, math.log(1.2)), (8.4, math.log(2.0)), (0.5, math.log(2.0))],
-    [(0.0, 0.0), (42.0, math.log(1.2)), (8.4, math.log(2.0)), (0.5, 0.693)],
 )
 def test_the_slower_a_fix_is_earned_the_more_it_must_gain_up_to_half_the_ellipse(
     bytes_per_s: float, least: float

@@ -91,27 +91,36 @@ def one_way_vs_both(
 
 @experiment_app.command("budget")
 def budget(
-    data: Annotated[Path, typer.Argument(help="Folder of an MRCLAM log, e.g. MRCLAM6.")],
+    data: Annotated[
+        Optional[Path], typer.Argument(help="Folder of an MRCLAM log, e.g. MRCLAM6.")
+    ] = None,
     blind: Annotated[str, typer.Option(help="Robots that shall not see landmarks.")] = "3,4,5",
     duration: Annotated[
         Optional[float], typer.Option(help="Seconds of the log; default: all.")
     ] = None,
+    robots: Annotated[
+        int, typer.Option(min=2, max=50, help="Without a log: the size of simulated teams.")
+    ] = 10,
+    seeds: Seeds = 3,
     jobs: Jobs = None,
     output: Output = Path(),
     as_json: AsJson = False,
 ) -> None:
-    """A real log: accuracy against bytes, by value and budget, by fixed intervals, all of it."""
+    """Accuracy against bytes, by value and budget, by fixed intervals, all of it: on a real log, or
+    with simulated teams of mixed quality."""
     from cpcbl_launch.lab.experiments import budget as experiment
     from cpcbl_launch.overrides import with_blind_robots
     from cpcbl_launch.run import logged_team
     from cpcbl_launch.team_file import load_team
 
-    team = load_team(logged_team.builtin_for(data))
-    logged = logged_team.with_duration(logged_team.load_logged_team(team, data), duration)
-    logged = logged._replace(
-        team=with_blind_robots(logged.team, parse_names(blind), logged.left_out)
-    )
-    measure = partial(experiment.measure_curve, logged, jobs)
+    if data is None:
+        runs = experiment.simulated_runs(robots, seeds)
+    else:
+        team = load_team(logged_team.builtin_for(data))
+        logged = logged_team.with_duration(logged_team.load_logged_team(team, data), duration)
+        team = with_blind_robots(logged.team, parse_names(blind), logged.left_out)
+        runs = experiment.runs_of_log(logged._replace(team=team))
+    measure = partial(experiment.measure_curve, runs, jobs)
     total = len(experiment.cases())
     _conduct("budget", measure, experiment.tables, output, as_json, total=total)
 

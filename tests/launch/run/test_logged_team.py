@@ -146,10 +146,10 @@ def test_so_much_of_a_log_cannot_be_used(duration_s: float, tmp_path: Path) -> N
 
 def test_a_budget_is_not_held_where_nothing_can_be_scored(tmp_path: Path) -> None:
     on, case = logged(tmp_path, seconds=8.0), budget.cases()[0]
-    assert budget.measure_point(on, case).position_rmse_m < MILLIMETRE
+    assert budget.measure_point(budget.runs_of_log(on), case).position_rmse_m < MILLIMETRE
     late = {name: rows[rows[:, 0] > EPOCH_MS * 1e-3 + 6.0] for name, rows in on.truth.items()}
     with pytest.raises(InputError, match=r"no truth in these 2 s; take more of the log"):
-        budget.measure_point(with_duration(on._replace(truth=late), 2.0), case)
+        budget.measure_point(budget.runs_of_log(with_duration(on._replace(truth=late), 2.0)), case)
 
 
 def test_blinding_takes_landmarks_from_the_named_robots_only(tmp_path: Path) -> None:

@@ -1,11 +1,12 @@
-"""Accuracy against bytes on a real log: value and budget, fixed intervals, everything both ways.
+"""Accuracy against bytes: value and budget, fixed intervals, everything both ways.
 
-Every point is the whole log once, all robots with the same settings; what it cost is what was sent,
-not what was allowed. Everything: a fix of each sighting of a teammate, beliefs at 5 Hz to whoever
-sees the robot.
+Every point is a whole log once, or a simulated team with several seeds, all robots with the same
+settings; what it cost is what was sent, not what was allowed. Everything: a fix of each sighting of
+a teammate, beliefs at 5 Hz to whoever sees the robot.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from itertools import groupby
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -15,16 +16,20 @@ from msgspec.structs import replace
 from rich.console import RenderableType
 
 from cpcbl_launch.lab.evaluation import evaluate_log
+from cpcbl_launch.lab.experiments.mixed_team import mixed_team
 from cpcbl_launch.lab.experiments.runs import ExperimentResult, map_in_processes
-from cpcbl_launch.reporting.recorder import mean_score
+from cpcbl_launch.reporting.recorder import Report, mean_score
 from cpcbl_launch.reporting.tables import cells, table
 from cpcbl_launch.run.logged_team import LoggedTeam
+from cpcbl_launch.simulation.in_process import simulate
+from cpcbl_team.config import Team
 from cpcbl_team.errors import InputError
 
 EVERYTHING: Mapping[str, Any] = {"least_value": 0.0, "least_use": 0.0, "belief_share": 0.0}
 # For a few messages a minute: messages of less value, or soon after the last, would only delay
 # those of more value.
 RARE = {"least_value": 0.2, "least_use": 0.9, "fix_interval_s": 10.0, "belief_rate_hz": 0.1}
+SIMULATED_S = 300.0
 OURS = ("bytes limited", "messages limited", "value alone")
 
 
@@ -72,16 +77,16 @@ class Case(NamedTuple):
 def cases() -> list[Case]:
     """All cases, from no help to all help; each series from little to much."""
     every = [Case("nothing", "alone", {"active": False, "passive": False})]
-    for limit in (1, 2, 5, 10, 20, 50):
+    for limit in (0.5, 1, 2, 4, 8, 20, 50):
         budget = {"bytes_per_s": limit, "urgent_share": 0.2}
-        every.append(Case("bytes limited", f"{limit} B/s", {}, budget))
+        every.append(Case("bytes limited", f"{limit:g} B/s", {}, budget))
     for limit in (2, 3, 4, 6, 8):
         budget = {"messages_per_minute": limit, "urgent_share": 0.0}
         every.append(Case("messages limited", f"{limit} /min", RARE, budget))
     for least in (0.4, 0.2, 0.1, 0.05, 0.02):
         rules = {"least_value": least, "least_use": 4.0 * least}
         every.append(Case("value alone", f"{least:g} nats", rules))
-    for interval_s in (60, 30, 15, 8, 4, 2, 1, 0.5):
+    for interval_s in (240, 120, 60, 30, 15, 8, 4, 2, 1, 0.5):
         rules = {**EVERYTHING, "fix_interval_s": interval_s, "belief_rate_hz": 1.0 / interval_s}
         every.append(Case("fixed interval", f"{interval_s:g} s", rules))
     every.append(Case("all, one way", "no limit", EVERYTHING))
@@ -89,48 +94,86 @@ def cases() -> list[Case]:
     return every
 
 
-def measure_point(logged: LoggedTeam, case: Case) -> Point:
-    """The figures of one case. Raises InputError if the log has no ground truth in this time."""
-    robots = {}
-    for name, robot in logged.team.robots.items():
-        rules = robot.collaboration
-        budget = replace(rules.budget, **case.budget)
-        robots[name] = replace(robot, collaboration=replace(rules, budget=budget, **case.rules))
-    run = logged._replace(team=replace(logged.team, robots=robots))
-    report = evaluate_log(run).report
-    team, minutes = report.team, report.duration_s / 60.0 * len(robots)
-    if team.position_rmse_m is None or team.heading_rmse_deg is None:
+class Runs(NamedTuple):
+    """What a curve is about: a log once, or simulated teams. `reports` are those of one case."""
+
+    name: str
+    team: Team
+    duration_s: float
+    reports: Callable[[Case], list[Report]]
+
+
+def runs_of_log(logged: LoggedTeam) -> Runs:
+    duration_s = (logged.end_ns - logged.start_ns) * 1e-9
+    name = Path(logged.team.data).name
+    return Runs(name, logged.team, duration_s, partial(_log_reports, logged))
+
+
+def simulated_runs(size: int, seeds: int) -> Runs:
+    """Mixed teams of this size, one for each seed."""
+    reports = partial(_simulated_reports, size, seeds)
+    return Runs(f"{size} robots, {seeds} seeds", mixed_team(size, 1), SIMULATED_S, reports)
+
+
+def _log_reports(logged: LoggedTeam, case: Case) -> list[Report]:
+    report = evaluate_log(logged._replace(team=_with_case(logged.team, case))).report
+    if report.team.position_rmse_m is None:
         raise InputError(
             f"{logged.team.data}: no truth in these {report.duration_s:g} s; take more of the log"
         )
-    blind = mean_score(r for name, r in report.robots.items() if name in _blind(logged))
+    return [report]
+
+
+def _simulated_reports(size: int, seeds: int, case: Case) -> list[Report]:
+    teams = {seed: _with_case(mixed_team(size, seed), case) for seed in range(1, seeds + 1)}
+    return [simulate(team, seed, SIMULATED_S)[0] for seed, team in teams.items()]
+
+
+def _with_case(team: Team, case: Case) -> Team:
+    robots = {}
+    for name, robot in team.robots.items():
+        rules = robot.collaboration
+        budget = replace(rules.budget, **case.budget)
+        robots[name] = replace(robot, collaboration=replace(rules, budget=budget, **case.rules))
+    return replace(team, robots=robots)
+
+
+def measure_point(runs: Runs, case: Case) -> Point:
+    """The figures of one case, means over its runs. Raises InputError if a log has no ground truth
+    in its time."""
+    robots = [named for report in runs.reports(case) for named in report.robots.items()]
+    team = mean_score(r for _, r in robots)
+    blind = mean_score(r for name, r in robots if name in _blind(runs.team))
+    robot_s = runs.duration_s * len(robots)
+    assert team.position_rmse_m is not None
+    assert team.heading_rmse_deg is not None
     return Point(
         series=case.series,
         setting=case.setting,
-        bytes_per_s=team.bytes_sent / 60.0 / minutes,
-        messages_per_minute=team.messages_sent / minutes,
+        bytes_per_s=sum(r.bytes_sent for _, r in robots) / robot_s,
+        messages_per_minute=60.0 * sum(r.messages_sent for _, r in robots) / robot_s,
         position_rmse_m=team.position_rmse_m,
         blind_rmse_m=blind.position_rmse_m,
         heading_rmse_deg=team.heading_rmse_deg,
         inside_3_sigma=team.inside_3_sigma,
         nees=team.nees,
-        within_budget=all(s.most <= s.allowed for r in report.robots.values() for s in r.spending),
+        within_budget=all(s.most <= s.allowed for _, r in robots for s in r.spending),
     )
 
 
-def _blind(logged: LoggedTeam) -> tuple[str, ...]:
-    return tuple(n for n, r in logged.team.robots.items() if not r.sensor.sees_landmarks)
+def _blind(team: Team) -> tuple[str, ...]:
+    return tuple(n for n, r in team.robots.items() if not r.sensor.sees_landmarks)
 
 
-def measure_curve(logged: LoggedTeam, jobs: int | None, done: Callable[[], None]) -> Curve:
-    """All points; `done` is called after each. The same log gives the same figures."""
-    tasks = [(logged, case) for case in cases()]
+def measure_curve(runs: Runs, jobs: int | None, done: Callable[[], None]) -> Curve:
+    """All points; `done` is called after each. The same runs give the same figures."""
+    tasks = [(runs, case) for case in cases()]
     points = tuple(map_in_processes(measure_point, tasks, jobs, done))
     return Curve(
         experiment="budget",
-        log=Path(logged.team.data).name,
-        blind=_blind(logged),
-        duration_s=(logged.end_ns - logged.start_ns) * 1e-9,
+        log=runs.name,
+        blind=_blind(runs.team),
+        duration_s=runs.duration_s,
         points=points,
         targets=targets(points),
     )
