@@ -258,7 +258,8 @@ def measure_camera_accuracy(observations: Sequence[CameraObservations]) -> Camer
             f"{len(rows.stretch)} sightings with known truth; at least {MIN_ROWS} are needed:"
             " more pictures or a longer drive, near and far, all over the picture"
         )
-    values, corrections = calibrate_sensor([observed.log for observed in observations])
+    values, fit = calibrate_sensor([observed.log for observed in observations])
+    corrections = SensorCorrections() if fit is None else fit.after
     times = _remaining_error_factor(_error_rows(observations, corrections))
     return CameraAccuracy(tuple(_accuracy_rows(rows)), values, corrections.is_depth, times)
 

@@ -253,7 +253,7 @@ def _covering_variances(errors: Floats, columns: Floats, weights: Floats) -> Flo
     return parts * max(1.0, *(float(unit[weights == w].mean()) for w in np.unique(weights)))
 
 
-class _OdometryFit(NamedTuple):
+class OdometryFit(NamedTuple):
     """The best corrections, and the data of their fit."""
 
     now: OdometryCorrections
@@ -262,11 +262,12 @@ class _OdometryFit(NamedTuple):
     windows: Sequence[OdometryWindows]  # of `NOISE_WINDOWS_S`
 
 
-def calibrate_odometry(logs: Sequence[RobotLog]) -> dict[str, Estimate]:
-    """Values named as in `OdometrySettings`; those that the logs do not determine are missing."""
-    logs = [log for log in logs if len(log.odometry)]
-    if not logs:
-        return {}
+def calibrate_odometry(
+    logs: Sequence[RobotLog],
+) -> tuple[dict[str, Estimate], OdometryFit | None]:
+    """Values named as in `OdometrySettings`, if the logs determine them, and their fit."""
+    if not (logs := [log for log in logs if len(log.odometry)]):
+        return {}, None
     found = _fit_corrections(logs, OdometryCorrections(1.0, 1.0, odometry_delay_s(logs), 0.0, 0.0))
     crawling: dict[str, Estimate | None] = {}
     if found and (least_speed := estimate_least_speed(logs, found.now)):
@@ -275,7 +276,7 @@ def calibrate_odometry(logs: Sequence[RobotLog]) -> dict[str, Estimate]:
         crawling = {"least_speed_m_s": least_speed, CRAWL_NOISE: crawl_noise}
         found = _fit_corrections([with_least_speed(log, speed) for log in logs], found.now)
     if found is None:
-        return {}
+        return {}, None
     now, known, fit, windows = found
     changes = jackknife(lambda keep: solve(select_rows(fit, keep(fit.stretch)), known), fit.stretch)
     values = [Estimate(v, c.standard_error) for v, c in zip(now, changes, strict=True)]
@@ -285,10 +286,10 @@ def calibrate_odometry(logs: Sequence[RobotLog]) -> dict[str, Estimate]:
     )
     result = {name: v for name, v, k in zip(CORRECTIONS, values, known, strict=True) if k}
     result |= {name: estimate for name, estimate in crawling.items() if estimate is not None}
-    return result | dict(zip(NOISE, grown, strict=False))
+    return result | dict(zip(NOISE, grown, strict=False)), found
 
 
-def _fit_corrections(logs: Sequence[RobotLog], now: OdometryCorrections) -> _OdometryFit | None:
+def _fit_corrections(logs: Sequence[RobotLog], now: OdometryCorrections) -> OdometryFit | None:
     """The corrections that fit best; None if the robot moved too little."""
     for _ in range(4):
         windows = [odometry_windows(logs, now.delay_s, length_s) for length_s in NOISE_WINDOWS_S]
@@ -301,7 +302,7 @@ def _fit_corrections(logs: Sequence[RobotLog], now: OdometryCorrections) -> _Odo
         scale, turn_scale, later_s, loss, bias = solve(fit, known).tolist()
         delay_s = now.delay_s + min(max(later_s, -0.05), 0.05) if known[2] else 0.0
         now = OdometryCorrections(1.0 + scale, 1.0 + turn_scale, delay_s, max(loss, 0.0), bias)
-    return _OdometryFit(now, known, fit, windows)
+    return OdometryFit(now, known, fit, windows)
 
 
 def turn_residuals(logs: Sequence[RobotLog], turn_scale: float) -> Floats:

@@ -226,12 +226,12 @@ def _range_error_sigma(found: SensorFit) -> float:
     return robust_sigma(np.abs(errors[np.isfinite(errors)]))
 
 
-def calibrate_sensor(logs: Sequence[RobotLog]) -> tuple[dict[str, Estimate], SensorCorrections]:
-    """Values named as in `SensorSettings`, without those that the logs do not determine, and all
-    corrections (neutral ones with too few sightings)."""
+def calibrate_sensor(logs: Sequence[RobotLog]) -> tuple[dict[str, Estimate], SensorFit | None]:
+    """Values named as in `SensorSettings`, without those that the logs do not determine, and their
+    fit (None: too few sightings)."""
     best = fit_sensor(logs)
     if best is None:
-        return {}, SensorCorrections()
+        return {}, None
     rows, before, fit, known, now = best
     corrections = jackknife(
         lambda keep: np.array(
@@ -255,7 +255,7 @@ def calibrate_sensor(logs: Sequence[RobotLog]) -> tuple[dict[str, Estimate], Sen
         if name.endswith("_deg"):
             value, error = result[name].value, result[name].standard_error
             result[name] = Estimate(math.degrees(value), math.degrees(error))
-    return {name: v for name, v in result.items() if math.isfinite(v.value)}, now
+    return {name: v for name, v in result.items() if math.isfinite(v.value)}, best
 
 
 def sensor_error_pairs(rows: SightingRows, now: SensorCorrections) -> ErrorPairs:

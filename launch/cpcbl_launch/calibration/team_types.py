@@ -12,6 +12,13 @@ from tomlkit.items import Table
 from tomlkit.toml_document import TOMLDocument
 
 from cpcbl_launch.calibration import odometry, sensor
+from cpcbl_launch.calibration.between_days import (
+    DayVariance,
+    odometry_day_variances,
+    pooled_variances,
+    sensor_day_variances,
+    with_day_variances,
+)
 from cpcbl_launch.calibration.logs import RobotLog, RobotLogs
 from cpcbl_launch.calibration.statistics import Estimate, decimals
 from cpcbl_launch.calibration.team_tables import MINIMUM, team_source
@@ -35,6 +42,7 @@ class RobotCalibration(msgspec.Struct, frozen=True):
     sensor: dict[str, Estimate]
     notes: tuple[str, ...] = ()
     range_is_depth: bool = False
+    day_variances: dict[str, DayVariance] = {}
 
 
 class Calibration(msgspec.Struct, frozen=True):
@@ -62,16 +70,19 @@ def calibrate_robots(
 
 def _calibrate_robot(logs: Sequence[RobotLog]) -> RobotCalibration:
     """One robot, from all its logs."""
-    odometry_values = odometry.calibrate_odometry(logs)
-    sensor_values, corrections = sensor.calibrate_sensor(logs)
+    odometry_values, motion = odometry.calibrate_odometry(logs)
+    sensor_values, sight = sensor.calibrate_sensor(logs)
+    days = {} if motion is None else odometry_day_variances(motion)
+    days |= {} if sight is None else sensor_day_variances(sight)
+    is_depth = sight is not None and sight.after.is_depth
     notes = []
     if not odometry_values:
         notes.append("does not drive: odometry stays as it is")
     if not sensor_values:
         notes.append("too few sightings with ground truth: the sensor stays as it is")
-    if corrections.is_depth:
+    if is_depth:
         notes.append("ranges are depths along the optical axis")
-    axis = () if corrections.is_depth else ("optical_axis_deg",)
+    axis = () if is_depth else ("optical_axis_deg",)
     for part, found, names in (
         ("odometry", odometry_values, (*odometry.CORRECTIONS, *odometry.NOISE)),
         ("sensor", sensor_values, (*sensor.CORRECTIONS, *sensor.NOISE, "correlation_s")),
@@ -79,7 +90,7 @@ def _calibrate_robot(logs: Sequence[RobotLog]) -> RobotCalibration:
         missing = [name for name in names if name not in found and name not in axis]
         if found and missing:
             notes.append(f"not determined by the logs: {part} {', '.join(missing)}")
-    return RobotCalibration(odometry_values, sensor_values, tuple(notes), corrections.is_depth)
+    return RobotCalibration(odometry_values, sensor_values, tuple(notes), is_depth, days)
 
 
 def base_team(logs: Sequence[Path], team_file: Path | None) -> tuple[str, str]:
@@ -118,21 +129,26 @@ def calibrated_team(
     """The base team file with a type for each calibrated robot. Raises TeamFileError, InputError.
 
     The new type of a robot includes its former one. Calibrated keys of the robot itself are
-    removed. `margin`: all sigmas are increased by this share. `correction_margin`: this share of
-    each correction (range, bearing, least speed) is added to its noise, because it may be different
-    on another day.
+    removed. `margin`: all sigmas are increased by this share. What differs between the days of
+    several logs is added to them (`between_days`). Of one log it is not known: instead the share
+    `correction_margin` of each correction of a range or bearing is added to its noise. Of the least
+    speed, which is not compared, it is always added.
     """
     parse_team(base, name)
     document = tomlkit.parse(base)
+    pooled = pooled_variances([robot.day_variances for robot in calibration.robots.values()])
     present = [n for n in calibration.robots if n in document["robots"]]
     if not present:
         raise InputError(f"{name}: has none of the robots {', '.join(calibration.robots)}")
+    noise = (*odometry.NOISE, odometry.CRAWL_NOISE)
     for robot in present:
         found = calibration.robots[robot]
-        noise = (*odometry.NOISE, odometry.CRAWL_NOISE)
-        odometry_values = _with_margin(found.odometry, noise, margin, correction_margin)
-        sensor_values = _with_margin(found.sensor, sensor.NOISE, margin, correction_margin)
-        _add_type(document, robot, replace(found, odometry=odometry_values, sensor=sensor_values))
+        share = 0.0 if "range" in pooled else correction_margin  # the differences were measured
+        motion = _with_margin(found.odometry, noise, margin, correction_margin)
+        sight = _with_margin(found.sensor, sensor.NOISE, margin, share)
+        own = found.day_variances
+        motion, sight = (with_day_variances(values, own, pooled) for values in (motion, sight))
+        _add_type(document, robot, replace(found, odometry=motion, sensor=sight))
     document["calibrated_on"] = list(calibration.logs)
     text = f"# Calibrated by `cpcbl-team calibrate` from {', '.join(calibration.logs)}.\n"
     text += tomlkit.dumps(document)

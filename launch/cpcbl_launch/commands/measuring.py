@@ -115,12 +115,13 @@ def calibrate(
         Path, Option(callback=options.writable_file, help="Team file to write.")
     ] = Path("calibrated.toml"),
     margin: Annotated[
-        float, Option(min=0.0, help="Share by which noise is written larger: days differ.")
+        float, Option(min=0.0, help="Share by which noise is written larger.")
     ] = 0.25,
     correction_margin: Annotated[
         float,
         Option(
-            min=0.0, help="Share of a range's, bearing's or crawl's correction added to its noise."
+            min=0.0,
+            help="Share of a crawl's correction (one log: a range's too) added to its noise.",
         ),
     ] = 0.5,
     picture: options.PictureFile = None,

@@ -96,7 +96,7 @@ def test_several_logs_are_pooled(recorded: Path) -> None:
     log = read_log(recorded)["a"]
     early = log.truth[:, 0] < 0.5 * SECONDS
     halves = [log._replace(truth=log.truth[half]) for half in (early, ~early)]
-    one, both = (calibrate_odometry(logs)["distance_scale"] for logs in (halves[:1], halves))
+    one, both = (calibrate_odometry(logs)[0]["distance_scale"] for logs in (halves[:1], halves))
     assert both.standard_error < 0.95 * one.standard_error
     assert both.value == pytest.approx(0.93, abs=SIGMAS * both.standard_error)
 

@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+from support.exact_logs import circling
 
 from cpcbl_launch.calibration.logs import RobotLog
 from cpcbl_launch.calibration.odometry import calibrate_odometry
@@ -15,27 +16,9 @@ from cpcbl_launch.calibration.statistics import (
 )
 
 
-def circling(turn_rate: float = 0.3, speed: float = 0.3, seconds: float = 100.0) -> RobotLog:
-    """An exact drive, one landmark in its midst, sightings at 5 Hz."""
-    times = np.arange(0.0, seconds, 0.02)
-    heading = turn_rate * times
-    radius = speed / turn_rate if turn_rate else 0.0
-    x, y = radius * np.sin(heading), radius * (1.0 - np.cos(heading))
-    truth = np.stack([times, x, y, (heading + math.pi) % math.tau - math.pi], axis=1)
-    from_s = times[:-1:5]
-    step = np.full_like(from_s, 0.1)
-    odometry = np.stack([from_s, from_s + 0.1, speed * step, turn_rate * step], axis=1)
-    rows = slice(0, None, 10)
-    dx, dy = 3.0 - x[rows], 1.0 - y[rows]
-    bearing = np.arctan2(dy, dx) - heading[rows]
-    bearing = (bearing + math.pi) % math.tau - math.pi
-    seen = np.stack([times[rows], np.zeros_like(dx), np.hypot(dx, dy), bearing], axis=1)
-    return RobotLog(truth, odometry, seen, (np.array([[0.0, 3.0, 1.0]]),))
-
-
 def test_an_exact_log_is_found_to_be_exact() -> None:
     log = circling()
-    odometry, sensor = calibrate_odometry([log]), calibrate_sensor([log])[0]
+    odometry, sensor = calibrate_odometry([log])[0], calibrate_sensor([log])[0]
     assert odometry["distance_scale"].value == pytest.approx(1.0, abs=1e-3)
     assert odometry["turn_scale"].value == pytest.approx(1.0, abs=1e-3)
     assert sensor["range_scale"].value == pytest.approx(1.0, abs=1e-3)
@@ -80,23 +63,23 @@ def crawling(least_speed: float, slow: float = 0.008, sigma: float = 0.0) -> Rob
 
 
 def test_motors_with_a_dead_zone_are_found_to_have_one() -> None:
-    found = calibrate_odometry([crawling(least_speed=0.02)])
+    found = calibrate_odometry([crawling(least_speed=0.02)])[0]
     assert found["least_speed_m_s"].value == pytest.approx(0.02, abs=0.001)
     assert found["distance_scale"].value == pytest.approx(1.0, abs=3e-3)
-    without = calibrate_odometry([crawling(least_speed=0.0)])
+    without = calibrate_odometry([crawling(least_speed=0.0)])[0]
     assert "least_speed_m_s" not in without
     assert "crawl_sigma_m_per_sqrt_s" not in without
 
 
 def test_how_crawling_errs_is_found() -> None:
-    found = calibrate_odometry([crawling(least_speed=0.02, sigma=0.006)])
+    found = calibrate_odometry([crawling(least_speed=0.02, sigma=0.006)])[0]
     crawl = found["crawl_sigma_m_per_sqrt_s"]
     assert crawl.standard_error < 0.0015
     assert abs(crawl.value - 0.006) < 3.0 * crawl.standard_error
 
 
 def test_a_robot_that_only_turns_tells_no_distance_scale() -> None:
-    found = calibrate_odometry([circling(turn_rate=0.5, speed=0.0)])
+    found = calibrate_odometry([circling(turn_rate=0.5, speed=0.0)])[0]
     assert "distance_scale" not in found
     assert found["turn_scale"].value == pytest.approx(1.0, abs=1e-3)
 
@@ -110,7 +93,7 @@ def test_truth_with_gaps_is_used_only_where_it_is_known() -> None:
     whole = calibrate_sensor([log._replace(sightings=seen)])[0]
     holed = calibrate_sensor([log._replace(sightings=seen, truth=log.truth[gaps])])[0]
     assert holed["range_floor_m"].value == pytest.approx(whole["range_floor_m"].value, rel=0.1)
-    odometry = calibrate_odometry([log._replace(truth=log.truth[gaps])])
+    odometry = calibrate_odometry([log._replace(truth=log.truth[gaps])])[0]
     assert odometry["turn_scale"].value == pytest.approx(1.0, abs=2e-3)
 
 

@@ -8,6 +8,7 @@ import pytest
 from support.logs import write_log
 from support.processes import command_line
 
+from cpcbl_launch.calibration.between_days import DayVariance, coverage_factor
 from cpcbl_launch.calibration.statistics import (
     Estimate,
     decimals,
@@ -106,6 +107,16 @@ def test_noise_is_written_as_of_another_day() -> None:
     assert r1.range_share == pytest.approx(math.hypot(0.03, 0.04), abs=5e-4)
     assert r1.range_floor_m == pytest.approx(0.016, abs=5e-4)
     assert r1.bearing_sigma_deg == pytest.approx(1.5, abs=0.05)
+
+
+def test_noise_holds_what_differs_between_days() -> None:
+    """With several logs their differences count, not shares of the corrections."""
+    sensor = {"range_bias_m": Estimate(0.5, 0.001), "range_floor_m": Estimate(0.03, 1e-6)}
+    days = {"range": DayVariance(2, 0.01**2, 0.03**2)}
+    found = Calibration(("a", "b"), {"r1": RobotCalibration({}, sensor, day_variances=days)})
+    r1 = parse_team(type_text(found, BASE, correction_margin=0.4)).robots["r1"].sensor
+    between = 0.01 * coverage_factor(1)
+    assert r1.range_floor_m == pytest.approx(math.hypot(0.03, between), abs=1e-5)
 
 
 def test_a_dead_zone_of_another_day_is_in_the_noise_of_crawling() -> None:
