@@ -90,9 +90,14 @@ def _day_variances(
         between = values.var(axis=0, ddof=1) - squares.mean(axis=0)
         between = between.reshape(len(errors), -1).mean(axis=1)
     return {
-        kind: DayVariance(max(len(each), 1), variance, statistics.robust_sigma(error) ** 2)
+        kind: DayVariance(max(len(each), 1), variance, _variance_without_outliers(error))
         for (kind, error), variance in zip(errors.items(), between.tolist(), strict=True)
     }
+
+
+def _variance_without_outliers(errors: Floats) -> float:
+    most = statistics.OUTLIER_SIGMAS * statistics.robust_sigma(errors)
+    return float(np.mean(np.minimum(errors * errors, most * most)))
 
 
 def _on_day(corrected: Callable[[RowFilter], Floats], day: int, keep: RowFilter) -> Floats:

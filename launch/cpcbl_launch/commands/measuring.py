@@ -114,9 +114,7 @@ def calibrate(
     output: Annotated[
         Path, Option(callback=options.writable_file, help="Team file to write.")
     ] = Path("calibrated.toml"),
-    margin: Annotated[
-        float, Option(min=0.0, help="Share by which noise is written larger.")
-    ] = 0.25,
+    margin: Annotated[float, Option(min=0.0, help="Share by which noise is written larger.")] = 0.5,
     correction_margin: Annotated[
         float,
         Option(
