@@ -25,6 +25,7 @@ DRIFT_SHARE = 0.1  # position sigma that a teammate gains between two fixes, per
 LOST_HEADING_SIGMA_RAD = math.pi / math.sqrt(3.0)  # of a uniform distribution
 USUAL_HEADING_SIGMA_RAD = math.radians(10.0)  # assumed: a tier describes the position only
 HEADING_DRIFT_RAD_PER_SQRT_M = 0.1  # heading sigma that a teammate gains, a random walk
+HEADING_WAY_M = 1.0  # over which a heading's error is counted as one of the position
 SUBSCRIBER_DRIFT_M_S = 0.005  # error that a subscriber is assumed to gain between two beliefs
 UNKNOWN_AGE_S = 60.0  # since the last help for a teammate, as long as there was none
 LEAST_VALUE = 0.17  # m sqrt(s): 3 cm after half a minute
@@ -156,10 +157,12 @@ def value_of_help(removed_m: float, age_s: float) -> float:
     return removed_m * math.sqrt(max(0.0, age_s))
 
 
-def value_of_fix(prior: Covariance2, after: Covariance2, age_s: float) -> float:
-    """The value (m sqrt(s)) of a fix that changes a teammate's covariance from `prior` to `after`
-    when the last one for it is `age_s` old."""
-    removed = prior.xx + prior.yy - after.xx - after.yy
+def value_of_fix(
+    prior: Covariance2, after: Covariance2, heading_variance: float, age_s: float
+) -> float:
+    """The value (m sqrt(s)) of a fix that changes a teammate's covariance from `prior` to `after`,
+    and removes so much variance of its heading (rad^2), when the last one for it is `age_s` old."""
+    removed = prior.xx + prior.yy - after.xx - after.yy + HEADING_WAY_M**2 * heading_variance
     return value_of_help(math.sqrt(max(0.0, removed)), age_s)
 
 

@@ -284,7 +284,7 @@ class CollaborationAgent:
         parts = Covariance2(*fix.sensor_covariance), Covariance2(*fix.observer_covariance)
         after = gains.merged_covariance(prior, *parts, rules.fusion)
         gain = gains.information_gain(prior, after)
-        value = gains.value_of_fix(prior, after, (fix.stamp_ns - last_ns) * 1e-9)
+        heading_variance = 0.0  # that the fix removes
         turned = None if before is None else before.heading
         if fix.heading_rad is not None:
             variance = gains.predicted_teammate_heading_variance(tier, turned, fix)
@@ -292,8 +292,11 @@ class CollaborationAgent:
             gained = gains.heading_information_gain(variance, left)
             if gained >= rules.least_value:
                 gain, turned = gain + gained, HeadingMemory(*place, left)
+                heading_variance = variance - left
             else:
                 fix = without_heading(fix)
+        age_s = (fix.stamp_ns - last_ns) * 1e-9
+        value = gains.value_of_fix(prior, after, heading_variance, age_s)
         memory = FixMemory(*place, after, turned)
         return _Offer(gain, value, tier == LOWEST_TIER, memory, fix)
 

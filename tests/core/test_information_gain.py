@@ -223,11 +223,13 @@ def test_a_teammate_at_the_same_point_gains_no_heading() -> None:
 
 
 def test_the_value_of_a_fix_is_the_error_that_it_removes_times_the_root_of_its_age() -> None:
-    """From 0.5 m to 0.3 m on both axes removes a variance of 0.32 m^2."""
+    """From 0.5 m to 0.3 m on both axes removes a variance of 0.32 m^2; a heading counts by the
+    error that it would make on the next metre."""
     prior, after = Covariance2(0.25, 0.0, 0.25), Covariance2(0.09, 0.0, 0.09)
-    assert value_of_fix(prior, after, 25.0) == pytest.approx(5.0 * math.sqrt(0.32))
-    assert value_of_fix(after, prior, 25.0) == 0.0
-    assert value_of_fix(prior, after, -1.0) == 0.0
+    assert value_of_fix(prior, after, 0.0, 25.0) == pytest.approx(5.0 * math.sqrt(0.32))
+    assert value_of_fix(prior, after, 0.04, 25.0) == pytest.approx(5.0 * math.sqrt(0.36))
+    assert value_of_fix(after, prior, 0.0, 25.0) == 0.0
+    assert value_of_fix(prior, after, 0.0, -1.0) == 0.0
 
 
 @pytest.mark.parametrize(("growth", "cost"), [(0.01, 2.0), (0.3, 2.0), (0.01, 50.0)])
