@@ -247,15 +247,18 @@ class CollaborationAgent:
         if not self._may_help(fix, tier):
             return []
         offer = self._offer(fix, tier)
-        if offer.gain >= self._least_gain(fix):
+        if offer.gain >= self._least_gain(offer):
             return [offer]
         self.counters.of("fix", fix.robot).worthless += 1
         return []
 
-    def _least_gain(self, fix: Fix) -> float:
-        """The information gain from which on the fix is sent; 0 sends all, whatever the budget."""
+    def _least_gain(self, offer: _Offer) -> float:
+        """The information gain from which on a fix is sent: a budget asks for more, but not for a
+        lost teammate, nor where `least_value` is 0."""
         least = self._rules.least_value
-        return max(least, self.budget.least_gain(_size(fix))) if least else 0.0
+        if offer.urgent or not least:
+            return least
+        return max(least, self.budget.least_gain(_size(offer.fix)))
 
     def _affordable(self, offers: list[_Offer], now_ns: int) -> list[Fix]:
         """The fixes that the budget admits, the one with the largest value first."""
