@@ -130,12 +130,11 @@ def test_a_fix_and_a_belief_are_small_on_both_links(kinds: dict[str, Any], paylo
             robots.exchange()
             time.sleep(0.2)  # so that no two are in one batch
 
-        repeat_until(step, lambda: len(data(worse.down)) >= 12)
+        repeat_until(step, lambda: min(len(data(better.up)), len(data(worse.down))) >= 12)
     assert payload <= 40
     for batches, most in (
         (data(better.up), sent_bytes(payload)),
         (data(worse.down), received_bytes(payload, "observer")),
     ):
-        assert len(batches) >= 12
         batches = batches[2:]  # the first may hold a fix that waited for the subscription, too
         assert [batch.size for batch in batches if not payload < batch.size <= min(60, most)] == []
