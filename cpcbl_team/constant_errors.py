@@ -18,7 +18,7 @@ from cpcbl_team.geometry import new
 LARGEST: Final = 7.0  # normalized correction: a bump is no calibration
 FADING: Final = 1.0 - 1.0 / 40.0  # of all sums, a block
 LEAST_SHARE: Final = 0.25  # of the variance that a block adds is taken away, or it tells little
-PRIOR: Final = Covariance3(4.0, 0.0, 4.0, 0.0, 0.0, 4.0)  # information: sigmas of 0.5
+PRIOR: Final = Covariance3(4.0, 0.0, 4.0, 0.0, 0.0, 4.0)  # information of each: sigma 0.5
 NO_ERRORS: Row = (0.0, 0.0, 0.0)
 INSENSITIVE: Matrix3 = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 """The sensitivity of a pose is its error for an error of one in each of the three (columns)."""
@@ -37,6 +37,7 @@ def sensitivity_after(v: Matrix3, distance: float, turn: float, course: float) -
 
 
 def matrix_product(m: Matrix3, n: Matrix3) -> Matrix3:
+    """M N."""
     a, b, c, d, e, f, g, h, i = m
     xx, xy, xz, yx, yy, yz, zx, zy, zz = n
     return (
@@ -47,12 +48,14 @@ def matrix_product(m: Matrix3, n: Matrix3) -> Matrix3:
 
 
 def difference(m: Matrix3, n: Matrix3) -> Matrix3:
+    """M - N."""
     a, b, c, d, e, f, g, h, i = m
     xx, xy, xz, yx, yy, yz, zx, zy, zz = n
     return a - xx, b - xy, c - xz, d - yx, e - yy, f - yz, g - zx, h - zy, i - zz
 
 
 def matrix_of(c: Covariance3) -> Matrix3:
+    """The covariance with its symmetric entries written twice."""
     return c.xx, c.xy, c.xh, c.xy, c.yy, c.yh, c.xh, c.yh, c.hh
 
 
@@ -151,10 +154,9 @@ class Evidence(NamedTuple):
         """With the correction of one more block."""
         xx, xy, yy, xh, yh, hh = self.information
         (x, y, z), old, k = self.vector, self.last, FADING
-        prior, pxy, pyy, pxh, pyh, phh = PRIOR
-        m = 1.0 - FADING
-        xx, xy, yy = k * xx + m * prior, k * xy + m * pxy, k * yy + m * pyy
-        xh, yh, hh = k * xh + m * pxh, k * yh + m * pyh, k * hh + m * phh
+        prior = (1.0 - k) * PRIOR.xx  # on the diagonal; it does not fade
+        xx, xy, yy = k * xx + prior, k * xy, k * yy + prior
+        xh, yh, hh = k * xh, k * yh, k * hh + prior
         x, y, z, total, lagged = k * x, k * y, k * z, k * self.total, k * self.lagged
         parts = k * self.parts
         for part in correction:

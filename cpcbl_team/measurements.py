@@ -70,19 +70,13 @@ def nearest_belief(
     return min(usable, key=lambda pair: abs(pair[0])) if usable else None
 
 
-def teammate_at(
-    beliefs: Iterable[Belief], at_ns: int, settings: config.CollaborationSettings
-) -> ObjectPosition | None:
-    """The position of a teammate at the time of a sighting, from its belief nearest to that time.
+def position_by_belief(belief: Belief, at_ns: int) -> ObjectPosition:
+    """The position of a belief's robot at another time.
 
     A third of the extrapolated distance is added to its sigma, because it may have stopped or
-    turned. None if all of its beliefs are too old, or too late.
+    turned.
     """
-    nearest = nearest_belief(beliefs, at_ns, settings)
-    if nearest is None:
-        return None
-    age, belief = nearest
-    pose = extrapolated(belief, at_ns)
+    pose, age = extrapolated(belief, at_ns), (at_ns - belief.stamp_ns) * 1e-9
     covariance = Covariance3(*belief.covariance)
     jacobian = (1.0, 0.0, belief.y_m - pose.y, 0.0, 1.0, pose.x - belief.x_m, 0.0, 0.0, 1.0)
     xx, xy, yy, *_ = covariance.transformed(jacobian)
@@ -156,18 +150,19 @@ def measurement_of(
     name, is_for_heading = sighting.id, False
     wall, landmark, gives = field.walls.get(name), field.landmarks.get(name), "both"
     if landmark is not None:
-        position: ObjectPosition | None = _on_map(landmark.x_m, landmark.y_m)
+        position = _on_map(landmark.x_m, landmark.y_m)
         gives = landmark.gives
     elif wall is not None:
         position, gives = _on_map(*wall.from_m), wall.gives
     elif name in teammates and settings.collaboration.passive:
-        position = teammate_at(teammates[name], stamp_ns, settings.collaboration)
         nearest = nearest_belief(teammates[name], stamp_ns, settings.collaboration)
-        if nearest is not None and isinstance(nearest[1], HeadingBelief):
+        if nearest is None:
+            return None
+        _, belief = nearest
+        position = position_by_belief(belief, stamp_ns)
+        if isinstance(belief, HeadingBelief):
             gives, is_for_heading = "bearing", True
     else:
-        return None
-    if position is None:
         return None
     range_m, bearing, sensor = sighting.range_m, sighting.bearing_rad, settings.sensor
     if gives == "bearing" or gives == "none" or (range_m or 0.0) > sensor.max_range_for_range_m:

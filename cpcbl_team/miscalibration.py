@@ -3,7 +3,7 @@
 In a filter whose models are right the corrections of the pose are independent of each other and of
 the motion, and as large as the covariance that they take away (Mehra, On the identification of
 variances and adaptive Kalman filtering, IEEE Transactions on Automatic Control, 1970). Here they
-are summed over blocks of a second.
+are summed over blocks of 1.5 s.
 
 - Corrections that a constant error explains (`constant_errors.py`): odometry measures with a wrong
   scale, or bearings have a bias.
@@ -202,7 +202,7 @@ def _believed(error: float, sigma: float) -> float:
 
 
 def errors_between(before: Adaptation, after: Adaptation) -> Row:
-    """The constant errors of one adaptation, as the other one tells them."""
+    """The constant errors that `after` corrects and `before` does not."""
     return (
         after.distance_scale / before.distance_scale - 1.0,
         after.turn_scale / before.turn_scale - 1.0,

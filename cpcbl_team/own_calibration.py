@@ -123,8 +123,9 @@ class OwnCalibration:
                 )
                 state = state._replace(estimate=state.estimate._replace(pose=pose))
                 now = now._replace(estimate=state.estimate)
-                is_scale = errors != NO_ERRORS
-                evidence = check.evidence.without(errors) if is_scale else Evidence()
+                # Other sigmas whiten otherwise: what was collected with the old ones is void
+                has_errors = errors != NO_ERRORS
+                evidence = check.evidence.without(errors) if has_errors else Evidence()
                 check = ModelCheck(now, check.sensitivity, evidence, accepted=accepted)
                 state, present = state.counted("miscalibrated"), changed
         learned, references, total_turn_rad, _, _ = memory

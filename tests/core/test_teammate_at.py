@@ -1,6 +1,7 @@
 """Passive collaboration: a teammate as a landmark, by its beliefs."""
 
 import math
+from collections.abc import Sequence
 from itertools import permutations
 
 import pytest
@@ -14,9 +15,17 @@ from support.core import (
 )
 
 from cpcbl_team.config import CollaborationSettings
-from cpcbl_team.measurements import ObjectPosition, teammate_at
+from cpcbl_team.inputs import Belief
+from cpcbl_team.measurements import ObjectPosition, nearest_belief, position_by_belief
 
 RULES = CollaborationSettings(tier_width=2.0, tier_hysteresis=1.2)
+
+
+def teammate_at(
+    beliefs: Sequence[Belief], at_ns: int, rules: CollaborationSettings
+) -> ObjectPosition | None:
+    nearest = nearest_belief(beliefs, at_ns, rules)
+    return None if nearest is None else position_by_belief(nearest[1], at_ns)
 
 
 def found(position: ObjectPosition | None) -> ObjectPosition:

@@ -269,7 +269,8 @@ def refusal(message: Message, now_ns: int) -> Refusal | None:
 
 
 def _numbers(message: msgspec.Struct) -> list[float]:
-    """All numbers in a message that are no integers, however deep."""
+    """All numbers in a message that are no integers, however deep. It runs for every
+    message, so it does without the names that `_leaves` gives."""
     found: list[float] = []
     parts: list[object] = [message]
     for part in parts:  # the list grows meanwhile
