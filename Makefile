@@ -6,7 +6,8 @@ VENV ?= .venv
 BIN = $(VENV)/bin
 
 .PHONY: setup demo test quick check unit test-long test-compiled test-docker test-bench chaos net \
-  fuzz compiled bench bench-latency bench-processes clean
+  fuzz compiled bench bench-detection bench-latency bench-pictures bench-processes \
+  bench-scaling clean
 
 setup: $(VENV)/ready
 
@@ -90,9 +91,10 @@ bench: test-bench
 	PYTHONPATH=$(BENCH_PATH) $(BIN)/python -m benchmarks.table build/bench_raw.json build/bench.json
 	PYTHONPATH=$(BENCH_PATH) $(BIN)/python -m benchmarks.eyes_table build/bench_eyes_raw.json build/bench_eyes.json
 
-# Real processes over Zenoh, alone on the machine: ARGS='--sightings 1000', '--robots 40,48,60',
-# '--old ../earlier-checkout' (measured in the same run), ...
-bench-latency bench-processes: setup
+# Measurements, each with options of its own (ARGS=--help). Real processes over Zenoh, alone on the
+# machine: latency, processes (ARGS='--robots 40,48,60 --old ../earlier-checkout'). In one process:
+# scaling (teams of any size), detection (rendered frames), pictures (ARGS='SET FOLDER': real ones).
+bench-detection bench-latency bench-pictures bench-processes bench-scaling: setup
 	@mkdir -p build
 	PYTHONPATH=$(BENCH_PATH) $(BIN)/python -m benchmarks.$(@:bench-%=%) $(ARGS)
 

@@ -3,9 +3,9 @@
 from functools import lru_cache
 
 import numpy as np
+from benchmarks.rendered_frames import random_frame, render_image
 
 from cpcbl_agents.vision.camera import Pixels
-from cpcbl_launch.lab.experiments.rendered_frames import random_frame, render_image
 from cpcbl_launch.team_file import builtin_path, load_team
 
 FRAMES = 24

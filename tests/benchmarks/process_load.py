@@ -14,13 +14,13 @@ from pathlib import Path
 from statistics import mean, median
 
 import msgspec
+from benchmarks.scaling import swarm_team
 from support.process_usage import MIB, process_usage
 from support.routers import open_router
 
 from cpcbl_agents.clock import Clock
 from cpcbl_agents.node import STATUS_NS
 from cpcbl_agents.process import StopSignal
-from cpcbl_launch.lab.scaling import swarm_team
 from cpcbl_launch.run.processes import ProcessSpec, Supervisor, process_table
 from cpcbl_launch.run.up import free_endpoint
 from cpcbl_launch.team_file import save_resolved

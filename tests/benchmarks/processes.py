@@ -24,9 +24,9 @@ from benchmarks.process_load import (
     measure_team,
 )
 from benchmarks.report import show_and_write
+from benchmarks.scaling import MOST_ROBOTS
 from rich.console import RenderableType
 
-from cpcbl_launch.lab.scaling import MOST_ROBOTS
 from cpcbl_launch.reporting.tables import number, table
 from cpcbl_launch.run.processes import require_process_usage
 from cpcbl_team.errors import InputError

@@ -1,6 +1,7 @@
 """The benchmark of real processes with two robots: its figures. Nothing is judged by time."""
 
 import os
+import re
 import time
 from pathlib import Path
 
@@ -11,9 +12,12 @@ from support.process_usage import MIB, process_usage
 from support.processes import command_line
 from support.tables import assert_fits
 
+from cpcbl_launch.commands.experimenting import MOVED
 from cpcbl_launch.run.processes import own_memory_mib
 from cpcbl_team.errors import InputError
 from cpcbl_transport.compact import BELIEF_BYTES
+
+MAKEFILE = Path(__file__).parents[2] / "Makefile"
 
 
 @pytest.mark.long
@@ -73,12 +77,14 @@ def test_the_robots_of_another_checkout_are_started() -> None:
     assert start.median_s > 0.0
 
 
-@pytest.mark.parametrize("name", ["latency", "processes"])
+@pytest.mark.parametrize("name", MOVED)
 def test_the_former_command_is_one_line_that_names_the_target(name: str) -> None:
     ran = command_line("experiment", name, "--robots", "4")
     assert ran.returncode == 2
     (line,) = ran.stderr.splitlines()
-    assert f"make bench-{name}" in line
+    assert f"make {MOVED[name]}" in line
+    (target,) = re.findall(r"^bench-[^:]*: setup$", MAKEFILE.read_text(), re.MULTILINE)
+    assert MOVED[name] in target.split(":")[0].split()
 
 
 def test_the_use_of_a_process_is_its_own() -> None:

@@ -151,56 +151,25 @@ def worlds(
     conduct(experiment.EXPERIMENT._replace(cases=cases), seeds, jobs, output, as_json)
 
 
-@experiment_app.command("eyes")
-def eyes(
-    frames: Annotated[int, typer.Option(min=1, help="Rendered frames.")] = 2000,
-    seed: Annotated[int, typer.Option(min=0, help="Of poses, light and noise.")] = 1,
-    jobs: Jobs = None,
-    output: Output = Path(),
-    as_json: AsJson = False,
-) -> None:
-    """Cameras on rendered images: precision, recall, and errors against the stated sigmas."""
-    require_opencv("experiment eyes")
-    from cpcbl_launch.lab.experiments import detection_figures as experiment
-
-    measure = partial(experiment.measure, frames, seed, jobs)
-    total = -(-frames // experiment.CHUNK)
-    _conduct("eyes", measure, experiment.tables, output, as_json, total=total, unit="batches")
-
-
-@experiment_app.command("pictures")
-def pictures(
-    name: Annotated[
-        str,
-        typer.Argument(
-            metavar="SET",
-            help="duckiebot, frc-speaker, frc-amp, nao; or NAME.csv, NAME.toml beside it.",
-        ),
-    ],
-    folder: Annotated[Path, typer.Argument(help="Where the set's pictures are.")],
-    output: Annotated[Path, typer.Option(help="Folder for pictures-SET.json.")] = Path(),
-    as_json: AsJson = False,
-) -> None:
-    """Real pictures whose truth is known: what is found and missed of them, and by how much."""
-    require_opencv("experiment pictures")
-    from cpcbl_launch.lab.experiments import real_pictures
-
-    title = f"pictures-{real_pictures.picture_set(name).stem}"
-    measure = partial(real_pictures.measure, name, folder)
-    _conduct(title, lambda _: measure(), real_pictures.tables, output, as_json, drawn=False)
+MOVED = {
+    "eyes": "bench-detection",
+    "latency": "bench-latency",
+    "pictures": "bench-pictures",
+    "processes": "bench-processes",
+}
+"""Experiments that are benchmarks of a checkout now: the target of make for each."""
 
 
 def _refuse_benchmark(context: typer.Context) -> None:
-    name = context.info_name
-    raise InputError(f"experiment {name}: it is a benchmark now: make bench-{name}, in a checkout")
+    name = str(context.info_name)
+    raise InputError(f"experiment {name}: it is a benchmark now: make {MOVED[name]}, in a checkout")
 
 
-for _name in ("latency", "processes"):
+for _name, _target in MOVED.items():
     _any_arguments = {"allow_extra_args": True, "ignore_unknown_options": True}
-    _help = f"Moved to `make bench-{_name}`."
-    experiment_app.command(_name, hidden=True, context_settings=_any_arguments, help=_help)(
-        _refuse_benchmark
-    )
+    experiment_app.command(
+        _name, hidden=True, context_settings=_any_arguments, help=f"Moved to `make {_target}`."
+    )(_refuse_benchmark)
 
 
 def conduct(
@@ -226,7 +195,6 @@ def _conduct(
     as_json: bool,
     *,
     total: int | None = None,
-    unit: str = "runs",
     drawn: bool = True,
 ) -> None:
     """Measures with a bar of progress, writes NAME.json (and NAME.png), and prints the result.
@@ -243,7 +211,7 @@ def _conduct(
     require_folder("--output", output)
     for path in (figures, picture) if drawn else (figures,):
         require_writable_file("--output", path)
-    with _progress(name, total, unit) as done:
+    with _progress(name, total) as done:
         result = measure(done)
     text = json_text(result) + "\n"
     lost = write_or_reason(figures, lambda: figures.write_text(text, encoding="utf-8"))
@@ -263,12 +231,12 @@ def _conduct(
 
 
 @contextmanager
-def _progress(title: str, total: int | None, unit: str) -> Iterator[Callable[[], None]]:
+def _progress(title: str, total: int | None) -> Iterator[Callable[[], None]]:
     """A bar on standard error; the function that it yields moves it by one."""
     from rich import progress
     from rich.console import Console
 
-    done = progress.BarColumn(), progress.MofNCompleteColumn(), progress.TextColumn(unit)
+    done = progress.BarColumn(), progress.MofNCompleteColumn(), progress.TextColumn("runs")
     columns = (progress.TextColumn(title), *done, progress.TimeRemainingColumn())
     with progress.Progress(*columns, console=Console(stderr=True), transient=True) as shown:
         task = shown.add_task(title, total=total)

@@ -150,13 +150,9 @@ def calibrate(
 
 def simulate(
     file: options.TeamArgument = None,
-    robots: Annotated[
-        str, Option(help="Sizes of generated teams, in place of FILE, e.g. 2,10,50,200,1000.")
-    ] = "",
-    duration: Annotated[
-        float | None, Option(help="Seconds of robot time; default: 5 with --robots, else 30.")
-    ] = None,
-    seed: Annotated[int, Option(help="Seed of the noise, and of generated teams.")] = 1,
+    robots: Annotated[str, Option(hidden=True)] = "",
+    duration: Annotated[float | None, Option(help="Seconds of robot time; default: 30.")] = None,
+    seed: options.NoiseSeed = 1,
     bytes_per_s: options.BytesPerS = None,
     messages_per_minute: options.MessagesPerMinute = None,
     match_messages: options.MatchMessages = None,
@@ -166,50 +162,23 @@ def simulate(
 ) -> None:
     """Run a simulated team in one process, without Zenoh: deterministic for a seed.
 
-    With a team file the command reports as `up` does. With --robots it reports
-    what a robot costs in teams of each size, on a field that grows with them:
-    the fixes and beliefs that a robot sends and receives, and the CPU time of
-    its own steps. The time that simulating the field takes does not count.
+    The command reports as `up` does.
     """
     from cpcbl_launch.run.up import Run, simulate_run
     from cpcbl_launch.views.run import print_report, progress_bar
 
-    budgets = Overrides(bytes_per_s, messages_per_minute, match_messages)
     if robots:
-        if file is not None:
-            raise InputError("simulate: FILE or --robots, which generates its teams; leave one out")
-        if budgets != Overrides():
-            raise InputError("simulate: generated teams have no budgets; name a team file instead")
-        _simulate_sizes(robots, duration, seed, report, picture, as_json)
-        return
+        raise InputError(
+            "simulate --robots: it is a benchmark now:"
+            f" make bench-scaling ARGS='--robots {robots}', in a checkout"
+        )
+    budgets = Overrides(bytes_per_s, messages_per_minute, match_messages)
     team = with_overrides(find_team(file or Path("demo")), budgets)
     require_team_opencv(team, team.robots, field=True)
     with progress_bar("simulating", quiet=as_json) as progress:
         result = simulate_run(Run(team, duration, seed=seed, picture=picture), progress)
     lost = options.write_report(report, result) | result.not_written
     options.print_result(result, as_json, lambda: print_report(result, Console()), lost)
-
-
-def _simulate_sizes(
-    robots: str,
-    duration_s: float | None,
-    seed: int,
-    report: Path | None,
-    picture: Path | None,
-    as_json: bool,
-) -> None:
-    from cpcbl_launch.lab import scaling
-    from cpcbl_launch.views.run import progress_bar
-
-    duration_s = scaling.DURATION_S if duration_s is None else duration_s
-    with progress_bar("simulating", quiet=as_json) as progress:
-        result = scaling.measure_sizes(scaling.parse_sizes(robots), seed, duration_s, progress)
-    lost = options.write_report(report, result)
-    if picture is not None:
-        from cpcbl_launch.lab.experiments.pictures import draw_scaling
-
-        lost |= write_or_reason(picture, partial(draw_scaling, result, picture))
-    options.print_result(result, as_json, lambda: scaling.print_scaling(result, Console()), lost)
 
 
 def chaos(

@@ -1,1 +1,1 @@
-"""The laboratory: experiments, fault scenarios, scaling, baselines, and robots with faults."""
+"""The laboratory: experiments, fault scenarios, baselines, and robots with faults."""

@@ -1,10 +1,9 @@
 """The experiments as pictures. Needs extra `plot`."""
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from itertools import groupby
 from pathlib import Path
-from statistics import median
 from typing import Any
 
 import matplotlib as mpl
@@ -13,11 +12,9 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Wedge
 
-from cpcbl_launch.lab.experiments import detection_figures as eyes
 from cpcbl_launch.lab.experiments.budget import Curve
 from cpcbl_launch.lab.experiments.liars import Liars
 from cpcbl_launch.lab.experiments.runs import Outcome, Spread
-from cpcbl_launch.lab.scaling import ScalingReport
 from cpcbl_team.config import RobotSettings, Team
 
 mpl.use("Agg")
@@ -161,51 +158,6 @@ def draw_liars(result: Liars) -> Figure:
     return figure
 
 
-def draw_eyes(result: eyes.DetectionReport) -> Figure:
-    """A column a kind of thing: errors against range with three stated sigmas, and recall."""
-    kinds = [kind for kind, errors in result.errors.items() if errors]
-    shape = 3, max(1, len(kinds))
-    figure, panels = plt.subplots(*shape, figsize=(12, 8), sharex=True, squeeze=False)
-    for (ranges, bearings, recall), kind in zip(panels.T, kinds, strict=False):
-        seen = result.errors[kind]
-        _scattered(ranges, seen, "range_share", "range_sigma_share", 100.0, eyes.MOST_RANGE_SHARE)
-        _scattered(bearings, seen, "bearing_deg", "bearing_sigma_deg", 1.0, eyes.MOST_BEARING_DEG)
-        bins = [f for f in result.bins[kind] if f.recall is not None]
-        middles = [0.5 * (f.from_m + f.to_m) for f in bins]
-        recall.plot(middles, [100.0 * (f.recall or 0.0) for f in bins], "o-", color="C0")
-        recall.axhline(100.0 * eyes.LEAST_RECALL, color="0.5", linestyle="--")
-        recall.set(ylim=(0.0, 103.0), xlabel="range (m)")
-        ranges.set_title(f"{kind}s: {result.within[kind].right} seen")
-    labels = ("range error (%)", "bearing error (°)", "found of what was due (%)")
-    for axes, label in zip(panels[:, 0], labels, strict=True):
-        axes.set_ylabel(label)
-    handles = [
-        Line2D([], [], color="C3", label="three stated σ, median of half a metre"),
-        Line2D([], [], color="0.5", linestyle="--", label="targets: one σ, recall"),
-    ]
-    figure.legend(handles=handles, loc="outside lower center", ncols=2)
-    return figure
-
-
-def draw_scaling(scale: ScalingReport, path: Path) -> None:
-    """The bytes per second that a robot sends and receives, and the CPU of its steps."""
-    figure, (traffic, cpu) = plt.subplots(1, 2, figsize=(10, 4))
-    sizes = [s.robots for s in scale.sizes]
-    traffic.plot(sizes, [s.bytes_sent_per_s for s in scale.sizes], "o-", label="sent")
-    traffic.plot(sizes, [s.bytes_received_per_s for s in scale.sizes], "o-", label="received")
-    traffic.set(title="fixes and beliefs of a robot", ylabel="bytes a second on their link")
-    traffic.legend()
-    cpu.plot(sizes, [s.cpu_ms_per_s for s in scale.sizes], "o-", color="C2")
-    cpu.set(title="CPU of a robot", ylabel="ms in a second of robot time")
-    for axes in (traffic, cpu):
-        axes.set(xlabel="robots in the team", xscale="log", ylim=(0, None))
-        axes.set_xticks(sizes, labels=[str(size) for size in sizes], minor=False)
-        axes.minorticks_off()
-        axes.grid(True, alpha=0.3)
-    figure.savefig(path, dpi=110)
-    plt.close(figure)
-
-
 # How the result of each experiment is drawn, by its name
 DRAWINGS: Mapping[str, Callable[[Any], Figure]] = {
     "table1": draw_table1,
@@ -215,7 +167,6 @@ DRAWINGS: Mapping[str, Callable[[Any], Figure]] = {
     "one-way-vs-both": draw_directions,
     "budget": draw_budget,
     "liars": draw_liars,
-    "eyes": draw_eyes,
 }
 
 
@@ -224,28 +175,6 @@ def draw(result: Any, path: Path) -> None:
     figure = DRAWINGS[result.experiment](result)
     figure.savefig(path)
     plt.close(figure)
-
-
-def _scattered(
-    axes: Any, seen: Sequence[eyes.Error], error: str, sigma: str, scale: float, target: float
-) -> None:
-    """Errors against range, with the band of three stated sigmas and that of one allowed; those
-    whose sigma is not stated are left out."""
-    readings = [(one.range_m, getattr(one, error), getattr(one, sigma)) for one in seen]
-    errors = [(r, scale * e, scale * s) for r, e, s in readings if e is not None and s is not None]
-    target *= scale
-    axes.plot([e[0] for e in errors], [e[1] for e in errors], ".", ms=2, alpha=0.5, color="C0")
-    halves: dict[int, list[float]] = {}
-    for range_m, _, stated in errors:
-        halves.setdefault(int(range_m / 0.5), []).append(stated)
-    middles = [0.5 * half + 0.25 for half in sorted(halves)]
-    sigmas = [3.0 * median(halves[half]) for half in sorted(halves)]
-    for sign in (1.0, -1.0):
-        axes.plot(middles, [sign * s for s in sigmas], color="C3", linewidth=1)
-        axes.axhline(sign * target, color="0.5", linestyle="--", linewidth=1)
-    limit = 1.5 * max([target, *sigmas])
-    axes.set_ylim(-limit, limit)
-    axes.grid(True, alpha=0.3)
 
 
 def _bar(axes: Any, at: float, found: Spread | None, colour: str, **style: Any) -> None:

@@ -1,4 +1,4 @@
-"""The experiment on rendered frames: its truth, its judgements, its figures; and what comes out."""
+"""The benchmark of rendered frames: its truth, its judgements, its figures; and what comes out."""
 
 import json
 import math
@@ -7,25 +7,25 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from msgspec.structs import replace
-from support.processes import cpcbl_team
-
-from cpcbl_agents.vision.camera import Camera, Floats, Pixels
-from cpcbl_launch.lab.experiments import detection_figures, rendered_frames
-from cpcbl_launch.lab.experiments.detection_figures import Batch, Kind, Mistake, Record
-from cpcbl_launch.lab.experiments.rendered_frames import (
+from benchmarks import detection, rendered_frames
+from benchmarks.detection import Batch, Kind, Mistake, Record
+from benchmarks.rendered_frames import (
     NamedObject,
     RandomFrame,
     compare_with_truth,
 )
-from cpcbl_launch.simulation.camera.render import Light, render
-from cpcbl_launch.simulation.camera.visibility import (
+from benchmarks.visibility import (
     Solid,
     cylinder_points,
     is_in_frame,
     plate_points,
     visible_shares,
 )
+from msgspec.structs import replace
+from support.benchmarks import run_benchmark
+
+from cpcbl_agents.vision.camera import Camera, Floats, Pixels
+from cpcbl_launch.simulation.camera.render import Light, render
 from cpcbl_team.config import CameraSettings
 from cpcbl_team.inputs import Sighting
 
@@ -200,7 +200,7 @@ def test_figures_count_detections_misses_and_mistakes() -> None:
     wrong = [
         Mistake(frame=1, kind="landmark", id="a", why="wrong id", range_m=1.0, bearing_deg=0.0)
     ]
-    f = detection_figures.figures("landmark", records, wrong, 0.0, 4.0)
+    f = detection.figures("landmark", records, wrong, 0.0, 4.0)
     assert (f.due, f.found, f.reported, f.right, f.ranged) == (3, 2, 4, 3, 2)
     assert f.recall == pytest.approx(2 / 3)
     assert f.precision == pytest.approx(3 / 4)
@@ -209,12 +209,12 @@ def test_figures_count_detections_misses_and_mistakes() -> None:
     assert f.bearing_sigma_deg == pytest.approx(math.degrees(0.01))
     assert f.range_inside == 0.5
     assert f.bearing_inside == pytest.approx(2 / 3)
-    marker = detection_figures.figures("marker", records, wrong, 0.0, 4.0)
+    marker = detection.figures("marker", records, wrong, 0.0, 4.0)
     assert (marker.recall, marker.precision, marker.heading_inside) == (1.0, 1.0, 0.0)
 
 
 def test_no_target_is_met_without_figures() -> None:
-    result = detection_figures.summarize(1, 1, [Batch([], [], {}, {"frame_blank": 1}, 0.0, 0.0)])
+    result = detection.summarize(1, 1, [Batch([], [], {}, {"frame_blank": 1}, 0.0, 0.0)])
     assert [said for said, held in result.pattern.items() if held] == ["no wrong id"]
 
 
@@ -222,13 +222,13 @@ def test_no_target_is_met_without_figures() -> None:
 
 
 @pytest.fixture(scope="module")
-def small_result() -> detection_figures.DetectionReport:
-    return detection_figures.measure(150, 1, 2, lambda: None)
+def small_result() -> detection.DetectionReport:
+    return detection.measure(150, 1, 2, lambda: None)
 
 
 @pytest.mark.long
 def test_few_objects_are_missed_and_none_is_mistaken(
-    small_result: detection_figures.DetectionReport,
+    small_result: detection.DetectionReport,
 ) -> None:
     assert not small_result.refused
     assert not [m for m in small_result.mistakes if m.why == "wrong id"]
@@ -247,7 +247,7 @@ def test_few_objects_are_missed_and_none_is_mistaken(
 
 
 @pytest.mark.long
-def test_stated_sigmas_are_consistent(small_result: detection_figures.DetectionReport) -> None:
+def test_stated_sigmas_are_consistent(small_result: detection.DetectionReport) -> None:
     for kind, known in small_result.accuracy.items():
         shares = [known.range_inside, known.bearing_inside]
         shares += [known.heading_inside] if kind == "marker" else []
@@ -269,13 +269,13 @@ def test_former_mistakes_do_not_occur_again(number: int) -> None:
 
 @pytest.mark.long
 def test_the_number_of_jobs_changes_no_figure() -> None:
-    one, two = (detection_figures.measure(40, 3, jobs, lambda: None) for jobs in (1, 2))
+    one, two = (detection.measure(40, 3, jobs, lambda: None) for jobs in (1, 2))
     assert one.within["landmark"].due > 10
     assert replace(one, cost={}) == replace(two, cost={})
 
 
-def test_the_command_shows_targets_and_writes_json_and_picture(tmp_path: Path) -> None:
-    done = cpcbl_team("experiment", "eyes", "--frames", 30, "--jobs", 1, "--output", tmp_path)
+def test_the_benchmark_shows_targets_and_writes_json_and_picture(tmp_path: Path) -> None:
+    done = run_benchmark("detection", "--frames", 30, "--jobs", 1, "--output", tmp_path)
     assert done.returncode == 0, done.stderr
     assert "no wrong id" in done.stdout
     assert "…" not in done.stdout
@@ -289,5 +289,5 @@ def test_the_command_shows_targets_and_writes_json_and_picture(tmp_path: Path) -
 @pytest.mark.long
 @pytest.mark.timeout(1200)
 def test_ten_thousand_frames() -> None:
-    result = detection_figures.measure(10_000, 2, 2, lambda: None)
+    result = detection.measure(10_000, 2, 2, lambda: None)
     assert not [said for said, held in result.pattern.items() if not held]

@@ -5,18 +5,23 @@ them. A robot drives around its home, so that the density is constant. It sees s
 small team fills its view: about seven teammates and three landmarks, fewer at the edge. One robot
 in five is an observer with good sensors; every second one of the others is a scout, blind to
 landmarks.
+
+`make bench-scaling ARGS='--robots 2,10,50,200,1000'`
 """
 
+import argparse
 import gc
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from functools import partial
+from pathlib import Path
 from random import Random
 
+from benchmarks.report import show_and_write, user_errors
 from msgspec import Struct
 from msgspec.structs import replace
-from rich.console import Console
+from rich.console import RenderableType
 
 from cpcbl_agents.node import Steppable
 from cpcbl_launch.checks import require_duration
@@ -25,6 +30,7 @@ from cpcbl_launch.reporting.tables import cells, table
 from cpcbl_launch.simulation.field import SimulatedField
 from cpcbl_launch.simulation.field_node import FieldNode
 from cpcbl_launch.simulation.in_process import Progress, robot_nodes, run_nodes, simulated_report
+from cpcbl_launch.views.run import progress_bar
 from cpcbl_team import config
 from cpcbl_team.config import RobotSettings, SensorSettings, Team
 from cpcbl_team.errors import InputError
@@ -69,7 +75,7 @@ class TeamSizeFigures(Struct, frozen=True, kw_only=True):
 
 
 class ScalingReport(Struct, frozen=True, kw_only=True):
-    """The report of `simulate --robots`."""
+    """What the benchmark writes."""
 
     duration_s: float
     seed: int
@@ -205,7 +211,8 @@ class TimedNode:
         self.cpu_s += time.process_time() - began_s
 
 
-def print_scaling(scale: ScalingReport, console: Console) -> None:
+def tables(scale: ScalingReport) -> Iterable[RenderableType]:
+    """The figures for people."""
     title = f"generated teams in one process, {scale.duration_s:g} s of robot time"
     rates = ("out/s", "B/s", "in/s", "B/s", "CPU ms/s", "x real")
     columns = ("robots", "in sight", *rates, "RMSE m", "in 3 σ")
@@ -215,5 +222,49 @@ def print_scaling(scale: ScalingReport, console: Console) -> None:
     quantities += " times_real_time:.3g position_rmse_m:.3f inside_3_sigma:.1%"
     for size in scale.sizes:
         shown.add_row(*cells(size, quantities))
-    console.print(shown)
-    console.print(LEGEND, style="yellow", highlight=False)
+    yield shown
+    yield LEGEND
+
+
+def draw(scale: ScalingReport, path: Path) -> None:
+    """The bytes per second that a robot sends and receives, and the CPU of its steps."""
+    import matplotlib as mpl
+    from matplotlib import pyplot as plt
+
+    mpl.use("Agg")
+
+    figure, (traffic, cpu) = plt.subplots(1, 2, figsize=(10, 4))
+    sizes = [s.robots for s in scale.sizes]
+    traffic.plot(sizes, [s.bytes_sent_per_s for s in scale.sizes], "o-", label="sent")
+    traffic.plot(sizes, [s.bytes_received_per_s for s in scale.sizes], "o-", label="received")
+    traffic.set(title="fixes and beliefs of a robot", ylabel="bytes a second on their link")
+    traffic.legend()
+    cpu.plot(sizes, [s.cpu_ms_per_s for s in scale.sizes], "o-", color="C2")
+    cpu.set(title="CPU of a robot", ylabel="ms in a second of robot time")
+    for axes in (traffic, cpu):
+        axes.set(xlabel="robots in the team", xscale="log", ylim=(0, None))
+        axes.set_xticks(sizes, labels=[str(size) for size in sizes], minor=False)
+        axes.minorticks_off()
+        axes.grid(True, alpha=0.3)
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+
+
+def main() -> None:
+    """Simulates generated teams in one process, and writes `scale.json` and `scale.png`."""
+    parser = argparse.ArgumentParser(prog="bench-scaling", description=main.__doc__)
+    parser.add_argument("--robots", default="2,10,50,200", help="Sizes of the teams.")
+    parser.add_argument("--duration", type=float, default=DURATION_S, help="Seconds of robot time.")
+    parser.add_argument("--seed", type=int, default=1, help="Of the noise and of the teams.")
+    parser.add_argument("--output", type=Path, default=Path("build"), help="Folder for the files.")
+    given = parser.parse_args()
+    with user_errors(parser):
+        sizes = parse_sizes(given.robots)
+        with progress_bar("scaling", quiet=False) as progress:
+            result = measure_sizes(sizes, given.seed, given.duration, progress)
+    show_and_write(result, tables(result), given.output / "scale.json")
+    draw(result, given.output / "scale.png")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,9 +1,9 @@
-"""One rendered frame of the experiment `eyes`: what is visible in it, and what was detected.
+"""One rendered frame of the benchmark `detection`: what is visible in it, and what was detected.
 
 A viewer, its teammates and cylinders on no map have random poses on the team's field, and the light
 is random. The camera's mounting and focal length differ from its settings by errors with the sigmas
 that the settings state. What is visible follows from the geometry
-(`simulation/camera/visibility.py`), not from the picture.
+(`visibility.py`), not from the picture.
 
 - landmark: due if all of it is in the frame and nothing hides it;
 - marker: a teammate is due if one of its markers is completely visible and faces the viewer within
@@ -24,19 +24,19 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
+from benchmarks import visibility
+from benchmarks.detection import Batch, Kind, Mistake, Record, Wrong, team
+from benchmarks.visibility import Solid
 
 from cpcbl_agents.vision.camera import Camera, Floats, Pixels
 from cpcbl_agents.vision.detector import CameraDetector
 from cpcbl_agents.vision.pictures import decode_image
 from cpcbl_agents.vision.poses import SIDE_ANGLES
-from cpcbl_launch.lab.experiments.detection_figures import Batch, Kind, Mistake, Record, Wrong, team
 from cpcbl_launch.reporting.metrics import degrees
-from cpcbl_launch.simulation.camera import visibility
 from cpcbl_launch.simulation.camera.cameras import with_focal_error, with_mount_error
 from cpcbl_launch.simulation.camera.objects import body_top_m
 from cpcbl_launch.simulation.camera.render import render
 from cpcbl_launch.simulation.camera.scene import Scene, SceneRobot
-from cpcbl_launch.simulation.camera.visibility import Solid
 from cpcbl_team.config import CameraSettings, Light
 from cpcbl_team.geometry import Pose2, wrap_angle
 from cpcbl_team.inputs import Sighting

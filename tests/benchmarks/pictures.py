@@ -4,20 +4,23 @@ A set is a team file and a table (CSV) of the same name: a line says that in a p
 the team sees something, and where it is in the viewer's frame as far as that is known; a line
 without an id states that nothing of the team is in it. The pictures belong to others: the user
 downloads them, and they are not copied.
+
+`make bench-pictures ARGS='duckiebot FOLDER'`
 """
 
+import argparse
 import math
 from collections.abc import Iterable, Sequence
-from importlib.resources import files
 from pathlib import Path
 
+from benchmarks.detection import within_3_sigma
+from benchmarks.report import show_and_write, user_errors
 from msgspec import Struct
 from rich.console import RenderableType
 
 from cpcbl_agents.vision.detections import Detections
 from cpcbl_agents.vision.detector import CameraDetector
 from cpcbl_agents.vision.pictures import decode_image
-from cpcbl_launch.lab.experiments.detection_figures import within_3_sigma
 from cpcbl_launch.lab.experiments.runs import ExperimentResult
 from cpcbl_launch.reporting.files import read_csv
 from cpcbl_launch.reporting.metrics import degrees
@@ -28,6 +31,7 @@ from cpcbl_team.errors import InputError
 from cpcbl_team.geometry import wrap_angle
 from cpcbl_team.inputs import Sighting
 
+SETS = Path(__file__).parent / "picture_sets"
 UNITS = {"range": "m", "bearing": "deg", "heading": "deg"}
 
 
@@ -71,16 +75,12 @@ def picture_set(name: str) -> Path:
     """The table of a built-in set, or one's own file; its team file is beside it. Raises
     InputError."""
     own = Path(name)
-    path = own if own.suffix == ".csv" else _folder() / f"{name}.csv"
+    path = own if own.suffix == ".csv" else SETS / f"{name}.csv"
     for needed in (path, path.with_suffix(".toml")):
         if not needed.is_file():
-            known = ", ".join(sorted(p.stem for p in _folder().glob("*.csv")))
+            known = ", ".join(sorted(p.stem for p in SETS.glob("*.csv")))
             raise InputError(f"{name}: no {needed}; a set is one of {known}, or your own NAME.csv")
     return path
-
-
-def _folder() -> Path:
-    return Path(str(files("cpcbl_launch") / "picture_sets"))
 
 
 def measure(name: str, folder: Path) -> RealPictures:
@@ -190,3 +190,20 @@ def _listed(pairs: Sequence[tuple[str, str]]) -> str:
         pictures.setdefault(what, []).append(picture)
     items = (f"{what} ({', '.join(dict.fromkeys(where))})" for what, where in pictures.items())
     return "; ".join(items) or "nothing"
+
+
+def main() -> None:
+    """Compares what is found in real pictures with a table, and writes `pictures-SET.json`."""
+    parser = argparse.ArgumentParser(prog="bench-pictures", description=main.__doc__)
+    known = ", ".join(sorted(path.stem for path in SETS.glob("*.csv")))
+    parser.add_argument("set", help=f"{known}; or NAME.csv, with NAME.toml beside it.")
+    parser.add_argument("folder", type=Path, help="Where the set's pictures are.")
+    parser.add_argument("--output", type=Path, default=Path("build"), help="Folder for the JSON.")
+    given = parser.parse_args()
+    with user_errors(parser):
+        result = measure(given.set, given.folder)
+    show_and_write(result, tables(result), given.output / f"{result.experiment}.json")
+
+
+if __name__ == "__main__":
+    main()

@@ -7,13 +7,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from benchmarks.pictures import TruthLine, measure, picture_set
 from msgspec.structs import replace
-from support.processes import command_line, cpcbl_team
+from support.benchmarks import run_benchmark
 
 from cpcbl_agents.vision.camera import Camera, Pixels
 from cpcbl_agents.vision.markers import MarkerDetector
-from cpcbl_launch.lab.experiments import real_pictures
-from cpcbl_launch.lab.experiments.real_pictures import TruthLine, measure, picture_set
 from cpcbl_launch.reporting.files import read_csv
 from cpcbl_launch.simulation.camera.render import Light, Scene, SceneRobot, render
 from cpcbl_launch.team_file import load_team, parse_team
@@ -31,7 +30,7 @@ sensing = "camera"
 source = "external"
 markers = { front = 1, left = 2, back = 3, right = 4 }
 """
-COLUMNS = real_pictures.TruthLine.__struct_fields__
+COLUMNS = TruthLine.__struct_fields__
 SETS = ("duckiebot", "frc-speaker", "frc-amp", "nao")
 
 
@@ -79,8 +78,8 @@ def test_unexpected_detections_are_in_the_same_order_each_time(own_set: Path) ->
     assert found == (("both.png", "mark"), ("both.png", "mate"))
 
 
-def test_the_command_shows_and_writes(own_set: Path, tmp_path: Path) -> None:
-    shown = cpcbl_team("experiment", "pictures", own_set, own_set.parent, "--output", tmp_path)
+def test_the_benchmark_shows_and_writes(own_set: Path, tmp_path: Path) -> None:
+    shown = run_benchmark("pictures", own_set, own_set.parent, "--output", tmp_path)
     assert shown.returncode == 0, shown.stderr
     assert "found 1 of 2" in shown.stdout
     assert "within three stated σ: range 1 of 1, bearing 1 of 1, heading 1 of 1" in shown.stdout
@@ -103,10 +102,10 @@ def test_an_unreadable_set_is_one_line(tmp_path: Path, name: str, text: str, sai
         (tmp_path / "x.toml").write_text(TEAM)
         (tmp_path / "x.csv").write_text(text)
         name = str(tmp_path / name)
-    shown = command_line("experiment", "pictures", name, tmp_path, "--output", tmp_path)
-    assert shown.returncode != 0
-    assert said in shown.stderr
-    assert len(shown.stderr.strip().splitlines()) == 1
+    shown = run_benchmark("pictures", name, tmp_path, "--output", tmp_path)
+    assert shown.returncode == 2
+    assert said in shown.stderr.splitlines()[-1]
+    assert "Traceback" not in shown.stderr
 
 
 @pytest.mark.parametrize("name", SETS)

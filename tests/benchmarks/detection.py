@@ -4,16 +4,21 @@
 figures: detections, misses, mistakes, errors and their stated sigmas. Ranges are from the centre of
 the viewer to the centre of the object. Spreads are about zero, not about the mean, so that they
 contain a bias.
+
+`make bench-detection ARGS='--frames 10000'`
 """
 
+import argparse
 import math
 import platform
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import lru_cache
 from itertools import pairwise
+from pathlib import Path
 from typing import Literal, NamedTuple
 
+from benchmarks.report import counted_progress, show_and_write, user_errors
 from msgspec import Struct
 from rich.console import RenderableType
 
@@ -22,6 +27,7 @@ from cpcbl_launch.reporting.metrics import degrees
 from cpcbl_launch.reporting.tables import cells, number, table
 from cpcbl_launch.team_file import builtin_path, load_team
 from cpcbl_team.config import Team
+from cpcbl_team.errors import InputError
 
 CHUNK = 25  # frames of one task
 Kind = Literal["landmark", "marker", "mast"]
@@ -130,7 +136,7 @@ def team() -> Team:
 
 def measure(count: int, seed: int, jobs: int | None, done: Callable[[], None]) -> DetectionReport:
     """So many frames, `jobs` processes at a time; `done` is called after each `CHUNK` of them."""
-    from cpcbl_launch.lab.experiments.rendered_frames import evaluate_frames  # needs OpenCV
+    from benchmarks.rendered_frames import evaluate_frames  # needs OpenCV
 
     starts = range(0, count, CHUNK)
     tasks = [(seed, start, min(CHUNK, count - start)) for start in starts]
@@ -303,3 +309,26 @@ def _cells(f: Figures) -> list[str]:
         *cells(f, "bearing_sigma_deg:.2f heading_sigma_deg:.1f"),
         *cells(f, "range_inside:.3f bearing_inside:.3f heading_inside:.3f"),
     ]
+
+
+def main() -> None:
+    """Renders frames, compares what is detected in them, and writes `eyes.json` and `eyes.png`."""
+    parser = argparse.ArgumentParser(prog="bench-detection", description=main.__doc__)
+    parser.add_argument("--frames", type=int, default=2000, help="Rendered frames.")
+    parser.add_argument("--seed", type=int, default=1, help="Of poses, light and noise.")
+    parser.add_argument("--jobs", type=int, help="Processes at a time; default: all cores.")
+    parser.add_argument("--output", type=Path, default=Path("build"), help="Folder for the files.")
+    given = parser.parse_args()
+    with user_errors(parser):
+        if given.frames < 1 or given.seed < 0 or (given.jobs is not None and given.jobs < 1):
+            raise InputError("--frames and --jobs: at least 1; --seed: at least 0")
+    with counted_progress("detection", -(-given.frames // CHUNK)) as done:
+        result = measure(given.frames, given.seed, given.jobs, done)
+    show_and_write(result, tables(result), given.output / "eyes.json")
+    from benchmarks.detection_picture import draw
+
+    draw(result, given.output / "eyes.png")
+
+
+if __name__ == "__main__":
+    main()
