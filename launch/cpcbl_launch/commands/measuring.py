@@ -35,13 +35,6 @@ WithBaselines = Annotated[
         help="Also run dead reckoning, a solo EKF per robot, a centralized EKF.",
     ),
 ]
-WithBatch = Annotated[
-    bool,
-    Option(
-        "--batch",
-        help="The same, and batch least squares over the whole log: the ceiling of any filter.",
-    ),
-]
 ExportFolder = Annotated[
     Path | None,
     Option(
@@ -74,7 +67,7 @@ def evaluate_mrclam(
         bool, Option("--unknown-starts", help="Robots do not know where they start.")
     ] = False,
     baselines: WithBaselines = False,
-    batch: WithBatch = False,
+    batch: Annotated[bool, Option("--batch", hidden=True)] = False,
     export: ExportFolder = None,
     as_json: options.AsJson = False,
 ) -> None:
@@ -84,6 +77,11 @@ def evaluate_mrclam(
     from cpcbl_launch.run import logged_team
     from cpcbl_launch.views.run import print_report, progress_bar
 
+    if batch:
+        raise InputError(
+            "evaluate mrclam --batch: it is a benchmark now:"
+            f" make bench-batch ARGS='{data}', in a checkout"
+        )
     budgets = bytes_per_s, messages_per_minute, match_messages
     overrides = Overrides(*budgets, variant, collaboration, fusion, direction)
     team = with_overrides(find_team(team_file or logged_team.builtin_for(data)), overrides)
@@ -93,7 +91,7 @@ def evaluate_mrclam(
     if unknown_starts:
         logged = logged_team.with_unknown_starts(logged)
     with progress_bar(f"{data.name}", quiet=as_json) as progress:
-        result, paths = evaluate_log(logged, progress, with_baselines=baselines, with_batch=batch)
+        result, paths = evaluate_log(logged, progress, with_baselines=baselines)
     lost: dict[str, str] = {}
     if export is not None:
         lost = write_or_reason(export, partial(export_tum, export, paths, logged.truth))

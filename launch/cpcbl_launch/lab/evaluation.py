@@ -2,8 +2,7 @@
 
 The baselines use the same log with the same settings. Dead reckoning; a solo extended Kalman filter
 (EKF) per robot, which uses landmarks only; one centralized EKF over the poses of all robots, which
-uses all sightings of all robots; and, if asked for, batch least squares over the whole log, which
-knows the future and is the upper bound for any filter.
+uses all sightings of all robots.
 """
 
 from collections.abc import Mapping, Sequence
@@ -13,7 +12,6 @@ from typing import NamedTuple
 from msgspec.structs import replace
 
 from cpcbl_launch.lab.baselines import BaselineInputs, baseline_inputs, run_ekf
-from cpcbl_launch.lab.batch import smooth
 from cpcbl_launch.reporting.metrics import Floats, Trajectory, samples_with_truth, score
 from cpcbl_launch.reporting.recorder import (
     BaselineReport,
@@ -40,16 +38,13 @@ def evaluate_log(
     progress: Progress | None = None,
     *,
     with_baselines: bool = False,
-    with_batch: bool = False,
 ) -> LogEvaluation:
     """Runs all robots of a log and scores them against its truth.
 
-    With baselines (and with batch least squares), other filters run on the same inputs and are
-    scored at the same times.
+    With baselines, other filters run on the same inputs and are scored at the same times.
     """
     team, start_ns, end_ns = logged.team, logged.start_ns, logged.end_ns
-    show, filters_end = progress or (lambda done: None), 0.7 if with_batch else 1.0
-    team_end = 0.5 if with_baselines or with_batch else 1.0
+    show, team_end = progress or (lambda done: None), 0.5 if with_baselines else 1.0
     hub = MemoryHub()
     recorder = Recorder(hub.session())
     nodes = robot_nodes(team, hub, start_ns)
@@ -63,18 +58,12 @@ def evaluate_log(
         duration_s=(end_ns - start_ns) * 1e-9,
     )
     own = {name: recorder.trajectory(name) for name in team.robots}
-    if team_end == 1.0:
+    if not with_baselines:
         return LogEvaluation(report, {"estimate": own})
     stamps_ns = {name: path.stamps_ns.tolist() for name, path in own.items()}
-    inputs = baseline_inputs(logged)
-
-    def part(begin: float, end: float) -> Progress:
-        return lambda done: show(begin + (end - begin) * done)
-
-    others = run_baselines(inputs, team.map, stamps_ns, part(team_end, filters_end))
-    if with_batch:
-        batch = smooth(inputs, team.map, stamps_ns, part(filters_end, 1.0))
-        others["batch_least_squares"] = batch
+    others = run_baselines(
+        baseline_inputs(logged), team.map, stamps_ns, lambda done: show(0.5 + 0.5 * done)
+    )
     figures = {kind: baseline_report(paths, logged.truth) for kind, paths in others.items()}
     return LogEvaluation(replace(report, yardsticks=figures), {"estimate": own, **others})
 

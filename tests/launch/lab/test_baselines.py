@@ -2,20 +2,26 @@
 
 import json
 import math
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import msgspec
 import numpy as np
 import pytest
-from support.logs import FRAME_MS, STEP_MS, log_team, write_log
-from support.noisy_logs import KINDS, ODOMETRY, ROBOTS, SENSOR
+from support.logs import FRAME_MS, log_team, write_log
+from support.noisy_logs import (
+    KINDS,
+    ROBOTS,
+    SENSOR,
+    add_noise,
+    figure,
+    noisy_log,
+    rewrite_table,
+    with_robot_settings,
+    with_start_poses,
+)
 from support.processes import command_line, cpcbl_team
 
-from cpcbl_agents.sources.mrclam import read_table
 from cpcbl_launch.lab.baselines import baseline_inputs
-from cpcbl_launch.lab.batch import smooth
 from cpcbl_launch.lab.evaluation import (
     baseline_report,
     evaluate_log,
@@ -29,69 +35,7 @@ from cpcbl_team.config import (
     LocalizerSettings,
     OdometrySettings,
     SensorSettings,
-    Team,
 )
-
-# Logs --------------------------------------------------------------------------------------------
-
-
-def rewrite_table(path: Path, change: Callable[[Floats], Floats], columns: int) -> None:
-    np.savetxt(path, change(read_table(path, columns)), fmt="%.9f")
-
-
-def add_noise(folder: Path, seed: int) -> None:
-    """White noise exactly as SENSOR and ODOMETRY say."""
-    rng, step_s = np.random.default_rng(seed), STEP_MS * 1e-3
-    shares = ODOMETRY.distance_sigma_m_per_sqrt_m, ODOMETRY.turn_sigma_rad_per_sqrt_m
-
-    def wheels(rows: Floats) -> Floats:
-        root = np.sqrt(np.abs(rows[:, 1:2]) * step_s)
-        rows[:, 1:] += root * np.array(shares) * rng.normal(size=(len(rows), 2)) / step_s
-        return rows
-
-    def camera(rows: Floats) -> Floats:
-        sigma = np.hypot(SENSOR.range_share * rows[:, 2], SENSOR.range_floor_m)
-        rows[:, 2] += sigma * rng.normal(size=len(rows))
-        rows[:, 3] += SENSOR.bearing_sigma_rad * rng.normal(size=len(rows))
-        rows[:, 3] = (rows[:, 3] + math.pi) % math.tau - math.pi
-        return rows
-
-    for path in sorted(folder.glob("Robot*_Odometry.dat")):
-        rewrite_table(path, wheels, 3)
-    for path in sorted(folder.glob("Robot*_Measurement.dat")):
-        rewrite_table(path, camera, 4)
-
-
-def with_robot_settings(team: Team, **settings: Any) -> Team:
-    """All robots with other settings."""
-    robots = {n: msgspec.structs.replace(r, **settings) for n, r in team.robots.items()}
-    return msgspec.structs.replace(team, robots=robots)
-
-
-def noisy_log(folder: Path, seed: int, seconds: float = 40.0) -> LoggedTeam:
-    write_log(folder, ROBOTS, seconds)
-    add_noise(folder, seed)
-    return with_start_poses(
-        load_logged_team(
-            with_robot_settings(log_team(*ROBOTS), sensor=SENSOR, odometry=ODOMETRY), folder
-        )
-    )
-
-
-def with_start_poses(logged: LoggedTeam, dx_m: float = 0.0, dy_m: float = 0.0) -> LoggedTeam:
-    """Robots that are sure of starts which are so far off."""
-    robots = {}
-    for name, robot in logged.team.robots.items():
-        assert robot.start is not None
-        start = msgspec.structs.replace(
-            robot.start,
-            x_m=robot.start.x_m + dx_m,
-            y_m=robot.start.y_m + dy_m,
-            sigma_m=1e-4,
-            heading_sigma_deg=0.01,
-        )
-        robots[name] = msgspec.structs.replace(robot, start=start)
-    return logged._replace(team=msgspec.structs.replace(logged.team, robots=robots))
 
 
 def paths_of(logged: LoggedTeam) -> dict[str, dict[str, Trajectory]]:
@@ -103,12 +47,6 @@ def paths_of(logged: LoggedTeam) -> dict[str, dict[str, Trajectory]]:
 
 def reports_of(logged: LoggedTeam) -> dict[str, BaselineReport]:
     return {kind: baseline_report(paths, logged.truth) for kind, paths in paths_of(logged).items()}
-
-
-def figure(report: BaselineReport, name: str = "position_rmse_m", robot: str = "") -> float:
-    value = getattr(report.robots[robot] if robot else report.team, name)
-    assert isinstance(value, float)
-    return value
 
 
 # Accuracy ----------------------------------------------------------------------------------------
@@ -172,54 +110,6 @@ def test_without_sightings_of_robots_the_centralized_filter_is_many_solo_filters
         assert alone.covariance is not None
         assert together.covariance is not None
         np.testing.assert_allclose(together.covariance, alone.covariance, atol=1e-9)
-
-
-# Batch least squares -----------------------------------------------------------------------------
-
-
-def batch_of(logged: LoggedTeam) -> dict[str, BaselineReport]:
-    """The report of the batch, at the times of the filters."""
-    stamps = range(logged.start_ns, logged.end_ns, 100_000_000)
-    names = dict.fromkeys(logged.team.robots, stamps)
-    paths = smooth(baseline_inputs(logged), logged.team.map, names)
-    return {"batch_least_squares": baseline_report(paths, logged.truth)}
-
-
-def test_the_batch_has_no_error_without_noise(tmp_path: Path) -> None:
-    write_log(tmp_path, ROBOTS, 20.0)
-    logged = load_logged_team(log_team(*ROBOTS), tmp_path)
-    report = batch_of(logged._replace(team=with_blind_robots(logged.team, ["2"])))
-    for robot in report["batch_least_squares"].robots.values():
-        assert robot.samples == 200
-        assert robot.position_max_m == pytest.approx(0.0, abs=1e-6)
-
-
-def test_the_batch_is_the_ceiling_and_consistent(
-    tmp_path: Path, runs: list[dict[str, BaselineReport]]
-) -> None:
-    """It knows the future: better than the centralized EKF in each run, with a NEES of 2."""
-    batches = []
-    for seed in range(5):
-        (tmp_path / str(seed)).mkdir()
-        batches.append(batch_of(noisy_log(tmp_path / str(seed), seed))["batch_least_squares"])
-    for batch, run in zip(batches, runs, strict=True):
-        assert figure(batch) < 0.9 * figure(run["centralized_ekf"])
-    assert np.mean([figure(batch, "nees") for batch in batches]) == pytest.approx(2.0, abs=0.4)
-
-
-def test_the_batch_bears_wrong_sightings(tmp_path: Path) -> None:
-    """Every twentieth range is 3 m too long: the error stays below that of the filter."""
-    logged = noisy_log(tmp_path, 9, 20.0)
-
-    def lengthened(rows: Floats) -> Floats:
-        rows[::20, 2] += 3.0
-        return rows
-
-    for robot in ROBOTS:
-        rewrite_table(tmp_path / f"Robot{robot}_Measurement.dat", lengthened, 4)
-    wrong = with_start_poses(load_logged_team(logged.team, tmp_path))
-    clean = figure(batch_of(logged)["batch_least_squares"])
-    assert figure(batch_of(wrong)["batch_least_squares"]) < 1.5 * clean
 
 
 # Settings ----------------------------------------------------------------------------------------
@@ -326,12 +216,9 @@ def test_the_table_of_baselines_fits_and_is_shown_on_demand(tmp_path: Path) -> N
     write_log(tmp_path, ROBOTS, 3.0)
     plain, compared_ = (
         cpcbl_team("evaluate", "mrclam", tmp_path, "--team", "mrclam-uncalibrated", *options)
-        for options in ((), ("--batch",))
+        for options in ((), ("--yardstick",))
     )
-    for words in (
-        *("dead reckoning", "solo EKF", "centralized EKF"),
-        *("batch least squares", "this team"),
-    ):
+    for words in ("dead reckoning", "solo EKF", "centralized EKF", "this team"):
         assert words in compared_.stdout
         assert words not in plain.stdout
     assert max(map(len, compared_.stdout.splitlines())) <= 80

@@ -1,0 +1,85 @@
+"""Batch least squares on logs whose noise is known, and the benchmark that shows it."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from benchmarks.batch import smooth
+from support.benchmarks import run_benchmark
+from support.logs import log_team, write_log
+from support.noisy_logs import ROBOTS, figure, noisy_log, rewrite_table, with_start_poses
+from support.processes import command_line
+
+from cpcbl_launch.lab.baselines import baseline_inputs, run_ekf
+from cpcbl_launch.lab.evaluation import baseline_report
+from cpcbl_launch.overrides import with_blind_robots
+from cpcbl_launch.reporting.metrics import Floats
+from cpcbl_launch.reporting.recorder import BaselineReport
+from cpcbl_launch.run.logged_team import LoggedTeam, load_logged_team
+
+
+def stamps_of(logged: LoggedTeam) -> dict[str, range]:
+    return dict.fromkeys(logged.team.robots, range(logged.start_ns, logged.end_ns, 100_000_000))
+
+
+def batch_of(logged: LoggedTeam) -> BaselineReport:
+    """The report of the batch, at the times of the filters."""
+    paths = smooth(baseline_inputs(logged), logged.team.map, stamps_of(logged))
+    return baseline_report(paths, logged.truth)
+
+
+def test_the_batch_has_no_error_without_noise(tmp_path: Path) -> None:
+    write_log(tmp_path, ROBOTS, 20.0)
+    logged = load_logged_team(log_team(*ROBOTS), tmp_path)
+    report = batch_of(logged._replace(team=with_blind_robots(logged.team, ["2"])))
+    for robot in report.robots.values():
+        assert robot.samples == 200
+        assert robot.position_max_m == pytest.approx(0.0, abs=1e-6)
+
+
+def test_the_batch_is_the_ceiling_and_consistent(tmp_path: Path) -> None:
+    """It knows the future: better than the centralized EKF in each run, with a NEES of 2."""
+    batches = []
+    for seed in range(5):
+        (tmp_path / str(seed)).mkdir()
+        logged = noisy_log(tmp_path / str(seed), seed)
+        batches.append(batch_of(logged))
+        ekf = run_ekf(baseline_inputs(logged), logged.team.map, stamps_of(logged))
+        assert figure(batches[-1]) < 0.9 * figure(baseline_report(ekf, logged.truth))
+    assert np.mean([figure(batch, "nees") for batch in batches]) == pytest.approx(2.0, abs=0.4)
+
+
+def test_the_batch_bears_wrong_sightings(tmp_path: Path) -> None:
+    """Every twentieth range is 3 m too long: the error stays below that of the filter."""
+    logged = noisy_log(tmp_path, 9, 20.0)
+
+    def lengthened(rows: Floats) -> Floats:
+        rows[::20, 2] += 3.0
+        return rows
+
+    for robot in ROBOTS:
+        rewrite_table(tmp_path / f"Robot{robot}_Measurement.dat", lengthened, 4)
+    wrong = with_start_poses(load_logged_team(logged.team, tmp_path))
+    clean = figure(batch_of(logged))
+    assert figure(batch_of(wrong)) < 1.5 * clean
+
+
+def test_the_benchmark_shows_the_batch_beside_the_filters(tmp_path: Path) -> None:
+    write_log(tmp_path, ROBOTS, 3.0)
+    team = ("--team", "mrclam-uncalibrated", "--blind", "3", "--output", tmp_path)
+    shown = run_benchmark("batch", tmp_path, *team)
+    assert shown.returncode == 0, shown.stderr
+    for words in ("dead reckoning", "solo EKF", "centralized EKF", "batch least squares"):
+        assert words in shown.stdout
+    lines = [line for line in shown.stdout.splitlines() if "written" not in line]
+    assert max(map(len, lines)) <= 80
+    written = json.loads((tmp_path / "batch.json").read_text())
+    assert written["yardsticks"]["batch_least_squares"]["robots"].keys() == set(ROBOTS)
+
+
+def test_the_former_option_is_one_line_that_names_the_target() -> None:
+    ran = command_line("evaluate", "mrclam", "MRCLAM6", "--batch")
+    assert ran.returncode == 2
+    (line,) = ran.stderr.splitlines()
+    assert "make bench-batch ARGS='MRCLAM6'" in line
