@@ -2,8 +2,8 @@
 
 A viewer, its teammates and cylinders on no map have random poses on the team's field, and the light
 is random. The camera's mounting and focal length differ from its settings by errors with the sigmas
-that the settings state. What is visible follows from the geometry
-(`visibility.py`), not from the picture.
+that the settings state. What is visible follows from the geometry (`visibility.py`), not from the
+picture.
 
 - landmark: due if all of it is in the frame and nothing hides it;
 - marker: a teammate is due if one of its markers is completely visible and faces the viewer within
@@ -25,6 +25,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 from benchmarks import visibility
+from benchmarks.clutter import with_clutter
 from benchmarks.detection import Batch, Kind, Mistake, Record, Wrong, team
 from benchmarks.visibility import Solid
 
@@ -115,7 +116,7 @@ def random_frame(random: np.random.Generator) -> RandomFrame:
     """A viewer, the poses of all objects, and the light."""
     viewers = team().cameras
     viewer = viewers[int(random.integers(len(viewers)))]
-    scene = _scene().with_clutter(int(random.integers(MOST_CLUTTER + 1)), random)
+    scene = with_clutter(_scene(), int(random.integers(MOST_CLUTTER + 1)), random)
     taken = [(post.x_m, post.y_m) for post in (*scene.landmarks.values(), *scene.clutter)]
     pose = _free_pose(random, taken, None)
     taken.append((pose.x, pose.y))

@@ -4,6 +4,7 @@ and looks as it does to OpenCV."""
 import cv2
 import numpy as np
 import pytest
+from benchmarks.clutter import with_clutter
 from numpy.typing import NDArray
 from support.rendered_pictures import (
     CAMERAS,
@@ -195,12 +196,12 @@ def test_light_is_as_it_says() -> None:
 def test_clutter_is_on_no_map() -> None:
     subject = team({"a": post(2.0, 0.5), "b": post(2.5, -0.5, ("blue", "green"))})
     scene = Scene.of(subject)
-    cluttered = scene.with_clutter(40, np.random.default_rng(4))
+    cluttered = with_clutter(scene, 40, np.random.default_rng(4))
     known = {mark.bands for mark in scene.landmarks.values()}
     assert len(cluttered.clutter) == 40
     assert not any(thing.bands in known for thing in cluttered.clutter)
     assert (picture(cluttered) != picture(scene)).any()
-    assert cluttered == scene.with_clutter(40, np.random.default_rng(4))
+    assert cluttered == with_clutter(scene, 40, np.random.default_rng(4))
     bare = picture(scene.without_landmarks())
     assert (bare == picture(team())).all()
 
