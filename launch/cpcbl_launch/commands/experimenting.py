@@ -14,10 +14,10 @@ from cpcbl_launch.checks import require_matplotlib, require_opencv
 from cpcbl_launch.commands.options import (
     parse_names,
     print_not_written,
+    refuse_moved,
     require_folder,
     require_writable_file,
 )
-from cpcbl_team.errors import InputError
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -162,7 +162,7 @@ MOVED = {
 
 def _refuse_benchmark(context: typer.Context) -> None:
     name = str(context.info_name)
-    raise InputError(f"experiment {name}: it is a benchmark now: make {MOVED[name]}, in a checkout")
+    refuse_moved(f"experiment {name}", MOVED[name])
 
 
 for _name, _target in MOVED.items():

@@ -16,7 +16,6 @@ from cpcbl_launch.overrides import Overrides, with_blind_robots, with_overrides
 from cpcbl_launch.reporting.files import write_or_reason
 from cpcbl_launch.team_file import find_team
 from cpcbl_team.config import Variant
-from cpcbl_team.errors import InputError
 
 LogTeamFile = Annotated[
     Path | None, Option("--team", help="Team file; default: the built-in mrclam without this log.")
@@ -78,10 +77,7 @@ def evaluate_mrclam(
     from cpcbl_launch.views.run import print_report, progress_bar
 
     if batch:
-        raise InputError(
-            "evaluate mrclam --batch: it is a benchmark now:"
-            f" make bench-batch ARGS='{data}', in a checkout"
-        )
+        options.refuse_moved("evaluate mrclam --batch", f"bench-batch ARGS='{data}'")
     budgets = bytes_per_s, messages_per_minute, match_messages
     overrides = Overrides(*budgets, variant, collaboration, fusion, direction)
     team = with_overrides(find_team(team_file or logged_team.builtin_for(data)), overrides)
@@ -166,10 +162,7 @@ def simulate(
     from cpcbl_launch.views.run import print_report, progress_bar
 
     if robots:
-        raise InputError(
-            "simulate --robots: it is a benchmark now:"
-            f" make bench-scaling ARGS='--robots {robots}', in a checkout"
-        )
+        options.refuse_moved("simulate --robots", f"bench-scaling ARGS='--robots {robots}'")
     budgets = Overrides(bytes_per_s, messages_per_minute, match_messages)
     team = with_overrides(find_team(file or Path("demo")), budgets)
     require_team_opencv(team, team.robots, field=True)

@@ -139,6 +139,11 @@ def print_not_written(lost: Mapping[str, str]) -> None:
         raise Exit(1)
 
 
+def refuse_moved(old: str, target: str) -> None:
+    """Raises InputError for what became a benchmark: a target of make."""
+    raise InputError(f"{old}: it is a benchmark now: make {target}, in a checkout")
+
+
 def parse_names(text: str) -> list[str]:
     """The names of a list with commas."""
     return [name.strip() for name in text.split(",") if name.strip()]

@@ -3,7 +3,7 @@
 import pytest
 
 from cpcbl_launch.lab.experiments import budget
-from cpcbl_launch.lab.experiments.mixed_team import mixed_team
+from cpcbl_launch.lab.experiments.budget import mixed_team
 
 
 @pytest.mark.parametrize("size", [2, 5, 12])
