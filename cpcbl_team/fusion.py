@@ -49,6 +49,14 @@ class Observation(NamedTuple):
         i, d, k = self.independent, self.dependent, dependent_factor
         return Covariance2(*_noise(i.xx + k * d.xx, i.xy + k * d.xy, i.yy + k * d.yy))
 
+    def moved(self, dx: float, dy: float, turn: float) -> "Observation":
+        """About an estimate that is so far from the present one (m, rad in the field's frame)."""
+        residuals = tuple(
+            e - x * dx - y * dy - a * turn
+            for (x, y, a), e in zip(self.rows, self.residuals, strict=True)
+        )
+        return Observation(self.rows, residuals, self.independent, self.dependent)
+
     def information(self, dependent_factor: float = 1.0) -> Information:
         """The evidence with the dependent part of its covariance times `dependent_factor`."""
         r = self.noise(dependent_factor)

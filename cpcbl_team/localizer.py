@@ -16,14 +16,13 @@ from cpcbl_team.inputs import Belief, BeliefShared, Fix, Odometry, Position, Sig
 from cpcbl_team.landmarks import Landmarks, LandmarkUpdate
 from cpcbl_team.measurements import (
     BELIEF_VALID_BEFORE_NS,
-    GatedObject,
     GatedObjects,
     Measurement,
     constrains,
     constraints_of,
     curved,
+    gated_object,
     measurement_of,
-    nis_of,
 )
 from cpcbl_team.motion import NO_VARIANCE, bridge, inflate_by_gap, is_gap, part_of_piece
 from cpcbl_team.object_timers import ObjectTimers, has_passed
@@ -244,10 +243,9 @@ class Localizer:
             if self._widens and not m.is_teammate:
                 constraints = curved(prior, m, constraints)
             if constraints:
-                nis = nis_of(prior, m, constraints)
-                is_accepted = nis <= self._gates[len(constraints) - 1]
-                objects = gated.accepted if is_accepted else gated.rejected
-                objects.append(GatedObject(m, constraints, nis))
+                found = gated_object(prior, m, constraints)
+                is_accepted = found.nis <= self._gates[len(constraints) - 1]
+                (gated.accepted if is_accepted else gated.rejected).append(found)
         return gated
 
     def correct(

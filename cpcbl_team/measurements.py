@@ -129,6 +129,8 @@ class GatedObject(NamedTuple):
     measurement: Measurement
     constraints: list[Constraint]
     nis: float
+    observation: Observation | None = None
+    """Of a teammate: the constraints as one observation of the prior."""
 
 
 class GatedObjects(NamedTuple):
@@ -260,31 +262,31 @@ def combine(evidence: Information, accepted: Iterable[GatedObject]) -> Informati
     )
 
 
-def nis_of(prior: Estimate, m: Measurement, cs: list[Constraint]) -> float:
-    """The normalized innovation squared of one object: chi-square, a degree a constraint."""
+def gated_object(prior: Estimate, m: Measurement, cs: list[Constraint]) -> GatedObject:
+    """One object with the normalized innovation squared of its constraints."""
+    covariance = prior.covariance
     if m.is_teammate:
-        return observation_of(prior, m, cs, prior).normalized_innovation_squared(prior.covariance)
+        observation = observation_of(prior, m, cs)
+        nis = observation.normalized_innovation_squared(covariance)
+        return GatedObject(m, cs, nis, observation)
     first, last = cs[0], cs[-1]
     rxx, ryy = first.sigma * first.sigma, last.sigma * last.sigma
     noise = rxx + SMALLEST_VARIANCE, 0.0, ryy + SMALLEST_VARIANCE
     if first is last:
-        return chi_square(prior.covariance, noise, (first.row,), (first.residual,))
-    residuals = first.residual, last.residual
-    return chi_square(prior.covariance, noise, (first.row, last.row), residuals)
+        nis = chi_square(covariance, noise, (first.row,), (first.residual,))
+    else:
+        rows, residuals = (first.row, last.row), (first.residual, last.residual)
+        nis = chi_square(covariance, noise, rows, residuals)
+    return GatedObject(m, cs, nis)
 
 
-def observation_of(
-    prior: Estimate, m: Measurement, cs: list[Constraint], now: Estimate
-) -> Observation:
-    """The constraints of one object, about the estimate `now` though linearized at the prior.
+def observation_of(prior: Estimate, m: Measurement, cs: list[Constraint]) -> Observation:
+    """The constraints of one object as an observation of the prior, at which they are linearized.
 
     A teammate's pose covariance is compounded with the sensor's (checklist row 39), as the
     dependent part.
     """
-    dx, dy = now.pose.x - prior.pose.x, now.pose.y - prior.pose.y
-    dh = wrap_angle(now.pose.heading - prior.pose.heading)
-    rows = tuple(c.row for c in cs)
-    residuals = tuple(c.residual - c.row[0] * dx - c.row[1] * dy - c.row[2] * dh for c in cs)
+    rows, residuals = tuple(c.row for c in cs), tuple(c.residual for c in cs)
     sensor = [c.sigma * c.sigma for c in cs]
     place = m.position.covariance
     (ax, ay), (bx, by) = cs[0].place_row, cs[-1].place_row

@@ -74,7 +74,8 @@ class OwnCalibration:
         self, state: State, landmarks: LandmarkUpdate, others: Sequence[GatedObject]
     ) -> State:
         """The state that has noticed which objects of the map were rejected in a frame."""
-        names = [m.source for m, _, _ in others if not m.is_teammate] + landmarks.rejected
+        objects = [found.measurement for found in others]
+        names = [m.source for m in objects if not m.is_teammate] + landmarks.rejected
         memory = state.memory.calibration
         if not names or state.memory.recovery.lost or not self._is_checked:
             return state

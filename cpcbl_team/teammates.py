@@ -48,7 +48,7 @@ class TeammateScreen:
         if (accepted or rejected) and not is_lost:
             state = self._with_own_sensors(state, accepted, rejected)
         distrusted = set()
-        for m, constraints, nis in (*gated.accepted, *gated.rejected):
+        for m, constraints, nis, _ in (*gated.accepted, *gated.rejected):
             if m.is_teammate:
                 is_fresh = _has_fresh(state.memory.teammates.beliefs[m.source], now)
                 of_two = 2.0 * nis / len(constraints) if is_fresh and not is_lost else None

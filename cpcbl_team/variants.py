@@ -23,7 +23,7 @@ from cpcbl_team.estimate import (
 from cpcbl_team.fusion import Observation, merge_naive, merge_split, with_all_shared
 from cpcbl_team.geometry import Pose2, wrap_angle
 from cpcbl_team.landmarks import LandmarkUpdate
-from cpcbl_team.measurements import GatedObject, combine, observation_of
+from cpcbl_team.measurements import GatedObject, combine
 from cpcbl_team.motion import NO_VARIANCE, MotionVariance, move
 
 UpdateOrder = tuple[Scope | None, ...]
@@ -78,12 +78,12 @@ class JointVariant:
             return self.merge(prior, evidence, scope)
         estimate = merge(prior, combine(Information.of(evidence), accepted), scope)
         for found in accepted:
-            m = found.measurement
-            if m.is_teammate:
-                observation = observation_of(prior, m, found.constraints, estimate)
-                within = scope
-                if m.is_for_heading:
+            if found.observation is not None:
+                dx, dy = estimate.pose.x - prior.pose.x, estimate.pose.y - prior.pose.y
+                turn, within = wrap_angle(estimate.pose.heading - prior.pose.heading), scope
+                if found.measurement.is_for_heading:
                     within, estimate = HEADING, with_all_shared(estimate)
+                observation = found.observation.moved(dx, dy, turn)
                 estimate = self._merge_teammate(estimate, observation, within)
         return self.reduce(estimate)
 

@@ -193,8 +193,12 @@ class CollaborationAgent:
         if not in_sight:
             return False
         if tier in accepted_tiers(self.tier, rules):
-            gain = gains.information_gain_of_belief(seen, tier, now.estimate, rules)
-            return bool(now.lost) or gain >= rules.least_use
+            about = seen, tier, now.estimate, rules  # the gain of heading costs least to compute
+            return (
+                bool(now.lost)
+                or gains.heading_information_gain_of_belief(*about) >= rules.least_use
+                or gains.information_gain_of_belief(*about) >= rules.least_use
+            )
         if tier != self.tier or now.lost or not self._listens_to_equals:
             return False
         gain = gains.heading_information_gain_of_belief(seen, tier, now.estimate, rules)

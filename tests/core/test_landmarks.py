@@ -29,8 +29,8 @@ from cpcbl_team.measurements import (
     constrains,
     constraints_of,
     curved,
+    gated_object,
     measurement_of,
-    nis_of,
 )
 from cpcbl_team.sensors import sighting_fault
 from cpcbl_team.state import State, Updates
@@ -134,7 +134,7 @@ def composed(robot: Localizer, state: State, frame: Sightings) -> tuple[Estimate
         bound = -2.0 * math.log(1.0 - r.gate_probability)
         if len(cs) == 1:
             bound = robot._gates[0]
-        if cs and nis_of(prior, m, cs) > bound:
+        if cs and gated_object(prior, m, cs).nis > bound:
             counts["gated"] += 1
         elif cs:
             counts["accepted"] += 1

@@ -20,8 +20,8 @@ from cpcbl_team.inputs import Belief, Sighting
 from cpcbl_team.measurements import (
     Measurement,
     constraints_of,
+    gated_object,
     measurement_of,
-    nis_of,
     observation_of,
 )
 
@@ -132,7 +132,7 @@ def test_the_gate_measures_the_innovation_of_the_whole_observation(name: str, sc
     )
     assert measurement is not None
     cs = constraints_of(HERE, measurement, scope, LocalizerSettings())
-    whole = observation_of(prior, measurement, cs, prior)
+    whole = observation_of(prior, measurement, cs)
     expected = whole.normalized_innovation_squared(prior.covariance)
     assert expected > 0.0
-    assert nis_of(prior, measurement, cs) == pytest.approx(expected, rel=1e-12)
+    assert gated_object(prior, measurement, cs).nis == pytest.approx(expected, rel=1e-12)

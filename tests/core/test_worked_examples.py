@@ -128,15 +128,14 @@ def test_a_teammates_place_correlates_its_range_and_its_bearing() -> None:
         columns.append([(a.residual - b.residual) / step for a, b in pairs if a is not None])
     jacobian = np.array(columns).T
     expected = jacobian @ matrix2(place) @ jacobian.T
-    found = matrix2(observation_of(prior, m, constraints, prior).dependent)
+    found = matrix2(observation_of(prior, m, constraints).dependent)
     np.testing.assert_allclose(found, expected, rtol=1e-4)
     assert abs(found[0, 1]) > 0.1 * math.sqrt(found[0, 0] * found[1, 1])
 
 
 def test_a_second_teammate_is_seen_from_where_the_first_has_moved_the_robot() -> None:
     prior, m, constraints = teammate_example()
-    now = prior._replace(pose=Pose2(0.1, -0.2, 0.05))
-    found = observation_of(prior, m, constraints, now).residuals
+    found = observation_of(prior, m, constraints).moved(0.1, -0.2, 0.05).residuals
     expected = [c.residual - float(np.dot(c.row, (0.1, -0.2, 0.05))) for c in constraints]
     assert found == pytest.approx(expected)
 
