@@ -193,12 +193,10 @@ class CollaborationAgent:
         if not in_sight:
             return False
         if tier in accepted_tiers(self.tier, rules):
-            about = seen, tier, now.estimate, rules  # the gain of heading costs least to compute
-            return (
-                bool(now.lost)
-                or gains.heading_information_gain_of_belief(*about) >= rules.least_use
-                or gains.information_gain_of_belief(*about) >= rules.least_use
-            )
+            # That of the heading alone is no larger, and costs less to compute
+            which = gains.heading_information_gain_of_belief, gains.information_gain_of_belief
+            enough = (gain(seen, tier, now.estimate, rules) >= rules.least_use for gain in which)
+            return bool(now.lost) or any(enough)
         if tier != self.tier or now.lost or not self._listens_to_equals:
             return False
         gain = gains.heading_information_gain_of_belief(seen, tier, now.estimate, rules)

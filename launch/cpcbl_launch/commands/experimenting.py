@@ -1,23 +1,17 @@
 """`cpcbl-team experiment ...`."""
 
 import sys
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable
 from functools import partial
 from importlib import import_module
+from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Optional
 
 import typer
 
 from cpcbl_launch.checks import require_matplotlib, require_opencv
-from cpcbl_launch.commands.options import (
-    parse_names,
-    print_not_written,
-    refuse_moved,
-    require_folder,
-    require_writable_file,
-)
+from cpcbl_launch.commands import options
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -118,7 +112,7 @@ def budget(
     else:
         team = load_team(logged_team.builtin_for(data))
         logged = logged_team.with_duration(logged_team.load_logged_team(team, data), duration)
-        team = with_blind_robots(logged.team, parse_names(blind), logged.left_out)
+        team = with_blind_robots(logged.team, options.parse_names(blind), logged.left_out)
         runs = experiment.runs_of_log(logged._replace(team=team))
     measure = partial(experiment.measure_curve, runs, jobs)
     total = len(experiment.cases())
@@ -147,7 +141,7 @@ def worlds(
     """Consistency outside the usual case: few landmarks, lost odometry, unknown starts, ..."""
     from cpcbl_launch.lab.experiments import worlds as experiment
 
-    cases = partial(experiment.cases, parse_names(names), parse_names(variants))
+    cases = partial(experiment.cases, options.parse_names(names), options.parse_names(variants))
     conduct(experiment.EXPERIMENT._replace(cases=cases), seeds, jobs, output, as_json)
 
 
@@ -162,7 +156,7 @@ MOVED = {
 
 def _refuse_benchmark(context: typer.Context) -> None:
     name = str(context.info_name)
-    refuse_moved(f"experiment {name}", MOVED[name])
+    options.refuse_moved(f"experiment {name}", MOVED[name])
 
 
 for _name, _target in MOVED.items():
@@ -194,7 +188,7 @@ def _conduct(
     output: Path,
     as_json: bool,
     *,
-    total: int | None = None,
+    total: int,
     drawn: bool = True,
 ) -> None:
     """Measures with a bar of progress, writes NAME.json (and NAME.png), and prints the result.
@@ -204,15 +198,17 @@ def _conduct(
     from rich.console import Console
 
     from cpcbl_launch.reporting.files import json_text, write_or_reason
+    from cpcbl_launch.views.run import progress_bar
 
     figures, picture = output / f"{name}.json", output / f"{name}.png"
     if drawn:
         require_matplotlib("experiment")
-    require_folder("--output", output)
+    options.require_folder("--output", output)
     for path in (figures, picture) if drawn else (figures,):
-        require_writable_file("--output", path)
-    with _progress(name, total) as done:
-        result = measure(done)
+        options.require_writable_file("--output", path)
+    with progress_bar(f"{name}, {total} runs", quiet=False) as show:
+        finished = count(1)
+        result = measure(lambda: show(next(finished) / total))
     text = json_text(result) + "\n"
     lost = write_or_reason(figures, lambda: figures.write_text(text, encoding="utf-8"))
     if drawn:
@@ -227,17 +223,4 @@ def _conduct(
             console.print(shown, highlight=False)
         if not lost:
             console.print(f"written: {figures}{', .png' * drawn}", highlight=False)
-    print_not_written(lost)
-
-
-@contextmanager
-def _progress(title: str, total: int | None) -> Iterator[Callable[[], None]]:
-    """A bar on standard error; the function that it yields moves it by one."""
-    from rich import progress
-    from rich.console import Console
-
-    done = progress.BarColumn(), progress.MofNCompleteColumn(), progress.TextColumn("runs")
-    columns = (progress.TextColumn(title), *done, progress.TimeRemainingColumn())
-    with progress.Progress(*columns, console=Console(stderr=True), transient=True) as shown:
-        task = shown.add_task(title, total=total)
-        yield lambda: shown.advance(task)
+    options.print_not_written(lost)

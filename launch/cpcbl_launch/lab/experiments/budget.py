@@ -12,7 +12,7 @@ poor odometry. Each drives from point to point on a field with 20 m² for each, 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
-from itertools import groupby
+from itertools import cycle, groupby
 from pathlib import Path
 from random import Random
 from typing import Any, NamedTuple
@@ -27,8 +27,9 @@ from cpcbl_launch.reporting.recorder import Report, mean_score
 from cpcbl_launch.reporting.tables import cells, table
 from cpcbl_launch.run.logged_team import LoggedTeam
 from cpcbl_launch.simulation.in_process import simulate
+from cpcbl_launch.team_file import builtin_path, load_team
 from cpcbl_team import config
-from cpcbl_team.config import OdometrySettings, RobotSettings, SensorSettings, Team
+from cpcbl_team.config import Team
 from cpcbl_team.errors import InputError
 
 EVERYTHING: Mapping[str, Any] = {"least_value": 0.0, "least_use": 0.0, "belief_share": 0.0}
@@ -38,15 +39,6 @@ RARE = {"least_value": 0.2, "least_use": 0.9, "fix_interval_s": 10.0, "belief_ra
 SIMULATED_S = 300.0
 OURS = ("bytes limited", "messages limited", "value alone")
 ROBOT_AREA_M2, LANDMARK_AREA_M2 = 20.0, 12.0
-GUIDE = SensorSettings(
-    range_share=0.02, bearing_sigma_deg=1.0, rate_hz=2.0, max_range_m=6.0, field_of_view_deg=90.0
-)
-BLIND = replace(GUIDE, range_share=0.05, bearing_sigma_deg=2.0, sees_landmarks=False)
-# Its sensor, the noise of its odometry as a multiple of the usual one, its speed in m/s
-KINDS = (
-    *((GUIDE, 1.0, 0.4), (BLIND, 1.0, 0.3), (BLIND, 3.0, 0.3)),
-    *((BLIND, 1.0, 0.5), (BLIND, 2.0, 0.2)),
-)
 
 
 class Point(Struct, frozen=True, kw_only=True):
@@ -132,31 +124,17 @@ def simulated_runs(size: int, seeds: int) -> Runs:
 
 
 def mixed_team(size: int, seed: int) -> Team:
-    """A team of so many robots; the seed determines their ways and the map."""
+    """A team of so many robots of the kinds in `teams/mixed.toml`; the seed determines their ways
+    and the map."""
     random, side_m = Random(f"{seed} {size}"), math.sqrt(ROBOT_AREA_M2 * size)
-    robots = {}
-    for i in range(size):
-        sensor, noise, speed = KINDS[i % len(KINDS)]
-        odometry = OdometrySettings(
-            distance_sigma_m_per_sqrt_m=0.05 * noise,
-            turn_sigma_rad_per_sqrt_rad=0.03 * noise,
-            turn_sigma_rad_per_sqrt_m=0.03 * noise,
-            rate_hz=10.0,
-        )
+    base, robots = load_team(builtin_path("mixed")), {}
+    for i, kind in zip(range(size), cycle(base.robots.values()), strict=False):
         first, *others = [_place(random, side_m) for _ in range(8)]
         start = config.Start(x_m=first[0], y_m=first[1], heading_deg=random.uniform(-180.0, 180.0))
-        robots[f"r{i:02}"] = RobotSettings(
-            start=start,
-            sensor=sensor,
-            odometry=odometry,
-            waypoints_m=(*others, first),
-            speed_m_s=speed,
-        )
+        robots[f"r{i:02}"] = replace(kind, start=start, waypoints_m=(*others, first))
     places = [_place(random, side_m) for _ in range(round(ROBOT_AREA_M2 * size / LANDMARK_AREA_M2))]
     marks = {f"m{i}": config.Landmark(x_m=x, y_m=y) for i, (x, y) in enumerate(places)}
-    simulation = config.SimulationSettings(step_rate_hz=10.0)
-    field = config.Field(landmarks=marks)
-    return Team(name=f"mixed{size}", robots=robots, map=field, simulation=simulation)
+    return replace(base, name=f"mixed{size}", robots=robots, map=config.Field(landmarks=marks))
 
 
 def _place(random: Random, side_m: float) -> tuple[float, float]:
