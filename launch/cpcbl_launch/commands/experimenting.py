@@ -1,6 +1,5 @@
 """`cpcbl-team experiment ...`."""
 
-import sys
 from collections.abc import Callable, Iterable
 from functools import partial
 from importlib import import_module
@@ -8,7 +7,7 @@ from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Optional
 
-import typer
+from typer import Argument, Context, Option, Typer
 
 from cpcbl_launch.checks import require_matplotlib, require_opencv
 from cpcbl_launch.commands import options
@@ -18,25 +17,25 @@ if TYPE_CHECKING:
 
     from cpcbl_launch.lab.experiments.runs import Experiment
 
-experiment_app = typer.Typer(
+experiment_app = Typer(
     help="The paper's experiments and others: each prints a table and writes NAME.json; most of"
     " them draw NAME.png.",
     no_args_is_help=True,
 )
 
-Seeds = Annotated[int, typer.Option(min=1, help="Runs of each case, each with its own noise.")]
-Jobs = Annotated[
-    Optional[int], typer.Option(min=1, help="Processes at a time; default: all cores.")
-]
-Output = Annotated[Path, typer.Option(help="Folder for NAME.json and NAME.png.")]
-AsJson = Annotated[bool, typer.Option("--json", help="Print the JSON instead of tables.")]
+Seeds = Annotated[int, Option(min=1, help="Runs of each case, each with its own noise.")]
+Jobs = Annotated[Optional[int], Option(min=1, help="Processes at a time; default: all cores.")]
+Output = Annotated[Path, Option(help="Folder for NAME.json and NAME.png.")]
 
 
 def _add_command(name: str, where: str, runs: int, text: str) -> None:
     """Adds the command of an experiment whose only options are seeds, jobs and output."""
 
     def command(
-        seeds: Seeds = runs, jobs: Jobs = None, output: Output = Path(), as_json: AsJson = False
+        seeds: Seeds = runs,
+        jobs: Jobs = None,
+        output: Output = Path(),
+        as_json: options.AsJson = False,
     ) -> None:
         module, attribute = where.split(":")
         experiment = getattr(import_module(f"cpcbl_launch.lab.experiments.{module}"), attribute)
@@ -73,8 +72,8 @@ def one_way_vs_both(
     seeds: Seeds = 3,
     jobs: Jobs = None,
     output: Output = Path(),
-    as_json: AsJson = False,
-    robots: Annotated[str, typer.Option(help="Sizes of the teams.")] = "2,5,10,20",
+    as_json: options.AsJson = False,
+    robots: Annotated[str, Option(help="Sizes of the teams.")] = "2,5,10,20",
 ) -> None:
     """Accuracy against bytes in teams of 2 to 20, with observers that are wrong."""
     from cpcbl_launch.lab.experiments.directions import experiment_of_sizes
@@ -85,20 +84,16 @@ def one_way_vs_both(
 
 @experiment_app.command("budget")
 def budget(
-    data: Annotated[
-        Optional[Path], typer.Argument(help="Folder of an MRCLAM log, e.g. MRCLAM6.")
-    ] = None,
-    blind: Annotated[str, typer.Option(help="Robots that shall not see landmarks.")] = "3,4,5",
-    duration: Annotated[
-        Optional[float], typer.Option(help="Seconds of the log; default: all.")
-    ] = None,
+    data: Annotated[Optional[Path], Argument(help="Folder of an MRCLAM log, e.g. MRCLAM6.")] = None,
+    blind: Annotated[str, Option(help="Robots that shall not see landmarks.")] = "3,4,5",
+    duration: Annotated[Optional[float], Option(help="Seconds of the log; default: all.")] = None,
     robots: Annotated[
-        int, typer.Option(min=2, max=50, help="Without a log: the size of simulated teams.")
+        int, Option(min=2, max=50, help="Without a log: the size of simulated teams.")
     ] = 10,
     seeds: Seeds = 3,
     jobs: Jobs = None,
     output: Output = Path(),
-    as_json: AsJson = False,
+    as_json: options.AsJson = False,
 ) -> None:
     """Accuracy against bytes, by value and budget, by fixed intervals, all of it: on a real log, or
     with simulated teams of mixed quality."""
@@ -131,12 +126,12 @@ _add_command(
 def worlds(
     seeds: Seeds = 60,
     names: Annotated[
-        str, typer.Option("--worlds", help='Words in the names of worlds: "landmark,helper".')
+        str, Option("--worlds", help='Words in the names of worlds: "landmark,helper".')
     ] = "",
-    variants: Annotated[str, typer.Option(help="Variants to compare.")] = "joint,oval,circular",
+    variants: Annotated[str, Option(help="Variants to compare.")] = "joint,oval,circular",
     jobs: Jobs = None,
     output: Output = Path(),
-    as_json: AsJson = False,
+    as_json: options.AsJson = False,
 ) -> None:
     """Consistency outside the usual case: few landmarks, lost odometry, unknown starts, ..."""
     from cpcbl_launch.lab.experiments import worlds as experiment
@@ -154,7 +149,7 @@ MOVED = {
 """Experiments that are benchmarks of a checkout now: the target of make for each."""
 
 
-def _refuse_benchmark(context: typer.Context) -> None:
+def _refuse_benchmark(context: Context) -> None:
     name = str(context.info_name)
     options.refuse_moved(f"experiment {name}", MOVED[name])
 
@@ -215,12 +210,10 @@ def _conduct(
         from cpcbl_launch.lab.experiments.pictures import draw
 
         lost |= write_or_reason(picture, lambda: draw(result, picture))
-    if as_json:
-        sys.stdout.write(text)
-    else:
-        console = Console()
-        for shown in tables(result):
-            console.print(shown, highlight=False)
-        if not lost:
-            console.print(f"written: {figures}{', .png' * drawn}", highlight=False)
-    options.print_not_written(lost)
+
+    def show_tables() -> None:
+        written = () if lost else (f"written: {figures}{', .png' * drawn}",)
+        for shown in (*tables(result), *written):
+            Console().print(shown, highlight=False)
+
+    options.print_result(result, as_json, show_tables, lost)

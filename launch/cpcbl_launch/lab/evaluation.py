@@ -34,10 +34,7 @@ class LogEvaluation(NamedTuple):
 
 
 def evaluate_log(
-    logged: LoggedTeam,
-    progress: Progress | None = None,
-    *,
-    with_baselines: bool = False,
+    logged: LoggedTeam, progress: Progress | None = None, *, with_baselines: bool = False
 ) -> LogEvaluation:
     """Runs all robots of a log and scores them against its truth.
 
@@ -61,9 +58,8 @@ def evaluate_log(
     if not with_baselines:
         return LogEvaluation(report, {"estimate": own})
     stamps_ns = {name: path.stamps_ns.tolist() for name, path in own.items()}
-    others = run_baselines(
-        baseline_inputs(logged), team.map, stamps_ns, lambda done: show(0.5 + 0.5 * done)
-    )
+    inputs = baseline_inputs(logged)
+    others = run_baselines(inputs, team.map, stamps_ns, lambda done: show(0.5 + 0.5 * done))
     figures = {kind: baseline_report(paths, logged.truth) for kind, paths in others.items()}
     return LogEvaluation(replace(report, yardsticks=figures), {"estimate": own, **others})
 

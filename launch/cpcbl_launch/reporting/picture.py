@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import matplotlib as mpl
 
@@ -14,6 +15,7 @@ mpl.use("Agg")
 from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
 
+BESIDE: Any = {"textcoords": "offset points", "fontsize": 8}
 Spans = Sequence[tuple[float, float]]  # from when until when (s)
 
 
@@ -69,15 +71,8 @@ def _draw_guest(
     if truth is not None:
         field.plot(truth[:, 1], truth[:, 2], color="black", linewidth=0.7)
         field.plot(truth[-1, 1], truth[-1, 2], "*", markersize=12, color="black")
-        field.annotate(name, tuple(truth[-1, 1:3]), (7, -3), textcoords="offset points", fontsize=8)
+        field.annotate(name, tuple(truth[-1, 1:3]), (7, -3), **BESIDE)
 
 
 def _annotate_time(errors: Axes, time_s: float, text: str) -> None:
-    errors.annotate(
-        text,
-        (time_s, 1.0),
-        (4, -10),
-        xycoords=("data", "axes fraction"),
-        textcoords="offset points",
-        fontsize=8,
-    )
+    errors.annotate(text, (time_s, 1.0), (4, -10), xycoords=("data", "axes fraction"), **BESIDE)
