@@ -57,9 +57,9 @@ class Observation(NamedTuple):
         )
         return Observation(self.rows, residuals, self.independent, self.dependent)
 
-    def information(self, dependent_factor: float = 1.0) -> Information:
-        """The evidence with the dependent part of its covariance times `dependent_factor`."""
-        r = self.noise(dependent_factor)
+    def information(self, noise: Covariance2 | None = None) -> Information:
+        """The evidence with this covariance of the residuals; default: `noise()`."""
+        r = noise or self.noise()
         if len(self.rows) == 1:
             return Information.none().add(self.rows[0], self.residuals[0], r.xx)
         # Two correlated scalars become two independent ones (r = L L^T).
@@ -171,7 +171,7 @@ def _variance(prior: Estimate, observation: Observation, scope: Scope) -> Callab
 
     def variance(weight: float) -> float:
         inflated = _inflated(prior, weight)
-        evidence = observation.information(1.0 / (1.0 - weight)).matrix
+        evidence = observation.information(observation.noise(1.0 / (1.0 - weight))).matrix
         merged = symmetric_product(posterior_factor(inflated, evidence), inflated)
         return _size(merged, scope)
 
@@ -220,7 +220,8 @@ def _merge_with_weight(
     prior: Estimate, observation: Observation, scope: Scope, weight: float
 ) -> Estimate:
     inflated = _inflated(prior, weight)
-    evidence = observation.information(1.0 / (1.0 - weight))
+    noise = observation.noise(1.0 / (1.0 - weight))
+    evidence = observation.information(noise)
     survive = posterior_factor(inflated, evidence.matrix)
     merged = symmetric_product(survive, inflated)
     if min(merged.xx, merged.yy, merged.hh) < 0.0:  # as in `merge`
@@ -228,7 +229,7 @@ def _merge_with_weight(
     pose = offset_pose(prior.pose, merged.times(evidence.vector), scope)
     if scope is POSE:
         own = prior.covariance.plus(prior.shared, -1.0).transformed(survive)
-        fresh = _sensor_part(observation, weight, merged)
+        fresh = _sensor_part(observation, noise, merged)
         return Estimate(pose, merged, merged.plus(own, -1.0).plus(fresh, -1.0))
     _, kept_apart = within_scope(survive, prior.covariance, merged, scope)
     # The part out of scope was not inflated, so its covariance with the rest is not either.
@@ -237,9 +238,8 @@ def _merge_with_weight(
     return Estimate(pose, kept_apart, kept_apart)
 
 
-def _sensor_part(observation: Observation, weight: float, merged: Covariance3) -> Covariance3:
+def _sensor_part(observation: Observation, r: Covariance2, merged: Covariance3) -> Covariance3:
     """K R_i K^T with K = P' H^T R^-1: the part of the merged covariance that is sensor noise."""
-    r = observation.noise(1.0 / (1.0 - weight))
     gains = [merged.times(row) for row in observation.rows]
     if len(gains) == 1:
         k, (gx, gy, gh) = observation.independent.xx / (r.xx * r.xx), gains[0]

@@ -210,7 +210,7 @@ def test_an_observations_information_is_that_of_its_correlated_noise(seed: int, 
     observation = random_observation(rng, rank)
     H, e, independent, dependent = parts(observation)
     inverse = np.linalg.inv(independent + 3.0 * dependent)
-    evidence = observation.information(3.0)
+    evidence = observation.information(observation.noise(3.0))
     np.testing.assert_allclose(matrix3(evidence.matrix), H.T @ inverse @ H, rtol=1e-6, atol=1e-6)
     np.testing.assert_allclose(evidence.vector, H.T @ inverse @ e, rtol=1e-6, atol=1e-6)
 
