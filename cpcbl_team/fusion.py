@@ -49,7 +49,7 @@ class Observation(NamedTuple):
         i, d, k = self.independent, self.dependent, dependent_factor
         return Covariance2(*_noise(i.xx + k * d.xx, i.xy + k * d.xy, i.yy + k * d.yy))
 
-    def moved(self, dx: float, dy: float, turn: float) -> "Observation":
+    def shifted(self, dx: float, dy: float, turn: float) -> "Observation":
         """About an estimate that is so far from the present one (m, rad in the field's frame)."""
         residuals = tuple(
             e - x * dx - y * dy - a * turn

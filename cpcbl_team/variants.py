@@ -83,7 +83,7 @@ class JointVariant:
                 turn, within = wrap_angle(estimate.pose.heading - prior.pose.heading), scope
                 if found.measurement.is_for_heading:
                     within, estimate = HEADING, with_all_shared(estimate)
-                observation = found.observation.moved(dx, dy, turn)
+                observation = found.observation.shifted(dx, dy, turn)
                 estimate = self._merge_teammate(estimate, observation, within)
         return self.reduce(estimate)
 

@@ -135,7 +135,7 @@ def test_a_teammates_place_correlates_its_range_and_its_bearing() -> None:
 
 def test_a_second_teammate_is_seen_from_where_the_first_has_moved_the_robot() -> None:
     prior, m, constraints = teammate_example()
-    found = observation_of(prior, m, constraints).moved(0.1, -0.2, 0.05).residuals
+    found = observation_of(prior, m, constraints).shifted(0.1, -0.2, 0.05).residuals
     expected = [c.residual - float(np.dot(c.row, (0.1, -0.2, 0.05))) for c in constraints]
     assert found == pytest.approx(expected)
 
