@@ -99,6 +99,8 @@ class RobotSettings(LocalizationSettings, frozen=True, kw_only=True):
     waypoints_m: tuple[tuple[float, float], ...] = ()
     """Simulated robots drive loops through these points, and steer by their own estimates."""
     speed_m_s: NotNegative = 0.5
+    pose_rate_hz: Annotated[float, msgspec.Meta(gt=0.0, le=100.0)] = 10.0
+    """How often the robot publishes its pose (`pose/<robot>`) while somebody subscribes to it."""
 
 
 class MatchSettings(Table, frozen=True, kw_only=True):

@@ -210,6 +210,7 @@ def test_permitted_subscriptions_follow_the_table_too() -> None:
     me = Identity(Role.ROBOT, "me")
     assert set(subscribe_keys(me)) == {
         *("alive/*/*/*", "belief/*/*", "fix/me/*/*", "status/me", "track/me", "look/me"),
+        *("pose/*", "pose/*/json", "status/me/json"),
         *("in/me/odometry", "in/me/sightings", "in/me/position", "in/me/frame"),
     }
     assert subscribe_keys(Identity(Role.OBSERVER, "me")) == subscribe_keys(me)
