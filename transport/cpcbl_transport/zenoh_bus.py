@@ -37,9 +37,11 @@ def open_bus(
     connect: Sequence[str],
     give_up: Callable[[], bool] = lambda: False,
     credentials: Credentials | None = None,
+    on_wait: Callable[[str], None] | None = None,
 ) -> "ZenohBus":
     """A client's session below the team's namespace; waits for a router until `give_up()`. With
-    credentials every link is mutual TLS. Raises BusError when it gave up."""
+    credentials every link is mutual TLS. `on_wait` is told again and again that there is none yet,
+    with the reason where TLS has one. Raises BusError when it gave up."""
     config = client_config(connect, credentials)
     reason = "stopped before a router answered"
     while not give_up():
@@ -47,8 +49,11 @@ def open_bus(
             return ZenohBus(_open(config, namespace(team)))
         except zenoh.ZError as error:
             reason = _tls_reason(connect, credentials) or _one_line(error)
-            shown = f": {reason}" if credentials else ""
-            log.info("no router at %s yet%s", ", ".join(connect), shown)
+            if on_wait is not None:
+                on_wait(reason if credentials else "")
+            else:
+                shown = f": {reason}" if credentials else ""
+                log.info("no router at %s yet%s", ", ".join(connect), shown)
             time.sleep(0.2)
     raise BusError(f"no router at {', '.join(connect)}: {reason}")
 
