@@ -8,7 +8,16 @@ from hypothesis import HealthCheck, settings
 from support.children import adopt_orphans, children, end
 from support.processes import eventually
 
-REAL = {"subprocess", "cpcbl_team", "patient_up", "PROGRAM", "open_bus", "open_router", "running"}
+REAL = {
+    "subprocess",
+    "programs",
+    "cpcbl_team",
+    "patient_up",
+    "PROGRAM",
+    "open_bus",
+    "open_router",
+    "running",
+}
 
 settings.register_profile("untimed", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("untimed")

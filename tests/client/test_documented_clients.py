@@ -1,13 +1,11 @@
 """The driver and the consumer of the docs, as processes: with a router that comes late and ends."""
 
-import signal
-import subprocess
 import sys
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from pathlib import Path
 
 from support.processes import eventually
+from support.programs import programs
 from support.routers import open_router
 
 from cpcbl_launch.run.processes import PROGRAM
@@ -26,45 +24,16 @@ connect = ["{endpoint}"]
 """
 
 
-class Program:
-    """A program that runs; what it printed, and what it said on standard error."""
-
-    def __init__(self, folder: Path, name: str, *words: str) -> None:
-        self._said, self._printed = folder / f"{name}.err", folder / f"{name}.out"
-        with self._said.open("w") as errors, self._printed.open("w") as output:
-            self.process = subprocess.Popen(words, stdout=output, stderr=errors)
-
-    @property
-    def said(self) -> str:
-        return self._said.read_text()
-
-    @property
-    def printed(self) -> list[str]:
-        return self._printed.read_text().splitlines()
-
-
-@contextmanager
-def running(folder: Path, **programs: tuple[str, ...]) -> Iterator[dict[str, Program]]:
-    started = {name: Program(folder, name, *words) for name, words in programs.items()}
-    try:
-        yield started
-    finally:
-        for program in started.values():
-            program.process.send_signal(signal.SIGINT)
-        for program in started.values():
-            program.process.wait(timeout=10.0)
-
-
 def test_driver_and_consumer_wait_for_a_router_and_survive_its_end(tmp_path: Path) -> None:
     endpoint, team = free_endpoint(), tmp_path / "team.toml"
     team.write_text(TEAM.format(endpoint=endpoint))
-    programs = {
+    commands = {
         "driver": (sys.executable, str(DOCS / "external_driver.py"), str(team)),
         "consumer": (sys.executable, str(DOCS / "pose_consumer.py"), str(team), "r1"),
     }
     waiting = f"waiting for a router at {endpoint}; start `cpcbl-team up` or `cpcbl-team router`"
     with ExitStack() as stack:
-        clients = stack.enter_context(running(tmp_path, **programs))
+        clients = stack.enter_context(programs(tmp_path, **commands))
         driver, consumer = clients["driver"], clients["consumer"]
         assert eventually(lambda: waiting in driver.said and waiting in consumer.said)
         with open_router("lab", [endpoint]):
@@ -72,7 +41,7 @@ def test_driver_and_consumer_wait_for_a_router_and_survive_its_end(tmp_path: Pat
             assert eventually(lambda: "no robot takes in/r1/odometry of team 'lab'" in driver.said)
             assert eventually(lambda: "no pose comes on pose/r1" in consumer.said)
             robot = (*PROGRAM, "robot", "r1", "--team", str(team))
-            stack.enter_context(running(tmp_path, robot=robot))
+            stack.enter_context(programs(tmp_path, robot=robot))
             assert eventually(lambda: len(consumer.printed) >= 5)
             assert eventually(lambda: "robot r1 takes in/r1/odometry" in driver.said)
         for client in clients.values():

@@ -218,4 +218,6 @@ def _is_in_team(identity: Identity, team: Team) -> bool:
             return team.guests.allowed and identity.name not in team.robots
         case Role.FIELD:  # a simulated one must not feed real robots
             return team.simulated
+        case Role.GATEWAY:
+            return team.gateway is not None
     return True

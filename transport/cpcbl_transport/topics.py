@@ -48,6 +48,7 @@ class Role(StrEnum):
     OBSERVER = "observer"  # helps a running team as a guest
     FIELD = "field"  # the simulated one
     OPERATOR = "operator"  # people: live tables, recordings
+    GATEWAY = "gateway"  # speaks for drivers and consumers that have no Zenoh
     ROUTER = "router"  # relays the messages of all others
 
 
@@ -64,7 +65,9 @@ _OWNER = Permission(Role.ROBOT, "robot"), Permission(Role.OBSERVER, "robot")
 _OBSERVER = Permission(Role.ROBOT, "observer"), Permission(Role.OBSERVER, "observer")
 _GUEST = (Permission(Role.OBSERVER, "robot"),)
 _FIELD = (Permission(Role.FIELD),)
-_SENSING = (*_OWNER, *_FIELD)  # the robot's own driver, or the simulated field
+_GATEWAY = (Permission(Role.GATEWAY),)
+_READERS = (*_MEMBERS, *_GATEWAY)
+_SENSING = (*_OWNER, *_FIELD, *_GATEWAY)  # the robot's own driver, or the simulated field
 
 
 class Topic(NamedTuple):
@@ -130,7 +133,7 @@ STATUS = Topic("status/<robot>", messages.Status, Qos.TELEMETRY, also_json=True)
 TRACK = Topic("track/<robot>", messages.Track, Qos.TELEMETRY)
 # `pose_rate_hz` (10 Hz) while somebody subscribes. For the robot's own software, and for everybody
 # in the team; the next one is better than a late one
-POSE = Topic("pose/<robot>", messages.Pose, Qos.TELEMETRY, subscribers=_MEMBERS, also_json=True)
+POSE = Topic("pose/<robot>", messages.Pose, Qos.TELEMETRY, subscribers=_READERS, also_json=True)
 # At the driver's rate, binary or JSON. Inputs are not dropped: a lost piece of odometry is a lost
 # piece of the way
 IN_ODOMETRY = Topic("in/<robot>/odometry", Odometry, Qos.INPUT, publishers=_SENSING)
