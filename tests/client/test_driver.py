@@ -40,7 +40,7 @@ class Stand:
     """A driver on a bus in memory, whose clock the test sets."""
 
     def __init__(self, path: Path) -> None:
-        hub = MemoryHub()
+        self.hub = hub = MemoryHub()
         self.now_ns, self.bus = NOW, hub.session()
         self.ear = Subscription(self.bus, "in/r1/*")
         self.driver = Driver(path, "r1", bus=hub.session(), clock=lambda: self.now_ns)
@@ -136,6 +136,24 @@ def test_an_unknown_object_is_said_once(stand: Stand, caplog: pytest.LogCaptureF
     (record,) = caplog.records
     assert "no landmark, wall or robot 'Door'" in record.getMessage()
     assert "did you mean 'door'?" in record.getMessage()
+
+
+def test_a_second_driver_of_a_robot_is_noticed_by_both(
+    stand: Stand, path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr("cpcbl_client.connection.CHECK_S", 0.0)
+    with Driver(path, "r1", bus=stand.hub.session(), clock=lambda: NOW) as second:
+        for driver in (stand.driver, second, stand.driver, second):
+            driver.sighting("door", range_m=2.0)
+    said = [record.getMessage() for record in caplog.records]
+    assert said == ["another program publishes on in/r1/sightings too: stop one of the drivers"] * 2
+
+
+def test_odometry_over_too_long_a_time_is_said(
+    stand: Stand, caplog: pytest.LogCaptureFixture
+) -> None:
+    stand.after(12 * SECOND).odometry(0.0, 0.0)
+    assert "odometry over 12.0 s: the robot refuses it" in caplog.text
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ from cpcbl_client.team import ClientTeam, nearest_name, read_team
 from cpcbl_team.errors import InputError
 from cpcbl_team.inputs import Odometry, Position, Sighting, Sightings
 from cpcbl_transport.bus import Bus, Publisher
-from cpcbl_transport.messages import Frame, SensorInput, encode
+from cpcbl_transport.messages import LONGEST_ODOMETRY_NS, Frame, SensorInput, encode
 from cpcbl_transport.security import Identity
 from cpcbl_transport.topics import Role, topic_of
 from cpcbl_transport.units import odometry_problem, sighting_problem, stamp_problem
@@ -58,6 +58,8 @@ class Driver:
         self._connection = Connection(self._team, who, connect, wait_s, bus)
         self._publishers: dict[type[SensorInput], Publisher] = {}
         self._reminders: dict[type[SensorInput], Reminder] = {}
+        self._others: set[str] = set()  # keys on which another program publishes too
+        self._another = Reminder()
         self._unknown: set[str] = set()
         self._odometry_ns = clock()
 
@@ -76,7 +78,10 @@ class Driver:
         from_ns = last_ns if duration_s is None else until_ns - int(duration_s * 1e9)
         if duration_s is not None and abs(from_ns - last_ns) < 0.5e9 * duration_s:
             from_ns = last_ns  # pieces join; what lies between them is the jitter of the loop
-        _require(odometry_problem(distance_m, turn_rad, (until_ns - from_ns) * 1e-9))
+        seconds = (until_ns - from_ns) * 1e-9
+        _require(odometry_problem(distance_m, turn_rad, seconds))
+        if seconds > LONGEST_ODOMETRY_NS * 1e-9:
+            log.warning("odometry over %.1f s: the robot refuses it; call it more often", seconds)
         self._odometry_ns = until_ns
         self._put(Odometry(from_ns, until_ns, float(distance_m), float(turn_rad)))
 
@@ -140,12 +145,19 @@ class Driver:
             key = topic.at(robot=self._robot)
             self._publishers[kind] = self._connection.bus.publisher(key, topic.qos)
             self._reminders[kind] = Reminder(SILENT_S)
+            # A session does not receive what it publishes itself
+            self._connection.bus.subscribe(key, lambda key, payload: self._others.add(key))
         self._publishers[kind].put(encode(message))
         if self._connection.check():
             self._check_listener(kind)
 
     def _check_listener(self, kind: type[SensorInput]) -> None:
-        """Says when no robot takes the messages: it is not there yet, or in another team."""
+        """Says when no robot takes the messages: it is not there yet, or in another team; and when
+        a second driver feeds the same robot."""
+        if self._others:
+            keys = ", ".join(sorted(self._others))
+            self._others.clear()
+            self._another.warn(f"another program publishes on {keys} too: stop one of the drivers")
         key, reminder = topic_of(kind).at(robot=self._robot), self._reminders[kind]
         if self._publishers[kind].matching:
             reminder.over(f"robot {self._robot} takes {key}")

@@ -179,6 +179,20 @@ def test_a_robot_that_is_absent_is_named() -> None:
     with_gateway(check)
 
 
+def test_stamps_that_are_late_are_logged_once(caplog: pytest.LogCaptureFixture) -> None:
+    async def check(stand: Stand) -> None:
+        ear = Subscription(stand.bus, "in/me/*")
+        for _ in range(3):
+            late_ns = time.time_ns() - 5 * SECOND
+            body = piece(from_ns=late_ns - 100 * MS, stamp_ns=late_ns)
+            assert (await stand.post("odometry", body))[0] == 204
+        assert len(ear.samples) == 3
+
+    with_gateway(check)
+    (said,) = [r.getMessage() for r in caplog.records if "behind" in r.getMessage()]
+    assert said.startswith("me: odometry: stamps are 5.")
+
+
 def test_an_old_pose_is_not_given(monkeypatch: pytest.MonkeyPatch) -> None:
     async def check(stand: Stand) -> None:
         robot = stand.bus.publisher(topics.POSE.at(robot="me"), topics.POSE.qos)

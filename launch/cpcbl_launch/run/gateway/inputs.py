@@ -14,6 +14,7 @@ from cpcbl_transport.units import odometry_problem, sighting_problem, stamp_prob
 
 log = logging.getLogger(__name__)
 
+LATE_S = 2.0
 INPUTS = {topic.key.rpartition("/")[2]: topic for topic in topics.INPUTS}
 
 
@@ -55,10 +56,14 @@ class RobotInputs:
     def take(self, name: str, payload: bytes) -> Problem | None:
         """Publishes an input; why it was not taken, or None."""
         problem = self._problem(name, payload)
-        if problem is not None and (name, problem.reason) not in self._logged:
-            self._logged.add((name, problem.reason))
-            log.warning("%s: %s: %s", self._robot, name, problem.error)
+        if problem is not None:
+            self._say_once(name, problem.reason, problem.error)
         return problem
+
+    def _say_once(self, name: str, reason: str, text: str) -> None:
+        if (name, reason) not in self._logged:
+            self._logged.add((name, reason))
+            log.warning("%s: %s: %s", self._robot, name, text)
 
     def _problem(self, name: str, payload: bytes) -> Problem | None:
         topic = INPUTS.get(name)
@@ -74,20 +79,29 @@ class RobotInputs:
         if not publisher.matching:
             error = f"robot {self._robot} does not listen: is it running, and its router?"
             return Problem(503, "robot_absent", error)
-        found = _refused(topic.at(robot=self._robot), payload, time.time_ns())
+        found = self._refused(name, payload, time.time_ns())
         if found is None or found.reason != "wrong_unit":
             publisher.put(payload)
         return found
 
+    def _refused(self, name: str, payload: bytes, now_ns: int) -> Problem | None:
+        if not is_json(payload):
+            return Problem(400, Refusal.VERSION.value, "write a JSON object, which begins with {")
+        key = INPUTS[name].at(robot=self._robot)
+        message = decode_by_key(key, payload)
+        if isinstance(message, Refusal):
+            return Problem(400, message.value, input_problem(key, payload))
+        assert isinstance(message, Odometry | Sightings | Position | Frame)
+        found = _misunderstood(message, now_ns)
+        late_s = (now_ns - message.stamp_ns) * 1e-9
+        if found is None and late_s > LATE_S:
+            text = f"stamps are {late_s:.1f} s behind the gateway's clock; set the driver's clock"
+            self._say_once(name, "late", text)
+        return found
 
-def _refused(key: str, payload: bytes, now_ns: int) -> Problem | None:
-    """Why the robot refuses a payload, or would misunderstand it; None if it takes it."""
-    if not is_json(payload):
-        return Problem(400, Refusal.VERSION.value, "write a JSON object, which begins with {")
-    message = decode_by_key(key, payload)
-    if isinstance(message, Refusal):
-        return Problem(400, message.value, input_problem(key, payload))
-    assert isinstance(message, Odometry | Sightings | Position | Frame)
+
+def _misunderstood(message: Odometry | Sightings | Position | Frame, now_ns: int) -> Problem | None:
+    """Why the robot refuses a message, or would take it in a wrong unit."""
     reason, unit = refusal(message, now_ns), stamp_problem(message.stamp_ns, now_ns)
     if reason is not None or unit:  # the robot refuses it as too late, if for no other reason
         error = f"refused: {(reason or '').replace('_', ' ')}"

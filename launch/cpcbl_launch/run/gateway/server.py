@@ -11,6 +11,7 @@ messages a second, clients, the time that a request may take.
 import asyncio
 import hmac
 import logging
+import os
 import socket
 import ssl
 from collections.abc import Awaitable, Callable, Mapping
@@ -62,7 +63,7 @@ class Gateway:
             await web.TCPSite(runner, host, port, ssl_context=tls).start()
         except OSError as error:
             await runner.cleanup()
-            reason = error.strerror or error
+            reason = os.strerror(error.errno) if error.errno else error
             raise InputError(f"gateway.port: {host}:{port}: {reason}; choose another") from error
         bound = runner.addresses[0]
         return runner, f"{'https' if tls else 'http'}://{host}:{bound[1]}"
