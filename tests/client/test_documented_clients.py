@@ -1,9 +1,12 @@
 """The driver and the consumer of the docs, as processes: with a router that comes late and ends."""
 
+import json
 import sys
+import time
 from contextlib import ExitStack
 from pathlib import Path
 
+import zenoh
 from support.processes import eventually
 from support.programs import programs
 from support.routers import open_router
@@ -54,3 +57,34 @@ def test_driver_and_consumer_wait_for_a_router_and_survive_its_end(tmp_path: Pat
             assert eventually(lambda: len(consumer.printed) >= before + 5)
     where = [float(number) for number in consumer.printed[-1].split(" lost")[0].split()]
     assert len(where) == 3
+
+
+def test_another_language_speaks_json_over_zenoh(tmp_path: Path) -> None:
+    """Zenoh alone, as a program in any language uses it, with JSON in place of our messages."""
+    endpoint, team = free_endpoint(), tmp_path / "team.toml"
+    team.write_text(TEAM.format(endpoint=endpoint))
+    heard: list[zenoh.Sample] = []
+    robot = (*PROGRAM, "robot", "r1", "--team", str(team))
+    config = {"mode": "client", "connect": {"endpoints": [endpoint]}}
+    with (
+        open_router("lab", [endpoint]),
+        programs(tmp_path, robot=robot) as running,
+        zenoh.open(zenoh.Config.from_json5(json.dumps(config))) as session,
+    ):
+        session.declare_subscriber("cpcbl/lab/pose/r1/json", heard.append)
+        last_ns = time.time_ns()
+
+        def has_moved() -> bool:
+            nonlocal last_ns
+            now_ns = time.time_ns()
+            piece = {"from_ns": last_ns, "stamp_ns": now_ns, "distance_m": 0.01, "turn_rad": 0}
+            payload, as_json = json.dumps(piece), zenoh.Encoding.APPLICATION_JSON
+            session.put("cpcbl/lab/in/r1/odometry", payload, encoding=as_json)
+            last_ns = now_ns
+            return bool(heard) and json.loads(heard[-1].payload.to_bytes())["x_m"] > 0.1
+
+        assert eventually(has_moved)
+        assert heard[-1].encoding == zenoh.Encoding.APPLICATION_JSON
+        session.put("cpcbl/lab/in/r1/odometry", '{"distance": 1}')
+        said = "r1: refused JSON on in/r1/odometry: unknown key 'distance'"
+        assert eventually(lambda: said in running["robot"].said)

@@ -15,6 +15,8 @@ from cpcbl_team.inputs import Belief, Fix, Odometry, Position, Sightings
 from cpcbl_transport import messages
 from cpcbl_transport.messages import LARGEST_FRAME, LARGEST_PAYLOAD, Message
 
+JSON_CHUNK = "/json"
+
 
 class QosProfile(NamedTuple):
     """How the bus transports a message."""
@@ -98,7 +100,12 @@ class Topic(NamedTuple):
 
 def json_key(key: str) -> str:
     """The key under which the messages of another key are sent as JSON."""
-    return f"{key}/json"
+    return key + JSON_CHUNK
+
+
+def is_json_key(key: str) -> bool:
+    """Whether messages under this key are JSON."""
+    return key.endswith(JSON_CHUNK)
 
 
 @lru_cache(maxsize=4096)

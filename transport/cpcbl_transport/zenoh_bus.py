@@ -22,7 +22,7 @@ import zenoh
 from cpcbl_team.errors import CpcblError
 from cpcbl_transport.bus import Bus, Handle, LivelinessCallback, MessageCallback, Publisher
 from cpcbl_transport.security import Credentials
-from cpcbl_transport.topics import Qos, namespace
+from cpcbl_transport.topics import Qos, is_json_key, namespace
 from cpcbl_transport.zenoh_config import client_config
 
 log = logging.getLogger(__name__)
@@ -165,6 +165,7 @@ class ZenohBus(Bus):
         kind = zenoh.Reliability.RELIABLE if reliable else zenoh.Reliability.BEST_EFFORT
         publisher = self._session.declare_publisher(
             key,
+            encoding=zenoh.Encoding.APPLICATION_JSON if is_json_key(key) else None,
             allowed_destination=zenoh.Locality.REMOTE,
             priority=getattr(zenoh.Priority, priority),
             congestion_control=getattr(zenoh.CongestionControl, when_full),

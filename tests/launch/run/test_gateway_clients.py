@@ -5,6 +5,7 @@ Each drives a robot of a team that `up` runs, and prints its pose; the gateway i
 
 import json
 import os
+import re
 import shutil
 import signal
 import ssl
@@ -25,6 +26,7 @@ from cpcbl_launch.run.processes import PROGRAM
 from cpcbl_launch.run.up import free_endpoint
 
 DOCS = Path(__file__).parents[3] / "docs"
+PAGE = DOCS / "wire_format.md"
 TEAM = """
 name = "doors"
 [map.landmarks]
@@ -81,6 +83,13 @@ def test_drivers_without_zenoh_feed_their_robots_and_get_poses(tmp_path: Path) -
             return all(len(p.printed) >= than[name] + more for name, p in running.items())
 
         assert eventually(lambda: all_print(3, dict.fromkeys(running, 0)), 40.0)
+        if shutil.which("curl"):
+            (shown,) = re.findall(r"```sh\n(now=.*?)```", PAGE.read_text(), re.DOTALL)
+            script = f"token={tokens['shell']}\n{shown}".replace("/r1", "/shell")
+            answer = subprocess.check_output(
+                ["sh", "-c", script.replace(":8447", f":{port}")], stderr=subprocess.DEVNULL
+            )
+            assert json.loads(answer)["robot"] == "shell"
         (pid,) = pids_of(process)
         os.kill(pid, signal.SIGKILL)
         assert eventually(lambda: all("no gateway" in p.said for p in running.values()))
