@@ -31,6 +31,7 @@ class PoseOutput:
         as_binary, as_json = self._as_binary.matching, self._as_json.matching
         self._has_subscribers = as_binary or as_json
         if not self._has_subscribers:
+            self._due_ns = now_ns + self._interval_ns
             return
         self._due_ns = max(self._due_ns + self._interval_ns, now_ns + self._interval_ns // 2)
         pose = self._robot.pose(now_ns)

@@ -69,7 +69,7 @@ async def run(gateway_bus: ZenohBus, driver: ZenohBus, robot: ZenohBus) -> None:
     robot.subscribe(KEY, on_input)
     publisher = driver.publisher(KEY, topics.IN_ODOMETRY.qos)
     settings = GatewaySettings(port=0, rate_hz=1e6)
-    gateway = server.Gateway(settings, {"r1": TOKEN}, gateway_bus)
+    gateway = server.Gateway(settings, {"r1": TOKEN}, ["r1"], gateway_bus)
     runner, url = await gateway.start(None)
     headers = {"Authorization": f"Bearer {TOKEN}"}
     async with ClientSession(headers=headers) as client:

@@ -52,6 +52,7 @@ odometry = { moves = false }
         ["traffic"],
         ["look"],
         ["observer"],
+        ["gateway"],
     ],
 )
 def test_every_command_explains_itself(command: list[str]) -> None:

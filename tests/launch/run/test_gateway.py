@@ -3,6 +3,7 @@
 import asyncio
 import io
 import json
+import random
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
@@ -10,13 +11,14 @@ from typing import Any, NamedTuple
 
 import pytest
 from aiohttp import ClientSession, ClientWebSocketResponse, WSServerHandshakeError
+from fuzz.payloads import damaged_payload, random_payload
 from support.buses import MS, SECOND, Subscription, robot_at, team_of
 
 from cpcbl_agents.node import Node
 from cpcbl_agents.robot import build_robot
 from cpcbl_launch.run.gateway import poses as pose_feeds
 from cpcbl_launch.run.gateway import server
-from cpcbl_launch.run.gateway.inputs import RateLimit
+from cpcbl_launch.run.gateway.inputs import INPUTS, RateLimit
 from cpcbl_team.config import GatewaySettings
 from cpcbl_team.inputs import Odometry, Sightings
 from cpcbl_transport import topics
@@ -57,7 +59,7 @@ class Stand(NamedTuple):
 @asynccontextmanager
 async def serving(settings: GatewaySettings = ANYWHERE) -> AsyncIterator[Stand]:
     hub = MemoryHub()
-    gateway = server.Gateway(settings, TOKENS, hub.session())
+    gateway = server.Gateway(settings, TOKENS, ["me"], hub.session())
     runner, url = await gateway.start(None)
     try:
         async with ClientSession() as client:
@@ -193,6 +195,19 @@ def test_stamps_that_are_late_are_logged_once(caplog: pytest.LogCaptureFixture) 
     assert said.startswith("me: odometry: stamps are 5.")
 
 
+def test_a_robot_without_a_driver_takes_no_inputs() -> None:
+    async def check(stand: Stand) -> None:
+        ear, stream = Subscription(stand.bus, "in/mate/*"), await stand.stream("mate")
+        await stream.send_str(f'{{"odometry": {piece().decode()}}}')
+        answer = await stream.receive_json()
+        assert answer["reason"] == "no_driver"
+        assert "robots.mate.source" in answer["error"]
+        assert not ear.samples
+        await stream.close()
+
+    with_gateway(check)
+
+
 def test_an_old_pose_is_not_given(monkeypatch: pytest.MonkeyPatch) -> None:
     async def check(stand: Stand) -> None:
         robot = stand.bus.publisher(topics.POSE.at(robot="me"), topics.POSE.qos)
@@ -209,6 +224,32 @@ def test_an_old_pose_is_not_given(monkeypatch: pytest.MonkeyPatch) -> None:
         assert not robot.matching
 
     with_gateway(check)
+
+
+def test_meaningless_requests_have_an_answer() -> None:
+    """Random bytes and odd objects, on every input, as a body and in a stream."""
+    generator = random.Random(1)
+    odd = [b'{"\\ud800": 1}', b'{"odometry": {"\\ud800": 1}}', b"[" * 9000, b'{"a":' * 9000]
+
+    async def check(stand: Stand) -> None:
+        Subscription(stand.bus, "in/me/*")
+        stream = await stand.stream()
+        payloads = odd + [random_payload(generator) for _ in range(100)]
+        payloads += [damaged_payload(piece(), generator) for _ in range(100)]
+        for payload in payloads:
+            status, _ = await stand.post(generator.choice([*INPUTS]), payload)
+            assert status in (204, 400)
+            await stream.send_bytes(payload)
+        await stream.send_str(f'{{"odometry": {piece().decode()}}}')
+        await stream.send_str('{"end": {}}')
+        while "no input 'end'" not in (await stream.receive_json())["error"]:
+            pass
+        for path in ("/pose/%FF", "/pose/%ED%A0%80", "/pose/" + "x" * 3000, "/in/me/%FF", "//"):
+            assert (await stand.get(path))[0] in (401, 404, 405)
+        assert (await stand.get("/pose/me", Authorization="Bearer \udcff"))[0] == 401
+        await stream.close()
+
+    with_gateway(check, GatewaySettings(port=0, rate_hz=1e6))
 
 
 def test_a_flood_is_limited() -> None:
@@ -297,7 +338,7 @@ def test_serving_ends_when_it_is_told_to() -> None:
     looks: list[int] = []
     bus, stop = MemoryHub().session(), lambda: len(looks) >= 2
     ended = server.serve(
-        *(ANYWHERE, TOKENS, bus, None, stop),
+        *(ANYWHERE, TOKENS, ["me"], bus, None, stop),
         on_look=lambda: looks.append(1),
         on_start=addresses.append,
     )

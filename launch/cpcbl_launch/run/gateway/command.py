@@ -27,6 +27,7 @@ def run_gateway(
     of a secured team."""
     path = Path(settings.tokens)
     tokens = tokens_for(team.robots, path, os.environ)
+    driven = {name for name, robot in team.robots.items() if robot.source == "external"}
     link = link_of(team, Identity(Role.GATEWAY), connect)
     where = f"in {VARIABLE}" if os.environ.get(VARIABLE) else f"in {path}"
     with open_bus(team.name, link.endpoints, stop, link.credentials) as bus:
@@ -39,7 +40,7 @@ def run_gateway(
 
         watch = RouterWatch(bus, ", ".join(link.endpoints))
         tls = server_tls(link.credentials)
-        asyncio.run(serve(settings, tokens, bus, tls, stop, watch.look, on_start))
+        asyncio.run(serve(settings, tokens, driven, bus, tls, stop, watch.look, on_start))
 
 
 def server_tls(credentials: Credentials | None) -> ssl.SSLContext | None:

@@ -46,8 +46,9 @@ class RobotInputs:
     """The inputs of one robot on the bus. What the robot would refuse is passed on too, so that it
     counts it; what it would take in a wrong unit is not."""
 
-    def __init__(self, robot: str, bus: Bus, rate_hz: float) -> None:
-        self._robot, self._limit = robot, RateLimit(rate_hz)
+    def __init__(self, robot: str, bus: Bus, rate_hz: float, has_driver: bool) -> None:
+        """`has_driver`: others' inputs come from the simulation or from a log."""
+        self._robot, self._limit, self._has_driver = robot, RateLimit(rate_hz), has_driver
         self._publishers: dict[str, Publisher] = {
             name: bus.publisher(topic.at(robot=robot), topic.qos) for name, topic in INPUTS.items()
         }
@@ -70,6 +71,9 @@ class RobotInputs:
         if topic is None:
             known = ", ".join(INPUTS)
             return Problem(404, "unknown_input", f"no input {name[:32]!r}; there are {known}")
+        if not self._has_driver:
+            error = f'robots.{self._robot}.source: is not "external": it takes no inputs'
+            return Problem(409, "no_driver", error)
         if not self._limit.admits():
             return Problem(429, "too_fast", "too many messages a second; gateway.rate_hz limits it")
         if len(payload) > topic.largest:
@@ -77,7 +81,7 @@ class RobotInputs:
             return Problem(413, Refusal.TOO_LARGE.value, error)
         publisher = self._publishers[name]
         if not publisher.matching:
-            error = f"robot {self._robot} does not listen: is it running, and its router?"
+            error = f"robot {self._robot} does not listen: it needs the same team name and router"
             return Problem(503, "robot_absent", error)
         found = self._refused(name, payload, time.time_ns())
         if found is None or found.reason != "wrong_unit":

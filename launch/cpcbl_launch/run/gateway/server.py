@@ -14,7 +14,7 @@ import logging
 import os
 import socket
 import ssl
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Awaitable, Callable, Collection, Mapping
 
 import msgspec
 from aiohttp import WSMsgType, web
@@ -39,9 +39,18 @@ Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 class Gateway:
     """The routes of one team."""
 
-    def __init__(self, settings: GatewaySettings, tokens: Mapping[str, str], bus: Bus) -> None:
+    def __init__(
+        self,
+        settings: GatewaySettings,
+        tokens: Mapping[str, str],
+        driven: Collection[str],
+        bus: Bus,
+    ) -> None:
+        """`driven`: the robots that take inputs."""
         self._settings, self._tokens = settings, tokens
-        self._inputs = {name: RobotInputs(name, bus, settings.rate_hz) for name in tokens}
+        self._inputs = {
+            name: RobotInputs(name, bus, settings.rate_hz, name in driven) for name in tokens
+        }
         self.feeds = {name: PoseFeed(name, bus) for name in tokens}
         self._server: web.Server | None = None
         self._app = web.Application(client_max_size=LARGEST_FRAME, middlewares=[self._guarded])
@@ -157,6 +166,7 @@ class Gateway:
 async def serve(
     settings: GatewaySettings,
     tokens: Mapping[str, str],
+    driven: Collection[str],
     bus: Bus,
     tls: ssl.SSLContext | None,
     stop: Callable[[], bool],
@@ -165,7 +175,7 @@ async def serve(
 ) -> None:
     """Serves until `stop()`. `on_look` is called several times a second, `on_start` with the
     address. Raises InputError where it cannot listen."""
-    gateway = Gateway(settings, tokens, bus)
+    gateway = Gateway(settings, tokens, driven, bus)
     runner, address = await gateway.start(tls)
     on_start(address)
     try:
