@@ -1,6 +1,7 @@
 """The driver and the consumer of the docs, as processes: with a router that comes late and ends."""
 
 import json
+import subprocess
 import sys
 import time
 from contextlib import ExitStack
@@ -85,6 +86,12 @@ def test_another_language_speaks_json_over_zenoh(tmp_path: Path) -> None:
 
         assert eventually(has_moved)
         assert heard[-1].encoding == zenoh.Encoding.APPLICATION_JSON
+        left_open = (
+            "from cpcbl_client import Driver, poses; "
+            f"d = Driver({str(team)!r}, 'r1'); s = poses({str(team)!r}, 'r1'); next(s)"
+        )
+        words = [sys.executable, "-c", left_open]
+        assert subprocess.run(words, timeout=30.0, check=False).returncode == 0
         session.put("cpcbl/lab/in/r1/odometry", '{"distance": 1}')
         said = "r1: refused JSON on in/r1/odometry: unknown key 'distance'"
         assert eventually(lambda: said in running["robot"].said)

@@ -1,6 +1,7 @@
 """The session of a driver or a consumer, which says what it waits for and what it has lost."""
 
 import logging
+import threading
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -63,6 +64,7 @@ class Connection:
                 link.credentials,
                 lambda reason: waiting.warn(self._waiting_text(reason)),
             )
+            _close_at_end(bus)
             waiting.over(f"connected to the router at {self._where}")
         self.bus: Bus = bus
 
@@ -83,6 +85,26 @@ class Connection:
 
     def close(self) -> None:
         self.bus.close()
+        _open.discard(self.bus)
+
+
+_open: set[Bus] = set()
+_closers: list[threading.Thread] = []
+
+
+def _close_at_end(bus: Bus) -> None:
+    """A session that is open would hang Python at its end: its threads are waited for before any
+    function of `atexit` runs. So one more thread waits for the end of the program."""
+
+    def close_all() -> None:
+        threading.main_thread().join()
+        for each in list(_open):
+            each.close()
+
+    _open.add(bus)
+    if not _closers:
+        _closers.append(threading.Thread(target=close_all))
+        _closers[0].start()
 
 
 def first_with_keys(team: ClientTeam, candidates: Sequence[Identity]) -> Identity:

@@ -122,7 +122,7 @@ class Driver:
         self._put(Frame(self._stamp(stamp_ns), image))
 
     def close(self) -> None:
-        """Ends the session. Without it Python would hang at its end: write `with Driver(...)`."""
+        """Ends the session, as `with Driver(...)` does."""
         self._connection.close()
 
     def __enter__(self) -> Self:
