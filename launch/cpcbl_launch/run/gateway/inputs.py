@@ -1,5 +1,6 @@
 """What the gateway does with an input: the checks of the robot itself, with words for people."""
 
+import asyncio
 import logging
 import time
 from typing import NamedTuple
@@ -15,6 +16,7 @@ from cpcbl_transport.units import odometry_problem, sighting_problem, stamp_prob
 log = logging.getLogger(__name__)
 
 LATE_S = 2.0
+DECLARE_S = 0.3
 INPUTS = {topic.key.rpartition("/")[2]: topic for topic in topics.INPUTS}
 
 
@@ -49,17 +51,28 @@ class RobotInputs:
     def __init__(self, robot: str, bus: Bus, rate_hz: float, has_driver: bool) -> None:
         """`has_driver`: others' inputs come from the simulation or from a log."""
         self._robot, self._limit, self._has_driver = robot, RateLimit(rate_hz), has_driver
-        self._publishers: dict[str, Publisher] = {
-            name: bus.publisher(topic.at(robot=robot), topic.qos) for name, topic in INPUTS.items()
-        }
+        self._bus = bus
+        self._publishers: dict[str, Publisher] = {}
         self._logged: set[tuple[str, str]] = set()
 
-    def take(self, name: str, payload: bytes) -> Problem | None:
+    async def take(self, name: str, payload: bytes) -> Problem | None:
         """Publishes an input; why it was not taken, or None."""
+        if self._has_driver and name in INPUTS and name not in self._publishers:
+            await self._declare(name)
         problem = self._problem(name, payload)
         if problem is not None:
-            self._say_once(name, problem.reason, problem.error)
+            self._say_once(name if name in INPUTS else "", problem.reason, problem.error)
         return problem
+
+    async def _declare(self, name: str) -> None:
+        """Declares the publisher of an input when it is first used: an operator sees by it who
+        feeds a robot. The bus takes a moment to find who subscribes."""
+        topic = INPUTS[name]
+        publisher = self._bus.publisher(topic.at(robot=self._robot), topic.qos)
+        self._publishers[name] = publisher
+        until_s = time.monotonic() + DECLARE_S
+        while not publisher.matching and time.monotonic() < until_s:
+            await asyncio.sleep(0.01)
 
     def _say_once(self, name: str, reason: str, text: str) -> None:
         if (name, reason) not in self._logged:

@@ -110,7 +110,7 @@ class Gateway:
         except TimeoutError:
             raise web.HTTPRequestTimeout from None
         robot, name = request.match_info["robot"], request.match_info["input"]
-        taken = self._inputs[robot].take(name, payload)
+        taken = await self._inputs[robot].take(name, payload)
         return web.Response(status=204) if taken is None else _answer(taken)
 
     async def _get_pose(self, request: web.Request) -> web.StreamResponse:
@@ -139,7 +139,7 @@ class Gateway:
         try:
             async for message in stream:
                 if message.type in (WSMsgType.TEXT, WSMsgType.BINARY):
-                    problem = self._take_from_stream(robot, message.data)
+                    problem = await self._take_from_stream(robot, message.data)
                     if problem is not None:
                         await stream.send_str(_as_text(problem))
         finally:
@@ -147,12 +147,13 @@ class Gateway:
             await asyncio.gather(sending, return_exceptions=True)
         return stream
 
-    def _take_from_stream(self, robot: str, data: str | bytes) -> Problem | None:
+    async def _take_from_stream(self, robot: str, data: str | bytes) -> Problem | None:
         try:
             parts = msgspec.json.decode(data, type=dict[str, msgspec.Raw])
         except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
             return Problem(400, "garbage", f'write {{"odometry": {{...}}}}: {error}')
-        problems = [self._inputs[robot].take(name, bytes(raw)) for name, raw in parts.items()]
+        inputs = self._inputs[robot]
+        problems = [await inputs.take(name, bytes(raw)) for name, raw in parts.items()]
         return next(filter(None, problems), None)
 
     async def _send_poses(self, stream: web.WebSocketResponse, feed: PoseFeed) -> None:
