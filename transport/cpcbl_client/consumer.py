@@ -39,18 +39,18 @@ def poses(
     *,
     connect: Sequence[str] = (),
     wait_s: float | None = None,
-    guest: bool = False,
+    observer: bool = False,
     bus: Bus | None = None,
 ) -> Iterator[Pose]:
-    """The poses of a robot as they come: a slow reader misses poses, and never
-    gets old ones. It goes on until it is closed, over restarts of robot and router.
+    """The poses of a robot as they come: a slow reader misses poses, and never gets old ones. It
+    goes on until it is closed, over restarts of robot and router.
 
-    `connect`, `wait_s`, `bus` and errors: as those of `Driver`. `guest`: the robot is not in the
-    team file. In a secured team it uses the operator's keys, or else the robot's, whichever are on
-    this machine.
+    `connect`, `wait_s`, `bus` and errors: as those of `Driver`. `observer`: the robot is a guest,
+    which is not in the team file. In a secured team it uses the operator's keys, or else the
+    robot's, whichever are on this machine.
     """
     known = read_team(team)
-    if not guest and robot not in known.sources:
+    if not observer and robot not in known.sources:
         raise InputError(f"{known.path}: no robot {robot!r}; {nearest_name(robot, known.sources)}")
     who = first_with_keys(known, (Identity(Role.OPERATOR), Identity(Role.ROBOT, robot)))
     return _stream(Connection(known, who, connect, wait_s, bus), known.team.name, robot)
@@ -68,7 +68,7 @@ def _stream(connection: Connection, team: str, robot: str) -> Iterator[Pose]:
                 silence.over(f"poses come on {key}")
                 yield pose
             else:
-                cause = f"is `cpcbl-team robot {robot}` running, and its team named {team!r}?"
+                cause = f"is `cpcbl-team robot` running for {robot}, in team {team!r}?"
                 silence.warn(f"no pose comes on {key}: {cause}")
     finally:
         connection.close()
