@@ -163,8 +163,8 @@ class Driver:
             reminder.over(f"robot {self._robot} takes {key}")
         else:
             reminder.warn(
-                f"no robot takes {key} of team {self._team.team.name!r}: is `cpcbl-team robot` running"
-                f" for {self._robot}, with the same team name and router?"
+                f"no robot takes {key} of team {self._team.team.name!r}: is `cpcbl-team robot`"
+                f" running for {self._robot}, with the same team name and router?"
             )
 
     def _check_name(self, name: str) -> None:
