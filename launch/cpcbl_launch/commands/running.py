@@ -134,6 +134,8 @@ def _launch(
     if containers:
         from cpcbl_launch.run.containers.launch import InContainers, line_printer
 
+        if run.team.gateway is not None:
+            console.print("no gateway with --containers: start `cpcbl-team gateway` beside it")
         return partial(InContainers, image=image, base=base_image, print_line=line_printer(console))
     from cpcbl_launch.run.up import OnThisMachine
 
