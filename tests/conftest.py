@@ -11,6 +11,7 @@ from support.processes import eventually
 REAL = {
     "benchmark",
     "subprocess",
+    "programs",
     "cpcbl_team",
     "patient_up",
     "PROGRAM",

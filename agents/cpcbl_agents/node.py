@@ -10,6 +10,7 @@ from cpcbl_agents.agent import BeliefSubscribers, FrameSubscribers
 from cpcbl_agents.clocks import ClockMonitor
 from cpcbl_agents.collaboration import MessageCounters
 from cpcbl_agents.declarations import Declarations, LivelinessTokens
+from cpcbl_agents.pose_output import PoseOutput
 from cpcbl_agents.robot import Robot, build_robot
 from cpcbl_agents.sources import OwnCamera
 from cpcbl_team.config import Team
@@ -17,7 +18,8 @@ from cpcbl_team.inputs import Belief, Fix
 from cpcbl_transport import messages, topics
 from cpcbl_transport.bus import Bus
 from cpcbl_transport.compact import encode_help, received_bytes, sent_bytes
-from cpcbl_transport.decoding import decode_by_key
+from cpcbl_transport.decoding import decode_by_key, input_problem
+from cpcbl_transport.json_messages import encode_json, is_json
 from cpcbl_transport.messages import Help, Message, Outgoing, Refusal, Status, refusal
 from cpcbl_transport.topics import Topic, topic_of
 
@@ -71,8 +73,10 @@ class Node:
         self._declarations = Declarations(
             robot.name, incarnation, rules, bus, self._on_message, self._on_token
         )
+        self._pose = PoseOutput(robot, bus, team.robots[robot.name].pose_rate_hz, start_ns)
         self._tokens = LivelinessTokens()
         self._subscribed: dict[object, str] = {BeliefSubscribers: "", FrameSubscribers: ""}
+        self._explained: set[tuple[str, Refusal]] = set()
         # What threads of the bus count has its entry: to add one, another thread must not read
         self.counts: Counter[str] = Counter(dict.fromkeys(ON_ARRIVAL, 0))
         self.received = MessageCounters()
@@ -110,7 +114,7 @@ class Node:
 
     @property
     def next_ns(self) -> int:
-        return self.robot.next_ns
+        return min(self.robot.next_ns, self._pose.next_ns)
 
     @property
     def waiting(self) -> bool:
@@ -133,6 +137,7 @@ class Node:
             self._tokens.forget(name)
             self.robot.handle(agent.Presence(name, None), now_ns)
         self._send(outgoing, now_ns)  # under the tier that these messages belong to
+        self._pose.step(now_ns)
         if now_ns - self._status_ns >= STATUS_NS and self._declarations.tier is not None:
             self._status_ns = now_ns
             self._publish_status(now_ns)
@@ -141,6 +146,7 @@ class Node:
         message = self._decode(key, payload, now_ns)
         if isinstance(message, Refusal):
             self.counts[message] += 1
+            self._explain(key, payload, message)
             return
         self._send(self.robot.handle(message, now_ns), now_ns)
         match message:
@@ -150,6 +156,14 @@ class Node:
             case Belief(robot=name):  # by one to this key
                 size = sent_bytes(len(payload))
                 self.received.of("belief", name).add(size, message.stamp_ns)
+
+    def _explain(self, key: str, payload: bytes, reason: Refusal) -> None:
+        """Says once for each key and reason what is wrong with an input that came as JSON."""
+        if (key, reason) in self._explained or not is_json(payload):
+            return
+        if problem := input_problem(key, payload):
+            self._explained.add((key, reason))
+            log.warning("%s: refused JSON on %s: %s", self._name, key, problem)
 
     def _decode(self, key: str, payload: bytes, now_ns: int) -> Message | Refusal:
         """The message, or why it must not be used: its bytes, its sender, then its clock, its
@@ -212,7 +226,12 @@ class Node:
     def _publish_status(self, now_ns: int) -> None:
         counts = self.counts + Counter(announced=self._declarations.announced)
         received = self.received.flows()
-        self._publish(self.robot.status(now_ns, self._incarnation, counts, received, self._clocks))
+        status = self.robot.status(now_ns, self._incarnation, counts, received, self._clocks)
+        self._publish(status)
+        key = topics.json_key(topics.STATUS.at(robot=self._name))
+        as_json = self._declarations.publisher(topics.STATUS, key)
+        if as_json.matching:
+            as_json.put(encode_json(status))
 
 
 class GuestNode(Node):

@@ -20,7 +20,7 @@ from cpcbl_team.config import Team
 from cpcbl_team.inputs import BeliefShared
 from cpcbl_team.trust import TrustStatus
 from cpcbl_transport.budget import Budget
-from cpcbl_transport.messages import Flow, Help, Message, Outgoing, SensorInput, Status, Trust
+from cpcbl_transport.messages import Flow, Help, Message, Outgoing, Pose, SensorInput, Status, Trust
 
 NEVER_NS = 2**62
 
@@ -34,6 +34,7 @@ class Robot:
         settings, teammates = team.robots[name], frozenset(team.robots) - {name}
         self.name, self.sensing, self._shared_ns = name, sensing, start_ns
         self.filter = FilterAgent(settings, team.map, teammates, start_ns)
+        self._is_weighted = settings.localizer.variant == "weighted"  # it has no covariance
         match = team.messages_per_s(name), restarted, team.match.duration_s
         budget = Budget(settings.collaboration.budget, start_ns, *match)
         known = frozenset(team.map.landmarks) | frozenset(team.map.walls) | frozenset(team.robots)
@@ -73,6 +74,13 @@ class Robot:
                 # From now on what this robot knows may be in what its teammates publish
                 self._shared_ns = sent.stamp_ns
                 self.filter.handle(BeliefShared(sent.stamp_ns), now_ns)
+
+    def pose(self, now_ns: int) -> Pose:
+        """The pose at `now_ns`, or at the end of the newest odometry."""
+        state = self.filter.timeline.latest(now_ns)
+        (x_m, y_m, heading_rad), (xx, xy, yy, xh, yh, hh), _ = state.estimate
+        rows = None if self._is_weighted else ((xx, xy, xh), (xy, yy, yh), (xh, yh, hh))
+        return Pose(self.name, state.stamp_ns, x_m, y_m, heading_rad, rows, state.lost)
 
     @property
     def next_ns(self) -> int:

@@ -33,6 +33,7 @@ from cpcbl_team.config.sensors import OdometryNoise as OdometryNoise
 from cpcbl_team.config.sensors import OdometrySettings as OdometrySettings
 from cpcbl_team.config.sensors import PositionSensor as PositionSensor
 from cpcbl_team.config.sensors import SensorSettings as SensorSettings
+from cpcbl_team.config.team import GatewaySettings as GatewaySettings
 from cpcbl_team.config.team import GuardSettings as GuardSettings
 from cpcbl_team.config.team import GuestSettings as GuestSettings
 from cpcbl_team.config.team import LocalizationSettings as LocalizationSettings

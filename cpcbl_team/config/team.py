@@ -56,6 +56,20 @@ class TransportSettings(Table, frozen=True, kw_only=True):
         return ("tls/127.0.0.1:7447",) if self.secured else ("tcp/127.0.0.1:7447",)
 
 
+class GatewaySettings(Table, frozen=True, kw_only=True):
+    """The door for drivers and consumers without Zenoh: JSON over HTTP and WebSocket."""
+
+    host: Annotated[str, msgspec.Meta(min_length=1)] = "127.0.0.1"
+    """The address at which it listens; 0.0.0.0 for all of this machine."""
+    port: Annotated[int, msgspec.Meta(ge=0, le=65535)] = 8447
+    tokens: Annotated[str, msgspec.Meta(min_length=1)] = "gateway-tokens.json"
+    """The file of the robots' tokens, relative to the team file; it is made where it is absent."""
+    rate_hz: Annotated[float, msgspec.Meta(ge=1.0)] = 250.0
+    """The most messages a second for one robot."""
+    clients: Annotated[int, msgspec.Meta(ge=1, le=10_000)] = 64
+    """The most connections at a time."""
+
+
 class StartModel(msgspec.Struct, frozen=True, kw_only=True):
     """The stated pose at the start, in the field's frame. The simulated field draws the true one
     around it. It is a model as those of `sensors` are."""
@@ -99,6 +113,8 @@ class RobotSettings(LocalizationSettings, frozen=True, kw_only=True):
     waypoints_m: tuple[tuple[float, float], ...] = ()
     """Simulated robots drive loops through these points, and steer by their own estimates."""
     speed_m_s: NotNegative = 0.5
+    pose_rate_hz: Annotated[float, msgspec.Meta(gt=0.0, le=100.0)] = 10.0
+    """How often the robot publishes its pose (`pose/<robot>`) while somebody subscribes to it."""
 
 
 class MatchSettings(Table, frozen=True, kw_only=True):
@@ -126,6 +142,8 @@ class Team(Table, frozen=True, kw_only=True):
     map: Field = Field()
     vision: VisionSettings = VisionSettings()
     transport: TransportSettings = TransportSettings()
+    gateway: GatewaySettings | None = None
+    """With this table `up` also starts the gateway."""
     match: MatchSettings = MatchSettings()
     simulation: SimulationSettings = SimulationSettings()
     guests: GuestSettings = GuestSettings()

@@ -74,6 +74,9 @@ def load_team(path: Path) -> Team:
             robots[name] = replace(robot, camera=replace(robot.camera, frames=frames))
     if team.transport.secured:
         team = replace(team, transport=replace(team.transport, keys=str(key_folder(team, path))))
+    if team.gateway is not None:
+        tokens = str((path.parent / team.gateway.tokens).absolute())
+        team = replace(team, gateway=replace(team.gateway, tokens=tokens))
     return replace(team, robots=robots)
 
 

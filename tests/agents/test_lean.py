@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-HEAVY = ("cv2", "matplotlib", "numpy", "pydantic", "rich", "typer")
+HEAVY = ("aiohttp", "cv2", "matplotlib", "numpy", "pydantic", "rich", "typer")
 CODE = """
 import json, sys
 import cpcbl_agents.process
@@ -28,3 +28,12 @@ def test_a_robot_without_camera_and_log_loads_nothing_heavy(source: str) -> None
         timeout=60.0,
     )
     assert json.loads(done.stdout) == []
+
+
+def test_a_driver_loads_nothing_heavy_and_no_robot() -> None:
+    code = "import json, sys, cpcbl_client; print(json.dumps(sorted(sys.modules)))"
+    done = subprocess.run(
+        [sys.executable, "-c", code], stdout=subprocess.PIPE, check=True, timeout=60.0
+    )
+    loaded = {name.partition(".")[0] for name in json.loads(done.stdout)}
+    assert not loaded & {*HEAVY, "cpcbl_agents", "cpcbl_launch"}

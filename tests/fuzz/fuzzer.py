@@ -43,7 +43,7 @@ from cpcbl_team.inputs import Sighting, Sightings
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus
 from cpcbl_transport.decoding import Subscriber, decode
-from cpcbl_transport.messages import AnnotatedFrame, Refusal, encode
+from cpcbl_transport.messages import AnnotatedFrame, Pose, Refusal, encode
 from cpcbl_transport.topics import Topic
 from cpcbl_transport.zenoh_bus import open_bus
 
@@ -54,7 +54,7 @@ SIGHTINGS_EVERY_S = 0.3
 VICTIM, MATE = "victim", "mate"  # the fuzzer plays the mate
 DRIVEN = "patrol"  # the field refuses its commands, because they name the mate
 TO_FIELD = (topics.DRIVE, topics.JOIN)
-TO_PEOPLE = (topics.STATUS, topics.TRACK, topics.TRUTH, topics.LOOK)
+TO_PEOPLE = (topics.STATUS, topics.TRACK, topics.TRUTH, topics.LOOK, topics.POSE)
 ACCEPTED = ("odometry", "sightings", "position", "messages_received")
 FRAME_REASONS = (
     "frame_skipped",
@@ -77,7 +77,7 @@ class SentCounts(NamedTuple):
     no_statuses: int
     """Those of them under `status/*`."""
     no_looks: int
-    """Those of them under `look/*`."""
+    """Those of them under `look/*` and `pose/*`."""
 
 
 class FinalCounts(NamedTuple):
@@ -124,6 +124,7 @@ def fuzz(options: ScenarioOptions, per_key: int = PER_KEY) -> ScenarioResult:
         ears = stack.enter_context(open_bus(plan.team.name, [team.endpoint]))
         recorder, watcher = Recorder(ears), StatusCollector(ears)
         looks = Subscriber(ears, AnnotatedFrame, lambda frame: None)
+        poses = Subscriber(ears, Pose, lambda pose: None)
         options.report_progress("starting a team")
         team.settle()
         from_s = team.now_s
@@ -136,7 +137,7 @@ def fuzz(options: ScenarioOptions, per_key: int = PER_KEY) -> ScenarioResult:
         team.wait_until(lambda: _total(fuzzer.victim_counts()) >= fuzzer.to_victim, 15.0)
         recorded = sent.no_messages - sent.no_looks
         team.wait_until(lambda: _refusals(recorder.counts) >= recorded, 15.0)
-        team.wait_until(lambda: looks.refused.total() >= sent.no_looks, 15.0)
+        team.wait_until(lambda: (looks.refused + poses.refused).total() >= sent.no_looks, 15.0)
         team.wait_until(lambda: watcher.refused.total() >= sent.no_statuses, 15.0)
         until_s = team.now_s
         final = FinalCounts(
@@ -145,7 +146,7 @@ def fuzz(options: ScenarioOptions, per_key: int = PER_KEY) -> ScenarioResult:
             {},
             dict(recorder.counts),
             watcher.refused,
-            looks.refused,
+            looks.refused + poses.refused,
             sum(team.supervisor.restarts.values()),
             0,
             _traffic_exit(team),
@@ -184,7 +185,7 @@ def fuzz_checks(sent: SentCounts, final: FinalCounts) -> list[Check]:
         _equal("commands refused by the field", refused_commands, sent.commands),
         _equal("messages refused by the recorder", refused, sent.no_messages - sent.no_looks),
         _equal("messages refused by the traffic watcher", by_watcher, sent.no_statuses),
-        _equal("messages refused by the subscriber of annotated frames", by_frames, sent.no_looks),
+        _equal("messages refused by the subscribers of frames and poses", by_frames, sent.no_looks),
         _equal("exit code of `cpcbl-team traffic`", final.traffic_exit, 0),
     ]
 
@@ -260,7 +261,7 @@ class Fuzzer:
             commands=sum(count[t.key] for t in TO_FIELD),
             no_messages=sum(count[f"bad {t.key}"] for t in TO_PEOPLE),
             no_statuses=count[f"bad {topics.STATUS.key}"],
-            no_looks=count[f"bad {topics.LOOK.key}"],
+            no_looks=sum(count[f"bad {t.key}"] for t in (topics.LOOK, topics.POSE)),
         )
 
     def victim_counts(self) -> Counter[str]:

@@ -16,6 +16,7 @@ from cpcbl_transport.messages import (
     Flow,
     Frame,
     Join,
+    Pose,
     Status,
     Track,
     Truth,
@@ -27,7 +28,7 @@ from cpcbl_transport.topics import Topic
 COVARIANCE_2, COVARIANCE_3 = (0.04, 0.01, 0.09), (0.04, 0.01, 0.09, 0.0, 0.0, 0.01)
 TAGS = (
     *("odometry", "sightings", "position", "frame", "look"),
-    *("status", "track", "drive", "truth", "join"),
+    *("status", "track", "pose", "drive", "truth", "join"),
 )
 LONGEST = 600
 DISTINCT = 1000  # hypothesis takes about 4 ms for each
@@ -48,6 +49,9 @@ def valid_payload(topic: Topic, target: str, speaker: str, now_ns: int) -> bytes
             return encode(msgspec.structs.replace(status, sent=flows))
         case topics.TRACK:
             return encode(Track(speaker, now_ns, 1.0, 2.0, 0.5, COVARIANCE_3, 3))
+        case topics.POSE:
+            rows = ((0.04, 0.01, 0.0), (0.01, 0.09, 0.0), (0.0, 0.0, 0.01))
+            return encode(Pose(speaker, now_ns, 1.0, 2.0, 0.5, rows))
         case topics.IN_ODOMETRY:
             return encode(Odometry(now_ns - 100_000_000, now_ns, 0.05, 0.01))
         case topics.IN_SIGHTINGS:
@@ -83,8 +87,8 @@ def mixed_payloads(
 
 
 def random_payload(generator: random.Random) -> bytes:
-    """Random bytes; half of these payloads begin with the version byte of a message."""
-    head = bytes([VERSION]) if generator.random() < 0.5 else b""
+    """Random bytes; half of these payloads begin as a message does, binary or JSON."""
+    head = generator.choice((bytes([VERSION]), b'{"stamp_ns":', b"", b""))
     return head + generator.randbytes(generator.randrange(LONGEST))
 
 

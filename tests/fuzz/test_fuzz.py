@@ -80,7 +80,7 @@ def test_fuzzed_payloads_are_all_counted() -> None:
         ({"field": {"drive": 500}}, "commands refused by the field"),
         ({"recorder": {"garbage": 59}}, "messages refused by the recorder"),
         ({"watcher": {}}, "messages refused by the traffic watcher"),
-        ({"looks": {"garbage": 19}}, "messages refused by the subscriber of annotated frames"),
+        ({"looks": {"garbage": 19}}, "messages refused by the subscribers of frames and poses"),
         ({"traffic_exit": 1}, "exit code of `cpcbl-team traffic`"),
     ],
 )

@@ -3,20 +3,15 @@
 import json
 import signal
 import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 from support.logs import write_log
 from support.processes import command_line, cpcbl_team, eventually, patient_up, pids_of
-from support.routers import open_router
 
 from cpcbl_launch.run.processes import PROGRAM
 from cpcbl_launch.run.up import free_endpoint
-from cpcbl_transport import topics
-from cpcbl_transport.messages import Status, decode_tagged
 
-DRIVER = Path(__file__).parents[2] / "docs" / "external_driver.py"
 FIGURES = {
     "position_rmse_m",
     "position_mean_m",
@@ -57,6 +52,7 @@ odometry = { moves = false }
         ["traffic"],
         ["look"],
         ["observer"],
+        ["gateway"],
     ],
 )
 def test_every_command_explains_itself(command: list[str]) -> None:
@@ -184,33 +180,3 @@ def test_a_team_spreads_over_machines_by_an_endpoint_in_its_file(tmp_path: Path)
     report = json.loads(ran.stdout)
     assert report["robots"]["watcher"]["samples"] > 0
     assert report["robots"]["driver"]["messages_received"] > 0
-
-
-def test_the_documented_driver_feeds_a_robot(tmp_path: Path) -> None:
-    endpoint, team = free_endpoint(), tmp_path / "team.toml"
-    team.write_text(
-        'name = "lab"\n[map.landmarks]\ndoor = { x_m = 2.0, y_m = 0.2 }\n'
-        '[robots.r1]\nsource = "external"\nstart = { x_m = 0.0, y_m = 0.0 }\n'
-    )
-    heard: list[Status] = []
-
-    def hear(key: str, payload: bytes) -> None:
-        status = decode_tagged(payload)
-        assert isinstance(status, Status)
-        heard.append(status)
-
-    commands = [
-        [*PROGRAM, "robot", "r1", "--team", str(team), "--connect", endpoint],
-        [sys.executable, str(DRIVER), "lab", "r1", endpoint],
-    ]
-    with open_router("lab", [endpoint]) as bus:
-        bus.subscribe(topics.STATUS.at(), hear)
-        processes = [subprocess.Popen(c, stderr=subprocess.DEVNULL) for c in commands]
-        try:
-            assert eventually(lambda: any(s.counts.get("accepted", 0) >= 3 for s in heard))
-        finally:
-            for process in processes:
-                process.send_signal(signal.SIGINT)
-                process.wait(timeout=5.0)
-    assert heard[-1].counts["odometry"] > 0
-    assert heard[-1].lost == ""

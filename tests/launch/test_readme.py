@@ -49,7 +49,7 @@ def test_a_command_of_the_readme_runs(
 ) -> None:
     """In a folder with a short log and the documented team file; `up` for a few seconds only."""
     write_log(tmp_path / "MRCLAM6", ("1", "2", "3", "4", "5"), seconds=6.0)
-    local = re.sub(r"\[transport\].*?\n\n", "", TOML[0], flags=re.DOTALL)
+    local = re.sub(r"\[(transport|gateway)\].*?\n\n", "", TOML[0], flags=re.DOTALL)
     (tmp_path / "team.toml").write_text(local)
     monkeypatch.chdir(tmp_path)
     words = shlex.split(command)[1:]

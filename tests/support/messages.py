@@ -11,6 +11,7 @@ from cpcbl_transport.messages import (
     Flow,
     Frame,
     Join,
+    Pose,
     SimulatedRobotModel,
     Spending,
     Status,
@@ -39,11 +40,13 @@ SPENDING = (Spending("bytes", 10.0, 500.0, 400.0),)
 TRUST = (Trust("r2", "biased", NOW, 2, False, -0.4),)
 STATUS = msgspec.structs.replace(STATUS, sent=SENT, heard=SENT[:1], spending=SPENDING, trust=TRUST)
 TRACK = Track("r1", NOW, 1.0, 2.0, 0.5, COVARIANCE, 3)
+ROWS = ((0.04, 0.01, 0.0), (0.01, 0.09, 0.0), (0.0, 0.0, 0.01))
+POSE = Pose("r1", NOW, 1.0, 2.0, 0.5, ROWS, "kidnapped")
 DRIVE = Drive("r1", NOW, 0.5, 0.1)
 MODEL = SimulatedRobotModel(StartModel(x_m=1.0, y_m=2.0), position_sensor=PositionSensorModel())
 JOIN = Join("tripod", "a", NOW, MODEL)
 TRUTHS = Truths(NOW, (Truth("r1", 1.0, 2.0, 0.5, 1), Truth("r2", 3.0, 4.0, -0.5)))
-VALID = (ODOMETRY, SIGHTINGS, POSITION, FRAME, LOOK, STATUS, TRACK, DRIVE, JOIN, TRUTHS)
+VALID = (ODOMETRY, SIGHTINGS, POSITION, FRAME, LOOK, STATUS, TRACK, POSE, DRIVE, JOIN, TRUTHS)
 BELIEF = Belief("r1", NOW, 1.0, 2.0, 0.5, COVARIANCE, 0.25, -0.1)
 FIX = Fix("r2", "r1", NOW, 1.5, -2.5, (0.04, 0.01, 0.09), (0.01, 0.0, 0.02))
 HEADED_FIX = msgspec.structs.replace(

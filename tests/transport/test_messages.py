@@ -37,6 +37,7 @@ from cpcbl_transport.messages import (
     Flow,
     Frame,
     Join,
+    Pose,
     Refusal,
     SimulatedRobotModel,
     Spending,
@@ -116,6 +117,16 @@ MESSAGES: dict[type[Any], st.SearchStrategy[Tagged]] = {
         FLOATS,
         COVARIANCES_3 | st.none(),
         TIERS,
+        st.text(),
+    ),
+    Pose: st.builds(
+        Pose,
+        NAMES,
+        STAMPS,
+        FLOATS,
+        FLOATS,
+        FLOATS,
+        st.tuples(*[st.tuples(FLOATS, FLOATS, FLOATS)] * 3) | st.none(),
         st.text(),
     ),
     Drive: st.builds(Drive, NAMES, STAMPS, FLOATS, FLOATS),
@@ -224,23 +235,20 @@ def test_a_valid_message_is_not_refused(valid: Tagged) -> None:
 def with_number(message: Any, field: str, value: float) -> list[Any]:
     """The message with each of the numbers of a field (or nested in it) replaced in turn."""
     replace = msgspec.structs.replace
-    old = getattr(message, field)
+    return [replace(message, **{field: new}) for new in _with_value(getattr(message, field), value)]
+
+
+def _with_value(old: Any, value: float) -> list[Any]:
     if isinstance(old, float):
-        return [replace(message, **{field: value})]
+        return [value]
+    if isinstance(old, msgspec.Struct):
+        return [new for f in old.__struct_fields__ for new in with_number(old, f, value)]
     if not isinstance(old, tuple):
         return []
-    entries: list[list[Any]] = []
-    for entry in old:
-        if isinstance(entry, float):
-            entries.append([value])
-        elif not isinstance(entry, str):
-            entries.append(
-                [n for f in entry.__struct_fields__ for n in with_number(entry, f, value)]
-            )
     return [
-        replace(message, **{field: (*old[:i], new, *old[i + 1 :])})
-        for i, news in enumerate(entries)
-        for new in news
+        (*old[:i], new, *old[i + 1 :])
+        for i, entry in enumerate(old)
+        for new in _with_value(entry, value)
     ]
 
 

@@ -24,7 +24,7 @@ from support.routers import open_router
 from support.secured_team import MARK, say
 
 from cpcbl_launch.run.up import free_endpoint
-from cpcbl_team.config import Team
+from cpcbl_team.config import GatewaySettings, Team
 from cpcbl_transport import topics
 from cpcbl_transport.security import (
     Identity,
@@ -45,12 +45,13 @@ from cpcbl_transport.zenoh_config import router_config
 OWN_ROBOT = {
     *("belief/3/r1", "fix/r2/3/r1", "status/r1", "track/r1", "look/r1", "field/drive/r1"),
     *("in/r1/odometry", "in/r1/sightings", "in/r1/position", "in/r1/frame"),
+    *("pose/r1", "pose/r1/json", "status/r1/json"),
 }
 OWN_OBSERVER = {
     *("belief/3/tripod", "fix/r1/3/tripod", "fix/r2/3/tripod", "status/tripod", "track/tripod"),
     *("field/join/tripod", "field/drive/tripod"),  # its own body on the simulated field
     *("in/tripod/odometry", "in/tripod/sightings", "in/tripod/position"),
-    *("look/tripod", "in/tripod/frame"),
+    *("look/tripod", "in/tripod/frame", "pose/tripod", "pose/tripod/json", "status/tripod/json"),
 }
 OWN_FIELD = {
     *("field/truth", "in/*/odometry"),  # to all robots at once
@@ -210,6 +211,7 @@ def test_permitted_subscriptions_follow_the_table_too() -> None:
     me = Identity(Role.ROBOT, "me")
     assert set(subscribe_keys(me)) == {
         *("alive/*/*/*", "belief/*/*", "fix/me/*/*", "status/me", "track/me", "look/me"),
+        *("pose/*", "pose/*/json", "status/me/json"),
         *("in/me/odometry", "in/me/sightings", "in/me/position", "in/me/frame"),
     }
     assert subscribe_keys(Identity(Role.OBSERVER, "me")) == subscribe_keys(me)
@@ -280,3 +282,16 @@ def test_all_options_are_known_to_zenoh(team: Team) -> None:
         assert json.loads(config.get_json(f"transport/link/tls/{name}")) == value
     assert json.loads(config.get_json("transport/link/protocols")) == ["tls"]
     assert json.loads(config.get_json("transport/link/tx/lease")) == 2000
+
+
+def test_a_gateway_speaks_for_all_drivers_and_hears_poses() -> None:
+    gateway = Identity(Role.GATEWAY)
+    assert set(publish_keys(gateway, carrying=True)) == {topic.at() for topic in topics.INPUTS}
+    assert publish_keys(gateway, carrying=False) == []
+    assert subscribe_keys(gateway) == ["pose/*", "pose/*/json"]
+
+
+def test_only_a_team_with_a_gateway_has_a_place_for_one(team: Team) -> None:
+    gateway = Member(role=Role.GATEWAY)
+    assert named_in_rules(team, gateway) == set()
+    assert named_in_rules(replace(team, gateway=GatewaySettings()), gateway) == {"gateway"}

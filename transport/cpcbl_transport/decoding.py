@@ -13,6 +13,7 @@ from typing import Generic, NamedTuple, TypeVar, cast
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus
 from cpcbl_transport.compact import decode_help
+from cpcbl_transport.json_messages import decode_json, is_json, json_problem
 from cpcbl_transport.messages import Message, Refusal, decode_tagged, refusal
 from cpcbl_transport.topics import Topic, topic_of
 
@@ -35,12 +36,22 @@ def decode_by_key(key: str, payload: bytes) -> Message | Refusal:
         return Refusal.WRONG_TYPE
     if topic.carries in topics.COLLABORATION:
         return decode_help(key, payload)
-    message = decode_tagged(payload, topic.largest)
+    message: Message | Refusal
+    if topic in topics.INPUTS and is_json(payload):
+        message = decode_json(payload, topic)
+    else:
+        message = decode_tagged(payload, topic.largest)
     if isinstance(message, Refusal):
         return message
     if type(message) is not topic.carries:
         return Refusal.WRONG_TYPE
     return message if getattr(message, "robot", name) == name else Refusal.NOT_ITS_OWN
+
+
+def input_problem(key: str, payload: bytes) -> str:
+    """What is wrong with an input that came as JSON, for people; empty if it can be read."""
+    topic, _ = _topic_of(key)
+    return json_problem(payload, topic) if topic in topics.INPUTS else ""
 
 
 @lru_cache(maxsize=4096)

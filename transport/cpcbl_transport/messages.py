@@ -123,6 +123,26 @@ class Track(msgspec.Struct, frozen=True, array_like=True, tag="track"):
     lost: str = ""
 
 
+Row3 = tuple[float, float, float]
+
+
+class Pose(msgspec.Struct, frozen=True, array_like=True, tag="pose"):
+    """Where a robot is in the field's frame, for its own software and for people.
+
+    `stamp_ns`: the time for which it holds, that of the newest odometry. `covariance`: rows of x, y
+    and heading (m^2, m rad, rad^2); None where the variant has none. `lost`: why the robot is lost,
+    empty while it is not; the pose of a lost robot is not to be used.
+    """
+
+    robot: Name
+    stamp_ns: int
+    x_m: float
+    y_m: float
+    heading_rad: float
+    covariance: tuple[Row3, Row3, Row3] | None
+    lost: str = ""
+
+
 class Drive(msgspec.Struct, frozen=True, array_like=True, tag="drive"):
     """Command to the simulated wheels."""
 
@@ -182,10 +202,10 @@ class Truths(msgspec.Struct, frozen=True, array_like=True, tag="truth"):
 
 Help = Belief | Fix
 SensorInput = Odometry | Sightings | Position | Frame
-Tagged = SensorInput | AnnotatedFrame | Status | Track | Drive | Join | Truths
+Tagged = SensorInput | AnnotatedFrame | Status | Track | Pose | Drive | Join | Truths
 Message = Tagged | Help
 Outgoing = AnnotatedFrame | Track | Drive | Help  # what a robot sends besides its status
-Telemetry = Status | Track | Drive | Truths
+Telemetry = Status | Track | Pose | Drive | Truths
 
 
 class Refusal(StrEnum):

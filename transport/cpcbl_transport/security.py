@@ -206,7 +206,7 @@ def subscribe_keys(identity: Identity) -> list[str]:
 def _keys(topic: Topic, allowed: Iterable[Permission], identity: Identity) -> Iterator[str]:
     for who in allowed:
         if who.role is identity.role:
-            yield topic.at(**{who.own: identity.name} if who.own else {})
+            yield from topic.keys(**{who.own: identity.name} if who.own else {})
 
 
 def _is_in_team(identity: Identity, team: Team) -> bool:
@@ -218,4 +218,6 @@ def _is_in_team(identity: Identity, team: Team) -> bool:
             return team.guests.allowed and identity.name not in team.robots
         case Role.FIELD:  # a simulated one must not feed real robots
             return team.simulated
+        case Role.GATEWAY:
+            return team.gateway is not None
     return True

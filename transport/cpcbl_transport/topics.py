@@ -15,6 +15,8 @@ from cpcbl_team.inputs import Belief, Fix, Odometry, Position, Sightings
 from cpcbl_transport import messages
 from cpcbl_transport.messages import LARGEST_FRAME, LARGEST_PAYLOAD, Message
 
+JSON_CHUNK = "/json"
+
 
 class QosProfile(NamedTuple):
     """How the bus transports a message."""
@@ -48,6 +50,7 @@ class Role(StrEnum):
     OBSERVER = "observer"  # helps a running team as a guest
     FIELD = "field"  # the simulated one
     OPERATOR = "operator"  # people: live tables, recordings
+    GATEWAY = "gateway"  # speaks for drivers and consumers that have no Zenoh
     ROUTER = "router"  # relays the messages of all others
 
 
@@ -64,7 +67,9 @@ _OWNER = Permission(Role.ROBOT, "robot"), Permission(Role.OBSERVER, "robot")
 _OBSERVER = Permission(Role.ROBOT, "observer"), Permission(Role.OBSERVER, "observer")
 _GUEST = (Permission(Role.OBSERVER, "robot"),)
 _FIELD = (Permission(Role.FIELD),)
-_SENSING = (*_OWNER, *_FIELD)  # the robot's own driver, or the simulated field
+_GATEWAY = (Permission(Role.GATEWAY),)
+_READERS = (*_MEMBERS, *_GATEWAY)
+_SENSING = (*_OWNER, *_FIELD, *_GATEWAY)  # the robot's own driver, or the simulated field
 
 
 class Topic(NamedTuple):
@@ -76,15 +81,31 @@ class Topic(NamedTuple):
     publishers: tuple[Permission, ...] = _OWNER  # where names are certified
     subscribers: tuple[Permission, ...] = _OWNER  # and operators, who may subscribe to everything
     largest: int = LARGEST_PAYLOAD  # a larger payload is refused unread (bytes)
+    also_json: bool = False  # whoever wants JSON subscribes to `json_key`
 
     def at(self, **names: object) -> str:
         """The key with these names; `*` for each that is left out."""
         return _filled(self.key, tuple(names.items()))
 
+    def keys(self, **names: object) -> tuple[str, ...]:
+        """All keys with these names: that of `at`, and the one under which it is sent as JSON."""
+        key = self.at(**names)
+        return (key, json_key(key)) if self.also_json else (key,)
+
     def names(self, key: str) -> dict[str, str] | None:
         """The names in a key of this topic, None for any other key: the inverse of `at`."""
         found = _pattern(self.key).fullmatch(key)
         return found.groupdict() if found else None
+
+
+def json_key(key: str) -> str:
+    """The key under which the messages of another key are sent as JSON."""
+    return key + JSON_CHUNK
+
+
+def is_json_key(key: str) -> bool:
+    """Whether messages under this key are JSON."""
+    return key.endswith(JSON_CHUNK)
 
 
 @lru_cache(maxsize=4096)
@@ -114,10 +135,14 @@ BELIEF = Topic("belief/<tier>/<robot>", Belief, Qos.FRESH, subscribers=_MEMBERS)
 # Each sighting of a worse robot that subscribes. The next one is better than a late one
 FIX = Topic("fix/<robot>/<tier>/<observer>", Fix, Qos.FRESH, publishers=_OBSERVER)
 # 1 Hz. For people; it must never delay a fix
-STATUS = Topic("status/<robot>", messages.Status, Qos.TELEMETRY)
+STATUS = Topic("status/<robot>", messages.Status, Qos.TELEMETRY, also_json=True)
 # 10 Hz while somebody records. For reports; it costs nothing without a subscriber
 TRACK = Topic("track/<robot>", messages.Track, Qos.TELEMETRY)
-# At the driver's rate. Inputs are not dropped: a lost piece of odometry is a lost piece of the way
+# `pose_rate_hz` (10 Hz) while somebody subscribes. For the robot's own software, and for everybody
+# in the team; the next one is better than a late one
+POSE = Topic("pose/<robot>", messages.Pose, Qos.TELEMETRY, subscribers=_READERS, also_json=True)
+# At the driver's rate, binary or JSON. Inputs are not dropped: a lost piece of odometry is a lost
+# piece of the way
 IN_ODOMETRY = Topic("in/<robot>/odometry", Odometry, Qos.INPUT, publishers=_SENSING)
 IN_SIGHTINGS = Topic("in/<robot>/sightings", Sightings, Qos.INPUT, publishers=_SENSING)
 IN_POSITION = Topic("in/<robot>/position", Position, Qos.INPUT, publishers=_SENSING)
@@ -138,7 +163,7 @@ JOIN = Topic(
 TRUTH = Topic("field/truth", messages.Truths, Qos.TELEMETRY, publishers=_FIELD, subscribers=())
 
 TOPICS = (
-    *(ALIVE, BELIEF, FIX, STATUS, TRACK),
+    *(ALIVE, BELIEF, FIX, STATUS, TRACK, POSE),
     *(IN_ODOMETRY, IN_SIGHTINGS, IN_POSITION, IN_FRAME, LOOK),
     *(DRIVE, JOIN, TRUTH),
 )

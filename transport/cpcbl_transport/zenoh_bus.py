@@ -22,7 +22,7 @@ import zenoh
 from cpcbl_team.errors import CpcblError
 from cpcbl_transport.bus import Bus, Handle, LivelinessCallback, MessageCallback, Publisher
 from cpcbl_transport.security import Credentials
-from cpcbl_transport.topics import Qos, namespace
+from cpcbl_transport.topics import Qos, is_json_key, namespace
 from cpcbl_transport.zenoh_config import client_config
 
 log = logging.getLogger(__name__)
@@ -37,9 +37,11 @@ def open_bus(
     connect: Sequence[str],
     give_up: Callable[[], bool] = lambda: False,
     credentials: Credentials | None = None,
+    on_wait: Callable[[str], None] | None = None,
 ) -> "ZenohBus":
     """A client's session below the team's namespace; waits for a router until `give_up()`. With
-    credentials every link is mutual TLS. Raises BusError when it gave up."""
+    credentials every link is mutual TLS. `on_wait` is told again and again that there is none yet,
+    with the reason where TLS has one. Raises BusError when it gave up."""
     config = client_config(connect, credentials)
     reason = "stopped before a router answered"
     while not give_up():
@@ -47,8 +49,11 @@ def open_bus(
             return ZenohBus(_open(config, namespace(team)))
         except zenoh.ZError as error:
             reason = _tls_reason(connect, credentials) or _one_line(error)
-            shown = f": {reason}" if credentials else ""
-            log.info("no router at %s yet%s", ", ".join(connect), shown)
+            if on_wait is not None:
+                on_wait(reason if credentials else "")
+            else:
+                shown = f": {reason}" if credentials else ""
+                log.info("no router at %s yet%s", ", ".join(connect), shown)
             time.sleep(0.2)
     raise BusError(f"no router at {', '.join(connect)}: {reason}")
 
@@ -160,6 +165,7 @@ class ZenohBus(Bus):
         kind = zenoh.Reliability.RELIABLE if reliable else zenoh.Reliability.BEST_EFFORT
         publisher = self._session.declare_publisher(
             key,
+            encoding=zenoh.Encoding.APPLICATION_JSON if is_json_key(key) else None,
             allowed_destination=zenoh.Locality.REMOTE,
             priority=getattr(zenoh.Priority, priority),
             congestion_control=getattr(zenoh.CongestionControl, when_full),

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from msgspec.structs import replace
 from rich.console import Console
 from typer import Argument, Option
 
@@ -17,7 +18,7 @@ from cpcbl_launch.commands import options
 from cpcbl_launch.overrides import Overrides, with_blind_robots, with_overrides
 from cpcbl_launch.run.containers import BASE_IMAGE
 from cpcbl_launch.team_file import find_team
-from cpcbl_team.config import Team
+from cpcbl_team.config import GatewaySettings, Team
 from cpcbl_team.errors import InputError
 from cpcbl_transport.security import Identity, link_of
 from cpcbl_transport.topics import Role
@@ -133,6 +134,8 @@ def _launch(
     if containers:
         from cpcbl_launch.run.containers.launch import InContainers, line_printer
 
+        if run.team.gateway is not None:
+            console.print("no gateway with --containers: start `cpcbl-team gateway` beside it")
         return partial(InContainers, image=image, base=base_image, print_line=line_printer(console))
     from cpcbl_launch.run.up import OnThisMachine
 
@@ -217,3 +220,29 @@ def router(
         typer.echo(json.dumps(settings, indent=2))
     else:
         run_router(settings, title, StopSignal(parent))
+
+
+def gateway(
+    file: Annotated[Path, Argument(help="Team file.")],
+    host: Annotated[
+        str | None, Option(help="Address to listen at; default: the file's, else 127.0.0.1.")
+    ] = None,
+    port: Annotated[
+        int | None, Option(min=0, max=65535, help="Port; default: the file's, else 8447.")
+    ] = None,
+    connect: options.Connect = None,
+    parent: options.Parent = None,
+) -> None:
+    """Run the gateway: JSON over HTTP and WebSocket for drivers and consumers without Zenoh."""
+    from cpcbl_agents.process import StopSignal
+    from cpcbl_launch.run.gateway.command import run_gateway
+
+    team = find_team(file)
+    tokens = str(file.parent.absolute() / GatewaySettings().tokens)
+    settings = team.gateway or GatewaySettings(tokens=tokens)
+    settings = replace(
+        settings,
+        host=settings.host if host is None else host,
+        port=settings.port if port is None else port,
+    )
+    run_gateway(team, settings, connect or team.transport.connect, StopSignal(parent))

@@ -3,7 +3,7 @@
     keys/ca                      private.key, ca.crt: only where certificates are made
     keys/router                  ca.crt, certificate.crt, private.key, members.json
     keys/robot/r1                ca.crt, certificate.crt, private.key
-    keys/observer/…, field, operator
+    keys/observer/…, field, gateway, operator
 
 Folders are 0700 and private keys 0600 from the first byte on. A file is replaced as a whole. A
 `.gitignore` keeps all of it out of a repository.
@@ -45,6 +45,7 @@ from cpcbl_transport.topics import Role
 ALL, AUTHORITY = "all", "ca"
 SELF_NAMED = ("localhost", "127.0.0.1", "::1", "router")
 SECRET, PUBLIC = 0o600, 0o644
+DIALLED = (Role.ROUTER, Role.GATEWAY)  # their certificates name hosts
 KeyAction = Literal["made", "kept", "renewed", "revoked"]
 """What is done to one member."""
 
@@ -91,7 +92,7 @@ def make_keys(team: Team, folder: Path, request: KeyRequest) -> list[KeysReport]
             pair = issue_certificate(
                 _signing_pair(folder, authorities),
                 member.common_name,
-                reached if member.role is Role.ROUTER else (),  # only routers are dialled
+                reached if member.role in DIALLED else (),
                 now,
                 request.lasting,
             )
@@ -135,6 +136,7 @@ def plan_actions(
     before = {member.identity: member for member in known}
     wanted = [Identity(role) for role in (Role.ROUTER, Role.OPERATOR)]
     wanted += [Identity(Role.FIELD)] if team.simulated else []
+    wanted += [Identity(Role.GATEWAY)] if team.gateway else []
     wanted += [Identity(Role.ROBOT, name) for name in team.robots]
     wanted += [Identity(Role.OBSERVER, name) for name in request.observers]
     everyone = list(dict.fromkeys([*wanted, *before]))

@@ -70,10 +70,14 @@ def process_table(
         ROBOT + name: ("--clock", str(clock._replace(epoch_ns=clock.epoch_ns + int(s * 1e9))))
         for name, s in team.simulation.clocks_ahead_s.items()
     }
-    return [
+    table = [
         ProcessSpec(name, (*PROGRAM, *arguments, *clocks.get(name, ())), on_restart)
         for name, arguments, _, on_restart in tasks(team, common, seed, here)
     ]
+    if team.gateway is not None:
+        gateway = ("gateway", str(team_file), "--connect", endpoint, "--parent", str(os.getpid()))
+        table.append(ProcessSpec("gateway", (*PROGRAM, *gateway)))
+    return table
 
 
 # Starting, watching and stopping them --------------------------------------------------------

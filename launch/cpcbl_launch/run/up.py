@@ -29,8 +29,8 @@ from cpcbl_launch.team_file import save_resolved
 from cpcbl_team.config import Team
 from cpcbl_team.errors import InputError
 from cpcbl_transport.bus import Bus
-from cpcbl_transport.security import link_of
-from cpcbl_transport.topics import namespace
+from cpcbl_transport.security import Identity, link_of
+from cpcbl_transport.topics import Role, namespace
 from cpcbl_transport.zenoh_bus import open_router
 
 log = logging.getLogger(__name__)
@@ -105,6 +105,8 @@ def require_keys(team: Team, listen: Sequence[str], here: Collection[str]) -> No
     """Says what a process would die of before any starts. Raises SecurityError."""
     for task in tasks(team, (), 0, here):
         link_of(team, task.identity, listen)
+    if team.gateway is not None:
+        link_of(team, Identity(Role.GATEWAY), listen)
 
 
 def free_endpoint(protocol: str = "tcp") -> str:

@@ -272,6 +272,7 @@ def test_a_real_tripod_is_fed_by_its_own_driver(tmp_path: Path) -> None:
     file.write_text(
         'name = "lab"\n[robots.r1]\nsource = "external"\nodometry = { moves = false }\n'
         "start = { x_m = 0.1, y_m = 0.0, sigma_m = 0.5 }\n"
+        f'[transport]\nconnect = ["{endpoint}"]\n'
     )
     heard: dict[str, Status] = {}
 
@@ -286,7 +287,7 @@ def test_a_real_tripod_is_fed_by_its_own_driver(tmp_path: Path) -> None:
             *(*PROGRAM, "observer", "tripod", "--team", str(file), "--at", "2,0,180"),
             *("--connect", endpoint),
         ],
-        [sys.executable, str(DRIVER), "lab", "tripod", endpoint],
+        [sys.executable, str(DRIVER), str(file), "tripod"],
     ]
     with open_router("lab", [endpoint]) as bus:
         bus.subscribe(topics.STATUS.at(), hear)
