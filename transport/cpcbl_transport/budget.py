@@ -3,11 +3,11 @@
 A limit is a token bucket whose tokens return one window after they were spent. So no window ever
 contains more than is allowed, and no reserve for bursts is necessary, as it is in a bucket that
 fills evenly. A price spreads the spending over time: it rises with each message and falls while
-nothing is sent, and so finds the level at which as much is worth sending as may be sent (dual ascent
-on the constraint). It moves slowly, so that all messages of some minutes have nearly the same price,
-and starts where the budget alone lets expect it: what is sent for less at first is missing later.
-The price does not fall while only the limits hold back a message: otherwise the first message after
-each full window would be sent, however small its value.
+nothing is sent, and so finds the level at which as much is worth sending as may be sent (dual
+ascent on the constraint). It moves slowly, so that all messages of some minutes have nearly the
+same price, and it starts high: what is sent for little at first is missing later. The price does
+not fall while only the limits hold back a message: otherwise the first message after each full
+window would be sent, however small its value.
 """
 
 import math
