@@ -26,9 +26,8 @@ LOST_HEADING_SIGMA_RAD = math.pi / math.sqrt(3.0)  # of a uniform distribution
 USUAL_HEADING_SIGMA_RAD = math.radians(10.0)  # assumed: a tier describes the position only
 HEADING_DRIFT_RAD_PER_SQRT_M = 0.1  # heading sigma that a teammate gains, a random walk
 HEADING_WAY_M = 1.0  # over which a heading's error is counted as one of the position
-SUBSCRIBER_DRIFT_M_S = 0.005  # error that a subscriber is assumed to gain between two beliefs
+SUBSCRIBER_DRIFT_M_S = 0.01  # error that a subscriber is assumed to gain between two beliefs
 UNKNOWN_AGE_S = 60.0  # since the last help for a teammate, as long as there was none
-LEAST_VALUE = 0.17  # m sqrt(s): 3 cm after half a minute
 
 
 class HeadingMemory(NamedTuple):

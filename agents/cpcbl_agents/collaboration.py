@@ -249,18 +249,10 @@ class CollaborationAgent:
         if not self._may_help(fix, tier):
             return []
         offer = self._offer(fix, tier)
-        if offer.gain >= self._least_gain(offer):
+        if offer.gain >= self._rules.least_value:
             return [offer]
         self.counters.of("fix", fix.robot).worthless += 1
         return []
-
-    def _least_gain(self, offer: _Offer) -> float:
-        """The information gain from which on a fix is sent: a budget asks for more, but not for a
-        lost teammate, nor where `least_value` is 0."""
-        least = self._rules.least_value
-        if offer.urgent or not least:
-            return least
-        return max(least, self.budget.least_gain(_size(offer.fix)))
 
     def _affordable(self, offers: list[_Offer], now_ns: int) -> list[Fix]:
         """The fixes that the budget admits, the one with the largest value first."""
@@ -334,14 +326,14 @@ class CollaborationAgent:
 
     def _affords(self, now_ns: int, size: int, value: float, urgent: bool) -> bool:
         """Whether a message of this value may be sent; if so, the budget is charged at once."""
-        budget, least = self.budget, gains.LEAST_VALUE if self._rules.least_value else 0.0
-        if not urgent and value < budget.price(now_ns, size):
+        budget, competes = self.budget, not urgent and self._rules.least_value > 0.0
+        if competes and value < budget.price(now_ns, size):
             return False
         admitted = budget.admits(now_ns, size, urgent)
         if admitted:
-            budget.spend(now_ns, size, least)
+            budget.spend(now_ns, size)
         else:
-            budget.refuse(now_ns, least)
+            budget.refuse(now_ns)
         return admitted
 
     def _record_sent(self, sent: agent.HelpSent, now_ns: int) -> None:

@@ -87,13 +87,12 @@ def test_both_ways_sends_uphill_too() -> None:
 
 
 def test_a_budget_is_not_spent_without_a_subscriber() -> None:
-    stand = helper(budget=BudgetSettings(messages_per_minute=1.0, urgent_share=0.0))
+    stand = helper(budget=BudgetSettings(messages_per_minute=60.0, urgent_share=0.0))
     exchange(stand)
     ear = stand.ear(topics.FIX.at(robot="mate"))
     exchange(stand)
-    assert len(ear.messages) == 1
     (spending,) = stand.status("me").spending
-    assert (spending.most, spending.allowed) == (1.0, 1.0)
+    assert 0 < len(ear.messages) == spending.most
 
 
 def test_a_robot_subscribes_only_to_teammates_in_sight() -> None:

@@ -16,7 +16,6 @@ from cpcbl_transport.budget import Budget, bytes_window
 from cpcbl_transport.messages import Spending
 
 FIX, BELIEF = 42, 50
-LEAST = 0.05
 HOUR = 3600 * SECOND
 
 
@@ -49,7 +48,7 @@ def granted(budget: Budget, wishes: Sequence[Wish]) -> list[Wish]:
     sent = []
     for wish in wishes:
         if budget.admits(*wish):
-            budget.spend(wish.at_ns, wish.size, LEAST)
+            budget.spend(wish.at_ns, wish.size)
             sent.append(wish)
     return sent
 
@@ -89,18 +88,18 @@ def test_no_window_holds_more_bytes_than_allowed(
 
 
 def test_of_several_limits_the_tightest_makes_the_price() -> None:
-    """It falls by e in the time in which three messages are earned: here 3 minutes."""
-    limits = BudgetSettings(bytes_per_s=1000.0, messages_per_minute=1.0)
+    """It falls by e in the time in which 20 messages are earned: here 20 minutes."""
+    limits = BudgetSettings(bytes_per_s=1000.0, messages_per_minute=1.0, urgent_share=0.0)
     budget = Budget(limits, 0)
-    budget.spend(0, 42, 0.1)
+    budget.spend(0, 42)
     at_once, later = budget.price(0, 42), budget.price(10 * 1_000_000_000, 42)
-    assert later == pytest.approx(at_once * math.exp(-10.0 / 180.0))
+    assert later == pytest.approx(at_once * math.exp(-10.0 / 1200.0))
 
 
 @pytest.mark.parametrize(
     ("bytes_per_s", "most", "window_s"),
     [
-        *((1.0, 120.0, 120.0), (2.0, 120.0, 60.0), (5.0, 300.0, 60.0)),
+        *((1.0, 500.0, 500.0), (2.0, 500.0, 250.0), (5.0, 500.0, 100.0)),
         *((20.0, 500.0, 25.0), (50.0, 500.0, 10.0), (200.0, 2000.0, 10.0)),
     ],
 )
@@ -189,9 +188,9 @@ def test_what_is_taken_back_can_be_spent_again() -> None:
     settings = BudgetSettings(bytes_per_s=50.0, messages_per_minute=3.0, urgent_share=0.0)
     budget = Budget(settings, 0, match_rate_hz=1.0)
     for _ in range(10):
-        budget.spend(5 * SECOND, FIX, LEAST)
+        budget.spend(5 * SECOND, FIX)
         budget.refund(5 * SECOND, FIX)
-    assert budget.price(5 * SECOND, FIX) <= LEAST
+    assert budget.price(5 * SECOND, FIX) <= Budget(settings, 0, 1.0).price(0, FIX)
     assert len(granted(budget, [Wish(5 * SECOND, FIX)] * 5)) == 3
 
 
@@ -237,20 +236,6 @@ def test_a_match_has_no_more_messages_however_early_the_robot_is_switched_on(fir
     assert (spending.most, spending.allowed) == (300.0, 300.0)
 
 
-# The least gain ---------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("bytes_per_s", "least"),
-    [(0.0, 0.0), (42.0, math.log(1.2)), (8.4, math.log(2.0)), (0.5, math.log(2.0))],
-)
-def test_the_slower_a_fix_is_earned_the_more_it_must_gain_up_to_half_the_ellipse(
-    bytes_per_s: float, least: float
-) -> None:
-    budget = Budget(BudgetSettings(bytes_per_s=bytes_per_s), 0)
-    assert budget.least_gain(FIX) == pytest.approx(least, abs=1e-3)
-
-
 # The price --------------------------------------------------------------------------------------
 
 LIMITED = [
@@ -264,17 +249,30 @@ LIMITED = [
 def test_the_price_rises_with_each_message_and_falls_while_nothing_is_sent(
     budget: Budget,
 ) -> None:
-    assert budget.price(0, FIX) == 0.0
-    prices = []
-    for _ in range(10):
-        budget.spend(SECOND, FIX, LEAST)
-        prices.append(budget.price(SECOND, FIX))
+    prices = [budget.price(0, FIX)]
+    for _ in range(40):
+        budget.spend(0, FIX)
+        prices.append(budget.price(0, FIX))
     assert prices == sorted(prices)
-    assert prices[0] >= LEAST
-    assert prices[-1] > 10 * prices[0]
-    later = [budget.price(SECOND * n, FIX) for n in range(1, 600)]
+    assert prices[-1] == pytest.approx(math.exp(2.0) * prices[0])
+    later = [budget.price(10 * SECOND * n, FIX) for n in range(600)]
     assert later == sorted(later, reverse=True)
-    assert later[-1] < LEAST < later[0]
+    assert 0.0 < later[-1] < 0.2 * prices[0]
+
+
+def test_the_price_stays_where_as_much_is_sent_as_is_not_reserved() -> None:
+    """Four fifths of 42 B/s are four fixes in 5 s."""
+    budget = Budget(BudgetSettings(bytes_per_s=42.0), 0)
+    at_first = budget.price(0, FIX)
+    for n in range(1, 400):
+        budget.spend(n * 1250 * MS, FIX)
+    assert budget.price(400 * 1250 * MS, FIX) == pytest.approx(at_first, rel=0.1)
+
+
+def test_at_the_start_half_the_square_of_the_price_is_the_time_that_earns_a_message() -> None:
+    for rate in (1.0, 2.0, 42.0):
+        budget = Budget(BudgetSettings(bytes_per_s=rate), 0)
+        assert budget.price(0, FIX) == pytest.approx(math.sqrt(2.0 * FIX / rate))
 
 
 def test_the_price_does_not_fall_while_only_the_limits_hold_back_messages() -> None:
@@ -283,16 +281,16 @@ def test_the_price_does_not_fall_while_only_the_limits_hold_back_messages() -> N
     price = budget.price(0, FIX)
     for second in range(1, 30):
         assert not budget.admits(second * SECOND, FIX, urgent=False)
-        budget.refuse(second * SECOND, LEAST)
+        budget.refuse(second * SECOND)
     assert budget.price(29 * SECOND, FIX) == price
     assert budget.price(59 * SECOND, FIX) < price
 
 
-def test_a_small_message_after_a_large_one_costs_little_less_than_before() -> None:
-    """There is one price: it fades by the time in which the message at hand is earned."""
+def test_there_is_one_price_for_the_square_of_the_value_of_a_byte() -> None:
     budget = Budget(BudgetSettings(bytes_per_s=100.0), 0)
-    budget.spend(0, BELIEF, LEAST)
-    assert budget.price(0, FIX) == budget.price(0, BELIEF)
+    budget.spend(0, BELIEF)
+    fix, belief = (budget.price(0, size) ** 2 / size for size in (FIX, BELIEF))
+    assert fix == pytest.approx(belief)
 
 
 @examples(100)
@@ -302,7 +300,7 @@ def test_without_limits_all_is_admitted_and_nothing_has_a_price(wishes: list[Wis
     for wish in wishes:
         assert budget.price(wish.at_ns, wish.size) == 0.0
         assert budget.admits(*wish)
-        budget.spend(wish.at_ns, wish.size, LEAST)
+        budget.spend(wish.at_ns, wish.size)
     assert budget.spending(HOUR) == ()
 
 
@@ -314,10 +312,10 @@ def values_sent(budget: Budget, values: Sequence[float], *, at_a_price: bool) ->
         if at_a_price and value < budget.price(now_ns, FIX):
             continue
         if budget.admits(now_ns, FIX, urgent=False):
-            budget.spend(now_ns, FIX, LEAST)
+            budget.spend(now_ns, FIX)
             sent.append(value)
         else:
-            budget.refuse(now_ns, LEAST)
+            budget.refuse(now_ns)
     return sent
 
 

@@ -1,11 +1,13 @@
-"""What a robot may still spend on messages, and the gain and value that a message must have.
+"""What a robot may still spend on messages, and the value that a message must have.
 
 A limit is a token bucket whose tokens return one window after they were spent. So no window ever
 contains more than is allowed, and no reserve for bursts is necessary, as it is in a bucket that
-fills evenly. A price spreads the spending over time: it falls while nothing is sent and rises with
-each message, and so finds the level at which as much is worth sending as may be sent (dual ascent
-on the constraint). The price does not fall while only the limits hold back a message: otherwise the
-first message after each full window would be sent, however small its gain.
+fills evenly. A price spreads the spending over time: it rises with each message and falls while
+nothing is sent, and so finds the level at which as much is worth sending as may be sent (dual
+ascent on the constraint). It moves slowly, so that all messages of some minutes have nearly the
+same price, and it starts high: what is sent for little at first is missing later. The price does
+not fall while only the limits hold back a message: otherwise the first message after each full
+window would be sent, however small its value.
 """
 
 import math
@@ -14,22 +16,22 @@ from collections import deque
 from cpcbl_team.config import BudgetSettings
 from cpcbl_transport.messages import Spending
 
-SHORTEST_WINDOW_S, LONGEST_WINDOW_S = 10.0, 60.0
-LEAST_BYTES = 120.0  # in a window, so that a small budget can be used up by whole messages
-USUAL_BYTES = 500.0  # in a window whose time is between these two
-DOUBLING_S = 5.0  # in which the error ellipse of a robot without help is assumed to double
-PRICE_MEMORY = 3.0  # messages: in the time in which so many are earned, the price falls by e
+SHORTEST_WINDOW_S = 10.0
+LEAST_BYTES = 500.0  # in a window, so that a small budget can be used up by whole messages
+PRICE_MEMORY = 20.0  # messages: in the time in which so many are earned, the price falls by e
+# At the start, half the variance that a message removes, times its age, must be so much for each
+# second in which the message is earned: 0.33 m^2 a minute after the last help if these are ten.
+START_PRICE_M2 = 1.0
+LEAST_PRICE = 0.03  # of that at the start
 _ROUNDING = 1e-9
 
 
 def bytes_window(bytes_per_s: float) -> tuple[float, float]:
     """The window of a limit in bytes: what may be spent in it, and its seconds.
 
-    A short one spreads the messages: after many at once a small budget would be silent for minutes.
-    A long one lets robots that meet say more.
+    The window of a small budget is long, so that robots that meet may say more than usual.
     """
-    most = min(max(LONGEST_WINDOW_S * bytes_per_s, LEAST_BYTES), USUAL_BYTES)
-    most = max(most, SHORTEST_WINDOW_S * bytes_per_s)
+    most = max(LEAST_BYTES, SHORTEST_WINDOW_S * bytes_per_s)
     return most, most / bytes_per_s
 
 
@@ -98,7 +100,8 @@ class Budget:
         match_s: float = math.inf,
     ) -> None:
         s = settings
-        self._price, self._price_ns = 0.0, start_ns
+        self._price, self._price_ns = 1.0, start_ns  # as a multiple of that at the start
+        self._spent_share = max(0.1, 1.0 - s.urgent_share)  # to which the price leads
         windows = []
         if s.bytes_per_s:
             most, window_s = bytes_window(s.bytes_per_s)
@@ -121,21 +124,16 @@ class Budget:
         )
 
     def price(self, now_ns: int, size: int) -> float:
-        """The least value that a message of this size must have, in the unit of `spend`."""
+        """The least value (m sqrt(s)) that a message of this size must have; 0 without limits."""
         earned_s = self._earned_s(size)
         if earned_s == 0.0:
             return 0.0
-        memory_s = PRICE_MEMORY * earned_s
-        return self._price * math.exp((self._price_ns - now_ns) * 1e-9 / memory_s)
+        return math.sqrt(2.0 * START_PRICE_M2 * earned_s) * self._multiple(now_ns, earned_s)
 
-    def least_gain(self, size: int) -> float:
-        """The least information gain (nats) that a fix of this size must have: it shrinks the
-        ellipse by at least as much as that grows while the fix is earned, at most to half."""
-        return math.log1p(min(1.0, self._earned_s(size) / DOUBLING_S))
-
-    def spend(self, now_ns: int, size: int, least: float) -> None:
-        """A message of this size is sent; its price was at least `least`."""
-        self._price = max(self.price(now_ns, size), least) * math.exp(1.0 / PRICE_MEMORY)
+    def spend(self, now_ns: int, size: int) -> None:
+        """A message of this size is sent."""
+        if earned_s := self._earned_s(size):
+            self._price = self._multiple(now_ns, earned_s) * math.exp(1.0 / PRICE_MEMORY)
         self._price_ns = now_ns
         for limit, amount in self._costs(size):
             limit.spend(now_ns, amount)
@@ -146,13 +144,18 @@ class Budget:
         for limit, amount in self._costs(size):
             limit.spend(now_ns, -amount)
 
-    def refuse(self, now_ns: int, least: float) -> None:
-        """A message with enough value, at least `least`, is not admitted by the limits."""
-        self._price, self._price_ns = max(self._price, least), now_ns
+    def refuse(self, now_ns: int) -> None:
+        """A message with enough value is not admitted by the limits."""
+        self._price_ns = now_ns
 
     def spending(self, now_ns: int) -> tuple[Spending, ...]:
         """Its limits, and the largest use of each so far."""
         return tuple(limit.spending(now_ns) for limit in self._limits)
+
+    def _multiple(self, now_ns: int, earned_s: float) -> float:
+        """The price as a multiple of that at the start."""
+        messages = (now_ns - self._price_ns) * 1e-9 / earned_s * self._spent_share
+        return max(LEAST_PRICE, self._price * math.exp(-messages / PRICE_MEMORY))
 
     def _earned_s(self, size: int) -> float:
         """The seconds in which a message of this size is earned; 0 without limits."""

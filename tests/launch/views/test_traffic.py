@@ -265,7 +265,7 @@ def test_a_running_team_is_watched_with_the_command_that_up_says(
     assert report["robots"]["giver"]["messages_sent"] > 0
     assert report["team"]["within_budget"] is True
     assert "Every robot kept every limit" in text
-    assert "of 300 B in 60 s" in text
+    assert "of 500 B in 100 s" in text
     assert max(map(len, text.splitlines())) <= 80
 
 
