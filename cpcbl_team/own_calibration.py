@@ -107,10 +107,13 @@ class OwnCalibration:
         now = Corrected(state.stamp_ns, state.estimate, state.odometry_from_robot, gaps)
         memory, accepted = state.memory.calibration, state.updates.accepted
         check, present, begin = memory.check, memory.adaptation, memory.check.begin
-        if state.memory.recovery.lost or state.odometry_until_ns < state.stamp_ns:
-            check = check._replace(begin=None)
-        elif begin is None or state.memory.teammates.last_report_ns >= begin.stamp_ns:
-            check = check._replace(begin=now)
+        if (
+            begin is None
+            or state.memory.recovery.lost
+            or state.odometry_until_ns < state.stamp_ns
+            or state.memory.teammates.last_report_ns >= begin.stamp_ns
+        ):
+            check = check.from_pose(now)
         else:
             noise = noise_with_factor(self._noise, present.motion_factor)
             check = check_models(check, now, noise)

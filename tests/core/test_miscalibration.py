@@ -31,13 +31,14 @@ from cpcbl_team.config import (
     Variant,
     Wall,
 )
-from cpcbl_team.constant_errors import Evidence, Whitened
+from cpcbl_team.constant_errors import INSENSITIVE, Evidence, Whitened
 from cpcbl_team.geometry import Pose2, step
 from cpcbl_team.inputs import Odometry, Sightings
 from cpcbl_team.localizer import Localizer
 from cpcbl_team.miscalibration import (
     AS_CONFIGURED,
     Adaptation,
+    Corrected,
     ModelCheck,
     adapted,
     noise_with_factor,
@@ -188,6 +189,22 @@ def test_a_block_with_a_gap_or_a_report_does_not_count() -> None:
     assert blocks_after(robot, robot.start(0), 12) > 4.0
     assert blocks_after(robot, robot.start(0), 12, gap=True) == 0.0
     assert blocks_after(robot, robot.start(0), 12, report=True) == 0.0
+
+
+@pytest.mark.parametrize("why", ["lost", "report"])
+def test_a_block_after_one_that_does_not_count_begins_without_sensitivity(why: str) -> None:
+    """The pose of a robot that was lost, or that a teammate moved, owes nothing to the constant
+    errors of the blocks before."""
+    robot, check = robot_of(), ModelCheck(sensitivity=(1.0,) * 9)
+    begin = Corrected(0, robot.start(0).estimate, Pose2(0.0, 0.0, 0.0), 0)
+    check = check._replace(begin=None if why == "lost" else begin)
+    state = robot.start(0)._replace(memory=Memory(calibration=CalibrationMemory(check=check)))
+    state = robot.add_odometry(state, Odometry(0, 2 * SECOND, 0.0, 0.0))
+    if why == "report":
+        state = robot.add_teammate_belief(state, belief(1.0, 0.0, SECOND))
+    after = robot.cycle(state, frame(LOOP_START, 2 * SECOND)).memory.calibration.check
+    assert after.begin is not None
+    assert (after.begin.stamp_ns, after.sensitivity) == (2 * SECOND, INSENSITIVE)
 
 
 def test_an_object_that_is_rejected_again_and_again_says_nothing() -> None:
