@@ -242,13 +242,15 @@ def main() -> None:
     logged = load_logged_team(team, options.data)
     blind = [name for name in options.blind.split(",") if name]
     logged = logged._replace(team=with_blind_robots(logged.team, blind, logged.left_out))
-    lines = ["| | RMSE m | heading deg | NEES | used |", "|---|---|---|---|---|"]
+    console = Console(highlight=False, soft_wrap=True)
+    console.print("| | RMSE m | heading deg | NEES | used |\n|---|---|---|---|---|")
     for label, changes in CHANGES.items():
-        lines += [f"| {' | '.join(cells)} |" for cells in rows(logged, label, changes)]
+        for cells in rows(logged, label, changes):
+            console.print(f"| {' | '.join(cells)} |")
     with tempfile.TemporaryDirectory() as folder:
         exact = with_true_turns(logged, Path(folder))
-        lines += [f"| true turns: {' | '.join(cells)} |" for cells in rows(exact, "the team", {})]
-    Console().print("\n".join(lines), highlight=False, soft_wrap=True)
+        for cells in rows(exact, "the team", {}):
+            console.print(f"| true turns: {' | '.join(cells)} |")
 
 
 if __name__ == "__main__":
