@@ -71,7 +71,7 @@ class Localizer:
         self._moves = settings.odometry.moves
         self._odometry_timeout_ns = int(settings.odometry.timeout_s * 1e9)
         self._has_dead_zone = settings.odometry.least_speed_m_s > 0.0
-        self._calibration = OwnCalibration(settings)
+        self._calibration = OwnCalibration(settings, field)
         self._widens = rules.variant != "weighted" and not rules.paper_uncertainty
         self._window = rules.lost_window
         self._belief_age_ns = int(settings.collaboration.max_age_s * 1e9)

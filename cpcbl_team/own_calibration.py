@@ -6,7 +6,7 @@ other one changes its settings only where they are wrong (`miscalibration.py`).
 
 from collections.abc import Sequence
 
-from cpcbl_team.config import LocalizationSettings, OdometryNoise
+from cpcbl_team.config import Field, LocalizationSettings, OdometryNoise
 from cpcbl_team.constant_errors import NO_ERRORS, Evidence, pose_offset
 from cpcbl_team.estimate import POSE, offset_pose
 from cpcbl_team.geometry import new
@@ -30,7 +30,7 @@ from cpcbl_team.state import CalibrationMemory, Memory, State, with_memory
 class OwnCalibration:
     """The calibration of one robot by itself."""
 
-    def __init__(self, settings: LocalizationSettings) -> None:
+    def __init__(self, settings: LocalizationSettings, field: Field) -> None:
         rules = settings.localizer
         self._noise: OdometryNoise = settings.odometry
         self._gate_probability = rules.gate_probability
@@ -38,6 +38,8 @@ class OwnCalibration:
         # The others do not know how large a correction should be
         knows_covariance = rules.variant in ("joint", "oval") and not rules.paper_uncertainty
         self._is_checked = knows_covariance and not rules.learns
+        # Of two that contradict each other either one may be wrong
+        self._names_misplaced = len(field.landmarks) + len(field.walls) > 2
         block_s = BLOCK_NS * 1e-9
         self._independent_share = block_s / (block_s + 2.0 * settings.sensor.correlation_s)
 
@@ -79,7 +81,11 @@ class OwnCalibration:
         memory = state.memory.calibration
         if not names or state.memory.recovery.lost or not self._is_checked:
             return state
-        return _with_calibration(state, memory._replace(check=memory.check.with_rejections(names)))
+        check, rejections = memory.check.with_rejections(names), memory.rejections
+        if self._names_misplaced:
+            rejections = rejections.plus(names, state.stamp_ns, state.updates.accepted)
+        memory = memory._replace(check=check, rejections=rejections)
+        return _with_calibration(state, memory)
 
     def after_update(self, state: State) -> State:
         """The state after an update of the pose, with what the robot learns from it."""
@@ -108,10 +114,13 @@ class OwnCalibration:
         now = Corrected(state.stamp_ns, state.estimate, state.odometry_from_robot, gaps)
         memory, accepted = state.memory.calibration, state.updates.accepted
         check, present, begin = memory.check, memory.adaptation, memory.check.begin
-        if state.memory.recovery.lost or state.odometry_until_ns < state.stamp_ns:
-            check = check._replace(begin=None)
-        elif begin is None or state.memory.teammates.last_report_ns >= begin.stamp_ns:
-            check = check._replace(begin=now)
+        if (
+            begin is None
+            or state.memory.recovery.lost
+            or state.odometry_until_ns < state.stamp_ns
+            or state.memory.teammates.last_report_ns >= begin.stamp_ns
+        ):
+            check = check.from_pose(now)
         else:
             noise = noise_with_factor(self._noise, present.motion_factor)
             check = check_models(check, now, noise)
@@ -129,8 +138,8 @@ class OwnCalibration:
                 evidence = check.evidence.without(errors) if has_errors else Evidence()
                 check = ModelCheck(now, check.sensitivity, evidence, accepted=accepted)
                 state, present = state.counted("miscalibrated"), changed
-        learned, references, total_turn_rad, _, _ = memory
-        parts = learned, references, total_turn_rad, check, present
+        learned, references, total_turn_rad, _, _, rejections = memory
+        parts = learned, references, total_turn_rad, check, present, rejections
         return _with_calibration(state, new(CalibrationMemory, parts))
 
 

@@ -14,6 +14,7 @@ from cpcbl_team.estimate import Covariance3, Estimate
 from cpcbl_team.fixes import PoseObservation
 from cpcbl_team.landmarks import Landmarks
 from cpcbl_team.measurements import Measurement
+from cpcbl_team.miscalibration import MapRejections
 from cpcbl_team.relocalization import relocalize
 from cpcbl_team.state import (
     FIX,
@@ -287,7 +288,9 @@ class Recovery:
             recovery=recovery._replace(lost="", kidnapped_ns=-1),
             teammates=teammates._replace(senders=reset_scores(teammates.senders)),
             calibration=calibration._replace(
-                references=None, check=calibration.check.restarted(state.updates.accepted)
+                references=None,
+                check=calibration.check.restarted(state.updates.accepted),
+                rejections=MapRejections(stamp_ns=state.stamp_ns, counted=state.updates.accepted),
             ),
         )
         updates = state.updates._replace(innovations=1)

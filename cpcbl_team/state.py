@@ -15,7 +15,7 @@ from cpcbl_team.config import Field, Start
 from cpcbl_team.estimate import HEADING, POSE, POSITION, Covariance3, Estimate, Scope
 from cpcbl_team.geometry import Pose2, new, wrap_angle
 from cpcbl_team.inputs import Belief, Odometry, Sighting
-from cpcbl_team.miscalibration import AS_CONFIGURED, Adaptation, ModelCheck
+from cpcbl_team.miscalibration import AS_CONFIGURED, Adaptation, MapRejections, ModelCheck
 from cpcbl_team.self_calibration import ReferencePoses, SelfCalibration
 from cpcbl_team.trust import SenderRecord
 
@@ -121,6 +121,7 @@ class CalibrationMemory(NamedTuple):
     total_turn_rad: float = 0.0  # of the odometry since the start
     check: ModelCheck = ModelCheck()
     adaptation: Adaptation = AS_CONFIGURED
+    rejections: MapRejections = MapRejections()
 
     @property
     def corrected(self) -> SelfCalibration:

@@ -7,7 +7,7 @@ from cpcbl_agents.agent import AgentMessage, FrameEstimate, PoseEstimate, Presen
 from cpcbl_team.config import Field, LocalizationSettings
 from cpcbl_team.inputs import Belief, BeliefShared, Fix, Input, Odometry, Position, Sightings
 from cpcbl_team.localizer import Localizer
-from cpcbl_team.miscalibration import sigma_percentages
+from cpcbl_team.miscalibration import MISPLACED, sigma_percentages
 from cpcbl_team.self_calibration import SelfCalibration
 from cpcbl_team.sensors import without_bearing_bias
 from cpcbl_team.timeline import Timeline
@@ -42,9 +42,13 @@ class FilterAgent:
 
     @property
     def all_counts(self) -> Counter[str]:
-        """What this agent refused, and what the localizer used and gated."""
-        calibration = self.timeline.state.memory.calibration
+        """What this agent refused, what the localizer used and gated, and what it finds wrong in
+        the settings and the map."""
+        state = self.timeline.state
+        calibration = state.memory.calibration
         factors = sigma_percentages(calibration.adaptation)
+        if name := calibration.rejections.misplaced(state.stamp_ns):
+            factors[MISPLACED + name] = 1
         return self.counts + Counter(self.timeline.state.counts) + Counter(factors)
 
     @property

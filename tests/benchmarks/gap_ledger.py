@@ -5,13 +5,15 @@
 Rows of a team change one setting. "All help in order" scores the estimate at a time after all fixes
 and beliefs of that time have arrived. "Messages of" a team is a centralized EKF that gets of the
 sightings between robots only those that the team used, so it knows all correlations but nothing
-more. "No help" and a solo EKF differ in the filter alone. "True turns" replaces the odometry's
-turns by those of the truth, for every filter. The last column counts sightings used as help.
+more. "No help" and a solo EKF differ in the filter alone. The "iterated" one linearizes each update
+again at its result. "Headings without help": sightings between robots correct positions alone.
+"True turns" replaces the odometry's turns by those of the truth, for every filter. The last column
+counts sightings used as help.
 """
 
 import argparse
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -30,10 +32,15 @@ from cpcbl_launch.run.logged_team import LoggedTeam, builtin_for, load_logged_te
 from cpcbl_launch.simulation.in_process import run_nodes
 from cpcbl_launch.team_file import find_team
 from cpcbl_team.config import Team
+from cpcbl_team.estimate import Estimate, Scope
+from cpcbl_team.fusion import Observation
+from cpcbl_team.geometry import Pose2
+from cpcbl_team.inputs import Sighting
 from cpcbl_team.state import FIX
 from cpcbl_transport.memory_bus import MemoryHub
 
 LATEST_NS = 1_000_000_000  # help that arrives later than this after its time counts as lost
+WITHOUT = "headings without help"
 CHANGES: dict[str, dict[str, Any]] = {  # of [collaboration], each alone
     "the team": {},
     "help both ways": {"direction": "both-ways"},
@@ -41,9 +48,47 @@ CHANGES: dict[str, dict[str, Any]] = {  # of [collaboration], each alone
     "fixes only": {"passive": False},
     "beliefs only": {"active": False},
     "naive fusion": {"fusion": "naive"},
+    WITHOUT: {},
     "no help": {"passive": False, "active": False},
 }
 Helped = set[tuple[str, str, int]]  # observer, seen robot, time of the sighting
+Merge = Callable[[Estimate, Observation, Scope], Estimate]
+
+
+class IteratedEkf(baselines.Ekf):
+    """Its updates are linearized at their results."""
+
+    iterations = 5
+
+
+class PositionsHelpedEkf(baselines.Ekf):
+    """Sightings between robots correct the positions of all robots and no heading (the headings are
+    considered, as in the filter of Schmidt)."""
+
+    def update(
+        self,
+        robot: baselines.RobotBlock,
+        mate: baselines.RobotBlock | None,
+        sighting: Sighting,
+        inflation: float,
+    ) -> bool | None:
+        headings, variances = self.mean[2::3].copy(), self.covariance[2::3, 2::3].copy()
+        accepted = super().update(robot, mate, sighting, inflation)
+        if mate is not None and accepted:
+            self.mean[2::3], self.covariance[2::3, 2::3] = headings, variances
+        return accepted
+
+
+def positions_helped(merge: Merge) -> Merge:
+    """A merge of a teammate's help with the estimate, which leaves the heading as it was."""
+
+    def merged(prior: Estimate, observation: Observation, scope: Scope) -> Estimate:
+        (x, y, _), p, shared = merge(prior, observation, scope)
+        more = max(prior.covariance.hh - p.hh, 0.0)
+        p, shared = (c._replace(hh=c.hh + more) for c in (p, shared))
+        return Estimate(Pose2(x, y, prior.pose.heading), p, shared)
+
+    return merged
 
 
 class WatchedNode:
@@ -75,12 +120,17 @@ class WatchedNode:
                 self.estimates.append((then.stamp_ns, np.array(pose), matrix))
 
 
-def run_team(logged: LoggedTeam) -> tuple[Recorder, dict[str, Trajectory], Helped]:
+def run_team(
+    logged: LoggedTeam, helps_headings: bool = True
+) -> tuple[Recorder, dict[str, Trajectory], Helped]:
     """What was recorded, the estimates after late help, and the help that was used."""
     hub = MemoryHub()
     recorder, nodes = Recorder(hub.session()), {}
     for name in logged.team.robots:
         robot = build_robot(name, logged.team, logged.start_ns)
+        if not helps_headings:
+            variant: Any = robot.filter.timeline._localizer._variant
+            variant._merge_teammate = positions_helped(variant._merge_teammate)
         node = Node(robot, logged.team, hub.session(), logged.start_ns, "0")
         nodes[name] = WatchedNode(node, name, robot)
     run_nodes([*nodes.values()], logged.start_ns, logged.end_ns)
@@ -140,23 +190,37 @@ def only_helped(
 def rows(logged: LoggedTeam, label: str, changes: dict[str, Any]) -> Iterator[tuple[str, ...]]:
     """The row of the team with these changes, and those of filters on its messages."""
     changed = logged._replace(team=with_collaboration(logged.team, changes))
-    recorder, late, helped = run_team(changed)
+    recorder, late, helped = run_team(changed, label != WITHOUT)
     tracks = {name: recorder.trajectory(name) for name in logged.team.robots}
     yield row(label, tracks, logged, f"{len({h for h in helped if h[1] in tracks})}")
-    if not changes or "direction" in changes:
+    if label == WITHOUT:
+        yield ekf_row(f"centralized EKF, {label}", changed, tracks, PositionsHelpedEkf)
+    elif not changes or "direction" in changes:
         if not changes:
             yield row(f"{label}, all help in order", late, logged)
-        stamps_ns = {name: path.stamps_ns.tolist() for name, path in tracks.items()}
-        inputs = baselines.baseline_inputs(changed)
-        ekf = baselines.run_ekf(only_helped(inputs, helped), logged.team.map, stamps_ns)
-        yield row(f"centralized EKF, messages of {label}", ekf, logged)
+        yield ekf_row(f"centralized EKF, messages of {label}", changed, tracks, helped=helped)
         if not changes:
-            every = baselines.run_ekf(inputs, logged.team.map, stamps_ns)
-            yield row("centralized EKF", every, logged)
-            solo = [
-                baselines.run_ekf({n: i}, logged.team.map, stamps_ns) for n, i in inputs.items()
-            ]
-            yield row("a solo EKF each", {n: p for one in solo for n, p in one.items()}, logged)
+            yield ekf_row("centralized EKF", changed, tracks)
+            yield ekf_row("iterated centralized EKF", changed, tracks, IteratedEkf)
+            yield ekf_row("a solo EKF each", changed, tracks, solo=True)
+
+
+def ekf_row(
+    label: str,
+    logged: LoggedTeam,
+    tracks: dict[str, Trajectory],
+    kind: type[baselines.Ekf] = baselines.Ekf,
+    helped: Helped | None = None,
+    solo: bool = False,
+) -> tuple[str, ...]:
+    """The row of one EKF over all robots at the times of the team's estimates, or of one each."""
+    inputs, field = baselines.baseline_inputs(logged), logged.team.map
+    if helped is not None:
+        inputs = only_helped(inputs, helped)
+    stamps_ns = {name: path.stamps_ns.tolist() for name, path in tracks.items()}
+    groups = [{name: own} for name, own in inputs.items()] if solo else [inputs]
+    paths = [baselines.run_ekf(group, field, stamps_ns, kind) for group in groups]
+    return row(label, {name: path for one in paths for name, path in one.items()}, logged)
 
 
 def row(
@@ -178,13 +242,15 @@ def main() -> None:
     logged = load_logged_team(team, options.data)
     blind = [name for name in options.blind.split(",") if name]
     logged = logged._replace(team=with_blind_robots(logged.team, blind, logged.left_out))
-    lines = ["| | RMSE m | heading deg | NEES | used |", "|---|---|---|---|---|"]
+    console = Console(highlight=False, soft_wrap=True)
+    console.print("| | RMSE m | heading deg | NEES | used |\n|---|---|---|---|---|")
     for label, changes in CHANGES.items():
-        lines += [f"| {' | '.join(cells)} |" for cells in rows(logged, label, changes)]
+        for cells in rows(logged, label, changes):
+            console.print(f"| {' | '.join(cells)} |")
     with tempfile.TemporaryDirectory() as folder:
         exact = with_true_turns(logged, Path(folder))
-        lines += [f"| true turns: {' | '.join(cells)} |" for cells in rows(exact, "the team", {})]
-    Console().print("\n".join(lines), highlight=False, soft_wrap=True)
+        for cells in rows(exact, "the team", {}):
+            console.print(f"| true turns: {' | '.join(cells)} |")
 
 
 if __name__ == "__main__":

@@ -1,10 +1,12 @@
 """A robot whose settings are wrong notices it by itself, corrects them, and stays consistent."""
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 from support.core import (
     CORNERS,
     LOOP_START,
@@ -31,13 +33,15 @@ from cpcbl_team.config import (
     Variant,
     Wall,
 )
-from cpcbl_team.constant_errors import Evidence, Whitened
+from cpcbl_team.constant_errors import INSENSITIVE, Evidence, Whitened
 from cpcbl_team.geometry import Pose2, step
 from cpcbl_team.inputs import Odometry, Sightings
 from cpcbl_team.localizer import Localizer
 from cpcbl_team.miscalibration import (
     AS_CONFIGURED,
     Adaptation,
+    Corrected,
+    MapRejections,
     ModelCheck,
     adapted,
     noise_with_factor,
@@ -64,13 +68,15 @@ class Truth(NamedTuple):
     sensor_sigmas: float = 1.0
 
 
-def robot_of(variant: Variant = "joint") -> Localizer:
-    return localizer(variant, CORNERS, start=START, sensor=SENSOR, odometry=OdometrySettings())
+def robot_of(variant: Variant = "joint", field: Field = CORNERS) -> Localizer:
+    return localizer(variant, field, start=START, sensor=SENSOR, odometry=OdometrySettings())
 
 
-def run(truth: Truth, seed: int, variant: Variant = "joint") -> tuple[State, float]:
+def run(
+    truth: Truth, seed: int, variant: Variant = "joint", field: Field = CORNERS
+) -> tuple[State, float]:
     """The state after some minutes on the loop, and the NEES of the position in the last third."""
-    rng, robot = np.random.default_rng(seed), robot_of(variant)
+    rng, robot = np.random.default_rng(seed), robot_of(variant, field)
     sensor = SensorSettings(
         range_share=truth.sensor_sigmas * SENSOR.range_share,
         bearing_sigma_deg=truth.sensor_sigmas * SENSOR.bearing_sigma_deg,
@@ -123,6 +129,7 @@ def test_what_is_wrong_is_found_and_the_estimate_becomes_consistent(
 def test_right_settings_are_left_alone(variant: Variant) -> None:
     found = [run(Truth(), seed, variant) for seed in range(6)]
     assert all(adaptation_of(state) is AS_CONFIGURED for state, _ in found)
+    assert not any(misplaced_in(state) for state, _ in found)
     assert 1.4 < np.mean([nees for _, nees in found]) < 2.8
 
 
@@ -131,6 +138,18 @@ def test_a_variant_without_the_covariance_of_its_errors_does_not_judge(variant: 
     state, _ = run(Truth(distance_scale=1.2), 0, variant)
     assert adaptation_of(state) is AS_CONFIGURED
     assert state.memory.calibration.check == ModelCheck()
+
+
+def misplaced_in(state: State) -> str:
+    return state.memory.calibration.rejections.misplaced(state.stamp_ns)
+
+
+@pytest.mark.parametrize("variant", ["joint", "oval"])
+def test_a_landmark_that_stands_elsewhere_than_on_the_map_is_named(variant: Variant) -> None:
+    moved = replace(CORNERS.landmarks["ne"], x_m=CORNERS.landmarks["ne"].x_m + 1.0)
+    field = Field(landmarks={**CORNERS.landmarks, "ne": moved})
+    found = [run(Truth(), seed, variant, field) for seed in range(3)]
+    assert [misplaced_in(state) for state, _ in found] == ["ne"] * 3
 
 
 def test_an_adaptation_is_what_the_right_settings_would_be() -> None:
@@ -190,6 +209,22 @@ def test_a_block_with_a_gap_or_a_report_does_not_count() -> None:
     assert blocks_after(robot, robot.start(0), 12, report=True) == 0.0
 
 
+@pytest.mark.parametrize("why", ["lost", "report"])
+def test_a_block_after_one_that_does_not_count_begins_without_sensitivity(why: str) -> None:
+    """The pose of a robot that was lost, or that a teammate moved, owes nothing to the constant
+    errors of the blocks before."""
+    robot, check = robot_of(), ModelCheck(sensitivity=(1.0,) * 9)
+    begin = Corrected(0, robot.start(0).estimate, Pose2(0.0, 0.0, 0.0), 0)
+    check = check._replace(begin=None if why == "lost" else begin)
+    state = robot.start(0)._replace(memory=Memory(calibration=CalibrationMemory(check=check)))
+    state = robot.add_odometry(state, Odometry(0, 2 * SECOND, 0.0, 0.0))
+    if why == "report":
+        state = robot.add_teammate_belief(state, belief(1.0, 0.0, SECOND))
+    after = robot.cycle(state, frame(LOOP_START, 2 * SECOND)).memory.calibration.check
+    assert after.begin is not None
+    assert (after.begin.stamp_ns, after.sensitivity) == (2 * SECOND, INSENSITIVE)
+
+
 def test_an_object_that_is_rejected_again_and_again_says_nothing() -> None:
     moved = ModelCheck()
     for _ in range(50):
@@ -199,6 +234,38 @@ def test_an_object_that_is_rejected_again_and_again_says_nothing() -> None:
         moved = moved.with_rejections([name])
     assert moved.rejections == 4
     assert moved.restarted(7) == ModelCheck(rejected="ne", accepted=7)
+
+
+def rejections_of(names: Sequence[str], accepted: int = 100) -> MapRejections:
+    """One rejection each second, and so many accepted observations."""
+    rejections = MapRejections()
+    for i, name in enumerate(names, 1):
+        rejections = rejections.plus([name], i * SECOND, i * accepted)
+    return rejections
+
+
+def test_an_object_is_misplaced_where_it_alone_is_rejected() -> None:
+    assert rejections_of(["ne"] * 7).misplaced(7 * SECOND) == "ne"
+    assert rejections_of(["ne"] * 7 + ["sw"] * 2).misplaced(9 * SECOND) == "ne"
+    assert not rejections_of(["ne"] * 5).misplaced(5 * SECOND)  # too few
+    assert not rejections_of(["ne"] * 7 + ["sw"] * 5).misplaced(12 * SECOND)  # the robot is wrong
+    assert not rejections_of(["ne"] * 7, 1000).misplaced(7 * SECOND)  # as rare as the gate allows
+    assert not rejections_of(["ne"] * 7).misplaced(120 * SECOND)  # it was put right
+
+
+def test_of_two_objects_none_is_called_misplaced() -> None:
+    two = Field(landmarks={name: CORNERS.landmarks[name] for name in ("ne", "sw")})
+    for field, expected in ((two, ""), (CORNERS, "ne")):
+        robot = robot_of(field=field)
+        state = robot.start(0)
+        seen = frame(LOOP_START, 0)
+        (wrong,) = (s for s in seen.sightings if s.id == "ne")
+        assert wrong.range_m is not None
+        wrong = replace(wrong, range_m=wrong.range_m + 3.0)
+        for second in range(1, 9):
+            others = [s for s in seen.sightings if s.id == "sw"]
+            state = robot.cycle(state, Sightings(second * SECOND, (wrong, *others)))
+        assert misplaced_in(state) == expected
 
 
 # The statistics -----------------------------------------------------------------------------------

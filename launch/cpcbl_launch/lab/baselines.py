@@ -62,10 +62,14 @@ def baseline_inputs(logged: LoggedTeam) -> dict[str, BaselineInputs]:
 
 
 def run_ekf(
-    inputs: Mapping[str, BaselineInputs], field: Field, stamps_ns: Mapping[str, Sequence[int]]
+    inputs: Mapping[str, BaselineInputs],
+    field: Field,
+    stamps_ns: Mapping[str, Sequence[int]],
+    kind: "type[Ekf] | None" = None,
 ) -> dict[str, Trajectory]:
-    """The estimates of one EKF over these robots, at each robot's own times, after its frames."""
-    ekf = Ekf(inputs, field)
+    """The estimates of one EKF (of this kind) over these robots, at each robot's own times, after
+    its frames."""
+    ekf = (kind or Ekf)(inputs, field)
     events: list[tuple[int, int, str, Sightings | None]] = []
     for name, robot in inputs.items():
         events += [(frame.stamp_ns, 0, name, frame) for frame in robot.frames]
@@ -179,7 +183,7 @@ def linearize(
     return Linearized(jacobian[rows, :columns], innovation, sigmas**2 + SMALLEST_VARIANCE)
 
 
-class _RobotBlock:
+class RobotBlock:
     """One robot in the filter: its columns of the state, its time, the odometry still to come."""
 
     def __init__(self, first: int, inputs: BaselineInputs) -> None:
@@ -211,10 +215,12 @@ class Ekf:
     asked for. The motions of robots are independent, so that the others' poses may lag behind.
     """
 
+    iterations = 1  # of each update; with more it is linearized again at its result (Gauss-Newton)
+
     def __init__(self, inputs: Mapping[str, BaselineInputs], field: Field) -> None:
         self._field = field
         self._robots = {
-            name: _RobotBlock(3 * i, own) for i, (name, own) in enumerate(inputs.items())
+            name: RobotBlock(3 * i, own) for i, (name, own) in enumerate(inputs.items())
         }
         self.mean = np.array([own.start.pose for own in inputs.values()], dtype=float).ravel()
         self.covariance = np.zeros((len(self.mean), len(self.mean)))
@@ -251,14 +257,10 @@ class Ekf:
             mate = self._robots.get(sighting.id)
             if mate is not None:
                 self.predict(sighting.id, frame.stamp_ns)
-            sensor, pose = robot.settings.sensor, self.mean[robot.columns]
-            seen = None if mate is None else self.mean[mate.columns]
-            measurement = linearize(sighting, sensor, self._field, pose, seen)
-            if measurement is None:
-                continue
-            columns = robot.columns + (mate.columns[:2] if mate is not None else [])
             inflation = robot.timers.inflation(robot.uses, *use)
-            accepted = self._update(measurement, columns, inflation, robot.bounds)
+            accepted = self.update(robot, mate, sighting, inflation)
+            if accepted is None:
+                continue
             if accepted:
                 robot.used_ns[sighting.id] = frame.stamp_ns
             kind, concerned = ("landmark", [robot]) if mate is None else ("robot", [robot, mate])
@@ -266,22 +268,33 @@ class Ekf:
                 if member.rejects_most(kind, accepted):
                     self._inflate(member)
 
-    def _update(
-        self, m: Linearized, columns: list[int], inflation: float, bounds: tuple[float, float]
-    ) -> bool:
-        """The Kalman update, if the innovation passes the chi-square gate; whether it did."""
-        cross = self.covariance[:, columns] @ m.jacobian.T
-        weights = np.linalg.inv(m.jacobian @ cross[columns] + np.diag(inflation * m.noise))
-        if m.innovation @ weights @ m.innovation > bounds[len(m.innovation) - 1]:
-            return False
-        gain = cross @ weights
-        self.mean += gain @ m.innovation
+    def update(
+        self, robot: RobotBlock, mate: RobotBlock | None, sighting: Sighting, inflation: float
+    ) -> bool | None:
+        """The Kalman update by a sighting of a landmark or a robot (`mate`), if its innovation
+        passes the chi-square gate; whether it did, None if it is not usable."""
+        columns = robot.columns + (mate.columns[:2] if mate is not None else [])
+        prior, sensor = self.mean, robot.settings.sensor
+        for iteration in range(self.iterations):
+            seen = None if mate is None else self.mean[mate.columns]
+            m = linearize(sighting, sensor, self._field, self.mean[robot.columns], seen)
+            if m is None:
+                self.mean = prior
+                return None
+            cross = self.covariance[:, columns] @ m.jacobian.T
+            weights = np.linalg.inv(m.jacobian @ cross[columns] + np.diag(inflation * m.noise))
+            chi_square = m.innovation @ weights @ m.innovation
+            if not iteration and chi_square > robot.bounds[len(m.innovation) - 1]:
+                return False
+            gain = cross @ weights
+            moved = (self.mean - prior)[columns]
+            self.mean = prior + gain @ (m.innovation + m.jacobian @ moved)
         self.mean[2::3] = (self.mean[2::3] + math.pi) % math.tau - math.pi
         self.covariance -= gain @ cross.T
         self.covariance = 0.5 * (self.covariance + self.covariance.T)
         return True
 
-    def _inflate(self, robot: _RobotBlock) -> None:
+    def _inflate(self, robot: RobotBlock) -> None:
         """Doubles the sigmas of a robot that rejects its sightings, so that its gates open: to at
         least 0.1 m and 0.1 rad, to at most the limits of being lost."""
         rules = robot.settings.localizer

@@ -6,6 +6,7 @@ from itertools import chain
 
 import msgspec
 
+from cpcbl_team.miscalibration import MISPLACED
 from cpcbl_transport.messages import Flow, Spending, Status, Trust
 
 
@@ -117,6 +118,11 @@ def miscalibration_text(counts: Mapping[str, int]) -> str:
     used, rejected = counts.get("accepted", 0), counts.get("gated", 0)
     texts.append(f"{rejected / max(used + rejected, 1):.1%} of observations rejected")
     return ", ".join(texts)
+
+
+def misplaced_objects(counts: Mapping[str, int]) -> Iterator[str]:
+    """The objects of the map that a robot finds elsewhere (docs/team_file.md)."""
+    return (name.removeprefix(MISPLACED) for name in counts if name.startswith(MISPLACED))
 
 
 def _reason_text(t: Trust | TrustReport) -> str:

@@ -13,7 +13,12 @@ from rich.text import Text
 from cpcbl_launch.reporting.metrics import ErrorFigures
 from cpcbl_launch.reporting.phases import AWAY_S
 from cpcbl_launch.reporting.recorder import Effect, GuestReport, Recorder, Report, RobotReport
-from cpcbl_launch.reporting.statuses import distrust_text, miscalibration_text, trust_remarks
+from cpcbl_launch.reporting.statuses import (
+    distrust_text,
+    miscalibration_text,
+    misplaced_objects,
+    trust_remarks,
+)
 from cpcbl_launch.reporting.tables import number, percent, short, table
 from cpcbl_launch.run.observer import ObserverReport
 from cpcbl_launch.run.processes import ROBOT, Processes
@@ -64,6 +69,8 @@ class LiveTable(LiveView):
                 state.append(f", {text}", "yellow")
             if status is not None and status.counts.get("miscalibrated"):
                 state.append(", miscalibrated", "yellow")
+            for place in misplaced_objects(status.counts if status is not None else {}):
+                state.append(f", finds {place} elsewhere", "yellow")
             if name not in self._robots:
                 there = newest_ns - tracks[name].stamp_ns <= AWAY_S * 1e9
                 pid, state = "guest", state if there else Text("left", "dim")
@@ -226,6 +233,8 @@ def _remarks(report: Report) -> Iterator[str]:
             yield f"Robot {name} calibrated itself: {scales}, {turned}."
         if text := miscalibration_text(r.counts):
             yield f"Robot {name} is miscalibrated: {text}. Run `cpcbl-team calibrate`."
+        for place in misplaced_objects(r.counts):
+            yield f"Robot {name} finds {place} elsewhere than on the map; measure its place again."
     for name, r in report.robots.items():
         yield from trust_remarks(name, r.trust)
     if report.refused:

@@ -8,7 +8,7 @@ import pytest
 from support.core import LOOP_START, diagonal, driven, loop
 from support.noisy_logs import ODOMETRY, SENSOR
 
-from cpcbl_launch.lab.baselines import BaselineInputs, Ekf, expected_sighting
+from cpcbl_launch.lab.baselines import BaselineInputs, Ekf, expected_sighting, linearize
 from cpcbl_launch.reporting.metrics import Floats
 from cpcbl_team.config import Field, OdometrySettings, RobotSettings
 from cpcbl_team.estimate import Estimate
@@ -97,6 +97,27 @@ def test_one_sighting_informs_and_correlates_both_robots() -> None:
     assert ekf.mean[3] > 2.02
     assert ekf.covariance[0, 3] > 0.003
     assert ekf.covariance[0, 0] < 0.008
+
+
+class IteratedEkf(Ekf):
+    iterations = 30
+
+
+def test_an_iterated_update_ends_at_the_most_probable_poses() -> None:
+    """There the pull of the prior equals that of the sighting; one linear step ends beside it."""
+    sighting, sigma, columns = Sighting("b", 1.6, 0.9), 0.5, [0, 1, 2, 3, 4]
+    start = {"a": Pose2(0.0, 0.0, 0.0), "b": Pose2(2.0, 0.5, 0.0)}
+    imbalance = []
+    for kind in (Ekf, IteratedEkf):
+        ekf = kind({name: inputs_at(pose, sigma=sigma) for name, pose in start.items()}, Field())
+        before = ekf.mean.copy()
+        ekf.correct("a", Sightings(0, (sighting,)))
+        m = linearize(sighting, SENSOR, Field(), ekf.mean[:3], ekf.mean[3:])
+        assert m is not None
+        pull = m.jacobian.T @ (m.innovation / m.noise)
+        imbalance.append(np.abs((ekf.mean - before)[columns] / sigma**2 - pull).max())
+    assert imbalance[0] > 0.1
+    assert imbalance[1] < 1e-6
 
 
 def test_an_outlier_is_gated_and_a_faulty_sighting_ignored() -> None:

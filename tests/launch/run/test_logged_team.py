@@ -318,10 +318,12 @@ def test_the_remark_says_what_is_done_to_readings(tmp_path: Path) -> None:
 def test_the_remark_says_what_is_wrong_with_the_settings(tmp_path: Path) -> None:
     evaluation = evaluate_log(logged(tmp_path, seconds=1.0)).report
     counts = {"accepted": 985, "gated": 15, "miscalibrated": 2, "odometry_sigma_percent": 210}
+    counts["misplaced_m2"] = 1
     robots = {"1": msgspec.structs.replace(evaluation.robots["1"], counts=counts)}
     text = (
         "Robot 1 is miscalibrated: σ of its odometry × 2.1, 1.5% of observations rejected."
         " Run `cpcbl-team calibrate`."
+        " Robot 1 finds m2 elsewhere than on the map; measure its place again."
     )
     shown = " ".join(printed(msgspec.structs.replace(evaluation, robots=robots)))
     assert text in " ".join(shown.split())
