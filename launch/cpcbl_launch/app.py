@@ -1,5 +1,8 @@
 """THE table of the commands of `cpcbl-team`."""
 
+import importlib.metadata
+from typing import Annotated
+
 import typer
 
 from cpcbl_launch.commands.calibrating import calibrate_app
@@ -10,13 +13,32 @@ from cpcbl_launch.commands.running import field, router, up
 from cpcbl_launch.commands.watching import look, observer, traffic
 from cpcbl_launch.run import robot
 
+HELP = {"help_option_names": ["-h", "--help"]}
 app = typer.Typer(
     help="A team of robots that find out where they are, together.",
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
+    context_settings=HELP,
 )
 _PASSED_ON = {"allow_extra_args": True, "ignore_unknown_options": True, "help_option_names": []}
+
+
+def _print_version(asked: bool) -> None:
+    if asked:
+        typer.echo(f"cpcbl-team {importlib.metadata.version('cpcbl-team')}")
+        raise typer.Exit
+
+
+@app.callback()
+def _common_options(
+    version: Annotated[
+        bool,
+        typer.Option(
+            "--version", is_eager=True, callback=_print_version, help="Print the version, and end."
+        ),
+    ] = False,
+) -> None:
+    """Options before a command."""
 
 
 def run_robot(context: typer.Context) -> None:

@@ -149,9 +149,9 @@ def calibrate(
 
 
 def simulate(
-    file: options.TeamArgument = None,
+    file: options.TeamOrDemo = None,
     robots: Annotated[
-        str, Option(help="Sizes of generated teams, in place of FILE, e.g. 2,10,50,200,1000.")
+        str, Option(help="Sizes of generated teams, in place of TEAM, e.g. 2,10,50,200,1000.")
     ] = "",
     duration: Annotated[
         float | None, Option(help="Seconds of robot time; default: 5 with --robots, else 30.")
@@ -177,7 +177,7 @@ def simulate(
     budgets = Overrides(bytes_per_s, messages_per_minute, match_messages)
     if robots:
         if file is not None:
-            raise InputError("simulate: FILE or --robots, which generates its teams; leave one out")
+            raise InputError("simulate: TEAM or --robots, which generates its teams; leave one out")
         if budgets != Overrides():
             raise InputError("simulate: generated teams have no budgets; name a team file instead")
         _simulate_sizes(robots, duration, seed, report, picture, as_json)

@@ -69,9 +69,12 @@ writable_file, writable_picture = checked(require_writable_file), checked(_requi
 folder, endpoints = checked(require_folder), checked(require_endpoints)
 duration = checked(_require_time)
 
-TeamFile = Annotated[Path, Option("--team", help="Team file (TOML).")]
-TeamArgument = Annotated[
-    Path | None, Argument(help="Team file, or a built-in one: demo (default).")
+Team = Annotated[
+    Path, Argument(metavar="TEAM", help="Team file (TOML), or the name of a built-in one.")
+]
+TeamOrDemo = Annotated[
+    Path | None,
+    Argument(metavar="TEAM", help="Team file, or a built-in one: demo (default)."),
 ]
 Blind = Annotated[str, Option(help="Robots that cannot see landmarks, e.g. 3,4,5.")]
 _limit = partial(Option, min=0.0, callback=checked(_require_limit))

@@ -42,7 +42,7 @@ def test_budgets_of_a_command_line_are_those_of_all_robots() -> None:
         (["simulate", "demo", "--bytes-per-s", "inf"], "--bytes-per-s inf"),
         (["up", "demo", "--messages-per-minute", "inf"], "--messages-per-minute inf"),
         (["simulate", "--robots", "2", "--match-messages", "9"], "generated teams have no budgets"),
-        (["traffic", "demo", "--for", "0"], "--for 0"),
+        (["traffic", "demo", "--duration", "0"], "--duration 0"),
         (["traffic", "nowhere.toml"], "nowhere.toml: no such file"),
     ],
 )
