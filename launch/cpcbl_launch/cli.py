@@ -51,5 +51,6 @@ def _run_command() -> None:
 
 def _end(problem: str, code: int) -> None:
     red, plain = ("\033[31m", "\033[0m") if sys.stderr.isatty() else ("", "")
-    sys.stderr.write(f"{red}cpcbl-team: {problem}{plain}\n")
+    for line in problem.splitlines():
+        sys.stderr.write(f"{red}cpcbl-team: {line}{plain}\n")
     sys.exit(code)

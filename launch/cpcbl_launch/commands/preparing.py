@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
-from typer import Argument, Option
+from typer import Option
 
 from cpcbl_launch.commands import options
 from cpcbl_launch.reporting.files import write_or_reason
