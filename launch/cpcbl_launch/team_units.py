@@ -79,7 +79,7 @@ def unit_warnings(team: Team) -> Iterator[str]:
         for key, text in (*_unusual(robot, "robot", ""), *_headings(robot)):
             by_text.setdefault((key, text), []).append(name)
     for (key, text), names in by_text.items():
-        others = f" (and {len(names) - 1} more robots)" if len(names) > 1 else ""
+        others = f" (and {len(names) - 1} more)" if len(names) > 1 else ""
         yield f"robots.{names[0]}.{key}{others}: {text}"
     for key, text in _unusual(team.vision, "vision", "vision."):
         yield f"{key}: {text}"
