@@ -7,6 +7,7 @@ import typer
 
 from cpcbl_launch.commands.calibrating import calibrate_app
 from cpcbl_launch.commands.experimenting import experiment_app
+from cpcbl_launch.commands.initializing import init
 from cpcbl_launch.commands.measuring import chaos, evaluate_mrclam, simulate
 from cpcbl_launch.commands.preparing import check, compose, keys
 from cpcbl_launch.commands.running import field, router, up
@@ -46,7 +47,20 @@ def run_robot(context: typer.Context) -> None:
     robot.main(context.args)
 
 
-for command in (check, keys, up, traffic, look, observer, router, field, compose, simulate, chaos):
+for command in (
+    init,
+    check,
+    keys,
+    up,
+    traffic,
+    look,
+    observer,
+    router,
+    field,
+    compose,
+    simulate,
+    chaos,
+):
     app.command()(command)
 app.command("robot", help=robot.DESCRIPTION, context_settings=_PASSED_ON)(run_robot)
 

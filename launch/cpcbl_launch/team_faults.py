@@ -14,7 +14,8 @@ from cpcbl_team.config import RobotSettings, Team
 from cpcbl_team.inputs import NAME_PATTERN
 
 DEEPEST = 12  # tables in tables; the settings need half of it
-LARGEST, SMALLEST = 1e9, 1e-9  # of numbers that are not 0: their squares are still numbers
+LARGEST, SMALLEST = 1e6, 1e-9  # of numbers that are not 0: messages carry no larger ones
+LARGEST_AMOUNT = 2**40  # of bytes and messages
 NAMED = ("robots", "types", "map.landmarks", "map.walls")  # their names become part of keys
 _WORDS = {
     "object": "a table",
@@ -130,18 +131,19 @@ def _depth_and_numbers(raw: Mapping[str, Any]) -> tuple[str | None, list[Fault]]
             parts += [(_joined(key, name), v, depth + 1) for name, v in reversed(value.items())]
         elif isinstance(value, list):
             parts += [(f"{key}[{i}]", v, depth + 1) for i, v in reversed([*enumerate(value)])]
-        elif isinstance(value, int | float) and (text := _number_fault(value)):
+        elif isinstance(value, int | float) and (text := _number_fault(key, value)):
             faults.append(Fault(key, text))
     return None, faults
 
 
-def _number_fault(value: float) -> str:
+def _number_fault(key: str, value: float) -> str:
+    largest = LARGEST_AMOUNT if "bytes" in key or "messages" in key else LARGEST
     if isinstance(value, float) and not math.isfinite(value):
         return "not a finite number; write a finite one"
-    if abs(value) > LARGEST:
-        return f"out of range; write a number of at most {LARGEST:.0e}"
+    if abs(value) > largest:
+        return f"out of range; write a number of at most {largest:g}"
     if 0 < abs(value) < SMALLEST:
-        return f"{value:g} is too small; write 0, or at least {SMALLEST:.0e}"
+        return f"{value:g} is too small; write 0, or at least {SMALLEST:g}"
     return ""
 
 

@@ -39,12 +39,13 @@ def open_bus(
     credentials: Credentials | None = None,
 ) -> "ZenohBus":
     """A client's session below the team's namespace; waits for a router until `give_up()`. With
-    credentials every link is mutual TLS. Raises BusError when it gave up."""
+    credentials every link is mutual TLS. Without a team, keys are whole ones, of all teams. Raises
+    BusError when it gave up."""
     config = client_config(connect, credentials)
     reason = "stopped before a router answered"
     while not give_up():
         try:
-            return ZenohBus(_open(config, namespace(team)))
+            return ZenohBus(_open(config, namespace(team) if team else None))
         except zenoh.ZError as error:
             reason = _tls_reason(connect, credentials) or _one_line(error)
             shown = f": {reason}" if credentials else ""
