@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 
 from cpcbl_launch.commands.calibrating import calibrate_app
+from cpcbl_launch.commands.diagnosing import doctor, list_teams, status
 from cpcbl_launch.commands.experimenting import experiment_app
 from cpcbl_launch.commands.initializing import init
 from cpcbl_launch.commands.measuring import chaos, evaluate_mrclam, simulate
@@ -48,20 +49,11 @@ def run_robot(context: typer.Context) -> None:
 
 
 for command in (
-    init,
-    check,
-    keys,
-    up,
-    traffic,
-    look,
-    observer,
-    router,
-    field,
-    compose,
-    simulate,
-    chaos,
+    *(init, check, doctor, keys, up, status, traffic, look, observer),
+    *(router, field, compose, simulate, chaos),
 ):
     app.command()(command)
+app.command("list")(list_teams)
 app.command("robot", help=robot.DESCRIPTION, context_settings=_PASSED_ON)(run_robot)
 
 evaluate_app = typer.Typer(help="Real logs in one process: deterministic and fast.")

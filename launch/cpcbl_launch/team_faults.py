@@ -160,7 +160,8 @@ def _faults(raw: Any, kind: Any, path: str) -> Iterator[Fault]:
     if isinstance(raw, dict) and isinstance(plain, type) and issubclass(plain, msgspec.Struct):
         yield from _struct_faults(raw, plain, path)
     elif isinstance(raw, dict) and get_origin(plain) is dict:
-        yield from _dict_faults(raw, *get_args(plain), path)
+        names, values = get_args(plain)
+        yield from _dict_faults(raw, names, values, path)
     elif isinstance(raw, list) and _is_list_of_tables(plain):
         for i, item in enumerate(raw):
             yield from _faults(item, get_args(plain)[0], f"{path}[{i}]")

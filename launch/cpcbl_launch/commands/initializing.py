@@ -106,8 +106,8 @@ def _plan(
                 f"{option}: no robot {', '.join(unknown)}; there are {', '.join(names)}"
             )
     endpoint = _endpoint(router or ask("Address of the machine with the router", "127.0.0.1"))
-    given = dict.fromkeys(camera, "camera") | dict.fromkeys(blind, "none")
-    sights = {own: given.get(own) or _sight(own, ask) for own in names}
+    known = dict.fromkeys(camera, "camera") | dict.fromkeys(blind, "none")
+    sights = {own: known.get(own) or _sight(own, ask) for own in names}
     return Plan(team, sights, endpoint)
 
 

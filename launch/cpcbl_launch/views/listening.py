@@ -45,10 +45,10 @@ class StatusHeard(NamedTuple):
 
     status: Status
     offset_s: float  # arrival minus stamp
-    count: int  # statuses of this process
+    messages: int  # statuses of this process
 
 
-class TeamHeard(NamedTuple):
+class TeamHeard(msgspec.Struct, frozen=True):
     """One team, as it is heard."""
 
     alive: dict[str, frozenset[str]] = {}  # robot -> its processes, by their tokens
@@ -64,7 +64,7 @@ class TeamHeard(NamedTuple):
     @property
     def twice(self) -> dict[str, int]:
         """Robots with more than one process that runs: how many."""
-        sending = {r: sum(s.count > 1 for s in own) for r, own in self.statuses.items()}
+        sending = {r: sum(s.messages > 1 for s in own) for r, own in self.statuses.items()}
         counts = {r: max(len(self.alive.get(r, ())), sending.get(r, 0)) for r in self.robots}
         return {robot: count for robot, count in counts.items() if count > 1}
 
@@ -140,7 +140,7 @@ def _team_heard(samples: Sequence[Sample], alive: dict[str, set[str]], seconds: 
         message = decode(sample.key, sample.payload)
         if isinstance(message, Status):
             process = message.robot, message.incarnation
-            count = statuses[process].count + 1 if process in statuses else 1
+            count = statuses[process].messages + 1 if process in statuses else 1
             statuses[process] = StatusHeard(message, _offset_s(sample, message), count)
         else:
             refused[str(message)] += 1
