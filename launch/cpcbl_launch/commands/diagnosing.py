@@ -48,9 +48,7 @@ def doctor(
     from cpcbl_launch.views.doctor_facts import gather
 
     _quiet()
-    if team_file is None and Path("team.toml").exists():
-        team_file = Path("team.toml")
-    found = findings(gather(team_file, connect, duration, wait, StopSignal()))
+    found = findings(gather(_here(team_file), connect, duration, wait, StopSignal()))
     well = is_well(found)
     report = {"well": well, "findings": found}
     options.print_result(report, as_json, lambda: _print_findings(found))
@@ -86,10 +84,12 @@ def list_teams(
 ) -> None:
     """List the teams on a router, with their robots and the inputs that drivers publish to.
 
-    The router is that of TEAM, or --connect. With keys only the own team is heard.
+    The router is that of TEAM (default: team.toml of this folder) or --connect.
+    With keys only the own team is heard.
     """
     _quiet()
-    team = None if team_file is None else find_team(team_file)
+    file = _here(team_file)
+    team = None if file is None else find_team(file)
     heard = _listen(team, connect, duration, wait)
     rows = [
         _ListedTeam(
@@ -155,6 +155,12 @@ def _listen(
         return {}
     with bus:
         return listen(bus, seconds, stop, own)
+
+
+def _here(team_file: Path | None) -> Path | None:
+    """The team file, or that of the present folder, if there is one."""
+    own = Path("team.toml")
+    return own if team_file is None and own.exists() else team_file
 
 
 def _quiet() -> None:

@@ -87,10 +87,15 @@ def _robot_status(name: str, heard: TeamHeard) -> RobotStatus:
 def _problems(name: str, status: Status | None, heard: TeamHeard) -> Iterator[str]:
     if name in heard.twice:
         yield f"{heard.twice[name]} processes have this name"
+    problems: tuple[str, ...] = getattr(status, "problems", ())
+    yield from problems
+    for own in heard.inputs if not problems else ():  # the robot itself knows more of them
+        if own.robot == name and own.refused:
+            reasons = ", ".join(f"{reason} {n}" for reason, n in own.refused.items())
+            yield f"in/{name}/{own.input}: cannot be used: {reasons}"
     if status is None:
         yield "alive, but sends no status" if name in heard.alive else "sends no status"
         return
-    yield from getattr(status, "problems", ())
     if status.lost:
         yield f"lost: {status.lost}"
     if text := distrust_text(status.trust):
