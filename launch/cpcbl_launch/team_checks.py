@@ -67,7 +67,7 @@ def _blind_team(team: Team) -> Iterator[str]:
     """Real robots of which none has landmarks or a position sensor only get worse."""
     if all(robot.source != "external" for robot in team.robots.values()):
         return  # a log has its own map, and a simulated team may be blind on purpose
-    objects = [*team.map.landmarks.values(), *team.map.walls.values()]
+    objects: list[Landmark | Wall] = [*team.map.landmarks.values(), *team.map.walls.values()]
     useful = any(o.gives != "none" for o in objects)
     coloured = any(mark.colours for mark in team.map.landmarks.values())
     for robot in team.robots.values():

@@ -27,15 +27,9 @@ def mutated(text: str, rng: random.Random) -> bytes:
         line = rng.randrange(len(lines)) if lines else 0
         match rng.randrange(7):
             case 0:
-                numbers = list(re.finditer(r"(?<== )[-\w.\"]+", text)) or [re.match("", text)]
-                found = rng.choice(numbers)
-                assert found is not None
-                text = text[: found.start()] + rng.choice(VALUES) + text[found.end() :]
+                text = _replaced(r"(?<== )[-\w.\"]+", text, rng.choice(VALUES), rng)
             case 1:
-                keys = list(re.finditer(r"[\w.]+(?= = )", text)) or [re.match("", text)]
-                found = rng.choice(keys)
-                assert found is not None
-                text = text[: found.start()] + rng.choice(KEYS) + text[found.end() :]
+                text = _replaced(r"[\w.]+(?= = )", text, rng.choice(KEYS), rng)
             case 2:
                 text = "\n".join([*lines[:line], *lines[line + 1 :]])
             case 3:
@@ -48,6 +42,13 @@ def mutated(text: str, rng: random.Random) -> bytes:
                 text = text[:place] if rng.random() < 0.2 else text + f"\n{rng.choice(KEYS)} = 1\n"
     data = text.encode()
     return data if rng.random() < 0.95 else data[:40] + b"\xff\xfe" + data[40:]
+
+
+def _replaced(pattern: str, text: str, new: str, rng: random.Random) -> str:
+    """A text with one of the matches of a pattern replaced."""
+    places = [match.span() for match in re.finditer(pattern, text)] or [(0, 0)]
+    start, end = rng.choice(places)
+    return text[:start] + new + text[end:]
 
 
 def assert_usable_or_explained(path: Path) -> bool:

@@ -182,13 +182,13 @@ def start_of(plan: Plan, name: str) -> tuple[float, float]:
 
 def driver_text(plan: Plan) -> str:
     """The driver of the team's robots, which stand until their sensors are put in."""
-    lines = [f'    "{name}": {_seen(plan, name)},\n' for name in plan.robots]
+    lines = [f'    "{name}": {_landmarks_ahead(plan, name)},\n' for name in plan.robots]
     return _template("driver.py.txt").substitute(
         team=plan.team, first=next(iter(plan.robots)), connect=plan.router, seen="".join(lines)
     )
 
 
-def _seen(plan: Plan, name: str) -> str:
+def _landmarks_ahead(plan: Plan, name: str) -> str:
     """The landmarks before a robot that stands at its start, as the text of a list."""
     if plan.robots[name] != "driver":
         return "[]"

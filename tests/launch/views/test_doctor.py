@@ -51,7 +51,10 @@ TOKENS = [token("tests", robot) for robot in TEAM.robots]
 
 
 def facts_of(
-    samples: list[Sample] = HEALTHY, tokens: list[str] = TOKENS, team: Team = TEAM, **more: object
+    samples: list[Sample] = HEALTHY,
+    tokens: list[str] = TOKENS,
+    team: Team | None = TEAM,
+    **more: object,
 ) -> Facts:
     """Facts of a team on a router where this is heard."""
     whole: dict[str, object] = {
