@@ -113,9 +113,8 @@ def _plan(
 
 def _sight(robot: str, ask: Callable[[str, str], str]) -> str:
     question = f"{robot}: who finds landmarks? your driver, this program in camera images, or none"
-    answer = ask(f"{question} ({'/'.join(SIGHTS)})", SIGHTS[0])
-    if answer not in SIGHTS:
-        raise InputError(f"{robot}: {answer!r} is no choice; use one of {', '.join(SIGHTS)}")
+    while (answer := ask(f"{question} ({'/'.join(SIGHTS)})", SIGHTS[0])) not in SIGHTS:
+        typer.echo(f"{answer!r} is no choice; use one of {', '.join(SIGHTS)}", err=True)
     return answer
 
 

@@ -8,12 +8,15 @@ from typing import Literal
 import msgspec
 
 from cpcbl_launch.views.doctor_facts import Facts
-from cpcbl_launch.views.listening import StatusHeard, TeamHeard
+from cpcbl_launch.views.listening import (
+    ANOTHER_EPOCH_S,
+    StatusHeard,
+    TeamHeard,
+    clock_problem,
+)
 from cpcbl_team.config import Team
 
-CLOCKS_APART_S = 0.1  # as far ahead a teammate's clock may be
-LATE_S = 0.5  # later than this, inputs or statuses were long on their way, or a clock is behind
-ANOTHER_EPOCH_S = 86_400.0  # no clock is so wrong: the stamps are of another kind
+STAMPS_AHEAD_S, STAMPS_BEHIND_S = 0.5, 1.0  # robots refuse what is further ahead, or 2 s behind
 SOON = timedelta(days=30)
 Level = Literal["good", "note", "warning", "error"]
 
@@ -187,13 +190,10 @@ def _clocks(facts: Facts) -> Iterator[tuple[Level, str, str]]:
     for name, processes in heard.statuses.items() if heard else ():
         offset_s = min((p.offset_s for p in processes), key=abs)
         remedy = f"set the clocks by NTP (chrony) on the machine of {name} and on this one"
-        if abs(offset_s) > ANOTHER_EPOCH_S:
+        if problem := clock_problem(offset_s):
+            yield "error", f"{name}: {problem}", remedy
+        elif abs(offset_s) >= ANOTHER_EPOCH_S:
             yield "note", f"{name}: its time is not this machine's: a log, or a faster run", ""
-        elif offset_s < -CLOCKS_APART_S:
-            yield "error", f"{name}: its clock is {-offset_s:.1f} s ahead of this machine's", remedy
-        elif offset_s > LATE_S:
-            text = f"{name}: its clock is {offset_s:.1f} s behind this machine's, or its link slow"
-            yield "error", text, remedy
 
 
 def _inputs(facts: Facts) -> Iterator[tuple[Level, str, str]]:
@@ -231,7 +231,7 @@ def _input_clock(
     if abs(apart_s) > ANOTHER_EPOCH_S:
         remedy = "stamps are Unix time in nanoseconds: neither seconds nor time since the start"
         yield "error", f"{key}: stamps are {abs(apart_s):.3g} s away from {whose} clock", remedy
-    elif not -CLOCKS_APART_S - LATE_S < apart_s < 2.0:
+    elif not -STAMPS_AHEAD_S < apart_s < STAMPS_BEHIND_S:
         order = "ahead of" if apart_s < 0.0 else "behind"
         remedy = "stamp with the clock of the robot's machine, or set both by NTP (chrony)"
         yield "error", f"{key}: stamps are {abs(apart_s):.1f} s {order} {whose} clock", remedy

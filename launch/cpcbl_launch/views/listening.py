@@ -19,6 +19,9 @@ from cpcbl_transport.messages import Message, Refusal, Status
 LISTENED = (topics.STATUS, topics.IN_ODOMETRY, topics.IN_SIGHTINGS, topics.IN_POSITION)
 STEP_S = 0.05
 ALL_TEAMS = "cpcbl/*/"  # before the keys of topics
+CLOCKS_APART_S = 0.1  # as far ahead a teammate's clock may be
+LATE_S = 0.5  # so late even the fastest status came: a clock is behind, or the link is slow
+ANOTHER_EPOCH_S = 86_400.0  # no clock is so wrong: the stamps are of another kind
 
 
 class Sample(NamedTuple):
@@ -44,7 +47,7 @@ class StatusHeard(NamedTuple):
     """The latest status of one process of a robot."""
 
     status: Status
-    offset_s: float  # arrival minus stamp
+    offset_s: float  # the least arrival minus stamp: below zero its clock is ahead
     messages: int  # statuses of this process
 
 
@@ -67,6 +70,16 @@ class TeamHeard(msgspec.Struct, frozen=True):
         sending = {r: sum(s.messages > 1 for s in own) for r, own in self.statuses.items()}
         counts = {r: max(len(self.alive.get(r, ())), sending.get(r, 0)) for r in self.robots}
         return {robot: count for robot, count in counts.items() if count > 1}
+
+
+def clock_problem(offset_s: float) -> str:
+    """What is wrong with the clock of a robot, by the offset of its statuses; empty if nothing. The
+    time of a log, or of a run faster than real time, is no clock's."""
+    if -ANOTHER_EPOCH_S < offset_s < -CLOCKS_APART_S:
+        return f"its clock is {-offset_s:.1f} s ahead of this machine's"
+    if LATE_S < offset_s < ANOTHER_EPOCH_S:
+        return f"its clock is {offset_s:.1f} s behind this machine's, or its link is slow"
+    return ""
 
 
 def listen(
@@ -139,9 +152,11 @@ def _team_heard(samples: Sequence[Sample], alive: dict[str, set[str]], seconds: 
             continue
         message = decode(sample.key, sample.payload)
         if isinstance(message, Status):
-            process = message.robot, message.incarnation
-            count = statuses[process].messages + 1 if process in statuses else 1
-            statuses[process] = StatusHeard(message, _offset_s(sample, message), count)
+            process, offset_s = (message.robot, message.incarnation), _offset_s(sample, message)
+            if earlier := statuses.get(process):
+                offset_s = min(offset_s, earlier.offset_s)
+            count = earlier.messages + 1 if earlier else 1
+            statuses[process] = StatusHeard(message, offset_s, count)
         else:
             refused[str(message)] += 1
     by_robot: dict[str, tuple[StatusHeard, ...]] = {}

@@ -18,7 +18,7 @@ from cpcbl_launch.reporting.statuses import (
     trust_reports,
 )
 from cpcbl_launch.reporting.tables import number, short, table
-from cpcbl_launch.views.listening import InputHeard, TeamHeard
+from cpcbl_launch.views.listening import InputHeard, TeamHeard, clock_problem
 from cpcbl_launch.views.traffic_tables import limit_text
 from cpcbl_transport.messages import Status
 
@@ -96,6 +96,8 @@ def _problems(name: str, status: Status | None, heard: TeamHeard) -> Iterator[st
     if status is None:
         yield "alive, but sends no status" if name in heard.alive else "sends no status"
         return
+    if clock := clock_problem(heard.statuses[name][-1].offset_s):
+        yield clock
     if status.lost:
         yield f"lost: {status.lost}"
     if text := distrust_text(status.trust):
@@ -158,7 +160,7 @@ def _robot_lines(robot: RobotStatus) -> Iterator[RenderableType]:
         yield Text(f"  {problem}", "red")
     if robot.tier is not None:
         sigma = f"{number(robot.position_sigma_m)} m, {number(robot.heading_sigma_deg, 1)} deg"
-        yield Text(f"  σ {sigma}, tier {robot.tier}, {_delay_text(robot.status_offset_s)}")
+        yield Text(f"  σ {sigma}, tier {robot.tier}")
     inputs = table("inputs", ("input",), ("/s", "delay s", REFUSALS))
     for own in robot.inputs:
         refused = ", ".join(f"{reason} {n}" for reason, n in own.refused.items()) or "0"
@@ -180,9 +182,3 @@ def _robot_lines(robot: RobotStatus) -> Iterator[RenderableType]:
     for trust in robot.trust:
         reason = trust.reason or ("not confirmed by others" if trust.unconfirmed else "trusted")
         yield Text(f"{trust.peer}: {reason}, in quarantine {trust.quarantines} times")
-
-
-def _delay_text(offset_s: float | None) -> str:
-    if offset_s is None:
-        return "no status"
-    return f"its status came {offset_s:.2f} s after its stamp"

@@ -228,6 +228,19 @@ def test_listening_hears_all_teams_or_its_own() -> None:
     assert listen(hub.session(), 5.0, lambda: publish(""), "labb").keys() == {"labb"}
 
 
+def test_the_fastest_status_tells_of_the_clock() -> None:
+    late = [s._replace(arrival_ns=NOW_NS + 3 * SECOND) for s in HEALTHY if "status" in s.key]
+    assert is_well(findings(facts_of([*HEALTHY, *late])))
+
+
+def test_the_status_of_a_robot_tells_of_its_clock() -> None:
+    off = status_samples("tests", status_of("r1", stamp_ns=NOW_NS + 2 * SECOND))
+    heard = heard_by_team([*without("status/r1"), *off], TOKENS, SECONDS)["tests"]
+    r1, r2 = robot_statuses(heard, TEAM.robots)
+    assert r1.problems == ("its clock is 2.0 s ahead of this machine's",)
+    assert r2.problems == ()
+
+
 def test_the_status_of_a_robot_has_its_problems() -> None:
     tokens = [*TOKENS, token("tests", "r1", "2"), token("tests", "r3")]
     heard = heard_by_team(without("status/r2"), tokens, SECONDS)["tests"]
