@@ -107,7 +107,8 @@ def _print_teams(rows: Collection[_ListedTeam]) -> None:
     shown.add_column("robots", overflow="fold")
     shown.add_column("inputs", overflow="fold")
     for row in rows:
-        shown.add_row(row.team, ", ".join(row.robots) or "-", ", ".join(row.inputs) or "-")
+        names = (row.team, ", ".join(row.robots) or "-", ", ".join(row.inputs) or "-")
+        shown.add_row(*map(Text, names))
     Console().print(shown if rows else Text("no team is heard on this router", "yellow"))
 
 
@@ -128,7 +129,7 @@ def status(
     _quiet()
     team = find_team(team_file)
     heard = _listen(team, connect, duration, wait).get(team.name, TeamHeard())
-    robots = robot_statuses(heard, team.robots)
+    robots = robot_statuses(heard, team)
     if robot:
         if robot not in heard.robots:
             require_robots(f"status {robot}", [robot], team)

@@ -7,6 +7,7 @@ from typing import Literal
 
 import msgspec
 
+from cpcbl_launch.team_faults import one_line
 from cpcbl_launch.views.doctor_facts import Facts
 from cpcbl_launch.views.listening import (
     ANOTHER_EPOCH_S,
@@ -18,6 +19,7 @@ from cpcbl_team.config import Team
 
 STAMPS_AHEAD_S, STAMPS_BEHIND_S = 0.5, 1.0  # robots refuse what is further ahead, or 2 s behind
 SOON = timedelta(days=30)
+LONGEST = 600  # characters of a finding
 Level = Literal["good", "note", "warning", "error"]
 
 
@@ -36,7 +38,7 @@ Check = Callable[[Facts], Iterator[tuple[Level, str, str]]]  # level, text, reme
 def findings(facts: Facts) -> list[Finding]:
     """What all checks find, in the order of the table."""
     return [
-        Finding(check=name, level=level, text=text, remedy=remedy)
+        Finding(check=name, level=level, text=one_line(text, LONGEST), remedy=remedy)
         for name, check in CHECKS.items()
         for level, text, remedy in check(facts)
     ]
@@ -185,9 +187,12 @@ def _health(facts: Facts) -> Iterator[tuple[Level, str, str]]:
 
 
 def _clocks(facts: Facts) -> Iterator[tuple[Level, str, str]]:
-    """Clocks of robots against that of this machine."""
+    """Clocks of robots against that of this machine. The time of a simulation or a log may run at
+    another speed."""
     heard = _own(facts)
     for name, processes in heard.statuses.items() if heard else ():
+        if facts.team is None or name not in facts.team.real:
+            continue
         offset_s = min((p.offset_s for p in processes), key=abs)
         remedy = f"set the clocks by NTP (chrony) on the machine of {name} and on this one"
         if problem := clock_problem(offset_s):
@@ -210,7 +215,8 @@ def _inputs(facts: Facts) -> Iterator[tuple[Level, str, str]]:
             remedy = "docs/team_file.md, Writing a driver"
             yield "error", f"{key}: {count} messages cannot be used: {reason}", remedy
         process = heard.statuses.get(robot)
-        yield from _input_clock(key, own.offset_s, process[-1] if process else None)
+        if robot in facts.team.real:
+            yield from _input_clock(key, own.offset_s, process[-1] if process else None)
         if not own.refused:
             yield "good", f"{key}: {own.rate_hz:.1f} Hz", ""
     for own_name, settings in facts.team.robots.items():

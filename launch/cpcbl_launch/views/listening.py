@@ -119,13 +119,16 @@ def listen(
 def heard_by_team(
     samples: Sequence[Sample], tokens: Iterable[str], seconds: float
 ) -> dict[str, TeamHeard]:
-    """What samples and tokens with whole keys come to, by team."""
+    """What samples and tokens with whole keys come to, by team. A key that no terminal can print is
+    nobody's of ours."""
     by_team: dict[str, list[Sample]] = {}
     alive: dict[str, dict[str, set[str]]] = {}
     for sample in samples:
+        if not sample.key.isprintable():
+            continue
         team, key = _split(sample.key)
         by_team.setdefault(team, []).append(sample._replace(key=key))
-    for token in tokens:
+    for token in filter(str.isprintable, tokens):
         team, key = _split(token)
         if names := topics.ALIVE.names(key):
             robots = alive.setdefault(team, {})

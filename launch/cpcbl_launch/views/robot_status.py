@@ -18,8 +18,10 @@ from cpcbl_launch.reporting.statuses import (
     trust_reports,
 )
 from cpcbl_launch.reporting.tables import number, short, table
+from cpcbl_launch.team_faults import one_line
 from cpcbl_launch.views.listening import InputHeard, TeamHeard, clock_problem
 from cpcbl_launch.views.traffic_tables import limit_text
+from cpcbl_team.config import Team
 from cpcbl_transport.messages import Status
 
 REFUSALS = "refused"
@@ -54,14 +56,14 @@ class RobotStatus(msgspec.Struct, frozen=True, kw_only=True):
     heard: tuple[FlowReport, ...]
 
 
-def robot_statuses(heard: TeamHeard, known: Collection[str]) -> list[RobotStatus]:
-    """All robots of a team: those that are known, then the others that are heard."""
+def robot_statuses(heard: TeamHeard, team: Team) -> list[RobotStatus]:
+    """All robots of a team: those of its file, then the others that are heard."""
     fed = {own.robot for own in heard.inputs}
-    names = dict.fromkeys([*known, *heard.robots, *sorted(fed)])
-    return [_robot_status(name, heard) for name in names]
+    names = dict.fromkeys([*team.robots, *heard.robots, *sorted(fed)])
+    return [_robot_status(name, heard, name in team.real) for name in names]
 
 
-def _robot_status(name: str, heard: TeamHeard) -> RobotStatus:
+def _robot_status(name: str, heard: TeamHeard, is_real: bool) -> RobotStatus:
     processes = heard.statuses.get(name, ())
     last = processes[-1] if processes else None
     status = last.status if last else None
@@ -74,7 +76,7 @@ def _robot_status(name: str, heard: TeamHeard) -> RobotStatus:
         heading_sigma_deg=math.degrees(status.heading_sigma_rad) if status else None,
         tier=status.tier if status else None,
         lost=status.lost if status else "",
-        problems=tuple(_problems(name, status, heard)),
+        problems=tuple(map(one_line, _problems(name, status, heard, is_real))),
         inputs=tuple(_inputs(name, status, heard)),
         counts=dict(sorted(status.counts.items())) if status else {},
         spending=summed_spending([status.spending] if status else []),
@@ -84,7 +86,7 @@ def _robot_status(name: str, heard: TeamHeard) -> RobotStatus:
     )
 
 
-def _problems(name: str, status: Status | None, heard: TeamHeard) -> Iterator[str]:
+def _problems(name: str, status: Status | None, heard: TeamHeard, is_real: bool) -> Iterator[str]:
     if name in heard.twice:
         yield f"{heard.twice[name]} processes have this name"
     problems: tuple[str, ...] = getattr(status, "problems", ())
@@ -96,7 +98,8 @@ def _problems(name: str, status: Status | None, heard: TeamHeard) -> Iterator[st
     if status is None:
         yield "alive, but sends no status" if name in heard.alive else "sends no status"
         return
-    if clock := clock_problem(heard.statuses[name][-1].offset_s):
+    clock = clock_problem(heard.statuses[name][-1].offset_s)
+    if clock and is_real:
         yield clock
     if status.lost:
         yield f"lost: {status.lost}"
@@ -137,7 +140,7 @@ def team_view(robots: Collection[RobotStatus]) -> RenderableType:
         refused = sum(sum(own.refused.values()) for own in robot.inputs)
         state = Text("mend", "red") if robot.problems else Text("ok", "green")
         shown.add_row(
-            robot.robot,
+            Text(robot.robot),
             number(robot.position_sigma_m),
             "-" if robot.tier is None else str(robot.tier),
             rates.get("odometry", "-"),
@@ -164,7 +167,7 @@ def _robot_lines(robot: RobotStatus) -> Iterator[RenderableType]:
     inputs = table("inputs", ("input",), ("/s", "delay s", REFUSALS))
     for own in robot.inputs:
         refused = ", ".join(f"{reason} {n}" for reason, n in own.refused.items()) or "0"
-        inputs.add_row(own.input, f"{own.published_hz:.1f}", number(own.offset_s, 2), refused)
+        inputs.add_row(own.input, f"{own.published_hz:.1f}", number(own.offset_s, 2), Text(refused))
     yield inputs if robot.inputs else Text("  no inputs are published to it")
     if robot.counts:
         counts = ", ".join(f"{name} {n}" for name, n in robot.counts.items())
@@ -175,7 +178,7 @@ def _robot_lines(robot: RobotStatus) -> Iterator[RenderableType]:
     for arrow, own_flows in (("to", robot.sent), ("from", robot.heard)):
         for flow in own_flows:
             peer = f"{arrow} {flow.peer or 'all who listen'}"
-            flows.add_row(peer, flow.topic, short(flow.messages), short(flow.bytes))
+            flows.add_row(Text(peer), Text(flow.topic), short(flow.messages), short(flow.bytes))
     if robot.sent or robot.heard:
         yield Text()
         yield flows

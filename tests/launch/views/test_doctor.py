@@ -146,6 +146,15 @@ def test_a_clock_that_is_off_is_found(ahead_s: float, text: str) -> None:
     )
 
 
+def test_the_time_of_a_simulation_is_no_clock() -> None:
+    simulated = replace(robot_at(), source="simulated")
+    team = replace(TEAM, robots={"r1": simulated, "r2": robot_at()})
+    fast = status_samples("tests", status_of("r1", stamp_ns=NOW_NS + 30 * SECOND))
+    samples = [*without("status/r1"), *fast]
+    assert is_well(findings(facts_of(samples, team=team)))
+    assert robot_statuses(heard_by_team(samples, TOKENS, SECONDS)["tests"], team)[0].problems == ()
+
+
 @pytest.mark.parametrize(
     ("stamp_ns", "text"),
     [
@@ -179,6 +188,15 @@ def test_payloads_that_cannot_be_used_are_found() -> None:
     assert [f.text for f in found] == ["in/r1/odometry: 1 messages cannot be used: wrong_version"]
     old = Sample("cpcbl/tests/status/r1", b"\x01", NOW_NS)
     assert the_one(facts_of([*HEALTHY, old]))[1] == "1 statuses cannot be used: wrong_version"
+
+
+def test_what_strangers_write_cannot_write_to_the_terminal() -> None:
+    evil = Sample("cpcbl/tests/in/\x1b[2J/odometry", b"x", NOW_NS)
+    assert is_well(findings(facts_of([*HEALTHY, evil], [*TOKENS, token("te\x1bsts", "r1")])))
+    lost = status_samples("tests", status_of("r1", lost="\x1b[2J" + "y" * 5000))
+    (finding,) = bad(facts_of([*without("status/r1"), *lost]))
+    assert finding.text.isprintable()
+    assert len(finding.text) <= 600
 
 
 def test_a_lost_robot_is_found() -> None:
@@ -236,7 +254,7 @@ def test_the_fastest_status_tells_of_the_clock() -> None:
 def test_the_status_of_a_robot_tells_of_its_clock() -> None:
     off = status_samples("tests", status_of("r1", stamp_ns=NOW_NS + 2 * SECOND))
     heard = heard_by_team([*without("status/r1"), *off], TOKENS, SECONDS)["tests"]
-    r1, r2 = robot_statuses(heard, TEAM.robots)
+    r1, r2 = robot_statuses(heard, TEAM)
     assert r1.problems == ("its clock is 2.0 s ahead of this machine's",)
     assert r2.problems == ()
 
@@ -244,7 +262,7 @@ def test_the_status_of_a_robot_tells_of_its_clock() -> None:
 def test_the_status_of_a_robot_has_its_problems() -> None:
     tokens = [*TOKENS, token("tests", "r1", "2"), token("tests", "r3")]
     heard = heard_by_team(without("status/r2"), tokens, SECONDS)["tests"]
-    r1, r2, r3 = robot_statuses(heard, TEAM.robots)
+    r1, r2, r3 = robot_statuses(heard, TEAM)
     assert r1.problems == ("2 processes have this name",)
     assert (r1.processes, r1.tier, r1.inputs[0].published_hz) == (2, 1, 10.0)
     assert r2.problems == r3.problems == ("alive, but sends no status",)
