@@ -10,7 +10,7 @@ import msgspec
 from cpcbl_launch.team_faults import one_line
 from cpcbl_launch.views.doctor_facts import Facts
 from cpcbl_launch.views.listening import (
-    ANOTHER_EPOCH_S,
+    DAY_S,
     StatusHeard,
     TeamHeard,
     clock_problem,
@@ -197,8 +197,6 @@ def _clocks(facts: Facts) -> Iterator[tuple[Level, str, str]]:
         remedy = f"set the clocks by NTP (chrony) on the machine of {name} and on this one"
         if problem := clock_problem(offset_s):
             yield "error", f"{name}: {problem}", remedy
-        elif abs(offset_s) >= ANOTHER_EPOCH_S:
-            yield "note", f"{name}: its time is not this machine's: a log, or a faster run", ""
 
 
 def _inputs(facts: Facts) -> Iterator[tuple[Level, str, str]]:
@@ -234,7 +232,7 @@ def _input_clock(
         return
     apart_s = offset_s - (process.offset_s if process else 0.0)
     whose = "its robot's" if process else "this machine's"
-    if abs(apart_s) > ANOTHER_EPOCH_S:
+    if abs(apart_s) > DAY_S:  # no clock is so wrong: it is another kind of time
         remedy = "stamps are Unix time in nanoseconds: neither seconds nor time since the start"
         yield "error", f"{key}: stamps are {abs(apart_s):.3g} s away from {whose} clock", remedy
     elif not -STAMPS_AHEAD_S < apart_s < STAMPS_BEHIND_S:

@@ -21,7 +21,7 @@ STEP_S = 0.05
 ALL_TEAMS = "cpcbl/*/"  # before the keys of topics
 CLOCKS_APART_S = 0.1  # as far ahead a teammate's clock may be
 LATE_S = 0.5  # so late even the fastest status came: a clock is behind, or the link is slow
-ANOTHER_EPOCH_S = 86_400.0  # no clock is so wrong: the stamps are of another kind
+DAY_S = 86_400.0
 
 
 class Sample(NamedTuple):
@@ -73,13 +73,17 @@ class TeamHeard(msgspec.Struct, frozen=True):
 
 
 def clock_problem(offset_s: float) -> str:
-    """What is wrong with the clock of a robot, by the offset of its statuses; empty if nothing. The
-    time of a log, or of a run faster than real time, is no clock's."""
-    if -ANOTHER_EPOCH_S < offset_s < -CLOCKS_APART_S:
-        return f"its clock is {-offset_s:.1f} s ahead of this machine's"
-    if LATE_S < offset_s < ANOTHER_EPOCH_S:
-        return f"its clock is {offset_s:.1f} s behind this machine's, or its link is slow"
+    """What is wrong with the clock of a real robot, by the offset of its statuses; empty if nothing
+    is."""
+    if offset_s < -CLOCKS_APART_S:
+        return f"its clock is {_duration_text(-offset_s)} ahead of this machine's"
+    if offset_s > LATE_S:
+        return f"its clock is {_duration_text(offset_s)} behind this machine's, or its link is slow"
     return ""
+
+
+def _duration_text(seconds: float) -> str:
+    return f"{seconds:.1f} s" if seconds < DAY_S else f"{seconds / DAY_S:.0f} days"
 
 
 def listen(

@@ -134,7 +134,12 @@ def test_a_name_that_is_used_twice_is_found_by_tokens_and_by_statuses() -> None:
 
 @pytest.mark.parametrize(
     ("ahead_s", "text"),
-    [(2.0, "2.0 s ahead of this"), (-3.0, "3.0 s behind this"), (0.05, ""), (-1e6, "")],
+    [
+        (2.0, "2.0 s ahead of this"),
+        (-3.0, "3.0 s behind this"),
+        (0.05, ""),
+        (-1e6, "12 days behind"),
+    ],
 )
 def test_a_clock_that_is_off_is_found(ahead_s: float, text: str) -> None:
     off = status_samples("tests", status_of("r1", stamp_ns=NOW_NS + int(ahead_s * 1e9)))
