@@ -11,6 +11,7 @@ from cpcbl_launch.team_faults import one_line
 from cpcbl_launch.views.doctor_facts import Facts
 from cpcbl_launch.views.listening import (
     DAY_S,
+    InputHeard,
     StatusHeard,
     TeamHeard,
     clock_problem,
@@ -212,10 +213,11 @@ def _inputs(facts: Facts) -> Iterator[tuple[Level, str, str]]:
         for reason, count in own.refused.items():
             remedy = "docs/team_file.md, Writing a driver"
             yield "error", f"{key}: {count} messages cannot be used: {reason}", remedy
-        process = heard.statuses.get(robot)
-        if robot in facts.team.real:
-            yield from _input_clock(key, own.offset_s, process[-1] if process else None)
-        if not own.refused:
+        process = heard.statuses[robot][-1] if robot in heard.statuses else None
+        told = process is not None and getattr(process.status, "problems", ())
+        wrong = [] if told or robot not in facts.team.real else [*_input_clock(key, own, process)]
+        yield from wrong
+        if not wrong and not told and not own.refused:
             yield "good", f"{key}: {own.rate_hz:.1f} Hz", ""
     for own_name, settings in facts.team.robots.items():
         drives = settings.source == "external" and settings.odometry.moves
@@ -225,12 +227,12 @@ def _inputs(facts: Facts) -> Iterator[tuple[Level, str, str]]:
 
 
 def _input_clock(
-    key: str, offset_s: float | None, process: StatusHeard | None
+    key: str, own: InputHeard, process: StatusHeard | None
 ) -> Iterator[tuple[Level, str, str]]:
     """Stamps of an input against the clock of its robot, or of this machine."""
-    if offset_s is None:
+    if own.offset_s is None:
         return
-    apart_s = offset_s - (process.offset_s if process else 0.0)
+    apart_s = own.offset_s - (process.offset_s if process else 0.0)
     whose = "its robot's" if process else "this machine's"
     if abs(apart_s) > DAY_S:  # no clock is so wrong: it is another kind of time
         remedy = "stamps are Unix time in nanoseconds: neither seconds nor time since the start"
