@@ -5,6 +5,7 @@ from typing import Annotated
 
 import typer
 
+from cpcbl_launch.commands import options
 from cpcbl_launch.commands.calibrating import calibrate_app
 from cpcbl_launch.commands.diagnosing import doctor, list_teams, status
 from cpcbl_launch.commands.experimenting import experiment_app
@@ -43,9 +44,13 @@ def _common_options(
     """Options before a command."""
 
 
-def run_robot(context: typer.Context) -> None:
-    """Passes the arguments on: `robot` has a parser of its own."""
-    robot.main(context.args)
+def run_robot(
+    context: typer.Context,
+    team_file: options.Team,
+    name: Annotated[str, options.robot_argument(metavar="ROBOT")],
+) -> None:
+    """Passes the arguments on: `robot` has a parser of its own. Here they are for the shell."""
+    robot.main([str(team_file), name, *context.args])
 
 
 for command in (

@@ -46,7 +46,7 @@ def _run_command() -> None:
     else:
         from cpcbl_launch.app import app
 
-        app(words)
+        app(words, prog_name="cpcbl-team")
 
 
 def _end(problem: str, code: int) -> None:

@@ -1,7 +1,6 @@
 """The command line as a user types it: real processes, real output, real exit codes."""
 
 import json
-import os
 import signal
 import subprocess
 import sys
@@ -74,12 +73,22 @@ def test_the_version_is_that_of_the_package() -> None:
     assert command_line("--version").stdout == f"cpcbl-team {version('cpcbl-team')}\n"
 
 
-def test_a_shell_completes_commands() -> None:
-    asked = {"_CPCBL_TEAM_COMPLETE": "complete_bash", "COMP_WORDS": "cpcbl-team tra"}
-    environment = {**os.environ, **asked, "COMP_CWORD": "1"}
-    program = Path(sys.executable).with_name("cpcbl-team")
-    ran = subprocess.run([program], env=environment, capture_output=True, text=True, check=False)
-    assert ran.stdout.split() == ["traffic"]
+@pytest.mark.parametrize(
+    ("words", "offered"),
+    [
+        ("tra", ["traffic"]),
+        ("status de", ["demo"]),
+        ("robot demo s", ["scout"]),
+        ("status nowhere.toml ", []),
+    ],
+)
+def test_a_shell_completes_commands_teams_and_robots(
+    words: str, offered: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("_CPCBL_TEAM_COMPLETE", "complete_bash")
+    monkeypatch.setenv("COMP_WORDS", f"cpcbl-team {words}")
+    monkeypatch.setenv("COMP_CWORD", str(len(f"cpcbl-team {words}x".split()) - 1))
+    assert command_line().stdout.split() == offered
 
 
 OLD_FORMS = {

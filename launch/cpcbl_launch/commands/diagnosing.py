@@ -9,7 +9,7 @@ import msgspec
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
-from typer import Argument, Exit, Option
+from typer import Exit, Option
 
 from cpcbl_launch.checks import require_robots
 from cpcbl_launch.commands import options
@@ -25,14 +25,11 @@ if TYPE_CHECKING:
 
 Duration = Annotated[float, Option(callback=options.duration, help="Seconds to listen.")]
 Wait = Annotated[float, Option(min=0.1, help="Seconds to wait for a router.")]
-TeamIfAny = Annotated[
-    Path | None, Argument(metavar="TEAM", help="Team file, or the name of a built-in one.")
-]
 STYLES = {"good": "green", "note": "dim", "warning": "yellow", "error": "bold red"}
 
 
 def doctor(
-    team_file: TeamIfAny = None,
+    team_file: options.TeamIfAny = None,
     connect: options.Connect = None,
     duration: Duration = 3.0,
     wait: Wait = 3.0,
@@ -76,7 +73,7 @@ class _ListedTeam(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def list_teams(
-    team_file: TeamIfAny = None,
+    team_file: options.TeamIfAny = None,
     connect: options.Connect = None,
     duration: Duration = 2.0,
     wait: Wait = 3.0,
@@ -114,7 +111,9 @@ def _print_teams(rows: Collection[_ListedTeam]) -> None:
 
 def status(
     team_file: options.Team,
-    robot: Annotated[str, Argument(help="One robot in full; default: a row for each.")] = "",
+    robot: Annotated[
+        str, options.robot_argument(help="One robot in full; default: a row for each.")
+    ] = "",
     connect: options.Connect = None,
     duration: Duration = 2.5,
     wait: Wait = 3.0,

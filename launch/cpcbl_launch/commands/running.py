@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
-from typer import Argument, Option
+from typer import Option
 
 from cpcbl_agents.clock import Clock
 from cpcbl_launch.checks import require_duration, require_robots, require_team_opencv
@@ -33,7 +33,7 @@ def _require_speed(option: str, speed: float) -> None:
 
 UpFile = Annotated[
     Path | None,
-    Argument(metavar="TEAM", help="Team file, or a built-in one: demo (default), mrclam."),
+    options.team_argument(help="Team file, or a built-in one: demo (default), mrclam."),
 ]
 UpDuration = Annotated[
     float | None, Option(help="Seconds of robot time; default: 30 simulated, or the whole log.")
@@ -175,7 +175,7 @@ def field(
 
 
 def router(
-    file: Annotated[Path | None, Argument(metavar="TEAM", help="Team file.")] = None,
+    file: options.TeamIfAny = None,
     listen: Annotated[
         list[str] | None,
         Option(

@@ -139,7 +139,7 @@ def traffic(
 
 def look(
     team_file: options.Team,
-    robot: Annotated[str, Argument(help="The robot whose camera it is.")],
+    robot: Annotated[str, options.robot_argument(help="The robot whose camera it is.")],
     pictures: Annotated[
         Path | None, Option(help="Detect in this picture, or folder of pictures; no team need run.")
     ] = None,

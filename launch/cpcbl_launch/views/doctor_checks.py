@@ -214,7 +214,7 @@ def _inputs(facts: Facts) -> Iterator[tuple[Level, str, str]]:
             remedy = "docs/team_file.md, Writing a driver"
             yield "error", f"{key}: {count} messages cannot be used: {reason}", remedy
         process = heard.statuses[robot][-1] if robot in heard.statuses else None
-        told = process is not None and getattr(process.status, "problems", ())
+        told: tuple[str, ...] = getattr(process.status, "problems", ()) if process else ()
         wrong = [] if told or robot not in facts.team.real else [*_input_clock(key, own, process)]
         yield from wrong
         if not wrong and not told and not own.refused:
