@@ -48,6 +48,25 @@ def test_the_options_are_in_the_file(tmp_path: Path) -> None:
     assert team.transport.connect == ("tcp/10.0.0.2:7000",)
 
 
+@pytest.mark.parametrize(
+    ("address", "listen", "connect"),
+    [
+        ("127.0.0.1", "127.0.0.1:7447", "127.0.0.1:7447"),
+        ("192.168.1.10", "0.0.0.0:7447", "192.168.1.10:7447"),
+        ("tcp/base:7000", "0.0.0.0:7000", "base:7000"),
+        ("fe80::1", "[::]:7447", "[fe80::1]:7447"),
+        ("[fe80::1]:7000", "[::]:7000", "[fe80::1]:7000"),
+    ],
+)
+def test_an_address_is_written_as_people_write_it(
+    address: str, listen: str, connect: str, tmp_path: Path
+) -> None:
+    init(tmp_path, "--yes", "--router", address)
+    transport = load_team(tmp_path / "team.toml").transport
+    assert transport.listen == (f"tcp/{listen}",)
+    assert transport.connect == (f"tcp/{connect}",)
+
+
 def test_little_is_asked_at_a_terminal(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[str] = []
     answers = {"Names of the robots": "north,south", "Address": "10.0.0.9", "south": "none"}

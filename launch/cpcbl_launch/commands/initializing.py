@@ -144,13 +144,14 @@ def team_text(plan: Plan, file: str, driver: str) -> str:
     cameras = "camera" in plan.robots.values()
     host, _, port = plan.router.partition("/")[2].rpartition(":")
     local = host in ("127.0.0.1", "localhost", "[::1]")
+    everywhere = "[::]" if host.startswith("[") else "0.0.0.0"
     text = _template("team.toml.txt").substitute(
         team=plan.team,
         count=len(plan.robots),
         file=file,
         driver=driver,
         landmarks="".join(_landmark_line(name, cameras) for name in CORNERS),
-        listen=plan.router if local else f"tcp/0.0.0.0:{port}",
+        listen=plan.router if local else f"tcp/{everywhere}:{port}",
         connect=plan.router,
     )
     return text + "".join(_robot_table(plan, name) for name in plan.robots)
