@@ -250,14 +250,18 @@ def _no_such_robot(robot: str, team: Team) -> str:
 
 
 def _teams(facts: Facts) -> Iterator[tuple[Level, str, str]]:
-    """Other teams on the router, among which a driver with a wrong team may be."""
-    team = facts.team
+    """Other teams on the router, among which drivers and robots with a wrong team may be."""
+    team, own = facts.team, _own(facts)
+    missing = set(team.robots) - set(own.robots) if team and own else set[str]()
     for name, heard in facts.heard.items():
         if team is not None and name == team.name:
             continue
         who = ", ".join(heard.robots or sorted({own.robot for own in heard.inputs}))
         if team is None:
             yield "good", f"team {name}: {who}", ""
+        elif strayed := sorted(missing & set(heard.robots)):
+            text = f"this team is `{team.name}`; {', '.join(strayed)} is in `{name}`"
+            yield "error", text, f"start it with {facts.file}, or write one name in all team files"
         elif heard.robots:
             yield "note", f"another team on this router: {name} ({who})", ""
         else:

@@ -183,7 +183,11 @@ def test_a_driver_of_another_team_or_name_is_named() -> None:
     unknown, missing = bad(facts_of(misspelt))
     assert unknown.text == "somebody publishes to in/r11/odometry"
     assert "no r11; r1?" in unknown.remedy
-    other = [*HEALTHY, *status_samples("other", status_of("x"))]
+    elsewhere = [*without("status/r1"), *status_samples("testz", status_of("r1"))]
+    missing, foreign = bad(facts_of(elsewhere, TOKENS[1:]))
+    assert missing.text == "r1: sends no status for 2 s"
+    assert foreign.text == "this team is `tests`; r1 is in `testz`"
+    other = [*HEALTHY, *status_samples("other", status_of("r1"))]
     assert is_well(findings(facts_of(other)))  # two teams may share a router
 
 
