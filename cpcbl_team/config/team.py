@@ -161,6 +161,11 @@ class Team(Table, frozen=True, kw_only=True):
         return any(robot.source == "simulated" for robot in self.robots.values())
 
     @property
+    def real(self) -> tuple[str, ...]:
+        """The robots with drivers of their own, and clocks that run as all others."""
+        return tuple(name for name, robot in self.robots.items() if robot.source == "external")
+
+    @property
     def cameras(self) -> tuple[str, ...]:
         """The robots that find their sightings in images."""
         return tuple(name for name, robot in self.robots.items() if robot.sensing == "camera")

@@ -5,6 +5,7 @@ import logging
 import os
 import sys
 
+from cpcbl_launch.commands.old_forms import with_present_form
 from cpcbl_team.errors import CpcblError
 
 NOT_WRITABLE = {
@@ -37,17 +38,19 @@ def main() -> None:
 
 def _run_command() -> None:
     """A robot's process loads neither typer nor the other commands."""
-    if sys.argv[1:2] == ["robot"]:
+    words = with_present_form(sys.argv[1:])
+    if words[:1] == ["robot"]:
         from cpcbl_launch.run.robot import main as run_robot
 
-        run_robot(sys.argv[2:])
+        run_robot(words[1:])
     else:
         from cpcbl_launch.app import app
 
-        app()
+        app(words, prog_name="cpcbl-team")
 
 
 def _end(problem: str, code: int) -> None:
     red, plain = ("\033[31m", "\033[0m") if sys.stderr.isatty() else ("", "")
-    sys.stderr.write(f"{red}cpcbl-team: {problem}{plain}\n")
+    for line in problem.splitlines():
+        sys.stderr.write(f"{red}cpcbl-team: {line}{plain}\n")
     sys.exit(code)

@@ -3,6 +3,7 @@
 import re
 from collections.abc import Iterator
 
+from cpcbl_launch.team_units import unit_warnings
 from cpcbl_team.config import LIKE_MIRRORED, MARKERS, Landmark, Team, Wall
 from cpcbl_transport.security import PROTOCOL
 
@@ -43,6 +44,8 @@ def problems(team: Team) -> Iterator[str]:
 def warnings(team: Team) -> Iterator[str]:
     """What is no contradiction, but will disappoint, each as `key: what; fix`."""
     objects: list[Landmark | Wall] = [*team.map.landmarks.values(), *team.map.walls.values()]
+    yield from unit_warnings(team)
+    yield from _blind_team(team)
     only_ranges = bool(objects) and all(o.gives in ("range", "none") for o in objects)
     for name, robot in team.robots.items():
         if not robot.sensor.sees_landmarks or robot.position_sensor is not None:
@@ -58,6 +61,25 @@ def warnings(team: Team) -> Iterator[str]:
                 f"robots.{name}: one object on the map does not determine a pose; if the robot is"
                 " carried away it stays lost; add a landmark"
             )
+
+
+def _blind_team(team: Team) -> Iterator[str]:
+    """Real robots of which none has landmarks or a position sensor only get worse."""
+    if all(robot.source != "external" for robot in team.robots.values()):
+        return  # a log has its own map, and a simulated team may be blind on purpose
+    objects: list[Landmark | Wall] = [*team.map.landmarks.values(), *team.map.walls.values()]
+    useful = any(o.gives != "none" for o in objects)
+    coloured = any(mark.colours for mark in team.map.landmarks.values())
+    for robot in team.robots.values():
+        seen = coloured if robot.sensing == "camera" else useful
+        if robot.position_sensor is not None or (robot.sensor.sees_landmarks and seen):
+            return
+    cameras_only = useful and all(r.sensing == "camera" for r in team.robots.values())
+    fix = "give the landmarks their colours" if cameras_only else "add landmarks"
+    yield (
+        f"map.landmarks: no robot sees a landmark or has a position sensor, so all estimates get"
+        f" worse while the robots drive; {fix}"
+    )
 
 
 def endpoint_problem(text: str) -> str:
@@ -92,14 +114,13 @@ def _marker_problems(team: Team) -> Iterator[str]:
     family = team.vision.family
     mirrored = LIKE_MIRRORED.get(family, frozenset())
     for name, robot in team.robots.items():
-        ids = list(robot.markers.values())
         for side, number in robot.markers.items():
             key = f"robots.{name}.markers.{side}"
             if not 0 <= number < MARKERS[family]:
                 yield f"{key}: {family} has no marker {number}; use 0 to {MARKERS[family] - 1}"
             elif number in mirrored:
                 yield f"{key}: marker {number} of {family} is its own mirror image; use another"
-            elif ids.count(number) > 1:
+            elif next(s for s, n in robot.markers.items() if n == number) != side:
                 yield f"{key}: marker {number} is on two sides; give each side its own"
 
 

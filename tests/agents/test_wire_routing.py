@@ -175,14 +175,16 @@ def test_of_two_processes_the_better_one_sends_and_the_worse_one_receives(tmp_pa
     team_file, endpoint = tmp_path / "team.json", free_endpoint()
     save_resolved(team, team_file)
     clock = Clock(EPOCH_MS * 1_000_000, time.monotonic_ns() + 6_000_000_000, 2.0)
-    common = ("--team", str(team_file), "--clock", str(clock), "--parent", str(os.getpid()))
+    common = ("--clock", str(clock), "--parent", str(os.getpid()))
     with (
         open_router(team.name, [endpoint], guards=guard_rules(team, clock.speed)),
         Relay(endpoint) as better,
         Relay(endpoint) as worse,
     ):
         table = [
-            ProcessSpec(name, (*PROGRAM, "robot", name, *common, "--connect", link.endpoint))
+            ProcessSpec(
+                name, (*PROGRAM, "robot", str(team_file), name, *common, "--connect", link.endpoint)
+            )
             for name, link in (("1", better), ("2", worse))
         ]
         with Supervisor(table, tmp_path) as supervisor:

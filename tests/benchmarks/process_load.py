@@ -171,10 +171,11 @@ def _robot_specs(
     # Without PYTHONSAFEPATH the present directory would come before the other checkout
     environment = ("env", "PYTHONSAFEPATH=1", f"PYTHONPATH={path}")
     program = (*environment, sys.executable, "-m", "cpcbl_launch")
-    return [
-        spec._replace(command=(*program, *spec.command[spec.command.index("robot") :]))
-        for spec in robot_specs
-    ]
+    old = []
+    for spec in robot_specs:  # in the form that every checkout knows
+        file, name, *rest = spec.command[spec.command.index("robot") + 1 :]
+        old.append(spec._replace(command=(*program, "robot", name, "--team", file, *rest)))
+    return old
 
 
 # Running ------------------------------------------------------------------------------------------

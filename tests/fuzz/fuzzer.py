@@ -316,7 +316,7 @@ class Fuzzer:
 def _traffic_exit(team: TeamUnderTest) -> int:
     """The exit code of `cpcbl-team traffic` that watches this team."""
     where = ("--team-name", team.plan.team.name, "--connect", team.endpoint)
-    words = (*PROGRAM, "traffic", *where, "--for", "2", "--json")
+    words = (*PROGRAM, "traffic", *where, "--duration", "2", "--json")
     return subprocess.run(words, capture_output=True, timeout=60.0, check=False).returncode
 
 

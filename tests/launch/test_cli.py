@@ -9,6 +9,7 @@ import pytest
 from support.logs import write_log
 from support.processes import command_line, cpcbl_team, eventually, patient_up, pids_of
 
+from cpcbl_launch.commands.old_forms import present_form, with_present_form
 from cpcbl_launch.run.processes import PROGRAM
 from cpcbl_launch.run.up import free_endpoint
 
@@ -53,12 +54,75 @@ odometry = { moves = false }
         ["look"],
         ["observer"],
         ["gateway"],
+        ["calibrate", "camera"],
     ],
 )
-def test_every_command_explains_itself(command: list[str]) -> None:
-    shown = command_line(*command, "--help")
+@pytest.mark.parametrize("option", ["--help", "-h"])
+def test_every_command_explains_itself(command: list[str], option: str) -> None:
+    shown = command_line(*command, option)
     assert shown.returncode == 0
     assert "Usage" in shown.stdout
+
+
+def test_the_version_is_that_of_the_package() -> None:
+    assert command_line("--version").stdout == f"cpcbl-team {version('cpcbl-team')}\n"
+
+
+@pytest.mark.parametrize(
+    ("words", "offered"),
+    [
+        ("tra", ["traffic"]),
+        ("status de", ["demo"]),
+        ("robot demo s", ["scout"]),
+        ("status nowhere.toml ", []),
+    ],
+)
+def test_a_shell_completes_commands_teams_and_robots(
+    words: str, offered: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("_CPCBL_TEAM_COMPLETE", "complete_bash")
+    monkeypatch.setenv("COMP_WORDS", f"cpcbl-team {words}")
+    monkeypatch.setenv("COMP_CWORD", str(len(f"cpcbl-team {words}x".split()) - 1))
+    assert command_line().stdout.split() == offered
+
+
+OLD_FORMS = {
+    "robot r1 --team t.toml --restarted": "robot t.toml r1 --restarted",
+    "robot --team=t.toml r1": "robot t.toml r1",
+    "field --seed 3 --team t.toml": "field t.toml --seed 3",
+    "look --pictures shots --team t.toml r1": "look t.toml --pictures shots r1",
+    "observer x --team blind --at 1,2 --for 3": "observer blind x --at 1,2 --duration 3",
+    "traffic demo --for=4": "traffic demo --duration=4",
+}
+
+
+@pytest.mark.parametrize("old", OLD_FORMS)
+def test_a_replaced_form_still_works_and_a_person_reads_the_new_one(
+    old: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    new = OLD_FORMS[old].split()
+    assert with_present_form(old.split()) == new
+    assert capsys.readouterr().err == ""
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
+    assert with_present_form(old.split()) == new
+    said = f"cpcbl-team: this is now written: cpcbl-team {OLD_FORMS[old]}\n"
+    assert capsys.readouterr().err == said
+    assert with_present_form(new) == new
+    assert capsys.readouterr().err == ""
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        "",
+        "--version",
+        "calibrate log --team t.toml",
+        "evaluate mrclam DIR --team t",
+        "robot --team",
+    ],
+)
+def test_other_words_stay_as_they_are(words: str) -> None:
+    assert present_form(words.split()) == words.split()
 
 
 def test_check_accepts_the_built_in_teams() -> None:
@@ -86,16 +150,16 @@ def test_check_names_file_key_and_fix_in_one_line(tmp_path: Path) -> None:
         (["up", "mrclam", "--data", "nowhere"], "asrl.utias.utoronto.ca"),
         (["up", "demo", "--blind", "nobody"], "has no robot nobody"),
         (["evaluate", "mrclam", "nowhere"], "asrl.utias.utoronto.ca"),
-        (["robot", "nobody", "--team", "demo"], "has no robot nobody"),
+        (["robot", "demo", "nobody"], "has no robot nobody"),
         (["up", "--picture", "run.xyz"], "--picture run.xyz: not a picture"),
         (["calibrate", "nowhere", "--picture", "run.xyz"], "--picture run.xyz: not a picture"),
         (["up", "--robots", "scout,nobody"], "nobody; there are navigator, observer, scout"),
         (["up", "--robots", ","], "names no robot; there are"),
         *((["up", "--duration", s], f"--duration {s}: at least 1") for s in ("inf", "nan", "-1")),
         *((["up", "--speed", s], f"--speed {s}: from 0.05 to") for s in ("inf", "nan", "0")),
-        (["robot", "scout", "--team", "demo", "--connect", "base:7447"], "--connect base:7447: no"),
+        (["robot", "demo", "scout", "--connect", "base:7447"], "--connect base:7447: no"),
         (["router", "demo", "--listen", "7447"], "--listen 7447: no endpoint; write it as tcp/"),
-        (["field", "--team", "demo", "--site", "base=scout"], "--site base=scout: no endpoint"),
+        (["field", "demo", "--site", "base=scout"], "--site base=scout: no endpoint"),
     ],
 )
 def test_what_the_user_can_mend_is_one_line(arguments: list[str], said: str) -> None:
@@ -171,7 +235,7 @@ def test_up_on_a_log_agrees_with_evaluate(tmp_path: Path) -> None:
 def test_a_team_spreads_over_machines_by_an_endpoint_in_its_file(tmp_path: Path) -> None:
     endpoint, team = free_endpoint(), tmp_path / "team.toml"
     team.write_text(f'{PAIR}\n[transport]\nlisten = ["{endpoint}"]\nconnect = ["{endpoint}"]\n')
-    elsewhere = [*PROGRAM, "robot", "watcher", "--team", str(team)]
+    elsewhere = [*PROGRAM, "robot", str(team), "watcher"]
     with subprocess.Popen(elsewhere, stderr=subprocess.DEVNULL) as other:
         ran = cpcbl_team("up", team, "--robots", "driver", "--duration", 8, "--json")
         other.send_signal(signal.SIGINT)

@@ -62,7 +62,7 @@ WRONG = [
     Wrong(
         "unknown in a colour",
         "[vision.colours.orange]\nhues = [1, 2]",
-        "vision.colours[...].hues",
+        "vision.colours.orange.hues",
         "'hue'",
     ),
     Wrong(
@@ -73,12 +73,12 @@ WRONG = [
     ),
     Wrong("unknown in simulation", "[simulation]\nnois = 1", "simulation.nois", "'noise'"),
     # types and ranges
-    Wrong("text for a number", "[simulation]\nnoise = 'x'", "simulation.noise", "float"),
-    Wrong("number for a table", "[defaults]\nsensor = 3", "defaults.sensor", "object"),
+    Wrong("text for a number", "[simulation]\nnoise = 'x'", "simulation.noise", "a number"),
+    Wrong("number for a table", "[defaults]\nsensor = 3", "defaults.sensor", "a table"),
     Wrong("number for a robot", "robots.r2 = 3", "robots.r2", "write [robots.r2]"),
     Wrong("list for a robot", "[[robots.r2]]", "robots.r2", "write [robots.r2]"),
-    Wrong("number for a name", "name = 3", "name", "str"),
-    Wrong("text for a list", "[transport]\nlisten = 'x'", "transport.listen", "array"),
+    Wrong("number for a name", "name = 3", "name", "a text"),
+    Wrong("text for a list", "[transport]\nlisten = 'x'", "transport.listen", "a list"),
     Wrong(
         "three numbers for a point",
         "[defaults]\nwaypoints_m = [[1.0, 2.0, 3.0]]",
@@ -89,7 +89,7 @@ WRONG = [
         "text in a landmark",
         "[map.landmarks.oak]\nx_m = 'west'\ny_m = 1.0",
         "map.landmarks.oak.x_m",
-        "float",
+        "a number",
     ),
     Wrong("below the range", "[simulation]\nnoise = -1.0", "simulation.noise", ">= 0.0"),
     Wrong(
@@ -226,7 +226,7 @@ WRONG = [
     Wrong(
         "a marker on two sides",
         "[defaults.markers]\nfront = 3\nback = 3",
-        "robots.r1.markers.front",
+        "robots.r1.markers.back",
         "give each side its own",
     ),
     Wrong(

@@ -41,12 +41,13 @@ def open_bus(
 ) -> "ZenohBus":
     """A client's session below the team's namespace; waits for a router until `give_up()`. With
     credentials every link is mutual TLS. `on_wait` is told again and again that there is none yet,
-    with the reason where TLS has one. Raises BusError when it gave up."""
+    with the reason where TLS has one. Without a team, keys are whole ones, of all teams. Raises
+    BusError when it gave up."""
     config = client_config(connect, credentials)
     reason = "stopped before a router answered"
     while not give_up():
         try:
-            return ZenohBus(_open(config, namespace(team)))
+            return ZenohBus(_open(config, namespace(team) if team else None))
         except zenoh.ZError as error:
             reason = _tls_reason(connect, credentials) or _one_line(error)
             if on_wait is not None:

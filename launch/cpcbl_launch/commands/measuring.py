@@ -143,7 +143,7 @@ def calibrate(
 
 
 def simulate(
-    file: options.TeamArgument = None,
+    file: options.TeamOrDemo = None,
     robots: Annotated[str, Option(hidden=True)] = "",
     duration: Annotated[float | None, Option(help="Seconds of robot time; default: 30.")] = None,
     seed: options.NoiseSeed = 1,

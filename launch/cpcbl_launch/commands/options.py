@@ -8,11 +8,12 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
-from typer import Argument, CallbackParam, Exit, Option, secho
+from typer import Argument, CallbackParam, Context, Exit, Option, secho
 
 from cpcbl_launch.checks import require_endpoints, require_matplotlib
 from cpcbl_launch.reporting.files import json_text, write_or_reason
 from cpcbl_launch.run.containers import BASE_VARIABLE
+from cpcbl_launch.team_file import builtin_path, find_team
 from cpcbl_team.errors import InputError
 
 
@@ -69,9 +70,31 @@ writable_file, writable_picture = checked(require_writable_file), checked(_requi
 folder, endpoints = checked(require_folder), checked(require_endpoints)
 duration = checked(_require_time)
 
-TeamFile = Annotated[Path, Option("--team", help="Team file (TOML).")]
-TeamArgument = Annotated[
-    Path | None, Argument(help="Team file, or a built-in one: demo (default).")
+
+def complete_team(incomplete: str) -> list[str]:
+    """Team files of the present folder and built-in teams, for a shell."""
+    built_in = [path.stem for path in builtin_path("demo").parent.glob("*.toml")]
+    names = [*sorted(map(str, Path().glob("*.toml"))), *sorted(built_in)]
+    return [name for name in names if name.startswith(incomplete)]
+
+
+def complete_robot(context: Context, incomplete: str) -> list[str]:
+    """The robots of the team that is named before, for a shell."""
+    try:
+        team = find_team(Path(str(context.params.get("team_file"))))
+    except InputError:
+        return []
+    return [name for name in team.robots if name.startswith(incomplete)]
+
+
+team_argument = partial(Argument, metavar="TEAM", autocompletion=complete_team)
+robot_argument = partial(Argument, autocompletion=complete_robot)
+Team = Annotated[Path, team_argument(help="Team file (TOML), or the name of a built-in one.")]
+TeamIfAny = Annotated[
+    Path | None, team_argument(help="Team file (TOML), or the name of a built-in one.")
+]
+TeamOrDemo = Annotated[
+    Path | None, team_argument(help="Team file, or a built-in one: demo (default).")
 ]
 Blind = Annotated[str, Option(help="Robots that cannot see landmarks, e.g. 3,4,5.")]
 _limit = partial(Option, min=0.0, callback=checked(_require_limit))

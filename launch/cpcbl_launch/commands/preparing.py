@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
-from typer import Argument, Option
+from typer import Option
 
 from cpcbl_launch.commands import options
 from cpcbl_launch.reporting.files import write_or_reason
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from cpcbl_launch.keys.folder import KeysReport
 
 
-def check(file: Annotated[Path, Argument(help="Team file (TOML).")]) -> None:
+def check(file: options.Team) -> None:
     """Validate a team file without starting anything."""
     team = find_team(file)
     marks, walls = len(team.map.landmarks), len(team.map.walls)
@@ -32,7 +32,7 @@ def check(file: Annotated[Path, Argument(help="Team file (TOML).")]) -> None:
 
 
 def keys(
-    file: Annotated[Path, Argument(help="Team file (TOML).")],
+    file: options.Team,
     output: Annotated[
         Path | None,
         Option(help="Folder of the keys; default: transport.keys, beside the team file."),
@@ -96,7 +96,7 @@ def _print_keys(made: "list[KeysReport]", folder: Path) -> None:
 
 
 def compose(
-    file: options.TeamArgument = None,
+    file: options.TeamOrDemo = None,
     image: options.Image = None,
     seed: options.NoiseSeed = 1,
     output: Annotated[

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from msgspec.structs import replace
 from rich.console import Console
-from typer import Argument, Option
+from typer import Option
 
 from cpcbl_agents.clock import Clock
 from cpcbl_launch.checks import require_duration, require_robots, require_team_opencv
@@ -33,7 +33,8 @@ def _require_speed(option: str, speed: float) -> None:
 
 
 UpFile = Annotated[
-    Path | None, Argument(help="Team file, or a built-in one: demo (default), mrclam.")
+    Path | None,
+    options.team_argument(help="Team file, or a built-in one: demo (default), mrclam."),
 ]
 UpDuration = Annotated[
     float | None, Option(help="Seconds of robot time; default: 30 simulated, or the whole log.")
@@ -144,7 +145,7 @@ def _launch(
 
 
 def field(
-    team_file: options.TeamFile,
+    team_file: options.Team,
     seed: options.NoiseSeed = 1,
     connect: options.Connect = None,
     site: Annotated[
@@ -177,7 +178,7 @@ def field(
 
 
 def router(
-    file: Annotated[Path | None, Argument(help="Team file.")] = None,
+    file: options.TeamIfAny = None,
     listen: Annotated[
         list[str] | None,
         Option(
@@ -190,7 +191,7 @@ def router(
         Option(callback=options.endpoints, help="Endpoint of another site's router to connect to."),
     ] = None,
     config: Annotated[
-        Path | None, Option(help="A configuration of Zenoh (JSON5), in place of FILE.")
+        Path | None, Option(help="A configuration of Zenoh (JSON5), in place of TEAM.")
     ] = None,
     speed: Annotated[float, Option(hidden=True, help="Guards let more in.")] = 1.0,
     parent: options.Parent = None,
@@ -214,7 +215,7 @@ def router(
         title = f"router of team {team.name}"
         settings = team_router(team, listen or (), connect or (), speed)
     else:
-        raise InputError("router: a team FILE, or --config FILE; one of them")
+        raise InputError("router: a TEAM, or --config FILE; one of them")
     if print_config:
         typer.echo(f"// {title}\n// zenohd -c FILE, or cpcbl-team router --config FILE")
         typer.echo(json.dumps(settings, indent=2))

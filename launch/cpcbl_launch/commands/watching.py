@@ -35,7 +35,7 @@ Source = Annotated[
 ]
 Stay = Annotated[
     float | None,
-    Option("--for", callback=options.duration, help="Seconds to stay; default: until Ctrl-C."),
+    Option(callback=options.duration, help="Seconds to stay; default: until Ctrl-C."),
 ]
 InContainer = Annotated[
     bool, Option("--container", help="Run it in a container of its own (needs Docker).")
@@ -43,8 +43,8 @@ InContainer = Annotated[
 
 
 def observer(
+    team_file: options.Team,
     name: Name,
-    team_file: options.TeamFile,
     at: At,
     sensor: Sensor = "survey",
     fov: FieldOfView = None,
@@ -78,8 +78,8 @@ def observer(
         from cpcbl_launch.run.containers.docker import ensure_image
         from cpcbl_launch.run.containers.launch import line_printer, run_observer_container
 
-        given = {"at": at, "fov": fov, "move": move, "source": source, "for": duration}
-        arguments = _arguments(given | {"clock": clock}, endpoints, as_json)
+        given = {"at": at, "fov": fov, "move": move, "source": source}
+        arguments = _arguments(given | {"duration": duration, "clock": clock}, endpoints, as_json)
         image = image or ensure_image(base_image, stop, line_printer(console))
         raise Exit(run_observer_container(name, file_team, sensor, arguments, image, stop))
     text = f"{name} joins team {team.name} at {', '.join(endpoints)}; Ctrl-C: it leaves"
@@ -98,14 +98,14 @@ def _arguments(given: Mapping[str, object], endpoints: Sequence[str], as_json: b
 
 
 def traffic(
-    file: options.TeamArgument = None,
+    file: options.TeamOrDemo = None,
     team_name: Annotated[
         str | None, Option(help="The running team's name, where its file is not at hand.")
     ] = None,
     connect: options.Connect = None,
     duration: Annotated[
         float | None,
-        Option("--for", callback=options.duration, help="Seconds to watch; default: until Ctrl-C."),
+        Option(callback=options.duration, help="Seconds to watch; default: until Ctrl-C."),
     ] = None,
     wait: Annotated[float, Option(min=0.1, help="Seconds to wait for the team's router.")] = 5.0,
     as_json: Annotated[
@@ -138,8 +138,8 @@ def traffic(
 
 
 def look(
-    robot: Annotated[str, Argument(help="The robot whose camera it is.")],
-    team_file: options.TeamFile,
+    team_file: options.Team,
+    robot: Annotated[str, options.robot_argument(help="The robot whose camera it is.")],
     pictures: Annotated[
         Path | None, Option(help="Detect in this picture, or folder of pictures; no team need run.")
     ] = None,

@@ -12,7 +12,7 @@ seconds after the start. Without times it lasts from the start to the end.
 | `overconfident:0.3` | its position has an error of this sigma (m), but it states 1 mm |
 | `clock:0.5` | its stamp is so many seconds too late (negative: too early) |
 
-`python -m cpcbl_launch.lab.faulty_robot NAME --team FILE --fault FAULT` runs such a robot.
+`python -m cpcbl_launch.lab.faulty_robot TEAM NAME --fault FAULT` runs such a robot.
 """
 
 import logging

@@ -37,15 +37,22 @@ class Task(NamedTuple):
     on_restart: tuple[str, ...] = ()
 
 
-def tasks(team: Team, common: tuple[str, ...], seed: int, here: Collection[str]) -> list[Task]:
+def tasks(
+    team: Team, team_file: str, common: tuple[str, ...], seed: int, here: Collection[str]
+) -> list[Task]:
     """name | arguments | when: the field if any robot is simulated, one process a robot."""
     rows = [
-        Task(ROBOT + name, ("robot", name, *common), Identity(Role.ROBOT, name), ("--restarted",))
+        Task(
+            ROBOT + name,
+            ("robot", team_file, name, *common),
+            Identity(Role.ROBOT, name),
+            ("--restarted",),
+        )
         for name in team.robots
         if name in here
     ]
     if team.simulated:
-        field = ("field", "--seed", str(seed), *common)
+        field = ("field", team_file, "--seed", str(seed), *common)
         rows.insert(0, Task("field", field, Identity(Role.FIELD)))
     return rows
 
@@ -62,17 +69,14 @@ def process_table(
     team: Team, team_file: Path, endpoint: str, clock: Clock, seed: int, here: Collection[str]
 ) -> list[ProcessSpec]:
     """The same as processes of this machine, which end with the one that started them."""
-    common = (
-        *("--team", str(team_file), "--connect", endpoint),
-        *("--clock", str(clock), "--parent", str(os.getpid())),
-    )
+    common = ("--connect", endpoint, "--clock", str(clock), "--parent", str(os.getpid()))
     clocks = {
         ROBOT + name: ("--clock", str(clock._replace(epoch_ns=clock.epoch_ns + int(s * 1e9))))
         for name, s in team.simulation.clocks_ahead_s.items()
     }
     table = [
         ProcessSpec(name, (*PROGRAM, *arguments, *clocks.get(name, ())), on_restart)
-        for name, arguments, _, on_restart in tasks(team, common, seed, here)
+        for name, arguments, _, on_restart in tasks(team, str(team_file), common, seed, here)
     ]
     if team.gateway is not None:
         gateway = ("gateway", str(team_file), "--connect", endpoint, "--parent", str(os.getpid()))

@@ -29,8 +29,8 @@ def robot_parser(program: str = "cpcbl-team robot") -> argparse.ArgumentParser:
         program, description=DESCRIPTION, allow_abbrev=False, formatter_class=_Formatter
     )
     add = parser.add_argument
-    add("name", metavar="NAME", help="The robot's name in the team file.")
-    add("--team", type=Path, required=True, metavar="FILE", help="Team file (TOML).")
+    add("team", type=Path, metavar="TEAM", help="Team file (TOML), or a built-in one.")
+    add("name", metavar="ROBOT", help="The robot's name in the team file.")
     add(
         "--connect",
         action="append",

@@ -103,7 +103,7 @@ Launch = Callable[[Run, Path, Stop], Launcher]
 
 def require_keys(team: Team, listen: Sequence[str], here: Collection[str]) -> None:
     """Says what a process would die of before any starts. Raises SecurityError."""
-    for task in tasks(team, (), 0, here):
+    for task in tasks(team, "", (), 0, here):
         link_of(team, task.identity, listen)
     if team.gateway is not None:
         link_of(team, Identity(Role.GATEWAY), listen)

@@ -45,10 +45,10 @@ def test_endpoints_go_with_the_security(text: str, said: str) -> None:
     "command",
     [
         ("up", "{file}", "--duration", "1"),
-        ("robot", "r1", "--team", "{file}"),
+        ("robot", "{file}", "r1"),
         ("traffic", "{file}"),
         ("router", "{file}"),
-        ("field", "--team", "{file}"),
+        ("field", "{file}"),
     ],
     ids=lambda words: words[0],
 )
@@ -64,7 +64,7 @@ def test_absent_keys_end_every_command_with_one_line(
 def test_plain_endpoints_end_every_command_with_one_line(team_file: Path) -> None:
     keys(team_file)
     plain = ("--connect", "tcp/127.0.0.1:1")
-    for command in (("robot", "r1", "--team", team_file), ("traffic", team_file)):
+    for command in (("robot", team_file, "r1"), ("traffic", team_file)):
         line = refused(*command, *plain)
         assert "tcp/127.0.0.1:1" in line
         assert "tls/127.0.0.1:1" in line
@@ -116,10 +116,12 @@ def test_an_observer_joins_a_secured_team_with_its_own_certificate(tmp_path: Pat
     secured, endpoint = demo(tmp_path, "mtls"), free_endpoint("tls")
     secured.write_text(secured.read_text() + f'listen = ["{endpoint}"]\n')
     keys(secured, "--observer", "tripod")
-    join = ("--team", secured, "--connect", endpoint, "--at", "4.5,0,90", "--json")
-    assert "observer/stranger" in refused("observer", "stranger", *join)
+    join = ("--connect", endpoint, "--at", "4.5,0,90", "--json")
+    assert "observer/stranger" in refused("observer", secured, "stranger", *join)
     with running("up", secured, "--duration", 20, "--json") as team:
-        visited = json.loads(cpcbl_team("observer", "tripod", *join, "--for", 12).stdout)
+        visited = json.loads(
+            cpcbl_team("observer", secured, "tripod", *join, "--duration", 12).stdout
+        )
         report = json.loads(team.communicate(timeout=60)[0])
     assert visited["lost"] == ""
     assert sum(flow["messages"] for flow in visited["sent"]) > 10
@@ -159,9 +161,9 @@ def test_robots_of_a_router_of_its_own(team_file: Path) -> None:
         TEAM.replace('source = "external"', 'source = "external"\nstart = {x_m = 0.0, y_m = 0.0}')
         + f'listen = ["{endpoint}"]\nconnect = ["{endpoint}"]\n'
     )
-    with running("router", team_file), running("robot", "r1", "--team", team_file):
+    with running("router", team_file), running("robot", team_file, "r1"):
         with session(load_team(team_file), OPERATOR, endpoint) as operator:
             ear = Subscription(operator, topics.STATUS.at())
             assert eventually(lambda: bool(ear.samples))
-        done = cpcbl_team("traffic", team_file, "--for", 4, "--wait", 30, "--json")
+        done = cpcbl_team("traffic", team_file, "--duration", 4, "--wait", 30, "--json")
         assert list(json.loads(done.stdout)["robots"]) == ["r1"]

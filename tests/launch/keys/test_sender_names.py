@@ -52,7 +52,7 @@ def test_operators_are_not_told_lies_about_others(tmp_path: Path) -> None:
         try:
             seen = cpcbl_team(
                 *("traffic", _written(team, tmp_path), "--connect", endpoint),
-                *("--for", 2, "--json"),
+                *("--duration", 2, "--json"),
             )
         finally:
             stop.set()

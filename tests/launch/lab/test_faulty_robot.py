@@ -120,7 +120,7 @@ def test_only_fixes_and_beliefs_are_changed_on_their_way_out() -> None:
 
 
 def test_the_process_refuses_a_text_that_is_no_fault() -> None:
-    command = (*PROGRAM, "robot", "patrol", "--team", str(builtin_path("demo")))
+    command = (*PROGRAM, "robot", str(builtin_path("demo")), "patrol")
     words = faulty_command(command, "bias:1")
     result = run(words, capture_output=True, text=True, timeout=60.0, check=False)
     assert result.returncode == 2

@@ -41,7 +41,7 @@ def test_budgets_of_a_command_line_are_those_of_all_robots() -> None:
     [
         (["simulate", "demo", "--bytes-per-s", "inf"], "--bytes-per-s inf"),
         (["up", "demo", "--messages-per-minute", "inf"], "--messages-per-minute inf"),
-        (["traffic", "demo", "--for", "0"], "--for 0"),
+        (["traffic", "demo", "--duration", "0"], "--duration 0"),
         (["traffic", "nowhere.toml"], "nowhere.toml: no such file"),
     ],
 )

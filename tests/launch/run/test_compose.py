@@ -67,9 +67,9 @@ def test_the_demo_is_a_router_a_field_and_four_robots() -> None:
     assert list(found) == ["router", "field", *robots]
     for name in DEMO.robots:
         command = found[f"robot-{name}"]["command"]
-        assert command == ["robot", name, "--team", "demo", "--connect", "tcp/router:7447"]
+        assert command == ["robot", "demo", name, "--connect", "tcp/router:7447"]
     assert found["router"]["command"] == ["router", "demo", "--listen", "tcp/0.0.0.0:7447"]
-    assert found["field"]["command"][:3] == ["field", "--seed", "1"]
+    assert found["field"]["command"][:3] == ["field", "demo", "--seed"]
 
 
 def test_robots_with_drivers_of_their_own_need_no_field() -> None:
@@ -114,7 +114,7 @@ def test_what_yaml_or_compose_would_take_for_something_else_stays_what_it_is() -
     found = services(team, HOW._replace(team_file=mount.target, mounts=(mount,), clock="1:2:3.0"))
     for name in names:
         command = found[f"robot-{name}"]["command"]
-        assert command[:2] == ["robot", name]
+        assert command[:3] == ["robot", mount.target, name]
         assert command[-2:] == ["--clock", "1:2:3.0"]
         assert all(isinstance(word, str) for word in command)
     assert len(found) == len(names) + 1
@@ -131,7 +131,7 @@ def test_a_part_of_the_team_at_another_speed_and_seed() -> None:
     found = services(DEMO, HOW._replace(here=("scout",), speed=4.0, seed=9, clock="7:8:4.0"))
     assert list(found) == ["router", "field", "robot-scout"]
     assert found["router"]["command"][-2:] == ["--speed", "4"]
-    assert found["field"]["command"][:3] == ["field", "--seed", "9"]
+    assert found["field"]["command"][:3] == ["field", "demo", "--seed"]
 
 
 def test_a_file_of_ones_own_is_mounted_by_its_way_from_the_compose_file(tmp_path: Path) -> None:

@@ -234,7 +234,7 @@ def test_the_committed_compose_file_runs_and_a_robot_that_crashes_comes_back(
     ):
         recorder = Recorder(bus)
         assert eventually(lambda: recorder.tracks.keys() == ROBOTS, 60.0)
-        watching = ("--connect", endpoint, "--for", 3, "--json")
+        watching = ("--connect", endpoint, "--duration", 3, "--json")
         seen = cpcbl_team("traffic", "demo", *watching)
         assert json.loads(seen.stdout)["robots"].keys() == ROBOTS
         containers = project.containers()
@@ -256,7 +256,7 @@ def test_the_committed_compose_file_runs_and_a_robot_that_crashes_comes_back(
 
 def observing(demo: Demo, *options: object) -> list[str]:
     at = ("--at", "4.5,6,-90", "--connect", demo.endpoint, "--image", image())
-    command = (*PROGRAM, "observer", "tripod", "--team", demo.file, *at, "--container", *options)
+    command = (*PROGRAM, "observer", demo.file, "tripod", *at, "--container", *options)
     return list(map(str, command))
 
 
@@ -266,7 +266,7 @@ def test_an_observer_in_a_container_helps_a_team_in_containers_and_leaves(demo: 
     with going_up(demo, "--duration", 600, "--json") as process:
         when(demo, lambda heard: "scout" in heard.tracks)
         ended = subprocess.run(
-            observing(demo, "--for", 6, "--json", "--sensor", sensor, "--fov", 170),
+            observing(demo, "--duration", 6, "--json", "--sensor", sensor, "--fov", 170),
             capture_output=True,
             text=True,
             timeout=90.0,

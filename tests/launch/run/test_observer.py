@@ -232,12 +232,12 @@ def test_a_team_that_lets_no_guest_in_does_as_if_there_were_none() -> None:
         (["x", "--at", "nan,1"], "--at nan,1"),
         (["x", "--at", "1,1", "--move", "1"], "--move 1"),
         (["x", "--at", "1,1", "--sensor", "radar"], "--sensor radar"),
-        (["x", "--at", "1,1", "--for", "0"], "--for 0"),
+        (["x", "--at", "1,1", "--duration", "0"], "--duration 0"),
         (["a b", "--at", "1,1"], "letters, digits"),
     ],
 )
 def test_a_refusal_is_one_line(arguments: list[str], said: str) -> None:
-    ran = command_line("observer", *arguments, "--team", "blind")
+    ran = command_line("observer", "blind", *arguments)
     assert ran.returncode == 2
     (line,) = ran.stderr.splitlines()
     assert said in line

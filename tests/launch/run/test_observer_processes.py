@@ -74,7 +74,7 @@ class Team3:
         """What each has written to standard output and error, once the run is over."""
 
     def observe(self, *more: str) -> bool:
-        command = [*PROGRAM, "observer", "tripod", "--team", str(self.file), "--at", "4.5,6,-90"]
+        command = [*PROGRAM, "observer", str(self.file), "tripod", "--at", "4.5,6,-90"]
         self.observers.append(
             subprocess.Popen(
                 [*command, *more],
@@ -213,7 +213,7 @@ def test_after_its_time_an_observer_leaves_and_says_what_it_did(team3: Team3) ->
 
     team3.run(
         team3.all_lose_their_way,
-        lambda recorder: team3.observe("--for", "4", "--json"),
+        lambda recorder: team3.observe("--duration", "4", "--json"),
         over,
         team3.guest_has_left,
     )
@@ -282,9 +282,9 @@ def test_a_real_tripod_is_fed_by_its_own_driver(tmp_path: Path) -> None:
         heard[status.robot] = status
 
     commands = [
-        [*PROGRAM, "robot", "r1", "--team", str(file), "--connect", endpoint],
+        [*PROGRAM, "robot", str(file), "r1", "--connect", endpoint],
         [
-            *(*PROGRAM, "observer", "tripod", "--team", str(file), "--at", "2,0,180"),
+            *(*PROGRAM, "observer", str(file), "tripod", "--at", "2,0,180"),
             *("--connect", endpoint),
         ],
         [sys.executable, str(DRIVER), str(file), "tripod"],

@@ -238,8 +238,8 @@ def test_what_is_no_configuration_of_a_router_is_refused(
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        ([], "a team FILE, or --config FILE"),
-        (["demo", "--config", "x.json5"], "a team FILE, or --config FILE"),
+        ([], "a TEAM, or --config FILE"),
+        (["demo", "--config", "x.json5"], "a TEAM, or --config FILE"),
         (["--config", "x.json5", "--listen", "tcp/0.0.0.0:1"], "says where it listens"),
         (["--config", "x.json5"], "x.json5: cannot be read"),
     ],

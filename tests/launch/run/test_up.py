@@ -84,7 +84,7 @@ def test_kills_one_of_four_robot_processes_and_it_localizes_again(
         seen.update(supervisor.pids)
         incarnations.update({n: s.incarnation for n, s in recorder.latest()[1].items()})
         for name in ROBOTS:
-            assert f"robot {name}" in command_of(supervisor.pids[f"robot-{name}"])
+            assert f" {name} --connect" in command_of(supervisor.pids[f"robot-{name}"])
         assert len(set(seen.values())) == len(ROBOTS) + 1
         killed.update({name: len(t) for name, t in recorder.tracks.items()})
         os.kill(seen["robot-navigator"], signal.SIGKILL)
@@ -148,7 +148,7 @@ def lone_robot(tmp_path: Path) -> tuple[list[str], str, Team]:
     path = tmp_path / "team.json"
     save_resolved(team, path)
     endpoint = free_endpoint()
-    command = [*PROGRAM, "robot", "observer", "--team", str(path), "--connect", endpoint]
+    command = [*PROGRAM, "robot", str(path), "observer", "--connect", endpoint]
     return command, endpoint, team
 
 

@@ -76,7 +76,7 @@ class Driven:
 @contextmanager
 def driven(team: Path) -> Iterator[Driven]:
     endpoint = free_endpoint()
-    command = [*PROGRAM, "robot", "r1", "--team", str(team), "--connect", endpoint]
+    command = [*PROGRAM, "robot", str(team), "r1", "--connect", endpoint]
     with open_router("tests", [endpoint]) as bus:
         process = subprocess.Popen(command, stderr=subprocess.PIPE)
         try:
@@ -153,16 +153,16 @@ def test_a_folder_ends_and_the_robot_goes_on(tmp_path: Path) -> None:
 def test_a_camera_that_cannot_be_played_is_one_line(tmp_path: Path) -> None:
     team = write_team(tmp_path, "gone.avi")
     done = subprocess.run(
-        [*PROGRAM, "robot", "r1", "--team", str(team)], capture_output=True, text=True, check=False
+        [*PROGRAM, "robot", str(team), "r1"], capture_output=True, text=True, check=False
     )
     assert done.returncode == 2
     (line,) = done.stderr.splitlines()
     assert f"robots.r1.camera.frames: {tmp_path}/gone.avi: no such file" in line
 
 
-@pytest.mark.parametrize("words", [["robot", "r1", "--team"], ["up"]], ids=["robot", "up"])
-def test_without_opencv_the_extra_is_named(tmp_path: Path, words: list[str]) -> None:
-    arguments = ["cpcbl-team", *words, str(write_team(tmp_path))]
+@pytest.mark.parametrize(("command", "more"), [("robot", ["r1"]), ("up", [])])
+def test_without_opencv_the_extra_is_named(tmp_path: Path, command: str, more: list[str]) -> None:
+    arguments = ["cpcbl-team", command, str(write_team(tmp_path)), *more]
     code = (
         f"import sys; sys.modules['cv2'] = None; sys.argv = {arguments!r};"
         "from cpcbl_launch.cli import main; main()"

@@ -204,8 +204,8 @@ def without_opencv(code: str) -> "subprocess.CompletedProcess[str]":
     [
         ["simulate", "FILE", "--duration", "1"],
         ["up", "FILE", "--duration", "1"],
-        ["robot", "eye", "--team", "FILE"],
-        ["field", "--team", "FILE"],
+        ["robot", "FILE", "eye"],
+        ["field", "FILE"],
     ],
 )
 def test_without_opencv_one_line_says_what_to_install(arguments: list[str], tmp_path: Path) -> None:

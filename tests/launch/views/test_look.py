@@ -63,7 +63,7 @@ def pictures(team_file: Path) -> Path:
 
 def test_eyes_are_shown_pictures(team_file: Path, pictures: Path) -> None:
     folder = team_file.parent / "looks"
-    words = ("look", "looker", "--team", team_file, "--pictures", pictures, "--save", folder)
+    words = ("look", team_file, "looker", "--pictures", pictures, "--save", folder)
     ran = cpcbl_team(*words, "--json")
     assert ran.returncode == 0, ran.stderr
     broken, nobody, seen = json.loads(ran.stdout)
@@ -102,7 +102,7 @@ def test_what_cannot_be_looked_at_is_one_line(
     team_file: Path, words: tuple[str, ...], said: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(team_file.parent)
-    ran = command_line("look", *words, "--team", team_file)
+    ran = command_line("look", team_file, *words)
     assert ran.returncode == 2
     assert not ran.stdout
     assert re.search(f"^cpcbl-team: {said}", ran.stderr.splitlines()[-1])
@@ -113,7 +113,7 @@ def test_a_running_robot_shows_what_it_sees_and_a_recording_holds_it(team_file: 
     words = ["up", str(team_file), "--duration", "60", "--record", str(record)]
     with subprocess.Popen([*PROGRAM, *words], stdout=subprocess.DEVNULL) as team:
         try:
-            look = ("look", "looker", "--team", team_file, "--save", folder / "looks")
+            look = ("look", team_file, "looker", "--save", folder / "looks")
             ran = cpcbl_team(*look, "--count", 3, "--wait", 30, "--json")
             assert ran.returncode == 0, ran.stderr
             again = cpcbl_team(*look, "--wait", 30)

@@ -231,7 +231,7 @@ def test_a_running_team_is_watched_with_the_command_that_up_says(
         assert first.startswith("watch it: cpcbl-team traffic trio.toml --connect tcp/127.0.0.1:")
         words = shlex.split(first.removeprefix("watch it: "))[1:]
         assert any("driver" in line for line in iter(up.stdout.readline, ""))
-        watched = cpcbl_team(*words, "--for", 3, "--json")
+        watched = cpcbl_team(*words, "--duration", 3, "--json")
         text, _ = up.communicate(timeout=60.0)
         assert up.returncode == 0
     assert watched.returncode == 0, watched.stderr

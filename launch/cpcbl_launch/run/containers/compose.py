@@ -111,7 +111,7 @@ def compose_text(team: Team, how: Deployment) -> str:
     speed = () if how.speed == 1.0 else ("--speed", f"{how.speed:g}")
     router = ("router", how.team_file, "--listen", f"{protocol}/0.0.0.0:{PORT}", *speed)
     clock = ("--clock", how.clock) if how.clock else ()
-    common = ("--team", how.team_file, "--connect", f"{protocol}/router:{PORT}", *clock)
+    common = ("--connect", f"{protocol}/router:{PORT}", *clock)
     head = _HEAD.format(
         title=f"Team {team.name}: a router,{field} and {robots}",
         image=_flow(how.image),
@@ -127,7 +127,7 @@ def compose_text(team: Team, how: Deployment) -> str:
         at=_flow(["CMD", "linked", "at", str(PORT)]),
     )
     services = []
-    for name, arguments, identity, _ in tasks(team, common, how.seed, here):
+    for name, arguments, identity, _ in tasks(team, how.team_file, common, how.seed, here):
         keys = _own_mounts(how, identity)
         services.append(_SERVICE.format(name=name, command=_flow(arguments), keys=keys))
     return "".join([head, router_service, *services])

@@ -111,7 +111,7 @@ class InContainers:
     def processes(self, clock: Clock) -> Iterator[Processes]:
         self._write(str(clock))
         self._project.up()
-        rows = tasks(self._run.team, (), self._run.seed, self._here)
+        rows = tasks(self._run.team, "", (), self._run.seed, self._here)
         yield ContainerSupervisor(self._project, ["router", *(row.name for row in rows)])
 
     def _write(self, clock: str) -> None:
@@ -177,7 +177,7 @@ def _replays(team: Team) -> bool:
 def run_observer_container(
     name: str, team: Team, sensor: str, arguments: Sequence[str], image: str, stop: Stop
 ) -> int:
-    """Runs `cpcbl-team observer NAME ARGUMENTS` in a container until it ends or `stop()`.
+    """Runs `cpcbl-team observer TEAM NAME ARGUMENTS` in a container until it ends or `stop()`.
 
     `sensor` is a preset or a file, which the container then reads. The container shares this
     machine's network, so that endpoints stay what they are, and this process's output. Returns its
@@ -193,7 +193,7 @@ def run_observer_container(
             mounts.append(compose.Mount(str(Path(sensor).resolve()), SENSOR_INSIDE))
             sensor = SENSOR_INSIDE
         container = f"cpcbl-{name}-{secrets.token_hex(3)}"
-        inner = ["observer", name, "--team", INSIDE, f"--sensor={sensor}", *arguments]
+        inner = ["observer", INSIDE, name, f"--sensor={sensor}", *arguments]
         user = compose.key_owner(team, Identity(Role.OBSERVER, name))
         command = docker_run(container, image, mounts, user, inner)
         process = subprocess.Popen(command, stdin=subprocess.DEVNULL, start_new_session=True)

@@ -1,0 +1,141 @@
+"""Numbers of a team file that are valid, but probably in another unit than their key says."""
+
+import math
+from collections.abc import Iterator, Mapping
+from statistics import median
+from typing import NamedTuple
+
+import msgspec
+
+from cpcbl_team.config import RobotSettings, Team
+
+LENGTH = {"millimetres": 1e-3, "centimetres": 1e-2}
+TIME = {"milliseconds": 1e-3, "microseconds": 1e-6, "nanoseconds": 1e-9}
+ANGLE = {"radians": math.degrees(1.0)}
+SHARE = {"percent": 1e-2}
+
+
+class Usual(NamedTuple):
+    """The usual size of a number, its sign and 0 aside; and units in which people write it."""
+
+    least: float
+    most: float
+    units: Mapping[str, float] = {}
+
+
+USUAL = {
+    "sensor.range_share": Usual(5e-4, 0.5, SHARE),
+    "sensor.range_floor_m": Usual(1e-4, 2.0, LENGTH),
+    "sensor.bearing_sigma_deg": Usual(0.05, 45.0, ANGLE),
+    "sensor.field_of_view_deg": Usual(7.0, 360.0, ANGLE),
+    "sensor.max_range_m": Usual(0.3, 300.0, LENGTH),
+    "sensor.rate_hz": Usual(0.1, 200.0),
+    "sensor.delay_s": Usual(0.0, 3.0, TIME),
+    "sensor.range_scale": Usual(0.4, 2.5, SHARE),
+    "sensor.range_bias_m": Usual(0.0, 3.0, LENGTH),
+    "sensor.robot_range_bias_m": Usual(0.0, 3.0, LENGTH),
+    "sensor.bearing_scale": Usual(0.4, 2.5, SHARE),
+    "sensor.correlation_s": Usual(0.0, 600.0, TIME),
+    "odometry.distance_scale": Usual(0.4, 2.5, SHARE),
+    "odometry.turn_scale": Usual(0.4, 2.5, SHARE),
+    "odometry.distance_sigma_m_per_sqrt_m": Usual(1e-4, 2.0, LENGTH),
+    "odometry.delay_s": Usual(0.0, 3.0, TIME),
+    "odometry.rate_hz": Usual(0.1, 1000.0),
+    "odometry.timeout_s": Usual(0.01, 30.0, TIME),
+    "position_sensor.sigma_m": Usual(5e-4, 20.0, LENGTH),
+    "position_sensor.delay_s": Usual(0.0, 3.0, TIME),
+    "start.sigma_m": Usual(1e-4, 20.0, LENGTH),
+    "start.heading_sigma_deg": Usual(0.06, 180.0, ANGLE),
+    "start.heading_deg": Usual(0.0, 360.0),
+    "camera.x_m": Usual(0.0, 5.0, LENGTH),
+    "camera.y_m": Usual(0.0, 5.0, LENGTH),
+    "camera.mounted_m": Usual(0.005, 20.0, LENGTH),
+    "camera.tilt_sigma_deg": Usual(0.005, 20.0),
+    "camera.focal_share": Usual(0.0, 0.3, SHARE),
+    "trust.clock_ahead_s": Usual(0.0, 10.0, TIME),
+    "trust.clock_behind_s": Usual(0.005, 10.0, TIME),
+    "collaboration.max_age_s": Usual(0.05, 60.0, TIME),
+    "robot.speed_m_s": Usual(0.0, 20.0, LENGTH),
+    "vision.marker_m": Usual(0.005, 2.0, LENGTH),
+    "vision.marker_mounted_m": Usual(0.005, 5.0, LENGTH),
+    "vision.marker_distance_m": Usual(0.005, 5.0, LENGTH),
+    "landmark.radius_m": Usual(0.002, 3.0, LENGTH),
+    "landmark.height_m": Usual(0.01, 20.0, LENGTH),
+    "landmark.foot_m": Usual(0.0, 20.0, LENGTH),
+    "mast.radius_m": Usual(0.002, 1.0, LENGTH),
+    "mast.height_m": Usual(0.01, 5.0, LENGTH),
+    "mast.foot_m": Usual(0.0, 5.0, LENGTH),
+}
+"""By the last table and the key."""
+FAR_RANGES = 20.0  # so many times the range of the sensors, and
+FAR_M = 100.0  # so far, an object is no part of the field
+
+
+def unit_warnings(team: Team) -> Iterator[str]:
+    """What is probably in another unit, each as `key: what; fix`; the same number of several
+    robots once."""
+    by_text: dict[tuple[str, str], list[str]] = {}
+    for name, robot in team.robots.items():
+        for key, text in (*_unusual(robot, "robot", ""), *_headings(robot)):
+            by_text.setdefault((key, text), []).append(name)
+    for (key, text), names in by_text.items():
+        others = f" (and {len(names) - 1} more)" if len(names) > 1 else ""
+        yield f"robots.{names[0]}.{key}{others}: {text}"
+    for key, text in _unusual(team.vision, "vision", "vision."):
+        yield f"{key}: {text}"
+    yield from _far_objects(team)
+
+
+def unit_text(value: float, usual: Usual) -> str:
+    """What is unusual about a number, and what it would be in its key's unit; empty if it is
+    usual."""
+    size = abs(value)
+    if not value or usual.least <= size <= usual.most:
+        return ""
+    within = f"{value:g} is unusual, for it is mostly {usual.least:g} to {usual.most:g}"
+    for unit, factor in usual.units.items():
+        if usual.least <= size * factor <= usual.most and size * factor > 0.0:
+            return f"{within}; if it is in {unit}, write {value * factor:.4g}"
+    return f"{within}; check the number"
+
+
+def _unusual(table: msgspec.Struct, last: str, path: str) -> Iterator[tuple[str, str]]:
+    """(key, text) of each unusual number in a table and the tables in it."""
+    for key in table.__struct_fields__:
+        value = getattr(table, key)
+        if isinstance(value, msgspec.Struct):
+            yield from _unusual(value, key, f"{path}{key}.")
+        elif isinstance(value, float) and (usual := USUAL.get(f"{last}.{key}")):
+            yield from ((f"{path}{key}", text) for text in [unit_text(value, usual)] if text)
+
+
+def _headings(robot: RobotSettings) -> Iterator[tuple[str, str]]:
+    """A heading such as 1.57 is a quarter of a turn in radians."""
+    heading = robot.start.heading_deg if robot.start else 0.0
+    turns = round(heading / (math.pi / 4.0))
+    if 1 <= abs(turns) <= 8 and abs(heading - turns * math.pi / 4.0) < 2e-3:
+        yield (
+            "start.heading_deg",
+            f"{heading:g} is in degrees; if it is in radians, write {45 * turns}",
+        )
+
+
+def _far_objects(team: Team) -> Iterator[str]:
+    """Landmarks and walls that no robot of the field can see."""
+    points = {f"map.landmarks.{n}": (p.x_m, p.y_m) for n, p in team.map.landmarks.items()}
+    for name, wall in team.map.walls.items():
+        points |= {f"map.walls.{name}.from_m": wall.from_m, f"map.walls.{name}.to_m": wall.to_m}
+    starts = [(r.start.x_m, r.start.y_m) for r in team.robots.values() if r.start]
+    if not points:
+        return
+    everywhere = [*points.values(), *starts]
+    middle = median(p[0] for p in everywhere), median(p[1] for p in everywhere)
+    ranges = [r.sensor.max_range_m for r in team.robots.values()]
+    far_m = max(FAR_M, FAR_RANGES * median(ranges)) if ranges else FAR_M
+    for key, (x, y) in points.items():
+        off_m = math.dist((x, y), middle)
+        if off_m > far_m:
+            yield (
+                f"{key}: is {off_m:.0f} m from the middle of the field, and no sensor sees so far;"
+                f" if it is in millimetres, write {x * 1e-3:.4g} and {y * 1e-3:.4g}"
+            )
