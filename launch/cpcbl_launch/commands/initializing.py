@@ -65,7 +65,7 @@ def init(
     text = team_text(plan, file.name, driver.name)
     team = parse_team(text, str(file))
     options.require_folder("init", file.parent)
-    for path, content in ((file, text), (driver, driver_text(plan))):
+    for path, content in ((file, text), (driver, driver_text(plan, file.name))):
         try:
             path.write_text(content, encoding="utf-8")
         except OSError as error:
@@ -180,11 +180,11 @@ def start_of(plan: Plan, name: str) -> tuple[float, float]:
     return 1.0, round(FIELD_M[1] * (i + 1) / (count + 1), 2)
 
 
-def driver_text(plan: Plan) -> str:
+def driver_text(plan: Plan, file: str) -> str:
     """The driver of the team's robots, which stand until their sensors are put in."""
     lines = [f'    "{name}": {_landmarks_ahead(plan, name)},\n' for name in plan.robots]
     return _template("driver.py.txt").substitute(
-        team=plan.team, first=next(iter(plan.robots)), connect=plan.router, seen="".join(lines)
+        file=file, first=next(iter(plan.robots)), seen="".join(lines)
     )
 
 

@@ -179,7 +179,7 @@ def _health(facts: Facts) -> Iterator[tuple[Level, str, str]]:
         status = processes[-1].status
         problems: tuple[str, ...] = getattr(status, "problems", ())
         for problem in problems:
-            yield "error", f"{name}: {problem}", "docs/team_file.md, Writing a driver"
+            yield "error", f"{name}: {problem}", "docs/refused_inputs.md"
         if status.lost:
             remedy = "it needs landmarks or a teammate in sight, or a start"
             yield "warning", f"{name}: is lost ({status.lost})", remedy
@@ -211,7 +211,7 @@ def _inputs(facts: Facts) -> Iterator[tuple[Level, str, str]]:
         if robot not in facts.team.robots and robot not in heard.robots:
             yield "error", f"somebody publishes to {key}", _no_such_robot(robot, facts.team)
         for reason, count in own.refused.items():
-            remedy = "docs/team_file.md, Writing a driver"
+            remedy = "docs/refused_inputs.md"
             yield "error", f"{key}: {count} messages cannot be used: {reason}", remedy
         process = heard.statuses[robot][-1] if robot in heard.statuses else None
         told: tuple[str, ...] = getattr(process.status, "problems", ()) if process else ()

@@ -26,7 +26,8 @@ def team(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     words = ("--yes", "--robots", "r1,r2", "--router", endpoint)
     assert command_line("init", folder, *words).returncode == 0
     file, driver = folder / "team.toml", folder / "driver.py"
-    (folder / "strayed.py").write_text(driver.read_text().replace('"lab"', '"labb"'))
+    (folder / "strayed.toml").write_text(file.read_text().replace('"lab"', '"labb"'))
+    (folder / "strayed.py").write_text(driver.read_text().replace("team.toml", "strayed.toml"))
     commands = [
         [*PROGRAM, "robot", str(file), "r1"],
         [sys.executable, str(driver), "r1"],
