@@ -3,6 +3,8 @@
 import json
 import signal
 import subprocess
+import sys
+from importlib.metadata import version
 from pathlib import Path
 
 import pytest

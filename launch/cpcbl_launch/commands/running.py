@@ -224,7 +224,7 @@ def router(
 
 
 def gateway(
-    file: Annotated[Path, Argument(help="Team file.")],
+    file: options.Team,
     host: Annotated[
         str | None, Option(help="Address to listen at; default: the file's, else 127.0.0.1.")
     ] = None,
