@@ -7,7 +7,7 @@ from cpcbl_launch.commands.experimenting import experiment_app
 from cpcbl_launch.commands.measuring import chaos, evaluate_mrclam, simulate
 from cpcbl_launch.commands.preparing import check, compose, keys
 from cpcbl_launch.commands.running import field, router, up
-from cpcbl_launch.commands.watching import look, observer, traffic
+from cpcbl_launch.commands.watching import look, observer, traffic, view
 from cpcbl_launch.run import robot
 
 app = typer.Typer(
@@ -24,7 +24,8 @@ def run_robot(context: typer.Context) -> None:
     robot.main(context.args)
 
 
-for command in (check, keys, up, traffic, look, observer, router, field, compose, simulate, chaos):
+WATCHING = (view, traffic, look)
+for command in (check, keys, up, *WATCHING, observer, router, field, compose, simulate, chaos):
     app.command()(command)
 app.command("robot", help=robot.DESCRIPTION, context_settings=_PASSED_ON)(run_robot)
 
