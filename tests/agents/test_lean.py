@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-HEAVY = ("cv2", "matplotlib", "numpy", "pydantic", "rich", "typer")
+HEAVY = ("aiohttp", "cv2", "matplotlib", "numpy", "pydantic", "rich", "typer")
 CODE = """
 import json, sys
 import cpcbl_agents.process

@@ -75,8 +75,15 @@ class Tab:
             while not await self.evaluate(f"Boolean({condition})"):
                 await asyncio.sleep(0.05)
 
-    async def resize(self, width: int, height: int, *, is_dark: bool = False, scale: float = 1.0) -> None:
-        metrics = {"width": width, "height": height, "deviceScaleFactor": scale, "mobile": width < 500}
+    async def resize(
+        self, width: int, height: int, *, is_dark: bool = False, scale: float = 1.0
+    ) -> None:
+        metrics = {
+            "width": width,
+            "height": height,
+            "deviceScaleFactor": scale,
+            "mobile": width < 500,
+        }
         await self.call("Emulation.setDeviceMetricsOverride", **metrics)
         theme = {"name": "prefers-color-scheme", "value": "dark" if is_dark else "light"}
         await self.call("Emulation.setEmulatedMedia", features=[theme])
@@ -87,7 +94,9 @@ class Tab:
 
 
 @asynccontextmanager
-async def opened(address: str, folder: Path, width: int = 1200, height: int = 760) -> AsyncIterator[Tab]:
+async def opened(
+    address: str, folder: Path, width: int = 1200, height: int = 760
+) -> AsyncIterator[Tab]:
     """A browser of its own with this page, until the end."""
     profile = folder / "profile"
     command = [PROGRAM, *OPTIONS, f"--user-data-dir={profile}", "about:blank"]

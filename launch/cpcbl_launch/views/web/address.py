@@ -38,8 +38,8 @@ def parse_listen(option: str, text: str | None) -> Listen:
     """`ADDRESS:PORT`, `ADDRESS` or `:PORT`; this machine alone by default. Raises InputError."""
     if text is None:
         return Listen(option=option)
-    found = re.fullmatch(r"(\[[0-9a-fA-F:]+\]|[^:\[\]]*)(?::(\d{1,5}))?", text.strip())
-    if not found or not any(found.groups()) or not 0 <= int(found[2] or 0) <= 65_535:
+    found = re.fullmatch(r"(\[[0-9a-fA-F:]+\]|[\w.-]*)(?::(\d{1,5}))?", text.strip())
+    if not found or not any(found.groups()) or found[0].isdecimal() or not 0 <= int(found[2] or 0) <= 65_535:
         raise InputError(f"{option} {text}: write ADDRESS:PORT, such as 0.0.0.0:{DEFAULT_PORT}")
     port = DEFAULT_PORT if found[2] is None else int(found[2])
     return Listen(found[1].strip("[]") or DEFAULT_HOST, port, found[2] is not None, option)
@@ -54,7 +54,7 @@ def listening_socket(listen: Listen) -> socket.socket:
     except OSError as error:
         if error.errno == errno.EADDRINUSE and not listen.is_chosen:
             return socket.create_server((listen.host, 0), family=family)
-        reason = (error.strerror or str(error)).lower()
+        reason = (error.strerror or str(error)).partition(" (")[0].lower()
         raise InputError(
             f"{listen.option} {listen.host}:{listen.port}: {reason}; name another address or port"
         ) from error

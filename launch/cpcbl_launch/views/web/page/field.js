@@ -143,7 +143,7 @@ export class FieldMap {
     this.drawMap();
     const all = [...this.robots.values()].filter((r) => r.pose), { chosen } = this.team;
     this.isCrowded = all.length > 12;
-    const strength = (r) => (!chosen || r.name === chosen ? 1 : 0.35);
+    const strength = (r) => (!chosen || r.name === chosen ? 1 : 0.5);
     for (const r of all) this.drawTrail(r, strength(r));
     for (const r of all) this.drawEllipse(r, strength(r));
     for (const r of all) this.drawSightings(r, strength(r));
@@ -236,7 +236,7 @@ export class FieldMap {
     c.beginPath();
     c.ellipse(px, py, Math.min(3 * a * this.scale, limit), Math.min(3 * b * this.scale, limit), -angle, 0, 2 * Math.PI);
     c.fillStyle = c.strokeStyle = r.state === "lost" ? this.ink("lost") : r.colour;
-    c.globalAlpha = 0.13 * strength;
+    c.globalAlpha = (3 * a * this.scale > this.w / 4 ? 0.03 : 0.13) * strength; // one that is lost would colour everything
     c.fill();
     c.globalAlpha = 0.8 * strength;
     c.lineWidth = 1.2;
@@ -299,7 +299,7 @@ export class FieldMap {
     const into = Math.atan2(b[1] - mid[1], b[0] - mid[0]), out = Math.atan2(mid[1] - a[1], mid[0] - a[0]);
     const gap = ROBOT_PX + 5, tip = [b[0] - gap * Math.cos(into), b[1] - gap * Math.sin(into)];
     c.strokeStyle = c.fillStyle = from.colour;
-    c.globalAlpha = (chosen && !mine ? 0.25 : 0.95) * Math.max(0.4, 1 - tier / 20) * (this.isCrowded && !chosen ? 0.5 : 1);
+    c.globalAlpha = (chosen && !mine ? 0.4 : 0.95) * Math.max(0.4, 1 - tier / 20) * (this.isCrowded && !chosen ? 0.5 : 1);
     c.lineWidth = (this.isCrowded ? 1 : 1.6) + Math.min(2, Math.log10(1 + (rate ?? 0)));
     c.setLineDash(topic === "fix" ? [] : [7, 5]);
     c.beginPath();
@@ -357,9 +357,9 @@ export class FieldMap {
     if (!place && this.isCrowded && r.name !== chosen) return;
     const [dx, dy] = place ?? [0, -21], ink = { lost: "lost", gone: "gone" }[r.state] ?? "ink";
     this.taken.push([px + dx - wide / 2, py + dy - 11, wide, 15]);
-    c.globalAlpha = chosen && chosen !== r.name && r.state !== "lost" ? 0.6 : 1;
+    c.globalAlpha = chosen && chosen !== r.name && r.state !== "lost" ? 0.75 : 1;
     this.text(words, px + dx, py + dy, "center", 13, ink, "600");
-    if (r.state === "lost" && !this.isCrowded) this.text(`lost: ${r.why}`, px + dx, py + dy + (dy < 0 ? -16 : 16), "center", 12, "lost");
+    if (r.state === "lost" && !this.isCrowded && (this.w > 500 || r.name === chosen)) this.text(`lost: ${r.why}`, px + dx, py + dy + (dy < 0 ? -16 : 16), "center", 12, "lost");
     c.globalAlpha = 1;
   }
 

@@ -139,6 +139,7 @@ function summary() {
   if (count.waiting) words.push(`${count.waiting} not heard yet`);
   if (total && count.ok === total) words.push("all well");
   setText($("summary"), words.join(", "));
+  $("summary").classList.toggle("bad", count.lost + count.gone > 0);
 }
 
 function setText(element, text) {

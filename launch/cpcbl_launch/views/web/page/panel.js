@@ -24,21 +24,23 @@ export class Panel {
 
   draw() {
     const names = [...this.robots.keys()];
-    for (const name of this.rows.keys()) if (!this.robots.has(name)) { this.rows.get(name).row.remove(); this.rows.delete(name); }
+    for (const name of this.rows.keys()) if (!this.robots.has(name)) { this.removeRow(name); }
     for (const name of names) this.drawRow(this.robots.get(name));
   }
 
   drawRow(r) {
     if (!this.rows.has(r.name)) this.addRow(r.name);
-    const { row, button, cells } = this.rows.get(r.name), state = r.state ?? "waiting";
-    row.classList.toggle("chosen", r.name === this.team.chosen);
+    const { row, reason, button, cells } = this.rows.get(r.name), state = r.state ?? "waiting";
+    for (const line of [row, reason]) line.classList.toggle("chosen", r.name === this.team.chosen);
     row.dataset.state = state;
     button.setAttribute("aria-pressed", r.name === this.team.chosen);
     button.style.setProperty("--own", r.colour);
     set(button, r.is_guest ? `${r.name} (guest)` : r.name);
-    const told = state === "ok" || state === "waiting" && !r.why ? WORDS[state] : r.why && state !== "waiting" ? `${WORDS[state]}: ${r.why}` : WORDS[state];
-    set(cells[0], told);
+    set(cells[0], WORDS[state]);
     cells[0].className = `s-${state}`;
+    reason.hidden = state === "ok" || !r.why || (state === "waiting" && !r.tier);
+    set(reason.firstChild, r.why ?? "");
+    reason.firstChild.className = `s-${state}`;
     const isThere = state !== "gone" && state !== "waiting";
     [isThere ? r.tier ?? "–" : "–", isThere ? number(r.sigma_m) : "–", isThere ? number(r.error_m) : "–", isThere ? r.sees.length : "–"].forEach((v, i) => set(cells[i + 1], String(v)));
   }
@@ -50,11 +52,24 @@ export class Panel {
     const cells = Array.from({ length: 5 }, () => document.createElement("td"));
     cells[3].className = "truth";
     row.append(first, ...cells);
-    row.onclick = () => this.choose(name);
+    const reason = document.createElement("tr"), words = document.createElement("td");
+    words.colSpan = 6;
+    reason.className = "why";
+    reason.append(words);
+    row.onclick = reason.onclick = () => this.choose(name);
     row.dataset.robot = name;
     const next = [...this.rows.keys()].filter((other) => other > name).sort()[0];
-    this.body.insertBefore(row, next ? this.rows.get(next).row : null);
-    this.rows.set(name, { row, button, cells });
+    const before = next ? this.rows.get(next).row : null;
+    this.body.insertBefore(row, before);
+    this.body.insertBefore(reason, before);
+    this.rows.set(name, { row, reason, button, cells });
+  }
+
+  removeRow(name) {
+    const { row, reason } = this.rows.get(name);
+    row.remove();
+    reason.remove();
+    this.rows.delete(name);
   }
 
   show(name) {
