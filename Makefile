@@ -5,8 +5,8 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN = $(VENV)/bin
 
-.PHONY: setup demo test quick check unit test-long test-compiled test-docker test-bench chaos net \
-  fuzz compiled bench bench-latency bench-processes clean
+.PHONY: setup demo test quick check unit test-long test-trial test-compiled test-docker test-bench \
+  chaos net fuzz compiled bench bench-latency bench-processes clean
 
 setup: $(VENV)/ready
 
@@ -36,11 +36,15 @@ check: setup
 unit: setup
 	$(BIN)/pytest -n 4 --dist worksteal -m "$(USUAL)"
 
-USUAL = not long and not log and not pictures and not docker
+USUAL = not long and not log and not pictures and not docker and not trial
 
 # Minutes long; with CPCBL_MRCLAM=folder also on real logs, with CPCBL_PICTURES=folder real pictures.
 test-long: setup
 	$(BIN)/pytest -n 2 -m "long$(if $(CPCBL_MRCLAM), or log)$(if $(CPCBL_PICTURES), or pictures)"
+
+# What a new user does, with a browser; needs Chromium (Debian: apt-get install chromium).
+test-trial: setup
+	$(BIN)/pytest -m trial
 
 # The core's tests with its hot files compiled, and that they say the same.
 test-compiled: compiled
