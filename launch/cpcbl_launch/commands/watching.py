@@ -160,7 +160,7 @@ def view(
     from cpcbl_launch.views.web.server import Shown
     from cpcbl_launch.views.web.view import address_lines, view_team
 
-    logging.getLogger("cpcbl_transport").setLevel(logging.WARNING)
+    logging.getLogger("cpcbl_transport").setLevel(logging.ERROR)  # the page says it
     team = None if team_name is not None and file is None else find_team(file or Path("demo"))
     endpoints = tuple(connect or (team.transport if team else TransportSettings()).connect)
     link = Link(endpoints) if team is None else link_of(team, Identity(Role.OPERATOR), endpoints)

@@ -39,7 +39,8 @@ def parse_listen(option: str, text: str | None) -> Listen:
     if text is None:
         return Listen(option=option)
     found = re.fullmatch(r"(\[[0-9a-fA-F:]+\]|[\w.-]*)(?::(\d{1,5}))?", text.strip())
-    if not found or not any(found.groups()) or found[0].isdecimal() or not 0 <= int(found[2] or 0) <= 65_535:
+    is_one = found is not None and any(found.groups()) and not found[0].isdecimal()
+    if not found or not is_one or int(found[2] or 0) > 65_535:
         raise InputError(f"{option} {text}: write ADDRESS:PORT, such as 0.0.0.0:{DEFAULT_PORT}")
     port = DEFAULT_PORT if found[2] is None else int(found[2])
     return Listen(found[1].strip("[]") or DEFAULT_HOST, port, found[2] is not None, option)

@@ -51,7 +51,10 @@ def truths(stamp_ns: int, x_m: float) -> Truths:
 
 def test_sightings_and_cameras_are_subscribed_to_only_while_somebody_watches(stand: Stand) -> None:
     assert stand.is_wanted(topics.TRACK, "r1")
-    wanted = lambda: [stand.is_wanted(t, "r1") for t in (topics.IN_SIGHTINGS, topics.LOOK)]  # noqa: E731
+
+    def wanted() -> list[bool]:
+        return [stand.is_wanted(topic, "r1") for topic in (topics.IN_SIGHTINGS, topics.LOOK)]
+
     assert wanted() == [False, False]
     stand.feed.watch(1)
     stand.feed.watch(1)

@@ -10,6 +10,7 @@ import pytest
 from support.buses import SECOND
 from support.traffic import flow, seen, status
 
+from cpcbl_launch.team_file import find_team
 from cpcbl_launch.views.traffic import traffic_from_statuses
 from cpcbl_launch.views.web.feed import RobotNews, Snapshot
 from cpcbl_launch.views.web.pictures import (
@@ -23,7 +24,6 @@ from cpcbl_launch.views.web.pictures import (
     state_of,
     team_picture,
 )
-from cpcbl_launch.team_file import find_team
 from cpcbl_team.inputs import Sighting, Sightings
 from cpcbl_transport.messages import Spending, Track, Trust, Truth
 
@@ -31,13 +31,18 @@ COVARIANCE = (0.04, 0.0, 0.01, 0.0, 0.0, 0.01)
 
 
 def track(at_s: float = 10.0, lost: str = "", **more: Any) -> Track:
-    values = {"covariance": COVARIANCE, "tier": 3, **more}
+    values: dict[str, Any] = {"covariance": COVARIANCE, "tier": 3, **more}
     return Track("r1", int(at_s * SECOND), 1.0, 2.0, 0.5, lost=lost, **values)
 
 
 def news(**more: Any) -> RobotNews:
     """A robot that sent a pose at 10 s and has its token."""
-    values = {"track": track(), "track_s": 10.0, "latest_s": 10.0, "tokens": frozenset("t")}
+    values: dict[str, Any] = {
+        "track": track(),
+        "track_s": 10.0,
+        "latest_s": 10.0,
+        "tokens": frozenset("t"),
+    }
     return RobotNews(**(values | more))
 
 

@@ -129,7 +129,6 @@ def test_a_page_is_told_the_team_then_what_changes() -> None:
 def test_a_page_that_is_slow_gets_the_newest_and_no_queue() -> None:
     async def test(there: Stand) -> None:
         async with there.live() as slow, there.live() as quick:
-            frames = []
             await received(quick, "team")
             there.drive("scout", 1.0)
             for n in range(12):  # cycles in which the slow page says nothing
@@ -137,8 +136,7 @@ def test_a_page_that_is_slow_gets_the_newest_and_no_queue() -> None:
                 await received(quick, "frame")
             await slow.send_json({"ack": 0})
             assert json.loads((await slow.receive()).data)["type"] == "team"
-            for _ in range(MOST_UNACKNOWLEDGED):
-                frames.append(json.loads((await slow.receive()).data))
+            frames = [json.loads((await slow.receive()).data) for _ in range(MOST_UNACKNOWLEDGED)]
             await slow.send_json({"ack": frames[-1]["number"]})
             newest = json.loads((await slow.receive()).data)
             assert newest["number"] == MOST_UNACKNOWLEDGED + 1

@@ -1,4 +1,4 @@
-"""The view and its router, over real Zenoh: whichever is there first, and whichever is restarted."""
+"""The view and its router over real Zenoh: whichever is first, and whichever is restarted."""
 
 import asyncio
 import json

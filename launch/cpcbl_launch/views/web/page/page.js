@@ -8,7 +8,7 @@ const $ = (id) => document.getElementById(id);
 
 export const team = { name: "", landmarks: [], walls: [], cameras: null, help: [], at: 0, chosen: "" };
 export const robots = new Map(); // name -> {name, colour, trail, samples, ...what the server sent}
-globalThis.viewStats = { frames: 0, drawn: 0, firstPictureMs: null, longestGapMs: 0, skipped: 0, lastMs: null, drawMs: 0 };
+globalThis.viewStats = { frames: 0, poses: 0, drawn: 0, firstPictureMs: null, longestGapMs: 0, skipped: 0, lastMs: null, drawMs: 0 };
 const stats = globalThis.viewStats;
 
 let socket = null, retryMs = 500, camera = null, due = false, slowDue = 0;
@@ -75,7 +75,10 @@ function frame(message) {
   for (const [name, picture] of Object.entries(message.robots)) {
     const known = robot(name), before = known.at_s;
     Object.assign(known, DEFAULTS, picture);
-    if (known.pose && known.at_s !== before) addSample(known);
+    if (known.pose && known.at_s !== before) {
+      addSample(known);
+      stats.poses += 1;
+    }
   }
   for (const name of message.removed) robots.delete(name);
   if (message.help) team.help = message.help;
