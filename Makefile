@@ -6,7 +6,8 @@ VENV ?= .venv
 BIN = $(VENV)/bin
 
 .PHONY: setup demo test quick check unit test-long test-trial test-compiled test-docker test-bench \
-  chaos net fuzz compiled bench bench-latency bench-processes clean
+  chaos net fuzz compiled bench bench-latency bench-processes bench-view screenshot \
+  clean
 
 setup: $(VENV)/ready
 
@@ -17,7 +18,7 @@ $(VENV)/ready: pyproject.toml
 	@touch $@
 
 demo: setup
-	$(BIN)/cpcbl-team up
+	$(BIN)/cpcbl-team up --view
 
 test: check unit
 
@@ -99,6 +100,13 @@ bench: test-bench
 bench-latency bench-processes: setup
 	@mkdir -p build
 	PYTHONPATH=$(BENCH_PATH) $(BIN)/python -m benchmarks.$(@:bench-%=%) $(ARGS)
+
+# The view with teams of 4, 50 and 200 robots in Chromium; and docs/view.png, a picture of the demo.
+bench-view: setup
+	PYTHONPATH=$(BENCH_PATH) $(BIN)/python -m benchmarks.view_load $(ARGS)
+
+screenshot: setup
+	PYTHONPATH=$(BENCH_PATH) $(BIN)/python -m benchmarks.view_picture $(ARGS)
 
 BENCH_PATH = .:agents:transport:launch:tests
 timed = $(BIN)/pytest -q --benchmark-json=build/$(2)_raw.json --benchmark-columns=median \

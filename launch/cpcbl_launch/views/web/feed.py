@@ -24,6 +24,7 @@ from cpcbl_transport.messages import AnnotatedFrame, Status, Track, Truth, Truth
 MOST_UNNAMED = 100  # robots that the team file does not name; more are ignored
 TRUTHS = 150  # the last 3 s of the simulated field's, at 50 Hz
 ALL_SIGHTINGS = ""  # beside the names of robots whose camera is watched
+UNSCORED = 20  # tracks of a robot that wait for their truth
 HISTORY_S, HISTORY_STEP_S = 120.0, 0.5  # what a page that is opened later can still plot
 
 
@@ -90,6 +91,7 @@ class Feed:
         self._robots = dict.fromkeys(robots, RobotNews())
         self._history: dict[str, deque[Sample]] = {}
         self._truths: deque[TruthAt] = deque(maxlen=TRUTHS)
+        self._unscored: dict[str, deque[Track]] = {}  # tracks that came before their truth
         self._problem = "not connected yet"
         self._connected_s: float | None = None
         self._while_watched: dict[str, Handle] = {}  # by robot, and one for all sightings
@@ -191,8 +193,8 @@ class Feed:
         with self._lock:
             if (news := self._news(track.robot)) is None:
                 return
-            known = pose_at(self._truths, track.robot, track.stamp_ns)
-            error_m = news.error_m if known is None else _distance_m(known, track)
+            self._unscored.setdefault(track.robot, deque(maxlen=UNSCORED)).append(track)
+            error_m = self._score(track.robot, news.error_m)
             self._robots[track.robot] = _arrived(news, now_s)._replace(
                 track=track, track_s=now_s, error_m=error_m
             )
@@ -234,16 +236,25 @@ class Feed:
         stamp_ns = received.message.stamp_ns
         truths = TruthAt(stamp_ns, {truth.robot: truth for truth in received.message.robots})
         with self._lock:
-            before_ns = self._truths[-1].stamp_ns if self._truths else stamp_ns
-            if stamp_ns <= before_ns:
+            if self._truths and stamp_ns <= self._truths[-1].stamp_ns:
                 self._truths.clear()  # of another field
             self._truths.append(truths)
-            for robot, news in self._robots.items():
-                track = news.track  # one that came before its truth has no error yet
-                if track is not None and before_ns < track.stamp_ns <= stamp_ns:
-                    known = pose_at(self._truths, robot, track.stamp_ns)
-                    error_m = None if known is None else _distance_m(known, track)
+            for robot, tracks in self._unscored.items():
+                if tracks and tracks[0].stamp_ns <= stamp_ns:
+                    news = self._robots[robot]
+                    error_m = self._score(robot, news.error_m)
                     self._robots[robot] = news._replace(error_m=error_m)
+
+    def _score(self, robot: str, error_m: float | None) -> float | None:
+        """The error of the newest track for whose stamp the truth is known, else the one before."""
+        tracks, until_ns = self._unscored[robot], -1
+        if self._truths:
+            until_ns = self._truths[-1].stamp_ns
+        while tracks and tracks[0].stamp_ns <= until_ns:
+            track = tracks.popleft()
+            if (known := pose_at(self._truths, robot, track.stamp_ns)) is not None:
+                error_m = _distance_m(known, track)
+        return error_m
 
     def _on_token(self, key: str, alive: bool) -> None:
         names = topics.ALIVE.names(key) or {}

@@ -97,6 +97,14 @@ def test_the_error_compares_equal_stamps(stand: Stand, is_truth_first: bool) -> 
     assert stand.error_m("r2") is None
 
 
+def test_a_truth_that_is_always_late_is_compared_too(stand: Stand) -> None:
+    for n in range(1, 10):
+        stand.put(topics.TRACK, "r1", track(n * SECOND, n + 0.2))
+        if n > 3:
+            stand.put(topics.TRUTH, "", truths((n - 3) * SECOND, n - 3.0))
+    assert stand.error_m("r1") == pytest.approx(0.2)
+
+
 def test_a_true_pose_between_two_turns_the_short_way() -> None:
     known = [TruthAt(0, {"r": Truth("r", 0.0, 0.0, 3.0)}), TruthAt(10, {"r": Truth("r", 1, 0, -3)})]
     half = pose_at(known, "r", 5)

@@ -1,5 +1,5 @@
 // The map: metres to pixels, pointers and keys, and everything that is drawn on it.
-const ROBOT_PX = 11, STEPS = [0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000];
+const STEPS = [0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000];
 
 export class FieldMap {
   constructor(canvas, team, robots, choose, redraw) {
@@ -143,6 +143,7 @@ export class FieldMap {
     this.drawMap();
     const all = [...this.robots.values()].filter((r) => r.pose), { chosen } = this.team;
     this.isCrowded = all.length > 12;
+    this.size = this.isCrowded ? 7 : 11;
     const strength = (r) => (!chosen || r.name === chosen ? 1 : 0.5);
     for (const r of all) this.drawTrail(r, strength(r));
     for (const r of all) this.drawEllipse(r, strength(r));
@@ -151,7 +152,8 @@ export class FieldMap {
     for (const arrow of this.team.help) this.drawHelp(arrow);
     for (const r of all) this.drawRobot(r);
     this.taken = [];
-    for (const r of all.sort((a, b) => (b.name === chosen) - (a.name === chosen))) this.drawName(r);
+    const rank = (r) => (r.name === chosen ? 0 : r.state === "lost" || r.state === "gone" ? 1 : 2);
+    for (const r of all.sort((a, b) => rank(a) - rank(b))) this.drawName(r);
     c.globalAlpha = 1;
     this.drawScale();
   }
@@ -276,7 +278,7 @@ export class FieldMap {
     c.globalAlpha = 1;
     c.strokeStyle = this.ink("truth");
     c.lineWidth = 1.5;
-    this.outline(px, py, heading, ROBOT_PX + 2);
+    this.outline(px, py, heading, this.size + 2);
     c.stroke();
   }
 
@@ -293,11 +295,11 @@ export class FieldMap {
     if (chosen && !mine && this.isCrowded) return;
     const c = this.context, a = this.pixels(from.pose[0], from.pose[1]), b = this.pixels(to.pose[0], to.pose[1]);
     const dx = b[0] - a[0], dy = b[1] - a[1], far = Math.hypot(dx, dy);
-    if (far < 3 * ROBOT_PX) return;
+    if (far < 3 * this.size) return;
     const bow = topic === "fix" ? 0.16 : 0.26; // both kinds beside each other
     const mid = [(a[0] + b[0]) / 2 - dy * bow, (a[1] + b[1]) / 2 + dx * bow];
     const into = Math.atan2(b[1] - mid[1], b[0] - mid[0]), out = Math.atan2(mid[1] - a[1], mid[0] - a[0]);
-    const gap = ROBOT_PX + 5, tip = [b[0] - gap * Math.cos(into), b[1] - gap * Math.sin(into)];
+    const gap = this.size + 5, tip = [b[0] - gap * Math.cos(into), b[1] - gap * Math.sin(into)];
     c.strokeStyle = c.fillStyle = from.colour;
     c.globalAlpha = (chosen && !mine ? 0.4 : 0.95) * Math.max(0.4, 1 - tier / 20) * (this.isCrowded && !chosen ? 0.5 : 1);
     c.lineWidth = (this.isCrowded ? 1 : 1.6) + Math.min(2, Math.log10(1 + (rate ?? 0)));
@@ -307,12 +309,13 @@ export class FieldMap {
     c.quadraticCurveTo(mid[0], mid[1], tip[0] - 6 * Math.cos(into), tip[1] - 6 * Math.sin(into));
     c.stroke();
     c.setLineDash([]);
-    this.path([0, 2.65, -2.65].map((turn) => (turn ? [tip[0] + 12 * Math.cos(into + turn), tip[1] + 12 * Math.sin(into + turn)] : tip)));
+    const head = this.isCrowded ? 7 : 12;
+    this.path([0, 2.65, -2.65].map((turn) => (turn ? [tip[0] + head * Math.cos(into + turn), tip[1] + head * Math.sin(into + turn)] : tip)));
     c.fill();
   }
 
   drawRobot(r) {
-    const c = this.context, [px, py] = this.pixels(r.pose[0], r.pose[1]), size = ROBOT_PX;
+    const c = this.context, [px, py] = this.pixels(r.pose[0], r.pose[1]), { size } = this;
     c.globalAlpha = 1;
     if (r.name === this.team.chosen) {
       c.strokeStyle = this.ink("focus");
@@ -336,10 +339,10 @@ export class FieldMap {
       c.arc(px, py, size, 0, 2 * Math.PI);
       c.fill();
       c.stroke();
-      c.font = "bold 15px system-ui, sans-serif";
+      c.font = `bold ${size + 4}px system-ui, sans-serif`;
       c.textAlign = "center";
       c.fillStyle = this.ink("panel");
-      c.fillText("!", px, py + 5.5);
+      c.fillText("!", px, py + size / 2);
       return;
     }
     this.outline(px, py, r.pose[2], size);
@@ -351,14 +354,15 @@ export class FieldMap {
     const { chosen } = this.team, words = r.state === "gone" ? `${r.name}, gone` : r.tier === null ? r.name : `${r.name} · ${r.tier}`;
     const [px, py] = this.pixels(r.pose[0], r.pose[1]), c = this.context;
     if (px < -50 || py < -20 || px > this.w + 50 || py > this.h + 20) return;
-    c.font = "600 13px system-ui, sans-serif";
+    const height = this.isCrowded ? 11 : 13, far = this.size + 10;
+    c.font = `600 ${height}px system-ui, sans-serif`;
     const wide = c.measureText(words).width + 4;
-    const place = [[0, -21], [0, 31], [20 + wide / 2, 5], [-20 - wide / 2, 5]].find(([dx, dy]) => this.isFree(px + dx - wide / 2, py + dy - 11, wide, 15));
+    const place = [[0, -far], [0, far + 10], [far + wide / 2, 5], [-far - wide / 2, 5]].find(([dx, dy]) => this.isFree(px + dx - wide / 2, py + dy - 11, wide, 15));
     if (!place && this.isCrowded && r.name !== chosen) return;
-    const [dx, dy] = place ?? [0, -21], ink = { lost: "lost", gone: "gone" }[r.state] ?? "ink";
+    const [dx, dy] = place ?? [0, -far], ink = { lost: "lost", gone: "gone" }[r.state] ?? "ink";
     this.taken.push([px + dx - wide / 2, py + dy - 11, wide, 15]);
     c.globalAlpha = chosen && chosen !== r.name && r.state !== "lost" ? 0.75 : 1;
-    this.text(words, px + dx, py + dy, "center", 13, ink, "600");
+    this.text(words, px + dx, py + dy, "center", height, ink, "600");
     if (r.state === "lost" && !this.isCrowded && (this.w > 500 || r.name === chosen)) this.text(`lost: ${r.why}`, px + dx, py + dy + (dy < 0 ? -16 : 16), "center", 12, "lost");
     c.globalAlpha = 1;
   }

@@ -98,7 +98,7 @@ export class Panel {
     if (before) URL.revokeObjectURL(before);
     const told = camera.found.length ? `sees ${camera.found.join(", ")}` : "sees nothing that it knows";
     image.alt = `Camera of ${camera.robot}: ${told}`;
-    set($("picture").querySelector("figcaption"), camera.no.length ? `${told}; rejected: ${camera.no.join(", ")}` : told);
+    set($("picture").querySelector("figcaption"), camera.no.length ? `${told}; rejected: ${camera.no.map(words).join(", ")}` : told);
     $("picture").hidden = false;
   }
 

@@ -53,8 +53,9 @@ export class Plot {
   drawLine(c, ink, x, y, r, rows, column) {
     const { chosen } = this.team;
     c.strokeStyle = r.state === "lost" ? ink("lost") : r.state === "gone" ? ink("gone") : r.colour;
-    c.globalAlpha = !chosen ? 0.95 : chosen === r.name ? 1 : 0.25;
-    c.lineWidth = chosen === r.name ? 2.5 : 1.6;
+    const isCrowded = this.robots.size > 12;
+    c.globalAlpha = chosen === r.name ? 1 : (chosen ? 0.3 : 0.95) * (isCrowded && r.state !== "lost" ? 0.45 : 1);
+    c.lineWidth = chosen === r.name ? 2.5 : isCrowded ? 0.9 : 1.6;
     c.beginPath();
     let before = null;
     for (const s of rows) {
