@@ -38,7 +38,7 @@ class Sample(NamedTuple):
     error_m: float | None
 
 
-class RobotNews(NamedTuple):
+class LatestMessages(NamedTuple):
     """The newest that was received of one robot; times of arrival are real seconds."""
 
     track: Track | None = None
@@ -49,7 +49,7 @@ class RobotNews(NamedTuple):
     tokens: frozenset[str] = frozenset()
     token_lost_s: float | None = None  # when the last token disappeared; None while there is one
     latest_s: float = 0.0  # of any track or status
-    pause_s: float = 0.0  # between the last two of them
+    pause_s: float = 0.0  # between the last ones of them
     error_m: float | None = None  # the distance to the truth at the stamp of a track
 
     @property
@@ -72,7 +72,7 @@ class TruthAt(NamedTuple):
 class Snapshot(NamedTuple):
     """The whole feed at one time."""
 
-    robots: Mapping[str, RobotNews] = MappingProxyType({})
+    robots: Mapping[str, LatestMessages] = MappingProxyType({})
     truths: Mapping[str, Truth] = MappingProxyType({})
     problem: str = ""  # of the connection; empty while there is one
     connected_s: float | None = None  # since when there is one
@@ -88,7 +88,7 @@ class Feed:
         self.named, self.now_s = frozenset(robots), now_s
         self._lock, self._bus_lock = threading.Lock(), threading.Lock()
         self._bus: Bus | None = None
-        self._robots = dict.fromkeys(robots, RobotNews())
+        self._robots = dict.fromkeys(robots, LatestMessages())
         self._history: dict[str, deque[Sample]] = {}
         self._truths: deque[TruthAt] = deque(maxlen=TRUTHS)
         self._unscored: dict[str, deque[Track]] = {}  # tracks that came before their truth
@@ -181,21 +181,21 @@ class Feed:
 
     # From the threads of the bus ------------------------------------------------------------------
 
-    def _news(self, robot: str) -> RobotNews | None:
+    def _latest_of(self, robot: str) -> LatestMessages | None:
         """What is known of a robot; None for one too many that the team file does not name."""
-        news = self._robots.get(robot)
-        if news is None and len(self._robots) - len(self.named) < MOST_UNNAMED:
-            news = RobotNews()
-        return news
+        latest = self._robots.get(robot)
+        if latest is None and len(self._robots) - len(self.named) < MOST_UNNAMED:
+            latest = LatestMessages()
+        return latest
 
     def _on_track(self, received: Received[Track]) -> None:
         track, now_s = received.message, self.now_s()
         with self._lock:
-            if (news := self._news(track.robot)) is None:
+            if (latest := self._latest_of(track.robot)) is None:
                 return
             self._unscored.setdefault(track.robot, deque(maxlen=UNSCORED)).append(track)
-            error_m = self._score(track.robot, news.error_m)
-            self._robots[track.robot] = _arrived(news, now_s)._replace(
+            error_m = self._score(track.robot, latest.error_m)
+            self._robots[track.robot] = _arrived(latest, now_s)._replace(
                 track=track, track_s=now_s, error_m=error_m
             )
             self._store_sample(track, now_s, error_m)
@@ -210,9 +210,9 @@ class Feed:
     def _on_status(self, received: Received[Status]) -> None:
         status, now_s = received.message, self.now_s()
         with self._lock:
-            if (news := self._news(status.robot)) is not None:
-                arrivals = with_arrival(news.arrivals, now_s, status)
-                self._robots[status.robot] = _arrived(news, now_s)._replace(arrivals=arrivals)
+            if (latest := self._latest_of(status.robot)) is not None:
+                arrivals = with_arrival(latest.arrivals, now_s, status)
+                self._robots[status.robot] = _arrived(latest, now_s)._replace(arrivals=arrivals)
 
     def _on_sightings(self, received: Received[Sightings]) -> None:
         names = topics.IN_SIGHTINGS.names(received.key) or {}
@@ -229,8 +229,8 @@ class Feed:
         now_s = self.now_s()
         with self._lock:
             if robot in self._robots:
-                news = self._robots[robot]
-                self._robots[robot] = news._replace(sightings=sightings, sightings_s=now_s)
+                latest = self._robots[robot]
+                self._robots[robot] = latest._replace(sightings=sightings, sightings_s=now_s)
 
     def _on_truths(self, received: Received[Truths]) -> None:
         stamp_ns = received.message.stamp_ns
@@ -241,9 +241,9 @@ class Feed:
             self._truths.append(truths)
             for robot, tracks in self._unscored.items():
                 if tracks and tracks[0].stamp_ns <= stamp_ns:
-                    news = self._robots[robot]
-                    error_m = self._score(robot, news.error_m)
-                    self._robots[robot] = news._replace(error_m=error_m)
+                    latest = self._robots[robot]
+                    error_m = self._score(robot, latest.error_m)
+                    self._robots[robot] = latest._replace(error_m=error_m)
 
     def _score(self, robot: str, error_m: float | None) -> float | None:
         """The error of the newest track for whose stamp the truth is known, else the one before."""
@@ -260,16 +260,17 @@ class Feed:
         names = topics.ALIVE.names(key) or {}
         robot, now_s = names.get("robot", ""), self.now_s()
         with self._lock:
-            if (news := self._news(robot)) is None:
+            if (latest := self._latest_of(robot)) is None:
                 return
-            tokens = news.tokens | {key} if alive else news.tokens - {key}
+            tokens = latest.tokens | {key} if alive else latest.tokens - {key}
             lost_s = None if tokens else now_s
-            self._robots[robot] = news._replace(tokens=tokens, token_lost_s=lost_s)
+            self._robots[robot] = latest._replace(tokens=tokens, token_lost_s=lost_s)
 
 
-def _arrived(news: RobotNews, now_s: float) -> RobotNews:
-    pause_s = now_s - news.latest_s if news.latest_s else 0.0
-    return news._replace(latest_s=now_s, pause_s=pause_s)
+def _arrived(latest: LatestMessages, now_s: float) -> LatestMessages:
+    pause_s = now_s - latest.latest_s if latest.latest_s else 0.0
+    pause_s = max(pause_s, 0.5 * latest.pause_s)  # a track and a status may come together
+    return latest._replace(latest_s=now_s, pause_s=pause_s)
 
 
 def _distance_m(truth: Truth, track: Track) -> float:

@@ -9,7 +9,7 @@ import msgspec
 from cpcbl_launch.reporting.metrics import degrees
 from cpcbl_launch.reporting.statuses import SpendingReport, TrustReport, distrust_text
 from cpcbl_launch.views.traffic import LiveFlow, Traffic
-from cpcbl_launch.views.web.feed import RobotNews, Snapshot, position_sigma_m
+from cpcbl_launch.views.web.feed import LatestMessages, Snapshot, position_sigma_m
 from cpcbl_team.config import Field, Team
 from cpcbl_team.inputs import SightingFault
 from cpcbl_transport.messages import Refusal, Truth
@@ -17,6 +17,7 @@ from cpcbl_transport.messages import Refusal, Truth
 SILENT_S = 2.0  # so long, and three of its pauses, a robot is silent before it is marked
 TOKEN_LOST_S = 0.5  # a robot that changes its tier may have no token for a moment
 SEEN_S = 1.0  # sightings older than this are not drawn
+MOST_SEEN, LONGEST_TEXT = 50, 200
 LEFT_S = 30.0  # a guest that left is shown for so long
 UNHEARD_S = 3.0  # so long after the connection the team should have been heard
 REFUSALS = frozenset([*Refusal, *SightingFault])
@@ -115,31 +116,31 @@ def robot_pictures(
     """All robots; `named` are those of the team file, all others are guests."""
     return {
         name: picture
-        for name, news in now.robots.items()
+        for name, latest in now.robots.items()
         if (
             picture := _picture(
-                news, now.truths.get(name), bool(named) and name not in named, now_s, began_s
+                latest, now.truths.get(name), bool(named) and name not in named, now_s, began_s
             )
         )
     }
 
 
 def _picture(
-    news: RobotNews, truth: Truth | None, is_guest: bool, now_s: float, began_s: float
+    latest: LatestMessages, truth: Truth | None, is_guest: bool, now_s: float, began_s: float
 ) -> RobotPicture | None:
     """None for a guest that left."""
-    state, why = state_of(news, now_s)
-    since_s = now_s - max(news.latest_s, news.token_lost_s or 0.0)
+    state, why = state_of(latest, now_s)
+    since_s = now_s - max(latest.latest_s, latest.token_lost_s or 0.0)
     if is_guest and state in ("gone", "waiting") and since_s > LEFT_S:
         return None
-    status, track = news.status, news.track
-    sees = news.sightings.sightings if news.sightings is not None else ()
-    is_fresh = state != "gone" and now_s - news.sightings_s <= SEEN_S
+    status, track = latest.status, latest.track
+    sees = latest.sightings.sightings[:MOST_SEEN] if latest.sightings is not None else ()
+    is_fresh = state != "gone" and now_s - latest.sightings_s <= SEEN_S
     seen = tuple((s.id, _rounded(s.range_m), _rounded(s.bearing_rad)) for s in sees)
     there = None if truth is None else (truth.x_m, truth.y_m, truth.heading_rad)
     common = RobotPicture(
         state=state,
-        why=why,
+        why=why[:LONGEST_TEXT],
         is_guest=is_guest,
         sigma_m=None if status is None else _rounded(status.position_sigma_m, 4),
         tier=None if status is None else status.tier,
@@ -151,36 +152,36 @@ def _picture(
     ellipse = None if track.covariance is None else ellipse_of(*track.covariance[:3])
     return msgspec.structs.replace(
         common,
-        at_s=_rounded(news.track_s - began_s),
+        at_s=_rounded(latest.track_s - began_s),
         pose=_triple(track.x_m, track.y_m, track.heading_rad),
         ellipse=None if ellipse is None else _triple(*ellipse),
         sigma_m=_rounded(position_sigma_m(track), 4) or common.sigma_m,
-        error_m=_rounded(news.error_m, 4),
+        error_m=_rounded(latest.error_m, 4),
         tier=track.tier,
     )
 
 
-def state_of(news: RobotNews, now_s: float) -> tuple[State, str]:
+def state_of(latest: LatestMessages, now_s: float) -> tuple[State, str]:
     """Whether all is well with a robot, and why not: the worst that is known, in words."""
-    if not news.is_present:
+    if not latest.is_present:
         return "waiting", "nothing was received from it yet"
-    silent_s = now_s - news.latest_s
-    if news.token_lost_s is not None and now_s - news.token_lost_s > TOKEN_LOST_S:
-        return "gone", f"its process or its link ended {now_s - news.token_lost_s:.0f} s ago"
-    if news.latest_s and silent_s > max(SILENT_S, 3.0 * news.pause_s):
+    silent_s = now_s - latest.latest_s
+    if latest.token_lost_s is not None and now_s - latest.token_lost_s > TOKEN_LOST_S:
+        return "gone", f"its process or its link ended {now_s - latest.token_lost_s:.0f} s ago"
+    if latest.latest_s and silent_s > max(SILENT_S, 3.0 * latest.pause_s):
         return "gone", f"silent for {silent_s:.0f} s"
-    track, status = news.track, news.status
+    track, status = latest.track, latest.status
     newest = status if track is None or (status and status.stamp_ns > track.stamp_ns) else track
     if newest is None:
         return "waiting", "its process runs, but has sent no pose yet"
     if newest.lost:
-        return "lost", newest.lost
-    problems = list(_problems(news))
+        return "lost", "; ".join([newest.lost, *getattr(status, "problems", ())[:1]])
+    problems = list(_problems(latest))
     return ("problem", problems[0]) if problems else ("ok", "")
 
 
-def _problems(news: RobotNews) -> Iterator[str]:
-    if (status := news.status) is not None:
+def _problems(latest: LatestMessages) -> Iterator[str]:
+    if (status := latest.status) is not None:
         yield from getattr(status, "problems", ())
         if text := distrust_text(status.trust):
             yield text
@@ -199,7 +200,7 @@ def notice_text(now: Snapshot, team: str, where: str, now_s: float) -> str:
     """What is wrong with the connection or with the whole team, and what to do; empty otherwise."""
     if now.connected_s is None:
         return f"{now.problem}. The page goes on by itself as soon as there is a router."
-    is_silent = not any(news.is_present for news in now.robots.values())
+    is_silent = not any(latest.is_present for latest in now.robots.values())
     if is_silent and now_s - now.connected_s > UNHEARD_S:
         return (
             f"No robot of team `{team}` is heard at {where}. Compare the team's name with that in"
@@ -226,9 +227,9 @@ def changed(
     return differing, [name for name in before if name not in now]
 
 
-def robot_detail(name: str, news: RobotNews, traffic: Traffic) -> RobotDetail:
+def robot_detail(name: str, latest: LatestMessages, traffic: Traffic) -> RobotDetail:
     """What the page shows of the robot that a person has chosen."""
-    status, live = news.status, traffic.robots.get(name)
+    status, live = latest.status, traffic.robots.get(name)
     if status is None or live is None:
         return RobotDetail(name)
     inputs = tuple(
@@ -246,7 +247,7 @@ def robot_detail(name: str, news: RobotNews, traffic: Traffic) -> RobotDetail:
         robot=name,
         process=status.incarnation,
         heading_sigma_deg=_rounded(degrees(status.heading_sigma_rad), 2),
-        problems=tuple(_problems(news)),
+        problems=tuple(_problems(latest)),
         inputs=inputs,
         refused={reason: n for reason, n in status.counts.items() if reason in REFUSALS and n},
         counts={what: n for what, n in status.counts.items() if what not in REFUSALS},

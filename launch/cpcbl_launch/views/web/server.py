@@ -1,11 +1,12 @@
 """Serves the page, and sends each open page ten frames a second over a WebSocket.
 
-A page acknowledges each frame. One that has not acknowledged the last two gets no other until it
+A page acknowledges each frame. One that has not acknowledged the last three gets no other until it
 does: its next frame then holds all that has changed meanwhile, so frames are dropped and never
 queued. A page can say nothing but what it wants to see; there is no way to publish.
 """
 
 import asyncio
+import logging
 import socket
 import threading
 from collections.abc import Awaitable, Callable, Iterator, Mapping
@@ -16,6 +17,7 @@ from typing import NamedTuple
 
 import msgspec
 from aiohttp import WSCloseCode, WSMsgType, web
+from aiohttp.http_exceptions import HttpProcessingError
 
 from cpcbl_launch.views.traffic import Traffic, traffic_from_statuses
 from cpcbl_launch.views.web.address import (
@@ -44,12 +46,21 @@ from cpcbl_team.config import Team
 CYCLE_S = 0.1
 TRAFFIC_S = 0.5  # rates change at 1 Hz
 MOST_PAGES = 16
-MOST_UNACKNOWLEDGED = 2
+MOST_UNACKNOWLEDGED = 3
 MOST_REQUESTS = 100  # of a page between two frames
 LARGEST_REQUEST = 1024
 PATIENCE_S = 20.0  # for a page that acknowledges nothing
 TYPES = {"html": "text/html", "css": "text/css", "js": "text/javascript", "svg": "image/svg+xml"}
-PAGE = ("page.html", "page.css", "page.js", "field.js", "panel.js", "plots.js", "icon.svg")
+PAGE = (
+    "page.html",
+    "page.css",
+    "page.js",
+    "colours.js",
+    "field.js",
+    "panel.js",
+    "plots.js",
+    "icon.svg",
+)
 
 
 class Shown(NamedTuple):
@@ -71,7 +82,6 @@ class Request(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class Now(NamedTuple):
     """One cycle, as all pages are sent it."""
 
-    number: int = 0
     at_s: float = 0.0
     notice: str = ""
     pictures: Mapping[str, RobotPicture] = {}
@@ -135,8 +145,8 @@ class Page:
         self._silent_since_s, self._requests = now.at_s, 0
         await self._send_camera_frame()
         if self._robot in now.snapshot.robots and now.traffic is not None:
-            news = now.snapshot.robots[self._robot]
-            detail = robot_detail(self._robot, news, now.traffic)
+            latest = now.snapshot.robots[self._robot]
+            detail = robot_detail(self._robot, latest, now.traffic)
             if detail != self._detail:
                 self._detail = detail
                 await self._send(detail)
@@ -262,7 +272,6 @@ class Server:
             arrivals = {n: r.arrivals for n, r in snapshot.robots.items() if r.arrivals}
             traffic = traffic_from_statuses(shown.name, (), arrivals, self._began_s, now_s)
         return Now(
-            before.number + 1,
             now_s - self._began_s,
             notice_text(snapshot, shown.name, shown.where, now_s),
             pictures,
@@ -283,8 +292,14 @@ async def _add_headers(request: web.Request, response: web.StreamResponse) -> No
     response.headers.update(security_headers(request.host))
 
 
+def _is_bug(record: logging.LogRecord) -> bool:
+    """Whether an error is one of this program, and not of a request that is no HTTP."""
+    return record.exc_info is None or not isinstance(record.exc_info[1], HttpProcessingError)
+
+
 async def _serve(server: Server, listener: socket.socket, ready: "Future[_Ready]") -> None:
     runner = web.AppRunner(server.application(), access_log=None, shutdown_timeout=1.0)
+    logging.getLogger("aiohttp.server").addFilter(_is_bug)
     await runner.setup()
     try:
         await web.SockSite(runner, listener).start()

@@ -12,7 +12,7 @@ from support.traffic import flow, seen, status
 
 from cpcbl_launch.team_file import find_team
 from cpcbl_launch.views.traffic import traffic_from_statuses
-from cpcbl_launch.views.web.feed import RobotNews, Snapshot
+from cpcbl_launch.views.web.feed import LatestMessages, Snapshot
 from cpcbl_launch.views.web.pictures import (
     RobotPicture,
     changed,
@@ -35,7 +35,7 @@ def track(at_s: float = 10.0, lost: str = "", **more: Any) -> Track:
     return Track("r1", int(at_s * SECOND), 1.0, 2.0, 0.5, lost=lost, **values)
 
 
-def news(**more: Any) -> RobotNews:
+def latest(**more: Any) -> LatestMessages:
     """A robot that sent a pose at 10 s and has its token."""
     values: dict[str, Any] = {
         "track": track(),
@@ -43,28 +43,28 @@ def news(**more: Any) -> RobotNews:
         "latest_s": 10.0,
         "tokens": frozenset("t"),
     }
-    return RobotNews(**(values | more))
+    return LatestMessages(**(values | more))
 
 
-def picture(robot: RobotNews, now_s: float = 10.1, **truths: Truth) -> RobotPicture:
+def picture(robot: LatestMessages, now_s: float = 10.1, **truths: Truth) -> RobotPicture:
     return robot_pictures(Snapshot({"r1": robot}, truths), ["r1"], now_s, 0.0)["r1"]
 
 
 @pytest.mark.parametrize(
     ("robot", "now_s", "state", "why"),
     [
-        (RobotNews(), 10.0, "waiting", "nothing was received"),
-        (RobotNews(tokens=frozenset("t")), 10.0, "waiting", "no pose yet"),
-        (news(), 10.1, "ok", ""),
-        (news(track=track(lost="position sigma 0.7 m")), 10.1, "lost", "position sigma 0.7 m"),
-        (news(), 12.1, "gone", "silent for 2 s"),
-        (news(pause_s=2.0), 15.9, "ok", ""),  # one whose time runs slowly
-        (news(token_lost_s=10.0), 10.4, "ok", ""),  # it changes its tier
-        (news(token_lost_s=10.0), 10.6, "gone", "its process or its link ended 1 s ago"),
+        (LatestMessages(), 10.0, "waiting", "nothing was received"),
+        (LatestMessages(tokens=frozenset("t")), 10.0, "waiting", "no pose yet"),
+        (latest(), 10.1, "ok", ""),
+        (latest(track=track(lost="position sigma 0.7 m")), 10.1, "lost", "position sigma 0.7 m"),
+        (latest(), 12.1, "gone", "silent for 2 s"),
+        (latest(pause_s=2.0), 15.9, "ok", ""),  # one whose time runs slowly
+        (latest(token_lost_s=10.0), 10.4, "ok", ""),  # it changes its tier
+        (latest(token_lost_s=10.0), 10.6, "gone", "its process or its link ended 1 s ago"),
     ],
 )
 def test_the_state_of_a_robot_is_the_worst_that_is_known(
-    robot: RobotNews, now_s: float, state: str, why: str
+    robot: LatestMessages, now_s: float, state: str, why: str
 ) -> None:
     found, told = state_of(robot, now_s)
     assert found == state
@@ -74,22 +74,22 @@ def test_the_state_of_a_robot_is_the_worst_that_is_known(
 
 def test_a_killed_robot_is_marked_within_three_seconds_however_it_ends() -> None:
     last_s = 10.0
-    assert state_of(news(token_lost_s=last_s), last_s + 3.0)[0] == "gone"  # its link was closed
-    cut = news(token_lost_s=last_s + 2.0)  # nobody closed it: the lease of 2 s
+    assert state_of(latest(token_lost_s=last_s), last_s + 3.0)[0] == "gone"  # its link was closed
+    cut = latest(token_lost_s=last_s + 2.0)  # nobody closed it: the lease of 2 s
     assert state_of(cut, last_s + 3.0)[0] == "gone"
-    assert state_of(news(), last_s + 3.0)[0] == "gone"  # it hangs, but its token stays
+    assert state_of(latest(), last_s + 3.0)[0] == "gone"  # it hangs, but its token stays
 
 
 def test_a_problem_that_a_robot_tells_is_shown_before_what_is_inferred() -> None:
     distrust = (Trust("west", "biased"),)
-    robot = news(arrivals=seen(status("r1", 10.0, 3, trust=distrust)))
+    robot = latest(arrivals=seen(status("r1", 10.0, 3, trust=distrust)))
     assert state_of(robot, 10.1) == ("problem", "distrusts west (biased)")
 
 
 def test_a_picture_has_the_ellipse_the_error_and_what_is_seen() -> None:
     sightings = Sightings(0, (Sighting("door", 2.0, 0.1), Sighting("wall", None, -1.0)))
     truth = Truth("r1", 1.1, 2.0, 0.5)
-    robot = news(sightings=sightings, sightings_s=9.5, error_m=0.1)
+    robot = latest(sightings=sightings, sightings_s=9.5, error_m=0.1)
     now = picture(robot, r1=truth)
     assert now.pose == (1.0, 2.0, 0.5)
     assert now.ellipse == pytest.approx((0.2, 0.1, 0.0))
@@ -97,7 +97,7 @@ def test_a_picture_has_the_ellipse_the_error_and_what_is_seen() -> None:
     assert (now.error_m, now.tier, now.truth) == (0.1, 3, (1.1, 2.0, 0.5))
     assert now.sees == (("door", 2.0, 0.1), ("wall", None, -1.0))
     assert picture(robot, 10.6).sees == ()  # these sightings are old
-    assert picture(news(track=track(covariance=None))).ellipse is None
+    assert picture(latest(track=track(covariance=None))).ellipse is None
 
 
 def test_the_ellipse_has_the_axes_of_the_covariance() -> None:
@@ -108,7 +108,7 @@ def test_the_ellipse_has_the_axes_of_the_covariance() -> None:
 
 
 def test_a_guest_is_marked_and_forgotten_some_time_after_it_left() -> None:
-    left = Snapshot({"visitor": news(token_lost_s=10.0)})
+    left = Snapshot({"visitor": latest(token_lost_s=10.0)})
     assert robot_pictures(left, ["r1"], 20.0, 0.0)["visitor"].is_guest
     assert robot_pictures(left, ["r1"], 50.0, 0.0) == {}
     assert not robot_pictures(left, [], 20.0, 0.0)["visitor"].is_guest  # without a team file
@@ -141,10 +141,10 @@ def test_a_notice_says_what_is_wrong_with_the_connection_and_what_to_do() -> Non
 
     waiting = Snapshot(problem="No router at tcp/10.0.0.1:7447")
     assert notice(waiting, 1.0).startswith("No router at tcp/10.0.0.1:7447. ")
-    silent = Snapshot({"r1": RobotNews()}, connected_s=10.0)
+    silent = Snapshot({"r1": LatestMessages()}, connected_s=10.0)
     assert notice(silent, 12.0) == ""
     assert notice(silent, 14.0).startswith("No robot of team `x` is heard at tcp/10.0.0.1:7447. ")
-    assert notice(Snapshot({"r1": news()}, connected_s=10.0), 99.0) == ""
+    assert notice(Snapshot({"r1": latest()}, connected_s=10.0), 99.0) == ""
 
 
 def test_the_detail_of_a_robot_separates_what_was_refused() -> None:
@@ -153,13 +153,13 @@ def test_the_detail_of_a_robot_separates_what_was_refused() -> None:
     now = msgspec.structs.replace(
         status("r1", 10.0, 3, spending=spending, sent=(flow("fix", "r2", 3, 9.9),)), counts=counts
     )
-    robot = news(arrivals=seen(now))
+    robot = latest(arrivals=seen(now))
     traffic = traffic_from_statuses("team", (), {"r1": robot.arrivals}, 0.0, 10.5)
     detail = robot_detail("r1", robot, traffic)
     assert detail.refused == {"not_finite": 4, "bearing_out_of_range": 2}
     assert detail.counts == {"odometry": 90}
     assert (detail.spending[0].most, detail.sent[0].peer) == (120.0, "r2")
-    assert robot_detail("r1", RobotNews(), traffic).process == ""
+    assert robot_detail("r1", LatestMessages(), traffic).process == ""
 
 
 def test_a_team_without_landmarks_or_without_a_file_is_a_picture_too() -> None:

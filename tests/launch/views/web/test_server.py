@@ -106,6 +106,20 @@ def test_foreign_pages_and_names_are_refused() -> None:
     run(test)
 
 
+def test_what_is_no_http_is_answered_without_a_traceback(caplog: pytest.LogCaptureFixture) -> None:
+    async def test(there: Stand) -> None:
+        port = there.address.rpartition(":")[2].strip("/")
+        for said in (b"GARBAGE\x00\xff\r\n\r\n", b"GET / HTTP/1.1\r\n\r\n", b"\x16\x03\x01"):
+            reader, writer = await asyncio.open_connection("127.0.0.1", int(port))
+            writer.write(said)
+            writer.write_eof()
+            assert b" 200 " not in await reader.read()
+            writer.close()
+
+    run(test)
+    assert caplog.records == []
+
+
 def test_a_page_is_told_the_team_then_what_changes() -> None:
     async def test(there: Stand) -> None:
         there.drive("scout", 1.0)

@@ -1,4 +1,6 @@
 // The map: metres to pixels, pointers and keys, and everything that is drawn on it.
+import { ink } from "./colours.js";
+
 const STEPS = [0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000];
 
 export class FieldMap {
@@ -133,10 +135,9 @@ export class FieldMap {
   draw() {
     if (!this.w) return;
     if (this.isFitted) this.frameAll();
-    const c = this.context, style = getComputedStyle(document.documentElement);
-    this.ink = (name) => style.getPropertyValue(`--${name}`);
+    const c = this.context;
     c.setTransform(this.ratio, 0, 0, this.ratio, 0, 0);
-    c.fillStyle = this.ink("field");
+    c.fillStyle = ink("field");
     c.fillRect(0, 0, this.w, this.h);
     c.lineJoin = c.lineCap = "round";
     this.drawGrid();
@@ -144,6 +145,7 @@ export class FieldMap {
     const all = [...this.robots.values()].filter((r) => r.pose), { chosen } = this.team;
     this.isCrowded = all.length > 12;
     this.size = this.isCrowded ? 7 : 11;
+    this.isPlain = all.length > 60; // without what takes long to draw
     const strength = (r) => (!chosen || r.name === chosen ? 1 : 0.5);
     for (const r of all) this.drawTrail(r, strength(r));
     for (const r of all) this.drawEllipse(r, strength(r));
@@ -166,7 +168,7 @@ export class FieldMap {
   drawGrid() {
     const c = this.context, step = this.gridStep = STEPS.find((s) => s * this.scale >= 45) ?? 1000;
     const [left, top] = this.metres(0, 0), [right, bottom] = this.metres(this.w, this.h);
-    c.strokeStyle = this.ink("grid");
+    c.strokeStyle = ink("grid");
     c.lineWidth = 1;
     c.beginPath();
     for (let x = Math.ceil(left / step) * step; x <= right; x += step) {
@@ -182,27 +184,27 @@ export class FieldMap {
 
   drawScale() {
     const c = this.context, wide = this.gridStep * this.scale, y = this.h - 14;
-    c.strokeStyle = c.fillStyle = this.ink("soft");
+    c.strokeStyle = c.fillStyle = ink("soft");
     c.lineWidth = 2;
     this.path([[12, y - 4], [12, y], [12 + wide, y], [12 + wide, y - 4]]);
     c.stroke();
     this.text(`${this.gridStep} m`, 18 + wide, y + 1, "left", 12, "soft");
   }
 
-  text(words, x, y, align, size, ink, weight = "") {
+  text(words, x, y, align, size, colour, weight = "") {
     const c = this.context;
     c.font = `${weight} ${size}px system-ui, sans-serif`;
     c.textAlign = align;
     c.lineWidth = 3;
-    c.strokeStyle = this.ink("field");
+    c.strokeStyle = ink("field");
     c.strokeText(words, x, y);
-    c.fillStyle = this.ink(ink);
+    c.fillStyle = ink(colour);
     c.fillText(words, x, y);
   }
 
   drawMap() {
     const c = this.context;
-    c.strokeStyle = this.ink("mark");
+    c.strokeStyle = ink("mark");
     c.lineWidth = 4;
     for (const [, x1, y1, x2, y2] of this.team.walls) {
       this.path([this.pixels(x1, y1), this.pixels(x2, y2)]);
@@ -210,7 +212,7 @@ export class FieldMap {
     }
     for (const [name, x, y] of this.team.landmarks) {
       const [px, py] = this.pixels(x, y), r = 6;
-      c.fillStyle = this.ink("mark");
+      c.fillStyle = ink("mark");
       this.path([[px, py - r], [px + r, py], [px, py + r], [px - r, py]]);
       c.fill();
       if (this.team.landmarks.length <= 24) this.text(name, px, py + 20, "center", 12, "soft");
@@ -220,10 +222,11 @@ export class FieldMap {
   drawTrail(r, strength) {
     if (r.trail.length < 2) return;
     const c = this.context;
-    c.strokeStyle = r.state === "gone" ? this.ink("gone") : r.colour;
+    c.strokeStyle = r.state === "gone" ? ink("gone") : r.colour;
     c.lineWidth = 1.5;
-    const points = r.trail.map(([, x, y]) => this.pixels(x, y)), n = points.length;
-    for (let part = 0; part < 4; part += 1) { // it fades
+    const trail = this.isPlain ? r.trail.filter((_, i) => i % 5 === 0) : r.trail;
+    const points = trail.map(([, x, y]) => this.pixels(x, y)), n = points.length;
+    for (let part = this.isPlain ? 3 : 0; part < 4; part += 1) { // it fades
       const from = Math.floor((part * n) / 4), until = Math.floor(((part + 1) * n) / 4) + 1;
       c.globalAlpha = strength * (0.15 + 0.15 * part);
       this.path(points.slice(from, until));
@@ -237,7 +240,7 @@ export class FieldMap {
     const [a, b, angle] = r.ellipse, limit = 20 * (this.w + this.h);
     c.beginPath();
     c.ellipse(px, py, Math.min(3 * a * this.scale, limit), Math.min(3 * b * this.scale, limit), -angle, 0, 2 * Math.PI);
-    c.fillStyle = c.strokeStyle = r.state === "lost" ? this.ink("lost") : r.colour;
+    c.fillStyle = c.strokeStyle = r.state === "lost" ? ink("lost") : r.colour;
     c.globalAlpha = (3 * a * this.scale > this.w / 4 ? 0.03 : 0.13) * strength; // one that is lost would colour everything
     c.fill();
     c.globalAlpha = 0.8 * strength;
@@ -276,7 +279,7 @@ export class FieldMap {
     if (!r.truth) return;
     const c = this.context, [x, y, heading] = r.truth, [px, py] = this.pixels(x, y);
     c.globalAlpha = 1;
-    c.strokeStyle = this.ink("truth");
+    c.strokeStyle = ink("truth");
     c.lineWidth = 1.5;
     this.outline(px, py, heading, this.size + 2);
     c.stroke();
@@ -303,7 +306,7 @@ export class FieldMap {
     c.strokeStyle = c.fillStyle = from.colour;
     c.globalAlpha = (chosen && !mine ? 0.4 : 0.95) * Math.max(0.4, 1 - tier / 20) * (this.isCrowded && !chosen ? 0.5 : 1);
     c.lineWidth = (this.isCrowded ? 1 : 1.6) + Math.min(2, Math.log10(1 + (rate ?? 0)));
-    c.setLineDash(topic === "fix" ? [] : [7, 5]);
+    c.setLineDash(topic === "fix" || this.isPlain ? [] : [7, 5]);
     c.beginPath();
     c.moveTo(a[0] + gap * Math.cos(out), a[1] + gap * Math.sin(out));
     c.quadraticCurveTo(mid[0], mid[1], tip[0] - 6 * Math.cos(into), tip[1] - 6 * Math.sin(into));
@@ -318,21 +321,21 @@ export class FieldMap {
     const c = this.context, [px, py] = this.pixels(r.pose[0], r.pose[1]), { size } = this;
     c.globalAlpha = 1;
     if (r.name === this.team.chosen) {
-      c.strokeStyle = this.ink("focus");
+      c.strokeStyle = ink("focus");
       c.lineWidth = 2.5;
       c.beginPath();
       c.arc(px, py, size + 9, 0, 2 * Math.PI);
       c.stroke();
     }
     if (r.state === "gone") {
-      c.strokeStyle = this.ink("gone");
+      c.strokeStyle = ink("gone");
       c.lineWidth = 4;
       for (const s of [1, -1]) { this.path([[px - 7, py - 7 * s], [px + 7, py + 7 * s]]); c.stroke(); }
       return;
     }
     const isLost = r.state === "lost";
-    c.fillStyle = isLost ? this.ink("lost") : r.colour;
-    c.strokeStyle = this.ink("field");
+    c.fillStyle = isLost ? ink("lost") : r.colour;
+    c.strokeStyle = ink("field");
     c.lineWidth = 2;
     if (isLost) { // with a mark: red alone is not for everybody
       c.beginPath();
@@ -341,7 +344,7 @@ export class FieldMap {
       c.stroke();
       c.font = `bold ${size + 4}px system-ui, sans-serif`;
       c.textAlign = "center";
-      c.fillStyle = this.ink("panel");
+      c.fillStyle = ink("panel");
       c.fillText("!", px, py + size / 2);
       return;
     }
@@ -359,11 +362,11 @@ export class FieldMap {
     const wide = c.measureText(words).width + 4;
     const place = [[0, -far], [0, far + 10], [far + wide / 2, 5], [-far - wide / 2, 5]].find(([dx, dy]) => this.isFree(px + dx - wide / 2, py + dy - 11, wide, 15));
     if (!place && this.isCrowded && r.name !== chosen) return;
-    const [dx, dy] = place ?? [0, -far], ink = { lost: "lost", gone: "gone" }[r.state] ?? "ink";
+    const [dx, dy] = place ?? [0, -far], colour = { lost: "lost", gone: "gone" }[r.state] ?? "ink";
     this.taken.push([px + dx - wide / 2, py + dy - 11, wide, 15]);
     c.globalAlpha = chosen && chosen !== r.name && r.state !== "lost" ? 0.75 : 1;
-    this.text(words, px + dx, py + dy, "center", height, ink, "600");
-    if (r.state === "lost" && !this.isCrowded && (this.w > 500 || r.name === chosen)) this.text(`lost: ${r.why}`, px + dx, py + dy + (dy < 0 ? -16 : 16), "center", 12, "lost");
+    this.text(words, px + dx, py + dy, "center", height, colour, "600");
+    if (r.state === "lost" && !this.isCrowded && (this.w > 500 || r.name === chosen)) this.text(`lost: ${r.why.split("; ")[0]}`, px + dx, py + dy + (dy < 0 ? -16 : 16), "center", 12, "lost");
     c.globalAlpha = 1;
   }
 

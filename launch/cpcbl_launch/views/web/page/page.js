@@ -1,4 +1,5 @@
 // The connection, the state of all robots, and who draws it when.
+import { forgetInks, ink } from "./colours.js";
 import { FieldMap } from "./field.js";
 import { Panel } from "./panel.js";
 import { Plot } from "./plots.js";
@@ -125,12 +126,9 @@ function draw() {
   stats.drawMs = Math.max(stats.drawMs, performance.now() - from);
 }
 
-// Each robot keeps its colour; red is for lost ones alone.
+// Each robot keeps its colour while the others stay the same; red is for lost ones alone.
 function colour() {
-  const style = getComputedStyle(document.documentElement);
-  [...robots.keys()].sort().forEach((name, i) => {
-    robots.get(name).colour = style.getPropertyValue(`--r${i % 7}`);
-  });
+  [...robots.keys()].sort().forEach((name, i) => { robots.get(name).colour = ink(`r${i % 7}`); });
 }
 
 function summary() {
@@ -140,7 +138,7 @@ function summary() {
   if (count.problem) words.push(`${count.problem} with a problem`);
   if (count.lost) words.push(`${count.lost} lost`);
   if (count.gone) words.push(`${count.gone} gone`);
-  if (count.waiting) words.push(`${count.waiting} not heard yet`);
+  if (count.waiting) words.push(`${count.waiting} waiting`);
   if (total && count.ok === total) words.push("all well");
   setText($("summary"), words.join(", "));
   $("summary").classList.toggle("bad", count.lost + count.gone > 0);
@@ -160,6 +158,6 @@ function setLink(isLive) {
   setText($("link"), !isLive ? "not connected" : stats.skipped ? `live, ${stats.skipped} frames left out` : "live");
 }
 
-matchMedia("(prefers-color-scheme: dark)").addEventListener("change", redraw);
+matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => { forgetInks(); redraw(); });
 $("legend").open = innerWidth > 820;
 connect();

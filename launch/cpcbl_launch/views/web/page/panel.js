@@ -1,6 +1,6 @@
 // The table of all robots, which also serves screen readers, and all of the chosen one.
 const $ = (id) => document.getElementById(id);
-const WORDS = { ok: "ok", problem: "problem", lost: "lost", gone: "gone", waiting: "not heard yet" };
+const WORDS = { ok: "ok", problem: "problem", lost: "lost", gone: "gone", waiting: "waiting" };
 const number = (value, digits = 3) => (value == null ? "–" : value.toFixed(digits));
 const plural = (n, what) => `${n} ${what}${n === 1 ? "" : "s"}`;
 const words = (name) => name.replaceAll("_", " ");
@@ -38,7 +38,7 @@ export class Panel {
     set(button, r.is_guest ? `${r.name} (guest)` : r.name);
     set(cells[0], WORDS[state]);
     cells[0].className = `s-${state}`;
-    reason.hidden = state === "ok" || !r.why || (state === "waiting" && !r.tier);
+    reason.hidden = state === "ok" || !r.why;
     set(reason.firstChild, r.why ?? "");
     reason.firstChild.className = `s-${state}`;
     const isThere = state !== "gone" && state !== "waiting";
@@ -106,7 +106,7 @@ export class Panel {
     if (d.robot !== this.team.chosen) return;
     if (!d.process) return;
     const r = this.robots.get(d.robot), parts = [];
-    if (r?.why) parts.push(paragraph(`${WORDS[r.state]}: ${r.why}`, `s-${r.state}`));
+    if (r?.why && !d.problems.includes(r.why)) parts.push(paragraph(`${WORDS[r.state]}: ${r.why}`, `s-${r.state}`));
     if (d.problems.length) parts.push(heading("Problems"), list(d.problems));
     const place = r?.pose ? `x ${number(r.pose[0], 2)} m, y ${number(r.pose[1], 2)} m, heading ${((r.pose[2] * 180) / Math.PI).toFixed(0)}°` : "no pose";
     parts.push(heading("Pose"), paragraph(`${place}; heading σ ${number(d.heading_sigma_deg, 1)}°; sees ${r?.sees.map((s) => s[0]).join(", ") || "nothing"}`));
@@ -126,8 +126,13 @@ export class Panel {
 
   inputs(d) {
     if (d.inputs.length) {
-      const rows = d.inputs.map((i) => [i.input, `${i.rate_hz} Hz`, i.age_s === null ? "–" : `${i.age_s} s`, i.taken, Object.values(i.refused).reduce((a, b) => a + b, 0)]);
-      return grid(["", "rate", "age", "taken", "refused"], rows);
+      const seconds = (s) => (s === null ? "–" : Math.abs(s) < 100 ? `${s.toFixed(2)} s` : s > 0 ? "> 100 s" : "< −100 s");
+      const rows = d.inputs.flatMap((i) => {
+        const refused = Object.entries(i.refused), all = refused.reduce((sum, [, n]) => sum + n, 0);
+        const row = [i.input, `${i.rate_hz} Hz`, seconds(i.age_s), seconds(i.offset_s), i.taken, all];
+        return all ? [row, [refused.map(([why, n]) => `${words(why)} ${n}`).join(", ")]] : [row];
+      });
+      return grid(["", "rate", "age", "late by", "taken", "refused"], rows);
     }
     const known = ["odometry", "sightings", "position", "frame", "accepted", "gated"].filter((k) => d.counts[k]);
     return known.length ? grid([], known.map((k) => [{ accepted: "measurements used", gated: "measurements rejected" }[k] ?? k, d.counts[k]])) : paragraph("nothing was taken yet", "warn");
@@ -175,6 +180,7 @@ function line(kind, cells) {
   const row = document.createElement("tr");
   for (const cell of cells) {
     const made = document.createElement(kind);
+    if (cells.length === 1) Object.assign(made, { colSpan: 6, className: "warn" }); // what is refused, below its input
     made.append(cell instanceof Node ? cell : String(cell));
     row.append(made);
   }

@@ -1,4 +1,6 @@
 // Lines over time on a logarithmic scale: one a robot, with its name at its end.
+import { ink } from "./colours.js";
+
 const MARGIN = { left: 44, right: 84, top: 6, bottom: 20 };
 
 export class Plot {
@@ -15,7 +17,6 @@ export class Plot {
       canvas.width = Math.round(w * ratio);
       canvas.height = Math.round(h * ratio);
     }
-    const style = getComputedStyle(document.documentElement), ink = (name) => style.getPropertyValue(`--${name}`);
     c.setTransform(ratio, 0, 0, ratio, 0, 0);
     c.clearRect(0, 0, w, h);
     const lines = [...this.robots.values()].map((r) => ({ r, rows: r.samples.filter((s) => s[column] != null && now - s[0] <= span) })).filter((l) => l.rows.length);
@@ -25,17 +26,17 @@ export class Plot {
     const right = lines.length ? MARGIN.right : 12;
     const x = (at) => w - right - ((now - at) / span) * (w - right - MARGIN.left);
     const y = (v) => h - MARGIN.bottom - ((Math.log10(Math.max(v, this.least)) - low) / (high - low)) * (h - MARGIN.bottom - MARGIN.top);
-    this.drawAxes({ c, ink, x, y, low, high, now, span, w, h, right });
+    this.drawAxes({ c, x, y, low, high, now, span, w, h, right });
     c.save();
     c.beginPath();
     c.rect(MARGIN.left, 0, w - MARGIN.left - right + 2, h);
     c.clip();
-    for (const { r, rows } of lines) this.drawLine(c, ink, x, y, r, rows, column);
+    for (const { r, rows } of lines) this.drawLine(c, x, y, r, rows, column);
     c.restore();
-    this.drawNames(c, y, lines, w - right + 6, h, column, team.chosen, ink);
+    this.drawNames(c, y, lines, w - right + 6, h, column, team.chosen);
   }
 
-  drawAxes({ c, ink, x, y, low, high, now, span, w, h, right }) {
+  drawAxes({ c, x, y, low, high, now, span, w, h, right }) {
     c.font = "11px system-ui, sans-serif";
     c.lineWidth = 1;
     c.fillStyle = ink("soft");
@@ -50,7 +51,7 @@ export class Plot {
     for (let s = 0; s <= span; s += 15) c.fillText(s ? `−${s} s` : "now", x(now - s), h - 5);
   }
 
-  drawLine(c, ink, x, y, r, rows, column) {
+  drawLine(c, x, y, r, rows, column) {
     const { chosen } = this.team;
     c.strokeStyle = r.state === "lost" ? ink("lost") : r.state === "gone" ? ink("gone") : r.colour;
     const isCrowded = this.robots.size > 12;
@@ -67,7 +68,7 @@ export class Plot {
     c.globalAlpha = 1;
   }
 
-  drawNames(c, y, lines, left, h, column, chosen, ink) {
+  drawNames(c, y, lines, left, h, column, chosen) {
     const fits = Math.floor((h - 8) / 13);
     let named = lines.map(({ r, rows }) => ({ r, at: y(rows.at(-1)[column]) })).sort((a, b) => a.at - b.at);
     if (named.length > fits) named = named.filter(({ r }, i) => r.name === chosen || i === 0 || i === named.length - 1);
