@@ -50,6 +50,19 @@ async def watched(folder: Path, *arguments: str) -> AsyncIterator[tuple[Tab, Pat
     assert up.returncode == 0
 
 
+async def fingers_and_keys_zoom(tab: Tab) -> None:
+    """Two fingers that part, then `0`, which shows the whole field again."""
+    await tab.call("Emulation.setTouchEmulationEnabled", enabled=True, maxTouchPoints=2)
+    before = await tab.evaluate("viewStats.scale")
+    for kind, apart in (("touchStart", 20), ("touchMove", 40), ("touchMove", 80), ("touchEnd", 0)):
+        ends = [{"x": 170 + apart * s, "y": 240, "id": s + 1} for s in (-1, 1)] if apart else []
+        await tab.call("Input.dispatchTouchEvent", type=kind, touchPoints=ends)
+    await tab.wait_for(f"viewStats.scale > {1.5 * before}")
+    await tab.evaluate("document.querySelector('#map').focus()")
+    await tab.call("Input.dispatchKeyEvent", type="keyDown", key="0")
+    await tab.wait_for(f"viewStats.scale < {1.2 * before}")
+
+
 def test_shows_the_demo_and_marks_a_robot_that_was_killed(tmp_path: Path) -> None:
     async def test() -> None:
         async with watched(tmp_path, "demo") as (tab, logs):
@@ -76,6 +89,7 @@ def test_shows_the_demo_and_marks_a_robot_that_was_killed(tmp_path: Path) -> Non
 
             await tab.resize(360, 740, is_dark=True)
             await tab.wait_for("document.documentElement.scrollWidth <= 360")
+            await fingers_and_keys_zoom(tab)
             assert tab.errors == []
             hosts = {request.split("/")[2] for request in tab.requests}
             assert len(hosts) == 1

@@ -9,7 +9,8 @@ const $ = (id) => document.getElementById(id);
 
 export const team = { name: "", landmarks: [], walls: [], cameras: null, help: [], at: 0, chosen: "" };
 export const robots = new Map(); // name -> {name, colour, trail, samples, ...what the server sent}
-globalThis.viewStats = { frames: 0, poses: 0, drawn: 0, firstPictureMs: null, longestGapMs: 0, skipped: 0, lastMs: null, drawMs: 0 };
+// For tests and benchmarks
+globalThis.viewStats = { frames: 0, poses: 0, drawn: 0, firstPictureMs: null, longestGapMs: 0, skipped: 0, lastMs: null, drawMs: 0, scale: 0 };
 const stats = globalThis.viewStats;
 
 let socket = null, retryMs = 500, camera = null, due = false, slowDue = 0;
@@ -113,6 +114,7 @@ function draw() {
   colour();
   map.draw();
   stats.drawn += 1;
+  stats.scale = map.scale;
   if (stats.firstPictureMs === null && [...robots.values()].some((r) => r.pose)) stats.firstPictureMs = performance.now();
   if (from >= slowDue) { // what nobody reads ten times a second
     const isTrue = [...robots.values()].some((r) => r.error_m != null);
