@@ -5,9 +5,9 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN = $(VENV)/bin
 
-.PHONY: setup demo test quick check unit test-long test-trial test-compiled test-docker test-bench chaos net \
-  fuzz compiled bench bench-batch bench-detection bench-latency bench-pictures bench-processes \
-  bench-scaling clean
+.PHONY: setup demo test quick check unit test-long test-trial test-compiled test-docker test-bench \
+  chaos net fuzz compiled bench bench-batch bench-detection bench-latency bench-pictures \
+  bench-processes bench-scaling bench-view screenshot clean
 
 setup: $(VENV)/ready
 
@@ -18,7 +18,7 @@ $(VENV)/ready: pyproject.toml
 	@touch $@
 
 demo: setup
-	$(BIN)/cpcbl-team up
+	$(BIN)/cpcbl-team up --view
 
 test: check unit
 
@@ -102,6 +102,13 @@ bench: test-bench
 bench-batch bench-detection bench-latency bench-pictures bench-processes bench-scaling: setup
 	@mkdir -p build
 	PYTHONPATH=$(BENCH_PATH) $(BIN)/python -m benchmarks.$(@:bench-%=%) $(ARGS)
+
+# The view with teams of 4, 50 and 200 robots in Chromium; and docs/view.png, a picture of the demo.
+bench-view: setup
+	PYTHONPATH=$(BENCH_PATH) $(BIN)/python -m benchmarks.view_load $(ARGS)
+
+screenshot: setup
+	PYTHONPATH=$(BENCH_PATH) $(BIN)/python -m benchmarks.view_picture $(ARGS)
 
 BENCH_PATH = .:agents:transport:launch:tests
 timed = $(BIN)/pytest -q --benchmark-json=build/$(2)_raw.json --benchmark-columns=median \

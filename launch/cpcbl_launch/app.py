@@ -13,7 +13,7 @@ from cpcbl_launch.commands.initializing import init
 from cpcbl_launch.commands.measuring import chaos, evaluate_mrclam, simulate
 from cpcbl_launch.commands.preparing import check, compose, keys
 from cpcbl_launch.commands.running import field, gateway, router, up
-from cpcbl_launch.commands.watching import look, observer, traffic
+from cpcbl_launch.commands.watching import look, observer, traffic, view
 from cpcbl_launch.run import robot
 
 HELP = {"help_option_names": ["-h", "--help"]}
@@ -54,7 +54,7 @@ def run_robot(
 
 
 for command in (
-    *(init, check, doctor, keys, up, status, traffic, look, observer),
+    *(init, check, doctor, keys, up, view, status, traffic, look, observer),
     *(router, gateway, field, compose, simulate, chaos),
 ):
     app.command()(command)

@@ -132,6 +132,11 @@ Connect = Annotated[
         help="Endpoint of the router, e.g. tcp/192.168.1.10:7447; default: the file's.",
     ),
 ]
+PageListen = Annotated[
+    str | None,
+    Option(help="ADDRESS:PORT of the page; default: 127.0.0.1:8700. 0.0.0.0:8700: for phones too."),
+]
+OpenPage = Annotated[bool, Option("--open", help="Open the page in a browser of this machine.")]
 ClockText = Annotated[str, Option("--clock", hidden=True)]
 Parent = Annotated[int | None, Option(hidden=True)]
 

@@ -2,7 +2,8 @@
 
 import json
 import shlex
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -25,6 +26,8 @@ from cpcbl_transport.topics import Role
 
 if TYPE_CHECKING:
     from cpcbl_launch.run.up import Launch, Run
+    from cpcbl_launch.views.web.address import Listen
+    from cpcbl_transport.bus import Bus
 
 
 def _require_speed(option: str, speed: float) -> None:
@@ -56,6 +59,7 @@ ProcessLogs = Annotated[
 InContainersOption = Annotated[
     bool, Option("--containers", help="Start one container per robot (needs Docker).")
 ]
+View = Annotated[bool, Option("--view", help="Serve a page that shows the field, live.")]
 
 
 def up(
@@ -77,11 +81,15 @@ def up(
     image: options.Image = None,
     base_image: options.BaseImage = BASE_IMAGE,
     as_json: options.AsJson = False,
+    view: View = False,
+    view_listen: options.PageListen = None,
+    open_page: options.OpenPage = False,
 ) -> None:
     """Start a team: the field, a process per robot, a live table, a report at the end."""
     from cpcbl_agents.process import StopSignal
     from cpcbl_launch.run.up import local_endpoint, run_team
     from cpcbl_launch.views.run import LiveTable, print_report
+    from cpcbl_launch.views.web.address import parse_listen
 
     budgets = Overrides(bytes_per_s, messages_per_minute, match_messages)
     run = _run_of(file, duration, data, budgets)
@@ -96,10 +104,30 @@ def up(
     watch = ["cpcbl-team", "traffic", str(file or "demo"), "--connect", endpoint]
     console.print(f"watch it: {shlex.join(watch)}", style="dim", highlight=False, soft_wrap=True)
     title = f"team {run.team.name}, {len(run.team.robots)} robots, {speed:g} x real time"
-    with LiveTable(title, run.team.robots, console, quiet=as_json) as table:
-        result = run_team(run, table.show, StopSignal(), launch)
+    listen = parse_listen("--view-listen", view_listen)
+    page = _page(run.team, listen, open_page, console) if view else nullcontext(nullcontext)
+    with page as attached, LiveTable(title, run.team.robots, console, quiet=as_json) as table:
+        result = run_team(run, table.show, StopSignal(), launch, attached)
     lost = dict(result.not_written) | options.write_report(report, result)
     options.print_result(result, as_json, lambda: print_report(result, console), lost)
+
+
+@contextmanager
+def _page(
+    team: Team, listen: "Listen", open_page: bool, console: Console
+) -> "Iterator[Callable[[Bus], AbstractContextManager[object]]]":
+    """Serves the page of a run; yields what attaches it to the run's bus."""
+    from cpcbl_launch.views.web.feed import Feed
+    from cpcbl_launch.views.web.server import Shown, serving
+    from cpcbl_launch.views.web.view import address_lines
+
+    feed = Feed(team.robots)
+    with serving(Shown(team.name, "the router of this run", team), feed, listen) as address:
+        for line in address_lines(team.name, address, listen):
+            console.print(line, highlight=False, soft_wrap=True)
+        if open_page:
+            typer.launch(address)
+        yield feed.attached
 
 
 def _run_of(

@@ -2,13 +2,14 @@
 
 import logging
 import math
+import time
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from rich.console import Console
-from typer import Argument, Exit, Option
+from typer import Argument, Exit, Option, launch
 
 from cpcbl_agents.clock import Clock
 from cpcbl_launch.checks import require_robots, require_team_opencv
@@ -135,6 +136,45 @@ def traffic(
     with TrafficView(where, console, quiet=as_json) as view:
         result = watch_team(request, view.show, StopSignal())
     options.print_result(result, as_json, lambda: console.print(traffic_view(result, where)))
+
+
+def view(
+    file: options.TeamOrDemo = None,
+    team_name: Annotated[
+        str | None, Option(help="The running team's name, where its file is not at hand.")
+    ] = None,
+    connect: options.Connect = None,
+    listen: options.PageListen = None,
+    open_page: options.OpenPage = False,
+    duration: Annotated[
+        float | None,
+        Option(callback=options.duration, help="Seconds to serve; default: until Ctrl-C."),
+    ] = None,
+) -> None:
+    """Show a running team's field in a browser, live; also on a phone (--listen 0.0.0.0:8700).
+
+    The page only watches. It needs nothing from the internet.
+    """
+    from cpcbl_agents.process import StopSignal
+    from cpcbl_launch.views.web.address import parse_listen
+    from cpcbl_launch.views.web.server import Shown
+    from cpcbl_launch.views.web.view import address_lines, view_team
+
+    logging.getLogger("cpcbl_transport").setLevel(logging.ERROR)  # the page says it
+    team = None if team_name is not None and file is None else find_team(file or Path("demo"))
+    endpoints = tuple(connect or (team.transport if team else TransportSettings()).connect)
+    link = Link(endpoints) if team is None else link_of(team, Identity(Role.OPERATOR), endpoints)
+    shown = Shown(team_name or (team.name if team else ""), ", ".join(endpoints), team)
+    console, where, stopped = Console(), parse_listen("--listen", listen), StopSignal()
+    until_s = math.inf if duration is None else time.monotonic() + duration
+
+    def show_address(address: str) -> None:
+        for line in address_lines(shown.name, address, where):
+            console.print(line, highlight=False, soft_wrap=True)
+        if open_page:
+            launch(address)
+
+    view_team(shown, link, where, lambda: stopped() or time.monotonic() > until_s, show_address)
 
 
 def look(

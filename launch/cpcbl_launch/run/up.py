@@ -43,6 +43,7 @@ SIMULATED_S = 30.0  # by default
 LEAST_S = 1.0
 
 Stop = Callable[[], bool]
+Watch = Callable[[Bus], AbstractContextManager[object]]  # entered before any process starts
 Show = Callable[[Recorder, Processes, float], None]  # of a run to a person, and its seconds so far
 
 
@@ -130,7 +131,13 @@ def local_endpoint(listen: str) -> str:
     return listen.replace("/0.0.0.0:", "/127.0.0.1:").replace("/[::]:", "/[::1]:")
 
 
-def run_team(run: Run, show: Show, stop: Stop, launch: Launch = OnThisMachine) -> Report:
+def run_team(
+    run: Run,
+    show: Show,
+    stop: Stop,
+    launch: Launch = OnThisMachine,
+    watch: Watch = nullcontext,
+) -> Report:
     """Runs a team until its time is over or `stop()`. Raises BusError without a router."""
     run = run._replace(team=with_listen_endpoint(run.team))
     with ExitStack() as stack:
@@ -143,6 +150,7 @@ def run_team(run: Run, show: Show, stop: Stop, launch: Launch = OnThisMachine) -
         bus = stack.enter_context(launcher.router())
         recording = stack.enter_context(_recording(run, bus))
         recorder = Recorder(bus)
+        stack.enter_context(watch(bus))
         clock = Clock.starting_in(launcher.lead_s, run.epoch_ns, run.speed)
         with launcher.processes(clock) as processes:
             end_ns = None if run.duration_s is None else int(run.duration_s * 1e9)

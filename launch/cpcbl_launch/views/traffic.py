@@ -3,7 +3,6 @@
 Only `status/*` is subscribed to. A subscription to fixes or beliefs would make robots send them.
 """
 
-import itertools
 import math
 import threading
 import time
@@ -143,13 +142,28 @@ def _live_flows(
 
 def _help_links(robots: Mapping[str, LiveRobot]) -> Iterator[HelpLink]:
     """Fixes as their senders count them; beliefs, which any may read, as each reader does."""
-    present = {name: robot for name, robot in robots.items() if not robot.away}
-    for (helper, giver), (helped, taker) in itertools.permutations(present.items(), 2):
-        for topic, flows, peer in (("fix", giver.sent, helped), ("belief", taker.heard, helper)):
-            for flow in flows:
-                if flow.at_present and (flow.topic, flow.peer) == (topic, peer):
-                    rate = flow.messages_per_s
-                    yield HelpLink(helper=helper, helped=helped, topic=topic, messages_per_s=rate)
+    order = {name: n for n, name in enumerate(r for r in robots if not robots[r].away)}
+    links = [
+        HelpLink(helper=helper, helped=helped, topic=flow.topic, messages_per_s=flow.messages_per_s)
+        for name in order
+        for topic, flows in (("fix", robots[name].sent), ("belief", robots[name].heard))
+        for flow in flows
+        for helper, helped in [(name, flow.peer) if topic == "fix" else (flow.peer, name)]
+        if flow.at_present and flow.topic == topic and helper != helped
+        if helper in order and helped in order
+    ]
+    yield from sorted(links, key=lambda h: (order[h.helper], order[h.helped], h.topic != "fix"))
+
+
+def with_arrival(arrivals: Sequence[Arrival], at_s: float, now: Status) -> list[Arrival]:
+    """A robot's arrivals and this one, without those of an earlier process, or too old."""
+    kept = [
+        earlier
+        for earlier in arrivals
+        if earlier.status.incarnation == now.incarnation
+        and 0 < now.stamp_ns - earlier.status.stamp_ns <= RATES_NS
+    ]
+    return [*kept, Arrival(at_s, now)]
 
 
 class StatusCollector:
@@ -163,13 +177,8 @@ class StatusCollector:
     def _receive(self, received: Received[Status]) -> None:
         now = received.message
         with self._lock:
-            kept = [  # of the same process, and not too old for its rates
-                earlier
-                for earlier in self._arrivals.get(now.robot, ())
-                if earlier.status.incarnation == now.incarnation
-                and 0 < now.stamp_ns - earlier.status.stamp_ns <= RATES_NS
-            ]
-            self._arrivals[now.robot] = [*kept, Arrival(self._now_s(), now)]
+            earlier = self._arrivals.get(now.robot, ())
+            self._arrivals[now.robot] = with_arrival(earlier, self._now_s(), now)
 
     @property
     def refused(self) -> Counter[str]:

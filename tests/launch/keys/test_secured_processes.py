@@ -47,6 +47,7 @@ def test_endpoints_go_with_the_security(text: str, said: str) -> None:
         ("up", "{file}", "--duration", "1"),
         ("robot", "{file}", "r1"),
         ("traffic", "{file}"),
+        ("view", "{file}"),
         ("router", "{file}"),
         ("field", "{file}"),
     ],

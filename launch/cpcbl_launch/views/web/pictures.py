@@ -1,0 +1,266 @@
+"""What the page draws, as plain data: pure functions of what was received, and of the time."""
+
+import math
+from collections.abc import Collection, Iterator, Mapping
+from typing import Any, Literal
+
+import msgspec
+
+from cpcbl_launch.reporting.metrics import degrees
+from cpcbl_launch.reporting.statuses import SpendingReport, TrustReport, distrust_text
+from cpcbl_launch.views.traffic import LiveFlow, Traffic
+from cpcbl_launch.views.web.feed import LatestMessages, Snapshot, position_sigma_m
+from cpcbl_team.config import Field, Team
+from cpcbl_team.inputs import SightingFault
+from cpcbl_transport.messages import Refusal, Truth
+
+SILENT_S = 2.0  # so long, and three of its pauses, a robot is silent before it is marked
+TOKEN_LOST_S = 0.5  # a robot that changes its tier may have no token for a moment
+SEEN_S = 1.0  # sightings older than this are not drawn
+MOST_SEEN, LONGEST_TEXT = 50, 200
+LEFT_S = 30.0  # a guest that left is shown for so long
+UNHEARD_S = 3.0  # so long after the connection the team should have been heard
+REFUSALS = frozenset([*Refusal, *SightingFault])
+
+State = Literal["ok", "problem", "lost", "gone", "waiting"]
+Triple = tuple[float, float, float]
+Arrow = tuple[str, str, str, int, float | None]
+"""Helper, helped, topic, tier of the helper, messages/s."""
+
+
+class RobotPicture(msgspec.Struct, frozen=True, omit_defaults=True):
+    """One robot as it is drawn. Metres and radians in the frame of the field; times are seconds
+    since the start of the view."""
+
+    state: State
+    why: str = ""  # in words, unless the state is ok
+    is_guest: bool = False
+    at_s: float | None = None  # when its latest pose arrived
+    pose: Triple | None = None  # x, y, heading
+    ellipse: Triple | None = None  # semi-axes of one sigma, and the direction of the first
+    sigma_m: float | None = None
+    error_m: float | None = None
+    tier: int | None = None
+    truth: Triple | None = None
+    sees: tuple[tuple[str, float | None, float | None], ...] = ()  # what, range, bearing
+
+
+class Frame(msgspec.Struct, frozen=True, tag="frame"):
+    """What has changed since the frame before that the same page was sent."""
+
+    number: int
+    at_s: float
+    notice: str
+    robots: dict[str, RobotPicture]
+    removed: list[str]
+    help: tuple[Arrow, ...] | None  # all of it at present; None while it is as before
+    skipped: int  # cycles for which this page was too slow, since it was opened
+
+
+class TeamPicture(msgspec.Struct, frozen=True, tag="team"):
+    """What a page is told first."""
+
+    team: str
+    landmarks: list[tuple[str, float, float]]
+    walls: list[tuple[str, float, float, float, float]]
+    cameras: tuple[str, ...] | None  # robots with one; None where the team file is not at hand
+    history: dict[str, list[tuple[float | None, ...]]]  # rows of `feed.Sample`
+
+
+class InputPicture(msgspec.Struct, frozen=True):
+    """The health of one of a robot's inputs."""
+
+    input: str
+    rate_hz: float
+    age_s: float | None  # of the newest stamp, when the robot reported it
+    taken: int
+    refused: dict[str, int]
+    offset_s: float
+
+
+class RobotDetail(msgspec.Struct, frozen=True, tag="detail"):
+    """All that a robot says of itself. Counts are those of its present process."""
+
+    robot: str
+    process: str = ""
+    heading_sigma_deg: float | None = None
+    problems: tuple[str, ...] = ()
+    inputs: tuple[InputPicture, ...] = ()
+    refused: dict[str, int] = {}  # messages and sightings, by reason
+    counts: dict[str, int] = {}
+    sent: tuple[LiveFlow, ...] = ()
+    heard: tuple[LiveFlow, ...] = ()
+    spending: tuple[SpendingReport, ...] = ()
+    trust: tuple[TrustReport, ...] = ()
+
+
+def team_picture(team: Team | None, name: str, history: Mapping[str, Any]) -> TeamPicture:
+    """`team`: None where its file is not at hand."""
+    field = Field() if team is None else team.map
+    rows = {
+        robot: [tuple(_rounded(value) for value in sample) for sample in samples]
+        for robot, samples in history.items()
+    }
+    return TeamPicture(
+        team=name,
+        landmarks=[(mark, p.x_m, p.y_m) for mark, p in field.landmarks.items()],
+        walls=[(wall, *w.from_m, *w.to_m) for wall, w in field.walls.items()],
+        cameras=None if team is None else team.cameras,
+        history=rows,
+    )
+
+
+def robot_pictures(
+    now: Snapshot, named: Collection[str], now_s: float, began_s: float
+) -> dict[str, RobotPicture]:
+    """All robots; `named` are those of the team file, all others are guests."""
+    return {
+        name: picture
+        for name, latest in now.robots.items()
+        if (
+            picture := _picture(
+                latest, now.truths.get(name), bool(named) and name not in named, now_s, began_s
+            )
+        )
+    }
+
+
+def _picture(
+    latest: LatestMessages, truth: Truth | None, is_guest: bool, now_s: float, began_s: float
+) -> RobotPicture | None:
+    """None for a guest that left."""
+    state, why = state_of(latest, now_s)
+    since_s = now_s - max(latest.latest_s, latest.token_lost_s or 0.0)
+    if is_guest and state in ("gone", "waiting") and since_s > LEFT_S:
+        return None
+    status, track = latest.status, latest.track
+    sees = latest.sightings.sightings[:MOST_SEEN] if latest.sightings is not None else ()
+    is_fresh = state != "gone" and now_s - latest.sightings_s <= SEEN_S
+    seen = tuple((s.id, _rounded(s.range_m), _rounded(s.bearing_rad)) for s in sees)
+    there = None if truth is None else (truth.x_m, truth.y_m, truth.heading_rad)
+    common = RobotPicture(
+        state=state,
+        why=why[:LONGEST_TEXT],
+        is_guest=is_guest,
+        sigma_m=None if status is None else _rounded(status.position_sigma_m, 4),
+        tier=None if status is None else status.tier,
+        truth=None if there is None else _triple(*there),
+        sees=seen if is_fresh else (),
+    )
+    if track is None:
+        return common
+    ellipse = None if track.covariance is None else ellipse_of(*track.covariance[:3])
+    return msgspec.structs.replace(
+        common,
+        at_s=_rounded(latest.track_s - began_s),
+        pose=_triple(track.x_m, track.y_m, track.heading_rad),
+        ellipse=None if ellipse is None else _triple(*ellipse),
+        sigma_m=_rounded(position_sigma_m(track), 4) or common.sigma_m,
+        error_m=_rounded(latest.error_m, 4),
+        tier=track.tier,
+    )
+
+
+def state_of(latest: LatestMessages, now_s: float) -> tuple[State, str]:
+    """Whether all is well with a robot, and why not: the worst that is known, in words."""
+    if not latest.is_present:
+        return "waiting", "nothing was received from it yet"
+    silent_s = now_s - latest.latest_s
+    if latest.token_lost_s is not None and now_s - latest.token_lost_s > TOKEN_LOST_S:
+        return "gone", f"its process or its link ended {now_s - latest.token_lost_s:.0f} s ago"
+    if latest.latest_s and silent_s > max(SILENT_S, 3.0 * latest.pause_s):
+        return "gone", f"silent for {silent_s:.0f} s"
+    track, status = latest.track, latest.status
+    newest = status if track is None or (status and status.stamp_ns > track.stamp_ns) else track
+    if newest is None:
+        return "waiting", "its process runs, but has sent no pose yet"
+    if newest.lost:
+        return "lost", "; ".join([newest.lost, *getattr(status, "problems", ())[:1]])
+    problems = list(_problems(latest))
+    return ("problem", problems[0]) if problems else ("ok", "")
+
+
+def _problems(latest: LatestMessages) -> Iterator[str]:
+    if (status := latest.status) is not None:
+        yield from getattr(status, "problems", ())
+        if text := distrust_text(status.trust):
+            yield text
+        if status.counts.get("miscalibrated"):
+            yield "its sensors or its odometry are miscalibrated"
+
+
+def ellipse_of(xx: float, xy: float, yy: float) -> Triple:
+    """Semi-axes of one sigma (m) of a covariance, and the direction of the longer one (rad)."""
+    mean, half = 0.5 * (xx + yy), math.hypot(0.5 * (xx - yy), xy)
+    angle = 0.5 * math.atan2(2.0 * xy, xx - yy)
+    return math.sqrt(max(0.0, mean + half)), math.sqrt(max(0.0, mean - half)), angle
+
+
+def notice_text(now: Snapshot, team: str, where: str, now_s: float) -> str:
+    """What is wrong with the connection or with the whole team, and what to do; empty otherwise."""
+    if now.connected_s is None:
+        return f"{now.problem}. The page goes on by itself as soon as there is a router."
+    is_silent = not any(latest.is_present for latest in now.robots.values())
+    if is_silent and now_s - now.connected_s > UNHEARD_S:
+        return (
+            f"No robot of team `{team}` is heard at {where}. Compare the team's name with that in"
+            " the robots' team file, and their --connect with this address."
+        )
+    return ""
+
+
+def help_arrows(traffic: Traffic, pictures: Mapping[str, RobotPicture]) -> tuple[Arrow, ...]:
+    """Who helps whom: only between robots that are there."""
+    present = {name for name, p in pictures.items() if p.state not in ("gone", "waiting")}
+    return tuple(
+        (h.helper, h.helped, h.topic, traffic.robots[h.helper].tier, _rounded(h.messages_per_s, 1))
+        for h in traffic.help
+        if h.helper in present and h.helped in present
+    )
+
+
+def changed(
+    before: Mapping[str, RobotPicture], now: Mapping[str, RobotPicture]
+) -> tuple[dict[str, RobotPicture], list[str]]:
+    """The robots that differ from those before, and the names of those that are no longer there."""
+    differing = {name: picture for name, picture in now.items() if before.get(name) != picture}
+    return differing, [name for name in before if name not in now]
+
+
+def robot_detail(name: str, latest: LatestMessages, traffic: Traffic) -> RobotDetail:
+    """What the page shows of the robot that a person has chosen."""
+    status, live = latest.status, traffic.robots.get(name)
+    if status is None or live is None:
+        return RobotDetail(name)
+    inputs = tuple(
+        InputPicture(
+            health.input,
+            round(health.rate_hz, 1),
+            _rounded((status.stamp_ns - health.latest_ns) * 1e-9) if health.latest_ns else None,
+            health.taken,
+            health.refused,
+            round(health.offset_s, 3),
+        )
+        for health in getattr(status, "inputs", ())
+    )
+    return RobotDetail(
+        robot=name,
+        process=status.incarnation,
+        heading_sigma_deg=_rounded(degrees(status.heading_sigma_rad), 2),
+        problems=tuple(_problems(latest)),
+        inputs=inputs,
+        refused={reason: n for reason, n in status.counts.items() if reason in REFUSALS and n},
+        counts={what: n for what, n in status.counts.items() if what not in REFUSALS},
+        sent=live.sent,
+        heard=live.heard,
+        spending=live.spending,
+        trust=live.trust,
+    )
+
+
+def _rounded(value: float | None, digits: int = 3) -> float | None:
+    return None if value is None or not math.isfinite(value) else round(value, digits)
+
+
+def _triple(a: float, b: float, c: float) -> Triple:
+    return round(a, 4), round(b, 4), round(c, 4)

@@ -1,0 +1,116 @@
+"""The page in a headless Chromium, beside teams of real processes."""
+
+import asyncio
+import os
+import re
+import signal
+import subprocess
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from pathlib import Path
+
+import pytest
+from support.chromium import PROGRAM as CHROMIUM
+from support.chromium import Tab, opened
+from support.processes import pids_of
+
+from cpcbl_launch.run.processes import PROGRAM
+from cpcbl_launch.team_file import builtin_path
+
+pytestmark = [
+    pytest.mark.trial,
+    pytest.mark.timeout(300),
+    pytest.mark.skipif(not CHROMIUM, reason="needs Chromium: apt-get install chromium"),
+]
+ROBOTS = ["navigator", "observer", "patrol", "scout"]
+STATES = "Object.fromEntries([...document.querySelectorAll('tr[data-robot]')]"
+STATES += ".map((row) => [row.dataset.robot, row.dataset.state]))"
+
+
+@asynccontextmanager
+async def watched(folder: Path, *arguments: str) -> AsyncIterator[tuple[Tab, Path]]:
+    """The page of a team that `up --view` runs, and the folder of the run's logs."""
+    logs = folder / "logs"
+    options = ["--view", "--view-listen", "127.0.0.1:0", "--duration", "200", "--logs", str(logs)]
+    with subprocess.Popen(
+        [*PROGRAM, "up", *arguments, *options], stdout=subprocess.PIPE, text=True
+    ) as up:
+        try:
+            assert up.stdout is not None
+            address = ""
+            while not address:
+                line = await asyncio.to_thread(up.stdout.readline)
+                assert line, "ended before it printed an address"
+                address = "".join(re.findall(r"^view of team \w+: (http://\S+)", line))
+            async with opened(address, folder) as tab:
+                yield tab, logs
+        finally:
+            up.send_signal(signal.SIGINT)
+            await asyncio.to_thread(up.communicate, None, 60.0)
+    assert up.returncode == 0
+
+
+async def fingers_and_keys_zoom(tab: Tab) -> None:
+    """Two fingers that part, then `0`, which shows the whole field again."""
+    await tab.call("Emulation.setTouchEmulationEnabled", enabled=True, maxTouchPoints=2)
+    before = await tab.evaluate("viewStats.scale")
+    for kind, apart in (("touchStart", 20), ("touchMove", 40), ("touchMove", 80), ("touchEnd", 0)):
+        ends = [{"x": 170 + apart * s, "y": 240, "id": s + 1} for s in (-1, 1)] if apart else []
+        await tab.call("Input.dispatchTouchEvent", type=kind, touchPoints=ends)
+    await tab.wait_for(f"viewStats.scale > {1.5 * before}")
+    await tab.evaluate("document.querySelector('#map').focus()")
+    await tab.call("Input.dispatchKeyEvent", type="keyDown", key="0")
+    await tab.wait_for(f"viewStats.scale < {1.2 * before}")
+
+
+def test_shows_the_demo_and_marks_a_robot_that_was_killed(tmp_path: Path) -> None:
+    async def test() -> None:
+        async with watched(tmp_path, "demo") as (tab, logs):
+            await tab.wait_for(f"Object.values({STATES}).filter((s) => s === 'ok').length === 4")
+            assert sorted(await tab.evaluate(STATES)) == ROBOTS
+            await tab.wait_for(
+                "document.querySelector('tr[data-robot=scout] .truth').textContent > '0'"
+            )
+            await tab.evaluate("document.querySelector('tr[data-robot=scout] button').click()")
+            await tab.wait_for("document.querySelector('#facts').textContent.includes('odometry')")
+            assert (
+                await tab.evaluate("document.querySelector('#detail-name').textContent") == "scout"
+            )
+            await tab.save_screenshot(tmp_path / "demo.png")
+
+            (pid,) = pids_of(["robot navigator", str(logs)])
+            os.kill(pid, signal.SIGSTOP)  # it hangs, and its link stays open
+            await tab.wait_for(f"({STATES}).navigator === 'gone'")
+            os.kill(pid, signal.SIGCONT)
+            await tab.wait_for(f"['ok', 'lost'].includes(({STATES}).navigator)")
+            os.kill(pid, signal.SIGKILL)
+            await tab.wait_for(f"({STATES}).navigator === 'gone'")
+            await tab.wait_for(f"({STATES}).navigator === 'ok'", 60.0)  # it was started again
+
+            await tab.resize(360, 740, is_dark=True)
+            await tab.wait_for("document.documentElement.scrollWidth <= 360")
+            await fingers_and_keys_zoom(tab)
+            assert tab.errors == []
+            hosts = {request.split("/")[2] for request in tab.requests}
+            assert len(hosts) == 1
+            assert hosts.pop().startswith("127.0.0.1:")
+        assert (tmp_path / "demo.png").stat().st_size > 20_000
+
+    asyncio.run(test())
+
+
+def test_shows_what_a_camera_sees_and_only_while_it_is_open(tmp_path: Path) -> None:
+    team = tmp_path / "eyes.toml"
+    team.write_text(builtin_path("eyes").read_text())
+
+    async def test() -> None:
+        async with watched(tmp_path, str(team)) as (tab, _):
+            await tab.wait_for(f"Object.values({STATES}).includes('ok')", 90.0)
+            await tab.evaluate("document.querySelector('tr[data-robot] button').click()")
+            await tab.evaluate("document.querySelector('#camera').click()")
+            await tab.wait_for("document.querySelector('#picture img').naturalWidth > 100", 60.0)
+            await tab.evaluate("document.querySelector('#camera').click()")
+            await tab.wait_for("document.querySelector('#picture').hidden")
+            assert tab.errors == []
+
+    asyncio.run(test())
