@@ -243,6 +243,15 @@ def decode_tagged(payload: bytes, largest: int = LARGEST_PAYLOAD) -> Tagged | Re
         return Refusal.GARBAGE
 
 
+def decode_error(payload: bytes) -> str:
+    """What is wrong with a payload that `decode_tagged` calls garbage, in one line."""
+    try:
+        _decoder.decode(memoryview(payload)[1:])
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+        return f"payloads cannot be decoded: {str(error)[:80]}"
+    return ""
+
+
 def header_refusal(payload: bytes, largest: int = LARGEST_PAYLOAD) -> Refusal | None:
     """Why a payload is refused by its size or its first byte, or None."""
     if not payload:
