@@ -1,8 +1,9 @@
 """What a driver probably got wrong, judged by messages that it sent. Pure functions, no clock."""
 
 import math
+from bisect import bisect_right
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from itertools import combinations, pairwise
+from itertools import accumulate, combinations, pairwise
 from statistics import median
 from typing import NamedTuple
 
@@ -16,7 +17,7 @@ MOST_SPEED_M_S = 30.0
 MOST_TURN_RATE_RAD_S = 15.0
 RANGE_FACTOR = 5.0  # beyond so many times what the sensor sees, a range has another unit
 LEAST_AREA = 0.1  # of a triangle, as a share of the square of its longest side
-LEAST_TURN_RAD = math.radians(3.0)
+LEAST_TURN_RAD = math.radians(5.0)
 LEAST_CASES = 5
 
 _UNITS = (("seconds", 10**9), ("milliseconds", 10**6), ("microseconds", 10**3))
@@ -62,7 +63,7 @@ def odometry_cause(pieces: Sequence[Odometry]) -> str:
         what = "distances since the start, not of each piece" if _grows(pieces) else "millimetres"
         return f"a speed of {speed_m_s:.0f} m/s: distances look like {what}"
     if turning[len(turning) * 3 // 4] > MOST_TURN_RATE_RAD_S:
-        what = "headings, not turns of each piece" if _turns_too_far(pieces) else "degrees"
+        what = "headings, not turns of each piece" if _turns_on(pieces) else "degrees"
         return f"turns of {turning[-1]:.0f} rad/s: they look like {what}"
     return ""
 
@@ -73,11 +74,11 @@ def _grows(pieces: Sequence[Odometry]) -> bool:
     return sum(step > 0.0 for step in steps) > 0.9 * len(steps)
 
 
-def _turns_too_far(pieces: Sequence[Odometry]) -> bool:
-    """Whether turns hardly differ from piece to piece, and are within a whole turn."""
-    most = max(abs(p.turn_rad) for p in pieces)
-    steps = [abs(wrap_angle(b.turn_rad - a.turn_rad)) for a, b in pairwise(pieces)]
-    return most <= 2.0 * math.pi and max(steps) < 0.2 * most
+def _turns_on(pieces: Sequence[Odometry]) -> bool:
+    """Whether nearly every turn is the one before and a little more, as headings are."""
+    steps = [wrap_angle(b.turn_rad - a.turn_rad) for a, b in pairwise(pieces)]
+    grew, shrank = (sum(sign * step > 1e-9 for step in steps) for sign in (1, -1))
+    return max(grew, shrank) > 0.9 * len(steps)
 
 
 def range_cause(frames: Iterable[Sightings], max_range_m: float, field_m: float) -> str:
@@ -126,9 +127,7 @@ def sign_cause(
     mirrored. A landmark that stands still moves in the robot's frame against the robot's turn,
     unless one of the two has the wrong sign. Neither needs a pose.
     """
-    order = _order_votes(frames, landmarks)
-    if order.is_right and not pieces:
-        return ""
+    order = _order_votes(frames[-10:], landmarks)
     turns = _turn_votes(frames, pieces, landmarks)
     if order.is_wrong:
         both = " and turns" if turns.is_right else ""
@@ -181,17 +180,24 @@ def _seen_again(
     frames: Sequence[Sightings], pieces: Sequence[Odometry], landmarks: Mapping[str, Landmark]
 ) -> Iterator[tuple[Sighting, float, float, float]]:
     """A landmark's sighting, its later bearing, and the distance and turn between the two."""
+    if not pieces:
+        return
+    stamps = [p.stamp_ns for p in pieces]
+    moved_m = [0.0, *accumulate(p.distance_m for p in pieces)]
+    turned = [0.0, *accumulate(p.turn_rad for p in pieces)]
     before: dict[str, tuple[int, Sighting]] = {}
     for frame in frames:
+        if not pieces[0].from_ns <= frame.stamp_ns <= stamps[-1]:
+            continue
+        after = bisect_right(stamps, frame.stamp_ns)  # pieces that had ended by then
         for s in frame.sightings:
             if s.id not in landmarks or s.bearing_rad is None:
                 continue
-            since_ns, first = before.setdefault(s.id, (frame.stamp_ns, s))
-            between = [p for p in pieces if since_ns <= p.from_ns and p.stamp_ns <= frame.stamp_ns]
-            turn = sum(p.turn_rad for p in between)
+            since, first = before.setdefault(s.id, (after, s))
+            turn = turned[after] - turned[since]
             if abs(turn) > LEAST_TURN_RAD:
-                yield first, s.bearing_rad, sum(p.distance_m for p in between), turn
-                before[s.id] = frame.stamp_ns, s
+                yield first, s.bearing_rad, moved_m[after] - moved_m[since], turn
+                before[s.id] = after, s
 
 
 def _bearing_after(s: Sighting, distance_m: float, turn: float) -> float:

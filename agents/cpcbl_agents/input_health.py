@@ -61,8 +61,6 @@ class _Totals(NamedTuple):
     taken: dict[str, int]
     refused: dict[str, Counter[str]]
     messages: dict[str, int]
-    accepted: int
-    gated: int
 
 
 class InputMonitor:
@@ -108,8 +106,6 @@ class InputMonitor:
         camera = robot.sensing.counts
         facts = self._facts._replace(
             windows={name: self._window(name, totals, before) for name in shown},
-            accepted=totals.accepted - before.accepted,
-            gated=totals.gated - before.gated,
             namesake=self._namesake_for >= NAMESAKE_JUDGEMENTS,
             camera_lost=camera["camera_lost"] > camera["camera_back"],
         )
@@ -131,8 +127,7 @@ class InputMonitor:
             later = refused[name].total() - entry.refused.total()
             taken[name] = max(0, entry.decoded - later)
         messages = {name: entry.messages for name, entry in self.inputs.items()}
-        accepted, gated = state.get("accepted", 0), state.get("gated", 0)
-        return _Totals(now_ns, taken, refused, messages, accepted, gated)
+        return _Totals(now_ns, taken, refused, messages)
 
     def _window(self, name: str, totals: _Totals, before: _Totals) -> InputWindow:
         entry, since_ns = self.inputs[name], before.now_ns

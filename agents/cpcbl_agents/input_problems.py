@@ -74,8 +74,6 @@ class Facts(NamedTuple):
     max_range_m: float = 8.0
     field_m: float = 0.0  # the diagonal of what is on the map
     pace: float = 1.0  # robot time over real time, at least 1
-    accepted: int = 0  # observations in the last seconds
-    gated: int = 0
     namesake: bool = False  # another process has this robot's name
     camera_lost: bool = False
 
@@ -187,7 +185,5 @@ def _implausible(facts: Facts) -> Iterator[str]:
         yield "odometry: pieces overlap; two drivers, or from_ns is not where the last one ended"
     if cause := causes.range_cause(frames[-10:], facts.max_range_m, facts.field_m):
         yield f"sightings: {cause}"
-    rejected = facts.gated > max(causes.LEAST_CASES, facts.accepted)
-    turning = pieces if rejected else []
-    if cause := causes.sign_cause(frames if rejected else frames[-10:], turning, facts.landmarks):
+    if cause := causes.sign_cause(frames, pieces, facts.landmarks):
         yield f"sightings: {cause}"
