@@ -12,7 +12,7 @@ from typing import NamedTuple, TypeVar
 from cpcbl_agents.input_problems import Facts, InputWindow, input_problems
 from cpcbl_agents.robot import Robot
 from cpcbl_team.config import Team
-from cpcbl_team.inputs import SightingFault, Sightings
+from cpcbl_team.inputs import Odometry, SightingFault, Sightings
 from cpcbl_transport import topics
 from cpcbl_transport.messages import LARGEST_NUMBER, Frame, InputHealth, SensorInput
 
@@ -20,6 +20,7 @@ WINDOW = 10  # judgements, one a second: shares are those of the last so many
 SETTLED_NS = 2_000_000_000  # what was on its way when the robot started is too late
 NAMESAKE_JUDGEMENTS = 3  # the token of a process that died may stay for its lease
 T = TypeVar("T")
+MOVED_M, TURNED_RAD = 0.1, 0.15  # beyond these a robot is no longer where it started
 NAMES = tuple(topic.key.rpartition("/")[2] for topic in topics.INPUTS)
 
 
@@ -29,6 +30,7 @@ class Input:
     def __init__(self, name: str, start_ns: int, latest: int) -> None:
         self.name, self.arrived_ns, self.messages = name, start_ns, 0
         self.decoded = 0  # sightings are counted one by one
+        self.distance_m = self.turn_rad = 0.0
         self.latest_ns = 0
         self.refused: Counter[str] = Counter()
         self.recent: deque[tuple[int, SensorInput]] = deque(maxlen=latest)
@@ -42,7 +44,10 @@ class Input:
             self.decoded += len(message.sightings) or 1
         else:
             self.decoded += 1
-            if isinstance(message, Frame):
+            if isinstance(message, Odometry):
+                self.distance_m += message.distance_m
+                self.turn_rad += message.turn_rad
+            elif isinstance(message, Frame):
                 message = Frame(message.stamp_ns, b"")
         self.recent.append((now_ns, message))
 
@@ -73,6 +78,8 @@ class InputMonitor:
         self.by_key = {f"in/{robot}/{name}": entry for name, entry in self.inputs.items()}
         self._start_ns, self._history = start_ns, deque[_Totals](maxlen=WINDOW + 1)
         self._namesake_for = 0
+        self.has_moved = False
+        """Whether odometry said so, at a judgement."""
         detects = settings.sensing == "camera"
         self._of_sightings = "frame" if detects else "sightings"
         by_message = {
@@ -97,6 +104,8 @@ class InputMonitor:
     ) -> tuple[tuple[InputHealth, ...], tuple[str, ...]]:
         """The health of each input that anything came on or is expected on, and the problems. To
         be called once a second. `namesake`: whether another process has this robot's name."""
+        odometry = self.inputs["odometry"]
+        self.has_moved |= abs(odometry.distance_m) > MOVED_M or abs(odometry.turn_rad) > TURNED_RAD
         totals = self._totals(robot, now_ns)
         if now_ns - self._start_ns >= SETTLED_NS:
             self._history.append(totals)

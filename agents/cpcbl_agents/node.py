@@ -96,6 +96,11 @@ class Node:
         ]
         self._own_name = bus.watch_liveliness(topics.ALIVE.at(robot=robot.name), self._on_own_name)
 
+    @property
+    def has_moved(self) -> bool:
+        """Whether the robot is no longer where it started, by its odometry."""
+        return self._health.has_moved
+
     # On a thread of the bus ---------------------------------------------------------------------
 
     def _on_message(self, key: str, payload: bytes) -> None:

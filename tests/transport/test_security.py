@@ -211,6 +211,7 @@ def test_permitted_subscriptions_follow_the_table_too() -> None:
     assert set(subscribe_keys(me)) == {
         *("alive/*/*/*", "belief/*/*", "fix/me/*/*", "status/me", "track/me", "look/me"),
         *("in/me/odometry", "in/me/sightings", "in/me/position", "in/me/frame"),
+        "ran/me/*/*",
     }
     assert subscribe_keys(Identity(Role.OBSERVER, "me")) == subscribe_keys(me)
     assert subscribe_keys(FIELD) == ["field/drive/*", "field/join/*"]

@@ -27,6 +27,9 @@ from cpcbl_transport.zenoh_config import client_config
 
 log = logging.getLogger(__name__)
 
+TOKENS_S = 5.0  # for the router's answer
+WAITING_S = 10.0  # after so long it is said again that no router answers
+
 
 class BusError(CpcblError):
     """The bus could not be opened."""
@@ -41,14 +44,16 @@ def open_bus(
     """A client's session below the team's namespace; waits for a router until `give_up()`. With
     credentials every link is mutual TLS. Raises BusError when it gave up."""
     config = client_config(connect, credentials)
-    reason = "stopped before a router answered"
+    reason, said_s = "stopped before a router answered", -WAITING_S
     while not give_up():
         try:
             return ZenohBus(_open(config, namespace(team)))
         except zenoh.ZError as error:
             reason = _tls_reason(connect, credentials) or _one_line(error)
-            shown = f": {reason}" if credentials else ""
-            log.info("no router at %s yet%s", ", ".join(connect), shown)
+            if time.monotonic() - said_s >= WAITING_S:
+                said_s = time.monotonic()
+                shown = f": {reason}" if credentials else ""
+                log.warning("waiting for a router at %s%s", ", ".join(connect), shown)
             time.sleep(0.2)
     raise BusError(f"no router at {', '.join(connect)}: {reason}")
 
@@ -184,6 +189,11 @@ class ZenohBus(Bus):
         liveliness = self._session.liveliness()
         subscriber = liveliness.declare_subscriber(keys, on_sample, history=True)
         return _Declared(self, subscriber.undeclare)
+
+    def tokens(self, keys: str) -> list[str]:
+        """The liveliness tokens that are there now."""
+        replies = self._session.liveliness().get(keys, timeout=TOKENS_S)
+        return [str(reply.ok.key_expr) for reply in replies if reply.ok is not None]
 
     def neighbours(self) -> dict[str, str]:
         """Who is linked to this session at present: its id -> what it is and where."""

@@ -5,6 +5,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+from cpcbl_agents.earlier_processes import ALL_TEAMS, repeat_tokens
 from cpcbl_team.config import Team
 from cpcbl_transport.security import Identity, access_control, link_of
 from cpcbl_transport.topics import Role
@@ -34,6 +35,7 @@ def team_router(
 def run_router(config: Mapping[str, Any], title: str, stop: Callable[[], bool]) -> None:
     """Routes until `stop()`; logs where it listens, and who comes and goes. Raises BusError."""
     with open_router(config) as bus:
+        repeat_tokens(bus, ALL_TEAMS)
         log.info("%s listens at %s", title, ", ".join(listening_at(config)))
         known: dict[str, str] = {}
         while not stop():

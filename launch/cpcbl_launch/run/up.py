@@ -15,6 +15,7 @@ import msgspec
 import numpy as np
 
 from cpcbl_agents.clock import Clock
+from cpcbl_agents.earlier_processes import repeat_tokens
 from cpcbl_launch.checks import require_duration
 from cpcbl_launch.reporting.files import write_or_reason
 from cpcbl_launch.reporting.metrics import Floats
@@ -88,7 +89,10 @@ class OnThisMachine:
     def router(self) -> AbstractContextManager[Bus]:
         team, listen = self._run.team, self._run.team.transport.listen
         require_keys(team, listen, self._here)
-        return open_router(team_router(team, listen, (), self._run.speed), namespace(team.name))
+        config = team_router(team, listen, (), self._run.speed)
+        bus = open_router(config, namespace(team.name))
+        repeat_tokens(bus)
+        return bus
 
     def processes(self, clock: Clock) -> AbstractContextManager[Processes]:
         team, path = self._run.team, self._folder / "team.json"
