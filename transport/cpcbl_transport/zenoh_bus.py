@@ -68,6 +68,15 @@ def _tls_reason(connect: Sequence[str], credentials: Credentials | None) -> str:
     return "; ".join(dict.fromkeys(filter(None, reasons.values())))
 
 
+def open_onlooker(endpoint: str) -> "ZenohBus":
+    """A client's session without a namespace, to ask for all `declarations`. Raises
+    BusError."""
+    try:
+        return ZenohBus(_open(client_config([endpoint])))
+    except zenoh.ZError as error:
+        raise BusError(f"no router at {endpoint}: {_one_line(error)}") from error
+
+
 def open_router(config: Mapping[str, Any], space: str | None = None) -> "ZenohBus":
     """A session that is a router for all teams, as its configuration says. Without a namespace its
     own keys are whole ones. Raises BusError when it cannot listen there."""
@@ -194,6 +203,18 @@ class ZenohBus(Bus):
         """The liveliness tokens that are there now."""
         replies = self._session.liveliness().get(keys, timeout=TOKENS_S)
         return [str(reply.ok.key_expr) for reply in replies if reply.ok is not None]
+
+    def declarations(self, kind: str) -> dict[str, tuple[str, ...]]:
+        """What the clients of all routers have declared of a kind (publisher, subscriber, token):
+        whole keys, and the ids of the clients. For a session without a namespace."""
+        found: dict[str, tuple[str, ...]] = {}
+        head = re.compile(rf"@/[^/]*/router/{kind}/")
+        for reply in self._session.get(f"@/*/router/{kind}/**", timeout=TOKENS_S):
+            if reply.ok is not None:
+                key = head.sub("", str(reply.ok.key_expr))
+                sources = json.loads(reply.ok.payload.to_bytes())
+                found[key] = (*found.get(key, ()), *sources.get("clients", ()))
+        return found
 
     def neighbours(self) -> dict[str, str]:
         """Who is linked to this session at present: its id -> what it is and where."""

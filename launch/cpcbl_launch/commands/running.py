@@ -200,6 +200,7 @@ def router(
     from cpcbl_launch.run.router import run_router, team_router
     from cpcbl_transport.zenoh_bus import read_router_config
 
+    team = None
     if config is not None and file is None:
         if listen or connect:
             raise InputError(
@@ -216,4 +217,4 @@ def router(
         typer.echo(f"// {title}\n// zenohd -c FILE, or cpcbl-team router --config FILE")
         typer.echo(json.dumps(settings, indent=2))
     else:
-        run_router(settings, title, StopSignal(parent))
+        run_router(settings, title, StopSignal(parent), team)
