@@ -17,7 +17,7 @@ MOST_SPEED_M_S = 30.0
 MOST_TURN_RATE_RAD_S = 15.0
 RANGE_FACTOR = 5.0  # beyond so many times what the sensor sees, a range has another unit
 LEAST_AREA = 0.1  # of a triangle, as a share of the square of its longest side
-LEAST_TURN_RAD = math.radians(5.0)
+LEAST_TURN_RAD, LEAST_DIFFERENCE_RAD = math.radians(10.0), math.radians(5.0)
 LEAST_CASES = 5
 
 _UNITS = (("seconds", 10**9), ("milliseconds", 10**6), ("microseconds", 10**3))
@@ -121,14 +121,17 @@ class Votes(NamedTuple):
 def sign_cause(
     frames: Sequence[Sightings], pieces: Sequence[Odometry], landmarks: Mapping[str, Landmark]
 ) -> str:
-    """Which of bearings and turns has the wrong sign; empty if none is known to have.
+    """Which of bearings and turns has the wrong sign, or turns the wrong unit; empty if none is
+    known to have.
 
     Three landmarks of one frame stand in the same order around as on the map, unless bearings are
     mirrored. A landmark that stands still moves in the robot's frame against the robot's turn,
     unless one of the two has the wrong sign. Neither needs a pose.
     """
     order = _order_votes(frames[-10:], landmarks)
-    turns = _turn_votes(frames, pieces, landmarks)
+    if _turn_votes(frames, pieces, landmarks, math.radians(1.0)).is_wrong:
+        return "turns look like degrees"
+    turns = _turn_votes(frames, pieces, landmarks, -1.0)
     if order.is_wrong:
         both = " and turns" if turns.is_right else ""
         return f"bearings{both} look mirrored; left is positive"
@@ -166,12 +169,17 @@ def _area(corners: Sequence[tuple[float, float]]) -> float:
 
 
 def _turn_votes(
-    frames: Sequence[Sightings], pieces: Sequence[Odometry], landmarks: Mapping[str, Landmark]
+    frames: Sequence[Sightings],
+    pieces: Sequence[Odometry],
+    landmarks: Mapping[str, Landmark],
+    factor: float,
 ) -> Votes:
+    """For turns as they are, against turns times `factor`."""
     votes = []
     for s, t, distance_m, turn in _seen_again(frames, pieces, landmarks):
-        errors = [abs(wrap_angle(_bearing_after(s, distance_m, x) - t)) for x in (turn, -turn)]
-        if abs(errors[0] - errors[1]) > LEAST_TURN_RAD:
+        turns = turn, factor * turn
+        errors = [abs(wrap_angle(_bearing_after(s, distance_m, x) - t)) for x in turns]
+        if min(errors) < 0.5 * abs(turn) and abs(errors[0] - errors[1]) > LEAST_DIFFERENCE_RAD:
             votes.append(errors[0] < errors[1])
     return Votes(sum(votes), len(votes) - sum(votes))
 

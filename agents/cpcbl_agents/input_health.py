@@ -9,7 +9,7 @@ from collections.abc import Iterable
 from statistics import median
 from typing import NamedTuple, TypeVar
 
-from cpcbl_agents.input_problems import Facts, InputWindow, input_problems
+from cpcbl_agents.input_problems import Facts, InputWindow, implausible_inputs, input_problems
 from cpcbl_agents.robot import Robot
 from cpcbl_team.config import Team
 from cpcbl_team.inputs import Odometry, SightingFault, Sightings
@@ -18,6 +18,7 @@ from cpcbl_transport.messages import LARGEST_NUMBER, Frame, InputHealth, SensorI
 
 WINDOW = 10  # judgements, one a second: shares are those of the last so many
 SETTLED_NS = 2_000_000_000  # what was on its way when the robot started is too late
+IMPLAUSIBLE_EVERY = 10  # judgements: to look for what is implausible takes a third of a millisecond
 NAMESAKE_JUDGEMENTS = 3  # the token of a process that died may stay for its lease
 T = TypeVar("T")
 MOVED_M, TURNED_RAD = 0.1, 0.15  # beyond these a robot is no longer where it started
@@ -73,11 +74,12 @@ class InputMonitor:
 
     def __init__(self, robot: str, team: Team, start_ns: int, speed: float = 1.0) -> None:
         settings = team.robots[robot]
-        lengths = {"odometry": 100, "sightings": 30}
+        lengths = {"odometry": 100, "sightings": 60}
         self.inputs = {name: Input(name, start_ns, lengths.get(name, 10)) for name in NAMES}
         self.by_key = {f"in/{robot}/{name}": entry for name, entry in self.inputs.items()}
         self._start_ns, self._history = start_ns, deque[_Totals](maxlen=WINDOW + 1)
-        self._namesake_for = 0
+        self._namesake_for = self._judgements = 0
+        self._implausible: tuple[str, ...] = ()
         self.has_moved = False
         """Whether odometry said so, at a judgement."""
         detects = settings.sensing == "camera"
@@ -119,7 +121,10 @@ class InputMonitor:
             camera_lost=camera["camera_lost"] > camera["camera_back"],
         )
         health = tuple(self._health(name, totals, before) for name in shown)
-        return health, input_problems(facts)
+        self._judgements += 1
+        if self._judgements % IMPLAUSIBLE_EVERY == 0:
+            self._implausible = implausible_inputs(facts)
+        return health, (*input_problems(facts), *self._implausible)
 
     def _totals(self, robot: Robot, now_ns: int) -> _Totals:
         refused = {name: entry.refused.copy() for name, entry in self.inputs.items()}
@@ -153,7 +158,8 @@ class InputMonitor:
         entry = self.inputs[name]
         seconds = (totals.now_ns - before.now_ns) * 1e-9
         came = totals.messages[name] - before.messages[name]
-        late_s = [(now_ns - m.stamp_ns) * 1e-9 for now_ns, m in entry.recent]
+        latest = list(entry.recent)[-20:]
+        late_s = [(now_ns - m.stamp_ns) * 1e-9 for now_ns, m in latest]
         offset_s = median(late_s) if late_s else 0.0
         return InputHealth(
             name,

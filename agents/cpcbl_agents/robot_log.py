@@ -11,11 +11,12 @@ log = logging.getLogger(__name__)
 
 
 class RobotLog:
-    """Tells of the first input, of the pose, and of problems, by the robot's status."""
+    """Tells of first inputs and help, of the pose, and of problems, by the robot's status."""
 
     def __init__(self, robot: str) -> None:
         self._robot = robot
         self._fed: set[str] = set()
+        self._heard: set[str] = set()
         self._lost: str | None = None
         self._problems: dict[str, str] = {}
 
@@ -32,6 +33,10 @@ class RobotLog:
             if health.taken and health.input not in self._fed:
                 self._fed.add(health.input)
                 log.info("%s: first %s", self._robot, health.input)
+        for flow in status.heard:
+            if flow.peer not in self._heard:
+                self._heard.add(flow.peer)
+                log.info("%s: first help from %s", self._robot, flow.peer)
         if status.lost != self._lost:
             self._lost = status.lost
             self._tell_pose(status)

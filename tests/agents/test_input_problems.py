@@ -175,7 +175,11 @@ WRONG = {
     "cumulated": (each_piece(distance_m=since_start), "look like distances since the start"),
     "turns in degrees": (
         each_piece(turn_rad=lambda p: math.degrees(p.turn_rad)),
-        "they look like degrees",
+        "turns look like degrees",
+    ),
+    "quick turns in degrees": (
+        each_piece(turn_rad=lambda p: 6.0 * math.degrees(p.turn_rad)),
+        "rad/s: they look like",
     ),
     "headings as turns": (
         each_piece(turn_rad=lambda p: TURN_RATE_RAD_S * (p.stamp_ns - EPOCH) * 1e-9 + 0.9),

@@ -21,11 +21,13 @@ from cpcbl_launch.reporting.metrics import (
 )
 from cpcbl_launch.reporting.statuses import (
     FlowReport,
+    InputReport,
     ProblemLog,
     ProblemReport,
     SpendingReport,
     TrustReport,
     are_limits_kept,
+    input_reports,
     summed_flows,
     summed_spending,
     trust_reports,
@@ -35,7 +37,6 @@ from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus
 from cpcbl_transport.decoding import decode
 from cpcbl_transport.messages import (
-    InputHealth,
     Refusal,
     Status,
     Tagged,
@@ -76,7 +77,7 @@ class RobotReport(Score, frozen=True, kw_only=True):
     spending: tuple[SpendingReport, ...] = ()  # its limits; empty where there are none
     trust: tuple[TrustReport, ...] = ()
     """Teammates whose messages it received at the end, or that were in quarantine."""
-    inputs: tuple[InputHealth, ...] = ()  # of its last process
+    inputs: tuple[InputReport, ...] = ()  # of its last process
     problems: tuple[ProblemReport, ...] = ()  # of its inputs
 
 
@@ -287,7 +288,7 @@ class Recorder:
             heard=summed_flows(s.heard for s in statuses),
             spending=summed_spending(s.spending for s in statuses),
             trust=trust_reports(statuses),
-            inputs=statuses[-1].inputs if statuses else (),
+            inputs=input_reports(statuses[-1]) if statuses else (),
             problems=self._problems[name].reports if name in self._problems else (),
         )
 

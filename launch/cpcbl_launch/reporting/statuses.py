@@ -52,6 +52,23 @@ class TrustReport(msgspec.Struct, frozen=True, kw_only=True):
     late_s: float  # the least time from stamp to arrival; below zero the teammate's clock is ahead
 
 
+class InputReport(msgspec.Struct, frozen=True, kw_only=True):
+    """What a robot received on one input, since its last process started."""
+
+    input: str  # odometry, sightings, position or frame
+    rate_hz: float  # at the end
+    latest_ns: int
+    taken: int
+    refused: dict[str, int]  # by reason
+    offset_s: float  # the median of arrival minus stamp
+
+
+def input_reports(status: Status) -> tuple[InputReport, ...]:
+    """Of a robot's latest status."""
+    inputs = status.inputs
+    return tuple(msgspec.convert(i, InputReport, from_attributes=True) for i in inputs)
+
+
 class ProblemReport(msgspec.Struct, frozen=True, kw_only=True):
     """Something that was wrong with a robot's inputs, in its latest words, and for how long."""
 
