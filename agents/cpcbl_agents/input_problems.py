@@ -1,7 +1,7 @@
 """What is wrong with a robot's inputs, as sentences: decided by counts and times, no clock."""
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from statistics import median
 from typing import NamedTuple
 
@@ -157,14 +157,20 @@ def _unknown_names(frames: Sequence[Sightings], names: frozenset[str]) -> str:
     unknown = {s.id for f in frames for s in f.sightings} - names
     if not unknown:
         return ""
-    from difflib import get_close_matches  # for a robot with a problem only
-
     listed = []
     for name in sorted(unknown)[:3]:
-        near = get_close_matches(name, names, 1) or [n for n in names if n.lower() == name.lower()]
-        listed.append(f"`{name}` (`{near[0]}`?)" if near else f"`{name}`")
+        near = nearest_name(name, names)
+        listed.append(f"`{name}` (`{near}`?)" if near else f"`{name}`")
     verb = "are" if len(listed) > 1 else "is"
     return f"{', '.join(listed)} {verb} no landmark, wall or robot of this team"
+
+
+def nearest_name(name: str, names: Iterable[str]) -> str:
+    """The name that somebody may have meant; empty if none is alike."""
+    from difflib import get_close_matches  # for a robot with a problem only
+
+    lower = {known.lower(): known for known in sorted(names)}
+    return next((lower[found] for found in get_close_matches(name.lower(), lower, 1)), "")
 
 
 def overlapping(window: InputWindow) -> bool:

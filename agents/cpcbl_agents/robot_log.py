@@ -37,8 +37,8 @@ class RobotLog:
             if flow.peer not in self._heard:
                 self._heard.add(flow.peer)
                 log.info("%s: first help from %s", self._robot, flow.peer)
-        if status.lost != self._lost:
-            self._lost = status.lost
+        if (lost := without_numbers(status.lost)) != self._lost:
+            self._lost = lost
             self._tell_pose(status)
         problems = {without_numbers(text): text for text in status.problems}
         for what, text in problems.items():

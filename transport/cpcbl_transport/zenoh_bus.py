@@ -40,9 +40,11 @@ def open_bus(
     connect: Sequence[str],
     give_up: Callable[[], bool] = lambda: False,
     credentials: Credentials | None = None,
+    quiet: bool = False,
 ) -> "ZenohBus":
-    """A client's session below the team's namespace; waits for a router until `give_up()`. With
-    credentials every link is mutual TLS. Raises BusError when it gave up."""
+    """A client's session below the team's namespace; waits for a router until `give_up()`, and says
+    so unless it is `quiet`. With credentials every link is mutual TLS. Raises BusError when it gave
+    up."""
     config = client_config(connect, credentials)
     reason, said_s = "stopped before a router answered", -WAITING_S
     while not give_up():
@@ -50,7 +52,7 @@ def open_bus(
             return ZenohBus(_open(config, namespace(team)))
         except zenoh.ZError as error:
             reason = _tls_reason(connect, credentials) or _one_line(error)
-            if time.monotonic() - said_s >= WAITING_S:
+            if not quiet and time.monotonic() - said_s >= WAITING_S:
                 said_s = time.monotonic()
                 shown = f": {reason}" if credentials else ""
                 log.warning("waiting for a router at %s%s", ", ".join(connect), shown)

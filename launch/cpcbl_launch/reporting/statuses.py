@@ -100,7 +100,8 @@ class ProblemLog:
 def problem_remarks(robot: str, problems: Iterable[ProblemReport]) -> Iterator[str]:
     """What a report says of them, in words."""
     for problem in problems:
-        yield f"Robot {robot}, for {problem.seconds:.0f} s: {problem.text}."
+        stop = "" if problem.text.endswith("?") else "."
+        yield f"Robot {robot}, for {problem.seconds:.0f} s: {problem.text}{stop}"
 
 
 COUNTS = ("messages", "bytes", "over_budget", "worthless", "silent")

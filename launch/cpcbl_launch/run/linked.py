@@ -4,9 +4,9 @@ Nothing is subscribed to and no robot is asked: Zenoh's router says what its cli
 """
 
 from collections.abc import Iterable, Iterator, Mapping
-from difflib import get_close_matches
 from typing import NamedTuple
 
+from cpcbl_agents.input_problems import nearest_name
 from cpcbl_team.config import Team
 from cpcbl_transport import topics
 from cpcbl_transport.topics import namespace
@@ -83,13 +83,12 @@ def _strays(
             continue
         if declared.team not in teams:
             yield (
-                f"this team is `{team.name}`; somebody publishes to `{declared.team}`"
-                f" ({declared.topic})"
+                f"this team is `{team.name}`; somebody publishes to `{declared.team}` (in/{robot})"
             )
         elif declared.team == team.name and robot not in robots:
-            near = get_close_matches(robot, team.robots, 1)
-            guess = f"; is it `{near[0]}`?" if near else ""
-            yield f"somebody publishes {declared.topic}; no robot `{robot}` is there{guess}"
+            near = nearest_name(robot, team.robots)
+            guess = f"; is it `{near}`?" if near else ""
+            yield f"somebody publishes to in/{robot}; no robot `{robot}` is there{guess}"
 
 
 def declared_at(found: Mapping[str, tuple[str, ...]]) -> list[Declared]:

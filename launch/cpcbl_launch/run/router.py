@@ -70,7 +70,7 @@ class Visitors:
             if client not in self._known and (name or self._looks[client] >= NAMELESS_LOOKS):
                 self._known[client] = f"{name}, {where}" if name else where
                 log.info("+ %s (%d linked)", self._known[client], len(present))
-        for client in self._known.keys() - present.keys():
+        for client in [c for c in self._known if c not in present]:
             log.info("- %s (%d linked)", self._known.pop(client), len(present))
         strays = () if self._team is None else stray_inputs(self._team, publishers, tokens)
         for text in strays:
