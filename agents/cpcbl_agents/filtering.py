@@ -89,7 +89,8 @@ class FilterAgent:
         if refusal:
             self.counts[refusal] += 1
             if isinstance(item, Odometry | Sightings | Position):
-                self.refused[type(item).__name__.lower(), refusal] += 1
+                number = len(item.sightings) or 1 if isinstance(item, Sightings) else 1
+                self.refused[type(item).__name__.lower(), refusal] += number
         return not refusal
 
     def _regular_estimate(self, now_ns: int) -> PoseEstimate:

@@ -1,6 +1,7 @@
 """What is wrong with a robot's inputs, as sentences: decided by counts and times, no clock."""
 
 import re
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from statistics import median
 from typing import NamedTuple
@@ -112,11 +113,12 @@ def _refused(name: str, window: InputWindow, facts: Facts) -> Iterator[str]:
     number = sum(window.refused.values())
     total = window.taken + number
     if number >= LEAST_REFUSED and number > REFUSED_SHARE * total:
-        worst = sorted(window.refused, key=lambda reason: -window.refused[reason])
-        for reason in worst[:2]:
-            share = window.refused[reason] / total
-            if reason == worst[0] or share > REFUSED_SHARE:
-                yield f"{100.0 * share:.0f} % of {name} refused: {_cause(reason, window, facts)}"
+        by_cause = Counter[str]()
+        for reason, refused in window.refused.items():
+            by_cause[_cause(reason, window, facts)] += refused
+        worst, *others = by_cause.most_common(2)
+        for cause, refused in (worst, *(o for o in others if o[1] > REFUSED_SHARE * total)):
+            yield f"{100.0 * refused / total:.0f} % of {name} refused: {cause}"
     elif len(window.recent) >= causes.LEAST_CASES:
         offset_s = median(now_ns - m.stamp_ns for now_ns, m in window.recent[-20:]) * 1e-9
         limits = 0.1 * facts.pace, 1.0 * facts.pace
@@ -185,12 +187,12 @@ def _pieces(window: InputWindow) -> list[Odometry]:
 def _implausible(facts: Facts) -> Iterator[str]:
     nothing = InputWindow(0.0)
     odometry = facts.windows.get("odometry", nothing)
-    pieces = _pieces(odometry)
+    pieces = _pieces(odometry) if odometry.taken else []
     seen = facts.windows.get("sightings", nothing).recent
     frames = [m for _, m in seen if isinstance(m, Sightings)]
     if cause := causes.odometry_cause(pieces[-20:]):
         yield f"odometry: {cause}"
-    elif overlapping(odometry) and "duplicate" not in odometry.refused:
+    elif pieces and overlapping(odometry) and "duplicate" not in odometry.refused:
         yield "odometry: pieces overlap; two drivers, or from_ns is not where the last one ended"
     if cause := causes.range_cause(frames[-10:], facts.max_range_m, facts.field_m):
         yield f"sightings: {cause}"

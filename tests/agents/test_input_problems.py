@@ -263,8 +263,9 @@ def test_what_is_refused_never_moves_the_estimate() -> None:
         driver.run(4.0, change)
         pose = driver.node.robot.filter.timeline.state.estimate.pose
         assert (pose.x, pose.y) == pytest.approx((0.0, 0.0), abs=1e-9)
+        for health in driver.statuses[-1].inputs:
+            assert health.taken == 0
         health = driver.statuses[-1].inputs[0]
-        assert health.taken == 0
         assert set(health.refused) <= refused
         assert sum(health.refused.values()) >= 30
 
@@ -295,6 +296,12 @@ def test_frames_for_a_robot_without_a_camera_are_refused_aloud() -> None:
     assert driver.run(8.0, frames) == (
         '100 % of frame refused: frames come, but `sensing` is not "camera"',
     )
+
+
+def test_what_has_one_cause_is_said_once_for_each_input() -> None:
+    said = "refused: stamps look like seconds since 1970; nanoseconds are due"
+    problems = Driver().run(12.0, stamped(1e-9))
+    assert problems == tuple(f"100 % of {name} {said}" for name in ("odometry", "sightings"))
 
 
 def test_a_problem_is_the_same_one_while_only_its_figures_change() -> None:
