@@ -208,6 +208,8 @@ def print_observer_report(report: ObserverReport, console: Console) -> None:
         console.print(f"{report.name} is lost: {report.lost}", style="yellow", highlight=False)
     if report.unfed:
         console.print(f"{report.name}: {report.unfed}", style="yellow", highlight=False)
+    for line in problem_remarks(report.name, report.problems):
+        console.print(line, style="yellow", highlight=False, markup=False)
 
 
 def _baseline_table(report: Report) -> Table:
