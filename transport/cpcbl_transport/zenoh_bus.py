@@ -55,7 +55,7 @@ def open_bus(
             if not quiet and time.monotonic() - said_s >= WAITING_S:
                 said_s = time.monotonic()
                 shown = f": {reason}" if credentials else ""
-                log.warning("waiting for a router at %s%s", ", ".join(connect), shown)
+                log.warning("no router at %s yet, waiting for it%s", ", ".join(connect), shown)
             time.sleep(0.2)
     raise BusError(f"no router at {', '.join(connect)}: {reason}")
 
