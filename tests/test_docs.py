@@ -7,7 +7,11 @@ from pathlib import Path
 
 import pytest
 
+from cpcbl_agents.input_problems import REASONS
 from cpcbl_launch.lab.chaos.scenarios import SCENARIOS
+from cpcbl_team.inputs import SightingFault
+from cpcbl_team.timeline import TimelineRefusal
+from cpcbl_transport.messages import Refusal
 
 ROOT = Path(__file__).parents[1]
 DOCUMENTS = sorted(ROOT.glob("*.md")) + sorted(ROOT.glob("docs/*.md"))
@@ -94,3 +98,22 @@ def test_paths_and_the_names_behind_them_exist(document: Path) -> None:
         assert (ROOT / path).exists(), path
         for name in names.split(", ") if names else ():
             assert name in names_in(ROOT / path), f"{path}: {name}"
+
+
+def test_every_reason_of_a_refusal_has_its_remedy_in_the_docs() -> None:
+    """Those of the messages, and the literals that sensing and cameras refuse by."""
+    page = (ROOT / "docs/refused_inputs.md").read_text()
+    table = page.partition("## Reasons")[2].partition("## Other problems")[0]
+    listed = {name for row in table.splitlines() for name in re.findall(r"`(\w+)`", _cell(row))}
+    pictures = (ROOT / "agents/cpcbl_agents/vision/pictures.py").read_text()
+    images = set(re.findall(r'"(frame_\w+)"', pictures))
+    faults = {*SightingFault, *TimelineRefusal, *images, "seen_twice", "no_camera"}
+    assert listed == {str(reason) for reason in {*Refusal, *faults, "unknown_object"}}
+    assert set(REASONS) <= listed
+    inputs = {str(r) for r in {*Refusal, *faults}} - set(REASONS)
+    assert inputs == {"unknown_robot", "own_message", "name_of_another", "clock_off"}
+
+
+def _cell(row: str) -> str:
+    """The first cell of a row of a table."""
+    return row.split("|")[1] if row.startswith("|") else ""

@@ -26,6 +26,8 @@ class FilterAgent:
         localizer = Localizer(settings, field)
         self.timeline = Timeline(localizer, localizer.start(start_ns))
         self.counts: Counter[str] = Counter()
+        self.refused: Counter[tuple[str, str]] = Counter()
+        """The same of inputs: by the name of the input, and the reason."""
         self._known = frozenset(field.landmarks) | frozenset(field.walls) | teammates
         self._guests: set[str] = set()
         self._moves = settings.odometry.moves
@@ -71,6 +73,7 @@ class FilterAgent:
                 for sighting in message.sightings:
                     if sighting.id not in self._known and sighting.id not in self._guests:
                         self.counts["unknown_object"] += 1
+                        self.refused["sightings", "unknown_object"] += 1
                 if self._add(message):
                     self._waiting.append(message)
                 return self._frame_estimates(now_ns)
@@ -89,6 +92,9 @@ class FilterAgent:
         refusal = self.timeline.add(item)
         if refusal:
             self.counts[refusal] += 1
+            if isinstance(item, Odometry | Sightings | Position):
+                number = len(item.sightings) or 1 if isinstance(item, Sightings) else 1
+                self.refused[type(item).__name__.lower(), refusal] += number
         return not refusal
 
     def _regular_estimate(self, now_ns: int) -> PoseEstimate:

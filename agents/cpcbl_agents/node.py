@@ -5,11 +5,14 @@ from collections import Counter, deque
 from collections.abc import Callable, Iterable
 from typing import Protocol
 
+import msgspec
+
 from cpcbl_agents import agent
 from cpcbl_agents.agent import BeliefSubscribers, FrameSubscribers
 from cpcbl_agents.clocks import ClockMonitor
 from cpcbl_agents.collaboration import MessageCounters
 from cpcbl_agents.declarations import Declarations, LivelinessTokens
+from cpcbl_agents.input_health import InputMonitor
 from cpcbl_agents.pose_output import PoseOutput
 from cpcbl_agents.robot import Robot, build_robot
 from cpcbl_agents.sources import OwnCamera
@@ -20,7 +23,15 @@ from cpcbl_transport.bus import Bus
 from cpcbl_transport.compact import encode_help, received_bytes, sent_bytes
 from cpcbl_transport.decoding import decode_by_key, input_problem
 from cpcbl_transport.json_messages import encode_json, is_json
-from cpcbl_transport.messages import Help, Message, Outgoing, Refusal, Status, refusal
+from cpcbl_transport.messages import (
+    Help,
+    Message,
+    Outgoing,
+    Refusal,
+    SensorInput,
+    Status,
+    refusal,
+)
 from cpcbl_transport.topics import Topic, topic_of
 
 log = logging.getLogger(__name__)
@@ -60,10 +71,11 @@ class Node:
         incarnation: str,
         on_arrival: Callable[[], None] = lambda: None,
         speed: float = 1.0,
+        on_status: Callable[[Status], None] = lambda status: None,
     ) -> None:
-        """`speed`: robot time beside real time."""
+        """`speed`: robot time beside real time. `on_status`: called once a second."""
         self.robot, self._incarnation, self._name = robot, incarnation, robot.name
-        self._on_arrival, self._status_ns = on_arrival, start_ns
+        self._on_arrival, self._on_status, self._status_ns = on_arrival, on_status, start_ns
         self._frame_key = topics.IN_FRAME.at(robot=robot.name)
         rules = team.robots[robot.name].collaboration
         self._team, self._passive = frozenset(team.robots), rules.passive
@@ -81,10 +93,17 @@ class Node:
         self.counts: Counter[str] = Counter(dict.fromkeys(ON_ARRIVAL, 0))
         self.received = MessageCounters()
         self._clocks = ClockMonitor(rules.trust, speed) if rules.trust.enabled else None
+        self._health = InputMonitor(robot.name, team, start_ns, speed)
+        self._namesakes: set[str] = set()  # tokens of other processes with this robot's name
         self._inputs = [
             bus.subscribe(topic.at(robot=robot.name), self._on_message) for topic in topics.INPUTS
         ]
         self._own_name = bus.watch_liveliness(topics.ALIVE.at(robot=robot.name), self._on_own_name)
+
+    @property
+    def has_moved(self) -> bool:
+        """Whether the robot is no longer where it started, by its odometry."""
+        return self._health.has_moved
 
     # On a thread of the bus ---------------------------------------------------------------------
 
@@ -107,8 +126,13 @@ class Node:
         self._on_arrival()
 
     def _on_own_name(self, key: str, alive: bool) -> None:
-        if alive and not key.endswith("/" + self._incarnation):
+        if key.endswith("/" + self._incarnation):
+            return
+        if alive:
             self.counts["same_name_twice"] += 1
+            self._namesakes.add(key)
+        else:
+            self._namesakes.discard(key)
 
     # On one thread at a time --------------------------------------------------------------------
 
@@ -143,11 +167,15 @@ class Node:
             self._publish_status(now_ns)
 
     def _handle_payload(self, key: str, payload: bytes, now_ns: int) -> None:
-        message = self._decode(key, payload, now_ns)
+        message, source = self._decode(key, payload, now_ns), self._health.by_key.get(key)
         if isinstance(message, Refusal):
             self.counts[message] += 1
             self._explain(key, payload, message)
+            if source is not None:
+                source.refuse(message, payload, now_ns)
             return
+        if source is not None and isinstance(message, SensorInput):
+            source.take(message, now_ns)
         self._send(self.robot.handle(message, now_ns), now_ns)
         match message:
             case Fix(observer=name):  # by a subscription to all observers
@@ -227,6 +255,9 @@ class Node:
         counts = self.counts + Counter(announced=self._declarations.announced)
         received = self.received.flows()
         status = self.robot.status(now_ns, self._incarnation, counts, received, self._clocks)
+        inputs, problems = self._health.judge(self.robot, now_ns, bool(self._namesakes))
+        status = msgspec.structs.replace(status, inputs=inputs, problems=problems)
+        self._on_status(status)
         self._publish(status)
         key = topics.json_key(topics.STATUS.at(robot=self._name))
         as_json = self._declarations.publisher(topics.STATUS, key)
@@ -248,9 +279,10 @@ class GuestNode(Node):
         on_arrival: Callable[[], None] = lambda: None,
         speed: float = 1.0,
         camera: OwnCamera | None = None,
+        on_status: Callable[[Status], None] = lambda status: None,
     ) -> None:
         robot = build_robot(name, team, start_ns, camera=camera)
-        super().__init__(robot, team, bus, start_ns, incarnation, on_arrival, speed)
+        super().__init__(robot, team, bus, start_ns, incarnation, on_arrival, speed, on_status)
         self._ask_ns = start_ns
         self._warn_ns: int | None = start_ns + WARN_AFTER_NS
         self._model = messages.model_from_settings(team.robots[name])

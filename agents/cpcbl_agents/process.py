@@ -12,12 +12,16 @@ from types import FrameType
 import msgspec
 
 from cpcbl_agents.clock import Clock
+from cpcbl_agents.earlier_processes import NEVER_RAN, Before, OwnTokens
 from cpcbl_agents.node import Node, Steppable
 from cpcbl_agents.robot import Robot, build_robot
+from cpcbl_agents.robot_log import RobotLog
 from cpcbl_agents.sources import OwnCamera
 from cpcbl_team.config import Team
 from cpcbl_team.errors import ClockError
+from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus
+from cpcbl_transport.messages import Status
 from cpcbl_transport.security import Identity, link_of
 from cpcbl_transport.topics import Role
 from cpcbl_transport.zenoh_bus import open_bus
@@ -113,10 +117,11 @@ def run_robot(
     connect: Sequence[str],
     clock: Clock,
     stop: Callable[[], bool],
-    restarted: bool = False,
+    restarted: bool | None = None,
     wrap_bus: Callable[[Bus], Bus] = lambda bus: bus,
 ) -> None:
-    """Runs a robot until `stop()`. One that is restarted, or late, does not know where it is.
+    """Runs a robot until `stop()`. One that is started again does not know where it is, once it has
+    moved. `restarted` says whether that is so; None: the router knows.
 
     `wrap_bus` may put something between the robot and its bus. Raises BusError when stopped before
     a router answered, LogError for an unreadable log, SecurityError without the keys of a secured
@@ -129,26 +134,55 @@ def run_robot(
         own_camera(name, team, clock, loop.wake) as camera,
         open_bus(team.name, link.endpoints, stop, link.credentials) as bus,
     ):
-        robot = make_robot(name, team, clock, restarted, camera)
+        before = Before.by_tokens(bus.tokens(topics.RAN.at(robot=name)))
+        robot = make_robot(
+            name,
+            team,
+            clock,
+            before if restarted is None else Before(restarted, before.ran or restarted),
+            camera,
+        )
         start_ns, incarnation = clock.now_ns(), new_incarnation()
-        node = Node(robot, team, wrap_bus(bus), start_ns, incarnation, loop.on_arrival, clock.speed)
+        said, tokens = RobotLog(name), OwnTokens(bus, name, incarnation)
+
+        def on_status(status: Status) -> None:
+            said.tell(status)
+            if node.has_moved:
+                tokens.tell_moved()
+
+        node = Node(
+            *(robot, team, wrap_bus(bus), start_ns, incarnation),
+            *(loop.on_arrival, clock.speed, on_status),
+        )
+        said.connected(team, link.endpoints)
         loop.run(node, stop_on_clock_step(name, team, clock, stop))
 
 
 def make_robot(
-    name: str, team: Team, clock: Clock, restarted: bool = False, camera: OwnCamera | None = None
+    name: str,
+    team: Team,
+    clock: Clock,
+    before: Before = NEVER_RAN,
+    camera: OwnCamera | None = None,
 ) -> Robot:
-    """The robot as it starts now. After a restart it knows neither its pose nor what it spent.
-    Docker restarts a robot without telling it; such a robot is recognized because it is late."""
+    """The robot as it starts now. It keeps its start unless it has moved since, or is late in its
+    log; one that ran before does not know what it spent."""
     start_ns = clock.now_ns()
     late_s = (start_ns - clock.epoch_ns) * 1e-9 / clock.speed
-    late = start_ns > clock.epoch_ns + LATE_NS * max(1.0, clock.speed)
-    if restarted or late:
-        log.warning("robot %s starts %.1f s after the team: it has to find its pose", name, late_s)
+    logged = team.robots[name].source == "mrclam"
+    late = logged and start_ns > clock.epoch_ns + LATE_NS * max(1.0, clock.speed)
+    if late:
+        log.warning("%s: begins %.1f s late in its log: it has to find its pose", name, late_s)
+    elif before.moved and team.robots[name].start is not None:
+        log.warning(
+            "%s: has moved since the team started: it has to find its pose; --no-restarted: it"
+            " stands at its start again",
+            name,
+        )
+    if late or before.moved:
         robot = msgspec.structs.replace(team.robots[name], start=None)
         team = msgspec.structs.replace(team, robots={**team.robots, name: robot})
-    spent = restarted or (late and not clock.unix)  # it may have waited for its router
-    return build_robot(name, team, start_ns, spent, camera)
+    return build_robot(name, team, start_ns, late or before.moved or before.ran, camera)
 
 
 def new_incarnation() -> str:

@@ -46,6 +46,8 @@ class SensingAgent:
         self._follower, self._detector, self._has_subscribers = follower, detector, False
         self._annotated_ns = -ANNOTATION_INTERVAL_NS
         self._counts: Counter[str] = Counter()
+        self.refused: Counter[str] = Counter()
+        """What could not be used, by reason."""
 
     @property
     def counts(self) -> Counter[str]:
@@ -81,7 +83,7 @@ class SensingAgent:
         if not isinstance(item, Frame | Picture):
             return [self._correct(item)]
         if self._detector is None:
-            self._counts["no_camera"] += 1
+            self._refuse("no_camera")
             return ()
         self._counts["frame"] += 1
         outgoing: list[AgentMessage] = []
@@ -93,7 +95,7 @@ class SensingAgent:
         else:
             sightings = self._detector.detect(item)
         if isinstance(sightings, str):
-            self._counts[sightings] += 1
+            self._refuse(sightings)
             return outgoing
         return [*outgoing, self._correct(sightings)]
 
@@ -105,10 +107,14 @@ class SensingAgent:
             return msgspec.structs.replace(item, stamp_ns=item.stamp_ns - self._position_delay_ns)
         sightings = without_duplicates(item.sightings)
         if len(sightings) < len(item.sightings):
-            self._counts["seen_twice"] += len(item.sightings) - len(sightings)
+            self._refuse("seen_twice", len(item.sightings) - len(sightings))
         sensor, map_names, kept = self._sensor, self._map_names, []
         for sighting in sightings:
             is_robot = sighting.id not in map_names
             if sensor.sees_robots if is_robot else sensor.sees_landmarks:
                 kept.append(corrected_sighting(sighting, sensor, is_robot))
         return Sightings(item.stamp_ns - self._sensor_delay_ns, tuple(kept))
+
+    def _refuse(self, reason: str, number: int = 1) -> None:
+        self._counts[reason] += number
+        self.refused[reason] += number

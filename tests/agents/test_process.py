@@ -12,6 +12,7 @@ from support.buses import robot_at, team_of, wait_until, with_robot
 
 from cpcbl_agents import process
 from cpcbl_agents.clock import Clock
+from cpcbl_agents.earlier_processes import Before
 from cpcbl_agents.process import Loop, StopSignal, make_robot, new_incarnation, stop_on_clock_step
 from cpcbl_team.config import BudgetSettings
 from cpcbl_team.errors import ClockError
@@ -188,20 +189,22 @@ def since(seconds: float, unix: bool = False) -> Clock:
 
 
 @pytest.mark.parametrize(
-    ("since_s", "unix", "restarted", "knows_its_place", "may_send"),
+    ("since_s", "before", "knows_its_place", "may_send"),
     [
-        (-60.0, False, False, True, True),
-        (-60.0, False, True, False, False),
-        (60.0, False, False, False, False),
-        (60.0, True, False, False, True),
+        (-60.0, Before(), True, True),
+        (60.0, Before(), True, True),
+        (60.0, Before(ran=True), True, False),
+        (60.0, Before(moved=True, ran=True), False, False),
+        (-60.0, Before(moved=True), False, False),
     ],
-    ids=["with the team", "restarted by up", "restarted by Docker", "waited for its router"],
+    ids=["with the team", "late", "restarted", "restarted after it moved", "so it was told"],
 )
-def test_a_robot_that_may_have_run_before_knows_neither_its_place_nor_what_it_spent(
-    since_s: float, unix: bool, restarted: bool, knows_its_place: bool, may_send: bool
+@pytest.mark.parametrize("unix", [False, True])
+def test_only_a_robot_that_ran_before_may_not_know_its_place_or_what_it_spent(
+    since_s: float, before: Before, knows_its_place: bool, may_send: bool, unix: bool
 ) -> None:
     clock = since(since_s, unix)
-    robot = make_robot("me", LIMITED, clock, restarted)
+    robot = make_robot("me", LIMITED, clock, before)
     assert (not robot.filter.timeline.state.lost) is knows_its_place
     now_ns = clock.now_ns()
     assert robot.collaboration.budget.admits(now_ns, 42, urgent=True) is may_send

@@ -10,6 +10,7 @@ from cpcbl_transport.messages import (
     Drive,
     Flow,
     Frame,
+    InputHealth,
     Join,
     Pose,
     SimulatedRobotModel,
@@ -39,6 +40,9 @@ SENT = (Flow("fix", "r2", 1, 41, 2, 3, 0, NOW), Flow("belief", "", 0, 0, 0, 0, 4
 SPENDING = (Spending("bytes", 10.0, 500.0, 400.0),)
 TRUST = (Trust("r2", "biased", NOW, 2, False, -0.4),)
 STATUS = msgspec.structs.replace(STATUS, sent=SENT, heard=SENT[:1], spending=SPENDING, trust=TRUST)
+OLDER_STATUS = STATUS  # as the first releases sent it
+INPUTS = (InputHealth("odometry", 9.5, NOW, 7, {"too_late": 2}, 0.02),)
+STATUS = msgspec.structs.replace(STATUS, inputs=INPUTS, problems=("camera lost",))
 TRACK = Track("r1", NOW, 1.0, 2.0, 0.5, COVARIANCE, 3)
 ROWS = ((0.04, 0.01, 0.0), (0.01, 0.09, 0.0), (0.0, 0.0, 0.01))
 POSE = Pose("r1", NOW, 1.0, 2.0, 0.5, ROWS, "kidnapped")

@@ -153,6 +153,10 @@ def test_the_bytes_of_a_fix_and_a_belief_are_frozen(message: Help, name: str) ->
     assert encode_help(message).hex() == GOLDEN[name]
 
 
+def test_a_status_without_inputs_is_still_understood() -> None:
+    assert decode_tagged(bytes.fromhex(GOLDEN["status without inputs"])) == samples.OLDER_STATUS
+
+
 def test_a_join_of_the_first_releases_is_still_understood() -> None:
     """Those wrote whole tables of the team file, with keys that the field does not need."""
     assert decode_tagged(bytes.fromhex(GOLDEN["join"])) == samples.JOIN

@@ -214,7 +214,7 @@ def test_a_payload_that_cannot_be_read_is_refused(payload: bytes, reason: Refusa
 
 
 def test_the_largest_payload_is_still_read() -> None:
-    fits = encode(STATUS).replace(b"\xa1a", b"\xda" + b"\xff\x00" + b"a" * 0xFF00)
+    fits = encode(STATUS).replace(b"\xa1a", b"\xda" + b"\xfe\x00" + b"a" * 0xFE00)
     assert len(fits) <= LARGEST_PAYLOAD
     assert isinstance(decode_tagged(fits), Status)
 

@@ -213,6 +213,7 @@ def test_permitted_subscriptions_follow_the_table_too() -> None:
         *("alive/*/*/*", "belief/*/*", "fix/me/*/*", "status/me", "track/me", "look/me"),
         *("pose/*", "pose/*/json", "status/me/json"),
         *("in/me/odometry", "in/me/sightings", "in/me/position", "in/me/frame"),
+        "ran/me/*/*",
     }
     assert subscribe_keys(Identity(Role.OBSERVER, "me")) == subscribe_keys(me)
     assert subscribe_keys(FIELD) == ["field/drive/*", "field/join/*"]

@@ -14,7 +14,7 @@ from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus
 from cpcbl_transport.compact import decode_help
 from cpcbl_transport.json_messages import decode_json, is_json, json_problem
-from cpcbl_transport.messages import Message, Refusal, decode_tagged, refusal
+from cpcbl_transport.messages import Message, Refusal, decode_error, decode_tagged, refusal
 from cpcbl_transport.topics import Topic, topic_of
 
 MessageT = TypeVar("MessageT", bound=Message)
@@ -49,9 +49,11 @@ def decode_by_key(key: str, payload: bytes) -> Message | Refusal:
 
 
 def input_problem(key: str, payload: bytes) -> str:
-    """What is wrong with an input that came as JSON, for people; empty if it can be read."""
+    """What is wrong with the payload of an input, for people; empty if it can be read."""
     topic, _ = _topic_of(key)
-    return json_problem(payload, topic) if topic in topics.INPUTS else ""
+    if topic not in topics.INPUTS:
+        return ""
+    return json_problem(payload, topic) if is_json(payload) else decode_error(payload)
 
 
 @lru_cache(maxsize=4096)

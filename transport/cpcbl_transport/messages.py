@@ -86,6 +86,18 @@ class Trust(msgspec.Struct, frozen=True, array_like=True):
     """The least delay from stamp to arrival lately; below zero the teammate's clock is ahead."""
 
 
+class InputHealth(msgspec.Struct, frozen=True, array_like=True):
+    """What a robot received on one of its inputs, since its process started."""
+
+    input: str  # odometry, sightings, position or frame
+    rate_hz: float = 0.0  # of the last seconds, with what was refused
+    latest_ns: int = 0  # the newest stamp that was taken; 0 before the first
+    taken: int = 0
+    refused: dict[str, int] = {}  # by reason
+    offset_s: float = 0.0
+    """The median of arrival minus stamp lately; below zero the driver's clock is ahead."""
+
+
 class Status(msgspec.Struct, frozen=True, array_like=True, tag="status"):
     """A robot's health, for operators. Metres, radians, counts since its process started."""
 
@@ -108,6 +120,9 @@ class Status(msgspec.Struct, frozen=True, array_like=True, tag="status"):
     spending: tuple[Spending, ...] = ()
     trust: tuple[Trust, ...] = ()
     """Teammates that send something, or that are or were in quarantine."""
+    inputs: tuple[InputHealth, ...] = ()
+    problems: tuple[str, ...] = ()
+    """What is wrong with the inputs, as sentences for people, the worst first."""
 
 
 class Track(msgspec.Struct, frozen=True, array_like=True, tag="track"):
@@ -246,6 +261,15 @@ def decode_tagged(payload: bytes, largest: int = LARGEST_PAYLOAD) -> Tagged | Re
         return _decoder.decode(memoryview(payload)[1:])
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
         return Refusal.GARBAGE
+
+
+def decode_error(payload: bytes) -> str:
+    """What is wrong with a payload that `decode_tagged` calls garbage, in one line."""
+    try:
+        _decoder.decode(memoryview(payload)[1:])
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+        return str(error)
+    return ""
 
 
 def header_refusal(payload: bytes, largest: int = LARGEST_PAYLOAD) -> Refusal | None:

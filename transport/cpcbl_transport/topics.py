@@ -130,6 +130,10 @@ def namespace(team: str) -> str:
 # At a change of tier. A liveliness token: the bus reports when it appears and disappears; it shows
 # presence, not health
 ALIVE = Topic("alive/<tier>/<robot>/<incarnation>", None, Qos.COMMAND, subscribers=_MEMBERS)
+# Twice in the life of a process: at its start (still), and when its robot has moved (moved). A
+# liveliness token, which the router repeats as long as it lives: a robot that is started again
+# after it has moved is not at its start
+RAN = Topic("ran/<robot>/<how>/<incarnation>", None, Qos.COMMAND)
 # 5 Hz while a worse robot subscribes. The next one is better than a late one
 BELIEF = Topic("belief/<tier>/<robot>", Belief, Qos.FRESH, subscribers=_MEMBERS)
 # Each sighting of a worse robot that subscribes. The next one is better than a late one
@@ -163,13 +167,15 @@ JOIN = Topic(
 TRUTH = Topic("field/truth", messages.Truths, Qos.TELEMETRY, publishers=_FIELD, subscribers=())
 
 TOPICS = (
-    *(ALIVE, BELIEF, FIX, STATUS, TRACK, POSE),
+    *(ALIVE, RAN, BELIEF, FIX, STATUS, TRACK, POSE),
     *(IN_ODOMETRY, IN_SIGHTINGS, IN_POSITION, IN_FRAME, LOOK),
     *(DRIVE, JOIN, TRUTH),
 )
 INPUTS = (IN_ODOMETRY, IN_SIGHTINGS, IN_POSITION, IN_FRAME)
 COLLABORATION = (Belief, Fix)
-_BY_TYPE: dict[type[object] | None, Topic] = {topic.carries: topic for topic in TOPICS}
+_BY_TYPE: dict[type[object], Topic] = {
+    topic.carries: topic for topic in TOPICS if topic.carries is not None
+}
 
 
 def topic_of(kind: type[object]) -> Topic:

@@ -27,6 +27,9 @@ from cpcbl_transport.zenoh_config import client_config
 
 log = logging.getLogger(__name__)
 
+TOKENS_S = 5.0  # for the router's answer
+WAITING_S = 10.0  # after so long it is said again that no router answers
+
 
 class BusError(CpcblError):
     """The bus could not be opened."""
@@ -41,10 +44,10 @@ def open_bus(
 ) -> "ZenohBus":
     """A client's session below the team's namespace; waits for a router until `give_up()`. With
     credentials every link is mutual TLS. `on_wait` is told again and again that there is none yet,
-    with the reason where TLS has one. Without a team, keys are whole ones, of all teams. Raises
-    BusError when it gave up."""
+    with the reason where TLS has one; without it the log says so. Without a team, keys are whole
+    ones, of all teams. Raises BusError when it gave up."""
     config = client_config(connect, credentials)
-    reason = "stopped before a router answered"
+    reason, said_s = "stopped before a router answered", -WAITING_S
     while not give_up():
         try:
             return ZenohBus(_open(config, namespace(team) if team else None))
@@ -52,9 +55,10 @@ def open_bus(
             reason = _tls_reason(connect, credentials) or _one_line(error)
             if on_wait is not None:
                 on_wait(reason if credentials else "")
-            else:
+            elif time.monotonic() - said_s >= WAITING_S:
+                said_s = time.monotonic()
                 shown = f": {reason}" if credentials else ""
-                log.info("no router at %s yet%s", ", ".join(connect), shown)
+                log.warning("no router at %s yet, waiting for it%s", ", ".join(connect), shown)
             time.sleep(0.2)
     raise BusError(f"no router at {', '.join(connect)}: {reason}")
 
@@ -67,6 +71,15 @@ def _tls_reason(connect: Sequence[str], credentials: Credentials | None) -> str:
 
     reasons = {endpoint: tls_diagnosis(endpoint, credentials) for endpoint in connect}
     return "; ".join(dict.fromkeys(filter(None, reasons.values())))
+
+
+def open_onlooker(endpoint: str) -> "ZenohBus":
+    """A client's session without a namespace, to ask for all `declarations`. Raises
+    BusError."""
+    try:
+        return ZenohBus(_open(client_config([endpoint])))
+    except zenoh.ZError as error:
+        raise BusError(f"no router at {endpoint}: {_one_line(error)}") from error
 
 
 def open_router(config: Mapping[str, Any], space: str | None = None) -> "ZenohBus":
@@ -191,6 +204,23 @@ class ZenohBus(Bus):
         liveliness = self._session.liveliness()
         subscriber = liveliness.declare_subscriber(keys, on_sample, history=True)
         return _Declared(self, subscriber.undeclare)
+
+    def tokens(self, keys: str) -> list[str]:
+        """The liveliness tokens that are there now."""
+        replies = self._session.liveliness().get(keys, timeout=TOKENS_S)
+        return [str(reply.ok.key_expr) for reply in replies if reply.ok is not None]
+
+    def declarations(self, kind: str) -> dict[str, tuple[str, ...]]:
+        """What the clients of all routers have declared of a kind (publisher, subscriber, token):
+        whole keys, and the ids of the clients. For a session without a namespace."""
+        found: dict[str, tuple[str, ...]] = {}
+        head = re.compile(rf"@/[^/]*/router/{kind}/")
+        for reply in self._session.get(f"@/*/router/{kind}/**", timeout=TOKENS_S):
+            if reply.ok is not None:
+                key = head.sub("", str(reply.ok.key_expr))
+                sources = json.loads(reply.ok.payload.to_bytes())
+                found[key] = (*found.get(key, ()), *sources.get("clients", ()))
+        return found
 
     def neighbours(self) -> dict[str, str]:
         """Who is linked to this session at present: its id -> what it is and where."""

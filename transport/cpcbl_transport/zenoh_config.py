@@ -78,11 +78,13 @@ def router_config(
 ) -> dict[str, Any]:
     """Of a router that listens at all of `listen` and joins the routers at `connect`.
 
-    It looks for these as long as it lives, again after a link broke. `guards`: what `guard_rules`
+    It looks for these as long as it lives, again after a link broke. It says who declared what
+    (`ZenohBus.declarations`). `guards`: what `guard_rules`
     and `access_control` say; none, and everything is let in.
     """
     here = {"endpoints": list(listen), "exit_on_failure": True}
-    return {**_config("router", connect, -1, credentials, listen=here), **(guards or {})}
+    config = _config("router", connect, -1, credentials, listen=here)
+    return {**config, "adminspace": {"enabled": True}, **(guards or {})}
 
 
 def guard_rules(team: Team, speed: float = 1.0) -> dict[str, Any]:

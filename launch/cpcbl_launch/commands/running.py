@@ -232,6 +232,7 @@ def router(
     from cpcbl_launch.run.router import run_router, team_router
     from cpcbl_transport.zenoh_bus import read_router_config
 
+    team = None
     if config is not None and file is None:
         if listen or connect:
             raise InputError(

@@ -21,9 +21,13 @@ from cpcbl_launch.reporting.metrics import (
 )
 from cpcbl_launch.reporting.statuses import (
     FlowReport,
+    InputReport,
+    ProblemLog,
+    ProblemReport,
     SpendingReport,
     TrustReport,
     are_limits_kept,
+    input_reports,
     summed_flows,
     summed_spending,
     trust_reports,
@@ -32,7 +36,15 @@ from cpcbl_team.config import Team
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus
 from cpcbl_transport.decoding import decode
-from cpcbl_transport.messages import Refusal, Status, Tagged, Track, Truth, Truths, decode_tagged
+from cpcbl_transport.messages import (
+    Refusal,
+    Status,
+    Tagged,
+    Track,
+    Truth,
+    Truths,
+    decode_tagged,
+)
 
 
 class LearnedReport(msgspec.Struct, frozen=True, kw_only=True):
@@ -65,6 +77,8 @@ class RobotReport(Score, frozen=True, kw_only=True):
     spending: tuple[SpendingReport, ...] = ()  # its limits; empty where there are none
     trust: tuple[TrustReport, ...] = ()
     """Teammates whose messages it received at the end, or that were in quarantine."""
+    inputs: tuple[InputReport, ...] = ()  # of its last process
+    problems: tuple[ProblemReport, ...] = ()  # of its inputs
 
 
 class Phase(Score, frozen=True, kw_only=True):
@@ -123,6 +137,7 @@ class Report(msgspec.Struct, frozen=True, kw_only=True):
     duration_s: float = 0.0
     starts: str = ""  # what robots knew of their start poses, on a log
     restarts: dict[str, int] = {}
+    strays: tuple[str, ...] = ()  # who published inputs to a team or robot that is not there
     refused: dict[str, int] = {}  # messages that the recorder could not use, by reason
     not_written: dict[str, str] = {}  # files that could not be written, with the reason
     alone: dict[str, Phase] = {}  # before collaboration began, where it began late
@@ -167,6 +182,9 @@ class Recorder:
         self.truths: EncodedLog[Truths] = EncodedLog()
         self.counts: Counter[str] = Counter()
         """Accepted messages by topic, and refused ones by reason."""
+        self.strays: tuple[str, ...] = ()
+        """Who publishes inputs to a team or robot that is not there; others set it."""
+        self._problems: dict[str, ProblemLog] = {}
         self._processes: dict[str, dict[str, Status]] = {}  # the last status by incarnation
         for topic in (topics.TRACK, topics.STATUS, topics.TRUTH):
             bus.subscribe(topic.at(), self._receive)
@@ -181,6 +199,7 @@ class Recorder:
                     self.tracks.setdefault(message.robot, EncodedLog()).append(payload)
                 case Status():
                     self.status[message.robot] = message
+                    self._problems.setdefault(message.robot, ProblemLog()).add(message)
                     self._processes.setdefault(message.robot, {})[message.incarnation] = message
                 case Truths():
                     self.truths.append(payload)
@@ -269,6 +288,8 @@ class Recorder:
             heard=summed_flows(s.heard for s in statuses),
             spending=summed_spending(s.spending for s in statuses),
             trust=trust_reports(statuses),
+            inputs=input_reports(statuses[-1]) if statuses else (),
+            problems=self._problems[name].reports if name in self._problems else (),
         )
 
 

@@ -6,6 +6,7 @@ from itertools import chain
 
 import msgspec
 
+from cpcbl_agents.input_problems import without_numbers
 from cpcbl_team.miscalibration import MISPLACED
 from cpcbl_transport.messages import Flow, Spending, Status, Trust
 
@@ -50,6 +51,58 @@ class TrustReport(msgspec.Struct, frozen=True, kw_only=True):
     unconfirmed: bool
     """No other teammate confirmed or contradicted it, so that a bias could not be detected."""
     late_s: float  # the least time from stamp to arrival; below zero the teammate's clock is ahead
+
+
+class InputReport(msgspec.Struct, frozen=True, kw_only=True):
+    """What a robot received on one input, since its last process started."""
+
+    input: str  # odometry, sightings, position or frame
+    rate_hz: float  # at the end
+    latest_ns: int
+    taken: int
+    refused: dict[str, int]  # by reason
+    offset_s: float  # the median of arrival minus stamp
+
+
+def input_reports(status: Status) -> tuple[InputReport, ...]:
+    """Of a robot's latest status."""
+    inputs = status.inputs
+    return tuple(msgspec.convert(i, InputReport, from_attributes=True) for i in inputs)
+
+
+class ProblemReport(msgspec.Struct, frozen=True, kw_only=True):
+    """Something that was wrong with a robot's inputs, in its latest words, and for how long."""
+
+    text: str
+    seconds: float
+
+
+class ProblemLog:
+    """The problems of one robot over a run, by its statuses."""
+
+    def __init__(self) -> None:
+        self._texts: dict[str, str] = {}
+        self._statuses: Counter[str] = Counter()
+
+    def add(self, status: Status) -> None:
+        """To be called with each status, of which there is one a second."""
+        for text in status.problems:
+            what = without_numbers(text)
+            self._texts[what] = text
+            self._statuses[what] += 1
+
+    @property
+    def reports(self) -> tuple[ProblemReport, ...]:
+        """All of them, the longest first."""
+        longest = self._statuses.most_common()
+        return tuple(ProblemReport(text=self._texts[w], seconds=float(n)) for w, n in longest)
+
+
+def problem_remarks(robot: str, problems: Iterable[ProblemReport]) -> Iterator[str]:
+    """What a report says of them, in words."""
+    for problem in problems:
+        stop = "" if problem.text.endswith("?") else "."
+        yield f"Robot {robot}, for {problem.seconds:.0f} s: {problem.text}{stop}"
 
 
 COUNTS = ("messages", "bytes", "over_budget", "worthless", "silent")

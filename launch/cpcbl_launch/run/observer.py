@@ -13,7 +13,8 @@ import msgspec
 from cpcbl_agents.clock import Clock
 from cpcbl_agents.node import GuestNode
 from cpcbl_agents.process import Loop, new_incarnation, own_camera, stop_on_clock_step
-from cpcbl_launch.reporting.statuses import FlowReport, summed_flows
+from cpcbl_agents.robot_log import RobotLog
+from cpcbl_launch.reporting.statuses import FlowReport, ProblemLog, ProblemReport, summed_flows
 from cpcbl_launch.simulation.guests import unsupported_delay
 from cpcbl_launch.team_file import read_layer, with_added_robot
 from cpcbl_team.config import Team
@@ -21,7 +22,7 @@ from cpcbl_team.errors import InputError
 from cpcbl_team.inputs import NAME_PATTERN
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus
-from cpcbl_transport.messages import model_from_settings
+from cpcbl_transport.messages import Status, model_from_settings
 from cpcbl_transport.security import Identity, link_of
 from cpcbl_transport.topics import Role
 from cpcbl_transport.zenoh_bus import open_bus
@@ -61,6 +62,7 @@ class ObserverReport(msgspec.Struct, frozen=True, kw_only=True):
     sent: tuple[FlowReport, ...]
     heard: tuple[FlowReport, ...]
     counts: dict[str, int]
+    problems: tuple[ProblemReport, ...] = ()  # of its inputs
 
 
 def presets() -> list[str]:
@@ -161,9 +163,17 @@ def run_observer(
     ):
         _require_unique_name(name, bus)
         start_ns, incarnation = clock.now_ns(), new_incarnation()
+        said, problems = RobotLog(name), ProblemLog()
+
+        def on_status(status: Status) -> None:
+            said.tell(status)
+            problems.add(status)
+
         node = GuestNode(
-            name, team, bus, start_ns, incarnation, loop.on_arrival, clock.speed, camera
+            *(name, team, bus, start_ns, incarnation, loop.on_arrival),
+            *(clock.speed, camera, on_status),
         )
+        said.connected(team, link.endpoints)
         over = stop_on_clock_step(name, team, clock, stop)
         loop.run(node, lambda: over() or clock.now_ns() - start_ns >= duration_s * 1e9)
         end_ns = clock.now_ns()
@@ -179,6 +189,7 @@ def run_observer(
         sent=summed_flows([node.robot.collaboration.counters.flows()]),
         heard=summed_flows([node.received.flows()]),
         counts=dict(node.robot.counts + node.counts),
+        problems=problems.reports,
     )
 
 

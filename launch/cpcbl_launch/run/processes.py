@@ -34,7 +34,6 @@ class Task(NamedTuple):
     name: str
     arguments: tuple[str, ...]
     identity: Identity  # whose keys it needs in a secured team
-    on_restart: tuple[str, ...] = ()
 
 
 def tasks(
@@ -42,12 +41,7 @@ def tasks(
 ) -> list[Task]:
     """name | arguments | when: the field if any robot is simulated, one process a robot."""
     rows = [
-        Task(
-            ROBOT + name,
-            ("robot", team_file, name, *common),
-            Identity(Role.ROBOT, name),
-            ("--restarted",),
-        )
+        Task(ROBOT + name, ("robot", team_file, name, *common), Identity(Role.ROBOT, name))
         for name in team.robots
         if name in here
     ]
@@ -62,7 +56,6 @@ class ProcessSpec(NamedTuple):
 
     name: str
     command: tuple[str, ...]
-    on_restart: tuple[str, ...] = ()  # added to the command from the second start on
 
 
 def process_table(
@@ -75,8 +68,8 @@ def process_table(
         for name, s in team.simulation.clocks_ahead_s.items()
     }
     table = [
-        ProcessSpec(name, (*PROGRAM, *arguments, *clocks.get(name, ())), on_restart)
-        for name, arguments, _, on_restart in tasks(team, str(team_file), common, seed, here)
+        ProcessSpec(name, (*PROGRAM, *arguments, *clocks.get(name, ())))
+        for name, arguments, _ in tasks(team, str(team_file), common, seed, here)
     ]
     if team.gateway is not None:
         gateway = ("gateway", str(team_file), "--connect", endpoint, "--parent", str(os.getpid()))
@@ -111,13 +104,13 @@ class _Child:
         self.spec, self.restarts, self.backoff_s = spec, 0, FIRST_BACKOFF_S
         self.due_s: float | None = None
         self._log = folder / f"{spec.name}.log"
-        self.process = self._start(())
+        self.process = self._start()
 
-    def _start(self, more: tuple[str, ...]) -> "subprocess.Popen[bytes]":
+    def _start(self) -> "subprocess.Popen[bytes]":
         self.started_s = time.monotonic()
         with self._open_log() as output:
             return subprocess.Popen(
-                [*self.spec.command, *more],
+                self.spec.command,
                 stdin=subprocess.DEVNULL,
                 stdout=output,
                 stderr=subprocess.STDOUT,
@@ -154,7 +147,7 @@ class _Child:
         elif now >= self.due_s:
             self.due_s = None
             self.restarts += 1
-            self.process = self._start(self.spec.on_restart)
+            self.process = self._start()
 
 
 class Supervisor:

@@ -40,8 +40,9 @@ def robot_parser(program: str = "cpcbl-team robot") -> argparse.ArgumentParser:
     add(
         "--restarted",
         action=argparse.BooleanOptionalAction,
-        default=False,
-        help="The robot does not know its pose: it has to find it first.",
+        default=None,
+        help="Whether it has moved since the team started, and has to find its pose; default: what"
+        " the team's router remembers.",
     )
     add("--clock", default="", help=argparse.SUPPRESS)
     add("--parent", type=int, help=argparse.SUPPRESS)

@@ -15,12 +15,14 @@ import msgspec
 import numpy as np
 
 from cpcbl_agents.clock import Clock
+from cpcbl_agents.earlier_processes import repeat_tokens
 from cpcbl_launch.checks import require_duration
 from cpcbl_launch.reporting.files import write_or_reason
 from cpcbl_launch.reporting.metrics import Floats
 from cpcbl_launch.reporting.phases import Span, guest_reports, phase_report
 from cpcbl_launch.reporting.recorder import Recorder, Report, variants_of
 from cpcbl_launch.reporting.recording import Recording
+from cpcbl_launch.run.linked import declared_at, stray_inputs
 from cpcbl_launch.run.logged_team import is_calibrated_on
 from cpcbl_launch.run.processes import Processes, Supervisor, process_table, tasks
 from cpcbl_launch.run.router import team_router
@@ -31,7 +33,7 @@ from cpcbl_team.errors import InputError
 from cpcbl_transport.bus import Bus
 from cpcbl_transport.security import Identity, link_of
 from cpcbl_transport.topics import Role, namespace
-from cpcbl_transport.zenoh_bus import open_router
+from cpcbl_transport.zenoh_bus import open_onlooker, open_router
 
 log = logging.getLogger(__name__)
 
@@ -39,6 +41,7 @@ LEAD_S = 2.0
 LEAD_S_A_PROCESS = 0.3
 LEAD_S_A_CAMERA = 1.0  # OpenCV is loaded, the lens laid out
 REFRESH_S = 0.25
+STRAYS_S = 2.0
 SIMULATED_S = 30.0  # by default
 LEAST_S = 1.0
 
@@ -89,7 +92,10 @@ class OnThisMachine:
     def router(self) -> AbstractContextManager[Bus]:
         team, listen = self._run.team, self._run.team.transport.listen
         require_keys(team, listen, self._here)
-        return open_router(team_router(team, listen, (), self._run.speed), namespace(team.name))
+        config = team_router(team, listen, (), self._run.speed)
+        bus = open_router(config, namespace(team.name))
+        repeat_tokens(bus)
+        return bus
 
     def processes(self, clock: Clock) -> AbstractContextManager[Processes]:
         team, path = self._run.team, self._folder / "team.json"
@@ -151,6 +157,7 @@ def run_team(
         recording = stack.enter_context(_recording(run, bus))
         recorder = Recorder(bus)
         stack.enter_context(watch(bus))
+        onlooker = _onlooker(run.team, launch, stack)
         clock = Clock.starting_in(launcher.lead_s, run.epoch_ns, run.speed)
         with launcher.processes(clock) as processes:
             end_ns = None if run.duration_s is None else int(run.duration_s * 1e9)
@@ -159,6 +166,7 @@ def run_team(
                 if end_ns is not None and elapsed_ns >= end_ns:
                     break
                 processes.watch()
+                onlooker(recorder)
                 show(recorder, processes, elapsed_ns * 1e-9)
                 time.sleep(REFRESH_S)
             elapsed_s = (clock.now_ns() - clock.epoch_ns) * 1e-9
@@ -168,6 +176,25 @@ def run_team(
         lost = {**report.not_written, str(run.record): recording.failed}
         report = msgspec.structs.replace(report, not_written=lost)
     return report
+
+
+def _onlooker(team: Team, launch: Launch, stack: ExitStack) -> Callable[[Recorder], None]:
+    """What notes now and then who publishes inputs to nobody. A secured team's router lets nobody
+    do so, and lets nobody ask."""
+    if launch is not OnThisMachine or team.transport.secured:
+        return lambda recorder: None
+    bus = stack.enter_context(open_onlooker(local_endpoint(team.transport.listen[0])))
+    next_s = 0.0
+
+    def look(recorder: Recorder) -> None:
+        nonlocal next_s
+        if time.monotonic() >= next_s:
+            next_s = time.monotonic() + STRAYS_S
+            kinds = ("publisher", "token")
+            found = [declared_at(bus.declarations(kind)) for kind in kinds]
+            recorder.strays = stray_inputs(team, *found)
+
+    return look
 
 
 def simulate_run(run: Run, progress: Progress | None = None) -> Report:
@@ -229,6 +256,7 @@ def _report(
         left_out=dict(run.left_out),
         duration_s=elapsed_s,
         restarts=restarts,
+        strays=recorder.strays,
         alone=alone,
         guests=guests,
         not_written=lost,

@@ -23,7 +23,8 @@ def open_bus_within(
     until_s = time.monotonic() + wait_s
     try:
         return open_bus(
-            team, link.endpoints, lambda: stop() or time.monotonic() > until_s, link.credentials
+            *(team, link.endpoints, lambda: stop() or time.monotonic() > until_s),
+            *(link.credentials, lambda reason: None),
         )
     except BusError:
         if stop():

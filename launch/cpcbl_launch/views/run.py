@@ -1,11 +1,12 @@
 """What a person sees: the live table, the report, progress. Fits 80 columns."""
 
 import math
+import time
 from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from statistics import fmean
 
-from rich.console import Console
+from rich.console import Console, Group, RenderableType
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 from rich.text import Text
@@ -17,6 +18,7 @@ from cpcbl_launch.reporting.statuses import (
     distrust_text,
     miscalibration_text,
     misplaced_objects,
+    problem_remarks,
     trust_remarks,
 )
 from cpcbl_launch.reporting.tables import number, percent, short, table
@@ -30,6 +32,7 @@ from cpcbl_transport.messages import Track, Truth
 FIGURES = ("RMSE m", "mean m", "max m", "deg", "in 3 σ", "NEES")
 ProgressSetter = Callable[[float], None]
 Cell = str | Text
+SILENT_S = 3.0  # real time without a track
 
 
 class LiveTable(LiveView):
@@ -41,10 +44,28 @@ class LiveTable(LiveView):
         """`robots` are those of the team file; every other robot is a guest."""
         super().__init__(console, quiet)
         self._title, self._robots = title, robots
+        self._heard: dict[str, tuple[int, float]] = {}
 
     def show(self, recorder: Recorder, processes: Processes, elapsed_s: float) -> None:
         """Called several times a second."""
-        self.draw(lambda: self._table(recorder, processes, elapsed_s), bool(recorder.tracks))
+        drawn = bool(recorder.tracks or recorder.strays)
+        self.draw(lambda: self._table_and_problems(recorder, processes, elapsed_s), drawn)
+
+    def _table_and_problems(
+        self, recorder: Recorder, processes: Processes, elapsed_s: float
+    ) -> RenderableType:
+        shown = self._table(recorder, processes, elapsed_s)
+        lines = [
+            f"{name}: {text}" for name, s in recorder.latest()[1].items() for text in s.problems
+        ]
+        return Group(shown, *(Text(line, "yellow") for line in (*recorder.strays, *lines)))
+
+    def _silent_s(self, name: str, track: Track | None) -> float:
+        """Real seconds since the latest track of a robot came."""
+        stamp_ns, now_s = 0 if track is None else track.stamp_ns, time.monotonic()
+        if self._heard.get(name, (-1, 0.0))[0] != stamp_ns:
+            self._heard[name] = stamp_ns, now_s
+        return now_s - self._heard[name][1]
 
     def _table(self, recorder: Recorder, processes: Processes, elapsed_s: float) -> Table:
         tracks, statuses, truths = recorder.latest()
@@ -63,8 +84,10 @@ class LiveTable(LiveView):
         for name in [*here, *others]:  # guests last
             process = f"{ROBOT}{name}"
             pid = str(pids[process]) if process in pids else "down" if name in here else "away"
-            state = _state(tracks.get(name), pid, restarts.get(process, 0))
-            status = statuses.get(name)
+            status, track = statuses.get(name), tracks.get(name)
+            silent_s = self._silent_s(name, track)
+            problems = status is not None and bool(status.problems)
+            state = _state(track, pid, restarts.get(process, 0), silent_s, problems)
             if status is not None and (text := distrust_text(status.trust)):
                 state.append(f", {text}", "yellow")
             if status is not None and status.counts.get("miscalibrated"):
@@ -85,13 +108,17 @@ class LiveTable(LiveView):
         return shown
 
 
-def _state(track: Track | None, pid: str, restarts: int) -> Text:
+def _state(track: Track | None, pid: str, restarts: int, silent_s: float, problems: bool) -> Text:
     if pid == "down":
         state = Text("down", style="bold red")
     elif track is None:
         state = Text("starting", style="dim")
-    else:
-        state = Text(f"lost: {track.lost}", "bold red") if track.lost else Text("ok", "green")
+    elif silent_s >= SILENT_S:
+        state = Text(f"silent for {silent_s:.0f} s", "bold red")
+    elif track.lost:
+        state = Text(f"lost: {track.lost}", "bold red")
+    else:  # what the problem is stands below the table
+        state = Text("problem", "yellow") if problems else Text("ok", "green")
     return state.append(f" (restarted {restarts})", "yellow") if restarts else state
 
 
@@ -184,6 +211,8 @@ def print_observer_report(report: ObserverReport, console: Console) -> None:
         console.print(f"{report.name} is lost: {report.lost}", style="yellow", highlight=False)
     if report.unfed:
         console.print(f"{report.name}: {report.unfed}", style="yellow", highlight=False)
+    for line in problem_remarks(report.name, report.problems):
+        console.print(line, style="yellow", highlight=False, markup=False)
 
 
 def _baseline_table(report: Report) -> Table:
@@ -236,7 +265,10 @@ def _remarks(report: Report) -> Iterator[str]:
         for place in misplaced_objects(r.counts):
             yield f"Robot {name} finds {place} elsewhere than on the map; measure its place again."
     for name, r in report.robots.items():
+        yield from problem_remarks(name, r.problems)
         yield from trust_remarks(name, r.trust)
+    for text in report.strays:
+        yield f"{text[0].upper()}{text[1:]}."
     if report.refused:
         counts = ", ".join(f"{reason} {n}" for reason, n in report.refused.items())
         yield f"Messages that could not be used, by reason: {counts}."

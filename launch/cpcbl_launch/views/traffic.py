@@ -54,6 +54,7 @@ class LiveRobot(msgspec.Struct, frozen=True, kw_only=True):
     heard: tuple[LiveFlow, ...]
     spending: tuple[SpendingReport, ...]
     trust: tuple[TrustReport, ...] = ()  # what it makes of teammates
+    problems: tuple[str, ...] = ()  # of its inputs
 
 
 class HelpLink(msgspec.Struct, frozen=True, kw_only=True):
@@ -121,6 +122,7 @@ def _live_robot(arrivals: Sequence[Arrival], now_s: float) -> LiveRobot:
         heard=tuple(_live_flows(first, last, first.heard, last.heard)),
         spending=summed_spending([last.spending]),
         trust=trust_reports([last]),
+        problems=last.problems,
     )
 
 

@@ -123,9 +123,13 @@ def traffic_view(now: Traffic, where: str) -> Group:
         for name, robot in now.robots.items()
         if robot.spending
     ]
+    problems = [
+        Text(f"{name}: {text}", "yellow") for name, r in now.robots.items() for text in r.problems
+    ]
     return Group(
         Text(title, "bold"),
         help_table(now),
+        *problems,
         *limits,
         "",
         flow_table(now),

@@ -127,7 +127,7 @@ def compose_text(team: Team, how: Deployment) -> str:
         at=_flow(["CMD", "linked", "at", str(PORT)]),
     )
     services = []
-    for name, arguments, identity, _ in tasks(team, how.team_file, common, how.seed, here):
+    for name, arguments, identity in tasks(team, how.team_file, common, how.seed, here):
         keys = _own_mounts(how, identity)
         services.append(_SERVICE.format(name=name, command=_flow(arguments), keys=keys))
     return "".join([head, router_service, *services])

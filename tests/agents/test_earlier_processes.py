@@ -1,0 +1,61 @@
+"""The router remembers which robots have run and moved, also where it certifies names."""
+
+from contextlib import ExitStack, closing
+from pathlib import Path
+
+import pytest
+from support.buses import wait_until
+from support.keys import R1, R2, ROUTER, secured_team, session, shown_by
+from support.routers import open_router
+
+from cpcbl_agents.earlier_processes import NEVER_RAN, Before, OwnTokens, repeat_tokens
+from cpcbl_launch.run.up import free_endpoint
+from cpcbl_team.config import Team
+from cpcbl_transport import topics
+from cpcbl_transport.security import Identity, access_control
+from cpcbl_transport.zenoh_bus import ZenohBus, open_bus
+
+
+def before(bus: ZenohBus, robot: str = "r1") -> Before:
+    return Before.by_tokens(bus.tokens(topics.RAN.at(robot=robot)))
+
+
+def check(first: ZenohBus, second: ZenohBus, other: ZenohBus) -> None:
+    """`first` and `second` are of processes of r1, `other` of r2."""
+    assert before(first) == before(other, "r2") == NEVER_RAN
+    tokens = OwnTokens(first, "r1", "1")
+    wait_until(lambda: before(second) == Before(ran=True))
+    tokens.tell_moved()
+    tokens.tell_moved()
+    wait_until(lambda: len(second.tokens(topics.RAN.at(robot="r1"))) == 4)
+    first.close()
+    wait_until(lambda: len(second.tokens(topics.RAN.at(robot="r1"))) == 2)  # the router's
+    assert before(second) == Before(moved=True, ran=True)
+    assert before(other, "r2") == NEVER_RAN
+
+
+def test_a_router_remembers_who_has_moved() -> None:
+    endpoint = free_endpoint()
+    with ExitStack() as stack:
+        repeat_tokens(stack.enter_context(open_router("lab", [endpoint])))
+        check(*(stack.enter_context(open_bus("lab", [endpoint])) for _ in range(3)))
+
+
+@pytest.fixture(scope="module")
+def team(tmp_path_factory: pytest.TempPathFactory) -> Team:
+    folder: Path = tmp_path_factory.mktemp("keys")
+    return secured_team(folder)
+
+
+def member(stack: ExitStack, team: Team, who: Identity, endpoint: str) -> ZenohBus:
+    bus = stack.enter_context(closing(session(team, who, endpoint)))
+    assert isinstance(bus, ZenohBus)
+    return bus
+
+
+def test_so_does_one_that_certifies_names(team: Team) -> None:
+    endpoint = free_endpoint("tls")
+    keys = {"guards": access_control(team), "credentials": shown_by(team, ROUTER)}
+    with ExitStack() as stack:
+        repeat_tokens(stack.enter_context(open_router(team.name, [endpoint], **keys)))  # type: ignore[arg-type]
+        check(*(member(stack, team, who, endpoint) for who in (R1, R1, R2)))
