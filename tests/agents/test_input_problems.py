@@ -193,7 +193,8 @@ WRONG = {
     "other names": (each_sighting(id=lambda n: n.replace("oo", "o")), "`dor` (`door`?) is no"),
     "no odometry": (without_odometry, "no odometry on in/r1/odometry for 12 s; is its driver"),
     "empty": (lambda m, t: [b""], "payloads are empty"),
-    "text": (lambda m, t: [b'{"stamp_ns": 1}'], "the first byte is not the version"),
+    "text": (lambda m, t: [b"stamp 1"], "the first byte is not the version"),
+    "bad JSON": (lambda m, t: [b'{"stamp": 1}'], "unknown key 'stamp'; did you mean 'stamp_ns'?"),
 }
 
 

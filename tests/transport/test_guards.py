@@ -56,6 +56,7 @@ def test_every_target_and_beliefs_have_a_rate_and_every_key_a_size() -> None:
         "cpcbl/tests/belief/*/*": 99,
         "cpcbl/tests/status/*": 999,
         "cpcbl/tests/track/*": 999,
+        "cpcbl/tests/pose/*": 999,
         "cpcbl/tests/in/*/odometry": 999,
         "cpcbl/tests/in/*/sightings": 999,
         "cpcbl/tests/in/*/position": 999,
