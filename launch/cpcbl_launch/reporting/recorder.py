@@ -9,12 +9,14 @@ from typing import Generic, TypeVar, cast
 import msgspec
 import numpy as np
 
+from cpcbl_launch.reporting.activity import ActivityLog
 from cpcbl_launch.reporting.metrics import (
     ErrorFigures,
     Floats,
     Samples,
     Score,
     Trajectory,
+    interpolated_truth,
     samples_with_truth,
     score,
     seconds,
@@ -133,6 +135,7 @@ class Report(msgspec.Struct, frozen=True, kw_only=True):
 
 
 M = TypeVar("M", bound=Tagged)
+RECENT = 20  # messages of which an error is known although truth comes later than the estimate
 
 
 class EncodedLog(Generic[M]):
@@ -152,6 +155,10 @@ class EncodedLog(Generic[M]):
     def __iter__(self) -> Iterator[M]:
         return (cast(M, decode_tagged(payload)) for payload in tuple(self._payloads))
 
+    def recent(self) -> list[M]:
+        """The newest messages, in the order of their arrival."""
+        return [cast(M, decode_tagged(payload)) for payload in self._payloads[-RECENT:]]
+
     @property
     def last(self) -> M:
         return cast(M, decode_tagged(self._payloads[-1]))
@@ -165,6 +172,7 @@ class Recorder:
         self.tracks: dict[str, EncodedLog[Track]] = {}
         self.status: dict[str, Status] = {}
         self.truths: EncodedLog[Truths] = EncodedLog()
+        self.activity: dict[str, ActivityLog] = {}
         self.counts: Counter[str] = Counter()
         """Accepted messages by topic, and refused ones by reason."""
         self._processes: dict[str, dict[str, Status]] = {}  # the last status by incarnation
@@ -181,6 +189,7 @@ class Recorder:
                     self.tracks.setdefault(message.robot, EncodedLog()).append(payload)
                 case Status():
                     self.status[message.robot] = message
+                    self.activity.setdefault(message.robot, ActivityLog()).add(message)
                     self._processes.setdefault(message.robot, {})[message.incarnation] = message
                 case Truths():
                     self.truths.append(payload)
@@ -197,6 +206,21 @@ class Recorder:
             truth = {t.robot: t for t in self.truths.last.robots} if self.truths else {}
             tracks = {name: t.last for name, t in self.tracks.items()}
             return tracks, dict(self.status), truth
+
+    def latest_errors_m(self) -> dict[str, float]:
+        """The position error of every robot's newest estimate for whose time truth is known."""
+        with self._lock:
+            truth = truth_rows(self.truths.recent())
+            tracks = {name: log.recent() for name, log in self.tracks.items() if name in truth}
+        errors_m = {}
+        for name, recent in tracks.items():
+            rows = truth[name]
+            for track in recent:
+                at_s = track.stamp_ns * 1e-9
+                at, counts = interpolated_truth(np.array([at_s]), rows)
+                if counts[0] and rows[0, 0] <= at_s <= rows[-1, 0]:
+                    errors_m[name] = math.hypot(track.x_m - at[0, 0], track.y_m - at[0, 1])
+        return errors_m
 
     def simulated_truth(self) -> dict[str, Floats]:
         """Rows of seconds, x, y, heading for every robot of the simulated field."""

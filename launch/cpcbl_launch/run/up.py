@@ -201,11 +201,11 @@ def _report(
     guests = guest_reports(recorder, list(robots), truth, epoch_s, begin_s)
     lost: dict[str, str] = {}
     if run.picture is not None:
-        from cpcbl_launch.reporting.picture import draw_run
+        from cpcbl_launch.reporting.picture import Times, draw_run
 
         present_s = {name: guest.present_s for name, guest in guests.items()}
-        times = epoch_s, helped_from_s, present_s
-        drawn = partial(draw_run, recorder, run.team, truth, run.picture, *times)
+        times = Times(epoch_s, elapsed_s, helped_from_s, present_s)
+        drawn = partial(draw_run, recorder, run.team, truth, run.picture, times)
         lost = write_or_reason(run.picture, drawn)
     report = recorder.report(variants_of(run.team), truth, begin_s)
     alone = {}

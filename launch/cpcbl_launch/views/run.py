@@ -20,7 +20,7 @@ from cpcbl_launch.run.processes import ROBOT, Processes
 from cpcbl_launch.views.live import LiveView
 from cpcbl_launch.views.traffic_tables import COLUMNS_EXPLAINED, help_traffic_table, limits_text
 from cpcbl_team.tiers import LOWEST_TIER
-from cpcbl_transport.messages import Track, Truth
+from cpcbl_transport.messages import Track
 
 FIGURES = ("RMSE m", "mean m", "max m", "deg", "in 3 σ", "NEES")
 ProgressSetter = Callable[[float], None]
@@ -42,7 +42,7 @@ class LiveTable(LiveView):
         self.draw(lambda: self._table(recorder, processes, elapsed_s), bool(recorder.tracks))
 
     def _table(self, recorder: Recorder, processes: Processes, elapsed_s: float) -> Table:
-        tracks, statuses, truths = recorder.latest()
+        (tracks, statuses, _), errors_m = recorder.latest(), recorder.latest_errors_m()
         shown = table(
             f"{self._title}, {elapsed_s:.1f} s",
             ("robot",),
@@ -67,7 +67,7 @@ class LiveTable(LiveView):
             if name not in self._robots:
                 there = newest_ns - tracks[name].stamp_ns <= AWAY_S * 1e9
                 pid, state = "guest", state if there else Text("left", "dim")
-            pose = _pose_cells(tracks.get(name), truths.get(name))
+            pose = _pose_cells(tracks.get(name), errors_m.get(name))
             traffic = [""] * 4
             if (s := status) is not None:
                 counts = s.messages_sent, s.bytes_sent, s.messages_received, s.bytes_received
@@ -88,15 +88,14 @@ def _state(track: Track | None, pid: str, restarts: int) -> Text:
     return state.append(f" (restarted {restarts})", "yellow") if restarts else state
 
 
-def _pose_cells(track: Track | None, truth: Truth | None) -> list[Cell]:
+def _pose_cells(track: Track | None, error_m: float | None) -> list[Cell]:
     if track is None:
         return [""] * 6
     x, y, heading = f"{track.x_m:.2f}", f"{track.y_m:.2f}", f"{math.degrees(track.heading_rad):.0f}"
     c, error_cell = track.covariance, Text("-")
-    if truth is not None:
-        error = math.hypot(truth.x_m - track.x_m, truth.y_m - track.y_m)
-        colour = "green" if error < 0.15 else "yellow" if error < 0.5 else "red"
-        error_cell = Text(f"{error:.3f}", colour)
+    if error_m is not None:
+        colour = "green" if error_m < 0.15 else "yellow" if error_m < 0.5 else "red"
+        error_cell = Text(f"{error_m:.3f}", colour)
     tier = Text(str(track.tier), "green" if track.tier < LOWEST_TIER // 2 else "yellow")
     sigma = number(None if c is None else math.sqrt(0.5 * (c[0] + c[2])))
     return [x, y, heading, sigma, error_cell, tier]
