@@ -20,6 +20,7 @@ from cpcbl_launch.reporting.metrics import (
     samples_with_truth,
     score,
     seconds,
+    stated_sigma_m,
 )
 from cpcbl_launch.reporting.statuses import (
     FlowReport,
@@ -67,6 +68,16 @@ class RobotReport(Score, frozen=True, kw_only=True):
     spending: tuple[SpendingReport, ...] = ()  # its limits; empty where there are none
     trust: tuple[TrustReport, ...] = ()
     """Teammates whose messages it received at the end, or that were in quarantine."""
+    inputs: int | None = None
+    """Odometry, sightings, positions and frames that it received; None where no status tells."""
+    sigma_rms_m: float | None = None
+    sigma_max_m: float | None = None
+    """Of the position's standard deviation as the robot states it; None where it states none."""
+
+    @property
+    def has_data(self) -> bool:
+        """Whether anything was heard of it, and it heard anything from its sensors."""
+        return self.inputs != 0 and self.lost_at_end != NOT_HEARD
 
 
 class Phase(Score, frozen=True, kw_only=True):
@@ -133,8 +144,15 @@ class Report(msgspec.Struct, frozen=True, kw_only=True):
     yardsticks: dict[str, BaselineReport] = {}
     """dead_reckoning, solo_ekf, centralized_ekf, batch_least_squares, where they were asked for."""
 
+    @property
+    def has_data(self) -> bool:
+        """Whether any robot of the team has."""
+        return any(robot.has_data for robot in self.robots.values())
+
 
 M = TypeVar("M", bound=Tagged)
+INPUTS = ("odometry", "sightings", "position", "frame")  # the counts of what a robot received
+NOT_HEARD = "no estimate was received"
 RECENT = 20  # messages of which an error is known although truth comes later than the estimate
 
 
@@ -268,7 +286,8 @@ class Recorder:
     ) -> RobotReport:
         """One robot's figures from `from_s` on."""
         _, _, last_truth = self.latest()
-        figures = score(self.samples(name, truth, from_s))
+        path = self.trajectory(name, from_s)
+        figures, sigma_m = score(samples_with_truth(path, truth)[1]), stated_sigma_m(path)
         tracks = list(self.tracks.get(name, ()))
         statuses = list(self._processes.get(name, {}).values())
         counts = Counter[str]()
@@ -279,9 +298,9 @@ class Recorder:
         return RobotReport(
             **msgspec.structs.asdict(figures),
             variant=variant,
-            lost_share=sum(bool(t.lost) for t in tracks) / max(len(tracks), 1),
+            lost_share=float(np.mean([bool(t.lost) for t in tracks])) if tracks else 1.0,
             longest_lost_s=_longest_lost_s(tracks),
-            lost_at_end=tracks[-1].lost if tracks else "no estimate was received",
+            lost_at_end=tracks[-1].lost if tracks else NOT_HEARD,
             bumps=last_truth[name].bumps if name in last_truth else 0,
             messages_sent=sum(s.messages_sent for s in statuses),
             bytes_sent=sum(s.bytes_sent for s in statuses),
@@ -293,6 +312,9 @@ class Recorder:
             heard=summed_flows(s.heard for s in statuses),
             spending=summed_spending(s.spending for s in statuses),
             trust=trust_reports(statuses),
+            sigma_rms_m=float(np.sqrt(np.mean(sigma_m**2))) if len(sigma_m) else None,
+            sigma_max_m=float(sigma_m.max()) if len(sigma_m) else None,
+            inputs=sum(counts[name] for name in INPUTS) if statuses else None,
         )
 
 

@@ -29,9 +29,9 @@ from cpcbl_launch.team_file import save_resolved
 from cpcbl_team.config import Team
 from cpcbl_team.errors import InputError
 from cpcbl_transport.bus import Bus
-from cpcbl_transport.security import link_of
-from cpcbl_transport.topics import namespace
-from cpcbl_transport.zenoh_bus import open_router
+from cpcbl_transport.security import Identity, link_of
+from cpcbl_transport.topics import Role, namespace
+from cpcbl_transport.zenoh_bus import open_bus, open_router
 
 log = logging.getLogger(__name__)
 
@@ -41,6 +41,7 @@ LEAD_S_A_CAMERA = 1.0  # OpenCV is loaded, the lens laid out
 REFRESH_S = 0.25
 SIMULATED_S = 30.0  # by default
 LEAST_S = 1.0
+JOIN_S = 10.0  # so long a router that runs is looked for
 
 Stop = Callable[[], bool]
 Show = Callable[[Recorder, Processes, float], None]  # of a run to a person, and its seconds so far
@@ -60,6 +61,7 @@ class Run(NamedTuple):
     folder: Path | None = None  # where processes write their logs; None: a temporary folder
     picture: Path | None = None  # the picture of the run to write (PNG or SVG)
     record: Path | None = None  # the recording of the run to write (MCAP)
+    connect: tuple[str, ...] = ()  # a router that runs; none: the run starts one
 
 
 class Launcher(Protocol):
@@ -80,20 +82,33 @@ class OnThisMachine:
     """The router in this process, everybody else in a process of its own."""
 
     def __init__(self, run: Run, folder: Path, stop: Stop) -> None:
-        self._run, self._folder = run, folder
+        self._run, self._folder, self._stop = run, folder, stop
         self._here = run.team.robots if run.here is None else run.here
         cameras = sum(name in self._here for name in run.team.cameras)
         self.lead_s = LEAD_S + LEAD_S_A_PROCESS * len(self._here) + LEAD_S_A_CAMERA * cameras
 
     def router(self) -> AbstractContextManager[Bus]:
         team, listen = self._run.team, self._run.team.transport.listen
+        if self._run.connect:
+            return self._joined()
         require_keys(team, listen, self._here)
         return open_router(team_router(team, listen, (), self._run.speed), namespace(team.name))
+
+    def _joined(self) -> AbstractContextManager[Bus]:
+        run, until_s = self._run, time.monotonic() + JOIN_S
+        require_keys(run.team, run.connect, self._here)
+        link = link_of(run.team, Identity(Role.OPERATOR), run.connect)
+        return open_bus(
+            run.team.name,
+            link.endpoints,
+            lambda: self._stop() or time.monotonic() > until_s,
+            link.credentials,
+        )
 
     def processes(self, clock: Clock) -> AbstractContextManager[Processes]:
         team, path = self._run.team, self._folder / "team.json"
         save_resolved(team, path)
-        endpoint = local_endpoint(team.transport.listen[0])
+        endpoint = router_endpoint(self._run)
         table = process_table(team, path, endpoint, clock, self._run.seed, self._here)
         return Supervisor(table, self._folder)
 
@@ -126,6 +141,11 @@ def with_listen_endpoint(team: Team) -> Team:
 def local_endpoint(listen: str) -> str:
     """The endpoint at which robots of this machine find a router that listens everywhere."""
     return listen.replace("/0.0.0.0:", "/127.0.0.1:").replace("/[::]:", "/[::1]:")
+
+
+def router_endpoint(run: Run) -> str:
+    """Where robots of this machine, and who watches the run here, find the router."""
+    return run.connect[0] if run.connect else local_endpoint(run.team.transport.listen[0])
 
 
 def run_team(run: Run, show: Show, stop: Stop, launch: Launch = OnThisMachine) -> Report:

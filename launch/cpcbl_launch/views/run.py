@@ -18,10 +18,13 @@ from cpcbl_launch.reporting.tables import number, percent, short, table
 from cpcbl_launch.run.observer import ObserverReport
 from cpcbl_launch.run.processes import ROBOT, Processes
 from cpcbl_launch.views.live import LiveView
+from cpcbl_launch.views.own_figures import own_figures_table
 from cpcbl_launch.views.traffic_tables import COLUMNS_EXPLAINED, help_traffic_table, limits_text
 from cpcbl_team.tiers import LOWEST_TIER
 from cpcbl_transport.messages import Track
 
+NARROW = 61  # columns of a terminal, with which a table does without its less important ones
+WITHOUT = ("before m", "mean m", "max m", "out", "B")
 FIGURES = ("RMSE m", "mean m", "max m", "deg", "in 3 σ", "NEES")
 ProgressSetter = Callable[[float], None]
 Cell = str | Text
@@ -75,6 +78,8 @@ class LiveTable(LiveView):
             shown.add_row(name, pid, *pose, *traffic, state)
         if not self.fits(shown):
             shown.padding = (0, 0)  # closer together, before a state is folded
+        if self.width < NARROW:  # without traffic and process, before "ok" is
+            del shown.columns[8:12], shown.columns[1]
         return shown
 
 
@@ -103,7 +108,13 @@ def _pose_cells(track: Track | None, error_m: float | None) -> list[Cell]:
 
 def print_report(report: Report, console: Console) -> None:
     """The figures of a run as a table with units."""
-    console.print(_figures_table(report))
+    figures = _figures_table(report)
+    if console.width < NARROW:
+        figures.columns[:] = [c for c in figures.columns if c.header not in WITHOUT]
+    if report.team.position_rmse_m is not None or not report.has_data:
+        console.print(figures)
+    else:
+        console.print(own_figures_table(report))
     for name, guest in report.guests.items():
         console.print()
         console.print(_effects(name, guest))
@@ -141,7 +152,8 @@ def _figures_table(report: Report) -> Table:
 
 def _robot_cells(r: RobotReport) -> list[str]:
     """The cells of a robot from FIGURES on."""
-    return [*_figures(r), percent(r.lost_share), short(r.messages_sent), short(r.bytes_sent)]
+    lost = percent(r.lost_share) if r.has_data else "-"
+    return [*_figures(r), lost, short(r.messages_sent), short(r.bytes_sent)]
 
 
 def _effects(name: str, guest: GuestReport) -> Table:
@@ -218,6 +230,8 @@ def _remarks(report: Report) -> Iterator[str]:
             yield f"Robot {name} bumped into a landmark {r.bumps} times."
         if r.lost_at_end:
             yield f"Robot {name} is lost: {r.lost_at_end}."
+        elif not r.has_data:
+            yield f"Robot {name} received no input: neither odometry nor sightings nor a position."
     for name, r in report.robots.items():
         if (own := r.learned) is not None:  # what is done to readings
             scales = f"distance × {own.distance_scale:.2f}, turn × {own.turn_scale:.2f}"

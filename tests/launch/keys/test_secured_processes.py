@@ -77,7 +77,7 @@ def running(*command: object) -> Iterator["subprocess.Popen[str]"]:
     try:
         yield process
         if process.poll() is None:
-            process.send_signal(signal.SIGINT)
+            process.send_signal(signal.SIGTERM)
         assert process.wait(timeout=20) == 0
     finally:
         process.kill()
