@@ -78,7 +78,7 @@ def test_a_port_in_use_is_one_clear_line(command: tuple[str, ...], external: Pat
             words = ["up", str(external)]
         ran = cpcbl_team(*words)
     assert ran.returncode == 2
-    line = f"cannot listen on {endpoint}: another program listens there; end it, join it, or name"
+    line = f"cannot listen on {endpoint}: another program listens there; end or join it, or name"
     assert line in last_line(ran)
 
 

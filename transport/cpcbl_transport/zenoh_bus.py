@@ -96,7 +96,7 @@ def listening_at(config: Mapping[str, Any]) -> list[str]:
 
 
 LISTEN_PROBLEMS = {  # what the system says, and what that means to a user
-    "Address already in use": "another program listens there; end it, join it, or name another port",
+    "Address already in use": "another program listens there; end or join it, or name another port",
     "Cannot assign requested address": "no address of this machine; 0.0.0.0 is all of them",
     "failed to lookup address": "no such host; write the address of this machine",
     "Permission denied": "not allowed to this user; name a port from 1024 on",
