@@ -102,7 +102,7 @@ def up(
         result = run_team(run, table.show, StopSignal(), launch)
     lost = dict(result.not_written) | options.write_report(report, result)
     options.print_result(result, as_json, lambda: print_report(result, console), lost)
-    if not result.has_data:
+    if not result.has_data and not StopSignal.was_interrupted:
         _fail_without_data(run)
 
 

@@ -97,7 +97,7 @@ def test_a_secured_team_does_as_well_as_one_without_a_network(tmp_path: Path) ->
     watch = ("traffic", secured, "--connect", endpoint, "--wait", 60, "--json")
     with running(*watch) as watching:
         done = patient_up(secured, *run)
-        watching.send_signal(signal.SIGINT)
+        watching.send_signal(signal.SIGTERM)
         seen = json.loads(watching.communicate(timeout=20)[0])
     assert done.returncode == 0, done.stderr
     report = json.loads(done.stdout)
