@@ -2,12 +2,10 @@
 
 import logging
 import os
-import signal
 import threading
 import time
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, closing, nullcontext, suppress
-from types import FrameType
 
 import msgspec
 
@@ -17,6 +15,7 @@ from cpcbl_agents.node import Node, Steppable
 from cpcbl_agents.robot import Robot, build_robot
 from cpcbl_agents.robot_log import RobotLog
 from cpcbl_agents.sources import OwnCamera
+from cpcbl_agents.stop import StopSignal as StopSignal  # with a robot, one needs it
 from cpcbl_team.config import Team
 from cpcbl_team.errors import ClockError
 from cpcbl_transport import topics
@@ -32,25 +31,6 @@ LONGEST_WAIT_S = 0.2
 LATE_NS = 1_000_000_000
 MAX_CLOCK_STEP_S = 0.25  # a clock that is set by more makes inputs late, or from the future
 BUSY_NS = 1_000_000  # after a step: what comes sooner may have queued behind it
-
-
-class StopSignal:
-    """Becomes true with SIGINT, SIGTERM or SIGHUP (a closed terminal, ignored under nohup), or when
-    the process that started this one has ended."""
-
-    def __init__(self, parent: int | None = None) -> None:
-        self._event = threading.Event()
-        self._parent = parent
-        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-            if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:
-                signal.signal(number, self._on_signal)
-
-    def _on_signal(self, number: int, frame: FrameType | None) -> None:
-        self._event.set()
-
-    def __call__(self) -> bool:
-        orphaned = self._parent is not None and os.getppid() != self._parent
-        return orphaned or self._event.is_set()
 
 
 class Loop:

@@ -5,6 +5,7 @@ import math
 from collections.abc import Collection, Iterable
 from pathlib import Path
 
+from cpcbl_agents.extras import install_command
 from cpcbl_launch.team_checks import endpoint_problem
 from cpcbl_team.config import Team
 from cpcbl_team.errors import DependencyError, InputError
@@ -40,15 +41,13 @@ def require_matplotlib(what: str, path: Path | None = None) -> None:
         endings = " or ".join(PICTURE_ENDINGS)
         raise InputError(f"{what} {path}: not a picture; end its name in {endings}")
     if importlib.util.find_spec("matplotlib") is None:
-        raise DependencyError(f"{what} needs matplotlib: pip install 'cpcbl-team[plot]'")
+        raise DependencyError(f"{what} needs Matplotlib: {install_command('plot')}")
 
 
 def require_opencv(what: str) -> None:
     """Raises DependencyError where OpenCV is not installed."""
     if importlib.util.find_spec("cv2") is None:
-        from cpcbl_agents.sources import NEEDS_OPENCV
-
-        raise DependencyError(f"{what} {NEEDS_OPENCV}")
+        raise DependencyError(f"{what} needs OpenCV: {install_command('camera')}")
 
 
 def require_team_opencv(team: Team, robots: Collection[str] = (), field: bool = False) -> None:

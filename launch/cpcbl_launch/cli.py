@@ -1,25 +1,44 @@
 """The entry point `cpcbl-team`: runs a command, and says in one line what its user can mend."""
 
 import errno
-import logging
+import io
 import os
 import sys
-
-from cpcbl_launch.commands.old_forms import with_present_form
-from cpcbl_team.errors import CpcblError
 
 NOT_WRITABLE = {
     *(errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EPIPE),
     *(errno.EROFS, errno.EACCES, errno.EPERM, errno.EISDIR),
 }
+LONGEST = 600  # characters of a line that says what went wrong
+
+
+class _ClosedOutput(io.TextIOBase):
+    """Standard output that was closed before the start, as by `>&-`."""
+
+    def write(self, text: str) -> int:
+        raise OSError(errno.EIO, "it is closed")
 
 
 def main() -> None:
     """Runs the command line.
 
     An error that the user can mend is one line and exit code 2. A file that could not be written is
-    one line and exit code 1. Everything else is a bug, and its traceback is shown.
+    one line and exit code 1. After Ctrl-C the exit code is 130. Everything else is a bug, and its
+    traceback is shown.
     """
+    try:
+        _open_standard_files()
+        _run()
+    except KeyboardInterrupt:  # also while modules are imported, which takes most of the start
+        _end("stopped", 130)
+
+
+def _run() -> None:
+    import logging
+
+    from cpcbl_agents.stop import INTERRUPTED, StopSignal
+    from cpcbl_team.errors import CpcblError
+
     logging.basicConfig(format="%(asctime)s %(levelname)s %(message)s", level=logging.INFO)
     try:
         try:
@@ -33,11 +52,28 @@ def main() -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # at exit it is flushed once more
         _end(f"{name}: not written: {error.strerror}", 1)
     except CpcblError as error:
-        _end(str(error), 2)
+        _end(str(error), INTERRUPTED if StopSignal.was_interrupted else 2)
+    except SystemExit as end:
+        if StopSignal.was_interrupted and not end.code:
+            sys.exit(INTERRUPTED)
+        raise
+    if StopSignal.was_interrupted:
+        sys.exit(INTERRUPTED)
+
+
+def _open_standard_files() -> None:
+    """Makes them valid where they were closed: else the first socket would be standard output."""
+    while (descriptor := os.open(os.devnull, os.O_RDWR)) <= 2:
+        pass
+    os.close(descriptor)
+    sys.stdout = sys.stdout or _ClosedOutput()
+    sys.stderr = sys.stderr or open(os.devnull, "w")  # noqa: SIM115  it is needed until the end
 
 
 def _run_command() -> None:
     """A robot's process loads neither typer nor the other commands."""
+    from cpcbl_launch.commands.old_forms import with_present_form
+
     words = with_present_form(sys.argv[1:])
     if words[:1] == ["robot"]:
         from cpcbl_launch.run.robot import main as run_robot
@@ -52,5 +88,7 @@ def _run_command() -> None:
 def _end(problem: str, code: int) -> None:
     red, plain = ("\033[31m", "\033[0m") if sys.stderr.isatty() else ("", "")
     for line in problem.splitlines():
+        if len(line) > LONGEST:  # its beginning names the cause, its end the remedy
+            line = f"{line[: LONGEST - 155]} ... {line[-150:]}"
         sys.stderr.write(f"{red}cpcbl-team: {line}{plain}\n")
     sys.exit(code)

@@ -46,6 +46,9 @@ def find_team(path: Path) -> Team:
     """
     own = builtin_path(path.name)
     is_name = path == Path(path.name) and not path.exists()
+    if is_name and not own.exists() and not path.suffix:
+        known = sorted(other.stem for other in own.parent.glob("*.toml"))
+        raise TeamFileError(f"{path}: no such file; the built-in teams are {', '.join(known)}")
     return load_team(own if is_name and own.exists() else path)
 
 

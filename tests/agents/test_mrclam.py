@@ -257,3 +257,16 @@ def test_a_file_with_a_number_that_is_not_finite_is_named(
 def test_a_folder_without_a_log_is_named(tmp_path: Path) -> None:
     with pytest.raises(LogError, match=f"{tmp_path}.*get the data at"):
         mrclam.robots_in(tmp_path)
+
+
+@pytest.mark.parametrize("kind", ["Odometry", "Measurement", "Groundtruth"])
+def test_a_stamp_of_another_epoch_is_one_line_not_a_wait_of_years(
+    kind: str, tmp_path: Path
+) -> None:
+    write_log(tmp_path, ("1",), seconds=2.0)
+    path = tmp_path / f"Robot1_{kind}.dat"
+    first, *rows = [line for line in path.read_text().splitlines() if not line.startswith("#")]
+    path.write_text("\n".join([" ".join(["0.0", *first.split()[1:]]), *rows]))
+    with pytest.raises(LogError, match=r"the time jumps from 0\.000 to 12000000") as raised:
+        mrclam.read_truth(tmp_path, "1") if kind == "Groundtruth" else MrclamSource(tmp_path, "1")
+    assert str(path) in str(raised.value)

@@ -13,7 +13,8 @@ from support.buses import robot_at, team_of, wait_until, with_robot
 from cpcbl_agents import process
 from cpcbl_agents.clock import Clock
 from cpcbl_agents.earlier_processes import Before
-from cpcbl_agents.process import Loop, StopSignal, make_robot, new_incarnation, stop_on_clock_step
+from cpcbl_agents.process import Loop, make_robot, new_incarnation, stop_on_clock_step
+from cpcbl_agents.stop import StopSignal
 from cpcbl_team.config import BudgetSettings
 from cpcbl_team.errors import ClockError
 from cpcbl_transport.compact import STAMP_NS

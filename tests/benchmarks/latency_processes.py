@@ -15,8 +15,9 @@ import numpy as np
 from cpcbl_agents.agent import BusEvent, Tick
 from cpcbl_agents.clock import Clock
 from cpcbl_agents.node import Node
-from cpcbl_agents.process import Loop, StopSignal
+from cpcbl_agents.process import Loop
 from cpcbl_agents.robot import Robot, build_sensing
+from cpcbl_agents.stop import StopSignal
 from cpcbl_team.config import (
     CollaborationSettings,
     OdometrySettings,

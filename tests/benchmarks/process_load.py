@@ -20,7 +20,7 @@ from support.routers import open_router
 
 from cpcbl_agents.clock import Clock
 from cpcbl_agents.node import STATUS_NS
-from cpcbl_agents.process import StopSignal
+from cpcbl_agents.stop import StopSignal
 from cpcbl_launch.run.processes import ProcessSpec, Supervisor, process_table
 from cpcbl_launch.run.up import free_endpoint
 from cpcbl_launch.team_file import save_resolved

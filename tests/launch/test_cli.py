@@ -216,7 +216,7 @@ def test_ctrl_c_ends_a_run_with_its_report_and_leaves_no_process(tmp_path: Path)
         assert eventually(lambda: len(pids_of([str(tmp_path / "logs")])) >= 4)
         process.send_signal(signal.SIGINT)
         shown, _ = process.communicate(timeout=10.0)
-        assert process.returncode == 0
+        assert process.returncode == 130
     assert json.loads(shown)["robots"].keys() == {"driver", "watcher"}
     assert not pids_of([str(tmp_path / "logs")])
 

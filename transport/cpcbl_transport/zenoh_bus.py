@@ -52,7 +52,7 @@ def open_bus(
         try:
             return ZenohBus(_open(config, namespace(team) if team else None))
         except zenoh.ZError as error:
-            reason = _tls_reason(connect, credentials) or _one_line(error)
+            reason = _tls_reason(connect, credentials) or one_line(str(error))
             if on_wait is not None:
                 on_wait(reason if credentials else "")
             elif time.monotonic() - said_s >= WAITING_S:
@@ -79,7 +79,7 @@ def open_onlooker(endpoint: str) -> "ZenohBus":
     try:
         return ZenohBus(_open(client_config([endpoint])))
     except zenoh.ZError as error:
-        raise BusError(f"no router at {endpoint}: {_one_line(error)}") from error
+        raise BusError(f"no router at {endpoint}: {one_line(str(error))}") from error
 
 
 def open_router(config: Mapping[str, Any], space: str | None = None) -> "ZenohBus":
@@ -89,7 +89,7 @@ def open_router(config: Mapping[str, Any], space: str | None = None) -> "ZenohBu
         return ZenohBus(_open(config, space))
     except zenoh.ZError as error:
         endpoints = ", ".join(listening_at(config))
-        raise BusError(f"cannot listen on {endpoints}: {_one_line(error)}") from error
+        raise BusError(f"cannot listen on {endpoints}: {listen_problem(str(error))}") from error
 
 
 def read_router_config(path: Path) -> dict[str, Any]:
@@ -100,7 +100,7 @@ def read_router_config(path: Path) -> dict[str, Any]:
     except (OSError, UnicodeDecodeError) as error:
         raise BusError(f"{path}: cannot be read: {error}") from error
     except zenoh.ZError as error:
-        raise BusError(f"{path}: no configuration of Zenoh: {_one_line(error)}") from error
+        raise BusError(f"{path}: no configuration of Zenoh: {one_line(str(error))}") from error
     config: dict[str, Any] = json.loads(str(read))
     config["mode"] = config["mode"] or "router"
     if config["mode"] != "router":
@@ -114,9 +114,23 @@ def listening_at(config: Mapping[str, Any]) -> list[str]:
     return list(endpoints["router"] if isinstance(endpoints, Mapping) else endpoints)
 
 
-def _one_line(error: "zenoh.ZError") -> str:
+LISTEN_PROBLEMS = {  # what the system says, and what that means to a user
+    "Address already in use": "another program listens there; end or join it, or name another port",
+    "Cannot assign requested address": "no address of this machine; 0.0.0.0 is all of them",
+    "failed to lookup address": "no such host; write the address of this machine",
+    "Permission denied": "not allowed to this user; name a port from 1024 on",
+}
+
+
+def listen_problem(error: str) -> str:
+    """Why a router cannot listen, by Zenoh's error."""
+    plain = (text for said, text in LISTEN_PROBLEMS.items() if said in error)
+    return next(plain, one_line(error))
+
+
+def one_line(error: str) -> str:
     """What went wrong, in one line, without the places in Zenoh's source."""
-    return " ".join(re.sub(r" at \S+\.rs:\d+\.?", "", str(error)).split())
+    return " ".join(re.sub(r"(?: at )?\(?/?\S+\.rs:\d+(?::\d+)?\)?[.:]?", "", error).split())
 
 
 def _open(config: Mapping[str, Any], space: str | None = None) -> "zenoh.Session":

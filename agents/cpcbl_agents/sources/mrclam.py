@@ -18,6 +18,7 @@ from cpcbl_team.errors import InputError
 from cpcbl_team.inputs import Odometry, Sighting, Sightings
 
 LONGEST_PIECE_NS = 100_000_000
+LONGEST_GAP_S = 3600.0
 WHERE = "asrl.utias.utoronto.ca/datasets/mrclam"
 ROBOTS = ("1", "2", "3", "4", "5")
 
@@ -44,6 +45,21 @@ def read_table(path: Path, columns: int) -> NDArray[np.float64]:
     return table[np.argsort(table[:, 0], kind="stable")]
 
 
+def read_log(path: Path, columns: int) -> NDArray[np.float64]:
+    """The same, of a table whose first column is a time. Raises LogError: after a stamp of
+    another epoch, such as 0, a replay would wait for years."""
+    table = read_table(path, columns)
+    gaps = np.diff(table[:, 0])
+    if len(gaps) and gaps.max() > LONGEST_GAP_S:
+        row = int(np.argmax(gaps))
+        before, after = table[row, 0], table[row + 1, 0]
+        raise LogError(
+            f"{path}: the time jumps from {before:.3f} to {after:.3f} s; remove the rows before or"
+            " after that"
+        )
+    return table
+
+
 def robots_in(folder: Path) -> list[str]:
     """The robots of a log of which all files are there (truth included). Raises LogError."""
     if not (folder / "Barcodes.dat").is_file():
@@ -67,7 +83,7 @@ def read_landmarks(folder: Path) -> dict[str, Landmark]:
 def read_truth(folder: Path, robot: str) -> NDArray[np.float64]:
     """Ground truth, shape (n, 4): seconds, x, y, heading. Recovered where there is no original."""
     path = _truth_file(folder, robot)
-    return read_table(path or folder / f"Robot{robot}_Groundtruth.dat", 4)
+    return read_log(path or folder / f"Robot{robot}_Groundtruth.dat", 4)
 
 
 def _truth_file(folder: Path, robot: str) -> Path | None:
@@ -77,7 +93,7 @@ def _truth_file(folder: Path, robot: str) -> Path | None:
 
 def odometry_span_ns(folder: Path, robot: str) -> tuple[int, int]:
     """(first, last) stamp of a robot's odometry."""
-    table = read_table(folder / f"Robot{robot}_Odometry.dat", 3)
+    table = read_log(folder / f"Robot{robot}_Odometry.dat", 3)
     return _ns(table[0, 0]), _ns(table[-1, 0])
 
 
@@ -87,7 +103,7 @@ def _ns(seconds: float) -> int:
 
 def read_odometry(folder: Path, robot: str) -> Iterator[Odometry]:
     """A command holds until the next one; equal commands in a row make one piece of up to 0.1 s."""
-    table = read_table(folder / f"Robot{robot}_Odometry.dat", 3)
+    table = read_log(folder / f"Robot{robot}_Odometry.dat", 3)
     rows = [(_ns(t), v, w) for t, v, w in table.tolist()]
     from_ns, speed, turn_rate = rows[0]
     for stamp_ns, next_speed, next_turn_rate in rows[1:]:
@@ -115,7 +131,7 @@ class MrclamSource:
         barcodes = read_table(folder / "Barcodes.dat", 2)
         names = {int(barcode): str(int(subject)) for subject, barcode in barcodes.tolist()}
         odometry = read_odometry(folder, robot)
-        seen = frames(read_table(folder / f"Robot{robot}_Measurement.dat", 4), names, robot)
+        seen = frames(read_log(folder / f"Robot{robot}_Measurement.dat", 4), names, robot)
         items: list[Odometry | Sightings] = [*odometry, *seen]
         items.sort(key=lambda item: item.stamp_ns)
         self.first_ns = next((i.from_ns for i in items if isinstance(i, Odometry)), 0)

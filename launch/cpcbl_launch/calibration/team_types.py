@@ -72,25 +72,36 @@ def _calibrate_robot(logs: Sequence[RobotLog]) -> RobotCalibration:
     """One robot, from all its logs."""
     odometry_values, motion = odometry.calibrate_odometry(logs)
     sensor_values, sight = sensor.calibrate_sensor(logs)
+    drives, sees = bool(odometry_values), bool(sensor_values)
+    odometry_values, sensor_values = _determined(odometry_values), _determined(sensor_values)
     days = {} if motion is None else odometry_day_variances(motion)
     days |= {} if sight is None else sensor_day_variances(sight)
     is_depth = sight is not None and sight.after.is_depth
     notes = []
-    if not odometry_values:
-        notes.append("does not drive: odometry stays as it is")
-    if not sensor_values:
+    if not drives:
+        notes.append("does not drive, or not for long enough: odometry stays as it is")
+    if not sees:
         notes.append("too few sightings with ground truth: the sensor stays as it is")
     if is_depth:
         notes.append("ranges are depths along the optical axis")
     axis = () if is_depth else ("optical_axis_deg",)
-    for part, found, names in (
-        ("odometry", odometry_values, (*odometry.CORRECTIONS, *odometry.NOISE)),
-        ("sensor", sensor_values, (*sensor.CORRECTIONS, *sensor.NOISE, "correlation_s")),
+    for part, has_data, found, names in (
+        ("odometry", drives, odometry_values, (*odometry.CORRECTIONS, *odometry.NOISE)),
+        ("sensor", sees, sensor_values, (*sensor.CORRECTIONS, *sensor.NOISE, "correlation_s")),
     ):
         missing = [name for name in names if name not in found and name not in axis]
-        if found and missing:
+        if has_data and missing:
             notes.append(f"not determined by the logs: {part} {', '.join(missing)}")
     return RobotCalibration(odometry_values, sensor_values, tuple(notes), is_depth, days)
+
+
+def _determined(values: Mapping[str, Estimate]) -> dict[str, Estimate]:
+    """Those with a value and a standard error: of too short a log they are not numbers."""
+    return {
+        name: found
+        for name, found in values.items()
+        if math.isfinite(found.value) and math.isfinite(found.standard_error)
+    }
 
 
 def base_team(logs: Sequence[Path], team_file: Path | None) -> tuple[str, str]:

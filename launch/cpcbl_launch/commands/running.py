@@ -70,6 +70,10 @@ def up(
     data: Annotated[Path | None, Option(help="Folder of an MRCLAM log, for source mrclam.")] = None,
     blind: options.Blind = "",
     robots: Robots = "",
+    connect: Annotated[
+        list[str] | None,
+        Option(callback=options.endpoints, help="Endpoint of a router that runs; default: own."),
+    ] = None,
     bytes_per_s: options.BytesPerS = None,
     messages_per_minute: options.MessagesPerMinute = None,
     match_messages: options.MatchMessages = None,
@@ -86,22 +90,22 @@ def up(
     open_page: options.OpenPage = False,
 ) -> None:
     """Start a team: the field, a process per robot, a live table, a report at the end."""
-    from cpcbl_agents.process import StopSignal
-    from cpcbl_launch.run.up import local_endpoint, run_team
+    from cpcbl_agents.stop import StopSignal
+    from cpcbl_launch.run.up import router_endpoint, run_team
     from cpcbl_launch.views.run import LiveTable, print_report
     from cpcbl_launch.views.web.address import parse_listen
 
     budgets = Overrides(bytes_per_s, messages_per_minute, match_messages)
     run = _run_of(file, duration, data, budgets)
     run = run._replace(speed=speed, seed=seed, folder=logs, picture=picture, record=record)
+    run = run._replace(connect=tuple(connect or ()))
     blind_team = with_blind_robots(run.team, options.parse_names(blind), run.left_out)
     run = run._replace(team=blind_team)
     if robots:
         run = run._replace(here=_robots_here(robots, run.team))
     console = Console(stderr=as_json)
     launch = _launch(run, containers, image, base_image, console)
-    endpoint = local_endpoint(run.team.transport.listen[0])
-    watch = ["cpcbl-team", "traffic", str(file or "demo"), "--connect", endpoint]
+    watch = ["cpcbl-team", "traffic", str(file or "demo"), "--connect", router_endpoint(run)]
     console.print(f"watch it: {shlex.join(watch)}", style="dim", highlight=False, soft_wrap=True)
     title = f"team {run.team.name}, {len(run.team.robots)} robots, {speed:g} x real time"
     listen = parse_listen("--view-listen", view_listen)
@@ -110,6 +114,21 @@ def up(
         result = run_team(run, table.show, StopSignal(), launch, attached)
     lost = dict(result.not_written) | options.write_report(report, result)
     options.print_result(result, as_json, lambda: print_report(result, console), lost)
+    if not result.has_data and not StopSignal.was_interrupted:
+        _fail_without_data(run)
+
+
+def _fail_without_data(run: "Run") -> None:
+    """A run in which no robot received anything is no success. Raises typer.Exit."""
+    external = [name for name, robot in run.team.robots.items() if robot.source == "external"]
+    remedy = "see the logs of their processes (--logs FOLDER)"
+    if external:
+        name = external[0]
+        remedy = f"do the drivers run, and publish in/{name}/odometry and in/{name}/sightings"
+        remedy += f" of team {run.team.name}?"
+    text = f"nothing was heard in this run: no robot received any input; {remedy}"
+    typer.secho(f"cpcbl-team: {text}", fg="red", err=True)
+    raise typer.Exit(1)
 
 
 @contextmanager
@@ -133,6 +152,7 @@ def _page(
 def _run_of(
     file: Path | None, duration_s: float | None, data: Path | None, budgets: Overrides
 ) -> "Run":
+    from cpcbl_agents.sources.mrclam import WHERE
     from cpcbl_launch.run import logged_team
     from cpcbl_launch.run.up import LEAST_S, SIMULATED_S, Run, with_listen_endpoint
 
@@ -143,7 +163,13 @@ def _run_of(
     team = with_overrides(with_listen_endpoint(find_team(file or Path("demo"))), budgets)
     if all(robot.source != "mrclam" for robot in team.robots.values()):
         return Run(team, SIMULATED_S if duration_s is None else duration_s)
-    logged = logged_team.load_logged_team(team, Path(data or team.data or "."))
+    folder = Path(data or team.data or ".")
+    if data is None and not team.data and not (folder / "Barcodes.dat").is_file():
+        raise InputError(
+            f"up {file}: its robots replay a log: name its folder, --data MRCLAM6 (get the data at"
+            f" {WHERE})"
+        )
+    logged = logged_team.load_logged_team(team, folder)
     logged = logged_team.with_duration(logged, duration_s)
     run = Run(logged.team, (logged.end_ns - logged.start_ns) * 1e-9, epoch_ns=logged.start_ns)
     return run._replace(truth=logged.truth, left_out=logged.left_out)
@@ -160,6 +186,8 @@ def _robots_here(text: str, team: Team) -> list[str]:
 def _launch(
     run: "Run", containers: bool, image: str | None, base_image: str, console: Console
 ) -> "Launch":
+    if containers and run.connect:
+        raise InputError("up: --connect or --containers, which have a router of their own")
     if containers:
         from cpcbl_launch.run.containers.launch import InContainers, line_printer
 
@@ -183,7 +211,7 @@ def field(
     parent: options.Parent = None,
 ) -> None:
     """Run the simulated field until SIGINT, SIGTERM or SIGHUP."""
-    from cpcbl_agents.process import StopSignal
+    from cpcbl_agents.stop import StopSignal
     from cpcbl_launch.simulation.field_node import parse_sites, run_field
     from cpcbl_transport.zenoh_bus import ZenohBus, open_bus
 
@@ -228,7 +256,7 @@ def router(
     ] = False,
 ) -> None:
     """Run the team's Zenoh router, on any machine, until SIGINT, SIGTERM or SIGHUP."""
-    from cpcbl_agents.process import StopSignal
+    from cpcbl_agents.stop import StopSignal
     from cpcbl_launch.run.router import run_router, team_router
     from cpcbl_transport.zenoh_bus import read_router_config
 

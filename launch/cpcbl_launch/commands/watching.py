@@ -65,7 +65,7 @@ def observer(
     The team file need not name the observer. Robots that it sees improve their
     estimates within a second. On a simulated field it gets a body at once.
     """
-    from cpcbl_agents.process import StopSignal
+    from cpcbl_agents.stop import StopSignal
     from cpcbl_launch.run import observer as run
     from cpcbl_launch.views.run import print_observer_report
 
@@ -118,7 +118,7 @@ def traffic(
     Subscribes to the robots' status (1 Hz) only. A subscription to fixes or
     beliefs would make robots send them.
     """
-    from cpcbl_agents.process import StopSignal
+    from cpcbl_agents.stop import StopSignal
     from cpcbl_launch.views.traffic import WatchRequest, watch_team
     from cpcbl_launch.views.traffic_tables import TrafficView, traffic_view
 
@@ -226,7 +226,7 @@ def _live_frames(
     robot: str, team: Team, connect: list[str] | None, wait_s: float
 ) -> "Iterator[tuple[str, str, AnnotatedFrame]]":
     """Annotated frames of a running robot, each with its name and that of its file."""
-    from cpcbl_agents.process import StopSignal
+    from cpcbl_agents.stop import StopSignal
     from cpcbl_launch.views.frames import live_frames
 
     logging.getLogger("cpcbl_transport").setLevel(logging.WARNING)

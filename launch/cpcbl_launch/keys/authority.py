@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from datetime import datetime, timedelta
 from typing import NamedTuple
 
+from cpcbl_agents.extras import install_command
 from cpcbl_team.errors import DependencyError, InputError
 from cpcbl_transport.security import CERTIFICATE, SecurityError
 
@@ -19,7 +20,8 @@ try:
     from cryptography.hazmat.primitives.asymmetric import ec
     from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 except ImportError as error:
-    raise DependencyError("keys needs cryptography: pip install 'cpcbl-team[security]'") from error
+    needed = f"keys needs cryptography: {install_command('security')}"
+    raise DependencyError(needed) from error
 
 CLOCKS_APART = timedelta(days=1)  # a machine whose clock is late takes a new certificate too
 AUTHORITY_DAYS = 3650

@@ -62,6 +62,13 @@ class Samples(NamedTuple):
     share: float | None = None  # of the estimates: those that have truth
 
 
+def stated_sigma_m(path: Trajectory) -> Floats:
+    """The standard deviations of the position along one axis, shape (n,), empty without any."""
+    if path.covariance is None:
+        return np.empty(0)
+    return np.asarray(np.sqrt(np.maximum(path.covariance[:, (0, 2)].mean(axis=1), 0.0)))
+
+
 def degrees(angle_rad: float | None) -> float | None:
     return None if angle_rad is None else math.degrees(angle_rad)
 

@@ -9,15 +9,18 @@ from typing import Generic, TypeVar, cast
 import msgspec
 import numpy as np
 
+from cpcbl_launch.reporting.activity import ActivityLog
 from cpcbl_launch.reporting.metrics import (
     ErrorFigures,
     Floats,
     Samples,
     Score,
     Trajectory,
+    interpolated_truth,
     samples_with_truth,
     score,
     seconds,
+    stated_sigma_m,
 )
 from cpcbl_launch.reporting.statuses import (
     FlowReport,
@@ -79,6 +82,16 @@ class RobotReport(Score, frozen=True, kw_only=True):
     """Teammates whose messages it received at the end, or that were in quarantine."""
     inputs: tuple[InputReport, ...] = ()  # of its last process
     problems: tuple[ProblemReport, ...] = ()  # of its inputs
+    inputs_taken: int | None = None
+    """Odometry, sightings, positions and frames that it received; None where no status tells."""
+    sigma_rms_m: float | None = None
+    sigma_max_m: float | None = None
+    """Of the position's standard deviation as the robot states it; None where it states none."""
+
+    @property
+    def has_data(self) -> bool:
+        """Whether anything was heard of it, and it heard anything from its sensors."""
+        return self.inputs_taken != 0 and self.lost_at_end != NOT_HEARD
 
 
 class Phase(Score, frozen=True, kw_only=True):
@@ -146,8 +159,16 @@ class Report(msgspec.Struct, frozen=True, kw_only=True):
     yardsticks: dict[str, BaselineReport] = {}
     """dead_reckoning, solo_ekf, centralized_ekf, batch_least_squares, where they were asked for."""
 
+    @property
+    def has_data(self) -> bool:
+        """Whether any robot of the team has."""
+        return any(robot.has_data for robot in self.robots.values())
+
 
 M = TypeVar("M", bound=Tagged)
+INPUTS = ("odometry", "sightings", "position", "frame")  # the counts of what a robot received
+NOT_HEARD = "no estimate was received"
+RECENT = 20  # messages of which an error is known although truth comes later than the estimate
 
 
 class EncodedLog(Generic[M]):
@@ -167,6 +188,10 @@ class EncodedLog(Generic[M]):
     def __iter__(self) -> Iterator[M]:
         return (cast(M, decode_tagged(payload)) for payload in tuple(self._payloads))
 
+    def recent(self) -> list[M]:
+        """The newest messages, in the order of their arrival."""
+        return [cast(M, decode_tagged(payload)) for payload in self._payloads[-RECENT:]]
+
     @property
     def last(self) -> M:
         return cast(M, decode_tagged(self._payloads[-1]))
@@ -180,6 +205,7 @@ class Recorder:
         self.tracks: dict[str, EncodedLog[Track]] = {}
         self.status: dict[str, Status] = {}
         self.truths: EncodedLog[Truths] = EncodedLog()
+        self.activity: dict[str, ActivityLog] = {}
         self.counts: Counter[str] = Counter()
         """Accepted messages by topic, and refused ones by reason."""
         self.strays: tuple[str, ...] = ()
@@ -200,6 +226,7 @@ class Recorder:
                 case Status():
                     self.status[message.robot] = message
                     self._problems.setdefault(message.robot, ProblemLog()).add(message)
+                    self.activity.setdefault(message.robot, ActivityLog()).add(message)
                     self._processes.setdefault(message.robot, {})[message.incarnation] = message
                 case Truths():
                     self.truths.append(payload)
@@ -216,6 +243,21 @@ class Recorder:
             truth = {t.robot: t for t in self.truths.last.robots} if self.truths else {}
             tracks = {name: t.last for name, t in self.tracks.items()}
             return tracks, dict(self.status), truth
+
+    def latest_errors_m(self) -> dict[str, float]:
+        """The position error of every robot's newest estimate for whose time truth is known."""
+        with self._lock:
+            truth = truth_rows(self.truths.recent())
+            tracks = {name: log.recent() for name, log in self.tracks.items() if name in truth}
+        errors_m = {}
+        for name, recent in tracks.items():
+            rows = truth[name]
+            for track in recent:
+                at_s = track.stamp_ns * 1e-9
+                at, counts = interpolated_truth(np.array([at_s]), rows)
+                if counts[0] and rows[0, 0] <= at_s <= rows[-1, 0]:
+                    errors_m[name] = math.hypot(track.x_m - at[0, 0], track.y_m - at[0, 1])
+        return errors_m
 
     def simulated_truth(self) -> dict[str, Floats]:
         """Rows of seconds, x, y, heading for every robot of the simulated field."""
@@ -263,7 +305,8 @@ class Recorder:
     ) -> RobotReport:
         """One robot's figures from `from_s` on."""
         _, _, last_truth = self.latest()
-        figures = score(self.samples(name, truth, from_s))
+        path = self.trajectory(name, from_s)
+        figures, sigma_m = score(samples_with_truth(path, truth)[1]), stated_sigma_m(path)
         tracks = list(self.tracks.get(name, ()))
         statuses = list(self._processes.get(name, {}).values())
         counts = Counter[str]()
@@ -274,9 +317,9 @@ class Recorder:
         return RobotReport(
             **msgspec.structs.asdict(figures),
             variant=variant,
-            lost_share=sum(bool(t.lost) for t in tracks) / max(len(tracks), 1),
+            lost_share=float(np.mean([bool(t.lost) for t in tracks])) if tracks else 1.0,
             longest_lost_s=_longest_lost_s(tracks),
-            lost_at_end=tracks[-1].lost if tracks else "no estimate was received",
+            lost_at_end=tracks[-1].lost if tracks else NOT_HEARD,
             bumps=last_truth[name].bumps if name in last_truth else 0,
             messages_sent=sum(s.messages_sent for s in statuses),
             bytes_sent=sum(s.bytes_sent for s in statuses),
@@ -290,6 +333,9 @@ class Recorder:
             trust=trust_reports(statuses),
             inputs=input_reports(statuses[-1]) if statuses else (),
             problems=self._problems[name].reports if name in self._problems else (),
+            sigma_rms_m=float(np.sqrt(np.mean(sigma_m**2))) if len(sigma_m) else None,
+            sigma_max_m=float(sigma_m.max()) if len(sigma_m) else None,
+            inputs_taken=sum(counts[name] for name in INPUTS) if statuses else None,
         )
 
 

@@ -19,6 +19,7 @@ import msgspec
 from mcap.exceptions import McapError
 from mcap.reader import make_reader
 from mcap.writer import Writer
+from zstandard import ZstdError
 
 from cpcbl_agents.sources.mrclam import LogError
 from cpcbl_launch.reporting.metrics import Floats
@@ -38,6 +39,10 @@ RECORDED = (
 )
 TEAM = "team.json"
 PICTURE = "foxglove.CompressedImage"
+DAMAGE = (  # what the readers of MCAP, its compressions and its contents raise of a damaged file
+    *(McapError, struct.error, ZstdError, RuntimeError, msgspec.MsgspecError),
+    *(ValueError, LookupError, OverflowError, EOFError, MemoryError),
+)
 _decoder: msgspec.json.Decoder[Message] = msgspec.json.Decoder(Message)
 
 
@@ -138,9 +143,9 @@ def read_recording(path: Path) -> RecordedRun:
             raise LogError(f"{path}: holds no team: not a recording of `up --record`")
         team = msgspec.json.decode(attached[0], type=Team)
     except OSError as error:
-        raise LogError(f"{path}: cannot be read: {error.strerror}") from error
-    except (McapError, struct.error, msgspec.MsgspecError, ValueError) as error:
-        raise LogError(f"{path}: not a whole recording: {error}") from error
+        raise LogError(f"{path}: cannot be read: {error.strerror or error}") from error
+    except DAMAGE as error:
+        raise LogError(f"{path}: not a whole recording: {type(error).__name__} {error}") from error
     truths = [message for _, message in messages if isinstance(message, Truths)]
     inputs: dict[str, list[SensorInput]] = {}
     for key, message in messages:

@@ -58,7 +58,8 @@ def run_robot_command(
     `wrap_bus` may put something between the robot of this name and clock, and its bus. Raises
     TeamFileError, InputError, and what `run_robot` raises.
     """
-    from cpcbl_agents.process import StopSignal, run_robot  # for other commands it costs 0.1 s
+    from cpcbl_agents.process import run_robot  # for other commands it costs 0.1 s
+    from cpcbl_agents.stop import StopSignal
 
     team = find_team(arguments.team)
     require_robots(str(arguments.team), [arguments.name], team)

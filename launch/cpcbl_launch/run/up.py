@@ -33,7 +33,7 @@ from cpcbl_team.errors import InputError
 from cpcbl_transport.bus import Bus
 from cpcbl_transport.security import Identity, link_of
 from cpcbl_transport.topics import Role, namespace
-from cpcbl_transport.zenoh_bus import open_onlooker, open_router
+from cpcbl_transport.zenoh_bus import open_bus, open_onlooker, open_router
 
 log = logging.getLogger(__name__)
 
@@ -44,6 +44,7 @@ REFRESH_S = 0.25
 STRAYS_S = 2.0
 SIMULATED_S = 30.0  # by default
 LEAST_S = 1.0
+JOIN_S = 10.0  # so long a router that runs is looked for
 
 Stop = Callable[[], bool]
 Watch = Callable[[Bus], AbstractContextManager[object]]  # entered before any process starts
@@ -64,6 +65,7 @@ class Run(NamedTuple):
     folder: Path | None = None  # where processes write their logs; None: a temporary folder
     picture: Path | None = None  # the picture of the run to write (PNG or SVG)
     record: Path | None = None  # the recording of the run to write (MCAP)
+    connect: tuple[str, ...] = ()  # a router that runs; none: the run starts one
 
 
 class Launcher(Protocol):
@@ -84,23 +86,36 @@ class OnThisMachine:
     """The router in this process, everybody else in a process of its own."""
 
     def __init__(self, run: Run, folder: Path, stop: Stop) -> None:
-        self._run, self._folder = run, folder
+        self._run, self._folder, self._stop = run, folder, stop
         self._here = run.team.robots if run.here is None else run.here
         cameras = sum(name in self._here for name in run.team.cameras)
         self.lead_s = LEAD_S + LEAD_S_A_PROCESS * len(self._here) + LEAD_S_A_CAMERA * cameras
 
     def router(self) -> AbstractContextManager[Bus]:
         team, listen = self._run.team, self._run.team.transport.listen
+        if self._run.connect:
+            return self._joined()
         require_keys(team, listen, self._here)
         config = team_router(team, listen, (), self._run.speed)
         bus = open_router(config, namespace(team.name))
         repeat_tokens(bus)
         return bus
 
+    def _joined(self) -> AbstractContextManager[Bus]:
+        run, until_s = self._run, time.monotonic() + JOIN_S
+        require_keys(run.team, run.connect, self._here)
+        link = link_of(run.team, Identity(Role.OPERATOR), run.connect)
+        return open_bus(
+            run.team.name,
+            link.endpoints,
+            lambda: self._stop() or time.monotonic() > until_s,
+            link.credentials,
+        )
+
     def processes(self, clock: Clock) -> AbstractContextManager[Processes]:
         team, path = self._run.team, self._folder / "team.json"
         save_resolved(team, path)
-        endpoint = local_endpoint(team.transport.listen[0])
+        endpoint = router_endpoint(self._run)
         table = process_table(team, path, endpoint, clock, self._run.seed, self._here)
         return Supervisor(table, self._folder)
 
@@ -137,6 +152,11 @@ def local_endpoint(listen: str) -> str:
     return listen.replace("/0.0.0.0:", "/127.0.0.1:").replace("/[::]:", "/[::1]:")
 
 
+def router_endpoint(run: Run) -> str:
+    """Where robots of this machine, and who watches the run here, find the router."""
+    return run.connect[0] if run.connect else local_endpoint(run.team.transport.listen[0])
+
+
 def run_team(
     run: Run,
     show: Show,
@@ -157,7 +177,7 @@ def run_team(
         recording = stack.enter_context(_recording(run, bus))
         recorder = Recorder(bus)
         stack.enter_context(watch(bus))
-        onlooker = _onlooker(run.team, launch, stack)
+        onlooker = _onlooker(run, launch, stack)
         clock = Clock.starting_in(launcher.lead_s, run.epoch_ns, run.speed)
         with launcher.processes(clock) as processes:
             end_ns = None if run.duration_s is None else int(run.duration_s * 1e9)
@@ -178,12 +198,13 @@ def run_team(
     return report
 
 
-def _onlooker(team: Team, launch: Launch, stack: ExitStack) -> Callable[[Recorder], None]:
+def _onlooker(run: Run, launch: Launch, stack: ExitStack) -> Callable[[Recorder], None]:
     """What notes now and then who publishes inputs to nobody. A secured team's router lets nobody
     do so, and lets nobody ask."""
+    team = run.team
     if launch is not OnThisMachine or team.transport.secured:
         return lambda recorder: None
-    bus = stack.enter_context(open_onlooker(local_endpoint(team.transport.listen[0])))
+    bus = stack.enter_context(open_onlooker(router_endpoint(run)))
     next_s = 0.0
 
     def look(recorder: Recorder) -> None:
@@ -238,11 +259,11 @@ def _report(
     guests = guest_reports(recorder, list(robots), truth, epoch_s, begin_s)
     lost: dict[str, str] = {}
     if run.picture is not None:
-        from cpcbl_launch.reporting.picture import draw_run
+        from cpcbl_launch.reporting.picture import Times, draw_run
 
         present_s = {name: guest.present_s for name, guest in guests.items()}
-        times = epoch_s, helped_from_s, present_s
-        drawn = partial(draw_run, recorder, run.team, truth, run.picture, *times)
+        times = Times(epoch_s, elapsed_s, helped_from_s, present_s)
+        drawn = partial(draw_run, recorder, run.team, truth, run.picture, times)
         lost = write_or_reason(run.picture, drawn)
     report = recorder.report(variants_of(run.team), truth, begin_s)
     alone = {}

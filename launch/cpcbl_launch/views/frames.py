@@ -18,6 +18,31 @@ from cpcbl_transport.security import Link
 
 MOST = 50  # frames that wait, some 100 kB each; the latest
 REFRESH_S = 0.02
+REASONS = {  # why something in a frame, or a whole frame, is not used (docs/eyes.md)
+    "cut_by_frame": "cut by the edge of the picture",
+    "wrong_shape": "two colour bands, but not of this shape",
+    "ranges_disagree": "does not stand on the floor at its distance",
+    "mirror_image": "a reflection in the floor",
+    "one_band_only": "one colour band without its second one",
+    "unknown_pair": "colour bands of no object of the team file",
+    "too_small": "too small to be sure",
+    "ambiguous": "could be any of these",
+    "seen_twice": "detected at two places, so at neither",
+    "contradiction": "its markers do not fit to one body",
+    "bad_fit": "a marker that is not where the team file says",
+    "heading_ambiguous": "its position is used; its heading is not clear",
+    "unknown_marker": "a marker of no robot of this team",
+    "own_marker": "the robot's own marker, as in a mirror",
+    "frame_empty": "the picture is empty",
+    "frame_undecodable": "no picture that can be decoded",
+    "frame_truncated": "the end of the picture is missing",
+    "frame_wrong_size": "the picture has another size than the camera in the team file",
+    "frame_wrong_channels": "the picture has no three colours",
+    "frame_wrong_depth": "the picture has not 8 bits a colour",
+    "frame_black": "the picture is black",
+    "frame_white": "the picture is white",
+    "frame_blank": "the picture shows nothing but one colour",
+}
 
 
 def live_frames(
@@ -111,8 +136,9 @@ def print_frame_report(report: FrameReport, console: Console) -> None:
         rows.add_row("nothing", style="dim")
     console.print(rows)
     for unclear in report.unclear:
-        names = f": {' or '.join(unclear.names)}" if unclear.names else ""
-        console.print(f"{unclear.reason}{names}", style="yellow", highlight=False)
+        names = f"{' or '.join(unclear.names)}: " if unclear.names else ""
+        text = REASONS.get(unclear.reason, unclear.reason)
+        console.print(f"{names}{text} ({unclear.reason})", style="yellow", highlight=False)
     if report.picture:
         console.print(report.picture, style="dim", highlight=False, soft_wrap=True)
     console.print()

@@ -54,6 +54,11 @@ class LiveView:
     def __exit__(self, *_: object) -> None:
         self._live.stop()
 
+    @property
+    def width(self) -> int:
+        """The columns of the console."""
+        return self._console.width
+
     def fits(self, drawn: RenderableType) -> bool:
         """Whether the console is as wide as this would like to be."""
         wide = self._console.options.update(max_width=10 * self._console.width)

@@ -25,10 +25,13 @@ from cpcbl_launch.reporting.tables import number, percent, short, table
 from cpcbl_launch.run.observer import ObserverReport
 from cpcbl_launch.run.processes import ROBOT, Processes
 from cpcbl_launch.views.live import LiveView
+from cpcbl_launch.views.own_figures import own_figures_table
 from cpcbl_launch.views.traffic_tables import COLUMNS_EXPLAINED, help_traffic_table, limits_text
 from cpcbl_team.tiers import LOWEST_TIER
-from cpcbl_transport.messages import Track, Truth
+from cpcbl_transport.messages import Track
 
+NARROW = 61  # columns of a terminal, with which a table does without its less important ones
+WITHOUT = ("before m", "mean m", "max m", "out", "B")
 FIGURES = ("RMSE m", "mean m", "max m", "deg", "in 3 σ", "NEES")
 ProgressSetter = Callable[[float], None]
 Cell = str | Text
@@ -68,7 +71,7 @@ class LiveTable(LiveView):
         return now_s - self._heard[name][1]
 
     def _table(self, recorder: Recorder, processes: Processes, elapsed_s: float) -> Table:
-        tracks, statuses, truths = recorder.latest()
+        (tracks, statuses, _), errors_m = recorder.latest(), recorder.latest_errors_m()
         shown = table(
             f"{self._title}, {elapsed_s:.1f} s",
             ("robot",),
@@ -97,7 +100,7 @@ class LiveTable(LiveView):
             if name not in self._robots:
                 there = newest_ns - tracks[name].stamp_ns <= AWAY_S * 1e9
                 pid, state = "guest", state if there else Text("left", "dim")
-            pose = _pose_cells(tracks.get(name), truths.get(name))
+            pose = _pose_cells(tracks.get(name), errors_m.get(name))
             traffic = [""] * 4
             if (s := status) is not None:
                 counts = s.messages_sent, s.bytes_sent, s.messages_received, s.bytes_received
@@ -105,6 +108,8 @@ class LiveTable(LiveView):
             shown.add_row(name, pid, *pose, *traffic, state)
         if not self.fits(shown):
             shown.padding = (0, 0)  # closer together, before a state is folded
+        if self.width < NARROW:  # without traffic and process, before "ok" is
+            del shown.columns[8:12], shown.columns[1]
         return shown
 
 
@@ -122,15 +127,14 @@ def _state(track: Track | None, pid: str, restarts: int, silent_s: float, proble
     return state.append(f" (restarted {restarts})", "yellow") if restarts else state
 
 
-def _pose_cells(track: Track | None, truth: Truth | None) -> list[Cell]:
+def _pose_cells(track: Track | None, error_m: float | None) -> list[Cell]:
     if track is None:
         return [""] * 6
     x, y, heading = f"{track.x_m:.2f}", f"{track.y_m:.2f}", f"{math.degrees(track.heading_rad):.0f}"
     c, error_cell = track.covariance, Text("-")
-    if truth is not None:
-        error = math.hypot(truth.x_m - track.x_m, truth.y_m - track.y_m)
-        colour = "green" if error < 0.15 else "yellow" if error < 0.5 else "red"
-        error_cell = Text(f"{error:.3f}", colour)
+    if error_m is not None:
+        colour = "green" if error_m < 0.15 else "yellow" if error_m < 0.5 else "red"
+        error_cell = Text(f"{error_m:.3f}", colour)
     tier = Text(str(track.tier), "green" if track.tier < LOWEST_TIER // 2 else "yellow")
     sigma = number(None if c is None else math.sqrt(0.5 * (c[0] + c[2])))
     return [x, y, heading, sigma, error_cell, tier]
@@ -138,7 +142,13 @@ def _pose_cells(track: Track | None, truth: Truth | None) -> list[Cell]:
 
 def print_report(report: Report, console: Console) -> None:
     """The figures of a run as a table with units."""
-    console.print(_figures_table(report))
+    figures = _figures_table(report)
+    if console.width < NARROW:
+        figures.columns[:] = [c for c in figures.columns if c.header not in WITHOUT]
+    if report.team.position_rmse_m is not None or not report.has_data:
+        console.print(figures)
+    else:
+        console.print(own_figures_table(report))
     for name, guest in report.guests.items():
         console.print()
         console.print(_effects(name, guest))
@@ -176,7 +186,8 @@ def _figures_table(report: Report) -> Table:
 
 def _robot_cells(r: RobotReport) -> list[str]:
     """The cells of a robot from FIGURES on."""
-    return [*_figures(r), percent(r.lost_share), short(r.messages_sent), short(r.bytes_sent)]
+    lost = percent(r.lost_share) if r.has_data else "-"
+    return [*_figures(r), lost, short(r.messages_sent), short(r.bytes_sent)]
 
 
 def _effects(name: str, guest: GuestReport) -> Table:
@@ -255,6 +266,8 @@ def _remarks(report: Report) -> Iterator[str]:
             yield f"Robot {name} bumped into a landmark {r.bumps} times."
         if r.lost_at_end:
             yield f"Robot {name} is lost: {r.lost_at_end}."
+        elif not r.has_data:
+            yield f"Robot {name} received no input: neither odometry nor sightings nor a position."
     for name, r in report.robots.items():
         if (own := r.learned) is not None:  # what is done to readings
             scales = f"distance × {own.distance_scale:.2f}, turn × {own.turn_scale:.2f}"

@@ -1,5 +1,6 @@
 """Calibration finds the errors that the simulated field was given."""
 
+import math
 from pathlib import Path
 
 import msgspec
@@ -122,3 +123,18 @@ def test_calibrate_prints_writes_and_draws(recorded: Path, tmp_path: Path) -> No
     checked = cpcbl_team("check", type_text)
     assert checked.returncode == 0, checked.stderr
     simulate(team, 1, 1.0)
+
+
+def test_what_a_short_recording_does_not_tell_is_not_written(tmp_path: Path) -> None:
+    path, output = tmp_path / "short.mcap", tmp_path / "calibrated.toml"
+    simulate_recorded(TEAM, 1, 1.0, path)
+    found = calibrate_robots(read_logs([path]), ["short.mcap"])
+    estimates = [
+        e for r in found.robots.values() for e in (*r.odometry.values(), *r.sensor.values())
+    ]
+    assert all(math.isfinite(e.value) and math.isfinite(e.standard_error) for e in estimates)
+    assert any("not determined by the logs: " in note for note in found.robots["a"].notes)
+    ran = cpcbl_team("calibrate", path, "--output", output)
+    assert ran.returncode == 0, ran.stderr
+    assert "nan" not in output.read_text()
+    assert "nan" not in ran.stdout

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from pathlib import Path
+from random import Random
 from typing import Any
 
 import msgspec
@@ -13,6 +14,7 @@ from support.simulated import simulate_recorded
 from cpcbl_agents.sources.mrclam import LogError
 from cpcbl_launch.calibration.logs import read_log, read_logs
 from cpcbl_launch.calibration.team_types import calibrate_robots
+from cpcbl_launch.reporting.recording import read_recording
 from cpcbl_team.config import (
     Team,
 )
@@ -73,3 +75,34 @@ def test_a_team_that_sees_and_does_nothing_is_one_line(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="nothing to calibrate") as raised:
         calibrate_robots(read_logs([path]), ["blind.mcap"])
     assert "\n" not in str(raised.value)
+
+
+def damaged(whole: bytes, seed: int) -> bytes:
+    """A file of which some bytes were changed, lost or cut off."""
+    random, damaged = Random(seed), bytearray(whole)
+    for _ in range(random.choice((1, 1, 3, 30))):
+        at = random.randrange(max(len(damaged), 1))
+        match random.randrange(4):
+            case 0:
+                damaged[at : at + 1] = bytes([random.randrange(256)])
+            case 1:
+                damaged[at : at + 8] = b"\xff" * 8
+            case 2:
+                del damaged[at : at + random.randrange(1, 100)]
+            case _:
+                del damaged[at + 1 :]
+    return bytes(damaged)
+
+
+def test_a_damaged_recording_is_one_line_or_read(tmp_path: Path) -> None:
+    path = tmp_path / "log.mcap"
+    simulate_recorded(TEAM, 1, 1.0, path)
+    whole, errors = path.read_bytes(), list[LogError]()
+    for seed in range(300):
+        path.write_bytes(damaged(whole, seed))
+        try:
+            read_recording(path)
+        except LogError as error:
+            errors.append(error)
+    assert not any("\n" in str(error) for error in errors)
+    assert {type(error.__cause__).__name__ for error in errors} >= {"ZstdError", "KeyError"}

@@ -14,6 +14,7 @@ from support.key_commands import TEAM, keys, refused
 from support.keys import again, secured_team
 from support.processes import cpcbl_team
 
+from cpcbl_agents.extras import install_command
 from cpcbl_launch.keys.authority import certificate_facts, issue_certificate, new_authority
 from cpcbl_launch.keys.folder import KeyRequest, hosts, plan_actions
 from cpcbl_launch.team_file import builtin_path, parse_team
@@ -194,7 +195,7 @@ def test_without_the_library_the_extra_is_named(team_file: Path) -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 2
-    assert "pip install 'cpcbl-team[security]'" in done.stderr.splitlines()[-1]
+    assert install_command("security") in done.stderr.splitlines()[-1]
 
 
 def test_a_table_says_what_was_made(team_file: Path) -> None:

@@ -78,7 +78,7 @@ def running(*command: object) -> Iterator["subprocess.Popen[str]"]:
     try:
         yield process
         if process.poll() is None:
-            process.send_signal(signal.SIGINT)
+            process.send_signal(signal.SIGTERM)
         assert process.wait(timeout=20) == 0
     finally:
         process.kill()
@@ -98,7 +98,7 @@ def test_a_secured_team_does_as_well_as_one_without_a_network(tmp_path: Path) ->
     watch = ("traffic", secured, "--connect", endpoint, "--wait", 60, "--json")
     with running(*watch) as watching:
         done = patient_up(secured, *run)
-        watching.send_signal(signal.SIGINT)
+        watching.send_signal(signal.SIGTERM)
         seen = json.loads(watching.communicate(timeout=20)[0])
     assert done.returncode == 0, done.stderr
     report = json.loads(done.stdout)

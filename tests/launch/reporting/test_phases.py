@@ -187,12 +187,17 @@ class FarOn(NoProcesses):
 def test_a_live_table_moves_together_before_it_folds_a_state() -> None:
     said = Said()
     said.tracks("navigator", 0.0, 30.0)
-    for width, gap in ((62, " "), (80, "  ")):
+    for width, begin in (
+        (80, "navigator  4194303  "),
+        (62, "navigator 4194303 "),
+        (60, "navigator 0.00"),
+        (50, "navigator 0.00"),
+    ):
         out = io.StringIO()
         with LiveTable("team", ["navigator"], Console(file=out, width=width)) as view:
             view.show(said.recorder, FarOn(), 30.0)
         _, _, _, row = out.getvalue().splitlines()
-        assert row.startswith(f"navigator{gap}4194303{gap}")
+        assert row.startswith(begin)
         assert row.split()[-1] == "ok"
 
 

@@ -176,7 +176,7 @@ def test_an_observer_in_a_container_does_the_same(team3: Team3, tmp_path: Path) 
 
     def leaves(recorder: Recorder) -> bool:
         team3.observers[0].send_signal(signal.SIGINT)
-        return team3.observers[0].wait(timeout=PATIENCE_S) == 0
+        return team3.observers[0].wait(timeout=PATIENCE_S) == 130
 
     team3.run(
         team3.all_lose_their_way,

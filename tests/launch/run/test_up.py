@@ -163,7 +163,7 @@ def test_a_signal_ends_a_robot_soon(
         with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
             assert eventually(lambda: any(alive.values())), process.stderr
             process.send_signal(number)
-            assert process.wait(timeout=5.0) == 0
+            assert process.wait(timeout=5.0) == (130 if number == signal.SIGINT else 0)
         assert eventually(lambda: not any(alive.values()))
 
 

@@ -10,6 +10,7 @@ import pytest
 from msgspec.structs import replace
 from support.buses import MS, SECOND, Subscription
 
+from cpcbl_agents.extras import install_command
 from cpcbl_agents.vision.camera import Camera, Pixels
 from cpcbl_agents.vision.pictures import decode_image
 from cpcbl_launch.simulation.camera.cameras import QUALITIES, Cameras, encode_jpeg_within
@@ -217,7 +218,7 @@ def test_without_opencv_one_line_says_what_to_install(arguments: list[str], tmp_
     lines = [line for line in run.stderr.splitlines() if line]
     assert len(lines) == 1
     assert lines[0].startswith("cpcbl-team: team t: ")
-    assert lines[0].endswith("sensing = \"camera\" needs OpenCV: pip install 'cpcbl-team[camera]'")
+    assert lines[0].endswith(f'sensing = "camera" needs OpenCV: {install_command("camera")}')
 
 
 def test_a_team_without_cameras_needs_no_opencv(tmp_path: Path) -> None:

@@ -82,7 +82,13 @@ def test_eyes_are_shown_pictures(team_file: Path, pictures: Path) -> None:
     assert plain is not None
     assert np.abs(drawn.astype(int) - plain).max() > 100  # an outline and a label
     said = cpcbl_team(*words, "--count", 2).stdout
-    for word in ("broken.png", "frame_truncated", "nobody.png", "nothing", nobody["picture"]):
+    for word in (
+        "broken.png",
+        "the end of the picture is missing (frame_truncated)",
+        "nobody.png",
+        "nothing",
+        nobody["picture"],
+    ):
         assert word in said
     assert "seen.png" not in said
 

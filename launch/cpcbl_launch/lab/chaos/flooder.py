@@ -3,7 +3,7 @@
 import sys
 import time
 
-from cpcbl_agents.process import StopSignal
+from cpcbl_agents.stop import StopSignal
 from cpcbl_team.inputs import Belief, Fix
 from cpcbl_transport import topics
 from cpcbl_transport.compact import encode_help

@@ -33,6 +33,14 @@ from cpcbl_launch.reporting.tables import cells, table
 
 KINDS = ("odometry", "weighted", "landmarks", "passive", "active", "both")
 CONFIGURATIONS = dict(zip("ABCDEF", KINDS, strict=True))
+LABELS = {
+    "A": "odometry only",
+    "B": "landmarks, weighted means",
+    "C": "landmarks",
+    "D": "C, and where it sees the observer",
+    "E": "C, and where the observer sees it",
+    "F": "C, D and E together",
+}
 LEGEND = (
     "position: mean ± σ, max; heading: mean; consistent filter: 98.9 % in 3 σ, NEES 2\n"
     "bump, rest, fail: bumps into landmarks, restarts, runs that failed"

@@ -1,6 +1,7 @@
 """The experiments as pictures. Needs extra `plot`."""
 
 import math
+import textwrap
 from collections.abc import Callable, Mapping
 from itertools import groupby
 from pathlib import Path
@@ -13,6 +14,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Wedge
 
 from cpcbl_launch.lab.experiments.budget import Curve
+from cpcbl_launch.lab.experiments.figure7 import LABELS
 from cpcbl_launch.lab.experiments.liars import Liars
 from cpcbl_launch.lab.experiments.runs import Outcome, Spread
 from cpcbl_team.config import RobotSettings, Team
@@ -42,7 +44,7 @@ def draw_table1(result: Outcome) -> Figure:
 
 def draw_figure7(result: Outcome) -> Figure:
     """The field, and as figure 7 of the paper: mean position error, bars of one sigma."""
-    figure, (field, errors) = plt.subplots(1, 2, figsize=(12, 4.4), width_ratios=(3, 2))
+    figure, (field, errors) = plt.subplots(1, 2, figsize=(13, 4.6), width_ratios=(1, 1))
     _field(field, result.teams["F"])
     names = list(result.figures)
     for x, a in enumerate(result.figures.values()):
@@ -51,8 +53,10 @@ def draw_figure7(result: Outcome) -> Figure:
             errors.errorbar(x, mean, a.position_sigma_m, fmt="o", capsize=5, color="C0")
             near = {"textcoords": "offset points", "annotation_clip": True}
             errors.annotate(f"{mean:.3f}", (x, mean), (8, 0), **near)
-    errors.set(xticks=range(len(names)), xticklabels=names, ylabel="position error (m)")
-    errors.set(title="mean, and one σ (A is off the scale where cut)")
+    labels = [f"{name}\n{textwrap.fill(LABELS[name], 14)}" for name in names]
+    errors.set_xticks(range(len(names)), labels, fontsize=8)
+    errors.set(ylabel="position error (m)")
+    errors.set(title="mean error of the navigator, and one σ (A is off the scale where cut)")
     others = [a for c, a in result.figures.items() if c != "A"]
     rest = [(a.position_mean_m or 0.0) + (a.position_sigma_m or 0.0) for a in others]
     errors.set_ylim(0.0, 1.6 * max(rest, default=0.0) or 1.0)

@@ -53,7 +53,8 @@ def deployment_text(team: Team, file: Path, folder: Path, image: str | None, see
     """What `cpcbl-team compose` prints: the compose file of the team in `file`, to lie in `folder`.
 
     `file` is mounted into the containers unless it is a built-in team's name. Without `image` the
-    file tells how to build one from the checkout. Raises InputError for robots that replay a log.
+    file tells how to build one from the checkout. Raises InputError for robots that replay a log,
+    and without an image and a checkout.
     """
     for name, robot in team.robots.items():
         if robot.source == "mrclam":
@@ -61,6 +62,11 @@ def deployment_text(team: Team, file: Path, folder: Path, image: str | None, see
                 f"robots.{name}.source: mrclam: a log is replayed by `up --containers --data DIR`"
             )
     top = None if image else checkout()
+    if image is None and top is None:
+        raise InputError(
+            "compose: nobody has built an image for this installation, which has no checkout: in"
+            f" one, docker build --file docker/Dockerfile --tag {NAME} . ; then --image {NAME}"
+        )
     how = Deployment(
         str(file),
         image or f"{NAME}:{version()}",
