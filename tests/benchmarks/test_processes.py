@@ -83,8 +83,8 @@ def test_the_former_command_is_one_line_that_names_the_target(name: str) -> None
     assert ran.returncode == 2
     (line,) = ran.stderr.splitlines()
     assert f"make {MOVED[name]}" in line
-    (target,) = re.findall(r"^bench-[^:]*: setup$", MAKEFILE.read_text(), re.MULTILINE)
-    assert MOVED[name] in target.split(":")[0].split()
+    targets = re.findall(r"^(bench-[^:]*): setup$", MAKEFILE.read_text(), re.MULTILINE)
+    assert MOVED[name] in " ".join(targets).split()
 
 
 def test_the_use_of_a_process_is_its_own() -> None:

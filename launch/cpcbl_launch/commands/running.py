@@ -59,6 +59,10 @@ ProcessLogs = Annotated[
 InContainersOption = Annotated[
     bool, Option("--containers", help="Start one container per robot (needs Docker).")
 ]
+JoinedRouter = Annotated[
+    list[str] | None,
+    Option(callback=options.endpoints, help="Endpoint of a router that runs; default: own."),
+]
 View = Annotated[bool, Option("--view", help="Serve a page that shows the field, live.")]
 
 
@@ -70,10 +74,7 @@ def up(
     data: Annotated[Path | None, Option(help="Folder of an MRCLAM log, for source mrclam.")] = None,
     blind: options.Blind = "",
     robots: Robots = "",
-    connect: Annotated[
-        list[str] | None,
-        Option(callback=options.endpoints, help="Endpoint of a router that runs; default: own."),
-    ] = None,
+    connect: JoinedRouter = None,
     bytes_per_s: options.BytesPerS = None,
     messages_per_minute: options.MessagesPerMinute = None,
     match_messages: options.MatchMessages = None,
@@ -98,15 +99,13 @@ def up(
     budgets = Overrides(bytes_per_s, messages_per_minute, match_messages)
     run = _run_of(file, duration, data, budgets)
     run = run._replace(speed=speed, seed=seed, folder=logs, picture=picture, record=record)
-    run = run._replace(connect=tuple(connect or ()))
     blind_team = with_blind_robots(run.team, options.parse_names(blind), run.left_out)
-    run = run._replace(team=blind_team)
+    run = run._replace(team=blind_team, connect=tuple(connect or ()))
     if robots:
         run = run._replace(here=_robots_here(robots, run.team))
     console = Console(stderr=as_json)
     launch = _launch(run, containers, image, base_image, console)
-    watch = ["cpcbl-team", "traffic", str(file or "demo"), "--connect", router_endpoint(run)]
-    console.print(f"watch it: {shlex.join(watch)}", style="dim", highlight=False, soft_wrap=True)
+    _print_how_to_watch(file, router_endpoint(run), console)
     title = f"team {run.team.name}, {len(run.team.robots)} robots, {speed:g} x real time"
     listen = parse_listen("--view-listen", view_listen)
     page = _page(run.team, listen, open_page, console) if view else nullcontext(nullcontext)
@@ -116,6 +115,11 @@ def up(
     options.print_result(result, as_json, lambda: print_report(result, console), lost)
     if not result.has_data and not StopSignal.was_interrupted:
         _fail_without_data(run)
+
+
+def _print_how_to_watch(file: Path | None, endpoint: str, console: Console) -> None:
+    watch = ["cpcbl-team", "traffic", str(file or "demo"), "--connect", endpoint]
+    console.print(f"watch it: {shlex.join(watch)}", style="dim", highlight=False, soft_wrap=True)
 
 
 def _fail_without_data(run: "Run") -> None:

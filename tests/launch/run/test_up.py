@@ -175,7 +175,7 @@ def test_a_robot_waiting_for_its_router_can_be_stopped(
         assert process.stderr is not None
         assert "no router" in process.stderr.readline()
         process.send_signal(signal.SIGINT)
-        assert process.wait(timeout=5.0) == 2
+        assert process.wait(timeout=5.0) == 130
         assert endpoint in process.stderr.read().splitlines()[-1]
 
 

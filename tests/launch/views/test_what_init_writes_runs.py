@@ -58,7 +58,9 @@ def test_the_driver_feeds_its_robot(team: Path) -> None:
     inputs = r1()["inputs"]
     assert isinstance(inputs, list)
     assert [own["input"] for own in inputs] == ["odometry", "sightings"]
-    assert all(own["published_hz"] > 0.0 and own["refused"] == {} for own in inputs)
+    assert all(own["published_hz"] > 0.0 for own in inputs)
+    # What was on its way when the robot started is too late for it
+    assert all(set(own["refused"]) <= {"too_late"} for own in inputs)
 
 
 def test_doctor_finds_what_is_missing_and_the_strayed_driver(team: Path) -> None:
