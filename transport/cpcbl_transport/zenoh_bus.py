@@ -86,7 +86,7 @@ def open_router(config: Mapping[str, Any], space: str | None = None) -> "ZenohBu
     """A session that is a router for all teams, as its configuration says. Without a namespace its
     own keys are whole ones. Raises BusError when it cannot listen there."""
     try:
-        return ZenohBus(_open(config, space))
+        return ZenohBus(_open(config, space), is_router=True)
     except zenoh.ZError as error:
         endpoints = ", ".join(listening_at(config))
         raise BusError(f"cannot listen on {endpoints}: {listen_problem(str(error))}") from error
@@ -184,8 +184,8 @@ class _ZenohPublisher(_Declared):
 class ZenohBus(Bus):
     """One Zenoh session."""
 
-    def __init__(self, session: "zenoh.Session") -> None:
-        self._session = session
+    def __init__(self, session: "zenoh.Session", is_router: bool = False) -> None:
+        self._session, self._is_router = session, is_router
         self.declared: set[_Declared] = set()
 
     def publisher(self, key: str, qos: Qos) -> Publisher:
@@ -225,11 +225,18 @@ class ZenohBus(Bus):
         return [str(reply.ok.key_expr) for reply in replies if reply.ok is not None]
 
     def declarations(self, kind: str) -> dict[str, tuple[str, ...]]:
-        """What the clients of all routers have declared of a kind (publisher, subscriber, token):
-        whole keys, and the ids of the clients. For a session without a namespace."""
-        found: dict[str, tuple[str, ...]] = {}
+        """What is declared of a kind (publisher, subscriber, token) as the router of this session
+        knows: whole keys, and the ids of its own clients. For a session without a namespace.
+
+        Other routers are not asked: where such a question came while the link between two routers
+        broke, two times of three they did not exchange anything after it was back.
+        """
+        info, found = self._session.info, dict[str, tuple[str, ...]]()
+        routers = [info.zid()] if self._is_router else info.routers_zid()
         head = re.compile(rf"@/[^/]*/router/{kind}/")
-        for reply in self._session.get(f"@/*/router/{kind}/**", timeout=TOKENS_S):
+        if not routers:
+            return found
+        for reply in self._session.get(f"@/{routers[0]}/router/{kind}/**", timeout=TOKENS_S):
             if reply.ok is not None:
                 key = head.sub("", str(reply.ok.key_expr))
                 sources = json.loads(reply.ok.payload.to_bytes())
