@@ -145,7 +145,8 @@ def print_report(report: Report, console: Console) -> None:
     figures = _figures_table(report)
     if console.width < NARROW:
         figures.columns[:] = [c for c in figures.columns if c.header not in WITHOUT]
-    if report.team.position_rmse_m is not None or not report.has_data:
+    scores = (report.team, *report.alone.values())  # a short run ends before teammates help
+    if any(s.position_rmse_m is not None for s in scores) or not report.has_data:
         console.print(figures)
     else:
         console.print(own_figures_table(report))
