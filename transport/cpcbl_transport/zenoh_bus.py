@@ -73,20 +73,11 @@ def _tls_reason(connect: Sequence[str], credentials: Credentials | None) -> str:
     return "; ".join(dict.fromkeys(filter(None, reasons.values())))
 
 
-def open_onlooker(endpoint: str) -> "ZenohBus":
-    """A client's session without a namespace, to ask for all `declarations`. Raises
-    BusError."""
-    try:
-        return ZenohBus(_open(client_config([endpoint])))
-    except zenoh.ZError as error:
-        raise BusError(f"no router at {endpoint}: {one_line(str(error))}") from error
-
-
 def open_router(config: Mapping[str, Any], space: str | None = None) -> "ZenohBus":
     """A session that is a router for all teams, as its configuration says. Without a namespace its
     own keys are whole ones. Raises BusError when it cannot listen there."""
     try:
-        return ZenohBus(_open(config, space), is_router=True)
+        return ZenohBus(_open(config, space))
     except zenoh.ZError as error:
         endpoints = ", ".join(listening_at(config))
         raise BusError(f"cannot listen on {endpoints}: {listen_problem(str(error))}") from error
@@ -184,8 +175,8 @@ class _ZenohPublisher(_Declared):
 class ZenohBus(Bus):
     """One Zenoh session."""
 
-    def __init__(self, session: "zenoh.Session", is_router: bool = False) -> None:
-        self._session, self._is_router = session, is_router
+    def __init__(self, session: "zenoh.Session") -> None:
+        self._session = session
         self.declared: set[_Declared] = set()
 
     def publisher(self, key: str, qos: Qos) -> Publisher:
@@ -223,25 +214,6 @@ class ZenohBus(Bus):
         """The liveliness tokens that are there now."""
         replies = self._session.liveliness().get(keys, timeout=TOKENS_S)
         return [str(reply.ok.key_expr) for reply in replies if reply.ok is not None]
-
-    def declarations(self, kind: str) -> dict[str, tuple[str, ...]]:
-        """What is declared of a kind (publisher, subscriber, token) as the router of this session
-        knows: whole keys, and the ids of its own clients. For a session without a namespace.
-
-        Other routers are not asked: where such a question came while the link between two routers
-        broke, two times of three they did not exchange anything after it was back.
-        """
-        info, found = self._session.info, dict[str, tuple[str, ...]]()
-        routers = [info.zid()] if self._is_router else info.routers_zid()
-        head = re.compile(rf"@/[^/]*/router/{kind}/")
-        if not routers:
-            return found
-        for reply in self._session.get(f"@/{routers[0]}/router/{kind}/**", timeout=TOKENS_S):
-            if reply.ok is not None:
-                key = head.sub("", str(reply.ok.key_expr))
-                sources = json.loads(reply.ok.payload.to_bytes())
-                found[key] = (*found.get(key, ()), *sources.get("clients", ()))
-        return found
 
     def neighbours(self) -> dict[str, str]:
         """Who is linked to this session at present: its id -> what it is and where."""

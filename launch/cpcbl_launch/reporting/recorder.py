@@ -150,7 +150,6 @@ class Report(msgspec.Struct, frozen=True, kw_only=True):
     duration_s: float = 0.0
     starts: str = ""  # what robots knew of their start poses, on a log
     restarts: dict[str, int] = {}
-    strays: tuple[str, ...] = ()  # who published inputs to a team or robot that is not there
     refused: dict[str, int] = {}  # messages that the recorder could not use, by reason
     not_written: dict[str, str] = {}  # files that could not be written, with the reason
     alone: dict[str, Phase] = {}  # before collaboration began, where it began late
@@ -208,8 +207,6 @@ class Recorder:
         self.activity: dict[str, ActivityLog] = {}
         self.counts: Counter[str] = Counter()
         """Accepted messages by topic, and refused ones by reason."""
-        self.strays: tuple[str, ...] = ()
-        """Who publishes inputs to a team or robot that is not there; others set it."""
         self._problems: dict[str, ProblemLog] = {}
         self._processes: dict[str, dict[str, Status]] = {}  # the last status by incarnation
         for topic in (topics.TRACK, topics.STATUS, topics.TRUTH):

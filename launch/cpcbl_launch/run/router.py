@@ -6,8 +6,8 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from cpcbl_agents.earlier_processes import ALL_TEAMS, repeat_tokens
-from cpcbl_launch.run.linked import Declared, client_names, declared_at, stray_inputs
 from cpcbl_team.config import Team
+from cpcbl_transport import topics
 from cpcbl_transport.security import Identity, access_control, link_of
 from cpcbl_transport.topics import Role
 from cpcbl_transport.zenoh_bus import listening_at, open_router
@@ -16,7 +16,6 @@ from cpcbl_transport.zenoh_config import guard_rules, router_config
 log = logging.getLogger(__name__)
 
 LOOK_S = 0.5
-NAMELESS_LOOKS = 4  # before somebody is said to have come who has declared nothing
 
 
 def team_router(
@@ -34,46 +33,40 @@ def team_router(
     return router_config(here, connect, guards, credentials)
 
 
-def run_router(
-    config: Mapping[str, Any], title: str, stop: Callable[[], bool], team: Team | None = None
-) -> None:
-    """Routes until `stop()`; logs where it listens, who comes and goes, and who publishes to nobody
-    of `team`. Raises BusError."""
+def run_router(config: Mapping[str, Any], title: str, stop: Callable[[], bool]) -> None:
+    """Routes until `stop()`; logs where it listens, and who comes and goes. Raises BusError."""
     with open_router(config) as bus:
         repeat_tokens(bus, ALL_TEAMS)
         log.info("%s listens at %s", title, ", ".join(listening_at(config)))
-        visitors = Visitors(team)
+        bus.watch_liveliness(ALL_TEAMS + topics.ALIVE.at(), RobotLog())
+        known: dict[str, str] = {}
         while not stop():
-            declared = (declared_at(bus.declarations(kind)) for kind in ("publisher", "token"))
-            visitors.look(bus.neighbours(), *declared)
+            present = bus.neighbours()
+            for came in present.keys() - known.keys():
+                log.info("+ %s (%d linked)", present[came], len(present))
+            for went in known.keys() - present.keys():
+                log.info("- %s (%d linked)", known[went], len(present))
+            known = present
             time.sleep(LOOK_S)
         log.info("%s ends", title)
 
 
-class Visitors:
-    """Says once who has come and gone, and whose inputs reach nobody."""
+class RobotLog:
+    """Says which robots of which teams come and go, by their liveliness tokens."""
 
-    def __init__(self, team: Team | None) -> None:
-        self._team = team
-        self._known: dict[str, str] = {}
-        self._looks: dict[str, int] = {}  # at those that have no name yet
-        self._strays: tuple[str, ...] = ()
+    def __init__(self) -> None:
+        self._present: dict[tuple[str, str], str] = {}  # the token of each robot
 
-    def look(
-        self, present: Mapping[str, str], publishers: list[Declared], tokens: list[Declared]
-    ) -> None:
-        """`present`: who is linked, by id, and where."""
-        names = client_names(publishers, tokens)
-        self._looks = {client: self._looks.get(client, 0) + 1 for client in present}
-        for client, where in present.items():
-            name = names.get(client)
-            if client not in self._known and (name or self._looks[client] >= NAMELESS_LOOKS):
-                self._known[client] = f"{name}, {where}" if name else where
-                log.info("+ %s (%d linked)", self._known[client], len(present))
-        for client in [c for c in self._known if c not in present]:
-            log.info("- %s (%d linked)", self._known.pop(client), len(present))
-        strays = () if self._team is None else stray_inputs(self._team, publishers, tokens)
-        for text in strays:
-            if text not in self._strays:
-                log.warning("%s", text)
-        self._strays = strays
+    def __call__(self, key: str, alive: bool) -> None:
+        _, team, topic = key.split("/", 2)
+        names = topics.ALIVE.names(topic)
+        if names is None:
+            return
+        robot = team, names["robot"]
+        if alive:
+            if robot not in self._present:
+                log.info("+ robot %s of team %s", robot[1], team)
+            self._present[robot] = key
+        elif self._present.get(robot) == key:  # else its tier has changed
+            del self._present[robot]
+            log.info("- robot %s of team %s", robot[1], team)

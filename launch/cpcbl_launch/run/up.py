@@ -22,7 +22,6 @@ from cpcbl_launch.reporting.metrics import Floats
 from cpcbl_launch.reporting.phases import Span, guest_reports, phase_report
 from cpcbl_launch.reporting.recorder import Recorder, Report, variants_of
 from cpcbl_launch.reporting.recording import Recording
-from cpcbl_launch.run.linked import declared_at, stray_inputs
 from cpcbl_launch.run.logged_team import is_calibrated_on
 from cpcbl_launch.run.processes import Processes, Supervisor, process_table, tasks
 from cpcbl_launch.run.router import team_router
@@ -33,7 +32,7 @@ from cpcbl_team.errors import InputError
 from cpcbl_transport.bus import Bus
 from cpcbl_transport.security import Identity, link_of
 from cpcbl_transport.topics import Role, namespace
-from cpcbl_transport.zenoh_bus import open_bus, open_onlooker, open_router
+from cpcbl_transport.zenoh_bus import open_bus, open_router
 
 log = logging.getLogger(__name__)
 
@@ -41,7 +40,6 @@ LEAD_S = 2.0
 LEAD_S_A_PROCESS = 0.3
 LEAD_S_A_CAMERA = 1.0  # OpenCV is loaded, the lens laid out
 REFRESH_S = 0.25
-STRAYS_S = 2.0
 SIMULATED_S = 30.0  # by default
 LEAST_S = 1.0
 JOIN_S = 10.0  # so long a router that runs is looked for
@@ -177,7 +175,6 @@ def run_team(
         recording = stack.enter_context(_recording(run, bus))
         recorder = Recorder(bus)
         stack.enter_context(watch(bus))
-        onlooker = _onlooker(run, launch, stack)
         clock = Clock.starting_in(launcher.lead_s, run.epoch_ns, run.speed)
         with launcher.processes(clock) as processes:
             end_ns = None if run.duration_s is None else int(run.duration_s * 1e9)
@@ -186,7 +183,6 @@ def run_team(
                 if end_ns is not None and elapsed_ns >= end_ns:
                     break
                 processes.watch()
-                onlooker(recorder)
                 show(recorder, processes, elapsed_ns * 1e-9)
                 time.sleep(REFRESH_S)
             elapsed_s = (clock.now_ns() - clock.epoch_ns) * 1e-9
@@ -196,26 +192,6 @@ def run_team(
         lost = {**report.not_written, str(run.record): recording.failed}
         report = msgspec.structs.replace(report, not_written=lost)
     return report
-
-
-def _onlooker(run: Run, launch: Launch, stack: ExitStack) -> Callable[[Recorder], None]:
-    """What notes now and then who publishes inputs to nobody. A secured team's router lets nobody
-    do so, and lets nobody ask."""
-    team = run.team
-    if launch is not OnThisMachine or team.transport.secured:
-        return lambda recorder: None
-    bus = stack.enter_context(open_onlooker(router_endpoint(run)))
-    next_s = 0.0
-
-    def look(recorder: Recorder) -> None:
-        nonlocal next_s
-        if time.monotonic() >= next_s:
-            next_s = time.monotonic() + STRAYS_S
-            kinds = ("publisher", "token")
-            found = [declared_at(bus.declarations(kind)) for kind in kinds]
-            recorder.strays = stray_inputs(team, *found)
-
-    return look
 
 
 def simulate_run(run: Run, progress: Progress | None = None) -> Report:
@@ -277,7 +253,6 @@ def _report(
         left_out=dict(run.left_out),
         duration_s=elapsed_s,
         restarts=restarts,
-        strays=recorder.strays,
         alone=alone,
         guests=guests,
         not_written=lost,

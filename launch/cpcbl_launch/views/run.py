@@ -51,7 +51,7 @@ class LiveTable(LiveView):
 
     def show(self, recorder: Recorder, processes: Processes, elapsed_s: float) -> None:
         """Called several times a second."""
-        drawn = bool(recorder.tracks or recorder.strays)
+        drawn = bool(recorder.tracks)
         self.draw(lambda: self._table_and_problems(recorder, processes, elapsed_s), drawn)
 
     def _table_and_problems(
@@ -61,7 +61,7 @@ class LiveTable(LiveView):
         lines = [
             f"{name}: {text}" for name, s in recorder.latest()[1].items() for text in s.problems
         ]
-        return Group(shown, *(Text(line, "yellow") for line in (*recorder.strays, *lines)))
+        return Group(shown, *(Text(line, "yellow") for line in lines))
 
     def _silent_s(self, name: str, track: Track | None) -> float:
         """Real seconds since the latest track of a robot came."""
@@ -281,8 +281,6 @@ def _remarks(report: Report) -> Iterator[str]:
     for name, r in report.robots.items():
         yield from problem_remarks(name, r.problems)
         yield from trust_remarks(name, r.trust)
-    for text in report.strays:
-        yield f"{text[0].upper()}{text[1:]}."
     if report.refused:
         counts = ", ".join(f"{reason} {n}" for reason, n in report.refused.items())
         yield f"Messages that could not be used, by reason: {counts}."

@@ -100,6 +100,22 @@ def test_routes_between_robots_says_who_is_there_and_ends_on_a_signal(
     assert f"router of team lab listens at {endpoint}" in said[0]
 
 
+def test_the_router_says_which_robots_come_and_go(team_file: Path) -> None:
+    endpoint = free_endpoint()
+    tiers = [topics.ALIVE.at(tier=tier, robot="victim", incarnation="1") for tier in (0, 1)]
+    with (
+        running(team_file, "--listen", endpoint) as said,
+        open_bus("lab", [endpoint]) as bus,
+    ):
+        first = bus.declare_token(tiers[0])
+        assert eventually(lambda: any("+ robot victim of team lab" in line for line in said)), said
+        second = bus.declare_token(tiers[1])
+        first.close()  # a change of tier
+        second.close()
+        assert eventually(lambda: any("- robot victim of team lab" in line for line in said)), said
+    assert sum("robot victim" in line for line in said) == 2
+
+
 def test_teams_stay_apart_on_one_router(team_file: Path) -> None:
     endpoint, key = free_endpoint(), "in/victim/odometry"
     with (
