@@ -74,7 +74,7 @@ class InputMonitor:
 
     def __init__(self, robot: str, team: Team, start_ns: int, speed: float = 1.0) -> None:
         settings = team.robots[robot]
-        lengths = {"odometry": 100, "sightings": 60}
+        lengths = {"odometry": 100, "sightings": 100}  # of ten seconds at 10 Hz
         self.inputs = {name: Input(name, start_ns, lengths.get(name, 10)) for name in NAMES}
         self.by_key = {f"in/{robot}/{name}": entry for name, entry in self.inputs.items()}
         self._start_ns, self._history = start_ns, deque[_Totals](maxlen=WINDOW + 1)

@@ -152,8 +152,9 @@ def _stamp_cause(reason: str, key: str, window: InputWindow) -> str:
         found = [(now_ns, decode_by_key(key, payload)) for now_ns, payload in window.recent_refused]
         kinds = Odometry | Sightings | Position | Frame
         stamps = [(now_ns, m.stamp_ns) for now_ns, m in found if isinstance(m, kinds)] or stamps
-    said = [causes.stamp_cause(stamp_ns, now_ns) for now_ns, stamp_ns in stamps[-3:]]
-    return next(filter(None, reversed(said)), "")
+    # Of the whole window, for a driver that was mended a moment ago sends good stamps at its end
+    said = (causes.stamp_cause(stamp_ns, now_ns) for now_ns, stamp_ns in reversed(stamps))
+    return next(filter(None, said), "")
 
 
 def _unknown_names(frames: Sequence[Sightings], names: frozenset[str]) -> str:
@@ -183,7 +184,9 @@ def overlapping(window: InputWindow) -> bool:
 
 
 def _pieces(window: InputWindow) -> list[Odometry]:
-    return [m for _, m in window.recent if isinstance(m, Odometry)]
+    """Those whose stamps are near: a speed says nothing where stamps have another unit."""
+    near = [m for now_ns, m in window.recent if abs(now_ns - m.stamp_ns) < causes.YEAR_NS]
+    return [m for m in near if isinstance(m, Odometry)]
 
 
 def _implausible(facts: Facts) -> Iterator[str]:
@@ -192,11 +195,11 @@ def _implausible(facts: Facts) -> Iterator[str]:
     pieces = _pieces(odometry) if odometry.taken else []
     seen = facts.windows.get("sightings", nothing).recent
     frames = [m for _, m in seen if isinstance(m, Sightings)]
-    if cause := causes.odometry_cause(pieces[-20:]):
-        yield f"odometry: {cause}"
+    if speed := causes.odometry_cause(pieces[-20:]):
+        yield f"odometry: {speed}"
     elif pieces and overlapping(odometry) and "duplicate" not in odometry.refused:
         yield "odometry: pieces overlap; two drivers, or from_ns is not where the last one ended"
     if cause := causes.range_cause(frames[-10:], facts.max_range_m, facts.field_m):
         yield f"sightings: {cause}"
-    if cause := causes.sign_cause(frames, pieces, facts.landmarks):
+    if not speed and (cause := causes.sign_cause(frames[-60:], pieces, facts.landmarks)):
         yield f"sightings: {cause}"

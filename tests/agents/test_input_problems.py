@@ -305,6 +305,18 @@ def test_what_has_one_cause_is_said_once_for_each_input() -> None:
     assert problems == tuple(f"100 % of {name} {said}" for name in ("odometry", "sightings"))
 
 
+@pytest.mark.parametrize("unit", [1e-9, 1e-6, 1e-3], ids=["s", "ms", "µs"])
+def test_a_driver_whose_stamps_were_mended_is_told_nothing_new(unit: float) -> None:
+    driver = Driver()
+    driver.run(12.0, stamped(unit))
+    driver.statuses.clear()
+    assert driver.run(15.0) == ()
+    said = {without_numbers(text) for status in driver.statuses for text in status.problems}
+    looks = "# % of {} refused: stamps look like {}seconds since #; nanoseconds are due"
+    prefix = {1e-9: "", 1e-6: "milli", 1e-3: "micro"}[unit]
+    assert said <= {looks.format(name, prefix) for name in ("odometry", "sightings")}
+
+
 def test_a_problem_is_the_same_one_while_only_its_figures_change() -> None:
     a = "no odometry on in/r1/odometry for 3 s; is its driver there?"
     assert without_numbers(a) == without_numbers(a.replace("3 s", "12 s"))
