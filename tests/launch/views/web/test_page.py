@@ -47,7 +47,7 @@ async def watched(folder: Path, *arguments: str) -> AsyncIterator[tuple[Tab, Pat
         finally:
             up.send_signal(signal.SIGINT)
             await asyncio.to_thread(up.communicate, None, 60.0)
-    assert up.returncode == 0
+    assert up.returncode == 130
 
 
 async def fingers_and_keys_zoom(tab: Tab) -> None:
