@@ -78,7 +78,7 @@ def test_shows_the_demo_and_marks_a_robot_that_was_killed(tmp_path: Path) -> Non
             )
             await tab.save_screenshot(tmp_path / "demo.png")
 
-            (pid,) = pids_of(["robot navigator", str(logs)])
+            (pid,) = pids_of([f"robot {logs}/team.json navigator"])
             os.kill(pid, signal.SIGSTOP)  # it hangs, and its link stays open
             await tab.wait_for(f"({STATES}).navigator === 'gone'")
             os.kill(pid, signal.SIGCONT)
