@@ -40,7 +40,7 @@ async def draw(picture: Path) -> None:
                     )
                     await asyncio.sleep(1.5)
                     await tab.save_screenshot(picture)
-                    (pid,) = pids_of(["robot navigator", logs])
+                    (pid,) = pids_of([f"robot {logs}/team.json navigator"])
                     await _measure_mark(tab, pid, signal.SIGSTOP)
                     os.kill(pid, signal.SIGCONT)
                     await tab.wait_for(_STATE.format("!= 'gone'"))

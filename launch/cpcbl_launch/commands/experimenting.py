@@ -23,6 +23,8 @@ experiment_app = Typer(
     no_args_is_help=True,
 )
 
+FILE_WIDTH = 110
+
 Seeds = Annotated[int, Option(min=1, help="Runs of each case, each with its own noise.")]
 Jobs = Annotated[Optional[int], Option(min=1, help="Processes at a time; default: all cores.")]
 Output = Annotated[Path, Option(help="Folder for NAME.json and NAME.png.")]
@@ -213,7 +215,10 @@ def _conduct(
 
     def show_tables() -> None:
         written = () if lost else (f"written: {figures}{', .png' * drawn}",)
+        console = Console()
+        if not console.is_terminal:  # a file; rich would cut the figures
+            console.width = max(console.width, FILE_WIDTH)
         for shown in (*tables(result), *written):
-            Console().print(shown, highlight=False)
+            console.print(shown, highlight=False)
 
     options.print_result(result, as_json, show_tables, lost)
