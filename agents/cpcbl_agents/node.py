@@ -256,6 +256,7 @@ class Node:
         received = self.received.flows()
         status = self.robot.status(now_ns, self._incarnation, counts, received, self._clocks)
         inputs, problems = self._health.judge(self.robot, now_ns, bool(self._namesakes))
+        problems += self.robot.sensing.problems
         status = msgspec.structs.replace(status, inputs=inputs, problems=problems)
         self._on_status(status)
         self._publish(status)

@@ -59,6 +59,11 @@ class SensingAgent:
         return self._detector is not None
 
     @property
+    def problems(self) -> tuple[str, ...]:
+        """What the detector doubts about its camera, as sentences."""
+        return () if self._detector is None else self._detector.problems
+
+    @property
     def next_ns(self) -> int | None:
         return min((s.next_ns for s in self._sources if s.next_ns is not None), default=None)
 

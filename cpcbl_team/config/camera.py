@@ -56,8 +56,11 @@ class CameraSettings(Table, frozen=True, kw_only=True):
     roll_deg: float = 0.0
     edge_sigma_px: Positive = 0.4
     """The accuracy with which the edge of a band, or the corner of a marker, is found."""
-    tilt_sigma_deg: NotNegative = 0.2
-    """The accuracy of the tilt, because floors are not even; it limits ranges from foot points."""
+    tilt_sigma_deg: NotNegative = 1.0
+    """The accuracy of the tilt, because no mount is exact, floors are not even and robots nod; it
+    limits ranges from foot points."""
+    roll_sigma_deg: NotNegative = 1.0
+    """The accuracy of the roll, for the same reasons."""
     yaw_sigma_deg: NotNegative = 0.1
     """The accuracy of the yaw; it is added to the sigma of every bearing."""
     focal_share: NotNegative = 0.005

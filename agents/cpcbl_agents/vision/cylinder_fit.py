@@ -115,10 +115,11 @@ def rejection_reason(shape: Shape, lens_m: float, outline: AngularOutline) -> st
     # The distance by its height alone, wherever it stands.
     near = (shape.foot - shape.top) / max(foot - top, 1e-9)
     expected = math.asin(min(1.0, shape.radius / (near + LEVEL * shape.radius)))
-    edge = outline.sigmas[MID]
-    width_sigma = math.hypot(outline.sigmas[WIDTH], expected * edge * math.sqrt(2.0) / (foot - top))
+    edge, face = outline.sigmas[MID], max(top, 0.0) * LEVEL * shape.radius / near
+    height_sigma = math.hypot(edge * math.sqrt(2.0), face) / (foot - top)
+    width_sigma = math.hypot(outline.sigmas[WIDTH], expected * height_sigma)
     if (
-        abs(foot - 2.0 * mid + top) > SIGMAS * math.sqrt(6.0) * edge
+        abs(foot - 2.0 * mid + top) > SIGMAS * math.hypot(math.sqrt(6.0) * edge, face)
         or abs(width - expected) > SIGMAS * width_sigma
     ):
         return "wrong_shape"
@@ -148,11 +149,20 @@ def expected_angles(shape: Shape, distance: float) -> tuple[float, float, float,
     """
     near = distance - LEVEL * shape.radius
     return (
-        shape.top / near,
+        shape.top / near - _top_face(shape, distance),
         shape.mid / near,
         shape.foot / near + _hidden_foot(shape, distance),
         math.asin(min(1.0, shape.radius / distance)),
     )
+
+
+def _top_face(shape: Shape, distance: float) -> float:
+    """Half of the top face as a slope, where the lens looks down on it: the expected value and the
+    sigma of how far the top edge moves up. A face of a few pixels is not told from the band."""
+    if shape.top <= 0.0:
+        return 0.0
+    near, far = distance - LEVEL * shape.radius, distance + LEVEL * shape.radius
+    return 0.5 * shape.top * (1.0 / near - 1.0 / far)
 
 
 def _hidden_foot(shape: Shape, distance: float) -> float:
@@ -183,7 +193,8 @@ def fit_distance(
         a_little = expected_angles(shape, distance * 1.0001)
         slopes = [(a_little[i] - expected[i]) / (1e-4 * distance) for i in use]
         errors = [angles[i] - expected[i] for i in use]
-        unsure = [_hidden_foot(shape, distance) if i == FOOT else 0.0 for i in use]
+        hidden = {FOOT: _hidden_foot(shape, distance), TOP: _top_face(shape, distance)}
+        unsure = [hidden.get(i, 0.0) for i in use]
         own = [math.hypot(sigmas[i], more) for i, more in zip(use, unsure, strict=True)]
         weigh = _Weights(own, shared)
         information = weigh(slopes, slopes)

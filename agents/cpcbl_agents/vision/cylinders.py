@@ -14,6 +14,7 @@ from cpcbl_agents.vision.camera import Camera, Pixels, panorama_for
 from cpcbl_agents.vision.colours import ColourBlob, ColourSegmenter
 from cpcbl_agents.vision.cylinder_fit import (
     FOOT,
+    MID,
     TOP,
     WIDTH,
     AngularOutline,
@@ -152,7 +153,10 @@ class CylinderDetector:
             panorama.azimuth(middle),
             (panorama.slope(o.top), panorama.slope(o.mid), panorama.slope(o.foot), half_width),
             (top, mid, foot, 0.5 * math.hypot(left, right)),
-            math.radians(self._settings.tilt_sigma_deg),
+            math.hypot(
+                math.radians(self._settings.tilt_sigma_deg),
+                math.radians(self._settings.roll_sigma_deg) * math.tan(panorama.azimuth(middle)),
+            ),
             panorama.corners(o.left, o.top, o.right, o.foot),
             o.hidden,
             o.cut,
@@ -170,7 +174,9 @@ class CylinderDetector:
         """Range and bearing from the robot's centre; the bearing only if something is hidden."""
         s, outline, azimuth = self._settings, fit.outline, fit.outline.azimuth
         oblique = s.focal_share * math.sin(azimuth) * math.cos(azimuth)
-        azimuth_sigma = math.hypot(outline.sigmas[WIDTH], oblique)
+        leans = (s.roll_sigma_deg, s.tilt_sigma_deg * math.sin(azimuth))
+        leaning = math.radians(math.hypot(*leans)) * outline.angles[MID]
+        azimuth_sigma = math.hypot(outline.sigmas[WIDTH], oblique, leaning)
         if fit.hidden == WIDTH:  # the axis is within the radius of the middle of what is seen
             azimuth_sigma += fit.half_width
         narrow = NARROW_PX * self._panorama.step / max(2.0 * outline.angles[WIDTH], 1e-6)

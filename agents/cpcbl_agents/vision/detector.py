@@ -4,6 +4,11 @@ It detects landmarks by their colour bands (`cylinders`), and teammates by their
 or, farther away, by the bands of their masts.
 """
 
+import logging
+
+import cv2
+import numpy as np
+
 from cpcbl_agents.sources import Picture
 from cpcbl_agents.vision.annotate import annotate
 from cpcbl_agents.vision.camera import NO_PIXELS, Camera, Pixels
@@ -15,14 +20,22 @@ from cpcbl_team.config import Team
 from cpcbl_team.inputs import Sightings
 from cpcbl_transport.messages import AnnotatedFrame, Frame, UnclearObject
 
+log = logging.getLogger(__name__)
+
 
 class CameraDetector:
     """The detector of one robot of a team."""
 
     def __init__(self, robot: str, team: Team) -> None:
         self.robot, self.camera = robot, Camera(team.robots[robot].camera)
+        self._has_failed = False
         self._cylinders = CylinderDetector(robot, team, self.camera)
         self._markers = MarkerDetector(robot, team, self.camera)
+
+    @property
+    def problems(self) -> tuple[str, ...]:
+        """What the latest frames say about the camera, as sentences."""
+        return self._markers.fits.problems
 
     def detect(self, frame: Frame | Picture) -> Sightings | str:
         """The sightings in a frame, or the reason why it cannot be used (`frame_...`)."""
@@ -54,7 +67,14 @@ class CameraDetector:
         """All detections in a picture (height, width, 3), BGR, or why it cannot be used."""
         if reason := pixel_fault(pixels, self.camera.size_px):
             return reason
-        near, far = self._markers.detections(pixels), self._cylinders.detections(pixels)
+        try:
+            near, far = self._markers.detections(pixels), self._cylinders.detections(pixels)
+        except (cv2.error, np.linalg.LinAlgError, ArithmeticError, LookupError, ValueError):
+            # Nobody can show every picture to a detector: one frame must not end a robot
+            if not self._has_failed:
+                log.exception("the detector failed; such frames are counted as `frame_failed`")
+            self._has_failed = True
+            return "frame_failed"
         # What markers detected or rejected, colours need not detect.
         known = {found.sighting.id for found in near.found}
         known.update(name for ambiguity in near.ambiguities for name in ambiguity.names)

@@ -20,15 +20,20 @@ from numpy.typing import NDArray
 
 from cpcbl_agents.vision.camera import Camera, Floats, Pixels
 from cpcbl_agents.vision.detections import Ambiguity, Detection, Detections
-from cpcbl_agents.vision.poses import PoseFit, fit_pose
+from cpcbl_agents.vision.marker_fits import MarkerFits
+from cpcbl_agents.vision.poses import Lean, PoseFit, fit_pose
 from cpcbl_team.config import MarkerFamily, Side, Team
 from cpcbl_team.inputs import Sighting
 
 WINDOW_PX = 7  # of the adaptive threshold; one is enough, as what is found is refined
 LEAST_SIDE_PX = 6.0
+MOST_OUTLINES = 300  # that are looked at: a floor of tiles has thousands, and the filter waits
 PASSES = 2  # until corners are exact enough to read between them
 FAR_PX = 8.0  # a corner that moves by so much in a pass is none
-MOST_MISFIT = 5.0  # mean squared error in sigmas, of a marker that stands where it should
+MOST_MISFIT = 25.0
+"""Mean squared error of a marker that stands where it should, in stated sigmas: corners of real
+images err by three to four times as much as those of clean ones."""
+MOST_LEAN_RAD = math.radians(7.0)  # of a camera; a marker that implies more is elsewhere
 CLEAR_RAD = math.radians(10.0)
 """A heading with a larger sigma is not reported."""
 POINTS_PER_SIDE = 12  # along a side
@@ -37,6 +42,7 @@ SHARE = 0.8  # of a cell is looked at on either side: beyond lie the marker's bi
 LEAST_PX, MOST_PX = 1.6, 4.0
 FAINT = 0.25  # of the steepest step: less is noise
 LEAST_CONTRAST = 12.0  # grey levels between a marker's black and its margin's white
+MOST_ROWS = 32_766  # cv2.remap numbers the rows of its result with 16 bits
 WRONG_SHARE = 0.25  # of the bits that a family could set right: a wrong name is worse than none
 
 _ALONG = np.linspace(0.12, 0.88, POINTS_PER_SIDE, dtype=np.float32)[:, None]
@@ -154,8 +160,9 @@ def _sample_grey(grey: Pixels, points: Floats | NDArray[np.float32]) -> NDArray[
     if not points.size:
         return np.zeros(points.shape[:-1], np.float32)
     flat = points.astype(np.float32, copy=False).reshape(-1, points.shape[-2], 2)
-    levels = cv2.remap(grey, flat[..., 0], flat[..., 1], cv2.INTER_LINEAR)
-    return levels.astype(np.float32).reshape(points.shape[:-1])
+    parts = (flat[i : i + MOST_ROWS] for i in range(0, len(flat), MOST_ROWS))
+    levels = [cv2.remap(grey, p[..., 0], p[..., 1], cv2.INTER_LINEAR) for p in parts]
+    return np.concatenate(levels).astype(np.float32).reshape(points.shape[:-1])
 
 
 class DetectedMarker(NamedTuple):
@@ -183,6 +190,8 @@ class MarkerDetector:
         for name, settings in team.robots.items():
             for side, number in settings.markers.items():
                 self._mounts[number].append(MarkerMount(name, side))
+        stated = (camera.settings.tilt_sigma_deg, camera.settings.roll_sigma_deg)
+        self.fits = MarkerFits(Lean(*map(math.radians, stated)))
         self._codes = MarkerReader(team.vision.family)
         chosen = cv2.aruco.DetectorParameters()  # finds outlines fast, small ones too
         chosen.adaptiveThreshWinSizeMin = chosen.adaptiveThreshWinSizeMax = WINDOW_PX
@@ -195,21 +204,25 @@ class MarkerDetector:
         if not self._mounts:
             return Detections()
         grey = cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY).astype(np.uint8, copy=False)
-        own, ambiguities = assign_markers(self._detect_markers(grey), self._mounts, self._robot)
-        found = Detections((), ambiguities)
+        markers, dropped = self._detect_markers(grey)
+        own, ambiguities = assign_markers(markers, self._mounts, self._robot)
+        found = Detections((), (*ambiguities, *dropped))
         for name, sides in own.items():
             found |= self._locate(name, sides)
         return found
 
-    def _detect_markers(self, grey: Pixels) -> list[DetectedMarker]:
-        """All markers of the family in a picture, those with the most exact outlines first.
+    def _detect_markers(self, grey: Pixels) -> tuple[list[DetectedMarker], Sequence[Ambiguity]]:
+        """All markers of the family in a picture, those with the most exact outlines first, and
+        what was not looked at.
 
         OpenCV finds outlines, of paper around a marker too; which of them are markers is read
         between corners that are nearly exact.
         """
         right, _, wrong = self._detector.detectMarkers(grey)
-        quads = np.array([*right, *wrong], dtype=np.float64).reshape(-1, 4, 2)
-        quads = quads[_shortest_sides(quads) > LEAST_SIDE_PX]
+        outlines = np.array([*right, *wrong], dtype=np.float64).reshape(-1, 4, 2)
+        quads = _likely_first(outlines, len(right))
+        dropped = tuple(Ambiguity("too_many_outlines", (), q) for q in quads[MOST_OUTLINES:][:1])
+        quads = quads[:MOST_OUTLINES]
         for _ in range(PASSES):
             better = line_intersections(side_edge_points(grey, quads, self._codes.cells))
             near = np.abs(better - quads).max(axis=(1, 2), initial=0.0) < FAR_PX
@@ -217,7 +230,7 @@ class MarkerDetector:
             quads = quads[_shortest_sides(quads) > LEAST_SIDE_PX]
         codes = self._codes.read(grey, quads)
         if not codes:
-            return []
+            return [], dropped
         rough = quads[list(codes)]
         sides = side_edge_points(grey, rough, self._codes.cells)
         exact = line_intersections(sides)
@@ -229,7 +242,7 @@ class MarkerDetector:
             outline, plane = np.roll(outline, turn, axis=0), np.roll(plane, turn, axis=0)
             markers.append(DetectedMarker(code.id, outline, plane))
         moved = np.abs(exact - rough).max(axis=(1, 2))
-        return [markers[i] for i in moved.argsort() if moved[i] < FAR_PX]
+        return [markers[i] for i in moved.argsort() if moved[i] < FAR_PX], dropped
 
     def _upside_down(self, plane: Floats) -> int:
         """The number of corners by which a marker must be turned to be upright: 2 or 0.
@@ -245,19 +258,25 @@ class MarkerDetector:
         corners = np.concatenate([mark.outline for mark in sides.values()]).astype(np.float32)
         outline = cv2.convexHull(corners).reshape(-1, 2).astype(np.float64)
         fit = self._fit(sides)
-        if fit.misfit > MOST_MISFIT:
-            alone = [self._fit({side: mark}).misfit for side, mark in sides.items()]
-            apart = len(alone) > 1 and max(alone) <= MOST_MISFIT
-            reason = "contradiction" if apart else "bad_fit"
+        reason = self._rejection(sides, fit)
+        self.fits.add(reason, fit)
+        if reason:
             return Detections((), (Ambiguity(reason, (name,), outline),))
         found = Detection(sighting(name, fit), outline)
         if found.sighting.heading_rad is not None:
             return Detections((found,))
         return Detections((found,), (Ambiguity("heading_ambiguous", (name,), outline),))
 
+    def _rejection(self, sides: Mapping[Side, DetectedMarker], fit: PoseFit) -> str:
+        """Why the pose of a teammate is not used; empty if it is."""
+        if fit.corner_variance <= MOST_MISFIT:
+            return "bad_fit" if max(map(abs, fit.lean)) > MOST_LEAN_RAD else ""
+        alone = [self._fit({side: mark}).corner_variance for side, mark in sides.items()]
+        return "contradiction" if len(alone) > 1 and max(alone) <= MOST_MISFIT else "bad_fit"
+
     def _fit(self, sides: Mapping[Side, DetectedMarker]) -> PoseFit:
         plane = {side: mark.plane for side, mark in sides.items()}
-        return fit_pose(plane, self._vision, self._camera)
+        return fit_pose(plane, self._vision, self._camera, self.fits.corner_variance)
 
 
 def assign_markers(
@@ -307,6 +326,14 @@ def sighting(name: str, fit: PoseFit) -> Sighting:
     if heading_sigma > CLEAR_RAD:
         return Sighting(name, range_m, bearing, range_sigma, bearing_sigma)
     return Sighting(name, range_m, bearing, range_sigma, bearing_sigma, heading, heading_sigma)
+
+
+def _likely_first(outlines: Floats, read: int) -> Floats:
+    """Those of the outlines (n, 4, 2) that are not too small: first those that OpenCV could read,
+    of which there are `read`, then the others, the largest first."""
+    sizes = _shortest_sides(outlines)
+    order = np.lexsort((-sizes, np.arange(len(outlines)) >= read))
+    return np.asarray(outlines[order][sizes[order] > LEAST_SIDE_PX])
 
 
 def _shortest_sides(quads: Floats) -> Floats:

@@ -7,10 +7,16 @@ reprojection errors of the corners, weighted with the inverse of their covarianc
 right (Schweighofer and Pinz, Robust pose estimation from a planar target, PAMI 2006). Therefore the
 optimization starts from both sides. If the errors exclude neither solution, the covariance is that
 of all headings between them.
+
+No mount is known exactly, floors are uneven and a driving robot nods. So the tilt and the roll of
+the camera are parameters too, eliminated with their sigmas as priors: they are part of the
+covariance of the corners. Corners in real images err by more than in good light. So a covariance
+grows with the misfit, and a second solution is excluded only if it is worse by that much more.
 """
 
 import math
 from collections.abc import Mapping
+from contextlib import suppress
 from typing import NamedTuple
 
 import numpy as np
@@ -31,7 +37,7 @@ each of which is fitted to many edge points."""
 LEAST_TURN = math.radians(15.0)  # between the normal of a marker and its ray, in the initial poses
 STEPS = 12
 SMALL = 1e-3  # Levenberg-Marquardt stops when a step reduces the weighted squared error by less
-RIVAL = 12.0
+RIVAL = 20.0
 """A pose is excluded if its weighted squared error exceeds that of the best pose by this."""
 LEAST_WEIGHT = 0.1
 """The least weight of a possible heading relative to the best: three sigma then include it."""
@@ -39,15 +45,30 @@ NARROW = math.radians(1.5)
 """Within this angle, the projection of the corners is linear in the heading, and the inverse of the
 information matrix is the covariance. Beyond it, the covariance is computed over all headings."""
 HEADINGS = 31
+GOOD_MISFIT = 2.0
+"""Mean squared error in sigmas: beyond it, the camera may lean by more than its settings state."""
+LEANING_RAD = math.radians(5.0)
+"""The sigma of tilt and roll then: a ramp, a kerb, a robot that brakes, a mount that was bent."""
 MOST_SIGMA = math.radians(20.0)
 
 
+class Lean(NamedTuple):
+    """How much farther than stated the camera is tilted down and rolled clockwise (rad)."""
+
+    tilt: float
+    roll: float
+
+
 class PoseFit(NamedTuple):
-    """`viewer_from_mate`, its covariance (3, 3; m, rad), and the mean squared error in sigmas."""
+    """`viewer_from_mate`, its covariance (3, 3; m, rad), the mean squared error in sigmas (infinite
+    if no pose fits at all), the lean of the camera which that pose implies, and the variance of the
+    corners, as a multiple of the stated one."""
 
     pose: Pose2
     covariance: Floats
     misfit: float
+    lean: Lean
+    corner_variance: float
 
 
 def side_corners(side: Side, vision: VisionSettings) -> Floats:
@@ -62,42 +83,90 @@ def side_corners(side: Side, vision: VisionSettings) -> Floats:
 
 
 def fit_pose(
-    corners_by_side: Mapping[Side, Floats], vision: VisionSettings, camera: Camera
+    corners_by_side: Mapping[Side, Floats],
+    vision: VisionSettings,
+    camera: Camera,
+    corner_variance: float = 1.0,
 ) -> PoseFit:
     """The pose with the least reprojection errors of all markers of a robot.
 
     `corners_by_side`: the detected corners (4, 2) of each marker in the order of `side_corners`,
-    on the plane z = 1 of the camera frame.
+    on the plane z = 1 of the camera frame. `corner_variance`: how much larger than stated it is in
+    this camera's images. If no pose fits with the stated sigmas of tilt and roll,
+    the camera may lean by `LEANING_RAD`.
     """
+    s = camera.settings
+    lean = Lean(math.radians(s.tilt_sigma_deg), math.radians(s.roll_sigma_deg))
+    farther = Lean(max(lean.tilt, LEANING_RAD), max(lean.roll, LEANING_RAD))
+    initial = _initial_poses(corners_by_side, vision, camera)
+    none = Lean(0.0, 0.0)
+    fit = PoseFit(Pose2(*initial[0].tolist()), np.eye(3), math.inf, none, math.inf)
+    for sigmas in (lean, farther):
+        with suppress(np.linalg.LinAlgError):  # corners that no upright marker has
+            fit = _fit(initial, corners_by_side, vision, camera, sigmas, corner_variance)
+        if fit.misfit <= GOOD_MISFIT:
+            break
+    return fit
+
+
+def _fit(
+    initial: Floats,
+    corners_by_side: Mapping[Side, Floats],
+    vision: VisionSettings,
+    camera: Camera,
+    sigmas: Lean,
+    corner_variance: float,
+) -> PoseFit:
+    """The same with these sigmas of tilt and roll. Raises LinAlgError if no pose fits."""
     shape = np.concatenate([side_corners(side, vision) for side in corners_by_side])
     plane = np.concatenate(list(corners_by_side.values()))
-    view = _Reprojection(shape, plane, camera)
-    poses, normal_equations = _refine(_initial_poses(corners_by_side, vision, camera), view)
-    errors = normal_equations[:, 3, 3]
-    best, possible = int(errors.argmin()), errors - errors.min() < RIVAL
+    view = _Reprojection(shape, plane, camera, sigmas, corner_variance)
+    poses, normal_equations = _refine(initial, view)
     covariances = _inverse(normal_equations[:, :3, :3])
-    sigmas = np.sqrt(covariances[:, 2, 2])
+    if not (np.diagonal(covariances, axis1=1, axis2=2) > 0.0).all():
+        raise np.linalg.LinAlgError("a covariance is not positive")
+    errors = normal_equations[:, 3, 3]
+    best = int(errors.argmin())
+    freedom = plane.size - 3
+    misfit = float(errors[best]) / freedom
+    # The variance of Student's distribution: a misfit of so few corners is itself uncertain
+    inflation = max(1.0, float(errors[best]) / (freedom - 2))
+    possible = errors - errors.min() < RIVAL * inflation
+    covariances *= inflation
+    headings = np.sqrt(covariances[:, 2, 2])
     mean, covariance = poses[best], covariances[best]
-    if sigmas[best] > NARROW or np.ptp(_wrap(poses[possible, 2] - mean[2])) > NARROW:
+    if headings[best] > NARROW or np.ptp(_wrap(poses[possible, 2] - mean[2])) > NARROW:
         pivot = shape[:4, :2].mean(axis=0)
-        mean, covariance = _average_over_headings(poses[possible], sigmas[possible], pivot, view)
+        mean, covariance = _average_over_headings(
+            poses[possible], headings[possible], pivot, view, inflation
+        )
     x, y, heading = mean.tolist()
-    misfit = float(errors[best]) / (plane.size - 3)
-    return PoseFit(Pose2(x, y, wrap_angle(heading)), covariance, misfit)
+    pose = Pose2(x, y, wrap_angle(heading))
+    lean = view.lean(poses[best])
+    return PoseFit(pose, covariance, misfit, lean, misfit * corner_variance)
 
 
 def _inverse(matrices: Floats) -> Floats:
     return np.linalg.inv(matrices).astype(np.float64, copy=False)
 
 
-def _corner_covariance(plane: Floats, s: CameraSettings) -> Floats:
-    """The covariance (2n, 2n) of corners (n, 2) on the plane z = 1. Each corner has an independent
-    error; the errors of tilt, yaw and focal length are common to all corners."""
+def _lean_errors(plane: Floats, sigmas: Lean) -> Floats:
+    """What one sigma of tilt and of roll moves corners (n, 2) on the plane z = 1: (2, 2n)."""
     u, v = plane[:, 0], plane[:, 1]
-    own = CORNER_SHARE * s.edge_sigma_px / np.array([s.fx_px, s.fy_px])
-    tilt = math.radians(s.tilt_sigma_deg) * np.stack([u * v, 1.0 + v * v], axis=1)
+    tilt = sigmas.tilt * np.stack([-u * v, -1.0 - v * v], axis=1)
+    roll = sigmas.roll * np.stack([v, -u], axis=1)
+    return np.stack([tilt, roll]).reshape(2, -1)
+
+
+def _corner_covariance(
+    plane: Floats, s: CameraSettings, own_px: float, lean_errors: Floats
+) -> Floats:
+    """The covariance (2n, 2n) of corners (n, 2) on the plane z = 1. Each corner has an independent
+    error `own_px`; the errors of tilt, roll, yaw and focal length are common to all corners."""
+    u, v = plane[:, 0], plane[:, 1]
+    own = own_px / np.array([s.fx_px, s.fy_px])
     yaw = math.radians(s.yaw_sigma_deg) * np.stack([1.0 + u * u, u * v], axis=1)
-    common = np.stack([tilt, yaw, s.focal_share * plane]).reshape(3, -1)
+    common = np.concatenate([np.stack([yaw, s.focal_share * plane]).reshape(2, -1), lean_errors])
     return np.asarray(np.diag(np.tile(own * own, len(plane))) + common.T @ common)
 
 
@@ -127,11 +196,16 @@ class _Reprojection:
     """The reprojection errors of a robot with corners `shape` (n, 3; m, its robot frame) against
     the detected corners `plane` (n, 2) on the plane z = 1 of the camera frame."""
 
-    def __init__(self, shape: Floats, plane: Floats, camera: Camera) -> None:
+    def __init__(
+        self, shape: Floats, plane: Floats, camera: Camera, sigmas: Lean, corner_variance: float
+    ) -> None:
         axes = camera.robot_from_camera
         ahead, aside, up = shape.T
         self._plane = plane
-        self._weights = _inverse(_corner_covariance(plane, camera.settings))
+        self._sigmas, self._lean_errors = sigmas, _lean_errors(plane, sigmas)
+        own_px = CORNER_SHARE * camera.settings.edge_sigma_px * math.sqrt(corner_variance)
+        covariance = _corner_covariance(plane, camera.settings, own_px, self._lean_errors)
+        self._weights = _inverse(covariance)
         self._still = np.outer(up, axes[2]) - camera.position @ axes
         along = np.outer(ahead, axes[0]) + np.outer(aside, axes[1])
         across = np.outer(ahead, axes[1]) - np.outer(aside, axes[0])
@@ -146,6 +220,17 @@ class _Reprojection:
         the information matrix, the last column its right-hand side, and the last element the
         weighted squared error.
         """
+        flat = self._derivatives(poses)
+        return np.asarray(flat.transpose(0, 2, 1) @ self._weights @ flat)
+
+    def lean(self, pose: Floats) -> Lean:
+        """The mean of tilt and roll given the reprojection errors of a pose (3,)."""
+        errors = self._derivatives(pose[None])[0, :, 3]
+        tilt, roll = self._lean_errors @ self._weights @ errors
+        return Lean(float(tilt) * self._sigmas.tilt, float(roll) * self._sigmas.roll)
+
+    def _derivatives(self, poses: Floats) -> Floats:
+        """The matrices J (k, 2n, 4)."""
         cos, sin = np.cos(poses[:, 2]), np.sin(poses[:, 2])
         turns = np.array([[cos, sin], [-sin, cos]]).transpose(0, 2, 1) @ self._rotated_point
         turns = turns.reshape(2, len(poses), -1, 3)
@@ -158,8 +243,7 @@ class _Reprojection:
         jacobian[..., 2] = turns[1, ..., :2] - projected * turns[1, ..., 2:]
         jacobian[..., :3] /= depth[..., None]
         jacobian[..., 3] = self._plane - projected
-        flat = jacobian.reshape(len(poses), -1, 4)
-        return np.asarray(flat.transpose(0, 2, 1) @ self._weights @ flat)
+        return jacobian.reshape(len(poses), -1, 4)
 
 
 def _refine(poses: Floats, view: _Reprojection) -> tuple[Floats, Floats]:
@@ -181,13 +265,13 @@ def _refine(poses: Floats, view: _Reprojection) -> tuple[Floats, Floats]:
 
 
 def _average_over_headings(
-    poses: Floats, sigmas: Floats, pivot: Floats, view: _Reprojection
+    poses: Floats, sigmas: Floats, pivot: Floats, view: _Reprojection, inflation: float
 ) -> tuple[Floats, Floats]:
     """The mean (3,) and covariance (3, 3) of the pose over a grid of headings, which covers those
     of the poses (k, 3) with their sigmas (k,).
 
     For each heading, x and y minimize the error. `pivot` is the middle (2,) of a marker in its
-    robot's frame; its position barely depends on the heading.
+    robot's frame; its position barely depends on the heading. `inflation`: of the variances.
     """
     headings = poses[0, 2] + _wrap(poses[:, 2] - poses[0, 2])
     reach = 4.0 * np.minimum(sigmas, MOST_SIGMA)
@@ -199,13 +283,15 @@ def _average_over_headings(
         matrices, sides = normal_equations[:, :2, :2], normal_equations[:, :2, 3:]
         tried[:, :2] += np.linalg.solve(matrices, sides)[..., 0]
     normal_equations = view.normal_equations(tried)
-    errors = normal_equations[:, 3, 3] - normal_equations[:, 3, 3].min()
-    likely = np.where(errors < RIVAL, np.maximum(np.exp(-0.5 * errors), LEAST_WEIGHT), 0.0)
-    weights = likely / likely.sum()
-    mean = weights @ tried
-    spread = tried - mean
+    errors = (normal_equations[:, 3, 3] - normal_equations[:, 3, 3].min()) / inflation
+    likelihoods = np.exp(-0.5 * errors)
+    mean = likelihoods @ tried / likelihoods.sum()
+    # The spread counts what is barely possible by more than its likelihood, and moves no mean
+    possible = np.where(errors < RIVAL, np.maximum(likelihoods, LEAST_WEIGHT), 0.0)
+    weights, spread = possible / possible.sum(), tried - mean
     covariance: Floats = (weights[:, None] * spread).T @ spread
-    covariance[:2, :2] += np.tensordot(weights, _inverse(normal_equations[:, :2, :2]), 1)
+    places = inflation * _inverse(normal_equations[:, :2, :2])
+    covariance[:2, :2] += np.tensordot(weights, places, 1)
     return mean, covariance
 
 

@@ -21,7 +21,13 @@ from cpcbl_team.config import COLOURS, CameraSettings, Colour
 from cpcbl_team.errors import InputError
 
 THRESHOLDS = ("hue", "saturation", "value")
-CAMERA_SIGMAS = ("edge_sigma_px", "tilt_sigma_deg", "yaw_sigma_deg", "focal_share")
+CAMERA_SIGMAS = (
+    "edge_sigma_px",
+    "tilt_sigma_deg",
+    "roll_sigma_deg",
+    "yaw_sigma_deg",
+    "focal_share",
+)
 MAX_SIGMA_ERROR = 0.1  # stated sigmas that differ from the errors by less stay
 MINIMUM = {  # a filter without any noise would trust a measurement without bounds
     "odometry.delay_s": 0.0,

@@ -99,6 +99,15 @@ class Processes(Protocol):
         """To be called several times a second: starts again what has ended."""
 
 
+def last_message(text: str) -> str:
+    """What a process said last: its last line with a word in it, or the exception of its last
+    traceback, whose message may have several lines."""
+    _, traceback, after = text.rpartition("Traceback (most recent call last):")
+    lines = [line.rstrip() for line in after.splitlines() if any(map(str.isalnum, line))]
+    raised = (line for line in lines if not line[0].isspace()) if traceback else iter(())
+    return next(raised, lines[-1].strip() if lines else "it printed nothing")
+
+
 class _Child:
     def __init__(self, spec: ProcessSpec, folder: Path) -> None:
         self.spec, self.restarts, self.backoff_s = spec, 0, FIRST_BACKOFF_S
@@ -126,10 +135,9 @@ class _Child:
 
     def _last_line(self) -> str:
         try:
-            lines = self._log.read_text(errors="replace").splitlines()
+            return last_message(self._log.read_text(errors="replace"))
         except OSError as error:
             return f"its log cannot be read: {error.strerror}"
-        return lines[-1] if lines else "it printed nothing"
 
     def watch(self) -> None:
         """Restarts the process some time after it ended, longer each time that it ends early."""

@@ -62,13 +62,14 @@ def with_focal_error(
 def with_mount_error(
     camera: CameraSettings, noise: float, random: np.random.Generator
 ) -> CameraSettings:
-    """The settings with random errors of tilt and yaw, as on an uneven floor; their sigmas are
-    scaled by `noise`."""
-    tilt, yaw = (noise * float(draw) for draw in random.normal(size=2))
+    """The settings with random errors of tilt, yaw and roll, as on an uneven floor; their sigmas
+    are scaled by `noise`."""
+    tilt, yaw, roll = (noise * float(draw) for draw in random.normal(size=3))
     return replace(
         camera,
         tilt_deg=camera.tilt_deg + camera.tilt_sigma_deg * tilt,
         yaw_deg=camera.yaw_deg + camera.yaw_sigma_deg * yaw,
+        roll_deg=camera.roll_deg + camera.roll_sigma_deg * roll,
     )
 
 
