@@ -4,21 +4,50 @@ To note a message costs next to nothing: a counter, and a reference among the la
 looked for in those, by `input_problems`.
 """
 
+import math
 from collections import Counter, deque
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from statistics import median
 from typing import NamedTuple, TypeVar
 
-from cpcbl_agents.input_problems import Facts, InputWindow, implausible_inputs, input_problems
+from cpcbl_agents.input_problems import (
+    MOTION,
+    Facts,
+    InputWindow,
+    implausible_inputs,
+    input_problems,
+    without_numbers,
+)
+from cpcbl_agents.motion_causes import CONTRADICTION, OR_START, Step, pose_near_start
 from cpcbl_agents.robot import Robot
-from cpcbl_team.config import Team
+from cpcbl_team.config import RobotSettings, Start, Team
+from cpcbl_team.geometry import Pose2, wrap_angle
 from cpcbl_team.inputs import Odometry, SightingFault, Sightings
 from cpcbl_transport import topics
-from cpcbl_transport.messages import LARGEST_NUMBER, Frame, InputHealth, SensorInput
+from cpcbl_transport.messages import (
+    LARGEST_FRAME,
+    LARGEST_NUMBER,
+    Frame,
+    InputHealth,
+    SensorInput,
+)
 
 WINDOW = 10  # judgements, one a second: shares are those of the last so many
 SETTLED_NS = 2_000_000_000  # what was on its way when the robot started is too late
-IMPLAUSIBLE_EVERY = 10  # judgements: to look for what is implausible takes a third of a millisecond
+OFTEN, SELDOM = 20, 5
+"""To look for what is implausible takes half a millisecond: at each of the first judgements with
+odometry or sightings and while something is found, later at every fifth one."""
+SECOND_NS, EMPTY_NS = 1_000_000_000, 5_000_000_000
+UNSEEN = 25  # judgements: of real logs a robot saw nothing for 20 s in front of landmarks
+EMPTY_CAME = "empty frames came too before"
+IN_VIEW = "a landmark should be in view"
+OVER = 4  # looks in a row that find nothing, before a cause is no longer said
+CHANGED = 30  # looks in a row that find another cause, before it is said in place of the first
+STEP_NS = 95_000_000
+STEPS = 100
+GAP_NS = 2_000_000_000
+KNOWN_M, KNOWN_RAD = 0.7, 0.35  # sigmas of a pose by which it is known what is in view
+SURE_M, SURE_DEG = 0.3, 10.0  # sigmas of a start by which inputs can be judged
 NAMESAKE_JUDGEMENTS = 3  # the token of a process that died may stay for its lease
 T = TypeVar("T")
 MOVED_M, TURNED_RAD = 0.1, 0.15  # beyond these a robot is no longer where it started
@@ -36,6 +65,11 @@ class Input:
         self.refused: Counter[str] = Counter()
         self.recent: deque[tuple[int, SensorInput]] = deque(maxlen=latest)
         self.recent_refused: deque[tuple[int, bytes]] = deque(maxlen=4)
+        self.steps: deque[Step] = deque(maxlen=STEPS)
+        self.has_empty = False  # whether a frame came in which nothing was seen
+        self.scales = 1.0, 1.0  # of distances and turns, as the team file corrects them
+        self._begun: tuple[int, float, float] | None = None
+        self._ended_ns = 0
 
     def take(self, message: SensorInput, now_ns: int) -> None:
         """A message was decoded and not refused."""
@@ -43,21 +77,84 @@ class Input:
         self.messages += 1
         if isinstance(message, Sightings):
             self.decoded += len(message.sightings) or 1
+            self.has_empty |= not message.sightings
         else:
             self.decoded += 1
             if isinstance(message, Odometry):
-                self.distance_m += message.distance_m
-                self.turn_rad += message.turn_rad
+                self._add_step(message)
             elif isinstance(message, Frame):
                 message = Frame(message.stamp_ns, b"")
         self.recent.append((now_ns, message))
+
+    def _add_step(self, piece: Odometry) -> None:
+        if piece.stamp_ns <= self._ended_ns and piece.from_ns < self._ended_ns:
+            return  # it is late, or came before
+        if self._begun is None or piece.from_ns > self._ended_ns + GAP_NS:
+            self._begun = piece.from_ns, self.distance_m, self.turn_rad
+        self.distance_m += piece.distance_m
+        self.turn_rad += piece.turn_rad
+        self._ended_ns = piece.stamp_ns
+        from_ns, distance_m, turn_rad = self._begun
+        if piece.stamp_ns - from_ns >= STEP_NS:
+            moved_m = (self.distance_m - distance_m) * self.scales[0]
+            turned_rad = (self.turn_rad - turn_rad) * self.scales[1]
+            self.steps.append(Step(from_ns, piece.stamp_ns, moved_m, turned_rad, piece))
+            self._begun = piece.stamp_ns, self.distance_m, self.turn_rad
 
     def refuse(self, reason: str, payload: bytes, now_ns: int) -> None:
         """A message was refused."""
         self.arrived_ns = now_ns
         self.messages += 1
         self.refused[reason] += 1
-        self.recent_refused.append((now_ns, payload[:4096]))
+        self.recent_refused.append((now_ns, payload[:LARGEST_FRAME]))
+
+
+class Held:
+    """What is implausible, held against flapping: what was said first stays said until nothing is
+    found several times in a row, or another cause again and again."""
+
+    def __init__(self) -> None:
+        self._said: dict[str, str] = {}
+        self._candidates: dict[str, str] = {}
+        self._misses: Counter[str] = Counter()
+
+    def __bool__(self) -> bool:
+        return bool(self._said or self._candidates)
+
+    @property
+    def by_start(self) -> dict[str, str]:
+        """What is said at present because of where the robot started."""
+        return {about: text for about, text in self._said.items() if OR_START in text}
+
+    def look(self, found: dict[str, str]) -> tuple[str, ...]:
+        """What is to be said after this look. `found`: by what it is about."""
+        for about in {**self._said, **self._candidates, **found}:
+            self._judge(about, found.get(about, ""))
+        return tuple(self._said.values())
+
+    def _judge(self, about: str, text: str) -> None:
+        said = self._said.get(about, "")
+        if said and _kind(said) == _kind(text):
+            if OR_START not in said:
+                self._said[about] = text
+            self._misses[about] = 0
+            return
+        is_again = bool(text) and _kind(self._candidates.get(about, "")) == _kind(text)
+        self._candidates[about] = text
+        if not text:
+            del self._candidates[about]
+        self._misses[about] += 1
+        if said and self._misses[about] < (CHANGED if text else OVER):
+            return
+        self._said.pop(about, None)
+        if is_again:
+            self._said[about] = text
+            self._misses[about] = 0
+
+
+def _kind(text: str) -> str:
+    """By what a cause is the same one, whichever evidence there is for it now."""
+    return without_numbers(text).removesuffix(f"; {OR_START}")
 
 
 class _Totals(NamedTuple):
@@ -74,31 +171,35 @@ class InputMonitor:
 
     def __init__(self, robot: str, team: Team, start_ns: int, speed: float = 1.0) -> None:
         settings = team.robots[robot]
-        lengths = {"odometry": 100, "sightings": 100}  # of ten seconds at 10 Hz
+        lengths = {"odometry": 100, "sightings": 100, "position": 50}  # ten seconds
         self.inputs = {name: Input(name, start_ns, lengths.get(name, 10)) for name in NAMES}
         self.by_key = {f"in/{robot}/{name}": entry for name, entry in self.inputs.items()}
         self._start_ns, self._history = start_ns, deque[_Totals](maxlen=WINDOW + 1)
-        self._namesake_for = self._judgements = 0
-        self._implausible: tuple[str, ...] = ()
+        self._namesake_for = self._judgements = self._looks_away = 0
+        self._unseen_for = 0
+        self._sees = (
+            settings.source == "external"
+            and settings.sensing == "sightings"
+            and settings.sensor.sees_landmarks
+        )
+        self._starts_known: bool | None = None
+        self._held, self._implausible = Held(), tuple[str, ...]()
         self.has_moved = False
         """Whether odometry said so, at a judgement."""
         detects = settings.sensing == "camera"
         self._of_sightings = "frame" if detects else "sightings"
-        by_message = {
-            "odometry": settings.odometry.moves,
-            "frame": detects and not settings.camera.frames,
-        }
-        is_logged = settings.source == "mrclam"
-        left, low, right, high = team.map.bounds()
+        wheels = settings.odometry
+        self.inputs["odometry"].scales = wheels.distance_scale, wheels.turn_scale
         self._facts = Facts(
             robot,
             {},
-            () if is_logged else tuple(name for name, due in by_message.items() if due),
+            tuple(_expected(settings)),
             frozenset(team.map.landmarks) | frozenset(team.map.walls) | frozenset(team.robots),
             team.map.landmarks,
-            settings.sensor.max_range_m,
-            ((right - left) ** 2 + (high - low) ** 2) ** 0.5,
-            max(1.0, speed),
+            settings.sensor,
+            team.map.bounds(),
+            _start_pose(settings.start),
+            pace=max(1.0, speed),
         )
 
     def judge(
@@ -116,15 +217,43 @@ class InputMonitor:
         shown = [n for n in NAMES if self.inputs[n].messages or n in self._facts.expected]
         camera = robot.sensing.counts
         facts = self._facts._replace(
+            unseen=self._unseen(robot, now_ns),
             windows={name: self._window(name, totals, before) for name in shown},
             namesake=self._namesake_for >= NAMESAKE_JUDGEMENTS,
             camera_lost=camera["camera_lost"] > camera["camera_back"],
         )
+        problems = input_problems(facts)
+        self._judgements += any(self.inputs[name].messages for name in shown)
+        if self._held or self._judgements < OFTEN or self._judgements % SELDOM == 0:
+            self._implausible = self._look(robot, facts, before, bool(problems))
         health = tuple(self._health(name, totals, before) for name in shown)
-        self._judgements += 1
-        if self._judgements % IMPLAUSIBLE_EVERY == 0:
-            self._implausible = implausible_inputs(facts)
-        return health, (*input_problems(facts), *self._implausible)
+        return health, (*problems, *self._implausible)
+
+    def _look(
+        self, robot: Robot, facts: Facts, before: _Totals, has_problems: bool
+    ) -> tuple[str, ...]:
+        """Looks for what is implausible; what is to be said of it."""
+        is_early, state = len(self._history) <= WINDOW, robot.filter.timeline.state
+        since_ns = self._start_ns if is_early else before.now_ns
+        if self._starts_known is None:
+            self._starts_known = not state.lost
+        steps = _since_stamp(self.inputs["odometry"].steps, since_ns)
+        near, is_from_start = None, self._starts_known and (is_early or not self.has_moved)
+        if facts.start is not None and is_from_start:
+            near = pose_near_start(steps, facts.start)
+        self._looks_away = 0 if near is not None else self._looks_away + 1
+        seen, is_open = self.inputs["sightings"].recent, state.lost or self._looks_away < WINDOW
+        facts = facts._replace(
+            near_start=near,
+            is_from_start=is_from_start,
+            said=self._held.by_start if is_open else {},
+            steps=steps,
+            frames=[m for _, m in _since(seen, since_ns) if isinstance(m, Sightings)],
+        )
+        found = implausible_inputs(facts)
+        if has_problems and CONTRADICTION in found.get(MOTION, ""):
+            del found[MOTION]
+        return self._held.look(found)
 
     def _totals(self, robot: Robot, now_ns: int) -> _Totals:
         refused = {name: entry.refused.copy() for name, entry in self.inputs.items()}
@@ -142,6 +271,30 @@ class InputMonitor:
             taken[name] = max(0, entry.decoded - later)
         messages = {name: entry.messages for name, entry in self.inputs.items()}
         return _Totals(now_ns, taken, refused, messages)
+
+    def _unseen(self, robot: Robot, now_ns: int) -> str:
+        """Why sightings should come that do not: an empty frame would come too, or a landmark has
+        been in view for long by the robot's own pose."""
+        entry = self.inputs["sightings"]
+        silent_ns = (now_ns - entry.arrived_ns) / self._facts.pace
+        if entry.has_empty:
+            return EMPTY_CAME if silent_ns > EMPTY_NS else ""
+        due = self._sees and silent_ns > SECOND_NS and self._has_in_view(robot)
+        self._unseen_for = self._unseen_for + 1 if due else 0
+        return IN_VIEW if self._unseen_for > UNSEEN * self._facts.pace else ""
+
+    def _has_in_view(self, robot: Robot) -> bool:
+        """Whether a landmark is well in view, by the robot's pose."""
+        state, sensor = robot.filter.timeline.state, self._facts.sensor
+        c, (x, y, heading) = state.estimate.covariance, state.estimate.pose
+        if state.lost or c.xx + c.yy > KNOWN_M**2 or c.hh > KNOWN_RAD**2:
+            return False
+        for mark in self._facts.landmarks.values():
+            bearing = wrap_angle(math.atan2(mark.y_m - y, mark.x_m - x) - heading)
+            within_m = 0.3 < math.hypot(mark.x_m - x, mark.y_m - y) < 0.7 * sensor.max_range_m
+            if within_m and abs(bearing) < math.radians(0.3 * sensor.field_of_view_deg):
+                return True
+        return False
 
     def _window(self, name: str, totals: _Totals, before: _Totals) -> InputWindow:
         entry, since_ns = self.inputs[name], before.now_ns
@@ -173,3 +326,36 @@ class InputMonitor:
 
 def _since(items: Iterable[tuple[int, T]], since_ns: int) -> list[tuple[int, T]]:
     return [item for item in items if item[0] >= since_ns]
+
+
+def _since_stamp(steps: Iterable[Step], since_ns: int) -> list[Step]:
+    """Those since a time, without what was before a gap."""
+    found: list[Step] = []
+    for step in steps:
+        if found and step.from_ns > found[-1].stamp_ns + GAP_NS:
+            found.clear()
+        if step.stamp_ns >= since_ns:
+            found.append(step)
+    return found
+
+
+def _expected(settings: RobotSettings) -> Iterator[str]:
+    """The inputs that a robot's driver owes it."""
+    detects = settings.sensing == "camera"
+    if settings.source == "mrclam":
+        return
+    if settings.odometry.moves:
+        yield "odometry"
+    if detects and not settings.camera.frames:
+        yield "frame"
+    if settings.source == "external" and settings.position_sensor is not None:
+        yield "position"
+
+
+def _start_pose(start: Start | None) -> Pose2 | None:
+    """The start, if it is known well enough to judge inputs by it."""
+    if start is None or not start.known:
+        return None
+    if start.sigma_m > SURE_M or start.heading_sigma_deg > SURE_DEG:
+        return None
+    return Pose2(start.x_m, start.y_m, math.radians(start.heading_deg))

@@ -1,5 +1,6 @@
 """What is wrong with a robot's inputs, as sentences: decided by counts and times, no clock."""
 
+import math
 import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -7,14 +8,23 @@ from statistics import median
 from typing import NamedTuple
 
 from cpcbl_agents import input_causes as causes
-from cpcbl_team.config import Landmark
+from cpcbl_agents import motion_causes as motions
+from cpcbl_agents.motion_causes import Step
+from cpcbl_agents.position_causes import position_cause
+from cpcbl_team.config import Landmark, SensorSettings
+from cpcbl_team.geometry import Pose2
 from cpcbl_team.inputs import Odometry, Position, Sightings
 from cpcbl_transport.decoding import decode_by_key, input_problem
-from cpcbl_transport.messages import Frame, SensorInput
+from cpcbl_transport.messages import LARGEST_NUMBER, Frame, SensorInput
 
 SILENT_S = 3.0
+ENDED_S = 5.0  # of a sensor that may pause
 REFUSED_SHARE = 0.05
 LEAST_REFUSED = 3  # a single message may be damaged, or late
+MOST_TOLERANCE = 0.4  # of where a landmark is seen again, as a share of its range
+LATEST_NS = 600_000_000
+WAIT_S = 7.0  # for what landmarks show
+LARGEST_ANGLE = 7.0
 OVERLAP_S = 0.001  # rounded stamps
 
 REASONS = {
@@ -55,6 +65,9 @@ REASONS = {
 STAMPS = {"from_the_future", "too_late", "impossible_duration", "implausible_number"}
 
 
+MOTION, OVERLAP, POSITION = "motion", "overlap", "position"  # what implausible inputs are about
+
+
 class InputWindow(NamedTuple):
     """What came on one input in the last seconds."""
 
@@ -74,11 +87,18 @@ class Facts(NamedTuple):
     expected: Sequence[str] = ()  # inputs that always come
     names: frozenset[str] = frozenset()  # of landmarks, walls, robots
     landmarks: Mapping[str, Landmark] = {}
-    max_range_m: float = 8.0
-    field_m: float = 0.0  # the diagonal of what is on the map
+    sensor: SensorSettings = SensorSettings()
+    bounds: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)  # of what is on the map
+    start: Pose2 | None = None
+    near_start: Pose2 | None = None  # the pose by odometry alone, while it has hardly moved
+    steps: Sequence[Step] = ()  # of odometry
+    frames: Sequence[Sightings] = ()  # within the same time
+    is_from_start: bool = False  # whether that time began at the start
+    said: Mapping[str, str] = {}  # by the start, and not known to be over since the robot left it
     pace: float = 1.0  # robot time over real time, at least 1
     namesake: bool = False  # another process has this robot's name
     camera_lost: bool = False
+    unseen: str = ""  # why sightings should come that do not
 
 
 def input_problems(facts: Facts) -> tuple[str, ...]:
@@ -86,14 +106,14 @@ def input_problems(facts: Facts) -> tuple[str, ...]:
     return tuple(dict.fromkeys(_problems(facts)))
 
 
-def implausible_inputs(facts: Facts) -> tuple[str, ...]:
-    """What no reason refuses, although it cannot be true. It takes ten times as long."""
-    return tuple(_implausible(facts))
+def implausible_inputs(facts: Facts) -> dict[str, str]:
+    """What no reason refuses, although it cannot be true, by what it is about."""
+    return {about: text for about, text in _implausible(facts) if text}
 
 
 def without_numbers(problem: str) -> str:
     """By what a problem is the same one as before, although its figures changed."""
-    return re.sub(r"(?<![\w/`])[\d.e+]+", "#", problem)
+    return re.sub(r"(?<![\w/`])\d[\d.e+]*", "#", problem)
 
 
 def _problems(facts: Facts) -> Iterator[str]:
@@ -101,9 +121,12 @@ def _problems(facts: Facts) -> Iterator[str]:
         yield f"another process is robot {facts.robot} too; stop one of them"
     for name in facts.expected:
         window = facts.windows[name]
-        if window.silent_s >= SILENT_S * facts.pace:
+        if window.silent_s >= (ENDED_S if name == "position" else SILENT_S) * facts.pace:
             key, ever = f"in/{facts.robot}/{name}", "" if window.came else "; is its driver there?"
             yield f"no {name} on {key} for {window.silent_s:.0f} s{ever}"
+    if facts.unseen:
+        key = f"in/{facts.robot}/sightings"
+        yield f"no sightings on {key}, although {facts.unseen}; is its driver there?"
     if facts.camera_lost:
         yield "camera lost: it delivers no frames, and is opened again and again"
     for name, window in facts.windows.items():
@@ -121,6 +144,8 @@ def _refused(name: str, window: InputWindow, facts: Facts) -> Iterator[str]:
         worst, *others = by_cause.most_common(2)
         for cause, refused in (worst, *(o for o in others if o[1] > REFUSED_SHARE * total)):
             yield f"{100.0 * refused / total:.0f} % of {name} refused: {cause}"
+    elif cause := causes.arrival_cause(_times(window)):
+        yield f"{name}: {cause}"
     elif len(window.recent) >= causes.LEAST_CASES:
         offset_s = median(now_ns - m.stamp_ns for now_ns, m in window.recent[-20:]) * 1e-9
         limits = 0.1 * facts.pace, 1.0 * facts.pace
@@ -128,10 +153,17 @@ def _refused(name: str, window: InputWindow, facts: Facts) -> Iterator[str]:
             yield f"{name}: {cause}"
 
 
+def _times(window: InputWindow) -> list[tuple[int, int]]:
+    """When messages arrived, and their stamps."""
+    return [(now_ns, m.stamp_ns) for now_ns, m in window.recent]
+
+
 def _cause(reason: str, key: str, window: InputWindow, facts: Facts) -> str:
     """The likely cause of a refusal, or else what the reason means."""
     frames = [m for _, m in window.recent if isinstance(m, Sightings)]
     cause = ""
+    if reason == "too_late" and (cause := causes.arrival_cause(_times(window))):
+        return cause
     if reason in STAMPS:
         cause = _stamp_cause(reason, key, window)
     elif reason == "garbage" and window.recent_refused:
@@ -140,7 +172,7 @@ def _cause(reason: str, key: str, window: InputWindow, facts: Facts) -> str:
     elif reason == "bearing_out_of_range":
         cause = causes.bearing_cause(frames)
     elif reason == "unknown_object":
-        cause = _unknown_names(frames, facts.names)
+        cause = _unknown_names(frames, facts)
     elif reason == "duplicate" and overlapping(window):
         cause = "pieces come twice, and overlap; are there two drivers?"
     return cause or REASONS.get(reason, reason)
@@ -158,11 +190,12 @@ def _stamp_cause(reason: str, key: str, window: InputWindow) -> str:
     return next(filter(None, said), "")
 
 
-def _unknown_names(frames: Sequence[Sightings], names: frozenset[str]) -> str:
+def _unknown_names(frames: Sequence[Sightings], facts: Facts) -> str:
     """`dor` is no landmark, wall or robot of this team; `door`?"""
-    unknown = {s.id for f in frames for s in f.sightings} - names
+    names, seen = facts.names, {s.id for f in frames for s in f.sightings}
+    unknown = seen - names
     if not unknown:
-        return ""
+        return f"`{facts.robot}` is this robot itself" if facts.robot in seen else ""
     listed = []
     for name in sorted(unknown)[:3]:
         near = nearest_name(name, names)
@@ -190,17 +223,75 @@ def _pieces(window: InputWindow) -> list[Odometry]:
     return [m for m in near if isinstance(m, Odometry)]
 
 
-def _implausible(facts: Facts) -> Iterator[str]:
+def _implausible(facts: Facts) -> Iterator[tuple[str, str]]:
     nothing = InputWindow(0.0)
     odometry = facts.windows.get("odometry", nothing)
+    positions = facts.windows.get("position", nothing).recent
     pieces = _pieces(odometry) if odometry.taken else []
-    seen = facts.windows.get("sightings", nothing).recent
-    frames = [m for _, m in seen if isinstance(m, Sightings)]
-    if speed := causes.odometry_cause(pieces[-20:]):
-        yield f"odometry: {speed}"
-    elif pieces and overlapping(odometry) and "duplicate" not in odometry.refused:
-        yield "odometry: pieces overlap; two drivers, or from_ns is not where the last one ended"
-    if cause := causes.range_cause(frames[-10:], facts.max_range_m, facts.field_m):
-        yield f"sightings: {cause}"
-    if not speed and (cause := causes.sign_cause(frames[-60:], pieces, facts.landmarks)):
-        yield f"sightings: {cause}"
+    frames = [_usable(frame) for frame in facts.frames]
+    overlap = bool(pieces) and overlapping(odometry)
+    if overlap and "duplicate" not in odometry.refused:
+        text = "pieces overlap; two drivers, or from_ns is not where the last one ended"
+        yield OVERLAP, f"odometry: {text}"
+    steps = [] if overlap or not pieces else facts.steps
+    motion = _motion(facts, frames, pieces, steps)
+    yield MOTION, motion
+    found = [p for _, p in positions if isinstance(p, Position)]
+    if found and not motion:
+        found = [p for p in found if all(map(math.isfinite, (p.x_m, p.y_m, *p.covariance)))]
+        cause = position_cause(
+            found, steps, facts.bounds, facts.near_start, facts.start, facts.is_from_start
+        )
+        open_text = "" if facts.near_start else facts.said.get(POSITION, "")
+        yield POSITION, f"position: {cause}" if cause else open_text
+
+
+def _motion(
+    facts: Facts, frames: Sequence[Sightings], pieces: Sequence[Odometry], steps: Sequence[Step]
+) -> str:
+    """What is wrong with sightings, or with odometry beside them."""
+    sensor, marks = facts.sensor, facts.landmarks
+    left, low, right, high = facts.bounds
+    scale = motions.scale_of(frames[-10:], marks)
+    field_m = math.hypot(right - left, high - low)
+    if cause := causes.range_cause(frames[-10:], sensor.max_range_m, field_m, scale):
+        return f"sightings: {cause}"
+    right_order, wrong_order = motions.order_votes(frames[-5:], marks)
+    if wrong_order >= causes.LEAST_CASES and wrong_order > 4 * right_order:
+        return "sightings: bearings look mirrored; left is positive"
+    tolerance = 0.15 + 3.0 * math.hypot(sensor.range_share, sensor.bearing_sigma_rad)
+    tolerance = min(tolerance, MOST_TOLERANCE)
+    cases = list(motions.seen_again(frames, steps, marks))
+    cause = motions.motion_cause(cases, steps, tolerance)
+    if not cause:
+        late = list(motions.seen_again(frames, steps, marks, *motions.LATER_NS))
+        cause = motions.motion_cause(late, steps, tolerance)
+        if not cause and motions.contradicts(late, steps, 1.5 * tolerance):
+            cause = causes.odometry_cause(pieces) or motions.CONTRADICTION
+    if cause:
+        is_order_right = right_order >= causes.LEAST_CASES and right_order > 4 * wrong_order
+        if cause == motions.MIRRORED and is_order_right:
+            cause = "turns have the wrong sign; left is positive"
+        about = "sightings" if cause.startswith(("ranges", "bearings")) else "odometry"
+        return f"{about}: {cause}"
+    if facts.near_start is None and (said := facts.said.get(MOTION)):
+        return said
+    if facts.near_start is not None and frames:
+        latest = [f for f in frames[-10:] if frames[-1].stamp_ns - f.stamp_ns < LATEST_NS]
+        if cause := motions.view_cause(latest, facts.near_start, marks, tolerance):
+            return f"sightings: {cause}"
+    spans_s = (steps[-1].stamp_ns - steps[0].from_ns) * 1e-9 if steps else math.inf
+    if cases or (spans_s < WAIT_S and any(s.id in marks for f in frames for s in f.sightings)):
+        return ""  # what landmarks show is known better, or soon
+    cause = causes.odometry_cause(pieces)
+    return cause and f"odometry: {cause}"
+
+
+def _usable(frame: Sightings) -> Sightings:
+    """The frame without sightings whose numbers cannot be used."""
+    usable = tuple(
+        s
+        for s in frame.sightings
+        if abs(s.bearing_rad or 0.0) <= LARGEST_ANGLE and abs(s.range_m or 0.0) <= LARGEST_NUMBER
+    )
+    return Sightings(frame.stamp_ns, usable)

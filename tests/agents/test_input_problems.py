@@ -157,6 +157,11 @@ def since_start(message: Odometry) -> float:
     return SPEED_M_S * (message.stamp_ns - EPOCH) * 1e-9 + 40.0
 
 
+def heading_at(stamp_ns: int) -> float:
+    begun, now = EPOCH * 1e-9, stamp_ns * 1e-9
+    return TURN_RATE_RAD_S * (now - begun + 0.5 * (math.cos(begun) - math.cos(now))) + 0.9
+
+
 WRONG = {
     "seconds": (stamped(1e-9), "stamps look like seconds since 1970"),
     "milliseconds": (stamped(1e-6), "stamps look like milliseconds"),
@@ -165,10 +170,13 @@ WRONG = {
     "float stamps": (float_stamps, "cannot be decoded: Expected `int`, got `float`"),
     "2 s ahead": (stamped(plus_s=2.0), "stamps are 2 s ahead of this robot's clock"),
     "0.3 s ahead": (stamped(plus_s=0.3), "stamps are 0.3 s ahead of this robot's clock"),
-    "an hour behind": (stamped(plus_s=-3600.0), "stamps are 3.6e+03 s behind"),
+    "an hour behind": (
+        stamped(plus_s=-3600.0),
+        "stamps are 1 h behind this robot's clock: local time",
+    ),
     "degrees": (each_sighting(bearing_rad=math.degrees), "bearings look like degrees"),
     "0 to 2 pi": (each_sighting(bearing_rad=lambda b: b % math.tau), "bearings go up to 2π"),
-    "ranges in mm": (each_sighting(range_m=lambda r: 1e3 * r), "they look like millimetres"),
+    "ranges in mm": (each_sighting(range_m=lambda r: 1e3 * r), "ranges look like millimetres"),
     "ranges of 0": (each_sighting(range_m=lambda r: 0.0), "ranges are not positive"),
     "NaN": (each_sighting(range_m=lambda r: math.nan), "numbers are infinite or NaN"),
     "distances in mm": (each_piece(distance_m=lambda p: 1e3 * p.distance_m), "like millimetres"),
@@ -182,8 +190,8 @@ WRONG = {
         "rad/s: they look like",
     ),
     "headings as turns": (
-        each_piece(turn_rad=lambda p: TURN_RATE_RAD_S * (p.stamp_ns - EPOCH) * 1e-9 + 0.9),
-        "they look like headings",
+        each_piece(turn_rad=lambda p: heading_at(p.stamp_ns)),
+        "turns look like headings",
     ),
     "mirrored bearings": (each_sighting(bearing_rad=lambda b: -b), "bearings look mirrored"),
     "mirrored turns": (each_piece(turn_rad=lambda p: -p.turn_rad), "turns have the wrong sign"),
@@ -330,3 +338,16 @@ def test_statuses_with_health_can_be_read_by_everybody() -> None:
     status = driver.statuses[-1]
     assert status.problems
     assert decode_tagged(encode(status)) == status
+
+
+def test_a_wrong_key_is_named_however_large_the_payload_is() -> None:
+    seen = ", ".join('{"id": "door", "range_m": 2.0, "bearing_rad": 0.1}' for _ in range(200))
+    payload = f'{{"stamp_ns": 1, "sightings": [{seen}], "robot": "r1"}}'.encode()
+
+    def wrong(message: SensorInput, now_ns: int) -> Sequence[Sent]:
+        return [payload] if isinstance(message, Sightings) else [message]
+
+    driver = Driver()
+    (problem,) = driver.run(5.0, wrong)
+    assert "unknown key 'robot'; known here: stamp_ns, sightings" in problem
+    assert set(driver.statuses[-1].inputs[1].refused) == {"garbage"}

@@ -195,8 +195,6 @@ def _launch(
     if containers:
         from cpcbl_launch.run.containers.launch import InContainers, line_printer
 
-        if run.team.gateway is not None:
-            console.print("no gateway with --containers: start `cpcbl-team gateway` beside it")
         return partial(InContainers, image=image, base=base_image, print_line=line_printer(console))
     from cpcbl_launch.run.up import OnThisMachine
 
@@ -292,16 +290,24 @@ def gateway(
     port: Annotated[
         int | None, Option(min=0, max=65535, help="Port; default: the file's, else 8447.")
     ] = None,
+    guest: Annotated[
+        str, Option(help="Make a token for a guest of this name in the tokens' file, and end.")
+    ] = "",
     connect: options.Connect = None,
     parent: options.Parent = None,
 ) -> None:
     """Run the gateway: JSON over HTTP and WebSocket for drivers and consumers without Zenoh."""
     from cpcbl_agents.process import StopSignal
     from cpcbl_launch.run.gateway.command import run_gateway
+    from cpcbl_launch.run.gateway.tokens import add_guest
 
     team = find_team(file)
     tokens = str(file.parent.absolute() / GatewaySettings().tokens)
     settings = team.gateway or GatewaySettings(tokens=tokens)
+    if guest:
+        add_guest(guest, team, Path(settings.tokens))
+        typer.echo(f"{settings.tokens}: has a token of {guest}; a gateway that runs takes it")
+        return
     settings = replace(
         settings,
         host=settings.host if host is None else host,

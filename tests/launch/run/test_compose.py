@@ -26,7 +26,7 @@ from cpcbl_launch.run.containers.docker import (
 )
 from cpcbl_launch.run.containers.fleet import Container, containers_by_service, restarts_between
 from cpcbl_launch.run.containers.launch import (
-    published_port,
+    published_router,
     run_observer_container,
     team_in_containers,
 )
@@ -148,6 +148,40 @@ def test_a_file_of_ones_own_is_mounted_by_its_way_from_the_compose_file(tmp_path
         assert "/team/lab.toml" in service["command"]
 
 
+GATEWAY = "[gateway]\nhost = '{}'\ntokens = 'secret/t.json'\n[robots.r1]\nsource = 'external'\n"
+
+
+@pytest.mark.parametrize(
+    ("host", "published"), [("localhost", "127.0.0.1:8447"), ("0.0.0.0", "8447")]
+)
+def test_the_gateway_is_a_service_whose_tokens_are_its_secret(
+    tmp_path: Path, host: str, published: str
+) -> None:
+    file, tokens = tmp_path / "lab.toml", tmp_path / "secret" / "t.json"
+    tokens.parent.mkdir()
+    file.write_text('name = "lab"\n' + GATEWAY.format(host))
+    found = yaml.safe_load(deployment_text(load_team(file), file, tmp_path, "mine:2", 1))
+    gateway, owner = found["services"]["gateway"], f"{os.getuid()}:{tokens.stat().st_gid}"
+    assert gateway["command"][:4] == ["gateway", "/team/lab.toml", "--host", "0.0.0.0"]
+    assert gateway["command"][-2:] == ["--connect", "tcp/router:7447"]
+    assert gateway["ports"] == [f"{published}:8447"]
+    assert gateway["user"] == owner
+    assert tokens.stat().st_mode & 0o777 == 0o600
+    assert found["secrets"] == {"gateway-tokens": {"file": "./secret/t.json"}}
+    (secret,) = gateway["secrets"]
+    assert (secret["target"], secret["mode"]) == ("/team/secret/t.json", 0o400)
+    assert f"{secret['uid']}:{secret['gid']}" == owner
+    assert ["secrets" in s for s in found["services"].values()] == [False, False, True]
+
+
+def test_docker_cannot_publish_the_gateway_at_a_name(tmp_path: Path) -> None:
+    file = tmp_path / "lab.toml"
+    (tmp_path / "secret").mkdir()
+    file.write_text('name = "lab"\n' + GATEWAY.format("lab.local"))
+    with pytest.raises(InputError, match=r"gateway.host: lab.local: Docker publishes at"):
+        deployment_text(load_team(file), file, tmp_path, "mine:2", 1)
+
+
 def test_a_log_is_not_for_a_compose_file() -> None:
     with pytest.raises(InputError, match=r"up --containers --data"):
         deployment_text(load_team(builtin_path("mrclam")), Path("mrclam"), Path(), None, 1)
@@ -169,12 +203,12 @@ def test_a_log_is_found_where_it_is_mounted() -> None:
     ],
 )
 def test_the_router_is_published_where_the_team_file_says(endpoint: str, port: str) -> None:
-    assert published_port(endpoint) == port
+    assert published_router(endpoint) == port
 
 
 def test_docker_cannot_publish_at_a_name() -> None:
-    with pytest.raises(InputError, match=r"transport.listen: tcp/robot.local:7447"):
-        published_port("tcp/robot.local:7447")
+    with pytest.raises(InputError, match=r"transport.listen: robot.local: Docker"):
+        published_router("tcp/robot.local:7447")
 
 
 # The image --------------------------------------------------------------------------------------

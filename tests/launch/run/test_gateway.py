@@ -59,7 +59,7 @@ class Stand(NamedTuple):
 @asynccontextmanager
 async def serving(settings: GatewaySettings = ANYWHERE) -> AsyncIterator[Stand]:
     hub = MemoryHub()
-    gateway = server.Gateway(settings, TOKENS, ["me"], hub.session())
+    gateway = server.Gateway(settings, TOKENS, ["me", "tripod"], hub.session())
     runner, url = await gateway.start(None)
     try:
         async with ClientSession() as client:
@@ -280,6 +280,27 @@ def test_meaningless_requests_have_an_answer() -> None:
         await stream.close()
 
     with_gateway(check, GatewaySettings(port=0, rate_hz=1e6))
+
+
+def test_a_guest_that_comes_later_is_served_as_a_robot_is(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setitem(TOKENS, "tripod", "token-of-tripod")
+
+    async def check(stand: Stand) -> None:
+        ear = Subscription(stand.bus, "in/tripod/*")
+        del TOKENS["tripod"]
+        stream = stand.url.replace("http", "ws") + "/stream/tripod?token=token-of-tripod"
+        with pytest.raises(WSServerHandshakeError, match="401"):
+            await stand.client.ws_connect(stream)
+        TOKENS["tripod"] = "token-of-tripod"
+        guest = await stand.client.ws_connect(stream)
+        await guest.send_str(f'{{"odometry": {piece().decode()}}}')
+        while not ear.samples:
+            await asyncio.sleep(0.01)
+        await guest.close()
+
+    with_gateway(check)
 
 
 def test_a_flood_is_limited() -> None:

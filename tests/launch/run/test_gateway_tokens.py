@@ -4,8 +4,11 @@ import json
 from pathlib import Path
 
 import pytest
+from msgspec.structs import replace
+from support.buses import robot_at, team_of
 
-from cpcbl_launch.run.gateway.tokens import VARIABLE, tokens_for
+from cpcbl_launch.run.gateway.tokens import VARIABLE, GuestTokens, add_guest, tokens_for
+from cpcbl_team.config import GuestSettings
 from cpcbl_team.errors import InputError
 
 
@@ -65,3 +68,34 @@ def test_a_damaged_file_is_refused(content: bytes, tmp_path: Path) -> None:
 def test_a_place_that_cannot_be_written_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=f"or set {VARIABLE}"):
         tokens_for(["r1"], tmp_path / "nowhere" / "tokens.json", {})
+
+
+def test_a_guest_gets_a_token_while_the_gateway_runs(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    team, path = team_of(r1=robot_at()), tmp_path / "tokens.json"
+    tokens, driven = tokens_for(team.robots, path, {}), {"r1"}
+    watch = GuestTokens(team, path, tokens, driven)
+    watch.look()
+    assert tokens.keys() == driven == {"r1"}
+    add_guest("tripod", team, path)
+    watch.look()
+    assert tokens.keys() == driven == {"r1", "tripod"}
+    assert tokens == json.loads(path.read_text())
+    path.chmod(0o644)
+    path.write_text("{}")
+    watch.look()
+    assert "others may read it" in caplog.text
+    path.chmod(0o600)
+    path.write_text(json.dumps({"r1": tokens["r1"]}) + "\n")
+    watch.look()
+    assert tokens.keys() == {"r1"}
+
+
+def test_a_guest_needs_a_name_of_its_own_and_a_team_that_admits_guests(tmp_path: Path) -> None:
+    team, path = team_of(r1=robot_at()), tmp_path / "tokens.json"
+    closed = replace(team, guests=GuestSettings(allowed=False))
+    for name, of, said in (("r1", team, "none of r1"), ("a b", team, "32"), ("x", closed, "true")):
+        with pytest.raises(InputError, match=f"--guest {name}: .*{said}"):
+            add_guest(name, of, path)
+    assert not list(tmp_path.iterdir())

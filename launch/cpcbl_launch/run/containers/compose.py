@@ -4,6 +4,7 @@ Nothing here is measured or started; what is written is decided by the team and 
 """
 
 import os
+import re
 from collections.abc import Collection
 from pathlib import Path
 from typing import NamedTuple
@@ -12,14 +13,16 @@ import yaml
 
 from cpcbl_launch.run.containers import BASE_IMAGE, BASE_VARIABLE
 from cpcbl_launch.run.containers.docker import NAME, checkout, version
+from cpcbl_launch.run.gateway.tokens import tokens_for
 from cpcbl_launch.run.processes import tasks
 from cpcbl_launch.team_file import parse_team
-from cpcbl_team.config import Team
+from cpcbl_team.config import GatewaySettings, Team
 from cpcbl_team.errors import InputError
 from cpcbl_transport.security import Identity, credentials_in
 from cpcbl_transport.topics import Role
 
 PORT = 7447  # where the router listens, inside
+_SECRET = "gateway-tokens"
 
 
 class Mount(NamedTuple):
@@ -42,6 +45,9 @@ class Deployment(NamedTuple):
     mounts: tuple[Mount, ...] = ()
     keys: Mount | None = None
     """The key folder of a secured team: of it each container may read its own part."""
+    tokens: Mount | None = None
+    """The gateway's tokens, a secret of its service; None: no gateway."""
+    tokens_owner: str = ""  # uid:gid of who alone can read them
     user: str = ""  # uid:gid of all containers, where the image's will not do
     seed: int = 1
     speed: float = 1.0
@@ -81,7 +87,21 @@ def deployment_text(team: Team, file: Path, folder: Path, image: str | None, see
         keys_folder = parse_team(file.read_text(encoding="utf-8")).transport.keys
         target = os.path.normpath(os.path.join("/team", keys_folder))
         how = how._replace(keys=Mount(_from(folder, Path(team.transport.keys)), target))
+    if team.gateway is not None:
+        own = parse_team(file.read_text(encoding="utf-8")).gateway or GatewaySettings()
+        inside = os.path.normpath(os.path.join("/team", own.tokens))
+        outside = _from(folder, Path(team.gateway.tokens))
+        how = how._replace(tokens=Mount(outside, inside), tokens_owner=token_owner(team))
     return compose_text(team, how)
+
+
+def token_owner(team: Team) -> str:
+    """uid:gid of who alone can read the tokens of a team's gateway, which are made where they are
+    missing: a container could not write them. Raises InputError."""
+    path = Path((team.gateway or GatewaySettings()).tokens)
+    tokens_for(team.robots, path, {})
+    whose = path.stat()
+    return f"{whose.st_uid}:{whose.st_gid}"
 
 
 def key_owner(team: Team, identity: Identity) -> str:
@@ -136,7 +156,44 @@ def compose_text(team: Team, how: Deployment) -> str:
     for name, arguments, identity in tasks(team, how.team_file, common, how.seed, here):
         keys = _own_mounts(how, identity)
         services.append(_SERVICE.format(name=name, command=_flow(arguments), keys=keys))
+    if team.gateway is not None and how.tokens is not None:
+        services.append(_gateway_service(team.gateway, how, how.tokens, common[:2]))
     return "".join([head, router_service, *services])
+
+
+def _gateway_service(
+    settings: GatewaySettings, how: Deployment, tokens: Mount, connect: tuple[str, ...]
+) -> str:
+    """The gateway, and the secret that its tokens are."""
+    port = settings.port or GatewaySettings().port  # inside a container any port is free
+    here = published_port("gateway.host", settings.host, settings.port)
+    uid, gid = how.tokens_owner.split(":")
+    secret = {"source": _SECRET, "target": tokens.target, "uid": uid, "gid": gid, "mode": 0o400}
+    inside = ("--host", "0.0.0.0", "--port", str(port))
+    return _GATEWAY.format(
+        command=_flow(("gateway", how.team_file, *inside, *connect)),
+        user=_flow(how.tokens_owner),
+        ports=_flow([f"{here}:{port}"]),
+        secret=_flow(secret),
+        keys=_own_mounts(how, Identity(Role.GATEWAY)),
+        file=_flow(tokens.source),
+    )
+
+
+def published_port(key: str, address: str, port: object) -> str:
+    """[address:]port of this machine where Docker publishes; all addresses for 0.0.0.0 and [::].
+
+    Raises InputError for a name, at which Docker cannot publish. `key`: of the team file.
+    """
+    if address == "localhost":
+        address = "127.0.0.1"
+    if address in ("0.0.0.0", "[::]", "::"):
+        return str(port)
+    if not re.fullmatch(r"[0-9.]+", address):
+        raise InputError(
+            f"{key}: {address}: Docker publishes at an IPv4 address; write one, or 0.0.0.0 for all"
+        )
+    return f"{address}:{port}"
 
 
 def _build(context: str, extras: str) -> str:
@@ -227,3 +284,17 @@ _SERVICE = """
     <<: *member
     command: {command}
 {keys}"""
+
+_GATEWAY = """
+  gateway:
+    <<: *member
+    command: {command}
+    user: {user} # whose the tokens are; nobody else can read them
+    ports: {ports}
+    secrets: # of this service alone; uid, gid and mode are for a swarm
+      - {secret}
+{keys}
+secrets:
+  gateway-tokens:
+    file: {file}
+"""

@@ -23,7 +23,6 @@ from cpcbl_launch.run.processes import Processes, tasks
 from cpcbl_launch.run.up import Run, Stop, local_endpoint, require_keys
 from cpcbl_launch.team_file import save_resolved
 from cpcbl_team.config import Team
-from cpcbl_team.errors import InputError
 from cpcbl_transport.bus import Bus
 from cpcbl_transport.security import Identity, Link, credentials_in, link_of
 from cpcbl_transport.topics import Role
@@ -38,6 +37,7 @@ INSIDE = "/team/team.json"
 DATA_INSIDE = "/team/data"
 KEYS_INSIDE = "/team/keys"
 SENSOR_INSIDE = "/team/sensor.toml"
+TOKENS_INSIDE = "/team/gateway-tokens.json"
 POLL_S = 0.1
 
 
@@ -112,19 +112,24 @@ class InContainers:
         self._write(str(clock))
         self._project.up()
         rows = tasks(self._run.team, "", (), self._run.seed, self._here)
-        yield ContainerSupervisor(self._project, ["router", *(row.name for row in rows)])
+        gateway = ["gateway"] if self._run.team.gateway else []
+        names = ["router", *(row.name for row in rows), *gateway]
+        yield ContainerSupervisor(self._project, names)
 
     def _write(self, clock: str) -> None:
         run, team, transport = self._run, self._run.team, self._run.team.transport
         mounts = [compose.Mount(str((self._folder / "team.json").resolve()), INSIDE)]
         if _replays(team):
             mounts.append(compose.Mount(str(Path(team.data).resolve()), DATA_INSIDE))
+        tokens = None if team.gateway is None else Path(team.gateway.tokens).resolve()
         how = compose.Deployment(
             INSIDE,
             self._image,
-            published=tuple(map(published_port, transport.listen)),
+            published=tuple(map(published_router, transport.listen)),
             mounts=tuple(mounts),
             keys=compose.Mount(transport.keys, KEYS_INSIDE) if transport.secured else None,
+            tokens=None if tokens is None else compose.Mount(str(tokens), TOKENS_INSIDE),
+            tokens_owner="" if tokens is None else compose.token_owner(team),
             user=compose.key_owner(team, Identity(Role.ROUTER)),
             seed=run.seed,
             speed=run.speed,
@@ -142,29 +147,22 @@ def line_printer(console: Console) -> docker.PrintLine:
 
 
 def team_in_containers(team: Team) -> Team:
-    """The team as containers see it: a log's folder and keys are where they are mounted."""
+    """The team as containers see it: a log's folder, keys and tokens are where they are mounted."""
     if _replays(team):
         team = msgspec.structs.replace(team, data=DATA_INSIDE)
     if team.transport.secured:
         transport = msgspec.structs.replace(team.transport, keys=KEYS_INSIDE)
         team = msgspec.structs.replace(team, transport=transport)
+    if team.gateway is not None:
+        gateway = msgspec.structs.replace(team.gateway, tokens=TOKENS_INSIDE)
+        team = msgspec.structs.replace(team, gateway=gateway)
     return team
 
 
-def published_port(endpoint: str) -> str:
-    """[address:]port of this machine for an endpoint; all addresses for 0.0.0.0 and [::].
-
-    Raises InputError for a name, at which Docker cannot publish.
-    """
+def published_router(endpoint: str) -> str:
+    """[address:]port of this machine for an endpoint of the router. Raises InputError."""
     address, _, port = endpoint.partition("/")[2].rpartition(":")
-    if address in ("0.0.0.0", "[::]"):
-        return port
-    if not re.fullmatch(r"[0-9.]+", address):
-        raise InputError(
-            f"transport.listen: {endpoint}: Docker publishes at an IPv4 address; write one, or"
-            " tcp/0.0.0.0:7447"
-        )
-    return f"{address}:{port}"
+    return compose.published_port("transport.listen", address, port)
 
 
 def _replays(team: Team) -> bool:

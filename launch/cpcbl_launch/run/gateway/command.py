@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from cpcbl_launch.run.gateway.server import serve
-from cpcbl_launch.run.gateway.tokens import VARIABLE, tokens_for
+from cpcbl_launch.run.gateway.tokens import VARIABLE, GuestTokens, tokens_for
 from cpcbl_team.config import GatewaySettings, Team
 from cpcbl_transport.security import Credentials, Identity, link_of
 from cpcbl_transport.topics import Role
@@ -29,7 +29,9 @@ def run_gateway(
     tokens = tokens_for(team.robots, path, os.environ)
     driven = {name for name, robot in team.robots.items() if robot.source == "external"}
     link = link_of(team, Identity(Role.GATEWAY), connect)
-    where = f"in {VARIABLE}" if os.environ.get(VARIABLE) else f"in {path}"
+    is_in_file = not os.environ.get(VARIABLE)
+    where = f"in {path}" if is_in_file else f"in {VARIABLE}"
+    guests = GuestTokens(team, path, tokens, driven)
     with open_bus(team.name, link.endpoints, stop, link.credentials) as bus:
         log.info("connected to the router at %s", ", ".join(link.endpoints))
 
@@ -39,8 +41,14 @@ def run_gateway(
                 log.warning("without keys the tokens are not encrypted: trust this network")
 
         watch = RouterWatch(bus, ", ".join(link.endpoints))
+
+        def on_look() -> None:
+            watch.look()
+            if is_in_file and team.guests.allowed:
+                guests.look()
+
         tls = server_tls(link.credentials)
-        asyncio.run(serve(settings, tokens, driven, bus, tls, stop, watch.look, on_start))
+        asyncio.run(serve(settings, tokens, driven, bus, tls, stop, on_look, on_start))
 
 
 def server_tls(credentials: Credentials | None) -> ssl.SSLContext | None:

@@ -46,12 +46,10 @@ class Gateway:
         driven: Collection[str],
         bus: Bus,
     ) -> None:
-        """`driven`: the robots that take inputs."""
-        self._settings, self._tokens = settings, tokens
-        self._inputs = {
-            name: RobotInputs(name, bus, settings.rate_hz, name in driven) for name in tokens
-        }
-        self.feeds = {name: PoseFeed(name, bus) for name in tokens}
+        """`driven`: the robots that take inputs. It and `tokens` may grow: guests come later."""
+        self._settings, self._tokens, self._driven, self._bus = settings, tokens, driven, bus
+        self._inputs: dict[str, RobotInputs] = {}
+        self.feeds: dict[str, PoseFeed] = {}
         self._server: web.Server | None = None
         self._app = web.Application(client_max_size=LARGEST_FRAME, middlewares=[self._guarded])
         self._app.add_routes(
@@ -61,6 +59,15 @@ class Gateway:
                 web.get("/stream/{robot}", self._stream),
             ]
         )
+
+    def _inputs_of(self, robot: str) -> RobotInputs:
+        if robot not in self._inputs:
+            rate_hz, has_driver = self._settings.rate_hz, robot in self._driven
+            self._inputs[robot] = RobotInputs(robot, self._bus, rate_hz, has_driver)
+        return self._inputs[robot]
+
+    def _feed(self, robot: str) -> PoseFeed:
+        return self.feeds.setdefault(robot, PoseFeed(robot, self._bus))
 
     async def start(self, tls: ssl.SSLContext | None) -> tuple[web.AppRunner, str]:
         """Listens; the runner, and the address. Raises InputError where it cannot."""
@@ -110,14 +117,14 @@ class Gateway:
         except TimeoutError:
             raise web.HTTPRequestTimeout from None
         robot, name = request.match_info["robot"], request.match_info["input"]
-        taken = await self._inputs[robot].take(name, payload)
+        taken = await self._inputs_of(robot).take(name, payload)
         return web.Response(status=204) if taken is None else _answer(taken)
 
     async def _get_pose(self, request: web.Request) -> web.StreamResponse:
         if problem := self._refused(request):
             return _answer(problem)
         robot = request.match_info["robot"]
-        if pose := await self.feeds[robot].wait():
+        if pose := await self._feed(robot).wait():
             return web.Response(text=pose, content_type="application/json")
         error = f"no pose of {robot} for 3 s: is it running, and does its odometry come?"
         return _answer(Problem(503, "no_pose", error))
@@ -135,7 +142,7 @@ class Gateway:
             if connection is not None:
                 connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER)
         await stream.prepare(request)
-        sending = asyncio.create_task(self._send_poses(stream, self.feeds[robot]))
+        sending = asyncio.create_task(self._send_poses(stream, self._feed(robot)))
         try:
             async for message in stream:
                 if message.type in (WSMsgType.TEXT, WSMsgType.BINARY):
@@ -152,7 +159,7 @@ class Gateway:
             parts = msgspec.json.decode(data, type=dict[str, msgspec.Raw])
         except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
             return Problem(400, "garbage", f'write {{"odometry": {{...}}}}: {error}')
-        inputs = self._inputs[robot]
+        inputs = self._inputs_of(robot)
         problems = [await inputs.take(name, bytes(raw)) for name, raw in parts.items()]
         return next(filter(None, problems), None)
 

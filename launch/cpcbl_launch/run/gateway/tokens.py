@@ -1,6 +1,8 @@
 """Who may speak for a robot at the gateway: one secret token a robot."""
 
+import logging
 import os
+import re
 import secrets
 import stat
 from collections.abc import Iterable, Mapping
@@ -8,7 +10,11 @@ from pathlib import Path
 
 import msgspec
 
+from cpcbl_team.config import Team
 from cpcbl_team.errors import InputError
+from cpcbl_team.inputs import NAME_PATTERN
+
+log = logging.getLogger(__name__)
 
 VARIABLE = "CPCBL_GATEWAY_TOKENS"
 SHORTEST = 8
@@ -25,6 +31,47 @@ def tokens_for(robots: Iterable[str], path: Path, environment: Mapping[str, str]
     if missing:
         _write(path, known | missing)
     return {name: (known | missing)[name] for name in names}
+
+
+def add_guest(name: str, team: Team, path: Path) -> None:
+    """Makes a token for a guest in the file, unless it has one. Raises InputError."""
+    if not re.fullmatch(NAME_PATTERN, name) or name in team.robots:
+        raise InputError(
+            f"--guest {name}: a guest's name has 1 to 32 letters, digits, _, . or -, and is none of"
+            f" {', '.join(team.robots)}"
+        )
+    if not team.guests.allowed:
+        raise InputError(f"--guest {name}: set guests.allowed = true in the file of {team.name}")
+    tokens_for([*team.robots, name], path, {})
+
+
+class GuestTokens:
+    """Keeps the tokens of guests as the file has them: a guest joins while the gateway runs."""
+
+    def __init__(self, team: Team, path: Path, tokens: dict[str, str], driven: set[str]) -> None:
+        """`tokens` and `driven` (the robots that take inputs) are changed when the file is."""
+        self._team, self._path, self._tokens, self._driven = team, path, tokens, driven
+        self._seen: tuple[int, int] | None = None
+
+    def look(self) -> None:
+        """To be called several times a second."""
+        try:
+            now = self._path.stat()
+            if (seen := (now.st_ino, now.st_mtime_ns)) == self._seen:
+                return
+            self._seen = seen
+            known = _read(self._path)
+        except (OSError, InputError) as error:
+            log.warning("guests keep their tokens: %s", error)
+            return
+        guests = {n: t for n, t in known.items() if n not in self._team.robots}
+        for name in self._tokens.keys() - self._team.robots.keys() - guests.keys():
+            log.info("guest %s has no token any more", name)
+            del self._tokens[name]
+        for name in guests.keys() - self._tokens.keys():
+            log.info("guest %s has a token", name)
+        self._tokens.update(guests)
+        self._driven.update(guests)
 
 
 def _from_environment(text: str, names: list[str]) -> dict[str, str]:
