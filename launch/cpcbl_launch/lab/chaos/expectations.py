@@ -203,6 +203,22 @@ def flood(run: FaultRun) -> list[Check]:
     ]
 
 
+def abuse(run: FaultRun, most_silent_s: float = 0.5, most_m: float = GOOD_M) -> list[Check]:
+    """What one member does to the team silences and misleads none of the other robots."""
+    return [
+        at_least("what the abuse sent", run.sent, 1),
+        *checks_unaffected(
+            run.log,
+            run.others,
+            run.fault_s,
+            run.end_s,
+            most_silent_s=most_silent_s,
+            most_m=most_m,
+        ),
+        *checks_recovered(run, run.healed_s + 1.0),
+    ]
+
+
 # The simulated world ------------------------------------------------------------------------------
 
 

@@ -14,10 +14,11 @@ from contextlib import contextmanager
 
 from cpcbl_launch.lab.chaos.links import LinkQuality, TunLink
 from cpcbl_launch.lab.chaos.scenario import FaultRun, Injector
-from cpcbl_launch.lab.chaos.team import FIELD, TeamUnderTest
+from cpcbl_launch.lab.chaos.team import FIELD, OPERATOR, TeamUnderTest
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus, Publisher
-from cpcbl_transport.zenoh_bus import open_bus
+from cpcbl_transport.security import Identity
+from cpcbl_transport.topics import Role
 
 LATEST_S = 4.0  # twice what a robot's timeline goes back
 
@@ -64,45 +65,57 @@ narrow = impair(LinkQuality(bytes_per_s=50_000 / 8))
 lossy = impair(LinkQuality(loss=0.2))
 
 
-@contextmanager
-def flood(team: TeamUnderTest, run: FaultRun) -> Iterator[None]:
-    """A process sends fixes, beliefs and statuses in the name of a robot, far too often."""
-    module = (sys.executable, "-m", "cpcbl_launch.lab.chaos.flooder")
-    words = (team.plan.team.name, team.endpoint, str(os.getpid()), run.robot, *run.others)
-    with subprocess.Popen([*module, *words], stdout=subprocess.PIPE, text=True) as process:
-        try:
-            yield
-        finally:
-            process.terminate()
-            run.sent = int(process.communicate(timeout=20.0)[0] or 0)
+def abuse(name: str) -> Injector:
+    """What a member of the team does to it (`abuses.py`), in a process of its own."""
+
+    @contextmanager
+    def inject(team: TeamUnderTest, run: FaultRun) -> Iterator[None]:
+        module = (sys.executable, "-m", "cpcbl_launch.lab.chaos.abuses", name)
+        words = (str(team.team_file), team.endpoint, str(os.getpid()), run.robot, *run.others)
+        with subprocess.Popen([*module, *words], stdout=subprocess.PIPE, text=True) as process:
+            try:
+                yield
+            finally:
+                process.terminate()
+                run.sent = int(process.communicate(timeout=20.0)[0] or 0)
+
+    return inject
+
+
+flood = abuse("flood")
 
 
 @contextmanager
 def echo(team: TeamUnderTest, run: FaultRun) -> Iterator[None]:
     """Repeats all help of a robot at once, and again up to 4 s late."""
     with (
-        open_bus(team.plan.team.name, [team.endpoint]) as bus,
-        echoes(bus, run.robot, LATEST_S, team.plan.seed) as sent,
+        team.session(OPERATOR) as ears,
+        team.session(Identity(Role.ROBOT, run.robot)) as mouth,
+        echoes(ears, mouth, run.robot, LATEST_S, team.plan.seed) as sent,
     ):
         yield
     run.sent = sent.total()
 
 
 @contextmanager
-def echoes(bus: Bus, robot: str, latest_s: float, seed: int) -> Iterator[Counter[str]]:
+def echoes(ears: Bus, mouth: Bus, robot: str, latest_s: float, seed: int) -> Iterator[Counter[str]]:
     """Sends the help of one robot again, once at once and once up to `latest_s` later, so that
     messages lose their order. Counts the copies by their key."""
     dice, due, stop = random.Random(seed), sched.scheduler(time.monotonic), threading.Event()
     publishers: dict[str, Publisher] = {}
     sent: Counter[str] = Counter()
+    repeated: set[bytes] = set()  # the ears hear what the mouth says
 
     def receive(key: str, payload: bytes) -> None:
+        if payload in repeated:
+            return
+        repeated.add(payload)
         for late_s in (0.0, dice.uniform(0.0, latest_s)):
             due.enter(late_s, 0, send, (key, payload))
 
     def send(key: str, payload: bytes) -> None:
         if key not in publishers:
-            publishers[key] = bus.publisher(key, topics.Qos.FRESH)
+            publishers[key] = mouth.publisher(key, topics.Qos.FRESH)
         publishers[key].put(payload)
         sent[key] += 1
 
@@ -111,7 +124,7 @@ def echoes(bus: Bus, robot: str, latest_s: float, seed: int) -> Iterator[Counter
             due.run(blocking=False)
 
     keys = (topics.FIX.at(observer=robot), topics.BELIEF.at(robot=robot))
-    handles = [bus.subscribe(key, receive) for key in keys]
+    handles = [ears.subscribe(key, receive) for key in keys]
     thread = threading.Thread(target=send_due, daemon=True)
     thread.start()
     try:

@@ -58,6 +58,8 @@ def team_fault(
     for key, module in (("inject", injectors), ("until", expectations), ("remark", injectors)):
         if key in settings:
             settings[key] = getattr(module, settings[key])
+    if "abuse" in settings:
+        settings["inject"] = injectors.abuse(settings.pop("abuse"))
     return TeamFault(
         partial(getattr(expectations, checks), **(bounds or {})),
         plan=partial(run_plan, team, simulation or {}, **(plan or {})),
@@ -80,7 +82,8 @@ def _scenarios() -> Iterator[Scenario]:
     for name, row in rows.items():
         if (run := OWN_SHAPE.get(name)) is None:
             usual = rows[row.like].run if row.like else {}
-            run = team_fault(**usual | row.run)
+            plan = {"plan": {**usual.get("plan", {}), **row.run.get("plan", {})}}
+            run = team_fault(**usual | row.run | plan)
         needs = REQUIREMENTS[row.needs]
         yield Scenario(name, row.fault, row.expectation, run, needs, row.quick)
 

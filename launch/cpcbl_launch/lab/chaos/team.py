@@ -10,7 +10,10 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import NamedTuple
 
+from msgspec.structs import replace
+
 from cpcbl_agents.clock import Clock
+from cpcbl_launch.keys.folder import KeyRequest, make_keys
 from cpcbl_launch.lab.chaos.links import Relay, TunLink
 from cpcbl_launch.lab.chaos.run_log import RunLog, RunRecorder
 from cpcbl_launch.lab.experiments.runs import with_settings
@@ -20,13 +23,16 @@ from cpcbl_launch.run.up import free_endpoint
 from cpcbl_launch.team_file import builtin_path, load_team, save_resolved
 from cpcbl_team.config import Team
 from cpcbl_team.errors import CpcblError
-from cpcbl_transport.zenoh_bus import open_bus
+from cpcbl_transport.security import Identity, link_of
+from cpcbl_transport.topics import Role
+from cpcbl_transport.zenoh_bus import ZenohBus, open_bus
 
 LEAD_S, LEAD_S_A_PROCESS = 2.0, 0.4
 SETTLED_M = 0.4
 PATIENCE_S = 60.0
 POLL_S = 0.05
 ROUTER, FIELD, FAR_ROUTER = "router", "field", "far-router"
+OPERATOR = Identity(Role.OPERATOR)
 
 
 class ChaosError(CpcblError):
@@ -41,6 +47,16 @@ class RunPlan(NamedTuple):
     far: Sequence[str] = ()  # robots at a site whose own router dials the first over a relay
     faults: Mapping[str, str] = MappingProxyType({})  # such as `bias:0.5,0.5@10-30`, by robot
     left_out: Sequence[str] = ()  # robots of the file that are not started
+    secured: bool = False  # with keys: mutual TLS and access control
+    guests: Sequence[str] = ()  # observers that get keys in a secured team
+
+
+def secured_plan(plan: RunPlan, folder: Path) -> RunPlan:
+    """The plan with keys for all members, in this folder."""
+    transport = replace(plan.team.transport, security="mtls", keys=str(folder), listen=())
+    team = replace(plan.team, transport=transport)
+    make_keys(team, folder, KeyRequest(observers=plan.guests))
+    return plan._replace(team=team)
 
 
 def demo_team() -> Team:
@@ -53,9 +69,10 @@ class TeamUnderTest:
 
     def __init__(self, plan: RunPlan, folder: Path, stack: ExitStack) -> None:
         """Starts all processes; `stack` ends them."""
-        team = plan.team
-        self.plan, self.folder = plan, folder
-        self.endpoint, self.far_endpoint = free_endpoint(), free_endpoint()
+        plan = secured_plan(plan, folder / "keys") if plan.secured else plan
+        team, protocol = plan.team, "tls" if plan.secured else "tcp"
+        self.plan, self.folder, self.team_file = plan, folder, folder / "team.json"
+        self.endpoint, self.far_endpoint = free_endpoint(protocol), free_endpoint(protocol)
         self.clock = Clock.starting_in(LEAD_S + LEAD_S_A_PROCESS * len(team.robots))
         simulated = [name for name, robot in team.robots.items() if robot.source == "simulated"]
         self.robots = [name for name in simulated if name not in plan.left_out]
@@ -71,14 +88,24 @@ class TeamUnderTest:
         self._recorders = []
         end_s = time.monotonic() + PATIENCE_S
         for endpoint in (self.endpoint, self.far_endpoint) if plan.far else (self.endpoint,):
-            bus = open_bus(team.name, [endpoint], lambda: time.monotonic() > end_s)
+            bus = self.session(OPERATOR, endpoint, lambda: time.monotonic() > end_s)
             self._recorders.append(RunRecorder(self.clock, team.simulation.clocks_ahead_s))
             self._recorders[-1].listen(stack.enter_context(bus))
+
+    def session(
+        self,
+        identity: Identity,
+        endpoint: str = "",
+        give_up: Callable[[], bool] = lambda: False,
+    ) -> ZenohBus:
+        """A session of a member, with its keys if the team has keys."""
+        link = link_of(self.plan.team, identity, [endpoint or self.endpoint])
+        return open_bus(self.plan.team.name, link.endpoints, give_up, link.credentials)
 
     def _process_table(self) -> list[ProcessSpec]:
         """The routers, the field and the robots, started as `up` does, with their own links and
         clocks."""
-        plan, team_file = self.plan, self.folder / "team.json"
+        plan, team_file = self.plan, self.team_file
         save_resolved(plan.team, team_file)
         settings, seed = (plan.team, team_file), plan.seed
         lossy = [self.links[name].endpoint for name in plan.lossy]
