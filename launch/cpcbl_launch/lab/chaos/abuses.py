@@ -4,6 +4,7 @@ An abuse is a function that goes on until `stop()` and returns how many messages
 the table of scenarios names it by its key in `ABUSES`.
 """
 
+import random
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -21,6 +22,7 @@ from cpcbl_transport.topics import Role
 from cpcbl_transport.zenoh_bus import ZenohBus, open_bus
 
 FLOOD_RATE_HZ = 2500.0
+GARBAGE_EVERY_S = 0.02
 UNSURE = (25.0, 0.0, 25.0, 0.0, 0.0, 1.0)
 
 
@@ -69,8 +71,26 @@ def flood(abuser: Abuser) -> int:
     return sent
 
 
+def garbage(abuser: Abuser) -> int:
+    """Sends payloads that are no messages on all keys on which a robot may publish."""
+    robot, dice, sent = abuser.robot, random.Random(abuser.robot), 0
+    topics_of_it = (*topics.INPUTS, topics.BELIEF, topics.STATUS, topics.TRACK, topics.DRIVE)
+    keys = [(t.at(robot=robot, tier=0), t.qos) for t in topics_of_it]
+    fixes = (topics.FIX.at(robot=name, tier=0, observer=robot) for name in abuser.targets)
+    keys += [(key, topics.FIX.qos) for key in fixes]
+    with abuser.session() as bus:
+        publishers = [bus.publisher(key, qos) for key, qos in keys]
+        while not abuser.stop():
+            for publisher in publishers:
+                publisher.put(b"\xff" + dice.randbytes(dice.randint(100, 300)))
+            sent += len(publishers)
+            time.sleep(GARBAGE_EVERY_S)
+    return sent
+
+
 ABUSES: Mapping[str, Callable[[Abuser], int]] = {
     "flood": flood,
+    "garbage": garbage,
 }
 
 

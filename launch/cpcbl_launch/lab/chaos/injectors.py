@@ -9,17 +9,23 @@ import sys
 import threading
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
+from cpcbl_agents.clock import Clock
 from cpcbl_launch.lab.chaos.links import LinkQuality, TunLink
 from cpcbl_launch.lab.chaos.scenario import FaultRun, Injector
 from cpcbl_launch.lab.chaos.team import FIELD, OPERATOR, TeamUnderTest
+from cpcbl_launch.lab.faulty_robot import faulty_command
+from cpcbl_launch.run.processes import PROGRAM, ProcessSpec
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus, Publisher
 from cpcbl_transport.security import Identity
 from cpcbl_transport.topics import Role
 
+CLOCK_AHEAD_NS = 3_000_000_000
+LIE = "bias:0.5,0.5"
+GUEST_AT = "4.5,0,90"
 LATEST_S = 4.0  # twice what a robot's timeline goes back
 
 
@@ -82,7 +88,47 @@ def abuse(name: str) -> Injector:
     return inject
 
 
-flood = abuse("flood")
+flood, garbage = abuse("flood"), abuse("garbage")
+
+
+def respawn(key: str, change: Callable[[ProcessSpec], ProcessSpec]) -> Injector:
+    """The robot is killed and starts again with another command; the same afterwards."""
+
+    @contextmanager
+    def inject(team: TeamUnderTest, run: FaultRun) -> Iterator[None]:
+        team.change_command(run.robot, key, change)
+        team.signal(run.robot, signal.SIGKILL)
+        yield
+        team.change_command(run.robot, key, None)
+        team.signal(run.robot, signal.SIGKILL)
+
+    return inject
+
+
+def _with_clock_ahead(spec: ProcessSpec) -> ProcessSpec:
+    clock = Clock.parse(spec.command[len(spec.command) - spec.command[::-1].index("--clock")])
+    ahead = clock._replace(epoch_ns=clock.epoch_ns + CLOCK_AHEAD_NS)
+    return spec._replace(command=(*spec.command, "--clock", str(ahead)))
+
+
+def _lying(spec: ProcessSpec) -> ProcessSpec:
+    return spec._replace(command=faulty_command(spec.command, LIE))
+
+
+clock_step, liar = respawn("clock", _with_clock_ahead), respawn("liar", _lying)
+
+
+@contextmanager
+def guest(team: TeamUnderTest, run: FaultRun) -> Iterator[None]:
+    """A guest comes, and goes: it says so, or (with an odd name) it is killed."""
+    own = ("--connect", team.endpoint, "--clock", str(team.clock), "--parent", str(os.getpid()))
+    words = ("observer", str(team.team_file), "--name", run.robot, "--at", GUEST_AT, *own)
+    log = (team.folder / f"guest-{run.robot}.log").open("ab")
+    with log, subprocess.Popen([*PROGRAM, *words], stdout=log, stderr=log) as process:
+        try:
+            yield
+        finally:
+            (process.kill if run.robot.endswith("1") else process.terminate)()
 
 
 @contextmanager

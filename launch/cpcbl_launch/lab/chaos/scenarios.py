@@ -12,6 +12,7 @@ from cpcbl_launch.lab.chaos import expectations, injectors
 from cpcbl_launch.lab.chaos.containers import missing_docker, partition_containers
 from cpcbl_launch.lab.chaos.files import disk_full, missing_mount, read_only
 from cpcbl_launch.lab.chaos.links import missing_tun
+from cpcbl_launch.lab.chaos.nemesis import nemesis, nemesis_with_keys
 from cpcbl_launch.lab.chaos.scenario import (
     Requirement,
     Scenario,
@@ -35,6 +36,8 @@ OWN_SHAPE: Mapping[str, Callable[[ScenarioOptions], ScenarioResult]] = {
     "disk-full": disk_full,
     "read-only": read_only,
     "soak": soak,
+    "nemesis": nemesis,
+    "nemesis-with-keys": nemesis_with_keys,
 }
 
 

@@ -2,6 +2,7 @@
 
 import os
 import signal
+import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -15,6 +16,7 @@ from msgspec.structs import replace
 from cpcbl_agents.clock import Clock
 from cpcbl_launch.keys.folder import KeyRequest, make_keys
 from cpcbl_launch.lab.chaos.links import Relay, TunLink
+from cpcbl_launch.lab.chaos.machine import IDLE, MachineWatch
 from cpcbl_launch.lab.chaos.run_log import RunLog, RunRecorder
 from cpcbl_launch.lab.experiments.runs import with_settings
 from cpcbl_launch.lab.faulty_robot import faulty_command
@@ -32,6 +34,7 @@ SETTLED_M = 0.4
 PATIENCE_S = 60.0
 POLL_S = 0.05
 ROUTER, FIELD, FAR_ROUTER = "router", "field", "far-router"
+UP, WATCHER = "up", "cpcbl_launch.lab.chaos.watcher"
 OPERATOR = Identity(Role.OPERATOR)
 
 
@@ -49,6 +52,7 @@ class RunPlan(NamedTuple):
     left_out: Sequence[str] = ()  # robots of the file that are not started
     secured: bool = False  # with keys: mutual TLS and access control
     guests: Sequence[str] = ()  # observers that get keys in a secured team
+    watched: bool = False  # with a process that records it, as `up --record` does
 
 
 def secured_plan(plan: RunPlan, folder: Path) -> RunPlan:
@@ -67,8 +71,11 @@ def demo_team() -> Team:
 class TeamUnderTest:
     """Made by `run_team`. Times are seconds of robot time after the run's epoch."""
 
-    def __init__(self, plan: RunPlan, folder: Path, stack: ExitStack) -> None:
+    def __init__(
+        self, plan: RunPlan, folder: Path, stack: ExitStack, machine: MachineWatch | None = None
+    ) -> None:
         """Starts all processes; `stack` ends them."""
+        self._machine = machine
         plan = secured_plan(plan, folder / "keys") if plan.secured else plan
         team, protocol = plan.team, "tls" if plan.secured else "tcp"
         self.plan, self.folder, self.team_file = plan, folder, folder / "team.json"
@@ -79,11 +86,16 @@ class TeamUnderTest:
         """The robots of the simulated field, whose ground truth is known."""
         relayed = [*plan.relayed, *([FAR_ROUTER] if plan.far else [])]
         self.links: dict[str, Relay | TunLink] = {
-            **{name: stack.enter_context(Relay(self.endpoint, plan.seed)) for name in relayed},
+            **{
+                name: stack.enter_context(Relay(self._router_of(name), plan.seed))
+                for name in relayed
+            },
             **{name: stack.enter_context(TunLink(plan.seed)) for name in plan.lossy},
         }
         """The links that can be impaired, by the robot or router that uses them."""
-        self.supervisor = stack.enter_context(Supervisor(self._process_table(), folder))
+        self._table = self._process_table()
+        self._changes: dict[str, dict[str, Callable[[ProcessSpec], ProcessSpec]]] = {}
+        self.supervisor = stack.enter_context(Supervisor(self._table, folder))
         self.seen_pids: set[int] = set()
         self._recorders = []
         end_s = time.monotonic() + PATIENCE_S
@@ -119,13 +131,18 @@ class TeamUnderTest:
         rows.append(field)
         for name in (name for name in plan.team.robots if name not in plan.left_out):
             link = self.links.get(name)
-            endpoint = self.far_endpoint if name in plan.far else self.endpoint
-            endpoint = link.endpoint if link else endpoint
+            endpoint = link.endpoint if link else self._router_of(name)
             own = process_table(*settings, endpoint, self.clock, seed, here=(name,))[-1]
             fault = plan.faults.get(name)
             command = faulty_command(own.command, fault) if fault else own.command
             rows.append(own._replace(command=(*(link.prefix if link else ()), *command)))
+        if plan.watched:
+            words = (team_file, self.endpoint, self.folder / "run.mcap", os.getpid())
+            rows.append(ProcessSpec(UP, (sys.executable, "-m", WATCHER, *map(str, words))))
         return rows
+
+    def _router_of(self, name: str) -> str:
+        return self.far_endpoint if name in self.plan.far else self.endpoint
 
     @property
     def now_s(self) -> float:
@@ -133,12 +150,15 @@ class TeamUnderTest:
 
     @property
     def run_log(self) -> RunLog:
-        return self._recorders[0].run_log()
+        zero_s = self.clock.from_ns * 1e-9
+        machine = self._machine.log(zero_s) if self._machine else IDLE
+        return self._recorders[0].run_log()._replace(machine=machine)
 
     @property
     def far_log(self) -> RunLog:
         """The far site's log, with the ground truth, which is published at the near site only."""
-        return self._recorders[-1].run_log()._replace(truth=self.run_log.truth)
+        near = self.run_log
+        return self._recorders[-1].run_log()._replace(truth=near.truth, machine=near.machine)
 
     def pid(self, name: str) -> int:
         """The process id of a robot, the field or a router, once it runs. Raises ChaosError."""
@@ -149,6 +169,22 @@ class TeamUnderTest:
 
     def signal(self, name: str, number: signal.Signals) -> None:
         os.kill(self.pid(name), number)
+
+    def change_command(
+        self, robot: str, key: str, change: Callable[[ProcessSpec], ProcessSpec] | None
+    ) -> None:
+        """What a robot is started with from its next start on: its command with all changes by
+        their keys; None takes one back."""
+        changes = self._changes.setdefault(robot, {})
+        if change is None:
+            changes.pop(key, None)
+        else:
+            changes[key] = change
+        process = f"robot-{robot}"
+        spec = next(spec for spec in self._table if spec.name == process)
+        for _, one in sorted(changes.items(), key=lambda item: item[0]):
+            spec = one(spec)
+        self.supervisor.change(spec)
 
     # Waiting ------------------------------------------------------------------------------------
 
@@ -199,11 +235,11 @@ class TeamUnderTest:
 
 
 @contextmanager
-def run_team(plan: RunPlan) -> Iterator[TeamUnderTest]:
+def run_team(plan: RunPlan, machine: MachineWatch | None = None) -> Iterator[TeamUnderTest]:
     """A team with all its processes. Raises ChaosError if one of them has not ended afterwards."""
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="cpcbl-chaos-")))
-        team = TeamUnderTest(plan, folder, stack)
+        team = TeamUnderTest(plan, folder, stack, machine)
         yield team
     left = []
     for pid in team.seen_pids:
