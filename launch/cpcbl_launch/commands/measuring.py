@@ -207,11 +207,7 @@ def chaos(
         return
     todo = runner.select_scenarios(scenarios)
     runner.require_judgeable(todo, soak_s, duration)
-    logging.getLogger("cpcbl_launch").setLevel(logging.ERROR)  # restarts are part of it
-    logging.getLogger("cpcbl_transport").setLevel(logging.ERROR)
-    for number in (signal.SIGTERM, signal.SIGHUP):  # each ends what it has started
-        if signal.getsignal(number) != signal.SIG_IGN:
-            signal.signal(number, signal.default_int_handler)
+    _prepare_for_faults()
     with runner.Progress(Console(stderr=True), len(todo)) as shown:
         chosen = ScenarioOptions(seed, soak_s, shown.doing, duration, history)
         faults = runner.run_scenarios(todo, chosen, shown.began, shown.done)
@@ -225,3 +221,12 @@ def chaos(
         raise typer.Exit(1)
     if require_judged and not faults.is_judged:
         raise typer.Exit(3)
+
+
+def _prepare_for_faults() -> None:
+    """Restarts are part of it, so they are not logged; each signal ends what was started."""
+    for logger in ("cpcbl_launch", "cpcbl_transport"):
+        logging.getLogger(logger).setLevel(logging.ERROR)
+    for number in (signal.SIGTERM, signal.SIGHUP):
+        if signal.getsignal(number) != signal.SIG_IGN:
+            signal.signal(number, signal.default_int_handler)

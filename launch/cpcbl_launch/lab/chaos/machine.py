@@ -52,6 +52,11 @@ class MachineLog(NamedTuple):
         both = zip(self.arrivals_s, self.delays_s, strict=True)
         return max((delay_s for at_s, delay_s in both if low < at_s < high), default=0.0)
 
+    def rate_hz(self, from_s: float, until_s: float) -> float:
+        """How many tracks of the control robot arrived a second."""
+        low, high = from_s + self.zero_s, until_s + self.zero_s
+        return sum(low < at_s < high for at_s in self.arrivals_s) / (high - low)
+
     def too_busy(self, from_s: float, until_s: float) -> str:
         """Why no time of this window can be judged; empty if it can."""
         low, high = from_s + self.zero_s, until_s + self.zero_s

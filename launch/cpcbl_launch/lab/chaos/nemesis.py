@@ -80,11 +80,9 @@ def nemesis(options: ScenarioOptions, secured: bool = False) -> ScenarioResult:
         nemesis.inject(faults)
         healed_s = nemesis.healed()
         team.run_for(AFTER_S)
-        log = without(merged_log(team), nemesis.unknown)
-        checks = [
-            *invariants(log, team.robots, healed_s, team.now_s, nemesis.forged),
-            *nemesis.checks(duration_s),
-        ]
+        log, end_s = without(merged_log(team), nemesis.unknown), team.now_s
+        held = invariants(log, team.robots, healed_s, end_s, nemesis.forged)
+        checks = [*held, *nemesis.checks(duration_s)]
         remarks = tuple(_remarks(options.seed, faults, nemesis, checks))
         if options.history is not None:
             write_history(options.history, options.seed, faults, log, checks)
