@@ -2,6 +2,8 @@
 
 from collections.abc import Sequence
 
+from msgspec.structs import replace
+
 from cpcbl_launch.lab.chaos.checks import Check, at_least, at_most, equal_to
 from cpcbl_launch.lab.chaos.consistency import USUAL_NEES
 from cpcbl_launch.lab.chaos.run_log import FOUND_M, RunLog, maximum, worst
@@ -224,10 +226,11 @@ def bad_link(
 def duplicates(run: FaultRun) -> list[Check]:
     """Copies and late messages change nothing and are counted."""
     counts = [run.log.counts_between(name, run.fault_s, run.end_s) for name in run.robots]
+    double, late = (sum(c[what] for c in counts) for what in ("duplicate", "too_late"))
     return [
         at_least("copies sent", run.sent, 200),
-        at_least("counted as duplicate", sum(c["duplicate"] for c in counts), 50),
-        at_least("counted as too late", sum(c["too_late"] for c in counts), 20),
+        replace(at_least("counted as duplicate", double, 0.1 * run.sent), by_load=False),
+        replace(at_least("counted as too late", late, 0.02 * run.sent), by_load=False),
         *checks_unaffected(run.log, run.robots, run.fault_s, run.end_s, who="team's"),
         *checks_recovered(run, run.fault_s),
     ]
