@@ -135,7 +135,8 @@ class RunLog(NamedTuple):
         stamps_s, samples = self._samples(robot, *EVER_S)
         nees = metrics.position_nees(samples)
         if nees is not None:
-            yield from zip(stamps_s, metrics.position_errors(samples), nees, strict=True)
+            columns = stamps_s, metrics.position_errors(samples), nees
+            yield from zip(*(column.tolist() for column in columns), strict=True)
 
     def consistency(self, robot: str, from_s: float, until_s: float) -> Consistency | None:
         """How well the robot's stated uncertainty fits its errors in [from_s, until_s)."""
@@ -264,6 +265,11 @@ class RunRecorder:
     @property
     def now_s(self) -> float:
         return self._robot_time_s(self._clock.now_ns())
+
+    @property
+    def zero_s(self) -> float:
+        """The machine's monotonic clock when robot time began."""
+        return self._clock.from_ns * 1e-9
 
     def _robot_time_s(self, stamp_ns: int) -> float:
         return (stamp_ns - self._clock.epoch_ns) * 1e-9
