@@ -1,7 +1,10 @@
 """Faults that overlap: their plan, what holds of any history, and when a figure can be judged."""
 
+import json
 import random
+from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 from support.buses import wait_until
@@ -33,9 +36,13 @@ from cpcbl_launch.lab.chaos.history import (
     without,
 )
 from cpcbl_launch.lab.chaos.machine import MachineLog, MachineWatch
-from cpcbl_launch.lab.chaos.nemesis import FAULTS, INSTANT
+from cpcbl_launch.lab.chaos.nemesis import FAULTS, INSTANT, write_history
+from cpcbl_launch.lab.chaos.runner import select_scenarios
+from cpcbl_launch.lab.chaos.scenario import TeamFault
 from cpcbl_launch.lab.chaos.schedule import overlapping, schedule
+from cpcbl_launch.lab.experiments.runs import with_settings
 from cpcbl_launch.reporting.metrics import Samples
+from cpcbl_launch.simulation.in_process import simulate
 from cpcbl_transport.messages import Spending
 
 ROBOTS = ["a", "b", "c"]
@@ -119,6 +126,17 @@ def test_a_robot_that_says_that_it_is_lost_claims_nothing() -> None:
     assert longest_false_claim_s(left_out, "a") == 0.0
 
 
+def test_a_history_is_written_as_lines_of_json(tmp_path: Path) -> None:
+    (fault, *_), path = schedule(1, 60.0, TARGETS, INSTANT), tmp_path / "what.jsonl"
+    log = run_log_of([tracks_of("a")], [token_appeared(1.0, "a")], [status_at("a", 2.0)])
+    write_history(path, 7, [fault], log, [equal_to("uphill", 3, 0)])
+    rows = [json.loads(line) for line in path.read_text().splitlines()]
+    assert rows[0] == {"seed": 7}
+    assert rows[1]["fault"]["name"] == fault.name
+    assert rows[2] == {"check": "uphill 3 (= 0)", "held": False}
+    assert rows[3]["token"]["robot"] == rows[4]["status"]["robot"] == rows[5]["track"]["robot"]
+
+
 # Consistency --------------------------------------------------------------------------------------
 
 
@@ -150,6 +168,26 @@ def test_a_consistent_robot_is_within_its_bounds_and_a_bold_one_is_not() -> None
         known = consistency("a", bold, bold, 10.0)
         assert known is not None
         assert known.nees > known.nees_bound
+
+
+@pytest.mark.parametrize(("fusion", "seed"), [("split-ci", 1), ("split-ci", 2), ("naive", 1)])
+def test_a_rumour_shows_naive_fusion_and_no_other(fusion: str, seed: int) -> None:
+    (rumour,) = select_scenarios(["rumour"])
+    assert isinstance(rumour.run, TeamFault)
+    plan, (from_s, until_s) = rumour.run.plan(), rumour.run.simulated_s or (0.0, 0.0)
+    team = with_settings(plan.team, None, collaboration={"fusion": fusion})
+    robots = {name: r for name, r in team.robots.items() if name not in plan.left_out}
+    _, recorder = simulate(msgspec.structs.replace(team, robots=robots), seed, until_s)
+    truth = recorder.simulated_truth()
+    known = []
+    for name in robots:
+        times_s, samples = recorder.timed_samples(name, truth[name])
+        assert samples.covariance is not None
+        hidden = times_s >= from_s
+        columns = samples.estimate[hidden], samples.truth[hidden], samples.covariance[hidden]
+        known.append(consistency(name, Samples(*columns), samples, 10.0))
+    is_bold = any(c is not None and c.nees > c.nees_bound for c in known)
+    assert is_bold is (fusion == "naive")
 
 
 def test_quantiles() -> None:

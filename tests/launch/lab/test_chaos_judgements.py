@@ -174,6 +174,17 @@ def test_a_flood() -> None:
     }
 
 
+def test_an_abuse() -> None:
+    assert not unmet_checks(expect.abuse(run_of(GOOD, "c", 20.0, 30.0, sent=1)))
+    silent = run_log_of([tracks_of("a", silent=(12.0, 12.8)), tracks_of("b", lambda s: 0.35)])
+    assert unmet_checks(expect.abuse(run_of(silent, "c", 20.0, 30.0))) == {
+        "what the abuse sent",
+        "others' longest gap between tracks",
+        "others' worst RMSE",
+        "RMSE afterwards, worst robot",
+    }
+
+
 # Files --------------------------------------------------------------------------------------------
 
 TABLE = "errors of position\nnavigator 1\nobserver 1\nscout 1\npatrol 1\n"

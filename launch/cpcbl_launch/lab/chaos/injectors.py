@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from cpcbl_agents.clock import Clock
+from cpcbl_launch.lab.chaos.abuses import ABUSES
 from cpcbl_launch.lab.chaos.links import LinkQuality, TunLink
 from cpcbl_launch.lab.chaos.scenario import FaultRun, Injector
 from cpcbl_launch.lab.chaos.team import FIELD, OPERATOR, TeamUnderTest
@@ -73,6 +74,7 @@ lossy = impair(LinkQuality(loss=0.2))
 
 def abuse(name: str) -> Injector:
     """What a member of the team does to it (`abuses.py`), in a process of its own."""
+    assert name in ABUSES, name
 
     @contextmanager
     def inject(team: TeamUnderTest, run: FaultRun) -> Iterator[None]:

@@ -84,8 +84,9 @@ def nemesis(options: ScenarioOptions, secured: bool = False) -> ScenarioResult:
         held = invariants(log, team.robots, healed_s, end_s, nemesis.forged)
         checks = [*held, *nemesis.checks(duration_s)]
         remarks = tuple(_remarks(options.seed, faults, nemesis, checks))
-        if options.history is not None:
-            write_history(options.history, options.seed, faults, log, checks)
+        if (path := options.history) is not None:
+            path = path.with_stem(f"{path.stem}-with-keys") if secured else path
+            write_history(path, options.seed, faults, log, checks)
         return ScenarioResult(checks, remarks)
 
 

@@ -7,6 +7,7 @@ import subprocess
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import AbstractContextManager
 from importlib.metadata import version
 from typing import Self
 
@@ -79,10 +80,11 @@ def run_scenarios(
     options: ScenarioOptions,
     began: Callable[[Scenario], None],
     done: Callable[[Outcome], None],
+    watching: Callable[[], AbstractContextManager[MachineWatch | None]] = MachineWatch,
 ) -> ChaosReport:
-    """Runs scenarios; calls `began` and `done` for each."""
+    """Runs scenarios; calls `began` and `done` for each. `watching` the machine meanwhile."""
     outcomes = []
-    with MachineWatch() as watch:
+    with watching() as watch:
         for scenario in scenarios:
             began(scenario)
             outcomes.append(run_scenario(scenario, options._replace(machine=watch)))
