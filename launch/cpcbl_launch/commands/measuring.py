@@ -44,6 +44,18 @@ ExportFolder = Annotated[
 Scenarios = Annotated[
     list[str] | None, Argument(help="Names of scenarios, or all.", metavar="SCENARIO")
 ]
+SoakSeconds = Annotated[float, Option(help="Seconds that the soak takes, at least 120.")]
+NemesisSeconds = Annotated[
+    float, Option(help="Seconds in which the nemesis injects faults, at least 20.")
+]
+WithKeys = Annotated[bool, Option("--keys", help="Give the teams keys: TLS and access control.")]
+HistoryFile = Annotated[
+    Path | None,
+    Option(callback=options.writable_file, help="File for what the nemesis did (JSON Lines)."),
+]
+RequireJudged = Annotated[
+    bool, Option("--require-judged", help="Exit with 3 if the machine was too busy to judge.")
+]
 MarkdownFile = Annotated[
     Path | None,
     Option(callback=options.writable_file, help="File to write the table into, as Markdown."),
@@ -176,17 +188,11 @@ def chaos(
     scenarios: Scenarios = None,
     listed: Annotated[bool, Option("--list", help="Show the scenarios.")] = False,
     seed: Annotated[int, Option(help="The seed of noise and of random faults.")] = 1,
-    soak_s: Annotated[float, Option(help="Seconds that the soak takes, at least 120.")] = 180.0,
-    duration: Annotated[
-        float, Option(help="Seconds in which the nemesis injects faults, at least 20.")
-    ] = 60.0,
-    history: Annotated[
-        Path | None,
-        Option(callback=options.writable_file, help="File for what the nemesis did (JSON Lines)."),
-    ] = None,
-    require_judged: Annotated[
-        bool, Option("--require-judged", help="Exit with 3 if the machine was too busy to judge.")
-    ] = False,
+    soak_s: SoakSeconds = 180.0,
+    duration: NemesisSeconds = 60.0,
+    keys: WithKeys = False,
+    history: HistoryFile = None,
+    require_judged: RequireJudged = False,
     markdown: MarkdownFile = None,
     report: options.ReportFile = None,
     as_json: options.AsJson = False,
@@ -209,7 +215,7 @@ def chaos(
     runner.require_judgeable(todo, soak_s, duration)
     _prepare_for_faults()
     with runner.Progress(Console(stderr=True), len(todo)) as shown:
-        chosen = ScenarioOptions(seed, soak_s, shown.doing, duration, history)
+        chosen = ScenarioOptions(seed, soak_s, shown.doing, duration, keys, history)
         faults = runner.run_scenarios(todo, chosen, shown.began, shown.done)
     result = report_data(faults)
     lost = options.write_report(report, result)

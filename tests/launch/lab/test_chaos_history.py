@@ -20,7 +20,7 @@ from support.chaos import (
 )
 from support.processes import command_line
 
-from cpcbl_launch.lab.chaos.checks import Check, Outcome, at_most, equal_to, judged
+from cpcbl_launch.lab.chaos.checks import Check, Outcome, at_most, equal_to, excused_by_load
 from cpcbl_launch.lab.chaos.consistency import (
     chi_square_quantile,
     consistency,
@@ -221,11 +221,11 @@ def outcome(*checks: Check) -> Outcome:
 def test_what_a_busy_machine_may_have_caused_is_not_judged() -> None:
     late, bold = at_most("gap", 2.0, 1.0, "s"), equal_to("uphill", 3, 0)
     met = at_most("gap", 0.5, 1.0, "s")
-    assert judged(outcome(late), "").is_met is False
-    assert judged(outcome(late), "too busy").not_judged == "too busy"
-    assert judged(outcome(late), "too busy").is_met is None
-    assert judged(outcome(late, bold), "too busy").is_met is False
-    assert judged(outcome(met), "too busy").is_met is True
+    assert excused_by_load(outcome(late), "").is_met is False
+    assert excused_by_load(outcome(late), "too busy").not_judged == "too busy"
+    assert excused_by_load(outcome(late), "too busy").is_met is None
+    assert excused_by_load(outcome(late, bold), "too busy").is_met is False
+    assert excused_by_load(outcome(met), "too busy").is_met is True
     assert at_most("gap", 2.0, 1.0, "s", machine=1.2).is_met
     assert "the machine 1.2 s" in str(at_most("gap", 2.0, 1.0, "s", machine=1.2))
 

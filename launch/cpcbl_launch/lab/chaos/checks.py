@@ -85,7 +85,7 @@ class Outcome(msgspec.Struct, frozen=True, kw_only=True):
         return not self.failed and bool(self.checks) and all(c.is_met for c in self.checks)
 
 
-def judged(outcome: Outcome, too_busy: str) -> Outcome:
+def excused_by_load(outcome: Outcome, too_busy: str) -> Outcome:
     """The outcome where the machine was `too_busy` (empty: it was not). What was met is met; what
     was not is not judged, unless it is something that no load excuses."""
     unmet = [check for check in outcome.checks if not check.is_met]

@@ -66,7 +66,7 @@ def require_judged_nemesis(duration_s: float) -> None:
 def nemesis(options: ScenarioOptions, secured: bool = False) -> ScenarioResult:
     """Injects overlapping faults for `duration_s`, then checks the history."""
     require_process_usage("chaos nemesis")
-    duration_s = options.duration_s
+    duration_s, secured = options.duration_s, secured or options.secured
     budget = {"bytes_per_s": BYTES_PER_S}
     settings = with_settings(demo_team(), None, collaboration={"budget": budget})
     robots = list(settings.robots)

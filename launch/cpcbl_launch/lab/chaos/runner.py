@@ -17,7 +17,7 @@ from rich.status import Status
 from rich.table import Table
 from rich.text import Text
 
-from cpcbl_launch.lab.chaos.checks import ChaosReport, Outcome, judged
+from cpcbl_launch.lab.chaos.checks import ChaosReport, Outcome, excused_by_load
 from cpcbl_launch.lab.chaos.machine import IDLE, MachineWatch
 from cpcbl_launch.lab.chaos.nemesis import require_judged_nemesis
 from cpcbl_launch.lab.chaos.scenario import MissingError, Scenario, ScenarioOptions
@@ -71,7 +71,7 @@ def run_scenario(scenario: Scenario, options: ScenarioOptions) -> Outcome:
         outcome = replace(outcome, failed=str(error))
     ended_s = time.monotonic()
     machine = options.machine.log() if options.machine else IDLE
-    outcome = judged(outcome, machine.too_busy(began_s, ended_s))
+    outcome = excused_by_load(outcome, machine.too_busy(began_s, ended_s))
     return replace(outcome, seconds=ended_s - began_s)
 
 

@@ -23,6 +23,7 @@ class ScenarioOptions(NamedTuple):
     soak_s: float = 180.0
     report_progress: Callable[[str], None] = lambda doing: None  # called with each step
     duration_s: float = 60.0  # of the nemesis
+    secured: bool = False  # whether teams have keys, even where the table does not say so
     history: Path | None = None  # where the nemesis writes what happened
     fault: str = ""  # the step of the fault: what the scenario does
     machine: MachineWatch | None = None  # None: nobody watches it
@@ -100,7 +101,11 @@ class TeamFault(msgspec.Struct, frozen=True):
     def __call__(self, options: ScenarioOptions) -> ScenarioResult:
         """Runs the team, injects the fault, and checks what happened."""
         options.report_progress("starting a team")
-        with run_team(self.plan()._replace(seed=options.seed), options.machine) as team:
+        plan = self.plan()._replace(seed=options.seed)
+        plan = plan._replace(secured=plan.secured or options.secured)
+        if plan.secured and plan.lossy:
+            raise MissingError("with keys: the router's certificate does not name this link")
+        with run_team(plan, options.machine) as team:
             team.settle(self.settled_m)
             team.run_for(0.0 if self.simulated_s else self.baseline_s)
             run = FaultRun(team.run_log, team.robots, self.robot, team.now_s, far=team.plan.far)

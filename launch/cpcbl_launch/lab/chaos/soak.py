@@ -44,6 +44,7 @@ def soak(options: ScenarioOptions) -> ScenarioResult:
     require_process_usage("chaos soak")
     settings = demo_team()
     plan = RunPlan(settings, options.seed, relayed=list(settings.robots), watched=True)
+    plan = plan._replace(secured=options.secured)
     options.report_progress("starting a team")
     with run_team(plan, options.machine) as team:
         team.settle()
