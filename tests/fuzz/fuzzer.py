@@ -18,7 +18,9 @@ import msgspec
 from fuzz.payloads import hypothesis_payloads, mixed_payloads, valid_payload
 
 from cpcbl_launch.lab.chaos.checks import Check, at_least, equal_to
-from cpcbl_launch.lab.chaos.expectations import checks_recovered, checks_unaffected
+from cpcbl_launch.lab.chaos.expectations import check_gap, checks_recovered, checks_unaffected
+from cpcbl_launch.lab.chaos.machine import MachineWatch
+from cpcbl_launch.lab.chaos.run_log import TRACKS_HZ, RunLog
 from cpcbl_launch.lab.chaos.scenario import FaultRun, ScenarioOptions, ScenarioResult
 from cpcbl_launch.lab.chaos.team import (
     FIELD,
@@ -119,7 +121,8 @@ def fuzz(options: ScenarioOptions, per_key: int = PER_KEY) -> ScenarioResult:
     examples = hypothesis_payloads(options.seed)
     with ExitStack() as stack:
         plan = RunPlan(fuzz_team(), options.seed, left_out=(MATE,))
-        team = stack.enter_context(run_team(plan))
+        machine = stack.enter_context(MachineWatch())
+        team = stack.enter_context(run_team(plan, machine))
         bus = stack.enter_context(open_bus(plan.team.name, [team.endpoint]))
         ears = stack.enter_context(open_bus(plan.team.name, [team.endpoint]))
         recorder, watcher = Recorder(ears), StatusCollector(ears)
@@ -157,6 +160,7 @@ def fuzz(options: ScenarioOptions, per_key: int = PER_KEY) -> ScenarioResult:
         checks = [
             *fuzz_checks(sent, final),
             *checks_unaffected(*window, most_silent_s=2.0, who="team's"),
+            *victim_checks(run.log, from_s, until_s),
             *checks_recovered(run, from_s),
         ]
         return ScenarioResult(checks, (_by_reason(final.victim),))
@@ -187,6 +191,17 @@ def fuzz_checks(sent: SentCounts, final: FinalCounts) -> list[Check]:
         _equal("messages refused by the traffic watcher", by_watcher, sent.no_statuses),
         _equal("messages refused by the subscribers of frames and poses", by_frames, sent.no_looks),
         _equal("exit code of `cpcbl-team traffic`", final.traffic_exit, 0),
+    ]
+
+
+def victim_checks(log: RunLog, from_s: float, until_s: float) -> list[Check]:
+    """The victim itself goes on working: the control robot's rate is what the machine allows."""
+    count = sum(from_s <= track.at_s < until_s for track in log.tracks.get(VICTIM, ()))
+    possible = min(log.machine.rate_hz(from_s, until_s), TRACKS_HZ)
+    share = count / (until_s - from_s) / max(possible, 1.0)
+    return [
+        check_gap(log, [VICTIM], from_s, until_s, "victim's longest gap between tracks", 2.0),
+        at_least("victim's rate of tracks beside a robot without a fault", share, 0.9, "%"),
     ]
 
 

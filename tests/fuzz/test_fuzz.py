@@ -9,14 +9,17 @@ from fuzz.fuzzer import (
     TO_FIELD,
     TO_PEOPLE,
     TOKENS,
+    VICTIM,
     FinalCounts,
     SentCounts,
     fuzz,
     fuzz_checks,
+    victim_checks,
 )
 from fuzz.payloads import valid_payload
-from support.chaos import unmet_checks
+from support.chaos import run_log_of, tracks_of, unmet_checks
 
+from cpcbl_launch.lab.chaos.machine import MachineLog
 from cpcbl_launch.lab.chaos.scenario import ScenarioOptions
 from cpcbl_transport import topics
 
@@ -27,6 +30,17 @@ from cpcbl_transport import topics
 def test_every_payload_is_counted_and_the_team_continues(seed: int, per_key: int) -> None:
     checks = list(fuzz(ScenarioOptions(seed=seed), per_key).checks)
     assert [str(check) for check in checks if not check.is_met] == []
+
+
+def test_a_victim_that_hardly_works_is_noticed() -> None:
+    calm = MachineLog(tuple(0.1 * n for n in range(900)), (0.01,) * 900)
+    works = run_log_of([tracks_of(VICTIM)])._replace(machine=calm)
+    assert not unmet_checks(victim_checks(works, 10.0, 60.0))
+    stalls = run_log_of([tracks_of(VICTIM, silent=(20.0, 40.0))])._replace(machine=calm)
+    assert unmet_checks(victim_checks(stalls, 10.0, 60.0)) == {
+        "victim's longest gap between tracks",
+        "victim's rate of tracks beside a robot without a fault",
+    }
 
 
 def test_every_topic_with_a_payload_is_fuzzed() -> None:

@@ -3,12 +3,13 @@
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+import msgspec
 import numpy as np
 
 from cpcbl_launch.lab.chaos.checks import Check
 from cpcbl_launch.lab.chaos.run_log import ReceivedTrack, RunLog, TokenEvent
 from cpcbl_launch.lab.chaos.scenario import FaultRun
-from cpcbl_transport.messages import Flow, Status, Track, Trust
+from cpcbl_transport.messages import Flow, Spending, Status, Track, Trust
 from support.buses import SECOND
 
 StatusAt = tuple[float, Status]
@@ -29,6 +30,7 @@ def tracks_of(
     silent: tuple[float, float] = (0.0, 0.0),
     lost: tuple[float, float] = (0.0, 0.0),
     late_s: float = 0.01,
+    tier: int = 3,
 ) -> list[ReceivedTrack]:
     """Ten tracks per second of a robot at (1, 2), except for a time of silence."""
     return [
@@ -42,7 +44,7 @@ def tracks_of(
                 2.0,
                 0.0,
                 COVARIANCE,
-                3,
+                tier,
                 "position sigma 3 m" if lost[0] <= at_s < lost[1] else "",
             ),
         )
@@ -85,6 +87,19 @@ def status_at(
             trust=tuple(Trust(peer, reason, 0, 0, False, 0.0) for peer, reason in trust),
         ),
     )
+
+
+def spending_at(robot: str, at_s: float, sent: int, spending: Spending) -> StatusAt:
+    """A status of a robot that has sent so many bytes of beliefs, and has such a budget."""
+    _, status = status_at(robot, at_s)
+    flow = Flow("belief", "", 1, sent)
+    return at_s, msgspec.structs.replace(status, sent=(flow,), spending=(spending,))
+
+
+def hearing_at(robot: str, at_s: float, peer: str, messages: int) -> StatusAt:
+    """A status of a robot that has taken so many fixes of a teammate."""
+    _, status = status_at(robot, at_s)
+    return at_s, msgspec.structs.replace(status, heard=(Flow("fix", peer, messages, 40),))
 
 
 def run_log_of(

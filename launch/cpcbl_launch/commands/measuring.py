@@ -44,6 +44,18 @@ ExportFolder = Annotated[
 Scenarios = Annotated[
     list[str] | None, Argument(help="Names of scenarios, or all.", metavar="SCENARIO")
 ]
+SoakSeconds = Annotated[float, Option(help="Seconds that the soak takes, at least 120.")]
+NemesisSeconds = Annotated[
+    float, Option(help="Seconds in which the nemesis injects faults, at least 20.")
+]
+WithKeys = Annotated[bool, Option("--keys", help="Give the teams keys: TLS and access control.")]
+HistoryFile = Annotated[
+    Path | None,
+    Option(callback=options.writable_file, help="File for what the nemesis did (JSON Lines)."),
+]
+RequireJudged = Annotated[
+    bool, Option("--require-judged", help="Exit with 3 if the machine was too busy to judge.")
+]
 MarkdownFile = Annotated[
     Path | None,
     Option(callback=options.writable_file, help="File to write the table into, as Markdown."),
@@ -176,7 +188,11 @@ def chaos(
     scenarios: Scenarios = None,
     listed: Annotated[bool, Option("--list", help="Show the scenarios.")] = False,
     seed: Annotated[int, Option(help="The seed of noise and of random faults.")] = 1,
-    soak_s: Annotated[float, Option(min=1.0, help="Seconds that the soak takes.")] = 180.0,
+    soak_s: SoakSeconds = 180.0,
+    duration: NemesisSeconds = 60.0,
+    keys: WithKeys = False,
+    history: HistoryFile = None,
+    require_judged: RequireJudged = False,
     markdown: MarkdownFile = None,
     report: options.ReportFile = None,
     as_json: options.AsJson = False,
@@ -184,7 +200,8 @@ def chaos(
     """Inject faults into real processes, and compare what happens with what is expected.
 
     The exit code is 1 if an expectation was not met. A scenario that cannot run here (lost
-    packets and full disks need root) is named, and counts as neither met nor not met.
+    packets and full disks need root), or that cannot be judged because other programs used the
+    processors, is named, and counts as neither met nor not met.
     """
     from cpcbl_launch.lab.chaos import runner
     from cpcbl_launch.lab.chaos.checks import report_data
@@ -195,13 +212,10 @@ def chaos(
         runner.print_scenarios(SCENARIOS, Console())
         return
     todo = runner.select_scenarios(scenarios)
-    logging.getLogger("cpcbl_launch").setLevel(logging.ERROR)  # restarts are part of it
-    logging.getLogger("cpcbl_transport").setLevel(logging.ERROR)
-    for number in (signal.SIGTERM, signal.SIGHUP):  # each ends what it has started
-        if signal.getsignal(number) != signal.SIG_IGN:
-            signal.signal(number, signal.default_int_handler)
+    runner.require_judgeable(todo, soak_s, duration)
+    _prepare_for_faults()
     with runner.Progress(Console(stderr=True), len(todo)) as shown:
-        chosen = ScenarioOptions(seed, soak_s, shown.doing)
+        chosen = ScenarioOptions(seed, soak_s, shown.doing, duration, keys, history)
         faults = runner.run_scenarios(todo, chosen, shown.began, shown.done)
     result = report_data(faults)
     lost = options.write_report(report, result)
@@ -211,3 +225,14 @@ def chaos(
     options.print_result(result, as_json, lambda: runner.print_faults(faults, Console()), lost)
     if not faults.is_met:
         raise typer.Exit(1)
+    if require_judged and not faults.is_judged:
+        raise typer.Exit(3)
+
+
+def _prepare_for_faults() -> None:
+    """Restarts are part of it, so they are not logged; each signal ends what was started."""
+    for logger in ("cpcbl_launch", "cpcbl_transport"):
+        logging.getLogger(logger).setLevel(logging.ERROR)
+    for number in (signal.SIGTERM, signal.SIGHUP):
+        if signal.getsignal(number) != signal.SIG_IGN:
+            signal.signal(number, signal.default_int_handler)

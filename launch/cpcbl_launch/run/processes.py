@@ -181,6 +181,10 @@ class Supervisor:
         for child in self._children.values():
             child.watch()
 
+    def change(self, spec: ProcessSpec) -> None:
+        """From its next start on, the process of this name runs this command."""
+        self._children[spec.name].spec = spec
+
     @property
     def names(self) -> list[str]:
         return list(self._children)

@@ -10,7 +10,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 
 import pytest
@@ -45,7 +45,7 @@ from cpcbl_transport.topics import Qos
 from cpcbl_transport.zenoh_bus import open_bus
 
 NOTHING = Requirement()
-SETTING = ScenarioOptions(seed=3, soak_s=60.0)
+SETTING = ScenarioOptions(seed=3)
 
 
 def assert_checks_met(outcome: Outcome) -> None:
@@ -118,7 +118,8 @@ def test_a_failure_and_a_missing_requirement_are_distinguished() -> None:
     ]
     began: list[str] = []
     done: list[Outcome] = []
-    faults = run_scenarios(table, ScenarioOptions(), lambda s: began.append(s.name), done.append)
+    calls = lambda s: began.append(s.name), done.append
+    faults = run_scenarios(table, ScenarioOptions(), *calls, nullcontext)
     assert [o.is_met for o in faults.outcomes] == [True, False, False, None]
     assert faults.outcomes[2].failed == "the team did not settle"
     assert faults.outcomes[3].not_run == "needs root"
@@ -282,7 +283,7 @@ def test_an_echo_sends_every_message_twice_more() -> None:
     ):
         ear, publisher = Subscription(listener, key), speaker.publisher(key, Qos.INPUT)
         wait_until(lambda: publisher.matching)
-        with echoes(echo_bus, "b", latest_s=0.5, seed=1) as copies:
+        with echoes(echo_bus, echo_bus, "b", latest_s=0.5, seed=1) as copies:
 
             def echoed() -> bool:  # its subscription cannot be told from the listener's
                 publisher.put(b"")

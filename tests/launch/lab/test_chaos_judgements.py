@@ -13,7 +13,13 @@ from support.chaos import (
 
 from cpcbl_launch.lab.chaos import expectations as expect
 from cpcbl_launch.lab.chaos.files import CommandResult, full_disk_checks, read_only_checks
-from cpcbl_launch.lab.chaos.soak import ProcessLife, ProcessSample, process_lives, soak_checks
+from cpcbl_launch.lab.chaos.memory import (
+    ProcessLife,
+    ProcessSample,
+    memory_checks,
+    process_lives,
+)
+from cpcbl_launch.lab.chaos.soak import soak_checks
 
 AT_S = 10.0
 GOOD = run_log_of([tracks_of("a"), tracks_of("b")])
@@ -168,6 +174,17 @@ def test_a_flood() -> None:
     }
 
 
+def test_an_abuse() -> None:
+    assert not unmet_checks(expect.abuse(run_of(GOOD, "c", 20.0, 30.0, sent=1)))
+    silent = run_log_of([tracks_of("a", silent=(12.0, 12.8)), tracks_of("b", lambda s: 0.35)])
+    assert unmet_checks(expect.abuse(run_of(silent, "c", 20.0, 30.0))) == {
+        "what the abuse sent",
+        "others' longest gap between tracks",
+        "others' worst RMSE",
+        "RMSE afterwards, worst robot",
+    }
+
+
 # Files --------------------------------------------------------------------------------------------
 
 TABLE = "errors of position\nnavigator 1\nobserver 1\nscout 1\npatrol 1\n"
@@ -215,7 +232,7 @@ def test_a_kidnapped_robot() -> None:
         "it reported that it was lost after",
         "it was localized after",
         "RMSE afterwards, worst robot",
-        "inside 3 σ afterwards",
+        "afterwards, NEES",
     }
     blamed = [status_at("b", 30.0, trust=[("a", "jumps")])]
     distrustful = run_log_of([found, tracks_of("b")], (), blamed, jump=("a", AT_S, 3.0))
@@ -237,10 +254,10 @@ def test_hidden_landmarks() -> None:
     )
     assert unmet_checks(bad) == {
         "team's worst RMSE",
-        "inside 3 σ while landmarks are hidden",
+        "team's NEES",
         "all were localized after",
         "RMSE afterwards, worst robot",
-        "inside 3 σ afterwards",
+        "afterwards, NEES",
     }
 
 
@@ -271,6 +288,7 @@ def test_a_faulty_robot() -> None:
         "quarantined by two robots after",
         "worst RMSE during the fault",
         "others' worst RMSE",
+        "others' NEES",
         "robots that still distrust it 20 s later",
     }
 
@@ -293,18 +311,23 @@ def test_a_process_life_is_computed_from_its_samples() -> None:
 
 
 def test_a_soak() -> None:
-    flat = process_lives(samples("field", 0.01) | samples("router", 0.0))
-    assert not unmet_checks(soak_checks(run_of(GOOD, "", 25.0, fault_s=20.0), flat, 0, 0))
-    leaking = [*flat, ProcessLife("robot-a", 400.0, 30.0, 45.0, 2.0, 30)]
+    assert not unmet_checks(soak_checks(run_of(GOOD, "", 25.0, fault_s=20.0), 0, 0))
     stuck = run_log_of([tracks_of("a"), tracks_of("b", lambda s: 2.0)])
-    assert unmet_checks(soak_checks(run_of(stuck, "", 25.0, fault_s=20.0), leaking, 1, 1)) >= {
+    assert unmet_checks(soak_checks(run_of(stuck, "", 25.0, fault_s=20.0), 1, 1)) >= {
         "processes that ended without being killed",
         "tracebacks in logs",
         "from the last fault until all were localized",
+    }
+
+
+def test_memory_is_flat_in_every_process_that_is_to_be_judged() -> None:
+    flat = process_lives(samples("field", 0.01) | samples("up", 0.0))
+    assert not unmet_checks(memory_checks(flat, ["field", "up"]))
+    leaking = [*flat, ProcessLife("robot-a", 400.0, 30.0, 45.0, 2.0, 30)]
+    assert unmet_checks(memory_checks(leaking, ["field", "up", "router"])) == {
+        "processes that ran too shortly to judge their memory",
         "largest growth of memory",
-        "steepest growth of a process that ran for 300 s",
+        "steepest growth of one that ran for 300 s",
         "largest growth of the number of open files",
     }
-    assert "largest growth of memory" in unmet_checks(
-        soak_checks(run_of(GOOD, "", 25.0, fault_s=20.0), [], 0, 0)
-    )
+    assert "largest growth of memory" in unmet_checks(memory_checks([], []))

@@ -58,8 +58,11 @@ def partition_containers(options: ScenarioOptions) -> ScenarioResult:
         healed_s = west.now_s
         options.report_progress("the link between the sites is back")
         time.sleep(AFTER_S)
-        run = FaultRun(west.run_log(), (*WEST, *EAST), "", cut_s, healed_s, west.now_s, far=EAST)
-        run.far_log = east.run_log()._replace(truth=run.log.truth)  # it is published in the west
+        log = west.run_log()
+        if options.machine is not None:
+            log = log._replace(machine=options.machine.log(west.zero_s))
+        run = FaultRun(log, (*WEST, *EAST), "", cut_s, healed_s, west.now_s, far=EAST)
+        run.far_log = east.run_log()._replace(truth=log.truth, machine=log.machine)
         return ScenarioResult(partition(run, most_far_m=BLIND_M))
 
 

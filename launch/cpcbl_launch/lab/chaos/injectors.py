@@ -9,16 +9,24 @@ import sys
 import threading
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
+from cpcbl_agents.clock import Clock
+from cpcbl_launch.lab.chaos.abuses import ABUSES
 from cpcbl_launch.lab.chaos.links import LinkQuality, TunLink
 from cpcbl_launch.lab.chaos.scenario import FaultRun, Injector
-from cpcbl_launch.lab.chaos.team import FIELD, TeamUnderTest
+from cpcbl_launch.lab.chaos.team import FIELD, OPERATOR, TeamUnderTest
+from cpcbl_launch.lab.faulty_robot import faulty_command
+from cpcbl_launch.run.processes import PROGRAM, ProcessSpec
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus, Publisher
-from cpcbl_transport.zenoh_bus import open_bus
+from cpcbl_transport.security import Identity
+from cpcbl_transport.topics import Role
 
+CLOCK_AHEAD_NS = 3_000_000_000
+LIE = "bias:0.5,0.5"
+GUEST_AT = "4.5,0,90"
 LATEST_S = 4.0  # twice what a robot's timeline goes back
 
 
@@ -64,45 +72,98 @@ narrow = impair(LinkQuality(bytes_per_s=50_000 / 8))
 lossy = impair(LinkQuality(loss=0.2))
 
 
+def abuse(name: str) -> Injector:
+    """What a member of the team does to it (`abuses.py`), in a process of its own."""
+    assert name in ABUSES, name
+
+    @contextmanager
+    def inject(team: TeamUnderTest, run: FaultRun) -> Iterator[None]:
+        module = (sys.executable, "-m", "cpcbl_launch.lab.chaos.abuses", name)
+        words = (str(team.team_file), team.endpoint, str(os.getpid()), run.robot, *run.others)
+        with subprocess.Popen([*module, *words], stdout=subprocess.PIPE, text=True) as process:
+            try:
+                yield
+            finally:
+                process.terminate()
+                run.sent = int(process.communicate(timeout=20.0)[0] or 0)
+
+    return inject
+
+
+flood, garbage = abuse("flood"), abuse("garbage")
+
+
+def respawn(key: str, change: Callable[[ProcessSpec], ProcessSpec]) -> Injector:
+    """The robot is killed and starts again with another command; the same afterwards."""
+
+    @contextmanager
+    def inject(team: TeamUnderTest, run: FaultRun) -> Iterator[None]:
+        team.change_command(run.robot, key, change)
+        team.signal(run.robot, signal.SIGKILL)
+        yield
+        team.change_command(run.robot, key, None)
+        team.signal(run.robot, signal.SIGKILL)
+
+    return inject
+
+
+def _with_clock_ahead(spec: ProcessSpec) -> ProcessSpec:
+    clock = Clock.parse(spec.command[len(spec.command) - spec.command[::-1].index("--clock")])
+    ahead = clock._replace(epoch_ns=clock.epoch_ns + CLOCK_AHEAD_NS)
+    return spec._replace(command=(*spec.command, "--clock", str(ahead)))
+
+
+def _lying(spec: ProcessSpec) -> ProcessSpec:
+    return spec._replace(command=faulty_command(spec.command, LIE))
+
+
+clock_step, liar = respawn("clock", _with_clock_ahead), respawn("liar", _lying)
+
+
 @contextmanager
-def flood(team: TeamUnderTest, run: FaultRun) -> Iterator[None]:
-    """A process sends fixes, beliefs and statuses in the name of a robot, far too often."""
-    module = (sys.executable, "-m", "cpcbl_launch.lab.chaos.flooder")
-    words = (team.plan.team.name, team.endpoint, str(os.getpid()), run.robot, *run.others)
-    with subprocess.Popen([*module, *words], stdout=subprocess.PIPE, text=True) as process:
+def guest(team: TeamUnderTest, run: FaultRun) -> Iterator[None]:
+    """A guest comes, and goes: it says so, or (with an odd name) it is killed."""
+    own = ("--connect", team.endpoint, "--clock", str(team.clock), "--parent", str(os.getpid()))
+    words = ("observer", str(team.team_file), "--name", run.robot, "--at", GUEST_AT, *own)
+    log = (team.folder / f"guest-{run.robot}.log").open("ab")
+    with log, subprocess.Popen([*PROGRAM, *words], stdout=log, stderr=log) as process:
         try:
             yield
         finally:
-            process.terminate()
-            run.sent = int(process.communicate(timeout=20.0)[0] or 0)
+            (process.kill if run.robot.endswith("1") else process.terminate)()
 
 
 @contextmanager
 def echo(team: TeamUnderTest, run: FaultRun) -> Iterator[None]:
     """Repeats all help of a robot at once, and again up to 4 s late."""
     with (
-        open_bus(team.plan.team.name, [team.endpoint]) as bus,
-        echoes(bus, run.robot, LATEST_S, team.plan.seed) as sent,
+        team.session(OPERATOR) as ears,
+        team.session(Identity(Role.ROBOT, run.robot)) as mouth,
+        echoes(ears, mouth, run.robot, LATEST_S, team.plan.seed) as sent,
     ):
         yield
     run.sent = sent.total()
 
 
 @contextmanager
-def echoes(bus: Bus, robot: str, latest_s: float, seed: int) -> Iterator[Counter[str]]:
+def echoes(ears: Bus, mouth: Bus, robot: str, latest_s: float, seed: int) -> Iterator[Counter[str]]:
     """Sends the help of one robot again, once at once and once up to `latest_s` later, so that
     messages lose their order. Counts the copies by their key."""
     dice, due, stop = random.Random(seed), sched.scheduler(time.monotonic), threading.Event()
     publishers: dict[str, Publisher] = {}
     sent: Counter[str] = Counter()
+    repeated: set[bytes] = set()  # the ears hear what the mouth says
 
     def receive(key: str, payload: bytes) -> None:
+        if payload in repeated:
+            return
+        repeated.add(payload)
         for late_s in (0.0, dice.uniform(0.0, latest_s)):
             due.enter(late_s, 0, send, (key, payload))
 
     def send(key: str, payload: bytes) -> None:
         if key not in publishers:
-            publishers[key] = bus.publisher(key, topics.Qos.FRESH)
+            publishers[key] = mouth.publisher(key, topics.Qos.FRESH)
         publishers[key].put(payload)
         sent[key] += 1
 
@@ -111,7 +172,7 @@ def echoes(bus: Bus, robot: str, latest_s: float, seed: int) -> Iterator[Counter
             due.run(blocking=False)
 
     keys = (topics.FIX.at(observer=robot), topics.BELIEF.at(robot=robot))
-    handles = [bus.subscribe(key, receive) for key in keys]
+    handles = [ears.subscribe(key, receive) for key in keys]
     thread = threading.Thread(target=send_due, daemon=True)
     thread.start()
     try:

@@ -5,7 +5,7 @@ All times are seconds of robot time since the run's epoch: those of stamps and t
 
 import threading
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from itertools import pairwise
 from types import MappingProxyType
 from typing import NamedTuple
@@ -13,6 +13,8 @@ from typing import NamedTuple
 import numpy as np
 
 from cpcbl_agents.clock import Clock
+from cpcbl_launch.lab.chaos.consistency import Consistency, consistency
+from cpcbl_launch.lab.chaos.machine import IDLE, MachineLog
 from cpcbl_launch.reporting import metrics
 from cpcbl_launch.reporting.metrics import Floats, Samples
 from cpcbl_transport import topics
@@ -22,6 +24,7 @@ from cpcbl_transport.messages import Status, Track, Trust, Truths
 
 FOUND_M = 0.3
 TRUTH_EVERY_NS = 80_000_000
+TRACKS_HZ = 10.0
 EVER_S = (-np.inf, np.inf)
 
 
@@ -52,6 +55,7 @@ class RunLog(NamedTuple):
     statuses: Mapping[str, Sequence[tuple[float, Status]]]  # each with the time at which it arrived
     tokens: Sequence[TokenEvent]
     truth: Mapping[str, Floats]  # rows of seconds, x, y, heading, by robot
+    machine: MachineLog = IDLE
 
     # Tokens -------------------------------------------------------------------------------------
 
@@ -126,10 +130,18 @@ class RunLog(NamedTuple):
         """The largest position error of the tracks stamped in [from_s, until_s)."""
         return metrics.score(self._samples(robot, from_s, until_s)[1]).position_max_m
 
-    def inside_3_sigma(self, robots: Iterable[str], from_s: float, until_s: float) -> float | None:
-        """The share of tracks within 3 sigma of the truth (a consistent filter: 98.9 %)."""
-        parts = [self._samples(name, from_s, until_s)[1] for name in robots]
-        return metrics.score(metrics.pooled(parts)).inside_3_sigma
+    def errors(self, robot: str) -> Iterator[tuple[float, float, float]]:
+        """(stamp s, position error m, its NEES) of each track."""
+        stamps_s, samples = self._samples(robot, *EVER_S)
+        nees = metrics.position_nees(samples)
+        if nees is not None:
+            columns = stamps_s, metrics.position_errors(samples), nees
+            yield from zip(*(column.tolist() for column in columns), strict=True)
+
+    def consistency(self, robot: str, from_s: float, until_s: float) -> Consistency | None:
+        """How well the robot's stated uncertainty fits its errors in [from_s, until_s)."""
+        window = self._samples(robot, from_s, until_s)[1]
+        return consistency(robot, window, self._samples(robot, *EVER_S)[1], TRACKS_HZ)
 
     def first_position_jump(self, robot: str) -> tuple[float, float] | None:
         """(time, metres) of the first jump of a robot's true position by at least 1 m."""
@@ -253,6 +265,11 @@ class RunRecorder:
     @property
     def now_s(self) -> float:
         return self._robot_time_s(self._clock.now_ns())
+
+    @property
+    def zero_s(self) -> float:
+        """The machine's monotonic clock when robot time began."""
+        return self._clock.from_ns * 1e-9
 
     def _robot_time_s(self, stamp_ns: int) -> float:
         return (stamp_ns - self._clock.epoch_ns) * 1e-9

@@ -7,6 +7,7 @@ import subprocess
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import AbstractContextManager
 from importlib.metadata import version
 from typing import Self
 
@@ -16,9 +17,12 @@ from rich.status import Status
 from rich.table import Table
 from rich.text import Text
 
-from cpcbl_launch.lab.chaos.checks import ChaosReport, Outcome
+from cpcbl_launch.lab.chaos.checks import ChaosReport, Outcome, excused_by_load
+from cpcbl_launch.lab.chaos.machine import IDLE, MachineWatch
+from cpcbl_launch.lab.chaos.nemesis import require_judged_nemesis
 from cpcbl_launch.lab.chaos.scenario import MissingError, Scenario, ScenarioOptions
 from cpcbl_launch.lab.chaos.scenarios import SCENARIOS
+from cpcbl_launch.lab.chaos.soak import require_judged_soak
 from cpcbl_launch.lab.chaos.team import ChaosError
 from cpcbl_launch.run.containers.docker import DockerError
 from cpcbl_team.errors import InputError
@@ -26,6 +30,7 @@ from cpcbl_transport.zenoh_bus import BusError
 
 ALL = "all"
 _VERDICT = {True: ("held", "green"), False: ("NOT HELD", "bold red"), None: ("not run", "yellow")}
+_NOT_JUDGED = ("not judged", "bold yellow")
 FUZZ = "chaos: fuzz: it is a test now: run `make fuzz`, or `pytest tests/fuzz`, in a checkout"
 
 
@@ -42,6 +47,15 @@ def select_scenarios(names: Sequence[str]) -> list[Scenario]:
     return [s for s in SCENARIOS if ALL in names or s.name in names]
 
 
+def require_judgeable(scenarios: Iterable[Scenario], soak_s: float, duration_s: float) -> None:
+    """Raises InputError for a soak test or nemesis that is too short to be judged."""
+    for scenario in scenarios:
+        if scenario.name == "soak":
+            require_judged_soak(soak_s)
+        elif scenario.name.startswith("nemesis"):
+            require_judged_nemesis(duration_s)
+
+
 def run_scenario(scenario: Scenario, options: ScenarioOptions) -> Outcome:
     name, done, expectation = scenario[:3]
     outcome = Outcome(scenario=name, done=done, expectation=expectation)
@@ -55,7 +69,10 @@ def run_scenario(scenario: Scenario, options: ScenarioOptions) -> Outcome:
         return replace(outcome, not_run=str(error))
     except (ChaosError, BusError, DockerError, OSError, subprocess.TimeoutExpired) as error:
         outcome = replace(outcome, failed=str(error))
-    return replace(outcome, seconds=time.monotonic() - began_s)
+    ended_s = time.monotonic()
+    machine = options.machine.log() if options.machine else IDLE
+    outcome = excused_by_load(outcome, machine.too_busy(began_s, ended_s))
+    return replace(outcome, seconds=ended_s - began_s)
 
 
 def run_scenarios(
@@ -63,13 +80,15 @@ def run_scenarios(
     options: ScenarioOptions,
     began: Callable[[Scenario], None],
     done: Callable[[Outcome], None],
+    watching: Callable[[], AbstractContextManager[MachineWatch | None]] = MachineWatch,
 ) -> ChaosReport:
-    """Runs scenarios; calls `began` and `done` for each."""
+    """Runs scenarios; calls `began` and `done` for each. `watching` the machine meanwhile."""
     outcomes = []
-    for scenario in scenarios:
-        began(scenario)
-        outcomes.append(run_scenario(scenario, options))
-        done(outcomes[-1])
+    with watching() as watch:
+        for scenario in scenarios:
+            began(scenario)
+            outcomes.append(run_scenario(scenario, options._replace(machine=watch)))
+            done(outcomes[-1])
     cores, load = os.cpu_count() or 1, os.getloadavg()[0]
     machine = f"{platform.system()} {platform.machine()}, {cores} cores, load {load:.1f}"
     own = version("cpcbl-team")
@@ -94,21 +113,24 @@ def print_faults(faults: ChaosReport, console: Console) -> None:
     for outcome in faults.outcomes:
         told = Text(outcome.scenario), Text(outcome.expectation)
         measured = Text("\n").join(Text(str(c), "" if c.is_met else "red") for c in outcome.checks)
-        if reason := outcome.not_run or outcome.failed:
-            measured = Text(reason, "yellow" if outcome.not_run else "red")
+        if reason := outcome.not_run or outcome.not_judged or outcome.failed:
+            is_missing = bool(outcome.not_run or outcome.not_judged)
+            why = Text(reason, "yellow" if is_missing else "red")
+            measured = Text("\n").join([why, *([measured] if outcome.checks else [])])
         shown.add_row(*told, measured, verdict(outcome))
     console.print(shown)
     for outcome in faults.outcomes:
         for remark in outcome.remarks:
             console.print(Text(f"{outcome.scenario}: {remark}", "dim"))
     counts = Counter(verdict(outcome).plain for outcome in faults.outcomes)
-    summary = ", ".join(f"{counts[text]} {text}" for text, _ in _VERDICT.values() if counts[text])
+    all_verdicts = (*_VERDICT.values(), _NOT_JUDGED)
+    summary = ", ".join(f"{counts[text]} {text}" for text, _ in all_verdicts if counts[text])
     console.print(Text(f"{summary}; {faults.machine}; seed {faults.seed}", "bold"))
 
 
 def verdict(outcome: Outcome) -> Text:
     """The outcome as one coloured word."""
-    return Text(*_VERDICT[outcome.is_met])
+    return Text(*(_NOT_JUDGED if outcome.not_judged else _VERDICT[outcome.is_met]))
 
 
 def _table(*columns: str) -> Table:
@@ -123,7 +145,7 @@ def markdown(faults: ChaosReport) -> Iterator[str]:
     yield "| scenario | fault | expectation | measured (bound) | |"
     yield "|---|---|---|---|---|"
     for o in faults.outcomes:
-        seen = o.not_run or o.failed or "; ".join(map(str, o.checks))
+        seen = o.not_run or o.not_judged or o.failed or "; ".join(map(str, o.checks))
         yield f"| `{o.scenario}` | {o.done} | {o.expectation} | {seen} | {verdict(o).plain} |"
 
 

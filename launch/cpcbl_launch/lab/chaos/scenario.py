@@ -2,11 +2,13 @@
 
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import AbstractContextManager, nullcontext
+from pathlib import Path
 from typing import NamedTuple
 
 import msgspec
 
 from cpcbl_launch.lab.chaos.checks import Check
+from cpcbl_launch.lab.chaos.machine import MachineWatch
 from cpcbl_launch.lab.chaos.run_log import RunLog
 from cpcbl_launch.lab.chaos.team import SETTLED_M, RunPlan, TeamUnderTest, demo_team, run_team
 from cpcbl_team.errors import CpcblError
@@ -20,7 +22,11 @@ class ScenarioOptions(NamedTuple):
     seed: int = 1
     soak_s: float = 180.0
     report_progress: Callable[[str], None] = lambda doing: None  # called with each step
+    duration_s: float = 60.0  # of the nemesis
+    secured: bool = False  # whether teams have keys, even where the table does not say so
+    history: Path | None = None  # where the nemesis writes what happened
     fault: str = ""  # the step of the fault: what the scenario does
+    machine: MachineWatch | None = None  # None: nobody watches it
 
 
 class ScenarioResult(NamedTuple):
@@ -95,7 +101,11 @@ class TeamFault(msgspec.Struct, frozen=True):
     def __call__(self, options: ScenarioOptions) -> ScenarioResult:
         """Runs the team, injects the fault, and checks what happened."""
         options.report_progress("starting a team")
-        with run_team(self.plan()._replace(seed=options.seed)) as team:
+        plan = self.plan()._replace(seed=options.seed)
+        plan = plan._replace(secured=plan.secured or options.secured)
+        if plan.secured and plan.lossy:
+            raise MissingError("with keys: the router's certificate does not name this link")
+        with run_team(plan, options.machine) as team:
             team.settle(self.settled_m)
             team.run_for(0.0 if self.simulated_s else self.baseline_s)
             run = FaultRun(team.run_log, team.robots, self.robot, team.now_s, far=team.plan.far)

@@ -12,6 +12,7 @@ from cpcbl_launch.lab.chaos import expectations, injectors
 from cpcbl_launch.lab.chaos.containers import missing_docker, partition_containers
 from cpcbl_launch.lab.chaos.files import disk_full, missing_mount, read_only
 from cpcbl_launch.lab.chaos.links import missing_tun
+from cpcbl_launch.lab.chaos.nemesis import nemesis, nemesis_with_keys
 from cpcbl_launch.lab.chaos.scenario import (
     Requirement,
     Scenario,
@@ -35,6 +36,8 @@ OWN_SHAPE: Mapping[str, Callable[[ScenarioOptions], ScenarioResult]] = {
     "disk-full": disk_full,
     "read-only": read_only,
     "soak": soak,
+    "nemesis": nemesis,
+    "nemesis-with-keys": nemesis_with_keys,
 }
 
 
@@ -58,6 +61,8 @@ def team_fault(
     for key, module in (("inject", injectors), ("until", expectations), ("remark", injectors)):
         if key in settings:
             settings[key] = getattr(module, settings[key])
+    if "abuse" in settings:
+        settings["inject"] = injectors.abuse(settings.pop("abuse"))
     return TeamFault(
         partial(getattr(expectations, checks), **(bounds or {})),
         plan=partial(run_plan, team, simulation or {}, **(plan or {})),
@@ -80,7 +85,8 @@ def _scenarios() -> Iterator[Scenario]:
     for name, row in rows.items():
         if (run := OWN_SHAPE.get(name)) is None:
             usual = rows[row.like].run if row.like else {}
-            run = team_fault(**usual | row.run)
+            plan = {"plan": {**usual.get("plan", {}), **row.run.get("plan", {})}}
+            run = team_fault(**usual | row.run | plan)
         needs = REQUIREMENTS[row.needs]
         yield Scenario(name, row.fault, row.expectation, run, needs, row.quick)
 

@@ -2,6 +2,7 @@
 
 import os
 import signal
+import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -10,8 +11,12 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import NamedTuple
 
+from msgspec.structs import replace
+
 from cpcbl_agents.clock import Clock
+from cpcbl_launch.keys.folder import KeyRequest, make_keys
 from cpcbl_launch.lab.chaos.links import Relay, TunLink
+from cpcbl_launch.lab.chaos.machine import IDLE, MachineWatch
 from cpcbl_launch.lab.chaos.run_log import RunLog, RunRecorder
 from cpcbl_launch.lab.experiments.runs import with_settings
 from cpcbl_launch.lab.faulty_robot import faulty_command
@@ -20,13 +25,17 @@ from cpcbl_launch.run.up import free_endpoint
 from cpcbl_launch.team_file import builtin_path, load_team, save_resolved
 from cpcbl_team.config import Team
 from cpcbl_team.errors import CpcblError
-from cpcbl_transport.zenoh_bus import open_bus
+from cpcbl_transport.security import Identity, link_of
+from cpcbl_transport.topics import Role
+from cpcbl_transport.zenoh_bus import ZenohBus, open_bus
 
 LEAD_S, LEAD_S_A_PROCESS = 2.0, 0.4
 SETTLED_M = 0.4
 PATIENCE_S = 60.0
 POLL_S = 0.05
 ROUTER, FIELD, FAR_ROUTER = "router", "field", "far-router"
+UP, WATCHER = "up", "cpcbl_launch.lab.chaos.watcher"
+OPERATOR = Identity(Role.OPERATOR)
 
 
 class ChaosError(CpcblError):
@@ -41,6 +50,17 @@ class RunPlan(NamedTuple):
     far: Sequence[str] = ()  # robots at a site whose own router dials the first over a relay
     faults: Mapping[str, str] = MappingProxyType({})  # such as `bias:0.5,0.5@10-30`, by robot
     left_out: Sequence[str] = ()  # robots of the file that are not started
+    secured: bool = False  # with keys: mutual TLS and access control
+    guests: Sequence[str] = ()  # observers that get keys in a secured team
+    watched: bool = False  # with a process that records it, as `up --record` does
+
+
+def secured_plan(plan: RunPlan, folder: Path) -> RunPlan:
+    """The plan with keys for all members, in this folder."""
+    transport = replace(plan.team.transport, security="mtls", keys=str(folder), listen=())
+    team = replace(plan.team, transport=transport)
+    make_keys(team, folder, KeyRequest(observers=plan.guests))
+    return plan._replace(team=team)
 
 
 def demo_team() -> Team:
@@ -51,34 +71,53 @@ def demo_team() -> Team:
 class TeamUnderTest:
     """Made by `run_team`. Times are seconds of robot time after the run's epoch."""
 
-    def __init__(self, plan: RunPlan, folder: Path, stack: ExitStack) -> None:
+    def __init__(
+        self, plan: RunPlan, folder: Path, stack: ExitStack, machine: MachineWatch | None = None
+    ) -> None:
         """Starts all processes; `stack` ends them."""
-        team = plan.team
-        self.plan, self.folder = plan, folder
-        self.endpoint, self.far_endpoint = free_endpoint(), free_endpoint()
+        self._machine = machine
+        plan = secured_plan(plan, folder / "keys") if plan.secured else plan
+        team, protocol = plan.team, "tls" if plan.secured else "tcp"
+        self.plan, self.folder, self.team_file = plan, folder, folder / "team.json"
+        self.endpoint, self.far_endpoint = free_endpoint(protocol), free_endpoint(protocol)
         self.clock = Clock.starting_in(LEAD_S + LEAD_S_A_PROCESS * len(team.robots))
         simulated = [name for name, robot in team.robots.items() if robot.source == "simulated"]
         self.robots = [name for name in simulated if name not in plan.left_out]
         """The robots of the simulated field, whose ground truth is known."""
         relayed = [*plan.relayed, *([FAR_ROUTER] if plan.far else [])]
         self.links: dict[str, Relay | TunLink] = {
-            **{name: stack.enter_context(Relay(self.endpoint, plan.seed)) for name in relayed},
+            **{
+                name: stack.enter_context(Relay(self._router_of(name), plan.seed))
+                for name in relayed
+            },
             **{name: stack.enter_context(TunLink(plan.seed)) for name in plan.lossy},
         }
         """The links that can be impaired, by the robot or router that uses them."""
-        self.supervisor = stack.enter_context(Supervisor(self._process_table(), folder))
+        self._table = self._process_table()
+        self._changes: dict[str, dict[str, Callable[[ProcessSpec], ProcessSpec]]] = {}
+        self.supervisor = stack.enter_context(Supervisor(self._table, folder))
         self.seen_pids: set[int] = set()
         self._recorders = []
         end_s = time.monotonic() + PATIENCE_S
         for endpoint in (self.endpoint, self.far_endpoint) if plan.far else (self.endpoint,):
-            bus = open_bus(team.name, [endpoint], lambda: time.monotonic() > end_s)
+            bus = self.session(OPERATOR, endpoint, lambda: time.monotonic() > end_s)
             self._recorders.append(RunRecorder(self.clock, team.simulation.clocks_ahead_s))
             self._recorders[-1].listen(stack.enter_context(bus))
+
+    def session(
+        self,
+        identity: Identity,
+        endpoint: str = "",
+        give_up: Callable[[], bool] = lambda: False,
+    ) -> ZenohBus:
+        """A session of a member, with its keys if the team has keys."""
+        link = link_of(self.plan.team, identity, [endpoint or self.endpoint])
+        return open_bus(self.plan.team.name, link.endpoints, give_up, link.credentials)
 
     def _process_table(self) -> list[ProcessSpec]:
         """The routers, the field and the robots, started as `up` does, with their own links and
         clocks."""
-        plan, team_file = self.plan, self.folder / "team.json"
+        plan, team_file = self.plan, self.team_file
         save_resolved(plan.team, team_file)
         settings, seed = (plan.team, team_file), plan.seed
         lossy = [self.links[name].endpoint for name in plan.lossy]
@@ -92,13 +131,18 @@ class TeamUnderTest:
         rows.append(field)
         for name in (name for name in plan.team.robots if name not in plan.left_out):
             link = self.links.get(name)
-            endpoint = self.far_endpoint if name in plan.far else self.endpoint
-            endpoint = link.endpoint if link else endpoint
+            endpoint = link.endpoint if link else self._router_of(name)
             own = process_table(*settings, endpoint, self.clock, seed, here=(name,))[-1]
             fault = plan.faults.get(name)
             command = faulty_command(own.command, fault) if fault else own.command
             rows.append(own._replace(command=(*(link.prefix if link else ()), *command)))
+        if plan.watched:
+            words = (team_file, self.endpoint, self.folder / "run.mcap", os.getpid())
+            rows.append(ProcessSpec(UP, (sys.executable, "-m", WATCHER, *map(str, words))))
         return rows
+
+    def _router_of(self, name: str) -> str:
+        return self.far_endpoint if name in self.plan.far else self.endpoint
 
     @property
     def now_s(self) -> float:
@@ -106,12 +150,15 @@ class TeamUnderTest:
 
     @property
     def run_log(self) -> RunLog:
-        return self._recorders[0].run_log()
+        zero_s = self.clock.from_ns * 1e-9
+        machine = self._machine.log(zero_s) if self._machine else IDLE
+        return self._recorders[0].run_log()._replace(machine=machine)
 
     @property
     def far_log(self) -> RunLog:
         """The far site's log, with the ground truth, which is published at the near site only."""
-        return self._recorders[-1].run_log()._replace(truth=self.run_log.truth)
+        near = self.run_log
+        return self._recorders[-1].run_log()._replace(truth=near.truth, machine=near.machine)
 
     def pid(self, name: str) -> int:
         """The process id of a robot, the field or a router, once it runs. Raises ChaosError."""
@@ -122,6 +169,22 @@ class TeamUnderTest:
 
     def signal(self, name: str, number: signal.Signals) -> None:
         os.kill(self.pid(name), number)
+
+    def change_command(
+        self, robot: str, key: str, change: Callable[[ProcessSpec], ProcessSpec] | None
+    ) -> None:
+        """What a robot is started with from its next start on: its command with all changes by
+        their keys; None takes one back."""
+        changes = self._changes.setdefault(robot, {})
+        if change is None:
+            changes.pop(key, None)
+        else:
+            changes[key] = change
+        process = f"robot-{robot}"
+        spec = next(spec for spec in self._table if spec.name == process)
+        for _, one in sorted(changes.items(), key=lambda item: item[0]):
+            spec = one(spec)
+        self.supervisor.change(spec)
 
     # Waiting ------------------------------------------------------------------------------------
 
@@ -172,11 +235,11 @@ class TeamUnderTest:
 
 
 @contextmanager
-def run_team(plan: RunPlan) -> Iterator[TeamUnderTest]:
+def run_team(plan: RunPlan, machine: MachineWatch | None = None) -> Iterator[TeamUnderTest]:
     """A team with all its processes. Raises ChaosError if one of them has not ended afterwards."""
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="cpcbl-chaos-")))
-        team = TeamUnderTest(plan, folder, stack)
+        team = TeamUnderTest(plan, folder, stack, machine)
         yield team
     left = []
     for pid in team.seen_pids:
