@@ -30,6 +30,7 @@ log = logging.getLogger(__name__)
 LONGEST_WAIT_S = 0.2
 LATE_NS = 1_000_000_000
 MAX_CLOCK_STEP_S = 0.25  # a clock that is set by more makes inputs late, or from the future
+LONGEST_STEP_NS = 50_000_000  # a step that lasts longer handles no more messages
 BUSY_NS = 1_000_000  # after a step: what comes sooner may have queued behind it
 
 
@@ -63,6 +64,8 @@ class Loop:
             return
         try:
             self._step()
+            if self._node.waiting:
+                self.wake()
         except BaseException as bug:  # the bus would swallow it
             self._bug = bug
             self.wake()
@@ -78,9 +81,10 @@ class Loop:
             while self._bug is None and not stop():
                 with self._step_lock:
                     self._step()
-                self._sleep_lock.acquire(
-                    timeout=min(self._clock.seconds_until(node.next_ns), LONGEST_WAIT_S)
-                )
+                if not node.waiting:  # as after a step that could not handle all
+                    self._sleep_lock.acquire(
+                        timeout=min(self._clock.seconds_until(node.next_ns), LONGEST_WAIT_S)
+                    )
         finally:
             self._step_lock.acquire()  # what still arrives is only stored
         if self._bug is not None:
@@ -88,7 +92,8 @@ class Loop:
 
     def _step(self) -> None:
         if self._bug is None:
-            self._node.step(self._clock.now_ns())
+            until_ns = time.monotonic_ns() + LONGEST_STEP_NS
+            self._node.step(self._clock.now_ns(), lambda handled: time.monotonic_ns() < until_ns)
 
 
 def run_robot(
