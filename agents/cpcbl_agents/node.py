@@ -56,6 +56,13 @@ class Steppable(Protocol):
     def waiting(self) -> bool:
         """Whether something has arrived."""
 
+    def step(self, now_ns: int) -> None:
+        """Does what is due and handles what has arrived."""
+
+
+class BoundedSteppable(Steppable, Protocol):
+    """A node whose steps can be bounded."""
+
     def step(self, now_ns: int, may_go_on: MayGoOn = everything) -> None:
         """Does what is due, and handles what has arrived as far as it may."""
 

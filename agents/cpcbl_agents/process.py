@@ -11,7 +11,7 @@ import msgspec
 
 from cpcbl_agents.clock import Clock
 from cpcbl_agents.earlier_processes import NEVER_RAN, Before, OwnTokens
-from cpcbl_agents.node import Node, Steppable
+from cpcbl_agents.node import BoundedSteppable, Node
 from cpcbl_agents.robot import Robot, build_robot
 from cpcbl_agents.robot_log import RobotLog
 from cpcbl_agents.sources import OwnCamera
@@ -48,7 +48,7 @@ class Loop:
         self._step_lock, self._sleep_lock = threading.Lock(), threading.Lock()
         self._step_lock.acquire()  # no thread may step the node before `run`
         self._sleep_lock.acquire()
-        self._node: Steppable
+        self._node: BoundedSteppable
         self._busy_ns = 0
         self._bug: BaseException | None = None
 
@@ -73,7 +73,7 @@ class Loop:
             self._busy_ns = time.monotonic_ns() + BUSY_NS
             self._step_lock.release()
 
-    def run(self, node: Steppable, stop: Callable[[], bool]) -> None:
+    def run(self, node: BoundedSteppable, stop: Callable[[], bool]) -> None:
         """Runs until `stop()`. An exception of any thread's step is raised here."""
         self._node = node
         self._step_lock.release()

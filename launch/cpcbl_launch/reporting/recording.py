@@ -24,12 +24,22 @@ from zstandard import ZstdError
 from cpcbl_agents.sources.mrclam import LogError
 from cpcbl_launch.reporting.metrics import Floats
 from cpcbl_launch.reporting.recorder import truth_rows
+from cpcbl_launch.team_faults import one_line
+from cpcbl_launch.team_file import decode_resolved
 from cpcbl_team.config import Team
 from cpcbl_team.inputs import Odometry, Position, Sightings
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus
 from cpcbl_transport.decoding import decode
-from cpcbl_transport.messages import AnnotatedFrame, Message, Refusal, SensorInput, Truths
+from cpcbl_transport.messages import (
+    LAST_NS,
+    AnnotatedFrame,
+    Message,
+    Refusal,
+    SensorInput,
+    Truths,
+    refusal,
+)
 
 log = logging.getLogger(__name__)
 
@@ -128,24 +138,32 @@ class RecordedRun(NamedTuple):
     truth: dict[str, Floats]
 
 
+def _checked(message: Message) -> Message:
+    """A message that could have been recorded. Raises ValueError."""
+    if reason := refusal(message, LAST_NS):
+        raise ValueError(f"a message that no robot takes: {reason}")
+    return message
+
+
 def read_recording(path: Path) -> RecordedRun:
-    """What `Recording` wrote. Raises LogError."""
+    """What `Recording` wrote. Raises LogError, TeamFileError."""
     try:
         with path.open("rb") as file:
             reader = make_reader(file)
             attached = [a.data for a in reader.iter_attachments() if a.name == TEAM]
             messages = [
-                (channel.topic, _decoder.decode(message.data))
+                (channel.topic, _checked(_decoder.decode(message.data)))
                 for _, channel, message in reader.iter_messages()
                 if channel.topic.startswith(("in/", "look/", topics.TRUTH.key))
             ]
         if not attached:
             raise LogError(f"{path}: holds no team: not a recording of `up --record`")
-        team = msgspec.json.decode(attached[0], type=Team)
+        team = decode_resolved(attached[0], f"{path}: {TEAM}")
     except OSError as error:
         raise LogError(f"{path}: cannot be read: {error.strerror or error}") from error
     except DAMAGE as error:
-        raise LogError(f"{path}: not a whole recording: {type(error).__name__} {error}") from error
+        what = one_line(f"{type(error).__name__} {error}")
+        raise LogError(f"{path}: not a whole recording: {what}") from error
     truths = [message for _, message in messages if isinstance(message, Truths)]
     inputs: dict[str, list[SensorInput]] = {}
     for key, message in messages:
