@@ -168,6 +168,8 @@ class Node:
         outgoing = self.robot.handle(agent.Tick(), now_ns)
         for name in self._declarations.update(self.robot.collaboration.interests):
             self._tokens.forget(name)
+            if name not in self._team:
+                self._declarations.forget_guest(name)
             self.robot.handle(agent.Presence(name, None), now_ns)
         self._send(outgoing, now_ns)  # under the tier that these messages belong to
         self._pose.step(now_ns)

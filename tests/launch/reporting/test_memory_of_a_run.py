@@ -60,7 +60,7 @@ def test_the_memory_of_a_recorder_does_not_grow_with_time() -> None:
         grown = tracemalloc.get_traced_memory()[0]
     finally:
         tracemalloc.stop()
-    assert grown < 1.5 * BLOCK_BYTES * (len(ROBOTS) + 1)  # it was 2.4 MB
+    assert grown < 1.5 * BLOCK_BYTES * (len(ROBOTS) + 1)  # it was 1.7 MB
     assert len(on.recorder.trajectory("r1").stamps_ns) == 4000
     assert len(on.recorder.simulated_truth()["r4"]) == 4000
 
