@@ -10,15 +10,15 @@ from contextlib import AbstractContextManager, closing, nullcontext, suppress
 import msgspec
 
 from cpcbl_agents.clock import Clock
-from cpcbl_agents.earlier_processes import NEVER_RAN, Before, OwnTokens
+from cpcbl_agents.earlier_processes import NEVER_RAN, Before, OwnTokens, wait_until_alone
 from cpcbl_agents.node import BoundedSteppable, Node
 from cpcbl_agents.robot import Robot, build_robot
 from cpcbl_agents.robot_log import RobotLog
 from cpcbl_agents.sources import OwnCamera
 from cpcbl_agents.stop import StopSignal as StopSignal  # with a robot, one needs it
+from cpcbl_agents.watchdog import watched
 from cpcbl_team.config import Team
 from cpcbl_team.errors import ClockError
-from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus
 from cpcbl_transport.messages import Status
 from cpcbl_transport.security import Identity, link_of
@@ -110,8 +110,8 @@ def run_robot(
 
     `wrap_bus` may put something between the robot and its bus. Raises BusError when stopped before
     a router answered, LogError for an unreadable log, SecurityError without the keys of a secured
-    team, InputError for a camera that cannot be used, DependencyError without OpenCV, ClockError
-    when this machine's clock was set.
+    team, InputError for a camera that cannot be used or when another process is this robot,
+    DependencyError without OpenCV, ClockError when this machine's clock was set.
     """
     loop = Loop(clock)
     link = link_of(team, Identity(Role.ROBOT, name), connect)
@@ -119,7 +119,7 @@ def run_robot(
         own_camera(name, team, clock, loop.wake) as camera,
         open_bus(team.name, link.endpoints, stop, link.credentials) as bus,
     ):
-        before = Before.by_tokens(bus.tokens(topics.RAN.at(robot=name)))
+        before = wait_until_alone(bus.tokens, name, stop)
         robot = make_robot(
             name,
             team,
@@ -140,7 +140,7 @@ def run_robot(
             *(loop.on_arrival, clock.speed, on_status),
         )
         said.connected(team, link.endpoints)
-        loop.run(node, stop_on_clock_step(name, team, clock, stop))
+        loop.run(node, watched(stop_on_clock_step(name, team, clock, stop)))
 
 
 def make_robot(
