@@ -30,7 +30,8 @@ log = logging.getLogger(__name__)
 LONGEST_WAIT_S = 0.2
 LATE_NS = 1_000_000_000
 MAX_CLOCK_STEP_S = 0.25  # a clock that is set by more makes inputs late, or from the future
-LONGEST_STEP_NS = 50_000_000  # a step that lasts longer handles no more messages
+LONGEST_STEP_S = 0.05  # a step that lasts longer handles no more messages,
+LEAST_STEP_S = 0.005  # nor one that lasts so long and delays what is due
 BUSY_NS = 1_000_000  # after a step: what comes sooner may have queued behind it
 
 
@@ -92,8 +93,9 @@ class Loop:
 
     def _step(self) -> None:
         if self._bug is None:
-            until_ns = time.monotonic_ns() + LONGEST_STEP_NS
-            self._node.step(self._clock.now_ns(), lambda handled: time.monotonic_ns() < until_ns)
+            free_s = self._clock.seconds_until(self._node.next_ns)
+            until_s = time.monotonic() + min(max(LEAST_STEP_S, free_s), LONGEST_STEP_S)
+            self._node.step(self._clock.now_ns(), lambda handled: time.monotonic() < until_s)
 
 
 def run_robot(

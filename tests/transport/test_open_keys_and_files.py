@@ -8,6 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from cpcbl_launch.run.up import free_endpoint
+from cpcbl_transport import zenoh_bus
 from cpcbl_transport.security import CA, CERTIFICATE, PRIVATE_KEY, Identity, credentials_in
 from cpcbl_transport.topics import Role
 from cpcbl_transport.zenoh_bus import LEAST_DESCRIPTORS
@@ -47,6 +49,21 @@ def test_nothing_is_said_of_a_private_key_that_is_private(
     with caplog.at_level(logging.WARNING):
         credentials_in(key_folder(tmp_path, mode), ROUTER)
     assert not caplog.messages
+
+
+def test_a_robot_that_waits_for_a_router_names_the_endpoint_and_then_asks_for_the_port(
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(zenoh_bus, "WAITING_S", 0.0)
+    endpoint = free_endpoint()
+    with (
+        caplog.at_level(logging.WARNING),
+        pytest.raises(zenoh_bus.BusError),
+    ):
+        zenoh_bus.open_bus("lab", [endpoint], lambda: len(caplog.messages) >= 2)
+    first, second = caplog.messages
+    assert first == f"no router at {endpoint} yet, waiting for it"
+    assert second == f"{first}; does the router say that it listens at another port?"
 
 
 def limited(soft: int, hard: int) -> "subprocess.CompletedProcess[str]":
