@@ -95,7 +95,9 @@ def decode_resolved(data: bytes, name: str) -> Team:
         faults: list[object] = [*number_faults(msgspec.json.decode(data))]
     except (msgspec.MsgspecError, RecursionError, UnicodeError) as error:
         raise TeamFileError.of(name, [error]) from error
-    if faults or (faults := [*problems(team)]):
+    # Endpoints may be those of one run
+    faults = faults or [p for p in problems(team) if not p.startswith("transport.")]
+    if faults:
         raise TeamFileError.of(name, faults)
     return team
 
