@@ -48,6 +48,7 @@ RECORDED = (
     *(topics.TRACK, topics.STATUS, topics.TRUTH, topics.LOOK),
 )
 TEAM = "team.json"
+CHUNK_BYTES = 262_144  # of messages that wait in memory, with as much for their index
 PICTURE = "foxglove.CompressedImage"
 DAMAGE = (  # what the readers of MCAP, its compressions and its contents raise of a damaged file
     *(McapError, struct.error, ZstdError, RuntimeError, msgspec.MsgspecError),
@@ -64,7 +65,7 @@ class Recording(AbstractContextManager["Recording"]):
         self._lock = threading.Lock()
         self._path, self.failed = path, ""
         self._file = path.open("wb")
-        self._writer: Writer | None = Writer(self._file)
+        self._writer: Writer | None = Writer(self._file, CHUNK_BYTES)
         self._writer.start(profile="cpcbl", library="cpcbl-team")
         self._writer.add_attachment(0, 0, TEAM, "application/json", msgspec.json.encode(team))
         self._channels: dict[str, int] = {}
