@@ -47,6 +47,7 @@ from cpcbl_team.state import (
     with_odometry,
     with_recovery,
     with_teammates,
+    with_uses,
 )
 from cpcbl_team.teammates import TeammateScreen
 from cpcbl_team.variants import UpdateOrder, variant_of
@@ -334,7 +335,7 @@ class Localizer:
                 # place. Still the fix counts as rejected: so a robot whose own heading is wrong
                 # finds out that it is lost.
                 updates = state.updates
-                updates = updates._replace(objects_ns={**updates.objects_ns, **used})
+                updates = updates._replace(objects_ns=with_uses(updates.objects_ns, used))
                 state = state.counted("heading_gated")._replace(updates=updates)
                 used, rejected = {}, 1
         estimate = self._variant.reduce(estimate)

@@ -22,6 +22,7 @@ from cpcbl_team.trust import SenderRecord
 FIX = "fix:"  # marks the source of an active fix, apart from a sighting of that teammate
 _NONE: Mapping[str, Any] = MappingProxyType({})
 _NEVER_NS = -(2**61)
+MOST_OBJECTS = 4096  # of which the last use is kept
 
 
 class Evidence(NamedTuple):
@@ -64,6 +65,16 @@ class Updates(NamedTuple):
     gated: int = 0
 
 
+def with_uses(objects_ns: Mapping[str, int], used: Mapping[str, int]) -> Mapping[str, int]:
+    """The last uses of objects with these. Where there are too many, as after guests of ever new
+    names, the older half is forgotten."""
+    uses = {**objects_ns, **used}
+    if len(uses) <= MOST_OBJECTS:
+        return uses
+    newest = sorted(uses, key=uses.__getitem__)[len(uses) // 2 :]
+    return {name: uses[name] for name in newest}
+
+
 def updates_with_frame(
     updates: Updates,
     now_ns: int,
@@ -83,7 +94,7 @@ def updates_with_frame(
             position_ns = now_ns
         if scope is HEADING or scope is POSE:
             heading_ns = now_ns
-        objects_ns, accepted_ns = {**objects_ns, **used}, now_ns
+        objects_ns, accepted_ns = with_uses(objects_ns, used), now_ns
     if scope is not None:
         is_latest = scope is HEADING
     accepted, gated = accepted + len(used), before + gated

@@ -18,6 +18,8 @@ from cpcbl_team.recovery import inflate_by_offset, without_senders
 from cpcbl_team.state import State, with_memory, with_senders, with_teammates
 from cpcbl_team.trust import NEVER_NS, ReportedPosition, TeammateReport
 
+MOST_SENDERS = 512  # of which records are kept
+
 
 class TeammateScreen:
     """Leaves out what untrusted teammates report, and keeps the trust up to date."""
@@ -123,8 +125,18 @@ class TeammateScreen:
         if decision.estimate_error_m:
             estimate = inflate_by_offset(estimate, decision.estimate_error_m, self._localizer_rules)
             state = state._replace(estimate=estimate)
-        teammates = with_senders(memory.teammates, decision.senders)
+        teammates = with_senders(memory.teammates, _bounded(decision.senders))
         return with_teammates(state, teammates), decision.trusted
+
+
+def _bounded(senders: trust.SenderRecords) -> trust.SenderRecords:
+    """The records without the older half of them, by their last reports, when there are too many:
+    guests of ever new names may come."""
+    if len(senders) <= MOST_SENDERS:
+        return senders
+    names = sorted(senders, key=lambda name: senders[name].last_report_ns)
+    kept = {*names[len(names) // 2 :], trust.OWN_SENSORS}
+    return {name: record for name, record in senders.items() if name in kept}
 
 
 def _without(objects: list[GatedObject], distrusted: set[str]) -> list[GatedObject]:

@@ -14,6 +14,7 @@ from cpcbl_transport.messages import FUTURE_NS, LARGEST_NUMBER
 SPAN_NS = 5_000_000_000
 MIN_MESSAGES = 5  # for a judgement: a single message may have been delayed, or be faulty
 NEVER_LATE_NS = 2**62
+MOST_SENDERS = 512  # guests of ever new names may come
 
 
 class Span(NamedTuple):
@@ -45,6 +46,8 @@ class ClockMonitor:
             last, before = fresh, last if now_ns - last.since_ns < 2 * SPAN_NS else fresh
         least_ns, ahead = min(last.least_ns, late_ns), last.ahead + (late_ns < -self._ahead_ns)
         last = Span(last.since_ns, least_ns, last.messages + 1, ahead)
+        if sender not in self._spans and len(self._spans) >= MOST_SENDERS:
+            del self._spans[min(self._spans, key=lambda name: self._spans[name][0].since_ns)]
         self._spans[sender] = last, before
         return self._is_off(last, before) or -FUTURE_NS <= late_ns < -self._ahead_ns
 

@@ -26,6 +26,8 @@ from cpcbl_transport.messages import Flow, Help, Track
 
 NEIGHBOUR_NS = 10_000_000_000  # a teammate's tier is watched for so long after it was seen
 IN_SIGHT_NS = 1_000_000_000  # its beliefs are useful for so long after it was seen
+MOST_PEERS = 256  # of which messages are counted one by one: guests of ever new names may come
+OTHERS = "others"  # in place of the peers that were heard or told anything longest ago
 EARLY_NS = 1_500_000_000  # a fix waits so long for its robot's tier
 
 
@@ -76,7 +78,22 @@ class MessageCounters:
         self._counters: dict[tuple[str, str], MessageCounter] = {}
 
     def of(self, topic: str, peer: str) -> MessageCounter:
-        return self._counters.setdefault((topic, peer), MessageCounter())
+        counter = self._counters.get((topic, peer))
+        if counter is None:
+            counter = self._counters[topic, peer] = MessageCounter()
+            if len(self._counters) > 2 * MOST_PEERS:
+                self._merge_oldest()
+        return counter
+
+    def _merge_oldest(self) -> None:
+        """Merges half of the counters of peers into one a topic."""
+        peers = [(topic, peer) for topic, peer in self._counters if peer not in ("", OTHERS)]
+        peers.sort(key=lambda key: self._counters[key].latest_ns)
+        for topic, peer in peers[:MOST_PEERS]:
+            gone = vars(self._counters.pop((topic, peer)))
+            sums = vars(self._counters.setdefault((topic, OTHERS), MessageCounter()))
+            latest_ns = max(sums["latest_ns"], gone["latest_ns"])
+            sums.update({name: sums[name] + gone[name] for name in sums}, latest_ns=latest_ns)
 
     def flows(self) -> tuple[Flow, ...]:
         """The counters as they are reported, without those that counted nothing."""
@@ -142,6 +159,8 @@ class CollaborationAgent:
             case agent.Presence(name, tier):
                 self.guests.set_presence(name, tier is not None)
                 self._tiers.pop(name, None)
+                if tier is None and name not in self._teammates:  # a guest: names are free
+                    self._fix_memories.pop(name, None)
                 if tier is not None and (name in self._teammates or name in self.guests):
                     self._tiers[name] = tier
             case agent.UnknownRobot(name):
@@ -175,6 +194,8 @@ class CollaborationAgent:
             for name, fix in self._latest_fixes.items()
             if fix.stamp_ns > forgotten_ns and (name in self._teammates or name in guests)
         }
+        early = self._early_fixes.items()
+        self._early_fixes = {name: fix for name, fix in early if fix.stamp_ns > forgotten_ns}
         self.neighbours = guests.union(self._latest_fixes)
         if self._rules.passive:
             self.sources = frozenset(

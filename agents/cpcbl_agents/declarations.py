@@ -76,6 +76,12 @@ class Declarations:
                 old_token.close()
         return forgotten
 
+    def forget_guest(self, name: str) -> None:
+        """Takes back the publishers for a guest that is no longer watched."""
+        own = f"{topics.FIX.key.partition('<')[0]}{name}/"
+        for key in [k for k in self._publishers if k.startswith(own)]:
+            self._publishers.pop(key).close()
+
     def _subscribed_keys(self, tier: int) -> Iterable[str]:
         if self._rules.active:
             for better in accepted_tiers(tier, self._rules):

@@ -4,14 +4,18 @@ Each process tells it by liveliness tokens, twice in its life, and the router re
 as it lives. So the router's start is the team's start, and the order of all other starts is free.
 """
 
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
+from cpcbl_team.errors import InputError
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus, Handle
 from cpcbl_transport.topics import namespace
 
 STILL, MOVED = "still", "moved"
+LEASE_S = 6.0  # the token of a process that ended stays no longer, over two routers either
+LOOK_S = 0.2
 ROUTER = "router"  # in place of an incarnation: what the router repeats
 
 
@@ -29,6 +33,29 @@ class Before(NamedTuple):
 
 
 NEVER_RAN = Before()
+
+
+def wait_until_alone(
+    tokens: Callable[[str], Sequence[str]],
+    robot: str,
+    stop: Callable[[], bool] = lambda: False,
+    within_s: float = LEASE_S,
+) -> Before:
+    """What is known of the earlier processes of a robot, once none of them runs any more. Two at a
+    time would share inputs, and teammates would mix what they say. `tokens`: those that are there
+    now, by key. Raises InputError when one goes on running."""
+    until_s = time.monotonic() + within_s
+    while True:
+        there = tokens(topics.RAN.at(robot=robot))
+        others = {key.rpartition("/")[2] for key in there} - {ROUTER}
+        if not others or stop():
+            return Before.by_tokens(there)
+        if time.monotonic() >= until_s:
+            raise InputError(
+                f"robot {robot}: another process is this robot already ({', '.join(sorted(others))}"
+                " in its status as `incarnation`); stop it first"
+            )
+        time.sleep(LOOK_S)
 
 
 class OwnTokens:

@@ -12,7 +12,9 @@ from cpcbl_agents.agent import BeliefSubscribers, FrameSubscribers
 from cpcbl_agents.clocks import ClockMonitor
 from cpcbl_agents.collaboration import MessageCounters
 from cpcbl_agents.declarations import Declarations, LivelinessTokens
+from cpcbl_agents.inbox import INBOX, Inbox
 from cpcbl_agents.input_health import InputMonitor
+from cpcbl_agents.load import LoadMonitor, MayGoOn, everything
 from cpcbl_agents.pose_output import PoseOutput
 from cpcbl_agents.robot import Robot, build_robot
 from cpcbl_agents.sources import OwnCamera
@@ -37,7 +39,6 @@ from cpcbl_transport.topics import Topic, topic_of
 log = logging.getLogger(__name__)
 
 STATUS_NS = 1_000_000_000
-INBOX = 10_000
 ASK_NS = 500_000_000  # how often a guest asks the simulated field to simulate it
 RETRY_NS = 50_000_000  # while no field subscribes
 WARN_AFTER_NS = 3_000_000_000  # without any input
@@ -57,6 +58,13 @@ class Steppable(Protocol):
 
     def step(self, now_ns: int) -> None:
         """Does what is due and handles what has arrived."""
+
+
+class BoundedSteppable(Steppable, Protocol):
+    """A node whose steps can be bounded."""
+
+    def step(self, now_ns: int, may_go_on: MayGoOn = everything) -> None:
+        """Does what is due, and handles what has arrived as far as it may."""
 
 
 class Node:
@@ -79,7 +87,7 @@ class Node:
         self._frame_key = topics.IN_FRAME.at(robot=robot.name)
         rules = team.robots[robot.name].collaboration
         self._team, self._passive = frozenset(team.robots), rules.passive
-        self._inbox: deque[tuple[str, bytes]] = deque(maxlen=INBOX)
+        self._inbox, self._load = Inbox(self._team), LoadMonitor(speed)
         self._frames: deque[tuple[str, bytes]] = deque(maxlen=1)
         self._liveliness_events: deque[tuple[str, bool]] = deque(maxlen=INBOX)
         self._declarations = Declarations(
@@ -113,10 +121,10 @@ class Node:
                 self.counts["frame_skipped"] += 1
             self._frames.append((key, payload))
         else:
-            if len(self._inbox) == INBOX:
-                self.counts["inbox_overflow"] += 1
             # Enough to refuse it: it may be a large frame
-            self._inbox.append((key, payload[: messages.LARGEST_PAYLOAD + 1]))
+            dropped = self._inbox.put(key, payload[: messages.LARGEST_PAYLOAD + 1])
+            if dropped:
+                self.counts["inbox_overflow"] += dropped
         self._on_arrival()
 
     def _on_token(self, key: str, alive: bool) -> None:
@@ -144,12 +152,13 @@ class Node:
     def waiting(self) -> bool:
         return bool(self._inbox or self._liveliness_events or self._frames)
 
-    def step(self, now_ns: int) -> None:
+    def step(self, now_ns: int, may_go_on: MayGoOn = everything) -> None:
         """Handles what has arrived, lets the robot work, and publishes the results. What arrives
-        meanwhile waits for the next step: a flood must not keep this one from ending."""
-        self._handle_liveliness(now_ns)
-        for _ in range(len(self._inbox)):
-            self._handle_payload(*self._inbox.popleft(), now_ns)
+        meanwhile waits for the next step, and so does what this one may not handle any more: a
+        flood must not keep it from ending."""
+        due_ns = self.robot.next_ns
+        self._handle_arrivals(now_ns, may_go_on)
+        self._load.note(due_ns, now_ns, self._inbox.is_fair)
         if self._frames:
             self._handle_payload(*self._frames.popleft(), now_ns)
         if self._passive and self._declarations.tier is not None:
@@ -159,12 +168,26 @@ class Node:
         outgoing = self.robot.handle(agent.Tick(), now_ns)
         for name in self._declarations.update(self.robot.collaboration.interests):
             self._tokens.forget(name)
+            if name not in self._team:
+                self._declarations.forget_guest(name)
             self.robot.handle(agent.Presence(name, None), now_ns)
         self._send(outgoing, now_ns)  # under the tier that these messages belong to
         self._pose.step(now_ns)
         if now_ns - self._status_ns >= STATUS_NS and self._declarations.tier is not None:
             self._status_ns = now_ns
             self._publish_status(now_ns)
+
+    def _handle_arrivals(self, now_ns: int, may_go_on: MayGoOn) -> None:
+        """Handles tokens, then messages; at least one of each that waits."""
+        handled, tokens, waiting = 0, len(self._liveliness_events), len(self._inbox)
+        while handled < tokens and (not handled or may_go_on(handled)):
+            self._handle_token(*self._liveliness_events.popleft(), now_ns)
+            handled += 1
+        taken = 0
+        while taken < waiting and (not taken or may_go_on(handled + taken)):
+            self._handle_payload(*self._inbox.take(), now_ns)
+            taken += 1
+        self._inbox.is_fair = taken < waiting
 
     def _handle_payload(self, key: str, payload: bytes, now_ns: int) -> None:
         message, source = self._decode(key, payload, now_ns), self._health.by_key.get(key)
@@ -211,18 +234,17 @@ class Node:
                     return Refusal.CLOCK
         return refusal(message, now_ns) or message
 
-    def _handle_liveliness(self, now_ns: int) -> None:
+    def _handle_token(self, key: str, alive: bool, now_ns: int) -> None:
         """Tells the robot which teammates are present, and with which tier."""
-        for _ in range(len(self._liveliness_events)):
-            presence = self._tokens.update(*self._liveliness_events.popleft())
-            if presence is None:
-                self.counts["bad_token"] += 1
-                continue
-            name, tier = presence
-            was_guest = self.robot.is_guest(name)
-            self.robot.handle(agent.Presence(name, tier), now_ns)
-            if was_guest is not self.robot.is_guest(name):
-                log.info("%s: guest %s %s", self._name, name, "left" if was_guest else "joined")
+        presence = self._tokens.update(key, alive)
+        if presence is None:
+            self.counts["bad_token"] += 1
+            return
+        name, tier = presence
+        was_guest = self.robot.is_guest(name)
+        self.robot.handle(agent.Presence(name, tier), now_ns)
+        if was_guest is not self.robot.is_guest(name):
+            log.info("%s: guest %s %s", self._name, name, "left" if was_guest else "joined")
 
     def _check_subscribers(
         self, topic: Topic, event: type[BeliefSubscribers | FrameSubscribers], now_ns: int
@@ -256,7 +278,8 @@ class Node:
         received = self.received.flows()
         status = self.robot.status(now_ns, self._incarnation, counts, received, self._clocks)
         inputs, problems = self._health.judge(self.robot, now_ns, bool(self._namesakes))
-        problems += self.robot.sensing.problems
+        overload = self._load.judge(len(self._inbox), self._inbox.pop_dropped())
+        problems = (*overload, *problems, *self.robot.sensing.problems)
         status = msgspec.structs.replace(status, inputs=inputs, problems=problems)
         self._on_status(status)
         self._publish(status)
@@ -306,7 +329,7 @@ class GuestNode(Node):
             " its file let guests in?"
         )
 
-    def step(self, now_ns: int) -> None:
+    def step(self, now_ns: int, may_go_on: MayGoOn = everything) -> None:
         """Asks the field when that is due, and steps the node."""
         if self._warn_ns is not None and now_ns >= self._warn_ns:
             self._warn_ns = None
@@ -314,7 +337,7 @@ class GuestNode(Node):
                 log.warning("%s %s", self.robot.name, self.missing_input)
         if self._model is not None and now_ns >= self._ask_ns:
             self._ask_ns = now_ns + (ASK_NS if self._ask(now_ns, self._model) else RETRY_NS)
-        super().step(now_ns)
+        super().step(now_ns, may_go_on)
 
     def leave(self, now_ns: int) -> None:
         """Tells the field that the guest leaves. All else ends with the session."""

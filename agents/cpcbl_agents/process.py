@@ -10,15 +10,15 @@ from contextlib import AbstractContextManager, closing, nullcontext, suppress
 import msgspec
 
 from cpcbl_agents.clock import Clock
-from cpcbl_agents.earlier_processes import NEVER_RAN, Before, OwnTokens
-from cpcbl_agents.node import Node, Steppable
+from cpcbl_agents.earlier_processes import NEVER_RAN, Before, OwnTokens, wait_until_alone
+from cpcbl_agents.node import BoundedSteppable, Node
 from cpcbl_agents.robot import Robot, build_robot
 from cpcbl_agents.robot_log import RobotLog
 from cpcbl_agents.sources import OwnCamera
 from cpcbl_agents.stop import StopSignal as StopSignal  # with a robot, one needs it
+from cpcbl_agents.watchdog import watched
 from cpcbl_team.config import Team
 from cpcbl_team.errors import ClockError
-from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus
 from cpcbl_transport.messages import Status
 from cpcbl_transport.security import Identity, link_of
@@ -30,6 +30,8 @@ log = logging.getLogger(__name__)
 LONGEST_WAIT_S = 0.2
 LATE_NS = 1_000_000_000
 MAX_CLOCK_STEP_S = 0.25  # a clock that is set by more makes inputs late, or from the future
+LONGEST_STEP_S = 0.05  # a step that lasts longer handles no more messages,
+LEAST_STEP_S = 0.005  # nor one that lasts so long and delays what is due
 BUSY_NS = 1_000_000  # after a step: what comes sooner may have queued behind it
 
 
@@ -47,7 +49,7 @@ class Loop:
         self._step_lock, self._sleep_lock = threading.Lock(), threading.Lock()
         self._step_lock.acquire()  # no thread may step the node before `run`
         self._sleep_lock.acquire()
-        self._node: Steppable
+        self._node: BoundedSteppable
         self._busy_ns = 0
         self._bug: BaseException | None = None
 
@@ -63,6 +65,8 @@ class Loop:
             return
         try:
             self._step()
+            if self._node.waiting:
+                self.wake()
         except BaseException as bug:  # the bus would swallow it
             self._bug = bug
             self.wake()
@@ -70,7 +74,7 @@ class Loop:
             self._busy_ns = time.monotonic_ns() + BUSY_NS
             self._step_lock.release()
 
-    def run(self, node: Steppable, stop: Callable[[], bool]) -> None:
+    def run(self, node: BoundedSteppable, stop: Callable[[], bool]) -> None:
         """Runs until `stop()`. An exception of any thread's step is raised here."""
         self._node = node
         self._step_lock.release()
@@ -78,9 +82,10 @@ class Loop:
             while self._bug is None and not stop():
                 with self._step_lock:
                     self._step()
-                self._sleep_lock.acquire(
-                    timeout=min(self._clock.seconds_until(node.next_ns), LONGEST_WAIT_S)
-                )
+                if not node.waiting:  # as after a step that could not handle all
+                    self._sleep_lock.acquire(
+                        timeout=min(self._clock.seconds_until(node.next_ns), LONGEST_WAIT_S)
+                    )
         finally:
             self._step_lock.acquire()  # what still arrives is only stored
         if self._bug is not None:
@@ -88,7 +93,9 @@ class Loop:
 
     def _step(self) -> None:
         if self._bug is None:
-            self._node.step(self._clock.now_ns())
+            free_s = self._clock.seconds_until(self._node.next_ns)
+            until_s = time.monotonic() + min(max(LEAST_STEP_S, free_s), LONGEST_STEP_S)
+            self._node.step(self._clock.now_ns(), lambda handled: time.monotonic() < until_s)
 
 
 def run_robot(
@@ -105,8 +112,8 @@ def run_robot(
 
     `wrap_bus` may put something between the robot and its bus. Raises BusError when stopped before
     a router answered, LogError for an unreadable log, SecurityError without the keys of a secured
-    team, InputError for a camera that cannot be used, DependencyError without OpenCV, ClockError
-    when this machine's clock was set.
+    team, InputError for a camera that cannot be used or when another process is this robot,
+    DependencyError without OpenCV, ClockError when this machine's clock was set.
     """
     loop = Loop(clock)
     link = link_of(team, Identity(Role.ROBOT, name), connect)
@@ -114,7 +121,7 @@ def run_robot(
         own_camera(name, team, clock, loop.wake) as camera,
         open_bus(team.name, link.endpoints, stop, link.credentials) as bus,
     ):
-        before = Before.by_tokens(bus.tokens(topics.RAN.at(robot=name)))
+        before = wait_until_alone(bus.tokens, name, stop)
         robot = make_robot(
             name,
             team,
@@ -135,7 +142,7 @@ def run_robot(
             *(loop.on_arrival, clock.speed, on_status),
         )
         said.connected(team, link.endpoints)
-        loop.run(node, stop_on_clock_step(name, team, clock, stop))
+        loop.run(node, watched(stop_on_clock_step(name, team, clock, stop)))
 
 
 def make_robot(

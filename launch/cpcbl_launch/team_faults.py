@@ -88,6 +88,12 @@ def _first_of_each_key(
     return list(found.values())
 
 
+def number_faults(raw: Mapping[str, Any]) -> list[Fault]:
+    """The numbers of a resolved team that are none, or too large. It holds computed numbers too,
+    which may be as small as they like."""
+    return _depth_and_numbers(raw, smallest=0.0)[1]
+
+
 def one_line(text: str, longest: int = 300) -> str:
     """A text of any origin as one line that a person can read."""
     line = "".join(c if c.isprintable() else " " for c in text)
@@ -119,7 +125,9 @@ def _type_faults(raw: Mapping[str, Any]) -> Iterator[Fault]:
             yield Fault(f"robots.{name}.type", f"no type {kind!r}; {fix}")
 
 
-def _depth_and_numbers(raw: Mapping[str, Any]) -> tuple[str | None, list[Fault]]:
+def _depth_and_numbers(
+    raw: Mapping[str, Any], smallest: float = SMALLEST
+) -> tuple[str | None, list[Fault]]:
     """The key where tables are too deep, if any; and the numbers that are none, or too large."""
     faults: list[Fault] = []
     parts: list[tuple[str, Any, int]] = [("", raw, 0)]
@@ -131,18 +139,18 @@ def _depth_and_numbers(raw: Mapping[str, Any]) -> tuple[str | None, list[Fault]]
             parts += [(_joined(key, name), v, depth + 1) for name, v in reversed(value.items())]
         elif isinstance(value, list):
             parts += [(f"{key}[{i}]", v, depth + 1) for i, v in reversed([*enumerate(value)])]
-        elif isinstance(value, int | float) and (text := _number_fault(key, value)):
+        elif isinstance(value, int | float) and (text := _number_fault(key, value, smallest)):
             faults.append(Fault(key, text))
     return None, faults
 
 
-def _number_fault(key: str, value: float) -> str:
+def _number_fault(key: str, value: float, smallest: float) -> str:
     largest = LARGEST_AMOUNT if "bytes" in key or "messages" in key else LARGEST
     if isinstance(value, float) and not math.isfinite(value):
         return "not a finite number; write a finite one"
     if abs(value) > largest:
         return f"out of range; write a number of at most {largest:g}"
-    if 0 < abs(value) < SMALLEST:
+    if 0 < abs(value) < smallest:
         return f"{value:g} is too small; write 0, or at least {SMALLEST:g}"
     return ""
 

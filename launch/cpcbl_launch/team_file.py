@@ -13,7 +13,7 @@ import msgspec
 from msgspec.structs import replace
 
 from cpcbl_launch.team_checks import problems
-from cpcbl_launch.team_faults import layer_faults, one_line, table_faults
+from cpcbl_launch.team_faults import layer_faults, number_faults, one_line, table_faults
 from cpcbl_team.config import RobotSettings, Team
 from cpcbl_team.errors import InputError
 
@@ -59,10 +59,7 @@ def load_team(path: Path) -> Team:
     """
     text = read_text(path)
     if path.suffix == ".json":
-        try:
-            return msgspec.json.decode(text, type=Team)
-        except (msgspec.MsgspecError, RecursionError) as error:
-            raise TeamFileError.of(str(path), [error]) from error
+        return decode_resolved(text.encode(), str(path))
     team = parse_team(text, str(path))
     robots = dict(team.robots)
     for name, robot in team.robots.items():
@@ -89,6 +86,20 @@ def save_resolved(team: Team, path: Path) -> None:
     except OSError as error:
         reason = f"{error.strerror}; the processes of a run read their team there"
         raise TeamFileError(f"{path}: not written: {reason}") from error
+
+
+def decode_resolved(data: bytes, name: str) -> Team:
+    """The team in what `save_resolved` wrote, or a recording holds. Raises TeamFileError."""
+    try:
+        team = msgspec.json.decode(data, type=Team)
+        faults: list[object] = [*number_faults(msgspec.json.decode(data))]
+    except (msgspec.MsgspecError, RecursionError, UnicodeError) as error:
+        raise TeamFileError.of(name, [error]) from error
+    # Endpoints may be those of one run
+    faults = faults or [p for p in problems(team) if not p.startswith("transport.")]
+    if faults:
+        raise TeamFileError.of(name, faults)
+    return team
 
 
 def parse_team(text: str, name: str = "team file") -> Team:

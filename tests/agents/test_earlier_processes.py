@@ -8,9 +8,16 @@ from support.buses import wait_until
 from support.keys import R1, R2, ROUTER, secured_team, session, shown_by
 from support.routers import open_router
 
-from cpcbl_agents.earlier_processes import NEVER_RAN, Before, OwnTokens, repeat_tokens
+from cpcbl_agents.earlier_processes import (
+    NEVER_RAN,
+    Before,
+    OwnTokens,
+    repeat_tokens,
+    wait_until_alone,
+)
 from cpcbl_launch.run.up import free_endpoint
 from cpcbl_team.config import Team
+from cpcbl_team.errors import InputError
 from cpcbl_transport import topics
 from cpcbl_transport.security import Identity, access_control
 from cpcbl_transport.zenoh_bus import ZenohBus, open_bus
@@ -39,6 +46,29 @@ def test_a_router_remembers_who_has_moved() -> None:
     with ExitStack() as stack:
         repeat_tokens(stack.enter_context(open_router("lab", [endpoint])))
         check(*(stack.enter_context(open_bus("lab", [endpoint])) for _ in range(3)))
+
+
+def test_a_second_process_of_a_robot_waits_for_the_first_and_then_gives_up() -> None:
+    endpoint = free_endpoint()
+    with ExitStack() as stack:
+        repeat_tokens(stack.enter_context(open_router("lab", [endpoint])))
+        first, second, other = (stack.enter_context(open_bus("lab", [endpoint])) for _ in range(3))
+        assert wait_until_alone(first.tokens, "r1") == NEVER_RAN
+        OwnTokens(first, "r1", "1")
+        wait_until(lambda: before(second) == Before(ran=True))
+        with pytest.raises(InputError, match="robot r1: another process is this robot already"):
+            wait_until_alone(second.tokens, "r1", within_s=0.3)
+        assert wait_until_alone(other.tokens, "r2", within_s=0.0) == NEVER_RAN
+        asked: list[str] = []
+
+        def ends_meanwhile(keys: str) -> list[str]:
+            asked.append(keys)
+            if len(asked) == 2:
+                first.close()
+            return second.tokens(keys)
+
+        assert wait_until_alone(ends_meanwhile, "r1") == Before(ran=True)
+        assert len(asked) >= 2
 
 
 @pytest.fixture(scope="module")

@@ -27,7 +27,7 @@ from support.nodes import (
     two_robots,
 )
 
-from cpcbl_agents.node import INBOX
+from cpcbl_agents.inbox import INBOX
 from cpcbl_team.inputs import Belief, Fix, Odometry, Position, Sighting, Sightings
 from cpcbl_team.timeline import HORIZON_NS
 from cpcbl_transport import topics

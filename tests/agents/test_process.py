@@ -13,6 +13,7 @@ from support.buses import robot_at, team_of, wait_until, with_robot
 from cpcbl_agents import process
 from cpcbl_agents.clock import Clock
 from cpcbl_agents.earlier_processes import Before
+from cpcbl_agents.load import MayGoOn, everything
 from cpcbl_agents.process import Loop, make_robot, new_incarnation, stop_on_clock_step
 from cpcbl_agents.stop import StopSignal
 from cpcbl_team.config import BudgetSettings
@@ -38,7 +39,7 @@ class Counting:
     def waiting(self) -> bool:
         return bool(self.inbox)
 
-    def step(self, now_ns: int) -> None:
+    def step(self, now_ns: int, may_go_on: MayGoOn = everything) -> None:
         self.at_once += 1
         self.most_at_once = max(self.most_at_once, self.at_once)
         self.threads.append(threading.get_ident())

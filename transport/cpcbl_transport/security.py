@@ -12,7 +12,10 @@ Both are Zenoh's own, as its configuration. What was measured:
   expires, but the link carries nothing. Links do not outlive their certificates.
 """
 
+import logging
+import os
 from collections.abc import Collection, Iterable, Iterator, Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -22,6 +25,8 @@ from cpcbl_team.config import Team
 from cpcbl_team.errors import CpcblError
 from cpcbl_transport import topics
 from cpcbl_transport.topics import Permission, Role, Topic
+
+log = logging.getLogger(__name__)
 
 CA, CERTIFICATE, PRIVATE_KEY, MEMBERS = "ca.crt", "certificate.crt", "private.key", "members.json"
 PROTOCOL = "tls"
@@ -92,7 +97,8 @@ def link_of(team: Team, identity: Identity, endpoints: Collection[str]) -> Link:
 
 
 def credentials_in(folder: Path, identity: Identity) -> Credentials:
-    """The key files of a member in the team's key folder. Raises SecurityError if one is absent."""
+    """The key files of a member in the team's key folder. Raises SecurityError if one is absent.
+    A private key that others can read is used, and that is said once."""
     paths = [folder / str(identity) / name for name in (CA, CERTIFICATE, PRIVATE_KEY)]
     for path in paths:
         try:
@@ -102,7 +108,22 @@ def credentials_in(folder: Path, identity: Identity) -> Credentials:
                 f"transport.keys: {path}: {error.strerror}; `cpcbl-team keys FILE` makes the keys"
                 f" of {identity}, which this process must be able to read"
             ) from error
+    _warn_if_open(folder / str(identity) / PRIVATE_KEY)
     return Credentials(*map(str, paths))
+
+
+@cache
+def _warn_if_open(private_key: Path) -> None:
+    """Says that others on this machine can read or change a private key. Not on a file system that
+    is mounted read-only: that is a secret of a container, which has no other users."""
+    others = private_key.stat().st_mode & 0o026
+    if others and not os.statvfs(private_key).f_flag & os.ST_RDONLY:
+        verb = "change" if others & 0o022 else "read"
+        log.warning(
+            "transport.keys: %s: others on this machine can %s this private key; run"
+            " `chmod 600 %s`, and renew the key if they may have used it",
+            *(private_key, verb, private_key),
+        )
 
 
 def members_in(folder: Path) -> tuple[Member, ...]:

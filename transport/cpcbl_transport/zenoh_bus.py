@@ -14,6 +14,7 @@ import logging
 import re
 import time
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +29,7 @@ from cpcbl_transport.zenoh_config import client_config
 log = logging.getLogger(__name__)
 
 TOKENS_S = 5.0  # for the router's answer
+LEAST_DESCRIPTORS, MOST_DESCRIPTORS = 64, 65_536
 WAITING_S = 10.0  # after so long it is said again that no router answers
 
 
@@ -46,8 +48,9 @@ def open_bus(
     credentials every link is mutual TLS. `on_wait` is told again and again that there is none yet,
     with the reason where TLS has one; without it the log says so. Without a team, keys are whole
     ones, of all teams. Raises BusError when it gave up."""
+    require_descriptors()
     config = client_config(connect, credentials)
-    reason, said_s = "stopped before a router answered", -WAITING_S
+    reason, said_s, first = "stopped before a router answered", -WAITING_S, True
     while not give_up():
         try:
             return ZenohBus(_open(config, namespace(team) if team else None))
@@ -58,7 +61,10 @@ def open_bus(
             elif time.monotonic() - said_s >= WAITING_S:
                 said_s = time.monotonic()
                 shown = f": {reason}" if credentials else ""
-                log.warning("no router at %s yet, waiting for it%s", ", ".join(connect), shown)
+                hint = "" if first else "; does the router say that it listens at another port?"
+                first = False
+                where = ", ".join(connect)
+                log.warning("no router at %s yet, waiting for it%s%s", where, shown, hint)
             time.sleep(0.2)
     raise BusError(f"no router at {', '.join(connect)}: {reason}")
 
@@ -76,6 +82,7 @@ def _tls_reason(connect: Sequence[str], credentials: Credentials | None) -> str:
 def open_router(config: Mapping[str, Any], space: str | None = None) -> "ZenohBus":
     """A session that is a router for all teams, as its configuration says. Without a namespace its
     own keys are whole ones. Raises BusError when it cannot listen there."""
+    require_descriptors()
     try:
         return ZenohBus(_open(config, space))
     except zenoh.ZError as error:
@@ -122,6 +129,26 @@ def listen_problem(error: str) -> str:
 def one_line(error: str) -> str:
     """What went wrong, in one line, without the places in Zenoh's source."""
     return " ".join(re.sub(r"(?: at )?\(?/?\S+\.rs:\d+(?::\d+)?\)?[.:]?", "", error).split())
+
+
+def require_descriptors() -> None:
+    """Lets this process open as many files and connections as its system does. Raises BusError
+    where these are too few: without them Zenoh aborts the process, or hangs."""
+    try:
+        import resource
+    except ImportError:  # not on Windows, which has no such limit
+        return
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    most = MOST_DESCRIPTORS if hard == resource.RLIM_INFINITY else min(hard, MOST_DESCRIPTORS)
+    if soft != resource.RLIM_INFINITY and soft < most:
+        with suppress(ValueError, OSError):  # macOS may have a lower limit of its own
+            resource.setrlimit(resource.RLIMIT_NOFILE, (most, hard))
+            soft = most
+    if soft != resource.RLIM_INFINITY and soft < LEAST_DESCRIPTORS:
+        raise BusError(
+            f"this process may open only {soft} files and connections, and needs"
+            f" {LEAST_DESCRIPTORS}; run `ulimit -n 1024` before (systemd: LimitNOFILE=)"
+        )
 
 
 def _open(config: Mapping[str, Any], space: str | None = None) -> "zenoh.Session":

@@ -19,6 +19,7 @@ from cpcbl_team.inputs import Odometry, Sighting, Sightings
 
 LONGEST_PIECE_NS = 100_000_000
 LONGEST_GAP_S = 3600.0
+LARGEST, LATEST_S = 1e6, 4e9  # of numbers (m, rad, ...) and of times: nothing real is beyond
 WHERE = "asrl.utias.utoronto.ca/datasets/mrclam"
 ROBOTS = ("1", "2", "3", "4", "5")
 
@@ -42,6 +43,13 @@ def read_table(path: Path, columns: int) -> NDArray[np.float64]:
     if not np.isfinite(table).all():
         row = int(np.argmin(np.isfinite(table).all(axis=1)))
         raise LogError(f"{path}: row {row + 1} has a number that is not finite")
+    is_large = np.abs(table) > np.array([LATEST_S] + [LARGEST] * (columns - 1))
+    if is_large.any():
+        row, column = (int(i) for i in np.argwhere(is_large)[0])
+        raise LogError(
+            f"{path}: row {row + 1}, column {column + 1}: {table[row, column]:g} is out of range;"
+            " write seconds, metres and radians"
+        )
     return table[np.argsort(table[:, 0], kind="stable")]
 
 

@@ -40,7 +40,10 @@ def decode_image(image: bytes) -> Pixels | str:
     files that a person names; `decode_frame` is for frames of cameras."""
     if not image:
         return "frame_empty"
-    pixels = cv2.imdecode(np.frombuffer(image, np.uint8), cv2.IMREAD_COLOR)
+    try:
+        pixels = cv2.imdecode(np.frombuffer(image, np.uint8), cv2.IMREAD_COLOR)
+    except cv2.error:  # as of a size beyond 2^30 pixels
+        pixels = None
     return "frame_undecodable" if pixels is None else pixels.astype(np.uint8, copy=False)
 
 

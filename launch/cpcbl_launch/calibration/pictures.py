@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 
 from cpcbl_agents.vision.camera import Pixels
+from cpcbl_agents.vision.pictures import decode_image
 from cpcbl_team.errors import InputError
 
 PICTURES = (".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp")
@@ -54,11 +55,11 @@ def read_pictures(
 def read_picture(file: Path) -> NamedPicture:
     """Reads one picture; the result names the reason if that fails."""
     try:
-        image = np.frombuffer(file.read_bytes(), np.uint8)
+        data = file.read_bytes()
     except OSError as error:
         return NamedPicture(file.name, error.strerror or "cannot be read")
-    pixels = cv2.imdecode(image, cv2.IMREAD_COLOR) if image.size else None
-    return NamedPicture(file.name, "no picture" if pixels is None else pixels.astype(np.uint8))
+    pixels = decode_image(data)
+    return NamedPicture(file.name, "no picture" if isinstance(pixels, str) else pixels)
 
 
 def _video_frames(file: Path, every_s: float) -> Iterator[NamedPicture]:

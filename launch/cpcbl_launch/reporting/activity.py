@@ -13,6 +13,7 @@ from cpcbl_transport.messages import Refusal, Status
 REFUSALS = {str(r) for kind in (Refusal, TimelineRefusal, SightingFault) for r in kind}
 FROM_START_S = 3.0  # a status so soon after the start of a run counts since then
 COLUMNS = 6  # process, stamp, and four sums
+MOST_ROWS = 8192  # two hours; of a longer run every second one is left out, and again
 
 
 class Rates(NamedTuple):
@@ -26,11 +27,12 @@ class Rates(NamedTuple):
 
 
 class ActivityLog:
-    """The sums of a robot's statuses in the order of arrival: 48 bytes each, for runs of days."""
+    """The sums of a robot's statuses in the order of arrival, 48 bytes each. In a long run they
+    are of every second, fourth ... second: sums lose nothing by that."""
 
     def __init__(self) -> None:
         self._numbers = array("q")
-        self._processes: dict[str, int] = {}
+        self._incarnation, self._process = "", 0
 
     def add(self, status: Status) -> None:
         counts = status.counts
@@ -39,8 +41,12 @@ class ActivityLog:
             *(sum(n for reason, n in counts.items() if reason in REFUSALS),),
             status.messages_received,
         )
-        process = self._processes.setdefault(status.incarnation, len(self._processes))
-        self._numbers.extend((process, status.stamp_ns, *sums))
+        if status.incarnation != self._incarnation:
+            self._incarnation, self._process = status.incarnation, self._process + 1
+        self._numbers.extend((self._process, status.stamp_ns, *sums))
+        if len(self._numbers) >= MOST_ROWS * COLUMNS:
+            rows = np.array(self._numbers, dtype=np.int64).reshape(-1, COLUMNS)
+            self._numbers = array("q", rows[1::2].tobytes())
 
     def rates(self, begin_s: float) -> Rates:
         """Rates between consecutive statuses of one process; the first status of a run, which

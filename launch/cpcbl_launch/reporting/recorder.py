@@ -3,13 +3,13 @@
 import math
 import threading
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import Generic, TypeVar, cast
+from collections.abc import Iterable, Mapping, Sequence
 
 import msgspec
 import numpy as np
 
 from cpcbl_launch.reporting.activity import ActivityLog
+from cpcbl_launch.reporting.encoded_log import BlockFile, EncodedLog
 from cpcbl_launch.reporting.metrics import (
     ErrorFigures,
     Floats,
@@ -42,11 +42,9 @@ from cpcbl_transport.decoding import decode
 from cpcbl_transport.messages import (
     Refusal,
     Status,
-    Tagged,
     Track,
     Truth,
     Truths,
-    decode_tagged,
 )
 
 
@@ -164,36 +162,10 @@ class Report(msgspec.Struct, frozen=True, kw_only=True):
         return any(robot.has_data for robot in self.robots.values())
 
 
-M = TypeVar("M", bound=Tagged)
 INPUTS = ("odometry", "sightings", "position", "frame")  # the counts of what a robot received
 NOT_HEARD = "no estimate was received"
-RECENT = 20  # messages of which an error is known although truth comes later than the estimate
-
-
-class EncodedLog(Generic[M]):
-    """Messages of one type in the order of their arrival, as they came, for runs of days.
-
-    Decoded, each is many objects: a track takes 440 bytes, 150 as it came; the truth of four robots
-    920 and 200.
-    """
-
-    def __init__(self) -> None:
-        self._payloads: list[bytes] = []
-        self.append = self._payloads.append
-
-    def __len__(self) -> int:
-        return len(self._payloads)
-
-    def __iter__(self) -> Iterator[M]:
-        return (cast(M, decode_tagged(payload)) for payload in tuple(self._payloads))
-
-    def recent(self) -> list[M]:
-        """The newest messages, in the order of their arrival."""
-        return [cast(M, decode_tagged(payload)) for payload in self._payloads[-RECENT:]]
-
-    @property
-    def last(self) -> M:
-        return cast(M, decode_tagged(self._payloads[-1]))
+MOST_NAMES = 512  # robots and guests of which a run is recorded: names are free
+MOST_PROCESSES = 256  # of one robot: the statuses of older ones are forgotten
 
 
 class Recorder:
@@ -203,7 +175,8 @@ class Recorder:
         self._lock = threading.Lock()
         self.tracks: dict[str, EncodedLog[Track]] = {}
         self.status: dict[str, Status] = {}
-        self.truths: EncodedLog[Truths] = EncodedLog()
+        self._file = BlockFile()
+        self.truths: EncodedLog[Truths] = EncodedLog(self._file)
         self.activity: dict[str, ActivityLog] = {}
         self.counts: Counter[str] = Counter()
         """Accepted messages by topic, and refused ones by reason."""
@@ -215,18 +188,29 @@ class Recorder:
     def _receive(self, key: str, payload: bytes) -> None:
         message = decode(key, payload)
         with self._lock:
+            if isinstance(message, Track | Status) and not self._has_room(message.robot):
+                self.counts["too_many_names"] += 1
+                return
             is_accepted = not isinstance(message, Refusal)
             self.counts[key.partition("/")[0] if is_accepted else str(message)] += 1
             match message:
                 case Track():
-                    self.tracks.setdefault(message.robot, EncodedLog()).append(payload)
+                    self.tracks.setdefault(message.robot, EncodedLog(self._file)).append(payload)
                 case Status():
                     self.status[message.robot] = message
                     self._problems.setdefault(message.robot, ProblemLog()).add(message)
                     self.activity.setdefault(message.robot, ActivityLog()).add(message)
-                    self._processes.setdefault(message.robot, {})[message.incarnation] = message
+                    processes = self._processes.setdefault(message.robot, {})
+                    processes[message.incarnation] = message
+                    if len(processes) > MOST_PROCESSES:
+                        del processes[next(iter(processes))]
                 case Truths():
                     self.truths.append(payload)
+
+    def _has_room(self, name: str) -> bool:
+        """Whether a robot of this name is recorded, or may be."""
+        is_known = name in self.tracks or name in self.status
+        return is_known or max(len(self.tracks), len(self.status)) < MOST_NAMES
 
     @property
     def refused(self) -> dict[str, int]:

@@ -24,12 +24,22 @@ from zstandard import ZstdError
 from cpcbl_agents.sources.mrclam import LogError
 from cpcbl_launch.reporting.metrics import Floats
 from cpcbl_launch.reporting.recorder import truth_rows
+from cpcbl_launch.team_faults import one_line
+from cpcbl_launch.team_file import decode_resolved
 from cpcbl_team.config import Team
 from cpcbl_team.inputs import Odometry, Position, Sightings
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus
 from cpcbl_transport.decoding import decode
-from cpcbl_transport.messages import AnnotatedFrame, Message, Refusal, SensorInput, Truths
+from cpcbl_transport.messages import (
+    LAST_NS,
+    AnnotatedFrame,
+    Message,
+    Refusal,
+    SensorInput,
+    Truths,
+    refusal,
+)
 
 log = logging.getLogger(__name__)
 
@@ -38,6 +48,7 @@ RECORDED = (
     *(topics.TRACK, topics.STATUS, topics.TRUTH, topics.LOOK),
 )
 TEAM = "team.json"
+CHUNK_BYTES = 262_144  # of messages that wait in memory, with as much for their index
 PICTURE = "foxglove.CompressedImage"
 DAMAGE = (  # what the readers of MCAP, its compressions and its contents raise of a damaged file
     *(McapError, struct.error, ZstdError, RuntimeError, msgspec.MsgspecError),
@@ -54,7 +65,7 @@ class Recording(AbstractContextManager["Recording"]):
         self._lock = threading.Lock()
         self._path, self.failed = path, ""
         self._file = path.open("wb")
-        self._writer: Writer | None = Writer(self._file)
+        self._writer: Writer | None = Writer(self._file, CHUNK_BYTES)
         self._writer.start(profile="cpcbl", library="cpcbl-team")
         self._writer.add_attachment(0, 0, TEAM, "application/json", msgspec.json.encode(team))
         self._channels: dict[str, int] = {}
@@ -128,24 +139,32 @@ class RecordedRun(NamedTuple):
     truth: dict[str, Floats]
 
 
+def _checked(message: Message) -> Message:
+    """A message that could have been recorded. Raises ValueError."""
+    if reason := refusal(message, LAST_NS):
+        raise ValueError(f"a message that no robot takes: {reason}")
+    return message
+
+
 def read_recording(path: Path) -> RecordedRun:
-    """What `Recording` wrote. Raises LogError."""
+    """What `Recording` wrote. Raises LogError, TeamFileError."""
     try:
         with path.open("rb") as file:
             reader = make_reader(file)
             attached = [a.data for a in reader.iter_attachments() if a.name == TEAM]
             messages = [
-                (channel.topic, _decoder.decode(message.data))
+                (channel.topic, _checked(_decoder.decode(message.data)))
                 for _, channel, message in reader.iter_messages()
                 if channel.topic.startswith(("in/", "look/", topics.TRUTH.key))
             ]
         if not attached:
             raise LogError(f"{path}: holds no team: not a recording of `up --record`")
-        team = msgspec.json.decode(attached[0], type=Team)
+        team = decode_resolved(attached[0], f"{path}: {TEAM}")
     except OSError as error:
         raise LogError(f"{path}: cannot be read: {error.strerror or error}") from error
     except DAMAGE as error:
-        raise LogError(f"{path}: not a whole recording: {type(error).__name__} {error}") from error
+        what = one_line(f"{type(error).__name__} {error}")
+        raise LogError(f"{path}: not a whole recording: {what}") from error
     truths = [message for _, message in messages if isinstance(message, Truths)]
     inputs: dict[str, list[SensorInput]] = {}
     for key, message in messages:

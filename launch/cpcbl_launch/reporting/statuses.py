@@ -77,6 +77,9 @@ class ProblemReport(msgspec.Struct, frozen=True, kw_only=True):
     seconds: float
 
 
+MOST_PROBLEMS = 100  # of one robot; they may have free names in them
+
+
 class ProblemLog:
     """The problems of one robot over a run, by its statuses."""
 
@@ -88,6 +91,8 @@ class ProblemLog:
         """To be called with each status, of which there is one a second."""
         for text in status.problems:
             what = without_numbers(text)
+            if what not in self._texts and len(self._texts) >= MOST_PROBLEMS:
+                continue
             self._texts[what] = text
             self._statuses[what] += 1
 

@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from cpcbl_agents.earlier_processes import ALL_TEAMS, repeat_tokens
+from cpcbl_agents.watchdog import watched
 from cpcbl_team.config import Team
 from cpcbl_transport import topics
 from cpcbl_transport.security import Identity, access_control, link_of
@@ -40,7 +41,8 @@ def run_router(config: Mapping[str, Any], title: str, stop: Callable[[], bool]) 
         log.info("%s listens at %s", title, ", ".join(listening_at(config)))
         bus.watch_liveliness(ALL_TEAMS + topics.ALIVE.at(), RobotLog())
         known: dict[str, str] = {}
-        while not stop():
+        is_over = watched(stop)
+        while not is_over():
             present = bus.neighbours()
             for came in present.keys() - known.keys():
                 log.info("+ %s (%d linked)", present[came], len(present))

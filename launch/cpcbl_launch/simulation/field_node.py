@@ -15,6 +15,7 @@ from typing import TypeVar
 from msgspec.structs import replace
 
 from cpcbl_agents.clock import Clock
+from cpcbl_agents.input_causes import MOST_SPEED_M_S, MOST_TURN_RATE_RAD_S
 from cpcbl_launch.checks import require_robots
 from cpcbl_launch.simulation.field import SimulatedField
 from cpcbl_launch.simulation.guests import GuestBodies
@@ -113,6 +114,11 @@ class FieldNode:
             message = with_clock_offset(message, -self._field.clock_offset_ns(message.robot))
         if reason := refusal(message, now_ns):
             return reason
+        if isinstance(message, Drive) and (
+            abs(message.speed_m_s) > MOST_SPEED_M_S
+            or abs(message.turn_rate_rad_s) > MOST_TURN_RATE_RAD_S
+        ):
+            return Refusal.IMPLAUSIBLE  # no wheels do that, and whatever stands there is hit
         self.counts[type(message).__name__.lower()] += 1
         if isinstance(message, Drive):
             self._field.command(message)

@@ -119,3 +119,19 @@ def test_a_robot_keeps_its_start_in_any_order_until_it_was_restarted_after_it_mo
 
     robot = floor.robot("--no-restarted")
     assert driver.drive_until(is_fed).lost == ""
+
+
+def test_a_second_process_of_a_robot_ends_with_one_line_and_the_first_goes_on(
+    floor: Floor,
+) -> None:
+    floor.router()
+    first = floor.robot()
+    driver = Driver(floor.bus())
+    incarnation = driver.drive_until(is_fed).incarnation
+    second = floor.robot()
+    said = second.communicate(timeout=PATIENCE_S)[1]
+    assert second.returncode == 2
+    assert "robot r1: another process is this robot already" in said.splitlines()[-1]
+    assert incarnation in said
+    assert driver.drive_until(is_fed).incarnation == incarnation
+    assert first.poll() is None

@@ -88,6 +88,16 @@ def test_a_command_that_makes_no_sense_is_counted_and_ignored(payload: bytes) ->
     assert on.field.robots["r1"].pose == pytest.approx(Pose2(0.05, 0.0, 0.0))
 
 
+@pytest.mark.parametrize(("speed_m_s", "turn_rate_rad_s"), [(1e5, 0.0), (-31.0, 0.0), (0.1, 16.0)])
+def test_wheels_do_not_do_what_no_wheels_can(speed_m_s: float, turn_rate_rad_s: float) -> None:
+    on = OnBus()
+    on.command(encode(Drive("r1", 0, 0.5, 0.0)))
+    on.command(encode(Drive("r1", 0, speed_m_s, turn_rate_rad_s)))
+    on.node.step(5 * STEP_NS)
+    assert on.node.counts == {"drive": 1, Refusal.IMPLAUSIBLE: 1}
+    assert on.field.robots["r1"].pose == pytest.approx(Pose2(0.05, 0.0, 0.0))
+
+
 def test_too_many_commands_at_once_are_counted_and_the_oldest_dropped() -> None:
     on = OnBus()
     for _ in range(INBOX + 3):

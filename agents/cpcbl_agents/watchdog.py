@@ -1,0 +1,47 @@
+"""What systemd is told of a process that it started as Type=notify (sd_notify(3)).
+
+A process that hangs stops telling that it is alive, and is ended and started again. Anywhere else
+nothing is told.
+"""
+
+import os
+import time
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+
+
+def notify(text: str, environment: Mapping[str, str] = os.environ) -> bool:
+    """Tells the service manager something, as `READY=1`; whether there is one."""
+    address = environment.get("NOTIFY_SOCKET", "")
+    if not address:
+        return False
+    import socket  # few processes need it
+
+    if address.startswith("@"):  # an abstract one
+        address = "\0" + address[1:]
+    with suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as speaker:
+        speaker.sendto(text.encode(), address)
+        return True
+    return False
+
+
+def watched(
+    stop: Callable[[], bool], environment: Mapping[str, str] = os.environ
+) -> Callable[[], bool]:
+    """`stop`, which a loop asks again and again, as a sign of life: each time it tells so, but no
+    more than four times in the interval that the service manager wants. The process is ready."""
+    notify("READY=1", environment)
+    interval_us = environment.get("WATCHDOG_USEC", "")
+    is_mine = environment.get("WATCHDOG_PID", str(os.getpid())) == str(os.getpid())
+    if not interval_us.isdecimal() or not int(interval_us) or not is_mine:
+        return stop
+    pause_ns, due_ns = int(interval_us) * 1_000 // 4, 0
+
+    def alive() -> bool:
+        nonlocal due_ns
+        if (now_ns := time.monotonic_ns()) >= due_ns:
+            due_ns = now_ns + pause_ns
+            notify("WATCHDOG=1", environment)
+        return stop()
+
+    return alive
