@@ -59,7 +59,7 @@ test-docker: setup
 
 # Every fault scenario; those that need root or Docker say so where there is none.
 chaos: setup
-	$(BIN)/cpcbl-team chaos all --soak-s 180
+	$(BIN)/cpcbl-team chaos all --duration 180
 
 # The net proves that a refactoring changes no bit; see tests/net/test_net.py.
 net: setup
@@ -97,7 +97,7 @@ bench: test-bench
 	PYTHONPATH=$(BENCH_PATH) $(BIN)/python -m benchmarks.eyes_table build/bench_eyes_raw.json build/bench_eyes.json
 
 # Measurements, each with options of its own (ARGS=--help). Real processes over Zenoh, alone on the
-# machine: latency, processes (ARGS='--robots 40,48,60 --old ../earlier-checkout'). In one process:
+# machine: latency, processes (ARGS='--team-sizes 40,48,60 --old ../earlier-checkout'). In one process:
 # scaling (teams of any size), detection (rendered frames), pictures (ARGS='SET FOLDER': real ones),
 # batch (ARGS='MRCLAM6': the ceiling of any filter on a real log).
 bench-batch bench-detection bench-latency bench-pictures bench-processes bench-scaling: setup
