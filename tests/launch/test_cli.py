@@ -12,6 +12,7 @@ from support.logs import write_log
 from support.processes import command_line, cpcbl_team, eventually, patient_up, pids_of
 
 from cpcbl_launch.commands.old_forms import present_form
+from cpcbl_launch.commands.options import team_and_files
 from cpcbl_launch.run.processes import PROGRAM
 from cpcbl_launch.run.up import free_endpoint
 
@@ -136,6 +137,21 @@ def test_a_replaced_form_is_one_line_that_names_the_present_one(old: str) -> Non
 )
 def test_other_words_stay_as_they_are(words: str) -> None:
     assert present_form(words.split()) == words.split()
+
+
+def test_the_first_word_is_a_team_where_it_can_be_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "demo").mkdir()  # a log of this name
+    for words, team, files in (
+        ([], None, []),
+        (["MRCLAM2", "MRCLAM4"], None, ["MRCLAM2", "MRCLAM4"]),
+        (["t.toml", "a.png"], Path("t.toml"), ["a.png"]),
+        (["blind", "run.mcap"], Path("blind"), ["run.mcap"]),
+        (["demo"], None, ["demo"]),
+    ):
+        assert team_and_files([*map(Path, words)]) == (team, [*map(Path, files)])
 
 
 def test_check_accepts_the_built_in_teams() -> None:
