@@ -114,13 +114,14 @@ def test_the_python_of_a_secured_driver(tmp_path: Path, monkeypatch: pytest.Monk
     assert command_line("keys", "team.toml").returncode == 0
     source = SECURED.replace("tls/192.168.1.10:7447", endpoint)
     source = source.replace("    ...", "    import time; time.sleep(60)")
-    with programs(
-        tmp_path,
-        router=(*PROGRAM, "router", "team.toml"),
-        driver=(sys.executable, "-c", source),
-    ) as running:
-        said = f"connected to the router at {endpoint}"
-        assert eventually(lambda: said in running["driver"].said, 60.0), running["driver"].said
+    with ExitStack() as stack:
+        started = programs(tmp_path, driver=(sys.executable, "-c", source))
+        driver = stack.enter_context(started)["driver"]
+        assert eventually(lambda: f"waiting for a router at {endpoint}" in driver.said, 60.0)
+        router = (*PROGRAM, "router", "team.toml")
+        stack.enter_context(programs(tmp_path, router=router))
+        connected = f"connected to the router at {endpoint}"
+        assert eventually(lambda: connected in driver.said, 60.0), driver.said
 
 
 @pytest.mark.trial
