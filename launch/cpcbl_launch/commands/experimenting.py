@@ -89,8 +89,9 @@ def budget(
     data: Annotated[Optional[Path], Argument(help="Folder of an MRCLAM log, e.g. MRCLAM6.")] = None,
     blind: Annotated[str, Option(help="Robots that shall not see landmarks.")] = "3,4,5",
     duration: Annotated[Optional[float], Option(help="Seconds of the log; default: all.")] = None,
-    team_size: Annotated[
-        int, Option(min=2, max=50, help="Without a log: the size of simulated teams.")
+    robots: Annotated[
+        int,
+        Option("--team-size", min=2, max=50, help="Without a log: the size of simulated teams."),
     ] = 10,
     seeds: Seeds = 3,
     jobs: Jobs = None,
@@ -105,7 +106,7 @@ def budget(
     from cpcbl_launch.team_file import load_team
 
     if data is None:
-        runs = experiment.simulated_runs(team_size, seeds)
+        runs = experiment.simulated_runs(robots, seeds)
     else:
         team = load_team(logged_team.builtin_for(data))
         logged = logged_team.with_duration(logged_team.load_logged_team(team, data), duration)

@@ -181,7 +181,7 @@ def chaos(
     scenarios: Scenarios = None,
     listed: Annotated[bool, Option("--list", help="Show the scenarios.")] = False,
     seed: Annotated[int, Option(help="The seed of noise and of random faults.")] = 1,
-    duration: Annotated[float, Option(min=1.0, help="Seconds that the soak takes.")] = 180.0,
+    soak_s: Annotated[float, Option(min=1.0, help="Seconds that the soak takes.")] = 180.0,
     markdown: MarkdownFile = None,
     report: options.ReportFile = None,
     as_json: options.AsJson = False,
@@ -206,7 +206,7 @@ def chaos(
         if signal.getsignal(number) != signal.SIG_IGN:
             signal.signal(number, signal.default_int_handler)
     with runner.Progress(Console(stderr=True), len(todo)) as shown:
-        chosen = ScenarioOptions(seed, duration, shown.doing)
+        chosen = ScenarioOptions(seed, soak_s, shown.doing)
         faults = runner.run_scenarios(todo, chosen, shown.began, shown.done)
     result = report_data(faults)
     lost = options.write_report(report, result)
