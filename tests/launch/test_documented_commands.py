@@ -84,7 +84,7 @@ WAYS = {
     "cpcbl-team chaos kill-router partition": Way("kill-router", "long"),
     "cpcbl-team chaos soak --soak-s 1800": Way("soak", "long", "--soak-s 120"),
     "cpcbl-team chaos all --seed 2 --json --report chaos.json --markdown chaos.md": Way(
-        '"scenarios"', "long", instead=("chaos all", "chaos kill-robot")
+        '"outcomes"', "long", instead=("chaos all", "chaos kill-robot")
     ),
     "cpcbl-team check team.toml": Way("team.toml: good: team 'lab', 3 robots"),
     "cpcbl-team compose team.toml": Way("robot-r1:"),
