@@ -97,7 +97,7 @@ bench: test-bench
 	PYTHONPATH=$(BENCH_PATH) $(BIN)/python -m benchmarks.eyes_table build/bench_eyes_raw.json build/bench_eyes.json
 
 # Measurements, each with options of its own (ARGS=--help). Real processes over Zenoh, alone on the
-# machine: latency, processes (ARGS='--robots 40,48,60 --old ../earlier-checkout'). In one process:
+# machine: latency, processes (ARGS='--team-sizes 40,48,60 --old ../earlier-checkout'). In one process:
 # scaling (teams of any size), detection (rendered frames), pictures (ARGS='SET FOLDER': real ones),
 # batch (ARGS='MRCLAM6': the ceiling of any filter on a real log).
 bench-batch bench-detection bench-latency bench-pictures bench-processes bench-scaling: setup

@@ -10,7 +10,7 @@ from cpcbl_launch.commands.calibrating import calibrate_app
 from cpcbl_launch.commands.diagnosing import doctor, list_teams, status
 from cpcbl_launch.commands.experimenting import experiment_app
 from cpcbl_launch.commands.initializing import init
-from cpcbl_launch.commands.measuring import chaos, evaluate_mrclam, simulate
+from cpcbl_launch.commands.measuring import chaos, evaluate, simulate
 from cpcbl_launch.commands.preparing import check, compose, keys
 from cpcbl_launch.commands.running import field, gateway, router, up
 from cpcbl_launch.commands.watching import look, observer, traffic, view
@@ -55,14 +55,11 @@ def run_robot(
 
 for command in (
     *(init, check, doctor, keys, up, view, status, traffic, look, observer),
-    *(router, gateway, field, compose, simulate, chaos),
+    *(router, gateway, field, compose, simulate, evaluate, chaos),
 ):
     app.command()(command)
 app.command("list")(list_teams)
 app.command("robot", help=robot.DESCRIPTION, context_settings=_PASSED_ON)(run_robot)
 
-evaluate_app = typer.Typer(help="Real logs in one process: deterministic and fast.")
-evaluate_app.command("mrclam")(evaluate_mrclam)
-app.add_typer(evaluate_app, name="evaluate")
 app.add_typer(calibrate_app, name="calibrate")
 app.add_typer(experiment_app, name="experiment")

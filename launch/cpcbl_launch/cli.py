@@ -72,9 +72,10 @@ def _open_standard_files() -> None:
 
 def _run_command() -> None:
     """A robot's process loads neither typer nor the other commands."""
-    from cpcbl_launch.commands.old_forms import with_present_form
+    from cpcbl_launch.commands.old_forms import require_present_form
 
-    words = with_present_form(sys.argv[1:])
+    words = sys.argv[1:]
+    require_present_form(words)
     if words[:1] == ["robot"]:
         from cpcbl_launch.run.robot import main as run_robot
 

@@ -246,14 +246,15 @@ def evaluate(logged: logged_team.LoggedTeam, progress: Progress = lambda done: N
 def main() -> None:
     """Evaluates a team on a real log beside EKFs and batch least squares; writes `batch.json`."""
     parser = argparse.ArgumentParser(prog="bench-batch", description=main.__doc__)
+    usual = Path("mrclam")  # without this log
+    parser.add_argument("team", type=Path, nargs="?", default=usual, help="Default: mrclam.")
     parser.add_argument("data", type=Path, help="Folder of one data set, e.g. MRCLAM6.")
-    parser.add_argument("--team", type=Path, help="Default: built-in mrclam without this log.")
     parser.add_argument("--blind", default="", help="Robots that cannot see landmarks.")
     parser.add_argument("--duration", type=float, help="Seconds of the log; default: all.")
     parser.add_argument("--output", type=Path, default=Path("build"), help="Folder for the JSON.")
     given = parser.parse_args()
     with user_errors(parser):
-        team = find_team(given.team or logged_team.builtin_for(given.data))
+        team = find_team(logged_team.file_for(given.team, given.data))
         logged = logged_team.load_logged_team(team, given.data)
         blind = with_blind_robots(logged.team, parse_names(given.blind), logged.left_out)
         logged = logged_team.with_duration(logged._replace(team=blind), given.duration)

@@ -28,7 +28,7 @@ from cpcbl_launch.lab import baselines
 from cpcbl_launch.overrides import with_blind_robots
 from cpcbl_launch.reporting.metrics import Floats, Trajectory, samples_with_truth, score
 from cpcbl_launch.reporting.recorder import Recorder, mean_score
-from cpcbl_launch.run.logged_team import LoggedTeam, builtin_for, load_logged_team
+from cpcbl_launch.run.logged_team import LoggedTeam, file_for, load_logged_team
 from cpcbl_launch.simulation.in_process import run_nodes
 from cpcbl_launch.team_file import find_team
 from cpcbl_team.config import Team
@@ -234,11 +234,11 @@ def row(
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("team", type=Path, nargs="?", default=Path("mrclam"))
     parser.add_argument("data", type=Path)
-    parser.add_argument("--team", type=Path)
     parser.add_argument("--blind", default="")
     options = parser.parse_args()
-    team = find_team(options.team or builtin_for(options.data))
+    team = find_team(file_for(options.team, options.data))
     logged = load_logged_team(team, options.data)
     blind = [name for name in options.blind.split(",") if name]
     logged = logged._replace(team=with_blind_robots(logged.team, blind, logged.left_out))

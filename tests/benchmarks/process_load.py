@@ -172,9 +172,9 @@ def _robot_specs(
     environment = ("env", "PYTHONSAFEPATH=1", f"PYTHONPATH={path}")
     program = (*environment, sys.executable, "-m", "cpcbl_launch")
     old = []
-    for spec in robot_specs:  # in the form that every checkout knows
-        file, name, *rest = spec.command[spec.command.index("robot") + 1 :]
-        old.append(spec._replace(command=(*program, "robot", name, "--team", file, *rest)))
+    for spec in robot_specs:
+        words = spec.command[spec.command.index("robot") :]
+        old.append(spec._replace(command=(*program, *words)))
     return old
 
 

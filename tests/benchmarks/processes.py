@@ -6,7 +6,7 @@ rate at which robots do, and receive and decode those of all others ("broadcast"
 nothing. `--old` measures the robots of another checkout in the same run, with the present field and
 router. A size is kept if the worst of its robots keeps `KEPT` of its ticks.
 
-`make bench-processes ARGS='--robots 24,32,40 --seconds 8 --old ../earlier-checkout'`
+`make bench-processes ARGS='--team-sizes 24,32,40 --duration 8 --old ../earlier-checkout'`
 """
 
 import argparse
@@ -68,7 +68,7 @@ def parse_sizes(text: str) -> list[int]:
     """The sizes in a text such as `4,8,16`. Raises InputError."""
     parts = [part.strip() for part in text.split(",")]
     if not all(part.isdecimal() and 1 <= int(part) <= MOST_ROBOTS for part in parts):
-        raise InputError(f"--robots {text}: name sizes from 1 to {MOST_ROBOTS}, such as 4,8,16")
+        raise InputError(f"--team-sizes {text}: name sizes from 1 to {MOST_ROBOTS}, such as 4,8,16")
     return [int(part) for part in parts]
 
 
@@ -143,17 +143,17 @@ def tables(result: Processes) -> Iterable[RenderableType]:
 def main() -> None:
     """Measures, prints tables and writes `processes.json`."""
     parser = argparse.ArgumentParser(prog="bench-processes", description=main.__doc__)
-    parser.add_argument("--robots", default="4,8,16,24,32,48,64", help="Sizes of the team.")
-    parser.add_argument("--seconds", type=float, default=15.0, help="For each size.")
+    parser.add_argument("--team-sizes", default="4,8,16,24,32,48,64", help="Sizes of the team.")
+    parser.add_argument("--duration", type=float, default=15.0, help="Seconds for each size.")
     parser.add_argument("--old", type=Path, help="Another checkout, measured in the same run.")
     parser.add_argument("--output", type=Path, default=Path("build"), help="Folder for the JSON.")
     given = parser.parse_args()
     require_process_usage("bench-processes")
     try:
-        sizes = parse_sizes(given.robots)
+        sizes = parse_sizes(given.team_sizes)
     except InputError as error:
         parser.error(str(error))
-    result = measure(sizes, given.seconds, given.old)
+    result = measure(sizes, given.duration, given.old)
     show_and_write(result, tables(result), given.output / "processes.json")
 
 

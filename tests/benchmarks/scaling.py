@@ -6,7 +6,7 @@ small team fills its view: about seven teammates and three landmarks, fewer at t
 in five is an observer with good sensors; every second one of the others is a scout, blind to
 landmarks.
 
-`make bench-scaling ARGS='--robots 2,10,50,200,1000'`
+`make bench-scaling ARGS='--team-sizes 2,10,50,200,1000'`
 """
 
 import argparse
@@ -118,7 +118,7 @@ def parse_sizes(text: str) -> list[int]:
     """The sizes in a text such as `2,10,50`. Raises InputError."""
     sizes = [int(part) if part.strip().isdecimal() else 0 for part in text.split(",")]
     if not all(2 <= size <= MOST_ROBOTS for size in sizes):
-        raise InputError(f"--robots {text}: team sizes from 2 to {MOST_ROBOTS}, such as 2,10,50")
+        raise InputError(f"--team-sizes {text}: sizes from 2 to {MOST_ROBOTS}, such as 2,10,50")
     return sizes
 
 
@@ -253,13 +253,13 @@ def draw(scale: ScalingReport, path: Path) -> None:
 def main() -> None:
     """Simulates generated teams in one process, and writes `scale.json` and `scale.png`."""
     parser = argparse.ArgumentParser(prog="bench-scaling", description=main.__doc__)
-    parser.add_argument("--robots", default="2,10,50,200", help="Sizes of the teams.")
+    parser.add_argument("--team-sizes", default="2,10,50,200", help="Sizes of the teams.")
     parser.add_argument("--duration", type=float, default=DURATION_S, help="Seconds of robot time.")
     parser.add_argument("--seed", type=int, default=1, help="Of the noise and of the teams.")
     parser.add_argument("--output", type=Path, default=Path("build"), help="Folder for the files.")
     given = parser.parse_args()
     with user_errors(parser):
-        sizes = parse_sizes(given.robots)
+        sizes = parse_sizes(given.team_sizes)
         with progress_bar("scaling", quiet=False) as progress:
             result = measure_sizes(sizes, given.seed, given.duration, progress)
     show_and_write(result, tables(result), given.output / "scale.json")

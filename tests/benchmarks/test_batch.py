@@ -67,8 +67,8 @@ def test_the_batch_bears_wrong_sightings(tmp_path: Path) -> None:
 
 def test_the_benchmark_shows_the_batch_beside_the_filters(tmp_path: Path) -> None:
     write_log(tmp_path, ROBOTS, 3.0)
-    team = ("--team", "mrclam-uncalibrated", "--blind", "3", "--output", tmp_path)
-    shown = run_benchmark("batch", tmp_path, *team)
+    options = ("--blind", "3", "--output", tmp_path)
+    shown = run_benchmark("batch", "mrclam-uncalibrated", tmp_path, *options)
     assert shown.returncode == 0, shown.stderr
     for words in ("dead reckoning", "solo EKF", "centralized EKF", "batch least squares"):
         assert words in shown.stdout

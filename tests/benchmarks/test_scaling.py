@@ -92,7 +92,7 @@ def test_robots_of_a_generated_team_drive_round_their_homes() -> None:
 
 @pytest.mark.parametrize("text", ["", "2,", "1", "0,5", "-2", "2,x", "2.5", "10000", "2;5"])
 def test_sizes_that_are_none_are_refused(text: str) -> None:
-    with pytest.raises(InputError, match=r"--robots .*such as 2,10,50"):
+    with pytest.raises(InputError, match=r"--team-sizes .*such as 2,10,50"):
         parse_sizes(text)
 
 
@@ -152,7 +152,7 @@ def test_teammates_are_counted_that_are_in_sight(apart_m: float, in_sight: float
 
 def test_sizes_as_table_json_and_picture(tmp_path: Path) -> None:
     shown = run_benchmark(
-        "scaling", "--robots", "2,5", "--duration", 2, "--seed", 3, "--output", tmp_path
+        "scaling", "--team-sizes", "2,5", "--duration", 2, "--seed", 3, "--output", tmp_path
     )
     assert shown.returncode == 0, shown.stderr
     assert shown.stderr == ""
@@ -171,7 +171,10 @@ def test_sizes_as_table_json_and_picture(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("arguments", "said"),
-    [(["--robots", "2,x"], "--robots 2,x"), (["--robots", "2", "--duration", 1], "--duration 1")],
+    [
+        (["--team-sizes", "2,x"], "--team-sizes 2,x"),
+        (["--team-sizes", "2", "--duration", 1], "--duration 1"),
+    ],
 )
 def test_what_the_user_can_mend_is_one_line(arguments: list[object], said: str) -> None:
     shown = run_benchmark("scaling", *arguments)

@@ -150,12 +150,12 @@ async def _stats(tab: Tab) -> dict[str, float]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--robots", default="4,50,200", help="sizes of the teams")
-    parser.add_argument("--seconds", type=float, default=60.0, help="to measure each of them")
+    parser.add_argument("--team-sizes", default="4,50,200", help="sizes of the teams")
+    parser.add_argument("--duration", type=float, default=60.0, help="seconds for each size")
     parser.add_argument("--picture", type=Path, help="where to write the last page (PNG)")
     given = parser.parse_args()
-    for robots in map(int, given.robots.split(",")):
-        asyncio.run(measure(robots, given.seconds, given.picture))
+    for robots in map(int, given.team_sizes.split(",")):
+        asyncio.run(measure(robots, given.duration, given.picture))
 
 
 if __name__ == "__main__":

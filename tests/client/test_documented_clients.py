@@ -44,7 +44,7 @@ def test_driver_and_consumer_wait_for_a_router_and_survive_its_end(tmp_path: Pat
             assert eventually(lambda: f"connected to the router at {endpoint}" in driver.said)
             assert eventually(lambda: "no robot takes in/r1/odometry of team 'lab'" in driver.said)
             assert eventually(lambda: "no pose comes on pose/r1" in consumer.said)
-            robot = (*PROGRAM, "robot", "r1", "--team", str(team))
+            robot = (*PROGRAM, "robot", str(team), "r1")
             stack.enter_context(programs(tmp_path, robot=robot))
             assert eventually(lambda: len(consumer.printed) >= 5)
             assert eventually(lambda: "robot r1 takes in/r1/odometry" in driver.said)
@@ -65,7 +65,7 @@ def test_another_language_speaks_json_over_zenoh(tmp_path: Path) -> None:
     endpoint, team = free_endpoint(), tmp_path / "team.toml"
     team.write_text(TEAM.format(endpoint=endpoint))
     heard: list[zenoh.Sample] = []
-    robot = (*PROGRAM, "robot", "r1", "--team", str(team))
+    robot = (*PROGRAM, "robot", str(team), "r1")
     config = {"mode": "client", "connect": {"endpoints": [endpoint]}}
     with (
         open_router("lab", [endpoint]),

@@ -1,9 +1,9 @@
 """The command line as a user types it: real processes, real output, real exit codes."""
 
 import json
+import shlex
 import signal
 import subprocess
-import sys
 from importlib.metadata import version
 from pathlib import Path
 
@@ -11,7 +11,8 @@ import pytest
 from support.logs import write_log
 from support.processes import command_line, cpcbl_team, eventually, patient_up, pids_of
 
-from cpcbl_launch.commands.old_forms import present_form, with_present_form
+from cpcbl_launch.commands.old_forms import present_form
+from cpcbl_launch.commands.options import team_and_files
 from cpcbl_launch.run.processes import PROGRAM
 from cpcbl_launch.run.up import free_endpoint
 
@@ -96,22 +97,28 @@ OLD_FORMS = {
     "look --pictures shots --team t.toml r1": "look t.toml --pictures shots r1",
     "observer x --team blind --at 1,2 --for 3": "observer blind x --at 1,2 --duration 3",
     "traffic demo --for=4": "traffic demo --duration=4",
+    "evaluate mrclam LOG --team t.toml --blind 3": "evaluate t.toml LOG --blind 3",
+    "evaluate mrclam --team=t.toml LOG": "evaluate t.toml LOG",
+    "calibrate LOG --team t.toml": "calibrate t.toml LOG",
+    "calibrate log --team t.toml LOG": "calibrate log t.toml LOG",
+    "calibrate camera shots --team t.toml --type eye": "calibrate camera t.toml shots --type eye",
+    "calibrate colours --team t.toml --samples s.csv": "calibrate colours t.toml --samples s.csv",
+    "calibrate sensor run.mcap --team t.toml": "calibrate sensor t.toml run.mcap",
+    "look t.toml r1 --save seen": "look t.toml r1 --output seen",
+    "init lab --name lab2": "init lab --team-name lab2",
+    "gateway t.toml --port 80 --host ::1": "gateway t.toml --listen '[::1]:80'",
+    "gateway t.toml --host=0.0.0.0": "gateway t.toml --listen 0.0.0.0",
+    "experiment one-way-vs-both --robots 2,5": "experiment one-way-vs-both --team-sizes 2,5",
+    "experiment budget --robots 5": "experiment budget --team-size 5",
 }
 
 
 @pytest.mark.parametrize("old", OLD_FORMS)
-def test_a_replaced_form_still_works_and_a_person_reads_the_new_one(
-    old: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    new = OLD_FORMS[old].split()
-    assert with_present_form(old.split()) == new
-    assert capsys.readouterr().err == ""
-    monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
-    assert with_present_form(old.split()) == new
+def test_a_replaced_form_is_one_line_that_names_the_present_one(old: str) -> None:
+    ran = command_line(*old.split())
     said = f"cpcbl-team: this is now written: cpcbl-team {OLD_FORMS[old]}\n"
-    assert capsys.readouterr().err == said
-    assert with_present_form(new) == new
-    assert capsys.readouterr().err == ""
+    assert (ran.returncode, ran.stdout, ran.stderr) == (2, "", said)
+    assert present_form(new := shlex.split(OLD_FORMS[old])) == new
 
 
 @pytest.mark.parametrize(
@@ -119,13 +126,31 @@ def test_a_replaced_form_still_works_and_a_person_reads_the_new_one(
     [
         "",
         "--version",
-        "calibrate log --team t.toml",
-        "evaluate mrclam DIR --team t",
+        "calibrate log t.toml LOG",
+        "calibrate LOG",
+        "evaluate mrclam LOG",
+        "up --robots r1",
+        "init lab --robots r1",
         "robot --team",
     ],
 )
 def test_other_words_stay_as_they_are(words: str) -> None:
     assert present_form(words.split()) == words.split()
+
+
+def test_the_first_word_is_a_team_where_it_can_be_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "demo").mkdir()  # a log of this name
+    for words, team, files in (
+        ([], None, []),
+        (["MRCLAM2", "MRCLAM4"], None, ["MRCLAM2", "MRCLAM4"]),
+        (["t.toml", "a.png"], Path("t.toml"), ["a.png"]),
+        (["blind", "run.mcap"], Path("blind"), ["run.mcap"]),
+        (["demo"], None, ["demo"]),
+    ):
+        assert team_and_files([*map(Path, words)]) == (team, [*map(Path, files)])
 
 
 def test_check_accepts_the_built_in_teams() -> None:
@@ -223,9 +248,7 @@ def test_ctrl_c_ends_a_run_with_its_report_and_leaves_no_process(tmp_path: Path)
 
 def test_up_on_a_log_agrees_with_evaluate(tmp_path: Path) -> None:
     write_log(tmp_path, ("1", "2"), seconds=40.0)
-    evaluated = cpcbl_team(
-        "evaluate", "mrclam", tmp_path, "--team", PLAIN, "--blind", "2", "--json"
-    )
+    evaluated = cpcbl_team("evaluate", PLAIN, tmp_path, "--blind", "2", "--json")
     assert evaluated.returncode == 0, evaluated.stderr
     ran = patient_up(PLAIN, "--data", tmp_path, "--blind", "2", "--speed", 5, "--json")
     assert ran.returncode == 0, ran.stderr

@@ -25,7 +25,7 @@ def init(folder: Path, *options: str) -> list[str]:
         (),
         ("--robots", "a", "--router", "192.168.1.10"),
         ("--robots", "a,b,c,d", "--camera", "a,b", "--blind", "d", "--router", "tcp/base:7000"),
-        ("--camera", "r1,r2,r3", "--name", "lab2", "--router", "fe80::1"),
+        ("--camera", "r1,r2,r3", "--team-name", "lab2", "--router", "fe80::1"),
     ],
 )
 def test_check_of_what_is_written_is_clean(options: tuple[str, ...], tmp_path: Path) -> None:
@@ -38,7 +38,7 @@ def test_check_of_what_is_written_is_clean(options: tuple[str, ...], tmp_path: P
 
 def test_the_options_are_in_the_file(tmp_path: Path) -> None:
     options = ("--robots", "a,b,c", "--camera", "b", "--blind", "c", "--router", "10.0.0.2:7000")
-    init(tmp_path / "new" / "t.toml", "--yes", "--name", "lab2", *options)
+    init(tmp_path / "new" / "t.toml", "--yes", "--team-name", "lab2", *options)
     team = load_team(tmp_path / "new" / "t.toml")
     assert (team.name, list(team.robots)) == ("lab2", ["a", "b", "c"])
     assert [robot.source for robot in team.robots.values()] == ["external"] * 3
@@ -77,7 +77,7 @@ def test_little_is_asked_at_a_terminal(tmp_path: Path, monkeypatch: pytest.Monke
 
     monkeypatch.setattr(initializing, "_ask", answer)
     monkeypatch.setattr(sys, "stdin", type("Terminal", (), {"isatty": lambda self: True})())
-    init(tmp_path, "--name", "lab")
+    init(tmp_path, "--team-name", "lab")
     assert len(asked) == 4
     team = load_team(tmp_path / "team.toml")
     assert list(team.robots) == ["north", "south"]
@@ -94,7 +94,7 @@ def test_little_is_asked_at_a_terminal(tmp_path: Path, monkeypatch: pytest.Monke
         (("--robots", ","), "--robots: names no robot"),
         (("--camera", "r9"), "--camera: no robot r9; there are r1, r2, r3"),
         (("--router", "my machine"), "--router my machine: no address"),
-        (("--name", "my team"), "--name my team: a name has"),
+        (("--team-name", "my team"), "--team-name my team: a name has"),
     ],
 )
 def test_an_answer_that_cannot_be_used_is_one_line(

@@ -125,7 +125,7 @@ def test_an_experiment_whose_files_are_lost_still_shows_its_figures(tmp_path: Pa
     files = [tmp_path / f"one-way-vs-both.{ending}" for ending in ("json", "png")]
     for path in files:
         path.symlink_to(FULL)
-    small = ("one-way-vs-both", "--robots", 2, "--seeds", 1, "--output", tmp_path, "--json")
+    small = ("one-way-vs-both", "--team-sizes", 2, "--seeds", 1, "--output", tmp_path, "--json")
     ran = cpcbl_team("experiment", *small)
     assert ran.returncode == 1
     assert json.loads(ran.stdout)["experiment"] == "one-way-vs-both"
@@ -150,7 +150,7 @@ def test_an_evaluation_whose_export_is_lost_still_reports(tmp_path: Path) -> Non
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "1_estimate.tum").symlink_to(FULL)
     ran = cpcbl_team(
-        *("evaluate", "mrclam", tmp_path / "log", "--team", "mrclam-uncalibrated"),
+        *("evaluate", "mrclam-uncalibrated", tmp_path / "log"),
         *("--export", tmp_path / "out", "--json"),
     )
     assert ran.returncode == 1

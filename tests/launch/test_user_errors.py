@@ -146,7 +146,7 @@ def test_ctrl_c_at_the_very_start_shows_no_traceback(imports: str) -> None:
 @pytest.fixture
 def waiting_robot() -> Iterator["subprocess.Popen[str]"]:
     """A robot that waits for its router."""
-    words = ("robot", "scout", "--team", "demo", "--connect", free_endpoint())
+    words = ("robot", "demo", "scout", "--connect", free_endpoint())
     command = [*PROGRAM, *words]
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
         yield process

@@ -58,7 +58,7 @@ def lab(user: Newcomer) -> Lab:
     user.says("r3", f"no router at {endpoint} yet, waiting for it")
     user.says("driver_r1", f"waiting for a router at {endpoint}")
     user.start("router", "cpcbl-team", "router", team)
-    user.start("gateway", "cpcbl-team", "gateway", team, "--port", port)
+    user.start("gateway", "cpcbl-team", "gateway", team, "--listen", f":{port}")
     user.says("driver_r1", "no robot takes in/r1/odometry")
     user.start("r1", "cpcbl-team", "robot", team, "r1")
     user.start("driver_r2", "sh", "driver.sh", token(user, "r2"), "r2", f"http://127.0.0.1:{port}")

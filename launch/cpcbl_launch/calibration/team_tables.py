@@ -76,7 +76,9 @@ def robot_table(
     if team_file is None and robot is None and type_name is None:
         return TablePath(("types", "eye", part))
     if (robot is None) == (type_name is None):
-        raise InputError("--team: name one table to write: --robot NAME or --type NAME")
+        raise InputError(
+            f"{team_file or 'table'}: name one table to write: --robot NAME or --type NAME"
+        )
     owner = ("robots", robot) if robot is not None else ("types", str(type_name))
     return TablePath((*owner, part))
 

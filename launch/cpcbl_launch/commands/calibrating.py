@@ -35,13 +35,13 @@ class LogByDefault(TyperGroup):
 calibrate_app = Typer(
     cls=LogByDefault,
     no_args_is_help=True,
-    help="Errors of odometry, sensors and cameras, as tables of a team file. `calibrate LOG` is"
-    " short for `calibrate log LOG`.",
+    help="Errors of odometry, sensors and cameras, as tables of a team file. `calibrate [TEAM] LOG`"
+    " is short for `calibrate log [TEAM] LOG`.",
 )
 calibrate_app.command(LOG)(calibrate)
 
-ToTeam = Annotated[Path | None, Option("--team", help="Team file to write into; default: print.")]
-ToFile = Annotated[Path | None, Option(help="Write the team here; default: into the --team file.")]
+INTO = " TEAM: the file to write into; without it the result is printed."
+ToFile = Annotated[Path | None, Option(help="Write the team here; default: into TEAM.")]
 Residuals = Annotated[
     Path | None,
     Option(
@@ -50,7 +50,11 @@ Residuals = Annotated[
     ),
 ]
 BoardPictures = Annotated[
-    list[Path] | None, Argument(help="Pictures of the board, folders of them, or videos.")
+    list[Path] | None,
+    Argument(
+        metavar="[TEAM] PICTURE",
+        help=f"Pictures of the board, folders of them, or videos.{INTO}",
+    ),
 ]
 BoardOption = Annotated[Literal["charuco", "chessboard"], Option(help="Kind of the printed board.")]
 PrintBoard = Annotated[
@@ -58,7 +62,10 @@ PrintBoard = Annotated[
 ]
 ColourPictures = Annotated[
     list[Path] | None,
-    Argument(help="Pictures, or folders of them, with samples or without any colour."),
+    Argument(
+        metavar="[TEAM] PICTURE",
+        help=f"Pictures, or folders of them, with samples or without any colour.{INTO}",
+    ),
 ]
 Samples = Annotated[
     list[str] | None,
@@ -77,7 +84,10 @@ Preview = Annotated[
 ]
 Recordings = Annotated[
     list[Path] | None,
-    Argument(help="Recordings with truth (`up --record`, .mcap) of robots with cameras."),
+    Argument(
+        metavar="[TEAM] RECORDING",
+        help=f"Recordings with truth (`up --record`, .mcap) of robots with cameras.{INTO}",
+    ),
 ]
 PoseFolder = Annotated[Path | None, Option(help="Or a folder of pictures that a robot took.")]
 Poses = Annotated[
@@ -91,7 +101,7 @@ IntoType = Annotated[str | None, Option("--type", help="Write into this type, no
 
 @calibrate_app.command("camera")
 def camera(
-    pictures: BoardPictures = None,
+    words: BoardPictures = None,
     board: BoardOption = "charuco",
     squares: Annotated[str, Option(help="Across and down, black and white.")] = "7x5",
     square_m: Annotated[float, Option(min=0.001, help="Side of a square.")] = 0.03,
@@ -99,7 +109,6 @@ def camera(
     family: Annotated[str, Option(help="Of the markers (charuco).")] = "aruco_4x4_50",
     every: Annotated[float, Option(min=0.0, help="Seconds between two frames of a video.")] = 0.5,
     print_board: PrintBoard = None,
-    team_file: ToTeam = None,
     robot: Annotated[str | None, Option(help="Into this robot's table, or")] = None,
     kind: Annotated[str | None, Option("--type", help="into this robot type's.")] = None,
     output: ToFile = None,
@@ -114,6 +123,7 @@ def camera(
     from cpcbl_launch.calibration.team_tables import camera_table, robot_table
     from cpcbl_launch.views.run import progress_bar
 
+    team_file, pictures = options.team_and_files(words or ())
     printed = parse_board(board, squares, square_m, marker_m, family)
     if print_board is not None:
         options.require_writable_file("--print-board", print_board)
@@ -140,12 +150,11 @@ def camera(
 
 @calibrate_app.command("colours")
 def colours(
-    pictures: ColourPictures = None,
+    words: ColourPictures = None,
     sample: Samples = None,
     samples: SampleFile = None,
     margin: Margin = 0.4,
     preview: Preview = None,
-    team_file: ToTeam = None,
     output: ToFile = None,
     as_json: AsJson = False,
 ) -> None:
@@ -157,6 +166,7 @@ def colours(
     from cpcbl_launch.calibration.reports import print_colours
     from cpcbl_launch.calibration.team_tables import colour_tables, unsampled_colours
 
+    team_file, pictures = options.team_and_files(words or ())
     chosen = [colour_samples.parse_sample(text) for text in sample or ()]
     chosen += colour_samples.read_samples(samples) if samples is not None else []
     if not chosen:
@@ -164,7 +174,7 @@ def colours(
     if preview is not None:
         colour_samples.require_picture_name(preview)
     _check_target(team_file, output)
-    files = picture_files(pictures or [])
+    files = picture_files(pictures)
     labelled = colour_samples.label_pictures(colour_samples.resolve_pictures(chosen, files), files)
     kept, file_has_kept = unsampled_colours(team_file, {s.colour for s in chosen})
     patches = colour_samples.colour_patches(labelled)
@@ -181,10 +191,9 @@ def colours(
 
 @calibrate_app.command("sensor")
 def sensor(
-    recordings: Recordings = None,
+    words: Recordings = None,
     pictures: PoseFolder = None,
     poses: Poses = None,
-    team_file: ToTeam = None,
     robot: Observer = None,
     kind: IntoType = None,
     output: ToFile = None,
@@ -198,11 +207,12 @@ def sensor(
     from cpcbl_launch.calibration.reports import print_camera_accuracy
     from cpcbl_launch.calibration.team_tables import robot_table, sensor_tables
 
+    team_file, recordings = options.team_and_files(words or ())
     if bool(recordings) == (pictures is not None):
         raise InputError("calibrate sensor: name recordings, or --pictures FOLDER --poses FILE.csv")
     _check_target(team_file, output)
     if pictures is None:
-        dataset = dataset_from_recordings(recordings or [], robot)
+        dataset = dataset_from_recordings(recordings, robot)
     else:
         dataset = _dataset_from_pictures(pictures, poses, team_file, robot, as_json)
     is_robots_own = team_file is not None and not kind and len(dataset.robots) == 1
@@ -225,7 +235,9 @@ def _dataset_from_pictures(
     if poses is None:
         raise InputError("--pictures: needs --poses FILE.csv, the poses of the camera")
     if team_file is None:
-        raise InputError("--pictures: needs --team FILE, which names landmarks and robots")
+        raise InputError(
+            "--pictures: name the team file, which has landmarks and robots, as the first argument"
+        )
     team = find_team(team_file)
     with progress_bar("detecting", quiet) as progress:
         return dataset_from_pictures(pictures, poses, robot, team, progress)
@@ -236,10 +248,10 @@ def _check_target(team_file: Path | None, output: Path | None) -> None:
     from cpcbl_launch.calibration.team_tables import team_source
 
     if team_file is not None:
-        option, target = "--output" if output else "--team", team_source(team_file, output)[1]
+        option, target = "--output" if output else "TEAM", team_source(team_file, output)[1]
         options.require_writable_file(option, target)
     elif output is not None:
-        raise InputError("--output: needs --team FILE, the team to write")
+        raise InputError("--output: name the team file to write as the first argument")
 
 
 def _save(

@@ -75,12 +75,12 @@ def one_way_vs_both(
     jobs: Jobs = None,
     output: Output = Path(),
     as_json: options.AsJson = False,
-    robots: Annotated[str, Option(help="Sizes of the teams.")] = "2,5,10,20",
+    team_sizes: Annotated[str, Option(help="Sizes of the teams.")] = "2,5,10,20",
 ) -> None:
     """Accuracy against bytes in teams of 2 to 20, with observers that are wrong."""
     from cpcbl_launch.lab.experiments.directions import experiment_of_sizes
 
-    sizes = [int(s) if s.strip().isdecimal() else 0 for s in robots.split(",")]
+    sizes = [int(s) if s.strip().isdecimal() else 0 for s in team_sizes.split(",")]
     conduct(experiment_of_sizes(sizes), seeds, jobs, output, as_json)
 
 
@@ -90,7 +90,8 @@ def budget(
     blind: Annotated[str, Option(help="Robots that shall not see landmarks.")] = "3,4,5",
     duration: Annotated[Optional[float], Option(help="Seconds of the log; default: all.")] = None,
     robots: Annotated[
-        int, Option(min=2, max=50, help="Without a log: the size of simulated teams.")
+        int,
+        Option("--team-size", min=2, max=50, help="Without a log: the size of simulated teams."),
     ] = 10,
     seeds: Seeds = 3,
     jobs: Jobs = None,

@@ -42,7 +42,7 @@ def init(
     place: Annotated[
         Path, Argument(metavar="[FOLDER|TEAM]", help="Folder for team.toml, or the team file.")
     ] = Path(),
-    name: Annotated[str, Option(help="Name of the team; asked for if not given.")] = "",
+    team_name: Annotated[str, Option(help="Name of the team; asked for if not given.")] = "",
     robots: Annotated[str, Option(help="Names of the robots, e.g. r1,r2,r3.")] = "",
     router: Annotated[str, Option(help="Address of the router's machine, e.g. 192.168.1.10.")] = "",
     camera: Annotated[
@@ -61,7 +61,9 @@ def init(
         if path.exists() and not force:
             raise InputError(f"{path}: is there already; name another folder, or add --force")
     ask = _no_question if yes or not sys.stdin.isatty() else _ask
-    plan = _plan(name, robots, router, options.parse_names(camera), options.parse_names(blind), ask)
+    plan = _plan(
+        team_name, robots, router, options.parse_names(camera), options.parse_names(blind), ask
+    )
     text = team_text(plan, file.name, driver.name)
     team = parse_team(text, str(file))
     options.require_folder("init", file.parent)
@@ -92,7 +94,7 @@ def _plan(
     ask: Callable[[str, str], str],
 ) -> Plan:
     """The answers, and the options in place of those that are given. Raises InputError."""
-    team = _checked_name("--name", name or ask("Name of the team", "lab"))
+    team = _checked_name("--team-name", name or ask("Name of the team", "lab"))
     names = options.parse_names(robots or ask("Names of the robots", "r1,r2,r3"))
     if not names:
         raise InputError("--robots: names no robot; write it as r1,r2,r3")

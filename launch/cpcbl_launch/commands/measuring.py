@@ -16,9 +16,13 @@ from cpcbl_launch.overrides import Overrides, with_blind_robots, with_overrides
 from cpcbl_launch.reporting.files import write_or_reason
 from cpcbl_launch.team_file import find_team
 from cpcbl_team.config import Variant
+from cpcbl_team.errors import InputError
 
 LogTeamFile = Annotated[
-    Path | None, Option("--team", help="Team file; default: the built-in mrclam without this log.")
+    Path,
+    options.team_argument(
+        help="Team file, or a built-in one; mrclam is the one that was not calibrated on this log."
+    ),
 ]
 Collaboration = Annotated[
     Literal["none", "passive", "active", "both"] | None, Option(help="Collaboration of all robots.")
@@ -62,9 +66,9 @@ MarkdownFile = Annotated[
 ]
 
 
-def evaluate_mrclam(
-    data: Annotated[Path, Argument(help="Folder of one data set, e.g. MRCLAM6.")],
-    team_file: LogTeamFile = None,
+def evaluate(
+    team_file: LogTeamFile,
+    data: Annotated[Path, Argument(metavar="LOG", help="Folder of one data set, e.g. MRCLAM6.")],
     blind: options.Blind = "",
     variant: Annotated[Variant | None, Option(help="Variant of all robots.")] = None,
     collaboration: Collaboration = None,
@@ -82,17 +86,17 @@ def evaluate_mrclam(
     export: ExportFolder = None,
     as_json: options.AsJson = False,
 ) -> None:
-    """Evaluate five robots of a real log (UTIAS MRCLAM) against its ground truth."""
+    """Evaluate robots of a real log (UTIAS MRCLAM) against its ground truth, in one process."""
     from cpcbl_launch.lab.evaluation import evaluate_log
     from cpcbl_launch.reporting.metrics import export_tum
     from cpcbl_launch.run import logged_team
     from cpcbl_launch.views.run import print_report, progress_bar
 
     if batch:
-        options.refuse_moved("evaluate mrclam --batch", f"bench-batch ARGS='{data}'")
+        options.refuse_moved("evaluate --batch", f"bench-batch ARGS='{data}'")
     budgets = bytes_per_s, messages_per_minute, match_messages
     overrides = Overrides(*budgets, variant, collaboration, fusion, direction)
-    team = with_overrides(find_team(team_file or logged_team.builtin_for(data)), overrides)
+    team = with_overrides(find_team(logged_team.file_for(team_file, data)), overrides)
     logged = logged_team.load_logged_team(team, data)
     blind_team = with_blind_robots(logged.team, options.parse_names(blind), logged.left_out)
     logged = logged_team.with_duration(logged._replace(team=blind_team), duration)
@@ -107,16 +111,14 @@ def evaluate_mrclam(
 
 
 def calibrate(
-    logs: Annotated[
-        list[Path], Argument(help="MRCLAM folders, or recordings of `up --record` (.mcap).")
-    ],
-    team_file: Annotated[
-        Path | None,
-        Option(
-            "--team",
-            help="Team file to add types to; default: the recorded team, or mrclam-uncalibrated.",
+    words: Annotated[
+        list[Path],
+        Argument(
+            metavar="[TEAM] LOG",
+            help="MRCLAM folders, or recordings of `up --record` (.mcap). TEAM: to which types are"
+            " added; default: the recorded team, or mrclam-uncalibrated.",
         ),
-    ] = None,
+    ],
     output: Annotated[
         Path, Option(callback=options.writable_file, help="Team file to write.")
     ] = Path("calibrated.toml"),
@@ -137,6 +139,9 @@ def calibrate(
     from cpcbl_launch.calibration.team_types import base_team, calibrate_robots, calibrated_team
     from cpcbl_launch.views.run import progress_bar
 
+    team_file, logs = options.team_and_files(words)
+    if not logs:
+        raise InputError(f"calibrate {team_file}: name logs after the team")
     base, base_name = base_team(logs, team_file)
     robot_logs = read_logs(logs)
     with progress_bar("calibrating", quiet=as_json) as progress:
@@ -174,7 +179,7 @@ def simulate(
     from cpcbl_launch.views.run import print_report, progress_bar
 
     if robots:
-        options.refuse_moved("simulate --robots", f"bench-scaling ARGS='--robots {robots}'")
+        options.refuse_moved("simulate --robots", f"bench-scaling ARGS='--team-sizes {robots}'")
     budgets = Overrides(bytes_per_s, messages_per_minute, match_messages)
     team = with_overrides(find_team(file or Path("demo")), budgets)
     require_team_opencv(team, team.robots, field=True)

@@ -1,32 +1,60 @@
-"""Forms of commands that were replaced. They still work, and a person is told the new form."""
+"""Forms of commands that were replaced: one line names the present form."""
 
 import shlex
-import sys
 from collections.abc import Sequence
 
-TEAM_WAS_AN_OPTION = ("robot", "field", "look", "observer")
-DURATION_WAS_FOR = ("traffic", "observer")
+from cpcbl_team.errors import InputError
+
+TEAM_WAS_AN_OPTION = ("robot", "field", "look", "observer", "evaluate", "calibrate")
+# Words before the team, old and present: `mrclam` is a team now.
+SUBCOMMANDS: dict[str, dict[str, tuple[str, ...]]] = {
+    "evaluate": {"mrclam": ()},
+    "calibrate": {name: (name,) for name in ("log", "camera", "colours", "sensor")},
+}
+RENAMED: dict[str, dict[str, str]] = {
+    "traffic": {"--for": "--duration"},
+    "observer": {"--for": "--duration"},
+    "look": {"--save": "--output"},
+    "init": {"--name": "--team-name"},
+    "experiment one-way-vs-both": {"--robots": "--team-sizes"},
+    "experiment budget": {"--robots": "--team-size"},
+}
 
 
 def present_form(words: Sequence[str]) -> list[str]:
     """The words after `cpcbl-team` in the present form: the team is the first argument of every
-    command, and `--duration` the name of every duration."""
+    command, and an option has one name in all of them."""
     new = list(words)
     command = new[0] if new else ""
-    for i, word in enumerate(words[1:], 1) if command in DURATION_WAS_FOR else ():
-        if word == "--for" or word.startswith("--for="):
-            new[i] = "--duration" + word.removeprefix("--for")
-    for i, word in enumerate(words[1:], 1) if command in TEAM_WAS_AN_OPTION else ():
-        if word == "--team" and i + 1 < len(new):
-            return [command, new[i + 1], *new[1:i], *new[i + 2 :]]
-        if word.startswith("--team="):
-            return [command, word.removeprefix("--team="), *new[1:i], *new[i + 1 :]]
+    names = RENAMED.get(command, {}) | RENAMED.get(" ".join(new[:2]), {})
+    for i, word in enumerate(new):
+        option, equals, value = word.partition("=")
+        new[i] = f"{names.get(option, option)}{equals}{value}"
+    if command in TEAM_WAS_AN_OPTION:
+        team, rest = _taken(new[1:], "--team")
+        if team:
+            inner = SUBCOMMANDS.get(command, {}).get(rest[0] if rest else "")
+            return [command, *(inner or ()), team, *(rest if inner is None else rest[1:])]
+    if command == "gateway":
+        host, rest = _taken(new, "--host")
+        port, rest = _taken(rest, "--port")
+        if host or port:
+            host = f"[{host}]" if ":" in host else host
+            return [*rest, "--listen", f"{host}:{port}" if port else host]
     return new
 
 
-def with_present_form(words: Sequence[str]) -> list[str]:
-    """The same; a person at a terminal is told the new form in one line."""
-    new = present_form(words)
-    if new != list(words) and sys.stderr is not None and sys.stderr.isatty():
-        sys.stderr.write(f"cpcbl-team: this is now written: cpcbl-team {shlex.join(new)}\n")
-    return new
+def _taken(words: Sequence[str], option: str) -> tuple[str, list[str]]:
+    """The value of an option (empty without it), and the words without both."""
+    for i, word in enumerate(words):
+        if word == option and i + 1 < len(words):
+            return words[i + 1], [*words[:i], *words[i + 2 :]]
+        if word.startswith(f"{option}="):
+            return word.removeprefix(f"{option}="), [*words[:i], *words[i + 1 :]]
+    return "", list(words)
+
+
+def require_present_form(words: Sequence[str]) -> None:
+    """Raises InputError, which names the present form, for one that was replaced."""
+    if (new := present_form(words)) != list(words):
+        raise InputError(f"this is now written: cpcbl-team {shlex.join(new)}")

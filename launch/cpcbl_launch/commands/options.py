@@ -3,7 +3,7 @@
 import math
 import os
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -170,6 +170,14 @@ def print_not_written(lost: Mapping[str, str]) -> None:
 def refuse_moved(old: str, target: str) -> None:
     """Raises InputError for what became a benchmark: a target of make."""
     raise InputError(f"{old}: it is a benchmark now: make {target}, in a checkout")
+
+
+def team_and_files(words: Sequence[Path]) -> tuple[Path | None, list[Path]]:
+    """The team, if the first word is a team file or the name of a built-in team, and the rest."""
+    first = words[0] if words else Path()
+    is_name = first == Path(first.name) and not first.exists() and builtin_path(first.name).exists()
+    is_team = is_name or first.suffix == ".toml"
+    return (first, list(words[1:])) if is_team else (None, list(words))
 
 
 def parse_names(text: str) -> list[str]:

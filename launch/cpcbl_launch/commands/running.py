@@ -162,8 +162,8 @@ def _run_of(
 
     if duration_s is not None:
         require_duration(duration_s, LEAST_S)
-    if file == Path("mrclam") and data is not None and not file.exists():
-        file = logged_team.builtin_for(data)
+    if file is not None and data is not None:
+        file = logged_team.file_for(file, data)
     team = with_overrides(with_listen_endpoint(find_team(file or Path("demo"))), budgets)
     if all(robot.source != "mrclam" for robot in team.robots.values()):
         return Run(team, SIMULATED_S if duration_s is None else duration_s)
@@ -284,11 +284,9 @@ def router(
 
 def gateway(
     file: options.Team,
-    host: Annotated[
-        str | None, Option(help="Address to listen at; default: the file's, else 127.0.0.1.")
-    ] = None,
-    port: Annotated[
-        int | None, Option(min=0, max=65535, help="Port; default: the file's, else 8447.")
+    listen: Annotated[
+        str | None,
+        Option(help="ADDRESS:PORT to listen at; default: the file's, else 127.0.0.1:8447."),
     ] = None,
     guest: Annotated[
         str, Option(help="Make a token for a guest of this name in the tokens' file, and end.")
@@ -300,6 +298,7 @@ def gateway(
     from cpcbl_agents.process import StopSignal
     from cpcbl_launch.run.gateway.command import run_gateway
     from cpcbl_launch.run.gateway.tokens import add_guest
+    from cpcbl_launch.views.web.address import parse_listen
 
     team = find_team(file)
     tokens = str(file.parent.absolute() / GatewaySettings().tokens)
@@ -308,9 +307,8 @@ def gateway(
         add_guest(guest, team, Path(settings.tokens))
         typer.echo(f"{settings.tokens}: has a token of {guest}; a gateway that runs takes it")
         return
-    settings = replace(
-        settings,
-        host=settings.host if host is None else host,
-        port=settings.port if port is None else port,
-    )
+    if listen is not None:
+        where = parse_listen("--listen", listen)
+        port = where.port if where.is_chosen else settings.port
+        settings = replace(settings, host=where.host, port=port)
     run_gateway(team, settings, connect or team.transport.connect, StopSignal(parent))

@@ -184,7 +184,7 @@ def look(
         Path | None, Option(help="Detect in this picture, or folder of pictures; no team need run.")
     ] = None,
     connect: options.Connect = None,
-    save: Annotated[
+    output: Annotated[
         Path, Option(help="Folder for the annotated pictures, made if need be.")
     ] = Path("looks"),
     count: Annotated[
@@ -208,14 +208,14 @@ def look(
         raise InputError(f'look {robot}: has no camera in {team_file}; set sensing = "camera"')
     if pictures is not None:
         require_team_opencv(team, [robot])
-    options.require_folder("--save", save)
+    options.require_folder("--output", output)
     if pictures is None:
         frames, count = _live_frames(robot, team, connect, wait), count or 1
     else:
         frames = _frames_of_pictures(robot, team, pictures)
     console, reports = Console(), list[view.FrameReport]()
     for name, file, annotated in islice(frames, count):
-        saved = view.save_picture(annotated, save, f"{robot}_{file}")
+        saved = view.save_picture(annotated, output, f"{robot}_{file}")
         reports.append(view.frame_report(annotated, name, saved))
         if not as_json:
             view.print_frame_report(reports[-1], console)

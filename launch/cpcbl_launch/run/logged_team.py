@@ -36,6 +36,12 @@ def builtin_for(folder: Path) -> Path:
     return without if without.exists() else builtin_path("mrclam")
 
 
+def file_for(team_file: Path, folder: Path) -> Path:
+    """The team file for a log: `mrclam` is the built-in one that was not calibrated on it."""
+    is_name = team_file == Path("mrclam") and not team_file.exists()
+    return builtin_for(folder) if is_name else team_file
+
+
 def is_calibrated_on(team: Team, folder: Path) -> bool:
     """Whether the team's robots were calibrated on this very data set."""
     return _number(folder.resolve().name) in map(_number, team.calibrated_on)

@@ -345,9 +345,7 @@ def test_values_are_rounded_to_what_they_are_worth() -> None:
 def test_the_command_line_writes_a_team_that_it_can_check(folder: Path, tmp_path: Path) -> None:
     team, drawing = tmp_path / "lab.toml", tmp_path / "left.png"
     team.write_text(TEAM)
-    ran = cpcbl_team(
-        *("calibrate", "camera", folder, "--team", team, "--type", "eye", "--picture", drawing)
-    )
+    ran = cpcbl_team(*("calibrate", "camera", team, folder, "--type", "eye", "--picture", drawing))
     assert ran.returncode == 0, ran.stderr
     assert max(len(line) for line in ran.stdout.splitlines()[:-1]) <= 80
     for word in ("00.png", "RMS", "fx_px", "focal_share", f"written: {team}"):
@@ -371,11 +369,8 @@ def test_json_and_boards_and_what_is_wrong(folder: Path, tmp_path: Path) -> None
     assert len(_corners(_pixels(read_picture(board))).pixels) == 24
     for arguments, said in (
         (["camera"], "name pictures of the board"),
-        (["camera", folder, "--output", tmp_path / "t.toml"], "--output: needs --team"),
-        (
-            ["camera", folder, "--team", tmp_path / "no.toml", "--robot", "a"],
-            "no.toml: no such file",
-        ),
+        (["camera", folder, "--output", tmp_path / "t.toml"], "--output: name the team"),
+        (["camera", tmp_path / "no.toml", folder, "--robot", "a"], "no.toml: no such file"),
         (["camera", folder, "--board", "chessboard", "--squares", "9x9"], "no board found in any"),
     ):
         failed = command_line("calibrate", *arguments)

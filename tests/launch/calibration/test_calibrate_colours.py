@@ -325,9 +325,7 @@ def test_the_command_line_writes_a_team_that_it_can_check(folder: Path, tmp_path
     team.write_text(TEAM)
     rows = [s for i in range(3) for s in boxes(PAINT, folder / f"{i}.png")]
     file.write_text("".join(f"{s.picture},{s.colour},{','.join(map(str, s.at))}\n" for s in rows))
-    ran = cpcbl_team(
-        *("calibrate", "colours", "--samples", file, "--team", team, "--preview", drawing)
-    )
+    ran = cpcbl_team(*("calibrate", "colours", team, "--samples", file, "--preview", drawing))
     assert ran.returncode == 0, ran.stderr
     assert max(len(line) for line in ran.stdout.splitlines()[:-1]) <= 80
     for word in ("thresholds, 8-bit HSV", "orange", "elsewhere", f"written: {team}"):
@@ -350,7 +348,7 @@ def test_json_and_what_is_wrong_in_one_line(folder: Path, tmp_path: Path) -> Non
         ([folder], "name areas of colours"),
         ([folder, "--sample", "red"], "write it as PICTURE:COLOUR="),
         ([folder, *samples, "--preview", tmp_path / "p.txt"], "p.txt: not a picture"),
-        ([folder, *samples, "--team", "demo"], "a built-in team cannot be changed"),
+        (["demo", folder, *samples], "a built-in team cannot be changed"),
         (["--sample", "no.png:red=1,2,3"], "no.png: No such file"),
     ):
         failed = command_line("calibrate", "colours", *arguments)

@@ -365,7 +365,7 @@ def test_whose_camera_it_is() -> None:
 def test_the_command_line_writes_a_team_that_it_can_check(wrong: Path, tmp_path: Path) -> None:
     team = tmp_path / "lab.toml"
     team.write_text(TEAM)
-    options = ["--pictures", wrong, "--poses", wrong / "poses.csv", "--team", team, "--type", "eye"]
+    options = [team, "--pictures", wrong, "--poses", wrong / "poses.csv", "--type", "eye"]
     ran = cpcbl_team("calibrate", "sensor", *options)
     assert ran.returncode == 0, ran.stderr
     assert max(len(line) for line in ran.stdout.splitlines()[:-1]) <= 80
@@ -384,8 +384,8 @@ def test_a_wrong_option_is_one_line(honest: Path, tmp_path: Path) -> None:
     team.write_text(TEAM)
     for arguments, words in (
         ([], "name recordings, or --pictures FOLDER --poses"),
-        (["--pictures", honest, "--team", team], "needs --poses"),
-        (["--pictures", honest, "--poses", honest / "poses.csv"], "needs --team"),
+        ([team, "--pictures", honest], "needs --poses"),
+        (["--pictures", honest, "--poses", honest / "poses.csv"], "as the first argument"),
         (["run.mp4"], "run.mp4: no recording"),
     ):
         failed = command_line("calibrate", "sensor", *arguments)

@@ -166,7 +166,8 @@ def test_calibrate_prints_json_and_says_what_is_wrong_in_one_line(tmp_path: Path
     assert load_team(type_text).robots["1"].source == "mrclam"
     for arguments, said in (
         ([tmp_path], "no MRCLAM log here"),
-        ([tmp_path / "log", "--team", tmp_path / "no.toml"], "no.toml: no such file"),
+        ([tmp_path / "no.toml", tmp_path / "log"], "no.toml: no such file"),
+        (["mrclam"], "calibrate mrclam: name logs after the team"),
     ):
         failed = command_line("calibrate", *arguments)
         assert failed.returncode == 2

@@ -183,7 +183,7 @@ def test_a_deaf_observer_stays_wrong_and_one_that_listens_does_not() -> None:
 
 @pytest.mark.parametrize("sizes", [[], [1], [21], [5, 0]])
 def test_team_sizes_are_checked(sizes: list[int]) -> None:
-    with pytest.raises(InputError, match="--robots: team sizes from 2 to 20"):
+    with pytest.raises(InputError, match="--team-sizes: sizes from 2 to 20"):
         directions.experiment_of_sizes(sizes)
 
 

@@ -80,8 +80,8 @@ def test_a_simulated_team_keeps_to_a_tiny_budget(tmp_path: Path) -> None:
 
 def test_a_log_is_evaluated_with_a_budget(tmp_path: Path) -> None:
     write_log(tmp_path, ("1", "2"), seconds=20.0)
-    options = ["--team", "mrclam-uncalibrated", "--blind", "2", "--messages-per-minute", 375.5]
-    ran = cpcbl_team("evaluate", "mrclam", tmp_path, *options, "--json")
+    options = ["--blind", "2", "--messages-per-minute", 375.5]
+    ran = cpcbl_team("evaluate", "mrclam-uncalibrated", tmp_path, *options, "--json")
     assert ran.returncode == 0, ran.stderr
     report = json.loads(ran.stdout)
     (limit,) = report["robots"]["1"]["spending"]

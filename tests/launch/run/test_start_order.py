@@ -40,7 +40,7 @@ class Floor:
         return self._start("router", self.file, "--listen", self.endpoint)
 
     def robot(self, *more: str) -> "Popen[str]":
-        return self._start("robot", "r1", "--team", self.file, "--connect", self.endpoint, *more)
+        return self._start("robot", self.file, "r1", "--connect", self.endpoint, *more)
 
     def bus(self) -> ZenohBus:
         return self.stack.enter_context(open_bus("floor", [self.endpoint]))

@@ -34,7 +34,7 @@ def test_a_team_file_gives_the_report_of_up(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["--robots", "2,x"], "make bench-scaling ARGS='--robots 2,x'"),
+        (["--robots", "2,x"], "make bench-scaling ARGS='--team-sizes 2,x'"),
         (["--duration", "0"], "--duration 0"),
         (["nowhere.toml"], "nowhere.toml: no such file"),
         (["mrclam"], "robots.1.source: mrclam: cannot be simulated"),

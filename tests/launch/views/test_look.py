@@ -63,7 +63,7 @@ def pictures(team_file: Path) -> Path:
 
 def test_eyes_are_shown_pictures(team_file: Path, pictures: Path) -> None:
     folder = team_file.parent / "looks"
-    words = ("look", team_file, "looker", "--pictures", pictures, "--save", folder)
+    words = ("look", team_file, "looker", "--pictures", pictures, "--output", folder)
     ran = cpcbl_team(*words, "--json")
     assert ran.returncode == 0, ran.stderr
     broken, nobody, seen = json.loads(ran.stdout)
@@ -100,7 +100,7 @@ def test_eyes_are_shown_pictures(team_file: Path, pictures: Path) -> None:
         (("seen",), 'look seen: has no camera in .*; set sensing = "camera"'),
         (("looker", "--pictures", "gone"), "--pictures gone: no such file or folder"),
         (("looker", "--pictures", "."), r"--pictures \.: no pictures"),
-        (("looker", "--save", "/dev/null/x"), "--save /dev/null/x: "),
+        (("looker", "--output", "/dev/null/x"), "--output /dev/null/x: "),
         (("looker", "--wait", "0.5"), r"no router at tcp/.* within 0\.5 s"),
     ],
 )
@@ -119,7 +119,7 @@ def test_a_running_robot_shows_what_it_sees_and_a_recording_holds_it(team_file: 
     words = ["up", str(team_file), "--duration", "60", "--record", str(record)]
     with subprocess.Popen([*PROGRAM, *words], stdout=subprocess.DEVNULL) as team:
         try:
-            look = ("look", team_file, "looker", "--save", folder / "looks")
+            look = ("look", team_file, "looker", "--output", folder / "looks")
             ran = cpcbl_team(*look, "--count", 3, "--wait", 30, "--json")
             assert ran.returncode == 0, ran.stderr
             again = cpcbl_team(*look, "--wait", 30)

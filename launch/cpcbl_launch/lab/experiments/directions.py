@@ -166,7 +166,7 @@ def tables(result: Outcome) -> Iterable[RenderableType]:
 def experiment_of_sizes(sizes: Sequence[int]) -> Experiment:
     """The experiment with teams of these sizes only. Raises InputError."""
     if not sizes or any(not 2 <= size <= 20 for size in sizes):
-        raise InputError("--robots: team sizes from 2 to 20, such as 2,5")
+        raise InputError("--team-sizes: sizes from 2 to 20, such as 2,5")
     return EXPERIMENT._replace(cases=partial(cases, sizes))
 
 
