@@ -226,6 +226,25 @@ def test_a_teammate_that_was_just_helped_waits_for_the_interval() -> None:
     assert alone.sees(ahead("other", 0.2)) == []
 
 
+@pytest.mark.parametrize("tier", [GOOD + 5, POORER])
+def test_fixes_come_at_the_interval_of_the_budget_however_large_the_errors_are(tier: int) -> None:
+    """A fix and a belief are earned in 28.75 s."""
+    alone = Alone(budget=BudgetSettings(bytes_per_s=4.0))
+    alone.tell(Presence("mate", tier))
+    sent = [n for n in range(300) if alone.sees(ahead(range_m=0.3), after_ns=SECOND)]
+    assert sent[0] == 0
+    assert all(28 < b - a < 40 for a, b in pairwise(sent))
+
+
+def test_a_teammate_whose_error_grows_faster_is_helped_more_often() -> None:
+    alone = Alone(budget=BudgetSettings(bytes_per_s=4.0))
+    alone.tell(Presence("mate", POOR), Presence("other", POORER))
+    frame, sent = [ahead("mate", 1.0), ahead("other", 1.0)], list[str]()
+    for _ in range(600):
+        sent += robots(alone.sees(*frame, after_ns=SECOND))
+    assert sent.count("other") > 1.5 * sent.count("mate") > 1.5
+
+
 def helped(alone: Alone, frames: int, range_m: float = 2.0) -> list[int]:
     """The frames with a fix for a mate that knows what they tell it, and announces its tier."""
     sigma_m, sent = SIGMA_M[POORER], []
