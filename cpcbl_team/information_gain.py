@@ -6,10 +6,12 @@ factor by which the sigma of the heading shrinks. A sender does not know the rec
 It predicts it from the tier that the receiver announces and from the last fix that it sent.
 
 Gains say whether a message is worth its bytes now. To choose among messages that compete for one
-budget there is a value: what counts then is the error in metres, and how long it stays away.
+budget there is an effective age: what counts then is the error in metres, and how long it stays
+away, beside those of the other teammates.
 """
 
 import math
+from collections.abc import Collection
 from typing import NamedTuple
 
 from cpcbl_team.config import CollaborationSettings, Fusion
@@ -26,7 +28,6 @@ LOST_HEADING_SIGMA_RAD = math.pi / math.sqrt(3.0)  # of a uniform distribution
 USUAL_HEADING_SIGMA_RAD = math.radians(10.0)  # assumed: a tier describes the position only
 HEADING_DRIFT_RAD_PER_SQRT_M = 0.1  # heading sigma that a teammate gains, a random walk
 HEADING_WAY_M = 1.0  # over which a heading's error is counted as one of the position
-SUBSCRIBER_DRIFT_M_S = 0.01  # error that a subscriber is assumed to gain between two beliefs
 UNKNOWN_AGE_S = 60.0  # since the last help for a teammate, as long as there was none
 
 
@@ -146,29 +147,41 @@ def information_gain(prior: Covariance2, after: Covariance2) -> float:
     return 0.5 * math.log(_regularized(prior).determinant() / left)
 
 
-def value_of_help(removed_m: float, age_s: float) -> float:
-    """The value (m sqrt(s)) of a message that removes a position error `age_s` after the last one.
-
-    It is the root of variance times time. If the variance grows by q in a second and a message
-    costs c, a message each T seconds costs q T / 2 + c / T, which is least where c = q T^2 / 2:
-    a message is due when half the variance that it removes, times its age, has reached its price.
-    """
-    return removed_m * math.sqrt(max(0.0, age_s))
-
-
-def value_of_fix(
-    prior: Covariance2, after: Covariance2, heading_variance: float, age_s: float
-) -> float:
-    """The value (m sqrt(s)) of a fix that changes a teammate's covariance from `prior` to `after`,
-    and removes so much variance of its heading (rad^2), when the last one for it is `age_s` old."""
+def removed_variance(prior: Covariance2, after: Covariance2, heading_variance: float) -> float:
+    """The variance (m^2) that a fix removes, when it changes a teammate's covariance from `prior`
+    to `after`, and removes so much variance of its heading (rad^2)."""
     removed = prior.xx + prior.yy - after.xx - after.yy + HEADING_WAY_M**2 * heading_variance
-    return value_of_help(math.sqrt(max(0.0, removed)), age_s)
+    return max(0.0, removed)
 
 
-def value_of_belief(age_s: float) -> float:
-    """The value (m sqrt(s)) of a belief when the last one is `age_s` old. The sender does not know
-    its subscribers, so it assumes that their error has grown since then."""
-    return value_of_help(min(SUBSCRIBER_DRIFT_M_S * age_s, LOST_SIGMA_M), age_s)
+class Need(NamedTuple):
+    """By how much a teammate's variance (m^2) grew in the time since this robot last helped it."""
+
+    grown: float
+    age_s: float
+    stamp_ns: int
+    """When the teammate was seen so."""
+
+
+def need_of(prior: Covariance2, last_fix: FixMemory | None, age_s: float, stamp_ns: int) -> Need:
+    """The need of a teammate that has this covariance now."""
+    left = 0.0 if last_fix is None else last_fix.covariance.xx + last_fix.covariance.yy
+    return Need(max(0.0, prior.xx + prior.yy - left), age_s, stamp_ns)
+
+
+def effective_age_s(removed: float, age_s: float, needs: Collection[Need]) -> float:
+    """The age (s) of the last help at which a usual message would remove as much error over time
+    as one that removes this variance (m^2) now does.
+
+    If a variance grows by q in a second and a message costs c, a message each T seconds costs
+    q T / 2 + c / T, which is least where c = q T^2 / 2: a message is due when the variance that it
+    removes, times its age, has reached 2 c (the index of Whittle). The same price for all messages
+    is an interval T for a usual one, which removes the mean growth q of all `needs`, and others are
+    due when removed * age = q T^2. The root of removed * age / q is the effective age: that of a
+    usual message is its age. A fixed interval is the case that all messages are usual.
+    """
+    grown, ages = sum(n.grown for n in needs), sum(n.age_s for n in needs)
+    return math.sqrt(removed * age_s * ages / grown) if grown > 0.0 else age_s
 
 
 def _regularized(c: Covariance2) -> Covariance2:

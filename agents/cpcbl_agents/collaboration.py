@@ -37,11 +37,11 @@ def _size(message: Belief | Fix) -> int:
 
 
 class _Offer(NamedTuple):
-    """A fix that could be sent, its information gain (nats), its value (m sqrt(s)), and what its
-    robot knows after it."""
+    """A fix that could be sent, its information gain (nats), its effective age, and what its robot
+    knows after it."""
 
     gain: float
-    value: float
+    age_s: float
     urgent: bool
     after: FixMemory
     fix: Fix
@@ -125,6 +125,7 @@ class CollaborationAgent:
         self._early_fixes: dict[str, Fix] = {}  # of robots whose tier is not known yet
         self._tiers: dict[str, int] = {}
         self._fix_memories: dict[str, tuple[int, FixMemory]] = {}
+        self._needs: dict[str, gains.Need] = {}
         self._last_belief: Belief | None = None
         self._never_ns = self._from_ns - int(gains.UNKNOWN_AGE_S * 1e9)  # in place of a last help
         self._belief_sent_ns = self._never_ns
@@ -276,11 +277,11 @@ class CollaborationAgent:
         return []
 
     def _affordable(self, offers: list[_Offer], now_ns: int) -> list[Fix]:
-        """The fixes that the budget admits, the one with the largest value first."""
-        offers.sort(key=lambda offer: (offer.urgent, offer.value), reverse=True)
+        """The fixes that the budget admits, the one with the largest effective age first."""
+        offers.sort(key=lambda offer: (offer.urgent, offer.age_s), reverse=True)
         sent = []
-        for _, value, urgent, after, fix in offers:
-            if self._affords(now_ns, _size(fix), value, urgent):
+        for _, age_s, urgent, after, fix in offers:
+            if self._affords(now_ns, _size(fix), age_s, urgent):
                 self._fix_memories[fix.robot] = fix.stamp_ns, after
                 sent.append(fix)
             else:
@@ -314,9 +315,13 @@ class CollaborationAgent:
             else:
                 fix = without_heading(fix)
         age_s = (fix.stamp_ns - last_ns) * 1e-9
-        value = gains.value_of_fix(prior, after, heading_variance, age_s)
+        removed = gains.removed_variance(prior, after, heading_variance)
+        if tier != LOWEST_TIER:
+            need = gains.need_of(prior, before, age_s, fix.stamp_ns)
+            self._needs[fix.robot] = need
+            age_s = gains.effective_age_s(removed, age_s, self._needs.values())
         memory = FixMemory(*place, after, turned)
-        return _Offer(gain, value, tier == LOWEST_TIER, memory, fix)
+        return _Offer(gain, age_s, tier == LOWEST_TIER, memory, fix)
 
     # Beliefs -------------------------------------------------------------------------------
 
@@ -336,8 +341,8 @@ class CollaborationAgent:
         if is_recent and stale < rules.belief_share:
             tally.silent += 1
             return []
-        value = gains.value_of_belief((now.stamp_ns - self._belief_sent_ns) * 1e-9)
-        if not self._affords(now_ns, _size(belief), value, urgent=False):
+        age_s = (now.stamp_ns - self._belief_sent_ns) * 1e-9
+        if not self._affords(now_ns, _size(belief), age_s, urgent=False):
             tally.over_budget += 1
             return []
         self._last_belief = belief
@@ -345,10 +350,10 @@ class CollaborationAgent:
 
     # Budget, and what was really sent ----------------------------------------------------
 
-    def _affords(self, now_ns: int, size: int, value: float, urgent: bool) -> bool:
-        """Whether a message of this value may be sent; if so, the budget is charged at once."""
+    def _affords(self, now_ns: int, size: int, age_s: float, urgent: bool) -> bool:
+        """Whether a message of this effective age may be sent; if so, the budget is charged."""
         budget, competes = self.budget, not urgent and self._rules.least_value > 0.0
-        if competes and value < budget.price(now_ns, size):
+        if competes and age_s < budget.interval_s(now_ns, self._teammates_to_help(now_ns)):
             return False
         admitted = budget.admits(now_ns, size, urgent)
         if admitted:
@@ -356,6 +361,15 @@ class CollaborationAgent:
         else:
             budget.refuse(now_ns)
         return admitted
+
+    def _teammates_to_help(self, now_ns: int) -> int:
+        """How many teammates there were to help within the interval of so many."""
+        number, stamps = 0, sorted((n.stamp_ns for n in self._needs.values()), reverse=True)
+        while number < len(stamps) and (
+            now_ns - stamps[number]
+        ) * 1e-9 < self.budget.own_interval_s(number):
+            number += 1
+        return number
 
     def _record_sent(self, sent: agent.HelpSent, now_ns: int) -> None:
         message = sent.message

@@ -110,7 +110,8 @@ def test_the_fix_with_the_largest_gain_comes_first() -> None:
 def test_a_budget_for_one_message_goes_to_the_fix_with_the_largest_gain() -> None:
     alone = Alone(budget=BudgetSettings(messages_per_minute=1.0, urgent_share=0.0))
     alone.tell(Presence("mate", POORER), Presence("other", LOWEST_TIER - 1))
-    assert robots(alone.sees(ahead("mate"), ahead("other"))) == ["other"]
+    frame = ahead("mate"), ahead("other")
+    assert robots(alone.sees(*frame, after_ns=200 * SECOND)) == ["other"]
     assert [alone.tally("fix", name).over_budget for name in ("mate", "other")] == [1, 0]
     assert [alone.tally("fix", name).messages for name in ("mate", "other")] == [0, 1]
 
@@ -118,16 +119,16 @@ def test_a_budget_for_one_message_goes_to_the_fix_with_the_largest_gain() -> Non
 def test_a_budget_for_one_message_goes_to_the_teammate_that_was_not_helped_for_longer() -> None:
     alone = Alone(budget=BudgetSettings(messages_per_minute=1.0, urgent_share=0.0))
     alone.tell(Presence("mate", LOWEST_TIER - 1), Presence("other", LOWEST_TIER - 1))
-    first = robots(alone.sees(ahead("mate"), ahead("other")))
-    second = robots(alone.sees(ahead("mate"), ahead("other"), after_ns=60 * SECOND))
-    third = robots(alone.sees(ahead("mate"), ahead("other"), after_ns=60 * SECOND))
+    frame = ahead("mate"), ahead("other")
+    first, second, third = (robots(alone.sees(*frame, after_ns=200 * SECOND)) for _ in range(3))
     assert sorted(first + second) == ["mate", "other"]
     assert third == first
 
 
-def test_with_a_tight_budget_a_fix_must_remove_more_error() -> None:
+def test_with_a_tight_budget_the_first_fix_waits_longer() -> None:
+    """Its teammate counts as last helped a minute ago; two messages take four minutes."""
     sent = []
-    for per_minute in (0.0, 4000.0, 4.0):
+    for per_minute in (0.0, 4000.0, 0.5):
         alone = Alone(budget=BudgetSettings(messages_per_minute=per_minute, urgent_share=0.0))
         alone.tell(Presence("mate", GOOD + 4))
         sent.append(len(alone.sees(ahead(range_m=1.2))))
@@ -177,11 +178,11 @@ def test_a_lost_teammate_comes_first_whatever_the_gain() -> None:
         assert sure[0] > 1000.0 * sure[1]
 
 
-def test_a_lost_teammate_gets_a_fix_that_is_not_worth_its_price() -> None:
-    """Far away, right after the price has risen."""
+def test_a_lost_teammate_gets_a_fix_that_is_not_due() -> None:
+    """Far away, right after the interval has risen."""
     alone = Alone(budget=BudgetSettings(bytes_per_s=1000.0))
     alone.tell(Presence("mate", LOWEST_TIER), Presence("other", LOWEST_TIER - 1))
-    for _ in range(100):
+    for _ in range(150):
         alone.agent.budget.spend(alone.now_ns, 42)
     assert alone.agent.budget.admits(alone.now_ns, 42, urgent=False)
     assert alone.sees(ahead("other", 1.0)) == []
@@ -192,7 +193,7 @@ def test_the_reserve_is_for_lost_teammates() -> None:
     alone = Alone(budget=BudgetSettings(messages_per_minute=2.0, urgent_share=0.5))
     others = (Presence(name, LOWEST_TIER - 1) for name in ("other", "third"))
     alone.tell(Presence("mate", LOWEST_TIER), *others)
-    assert len(alone.sees(ahead("other"))) == 1
+    assert len(alone.sees(ahead("other"), after_ns=100 * SECOND)) == 1
     assert alone.sees(ahead("third")) == []
     assert len(alone.sees(ahead("mate"))) == 1
 
@@ -205,7 +206,7 @@ def test_a_fix_with_too_little_gain_is_not_sent_but_counted() -> None:
     assert alone.agent.counters.flows() == (Flow("fix", "mate", worthless=1),)
 
 
-def test_a_fix_with_a_gain_below_the_price_is_counted_as_beyond_the_budget() -> None:
+def test_a_fix_that_is_not_due_is_counted_as_beyond_the_budget() -> None:
     alone = Alone(budget=BudgetSettings(bytes_per_s=100.0))
     alone.tell(*(Presence(name, POORER) for name in MATES))
     while alone.sees(*map(ahead, sorted(MATES)), after_ns=20 * MS):
@@ -215,7 +216,7 @@ def test_a_fix_with_a_gain_below_the_price_is_counted_as_beyond_the_budget() -> 
     assert sum(alone.tally("fix", name).over_budget for name in MATES) > 0
 
 
-def test_a_teammate_that_was_just_helped_waits_until_another_fix_has_its_price() -> None:
+def test_a_teammate_that_was_just_helped_waits_for_the_interval() -> None:
     """Though it still announces a bad tier, and the budget would allow four fixes a minute."""
     alone = Alone(budget=BudgetSettings(messages_per_minute=4.0, urgent_share=0.0))
     alone.tell(Presence("mate", POORER), Presence("other", GOOD + 2))
@@ -223,6 +224,25 @@ def test_a_teammate_that_was_just_helped_waits_until_another_fix_has_its_price()
     assert 2 <= len(sent) <= 6
     assert min(b - a for a, b in pairwise(sent)) > 10
     assert alone.sees(ahead("other", 0.2)) == []
+
+
+@pytest.mark.parametrize("tier", [GOOD + 5, POORER])
+def test_fixes_come_at_the_interval_of_the_budget_however_large_the_errors_are(tier: int) -> None:
+    """A fix and a belief are earned in 28.75 s."""
+    alone = Alone(budget=BudgetSettings(bytes_per_s=4.0))
+    alone.tell(Presence("mate", tier))
+    sent = [n for n in range(300) if alone.sees(ahead(range_m=0.3), after_ns=SECOND)]
+    assert sent[0] == 0
+    assert all(28 < b - a < 40 for a, b in pairwise(sent))
+
+
+def test_a_teammate_whose_error_grows_faster_is_helped_more_often() -> None:
+    alone = Alone(budget=BudgetSettings(bytes_per_s=4.0))
+    alone.tell(Presence("mate", POOR), Presence("other", POORER))
+    frame, sent = [ahead("mate", 1.0), ahead("other", 1.0)], list[str]()
+    for _ in range(600):
+        sent += robots(alone.sees(*frame, after_ns=SECOND))
+    assert sent.count("other") > 1.5 * sent.count("mate") > 1.5
 
 
 def helped(alone: Alone, frames: int, range_m: float = 2.0) -> list[int]:

@@ -27,12 +27,14 @@ from cpcbl_team.estimate import SMALLEST_VARIANCE, Covariance3, Estimate
 from cpcbl_team.gaussian import Covariance2, Gaussian2
 from cpcbl_team.geometry import Pose2
 from cpcbl_team.information_gain import (
+    FixMemory,
+    Need,
+    effective_age_s,
     information_gain,
     information_gain_of_belief,
     merged_covariance,
-    value_of_belief,
-    value_of_fix,
-    value_of_help,
+    need_of,
+    removed_variance,
 )
 from cpcbl_team.inputs import Fix
 from cpcbl_team.tiers import LOWEST_TIER
@@ -219,30 +221,42 @@ def test_a_teammate_at_the_same_point_gains_no_heading() -> None:
         )
 
 
-# The value of help, for which messages compete --------------------------------------------------
+# The effective age, by which messages compete ---------------------------------------------------
 
 
-def test_the_value_of_a_fix_is_the_error_that_it_removes_times_the_root_of_its_age() -> None:
+def test_a_fix_removes_variance_of_the_position_and_of_the_next_metre() -> None:
     """From 0.5 m to 0.3 m on both axes removes a variance of 0.32 m^2; a heading counts by the
     error that it would make on the next metre."""
-    prior, after = Covariance2(0.25, 0.0, 0.25), Covariance2(0.09, 0.0, 0.09)
-    assert value_of_fix(prior, after, 0.0, 25.0) == pytest.approx(5.0 * math.sqrt(0.32))
-    assert value_of_fix(prior, after, 0.04, 25.0) == pytest.approx(5.0 * math.sqrt(0.36))
-    assert value_of_fix(after, prior, 0.0, 25.0) == 0.0
-    assert value_of_fix(prior, after, 0.0, -1.0) == 0.0
+    prior, after = round_covariance(0.5), round_covariance(0.3)
+    assert removed_variance(prior, after, 0.0) == pytest.approx(0.32)
+    assert removed_variance(prior, after, 0.04) == pytest.approx(0.36)
+    assert removed_variance(after, prior, 0.0) == 0.0
+
+
+def test_a_teammate_needs_what_its_variance_grew_since_the_last_fix() -> None:
+    last = FixMemory(0.0, 0.0, round_covariance(0.3))
+    assert need_of(round_covariance(0.5), last, 20.0, 7) == pytest.approx((0.32, 20.0, 7))
+    assert need_of(round_covariance(0.2), last, 20.0, 7) == (0.0, 20.0, 7)
+    assert need_of(round_covariance(0.5), None, 20.0, 7) == pytest.approx((0.50, 20.0, 7))
+
+
+def test_a_usual_message_is_as_old_as_it_is_and_one_that_removes_a_quarter_is_half_as_old() -> None:
+    needs = [Need(0.2, 20.0, 0), Need(0.4, 40.0, 0)]
+    assert effective_age_s(0.3, 30.0, needs) == pytest.approx(30.0)
+    assert effective_age_s(0.3 / 4.0, 30.0, needs) == pytest.approx(15.0)
+    assert effective_age_s(0.0, 30.0, needs) == 0.0
+    assert effective_age_s(0.0, 30.0, [Need(0.0, 30.0, 0)]) == 30.0
 
 
 @pytest.mark.parametrize(("growth", "cost"), [(0.01, 2.0), (0.3, 2.0), (0.01, 50.0)])
-def test_help_that_is_due_at_its_price_costs_least(growth: float, cost: float) -> None:
-    """Of error and messages together, where the variance grows evenly and each fix removes it."""
-    periods = [0.01 * n for n in range(1, 20_000)]
-    cheapest = min(periods, key=lambda t: growth * t / 2.0 + cost / t)
-    due = next(t for t in periods if value_of_help(math.sqrt(growth * t), t) ** 2 / 2.0 >= cost)
+@pytest.mark.parametrize("ratio", [0.2, 1.0, 5.0])
+def test_help_that_is_due_at_one_interval_costs_least_for_each_teammate(
+    growth: float, cost: float, ratio: float
+) -> None:
+    """Of error and messages together, where variances grow evenly, one of them `ratio` times as
+    fast as the mean, and each fix removes them."""
+    interval_s, needs = math.sqrt(2.0 * cost / growth), [Need(growth * 50.0, 50.0, 0)]
+    periods, own = [0.01 * n for n in range(1, 30_000)], ratio * growth
+    cheapest = min(periods, key=lambda t: own * t / 2.0 + cost / t)
+    due = next(t for t in periods if effective_age_s(own * t, t, needs) >= interval_s)
     assert due == pytest.approx(cheapest, abs=0.02)
-
-
-def test_the_value_of_a_belief_grows_since_the_last_one_until_subscribers_are_lost() -> None:
-    values = [value_of_belief(age_s) for age_s in (0.0, 1.0, 10.0, 100.0)]
-    assert values == sorted(values)
-    assert values[0] == 0.0
-    assert value_of_belief(4.0 * 3600.0) == pytest.approx(2.0 * value_of_belief(3600.0))

@@ -87,12 +87,14 @@ def test_no_window_holds_more_bytes_than_allowed(
     assert most_within(window_s, sent, size_of) <= window_s * bytes_per_s + 1e-6
 
 
-def test_of_several_limits_the_tightest_makes_the_price() -> None:
-    """It falls by e in the time in which 20 messages are earned: here 20 minutes."""
+def test_of_several_limits_the_tightest_makes_the_interval() -> None:
+    """Its factor falls by e in the time in which 20 messages are earned: here 20 minutes."""
     limits = BudgetSettings(bytes_per_s=1000.0, messages_per_minute=1.0, urgent_share=0.0)
     budget = Budget(limits, 0)
-    budget.spend(0, 42)
-    at_once, later = budget.price(0, 42), budget.price(10 * 1_000_000_000, 42)
+    assert budget.own_interval_s(2) == 180.0
+    budget.spend(0, FIX)
+    budget.spend(0, FIX)
+    at_once, later = budget.interval_s(0, 2), budget.interval_s(10 * SECOND, 2)
     assert later == pytest.approx(at_once * math.exp(-10.0 / 1200.0))
 
 
@@ -190,7 +192,7 @@ def test_what_is_taken_back_can_be_spent_again() -> None:
     for _ in range(10):
         budget.spend(5 * SECOND, FIX)
         budget.refund(5 * SECOND, FIX)
-    assert budget.price(5 * SECOND, FIX) <= Budget(settings, 0, 1.0).price(0, FIX)
+    assert budget.interval_s(5 * SECOND, 1) == budget.own_interval_s(1)
     assert len(granted(budget, [Wish(5 * SECOND, FIX)] * 5)) == 3
 
 
@@ -236,7 +238,7 @@ def test_a_match_has_no_more_messages_however_early_the_robot_is_switched_on(fir
     assert (spending.most, spending.allowed) == (300.0, 300.0)
 
 
-# The price --------------------------------------------------------------------------------------
+# The interval -----------------------------------------------------------------------------------
 
 LIMITED = [
     Budget(BudgetSettings(bytes_per_s=100.0), 0),
@@ -245,75 +247,76 @@ LIMITED = [
 ]
 
 
+def test_the_own_interval_earns_a_fix_for_each_teammate_and_a_belief_beside_the_reserve() -> None:
+    """At 1 B/s of which a fifth is reserved; three messages at 5 a minute; no limit."""
+    by_bytes = Budget(BudgetSettings(bytes_per_s=1.0, urgent_share=0.2), 0)
+    assert by_bytes.own_interval_s(4) == pytest.approx((4 * FIX + BELIEF) / 0.8)
+    by_number = Budget(BudgetSettings(messages_per_minute=5.0, urgent_share=0.0), 0)
+    assert by_number.own_interval_s(2) == pytest.approx(36.0)
+    assert Budget(BudgetSettings(), 0).own_interval_s(4) == 0.0
+
+
 @pytest.mark.parametrize("budget", LIMITED, ids=["bytes", "messages", "match"])
-def test_the_price_rises_with_each_message_and_falls_while_nothing_is_sent(
+def test_the_interval_rises_with_each_message_and_falls_to_the_own_one_while_nothing_is_sent(
     budget: Budget,
 ) -> None:
-    prices = [budget.price(0, FIX)]
+    own_s = budget.own_interval_s(3)
+    intervals = [budget.interval_s(0, 3)]
+    assert intervals == [own_s]
     for _ in range(40):
         budget.spend(0, FIX)
-        prices.append(budget.price(0, FIX))
-    assert prices == sorted(prices)
-    assert prices[-1] == pytest.approx(math.exp(2.0) * prices[0])
-    later = [budget.price(10 * SECOND * n, FIX) for n in range(600)]
+        intervals.append(budget.interval_s(0, 3))
+    assert intervals == sorted(intervals)
+    assert intervals[-1] == pytest.approx(math.exp(2.0) * own_s)
+    later = [budget.interval_s(10 * SECOND * n, 3) for n in range(600)]
     assert later == sorted(later, reverse=True)
-    assert 0.0 < later[-1] < 0.2 * prices[0]
+    assert later[0] == intervals[-1]
+    assert later[-1] == own_s
 
 
-def test_the_price_stays_where_as_much_is_sent_as_is_not_reserved() -> None:
+def test_the_interval_stays_where_as_much_is_sent_as_is_not_reserved() -> None:
     """Four fifths of 42 B/s are four fixes in 5 s."""
     budget = Budget(BudgetSettings(bytes_per_s=42.0), 0)
-    at_first = budget.price(0, FIX)
+    for _ in range(10):
+        budget.spend(0, FIX)
+    at_first = budget.interval_s(0, 1)
     for n in range(1, 400):
         budget.spend(n * 1250 * MS, FIX)
-    assert budget.price(400 * 1250 * MS, FIX) == pytest.approx(at_first, rel=0.1)
+    assert budget.interval_s(400 * 1250 * MS, 1) == pytest.approx(at_first, rel=0.1)
 
 
-def test_at_the_start_half_the_square_of_the_price_is_the_time_that_earns_a_message() -> None:
-    for rate in (1.0, 2.0, 42.0):
-        budget = Budget(BudgetSettings(bytes_per_s=rate), 0)
-        assert budget.price(0, FIX) == pytest.approx(math.sqrt(2.0 * FIX / rate))
-
-
-def test_the_price_does_not_fall_while_only_the_limits_hold_back_messages() -> None:
+def test_the_interval_does_not_fall_while_only_the_limits_hold_back_messages() -> None:
     budget = Budget(BudgetSettings(messages_per_minute=4.0, urgent_share=0.0), 0)
     assert len(granted(budget, [Wish(0, FIX)] * 5)) == 4
-    price = budget.price(0, FIX)
+    interval_s = budget.interval_s(0, 1)
     for second in range(1, 30):
         assert not budget.admits(second * SECOND, FIX, urgent=False)
         budget.refuse(second * SECOND)
-    assert budget.price(29 * SECOND, FIX) == price
-    assert budget.price(59 * SECOND, FIX) < price
-
-
-def test_there_is_one_price_for_the_square_of_the_value_of_a_byte() -> None:
-    budget = Budget(BudgetSettings(bytes_per_s=100.0), 0)
-    budget.spend(0, BELIEF)
-    fix, belief = (budget.price(0, size) ** 2 / size for size in (FIX, BELIEF))
-    assert fix == pytest.approx(belief)
+    assert budget.interval_s(29 * SECOND, 1) == interval_s
+    assert budget.interval_s(59 * SECOND, 1) < interval_s
 
 
 @examples(100)
 @given(WISHES)
-def test_without_limits_all_is_admitted_and_nothing_has_a_price(wishes: list[Wish]) -> None:
+def test_without_limits_all_is_admitted_and_always_due(wishes: list[Wish]) -> None:
     budget = Budget(BudgetSettings(), 0)
     for wish in wishes:
-        assert budget.price(wish.at_ns, wish.size) == 0.0
+        assert budget.interval_s(wish.at_ns, 3) == 0.0
         assert budget.admits(*wish)
         budget.spend(wish.at_ns, wish.size)
     assert budget.spending(HOUR) == ()
 
 
-def values_sent(budget: Budget, values: Sequence[float], *, at_a_price: bool) -> list[float]:
-    """Of fixes of these values, offered at 5 Hz, those that are sent."""
+def ages_sent(budget: Budget, ages_s: Sequence[float], *, when_due: bool) -> list[float]:
+    """Of fixes of these effective ages, offered at 5 Hz, those that are sent."""
     sent = []
-    for n, value in enumerate(values, start=1):
+    for n, age_s in enumerate(ages_s, start=1):
         now_ns = n * 200 * MS
-        if at_a_price and value < budget.price(now_ns, FIX):
+        if when_due and age_s < budget.interval_s(now_ns, 1):
             continue
         if budget.admits(now_ns, FIX, urgent=False):
             budget.spend(now_ns, FIX)
-            sent.append(value)
+            sent.append(age_s)
         else:
             budget.refuse(now_ns)
     return sent
@@ -329,17 +332,18 @@ TEN_MINUTES_OF = [
 
 @pytest.mark.parametrize(("settings", "match_hz", "whole"), TEN_MINUTES_OF)
 @pytest.mark.parametrize("seed", range(3))
-def test_with_a_price_the_budget_is_used_for_larger_gains(
+def test_the_interval_spends_the_budget_on_what_waited_longest(
     seed: int, settings: BudgetSettings, match_hz: float | None, whole: float
 ) -> None:
-    values = np.random.default_rng(seed).exponential(1.0, 3000).tolist()
-    dear, first_come = (
-        values_sent(Budget(settings, 0, match_hz), values, at_a_price=priced)
-        for priced in (True, False)
+    own_s = Budget(settings, 0, match_hz).own_interval_s(1)
+    ages_s = (own_s * np.random.default_rng(seed).exponential(1.0, 3000)).tolist()
+    due, first_come = (
+        ages_sent(Budget(settings, 0, match_hz), ages_s, when_due=when_due)
+        for when_due in (True, False)
     )
-    assert 0.6 * whole < len(dear) <= 1.1 * whole
-    assert np.mean(dear) > 2.0 * np.mean(first_come)
-    assert sum(dear) > 1.5 * sum(first_come)
+    assert 0.6 * whole < len(due) <= 1.1 * whole
+    assert np.mean(due) > 2.0 * np.mean(first_come)
+    assert sum(due) > 1.5 * sum(first_come)
 
 
 # What is reported -------------------------------------------------------------------------------

@@ -1,28 +1,25 @@
-"""What a robot may still spend on messages, and the value that a message must have.
+"""What a robot may still spend on messages, and the interval that its budget pays for.
 
 A limit is a token bucket whose tokens return one window after they were spent. So no window ever
 contains more than is allowed, and no reserve for bursts is necessary, as it is in a bucket that
-fills evenly. A price spreads the spending over time: it rises with each message and falls while
-nothing is sent, and so finds the level at which as much is worth sending as may be sent (dual
-ascent on the constraint). It moves slowly, so that all messages of some minutes have nearly the
-same price, and it starts high: what is sent for little at first is missing later. The price does
-not fall while only the limits hold back a message: otherwise the first message after each full
-window would be sent, however small its value.
+fills evenly. An interval spreads the spending over time: that in which the budget earns a fix for
+each teammate that there is to help, and a belief. It becomes longer with each message and shorter
+again while others are earned, so it settles where the limits hold back little (dual ascent on the
+constraint), but never shorter than the budget's own: what little there is to say is not said more
+often because it could be paid for. It does not become shorter while only the limits hold back a
+message: otherwise the first message after each full window would be sent, however small its value.
 """
 
 import math
 from collections import deque
 
 from cpcbl_team.config import BudgetSettings
+from cpcbl_transport.compact import BELIEF_BYTES, FIX_BYTES, sent_bytes
 from cpcbl_transport.messages import Spending
 
 SHORTEST_WINDOW_S = 10.0
 LEAST_BYTES = 500.0  # in a window, so that a small budget can be used up by whole messages
-PRICE_MEMORY = 20.0  # messages: in the time in which so many are earned, the price falls by e
-# At the start, half the variance that a message removes, times its age, must be so much for each
-# second in which the message is earned: 0.33 m^2 a minute after the last help if these are ten.
-START_PRICE_M2 = 1.0
-LEAST_PRICE = 0.03  # of that at the start
+INTERVAL_MEMORY = 20.0  # messages: while so many are earned, the interval's factor falls by e
 _ROUNDING = 1e-9
 
 
@@ -100,8 +97,8 @@ class Budget:
         match_s: float = math.inf,
     ) -> None:
         s = settings
-        self._price, self._price_ns = 1.0, start_ns  # as a multiple of that at the start
-        self._spent_share = max(0.1, 1.0 - s.urgent_share)  # to which the price leads
+        self._factor, self._factor_ns = 1.0, start_ns  # of the interval, and when it was so
+        self._spent_share = max(0.1, 1.0 - s.urgent_share)  # what is not reserved
         windows = []
         if s.bytes_per_s:
             most, window_s = bytes_window(s.bytes_per_s)
@@ -123,43 +120,52 @@ class Budget:
             limit.room(now_ns, urgent) >= amount - _ROUNDING for limit, amount in self._costs(size)
         )
 
-    def price(self, now_ns: int, size: int) -> float:
-        """The least value (m sqrt(s)) that a message of this size must have; 0 without limits."""
-        earned_s = self._earned_s(size)
-        if earned_s == 0.0:
-            return 0.0
-        return math.sqrt(2.0 * START_PRICE_M2 * earned_s) * self._multiple(now_ns, earned_s)
+    def own_interval_s(self, teammates: int) -> float:
+        """The time in which a fix for each of so many teammates, and a belief, are earned; 0
+        without limits."""
+        size = teammates * sent_bytes(FIX_BYTES) + sent_bytes(BELIEF_BYTES)
+        return self._earned_s(size, teammates + 1) / self._spent_share
+
+    def interval_s(self, now_ns: int, teammates: int) -> float:
+        """The interval at which a message is due now, if there are so many teammates to help."""
+        return self.own_interval_s(teammates) * self._factor_at(now_ns, sent_bytes(FIX_BYTES))
 
     def spend(self, now_ns: int, size: int) -> None:
         """A message of this size is sent."""
-        if earned_s := self._earned_s(size):
-            self._price = self._multiple(now_ns, earned_s) * math.exp(1.0 / PRICE_MEMORY)
-        self._price_ns = now_ns
+        self._factor = self._factor_at(now_ns, size) * math.exp(1.0 / INTERVAL_MEMORY)
+        self._factor_ns = now_ns
         for limit, amount in self._costs(size):
             limit.spend(now_ns, amount)
 
     def refund(self, now_ns: int, size: int) -> None:
         """Undoes the latest `spend`: the message was not sent."""
-        self._price *= math.exp(-1.0 / PRICE_MEMORY)
+        self._factor *= math.exp(-1.0 / INTERVAL_MEMORY)
         for limit, amount in self._costs(size):
             limit.spend(now_ns, -amount)
 
     def refuse(self, now_ns: int) -> None:
-        """A message with enough value is not admitted by the limits."""
-        self._price_ns = now_ns
+        """A message that is due is not admitted by the limits."""
+        self._factor_ns = now_ns
 
     def spending(self, now_ns: int) -> tuple[Spending, ...]:
         """Its limits, and the largest use of each so far."""
         return tuple(limit.spending(now_ns) for limit in self._limits)
 
-    def _multiple(self, now_ns: int, earned_s: float) -> float:
-        """The price as a multiple of that at the start."""
-        messages = (now_ns - self._price_ns) * 1e-9 / earned_s * self._spent_share
-        return max(LEAST_PRICE, self._price * math.exp(-messages / PRICE_MEMORY))
+    def _factor_at(self, now_ns: int, size: int) -> float:
+        """The factor of the interval now, by messages of this size."""
+        if not (earned_s := self._earned_s(size)):
+            return 1.0
+        messages = (now_ns - self._factor_ns) * 1e-9 / earned_s * self._spent_share
+        return max(1.0, self._factor * math.exp(-messages / INTERVAL_MEMORY))
 
-    def _earned_s(self, size: int) -> float:
-        """The seconds in which a message of this size is earned; 0 without limits."""
-        return max((limit.pace_s * amount for limit, amount in self._costs(size)), default=0.0)
+    def _earned_s(self, size: int, messages: int = 1) -> float:
+        """The seconds in which messages of this size together are earned; 0 without limits."""
+        costs = self._costs(size, messages)
+        return max((limit.pace_s * amount for limit, amount in costs), default=0.0)
 
-    def _costs(self, size: int) -> list[tuple[SlidingWindow | MatchAllowance, float]]:
-        return [(limit, size if limit.unit == "bytes" else 1.0) for limit in self._limits]
+    def _costs(
+        self, size: int, messages: int = 1
+    ) -> list[tuple[SlidingWindow | MatchAllowance, float]]:
+        return [
+            (limit, size if limit.unit == "bytes" else float(messages)) for limit in self._limits
+        ]

@@ -93,6 +93,9 @@ def budget(
         int,
         Option("--team-size", min=2, max=50, help="Without a log: the size of simulated teams."),
     ] = 10,
+    world: Annotated[
+        str, Option(help="Their world: mixed, few-landmarks, one-observer or chain.")
+    ] = "mixed",
     seeds: Seeds = 3,
     jobs: Jobs = None,
     output: Output = Path(),
@@ -101,12 +104,13 @@ def budget(
     """Accuracy against bytes, by value and budget, by fixed intervals, all of it: on a real log, or
     with simulated teams of mixed quality."""
     from cpcbl_launch.lab.experiments import budget as experiment
+    from cpcbl_launch.lab.experiments import mixed_teams
     from cpcbl_launch.overrides import with_blind_robots
     from cpcbl_launch.run import logged_team
     from cpcbl_launch.team_file import load_team
 
     if data is None:
-        runs = experiment.simulated_runs(robots, seeds)
+        runs = experiment.simulated_runs(robots, seeds, mixed_teams.known_world(world))
     else:
         team = load_team(logged_team.builtin_for(data))
         logged = logged_team.with_duration(logged_team.load_logged_team(team, data), duration)

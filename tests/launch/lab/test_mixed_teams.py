@@ -3,7 +3,9 @@
 import pytest
 
 from cpcbl_launch.lab.experiments import budget
-from cpcbl_launch.lab.experiments.budget import mixed_team
+from cpcbl_launch.lab.experiments.budget import RunFigures, interval_rmse_m
+from cpcbl_launch.lab.experiments.mixed_teams import WORLDS, known_world, mixed_team
+from cpcbl_team.errors import InputError
 
 
 @pytest.mark.parametrize("size", [2, 5, 12])
@@ -33,3 +35,40 @@ def test_a_curve_of_simulated_teams_has_the_means_of_its_seeds(
     assert tight.blind_rmse_m > tight.position_rmse_m
     first = budget.measure_point(budget.simulated_runs(5, 1), by_setting["nothing", "alone"])
     assert first.bytes_per_s == 0.0
+
+
+@pytest.mark.parametrize("world", WORLDS)
+def test_in_each_world_somebody_knows_where_it_is_and_most_see_no_landmark(world: str) -> None:
+    team = mixed_team(10, 3, world)
+    guides = [name for name, robot in team.robots.items() if robot.sensor.sees_landmarks]
+    assert len(guides) == (2 if world in ("mixed", "few-landmarks") else 1)
+    assert known_world(world) == world
+    assert mixed_team(10, 3, world) == team
+
+
+def test_an_unknown_world_is_named_with_those_that_there_are() -> None:
+    with pytest.raises(InputError, match="--world moon: unknown; write one of mixed, few"):
+        known_world("moon")
+
+
+def test_a_budget_is_compared_with_an_interval_of_the_same_bytes() -> None:
+    """Halfway in logarithms; an interval that is worse at more bytes does not count."""
+    intervals = [RunFigures(1.0, 0.8), RunFigures(4.0, 0.2), RunFigures(8.0, 0.3)]
+    assert interval_rmse_m(intervals, 2.0) == pytest.approx(0.4)
+    assert interval_rmse_m(intervals, 6.0) == pytest.approx(0.2)
+    assert interval_rmse_m(intervals, 20.0) == pytest.approx(0.2)
+    assert interval_rmse_m(intervals, 0.5) is None
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("world", WORLDS)
+def test_help_by_value_is_better_than_a_fixed_interval_of_the_same_bytes(world: str) -> None:
+    """By a fifth at 4 B/s; at 20 B/s an interval too sends nearly all that is worth sending."""
+    chosen = {"4 B/s", "20 B/s", "120 s", "60 s", "30 s", "15 s", "8 s", "4 s"}
+    of_both = [case for case in budget.cases() if case.setting in chosen]
+    runs = budget.simulated_runs(5, 8, world)
+    points = [budget.measure_point(runs, case) for case in of_both]
+    assert all(p.within_budget for p in points)
+    tight, generous = budget.comparisons(points)
+    assert tight.share < 0.9
+    assert generous.share < 1.05

@@ -1,20 +1,17 @@
 """Accuracy against bytes: value and budget, fixed intervals, everything both ways.
 
-Every point is a whole log once, or a simulated team with several seeds, all robots with the same
-settings; what it cost is what was sent, not what was allowed. Everything: a fix of each sighting of
-a teammate, beliefs at 5 Hz to whoever sees the robot.
-
-Simulated teams are of mixed quality, and their robots meet now and then. One robot in five is a
-guide: it sees landmarks, and has good sensors. The others see teammates only, and half of them have
-poor odometry. Each drives from point to point on a field with 20 m² for each, and sees 6 m ahead.
+Every point is a whole log once, or simulated teams of mixed quality with several seeds, all robots
+with the same settings; what it cost is what was sent, not what was allowed. Everything: a fix of
+each sighting of a teammate, beliefs at 5 Hz to whoever sees the robot. A budget is compared with a
+fixed interval at the bytes that were sent, which is interpolated between those of the experiment.
 """
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
-from itertools import cycle, groupby
+from itertools import groupby, pairwise
 from pathlib import Path
-from random import Random
+from statistics import fmean, stdev
 from typing import Any, NamedTuple
 
 from msgspec import Struct
@@ -22,13 +19,12 @@ from msgspec.structs import replace
 from rich.console import RenderableType
 
 from cpcbl_launch.lab.evaluation import evaluate_log
+from cpcbl_launch.lab.experiments.mixed_teams import mixed_team
 from cpcbl_launch.lab.experiments.runs import ExperimentResult, map_in_processes
 from cpcbl_launch.reporting.recorder import Report, mean_score
 from cpcbl_launch.reporting.tables import cells, table
 from cpcbl_launch.run.logged_team import LoggedTeam
 from cpcbl_launch.simulation.in_process import simulate
-from cpcbl_launch.team_file import builtin_path, load_team
-from cpcbl_team import config
 from cpcbl_team.config import Team
 from cpcbl_team.errors import InputError
 
@@ -38,7 +34,7 @@ EVERYTHING: Mapping[str, Any] = {"least_value": 0.0, "least_use": 0.0, "belief_s
 RARE = {"least_value": 0.2, "least_use": 0.9, "fix_interval_s": 10.0, "belief_rate_hz": 0.1}
 SIMULATED_S = 300.0
 OURS = ("bytes limited", "messages limited", "value alone")
-ROBOT_AREA_M2, LANDMARK_AREA_M2 = 20.0, 12.0
+BUDGETS, INTERVALS = OURS[:2], "fixed interval"
 
 
 class Point(Struct, frozen=True, kw_only=True):
@@ -54,6 +50,25 @@ class Point(Struct, frozen=True, kw_only=True):
     inside_3_sigma: float | None
     nees: float | None
     within_budget: bool
+    runs: tuple["RunFigures", ...] = ()
+
+
+class RunFigures(Struct, frozen=True):
+    """One run of a point: means over its robots."""
+
+    bytes_per_s: float
+    position_rmse_m: float
+
+
+class Comparison(Struct, frozen=True, kw_only=True):
+    """The error under a budget as a share of that with a fixed interval of the same bytes: mean
+    over the runs, and its standard error if there are several."""
+
+    setting: str
+    bytes_per_s: float
+    position_rmse_m: float
+    share: float
+    standard_error: float | None
 
 
 class Target(Struct, frozen=True, kw_only=True):
@@ -70,6 +85,7 @@ class Curve(ExperimentResult, frozen=True, kw_only=True):
     blind: tuple[str, ...]
     duration_s: float
     points: tuple[Point, ...]
+    comparisons: tuple[Comparison, ...]
     targets: tuple[Target, ...]
 
 
@@ -96,7 +112,7 @@ def cases() -> list[Case]:
         every.append(Case("value alone", f"{least:g} nats", rules))
     for interval_s in (240, 120, 60, 30, 15, 8, 4, 2, 1, 0.5):
         rules = {**EVERYTHING, "fix_interval_s": interval_s, "belief_rate_hz": 1.0 / interval_s}
-        every.append(Case("fixed interval", f"{interval_s:g} s", rules))
+        every.append(Case(INTERVALS, f"{interval_s:g} s", rules))
     every.append(Case("all, one way", "no limit", EVERYTHING))
     every.append(Case("all, both ways", "no limit", {**EVERYTHING, "direction": "both-ways"}))
     return every
@@ -117,28 +133,11 @@ def runs_of_log(logged: LoggedTeam) -> Runs:
     return Runs(name, logged.team, duration_s, partial(_log_reports, logged))
 
 
-def simulated_runs(size: int, seeds: int) -> Runs:
-    """Mixed teams of this size, one for each seed."""
-    reports = partial(_simulated_reports, size, seeds)
-    return Runs(f"{size} robots, {seeds} seeds", mixed_team(size, 1), SIMULATED_S, reports)
-
-
-def mixed_team(size: int, seed: int) -> Team:
-    """A team of so many robots of the kinds in `teams/mixed.toml`; the seed determines their ways
-    and the map."""
-    random, side_m = Random(f"{seed} {size}"), math.sqrt(ROBOT_AREA_M2 * size)
-    base, robots = load_team(builtin_path("mixed")), {}
-    for i, kind in zip(range(size), cycle(base.robots.values()), strict=False):
-        first, *others = [_place(random, side_m) for _ in range(8)]
-        start = config.Start(x_m=first[0], y_m=first[1], heading_deg=random.uniform(-180.0, 180.0))
-        robots[f"r{i:02}"] = replace(kind, start=start, waypoints_m=(*others, first))
-    places = [_place(random, side_m) for _ in range(round(ROBOT_AREA_M2 * size / LANDMARK_AREA_M2))]
-    marks = {f"m{i}": config.Landmark(x_m=x, y_m=y) for i, (x, y) in enumerate(places)}
-    return replace(base, name=f"mixed{size}", robots=robots, map=config.Field(landmarks=marks))
-
-
-def _place(random: Random, side_m: float) -> tuple[float, float]:
-    return random.uniform(0.0, side_m), random.uniform(0.0, side_m)
+def simulated_runs(size: int, seeds: int, world: str = "mixed") -> Runs:
+    """Mixed teams of this size in this world, one for each seed."""
+    teams = {seed: mixed_team(size, seed, world) for seed in range(1, seeds + 1)}
+    name = f"{world}, {size} robots, {seeds} seeds"
+    return Runs(name, teams[1], SIMULATED_S, partial(_simulated_reports, teams))
 
 
 def _log_reports(logged: LoggedTeam, case: Case) -> list[Report]:
@@ -150,9 +149,8 @@ def _log_reports(logged: LoggedTeam, case: Case) -> list[Report]:
     return [report]
 
 
-def _simulated_reports(size: int, seeds: int, case: Case) -> list[Report]:
-    teams = {seed: _with_case(mixed_team(size, seed), case) for seed in range(1, seeds + 1)}
-    return [simulate(team, seed, SIMULATED_S)[0] for seed, team in teams.items()]
+def _simulated_reports(teams: Mapping[int, Team], case: Case) -> list[Report]:
+    return [simulate(_with_case(team, case), seed, SIMULATED_S)[0] for seed, team in teams.items()]
 
 
 def _with_case(team: Team, case: Case) -> Team:
@@ -167,7 +165,8 @@ def _with_case(team: Team, case: Case) -> Team:
 def measure_point(runs: Runs, case: Case) -> Point:
     """The figures of one case, means over its runs. Raises InputError if a log has no ground truth
     in its time."""
-    robots = [named for report in runs.reports(case) for named in report.robots.items()]
+    reports = runs.reports(case)
+    robots = [named for report in reports for named in report.robots.items()]
     team = mean_score(r for _, r in robots)
     blind = mean_score(r for name, r in robots if name in _blind(runs.team))
     robot_s = runs.duration_s * len(robots)
@@ -184,7 +183,58 @@ def measure_point(runs: Runs, case: Case) -> Point:
         inside_3_sigma=team.inside_3_sigma,
         nees=team.nees,
         within_budget=all(s.most <= s.allowed for _, r in robots for s in r.spending),
+        runs=tuple(_run_figures(report, runs.duration_s) for report in reports),
     )
+
+
+def _run_figures(report: Report, duration_s: float) -> RunFigures:
+    sent, rmse_m = report.team.bytes_sent, report.team.position_rmse_m
+    assert rmse_m is not None
+    return RunFigures(sent / (duration_s * len(report.robots)), rmse_m)
+
+
+def interval_rmse_m(intervals: Sequence[RunFigures], bytes_per_s: float) -> float | None:
+    """The RMSE with a fixed interval of so many bytes: the best of those that send no more, or
+    interpolated to it, in logarithms. None if all of them send more."""
+    best, before = math.inf, list[RunFigures]()
+    for run in sorted(intervals, key=lambda run: run.bytes_per_s):
+        best = min(best, run.position_rmse_m)
+        before.append(RunFigures(run.bytes_per_s, best))
+    for low, high in pairwise(before):
+        if low.bytes_per_s <= bytes_per_s <= high.bytes_per_s:
+            if low.bytes_per_s == high.bytes_per_s:
+                return high.position_rmse_m
+            way = math.log(bytes_per_s / low.bytes_per_s)
+            way /= math.log(high.bytes_per_s / low.bytes_per_s)
+            ratio = high.position_rmse_m / low.position_rmse_m
+            return low.position_rmse_m * math.exp(way * math.log(ratio))
+    return best if before and before[-1].bytes_per_s <= bytes_per_s else None
+
+
+def comparisons(points: Sequence[Point]) -> tuple[Comparison, ...]:
+    """Each budget beside a fixed interval of the bytes that it sent, run by run."""
+    intervals = [p.runs for p in points if p.series == INTERVALS]
+    compared = []
+    for p in points:
+        if p.series not in BUDGETS:
+            continue
+        shares = [
+            run.position_rmse_m / rmse_m
+            for number, run in enumerate(p.runs)
+            if (rmse_m := interval_rmse_m([i[number] for i in intervals], run.bytes_per_s))
+        ]
+        if shares:
+            error = stdev(shares) / math.sqrt(len(shares)) if len(shares) > 1 else None
+            compared.append(
+                Comparison(
+                    setting=p.setting,
+                    bytes_per_s=p.bytes_per_s,
+                    position_rmse_m=p.position_rmse_m,
+                    share=fmean(shares),
+                    standard_error=error,
+                )
+            )
+    return tuple(compared)
 
 
 def _blind(team: Team) -> tuple[str, ...]:
@@ -201,6 +251,7 @@ def measure_curve(runs: Runs, jobs: int | None, done: Callable[[], None]) -> Cur
         blind=_blind(runs.team),
         duration_s=runs.duration_s,
         points=points,
+        comparisons=comparisons(points),
         targets=targets(points),
     )
 
@@ -233,6 +284,12 @@ def tables(result: Curve) -> Iterable[RenderableType]:
         for i, p in enumerate(points):
             shown.add_row("" if i else series, p.setting, *cells(p, quantities))
         shown.add_section()
+    yield shown
+    columns = ("B/s", "RMSE m", "of interval", "±")
+    shown = table("beside a fixed interval of the same bytes", ("budget",), columns)
+    for c in result.comparisons:
+        figures = cells(c, "bytes_per_s:.2f position_rmse_m:.3f share:.2f standard_error:.2f")
+        shown.add_row(c.setting, *figures)
     yield shown
     for t in result.targets:
         best, off = "nothing was", ""
