@@ -162,7 +162,7 @@ def test_the_gateway_is_a_service_whose_tokens_are_its_secret(
     file.write_text('name = "lab"\n' + GATEWAY.format(host))
     found = yaml.safe_load(deployment_text(load_team(file), file, tmp_path, "mine:2", 1))
     gateway, owner = found["services"]["gateway"], f"{os.getuid()}:{tokens.stat().st_gid}"
-    assert gateway["command"][:4] == ["gateway", "/team/lab.toml", "--host", "0.0.0.0"]
+    assert gateway["command"][:4] == ["gateway", "/team/lab.toml", "--listen", "0.0.0.0:8447"]
     assert gateway["command"][-2:] == ["--connect", "tcp/router:7447"]
     assert gateway["ports"] == [f"{published}:8447"]
     assert gateway["user"] == owner

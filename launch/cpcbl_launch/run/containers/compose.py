@@ -169,7 +169,7 @@ def _gateway_service(
     here = published_port("gateway.host", settings.host, settings.port)
     uid, gid = how.tokens_owner.split(":")
     secret = {"source": _SECRET, "target": tokens.target, "uid": uid, "gid": gid, "mode": 0o400}
-    inside = ("--host", "0.0.0.0", "--port", str(port))
+    inside = ("--listen", f"0.0.0.0:{port}")
     return _GATEWAY.format(
         command=_flow(("gateway", how.team_file, *inside, *connect)),
         user=_flow(how.tokens_owner),
