@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from support.buses import MS, SECOND, examples
 
 from cpcbl_team.config import BudgetSettings
-from cpcbl_transport.budget import Budget, bytes_window
+from cpcbl_transport.budget import LONGEST_INTERVAL_S, Budget, bytes_window
 from cpcbl_transport.messages import Spending
 
 FIX, BELIEF = 42, 50
@@ -248,9 +248,11 @@ LIMITED = [
 
 
 def test_the_own_interval_earns_a_fix_for_each_teammate_and_a_belief_beside_the_reserve() -> None:
-    """At 1 B/s of which a fifth is reserved; three messages at 5 a minute; no limit."""
-    by_bytes = Budget(BudgetSettings(bytes_per_s=1.0, urgent_share=0.2), 0)
-    assert by_bytes.own_interval_s(4) == pytest.approx((4 * FIX + BELIEF) / 0.8)
+    """At 2 B/s of which a fifth is reserved; at too little; at 5 a minute; without a limit."""
+    by_bytes = Budget(BudgetSettings(bytes_per_s=2.0, urgent_share=0.2), 0)
+    assert by_bytes.own_interval_s(4) == pytest.approx((4 * FIX + BELIEF) / 1.6)
+    tiny = Budget(BudgetSettings(bytes_per_s=0.5, urgent_share=0.2), 0)
+    assert tiny.own_interval_s(4) == LONGEST_INTERVAL_S
     by_number = Budget(BudgetSettings(messages_per_minute=5.0, urgent_share=0.0), 0)
     assert by_number.own_interval_s(2) == pytest.approx(36.0)
     assert Budget(BudgetSettings(), 0).own_interval_s(4) == 0.0

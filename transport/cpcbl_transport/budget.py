@@ -20,6 +20,7 @@ from cpcbl_transport.messages import Spending
 SHORTEST_WINDOW_S = 10.0
 LEAST_BYTES = 500.0  # in a window, so that a small budget can be used up by whole messages
 INTERVAL_MEMORY = 20.0  # messages: while so many are earned, the interval's factor falls by e
+LONGEST_INTERVAL_S = 240.0  # of a tiny budget: in more time teammates get lost
 _ROUNDING = 1e-9
 
 
@@ -121,10 +122,11 @@ class Budget:
         )
 
     def own_interval_s(self, teammates: int) -> float:
-        """The time in which a fix for each of so many teammates, and a belief, are earned; 0
-        without limits."""
+        """The time in which a fix for each of so many teammates, and a belief, are earned, at
+        most `LONGEST_INTERVAL_S`; 0 without limits."""
         size = teammates * sent_bytes(FIX_BYTES) + sent_bytes(BELIEF_BYTES)
-        return self._earned_s(size, teammates + 1) / self._spent_share
+        earned_s = self._earned_s(size, teammates + 1) / self._spent_share
+        return min(earned_s, LONGEST_INTERVAL_S)
 
     def interval_s(self, now_ns: int, teammates: int) -> float:
         """The interval at which a message is due now, if there are so many teammates to help."""
