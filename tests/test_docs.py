@@ -105,8 +105,9 @@ def test_every_reason_of_a_refusal_has_its_remedy_in_the_docs() -> None:
     page = (ROOT / "docs/refused_inputs.md").read_text()
     table = page.partition("## Reasons")[2].partition("## Other problems")[0]
     listed = {name for row in table.splitlines() for name in re.findall(r"`(\w+)`", _cell(row))}
-    pictures = (ROOT / "agents/cpcbl_agents/vision/pictures.py").read_text()
-    images = set(re.findall(r'"(frame_\w+)"', pictures))
+    vision = ROOT / "agents/cpcbl_agents/vision"
+    code = "".join((vision / name).read_text() for name in ("pictures.py", "detector.py"))
+    images = set(re.findall(r'"(frame_\w+)"', code))
     faults = {*SightingFault, *TimelineRefusal, *images, "seen_twice", "no_camera"}
     assert listed == {str(reason) for reason in {*Refusal, *faults, "unknown_object"}}
     assert set(REASONS) <= listed

@@ -193,7 +193,7 @@ class InputMonitor:
         self._facts = Facts(
             robot,
             {},
-            tuple(_expected(settings)),
+            tuple(_due_inputs(settings)),
             frozenset(team.map.landmarks) | frozenset(team.map.walls) | frozenset(team.robots),
             team.map.landmarks,
             settings.sensor,
@@ -339,7 +339,7 @@ def _since_stamp(steps: Iterable[Step], since_ns: int) -> list[Step]:
     return found
 
 
-def _expected(settings: RobotSettings) -> Iterator[str]:
+def _due_inputs(settings: RobotSettings) -> Iterator[str]:
     """The inputs that a robot's driver owes it."""
     detects = settings.sensing == "camera"
     if settings.source == "mrclam":

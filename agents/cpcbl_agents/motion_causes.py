@@ -72,7 +72,7 @@ def _turn_of_rate(step: Step) -> float:
     return step.turn_rad * _seconds(step)
 
 
-def _moved(step: Step) -> float:
+def _distance(step: Step) -> float:
     return step.distance_m
 
 
@@ -94,31 +94,31 @@ _90_OFF = "bearings are 90° off; ahead is 0, left is positive"
 _SINCE = "distances look like distances since the start, not of each piece"
 _HEADINGS = "turns look like headings, not turns of each piece"
 _MM, _CM = "distances look like millimetres", "distances look like centimetres"
-AS_IT_CAME = Mistake("", _moved, _turned)
+AS_IT_CAME = Mistake("", _distance, _turned)
 MISTAKES = (
-    Mistake(_HEADINGS, _moved, turn_total=1.0),
-    Mistake("turns look like headings in degrees", _moved, turn_total=DEGREE),
-    Mistake("turns look like degrees", _moved, _in_degrees),
-    Mistake(MIRRORED, _moved, lambda s: -s.turn_rad),
-    Mistake("turns look like rates (rad/s)", _moved, _turn_of_rate),
+    Mistake(_HEADINGS, _distance, turn_total=1.0),
+    Mistake("turns look like headings in degrees", _distance, turn_total=DEGREE),
+    Mistake("turns look like degrees", _distance, _in_degrees),
+    Mistake(MIRRORED, _distance, lambda s: -s.turn_rad),
+    Mistake("turns look like rates (rad/s)", _distance, _turn_of_rate),
     Mistake(_SINCE, None, _turned),
-    Mistake(_MM, _moved, _turned, 1e-3),
-    Mistake(_CM, _moved, _turned, 1e-2),
-    Mistake("distances look like feet, or come from km/h", _moved, _turned, 0.29),
+    Mistake(_MM, _distance, _turned, 1e-3),
+    Mistake(_CM, _distance, _turned, 1e-2),
+    Mistake("distances look like feet, or come from km/h", _distance, _turned, 0.29),
     Mistake("distances look like speeds (m/s)", _way_of_speed, _turned),
-    Mistake("ranges look like millimetres", _moved, _turned, 1e3),
-    Mistake("ranges look like centimetres", _moved, _turned, 1e2),
-    Mistake("ranges look like feet", _moved, _turned, 1.0 / 0.3048),
+    Mistake("ranges look like millimetres", _distance, _turned, 1e3),
+    Mistake("ranges look like centimetres", _distance, _turned, 1e2),
+    Mistake("ranges look like feet", _distance, _turned, 1.0 / 0.3048),
     Mistake(
-        "distances have the wrong sign or frame, or bearings are 180° off", _moved, _turned, -1.0
+        "distances have the wrong sign or frame, or bearings are 180° off", _distance, _turned, -1.0
     ),
-    Mistake(_90_OFF, _moved, _turned, 1.0j),
-    Mistake(_90_OFF, _moved, _turned, -1.0j),
+    Mistake(_90_OFF, _distance, _turned, 1.0j),
+    Mistake(_90_OFF, _distance, _turned, -1.0j),
     Mistake(f"{_HEADINGS}, and {_SINCE}", None, turn_total=1.0),
     Mistake(f"turns look like headings in degrees, and {_SINCE}", None, turn_total=DEGREE),
     Mistake("distances and turns look like speeds (m/s, rad/s)", _way_of_speed, _turn_of_rate),
-    Mistake(f"turns look like degrees, and {_MM}", _moved, _in_degrees, 1e-3),
-    Mistake(f"turns look like degrees, and {_CM}", _moved, _in_degrees, 1e-2),
+    Mistake(f"turns look like degrees, and {_MM}", _distance, _in_degrees, 1e-3),
+    Mistake(f"turns look like degrees, and {_CM}", _distance, _in_degrees, 1e-2),
     Mistake("distances and turns are swapped", lambda s: s.turn_rad, lambda s: s.distance_m),
 )
 """Those of one kind come before those of two, and win a tie."""

@@ -86,6 +86,13 @@ WAYS = {
     "cpcbl-team chaos all --seed 2 --json --report chaos.json --markdown chaos.md": Way(
         '"outcomes"', "long", instead=("chaos all", "chaos kill-robot")
     ),
+    "cpcbl-team chaos freeze partition --keys": Way(
+        "freeze", "long", instead=("freeze partition", "kill-robot")
+    ),
+    "cpcbl-team chaos nemesis": Way("nemesis", "long", "--duration 60"),
+    "cpcbl-team chaos nemesis --seed 7 --duration 600 --history what.jsonl": Way(
+        "nemesis", "long", instead=("600", "60")
+    ),
     "cpcbl-team check team.toml": Way("team.toml: good: team 'lab', 3 robots"),
     "cpcbl-team compose team.toml": Way("robot-r1:"),
     "cpcbl-team compose team.toml > compose.yaml": Way("robot-r1:"),
@@ -118,6 +125,8 @@ WAYS = {
     "cpcbl-team gateway team.toml": LIVE._replace(
         says="gateway of team lab", more="--listen :0", beside="router"
     ),
+    "cpcbl-team gateway lab.toml --guest tripod": Way("has a token of tripod"),
+    "cpcbl-team gateway team.toml --guest tripod": Way("has a token of tripod"),
     "cpcbl-team init lab": Way("lab/team.toml and lab/driver.py are written", more="--yes"),
     "cpcbl-team keys team.toml --host 192.168.1.10 --observer tripod": Way("robot r1|robot/r1"),
     "cpcbl-team keys team.toml --renew r1": Way("renewed"),
@@ -210,12 +219,14 @@ ELSEWHERE = {
     f"{CURL}/pose/r1": f"{SNIPPETS}::test_the_shell_of_the_gateway",
 }
 LEFT_OUT = {
+    'cd "$(python -c': "systemd's folder of the package; its units are in the tests of systemd",
+    "sudo ": "it would change this machine; the units are in the tests of systemd",
     "zenohd -c router.json5": "no package of zenohd; `router --config` reads the same file",
     "git clone": "pictures of others; CPCBL_PICTURES=FOLDER make test-long uses such a folder",
     "for f in nao": "it arranges these pictures",
 }
 OUTPUT_ELSEWHERE = {
-    "rendered frames: 10000, seed 1": "tests/benchmarks/test_detection.py::benchmark_shows",
+    "rendered frames: 3000, seed 1": "tests/benchmarks/test_detection.py::benchmark_shows",
     "duckiebot: 15 pictures": "tests/benchmarks/test_pictures.py::test_the_benchmark_shows",
     "team.toml: warning: robots.r1": f"{SNIPPETS}::test_the_warnings_of_the_page",
     "thresholds, 8-bit HSV": "tests/launch/calibration/test_calibrate_colours.py::8-bit HSV",

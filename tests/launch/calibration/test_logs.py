@@ -97,12 +97,12 @@ def damaged(whole: bytes, seed: int) -> bytes:
 def test_a_damaged_recording_is_one_line_or_read(tmp_path: Path) -> None:
     path = tmp_path / "log.mcap"
     simulate_recorded(TEAM, 1, 1.0, path)
-    whole, errors = path.read_bytes(), list[LogError]()
+    whole, errors = path.read_bytes(), list[InputError]()
     for seed in range(300):
         path.write_bytes(damaged(whole, seed))
         try:
             read_recording(path)
-        except LogError as error:
+        except InputError as error:
             errors.append(error)
     assert not any("\n" in str(error) for error in errors)
     assert {type(error.__cause__).__name__ for error in errors} >= {"ZstdError", "KeyError"}
