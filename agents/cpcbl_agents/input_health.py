@@ -34,9 +34,9 @@ from cpcbl_transport.messages import (
 
 WINDOW = 10  # judgements, one a second: shares are those of the last so many
 SETTLED_NS = 2_000_000_000  # what was on its way when the robot started is too late
-OFTEN, SELDOM = 20, 5
+OFTEN, SELDOM = 20, 10
 """To look for what is implausible takes half a millisecond: at each of the first judgements with
-odometry or sightings and while something is found, later at every fifth one."""
+odometry or sightings and while something is found, later at every tenth one."""
 SECOND_NS, EMPTY_NS = 1_000_000_000, 5_000_000_000
 UNSEEN = 25  # judgements: of real logs a robot saw nothing for 20 s in front of landmarks
 EMPTY_CAME = "empty frames came too before"

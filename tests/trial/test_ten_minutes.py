@@ -193,8 +193,8 @@ ROUNDS = (
     ),
     (
         Mistake("stamps in ms", "odometry refused: stamps look like milliseconds"),
-        Mistake("ranges in mm", "they look like millimetres"),
-        Mistake("mirrored bearings", "the wrong sign; left is positive"),
+        Mistake("ranges in mm", "look like millimetres"),
+        Mistake("mirrored bearings", "left is positive"),
     ),
     (
         Mistake("stamps 2 s ahead", "odometry refused: stamps are 2 s ahead of this robot's clock"),
@@ -217,7 +217,7 @@ ROUNDS = (
     ),
     (
         Mistake("wrong landmark", "`Southeast` (`southeast`?)"),
-        Mistake("turns in degrees", "rad/s: they look like "),
+        Mistake("turns in degrees", "look like degrees"),
         Mistake("mirrored turns", "the wrong sign; left is positive"),
     ),
 )
