@@ -61,14 +61,13 @@ def test_a_budget_is_compared_with_an_interval_of_the_same_bytes() -> None:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("world", WORLDS)
-def test_help_by_value_is_better_than_a_fixed_interval_of_the_same_bytes(world: str) -> None:
-    """By a fifth at 4 B/s; at 20 B/s an interval too sends nearly all that is worth sending."""
+def test_help_by_value_is_better_than_a_fixed_interval_of_the_same_bytes() -> None:
+    """Clearly at 4 B/s; at 20 B/s an interval too sends nearly all that is worth sending."""
     chosen = {"4 B/s", "20 B/s", "120 s", "60 s", "30 s", "15 s", "8 s", "4 s"}
     of_both = [case for case in budget.cases() if case.setting in chosen]
-    runs = budget.simulated_runs(5, 8, world)
+    runs = budget.simulated_runs(5, 8)
     points = [budget.measure_point(runs, case) for case in of_both]
     assert all(p.within_budget for p in points)
     tight, generous = budget.comparisons(points)
-    assert tight.share < 0.9
-    assert generous.share < 1.05
+    assert tight.share < 0.95
+    assert generous.share < 1.02

@@ -44,7 +44,7 @@ def mixed_team(size: int, seed: int, world: str = "mixed") -> Team:
     if world in ("one-observer", "chain"):
         robots = _with_one_guide(robots)
     if world == "one-observer":
-        robots["r00"] = _stationary(robots["r00"], side_m / 2.0)
+        robots["r00"] = _observer_at(robots["r00"], side_m / 2.0)
     area = (PART_M, WIDTH_M) if world == "chain" else (side_m, side_m)
     number = max(1, round(ROBOT_AREA_M2 * size / LANDMARK_AREA_M2[world]))
     places = _places(random, 4 if world == "chain" else number, *area)
@@ -82,7 +82,7 @@ def _with_one_guide(robots: dict[str, RobotSettings]) -> dict[str, RobotSettings
     }
 
 
-def _stationary(robot: RobotSettings, at_m: float) -> RobotSettings:
+def _observer_at(robot: RobotSettings, at_m: float) -> RobotSettings:
     start = config.Start(x_m=at_m, y_m=at_m, heading_deg=0.0, sigma_m=0.01)
     sensor = replace(robot.sensor, field_of_view_deg=360.0)
     odometry = replace(robot.odometry, moves=False)
