@@ -26,6 +26,7 @@ HOT = (
     "motion",
     "object_timers",
     "own_calibration",
+    "range_errors",
     "recovery",
     "relocalization",
     "sensors",

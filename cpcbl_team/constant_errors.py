@@ -181,6 +181,9 @@ class Evidence(NamedTuple):
         return self._replace(vector=(x - u, y - v, z - w), total=self.total - explained)
 
 
+NO_EVIDENCE: Final = Evidence()
+
+
 def _dot(a: Row, b: Row) -> float:
     ax, ay, az = a
     bx, by, bz = b

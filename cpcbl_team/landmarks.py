@@ -66,10 +66,13 @@ class LandmarkUpdate:
         pose, self.covariance, _ = state.estimate  # all is linearized at this prior
         self.x, self.y, self.heading = pose
         self.weight = 1.0  # of what the sensor model says
+        self.range_scale, self.range_offset_m = 1.0, 0.0
         adaptation = state.memory.calibration.adaptation
         if adaptation is not AS_CONFIGURED:
             self.heading -= adaptation.bearing_bias_rad  # the direction of bearing 0
             self.weight = 1.0 / adaptation.sensor_factor
+            self.range_scale = adaptation.ranges.scale
+            self.range_offset_m = adaptation.ranges.offset_m
         self.evidence = InformationSum()
         self.used: dict[str, int] = {}  # the landmarks whose evidence was accepted, and when: now
         self.rejected: list[str] = []  # the landmarks that the gate has rejected
@@ -160,13 +163,13 @@ class Landmarks:
         """Adds the constraints of one landmark, unless the gate rejects them. A range gives the row
         (u, v, 0), a bearing (m, n, 1)."""
         dx, dy = mark.x - update.x, mark.y - update.y
-        distance_squared = dx * dx + dy * dy
-        distance = sqrt(distance_squared)
+        distance = sqrt(distance_squared := dx * dx + dy * dy)
         if distance < NEAREST_M:
             return
         u = v = m = n = range_error = bearing_error = range_weight = bearing_weight = 0.0
         if range_m is not None:
-            u, v, range_error = circle(dx, dy, distance, range_m)
+            corrected_m = update.range_scale * range_m + update.range_offset_m
+            u, v, range_error = circle(dx, dy, distance, corrected_m)
             range_weight = update.weight / sharpest(self._range_variance(distance, range_m))
         if bearing is not None:
             m, n, bearing_error = heading(dx, dy, distance_squared, bearing, update.heading)

@@ -72,13 +72,13 @@ class Localizer:
         self._moves = settings.odometry.moves
         self._odometry_timeout_ns = int(settings.odometry.timeout_s * 1e9)
         self._has_dead_zone = settings.odometry.least_speed_m_s > 0.0
-        self._calibration = OwnCalibration(settings, field)
         self._widens = rules.variant != "weighted" and not rules.paper_uncertainty
         self._window = rules.lost_window
         self._belief_age_ns = int(settings.collaboration.max_age_s * 1e9)
         self._timers = ObjectTimers(settings)
         self._variant = variant_of(settings)
         self._landmarks = Landmarks(field, settings, gates)
+        self._calibration = OwnCalibration(settings, field, self._landmarks)
         self.recovery = Recovery(settings, field, self._landmarks, self._variant.reduce)
         self.screen = TeammateScreen(settings, gates, self._variant.is_probabilistic)
 
@@ -219,7 +219,8 @@ class Localizer:
         measured: list[Measurement] = []
         faults: list[str] = []
         calibration = state.memory.calibration
-        bias, factor = calibration.bearing_bias_rad, calibration.adaptation.sensor_factor
+        bias, adaptation = calibration.bearing_bias_rad, calibration.adaptation
+        factor, is_wrong = adaptation.sensor_factor, bias != 0.0 or any(adaptation.ranges)
         for sighting in sightings:
             fault = sighting_fault(sighting)
             if fault:
@@ -227,7 +228,7 @@ class Localizer:
                 continue
             m = measurement_of(sighting, now_ns, pose, self.field, beliefs, self.settings)
             if m is not None:
-                m = m if bias == 0.0 else m.rotated(-bias)
+                m = m.corrected(bias, adaptation.ranges) if is_wrong else m
                 measured.append(m if factor == 1.0 else m.inflated(factor))
         return measured, faults
 

@@ -34,6 +34,7 @@ from cpcbl_team.fusion import Observation, chi_square
 from cpcbl_team.gaussian import Covariance2
 from cpcbl_team.geometry import Pose2, step, wrap_angle
 from cpcbl_team.inputs import Belief, HeadingBelief, Sighting
+from cpcbl_team.range_errors import RangeErrors
 from cpcbl_team.sensors import sighting_sigmas
 
 _EXACT = Covariance2(0.0, 0.0, 0.0)
@@ -115,11 +116,14 @@ class Measurement(msgspec.Struct, frozen=True, gc=False):
         sigmas = {"range_sigma": k * self.range_sigma, "bearing_sigma": k * self.bearing_sigma}
         return msgspec.structs.replace(self, **sigmas)
 
-    def rotated(self, angle: float) -> "Measurement":
-        """With a bearing that is larger by this angle (rad)."""
-        if self.bearing is None:
-            return self
-        return msgspec.structs.replace(self, bearing=wrap_angle(self.bearing + angle))
+    def corrected(self, bearing_bias: float, ranges: RangeErrors) -> "Measurement":
+        """Without this bias of its bearing (rad), and these errors of its range. (A bias of ranges
+        to teammates is another one.)"""
+        bearing = None if self.bearing is None else wrap_angle(self.bearing - bearing_bias)
+        range_m = self.range_m
+        if range_m is not None:
+            range_m = ranges.scale * range_m + (0.0 if self.is_teammate else ranges.offset_m)
+        return msgspec.structs.replace(self, bearing=bearing, range_m=range_m)
 
 
 class GatedObject(NamedTuple):

@@ -33,6 +33,7 @@ from cpcbl_team.constant_errors import (
 from cpcbl_team.estimate import SMALLEST_VARIANCE, Estimate, Matrix3, Row
 from cpcbl_team.geometry import Pose2, new, wrap_angle
 from cpcbl_team.motion import move
+from cpcbl_team.range_errors import NO_RANGE_ERRORS, RangeErrors
 
 BLOCK_NS: Final = 1_500_000_000
 LONGEST_NS: Final = 5_000_000_000
@@ -138,6 +139,7 @@ class Adaptation(NamedTuple):
     bearing_bias_rad: float = 0.0
     motion_factor: float = 1.0  # of the variance of the motion
     sensor_factor: float = 1.0  # of the variances of ranges and bearings
+    ranges: RangeErrors = NO_RANGE_ERRORS
 
 
 AS_CONFIGURED: Final = Adaptation()
@@ -280,10 +282,16 @@ def noise_with_factor(noise: OdometryNoise, factor: float) -> OdometryNoise:
     )
 
 
-def sigma_percentages(adaptation: Adaptation) -> dict[str, int]:
-    """How large the sigmas are, in percent of those of the settings, where they are others."""
+def percentages(adaptation: Adaptation) -> dict[str, int]:
+    """How large sigmas and ranges are in percent of those of the settings, where they differ; and
+    by how much ranges are longer or shorter."""
     factors = {
         "odometry_sigma_percent": adaptation.motion_factor,
         "sensor_sigma_percent": adaptation.sensor_factor,
     }
-    return {name: round(100.0 * math.sqrt(f)) for name, f in factors.items() if f != 1.0}
+    found = {name: round(100.0 * math.sqrt(f)) for name, f in factors.items() if f != 1.0}
+    if (share := adaptation.ranges.share) != 0.0:
+        found["range_percent"] = round(100.0 / (1.0 - share))
+    if (offset_m := adaptation.ranges.offset_m) != 0.0:  # counts are not negative
+        found[f"range_{'plus' if offset_m > 0.0 else 'minus'}_mm"] = round(1000.0 * abs(offset_m))
+    return found

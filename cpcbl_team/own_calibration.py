@@ -4,13 +4,13 @@ A robot that calibrates itself (`self_calibration.py`) learns scales and a bias 
 other one changes its settings only where they are wrong (`miscalibration.py`).
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 from cpcbl_team.config import Field, LocalizationSettings, OdometryNoise
-from cpcbl_team.constant_errors import NO_ERRORS, Evidence, pose_offset
+from cpcbl_team.constant_errors import NO_ERRORS, NO_EVIDENCE, pose_offset
 from cpcbl_team.estimate import POSE, offset_pose
 from cpcbl_team.geometry import new
-from cpcbl_team.landmarks import LandmarkUpdate
+from cpcbl_team.landmarks import Landmarks, LandmarkUpdate
 from cpcbl_team.measurements import GatedObject
 from cpcbl_team.miscalibration import (
     AS_CONFIGURED,
@@ -23,15 +23,18 @@ from cpcbl_team.miscalibration import (
     noise_with_factor,
 )
 from cpcbl_team.motion import NO_VARIANCE, MotionVariance, distance_variance, turn_variance
+from cpcbl_team.range_errors import NO_RANGE_ERRORS, RangeErrors, Seen
+from cpcbl_team.recovery import SPACING_NS
 from cpcbl_team.self_calibration import ReferencePose, ReferencePoses, self_calibrate
-from cpcbl_team.state import CalibrationMemory, Memory, State, with_memory
+from cpcbl_team.state import CalibrationMemory, Evidence, Memory, RecoveryMemory, State, with_memory
 
 
 class OwnCalibration:
     """The calibration of one robot by itself."""
 
-    def __init__(self, settings: LocalizationSettings, field: Field) -> None:
+    def __init__(self, settings: LocalizationSettings, field: Field, landmarks: Landmarks) -> None:
         rules = settings.localizer
+        self._landmarks = landmarks
         self._noise: OdometryNoise = settings.odometry
         self._gate_probability = rules.gate_probability
         self._learns = rules.learns
@@ -41,7 +44,9 @@ class OwnCalibration:
         # Of two that contradict each other either one may be wrong
         self._names_misplaced = len(field.landmarks) + len(field.walls) > 2
         block_s = BLOCK_NS * 1e-9
-        self._independent_share = block_s / (block_s + 2.0 * settings.sensor.correlation_s)
+        correlation_s, spacing_s = settings.sensor.correlation_s, SPACING_NS * 1e-9
+        self._independent_share = block_s / (block_s + 2.0 * correlation_s)
+        self._independent_frames = spacing_s / (spacing_s + 2.0 * correlation_s)
 
     def is_known(self, state: State) -> bool:
         """Whether the robot knows anything of its calibration that its settings do not say."""
@@ -93,8 +98,46 @@ class OwnCalibration:
             return self._after_learning(state)
         begin = state.memory.calibration.check.begin
         if self._is_checked and (begin is None or state.stamp_ns - begin.stamp_ns >= BLOCK_NS):
-            return self._after_check(state)
+            return self._after_check(self._with_ranges(state))
         return state
+
+    def _with_ranges(self, state: State) -> State:
+        """The state that has compared distances between landmarks with the map, once a block."""
+        memory, recovery = state.memory.calibration, state.memory.recovery
+        if memory.check.begin is None or recovery.lost:
+            return state
+        ranges = memory.ranges
+        present = memory.adaptation
+        for frame in self._frames_since(recovery, memory.check.begin.stamp_ns, present.ranges):
+            ranges = ranges.plus(frame)
+        errors = ranges.errors(present.ranges, self._independent_frames)
+        if errors != present.ranges:
+            if present.ranges == NO_RANGE_ERRORS:
+                state = state.counted("miscalibrated")
+                # What was collected with other ranges is void
+                memory = memory._replace(check=ModelCheck(accepted=state.updates.accepted))
+            memory = memory._replace(adaptation=present._replace(ranges=errors))
+        return _with_calibration(state, memory._replace(ranges=ranges))
+
+    def _frames_since(
+        self, recovery: RecoveryMemory, since_ns: int, present: RangeErrors
+    ) -> Iterable[list[Seen]]:
+        """The landmarks that were seen with range and bearing after this time, by frames."""
+        pieces: list[Evidence] = []
+        for e in recovery.evidence:
+            if e.stamp_ns > since_ns and not e.from_teammate and e.range_m is not None:
+                read_m = (e.range_m - present.offset_m) / present.scale  # these are corrected
+                pieces.append(e._replace(range_m=read_m))
+        for snapshot in recovery.snapshots:
+            if snapshot.stamp_ns > since_ns:
+                pieces += self._landmarks.evidence_of(snapshot)
+        frames: dict[int, list[Seen]] = {}
+        for e in pieces:
+            if e.range_m is not None and e.bearing_rad is not None:
+                sigmas = e.range_sigma_m, e.bearing_sigma_rad
+                seen = Seen(e.source, e.x, e.y, e.range_m, e.bearing_rad, *sigmas)
+                frames.setdefault(e.stamp_ns, []).append(seen)
+        return frames.values()
 
     def _after_learning(self, state: State) -> State:
         memory, place = state.memory.calibration, state.odometry_from_robot
@@ -134,12 +177,13 @@ class OwnCalibration:
                 state = state._replace(estimate=state.estimate._replace(pose=pose))
                 now = now._replace(estimate=state.estimate)
                 # Other sigmas whiten otherwise: what was collected with the old ones is void
-                has_errors = errors != NO_ERRORS
-                evidence = check.evidence.without(errors) if has_errors else Evidence()
+                evidence = NO_EVIDENCE
+                if errors != NO_ERRORS:
+                    evidence = check.evidence.without(errors)
                 check = ModelCheck(now, check.sensitivity, evidence, accepted=accepted)
                 state, present = state.counted("miscalibrated"), changed
-        learned, references, total_turn_rad, _, _, rejections = memory
-        parts = learned, references, total_turn_rad, check, present, rejections
+        learned, references, total_turn_rad, _, _, rejections, ranges = memory
+        parts = learned, references, total_turn_rad, check, present, rejections, ranges
         return _with_calibration(state, new(CalibrationMemory, parts))
 
 

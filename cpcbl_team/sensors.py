@@ -70,18 +70,21 @@ def corrected_sighting(sighting: Sighting, sensor: SensorSettings, teammate: boo
     return Sighting(name, range_m, bearing, range_sigma, bearing_sigma, heading, heading_sigma)
 
 
-def without_bearing_bias(frame: Sightings, bias_rad: float) -> Sightings:
-    """The frame with this bias subtracted from its bearings and headings; faulty sightings are not
-    changed."""
-    if bias_rad == 0.0:
+def recalibrated(frame: Sightings, bias_rad: float, range_scale: float = 1.0) -> Sightings:
+    """The frame with this bias subtracted from its bearings and headings, and with its ranges times
+    this scale; faulty sightings are not changed."""
+    if bias_rad == 0.0 and range_scale == 1.0:
         return frame
     sightings = []
     for s in frame.sightings:
-        bearing, heading = s.bearing_rad, s.heading_rad
-        if bearing is not None and not sighting_fault(s):
-            bearing = wrap_angle(bearing - bias_rad)
-            heading = None if heading is None else wrap_angle(heading - bias_rad)
-            s = msgspec.structs.replace(s, bearing_rad=bearing, heading_rad=heading)
+        range_m, bearing, heading = s.range_m, s.bearing_rad, s.heading_rad
+        if not sighting_fault(s):
+            range_m = None if range_m is None else range_scale * range_m
+            if bearing is not None:
+                bearing = wrap_angle(bearing - bias_rad)
+                heading = None if heading is None else wrap_angle(heading - bias_rad)
+            read = {"range_m": range_m, "bearing_rad": bearing, "heading_rad": heading}
+            s = msgspec.structs.replace(s, **read)
         sightings.append(s)
     return Sightings(frame.stamp_ns, tuple(sightings))
 

@@ -16,6 +16,7 @@ from cpcbl_team.estimate import HEADING, POSE, POSITION, Covariance3, Estimate, 
 from cpcbl_team.geometry import Pose2, new, wrap_angle
 from cpcbl_team.inputs import Belief, Odometry, Sighting
 from cpcbl_team.miscalibration import AS_CONFIGURED, Adaptation, MapRejections, ModelCheck
+from cpcbl_team.range_errors import RangeEvidence
 from cpcbl_team.self_calibration import ReferencePoses, SelfCalibration
 from cpcbl_team.trust import SenderRecord
 
@@ -133,6 +134,7 @@ class CalibrationMemory(NamedTuple):
     check: ModelCheck = ModelCheck()
     adaptation: Adaptation = AS_CONFIGURED
     rejections: MapRejections = MapRejections()
+    ranges: RangeEvidence = RangeEvidence()
 
     @property
     def corrected(self) -> SelfCalibration:

@@ -7,9 +7,9 @@ from cpcbl_agents.agent import AgentMessage, FrameEstimate, PoseEstimate, Presen
 from cpcbl_team.config import Field, LocalizationSettings
 from cpcbl_team.inputs import Belief, BeliefShared, Fix, Input, Odometry, Position, Sightings
 from cpcbl_team.localizer import Localizer
-from cpcbl_team.miscalibration import MISPLACED, sigma_percentages
+from cpcbl_team.miscalibration import MISPLACED, percentages
 from cpcbl_team.self_calibration import SelfCalibration
-from cpcbl_team.sensors import without_bearing_bias
+from cpcbl_team.sensors import recalibrated
 from cpcbl_team.timeline import Timeline
 from cpcbl_team.trust import TrustStatus, trust_statuses
 
@@ -48,7 +48,7 @@ class FilterAgent:
         the settings and the map."""
         state = self.timeline.state
         calibration = state.memory.calibration
-        factors = sigma_percentages(calibration.adaptation)
+        factors = percentages(calibration.adaptation)
         if name := calibration.rejections.misplaced(state.stamp_ns):
             factors[MISPLACED + name] = 1
         return self.counts + Counter(self.timeline.state.counts) + Counter(factors)
@@ -120,7 +120,8 @@ class FilterAgent:
             if state is None:
                 continue
             calibration = state.memory.calibration
-            frame = without_bearing_bias(frame, calibration.bearing_bias_rad)
-            factor = calibration.adaptation.sensor_factor
+            adaptation = calibration.adaptation
+            factor, scale = adaptation.sensor_factor, adaptation.ranges.scale
+            frame = recalibrated(frame, calibration.bearing_bias_rad, scale)
             ready.append(FrameEstimate(frame, state.estimate, state.lost, factor))
         return ready

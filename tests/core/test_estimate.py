@@ -286,6 +286,37 @@ def test_a_split_merge_is_consistent_whatever_is_correlated(
         assert least_eigenvalue((claimed - true)[block]) > -1e-9
 
 
+@ranks
+@seeds
+@pytest.mark.parametrize("scope", [Scope.POSITION, Scope.HEADING])
+def test_a_split_merge_correlates_what_it_leaves_alone_as_before(
+    seed: int, rank: int, scope: Scope
+) -> None:
+    """The part out of scope was not inflated, so nor was its covariance with the rest."""
+    rng = np.random.default_rng(seed)
+    covariance = covariance3(random_matrix(rng, 3))
+    prior, observation = Estimate(POSE, covariance, covariance), random_observation(rng, rank)
+    H, *_ = parts(observation)
+    expected = (np.eye(3) - gain(prior, observation, scope) @ H) @ matrix3(covariance)
+    merged = matrix3(merge_split(prior, observation, scope).covariance)
+    if scope is Scope.POSITION:
+        np.testing.assert_allclose(merged[:2, 2], expected[:2, 2], atol=1e-9)
+    else:
+        np.testing.assert_allclose(merged[2, :2], expected[2, :2], atol=1e-9)
+
+
+def test_an_error_that_two_readings_share_wholly_is_no_certainty() -> None:
+    """Their difference is then exact, which no evidence may be."""
+    together = Covariance2(0.01, 0.01, 0.01)
+    observation = Observation(PLACE, (0.1, 0.1), Covariance2(0.0, 0.0, 0.0), together)
+    prior = Estimate(POSE, diagonal(0.3, 0.1), diagonal(0.2, 0.1))
+    merged = merge_split(prior, observation)
+    private = matrix3(merged.covariance) - matrix3(merged.shared)
+    assert least_eigenvalue(matrix3(merged.covariance)) > 0.0
+    assert least_eigenvalue(matrix3(merged.shared)) > -1e-9
+    assert least_eigenvalue(private) > -1e-9
+
+
 @seeds
 def test_a_split_merge_counts_as_private_only_what_is(seed: int) -> None:
     rng = np.random.default_rng(seed)

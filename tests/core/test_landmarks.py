@@ -13,6 +13,7 @@ from support.core import (
     PROBABILISTIC,
     SECOND,
     covariance3,
+    diagonal,
     localizer,
     point_sighting,
     random_matrix,
@@ -215,3 +216,13 @@ def test_a_plain_landmark_is_not_measured_the_general_way(monkeypatch: pytest.Mo
         exact = (point_sighting(LOOP_START, n, p.x_m, p.y_m) for n, p in CORNERS.landmarks.items())
         after = robot.cycle(state, Sightings(NOW, tuple(exact)))
         assert after.updates.accepted == 4
+
+
+def test_a_ray_to_an_object_behind_says_nothing() -> None:
+    """Its reading points the other way, however little the robot knows of its heading."""
+    robot = localizer("oval", Field(landmarks={"post": Landmark(x_m=2.0, y_m=0.0)}))
+    state = state_at(Pose2(0.0, 0.0, 0.0), diagonal(0.1, 1.5), NOW)
+    updates = state.updates._replace(heading_is_latest=True)
+    behind = Sightings(NOW, (Sighting("post", None, 2.0),))
+    after = robot.cycle(state._replace(updates=updates), behind)
+    assert after.estimate == state.estimate

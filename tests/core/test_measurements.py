@@ -12,8 +12,10 @@ from cpcbl_team.config import (
     LocalizationSettings,
     LocalizerSettings,
     SensorSettings,
+    Variant,
     Wall,
 )
+from cpcbl_team.constraints import bearing_position, bearing_ray, curvature
 from cpcbl_team.estimate import Scope
 from cpcbl_team.geometry import Pose2
 from cpcbl_team.inputs import Belief, Sighting
@@ -136,3 +138,34 @@ def test_the_gate_measures_the_innovation_of_the_whole_observation(name: str, sc
     expected = whole.normalized_innovation_squared(prior.covariance)
     assert expected > 0.0
     assert gated_object(prior, measurement, cs).nis == pytest.approx(expected, rel=1e-12)
+
+
+def test_a_teammate_nearby_is_as_uncertain_as_its_linear_form_is_wrong() -> None:
+    """That part of the error repeats itself, so it counts as the teammate's."""
+    prior, place = state_at(HERE, diagonal(0.3, 0.2)).estimate, (0.6, 0.8)
+    m = measure(Sighting("mate", 1.0, 0.9), teammates={"mate": (belief(*place, sigma_m=0.2),)})
+    assert m is not None
+    found = observation_of(prior, m, constraints_of(HERE, m, Scope.POSE, LocalizerSettings()))
+    both = prior.covariance.plus(diagonal(0.2, 0.0))
+    of_range, of_bearing = curvature(both, *place)
+    assert of_range > 0.01
+    assert found.dependent.xx == pytest.approx(0.2**2 + of_range)
+    assert found.dependent.yy == pytest.approx(0.2**2 + of_bearing)
+
+
+@pytest.mark.parametrize("variant", ["oval", "circular"])
+def test_a_ray_is_linear_at_the_estimate_and_as_drawn_at_the_reading(variant: Variant) -> None:
+    m = measure(Sighting("ne", 5.0, 1.2))
+    assert m is not None
+    place = m.position.x, m.position.y
+    read = 1.2, m.bearing_sigma
+    for rules, expected in (
+        (LocalizerSettings(variant=variant), bearing_position(HERE, *place, *read)),
+        (
+            LocalizerSettings(variant=variant, paper_uncertainty=True),
+            bearing_ray(HERE, *place, *read),
+        ),
+    ):
+        assert expected is not None
+        *_, ray = constraints_of(HERE, m, Scope.POSITION, rules)
+        assert ray.row[:2] == expected.row[:2]

@@ -45,10 +45,10 @@ from cpcbl_team.miscalibration import (
     ModelCheck,
     adapted,
     noise_with_factor,
-    sigma_percentages,
+    percentages,
 )
 from cpcbl_team.motion import motion_noise
-from cpcbl_team.sensors import without_bearing_bias
+from cpcbl_team.sensors import recalibrated
 from cpcbl_team.state import CalibrationMemory, Memory, State
 
 START = Start(x_m=LOOP_START.x, y_m=LOOP_START.y, sigma_m=0.05, heading_sigma_deg=3.0)
@@ -94,7 +94,7 @@ def run(
         state = robot.add_odometry(state, Odometry(now, now + PIECE_NS, *reading))
         now += PIECE_NS
         seen = frame(pose, now, noise=errors)
-        state = robot.cycle(state, without_bearing_bias(seen, -truth.bearing_bias_rad))
+        state = robot.cycle(state, recalibrated(seen, -truth.bearing_bias_rad))
         off = np.array([state.estimate.pose.x - pose.x, state.estimate.pose.y - pose.y])
         nees.append(off @ np.linalg.solve(matrix3(state.estimate.covariance)[:2, :2], off))
     return state, float(np.mean(nees[-len(nees) // 3 :]))
@@ -175,7 +175,7 @@ def test_an_adaptation_is_what_the_right_settings_would_be() -> None:
     seen = frame(truth, SECOND)
     seen = Sightings(SECOND, (*seen.sightings, wall_sighting(truth, "wall", wall)))
     adapting = wrong.add_odometry(before._replace(memory=memory), Odometry(0, SECOND, 1.0, 0.2))
-    adapting = wrong.cycle(adapting, without_bearing_bias(seen, -0.1))
+    adapting = wrong.cycle(adapting, recalibrated(seen, -0.1))
     expected = right.cycle(right.add_odometry(before, Odometry(0, SECOND, 1.1, 0.18)), seen)
     assert len(expected.updates.objects_ns) == 5
     assert adapting.estimate.pose == pytest.approx(expected.estimate.pose, abs=1e-12)
@@ -286,11 +286,11 @@ def test_scattered_corrections_widen_what_they_point_at() -> None:
     assert adapted(scattered(1.0, alternating=True), AS_CONFIGURED, 0, due) is None
     by_sensor = adapted(scattered(2.0, alternating=True), AS_CONFIGURED, 0, due)
     assert by_sensor is not None
-    assert by_sensor == pytest.approx(Adaptation(sensor_factor=4.0), rel=0.05)
+    assert by_sensor[:5] == pytest.approx(Adaptation(sensor_factor=4.0)[:5], rel=0.05)
     assert adapted(scattered(2.0, alternating=True), AS_CONFIGURED, 0, due, 0.03) is None
     by_motion = adapted(scattered(2.0, alternating=False), AS_CONFIGURED, 0, due)
     assert by_motion is not None
-    assert by_motion == pytest.approx(Adaptation(motion_factor=4.0), rel=0.05)
+    assert by_motion[:5] == pytest.approx(Adaptation(motion_factor=4.0)[:5], rel=0.05)
     again = adapted(scattered(0.5, alternating=True), by_sensor, 0, due)
     assert again is not None
     assert again.sensor_factor == pytest.approx(1.0, rel=0.05)
@@ -310,7 +310,7 @@ def explained(bias: float, blocks: int = 12) -> ModelCheck:
 def test_a_clear_constant_error_is_corrected() -> None:
     found = adapted(explained(0.1), AS_CONFIGURED, 0, 0.999)
     assert found is not None
-    assert found == pytest.approx(Adaptation(bearing_bias_rad=0.1), abs=0.01)
+    assert found[:5] == pytest.approx(Adaptation(bearing_bias_rad=0.1)[:5], abs=0.01)
     assert adapted(explained(0.1), AS_CONFIGURED, 0, 0.999, 0.2) is None  # errors come in groups
     assert adapted(explained(0.1, blocks=8), AS_CONFIGURED, 0, 0.999) is None  # too few
     assert adapted(explained(0.05), AS_CONFIGURED, 0, 0.999) is None  # 3.3 sigma
@@ -336,5 +336,5 @@ def test_noise_that_is_said_to_be_zero_can_be_widened() -> None:
         turn_sigma_rad_per_sqrt_m=0.0,
     )
     assert noise_with_factor(exact, 4.0).distance_sigma_m_per_sqrt_m == pytest.approx(0.02)
-    assert sigma_percentages(Adaptation(motion_factor=4.0)) == {"odometry_sigma_percent": 200}
-    assert sigma_percentages(AS_CONFIGURED) == {}
+    assert percentages(Adaptation(motion_factor=4.0)) == {"odometry_sigma_percent": 200}
+    assert percentages(AS_CONFIGURED) == {}

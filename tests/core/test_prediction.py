@@ -172,3 +172,15 @@ def test_a_speed_that_cannot_be_is_not_extrapolated() -> None:
     robot, state = localizer(odometry=EXACT), state_at(ORIGIN, diagonal(0.0, 0.0))
     state = robot.add_odometry(state, Odometry(0, 1, 1e-3, 0.0))
     assert robot.predict(state, SECOND // 2).estimate.pose.x == pytest.approx(1e-3)
+
+
+def test_after_lost_odometry_the_heading_is_in_doubt_too() -> None:
+    """As long as the robot may drive on, by its last turn rate; then as fast as that allows."""
+    robot, still = localizer(odometry=EXACT), state_at(ORIGIN, diagonal(0.0, 0.0))
+    turning = robot.add_odometry(still, Odometry(0, PIECE_NS, 0.0, 0.5 * PIECE_NS / SECOND))
+    variances = [
+        robot.predict(turning, PIECE_NS + after_ns).estimate.covariance.hh
+        for after_ns in (SECOND // 5, SECOND // 2, 3 * SECOND // 2)
+    ]
+    within = 0.3**2 * 0.5**2
+    assert variances == pytest.approx([0.3**2 * 0.2**2, within, within + 0.3**2 + 0.5**2])

@@ -192,6 +192,29 @@ def test_a_pose_found_by_a_teammates_reports_is_shared() -> None:
     assert set(measured.shared) == {0.0}
 
 
+def test_a_pose_whose_evidence_disagrees_is_as_uncertain_as_that() -> None:
+    """Readings that are off by about two sigmas: the covariance grows by chi-square a residual."""
+    exact = measured_along(PATH, ["ne", "nw", "se"])
+    off = [
+        e._replace(range_m=e.range_m + (-1) ** i * 2.0 * e.range_sigma_m)
+        for i, e in enumerate(exact)
+        if e.range_m is not None
+    ]
+    agreeing, disagreeing = (
+        relocalize(tuple(pieces), PATH[-1], CORNERS, NOISE) for pieces in (exact, off)
+    )
+    assert agreeing is not None
+    assert disagreeing is not None
+    ratio = disagreeing.covariance.determinant() / agreeing.covariance.determinant()
+    assert ratio > 1.5**3
+
+
+def test_evidence_without_a_sigma_is_no_division_by_zero() -> None:
+    exact = measured_along(PATH, ["ne", "nw", "se"])
+    sharp = tuple(e._replace(range_sigma_m=0.0, bearing_sigma_rad=0.0) for e in exact)
+    assert found_at(sharp, PATH[-1]) is not None
+
+
 # Dead reckoning drifts ----------------------------------------------------------------------------
 
 

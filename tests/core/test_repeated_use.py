@@ -98,3 +98,14 @@ def test_another_object_counts_in_full_at_any_time() -> None:
     once = add_frame(robot, state_at(ORIGIN, diagonal(0.3, 0.2)), TENTH)
     other = frame(HERE, 2 * TENTH, names=["nw"])
     assert alike(robot.cycle(once, other), plain.cycle(once, other))
+
+
+@sources
+def test_a_source_is_used_once_in_its_interval(
+    report: Callable[[Localizer, State, int], State],
+) -> None:
+    robot = standing("joint", object_interval_s=1.0)
+    once = report(robot, state_at(ORIGIN, diagonal(0.3, 0.2)), TENTH)
+    again = report(robot, once, 2 * TENTH)
+    assert (again.estimate, again.counts) == (once.estimate, once.counts)
+    assert report(robot, again, TENTH + SECOND).counts["accepted"] == 2

@@ -43,7 +43,7 @@ from cpcbl_team.self_calibration import (
     SelfCalibration,
     self_calibrate,
 )
-from cpcbl_team.sensors import without_bearing_bias
+from cpcbl_team.sensors import recalibrated
 from cpcbl_team.state import CalibrationMemory, Memory, RecoveryMemory, State
 
 ORIGIN = Pose2(0.0, 0.0, 0.0)
@@ -356,7 +356,7 @@ def test_the_calibration_corrects_odometry_and_bearings() -> None:
     robot = calibrating_robot(True)
     moved = robot.predict(robot.add_odometry(before, Odometry(0, SECOND, 1.0, 0.5)), SECOND)
     assert moved.estimate.pose == pytest.approx(step(ORIGIN, 0.9, 0.4))
-    frame_with_bias = without_bearing_bias(frame(ORIGIN, 1), -0.1)
+    frame_with_bias = recalibrated(frame(ORIGIN, 1), -0.1)
     seen = robot.cycle(before, frame_with_bias).estimate.pose
     assert seen.heading == pytest.approx(0.0, abs=1e-9)
 

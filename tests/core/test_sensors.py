@@ -11,11 +11,11 @@ from cpcbl_team.sensors import (
     corrected_odometry,
     corrected_sighting,
     range_sigma_m,
+    recalibrated,
     repetition_variance_factor,
     sighting_fault,
     sighting_sigmas,
     time_at_min_speed_s,
-    without_bearing_bias,
     without_duplicates,
 )
 
@@ -171,7 +171,7 @@ def test_a_heading_keeps_its_angle_to_the_line_of_sight(
     sensor = SensorSettings(bearing_scale=scale, bearing_bias_deg=bias_deg)
     seen = Sighting("a", 2.0, bearing, None, None, heading, 0.1)
     found = corrected_sighting(seen, sensor, True)
-    for after in (found, *without_bearing_bias(Sightings(7, (seen,)), 0.3).sightings):
+    for after in (found, *recalibrated(Sightings(7, (seen,)), 0.3).sightings):
         assert after.heading_rad is not None
         assert after.bearing_rad is not None
         assert abs(after.heading_rad) <= math.pi
@@ -225,7 +225,7 @@ def test_a_frame_uses_each_reading_once() -> None:
 def test_a_bias_is_subtracted_from_all_valid_bearings() -> None:
     good = (Sighting("a", 1.0, 0.3, 0.1, 0.2), Sighting("b", None, -3.1), Sighting("c", 1.0))
     faulty = (Sighting("d", 1.0, NAN), Sighting("e", 1.0, math.inf), Sighting("f", 1.0, 3.2))
-    found = without_bearing_bias(Sightings(7, good + faulty), 0.1)
+    found = recalibrated(Sightings(7, good + faulty), 0.1)
     turned = Sighting("a", 1.0, 0.3 - 0.1, 0.1, 0.2), Sighting("b", None, math.tau - 3.2)
     assert found.stamp_ns == 7
     assert [s.bearing_rad for s in found.sightings[:2]] == pytest.approx(

@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 from support.core import (
     LOOP_START,
     belief,
@@ -196,3 +197,48 @@ def test_the_shared_part_stays_a_part_of_the_covariance(variant: Variant, paper:
         covariance, shared = matrix3(state.estimate.covariance), matrix3(state.estimate.shared)
         for part in (covariance, shared, covariance - shared):
             assert least_eigenvalue(part) > -1e-9 * np.trace(covariance)
+
+
+def test_two_teammates_in_one_frame_are_two_landmarks() -> None:
+    """The second one is merged about the estimate that the first one moved."""
+    places = {"mate": (3.0, 0.5), "other": (3.2, -0.4)}
+    posts = Field(landmarks={n: Landmark(x_m=x, y_m=y) for n, (x, y) in places.items()})
+    seen = [point_sighting(Pose2(0.1, 0.05, 0.05), n, *place) for n, place in places.items()]
+    ends = []
+    for robot in (standing("joint", posts), standing("joint", Field())):
+        state = state_at(ORIGIN, diagonal(0.13, 0.1))
+        for name, place in places.items() if robot.field.landmarks == {} else ():
+            known = replace(belief(*place, sigma_m=1e-6), robot=name)
+            state = robot.add_teammate_belief(state, known)
+        ends.append(robot.cycle(state, Sightings(1, tuple(seen))).estimate)
+    assert ends[1].pose == pytest.approx(ends[0].pose, rel=0.03)
+    assert math.hypot(ends[1].pose.x, ends[1].pose.y) > 0.08
+
+
+@pytest.mark.parametrize(("nis", "counts"), [(13.0, "accepted"), (14.5, "gated")])
+def test_a_fix_is_rejected_by_the_bound_of_two_degrees_of_freedom(nis: float, counts: str) -> None:
+    """99.9 %: 13.8; 10.8 of one degree of freedom."""
+    before = state_at(ORIGIN, diagonal(0.3, 0.2))
+    sigma_m = math.sqrt(0.3**2 + 2.0 * 0.05**2)
+    after = standing("joint").add_fix(before, fix(math.sqrt(nis) * sigma_m, 0.0, 1))
+    assert after.counts == {counts: 1}
+
+
+@pytest.mark.parametrize(("nis", "counts"), [(10.0, "accepted"), (11.5, "gated")])
+def test_the_heading_of_a_fix_is_rejected_by_the_bound_of_one(nis: float, counts: str) -> None:
+    before = state_at(ORIGIN, diagonal(0.3, 0.2))
+    sigma = math.sqrt(0.2**2 + 0.05**2 + 0.02**2)
+    after = standing("joint").add_fix(before, fix(0.0, 0.0, 1, heading=math.sqrt(nis) * sigma))
+    assert after.counts[counts] == 1
+
+
+@pytest.mark.parametrize(("nis", "agrees"), [(8.5, True), (9.5, False)])
+def test_a_fix_with_a_heading_is_judged_by_three_degrees_of_freedom(
+    nis: float, agrees: bool
+) -> None:
+    """Half of it from the position, half from the heading; 6 of two are 9 of three."""
+    before = state_at(ORIGIN, diagonal(0.3, 0.2))
+    off_m = math.sqrt(0.5 * nis * (0.3**2 + 2.0 * 0.05**2))
+    turned = math.sqrt(0.5 * nis * (0.2**2 + 0.05**2 + 0.02**2))
+    after = standing("joint").add_fix(before, fix(off_m, 0.0, 1, heading=turned))
+    assert (after.memory.teammates.senders["mate"].score == 0.0) is agrees

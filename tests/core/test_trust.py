@@ -117,6 +117,11 @@ def test_a_sender_that_is_only_suspected_is_not_used_and_not_quarantined() -> No
     assert found.quarantined == {"west"}
 
 
+def test_a_sender_below_the_limit_is_used_while_nobody_is_above_it() -> None:
+    senders = disputed(east=0.7, a=0.0, b=0.0)
+    assert assess(senders, "east", TeammateReport(10 * SECOND, USUAL_NIS), 0, RULES).trusted
+
+
 def test_a_sender_that_is_suspected_votes_against_the_estimate() -> None:
     senders = disputed(west=1.2, east=0.7, a=0.0)
     decision = assess(senders, "a", TeammateReport(10 * SECOND, AGREES), 0, RULES)

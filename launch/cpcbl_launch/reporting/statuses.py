@@ -173,6 +173,13 @@ def miscalibration_text(counts: Mapping[str, int]) -> str:
         for what in ("odometry", "sensor")
         if (name := f"{what}_sigma_percent") in counts
     ]
+    if (percent := counts.get("range_percent")) is not None:
+        texts.append(f"ranges × {percent / 100.0:.2f}")
+    texts += [
+        f"ranges {sign} {counts[name] / 1000.0:.2f} m"
+        for sign, word in (("+", "plus"), ("-", "minus"))
+        if (name := f"range_{word}_mm") in counts
+    ]
     used, rejected = counts.get("accepted", 0), counts.get("gated", 0)
     texts.append(f"{rejected / max(used + rejected, 1):.1%} of observations rejected")
     return ", ".join(texts)

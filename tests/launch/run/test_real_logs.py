@@ -73,10 +73,10 @@ def test_robots_calibrated_on_other_logs_are_accurate_and_know_how_much(
     assert not report.seen_before
     assert team_rmse_m(report) <= rmse_m
     assert report.team.nees is not None
-    assert 1.0 <= report.team.nees <= 4.0
+    assert 0.5 <= report.team.nees <= 4.0  # σ holds what differs between days
     for robot, r in report.robots.items():
         assert r.inside_3_sigma is not None
-        assert r.inside_3_sigma >= 0.95, robot
+        assert r.inside_3_sigma >= 0.97, robot
         assert r.lost_at_end == "", robot
 
 
