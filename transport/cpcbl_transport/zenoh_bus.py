@@ -11,6 +11,7 @@
 
 import json
 import logging
+import os
 import re
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -28,6 +29,9 @@ from cpcbl_transport.zenoh_config import client_config
 
 log = logging.getLogger(__name__)
 
+RUNTIME = "ZENOH_RUNTIME"
+ROUTER_RUNTIME = "(rx: (worker_threads: 16))"
+"""Two by default: two slow receivers held up everybody."""
 TOKENS_S = 5.0  # for the router's answer
 LEAST_DESCRIPTORS, MOST_DESCRIPTORS = 64, 65_536
 WAITING_S = 10.0  # after so long it is said again that no router answers
@@ -83,11 +87,16 @@ def open_router(config: Mapping[str, Any], space: str | None = None) -> "ZenohBu
     """A session that is a router for all teams, as its configuration says. Without a namespace its
     own keys are whole ones. Raises BusError when it cannot listen there."""
     require_descriptors()
+    own = RUNTIME not in os.environ  # read once, when Zenoh starts
+    os.environ.setdefault(RUNTIME, ROUTER_RUNTIME)
     try:
         return ZenohBus(_open(config, space))
     except zenoh.ZError as error:
         endpoints = ", ".join(listening_at(config))
         raise BusError(f"cannot listen on {endpoints}: {listen_problem(str(error))}") from error
+    finally:
+        if own:
+            del os.environ[RUNTIME]  # child processes are no routers
 
 
 def read_router_config(path: Path) -> dict[str, Any]:

@@ -26,13 +26,21 @@ from typing import Any
 
 from cpcbl_team.config import GuardSettings, Team
 from cpcbl_transport import topics
-from cpcbl_transport.messages import LARGEST_PAYLOAD
+from cpcbl_transport.messages import LARGEST_FRAME, LARGEST_PAYLOAD
 from cpcbl_transport.security import Credentials, link_options
 from cpcbl_transport.topics import Topic
 
 OPEN_TIMEOUT_MS = 2000
 LEASE_MS = 2000
+BLOCKED_US = 200_000  # so long a declaration waits for a silent session, which ends then
+LARGEST_MESSAGE = LARGEST_FRAME + 16_384  # with its key and headers; checked fragment by fragment
 
+# A session that reads nothing must not hold up the router's threads, which serve all others
+_NEVER_BLOCK = {
+    "flows": ["egress"],
+    "messages": ["put", "delete"],
+    "overwrite": {"congestion_control": "drop"},
+}
 _RETRY = {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 2}
 _PUTS = {"flows": ["ingress"], "messages": ["put", "delete"]}
 _TX = {"sequence_number_resolution": "16bit", "lease": LEASE_MS, "keep_alive": 4}
@@ -86,7 +94,12 @@ def router_config(
     each other did not exchange anything any more (Zenoh 1.10).
     """
     here = {"endpoints": list(listen), "exit_on_failure": True}
-    return {**_config("router", connect, -1, credentials, listen=here), **(guards or {})}
+    config = _config("router", connect, -1, credentials, listen=here)
+    link = config["transport"]["link"]
+    waits = {"congestion_control": {"block": {"wait_before_close": BLOCKED_US}}}
+    link["tx"] = {**_TX, "queue": waits}
+    link["rx"] = {"max_message_size": LARGEST_MESSAGE}
+    return {**config, "qos": {"network": [_NEVER_BLOCK]}, **(guards or {})}
 
 
 def guard_rules(team: Team, speed: float = 1.0) -> dict[str, Any]:
