@@ -106,9 +106,6 @@ WAYS = {
     "cpcbl-team experiment budget --world chain": Way(
         EXPERIMENT, "long", "--team-size 2 --seeds 1"
     ),
-    "cpcbl-team experiment budget --team-size 5 --world chain --seeds 6": Way(
-        EXPERIMENT, "long", instead=("5 --world chain --seeds 6", "2 --world chain --seeds 1")
-    ),
     "cpcbl-team experiment budget MRCLAM6": Way(EXPERIMENT, "long"),
     "cpcbl-team experiment circular-vs-oval": Way(
         EXPERIMENT, "trial", "--seeds 1", shows=("navigator, 5 loops, 20 runs",)
