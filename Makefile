@@ -59,7 +59,7 @@ test-docker: setup
 
 # Every fault scenario; those that need root or Docker say so where there is none.
 chaos: setup
-	$(BIN)/cpcbl-team chaos all --soak-s 120
+	$(BIN)/cpcbl-team chaos all
 
 # The net proves that a refactoring changes no bit; see tests/net/test_net.py.
 net: setup

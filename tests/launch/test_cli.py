@@ -104,6 +104,7 @@ OLD_FORMS = {
     "calibrate camera shots --team t.toml --type eye": "calibrate camera t.toml shots --type eye",
     "calibrate colours --team t.toml --samples s.csv": "calibrate colours t.toml --samples s.csv",
     "calibrate sensor run.mcap --team t.toml": "calibrate sensor t.toml run.mcap",
+    "chaos soak --soak-s 1800": "chaos soak --duration 1800",
     "look t.toml r1 --save seen": "look t.toml r1 --output seen",
     "init lab --name lab2": "init lab --team-name lab2",
     "gateway t.toml --port 80 --host ::1": "gateway t.toml --listen '[::1]:80'",

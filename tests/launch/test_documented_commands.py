@@ -82,7 +82,7 @@ WAYS = {
     ),
     "cpcbl-team chaos --list": Way("kill-router"),
     "cpcbl-team chaos kill-router partition": Way("kill-router", "long"),
-    "cpcbl-team chaos soak --soak-s 1800": Way("soak", "long", "--soak-s 120"),
+    "cpcbl-team chaos soak --duration 1800": Way("soak", "long", "--duration 120"),
     "cpcbl-team chaos all --seed 2 --json --report chaos.json --markdown chaos.md": Way(
         '"outcomes"', "long", instead=("chaos all", "chaos kill-robot")
     ),

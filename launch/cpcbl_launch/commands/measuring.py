@@ -48,9 +48,12 @@ ExportFolder = Annotated[
 Scenarios = Annotated[
     list[str] | None, Argument(help="Names of scenarios, or all.", metavar="SCENARIO")
 ]
-SoakSeconds = Annotated[float, Option(help="Seconds that the soak takes, at least 120.")]
-NemesisSeconds = Annotated[
-    float, Option(help="Seconds in which the nemesis injects faults, at least 20.")
+FaultSeconds = Annotated[
+    float | None,
+    Option(
+        help="Seconds of faults: of the soak (at least 120, the default), and of the nemesis"
+        " (at least 20; default: 60)."
+    ),
 ]
 WithKeys = Annotated[bool, Option("--keys", help="Give the teams keys: TLS and access control.")]
 HistoryFile = Annotated[
@@ -193,8 +196,7 @@ def chaos(
     scenarios: Scenarios = None,
     listed: Annotated[bool, Option("--list", help="Show the scenarios.")] = False,
     seed: Annotated[int, Option(help="The seed of noise and of random faults.")] = 1,
-    soak_s: SoakSeconds = 180.0,
-    duration: NemesisSeconds = 60.0,
+    duration: FaultSeconds = None,
     keys: WithKeys = False,
     history: HistoryFile = None,
     require_judged: RequireJudged = False,
@@ -217,10 +219,10 @@ def chaos(
         runner.print_scenarios(SCENARIOS, Console())
         return
     todo = runner.select_scenarios(scenarios)
-    runner.require_judgeable(todo, soak_s, duration)
+    runner.require_judgeable(todo, duration)
     _prepare_for_faults()
     with runner.Progress(Console(stderr=True), len(todo)) as shown:
-        chosen = ScenarioOptions(seed, soak_s, shown.doing, duration, keys, history)
+        chosen = ScenarioOptions(seed, shown.doing, duration, keys, history)
         faults = runner.run_scenarios(todo, chosen, shown.began, shown.done)
     result = report_data(faults)
     lost = options.write_report(report, result)

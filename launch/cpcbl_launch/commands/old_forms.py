@@ -14,6 +14,7 @@ SUBCOMMANDS: dict[str, dict[str, tuple[str, ...]]] = {
 RENAMED: dict[str, dict[str, str]] = {
     "traffic": {"--for": "--duration"},
     "observer": {"--for": "--duration"},
+    "chaos": {"--soak-s": "--duration"},
     "look": {"--save": "--output"},
     "init": {"--name": "--team-name"},
     "experiment one-way-vs-both": {"--robots": "--team-sizes"},

@@ -241,7 +241,7 @@ def test_the_control_robot_runs_and_leaves_nothing() -> None:
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (("soak", "--soak-s", "60"), "--soak-s 60: too short to judge whether memory grows"),
+        (("soak", "--duration", "60"), "--duration 60: too short to judge whether memory grows"),
         (("nemesis", "--duration", "5"), "--duration 5: too short to judge"),
     ],
 )

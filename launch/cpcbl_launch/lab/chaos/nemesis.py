@@ -53,7 +53,7 @@ KILLS = {"kill": 1, "clock": 2, "liar": 2}  # processes that a fault ends
 FAR = ("navigator", "patrol")
 GUESTS = ("visitor1", "visitor2")
 BYTES_PER_S = 400.0
-SHORTEST_S, STUCK_S, AFTER_S = 20.0, 30.0, 8.0
+SHORTEST_S, USUAL_S, STUCK_S, AFTER_S = 20.0, 60.0, 30.0, 8.0
 JUDGED_S = 90.0  # from this duration on, the memory of what is never killed is judged
 
 
@@ -66,7 +66,7 @@ def require_judged_nemesis(duration_s: float) -> None:
 def nemesis(options: ScenarioOptions, secured: bool = False) -> ScenarioResult:
     """Injects overlapping faults for `duration_s`, then checks the history."""
     require_process_usage("chaos nemesis")
-    duration_s, secured = options.duration_s, secured or options.secured
+    duration_s, secured = options.duration_s or USUAL_S, secured or options.secured
     budget = {"bytes_per_s": BYTES_PER_S}
     settings = with_settings(demo_team(), None, collaboration={"budget": budget})
     robots = list(settings.robots)

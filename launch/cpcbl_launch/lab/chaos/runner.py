@@ -47,11 +47,13 @@ def select_scenarios(names: Sequence[str]) -> list[Scenario]:
     return [s for s in SCENARIOS if ALL in names or s.name in names]
 
 
-def require_judgeable(scenarios: Iterable[Scenario], soak_s: float, duration_s: float) -> None:
+def require_judgeable(scenarios: Iterable[Scenario], duration_s: float | None) -> None:
     """Raises InputError for a soak test or nemesis that is too short to be judged."""
+    if duration_s is None:
+        return
     for scenario in scenarios:
         if scenario.name == "soak":
-            require_judged_soak(soak_s)
+            require_judged_soak(duration_s)
         elif scenario.name.startswith("nemesis"):
             require_judged_nemesis(duration_s)
 

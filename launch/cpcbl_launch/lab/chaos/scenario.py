@@ -20,9 +20,8 @@ class MissingError(CpcblError):
 
 class ScenarioOptions(NamedTuple):
     seed: int = 1
-    soak_s: float = 180.0
     report_progress: Callable[[str], None] = lambda doing: None  # called with each step
-    duration_s: float = 60.0  # of the nemesis
+    duration_s: float | None = None  # of the soak test and of the nemesis; None: as they say
     secured: bool = False  # whether teams have keys, even where the table does not say so
     history: Path | None = None  # where the nemesis writes what happened
     fault: str = ""  # the step of the fault: what the scenario does

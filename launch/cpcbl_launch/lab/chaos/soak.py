@@ -30,12 +30,12 @@ SHORTEST_S = UNDISTURBED_S + 30.0
 STUCK_S = 30.0
 
 
-def require_judged_soak(soak_s: float) -> None:
+def require_judged_soak(duration_s: float) -> None:
     """Raises InputError for a soak test that could not be judged."""
-    if soak_s < SHORTEST_S:
+    if duration_s < SHORTEST_S:
         raise InputError(
-            f"--soak-s {soak_s:g}: too short to judge whether memory grows: each process must run"
-            f" for {LEAST_LIFE_S:g} s; at least {SHORTEST_S:g}"
+            f"--duration {duration_s:g}: too short to judge whether memory grows: each process must"
+            f" run for {LEAST_LIFE_S:g} s; at least {SHORTEST_S:g}"
         )
 
 
@@ -80,9 +80,13 @@ def soak_checks(run: FaultRun, unasked_restarts: int, tracebacks: int) -> list[C
 
 
 def _inject(sampler: MemorySampler, options: ScenarioOptions) -> Counter[str]:
-    """Injects one fault after another for `soak_s`; how many of each."""
+    """Injects one fault after another for `duration_s`; how many of each."""
     team, dice = sampler.team, random.Random(options.seed)
-    robots, end_s, counts = team.robots, team.now_s + options.soak_s, Counter[str]()
+    robots, end_s, counts = (
+        team.robots,
+        team.now_s + (options.duration_s or SHORTEST_S),
+        Counter[str](),
+    )
     targets = {"echo": ["observer"], "kill": [*robots, FIELD, ROUTER]}
 
     def wait(least_s: float, most_s: float) -> None:
