@@ -89,6 +89,9 @@ WAYS = {
     "cpcbl-team chaos freeze partition --keys": Way(
         "freeze", "long", instead=("freeze partition", "kill-robot")
     ),
+    "cpcbl-team chaos slow-link narrow-link lossy-link": Way(
+        "slow-link", "long", instead=(" narrow-link lossy-link", "")
+    ),
     "cpcbl-team chaos nemesis": Way("nemesis", "long", "--duration 60"),
     "cpcbl-team chaos nemesis --seed 7 --duration 600 --history what.jsonl": Way(
         "nemesis", "long", instead=("600", "60")
