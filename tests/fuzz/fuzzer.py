@@ -51,6 +51,8 @@ from cpcbl_transport.zenoh_bus import open_bus
 
 PER_KEY = 10_000
 TOKENS = 300
+LEAST_SHARE = 0.75
+"""Of the rate of a robot without a fault: valid payloads with odd stamps cost the victim tracks."""
 BURST, PAUSE_S = 50, 0.012
 SIGHTINGS_EVERY_S = 0.3
 VICTIM, MATE = "victim", "mate"  # the fuzzer plays the mate
@@ -201,7 +203,7 @@ def victim_checks(log: RunLog, from_s: float, until_s: float) -> list[Check]:
     share = count / (until_s - from_s) / max(possible, 1.0)
     return [
         check_gap(log, [VICTIM], from_s, until_s, "victim's longest gap between tracks", 2.0),
-        at_least("victim's rate of tracks beside a robot without a fault", share, 0.9, "%"),
+        at_least("victim's rate of tracks beside a robot without a fault", share, LEAST_SHARE, "%"),
     ]
 
 
