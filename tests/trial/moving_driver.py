@@ -142,7 +142,7 @@ def main(team_file: str, robot: str, mistake_file: str) -> None:
     config = {"mode": "client", "connect": {"endpoints": team["transport"]["connect"]}}
     with zenoh.open(zenoh.Config.from_json5(json.dumps(config))) as session:
         publishers: dict[str, zenoh.Publisher] = {}
-        last_ns = time.time_ns()
+        mistake, last_ns = MISTAKES["none"], time.time_ns()
         while True:
             time.sleep(PERIOD_S)
             from_ns, last_ns = last_ns, time.time_ns()
@@ -150,7 +150,8 @@ def main(team_file: str, robot: str, mistake_file: str) -> None:
             piece: dict[str, Any] = {"from_ns": from_ns, "stamp_ns": last_ns}
             piece |= {"distance_m": distance_m, "turn_rad": turn_rad}
             frame = {"stamp_ns": last_ns, "sightings": drive.sightings()}
-            mistake = MISTAKES[Path(mistake_file).read_text()]
+            # The file is empty for a moment while it is written
+            mistake = MISTAKES.get(Path(mistake_file).read_text(), mistake)
             for name, content in (("odometry", piece), ("sightings", frame)):
                 for message in mistake(Message(team["name"], robot, name, content)):
                     key = f"cpcbl/{message.team}/in/{message.robot}/{message.input}"

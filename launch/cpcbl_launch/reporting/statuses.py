@@ -163,11 +163,9 @@ def distrust_text(trust: Iterable[Trust | TrustReport]) -> str:
     return f"distrusts {', '.join(named)}" if named else ""
 
 
-def miscalibration_text(counts: Mapping[str, int]) -> str:
+def miscalibration_text(counts: Mapping[str, int], learned: object | None) -> str:
     """`σ of its odometry × 2.1, 13.0% of observations rejected`: why a robot is called
-    miscalibrated; empty if it is not."""
-    if not counts.get("miscalibrated"):
-        return ""
+    miscalibrated; empty if it is not, or no longer. Scales that it has `learned` are not in it."""
     texts = [
         f"σ of its {what} × {counts[name] / 100.0:.1f}"
         for what in ("odometry", "sensor")
@@ -180,9 +178,17 @@ def miscalibration_text(counts: Mapping[str, int]) -> str:
         for sign, word in (("+", "plus"), ("-", "minus"))
         if (name := f"range_{word}_mm") in counts
     ]
+    if not counts.get("miscalibrated") or not (texts or learned):
+        return ""
     used, rejected = counts.get("accepted", 0), counts.get("gated", 0)
     texts.append(f"{rejected / max(used + rejected, 1):.1%} of observations rejected")
     return ", ".join(texts)
+
+
+def learned_text(distance_scale: float, turn_scale: float, bearing_bias_deg: float) -> str:
+    """`distance × 0.98, turn × 0.96, bearings -0.6°`: what a robot does to its readings."""
+    turned = f"bearings {-bearing_bias_deg:+z.1f}°"
+    return f"distance × {distance_scale:.2f}, turn × {turn_scale:.2f}, {turned}"
 
 
 def misplaced_objects(counts: Mapping[str, int]) -> Iterator[str]:

@@ -12,6 +12,7 @@ from cpcbl_launch.reporting.statuses import (
     SpendingReport,
     TrustReport,
     distrust_text,
+    learned_text,
     miscalibration_text,
     summed_flows,
     summed_spending,
@@ -105,7 +106,10 @@ def _problems(name: str, status: Status | None, heard: TeamHeard, is_real: bool)
         yield f"lost: {status.lost}"
     if text := distrust_text(status.trust):
         yield text
-    if text := miscalibration_text(status.counts):
+    if text := miscalibration_text(status.counts, status.learned):
+        if status.learned is not None:
+            distance, turn, bias_rad = status.learned
+            text = f"{learned_text(distance, turn, math.degrees(bias_rad))}, {text}"
         yield f"miscalibrated: {text}"
 
 

@@ -16,6 +16,7 @@ from cpcbl_launch.reporting.phases import AWAY_S
 from cpcbl_launch.reporting.recorder import Effect, GuestReport, Recorder, Report, RobotReport
 from cpcbl_launch.reporting.statuses import (
     distrust_text,
+    learned_text,
     miscalibration_text,
     misplaced_objects,
     problem_remarks,
@@ -93,7 +94,7 @@ class LiveTable(LiveView):
             state = _state(track, pid, restarts.get(process, 0), silent_s, problems)
             if status is not None and (text := distrust_text(status.trust)):
                 state.append(f", {text}", "yellow")
-            if status is not None and status.counts.get("miscalibrated"):
+            if status is not None and miscalibration_text(status.counts, status.learned):
                 state.append(", miscalibrated", "yellow")
             for place in misplaced_objects(status.counts if status is not None else {}):
                 state.append(f", finds {place} elsewhere", "yellow")
@@ -271,10 +272,9 @@ def _remarks(report: Report) -> Iterator[str]:
             yield f"Robot {name} received no input: neither odometry nor sightings nor a position."
     for name, r in report.robots.items():
         if (own := r.learned) is not None:  # what is done to readings
-            scales = f"distance × {own.distance_scale:.2f}, turn × {own.turn_scale:.2f}"
-            turned = f"bearings {-own.bearing_bias_deg:+z.1f}°"
-            yield f"Robot {name} calibrated itself: {scales}, {turned}."
-        if text := miscalibration_text(r.counts):
+            text = learned_text(own.distance_scale, own.turn_scale, own.bearing_bias_deg)
+            yield f"Robot {name} calibrated itself: {text}."
+        if text := miscalibration_text(r.counts, r.learned):
             yield f"Robot {name} is miscalibrated: {text}. Run `cpcbl-team calibrate`."
         for place in misplaced_objects(r.counts):
             yield f"Robot {name} finds {place} elsewhere than on the map; measure its place again."

@@ -17,6 +17,7 @@ from cpcbl_launch.lab.evaluation import evaluate_log
 from cpcbl_launch.lab.experiments import budget
 from cpcbl_launch.overrides import Overrides, with_blind_robots, with_overrides
 from cpcbl_launch.reporting.recorder import LearnedReport, Report
+from cpcbl_launch.reporting.statuses import miscalibration_text
 from cpcbl_launch.run.logged_team import (
     LoggedTeam,
     builtin_for,
@@ -327,6 +328,14 @@ def test_the_remark_says_what_is_wrong_with_the_settings(tmp_path: Path) -> None
     )
     shown = " ".join(printed(msgspec.structs.replace(evaluation, robots=robots)))
     assert text in " ".join(shown.split())
+
+
+def test_a_robot_whose_settings_fit_again_is_not_called_miscalibrated() -> None:
+    """The count tells of every change since the start, the other counts of what differs now."""
+    counts = {"accepted": 985, "gated": 15, "miscalibrated": 2}
+    assert miscalibration_text(counts, None) == ""
+    assert miscalibration_text(counts | {"odometry_sigma_percent": 210}, None) != ""
+    assert miscalibration_text(counts, (0.9, 1.0, 0.0)) == "1.5% of observations rejected"
 
 
 def test_an_evaluation_can_stop_early(tmp_path: Path) -> None:

@@ -7,7 +7,12 @@ from typing import Any, Literal
 import msgspec
 
 from cpcbl_launch.reporting.metrics import degrees
-from cpcbl_launch.reporting.statuses import SpendingReport, TrustReport, distrust_text
+from cpcbl_launch.reporting.statuses import (
+    SpendingReport,
+    TrustReport,
+    distrust_text,
+    miscalibration_text,
+)
 from cpcbl_launch.views.traffic import LiveFlow, Traffic
 from cpcbl_launch.views.web.feed import LatestMessages, Snapshot, position_sigma_m
 from cpcbl_team.config import Field, Team
@@ -185,7 +190,7 @@ def _problems(latest: LatestMessages) -> Iterator[str]:
         yield from getattr(status, "problems", ())
         if text := distrust_text(status.trust):
             yield text
-        if status.counts.get("miscalibrated"):
+        if miscalibration_text(status.counts, status.learned):
             yield "its sensors or its odometry are miscalibrated"
 
 
