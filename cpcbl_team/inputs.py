@@ -116,4 +116,10 @@ class BeliefShared(msgspec.Struct, frozen=True, array_like=True, tag="told"):
     stamp_ns: int
 
 
-Input = Odometry | Sightings | Position | Belief | Fix | BeliefShared
+class InputsMended(msgspec.Struct, frozen=True, array_like=True, tag="mended"):
+    """This robot's inputs were wrong until now: they tell nothing of its calibration."""
+
+    stamp_ns: int
+
+
+Input = Odometry | Sightings | Position | Belief | Fix | BeliefShared | InputsMended

@@ -12,7 +12,16 @@ from cpcbl_team.estimate import HEADING, POSE, POSITION, Estimate, Scope
 from cpcbl_team.fixes import PoseObservation, from_fix, from_position_sensor
 from cpcbl_team.fusion import chi_square_bounds, mark_shared
 from cpcbl_team.geometry import new, step
-from cpcbl_team.inputs import Belief, BeliefShared, Fix, Odometry, Position, Sighting, Sightings
+from cpcbl_team.inputs import (
+    Belief,
+    BeliefShared,
+    Fix,
+    InputsMended,
+    Odometry,
+    Position,
+    Sighting,
+    Sightings,
+)
 from cpcbl_team.landmarks import Landmarks, LandmarkUpdate
 from cpcbl_team.measurements import (
     BELIEF_VALID_BEFORE_NS,
@@ -371,6 +380,10 @@ class Localizer:
         """This robot's belief goes to a teammate: its information may come back."""
         state = self.predict(state, event.stamp_ns)
         return state._replace(estimate=mark_shared(state.estimate))
+
+    def forget_adaptation(self, state: State, event: InputsMended) -> State:
+        """What the robot changed in its settings because of wrong inputs is as configured again."""
+        return self._calibration.without_adaptation(self.predict(state, event.stamp_ns))
 
     # The start --------------------------------------------------------------------------------
 

@@ -101,6 +101,12 @@ class OwnCalibration:
             return self._after_check(self._with_ranges(state))
         return state
 
+    def without_adaptation(self, state: State) -> State:
+        """The state without what the robot noticed of its settings and of its map so far."""
+        memory, check = state.memory.calibration, ModelCheck(accepted=state.updates.accepted)
+        known = CalibrationMemory(memory.learned, memory.references, memory.total_turn_rad, check)
+        return _with_calibration(state, known)
+
     def _with_ranges(self, state: State) -> State:
         """The state that has compared distances between landmarks with the map, once a block."""
         memory, recovery = state.memory.calibration, state.memory.recovery

@@ -7,7 +7,7 @@ the same object runs live, in one process with others, and in replay.
 from typing import NamedTuple
 
 from cpcbl_team.estimate import Estimate
-from cpcbl_team.inputs import Belief, BeliefShared, Fix, Sightings
+from cpcbl_team.inputs import Belief, BeliefShared, Fix, InputsMended, Sightings
 from cpcbl_transport.messages import Message
 
 
@@ -69,4 +69,6 @@ class HelpSent(NamedTuple):
 
 
 BusEvent = Presence | UnknownRobot | BeliefSubscribers | FrameSubscribers | HelpSent
-AgentMessage = Message | Tick | PoseEstimate | FrameEstimate | BeliefShared | BusEvent
+AgentMessage = (
+    Message | Tick | PoseEstimate | FrameEstimate | BeliefShared | InputsMended | BusEvent
+)

@@ -5,7 +5,16 @@ from collections.abc import Sequence
 
 from cpcbl_agents.agent import AgentMessage, FrameEstimate, PoseEstimate, Presence, Tick
 from cpcbl_team.config import Field, LocalizationSettings
-from cpcbl_team.inputs import Belief, BeliefShared, Fix, Input, Odometry, Position, Sightings
+from cpcbl_team.inputs import (
+    Belief,
+    BeliefShared,
+    Fix,
+    Input,
+    InputsMended,
+    Odometry,
+    Position,
+    Sightings,
+)
 from cpcbl_team.localizer import Localizer
 from cpcbl_team.miscalibration import MISPLACED, percentages
 from cpcbl_team.self_calibration import SelfCalibration
@@ -77,7 +86,7 @@ class FilterAgent:
                 if self._add(message):
                     self._waiting.append(message)
                 return self._frame_estimates(now_ns)
-            case Position() | Belief() | Fix() | BeliefShared():
+            case Position() | Belief() | Fix() | BeliefShared() | InputsMended():
                 self._add(message)
             case Presence(name, None):
                 self._guests.discard(name)

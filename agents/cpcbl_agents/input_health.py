@@ -16,6 +16,7 @@ from cpcbl_agents.input_problems import (
     InputWindow,
     implausible_inputs,
     input_problems,
+    is_often_refused,
     without_numbers,
 )
 from cpcbl_agents.motion_causes import CONTRADICTION, OR_START, Step, pose_near_start
@@ -184,6 +185,8 @@ class InputMonitor:
         )
         self._starts_known: bool | None = None
         self._held, self._implausible = Held(), tuple[str, ...]()
+        self.are_mended = self._are_wrong = False
+        """Whether inputs were implausible or refused before the last judgement, and are right."""
         self.has_moved = False
         """Whether odometry said so, at a judgement."""
         detects = settings.sensing == "camera"
@@ -226,6 +229,8 @@ class InputMonitor:
         self._judgements += any(self.inputs[name].messages for name in shown)
         if self._held or self._judgements < OFTEN or self._judgements % SELDOM == 0:
             self._implausible = self._look(robot, facts, before, bool(problems))
+        are_wrong = bool(self._implausible) or any(map(is_often_refused, facts.windows.values()))
+        self.are_mended, self._are_wrong = self._are_wrong and not are_wrong, are_wrong
         health = tuple(self._health(name, totals, before) for name in shown)
         return health, (*problems, *self._implausible)
 

@@ -133,11 +133,16 @@ def _problems(facts: Facts) -> Iterator[str]:
         yield from _refused(name, window, facts)
 
 
+def is_often_refused(window: InputWindow) -> bool:
+    """Whether so much of an input is refused that it is a problem."""
+    number = sum(window.refused.values())
+    return number >= LEAST_REFUSED and number > REFUSED_SHARE * (window.taken + number)
+
+
 def _refused(name: str, window: InputWindow, facts: Facts) -> Iterator[str]:
     """What is refused of one input and why, or whose stamps are off although it is taken."""
-    number = sum(window.refused.values())
-    total = window.taken + number
-    if number >= LEAST_REFUSED and number > REFUSED_SHARE * total:
+    total = window.taken + sum(window.refused.values())
+    if is_often_refused(window):
         by_cause = Counter[str]()
         for reason, refused in window.refused.items():
             by_cause[_cause(reason, f"in/{facts.robot}/{name}", window, facts)] += refused

@@ -278,6 +278,8 @@ class Node:
         received = self.received.flows()
         status = self.robot.status(now_ns, self._incarnation, counts, received, self._clocks)
         inputs, problems = self._health.judge(self.robot, now_ns, bool(self._namesakes))
+        if self._health.are_mended:
+            self.robot.forget_wrong_inputs(now_ns)
         overload = self._load.judge(len(self._inbox), self._inbox.pop_dropped())
         problems = (*overload, *problems, *self.robot.sensing.problems)
         status = msgspec.structs.replace(status, inputs=inputs, problems=problems)

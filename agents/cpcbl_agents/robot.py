@@ -17,7 +17,7 @@ from cpcbl_agents.sensing import SensingAgent
 from cpcbl_agents.sources import OwnCamera, Source
 from cpcbl_agents.waypoint_follower import WaypointFollower
 from cpcbl_team.config import Team
-from cpcbl_team.inputs import BeliefShared
+from cpcbl_team.inputs import BeliefShared, InputsMended
 from cpcbl_team.trust import TrustStatus
 from cpcbl_transport.budget import Budget
 from cpcbl_transport.messages import Flow, Help, Message, Outgoing, Pose, SensorInput, Status, Trust
@@ -74,6 +74,11 @@ class Robot:
                 # From now on what this robot knows may be in what its teammates publish
                 self._shared_ns = sent.stamp_ns
                 self.filter.handle(BeliefShared(sent.stamp_ns), now_ns)
+
+    def forget_wrong_inputs(self, now_ns: int) -> None:
+        """Its inputs were wrong, as their monitor said, and no longer are."""
+        latest = self.filter.timeline.latest(now_ns)
+        self.filter.handle(InputsMended(latest.stamp_ns), now_ns)
 
     def pose(self, now_ns: int) -> Pose:
         """The pose at `now_ns`, or at the end of the newest odometry."""

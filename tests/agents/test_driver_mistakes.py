@@ -252,3 +252,12 @@ def test_an_infinite_bearing_does_not_end_the_robot() -> None:
     robot = DrivenRobot(CIRCLE)
     robot.run(12.0, of(Sightings, bearing_rad=lambda s: -math.inf, range_m=lambda s: math.nan))
     assert robot.is_consistent
+
+
+def test_what_was_learned_from_a_mistake_is_forgotten_when_it_is_mended() -> None:
+    robot = DrivenRobot(STOPS._replace(places=PLACES))
+    robot.run(32.0, ROWS["odometry: feet"].make())
+    assert robot.statuses[-1].learned is not None
+    robot.run(13.0)
+    assert robot.problems == ()
+    assert robot.statuses[-1].learned is None
