@@ -122,6 +122,13 @@ def unit_of(scale: float) -> str:
     return "feet" if 2.8 < scale < 3.9 else ""
 
 
+def piece_s(pieces: Sequence[Odometry]) -> float:
+    """For how long pieces of odometry last (s, median); 0 for too few to tell."""
+    if len(pieces) < LEAST_CASES:
+        return 0.0
+    return median((p.stamp_ns - p.from_ns) * 1e-9 for p in pieces)
+
+
 def overlap_s(pieces: Sequence[Odometry]) -> float:
     """The median overlap of a piece with the one before (s), negative for a gap."""
     if len(pieces) < LEAST_CASES:

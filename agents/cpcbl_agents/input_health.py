@@ -201,6 +201,7 @@ class InputMonitor:
             team.map.landmarks,
             settings.sensor,
             team.map.bounds(),
+            settings.odometry.timeout_s,
             _start_pose(settings.start),
             pace=max(1.0, speed),
         )

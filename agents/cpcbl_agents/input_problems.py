@@ -89,6 +89,7 @@ class Facts(NamedTuple):
     landmarks: Mapping[str, Landmark] = {}
     sensor: SensorSettings = SensorSettings()
     bounds: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)  # of what is on the map
+    timeout_s: float = math.inf  # of odometry
     start: Pose2 | None = None
     near_start: Pose2 | None = None  # the pose by odometry alone, while it has hardly moved
     steps: Sequence[Step] = ()  # of odometry
@@ -131,6 +132,11 @@ def _problems(facts: Facts) -> Iterator[str]:
         yield "camera lost: it delivers no frames, and is opened again and again"
     for name, window in facts.windows.items():
         yield from _refused(name, window, facts)
+    if (lasts_s := causes.piece_s(_odometry(facts))) > facts.timeout_s:
+        yield (
+            f"odometry: pieces of {lasts_s:.1f} s are longer than odometry.timeout_s; send them more"
+            " often"
+        )
 
 
 def is_often_refused(window: InputWindow) -> bool:
@@ -222,6 +228,11 @@ def overlapping(window: InputWindow) -> bool:
     return causes.overlap_s(_pieces(window)) > OVERLAP_S
 
 
+def _odometry(facts: Facts) -> list[Odometry]:
+    window = facts.windows.get("odometry")
+    return _pieces(window) if window is not None and window.taken else []
+
+
 def _pieces(window: InputWindow) -> list[Odometry]:
     """Those whose stamps are near: a speed says nothing where stamps have another unit."""
     near = [m for now_ns, m in window.recent if abs(now_ns - m.stamp_ns) < causes.YEAR_NS]
@@ -232,7 +243,7 @@ def _implausible(facts: Facts) -> Iterator[tuple[str, str]]:
     nothing = InputWindow(0.0)
     odometry = facts.windows.get("odometry", nothing)
     positions = facts.windows.get("position", nothing).recent
-    pieces = _pieces(odometry) if odometry.taken else []
+    pieces = _odometry(facts)
     frames = [_usable(frame) for frame in facts.frames]
     overlap = bool(pieces) and overlapping(odometry)
     if overlap and "duplicate" not in odometry.refused:

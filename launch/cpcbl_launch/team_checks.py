@@ -48,6 +48,13 @@ def warnings(team: Team) -> Iterator[str]:
     yield from _blind_team(team)
     only_ranges = bool(objects) and all(o.gives in ("range", "none") for o in objects)
     for name, robot in team.robots.items():
+        odometry = robot.odometry
+        if odometry.moves and odometry.rate_hz * odometry.timeout_s < 1.0:
+            yield (
+                f"robots.{name}.odometry.timeout_s: pieces of odometry last"
+                f" {1.0 / odometry.rate_hz:.2g} s, and the robot only guesses its motion after"
+                f" {odometry.timeout_s:g} s; raise rate_hz"
+            )
         if not robot.sensor.sees_landmarks or robot.position_sensor is not None:
             continue
         variant = robot.localizer.variant

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import pytest
 from support.buses import SECOND
-from support.drivers import EPOCH, PLACES, Change, DrivenRobot, World
+from support.drivers import EPOCH, PLACES, Change, DrivenRobot, World, as_it_is
 from support.mistakes import (
     FOOT_M,
     FromField,
@@ -208,6 +208,10 @@ ROWS = {
     )
     for name, row in rows.items()
 }
+
+
+SLOW = CIRCLE._replace(odometry_hz=1.0)
+ROWS["odometry: 1 Hz"] = Row(lambda: as_it_is, "pieces of 1.0 s are longer than", (SLOW,), 7)
 
 
 @pytest.mark.parametrize("row", ROWS.values(), ids=list(ROWS))

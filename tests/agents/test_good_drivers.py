@@ -51,7 +51,7 @@ def world(seed: int) -> World:
         drives(r),
         {name: (r.uniform(-5, 5), r.uniform(-5, 5)) for name in [*PLACES][:number]},
         Pose2(r.uniform(-1, 1), r.uniform(-1, 1), r.uniform(-3, 3)),
-        odometry_hz=r.choice([1.0, 5.0, 10.0, 20.0, 50.0]),
+        odometry_hz=r.choice([2.0, 5.0, 10.0, 20.0, 50.0]),
         sightings_hz=r.choice([1.0, 2.0, 5.0, 10.0, 30.0]),
         position_hz=r.choice([0.0, 0.0, 1.0, 5.0, 10.0]),
         latency_s=r.choice([0.0, 0.02, 0.1, 0.3, 0.49]),

@@ -216,12 +216,12 @@ def test_what_a_driver_gets_wrong_is_said_with_its_likely_cause(change: Change, 
 @pytest.mark.parametrize(
     "driver",
     [
-        Driver(1.0),
+        Driver(2.0),
         Driver(10.0),
         Driver(100.0),
         Driver(10.0, speed=10.0),
     ],
-    ids=["1 Hz", "10 Hz", "100 Hz", "at 10x"],
+    ids=["2 Hz", "10 Hz", "100 Hz", "at 10x"],
 )
 def test_nothing_is_said_of_a_driver_that_does_well(driver: Driver) -> None:
     driver.run(15.0)

@@ -12,6 +12,7 @@ from cpcbl_team.config import (
     Field,
     Landmark,
     LocalizerSettings,
+    OdometrySettings,
     PositionSensor,
     RobotSettings,
     SensorSettings,
@@ -44,6 +45,14 @@ def test_one_object_determines_no_pose() -> None:
     blind = RobotSettings(sensor=SensorSettings(sees_landmarks=False))
     with_gps = RobotSettings(position_sensor=PositionSensor())
     assert list(warnings(team_of(one, blind))) == list(warnings(team_of(one, with_gps))) == []
+
+
+def test_odometry_is_sent_more_often_than_its_timeout() -> None:
+    slow = RobotSettings(odometry=OdometrySettings(rate_hz=1.0))
+    (line,) = warnings(team_of(MARKS, slow))
+    assert line.startswith("robots.r1.odometry.timeout_s: pieces of odometry last 1 s")
+    standing = RobotSettings(odometry=OdometrySettings(rate_hz=1.0, moves=False))
+    assert list(warnings(team_of(MARKS, standing))) == []
 
 
 TEAMS = sorted(path.stem for path in builtin_path("demo").parent.glob("*.toml"))
