@@ -134,8 +134,8 @@ def _problems(facts: Facts) -> Iterator[str]:
         yield from _refused(name, window, facts)
     if (lasts_s := causes.piece_s(_odometry(facts))) > facts.timeout_s:
         yield (
-            f"odometry: pieces of {lasts_s:.1f} s are longer than odometry.timeout_s; send them more"
-            " often"
+            f"odometry: pieces of {lasts_s:.1f} s are longer than odometry.timeout_s; send"
+            " them more often"
         )
 
 
