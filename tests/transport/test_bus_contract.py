@@ -209,6 +209,13 @@ def test_everything_can_be_closed_twice_and_after_its_session(pair: Pair) -> Non
     pair.one.close()
     for close in [*early, *late, pair.one.close]:
         close()
+    publisher = pair.other.publisher("a/b", RELIABLE)
+    tokens = Watched(pair.other, "alive/*")
+    wait_until(lambda: not publisher.matching)
+    mark = pair.other.declare_token("alive/r2")
+    wait_until(lambda: ("alive/r2", True) in tokens.events)
+    mark.close()
+    assert ("alive/r1", True) not in tokens.events
 
 
 # Liveliness -------------------------------------------------------------------------------------

@@ -1,6 +1,7 @@
 """Fixes and beliefs that cannot be sent, and payloads that are refused."""
 
 import math
+import re
 from typing import Any
 
 import numpy as np
@@ -23,7 +24,7 @@ from support.compact import (
     there_and_back,
 )
 
-from cpcbl_team.inputs import Belief, Fix
+from cpcbl_team.inputs import NAME_PATTERN, Belief, Fix
 from cpcbl_transport import topics
 from cpcbl_transport.compact import (
     BELIEF_BYTES,
@@ -233,8 +234,15 @@ def test_a_flipped_bit_never_raises(message: Help, data: st.DataObject) -> None:
 
 
 @examples(300)
-@given(st.text(max_size=40))
-def test_any_key_is_refused_or_read(key: str) -> None:
-    for start in ("", "belief/", "fix/"):
-        read = decode_help(start + key, encode_help(BELIEF))
-        assert isinstance(read, Refusal | Belief)
+@given(st.from_regex(NAME_PATTERN, fullmatch=True) | st.text(max_size=40))
+def test_a_belief_is_read_under_the_key_of_a_robot_and_no_other(name: str) -> None:
+    read = decode_help(f"belief/3/{name}", encode_help(BELIEF))
+    if re.fullmatch(NAME_PATTERN[1:-1], name):
+        known = decode_help(BELIEF_KEY, encode_help(BELIEF))
+        assert isinstance(read, Belief)
+        assert isinstance(known, Belief)
+        assert read == replace(known, robot=name)
+    else:
+        assert read is (Refusal.WRONG_TYPE if "/" in name else Refusal.UNKNOWN_ROBOT)
+    for key in (name, f"belief/{name}", f"fix/{name}"):
+        assert isinstance(decode_help(key, encode_help(BELIEF)), Refusal)

@@ -44,7 +44,8 @@ def test_every_member_has_a_folder_with_all_that_it_needs(team_file: Path) -> No
     assert (folder / ".gitignore").read_text() == "*\n"
 
 
-def test_only_a_simulated_team_has_a_field(tmp_path: Path) -> None:
+def test_only_a_simulated_team_has_a_field(tmp_path: Path, team_file: Path) -> None:
+    assert "field" not in keys(team_file)
     path = tmp_path / "demo.toml"
     path.write_text(builtin_path("demo").read_text())
     assert "field" in keys(path)
