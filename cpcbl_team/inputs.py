@@ -117,9 +117,13 @@ class BeliefShared(msgspec.Struct, frozen=True, array_like=True, tag="told"):
 
 
 class InputsMended(msgspec.Struct, frozen=True, array_like=True, tag="mended"):
-    """This robot's inputs were wrong until now: they tell nothing of its calibration."""
+    """This robot's inputs were wrong until now: they tell nothing of its calibration, and made
+    teammates look wrong. They have turned its heading by `-turn_rad`, and may have moved its
+    position by `position_sigma_m`."""
 
     stamp_ns: int
+    turn_rad: float = 0.0
+    position_sigma_m: float = 0.0
 
 
 Input = Odometry | Sightings | Position | Belief | Fix | BeliefShared | InputsMended

@@ -33,6 +33,7 @@ from cpcbl_team.measurements import (
     gated_object,
     measurement_of,
 )
+from cpcbl_team.mended_inputs import with_mended_inputs
 from cpcbl_team.motion import NO_VARIANCE, bridge, inflate_by_gap, is_gap, part_of_piece
 from cpcbl_team.object_timers import ObjectTimers, has_passed
 from cpcbl_team.own_calibration import OwnCalibration
@@ -381,9 +382,10 @@ class Localizer:
         state = self.predict(state, event.stamp_ns)
         return state._replace(estimate=mark_shared(state.estimate))
 
-    def forget_adaptation(self, state: State, event: InputsMended) -> State:
+    def forget_wrong_inputs(self, state: State, event: InputsMended) -> State:
         """What the robot changed in its settings because of wrong inputs is as configured again."""
-        return self._calibration.without_adaptation(self.predict(state, event.stamp_ns))
+        state = self._calibration.without_adaptation(self.predict(state, event.stamp_ns))
+        return with_mended_inputs(state, event)
 
     # The start --------------------------------------------------------------------------------
 

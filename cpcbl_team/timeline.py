@@ -40,7 +40,7 @@ _apply: dict[type, Callable[[Localizer, State, Input], State]] = {
     Position: Localizer.add_position,  # type: ignore[dict-item]
     Fix: Localizer.add_fix,  # type: ignore[dict-item]
     BeliefShared: Localizer.mark_shared,  # type: ignore[dict-item]
-    InputsMended: Localizer.forget_adaptation,  # type: ignore[dict-item]
+    InputsMended: Localizer.forget_wrong_inputs,  # type: ignore[dict-item]
     Odometry: Localizer.add_odometry,  # type: ignore[dict-item]
 }
 _rank = {kind: rank for rank, kind in enumerate(_apply)}

@@ -378,6 +378,15 @@ def reset_scores(senders: SenderRecords) -> SenderRecords:
     return {n: r if r.reason else replace(r, score=0.0) for n, r in senders.items()}
 
 
+def forgive(senders: SenderRecords, now_ns: int) -> SenderRecords:
+    """The records after the robot found an error of its own: what disagreed with its estimate may
+    have been right."""
+    return {
+        n: _released(r, now_ns) if r.reason in _BY_COMPARISON else replace(r, score=0.0)
+        for n, r in senders.items()
+    }
+
+
 def trust_statuses(senders: SenderRecords, now_ns: int) -> tuple[TrustStatus, ...]:
     """The status of each sender that reported recently, or is or was in quarantine."""
     statuses = []

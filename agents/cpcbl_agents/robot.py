@@ -181,9 +181,10 @@ def build_sensing(
     follower = None
     if settings.source == "simulated":
         follower = WaypointFollower(name, settings.waypoints_m, settings.speed_m_s)
-    detector = None
+    detector = correction = None
     if settings.sensing == "camera":
+        from cpcbl_agents.vision.camera_correction import CameraCorrection
         from cpcbl_agents.vision.detector import CameraDetector
 
-        detector = CameraDetector(name, team)
-    return SensingAgent(settings, source, map_names, follower, detector, camera)
+        detector, correction = CameraDetector(name, team), CameraCorrection(name, team)
+    return SensingAgent(settings, source, map_names, follower, detector, camera, correction)

@@ -15,6 +15,7 @@ from cpcbl_team.sensors import corrected_odometry, corrected_sighting, without_d
 from cpcbl_transport.messages import Frame, SensorInput
 
 if TYPE_CHECKING:  # it needs OpenCV
+    from cpcbl_agents.vision.camera_correction import CameraCorrection
     from cpcbl_agents.vision.detector import CameraDetector
 
 ANNOTATION_INTERVAL_NS = 500_000_000
@@ -36,6 +37,7 @@ class SensingAgent:
         follower: WaypointFollower | None = None,
         detector: "CameraDetector | None" = None,
         camera: OwnCamera | None = None,
+        correction: "CameraCorrection | None" = None,
     ) -> None:
         self._sensor, self._odometry = settings.sensor, settings.odometry
         self._sensor_delay_ns = int(settings.sensor.delay_s * 1e9)
@@ -44,6 +46,7 @@ class SensingAgent:
         self._source, self._camera, self._map_names = source, camera, map_names
         self._sources = [s for s in (source, camera) if s is not None]
         self._follower, self._detector, self._has_subscribers = follower, detector, False
+        self._correction = correction
         self._annotated_ns = -ANNOTATION_INTERVAL_NS
         self._counts: Counter[str] = Counter()
         self.refused: Counter[str] = Counter()
@@ -52,7 +55,8 @@ class SensingAgent:
     @property
     def counts(self) -> Counter[str]:
         """What was sensed, and what could not be used, by reason."""
-        return self._counts + (Counter() if self._camera is None else self._camera.counts)
+        parts = (p.counts for p in (self._camera, self._correction) if p is not None)
+        return sum(parts, self._counts)
 
     @property
     def has_detector(self) -> bool:
@@ -60,8 +64,9 @@ class SensingAgent:
 
     @property
     def problems(self) -> tuple[str, ...]:
-        """What the detector doubts about its camera, as sentences."""
-        return () if self._detector is None else self._detector.problems
+        """What the robot doubts about its camera, as sentences."""
+        parts = (p for p in (self._detector, self._correction) if p is not None)
+        return tuple(problem for part in parts for problem in part.problems)
 
     @property
     def next_ns(self) -> int | None:
@@ -80,8 +85,11 @@ class SensingAgent:
                 return self._process(message)
             case FrameSubscribers():
                 self._has_subscribers = message.present
-            case PoseEstimate() if self._follower is not None:
-                return self._follower.command(message)
+            case PoseEstimate():
+                if self._correction is not None:
+                    self._correction.set_estimate(message.estimate, message.lost)
+                if self._follower is not None:
+                    return self._follower.command(message)
         return ()
 
     def _process(self, item: SensorInput | Picture) -> Sequence[AgentMessage]:
@@ -102,14 +110,25 @@ class SensingAgent:
         if isinstance(sightings, str):
             self._refuse(sightings)
             return outgoing
-        return [*outgoing, self._correct(sightings)]
+        frame = self._corrected_frame(sightings)
+        if self._correction is None:
+            return [*outgoing, frame]
+        frame, change = self._correction.correct(frame)
+        return [*outgoing, frame, *([] if change is None else [change])]
 
     def _correct(self, item: Odometry | Sightings | Position) -> Odometry | Sightings | Position:
+        if isinstance(item, Sightings):
+            return self._corrected_frame(item)
         self._counts[type(item).__name__.lower()] += 1
         if isinstance(item, Odometry):
-            return corrected_odometry(item, self._odometry)
-        if isinstance(item, Position):
-            return msgspec.structs.replace(item, stamp_ns=item.stamp_ns - self._position_delay_ns)
+            piece = corrected_odometry(item, self._odometry)
+            if self._correction is not None:
+                self._correction.add_odometry(piece)
+            return piece
+        return msgspec.structs.replace(item, stamp_ns=item.stamp_ns - self._position_delay_ns)
+
+    def _corrected_frame(self, item: Sightings) -> Sightings:
+        self._counts["sightings"] += 1
         sightings = without_duplicates(item.sightings)
         if len(sightings) < len(item.sightings):
             self._refuse("seen_twice", len(item.sightings) - len(sightings))

@@ -66,6 +66,10 @@ class CameraSettings(Table, frozen=True, kw_only=True):
     focal_share: NotNegative = 0.005
     """The accuracy of the focal length as a share; it is added to the sigma of every range."""
 
+    self_calibration: bool = True
+    """Whether the robot corrects its yaw and its focal length while it drives, where landmarks and
+    odometry show that they are wrong."""
+
     @property
     def live(self) -> bool:
         """Whether images come from a device or a URL, and not from files or messages."""

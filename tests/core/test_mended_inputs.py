@@ -1,0 +1,38 @@
+"""What the state is after a robot's inputs were wrong."""
+
+import math
+
+import pytest
+from msgspec.structs import replace
+
+from cpcbl_team.config import Field, LocalizationSettings, Start
+from cpcbl_team.inputs import InputsMended
+from cpcbl_team.localizer import Localizer
+from cpcbl_team.state import with_senders, with_teammates
+from cpcbl_team.timeline import Timeline
+from cpcbl_team.trust import QuarantineReason, SenderRecord
+
+
+def test_the_heading_turns_the_covariance_grows_and_teammates_are_forgiven() -> None:
+    settings = LocalizationSettings(start=Start(x_m=1.0, y_m=2.0, heading_deg=179.0))
+    localizer = Localizer(settings, Field())
+    state = localizer.start(0)
+    biased = SenderRecord(reason=QuarantineReason.BIASED, score=50.0, quarantines=1)
+    senders = {
+        "north": biased,
+        "west": replace(biased, reason=QuarantineReason.JUMPS),
+        "east": SenderRecord(score=20.0),
+    }
+    state = with_teammates(state, with_senders(state.memory.teammates, senders))
+    timeline = Timeline(localizer, state)
+    timeline.add(InputsMended(1, math.radians(3.0), 0.1))
+    after = timeline.state
+    assert math.degrees(after.estimate.pose.heading) == pytest.approx(-178.0)
+    before, now = state.estimate.covariance, after.estimate.covariance
+    assert now.xx == pytest.approx(before.xx + 0.01)
+    assert now.hh == pytest.approx(before.hh + math.radians(3.0) ** 2)
+    assert now.xy == before.xy
+    records = after.memory.teammates.senders
+    assert records["north"].reason is None
+    assert records["west"].reason is QuarantineReason.JUMPS  # odometry contradicts it
+    assert all(record.score == 0.0 for record in records.values())
