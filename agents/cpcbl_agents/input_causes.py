@@ -101,7 +101,7 @@ def range_cause(
     frames: Iterable[Sightings], max_range_m: float, field_m: float, scale: float
 ) -> str:
     """What ranges look like that are far beyond the sensor's reach and the field's diagonal (m), or
-    that make the ways between landmarks `scale` times as long as the map has them."""
+    that make distances between landmarks `scale` times as long as on the map."""
     if unit := unit_of(scale):
         return f"ranges look like {unit}"
     ranges = [s.range_m for f in frames for s in f.sightings if s.range_m is not None]

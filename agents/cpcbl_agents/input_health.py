@@ -1,7 +1,7 @@
-"""What came on a robot's inputs: counted as it comes, judged once a second.
+"""The messages on a robot's inputs: counted as they arrive, judged once a second.
 
-To note a message costs next to nothing: a counter, and a reference among the latest few. Causes are
-looked for in those, by `input_problems`.
+A message costs a counter and a reference among the latest few. `input_problems` looks for causes in
+those few.
 """
 
 import math
@@ -12,7 +12,7 @@ from typing import NamedTuple, TypeVar
 
 from cpcbl_agents.input_problems import (
     MOTION,
-    Facts,
+    InputFacts,
     InputWindow,
     implausible_inputs,
     input_problems,
@@ -36,14 +36,14 @@ from cpcbl_transport.messages import (
 WINDOW = 10  # judgements, one a second: shares are those of the last so many
 SETTLED_NS = 2_000_000_000  # what was on its way when the robot started is too late
 OFTEN, SELDOM = 20, 10
-"""To look for what is implausible takes half a millisecond: at each of the first judgements with
-odometry or sightings and while something is found, later at every tenth one."""
+"""The search for implausible inputs takes half a millisecond. It runs at each of the first `OFTEN`
+judgements and while it finds something, later at every tenth one (`SELDOM`)."""
 SECOND_NS, EMPTY_NS = 1_000_000_000, 5_000_000_000
-UNSEEN = 25  # judgements: of real logs a robot saw nothing for 20 s in front of landmarks
+UNSEEN = 25  # judgements: in real logs a robot saw nothing for 20 s in front of landmarks
 EMPTY_CAME = "empty frames came too before"
 IN_VIEW = "a landmark should be in view"
-OVER = 4  # looks in a row that find nothing, before a cause is no longer said
-CHANGED = 30  # looks in a row that find another cause, before it is said in place of the first
+OVER = 4  # judgements in a row that find nothing, before a cause is no longer reported
+CHANGED = 30  # judgements in a row that find another cause, before it replaces the first
 STEP_NS = 95_000_000
 STEPS = 100
 GAP_NS = 2_000_000_000
@@ -110,51 +110,54 @@ class Input:
         self.recent_refused.append((now_ns, payload[:LARGEST_FRAME]))
 
 
-class Held:
-    """What is implausible, held against flapping: what was said first stays said until nothing is
-    found several times in a row, or another cause again and again."""
+class ProblemHysteresis:
+    """Keeps reported problems from flapping. A reported problem stays reported until several
+    judgements in a row find nothing, or many in a row find another cause."""
 
     def __init__(self) -> None:
-        self._said: dict[str, str] = {}
+        self._reported: dict[str, str] = {}
         self._candidates: dict[str, str] = {}
         self._misses: Counter[str] = Counter()
 
     def __bool__(self) -> bool:
-        return bool(self._said or self._candidates)
+        return bool(self._reported or self._candidates)
 
     @property
-    def by_start(self) -> dict[str, str]:
-        """What is said at present because of where the robot started."""
-        return {about: text for about, text in self._said.items() if OR_START in text}
+    def reported_by_start(self) -> dict[str, str]:
+        """The problems reported now that assume the robot was at its start, by subject."""
+        return {about: text for about, text in self._reported.items() if OR_START in text}
 
-    def look(self, found: dict[str, str]) -> tuple[str, ...]:
-        """What is to be said after this look. `found`: by what it is about."""
-        for about in {**self._said, **self._candidates, **found}:
+    def update(self, found: dict[str, str]) -> tuple[str, ...]:
+        """Takes what this judgement found, by subject, and returns the problems to report."""
+        for about in {**self._reported, **self._candidates, **found}:
             self._judge(about, found.get(about, ""))
-        return tuple(self._said.values())
+        return tuple(self._reported.values())
 
     def _judge(self, about: str, text: str) -> None:
-        said = self._said.get(about, "")
-        if said and _kind(said) == _kind(text):
-            if OR_START not in said:
-                self._said[about] = text
+        reported = self._reported.get(about, "")
+        if reported and _problem_key(reported) == _problem_key(text):
+            if OR_START not in reported:
+                self._reported[about] = text
             self._misses[about] = 0
             return
-        is_again = bool(text) and _kind(self._candidates.get(about, "")) == _kind(text)
+        is_again = bool(text) and _problem_key(self._candidates.get(about, "")) == _problem_key(
+            text
+        )
         self._candidates[about] = text
         if not text:
             del self._candidates[about]
         self._misses[about] += 1
-        if said and self._misses[about] < (CHANGED if text else OVER):
+        if reported and self._misses[about] < (CHANGED if text else OVER):
             return
-        self._said.pop(about, None)
+        self._reported.pop(about, None)
         if is_again:
-            self._said[about] = text
+            self._reported[about] = text
             self._misses[about] = 0
 
 
-def _kind(text: str) -> str:
-    """By what a cause is the same one, whichever evidence there is for it now."""
+def _problem_key(text: str) -> str:
+    """The text of a problem without its figures and evidence: two problems with the same key have
+    the same cause."""
     return without_numbers(text).removesuffix(f"; {OR_START}")
 
 
@@ -176,15 +179,15 @@ class InputMonitor:
         self.inputs = {name: Input(name, start_ns, lengths.get(name, 10)) for name in NAMES}
         self.by_key = {f"in/{robot}/{name}": entry for name, entry in self.inputs.items()}
         self._start_ns, self._history = start_ns, deque[_Totals](maxlen=WINDOW + 1)
-        self._namesake_for = self._judgements = self._looks_away = 0
-        self._unseen_for = 0
+        self._namesake_for = self._judgements = self._judgements_away = 0
+        self._in_view_for = 0
         self._sees = (
             settings.source == "external"
             and settings.sensing == "sightings"
             and settings.sensor.sees_landmarks
         )
         self._starts_known: bool | None = None
-        self._held, self._implausible = Held(), tuple[str, ...]()
+        self._hysteresis, self._implausible = ProblemHysteresis(), tuple[str, ...]()
         self.are_mended = self._are_wrong = False
         """Whether inputs were implausible or refused before the last judgement, and are right."""
         self.has_moved = False
@@ -193,10 +196,10 @@ class InputMonitor:
         self._of_sightings = "frame" if detects else "sightings"
         wheels = settings.odometry
         self.inputs["odometry"].scales = wheels.distance_scale, wheels.turn_scale
-        self._facts = Facts(
+        self._facts = InputFacts(
             robot,
             {},
-            tuple(_due_inputs(settings)),
+            tuple(_expected_inputs(settings)),
             frozenset(team.map.landmarks) | frozenset(team.map.walls) | frozenset(team.robots),
             team.map.landmarks,
             settings.sensor,
@@ -221,24 +224,24 @@ class InputMonitor:
         shown = [n for n in NAMES if self.inputs[n].messages or n in self._facts.expected]
         camera = robot.sensing.counts
         facts = self._facts._replace(
-            unseen=self._unseen(robot, now_ns),
+            unseen=self._missing_sightings_reason(robot, now_ns),
             windows={name: self._window(name, totals, before) for name in shown},
             namesake=self._namesake_for >= NAMESAKE_JUDGEMENTS,
             camera_lost=camera["camera_lost"] > camera["camera_back"],
         )
         problems = input_problems(facts)
         self._judgements += any(self.inputs[name].messages for name in shown)
-        if self._held or self._judgements < OFTEN or self._judgements % SELDOM == 0:
-            self._implausible = self._look(robot, facts, before, bool(problems))
+        if self._hysteresis or self._judgements < OFTEN or self._judgements % SELDOM == 0:
+            self._implausible = self._find_implausible(robot, facts, before, bool(problems))
         are_wrong = bool(self._implausible) or any(map(is_often_refused, facts.windows.values()))
         self.are_mended, self._are_wrong = self._are_wrong and not are_wrong, are_wrong
         health = tuple(self._health(name, totals, before) for name in shown)
         return health, (*problems, *self._implausible)
 
-    def _look(
-        self, robot: Robot, facts: Facts, before: _Totals, has_problems: bool
+    def _find_implausible(
+        self, robot: Robot, facts: InputFacts, before: _Totals, has_problems: bool
     ) -> tuple[str, ...]:
-        """Looks for what is implausible; what is to be said of it."""
+        """Judges what is implausible about the inputs, and returns the problems to report."""
         is_early, state = len(self._history) <= WINDOW, robot.filter.timeline.state
         since_ns = self._start_ns if is_early else before.now_ns
         if self._starts_known is None:
@@ -247,19 +250,22 @@ class InputMonitor:
         near, is_from_start = None, self._starts_known and (is_early or not self.has_moved)
         if facts.start is not None and is_from_start:
             near = pose_near_start(steps, facts.start)
-        self._looks_away = 0 if near is not None else self._looks_away + 1
-        seen, is_open = self.inputs["sightings"].recent, state.lost or self._looks_away < WINDOW
+        self._judgements_away = 0 if near is not None else self._judgements_away + 1
+        seen, is_open = (
+            self.inputs["sightings"].recent,
+            state.lost or self._judgements_away < WINDOW,
+        )
         facts = facts._replace(
             near_start=near,
             is_from_start=is_from_start,
-            said=self._held.by_start if is_open else {},
+            reported_by_start=self._hysteresis.reported_by_start if is_open else {},
             steps=steps,
             frames=[m for _, m in _since(seen, since_ns) if isinstance(m, Sightings)],
         )
         found = implausible_inputs(facts)
         if has_problems and CONTRADICTION in found.get(MOTION, ""):
             del found[MOTION]
-        return self._held.look(found)
+        return self._hysteresis.update(found)
 
     def _totals(self, robot: Robot, now_ns: int) -> _Totals:
         refused = {name: entry.refused.copy() for name, entry in self.inputs.items()}
@@ -278,7 +284,7 @@ class InputMonitor:
         messages = {name: entry.messages for name, entry in self.inputs.items()}
         return _Totals(now_ns, taken, refused, messages)
 
-    def _unseen(self, robot: Robot, now_ns: int) -> str:
+    def _missing_sightings_reason(self, robot: Robot, now_ns: int) -> str:
         """Why sightings should come that do not: an empty frame would come too, or a landmark has
         been in view for long by the robot's own pose."""
         entry = self.inputs["sightings"]
@@ -286,8 +292,8 @@ class InputMonitor:
         if entry.has_empty:
             return EMPTY_CAME if silent_ns > EMPTY_NS else ""
         due = self._sees and silent_ns > SECOND_NS and self._has_in_view(robot)
-        self._unseen_for = self._unseen_for + 1 if due else 0
-        return IN_VIEW if self._unseen_for > UNSEEN * self._facts.pace else ""
+        self._in_view_for = self._in_view_for + 1 if due else 0
+        return IN_VIEW if self._in_view_for > UNSEEN * self._facts.pace else ""
 
     def _has_in_view(self, robot: Robot) -> bool:
         """Whether a landmark is well in view, by the robot's pose."""
@@ -345,8 +351,8 @@ def _since_stamp(steps: Iterable[Step], since_ns: int) -> list[Step]:
     return found
 
 
-def _due_inputs(settings: RobotSettings) -> Iterator[str]:
-    """The inputs that a robot's driver owes it."""
+def _expected_inputs(settings: RobotSettings) -> Iterator[str]:
+    """The inputs that a robot's driver must always send."""
     detects = settings.sensing == "camera"
     if settings.source == "mrclam":
         return

@@ -1,4 +1,4 @@
-"""One robot: three agents and the way of messages between them. It knows no bus and no clock.
+"""One robot: three agents and the route of messages between them. It knows no bus and no clock.
 
 `build_robot` makes one from a team file: it alone opens a robot's files. What a robot does not need
 is not imported: numpy for a log, OpenCV for a camera.
