@@ -1,4 +1,4 @@
-"""What is wrong with a robot's inputs, as sentences. Pure functions of counts and times, no clock."""
+"""What is wrong with a robot's inputs, as sentences: pure functions of counts and times."""
 
 import math
 import re

@@ -13,10 +13,10 @@ from cpcbl_agents.clock import Clock
 from cpcbl_agents.earlier_processes import NEVER_RAN, Before, OwnTokens, wait_until_alone
 from cpcbl_agents.node import BoundedSteppable, Node
 from cpcbl_agents.robot import Robot, build_robot
-from cpcbl_agents.robot_log import RobotLog
+from cpcbl_agents.robot_log import RobotLogger
 from cpcbl_agents.sources import OwnCamera
 from cpcbl_agents.stop import StopSignal as StopSignal  # with a robot, one needs it
-from cpcbl_agents.watchdog import watched
+from cpcbl_agents.watchdog import with_watchdog
 from cpcbl_team.config import Team
 from cpcbl_team.errors import ClockError
 from cpcbl_transport.bus import Bus
@@ -130,10 +130,10 @@ def run_robot(
             camera,
         )
         start_ns, incarnation = clock.now_ns(), new_incarnation()
-        said, tokens = RobotLog(name), OwnTokens(bus, name, incarnation)
+        logger, tokens = RobotLogger(name), OwnTokens(bus, name, incarnation)
 
         def on_status(status: Status) -> None:
-            said.tell(status)
+            logger.log_status(status)
             if node.has_moved:
                 tokens.tell_moved()
 
@@ -141,8 +141,8 @@ def run_robot(
             *(robot, team, wrap_bus(bus), start_ns, incarnation),
             *(loop.on_arrival, clock.speed, on_status),
         )
-        said.connected(team, link.endpoints)
-        loop.run(node, watched(stop_on_clock_step(name, team, clock, stop)))
+        logger.log_connected(team, link.endpoints)
+        loop.run(node, with_watchdog(stop_on_clock_step(name, team, clock, stop)))
 
 
 def make_robot(

@@ -109,8 +109,8 @@ def up(
     title = f"team {run.team.name}, {len(run.team.robots)} robots, {speed:g} x real time"
     listen = parse_listen("--view-listen", view_listen)
     page = _page(run.team, listen, open_page, console) if view else nullcontext(nullcontext)
-    with page as attached, LiveTable(title, run.team.robots, console, quiet=as_json) as table:
-        result = run_team(run, table.show, StopSignal(), launch, attached)
+    with page as attach, LiveTable(title, run.team.robots, console, quiet=as_json) as table:
+        result = run_team(run, table.show, StopSignal(), launch, attach)
     lost = dict(result.not_written) | options.write_report(report, result)
     options.print_result(result, as_json, lambda: print_report(result, console), lost)
     if not result.has_data and not StopSignal.was_interrupted:
@@ -150,7 +150,7 @@ def _page(
             console.print(line, highlight=False, soft_wrap=True)
         if open_page:
             typer.launch(address)
-        yield feed.attached
+        yield feed.attach
 
 
 def _run_of(

@@ -92,14 +92,14 @@ class OnThisMachine:
     def router(self) -> AbstractContextManager[Bus]:
         team, listen = self._run.team, self._run.team.transport.listen
         if self._run.connect:
-            return self._joined()
+            return self._join_router()
         require_keys(team, listen, self._here)
         config = team_router(team, listen, (), self._run.speed)
         bus = open_router(config, namespace(team.name))
         repeat_tokens(bus)
         return bus
 
-    def _joined(self) -> AbstractContextManager[Bus]:
+    def _join_router(self) -> AbstractContextManager[Bus]:
         run, until_s = self._run, time.monotonic() + JOIN_S
         require_keys(run.team, run.connect, self._here)
         link = link_of(run.team, Identity(Role.OPERATOR), run.connect)

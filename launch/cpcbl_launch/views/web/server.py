@@ -29,12 +29,12 @@ from cpcbl_launch.views.web.address import (
     security_headers,
 )
 from cpcbl_launch.views.web.feed import Feed, Snapshot
-from cpcbl_launch.views.web.pictures import (
+from cpcbl_launch.views.web.page_data import (
     Arrow,
     Frame,
     RobotDetail,
     RobotPicture,
-    changed,
+    difference,
     help_arrows,
     notice_text,
     robot_detail,
@@ -150,7 +150,7 @@ class Page:
             if detail != self._detail:
                 self._detail = detail
                 await self._send(detail)
-        robots, removed = changed(self._robots, now.pictures)
+        robots, removed = difference(self._robots, now.pictures)
         help_now = None if now.help == self._help else now.help
         self._robots, self._help, self._sent = now.pictures, now.help, self._sent + 1
         number, at_s = self._sent, round(now.at_s, 3)

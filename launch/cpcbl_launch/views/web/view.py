@@ -27,7 +27,7 @@ def view_team(
         bus = _bus_of(shown.name, link, stop, feed.set_problem)
         if bus is None:
             return
-        with bus, feed.attached(bus):
+        with bus, feed.attach(bus):
             while not stop():
                 lost = f"The connection to the router at {shown.where} is lost"
                 feed.set_problem("" if bus.neighbours() else lost)

@@ -47,7 +47,7 @@ async def stand() -> AsyncIterator[Stand]:
     team, hub = find_team(Path("demo")), MemoryHub()
     feed = Feed(team.robots)
     with (
-        feed.attached(hub.session()),
+        feed.attach(hub.session()),
         serving(Shown("demo", "here", team), feed, Listen("127.0.0.1", 0)) as address,
     ):
         async with ClientSession() as session:

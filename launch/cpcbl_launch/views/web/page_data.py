@@ -69,7 +69,7 @@ class TeamPicture(msgspec.Struct, frozen=True, tag="team"):
     landmarks: list[tuple[str, float, float]]
     walls: list[tuple[str, float, float, float, float]]
     cameras: tuple[str, ...] | None  # robots with one; None where the team file is not at hand
-    history: dict[str, list[tuple[float | None, ...]]]  # rows of `feed.Sample`
+    history: dict[str, list[tuple[float | None, ...]]]  # rows of `feed.TrailPoint`
 
 
 class InputPicture(msgspec.Struct, frozen=True):
@@ -224,7 +224,7 @@ def help_arrows(traffic: Traffic, pictures: Mapping[str, RobotPicture]) -> tuple
     )
 
 
-def changed(
+def difference(
     before: Mapping[str, RobotPicture], now: Mapping[str, RobotPicture]
 ) -> tuple[dict[str, RobotPicture], list[str]]:
     """The robots that differ from those before, and the names of those that are no longer there."""
