@@ -189,7 +189,7 @@ class CollaborationAgent:
         """Selects the teammates whose tiers are watched, and those whose beliefs are useful."""
         forgotten_ns = now.stamp_ns - NEIGHBOUR_NS
         self.guests.forget(now.stamp_ns)
-        guests = self.guests.watched
+        guests = self.guests.watched_robots
         self._latest_fixes = {
             name: fix
             for name, fix in self._latest_fixes.items()

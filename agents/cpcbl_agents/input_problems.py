@@ -184,7 +184,7 @@ def _refusal_cause(reason: str, key: str, window: InputWindow, facts: InputFacts
         cause = causes.bearing_cause(frames)
     elif reason == "unknown_object":
         cause = _unknown_names(frames, facts)
-    elif reason == "duplicate" and overlapping(window):
+    elif reason == "duplicate" and has_overlap(window):
         cause = "pieces come twice, and overlap; are there two drivers?"
     return cause or REASONS.get(reason, reason)
 
@@ -223,7 +223,7 @@ def nearest_name(name: str, names: Iterable[str]) -> str:
     return next((lower[found] for found in get_close_matches(name.lower(), lower, 1)), "")
 
 
-def overlapping(window: InputWindow) -> bool:
+def has_overlap(window: InputWindow) -> bool:
     """Whether pieces of odometry overlap, as those of two drivers do."""
     return causes.overlap_s(_pieces(window)) > OVERLAP_S
 
@@ -245,7 +245,7 @@ def _implausible(facts: InputFacts) -> Iterator[tuple[str, str]]:
     positions = facts.windows.get("position", nothing).recent
     pieces = _odometry(facts)
     frames = [_usable(frame) for frame in facts.frames]
-    overlap = bool(pieces) and overlapping(odometry)
+    overlap = bool(pieces) and has_overlap(odometry)
     if overlap and "duplicate" not in odometry.refused:
         text = "pieces overlap; two drivers, or from_ns is not where the last one ended"
         yield OVERLAP, f"odometry: {text}"

@@ -10,7 +10,7 @@ from contextlib import AbstractContextManager, closing, nullcontext, suppress
 import msgspec
 
 from cpcbl_agents.clock import Clock
-from cpcbl_agents.earlier_processes import NEVER_RAN, Before, OwnTokens, wait_until_alone
+from cpcbl_agents.earlier_processes import NEVER_RAN, EarlierRuns, OwnTokens, wait_until_alone
 from cpcbl_agents.node import BoundedSteppable, Node
 from cpcbl_agents.robot import Robot, build_robot
 from cpcbl_agents.robot_log import RobotLogger
@@ -126,7 +126,7 @@ def run_robot(
             name,
             team,
             clock,
-            before if restarted is None else Before(restarted, before.ran or restarted),
+            before if restarted is None else EarlierRuns(restarted, before.ran or restarted),
             camera,
         )
         start_ns, incarnation = clock.now_ns(), new_incarnation()
@@ -135,7 +135,7 @@ def run_robot(
         def on_status(status: Status) -> None:
             logger.log_status(status)
             if node.has_moved:
-                tokens.tell_moved()
+                tokens.declare_moved()
 
         node = Node(
             *(robot, team, wrap_bus(bus), start_ns, incarnation),
@@ -149,7 +149,7 @@ def make_robot(
     name: str,
     team: Team,
     clock: Clock,
-    before: Before = NEVER_RAN,
+    before: EarlierRuns = NEVER_RAN,
     camera: OwnCamera | None = None,
 ) -> Robot:
     """The robot as it starts now. It keeps its start unless it has moved since, or is late in its
@@ -185,7 +185,7 @@ def stop_on_clock_step(
     if team.robots[name].source != "external":
         return stop
 
-    def checked() -> bool:
+    def stop_or_raise() -> bool:
         if abs(by_s := clock.clock_step_s()) > MAX_CLOCK_STEP_S:
             raise ClockError(
                 f"robot {name}: this machine's clock was set by {by_s:+.2f} s, or it slept: start"
@@ -193,7 +193,7 @@ def stop_on_clock_step(
             )
         return stop()
 
-    return checked
+    return stop_or_raise
 
 
 def own_camera(

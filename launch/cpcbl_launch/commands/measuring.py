@@ -222,8 +222,8 @@ def chaos(
     runner.require_judgeable(todo, duration)
     _prepare_for_faults()
     with runner.Progress(Console(stderr=True), len(todo)) as shown:
-        chosen = ScenarioOptions(seed, shown.doing, duration, keys, history)
-        faults = runner.run_scenarios(todo, chosen, shown.began, shown.done)
+        chosen = ScenarioOptions(seed, shown.on_step, duration, keys, history)
+        faults = runner.run_scenarios(todo, chosen, shown.on_begin, shown.on_end)
     result = report_data(faults)
     lost = options.write_report(report, result)
     if (page := markdown) is not None:

@@ -43,7 +43,8 @@ UpDuration = Annotated[
     float | None, Option(help="Seconds of robot time; default: 30 simulated, or the whole log.")
 ]
 Speed = Annotated[
-    float, Option(callback=options.checked(_require_speed), help="Times real time, at least 0.05.")
+    float,
+    Option(callback=options.check_callback(_require_speed), help="Times real time, at least 0.05."),
 ]
 Robots = Annotated[str, Option(help="Robots to start on this machine; default: all.")]
 RecordFile = Annotated[
@@ -141,11 +142,11 @@ def _page(
 ) -> "Iterator[Callable[[Bus], AbstractContextManager[object]]]":
     """Serves the page of a run; yields what attaches it to the run's bus."""
     from cpcbl_launch.views.web.feed import Feed
-    from cpcbl_launch.views.web.server import Shown, serving
+    from cpcbl_launch.views.web.server import ShownTeam, serve
     from cpcbl_launch.views.web.view import address_lines
 
     feed = Feed(team.robots)
-    with serving(Shown(team.name, "the router of this run", team), feed, listen) as address:
+    with serve(ShownTeam(team.name, "the router of this run", team), feed, listen) as address:
         for line in address_lines(team.name, address, listen):
             console.print(line, highlight=False, soft_wrap=True)
         if open_page:

@@ -139,7 +139,7 @@ class RecordedRun(NamedTuple):
     truth: dict[str, Floats]
 
 
-def _checked(message: Message) -> Message:
+def _check_message(message: Message) -> Message:
     """A message that could have been recorded. Raises ValueError."""
     if reason := refusal(message, LAST_NS):
         raise ValueError(f"a message that no robot takes: {reason}")
@@ -153,7 +153,7 @@ def read_recording(path: Path) -> RecordedRun:
             reader = make_reader(file)
             attached = [a.data for a in reader.iter_attachments() if a.name == TEAM]
             messages = [
-                (channel.topic, _checked(_decoder.decode(message.data)))
+                (channel.topic, _check_message(_decoder.decode(message.data)))
                 for _, channel, message in reader.iter_messages()
                 if channel.topic.startswith(("in/", "look/", topics.TRUTH.key))
             ]

@@ -172,7 +172,7 @@ def run_team(
             raise InputError(f"{folder}: {error.strerror}; robots read their team there") from error
         launcher = launch(run, folder, stop)
         bus = stack.enter_context(launcher.router())
-        recording = stack.enter_context(_recording(run, bus))
+        recording = stack.enter_context(_open_recording(run, bus))
         recorder = Recorder(bus)
         stack.enter_context(watch(bus))
         clock = Clock.starting_in(launcher.lead_s, run.epoch_ns, run.speed)
@@ -211,7 +211,7 @@ def simulate_run(run: Run, progress: Progress | None = None) -> Report:
     return _report(run, recorder, 0.0, duration_s, {})
 
 
-def _recording(run: Run, bus: Bus) -> AbstractContextManager[Recording | None]:
+def _open_recording(run: Run, bus: Bus) -> AbstractContextManager[Recording | None]:
     if run.record is None:
         return nullcontext()
     replayed = [name for name, robot in run.team.robots.items() if robot.source == "mrclam"]

@@ -91,7 +91,7 @@ class MachineWatch:
             end_s = time.monotonic() + 60.0
             bus = open_bus(CONTROL, [endpoint], lambda: time.monotonic() > end_s)
             self._clock = clock
-            stack.enter_context(bus).subscribe(topics.TRACK.at(), self._arrived)
+            stack.enter_context(bus).subscribe(topics.TRACK.at(), self._on_message)
             thread = threading.Thread(target=self._sample, daemon=True)
             thread.start()
             stack.callback(thread.join)
@@ -108,7 +108,7 @@ class MachineWatch:
         arrivals_s, delays_s = self._arrivals_s[:known], self._delays_s[:known]
         return MachineLog(tuple(arrivals_s), tuple(delays_s), tuple(self._others), zero_s)
 
-    def _arrived(self, key: str, payload: bytes) -> None:
+    def _on_message(self, key: str, payload: bytes) -> None:
         if isinstance(track := decode(key, payload), Track):
             self._arrivals_s.append(time.monotonic())
             self._delays_s.append((self._clock.now_ns() - track.stamp_ns) * 1e-9)

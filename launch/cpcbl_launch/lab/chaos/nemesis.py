@@ -19,7 +19,7 @@ from cpcbl_launch.lab.chaos.history import Span, invariants, without
 from cpcbl_launch.lab.chaos.memory import MemorySampler, ProcessSample, memory_checks, process_lives
 from cpcbl_launch.lab.chaos.run_log import RunLog
 from cpcbl_launch.lab.chaos.scenario import FaultRun, Injector, ScenarioOptions, ScenarioResult
-from cpcbl_launch.lab.chaos.schedule import PlannedFault, overlapping, schedule
+from cpcbl_launch.lab.chaos.schedule import PlannedFault, largest_overlap, schedule
 from cpcbl_launch.lab.chaos.team import (
     FAR_ROUTER,
     FIELD,
@@ -189,7 +189,7 @@ class Nemesis:
 def _remarks(
     seed: int, faults: Sequence[PlannedFault], nemesis: Nemesis, checks: Sequence[Check]
 ) -> Iterator[str]:
-    yield f"seed {seed}: {len(faults)} faults, up to {overlapping(faults)} at a time"
+    yield f"seed {seed}: {len(faults)} faults, up to {largest_overlap(faults)} at a time"
     if not all(check.is_met for check in checks):
         yield "events: " + "; ".join(map(str, faults))
     yield from map(str, process_lives(nemesis.samples))

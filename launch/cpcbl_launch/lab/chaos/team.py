@@ -209,13 +209,13 @@ class TeamUnderTest:
     def settle(self, within_m: float = SETTLED_M, patience_s: float = PATIENCE_S) -> None:
         """Waits until all robots are localized. Raises ChaosError."""
 
-        def unsettled() -> list[str]:
+        def not_localized() -> list[str]:
             log, from_s = self.run_log, max(0.0, self.now_s - 4.0)
             found = {name: log.localized_after_s(name, from_s, within_m) for name in self.robots}
             return [name for name, after_s in found.items() if after_s is None]
 
-        if not self.wait_until(lambda: self.now_s > 3.0 and not unsettled(), patience_s):
-            waiting = unsettled()
+        if not self.wait_until(lambda: self.now_s > 3.0 and not not_localized(), patience_s):
+            waiting = not_localized()
             lines = "; ".join(self.last_log_line(f"robot-{name}") for name in waiting)
             raise ChaosError(f"the team did not settle: {', '.join(waiting)}: {lines}")
 

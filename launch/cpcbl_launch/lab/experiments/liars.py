@@ -120,9 +120,9 @@ class _Statuses:
         self.found: dict[tuple[str, str, int], Quarantine] = {}
 
     def attach(self, bus: Bus) -> None:
-        self._subscriber = Subscriber(bus, Status, self._arrived)
+        self._subscriber = Subscriber(bus, Status, self._on_message)
 
-    def _arrived(self, received: Received[Status]) -> None:
+    def _on_message(self, received: Received[Status]) -> None:
         status = received.message
         for trust in status.trust:
             key_ = status.robot, trust.peer, trust.quarantines

@@ -63,7 +63,7 @@ PAGE = (
 )
 
 
-class Shown(NamedTuple):
+class ShownTeam(NamedTuple):
     """Which team is shown."""
 
     name: str
@@ -173,7 +173,7 @@ class Page:
 class Server:
     """Serves one team to all pages."""
 
-    def __init__(self, shown: Shown, feed: Feed, listen: Listen) -> None:
+    def __init__(self, shown: ShownTeam, feed: Feed, listen: Listen) -> None:
         self._shown, self._feed, self._listen = shown, feed, listen
         self._pages: set[Page] = set()
         self._began_s = feed.now_s()
@@ -318,7 +318,7 @@ async def _serve(server: Server, listener: socket.socket, ready: "Future[_Ready]
 
 
 @contextmanager
-def serving(shown: Shown, feed: Feed, listen: Listen) -> Iterator[str]:
+def serve(shown: ShownTeam, feed: Feed, listen: Listen) -> Iterator[str]:
     """Serves on a thread of its own; yields the page's address. Raises InputError where it cannot
     listen."""
     with listening_socket(listen) as listener:

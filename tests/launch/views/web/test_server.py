@@ -16,7 +16,7 @@ from cpcbl_launch.team_file import find_team
 from cpcbl_launch.views.web import server
 from cpcbl_launch.views.web.address import Listen
 from cpcbl_launch.views.web.feed import Feed
-from cpcbl_launch.views.web.server import MOST_PAGES, MOST_UNACKNOWLEDGED, Shown, serving
+from cpcbl_launch.views.web.server import MOST_PAGES, MOST_UNACKNOWLEDGED, ShownTeam, serve
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus
 from cpcbl_transport.memory_bus import MemoryHub
@@ -48,7 +48,7 @@ async def stand() -> AsyncIterator[Stand]:
     feed = Feed(team.robots)
     with (
         feed.attach(hub.session()),
-        serving(Shown("demo", "here", team), feed, Listen("127.0.0.1", 0)) as address,
+        serve(ShownTeam("demo", "here", team), feed, Listen("127.0.0.1", 0)) as address,
     ):
         async with ClientSession() as session:
             yield Stand(address, session, hub.session())
