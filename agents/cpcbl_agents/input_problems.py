@@ -34,8 +34,8 @@ REASONS = {
     "garbage": "payloads cannot be decoded",
     "wrong_type": "another type of message came on this key",
     "not_finite": "numbers are infinite or NaN",
-    "implausible_number": "numbers are too large; metres, radians, nanoseconds are due",
-    "not_a_covariance": "the covariance is none; xx > 0, yy > 0, xy² <= xx yy are due",
+    "implausible_number": "numbers are too large; they must be in metres, radians, nanoseconds",
+    "not_a_covariance": "the covariance is not valid; xx > 0, yy > 0 and xy² <= xx yy must hold",
     "from_the_future": "stamps are in the future",
     "impossible_duration": "pieces last no time, or more than 10 s",
     "too_late": "messages come more than 2 s late, or out of order",
@@ -206,7 +206,7 @@ def _unknown_names(frames: Sequence[Sightings], facts: InputFacts) -> str:
     names, seen = facts.names, {s.id for f in frames for s in f.sightings}
     unknown = seen - names
     if not unknown:
-        return f"`{facts.robot}` is this robot itself" if facts.robot in seen else ""
+        return f"`{facts.robot}` is this robot's own name" if facts.robot in seen else ""
     listed = []
     for name in sorted(unknown)[:3]:
         near = nearest_name(name, names)

@@ -327,8 +327,8 @@ class GuestNode(Node):
             keys = topics.IN_SIGHTINGS.at(robot=self.robot.name)
             return f"senses nothing: nothing came on {keys}; is its driver there?"
         return (
-            "senses nothing: no field gives it a body; is the team simulated in real time, and does"
-            " its file let guests in?"
+            "senses nothing: no simulated field simulates it; is the team simulated in real time,"
+            " and does its file let guests in?"
         )
 
     def step(self, now_ns: int, may_go_on: MayGoOn = everything) -> None:

@@ -20,7 +20,7 @@ OTHER_ORIGIN = (
     "are far from the map: another origin, or latitude and longitude; metres of the field"
 )
 OTHER_PLACE = "are not where odometry is since the start: another origin, or latitude and longitude"
-DEGREES = "look like latitude and longitude; metres of the field are due"
+DEGREES = "look like latitude and longitude; they must be metres of the field"
 
 
 def position_cause(

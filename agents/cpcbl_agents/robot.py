@@ -76,7 +76,8 @@ class Robot:
                 self.filter.handle(BeliefShared(sent.stamp_ns), now_ns)
 
     def forget_wrong_inputs(self, now_ns: int) -> None:
-        """Its inputs were wrong, as their monitor said, and no longer are."""
+        """Discards what the filter adapted while inputs were wrong: call it when the monitor finds
+        them right again."""
         latest = self.filter.timeline.latest(now_ns)
         self.filter.handle(InputsMended(latest.stamp_ns), now_ns)
 

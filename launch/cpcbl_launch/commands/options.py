@@ -47,7 +47,7 @@ def _require_picture(option: str, path: Path) -> None:
 
 def _require_limit(option: str, limit: float) -> None:
     if not math.isfinite(limit):
-        raise InputError(f"{option} {limit:g}: no limit; write a number, 0 for as much as it likes")
+        raise InputError(f"{option} {limit:g}: not a limit; write a number, 0 for no limit")
 
 
 def _require_time(option: str, seconds: float) -> None:

@@ -45,7 +45,7 @@ class BlockFile:
                 reason = error.strerror or str(error)
             if not self._failed:
                 self._failed = True
-                log.warning("what a report needs stays in memory, which grows: %s", reason)
+                log.warning("data for the report stays in memory, so memory use grows: %s", reason)
             return block
 
     def load(self, place: "int | bytes", size: int) -> bytes:

@@ -105,7 +105,7 @@ def _certificates(facts: Facts) -> Iterator[tuple[Level, str, str]]:
     for own in facts.certificates:
         renew = f"cpcbl-team keys {facts.file} --renew {own.who.rpartition('/')[2]}"
         if own.valid_until is None:
-            remedy = "see who may read it; the extra security reads certificates"
+            remedy = "check its permissions; reading certificates needs the extra `security`"
             yield "warning", f"{own.file}: cannot be read here", remedy
         elif own.valid_until <= facts.now:
             yield "error", f"{own.who}: expired {own.valid_until:%Y-%m-%d %H:%M} UTC", renew
@@ -274,7 +274,7 @@ def _teams(facts: Facts) -> Iterator[tuple[Level, str, str]]:
 def _cameras(facts: Facts) -> Iterator[tuple[Level, str, str]]:
     for name, where in facts.missing_frames.items():
         text = f"{name}: this machine has no {where}"
-        yield "note", text, "no matter, if the robot's process runs elsewhere"
+        yield "note", text, "ignore this if the robot's process runs elsewhere"
 
 
 CHECKS: dict[str, Check] = {
