@@ -6,7 +6,7 @@ those few.
 
 import math
 from collections import Counter, deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from statistics import median
 from typing import NamedTuple, TypeVar
 
@@ -20,10 +20,10 @@ from cpcbl_agents.input_problems import (
     without_numbers,
 )
 from cpcbl_agents.motion_causes import CONTRADICTION, OR_START, Step, pose_near_start
-from cpcbl_agents.robot import Robot
+from cpcbl_agents.robot import InputSnapshot
 from cpcbl_team.config import RobotSettings, Start, Team
 from cpcbl_team.geometry import Pose2, wrap_angle
-from cpcbl_team.inputs import Odometry, SightingFault, Sightings
+from cpcbl_team.inputs import Odometry, Sightings
 from cpcbl_transport import topics
 from cpcbl_transport.messages import (
     LARGEST_FRAME,
@@ -192,8 +192,6 @@ class InputMonitor:
         """Whether inputs were implausible or refused before the last judgement, and are right."""
         self.has_moved = False
         """Whether odometry said so, at a judgement."""
-        detects = settings.sensing == "camera"
-        self._of_sightings = "frame" if detects else "sightings"
         wheels = settings.odometry
         self.inputs["odometry"].scales = wheels.distance_scale, wheels.turn_scale
         self._facts = InputFacts(
@@ -210,51 +208,48 @@ class InputMonitor:
         )
 
     def judge(
-        self, robot: Robot, now_ns: int, namesake: bool
+        self, snapshot: InputSnapshot, now_ns: int, namesake: bool
     ) -> tuple[tuple[InputHealth, ...], tuple[str, ...]]:
         """The health of each input that anything came on or is expected on, and the problems. To
         be called once a second. `namesake`: whether another process has this robot's name."""
         odometry = self.inputs["odometry"]
         self.has_moved |= abs(odometry.distance_m) > MOVED_M or abs(odometry.turn_rad) > TURNED_RAD
-        totals = self._totals(robot, now_ns)
+        totals = self._totals(snapshot.refused, now_ns)
         if now_ns - self._start_ns >= SETTLED_NS:
             self._history.append(totals)
         before = self._history[0] if self._history else totals
         self._namesake_for = self._namesake_for + 1 if namesake else 0
         shown = [n for n in NAMES if self.inputs[n].messages or n in self._facts.expected]
-        camera = robot.sensing.counts
         facts = self._facts._replace(
-            unseen=self._missing_sightings_reason(robot, now_ns),
+            unseen=self._missing_sightings_reason(snapshot, now_ns),
             windows={name: self._window(name, totals, before) for name in shown},
             namesake=self._namesake_for >= NAMESAKE_JUDGEMENTS,
-            camera_lost=camera["camera_lost"] > camera["camera_back"],
+            camera_lost=snapshot.is_camera_lost,
         )
         problems = input_problems(facts)
         self._judgements += any(self.inputs[name].messages for name in shown)
         if self._hysteresis or self._judgements < OFTEN or self._judgements % SELDOM == 0:
-            self._implausible = self._find_implausible(robot, facts, before, bool(problems))
+            self._implausible = self._find_implausible(snapshot, facts, before, bool(problems))
         are_wrong = bool(self._implausible) or any(map(is_often_refused, facts.windows.values()))
         self.are_mended, self._are_wrong = self._are_wrong and not are_wrong, are_wrong
         health = tuple(self._health(name, totals, before) for name in shown)
         return health, (*problems, *self._implausible)
 
     def _find_implausible(
-        self, robot: Robot, facts: InputFacts, before: _Totals, has_problems: bool
+        self, snapshot: InputSnapshot, facts: InputFacts, before: _Totals, has_problems: bool
     ) -> tuple[str, ...]:
         """Judges what is implausible about the inputs, and returns the problems to report."""
-        is_early, state = len(self._history) <= WINDOW, robot.filter.timeline.state
+        is_early = len(self._history) <= WINDOW
         since_ns = self._start_ns if is_early else before.now_ns
         if self._starts_known is None:
-            self._starts_known = not state.lost
+            self._starts_known = not snapshot.lost
         steps = _since_stamp(self.inputs["odometry"].steps, since_ns)
         near, is_from_start = None, self._starts_known and (is_early or not self.has_moved)
         if facts.start is not None and is_from_start:
             near = pose_near_start(steps, facts.start)
         self._judgements_away = 0 if near is not None else self._judgements_away + 1
-        seen, is_open = (
-            self.inputs["sightings"].recent,
-            state.lost or self._judgements_away < WINDOW,
-        )
+        seen = self.inputs["sightings"].recent
+        is_open = bool(snapshot.lost) or self._judgements_away < WINDOW
         facts = facts._replace(
             near_start=near,
             is_from_start=is_from_start,
@@ -267,15 +262,9 @@ class InputMonitor:
             del found[MOTION]
         return self._hysteresis.update(found)
 
-    def _totals(self, robot: Robot, now_ns: int) -> _Totals:
+    def _totals(self, refused_later: Mapping[tuple[str, str], int], now_ns: int) -> _Totals:
         refused = {name: entry.refused.copy() for name, entry in self.inputs.items()}
-        state = robot.filter.timeline.state.counts
-        for (name, reason), number in robot.filter.refused.items():
-            refused[name][reason] += number
-        for reason in SightingFault:
-            refused[self._of_sightings][reason] += state.get(reason, 0)
-        for reason, number in robot.sensing.refused.items():
-            name = "sightings" if reason == "seen_twice" else "frame"
+        for (name, reason), number in refused_later.items():
             refused[name][reason] += number
         taken = {}
         for name, entry in self.inputs.items():
@@ -284,22 +273,22 @@ class InputMonitor:
         messages = {name: entry.messages for name, entry in self.inputs.items()}
         return _Totals(now_ns, taken, refused, messages)
 
-    def _missing_sightings_reason(self, robot: Robot, now_ns: int) -> str:
+    def _missing_sightings_reason(self, snapshot: InputSnapshot, now_ns: int) -> str:
         """Why sightings should come that do not: an empty frame would come too, or a landmark has
         been in view for long by the robot's own pose."""
         entry = self.inputs["sightings"]
         silent_ns = (now_ns - entry.arrived_ns) / self._facts.pace
         if entry.has_empty:
             return EMPTY_CAME if silent_ns > EMPTY_NS else ""
-        due = self._sees and silent_ns > SECOND_NS and self._has_in_view(robot)
+        due = self._sees and silent_ns > SECOND_NS and self._has_in_view(snapshot)
         self._in_view_for = self._in_view_for + 1 if due else 0
         return IN_VIEW if self._in_view_for > UNSEEN * self._facts.pace else ""
 
-    def _has_in_view(self, robot: Robot) -> bool:
+    def _has_in_view(self, snapshot: InputSnapshot) -> bool:
         """Whether a landmark is well in view, by the robot's pose."""
-        state, sensor = robot.filter.timeline.state, self._facts.sensor
-        c, (x, y, heading) = state.estimate.covariance, state.estimate.pose
-        if state.lost or c.xx + c.yy > KNOWN_M**2 or c.hh > KNOWN_RAD**2:
+        sensor, c = self._facts.sensor, snapshot.estimate.covariance
+        x, y, heading = snapshot.estimate.pose
+        if snapshot.lost or c.xx + c.yy > KNOWN_M**2 or c.hh > KNOWN_RAD**2:
             return False
         for mark in self._facts.landmarks.values():
             bearing = wrap_angle(math.atan2(mark.y_m - y, mark.x_m - x) - heading)

@@ -277,7 +277,9 @@ class Node:
         counts = self.counts + Counter(announced=self._declarations.announced)
         received = self.received.flows()
         status = self.robot.status(now_ns, self._incarnation, counts, received, self._clocks)
-        inputs, problems = self._health.judge(self.robot, now_ns, bool(self._namesakes))
+        inputs, problems = self._health.judge(
+            self.robot.input_snapshot(), now_ns, bool(self._namesakes)
+        )
         if self._health.are_mended:
             self.robot.forget_wrong_inputs(now_ns)
         overload = self._load.judge(len(self._inbox), self._inbox.pop_dropped())
