@@ -3,7 +3,7 @@
 import math
 import re
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from statistics import median
 from typing import NamedTuple
 
@@ -12,6 +12,7 @@ from cpcbl_agents import motion_causes as motions
 from cpcbl_agents.motion_causes import Step
 from cpcbl_agents.position_causes import position_cause
 from cpcbl_team.config import Landmark, SensorSettings
+from cpcbl_team.errors import nearest_name
 from cpcbl_team.geometry import Pose2
 from cpcbl_team.inputs import Odometry, Position, Sightings
 from cpcbl_transport.decoding import decode_by_key, input_problem
@@ -213,14 +214,6 @@ def _unknown_names(frames: Sequence[Sightings], facts: InputFacts) -> str:
         listed.append(f"`{name}` (`{near}`?)" if near else f"`{name}`")
     verb = "are" if len(listed) > 1 else "is"
     return f"{', '.join(listed)} {verb} no landmark, wall or robot of this team"
-
-
-def nearest_name(name: str, names: Iterable[str]) -> str:
-    """The name that somebody may have meant; empty if none is alike."""
-    from difflib import get_close_matches  # for a robot with a problem only
-
-    lower = {known.lower(): known for known in sorted(names)}
-    return next((lower[found] for found in get_close_matches(name.lower(), lower, 1)), "")
 
 
 def has_overlap(window: InputWindow) -> bool:

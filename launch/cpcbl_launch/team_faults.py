@@ -1,6 +1,5 @@
 """What is wrong with the tables of a team file: every fault, each with its key and the fix."""
 
-import difflib
 import math
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -11,6 +10,7 @@ from typing import Annotated, Any, Literal, NamedTuple, Union, get_args, get_ori
 import msgspec
 
 from cpcbl_team.config import RobotSettings, Team
+from cpcbl_team.errors import nearest_name
 from cpcbl_team.inputs import NAME_PATTERN
 
 DEEPEST = 12  # tables in tables; the settings need half of it
@@ -246,8 +246,8 @@ def _hints(kind: type[msgspec.Struct]) -> dict[str, Any]:
 
 
 def _choice_text(value: str, choices: tuple[str, ...]) -> str:
-    close = difflib.get_close_matches(value, choices, n=1)
-    mean = f"did you mean {close[0]!r}? " if close else ""
+    near = nearest_name(value, choices)
+    mean = f"did you mean {near!r}? " if near else ""
     return f"{value!r} is no choice; {mean}use one of {', '.join(choices)}"
 
 
@@ -260,7 +260,8 @@ def _nearest(name: str, known: Mapping[str, Any]) -> list[str]:
     for word in (name.lower(), stem):
         if other := [key for key in _OTHER_WORDS.get(word, ()) if key in known]:
             return other
-    return difflib.get_close_matches(name, known, n=1)
+    near = nearest_name(name, known)
+    return [near] if near else []
 
 
 def _unknown_text(near: list[str], known: Mapping[str, Any]) -> str:

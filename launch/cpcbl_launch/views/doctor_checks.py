@@ -1,6 +1,5 @@
 """The checks of `doctor`: pure functions over facts, each with findings and their remedies."""
 
-import difflib
 from collections.abc import Callable, Iterator
 from datetime import timedelta
 from typing import Literal
@@ -17,6 +16,7 @@ from cpcbl_launch.views.listening import (
     clock_problem,
 )
 from cpcbl_team.config import Team
+from cpcbl_team.errors import nearest_name
 
 STAMPS_AHEAD_S, STAMPS_BEHIND_S = 0.5, 1.0  # robots refuse what is further ahead, or 2 s behind
 SOON = timedelta(days=30)
@@ -246,8 +246,8 @@ def _input_clock(
 
 
 def _no_such_robot(robot: str, team: Team) -> str:
-    close = difflib.get_close_matches(robot, team.robots, n=1)
-    mean = f"{close[0]}? " if close else ""
+    near = nearest_name(robot, team.robots)
+    mean = f"{near}? " if near else ""
     return f"team {team.name} has no {robot}; {mean}there are {', '.join(team.robots)}"
 
 

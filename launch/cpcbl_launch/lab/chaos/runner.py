@@ -1,6 +1,5 @@
 """Runs scenarios one after another, so that they do not disturb each other; shows the outcomes."""
 
-import difflib
 import os
 import platform
 import subprocess
@@ -25,7 +24,7 @@ from cpcbl_launch.lab.chaos.scenarios import SCENARIOS
 from cpcbl_launch.lab.chaos.soak import require_judged_soak
 from cpcbl_launch.lab.chaos.team import ChaosError
 from cpcbl_launch.run.containers.docker import DockerError
-from cpcbl_team.errors import InputError
+from cpcbl_team.errors import InputError, nearest_name
 from cpcbl_transport.zenoh_bus import BusError
 
 ALL = "all"
@@ -41,8 +40,8 @@ def select_scenarios(names: Sequence[str]) -> list[Scenario]:
         if name == "fuzz":
             raise InputError(FUZZ)
         if name not in known and name != ALL:
-            close = difflib.get_close_matches(name, known, 1)
-            hint = f"did you mean {close[0]}?" if close else f"one of {', '.join(known)}, {ALL}"
+            near = nearest_name(name, known)
+            hint = f"did you mean {near}?" if near else f"one of {', '.join(known)}, {ALL}"
             raise InputError(f"chaos: no scenario {name!r}; {hint}")
     return [s for s in SCENARIOS if ALL in names or s.name in names]
 
