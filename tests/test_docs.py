@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from cpcbl_agents.input_problems import REASONS
+from cpcbl_agents.input_diagnosis.problems import REASONS
 from cpcbl_launch.lab.chaos.scenarios import SCENARIOS
 from cpcbl_team.inputs import SightingFault
 from cpcbl_team.timeline import TimelineRefusal

@@ -13,7 +13,7 @@ from cpcbl_agents.clocks import ClockMonitor
 from cpcbl_agents.collaboration import MessageCounters
 from cpcbl_agents.declarations import Declarations, LivelinessTokens
 from cpcbl_agents.inbox import INBOX, Inbox
-from cpcbl_agents.input_health import InputMonitor
+from cpcbl_agents.input_diagnosis.monitor import InputMonitor
 from cpcbl_agents.load import LoadMonitor, MayGoOn, everything
 from cpcbl_agents.pose_output import PoseOutput
 from cpcbl_agents.robot import Robot, build_robot

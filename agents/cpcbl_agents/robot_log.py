@@ -3,7 +3,7 @@
 import logging
 from collections.abc import Sequence
 
-from cpcbl_agents.input_problems import without_numbers
+from cpcbl_agents.input_diagnosis.problems import without_numbers
 from cpcbl_team.config import Team
 from cpcbl_transport.messages import Status
 

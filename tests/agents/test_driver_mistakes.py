@@ -24,7 +24,7 @@ from support.mistakes import (
     stamps,
 )
 
-from cpcbl_agents.input_problems import without_numbers
+from cpcbl_agents.input_diagnosis.problems import without_numbers
 from cpcbl_team.geometry import Pose2
 from cpcbl_team.inputs import Odometry, Position, Sightings
 

@@ -11,7 +11,7 @@ import msgspec
 import pytest
 from support.buses import SECOND, robot_at
 
-from cpcbl_agents.input_problems import without_numbers
+from cpcbl_agents.input_diagnosis.problems import without_numbers
 from cpcbl_agents.node import Node
 from cpcbl_agents.robot import build_robot
 from cpcbl_team.config import Field, Landmark, OdometrySettings, RobotSettings, Team

@@ -15,7 +15,7 @@ from typing import TypeVar
 from msgspec.structs import replace
 
 from cpcbl_agents.clock import Clock
-from cpcbl_agents.input_causes import MOST_SPEED_M_S, MOST_TURN_RATE_RAD_S
+from cpcbl_agents.input_diagnosis.message_causes import MOST_SPEED_M_S, MOST_TURN_RATE_RAD_S
 from cpcbl_launch.checks import require_robots
 from cpcbl_launch.simulation.field import SimulatedField
 from cpcbl_launch.simulation.guests import GuestBodies

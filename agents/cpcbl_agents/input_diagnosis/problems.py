@@ -7,10 +7,10 @@ from collections.abc import Iterator, Mapping, Sequence
 from statistics import median
 from typing import NamedTuple
 
-from cpcbl_agents import input_causes as causes
-from cpcbl_agents import motion_causes as motions
-from cpcbl_agents.motion_causes import Step
-from cpcbl_agents.position_causes import position_cause
+from cpcbl_agents.input_diagnosis import message_causes as causes
+from cpcbl_agents.input_diagnosis import motion_causes as motions
+from cpcbl_agents.input_diagnosis.motion_causes import Step
+from cpcbl_agents.input_diagnosis.position_causes import position_cause
 from cpcbl_team.config import Landmark, SensorSettings
 from cpcbl_team.errors import nearest_name
 from cpcbl_team.geometry import Pose2

@@ -1,6 +1,6 @@
 """The messages on a robot's inputs: counted as they arrive, judged once a second.
 
-A message costs a counter and a reference among the latest few. `input_problems` looks for causes in
+A message costs a counter and a reference among the latest few. `problems.py` looks for causes in
 those few.
 """
 
@@ -10,7 +10,13 @@ from collections.abc import Iterable, Iterator, Mapping
 from statistics import median
 from typing import NamedTuple, TypeVar
 
-from cpcbl_agents.input_problems import (
+from cpcbl_agents.input_diagnosis.motion_causes import (
+    CONTRADICTION,
+    OR_START,
+    Step,
+    pose_near_start,
+)
+from cpcbl_agents.input_diagnosis.problems import (
     MOTION,
     InputFacts,
     InputWindow,
@@ -19,7 +25,6 @@ from cpcbl_agents.input_problems import (
     is_often_refused,
     without_numbers,
 )
-from cpcbl_agents.motion_causes import CONTRADICTION, OR_START, Step, pose_near_start
 from cpcbl_agents.robot import InputSnapshot
 from cpcbl_team.config import RobotSettings, Start, Team
 from cpcbl_team.geometry import Pose2, wrap_angle

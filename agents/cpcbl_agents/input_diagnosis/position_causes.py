@@ -4,8 +4,8 @@ import math
 from collections.abc import Callable, Sequence
 from statistics import median
 
-from cpcbl_agents.input_causes import LEAST_CASES, unit_of
-from cpcbl_agents.motion_causes import OR_START, Step, places_at
+from cpcbl_agents.input_diagnosis.message_causes import LEAST_CASES, unit_of
+from cpcbl_agents.input_diagnosis.motion_causes import OR_START, Step, places_at
 from cpcbl_team.geometry import Pose2
 from cpcbl_team.inputs import Position
 
