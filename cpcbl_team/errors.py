@@ -11,7 +11,7 @@ class CpcblError(Exception):
 
         CpcblError
         ├── InputError          an option, an argument or a file of the user
-        │   ├── TeamFileError   a team file (cpcbl_launch.team_file)
+        │   ├── TeamFileError   a team file (cpcbl_launch.team.file)
         │   └── LogError        a log or a recording (cpcbl_agents.sources.mrclam)
         ├── DependencyError     a package or a system that this machine does not have
         ├── ClockError          the machine's clock was set while a robot ran

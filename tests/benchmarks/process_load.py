@@ -23,7 +23,7 @@ from cpcbl_agents.node import STATUS_NS
 from cpcbl_agents.stop import StopSignal
 from cpcbl_launch.run.processes import ProcessSpec, Supervisor, process_table
 from cpcbl_launch.run.up import free_endpoint
-from cpcbl_launch.team_file import save_resolved
+from cpcbl_launch.team.file import save_resolved
 from cpcbl_team.config import CollaborationSettings, Team
 from cpcbl_team.inputs import Belief, Odometry
 from cpcbl_transport import topics

@@ -23,7 +23,7 @@ from cpcbl_launch.calibration.logs import RobotLog, RobotLogs
 from cpcbl_launch.calibration.statistics import Estimate, decimals
 from cpcbl_launch.calibration.team_tables import MINIMUM, team_source
 from cpcbl_launch.reporting.recording import read_recording
-from cpcbl_launch.team_file import builtin_path, parse_team
+from cpcbl_launch.team.file import builtin_path, parse_team
 from cpcbl_team.errors import InputError
 
 INTERVAL_S = 0.5  # with correlation_s known, more frequent sightings of an object add little

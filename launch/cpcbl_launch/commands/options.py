@@ -10,10 +10,10 @@ from typing import Annotated, Any
 
 from typer import Argument, CallbackParam, Context, Exit, Option, secho
 
-from cpcbl_launch.checks import require_endpoints, require_matplotlib
 from cpcbl_launch.reporting.files import json_text, write_or_reason
 from cpcbl_launch.run.containers import BASE_VARIABLE
-from cpcbl_launch.team_file import builtin_path, find_team
+from cpcbl_launch.team.file import builtin_path, find_team
+from cpcbl_launch.team.requirements import require_endpoints, require_matplotlib
 from cpcbl_team.errors import InputError
 
 

@@ -14,11 +14,11 @@ from rich.console import Console
 from typer import Option
 
 from cpcbl_agents.clock import Clock
-from cpcbl_launch.checks import require_duration, require_robots, require_team_opencv
 from cpcbl_launch.commands import options
-from cpcbl_launch.overrides import Overrides, with_blind_robots, with_overrides
 from cpcbl_launch.run.containers import BASE_IMAGE
-from cpcbl_launch.team_file import find_team
+from cpcbl_launch.team.file import find_team
+from cpcbl_launch.team.overrides import Overrides, with_blind_robots, with_overrides
+from cpcbl_launch.team.requirements import require_duration, require_robots, require_team_opencv
 from cpcbl_team.config import GatewaySettings, Team
 from cpcbl_team.errors import InputError
 from cpcbl_transport.security import Identity, link_of

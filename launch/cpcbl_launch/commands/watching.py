@@ -12,10 +12,10 @@ from rich.console import Console
 from typer import Argument, Exit, Option, launch
 
 from cpcbl_agents.clock import Clock
-from cpcbl_launch.checks import require_robots, require_team_opencv
 from cpcbl_launch.commands import options
 from cpcbl_launch.run.containers import BASE_IMAGE
-from cpcbl_launch.team_file import find_team
+from cpcbl_launch.team.file import find_team
+from cpcbl_launch.team.requirements import require_robots, require_team_opencv
 from cpcbl_team.config import Team, TransportSettings
 from cpcbl_team.errors import InputError
 from cpcbl_transport.security import Identity, Link, link_of

@@ -24,8 +24,8 @@ from zstandard import ZstdError
 from cpcbl_agents.sources.mrclam import LogError
 from cpcbl_launch.reporting.metrics import Floats
 from cpcbl_launch.reporting.recorder import truth_rows
-from cpcbl_launch.team_faults import one_line
-from cpcbl_launch.team_file import decode_resolved
+from cpcbl_launch.team.faults import one_line
+from cpcbl_launch.team.file import decode_resolved
 from cpcbl_team.config import Team
 from cpcbl_team.inputs import Odometry, Position, Sightings
 from cpcbl_transport import topics

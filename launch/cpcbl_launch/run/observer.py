@@ -16,7 +16,7 @@ from cpcbl_agents.process import Loop, new_incarnation, own_camera, stop_on_cloc
 from cpcbl_agents.robot_log import RobotLogger
 from cpcbl_launch.reporting.statuses import FlowReport, ProblemLog, ProblemReport, summed_flows
 from cpcbl_launch.simulation.guests import unsupported_delay
-from cpcbl_launch.team_file import read_layer, with_added_robot
+from cpcbl_launch.team.file import read_layer, with_added_robot
 from cpcbl_team.config import Team
 from cpcbl_team.errors import InputError
 from cpcbl_team.inputs import NAME_PATTERN

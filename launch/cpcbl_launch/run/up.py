@@ -16,7 +16,6 @@ import numpy as np
 
 from cpcbl_agents.clock import Clock
 from cpcbl_agents.earlier_processes import repeat_tokens
-from cpcbl_launch.checks import require_duration
 from cpcbl_launch.reporting.files import write_or_reason
 from cpcbl_launch.reporting.metrics import Floats
 from cpcbl_launch.reporting.phases import Span, guest_reports, phase_report
@@ -26,7 +25,8 @@ from cpcbl_launch.run.logged_team import is_calibrated_on
 from cpcbl_launch.run.processes import Processes, Supervisor, process_table, tasks
 from cpcbl_launch.run.router import team_router
 from cpcbl_launch.simulation.in_process import Progress, simulate
-from cpcbl_launch.team_file import save_resolved
+from cpcbl_launch.team.file import save_resolved
+from cpcbl_launch.team.requirements import require_duration
 from cpcbl_team.config import Team
 from cpcbl_team.errors import InputError
 from cpcbl_transport.bus import Bus

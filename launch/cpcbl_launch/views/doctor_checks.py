@@ -6,7 +6,7 @@ from typing import Literal
 
 import msgspec
 
-from cpcbl_launch.team_faults import one_line
+from cpcbl_launch.team.faults import one_line
 from cpcbl_launch.views.doctor_facts import Facts
 from cpcbl_launch.views.listening import (
     DAY_S,

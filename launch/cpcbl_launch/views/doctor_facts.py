@@ -12,8 +12,8 @@ from pathlib import Path
 import msgspec
 
 from cpcbl_launch.run.containers.docker import DockerError, check_daemon
-from cpcbl_launch.team_checks import warnings
-from cpcbl_launch.team_file import TeamFileError, find_team
+from cpcbl_launch.team.checks import warnings
+from cpcbl_launch.team.file import TeamFileError, find_team
 from cpcbl_launch.views.listening import TeamHeard, listen
 from cpcbl_team.config import Team, TransportSettings
 from cpcbl_team.errors import CpcblError

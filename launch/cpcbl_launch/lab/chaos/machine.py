@@ -16,7 +16,7 @@ from typing import NamedTuple, Self
 from cpcbl_agents.clock import Clock
 from cpcbl_launch.run.processes import PROGRAM, ProcessSpec, Supervisor
 from cpcbl_launch.run.up import free_endpoint
-from cpcbl_launch.team_file import save_resolved
+from cpcbl_launch.team.file import save_resolved
 from cpcbl_team.config import OdometrySettings, RobotSettings, Start, Team
 from cpcbl_transport import topics
 from cpcbl_transport.decoding import decode

@@ -22,7 +22,7 @@ from cpcbl_launch.lab.experiments.runs import with_settings
 from cpcbl_launch.lab.faulty_robot import faulty_command
 from cpcbl_launch.run.processes import PROGRAM, ProcessSpec, Supervisor, process_table
 from cpcbl_launch.run.up import free_endpoint
-from cpcbl_launch.team_file import builtin_path, load_team, save_resolved
+from cpcbl_launch.team.file import builtin_path, load_team, save_resolved
 from cpcbl_team.config import Team
 from cpcbl_team.errors import CpcblError
 from cpcbl_transport.security import Identity, link_of

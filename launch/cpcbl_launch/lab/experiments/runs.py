@@ -25,7 +25,7 @@ from cpcbl_launch.reporting import metrics
 from cpcbl_launch.reporting.metrics import Floats, Samples, Score
 from cpcbl_launch.reporting.recorder import Recorder
 from cpcbl_launch.simulation.in_process import simulate
-from cpcbl_launch.team_file import builtin_path, load_team
+from cpcbl_launch.team.file import builtin_path, load_team
 from cpcbl_team.config import Team
 from cpcbl_team.geometry import Pose2, step
 from cpcbl_team.inputs import Odometry

@@ -12,7 +12,7 @@ from aiohttp import ClientSession, ClientWebSocketResponse, WSMsgType, WSServerH
 from support.buses import SECOND
 from support.traffic import status
 
-from cpcbl_launch.team_file import find_team
+from cpcbl_launch.team.file import find_team
 from cpcbl_launch.views.web import server
 from cpcbl_launch.views.web.address import Listen
 from cpcbl_launch.views.web.feed import Feed

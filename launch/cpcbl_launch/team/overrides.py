@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 from msgspec.structs import replace
 
-from cpcbl_launch.checks import require_robots
+from cpcbl_launch.team.requirements import require_robots
 from cpcbl_team.config import Team
 
 
