@@ -1,5 +1,7 @@
 """The errors that a user can cause, and can mend: one root for all of them."""
 
+from collections.abc import Iterable
+
 
 class CpcblError(Exception):
     """Something that a user can cause; its text is one line that names the cause and the remedy.
@@ -9,7 +11,7 @@ class CpcblError(Exception):
 
         CpcblError
         ├── InputError          an option, an argument or a file of the user
-        │   ├── TeamFileError   a team file (cpcbl_launch.team_file)
+        │   ├── TeamFileError   a team file (cpcbl_launch.team.file)
         │   └── LogError        a log or a recording (cpcbl_agents.sources.mrclam)
         ├── DependencyError     a package or a system that this machine does not have
         ├── ClockError          the machine's clock was set while a robot ran
@@ -34,3 +36,13 @@ class DependencyError(CpcblError):
 
 class ClockError(CpcblError):
     """The clock of this machine was set while a robot with real inputs was running."""
+
+
+def nearest_name(name: str, known: Iterable[str], least_ratio: float = 0.6) -> str:
+    """The known name that is spelled most like this one, whatever their case; empty if none is as
+    similar as `least_ratio` (of difflib's SequenceMatcher)."""
+    from difflib import get_close_matches  # only what goes wrong needs it
+
+    by_folded = {other.casefold(): other for other in sorted(known)}
+    near = get_close_matches(name.casefold(), by_folded, n=1, cutoff=least_ratio)
+    return by_folded[near[0]] if near else ""

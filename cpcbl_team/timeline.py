@@ -113,7 +113,7 @@ class Timeline:
             if screen.is_changed_by_beliefs(item, before, state, belief.robot):
                 return
             is_belief = isinstance(item, Belief)
-            state = self._applied(item, state) if is_belief else with_beliefs(after, state)
+            state = self._apply(item, state) if is_belief else with_beliefs(after, state)
             states.append(state)
 
     def latest(self, now_ns: int) -> State:
@@ -133,10 +133,10 @@ class Timeline:
     def _state_before(self, index: int) -> State:
         states = self._states
         for item in self._inputs[len(states) - 1 : index]:
-            states.append(self._applied(item, states[-1]))
+            states.append(self._apply(item, states[-1]))
         return states[index]
 
-    def _applied(self, item: Input, state: State) -> State:
+    def _apply(self, item: Input, state: State) -> State:
         return _apply[type(item)](self._localizer, state, item)
 
     def _forget(self) -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from cpcbl_agents.input_problems import REASONS
+from cpcbl_agents.input_diagnosis.problems import REASONS
 from cpcbl_launch.lab.chaos.scenarios import SCENARIOS
 from cpcbl_team.inputs import SightingFault
 from cpcbl_team.timeline import TimelineRefusal
@@ -118,3 +118,13 @@ def test_every_reason_of_a_refusal_has_its_remedy_in_the_docs() -> None:
 def _cell(row: str) -> str:
     """The first cell of a row of a table."""
     return row.split("|")[1] if row.startswith("|") else ""
+
+
+def test_the_guide_for_contributors_lists_every_make_target() -> None:
+    declared = re.search(r"^\.PHONY:((?:.*\\\n)*.*)", (ROOT / "Makefile").read_text(), re.MULTILINE)
+    assert declared is not None
+    table = (ROOT / "CONTRIBUTING.md").read_text().partition("## The house")[0]
+    rows = [row for row in table.splitlines() if row.startswith("|")]
+    listed = {name for row in rows for name in re.findall(r"`(?:make )?([\w-]+)`", _cell(row))}
+    listed |= {name for row in rows for name in re.findall(r"`make ([\w-]+)`", row)}
+    assert listed == set(declared[1].replace("\\", "").split())

@@ -19,6 +19,10 @@ PRIVATE = re.findall(
     Stepped said_by heard_by Treatment announce reading overhead handshake why_not PassingBus liar
     Lie Liar bodies Body posts carriers visitors Visitor Notes NoteTaker Kept LookEar ear standing
     Wish Visited yardstick yardsticks sights they_go_on all_is_well Weather Wire
+    Held unseen kind cause turned way_of_speed seen_again by_ways by_pose by_start by_tokens
+    Before changed tell_moved Shown serving bus_of doing done given guarded misunderstood
+    determined unsettled lying spent healed thinned attached watched joined checked taken arrived
+    stored connected filled clamped applied overlapping
     """,
 )
 

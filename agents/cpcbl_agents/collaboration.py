@@ -189,7 +189,7 @@ class CollaborationAgent:
         """Selects the teammates whose tiers are watched, and those whose beliefs are useful."""
         forgotten_ns = now.stamp_ns - NEIGHBOUR_NS
         self.guests.forget(now.stamp_ns)
-        guests = self.guests.watched
+        guests = self.guests.watched_robots
         self._latest_fixes = {
             name: fix
             for name, fix in self._latest_fixes.items()
@@ -363,7 +363,8 @@ class CollaborationAgent:
         return admitted
 
     def _teammates_to_help(self, now_ns: int) -> int:
-        """How many teammates there were to help within the interval of so many."""
+        """How many teammates share the budget. Beginning with the one that was seen last, each
+        counts that was seen within the interval that the budget pays for those before it."""
         number, stamps = 0, sorted((n.stamp_ns for n in self._needs.values()), reverse=True)
         while number < len(stamps) and (
             now_ns - stamps[number]

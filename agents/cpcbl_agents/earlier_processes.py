@@ -19,20 +19,20 @@ LOOK_S = 0.2
 ROUTER = "router"  # in place of an incarnation: what the router repeats
 
 
-class Before(NamedTuple):
+class EarlierRuns(NamedTuple):
     """What is known of the earlier processes of a robot."""
 
     moved: bool = False  # the robot is not where it started
     ran: bool = False  # and may have spent its budget
 
     @staticmethod
-    def by_tokens(tokens: Sequence[str]) -> "Before":
+    def from_tokens(tokens: Sequence[str]) -> "EarlierRuns":
         """By the tokens of this robot that are there."""
         known = [names["how"] for token in tokens if (names := topics.RAN.names(token))]
-        return Before(MOVED in known, bool(known))
+        return EarlierRuns(MOVED in known, bool(known))
 
 
-NEVER_RAN = Before()
+NEVER_RAN = EarlierRuns()
 
 
 def wait_until_alone(
@@ -40,7 +40,7 @@ def wait_until_alone(
     robot: str,
     stop: Callable[[], bool] = lambda: False,
     within_s: float = LEASE_S,
-) -> Before:
+) -> EarlierRuns:
     """What is known of the earlier processes of a robot, once none of them runs any more. Two at a
     time would share inputs, and teammates would mix what they say. `tokens`: those that are there
     now, by key. Raises InputError when one goes on running."""
@@ -49,7 +49,7 @@ def wait_until_alone(
         there = tokens(topics.RAN.at(robot=robot))
         others = {key.rpartition("/")[2] for key in there} - {ROUTER}
         if not others or stop():
-            return Before.by_tokens(there)
+            return EarlierRuns.from_tokens(there)
         if time.monotonic() >= until_s:
             raise InputError(
                 f"robot {robot}: another process is this robot already ({', '.join(sorted(others))}"
@@ -66,7 +66,7 @@ class OwnTokens:
         self._has_moved = False
         bus.declare_token(topics.RAN.at(**self._names, how=STILL))
 
-    def tell_moved(self) -> None:
+    def declare_moved(self) -> None:
         """The robot is no longer where it started. May be called again and again."""
         if not self._has_moved:
             self._has_moved = True

@@ -1,7 +1,6 @@
 """How to install what not everybody needs: the extras of this package (pyproject.toml)."""
 
 import json
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote, urlsplit
@@ -12,6 +11,8 @@ PACKAGE = "cpcbl-team"
 def install_command(extra: str) -> str:
     """`pip install --editable '/home/me/cpcbl-team[camera]'`: the command that adds an extra to
     this installation, from where it came (PEP 610). The package is on no registry."""
+    from importlib import metadata  # 1.6 MiB, which no robot needs
+
     try:
         text = metadata.distribution(PACKAGE).read_text("direct_url.json")
     except metadata.PackageNotFoundError:

@@ -29,7 +29,7 @@ class GuestRegistry:
         return name in self._present
 
     @property
-    def watched(self) -> frozenset[str]:
+    def watched_robots(self) -> frozenset[str]:
         """Guests and candidates: their tokens are watched."""
         return frozenset(self._noticed)
 

@@ -13,7 +13,7 @@ from cpcbl_agents.clocks import ClockMonitor
 from cpcbl_agents.collaboration import MessageCounters
 from cpcbl_agents.declarations import Declarations, LivelinessTokens
 from cpcbl_agents.inbox import INBOX, Inbox
-from cpcbl_agents.input_health import InputMonitor
+from cpcbl_agents.input_diagnosis.monitor import InputMonitor
 from cpcbl_agents.load import LoadMonitor, MayGoOn, everything
 from cpcbl_agents.pose_output import PoseOutput
 from cpcbl_agents.robot import Robot, build_robot
@@ -277,7 +277,9 @@ class Node:
         counts = self.counts + Counter(announced=self._declarations.announced)
         received = self.received.flows()
         status = self.robot.status(now_ns, self._incarnation, counts, received, self._clocks)
-        inputs, problems = self._health.judge(self.robot, now_ns, bool(self._namesakes))
+        inputs, problems = self._health.judge(
+            self.robot.input_snapshot(), now_ns, bool(self._namesakes)
+        )
         if self._health.are_mended:
             self.robot.forget_wrong_inputs(now_ns)
         overload = self._load.judge(len(self._inbox), self._inbox.pop_dropped())
@@ -327,8 +329,8 @@ class GuestNode(Node):
             keys = topics.IN_SIGHTINGS.at(robot=self.robot.name)
             return f"senses nothing: nothing came on {keys}; is its driver there?"
         return (
-            "senses nothing: no field gives it a body; is the team simulated in real time, and does"
-            " its file let guests in?"
+            "senses nothing: no simulated field simulates it; is the team simulated in real time,"
+            " and does its file let guests in?"
         )
 
     def step(self, now_ns: int, may_go_on: MayGoOn = everything) -> None:

@@ -10,13 +10,13 @@ from contextlib import AbstractContextManager, closing, nullcontext, suppress
 import msgspec
 
 from cpcbl_agents.clock import Clock
-from cpcbl_agents.earlier_processes import NEVER_RAN, Before, OwnTokens, wait_until_alone
+from cpcbl_agents.earlier_processes import NEVER_RAN, EarlierRuns, OwnTokens, wait_until_alone
 from cpcbl_agents.node import BoundedSteppable, Node
 from cpcbl_agents.robot import Robot, build_robot
-from cpcbl_agents.robot_log import RobotLog
+from cpcbl_agents.robot_log import RobotLogger
 from cpcbl_agents.sources import OwnCamera
 from cpcbl_agents.stop import StopSignal as StopSignal  # with a robot, one needs it
-from cpcbl_agents.watchdog import watched
+from cpcbl_agents.watchdog import with_watchdog
 from cpcbl_team.config import Team
 from cpcbl_team.errors import ClockError
 from cpcbl_transport.bus import Bus
@@ -126,30 +126,30 @@ def run_robot(
             name,
             team,
             clock,
-            before if restarted is None else Before(restarted, before.ran or restarted),
+            before if restarted is None else EarlierRuns(restarted, before.ran or restarted),
             camera,
         )
         start_ns, incarnation = clock.now_ns(), new_incarnation()
-        said, tokens = RobotLog(name), OwnTokens(bus, name, incarnation)
+        logger, tokens = RobotLogger(name), OwnTokens(bus, name, incarnation)
 
         def on_status(status: Status) -> None:
-            said.tell(status)
+            logger.log_status(status)
             if node.has_moved:
-                tokens.tell_moved()
+                tokens.declare_moved()
 
         node = Node(
             *(robot, team, wrap_bus(bus), start_ns, incarnation),
             *(loop.on_arrival, clock.speed, on_status),
         )
-        said.connected(team, link.endpoints)
-        loop.run(node, watched(stop_on_clock_step(name, team, clock, stop)))
+        logger.log_connected(team, link.endpoints)
+        loop.run(node, with_watchdog(stop_on_clock_step(name, team, clock, stop)))
 
 
 def make_robot(
     name: str,
     team: Team,
     clock: Clock,
-    before: Before = NEVER_RAN,
+    before: EarlierRuns = NEVER_RAN,
     camera: OwnCamera | None = None,
 ) -> Robot:
     """The robot as it starts now. It keeps its start unless it has moved since, or is late in its
@@ -185,7 +185,7 @@ def stop_on_clock_step(
     if team.robots[name].source != "external":
         return stop
 
-    def checked() -> bool:
+    def stop_or_raise() -> bool:
         if abs(by_s := clock.clock_step_s()) > MAX_CLOCK_STEP_S:
             raise ClockError(
                 f"robot {name}: this machine's clock was set by {by_s:+.2f} s, or it slept: start"
@@ -193,7 +193,7 @@ def stop_on_clock_step(
             )
         return stop()
 
-    return checked
+    return stop_or_raise
 
 
 def own_camera(

@@ -1,4 +1,4 @@
-"""One robot: three agents and the way of messages between them. It knows no bus and no clock.
+"""One robot: three agents and the route of messages between them. It knows no bus and no clock.
 
 `build_robot` makes one from a team file: it alone opens a robot's files. What a robot does not need
 is not imported: numpy for a log, OpenCV for a camera.
@@ -7,6 +7,7 @@ is not imported: numpy for a log, OpenCV for a camera.
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
+from typing import NamedTuple
 
 from cpcbl_agents.agent import AgentMessage, BusEvent, FrameSubscribers, HelpSent, Presence, Tick
 from cpcbl_agents.clocks import ClockMonitor
@@ -17,12 +18,22 @@ from cpcbl_agents.sensing import SensingAgent
 from cpcbl_agents.sources import OwnCamera, Source
 from cpcbl_agents.waypoint_follower import WaypointFollower
 from cpcbl_team.config import Team
-from cpcbl_team.inputs import BeliefShared, InputsMended
+from cpcbl_team.estimate import Estimate
+from cpcbl_team.inputs import BeliefShared, InputsMended, SightingFault
 from cpcbl_team.trust import TrustStatus
 from cpcbl_transport.budget import Budget
 from cpcbl_transport.messages import Flow, Help, Message, Outgoing, Pose, SensorInput, Status, Trust
 
 NEVER_NS = 2**62
+
+
+class InputSnapshot(NamedTuple):
+    """What the agents of a robot know of its inputs, for the monitor that judges them."""
+
+    estimate: Estimate
+    lost: str  # why the robot is lost; empty if it is not
+    refused: Counter[tuple[str, str]]  # since the start, by input and reason
+    is_camera_lost: bool
 
 
 class Robot:
@@ -35,6 +46,7 @@ class Robot:
         self.name, self.sensing, self._shared_ns = name, sensing, start_ns
         self.filter = FilterAgent(settings, team.map, teammates, start_ns)
         self._is_weighted = settings.localizer.variant == "weighted"  # it has no covariance
+        self._sightings_input = "frame" if settings.sensing == "camera" else "sightings"
         match = team.messages_per_s(name), restarted, team.match.duration_s
         budget = Budget(settings.collaboration.budget, start_ns, *match)
         known = frozenset(team.map.landmarks) | frozenset(team.map.walls) | frozenset(team.robots)
@@ -76,9 +88,21 @@ class Robot:
                 self.filter.handle(BeliefShared(sent.stamp_ns), now_ns)
 
     def forget_wrong_inputs(self, now_ns: int) -> None:
-        """Its inputs were wrong, as their monitor said, and no longer are."""
+        """Discards what the filter adapted while inputs were wrong: call it when the monitor finds
+        them right again."""
         latest = self.filter.timeline.latest(now_ns)
         self.filter.handle(InputsMended(latest.stamp_ns), now_ns)
+
+    def input_snapshot(self) -> InputSnapshot:
+        """The state of the inputs now."""
+        state, camera = self.filter.timeline.state, self.sensing.counts
+        refused = self.filter.refused.copy()
+        for fault in SightingFault:
+            refused[self._sightings_input, fault] += state.counts.get(fault, 0)
+        for reason, number in self.sensing.refused.items():
+            refused["sightings" if reason == "seen_twice" else "frame", reason] += number
+        is_camera_lost = camera["camera_lost"] > camera["camera_back"]
+        return InputSnapshot(state.estimate, state.lost, refused, is_camera_lost)
 
     def pose(self, now_ns: int) -> Pose:
         """The pose at `now_ns`, or at the end of the newest odometry."""

@@ -1,7 +1,7 @@
-"""What systemd is told of a process that it started as Type=notify (sd_notify(3)).
+"""The watchdog of systemd, for a process that it started as Type=notify (sd_notify(3)).
 
-A process that hangs stops telling that it is alive, and is ended and started again. Anywhere else
-nothing is told.
+A process that hangs sends no more signs of life: systemd ends it and starts it again. Without
+systemd nothing is sent.
 """
 
 import os
@@ -11,7 +11,7 @@ from contextlib import suppress
 
 
 def notify(text: str, environment: Mapping[str, str] = os.environ) -> bool:
-    """Tells the service manager something, as `READY=1`; whether there is one."""
+    """Sends a state such as `READY=1` to the service manager; returns whether there is one."""
     address = environment.get("NOTIFY_SOCKET", "")
     if not address:
         return False
@@ -25,11 +25,11 @@ def notify(text: str, environment: Mapping[str, str] = os.environ) -> bool:
     return False
 
 
-def watched(
+def with_watchdog(
     stop: Callable[[], bool], environment: Mapping[str, str] = os.environ
 ) -> Callable[[], bool]:
-    """`stop`, which a loop asks again and again, as a sign of life: each time it tells so, but no
-    more than four times in the interval that the service manager wants. The process is ready."""
+    """Tells the service manager that the process is ready. Returns `stop` wrapped: each call of it
+    is a sign of life, sent at most four times in the watchdog's interval."""
     notify("READY=1", environment)
     interval_us = environment.get("WATCHDOG_USEC", "")
     is_mine = environment.get("WATCHDOG_PID", str(os.getpid())) == str(os.getpid())

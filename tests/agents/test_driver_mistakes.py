@@ -24,7 +24,7 @@ from support.mistakes import (
     stamps,
 )
 
-from cpcbl_agents.input_problems import without_numbers
+from cpcbl_agents.input_diagnosis.problems import without_numbers
 from cpcbl_team.geometry import Pose2
 from cpcbl_team.inputs import Odometry, Position, Sightings
 
@@ -120,7 +120,9 @@ SEEN = {
     "capitals": Row(
         lambda: of(Sightings, id=lambda s: s.id.upper()), "`DOOR` (`door`?)", (STAND, TURN), 4
     ),
-    "itself": Row(lambda: of(Sightings, id=lambda s: "r1"), "this robot itself", (STAND, TURN), 4),
+    "itself": Row(
+        lambda: of(Sightings, id=lambda s: "r1"), "this robot's own name", (STAND, TURN), 4
+    ),
     "infinite": Row(
         lambda: of(Sightings, bearing_rad=lambda s: math.inf), "infinite or NaN", (STAND, CIRCLE), 4
     ),

@@ -10,7 +10,7 @@ from support.routers import open_router
 
 from cpcbl_agents.earlier_processes import (
     NEVER_RAN,
-    Before,
+    EarlierRuns,
     OwnTokens,
     repeat_tokens,
     wait_until_alone,
@@ -23,21 +23,21 @@ from cpcbl_transport.security import Identity, access_control
 from cpcbl_transport.zenoh_bus import ZenohBus, open_bus
 
 
-def before(bus: ZenohBus, robot: str = "r1") -> Before:
-    return Before.by_tokens(bus.tokens(topics.RAN.at(robot=robot)))
+def before(bus: ZenohBus, robot: str = "r1") -> EarlierRuns:
+    return EarlierRuns.from_tokens(bus.tokens(topics.RAN.at(robot=robot)))
 
 
 def check(first: ZenohBus, second: ZenohBus, other: ZenohBus) -> None:
     """`first` and `second` are of processes of r1, `other` of r2."""
     assert before(first) == before(other, "r2") == NEVER_RAN
     tokens = OwnTokens(first, "r1", "1")
-    wait_until(lambda: before(second) == Before(ran=True))
-    tokens.tell_moved()
-    tokens.tell_moved()
+    wait_until(lambda: before(second) == EarlierRuns(ran=True))
+    tokens.declare_moved()
+    tokens.declare_moved()
     wait_until(lambda: len(second.tokens(topics.RAN.at(robot="r1"))) == 4)
     first.close()
     wait_until(lambda: len(second.tokens(topics.RAN.at(robot="r1"))) == 2)  # the router's
-    assert before(second) == Before(moved=True, ran=True)
+    assert before(second) == EarlierRuns(moved=True, ran=True)
     assert before(other, "r2") == NEVER_RAN
 
 
@@ -55,7 +55,7 @@ def test_a_second_process_of_a_robot_waits_for_the_first_and_then_gives_up() -> 
         first, second, other = (stack.enter_context(open_bus("lab", [endpoint])) for _ in range(3))
         assert wait_until_alone(first.tokens, "r1") == NEVER_RAN
         OwnTokens(first, "r1", "1")
-        wait_until(lambda: before(second) == Before(ran=True))
+        wait_until(lambda: before(second) == EarlierRuns(ran=True))
         with pytest.raises(InputError, match="robot r1: another process is this robot already"):
             wait_until_alone(second.tokens, "r1", within_s=0.3)
         assert wait_until_alone(other.tokens, "r2", within_s=0.0) == NEVER_RAN
@@ -67,7 +67,7 @@ def test_a_second_process_of_a_robot_waits_for_the_first_and_then_gives_up() -> 
                 first.close()
             return second.tokens(keys)
 
-        assert wait_until_alone(ends_meanwhile, "r1") == Before(ran=True)
+        assert wait_until_alone(ends_meanwhile, "r1") == EarlierRuns(ran=True)
         assert len(asked) >= 2
 
 

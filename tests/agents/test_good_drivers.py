@@ -13,7 +13,7 @@ from cpcbl_agents.node import Node
 from cpcbl_agents.robot import build_robot
 from cpcbl_agents.sources.mrclam import MrclamSource
 from cpcbl_launch.run.logged_team import load_logged_team
-from cpcbl_launch.team_file import builtin_path, load_team
+from cpcbl_launch.team.file import builtin_path, load_team
 from cpcbl_team.config import SensorSettings, Team
 from cpcbl_team.geometry import Pose2
 from cpcbl_transport import topics

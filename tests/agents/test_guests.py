@@ -27,7 +27,7 @@ EXACT = SensorSettings(field_of_view_deg=360.0, range_share=0.0, range_floor_m=1
 def test_a_candidate_is_a_guest_while_its_token_is_there() -> None:
     guests = GuestRegistry(most=2)
     assert guests.notice("tripod", 0)
-    assert guests.watched == {"tripod"}
+    assert guests.watched_robots == {"tripod"}
     assert "tripod" not in guests
     guests.set_presence("tripod", True)
     guests.set_presence("tripod", True)  # at a change of tier
@@ -45,14 +45,14 @@ def test_a_known_name_is_no_candidate_and_an_unnoticed_robot_is_no_guest() -> No
         assert name not in guests
     guests.set_presence("tripod", True)
     assert "tripod" not in guests
-    assert guests.watched == frozenset()
+    assert guests.watched_robots == frozenset()
     assert not guests.counts
 
 
 def test_a_team_without_guests_has_no_candidates() -> None:
     guests = GuestRegistry(most=0)
     assert not guests.notice("tripod", 0)
-    assert guests.watched == frozenset()
+    assert guests.watched_robots == frozenset()
 
 
 def test_a_candidate_without_a_token_loses_its_place_a_guest_does_not() -> None:
@@ -64,7 +64,7 @@ def test_a_candidate_without_a_token_loses_its_place_a_guest_does_not() -> None:
     assert not guests.notice("new", LOOKUP_NS)
     assert guests.counts["guest_refused"] == 2
     assert guests.notice("late", LOOKUP_NS)  # it comes again
-    assert guests.watched == {"tripod", "late"}
+    assert guests.watched_robots == {"tripod", "late"}
     for time_ns in range(0, FORGET_NS, LOOKUP_NS):
         assert not guests.notice("garbage", LOOKUP_NS + time_ns)  # in vain before
     assert guests.notice("garbage", LOOKUP_NS + FORGET_NS)
@@ -75,7 +75,7 @@ def test_a_candidate_without_a_token_loses_its_place_a_guest_does_not() -> None:
     guests.set_presence("tripod", True)
     guests.set_presence("late", True)
     assert not guests.notice("third", 100 * LOOKUP_NS)
-    assert guests.watched == {"tripod", "late"}
+    assert guests.watched_robots == {"tripod", "late"}
 
 
 def test_every_robot_that_is_seen_all_the_time_is_looked_up() -> None:
@@ -84,7 +84,7 @@ def test_every_robot_that_is_seen_all_the_time_is_looked_up() -> None:
     for frame in range(100):
         for number in range(12):
             guests.notice(f"g{number}", frame * LOOKUP_NS // 10)
-        turns |= guests.watched
+        turns |= guests.watched_robots
     assert len(turns) == 12
 
 
@@ -95,12 +95,12 @@ def test_strangers_are_forgotten_some_time_after_they_were_noticed_guests_are_no
     guests.notice("garbage", SECOND)
     guests.set_presence("tripod", True)
     guests.forget(FORGET_NS + SECOND)
-    assert guests.watched == {"tripod", "garbage"}
+    assert guests.watched_robots == {"tripod", "garbage"}
     guests.forget(FORGET_NS + SECOND + 1)
-    assert guests.watched == {"tripod"}
+    assert guests.watched_robots == {"tripod"}
     guests.set_presence("tripod", False)
     guests.forget(FORGET_NS + SECOND + 1)
-    assert guests.watched == frozenset()
+    assert guests.watched_robots == frozenset()
 
 
 @examples(100)
@@ -121,10 +121,10 @@ def test_whatever_happens_there_are_never_more_than_allowed(
         else:
             guests.set_presence(name, event == "came")
         guests.forget(now_ns)
-        assert len(guests.watched) <= most
+        assert len(guests.watched_robots) <= most
         here = {n for _, n in events if n in guests}
-        assert here <= guests.watched
-        assert "a" not in guests.watched
+        assert here <= guests.watched_robots
+        assert "a" not in guests.watched_robots
 
 
 # Help, both ways, over the bus in memory --------------------------------------------------------

@@ -11,7 +11,7 @@ import msgspec
 import pytest
 from support.buses import SECOND, robot_at
 
-from cpcbl_agents.input_problems import without_numbers
+from cpcbl_agents.input_diagnosis.problems import without_numbers
 from cpcbl_agents.node import Node
 from cpcbl_agents.robot import build_robot
 from cpcbl_team.config import Field, Landmark, OdometrySettings, RobotSettings, Team
@@ -308,7 +308,7 @@ def test_frames_for_a_robot_without_a_camera_are_refused_aloud() -> None:
 
 
 def test_what_has_one_cause_is_said_once_for_each_input() -> None:
-    said = "refused: stamps look like seconds since 1970; nanoseconds are due"
+    said = "refused: stamps look like seconds since 1970; they must be in nanoseconds"
     problems = Driver().run(12.0, stamped(1e-9))
     assert problems == tuple(f"100 % of {name} {said}" for name in ("odometry", "sightings"))
 
@@ -320,7 +320,7 @@ def test_a_driver_whose_stamps_were_mended_is_told_nothing_new(unit: float) -> N
     driver.statuses.clear()
     assert driver.run(15.0) == ()
     said = {without_numbers(text) for status in driver.statuses for text in status.problems}
-    looks = "# % of {} refused: stamps look like {}seconds since #; nanoseconds are due"
+    looks = "# % of {} refused: stamps look like {}seconds since #; they must be in nanoseconds"
     prefix = {1e-9: "", 1e-6: "milli", 1e-3: "micro"}[unit]
     assert said <= {looks.format(name, prefix) for name in ("odometry", "sightings")}
 

@@ -6,10 +6,14 @@ import sys
 
 import pytest
 
-HEAVY = ("aiohttp", "cv2", "matplotlib", "numpy", "pydantic", "rich", "typer")
+HEAVY = (
+    *("aiohttp", "cv2", "matplotlib", "numpy", "pydantic", "rich", "typer"),
+    *("email", "importlib.metadata"),
+)
 CODE = """
 import json, sys
 import cpcbl_agents.process
+import cpcbl_launch.run.robot
 from cpcbl_agents.robot import build_robot
 from cpcbl_team.config import RobotSettings, Start, Team
 

@@ -12,7 +12,7 @@ from support.buses import robot_at, team_of, wait_until, with_robot
 
 from cpcbl_agents import process
 from cpcbl_agents.clock import Clock
-from cpcbl_agents.earlier_processes import Before
+from cpcbl_agents.earlier_processes import EarlierRuns
 from cpcbl_agents.load import MayGoOn, everything
 from cpcbl_agents.process import Loop, make_robot, new_incarnation, stop_on_clock_step
 from cpcbl_agents.stop import StopSignal
@@ -193,17 +193,17 @@ def since(seconds: float, unix: bool = False) -> Clock:
 @pytest.mark.parametrize(
     ("since_s", "before", "knows_its_place", "may_send"),
     [
-        (-60.0, Before(), True, True),
-        (60.0, Before(), True, True),
-        (60.0, Before(ran=True), True, False),
-        (60.0, Before(moved=True, ran=True), False, False),
-        (-60.0, Before(moved=True), False, False),
+        (-60.0, EarlierRuns(), True, True),
+        (60.0, EarlierRuns(), True, True),
+        (60.0, EarlierRuns(ran=True), True, False),
+        (60.0, EarlierRuns(moved=True, ran=True), False, False),
+        (-60.0, EarlierRuns(moved=True), False, False),
     ],
     ids=["with the team", "late", "restarted", "restarted after it moved", "so it was told"],
 )
 @pytest.mark.parametrize("unix", [False, True])
 def test_only_a_robot_that_ran_before_may_not_know_its_place_or_what_it_spent(
-    since_s: float, before: Before, knows_its_place: bool, may_send: bool, unix: bool
+    since_s: float, before: EarlierRuns, knows_its_place: bool, may_send: bool, unix: bool
 ) -> None:
     clock = since(since_s, unix)
     robot = make_robot("me", LIMITED, clock, before)

@@ -6,22 +6,24 @@ import pytest
 from support.buses import robot_at, team_of
 from support.traffic import status
 
-from cpcbl_agents.robot_log import RobotLog
+from cpcbl_agents.robot_log import RobotLogger
 from cpcbl_transport.messages import Flow, InputHealth
 
 
 def test_each_thing_is_said_once(caplog: pytest.LogCaptureFixture) -> None:
-    said, health = RobotLog("r1"), InputHealth("odometry", 10.0, 1, 5)
+    logger, health = RobotLogger("r1"), InputHealth("odometry", 10.0, 1, 5)
     silent = "no odometry on in/r1/odometry for {} s"
     heard = (Flow("fix", "r2", 1),)
     with caplog.at_level(logging.INFO):
-        said.connected(team_of(r1=robot_at()), ["tcp/10.0.0.1:7447"])
-        said.tell(status("r1", 1.0, 3, lost="9 of the last 20 innovations rejected"))
-        said.tell(status("r1", 2.0, 3, lost="8 of the last 20 innovations rejected"))
-        said.tell(status("r1", 3.0, 3, inputs=(health,), heard=heard))
+        logger.log_connected(team_of(r1=robot_at()), ["tcp/10.0.0.1:7447"])
+        logger.log_status(status("r1", 1.0, 3, lost="9 of the last 20 innovations rejected"))
+        logger.log_status(status("r1", 2.0, 3, lost="8 of the last 20 innovations rejected"))
+        logger.log_status(status("r1", 3.0, 3, inputs=(health,), heard=heard))
         for seconds in (3, 4, 5):
-            said.tell(status("r1", 4.0, 3, inputs=(health,), problems=(silent.format(seconds),)))
-        said.tell(status("r1", 5.0, 3, inputs=(health,), heard=heard))
+            logger.log_status(
+                status("r1", 4.0, 3, inputs=(health,), problems=(silent.format(seconds),))
+            )
+        logger.log_status(status("r1", 5.0, 3, inputs=(health,), heard=heard))
     assert [record.message for record in caplog.records] == [
         "r1: connected to team tests at tcp/10.0.0.1:7447",
         "r1: waiting for its inputs on in/r1/*",

@@ -33,7 +33,7 @@ from cpcbl_agents.clock import Clock
 from cpcbl_agents.sources.mrclam import read_landmarks
 from cpcbl_launch.run.processes import PROGRAM, ProcessSpec, Supervisor
 from cpcbl_launch.run.up import free_endpoint
-from cpcbl_launch.team_file import save_resolved
+from cpcbl_launch.team.file import save_resolved
 from cpcbl_team.config import (
     Direction,
     Field,

@@ -33,12 +33,12 @@ from cpcbl_launch.lab.baselines import (
     run_ekf,
 )
 from cpcbl_launch.lab.evaluation import baseline_report, evaluate_log
-from cpcbl_launch.overrides import with_blind_robots
 from cpcbl_launch.reporting.metrics import Floats, Trajectory
 from cpcbl_launch.reporting.recorder import Report
 from cpcbl_launch.run import logged_team
 from cpcbl_launch.simulation.in_process import Progress
-from cpcbl_launch.team_file import find_team
+from cpcbl_launch.team.file import find_team
+from cpcbl_launch.team.overrides import with_blind_robots
 from cpcbl_launch.views.run import print_report, progress_bar
 from cpcbl_team.config import Field
 from cpcbl_team.estimate import Estimate

@@ -25,7 +25,7 @@ from rich.console import RenderableType
 from cpcbl_launch.lab.experiments.runs import ExperimentResult, map_in_processes
 from cpcbl_launch.reporting.metrics import degrees
 from cpcbl_launch.reporting.tables import cells, number, table
-from cpcbl_launch.team_file import builtin_path, load_team
+from cpcbl_launch.team.file import builtin_path, load_team
 from cpcbl_team.config import Team
 from cpcbl_team.errors import InputError
 

@@ -6,7 +6,7 @@ import numpy as np
 from benchmarks.rendered_frames import random_frame, render_image
 
 from cpcbl_agents.vision.camera import Pixels
-from cpcbl_launch.team_file import builtin_path, load_team
+from cpcbl_launch.team.file import builtin_path, load_team
 
 FRAMES = 24
 VIEWER = "rover1"

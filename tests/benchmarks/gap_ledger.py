@@ -25,12 +25,12 @@ from cpcbl_agents.node import Node
 from cpcbl_agents.robot import build_robot
 from cpcbl_agents.sources import mrclam
 from cpcbl_launch.lab import baselines
-from cpcbl_launch.overrides import with_blind_robots
 from cpcbl_launch.reporting.metrics import Floats, Trajectory, samples_with_truth, score
 from cpcbl_launch.reporting.recorder import Recorder, mean_score
 from cpcbl_launch.run.logged_team import LoggedTeam, file_for, load_logged_team
 from cpcbl_launch.simulation.in_process import run_nodes
-from cpcbl_launch.team_file import find_team
+from cpcbl_launch.team.file import find_team
+from cpcbl_launch.team.overrides import with_blind_robots
 from cpcbl_team.config import Team
 from cpcbl_team.estimate import Estimate, Scope
 from cpcbl_team.fusion import Observation

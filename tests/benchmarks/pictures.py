@@ -25,7 +25,7 @@ from cpcbl_launch.lab.experiments.runs import ExperimentResult
 from cpcbl_launch.reporting.files import read_csv
 from cpcbl_launch.reporting.metrics import degrees
 from cpcbl_launch.reporting.tables import number, table
-from cpcbl_launch.team_file import load_team
+from cpcbl_launch.team.file import load_team
 from cpcbl_team.config import Team
 from cpcbl_team.errors import InputError
 from cpcbl_team.geometry import wrap_angle

@@ -8,7 +8,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from multiprocessing import get_context
 from pathlib import Path
 from statistics import mean, median
@@ -23,7 +23,7 @@ from cpcbl_agents.node import STATUS_NS
 from cpcbl_agents.stop import StopSignal
 from cpcbl_launch.run.processes import ProcessSpec, Supervisor, process_table
 from cpcbl_launch.run.up import free_endpoint
-from cpcbl_launch.team_file import save_resolved
+from cpcbl_launch.team.file import save_resolved
 from cpcbl_team.config import CollaborationSettings, Team
 from cpcbl_team.inputs import Belief, Odometry
 from cpcbl_transport import topics
@@ -124,23 +124,32 @@ def measure_start(starts: int, checkout: Path | None = None) -> Start:
         for _ in range(starts):
             clock = Clock.starting_in(0.0)  # a robot declares its token after the run's epoch
             (spec,) = _robot_specs(team, folder, endpoint, clock, checkout, [robot])
-            appeared = threading.Event()
-            tokens = bus.watch_liveliness(topics.ALIVE.at(robot=robot), _setter(appeared))
+            appeared, vanished = threading.Event(), threading.Event()
+            tokens = bus.watch_liveliness(
+                topics.ALIVE.at(robot=robot), _token_events(appeared, vanished)
+            )
             began_s = time.monotonic()
-            with subprocess.Popen(spec.command, stderr=subprocess.DEVNULL) as process:
-                try:
-                    if not appeared.wait(PATIENCE_S):
-                        raise TimeoutError(f"no token within {PATIENCE_S:g} s: {spec.command}")
-                    seconds.append(time.monotonic() - began_s)
-                    resident.append(process_usage(process.pid).resident_bytes / MIB)
-                finally:
-                    tokens.close()
-                    process.kill()
+            with closing(tokens):
+                with subprocess.Popen(spec.command, stderr=subprocess.DEVNULL) as process:
+                    try:
+                        _wait(appeared, f"no token: {spec.command}")
+                        seconds.append(time.monotonic() - began_s)
+                        resident.append(process_usage(process.pid).resident_bytes / MIB)
+                    finally:
+                        process.kill()
+                _wait(vanished, "a token that stays")  # else the next start would see it at once
     return Start(median_s=median(seconds), slowest_s=max(seconds), resident_mib=mean(resident))
 
 
-def _setter(event: threading.Event) -> Callable[[str, bool], None]:
-    return lambda key, alive: event.set() if alive else None
+def _token_events(
+    appeared: threading.Event, vanished: threading.Event
+) -> Callable[[str, bool], None]:
+    return lambda key, alive: (appeared if alive else vanished).set()
+
+
+def _wait(event: threading.Event, problem: str) -> None:
+    if not event.wait(PATIENCE_S):
+        raise TimeoutError(f"{problem} after {PATIENCE_S:g} s")
 
 
 @contextmanager

@@ -24,12 +24,12 @@ from msgspec.structs import replace
 from rich.console import RenderableType
 
 from cpcbl_agents.node import Steppable
-from cpcbl_launch.checks import require_duration
 from cpcbl_launch.reporting.recorder import Recorder
 from cpcbl_launch.reporting.tables import cells, table
 from cpcbl_launch.simulation.field import SimulatedField
 from cpcbl_launch.simulation.field_node import FieldNode
 from cpcbl_launch.simulation.in_process import Progress, robot_nodes, run_nodes, simulated_report
+from cpcbl_launch.team.requirements import require_duration
 from cpcbl_launch.views.run import progress_bar
 from cpcbl_team import config
 from cpcbl_team.config import RobotSettings, SensorSettings, Team

@@ -13,10 +13,10 @@ from support.processes import command_line
 
 from cpcbl_launch.lab.baselines import baseline_inputs, run_ekf
 from cpcbl_launch.lab.evaluation import baseline_report
-from cpcbl_launch.overrides import with_blind_robots
 from cpcbl_launch.reporting.metrics import Floats
 from cpcbl_launch.reporting.recorder import BaselineReport
 from cpcbl_launch.run.logged_team import LoggedTeam, load_logged_team
+from cpcbl_launch.team.overrides import with_blind_robots
 
 
 def stamps_of(logged: LoggedTeam) -> dict[str, range]:

@@ -15,7 +15,7 @@ from cpcbl_agents.vision.camera import Camera, Pixels
 from cpcbl_agents.vision.markers import MarkerDetector
 from cpcbl_launch.reporting.files import read_csv
 from cpcbl_launch.simulation.camera.render import Light, Scene, SceneRobot, render
-from cpcbl_launch.team_file import load_team, parse_team
+from cpcbl_launch.team.file import load_team, parse_team
 from cpcbl_team.config import MarkerFamily
 from cpcbl_team.geometry import Pose2
 

@@ -18,7 +18,7 @@ from benchmarks.scaling import (
 from support.benchmarks import run_benchmark
 
 from cpcbl_launch.simulation.in_process import simulate
-from cpcbl_launch.team_checks import problems
+from cpcbl_launch.team.checks import problems
 from cpcbl_team.config import (
     Field,
     Landmark,

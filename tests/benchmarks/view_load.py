@@ -27,7 +27,7 @@ from cpcbl_launch.run.up import free_endpoint
 from cpcbl_launch.simulation.field import SimulatedField
 from cpcbl_launch.simulation.field_node import FieldNode
 from cpcbl_launch.simulation.in_process import robot_nodes, run_nodes
-from cpcbl_launch.team_file import save_resolved
+from cpcbl_launch.team.file import save_resolved
 from cpcbl_team.config import Team
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus, Publisher

@@ -39,8 +39,8 @@ from cpcbl_launch.lab.evaluation import evaluate_log
 from cpcbl_launch.reporting.recording import TEAM, read_recording
 from cpcbl_launch.run.logged_team import load_logged_team, with_duration
 from cpcbl_launch.simulation.in_process import simulate
-from cpcbl_launch.team_checks import warnings
-from cpcbl_launch.team_file import MOST_LINES, builtin_path, load_team
+from cpcbl_launch.team.checks import warnings
+from cpcbl_launch.team.file import MOST_LINES, builtin_path, load_team
 from cpcbl_team.errors import CpcblError
 from cpcbl_transport.messages import Frame
 

@@ -19,7 +19,7 @@ from cpcbl_agents.sources.mrclam import LogError
 from cpcbl_launch.calibration.pictures import read_picture
 from cpcbl_launch.reporting.recording import TEAM, read_recording
 from cpcbl_launch.run.logged_team import load_logged_team
-from cpcbl_launch.team_file import TeamFileError, builtin_path, load_team, save_resolved
+from cpcbl_launch.team.file import TeamFileError, builtin_path, load_team, save_resolved
 from cpcbl_team.inputs import Odometry
 
 FEW = {"team": 120, "resolved": 120, "log": 120, "recording": 200, "picture": 300}

@@ -23,7 +23,7 @@ from support.programs import programs
 from cpcbl_launch.run.observer import ObserverRequest, parse_pose, team_with_observer
 from cpcbl_launch.run.processes import PROGRAM
 from cpcbl_launch.run.up import free_endpoint
-from cpcbl_launch.team_file import load_team, parse_team
+from cpcbl_launch.team.file import load_team, parse_team
 
 TOML = blocks("toml")
 DRIVER, CONSUMER, SECURED = (

@@ -8,7 +8,7 @@ import pytest
 import cpcbl_launch.lab.chaos.scenario
 import cpcbl_launch.lab.chaos.team
 import cpcbl_launch.run.containers.docker
-import cpcbl_launch.team_file  # noqa: F401  these modules define the errors of the tree
+import cpcbl_launch.team.file  # noqa: F401  these modules define the errors of the tree
 from cpcbl_agents.clock import Clock
 from cpcbl_agents.sources.mrclam import LogError
 from cpcbl_launch import cli

@@ -8,7 +8,7 @@ import pytest
 from support.processes import command_line
 
 from cpcbl_launch.commands import initializing
-from cpcbl_launch.team_file import load_team
+from cpcbl_launch.team.file import load_team
 
 
 def init(folder: Path, *options: str) -> list[str]:

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from cpcbl_launch.team_checks import warnings
-from cpcbl_launch.team_faults import LARGEST
-from cpcbl_launch.team_file import MOST_LINES, TeamFileError, builtin_path, load_team
+from cpcbl_launch.team.checks import warnings
+from cpcbl_launch.team.faults import LARGEST
+from cpcbl_launch.team.file import MOST_LINES, TeamFileError, builtin_path, load_team
 
 SEEDS = [builtin_path(name) for name in ("demo", "eyes", "blind", "mrclam", "worlds")]
 VALUES = (

@@ -4,7 +4,7 @@ import re
 import tomllib
 from pathlib import Path
 
-from cpcbl_launch.team_file import parse_team
+from cpcbl_launch.team.file import parse_team
 from cpcbl_team.config import (
     COLOURS,
     CameraSettings,

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from support.team_texts import ROBOT, robots, team
 
-from cpcbl_launch.team_file import TeamFileError, builtin_path, load_team, save_resolved
+from cpcbl_launch.team.file import TeamFileError, builtin_path, load_team, save_resolved
 from cpcbl_team.config import RobotSettings
 
 LAYERS = """

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import pytest
 from support.team_texts import ROBOT, robots
 
-from cpcbl_launch.team_file import TeamFileError, load_team
+from cpcbl_launch.team.file import TeamFileError, load_team
 
 
 class Wrong(NamedTuple):

@@ -16,7 +16,7 @@ from cpcbl_launch.cli import LONGEST
 from cpcbl_launch.run.containers import compose
 from cpcbl_launch.run.processes import PROGRAM
 from cpcbl_launch.run.up import free_endpoint
-from cpcbl_launch.team_file import find_team
+from cpcbl_launch.team.file import find_team
 from cpcbl_team.errors import InputError
 from cpcbl_transport.zenoh_bus import listen_problem, one_line
 

@@ -6,8 +6,8 @@ import pytest
 from typer.testing import CliRunner
 
 from cpcbl_launch.app import app
-from cpcbl_launch.team_checks import warnings
-from cpcbl_launch.team_file import builtin_path, load_team
+from cpcbl_launch.team.checks import warnings
+from cpcbl_launch.team.file import builtin_path, load_team
 from cpcbl_team.config import (
     Field,
     Landmark,

@@ -16,7 +16,7 @@ from net.scenario import FIELD, START, arrivals, with_bearings_only, without_lan
 
 import cpcbl_launch
 from cpcbl_launch.simulation.in_process import simulate
-from cpcbl_launch.team_file import load_team
+from cpcbl_launch.team.file import load_team
 from cpcbl_team.config import (
     CollaborationSettings,
     LocalizationSettings,

@@ -1,6 +1,6 @@
 """A simulated team whose odometry and sensors err, for tests of calibrations."""
 
-from cpcbl_launch.overrides import Overrides, with_overrides
+from cpcbl_launch.team.overrides import Overrides, with_overrides
 from cpcbl_team.config import (
     Field,
     Landmark,

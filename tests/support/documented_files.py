@@ -11,7 +11,7 @@ import numpy as np
 from cpcbl_agents.vision.camera import Camera
 from cpcbl_launch.calibration.lens import parse_board
 from cpcbl_launch.simulation.camera.render import Light, Scene, SceneRobot, render
-from cpcbl_launch.team_file import builtin_path, parse_team
+from cpcbl_launch.team.file import builtin_path, parse_team
 from cpcbl_team.config import CameraSettings
 from cpcbl_team.geometry import Pose2
 from support.board_pictures import board_pictures

@@ -7,7 +7,7 @@ from typing import Any
 from typer.testing import CliRunner
 
 from cpcbl_launch.app import app
-from cpcbl_launch.team_file import builtin_path
+from cpcbl_launch.team.file import builtin_path
 from support.processes import cpcbl_team
 
 SECURED = '\n[transport]\nsecurity = "mtls"\n'

@@ -4,7 +4,7 @@ from typing import Any
 
 import msgspec
 
-from cpcbl_launch.team_file import builtin_path, load_team
+from cpcbl_launch.team.file import builtin_path, load_team
 from cpcbl_team.config import Team
 
 BLIND = load_team(builtin_path("blind"))

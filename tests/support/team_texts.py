@@ -1,6 +1,6 @@
 """Team files as texts."""
 
-from cpcbl_launch.team_file import parse_team
+from cpcbl_launch.team.file import parse_team
 from cpcbl_team.config import RobotSettings, Team
 
 ROBOT = """

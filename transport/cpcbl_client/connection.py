@@ -19,20 +19,20 @@ SILENT_S = 3.0
 
 
 class Reminder:
-    """Says something at once, and again every ten seconds while it lasts."""
+    """Warns of a condition at once, and again every ten seconds while it lasts."""
 
     def __init__(self, after_s: float = 0.0) -> None:
         self._after_s, self._due_s = after_s, time.monotonic() + after_s
         self._has_spoken = False
 
     def warn(self, text: str) -> None:
-        """It is so at present."""
+        """The condition holds: logs `text`, unless it is too soon after the last warning."""
         if time.monotonic() >= self._due_s:
             self._due_s, self._has_spoken = time.monotonic() + REMIND_S, True
             log.warning(text)
 
     def over(self, text: str) -> None:
-        """It is so no more; `text` is said if a warning was."""
+        """The condition has ended: logs `text` if there was a warning about it."""
         if self._has_spoken:
             log.warning(text)
         self._due_s, self._has_spoken = time.monotonic() + self._after_s, False

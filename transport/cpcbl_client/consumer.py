@@ -5,7 +5,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from cpcbl_client.connection import CHECK_S, SILENT_S, Connection, Reminder, first_with_keys
-from cpcbl_client.team import nearest_name, read_team
+from cpcbl_client.team import name_hint, read_team
 from cpcbl_team.errors import InputError
 from cpcbl_transport.bus import Bus
 from cpcbl_transport.decoding import Received, Subscriber
@@ -51,7 +51,7 @@ def poses(
     """
     known = read_team(team)
     if not observer and robot not in known.sources:
-        raise InputError(f"{known.path}: no robot {robot!r}; {nearest_name(robot, known.sources)}")
+        raise InputError(f"{known.path}: no robot {robot!r}; {name_hint(robot, known.sources)}")
     who = first_with_keys(known, (Identity(Role.OPERATOR), Identity(Role.ROBOT, robot)))
     return _stream(Connection(known, who, connect, wait_s, bus), known.team.name, robot)
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Self
 
 from cpcbl_client.connection import SILENT_S, Connection, Reminder, log
-from cpcbl_client.team import ClientTeam, nearest_name, read_team
+from cpcbl_client.team import ClientTeam, name_hint, read_team
 from cpcbl_team.errors import InputError
 from cpcbl_team.inputs import Odometry, Position, Sighting, Sightings
 from cpcbl_transport.bus import Bus, Publisher
@@ -170,7 +170,7 @@ class Driver:
     def _check_name(self, name: str) -> None:
         if name not in self._team.objects and name not in self._unknown:
             self._unknown.add(name)
-            near = nearest_name(name, self._team.objects)
+            near = name_hint(name, self._team.objects)
             log.warning("no landmark, wall or robot %r in %s; %s", name, self._team.path, near)
 
 
@@ -182,7 +182,7 @@ def _require(problem: str) -> None:
 def _require_driven(team: ClientTeam, robot: str) -> None:
     if robot not in team.sources:
         raise InputError(
-            f"{team.path}: no robot {robot!r}; {nearest_name(robot, team.sources)}; a guest that is"
+            f"{team.path}: no robot {robot!r}; {name_hint(robot, team.sources)}; a guest that is"
             " not in the file is Driver(..., observer=True)"
         )
     if team.sources[robot] != "external":

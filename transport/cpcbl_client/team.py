@@ -1,6 +1,5 @@
 """What a driver or a consumer must know of a team file. `cpcbl-team check` checks all of it."""
 
-import difflib
 import tomllib
 from collections.abc import Iterable
 from pathlib import Path
@@ -9,7 +8,7 @@ from typing import Any, NamedTuple
 import msgspec
 
 from cpcbl_team.config import Team, TransportSettings
-from cpcbl_team.errors import InputError
+from cpcbl_team.errors import InputError, nearest_name
 from cpcbl_team.inputs import Name
 
 
@@ -73,9 +72,8 @@ def read_team(path: str | Path) -> ClientTeam:
     )
 
 
-def nearest_name(name: str, known: Iterable[str]) -> str:
-    """`; did you mean 'door'?`, or which names there are."""
+def name_hint(name: str, known: Iterable[str]) -> str:
+    """`did you mean 'door'?`, or which names there are."""
     names = sorted(known)
-    folded = {other.casefold(): other for other in names}
-    near = difflib.get_close_matches(name.casefold(), folded, n=1, cutoff=0.6)
-    return f"did you mean {folded[near[0]]!r}?" if near else f"there are {', '.join(names)}"
+    near = nearest_name(name, names)
+    return f"did you mean {near!r}?" if near else f"there are {', '.join(names)}"

@@ -2,12 +2,12 @@
 
 A limit is a token bucket whose tokens return one window after they were spent. So no window ever
 contains more than is allowed, and no reserve for bursts is necessary, as it is in a bucket that
-fills evenly. An interval spreads the spending over time: that in which the budget earns a fix for
-each teammate that there is to help, and a belief. It becomes longer with each message and shorter
-again while others are earned, so it settles where the limits hold back little (dual ascent on the
-constraint), but never shorter than the budget's own: what little there is to say is not said more
-often because it could be paid for. It does not become shorter while only the limits hold back a
-message: otherwise the first message after each full window would be sent, however small its value.
+fills evenly. An interval spreads the spending over time. Its shortest value is the
+time in which the budget earns one fix for each teammate to help, and one belief. Each message makes
+it longer, and each message that is earned and not sent makes it shorter (dual ascent on the
+constraint), so it settles where the limits hold back few messages. While only the limits hold back
+a message it stays as it is: otherwise the first message after each full window would be sent,
+however small its value.
 """
 
 import math
@@ -146,7 +146,7 @@ class Budget:
             limit.spend(now_ns, -amount)
 
     def refuse(self, now_ns: int) -> None:
-        """A message that is due is not admitted by the limits."""
+        """Notes that the limits did not admit a message whose interval was over."""
         self._factor_ns = now_ns
 
     def spending(self, now_ns: int) -> tuple[Spending, ...]:

@@ -44,7 +44,7 @@ class _Number(NamedTuple):
     least: int
     most: int
 
-    def clamped(self, value: float) -> int:
+    def clamp(self, value: float) -> int:
         """The nearest count that fits."""
         return round(min(max(value, self.least), self.most))
 
@@ -88,7 +88,7 @@ def encode_help(message: Belief | Fix) -> bytes:
     Raises ValueError for what no agent sends: NaN, an infinite heading, a negative variance, a
     stamp 1,100 years away.
     """
-    x, y = _PLACE.clamped(message.x_m * PLACES), _PLACE.clamped(message.y_m * PLACES)
+    x, y = _PLACE.clamp(message.x_m * PLACES), _PLACE.clamp(message.y_m * PLACES)
     start = (message.stamp_ns // STAMP_NS, x, y)
     if isinstance(message, Fix):
         sensor, observer = message.sensor_covariance, message.observer_covariance
@@ -100,8 +100,8 @@ def encode_help(message: Belief | Fix) -> bytes:
         return _pack(_HEADED_FIX, (*counts, heading, *map(_variance_count, parts)))
     heading = _heading_count(message.heading_rad)
     factor = _covariance_3_counts(*message.covariance)
-    speed = _RATE.clamped(message.speed_m_s * RATES)
-    turn_rate = _RATE.clamped(message.turn_rate_rad_s * RATES)
+    speed = _RATE.clamp(message.speed_m_s * RATES)
+    turn_rate = _RATE.clamp(message.turn_rate_rad_s * RATES)
     return _pack(_BELIEF, (*start, heading, *factor, speed, turn_rate))
 
 
@@ -183,7 +183,7 @@ def _covariance_2_counts(xx: float, xy: float, yy: float) -> tuple[int, int, int
     d2 = max(yy - l21 * xy, NOISE * yy, MIN_VARIANCE)
     x, a = _rounded_up(math.sqrt(d1))
     y, b = _rounded_up(max(math.sqrt(d2), abs(l21) * a / MAX_SLOPE))
-    return x, y, _SLOPE.clamped(l21 * a / b / SLOPE)
+    return x, y, _SLOPE.clamp(l21 * a / b / SLOPE)
 
 
 def _covariance_3_counts(
@@ -202,8 +202,8 @@ def _covariance_3_counts(
     heading, c = _rounded_up(max(math.sqrt(d3), least))
     # T is rounded to T (I + F): the slope on x compensates the error of the slope on y
     t31, t32 = l31 * a / c, l32 * b / c
-    hx = _SLOPE.clamped((t31 + t32 * (t21 - l21 * a / b)) / SLOPE)
-    return x, y, yx, heading, hx, _SLOPE.clamped(t32 / SLOPE)
+    hx = _SLOPE.clamp((t31 + t32 * (t21 - l21 * a / b)) / SLOPE)
+    return x, y, yx, heading, hx, _SLOPE.clamp(t32 / SLOPE)
 
 
 def _rounded_up(sigma: float) -> tuple[int, float]:

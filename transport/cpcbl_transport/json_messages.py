@@ -11,6 +11,7 @@ from typing import Any, get_args, get_origin
 
 import msgspec
 
+from cpcbl_team.errors import nearest_name
 from cpcbl_transport.messages import Refusal, SensorInput, Tagged
 from cpcbl_transport.topics import Topic
 
@@ -70,15 +71,13 @@ def _error_text(error: str, topic: Topic) -> str:
     problem, _, where = error.partition(" - at `$")
     path = where.rstrip("`").lstrip(".")
     text = f"{path}: {problem}" if path else problem
-    import difflib  # a robot whose JSON is right does without it
-
     if unknown := re.search(r"unknown field `(.*)`", problem):
         part = _object_type(topic.carries)
         if path.startswith("sightings["):
             part = get_args(msgspec.structs.fields(part)[1].type)[0]
-        near = difflib.get_close_matches(unknown[1], part.__struct_fields__, n=1, cutoff=0.5)
+        near = nearest_name(unknown[1], part.__struct_fields__, 0.5)
         known = ", ".join(part.__struct_fields__)
-        fix = f"did you mean '{near[0]}'?" if near else f"known here: {known}"
+        fix = f"did you mean '{near}'?" if near else f"known here: {known}"
         return f"{f'{path}: ' if path else ''}unknown key '{unknown[1]}'; {fix}"
     if "`int`, got `float`" in problem and path.endswith("_ns"):
         return f"{text}; write whole nanoseconds, without a point or an exponent"

@@ -187,10 +187,12 @@ class _ZenohPublisher(_Declared):
         super().__init__(bus, publisher.undeclare)
         self._publisher = publisher
         self._asked = self._matching = False
-        listener = zenoh.handlers.Callback(self._changed, indirect=False)  # no thread for each
+        listener = zenoh.handlers.Callback(
+            self._on_matching_status, indirect=False
+        )  # no thread for each
         publisher.declare_matching_listener(listener)
 
-    def _changed(self, status: "zenoh.MatchingStatus") -> None:
+    def _on_matching_status(self, status: "zenoh.MatchingStatus") -> None:
         self._asked = False
 
     @property

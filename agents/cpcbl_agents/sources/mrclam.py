@@ -39,7 +39,7 @@ def read_table(path: Path, columns: int) -> NDArray[np.float64]:
     except (ValueError, UserWarning, OSError) as error:
         raise LogError(f"{path}: {error}") from error
     if table.shape[1] != columns:
-        raise LogError(f"{path}: {table.shape[1]} columns where {columns} are due")
+        raise LogError(f"{path}: {table.shape[1]} columns; there must be {columns}")
     if not np.isfinite(table).all():
         row = int(np.argmin(np.isfinite(table).all(axis=1)))
         raise LogError(f"{path}: row {row + 1} has a number that is not finite")

@@ -16,7 +16,7 @@ from cpcbl_launch.calibration.camera_accuracy import CameraAccuracy
 from cpcbl_launch.calibration.colours import ColourCalibration
 from cpcbl_launch.calibration.lens import DISTORTION, LensCalibration
 from cpcbl_launch.calibration.statistics import Estimate, decimals
-from cpcbl_launch.team_file import TeamFileError, builtin_path, parse_team, read_text
+from cpcbl_launch.team.file import TeamFileError, builtin_path, parse_team, read_text
 from cpcbl_team.config import COLOURS, CameraSettings, Colour
 from cpcbl_team.errors import InputError
 

@@ -23,7 +23,7 @@ from cpcbl_launch.calibration.logs import RobotLog, RobotLogs
 from cpcbl_launch.calibration.statistics import Estimate, decimals
 from cpcbl_launch.calibration.team_tables import MINIMUM, team_source
 from cpcbl_launch.reporting.recording import read_recording
-from cpcbl_launch.team_file import builtin_path, parse_team
+from cpcbl_launch.team.file import builtin_path, parse_team
 from cpcbl_team.errors import InputError
 
 INTERVAL_S = 0.5  # with correlation_s known, more frequent sightings of an object add little
@@ -73,7 +73,10 @@ def _calibrate_robot(logs: Sequence[RobotLog]) -> RobotCalibration:
     odometry_values, motion = odometry.calibrate_odometry(logs)
     sensor_values, sight = sensor.calibrate_sensor(logs)
     drives, sees = bool(odometry_values), bool(sensor_values)
-    odometry_values, sensor_values = _determined(odometry_values), _determined(sensor_values)
+    odometry_values, sensor_values = (
+        _with_standard_errors(odometry_values),
+        _with_standard_errors(sensor_values),
+    )
     days = {} if motion is None else odometry_day_variances(motion)
     days |= {} if sight is None else sensor_day_variances(sight)
     is_depth = sight is not None and sight.after.is_depth
@@ -95,7 +98,7 @@ def _calibrate_robot(logs: Sequence[RobotLog]) -> RobotCalibration:
     return RobotCalibration(odometry_values, sensor_values, tuple(notes), is_depth, days)
 
 
-def _determined(values: Mapping[str, Estimate]) -> dict[str, Estimate]:
+def _with_standard_errors(values: Mapping[str, Estimate]) -> dict[str, Estimate]:
     """Those with a value and a standard error: of too short a log they are not numbers."""
     return {
         name: found

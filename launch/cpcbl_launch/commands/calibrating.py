@@ -8,12 +8,12 @@ from rich.console import Console
 from typer import Argument, Option, Typer, echo
 from typer.core import TyperGroup
 
-from cpcbl_launch.checks import require_opencv
 from cpcbl_launch.commands import options
 from cpcbl_launch.commands.measuring import calibrate
 from cpcbl_launch.commands.options import AsJson, print_not_written, print_result
 from cpcbl_launch.reporting.files import write_or_reason
-from cpcbl_launch.team_file import find_team
+from cpcbl_launch.team.file import find_team
+from cpcbl_launch.team.requirements import require_opencv
 from cpcbl_team.errors import InputError
 
 if TYPE_CHECKING:

@@ -11,10 +11,10 @@ from rich.table import Table
 from rich.text import Text
 from typer import Exit, Option
 
-from cpcbl_launch.checks import require_robots
 from cpcbl_launch.commands import options
 from cpcbl_launch.reporting.tables import table
-from cpcbl_launch.team_file import find_team
+from cpcbl_launch.team.file import find_team
+from cpcbl_launch.team.requirements import require_robots
 from cpcbl_launch.views.listening import TeamHeard
 from cpcbl_team.config import Team, TransportSettings
 from cpcbl_transport.security import Identity, Link, link_of

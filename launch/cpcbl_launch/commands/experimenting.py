@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Optional
 
 from typer import Argument, Context, Option, Typer
 
-from cpcbl_launch.checks import require_matplotlib, require_opencv
 from cpcbl_launch.commands import options
+from cpcbl_launch.team.requirements import require_matplotlib, require_opencv
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -105,9 +105,9 @@ def budget(
     with simulated teams of mixed quality."""
     from cpcbl_launch.lab.experiments import budget as experiment
     from cpcbl_launch.lab.experiments import mixed_teams
-    from cpcbl_launch.overrides import with_blind_robots
     from cpcbl_launch.run import logged_team
-    from cpcbl_launch.team_file import load_team
+    from cpcbl_launch.team.file import load_team
+    from cpcbl_launch.team.overrides import with_blind_robots
 
     if data is None:
         runs = experiment.simulated_runs(robots, seeds, mixed_teams.known_world(world))

@@ -14,8 +14,8 @@ import typer
 from typer import Argument, Option
 
 from cpcbl_launch.commands import options
-from cpcbl_launch.team_checks import warnings
-from cpcbl_launch.team_file import parse_team
+from cpcbl_launch.team.checks import warnings
+from cpcbl_launch.team.file import parse_team
 from cpcbl_team.errors import InputError
 from cpcbl_team.inputs import NAME_PATTERN
 

@@ -10,11 +10,11 @@ import typer
 from rich.console import Console
 from typer import Argument, Option
 
-from cpcbl_launch.checks import require_team_opencv
 from cpcbl_launch.commands import options
-from cpcbl_launch.overrides import Overrides, with_blind_robots, with_overrides
 from cpcbl_launch.reporting.files import write_or_reason
-from cpcbl_launch.team_file import find_team
+from cpcbl_launch.team.file import find_team
+from cpcbl_launch.team.overrides import Overrides, with_blind_robots, with_overrides
+from cpcbl_launch.team.requirements import require_team_opencv
 from cpcbl_team.config import Variant
 from cpcbl_team.errors import InputError
 
@@ -222,8 +222,8 @@ def chaos(
     runner.require_judgeable(todo, duration)
     _prepare_for_faults()
     with runner.Progress(Console(stderr=True), len(todo)) as shown:
-        chosen = ScenarioOptions(seed, shown.doing, duration, keys, history)
-        faults = runner.run_scenarios(todo, chosen, shown.began, shown.done)
+        chosen = ScenarioOptions(seed, shown.on_step, duration, keys, history)
+        faults = runner.run_scenarios(todo, chosen, shown.on_begin, shown.on_end)
     result = report_data(faults)
     lost = options.write_report(report, result)
     if (page := markdown) is not None:

@@ -32,20 +32,20 @@ def present_form(words: Sequence[str]) -> list[str]:
         option, equals, value = word.partition("=")
         new[i] = f"{names.get(option, option)}{equals}{value}"
     if command in TEAM_WAS_AN_OPTION:
-        team, rest = _taken(new[1:], "--team")
+        team, rest = _split_option(new[1:], "--team")
         if team:
             inner = SUBCOMMANDS.get(command, {}).get(rest[0] if rest else "")
             return [command, *(inner or ()), team, *(rest if inner is None else rest[1:])]
     if command == "gateway":
-        host, rest = _taken(new, "--host")
-        port, rest = _taken(rest, "--port")
+        host, rest = _split_option(new, "--host")
+        port, rest = _split_option(rest, "--port")
         if host or port:
             host = f"[{host}]" if ":" in host else host
             return [*rest, "--listen", f"{host}:{port}" if port else host]
     return new
 
 
-def _taken(words: Sequence[str], option: str) -> tuple[str, list[str]]:
+def _split_option(words: Sequence[str], option: str) -> tuple[str, list[str]]:
     """The value of an option (empty without it), and the words without both."""
     for i, word in enumerate(words):
         if word == option and i + 1 < len(words):

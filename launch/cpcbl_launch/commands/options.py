@@ -10,10 +10,10 @@ from typing import Annotated, Any
 
 from typer import Argument, CallbackParam, Context, Exit, Option, secho
 
-from cpcbl_launch.checks import require_endpoints, require_matplotlib
 from cpcbl_launch.reporting.files import json_text, write_or_reason
 from cpcbl_launch.run.containers import BASE_VARIABLE
-from cpcbl_launch.team_file import builtin_path, find_team
+from cpcbl_launch.team.file import builtin_path, find_team
+from cpcbl_launch.team.requirements import require_endpoints, require_matplotlib
 from cpcbl_team.errors import InputError
 
 
@@ -47,7 +47,7 @@ def _require_picture(option: str, path: Path) -> None:
 
 def _require_limit(option: str, limit: float) -> None:
     if not math.isfinite(limit):
-        raise InputError(f"{option} {limit:g}: no limit; write a number, 0 for as much as it likes")
+        raise InputError(f"{option} {limit:g}: not a limit; write a number, 0 for no limit")
 
 
 def _require_time(option: str, seconds: float) -> None:
@@ -55,8 +55,9 @@ def _require_time(option: str, seconds: float) -> None:
         raise InputError(f"{option} {seconds:g}: more than 0 seconds")
 
 
-def checked(require: Callable[[str, Any], object]) -> Callable[[CallbackParam, Any], Any]:
-    """A callback: `require` gets the option as it is typed, and its value where it was given."""
+def check_callback(require: Callable[[str, Any], object]) -> Callable[[CallbackParam, Any], Any]:
+    """A callback of an option that passes the option as typed, and its value if there is one, to
+    `require`."""
 
     def callback(option: CallbackParam, value: Any) -> Any:
         if value is not None:
@@ -66,9 +67,12 @@ def checked(require: Callable[[str, Any], object]) -> Callable[[CallbackParam, A
     return callback
 
 
-writable_file, writable_picture = checked(require_writable_file), checked(_require_picture)
-folder, endpoints = checked(require_folder), checked(require_endpoints)
-duration = checked(_require_time)
+writable_file, writable_picture = (
+    check_callback(require_writable_file),
+    check_callback(_require_picture),
+)
+folder, endpoints = check_callback(require_folder), check_callback(require_endpoints)
+duration = check_callback(_require_time)
 
 
 def complete_team(incomplete: str) -> list[str]:
@@ -97,7 +101,7 @@ TeamOrDemo = Annotated[
     Path | None, team_argument(help="Team file, or a built-in one: demo (default).")
 ]
 Blind = Annotated[str, Option(help="Robots that cannot see landmarks, e.g. 3,4,5.")]
-_limit = partial(Option, min=0.0, callback=checked(_require_limit))
+_limit = partial(Option, min=0.0, callback=check_callback(_require_limit))
 BytesPerS = Annotated[
     float | None,
     _limit(help="Bytes per second of fixes and beliefs that each robot may send; 0: no limit."),

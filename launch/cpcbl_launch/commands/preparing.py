@@ -11,8 +11,8 @@ from typer import Option
 from cpcbl_launch.commands import options
 from cpcbl_launch.reporting.files import write_or_reason
 from cpcbl_launch.reporting.tables import table
-from cpcbl_launch.team_checks import warnings
-from cpcbl_launch.team_file import find_team, key_folder
+from cpcbl_launch.team.checks import warnings
+from cpcbl_launch.team.file import find_team, key_folder
 from cpcbl_team.errors import InputError
 
 if TYPE_CHECKING:

@@ -14,11 +14,11 @@ from rich.console import Console
 from typer import Option
 
 from cpcbl_agents.clock import Clock
-from cpcbl_launch.checks import require_duration, require_robots, require_team_opencv
 from cpcbl_launch.commands import options
-from cpcbl_launch.overrides import Overrides, with_blind_robots, with_overrides
 from cpcbl_launch.run.containers import BASE_IMAGE
-from cpcbl_launch.team_file import find_team
+from cpcbl_launch.team.file import find_team
+from cpcbl_launch.team.overrides import Overrides, with_blind_robots, with_overrides
+from cpcbl_launch.team.requirements import require_duration, require_robots, require_team_opencv
 from cpcbl_team.config import GatewaySettings, Team
 from cpcbl_team.errors import InputError
 from cpcbl_transport.security import Identity, link_of
@@ -43,7 +43,8 @@ UpDuration = Annotated[
     float | None, Option(help="Seconds of robot time; default: 30 simulated, or the whole log.")
 ]
 Speed = Annotated[
-    float, Option(callback=options.checked(_require_speed), help="Times real time, at least 0.05.")
+    float,
+    Option(callback=options.check_callback(_require_speed), help="Times real time, at least 0.05."),
 ]
 Robots = Annotated[str, Option(help="Robots to start on this machine; default: all.")]
 RecordFile = Annotated[
@@ -109,8 +110,8 @@ def up(
     title = f"team {run.team.name}, {len(run.team.robots)} robots, {speed:g} x real time"
     listen = parse_listen("--view-listen", view_listen)
     page = _page(run.team, listen, open_page, console) if view else nullcontext(nullcontext)
-    with page as attached, LiveTable(title, run.team.robots, console, quiet=as_json) as table:
-        result = run_team(run, table.show, StopSignal(), launch, attached)
+    with page as attach, LiveTable(title, run.team.robots, console, quiet=as_json) as table:
+        result = run_team(run, table.show, StopSignal(), launch, attach)
     lost = dict(result.not_written) | options.write_report(report, result)
     options.print_result(result, as_json, lambda: print_report(result, console), lost)
     if not result.has_data and not StopSignal.was_interrupted:
@@ -141,16 +142,16 @@ def _page(
 ) -> "Iterator[Callable[[Bus], AbstractContextManager[object]]]":
     """Serves the page of a run; yields what attaches it to the run's bus."""
     from cpcbl_launch.views.web.feed import Feed
-    from cpcbl_launch.views.web.server import Shown, serving
+    from cpcbl_launch.views.web.server import ShownTeam, serve
     from cpcbl_launch.views.web.view import address_lines
 
     feed = Feed(team.robots)
-    with serving(Shown(team.name, "the router of this run", team), feed, listen) as address:
+    with serve(ShownTeam(team.name, "the router of this run", team), feed, listen) as address:
         for line in address_lines(team.name, address, listen):
             console.print(line, highlight=False, soft_wrap=True)
         if open_page:
             typer.launch(address)
-        yield feed.attached
+        yield feed.attach
 
 
 def _run_of(

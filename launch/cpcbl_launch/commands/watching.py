@@ -12,10 +12,10 @@ from rich.console import Console
 from typer import Argument, Exit, Option, launch
 
 from cpcbl_agents.clock import Clock
-from cpcbl_launch.checks import require_robots, require_team_opencv
 from cpcbl_launch.commands import options
 from cpcbl_launch.run.containers import BASE_IMAGE
-from cpcbl_launch.team_file import find_team
+from cpcbl_launch.team.file import find_team
+from cpcbl_launch.team.requirements import require_robots, require_team_opencv
 from cpcbl_team.config import Team, TransportSettings
 from cpcbl_team.errors import InputError
 from cpcbl_transport.security import Identity, Link, link_of
@@ -157,14 +157,14 @@ def view(
     """
     from cpcbl_agents.process import StopSignal
     from cpcbl_launch.views.web.address import parse_listen
-    from cpcbl_launch.views.web.server import Shown
+    from cpcbl_launch.views.web.server import ShownTeam
     from cpcbl_launch.views.web.view import address_lines, view_team
 
     logging.getLogger("cpcbl_transport").setLevel(logging.ERROR)  # the page says it
     team = None if team_name is not None and file is None else find_team(file or Path("demo"))
     endpoints = tuple(connect or (team.transport if team else TransportSettings()).connect)
     link = Link(endpoints) if team is None else link_of(team, Identity(Role.OPERATOR), endpoints)
-    shown = Shown(team_name or (team.name if team else ""), ", ".join(endpoints), team)
+    shown = ShownTeam(team_name or (team.name if team else ""), ", ".join(endpoints), team)
     console, where, stopped = Console(), parse_listen("--listen", listen), StopSignal()
     until_s = math.inf if duration is None else time.monotonic() + duration
 

@@ -45,7 +45,7 @@ class BlockFile:
                 reason = error.strerror or str(error)
             if not self._failed:
                 self._failed = True
-                log.warning("what a report needs stays in memory, which grows: %s", reason)
+                log.warning("data for the report stays in memory, so memory use grows: %s", reason)
             return block
 
     def load(self, place: "int | bytes", size: int) -> bytes:
@@ -84,9 +84,9 @@ class EncodedLog(Generic[M]):
     def __iter__(self) -> Iterator[M]:
         with self._lock:
             blocks, newest = tuple(self._blocks), tuple(self._newest)
-        return (cast(M, decode_tagged(p)) for p in chain(self._stored(blocks), newest))
+        return (cast(M, decode_tagged(p)) for p in chain(self._stored_payloads(blocks), newest))
 
-    def _stored(self, blocks: tuple[tuple[int | bytes, int], ...]) -> Iterator[bytes]:
+    def _stored_payloads(self, blocks: tuple[tuple[int | bytes, int], ...]) -> Iterator[bytes]:
         for place, size in blocks:
             block, at = self._file.load(place, size), 0
             while at < len(block):

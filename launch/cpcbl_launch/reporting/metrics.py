@@ -88,7 +88,7 @@ def samples_with_truth(trajectory: Trajectory, truth: Floats | None) -> tuple[St
     return stamps_ns, Samples(estimate, at[counts], covariance, share)
 
 
-def pooled(parts: Sequence[Samples]) -> Samples:
+def pool(parts: Sequence[Samples]) -> Samples:
     """The samples of all parts together; without covariances where a part has none."""
     estimates, truths = [part.estimate for part in parts], [part.truth for part in parts]
     covariances = [part.covariance for part in parts if part.covariance is not None]

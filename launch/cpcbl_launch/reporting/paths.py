@@ -105,7 +105,7 @@ def worst_first(paths: Sequence[RobotPath]) -> list[RobotPath]:
     return sorted(paths, key=badness, reverse=True)
 
 
-def thinned(times_s: Floats, values: Floats) -> tuple[Floats, Floats]:
+def thin(times_s: Floats, values: Floats) -> tuple[Floats, Floats]:
     """A line over time of at most `MOST_POINTS` points: of more, the largest value in each of as
     many spans of equal length. A span of silence is NaN, which breaks the line."""
     if len(times_s) > MOST_POINTS:

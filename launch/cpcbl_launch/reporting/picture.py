@@ -15,7 +15,7 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 
 from cpcbl_launch.reporting.metrics import Floats
-from cpcbl_launch.reporting.paths import MOST_POINTS, RobotPath, robot_paths, thinned, worst_first
+from cpcbl_launch.reporting.paths import MOST_POINTS, RobotPath, robot_paths, thin, worst_first
 from cpcbl_launch.reporting.picture_field import OTHERS, draw_field
 from cpcbl_launch.reporting.recorder import Recorder
 from cpcbl_team.config import Team
@@ -141,11 +141,11 @@ def _strip_legend(paths: Sequence[RobotPath], duration_s: float) -> list[Line2D 
 
 def _draw_strip(axes: Axes, path: RobotPath, colour: str, duration_s: float) -> None:
     """The error beside three sigma; without truth sigma itself; when it was lost or silent."""
-    at_s, sigma_m = thinned(path.times_s, path.sigma_m)
+    at_s, sigma_m = thin(path.times_s, path.sigma_m)
     shown = np.where(np.isfinite(sigma_m), np.clip(3.0 * sigma_m, LEAST_M, LARGEST_M), LEAST_M)
     axes.fill_between(at_s, LEAST_M / 10.0, shown, color=colour, alpha=0.2, linewidth=0)
     _plot(axes, path.times_s, path.error_or_sigma_m, color=colour, linewidth=1)
-    at_s, lost = thinned(path.times_s, path.is_lost.astype(np.float64))
+    at_s, lost = thin(path.times_s, path.is_lost.astype(np.float64))
     whole = axes.get_xaxis_transform()
     axes.fill_between(at_s, 0.0, 1.0, where=lost > 0.0, transform=whole, **LOST)
     for from_s, until_s in path.silent_spans(duration_s):
@@ -164,7 +164,7 @@ def _draw_strip(axes: Axes, path: RobotPath, colour: str, duration_s: float) -> 
 def _plot(axes: Axes, times_s: Floats, values: Floats, **style: Any) -> None:
     """A line; so few points that a line would hardly be seen are also marked."""
     marker = "." if len(times_s) <= FEW else ""
-    axes.plot(*thinned(times_s, values), marker=marker, **style)
+    axes.plot(*thin(times_s, values), marker=marker, **style)
 
 
 def _summary(path: RobotPath) -> str:

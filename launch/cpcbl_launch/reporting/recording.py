@@ -24,8 +24,8 @@ from zstandard import ZstdError
 from cpcbl_agents.sources.mrclam import LogError
 from cpcbl_launch.reporting.metrics import Floats
 from cpcbl_launch.reporting.recorder import truth_rows
-from cpcbl_launch.team_faults import one_line
-from cpcbl_launch.team_file import decode_resolved
+from cpcbl_launch.team.faults import one_line
+from cpcbl_launch.team.file import decode_resolved
 from cpcbl_team.config import Team
 from cpcbl_team.inputs import Odometry, Position, Sightings
 from cpcbl_transport import topics
@@ -139,7 +139,7 @@ class RecordedRun(NamedTuple):
     truth: dict[str, Floats]
 
 
-def _checked(message: Message) -> Message:
+def _check_message(message: Message) -> Message:
     """A message that could have been recorded. Raises ValueError."""
     if reason := refusal(message, LAST_NS):
         raise ValueError(f"a message that no robot takes: {reason}")
@@ -153,7 +153,7 @@ def read_recording(path: Path) -> RecordedRun:
             reader = make_reader(file)
             attached = [a.data for a in reader.iter_attachments() if a.name == TEAM]
             messages = [
-                (channel.topic, _checked(_decoder.decode(message.data)))
+                (channel.topic, _check_message(_decoder.decode(message.data)))
                 for _, channel, message in reader.iter_messages()
                 if channel.topic.startswith(("in/", "look/", topics.TRUTH.key))
             ]

@@ -6,7 +6,7 @@ from itertools import chain
 
 import msgspec
 
-from cpcbl_agents.input_problems import without_numbers
+from cpcbl_agents.input_diagnosis.problems import without_numbers
 from cpcbl_team.miscalibration import MISPLACED
 from cpcbl_transport.messages import Flow, Spending, Status, Trust
 

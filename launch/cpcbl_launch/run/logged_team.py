@@ -9,9 +9,9 @@ import msgspec
 import numpy as np
 
 from cpcbl_agents.sources import mrclam
-from cpcbl_launch.checks import require_duration
 from cpcbl_launch.reporting.metrics import Floats, interpolated_truth
-from cpcbl_launch.team_file import builtin_path
+from cpcbl_launch.team.file import builtin_path
+from cpcbl_launch.team.requirements import require_duration
 from cpcbl_team.config import Field, Start, Team
 from cpcbl_team.errors import InputError
 from cpcbl_team.geometry import Pose2, step

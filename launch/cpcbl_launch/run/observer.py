@@ -13,10 +13,10 @@ import msgspec
 from cpcbl_agents.clock import Clock
 from cpcbl_agents.node import GuestNode
 from cpcbl_agents.process import Loop, new_incarnation, own_camera, stop_on_clock_step
-from cpcbl_agents.robot_log import RobotLog
+from cpcbl_agents.robot_log import RobotLogger
 from cpcbl_launch.reporting.statuses import FlowReport, ProblemLog, ProblemReport, summed_flows
 from cpcbl_launch.simulation.guests import unsupported_delay
-from cpcbl_launch.team_file import read_layer, with_added_robot
+from cpcbl_launch.team.file import read_layer, with_added_robot
 from cpcbl_team.config import Team
 from cpcbl_team.errors import InputError
 from cpcbl_team.inputs import NAME_PATTERN
@@ -163,17 +163,17 @@ def run_observer(
     ):
         _require_unique_name(name, bus)
         start_ns, incarnation = clock.now_ns(), new_incarnation()
-        said, problems = RobotLog(name), ProblemLog()
+        logger, problems = RobotLogger(name), ProblemLog()
 
         def on_status(status: Status) -> None:
-            said.tell(status)
+            logger.log_status(status)
             problems.add(status)
 
         node = GuestNode(
             *(name, team, bus, start_ns, incarnation, loop.on_arrival),
             *(clock.speed, camera, on_status),
         )
-        said.connected(team, link.endpoints)
+        logger.log_connected(team, link.endpoints)
         over = stop_on_clock_step(name, team, clock, stop)
         loop.run(node, lambda: over() or clock.now_ns() - start_ns >= duration_s * 1e9)
         end_ns = clock.now_ns()

@@ -9,8 +9,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from cpcbl_agents.clock import Clock
-from cpcbl_launch.checks import require_endpoints, require_robots, require_team_opencv
-from cpcbl_launch.team_file import find_team
+from cpcbl_launch.team.file import find_team
+from cpcbl_launch.team.requirements import require_endpoints, require_robots, require_team_opencv
 from cpcbl_transport.bus import Bus
 
 DESCRIPTION = "Run one robot, on any machine, until SIGINT, SIGTERM or SIGHUP."

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from cpcbl_agents.earlier_processes import ALL_TEAMS, repeat_tokens
-from cpcbl_agents.watchdog import watched
+from cpcbl_agents.watchdog import with_watchdog
 from cpcbl_team.config import Team
 from cpcbl_transport import topics
 from cpcbl_transport.security import Identity, access_control, link_of
@@ -39,9 +39,9 @@ def run_router(config: Mapping[str, Any], title: str, stop: Callable[[], bool]) 
     with open_router(config) as bus:
         repeat_tokens(bus, ALL_TEAMS)
         log.info("%s listens at %s", title, ", ".join(listening_at(config)))
-        bus.watch_liveliness(ALL_TEAMS + topics.ALIVE.at(), RobotLog())
+        bus.watch_liveliness(ALL_TEAMS + topics.ALIVE.at(), PresenceLogger())
         known: dict[str, str] = {}
-        is_over = watched(stop)
+        is_over = with_watchdog(stop)
         while not is_over():
             present = bus.neighbours()
             for came in present.keys() - known.keys():
@@ -53,8 +53,8 @@ def run_router(config: Mapping[str, Any], title: str, stop: Callable[[], bool]) 
         log.info("%s ends", title)
 
 
-class RobotLog:
-    """Says which robots of which teams come and go, by their liveliness tokens."""
+class PresenceLogger:
+    """Logs which robots of which teams come and go, by their liveliness tokens."""
 
     def __init__(self) -> None:
         self._present: dict[tuple[str, str], str] = {}  # the token of each robot

@@ -16,7 +16,6 @@ import numpy as np
 
 from cpcbl_agents.clock import Clock
 from cpcbl_agents.earlier_processes import repeat_tokens
-from cpcbl_launch.checks import require_duration
 from cpcbl_launch.reporting.files import write_or_reason
 from cpcbl_launch.reporting.metrics import Floats
 from cpcbl_launch.reporting.phases import Span, guest_reports, phase_report
@@ -26,7 +25,8 @@ from cpcbl_launch.run.logged_team import is_calibrated_on
 from cpcbl_launch.run.processes import Processes, Supervisor, process_table, tasks
 from cpcbl_launch.run.router import team_router
 from cpcbl_launch.simulation.in_process import Progress, simulate
-from cpcbl_launch.team_file import save_resolved
+from cpcbl_launch.team.file import save_resolved
+from cpcbl_launch.team.requirements import require_duration
 from cpcbl_team.config import Team
 from cpcbl_team.errors import InputError
 from cpcbl_transport.bus import Bus
@@ -92,14 +92,14 @@ class OnThisMachine:
     def router(self) -> AbstractContextManager[Bus]:
         team, listen = self._run.team, self._run.team.transport.listen
         if self._run.connect:
-            return self._joined()
+            return self._join_router()
         require_keys(team, listen, self._here)
         config = team_router(team, listen, (), self._run.speed)
         bus = open_router(config, namespace(team.name))
         repeat_tokens(bus)
         return bus
 
-    def _joined(self) -> AbstractContextManager[Bus]:
+    def _join_router(self) -> AbstractContextManager[Bus]:
         run, until_s = self._run, time.monotonic() + JOIN_S
         require_keys(run.team, run.connect, self._here)
         link = link_of(run.team, Identity(Role.OPERATOR), run.connect)
@@ -172,7 +172,7 @@ def run_team(
             raise InputError(f"{folder}: {error.strerror}; robots read their team there") from error
         launcher = launch(run, folder, stop)
         bus = stack.enter_context(launcher.router())
-        recording = stack.enter_context(_recording(run, bus))
+        recording = stack.enter_context(_open_recording(run, bus))
         recorder = Recorder(bus)
         stack.enter_context(watch(bus))
         clock = Clock.starting_in(launcher.lead_s, run.epoch_ns, run.speed)
@@ -211,7 +211,7 @@ def simulate_run(run: Run, progress: Progress | None = None) -> Report:
     return _report(run, recorder, 0.0, duration_s, {})
 
 
-def _recording(run: Run, bus: Bus) -> AbstractContextManager[Recording | None]:
+def _open_recording(run: Run, bus: Bus) -> AbstractContextManager[Recording | None]:
     if run.record is None:
         return nullcontext()
     replayed = [name for name, robot in run.team.robots.items() if robot.source == "mrclam"]

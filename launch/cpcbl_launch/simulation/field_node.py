@@ -15,11 +15,11 @@ from typing import TypeVar
 from msgspec.structs import replace
 
 from cpcbl_agents.clock import Clock
-from cpcbl_agents.input_causes import MOST_SPEED_M_S, MOST_TURN_RATE_RAD_S
-from cpcbl_launch.checks import require_robots
+from cpcbl_agents.input_diagnosis.message_causes import MOST_SPEED_M_S, MOST_TURN_RATE_RAD_S
 from cpcbl_launch.simulation.field import SimulatedField
 from cpcbl_launch.simulation.guests import GuestBodies
-from cpcbl_launch.team_checks import endpoint_problem
+from cpcbl_launch.team.checks import endpoint_problem
+from cpcbl_launch.team.requirements import require_robots
 from cpcbl_team.config import Team
 from cpcbl_team.errors import InputError
 from cpcbl_team.inputs import Odometry

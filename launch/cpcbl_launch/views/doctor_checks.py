@@ -1,13 +1,12 @@
 """The checks of `doctor`: pure functions over facts, each with findings and their remedies."""
 
-import difflib
 from collections.abc import Callable, Iterator
 from datetime import timedelta
 from typing import Literal
 
 import msgspec
 
-from cpcbl_launch.team_faults import one_line
+from cpcbl_launch.team.faults import one_line
 from cpcbl_launch.views.doctor_facts import Facts
 from cpcbl_launch.views.listening import (
     DAY_S,
@@ -17,6 +16,7 @@ from cpcbl_launch.views.listening import (
     clock_problem,
 )
 from cpcbl_team.config import Team
+from cpcbl_team.errors import nearest_name
 
 STAMPS_AHEAD_S, STAMPS_BEHIND_S = 0.5, 1.0  # robots refuse what is further ahead, or 2 s behind
 SOON = timedelta(days=30)
@@ -105,7 +105,7 @@ def _certificates(facts: Facts) -> Iterator[tuple[Level, str, str]]:
     for own in facts.certificates:
         renew = f"cpcbl-team keys {facts.file} --renew {own.who.rpartition('/')[2]}"
         if own.valid_until is None:
-            remedy = "see who may read it; the extra security reads certificates"
+            remedy = "check its permissions; reading certificates needs the extra `security`"
             yield "warning", f"{own.file}: cannot be read here", remedy
         elif own.valid_until <= facts.now:
             yield "error", f"{own.who}: expired {own.valid_until:%Y-%m-%d %H:%M} UTC", renew
@@ -140,7 +140,7 @@ def _router(facts: Facts) -> Iterator[tuple[Level, str, str]]:
         yield "error", f"no router at {endpoint.endpoint}: {text}", remedy
 
 
-def _own(facts: Facts) -> TeamHeard | None:
+def _own_team(facts: Facts) -> TeamHeard | None:
     """The team of the file, as it is heard; None where nobody could listen."""
     if facts.team is None or not facts.endpoints or facts.router_problem or facts.link_problem:
         return None
@@ -149,7 +149,7 @@ def _own(facts: Facts) -> TeamHeard | None:
 
 def _robots(facts: Facts) -> Iterator[tuple[Level, str, str]]:
     """Robots that are not heard, or twice."""
-    heard = _own(facts)
+    heard = _own_team(facts)
     if heard is None or facts.team is None:
         return
     for name in facts.team.robots:
@@ -174,7 +174,7 @@ def _robots(facts: Facts) -> Iterator[tuple[Level, str, str]]:
 
 def _health(facts: Facts) -> Iterator[tuple[Level, str, str]]:
     """What robots say of themselves."""
-    heard = _own(facts)
+    heard = _own_team(facts)
     for name, processes in heard.statuses.items() if heard else ():
         status = processes[-1].status
         problems: tuple[str, ...] = getattr(status, "problems", ())
@@ -190,7 +190,7 @@ def _health(facts: Facts) -> Iterator[tuple[Level, str, str]]:
 def _clocks(facts: Facts) -> Iterator[tuple[Level, str, str]]:
     """Clocks of robots against that of this machine. The time of a simulation or a log may run at
     another speed."""
-    heard = _own(facts)
+    heard = _own_team(facts)
     for name, processes in heard.statuses.items() if heard else ():
         if facts.team is None or name not in facts.team.real:
             continue
@@ -202,7 +202,7 @@ def _clocks(facts: Facts) -> Iterator[tuple[Level, str, str]]:
 
 def _inputs(facts: Facts) -> Iterator[tuple[Level, str, str]]:
     """Who publishes to which inputs, and whether that can be used."""
-    heard = _own(facts)
+    heard = _own_team(facts)
     if heard is None or facts.team is None:
         return
     fed = {(own.robot, own.input): own for own in heard.inputs}
@@ -214,10 +214,12 @@ def _inputs(facts: Facts) -> Iterator[tuple[Level, str, str]]:
             remedy = "docs/refused_inputs.md"
             yield "error", f"{key}: {count} messages cannot be used: {reason}", remedy
         process = heard.statuses[robot][-1] if robot in heard.statuses else None
-        told: tuple[str, ...] = getattr(process.status, "problems", ()) if process else ()
-        wrong = [] if told or robot not in facts.team.real else [*_input_clock(key, own, process)]
+        reported: tuple[str, ...] = getattr(process.status, "problems", ()) if process else ()
+        wrong = (
+            [] if reported or robot not in facts.team.real else [*_input_clock(key, own, process)]
+        )
         yield from wrong
-        if not wrong and not told and not own.refused:
+        if not wrong and not reported and not own.refused:
             yield "good", f"{key}: {own.rate_hz:.1f} Hz", ""
     for own_name, settings in facts.team.robots.items():
         drives = settings.source == "external" and settings.odometry.moves
@@ -244,14 +246,14 @@ def _input_clock(
 
 
 def _no_such_robot(robot: str, team: Team) -> str:
-    close = difflib.get_close_matches(robot, team.robots, n=1)
-    mean = f"{close[0]}? " if close else ""
+    near = nearest_name(robot, team.robots)
+    mean = f"{near}? " if near else ""
     return f"team {team.name} has no {robot}; {mean}there are {', '.join(team.robots)}"
 
 
 def _teams(facts: Facts) -> Iterator[tuple[Level, str, str]]:
     """Other teams on the router, among which drivers and robots with a wrong team may be."""
-    team, own = facts.team, _own(facts)
+    team, own = facts.team, _own_team(facts)
     missing = set(team.robots) - set(own.robots) if team and own else set[str]()
     for name, heard in facts.heard.items():
         if team is not None and name == team.name:
@@ -272,7 +274,7 @@ def _teams(facts: Facts) -> Iterator[tuple[Level, str, str]]:
 def _cameras(facts: Facts) -> Iterator[tuple[Level, str, str]]:
     for name, where in facts.missing_frames.items():
         text = f"{name}: this machine has no {where}"
-        yield "note", text, "no matter, if the robot's process runs elsewhere"
+        yield "note", text, "ignore this if the robot's process runs elsewhere"
 
 
 CHECKS: dict[str, Check] = {

@@ -12,8 +12,8 @@ from pathlib import Path
 import msgspec
 
 from cpcbl_launch.run.containers.docker import DockerError, check_daemon
-from cpcbl_launch.team_checks import warnings
-from cpcbl_launch.team_file import TeamFileError, find_team
+from cpcbl_launch.team.checks import warnings
+from cpcbl_launch.team.file import TeamFileError, find_team
 from cpcbl_launch.views.listening import TeamHeard, listen
 from cpcbl_team.config import Team, TransportSettings
 from cpcbl_team.errors import CpcblError
@@ -34,7 +34,7 @@ class EndpointFacts(msgspec.Struct, frozen=True, kw_only=True):
     """open, refused, unknown host, or silent: nothing came back in a second."""
 
 
-class CertificateFacts(msgspec.Struct, frozen=True, kw_only=True):
+class CertificateFile(msgspec.Struct, frozen=True, kw_only=True):
     """A certificate in the team's key folder."""
 
     who: str
@@ -59,7 +59,7 @@ class Facts(msgspec.Struct, frozen=True, kw_only=True):
     router_problem: str = ""  # why there is no session; empty: there is one
     heard: dict[str, TeamHeard] = {}
     seconds: float = 0.0  # of listening
-    certificates: tuple[CertificateFacts, ...] = ()
+    certificates: tuple[CertificateFile, ...] = ()
     missing_frames: dict[str, str] = {}  # robot -> its camera, which is not here
 
 
@@ -156,13 +156,13 @@ def _docker_problem() -> str:
     return ""
 
 
-def _certificates(team: Team | None) -> tuple[CertificateFacts, ...]:
+def _certificates(team: Team | None) -> tuple[CertificateFile, ...]:
     """The certificates below the team's key folder; none where they cannot be read here."""
     if team is None or not team.transport.secured:
         return ()
     folder = Path(team.transport.keys)
     return tuple(
-        CertificateFacts(
+        CertificateFile(
             who=str(path.parent.relative_to(folder)), file=str(path), valid_until=_valid_until(path)
         )
         for path in sorted(folder.rglob(CERTIFICATE))

@@ -19,7 +19,7 @@ from cpcbl_launch.reporting.statuses import (
     trust_reports,
 )
 from cpcbl_launch.reporting.tables import number, short, table
-from cpcbl_launch.team_faults import one_line
+from cpcbl_launch.team.faults import one_line
 from cpcbl_launch.views.listening import InputHeard, TeamHeard, clock_problem
 from cpcbl_launch.views.traffic_tables import limit_text
 from cpcbl_team.config import Team

@@ -252,7 +252,7 @@ def _remarks(report: Report) -> Iterator[str]:
     team = report.team
     if team.pooled_rmse_m is not None:
         pooled = f"All samples together: RMSE {team.pooled_rmse_m:.3f} m"
-        nees = f"; NEES of the heading {number(team.heading_nees, 1)} (1 is due)"
+        nees = f"; NEES of the heading {number(team.heading_nees, 1)} (1 expected)"
         yield f"{pooled}{nees if team.heading_nees is not None else ''}."
     if team.scored_share is not None and team.scored_share < 0.995:
         yield f"Truth is known for {team.scored_share:.0%} of the estimates; the rest has no score."

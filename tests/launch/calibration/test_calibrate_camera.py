@@ -40,7 +40,7 @@ from cpcbl_launch.calibration.team_tables import (
     team_source,
     toml_value,
 )
-from cpcbl_launch.team_file import TeamFileError, load_team, parse_team
+from cpcbl_launch.team.file import TeamFileError, load_team, parse_team
 from cpcbl_team.config import CameraSettings
 from cpcbl_team.errors import InputError
 

@@ -29,7 +29,7 @@ from cpcbl_launch.calibration.colours import (
     thresholds,
 )
 from cpcbl_launch.calibration.team_tables import colour_tables, edit_team, unsampled_colours
-from cpcbl_launch.team_file import TeamFileError, load_team, parse_team
+from cpcbl_launch.team.file import TeamFileError, load_team, parse_team
 from cpcbl_team.config import COLOURS, Colour
 from cpcbl_team.errors import InputError
 

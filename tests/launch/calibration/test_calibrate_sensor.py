@@ -28,7 +28,7 @@ from cpcbl_launch.calibration.logs import ground_truth
 from cpcbl_launch.calibration.team_tables import CAMERA_SIGMAS, TablePath, edit_team, sensor_tables
 from cpcbl_launch.reporting.recording import Recording
 from cpcbl_launch.simulation.camera.render import Light, Scene, SceneRobot, render
-from cpcbl_launch.team_file import load_team, parse_team
+from cpcbl_launch.team.file import load_team, parse_team
 from cpcbl_team.config import CameraSettings, Landmark, RobotSettings, Team
 from cpcbl_team.errors import InputError
 from cpcbl_team.geometry import Pose2

@@ -14,7 +14,7 @@ from cpcbl_launch.calibration.odometry import calibrate_odometry
 from cpcbl_launch.calibration.team_types import Calibration, calibrate_robots, non_default_settings
 from cpcbl_launch.reporting.recording import read_recording
 from cpcbl_launch.simulation.in_process import simulate
-from cpcbl_launch.team_file import load_team
+from cpcbl_launch.team.file import load_team
 from cpcbl_team.config import Team
 
 BOUNDS = {  # of robots a and b: the largest error that is allowed, whatever the standard error

@@ -19,7 +19,7 @@ from cpcbl_launch.calibration.team_types import (
     RobotCalibration,
     calibrated_team,
 )
-from cpcbl_launch.team_file import TeamFileError, load_team, parse_team
+from cpcbl_launch.team.file import TeamFileError, load_team, parse_team
 from cpcbl_team.config import (
     OdometrySettings,
     SensorSettings,

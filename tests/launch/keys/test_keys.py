@@ -17,7 +17,7 @@ from support.processes import cpcbl_team
 from cpcbl_agents.extras import install_command
 from cpcbl_launch.keys.authority import certificate_facts, issue_certificate, new_authority
 from cpcbl_launch.keys.folder import KeyRequest, hosts, plan_actions
-from cpcbl_launch.team_file import builtin_path, parse_team
+from cpcbl_launch.team.file import builtin_path, parse_team
 from cpcbl_team.errors import InputError
 from cpcbl_transport.security import Member
 from cpcbl_transport.topics import Role

@@ -15,7 +15,7 @@ from support.processes import cpcbl_team, eventually, patient_up
 
 from cpcbl_launch.run.processes import PROGRAM
 from cpcbl_launch.run.up import free_endpoint
-from cpcbl_launch.team_file import TeamFileError, load_team, parse_team
+from cpcbl_launch.team.file import TeamFileError, load_team, parse_team
 from cpcbl_transport import topics
 from cpcbl_transport.topics import Qos
 from cpcbl_transport.zenoh_bus import BusError

@@ -61,7 +61,7 @@ def test_operators_are_not_told_lies_about_others(tmp_path: Path) -> None:
 
 
 def _written(team: Team, folder: Path) -> Path:
-    from cpcbl_launch.team_file import save_resolved
+    from cpcbl_launch.team.file import save_resolved
 
     path = folder / "team.json"
     save_resolved(team, path)

@@ -27,10 +27,10 @@ from cpcbl_launch.lab.evaluation import (
     evaluate_log,
     run_baselines,
 )
-from cpcbl_launch.overrides import with_blind_robots
 from cpcbl_launch.reporting.metrics import Floats, Trajectory, position_errors, samples_with_truth
 from cpcbl_launch.reporting.recorder import BaselineReport
 from cpcbl_launch.run.logged_team import LoggedTeam, load_logged_team
+from cpcbl_launch.team.overrides import with_blind_robots
 from cpcbl_team.config import (
     LocalizerSettings,
     OdometrySettings,

@@ -39,7 +39,7 @@ from cpcbl_launch.lab.chaos.team import (
 )
 from cpcbl_launch.run.processes import PROGRAM, Supervisor, own_memory_mib
 from cpcbl_launch.run.up import free_endpoint
-from cpcbl_launch.team_file import save_resolved
+from cpcbl_launch.team.file import save_resolved
 from cpcbl_transport import topics
 from cpcbl_transport.topics import Qos
 from cpcbl_transport.zenoh_bus import open_bus

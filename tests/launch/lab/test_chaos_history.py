@@ -39,7 +39,7 @@ from cpcbl_launch.lab.chaos.machine import MachineLog, MachineWatch
 from cpcbl_launch.lab.chaos.nemesis import FAULTS, INSTANT, write_history
 from cpcbl_launch.lab.chaos.runner import select_scenarios
 from cpcbl_launch.lab.chaos.scenario import TeamFault
-from cpcbl_launch.lab.chaos.schedule import overlapping, schedule
+from cpcbl_launch.lab.chaos.schedule import largest_overlap, schedule
 from cpcbl_launch.lab.experiments.runs import with_settings
 from cpcbl_launch.reporting.metrics import Samples
 from cpcbl_launch.simulation.in_process import simulate
@@ -55,7 +55,7 @@ def test_a_seed_determines_the_faults_and_they_overlap() -> None:
     plan = schedule(4, 60.0, TARGETS, INSTANT)
     assert plan == schedule(4, 60.0, TARGETS, INSTANT) != schedule(5, 60.0, TARGETS, INSTANT)
     assert {fault.name for fault in plan} == FAULTS.keys()
-    assert overlapping(plan) >= 3
+    assert largest_overlap(plan) >= 3
     assert all(0.0 < f.from_s < f.until_s <= 60.0 for f in plan)
 
 

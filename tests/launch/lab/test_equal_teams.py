@@ -11,8 +11,8 @@ import pytest
 from support.equal_teams import SHAPES, START_SIGMA_M, Sighted, equal_team, nees_bounds, team_nees
 
 from cpcbl_launch.lab.experiments.runs import Case, run_case
-from cpcbl_launch.overrides import Overrides, with_overrides
 from cpcbl_launch.simulation.in_process import simulate
+from cpcbl_launch.team.overrides import Overrides, with_overrides
 from cpcbl_team.config import Team
 
 SPLIT = Overrides()

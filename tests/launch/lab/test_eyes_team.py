@@ -11,7 +11,7 @@ from cpcbl_launch.reporting.recorder import Recorder, Report
 from cpcbl_launch.run.processes import Processes
 from cpcbl_launch.run.up import Run, run_team, with_listen_endpoint
 from cpcbl_launch.simulation.in_process import simulate
-from cpcbl_launch.team_file import builtin_path, load_team
+from cpcbl_launch.team.file import builtin_path, load_team
 from cpcbl_team.config import Team
 
 RUN_S = 8.0

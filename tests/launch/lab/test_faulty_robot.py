@@ -20,7 +20,7 @@ from cpcbl_launch.lab.faulty_robot import (
     faulty_command,
 )
 from cpcbl_launch.run.processes import PROGRAM
-from cpcbl_launch.team_file import builtin_path
+from cpcbl_launch.team.file import builtin_path
 from cpcbl_team.errors import InputError
 from cpcbl_team.inputs import Belief, Fix
 from cpcbl_transport import topics

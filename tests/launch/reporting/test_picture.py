@@ -17,7 +17,7 @@ from matplotlib.text import Text
 
 from cpcbl_launch.reporting.activity import ActivityLog
 from cpcbl_launch.reporting.metrics import Floats
-from cpcbl_launch.reporting.paths import MOST_POINTS, places, robot_path, thinned
+from cpcbl_launch.reporting.paths import MOST_POINTS, places, robot_path, thin
 from cpcbl_launch.reporting.picture import MOST_STRIPS, Times, run_figure
 from cpcbl_launch.reporting.picture_field import visible_box
 from cpcbl_launch.reporting.recorder import Recorder
@@ -201,7 +201,7 @@ def test_a_long_line_keeps_its_peak_and_its_gap() -> None:
     times_s = np.concatenate([np.arange(0.0, 3000.0, 0.1), np.arange(4000.0, 7200.0, 0.1)])
     values = np.ones(len(times_s))
     values[12_345] = 9.0
-    at_s, largest = thinned(times_s, values)
+    at_s, largest = thin(times_s, values)
     assert len(at_s) <= MOST_POINTS + 1
     assert np.nanmax(largest) == 9.0
     assert np.isnan(largest).sum() == 1

@@ -11,7 +11,7 @@ from support.simulated import simulate_recorded
 
 from cpcbl_launch.reporting.recording import Recording, read_recording
 from cpcbl_launch.simulation.in_process import simulate
-from cpcbl_launch.team_file import builtin_path, load_team
+from cpcbl_launch.team.file import builtin_path, load_team
 from cpcbl_team.config import RobotSettings, Team
 from cpcbl_team.inputs import Odometry, Position, Sighting, Sightings
 from cpcbl_transport import topics

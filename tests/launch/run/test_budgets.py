@@ -11,8 +11,8 @@ from support.processes import cpcbl_team
 from support.traffic import TEAM, status
 
 from cpcbl_launch.cli import main
-from cpcbl_launch.overrides import Overrides, with_overrides
-from cpcbl_launch.team_file import parse_team
+from cpcbl_launch.team.file import parse_team
+from cpcbl_launch.team.overrides import Overrides, with_overrides
 from cpcbl_launch.views.traffic import (
     Arrival,
     traffic_from_statuses,

@@ -31,7 +31,7 @@ from cpcbl_launch.run.containers.launch import (
     team_in_containers,
 )
 from cpcbl_launch.run.processes import PROGRAM
-from cpcbl_launch.team_file import builtin_path, load_team
+from cpcbl_launch.team.file import builtin_path, load_team
 from cpcbl_team.config import Team
 from cpcbl_team.errors import InputError
 

@@ -21,7 +21,7 @@ from cpcbl_launch.run.containers.docker import command_output
 from cpcbl_launch.run.containers.fleet import SERVICE_LABEL
 from cpcbl_launch.run.processes import PROGRAM
 from cpcbl_launch.run.up import free_endpoint
-from cpcbl_launch.team_file import builtin_path, load_team
+from cpcbl_launch.team.file import builtin_path, load_team
 from cpcbl_transport.zenoh_bus import open_bus
 
 pytestmark = [pytest.mark.docker, pytest.mark.timeout(600)]

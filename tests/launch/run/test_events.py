@@ -13,7 +13,7 @@ from cpcbl_launch.reporting.metrics import Floats, position_errors, position_nee
 from cpcbl_launch.reporting.recorder import Recorder
 from cpcbl_launch.simulation.field import SimulatedField
 from cpcbl_launch.simulation.in_process import simulate
-from cpcbl_launch.team_file import TeamFileError, builtin_path, load_team, parse_team, save_resolved
+from cpcbl_launch.team.file import TeamFileError, builtin_path, load_team, parse_team, save_resolved
 from cpcbl_team.config import SimulationEvent, Team
 from cpcbl_team.inputs import Sightings
 

@@ -15,7 +15,6 @@ from support.logs import EPOCH_MS, LANDMARKS, STARTS, STEP_MS, log_team, write_l
 from cpcbl_agents.sources.mrclam import LogError
 from cpcbl_launch.lab.evaluation import evaluate_log
 from cpcbl_launch.lab.experiments import budget
-from cpcbl_launch.overrides import Overrides, with_blind_robots, with_overrides
 from cpcbl_launch.reporting.recorder import LearnedReport, Report
 from cpcbl_launch.reporting.statuses import miscalibration_text
 from cpcbl_launch.run.logged_team import (
@@ -26,7 +25,8 @@ from cpcbl_launch.run.logged_team import (
     with_duration,
     with_unknown_starts,
 )
-from cpcbl_launch.team_file import builtin_path, load_team
+from cpcbl_launch.team.file import builtin_path, load_team
+from cpcbl_launch.team.overrides import Overrides, with_blind_robots, with_overrides
 from cpcbl_launch.views.run import print_report
 from cpcbl_team.config import (
     LocalizerSettings,

@@ -20,7 +20,7 @@ from cpcbl_launch.run.observer import (
     team_with_observer,
 )
 from cpcbl_launch.simulation.in_process import simulate
-from cpcbl_launch.team_file import builtin_path, load_team, parse_team, save_resolved
+from cpcbl_launch.team.file import builtin_path, load_team, parse_team, save_resolved
 from cpcbl_team.config import GuestSettings, MatchSettings, Team
 from cpcbl_team.errors import InputError
 

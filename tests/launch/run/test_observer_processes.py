@@ -24,7 +24,7 @@ from cpcbl_launch.run.containers.compose import Mount
 from cpcbl_launch.run.containers.launch import KEYS_INSIDE, docker_run, mounts_of_keys
 from cpcbl_launch.run.processes import PROGRAM
 from cpcbl_launch.run.up import Run, free_endpoint, run_team
-from cpcbl_launch.team_file import save_resolved
+from cpcbl_launch.team.file import save_resolved
 from cpcbl_team.config import TransportSettings
 from cpcbl_transport import topics
 from cpcbl_transport.messages import Status, decode_tagged

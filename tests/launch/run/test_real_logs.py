@@ -11,10 +11,10 @@ from support.processes import cpcbl_team
 
 from cpcbl_launch.lab.evaluation import evaluate_log
 from cpcbl_launch.lab.evaluation import evaluate_log as evaluated_log
-from cpcbl_launch.overrides import Overrides, with_blind_robots, with_overrides
 from cpcbl_launch.reporting.recorder import Report
 from cpcbl_launch.run.logged_team import builtin_for, load_logged_team
-from cpcbl_launch.team_file import builtin_path, load_team
+from cpcbl_launch.team.file import builtin_path, load_team
+from cpcbl_launch.team.overrides import Overrides, with_blind_robots, with_overrides
 
 pytestmark = [pytest.mark.log, pytest.mark.timeout(900)]
 

@@ -14,7 +14,7 @@ from support.processes import command_line, cpcbl_team, eventually
 
 from cpcbl_launch.run.processes import PROGRAM
 from cpcbl_launch.run.up import free_endpoint
-from cpcbl_launch.team_file import builtin_path, load_team
+from cpcbl_launch.team.file import builtin_path, load_team
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus
 from cpcbl_transport.topics import Qos

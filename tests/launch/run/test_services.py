@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 from support.processes import eventually
 
-from cpcbl_agents.watchdog import notify, watched
+from cpcbl_agents.watchdog import notify, with_watchdog
 from cpcbl_launch.run.processes import PROGRAM
 from cpcbl_launch.run.up import free_endpoint
 
@@ -122,9 +122,9 @@ def test_without_a_service_manager_nothing_is_told() -> None:
         return False
 
     assert not notify("READY=1", {})
-    assert watched(never, {}) is never
+    assert with_watchdog(never, {}) is never
     elsewhere = {"WATCHDOG_USEC": "1000", "WATCHDOG_PID": "1"}  # of the shell that started it
-    assert watched(never, elsewhere) is never
+    assert with_watchdog(never, elsewhere) is never
     assert not notify("READY=1", {"NOTIFY_SOCKET": "/nobody/listens"})
 
 
@@ -133,7 +133,7 @@ def test_signs_of_life_are_no_more_than_the_service_manager_wants(
 ) -> None:
     manager, now_ns = Manager(tmp_path, "socket", watchdog_s=10.0), [0]
     monkeypatch.setattr("time.monotonic_ns", lambda: now_ns[0])
-    asked: Callable[[], bool] = watched(lambda: False, manager.environment)
+    asked: Callable[[], bool] = with_watchdog(lambda: False, manager.environment)
     for _ in range(100):  # ten seconds
         assert not asked()
         now_ns[0] += 100_000_000

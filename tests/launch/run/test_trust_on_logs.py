@@ -9,12 +9,12 @@ import pytest
 
 from cpcbl_launch.lab.evaluation import evaluate_log
 from cpcbl_launch.lab.faulty_robot import Fault, FaultyBus
-from cpcbl_launch.overrides import with_blind_robots
 from cpcbl_launch.reporting.metrics import score
 from cpcbl_launch.reporting.recorder import Recorder, Report
 from cpcbl_launch.run import logged_team
 from cpcbl_launch.simulation.in_process import robot_nodes, run_nodes
-from cpcbl_launch.team_file import load_team
+from cpcbl_launch.team.file import load_team
+from cpcbl_launch.team.overrides import with_blind_robots
 from cpcbl_team.config import Team, TrustSettings
 from cpcbl_transport.memory_bus import MemoryHub
 

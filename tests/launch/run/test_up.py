@@ -17,7 +17,7 @@ from support.routers import open_router
 from cpcbl_launch.reporting.recorder import Recorder, Report
 from cpcbl_launch.run.processes import PROGRAM, Processes, ProcessSpec, Supervisor
 from cpcbl_launch.run.up import Run, free_endpoint, run_team
-from cpcbl_launch.team_file import builtin_path, load_team, save_resolved
+from cpcbl_launch.team.file import builtin_path, load_team, save_resolved
 from cpcbl_team.config import GuardSettings, Team, TransportSettings
 from cpcbl_transport import topics
 from cpcbl_transport.topics import Qos

@@ -179,7 +179,7 @@ def test_a_robot_without_a_camera_does_not_load_opencv(tmp_path: Path) -> None:
         "import sys; from cpcbl_agents.robot import build_robot;"
         "from cpcbl_launch.run import up;"
         "from cpcbl_agents import process;"
-        "from cpcbl_launch.team_file import builtin_path, load_team;"
+        "from cpcbl_launch.team.file import builtin_path, load_team;"
         "build_robot('scout', load_team(builtin_path('demo')), 0); print('cv2' in sys.modules)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

@@ -17,7 +17,7 @@ from cpcbl_launch.simulation.camera.cameras import QUALITIES, Cameras, encode_jp
 from cpcbl_launch.simulation.camera.render import Scene, SceneRobot, render
 from cpcbl_launch.simulation.field import SimulatedField
 from cpcbl_launch.simulation.field_node import PICTURES_LATE_NS, FieldNode
-from cpcbl_launch.team_file import builtin_path, load_team, parse_team
+from cpcbl_launch.team.file import builtin_path, load_team, parse_team
 from cpcbl_team.config import Team
 from cpcbl_team.geometry import Pose2
 from cpcbl_team.inputs import Sightings
@@ -224,7 +224,7 @@ def test_without_opencv_one_line_says_what_to_install(arguments: list[str], tmp_
 def test_a_team_without_cameras_needs_no_opencv(tmp_path: Path) -> None:
     code = (
         "from cpcbl_launch.simulation.in_process import simulate\n"
-        "from cpcbl_launch.team_file import builtin_path, load_team\n"
+        "from cpcbl_launch.team.file import builtin_path, load_team\n"
         "report, _ = simulate(load_team(builtin_path('demo')), 1, 2.0)\n"
         "print(len(report.robots))"
     )

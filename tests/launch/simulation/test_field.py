@@ -10,7 +10,7 @@ from support.fields import ALL_ROUND, STEP_NS, drive, field, frame, marks, robot
 
 from cpcbl_launch.simulation.in_process import simulate
 from cpcbl_launch.simulation.robot import COMMAND_LASTS_NS
-from cpcbl_launch.team_file import builtin_path, load_team
+from cpcbl_launch.team.file import builtin_path, load_team
 from cpcbl_team.config import (
     Field,
     Gives,

@@ -12,7 +12,7 @@ from cpcbl_agents.clock import Clock
 from cpcbl_launch.simulation.field import SimulatedField
 from cpcbl_launch.simulation.field_node import INBOX, FieldNode, parse_sites, run_field
 from cpcbl_launch.simulation.guests import REQUEST_LASTS_NS
-from cpcbl_launch.team_file import builtin_path, load_team
+from cpcbl_launch.team.file import builtin_path, load_team
 from cpcbl_team.config import (
     GuestSettings,
     OdometrySettings,

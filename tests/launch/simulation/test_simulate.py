@@ -8,7 +8,7 @@ from support.processes import cpcbl_team
 
 from cpcbl_launch.cli import main
 from cpcbl_launch.simulation.in_process import simulate
-from cpcbl_launch.team_file import builtin_path, load_team
+from cpcbl_launch.team.file import builtin_path, load_team
 
 PNG = b"\x89PNG\r\n\x1a\n"
 

@@ -7,9 +7,9 @@ import msgspec
 import numpy as np
 import pytest
 
-from cpcbl_launch.overrides import Overrides, with_overrides
 from cpcbl_launch.simulation.in_process import simulate
-from cpcbl_launch.team_file import builtin_path, load_team
+from cpcbl_launch.team.file import builtin_path, load_team
+from cpcbl_launch.team.overrides import Overrides, with_overrides
 from cpcbl_team.config import Team
 
 SEEDS = range(20)

@@ -7,7 +7,7 @@ from msgspec.structs import replace
 from support.buses import MS, SECOND, robot_at, team_of
 
 from cpcbl_launch.views.doctor_checks import Finding, findings, is_well
-from cpcbl_launch.views.doctor_facts import CertificateFacts, EndpointFacts, Facts
+from cpcbl_launch.views.doctor_facts import CertificateFile, EndpointFacts, Facts
 from cpcbl_launch.views.listening import Sample, heard_by_team, listen
 from cpcbl_launch.views.robot_status import robot_statuses
 from cpcbl_team.config import Team, TransportSettings
@@ -218,7 +218,7 @@ def test_a_lost_robot_is_found() -> None:
 )
 def test_the_ends_of_certificates_are_found(days: int | None, level: str) -> None:
     until = None if days is None else NOW + timedelta(days=days)
-    own = CertificateFacts(who="robot/r1", file="keys/robot/r1/x.crt", valid_until=until)
+    own = CertificateFile(who="robot/r1", file="keys/robot/r1/x.crt", valid_until=until)
     (finding,) = [f for f in findings(facts_of(certificates=(own,))) if f.check == "certificates"]
     assert finding.level == level
     assert ("--renew r1" in finding.remedy) is (days in (-1, 10))

@@ -20,7 +20,7 @@ from cpcbl_launch.reporting.recording import read_recording
 from cpcbl_launch.run.processes import PROGRAM
 from cpcbl_launch.run.up import free_endpoint
 from cpcbl_launch.simulation.camera.render import Light, Scene, SceneRobot, render
-from cpcbl_launch.team_file import load_team
+from cpcbl_launch.team.file import load_team
 from cpcbl_team.geometry import Pose2
 from cpcbl_team.inputs import Sightings
 

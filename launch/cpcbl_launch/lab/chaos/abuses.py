@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from cpcbl_agents.stop import StopSignal
-from cpcbl_launch.team_file import load_team
+from cpcbl_launch.team.file import load_team
 from cpcbl_team.config import Team
 from cpcbl_team.inputs import Belief, Fix
 from cpcbl_transport import topics

@@ -135,13 +135,13 @@ def spent_shares(log: RunLog, robot: str) -> Iterator[float]:
             if limit.window_s <= 0.0 or limit.allowed <= 0.0:
                 continue
             yield limit.most / limit.allowed
-            spent = np.array([_spent(s.sent, limit.unit) for s in statuses])
+            spent = np.array([_spending(s.sent, limit.unit) for s in statuses])
             for n, stamp_s in enumerate(stamps_s):
                 inside = (stamps_s >= stamp_s) & (stamps_s - stamp_s < limit.window_s)
                 yield float(spent[inside].max() - spent[n]) / limit.allowed
 
 
-def _spent(flows: Iterable[Flow], unit: str) -> int:
+def _spending(flows: Iterable[Flow], unit: str) -> int:
     return sum(f.bytes if unit == "bytes" else f.messages for f in flows if f.topic in HELP)
 
 

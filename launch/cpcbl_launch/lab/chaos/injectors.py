@@ -113,11 +113,11 @@ def _with_clock_ahead(spec: ProcessSpec) -> ProcessSpec:
     return spec._replace(command=(*spec.command, "--clock", str(ahead)))
 
 
-def _lying(spec: ProcessSpec) -> ProcessSpec:
+def _with_lie(spec: ProcessSpec) -> ProcessSpec:
     return spec._replace(command=faulty_command(spec.command, LIE))
 
 
-clock_step, liar = respawn("clock", _with_clock_ahead), respawn("liar", _lying)
+clock_step, liar = respawn("clock", _with_clock_ahead), respawn("liar", _with_lie)
 
 
 @contextmanager

@@ -16,7 +16,7 @@ from typing import NamedTuple, Self
 from cpcbl_agents.clock import Clock
 from cpcbl_launch.run.processes import PROGRAM, ProcessSpec, Supervisor
 from cpcbl_launch.run.up import free_endpoint
-from cpcbl_launch.team_file import save_resolved
+from cpcbl_launch.team.file import save_resolved
 from cpcbl_team.config import OdometrySettings, RobotSettings, Start, Team
 from cpcbl_transport import topics
 from cpcbl_transport.decoding import decode
@@ -91,7 +91,7 @@ class MachineWatch:
             end_s = time.monotonic() + 60.0
             bus = open_bus(CONTROL, [endpoint], lambda: time.monotonic() > end_s)
             self._clock = clock
-            stack.enter_context(bus).subscribe(topics.TRACK.at(), self._arrived)
+            stack.enter_context(bus).subscribe(topics.TRACK.at(), self._on_message)
             thread = threading.Thread(target=self._sample, daemon=True)
             thread.start()
             stack.callback(thread.join)
@@ -108,7 +108,7 @@ class MachineWatch:
         arrivals_s, delays_s = self._arrivals_s[:known], self._delays_s[:known]
         return MachineLog(tuple(arrivals_s), tuple(delays_s), tuple(self._others), zero_s)
 
-    def _arrived(self, key: str, payload: bytes) -> None:
+    def _on_message(self, key: str, payload: bytes) -> None:
         if isinstance(track := decode(key, payload), Track):
             self._arrivals_s.append(time.monotonic())
             self._delays_s.append((self._clock.now_ns() - track.stamp_ns) * 1e-9)

@@ -97,9 +97,9 @@ def memory_checks(lives: Sequence[ProcessLife], processes: Sequence[str]) -> lis
     growth_mib = grown and grown.end_mib - grown.start_mib
     name = grown.process if grown else ""
     checks = [
-        _most("processes that ran too shortly to judge their memory", len(short), 0),
-        _most("largest growth of memory", growth_mib, GROWTH_MIB, "MiB", name),
-        _most(
+        _check_at_most("processes that ran too shortly to judge their memory", len(short), 0),
+        _check_at_most("largest growth of memory", growth_mib, GROWTH_MIB, "MiB", name),
+        _check_at_most(
             "largest growth of the number of open files",
             max((life.more_files for life in lives), default=None),
             MORE_FILES,
@@ -107,9 +107,13 @@ def memory_checks(lives: Sequence[ProcessLife], processes: Sequence[str]) -> lis
     ]
     if steepest is not None:
         what, bound = f"steepest growth of one that ran for {LONG_LIFE_S:g} s", SLOPE_MIB_A_MINUTE
-        checks.append(_most(what, steepest.mib_a_minute, bound, "MiB/min", steepest.process))
+        checks.append(
+            _check_at_most(what, steepest.mib_a_minute, bound, "MiB/min", steepest.process)
+        )
     return checks
 
 
-def _most(what: str, seen: float | None, bound: float, unit: str = "", robot: str = "") -> Check:
+def _check_at_most(
+    what: str, seen: float | None, bound: float, unit: str = "", robot: str = ""
+) -> Check:
     return Check(what=what, seen=seen, at_most=bound, unit=unit, robot=robot, by_load=False)

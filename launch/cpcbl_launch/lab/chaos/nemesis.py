@@ -19,7 +19,7 @@ from cpcbl_launch.lab.chaos.history import Span, invariants, without
 from cpcbl_launch.lab.chaos.memory import MemorySampler, ProcessSample, memory_checks, process_lives
 from cpcbl_launch.lab.chaos.run_log import RunLog
 from cpcbl_launch.lab.chaos.scenario import FaultRun, Injector, ScenarioOptions, ScenarioResult
-from cpcbl_launch.lab.chaos.schedule import PlannedFault, overlapping, schedule
+from cpcbl_launch.lab.chaos.schedule import PlannedFault, largest_overlap, schedule
 from cpcbl_launch.lab.chaos.team import (
     FAR_ROUTER,
     FIELD,
@@ -78,7 +78,7 @@ def nemesis(options: ScenarioOptions, secured: bool = False) -> ScenarioResult:
         team.settle()
         nemesis = Nemesis(team, options)
         nemesis.inject(faults)
-        healed_s = nemesis.healed()
+        healed_s = nemesis.healing_time_s()
         team.run_for(AFTER_S)
         log, end_s = without(merged_log(team), nemesis.unknown), team.now_s
         held = invariants(log, team.robots, healed_s, end_s, nemesis.forged)
@@ -146,17 +146,17 @@ class Nemesis:
                 else:
                     own, run = active.pop(fault)
                     own.close()
-                    self._ended(fault, run)
+                    self._end_fault(fault, run)
                 self._report(", ".join(f"{f.name} {f.target}" for f in active) or "no fault")
 
-    def _ended(self, fault: PlannedFault, run: FaultRun) -> None:
+    def _end_fault(self, fault: PlannedFault, run: FaultRun) -> None:
         span = Span(fault.target, run.fault_s - 0.5, self._team.now_s + 0.5)
         kept = {"clock": self.unknown, "flood": self.forged}.get(fault.name)
         if kept is not None:
             kept.append(span)
 
-    def healed(self) -> float:
-        """When all that was killed runs again."""
+    def healing_time_s(self) -> float:
+        """Waits until all that was killed runs again; returns the time (s)."""
         team = self._team
         self._report("waiting until all processes run")
         names = set(team.supervisor.names)
@@ -189,7 +189,7 @@ class Nemesis:
 def _remarks(
     seed: int, faults: Sequence[PlannedFault], nemesis: Nemesis, checks: Sequence[Check]
 ) -> Iterator[str]:
-    yield f"seed {seed}: {len(faults)} faults, up to {overlapping(faults)} at a time"
+    yield f"seed {seed}: {len(faults)} faults, up to {largest_overlap(faults)} at a time"
     if not all(check.is_met for check in checks):
         yield "events: " + "; ".join(map(str, faults))
     yield from map(str, process_lives(nemesis.samples))

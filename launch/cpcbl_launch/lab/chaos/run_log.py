@@ -259,7 +259,7 @@ class RunRecorder:
     def listen(self, bus: Bus) -> None:
         """Subscribes to tracks, statuses, the ground truth and liveliness tokens."""
         for topic in (topics.TRACK, topics.STATUS, topics.TRUTH):
-            bus.subscribe(topic.at(), self._arrived)
+            bus.subscribe(topic.at(), self._on_message)
         bus.watch_liveliness(topics.ALIVE.at(), self._record_token)
 
     @property
@@ -279,7 +279,7 @@ class RunRecorder:
             with self._lock:
                 self._tokens.append(TokenEvent(self.now_s, alive=alive, **names))
 
-    def _arrived(self, key: str, payload: bytes) -> None:
+    def _on_message(self, key: str, payload: bytes) -> None:
         at_s, message = self.now_s, decode(key, payload)
         with self._lock:
             match message:

@@ -1,6 +1,5 @@
 """Runs scenarios one after another, so that they do not disturb each other; shows the outcomes."""
 
-import difflib
 import os
 import platform
 import subprocess
@@ -25,7 +24,7 @@ from cpcbl_launch.lab.chaos.scenarios import SCENARIOS
 from cpcbl_launch.lab.chaos.soak import require_judged_soak
 from cpcbl_launch.lab.chaos.team import ChaosError
 from cpcbl_launch.run.containers.docker import DockerError
-from cpcbl_team.errors import InputError
+from cpcbl_team.errors import InputError, nearest_name
 from cpcbl_transport.zenoh_bus import BusError
 
 ALL = "all"
@@ -41,8 +40,8 @@ def select_scenarios(names: Sequence[str]) -> list[Scenario]:
         if name == "fuzz":
             raise InputError(FUZZ)
         if name not in known and name != ALL:
-            close = difflib.get_close_matches(name, known, 1)
-            hint = f"did you mean {close[0]}?" if close else f"one of {', '.join(known)}, {ALL}"
+            near = nearest_name(name, known)
+            hint = f"did you mean {near}?" if near else f"one of {', '.join(known)}, {ALL}"
             raise InputError(f"chaos: no scenario {name!r}; {hint}")
     return [s for s in SCENARIOS if ALL in names or s.name in names]
 
@@ -80,17 +79,17 @@ def run_scenario(scenario: Scenario, options: ScenarioOptions) -> Outcome:
 def run_scenarios(
     scenarios: Iterable[Scenario],
     options: ScenarioOptions,
-    began: Callable[[Scenario], None],
-    done: Callable[[Outcome], None],
+    on_begin: Callable[[Scenario], None],
+    on_end: Callable[[Outcome], None],
     watching: Callable[[], AbstractContextManager[MachineWatch | None]] = MachineWatch,
 ) -> ChaosReport:
-    """Runs scenarios; calls `began` and `done` for each. `watching` the machine meanwhile."""
+    """Runs scenarios; calls `on_begin` and `on_end` for each. `watching` the machine meanwhile."""
     outcomes = []
     with watching() as watch:
         for scenario in scenarios:
-            began(scenario)
+            on_begin(scenario)
             outcomes.append(run_scenario(scenario, options._replace(machine=watch)))
-            done(outcomes[-1])
+            on_end(outcomes[-1])
     cores, load = os.cpu_count() or 1, os.getloadavg()[0]
     machine = f"{platform.system()} {platform.machine()}, {cores} cores, load {load:.1f}"
     own = version("cpcbl-team")
@@ -163,14 +162,14 @@ class Progress(Status):
         self.start()
         return self
 
-    def began(self, scenario: Scenario) -> None:
+    def on_begin(self, scenario: Scenario) -> None:
         self._count += 1
         self._step = f"{self._count}/{self._total} {scenario.name}"
-        self.doing("starting")
+        self.on_step("starting")
 
-    def doing(self, what: str) -> None:
+    def on_step(self, what: str) -> None:
         self.update(Text(f"{self._step}: {what}"))
 
-    def done(self, outcome: Outcome) -> None:
+    def on_end(self, outcome: Outcome) -> None:
         line = Text(f"{self._step}, {outcome.seconds:.0f} s: ")
         self.console.print(line.append_text(verdict(outcome)))

@@ -22,7 +22,7 @@ from cpcbl_launch.lab.chaos.scenario import (
 )
 from cpcbl_launch.lab.chaos.soak import soak
 from cpcbl_launch.lab.chaos.team import RunPlan, demo_team
-from cpcbl_launch.team_file import builtin_path, load_team
+from cpcbl_launch.team.file import builtin_path, load_team
 from cpcbl_team.config import SimulationSettings
 
 REQUIREMENTS = {

@@ -48,6 +48,6 @@ def schedule(
     return plan
 
 
-def overlapping(plan: Sequence[PlannedFault]) -> int:
+def largest_overlap(plan: Sequence[PlannedFault]) -> int:
     """The largest number of faults at one time."""
     return max((sum(f.from_s <= g.from_s < f.until_s for f in plan) for g in plan), default=0)

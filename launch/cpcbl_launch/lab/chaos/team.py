@@ -22,7 +22,7 @@ from cpcbl_launch.lab.experiments.runs import with_settings
 from cpcbl_launch.lab.faulty_robot import faulty_command
 from cpcbl_launch.run.processes import PROGRAM, ProcessSpec, Supervisor, process_table
 from cpcbl_launch.run.up import free_endpoint
-from cpcbl_launch.team_file import builtin_path, load_team, save_resolved
+from cpcbl_launch.team.file import builtin_path, load_team, save_resolved
 from cpcbl_team.config import Team
 from cpcbl_team.errors import CpcblError
 from cpcbl_transport.security import Identity, link_of
@@ -209,13 +209,13 @@ class TeamUnderTest:
     def settle(self, within_m: float = SETTLED_M, patience_s: float = PATIENCE_S) -> None:
         """Waits until all robots are localized. Raises ChaosError."""
 
-        def unsettled() -> list[str]:
+        def not_localized() -> list[str]:
             log, from_s = self.run_log, max(0.0, self.now_s - 4.0)
             found = {name: log.localized_after_s(name, from_s, within_m) for name in self.robots}
             return [name for name, after_s in found.items() if after_s is None]
 
-        if not self.wait_until(lambda: self.now_s > 3.0 and not unsettled(), patience_s):
-            waiting = unsettled()
+        if not self.wait_until(lambda: self.now_s > 3.0 and not not_localized(), patience_s):
+            waiting = not_localized()
             lines = "; ".join(self.last_log_line(f"robot-{name}") for name in waiting)
             raise ChaosError(f"the team did not settle: {', '.join(waiting)}: {lines}")
 

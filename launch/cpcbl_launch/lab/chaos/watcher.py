@@ -11,7 +11,7 @@ from msgspec.structs import replace
 
 from cpcbl_agents.stop import StopSignal
 from cpcbl_launch.run.up import Run, run_team
-from cpcbl_launch.team_file import load_team
+from cpcbl_launch.team.file import load_team
 
 
 def main(team_file: str, endpoint: str, record: str, parent: str) -> None:

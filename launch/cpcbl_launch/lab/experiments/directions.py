@@ -28,8 +28,8 @@ from cpcbl_launch.lab.experiments.runs import (
     spread,
     with_settings,
 )
-from cpcbl_launch.overrides import Overrides, with_overrides
 from cpcbl_launch.reporting.tables import cells, table
+from cpcbl_launch.team.overrides import Overrides, with_overrides
 from cpcbl_team.config import RobotSettings, Start, Team
 from cpcbl_team.errors import InputError
 

@@ -28,8 +28,8 @@ from cpcbl_launch.lab.experiments.runs import (
     pattern_lines,
     with_settings,
 )
-from cpcbl_launch.overrides import Overrides, with_overrides
 from cpcbl_launch.reporting.tables import cells, table
+from cpcbl_launch.team.overrides import Overrides, with_overrides
 
 KINDS = ("odometry", "weighted", "landmarks", "passive", "active", "both")
 CONFIGURATIONS = dict(zip("ABCDEF", KINDS, strict=True))

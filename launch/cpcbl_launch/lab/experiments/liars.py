@@ -30,7 +30,7 @@ from cpcbl_launch.lab.faulty_robot import Fault, FaultyBus
 from cpcbl_launch.reporting.metrics import score
 from cpcbl_launch.reporting.tables import number, table
 from cpcbl_launch.simulation.in_process import simulate
-from cpcbl_launch.team_file import builtin_path, load_team
+from cpcbl_launch.team.file import builtin_path, load_team
 from cpcbl_team.config import Team, TrustSettings
 from cpcbl_transport.bus import Bus
 from cpcbl_transport.decoding import Received, Subscriber
@@ -120,9 +120,9 @@ class _Statuses:
         self.found: dict[tuple[str, str, int], Quarantine] = {}
 
     def attach(self, bus: Bus) -> None:
-        self._subscriber = Subscriber(bus, Status, self._arrived)
+        self._subscriber = Subscriber(bus, Status, self._on_message)
 
-    def _arrived(self, received: Received[Status]) -> None:
+    def _on_message(self, received: Received[Status]) -> None:
         status = received.message
         for trust in status.trust:
             key_ = status.robot, trust.peer, trust.quarantines

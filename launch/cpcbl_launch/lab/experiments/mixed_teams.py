@@ -11,7 +11,7 @@ from random import Random
 
 from msgspec.structs import replace
 
-from cpcbl_launch.team_file import builtin_path, load_team
+from cpcbl_launch.team.file import builtin_path, load_team
 from cpcbl_team import config
 from cpcbl_team.config import RobotSettings, Team
 from cpcbl_team.errors import InputError

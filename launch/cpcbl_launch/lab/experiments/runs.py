@@ -25,7 +25,7 @@ from cpcbl_launch.reporting import metrics
 from cpcbl_launch.reporting.metrics import Floats, Samples, Score
 from cpcbl_launch.reporting.recorder import Recorder
 from cpcbl_launch.simulation.in_process import simulate
-from cpcbl_launch.team_file import builtin_path, load_team
+from cpcbl_launch.team.file import builtin_path, load_team
 from cpcbl_team.config import Team
 from cpcbl_team.geometry import Pose2, step
 from cpcbl_team.inputs import Odometry
@@ -77,15 +77,15 @@ class LoopReferee:
         self.bumped = self.finished = False
 
     def attach(self, bus: Bus) -> None:
-        bus.subscribe(topics.DRIVE.at(robot=self._robot), self._arrived)
-        bus.subscribe(topics.IN_ODOMETRY.at(robot=self._robot), self._arrived)
+        bus.subscribe(topics.DRIVE.at(robot=self._robot), self._on_message)
+        bus.subscribe(topics.IN_ODOMETRY.at(robot=self._robot), self._on_message)
         if self._to_reach < math.inf:
-            bus.subscribe(topics.TRUTH.at(), self._arrived)
+            bus.subscribe(topics.TRUTH.at(), self._on_message)
 
     def is_over(self) -> bool:
         return self.bumped or self.finished
 
-    def _arrived(self, key: str, payload: bytes) -> None:
+    def _on_message(self, key: str, payload: bytes) -> None:
         match decode_tagged(payload):
             case Drive(stamp_ns=stamp_ns, reached=reached) if reached > len(self.reached_s):
                 self.reached_s.append(stamp_ns * 1e-9)
@@ -242,7 +242,7 @@ class Accuracy(Score, frozen=True, kw_only=True):
 def accuracy(runs: Sequence[Run], prefix: str = "") -> Accuracy:
     """The figures of all runs together, of the scored robots whose names begin so."""
     robots = [named for run in runs if run.finished for named in run.robots.items()]
-    pooled = metrics.pooled([samples for name, samples in robots if name.startswith(prefix)])
+    pooled = metrics.pool([samples for name, samples in robots if name.startswith(prefix)])
     errors_m, turns = metrics.position_errors(pooled), np.abs(metrics.heading_errors(pooled))
     return Accuracy(
         **asdict(metrics.score(pooled)),

@@ -26,12 +26,12 @@ from cpcbl_launch.lab.experiments.runs import (
     new_outcome,
     with_settings,
 )
-from cpcbl_launch.overrides import Overrides, with_blind_robots, with_overrides
 from cpcbl_launch.reporting.metrics import Floats, samples_with_truth, score
 from cpcbl_launch.reporting.recorder import Recorder
 from cpcbl_launch.reporting.tables import cells, table
 from cpcbl_launch.simulation.in_process import simulate
-from cpcbl_launch.team_file import builtin_path, load_team
+from cpcbl_launch.team.file import builtin_path, load_team
+from cpcbl_launch.team.overrides import Overrides, with_blind_robots, with_overrides
 from cpcbl_team.config import Field, OdometrySettings, RobotSettings, SimulationEvent, Start, Team
 from cpcbl_team.errors import InputError
 from cpcbl_transport import topics

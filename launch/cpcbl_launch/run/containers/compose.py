@@ -15,7 +15,7 @@ from cpcbl_launch.run.containers import BASE_IMAGE, BASE_VARIABLE
 from cpcbl_launch.run.containers.docker import NAME, checkout, version
 from cpcbl_launch.run.gateway.tokens import tokens_for
 from cpcbl_launch.run.processes import tasks
-from cpcbl_launch.team_file import parse_team
+from cpcbl_launch.team.file import parse_team
 from cpcbl_team.config import GatewaySettings, Team
 from cpcbl_team.errors import InputError
 from cpcbl_transport.security import Identity, credentials_in

@@ -21,7 +21,7 @@ from cpcbl_launch.run.containers.fleet import ContainerSupervisor, Project
 from cpcbl_launch.run.observer import presets
 from cpcbl_launch.run.processes import Processes, tasks
 from cpcbl_launch.run.up import Run, Stop, local_endpoint, require_keys
-from cpcbl_launch.team_file import save_resolved
+from cpcbl_launch.team.file import save_resolved
 from cpcbl_team.config import Team
 from cpcbl_transport.bus import Bus
 from cpcbl_transport.security import Identity, Link, credentials_in, link_of

@@ -96,12 +96,12 @@ class RobotInputs:
         if not publisher.matching:
             error = f"robot {self._robot} does not listen: it needs the same team name and router"
             return Problem(503, "robot_absent", error)
-        found = self._refused(name, payload, time.time_ns())
+        found = self._payload_problem(name, payload, time.time_ns())
         if found is None or found.reason != "wrong_unit":
             publisher.put(payload)
         return found
 
-    def _refused(self, name: str, payload: bytes, now_ns: int) -> Problem | None:
+    def _payload_problem(self, name: str, payload: bytes, now_ns: int) -> Problem | None:
         if not is_json(payload):
             return Problem(400, Refusal.VERSION.value, "write a JSON object, which begins with {")
         key = INPUTS[name].at(robot=self._robot)
@@ -109,7 +109,7 @@ class RobotInputs:
         if isinstance(message, Refusal):
             return Problem(400, message.value, input_problem(key, payload))
         assert isinstance(message, Odometry | Sightings | Position | Frame)
-        found = _misunderstood(message, now_ns)
+        found = _message_problem(message, now_ns)
         late_s = (now_ns - message.stamp_ns) * 1e-9
         if found is None and late_s > LATE_S:
             text = f"stamps are {late_s:.1f} s behind the gateway's clock; set the driver's clock"
@@ -117,7 +117,9 @@ class RobotInputs:
         return found
 
 
-def _misunderstood(message: Odometry | Sightings | Position | Frame, now_ns: int) -> Problem | None:
+def _message_problem(
+    message: Odometry | Sightings | Position | Frame, now_ns: int
+) -> Problem | None:
     """Why the robot refuses a message, or would take it in a wrong unit."""
     reason, unit = refusal(message, now_ns), stamp_problem(message.stamp_ns, now_ns)
     if reason is not None or unit:  # the robot refuses it as too late, if for no other reason

@@ -51,7 +51,9 @@ class Gateway:
         self._inputs: dict[str, RobotInputs] = {}
         self.feeds: dict[str, PoseFeed] = {}
         self._server: web.Server | None = None
-        self._app = web.Application(client_max_size=LARGEST_FRAME, middlewares=[self._guarded])
+        self._app = web.Application(
+            client_max_size=LARGEST_FRAME, middlewares=[self._with_json_errors]
+        )
         self._app.add_routes(
             [
                 web.post("/in/{robot}/{input}", self._post_input),
@@ -85,7 +87,7 @@ class Gateway:
         return runner, f"{'https' if tls else 'http'}://{host}:{bound[1]}"
 
     @web.middleware
-    async def _guarded(self, request: web.Request, handler: Handler) -> web.StreamResponse:
+    async def _with_json_errors(self, request: web.Request, handler: Handler) -> web.StreamResponse:
         """Answers in JSON whatever is wrong, before a body is read."""
         try:
             clients = len(self._server.connections) if self._server is not None else 0
@@ -98,7 +100,7 @@ class Gateway:
         except web.HTTPException as error:
             return _answer(Problem(error.status, "http", error.reason))
 
-    def _refused(self, request: web.Request) -> Problem | None:
+    def _token_problem(self, request: web.Request) -> Problem | None:
         robot = request.match_info["robot"]
         given = request.headers.get("Authorization", "").removeprefix("Bearer ").strip()
         if request.path.startswith("/stream/"):  # a browser cannot set the header there
@@ -110,7 +112,7 @@ class Gateway:
         return None
 
     async def _post_input(self, request: web.Request) -> web.StreamResponse:
-        if problem := self._refused(request):
+        if problem := self._token_problem(request):
             return _answer(problem)
         try:
             payload = await asyncio.wait_for(request.read(), REQUEST_S)
@@ -121,7 +123,7 @@ class Gateway:
         return web.Response(status=204) if taken is None else _answer(taken)
 
     async def _get_pose(self, request: web.Request) -> web.StreamResponse:
-        if problem := self._refused(request):
+        if problem := self._token_problem(request):
             return _answer(problem)
         robot = request.match_info["robot"]
         if pose := await self._feed(robot).wait():
@@ -130,7 +132,7 @@ class Gateway:
         return _answer(Problem(503, "no_pose", error))
 
     async def _stream(self, request: web.Request) -> web.StreamResponse:
-        if problem := self._refused(request):
+        if problem := self._token_problem(request):
             return _answer(problem)
         robot = request.match_info["robot"]
         stream = web.WebSocketResponse(

@@ -81,7 +81,7 @@ def _from_environment(text: str, names: list[str]) -> dict[str, str]:
         if not is_pair or name not in names:
             known = ", ".join(names)
             raise InputError(f"{VARIABLE}: {name!r}: write ROBOT=TOKEN,...; there are {known}")
-        tokens[name] = _checked(VARIABLE, name, token)
+        tokens[name] = _check(VARIABLE, name, token)
     return tokens
 
 
@@ -97,10 +97,10 @@ def _read(path: Path) -> dict[str, str]:
         raise InputError(f"gateway.tokens: {path}: {error.strerror}") from error
     except (msgspec.DecodeError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: {error}; remove it, and the gateway makes another") from error
-    return {name: _checked(str(path), name, token) for name, token in tokens.items()}
+    return {name: _check(str(path), name, token) for name, token in tokens.items()}
 
 
-def _checked(where: str, name: str, token: str) -> str:
+def _check(where: str, name: str, token: str) -> str:
     if len(token) < SHORTEST or not token.isascii() or not token.isprintable() or " " in token:
         raise InputError(f"{where}: the token of {name}: at least {SHORTEST} letters and digits")
     return token

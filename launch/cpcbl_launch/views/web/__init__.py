@@ -1,1 +1,1 @@
-"""`cpcbl-team view`: the field in a browser. Bus -> feed -> pictures -> server -> page."""
+"""`cpcbl-team view`: the field in a browser. Bus -> feed -> page data -> server -> page."""

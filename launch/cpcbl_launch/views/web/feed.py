@@ -28,7 +28,7 @@ UNSCORED = 20  # tracks of a robot that wait for their truth
 HISTORY_S, HISTORY_STEP_S = 120.0, 0.5  # what a page that is opened later can still plot
 
 
-class Sample(NamedTuple):
+class TrailPoint(NamedTuple):
     """A robot at one time, for trails and plots."""
 
     at_s: float
@@ -89,7 +89,7 @@ class Feed:
         self._lock, self._bus_lock = threading.Lock(), threading.Lock()
         self._bus: Bus | None = None
         self._robots = dict.fromkeys(robots, LatestMessages())
-        self._history: dict[str, deque[Sample]] = {}
+        self._history: dict[str, deque[TrailPoint]] = {}
         self._truths: deque[TruthAt] = deque(maxlen=TRUTHS)
         self._unscored: dict[str, deque[Track]] = {}  # tracks that came before their truth
         self._problem = "not connected yet"
@@ -102,7 +102,7 @@ class Feed:
     # From the threads of the server ---------------------------------------------------------------
 
     @contextmanager
-    def attached(self, bus: Bus) -> Iterator[None]:
+    def attach(self, bus: Bus) -> Iterator[None]:
         """Subscribes, until the end; the bus must not be closed before."""
         with self._bus_lock:
             self._bus = bus
@@ -169,7 +169,7 @@ class Feed:
             truths = self._truths[-1].robots if self._truths else {}
             return Snapshot(dict(self._robots), truths, self._problem, self._connected_s)
 
-    def history(self) -> dict[str, tuple[Sample, ...]]:
+    def history(self) -> dict[str, tuple[TrailPoint, ...]]:
         """What plots and trails begin with."""
         with self._lock:
             return {name: tuple(samples) for name, samples in self._history.items()}
@@ -195,24 +195,26 @@ class Feed:
                 return
             self._unscored.setdefault(track.robot, deque(maxlen=UNSCORED)).append(track)
             error_m = self._score(track.robot, latest.error_m)
-            self._robots[track.robot] = _arrived(latest, now_s)._replace(
+            self._robots[track.robot] = with_arrival_time(latest, now_s)._replace(
                 track=track, track_s=now_s, error_m=error_m
             )
-            self._store_sample(track, now_s, error_m)
+            self._store_point(track, now_s, error_m)
 
-    def _store_sample(self, track: Track, now_s: float, error_m: float | None) -> None:
+    def _store_point(self, track: Track, now_s: float, error_m: float | None) -> None:
         most = int(HISTORY_S / HISTORY_STEP_S)
         samples = self._history.setdefault(track.robot, deque(maxlen=most))
         if not samples or now_s - samples[-1].at_s >= HISTORY_STEP_S:
             sigma_m = position_sigma_m(track)
-            samples.append(Sample(now_s, track.x_m, track.y_m, sigma_m, error_m))
+            samples.append(TrailPoint(now_s, track.x_m, track.y_m, sigma_m, error_m))
 
     def _on_status(self, received: Received[Status]) -> None:
         status, now_s = received.message, self.now_s()
         with self._lock:
             if (latest := self._latest_of(status.robot)) is not None:
                 arrivals = with_arrival(latest.arrivals, now_s, status)
-                self._robots[status.robot] = _arrived(latest, now_s)._replace(arrivals=arrivals)
+                self._robots[status.robot] = with_arrival_time(latest, now_s)._replace(
+                    arrivals=arrivals
+                )
 
     def _on_sightings(self, received: Received[Sightings]) -> None:
         names = topics.IN_SIGHTINGS.names(received.key) or {}
@@ -267,7 +269,7 @@ class Feed:
             self._robots[robot] = latest._replace(tokens=tokens, token_lost_s=lost_s)
 
 
-def _arrived(latest: LatestMessages, now_s: float) -> LatestMessages:
+def with_arrival_time(latest: LatestMessages, now_s: float) -> LatestMessages:
     pause_s = now_s - latest.latest_s if latest.latest_s else 0.0
     pause_s = max(pause_s, 0.5 * latest.pause_s)  # a track and a status may come together
     return latest._replace(latest_s=now_s, pause_s=pause_s)

@@ -29,12 +29,12 @@ from cpcbl_launch.views.web.address import (
     security_headers,
 )
 from cpcbl_launch.views.web.feed import Feed, Snapshot
-from cpcbl_launch.views.web.pictures import (
+from cpcbl_launch.views.web.page_data import (
     Arrow,
     Frame,
     RobotDetail,
     RobotPicture,
-    changed,
+    difference,
     help_arrows,
     notice_text,
     robot_detail,
@@ -63,7 +63,7 @@ PAGE = (
 )
 
 
-class Shown(NamedTuple):
+class ShownTeam(NamedTuple):
     """Which team is shown."""
 
     name: str
@@ -150,7 +150,7 @@ class Page:
             if detail != self._detail:
                 self._detail = detail
                 await self._send(detail)
-        robots, removed = changed(self._robots, now.pictures)
+        robots, removed = difference(self._robots, now.pictures)
         help_now = None if now.help == self._help else now.help
         self._robots, self._help, self._sent = now.pictures, now.help, self._sent + 1
         number, at_s = self._sent, round(now.at_s, 3)
@@ -173,7 +173,7 @@ class Page:
 class Server:
     """Serves one team to all pages."""
 
-    def __init__(self, shown: Shown, feed: Feed, listen: Listen) -> None:
+    def __init__(self, shown: ShownTeam, feed: Feed, listen: Listen) -> None:
         self._shown, self._feed, self._listen = shown, feed, listen
         self._pages: set[Page] = set()
         self._began_s = feed.now_s()
@@ -318,7 +318,7 @@ async def _serve(server: Server, listener: socket.socket, ready: "Future[_Ready]
 
 
 @contextmanager
-def serving(shown: Shown, feed: Feed, listen: Listen) -> Iterator[str]:
+def serve(shown: ShownTeam, feed: Feed, listen: Listen) -> Iterator[str]:
     """Serves on a thread of its own; yields the page's address. Raises InputError where it cannot
     listen."""
     with listening_socket(listen) as listener:

@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator
 
 from cpcbl_launch.views.web.address import Listen
 from cpcbl_launch.views.web.feed import Feed
-from cpcbl_launch.views.web.server import Shown, serving
+from cpcbl_launch.views.web.server import ShownTeam, serve
 from cpcbl_transport.security import Link
 from cpcbl_transport.zenoh_bus import BusError, ZenohBus, open_bus
 
@@ -14,7 +14,7 @@ REFRESH_S = 0.25
 
 
 def view_team(
-    shown: Shown,
+    shown: ShownTeam,
     link: Link,
     listen: Listen,
     stop: Callable[[], bool],
@@ -22,12 +22,12 @@ def view_team(
 ) -> None:
     """Serves until `stop()`. Raises InputError where it cannot listen."""
     feed = Feed(shown.team.robots if shown.team else ())
-    with serving(shown, feed, listen) as address:
+    with serve(shown, feed, listen) as address:
         show_address(address)
-        bus = _bus_of(shown.name, link, stop, feed.set_problem)
+        bus = _open_bus(shown.name, link, stop, feed.set_problem)
         if bus is None:
             return
-        with bus, feed.attached(bus):
+        with bus, feed.attach(bus):
             while not stop():
                 lost = f"The connection to the router at {shown.where} is lost"
                 feed.set_problem("" if bus.neighbours() else lost)
@@ -43,7 +43,7 @@ def address_lines(team: str, address: str, listen: Listen) -> Iterator[str]:
         yield "Everybody who reaches this address can watch the team, and its cameras."
 
 
-def _bus_of(
+def _open_bus(
     team: str, link: Link, stop: Callable[[], bool], say: Callable[[str], None]
 ) -> ZenohBus | None:
     """A session, as soon as a router answers; None where `stop()` came first."""

@@ -37,7 +37,7 @@ class Stand(NamedTuple):
 def stand() -> Iterator[Stand]:
     hub, now_s = MemoryHub(), iter(range(1, 10_000))
     feed = Feed(["r1", "r2"], lambda: float(next(now_s)))
-    with feed.attached(hub.session()):
+    with feed.attach(hub.session()):
         yield Stand(feed, hub.session())
 
 
@@ -136,7 +136,7 @@ def test_a_flood_of_names_is_bounded_and_the_teams_own_are_not_touched(stand: St
 def test_the_history_has_two_samples_a_second_and_an_end() -> None:
     hub, now_s = MemoryHub(), [0.0]
     feed, robots = Feed(["r1"], lambda: now_s[0]), hub.session()
-    with feed.attached(hub.session()):
+    with feed.attach(hub.session()):
         for n in range(5000):
             now_s[0] = 0.1 * n
             robots.publisher("track/r1", topics.TRACK.qos).put(encode(track(n * 100 * MS, 0.1 * n)))
@@ -159,7 +159,7 @@ def test_a_feed_that_is_detached_subscribes_to_nothing() -> None:
     feed, robots = Feed(["r1"]), hub.session()
     feed.watch(1)  # before there is a bus
     publisher = robots.publisher("in/r1/sightings", topics.IN_SIGHTINGS.qos)
-    with feed.attached(hub.session()):
+    with feed.attach(hub.session()):
         assert publisher.matching
     assert not publisher.matching
     feed.watch_camera("r1", 1)

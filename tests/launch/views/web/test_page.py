@@ -15,7 +15,7 @@ from support.chromium import Tab, opened
 from support.processes import pids_of
 
 from cpcbl_launch.run.processes import PROGRAM
-from cpcbl_launch.team_file import builtin_path
+from cpcbl_launch.team.file import builtin_path
 
 pytestmark = [
     pytest.mark.trial,

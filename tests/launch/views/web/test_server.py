@@ -12,11 +12,11 @@ from aiohttp import ClientSession, ClientWebSocketResponse, WSMsgType, WSServerH
 from support.buses import SECOND
 from support.traffic import status
 
-from cpcbl_launch.team_file import find_team
+from cpcbl_launch.team.file import find_team
 from cpcbl_launch.views.web import server
 from cpcbl_launch.views.web.address import Listen
 from cpcbl_launch.views.web.feed import Feed
-from cpcbl_launch.views.web.server import MOST_PAGES, MOST_UNACKNOWLEDGED, Shown, serving
+from cpcbl_launch.views.web.server import MOST_PAGES, MOST_UNACKNOWLEDGED, ShownTeam, serve
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus
 from cpcbl_transport.memory_bus import MemoryHub
@@ -47,8 +47,8 @@ async def stand() -> AsyncIterator[Stand]:
     team, hub = find_team(Path("demo")), MemoryHub()
     feed = Feed(team.robots)
     with (
-        feed.attached(hub.session()),
-        serving(Shown("demo", "here", team), feed, Listen("127.0.0.1", 0)) as address,
+        feed.attach(hub.session()),
+        serve(ShownTeam("demo", "here", team), feed, Listen("127.0.0.1", 0)) as address,
     ):
         async with ClientSession() as session:
             yield Stand(address, session, hub.session())

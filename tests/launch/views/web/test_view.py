@@ -15,7 +15,7 @@ from support.routers import open_router
 
 from cpcbl_launch.run.up import free_endpoint
 from cpcbl_launch.views.web.address import Listen
-from cpcbl_launch.views.web.server import Shown
+from cpcbl_launch.views.web.server import ShownTeam
 from cpcbl_launch.views.web.view import view_team
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus
@@ -34,7 +34,7 @@ async def watched(
     addresses: Queue[str] = Queue()
     stop = threading.Event()
     link, listen = Link((endpoint,), credentials), Listen("127.0.0.1", 0)
-    arguments = (Shown(team, endpoint), link, listen, stop.is_set, addresses.put)
+    arguments = (ShownTeam(team, endpoint), link, listen, stop.is_set, addresses.put)
     view = threading.Thread(target=view_team, args=arguments)
     view.start()
     try:

@@ -157,7 +157,7 @@ function trust(all) {
   if (!all.length) return paragraph("it hears no teammate", "none");
   return list(all.map((t) => {
     const times = t.quarantines ? `; in quarantine ${plural(t.quarantines, "time")} so far` : "";
-    return `${t.peer}: ${t.reason ? `not believed, ${t.reason}` : t.unconfirmed ? "believed, nobody can confirm it" : "believed"}${times}`;
+    return `${t.peer}: ${t.reason ? `not used, ${t.reason}` : t.unconfirmed ? "used, but no other source can confirm it" : "used"}${times}`;
   }));
 }
 

@@ -69,7 +69,7 @@ class TeamPicture(msgspec.Struct, frozen=True, tag="team"):
     landmarks: list[tuple[str, float, float]]
     walls: list[tuple[str, float, float, float, float]]
     cameras: tuple[str, ...] | None  # robots with one; None where the team file is not at hand
-    history: dict[str, list[tuple[float | None, ...]]]  # rows of `feed.Sample`
+    history: dict[str, list[tuple[float | None, ...]]]  # rows of `feed.TrailPoint`
 
 
 class InputPicture(msgspec.Struct, frozen=True):
@@ -103,7 +103,7 @@ def team_picture(team: Team | None, name: str, history: Mapping[str, Any]) -> Te
     """`team`: None where its file is not at hand."""
     field = Field() if team is None else team.map
     rows = {
-        robot: [tuple(_rounded(value) for value in sample) for sample in samples]
+        robot: [tuple(_round(value) for value in sample) for sample in samples]
         for robot, samples in history.items()
     }
     return TeamPicture(
@@ -141,13 +141,13 @@ def _picture(
     status, track = latest.status, latest.track
     sees = latest.sightings.sightings[:MOST_SEEN] if latest.sightings is not None else ()
     is_fresh = state != "gone" and now_s - latest.sightings_s <= SEEN_S
-    seen = tuple((s.id, _rounded(s.range_m), _rounded(s.bearing_rad)) for s in sees)
+    seen = tuple((s.id, _round(s.range_m), _round(s.bearing_rad)) for s in sees)
     there = None if truth is None else (truth.x_m, truth.y_m, truth.heading_rad)
     common = RobotPicture(
         state=state,
         why=why[:LONGEST_TEXT],
         is_guest=is_guest,
-        sigma_m=None if status is None else _rounded(status.position_sigma_m, 4),
+        sigma_m=None if status is None else _round(status.position_sigma_m, 4),
         tier=None if status is None else status.tier,
         truth=None if there is None else _triple(*there),
         sees=seen if is_fresh else (),
@@ -157,11 +157,11 @@ def _picture(
     ellipse = None if track.covariance is None else ellipse_of(*track.covariance[:3])
     return msgspec.structs.replace(
         common,
-        at_s=_rounded(latest.track_s - began_s),
+        at_s=_round(latest.track_s - began_s),
         pose=_triple(track.x_m, track.y_m, track.heading_rad),
         ellipse=None if ellipse is None else _triple(*ellipse),
-        sigma_m=_rounded(position_sigma_m(track), 4) or common.sigma_m,
-        error_m=_rounded(latest.error_m, 4),
+        sigma_m=_round(position_sigma_m(track), 4) or common.sigma_m,
+        error_m=_round(latest.error_m, 4),
         tier=track.tier,
     )
 
@@ -218,13 +218,13 @@ def help_arrows(traffic: Traffic, pictures: Mapping[str, RobotPicture]) -> tuple
     """Who helps whom: only between robots that are there."""
     present = {name for name, p in pictures.items() if p.state not in ("gone", "waiting")}
     return tuple(
-        (h.helper, h.helped, h.topic, traffic.robots[h.helper].tier, _rounded(h.messages_per_s, 1))
+        (h.helper, h.helped, h.topic, traffic.robots[h.helper].tier, _round(h.messages_per_s, 1))
         for h in traffic.help
         if h.helper in present and h.helped in present
     )
 
 
-def changed(
+def difference(
     before: Mapping[str, RobotPicture], now: Mapping[str, RobotPicture]
 ) -> tuple[dict[str, RobotPicture], list[str]]:
     """The robots that differ from those before, and the names of those that are no longer there."""
@@ -241,7 +241,7 @@ def robot_detail(name: str, latest: LatestMessages, traffic: Traffic) -> RobotDe
         InputPicture(
             health.input,
             round(health.rate_hz, 1),
-            _rounded((status.stamp_ns - health.latest_ns) * 1e-9) if health.latest_ns else None,
+            _round((status.stamp_ns - health.latest_ns) * 1e-9) if health.latest_ns else None,
             health.taken,
             health.refused,
             round(health.offset_s, 3),
@@ -251,7 +251,7 @@ def robot_detail(name: str, latest: LatestMessages, traffic: Traffic) -> RobotDe
     return RobotDetail(
         robot=name,
         process=status.incarnation,
-        heading_sigma_deg=_rounded(degrees(status.heading_sigma_rad), 2),
+        heading_sigma_deg=_round(degrees(status.heading_sigma_rad), 2),
         problems=tuple(_problems(latest)),
         inputs=inputs,
         refused={reason: n for reason, n in status.counts.items() if reason in REFUSALS and n},
@@ -263,7 +263,7 @@ def robot_detail(name: str, latest: LatestMessages, traffic: Traffic) -> RobotDe
     )
 
 
-def _rounded(value: float | None, digits: int = 3) -> float | None:
+def _round(value: float | None, digits: int = 3) -> float | None:
     return None if value is None or not math.isfinite(value) else round(value, digits)
 
 

@@ -1,17 +1,18 @@
-"""What is wrong with a robot's inputs, as sentences: decided by counts and times, no clock."""
+"""What is wrong with a robot's inputs, as sentences: pure functions of counts and times."""
 
 import math
 import re
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from statistics import median
 from typing import NamedTuple
 
-from cpcbl_agents import input_causes as causes
-from cpcbl_agents import motion_causes as motions
-from cpcbl_agents.motion_causes import Step
-from cpcbl_agents.position_causes import position_cause
+from cpcbl_agents.input_diagnosis import message_causes as causes
+from cpcbl_agents.input_diagnosis import motion_causes as motions
+from cpcbl_agents.input_diagnosis.motion_causes import Step
+from cpcbl_agents.input_diagnosis.position_causes import position_cause
 from cpcbl_team.config import Landmark, SensorSettings
+from cpcbl_team.errors import nearest_name
 from cpcbl_team.geometry import Pose2
 from cpcbl_team.inputs import Odometry, Position, Sightings
 from cpcbl_transport.decoding import decode_by_key, input_problem
@@ -34,8 +35,8 @@ REASONS = {
     "garbage": "payloads cannot be decoded",
     "wrong_type": "another type of message came on this key",
     "not_finite": "numbers are infinite or NaN",
-    "implausible_number": "numbers are too large; metres, radians, nanoseconds are due",
-    "not_a_covariance": "the covariance is none; xx > 0, yy > 0, xy² <= xx yy are due",
+    "implausible_number": "numbers are too large; they must be in metres, radians, nanoseconds",
+    "not_a_covariance": "the covariance is not valid; xx > 0, yy > 0 and xy² <= xx yy must hold",
     "from_the_future": "stamps are in the future",
     "impossible_duration": "pieces last no time, or more than 10 s",
     "too_late": "messages come more than 2 s late, or out of order",
@@ -79,8 +80,8 @@ class InputWindow(NamedTuple):
     recent_refused: Sequence[tuple[int, bytes]] = ()  # arrival and payload
 
 
-class Facts(NamedTuple):
-    """All that the problems of a robot's inputs are decided by."""
+class InputFacts(NamedTuple):
+    """Everything from which the problems of a robot's inputs are derived."""
 
     robot: str
     windows: Mapping[str, InputWindow]  # by input
@@ -95,29 +96,29 @@ class Facts(NamedTuple):
     steps: Sequence[Step] = ()  # of odometry
     frames: Sequence[Sightings] = ()  # within the same time
     is_from_start: bool = False  # whether that time began at the start
-    said: Mapping[str, str] = {}  # by the start, and not known to be over since the robot left it
+    reported_by_start: Mapping[str, str] = {}  # earlier, by the start; nothing shows they are over
     pace: float = 1.0  # robot time over real time, at least 1
     namesake: bool = False  # another process has this robot's name
     camera_lost: bool = False
     unseen: str = ""  # why sightings should come that do not
 
 
-def input_problems(facts: Facts) -> tuple[str, ...]:
+def input_problems(facts: InputFacts) -> tuple[str, ...]:
     """The problems as whole sentences, the worst first; none when all is well."""
     return tuple(dict.fromkeys(_problems(facts)))
 
 
-def implausible_inputs(facts: Facts) -> dict[str, str]:
+def implausible_inputs(facts: InputFacts) -> dict[str, str]:
     """What no reason refuses, although it cannot be true, by what it is about."""
     return {about: text for about, text in _implausible(facts) if text}
 
 
 def without_numbers(problem: str) -> str:
-    """By what a problem is the same one as before, although its figures changed."""
+    """The text without its figures: the same problem has the same text when its figures change."""
     return re.sub(r"(?<![\w/`])\d[\d.e+]*", "#", problem)
 
 
-def _problems(facts: Facts) -> Iterator[str]:
+def _problems(facts: InputFacts) -> Iterator[str]:
     if facts.namesake:
         yield f"another process is robot {facts.robot} too; stop one of them"
     for name in facts.expected:
@@ -131,7 +132,7 @@ def _problems(facts: Facts) -> Iterator[str]:
     if facts.camera_lost:
         yield "camera lost: it delivers no frames, and is opened again and again"
     for name, window in facts.windows.items():
-        yield from _refused(name, window, facts)
+        yield from _refusal_problems(name, window, facts)
     if (lasts_s := causes.piece_s(_odometry(facts))) > facts.timeout_s:
         yield (
             f"odometry: pieces of {lasts_s:.1f} s are longer than odometry.timeout_s; send"
@@ -145,13 +146,13 @@ def is_often_refused(window: InputWindow) -> bool:
     return number >= LEAST_REFUSED and number > REFUSED_SHARE * (window.taken + number)
 
 
-def _refused(name: str, window: InputWindow, facts: Facts) -> Iterator[str]:
+def _refusal_problems(name: str, window: InputWindow, facts: InputFacts) -> Iterator[str]:
     """What is refused of one input and why, or whose stamps are off although it is taken."""
     total = window.taken + sum(window.refused.values())
     if is_often_refused(window):
         by_cause = Counter[str]()
         for reason, refused in window.refused.items():
-            by_cause[_cause(reason, f"in/{facts.robot}/{name}", window, facts)] += refused
+            by_cause[_refusal_cause(reason, f"in/{facts.robot}/{name}", window, facts)] += refused
         worst, *others = by_cause.most_common(2)
         for cause, refused in (worst, *(o for o in others if o[1] > REFUSED_SHARE * total)):
             yield f"{100.0 * refused / total:.0f} % of {name} refused: {cause}"
@@ -169,7 +170,7 @@ def _times(window: InputWindow) -> list[tuple[int, int]]:
     return [(now_ns, m.stamp_ns) for now_ns, m in window.recent]
 
 
-def _cause(reason: str, key: str, window: InputWindow, facts: Facts) -> str:
+def _refusal_cause(reason: str, key: str, window: InputWindow, facts: InputFacts) -> str:
     """The likely cause of a refusal, or else what the reason means."""
     frames = [m for _, m in window.recent if isinstance(m, Sightings)]
     cause = ""
@@ -184,7 +185,7 @@ def _cause(reason: str, key: str, window: InputWindow, facts: Facts) -> str:
         cause = causes.bearing_cause(frames)
     elif reason == "unknown_object":
         cause = _unknown_names(frames, facts)
-    elif reason == "duplicate" and overlapping(window):
+    elif reason == "duplicate" and has_overlap(window):
         cause = "pieces come twice, and overlap; are there two drivers?"
     return cause or REASONS.get(reason, reason)
 
@@ -197,16 +198,16 @@ def _stamp_cause(reason: str, key: str, window: InputWindow) -> str:
         kinds = Odometry | Sightings | Position | Frame
         stamps = [(now_ns, m.stamp_ns) for now_ns, m in found if isinstance(m, kinds)] or stamps
     # Of the whole window, for a driver that was mended a moment ago sends good stamps at its end
-    said = (causes.stamp_cause(stamp_ns, now_ns) for now_ns, stamp_ns in reversed(stamps))
-    return next(filter(None, said), "")
+    found_causes = (causes.stamp_cause(stamp_ns, now_ns) for now_ns, stamp_ns in reversed(stamps))
+    return next(filter(None, found_causes), "")
 
 
-def _unknown_names(frames: Sequence[Sightings], facts: Facts) -> str:
+def _unknown_names(frames: Sequence[Sightings], facts: InputFacts) -> str:
     """`dor` is no landmark, wall or robot of this team; `door`?"""
     names, seen = facts.names, {s.id for f in frames for s in f.sightings}
     unknown = seen - names
     if not unknown:
-        return f"`{facts.robot}` is this robot itself" if facts.robot in seen else ""
+        return f"`{facts.robot}` is this robot's own name" if facts.robot in seen else ""
     listed = []
     for name in sorted(unknown)[:3]:
         near = nearest_name(name, names)
@@ -215,20 +216,12 @@ def _unknown_names(frames: Sequence[Sightings], facts: Facts) -> str:
     return f"{', '.join(listed)} {verb} no landmark, wall or robot of this team"
 
 
-def nearest_name(name: str, names: Iterable[str]) -> str:
-    """The name that somebody may have meant; empty if none is alike."""
-    from difflib import get_close_matches  # for a robot with a problem only
-
-    lower = {known.lower(): known for known in sorted(names)}
-    return next((lower[found] for found in get_close_matches(name.lower(), lower, 1)), "")
-
-
-def overlapping(window: InputWindow) -> bool:
+def has_overlap(window: InputWindow) -> bool:
     """Whether pieces of odometry overlap, as those of two drivers do."""
     return causes.overlap_s(_pieces(window)) > OVERLAP_S
 
 
-def _odometry(facts: Facts) -> list[Odometry]:
+def _odometry(facts: InputFacts) -> list[Odometry]:
     window = facts.windows.get("odometry")
     return _pieces(window) if window is not None and window.taken else []
 
@@ -239,13 +232,13 @@ def _pieces(window: InputWindow) -> list[Odometry]:
     return [m for m in near if isinstance(m, Odometry)]
 
 
-def _implausible(facts: Facts) -> Iterator[tuple[str, str]]:
+def _implausible(facts: InputFacts) -> Iterator[tuple[str, str]]:
     nothing = InputWindow(0.0)
     odometry = facts.windows.get("odometry", nothing)
     positions = facts.windows.get("position", nothing).recent
     pieces = _odometry(facts)
     frames = [_usable(frame) for frame in facts.frames]
-    overlap = bool(pieces) and overlapping(odometry)
+    overlap = bool(pieces) and has_overlap(odometry)
     if overlap and "duplicate" not in odometry.refused:
         text = "pieces overlap; two drivers, or from_ns is not where the last one ended"
         yield OVERLAP, f"odometry: {text}"
@@ -258,12 +251,15 @@ def _implausible(facts: Facts) -> Iterator[tuple[str, str]]:
         cause = position_cause(
             found, steps, facts.bounds, facts.near_start, facts.start, facts.is_from_start
         )
-        open_text = "" if facts.near_start else facts.said.get(POSITION, "")
+        open_text = "" if facts.near_start else facts.reported_by_start.get(POSITION, "")
         yield POSITION, f"position: {cause}" if cause else open_text
 
 
 def _motion(
-    facts: Facts, frames: Sequence[Sightings], pieces: Sequence[Odometry], steps: Sequence[Step]
+    facts: InputFacts,
+    frames: Sequence[Sightings],
+    pieces: Sequence[Odometry],
+    steps: Sequence[Step],
 ) -> str:
     """What is wrong with sightings, or with odometry beside them."""
     sensor, marks = facts.sensor, facts.landmarks
@@ -277,10 +273,10 @@ def _motion(
         return "sightings: bearings look mirrored; left is positive"
     tolerance = 0.15 + 3.0 * math.hypot(sensor.range_share, sensor.bearing_sigma_rad)
     tolerance = min(tolerance, MOST_TOLERANCE)
-    cases = list(motions.seen_again(frames, steps, marks))
-    cause = motions.motion_cause(cases, steps, tolerance)
+    resightings = list(motions.resightings(frames, steps, marks))
+    cause = motions.motion_cause(resightings, steps, tolerance)
     if not cause:
-        late = list(motions.seen_again(frames, steps, marks, *motions.LATER_NS))
+        late = list(motions.resightings(frames, steps, marks, *motions.LATER_NS))
         cause = motions.motion_cause(late, steps, tolerance)
         if not cause and motions.contradicts(late, steps, 1.5 * tolerance):
             cause = causes.odometry_cause(pieces) or motions.CONTRADICTION
@@ -290,14 +286,16 @@ def _motion(
             cause = "turns have the wrong sign; left is positive"
         about = "sightings" if cause.startswith(("ranges", "bearings")) else "odometry"
         return f"{about}: {cause}"
-    if facts.near_start is None and (said := facts.said.get(MOTION)):
-        return said
+    if facts.near_start is None and (reported := facts.reported_by_start.get(MOTION)):
+        return reported
     if facts.near_start is not None and frames:
         latest = [f for f in frames[-10:] if frames[-1].stamp_ns - f.stamp_ns < LATEST_NS]
         if cause := motions.view_cause(latest, facts.near_start, marks, tolerance):
             return f"sightings: {cause}"
     spans_s = (steps[-1].stamp_ns - steps[0].from_ns) * 1e-9 if steps else math.inf
-    if cases or (spans_s < WAIT_S and any(s.id in marks for f in frames for s in f.sightings)):
+    if resightings or (
+        spans_s < WAIT_S and any(s.id in marks for f in frames for s in f.sightings)
+    ):
         return ""  # what landmarks show is known better, or soon
     cause = causes.odometry_cause(pieces)
     return cause and f"odometry: {cause}"

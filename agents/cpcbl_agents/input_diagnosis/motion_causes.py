@@ -20,8 +20,10 @@ from cpcbl_team.geometry import Pose2
 from cpcbl_team.inputs import Odometry, Sighting, Sightings
 
 LEAST_CASES = 5
-MOST = 0.8  # the share of cases that a mistake must explain, or that speak for a driver
-SPACING_NS = 500_000_000  # from case to case
+MOST = (
+    0.8  # the share of resightings that a mistake must explain, or that show a driver to be right
+)
+SPACING_NS = 500_000_000  # from one resighting to the next
 SOON_NS = 1_000_000_000, 2_000_000_000  # from sighting to sighting: if they show a motion, or not
 LATER_NS = 4_000_000_000, 4_000_000_000  # a slow motion shows later
 NOTABLE = 0.3  # a change of where a landmark is seen, as a share of its range
@@ -41,7 +43,7 @@ class Step(NamedTuple):
     last: Odometry
 
 
-class Case(NamedTuple):
+class Resighting(NamedTuple):
     """A landmark that was seen again, as complex numbers in the robot's frame (m)."""
 
     since_ns: int
@@ -56,7 +58,7 @@ class Mistake(NamedTuple):
     text: str
     distance: Callable[[Step], float] | None = None  # None: a total, in the last piece
     turn: Callable[[Step], float] | None = None
-    aside: complex = 1.0 + 0.0j  # turns the way, and scales it
+    direction: complex = 1.0 + 0.0j  # multiplies the displacement: rotates and scales it
     turn_total: float = 0.0  # the unit of a heading that stands in the place of a turn
 
 
@@ -64,7 +66,7 @@ def _seconds(step: Step) -> float:
     return (step.last.stamp_ns - step.last.from_ns) * 1e-9
 
 
-def _turned(step: Step) -> float:
+def _turn(step: Step) -> float:
     return step.turn_rad
 
 
@@ -76,7 +78,7 @@ def _distance(step: Step) -> float:
     return step.distance_m
 
 
-def _way_of_speed(step: Step) -> float:
+def _distance_of_speed(step: Step) -> float:
     return step.distance_m * _seconds(step)
 
 
@@ -94,29 +96,29 @@ _90_OFF = "bearings are 90° off; ahead is 0, left is positive"
 _SINCE = "distances look like distances since the start, not of each piece"
 _HEADINGS = "turns look like headings, not turns of each piece"
 _MM, _CM = "distances look like millimetres", "distances look like centimetres"
-AS_IT_CAME = Mistake("", _distance, _turned)
+AS_IT_CAME = Mistake("", _distance, _turn)
 MISTAKES = (
     Mistake(_HEADINGS, _distance, turn_total=1.0),
     Mistake("turns look like headings in degrees", _distance, turn_total=DEGREE),
     Mistake("turns look like degrees", _distance, _in_degrees),
     Mistake(MIRRORED, _distance, lambda s: -s.turn_rad),
     Mistake("turns look like rates (rad/s)", _distance, _turn_of_rate),
-    Mistake(_SINCE, None, _turned),
-    Mistake(_MM, _distance, _turned, 1e-3),
-    Mistake(_CM, _distance, _turned, 1e-2),
-    Mistake("distances look like feet, or come from km/h", _distance, _turned, 0.29),
-    Mistake("distances look like speeds (m/s)", _way_of_speed, _turned),
-    Mistake("ranges look like millimetres", _distance, _turned, 1e3),
-    Mistake("ranges look like centimetres", _distance, _turned, 1e2),
-    Mistake("ranges look like feet", _distance, _turned, 1.0 / 0.3048),
+    Mistake(_SINCE, None, _turn),
+    Mistake(_MM, _distance, _turn, 1e-3),
+    Mistake(_CM, _distance, _turn, 1e-2),
+    Mistake("distances look like feet, or come from km/h", _distance, _turn, 0.29),
+    Mistake("distances look like speeds (m/s)", _distance_of_speed, _turn),
+    Mistake("ranges look like millimetres", _distance, _turn, 1e3),
+    Mistake("ranges look like centimetres", _distance, _turn, 1e2),
+    Mistake("ranges look like feet", _distance, _turn, 1.0 / 0.3048),
     Mistake(
-        "distances have the wrong sign or frame, or bearings are 180° off", _distance, _turned, -1.0
+        "distances have the wrong sign or frame, or bearings are 180° off", _distance, _turn, -1.0
     ),
-    Mistake(_90_OFF, _distance, _turned, 1.0j),
-    Mistake(_90_OFF, _distance, _turned, -1.0j),
+    Mistake(_90_OFF, _distance, _turn, 1.0j),
+    Mistake(_90_OFF, _distance, _turn, -1.0j),
     Mistake(f"{_HEADINGS}, and {_SINCE}", None, turn_total=1.0),
     Mistake(f"turns look like headings in degrees, and {_SINCE}", None, turn_total=DEGREE),
-    Mistake("distances and turns look like speeds (m/s, rad/s)", _way_of_speed, _turn_of_rate),
+    Mistake("distances and turns look like speeds (m/s, rad/s)", _distance_of_speed, _turn_of_rate),
     Mistake(f"turns look like degrees, and {_MM}", _distance, _in_degrees, 1e-3),
     Mistake(f"turns look like degrees, and {_CM}", _distance, _in_degrees, 1e-2),
     Mistake("distances and turns are swapped", lambda s: s.turn_rad, lambda s: s.distance_m),
@@ -126,20 +128,20 @@ CONTRADICTION = "odometry and sightings contradict each other: another frame, un
 MANY_CASES, MANY = 12, 0.75
 
 
-def motion_cause(cases: Sequence[Case], steps: Sequence[Step], tolerance: float) -> str:
-    """Which mistake explains the cases; empty if the motion as it came does, or nothing does.
+def motion_cause(resightings: Sequence[Resighting], steps: Sequence[Step], tolerance: float) -> str:
+    """Which mistake explains the resightings; empty if the motion as it came does, or nothing does.
 
     `tolerance`: how far off a landmark may be seen, as a share of its range.
     """
-    if len(cases) < LEAST_CASES:
+    if len(resightings) < LEAST_CASES:
         return ""
-    as_it_came = errors(cases, steps, AS_IT_CAME)
+    as_it_came = errors(resightings, steps, AS_IT_CAME)
     wrong = [i for i, error in enumerate(as_it_came) if error > tolerance]
-    if len(wrong) < max(LEAST_CASES, 0.5 * len(cases)):
+    if len(wrong) < max(LEAST_CASES, 0.5 * len(resightings)):
         return ""
     found = []
-    fits = [(FIXED, fixed_errors(cases, steps, sign)) for sign in (1, -1)]
-    fits += [(m.text, errors(cases, steps, m)) for m in MISTAKES]
+    fits = [(FIXED, fixed_errors(resightings, steps, sign)) for sign in (1, -1)]
+    fits += [(m.text, errors(resightings, steps, m)) for m in MISTAKES]
     for text, fit in fits:
         explained = sum(fit[i] < min(tolerance, 0.5 * as_it_came[i]) for i in wrong)
         spoilt = sum(e > tolerance for i, e in enumerate(fit) if as_it_came[i] <= tolerance)
@@ -151,42 +153,46 @@ def motion_cause(cases: Sequence[Case], steps: Sequence[Step], tolerance: float)
     return ""
 
 
-def contradicts(cases: Sequence[Case], steps: Sequence[Step], tolerance: float) -> bool:
+def contradicts(resightings: Sequence[Resighting], steps: Sequence[Step], tolerance: float) -> bool:
     """Whether landmarks are mostly seen where the motion says that they are not."""
-    if len(cases) < MANY_CASES:
+    if len(resightings) < MANY_CASES:
         return False
-    far = errors(cases, steps, AS_IT_CAME)
+    far = errors(resightings, steps, AS_IT_CAME)
     return sum(error > tolerance for error in far) > MANY * len(far)
 
 
-def errors(cases: Sequence[Case], steps: Sequence[Step], mistake: Mistake) -> list[float]:
+def errors(
+    resightings: Sequence[Resighting], steps: Sequence[Step], mistake: Mistake
+) -> list[float]:
     """How far off each landmark is seen again, as a share of its range."""
     stamps, poses = _track(steps, mistake)
     found = []
-    for case in cases:
-        a, b = (_pose_at(ns, stamps, poses) for ns in (case.since_ns, case.until_ns))
-        way = (b[0] - a[0]) * cmath.rect(1.0, -a[1]) * mistake.aside
-        expected = (case.before - way) * cmath.rect(1.0, a[1] - b[1])
-        found.append(abs(expected - case.after) / max(abs(case.before), abs(case.after), 1.0))
+    for r in resightings:
+        a, b = (_pose_at(ns, stamps, poses) for ns in (r.since_ns, r.until_ns))
+        displacement = (b[0] - a[0]) * cmath.rect(1.0, -a[1]) * mistake.direction
+        expected = (r.before - displacement) * cmath.rect(1.0, a[1] - b[1])
+        found.append(abs(expected - r.after) / max(abs(r.before), abs(r.after), 1.0))
     return found
 
 
-def fixed_errors(cases: Sequence[Case], steps: Sequence[Step], sign: int) -> list[float]:
+def fixed_errors(
+    resightings: Sequence[Resighting], steps: Sequence[Step], sign: int
+) -> list[float]:
     """The same if bearings do not turn with the robot, but count from a direction of the field,
     which is chosen to fit best. `sign` -1: they grow to the right."""
     stamps, poses = _track(steps)
     ends = [
-        (_pose_at(case.since_ns, stamps, poses), _pose_at(case.until_ns, stamps, poses))
-        for case in cases
+        (_pose_at(r.since_ns, stamps, poses), _pose_at(r.until_ns, stamps, poses))
+        for r in resightings
     ]
     if median(abs(b[1] - a[1]) for a, b in ends) < NEAR_RAD:  # another mistake says the same
-        return [math.inf for _ in cases]
-    ways = [b[0] - a[0] for a, b in ends]
-    ways = ways if sign > 0 else [way.conjugate() for way in ways]
-    seen = [case.before - case.after for case in cases]
-    fitted = cmath.phase(sum(p * w.conjugate() for p, w in zip(seen, ways, strict=True)) or 1.0)
-    far = [abs(p - w * cmath.rect(1.0, fitted)) for p, w in zip(seen, ways, strict=True)]
-    reach = [max(abs(case.before), abs(case.after), 1.0) for case in cases]
+        return [math.inf for _ in resightings]
+    driven = [b[0] - a[0] for a, b in ends]
+    driven = driven if sign > 0 else [d.conjugate() for d in driven]
+    seen = [r.before - r.after for r in resightings]
+    fitted = cmath.phase(sum(p * d.conjugate() for p, d in zip(seen, driven, strict=True)) or 1.0)
+    far = [abs(p - d * cmath.rect(1.0, fitted)) for p, d in zip(seen, driven, strict=True)]
+    reach = [max(abs(r.before), abs(r.after), 1.0) for r in resightings]
     return [f / r for f, r in zip(far, reach, strict=True)]
 
 
@@ -233,13 +239,13 @@ def _pose_at(
     return a + share * (b - a), h + share * (k - h)
 
 
-def seen_again(
+def resightings(
     frames: Iterable[Sightings],
     steps: Sequence[Step],
     names: Mapping[str, Landmark],
     least_ns: int = SOON_NS[0],
     most_ns: int = SOON_NS[1],
-) -> Iterator[Case]:
+) -> Iterator[Resighting]:
     """Each landmark and a later sighting of it within the time of the steps: as soon as it shows a
     motion, or after so long."""
     if len(steps) < 2:
@@ -258,7 +264,7 @@ def seen_again(
                 gap_ns = frame.stamp_ns - since_ns
                 changed = abs(place - before) > NOTABLE * max(abs(place), abs(before))
                 if gap_ns >= (least_ns if changed else most_ns):
-                    yield Case(since_ns, frame.stamp_ns, before, place)
+                    yield Resighting(since_ns, frame.stamp_ns, before, place)
                     waiting.remove((since_ns, before))
             if not waiting or frame.stamp_ns - waiting[-1][0] >= SPACING_NS:
                 waiting.append((frame.stamp_ns, place))
@@ -300,17 +306,17 @@ def _area(corners: Sequence[complex]) -> float:
 
 
 def scale_of(frames: Iterable[Sightings], landmarks: Mapping[str, Landmark]) -> float:
-    """How many times as long as on the map the ways between landmarks of one frame look (the
-    median); 1 if too few were seen."""
+    """The measured distance between two landmarks of one frame over that on the map (the median); 1
+    if too few were seen."""
     times = []
     for frame in frames:
         seen = [s for s in frame.sightings if s.id in landmarks and s.range_m is not None]
         for a, b in pairwise(seen[:4]):
             p, q = place_of(a), place_of(b)
             m, n = landmarks[a.id], landmarks[b.id]
-            way_m = math.hypot(m.x_m - n.x_m, m.y_m - n.y_m)
-            if p is not None and q is not None and way_m > 0.5:
-                times.append(abs(p - q) / way_m)
+            map_m = math.hypot(m.x_m - n.x_m, m.y_m - n.y_m)
+            if p is not None and q is not None and map_m > 0.5:
+                times.append(abs(p - q) / map_m)
     return median(times) if len(times) >= LEAST_CASES else 1.0
 
 

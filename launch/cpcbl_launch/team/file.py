@@ -12,8 +12,8 @@ from typing import Any
 import msgspec
 from msgspec.structs import replace
 
-from cpcbl_launch.team_checks import problems
-from cpcbl_launch.team_faults import layer_faults, number_faults, one_line, table_faults
+from cpcbl_launch.team.checks import problems
+from cpcbl_launch.team.faults import layer_faults, number_faults, one_line, table_faults
 from cpcbl_team.config import RobotSettings, Team
 from cpcbl_team.errors import InputError
 

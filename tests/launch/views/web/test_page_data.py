@@ -10,12 +10,12 @@ import pytest
 from support.buses import SECOND
 from support.traffic import flow, seen, status
 
-from cpcbl_launch.team_file import find_team
+from cpcbl_launch.team.file import find_team
 from cpcbl_launch.views.traffic import traffic_from_statuses
 from cpcbl_launch.views.web.feed import LatestMessages, Snapshot
-from cpcbl_launch.views.web.pictures import (
+from cpcbl_launch.views.web.page_data import (
     RobotPicture,
-    changed,
+    difference,
     ellipse_of,
     help_arrows,
     notice_text,
@@ -116,9 +116,9 @@ def test_a_guest_is_marked_and_forgotten_some_time_after_it_left() -> None:
 
 def test_only_what_has_changed_is_sent() -> None:
     a, b = RobotPicture("ok"), RobotPicture("lost", "position sigma 1.0 m")
-    assert changed({}, {"r1": a, "r2": b}) == ({"r1": a, "r2": b}, [])
-    assert changed({"r1": a, "r2": b}, {"r1": a, "r2": b}) == ({}, [])
-    assert changed({"r1": a, "r2": b}, {"r1": b}) == ({"r1": b}, ["r2"])
+    assert difference({}, {"r1": a, "r2": b}) == ({"r1": a, "r2": b}, [])
+    assert difference({"r1": a, "r2": b}, {"r1": a, "r2": b}) == ({}, [])
+    assert difference({"r1": a, "r2": b}, {"r1": b}) == ({"r1": b}, ["r2"])
     assert json.loads(msgspec.json.encode(a)) == {"state": "ok"}
 
 

@@ -1,6 +1,5 @@
 """What is wrong with the tables of a team file: every fault, each with its key and the fix."""
 
-import difflib
 import math
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -11,6 +10,7 @@ from typing import Annotated, Any, Literal, NamedTuple, Union, get_args, get_ori
 import msgspec
 
 from cpcbl_team.config import RobotSettings, Team
+from cpcbl_team.errors import nearest_name
 from cpcbl_team.inputs import NAME_PATTERN
 
 DEEPEST = 12  # tables in tables; the settings need half of it
@@ -136,7 +136,7 @@ def _depth_and_numbers(
         if depth > DEEPEST:
             return key, faults
         if isinstance(value, dict):
-            parts += [(_joined(key, name), v, depth + 1) for name, v in reversed(value.items())]
+            parts += [(_key_path(key, name), v, depth + 1) for name, v in reversed(value.items())]
         elif isinstance(value, list):
             parts += [(f"{key}[{i}]", v, depth + 1) for i, v in reversed([*enumerate(value)])]
         elif isinstance(value, int | float) and (text := _number_fault(key, value, smallest)):
@@ -155,7 +155,7 @@ def _number_fault(key: str, value: float, smallest: float) -> str:
     return ""
 
 
-def _joined(path: str, name: str) -> str:
+def _key_path(path: str, name: str) -> str:
     return f"{path}.{name}" if path else name
 
 
@@ -184,20 +184,20 @@ def _struct_faults(raw: dict[str, Any], kind: type[msgspec.Struct], path: str) -
     hints, meant = _hints(kind), set[str]()
     for name, value in raw.items():
         if name in hints:
-            yield from _faults(value, hints[name], _joined(path, name))
+            yield from _faults(value, hints[name], _key_path(path, name))
         else:
             near = _nearest(name, hints)
             meant |= set(near)
-            yield Fault(_joined(path, name), _unknown_text(near, hints))
+            yield Fault(_key_path(path, name), _unknown_text(near, hints))
     for field in msgspec.structs.fields(kind):
         if field.required and field.name not in raw and field.name not in meant:
-            yield Fault(_joined(path, field.name), "missing; add it")
+            yield Fault(_key_path(path, field.name), "missing; add it")
 
 
 def _dict_faults(raw: dict[str, Any], names: Any, values: Any, path: str) -> Iterator[Fault]:
     choices = get_args(names) if get_origin(names) is Literal else ()
     for name, value in raw.items():
-        own = _joined(path, name)
+        own = _key_path(path, name)
         if choices and name not in choices:
             yield Fault(path, _choice_text(name, choices))
         elif path in NAMED and not re.fullmatch(NAME_PATTERN, name):
@@ -246,8 +246,8 @@ def _hints(kind: type[msgspec.Struct]) -> dict[str, Any]:
 
 
 def _choice_text(value: str, choices: tuple[str, ...]) -> str:
-    close = difflib.get_close_matches(value, choices, n=1)
-    mean = f"did you mean {close[0]!r}? " if close else ""
+    near = nearest_name(value, choices)
+    mean = f"did you mean {near!r}? " if near else ""
     return f"{value!r} is no choice; {mean}use one of {', '.join(choices)}"
 
 
@@ -260,7 +260,8 @@ def _nearest(name: str, known: Mapping[str, Any]) -> list[str]:
     for word in (name.lower(), stem):
         if other := [key for key in _OTHER_WORDS.get(word, ()) if key in known]:
             return other
-    return difflib.get_close_matches(name, known, n=1)
+    near = nearest_name(name, known)
+    return [near] if near else []
 
 
 def _unknown_text(near: list[str], known: Mapping[str, Any]) -> str:

@@ -3,7 +3,7 @@
 import re
 from collections.abc import Iterator
 
-from cpcbl_launch.team_units import unit_warnings
+from cpcbl_launch.team.units import unit_warnings
 from cpcbl_team.config import LIKE_MIRRORED, MARKERS, Landmark, Team, Wall
 from cpcbl_transport.security import PROTOCOL
 

@@ -1,29 +1,34 @@
-"""What came on a robot's inputs: counted as it comes, judged once a second.
+"""The messages on a robot's inputs: counted as they arrive, judged once a second.
 
-To note a message costs next to nothing: a counter, and a reference among the latest few. Causes are
-looked for in those, by `input_problems`.
+A message costs a counter and a reference among the latest few. `problems.py` looks for causes in
+those few.
 """
 
 import math
 from collections import Counter, deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from statistics import median
 from typing import NamedTuple, TypeVar
 
-from cpcbl_agents.input_problems import (
+from cpcbl_agents.input_diagnosis.motion_causes import (
+    CONTRADICTION,
+    OR_START,
+    Step,
+    pose_near_start,
+)
+from cpcbl_agents.input_diagnosis.problems import (
     MOTION,
-    Facts,
+    InputFacts,
     InputWindow,
     implausible_inputs,
     input_problems,
     is_often_refused,
     without_numbers,
 )
-from cpcbl_agents.motion_causes import CONTRADICTION, OR_START, Step, pose_near_start
-from cpcbl_agents.robot import Robot
+from cpcbl_agents.robot import InputSnapshot
 from cpcbl_team.config import RobotSettings, Start, Team
 from cpcbl_team.geometry import Pose2, wrap_angle
-from cpcbl_team.inputs import Odometry, SightingFault, Sightings
+from cpcbl_team.inputs import Odometry, Sightings
 from cpcbl_transport import topics
 from cpcbl_transport.messages import (
     LARGEST_FRAME,
@@ -36,14 +41,14 @@ from cpcbl_transport.messages import (
 WINDOW = 10  # judgements, one a second: shares are those of the last so many
 SETTLED_NS = 2_000_000_000  # what was on its way when the robot started is too late
 OFTEN, SELDOM = 20, 10
-"""To look for what is implausible takes half a millisecond: at each of the first judgements with
-odometry or sightings and while something is found, later at every tenth one."""
+"""The search for implausible inputs takes half a millisecond. It runs at each of the first `OFTEN`
+judgements and while it finds something, later at every tenth one (`SELDOM`)."""
 SECOND_NS, EMPTY_NS = 1_000_000_000, 5_000_000_000
-UNSEEN = 25  # judgements: of real logs a robot saw nothing for 20 s in front of landmarks
+UNSEEN = 25  # judgements: in real logs a robot saw nothing for 20 s in front of landmarks
 EMPTY_CAME = "empty frames came too before"
 IN_VIEW = "a landmark should be in view"
-OVER = 4  # looks in a row that find nothing, before a cause is no longer said
-CHANGED = 30  # looks in a row that find another cause, before it is said in place of the first
+OVER = 4  # judgements in a row that find nothing, before a cause is no longer reported
+CHANGED = 30  # judgements in a row that find another cause, before it replaces the first
 STEP_NS = 95_000_000
 STEPS = 100
 GAP_NS = 2_000_000_000
@@ -110,51 +115,54 @@ class Input:
         self.recent_refused.append((now_ns, payload[:LARGEST_FRAME]))
 
 
-class Held:
-    """What is implausible, held against flapping: what was said first stays said until nothing is
-    found several times in a row, or another cause again and again."""
+class ProblemHysteresis:
+    """Keeps reported problems from flapping. A reported problem stays reported until several
+    judgements in a row find nothing, or many in a row find another cause."""
 
     def __init__(self) -> None:
-        self._said: dict[str, str] = {}
+        self._reported: dict[str, str] = {}
         self._candidates: dict[str, str] = {}
         self._misses: Counter[str] = Counter()
 
     def __bool__(self) -> bool:
-        return bool(self._said or self._candidates)
+        return bool(self._reported or self._candidates)
 
     @property
-    def by_start(self) -> dict[str, str]:
-        """What is said at present because of where the robot started."""
-        return {about: text for about, text in self._said.items() if OR_START in text}
+    def reported_by_start(self) -> dict[str, str]:
+        """The problems reported now that assume the robot was at its start, by subject."""
+        return {about: text for about, text in self._reported.items() if OR_START in text}
 
-    def look(self, found: dict[str, str]) -> tuple[str, ...]:
-        """What is to be said after this look. `found`: by what it is about."""
-        for about in {**self._said, **self._candidates, **found}:
+    def update(self, found: dict[str, str]) -> tuple[str, ...]:
+        """Takes what this judgement found, by subject, and returns the problems to report."""
+        for about in {**self._reported, **self._candidates, **found}:
             self._judge(about, found.get(about, ""))
-        return tuple(self._said.values())
+        return tuple(self._reported.values())
 
     def _judge(self, about: str, text: str) -> None:
-        said = self._said.get(about, "")
-        if said and _kind(said) == _kind(text):
-            if OR_START not in said:
-                self._said[about] = text
+        reported = self._reported.get(about, "")
+        if reported and _problem_key(reported) == _problem_key(text):
+            if OR_START not in reported:
+                self._reported[about] = text
             self._misses[about] = 0
             return
-        is_again = bool(text) and _kind(self._candidates.get(about, "")) == _kind(text)
+        is_again = bool(text) and _problem_key(self._candidates.get(about, "")) == _problem_key(
+            text
+        )
         self._candidates[about] = text
         if not text:
             del self._candidates[about]
         self._misses[about] += 1
-        if said and self._misses[about] < (CHANGED if text else OVER):
+        if reported and self._misses[about] < (CHANGED if text else OVER):
             return
-        self._said.pop(about, None)
+        self._reported.pop(about, None)
         if is_again:
-            self._said[about] = text
+            self._reported[about] = text
             self._misses[about] = 0
 
 
-def _kind(text: str) -> str:
-    """By what a cause is the same one, whichever evidence there is for it now."""
+def _problem_key(text: str) -> str:
+    """The text of a problem without its figures and evidence: two problems with the same key have
+    the same cause."""
     return without_numbers(text).removesuffix(f"; {OR_START}")
 
 
@@ -176,27 +184,25 @@ class InputMonitor:
         self.inputs = {name: Input(name, start_ns, lengths.get(name, 10)) for name in NAMES}
         self.by_key = {f"in/{robot}/{name}": entry for name, entry in self.inputs.items()}
         self._start_ns, self._history = start_ns, deque[_Totals](maxlen=WINDOW + 1)
-        self._namesake_for = self._judgements = self._looks_away = 0
-        self._unseen_for = 0
+        self._namesake_for = self._judgements = self._judgements_away = 0
+        self._in_view_for = 0
         self._sees = (
             settings.source == "external"
             and settings.sensing == "sightings"
             and settings.sensor.sees_landmarks
         )
         self._starts_known: bool | None = None
-        self._held, self._implausible = Held(), tuple[str, ...]()
+        self._hysteresis, self._implausible = ProblemHysteresis(), tuple[str, ...]()
         self.are_mended = self._are_wrong = False
         """Whether inputs were implausible or refused before the last judgement, and are right."""
         self.has_moved = False
         """Whether odometry said so, at a judgement."""
-        detects = settings.sensing == "camera"
-        self._of_sightings = "frame" if detects else "sightings"
         wheels = settings.odometry
         self.inputs["odometry"].scales = wheels.distance_scale, wheels.turn_scale
-        self._facts = Facts(
+        self._facts = InputFacts(
             robot,
             {},
-            tuple(_due_inputs(settings)),
+            tuple(_expected_inputs(settings)),
             frozenset(team.map.landmarks) | frozenset(team.map.walls) | frozenset(team.robots),
             team.map.landmarks,
             settings.sensor,
@@ -207,69 +213,63 @@ class InputMonitor:
         )
 
     def judge(
-        self, robot: Robot, now_ns: int, namesake: bool
+        self, snapshot: InputSnapshot, now_ns: int, namesake: bool
     ) -> tuple[tuple[InputHealth, ...], tuple[str, ...]]:
         """The health of each input that anything came on or is expected on, and the problems. To
         be called once a second. `namesake`: whether another process has this robot's name."""
         odometry = self.inputs["odometry"]
         self.has_moved |= abs(odometry.distance_m) > MOVED_M or abs(odometry.turn_rad) > TURNED_RAD
-        totals = self._totals(robot, now_ns)
+        totals = self._totals(snapshot.refused, now_ns)
         if now_ns - self._start_ns >= SETTLED_NS:
             self._history.append(totals)
         before = self._history[0] if self._history else totals
         self._namesake_for = self._namesake_for + 1 if namesake else 0
         shown = [n for n in NAMES if self.inputs[n].messages or n in self._facts.expected]
-        camera = robot.sensing.counts
         facts = self._facts._replace(
-            unseen=self._unseen(robot, now_ns),
+            unseen=self._missing_sightings_reason(snapshot, now_ns),
             windows={name: self._window(name, totals, before) for name in shown},
             namesake=self._namesake_for >= NAMESAKE_JUDGEMENTS,
-            camera_lost=camera["camera_lost"] > camera["camera_back"],
+            camera_lost=snapshot.is_camera_lost,
         )
         problems = input_problems(facts)
         self._judgements += any(self.inputs[name].messages for name in shown)
-        if self._held or self._judgements < OFTEN or self._judgements % SELDOM == 0:
-            self._implausible = self._look(robot, facts, before, bool(problems))
+        if self._hysteresis or self._judgements < OFTEN or self._judgements % SELDOM == 0:
+            self._implausible = self._find_implausible(snapshot, facts, before, bool(problems))
         are_wrong = bool(self._implausible) or any(map(is_often_refused, facts.windows.values()))
         self.are_mended, self._are_wrong = self._are_wrong and not are_wrong, are_wrong
         health = tuple(self._health(name, totals, before) for name in shown)
         return health, (*problems, *self._implausible)
 
-    def _look(
-        self, robot: Robot, facts: Facts, before: _Totals, has_problems: bool
+    def _find_implausible(
+        self, snapshot: InputSnapshot, facts: InputFacts, before: _Totals, has_problems: bool
     ) -> tuple[str, ...]:
-        """Looks for what is implausible; what is to be said of it."""
-        is_early, state = len(self._history) <= WINDOW, robot.filter.timeline.state
+        """Judges what is implausible about the inputs, and returns the problems to report."""
+        is_early = len(self._history) <= WINDOW
         since_ns = self._start_ns if is_early else before.now_ns
         if self._starts_known is None:
-            self._starts_known = not state.lost
+            self._starts_known = not snapshot.lost
         steps = _since_stamp(self.inputs["odometry"].steps, since_ns)
         near, is_from_start = None, self._starts_known and (is_early or not self.has_moved)
         if facts.start is not None and is_from_start:
             near = pose_near_start(steps, facts.start)
-        self._looks_away = 0 if near is not None else self._looks_away + 1
-        seen, is_open = self.inputs["sightings"].recent, state.lost or self._looks_away < WINDOW
+        self._judgements_away = 0 if near is not None else self._judgements_away + 1
+        seen = self.inputs["sightings"].recent
+        is_open = bool(snapshot.lost) or self._judgements_away < WINDOW
         facts = facts._replace(
             near_start=near,
             is_from_start=is_from_start,
-            said=self._held.by_start if is_open else {},
+            reported_by_start=self._hysteresis.reported_by_start if is_open else {},
             steps=steps,
             frames=[m for _, m in _since(seen, since_ns) if isinstance(m, Sightings)],
         )
         found = implausible_inputs(facts)
         if has_problems and CONTRADICTION in found.get(MOTION, ""):
             del found[MOTION]
-        return self._held.look(found)
+        return self._hysteresis.update(found)
 
-    def _totals(self, robot: Robot, now_ns: int) -> _Totals:
+    def _totals(self, refused_later: Mapping[tuple[str, str], int], now_ns: int) -> _Totals:
         refused = {name: entry.refused.copy() for name, entry in self.inputs.items()}
-        state = robot.filter.timeline.state.counts
-        for (name, reason), number in robot.filter.refused.items():
-            refused[name][reason] += number
-        for reason in SightingFault:
-            refused[self._of_sightings][reason] += state.get(reason, 0)
-        for reason, number in robot.sensing.refused.items():
-            name = "sightings" if reason == "seen_twice" else "frame"
+        for (name, reason), number in refused_later.items():
             refused[name][reason] += number
         taken = {}
         for name, entry in self.inputs.items():
@@ -278,22 +278,22 @@ class InputMonitor:
         messages = {name: entry.messages for name, entry in self.inputs.items()}
         return _Totals(now_ns, taken, refused, messages)
 
-    def _unseen(self, robot: Robot, now_ns: int) -> str:
+    def _missing_sightings_reason(self, snapshot: InputSnapshot, now_ns: int) -> str:
         """Why sightings should come that do not: an empty frame would come too, or a landmark has
         been in view for long by the robot's own pose."""
         entry = self.inputs["sightings"]
         silent_ns = (now_ns - entry.arrived_ns) / self._facts.pace
         if entry.has_empty:
             return EMPTY_CAME if silent_ns > EMPTY_NS else ""
-        due = self._sees and silent_ns > SECOND_NS and self._has_in_view(robot)
-        self._unseen_for = self._unseen_for + 1 if due else 0
-        return IN_VIEW if self._unseen_for > UNSEEN * self._facts.pace else ""
+        due = self._sees and silent_ns > SECOND_NS and self._has_in_view(snapshot)
+        self._in_view_for = self._in_view_for + 1 if due else 0
+        return IN_VIEW if self._in_view_for > UNSEEN * self._facts.pace else ""
 
-    def _has_in_view(self, robot: Robot) -> bool:
+    def _has_in_view(self, snapshot: InputSnapshot) -> bool:
         """Whether a landmark is well in view, by the robot's pose."""
-        state, sensor = robot.filter.timeline.state, self._facts.sensor
-        c, (x, y, heading) = state.estimate.covariance, state.estimate.pose
-        if state.lost or c.xx + c.yy > KNOWN_M**2 or c.hh > KNOWN_RAD**2:
+        sensor, c = self._facts.sensor, snapshot.estimate.covariance
+        x, y, heading = snapshot.estimate.pose
+        if snapshot.lost or c.xx + c.yy > KNOWN_M**2 or c.hh > KNOWN_RAD**2:
             return False
         for mark in self._facts.landmarks.values():
             bearing = wrap_angle(math.atan2(mark.y_m - y, mark.x_m - x) - heading)
@@ -345,8 +345,8 @@ def _since_stamp(steps: Iterable[Step], since_ns: int) -> list[Step]:
     return found
 
 
-def _due_inputs(settings: RobotSettings) -> Iterator[str]:
-    """The inputs that a robot's driver owes it."""
+def _expected_inputs(settings: RobotSettings) -> Iterator[str]:
+    """The inputs that a robot's driver must always send."""
     detects = settings.sensing == "camera"
     if settings.source == "mrclam":
         return

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 from msgspec.structs import replace
 
-from cpcbl_launch.checks import require_robots
+from cpcbl_launch.team.requirements import require_robots
 from cpcbl_team.config import Team
 
 
@@ -20,7 +20,7 @@ class Overrides(NamedTuple):
     fusion: str | None = None
     direction: str | None = None
 
-    def given(self, *names: str) -> dict[str, object]:
+    def set_fields(self, *names: str) -> dict[str, object]:
         """Those of these fields that are set."""
         values = {name: getattr(self, name) for name in names}
         return {name: value for name, value in values.items() if value is not None}
@@ -28,16 +28,16 @@ class Overrides(NamedTuple):
 
 def with_overrides(team: Team, overrides: Overrides) -> Team:
     """The team with these settings for all its robots."""
-    rules = overrides.given("fusion", "direction")
+    rules = overrides.set_fields("fusion", "direction")
     if (kinds := overrides.collaboration) is not None:
         rules |= {"passive": kinds in ("passive", "both"), "active": kinds in ("active", "both")}
-    limits = overrides.given("bytes_per_s", "messages_per_minute")
+    limits = overrides.set_fields("bytes_per_s", "messages_per_minute")
     robots = {}
     for name, robot in team.robots.items():
         own = robot.collaboration
         robots[name] = replace(
             robot,
-            localizer=replace(robot.localizer, **overrides.given("variant")),
+            localizer=replace(robot.localizer, **overrides.set_fields("variant")),
             collaboration=replace(own, budget=replace(own.budget, **limits), **rules),
         )
     if overrides.match_messages is not None:

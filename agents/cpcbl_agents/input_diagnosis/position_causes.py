@@ -4,23 +4,23 @@ import math
 from collections.abc import Callable, Sequence
 from statistics import median
 
-from cpcbl_agents.input_causes import LEAST_CASES, unit_of
-from cpcbl_agents.motion_causes import OR_START, Step, places_at
+from cpcbl_agents.input_diagnosis.message_causes import LEAST_CASES, unit_of
+from cpcbl_agents.input_diagnosis.motion_causes import OR_START, Step, places_at
 from cpcbl_team.geometry import Pose2
 from cpcbl_team.inputs import Position
 
 GAP_NS = 1_000_000_000
-LEAST_WAY_M = 0.3
+LEAST_DISTANCE_M = 0.3
 WAIT_NS = 7_500_000_000
 FAR_FIELDS, FAR_M = 3.0, 20.0  # from the map: nobody drives so far away from it
 LEAST_TURN = 0.15
 LARGEST_DEGREE = 1e-4  # for a metre
-AGREE = 0.35  # how much ways of odometry and of positions may differ
+AGREE = 0.35  # how much distances by odometry and by positions may differ
 OTHER_ORIGIN = (
     "are far from the map: another origin, or latitude and longitude; metres of the field"
 )
 OTHER_PLACE = "are not where odometry is since the start: another origin, or latitude and longitude"
-DEGREES = "look like latitude and longitude; metres of the field are due"
+DEGREES = "look like latitude and longitude; they must be metres of the field"
 
 
 def position_cause(
@@ -39,9 +39,9 @@ def position_cause(
     x, y = (median(p.x_m for p in positions), median(p.y_m for p in positions))
     outside_m, field_m = _outside(x, y, bounds)
     is_far = field_m > 0.0 and outside_m > max(FAR_M, FAR_FIELDS * field_m)
-    if cause := _by_ways(positions, steps, is_far):
+    if cause := _cause_from_distances(positions, steps, is_far):
         return cause
-    if pose is not None and (cause := _by_pose(positions[-3:], pose, start)):
+    if pose is not None and (cause := _cause_from_pose(positions[-3:], pose, start)):
         return cause
     for unit, factor in (("millimetres", 1e-3), ("centimetres", 1e-2)):
         is_large = is_far and max(abs(x), abs(y)) > 180.0  # no degrees
@@ -49,7 +49,7 @@ def position_cause(
             return f"positions look like {unit}"
     if is_far:
         return f"positions {OTHER_ORIGIN}"
-    return _by_start(x, y, steps, start) if start is not None and is_from_start else ""
+    return _cause_from_start(x, y, steps, start) if start is not None and is_from_start else ""
 
 
 def _outside(x: float, y: float, bounds: tuple[float, float, float, float]) -> tuple[float, float]:
@@ -59,8 +59,10 @@ def _outside(x: float, y: float, bounds: tuple[float, float, float, float]) -> t
     return far, abs(complex(right - left, high - low))
 
 
-def _by_ways(positions: Sequence[Position], steps: Sequence[Step], is_far: bool) -> str:
-    """By how far the robot drove, and which way it turned, as odometry says it."""
+def _cause_from_distances(
+    positions: Sequence[Position], steps: Sequence[Step], is_far: bool
+) -> str:
+    """The cause by how far the robot drove, and to which side it turned, according to odometry."""
     times, turned = list[float](), [0, 0]
     places = places_at(steps, [p.stamp_ns for p in positions])
     before: tuple[Position, complex] | None = None
@@ -72,7 +74,9 @@ def _by_ways(positions: Sequence[Position], steps: Sequence[Step], is_far: bool)
             before = p, place
         own = place - before[1]
         sigma_m = max(before[0].covariance[0], p.covariance[0]) ** 0.5
-        if p.stamp_ns - before[0].stamp_ns < GAP_NS or abs(own) < max(LEAST_WAY_M, 5.0 * sigma_m):
+        if p.stamp_ns - before[0].stamp_ns < GAP_NS or abs(own) < max(
+            LEAST_DISTANCE_M, 5.0 * sigma_m
+        ):
             continue
         its = complex(p.x_m - before[0].x_m, p.y_m - before[0].y_m)
         times.append(abs(its) / abs(own))
@@ -104,8 +108,8 @@ _VIEWS: tuple[tuple[str, Callable[[complex, complex], complex]], ...] = (
 )
 
 
-def _by_pose(positions: Sequence[Position], pose: Pose2, start: Pose2 | None) -> str:
-    """By the pose that the robot has of its other inputs."""
+def _cause_from_pose(positions: Sequence[Position], pose: Pose2, start: Pose2 | None) -> str:
+    """The cause by the pose that the robot has from its other inputs."""
     due = complex(pose.x, pose.y)
     begun = complex(start.x, start.y) if start else 0j
     seen = complex(median(p.x_m for p in positions), median(p.y_m for p in positions))
@@ -120,10 +124,12 @@ def _by_pose(positions: Sequence[Position], pose: Pose2, start: Pose2 | None) ->
     return f"positions {OTHER_PLACE}; {OR_START}" if off > max(1.0, 8.0 * sigma_m) else ""
 
 
-def _by_start(x: float, y: float, steps: Sequence[Step], start: Pose2) -> str:
-    """By how far the robot can have come. Ways that it drives tell more, but later."""
+def _cause_from_start(x: float, y: float, steps: Sequence[Step], start: Pose2) -> str:
+    """The cause by how far the robot can have come. Distances tell more, but later."""
     reach_m = sum(abs(step.distance_m) for step in steps)
-    if not steps or (reach_m > LEAST_WAY_M and steps[-1].stamp_ns - steps[0].from_ns < WAIT_NS):
+    if not steps or (
+        reach_m > LEAST_DISTANCE_M and steps[-1].stamp_ns - steps[0].from_ns < WAIT_NS
+    ):
         return ""
     is_near = math.hypot(x - start.x, y - start.y) < FAR_M + 2.0 * reach_m
     return "" if is_near else f"positions {OTHER_PLACE}; {OR_START}"

@@ -25,9 +25,9 @@ def stamp_cause(stamp_ns: int, now_ns: int) -> str:
     """Why a stamp is far from the time of its arrival; empty if it is not."""
     for unit, factor in _UNITS:
         if abs(stamp_ns * factor - now_ns) < YEAR_NS and now_ns > UNIX_NS:
-            return f"stamps look like {unit} since 1970; nanoseconds are due"
+            return f"stamps look like {unit} since 1970; they must be in nanoseconds"
     if 0 <= stamp_ns < UNIX_NS // 3 and now_ns > UNIX_NS:
-        return "stamps look like a monotonic clock's, since its start; Unix time is due"
+        return "stamps look like a monotonic clock's, since its start; they must be Unix time"
     return offset_cause((now_ns - stamp_ns) * 1e-9)
 
 
@@ -36,9 +36,8 @@ def offset_cause(offset_s: float, ahead_s: float = 0.1, behind_s: float = 1.0) -
     hours = round(offset_s / 1800.0) / 2.0
     if 0.0 < abs(hours) <= 14.0 and abs(offset_s - 3600.0 * hours) < 60.0:
         side = "behind" if hours > 0.0 else "ahead of"
-        return (
-            f"stamps are {abs(hours):g} h {side} this robot's clock: local time, where UTC is due?"
-        )
+        apart = f"stamps are {abs(hours):g} h {side} this robot's clock"
+        return f"{apart}: local time in place of UTC?"
     if offset_s < -ahead_s:
         return f"stamps are {-offset_s:.2g} s ahead of this robot's clock"
     if offset_s > behind_s:
@@ -70,8 +69,8 @@ def bearing_cause(frames: Iterable[Sightings]) -> str:
     if largest <= math.pi + 1e-9:
         return ""
     if largest <= 2.0 * math.pi + 1e-6:
-        return "bearings go up to 2π; they are due from -π to π"
-    return "bearings look like degrees; radians are due"
+        return "bearings go up to 2π; they must be between -π and π"
+    return "bearings look like degrees; they must be in radians"
 
 
 def odometry_cause(pieces: Sequence[Odometry]) -> str:
@@ -101,7 +100,7 @@ def range_cause(
     frames: Iterable[Sightings], max_range_m: float, field_m: float, scale: float
 ) -> str:
     """What ranges look like that are far beyond the sensor's reach and the field's diagonal (m), or
-    that make the ways between landmarks `scale` times as long as the map has them."""
+    that make distances between landmarks `scale` times as long as on the map."""
     if unit := unit_of(scale):
         return f"ranges look like {unit}"
     ranges = [s.range_m for f in frames for s in f.sightings if s.range_m is not None]

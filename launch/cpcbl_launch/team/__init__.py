@@ -1,0 +1,1 @@
+"""The team file: reading it, its faults and warnings, and what the command line changes in it."""
