@@ -12,7 +12,7 @@ from msgspec.structs import replace
 from cpcbl_team.config import SensorSettings
 from cpcbl_team.estimate import Estimate
 from cpcbl_team.fusion import Observation
-from cpcbl_team.gaussian import Covariance2, sighting_gaussian
+from cpcbl_team.gaussian import Covariance2, Gaussian2, sighting_gaussian
 from cpcbl_team.geometry import Pose2, wrap_angle
 from cpcbl_team.inputs import Fix, Position, Sighting
 from cpcbl_team.sensors import sighting_fault, sighting_sigmas
@@ -53,22 +53,9 @@ def fix_for(
     expected_m = None
     if earlier is not None and stamp_ns - earlier.stamp_ns <= EARLIER_NS:
         expected_m = math.hypot(earlier.x_m - pose.x, earlier.y_m - pose.y)
-    range_sigma, bearing_sigma = sighting_sigmas(sighting, sensor, expected_m)
-    of_reading = expected_m is None and sighting.range_sigma_m is None
-    share = sensor.range_share if of_reading else 0.0
-    mean_m = unbiased_range_m(range_m, range_sigma, bearing_sigma, share)
-    width_m = range_m * arc_width(bearing_sigma)
-    along_m = math.hypot(range_sigma, width_m)
-    sighted = sighting_gaussian(range_m, bearing, along_m, bearing_sigma)
-    sighted = sighted._replace(x=mean_m * math.cos(bearing), y=mean_m * math.sin(bearing))
+    sighted = _sighted_gaussian(sighting, range_m, bearing, sensor, expected_m)
     x, y = pose.transform(sighted.x, sighted.y)
-    c, s = math.cos(pose.heading), math.sin(pose.heading)
-    own = sighted.covariance
-    rotated = Covariance2(
-        c * c * own.xx - 2.0 * c * s * own.xy + s * s * own.yy,
-        c * s * (own.xx - own.yy) + (c * c - s * s) * own.xy,
-        s * s * own.xx + 2.0 * c * s * own.xy + c * c * own.yy,
-    )
+    rotated = sighted.covariance.rotated(pose.heading)
     jacobian = (1.0, 0.0, pose.y - y, 0.0, 1.0, x - pose.x, 0.0, 0.0, 0.0)
     arc, dx, dy = arc_variance(covariance.hh), x - pose.x, y - pose.y
     observer_part = covariance.transformed(jacobian).position()
@@ -83,6 +70,23 @@ def fix_for(
         heading_sensor_variance=heading_sigma * heading_sigma,
         heading_observer_variance=covariance.hh,
     )
+
+
+def _sighted_gaussian(
+    sighting: Sighting,
+    range_m: float,
+    bearing: float,
+    sensor: SensorSettings,
+    expected_m: float | None,
+) -> Gaussian2:
+    """The teammate in the observer's frame; `expected_m`: the range by an earlier fix."""
+    range_sigma, bearing_sigma = sighting_sigmas(sighting, sensor, expected_m)
+    of_reading = expected_m is None and sighting.range_sigma_m is None
+    share = sensor.range_share if of_reading else 0.0
+    mean_m = unbiased_range_m(range_m, range_sigma, bearing_sigma, share)
+    along_m = math.hypot(range_sigma, range_m * arc_width(bearing_sigma))
+    _, _, covariance = sighting_gaussian(range_m, bearing, along_m, bearing_sigma)
+    return Gaussian2(mean_m * math.cos(bearing), mean_m * math.sin(bearing), covariance)
 
 
 def unbiased_range_m(
