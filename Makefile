@@ -6,7 +6,7 @@ VENV ?= .venv
 BIN = $(VENV)/bin
 
 .PHONY: setup demo test quick check unit test-long test-trial test-compiled test-docker test-bench \
-  chaos net fuzz compiled bench bench-batch bench-detection bench-latency bench-pictures \
+  chaos net fuzz compiled bench bench-detection bench-latency bench-pictures \
   bench-processes bench-scaling bench-view screenshot clean
 
 setup: $(VENV)/ready
@@ -98,9 +98,8 @@ bench: test-bench
 
 # Measurements, each with options of its own (ARGS=--help). Real processes over Zenoh, alone on the
 # machine: latency, processes (ARGS='--team-sizes 40,48,60 --old ../earlier-checkout'). In one process:
-# scaling (teams of any size), detection (rendered frames), pictures (ARGS='SET FOLDER': real ones),
-# batch (ARGS='MRCLAM6': the ceiling of any filter on a real log).
-bench-batch bench-detection bench-latency bench-pictures bench-processes bench-scaling: setup
+# scaling (teams of any size), detection (rendered frames), pictures (ARGS='SET FOLDER': real ones).
+bench-detection bench-latency bench-pictures bench-processes bench-scaling: setup
 	@mkdir -p build
 	PYTHONPATH=$(BENCH_PATH) $(BIN)/python -m benchmarks.$(@:bench-%=%) $(ARGS)
 

@@ -12,7 +12,7 @@ from msgspec.structs import replace
 from cpcbl_team.config import SensorSettings
 from cpcbl_team.estimate import Estimate
 from cpcbl_team.fusion import Observation
-from cpcbl_team.gaussian import Covariance2, sighting_gaussian
+from cpcbl_team.gaussian import Covariance2, Gaussian2, sighting_gaussian
 from cpcbl_team.geometry import Pose2, wrap_angle
 from cpcbl_team.inputs import Fix, Position, Sighting
 from cpcbl_team.sensors import sighting_fault, sighting_sigmas
@@ -20,6 +20,7 @@ from cpcbl_team.state import FIX
 
 POSITION_SENSOR = "position sensor"
 EARLIER_NS = 1_000_000_000  # since an earlier fix, in which a teammate does not get far
+MOST_SHIFT = 0.25  # of a range; a Gaussian does not describe what is less certain
 _NOTHING = Covariance2(0.0, 0.0, 0.0)
 _AXES = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
 _HEADING = ((0.0, 0.0, 1.0),)
@@ -41,6 +42,7 @@ def fix_for(
     which J does not know: its variance along the line of sight is added to the observer's part. A
     heading of the teammate is the observer's plus the one in its frame, and so are their variances.
     The sigma is a share of the range to an `earlier` fix: that one errs apart from this reading.
+    The position is not that of the reading itself, but see `unbiased_range_m`.
     """
     range_m, bearing = sighting.range_m, sighting.bearing_rad
     if range_m is None or bearing is None or sighting_fault(sighting):
@@ -51,16 +53,9 @@ def fix_for(
     expected_m = None
     if earlier is not None and stamp_ns - earlier.stamp_ns <= EARLIER_NS:
         expected_m = math.hypot(earlier.x_m - pose.x, earlier.y_m - pose.y)
-    sigmas = sighting_sigmas(sighting, sensor, expected_m)
-    sighted = sighting_gaussian(range_m, bearing, *sigmas)
+    sighted = _sighted_gaussian(sighting, range_m, bearing, sensor, expected_m)
     x, y = pose.transform(sighted.x, sighted.y)
-    c, s = math.cos(pose.heading), math.sin(pose.heading)
-    own = sighted.covariance
-    rotated = Covariance2(
-        c * c * own.xx - 2.0 * c * s * own.xy + s * s * own.yy,
-        c * s * (own.xx - own.yy) + (c * c - s * s) * own.xy,
-        s * s * own.xx + 2.0 * c * s * own.xy + c * c * own.yy,
-    )
+    rotated = sighted.covariance.rotated(pose.heading)
     jacobian = (1.0, 0.0, pose.y - y, 0.0, 1.0, x - pose.x, 0.0, 0.0, 0.0)
     arc, dx, dy = arc_variance(covariance.hh), x - pose.x, y - pose.y
     observer_part = covariance.transformed(jacobian).position()
@@ -75,6 +70,45 @@ def fix_for(
         heading_sensor_variance=heading_sigma * heading_sigma,
         heading_observer_variance=covariance.hh,
     )
+
+
+def _sighted_gaussian(
+    sighting: Sighting,
+    range_m: float,
+    bearing: float,
+    sensor: SensorSettings,
+    expected_m: float | None,
+) -> Gaussian2:
+    """The teammate in the observer's frame; `expected_m`: the range by an earlier fix."""
+    range_sigma, bearing_sigma = sighting_sigmas(sighting, sensor, expected_m)
+    of_reading = expected_m is None and sighting.range_sigma_m is None
+    share = sensor.range_share if of_reading else 0.0
+    mean_m = unbiased_range_m(range_m, range_sigma, bearing_sigma, share)
+    along_m = math.hypot(range_sigma, range_m * arc_width(bearing_sigma))
+    _, _, covariance = sighting_gaussian(range_m, bearing, along_m, bearing_sigma)
+    return Gaussian2(mean_m * math.cos(bearing), mean_m * math.sin(bearing), covariance)
+
+
+def unbiased_range_m(
+    range_m: float, range_sigma_m: float, bearing_sigma: float, share_of_reading: float
+) -> float:
+    """The range (m) at which a Gaussian stands for a sighting without pulling repeated fixes aside.
+
+    Three errors of second order depend on the reading, and so do not average out: a bearing that is
+    off puts the point too near, by r sigma_a^2 / 2; it also turns the axes of the Gaussian, which
+    adds sigma_r^2 / r in the end; and where sigma_r is a share of the reading, too short ones have
+    too much weight: 2 share^2 r. Together this is the mean of what the sighting says, as a density
+    over the plane. (Lerro & Bar-Shalom, Tracking with debiased consistent converted measurements,
+    IEEE Transactions on Aerospace and Electronic Systems, 1993, for the first of them.)
+    """
+    share = (range_sigma_m / range_m) ** 2 + 2.0 * share_of_reading * share_of_reading
+    return range_m * (1.0 + min(share, MOST_SHIFT)) * math.exp(-0.5 * bearing_sigma**2)
+
+
+def arc_width(bearing_sigma: float) -> float:
+    """The sigma along the line of sight, in metres a metre of range, of a bearing that errs: that
+    of cos e, of a Gaussian e."""
+    return -math.sqrt(0.5) * math.expm1(-(bearing_sigma**2))
 
 
 def arc_variance(heading_variance: float) -> float:

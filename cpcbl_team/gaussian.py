@@ -37,6 +37,15 @@ class Covariance2(NamedTuple):
             return self
         return Covariance2(self.xx, math.copysign(most, self.xy), self.yy)
 
+    def rotated(self, angle: float) -> "Covariance2":
+        """The covariance turned by `angle` (rad)."""
+        c, s = math.cos(angle), math.sin(angle)
+        return Covariance2(
+            c * c * self.xx - 2.0 * c * s * self.xy + s * s * self.yy,
+            c * s * (self.xx - self.yy) + (c * c - s * s) * self.xy,
+            s * s * self.xx + 2.0 * c * s * self.xy + c * c * self.yy,
+        )
+
     def along(self, nx: float, ny: float) -> float:
         """The variance along the unit vector (nx, ny)."""
         return self.xx * nx * nx + 2.0 * self.xy * nx * ny + self.yy * ny * ny

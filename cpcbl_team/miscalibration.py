@@ -27,15 +27,17 @@ from cpcbl_team.constant_errors import (
     difference,
     matrix_of,
     matrix_product,
+    pose_offset,
     sensitivity_after,
     whiten,
 )
-from cpcbl_team.estimate import SMALLEST_VARIANCE, Estimate, Matrix3, Row
-from cpcbl_team.geometry import Pose2, new, wrap_angle
+from cpcbl_team.estimate import SMALLEST_VARIANCE, Covariance3, Estimate, Matrix3, Row
+from cpcbl_team.geometry import Pose2, wrap_angle
 from cpcbl_team.motion import move
 from cpcbl_team.range_errors import NO_RANGE_ERRORS, RangeErrors
 
 BLOCK_NS: Final = 1_500_000_000
+STEP_NS: Final = 300_000_000
 LONGEST_NS: Final = 5_000_000_000
 MOST_TURN_RAD: Final = 2.5  # beyond, the chord of a block is much shorter than its path
 LEAST_DISTANCE_M: Final = 0.02
@@ -43,12 +45,15 @@ LEAST_TURN_RAD: Final = 0.02
 LEAST_SIGMA: Final = 0.01  # of odometry whose noise grows, per root of a metre or radian
 LEAST_PARTS: Final = 30.0  # of corrections
 SIGMAS: Final = 4.0  # of an error that is believed,
+SIGMAS_OF_CIRCLE: Final = 5.5  # of one that is believed without the covariance of errors
 AGAIN_SIGMAS: Final = 2.5  # and of others beside it, and after it
+DOUBT_SIGMAS: Final = 3.0  # of an error that is not believed yet, but may be there
 LEAST_SCALE: Final = 0.03  # of the first change: what is smaller is not worth one
 LEAST_BIAS_RAD: Final = math.radians(2.0)
 MOST: Final = 0.5  # of an error that is believed at once
 LARGE: Final = 1.8  # factor of a variance, for a robot that rejects too much
 SCATTER_SIGMAS: Final = 4.0  # a mean square of so many is larger than due
+SCATTER_SIGMAS_AGAIN: Final = 2.0  # where the sigmas were too small before
 SMALL: Final = 0.6  # a mean square below it makes larger sigmas smaller again
 MOTION_LAG: Final = 0.1  # correlation of each correction with the one before; for a robot that
 REJECTING_LAG: Final = 0.3  # rejects too much it is more, for a wrong sensor is the usual cause
@@ -61,6 +66,7 @@ LEAST_MISPLACED: Final = 6.0  # rejections of an object that stands elsewhere,
 MISPLACED_SHARE: Final = 0.7  # of all, and
 MISPLACED_REJECTED: Final = 0.003  # of what is accepted, of any object
 MISPLACED: Final = "misplaced_"  # the count of such an object begins with this
+UNITS: Final = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 _NONE: Final[Mapping[str, float]] = {}
 
 
@@ -83,14 +89,34 @@ class ModelCheck(NamedTuple):
     rejections: int = 0  # of objects of the map,
     rejected: str = ""  # the last of which is this one,
     accepted: int = 0  # since so many observations were accepted
+    doubts: Row = NO_ERRORS  # variances of constant errors that the settings may still have
+    ahead: Corrected | None = None
+    """Where the odometry alone has led since the block began."""
 
     def restarted(self, accepted: int) -> "ModelCheck":
         """For a robot that was lost: what it rejected then tells nothing."""
-        return self._replace(begin=None, rejections=0, accepted=accepted)
+        return self._replace(begin=None, ahead=None, rejections=0, accepted=accepted)
 
     def from_pose(self, now: Corrected) -> "ModelCheck":
         """With a block that begins now, after one that tells nothing."""
-        return self._replace(begin=now, sensitivity=INSENSITIVE)
+        return self._replace(begin=now, ahead=now, sensitivity=INSENSITIVE)
+
+    def with_step(self, stamp_ns: int, place_now: Pose2, noise: OdometryNoise) -> "ModelCheck":
+        """With the odometry until now, as one arc. A block has several: how a turn's noise moves
+        the position depends on the path."""
+        ahead = self.ahead or self.begin
+        assert ahead is not None
+        _, (pose, covariance, _), place, gaps = ahead
+        x, y = place_now.x - place.x, place_now.y - place.y
+        distance, turn = math.sqrt(x * x + y * y), wrap_angle(place_now.heading - place.heading)
+        course = math.atan2(y, x) - place.heading + pose.heading
+        start = Estimate(Pose2(pose.x, pose.y, course - 0.5 * turn), covariance)
+        moved, due, _ = move(start, distance, turn, noise)
+        estimate = Estimate(Pose2(moved.x, moved.y, wrap_angle(pose.heading + turn)), due)
+        return self._replace(
+            ahead=Corrected(stamp_ns, estimate, place_now, gaps),
+            sensitivity=sensitivity_after(self.sensitivity, distance, turn, course),
+        )
 
     def with_rejections(self, names: Sequence[str]) -> "ModelCheck":
         """With more rejected objects of the map. One that is rejected time after time, while
@@ -152,29 +178,28 @@ def check_models(check: ModelCheck, now: Corrected, noise: OdometryNoise) -> Mod
     that reduce P to Q correct the pose with the covariance P - Q, of which the constant errors are
     (P - Q) P^-1 V.
     """
-    begin, sensitivity, evidence, rejections, rejected, accepted = check
+    begin = check.begin
     if begin is None or now.gaps > begin.gaps or now.stamp_ns - begin.stamp_ns > LONGEST_NS:
         return check.from_pose(now)
     _, (pose, before, _), place, _ = begin
     _, (pose_now, left, _), place_now, _ = now
     x, y, turn = place_now.x - place.x, place_now.y - place.y, place_now.heading - place.heading
-    distance, turn = math.sqrt(x * x + y * y), wrap_angle(turn)
+    turn = wrap_angle(turn)
     if abs(turn) > MOST_TURN_RAD:
         return check.from_pose(now)
-    if distance < LEAST_DISTANCE_M and abs(turn) < LEAST_TURN_RAD:
-        return check._replace(begin=now)
-    course = math.atan2(y, x) - place.heading + pose.heading
-    start = Estimate(Pose2(pose.x, pose.y, course - 0.5 * turn), before)
-    predicted, due, _ = move(start, distance, turn, noise)
+    if x * x + y * y < LEAST_DISTANCE_M**2 and abs(turn) < LEAST_TURN_RAD:
+        return check._replace(begin=now, ahead=now)
+    check = check.with_step(now.stamp_ns, place_now, noise)
+    assert check.ahead is not None
+    (predicted, due, _), sensitivity = check.ahead.estimate, check.sensitivity
     if due.determinant() <= SMALLEST_VARIANCE**3:
         return check.from_pose(now)
-    predicted_heading = pose.heading + turn
     taken, added = due.plus(left, -1.0), due.plus(before, -1.0)
+    course = math.atan2(y, x) - place.heading + pose.heading
     c, s = math.cos(course), math.sin(course)
     to_course = c, s, 0.0, -s, c, 0.0, 0.0, 0.0, 1.0
     dx, dy = pose_now.x - predicted.x, pose_now.y - predicted.y
-    correction = c * dx + s * dy, c * dy - s * dx, wrap_angle(pose_now.heading - predicted_heading)
-    sensitivity = sensitivity_after(sensitivity, distance, turn, course)
+    correction = c * dx + s * dy, c * dy - s * dx, wrap_angle(pose_now.heading - predicted.heading)
     gain = matrix_product(matrix_of(taken), matrix_of(due.inverse()))
     corrected = matrix_product(gain, sensitivity)
     whitened = whiten(
@@ -183,45 +208,59 @@ def check_models(check: ModelCheck, now: Corrected, noise: OdometryNoise) -> Mod
         taken.transformed(to_course),
         added.transformed(to_course),
     )
-    sensitivity = difference(sensitivity, corrected)
-    evidence = evidence.plus(whitened)
-    return new(ModelCheck, (now, sensitivity, evidence, rejections, rejected, accepted))
+    return check._replace(
+        begin=now,
+        ahead=now,
+        sensitivity=difference(sensitivity, corrected),
+        evidence=check.evidence.plus(whitened),
+    )
+
+
+class Rules(NamedTuple):
+    """How the corrections of one robot's pose are judged."""
+
+    gate_probability: float
+    independent_share: float = 1.0  # of the blocks: that many have errors of their own
+    knows_covariance: bool = True
+    """Whether the covariance is that of the errors. Where it is only larger (`circular`), the size
+    of corrections tells nothing, and a constant error must be clearer."""
 
 
 def adapted(
-    check: ModelCheck,
-    present: Adaptation,
-    accepted: int,
-    gate_probability: float,
-    independent_share: float = 1.0,
+    check: ModelCheck, present: Adaptation, accepted: int, rules: Rules
 ) -> Adaptation | None:
     """What the settings should be changed to; None if they fit. So many observations have been
-    `accepted` since the start; this share of the blocks has errors of its own."""
+    `accepted` since the start."""
     evidence = check.evidence
     if evidence.parts < LEAST_PARTS:
         return None
     fit = evidence.fit()
-    by_errors = _with_errors(present, fit, independent_share)
+    by_errors = _with_errors(present, fit, rules)
     if by_errors is not None:
         return by_errors
     all_of_them = max(check.rejections + accepted - check.accepted, 1)
-    due = LEAST_REJECTED + MOST_DUE * (1.0 - gate_probability)
+    due = LEAST_REJECTED + MOST_DUE * (1.0 - rules.gate_probability)
     is_rejecting = check.rejections > max(due * all_of_them, LEAST_REJECTIONS)
-    scatter, parts = fit.scatter, independent_share * evidence.parts
-    if scatter > 1.0 + SCATTER_SIGMAS * math.sqrt(2.0 / parts) or is_rejecting:  # chi-square
-        least_lag = REJECTING_LAG if is_rejecting else MOTION_LAG
-        of_motion = evidence.lagged > least_lag * scatter * evidence.parts
+    scatter, parts = fit.scatter, rules.independent_share * evidence.parts
+    least_lag = REJECTING_LAG if is_rejecting else MOTION_LAG
+    of_motion = evidence.lagged > least_lag * scatter * evidence.parts
+    if not rules.knows_covariance:
+        return _with_larger_sigma(present, LARGE, of_motion) if is_rejecting else None
+    is_first = present.motion_factor == present.sensor_factor == 1.0
+    sigmas = SCATTER_SIGMAS if is_first else SCATTER_SIGMAS_AGAIN
+    if scatter > 1.0 + sigmas * math.sqrt(2.0 / parts) or is_rejecting:  # chi-square
         return _with_larger_sigma(present, max(scatter, LARGE), of_motion)
     return _with_smaller_sigmas(present, scatter) if scatter < SMALL else None
 
 
-def _with_errors(present: Adaptation, fit: Fit, independent_share: float) -> Adaptation | None:
+def _with_errors(present: Adaptation, fit: Fit, rules: Rules) -> Adaptation | None:
     """The adaptation without the constant errors, where one of them is clear."""
     (distance, turn, bias), sigmas, _ = fit
-    of_distance, of_turn, of_bias = (sigma / math.sqrt(independent_share) for sigma in sigmas)
+    of_distance, of_turn, of_bias = (s / math.sqrt(rules.independent_share) for s in sigmas)
     clear = max(abs(distance) / of_distance, abs(turn) / of_turn, abs(bias) / of_bias)
     is_first = errors_between(AS_CONFIGURED, present) == NO_ERRORS
-    if clear <= (SIGMAS if is_first else AGAIN_SIGMAS):
+    first = SIGMAS if rules.knows_covariance else SIGMAS_OF_CIRCLE
+    if clear <= (first if is_first else AGAIN_SIGMAS):
         return None
     distance, turn, bias = (
         _believed(distance, of_distance),
@@ -240,6 +279,40 @@ def _with_errors(present: Adaptation, fit: Fit, independent_share: float) -> Ada
 def _believed(error: float, sigma: float) -> float:
     """An error that is clear, or else none."""
     return min(max(error, -MOST), MOST) if abs(error) > AGAIN_SIGMAS * sigma else 0.0
+
+
+def doubts_of(
+    check: ModelCheck, before: Adaptation, after: Adaptation, independent_share: float
+) -> Row:
+    """The variances of the constant errors that are left after a block: of one that was corrected,
+    that of the correction; of one that is nearly clear, its square."""
+    errors, sigmas, _ = check.evidence.fit()
+    changed, corrected = errors_between(before, after), errors_between(AS_CONFIGURED, after)
+    doubts = []
+    for i, error in enumerate(errors):
+        variance = sigmas[i] ** 2 / independent_share
+        if changed[i] != 0.0:
+            doubts.append(variance)
+        elif corrected[i] != 0.0:
+            doubts.append(check.doubts[i])
+        else:
+            is_doubtful = error * error > DOUBT_SIGMAS**2 * variance
+            doubts.append(error * error + variance if is_doubtful else 0.0)
+    distance, turn, bias = doubts
+    return distance, turn, bias
+
+
+def with_doubts(estimate: Estimate, check: ModelCheck) -> Estimate:
+    """The estimate, less certain by what the constant errors may add (a considered covariance;
+    Schmidt 1966). No update makes that smaller, for such an error is in all of them."""
+    if check.doubts == NO_ERRORS:
+        return estimate
+    covariance = estimate.covariance
+    for i, variance in enumerate(check.doubts):
+        x, y, h = pose_offset(check.sensitivity, UNITS[i])
+        added = Covariance3(x * x, x * y, y * y, x * h, y * h, h * h)
+        covariance = covariance.plus(added, variance)
+    return estimate._replace(covariance=covariance)
 
 
 def errors_between(before: Adaptation, after: Adaptation) -> Row:

@@ -15,10 +15,15 @@ from cpcbl_team.measurements import GatedObject
 from cpcbl_team.miscalibration import (
     AS_CONFIGURED,
     BLOCK_NS,
+    LEAST_PARTS,
+    STEP_NS,
+    Adaptation,
     Corrected,
     ModelCheck,
+    Rules,
     adapted,
     check_models,
+    doubts_of,
     errors_between,
     noise_with_factor,
 )
@@ -36,16 +41,19 @@ class OwnCalibration:
         rules = settings.localizer
         self._landmarks = landmarks
         self._noise: OdometryNoise = settings.odometry
-        self._gate_probability = rules.gate_probability
         self._learns = rules.learns
-        # The others do not know how large a correction should be
-        knows_covariance = rules.variant in ("joint", "oval") and not rules.paper_uncertainty
-        self._is_checked = knows_covariance and not rules.learns
+        self._is_checked = not (
+            rules.learns or rules.variant == "weighted" or rules.paper_uncertainty
+        )
         # Of two that contradict each other either one may be wrong
         self._names_misplaced = len(field.landmarks) + len(field.walls) > 2
         block_s = BLOCK_NS * 1e-9
         correlation_s, spacing_s = settings.sensor.correlation_s, SPACING_NS * 1e-9
-        self._independent_share = block_s / (block_s + 2.0 * correlation_s)
+        self._rules = Rules(
+            rules.gate_probability,
+            independent_share=block_s / (block_s + 2.0 * correlation_s),
+            knows_covariance=rules.variant != "circular",
+        )
         self._independent_frames = spacing_s / (spacing_s + 2.0 * correlation_s)
 
     def is_known(self, state: State) -> bool:
@@ -96,9 +104,17 @@ class OwnCalibration:
         """The state after an update of the pose, with what the robot learns from it."""
         if self._learns:
             return self._after_learning(state)
-        begin = state.memory.calibration.check.begin
-        if self._is_checked and (begin is None or state.stamp_ns - begin.stamp_ns >= BLOCK_NS):
+        if not self._is_checked:
+            return state
+        memory, now_ns = state.memory.calibration, state.stamp_ns
+        check = memory.check
+        begin, ahead = check.begin, check.ahead
+        if begin is None or ahead is None or now_ns - begin.stamp_ns >= BLOCK_NS:
             return self._after_check(self._with_ranges(state))
+        if now_ns - ahead.stamp_ns >= STEP_NS:
+            noise = noise_with_factor(self._noise, memory.adaptation.motion_factor)
+            check = check.with_step(now_ns, state.odometry_from_robot, noise)
+            return self._with_check(state, check, memory.adaptation)
         return state
 
     def without_adaptation(self, state: State) -> State:
@@ -161,7 +177,7 @@ class OwnCalibration:
         """The state at the end of a block."""
         gaps = state.memory.events.get("odometry_gap", 0)
         now = Corrected(state.stamp_ns, state.estimate, state.odometry_from_robot, gaps)
-        memory, accepted = state.memory.calibration, state.updates.accepted
+        memory = state.memory.calibration
         check, present, begin = memory.check, memory.adaptation, memory.check.begin
         if (
             begin is None
@@ -173,21 +189,31 @@ class OwnCalibration:
         else:
             noise = noise_with_factor(self._noise, present.motion_factor)
             check = check_models(check, now, noise)
-            rules = self._gate_probability, self._independent_share
-            changed = adapted(check, present, accepted, *rules)
-            if changed is not None:
-                errors = errors_between(present, changed)
-                pose = offset_pose(
-                    state.estimate.pose, pose_offset(check.sensitivity, errors), POSE
-                )
-                state = state._replace(estimate=state.estimate._replace(pose=pose))
-                now = now._replace(estimate=state.estimate)
-                # Other sigmas whiten otherwise: what was collected with the old ones is void
-                evidence = NO_EVIDENCE
-                if errors != NO_ERRORS:
-                    evidence = check.evidence.without(errors)
-                check = ModelCheck(now, check.sensitivity, evidence, accepted=accepted)
-                state, present = state.counted("miscalibrated"), changed
+            if check.evidence.parts >= LEAST_PARTS:
+                return self._after_judgement(state, check, now)
+        return self._with_check(state, check, present)
+
+    def _after_judgement(self, state: State, check: ModelCheck, now: Corrected) -> State:
+        """The state at the end of a block, after which there are enough to judge the settings."""
+        present, accepted = state.memory.calibration.adaptation, state.updates.accepted
+        changed = adapted(check, present, accepted, self._rules)
+        doubts = doubts_of(check, present, changed or present, self._rules.independent_share)
+        check = check._replace(doubts=doubts)
+        if changed is None:
+            return self._with_check(state, check, present)
+        errors = errors_between(present, changed)
+        pose = offset_pose(state.estimate.pose, pose_offset(check.sensitivity, errors), POSE)
+        state = state._replace(estimate=state.estimate._replace(pose=pose))
+        now = now._replace(estimate=state.estimate)
+        # Other sigmas whiten otherwise: what was collected with the old ones is void
+        evidence = NO_EVIDENCE
+        if errors != NO_ERRORS:
+            evidence = check.evidence.without(errors)
+        check = ModelCheck(now, check.sensitivity, evidence, 0, "", accepted, doubts, now)
+        return self._with_check(state.counted("miscalibrated"), check, changed)
+
+    def _with_check(self, state: State, check: ModelCheck, present: Adaptation) -> State:
+        memory = state.memory.calibration
         learned, references, total_turn_rad, _, _, rejections, ranges = memory
         parts = learned, references, total_turn_rad, check, present, rejections, ranges
         return _with_calibration(state, new(CalibrationMemory, parts))

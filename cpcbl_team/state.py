@@ -15,7 +15,13 @@ from cpcbl_team.config import Field, Start
 from cpcbl_team.estimate import HEADING, POSE, POSITION, Covariance3, Estimate, Scope
 from cpcbl_team.geometry import Pose2, new, wrap_angle
 from cpcbl_team.inputs import Belief, Odometry, Sighting
-from cpcbl_team.miscalibration import AS_CONFIGURED, Adaptation, MapRejections, ModelCheck
+from cpcbl_team.miscalibration import (
+    AS_CONFIGURED,
+    Adaptation,
+    MapRejections,
+    ModelCheck,
+    with_doubts,
+)
 from cpcbl_team.range_errors import RangeEvidence
 from cpcbl_team.self_calibration import ReferencePoses, SelfCalibration
 from cpcbl_team.trust import SenderRecord
@@ -175,6 +181,11 @@ class State(NamedTuple):
     odometry_until_ns: int = 0  # until when odometry is known
     updates: Updates = Updates()
     memory: Memory = Memory()
+
+    @property
+    def reported(self) -> Estimate:
+        """The estimate as it is told to others: as uncertain as the settings are, too."""
+        return with_doubts(self.estimate, self.memory.calibration.check)
 
     @property
     def lost(self) -> str:

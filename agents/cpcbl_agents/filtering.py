@@ -114,7 +114,7 @@ class FilterAgent:
         if o is not None and state.stamp_ns - o.stamp_ns < ODOMETRY_WAIT_NS:
             seconds = (o.stamp_ns - o.from_ns) * 1e-9
             speed, turn_rate = o.distance_m / seconds, o.turn_rad / seconds
-        return PoseEstimate(state.stamp_ns, state.estimate, state.lost, speed, turn_rate)
+        return PoseEstimate(state.stamp_ns, state.reported, state.lost, speed, turn_rate)
 
     def _frame_estimates(self, now_ns: int) -> list[FrameEstimate]:
         """The estimate at each frame that odometry covers by now, or that waited long enough."""
@@ -132,5 +132,5 @@ class FilterAgent:
             adaptation = calibration.adaptation
             factor, scale = adaptation.sensor_factor, adaptation.ranges.scale
             frame = recalibrated(frame, calibration.bearing_bias_rad, scale)
-            ready.append(FrameEstimate(frame, state.estimate, state.lost, factor))
+            ready.append(FrameEstimate(frame, state.reported, state.lost, factor))
         return ready

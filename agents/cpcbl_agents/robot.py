@@ -107,7 +107,7 @@ class Robot:
     def pose(self, now_ns: int) -> Pose:
         """The pose at `now_ns`, or at the end of the newest odometry."""
         state = self.filter.timeline.latest(now_ns)
-        (x_m, y_m, heading_rad), (xx, xy, yy, xh, yh, hh), _ = state.estimate
+        (x_m, y_m, heading_rad), (xx, xy, yy, xh, yh, hh), _ = state.reported
         rows = None if self._is_weighted else ((xx, xy, xh), (xy, yy, yh), (xh, yh, hh))
         return Pose(self.name, state.stamp_ns, x_m, y_m, heading_rad, rows, state.lost)
 

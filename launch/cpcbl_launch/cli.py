@@ -72,7 +72,7 @@ def _open_standard_files() -> None:
 
 def _run_command() -> None:
     """A robot's process loads neither typer nor the other commands."""
-    from cpcbl_launch.commands.old_forms import require_present_form
+    from cpcbl_launch.commands.old_forms import require_present_form, with_values
 
     words = sys.argv[1:]
     require_present_form(words)
@@ -83,7 +83,7 @@ def _run_command() -> None:
     else:
         from cpcbl_launch.app import app
 
-        app(words, prog_name="cpcbl-team")
+        app(with_values(words), prog_name="cpcbl-team")
 
 
 def _end(problem: str, code: int) -> None:

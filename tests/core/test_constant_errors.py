@@ -179,3 +179,24 @@ def test_an_exact_pose_tells_nothing() -> None:
     check = check_models(ModelCheck(), start, exact)
     later = start._replace(stamp_ns=BLOCK_NS, odometry_from_robot=Pose2(1.0, 0.0, 0.0))
     assert check_models(check, later, exact).evidence == Evidence()
+
+
+def test_a_block_knows_the_path_of_its_robot() -> None:
+    """It turns on the spot and then drives: by one arc, turns would move it half as far."""
+    pieces = [(0.0, 0.1)] * 10 + [(0.04, 0.0)] * 10
+    exact = estimate = Estimate(Pose2(1.0, 2.0, 0.3), diagonal(0.01, 0.01))
+    place = Pose2(0.0, 0.0, 0.0)
+    steps = ModelCheck().from_pose(Corrected(0, estimate, place, 0))
+    for i, piece in enumerate(pieces, 1):
+        exact, place = move(exact, *piece, NOISE), step(place, *piece)
+        if i % 5 == 0:
+            steps = steps.with_step(i * BLOCK_NS // 20, place, NOISE)
+    once = ModelCheck().from_pose(Corrected(0, estimate, Pose2(0.0, 0.0, 0.0), 0))
+    once = once.with_step(BLOCK_NS, place, NOISE)
+    assert steps.ahead is not None
+    assert once.ahead is not None
+    assert steps.ahead.estimate.pose == pytest.approx(exact.pose, abs=0.001)
+    found = matrix3(steps.ahead.estimate.covariance)
+    assert found == pytest.approx(matrix3(exact.covariance), rel=0.05, abs=1e-5)
+    by_one = np.linalg.eigvalsh(matrix3(once.ahead.estimate.covariance))
+    assert by_one[0] < 0.85 * np.linalg.eigvalsh(matrix3(exact.covariance))[0]

@@ -8,15 +8,24 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 from support.core import (
+    SECOND,
     covariance3,
     diagonal,
+    localizer,
     matrix2,
     random_matrix,
+    state_at,
 )
 
-from cpcbl_team.config import SensorSettings
+from cpcbl_team.config import Field, OdometrySettings, SensorSettings
 from cpcbl_team.estimate import Estimate
-from cpcbl_team.fixes import arc_variance, fix_for, without_heading
+from cpcbl_team.fixes import (
+    arc_variance,
+    arc_width,
+    fix_for,
+    unbiased_range_m,
+    without_heading,
+)
 from cpcbl_team.gaussian import Covariance2
 from cpcbl_team.geometry import Pose2
 from cpcbl_team.inputs import Fix, Sighting
@@ -35,15 +44,17 @@ def an_observer(seed: int) -> Estimate:
 
 @pytest.mark.parametrize("seed", range(4))
 def test_a_fix_is_the_sighting_compounded_with_the_observers_pose(seed: int) -> None:
-    """Row 40: both parts of the covariance equal those by finite differences, and the observer's
-    heading, along the line of sight, bends it to an arc."""
+    """Row 40: both parts of the covariance equal those by finite differences, and headings, along
+    the line of sight, bend it to an arc."""
     observer = an_observer(seed)
     pose = observer.pose
     r, a = 3.0, 0.4 * seed - 0.9
 
+    mean_m = unbiased_range_m(r, 0.05 * r, math.radians(5.0), 0.05)
+
     def position(x: float, y: float, h: float, along: float, across: float) -> tuple[float, float]:
         c, s = math.cos(a), math.sin(a)
-        sight = (r + along) * c - across * s, (r + along) * s + across * c
+        sight = (mean_m + along) * c - across * s, (mean_m + along) * s + across * c
         return Pose2(x, y, h).transform(*sight)
 
     h = 1e-6
@@ -52,7 +63,8 @@ def test_a_fix_is_the_sighting_compounded_with_the_observers_pose(seed: int) -> 
         [(np.array(position(*(v + d))) - position(*(v - d))) / (2 * h) for d in h * np.eye(5)],
         axis=1,
     )
-    sensor = np.diag([0.05 * r, r * math.sin(math.radians(5.0))]) ** 2
+    bent = r * arc_width(math.radians(5.0))
+    sensor = np.diag([math.hypot(0.05 * r, bent), r * math.sin(math.radians(5.0))]) ** 2
     P = np.array(observer.covariance)[[[0, 1, 3], [1, 2, 4], [3, 4, 5]]]
 
     sent = observed(Sighting("me", r, a), observer)
@@ -74,6 +86,50 @@ def test_an_arc_shortens_the_line_of_sight_by_this_mean_square(sigma_deg: float)
     weights = np.exp(-0.5 * turns**2) / math.sqrt(math.tau)
     expected = np.trapezoid(weights * (1.0 - np.cos(sigma * turns)) ** 2, turns)
     assert arc_variance(sigma**2) == pytest.approx(expected, rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("share", "sigma_deg"), [(0.05, 2.0), (0.1, 5.0), (0.1, 0.5), (0.01, 20.0)]
+)
+def test_a_fix_stands_where_the_mean_of_its_sighting_is(share: float, sigma_deg: float) -> None:
+    """As a density over the plane: range and bearing err, and so do the sigma and the axes that are
+    taken from them."""
+    sigma = math.radians(sigma_deg)
+    ranges, bearings = np.linspace(0.3, 3.0, 4001), np.linspace(-2.0, 2.0, 2001)
+    density = np.exp(-0.5 * ((1.0 - ranges) / (share * ranges)) ** 2)  # times r dr / (share r)
+    angles = np.exp(-0.5 * (bearings / sigma) ** 2)
+    expected = (density @ ranges / density.sum()) * (angles @ np.cos(bearings) / angles.sum())
+    found = unbiased_range_m(1.0, share, sigma, share)
+    assert found == pytest.approx(expected, abs=60.0 * share**4 + 1e-4)
+    width = angles @ np.cos(bearings) ** 2 / angles.sum() - (angles @ np.cos(bearings)) ** 2 / (
+        angles.sum() ** 2
+    )
+    assert arc_width(sigma) == pytest.approx(math.sqrt(width), abs=1e-4)
+
+
+@pytest.mark.parametrize("interval_s", [0.2, 2.0])
+@pytest.mark.parametrize(("share", "sigma_deg"), [(0.1, 2.0), (0.03, 5.0)])
+def test_fixes_that_repeat_do_not_pull_a_teammate(
+    interval_s: float, share: float, sigma_deg: float
+) -> None:
+    """A standing teammate merges a hundred of them: their mean error along the line of sight stays
+    far below the sigma that is left."""
+    sensor = replace(SENSOR, range_share=share, bearing_sigma_deg=sigma_deg)
+    here = Estimate(Pose2(0.0, 0.0, 0.0), diagonal(1e-5, 1e-5))
+    robot, errors = localizer("joint", Field(), odometry=OdometrySettings(moves=False)), []
+    for seed in range(40):
+        rng, fix = np.random.default_rng(seed), None
+        state = state_at(Pose2(3.3, 0.0, 0.0), diagonal(0.5, 0.1))
+        for i in range(1, 101):
+            read = 3.3 * (1.0 + share * rng.normal()), math.radians(sigma_deg) * rng.normal()
+            stamp_ns = int(i * interval_s * SECOND)
+            fix = fix_for("mate", stamp_ns, here, Sighting("me", *read), sensor, fix)
+            assert fix is not None
+            state = robot.add_fix(state, fix)
+        estimate = state.estimate
+        errors.append((estimate.pose.x - 3.3) / math.sqrt(estimate.covariance.xx))
+    assert abs(np.mean(errors)) < 0.4
+    assert np.std(errors) < 1.3
 
 
 def test_a_fix_from_a_turned_observer_is_within_its_sigma() -> None:

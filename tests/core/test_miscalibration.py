@@ -33,8 +33,9 @@ from cpcbl_team.config import (
     Variant,
     Wall,
 )
-from cpcbl_team.constant_errors import INSENSITIVE, Evidence, Whitened
-from cpcbl_team.geometry import Pose2, step
+from cpcbl_team.constant_errors import INSENSITIVE, NO_ERRORS, Evidence, Whitened
+from cpcbl_team.estimate import Row
+from cpcbl_team.geometry import Pose2, step, wrap_angle
 from cpcbl_team.inputs import Odometry, Sightings
 from cpcbl_team.localizer import Localizer
 from cpcbl_team.miscalibration import (
@@ -43,9 +44,12 @@ from cpcbl_team.miscalibration import (
     Corrected,
     MapRejections,
     ModelCheck,
+    Rules,
     adapted,
+    doubts_of,
     noise_with_factor,
     percentages,
+    with_doubts,
 )
 from cpcbl_team.motion import motion_noise
 from cpcbl_team.sensors import recalibrated
@@ -56,6 +60,20 @@ SENSOR = SensorSettings(range_share=0.05, bearing_sigma_deg=3.0, field_of_view_d
 NOISE = OdometryNoise()
 PIECE_NS = SECOND // 10
 ROUNDS = 8
+
+
+LOOP = tuple(loop() * ROUNDS)
+# In a second each: 0.4 m ahead, a quarter of a circle on the spot, nothing
+STOP_AND_GO = (((0.04, 0.0),) * 10 + ((0.0, 0.05 * math.pi),) * 10 + ((0.0, 0.0),) * 10) * 30
+# In 2 s 1 m ahead, then a quarter of a circle on the spot, then slowly around
+PAUSES = (((0.05, 0.0),) * 20 + ((0.0, 0.05 * math.pi),) * 10 + ((0.025, 0.02),) * 10) * 14
+
+
+class Nees(NamedTuple):
+    """Means over time; 2 and 1 are due."""
+
+    position: float
+    heading: float
 
 
 class Truth(NamedTuple):
@@ -73,9 +91,13 @@ def robot_of(variant: Variant = "joint", field: Field = CORNERS) -> Localizer:
 
 
 def run(
-    truth: Truth, seed: int, variant: Variant = "joint", field: Field = CORNERS
-) -> tuple[State, float]:
-    """The state after some minutes on the loop, and the NEES of the position in the last third."""
+    truth: Truth,
+    seed: int,
+    variant: Variant = "joint",
+    field: Field = CORNERS,
+    plan: Sequence[tuple[float, float]] = LOOP,
+) -> tuple[State, Nees]:
+    """The state after some minutes on the loop, and the NEES in the last third."""
     rng, robot = np.random.default_rng(seed), robot_of(variant, field)
     sensor = SensorSettings(
         range_share=truth.sensor_sigmas * SENSOR.range_share,
@@ -85,7 +107,7 @@ def run(
     state, planned, now = robot.start(0), LOOP_START, 0
     pose = displaced(state.estimate.pose, state.estimate.covariance, rng)
     nees = []
-    for distance, turn in loop() * ROUNDS:
+    for distance, turn in plan:
         planned = step(planned, distance, turn)
         turn = steered(pose, planned)
         noise = motion_noise(pose.heading, distance, turn, NOISE).scaled(factor)
@@ -95,9 +117,12 @@ def run(
         now += PIECE_NS
         seen = frame(pose, now, noise=errors)
         state = robot.cycle(state, recalibrated(seen, -truth.bearing_bias_rad))
-        off = np.array([state.estimate.pose.x - pose.x, state.estimate.pose.y - pose.y])
-        nees.append(off @ np.linalg.solve(matrix3(state.estimate.covariance)[:2, :2], off))
-    return state, float(np.mean(nees[-len(nees) // 3 :]))
+        (x, y, heading), covariance, _ = state.reported
+        off, turned = np.array([x - pose.x, y - pose.y]), wrap_angle(heading - pose.heading)
+        of_position = float(off @ np.linalg.solve(matrix3(covariance)[:2, :2], off))
+        nees.append((of_position, turned**2 / covariance.hh))
+    position, turned = np.mean(nees[-len(nees) // 3 :], axis=0)
+    return state, Nees(position, turned)
 
 
 def adaptation_of(state: State) -> Adaptation:
@@ -122,7 +147,13 @@ def test_what_is_wrong_is_found_and_the_estimate_becomes_consistent(
     found = [run(truth, seed) for seed in range(3)]
     assert all(low < getattr(adaptation_of(state), name) < high for state, _ in found)
     assert all(state.counts["miscalibrated"] for state, _ in found)
-    assert np.mean([nees for _, nees in found]) < 5.0  # 9 to 84 without
+    assert np.mean([nees.position for _, nees in found]) < 5.0  # 9 to 84 without
+
+
+def test_the_heading_that_biased_bearings_gave_is_doubted() -> None:
+    """Also after the correction, by what that may be off (2 to 3 without)."""
+    found = [run(Truth(bearing_bias_rad=math.radians(5.0)), i, plan=PAUSES) for i in range(8)]
+    assert np.mean([nees.heading for _, nees in found]) < 1.5
 
 
 @pytest.mark.parametrize("variant", ["joint", "oval"])
@@ -130,12 +161,35 @@ def test_right_settings_are_left_alone(variant: Variant) -> None:
     found = [run(Truth(), seed, variant) for seed in range(6)]
     assert all(adaptation_of(state) is AS_CONFIGURED for state, _ in found)
     assert not any(misplaced_in(state) for state, _ in found)
-    assert 1.4 < np.mean([nees for _, nees in found]) < 2.8
+    assert 1.4 < np.mean([nees.position for _, nees in found]) < 2.8
 
 
-@pytest.mark.parametrize("variant", ["circular", "weighted"])
-def test_a_variant_without_the_covariance_of_its_errors_does_not_judge(variant: Variant) -> None:
-    state, _ = run(Truth(distance_scale=1.2), 0, variant)
+@pytest.mark.parametrize("variant", ["joint", "circular"])
+def test_right_settings_of_a_robot_that_turns_on_the_spot_are_left_alone(variant: Variant) -> None:
+    """How its noise moves it depends on the path within a block."""
+    for seed in range(8):
+        state, _ = run(Truth(), seed, variant, plan=STOP_AND_GO)
+        assert adaptation_of(state) is AS_CONFIGURED
+
+
+@pytest.mark.parametrize(
+    ("truth", "name", "low"),
+    [
+        (Truth(distance_scale=1.3), "distance_scale", 1.15),
+        (Truth(turn_scale=1.4), "turn_scale", 1.2),
+        (Truth(sensor_sigmas=3.0), "sensor_factor", 1.7),
+    ],
+)
+def test_a_circle_notices_what_is_clear_without_the_covariance_of_errors(
+    truth: Truth, name: str, low: float
+) -> None:
+    found = [run(truth, seed, "circular") for seed in range(3)]
+    assert all(getattr(adaptation_of(state), name) > low for state, _ in found)
+    assert np.mean([nees.position for _, nees in found]) < 4.0
+
+
+def test_a_variant_without_a_covariance_does_not_judge() -> None:
+    state, _ = run(Truth(distance_scale=1.2), 0, "weighted")
     assert adaptation_of(state) is AS_CONFIGURED
     assert state.memory.calibration.check == ModelCheck()
 
@@ -283,15 +337,15 @@ def scattered(size: float, alternating: bool) -> ModelCheck:
 
 def test_scattered_corrections_widen_what_they_point_at() -> None:
     due = 0.999
-    assert adapted(scattered(1.0, alternating=True), AS_CONFIGURED, 0, due) is None
-    by_sensor = adapted(scattered(2.0, alternating=True), AS_CONFIGURED, 0, due)
+    assert adapted(scattered(1.0, alternating=True), AS_CONFIGURED, 0, Rules(due)) is None
+    by_sensor = adapted(scattered(2.0, alternating=True), AS_CONFIGURED, 0, Rules(due))
     assert by_sensor is not None
     assert by_sensor[:5] == pytest.approx(Adaptation(sensor_factor=4.0)[:5], rel=0.05)
-    assert adapted(scattered(2.0, alternating=True), AS_CONFIGURED, 0, due, 0.03) is None
-    by_motion = adapted(scattered(2.0, alternating=False), AS_CONFIGURED, 0, due)
+    assert adapted(scattered(2.0, alternating=True), AS_CONFIGURED, 0, Rules(due, 0.03)) is None
+    by_motion = adapted(scattered(2.0, alternating=False), AS_CONFIGURED, 0, Rules(due))
     assert by_motion is not None
     assert by_motion[:5] == pytest.approx(Adaptation(motion_factor=4.0)[:5], rel=0.05)
-    again = adapted(scattered(0.5, alternating=True), by_sensor, 0, due)
+    again = adapted(scattered(0.5, alternating=True), by_sensor, 0, Rules(due))
     assert again is not None
     assert again.sensor_factor == pytest.approx(1.0, rel=0.05)
 
@@ -308,25 +362,68 @@ def explained(bias: float, blocks: int = 12) -> ModelCheck:
 
 
 def test_a_clear_constant_error_is_corrected() -> None:
-    found = adapted(explained(0.1), AS_CONFIGURED, 0, 0.999)
+    found = adapted(explained(0.1), AS_CONFIGURED, 0, Rules(0.999))
     assert found is not None
     assert found[:5] == pytest.approx(Adaptation(bearing_bias_rad=0.1)[:5], abs=0.01)
-    assert adapted(explained(0.1), AS_CONFIGURED, 0, 0.999, 0.2) is None  # errors come in groups
-    assert adapted(explained(0.1, blocks=8), AS_CONFIGURED, 0, 0.999) is None  # too few
-    assert adapted(explained(0.05), AS_CONFIGURED, 0, 0.999) is None  # 3.3 sigma
-    again = adapted(explained(0.05), Adaptation(bearing_bias_rad=0.1), 0, 0.999)
+    assert (
+        adapted(explained(0.1), AS_CONFIGURED, 0, Rules(0.999, 0.2)) is None
+    )  # errors come in groups
+    assert adapted(explained(0.1, blocks=8), AS_CONFIGURED, 0, Rules(0.999)) is None  # too few
+    assert adapted(explained(0.05), AS_CONFIGURED, 0, Rules(0.999)) is None  # 3.3 sigma
+    again = adapted(explained(0.05), Adaptation(bearing_bias_rad=0.1), 0, Rules(0.999))
     assert again is not None
     assert again.bearing_bias_rad == pytest.approx(0.15, abs=0.01)
-    assert adapted(explained(0.02, blocks=90), AS_CONFIGURED, 0, 0.999) is None  # 1 deg
+    assert adapted(explained(0.02, blocks=90), AS_CONFIGURED, 0, Rules(0.999)) is None  # 1 deg
+
+
+def test_sizes_of_corrections_tell_a_circle_nothing() -> None:
+    rules = Rules(0.999, knows_covariance=False)
+    large = scattered(2.0, alternating=True)
+    assert adapted(large, AS_CONFIGURED, 0, rules) is None
+    assert adapted(explained(0.1), AS_CONFIGURED, 0, rules) is not None  # 6 sigma
+    assert adapted(explained(0.08), AS_CONFIGURED, 0, rules) is None
+    assert adapted(explained(0.08), AS_CONFIGURED, 0, Rules(0.999)) is not None
+    found = adapted(large._replace(rejections=20), AS_CONFIGURED, 980, rules)
+    assert found is not None
+    assert found.sensor_factor == pytest.approx(1.8)
+
+
+def test_an_error_that_is_nearly_clear_is_doubted_and_one_that_was_corrected_too() -> None:
+    def doubts(bias: float, after: Adaptation = AS_CONFIGURED, check: float = 0.0) -> Row:
+        evidence = explained(bias)._replace(doubts=(0.0, 0.0, check))
+        return doubts_of(evidence, AS_CONFIGURED, after, 1.0)
+
+    sigma = explained(0.0).evidence.fit().sigmas[2]
+    assert doubts(2.0 * sigma) == NO_ERRORS
+    assert doubts(3.5 * sigma) == pytest.approx((0.0, 0.0, (3.5**2 + 1.0) * sigma**2), rel=0.1)
+    corrected = Adaptation(bearing_bias_rad=0.1)
+    assert doubts(0.1, corrected) == pytest.approx((0.0, 0.0, sigma**2), rel=0.1)
+    later = explained(0.0)._replace(doubts=(0.0, 0.0, 0.5))
+    assert doubts_of(later, corrected, corrected, 1.0) == (0.0, 0.0, 0.5)
+
+
+def test_doubts_widen_what_is_reported_and_not_what_is_estimated() -> None:
+    """A bias of bearings turns the heading, and the position by its sensitivity."""
+    sensitivity = (0.0, 0.0, 0.3, 0.0, 0.0, -0.2, 0.0, 0.0, 0.0)
+    check = ModelCheck(sensitivity=sensitivity, doubts=(0.0, 0.0, 0.01))
+    state = state_at(LOOP_START, diagonal(0.1, 0.05))
+    assert state.reported is state.estimate
+    memory = Memory(calibration=CalibrationMemory(check=check))
+    reported = state._replace(memory=memory).reported
+    column = np.array([0.3, -0.2, 1.0])
+    expected = matrix3(state.estimate.covariance) + 0.01 * np.outer(column, column)
+    assert matrix3(reported.covariance) == pytest.approx(expected)
+    assert reported.pose == state.estimate.pose
+    assert with_doubts(state.estimate, check) == reported
 
 
 def test_a_persistent_share_of_rejections_widens_too() -> None:
     check = scattered(1.0, alternating=True)._replace(rejections=20)
-    assert adapted(check, AS_CONFIGURED, 2000, 0.999) is None  # 1.0 %
-    found = adapted(check, AS_CONFIGURED, 980, 0.999)  # 2.0 %
+    assert adapted(check, AS_CONFIGURED, 2000, Rules(0.999)) is None  # 1.0 %
+    found = adapted(check, AS_CONFIGURED, 980, Rules(0.999))  # 2.0 %
     assert found is not None
     assert found.sensor_factor > 1.5
-    assert adapted(check, AS_CONFIGURED, 980, 0.99) is None  # here 1 % is due
+    assert adapted(check, AS_CONFIGURED, 980, Rules(0.99)) is None  # here 1 % is due
 
 
 def test_noise_that_is_said_to_be_zero_can_be_widened() -> None:

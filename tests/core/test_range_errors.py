@@ -7,7 +7,7 @@ import pytest
 from msgspec.structs import replace
 from support.core import CORNERS, SECOND, diagonal, frame, localizer, state_at
 
-from cpcbl_team.config import Field, Landmark, SensorSettings
+from cpcbl_team.config import Field, Landmark, SensorSettings, Variant
 from cpcbl_team.geometry import Pose2
 from cpcbl_team.inputs import Sighting, Sightings
 from cpcbl_team.miscalibration import Adaptation, percentages
@@ -103,11 +103,15 @@ def test_landmarks_side_by_side_tell_nothing() -> None:
     assert found.pairs == 0.0
 
 
-@pytest.mark.parametrize("correlation_s", [0.0, 2.0])
-def test_a_robot_whose_ranges_are_short_says_so_and_corrects_them(correlation_s: float) -> None:
+@pytest.mark.parametrize(
+    ("variant", "correlation_s"), [("joint", 0.0), ("joint", 2.0), ("oval", 0.0), ("circular", 0.0)]
+)
+def test_a_robot_whose_ranges_are_short_says_so_and_corrects_them(
+    variant: Variant, correlation_s: float
+) -> None:
     """On both paths of the core."""
     sensor = SensorSettings(correlation_s=correlation_s, field_of_view_deg=360.0)
-    robot, here = localizer("joint", sensor=sensor), Pose2(0.5, -0.3, 0.4)
+    robot, here = localizer(variant, sensor=sensor), Pose2(0.5, -0.3, 0.4)
     rng = np.random.default_rng(0)
     state = state_at(here, diagonal(0.05, 0.05))
     for i in range(1, 181):

@@ -103,6 +103,7 @@ WAYS = {
     "cpcbl-team evaluate calibrated.toml MRCLAM6": Way("RMSE m"),
     "cpcbl-team evaluate mrclam MRCLAM6 --blind 3,4,5 --collaboration none": Way("RMSE m"),
     "cpcbl-team evaluate mrclam MRCLAM6 --blind 3,4,5 --yardstick": Way("centralized EKF"),
+    "cpcbl-team evaluate mrclam MRCLAM6 --blind 3,4,5 --yardstick batch": Way("batch"),
     "cpcbl-team experiment budget --team-size 5 --world chain --seeds 6": Way(
         EXPERIMENT, "long", "--team-size 2 --seeds 1"
     ),

@@ -31,11 +31,12 @@ Fusion = Annotated[Literal["naive", "split-ci"] | None, Option(help="Fusion of a
 Direction = Annotated[
     Literal["one-way", "both-ways"] | None, Option(help="Direction of all robots.")
 ]
-WithBaselines = Annotated[
-    bool,
+Yardstick = Annotated[
+    Literal["ekf", "batch"] | None,
     Option(
-        "--yardstick/--no-yardstick",
-        help="Also run dead reckoning, a solo EKF per robot, a centralized EKF.",
+        help="ekf, or no value: also run dead reckoning, a solo EKF per robot, a centralized EKF;"
+        " batch: these, and batch least squares over all robots, which knows the future.",
+        metavar="[ekf|batch]",
     ),
 ]
 ExportFolder = Annotated[
@@ -84,8 +85,7 @@ def evaluate(
     unknown_starts: Annotated[
         bool, Option("--unknown-starts", help="Robots do not know where they start.")
     ] = False,
-    baselines: WithBaselines = False,
-    batch: Annotated[bool, Option("--batch", hidden=True)] = False,
+    yardstick: Yardstick = None,
     export: ExportFolder = None,
     as_json: options.AsJson = False,
 ) -> None:
@@ -95,8 +95,6 @@ def evaluate(
     from cpcbl_launch.run import logged_team
     from cpcbl_launch.views.run import print_report, progress_bar
 
-    if batch:
-        options.refuse_moved("evaluate --batch", f"bench-batch ARGS='{data}'")
     budgets = bytes_per_s, messages_per_minute, match_messages
     overrides = Overrides(*budgets, variant, collaboration, fusion, direction)
     team = with_overrides(find_team(logged_team.file_for(team_file, data)), overrides)
@@ -106,7 +104,12 @@ def evaluate(
     if unknown_starts:
         logged = logged_team.with_unknown_starts(logged)
     with progress_bar(f"{data.name}", quiet=as_json) as progress:
-        result, paths = evaluate_log(logged, progress, with_baselines=baselines)
+        result, paths = evaluate_log(
+            logged,
+            progress,
+            with_baselines=yardstick is not None,
+            with_batch=yardstick == "batch",
+        )
     lost: dict[str, str] = {}
     if export is not None:
         lost = write_or_reason(export, partial(export_tum, export, paths, logged.truth))

@@ -14,12 +14,30 @@ SUBCOMMANDS: dict[str, dict[str, tuple[str, ...]]] = {
 RENAMED: dict[str, dict[str, str]] = {
     "traffic": {"--for": "--duration"},
     "observer": {"--for": "--duration"},
+    "evaluate": {"--batch": "--yardstick=batch"},
     "chaos": {"--soak-s": "--duration"},
     "look": {"--save": "--output"},
     "init": {"--name": "--team-name"},
     "experiment one-way-vs-both": {"--robots": "--team-sizes"},
     "experiment budget": {"--robots": "--team-size"},
 }
+
+
+# Options whose value may be left out: what they mean then, and the values that they can have
+VALUES: dict[str, dict[str, tuple[str, ...]]] = {"evaluate": {"--yardstick": ("ekf", "batch")}}
+LEFT_OUT: dict[str, tuple[str, ...]] = {"evaluate": ("--no-yardstick",)}  # they said the default
+
+
+def with_values(words: Sequence[str]) -> list[str]:
+    """The words after `cpcbl-team`, with the values that may be left out: the first of those that
+    the option can have. (Typer knows no such values.)"""
+    command = words[0] if words else ""
+    left_out, new = LEFT_OUT.get(command, ()), []
+    for i, word in enumerate(words):
+        values = VALUES.get(command, {}).get(word, ())
+        is_alone = values and not any(value in values for value in words[i + 1 : i + 2])
+        new.append(f"{word}={values[0]}" if is_alone else word)
+    return [word for word in new if word not in left_out]
 
 
 def present_form(words: Sequence[str]) -> list[str]:

@@ -2,7 +2,7 @@
 
 The baselines use the same log with the same settings. Dead reckoning; a solo extended Kalman filter
 (EKF) per robot, which uses landmarks only; one centralized EKF over the poses of all robots, which
-uses all sightings of all robots.
+uses all sightings of all robots; batch least squares, which uses the later ones too (`batch.py`).
 """
 
 from collections.abc import Mapping, Sequence
@@ -12,6 +12,7 @@ from typing import NamedTuple
 from msgspec.structs import replace
 
 from cpcbl_launch.lab.baselines import BaselineInputs, baseline_inputs, run_ekf
+from cpcbl_launch.lab.batch import smooth
 from cpcbl_launch.reporting.metrics import Floats, Trajectory, samples_with_truth, score
 from cpcbl_launch.reporting.recorder import (
     BaselineReport,
@@ -34,14 +35,20 @@ class LogEvaluation(NamedTuple):
 
 
 def evaluate_log(
-    logged: LoggedTeam, progress: Progress | None = None, *, with_baselines: bool = False
+    logged: LoggedTeam,
+    progress: Progress | None = None,
+    *,
+    with_baselines: bool = False,
+    with_batch: bool = False,
 ) -> LogEvaluation:
     """Runs all robots of a log and scores them against its truth.
 
-    With baselines, other filters run on the same inputs and are scored at the same times.
+    With baselines, other filters run on the same inputs and are scored at the same times; with the
+    batch, they and batch least squares do.
     """
     team, start_ns, end_ns = logged.team, logged.start_ns, logged.end_ns
-    show, team_end = progress or (lambda done: None), 0.5 if with_baselines else 1.0
+    with_others = with_baselines or with_batch
+    show, team_end = progress or (lambda done: None), 0.5 if with_others else 1.0
     hub = MemoryHub()
     recorder = Recorder(hub.session())
     nodes = robot_nodes(team, hub, start_ns)
@@ -55,11 +62,16 @@ def evaluate_log(
         duration_s=(end_ns - start_ns) * 1e-9,
     )
     own = {name: recorder.trajectory(name) for name in team.robots}
-    if not with_baselines:
+    if not with_others:
         return LogEvaluation(report, {"estimate": own})
     stamps_ns = {name: path.stamps_ns.tolist() for name, path in own.items()}
     inputs = baseline_inputs(logged)
-    others = run_baselines(inputs, team.map, stamps_ns, lambda done: show(0.5 + 0.5 * done))
+    share = 0.2 if with_batch else 0.5  # of the time
+    others = run_baselines(inputs, team.map, stamps_ns, lambda done: show(0.5 + share * done))
+    if with_batch:
+        others["batch_least_squares"] = smooth(
+            inputs, team.map, stamps_ns, lambda done: show(0.7 + 0.3 * done)
+        )
     figures = {kind: baseline_report(paths, logged.truth) for kind, paths in others.items()}
     return LogEvaluation(replace(report, yardsticks=figures), {"estimate": own, **others})
 

@@ -1,17 +1,17 @@
-"""Batch least squares on logs whose noise is known, and the benchmark that shows it."""
+"""Batch least squares on logs whose noise is known, and the command that shows it."""
 
 import json
 from pathlib import Path
 
 import numpy as np
 import pytest
-from benchmarks.batch import smooth
-from support.benchmarks import run_benchmark
 from support.logs import log_team, write_log
 from support.noisy_logs import ROBOTS, figure, noisy_log, rewrite_table, with_start_poses
 from support.processes import command_line
 
+from cpcbl_launch.commands.old_forms import with_values
 from cpcbl_launch.lab.baselines import baseline_inputs, run_ekf
+from cpcbl_launch.lab.batch import smooth
 from cpcbl_launch.lab.evaluation import baseline_report
 from cpcbl_launch.reporting.metrics import Floats
 from cpcbl_launch.reporting.recorder import BaselineReport
@@ -65,21 +65,45 @@ def test_the_batch_bears_wrong_sightings(tmp_path: Path) -> None:
     assert figure(batch_of(wrong)) < 1.5 * clean
 
 
-def test_the_benchmark_shows_the_batch_beside_the_filters(tmp_path: Path) -> None:
+def test_the_command_shows_the_batch_beside_the_filters(tmp_path: Path) -> None:
     write_log(tmp_path, ROBOTS, 3.0)
-    options = ("--blind", "3", "--output", tmp_path)
-    shown = run_benchmark("batch", "mrclam-uncalibrated", tmp_path, *options)
+    evaluate = "evaluate", "--yardstick", "batch", "mrclam-uncalibrated", str(tmp_path)
+    shown = command_line(*evaluate, "--blind", "3")
     assert shown.returncode == 0, shown.stderr
     for words in ("dead reckoning", "solo EKF", "centralized EKF", "batch least squares"):
         assert words in shown.stdout
-    lines = [line for line in shown.stdout.splitlines() if "written" not in line]
-    assert max(map(len, lines)) <= 80
-    written = json.loads((tmp_path / "batch.json").read_text())
+    assert max(map(len, shown.stdout.splitlines())) <= 80
+    written = json.loads(command_line(*evaluate, "--json").stdout)
     assert written["yardsticks"]["batch_least_squares"]["robots"].keys() == set(ROBOTS)
 
 
-def test_the_former_option_is_one_line_that_names_the_target() -> None:
+def test_a_yardstick_without_a_value_is_that_of_filters(tmp_path: Path) -> None:
+    write_log(tmp_path, ROBOTS, 3.0)
+    shown = command_line("evaluate", "--yardstick", "mrclam-uncalibrated", str(tmp_path))
+    assert shown.returncode == 0, shown.stderr
+    assert "centralized EKF" in shown.stdout
+    assert "batch" not in shown.stdout
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        (["evaluate", "a", "b", "--yardstick"], ["evaluate", "a", "b", "--yardstick=ekf"]),
+        (["evaluate", "--yardstick", "a", "b"], ["evaluate", "--yardstick=ekf", "a", "b"]),
+        (["evaluate", "--yardstick", "--json"], ["evaluate", "--yardstick=ekf", "--json"]),
+        (["evaluate", "--yardstick", "batch", "b"], ["evaluate", "--yardstick", "batch", "b"]),
+        (["evaluate", "--yardstick=batch"], ["evaluate", "--yardstick=batch"]),
+        (["evaluate", "a", "--no-yardstick", "b"], ["evaluate", "a", "b"]),
+        (["check", "--yardstick"], ["check", "--yardstick"]),
+        ([], []),
+    ],
+)
+def test_a_value_may_be_left_out(words: list[str], expected: list[str]) -> None:
+    assert with_values(words) == expected
+
+
+def test_the_former_option_is_one_line_that_names_the_present_one() -> None:
     ran = command_line("evaluate", "mrclam", "MRCLAM6", "--batch")
     assert ran.returncode == 2
     (line,) = ran.stderr.splitlines()
-    assert "make bench-batch ARGS='MRCLAM6'" in line
+    assert "evaluate mrclam MRCLAM6 --yardstick=batch" in line

@@ -6,40 +6,25 @@ linear around the last trajectory, backwards the smoother of Rauch, Tung & Strie
 position moves any more. Source: Bell (1994), "The iterated Kalman smoother as a Gauss-Newton
 method". The first trajectory is that of the centralized EKF. The further a sighting is beyond the
 gate, the less it counts (iteratively reweighted least squares).
-
-`make bench-batch ARGS='MRCLAM6 --blind 3,4,5'`
 """
 
-import argparse
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from benchmarks.report import show_and_write, user_errors
-from msgspec.structs import replace
-from rich.console import Console
 
-from cpcbl_launch.commands.options import parse_names
 from cpcbl_launch.lab.baselines import (
     SMALLEST_VARIANCE,
     BaselineInputs,
     OdometryTrack,
     as_matrix,
     as_trajectory,
-    baseline_inputs,
     compose,
     linearize,
     run_ekf,
 )
-from cpcbl_launch.lab.evaluation import baseline_report, evaluate_log
 from cpcbl_launch.reporting.metrics import Floats, Trajectory
-from cpcbl_launch.reporting.recorder import Report
-from cpcbl_launch.run import logged_team
 from cpcbl_launch.simulation.in_process import Progress
-from cpcbl_launch.team.file import find_team
-from cpcbl_launch.team.overrides import with_blind_robots
-from cpcbl_launch.views.run import print_report, progress_bar
 from cpcbl_team.config import Field
 from cpcbl_team.estimate import Estimate
 from cpcbl_team.fusion import chi_square_bounds
@@ -231,38 +216,3 @@ def _between(
         if stamp_ns in wanted:
             estimates.append((stamp_ns, pose, covariance))
     return as_trajectory(estimates)
-
-
-def evaluate(logged: logged_team.LoggedTeam, progress: Progress = lambda done: None) -> Report:
-    """The figures of a team and its baselines on a log, and of batch least squares beside them."""
-    report, paths = evaluate_log(logged, lambda done: progress(0.7 * done), with_baselines=True)
-    stamps_ns = {name: path.stamps_ns.tolist() for name, path in paths["estimate"].items()}
-    inputs = baseline_inputs(logged)
-    batch = smooth(inputs, logged.team.map, stamps_ns, lambda done: progress(0.7 + 0.3 * done))
-    figures = baseline_report(batch, logged.truth)
-    return replace(report, yardsticks=report.yardsticks | {"batch_least_squares": figures})
-
-
-def main() -> None:
-    """Evaluates a team on a real log beside EKFs and batch least squares; writes `batch.json`."""
-    parser = argparse.ArgumentParser(prog="bench-batch", description=main.__doc__)
-    usual = Path("mrclam")  # without this log
-    parser.add_argument("team", type=Path, nargs="?", default=usual, help="Default: mrclam.")
-    parser.add_argument("data", type=Path, help="Folder of one data set, e.g. MRCLAM6.")
-    parser.add_argument("--blind", default="", help="Robots that cannot see landmarks.")
-    parser.add_argument("--duration", type=float, help="Seconds of the log; default: all.")
-    parser.add_argument("--output", type=Path, default=Path("build"), help="Folder for the JSON.")
-    given = parser.parse_args()
-    with user_errors(parser):
-        team = find_team(logged_team.file_for(given.team, given.data))
-        logged = logged_team.load_logged_team(team, given.data)
-        blind = with_blind_robots(logged.team, parse_names(given.blind), logged.left_out)
-        logged = logged_team.with_duration(logged._replace(team=blind), given.duration)
-        with progress_bar(given.data.name, quiet=False) as progress:
-            report = evaluate(logged, progress)
-    print_report(report, Console())
-    show_and_write(report, (), given.output / "batch.json")
-
-
-if __name__ == "__main__":
-    main()
