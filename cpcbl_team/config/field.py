@@ -45,7 +45,8 @@ class Field(Table, frozen=True, kw_only=True):
     @property
     def gives_only_ranges(self) -> bool:
         """Whether there is something on the map, and no bearing of it is used."""
-        gives = {o.gives for o in (*self.landmarks.values(), *self.walls.values())}
+        gives = {mark.gives for mark in self.landmarks.values()}
+        gives |= {wall.gives for wall in self.walls.values()}
         return "range" in gives and not gives & {"both", "bearing"}
 
     def bounds(self) -> tuple[float, float, float, float]:
