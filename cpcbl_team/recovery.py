@@ -211,7 +211,8 @@ def undetermined(
     it measures now; empty if it does, and without evidence (walls are none).
 
     `objects_ns`: when each object was last accepted. A pose has three unknowns, so fewer than three
-    readings of different objects determine none. (Along the way they may: see `relocalize`.)
+    readings of different objects determine none, and without a bearing no readings determine a
+    heading. (Along the way they may: see `relocalize`.)
     """
     accepted = [e for e in evidence if objects_ns.get(e.source, kidnapped_ns) > kidnapped_ns]
     if not evidence or any(e.heading_rad is not None for e in accepted):
@@ -224,6 +225,8 @@ def undetermined(
         )
     if sum(readings.values()) < UNKNOWNS:
         return f"only {' and '.join(names)} agree: two readings do not determine a pose"
+    if all(e.bearing_rad is None for e in accepted):
+        return "only ranges or positions agree: they do not determine a heading"
     return ""
 
 

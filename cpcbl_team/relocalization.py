@@ -18,7 +18,7 @@ from cpcbl_team.estimate import (
     ZERO3,
     Covariance3,
     Estimate,
-    Information,
+    InformationSum,
     Row,
     merge,
 )
@@ -28,7 +28,7 @@ from cpcbl_team.state import Evidence
 
 DRIFT_SHARE = 0.1  # of the way: how far dead reckoning errs, while a pose is looked for
 DRIFT_FACTOR = 1.0  # on the variance of the odometry's noise
-MOST_STARTS = 16
+MOST_STARTS = 10
 CELLS = 5, 4, 8  # of x, y and heading: from the middle of each a pose is looked for
 OUTLIER = 14.0  # the chi-square of a piece that is left out
 RIVAL = 6.0  # another pose whose chi-square is larger by less than this may be the right one
@@ -251,14 +251,14 @@ def _fit(start: Pose2, pieces: list[PropagatedEvidence]) -> Fit | None:
     while True:
         estimate = Estimate(start, _OPEN)
         for _ in range(10):
-            evidence = Information.none()
+            evidence = InformationSum()
             for piece in used:
-                for row, residual, variance in piece.rows(estimate.pose):
-                    evidence = evidence.add(row, residual, variance)
-            if evidence.matrix.hh <= 0.0:
+                for (x, y, a), residual, variance in piece.rows(estimate.pose):
+                    evidence.add(x, y, a, residual, 1.0 / variance)
+            if evidence.hh <= 0.0:
                 return None
             before = estimate.pose
-            estimate = merge(Estimate(before, _STEP), evidence)
+            estimate = merge(Estimate(before, _STEP), evidence.sums())
             change = math.hypot(estimate.pose.x - before.x, estimate.pose.y - before.y)
             if change < 1e-4 and abs(estimate.pose.heading - before.heading) < 1e-4:
                 break

@@ -70,7 +70,9 @@ def found_nees(seed: int, gives: Gives, places: Sequence[tuple[float, float]]) -
                 bearing_sigma_rad=sigma_rad,
             )
             pieces.append(noisy)
-        found = relocalize(tuple(pieces[-MOST_PIECES:]), reckoned, field, NOISE)
+        found = None
+        if i % 4 == 3:
+            found = relocalize(tuple(pieces[-MOST_PIECES:]), reckoned, field, NOISE)
         if found is not None:
             return [pose_nees(found, true)]
         reckoned, true = step(reckoned, 0.25, 0.17), noisy_step(true, 0.25, 0.17, rng)
@@ -119,9 +121,26 @@ def carried_away(
     return state, true
 
 
-@pytest.mark.parametrize("variant", ["joint", "oval", "circular"])
+LONG = [
+    pytest.param(gives, count, variant, marks=pytest.mark.long)
+    for gives, count in (("bearing", 2), ("bearing", 3), ("both", 1), ("both", 2))
+    for variant in ("oval", "circular")
+]
+
+
 @pytest.mark.parametrize(
-    ("gives", "count"), [("bearing", 2), ("range", 2), ("bearing", 3), ("both", 1), ("both", 2)]
+    ("gives", "count", "variant"),
+    [
+        ("bearing", 2, "joint"),
+        ("range", 2, "joint"),
+        ("range", 2, "oval"),
+        ("range", 2, "circular"),
+        ("range", 4, "joint"),
+        ("bearing", 3, "joint"),
+        ("both", 1, "joint"),
+        ("both", 2, "joint"),
+        *LONG,
+    ],
 )
 def test_a_robot_that_was_carried_away_is_found_or_lost(
     gives: Gives, count: int, variant: Variant
@@ -135,5 +154,5 @@ def test_a_robot_that_was_carried_away_is_found_or_lost(
 
 
 def test_a_robot_with_two_readings_a_frame_says_why_it_stays_lost() -> None:
-    reasons = {carried_away(seed, "bearing", 2)[0].lost for seed in range(8)}
+    reasons = {carried_away(seed, "bearing", 2, "joint")[0].lost for seed in range(8)}
     assert any("agree: two readings do not determine a pose" in reason for reason in reasons)
