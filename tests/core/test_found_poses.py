@@ -156,3 +156,22 @@ def test_a_robot_that_was_carried_away_is_found_or_lost(
 def test_a_robot_with_two_readings_a_frame_says_why_it_stays_lost() -> None:
     reasons = {carried_away(seed, "bearing", 2, "joint")[0].lost for seed in range(8)}
     assert any("agree: two readings do not determine a pose" in reason for reason in reasons)
+
+
+# Ranges alone -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("gives", "is_corrected"), [("range", True), ("both", False)])
+def test_ranges_correct_the_heading_of_oval_where_nothing_else_does(
+    gives: Gives, is_corrected: bool
+) -> None:
+    """After a drive a wrong place says that the heading was wrong too."""
+    field = giving("range", CORNERS)
+    field.landmarks["last"] = Landmark(x_m=4.0, y_m=9.0, gives=gives)
+    robot, begin = localizer("oval", field, sensor=SENSOR), Pose2(3.0, 3.0, 0.0)
+    state = state_at(begin, diagonal_of(0.05, 0.3))
+    state = robot.add_odometry(state, Odometry(0, SECOND, 1.0, 0.0))
+    true = step(Pose2(3.0, 3.0, 0.3), 1.0, 0.0)
+    names = [name for name in field.landmarks if name != "last"]
+    state = robot.cycle(state, frame(true, SECOND, field=field, names=names))
+    assert (state.estimate.pose.heading > 0.1) is is_corrected

@@ -129,5 +129,6 @@ def test_no_variant_is_overconfident_in_any_world() -> None:
     right = tuple(name for name, world in world_list.worlds().items() if world.truth is None)
     found = figures(right, VARIANTS, 60)
     lost = {name for name, word in found.items() if word == "always lost"}
-    assert lost == {f"carried away, 1 landmark, {variant}" for variant in VARIANTS}
+    assert all("1 landmark" in name for name in lost)
+    assert lost >= {f"carried away, 1 landmark, {variant}" for variant in VARIANTS}
     assert {n for n, word in found.items() if n not in lost and word not in CONSISTENT} == set()
