@@ -76,7 +76,7 @@ def relocalize(
     freedom = sum(readings_of(piece.evidence) for piece in best.used) - 3
     if freedom < 1 or not _is_certain(estimate) or cost > chi_square_bound(freedom):
         return None
-    widened = _widened(cost, estimate, best.used, noise)
+    widened = _wider_covariance(cost, estimate, best.used, noise)
     if widened is None or not _is_certain(estimate._replace(covariance=widened)):
         return None
     covariance = widened.scaled(max(1.0, cost / freedom))
@@ -277,7 +277,7 @@ def _with_drift(fit: Fit, noise: OdometryNoise) -> tuple[float, Estimate]:
     pose = fit.pose
     for _ in range(2):
         cost, offset, covariance = _filtered(pose, fit.used, noise)
-        pose = _moved(pose, offset)
+        pose = _at_offset(pose, offset)
     return cost, Estimate(pose, covariance)
 
 
@@ -309,12 +309,12 @@ def _filtered(
     return cost, (x, y, heading), covariance
 
 
-def _moved(pose: Pose2, offset: Row) -> Pose2:
+def _at_offset(pose: Pose2, offset: Row) -> Pose2:
     x, y, heading = offset
     return Pose2(pose.x + x, pose.y + y, wrap_angle(pose.heading + heading))
 
 
-def _widened(
+def _wider_covariance(
     cost: float, estimate: Estimate, used: list[PropagatedEvidence], noise: OdometryNoise
 ) -> Covariance3 | None:
     """The covariance, wider along its weakest axis where the chi-square rises less there than that
@@ -349,7 +349,7 @@ def _profile(
     """(chi-square, offset) of the best pose among those that are so far along an axis."""
     offset, least = _sum((0.0, 0.0, 0.0), axis, goal), math.nan
     for _ in range(3):
-        least, step, covariance = _filtered(_moved(origin, offset), used, noise)
+        least, step, covariance = _filtered(_at_offset(origin, offset), used, noise)
         towards = covariance.times(axis)
         along = _dot(axis, towards)
         if along <= 0.0:
