@@ -288,7 +288,7 @@ class Recovery:
 
     def _questioned(self, state: State) -> State:
         """The state of a robot that is not lost, but rejects more than it should, or did lately. It
-        is elsewhere if the evidence since then determines another pose."""
+        is elsewhere if its own evidence since then determines another pose."""
         now, memory = state.stamp_ns, state.memory.recovery
         if rejected_of(state.updates.innovations)[0] >= SUSPICIOUS:
             if memory.suspected_ns < 0:
@@ -300,8 +300,9 @@ class Recovery:
         if now - memory.relocalization_ns < QUESTION_NS:
             return state
         evidence = self._evidence_since(memory, memory.suspected_ns)
+        own = tuple(e for e in evidence if not e.from_teammate)  # a liar must not move it
         memory = memory._replace(relocalization_ns=now)
-        found = relocalize(evidence, state.odometry_from_robot, self._field, self._noise)
+        found = relocalize(own, state.odometry_from_robot, self._field, self._noise)
         if found is None or agrees(state.estimate, found):
             return with_recovery(state, memory)
         return self._found(state.counted("lost"), found, memory)
