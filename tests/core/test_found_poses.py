@@ -15,9 +15,9 @@ from cpcbl_team.config import Field, Gives, Landmark, OdometrySettings, SensorSe
 from cpcbl_team.estimate import Estimate
 from cpcbl_team.geometry import Pose2, step, wrap_angle
 from cpcbl_team.inputs import Odometry
-from cpcbl_team.recovery import MOST_PIECES, SPACING_NS
+from cpcbl_team.recovery import MOST_PIECES, SPACING_NS, with_innovations
 from cpcbl_team.relocalization import relocalize
-from cpcbl_team.state import State
+from cpcbl_team.state import Evidence, Memory, RecoveryMemory, State, Updates
 
 NOISE = OdometrySettings()
 SENSOR = SensorSettings(range_share=0.05, bearing_sigma_deg=3.0)
@@ -156,6 +156,26 @@ def test_a_robot_that_was_carried_away_is_found_or_lost(
 def test_a_robot_with_two_readings_a_frame_says_why_it_stays_lost() -> None:
     reasons = {carried_away(seed, "bearing", 2, "joint")[0].lost for seed in range(8)}
     assert any("agree: two readings do not determine a pose" in reason for reason in reasons)
+
+
+@pytest.mark.parametrize("from_teammate", [False, True])
+def test_only_its_own_evidence_moves_a_robot_that_is_not_lost(from_teammate: bool) -> None:
+    """Else a liar whose reports it rejects could carry it away."""
+    robot, elsewhere, pieces = localizer(field=Field()), Pose2(5.0, 5.0, 0.0), []
+    for i in range(1, 9):
+        here = Pose2(0.3 * i, 0.05 * i * i, 0.3 * i)
+        there = elsewhere @ here
+        sigmas = 0.05, 0.0, 0.0
+        fix = Evidence(i * SPACING_NS, here, "mate", there.x, there.y, None, None, *sigmas)
+        pieces.append(fix._replace(from_teammate=from_teammate))
+    now = pieces[-1].stamp_ns
+    memory = Memory(RecoveryMemory(evidence=tuple(pieces), suspected_ns=0))
+    state = state_at(pieces[-1].odometry_from_robot, diagonal_of(0.05, 0.05), now)
+    suspicious = Updates(innovations=with_innovations(1, 16, 2, 20))
+    state = state._replace(memory=memory, updates=suspicious)
+    state = state._replace(odometry_from_robot=pieces[-1].odometry_from_robot)
+    after = robot.recovery.check(state)
+    assert ("found_again" in after.counts) is not from_teammate
 
 
 # Ranges alone -------------------------------------------------------------------------------------
