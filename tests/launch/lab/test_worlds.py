@@ -65,7 +65,7 @@ def test_a_lost_robot_has_no_figures_but_that() -> None:
 
 
 def test_worlds_are_chosen_by_words() -> None:
-    chosen = cases(["2 landmarks range", "ring,"], ["joint", "oval"])
+    chosen = cases(["2 landmarks range-only", "ring,"], ["joint", "oval"])
     assert list(chosen) == [
         ("2 landmarks range-only", "joint"),
         ("2 landmarks range-only", "oval"),
