@@ -86,7 +86,7 @@ class Localizer:
         self._window = rules.lost_window
         self._belief_age_ns = int(settings.collaboration.max_age_s * 1e9)
         self._timers = ObjectTimers(settings)
-        self._variant = variant_of(settings)
+        self._variant = variant_of(settings, field)
         self._landmarks = Landmarks(field, settings, gates)
         self._calibration = OwnCalibration(settings, field, self._landmarks)
         self.recovery = Recovery(settings, field, self._landmarks, self._variant.reduce)

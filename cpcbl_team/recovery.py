@@ -15,7 +15,7 @@ from cpcbl_team.fixes import PoseObservation
 from cpcbl_team.landmarks import Landmarks
 from cpcbl_team.measurements import Measurement
 from cpcbl_team.miscalibration import MapRejections
-from cpcbl_team.relocalization import relocalize
+from cpcbl_team.relocalization import are_apart, chi_square_bound, readings_of, relocalize
 from cpcbl_team.state import (
     FIX,
     Evidence,
@@ -31,6 +31,9 @@ WINDOW_NS: Final = 20_000_000_000
 SPACING_NS: Final = 500_000_000  # one piece of evidence an object and so long
 MOST_PIECES: Final = 30
 INFLATION_NS: Final = 1_000_000_000
+QUESTION_NS: Final = 2_000_000_000  # a suspicious robot asks so often whether it is elsewhere
+SUSPICIOUS: Final = 2  # of the last innovations rejected; of 20 that is 2 in 10 000 times
+UNKNOWNS: Final = 3  # of a pose
 _LEVER_M = 2.0  # over such a way an error of position has become one of heading
 Stamped = TypeVar("Stamped", Evidence, LandmarkSnapshot)
 
@@ -173,12 +176,9 @@ def lost_reason(estimate: Estimate, innovations: int, limits: Limits) -> str:
         return f"position sigma {estimate.position_sigma_m:.2f} m"
     if hh > heading_variance:
         return f"heading sigma {math.degrees(estimate.heading_sigma_rad):.0f} deg"
-    if innovations & innovations + 1 == 0:  # all bits are set: none was rejected
-        return ""
-    digits = innovations.bit_length()
-    rejected = digits - innovations.bit_count()
-    if rejected > most and digits > least:
-        return f"{rejected} of the last {digits - 1} innovations rejected"
+    rejected, length = rejected_of(innovations)
+    if rejected > most and length >= least:
+        return f"{rejected} of the last {length} innovations rejected"
     return ""
 
 
@@ -210,14 +210,44 @@ def undetermined(
     """Why a robot that may have been kidnapped does not know its pose, though its gates accept what
     it measures now; empty if it does, and without evidence (walls are none).
 
-    `objects_ns`: when each object was last accepted.
+    `objects_ns`: when each object was last accepted. A pose has three unknowns, so fewer than three
+    readings of different objects determine none, and without a bearing no readings determine a
+    heading. (Along the way they may: see `relocalize`.)
     """
     accepted = [e for e in evidence if objects_ns.get(e.source, kidnapped_ns) > kidnapped_ns]
-    is_determined = len({(e.x, e.y) for e in accepted}) > 1
-    if not evidence or is_determined or any(e.heading_rad is not None for e in accepted):
+    if not evidence or any(e.heading_rad is not None for e in accepted):
         return ""
-    names = sorted({e.source for e in accepted})
-    return f"only {names[0] if names else 'one object'} agrees: no turn about it can be observed"
+    readings = {e.source: readings_of(e) for e in accepted}
+    names = sorted(readings)
+    if len(names) < 2:
+        return (
+            f"only {names[0] if names else 'one object'} agrees: no turn about it can be observed"
+        )
+    if sum(readings.values()) < UNKNOWNS:
+        return f"only {' and '.join(names)} agree: two readings do not determine a pose"
+    if all(e.bearing_rad is None for e in accepted):
+        return "only ranges or positions agree: they do not determine a heading"
+    return ""
+
+
+def agrees(estimate: Estimate, found: Estimate) -> bool:
+    """Whether a pose from recent evidence is the estimate's, by the chi-square bound of 99.9 %; a
+    small difference may have other causes than a wrong pose."""
+    if not are_apart(estimate.pose, found.pose):
+        return True
+    information = estimate.covariance.plus(found.covariance).inverse()
+    dx, dy = found.pose.x - estimate.pose.x, found.pose.y - estimate.pose.y
+    turn = math.remainder(found.pose.heading - estimate.pose.heading, math.tau)
+    x, y, heading = information.times((dx, dy, turn))
+    return dx * x + dy * y + turn * heading <= chi_square_bound(UNKNOWNS)
+
+
+def rejected_of(innovations: int) -> tuple[int, int]:
+    """How many innovations of a window were rejected, and how many it has."""
+    if innovations & innovations + 1 == 0:  # all bits are set: none was rejected
+        return 0, innovations.bit_length() - 1
+    digits = innovations.bit_length()
+    return digits - innovations.bit_count(), digits - 1
 
 
 class Recovery:
@@ -250,9 +280,32 @@ class Recovery:
             reason = undetermined(evidence, state.updates.objects_ns, memory.kidnapped_ns)
         if reason:
             return self._recover(state, reason)
-        if not memory.lost:
+        if memory.lost:
+            return with_recovery(state, memory._replace(lost="", kidnapped_ns=-1))
+        if memory.suspected_ns < 0 and not rejected_of(state.updates.innovations)[0]:
             return state
-        return with_recovery(state, memory._replace(lost="", kidnapped_ns=-1))
+        return self._questioned(state)
+
+    def _questioned(self, state: State) -> State:
+        """The state of a robot that is not lost, but rejects more than it should, or did lately. It
+        is elsewhere if its own evidence since then determines another pose."""
+        now, memory = state.stamp_ns, state.memory.recovery
+        if rejected_of(state.updates.innovations)[0] >= SUSPICIOUS:
+            if memory.suspected_ns < 0:
+                return with_recovery(state, memory._replace(suspected_ns=now))
+        elif memory.suspected_ns < 0:
+            return state
+        elif now - memory.suspected_ns > WINDOW_NS:
+            return with_recovery(state, memory._replace(suspected_ns=-1))
+        if now - memory.relocalization_ns < QUESTION_NS:
+            return state
+        evidence = self._evidence_since(memory, memory.suspected_ns)
+        own = tuple(e for e in evidence if not e.from_teammate)  # a liar must not move it
+        memory = memory._replace(relocalization_ns=now)
+        found = relocalize(own, state.odometry_from_robot, self._field, self._noise)
+        if found is None or agrees(state.estimate, found):
+            return with_recovery(state, memory)
+        return self._found(state.counted("lost"), found, memory)
 
     def _recover(self, state: State, reason: str) -> State:
         """The next state of a robot that is lost for this reason."""
@@ -285,7 +338,7 @@ class Recovery:
         """The state of a robot that is found again: here everything begins anew."""
         _, teammates, calibration, _ = memory = state.memory.counted("found_again")
         memory = memory._replace(
-            recovery=recovery._replace(lost="", kidnapped_ns=-1),
+            recovery=recovery._replace(lost="", kidnapped_ns=-1, suspected_ns=-1),
             teammates=teammates._replace(senders=reset_scores(teammates.senders)),
             calibration=calibration._replace(
                 references=None,

@@ -18,7 +18,7 @@ from cpcbl_team.estimate import (
     ZERO3,
     Covariance3,
     Estimate,
-    Information,
+    InformationSum,
     Row,
     merge,
 )
@@ -28,8 +28,16 @@ from cpcbl_team.state import Evidence
 
 DRIFT_SHARE = 0.1  # of the way: how far dead reckoning errs, while a pose is looked for
 DRIFT_FACTOR = 1.0  # on the variance of the odometry's noise
-MOST_STARTS = 16
+MOST_STARTS = 10
+CELLS = 5, 4, 8  # of x, y and heading: from the middle of each a pose is looked for
+OUTLIER = 14.0  # the chi-square of a piece that is left out
+RIVAL = 6.0  # another pose whose chi-square is larger by less than this may be the right one
+STEPS = (-8.0, -4.0, -2.0, 2.0, 4.0, 8.0)  # sigmas along the weakest axis
+MOST_WIDENING = 4.0  # of the variance along it
+LEAST_RISE = 0.5  # of the chi-square, against that of the Gaussian,
+FAR = 32.0  # which counts as this at most
 _OPEN = Covariance3(1e6, 0.0, 1e6, 0.0, 0.0, 1e3)
+_STEP = Covariance3(9.0, 0.0, 9.0, 0.0, 0.0, 1.0)  # how far one iteration of a fit may lead
 _SHARPEST = 1e-6  # (1 mm)^2, (1 mrad)^2: sharper evidence drowns _OPEN in rounding
 _ENOUGH_POSITION_SIGMA_M = 0.7
 _ENOUGH_HEADING_SIGMA_RAD = 0.5
@@ -43,33 +51,43 @@ def relocalize(
 ) -> Estimate | None:
     """The pose from recent evidence alone, or None where the evidence does not determine one.
 
-    It needs one residual more than unknowns, a fit that the chi-square bound accepts, and no second
-    pose that fits nearly as well. What n pieces owe to teammates may be one and the same error:
-    each counts it with n times its variance (split covariance intersection of n, equal weights). A
-    fix with a heading counts as two, for one error of its observer may be in both. It is a whole
-    pose, but nothing confirms it while it is alone.
+    It needs one residual more than unknowns, a fit that the chi-square bound accepts, no second
+    pose that fits nearly as well, and a chi-square that rises to either side as that of a Gaussian
+    does. What n pieces owe to teammates may be one and the same error: each counts it with n times
+    its variance (split covariance intersection of n, equal weights). A fix with a heading counts as
+    two, for one error of its observer may be in both. It is a whole pose, but nothing confirms it
+    while it is alone.
     """
     headed = sum(e.heading_rad is not None for e in evidence)
     if not headed and len({(e.x, e.y) for e in evidence}) < 2:
         return None
     repeated = sum(e.from_teammate for e in evidence) + headed
     pieces = [PropagatedEvidence(e, odometry_from_robot, repeated) for e in evidence]
-    if sum(p.residual_count for p in pieces) < 4:
+    if sum(readings_of(e) for e in evidence) < 4:
         return None
-    starts = sorted(_starts(pieces, field), key=lambda start: _cost(start, pieces))
-    fits = [_fit(start, pieces) for start in starts[:MOST_STARTS]]
+    fits = [_fit(start, pieces) for start in _spread_starts(pieces, field)]
     found = sorted((f for f in fits if f is not None), key=lambda f: f.cost)
     if not found:
         return None
     best = found[0]
-    if any(f.cost < best.cost + 6.0 and _are_apart(f.pose, best.pose) for f in found[1:]):
+    if any(f.cost < best.cost + RIVAL and are_apart(f.pose, best.pose) for f in found[1:]):
         return None
     cost, estimate = _with_drift(best, noise)
-    freedom = sum(piece.residual_count for piece in best.used) - 3
-    if freedom < 1 or not _is_certain(estimate) or cost > _chi_square_bound(freedom):
+    freedom = sum(readings_of(piece.evidence) for piece in best.used) - 3
+    if freedom < 1 or not _is_certain(estimate) or cost > chi_square_bound(freedom):
         return None
-    covariance = estimate.covariance.scaled(max(1.0, cost / freedom))
+    widened = _wider_covariance(cost, estimate, best.used, noise)
+    if widened is None or not _is_certain(estimate._replace(covariance=widened)):
+        return None
+    covariance = widened.scaled(max(1.0, cost / freedom))
     return Estimate(estimate.pose, covariance, covariance if repeated else ZERO3)
+
+
+def readings_of(e: Evidence) -> int:
+    """How many numbers a piece of evidence says: a position is two."""
+    if e.range_m is None and e.bearing_rad is None:
+        return 2 + (e.heading_rad is not None)
+    return (e.range_m is not None) + (e.bearing_rad is not None)
 
 
 class PropagatedEvidence:
@@ -88,13 +106,6 @@ class PropagatedEvidence:
         self._teammate_rad = factor * evidence.teammate_sigma_rad
         self.sigma_m = math.hypot(self._teammate_m, drift_m)
         self._sigma_rad = math.hypot(self._teammate_rad, drift_rad)
-
-    @property
-    def residual_count(self) -> int:
-        e = self.evidence
-        if self.is_fix:
-            return 2 + (e.heading_rad is not None)
-        return (e.range_m is not None) + (e.bearing_rad is not None)
 
     def pose(self) -> Pose2 | None:
         """The present pose (field_from_robot), if a fix holds the whole of it."""
@@ -167,12 +178,41 @@ def _starts(pieces: list[PropagatedEvidence], field: Field) -> Iterator[Pose2]:
         yield aligned
     if reported or aligned is not None:
         return
+    x0, y0, side = _square(field)
+    of_x, of_y, of_heading = CELLS
+    for i in range(of_x):
+        for j in range(of_y):
+            x, y = x0 + side * (i + 0.5) / of_x, y0 + side * (j + 0.5) / of_y
+            for k in range(of_heading):
+                yield Pose2(x, y, math.tau * k / of_heading)
+
+
+def _square(field: Field) -> tuple[float, float, float]:
+    """(least x, least y, side) in metres of the square around what is on the map: objects in a line
+    leave both sides of it."""
     x0, y0, x1, y1 = field.bounds()
-    for i in range(5):
-        for j in range(4):
-            for k in range(8):
-                x, y = x0 + (x1 - x0) * (i + 0.5) / 5, y0 + (y1 - y0) * (j + 0.5) / 4
-                yield Pose2(x, y, math.tau * k / 8)
+    side = max(x1 - x0, y1 - y0)
+    return 0.5 * (x0 + x1 - side), 0.5 * (y0 + y1 - side), side
+
+
+def _spread_starts(pieces: list[PropagatedEvidence], field: Field) -> list[Pose2]:
+    """The best starts: first those that are better than all starts beside them, lest all be near
+    one pose."""
+    starts = sorted(_starts(pieces, field), key=lambda start: _cost(start, pieces))
+    _, _, side = _square(field)
+    of_x, of_y, of_heading = CELLS
+    near_x, near_y, near_rad = 1.2 * side / of_x, 1.2 * side / of_y, 1.2 * math.tau / of_heading
+    first: list[Pose2] = []
+    rest: list[Pose2] = []
+    for i, (x, y, heading) in enumerate(starts):
+        is_beside = any(
+            abs(better.x - x) < near_x
+            and abs(better.y - y) < near_y
+            and abs(math.remainder(better.heading - heading, math.tau)) < near_rad
+            for better in starts[:i]
+        )
+        (rest if is_beside else first).append(starts[i])
+    return (first + rest)[:MOST_STARTS]
 
 
 def _alignment(pieces: list[PropagatedEvidence]) -> Pose2 | None:
@@ -197,7 +237,8 @@ def _alignment(pieces: list[PropagatedEvidence]) -> Pose2 | None:
 
 
 class Fit(NamedTuple):
-    """A pose that fits some pieces of evidence, and their chi-square."""
+    """A pose that fits some pieces of evidence, and the chi-square of all: of those that are left
+    out `OUTLIER` each."""
 
     cost: float
     pose: Pose2
@@ -210,52 +251,130 @@ def _fit(start: Pose2, pieces: list[PropagatedEvidence]) -> Fit | None:
     while True:
         estimate = Estimate(start, _OPEN)
         for _ in range(10):
-            evidence = Information.none()
+            evidence = InformationSum()
             for piece in used:
-                for row, residual, variance in piece.rows(estimate.pose):
-                    evidence = evidence.add(row, residual, variance)
-            if evidence.matrix.hh <= 0.0:
+                for (x, y, a), residual, variance in piece.rows(estimate.pose):
+                    evidence.add(x, y, a, residual, 1.0 / variance)
+            if evidence.hh <= 0.0:
                 return None
             before = estimate.pose
-            estimate = merge(Estimate(before, _OPEN), evidence)
+            estimate = merge(Estimate(before, _STEP), evidence.sums())
             change = math.hypot(estimate.pose.x - before.x, estimate.pose.y - before.y)
             if change < 1e-4 and abs(estimate.pose.heading - before.heading) < 1e-4:
                 break
         costs = [_cost(estimate.pose, [piece]) for piece in used]
         worst = max(range(len(used)), key=costs.__getitem__)
-        if costs[worst] < 14.0 or len(used) - 1 < max(2, 0.75 * len(pieces)):
-            return Fit(sum(costs), estimate.pose, used)
+        if costs[worst] < OUTLIER or len(used) - 1 < max(2, 0.75 * len(pieces)):
+            left_out = OUTLIER * (len(pieces) - len(used))
+            return Fit(sum(costs) + left_out, estimate.pose, used)
         del used[worst]
         start = estimate.pose
 
 
 def _with_drift(fit: Fit, noise: OdometryNoise) -> tuple[float, Estimate]:
-    """(chi-square, estimate) by a Kalman filter over the pieces that a fit used, linear around its
-    path, and around the better one."""
-    pose, cost = fit.pose, 0.0
+    """(chi-square, estimate) of the pieces that a fit used, with the drift between them: linear
+    around its path, and around the better one."""
+    pose = fit.pose
     for _ in range(2):
-        cost, (x, y, heading), covariance = 0.0, (0.0, 0.0, 0.0), _OPEN
-        last = None
-        for piece in (*fit.used, None):
-            then = pose if piece is None else pose @ piece.now_from_then
-            if last is not None:
-                dx, dy, turn = then.x - last.x, then.y - last.y, then.heading - last.heading
-                x, y = x - dy * heading, y + dx * heading
-                covariance = covariance.transformed((1.0, 0.0, -dy, 0.0, 1.0, dx, 0.0, 0.0, 1.0))
-                way = math.hypot(dx, dy)
-                drift = motion_noise(last.heading, way, wrap_angle(turn), noise)
-                covariance = covariance.plus(drift, DRIFT_FACTOR)
-            last = then
-            for row, residual, variance in () if piece is None else piece.rows_without_drift(then):
-                px, py, ph = covariance.times(row)
-                k = 1.0 / (row[0] * px + row[1] * py + row[2] * ph + variance)
-                off = residual - row[0] * x - row[1] * y - row[2] * heading
-                cost += k * off * off
-                x, y, heading = x + k * off * px, y + k * off * py, heading + k * off * ph
-                gained = px * px, px * py, py * py, px * ph, py * ph, ph * ph
-                covariance = covariance.plus(Covariance3(*gained), -k)
-        pose = Pose2(pose.x + x, pose.y + y, wrap_angle(pose.heading + heading))
+        cost, offset, covariance = _filtered(pose, fit.used, noise)
+        pose = _at_offset(pose, offset)
     return cost, Estimate(pose, covariance)
+
+
+def _filtered(
+    pose: Pose2, used: list[PropagatedEvidence], noise: OdometryNoise
+) -> tuple[float, Row, Covariance3]:
+    """The least chi-square, its offset from `pose` and the offset's covariance, by a Kalman filter
+    from the oldest piece to the present. It is linear around the path that ends at `pose`."""
+    cost, (x, y, heading), covariance = 0.0, (0.0, 0.0, 0.0), _OPEN
+    last = None
+    for piece in (*used, None):
+        then = pose if piece is None else pose @ piece.now_from_then
+        if last is not None:
+            dx, dy, turn = then.x - last.x, then.y - last.y, then.heading - last.heading
+            x, y = x - dy * heading, y + dx * heading
+            covariance = covariance.transformed((1.0, 0.0, -dy, 0.0, 1.0, dx, 0.0, 0.0, 1.0))
+            way = math.hypot(dx, dy)
+            drift = motion_noise(last.heading, way, wrap_angle(turn), noise)
+            covariance = covariance.plus(drift, DRIFT_FACTOR)
+        last = then
+        for row, residual, variance in () if piece is None else piece.rows_without_drift(then):
+            px, py, ph = covariance.times(row)
+            k = 1.0 / (row[0] * px + row[1] * py + row[2] * ph + variance)
+            off = residual - row[0] * x - row[1] * y - row[2] * heading
+            cost += k * off * off
+            x, y, heading = x + k * off * px, y + k * off * py, heading + k * off * ph
+            gained = px * px, px * py, py * py, px * ph, py * ph, ph * ph
+            covariance = covariance.plus(Covariance3(*gained), -k)
+    return cost, (x, y, heading), covariance
+
+
+def _at_offset(pose: Pose2, offset: Row) -> Pose2:
+    x, y, heading = offset
+    return Pose2(pose.x + x, pose.y + y, wrap_angle(pose.heading + heading))
+
+
+def _wider_covariance(
+    cost: float, estimate: Estimate, used: list[PropagatedEvidence], noise: OdometryNoise
+) -> Covariance3 | None:
+    """The covariance, wider along its weakest axis where the chi-square rises less there than that
+    of a Gaussian; None if it rises so little somewhere that the pose may be elsewhere.
+
+    The chi-square is the profile: that of the best pose so many sigmas along the axis. Bearings
+    and dead reckoning alone give one that is steep at its least and flat far away, and curved.
+    """
+    variance, (x, y, h) = _weakest_axis(estimate.covariance)
+    sigma = math.sqrt(variance)
+    profile = [_profile(estimate.pose, k * sigma, (x, y, h), used, noise) for k in STEPS]
+    wider = 1.0
+    for k, (least, _) in zip(STEPS, profile, strict=True):
+        if not least - cost > 0.0:
+            return None
+        if k * k < FAR:
+            wider = max(wider, k * k / (least - cost))
+    more = variance * (min(wider, MOST_WIDENING) - 1.0)
+    along = Covariance3(x * x, x * y, y * y, x * h, y * h, h * h)
+    covariance = estimate.covariance.plus(along, more)
+    information = covariance.inverse()
+    for least, offset in profile:
+        claimed = min(_dot(offset, information.times(offset)), FAR)
+        if least - cost < LEAST_RISE * claimed:
+            return None
+    return covariance
+
+
+def _profile(
+    origin: Pose2, goal: float, axis: Row, used: list[PropagatedEvidence], noise: OdometryNoise
+) -> tuple[float, Row]:
+    """(chi-square, offset) of the best pose among those that are so far along an axis."""
+    offset, least = _sum((0.0, 0.0, 0.0), axis, goal), math.nan
+    for _ in range(3):
+        least, step, covariance = _filtered(_at_offset(origin, offset), used, noise)
+        towards = covariance.times(axis)
+        along = _dot(axis, towards)
+        if along <= 0.0:
+            return math.nan, offset
+        k = -_dot(axis, step) / along
+        least += k * k * along
+        offset = _sum(_sum(offset, step), towards, k)
+    return least, offset
+
+
+def _dot(a: Row, b: Row) -> float:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def _sum(a: Row, b: Row, k: float = 1.0) -> Row:
+    return a[0] + k * b[0], a[1] + k * b[1], a[2] + k * b[2]
+
+
+def _weakest_axis(covariance: Covariance3) -> tuple[float, Row]:
+    """The largest eigenvalue of a covariance (m and rad alike), and its axis: the power method."""
+    axis = 1.0, 0.7, 0.4
+    for _ in range(30):
+        towards = covariance.times(axis)
+        axis = _sum((0.0, 0.0, 0.0), towards, 1.0 / math.sqrt(_dot(towards, towards)))
+    return _dot(axis, covariance.times(axis)), axis
 
 
 def _is_certain(estimate: Estimate) -> bool:
@@ -266,12 +385,12 @@ def _is_certain(estimate: Estimate) -> bool:
     return 0.5 * (xx + yy) < _ENOUGH_POSITION_SIGMA_M**2 and hh < _ENOUGH_HEADING_SIGMA_RAD**2
 
 
-def _are_apart(a: Pose2, b: Pose2) -> bool:
+def are_apart(a: Pose2, b: Pose2) -> bool:
     turn = math.remainder(a.heading - b.heading, math.tau)
     return math.hypot(a.x - b.x, a.y - b.y) > 0.5 or abs(turn) > 0.5
 
 
-def _chi_square_bound(freedom: int) -> float:
+def chi_square_bound(freedom: int) -> float:
     """About the 99.9 % quantile (Wilson & Hilferty 1931)."""
     k = max(freedom, 1)
     return k * (1.0 - 2.0 / (9.0 * k) + 3.09 * math.sqrt(2.0 / (9.0 * k))) ** 3

@@ -120,6 +120,7 @@ class RecoveryMemory(NamedTuple):
     recorded: frozenset[str] = frozenset()  # sources of which no more evidence is needed yet,
     recorded_until_ns: int = 0  # until then
     kidnapped_ns: int = -1  # since when the robot may be elsewhere; -1: it is where it was
+    suspected_ns: int = -1  # since when it rejects more than it should; -1: it does not
 
 
 class TeammateMemory(NamedTuple):
@@ -273,18 +274,8 @@ def with_records(
     until_ns: int,
 ) -> RecoveryMemory:
     """The recovery's memory with other evidence, and the sources of which no more is needed."""
-    lost, inflated_ns, relocalization_ns, _, _, _, _, kidnapped_ns = recovery
-    fields = (
-        lost,
-        inflated_ns,
-        relocalization_ns,
-        snapshots,
-        evidence,
-        recorded,
-        until_ns,
-        kidnapped_ns,
-    )
-    return new(RecoveryMemory, fields)
+    records = snapshots, evidence, recorded, until_ns
+    return new(RecoveryMemory, (*recovery[:3], *records, *recovery[7:]))
 
 
 def with_correction(state: State, estimate: Estimate, updates: Updates) -> State:

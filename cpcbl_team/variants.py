@@ -6,7 +6,7 @@ paper. `weighted` is the paper's non-probabilistic variant (section 3).
 
 import math
 
-from cpcbl_team.config import LocalizationSettings, Weights
+from cpcbl_team.config import Field, LocalizationSettings, Weights
 from cpcbl_team.constraints import Constraint
 from cpcbl_team.estimate import (
     HEADING,
@@ -101,14 +101,21 @@ class JointVariant:
 
 
 class OvalVariant(JointVariant):
-    """Position and heading apart, the position's covariance of any shape."""
+    """Position and heading apart, the position's covariance of any shape.
 
-    def __init__(self, settings: LocalizationSettings) -> None:
+    Where the map gives only ranges nothing else would correct the heading, and a linear filter
+    would not know where the robot drives. There they do so through the covariance with it.
+    """
+
+    def __init__(self, settings: LocalizationSettings, field: Field) -> None:
         super().__init__(settings)
         self._uncoupled = settings.localizer.paper_uncertainty
+        self._scopes = {scope: scope for scope in Scope}
+        if field.gives_only_ranges and not self._uncoupled:
+            self._scopes[POSITION] = POSE
 
     def scope(self, scope: Scope) -> Scope:
-        return scope
+        return self._scopes[scope]
 
     def reduce(self, estimate: Estimate) -> Estimate:
         if self._uncoupled:
@@ -132,6 +139,9 @@ class OvalVariant(JointVariant):
 
 class CircularVariant(OvalVariant):
     """Position and heading apart, the position's covariance a circle."""
+
+    def scope(self, scope: Scope) -> Scope:
+        return scope
 
     def reduce(self, estimate: Estimate) -> Estimate:
         if self._uncoupled:
@@ -163,8 +173,8 @@ class WeightedVariant(CircularVariant):
 
     is_probabilistic = False
 
-    def __init__(self, settings: LocalizationSettings) -> None:
-        super().__init__(settings)
+    def __init__(self, settings: LocalizationSettings, field: Field) -> None:
+        super().__init__(settings, field)
         self._weights = settings.localizer.weights
 
     def correct(
@@ -212,11 +222,11 @@ def weighted_average(
     return Estimate(pose, Covariance3(p, 0.0, p, 0.0, 0.0, c.hh))
 
 
-def variant_of(settings: LocalizationSettings) -> JointVariant:
-    """The variant that the settings name."""
+def variant_of(settings: LocalizationSettings, field: Field) -> JointVariant:
+    """The variant that the settings name, on a field."""
     name = settings.localizer.variant
     if name == "joint":
         return JointVariant(settings)
     if name == "oval":
-        return OvalVariant(settings)
-    return CircularVariant(settings) if name == "circular" else WeightedVariant(settings)
+        return OvalVariant(settings, field)
+    return (CircularVariant if name == "circular" else WeightedVariant)(settings, field)

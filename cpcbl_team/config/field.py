@@ -42,6 +42,13 @@ class Field(Table, frozen=True, kw_only=True):
     landmarks: dict[str, Landmark] = msgspec.field(default_factory=dict)
     walls: dict[str, Wall] = msgspec.field(default_factory=dict)
 
+    @property
+    def gives_only_ranges(self) -> bool:
+        """Whether there is something on the map, and no bearing of it is used."""
+        gives = {mark.gives for mark in self.landmarks.values()}
+        gives |= {wall.gives for wall in self.walls.values()}
+        return "range" in gives and not gives & {"both", "bearing"}
+
     def bounds(self) -> tuple[float, float, float, float]:
         """(least x, least y, greatest x, greatest y) in metres of what is on the map; zeros for an
         empty map."""

@@ -38,7 +38,7 @@ from cpcbl_team.geometry import Pose2
 from cpcbl_team.inputs import Odometry
 from cpcbl_team.measurements import Measurement, ObjectPosition, observation_of
 from cpcbl_team.motion import bridge, inflate_by_gap
-from cpcbl_team.relocalization import PropagatedEvidence, _chi_square_bound, relocalize
+from cpcbl_team.relocalization import PropagatedEvidence, chi_square_bound, relocalize
 from cpcbl_team.state import Evidence
 
 ORIGIN = Pose2(0.0, 0.0, 0.0)
@@ -195,7 +195,7 @@ def test_gates_have_the_bounds_of_the_tables(probability: float, one: float, two
     ("freedom", "bound"), [(1, 10.83), (2, 13.82), (3, 16.27), (10, 29.59), (30, 59.70)]
 )
 def test_a_fit_has_the_bound_of_the_tables(freedom: int, bound: float) -> None:
-    assert _chi_square_bound(freedom) == pytest.approx(bound, rel=0.035)
+    assert chi_square_bound(freedom) == pytest.approx(bound, rel=0.035)
 
 
 # Lost odometry ------------------------------------------------------------------------------------

@@ -10,6 +10,7 @@ from cpcbl_launch.team.checks import warnings
 from cpcbl_launch.team.file import builtin_path, load_team
 from cpcbl_team.config import (
     Field,
+    Gives,
     Landmark,
     LocalizerSettings,
     OdometrySettings,
@@ -28,14 +29,26 @@ def team_of(marks: dict[str, Landmark], robot: RobotSettings) -> Team:
     return Team(name="tests", map=Field(landmarks=marks), robots={"r1": robot})
 
 
-@pytest.mark.parametrize("variant", ["oval", "circular", "weighted"])
+THREE = RANGES | {"ash": Landmark(x_m=0.0, y_m=3.0, gives="range")}
+
+
+@pytest.mark.parametrize("variant", ["circular", "weighted"])
 def test_ranges_alone_give_these_variants_no_heading(variant: Variant) -> None:
     robot = RobotSettings(localizer=LocalizerSettings(variant=variant))
-    (line,) = warnings(team_of(RANGES, robot))
+    (line,) = warnings(team_of(THREE, robot))
     assert line.startswith("robots.r1.localizer.variant: ")
     assert line.endswith("use variant joint")
     assert list(warnings(team_of(RANGES | {"elm": MARKS["elm"]}, robot))) == []
-    assert list(warnings(team_of(RANGES, RobotSettings()))) == []
+    for other in (RobotSettings(), RobotSettings(localizer=LocalizerSettings(variant="oval"))):
+        assert list(warnings(team_of(THREE, other))) == []
+
+
+@pytest.mark.parametrize("gives", ["range", "bearing"])
+def test_two_readings_at_a_time_determine_no_pose(gives: Gives) -> None:
+    two = {n: Landmark(x_m=m.x_m, y_m=m.y_m, gives=gives) for n, m in MARKS.items()}
+    (line,) = warnings(team_of(two, RobotSettings()))
+    assert line.startswith("robots.r1: 2 readings at a time do not determine a pose")
+    assert list(warnings(team_of(two | {"ash": MARKS["oak"]}, RobotSettings()))) == []
 
 
 def test_one_object_determines_no_pose() -> None:

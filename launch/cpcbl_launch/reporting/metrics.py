@@ -136,6 +136,22 @@ def heading_nees(samples: Samples) -> Floats | None:
     return np.asarray(heading_errors(samples) ** 2 / (samples.covariance[:, 5] + 1e-12))
 
 
+def pose_nees(samples: Samples) -> Floats:
+    """Squared Mahalanobis distances of the whole pose, shape (n,); empty without covariance."""
+    if samples.covariance is None:
+        return np.empty(0)
+    xx, xy, yy, xh, yh, hh = samples.covariance.T
+    rows = np.array([[xx, xy, xh], [xy, yy, yh], [xh, yh, hh]])
+    covariances = np.moveaxis(rows, 2, 0) + 1e-12 * np.eye(3)
+    errors = pose_errors(samples)
+    return np.asarray(np.einsum("ni,ni->n", errors, _solved(covariances, errors)))
+
+
+def _solved(covariances: Floats, errors: Floats) -> Floats:
+    """C^-1 e of each, shape (n, 3)."""
+    return np.asarray(np.linalg.solve(covariances, errors[:, :, None])[:, :, 0])
+
+
 def score(samples: Samples) -> Score:
     """The figures of one robot; None where there was nothing to compare."""
     if not len(samples.estimate):

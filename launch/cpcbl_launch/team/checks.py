@@ -5,6 +5,7 @@ from collections.abc import Iterator
 
 from cpcbl_launch.team.units import unit_warnings
 from cpcbl_team.config import LIKE_MIRRORED, MARKERS, Landmark, Team, Wall
+from cpcbl_team.recovery import UNKNOWNS
 from cpcbl_transport.security import PROTOCOL
 
 
@@ -46,7 +47,7 @@ def warnings(team: Team) -> Iterator[str]:
     objects: list[Landmark | Wall] = [*team.map.landmarks.values(), *team.map.walls.values()]
     yield from unit_warnings(team)
     yield from _blind_team(team)
-    only_ranges = bool(objects) and all(o.gives in ("range", "none") for o in objects)
+    readings = sum({"both": 2, "none": 0}.get(o.gives, 1) for o in objects)
     for name, robot in team.robots.items():
         odometry = robot.odometry
         if odometry.moves and odometry.rate_hz * odometry.timeout_s < 1.0:
@@ -58,7 +59,7 @@ def warnings(team: Team) -> Iterator[str]:
         if not robot.sensor.sees_landmarks or robot.position_sensor is not None:
             continue
         variant = robot.localizer.variant
-        if only_ranges and variant != "joint":
+        if team.map.gives_only_ranges and variant not in ("joint", "oval"):
             yield (
                 f"robots.{name}.localizer.variant: {variant} never learns its heading from ranges"
                 " alone; use variant joint"
@@ -67,6 +68,12 @@ def warnings(team: Team) -> Iterator[str]:
             yield (
                 f"robots.{name}: one object on the map does not determine a pose; if the robot is"
                 " carried away it stays lost; add a landmark"
+            )
+        elif 0 < readings < UNKNOWNS:
+            yield (
+                f"robots.{name}: {readings} readings at a time do not determine a pose; if the"
+                " robot is carried away it is wrong or lost for half a minute of driving; add a"
+                " landmark"
             )
 
 

@@ -1,0 +1,213 @@
+"""The worlds of the table in `worlds.py`: small teams in which one thing is scarce or wrong."""
+
+from collections.abc import Mapping
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import numpy as np
+from msgspec.structs import replace
+
+from cpcbl_launch.lab.experiments.runs import with_settings
+from cpcbl_launch.team.file import builtin_path, load_team
+from cpcbl_launch.team.overrides import with_blind_robots
+from cpcbl_team.config import (
+    Field,
+    OdometrySettings,
+    PositionSensor,
+    RobotSettings,
+    SimulationEvent,
+    Start,
+    Team,
+)
+
+DURATION_S = 40.0
+LEARNING_S = 60.0  # for a robot whose settings are wrong
+ZIGZAG = ((3.0, 2.5), (3.4, 3.5), (3.8, 2.5), (4.2, 3.5), (4.6, 2.5), (4.2, 3.6))
+KINDS = ("both", ""), ("range", " range-only"), ("bearing", " bearing-only")
+
+
+class World(NamedTuple):
+    """A team as its robots know it, and what happens to it."""
+
+    team: Team
+    scored: tuple[str, ...]
+    odometry_lost: float = 0.0  # this share of all pieces of odometry does not arrive
+    silent_s: float = 0.0  # from the tenth second on, none arrives for so long
+    duration_s: float = DURATION_S
+    scored_from_s: float = 5.0
+    drives_lost: bool = False  # whether it drives on while it is lost
+    truth: Team | None = None  # the team as it really is, where its settings are wrong
+
+
+# Teams --------------------------------------------------------------------------------------------
+
+
+@lru_cache(maxsize=1)
+def all_robots() -> Team:
+    """All landmarks and walls, and every robot that is in a world (`teams/worlds.toml`)."""
+    return load_team(builtin_path("worlds"))
+
+
+def _field(places: int, gives: str = "both") -> Field:
+    """So many of the landmarks."""
+    marks = list(all_robots().map.landmarks.items())[:places]
+    return Field(landmarks={name: replace(m, gives=gives) for name, m in marks})
+
+
+def _alone(field: Field, *events: SimulationEvent, **changes: Any) -> Team:
+    return _team({"r": replace(all_robots().robots["a"], **changes)}, field, *events)
+
+
+def _team(robots: Mapping[str, RobotSettings], field: Field, *events: SimulationEvent) -> Team:
+    base = all_robots()
+    simulation = replace(base.simulation, events=events)
+    return replace(base, map=field, robots=dict(robots), simulation=simulation)
+
+
+def _hidden(every_s: float, duration_s: float) -> list[SimulationEvent]:
+    """Landmarks are visible for one second in so many."""
+    times = np.arange(1.0, duration_s, every_s).tolist()
+    return [SimulationEvent(at_s=t, hide_landmarks_s=every_s - 1.0) for t in times]
+
+
+def _seeing(seeing: str, *events: SimulationEvent, ahead: bool = False) -> World:
+    """Robots a, b, c, d on one circuit among four landmarks, of which some see landmarks. With
+    `ahead` each sees only the teammate ahead of it."""
+    robots = {name: all_robots().robots[name] for name in "abcd"}
+    team = _team(robots, _field(4), *events)
+    if ahead:
+        team = with_settings(team, None, sensor={"field_of_view_deg": 60.0})
+    blind = [name for name in robots if name not in seeing]
+    return World(with_blind_robots(team, blind), tuple(robots))
+
+
+# Worlds -------------------------------------------------------------------------------------------
+
+
+def worlds() -> dict[str, World]:
+    """All worlds by name."""
+    found: dict[str, World] = {}
+    for gives, text in KINDS:
+        for count in (1, 2, 4, 8):
+            found[_landmarks(count) + text] = World(_alone(_field(count, gives)), ("r",))
+    found["1 landmark, standing"] = World(_alone(_field(1), waypoints_m=()), ("r",))
+    still = _alone(_field(1, "range"), waypoints_m=())
+    found["1 landmark range-only, standing"] = World(still, ("r",))
+    found["walls"] = World(_alone(Field(walls=all_robots().map.walls)), ("r",))
+    found["fast turns"] = World(_alone(_field(2), waypoints_m=ZIGZAG, speed_m_s=1.0), ("r",))
+    for every_s in (10.0, 30.0, 60.0):
+        length_s = max(DURATION_S, 2.0 * every_s + 5.0)
+        team = _alone(_field(4), *_hidden(every_s, length_s))
+        found[f"landmarks 1 s in {every_s:g}"] = World(team, ("r",), duration_s=length_s)
+    wide = {"sigma_m": 0.8, "heading_sigma_deg": 30.0}
+    for gives, text in KINDS[1:]:
+        team = with_settings(_alone(_field(4, gives)), None, start=wide)
+        found[f"wide prior{text}"] = World(team, ("r",))
+    found |= _odometry_worlds() | _unknown_pose_worlds()
+    return found | _team_worlds() | _miscalibrated_worlds()
+
+
+def _landmarks(count: int) -> str:
+    return f"{count} landmark{'' if count == 1 else 's'}"
+
+
+def _odometry_worlds() -> dict[str, World]:
+    """Worlds in which odometry does not arrive."""
+    found: dict[str, World] = {}
+    for share in (0.05, 0.2, 0.5):
+        for count in (0, 2, 4):
+            name = f"{share:.0%} of odometry lost, {_landmarks(count)}"
+            found[name] = World(_alone(_field(count)), ("r",), odometry_lost=share)
+    for gives, text in KINDS[1:]:
+        name = f"20% of odometry lost, 4 landmarks{text}"
+        found[name] = World(_alone(_field(4, gives)), ("r",), odometry_lost=0.2)
+    for count in (0, 1, 2, 4):
+        name = "2 s without odometry" + ("" if count == 2 else f", {_landmarks(count)}")
+        found[name] = World(_alone(_field(count)), ("r",), silent_s=2.0)
+    return found
+
+
+def _unknown_pose_worlds() -> dict[str, World]:
+    """Worlds of a robot that has to find out where it is: from the start, or after ten seconds.
+    Two readings a frame take it some ten seconds of driving."""
+    found = {"start unknown": World(_alone(_field(4), start=None), ("r",))}
+    for gives, text in KINDS[1:]:
+        for count in (1, 2, 3, 4):
+            world = World(_alone(_field(count, gives), start=None), ("r",), drives_lost=True)
+            found[f"start unknown, {_landmarks(count)}{text}"] = world
+    away = SimulationEvent(at_s=10.0, kidnap="r", to=(5.5, 4.0, 200.0))
+    for gives, text in KINDS:
+        length_s, from_s = (DURATION_S, 20.0) if gives == "both" else (60.0, 40.0)
+        for count in (1, 2, 4):
+            team, name = _alone(_field(count, gives), away), _landmarks(count) + text
+            world = World(team, ("r",), duration_s=length_s, scored_from_s=from_s)
+            found[f"carried away, {name}"] = world._replace(drives_lost=gives != "both")
+    return found
+
+
+def _team_worlds() -> dict[str, World]:
+    """Worlds of several robots, which help each other."""
+    found: dict[str, World] = {}
+    helper, blind, driver = (all_robots().robots[name] for name in ("helper", "blind", "a"))
+    driver = replace(driver, sensor=blind.sensor)
+    near = Start(x_m=5.3, y_m=3.75, sigma_m=0.8, heading_sigma_deg=10.0)
+    blind = replace(blind, start=near)
+    for sigma_deg in (10.0, 20.0, 30.0, 60.0):
+        start = {"heading_sigma_deg": sigma_deg}
+        for name, helped in (
+            (f"helper with heading σ {sigma_deg:g} deg", blind),
+            (f"the same, {sigma_deg:g} deg, helped robot drives", driver),
+        ):
+            team = _team({"helper": helper, "r": helped}, Field())
+            each = {"least_value": 0.0}  # else the worth of a fix hides what it does
+            team = with_settings(team, "helper", start=start, collaboration=each)
+            found[name] = World(team, ("r",))
+    rare = _hidden(10.0, DURATION_S)
+    found["chain, the first sees landmarks"] = _seeing("a", ahead=True)
+    found["clique, one sees landmarks"] = _seeing("a")
+    found["clique, two see landmarks"] = _seeing("ac")
+    found["clique, landmarks 1 s in 10"] = _seeing("abcd", *rare)
+    found["mixed team"] = _mixed_team()
+    found["ring, landmarks 1 s in 10"] = _seeing("abcd", *rare, ahead=True)
+    return found
+
+
+def _mixed_team() -> World:
+    """On one circuit: a robot that sees landmarks, one with poor sensors and poor odometry that
+    sees them too, one that sees only teammates, and one with a position sensor alone. In the middle
+    stands the helper."""
+    team = _seeing("ab").team
+    poor = {
+        "sensor": {"range_share": 0.15, "bearing_sigma_deg": 9.0},
+        "odometry": {"turn_sigma_rad_per_sqrt_rad": 0.15},
+    }
+    team = with_settings(team, "b", **poor)
+    robots = {**team.robots, "helper": all_robots().robots["helper"]}
+    robots["d"] = replace(robots["d"], position_sensor=PositionSensor(sigma_m=0.3))
+    return World(replace(team, robots=robots), tuple("abcd"))
+
+
+def _miscalibrated_worlds() -> dict[str, World]:
+    """Robots whose settings are wrong; they have a minute to notice it."""
+    odometry, sensor = OdometrySettings(), all_robots().robots["a"].sensor
+    sigmas = (
+        "distance_sigma_m_per_sqrt_m",
+        "turn_sigma_rad_per_sqrt_m",
+        "turn_sigma_rad_per_sqrt_rad",
+    )
+    motion = {name: 3.0 * getattr(odometry, name) for name in sigmas}
+    noisy = {"range_share": 2.0 * sensor.range_share, "bearing_sigma_deg": 6.0}
+    truths = {
+        "drives 1.2 × what its odometry says": replace(odometry, distance_scale=1.2),
+        "turns 1.4 × what its odometry says": replace(odometry, turn_scale=1.4),
+        "odometry with 3 × its σ": replace(odometry, **motion),
+        "sensor with 2 × its σ": replace(sensor, **noisy),
+        "bearings 5 deg off": replace(sensor, bearing_bias_deg=5.0),
+    }
+    field, found = _field(4), {}
+    for name, part in truths.items():
+        is_odometry = isinstance(part, OdometrySettings)
+        truth = _alone(field, **{"odometry" if is_odometry else "sensor": part})
+        world = World(_alone(field), ("r",), truth=truth)
+        found[name] = world._replace(duration_s=2.0 * LEARNING_S, scored_from_s=LEARNING_S)
+    return found
