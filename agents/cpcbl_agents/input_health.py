@@ -10,6 +10,7 @@ from collections.abc import Iterable, Iterator
 from statistics import median
 from typing import NamedTuple, TypeVar
 
+from cpcbl_agents.implausible_errors import ImplausibleErrors
 from cpcbl_agents.input_problems import (
     MOTION,
     Facts,
@@ -45,12 +46,16 @@ IN_VIEW = "a landmark should be in view"
 OVER = 4  # looks in a row that find nothing, before a cause is no longer said
 CHANGED = 30  # looks in a row that find another cause, before it is said in place of the first
 STEP_NS = 95_000_000
-STEPS = 100
+STEPS = 200
+LONGER_NS = (
+    10_000_000_000  # before the others: for what landmarks show of a robot that moves little
+)
 GAP_NS = 2_000_000_000
 KNOWN_M, KNOWN_RAD = 0.7, 0.35  # sigmas of a pose by which it is known what is in view
 SURE_M, SURE_DEG = 0.3, 10.0  # sigmas of a start by which inputs can be judged
 NAMESAKE_JUDGEMENTS = 3  # the token of a process that died may stay for its lease
 T = TypeVar("T")
+KEPT = 60  # looks for which a cause by the start is said of a robot that has left it
 MOVED_M, TURNED_RAD = 0.1, 0.15  # beyond these a robot is no longer where it started
 NAMES = tuple(topic.key.rpartition("/")[2] for topic in topics.INPUTS)
 
@@ -67,6 +72,7 @@ class Input:
         self.recent: deque[tuple[int, SensorInput]] = deque(maxlen=latest)
         self.recent_refused: deque[tuple[int, bytes]] = deque(maxlen=4)
         self.steps: deque[Step] = deque(maxlen=STEPS)
+        self.spaced: deque[tuple[int, Sightings]] = deque(maxlen=STEPS)  # frames, ten a second
         self.has_empty = False  # whether a frame came in which nothing was seen
         self.scales = 1.0, 1.0  # of distances and turns, as the team file corrects them
         self._begun: tuple[int, float, float] | None = None
@@ -79,6 +85,8 @@ class Input:
         if isinstance(message, Sightings):
             self.decoded += len(message.sightings) or 1
             self.has_empty |= not message.sightings
+            if not self.spaced or now_ns - self.spaced[-1][0] >= STEP_NS:
+                self.spaced.append((now_ns, message))
         else:
             self.decoded += 1
             if isinstance(message, Odometry):
@@ -121,6 +129,9 @@ class Held:
 
     def __bool__(self) -> bool:
         return bool(self._said or self._candidates)
+
+    def __contains__(self, about: str) -> bool:
+        return about in self._said
 
     @property
     def by_start(self) -> dict[str, str]:
@@ -184,6 +195,7 @@ class InputMonitor:
             and settings.sensor.sees_landmarks
         )
         self._starts_known: bool | None = None
+        self._errors = ImplausibleErrors()
         self._held, self._implausible = Held(), tuple[str, ...]()
         self.are_mended = self._are_wrong = False
         """Whether inputs were implausible or refused before the last judgement, and are right."""
@@ -248,18 +260,30 @@ class InputMonitor:
         if facts.start is not None and is_from_start:
             near = pose_near_start(steps, facts.start)
         self._looks_away = 0 if near is not None else self._looks_away + 1
-        seen, is_open = self.inputs["sightings"].recent, state.lost or self._looks_away < WINDOW
+        seen, long_ns = self.inputs["sightings"], max(self._start_ns, since_ns - LONGER_NS)
         facts = facts._replace(
+            corrections=self._errors.look(state.memory.calibration, MOTION in self._held),
             near_start=near,
             is_from_start=is_from_start,
-            said=self._held.by_start if is_open else {},
+            said=self._said_by_start(bool(state.lost)),
             steps=steps,
-            frames=[m for _, m in _since(seen, since_ns) if isinstance(m, Sightings)],
+            frames=[m for _, m in _since(seen.recent, since_ns) if isinstance(m, Sightings)],
+            long_steps=_since_stamp(self.inputs["odometry"].steps, long_ns),
+            long_frames=[frame for _, frame in _since(seen.spaced, long_ns)],
         )
         found = implausible_inputs(facts)
         if has_problems and CONTRADICTION in found.get(MOTION, ""):
             del found[MOTION]
         return self._held.look(found)
+
+    def _said_by_start(self, is_lost: bool) -> dict[str, str]:
+        """What is said because of where the robot started, and still holds unless inputs show the
+        contrary."""
+        said = self._held.by_start
+        if is_lost or self._looks_away < WINDOW:
+            return said
+        kept = MOTION in said and self._looks_away < KEPT
+        return {MOTION: said[MOTION]} if kept else {}
 
     def _totals(self, robot: Robot, now_ns: int) -> _Totals:
         refused = {name: entry.refused.copy() for name, entry in self.inputs.items()}

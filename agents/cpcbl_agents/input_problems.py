@@ -11,6 +11,8 @@ from cpcbl_agents import input_causes as causes
 from cpcbl_agents import motion_causes as motions
 from cpcbl_agents.motion_causes import Step
 from cpcbl_agents.position_causes import position_cause
+from cpcbl_agents.shift_causes import is_same, is_sure, shift_cause, shift_of
+from cpcbl_agents.start_causes import turned_view_cause
 from cpcbl_team.config import Landmark, SensorSettings
 from cpcbl_team.geometry import Pose2
 from cpcbl_team.inputs import Odometry, Position, Sightings
@@ -66,6 +68,7 @@ STAMPS = {"from_the_future", "too_late", "impossible_duration", "implausible_num
 
 
 MOTION, OVERLAP, POSITION = "motion", "overlap", "position"  # what implausible inputs are about
+CALIBRATION = "calibration"
 
 
 class InputWindow(NamedTuple):
@@ -94,6 +97,9 @@ class Facts(NamedTuple):
     near_start: Pose2 | None = None  # the pose by odometry alone, while it has hardly moved
     steps: Sequence[Step] = ()  # of odometry
     frames: Sequence[Sightings] = ()  # within the same time
+    long_steps: Sequence[Step] = ()  # of twice that time,
+    long_frames: Sequence[Sightings] = ()  # and frames, at most ten a second
+    corrections: str = ""  # what those of the pose say of inputs
     is_from_start: bool = False  # whether that time began at the start
     said: Mapping[str, str] = {}  # by the start, and not known to be over since the robot left it
     pace: float = 1.0  # robot time over real time, at least 1
@@ -252,6 +258,7 @@ def _implausible(facts: Facts) -> Iterator[tuple[str, str]]:
     steps = [] if overlap or not pieces else facts.steps
     motion = _motion(facts, frames, pieces, steps)
     yield MOTION, motion
+    yield CALIBRATION, "" if motion else facts.corrections
     found = [p for _, p in positions if isinstance(p, Position)]
     if found and not motion:
         found = [p for p in found if all(map(math.isfinite, (p.x_m, p.y_m, *p.covariance)))]
@@ -278,7 +285,12 @@ def _motion(
     tolerance = 0.15 + 3.0 * math.hypot(sensor.range_share, sensor.bearing_sigma_rad)
     tolerance = min(tolerance, MOST_TOLERANCE)
     cases = list(motions.seen_again(frames, steps, marks))
-    cause = motions.motion_cause(cases, steps, tolerance)
+    long_steps = facts.long_steps if steps else []
+    shift = shift_of([_usable(f) for f in facts.long_frames], long_steps, marks, sensor)
+    cause = shift_cause(shift, long_steps) if shift else ""
+    if shift and cause and not is_same(shift, shift_of(frames, steps, marks, sensor)):
+        cause = ""  # the driver was mended meanwhile
+    cause = cause or motions.motion_cause(cases, steps, tolerance)
     if not cause:
         late = list(motions.seen_again(frames, steps, marks, *motions.LATER_NS))
         cause = motions.motion_cause(late, steps, tolerance)
@@ -290,12 +302,16 @@ def _motion(
             cause = "turns have the wrong sign; left is positive"
         about = "sightings" if cause.startswith(("ranges", "bearings")) else "odometry"
         return f"{about}: {cause}"
-    if facts.near_start is None and (said := facts.said.get(MOTION)):
+    is_right = shift is not None and is_sure(shift)
+    if facts.near_start is None and not is_right and (said := facts.said.get(MOTION)):
         return said
     if facts.near_start is not None and frames:
         latest = [f for f in frames[-10:] if frames[-1].stamp_ns - f.stamp_ns < LATEST_NS]
         if cause := motions.view_cause(latest, facts.near_start, marks, tolerance):
             return f"sightings: {cause}"
+    start = facts.start if facts.is_from_start and not is_right else None
+    if start is not None and (cause := turned_view_cause(frames, steps, start, marks)):
+        return f"sightings: {cause}"
     spans_s = (steps[-1].stamp_ns - steps[0].from_ns) * 1e-9 if steps else math.inf
     if cases or (spans_s < WAIT_S and any(s.id in marks for f in frames for s in f.sightings)):
         return ""  # what landmarks show is known better, or soon
