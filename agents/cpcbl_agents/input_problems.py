@@ -27,6 +27,7 @@ MOST_TOLERANCE = 0.4  # of where a landmark is seen again, as a share of its ran
 LATEST_NS = 600_000_000
 WAIT_S = 7.0  # for what landmarks show
 LARGEST_ANGLE = 7.0
+LEAST_COVERED = 0.8  # of the time, by odometry
 OVERLAP_S = 0.001  # rounded stamps
 
 REASONS = {
@@ -138,10 +139,23 @@ def _problems(facts: Facts) -> Iterator[str]:
         yield "camera lost: it delivers no frames, and is opened again and again"
     for name, window in facts.windows.items():
         yield from _refused(name, window, facts)
+    yield from _gaps(facts)
     if (lasts_s := causes.piece_s(_odometry(facts))) > facts.timeout_s:
         yield (
             f"odometry: pieces of {lasts_s:.1f} s are longer than odometry.timeout_s; send"
             " them more often"
+        )
+
+
+def _gaps(facts: Facts) -> Iterator[str]:
+    """Pieces of odometry that are missing, where none is refused."""
+    window = facts.windows.get("odometry")
+    if window is None or is_often_refused(window):
+        return
+    if (share := causes.covered_share(_odometry(facts))) < LEAST_COVERED:
+        yield (
+            f"odometry covers only {100.0 * share:.0f} % of the time: pieces are lost, or from_ns"
+            " is not where the last one ended"
         )
 
 
@@ -294,7 +308,8 @@ def _motion(
     if not cause:
         late = list(motions.seen_again(frames, steps, marks, *motions.LATER_NS))
         cause = motions.motion_cause(late, steps, tolerance)
-        if not cause and motions.contradicts(late, steps, 1.5 * tolerance):
+        is_whole = causes.covered_share(pieces, 1) >= LEAST_COVERED
+        if not cause and is_whole and motions.contradicts(late, steps, 1.5 * tolerance):
             cause = causes.odometry_cause(pieces) or motions.CONTRADICTION
     if cause:
         is_order_right = right_order >= causes.LEAST_CASES and right_order > 4 * wrong_order

@@ -4,6 +4,7 @@ Robots stand, drive ahead or turn among one, two or four landmarks. The mistake 
 start.
 """
 
+import itertools
 import math
 from collections.abc import Callable
 
@@ -96,6 +97,28 @@ ROWS = {
 
 SLOW = CIRCLE._replace(odometry_hz=1.0)
 ROWS["odometry: 1 Hz"] = Row(lambda: as_it_is, "pieces of 1.0 s are longer than", (SLOW,), 7)
+
+
+def every(number: int) -> Change:
+    """One piece of odometry of so many."""
+    count = itertools.count()
+    return sent(Odometry, lambda m: [m] if next(count) % number == 0 else [])
+
+
+ROWS["odometry: 1 of 20"] = Row(
+    lambda: every(20), "% of the time: pieces are lost", (CIRCLE, STOPS), 9
+)
+ROWS["odometry: 1 of 2"] = Row(lambda: every(2), "covers only 5", (CIRCLE, STOPS), 4)
+ROWS["odometry: from_ns"] = Row(
+    lambda: of(Odometry, from_ns=lambda m: m.stamp_ns - 10**7), "covers only 1", (STOPS,), 4
+)
+
+
+def test_a_driver_that_is_silent_while_its_robot_stands_is_not_blamed() -> None:
+    robot = DrivenRobot(CIRCLE._replace(drive=lambda t: (0.4, 0.0) if t % 5 < 3 else (0.0, 0.0)))
+    moving = sent(Odometry, lambda m: [m] if m.distance_m else [])  # type: ignore[union-attr]
+    robot.run(25.0, moving)
+    assert not [text for status in robot.statuses for text in status.problems]
 
 
 @pytest.mark.parametrize("row", ROWS.values(), ids=list(ROWS))
