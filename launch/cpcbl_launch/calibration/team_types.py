@@ -96,11 +96,13 @@ def _calibrate_robot(logs: Sequence[RobotLog]) -> RobotCalibration:
 
 
 def _determined(values: Mapping[str, Estimate]) -> dict[str, Estimate]:
-    """Those with a value and a standard error: of too short a log they are not numbers."""
+    """Those with a value and a standard error. Of too short a log they are not numbers, or the time
+    in which errors fade is 0 in all parts of it, for they are too short to show it."""
     return {
         name: found
         for name, found in values.items()
         if math.isfinite(found.value) and math.isfinite(found.standard_error)
+        if name != "correlation_s" or found.standard_error > 0.0
     }
 
 
