@@ -212,6 +212,7 @@ class InputMonitor:
             frozenset(team.map.landmarks) | frozenset(team.map.walls) | frozenset(team.robots),
             team.map.landmarks,
             settings.sensor,
+            wheels,
             team.map.bounds(),
             settings.odometry.timeout_s,
             _start_pose(settings.start),

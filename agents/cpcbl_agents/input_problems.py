@@ -13,7 +13,7 @@ from cpcbl_agents.motion_causes import Step
 from cpcbl_agents.position_causes import position_cause
 from cpcbl_agents.shift_causes import is_same, is_sure, shift_cause, shift_of
 from cpcbl_agents.start_causes import turned_view_cause
-from cpcbl_team.config import Landmark, SensorSettings
+from cpcbl_team.config import Landmark, OdometryNoise, SensorSettings
 from cpcbl_team.geometry import Pose2
 from cpcbl_team.inputs import Odometry, Position, Sightings
 from cpcbl_transport.decoding import decode_by_key, input_problem
@@ -92,6 +92,7 @@ class Facts(NamedTuple):
     names: frozenset[str] = frozenset()  # of landmarks, walls, robots
     landmarks: Mapping[str, Landmark] = {}
     sensor: SensorSettings = SensorSettings()
+    wheels: OdometryNoise = OdometryNoise()
     bounds: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)  # of what is on the map
     timeout_s: float = math.inf  # of odometry
     start: Pose2 | None = None
@@ -300,9 +301,10 @@ def _motion(
     tolerance = min(tolerance, MOST_TOLERANCE)
     cases = list(motions.seen_again(frames, steps, marks))
     long_steps = facts.long_steps if steps else []
-    shift = shift_of([_usable(f) for f in facts.long_frames], long_steps, marks, sensor)
+    long_frames, wheels = [_usable(f) for f in facts.long_frames], facts.wheels
+    shift = shift_of(long_frames, long_steps, marks, sensor, wheels)
     cause = shift_cause(shift, long_steps) if shift else ""
-    if shift and cause and not is_same(shift, shift_of(frames, steps, marks, sensor)):
+    if shift and cause and not is_same(shift, shift_of(frames, steps, marks, sensor, wheels)):
         cause = ""  # the driver was mended meanwhile
     cause = cause or motions.motion_cause(cases, steps, tolerance)
     if not cause:

@@ -25,7 +25,7 @@ from cpcbl_agents.motion_causes import (
     poses_at,
 )
 from cpcbl_agents.start_causes import bearings_off
-from cpcbl_team.config import Landmark, SensorSettings
+from cpcbl_team.config import Landmark, OdometryNoise, SensorSettings
 from cpcbl_team.inputs import Sightings
 
 BIN_NS = 500_000_000  # sightings of a landmark within it are one point: their median
@@ -39,6 +39,7 @@ NEAR_SIGMAS = 3.0  # to what a mistake makes of it
 SCALE_SIGMA, BIAS_SIGMA_RAD = 0.22, math.radians(5.0)  # of a good driver without calibration
 TURN_SIGMA = 0.3
 LEAST_BIAS_RAD = math.radians(20.0)
+LEAST_DRIFT = 0.05  # of the heading, per root of a metre or radian
 INLIERS = 0.7
 WORSE = 3.5  # times the errors that the settings say
 ROUNDS = 4  # of weights against outliers
@@ -57,7 +58,15 @@ class Point(NamedTuple):
     place: complex
     robot: complex
     heading: float
+    progress: float  # the share of the time that has passed
     weight: float
+
+
+class _Unsure(NamedTuple):
+    """What makes sightings of one landmark err alike."""
+
+    drift_rad: float  # of the heading over the whole time
+    correlation_s: float  # in which errors of the sensor fade
 
 
 class Shift(NamedTuple):
@@ -67,15 +76,17 @@ class Shift(NamedTuple):
     turn_scale: float
     turn_sigma: float
     variance: float  # of the gain, in any direction,
-    along: complex  # and more in this one: a sigma
+    along: tuple[complex, ...]  # and more in these: sigmas
     most_turn_rad: float
 
     def sigmas_from(self, gain: complex, share: float = 0.0) -> float:
         """How far the gain is from another one, which may itself be off by a share of it."""
         off, variance = self.gain - gain, self.variance + abs(share * gain) ** 2
-        dot = (off.conjugate() * self.along).real
-        square = abs(off) ** 2 - dot * dot / (variance + abs(self.along) ** 2)
-        return math.sqrt(max(square, 0.0) / variance)
+        xx = variance + sum(a.real * a.real for a in self.along)
+        yy = variance + sum(a.imag * a.imag for a in self.along)
+        xy = sum(a.real * a.imag for a in self.along)
+        square = yy * off.real**2 - 2.0 * xy * off.real * off.imag + xx * off.imag**2
+        return math.sqrt(square / (xx * yy - xy * xy))
 
 
 def shift_of(
@@ -83,11 +94,13 @@ def shift_of(
     steps: Sequence[Step],
     marks: Mapping[str, Landmark],
     sensor: SensorSettings,
+    wheels: OdometryNoise,
 ) -> Shift | None:
     """The shift of the landmarks of these frames; None if they tell nothing, or no constant gain
     explains them."""
     points = list(_points(frames, steps, marks, sensor))
-    found = _fitted(points) if len(points) >= LEAST_POINTS else None
+    unsure = _Unsure(_drift_rad(steps, wheels), sensor.correlation_s)
+    found = _fitted(points, unsure) if len(points) >= LEAST_POINTS else None
     if found is None:
         return None
     shift, residuals, inliers = found
@@ -109,7 +122,8 @@ def is_same(shift: Shift, late: Shift | None) -> bool:
 
 def is_sure(shift: Shift) -> bool:
     """Whether the shift speaks for the driver: its turns, bearings and distances are right."""
-    sigma = max(math.sqrt(shift.variance + abs(shift.along) ** 2), shift.turn_sigma)
+    variance = shift.variance + sum(abs(a) ** 2 for a in shift.along)
+    sigma = max(math.sqrt(variance), shift.turn_sigma)
     is_turn_right = abs(shift.turn_scale - 1.0) < 2.0 * SCALE_SIGMA
     return sigma < SURE and is_turn_right and _sigmas_from_good(shift) < NEAR_SIGMAS
 
@@ -189,12 +203,13 @@ def _points(
     for name, own_bins in bins.items():
         if len(own_bins) < LEAST_OF_ONE or max(own_bins) - min(own_bins) < LEAST_SPAN_NS // BIN_NS:
             continue
-        for some in own_bins.values():
-            yield _point(name, some, share)
+        for number, some in own_bins.items():
+            passed = (number * BIN_NS - begin_ns) / (end_ns - begin_ns)
+            yield _point(name, some, share, passed)
 
 
 def _point(
-    name: str, some: Sequence[tuple[complex, complex, complex, float]], share: float
+    name: str, some: Sequence[tuple[complex, complex, complex, float]], share: float, passed: float
 ) -> Point:
     """One of several sightings. `share`: how far off the landmark is seen, of its range."""
     number = len(some)
@@ -202,10 +217,19 @@ def _point(
     variance = 0.5 * (median(abs(s[0]) for s in some) * share) ** 2 + LEAST_SIGMA_M**2
     weight = (number * EFFICIENCY if number > 2 else number) / variance
     robot = sum((s[2] for s in some), 0j) / number
-    return Point(name, place, robot, fmean(s[3] for s in some), weight)
+    return Point(name, place, robot, fmean(s[3] for s in some), passed, weight)
 
 
-def _fitted(points: Sequence[Point]) -> tuple[Shift, float, int] | None:
+def _drift_rad(steps: Sequence[Step], wheels: OdometryNoise) -> float:
+    """The sigma that the heading gains over all steps: it shifts landmarks, too."""
+    moved_m = sum(abs(step.distance_m) for step in steps)
+    turned = sum(abs(step.turn_rad) for step in steps)
+    of_way = max(wheels.turn_sigma_rad_per_sqrt_m, LEAST_DRIFT) ** 2 * moved_m
+    of_turn = max(wheels.turn_sigma_rad_per_sqrt_rad, LEAST_DRIFT) ** 2 * turned
+    return min(math.sqrt(of_way + of_turn), 1.0)
+
+
+def _fitted(points: Sequence[Point], unsure: _Unsure) -> tuple[Shift, float, int] | None:
     """The shift by least squares with weights against outliers; how large the errors are as a
     multiple of what is due, and how many points are no outliers."""
     weights, sums = [p.weight for p in points], None
@@ -223,13 +247,13 @@ def _fitted(points: Sequence[Point]) -> tuple[Shift, float, int] | None:
         ]
     if sums is None:
         return None
-    inflation = max(scale, 1.0) ** 2 * _repetition(points, sums.residuals())
-    return sums.shift(inflation), scale, sum(far < CUT * scale for far in off)
+    inflation = max(scale, 1.0) ** 2 * _repetition(points, sums.residuals(), unsure)
+    return sums.shift(inflation, unsure.drift_rad), scale, sum(far < CUT * scale for far in off)
 
 
-def _repetition(points: Sequence[Point], residuals: Sequence[complex]) -> float:
+def _repetition(points: Sequence[Point], residuals: Sequence[complex], unsure: _Unsure) -> float:
     """By how much variances are larger because errors repeat: (1 + r) / (1 - r), with the
-    correlation r of each with the one before of the same landmark."""
+    correlation r of each with the one before of the same landmark, as it is or as it is known."""
     before: dict[str, complex] = {}
     product = square = 0.0
     for p, residual in zip(points, residuals, strict=True):
@@ -239,7 +263,8 @@ def _repetition(points: Sequence[Point], residuals: Sequence[complex]) -> float:
             product += (r * before[p.name].conjugate()).real
             square += abs(r) ** 2
         before[p.name] = r
-    correlation = min(max(product / square if square else 0.0, 0.0), 0.9)
+    known = math.exp(-BIN_NS * 1e-9 / unsure.correlation_s) if unsure.correlation_s else 0.0
+    correlation = max(min(max(product / square if square else 0.0, 0.0), 0.9), known)
     return (1.0 + correlation) / (1.0 - correlation)
 
 
@@ -255,6 +280,7 @@ class _Sums(NamedTuple):
     xz: complex
     xq: complex
     zq: float
+    xd: complex  # with d = i q times the progress: a heading that drifts by one in all that time
     most_turn_rad: float
 
     @property
@@ -271,11 +297,11 @@ class _Sums(NamedTuple):
         g, e = self.solved()
         return [b + g * a - e * c for a, b, c in zip(self.x, self.q, self.z, strict=True)]
 
-    def shift(self, inflation: float) -> Shift:
+    def shift(self, inflation: float, drift_rad: float) -> Shift:
         """What was found; `inflation`: of all variances."""
         g, e = self.solved()
         sigma = math.sqrt(inflation / self._of_turn)
-        along = sigma * self.xz / self.xx
+        along = sigma * self.xz / self.xx, drift_rad * self.xd / self.xx
         return Shift(g, 1.0 - e, sigma, inflation / self.xx, along, self.most_turn_rad)
 
 
@@ -284,12 +310,13 @@ def _sums(points: Sequence[Point], weights: Sequence[float]) -> _Sums | None:
     middle = median(p.heading for p in points)
     q, x = [p.place for p in points], [p.robot for p in points]
     z = [1j * (p.heading - middle) * p.place for p in points]
+    d = [1j * p.progress * p.place for p in points]
     by_name: dict[str, list[int]] = {}
     for i, p in enumerate(points):
         by_name.setdefault(p.name, []).append(i)
     for own in by_name.values():
         total = sum(weights[i] for i in own)
-        for values in (q, x, z):
+        for values in (q, x, z, d):
             mean = sum((weights[i] * values[i] for i in own), 0j) / total
             for i in own:
                 values[i] -= mean
@@ -299,6 +326,7 @@ def _sums(points: Sequence[Point], weights: Sequence[float]) -> _Sums | None:
     zz = sum(w * abs(c) ** 2 for w, c in zip(weights, z, strict=True)) + TURN_SIGMA**-2
     xz = sum((w * a.conjugate() * c for w, a, c in zip(weights, x, z, strict=True)), 0j)
     xq = sum((w * a.conjugate() * b for w, a, b in zip(weights, x, q, strict=True)), 0j)
+    xd = sum((w * a.conjugate() * c for w, a, c in zip(weights, x, d, strict=True)), 0j)
     zq = sum((w * c.conjugate() * b).real for w, c, b in zip(weights, z, q, strict=True))
     most = max(abs(p.heading - middle) for p in points)
-    return _Sums(q, x, z, xx, zz, xz, xq, zq, most)
+    return _Sums(q, x, z, xx, zz, xz, xq, zq, xd, most)
