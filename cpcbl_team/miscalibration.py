@@ -6,7 +6,7 @@ variances and adaptive Kalman filtering, IEEE Transactions on Automatic Control,
 are summed over blocks of 1.5 s.
 
 - Corrections that a constant error explains (`constant_errors.py`): odometry measures with a wrong
-  scale, or bearings have a bias.
+  scale, or bearings have a bias. What no wrong calibration explains is not corrected.
 - One object of the map is rejected time after time, and hardly any other: it stands elsewhere.
 - Larger corrections than are due: the motion is less certain than the settings say if each
   correction resembles the one before, and the sensor is if it does not.
@@ -44,12 +44,15 @@ LEAST_DISTANCE_M: Final = 0.02
 LEAST_TURN_RAD: Final = 0.02
 LEAST_SIGMA: Final = 0.01  # of odometry whose noise grows, per root of a metre or radian
 LEAST_PARTS: Final = 30.0  # of corrections
+LEAST_OF_IMPLAUSIBLE: Final = 15.0
 SIGMAS: Final = 4.0  # of an error that is believed,
 SIGMAS_OF_CIRCLE: Final = 5.5  # of one that is believed without the covariance of errors
 AGAIN_SIGMAS: Final = 2.5  # and of others beside it, and after it
 DOUBT_SIGMAS: Final = 3.0  # of an error that is not believed yet, but may be there
 LEAST_SCALE: Final = 0.03  # of the first change: what is smaller is not worth one
 LEAST_BIAS_RAD: Final = math.radians(2.0)
+PLAUSIBLE_SCALES: Final = 0.4, 2.5  # beyond, a scale is no error of calibration,
+MOST_BIAS_RAD: Final = math.radians(15.0)  # nor is a bias of bearings: a sign or a frame is wrong
 MOST: Final = 0.5  # of an error that is believed at once
 LARGE: Final = 1.8  # factor of a variance, for a robot that rejects too much
 SCATTER_SIGMAS: Final = 4.0  # a mean square of so many is larger than due
@@ -260,7 +263,7 @@ def _with_errors(present: Adaptation, fit: Fit, rules: Rules) -> Adaptation | No
     clear = max(abs(distance) / of_distance, abs(turn) / of_turn, abs(bias) / of_bias)
     is_first = errors_between(AS_CONFIGURED, present) == NO_ERRORS
     first = SIGMAS if rules.knows_covariance else SIGMAS_OF_CIRCLE
-    if clear <= (first if is_first else AGAIN_SIGMAS):
+    if clear <= (first if is_first else AGAIN_SIGMAS) or implausible_errors(present, fit):
         return None
     distance, turn, bias = (
         _believed(distance, of_distance),
@@ -274,6 +277,29 @@ def _with_errors(present: Adaptation, fit: Fit, rules: Rules) -> Adaptation | No
         turn_scale=present.turn_scale * (1.0 + turn),
         bearing_bias_rad=present.bearing_bias_rad + bias,
     )
+
+
+def implausible_errors(present: Adaptation, fit: Fit) -> tuple[str, ...]:
+    """Which of the constant errors (`distances`, `turns`, `bearings`) are clearly larger than a
+    wrong calibration explains, on top of what is corrected at present."""
+    (distance, turn, bias), (of_distance, of_turn, of_bias), _ = fit
+    found = []
+    for name, scale, error, sigma in (
+        ("distances", present.distance_scale, distance, of_distance),
+        ("turns", present.turn_scale, turn, of_turn),
+    ):
+        least, most = (limit / scale - 1.0 for limit in PLAUSIBLE_SCALES)
+        if max(least - error, error - most) > 0.0 and abs(error) > SIGMAS * sigma:
+            found.append(name)
+    is_off = abs(present.bearing_bias_rad + bias) > MOST_BIAS_RAD
+    return (*found, *(["bearings"] if is_off and abs(bias) > SIGMAS * of_bias else []))
+
+
+def implausible_now(check: ModelCheck, present: Adaptation) -> tuple[str, ...] | None:
+    """The same by what the blocks tell so far; None if they tell too little."""
+    if check.evidence.parts < LEAST_OF_IMPLAUSIBLE:
+        return None
+    return implausible_errors(present, check.evidence.fit())
 
 
 def _believed(error: float, sigma: float) -> float:

@@ -52,8 +52,8 @@ def wait_until_alone(
             return EarlierRuns.from_tokens(there)
         if time.monotonic() >= until_s:
             raise InputError(
-                f"robot {robot}: another process is this robot already ({', '.join(sorted(others))}"
-                " in its status as `incarnation`); stop it first"
+                f"robot {robot}: another process is this robot already; stop it first (its status"
+                f" has the incarnation {', '.join(sorted(others))})"
             )
         time.sleep(LOOK_S)
 

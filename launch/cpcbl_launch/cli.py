@@ -54,9 +54,7 @@ def _run() -> None:
     except CpcblError as error:
         _end(str(error), INTERRUPTED if StopSignal.was_interrupted else 2)
     except SystemExit as end:
-        if StopSignal.was_interrupted and not end.code:
-            sys.exit(INTERRUPTED)
-        raise
+        sys.exit(INTERRUPTED if StopSignal.was_interrupted else end.code)
     if StopSignal.was_interrupted:
         sys.exit(INTERRUPTED)
 

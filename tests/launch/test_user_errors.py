@@ -12,6 +12,8 @@ import pytest
 from support.processes import cpcbl_team, eventually
 
 from cpcbl_agents.extras import command_from_origin, install_command
+from cpcbl_agents.stop import StopSignal
+from cpcbl_launch import cli
 from cpcbl_launch.cli import LONGEST
 from cpcbl_launch.run.containers import compose
 from cpcbl_launch.run.processes import PROGRAM
@@ -205,3 +207,14 @@ def test_compose_names_no_image_that_nobody_built(monkeypatch: pytest.MonkeyPatc
     with pytest.raises(InputError, match="nobody has built an image"):
         compose.deployment_text(team, file, Path(), None, 1)
     assert "mine:2" in compose.deployment_text(team, file, Path(), "mine:2", 1)
+
+
+@pytest.mark.parametrize("code", [0, 1, 2, None])
+def test_after_ctrl_c_the_exit_code_says_so_whatever_a_command_found(
+    code: int | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(StopSignal, "was_interrupted", True)
+    monkeypatch.setattr(cli, "_run_command", lambda: sys.exit(code))
+    with pytest.raises(SystemExit) as end:
+        cli._run()
+    assert end.value.code == 130

@@ -83,6 +83,13 @@ def wrong_landmark(message: Message) -> list[Message]:
     return changed(message, sightings=named) if sightings else [message]
 
 
+def lost_pieces(message: Message) -> list[Message]:
+    is_kept = (
+        message.input != "odometry" or message.content["stamp_ns"] % 2_000_000_000 < 150_000_000
+    )
+    return [message] if is_kept else []
+
+
 MISTAKES: dict[str, Mistake] = {
     "none": lambda message: [message],
     "bearings in degrees": seen("bearing_rad", math.degrees),
@@ -100,6 +107,11 @@ MISTAKES: dict[str, Mistake] = {
     "NaN": moved("distance_m", lambda m: math.nan),
     "duplicates": lambda message: [message, message],
     "mirrored turns": moved("turn_rad", lambda rad: -rad),
+    "bearings 90° off": seen(
+        "bearing_rad", lambda rad: math.remainder(rad + 0.5 * math.pi, math.tau)
+    ),
+    "distances backwards": moved("distance_m", lambda m: -m),
+    "lost pieces": lost_pieces,
     "silence": lambda message: [],
     "wrong key": wrong_key,
     "wrong landmark": wrong_landmark,

@@ -220,6 +220,11 @@ ROUNDS = (
         Mistake("turns in degrees", "look like degrees"),
         Mistake("mirrored turns", "the wrong sign; left is positive"),
     ),
+    (
+        Mistake("bearings 90° off", "bearings are 90° off; ahead is 0, left is positive"),
+        Mistake("distances backwards", "distances have the wrong sign or frame"),
+        Mistake("lost pieces", "of the time: pieces are lost"),
+    ),
 )
 
 

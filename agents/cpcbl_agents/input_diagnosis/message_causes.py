@@ -17,6 +17,8 @@ GROWING = 50  # pieces
 BACK_SHARE = 0.15  # of messages that are older than the one before: a network does not do so
 BURST, BURST_GAP_NS = 4, 900_000_000
 LATEST_NS = 60_000_000_000
+LEAST_GAPS = 3  # a driver may send nothing while its robot stands
+GAP_SHARE = 0.1  # of a piece: stamps are rounded
 
 _UNITS = (("seconds", 10**9), ("milliseconds", 10**6), ("microseconds", 10**3))
 
@@ -134,3 +136,15 @@ def overlap_s(pieces: Sequence[Odometry]) -> float:
         return 0.0
     pieces = sorted(pieces, key=lambda p: p.stamp_ns)
     return median((a.stamp_ns - b.from_ns) * 1e-9 for a, b in pairwise(pieces))
+
+
+def covered_share(pieces: Sequence[Odometry], least_gaps: int = LEAST_GAPS) -> float:
+    """The share of the time that pieces of odometry cover, from the first to the last one; 1 where
+    they leave fewer gaps, or overlap."""
+    pieces = sorted(pieces, key=lambda p: p.stamp_ns)
+    gaps = [b.from_ns - a.stamp_ns for a, b in pairwise(pieces)]
+    lasts = [p.stamp_ns - p.from_ns for p in pieces]
+    often = sum(gap > GAP_SHARE * last for gap, last in zip(gaps, lasts[1:], strict=True))
+    if often < least_gaps or min(gaps) < 0:
+        return 1.0
+    return sum(lasts) / (sum(lasts) + sum(gaps))

@@ -10,6 +10,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from statistics import median
 from typing import NamedTuple, TypeVar
 
+from cpcbl_agents.input_diagnosis.implausible_errors import ImplausibleErrors
 from cpcbl_agents.input_diagnosis.motion_causes import (
     CONTRADICTION,
     OR_START,
@@ -41,7 +42,7 @@ from cpcbl_transport.messages import (
 WINDOW = 10  # judgements, one a second: shares are those of the last so many
 SETTLED_NS = 2_000_000_000  # what was on its way when the robot started is too late
 OFTEN, SELDOM = 20, 10
-"""The search for implausible inputs takes half a millisecond. It runs at each of the first `OFTEN`
+"""The search for implausible inputs takes some milliseconds. It runs at each of the first `OFTEN`
 judgements and while it finds something, later at every tenth one (`SELDOM`)."""
 SECOND_NS, EMPTY_NS = 1_000_000_000, 5_000_000_000
 UNSEEN = 25  # judgements: in real logs a robot saw nothing for 20 s in front of landmarks
@@ -50,12 +51,16 @@ IN_VIEW = "a landmark should be in view"
 OVER = 4  # judgements in a row that find nothing, before a cause is no longer reported
 CHANGED = 30  # judgements in a row that find another cause, before it replaces the first
 STEP_NS = 95_000_000
-STEPS = 100
+STEPS = 200
+LONGER_NS = (
+    10_000_000_000  # before the others: for what landmarks show of a robot that moves little
+)
 GAP_NS = 2_000_000_000
 KNOWN_M, KNOWN_RAD = 0.7, 0.35  # sigmas of a pose by which it is known what is in view
 SURE_M, SURE_DEG = 0.3, 10.0  # sigmas of a start by which inputs can be judged
 NAMESAKE_JUDGEMENTS = 3  # the token of a process that died may stay for its lease
 T = TypeVar("T")
+KEPT = 60  # looks for which a cause by the start is said of a robot that has left it
 MOVED_M, TURNED_RAD = 0.1, 0.15  # beyond these a robot is no longer where it started
 NAMES = tuple(topic.key.rpartition("/")[2] for topic in topics.INPUTS)
 
@@ -72,6 +77,7 @@ class Input:
         self.recent: deque[tuple[int, SensorInput]] = deque(maxlen=latest)
         self.recent_refused: deque[tuple[int, bytes]] = deque(maxlen=4)
         self.steps: deque[Step] = deque(maxlen=STEPS)
+        self.spaced: deque[tuple[int, Sightings]] = deque(maxlen=STEPS)  # frames, ten a second
         self.has_empty = False  # whether a frame came in which nothing was seen
         self.scales = 1.0, 1.0  # of distances and turns, as the team file corrects them
         self._begun: tuple[int, float, float] | None = None
@@ -84,6 +90,8 @@ class Input:
         if isinstance(message, Sightings):
             self.decoded += len(message.sightings) or 1
             self.has_empty |= not message.sightings
+            if not self.spaced or now_ns - self.spaced[-1][0] >= STEP_NS:
+                self.spaced.append((now_ns, message))
         else:
             self.decoded += 1
             if isinstance(message, Odometry):
@@ -126,6 +134,9 @@ class ProblemHysteresis:
 
     def __bool__(self) -> bool:
         return bool(self._reported or self._candidates)
+
+    def __contains__(self, about: str) -> bool:
+        return about in self._reported
 
     @property
     def reported_by_start(self) -> dict[str, str]:
@@ -192,6 +203,7 @@ class InputMonitor:
             and settings.sensor.sees_landmarks
         )
         self._starts_known: bool | None = None
+        self._errors = ImplausibleErrors()
         self._hysteresis, self._implausible = ProblemHysteresis(), tuple[str, ...]()
         self.are_mended = self._are_wrong = False
         """Whether inputs were implausible or refused before the last judgement, and are right."""
@@ -206,6 +218,7 @@ class InputMonitor:
             frozenset(team.map.landmarks) | frozenset(team.map.walls) | frozenset(team.robots),
             team.map.landmarks,
             settings.sensor,
+            wheels,
             team.map.bounds(),
             settings.odometry.timeout_s,
             _start_pose(settings.start),
@@ -253,19 +266,30 @@ class InputMonitor:
         if facts.start is not None and is_from_start:
             near = pose_near_start(steps, facts.start)
         self._judgements_away = 0 if near is not None else self._judgements_away + 1
-        seen = self.inputs["sightings"].recent
-        is_open = bool(snapshot.lost) or self._judgements_away < WINDOW
+        seen, long_ns = self.inputs["sightings"], max(self._start_ns, since_ns - LONGER_NS)
         facts = facts._replace(
+            corrections=self._errors.update(snapshot.calibration, MOTION in self._hysteresis),
             near_start=near,
             is_from_start=is_from_start,
-            reported_by_start=self._hysteresis.reported_by_start if is_open else {},
+            reported_by_start=self._reported_by_start(bool(snapshot.lost)),
             steps=steps,
-            frames=[m for _, m in _since(seen, since_ns) if isinstance(m, Sightings)],
+            frames=[m for _, m in _since(seen.recent, since_ns) if isinstance(m, Sightings)],
+            long_steps=_since_stamp(self.inputs["odometry"].steps, long_ns),
+            long_frames=[frame for _, frame in _since(seen.spaced, long_ns)],
         )
         found = implausible_inputs(facts)
         if has_problems and CONTRADICTION in found.get(MOTION, ""):
             del found[MOTION]
         return self._hysteresis.update(found)
+
+    def _reported_by_start(self, is_lost: bool) -> dict[str, str]:
+        """The problems reported because of where the robot started that still hold unless inputs
+        show the contrary."""
+        reported = self._hysteresis.reported_by_start
+        if is_lost or self._judgements_away < WINDOW:
+            return reported
+        is_kept = MOTION in reported and self._judgements_away < KEPT
+        return {MOTION: reported[MOTION]} if is_kept else {}
 
     def _totals(self, refused_later: Mapping[tuple[str, str], int], now_ns: int) -> _Totals:
         refused = {name: entry.refused.copy() for name, entry in self.inputs.items()}

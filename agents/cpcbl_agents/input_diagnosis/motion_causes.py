@@ -229,6 +229,12 @@ def places_at(steps: Sequence[Step], times_ns: Sequence[int]) -> list[complex | 
     return [_pose_at(ns, stamps, poses)[0] if begin_ns <= ns <= end_ns else None for ns in times_ns]
 
 
+def poses_at(steps: Sequence[Step], times_ns: Sequence[int]) -> list[tuple[complex, float]]:
+    """Where odometry says the robot was (m), and its heading (rad), in a frame of its own."""
+    stamps, poses = _track(steps)
+    return [_pose_at(ns, stamps, poses) for ns in times_ns]
+
+
 def _pose_at(
     stamp_ns: int, stamps: Sequence[int], poses: Sequence[tuple[complex, float]]
 ) -> tuple[complex, float]:

@@ -11,7 +11,9 @@ from cpcbl_agents.input_diagnosis import message_causes as causes
 from cpcbl_agents.input_diagnosis import motion_causes as motions
 from cpcbl_agents.input_diagnosis.motion_causes import Step
 from cpcbl_agents.input_diagnosis.position_causes import position_cause
-from cpcbl_team.config import Landmark, SensorSettings
+from cpcbl_agents.input_diagnosis.shift_causes import is_same, is_sure, shift_cause, shift_of
+from cpcbl_agents.input_diagnosis.start_causes import turned_view_cause
+from cpcbl_team.config import Landmark, OdometryNoise, SensorSettings
 from cpcbl_team.errors import nearest_name
 from cpcbl_team.geometry import Pose2
 from cpcbl_team.inputs import Odometry, Position, Sightings
@@ -26,6 +28,7 @@ MOST_TOLERANCE = 0.4  # of where a landmark is seen again, as a share of its ran
 LATEST_NS = 600_000_000
 WAIT_S = 7.0  # for what landmarks show
 LARGEST_ANGLE = 7.0
+LEAST_COVERED = 0.8  # of the time, by odometry
 OVERLAP_S = 0.001  # rounded stamps
 
 REASONS = {
@@ -67,6 +70,7 @@ STAMPS = {"from_the_future", "too_late", "impossible_duration", "implausible_num
 
 
 MOTION, OVERLAP, POSITION = "motion", "overlap", "position"  # what implausible inputs are about
+CALIBRATION = "calibration"
 
 
 class InputWindow(NamedTuple):
@@ -89,12 +93,16 @@ class InputFacts(NamedTuple):
     names: frozenset[str] = frozenset()  # of landmarks, walls, robots
     landmarks: Mapping[str, Landmark] = {}
     sensor: SensorSettings = SensorSettings()
+    wheels: OdometryNoise = OdometryNoise()
     bounds: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)  # of what is on the map
     timeout_s: float = math.inf  # of odometry
     start: Pose2 | None = None
     near_start: Pose2 | None = None  # the pose by odometry alone, while it has hardly moved
     steps: Sequence[Step] = ()  # of odometry
     frames: Sequence[Sightings] = ()  # within the same time
+    long_steps: Sequence[Step] = ()  # of twice that time,
+    long_frames: Sequence[Sightings] = ()  # and frames, at most ten a second
+    corrections: str = ""  # what those of the pose say of inputs
     is_from_start: bool = False  # whether that time began at the start
     reported_by_start: Mapping[str, str] = {}  # earlier, by the start; nothing shows they are over
     pace: float = 1.0  # robot time over real time, at least 1
@@ -133,10 +141,23 @@ def _problems(facts: InputFacts) -> Iterator[str]:
         yield "camera lost: it delivers no frames, and is opened again and again"
     for name, window in facts.windows.items():
         yield from _refusal_problems(name, window, facts)
+    yield from _gaps(facts)
     if (lasts_s := causes.piece_s(_odometry(facts))) > facts.timeout_s:
         yield (
             f"odometry: pieces of {lasts_s:.1f} s are longer than odometry.timeout_s; send"
             " them more often"
+        )
+
+
+def _gaps(facts: InputFacts) -> Iterator[str]:
+    """Pieces of odometry that are missing, where none is refused."""
+    window = facts.windows.get("odometry")
+    if window is None or is_often_refused(window):
+        return
+    if (share := causes.covered_share(_odometry(facts))) < LEAST_COVERED:
+        yield (
+            f"odometry covers only {100.0 * share:.0f} % of the time: pieces are lost, or from_ns"
+            " is not where the last one ended"
         )
 
 
@@ -245,6 +266,7 @@ def _implausible(facts: InputFacts) -> Iterator[tuple[str, str]]:
     steps = [] if overlap or not pieces else facts.steps
     motion = _motion(facts, frames, pieces, steps)
     yield MOTION, motion
+    yield CALIBRATION, "" if motion else facts.corrections
     found = [p for _, p in positions if isinstance(p, Position)]
     if found and not motion:
         found = [p for p in found if all(map(math.isfinite, (p.x_m, p.y_m, *p.covariance)))]
@@ -274,11 +296,18 @@ def _motion(
     tolerance = 0.15 + 3.0 * math.hypot(sensor.range_share, sensor.bearing_sigma_rad)
     tolerance = min(tolerance, MOST_TOLERANCE)
     resightings = list(motions.resightings(frames, steps, marks))
-    cause = motions.motion_cause(resightings, steps, tolerance)
+    long_steps = facts.long_steps if steps else []
+    long_frames, wheels = [_usable(f) for f in facts.long_frames], facts.wheels
+    shift = shift_of(long_frames, long_steps, marks, sensor, wheels)
+    cause = shift_cause(shift, long_steps) if shift else ""
+    if shift and cause and not is_same(shift, shift_of(frames, steps, marks, sensor, wheels)):
+        cause = ""  # the driver was mended meanwhile
+    cause = cause or motions.motion_cause(resightings, steps, tolerance)
     if not cause:
         late = list(motions.resightings(frames, steps, marks, *motions.LATER_NS))
         cause = motions.motion_cause(late, steps, tolerance)
-        if not cause and motions.contradicts(late, steps, 1.5 * tolerance):
+        is_whole = causes.covered_share(pieces, 1) >= LEAST_COVERED
+        if not cause and is_whole and motions.contradicts(late, steps, 1.5 * tolerance):
             cause = causes.odometry_cause(pieces) or motions.CONTRADICTION
     if cause:
         is_order_right = right_order >= causes.LEAST_CASES and right_order > 4 * wrong_order
@@ -286,12 +315,17 @@ def _motion(
             cause = "turns have the wrong sign; left is positive"
         about = "sightings" if cause.startswith(("ranges", "bearings")) else "odometry"
         return f"{about}: {cause}"
-    if facts.near_start is None and (reported := facts.reported_by_start.get(MOTION)):
+    is_right = shift is not None and is_sure(shift)
+    reported = facts.reported_by_start.get(MOTION)
+    if facts.near_start is None and not is_right and reported:
         return reported
     if facts.near_start is not None and frames:
         latest = [f for f in frames[-10:] if frames[-1].stamp_ns - f.stamp_ns < LATEST_NS]
         if cause := motions.view_cause(latest, facts.near_start, marks, tolerance):
             return f"sightings: {cause}"
+    start = facts.start if facts.is_from_start and not is_right else None
+    if start is not None and (cause := turned_view_cause(frames, steps, start, marks)):
+        return f"sightings: {cause}"
     spans_s = (steps[-1].stamp_ns - steps[0].from_ns) * 1e-9 if steps else math.inf
     if resightings or (
         spans_s < WAIT_S and any(s.id in marks for f in frames for s in f.sightings)

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
+import numpy as np
 import tomlkit
 from msgspec.structs import replace
 from tomlkit.items import Table
@@ -26,6 +27,7 @@ from cpcbl_launch.reporting.recording import read_recording
 from cpcbl_launch.team.file import builtin_path, parse_team
 from cpcbl_team.errors import InputError
 
+SHORT_S = 20.0  # a recording that does not show whether errors fade
 INTERVAL_S = 0.5  # with correlation_s known, more frequent sightings of an object add little
 _CORRECTED = {  # the noise of a reading: its correction, the neutral value, the unit of the noise
     "range_share": ("range_scale", 1.0, 1.0),
@@ -77,6 +79,9 @@ def _calibrate_robot(logs: Sequence[RobotLog]) -> RobotCalibration:
         _with_standard_errors(odometry_values),
         _with_standard_errors(sensor_values),
     )
+    fades = sensor_values.get("correlation_s")
+    if fades and sight and fades.standard_error == 0.0 and np.ptp(sight.rows.stamp_s) < SHORT_S:
+        del sensor_values["correlation_s"]  # 0 in all parts: they are too short to show it
     days = {} if motion is None else odometry_day_variances(motion)
     days |= {} if sight is None else sensor_day_variances(sight)
     is_depth = sight is not None and sight.after.is_depth

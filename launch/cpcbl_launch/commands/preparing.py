@@ -10,7 +10,7 @@ from typer import Option
 
 from cpcbl_launch.commands import options
 from cpcbl_launch.reporting.files import write_or_reason
-from cpcbl_launch.reporting.tables import table
+from cpcbl_launch.reporting.tables import plural, table
 from cpcbl_launch.team.checks import warnings
 from cpcbl_launch.team.file import find_team, key_folder
 from cpcbl_team.errors import InputError
@@ -24,8 +24,8 @@ def check(file: options.Team) -> None:
     team = find_team(file)
     marks, walls = len(team.map.landmarks), len(team.map.walls)
     typer.echo(
-        f"{file}: good: team {team.name!r}, {len(team.robots)} robots"
-        f" ({', '.join(team.robots)}), {marks} landmarks, {walls} walls"
+        f"{file}: good: team {team.name!r}, {plural(len(team.robots), 'robot')}"
+        f" ({', '.join(team.robots)}), {plural(marks, 'landmark')}, {plural(walls, 'wall')}"
     )
     for warning in warnings(team):
         typer.echo(f"{file}: warning: {warning}", err=True)

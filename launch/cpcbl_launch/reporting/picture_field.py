@@ -74,7 +74,8 @@ def visible_box(team: Team, paths: Sequence[RobotPath]) -> Box:
     for path in paths:
         points += [path.truth[:, 1:], _almost_all(path.pose[~path.is_lost, :2])]
     known = _box(np.concatenate(points))
-    lost = _box(np.concatenate([_almost_all(p.pose[p.is_lost, :2]) for p in paths] or points))
+    unsure = [*(_almost_all(p.pose[p.is_lost, :2]) for p in paths), *map(_ellipse_corners, paths)]
+    lost = _box(np.concatenate(unsure or points))
     if known is None:
         known = lost or Box(0.0, 0.0, 1.0, 1.0)
     size = max(known.right - known.left, known.top - known.bottom, 1.0)
@@ -94,6 +95,16 @@ def visible_box(team: Team, paths: Sequence[RobotPath]) -> Box:
         known.right + margin + narrow[0],
         known.top + margin + narrow[1],
     )
+
+
+def _ellipse_corners(path: RobotPath) -> Floats:
+    """Two corners around the ellipse at the end of a path, of shape (2, 2); none without one."""
+    known = np.flatnonzero(np.isfinite(path.pose).all(axis=1))
+    if not len(known) or not np.isfinite(path.covariance[known[-1]]).all():
+        return np.empty((0, 2))
+    xx, _, yy = path.covariance[known[-1]]
+    reach = 3.0 * np.sqrt(np.maximum([xx, yy], 0.0))
+    return np.asarray([path.pose[known[-1], :2] - reach, path.pose[known[-1], :2] + reach])
 
 
 def _sides(box: Box) -> tuple[tuple[float, float], tuple[float, float]]:

@@ -49,3 +49,13 @@ def short(n: float) -> str:
             digits = 1 if unit and n < 9.95 * size else 0
             return f"{n / size:.{digits}f}{unit}"
     return f"{n / 1e9:.1f}G"
+
+
+def plural(number: int, noun: str) -> str:
+    """`1 landmark`, `2 landmarks`."""
+    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
+
+
+def times(number: int) -> str:
+    """`once`, `3 times`."""
+    return "once" if number == 1 else f"{number} times"

@@ -1,7 +1,7 @@
 """Annotated frames of a robot's camera: received, saved, and printed as `look` does."""
 
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -135,10 +135,14 @@ def print_frame_report(report: FrameReport, console: Console) -> None:
     if not report.found:
         rows.add_row("nothing", style="dim")
     console.print(rows)
-    for unclear in report.unclear:
-        names = f"{' or '.join(unclear.names)}: " if unclear.names else ""
-        text = REASONS.get(unclear.reason, unclear.reason)
-        console.print(f"{names}{text} ({unclear.reason})", style="yellow", highlight=False)
+    lines = Counter(
+        f"{' or '.join(unclear.names)}{': ' if unclear.names else ''}"
+        f"{REASONS.get(unclear.reason, unclear.reason)} ({unclear.reason})"
+        for unclear in report.unclear
+    )
+    for line, number in lines.items():
+        often = f"{number} x " if number > 1 else ""
+        console.print(f"{often}{line}", style="yellow", highlight=False)
     if report.picture:
         console.print(report.picture, style="dim", highlight=False, soft_wrap=True)
     console.print()

@@ -18,7 +18,7 @@ from cpcbl_launch.reporting.statuses import (
     summed_spending,
     trust_reports,
 )
-from cpcbl_launch.reporting.tables import number, short, table
+from cpcbl_launch.reporting.tables import number, short, table, times
 from cpcbl_launch.team.faults import one_line
 from cpcbl_launch.views.listening import InputHeard, TeamHeard, clock_problem
 from cpcbl_launch.views.traffic_tables import limit_text
@@ -94,8 +94,7 @@ def _problems(name: str, status: Status | None, heard: TeamHeard, is_real: bool)
     yield from problems
     for own in heard.inputs if not problems else ():  # the robot itself knows more of them
         if own.robot == name and own.refused:
-            reasons = ", ".join(f"{reason} {n}" for reason, n in own.refused.items())
-            yield f"in/{name}/{own.input}: cannot be used: {reasons}"
+            yield f"in/{name}/{own.input}: cannot be used: {_words(own.refused)}"
     if status is None:
         yield "alive, but sends no status" if name in heard.alive else "sends no status"
         return
@@ -142,7 +141,7 @@ def team_view(robots: Collection[RobotStatus]) -> RenderableType:
     for robot in robots:
         rates = {own.input: f"{own.published_hz:.1f}" for own in robot.inputs}
         refused = sum(sum(own.refused.values()) for own in robot.inputs)
-        state = Text("mend", "red") if robot.problems else Text("ok", "green")
+        state = _state(robot)
         shown.add_row(
             Text(robot.robot),
             number(robot.position_sigma_m),
@@ -154,6 +153,20 @@ def team_view(robots: Collection[RobotStatus]) -> RenderableType:
         )
         lines += [Text(f"{robot.robot}: {problem}", "red") for problem in robot.problems]
     return Group(shown, *lines)
+
+
+def _state(robot: RobotStatus) -> Text:
+    """In the words of the page and of `up`."""
+    if robot.position_sigma_m is None:
+        return Text("waiting", "yellow")
+    if robot.lost:
+        return Text("lost", "red")
+    return Text("problem", "yellow") if robot.problems else Text("ok", "green")
+
+
+def _words(reasons: dict[str, int]) -> str:
+    """`too late 3, seen twice 1`."""
+    return ", ".join(f"{reason.replace('_', ' ')} {n}" for reason, n in reasons.items())
 
 
 def robot_view(robot: RobotStatus) -> RenderableType:
@@ -170,7 +183,7 @@ def _robot_lines(robot: RobotStatus) -> Iterator[RenderableType]:
         yield Text(f"  σ {sigma}, tier {robot.tier}")
     inputs = table("inputs", ("input",), ("/s", "delay s", REFUSALS))
     for own in robot.inputs:
-        refused = ", ".join(f"{reason} {n}" for reason, n in own.refused.items()) or "0"
+        refused = _words(own.refused) or "0"
         inputs.add_row(own.input, f"{own.published_hz:.1f}", number(own.offset_s, 2), Text(refused))
     yield inputs if robot.inputs else Text("  no inputs are published to it")
     if robot.counts:
@@ -188,4 +201,4 @@ def _robot_lines(robot: RobotStatus) -> Iterator[RenderableType]:
         yield flows
     for trust in robot.trust:
         reason = trust.reason or ("not confirmed by others" if trust.unconfirmed else "trusted")
-        yield Text(f"{trust.peer}: {reason}, in quarantine {trust.quarantines} times")
+        yield Text(f"{trust.peer}: {reason}, in quarantine {times(trust.quarantines)}")

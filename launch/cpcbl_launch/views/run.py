@@ -22,7 +22,7 @@ from cpcbl_launch.reporting.statuses import (
     problem_remarks,
     trust_remarks,
 )
-from cpcbl_launch.reporting.tables import number, percent, short, table
+from cpcbl_launch.reporting.tables import number, percent, short, table, times
 from cpcbl_launch.run.observer import ObserverReport
 from cpcbl_launch.run.processes import ROBOT, Processes
 from cpcbl_launch.views.live import LiveView
@@ -162,7 +162,7 @@ def print_report(report: Report, console: Console) -> None:
         console.print(text)
     if report.yardsticks:
         console.print(_baseline_table(report))
-    for line in _remarks(report):
+    for line in _remarks(report, console.width >= NARROW):
         console.print(line, style="yellow", highlight=False, markup=False)  # robots may say [/b]
 
 
@@ -244,10 +244,11 @@ def _figures(s: ErrorFigures) -> list[str]:
     return [*map(number, errors_m), heading, inside, number(s.nees, 1)]
 
 
-def _remarks(report: Report) -> Iterator[str]:
-    if report.alone:
+def _remarks(report: Report, is_wide: bool) -> Iterator[str]:
+    if report.alone and is_wide:
         yield "Column before is the RMSE before teammates began to help, the others since then."
-    yield "Columns out and B count fixes and beliefs that were sent, and their bytes."
+    if is_wide:
+        yield "Columns out and B count fixes and beliefs that were sent, and their bytes."
     yield "For reference: a consistent filter has 98.9 % in 3 σ and a NEES of 2."
     team = report.team
     if team.pooled_rmse_m is not None:
@@ -265,7 +266,7 @@ def _remarks(report: Report) -> Iterator[str]:
         yield f"Robot {name} did not take part: {reason}."
     for name, r in report.robots.items():
         if r.bumps:
-            yield f"Robot {name} bumped into a landmark {r.bumps} times."
+            yield f"Robot {name} bumped into a landmark {times(r.bumps)}."
         if r.lost_at_end:
             yield f"Robot {name} is lost: {r.lost_at_end}."
         elif not r.has_data:
@@ -285,7 +286,7 @@ def _remarks(report: Report) -> Iterator[str]:
         counts = ", ".join(f"{reason} {n}" for reason, n in report.refused.items())
         yield f"Messages that could not be used, by reason: {counts}."
     for name, n in report.restarts.items():
-        yield f"Process {name} was restarted {n} times."
+        yield f"Process {name} was restarted {times(n)}."
 
 
 @contextmanager

@@ -138,3 +138,15 @@ def test_what_a_short_recording_does_not_tell_is_not_written(tmp_path: Path) -> 
     assert ran.returncode == 0, ran.stderr
     assert "nan" not in output.read_text()
     assert "nan" not in ran.stdout
+
+
+def test_a_time_in_which_errors_fade_is_not_known_of_a_recording_too_short_to_show_it(
+    tmp_path: Path,
+) -> None:
+    path, output = tmp_path / "short.mcap", tmp_path / "calibrated.toml"
+    simulate_recorded(TEAM, 1, 3.0, path)
+    ran = cpcbl_team("calibrate", path, "--output", output)
+    assert ran.returncode == 0, ran.stderr
+    assert "0.0000 ± 0.0000" not in ran.stdout
+    assert "correlation_s" in ran.stdout
+    assert "correlation_s = 0.0 #" not in output.read_text()

@@ -1,15 +1,17 @@
 """What `doctor` finds, from facts; and what is heard of teams on a bus."""
 
 from datetime import UTC, datetime, timedelta
+from io import StringIO
 
 import pytest
 from msgspec.structs import replace
+from rich.console import Console
 from support.buses import MS, SECOND, robot_at, team_of
 
 from cpcbl_launch.views.doctor_checks import Finding, findings, is_well
 from cpcbl_launch.views.doctor_facts import CertificateFile, EndpointFacts, Facts
 from cpcbl_launch.views.listening import Sample, heard_by_team, listen
-from cpcbl_launch.views.robot_status import robot_statuses
+from cpcbl_launch.views.robot_status import robot_statuses, team_view
 from cpcbl_team.config import Team, TransportSettings
 from cpcbl_team.inputs import Odometry
 from cpcbl_transport import topics
@@ -276,3 +278,14 @@ def test_the_status_of_a_robot_has_its_problems() -> None:
     assert (r1.processes, r1.tier, r1.inputs[0].published_hz) == (2, 1, 10.0)
     assert r2.problems == r3.problems == ("alive, but sends no status",)
     assert r2.status_offset_s is None
+
+
+def test_the_table_of_robots_has_the_words_of_the_view() -> None:
+    heard = heard_by_team(without("status/r2"), TOKENS, SECONDS)["tests"]
+    r1, r2 = robot_statuses(heard, TEAM)
+    bad = replace(r1, robot="r3", problems=("bad",)), replace(r1, robot="r4", lost="sigma")
+    console = Console(width=80, record=True, file=StringIO())
+    console.print(team_view([r1, r2, *bad]))
+    rows = [line.split() for line in console.export_text().splitlines()]
+    states = {row[0]: row[-1] for row in rows if row and row[0] in ("r1", "r2", "r3", "r4")}
+    assert states == {"r1": "ok", "r2": "waiting", "r3": "problem", "r4": "lost"}

@@ -20,7 +20,7 @@ from typing import NamedTuple
 from cpcbl_launch.run.containers import BASE_VARIABLE
 from cpcbl_team.errors import CpcblError
 
-ON_DEBIAN = "docker/dockerd.sh start installs and starts what is missing on Debian"
+ON_DEBIAN = "docker/dockerd.sh start installs and starts what is missing on Debian"  # in a checkout
 POLL_S = 0.05
 NAME = "cpcbl-team"
 DOCKERFILE = Path("docker/Dockerfile")
@@ -107,9 +107,13 @@ def _start(command: Sequence[str], output: int) -> "subprocess.Popen[bytes]":
         )
     except FileNotFoundError:
         raise DockerError(
-            f"no program {command[0]} here: install Docker, docs.docker.com/engine/install;"
-            f" {ON_DEBIAN}"
+            f"no program {command[0]} here: install Docker, docs.docker.com/engine/install"
+            f"{_on_debian()}"
         ) from None
+
+
+def _on_debian() -> str:
+    return "" if checkout() is None else f"; {ON_DEBIAN}"
 
 
 def command_output(
@@ -129,7 +133,7 @@ def check_daemon() -> None:
     """Raises DockerError unless a daemon answers that runs on this machine's kernel."""
     answer = run_command(["docker", "info", "--format", "{{.KernelVersion}}"], timeout_s=20.0)
     if answer.code:
-        raise DockerError(f"no Docker daemon answers ({answer.last_line}); start it: {ON_DEBIAN}")
+        raise DockerError(f"no Docker daemon answers ({answer.last_line}); start it{_on_debian()}")
     kernel, own = answer.last_line, platform.release()
     if kernel != own:
         raise DockerError(
@@ -147,8 +151,8 @@ def compose_program() -> tuple[str, ...]:
         except DockerError:
             continue
     raise DockerError(
-        "neither `docker compose` nor docker-compose here: apt-get install docker-compose;"
-        f" {ON_DEBIAN}"
+        "neither `docker compose` nor docker-compose here: apt-get install docker-compose"
+        f"{_on_debian()}"
     )
 
 

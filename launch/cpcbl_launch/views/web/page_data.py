@@ -16,7 +16,7 @@ from cpcbl_launch.reporting.statuses import (
 from cpcbl_launch.views.traffic import LiveFlow, Traffic
 from cpcbl_launch.views.web.feed import LatestMessages, Snapshot, position_sigma_m
 from cpcbl_team.config import Field, Team
-from cpcbl_team.inputs import SightingFault
+from cpcbl_team.inputs import Sighting, SightingFault
 from cpcbl_transport.messages import Refusal, Truth
 
 SILENT_S = 2.0  # so long, and three of its pauses, a robot is silent before it is marked
@@ -116,22 +116,41 @@ def team_picture(team: Team | None, name: str, history: Mapping[str, Any]) -> Te
 
 
 def robot_pictures(
-    now: Snapshot, named: Collection[str], now_s: float, began_s: float
+    now: Snapshot, named: Collection[str], now_s: float, began_s: float, team: Team | None = None
 ) -> dict[str, RobotPicture]:
-    """All robots; `named` are those of the team file, all others are guests."""
+    """All robots; `named` are those of the `team` file, all others are guests."""
+    own = {} if team is None else team.robots
+    unused = {name for name, robot in own.items() if not robot.sensor.sees_landmarks}
+    marks = () if team is None else (*team.map.landmarks, *team.map.walls)
     return {
         name: picture
         for name, latest in now.robots.items()
         if (
             picture := _picture(
-                latest, now.truths.get(name), bool(named) and name not in named, now_s, began_s
+                latest,
+                marks if name in unused else (),
+                now.truths.get(name),
+                bool(named) and name not in named,
+                now_s,
+                began_s,
             )
         )
     }
 
 
+def _used(latest: LatestMessages, unused: Collection[str]) -> tuple[Sighting, ...]:
+    """What a robot saw, without objects that it does not use."""
+    seen = latest.sightings.sightings if latest.sightings is not None else ()
+    return tuple(s for s in seen if s.id not in unused)[:MOST_SEEN]
+
+
 def _picture(
-    latest: LatestMessages, truth: Truth | None, is_guest: bool, now_s: float, began_s: float
+    latest: LatestMessages,
+    unused: Collection[str],
+    truth: Truth | None,
+    is_guest: bool,
+    now_s: float,
+    began_s: float,
 ) -> RobotPicture | None:
     """None for a guest that left."""
     state, why = state_of(latest, now_s)
@@ -139,9 +158,8 @@ def _picture(
     if is_guest and state in ("gone", "waiting") and since_s > LEFT_S:
         return None
     status, track = latest.status, latest.track
-    sees = latest.sightings.sightings[:MOST_SEEN] if latest.sightings is not None else ()
     is_fresh = state != "gone" and now_s - latest.sightings_s <= SEEN_S
-    seen = tuple((s.id, _round(s.range_m), _round(s.bearing_rad)) for s in sees)
+    seen = tuple((s.id, _round(s.range_m), _round(s.bearing_rad)) for s in _used(latest, unused))
     there = None if truth is None else (truth.x_m, truth.y_m, truth.heading_rad)
     common = RobotPicture(
         state=state,

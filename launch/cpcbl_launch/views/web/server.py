@@ -265,7 +265,7 @@ class Server:
     def _next(self) -> Now:
         feed, shown, before = self._feed, self._shown, self._now
         now_s, snapshot = feed.now_s(), feed.snapshot()
-        pictures = robot_pictures(snapshot, feed.named, now_s, self._began_s)
+        pictures = robot_pictures(snapshot, feed.named, now_s, self._began_s, shown.team)
         traffic = before.traffic
         if traffic is None or now_s - self._traffic_s >= TRAFFIC_S:
             self._traffic_s = now_s

@@ -26,6 +26,15 @@ ROBOTS = ["navigator", "observer", "patrol", "scout"]
 STATES = "Object.fromEntries([...document.querySelectorAll('tr[data-robot]')]"
 STATES += ".map((row) => [row.dataset.robot, row.dataset.state]))"
 
+BUTTONS_ARE_FREE = """(() => {
+  const map = document.querySelector('#map').getBoundingClientRect();
+  const tools = document.querySelector('.tools').getBoundingClientRect();
+  const [left, bottom] = [tools.left - map.left - 6, tools.bottom - map.top + 6];
+  const marks = viewStats.marks();
+  return map.width < 400 && marks.length > 0 && marks.every(([x, y]) => x < left || y > bottom);
+})()"""
+"""Whether no landmark is below the buttons of a map on a telephone."""
+
 
 @asynccontextmanager
 async def watched(folder: Path, *arguments: str) -> AsyncIterator[tuple[Tab, Path]]:
@@ -90,6 +99,8 @@ def test_shows_the_demo_and_marks_a_robot_that_was_killed(tmp_path: Path) -> Non
             await tab.resize(360, 740, is_dark=True)
             await tab.wait_for("document.documentElement.scrollWidth <= 360")
             await fingers_and_keys_zoom(tab)
+            await tab.resize(390, 844, is_dark=False)
+            await tab.wait_for(BUTTONS_ARE_FREE)
             assert tab.errors == []
             hosts = {request.split("/")[2] for request in tab.requests}
             assert len(hosts) == 1

@@ -24,6 +24,7 @@ from cpcbl_launch.views.web.page_data import (
     state_of,
     team_picture,
 )
+from cpcbl_team.config import Field, Landmark, RobotSettings, SensorSettings, Team
 from cpcbl_team.inputs import Sighting, Sightings
 from cpcbl_transport.messages import Spending, Track, Trust, Truth
 
@@ -98,6 +99,17 @@ def test_a_picture_has_the_ellipse_the_error_and_what_is_seen() -> None:
     assert now.sees == (("door", 2.0, 0.1), ("wall", None, -1.0))
     assert picture(robot, 10.6).sees == ()  # these sightings are old
     assert picture(latest(track=track(covariance=None))).ellipse is None
+
+
+def test_a_robot_that_uses_no_landmarks_is_not_shown_to_see_them() -> None:
+    sightings = Sightings(0, (Sighting("door", 2.0, 0.1), Sighting("r2", 3.0, -1.0)))
+    now = Snapshot({"r1": latest(sightings=sightings, sightings_s=9.9)})
+    for sees_landmarks, names in ((True, ["door", "r2"]), (False, ["r2"])):
+        own = RobotSettings(sensor=SensorSettings(sees_landmarks=sees_landmarks))
+        field = Field(landmarks={"door": Landmark(x_m=1.0, y_m=1.0)})
+        team = Team(name="lab", robots={"r1": own}, map=field)
+        shown = robot_pictures(now, ["r1"], 10.1, 0.0, team)["r1"].sees
+        assert [name for name, _, _ in shown] == names
 
 
 def test_the_ellipse_has_the_axes_of_the_covariance() -> None:

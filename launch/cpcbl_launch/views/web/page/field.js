@@ -2,6 +2,7 @@
 import { ink } from "./colours.js";
 
 const STEPS = [0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000];
+const SMALL = 600; // pixels of a map
 
 export class FieldMap {
   constructor(canvas, team, robots, choose, redraw) {
@@ -107,9 +108,10 @@ export class FieldMap {
     }
     if (!points.length) return;
     const [[x0, y0], [x1, y1]] = box(points), space = Math.min(48, this.w * 0.1);
+    const tools = document.querySelector(".tools"), right = this.w < SMALL ? Math.max(space, tools.offsetWidth + 16) : space; // no mark below the buttons
     const wide = Math.max(x1 - x0, 1), high = Math.max(y1 - y0, 1);
-    const scale = Math.min((this.w - 2 * space) / wide, (this.h - 2 * space) / high);
-    if (scale > 0) Object.assign(this, { scale: Math.min(scale, 2000), x: (x0 + x1) / 2, y: (y0 + y1) / 2 });
+    const scale = Math.min((this.w - space - right) / wide, (this.h - 2 * space) / high, 2000);
+    if (scale > 0) Object.assign(this, { scale, x: (x0 + x1) / 2 + (right - space) / (2 * scale), y: (y0 + y1) / 2 });
   }
 
   pixels(x, y) {

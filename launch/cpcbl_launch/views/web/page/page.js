@@ -4,7 +4,7 @@ import { FieldMap } from "./field.js";
 import { Panel } from "./panel.js";
 import { Plot } from "./plots.js";
 
-const TRAIL_S = 30, PLOT_S = 60, SLOW_MS = 500;
+const TRAIL_S = 30, PLOT_S = 60, SLOW_MS = 500, LEFT_OUT_MS = 5000;
 const $ = (id) => document.getElementById(id);
 
 export const team = { name: "", landmarks: [], walls: [], cameras: null, help: [], at: 0, chosen: "" };
@@ -13,6 +13,7 @@ export const robots = new Map(); // name -> {name, colour, trail, samples, ...wh
 globalThis.viewStats = { frames: 0, poses: 0, drawn: 0, firstPictureMs: null, longestGapMs: 0, skipped: 0, lastMs: null, drawMs: 0, scale: 0 };
 const stats = globalThis.viewStats;
 
+const leftOut = []; // [when, how many frames] of late
 let socket = null, retryMs = 500, camera = null, due = false, slowDue = 0;
 const choose = (name) => {
   team.chosen = name === team.chosen ? "" : name;
@@ -22,6 +23,7 @@ const choose = (name) => {
 };
 const map = new FieldMap($("map"), team, robots, choose, () => redraw());
 const panel = new Panel(team, robots, choose, (open) => say({ camera: open }));
+stats.marks = () => team.landmarks.map(([, x, y]) => map.pixels(x, y));
 const plots = [new Plot($("sigma"), robots, team, 3, 1e-4), new Plot($("error"), robots, team, 4, 1e-3)];
 
 function say(request) {
@@ -85,9 +87,11 @@ function frame(message) {
   for (const name of message.removed) robots.delete(name);
   if (message.help) team.help = message.help;
   notice(message.notice);
-  setLink(true);
-  stats.skipped = message.skipped;
   const now = performance.now();
+  if (message.skipped > stats.skipped) leftOut.push([now, message.skipped - stats.skipped]);
+  while (leftOut.length && now - leftOut[0][0] > LEFT_OUT_MS) leftOut.shift();
+  stats.skipped = message.skipped;
+  setLink(true);
   if (stats.lastMs !== null) stats.longestGapMs = Math.max(stats.longestGapMs, now - stats.lastMs);
   stats.lastMs = now;
   stats.frames += 1;
@@ -157,7 +161,8 @@ function notice(text) {
 
 function setLink(isLive) {
   $("link").classList.toggle("live", isLive);
-  setText($("link"), !isLive ? "not connected" : stats.skipped ? `live, ${stats.skipped} frames left out` : "live");
+  const recent = leftOut.filter(([at]) => performance.now() - at < LEFT_OUT_MS).reduce((n, [, more]) => n + more, 0);
+  setText($("link"), !isLive ? "not connected" : recent ? `live, ${recent} ${recent === 1 ? "frame" : "frames"} left out` : "live");
 }
 
 matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => { forgetInks(); redraw(); });
