@@ -17,7 +17,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import zenoh
 
@@ -208,6 +208,19 @@ class _ZenohPublisher(_Declared):
             self._publisher.put(payload)
 
 
+class PeerLink(NamedTuple):
+    """The link of a session to another one."""
+
+    session: str
+    peer: str  # the other side's address and port
+    member: str = ""  # what its certificate says, such as `robot/r1`; empty without one
+
+    @staticmethod
+    def of(link: "zenoh.Link") -> "PeerLink":
+        peer = re.split("[?#]", str(link.dst).partition("/")[2])[0]
+        return PeerLink(str(link.zid), peer, link.auth_identifier or "")
+
+
 class ZenohBus(Bus):
     """One Zenoh session."""
 
@@ -259,6 +272,19 @@ class ZenohBus(Bus):
             for transport in self._session.info.transports()
             if (zid := str(transport.zid)) in links
         }
+
+    def links(self) -> list[PeerLink]:
+        """The links of this session at present."""
+        return [PeerLink.of(link) for link in self._session.info.links()]
+
+    def watch_links(self, on_change: Callable[[], None]) -> Handle:
+        """Calls `on_change` when a link was opened or has ended."""
+
+        def on_event(event: "zenoh.LinkEvent") -> None:
+            on_change()
+
+        declared = self._session.info.declare_link_events_listener(on_event)
+        return _Declared(self, declared.undeclare)
 
     def close(self) -> None:
         self.declared.clear()

@@ -320,14 +320,24 @@ def test_a_soak() -> None:
     }
 
 
+FLAT = process_lives(samples("field", 0.01) | samples("up", 0.0))
+
+
 def test_memory_is_flat_in_every_process_that_is_to_be_judged() -> None:
-    flat = process_lives(samples("field", 0.01) | samples("up", 0.0))
-    assert not unmet_checks(memory_checks(flat, ["field", "up"]))
-    leaking = [*flat, ProcessLife("robot-a", 400.0, 30.0, 45.0, 2.0, 30)]
+    assert not unmet_checks(memory_checks(FLAT, ["field", "up"]))
+    leaking = [*FLAT, ProcessLife("robot-a", 400.0, 30.0, 45.0, 2.0, 30, 0.6)]
     assert unmet_checks(memory_checks(leaking, ["field", "up", "router"])) == {
         "processes that ran too shortly to judge their memory",
         "largest growth of memory",
-        "steepest growth of one that ran for 300 s",
+        "steepest growth in the second half of a life of 300 s",
         "largest growth of the number of open files",
     }
     assert "largest growth of memory" in unmet_checks(memory_checks([], []))
+
+
+def test_buffers_that_fill_are_no_growth_of_a_long_life() -> None:
+    filling = {("up", 1): [ProcessSample(at, min(at, 300.0) / 30.0, 9) for at in range(0, 1200, 5)]}
+    growing = {("up", 1): [ProcessSample(at, at / 90.0, 9) for at in range(0, 1200, 5)]}
+    assert not unmet_checks(memory_checks([*FLAT, *process_lives(filling)], ["up"]))
+    steep = {"steepest growth in the second half of a life of 300 s"}
+    assert unmet_checks(memory_checks([*FLAT, *process_lives(growing)], ["up"])) == steep
