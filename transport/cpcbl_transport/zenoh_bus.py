@@ -13,6 +13,7 @@ import json
 import logging
 import os
 import re
+import socket
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
@@ -32,6 +33,7 @@ log = logging.getLogger(__name__)
 RUNTIME = "ZENOH_RUNTIME"
 ROUTER_RUNTIME = "(rx: (worker_threads: 16))"
 """Two by default: two slow receivers held up everybody."""
+USUAL_PORT = 7447
 TOKENS_S = 5.0  # for the router's answer
 LEAST_DESCRIPTORS, MOST_DESCRIPTORS = 64, 65_536
 WAITING_S = 10.0  # after so long it is said again that no router answers
@@ -65,12 +67,33 @@ def open_bus(
             elif time.monotonic() - said_s >= WAITING_S:
                 said_s = time.monotonic()
                 shown = f": {reason}" if credentials else ""
-                hint = "" if first else "; does the router say that it listens at another port?"
+                hint = _port_hint(connect, credentials, first)
                 first = False
                 where = ", ".join(connect)
                 log.warning("no router at %s yet, waiting for it%s%s", where, shown, hint)
             time.sleep(0.2)
     raise BusError(f"no router at {', '.join(connect)}: {reason}")
+
+
+def _port_hint(connect: Sequence[str], credentials: Credentials | None, first: bool) -> str:
+    """What to say of ports to somebody who waits for a router: where one is instead."""
+    for head, _, port in (endpoint.rpartition(":") for endpoint in connect):
+        usual = f"{head}:{USUAL_PORT}"
+        if port != str(USUAL_PORT) and _listens(usual, credentials):
+            return f"; a router listens at {usual}, not at {port}: connect there, or move it"
+    return "" if first else "; does the router say that it listens at another port?"
+
+
+def _listens(endpoint: str, credentials: Credentials | None) -> bool:
+    """Whether a router answers there at once."""
+    host, _, port = endpoint.partition("/")[2].rpartition(":")
+    config = client_config([endpoint], credentials)
+    config["connect"]["timeout_ms"] = 500
+    with suppress(zenoh.ZError, OSError, ValueError):
+        socket.create_connection((host.strip("[]"), int(port)), 0.2).close()
+        _open(config).close()  # type: ignore[no-untyped-call]
+        return True
+    return False
 
 
 def _tls_reason(connect: Sequence[str], credentials: Credentials | None) -> str:

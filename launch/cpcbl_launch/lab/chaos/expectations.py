@@ -249,20 +249,28 @@ def flood(run: FaultRun) -> list[Check]:
     ]
 
 
-def abuse(run: FaultRun, most_silent_s: float = 0.5, most_m: float = GOOD_M) -> list[Check]:
+def abuse(
+    run: FaultRun, most_silent_s: float = 0.5, most_m: float = GOOD_M, most_mib: float = 30.0
+) -> list[Check]:
     """What one member does to the team silences and misleads none of the other robots."""
-    return [
+    window = run.log, run.others, run.fault_s, run.end_s
+    checks = [
         at_least("what the abuse sent", run.sent, 1),
-        *checks_unaffected(
-            run.log,
-            run.others,
-            run.fault_s,
-            run.end_s,
-            most_silent_s=most_silent_s,
-            most_m=most_m,
-        ),
+        *checks_unaffected(*window, most_silent_s=most_silent_s, most_m=most_m),
         *checks_recovered(run, run.healed_s + 1.0),
     ]
+    if run.router_mib is not None:
+        what, grown = "growth of the router's memory", run.router_mib
+        checks.append(Check(what=what, seen=grown, at_most=most_mib, unit="MiB", by_load=False))
+    return checks
+
+
+def rejoin(run: FaultRun, most_mib: float = 120.0) -> list[Check]:
+    """The same, and a robot that starts again meanwhile finds a place at the router."""
+    back_s = run.log.token_back_after_s(run.victim, run.killed_s, run.incarnation)
+    late_s = run.log.machine.late_s(run.killed_s, run.end_s)
+    what = f"{run.victim} was back with a token after"
+    return [at_most(what, back_s, 5.0, "s", late_s), *abuse(run, most_mib=most_mib)]
 
 
 # The simulated world ------------------------------------------------------------------------------

@@ -16,9 +16,9 @@ from cpcbl_agents.clock import Clock
 from cpcbl_launch.lab.chaos.abuses import ABUSES
 from cpcbl_launch.lab.chaos.links import LinkQuality, TunLink
 from cpcbl_launch.lab.chaos.scenario import FaultRun, Injector
-from cpcbl_launch.lab.chaos.team import FIELD, OPERATOR, TeamUnderTest
+from cpcbl_launch.lab.chaos.team import FIELD, OPERATOR, ROUTER, TeamUnderTest
 from cpcbl_launch.lab.faulty_robot import faulty_command
-from cpcbl_launch.run.processes import PROGRAM, ProcessSpec
+from cpcbl_launch.run.processes import PROGRAM, ProcessSpec, own_memory_mib
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus, Publisher
 from cpcbl_transport.security import Identity
@@ -27,6 +27,7 @@ from cpcbl_transport.topics import Role
 CLOCK_AHEAD_NS = 3_000_000_000
 LIE = "bias:0.5,0.5"
 GUEST_AT = "4.5,0,90"
+IN_FULL_S = 12.0  # until an abuse has taken all that it can
 LATEST_S = 4.0  # twice what a robot's timeline goes back
 
 
@@ -72,22 +73,39 @@ narrow = impair(LinkQuality(bytes_per_s=50_000 / 8))
 lossy = impair(LinkQuality(loss=0.2))
 
 
-def abuse(name: str) -> Injector:
-    """What a member of the team does to it (`abuses.py`), in a process of its own."""
+def abuse(name: str, victim: str = "") -> Injector:
+    """What a member of the team does to it (`abuses.py`), in a process of its own. A `victim` is a
+    robot that is killed while it goes on, and has to start again."""
     assert name in ABUSES, name
 
     @contextmanager
     def inject(team: TeamUnderTest, run: FaultRun) -> Iterator[None]:
         module = (sys.executable, "-m", "cpcbl_launch.lab.chaos.abuses", name)
         words = (str(team.team_file), team.endpoint, str(os.getpid()), run.robot, *run.others)
+        before_mib = _router_mib(team)
         with subprocess.Popen([*module, *words], stdout=subprocess.PIPE, text=True) as process:
             try:
+                if victim:
+                    team.run_for(IN_FULL_S)
+                    run.victim, run.incarnation = victim, team.run_log.latest_incarnation(victim)
+                    run.killed_s = team.now_s
+                    team.signal(victim, signal.SIGKILL)
                 yield
             finally:
+                after_mib = _router_mib(team)
                 process.terminate()
                 run.sent = int(process.communicate(timeout=20.0)[0] or 0)
+        if before_mib is not None and after_mib is not None:
+            run.router_mib = after_mib - before_mib
 
     return inject
+
+
+def _router_mib(team: TeamUnderTest) -> float | None:
+    try:
+        return own_memory_mib(team.pid(ROUTER))
+    except OSError:  # no Linux
+        return None
 
 
 flood, garbage = abuse("flood"), abuse("garbage")

@@ -27,6 +27,7 @@ STOPPED_S, AWAKE_S = 1.0, 0.3  # the deaf session is closed, and comes again
 TOKEN_SESSIONS, TOKENS_HZ = 3, 1200.0
 SUBSCRIPTIONS, SUBSCRIBED_S = 3_000, 2.0
 SESSIONS = 1100  # Zenoh takes 1,000, unless it is told otherwise
+SESSIONS_HZ = 200.0
 HALF_OPEN, HALF_OPEN_EVERY_S = 600, 0.02
 LARGE_EVERY_S = 1.0
 
@@ -112,11 +113,12 @@ def subscriptions(abuser: "Abuser") -> int:
 def sessions(abuser: "Abuser") -> int:
     """Opens as many sessions as the router takes, and keeps them open."""
     with ExitStack() as stack:
-        opened = 0
+        opened, begin_s = 0, time.monotonic()
         while not abuser.stop():
             if opened < SESSIONS:
                 stack.enter_context(abuser.session())
                 opened += 1
+                time.sleep(max(0.0, opened / SESSIONS_HZ - (time.monotonic() - begin_s)))
             else:
                 time.sleep(0.05)
         os.write(sys.stdout.fileno(), f"{opened}\n".encode())
