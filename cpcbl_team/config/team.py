@@ -34,7 +34,7 @@ class GuardSettings(Table, frozen=True, kw_only=True):
     frame_rate_hz: Positive = 120.0
     """Of images for one robot; at least twice the camera's rate."""
     tokens_per_s: Positive = 50.0
-    """How often the liveliness tokens of a member may change. One with more is refused for 10 s."""
+    """How often the liveliness tokens of a member may change. One with more is refused for 3 s."""
     sessions_per_member: Annotated[int, msgspec.Meta(ge=1)] = 64
     """With keys: the sessions of one certificate."""
     sessions_per_address: Annotated[int, msgspec.Meta(ge=1)] = 1000

@@ -10,11 +10,14 @@ With keys a member is what its certificate says. Without them it is the address 
 nobody can be blamed for tokens, because the names in their keys prove nothing.
 """
 
+import ctypes
 import ipaddress
 import logging
 import os
 import re
 import socket
+import struct
+import sys
 import threading
 import time
 from collections import Counter
@@ -31,11 +34,15 @@ log = logging.getLogger(__name__)
 
 LOOK_S = 0.2  # without news of links
 COUNTED_S = 1.0  # changes of tokens are counted so long
-BARRED_S = 10.0
+BARRED_S = 3.0
 PAUSE_S = 1.0  # between sessions of a member that has too many: most clients come again at once,
 CROWDED = SESSIONS * 3 // 4  # and each that comes costs more than one that stays, but for places
+SO_ATTACH_FILTER = 26
 DEFERRED_S = 3600  # so long a connection may say nothing
 OPEN_FILES = "/dev/fd"
+
+
+Refused = list[tuple[PeerLink, str]]
 
 
 class Admission:
@@ -54,13 +61,14 @@ class Admission:
         """A token with the name of this robot has appeared or disappeared."""
         self._changes[robot] += 1
 
-    def refused(self, links: Iterable[PeerLink], now_s: float) -> list[tuple[PeerLink, str]]:
-        """The links to be shut down, each with the reason. To be asked several times a second."""
+    def refused(self, links: Iterable[PeerLink], now_s: float) -> tuple[Refused, Refused]:
+        """The links of members that are refused for a time, and those that are too many, each with
+        the reason. To be asked several times a second."""
         present = set(links)
         self._order = {link: None for link in self._order if link in present}
         self._order |= dict.fromkeys(present)
         self._bar(now_s)
-        return [*self._of_barred(), *self._too_many(now_s)]
+        return list(self._of_barred()), list(self._too_many(now_s))
 
     def _bar(self, now_s: float) -> None:
         self._barred = {name: until for name, until in self._barred.items() if until > now_s}
@@ -123,9 +131,10 @@ def admission_control(
         while not over.is_set():
             news.wait(LOOK_S)
             news.clear()
-            refused = admission.refused(bus.links(), time.monotonic())
-            shut_down([link.peer for link, _ in refused])
-            said.tell(refused)
+            barred, too_many = admission.refused(bus.links(), time.monotonic())
+            mute([link.peer for link, _ in barred])
+            shut_down([link.peer for link, _ in too_many])
+            said.tell([*barred, *too_many])
 
     said = _Told()
     handles = [bus.watch_liveliness(space + t.at(), on_token) for t in (topics.ALIVE, topics.RAN)]
@@ -155,7 +164,7 @@ class _Told:
             about = member_of(link), reason
             if about not in self._said_s:
                 self._said_s[about] = now_s
-                log.warning("closed a session of %s: %s", *about)
+                log.warning("refuses a session of %s: %s", *about)
 
 
 # Connections of this process ----------------------------------------------------------------------
@@ -170,14 +179,20 @@ def ports_of(endpoints: Iterable[str]) -> set[int]:
 def shut_down(peers: Sequence[str]) -> int:
     """Shuts down the connections of this process to these peers (`127.0.0.1:40001`), whatever part
     of it opened them; how many there were."""
-    wanted, found = set(map(_canonical, peers)), 0
+    found = 0
+    for connection in _connections_to(set(map(_canonical, peers))):
+        with suppress(OSError):  # it has ended
+            connection.shutdown(socket.SHUT_RDWR)
+            found += 1
+    return found
+
+
+def _connections_to(wanted: Collection[tuple[str, str]]) -> Iterator[socket.socket]:
     for name in os.listdir(OPEN_FILES) if wanted else ():
         with suppress(OSError), _connection(int(name)) as connection:
             host, port, *_ = connection.getpeername()
             if _canonical(f"{host}:{port}") in wanted:
-                connection.shutdown(socket.SHUT_RDWR)
-                found += 1
-    return found
+                yield connection
 
 
 def _connection(descriptor: int) -> socket.socket:
@@ -189,6 +204,20 @@ def _connection(descriptor: int) -> socket.socket:
     except OSError:
         os.close(copy)
         raise
+
+
+def mute(peers: Collection[str]) -> int:
+    """Lets nothing come any more from these peers, until their leases end their sessions: clients
+    that are shut down come again within milliseconds. Without Linux they are shut down."""
+    if sys.platform != "linux":
+        return shut_down(list(peers))
+    refuse_all = ctypes.create_string_buffer(struct.pack("HBBI", 0x06, 0, 0, 0))  # BPF: return 0
+    program = struct.pack("HL", 1, ctypes.addressof(refuse_all))
+    wanted, found = set(map(_canonical, peers)), 0
+    for connection in _connections_to(wanted):
+        connection.setsockopt(socket.SOL_SOCKET, SO_ATTACH_FILTER, program)
+        found += 1
+    return found
 
 
 def _canonical(peer: str) -> tuple[str, str]:
