@@ -216,6 +216,8 @@ def mute(peers: Collection[str]) -> int:
     wanted, found = set(map(_canonical, peers)), 0
     for connection in _connections_to(wanted):
         connection.setsockopt(socket.SOL_SOCKET, SO_ATTACH_FILTER, program)
+        linger = struct.pack("ii", 1, 0)  # nothing is acknowledged any more: do not wait for it
+        connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, linger)
         found += 1
     return found
 
