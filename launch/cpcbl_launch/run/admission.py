@@ -136,7 +136,7 @@ def admission_control(
             shut_down([link.peer for link, _ in too_many])
             said.tell([*barred, *too_many])
 
-    said = _Told()
+    said = _RefusalLog()
     handles = [bus.watch_liveliness(space + t.at(), on_token) for t in (topics.ALIVE, topics.RAN)]
     handles.append(bus.watch_links(news.set))
     thread = threading.Thread(target=watch, name="admission", daemon=True)
@@ -151,7 +151,7 @@ def admission_control(
             handle.close()
 
 
-class _Told:
+class _RefusalLog:
     """Says who is refused, once in a while for each."""
 
     def __init__(self) -> None:
