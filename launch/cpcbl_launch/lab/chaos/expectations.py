@@ -245,6 +245,18 @@ def duplicates(run: FaultRun) -> list[Check]:
     ]
 
 
+def late(run: FaultRun) -> list[Check]:
+    """What comes too late is refused and counted, and no estimate suffers from it."""
+    count = sum(
+        run.log.counts_between(name, run.fault_s, run.end_s)["too_late"] for name in run.robots
+    )
+    return [
+        at_least("copies sent", run.sent, 400),
+        replace(at_least("counted as too late", count, 0.1 * run.sent), by_load=False),
+        *checks_unaffected(run.log, run.robots, *run.window_s, most_m=GOOD_M, who="team's"),
+    ]
+
+
 def flood(run: FaultRun) -> list[Check]:
     """The router limits what a robot may send; the other robots work as before."""
     log, seconds = run.log, run.healed_s - run.fault_s

@@ -9,7 +9,7 @@ import sys
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 
 from cpcbl_agents.clock import Clock
@@ -29,6 +29,7 @@ LIE = "bias:0.5,0.5"
 GUEST_AT = "4.5,0,90"
 IN_FULL_S = 12.0  # until an abuse has taken all that it can
 LATEST_S = 4.0  # twice what a robot's timeline goes back
+TOO_LATE_S, LATE_COPIES = 2.3, 4
 
 
 @contextmanager
@@ -151,22 +152,36 @@ def guest(team: TeamUnderTest, run: FaultRun) -> Iterator[None]:
             (process.kill if run.robot.endswith("1") else process.terminate)()
 
 
-@contextmanager
-def echo(team: TeamUnderTest, run: FaultRun) -> Iterator[None]:
-    """Repeats all help of a robot at once, and again up to 4 s late."""
-    with (
-        team.session(OPERATOR) as ears,
-        team.session(Identity(Role.ROBOT, run.robot)) as mouth,
-        echoes(ears, mouth, run.robot, LATEST_S, team.plan.seed) as sent,
-    ):
-        yield
-    run.sent = sent.total()
+def repeat(delays: Callable[[random.Random], Sequence[float]]) -> Injector:
+    """All help of a robot comes again, so many seconds late."""
+
+    @contextmanager
+    def inject(team: TeamUnderTest, run: FaultRun) -> Iterator[None]:
+        with (
+            team.session(OPERATOR) as ears,
+            team.session(Identity(Role.ROBOT, run.robot)) as mouth,
+            echoes(ears, mouth, run.robot, delays, team.plan.seed) as sent,
+        ):
+            yield
+        run.sent = sent.total()
+
+    return inject
+
+
+echo = repeat(lambda dice: (0.0, dice.uniform(0.0, LATEST_S)))
+late = repeat(lambda dice: [dice.uniform(TOO_LATE_S, LATEST_S) for _ in range(LATE_COPIES)])
 
 
 @contextmanager
-def echoes(ears: Bus, mouth: Bus, robot: str, latest_s: float, seed: int) -> Iterator[Counter[str]]:
-    """Sends the help of one robot again, once at once and once up to `latest_s` later, so that
-    messages lose their order. Counts the copies by their key."""
+def echoes(
+    ears: Bus,
+    mouth: Bus,
+    robot: str,
+    delays: Callable[[random.Random], Sequence[float]],
+    seed: int,
+) -> Iterator[Counter[str]]:
+    """Sends the help of one robot again, after each of these delays, so that messages lose their
+    order. Counts the copies by their key."""
     dice, due, stop = random.Random(seed), sched.scheduler(time.monotonic), threading.Event()
     publishers: dict[str, Publisher] = {}
     sent: Counter[str] = Counter()
@@ -176,7 +191,7 @@ def echoes(ears: Bus, mouth: Bus, robot: str, latest_s: float, seed: int) -> Ite
         if payload in repeated:
             return
         repeated.add(payload)
-        for late_s in (0.0, dice.uniform(0.0, latest_s)):
+        for late_s in delays(dice):
             due.enter(late_s, 0, send, (key, payload))
 
     def send(key: str, payload: bytes) -> None:
