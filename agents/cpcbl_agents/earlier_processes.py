@@ -16,6 +16,7 @@ from cpcbl_transport.topics import namespace
 STILL, MOVED = "still", "moved"
 LEASE_S = 6.0  # the token of a process that ended stays no longer, over two routers either
 LOOK_S = 0.2
+MOST_REPEATED = 8192
 ROUTER = "router"  # in place of an incarnation: what the router repeats
 
 
@@ -80,7 +81,8 @@ def repeat_tokens(bus: Bus, space: str = "") -> None:
 
     def on_token(key: str, alive: bool) -> None:
         head, _, incarnation = key.rpartition("/")
-        if alive and incarnation != ROUTER and head not in kept:
+        is_known = head.rpartition("/")[2] in (STILL, MOVED) and len(kept) < MOST_REPEATED
+        if alive and is_known and incarnation != ROUTER and head not in kept:
             kept[head] = bus.declare_token(f"{head}/{ROUTER}")
 
     bus.watch_liveliness(space + topics.RAN.at(), on_token)

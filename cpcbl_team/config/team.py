@@ -31,6 +31,14 @@ class GuardSettings(Table, frozen=True, kw_only=True):
     """The largest payload of any other message; robots refuse larger ones too."""
     largest_frame_bytes: Annotated[int, msgspec.Meta(ge=1)] = 1_048_576
     """The largest payload of a camera's image, plain or annotated."""
+    frame_rate_hz: Positive = 120.0
+    """Of images for one robot; at least twice the camera's rate."""
+    tokens_per_s: Positive = 50.0
+    """How often the liveliness tokens of a member may change. One with more is refused for 3 s."""
+    sessions_per_member: Annotated[int, msgspec.Meta(ge=1)] = 64
+    """With keys: the sessions of one certificate."""
+    sessions_per_address: Annotated[int, msgspec.Meta(ge=1)] = 1000
+    """Without keys: the sessions of one address."""
 
 
 class TransportSettings(Table, frozen=True, kw_only=True):

@@ -4,6 +4,7 @@ import random
 import struct
 import zlib
 from collections.abc import Callable
+from copy import deepcopy
 from typing import Any
 
 NUMBERS = (
@@ -50,7 +51,7 @@ def mutated_tree(tree: Any, rng: random.Random, values: tuple[Any, ...] = VALUES
             continue
         match rng.randrange(8):
             case 0 | 1 | 2 | 3:
-                parent[key] = rng.choice(values)
+                parent[key] = deepcopy(rng.choice(values))  # a later change is of this file only
             case 4 if isinstance(parent, dict):
                 parent[rng.choice(("x", "start", f"{key}_m", str(key)[:-1]))] = parent.pop(key)
             case 5:

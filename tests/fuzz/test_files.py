@@ -4,6 +4,7 @@
 """
 
 import json
+import random
 from collections import Counter
 from pathlib import Path
 
@@ -12,6 +13,7 @@ import msgspec
 import numpy as np
 import pytest
 from fuzz.files import KINDS, tried
+from fuzz.mutations import mutated_tree
 from mcap.writer import Writer
 from support.logs import log_team, write_log
 
@@ -91,3 +93,11 @@ def test_a_picture_that_claims_to_be_huge_is_no_picture(tmp_path: Path) -> None:
     data[size : size + 4] = b"\xff\xff\xff\xff"
     path.write_bytes(data)
     assert read_picture(path).pixels == "no picture"
+
+
+def test_a_change_of_a_file_leaves_the_next_one_as_it_was() -> None:
+    values: tuple[object, ...] = ({"a": {}}, [[]])
+    for number in range(3_000):
+        tree: list[object] = [{"a": 1, "b": ["c"]}, 2]
+        mutated_tree(tree, random.Random(number), values)
+    assert values == ({"a": {}}, [[]])

@@ -42,7 +42,7 @@ def limits(rules: dict[str, Any]) -> dict[str, int]:
 
 
 def test_every_target_and_beliefs_have_a_rate_and_every_key_a_size() -> None:
-    rates_hz: dict[str, Any] = {"fix_rate_hz": 30.0, "belief_rate_hz": 20.0}
+    rates_hz: dict[str, Any] = {"fix_rate_hz": 30.0, "belief_rate_hz": 20.0, "frame_rate_hz": 60.0}
     team = guarded(**rates_hz, largest_help_bytes=99, largest_bytes=999, largest_frame_bytes=99_999)
     rules = guard_rules(team)
     assert rates(rules) == {
@@ -50,6 +50,9 @@ def test_every_target_and_beliefs_have_a_rate_and_every_key_a_size() -> None:
         "cpcbl/tests/fix/healthy/*/*": 30.0,
         "cpcbl/tests/fix/faulty/*/*": 30.0,
         "cpcbl/tests/belief/*/*": 20.0,
+        "cpcbl/tests/in/victim/frame": 60.0,
+        "cpcbl/tests/in/healthy/frame": 60.0,
+        "cpcbl/tests/in/faulty/frame": 60.0,
     }
     assert limits(rules) == {
         "cpcbl/tests/fix/*/*/*": 99,
@@ -216,7 +219,7 @@ def test_what_is_too_large_is_not_let_in() -> None:
     odometry = topics.IN_ODOMETRY.at(robot="victim")
     frame = topics.IN_FRAME.at(robot="victim")
     small, largest, largest_frame = bytes(256), bytes(LARGEST_PAYLOAD), bytes(LARGEST_FRAME)
-    with three_robots(guarded(belief_rate_hz=ANY_RATE_HZ)) as robots:
+    with three_robots(guarded(belief_rate_hz=ANY_RATE_HZ, frame_rate_hz=ANY_RATE_HZ)) as robots:
         put(robots.faulty, belief, bytes(1_000_000), bytes(257), small)
         put(robots.faulty, odometry, bytes(1_000_000), bytes(LARGEST_PAYLOAD + 1), largest)
         put(robots.faulty, frame, bytes(LARGEST_FRAME + 1), largest_frame)
@@ -226,7 +229,18 @@ def test_what_is_too_large_is_not_let_in() -> None:
     assert robots.inputs.payloads == [largest, largest_frame, b"last"]
 
 
-def test_inputs_are_let_in_as_they_come() -> None:
+def test_images_have_a_rate_for_each_robot() -> None:
+    images = [topics.IN_FRAME.at(robot=name) for name in ("victim", "healthy")]
+    with three_robots(guarded(frame_rate_hz=TOO_SELDOM_HZ)) as robots:
+        other = Subscription(robots.healthy, "in/healthy/*")
+        for key in images:
+            put(robots.faulty, key, b"1", b"2")
+        last_of(robots.faulty, robots.inputs)
+        last_of(robots.faulty, other, "healthy")
+    assert robots.inputs.payloads == other.payloads == [b"1", b"last"]
+
+
+def test_other_inputs_are_let_in_as_they_come() -> None:
     sent = [n.to_bytes(20, "big") for n in range(2000)]
     with three_robots(guarded()) as robots:
         put(robots.faulty, topics.IN_ODOMETRY.at(robot="victim"), *sent)

@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from support.routers import open_router
 
 from cpcbl_launch.run.up import free_endpoint
 from cpcbl_transport import zenoh_bus
@@ -55,6 +56,7 @@ def test_a_robot_that_waits_for_a_router_names_the_endpoint_and_then_asks_for_th
     caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(zenoh_bus, "WAITING_S", 0.0)
+    monkeypatch.setattr(zenoh_bus, "USUAL_PORT", 1)  # nobody listens there
     endpoint = free_endpoint()
     with (
         caplog.at_level(logging.WARNING),
@@ -64,6 +66,22 @@ def test_a_robot_that_waits_for_a_router_names_the_endpoint_and_then_asks_for_th
     first, second = caplog.messages
     assert first == f"no router at {endpoint} yet, waiting for it"
     assert second == f"{first}; does the router say that it listens at another port?"
+
+
+def test_a_robot_that_waits_at_another_port_than_the_router_is_told_the_router_s(
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    usual, other = free_endpoint(), free_endpoint()
+    monkeypatch.setattr(zenoh_bus, "USUAL_PORT", int(usual.rpartition(":")[2]))
+    port = other.rpartition(":")[2]
+    with (
+        open_router("lab", [usual]),
+        caplog.at_level(logging.WARNING),
+        pytest.raises(zenoh_bus.BusError),
+    ):
+        zenoh_bus.open_bus("lab", [other], lambda: bool(caplog.messages))
+    (line,) = caplog.messages
+    assert line.endswith(f"; a router listens at {usual}, not at {port}: connect there, or move it")
 
 
 def limited(soft: int, hard: int) -> "subprocess.CompletedProcess[str]":

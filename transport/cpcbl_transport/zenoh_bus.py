@@ -17,7 +17,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import zenoh
 
@@ -32,6 +32,7 @@ log = logging.getLogger(__name__)
 RUNTIME = "ZENOH_RUNTIME"
 ROUTER_RUNTIME = "(rx: (worker_threads: 16))"
 """Two by default: two slow receivers held up everybody."""
+USUAL_PORT = 7447
 TOKENS_S = 5.0  # for the router's answer
 LEAST_DESCRIPTORS, MOST_DESCRIPTORS = 64, 65_536
 WAITING_S = 10.0  # after so long it is said again that no router answers
@@ -65,12 +66,31 @@ def open_bus(
             elif time.monotonic() - said_s >= WAITING_S:
                 said_s = time.monotonic()
                 shown = f": {reason}" if credentials else ""
-                hint = "" if first else "; does the router say that it listens at another port?"
+                hint = _port_hint(connect, credentials, first)
                 first = False
                 where = ", ".join(connect)
                 log.warning("no router at %s yet, waiting for it%s%s", where, shown, hint)
             time.sleep(0.2)
     raise BusError(f"no router at {', '.join(connect)}: {reason}")
+
+
+def _port_hint(connect: Sequence[str], credentials: Credentials | None, first: bool) -> str:
+    """What to say of ports to somebody who waits for a router: where one is instead."""
+    for head, _, port in (endpoint.rpartition(":") for endpoint in connect):
+        usual = f"{head}:{USUAL_PORT}"
+        if port != str(USUAL_PORT) and _listens(usual, credentials):
+            return f"; a router listens at {usual}, not at {port}: connect there, or move it"
+    return "" if first else "; does the router say that it listens at another port?"
+
+
+def _listens(endpoint: str, credentials: Credentials | None) -> bool:
+    """Whether a router answers there at once."""
+    config = client_config([endpoint], credentials)
+    config["connect"]["timeout_ms"] = 500
+    with suppress(zenoh.ZError):
+        _open(config).close()  # type: ignore[no-untyped-call]
+        return True
+    return False
 
 
 def _tls_reason(connect: Sequence[str], credentials: Credentials | None) -> str:
@@ -210,6 +230,19 @@ class _ZenohPublisher(_Declared):
             self._publisher.put(payload)
 
 
+class PeerLink(NamedTuple):
+    """The link of a session to another one."""
+
+    session: str
+    peer: str  # the other side's address and port
+    member: str = ""  # what its certificate says, such as `robot/r1`; empty without one
+
+    @staticmethod
+    def of(link: "zenoh.Link") -> "PeerLink":
+        peer = re.split("[?#]", str(link.dst).partition("/")[2])[0]
+        return PeerLink(str(link.zid), peer, link.auth_identifier or "")
+
+
 class ZenohBus(Bus):
     """One Zenoh session."""
 
@@ -261,6 +294,19 @@ class ZenohBus(Bus):
             for transport in self._session.info.transports()
             if (zid := str(transport.zid)) in links
         }
+
+    def links(self) -> list[PeerLink]:
+        """The links of this session at present."""
+        return [PeerLink.of(link) for link in self._session.info.links()]
+
+    def watch_links(self, on_change: Callable[[], None]) -> Handle:
+        """Calls `on_change` when a link was opened or has ended."""
+
+        def on_event(event: "zenoh.LinkEvent") -> None:
+            on_change()
+
+        declared = self._session.info.declare_link_events_listener(on_event)
+        return _Declared(self, declared.undeclare)
 
     def close(self) -> None:
         self.declared.clear()

@@ -16,9 +16,10 @@ each robot has its own share, and a flood ends at the router. What was measured:
   after the rate: what is too large has used its turn.
 - The sender is not told; its `matching` stays true.
 
-Inputs have a limit of size but none of rate: a lost piece of odometry is a lost piece of the way,
-they come in bursts after every stall, and reach one robot only, whose inbox has a bound. Status and
-tracks are for people; no robot subscribes to them.
+Of the inputs only images have a limit of rate. A lost piece of odometry is a lost piece of the way;
+after a stall all pieces of that time come within a millisecond, and any limit that lets them pass
+bounds nothing, because Zenoh's has no burst. They reach one robot only, whose inbox has a bound.
+Status and tracks are for people; no robot subscribes to them.
 """
 
 from collections.abc import Mapping, Sequence
@@ -33,6 +34,8 @@ from cpcbl_transport.topics import Topic
 OPEN_TIMEOUT_MS = 2000
 LEASE_MS = 2000
 BLOCKED_US = 200_000  # so long a declaration waits for a silent session, which ends then
+ACCEPT_TIMEOUT_MS, PENDING = 5000, 10_000  # half-open connections, each an open file
+SESSIONS = 4096  # in all; a guard limits those of each member
 LARGEST_MESSAGE = LARGEST_FRAME + 16_384  # with its key and headers; checked fragment by fragment
 
 # A session that reads nothing must not hold up the router's threads, which serve all others
@@ -99,6 +102,11 @@ def router_config(
     waits = {"congestion_control": {"block": {"wait_before_close": BLOCKED_US}}}
     link["tx"] = {**_TX, "queue": waits}
     link["rx"] = {"max_message_size": LARGEST_MESSAGE}
+    config["transport"]["unicast"] = {
+        "accept_timeout": ACCEPT_TIMEOUT_MS,
+        "accept_pending": PENDING,
+        "max_sessions": SESSIONS,
+    }
     return {**config, "qos": {"network": [_NEVER_BLOCK]}, **(guards or {})}
 
 
@@ -111,6 +119,7 @@ def guard_rules(team: Team, speed: float = 1.0) -> dict[str, Any]:
     space, faster = topics.namespace(team.name), max(1.0, speed)
     rates = {topics.FIX.at(robot=name): guards.fix_rate_hz for name in team.robots}
     rates[topics.BELIEF.at()] = guards.belief_rate_hz
+    rates |= {topics.IN_FRAME.at(robot=name): guards.frame_rate_hz for name in team.robots}
     limits = {topic.at(): _limit(topic, guards) for topic in topics.TOPICS if topic.carries}
     limits["**"] = max(limits.values())
     rules = [{"key_expr": f"{space}/{keys}", "freq": hz * faster} for keys, hz in rates.items()]

@@ -261,6 +261,7 @@ def router(
     """Run the team's Zenoh router, on any machine, until SIGINT, SIGTERM or SIGHUP."""
     from cpcbl_agents.stop import StopSignal
     from cpcbl_launch.run.router import run_router, team_router
+    from cpcbl_team.config import GuardSettings
     from cpcbl_transport.zenoh_bus import read_router_config
 
     team = None
@@ -280,7 +281,8 @@ def router(
         typer.echo(f"// {title}\n// zenohd -c FILE, or cpcbl-team router --config FILE")
         typer.echo(json.dumps(settings, indent=2))
     else:
-        run_router(settings, title, StopSignal(parent))
+        guards = team.transport.guards if team else GuardSettings()
+        run_router(settings, title, StopSignal(parent), guards, speed)
 
 
 def gateway(

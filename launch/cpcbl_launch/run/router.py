@@ -7,7 +7,8 @@ from typing import Any
 
 from cpcbl_agents.earlier_processes import ALL_TEAMS, repeat_tokens
 from cpcbl_agents.watchdog import with_watchdog
-from cpcbl_team.config import Team
+from cpcbl_launch.run.admission import admission_control
+from cpcbl_team.config import GuardSettings, Team
 from cpcbl_transport import topics
 from cpcbl_transport.security import Identity, access_control, link_of
 from cpcbl_transport.topics import Role
@@ -34,11 +35,21 @@ def team_router(
     return router_config(here, connect, guards, credentials)
 
 
-def run_router(config: Mapping[str, Any], title: str, stop: Callable[[], bool]) -> None:
+def run_router(
+    config: Mapping[str, Any],
+    title: str,
+    stop: Callable[[], bool],
+    guards: GuardSettings,
+    speed: float = 1.0,
+) -> None:
     """Routes until `stop()`; logs where it listens, and who comes and goes. Raises BusError."""
-    with open_router(config) as bus:
+    listen = listening_at(config)
+    with (
+        open_router(config) as bus,
+        admission_control(bus, guards, listen, speed, ALL_TEAMS),
+    ):
         repeat_tokens(bus, ALL_TEAMS)
-        log.info("%s listens at %s", title, ", ".join(listening_at(config)))
+        log.info("%s listens at %s", title, ", ".join(listen))
         bus.watch_liveliness(ALL_TEAMS + topics.ALIVE.at(), PresenceLogger())
         known: dict[str, str] = {}
         is_over = with_watchdog(stop)

@@ -3,13 +3,13 @@
 import logging
 import socket
 import time
-from collections.abc import Callable, Collection, Mapping, Sequence
-from contextlib import AbstractContextManager, ExitStack, nullcontext
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from types import MappingProxyType
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import msgspec
 import numpy as np
@@ -21,6 +21,7 @@ from cpcbl_launch.reporting.metrics import Floats
 from cpcbl_launch.reporting.phases import Span, guest_reports, phase_report
 from cpcbl_launch.reporting.recorder import Recorder, Report, variants_of
 from cpcbl_launch.reporting.recording import Recording
+from cpcbl_launch.run.admission import admission_control
 from cpcbl_launch.run.logged_team import is_calibrated_on
 from cpcbl_launch.run.processes import Processes, Supervisor, process_table, tasks
 from cpcbl_launch.run.router import team_router
@@ -94,10 +95,17 @@ class OnThisMachine:
         if self._run.connect:
             return self._join_router()
         require_keys(team, listen, self._here)
-        config = team_router(team, listen, (), self._run.speed)
-        bus = open_router(config, namespace(team.name))
-        repeat_tokens(bus)
-        return bus
+        return self._opened(team_router(team, listen, (), self._run.speed))
+
+    @contextmanager
+    def _opened(self, config: Mapping[str, Any]) -> Iterator[Bus]:
+        team, speed = self._run.team, self._run.speed
+        with (
+            open_router(config, namespace(team.name)) as bus,
+            admission_control(bus, team.transport.guards, team.transport.listen, speed),
+        ):
+            repeat_tokens(bus)
+            yield bus
 
     def _join_router(self) -> AbstractContextManager[Bus]:
         run, until_s = self._run, time.monotonic() + JOIN_S

@@ -283,7 +283,9 @@ def test_an_echo_sends_every_message_twice_more() -> None:
     ):
         ear, publisher = Subscription(listener, key), speaker.publisher(key, Qos.INPUT)
         wait_until(lambda: publisher.matching)
-        with echoes(echo_bus, echo_bus, "b", latest_s=0.5, seed=1) as copies:
+        with echoes(
+            echo_bus, echo_bus, "b", lambda dice: (0.0, dice.uniform(0.0, 0.5)), seed=1
+        ) as copies:
 
             def echoed() -> bool:  # its subscription cannot be told from the listener's
                 publisher.put(b"")

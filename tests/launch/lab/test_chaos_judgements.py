@@ -1,5 +1,7 @@
 """What scenarios make of what was recorded: expectations that hold, and that do not."""
 
+from typing import Any
+
 import pytest
 from support.chaos import (
     run_log_of,
@@ -13,6 +15,7 @@ from support.chaos import (
 
 from cpcbl_launch.lab.chaos import expectations as expect
 from cpcbl_launch.lab.chaos.files import CommandResult, full_disk_checks, read_only_checks
+from cpcbl_launch.lab.chaos.machine import MachineLog
 from cpcbl_launch.lab.chaos.memory import (
     ProcessLife,
     ProcessSample,
@@ -320,14 +323,57 @@ def test_a_soak() -> None:
     }
 
 
+FLAT = process_lives(samples("field", 0.01) | samples("up", 0.0))
+
+
 def test_memory_is_flat_in_every_process_that_is_to_be_judged() -> None:
-    flat = process_lives(samples("field", 0.01) | samples("up", 0.0))
-    assert not unmet_checks(memory_checks(flat, ["field", "up"]))
-    leaking = [*flat, ProcessLife("robot-a", 400.0, 30.0, 45.0, 2.0, 30)]
+    assert not unmet_checks(memory_checks(FLAT, ["field", "up"]))
+    leaking = [*FLAT, ProcessLife("robot-a", 400.0, 30.0, 45.0, 2.0, 30, 0.6)]
     assert unmet_checks(memory_checks(leaking, ["field", "up", "router"])) == {
         "processes that ran too shortly to judge their memory",
         "largest growth of memory",
-        "steepest growth of one that ran for 300 s",
+        "steepest growth in the second half of a life of 300 s",
         "largest growth of the number of open files",
     }
     assert "largest growth of memory" in unmet_checks(memory_checks([], []))
+
+
+def test_buffers_that_fill_are_no_growth_of_a_long_life() -> None:
+    filling = {("up", 1): [ProcessSample(at, min(at, 300.0) / 30.0, 9) for at in range(0, 1200, 5)]}
+    growing = {("up", 1): [ProcessSample(at, at / 90.0, 9) for at in range(0, 1200, 5)]}
+    assert not unmet_checks(memory_checks([*FLAT, *process_lives(filling)], ["up"]))
+    steep = {"steepest growth in the second half of a life of 300 s"}
+    assert unmet_checks(memory_checks([*FLAT, *process_lives(growing)], ["up"])) == steep
+
+
+def test_a_robot_that_finds_no_place_at_the_router_while_it_is_abused() -> None:
+    besieged: dict[str, Any] = {
+        "victim": "a",
+        "killed_s": AT_S,
+        "incarnation": "1",
+        "sent": 9,
+        "router_mib": 60.0,
+    }
+    back = run_log_of([tracks_of("a", silent=(10.0, 12.0)), tracks_of("b")], KILLED)
+    assert not unmet_checks(expect.rejoin(run_of(back, "", 20.0, **besieged)))
+    out = run_log_of([tracks_of("a", silent=(10.0, 19.0)), tracks_of("b")], KILLED[:3])
+    assert unmet_checks(expect.rejoin(run_of(out, "", 20.0, **besieged))) == {
+        "a was back with a token after"
+    }
+    heavy = run_of(back, "", 20.0, **besieged | {"router_mib": 300.0})
+    assert unmet_checks(expect.rejoin(heavy)) == {"growth of the router's memory"}
+
+
+def test_an_abuse_that_silences_others_for_half_a_second_and_more() -> None:
+    for until_s, unmet in ((10.4, set()), (10.7, {"others' longest gap between tracks"})):
+        log = run_log_of([tracks_of("a"), tracks_of("b", silent=(10.0, until_s))])
+        assert unmet_checks(expect.abuse(run_of(log, "a", 20.0, sent=9))) == unmet
+
+
+def test_what_the_machine_adds_to_a_return_does_not_count() -> None:
+    arrivals_s = (*(0.1 * n for n in range(100)), *(13.0 + 0.1 * n for n in range(100)))
+    seldom = MachineLog(arrivals_s, (0.0,) * len(arrivals_s))
+    run = run_of(GOOD._replace(machine=seldom), "a", AT_S)
+    assert expect.check_back(run, "back after", 7.5, AT_S).is_met
+    assert not expect.check_back(run, "back after", 9.0, AT_S).is_met
+    assert not expect.check_back(run, "back after", None, AT_S).is_met

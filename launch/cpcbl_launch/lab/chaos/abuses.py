@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from cpcbl_agents.stop import StopSignal
+from cpcbl_launch.lab.chaos import router_abuses
 from cpcbl_launch.team.file import load_team
 from cpcbl_team.config import Team
 from cpcbl_team.inputs import Belief, Fix
@@ -91,6 +92,13 @@ def garbage(abuser: Abuser) -> int:
 ABUSES: Mapping[str, Callable[[Abuser], int]] = {
     "flood": flood,
     "garbage": garbage,
+    "deaf": router_abuses.deaf,
+    "listen": router_abuses.listen,
+    "tokens": router_abuses.tokens,
+    "subscriptions": router_abuses.subscriptions,
+    "sessions": router_abuses.sessions,
+    "half-open": router_abuses.half_open,
+    "large": router_abuses.large,
 }
 
 

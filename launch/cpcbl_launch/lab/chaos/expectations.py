@@ -11,6 +11,7 @@ from cpcbl_launch.lab.chaos.scenario import FaultRun
 from cpcbl_transport.messages import Refusal
 
 GOOD_M = 0.15  # the demonstration has 0.03 m; the blind scout without help 0.1 m after some seconds
+REJOIN_S = 5.0  # after a fault has healed; less what the machine lengthens gaps by
 LATE_S = 1.0  # later than any track should come
 FINDERS = 2  # of three that drive; one may be out of the liar's sight for long
 
@@ -39,6 +40,12 @@ def checks_unaffected(
         at_most(f"{who} worst RMSE", rmse_m, most_m, "m"),
         *checks_consistent(log, robots, *window, who),
     ]
+
+
+def check_back(run: FaultRun, what: str, after_s: float | None, from_s: float) -> Check:
+    """From the end of a fault until something was as before it, less what the machine adds."""
+    late_s = 0.0 if after_s is None else run.log.machine.late_s(from_s, from_s + after_s)
+    return at_most(what, after_s, REJOIN_S, "s", late_s)
 
 
 def check_gap(
@@ -110,8 +117,8 @@ def kill(run: FaultRun) -> list[Check]:
     back_s = run.log.token_back_after_s(run.robot, run.fault_s, run.incarnation)
     return [
         check_token_gone(run, 1.0),
-        at_most("a new process started after", back_s, 10.0, "s"),
-        at_most("from then until it was localized", found_after_s(run), 15.0, "s"),
+        check_back(run, "a new process started after", back_s, run.fault_s),
+        check_back(run, "from then until it was localized", found_after_s(run), run.fault_s),
         *checks_unaffected(run.log, run.others, *run.window_s),
         *checks_recovered(run, run.healed_s),
     ]
@@ -128,7 +135,7 @@ def freeze(run: FaultRun) -> list[Check]:
         check_token_gone(run, 4.0),
         *checks_unaffected(log, run.others, *run.window_s),
         at_most("from waking to its first new track", track_s, 3.0, "s"),
-        at_most("from waking until it was localized", found_s, 5.0, "s"),
+        check_back(run, "from waking until it was localized", found_s, woke_s),
         at_most(f"tracks that arrived more than {LATE_S:g} s late", late, 10),
         at_most("others' largest error in the 4 s after it woke", error_m, 0.5, "m"),
         *checks_recovered(run, woke_s + 4.0),
@@ -146,7 +153,7 @@ def kill_router(run: FaultRun) -> list[Check]:
     back = {t.robot for t in log.tokens if t.at_s >= run.fault_s and t.alive} & set(robots)
     helped = sum(log.counts_between(name, run.healed_s)["messages_received"] for name in robots)
     return [
-        check_gap(log, robots, run.fault_s, run.end_s, "longest gap between tracks", 6.0),
+        check_gap(log, robots, run.fault_s, run.end_s, "longest gap between tracks", REJOIN_S),
         at_least("robots with a token at the new router", len(back), len(robots)),
         at_least(f"help received in the {run.end_s - run.healed_s:.0f} s after", helped, 20),
         *checks_recovered(run, run.healed_s),
@@ -163,7 +170,9 @@ def kill_field(run: FaultRun) -> list[Check]:
     return [
         check_gap(run.log, run.robots, *run.window_s, "longest gap between tracks", 1.5),
         at_most("a new field started after", run.restarted_s - run.fault_s, 10.0, "s"),
-        at_most("from then until all were localized", all_found_after_s(run), 20.0, "s"),
+        check_back(
+            run, "from then until all were localized", all_found_after_s(run), run.restarted_s
+        ),
         *checks_recovered(run, run.healed_s),
     ]
 
@@ -185,8 +194,8 @@ def partition(run: FaultRun, most_far_m: float = FOUND_M) -> list[Check]:
         at_most("other side's tokens disappeared after", gone_s, 4.0, "s"),
         *checks_unaffected(near_log, near, *run.window_s, who="near side's"),
         *checks_unaffected(far_log, far, *run.window_s, most_m=most_far_m, who="far side's"),
-        at_most("from healing to all tokens back", back_s, 5.0, "s"),
-        at_most("from healing to the first help", helped_s, 5.0, "s"),
+        check_back(run, "from healing to all tokens back", back_s, run.healed_s),
+        check_back(run, "from healing to the first help", helped_s, run.healed_s),
         *checks_recovered(run, run.healed_s + 5.0),
     ]
 
@@ -198,8 +207,8 @@ def cut_link(run: FaultRun) -> list[Check]:
     return [
         check_token_gone(run, 4.0),
         *checks_unaffected(run.log, run.others, run.fault_s, run.healed_s),
-        at_most("from healing to its token back", back_s, 5.0, "s"),
-        at_most("from healing until it was localized", found_s, 8.0, "s"),
+        check_back(run, "from healing to its token back", back_s, run.healed_s),
+        check_back(run, "from healing until it was localized", found_s, run.healed_s),
         *checks_recovered(run, run.healed_s + 5.0),
     ]
 
@@ -236,6 +245,18 @@ def duplicates(run: FaultRun) -> list[Check]:
     ]
 
 
+def late(run: FaultRun) -> list[Check]:
+    """What comes too late is refused and counted, and no estimate suffers from it."""
+    count = sum(
+        run.log.counts_between(name, run.fault_s, run.end_s)["too_late"] for name in run.robots
+    )
+    return [
+        at_least("copies sent", run.sent, 400),
+        replace(at_least("counted as too late", count, 0.1 * run.sent), by_load=False),
+        *checks_unaffected(run.log, run.robots, *run.window_s, most_m=GOOD_M, who="team's"),
+    ]
+
+
 def flood(run: FaultRun) -> list[Check]:
     """The router limits what a robot may send; the other robots work as before."""
     log, seconds = run.log, run.healed_s - run.fault_s
@@ -249,20 +270,27 @@ def flood(run: FaultRun) -> list[Check]:
     ]
 
 
-def abuse(run: FaultRun, most_silent_s: float = 0.5, most_m: float = GOOD_M) -> list[Check]:
+def abuse(
+    run: FaultRun, most_silent_s: float = 0.5, most_m: float = GOOD_M, most_mib: float = 30.0
+) -> list[Check]:
     """What one member does to the team silences and misleads none of the other robots."""
-    return [
+    window = run.log, run.others, run.fault_s, run.end_s
+    checks = [
         at_least("what the abuse sent", run.sent, 1),
-        *checks_unaffected(
-            run.log,
-            run.others,
-            run.fault_s,
-            run.end_s,
-            most_silent_s=most_silent_s,
-            most_m=most_m,
-        ),
+        *checks_unaffected(*window, most_silent_s=most_silent_s, most_m=most_m),
         *checks_recovered(run, run.healed_s + 1.0),
     ]
+    if run.router_mib is not None:
+        what, grown = "growth of the router's memory", run.router_mib
+        checks.append(Check(what=what, seen=grown, at_most=most_mib, unit="MiB", by_load=False))
+    return checks
+
+
+def rejoin(run: FaultRun, most_mib: float = 120.0) -> list[Check]:
+    """The same, and a robot that starts again meanwhile finds a place at the router."""
+    back_s = run.log.token_back_after_s(run.victim, run.killed_s, run.incarnation)
+    what = f"{run.victim} was back with a token after"
+    return [check_back(run, what, back_s, run.killed_s), *abuse(run, most_mib=most_mib)]
 
 
 # The simulated world ------------------------------------------------------------------------------
@@ -291,7 +319,7 @@ def hidden_landmarks(
     back_s = worst(run.log.localized_after_s, run.robots, run.healed_s)
     return [
         *checks_unaffected(run.log, run.robots, *run.window_s, most_m=most_m, who="team's"),
-        at_most("all were localized after", back_s, 8.0, "s"),
+        check_back(run, "all were localized after", back_s, run.healed_s),
         *checks_recovered(run, run.healed_s + 3.0, afterwards_m),
     ]
 

@@ -9,16 +9,16 @@ import sys
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 
 from cpcbl_agents.clock import Clock
 from cpcbl_launch.lab.chaos.abuses import ABUSES
 from cpcbl_launch.lab.chaos.links import LinkQuality, TunLink
 from cpcbl_launch.lab.chaos.scenario import FaultRun, Injector
-from cpcbl_launch.lab.chaos.team import FIELD, OPERATOR, TeamUnderTest
+from cpcbl_launch.lab.chaos.team import FIELD, OPERATOR, ROUTER, TeamUnderTest
 from cpcbl_launch.lab.faulty_robot import faulty_command
-from cpcbl_launch.run.processes import PROGRAM, ProcessSpec
+from cpcbl_launch.run.processes import PROGRAM, ProcessSpec, own_memory_mib
 from cpcbl_transport import topics
 from cpcbl_transport.bus import Bus, Publisher
 from cpcbl_transport.security import Identity
@@ -27,7 +27,9 @@ from cpcbl_transport.topics import Role
 CLOCK_AHEAD_NS = 3_000_000_000
 LIE = "bias:0.5,0.5"
 GUEST_AT = "4.5,0,90"
+IN_FULL_S = 12.0  # until an abuse has taken all that it can
 LATEST_S = 4.0  # twice what a robot's timeline goes back
+TOO_LATE_S, LATE_COPIES = 2.3, 4
 
 
 @contextmanager
@@ -72,22 +74,39 @@ narrow = impair(LinkQuality(bytes_per_s=50_000 / 8))
 lossy = impair(LinkQuality(loss=0.2))
 
 
-def abuse(name: str) -> Injector:
-    """What a member of the team does to it (`abuses.py`), in a process of its own."""
+def abuse(name: str, victim: str = "") -> Injector:
+    """What a member of the team does to it (`abuses.py`), in a process of its own. A `victim` is a
+    robot that is killed while it goes on, and has to start again."""
     assert name in ABUSES, name
 
     @contextmanager
     def inject(team: TeamUnderTest, run: FaultRun) -> Iterator[None]:
         module = (sys.executable, "-m", "cpcbl_launch.lab.chaos.abuses", name)
         words = (str(team.team_file), team.endpoint, str(os.getpid()), run.robot, *run.others)
+        before_mib = _router_mib(team)
         with subprocess.Popen([*module, *words], stdout=subprocess.PIPE, text=True) as process:
             try:
+                if victim:
+                    team.run_for(IN_FULL_S)
+                    run.victim, run.incarnation = victim, team.run_log.latest_incarnation(victim)
+                    run.killed_s = team.now_s
+                    team.signal(victim, signal.SIGKILL)
                 yield
             finally:
+                after_mib = _router_mib(team)
                 process.terminate()
                 run.sent = int(process.communicate(timeout=20.0)[0] or 0)
+        if before_mib is not None and after_mib is not None:
+            run.router_mib = after_mib - before_mib
 
     return inject
+
+
+def _router_mib(team: TeamUnderTest) -> float | None:
+    try:
+        return own_memory_mib(team.pid(ROUTER))
+    except OSError:  # no Linux
+        return None
 
 
 flood, garbage = abuse("flood"), abuse("garbage")
@@ -133,22 +152,36 @@ def guest(team: TeamUnderTest, run: FaultRun) -> Iterator[None]:
             (process.kill if run.robot.endswith("1") else process.terminate)()
 
 
-@contextmanager
-def echo(team: TeamUnderTest, run: FaultRun) -> Iterator[None]:
-    """Repeats all help of a robot at once, and again up to 4 s late."""
-    with (
-        team.session(OPERATOR) as ears,
-        team.session(Identity(Role.ROBOT, run.robot)) as mouth,
-        echoes(ears, mouth, run.robot, LATEST_S, team.plan.seed) as sent,
-    ):
-        yield
-    run.sent = sent.total()
+def repeat(delays: Callable[[random.Random], Sequence[float]]) -> Injector:
+    """All help of a robot comes again, so many seconds late."""
+
+    @contextmanager
+    def inject(team: TeamUnderTest, run: FaultRun) -> Iterator[None]:
+        with (
+            team.session(OPERATOR) as ears,
+            team.session(Identity(Role.ROBOT, run.robot)) as mouth,
+            echoes(ears, mouth, run.robot, delays, team.plan.seed) as sent,
+        ):
+            yield
+        run.sent = sent.total()
+
+    return inject
+
+
+echo = repeat(lambda dice: (0.0, dice.uniform(0.0, LATEST_S)))
+late = repeat(lambda dice: [dice.uniform(TOO_LATE_S, LATEST_S) for _ in range(LATE_COPIES)])
 
 
 @contextmanager
-def echoes(ears: Bus, mouth: Bus, robot: str, latest_s: float, seed: int) -> Iterator[Counter[str]]:
-    """Sends the help of one robot again, once at once and once up to `latest_s` later, so that
-    messages lose their order. Counts the copies by their key."""
+def echoes(
+    ears: Bus,
+    mouth: Bus,
+    robot: str,
+    delays: Callable[[random.Random], Sequence[float]],
+    seed: int,
+) -> Iterator[Counter[str]]:
+    """Sends the help of one robot again, after each of these delays, so that messages lose their
+    order. Counts the copies by their key."""
     dice, due, stop = random.Random(seed), sched.scheduler(time.monotonic), threading.Event()
     publishers: dict[str, Publisher] = {}
     sent: Counter[str] = Counter()
@@ -158,7 +191,7 @@ def echoes(ears: Bus, mouth: Bus, robot: str, latest_s: float, seed: int) -> Ite
         if payload in repeated:
             return
         repeated.add(payload)
-        for late_s in (0.0, dice.uniform(0.0, latest_s)):
+        for late_s in delays(dice):
             due.enter(late_s, 0, send, (key, payload))
 
     def send(key: str, payload: bytes) -> None:

@@ -64,6 +64,9 @@ class FaultRun(msgspec.Struct):
     incarnation: str = ""  # the robot's process before the fault
     restarted_s: float = 0.0  # when a new field had started
     sent: int = 0  # messages that the fault sent
+    victim: str = ""  # a robot that has to start again meanwhile
+    killed_s: float = 0.0  # when it was killed
+    router_mib: float | None = None  # what the router's memory grew by; None: not measured
     far: Sequence[str] = ()
     far_log: RunLog | None = None  # what was received at the site of the far robots
 
@@ -74,7 +77,7 @@ class FaultRun(msgspec.Struct):
 
     @property
     def others(self) -> list[str]:
-        return [name for name in self.robots if name != self.robot]
+        return [name for name in self.robots if name not in (self.robot, self.victim)]
 
 
 Injector = Callable[[TeamUnderTest, FaultRun], AbstractContextManager[None]]

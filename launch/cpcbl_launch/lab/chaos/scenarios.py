@@ -62,7 +62,7 @@ def team_fault(
         if key in settings:
             settings[key] = getattr(module, settings[key])
     if "abuse" in settings:
-        settings["inject"] = injectors.abuse(settings.pop("abuse"))
+        settings["inject"] = injectors.abuse(settings.pop("abuse"), settings.pop("victim", ""))
     return TeamFault(
         partial(getattr(expectations, checks), **(bounds or {})),
         plan=partial(run_plan, team, simulation or {}, **(plan or {})),
@@ -79,14 +79,19 @@ class _Row(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     run: dict[str, Any] = {}
 
 
+def _settings(rows: Mapping[str, _Row], row: _Row) -> dict[str, Any]:
+    """What `run` says in a row, and in those that it is like."""
+    usual = _settings(rows, rows[row.like]) if row.like else {}
+    plan = {"plan": {**usual.get("plan", {}), **row.run.get("plan", {})}}
+    return usual | row.run | plan
+
+
 def _scenarios() -> Iterator[Scenario]:
     text = (files("cpcbl_launch.lab.chaos") / "scenarios.toml").read_bytes()
     rows = msgspec.toml.decode(text, type=dict[str, _Row])
     for name, row in rows.items():
         if (run := OWN_SHAPE.get(name)) is None:
-            usual = rows[row.like].run if row.like else {}
-            plan = {"plan": {**usual.get("plan", {}), **row.run.get("plan", {})}}
-            run = team_fault(**usual | row.run | plan)
+            run = team_fault(**_settings(rows, row))
         needs = REQUIREMENTS[row.needs]
         yield Scenario(name, row.fault, row.expectation, run, needs, row.quick)
 

@@ -6,8 +6,8 @@ from collections.abc import Iterable, Iterator, Sequence
 from statistics import mean, median
 
 from cpcbl_launch.lab.chaos import injectors
-from cpcbl_launch.lab.chaos.checks import Check, at_most, equal_to
-from cpcbl_launch.lab.chaos.expectations import check_gap, checks_recovered
+from cpcbl_launch.lab.chaos.checks import Check, equal_to
+from cpcbl_launch.lab.chaos.expectations import check_back, check_gap, checks_recovered
 from cpcbl_launch.lab.chaos.memory import (
     LEAST_LIFE_S,
     MemorySampler,
@@ -74,7 +74,9 @@ def soak_checks(run: FaultRun, unasked_restarts: int, tracebacks: int) -> list[C
         equal_to("processes that ended without being killed", unasked_restarts, 0),
         equal_to("tracebacks in logs", tracebacks, 0),
         check_gap(*window, "longest gap between tracks", STUCK_S),
-        at_most("from the last fault until all were localized", _back_after_s(run), STUCK_S, "s"),
+        check_back(
+            run, "from the last fault until all were localized", _back_after_s(run), run.fault_s
+        ),
         *checks_recovered(run, run.healed_s),
     ]
 
