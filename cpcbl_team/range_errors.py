@@ -11,8 +11,8 @@ from itertools import combinations
 from typing import Final, NamedTuple
 
 FADING: Final = 1.0 - 1.0 / 500.0  # of all sums, a frame
-PRIOR_SHARE: Final = 0.15  # sigmas; the two errors look alike, and each takes its part
-PRIOR_BIAS_M: Final = 0.45
+PRIOR_SHARE: Final = 0.05  # sigmas; the two errors look alike, and each takes its part. Wider ones
+PRIOR_BIAS_M: Final = 0.15  # let a robot that stands find large errors that cancel each other
 MOST_OBJECTS: Final = 6  # of a frame; more tell little more
 CURVED: Final = 0.003  # of a squared distance: a larger variance across it bends its linear form
 LEAST_PAIRS: Final = 20.0
