@@ -325,9 +325,11 @@ class Localizer:
             state, is_trusted = self.screen.screen_observation(state, observation, position, nis)
             if not is_trusted or state.estimate is not prior:
                 return self.recovery.check(state)
+            observation = self.screen.with_caution(state, observation)
         if nis > self._gates[1]:
             return self.recovery.check(self._with_update(state, prior, None, {}, 1))
         by_teammate = observation.observer is not None
+        position = observation.of_position(prior.pose)
         estimate = self._variant.correct_position(prior, position, by_teammate)
         return self._observe_heading(state, estimate, observation)
 

@@ -1,0 +1,179 @@
+"""What each source says of the robot's position on average, and how far sources disagree.
+
+An error that grows slowly hides in the noise of each report, and the estimate follows it, so that
+the innovations of the honest senders become suspicious instead. The mean of many signed offsets
+from the estimate is far more precise than one of them, and the difference between the means of two
+sources is free of the error of the estimate, which both have in common: nobody can hide a drift by
+dragging the estimate along. (It is the test of a mean against a reference; the mean fades
+exponentially: S. W. Roberts, Technometrics 1, 1959.)
+"""
+
+import math
+from collections.abc import Mapping
+from typing import Final, NamedTuple
+
+from cpcbl_team.estimate import ZERO3, Covariance3, Information, Sums
+from cpcbl_team.gaussian import Covariance2
+from cpcbl_team.geometry import new
+
+FADING_NS: Final = 3_000_000_000  # time constant with which reports fade
+LEAST_REPORTS: Final = 5.0  # with fewer, fading, a source has no mean
+MOST_SIGMA_M: Final = 0.15  # a source whose mean is less certain has no voice
+COMMON_SIGMA_M: Final = 0.01
+"""What two correct sources may disagree by for ever: calibration, map, and that the estimate moves
+between their reports."""
+CONFLICT: Final = 20.0
+"""Two sources contradict each other beyond this chi-square (two degrees of freedom)."""
+LEAD: Final = 9.0
+"""Of two that contradict each other one is clearly nearer to a third source by this difference of
+their chi-squares."""
+NOTHING: Final = Covariance2(0.0, 0.0, 0.0)
+
+
+class MeanOffset(NamedTuple):
+    """The mean offset of the positions that a source reports from the estimate, m, and its
+    covariance, m^2."""
+
+    x: float
+    y: float
+    covariance: Covariance2
+
+    @property
+    def length_m(self) -> float:
+        return math.hypot(self.x, self.y)
+
+    @property
+    def is_precise(self) -> bool:
+        """Whether it is certain enough for a judgement."""
+        return self.covariance.xx + self.covariance.yy <= 2.0 * MOST_SIGMA_M**2
+
+
+class FadingOffsets(NamedTuple):
+    """Fading sums over the reports of one source."""
+
+    stamp_ns: int = 0
+    reports: float = 0.0
+    evidence: Sums = (ZERO3, (0.0, 0.0, 0.0))
+    """About the offset (m, m, rad) of the estimate, by the independent part of the noise."""
+    dependent: Covariance2 = NOTHING
+    """The mean of the parts of the noise that are the same in all reports, m^2."""
+
+    def with_report(
+        self, stamp_ns: int, evidence: Sums, dependent: Covariance2 = NOTHING
+    ) -> "FadingOffsets":
+        """The sums with one more report. A report that is older than the last fades nothing."""
+        elapsed_ns = stamp_ns - self.stamp_ns
+        fade = math.exp(-elapsed_ns / FADING_NS) if elapsed_ns > 0 else 1.0
+        (matrix, vector), (more, further) = self.evidence, evidence
+        count = fade * self.reports + 1.0
+        share = 1.0 / count
+        (xx, xy, yy), (dxx, dxy, dyy) = self.dependent, dependent
+        fields = (
+            max(stamp_ns, self.stamp_ns),
+            count,
+            (
+                Covariance3(*(fade * a + b for a, b in zip(matrix, more, strict=True))),
+                tuple(fade * a + b for a, b in zip(vector, further, strict=True)),
+            ),
+            Covariance2(xx + share * (dxx - xx), xy + share * (dxy - xy), yy + share * (dyy - yy)),
+        )
+        return new(FadingOffsets, fields)
+
+    def mean(self, heading_variance: float) -> MeanOffset | None:
+        """The mean of the reports, if they are enough to determine one. `heading_variance` (rad^2):
+        that of the estimate; what a bearing says of the position depends on the heading."""
+        if self.reports < LEAST_REPORTS:
+            return None
+        (xx, xy, yy, xh, yh, hh), (x, y, h) = self.evidence
+        # The heading is marginalized: the Schur complement.
+        k = 1.0 / (hh + 1.0 / heading_variance)
+        xx, xy, yy = xx - k * xh * xh, xy - k * xh * yh, yy - k * yh * yh
+        x, y = x - k * xh * h, y - k * yh * h
+        determinant = xx * yy - xy * xy
+        if determinant <= 1e-9 * xx * yy or xx <= 0.0 or yy <= 0.0:
+            return None
+        cxx, cxy, cyy = yy / determinant, -xy / determinant, xx / determinant
+        covariance = Covariance2(cxx, cxy, cyy) + self.dependent
+        return MeanOffset(cxx * x + cxy * y, cxy * x + cyy * y, covariance)
+
+
+Means = Mapping[str, MeanOffset]
+"""The means of some sources, by name."""
+
+
+def evidence_of_position(offset: tuple[float, float], noise: Covariance2) -> Sums:
+    """What a reported position at this offset (m) from the estimate says; `noise`: the independent
+    part of its covariance, m^2."""
+    (x, y), (xx, xy, yy) = offset, noise
+    k = 1.0 / max(xx * yy - xy * xy, 1e-16)
+    xx, xy, yy = k * yy, -k * xy, k * xx
+    matrix = Covariance3(xx, xy, yy, 0.0, 0.0, 0.0)
+    return Information(matrix, (xx * x + xy * y, xy * x + yy * y, 0.0))
+
+
+# How far two sources disagree ---------------------------------------------------------------------
+
+
+def disagreement(one: MeanOffset, other: MeanOffset) -> float:
+    """The chi-square of the difference of two means (two degrees of freedom)."""
+    (xx, xy, yy), (oxx, oxy, oyy) = one.covariance, other.covariance
+    common = 2.0 * COMMON_SIGMA_M**2
+    sum_ = Covariance2(xx + oxx + common, xy + oxy, yy + oyy + common)
+    return sum_.mahalanobis_squared(one.x - other.x, one.y - other.y)
+
+
+def bias_variance(one: MeanOffset, other: MeanOffset) -> float:
+    """The square of the bias (m^2) by which the noise of two means does not explain their
+    difference."""
+    dx, dy = one.x - other.x, one.y - other.y
+    c, d = one.covariance, other.covariance
+    excess = dx * dx + dy * dy - (c.xx + c.yy + d.xx + d.yy)
+    return excess if excess > 0.0 else 0.0
+
+
+class Verdict(NamedTuple):
+    """What the means of the others say of one source."""
+
+    bias_variance: float = 0.0  # m^2, that a report of it may have in common with all others of it
+    is_wrong: bool = False
+    is_contested: bool = False
+    """It contradicts others, and there is no majority for either side."""
+    is_confirmed: bool = False  # at least one other source agrees, and no majority contradicts
+
+
+def verdict_by_own_sensors(mean: MeanOffset, own: MeanOffset, others: Means) -> Verdict:
+    """The verdict of the robot's own sensors, which outweigh any number of voices. Where this one
+    and another contradict each other, they decide by which of both is clearly nearer to theirs."""
+    here = disagreement(mean, own)
+    rivals = [other for other in others.values() if disagreement(mean, other) > CONFLICT]
+    there = [disagreement(rival, own) for rival in rivals]
+    if here > CONFLICT or any(here - z > LEAD for z in there):
+        return Verdict(bias_variance(mean, own), is_wrong=True)
+    is_contested = any(z - here <= LEAD for z in there)
+    bias = max(bias_variance(mean, own), verdict_by_majority(mean, others).bias_variance)
+    return Verdict(bias, False, is_contested, not is_contested)
+
+
+def verdict_by_majority(mean: MeanOffset, others: Means) -> Verdict:
+    """The verdict of the other senders. The bias is the distance within which a strict majority of
+    all agrees with it: with three, its own and one more; with four, its own and two more."""
+    count = len(others) + 1
+    if count == 1:
+        return Verdict()
+    needed = count // 2  # other voices that make a strict majority with its own
+    biases = sorted(bias_variance(mean, other) for other in others.values())
+    bias = biases[needed - 1]
+    agreeing = sum(disagreement(mean, other) <= CONFLICT for other in others.values())
+    if agreeing >= needed:
+        return Verdict(bias, is_confirmed=True)
+    is_wrong = any(
+        disagreement(mean, other) > CONFLICT and _agreeing(name, others) >= needed
+        for name, other in others.items()
+    )
+    return Verdict(bias, is_wrong, not is_wrong)
+
+
+def _agreeing(name: str, others: Means) -> int:
+    """How many of the others agree with this one of them."""
+    mean = others[name]
+    return sum(disagreement(mean, other) <= CONFLICT for n, other in others.items() if n != name)
