@@ -16,15 +16,15 @@ from cpcbl_team.estimate import ZERO3, Covariance3, Information, Sums
 from cpcbl_team.gaussian import Covariance2
 from cpcbl_team.geometry import new
 
-FADING_NS: Final = 3_000_000_000  # time constant with which reports fade
+FADING_NS: Final = 1_500_000_000  # time constant with which reports fade
 LEAST_REPORTS: Final = 5.0  # with fewer, fading, a source has no mean
 MOST_SIGMA_M: Final = 0.15  # a source whose mean is less certain has no voice
 COMMON_SIGMA_M: Final = 0.01
 """What two correct sources may disagree by for ever: calibration, map, and that the estimate moves
 between their reports."""
-CONFLICT: Final = 20.0
+CONFLICT: Final = 16.0
 """Two sources contradict each other beyond this chi-square (two degrees of freedom)."""
-LEAD: Final = 9.0
+LEAD: Final = 6.0
 """Of two that contradict each other one is clearly nearer to a third source by this difference of
 their chi-squares."""
 NOTHING: Final = Covariance2(0.0, 0.0, 0.0)
@@ -53,6 +53,7 @@ class FadingOffsets(NamedTuple):
 
     stamp_ns: int = 0
     reports: float = 0.0
+    squares: float = 0.0  # of the weights of the reports
     evidence: Sums = (ZERO3, (0.0, 0.0, 0.0))
     """About the offset (m, m, rad) of the estimate, by the independent part of the noise."""
     dependent: Covariance2 = NOTHING
@@ -71,6 +72,7 @@ class FadingOffsets(NamedTuple):
         fields = (
             max(stamp_ns, self.stamp_ns),
             count,
+            fade * fade * self.squares + 1.0,
             (
                 Covariance3(*(fade * a + b for a, b in zip(matrix, more, strict=True))),
                 tuple(fade * a + b for a, b in zip(vector, further, strict=True)),
@@ -93,7 +95,9 @@ class FadingOffsets(NamedTuple):
         if determinant <= 1e-9 * xx * yy or xx <= 0.0 or yy <= 0.0:
             return None
         cxx, cxy, cyy = yy / determinant, -xy / determinant, xx / determinant
-        covariance = Covariance2(cxx, cxy, cyy) + self.dependent
+        # The variance of a weighted mean: old reports fade, so their errors do too.
+        covariance = Covariance2(cxx, cxy, cyy).scaled(self.squares / self.reports)
+        covariance += self.dependent
         return MeanOffset(cxx * x + cxy * y, cxy * x + cyy * y, covariance)
 
 
