@@ -69,7 +69,12 @@ _NO_OBJECTS: Final = GatedObjects([], [])
 class Localizer:
     """The localizer of one robot on one field."""
 
-    def __init__(self, settings: LocalizationSettings, field: Field) -> None:
+    def __init__(
+        self,
+        settings: LocalizationSettings,
+        field: Field,
+        teammates: frozenset[str] | None = None,
+    ) -> None:
         self.settings = settings
         self.field = field
         rules = settings.localizer
@@ -89,7 +94,8 @@ class Localizer:
         self._landmarks = Landmarks(field, settings, gates)
         self._calibration = OwnCalibration(settings, field, self._landmarks)
         self.recovery = Recovery(settings, field, self._landmarks, self._variant.reduce)
-        self.screen = TeammateScreen(settings, gates, self._variant.is_probabilistic)
+        is_probabilistic = self._variant.is_probabilistic
+        self.screen = TeammateScreen(settings, gates, is_probabilistic, teammates)
 
     def cycle(self, state: State, frame: Sightings) -> State:
         """One cycle (paper, section 3, figure 1). Pure: the same inputs give the same bits.

@@ -18,7 +18,7 @@ from cpcbl_team.geometry import new
 
 FADING_NS: Final = 1_500_000_000  # time constant with which reports fade
 LEAST_REPORTS: Final = 5.0  # with fewer, fading, a source has no mean
-MOST_SIGMA_M: Final = 0.15  # a source whose mean is less certain has no voice
+MOST_SIGMA_M: Final = 0.08  # a source whose mean is less certain has no voice
 COMMON_SIGMA_M: Final = 0.01
 """What two correct sources may disagree by for ever: calibration, map, and that the estimate moves
 between their reports."""

@@ -73,7 +73,8 @@ class TeammateReport(NamedTuple):
     """The reported position minus the estimated one, m; None for a sighting."""
     position: ReportedPosition | None = None  # for test 2; None for a sighting
     evidence: OffsetEvidence | None = None
-    """For the mean of its reports; None if the robot is lost."""
+    """For the mean of its reports; None for what has no part in it."""
+    is_guest: bool = False  # whether its sender is no robot of the team
 
 
 class SenderRecord(msgspec.Struct, frozen=True, gc=False):
@@ -105,7 +106,9 @@ class SenderRecord(msgspec.Struct, frozen=True, gc=False):
     """m^2: of the error that its reports may have in common, by what others say."""
     contested_ns: int = NEVER_NS
     """When it last contradicted others without a majority for either side."""
+    wrong_ns: int = NEVER_NS  # since when others say without interruption that its mean is wrong
     confirmed: int = 0  # reports beside which another source agreed with it
+    is_guest: bool = False
 
 
 def with_report(record: SenderRecord, report: TeammateReport, limit: float) -> SenderRecord:
@@ -113,7 +116,8 @@ def with_report(record: SenderRecord, report: TeammateReport, limit: float) -> S
     if record.score and report.stamp_ns - record.last_report_ns > SILENCE_NS:
         record = replace(record, score=0.0)
     record = _with_position(_with_faded_conflicts(record, report.stamp_ns), report.position)
-    record = replace(record, last_report_ns=max(record.last_report_ns, report.stamp_ns))
+    last_ns = max(record.last_report_ns, report.stamp_ns)
+    record = replace(record, last_report_ns=last_ns, is_guest=report.is_guest)
     if report.nis is None:
         return record
     if report.evidence is not None and report.nis <= CONTRADICTING_NIS:

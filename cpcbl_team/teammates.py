@@ -5,7 +5,7 @@ assessed by `trust.py`. What may not be used is left out; where the estimate has
 before, the covariance is inflated.
 """
 
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 
 from msgspec.structs import replace
 
@@ -28,6 +28,7 @@ from cpcbl_team.recovery import inflate_by_offset, inflate_to, without_senders
 from cpcbl_team.sender_records import NEVER_NS, OffsetEvidence, ReportedPosition, TeammateReport
 from cpcbl_team.state import State, with_memory, with_senders, with_teammates
 
+LEAST_CONFIRMED = 20  # reports of a guest beside which others agreed, until it counts as the others
 MOST_SENDERS = 512  # of which records are kept
 
 
@@ -35,10 +36,16 @@ class TeammateScreen:
     """Leaves out what untrusted teammates report, and keeps the trust up to date."""
 
     def __init__(
-        self, settings: LocalizationSettings, gates: tuple[float, float], is_probabilistic: bool
+        self,
+        settings: LocalizationSettings,
+        gates: tuple[float, float],
+        is_probabilistic: bool,
+        teammates: Collection[str] | None = None,
     ) -> None:
         """`gates`: chi-square bounds of one and of two degrees of freedom. Without a covariance
-        there is no NIS, and nothing is screened."""
+        there is no NIS, and nothing is screened. `teammates`: the robots of the team; all others
+        are guests (None: there are no guests)."""
+        self._teammates = teammates
         self._collaboration, self._rules = settings.collaboration, settings.collaboration.trust
         self._localizer_rules = settings.localizer
         self._gates = gates
@@ -70,7 +77,9 @@ class TeammateScreen:
                     if of_two is not None and observation
                     else None
                 )
-                report = TeammateReport(now, of_two, evidence=evidence)
+                report = TeammateReport(
+                    now, of_two, evidence=evidence, is_guest=self._is_guest(m.source)
+                )
                 state, is_trusted = self._assess(state, m.source, report, m.source)
                 if not is_trusted:
                     distrusted.add(m.source)
@@ -105,10 +114,16 @@ class TeammateScreen:
         intersection does not average this part away, so it bounds the weight of all its reports
         together."""
         record = state.memory.teammates.senders.get(sender)
-        least = self._rules.least_sigma_m**2
+        rules = self._rules
+        is_new = record is None or record.confirmed < LEAST_CONFIRMED
+        is_new_guest = is_new and self._is_guest(sender)
+        least = (rules.guest_sigma_m if is_new_guest else rules.least_sigma_m) ** 2
         more = max(0.0, least - min(dependent.xx, dependent.yy))
         more += 0.0 if record is None else record.bias_variance
         return dependent + Covariance2(more, 0.0, more) if more else dependent
+
+    def _is_guest(self, sender: str) -> bool:
+        return self._teammates is not None and sender not in self._teammates
 
     def _evidence(self, state: State, observation: Observation) -> OffsetEvidence:
         """What a report says of the offset of the estimate."""
@@ -146,6 +161,7 @@ class TeammateScreen:
             (ex, ey),
             ReportedPosition(*where),
             self._evidence(state, position),
+            self._is_guest(observation.sender),
         )
         return self._assess(state, observation.sender, report, observation.source)
 

@@ -23,8 +23,10 @@ from msgspec.structs import replace
 
 from cpcbl_team.config import TrustSettings
 from cpcbl_team.mean_offsets import (
+    CONFLICT,
     MeanOffset,
     Verdict,
+    disagreement,
     verdict_by_majority,
     verdict_by_own_sensors,
 )
@@ -49,6 +51,8 @@ CLEAR_CONFLICTS = 0.5  # odometry speaks against a sender with this many conflic
 MOST_CONFLICTS = 2.5  # with more a sender is quarantined: at the third within a short time
 LEAST_AGREEMENTS = 10  # reports that must agree with the estimate before a sender is readmitted,
 LEAST_CONFIRMATIONS = 2  # or distances that must agree with odometry
+PERSISTENCE_NS: Final = 500_000_000  # a mean that is wrong for so long is no chance
+MAJORITY_NS: Final = 20_000_000_000  # most senders are not found wrong within so short a time
 
 # The reasons that rest on what other senders reported
 _BY_COMPARISON = QuarantineReason.BIASED, QuarantineReason.OVERCONFIDENT, QuarantineReason.OUTVOTED
@@ -100,6 +104,16 @@ def assess(
 ) -> TrustDecision:
     """The records after a report of the sender `name`, and whether the report may be used.
     `used_ns`: when a report of this sender was last used."""
+    decision = _decide(senders, name, report, used_ns, rules)
+    if decision.quarantined and _is_majority_out(decision.senders, report.stamp_ns):
+        return _without_decision(decision, report.stamp_ns)
+    return decision
+
+
+def _decide(
+    senders: SenderRecords, name: str, report: TeammateReport, used_ns: int, rules: TrustSettings
+) -> TrustDecision:
+    """The decision that the tests of one report lead to."""
     now = report.stamp_ns
     record = with_report(senders.get(name, SenderRecord()), report, rules.limit)
     senders = {**senders, name: record}
@@ -113,7 +127,9 @@ def assess(
         return _quarantine(senders, name, now, used_ns)
     if report.nis is None:
         return TrustDecision(senders, True)
-    if verdict is not None and verdict.is_wrong:
+    if verdict is not None and verdict.is_wrong:  # suspicion is no accusation yet
+        if now - record.wrong_ns < PERSISTENCE_NS:
+            return TrustDecision(senders, False)
         return _quarantine_by_mean(senders, name, now)
     return _decide_dispute(senders, name, now, used_ns, rules)
 
@@ -122,12 +138,17 @@ def assess(
 
 
 def _voices(senders: SenderRecords, now_ns: int, name: str) -> dict[str, MeanOffset]:
-    """The precise means of the recent sources but `name`."""
-    return {
+    """The precise means of the recent sources but `name`. Guests have no voice beside two robots of
+    the team."""
+    voices = {
         other: r.mean
         for other, r in _recent(senders, now_ns, name)
         if r.mean is not None and r.mean.is_precise and now_ns - r.offsets.stamp_ns <= RECENT_NS
     }
+    guests = {other for other in voices if senders[other].is_guest}
+    if len(voices.keys() - guests - {OWN_SENSORS}) < 2:
+        return voices
+    return {other: mean for other, mean in voices.items() if other not in guests}
 
 
 def _verdict(senders: SenderRecords, name: str, now_ns: int) -> Verdict | None:
@@ -143,10 +164,14 @@ def _verdict(senders: SenderRecords, name: str, now_ns: int) -> Verdict | None:
 
 
 def _with_verdict(record: SenderRecord, verdict: Verdict, now_ns: int) -> SenderRecord:
+    since_ns = now_ns if record.wrong_ns == NEVER_NS else record.wrong_ns
     return replace(
         record,
         bias_variance=verdict.bias_variance,
         contested_ns=now_ns if verdict.is_contested else record.contested_ns,
+        wrong_ns=(record.wrong_ns if record.wrong_ns > NEVER_NS else now_ns)
+        if verdict.is_wrong
+        else NEVER_NS,
         confirmed=record.confirmed + 1 if verdict.is_confirmed else record.confirmed,
     )
 
@@ -161,7 +186,11 @@ def _quarantine_by_mean(senders: SenderRecords, name: str, now_ns: int) -> Trust
     voices = _voices(senders, now_ns, name)
     own, mean = voices.get(OWN_SENSORS), senders[name].mean
     assert mean is not None
-    right = [own] if own is not None else list(voices.values())
+    right = (
+        [own]
+        if own is not None
+        else [v for v in voices.values() if disagreement(mean, v) > CONFLICT]
+    )
     offset = mean.x - right[0].x, mean.y - right[0].y
     record = replace(senders[name], mean_offset=offset, offset_variance=0.0)
     changed = {**senders, name: _quarantined(record, _reason_of(record), now_ns)}
@@ -269,6 +298,33 @@ def _quarantine_supporters(
     changed = {n: _quarantined(senders[n], QuarantineReason.OUTVOTED, now_ns) for n in names}
     changed = {**senders, **changed, **{n: replace(senders[n], score=0.0) for n in dissenters}}
     return TrustDecision(changed, name not in names, "outvoted", names, max(errors_m))
+
+
+def _is_majority_out(senders: SenderRecords, now_ns: int) -> bool:
+    """Whether most of the senders were quarantined lately because others contradict them, while the
+    robot's own sensors say nothing: then rather the others are wrong."""
+    recent = {n: r for n, r in senders.items() if now_ns - r.last_report_ns <= RECENT_NS}
+    if OWN_SENSORS in recent:
+        return False
+    return 2 * sum(_was_outvoted(r, now_ns) for r in recent.values()) > len(recent)
+
+
+def _was_outvoted(record: SenderRecord, now_ns: int) -> bool:
+    return record.reason in _BY_COMPARISON and now_ns - record.since_ns <= MAJORITY_NS
+
+
+def _without_decision(decision: TrustDecision, now_ns: int) -> TrustDecision:
+    """The decision that nobody can decide: all that were outvoted lately are released, and the
+    estimate is as uncertain as the senders disagree."""
+    senders, errors_m = dict(decision.senders), [decision.estimate_error_m]
+    for name, record in decision.senders.items():
+        if now_ns - record.last_report_ns > RECENT_NS:
+            continue
+        if _was_outvoted(record, now_ns):
+            errors_m.append(math.hypot(*record.mean_offset))
+            record = _released(record, now_ns)
+        senders[name] = replace(record, score=0.0, contested_ns=now_ns)
+    return TrustDecision(senders, True, "contested", least_sigma_m=max(errors_m))
 
 
 def _quarantined(record: SenderRecord, reason: QuarantineReason, now_ns: int) -> SenderRecord:
