@@ -18,7 +18,8 @@ from cpcbl_team.geometry import new
 
 FADING_NS: Final = 1_500_000_000  # time constant with which reports fade
 LEAST_REPORTS: Final = 5.0  # with fewer, fading, a source has no mean
-MOST_SIGMA_M: Final = 0.08  # a source whose mean is less certain has no voice
+MOST_SIGMA_M: Final = 0.15  # a source whose mean is less certain has no voice
+SURE_SIGMA_M: Final = 0.08  # own sensors that are less certain convict nobody alone
 COMMON_SIGMA_M: Final = 0.01
 """What two correct sources may disagree by for ever: calibration, map, and that the estimate moves
 between their reports."""
@@ -42,10 +43,14 @@ class MeanOffset(NamedTuple):
     def length_m(self) -> float:
         return math.hypot(self.x, self.y)
 
+    def is_within(self, sigma_m: float) -> bool:
+        """Whether it is as certain as this, in the mean of the axes."""
+        return self.covariance.xx + self.covariance.yy <= 2.0 * sigma_m * sigma_m
+
     @property
     def is_precise(self) -> bool:
-        """Whether it is certain enough for a judgement."""
-        return self.covariance.xx + self.covariance.yy <= 2.0 * MOST_SIGMA_M**2
+        """Whether it is certain enough for a voice."""
+        return self.is_within(MOST_SIGMA_M)
 
 
 class FadingOffsets(NamedTuple):
@@ -142,7 +147,11 @@ class Verdict(NamedTuple):
     is_wrong: bool = False
     is_contested: bool = False
     """It contradicts others, and there is no majority for either side."""
-    is_confirmed: bool = False  # at least one other source agrees, and no majority contradicts
+    is_confirmed: bool = False
+    """At least one other source agrees, and no majority contradicts."""
+    is_left_out: bool = (
+        False  # the robot has sensors of its own, and need not use it while contested
+    )
 
 
 def verdict_by_own_sensors(mean: MeanOffset, own: MeanOffset, others: Means) -> Verdict:
@@ -151,11 +160,12 @@ def verdict_by_own_sensors(mean: MeanOffset, own: MeanOffset, others: Means) -> 
     here = disagreement(mean, own)
     rivals = [other for other in others.values() if disagreement(mean, other) > CONFLICT]
     there = [disagreement(rival, own) for rival in rivals]
-    if here > CONFLICT or any(here - z > LEAD for z in there):
+    is_refuted = here > CONFLICT and own.is_within(SURE_SIGMA_M)
+    if is_refuted or any(here - z > LEAD for z in there):
         return Verdict(bias_variance(mean, own), is_wrong=True)
     is_contested = any(z - here <= LEAD for z in there)
     bias = max(bias_variance(mean, own), verdict_by_majority(mean, others).bias_variance)
-    return Verdict(bias, False, is_contested, not is_contested)
+    return Verdict(bias, False, is_contested, not is_contested, is_contested)
 
 
 def verdict_by_majority(mean: MeanOffset, others: Means) -> Verdict:

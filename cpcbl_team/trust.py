@@ -131,6 +131,8 @@ def _decide(
         if now - record.wrong_ns < PERSISTENCE_NS:
             return TrustDecision(senders, False)
         return _quarantine_by_mean(senders, name, now)
+    if verdict is not None and verdict.is_left_out:
+        return TrustDecision(senders, False, least_sigma_m=_contested_m(record))
     return _decide_dispute(senders, name, now, used_ns, rules)
 
 
@@ -169,9 +171,7 @@ def _with_verdict(record: SenderRecord, verdict: Verdict, now_ns: int) -> Sender
         record,
         bias_variance=verdict.bias_variance,
         contested_ns=now_ns if verdict.is_contested else record.contested_ns,
-        wrong_ns=(record.wrong_ns if record.wrong_ns > NEVER_NS else now_ns)
-        if verdict.is_wrong
-        else NEVER_NS,
+        wrong_ns=since_ns if verdict.is_wrong else NEVER_NS,
         confirmed=record.confirmed + 1 if verdict.is_confirmed else record.confirmed,
     )
 
@@ -219,8 +219,8 @@ def _decide_dispute(
     }
     if not supporters:
         return TrustDecision(senders, True)
-    teammates = (dissenters | supporters) - {OWN_SENSORS}
-    if any(_is_contested(recent[n], now_ns) for n in teammates):
+    sides = dissenters | supporters
+    if OWN_SENSORS not in sides and any(_is_contested(recent[n], now_ns) for n in sides):
         return TrustDecision(senders, True, least_sigma_m=_contested_m(senders[name]))
     is_right = _is_estimate_right(recent, dissenters, supporters, now_ns - since_ns)
     if is_right is None:
