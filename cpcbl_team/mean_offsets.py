@@ -16,18 +16,21 @@ from cpcbl_team.estimate import ZERO3, Covariance3, Information, Sums
 from cpcbl_team.gaussian import Covariance2
 from cpcbl_team.geometry import new
 
-FADING_NS: Final = 1_500_000_000  # time constant with which reports fade
+FAST_NS: Final = 1_500_000_000  # time constants with which reports fade: a fast drift shows sooner
+SLOW_NS: Final = 6_000_000_000  # in the mean of a short time, a slow one in that of a long time
 LEAST_REPORTS: Final = 5.0  # with fewer, fading, a source has no mean
 MOST_SIGMA_M: Final = 0.15  # a source whose mean is less certain has no voice
 SURE_SIGMA_M: Final = 0.08  # own sensors that are less certain convict nobody alone
 COMMON_SIGMA_M: Final = 0.01
 """What two correct sources may disagree by for ever: calibration, map, and that the estimate moves
 between their reports."""
-CONFLICT: Final = 16.0
+CONFLICT: Final = 18.0
 """Two sources contradict each other beyond this chi-square (two degrees of freedom)."""
-LEAD: Final = 6.0
+LEAD: Final = 7.0
 """Of two that contradict each other one is clearly nearer to a third source by this difference of
 their chi-squares."""
+HEADING_VARIANCE: Final = math.radians(5.0) ** 2
+"""rad^2: what the heading of an estimate that was led astray may be wrong by, beside its variance."""
 NOTHING: Final = Covariance2(0.0, 0.0, 0.0)
 
 
@@ -65,11 +68,11 @@ class FadingOffsets(NamedTuple):
     """The mean of the parts of the noise that are the same in all reports, m^2."""
 
     def with_report(
-        self, stamp_ns: int, evidence: Sums, dependent: Covariance2 = NOTHING
+        self, stamp_ns: int, fading_ns: int, evidence: Sums, dependent: Covariance2 = NOTHING
     ) -> "FadingOffsets":
         """The sums with one more report. A report that is older than the last fades nothing."""
         elapsed_ns = stamp_ns - self.stamp_ns
-        fade = math.exp(-elapsed_ns / FADING_NS) if elapsed_ns > 0 else 1.0
+        fade = math.exp(-elapsed_ns / fading_ns) if elapsed_ns > 0 else 1.0
         (matrix, vector), (more, further) = self.evidence, evidence
         count = fade * self.reports + 1.0
         share = 1.0 / count
@@ -93,7 +96,7 @@ class FadingOffsets(NamedTuple):
             return None
         (xx, xy, yy, xh, yh, hh), (x, y, h) = self.evidence
         # The heading is marginalized: the Schur complement.
-        k = 1.0 / (hh + 1.0 / heading_variance)
+        k = 1.0 / (hh + 1.0 / (heading_variance + HEADING_VARIANCE))
         xx, xy, yy = xx - k * xh * xh, xy - k * xh * yh, yy - k * yh * yh
         x, y = x - k * xh * h, y - k * yh * h
         determinant = xx * yy - xy * xy
@@ -154,6 +157,17 @@ class Verdict(NamedTuple):
     )
 
 
+def both(fast: Verdict, slow: Verdict) -> Verdict:
+    """The verdict of two means of the same source, of a short and of a long time."""
+    return Verdict(
+        max(fast.bias_variance, slow.bias_variance),
+        fast.is_wrong or slow.is_wrong,
+        fast.is_contested or slow.is_contested,
+        fast.is_confirmed and slow.is_confirmed,
+        fast.is_left_out or slow.is_left_out,
+    )
+
+
 def verdict_by_own_sensors(mean: MeanOffset, own: MeanOffset, others: Means) -> Verdict:
     """The verdict of the robot's own sensors, which outweigh any number of voices. Where this one
     and another contradict each other, they decide by which of both is clearly nearer to theirs."""
@@ -180,10 +194,8 @@ def verdict_by_majority(mean: MeanOffset, others: Means) -> Verdict:
     agreeing = sum(disagreement(mean, other) <= CONFLICT for other in others.values())
     if agreeing >= needed:
         return Verdict(bias, is_confirmed=True)
-    is_wrong = any(
-        disagreement(mean, other) > CONFLICT and _agreeing(name, others) >= needed
-        for name, other in others.items()
-    )
+    accusers = {n: o for n, o in others.items() if disagreement(mean, o) > CONFLICT}
+    is_wrong = any(2 * (_agreeing(name, accusers) + 1) > count for name in accusers)
     return Verdict(bias, is_wrong, not is_wrong)
 
 

@@ -19,7 +19,7 @@ from msgspec.structs import replace
 from cpcbl_team.estimate import Sums
 from cpcbl_team.gaussian import Covariance2
 from cpcbl_team.geometry import Pose2
-from cpcbl_team.mean_offsets import NOTHING, FadingOffsets, MeanOffset
+from cpcbl_team.mean_offsets import FAST_NS, NOTHING, SLOW_NS, FadingOffsets, MeanOffset
 
 SILENCE_NS: Final = 10_000_000_000  # earlier reports count no longer after this silence
 USUAL_NIS = 6.0  # 95 % quantile of the chi-square distribution of two degrees of freedom
@@ -100,8 +100,8 @@ class SenderRecord(msgspec.Struct, frozen=True, gc=False):
     reason: QuarantineReason | None = None  # why it is in quarantine; None if it is not
     since_ns: int = 0  # when the quarantine began, or ended
     quarantines: int = 0
-    offsets: FadingOffsets = FadingOffsets()
-    mean: MeanOffset | None = None  # of these, after the last report
+    offsets: tuple[FadingOffsets, ...] = (FadingOffsets(), FadingOffsets())  # fast and slow
+    means: tuple[MeanOffset | None, ...] = (None, None)  # of these, after the last report
     bias_variance: float = 0.0
     """m^2: of the error that its reports may have in common, by what others say."""
     contested_ns: int = NEVER_NS
@@ -129,8 +129,12 @@ def with_evidence(record: SenderRecord, stamp_ns: int, report: OffsetEvidence) -
     """The record with one more report in its mean. (Of one that contradicts the estimate clearly
     test 1 takes care; an outlier would move the mean for seconds.)"""
     evidence, dependent, heading_variance = report
-    offsets = record.offsets.with_report(stamp_ns, evidence, dependent)
-    return replace(record, offsets=offsets, mean=offsets.mean(heading_variance))
+    offsets = tuple(
+        sums.with_report(stamp_ns, fading_ns, evidence, dependent)
+        for sums, fading_ns in zip(record.offsets, (FAST_NS, SLOW_NS), strict=True)
+    )
+    means = tuple(sums.mean(heading_variance) for sums in offsets)
+    return replace(record, offsets=offsets, means=means)
 
 
 def _with_nis(

@@ -23,9 +23,9 @@ from msgspec.structs import replace
 
 from cpcbl_team.config import TrustSettings
 from cpcbl_team.mean_offsets import (
-    CONFLICT,
     MeanOffset,
     Verdict,
+    both,
     disagreement,
     verdict_by_majority,
     verdict_by_own_sensors,
@@ -131,21 +131,24 @@ def _decide(
         if now - record.wrong_ns < PERSISTENCE_NS:
             return TrustDecision(senders, False)
         return _quarantine_by_mean(senders, name, now)
-    if verdict is not None and verdict.is_left_out:
-        return TrustDecision(senders, False, least_sigma_m=_contested_m(record))
+    if verdict is not None and (verdict.is_contested or record.score > 0.5 * rules.limit):
+        # Others do not contradict it, so rather the estimate is wrong.
+        return TrustDecision(senders, not verdict.is_left_out, least_sigma_m=_contested_m(record))
     return _decide_dispute(senders, name, now, used_ns, rules)
 
 
 # Test 3: the mean of a sender against own sensors, or against other senders ----------------------
 
 
-def _voices(senders: SenderRecords, now_ns: int, name: str) -> dict[str, MeanOffset]:
-    """The precise means of the recent sources but `name`. Guests have no voice beside two robots of
-    the team."""
+def _voices(senders: SenderRecords, now_ns: int, name: str, of: int) -> dict[str, MeanOffset]:
+    """The precise fast (0) or slow (1) means of the recent sources but `name`. Guests have no voice
+    beside two robots of the team."""
     voices = {
-        other: r.mean
+        other: mean
         for other, r in _recent(senders, now_ns, name)
-        if r.mean is not None and r.mean.is_precise and now_ns - r.offsets.stamp_ns <= RECENT_NS
+        if (mean := r.means[of]) is not None
+        and mean.is_precise
+        and now_ns - r.offsets[of].stamp_ns <= RECENT_NS
     }
     guests = {other for other in voices if senders[other].is_guest}
     if len(voices.keys() - guests - {OWN_SENSORS}) < 2:
@@ -155,14 +158,20 @@ def _voices(senders: SenderRecords, now_ns: int, name: str) -> dict[str, MeanOff
 
 def _verdict(senders: SenderRecords, name: str, now_ns: int) -> Verdict | None:
     """The verdict of test 3; None while the sender has no recent mean, or one that says nothing."""
-    record = senders[name]
-    if record.offsets.stamp_ns != now_ns or record.mean is None or not record.mean.is_precise:
+    fast, slow = (_verdict_of(senders, name, now_ns, of) for of in (0, 1))
+    return both(fast, slow) if fast is not None and slow is not None else fast or slow
+
+
+def _verdict_of(senders: SenderRecords, name: str, now_ns: int, of: int) -> Verdict | None:
+    """The verdict about the fast (0) or slow (1) mean of a sender."""
+    record, mean = senders[name], senders[name].means[of]
+    if record.offsets[of].stamp_ns != now_ns or mean is None or not mean.is_precise:
         return None
-    voices = _voices(senders, now_ns, name)
+    voices = _voices(senders, now_ns, name, of)
     own = voices.pop(OWN_SENSORS, None)
     if own is not None:
-        return verdict_by_own_sensors(record.mean, own, voices)
-    return verdict_by_majority(record.mean, voices)
+        return verdict_by_own_sensors(mean, own, voices)
+    return verdict_by_majority(mean, voices)
 
 
 def _with_verdict(record: SenderRecord, verdict: Verdict, now_ns: int) -> SenderRecord:
@@ -182,20 +191,17 @@ def _is_contested(record: SenderRecord, now_ns: int) -> bool:
 
 def _quarantine_by_mean(senders: SenderRecords, name: str, now_ns: int) -> TrustDecision:
     """The decision against a sender whose mean is wrong. The estimate is off by the means of those
-    that are right."""
-    voices = _voices(senders, now_ns, name)
-    own, mean = voices.get(OWN_SENSORS), senders[name].mean
-    assert mean is not None
-    right = (
-        [own]
-        if own is not None
-        else [v for v in voices.values() if disagreement(mean, v) > CONFLICT]
-    )
-    offset = mean.x - right[0].x, mean.y - right[0].y
+    that contradict it."""
+    mean, voices = senders[name].means[0], _voices(senders, now_ns, name, 0)
+    if mean is None or not voices:
+        return TrustDecision(senders, False)
+    own = voices.get(OWN_SENSORS)
+    farthest = max(voices.values(), key=lambda voice: disagreement(mean, voice))
+    right = own or farthest
+    offset = mean.x - right.x, mean.y - right.y
     record = replace(senders[name], mean_offset=offset, offset_variance=0.0)
     changed = {**senders, name: _quarantined(record, _reason_of(record), now_ns)}
-    error_m = max(m.length_m for m in right)
-    return TrustDecision(changed, False, "quarantined", frozenset((name,)), error_m)
+    return TrustDecision(changed, False, "quarantined", frozenset((name,)), right.length_m)
 
 
 def _decide_dispute(
@@ -234,7 +240,8 @@ def _decide_dispute(
 
 def _contested_m(record: SenderRecord) -> float:
     """How far from the estimate a contested sender says that the robot is."""
-    return 0.0 if record.mean is None else record.mean.length_m
+    mean = record.means[0]
+    return 0.0 if mean is None else mean.length_m
 
 
 def _is_estimate_right(
@@ -301,12 +308,13 @@ def _quarantine_supporters(
 
 
 def _is_majority_out(senders: SenderRecords, now_ns: int) -> bool:
-    """Whether most of the senders were quarantined lately because others contradict them, while the
-    robot's own sensors say nothing: then rather the others are wrong."""
+    """Whether half of three or more senders were quarantined lately because others contradict them, while the
+    robot's own sensors say nothing: then no majority is left."""
     recent = {n: r for n, r in senders.items() if now_ns - r.last_report_ns <= RECENT_NS}
     if OWN_SENSORS in recent:
         return False
-    return 2 * sum(_was_outvoted(r, now_ns) for r in recent.values()) > len(recent)
+    out = sum(_was_outvoted(r, now_ns) for r in recent.values())
+    return len(recent) > 2 and 2 * out >= len(recent)
 
 
 def _was_outvoted(record: SenderRecord, now_ns: int) -> bool:
