@@ -70,14 +70,10 @@ class Localizer:
     """The localizer of one robot on one field."""
 
     def __init__(
-        self,
-        settings: LocalizationSettings,
-        field: Field,
-        teammates: frozenset[str] | None = None,
+        self, settings: LocalizationSettings, field: Field, team: frozenset[str] | None = None
     ) -> None:
-        self.settings = settings
-        self.field = field
-        rules = settings.localizer
+        """`team`: its robots; who else sends something is a guest (None: there are no guests)."""
+        self.settings, self.field, rules = settings, field, settings.localizer
         gates = chi_square_bounds(rules.gate_probability)
         self._rules = rules
         self._gates = gates
@@ -94,8 +90,7 @@ class Localizer:
         self._landmarks = Landmarks(field, settings, gates)
         self._calibration = OwnCalibration(settings, field, self._landmarks)
         self.recovery = Recovery(settings, field, self._landmarks, self._variant.reduce)
-        is_probabilistic = self._variant.is_probabilistic
-        self.screen = TeammateScreen(settings, gates, is_probabilistic, teammates)
+        self.screen = TeammateScreen(settings, gates, self._variant.is_probabilistic, team)
 
     def cycle(self, state: State, frame: Sightings) -> State:
         """One cycle (paper, section 3, figure 1). Pure: the same inputs give the same bits.
@@ -334,8 +329,10 @@ class Localizer:
             observation = self.screen.with_caution(state, observation)
         if nis > self._gates[1]:
             return self.recovery.check(self._with_update(state, prior, None, {}, 1))
-        by_teammate = observation.observer is not None
-        position = observation.of_position(prior.pose)
+        position, by_teammate = (
+            observation.of_position(prior.pose),
+            observation.observer is not None,
+        )
         estimate = self._variant.correct_position(prior, position, by_teammate)
         return self._observe_heading(state, estimate, observation)
 

@@ -30,7 +30,7 @@ LEAD: Final = 7.0
 """Of two that contradict each other one is clearly nearer to a third source by this difference of
 their chi-squares."""
 HEADING_VARIANCE: Final = math.radians(5.0) ** 2
-"""rad^2: what the heading of an estimate that was led astray may be wrong by, beside its variance."""
+"""rad^2: by what the heading of an estimate that was led astray may be wrong beside its variance."""
 NOTHING: Final = Covariance2(0.0, 0.0, 0.0)
 
 

@@ -198,3 +198,30 @@ def _with_position(record: SenderRecord, now: ReportedPosition | None) -> Sender
     # While the robot stands, a frozen sender is right: that confirms nothing.
     confirms = is_far or record.reason is not QuarantineReason.FROZEN
     return replace(record, confirmations=record.confirmations + 1) if confirms else record
+
+
+# Quarantine ---------------------------------------------------------------------------------------
+
+
+def quarantined(record: SenderRecord, reason: QuarantineReason, now_ns: int) -> SenderRecord:
+    """The record of a sender whose quarantine begins."""
+    record = replace(record, agreements=0, confirmations=0, quarantines=record.quarantines + 1)
+    return replace(record, reason=reason, since_ns=now_ns)
+
+
+def released(record: SenderRecord, now_ns: int) -> SenderRecord:
+    """The record of a sender whose quarantine ends."""
+    record = replace(record, score=0.0, odometry_conflicts=0.0, dispute_since_ns=NEVER_NS)
+    return replace(record, reason=None, since_ns=now_ns)
+
+
+def reason_of(record: SenderRecord) -> QuarantineReason:
+    """The best explanation so far. Conflicts fade: nearly one, and nearly two, are 0.8 and 1.8."""
+    conflicts = record.odometry_conflicts
+    if record.missed_motion and conflicts >= 0.8:
+        return QuarantineReason.FROZEN
+    if conflicts >= 1.8:
+        often = conflicts > 0.5 * record.comparisons
+        return QuarantineReason.OVERCONFIDENT if often else QuarantineReason.JUMPS
+    (x, y), variance = record.mean_offset, record.offset_variance
+    return QuarantineReason.BIASED if x * x + y * y > variance else QuarantineReason.OVERCONFIDENT

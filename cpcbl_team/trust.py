@@ -39,6 +39,9 @@ from cpcbl_team.sender_records import (
     QuarantineReason,
     SenderRecord,
     TeammateReport,
+    quarantined,
+    reason_of,
+    released,
     with_evidence,
     with_report,
 )
@@ -52,6 +55,7 @@ MOST_CONFLICTS = 2.5  # with more a sender is quarantined: at the third within a
 LEAST_AGREEMENTS = 10  # reports that must agree with the estimate before a sender is readmitted,
 LEAST_CONFIRMATIONS = 2  # or distances that must agree with odometry
 PERSISTENCE_NS: Final = 500_000_000  # a mean that is wrong for so long is no chance
+ALIKE_M: Final = 0.05  # two senders whose offsets differ by no more, or by half of them, agree
 MAJORITY_NS: Final = 20_000_000_000  # most senders are not found wrong within so short a time
 
 # The reasons that rest on what other senders reported
@@ -105,9 +109,8 @@ def assess(
     """The records after a report of the sender `name`, and whether the report may be used.
     `used_ns`: when a report of this sender was last used."""
     decision = _decide(senders, name, report, used_ns, rules)
-    if decision.quarantined and _is_majority_out(decision.senders, report.stamp_ns):
-        return _without_decision(decision, report.stamp_ns)
-    return decision
+    out = _outvoted_majority(decision, report.stamp_ns) if decision.quarantined else None
+    return _without_decision(decision, out, report.stamp_ns) if out else decision
 
 
 def _decide(
@@ -200,7 +203,7 @@ def _quarantine_by_mean(senders: SenderRecords, name: str, now_ns: int) -> Trust
     right = own or farthest
     offset = mean.x - right.x, mean.y - right.y
     record = replace(senders[name], mean_offset=offset, offset_variance=0.0)
-    changed = {**senders, name: _quarantined(record, _reason_of(record), now_ns)}
+    changed = {**senders, name: quarantined(record, reason_of(record), now_ns)}
     return TrustDecision(changed, False, "quarantined", frozenset((name,)), right.length_m)
 
 
@@ -286,11 +289,11 @@ def _quarantine(senders: SenderRecords, name: str, now_ns: int, used_ns: int) ->
     record = senders[name]
     was_followed = bool(record.score) and used_ns >= record.dispute_since_ns
     errors_m = [math.hypot(*record.mean_offset)] if was_followed else []
-    changed = {**senders, name: _quarantined(record, _reason_of(record), now_ns)}
+    changed = {**senders, name: quarantined(record, reason_of(record), now_ns)}
     if record.odometry_conflicts > MOST_CONFLICTS:  # the senders that it contradicted may be right
         for other, accused in senders.items():
             if accused.reason in _BY_COMPARISON and accused.since_ns > now_ns - SILENCE_NS:
-                changed[other] = _released(accused, now_ns)
+                changed[other] = released(accused, now_ns)
                 errors_m.append(math.hypot(*accused.mean_offset))
     error_m = max(errors_m, default=0.0)
     return TrustDecision(changed, False, "quarantined", frozenset((name,)), error_m)
@@ -302,59 +305,39 @@ def _quarantine_supporters(
     """The decision against the senders that a wrong estimate followed."""
     names = frozenset(supporters - {OWN_SENSORS})
     errors_m = [math.hypot(*senders[n].mean_offset) for n in dissenters]
-    changed = {n: _quarantined(senders[n], QuarantineReason.OUTVOTED, now_ns) for n in names}
+    changed = {n: quarantined(senders[n], QuarantineReason.OUTVOTED, now_ns) for n in names}
     changed = {**senders, **changed, **{n: replace(senders[n], score=0.0) for n in dissenters}}
     return TrustDecision(changed, name not in names, "outvoted", names, max(errors_m))
 
 
-def _is_majority_out(senders: SenderRecords, now_ns: int) -> bool:
-    """Whether half of three or more senders were quarantined lately because others contradict them, while the
-    robot's own sensors say nothing: then no majority is left."""
-    recent = {n: r for n, r in senders.items() if now_ns - r.last_report_ns <= RECENT_NS}
-    if OWN_SENSORS in recent:
-        return False
-    out = sum(_was_outvoted(r, now_ns) for r in recent.values())
-    return len(recent) > 2 and 2 * out >= len(recent)
+def _outvoted_majority(decision: TrustDecision, now_ns: int) -> frozenset[str]:
+    """The senders that were quarantined lately, and that agree with those that are now, if they are
+    half or more of three or more senders while the robot's own sensors say nothing; else none."""
+    recent = {n: r for n, r in decision.senders.items() if now_ns - r.last_report_ns <= RECENT_NS}
+    if OWN_SENSORS in recent or len(recent) < 3:
+        return frozenset()
+    new = [recent[n].mean_offset for n in decision.quarantined if n in recent]
+    out = frozenset(
+        n
+        for n, r in recent.items()
+        if r.reason in _BY_COMPARISON
+        and now_ns - r.since_ns <= MAJORITY_NS
+        and all(math.dist(r.mean_offset, o) <= ALIKE_M + 0.5 * math.hypot(*o) for o in new)
+    )
+    return out if 2 * len(out) >= len(recent) else frozenset()
 
 
-def _was_outvoted(record: SenderRecord, now_ns: int) -> bool:
-    return record.reason in _BY_COMPARISON and now_ns - record.since_ns <= MAJORITY_NS
-
-
-def _without_decision(decision: TrustDecision, now_ns: int) -> TrustDecision:
-    """The decision that nobody can decide: all that were outvoted lately are released, and the
-    estimate is as uncertain as the senders disagree."""
+def _without_decision(decision: TrustDecision, out: frozenset[str], now_ns: int) -> TrustDecision:
+    """The decision that nobody can decide: these senders are released, and the estimate is as
+    uncertain as they differ from it."""
     senders, errors_m = dict(decision.senders), [decision.estimate_error_m]
     for name, record in decision.senders.items():
-        if now_ns - record.last_report_ns > RECENT_NS:
-            continue
-        if _was_outvoted(record, now_ns):
+        if name in out:
             errors_m.append(math.hypot(*record.mean_offset))
-            record = _released(record, now_ns)
-        senders[name] = replace(record, score=0.0, contested_ns=now_ns)
+            record = released(record, now_ns)
+        if not record.reason:
+            senders[name] = replace(record, score=0.0, contested_ns=now_ns)
     return TrustDecision(senders, True, "contested", least_sigma_m=max(errors_m))
-
-
-def _quarantined(record: SenderRecord, reason: QuarantineReason, now_ns: int) -> SenderRecord:
-    record = replace(record, agreements=0, confirmations=0, quarantines=record.quarantines + 1)
-    return replace(record, reason=reason, since_ns=now_ns)
-
-
-def _released(record: SenderRecord, now_ns: int) -> SenderRecord:
-    record = replace(record, score=0.0, odometry_conflicts=0.0, dispute_since_ns=NEVER_NS)
-    return replace(record, reason=None, since_ns=now_ns)
-
-
-def _reason_of(record: SenderRecord) -> QuarantineReason:
-    """The best explanation so far. Conflicts fade: nearly one, and nearly two, are 0.8 and 1.8."""
-    conflicts = record.odometry_conflicts
-    if record.missed_motion and conflicts >= 0.8:
-        return QuarantineReason.FROZEN
-    if conflicts >= 1.8:
-        often = conflicts > 0.5 * record.comparisons
-        return QuarantineReason.OVERCONFIDENT if often else QuarantineReason.JUMPS
-    (x, y), variance = record.mean_offset, record.offset_variance
-    return QuarantineReason.BIASED if x * x + y * y > variance else QuarantineReason.OVERCONFIDENT
 
 
 def _assess_quarantined(
@@ -370,7 +353,7 @@ def _assess_quarantined(
     record, now = senders[name], report.stamp_ns
     contradicts = report.nis is None or report.nis > CONTRADICTING_NIS
     if record.last_failure_ns == now and contradicts:
-        record = replace(record, reason=_reason_of(record))
+        record = replace(record, reason=reason_of(record))
         senders = {**senders, name: record}
     readmit_ns = int(rules.readmit_s * 1e9)
     others = _recent(senders, now, name)
@@ -384,7 +367,7 @@ def _assess_quarantined(
     is_consistent = has_confirmations and now - record.last_conflict_ns >= readmit_ns
     if not ((agrees and is_confirmed) or (is_alone and is_consistent)):
         return TrustDecision(senders, False)
-    return TrustDecision({**senders, name: _released(record, now)}, True, "readmitted")
+    return TrustDecision({**senders, name: released(record, now)}, True, "readmitted")
 
 
 def reset_scores(senders: SenderRecords) -> SenderRecords:
