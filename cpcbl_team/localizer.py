@@ -327,12 +327,10 @@ class Localizer:
             if not is_trusted or state.estimate is not prior:
                 return self.recovery.check(state)
             observation = self.screen.with_caution(state, observation)
+            position = observation.of_position(prior.pose)
         if nis > self._gates[1]:
             return self.recovery.check(self._with_update(state, prior, None, {}, 1))
-        position, by_teammate = (
-            observation.of_position(prior.pose),
-            observation.observer is not None,
-        )
+        by_teammate = observation.observer is not None
         estimate = self._variant.correct_position(prior, position, by_teammate)
         return self._observe_heading(state, estimate, observation)
 

@@ -19,7 +19,7 @@ from cpcbl_team.geometry import new
 FAST_NS: Final = 1_500_000_000  # time constants with which reports fade: a fast drift shows sooner
 SLOW_NS: Final = 6_000_000_000  # in the mean of a short time, a slow one in that of a long time
 LEAST_REPORTS: Final = 5.0  # with fewer, fading, a source has no mean
-MOST_SIGMA_M: Final = 0.15  # a source whose mean is less certain has no voice
+MOST_SIGMA_M: Final = 0.15  # a source whose mean is less certain has no vote
 SURE_SIGMA_M: Final = 0.08  # own sensors that are less certain convict nobody alone
 COMMON_SIGMA_M: Final = 0.01
 """What two correct sources may disagree by for ever: calibration, map, and that the estimate moves
@@ -30,7 +30,7 @@ LEAD: Final = 7.0
 """Of two that contradict each other one is clearly nearer to a third source by this difference of
 their chi-squares."""
 HEADING_VARIANCE: Final = math.radians(5.0) ** 2
-"""rad^2: by what the heading of an estimate that was led astray may be wrong beside its variance."""
+"""rad^2: the heading of an estimate that was led astray may be wrong by more than its variance."""
 NOTHING: Final = Covariance2(0.0, 0.0, 0.0)
 
 
@@ -52,7 +52,7 @@ class MeanOffset(NamedTuple):
 
     @property
     def is_precise(self) -> bool:
-        """Whether it is certain enough for a voice."""
+        """Whether it is certain enough for a vote."""
         return self.is_within(MOST_SIGMA_M)
 
 
@@ -143,8 +143,8 @@ def bias_variance(one: MeanOffset, other: MeanOffset) -> float:
     return excess if excess > 0.0 else 0.0
 
 
-class Verdict(NamedTuple):
-    """What the means of the others say of one source."""
+class Comparison(NamedTuple):
+    """What the means of other sources say of that of one."""
 
     bias_variance: float = 0.0  # m^2, that a report of it may have in common with all others of it
     is_wrong: bool = False
@@ -157,9 +157,9 @@ class Verdict(NamedTuple):
     )
 
 
-def both(fast: Verdict, slow: Verdict) -> Verdict:
-    """The verdict of two means of the same source, of a short and of a long time."""
-    return Verdict(
+def both(fast: Comparison, slow: Comparison) -> Comparison:
+    """Both comparisons of one source, by its means of a short and of a long time."""
+    return Comparison(
         max(fast.bias_variance, slow.bias_variance),
         fast.is_wrong or slow.is_wrong,
         fast.is_contested or slow.is_contested,
@@ -168,35 +168,35 @@ def both(fast: Verdict, slow: Verdict) -> Verdict:
     )
 
 
-def verdict_by_own_sensors(mean: MeanOffset, own: MeanOffset, others: Means) -> Verdict:
-    """The verdict of the robot's own sensors, which outweigh any number of voices. Where this one
+def compared_with_own_sensors(mean: MeanOffset, own: MeanOffset, others: Means) -> Comparison:
+    """A sender beside the robot's own sensors, which outweigh any number of others. Where this one
     and another contradict each other, they decide by which of both is clearly nearer to theirs."""
     here = disagreement(mean, own)
     rivals = [other for other in others.values() if disagreement(mean, other) > CONFLICT]
     there = [disagreement(rival, own) for rival in rivals]
     is_refuted = here > CONFLICT and own.is_within(SURE_SIGMA_M)
     if is_refuted or any(here - z > LEAD for z in there):
-        return Verdict(bias_variance(mean, own), is_wrong=True)
+        return Comparison(bias_variance(mean, own), is_wrong=True)
     is_contested = any(z - here <= LEAD for z in there)
-    bias = max(bias_variance(mean, own), verdict_by_majority(mean, others).bias_variance)
-    return Verdict(bias, False, is_contested, not is_contested, is_contested)
+    bias = max(bias_variance(mean, own), compared_with_majority(mean, others).bias_variance)
+    return Comparison(bias, False, is_contested, not is_contested, is_contested)
 
 
-def verdict_by_majority(mean: MeanOffset, others: Means) -> Verdict:
-    """The verdict of the other senders. The bias is the distance within which a strict majority of
-    all agrees with it: with three, its own and one more; with four, its own and two more."""
+def compared_with_majority(mean: MeanOffset, others: Means) -> Comparison:
+    """A sender beside the others. The bias is the distance within which a strict majority of all
+    agrees with it: with three, its own and one more; with four, its own and two more."""
     count = len(others) + 1
     if count == 1:
-        return Verdict()
-    needed = count // 2  # other voices that make a strict majority with its own
+        return Comparison()
+    needed = count // 2  # other means that make a strict majority with its own
     biases = sorted(bias_variance(mean, other) for other in others.values())
     bias = biases[needed - 1]
     agreeing = sum(disagreement(mean, other) <= CONFLICT for other in others.values())
     if agreeing >= needed:
-        return Verdict(bias, is_confirmed=True)
+        return Comparison(bias, is_confirmed=True)
     accusers = {n: o for n, o in others.items() if disagreement(mean, o) > CONFLICT}
     is_wrong = any(2 * (_agreeing(name, accusers) + 1) > count for name in accusers)
-    return Verdict(bias, is_wrong, not is_wrong)
+    return Comparison(bias, is_wrong, not is_wrong)
 
 
 def _agreeing(name: str, others: Means) -> int:

@@ -23,12 +23,12 @@ from msgspec.structs import replace
 
 from cpcbl_team.config import TrustSettings
 from cpcbl_team.mean_offsets import (
+    Comparison,
     MeanOffset,
-    Verdict,
     both,
+    compared_with_majority,
+    compared_with_own_sensors,
     disagreement,
-    verdict_by_majority,
-    verdict_by_own_sensors,
 )
 from cpcbl_team.sender_records import (
     CONTRADICTING_NIS,
@@ -120,71 +120,73 @@ def _decide(
     now = report.stamp_ns
     record = with_report(senders.get(name, SenderRecord()), report, rules.limit)
     senders = {**senders, name: record}
-    verdict = _verdict(senders, name, now)
-    if verdict is not None:
-        record = _with_verdict(record, verdict, now)
+    comparison = _comparison(senders, name, now)
+    if comparison is not None:
+        record = _with_comparison(record, comparison, now)
         senders = {**senders, name: record}
     if record.reason:
-        return _assess_quarantined(senders, name, report, verdict, rules)
+        return _assess_quarantined(senders, name, report, comparison, rules)
     if record.odometry_conflicts > MOST_CONFLICTS and not _is_odometry_wrong(senders, name, rules):
         return _quarantine(senders, name, now, used_ns)
     if report.nis is None:
         return TrustDecision(senders, True)
-    if verdict is not None and verdict.is_wrong:  # suspicion is no accusation yet
+    if comparison is not None and comparison.is_wrong:  # suspicion is no accusation yet
         if now - record.wrong_ns < PERSISTENCE_NS:
             return TrustDecision(senders, False)
         return _quarantine_by_mean(senders, name, now)
-    if verdict is not None and (verdict.is_contested or record.score > 0.5 * rules.limit):
+    if comparison is not None and (comparison.is_contested or record.score > 0.5 * rules.limit):
         # Others do not contradict it, so rather the estimate is wrong.
-        return TrustDecision(senders, not verdict.is_left_out, least_sigma_m=_contested_m(record))
+        return TrustDecision(
+            senders, not comparison.is_left_out, least_sigma_m=_contested_m(record)
+        )
     return _decide_dispute(senders, name, now, used_ns, rules)
 
 
 # Test 3: the mean of a sender against own sensors, or against other senders ----------------------
 
 
-def _voices(senders: SenderRecords, now_ns: int, name: str, of: int) -> dict[str, MeanOffset]:
-    """The precise fast (0) or slow (1) means of the recent sources but `name`. Guests have no voice
+def _means(senders: SenderRecords, now_ns: int, name: str, of: int) -> dict[str, MeanOffset]:
+    """The precise fast (0) or slow (1) means of the recent sources but `name`. Guests have no vote
     beside two robots of the team."""
-    voices = {
+    means = {
         other: mean
         for other, r in _recent(senders, now_ns, name)
         if (mean := r.means[of]) is not None
         and mean.is_precise
         and now_ns - r.offsets[of].stamp_ns <= RECENT_NS
     }
-    guests = {other for other in voices if senders[other].is_guest}
-    if len(voices.keys() - guests - {OWN_SENSORS}) < 2:
-        return voices
-    return {other: mean for other, mean in voices.items() if other not in guests}
+    guests = {other for other in means if senders[other].is_guest}
+    if len(means.keys() - guests - {OWN_SENSORS}) < 2:
+        return means
+    return {other: mean for other, mean in means.items() if other not in guests}
 
 
-def _verdict(senders: SenderRecords, name: str, now_ns: int) -> Verdict | None:
-    """The verdict of test 3; None while the sender has no recent mean, or one that says nothing."""
-    fast, slow = (_verdict_of(senders, name, now_ns, of) for of in (0, 1))
+def _comparison(senders: SenderRecords, name: str, now_ns: int) -> Comparison | None:
+    """The result of test 3; None while the sender has no recent mean that is precise."""
+    fast, slow = (_comparison_of(senders, name, now_ns, of) for of in (0, 1))
     return both(fast, slow) if fast is not None and slow is not None else fast or slow
 
 
-def _verdict_of(senders: SenderRecords, name: str, now_ns: int, of: int) -> Verdict | None:
-    """The verdict about the fast (0) or slow (1) mean of a sender."""
+def _comparison_of(senders: SenderRecords, name: str, now_ns: int, of: int) -> Comparison | None:
+    """The result of test 3 with the fast (0) or slow (1) mean of a sender."""
     record, mean = senders[name], senders[name].means[of]
     if record.offsets[of].stamp_ns != now_ns or mean is None or not mean.is_precise:
         return None
-    voices = _voices(senders, now_ns, name, of)
-    own = voices.pop(OWN_SENSORS, None)
+    means = _means(senders, now_ns, name, of)
+    own = means.pop(OWN_SENSORS, None)
     if own is not None:
-        return verdict_by_own_sensors(mean, own, voices)
-    return verdict_by_majority(mean, voices)
+        return compared_with_own_sensors(mean, own, means)
+    return compared_with_majority(mean, means)
 
 
-def _with_verdict(record: SenderRecord, verdict: Verdict, now_ns: int) -> SenderRecord:
+def _with_comparison(record: SenderRecord, comparison: Comparison, now_ns: int) -> SenderRecord:
     since_ns = now_ns if record.wrong_ns == NEVER_NS else record.wrong_ns
     return replace(
         record,
-        bias_variance=verdict.bias_variance,
-        contested_ns=now_ns if verdict.is_contested else record.contested_ns,
-        wrong_ns=since_ns if verdict.is_wrong else NEVER_NS,
-        confirmed=record.confirmed + 1 if verdict.is_confirmed else record.confirmed,
+        bias_variance=comparison.bias_variance,
+        contested_ns=now_ns if comparison.is_contested else record.contested_ns,
+        wrong_ns=since_ns if comparison.is_wrong else NEVER_NS,
+        confirmed=record.confirmed + 1 if comparison.is_confirmed else record.confirmed,
     )
 
 
@@ -195,11 +197,11 @@ def _is_contested(record: SenderRecord, now_ns: int) -> bool:
 def _quarantine_by_mean(senders: SenderRecords, name: str, now_ns: int) -> TrustDecision:
     """The decision against a sender whose mean is wrong. The estimate is off by the means of those
     that contradict it."""
-    mean, voices = senders[name].means[0], _voices(senders, now_ns, name, 0)
-    if mean is None or not voices:
+    mean, means = senders[name].means[0], _means(senders, now_ns, name, 0)
+    if mean is None or not means:
         return TrustDecision(senders, False)
-    own = voices.get(OWN_SENSORS)
-    farthest = max(voices.values(), key=lambda voice: disagreement(mean, voice))
+    own = means.get(OWN_SENSORS)
+    farthest = max(means.values(), key=lambda other: disagreement(mean, other))
     right = own or farthest
     offset = mean.x - right.x, mean.y - right.y
     record = replace(senders[name], mean_offset=offset, offset_variance=0.0)
@@ -344,7 +346,7 @@ def _assess_quarantined(
     senders: SenderRecords,
     name: str,
     report: TeammateReport,
-    verdict: Verdict | None,
+    comparison: Comparison | None,
     rules: TrustSettings,
 ) -> TrustDecision:
     """A report of a sender in quarantine is not used, unless it is the one that ends it. The
@@ -358,7 +360,7 @@ def _assess_quarantined(
     readmit_ns = int(rules.readmit_s * 1e9)
     others = _recent(senders, now, name)
     is_confirmed = any(r.last_agreement_ns >= now - RECENT_NS for _, r in others)
-    if verdict is not None and (verdict.is_wrong or verdict.is_contested):
+    if comparison is not None and (comparison.is_wrong or comparison.is_contested):
         record = replace(record, last_failure_ns=now, agreements=0)
         senders = {**senders, name: record}
     agrees = record.agreements >= LEAST_AGREEMENTS and now - record.last_failure_ns >= readmit_ns

@@ -15,10 +15,10 @@ from cpcbl_team.mean_offsets import (
     FadingOffsets,
     MeanOffset,
     bias_variance,
+    compared_with_majority,
+    compared_with_own_sensors,
     disagreement,
     evidence_of_position,
-    verdict_by_majority,
-    verdict_by_own_sensors,
 )
 
 SECOND = 1_000_000_000
@@ -106,67 +106,69 @@ def test_a_difference_within_the_noise_is_no_bias() -> None:
     assert bias_variance(at(0.0), at(0.1)) == pytest.approx(0.1**2 - 4e-4)
 
 
-# Verdicts -----------------------------------------------------------------------------------------
+# Comparisons --------------------------------------------------------------------------------------
 
 
-def verdicts(*means: MeanOffset) -> list[str]:
+def results(*means: MeanOffset) -> list[str]:
     """What all others say of each."""
     found = []
     for i, mean in enumerate(means):
         others = {str(j): other for j, other in enumerate(means) if j != i}
-        verdict = verdict_by_majority(mean, others)
-        word = "wrong" if verdict.is_wrong else "contested" if verdict.is_contested else "right"
+        comparison = compared_with_majority(mean, others)
+        word = (
+            "wrong" if comparison.is_wrong else "contested" if comparison.is_contested else "right"
+        )
         found.append(word)
     return found
 
 
 def test_a_strict_majority_convicts_and_half_does_not() -> None:
-    assert verdicts(at(0.0), at(0.01), at(0.5)) == ["right", "right", "wrong"]
-    assert verdicts(at(0.0), at(0.5)) == ["contested", "contested"]
-    assert verdicts(at(0.0), at(0.0), at(0.5), at(0.5)) == ["contested"] * 4
-    assert verdicts(at(0.0), at(0.0), at(0.0), at(0.5), at(0.5)) == ["right"] * 3 + ["wrong"] * 2
-    assert verdicts(at(0.0)) == ["right"]
+    assert results(at(0.0), at(0.01), at(0.5)) == ["right", "right", "wrong"]
+    assert results(at(0.0), at(0.5)) == ["contested", "contested"]
+    assert results(at(0.0), at(0.0), at(0.5), at(0.5)) == ["contested"] * 4
+    assert results(at(0.0), at(0.0), at(0.0), at(0.5), at(0.5)) == ["right"] * 3 + ["wrong"] * 2
+    assert results(at(0.0)) == ["right"]
 
 
 def test_three_that_all_disagree_convict_nobody() -> None:
-    assert verdicts(at(0.0), at(0.5), at(1.0)) == ["contested"] * 3
+    assert results(at(0.0), at(0.5), at(1.0)) == ["contested"] * 3
 
 
 def test_one_that_agrees_with_both_sides_is_no_accuser_of_either() -> None:
     vague = at(0.05, sigma=0.03)
     assert disagreement(vague, at(0.0)) < CONFLICT > disagreement(vague, at(0.1))
-    words = verdicts(at(0.0), at(0.1), at(0.1), vague)
+    words = results(at(0.0), at(0.1), at(0.1), vague)
     assert words[0] == "contested"  # two accusers of four are no majority
 
 
 def test_the_bias_is_the_distance_to_a_strict_majority() -> None:
     honest, liar = at(0.0), at(0.1)
-    of_liar = verdict_by_majority(liar, {"a": honest, "b": honest}).bias_variance
+    of_liar = compared_with_majority(liar, {"a": honest, "b": honest}).bias_variance
     assert of_liar == pytest.approx(0.1**2 - 4e-4)
-    assert verdict_by_majority(honest, {"a": honest, "b": liar}).bias_variance == 0.0
-    two_each = verdict_by_majority(honest, {"a": honest, "b": liar, "c": liar})
+    assert compared_with_majority(honest, {"a": honest, "b": liar}).bias_variance == 0.0
+    two_each = compared_with_majority(honest, {"a": honest, "b": liar, "c": liar})
     assert two_each.bias_variance == of_liar
 
 
 @given(st.permutations(range(5)))
 def test_the_order_of_the_senders_does_not_matter(order: list[int]) -> None:
     means = [at(0.0), at(0.02), at(0.3), at(0.31), at(0.01)]
-    words = verdicts(*means)
-    assert verdicts(*(means[i] for i in order)) == [words[i] for i in order]
+    words = results(*means)
+    assert results(*(means[i] for i in order)) == [words[i] for i in order]
 
 
-def test_own_sensors_outweigh_any_number_of_voices() -> None:
+def test_own_sensors_outweigh_any_number_of_means() -> None:
     own, liars = at(0.0, sigma=0.03), {str(i): at(0.5) for i in range(9)}
-    assert verdict_by_own_sensors(at(0.5), own, liars).is_wrong
-    assert not verdict_by_own_sensors(at(0.0), own, liars).is_wrong
-    assert not verdict_by_own_sensors(at(0.0), own, liars).is_contested
+    assert compared_with_own_sensors(at(0.5), own, liars).is_wrong
+    assert not compared_with_own_sensors(at(0.0), own, liars).is_wrong
+    assert not compared_with_own_sensors(at(0.0), own, liars).is_contested
 
 
 def test_vague_own_sensors_convict_only_one_of_two_that_contradict_each_other() -> None:
     own = at(0.0, sigma=0.1)
-    assert not verdict_by_own_sensors(at(0.6), own, {}).is_wrong
-    assert verdict_by_own_sensors(at(0.6), own, {"a": at(0.0)}).is_wrong
-    undecided = verdict_by_own_sensors(at(0.1), own, {"a": at(0.0)})
+    assert not compared_with_own_sensors(at(0.6), own, {}).is_wrong
+    assert compared_with_own_sensors(at(0.6), own, {"a": at(0.0)}).is_wrong
+    undecided = compared_with_own_sensors(at(0.1), own, {"a": at(0.0)})
     assert undecided.is_contested
     assert undecided.is_left_out
     assert not undecided.is_wrong
