@@ -21,9 +21,10 @@ SLOW_NS: Final = 6_000_000_000  # in the mean of a short time, a slow one in tha
 LEAST_REPORTS: Final = 5.0  # with fewer, fading, a source has no mean
 MOST_SIGMA_M: Final = 0.15  # a source whose mean is less certain has no vote
 SURE_SIGMA_M: Final = 0.08  # own sensors that are less certain convict nobody alone
-COMMON_SIGMA_M: Final = 0.01
-"""What two correct sources may disagree by for ever: calibration, map, and that the estimate moves
-between their reports."""
+FAST_COMMON_M: Final = 0.01
+SLOW_COMMON_M: Final = 0.02
+"""Sigmas of what two correct sources may disagree by for ever: calibration, map, and the error of
+the estimate, which differs between the times of their reports, the more the longer the mean."""
 CONFLICT: Final = 18.0
 """Two sources contradict each other beyond this chi-square (two degrees of freedom)."""
 LEAD: Final = 7.0
@@ -41,6 +42,7 @@ class MeanOffset(NamedTuple):
     x: float
     y: float
     covariance: Covariance2
+    common_m: float = FAST_COMMON_M  # sigma of an error that never averages away
 
     @property
     def length_m(self) -> float:
@@ -89,7 +91,7 @@ class FadingOffsets(NamedTuple):
         )
         return new(FadingOffsets, fields)
 
-    def mean(self, heading_variance: float) -> MeanOffset | None:
+    def mean(self, heading_variance: float, common_m: float = FAST_COMMON_M) -> MeanOffset | None:
         """The mean of the reports, if they are enough to determine one. `heading_variance` (rad^2):
         that of the estimate; what a bearing says of the position depends on the heading."""
         if self.reports < LEAST_REPORTS:
@@ -106,7 +108,7 @@ class FadingOffsets(NamedTuple):
         # The variance of a weighted mean: old reports fade, so their errors do too.
         covariance = Covariance2(cxx, cxy, cyy).scaled(self.squares / self.reports)
         covariance += self.dependent
-        return MeanOffset(cxx * x + cxy * y, cxy * x + cyy * y, covariance)
+        return MeanOffset(cxx * x + cxy * y, cxy * x + cyy * y, covariance, common_m)
 
 
 Means = Mapping[str, MeanOffset]
@@ -129,7 +131,7 @@ def evidence_of_position(offset: tuple[float, float], noise: Covariance2) -> Sum
 def disagreement(one: MeanOffset, other: MeanOffset) -> float:
     """The chi-square of the difference of two means (two degrees of freedom)."""
     (xx, xy, yy), (oxx, oxy, oyy) = one.covariance, other.covariance
-    common = 2.0 * COMMON_SIGMA_M**2
+    common = one.common_m * one.common_m + other.common_m * other.common_m
     sum_ = Covariance2(xx + oxx + common, xy + oxy, yy + oyy + common)
     return sum_.mahalanobis_squared(one.x - other.x, one.y - other.y)
 

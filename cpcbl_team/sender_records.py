@@ -19,7 +19,14 @@ from msgspec.structs import replace
 from cpcbl_team.estimate import Sums
 from cpcbl_team.gaussian import Covariance2
 from cpcbl_team.geometry import Pose2
-from cpcbl_team.mean_offsets import FAST_NS, NOTHING, SLOW_NS, FadingOffsets, MeanOffset
+from cpcbl_team.mean_offsets import (
+    FAST_NS,
+    NOTHING,
+    SLOW_COMMON_M,
+    SLOW_NS,
+    FadingOffsets,
+    MeanOffset,
+)
 
 SILENCE_NS: Final = 10_000_000_000  # earlier reports count no longer after this silence
 USUAL_NIS = 6.0  # 95 % quantile of the chi-square distribution of two degrees of freedom
@@ -133,7 +140,8 @@ def with_evidence(record: SenderRecord, stamp_ns: int, report: OffsetEvidence) -
         sums.with_report(stamp_ns, fading_ns, evidence, dependent)
         for sums, fading_ns in zip(record.offsets, (FAST_NS, SLOW_NS), strict=True)
     )
-    means = tuple(sums.mean(heading_variance) for sums in offsets)
+    fast, slow = offsets
+    means = fast.mean(heading_variance), slow.mean(heading_variance, SLOW_COMMON_M)
     return replace(record, offsets=offsets, means=means)
 
 
