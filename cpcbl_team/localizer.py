@@ -70,13 +70,13 @@ _NO_OBJECTS: Final = GatedObjects([], [])
 class Localizer:
     """The localizer of one robot on one field."""
 
-    def __init__(self, settings: LocalizationSettings, field: Field) -> None:
-        self.settings = settings
-        self.field = field
-        rules = settings.localizer
+    def __init__(
+        self, settings: LocalizationSettings, field: Field, team: frozenset[str] | None = None
+    ) -> None:
+        """`team`: its robots; who else sends something is a guest (None: there are no guests)."""
+        self.settings, self.field, rules = settings, field, settings.localizer
         gates = chi_square_bounds(rules.gate_probability)
-        self._rules = rules
-        self._gates = gates
+        self._rules, self._gates = rules, gates
         self._minimum_interval_ns = rules.minimum_interval_s * 1e9
         self._odometry = settings.odometry
         self._moves = settings.odometry.moves
@@ -90,7 +90,7 @@ class Localizer:
         self._landmarks = Landmarks(field, settings, gates)
         self._calibration = OwnCalibration(settings, field, self._landmarks)
         self.recovery = Recovery(settings, field, self._landmarks, self._variant.reduce)
-        self.screen = TeammateScreen(settings, gates, self._variant.is_probabilistic)
+        self.screen = TeammateScreen(settings, gates, self._variant.is_probabilistic, team)
 
     def cycle(self, state: State, frame: Sightings) -> State:
         """One cycle (paper, section 3, figure 1). Pure: the same inputs give the same bits.
@@ -326,6 +326,8 @@ class Localizer:
             state, is_trusted = self.screen.screen_observation(state, observation, position, nis)
             if not is_trusted or state.estimate is not prior:
                 return self.recovery.check(state)
+            observation = self.screen.with_caution(state, observation)
+            position = observation.of_position(prior.pose)
         if nis > self._gates[1]:
             return self.recovery.check(self._with_update(state, prior, None, {}, 1))
         by_teammate = observation.observer is not None

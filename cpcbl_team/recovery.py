@@ -204,6 +204,17 @@ def inflate_by_offset(estimate: Estimate, offset_m: float, settings: LocalizerSe
     return estimate._replace(covariance=grown)
 
 
+def inflate_to(estimate: Estimate, sigma_m: float, settings: LocalizerSettings) -> Estimate:
+    """For a robot whose teammates contradict each other: its position is no more certain than this
+    along any axis. What is added is shared, for it is an error of teammates."""
+    c, most_m = estimate.covariance, settings.lost_position_sigma_m
+    more = min(sigma_m, most_m) ** 2 - min(c.xx, c.yy)
+    if more <= 0.0:
+        return estimate
+    added = Covariance3(more, 0.0, more, 0.0, 0.0, 0.0)
+    return estimate._replace(covariance=c.plus(added), shared=estimate.shared.plus(added))
+
+
 def undetermined(
     evidence: Sequence[Evidence], objects_ns: Mapping[str, int], kidnapped_ns: int
 ) -> str:

@@ -24,7 +24,7 @@ from cpcbl_team.miscalibration import (
 )
 from cpcbl_team.range_errors import RangeEvidence
 from cpcbl_team.self_calibration import ReferencePoses, SelfCalibration
-from cpcbl_team.trust import SenderRecord
+from cpcbl_team.sender_records import SenderRecord
 
 FIX = "fix:"  # marks the source of an active fix, apart from a sighting of that teammate
 _NONE: Mapping[str, Any] = MappingProxyType({})

@@ -5,19 +5,30 @@ assessed by `trust.py`. What may not be used is left out; where the estimate has
 before, the covariance is inflated.
 """
 
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
+
+from msgspec.structs import replace
 
 from cpcbl_team import trust
 from cpcbl_team.config import LocalizationSettings
+from cpcbl_team.estimate import Information
 from cpcbl_team.fixes import PoseObservation
 from cpcbl_team.fusion import Observation
+from cpcbl_team.gaussian import Covariance2
 from cpcbl_team.inputs import Belief, Input, Position, Sightings
 from cpcbl_team.landmarks import LandmarkUpdate
-from cpcbl_team.measurements import GatedObject, GatedObjects, nearest_belief
-from cpcbl_team.recovery import inflate_by_offset, without_senders
+from cpcbl_team.measurements import (
+    GatedObject,
+    GatedObjects,
+    combine,
+    nearest_belief,
+    observation_of,
+)
+from cpcbl_team.recovery import inflate_by_offset, inflate_to, without_senders
+from cpcbl_team.sender_records import NEVER_NS, OffsetEvidence, ReportedPosition, TeammateReport
 from cpcbl_team.state import State, with_memory, with_senders, with_teammates
-from cpcbl_team.trust import NEVER_NS, ReportedPosition, TeammateReport
 
+LEAST_CONFIRMED = 20  # reports of a guest beside which others agreed, until it counts as the others
 MOST_SENDERS = 512  # of which records are kept
 
 
@@ -25,10 +36,16 @@ class TeammateScreen:
     """Leaves out what untrusted teammates report, and keeps the trust up to date."""
 
     def __init__(
-        self, settings: LocalizationSettings, gates: tuple[float, float], is_probabilistic: bool
+        self,
+        settings: LocalizationSettings,
+        gates: tuple[float, float],
+        is_probabilistic: bool,
+        teammates: Collection[str] | None = None,
     ) -> None:
         """`gates`: chi-square bounds of one and of two degrees of freedom. Without a covariance
-        there is no NIS, and nothing is screened."""
+        there is no NIS, and nothing is screened. `teammates`: the robots of the team; all others
+        are guests (None: there are no guests)."""
+        self._teammates = teammates
         self._collaboration, self._rules = settings.collaboration, settings.collaboration.trust
         self._localizer_rules = settings.localizer
         self._gates = gates
@@ -48,19 +65,73 @@ class TeammateScreen:
         )
         accepted, rejected = accepted + len(landmarks.used), rejected + len(landmarks.rejected)
         if (accepted or rejected) and not is_lost:
-            state = self._with_own_sensors(state, accepted, rejected)
+            sums = combine(Information.of(landmarks.evidence.sums()), gated.accepted)
+            state = self._with_own_sensors(state, accepted, rejected, sums)
         distrusted = set()
-        for m, constraints, nis, _ in (*gated.accepted, *gated.rejected):
+        for m, constraints, nis, observation in (*gated.accepted, *gated.rejected):
             if m.is_teammate:
                 is_fresh = _has_fresh(state.memory.teammates.beliefs[m.source], now)
                 of_two = 2.0 * nis / len(constraints) if is_fresh and not is_lost else None
-                report = TeammateReport(now, of_two)
+                evidence = (
+                    self._evidence(state, observation)
+                    if of_two is not None and observation
+                    else None
+                )
+                report = TeammateReport(
+                    now, of_two, evidence=evidence, is_guest=self._is_guest(m.source)
+                )
                 state, is_trusted = self._assess(state, m.source, report, m.source)
                 if not is_trusted:
                     distrusted.add(m.source)
-        if not distrusted:
-            return state, gated
-        return state, GatedObjects(*(_without(objects, distrusted) for objects in gated))
+        if distrusted:
+            gated = GatedObjects(*(_without(objects, distrusted) for objects in gated))
+        accepted_ = [self._with_caution(state, found) for found in gated.accepted]
+        return state, gated._replace(accepted=accepted_)
+
+    def _with_caution(self, state: State, found: GatedObject) -> GatedObject:
+        """A teammate as landmark with what this robot adds to the covariance of its position."""
+        m = found.measurement
+        if not m.is_teammate:
+            return found
+        place = m.position._replace(
+            covariance=self._cautious(state, m.source, m.position.covariance)
+        )
+        m = replace(m, position=place)
+        return found._replace(
+            measurement=m, observation=observation_of(state.estimate, m, found.constraints)
+        )
+
+    def with_caution(self, state: State, observation: PoseObservation) -> PoseObservation:
+        """A teammate's fix with what this robot adds to the observer's part of its covariance."""
+        if observation.observer is None:
+            return observation
+        observer = self._cautious(state, observation.sender, observation.observer)
+        return observation._replace(observer=observer)
+
+    def _cautious(self, state: State, sender: str, dependent: Covariance2) -> Covariance2:
+        """The part of a teammate's noise that is the same in all its reports: never below what this
+        robot believes any teammate, and with the bias that others find in it. Split covariance
+        intersection does not average this part away, so it bounds the weight of all its reports
+        together."""
+        record = state.memory.teammates.senders.get(sender)
+        rules = self._rules
+        is_new = record is None or record.confirmed < LEAST_CONFIRMED
+        is_new_guest = is_new and self._is_guest(sender)
+        least = (rules.guest_sigma_m if is_new_guest else rules.least_sigma_m) ** 2
+        more = max(0.0, least - min(dependent.xx, dependent.yy))
+        more += 0.0 if record is None else record.bias_variance
+        return dependent + Covariance2(more, 0.0, more) if more else dependent
+
+    def _is_guest(self, sender: str) -> bool:
+        return self._teammates is not None and sender not in self._teammates
+
+    def _evidence(self, state: State, observation: Observation) -> OffsetEvidence:
+        """What a report says of the offset of the estimate."""
+        independent, dependent = observation.independent, observation.dependent
+        sums = observation.information(independent)
+        variance = 0.5 * (dependent.xx + dependent.yy)
+        hh = state.estimate.covariance.hh
+        return OffsetEvidence(sums, Covariance2(variance, 0.0, variance), hh)
 
     def screen_observation(
         self, state: State, observation: PoseObservation, position: Observation, nis: float
@@ -74,7 +145,8 @@ class TeammateScreen:
         if observation.observer is None:
             if self.has_recent_reports(state, now) and not is_lost:
                 is_accepted = nis <= self._gates[1]
-                state = self._with_own_sensors(state, is_accepted, not is_accepted)
+                sums = position.information(position.independent)
+                state = self._with_own_sensors(state, is_accepted, not is_accepted, sums)
             return state, True
         heading = observation.of_heading(state.estimate.pose)
         if heading is not None:  # three degrees of freedom, scaled to two
@@ -83,7 +155,14 @@ class TeammateScreen:
         noise, (ex, ey) = position.noise(), position.residuals
         variance = 0.5 * (noise.xx + noise.yy)
         where = now, observation.x, observation.y, variance, state.odometry_from_robot
-        report = TeammateReport(now, None if is_lost else nis, (ex, ey), ReportedPosition(*where))
+        report = TeammateReport(
+            now,
+            None if is_lost else nis,
+            (ex, ey),
+            ReportedPosition(*where),
+            self._evidence(state, position),
+            self._is_guest(observation.sender),
+        )
         return self._assess(state, observation.sender, report, observation.source)
 
     def is_changed_by_beliefs(self, item: Input, before: State, after: State, robot: str) -> bool:
@@ -101,10 +180,13 @@ class TeammateScreen:
             return True
         return _has_fresh(old, now_ns) is not _has_fresh(new, now_ns)
 
-    def _with_own_sensors(self, state: State, accepted: int, rejected: int) -> State:
+    def _with_own_sensors(
+        self, state: State, accepted: int, rejected: int, sums: Information
+    ) -> State:
         """The state with how far the robot's own sensors agree with the estimate."""
         memory = state.memory.teammates
-        result = state.stamp_ns, accepted, rejected, self._rules.limit
+        evidence = OffsetEvidence(sums, heading_variance=state.estimate.covariance.hh)
+        result = state.stamp_ns, accepted, rejected, self._rules.limit, evidence
         senders = trust.with_own_sensor_result(memory.senders, *result)
         return with_teammates(state, with_senders(memory, senders))
 
@@ -124,6 +206,9 @@ class TeammateScreen:
         state = with_memory(state, memory)
         if decision.estimate_error_m:
             estimate = inflate_by_offset(estimate, decision.estimate_error_m, self._localizer_rules)
+            state = state._replace(estimate=estimate)
+        if decision.least_sigma_m:
+            estimate = inflate_to(state.estimate, decision.least_sigma_m, self._localizer_rules)
             state = state._replace(estimate=estimate)
         teammates = with_senders(memory.teammates, _bounded(decision.senders))
         return with_teammates(state, teammates), decision.trusted

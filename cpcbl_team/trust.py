@@ -1,19 +1,15 @@
 """Whether a teammate can be trusted: what follows when its reports fail a test.
 
-Each report of a sender has to pass two tests.
-
-1. Against the estimate, an innovation test over time: the amounts by which the normalized
-   innovation squared (NIS) of the reports exceeds its usual size are added up to a score (a CUSUM;
-   E. S. Page, Biometrika 41, 1954).
-2. Against odometry: the distance between two positions of this robot that a sender reported must be
-   the distance between them by odometry. This needs neither the heading nor a second sender.
+The reports of a sender have to pass three tests: each report one against the estimate and one
+against odometry (`sender_records.py`), and their mean one against the robot's own sensors or the
+other senders (`mean_offsets.py`).
 
 A sender whose score against the estimate exceeds the limit is in dispute with it. The dispute is
-decided against the
-sender only if somebody else supported the estimate since it began: the robot's own sensors, or at
-least as many teammates as dissent. If most dissent, the estimate is wrong, and so are the senders
-that it followed. A sender that contradicts odometry again and again is wrong without a second
-opinion.
+decided against the sender only if somebody else supported the estimate since it began: the robot's
+own sensors, or at least as many teammates as dissent. If most dissent, the estimate is wrong, and
+so are the senders that it followed. A sender that contradicts odometry again and again is wrong
+without a second opinion, and so is one whose mean contradicts the robot's own sensors, or, without
+these, a majority of the senders.
 
 A sender that is wrong is quarantined: its reports are not used, but they are still tested. It is
 readmitted after its reports were right for some time (docs/trust.md).
@@ -21,27 +17,35 @@ readmitted after its reports were right for some time (docs/trust.md).
 
 import math
 from collections.abc import Iterator, Mapping
-from enum import StrEnum
 from typing import Final, NamedTuple
 
-import msgspec
 from msgspec.structs import replace
 
 from cpcbl_team.config import TrustSettings
-from cpcbl_team.geometry import Pose2
+from cpcbl_team.mean_offsets import (
+    Comparison,
+    MeanOffset,
+    both,
+    compared_with_majority,
+    compared_with_own_sensors,
+    disagreement,
+)
+from cpcbl_team.sender_records import (
+    CONTRADICTING_NIS,
+    MOST_NIS,
+    NEVER_NS,
+    SILENCE_NS,
+    OffsetEvidence,
+    QuarantineReason,
+    SenderRecord,
+    TeammateReport,
+    quarantined,
+    reason_of,
+    released,
+    with_evidence,
+    with_report,
+)
 
-SILENCE_NS = 10_000_000_000  # after this long without a report, earlier reports count no longer
-USUAL_NIS = 6.0  # 95 % quantile of the chi-square distribution of two degrees of freedom
-CONTRADICTING_NIS = 13.8  # its 99.9 % quantile
-MOST_NIS = 20.0  # one report counts for no more than this
-JUMP_SIGMAS = 5.0  # a reported distance conflicts with odometry if it is longer by this,
-FROZEN_SIGMAS, FROZEN_SHARE = 3.0, 0.3  # or shorter by this and below this share of odometry's
-SLIP_SHARE, SLIP_M = 0.1, 0.03  # sigma of a distance by odometry: a share of it, and a constant
-LAST_OFFSET_SHARE = 0.2  # with which the last offset counts in their mean and variance
-LEAST_DISTANCE_M = 0.3  # the shortest distance that shows whether a sender follows the robot
-LONGEST_COMPARISON_NS = 5_000_000_000  # after this time without a jump any distance is a comparison
-FADING_S = 10.0  # time constant with which conflicts with odometry fade
-NEVER_NS = -(2**62)
 OWN_SENSORS = ""  # stands for the robot's own sensors among the senders; no robot has this name
 RECENT_NS: Final = 3_000_000_000  # a sender takes part in disputes for so long after a report
 FRESH_BELIEF_NS: Final = 300_000_000  # the robot of an older belief may have turned since
@@ -50,140 +54,9 @@ CLEAR_CONFLICTS = 0.5  # odometry speaks against a sender with this many conflic
 MOST_CONFLICTS = 2.5  # with more a sender is quarantined: at the third within a short time
 LEAST_AGREEMENTS = 10  # reports that must agree with the estimate before a sender is readmitted,
 LEAST_CONFIRMATIONS = 2  # or distances that must agree with odometry
-
-
-# The record of one sender, and the tests of its reports -------------------------------------------
-
-
-class QuarantineReason(StrEnum):
-    """What kind of fault explains the reports of a sender best."""
-
-    BIASED = "biased"
-    FROZEN = "frozen"
-    JUMPS = "jumps"
-    OVERCONFIDENT = "overconfident"
-    OUTVOTED = "outvoted"
-
-
-class ReportedPosition(NamedTuple):
-    """Where a sender reported this robot, in the field's frame, and its odometry at that time."""
-
-    stamp_ns: int
-    x: float
-    y: float
-    variance: float  # m^2, mean of the axes
-    odometry_from_robot: Pose2
-
-
-class TeammateReport(NamedTuple):
-    """A fix of a teammate, or a sighting of a teammate whose belief is used as a landmark."""
-
-    stamp_ns: int
-    nis: float | None
-    """Scaled to two degrees of freedom; None if the robot is lost, so that there is no test 1."""
-    offset: tuple[float, float] | None = None
-    """The reported position minus the estimated one, m; None for a sighting."""
-    position: ReportedPosition | None = None  # for test 2; None for a sighting
-
-
-class SenderRecord(msgspec.Struct, frozen=True, gc=False):
-    """What the robot remembers of one sender."""
-
-    last_report_ns: int = NEVER_NS
-    last_agreement_ns: int = NEVER_NS
-    dispute_since_ns: int = NEVER_NS  # when its score last left zero
-    score: float = 0.0  # the sum of test 1: NIS beyond the usual
-    mean_offset: tuple[float, float] = (0.0, 0.0)
-    """Exponential mean of the offsets of its reports that disagree, m."""
-    offset_variance: float = 0.0  # exponential variance of these offsets, m^2
-    position: ReportedPosition | None = None  # with which the next position is compared in test 2
-    comparisons: float = 0.0  # number of comparisons with odometry, fading
-    odometry_conflicts: float = 0.0  # number of them that contradicted odometry, fading
-    missed_motion: bool = False
-    """Whether the last conflict was a motion of the robot that the sender did not report."""
-    confirmations: int = 0  # distances that odometry confirmed since the last conflict
-    last_conflict_ns: int = NEVER_NS
-    last_failure_ns: int = NEVER_NS
-    """When a report last contradicted the estimate clearly, or odometry."""
-    agreements: int = 0  # reports that agreed with the estimate since then
-    reason: QuarantineReason | None = None  # why it is in quarantine; None if it is not
-    since_ns: int = 0  # when the quarantine began, or ended
-    quarantines: int = 0
-
-
-def with_report(record: SenderRecord, report: TeammateReport, limit: float) -> SenderRecord:
-    """The record after both tests of one more report."""
-    if record.score and report.stamp_ns - record.last_report_ns > SILENCE_NS:
-        record = replace(record, score=0.0)
-    record = _with_position(_with_faded_conflicts(record, report.stamp_ns), report.position)
-    record = replace(record, last_report_ns=max(record.last_report_ns, report.stamp_ns))
-    return record if report.nis is None else _with_nis(record, report, report.nis, limit)
-
-
-def _with_nis(
-    record: SenderRecord, report: TeammateReport, nis: float, limit: float
-) -> SenderRecord:
-    """Test 1: the innovation of a report against the estimate."""
-    now = report.stamp_ns
-    score = max(0.0, min(record.score + min(nis, MOST_NIS) - USUAL_NIS, 2.0 * limit))
-    if score and not record.score and not record.reason:
-        offset = report.offset or (0.0, 0.0)
-        record = replace(record, dispute_since_ns=now, mean_offset=offset, offset_variance=0.0)
-    record = replace(record, score=score)
-    if nis <= USUAL_NIS:
-        return replace(record, last_agreement_ns=now, agreements=record.agreements + 1)
-    if report.offset is not None:
-        (x, y), (mx, my), k = report.offset, record.mean_offset, LAST_OFFSET_SHARE
-        dx, dy = x - mx, y - my
-        variance = (1.0 - k) * (record.offset_variance + k * (dx * dx + dy * dy))
-        record = replace(record, mean_offset=(mx + k * dx, my + k * dy), offset_variance=variance)
-    contradicts = nis > CONTRADICTING_NIS
-    return replace(record, last_failure_ns=now, agreements=0) if contradicts else record
-
-
-def _with_faded_conflicts(record: SenderRecord, now_ns: int) -> SenderRecord:
-    if not record.comparisons or now_ns <= record.last_report_ns:
-        return record
-    fade = math.exp((record.last_report_ns - now_ns) * 1e-9 / FADING_S)
-    conflicts, comparisons = fade * record.odometry_conflicts, fade * record.comparisons
-    return replace(record, odometry_conflicts=conflicts, comparisons=comparisons)
-
-
-def _with_position(record: SenderRecord, now: ReportedPosition | None) -> SenderRecord:
-    """Test 2: the distance between two reported positions against that of odometry. Both are
-    straight distances, so neither the path nor the heading matters. The later position is the next
-    one to compare with, unless this comparison shows nothing yet."""
-    then = record.position
-    if now is None:
-        return record
-    if then is None or now.stamp_ns - then.stamp_ns > SILENCE_NS:
-        return replace(record, position=now)
-    if now.stamp_ns <= then.stamp_ns:
-        return record
-    displacement = then.odometry_from_robot.inverse() @ now.odometry_from_robot
-    driven = math.hypot(displacement.x, displacement.y)
-    reported = math.hypot(now.x - then.x, now.y - then.y)
-    slip = SLIP_SHARE * driven + SLIP_M
-    sigma = math.sqrt(then.variance + now.variance + slip * slip)
-    is_far = driven >= max(LEAST_DISTANCE_M, (FROZEN_SIGMAS + 1.0) * sigma)
-    jumped = reported - driven > JUMP_SIGMAS * sigma
-    is_short = reported < FROZEN_SHARE * driven and driven - reported > FROZEN_SIGMAS * sigma
-    missed_motion = is_far and is_short
-    record = replace(record, comparisons=record.comparisons + 1.0)
-    if not (jumped or is_far or now.stamp_ns - then.stamp_ns >= LONGEST_COMPARISON_NS):
-        return record
-    record = replace(record, position=now)
-    if jumped or missed_motion:
-        conflicts, at_ns = record.odometry_conflicts + 1.0, now.stamp_ns
-        record = replace(record, odometry_conflicts=conflicts, last_conflict_ns=at_ns)
-        record = replace(record, missed_motion=missed_motion, last_failure_ns=at_ns)
-        return replace(record, confirmations=0, agreements=0)
-    # While the robot stands, a frozen sender is right: that confirms nothing.
-    confirms = is_far or record.reason is not QuarantineReason.FROZEN
-    return replace(record, confirmations=record.confirmations + 1) if confirms else record
-
-
-# The decision -------------------------------------------------------------------------------------
+PERSISTENCE_NS: Final = 500_000_000  # a mean that is wrong for so long is no chance
+ALIKE_M: Final = 0.05  # two senders whose offsets differ by no more, or by half of them, agree
+MAJORITY_NS: Final = 20_000_000_000  # most senders are not found wrong within so short a time
 
 # The reasons that rest on what other senders reported
 _BY_COMPARISON = QuarantineReason.BIASED, QuarantineReason.OVERCONFIDENT, QuarantineReason.OUTVOTED
@@ -198,6 +71,7 @@ class TrustDecision(NamedTuple):
     event: str = ""  # the count to increase: quarantined, readmitted, outvoted
     quarantined: frozenset[str] = frozenset()  # the senders whose quarantine begins now
     estimate_error_m: float = 0.0  # how far the estimate may be off because it followed them
+    least_sigma_m: float = 0.0  # of the estimate, while senders contradict each other
 
 
 class TrustStatus(NamedTuple):
@@ -208,15 +82,24 @@ class TrustStatus(NamedTuple):
     since_ns: int = 0
     quarantines: int = 0
     unconfirmed: bool = False  # it is the only recent sender, so a bias of it cannot be detected
+    contested: bool = False  # it contradicts others, and nobody can decide who is right
 
 
 def with_own_sensor_result(
-    senders: SenderRecords, stamp_ns: int, accepted: int, rejected: int, limit: float
+    senders: SenderRecords,
+    stamp_ns: int,
+    accepted: int,
+    rejected: int,
+    limit: float,
+    evidence: OffsetEvidence | None = None,
 ) -> SenderRecords:
     """The records after the gate accepted and rejected so many measurements of the robot's own
-    sensors. Their NIS is the largest one that counts, times the share that was rejected."""
+    sensors, and what the accepted ones say. Their NIS is the largest one that counts, times the
+    share that was rejected."""
     report = TeammateReport(stamp_ns, MOST_NIS * (rejected / (accepted + rejected)))
     record = with_report(senders.get(OWN_SENSORS, SenderRecord()), report, limit)
+    if evidence is not None and accepted:
+        record = with_evidence(record, stamp_ns, evidence)
     return {**senders, OWN_SENSORS: record}
 
 
@@ -225,15 +108,105 @@ def assess(
 ) -> TrustDecision:
     """The records after a report of the sender `name`, and whether the report may be used.
     `used_ns`: when a report of this sender was last used."""
+    decision = _decide(senders, name, report, used_ns, rules)
+    out = _outvoted_majority(decision, report.stamp_ns) if decision.quarantined else None
+    return _without_decision(decision, out, report.stamp_ns) if out else decision
+
+
+def _decide(
+    senders: SenderRecords, name: str, report: TeammateReport, used_ns: int, rules: TrustSettings
+) -> TrustDecision:
+    """The decision that the tests of one report lead to."""
+    now = report.stamp_ns
     record = with_report(senders.get(name, SenderRecord()), report, rules.limit)
     senders = {**senders, name: record}
+    comparison = _comparison(senders, name, now)
+    if comparison is not None:
+        record = _with_comparison(record, comparison, now)
+        senders = {**senders, name: record}
     if record.reason:
-        return _assess_quarantined(senders, name, report, rules)
+        return _assess_quarantined(senders, name, report, comparison, rules)
     if record.odometry_conflicts > MOST_CONFLICTS and not _is_odometry_wrong(senders, name, rules):
-        return _quarantine(senders, name, report.stamp_ns, used_ns)
+        return _quarantine(senders, name, now, used_ns)
     if report.nis is None:
         return TrustDecision(senders, True)
-    return _decide_dispute(senders, name, report.stamp_ns, used_ns, rules)
+    if comparison is not None and comparison.is_wrong:  # suspicion is no accusation yet
+        if now - record.wrong_ns < PERSISTENCE_NS:
+            return TrustDecision(senders, False)
+        return _quarantine_by_mean(senders, name, now)
+    if comparison is not None and (comparison.is_contested or record.score > 0.5 * rules.limit):
+        # Others do not contradict it, so rather the estimate is wrong.
+        return TrustDecision(
+            senders, not comparison.is_left_out, least_sigma_m=_contested_m(record)
+        )
+    return _decide_dispute(senders, name, now, used_ns, rules)
+
+
+# Test 3: the mean of a sender against own sensors, or against other senders ----------------------
+
+
+def _means(senders: SenderRecords, now_ns: int, name: str, of: int) -> dict[str, MeanOffset]:
+    """The precise fast (0) or slow (1) means of the recent sources but `name`. Guests have no vote
+    beside two robots of the team."""
+    means = {
+        other: mean
+        for other, r in _recent(senders, now_ns, name)
+        if (mean := r.means[of]) is not None
+        and mean.is_precise
+        and now_ns - r.offsets[of].stamp_ns <= RECENT_NS
+    }
+    guests = {other for other in means if senders[other].is_guest}
+    if len(means.keys() - guests - {OWN_SENSORS}) < 2:
+        return means
+    return {other: mean for other, mean in means.items() if other not in guests}
+
+
+def _comparison(senders: SenderRecords, name: str, now_ns: int) -> Comparison | None:
+    """The result of test 3; None while the sender has no recent mean that is precise."""
+    fast, slow = (_comparison_of(senders, name, now_ns, of) for of in (0, 1))
+    return both(fast, slow) if fast is not None and slow is not None else fast or slow
+
+
+def _comparison_of(senders: SenderRecords, name: str, now_ns: int, of: int) -> Comparison | None:
+    """The result of test 3 with the fast (0) or slow (1) mean of a sender."""
+    record, mean = senders[name], senders[name].means[of]
+    if record.offsets[of].stamp_ns != now_ns or mean is None or not mean.is_precise:
+        return None
+    means = _means(senders, now_ns, name, of)
+    own = means.pop(OWN_SENSORS, None)
+    if own is not None:
+        return compared_with_own_sensors(mean, own, means)
+    return compared_with_majority(mean, means)
+
+
+def _with_comparison(record: SenderRecord, comparison: Comparison, now_ns: int) -> SenderRecord:
+    since_ns = now_ns if record.wrong_ns == NEVER_NS else record.wrong_ns
+    return replace(
+        record,
+        bias_variance=comparison.bias_variance,
+        contested_ns=now_ns if comparison.is_contested else record.contested_ns,
+        wrong_ns=since_ns if comparison.is_wrong else NEVER_NS,
+        confirmed=record.confirmed + 1 if comparison.is_confirmed else record.confirmed,
+    )
+
+
+def _is_contested(record: SenderRecord, now_ns: int) -> bool:
+    return now_ns - record.contested_ns <= RECENT_NS
+
+
+def _quarantine_by_mean(senders: SenderRecords, name: str, now_ns: int) -> TrustDecision:
+    """The decision against a sender whose mean is wrong. The estimate is off by the means of those
+    that contradict it."""
+    mean, means = senders[name].means[0], _means(senders, now_ns, name, 0)
+    if mean is None or not means:
+        return TrustDecision(senders, False)
+    own = means.get(OWN_SENSORS)
+    farthest = max(means.values(), key=lambda other: disagreement(mean, other))
+    right = own or farthest
+    offset = mean.x - right.x, mean.y - right.y
+    record = replace(senders[name], mean_offset=offset, offset_variance=0.0)
+    changed = {**senders, name: quarantined(record, reason_of(record), now_ns)}
+    return TrustDecision(changed, False, "quarantined", frozenset((name,)), right.length_m)
 
 
 def _decide_dispute(
@@ -245,7 +218,9 @@ def _decide_dispute(
     recent = dict(_recent(senders, now_ns))
     disputes_ns = [r.dispute_since_ns for r in recent.values() if r.score > rules.limit]
     if not disputes_ns:
-        return TrustDecision(senders, True)
+        is_contested = _is_contested(recent[name], now_ns)
+        least_m = _contested_m(recent[name]) if is_contested else 0.0
+        return TrustDecision(senders, True, least_sigma_m=least_m)
     since_ns = min(disputes_ns)
     dissenters = {n for n, r in recent.items() if r.score > 0.5 * rules.limit}
     supporters = {
@@ -255,6 +230,9 @@ def _decide_dispute(
     }
     if not supporters:
         return TrustDecision(senders, True)
+    sides = dissenters | supporters
+    if OWN_SENSORS not in sides and any(_is_contested(recent[n], now_ns) for n in sides):
+        return TrustDecision(senders, True, least_sigma_m=_contested_m(senders[name]))
     is_right = _is_estimate_right(recent, dissenters, supporters, now_ns - since_ns)
     if is_right is None:
         return TrustDecision(senders, False)
@@ -263,6 +241,12 @@ def _decide_dispute(
     if name in dissenters and recent[name].score > rules.limit:
         return _quarantine(senders, name, now_ns, used_ns)
     return TrustDecision(senders, name not in dissenters)
+
+
+def _contested_m(record: SenderRecord) -> float:
+    """How far from the estimate a contested sender says that the robot is."""
+    mean = record.means[0]
+    return 0.0 if mean is None else mean.length_m
 
 
 def _is_estimate_right(
@@ -307,11 +291,11 @@ def _quarantine(senders: SenderRecords, name: str, now_ns: int, used_ns: int) ->
     record = senders[name]
     was_followed = bool(record.score) and used_ns >= record.dispute_since_ns
     errors_m = [math.hypot(*record.mean_offset)] if was_followed else []
-    changed = {**senders, name: _quarantined(record, _reason_of(record), now_ns)}
+    changed = {**senders, name: quarantined(record, reason_of(record), now_ns)}
     if record.odometry_conflicts > MOST_CONFLICTS:  # the senders that it contradicted may be right
         for other, accused in senders.items():
             if accused.reason in _BY_COMPARISON and accused.since_ns > now_ns - SILENCE_NS:
-                changed[other] = _released(accused, now_ns)
+                changed[other] = released(accused, now_ns)
                 errors_m.append(math.hypot(*accused.mean_offset))
     error_m = max(errors_m, default=0.0)
     return TrustDecision(changed, False, "quarantined", frozenset((name,)), error_m)
@@ -323,35 +307,47 @@ def _quarantine_supporters(
     """The decision against the senders that a wrong estimate followed."""
     names = frozenset(supporters - {OWN_SENSORS})
     errors_m = [math.hypot(*senders[n].mean_offset) for n in dissenters]
-    changed = {n: _quarantined(senders[n], QuarantineReason.OUTVOTED, now_ns) for n in names}
+    changed = {n: quarantined(senders[n], QuarantineReason.OUTVOTED, now_ns) for n in names}
     changed = {**senders, **changed, **{n: replace(senders[n], score=0.0) for n in dissenters}}
     return TrustDecision(changed, name not in names, "outvoted", names, max(errors_m))
 
 
-def _quarantined(record: SenderRecord, reason: QuarantineReason, now_ns: int) -> SenderRecord:
-    record = replace(record, agreements=0, confirmations=0, quarantines=record.quarantines + 1)
-    return replace(record, reason=reason, since_ns=now_ns)
+def _outvoted_majority(decision: TrustDecision, now_ns: int) -> frozenset[str]:
+    """The senders that were quarantined lately, and that agree with those that are now, if they are
+    half or more of three or more senders while the robot's own sensors say nothing; else none."""
+    recent = {n: r for n, r in decision.senders.items() if now_ns - r.last_report_ns <= RECENT_NS}
+    if OWN_SENSORS in recent or len(recent) < 3:
+        return frozenset()
+    new = [recent[n].mean_offset for n in decision.quarantined if n in recent]
+    out = frozenset(
+        n
+        for n, r in recent.items()
+        if r.reason in _BY_COMPARISON
+        and now_ns - r.since_ns <= MAJORITY_NS
+        and all(math.dist(r.mean_offset, o) <= ALIKE_M + 0.5 * math.hypot(*o) for o in new)
+    )
+    return out if 2 * len(out) >= len(recent) else frozenset()
 
 
-def _released(record: SenderRecord, now_ns: int) -> SenderRecord:
-    record = replace(record, score=0.0, odometry_conflicts=0.0, dispute_since_ns=NEVER_NS)
-    return replace(record, reason=None, since_ns=now_ns)
-
-
-def _reason_of(record: SenderRecord) -> QuarantineReason:
-    """The best explanation so far. Conflicts fade: nearly one, and nearly two, are 0.8 and 1.8."""
-    conflicts = record.odometry_conflicts
-    if record.missed_motion and conflicts >= 0.8:
-        return QuarantineReason.FROZEN
-    if conflicts >= 1.8:
-        often = conflicts > 0.5 * record.comparisons
-        return QuarantineReason.OVERCONFIDENT if often else QuarantineReason.JUMPS
-    (x, y), variance = record.mean_offset, record.offset_variance
-    return QuarantineReason.BIASED if x * x + y * y > variance else QuarantineReason.OVERCONFIDENT
+def _without_decision(decision: TrustDecision, out: frozenset[str], now_ns: int) -> TrustDecision:
+    """The decision that nobody can decide: these senders are released, and the estimate is as
+    uncertain as they differ from it."""
+    senders, errors_m = dict(decision.senders), [decision.estimate_error_m]
+    for name, record in decision.senders.items():
+        if name in out:
+            errors_m.append(math.hypot(*record.mean_offset))
+            record = released(record, now_ns)
+        if not record.reason:
+            senders[name] = replace(record, score=0.0, contested_ns=now_ns)
+    return TrustDecision(senders, True, "contested", least_sigma_m=max(errors_m))
 
 
 def _assess_quarantined(
-    senders: SenderRecords, name: str, report: TeammateReport, rules: TrustSettings
+    senders: SenderRecords,
+    name: str,
+    report: TeammateReport,
+    comparison: Comparison | None,
+    rules: TrustSettings,
 ) -> TrustDecision:
     """A report of a sender in quarantine is not used, unless it is the one that ends it. The
     quarantine ends when enough reports agreed with the estimate while another source confirmed the
@@ -359,18 +355,21 @@ def _assess_quarantined(
     record, now = senders[name], report.stamp_ns
     contradicts = report.nis is None or report.nis > CONTRADICTING_NIS
     if record.last_failure_ns == now and contradicts:
-        record = replace(record, reason=_reason_of(record))
+        record = replace(record, reason=reason_of(record))
         senders = {**senders, name: record}
     readmit_ns = int(rules.readmit_s * 1e9)
     others = _recent(senders, now, name)
     is_confirmed = any(r.last_agreement_ns >= now - RECENT_NS for _, r in others)
+    if comparison is not None and (comparison.is_wrong or comparison.is_contested):
+        record = replace(record, last_failure_ns=now, agreements=0)
+        senders = {**senders, name: record}
     agrees = record.agreements >= LEAST_AGREEMENTS and now - record.last_failure_ns >= readmit_ns
     is_alone = all(now - r.last_report_ns > SILENCE_NS for n, r in senders.items() if n != name)
     has_confirmations = record.confirmations >= LEAST_CONFIRMATIONS
     is_consistent = has_confirmations and now - record.last_conflict_ns >= readmit_ns
     if not ((agrees and is_confirmed) or (is_alone and is_consistent)):
         return TrustDecision(senders, False)
-    return TrustDecision({**senders, name: _released(record, now)}, True, "readmitted")
+    return TrustDecision({**senders, name: released(record, now)}, True, "readmitted")
 
 
 def reset_scores(senders: SenderRecords) -> SenderRecords:
@@ -382,7 +381,7 @@ def forgive(senders: SenderRecords, now_ns: int) -> SenderRecords:
     """The records after the robot found an error of its own: what disagreed with its estimate may
     have been right."""
     return {
-        n: _released(r, now_ns) if r.reason in _BY_COMPARISON else replace(r, score=0.0)
+        n: released(r, now_ns) if r.reason in _BY_COMPARISON else replace(r, score=0.0)
         for n, r in senders.items()
     }
 
@@ -394,5 +393,7 @@ def trust_statuses(senders: SenderRecords, now_ns: int) -> tuple[TrustStatus, ..
         if name != OWN_SENSORS and (r.quarantines or now_ns - r.last_report_ns <= RECENT_NS):
             is_only = not any(_recent(senders, now_ns, name))
             reason = str(r.reason or "")
-            statuses.append(TrustStatus(name, reason, r.since_ns, r.quarantines, is_only))
+            is_contested = _is_contested(r, now_ns)
+            fields = name, reason, r.since_ns, r.quarantines, is_only, is_contested
+            statuses.append(TrustStatus(*fields))
     return tuple(statuses)

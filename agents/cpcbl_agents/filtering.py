@@ -32,7 +32,7 @@ class FilterAgent:
     def __init__(
         self, settings: LocalizationSettings, field: Field, teammates: frozenset[str], start_ns: int
     ) -> None:
-        localizer = Localizer(settings, field)
+        localizer = Localizer(settings, field, teammates)
         self.timeline = Timeline(localizer, localizer.start(start_ns))
         self.counts: Counter[str] = Counter()
         self.refused: Counter[tuple[str, str]] = Counter()

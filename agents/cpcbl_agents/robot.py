@@ -176,7 +176,8 @@ class Robot:
             status = statuses.get(name, TrustStatus(name))
             if name in clock_off:
                 status = status._replace(reason="clock")
-            yield Trust(*status, 0.0 if clocks is None else clocks.late_s(name))
+            late_s = 0.0 if clocks is None else clocks.late_s(name)
+            yield Trust(*status[:5], late_s, status.contested)
 
 
 def build_robot(

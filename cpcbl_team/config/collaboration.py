@@ -33,6 +33,10 @@ class TrustSettings(Table, frozen=True, kw_only=True):
     """The sum of NIS beyond the usual at which there is a dispute: three clear contradictions."""
     readmit_s: NotNegative = 5.0
     """A sender is used again after its messages were right for this time."""
+    least_sigma_m: NotNegative = 0.02
+    """The pose of a teammate is believed to be no better than this."""
+    guest_sigma_m: NotNegative = 0.05
+    """The same of a guest that no other source has confirmed yet."""
     clock_ahead_s: NotNegative = 0.1
     """Help is refused if the clock of its sender is further ahead than this."""
     clock_behind_s: Positive = 0.4

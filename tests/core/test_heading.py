@@ -45,9 +45,9 @@ from cpcbl_team.geometry import Pose2, step, wrap_angle
 from cpcbl_team.inputs import BeliefShared, Fix, Odometry, Sighting
 from cpcbl_team.localizer import Localizer
 from cpcbl_team.motion import motion_noise
+from cpcbl_team.sender_records import QuarantineReason
 from cpcbl_team.sensors import range_sigma_m
 from cpcbl_team.state import State, TeammateMemory
-from cpcbl_team.trust import QuarantineReason
 
 ORIGIN = Pose2(0.0, 0.0, 0.0)
 STILL = OdometrySettings(moves=False)

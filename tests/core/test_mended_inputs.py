@@ -10,7 +10,7 @@ from cpcbl_team.inputs import InputsMended
 from cpcbl_team.localizer import Localizer
 from cpcbl_team.state import with_senders, with_teammates
 from cpcbl_team.timeline import Timeline
-from cpcbl_team.trust import QuarantineReason, SenderRecord
+from cpcbl_team.sender_records import QuarantineReason, SenderRecord
 
 
 def test_the_heading_turns_the_covariance_grows_and_teammates_are_forgiven() -> None:

@@ -12,13 +12,8 @@ from support.core import (
 from support.trust import AGREES, CONTRADICTS, MS, RULES, Receiver
 
 from cpcbl_team.geometry import Pose2
-from cpcbl_team.trust import (
-    ReportedPosition,
-    SenderRecord,
-    TeammateReport,
-    assess,
-    with_report,
-)
+from cpcbl_team.sender_records import ReportedPosition, SenderRecord, TeammateReport, with_report
+from cpcbl_team.trust import assess
 
 Reported = Callable[[float], tuple[float, float]]
 

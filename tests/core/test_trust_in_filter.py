@@ -37,9 +37,7 @@ from cpcbl_team.inputs import Fix, Input, Odometry, Sighting, Sightings
 from cpcbl_team.localizer import Localizer
 from cpcbl_team.state import State
 from cpcbl_team.timeline import Timeline
-from cpcbl_team.trust import (
-    trust_statuses,
-)
+from cpcbl_team.trust import trust_statuses
 
 NOISE = OdometrySettings(distance_sigma_m_per_sqrt_m=0.05)
 Observed = Callable[[int, Pose2, np.random.Generator], tuple[float, float] | None]

@@ -3,10 +3,12 @@
 import pytest
 
 from cpcbl_team.config import (
+    CollaborationSettings,
     Field,
     LocalizerSettings,
     OdometrySettings,
     SensorSettings,
+    TrustSettings,
     Variant,
     Weights,
 )
@@ -34,6 +36,10 @@ separated = pytest.mark.parametrize("variant", SEPARATED)
 probabilistic = pytest.mark.parametrize("variant", PROBABILISTIC)
 
 
+FORMULAS = CollaborationSettings(trust=TrustSettings(least_sigma_m=0.0))
+"""Reports count as they are stated."""
+
+
 def standing(
     variant: Variant,
     field: Field = CORNERS,
@@ -54,7 +60,9 @@ def standing(
         paper_uncertainty=paper_uncertainty,
         weights=weights or Weights(),
     )
-    return localizer(field=field, rules=rules, odometry=STANDING, sensor=sensor)
+    return localizer(
+        field=field, rules=rules, odometry=STANDING, sensor=sensor, collaboration=FORMULAS
+    )
 
 
 def moved_parts(before: State, after: State) -> str:

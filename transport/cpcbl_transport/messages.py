@@ -84,6 +84,8 @@ class Trust(msgspec.Struct, frozen=True, array_like=True):
     """No other teammate sends anything, so a bias of this one cannot be recognized."""
     late_s: float = 0.0
     """The least delay from stamp to arrival lately; below zero the teammate's clock is ahead."""
+    contested: bool = False
+    """It contradicts other teammates, and there is no majority for either side."""
 
 
 class InputHealth(msgspec.Struct, frozen=True, array_like=True):

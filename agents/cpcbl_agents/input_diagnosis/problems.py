@@ -296,12 +296,7 @@ def _motion(
     tolerance = 0.15 + 3.0 * math.hypot(sensor.range_share, sensor.bearing_sigma_rad)
     tolerance = min(tolerance, MOST_TOLERANCE)
     resightings = list(motions.resightings(frames, steps, marks))
-    long_steps = facts.long_steps if steps else []
-    long_frames, wheels = [_usable(f) for f in facts.long_frames], facts.wheels
-    shift = shift_of(long_frames, long_steps, marks, sensor, wheels)
-    cause = shift_cause(shift, long_steps) if shift else ""
-    if shift and cause and not is_same(shift, shift_of(frames, steps, marks, sensor, wheels)):
-        cause = ""  # the driver was mended meanwhile
+    is_right, cause = _shift_of_landmarks(facts, frames, steps)
     cause = cause or motions.motion_cause(resightings, steps, tolerance)
     if not cause:
         late = list(motions.resightings(frames, steps, marks, *motions.LATER_NS))
@@ -315,7 +310,6 @@ def _motion(
             cause = "turns have the wrong sign; left is positive"
         about = "sightings" if cause.startswith(("ranges", "bearings")) else "odometry"
         return f"{about}: {cause}"
-    is_right = shift is not None and is_sure(shift)
     reported = facts.reported_by_start.get(MOTION)
     if facts.near_start is None and not is_right and reported:
         return reported
@@ -333,6 +327,20 @@ def _motion(
         return ""  # what landmarks show is known better, or soon
     cause = causes.odometry_cause(pieces)
     return cause and f"odometry: {cause}"
+
+
+def _shift_of_landmarks(
+    facts: InputFacts, frames: Sequence[Sightings], steps: Sequence[Step]
+) -> tuple[bool, str]:
+    """Whether landmarks surely move as odometry says, and else the cause that explains how they
+    move, if one does."""
+    of_robot = facts.landmarks, facts.sensor, facts.wheels
+    long_steps = facts.long_steps if steps else []
+    shift = shift_of([_usable(f) for f in facts.long_frames], long_steps, *of_robot)
+    cause = shift_cause(shift, long_steps) if shift else ""
+    if shift and cause and not is_same(shift, shift_of(frames, steps, *of_robot)):
+        cause = ""  # the driver was mended meanwhile
+    return shift is not None and is_sure(shift), cause
 
 
 def _usable(frame: Sightings) -> Sightings:

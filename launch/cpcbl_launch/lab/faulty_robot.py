@@ -10,6 +10,7 @@ seconds after the start. Without times it lasts from the start to the end.
 | `frozen` | its position stays the last one from before the fault |
 | `jumps:1.5` | its position is shifted by so many metres, every 2 s in another direction |
 | `overconfident:0.3` | its position has an error of this sigma (m), but it states 1 mm |
+| `drift:0.01,0.0,0.02` | its error grows by these m/s in x and y, and it states this sigma (m) |
 | `clock:0.5` | its stamp is so many seconds too late (negative: too early) |
 
 `python -m cpcbl_launch.lab.faulty_robot TEAM NAME --fault FAULT` runs such a robot.
@@ -35,7 +36,7 @@ from cpcbl_transport.messages import Refusal
 from cpcbl_transport.topics import Qos
 
 Help = Belief | Fix
-VALUE_COUNTS = {"bias": 2, "frozen": 0, "jumps": 1, "overconfident": 1, "clock": 1}
+VALUE_COUNTS = {"bias": 2, "frozen": 0, "jumps": 1, "overconfident": 1, "drift": 3, "clock": 1}
 JUMP_NS = 2_000_000_000
 STATED_SIGMA_M = 0.001
 _HELP_KEYS = ("fix/", "belief/")
@@ -88,13 +89,19 @@ class FaultInjector:
             return replace(message, stamp_ns=message.stamp_ns + int(self._fault.values[0] * 1e9))
         dx, dy = self._offset(message.stamp_ns)
         message = replace(message, x_m=message.x_m + dx, y_m=message.y_m + dy)
-        return _with_tiny_covariance(message) if self._fault.kind == "overconfident" else message
+        if self._fault.kind == "drift":
+            return _with_stated_sigma(message, self._fault.values[2])
+        is_tiny = self._fault.kind == "overconfident"
+        return _with_stated_sigma(message, STATED_SIGMA_M) if is_tiny else message
 
     def _offset(self, stamp_ns: int) -> tuple[float, float]:
         """Metres in x and y."""
         first, *_ = self._fault.values
         if self._fault.kind == "bias":
             return first, self._fault.values[1]
+        if self._fault.kind == "drift":
+            since_s = (stamp_ns - self._start_ns) * 1e-9 - self._fault.from_s
+            return first * since_s, self._fault.values[1] * since_s
         if self._fault.kind == "overconfident":
             return self._random.gauss(0.0, first), self._random.gauss(0.0, first)
         jump = (stamp_ns - self._start_ns) // JUMP_NS
@@ -109,8 +116,8 @@ class FaultInjector:
         return replace(message, x_m=x, y_m=y)
 
 
-def _with_tiny_covariance(message: Help) -> Help:
-    variance = STATED_SIGMA_M**2
+def _with_stated_sigma(message: Help, sigma_m: float) -> Help:
+    variance = sigma_m**2
     if isinstance(message, Fix):
         position = (variance, 0.0, variance)
         return replace(message, sensor_covariance=position, observer_covariance=position)

@@ -51,6 +51,8 @@ class TrustReport(msgspec.Struct, frozen=True, kw_only=True):
     unconfirmed: bool
     """No other teammate confirmed or contradicted it, so that a bias could not be detected."""
     late_s: float  # the least time from stamp to arrival; below zero the teammate's clock is ahead
+    contested: bool = False
+    """It contradicts other teammates, and there is no majority for either side."""
 
 
 class InputReport(msgspec.Struct, frozen=True, kw_only=True):
@@ -158,9 +160,14 @@ def trust_reports(statuses: Sequence[Status]) -> tuple[TrustReport, ...]:
 
 
 def distrust_text(trust: Iterable[Trust | TrustReport]) -> str:
-    """`distrusts west (biased), r4 (clock 0.45 s ahead)`; empty where all are believed."""
-    named = [f"{t.peer} ({_reason_text(t)})" for t in trust if t.reason]
-    return f"distrusts {', '.join(named)}" if named else ""
+    """`distrusts west (biased), r4 (clock 0.45 s ahead)`, or `contested: north, south`; empty where
+    all are believed."""
+    all_of_it = tuple(trust)
+    named = [f"{t.peer} ({_reason_text(t)})" for t in all_of_it if t.reason]
+    contested = [t.peer for t in all_of_it if t.contested and not t.reason]
+    texts = [f"distrusts {', '.join(named)}"] if named else []
+    texts += [f"contested: {', '.join(contested)}"] if contested else []
+    return "; ".join(texts)
 
 
 def miscalibration_text(counts: Mapping[str, int], learned: object | None) -> str:
@@ -208,5 +215,7 @@ def trust_remarks(robot: str, trust: Iterable[TrustReport]) -> Iterator[str]:
         times = f"{t.quarantines} times" if t.quarantines != 1 else "once"
         if t.reason:
             yield f"robot {robot} does not believe {t.peer}: {_reason_text(t)}"
+        elif t.contested:
+            yield f"robot {robot} cannot decide whether {t.peer} is right: no majority"
         elif t.quarantines:
             yield f"robot {robot} did not believe {t.peer} for a time ({times})"

@@ -200,5 +200,6 @@ def _robot_lines(robot: RobotStatus) -> Iterator[RenderableType]:
         yield Text()
         yield flows
     for trust in robot.trust:
-        reason = trust.reason or ("not confirmed by others" if trust.unconfirmed else "trusted")
+        believed = "not confirmed by others" if trust.unconfirmed else "trusted"
+        reason = trust.reason or ("contested by others" if trust.contested else believed)
         yield Text(f"{trust.peer}: {reason}, in quarantine {times(trust.quarantines)}")

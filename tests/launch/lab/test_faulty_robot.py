@@ -69,7 +69,7 @@ def test_a_text_that_is_no_fault_is_refused_with_an_example(text: str) -> None:
 
 
 def test_messages_are_unchanged_before_and_after_the_fault() -> None:
-    for kind in ("bias:1,1", "frozen", "jumps:1", "overconfident:1", "clock:1"):
+    for kind in ("bias:1,1", "frozen", "jumps:1", "overconfident:1", "clock:1", "drift:1,0,0.1"):
         faulty = injector(f"{kind}@10-20")
         for at_s in (0.0, 9.9, 20.0, 30.0):
             assert faulty.alter(fix(at_s)) == fix(at_s)
@@ -79,6 +79,10 @@ def test_messages_are_unchanged_before_and_after_the_fault() -> None:
 def test_each_kind_changes_what_it_names() -> None:
     biased = injector("bias:0.5,-0.25").alter(fix(1.0))
     assert (biased.x_m, biased.y_m) == (1.5, 1.75)
+    drifting = injector("drift:0.5,-0.25,0.02@1-9").alter(fix(3.0))
+    assert (drifting.x_m, drifting.y_m) == (2.0, 1.5)
+    assert isinstance(drifting, Fix)
+    assert drifting.sensor_covariance == pytest.approx((0.0004, 0.0, 0.0004))
     late = injector("clock:-0.5").alter(fix(1.0))
     assert late == msgspec.structs.replace(fix(1.0), stamp_ns=500 * MS)
     frozen = injector("frozen@1-9")

@@ -23,6 +23,7 @@ from cpcbl_transport.messages import Status, Trust, encode
 BIASED = Trust("west", "biased", 3, 2)
 HEALED = Trust("north", "", 5, 1, unconfirmed=True)
 AHEAD = Trust("r4", "clock", late_s=-0.45)
+CONTESTED = Trust("south", contested=True)
 BEHIND = Trust("r5", "clock", late_s=3600.0)
 
 
@@ -36,6 +37,8 @@ def status(trust: Sequence[Trust], incarnation: str = "1") -> Status:
         ([], ""),
         ([HEALED], ""),
         ([BIASED, HEALED], "distrusts west (biased)"),
+        ([CONTESTED], "contested: south"),
+        ([BIASED, CONTESTED], "distrusts west (biased); contested: south"),
         ([AHEAD, BEHIND], "distrusts r4 (clock 0.45 s ahead), r5 (3600.00 s late)"),
     ],
 )

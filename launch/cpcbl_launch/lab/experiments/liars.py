@@ -40,7 +40,12 @@ FROM_S, UNTIL_S, END_S = 10.0, 25.0, 45.0
 MOST_RATIO = 1.3
 LIAR = "west"
 SLOW_CLOCKS = ("clock:-0.3", "clock:-0.5")
-FAULTS = ("bias:0.5,0.5", "bias:0.2,0.0", "frozen", "jumps:1.5", "overconfident:0.3", *SLOW_CLOCKS)
+DRIFTS = ("drift:0.01,0.0,0.01", "drift:0.03,-0.02,0.02")
+FAULTS = (
+    *("bias:0.5,0.5", "bias:0.2,0.0", "frozen", "jumps:1.5", "overconfident:0.3"),
+    *SLOW_CLOCKS,
+    *DRIFTS,
+)
 HONEST = ("north", "south")
 DRIVERS = ("navigator", "scout", "scout2")
 
@@ -66,6 +71,7 @@ class Quarantine(NamedTuple):
 
 class Run(NamedTuple):
     rmse_m: dict[str, float]
+    inside_3_sigma: float  # of the robots that drive, mean
     quarantines: tuple[Quarantine, ...]
 
 
@@ -76,6 +82,7 @@ class Row(Struct, frozen=True, kw_only=True):
     rmse_m: Spread | None  # of the robots that drive: root of the mean over all their samples
     worst_m: Spread | None  # of the robot with the largest error
     ratio: Spread | None  # to the team without the faulty observer, with the same seed
+    inside_3_sigma: float  # of the seed in which it is smallest
     found: int  # robots that quarantined the faulty observer, over all seeds
     listening: int  # robots that drive, over all seeds
     found_after_s: Spread | None
@@ -146,7 +153,8 @@ def run_case(case: Case, seed: int) -> Run:
     truth = recorder.simulated_truth()
     scores = {name: score(recorder.samples(name, truth[name], FROM_S)) for name in DRIVERS}
     rmse_m = {name: s.position_rmse_m or 0.0 for name, s in scores.items()}
-    return Run(rmse_m, tuple(statuses.found.values()))
+    inside = sum(s.inside_3_sigma or 0.0 for s in scores.values()) / len(scores)
+    return Run(rmse_m, inside, tuple(statuses.found.values()))
 
 
 def outcome(results: Results) -> Liars:
@@ -193,6 +201,7 @@ def _row(case: Case, runs: Sequence[Run], without: Sequence[Run] | None) -> Row:
         rmse_m=spread(rmse_m),
         worst_m=spread([max(run.rmse_m.values()) for run in runs]),
         ratio=spread([a / b for a, b in zip(rmse_m, others_m, strict=False)]),
+        inside_3_sigma=min(run.inside_3_sigma for run in runs),
         found=len(first),
         listening=len(runs) * len(DRIVERS),
         found_after_s=spread([q.from_s - FROM_S for q in first.values()]),
@@ -208,7 +217,7 @@ def tables(result: Liars) -> Iterable[RenderableType]:
     believed = {(r.case.lie, r.case.honest): r for r in result.rows if not r.case.trust}
     for honest in sorted({r.case.honest for r in result.rows}, reverse=True):
         title = f"one liar, {honest} honest: robots that drive, {result.seeds} seeds"
-        figures = ("m", "ratio", "80 %", "believed", "found", "s", "back", "false")
+        figures = ("m", "ratio", "80 %", "in 3 σ", "believed", "found", "s", "back", "false")
         shown = table(title, ("lie",), figures)
         for row in result.rows:
             if row.case.honest == honest and row.case.trust:
@@ -217,6 +226,7 @@ def tables(result: Liars) -> Iterable[RenderableType]:
     yield (
         "Column m is the RMSE; ratio is relative to the team without the liar, and 80 %\n"
         "the range of 80 % of the seeds; believed is the ratio with trust switched off.\n"
+        "Column in 3 σ is the share of the seed in which it is smallest.\n"
         "Column found counts the robots that detected the liar, s is the time after the\n"
         "lie began, and back the time after its end until they used it again, in s.\n"
         "Column false is the time that honest robots spent in quarantine, s per run."
@@ -243,6 +253,7 @@ def _cells(row: Row, believed: Row | None) -> list[str]:
         median(row.rmse_m, 3),
         median(ratio, 2),
         "-" if ratio is None else f"{ratio.low:.2f}-{ratio.high:.2f}",
+        f"{row.inside_3_sigma:.1%}",
         median(believed.ratio, 2) if believed is not None else "",
         *found,
         f"{row.false_quarantine_s:.1f}",

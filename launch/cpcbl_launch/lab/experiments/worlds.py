@@ -115,14 +115,14 @@ def with_true_starts(team: Team, seed: int) -> Team:
 
 def run_world(world: World, seed: int) -> list[WorldRun]:
     """One run of a world: the figures of each scored robot."""
-    wrappers = {name: partial(_bus_of, world, seed, name) for name in world.team.robots}
+    wrappers = {name: partial(_lossy_bus, world, seed, name) for name in world.team.robots}
     truth = with_true_starts(world.truth or world.team, seed)
     _, recorder = simulate(world.team, seed, world.duration_s, truth, bus_wrappers=wrappers)
     true_paths = recorder.simulated_truth()
     return [_figures(world, name, recorder, true_paths[name]) for name in world.scored]
 
 
-def _bus_of(world: World, seed: int, robot: str, bus: Bus) -> Bus:
+def _lossy_bus(world: World, seed: int, robot: str, bus: Bus) -> Bus:
     lossy = LossyBus(bus, robot, world, seed)
     return DrivingBus(lossy) if world.drives_lost else lossy
 

@@ -1,0 +1,207 @@
+"""What each source says of the robot's position on average, and how far sources disagree.
+
+An error that grows slowly hides in the noise of each report, and the estimate follows it, so that
+the innovations of the honest senders become suspicious instead. The mean of many signed offsets
+from the estimate is far more precise than one of them, and the difference between the means of two
+sources is free of the error of the estimate, which both have in common: nobody can hide a drift by
+dragging the estimate along. (It is the test of a mean against a reference; the mean fades
+exponentially: S. W. Roberts, Technometrics 1, 1959.)
+"""
+
+import math
+from collections.abc import Mapping
+from typing import Final, NamedTuple
+
+from cpcbl_team.estimate import ZERO3, Covariance3, Information, Sums
+from cpcbl_team.gaussian import Covariance2
+from cpcbl_team.geometry import new
+
+FAST_NS: Final = 1_500_000_000  # time constants with which reports fade: a fast drift shows sooner
+SLOW_NS: Final = 6_000_000_000  # in the mean of a short time, a slow one in that of a long time
+LEAST_REPORTS: Final = 5.0  # with fewer, fading, a source has no mean
+MOST_SIGMA_M: Final = 0.15  # a source whose mean is less certain has no vote
+SURE_SIGMA_M: Final = 0.08  # own sensors that are less certain convict nobody alone
+FAST_COMMON_M: Final = 0.01
+SLOW_COMMON_M: Final = 0.02
+"""Sigmas of what two correct sources may disagree by for ever: calibration, map, and the error of
+the estimate, which differs between the times of their reports, the more the longer the mean."""
+CONFLICT: Final = 18.0
+"""Two sources contradict each other beyond this chi-square (two degrees of freedom)."""
+LEAD: Final = 7.0
+"""Of two that contradict each other one is clearly nearer to a third source by this difference of
+their chi-squares."""
+HEADING_VARIANCE: Final = math.radians(5.0) ** 2
+"""rad^2: the heading of an estimate that was led astray may be wrong by more than its variance."""
+NOTHING: Final = Covariance2(0.0, 0.0, 0.0)
+
+
+class MeanOffset(NamedTuple):
+    """The mean offset of the positions that a source reports from the estimate, m, and its
+    covariance, m^2."""
+
+    x: float
+    y: float
+    covariance: Covariance2
+    common_m: float = FAST_COMMON_M  # sigma of an error that never averages away
+
+    @property
+    def length_m(self) -> float:
+        return math.hypot(self.x, self.y)
+
+    def is_within(self, sigma_m: float) -> bool:
+        """Whether it is as certain as this, in the mean of the axes."""
+        return self.covariance.xx + self.covariance.yy <= 2.0 * sigma_m * sigma_m
+
+    @property
+    def is_precise(self) -> bool:
+        """Whether it is certain enough for a vote."""
+        return self.is_within(MOST_SIGMA_M)
+
+
+class FadingOffsets(NamedTuple):
+    """Fading sums over the reports of one source."""
+
+    stamp_ns: int = 0
+    reports: float = 0.0
+    squares: float = 0.0  # of the weights of the reports
+    evidence: Sums = (ZERO3, (0.0, 0.0, 0.0))
+    """About the offset (m, m, rad) of the estimate, by the independent part of the noise."""
+    dependent: Covariance2 = NOTHING
+    """The mean of the parts of the noise that are the same in all reports, m^2."""
+
+    def with_report(
+        self, stamp_ns: int, fading_ns: int, evidence: Sums, dependent: Covariance2 = NOTHING
+    ) -> "FadingOffsets":
+        """The sums with one more report. A report that is older than the last fades nothing."""
+        elapsed_ns = stamp_ns - self.stamp_ns
+        fade = math.exp(-elapsed_ns / fading_ns) if elapsed_ns > 0 else 1.0
+        (matrix, vector), (more, further) = self.evidence, evidence
+        count = fade * self.reports + 1.0
+        share = 1.0 / count
+        (xx, xy, yy), (dxx, dxy, dyy) = self.dependent, dependent
+        fields = (
+            max(stamp_ns, self.stamp_ns),
+            count,
+            fade * fade * self.squares + 1.0,
+            (
+                Covariance3(*(fade * a + b for a, b in zip(matrix, more, strict=True))),
+                tuple(fade * a + b for a, b in zip(vector, further, strict=True)),
+            ),
+            Covariance2(xx + share * (dxx - xx), xy + share * (dxy - xy), yy + share * (dyy - yy)),
+        )
+        return new(FadingOffsets, fields)
+
+    def mean(self, heading_variance: float, common_m: float = FAST_COMMON_M) -> MeanOffset | None:
+        """The mean of the reports, if they are enough to determine one. `heading_variance` (rad^2):
+        that of the estimate; what a bearing says of the position depends on the heading."""
+        if self.reports < LEAST_REPORTS:
+            return None
+        (xx, xy, yy, xh, yh, hh), (x, y, h) = self.evidence
+        # The heading is marginalized: the Schur complement.
+        k = 1.0 / (hh + 1.0 / (heading_variance + HEADING_VARIANCE))
+        xx, xy, yy = xx - k * xh * xh, xy - k * xh * yh, yy - k * yh * yh
+        x, y = x - k * xh * h, y - k * yh * h
+        determinant = xx * yy - xy * xy
+        if determinant <= 1e-9 * xx * yy or xx <= 0.0 or yy <= 0.0:
+            return None
+        cxx, cxy, cyy = yy / determinant, -xy / determinant, xx / determinant
+        # The variance of a weighted mean: old reports fade, so their errors do too.
+        covariance = Covariance2(cxx, cxy, cyy).scaled(self.squares / self.reports)
+        covariance += self.dependent
+        return MeanOffset(cxx * x + cxy * y, cxy * x + cyy * y, covariance, common_m)
+
+
+Means = Mapping[str, MeanOffset]
+"""The means of some sources, by name."""
+
+
+def evidence_of_position(offset: tuple[float, float], noise: Covariance2) -> Sums:
+    """What a reported position at this offset (m) from the estimate says; `noise`: the independent
+    part of its covariance, m^2."""
+    (x, y), (xx, xy, yy) = offset, noise
+    k = 1.0 / max(xx * yy - xy * xy, 1e-16)
+    xx, xy, yy = k * yy, -k * xy, k * xx
+    matrix = Covariance3(xx, xy, yy, 0.0, 0.0, 0.0)
+    return Information(matrix, (xx * x + xy * y, xy * x + yy * y, 0.0))
+
+
+# How far two sources disagree ---------------------------------------------------------------------
+
+
+def disagreement(one: MeanOffset, other: MeanOffset) -> float:
+    """The chi-square of the difference of two means (two degrees of freedom)."""
+    (xx, xy, yy), (oxx, oxy, oyy) = one.covariance, other.covariance
+    common = one.common_m * one.common_m + other.common_m * other.common_m
+    sum_ = Covariance2(xx + oxx + common, xy + oxy, yy + oyy + common)
+    return sum_.mahalanobis_squared(one.x - other.x, one.y - other.y)
+
+
+def bias_variance(one: MeanOffset, other: MeanOffset) -> float:
+    """The square of the bias (m^2) by which the noise of two means does not explain their
+    difference."""
+    dx, dy = one.x - other.x, one.y - other.y
+    c, d = one.covariance, other.covariance
+    excess = dx * dx + dy * dy - (c.xx + c.yy + d.xx + d.yy)
+    return excess if excess > 0.0 else 0.0
+
+
+class Comparison(NamedTuple):
+    """What the means of other sources say of that of one."""
+
+    bias_variance: float = 0.0  # m^2, that a report of it may have in common with all others of it
+    is_wrong: bool = False
+    is_contested: bool = False
+    """It contradicts others, and there is no majority for either side."""
+    is_confirmed: bool = False
+    """At least one other source agrees, and no majority contradicts."""
+    is_left_out: bool = (
+        False  # the robot has sensors of its own, and need not use it while contested
+    )
+
+
+def both(fast: Comparison, slow: Comparison) -> Comparison:
+    """Both comparisons of one source, by its means of a short and of a long time."""
+    return Comparison(
+        max(fast.bias_variance, slow.bias_variance),
+        fast.is_wrong or slow.is_wrong,
+        fast.is_contested or slow.is_contested,
+        fast.is_confirmed and slow.is_confirmed,
+        fast.is_left_out or slow.is_left_out,
+    )
+
+
+def compared_with_own_sensors(mean: MeanOffset, own: MeanOffset, others: Means) -> Comparison:
+    """A sender beside the robot's own sensors, which outweigh any number of others. Where this one
+    and another contradict each other, they decide by which of both is clearly nearer to theirs."""
+    here = disagreement(mean, own)
+    rivals = [other for other in others.values() if disagreement(mean, other) > CONFLICT]
+    there = [disagreement(rival, own) for rival in rivals]
+    is_refuted = here > CONFLICT and own.is_within(SURE_SIGMA_M)
+    if is_refuted or any(here - z > LEAD for z in there):
+        return Comparison(bias_variance(mean, own), is_wrong=True)
+    is_contested = any(z - here <= LEAD for z in there)
+    bias = max(bias_variance(mean, own), compared_with_majority(mean, others).bias_variance)
+    return Comparison(bias, False, is_contested, not is_contested, is_contested)
+
+
+def compared_with_majority(mean: MeanOffset, others: Means) -> Comparison:
+    """A sender beside the others. The bias is the distance within which a strict majority of all
+    agrees with it: with three, its own and one more; with four, its own and two more."""
+    count = len(others) + 1
+    if count == 1:
+        return Comparison()
+    needed = count // 2  # other means that make a strict majority with its own
+    biases = sorted(bias_variance(mean, other) for other in others.values())
+    bias = biases[needed - 1]
+    agreeing = sum(disagreement(mean, other) <= CONFLICT for other in others.values())
+    if agreeing >= needed:
+        return Comparison(bias, is_confirmed=True)
+    accusers = {n: o for n, o in others.items() if disagreement(mean, o) > CONFLICT}
+    is_wrong = any(2 * (_agreeing(name, accusers) + 1) > count for name in accusers)
+    return Comparison(bias, is_wrong, not is_wrong)
+
+
+def _agreeing(name: str, others: Means) -> int:
+    """How many of the others agree with this one of them."""
+    mean = others[name]
+    return sum(disagreement(mean, other) <= CONFLICT for n, other in others.items() if n != name)

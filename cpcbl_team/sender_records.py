@@ -1,0 +1,235 @@
+"""What a robot remembers of one sender, and the tests of each of its reports.
+
+1. Against the estimate, an innovation test over time: the amounts by which the normalized
+   innovation squared (NIS) of the reports exceeds its usual size are added up to a score (a CUSUM;
+   E. S. Page, Biometrika 41, 1954).
+2. Against odometry: the distance between two positions of this robot that a sender reported must be
+   the distance between them by odometry. This needs neither the heading nor a second sender.
+
+What follows from them, and from the mean of the reports (`mean_offsets.py`), is in `trust.py`.
+"""
+
+import math
+from enum import StrEnum
+from typing import Final, NamedTuple
+
+import msgspec
+from msgspec.structs import replace
+
+from cpcbl_team.estimate import Sums
+from cpcbl_team.gaussian import Covariance2
+from cpcbl_team.geometry import Pose2
+from cpcbl_team.mean_offsets import (
+    FAST_NS,
+    NOTHING,
+    SLOW_COMMON_M,
+    SLOW_NS,
+    FadingOffsets,
+    MeanOffset,
+)
+
+SILENCE_NS: Final = 10_000_000_000  # earlier reports count no longer after this silence
+USUAL_NIS = 6.0  # 95 % quantile of the chi-square distribution of two degrees of freedom
+CONTRADICTING_NIS = 13.8  # its 99.9 % quantile
+MOST_NIS = 20.0  # one report counts for no more than this
+JUMP_SIGMAS = 5.0  # a reported distance conflicts with odometry if it is longer by this,
+FROZEN_SIGMAS, FROZEN_SHARE = 3.0, 0.3  # or shorter by this and below this share of odometry's
+SLIP_SHARE, SLIP_M = 0.1, 0.03  # sigma of a distance by odometry: a share of it, and a constant
+LAST_OFFSET_SHARE = 0.2  # with which the last offset counts in their mean and variance
+LEAST_DISTANCE_M = 0.3  # the shortest distance that shows whether a sender follows the robot
+LONGEST_COMPARISON_NS = 5_000_000_000  # after this time without a jump any distance is a comparison
+FADING_S = 10.0  # time constant with which conflicts with odometry fade
+NEVER_NS: Final = -(2**62)
+
+
+class QuarantineReason(StrEnum):
+    """What kind of fault explains the reports of a sender best."""
+
+    BIASED = "biased"
+    FROZEN = "frozen"
+    JUMPS = "jumps"
+    OVERCONFIDENT = "overconfident"
+    OUTVOTED = "outvoted"
+
+
+class ReportedPosition(NamedTuple):
+    """Where a sender reported this robot, in the field's frame, and its odometry at that time."""
+
+    stamp_ns: int
+    x: float
+    y: float
+    variance: float  # m^2, mean of the axes
+    odometry_from_robot: Pose2
+
+
+class OffsetEvidence(NamedTuple):
+    """What a report says of the offset of the estimate, for the mean of its sender's reports."""
+
+    evidence: Sums  # by the independent part of the noise
+    dependent: Covariance2 = NOTHING  # the part that is the same in all reports, m^2
+    heading_variance: float = 1.0  # of the estimate, rad^2
+
+
+class TeammateReport(NamedTuple):
+    """A fix of a teammate, or a sighting of a teammate whose belief is used as a landmark."""
+
+    stamp_ns: int
+    nis: float | None
+    """Scaled to two degrees of freedom; None if the robot is lost, so that there is no test 1."""
+    offset: tuple[float, float] | None = None
+    """The reported position minus the estimated one, m; None for a sighting."""
+    position: ReportedPosition | None = None  # for test 2; None for a sighting
+    evidence: OffsetEvidence | None = None
+    """For the mean of its reports; None for what has no part in it."""
+    is_guest: bool = False  # whether its sender is no robot of the team
+
+
+class SenderRecord(msgspec.Struct, frozen=True, gc=False):
+    """What the robot remembers of one sender."""
+
+    last_report_ns: int = NEVER_NS
+    last_agreement_ns: int = NEVER_NS
+    dispute_since_ns: int = NEVER_NS  # when its score last left zero
+    score: float = 0.0  # the sum of test 1: NIS beyond the usual
+    mean_offset: tuple[float, float] = (0.0, 0.0)
+    """Exponential mean of the offsets of its reports that disagree, m."""
+    offset_variance: float = 0.0  # exponential variance of these offsets, m^2
+    position: ReportedPosition | None = None  # with which the next position is compared in test 2
+    comparisons: float = 0.0  # number of comparisons with odometry, fading
+    odometry_conflicts: float = 0.0  # number of them that contradicted odometry, fading
+    missed_motion: bool = False
+    """Whether the last conflict was a motion of the robot that the sender did not report."""
+    confirmations: int = 0  # distances that odometry confirmed since the last conflict
+    last_conflict_ns: int = NEVER_NS
+    last_failure_ns: int = NEVER_NS
+    """When a report last contradicted the estimate clearly, or odometry."""
+    agreements: int = 0  # reports that agreed with the estimate since then
+    reason: QuarantineReason | None = None  # why it is in quarantine; None if it is not
+    since_ns: int = 0  # when the quarantine began, or ended
+    quarantines: int = 0
+    offsets: tuple[FadingOffsets, ...] = (FadingOffsets(), FadingOffsets())  # fast and slow
+    means: tuple[MeanOffset | None, ...] = (None, None)  # of these, after the last report
+    bias_variance: float = 0.0
+    """m^2: of the error that its reports may have in common, by what others say."""
+    contested_ns: int = NEVER_NS
+    """When it last contradicted others without a majority for either side."""
+    wrong_ns: int = NEVER_NS  # since when others say without interruption that its mean is wrong
+    confirmed: int = 0  # reports beside which another source agreed with it
+    is_guest: bool = False
+
+
+def with_report(record: SenderRecord, report: TeammateReport, limit: float) -> SenderRecord:
+    """The record after both tests of one more report."""
+    if record.score and report.stamp_ns - record.last_report_ns > SILENCE_NS:
+        record = replace(record, score=0.0)
+    record = _with_position(_with_faded_conflicts(record, report.stamp_ns), report.position)
+    last_ns = max(record.last_report_ns, report.stamp_ns)
+    record = replace(record, last_report_ns=last_ns, is_guest=report.is_guest)
+    if report.nis is None:
+        return record
+    if report.evidence is not None and report.nis <= CONTRADICTING_NIS:
+        record = with_evidence(record, report.stamp_ns, report.evidence)
+    return _with_nis(record, report, report.nis, limit)
+
+
+def with_evidence(record: SenderRecord, stamp_ns: int, report: OffsetEvidence) -> SenderRecord:
+    """The record with one more report in its mean. (Of one that contradicts the estimate clearly
+    test 1 takes care; an outlier would move the mean for seconds.)"""
+    evidence, dependent, heading_variance = report
+    offsets = tuple(
+        sums.with_report(stamp_ns, fading_ns, evidence, dependent)
+        for sums, fading_ns in zip(record.offsets, (FAST_NS, SLOW_NS), strict=True)
+    )
+    fast, slow = offsets
+    means = fast.mean(heading_variance), slow.mean(heading_variance, SLOW_COMMON_M)
+    return replace(record, offsets=offsets, means=means)
+
+
+def _with_nis(
+    record: SenderRecord, report: TeammateReport, nis: float, limit: float
+) -> SenderRecord:
+    """Test 1: the innovation of a report against the estimate."""
+    now = report.stamp_ns
+    score = max(0.0, min(record.score + min(nis, MOST_NIS) - USUAL_NIS, 2.0 * limit))
+    if score and not record.score and not record.reason:
+        offset = report.offset or (0.0, 0.0)
+        record = replace(record, dispute_since_ns=now, mean_offset=offset, offset_variance=0.0)
+    record = replace(record, score=score)
+    if nis <= USUAL_NIS:
+        return replace(record, last_agreement_ns=now, agreements=record.agreements + 1)
+    if report.offset is not None:
+        (x, y), (mx, my), k = report.offset, record.mean_offset, LAST_OFFSET_SHARE
+        dx, dy = x - mx, y - my
+        variance = (1.0 - k) * (record.offset_variance + k * (dx * dx + dy * dy))
+        record = replace(record, mean_offset=(mx + k * dx, my + k * dy), offset_variance=variance)
+    contradicts = nis > CONTRADICTING_NIS
+    return replace(record, last_failure_ns=now, agreements=0) if contradicts else record
+
+
+def _with_faded_conflicts(record: SenderRecord, now_ns: int) -> SenderRecord:
+    if not record.comparisons or now_ns <= record.last_report_ns:
+        return record
+    fade = math.exp((record.last_report_ns - now_ns) * 1e-9 / FADING_S)
+    conflicts, comparisons = fade * record.odometry_conflicts, fade * record.comparisons
+    return replace(record, odometry_conflicts=conflicts, comparisons=comparisons)
+
+
+def _with_position(record: SenderRecord, now: ReportedPosition | None) -> SenderRecord:
+    """Test 2: the distance between two reported positions against that of odometry. Both are
+    straight distances, so neither the path nor the heading matters. The later position is the next
+    one to compare with, unless this comparison shows nothing yet."""
+    then = record.position
+    if now is None:
+        return record
+    if then is None or now.stamp_ns - then.stamp_ns > SILENCE_NS:
+        return replace(record, position=now)
+    if now.stamp_ns <= then.stamp_ns:
+        return record
+    displacement = then.odometry_from_robot.inverse() @ now.odometry_from_robot
+    driven = math.hypot(displacement.x, displacement.y)
+    reported = math.hypot(now.x - then.x, now.y - then.y)
+    slip = SLIP_SHARE * driven + SLIP_M
+    sigma = math.sqrt(then.variance + now.variance + slip * slip)
+    is_far = driven >= max(LEAST_DISTANCE_M, (FROZEN_SIGMAS + 1.0) * sigma)
+    jumped = reported - driven > JUMP_SIGMAS * sigma
+    is_short = reported < FROZEN_SHARE * driven and driven - reported > FROZEN_SIGMAS * sigma
+    missed_motion = is_far and is_short
+    record = replace(record, comparisons=record.comparisons + 1.0)
+    if not (jumped or is_far or now.stamp_ns - then.stamp_ns >= LONGEST_COMPARISON_NS):
+        return record
+    record = replace(record, position=now)
+    if jumped or missed_motion:
+        conflicts, at_ns = record.odometry_conflicts + 1.0, now.stamp_ns
+        record = replace(record, odometry_conflicts=conflicts, last_conflict_ns=at_ns)
+        record = replace(record, missed_motion=missed_motion, last_failure_ns=at_ns)
+        return replace(record, confirmations=0, agreements=0)
+    # While the robot stands, a frozen sender is right: that confirms nothing.
+    confirms = is_far or record.reason is not QuarantineReason.FROZEN
+    return replace(record, confirmations=record.confirmations + 1) if confirms else record
+
+
+# Quarantine ---------------------------------------------------------------------------------------
+
+
+def quarantined(record: SenderRecord, reason: QuarantineReason, now_ns: int) -> SenderRecord:
+    """The record of a sender whose quarantine begins."""
+    record = replace(record, agreements=0, confirmations=0, quarantines=record.quarantines + 1)
+    return replace(record, reason=reason, since_ns=now_ns)
+
+
+def released(record: SenderRecord, now_ns: int) -> SenderRecord:
+    """The record of a sender whose quarantine ends."""
+    record = replace(record, score=0.0, odometry_conflicts=0.0, dispute_since_ns=NEVER_NS)
+    return replace(record, reason=None, since_ns=now_ns)
+
+
+def reason_of(record: SenderRecord) -> QuarantineReason:
+    """The best explanation so far. Conflicts fade: nearly one, and nearly two, are 0.8 and 1.8."""
+    conflicts = record.odometry_conflicts
+    if record.missed_motion and conflicts >= 0.8:
+        return QuarantineReason.FROZEN
+    if conflicts >= 1.8:
+        often = conflicts > 0.5 * record.comparisons
+        return QuarantineReason.OVERCONFIDENT if often else QuarantineReason.JUMPS
+    (x, y), variance = record.mean_offset, record.offset_variance
+    return QuarantineReason.BIASED if x * x + y * y > variance else QuarantineReason.OVERCONFIDENT

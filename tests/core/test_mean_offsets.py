@@ -1,0 +1,174 @@
+"""The mean of what a source reports, and what the means of several sources say of each other."""
+
+import math
+import random
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from cpcbl_team.estimate import Information
+from cpcbl_team.gaussian import Covariance2
+from cpcbl_team.mean_offsets import (
+    CONFLICT,
+    NOTHING,
+    FadingOffsets,
+    MeanOffset,
+    bias_variance,
+    compared_with_majority,
+    compared_with_own_sensors,
+    disagreement,
+    evidence_of_position,
+)
+
+SECOND = 1_000_000_000
+FADING_NS = 2 * SECOND
+SHARP = Covariance2(1e-4, 0.0, 1e-4)
+
+
+def at(x: float, y: float = 0.0, sigma: float = 0.01) -> MeanOffset:
+    return MeanOffset(x, y, Covariance2(sigma * sigma, 0.0, sigma * sigma))
+
+
+def summed(offsets: list[tuple[float, float]], dependent: Covariance2 = NOTHING) -> FadingOffsets:
+    """Reports of 1 cm, ten times a second."""
+    sums = FadingOffsets()
+    for i, offset in enumerate(offsets):
+        evidence = evidence_of_position(offset, SHARP)
+        sums = sums.with_report(i * SECOND // 10, FADING_NS, evidence, dependent)
+    return sums
+
+
+def test_the_mean_of_equal_reports_is_the_report_and_gets_sharper_than_one() -> None:
+    mean = summed([(0.3, -0.2)] * 300).mean(0.01)
+    assert mean is not None
+    assert (mean.x, mean.y) == pytest.approx((0.3, -0.2))
+    # exp(-0.1 s / 2 s) = f: the variance of the weighted mean is (1 - f) / (1 + f) of one report's
+    assert mean.covariance.xx == pytest.approx(1e-4 * math.tanh(0.025), rel=0.01)
+
+
+def test_few_reports_have_no_mean() -> None:
+    assert summed([(0.0, 0.0)] * 4).mean(0.01) is None
+    assert summed([(0.0, 0.0)] * 6).mean(0.01) is not None
+
+
+def test_the_dependent_part_of_the_noise_does_not_average_away() -> None:
+    mean = summed([(0.0, 0.0)] * 100, Covariance2(0.04, 0.01, 0.09)).mean(0.01)
+    assert mean is not None
+    assert mean.covariance.xx == pytest.approx(0.04, rel=0.01)
+    assert mean.covariance.xy == pytest.approx(0.01, rel=0.01)
+    assert mean.covariance.yy == pytest.approx(0.09, rel=0.01)
+
+
+def test_the_stated_variance_of_a_mean_is_that_of_many_runs() -> None:
+    dice, squares, stated = random.Random(1), [], 0.0
+    for _ in range(200):
+        offsets = [(dice.gauss(0.0, 0.01), dice.gauss(0.0, 0.01)) for _ in range(80)]
+        mean = summed(offsets).mean(0.01)
+        assert mean is not None
+        squares.append(mean.x**2 + mean.y**2)
+        stated = mean.covariance.xx + mean.covariance.yy
+    assert sum(squares) / len(squares) == pytest.approx(stated, rel=0.2)
+
+
+def test_one_direction_alone_determines_no_mean() -> None:
+    sums = FadingOffsets()
+    for i in range(50):
+        row = Information.none().add((1.0, 0.0, 0.0), 0.1, 1e-4)
+        sums = sums.with_report(i * SECOND // 10, FADING_NS, row)
+    assert sums.mean(0.01) is None
+
+
+def test_what_depends_on_the_heading_counts_as_little_as_the_heading_is_known() -> None:
+    sums = FadingOffsets()
+    for i in range(50):
+        both = Information.none().add((1.0, 0.0, 0.0), 0.0, 1e-4).add((0.0, 0.2, 1.0), 0.0, 1e-4)
+        sums = sums.with_report(i * SECOND // 10, FADING_NS, both)
+    mean = sums.mean(math.radians(10.0) ** 2)
+    assert mean is not None
+    assert mean.covariance.xx < 0.01**2
+    assert mean.covariance.yy > (5.0 * math.radians(10.0)) ** 2 / 4.0  # 1 m across is 0.2 rad
+
+
+@given(st.floats(-1.0, 1.0), st.floats(-1.0, 1.0), st.floats(0.005, 0.1), st.floats(-1.0, 1.0))
+def test_the_error_of_the_estimate_changes_no_comparison(
+    x: float, y: float, sigma: float, common: float
+) -> None:
+    one, other = at(x, 0.1, sigma), at(0.2, y, sigma)
+    moved = [m._replace(x=m.x + common, y=m.y - common) for m in (one, other)]
+    assert disagreement(*moved) == pytest.approx(disagreement(one, other), abs=1e-6)
+    assert bias_variance(*moved) == pytest.approx(bias_variance(one, other), abs=1e-9)
+    assert disagreement(one, other) == pytest.approx(disagreement(other, one))
+
+
+def test_a_difference_within_the_noise_is_no_bias() -> None:
+    assert bias_variance(at(0.0), at(0.015)) == 0.0
+    assert bias_variance(at(0.0), at(0.1)) == pytest.approx(0.1**2 - 4e-4)
+
+
+# Comparisons --------------------------------------------------------------------------------------
+
+
+def results(*means: MeanOffset) -> list[str]:
+    """What all others say of each."""
+    found = []
+    for i, mean in enumerate(means):
+        others = {str(j): other for j, other in enumerate(means) if j != i}
+        comparison = compared_with_majority(mean, others)
+        word = (
+            "wrong" if comparison.is_wrong else "contested" if comparison.is_contested else "right"
+        )
+        found.append(word)
+    return found
+
+
+def test_a_strict_majority_convicts_and_half_does_not() -> None:
+    assert results(at(0.0), at(0.01), at(0.5)) == ["right", "right", "wrong"]
+    assert results(at(0.0), at(0.5)) == ["contested", "contested"]
+    assert results(at(0.0), at(0.0), at(0.5), at(0.5)) == ["contested"] * 4
+    assert results(at(0.0), at(0.0), at(0.0), at(0.5), at(0.5)) == ["right"] * 3 + ["wrong"] * 2
+    assert results(at(0.0)) == ["right"]
+
+
+def test_three_that_all_disagree_convict_nobody() -> None:
+    assert results(at(0.0), at(0.5), at(1.0)) == ["contested"] * 3
+
+
+def test_one_that_agrees_with_both_sides_is_no_accuser_of_either() -> None:
+    vague = at(0.05, sigma=0.03)
+    assert disagreement(vague, at(0.0)) < CONFLICT > disagreement(vague, at(0.1))
+    words = results(at(0.0), at(0.1), at(0.1), vague)
+    assert words[0] == "contested"  # two accusers of four are no majority
+
+
+def test_the_bias_is_the_distance_to_a_strict_majority() -> None:
+    honest, liar = at(0.0), at(0.1)
+    of_liar = compared_with_majority(liar, {"a": honest, "b": honest}).bias_variance
+    assert of_liar == pytest.approx(0.1**2 - 4e-4)
+    assert compared_with_majority(honest, {"a": honest, "b": liar}).bias_variance == 0.0
+    two_each = compared_with_majority(honest, {"a": honest, "b": liar, "c": liar})
+    assert two_each.bias_variance == of_liar
+
+
+@given(st.permutations(range(5)))
+def test_the_order_of_the_senders_does_not_matter(order: list[int]) -> None:
+    means = [at(0.0), at(0.02), at(0.3), at(0.31), at(0.01)]
+    words = results(*means)
+    assert results(*(means[i] for i in order)) == [words[i] for i in order]
+
+
+def test_own_sensors_outweigh_any_number_of_means() -> None:
+    own, liars = at(0.0, sigma=0.03), {str(i): at(0.5) for i in range(9)}
+    assert compared_with_own_sensors(at(0.5), own, liars).is_wrong
+    assert not compared_with_own_sensors(at(0.0), own, liars).is_wrong
+    assert not compared_with_own_sensors(at(0.0), own, liars).is_contested
+
+
+def test_vague_own_sensors_convict_only_one_of_two_that_contradict_each_other() -> None:
+    own = at(0.0, sigma=0.1)
+    assert not compared_with_own_sensors(at(0.6), own, {}).is_wrong
+    assert compared_with_own_sensors(at(0.6), own, {"a": at(0.0)}).is_wrong
+    undecided = compared_with_own_sensors(at(0.1), own, {"a": at(0.0)})
+    assert undecided.is_contested
+    assert undecided.is_left_out
+    assert not undecided.is_wrong
