@@ -52,7 +52,9 @@ class SensingAgent:
     @property
     def counts(self) -> Counter[str]:
         """What was sensed, and what could not be used, by reason."""
-        return self._counts + (Counter() if self._camera is None else self._camera.counts)
+        camera = Counter[str]() if self._camera is None else self._camera.counts
+        detector = Counter[str]() if self._detector is None else self._detector.counts
+        return self._counts + camera + detector
 
     @property
     def has_detector(self) -> bool:

@@ -10,7 +10,7 @@ from support.markers import CARRIED, team
 from cpcbl_agents.vision.camera import Pixels
 from cpcbl_agents.vision.detections import Detections
 from cpcbl_agents.vision.detector import CameraDetector
-from cpcbl_agents.vision.markers import marker_dictionary
+from cpcbl_agents.vision.marker_codes import marker_dictionary
 
 TEAM = team(CARRIED)
 
@@ -35,21 +35,22 @@ def turned_marker(number: int, degrees: float, at: tuple[float, float], scale: f
 
 @pytest.mark.parametrize("side_px", [6, 8, 10, 12, 16])
 def test_a_floor_of_tiles_costs_no_robot(side_px: int) -> None:
-    found = CameraDetector("me", TEAM).detections(tiles(side_px))
-    assert isinstance(found, Detections)
-    assert found.found == ()
-    assert [one.reason for one in found.ambiguities] == ["too_many_outlines"]
+    detector = CameraDetector("me", TEAM)
+    assert detector.detections(tiles(side_px)) == Detections()
+    assert detector.counts["outlines_dropped"] > 100
 
 
-def test_a_teammate_that_fell_over_is_a_bad_fit() -> None:
+def test_a_teammate_that_fell_over_is_rejected() -> None:
     random, detector = np.random.default_rng(0), CameraDetector("me", TEAM)
     for _ in range(60):
         degrees, scale = float(random.normal(90.0, 3.0)), float(random.uniform(0.5, 1.5))
         at = float(random.uniform(60.0, 500.0)), float(random.uniform(60.0, 350.0))
         found = detector.detections(turned_marker(0, degrees, at, scale))
+        if found == "camera_upside_down":  # which the picture of a single marker may be, too
+            continue
         assert isinstance(found, Detections)
         assert found.found == ()
-        assert {one.reason for one in found.ambiguities} <= {"bad_fit"}
+        assert {one.reason for one in found.ambiguities} <= {"bad_fit", "upside_down"}
 
 
 def test_an_error_within_a_frame_costs_that_frame_and_is_said_once(
