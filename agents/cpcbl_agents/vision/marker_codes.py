@@ -20,15 +20,16 @@ MOST_ROWS = 32_766  # cv2.remap numbers the rows of its result with 16 bits
 LEAST_CONTRAST = 5.0  # grey levels between a marker's black and its margin's white
 BORDER_SPOILT, MARGIN_SPOILT = 0.10, 0.15  # shares of cells that a highlight or a finger may cover
 SHARPENING = 0.25
-MOST_CHANCE = 2e-4
-"""That random bits are taken for a marker of the family: so many wrong bits are corrected."""
+MOST_CHANCE, MOST_CHANCE_SPOILT = 2e-4, 3e-5
+"""That random bits are taken for a marker of the family: so many wrong bits are corrected. The
+second if a part of the border or the margin is covered, which is less evidence for a marker."""
 MOST_CORRECTED = 0.5  # share of the bits that a family could set right
 CLEAR_BITS = (
     0.45  # mean distance of the bits from the threshold; 1: as black or as white as the rings
 )
 
 _SQUARE = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]], np.float32)
-_WITHIN = np.array([[x, y] for y in (-0.15, 0.15) for x in (-0.15, 0.15)])
+_WITHIN = np.array([[x, y] for y in (-0.2, 0.2) for x in (-0.2, 0.2)])
 
 
 @lru_cache(maxsize=8)
@@ -65,9 +66,10 @@ class MarkerReader:
         self._margin, self._border, self._inside = rings == 0, rings == 1, rings > 1
         self._margin_plane = _Plane(basis, self._margin)
         self._border_plane = _Plane(basis, self._border)
-        corrected = _most_corrected(self.dictionary)
-        self._correction = (corrected + 0.5) / max(self.dictionary.maxCorrectionBits, 1)
-        self._corrects = corrected > 0
+        self._correction_rates = tuple(
+            _correction_rate(self.dictionary, chance)
+            for chance in (MOST_CHANCE_SPOILT, MOST_CHANCE)
+        )
 
     def read(self, grey: Pixels, quads: Floats) -> dict[int, MarkerCode]:
         """What the quads (m, 4, 2) show, clockwise in the picture: by index, of those that are
@@ -75,11 +77,10 @@ class MarkerReader:
         if not len(quads):
             return {}
         samples = sample_grey(grey, _project_to_quads(self._sample_points, quads))
-        levels = samples.reshape(len(quads), self.cells + 2, self.cells + 2, -1).mean(axis=3)
+        in_cells = np.sort(samples.reshape(len(quads), self.cells + 2, self.cells + 2, -1), axis=3)
+        levels = in_cells[..., 1:-1].mean(axis=3)  # a small highlight is an extreme
         white, black = self._margin_plane.fit(levels), self._border_plane.fit(levels)
         middle = 0.5 * (white + black)
-        spoilt_border = (levels > middle)[:, self._border]
-        spoilt_margin = (levels < middle)[:, self._margin]
         white = self._margin_plane.fit(np.where(levels < middle, white, levels))
         black = self._border_plane.fit(np.where(levels > middle, black, levels))
         middle, half = 0.5 * (white + black), 0.5 * (white - black)
@@ -94,7 +95,7 @@ class MarkerReader:
             if np.abs(shades).clip(max=1.0).mean() < CLEAR_BITS:
                 continue
             square = (shades > 0.0).astype(np.uint8).reshape(self._bits, self._bits)
-            rate = self._correction if whole[i] and self._corrects else 0.0
+            rate = self._correction_rates[int(whole[i])]
             is_known, number, turns = self.dictionary.identify(square, rate)
             if is_known:
                 codes[i] = MarkerCode(number, -turns % 4)
@@ -114,15 +115,16 @@ class _Plane:
         return np.asarray(np.einsum("mk,ijk->mij", found, self._basis))
 
 
-def _most_corrected(dictionary: cv2.aruco.Dictionary) -> int:
-    """The most wrong bits that are corrected in a family."""
+def _correction_rate(dictionary: cv2.aruco.Dictionary, most_chance: float) -> float:
+    """The wrong bits that are corrected in a family, as a share of those that could be."""
     bits = dictionary.markerSize**2
     patterns, most = 4 * len(dictionary.bytesList), 0
     for wrong in range(1, int(MOST_CORRECTED * dictionary.maxCorrectionBits) + 1):
-        if patterns * sum(comb(bits, k) for k in range(wrong + 1)) > MOST_CHANCE * 2.0**bits:
+        if patterns * sum(comb(bits, k) for k in range(wrong + 1)) > most_chance * 2.0**bits:
             break
         most = wrong
-    return most
+    # Half a bit more than what OpenCV rounds down
+    return (most + 0.5) / dictionary.maxCorrectionBits if most else 0.0
 
 
 def _sharpened(levels: Floats) -> Floats:

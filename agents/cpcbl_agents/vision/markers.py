@@ -34,6 +34,7 @@ MOST_MISFIT = 25.0
 """Mean squared error of a marker that stands where it should, in stated sigmas: corners of real
 images err by three to four times as much as those of clean ones."""
 MOST_LEAN_RAD = math.radians(7.0)  # of a camera; a marker that implies more is elsewhere
+LEAST_HEADING_SIGMA = math.radians(0.2)  # markers are mounted no better than that
 CLEAR_RAD = math.radians(10.0)
 """A heading with a larger sigma is not reported."""
 POINTS_PER_SIDE = 12  # along a side
@@ -256,7 +257,7 @@ def sighting(name: str, fit: PoseFit) -> Sighting:
     along, across = np.array([x, y]) / range_m, np.array([-y, x]) / range_m**2
     place = fit.covariance[:2, :2]
     range_sigma, bearing_sigma = (math.sqrt(way @ place @ way) for way in (along, across))
-    heading_sigma = math.sqrt(fit.covariance[2, 2])
+    heading_sigma = math.hypot(math.sqrt(fit.covariance[2, 2]), LEAST_HEADING_SIGMA)
     if heading_sigma > CLEAR_RAD:
         return Sighting(name, range_m, bearing, range_sigma, bearing_sigma)
     return Sighting(name, range_m, bearing, range_sigma, bearing_sigma, heading, heading_sigma)

@@ -57,7 +57,7 @@ def test_a_square_without_a_marker_and_one_without_its_border_say_nothing() -> N
         assert codes.read(pixels, SQUARE[None]) == {}
 
 
-@pytest.mark.parametrize("family", FAMILIES)
+@pytest.mark.parametrize("family", ["aruco_4x4_50", "aruco_5x5_50", "apriltag_25h9"])
 def test_a_highlight_on_the_border_is_no_matter_but_then_no_bit_is_corrected(
     family: MarkerFamily,
 ) -> None:
