@@ -18,7 +18,14 @@ from typing import Any, NamedTuple, get_args
 import cv2
 import msgspec
 import numpy as np
-from benchmarks.degraded_frames import KINDS, SIDES, Degraded, Pixels, degraded_frame
+from benchmarks.degraded_frames import (
+    KINDS,
+    SIDES,
+    Degraded,
+    Pixels,
+    background,
+    degraded_frame,
+)
 from rich.console import Console
 from rich.table import Table
 
@@ -124,6 +131,23 @@ def measured(
     )
 
 
+def false_markers(
+    family: MarkerFamily, backgrounds: Sequence[Pixels], frames: int, seed: int = 1
+) -> int:
+    """The markers that the detector sees in parts of pictures that have none: sightings, and
+    markers of nobody."""
+    team, settings, random = marked_team(family), CameraSettings(), np.random.default_rng(seed)
+    detector = CameraDetector("me", team)
+    false = 0
+    for _ in range(frames):
+        levels = background(backgrounds, random, settings) * random.uniform(0.2, 1.1)
+        noisy = levels + random.normal(0.0, random.uniform(0.0, 4.0), levels.shape)
+        found = detector.detections(noisy.clip(0, 255).astype(np.uint8))
+        if isinstance(found, Detections):
+            false += len(found.found) + len(found.ambiguities)
+    return false
+
+
 def _timed(look: Callable[[Any], Any], pixels: Any) -> tuple[Any, float]:
     start = time.process_time()
     found = look(pixels)
@@ -213,6 +237,7 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=200, help="of each kind")
     parser.add_argument("--family", choices=get_args(MarkerFamily), default="apriltag_36h11")
     parser.add_argument("--kinds", default=",".join(KINDS), help="separated by commas")
+    parser.add_argument("--crops", type=int, default=0, help="natural pictures without a marker")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--out", type=Path, default=Path("build/degraded.json"))
     chosen = parser.parse_args()
@@ -227,7 +252,11 @@ def main() -> None:
     ]
     chosen.out.parent.mkdir(exist_ok=True)
     chosen.out.write_bytes(msgspec.json.format(msgspec.json.encode([s._asdict() for s in scores])))
-    Console(width=160).print(printed(scores, list(peers)))
+    console = Console(width=160)
+    console.print(printed(scores, list(peers)))
+    if chosen.crops:
+        false = false_markers(chosen.family, backgrounds, chosen.crops, chosen.seed)
+        console.print(f"{chosen.crops} natural pictures without a marker: {false} false markers")
 
 
 if __name__ == "__main__":

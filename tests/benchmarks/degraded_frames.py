@@ -81,7 +81,7 @@ def degraded_frame(
         size = np.array([settings.width_px, settings.height_px])
         if low > BORDER_PX and (high < size - BORDER_PX).all():
             break
-    levels = _background(backgrounds, random, settings)
+    levels = background(backgrounds, random, settings)
     _paste(levels, _pattern(family, number), corners, random)
     pixels = _through_camera(levels, kind, Subject(corners), random)
     heading = facing - QUARTERS[SIDES[number]]
@@ -131,7 +131,7 @@ def _pattern(family: MarkerFamily, number: int) -> Pixels:
     return cv2.copyMakeBorder(marker, *margin, cv2.BORDER_CONSTANT, value=(255,)).astype(np.uint8)
 
 
-def _background(backgrounds: Sequence[Pixels], random: Random, s: CameraSettings) -> Levels:
+def background(backgrounds: Sequence[Pixels], random: Random, s: CameraSettings) -> Levels:
     """A random part of a picture, in the size of the frame."""
     picture = backgrounds[int(random.integers(len(backgrounds)))]
     height, width = picture.shape[:2]

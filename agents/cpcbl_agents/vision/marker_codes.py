@@ -19,6 +19,7 @@ from cpcbl_team.config import MarkerFamily
 MOST_ROWS = 32_766  # cv2.remap numbers the rows of its result with 16 bits
 LEAST_CONTRAST = 5.0  # grey levels between a marker's black and its margin's white
 BORDER_SPOILT, MARGIN_SPOILT = 0.10, 0.15  # shares of cells that a highlight or a finger may cover
+MOST_SCATTER = 0.25  # of the cells of border and margin, as a share of the contrast
 SHARPENING = 0.25
 MOST_CHANCE, MOST_CHANCE_SPOILT = 2e-4, 3e-5
 """That random bits are taken for a marker of the family: so many wrong bits are corrected. The
@@ -88,6 +89,7 @@ class MarkerReader:
         spoilt_margin = (levels < middle)[:, self._margin].mean(axis=1)
         framed = (spoilt_border <= BORDER_SPOILT) & (spoilt_margin <= MARGIN_SPOILT)
         framed &= 2.0 * half.min(axis=(1, 2)) > LEAST_CONTRAST
+        framed &= self._scatter(levels, white, black, middle) < MOST_SCATTER
         whole = (spoilt_border == 0.0) & (spoilt_margin == 0.0)
         codes = {}
         for i in framed.nonzero()[0].tolist():
@@ -100,6 +102,15 @@ class MarkerReader:
             if is_known:
                 codes[i] = MarkerCode(number, -turns % 4)
         return codes
+
+    def _scatter(self, levels: Floats, white: Floats, black: Floats, middle: Floats) -> Floats:
+        """The standard deviation of border and margin from black and white, without what is spoilt,
+        as a share of the contrast: large in noise and texture."""
+        contrast = white - black
+        off = np.where(self._margin, levels - white, levels - black) / np.maximum(contrast, 1e-3)
+        counts = np.where(self._margin, levels > middle, self._border & (levels < middle))
+        squares = (off * off * counts).sum(axis=(1, 2))
+        return np.asarray(np.sqrt(squares / np.maximum(counts.sum(axis=(1, 2)), 1)))
 
 
 class _Plane:

@@ -123,7 +123,7 @@ def test_a_camera_that_is_upside_down_is_said_and_tells_nothing() -> None:
     assert detector.problems == ()
     stated = replace(TEAM.robots["me"], camera=replace(CAMERA, roll_deg=180.0))
     right = CameraDetector("me", replace(TEAM, robots={**TEAM.robots, "me": stated}))
-    (found,) = [right.detect(Picture(1, robots_in_view(1)[::-1, ::-1].copy()))]
+    found = right.detect(Picture(1, robots_in_view(1)[::-1, ::-1].copy()))
     assert isinstance(found, Sightings)
     assert len(found.sightings) == 2
 
@@ -160,7 +160,7 @@ def test_what_is_doubted_is_counted_by_reason() -> None:
 def test_landmarks_that_are_mostly_rejected_are_said_with_the_likely_cause() -> None:
     doubts, rejected = LandmarkDoubts(), Ambiguity("ranges_disagree", ("a",), np.zeros((4, 2)))
     doubts.add(2, [rejected] * 7)
-    assert doubts.problems == ()
+    assert not doubts.problems
     doubts.add(0, [rejected] * 5)
     (said,) = doubts.problems
     assert said.startswith("12 of 14 landmarks are rejected (ranges_disagree); is the camera")
