@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 import pytest
 from msgspec.structs import replace
+from support.hostile_frames import tiles, turned_marker
 from support.markers import CARRIED, picture, standing, team
 from support.rendered_pictures import picture as field_picture
 from support.rendered_pictures import post
@@ -19,31 +20,12 @@ from cpcbl_agents.vision.cylinders import CylinderDetector
 from cpcbl_agents.vision.detections import Ambiguity, Detections
 from cpcbl_agents.vision.detector import CameraDetector
 from cpcbl_agents.vision.landmark_doubts import LandmarkDoubts
-from cpcbl_agents.vision.marker_codes import marker_dictionary
 from cpcbl_launch.simulation.camera.render import Light
 from cpcbl_team.config import CameraSettings
 from cpcbl_team.inputs import Sightings
 from cpcbl_transport.messages import UnclearObject
 
 TEAM, CAMERA = team(CARRIED), CameraSettings()
-
-
-def tiles(side_px: int) -> Pixels:
-    """A floor of black and white squares."""
-    y, x = np.mgrid[0:480, 0:640]
-    grey = ((x // side_px + y // side_px) % 2 * 200 + 20).astype(np.uint8)
-    return np.repeat(grey[..., None], 3, axis=2)
-
-
-def turned_marker(number: int, degrees: float, at: tuple[float, float], scale: float) -> Pixels:
-    """A marker of a robot that fell over."""
-    pattern = cv2.aruco.generateImageMarker(marker_dictionary(TEAM.vision.family), number, 60)
-    paper = cv2.copyMakeBorder(pattern, 12, 12, 12, 12, cv2.BORDER_CONSTANT, value=255)
-    turn = cv2.getRotationMatrix2D((42.0, 42.0), degrees, scale)
-    turn[:, 2] += np.array(at)
-    grey = np.full((480, 640), 180, np.uint8)
-    cv2.warpAffine(paper, turn, (640, 480), grey, cv2.INTER_LINEAR, cv2.BORDER_TRANSPARENT)
-    return np.repeat(grey[..., None], 3, axis=2)
 
 
 @pytest.mark.parametrize("side_px", [6, 8, 10, 12, 16])
