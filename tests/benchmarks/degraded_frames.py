@@ -193,7 +193,7 @@ def _motion(levels: Levels, _: Subject, random: Random) -> Levels:
 
 
 def _low_light(levels: Levels, _: Subject, random: Random) -> Levels:
-    return levels * np.float32(random.uniform(0.06, 0.2))
+    return np.asarray(levels * np.float32(random.uniform(0.06, 0.2)))
 
 
 def _glare(levels: Levels, subject: Subject, random: Random) -> Levels:
@@ -201,7 +201,7 @@ def _glare(levels: Levels, subject: Subject, random: Random) -> Levels:
     spread, light = random.uniform(0.4, 1.5) * subject.size, random.uniform(100.0, 220.0)
     v, u = np.mgrid[: levels.shape[0], : levels.shape[1]]
     bright = light * np.exp(-((u - x) ** 2 + (v - y) ** 2) / (2.0 * spread**2))
-    return levels + bright[..., None].astype(np.float32)
+    return np.asarray(levels + bright[..., None].astype(np.float32))
 
 
 def _specular(levels: Levels, subject: Subject, random: Random) -> Levels:
