@@ -180,7 +180,9 @@ def _through_camera(levels: Levels, kind: str, subject: Subject, random: Random)
     blurred = cv2.GaussianBlur(levels, (0, 0), blur)
     seen = np.clip(blurred + random.normal(0.0, noise, blurred.shape), 0, 255).astype(np.uint8)
     _, data = cv2.imencode(".jpg", seen, (cv2.IMWRITE_JPEG_QUALITY, quality))
-    return cv2.imdecode(data, cv2.IMREAD_COLOR).astype(np.uint8)
+    decoded = cv2.imdecode(data, cv2.IMREAD_COLOR)
+    assert decoded is not None
+    return decoded.astype(np.uint8)
 
 
 def _motion(levels: Levels, _: Subject, random: Random) -> Levels:
