@@ -6,7 +6,7 @@ VENV ?= .venv
 BIN = $(VENV)/bin
 
 .PHONY: setup demo test quick check unit test-long test-trial test-compiled test-docker test-bench \
-  chaos net fuzz compiled bench bench-detection bench-latency bench-pictures \
+  chaos net fuzz compiled bench bench-degraded bench-detection bench-latency bench-pictures \
   bench-processes bench-scaling bench-view screenshot clean
 
 setup: $(VENV)/ready
@@ -102,6 +102,12 @@ bench: test-bench
 bench-detection bench-latency bench-pictures bench-processes bench-scaling: setup
 	@mkdir -p build
 	PYTHONPATH=$(BENCH_PATH) $(BIN)/python -m benchmarks.$(@:bench-%=%) $(ARGS)
+
+# A robot's detector beside two others on frames of a bad camera; ARGS='--family aruco_4x4_50'.
+bench-degraded: setup
+	@mkdir -p build
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev,bench]'
+	PYTHONPATH=$(BENCH_PATH) $(BIN)/python -m benchmarks.degraded $(ARGS)
 
 # The view with teams of 4, 50 and 200 robots in Chromium; and docs/view.png, a picture of the demo.
 bench-view: setup

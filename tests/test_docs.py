@@ -107,7 +107,7 @@ def test_every_reason_of_a_refusal_has_its_remedy_in_the_docs() -> None:
     listed = {name for row in table.splitlines() for name in re.findall(r"`(\w+)`", _cell(row))}
     vision = ROOT / "agents/cpcbl_agents/vision"
     code = "".join((vision / name).read_text() for name in ("pictures.py", "detector.py"))
-    images = set(re.findall(r'"(frame_\w+)"', code))
+    images = set(re.findall(r'"((?:frame|camera)_\w+)"', code))
     faults = {*SightingFault, *TimelineRefusal, *images, "seen_twice", "no_camera"}
     assert listed == {str(reason) for reason in {*Refusal, *faults, "unknown_object"}}
     assert set(REASONS) <= listed

@@ -55,8 +55,8 @@ class SensingAgent:
     @property
     def counts(self) -> Counter[str]:
         """What was sensed, and what could not be used, by reason."""
-        parts = (p.counts for p in (self._camera, self._correction) if p is not None)
-        return sum(parts, self._counts)
+        parts = (self._camera, self._detector, self._correction)
+        return sum((part.counts for part in parts if part is not None), self._counts)
 
     @property
     def has_detector(self) -> bool:

@@ -155,6 +155,24 @@ def test_pixels_that_show_nothing_are_refused(reason: str, pixels: Any) -> None:
     assert pixel_fault(pixels, SIZE) == reason
 
 
+def test_a_small_landmark_on_a_plain_wall_is_something_to_see() -> None:
+    wall = np.full((480, 640, 3), 150, np.uint8)
+    wall[201:213, 301:305] = (0, 0, 200)
+    wall[213:225, 301:305] = (0, 200, 220)
+    assert pixel_fault(wall, (640, 480)) == ""
+    noisy = wall + np.random.default_rng(1).normal(0.0, 4.0, wall.shape)
+    assert pixel_fault(noisy.clip(0, 255).astype(np.uint8), (640, 480)) == ""
+
+
+def test_a_dark_picture_is_black_only_if_it_shows_nothing() -> None:
+    noise = np.random.default_rng(1).normal(8.0, 3.0, (480, 640, 3))
+    dark = noise.clip(0, 255).astype(np.uint8)
+    dark[50, 70] = 255  # a pixel of the sensor that is broken
+    assert pixel_fault(dark, (640, 480)) == "frame_black"
+    noise[100:200, 300:400] += 20.0
+    assert pixel_fault(noise.clip(0, 255).astype(np.uint8), (640, 480)) == ""
+
+
 def test_a_picture_for_people_is_a_jpeg_of_moderate_size() -> None:
     small = decode_frame(encode_jpeg(GOOD), SIZE)
     assert not isinstance(small, str)

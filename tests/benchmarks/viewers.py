@@ -9,7 +9,8 @@ from benchmarks.frames import TEAM, VIEWER
 from cpcbl_agents.vision.camera import Camera, Pixels
 from cpcbl_agents.vision.cylinders import CylinderDetector
 from cpcbl_agents.vision.detector import CameraDetector
-from cpcbl_agents.vision.markers import MarkerDetector, marker_dictionary
+from cpcbl_agents.vision.marker_codes import marker_dictionary
+from cpcbl_agents.vision.markers import MarkerDetector
 
 YARDSTICK = "OpenCV's marker detection"
 EYES = "eyes"

@@ -60,6 +60,8 @@ REASONS = {
     "frame_wrong_depth": "images do not have 8 bits a colour",
     "frame_wrong_size": "images do not have the size of `camera`",
     "frame_failed": "images make the detector fail; the robot's log has the error",
+    "frame_repeated": "images repeat the one before exactly; the camera or its driver hangs",
+    "camera_upside_down": "the camera is upside down",
     "frame_black": "images are black",
     "frame_white": "images are white",
     "frame_blank": "images are blank",

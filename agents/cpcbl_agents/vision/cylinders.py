@@ -25,6 +25,7 @@ from cpcbl_agents.vision.cylinder_fit import (
     rejection_reason,
 )
 from cpcbl_agents.vision.detections import Ambiguity, Detection, Detections, without_duplicates
+from cpcbl_agents.vision.landmark_doubts import LandmarkDoubts
 from cpcbl_agents.vision.outlines import (
     GAP_PX,
     Candidate,
@@ -66,6 +67,7 @@ class CylinderDetector:
         used = {colour for bands in self._kinds for colour in bands}
         self._colours = ColourSegmenter(team.vision.colours, used)
         self._panorama = panorama_for(camera.settings)
+        self.doubts = LandmarkDoubts()
 
     def detections(self, pixels: Pixels) -> Detections:
         """All known cylinders in a frame (height, width, 3), BGR, of the camera's size."""
@@ -76,6 +78,7 @@ class CylinderDetector:
         identified = [self._identify(pixels, pair) for pair in pairs]
         found = tuple(one for one in identified if isinstance(one, Detection))
         ambiguities = tuple(one for one in identified if isinstance(one, Ambiguity))
+        self.doubts.add(len(found), ambiguities)
         ambiguities += tuple(self._single_bands(blobs, pairs))
         return without_duplicates(Detections(found, ambiguities))
 
@@ -111,8 +114,9 @@ class CylinderDetector:
         upside_down = self._kinds.get((pair.lower.colour, pair.upper.colour), ())
         if upside_down and pair.height >= LEAST_PX:
             outlines = self._angular_outlines(pixels, pair)
-            if self._rejection_reason(upside_down, outlines) == "mirror_image":
-                return Ambiguity("mirror_image", _names(upside_down), pair.outline)
+            is_mirrored = self._rejection_reason(upside_down, outlines) == "mirror_image"
+            reason = "mirror_image" if is_mirrored else "upside_down"
+            return Ambiguity(reason, _names(upside_down), pair.outline)
         return Ambiguity("unknown_pair", (), pair.outline)
 
     def _single_bands(

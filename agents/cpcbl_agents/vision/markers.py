@@ -9,31 +9,32 @@ reads only three of four markers at 3 m, and fewer in blurred pictures.
 """
 
 import math
-from collections import defaultdict
+import time
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
-from functools import lru_cache
 from typing import NamedTuple
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from cpcbl_agents.vision.camera import Camera, Floats, Pixels
 from cpcbl_agents.vision.detections import Ambiguity, Detection, Detections
+from cpcbl_agents.vision.marker_codes import MarkerReader, sample_grey
 from cpcbl_agents.vision.marker_fits import MarkerFits
 from cpcbl_agents.vision.poses import Lean, PoseFit, fit_pose
-from cpcbl_team.config import MarkerFamily, Side, Team
+from cpcbl_agents.vision.quads import dark_quads
+from cpcbl_team.config import Side, Team
 from cpcbl_team.inputs import Sighting
 
-WINDOW_PX = 7  # of the adaptive threshold; one is enough, as what is found is refined
 LEAST_SIDE_PX = 6.0
-MOST_OUTLINES = 300  # that are looked at: a floor of tiles has thousands, and the filter waits
+BATCH = 64  # quads that are read together, the most likely first, until the time of a frame is over
 PASSES = 2  # until corners are exact enough to read between them
 FAR_PX = 8.0  # a corner that moves by so much in a pass is none
 MOST_MISFIT = 25.0
 """Mean squared error of a marker that stands where it should, in stated sigmas: corners of real
 images err by three to four times as much as those of clean ones."""
 MOST_LEAN_RAD = math.radians(7.0)  # of a camera; a marker that implies more is elsewhere
+LEAST_HEADING_SIGMA = math.radians(0.2)  # markers are mounted no better than that
 CLEAR_RAD = math.radians(10.0)
 """A heading with a larger sigma is not reported."""
 POINTS_PER_SIDE = 12  # along a side
@@ -41,9 +42,6 @@ TAPS = 13  # across it
 SHARE = 0.8  # of a cell is looked at on either side: beyond lie the marker's bits
 LEAST_PX, MOST_PX = 1.6, 4.0
 FAINT = 0.25  # of the steepest step: less is noise
-LEAST_CONTRAST = 12.0  # grey levels between a marker's black and its margin's white
-MOST_ROWS = 32_766  # cv2.remap numbers the rows of its result with 16 bits
-WRONG_SHARE = 0.25  # of the bits that a family could set right: a wrong name is worse than none
 
 _ALONG = np.linspace(0.12, 0.88, POINTS_PER_SIDE, dtype=np.float32)[:, None]
 """Not up to the corners, which are round, even where no marker is."""
@@ -51,72 +49,9 @@ _ACROSS = np.linspace(-1.0, 1.0, TAPS, dtype=np.float32)
 _BETWEEN = 0.5 * (_ACROSS[1:] + _ACROSS[:-1])
 _OUTWARDS = np.array([1.0, -1.0], np.float32)
 _NEXT = [1, 2, 3, 0]
-_SQUARE = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]], np.float32)
-_WITHIN = np.array([[x, y] for y in (-0.15, 0.15) for x in (-0.15, 0.15)])
-
-
-@lru_cache(maxsize=8)
-def marker_dictionary(family: MarkerFamily) -> cv2.aruco.Dictionary:
-    """OpenCV's dictionary of a family."""
-    name = f"DICT_{family.removeprefix('aruco_').upper()}"
-    return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
-
-
-class MarkerCode(NamedTuple):
-    """A marker's number, and which of the quad's corners is its upper left one."""
-
-    id: int
-    first: int
-
-
-class MarkerReader:
-    """Reads the markers of a family."""
-
-    def __init__(self, family: MarkerFamily) -> None:
-        self.dictionary = marker_dictionary(family)
-        self._bits = self.dictionary.markerSize
-        self.cells = self._bits + 2
-        """Of a marker's side, its black border too."""
-        self._sample_points = _sample_points(self.cells)
-        along = np.arange(self.cells + 2)
-        from_side = np.minimum(along, along[::-1])
-        self._ring_numbers = np.minimum(from_side[:, None], from_side).ravel()
-        """The distance of each cell from the outside, including the ring around the marker."""
-
-    def read(self, grey: Pixels, quads: Floats) -> dict[int, MarkerCode]:
-        """What the quads (m, 4, 2) show, clockwise in the picture: by index, of those that are
-        markers."""
-        if not len(quads):
-            return {}
-        samples = _sample_grey(grey, _project_to_quads(self._sample_points, quads))
-        levels = samples.reshape(len(quads), -1, len(_WITHIN)).mean(axis=2)
-        margins, borders = levels[:, self._ring_numbers == 0], levels[:, self._ring_numbers == 1]
-        white, black = margins.mean(axis=1), borders.mean(axis=1)
-        middle = 0.5 * (white + black)
-        framed = (borders.max(axis=1) < middle) & (middle < margins.min(axis=1))
-        framed &= white - black > LEAST_CONTRAST
-        bits = (levels[:, self._ring_numbers > 1] > middle[:, None]).astype(np.uint8)
-        codes = {}
-        for i in framed.nonzero()[0].tolist():
-            square = bits[i].reshape(self._bits, self._bits)
-            is_known, number, turns = self.dictionary.identify(square, WRONG_SHARE)
-            if is_known:
-                codes[i] = MarkerCode(number, -turns % 4)
-        return codes
-
-
-def _sample_points(cells: int) -> Floats:
-    """The points to sample in a marker with corners (0, 0) to (1, 1), and in a ring around it."""
-    middles = (np.arange(-1, cells + 1) + 0.5) / cells
-    x, y = np.meshgrid(middles, middles)
-    cell_points = np.stack([x, y], axis=2).reshape(-1, 1, 2) + _WITHIN / cells
-    return np.asarray(cell_points.reshape(-1, 2))
-
-
-def _project_to_quads(points: Floats, quads: Floats) -> Floats:
-    """Points (n, 2) of the unit square, projected into each of the quads: (m, n, 2)."""
-    maps = (cv2.getPerspectiveTransform(_SQUARE, quad) for quad in quads.astype(np.float32))
-    return np.stack([cv2.perspectiveTransform(points[None], one)[0] for one in maps])
+_PROBES = np.array([0.15, 0.38, 0.62, 0.85])
+"""Places along a side where a quad is compared with what is around it."""
+LEAST_STEP = 3.0  # grey levels: a quad whose sides are no step from dark to bright is no marker
 
 
 def side_edge_points(grey: Pixels, quads: Floats, cells: int) -> Floats:
@@ -132,7 +67,7 @@ def side_edge_points(grey: Pixels, quads: Floats, cells: int) -> Floats:
     outwards = ways[..., ::-1] * _OUTWARDS * (reach[:, None] / lengths)[..., None]
     places = quads[:, :, None] + _ALONG * ways[:, :, None]
     aside = _ACROSS[:, None] * outwards[:, :, None]
-    levels = _sample_grey(grey, places[:, :, :, None] + aside[:, :, None])
+    levels = sample_grey(grey, places[:, :, :, None] + aside[:, :, None])
     slopes = levels[..., 1:] - levels[..., :-1]
     slopes -= FAINT * slopes.max(axis=3, keepdims=True)
     slopes = slopes.clip(0.0) + 1e-6
@@ -155,16 +90,6 @@ def line_intersections(sides: Floats) -> Floats:
     return np.stack([x, y], axis=2)
 
 
-def _sample_grey(grey: Pixels, points: Floats | NDArray[np.float32]) -> NDArray[np.float32]:
-    """The grey levels (...) at points (..., 2), pixels."""
-    if not points.size:
-        return np.zeros(points.shape[:-1], np.float32)
-    flat = points.astype(np.float32, copy=False).reshape(-1, points.shape[-2], 2)
-    parts = (flat[i : i + MOST_ROWS] for i in range(0, len(flat), MOST_ROWS))
-    levels = [cv2.remap(grey, p[..., 0], p[..., 1], cv2.INTER_LINEAR) for p in parts]
-    return np.concatenate(levels).astype(np.float32).reshape(points.shape[:-1])
-
-
 class DetectedMarker(NamedTuple):
     """A marker in a picture. Corners (4, 2) from its upper left one, clockwise: in pixels, and on
     the plane z = 1 of the camera's frame."""
@@ -172,6 +97,7 @@ class DetectedMarker(NamedTuple):
     id: int
     outline: Floats
     plane: Floats
+    is_upside_down: bool = False
 
 
 class MarkerMount(NamedTuple):
@@ -193,36 +119,38 @@ class MarkerDetector:
         stated = (camera.settings.tilt_sigma_deg, camera.settings.roll_sigma_deg)
         self.fits = MarkerFits(Lean(*map(math.radians, stated)))
         self._codes = MarkerReader(team.vision.family)
-        chosen = cv2.aruco.DetectorParameters()  # finds outlines fast, small ones too
-        chosen.adaptiveThreshWinSizeMin = chosen.adaptiveThreshWinSizeMax = WINDOW_PX
-        chosen.polygonalApproxAccuracyRate = 0.08
-        chosen.minMarkerDistanceRate = 0.05
-        self._detector = cv2.aruco.ArucoDetector(self._codes.dictionary, chosen)
+        self.counts: Counter[str] = Counter()
 
-    def detections(self, pixels: Pixels) -> Detections:
-        """The teammates whose markers are in a picture, and the markers that identify none."""
+    def detections(self, pixels: Pixels, until_s: float = math.inf) -> Detections:
+        """The teammates whose markers are in a picture, and the markers that identify none. When
+        this thread's CPU clock is beyond `until_s`, no more quads are looked at."""
         if not self._mounts:
             return Detections()
         grey = cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY).astype(np.uint8, copy=False)
-        markers, dropped = self._detect_markers(grey)
+        markers = self._detect_markers(grey, until_s)
         own, ambiguities = assign_markers(markers, self._mounts, self._robot)
-        found = Detections((), (*ambiguities, *dropped))
+        found = Detections((), ambiguities)
         for name, sides in own.items():
             found |= self._locate(name, sides)
         return found
 
-    def _detect_markers(self, grey: Pixels) -> tuple[list[DetectedMarker], Sequence[Ambiguity]]:
-        """All markers of the family in a picture, those with the most exact outlines first, and
-        what was not looked at.
+    def _detect_markers(self, grey: Pixels, until_s: float = math.inf) -> list[DetectedMarker]:
+        """All markers of the family in a picture, those with the most exact outlines first. Which
+        quads are markers is read between corners that are nearly exact."""
+        quads, dropped = dark_quads(grey)
+        quads = _framed_quads(grey, quads, self._codes.cells)
+        found: list[tuple[float, DetectedMarker]] = []
+        for first in range(0, len(quads), BATCH):
+            if first and time.thread_time() > until_s:
+                dropped += len(quads) - first
+                break
+            found += self._read(grey, quads[first : first + BATCH])
+        self.counts["outlines_dropped"] += dropped
+        return [marker for _, marker in sorted(found, key=lambda one: one[0])]
 
-        OpenCV finds outlines, of paper around a marker too; which of them are markers is read
-        between corners that are nearly exact.
-        """
-        right, _, wrong = self._detector.detectMarkers(grey)
-        outlines = np.array([*right, *wrong], dtype=np.float64).reshape(-1, 4, 2)
-        quads = _likely_first(outlines, len(right))
-        dropped = tuple(Ambiguity("too_many_outlines", (), q) for q in quads[MOST_OUTLINES:][:1])
-        quads = quads[:MOST_OUTLINES]
+    def _read(self, grey: Pixels, quads: Floats) -> list[tuple[float, DetectedMarker]]:
+        """The markers among some quads (m, 4, 2), and by how much (px) the last pass moved their
+        corners."""
         for _ in range(PASSES):
             better = line_intersections(side_edge_points(grey, quads, self._codes.cells))
             near = np.abs(better - quads).max(axis=(1, 2), initial=0.0) < FAR_PX
@@ -230,28 +158,31 @@ class MarkerDetector:
             quads = quads[_shortest_sides(quads) > LEAST_SIDE_PX]
         codes = self._codes.read(grey, quads)
         if not codes:
-            return [], dropped
+            return []
         rough = quads[list(codes)]
         sides = side_edge_points(grey, rough, self._codes.cells)
         exact = line_intersections(sides)
         undistorted = self._camera.undistort(sides.reshape(-1, 2)).reshape(sides.shape)
         planes = line_intersections(undistorted)
+        moved = np.abs(exact - rough).max(axis=(1, 2)).tolist()
         markers = []
-        for code, outline, plane in zip(codes.values(), exact, planes, strict=True):
-            turn = -code.first - self._upside_down(np.roll(plane, -code.first, axis=0))
-            outline, plane = np.roll(outline, turn, axis=0), np.roll(plane, turn, axis=0)
-            markers.append(DetectedMarker(code.id, outline, plane))
-        moved = np.abs(exact - rough).max(axis=(1, 2))
-        return [markers[i] for i in moved.argsort() if moved[i] < FAR_PX], dropped
+        for i, code in enumerate(codes.values()):
+            if moved[i] >= FAR_PX:
+                continue
+            outline, plane = (np.roll(a[i], -code.first, axis=0) for a in (exact, planes))
+            is_upside_down = self._is_upside_down(plane)
+            if is_upside_down and self._codes.is_printed_both_ways:
+                outline, plane = np.roll(outline, 2, axis=0), np.roll(plane, 2, axis=0)
+                is_upside_down = False
+            marker = DetectedMarker(code.id, outline, plane, is_upside_down)
+            markers.append((moved[i], marker))
+        return markers
 
-    def _upside_down(self, plane: Floats) -> int:
-        """The number of corners by which a marker must be turned to be upright: 2 or 0.
-
-        Before version 5, OpenCV's AprilTags are upside down beside those of the AprilTag library
-        (opencv/opencv#28823); robots are not.
-        """
+    def _is_upside_down(self, plane: Floats) -> bool:
+        """Whether corners (4, 2) that begin with the upper left one of the pattern stand on their
+        head."""
         heights = np.column_stack([plane, np.ones(4)]) @ self._camera.robot_from_camera[2]
-        return 2 if heights[:2].sum() < heights[2:].sum() else 0
+        return bool(heights[:2].sum() < heights[2:].sum())
 
     def _locate(self, name: str, sides: Mapping[Side, DetectedMarker]) -> Detections:
         """The pose of a teammate from its detected markers."""
@@ -288,7 +219,7 @@ def assign_markers(
     for mark in markers:
         if not any(_is_same_outline(mark, other) for other in seen[mark.id]):
             seen[mark.id].append(mark)
-    reasons = {i: _rejection_reason(len(seen[i]), mounts.get(i, ()), own) for i in seen}
+    reasons = {i: _rejection_reason(seen[i], mounts.get(i, ()), own) for i in seen}
     ambiguities = tuple(
         Ambiguity(reason, tuple(dict.fromkeys(m.robot for m in mounts.get(i, ()))), mark.outline)
         for i, reason in reasons.items()
@@ -304,7 +235,9 @@ def assign_markers(
     return sides, ambiguities
 
 
-def _rejection_reason(count: int, mounts: Sequence[MarkerMount], own: str) -> str:
+def _rejection_reason(
+    seen: Sequence[DetectedMarker], mounts: Sequence[MarkerMount], own: str
+) -> str:
     """Why a marker identifies no teammate; empty if it does."""
     if not mounts:
         return "unknown_marker"
@@ -312,7 +245,9 @@ def _rejection_reason(count: int, mounts: Sequence[MarkerMount], own: str) -> st
         return "ambiguous"
     if mounts[0].robot == own:
         return "own_marker"
-    return "seen_twice" if count > 1 else ""
+    if any(mark.is_upside_down for mark in seen):
+        return "upside_down"
+    return "seen_twice" if len(seen) > 1 else ""
 
 
 def sighting(name: str, fit: PoseFit) -> Sighting:
@@ -322,18 +257,26 @@ def sighting(name: str, fit: PoseFit) -> Sighting:
     along, across = np.array([x, y]) / range_m, np.array([-y, x]) / range_m**2
     place = fit.covariance[:2, :2]
     range_sigma, bearing_sigma = (math.sqrt(way @ place @ way) for way in (along, across))
-    heading_sigma = math.sqrt(fit.covariance[2, 2])
+    heading_sigma = math.hypot(math.sqrt(fit.covariance[2, 2]), LEAST_HEADING_SIGMA)
     if heading_sigma > CLEAR_RAD:
         return Sighting(name, range_m, bearing, range_sigma, bearing_sigma)
     return Sighting(name, range_m, bearing, range_sigma, bearing_sigma, heading, heading_sigma)
 
 
-def _likely_first(outlines: Floats, read: int) -> Floats:
-    """Those of the outlines (n, 4, 2) that are not too small: first those that OpenCV could read,
-    of which there are `read`, then the others, the largest first."""
-    sizes = _shortest_sides(outlines)
-    order = np.lexsort((-sizes, np.arange(len(outlines)) >= read))
-    return np.asarray(outlines[order][sizes[order] > LEAST_SIDE_PX])
+def _framed_quads(grey: Pixels, quads: Floats, cells: int) -> Floats:
+    """Those of the quads (m, 4, 2) that are brighter outside than inside at three of their sides or
+    more, those of the largest difference first."""
+    if not len(quads):
+        return quads
+    ways = quads[:, _NEXT] - quads
+    outwards = 0.5 / cells * ways[..., ::-1] * _OUTWARDS
+    places = quads[:, :, None] + _PROBES[:, None] * ways[:, :, None]
+    pairs = np.stack([places - outwards[:, :, None], places + outwards[:, :, None]], axis=3)
+    levels = sample_grey(grey, pairs.reshape(len(quads), -1, 2)).reshape(pairs.shape[:-1])
+    steps = levels[..., 1] - levels[..., 0]
+    third = np.sort(np.median(steps, axis=2), axis=1)[:, 1]
+    order = np.argsort(-third, kind="stable")
+    return np.asarray(quads[order[third[order] > LEAST_STEP]])
 
 
 def _shortest_sides(quads: Floats) -> Floats:

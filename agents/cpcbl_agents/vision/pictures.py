@@ -12,9 +12,12 @@ import cv2
 import numpy as np
 
 from cpcbl_agents.vision.camera import Pixels
+from cpcbl_agents.vision.quads import noise_sigma
 
-LEAST_CONTRAST = 4.0  # standard deviation of levels: a frame of one colour shows nothing
-DARK, BRIGHT = 32.0, 223.0  # mean level of a frame of one colour that is called black, white
+BLOCK_PX = 4  # high and wide: levels are compared between the means of such blocks
+CLEAR_LEVELS = 40.0  # grey levels between blocks: a frame that surely shows something
+LEAST_LEVELS, LEAST_SIGMAS = 6.0, 2.5  # less, also in sigmas of the noise, is a frame of one colour
+DARK, BRIGHT = 32.0, 223.0  # level of a frame of one colour that is called black, white
 QUALITY = 85  # of JPEGs, percent
 WIDEST_SHOWN_PX = 1280
 
@@ -101,13 +104,24 @@ def pixel_fault(pixels: Pixels, size_px: tuple[int, int]) -> str:
     height, width, channels = (*pixels.shape, 1)[:3]
     if reason := _header_fault(Header(width, height, channels, 8 * pixels.itemsize), size_px):
         return reason
-    means, spreads = cv2.meanStdDev(np.ascontiguousarray(pixels[::8, ::8]))
-    if spreads.max() >= LEAST_CONTRAST:
+    if _contrast(pixels) >= CLEAR_LEVELS:
         return ""
-    level = float(means.mean())
+    # A single bright pixel is a defect of the sensor
+    noise = noise_sigma(cv2.extractChannel(pixels, 1).astype(np.uint8, copy=False))
+    if _contrast(cv2.medianBlur(pixels, 3)) >= max(LEAST_LEVELS, LEAST_SIGMAS * noise):
+        return ""
+    level = float(pixels.mean())
     if level < DARK:
         return "frame_black"
     return "frame_white" if level > BRIGHT else "frame_blank"
+
+
+def _contrast(pixels: cv2.typing.MatLike) -> float:
+    """The difference between the darkest and the brightest block, in that channel in which it is
+    the greatest."""
+    height, width = (max(1, size // BLOCK_PX) for size in pixels.shape[:2])
+    blocks = cv2.resize(pixels, (width, height), interpolation=cv2.INTER_AREA).reshape(-1, 3)
+    return float((blocks.max(axis=0).astype(int) - blocks.min(axis=0)).max())
 
 
 def encode_jpeg(pixels: Pixels) -> bytes:

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cpcbl_agents.vision.camera import Pixels
-from cpcbl_agents.vision.markers import marker_dictionary
+from cpcbl_agents.vision.marker_codes import marker_dictionary
 from cpcbl_launch.calibration.pictures import NamedPicture
 from cpcbl_launch.calibration.statistics import Estimate
 from cpcbl_launch.reporting.metrics import Floats

@@ -1,5 +1,6 @@
 """Real processes of robots with cameras: broken frames, cameras that come and go, no OpenCV."""
 
+import json
 import signal
 import socket
 import subprocess
@@ -11,7 +12,8 @@ from pathlib import Path
 
 import pytest
 from support.cameras import jpeg, picture, png, streaming, url
-from support.processes import eventually
+from support.hostile_frames import tiles, turned_marker
+from support.processes import cpcbl_team, eventually
 from support.routers import open_router
 
 from cpcbl_agents.extras import install_command
@@ -32,6 +34,20 @@ sensing = "camera"
 start = {{ x_m = 1.0, y_m = 1.0 }}
 sensor = {{ rate_hz = {rate_hz} }}
 camera = {{ frames = "{frames}", width_px = 64, height_px = 48 }}
+"""
+
+
+MARKED = """
+name = "tests"
+[robots.r1]
+source = "external"
+sensing = "camera"
+start = { x_m = 1.0, y_m = 1.0 }
+camera = { frames = "" }
+[robots.r2]
+source = "external"
+start = { x_m = 2.0, y_m = 1.0 }
+markers = { front = 0, left = 1, back = 2, right = 3 }
 """
 
 
@@ -92,6 +108,13 @@ def driven(team: Path) -> Iterator[Driven]:
 
 
 GOOD = picture(3, (64, 48))
+
+
+def good(number: int) -> bytes:
+    """A frame that can be used, and that differs from others."""
+    return jpeg(picture(number, (64, 48)))
+
+
 BROKEN = {
     "frame_empty": b"",
     "frame_undecodable": b"garbage" * 100,
@@ -107,17 +130,50 @@ BROKEN = {
 def test_broken_frames_between_good_ones_are_counted_by_reason(tmp_path: Path) -> None:
     with driven(write_team(tmp_path)) as robot:
         for n, image in enumerate(BROKEN.values(), start=1):
-            robot.frames.put(encode(Frame(time.time_ns(), jpeg(GOOD))))
+            robot.frames.put(encode(Frame(time.time_ns(), good(n))))
             robot.until(sightings=n, frame=2 * n - 1)
             robot.frames.put(encode(Frame(time.time_ns(), image)))
             robot.until(frame=2 * n)
         robot.frames.put(b"no message")
-        robot.frames.put(encode(Frame(time.time_ns(), jpeg(GOOD))))
+        robot.frames.put(encode(Frame(time.time_ns(), good(0))))
         robot.until(sightings=len(BROKEN) + 1, **dict.fromkeys(BROKEN, 1))
         before = robot.counts()["odometry"]
         assert robot.counted("odometry", before + 1)
         refused = {str(reason) for reason in Refusal} & robot.counts().keys()
         assert refused <= {"wrong_version"}  # unless the good frame was sooner at hand
+
+
+def hostile_frames() -> list[bytes]:
+    """A floor of tiles, which once ended a robot, and a teammate that fell over, which did too."""
+    fallen = [turned_marker(0, degrees, (200.0, 150.0), 1.2) for degrees in (88.0, 90.0, 91.5)]
+    return [jpeg(frame) for frame in (*map(tiles, (6, 8, 12)), *fallen)]
+
+
+def test_tiles_and_a_teammate_that_fell_over_end_no_robot(tmp_path: Path) -> None:
+    team, images = tmp_path / "team.toml", hostile_frames()
+    team.write_text(MARKED)
+    with driven(team) as robot:
+        for n, image in enumerate(images, start=1):
+            robot.frames.put(encode(Frame(time.time_ns(), image)))
+            assert robot.counted("frame", n)
+        before = robot.counts()
+        assert before["outlines_dropped"] > 0
+        assert before["bad_fit"] + before["upside_down"] > 0
+        assert "frame_failed" not in before
+        assert robot.counted("odometry", before["odometry"] + 5)
+
+
+def test_tiles_and_a_teammate_that_fell_over_restart_no_process_of_a_team(tmp_path: Path) -> None:
+    (tmp_path / "frames").mkdir()
+    for n, image in enumerate(hostile_frames()):
+        (tmp_path / "frames" / f"{n}.jpg").write_bytes(image)
+    (tmp_path / "team.toml").write_text(MARKED.replace('frames = ""', 'frames = "frames"'))
+    report = tmp_path / "report.json"
+    done = cpcbl_team("up", tmp_path / "team.toml", "--duration", 6, "--report", report)
+    assert done.returncode == 0, done.stderr
+    result = json.loads(report.read_text())
+    assert result["restarts"] == {}
+    assert result["robots"]["r1"]["counts"]["frame"] == 6
 
 
 def test_a_camera_disappears_and_comes_back_and_the_robot_goes_on(tmp_path: Path) -> None:
@@ -144,8 +200,8 @@ def test_a_robot_ends_whose_camera_does_not_answer(tmp_path: Path) -> None:
 
 
 def test_a_folder_ends_and_the_robot_goes_on(tmp_path: Path) -> None:
-    for name in "abc":
-        (tmp_path / f"{name}.png").write_bytes(png(GOOD))
+    for number in range(3):
+        (tmp_path / f"{number}.png").write_bytes(png(picture(number, (64, 48))))
     with driven(write_team(tmp_path, ".", rate_hz=1.0)) as robot:
         assert robot.counted("odometry", robot.counts()["odometry"] + 20)
         robot.until(frame=3, sightings=3)

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from cpcbl_agents.vision.camera import Box, Floats, Pixels
-from cpcbl_agents.vision.markers import marker_dictionary
+from cpcbl_agents.vision.marker_codes import marker_dictionary
 from cpcbl_agents.vision.poses import SIDE_ANGLES
 from cpcbl_launch.simulation.camera.scene import Bgr, Scene, SceneCylinder, SceneRobot, with_stand
 from cpcbl_launch.simulation.camera.view import Grey, View, cross_products

@@ -1,0 +1,48 @@
+"""Frames of a bad camera, without the peers: what is recalled, and that nothing is wrong.
+
+The bounds of recall are below those of the better of OpenCV's detector and pupil-apriltags on the
+frames of `make bench-degraded` by what 20 frames leave to chance.
+"""
+
+import numpy as np
+import pytest
+from benchmarks.degraded import false_markers, measured, printed
+from benchmarks.degraded_frames import KINDS, textures
+
+from cpcbl_team.config import MarkerFamily
+
+FRAMES = 20
+LEAST_RECALL = {
+    "clean": 0.8,
+    "lean": 0.8,
+    "motion blur": 0.35,
+    "low light": 0.6,
+    "glare": 0.4,
+    "specular": 0.5,
+    "occlusion": 0.6,
+    "rolling shutter": 0.75,
+    "defocus": 0.3,
+    "jpeg": 0.65,
+    "noise": 0.65,
+}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_markers_of_a_bad_camera_are_recalled_and_none_is_wrong(kind: str) -> None:
+    backgrounds = textures(4, np.random.default_rng(3))
+    score = measured(kind, FRAMES, "apriltag_36h11", backgrounds, seed=2)
+    assert score.wrong == 0
+    assert score.recall >= LEAST_RECALL[kind]
+    for errors in score.errors.values():
+        assert sum(error >= 3.0 for error in errors) <= 1
+        assert max(errors) < 6.0
+    assert printed([score], ()).row_count == 1
+
+
+def test_no_marker_is_in_pictures_without_one() -> None:
+    """The families whose codes are the shortest are the likeliest to be seen where there are none;
+    `make bench-degraded` has natural pictures."""
+    backgrounds = textures(12, np.random.default_rng(4))
+    families: tuple[MarkerFamily, ...] = ("aruco_4x4_50", "apriltag_16h5")
+    for family in families:
+        assert false_markers(family, backgrounds, 40, seed=1) == 0
