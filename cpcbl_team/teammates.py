@@ -127,8 +127,8 @@ class TeammateScreen:
 
     def _evidence(self, state: State, observation: Observation) -> OffsetEvidence:
         """What a report says of the offset of the estimate."""
-        independent, dependent = observation.independent, observation.dependent
-        sums = observation.information(independent)
+        dependent = observation.dependent
+        sums = observation.information(observation.noise(0.0))
         variance = 0.5 * (dependent.xx + dependent.yy)
         hh = state.estimate.covariance.hh
         return OffsetEvidence(sums, Covariance2(variance, 0.0, variance), hh)
@@ -145,7 +145,7 @@ class TeammateScreen:
         if observation.observer is None:
             if self.has_recent_reports(state, now) and not is_lost:
                 is_accepted = nis <= self._gates[1]
-                sums = position.information(position.independent)
+                sums = position.information(position.noise(0.0))
                 state = self._with_own_sensors(state, is_accepted, not is_accepted, sums)
             return state, True
         heading = observation.of_heading(state.estimate.pose)

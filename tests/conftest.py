@@ -1,5 +1,6 @@
 """What holds for every test: none is timed, and no process that it started outlives it."""
 
+import logging
 import signal
 from collections.abc import Iterator
 
@@ -42,6 +43,15 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         module = getattr(item, "module", None)
         if REAL & vars(module).keys():
             item.add_marker("process")
+
+
+@pytest.fixture(autouse=True)
+def log_levels_are_as_before() -> Iterator[None]:
+    """A command that runs in the process of a test may say less of the bus than others."""
+    bus = logging.getLogger("cpcbl_transport")
+    level = bus.level
+    yield
+    bus.setLevel(level)
 
 
 @pytest.fixture(autouse=True, scope="module")

@@ -35,7 +35,7 @@ class TrustSettings(Table, frozen=True, kw_only=True):
     """A sender is used again after its messages were right for this time."""
     least_sigma_m: NotNegative = 0.02
     """The pose of a teammate is believed to be no better than this."""
-    guest_sigma_m: NotNegative = 0.05
+    guest_sigma_m: NotNegative = 0.03
     """The same of a guest that no other source has confirmed yet."""
     clock_ahead_s: NotNegative = 0.1
     """Help is refused if the clock of its sender is further ahead than this."""

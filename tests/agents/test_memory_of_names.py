@@ -8,6 +8,7 @@ import pytest
 from support.buses import SECOND, TeamOnBus, robot_at, saw, team_of
 
 from cpcbl_agents import clocks, collaboration
+from cpcbl_agents.input_diagnosis import monitor
 from cpcbl_team import state, teammates
 from cpcbl_team.config import GuestSettings
 from cpcbl_team.inputs import Fix, Sighting
@@ -36,6 +37,7 @@ def test_names_of_guests_that_left_are_forgotten(monkeypatch: pytest.MonkeyPatch
         (collaboration, "MOST_PEERS"),
         (teammates, "MOST_SENDERS"),
         (state, "MOST_OBJECTS"),
+        (monitor, "STEPS"),  # so many frames are kept, too
     ):
         monkeypatch.setattr(module, limit, FEW, raising=False)
     team = msgspec.structs.replace(

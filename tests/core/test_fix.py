@@ -16,6 +16,7 @@ from support.core import (
     random_matrix,
     state_at,
 )
+from support.standing import FORMULAS
 
 from cpcbl_team.config import Field, OdometrySettings, SensorSettings
 from cpcbl_team.estimate import Estimate
@@ -116,7 +117,8 @@ def test_fixes_that_repeat_do_not_pull_a_teammate(
     far below the sigma that is left."""
     sensor = replace(SENSOR, range_share=share, bearing_sigma_deg=sigma_deg)
     here = Estimate(Pose2(0.0, 0.0, 0.0), diagonal(1e-5, 1e-5))
-    robot, errors = localizer("joint", Field(), odometry=OdometrySettings(moves=False)), []
+    settings = {"odometry": OdometrySettings(moves=False), "collaboration": FORMULAS}
+    robot, errors = localizer("joint", Field(), **settings), []
     for seed in range(40):
         rng, fix = np.random.default_rng(seed), None
         state = state_at(Pose2(3.3, 0.0, 0.0), diagonal(0.5, 0.1))

@@ -21,7 +21,15 @@ from support.core import (
 )
 
 from cpcbl_team.config import Field, Gives, Landmark, LocalizerSettings, SensorSettings, Variant
-from cpcbl_team.estimate import POSE, Estimate, Information, Scope, merge, with_circular_position
+from cpcbl_team.estimate import (
+    POSE,
+    POSITION,
+    Estimate,
+    Information,
+    Scope,
+    merge,
+    with_circular_position,
+)
 from cpcbl_team.geometry import Pose2, wrap_angle
 from cpcbl_team.inputs import Sighting, Sightings
 from cpcbl_team.localizer import Localizer
@@ -143,7 +151,9 @@ def composed(robot: Localizer, state: State, frame: Sightings) -> tuple[Estimate
                 evidence = evidence.add(c.row, c.residual, c.sigma**2)
     if scope is None:
         return prior, counts
-    after = merge(prior, evidence, POSE if r.variant == "joint" else scope)
+    ranges_turn = r.variant == "oval" and robot.field.gives_only_ranges and not r.paper_uncertainty
+    is_whole = r.variant == "joint" or (ranges_turn and scope is POSITION)
+    after = merge(prior, evidence, POSE if is_whole else scope)
     if r.paper_uncertainty and r.variant != "joint":
         after = after._replace(covariance=after.covariance._replace(xh=0.0, yh=0.0))
     return with_circular_position(after) if r.variant == "circular" else after, counts

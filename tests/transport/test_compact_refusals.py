@@ -244,5 +244,6 @@ def test_a_belief_is_read_under_the_key_of_a_robot_and_no_other(name: str) -> No
         assert read == replace(known, robot=name)
     else:
         assert read is (Refusal.WRONG_TYPE if "/" in name else Refusal.UNKNOWN_ROBOT)
-    for key in (name, f"belief/{name}", f"fix/{name}"):
-        assert isinstance(decode_help(key, encode_help(BELIEF)), Refusal)
+    if "/" not in name:
+        for key in (name, f"belief/{name}", f"fix/{name}"):
+            assert decode_help(key, encode_help(BELIEF)) is Refusal.WRONG_TYPE

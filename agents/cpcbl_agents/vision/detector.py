@@ -54,12 +54,12 @@ class CameraDetector:
 
     def detect(self, frame: Frame | Picture) -> Sightings | str:
         """The sightings in a frame, or the reason why it cannot be used (`frame_...`)."""
-        found = self._guarded(lambda: self._decode_and_detect(frame)[1])
+        found = self._attempt(lambda: self._decode_and_detect(frame)[1])
         return found if isinstance(found, str) else Sightings(frame.stamp_ns, found.sightings)
 
     def detect_and_annotate(self, frame: Frame | Picture) -> tuple[Sightings | str, AnnotatedFrame]:
         """The same, and the annotated frame; it has no picture if the frame cannot be decoded."""
-        found = self._guarded(lambda: self._annotated(frame))
+        found = self._attempt(lambda: self._annotated(frame))
         if not isinstance(found, str):
             return found
         unclear = (UnclearObject(found),)
@@ -93,7 +93,7 @@ class CameraDetector:
     def detections(self, pixels: Pixels) -> Detections | str:
         """All detections in a picture (height, width, 3), BGR, or why it cannot be used."""
         size_px = self.camera.size_px
-        return self._guarded(lambda: pixel_fault(pixels, size_px) or self._detections(pixels))
+        return self._attempt(lambda: pixel_fault(pixels, size_px) or self._detections(pixels))
 
     def _detections(self, pixels: Pixels) -> Detections | str:
         until_s = time.thread_time() + self._frame_s
@@ -108,7 +108,7 @@ class CameraDetector:
         self._checks.note_uprightness(found)
         return "camera_upside_down" if self._checks.is_upside_down else found
 
-    def _guarded(self, work: Callable[[], T]) -> T | str:
+    def _attempt(self, work: Callable[[], T]) -> T | str:
         """The result of `work`, or `frame_failed`: nobody can show every picture to a detector, and
         one frame must not end a robot."""
         try:
