@@ -117,8 +117,9 @@ def test_fixes_that_repeat_do_not_pull_a_teammate(
     far below the sigma that is left."""
     sensor = replace(SENSOR, range_share=share, bearing_sigma_deg=sigma_deg)
     here = Estimate(Pose2(0.0, 0.0, 0.0), diagonal(1e-5, 1e-5))
-    settings = {"odometry": OdometrySettings(moves=False), "collaboration": FORMULAS}
-    robot, errors = localizer("joint", Field(), **settings), []
+    stands = OdometrySettings(moves=False)
+    robot = localizer("joint", Field(), odometry=stands, collaboration=FORMULAS)
+    errors = []
     for seed in range(40):
         rng, fix = np.random.default_rng(seed), None
         state = state_at(Pose2(3.3, 0.0, 0.0), diagonal(0.5, 0.1))

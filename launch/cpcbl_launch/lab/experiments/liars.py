@@ -217,7 +217,7 @@ def tables(result: Liars) -> Iterable[RenderableType]:
     believed = {(r.case.lie, r.case.honest): r for r in result.rows if not r.case.trust}
     for honest in sorted({r.case.honest for r in result.rows}, reverse=True):
         title = f"one liar, {honest} honest: robots that drive, {result.seeds} seeds"
-        figures = ("m", "ratio", "80 %", "in 3 σ", "believed", "found", "s", "back", "false")
+        figures = ("m", "ratio", "80 %", "3 σ", "believed", "found", "s", "back", "false")
         shown = table(title, ("lie",), figures)
         for row in result.rows:
             if row.case.honest == honest and row.case.trust:
@@ -226,7 +226,7 @@ def tables(result: Liars) -> Iterable[RenderableType]:
     yield (
         "Column m is the RMSE; ratio is relative to the team without the liar, and 80 %\n"
         "the range of 80 % of the seeds; believed is the ratio with trust switched off.\n"
-        "Column in 3 σ is the share of the seed in which it is smallest.\n"
+        "Column 3 σ is the share inside, of the seed in which it is smallest.\n"
         "Column found counts the robots that detected the liar, s is the time after the\n"
         "lie began, and back the time after its end until they used it again, in s.\n"
         "Column false is the time that honest robots spent in quarantine, s per run."
