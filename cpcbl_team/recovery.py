@@ -31,6 +31,7 @@ WINDOW_NS: Final = 20_000_000_000
 SPACING_NS: Final = 500_000_000  # one piece of evidence an object and so long
 MOST_PIECES: Final = 30
 INFLATION_NS: Final = 1_000_000_000
+DOUBT_NS: Final = 5_000_000_000  # wrong inputs are named before they move a robot elsewhere
 QUESTION_NS: Final = 2_000_000_000  # a suspicious robot asks so often whether it is elsewhere
 SUSPICIOUS: Final = 2  # of the last innovations rejected; of 20 that is 2 in 10 000 times
 UNKNOWNS: Final = 3  # of a pose
@@ -308,7 +309,7 @@ class Recovery:
             return state
         elif now - memory.suspected_ns > WINDOW_NS:
             return with_recovery(state, memory._replace(suspected_ns=-1))
-        if now - memory.relocalization_ns < QUESTION_NS:
+        if now - max(memory.relocalization_ns, memory.suspected_ns + DOUBT_NS) < QUESTION_NS:
             return state
         evidence = self._evidence_since(memory, memory.suspected_ns)
         own = tuple(e for e in evidence if not e.from_teammate)  # a liar must not move it

@@ -166,7 +166,7 @@ def test_only_its_own_evidence_moves_a_robot_that_is_not_lost(from_teammate: boo
         here = Pose2(0.3 * i, 0.05 * i * i, 0.3 * i)
         there = elsewhere @ here
         sigmas = 0.05, 0.0, 0.0
-        fix = Evidence(i * SPACING_NS, here, "mate", there.x, there.y, None, None, *sigmas)
+        fix = Evidence((i + 16) * SPACING_NS, here, "mate", there.x, there.y, None, None, *sigmas)
         pieces.append(fix._replace(from_teammate=from_teammate))
     now = pieces[-1].stamp_ns
     memory = Memory(RecoveryMemory(evidence=tuple(pieces), suspected_ns=0))
