@@ -27,6 +27,7 @@ SLOW_COMMON_M: Final = 0.02
 the estimate, which differs between the times of their reports, the more the longer the mean."""
 CONFLICT: Final = 18.0
 """Two sources contradict each other beyond this chi-square (two degrees of freedom)."""
+USUAL: Final = 6.0  # 95 % of correct sources differ by less (chi-square, two degrees of freedom)
 LEAD: Final = 7.0
 """Of two that contradict each other one is clearly nearer to a third source by this difference of
 their chi-squares."""
@@ -139,6 +140,8 @@ def disagreement(one: MeanOffset, other: MeanOffset) -> float:
 def bias_variance(one: MeanOffset, other: MeanOffset) -> float:
     """The square of the bias (m^2) by which the noise of two means does not explain their
     difference."""
+    if disagreement(one, other) <= USUAL:
+        return 0.0
     dx, dy = one.x - other.x, one.y - other.y
     c, d = one.covariance, other.covariance
     excess = dx * dx + dy * dy - (c.xx + c.yy + d.xx + d.yy)
