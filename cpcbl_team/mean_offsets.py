@@ -12,7 +12,7 @@ import math
 from collections.abc import Mapping
 from typing import Final, NamedTuple
 
-from cpcbl_team.estimate import ZERO3, Covariance3, Information, Sums
+from cpcbl_team.estimate import ZERO3, Covariance3, Sums
 from cpcbl_team.gaussian import Covariance2
 from cpcbl_team.geometry import new
 
@@ -114,16 +114,6 @@ class FadingOffsets(NamedTuple):
 
 Means = Mapping[str, MeanOffset]
 """The means of some sources, by name."""
-
-
-def evidence_of_position(offset: tuple[float, float], noise: Covariance2) -> Sums:
-    """What a reported position at this offset (m) from the estimate says; `noise`: the independent
-    part of its covariance, m^2."""
-    (x, y), (xx, xy, yy) = offset, noise
-    k = 1.0 / max(xx * yy - xy * xy, 1e-16)
-    xx, xy, yy = k * yy, -k * xy, k * xx
-    matrix = Covariance3(xx, xy, yy, 0.0, 0.0, 0.0)
-    return Information(matrix, (xx * x + xy * y, xy * x + yy * y, 0.0))
 
 
 # How far two sources disagree ---------------------------------------------------------------------

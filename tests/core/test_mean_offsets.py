@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cpcbl_team.estimate import Information
+from cpcbl_team.fusion import Observation
 from cpcbl_team.gaussian import Covariance2
 from cpcbl_team.mean_offsets import (
     CONFLICT,
@@ -18,11 +19,11 @@ from cpcbl_team.mean_offsets import (
     compared_with_majority,
     compared_with_own_sensors,
     disagreement,
-    evidence_of_position,
 )
 
 SECOND = 1_000_000_000
 FADING_NS = 2 * SECOND
+AXES = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
 SHARP = Covariance2(1e-4, 0.0, 1e-4)
 
 
@@ -34,7 +35,7 @@ def summed(offsets: list[tuple[float, float]], dependent: Covariance2 = NOTHING)
     """Reports of 1 cm, ten times a second."""
     sums = FadingOffsets()
     for i, offset in enumerate(offsets):
-        evidence = evidence_of_position(offset, SHARP)
+        evidence = Observation(AXES, offset, SHARP, NOTHING).information(SHARP)
         sums = sums.with_report(i * SECOND // 10, FADING_NS, evidence, dependent)
     return sums
 

@@ -190,9 +190,10 @@ class Panorama:
     def _panorama_angles(self, pixels: Floats) -> tuple[Floats, Floats]:
         """Azimuths and slopes (n,) of pixels (n, 2)."""
         rays = self._camera.rays(pixels)
-        azimuths = self._yaw - np.arctan2(rays[:, 1], rays[:, 0])
-        azimuths = np.remainder(azimuths + math.pi, math.tau) - math.pi
-        return azimuths, -rays[:, 2] / np.maximum(np.hypot(rays[:, 0], rays[:, 1]), 1e-9)
+        azimuths = wrap_angles(self._yaw - np.arctan2(rays[:, 1], rays[:, 0]))
+        return azimuths, -rays[:, 2] / np.maximum(
+            np.hypot(rays[:, 0], rays[:, 1]), 1e-9
+        )
 
     def _columns_and_rows(self, azimuths: Floats, slopes: Floats) -> tuple[Floats, Floats]:
         return (azimuths - self.first_azimuth) / self.step, (slopes - self.first_slope) / self.step
@@ -223,3 +224,8 @@ def _grid(width: int, height: int) -> Floats:
     """All (x, y) of a picture, row by row: (width * height, 2)."""
     y, x = np.mgrid[:height, :width]
     return np.column_stack([x.ravel(), y.ravel()]).astype(np.float64)
+
+
+def wrap_angles(angles: Floats) -> Floats:
+    """The same angles (rad), from -pi to pi."""
+    return np.remainder(angles + math.pi, math.tau) - math.pi

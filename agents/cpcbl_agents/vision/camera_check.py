@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from cpcbl_agents.vision.camera import wrap_angles
 from cpcbl_agents.vision.camera_errors import CameraErrors
 from cpcbl_team.config import OdometryNoise, Start
 from cpcbl_team.estimate import ZERO3, Estimate
@@ -34,7 +35,7 @@ STEPS, ROBUST_SIGMAS = 6, 2.5
 CONVERGED = 0.1  # the last change of the errors, in sigmas
 MOST_ERRORS = np.array([0.3, 0.3])  # rad, and of the logarithm: no camera is so wrong
 MOST_SCATTER = 9.0  # a fit that is worse explains nothing
-LEAST_SIGMA = 1e-4  # m and rad, of a motion
+LEAST_SIGMA = 1e-4  # m and rad, of a motion and of a start
 
 
 class Estimated(NamedTuple):
@@ -145,7 +146,8 @@ class CameraCheck:
         s = self._start
         if s is None:
             return
-        information = np.array([s.sigma_m, s.sigma_m, math.radians(s.heading_sigma_deg)]) ** -2.0
+        sigmas = np.array([s.sigma_m, s.sigma_m, math.radians(s.heading_sigma_deg)])
+        information = np.maximum(sigmas, LEAST_SIGMA) ** -2.0  # a start may be said to be exact
         normal[range(3), range(3)] += information
         offset = np.array([s.x_m, s.y_m, math.radians(s.heading_deg)]) - x[:3]
         offset[2] = math.remainder(offset[2], math.tau)
@@ -171,7 +173,7 @@ class CameraCheck:
         size, rows = len(x), np.arange(len(seen))
         parts = []
         for residual, (by_distance, by_angle, by_focal), sigma in (
-            (_wrapped(seen[:, 2] - bearing), d_bearing, seen[:, 3]),
+            (wrap_angles(seen[:, 2] - bearing), d_bearing, seen[:, 3]),
             (seen[:, 4] - read, d_range, seen[:, 5]),
         ):
             j = np.zeros((len(seen), size))
@@ -195,7 +197,7 @@ def _motion_errors(x: Floats, motions: Floats, whiteners: Floats) -> tuple[Float
     moved = np.stack([c * dx + s * dy, c * dy - s * dx, after[:, 2] - before[:, 2]], axis=1)
     scales = np.array([1.0 + x[-2], 1.0 + x[-2], 1.0 + x[-1]])
     residual = scales * motions - moved
-    residual[:, 2] = _wrapped(residual[:, 2])
+    residual[:, 2] = wrap_angles(residual[:, 2])
     j = np.zeros((number, 3, len(x)))
     k, zero, one = np.arange(number), np.zeros(number), np.ones(number)
     turn = np.array([[c, s, zero], [-s, c, zero], [zero, zero, one]]).transpose(2, 0, 1)
@@ -213,7 +215,3 @@ def _whitener(motion: Estimate) -> Floats:
     xx, xy, yy, xh, yh, hh = motion.covariance
     covariance = np.array([[xx, xy, xh], [xy, yy, yh], [xh, yh, hh]])
     return np.linalg.inv(np.linalg.cholesky(covariance + LEAST_SIGMA**2 * np.eye(3)))
-
-
-def _wrapped(angles: Floats) -> Floats:
-    return np.remainder(angles + math.pi, math.tau) - math.pi
