@@ -191,9 +191,7 @@ class Panorama:
         """Azimuths and slopes (n,) of pixels (n, 2)."""
         rays = self._camera.rays(pixels)
         azimuths = wrap_angles(self._yaw - np.arctan2(rays[:, 1], rays[:, 0]))
-        return azimuths, -rays[:, 2] / np.maximum(
-            np.hypot(rays[:, 0], rays[:, 1]), 1e-9
-        )
+        return azimuths, -rays[:, 2] / np.maximum(np.hypot(rays[:, 0], rays[:, 1]), 1e-9)
 
     def _columns_and_rows(self, azimuths: Floats, slopes: Floats) -> tuple[Floats, Floats]:
         return (azimuths - self.first_azimuth) / self.step, (slopes - self.first_slope) / self.step
