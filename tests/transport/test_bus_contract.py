@@ -215,7 +215,8 @@ def test_everything_can_be_closed_twice_and_after_its_session(pair: Pair) -> Non
     mark = pair.other.declare_token("alive/r2")
     wait_until(lambda: ("alive/r2", True) in tokens.events)
     mark.close()
-    assert ("alive/r1", True) not in tokens.events
+    # Its withdrawal may still be on its way when the watcher comes; what counts is the end.
+    wait_until(lambda: not dict(tokens.events).get("alive/r1"))
 
 
 # Liveliness -------------------------------------------------------------------------------------
