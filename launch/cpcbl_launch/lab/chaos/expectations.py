@@ -303,7 +303,7 @@ def kidnap(run: FaultRun) -> list[Check]:
     lost_s = log.reported_lost_after_s(robot, at_s)
     believed = [name for name in run.robots if not log.distrusted_peers(name)]
     return [
-        at_least("distance of the kidnapping", moved_m, 2.9, "m"),
+        at_least("distance of the kidnapping", moved_m, 2.0, "m"),
         at_most("it reported that it was lost after", lost_s, 3.0, "s"),
         at_most("it was localized after", log.localized_after_s(robot, at_s), 8.0, "s"),
         *checks_unaffected(log, run.others, at_s, run.end_s),

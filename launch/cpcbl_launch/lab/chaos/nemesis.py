@@ -134,6 +134,8 @@ class Nemesis:
         """Times in which a robot's clock was wrong, or about to be."""
         self.forged: list[Span] = []
         """Times in which somebody sent in the name of a robot, under a tier that is not its."""
+        self.meaningless = 0
+        """Payloads sent that are no messages: none if a fault ends before its process begins."""
 
     @property
     def samples(self) -> Mapping[tuple[str, int], Sequence[ProcessSample]]:
@@ -165,6 +167,8 @@ class Nemesis:
         kept = {"clock": self.unknown, "flood": self.forged}.get(fault.name)
         if kept is not None:
             kept.append(span)
+        if fault.name == "garbage":
+            self.meaningless += run.sent
 
     def healing_time_s(self) -> float:
         """Waits until all that was killed runs again; returns the time (s)."""
@@ -189,7 +193,8 @@ class Nemesis:
         )
         yield equal_to("tracebacks in logs", team.tracebacks(), 0)
         refused = sum(refusals(team.run_log, name) for name in team.robots)
-        yield at_least("meaningless payloads counted", refused, 10 * self.begun["garbage"])
+        due = min(10 * self.begun["garbage"], self.meaningless // 10)
+        yield at_least("meaningless payloads counted", refused, due)
         yield at_least("kinds of faults", len(self.begun), min(len(FAULTS) - 1, duration_s / 8.0))
         judged = (FIELD, UP, FAR_ROUTER) if duration_s >= JUDGED_S else ()
         lives = process_lives(self._sampler.samples)
