@@ -4,6 +4,8 @@
 PYTHON ?= python3
 VENV ?= .venv
 BIN = $(VENV)/bin
+# Where it is set, each process that the tests start compiles whatever it imports once more.
+export PYTHONDONTWRITEBYTECODE =
 
 .PHONY: setup demo test quick check unit test-long test-trial test-compiled test-docker test-bench \
   chaos net fuzz compiled bench bench-degraded bench-detection bench-latency bench-pictures \

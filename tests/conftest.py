@@ -1,6 +1,7 @@
 """What holds for every test: none is timed, and no process that it started outlives it."""
 
 import logging
+import os
 import signal
 from collections.abc import Iterator
 
@@ -29,7 +30,9 @@ def pytest_configure() -> None:
     """Restores the signals that a background job or `nohup` ignores, for children inherit that.
 
     The tests themselves still survive a closed terminal; what they start reacts as in a terminal.
+    Numpy, which no module here has loaded yet, works without threads, as in every command.
     """
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
     if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:

@@ -3,7 +3,7 @@
 import logging
 from collections import Counter, deque
 from collections.abc import Callable, Iterable
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import msgspec
 
@@ -67,6 +67,24 @@ class BoundedSteppable(Steppable, Protocol):
         """Does what is due, and handles what has arrived as far as it may."""
 
 
+class NodeStart(NamedTuple):
+    """When and as what a node starts."""
+
+    stamp_ns: int  # of the robot's time
+    incarnation: str  # distinguishes its process from others with the same robot's name
+    speed: float = 1.0  # robot time beside real time
+
+
+class NodeCallbacks(NamedTuple):
+    """What a node tells the process that runs it."""
+
+    on_arrival: Callable[[], None] = lambda: None  # called on a thread of the bus
+    on_status: Callable[[Status], None] = lambda status: None  # called once a second
+
+
+NO_CALLBACKS = NodeCallbacks()
+
+
 class Node:
     """Runs a `Robot` on a `Bus`. `step` it whenever `next_ns` has come or something arrived."""
 
@@ -75,15 +93,12 @@ class Node:
         robot: Robot,
         team: Team,
         bus: Bus,
-        start_ns: int,
-        incarnation: str,
-        on_arrival: Callable[[], None] = lambda: None,
-        speed: float = 1.0,
-        on_status: Callable[[Status], None] = lambda status: None,
+        start: NodeStart,
+        callbacks: NodeCallbacks = NO_CALLBACKS,
     ) -> None:
-        """`speed`: robot time beside real time. `on_status`: called once a second."""
+        start_ns, incarnation, speed = start
         self.robot, self._incarnation, self._name = robot, incarnation, robot.name
-        self._on_arrival, self._on_status, self._status_ns = on_arrival, on_status, start_ns
+        self._callbacks, self._status_ns = callbacks, start_ns
         self._frame_key = topics.IN_FRAME.at(robot=robot.name)
         rules = team.robots[robot.name].collaboration
         self._team, self._passive = frozenset(team.robots), rules.passive
@@ -125,13 +140,13 @@ class Node:
             dropped = self._inbox.put(key, payload[: messages.LARGEST_PAYLOAD + 1])
             if dropped:
                 self.counts["inbox_overflow"] += dropped
-        self._on_arrival()
+        self._callbacks.on_arrival()
 
     def _on_token(self, key: str, alive: bool) -> None:
         if len(self._liveliness_events) == INBOX:
             self.counts["news_overflow"] += 1
         self._liveliness_events.append((key, alive))
-        self._on_arrival()
+        self._callbacks.on_arrival()
 
     def _on_own_name(self, key: str, alive: bool) -> None:
         if key.endswith("/" + self._incarnation):
@@ -285,7 +300,7 @@ class Node:
         overload = self._load.judge(len(self._inbox), self._inbox.pop_dropped())
         problems = (*overload, *problems, *self.robot.sensing.problems)
         status = msgspec.structs.replace(status, inputs=inputs, problems=problems)
-        self._on_status(status)
+        self._callbacks.on_status(status)
         self._publish(status)
         key = topics.json_key(topics.STATUS.at(robot=self._name))
         as_json = self._declarations.publisher(topics.STATUS, key)
@@ -302,17 +317,14 @@ class GuestNode(Node):
         name: str,
         team: Team,
         bus: Bus,
-        start_ns: int,
-        incarnation: str,
-        on_arrival: Callable[[], None] = lambda: None,
-        speed: float = 1.0,
+        start: NodeStart,
         camera: OwnCamera | None = None,
-        on_status: Callable[[Status], None] = lambda status: None,
+        callbacks: NodeCallbacks = NO_CALLBACKS,
     ) -> None:
-        robot = build_robot(name, team, start_ns, camera=camera)
-        super().__init__(robot, team, bus, start_ns, incarnation, on_arrival, speed, on_status)
-        self._ask_ns = start_ns
-        self._warn_ns: int | None = start_ns + WARN_AFTER_NS
+        robot = build_robot(name, team, start.stamp_ns, camera=camera)
+        super().__init__(robot, team, bus, start, callbacks)
+        self._ask_ns = start.stamp_ns
+        self._warn_ns: int | None = start.stamp_ns + WARN_AFTER_NS
         self._model = messages.model_from_settings(team.robots[name])
         self._join = bus.publisher(topics.JOIN.at(robot=name), topics.JOIN.qos)
 

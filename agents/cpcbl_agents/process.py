@@ -11,7 +11,7 @@ import msgspec
 
 from cpcbl_agents.clock import Clock
 from cpcbl_agents.earlier_processes import NEVER_RAN, EarlierRuns, OwnTokens, wait_until_alone
-from cpcbl_agents.node import BoundedSteppable, Node
+from cpcbl_agents.node import BoundedSteppable, Node, NodeCallbacks, NodeStart
 from cpcbl_agents.robot import Robot, build_robot
 from cpcbl_agents.robot_log import RobotLogger
 from cpcbl_agents.sources import OwnCamera
@@ -129,18 +129,16 @@ def run_robot(
             before if restarted is None else EarlierRuns(restarted, before.ran or restarted),
             camera,
         )
-        start_ns, incarnation = clock.now_ns(), new_incarnation()
-        logger, tokens = RobotLogger(name), OwnTokens(bus, name, incarnation)
+        start = NodeStart(clock.now_ns(), new_incarnation(), clock.speed)
+        logger, tokens = RobotLogger(name), OwnTokens(bus, name, start.incarnation)
 
         def on_status(status: Status) -> None:
             logger.log_status(status)
             if node.has_moved:
                 tokens.declare_moved()
 
-        node = Node(
-            *(robot, team, wrap_bus(bus), start_ns, incarnation),
-            *(loop.on_arrival, clock.speed, on_status),
-        )
+        callbacks = NodeCallbacks(loop.on_arrival, on_status)
+        node = Node(robot, team, wrap_bus(bus), start, callbacks)
         logger.log_connected(team, link.endpoints)
         loop.run(node, with_watchdog(stop_on_clock_step(name, team, clock, stop)))
 

@@ -1,29 +1,40 @@
 """THE table of the commands of `cpcbl-team`."""
 
+import importlib
 import importlib.metadata
 from typing import Annotated
 
 import typer
 
 from cpcbl_launch.commands import options
-from cpcbl_launch.commands.calibrating import calibrate_app
-from cpcbl_launch.commands.diagnosing import doctor, list_teams, status
-from cpcbl_launch.commands.experimenting import experiment_app
-from cpcbl_launch.commands.initializing import init
-from cpcbl_launch.commands.measuring import chaos, evaluate, simulate
-from cpcbl_launch.commands.preparing import check, compose, keys
-from cpcbl_launch.commands.running import field, gateway, router, up
-from cpcbl_launch.commands.watching import look, observer, traffic, view
 from cpcbl_launch.run import robot
 
 HELP = {"help_option_names": ["-h", "--help"]}
-app = typer.Typer(
-    help="A team of robots that find out where they are, together.",
-    no_args_is_help=True,
-    pretty_exceptions_enable=False,
-    context_settings=HELP,
-)
 _PASSED_ON = {"allow_extra_args": True, "ignore_unknown_options": True, "help_option_names": []}
+# Command: module of `commands`, and the function or the group of commands in it
+COMMANDS = {
+    "init": "initializing.init",
+    "check": "preparing.check",
+    "doctor": "diagnosing.doctor",
+    "keys": "preparing.keys",
+    "up": "running.up",
+    "view": "watching.view",
+    "status": "diagnosing.status",
+    "traffic": "watching.traffic",
+    "look": "watching.look",
+    "observer": "watching.observer",
+    "router": "running.router",
+    "gateway": "running.gateway",
+    "field": "running.field",
+    "compose": "preparing.compose",
+    "simulate": "measuring.simulate",
+    "evaluate": "measuring.evaluate",
+    "chaos": "measuring.chaos",
+    "list": "diagnosing.list_teams",
+    "robot": "",  # it has a parser of its own
+    "calibrate": "calibrating.calibrate_app",
+    "experiment": "experimenting.experiment_app",
+}
 
 
 def _print_version(asked: bool) -> None:
@@ -32,7 +43,6 @@ def _print_version(asked: bool) -> None:
         raise typer.Exit
 
 
-@app.callback()
 def _common_options(
     version: Annotated[
         bool,
@@ -53,13 +63,26 @@ def run_robot(
     robot.main([str(team_file), name, *context.args])
 
 
-for command in (
-    *(init, check, doctor, keys, up, view, status, traffic, look, observer),
-    *(router, gateway, field, compose, simulate, evaluate, chaos),
-):
-    app.command()(command)
-app.command("list")(list_teams)
-app.command("robot", help=robot.DESCRIPTION, context_settings=_PASSED_ON)(run_robot)
+def build_app(command: str = "") -> typer.Typer:
+    """The command line with this command alone, if there is one of this name, else with all.
 
-app.add_typer(calibrate_app, name="calibrate")
-app.add_typer(experiment_app, name="experiment")
+    Whoever runs one command does not wait until the modules of the others are loaded.
+    """
+    app = typer.Typer(
+        help="A team of robots that find out where they are, together.",
+        no_args_is_help=True,
+        pretty_exceptions_enable=False,
+        context_settings=HELP,
+    )
+    app.callback()(_common_options)
+    for name in [command] if command in COMMANDS else COMMANDS:
+        if name == "robot":
+            app.command(name, help=robot.DESCRIPTION, context_settings=_PASSED_ON)(run_robot)
+            continue
+        module, attribute = COMMANDS[name].split(".")
+        found = getattr(importlib.import_module(f"cpcbl_launch.commands.{module}"), attribute)
+        if isinstance(found, typer.Typer):
+            app.add_typer(found, name=name)
+        else:
+            app.command(name)(found)
+    return app

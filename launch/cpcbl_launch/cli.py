@@ -26,6 +26,8 @@ def main() -> None:
     one line and exit code 1. After Ctrl-C the exit code is 130. Everything else is a bug, and its
     traceback is shown.
     """
+    # The matrices here are small: on them, threads of numpy wait for each other, and burn a core
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     try:
         _open_standard_files()
         _run()
@@ -79,8 +81,9 @@ def _run_command() -> None:
 
         run_robot(words[1:])
     else:
-        from cpcbl_launch.app import app
+        from cpcbl_launch.app import build_app
 
+        app = build_app(words[0] if words else "")
         app(with_values(words), prog_name="cpcbl-team")
 
 

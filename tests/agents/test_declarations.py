@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from support.buses import Subscription, TeamOnBus, examples, robot_at, saw, standing, team_of
 
 from cpcbl_agents.declarations import LivelinessTokens
-from cpcbl_agents.node import Node
+from cpcbl_agents.node import Node, NodeStart
 from cpcbl_agents.robot import build_robot
 from cpcbl_team.inputs import Fix, Odometry, Sighting
 from cpcbl_team.tiers import LOWEST_TIER
@@ -219,7 +219,7 @@ class Wired(TeamOnBus):
         super().__init__(TEAM, here=[])
         self.recording = Recording(self.hub)
         self.robots["me"] = build_robot("me", TEAM, 0)
-        self.nodes["me"] = Node(self.robots["me"], TEAM, self.recording, 0, "1")
+        self.nodes["me"] = Node(self.robots["me"], TEAM, self.recording, NodeStart(0, "1"))
         self.stand_still(0.5)
 
     @property
@@ -363,7 +363,7 @@ def test_nothing_is_declared_twice_or_again_without_need() -> None:
 def test_a_robot_of_which_nothing_is_known_declares_no_tier() -> None:
     hub = MemoryHub()
     recording = Recording(hub)
-    node = Node(build_robot("me", TEAM, 0), TEAM, recording, 0, "1")
+    node = Node(build_robot("me", TEAM, 0), TEAM, recording, NodeStart(0, "1"))
     node.step(0)
     assert recording.open("declare_token") == []
     TeamOnBus(TEAM, here=[], hub=hub).odometry("me", standing(100 * MS))

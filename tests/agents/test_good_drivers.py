@@ -9,7 +9,7 @@ import pytest
 from msgspec.structs import replace
 from support.drivers import PLACES, Drive, DrivenRobot, World
 
-from cpcbl_agents.node import Node
+from cpcbl_agents.node import Node, NodeCallbacks, NodeStart
 from cpcbl_agents.robot import build_robot
 from cpcbl_agents.sources.mrclam import MrclamSource
 from cpcbl_launch.run.logged_team import load_logged_team
@@ -79,12 +79,12 @@ def said_of(seeds: range) -> dict[int, set[str]]:
 
 
 def test_nothing_is_said_of_good_drivers() -> None:
-    assert said_of(range(50)) == {}
+    assert said_of(range(30)) == {}
 
 
 @pytest.mark.long
 def test_nothing_is_said_of_many_more_good_drivers() -> None:
-    assert said_of(range(50, 450)) == {}
+    assert said_of(range(30, 450)) == {}
 
 
 @pytest.mark.log
@@ -103,7 +103,8 @@ def problems_of(name: str, team: Team, folder: Path, start_ns: int) -> set[str]:
     source, hub, statuses = MrclamSource(folder, name), MemoryHub(), list[Status]()
     start_ns = max(start_ns, source.first_ns)
     robot = build_robot(name, team, start_ns)
-    node = Node(robot, team, hub.session(), start_ns, "1", on_status=statuses.append)
+    callbacks = NodeCallbacks(on_status=statuses.append)
+    node = Node(robot, team, hub.session(), NodeStart(start_ns, "1"), callbacks)
     bus = hub.session()
     source.poll(start_ns)
     for now_ns in range(start_ns, start_ns + 200 * 10**9, 10**8):

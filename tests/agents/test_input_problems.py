@@ -12,7 +12,7 @@ import pytest
 from support.buses import SECOND, robot_at
 
 from cpcbl_agents.input_diagnosis.problems import without_numbers
-from cpcbl_agents.node import Node
+from cpcbl_agents.node import Node, NodeCallbacks, NodeStart
 from cpcbl_agents.robot import build_robot
 from cpcbl_team.config import Field, Landmark, OdometrySettings, RobotSettings, Team
 from cpcbl_team.geometry import wrap_angle
@@ -47,10 +47,8 @@ class Driver:
             build_robot("r1", self.team, EPOCH),
             self.team,
             self.bus.session(),
-            EPOCH,
-            "1",
-            speed=speed,
-            on_status=self.statuses.append,
+            NodeStart(EPOCH, "1", speed),
+            NodeCallbacks(on_status=self.statuses.append),
         )
         self.step_ns = round(SECOND / rate_hz)
         self.now_ns, self.x, self.y, self.heading = EPOCH, 0.0, 0.0, 0.0

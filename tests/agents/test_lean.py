@@ -1,8 +1,10 @@
 """A robot loads only what its inputs need: memory and start-up time count on small computers."""
 
 import json
+import os
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -41,3 +43,37 @@ def test_a_driver_loads_nothing_heavy_and_no_robot() -> None:
     )
     loaded = {name.partition(".")[0] for name in json.loads(done.stdout)}
     assert not loaded & {*HEAVY, "cpcbl_agents", "cpcbl_launch"}
+
+
+@pytest.mark.parametrize("command", ["router", "check"])
+def test_a_command_does_not_load_the_modules_of_the_others(command: str) -> None:
+    code = (
+        "import json, sys; from cpcbl_launch.app import COMMANDS, build_app;"
+        " build_app(sys.argv[1]); print(json.dumps([COMMANDS[sys.argv[1]], *sys.modules]))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code, command], stdout=subprocess.PIPE, check=True, timeout=60.0
+    )
+    target, *loaded = json.loads(done.stdout)
+    rooms = {name for name in loaded if name.startswith("cpcbl_launch.commands.")}
+    own = {f"cpcbl_launch.commands.{name}" for name in (target.partition(".")[0], "options")}
+    assert rooms == own
+
+
+@pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="threads are counted in /proc")
+def test_no_command_starts_threads_of_numpy() -> None:
+    """On matrices as small as these, they would only wait for each other, and burn a core."""
+    code = (
+        "import os, sys; from cpcbl_launch.cli import main; sys.argv[1:] = ['--version'];"
+        "\ntry: main()\nexcept SystemExit: pass"
+        "\nimport numpy; print(len(os.listdir('/proc/self/task')))"
+    )
+    environment = {k: v for k, v in os.environ.items() if k != "OPENBLAS_NUM_THREADS"}
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        stdout=subprocess.PIPE,
+        check=True,
+        timeout=60.0,
+        env=environment,
+    )
+    assert done.stdout.split()[-1] == b"1"

@@ -11,7 +11,7 @@ from support.buses import (
 )
 from support.nodes import estimate, exchange, helper, only_me, tier, two_robots
 
-from cpcbl_agents.node import Node
+from cpcbl_agents.node import Node, NodeCallbacks, NodeStart
 from cpcbl_agents.robot import build_robot
 from cpcbl_team.config import LocalizerSettings
 from cpcbl_team.estimate import ZERO3
@@ -81,7 +81,7 @@ def test_a_second_robot_of_the_same_name_is_counted() -> None:
     stand = only_me()
     assert "same_name_twice" not in stand.status("me").counts
     team = stand.team
-    twin = Node(build_robot("me", team, 0), team, stand.hub.session(), 0, incarnation="2")
+    twin = Node(build_robot("me", team, 0), team, stand.hub.session(), NodeStart(0, "2"))
     stand.odometry("me", standing(stand.now_ns))
     twin.step(stand.now_ns)
     assert stand.status("me").counts["same_name_twice"] == 1
@@ -95,9 +95,8 @@ def test_arrivals_wake_the_robots_own_loop() -> None:
         build_robot("me", stand.team, 0),
         stand.team,
         stand.hub.session(),
-        0,
-        "1",
-        on_arrival=lambda: woken.append(node.waiting),
+        NodeStart(0, "1"),
+        NodeCallbacks(on_arrival=lambda: woken.append(node.waiting)),
     )
     stand.odometry("me", standing(100 * MS))
     assert woken == [True]

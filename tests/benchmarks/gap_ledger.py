@@ -21,7 +21,7 @@ import numpy as np
 from msgspec.structs import replace
 from rich.console import Console
 
-from cpcbl_agents.node import Node
+from cpcbl_agents.node import Node, NodeStart
 from cpcbl_agents.robot import build_robot
 from cpcbl_agents.sources import mrclam
 from cpcbl_launch.lab import baselines
@@ -131,7 +131,7 @@ def run_team(
         if not helps_headings:
             variant: Any = robot.filter.timeline._localizer._variant
             variant._merge_teammate = positions_helped(variant._merge_teammate)
-        node = Node(robot, logged.team, hub.session(), logged.start_ns, "0")
+        node = Node(robot, logged.team, hub.session(), NodeStart(logged.start_ns, "0"))
         nodes[name] = WatchedNode(node, name, robot)
     run_nodes([*nodes.values()], logged.start_ns, logged.end_ns)
     late = {name: baselines.as_trajectory(node.estimates) for name, node in nodes.items()}

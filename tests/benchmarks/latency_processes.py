@@ -14,7 +14,7 @@ import numpy as np
 
 from cpcbl_agents.agent import BusEvent, Tick
 from cpcbl_agents.clock import Clock
-from cpcbl_agents.node import Node
+from cpcbl_agents.node import Node, NodeCallbacks, NodeStart
 from cpcbl_agents.process import Loop
 from cpcbl_agents.robot import Robot, build_sensing
 from cpcbl_agents.stop import StopSignal
@@ -113,7 +113,9 @@ def run_timed_robot(
     with open_bus(team.name, [endpoint], stop) as session:
         bus, start_ns = TimingBus(session), clock.now_ns()
         robot = TimingRobot(name, team, start_ns)
-        loop.run(Node(robot, team, bus, start_ns, "1", loop.on_arrival), stop)
+        loop.run(
+            Node(robot, team, bus, NodeStart(start_ns, "1"), NodeCallbacks(loop.on_arrival)), stop
+        )
     out.send(RobotTimes(bus.received, bus.sent, robot.changed_ns))
 
 

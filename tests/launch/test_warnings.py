@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from cpcbl_launch.app import app
+from cpcbl_launch.app import build_app
 from cpcbl_launch.team.checks import warnings
 from cpcbl_launch.team.file import builtin_path, load_team
 from cpcbl_team.config import (
@@ -84,6 +84,6 @@ def test_check_prints_them_and_finds_the_team_good(tmp_path: Path) -> None:
         "robots.r1.start = { x_m = 1.0, y_m = 0.0 }",
     )
     path.write_text("\n".join(lines))
-    result = CliRunner().invoke(app, ["check", str(path)])
+    result = CliRunner().invoke(build_app(), ["check", str(path)])
     assert result.exit_code == 0, result.output
     assert "warning: robots.r1: one object on the map" in result.output

@@ -7,7 +7,7 @@ from typing import Any
 import msgspec
 from hypothesis import settings
 
-from cpcbl_agents.node import Node
+from cpcbl_agents.node import Node, NodeStart
 from cpcbl_agents.robot import build_robot
 from cpcbl_team.config import (
     CollaborationSettings,
@@ -139,7 +139,7 @@ class TeamOnBus:
         names = team.robots if here is None else here
         self.robots = {name: build_robot(name, team, 0) for name in names}
         self.nodes = {
-            name: Node(robot, team, self.hub.session(), 0, "1")
+            name: Node(robot, team, self.hub.session(), NodeStart(0, "1"))
             for name, robot in self.robots.items()
         }
         self.now_ns = 0

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import msgspec
 
-from cpcbl_agents.node import Node
+from cpcbl_agents.node import Node, NodeCallbacks, NodeStart
 from cpcbl_agents.robot import build_robot
 from cpcbl_team.config import Field, Landmark, PositionSensor, Team
 from cpcbl_team.geometry import Pose2, step, wrap_angle
@@ -78,9 +78,8 @@ class DrivenRobot:
             build_robot("r1", self.team, EPOCH),
             self.team,
             hub.session(),
-            EPOCH,
-            "1",
-            on_status=self.statuses.append,
+            NodeStart(EPOCH, "1"),
+            NodeCallbacks(on_status=self.statuses.append),
         )
         self.now_ns, self.pose = EPOCH, world.start
         self._since = self._position_ns = self._sightings_ns = EPOCH

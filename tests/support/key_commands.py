@@ -6,7 +6,7 @@ from typing import Any
 
 from typer.testing import CliRunner
 
-from cpcbl_launch.app import app
+from cpcbl_launch.app import build_app
 from cpcbl_launch.team.file import builtin_path
 from support.processes import cpcbl_team
 
@@ -24,7 +24,7 @@ source = "external"
 
 def keys(file: Path, *more: object) -> dict[str, dict[str, Any]]:
     """What `keys FILE MORE --json` says, by member."""
-    done = CliRunner().invoke(app, [str(word) for word in ("keys", file, *more, "--json")])
+    done = CliRunner().invoke(build_app(), [str(word) for word in ("keys", file, *more, "--json")])
     assert done.exit_code == 0, done.output
     return {member["who"]: member for member in json.loads(done.stdout)}
 

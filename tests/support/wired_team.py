@@ -7,7 +7,7 @@ from contextlib import ExitStack, contextmanager
 from typing import NamedTuple
 
 from cpcbl_agents.collaboration import CollaborationAgent
-from cpcbl_agents.node import Node
+from cpcbl_agents.node import Node, NodeStart
 from cpcbl_agents.robot import build_robot
 from cpcbl_launch.run.up import free_endpoint
 from cpcbl_team.config import (
@@ -125,5 +125,5 @@ def wired(team: Team, *here: str) -> Iterator[Wired]:
             wire = stack.enter_context(open_bus(team.name, [link.endpoint]))
             stand.robots[name] = build_robot(name, team, 0)
             fed = Fed(wire, stand.hub.session())
-            stand.nodes[name] = Node(stand.robots[name], team, fed, 0, "1")
+            stand.nodes[name] = Node(stand.robots[name], team, fed, NodeStart(0, "1"))
         yield Wired(stand, links, endpoint)

@@ -1,1 +1,1 @@
-"""The commands of `cpcbl-team`, by what they are for; `cli.py` is their table."""
+"""The commands of `cpcbl-team`, by what they are for; `app.py` is their table."""

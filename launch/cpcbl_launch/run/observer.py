@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import msgspec
 
 from cpcbl_agents.clock import Clock
-from cpcbl_agents.node import GuestNode
+from cpcbl_agents.node import GuestNode, NodeCallbacks, NodeStart
 from cpcbl_agents.process import Loop, new_incarnation, own_camera, stop_on_clock_step
 from cpcbl_agents.robot_log import RobotLogger
 from cpcbl_launch.reporting.statuses import FlowReport, ProblemLog, ProblemReport, summed_flows
@@ -162,27 +162,25 @@ def run_observer(
         open_bus(team.name, link.endpoints, stop, link.credentials) as bus,
     ):
         _require_unique_name(name, bus)
-        start_ns, incarnation = clock.now_ns(), new_incarnation()
+        start = NodeStart(clock.now_ns(), new_incarnation(), clock.speed)
         logger, problems = RobotLogger(name), ProblemLog()
 
         def on_status(status: Status) -> None:
             logger.log_status(status)
             problems.add(status)
 
-        node = GuestNode(
-            *(name, team, bus, start_ns, incarnation, loop.on_arrival),
-            *(clock.speed, camera, on_status),
-        )
+        callbacks = NodeCallbacks(loop.on_arrival, on_status)
+        node = GuestNode(name, team, bus, start, camera, callbacks)
         logger.log_connected(team, link.endpoints)
         over = stop_on_clock_step(name, team, clock, stop)
-        loop.run(node, lambda: over() or clock.now_ns() - start_ns >= duration_s * 1e9)
+        loop.run(node, lambda: over() or clock.now_ns() - start.stamp_ns >= duration_s * 1e9)
         end_ns = clock.now_ns()
         node.leave(end_ns)
     latest = node.robot.collaboration.latest
     return ObserverReport(
         name=name,
         team=team.name,
-        seconds=(end_ns - start_ns) * 1e-9,
+        seconds=(end_ns - start.stamp_ns) * 1e-9,
         position_sigma_m=None if latest is None else latest.estimate.position_sigma_m,
         lost="" if latest is None else latest.lost,
         unfed=node.missing_input,

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
 
-from cpcbl_agents.node import Node, Steppable
+from cpcbl_agents.node import Node, NodeStart, Steppable
 from cpcbl_agents.robot import build_robot
 from cpcbl_launch.reporting.recorder import Recorder, Report, variants_of
 from cpcbl_launch.simulation.field import SimulatedField
@@ -58,7 +58,7 @@ def robot_nodes(
         return bus_wrappers[name](bus) if name in bus_wrappers else bus
 
     return [
-        Node(build_robot(name, team, start_ns), team, session(name), start_ns, "0")
+        Node(build_robot(name, team, start_ns), team, session(name), NodeStart(start_ns, "0"))
         for name in team.robots
     ]
 

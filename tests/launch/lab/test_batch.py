@@ -43,7 +43,7 @@ def test_the_batch_is_the_ceiling_and_consistent(tmp_path: Path) -> None:
     batches = []
     for seed in range(5):
         (tmp_path / str(seed)).mkdir()
-        logged = noisy_log(tmp_path / str(seed), seed)
+        logged = noisy_log(tmp_path / str(seed), seed, 20.0)
         batches.append(batch_of(logged))
         ekf = run_ekf(baseline_inputs(logged), logged.team.map, stamps_of(logged))
         assert figure(batches[-1]) < 0.9 * figure(baseline_report(ekf, logged.truth))

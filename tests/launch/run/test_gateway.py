@@ -14,7 +14,7 @@ from aiohttp import ClientSession, ClientWebSocketResponse, WSServerHandshakeErr
 from fuzz.payloads import damaged_payload, random_payload
 from support.buses import MS, SECOND, Subscription, robot_at, team_of
 
-from cpcbl_agents.node import Node
+from cpcbl_agents.node import Node, NodeStart
 from cpcbl_agents.robot import build_robot
 from cpcbl_launch.run.gateway import poses as pose_feeds
 from cpcbl_launch.run.gateway import server
@@ -92,7 +92,7 @@ def test_inputs_reach_the_robot_and_its_pose_comes_back() -> None:
     async def check(stand: Stand) -> None:
         team, start_ns = team_of(me=robot_at(1.0, 2.0)), time.time_ns() - SECOND
         robot = build_robot("me", team, start_ns)
-        node = Node(robot, team, stand.hub.session(), start_ns, "1")
+        node = Node(robot, team, stand.hub.session(), NodeStart(start_ns, "1"))
         assert await stand.post("odometry", piece(distance_m=0.5)) == (204, None)
         seen = {"stamp_ns": time.time_ns(), "sightings": [{"id": "oak", "range_m": 3}]}
         assert await stand.post("sightings", json.dumps(seen).encode()) == (204, None)
