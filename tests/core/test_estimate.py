@@ -317,12 +317,13 @@ def test_an_error_that_two_readings_share_wholly_is_no_certainty() -> None:
     assert least_eigenvalue(private) > -1e-9
 
 
+@ranks
 @seeds
-def test_a_split_merge_counts_as_private_only_what_is(seed: int) -> None:
+def test_a_split_merge_counts_as_private_only_what_is(seed: int, rank: int) -> None:
     rng = np.random.default_rng(seed)
     private, shared = random_matrix(rng, 3), random_matrix(rng, 3)
     prior = Estimate(POSE, covariance3(private + shared), covariance3(shared))
-    observation = random_observation(rng, 2)
+    observation = random_observation(rng, rank)
     H, _, independent, _ = parts(observation)
     K = gain(prior, observation, Scope.POSE)
     survive = np.eye(3) - K @ H

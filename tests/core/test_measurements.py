@@ -1,8 +1,9 @@
 import math
 from collections.abc import Mapping
 
+import numpy as np
 import pytest
-from support.core import CORNERS, SECOND, belief, diagonal, state_at
+from support.core import CORNERS, SECOND, belief, diagonal, matrix2, state_at
 
 from cpcbl_team.config import (
     CollaborationSettings,
@@ -17,10 +18,12 @@ from cpcbl_team.config import (
 )
 from cpcbl_team.constraints import bearing_position, bearing_ray, curvature
 from cpcbl_team.estimate import Scope
+from cpcbl_team.gaussian import Covariance2
 from cpcbl_team.geometry import Pose2
 from cpcbl_team.inputs import Belief, Sighting
 from cpcbl_team.measurements import (
     Measurement,
+    ObjectPosition,
     constraints_of,
     gated_object,
     measurement_of,
@@ -151,6 +154,18 @@ def test_a_teammate_nearby_is_as_uncertain_as_its_linear_form_is_wrong() -> None
     assert of_range > 0.01
     assert found.dependent.xx == pytest.approx(0.2**2 + of_range)
     assert found.dependent.yy == pytest.approx(0.2**2 + of_bearing)
+
+
+def test_an_error_of_a_teammates_place_is_in_its_range_and_in_its_bearing() -> None:
+    """The dependent part is A C A^T; A: how the two residuals follow an error of the place."""
+    place = ObjectPosition(3.0, 4.0, Covariance2(0.04, 0.03, 0.09))
+    m = Measurement("mate", place, None, True, 5.0, 0.9, 0.1, 0.05)
+    prior = state_at(HERE, diagonal(0.05, 0.1)).estimate
+    found = observation_of(prior, m, constraints_of(HERE, m, Scope.POSE, LocalizerSettings()))
+    follows = np.array([[-0.6, -0.8], [-0.8 / 5.0, 0.6 / 5.0]])
+    expected = follows @ matrix2(place.covariance) @ follows.T
+    assert abs(expected[0, 1]) > 0.002
+    assert found.dependent.xy == pytest.approx(expected[0, 1])
 
 
 @pytest.mark.parametrize("variant", ["oval", "circular"])

@@ -37,6 +37,7 @@ from cpcbl_team.config import (
     Variant,
 )
 from cpcbl_team.estimate import Estimate
+from cpcbl_team.fixes import from_fix, from_position_sensor
 from cpcbl_team.gaussian import Covariance2
 from cpcbl_team.geometry import Pose2, wrap_angle
 from cpcbl_team.inputs import Sighting, Sightings
@@ -46,6 +47,8 @@ from cpcbl_team.recovery import (
     SPACING_NS,
     WINDOW_NS,
     Limits,
+    evidence_from_measurement,
+    evidence_from_observation,
     inflate_covariance,
     lost_reason,
     with_evidence,
@@ -169,6 +172,20 @@ def test_a_reading_that_may_not_be_used_is_no_evidence(gives: Gives) -> None:
         (e.range_m, e.bearing_rad) != (None, None)
         for e in robot.recovery.evidence(state.memory.recovery)
     )
+
+
+def test_evidence_is_as_uncertain_as_the_teammate_that_gave_it() -> None:
+    """Of a place the mean variance of both axes: that of a belief, or the observer's part."""
+    state = state_at(ORIGIN, diagonal(0.1, 0.1), stamp_ns=SECOND)
+    place = ObjectPosition(4.5, 2.5, Covariance2(0.01, 0.0, 0.07))
+    visible = Measurement("mate", place, None, True, 5.0, 0.5, 0.1, 0.1)
+    by_belief = evidence_from_measurement(state, visible)
+    assert by_belief.teammate_sigma_m == pytest.approx(0.2)
+    assert by_belief.from_teammate
+    by_fix = evidence_from_observation(state, from_fix(fix(1.0, 2.0, observer_m=0.3)))
+    assert by_fix.teammate_sigma_m == pytest.approx(0.3)
+    own = evidence_from_observation(state, from_position_sensor(placed_at(1.0, 2.0)))
+    assert (own.teammate_sigma_m, own.from_teammate) == (0.0, False)
 
 
 # The whole way back -------------------------------------------------------------------------------
