@@ -4,6 +4,7 @@ import errno
 import io
 import os
 import sys
+from types import TracebackType  # nothing here takes time: see `_print_uncaught`
 
 NOT_WRITABLE = {
     *(errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EPIPE),
@@ -17,6 +18,20 @@ class _ClosedOutput(io.TextIOBase):
 
     def write(self, text: str) -> int:
         raise OSError(errno.EIO, "it is closed")
+
+
+def _print_uncaught(
+    kind: type[BaseException], error: BaseException, trace: TracebackType | None
+) -> None:
+    """Prints one line for a Ctrl-C that comes before `main` can catch it. Python then ends itself
+    with SIGINT, which shells report as 130."""
+    if issubclass(kind, KeyboardInterrupt):
+        sys.stderr.write("cpcbl-team: stopped\n")
+    else:
+        sys.__excepthook__(kind, error, trace)
+
+
+sys.excepthook = _print_uncaught
 
 
 def main() -> None:

@@ -145,6 +145,14 @@ def test_ctrl_c_at_the_very_start_shows_no_traceback(imports: str) -> None:
     assert ran.stderr == "cpcbl-team: stopped\n"
 
 
+def test_ctrl_c_before_the_command_line_runs_shows_no_traceback() -> None:
+    code = "import os, signal, cpcbl_launch.cli; os.kill(os.getpid(), signal.SIGINT); 1 + 1"
+    command = [sys.executable, "-c", code]
+    ran = subprocess.run(command, capture_output=True, text=True, check=False, timeout=60)
+    assert ran.returncode == -signal.SIGINT  # a shell's 130
+    assert ran.stderr == "cpcbl-team: stopped\n"
+
+
 @pytest.fixture
 def waiting_robot() -> Iterator["subprocess.Popen[str]"]:
     """A robot that waits for its router."""

@@ -32,11 +32,11 @@ from cpcbl_launch.calibration.statistics import (
 )
 from cpcbl_launch.reporting.metrics import Floats
 
-WINDOW_S = 2.0
 NOISE_WINDOWS_S = (1.0, 2.0, 4.0, 8.0, 16.0)
-NUDGE_S = 0.01
+WINDOW_S, NUDGE_S = 2.0, 0.01
 MIN_MOTION = 0.02  # m or rad in a window; a smaller motion does not determine scales
 DELAYS_S = np.arange(0.0, 1.001, 0.02)
+REFINEMENTS, MOST_STEP_S = 4, 0.05  # of the best of these
 CORRECTIONS = {  # with their limits; of two that a log cannot separate the larger stays
     "distance_scale": 0.2,
     "turn_scale": 0.2,
@@ -291,7 +291,7 @@ def calibrate_odometry(
 
 def _fit_corrections(logs: Sequence[RobotLog], now: OdometryCorrections) -> OdometryFit | None:
     """The corrections that fit best; None if the robot moved too little."""
-    for _ in range(4):
+    for _ in range(REFINEMENTS):
         windows = [odometry_windows(logs, now.delay_s, length_s) for length_s in NOISE_WINDOWS_S]
         noise = odometry_noise(windows, now)
         if np.isnan(noise).all():
@@ -300,7 +300,7 @@ def _fit_corrections(logs: Sequence[RobotLog], now: OdometryCorrections) -> Odom
         fit = odometry_fit(rows, now, np.nan_to_num(noise[0]))
         known = determined_coefficients(fit.columns, CORRECTIONS.values())
         scale, turn_scale, later_s, loss, bias = solve(fit, known).tolist()
-        delay_s = now.delay_s + min(max(later_s, -0.05), 0.05) if known[2] else 0.0
+        delay_s = now.delay_s + min(max(later_s, -MOST_STEP_S), MOST_STEP_S) if known[2] else 0.0
         now = OdometryCorrections(1.0 + scale, 1.0 + turn_scale, delay_s, max(loss, 0.0), bias)
     return OdometryFit(now, known, fit, windows)
 

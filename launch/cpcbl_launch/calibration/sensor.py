@@ -44,6 +44,8 @@ CORRECTIONS = {  # with their limits; of two that a log cannot separate the larg
     "bearing_bias_deg": 0.1,
     "delay_s": 0.1,
 }
+STEPS, MOST_STEP = 5, 0.1  # of axis (rad) and delay (s), which are not linear
+MOST_CHANGE = STEPS * MOST_STEP
 NOISE = ("range_share", "range_floor_m", "bearing_sigma_deg")
 
 
@@ -167,8 +169,8 @@ def corrections_from_fit(now: SensorCorrections, fitted: Floats) -> SensorCorrec
     """The corrections that undo fitted slopes, offsets and differences."""
     slope, offset, robot_offset, axis, bearing_slope, bearing_offset, later_s = fitted.tolist()
     scale, bearing_scale = 1.0 / max(1.0 + slope, 0.1), 1.0 / max(1.0 + bearing_slope, 0.1)
-    optical_axis = now.optical_axis + min(max(axis, -0.1), 0.1)
-    delay_s = now.delay_s + min(max(later_s, -0.1), 0.1)
+    optical_axis = now.optical_axis + min(max(axis, -MOST_STEP), MOST_STEP)
+    delay_s = now.delay_s + min(max(later_s, -MOST_STEP), MOST_STEP)
     ranges = scale, scale * offset, scale * robot_offset
     bearings = bearing_scale, bearing_scale * bearing_offset
     return SensorCorrections(*ranges, optical_axis, *bearings, delay_s, now.is_depth)
@@ -203,7 +205,7 @@ class SensorFit(NamedTuple):
 def _fit_corrections(logs: Sequence[RobotLog], is_depth: bool) -> SensorFit | None:
     """The corrections, weighted by the noise of the residuals; None with too few sightings."""
     now = SensorCorrections(is_depth=is_depth)
-    for _ in range(5):
+    for _ in range(STEPS):
         rows = sighting_rows(logs, now.delay_s)
         if len(rows.stamp_s) < MIN_ROWS:
             return None

@@ -21,13 +21,14 @@ from cpcbl_launch.calibration.between_days import (
     with_day_variances,
 )
 from cpcbl_launch.calibration.logs import RobotLog, RobotLogs
+from cpcbl_launch.calibration.search_bounds import bound_notes, without_bounds
 from cpcbl_launch.calibration.statistics import Estimate, decimals
 from cpcbl_launch.calibration.team_tables import MINIMUM, team_source
 from cpcbl_launch.reporting.recording import read_recording
 from cpcbl_launch.team.file import builtin_path, parse_team
 from cpcbl_team.errors import InputError
 
-SHORT_S = 20.0  # a recording that does not show whether errors fade
+SHORT_S = 20.0  # of a short recording: where a value is at a bound, it may have any other
 INTERVAL_S = 0.5  # with correlation_s known, more frequent sightings of an object add little
 _CORRECTED = {  # the noise of a reading: its correction, the neutral value, the unit of the noise
     "range_share": ("range_scale", 1.0, 1.0),
@@ -79,9 +80,9 @@ def _calibrate_robot(logs: Sequence[RobotLog]) -> RobotCalibration:
         _with_standard_errors(odometry_values),
         _with_standard_errors(sensor_values),
     )
-    fades = sensor_values.get("correlation_s")
-    if fades and sight and fades.standard_error == 0.0 and np.ptp(sight.rows.stamp_s) < SHORT_S:
-        del sensor_values["correlation_s"]  # 0 in all parts: they are too short to show it
+    if max(np.ptp(log.truth[:, 0]) for log in logs) < SHORT_S:
+        odometry_values = without_bounds("odometry", odometry_values)
+        sensor_values = without_bounds("sensor", sensor_values)
     days = {} if motion is None else odometry_day_variances(motion)
     days |= {} if sight is None else sensor_day_variances(sight)
     is_depth = sight is not None and sight.after.is_depth
@@ -100,6 +101,12 @@ def _calibrate_robot(logs: Sequence[RobotLog]) -> RobotCalibration:
         missing = [name for name in names if name not in found and name not in axis]
         if has_data and missing:
             notes.append(f"not determined by the logs: {part} {', '.join(missing)}")
+    at_bounds = [
+        *bound_notes("odometry", odometry_values),
+        *bound_notes("sensor", sensor_values),
+    ]
+    if at_bounds:
+        notes.append(f"at a bound of the calibration: {', '.join(at_bounds)}")
     return RobotCalibration(odometry_values, sensor_values, tuple(notes), is_depth, days)
 
 

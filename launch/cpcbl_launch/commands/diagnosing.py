@@ -70,6 +70,7 @@ class _ListedTeam(msgspec.Struct, frozen=True, kw_only=True):
     team: str
     robots: tuple[str, ...]  # that are alive or send a status
     inputs: tuple[str, ...]  # keys that drivers publish to
+    gone: tuple[str, ...] = ()  # that ran since the router started, and are not heard any more
 
 
 def list_teams(
@@ -93,6 +94,7 @@ def list_teams(
             team=name,
             robots=tuple(own.robots),
             inputs=tuple(f"in/{i.robot}/{i.input}" for i in own.inputs),
+            gone=tuple(own.gone),
         )
         for name, own in heard.items()
     ]
@@ -104,7 +106,8 @@ def _print_teams(rows: Collection[_ListedTeam]) -> None:
     shown.add_column("robots", overflow="fold")
     shown.add_column("inputs", overflow="fold")
     for row in rows:
-        names = (row.team, ", ".join(row.robots) or "-", ", ".join(row.inputs) or "-")
+        robots = [*row.robots, *(f"{name} (gone)" for name in row.gone)]
+        names = (row.team, ", ".join(robots) or "-", ", ".join(row.inputs) or "-")
         shown.add_row(*map(Text, names))
     Console().print(shown if rows else Text("no team is heard on this router", "yellow"))
 

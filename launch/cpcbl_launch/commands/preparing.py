@@ -108,7 +108,11 @@ def compose(
     ] = None,
 ) -> None:
     """Print a team's compose file: for docker-compose, docker compose, a swarm."""
-    from cpcbl_launch.run.containers.compose import deployment_text
+    from cpcbl_launch.run.containers.compose import (
+        deployment_image,
+        deployment_text,
+        image_origin,
+    )
 
     file = file or Path("demo")
     folder = Path() if output is None else output.parent
@@ -118,3 +122,4 @@ def compose(
     else:
         lost = write_or_reason(output, lambda: output.write_text(text, encoding="utf-8"))
         options.print_not_written(lost)
+    typer.echo(f"compose: {image_origin(deployment_image(image), image is None)}", err=True)

@@ -159,6 +159,8 @@ def _robots(facts: Facts) -> Iterator[tuple[Level, str, str]]:
                 remedy = "it has just started, hangs, or is paused: see its log"
                 yield "error", f"{text}, though its process is alive", remedy
             else:
+                if name in heard.ran:
+                    text = f"{text}: gone, its process or its link ended"
                 remedy = f"cpcbl-team robot {facts.file} {name} on its machine"
                 yield "error", text, remedy
     for name, count in heard.twice.items():

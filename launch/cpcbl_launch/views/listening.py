@@ -58,6 +58,12 @@ class TeamHeard(msgspec.Struct, frozen=True):
     statuses: dict[str, tuple[StatusHeard, ...]] = {}  # robot -> one for each process
     inputs: tuple[InputHeard, ...] = ()
     refused: dict[str, int] = {}  # statuses that cannot be used, by reason
+    ran: frozenset[str] = frozenset()  # robots of which a process ran, as far as the router knows
+
+    @property
+    def gone(self) -> list[str]:
+        """Robots that ran and are not heard any more: their process or their link ended."""
+        return sorted(self.ran - self.alive.keys() - self.statuses.keys())
 
     @property
     def robots(self) -> list[str]:
@@ -101,7 +107,8 @@ def listen(
     def on_token(key: str, alive: bool) -> None:
         tokens[key] = alive
 
-    handles = [bus.watch_liveliness(before + topics.ALIVE.at(), on_token)]
+    tokens_of = topics.ALIVE, topics.RAN
+    handles = [bus.watch_liveliness(before + topic.at(), on_token) for topic in tokens_of]
     handles += [bus.subscribe(before + topic.at(), on_message) for topic in LISTENED]
     until_s = time.monotonic() + seconds
     while not stop() and time.monotonic() < until_s:
@@ -109,22 +116,24 @@ def listen(
     for handle in handles:
         handle.close()
     present = [key for key, alive in list(tokens.items()) if alive]
+    ended = [key for key, alive in list(tokens.items()) if not alive]
     if not team:
-        return heard_by_team(list(samples), present, seconds)
+        return heard_by_team(list(samples), present, seconds, ended)
     whole = f"{topics.namespace(team)}/"
     heard = heard_by_team(
         [s._replace(key=whole + s.key) for s in list(samples)],
         [whole + key for key in present],
         seconds,
+        [whole + key for key in ended],
     )
     return heard or {team: TeamHeard()}
 
 
 def heard_by_team(
-    samples: Sequence[Sample], tokens: Iterable[str], seconds: float
+    samples: Sequence[Sample], tokens: Iterable[str], seconds: float, ended: Iterable[str] = ()
 ) -> dict[str, TeamHeard]:
     """What samples and tokens with whole keys come to, by team. A key that no terminal can print is
-    nobody's of ours."""
+    nobody's of ours. `ended`: tokens that went away meanwhile."""
     by_team: dict[str, list[Sample]] = {}
     alive: dict[str, dict[str, set[str]]] = {}
     for sample in samples:
@@ -132,15 +141,29 @@ def heard_by_team(
             continue
         team, key = _split(sample.key)
         by_team.setdefault(team, []).append(sample._replace(key=key))
+    tokens = list(tokens)
     for token in filter(str.isprintable, tokens):
         team, key = _split(token)
         if names := topics.ALIVE.names(key):
             robots = alive.setdefault(team, {})
             robots.setdefault(names["robot"], set()).add(names["incarnation"])
+    ran = _robots_that_ran([*tokens, *ended])
     return {
-        team: _team_heard(by_team.get(team, []), alive.get(team, {}), seconds)
-        for team in sorted(by_team.keys() | alive.keys())
+        team: _team_heard(
+            by_team.get(team, []), alive.get(team, {}), ran.get(team, frozenset()), seconds
+        )
+        for team in sorted(by_team.keys() | alive.keys() | ran.keys())
     }
+
+
+def _robots_that_ran(tokens: Iterable[str]) -> dict[str, frozenset[str]]:
+    """Robots, by team: those of all tokens, that the router repeats for a process that ended."""
+    found: dict[str, frozenset[str]] = {}
+    for token in filter(str.isprintable, tokens):
+        team, key = _split(token)
+        if names := topics.ALIVE.names(key) or topics.RAN.names(key):
+            found[team] = found.get(team, frozenset()) | {names["robot"]}
+    return found
 
 
 def _split(key: str) -> tuple[str, str]:
@@ -149,7 +172,9 @@ def _split(key: str) -> tuple[str, str]:
     return team, rest
 
 
-def _team_heard(samples: Sequence[Sample], alive: dict[str, set[str]], seconds: float) -> TeamHeard:
+def _team_heard(
+    samples: Sequence[Sample], alive: dict[str, set[str]], ran: frozenset[str], seconds: float
+) -> TeamHeard:
     statuses: dict[tuple[str, str], StatusHeard] = {}
     refused = Counter[str]()
     inputs: dict[str, list[Sample]] = {}
@@ -174,6 +199,7 @@ def _team_heard(samples: Sequence[Sample], alive: dict[str, set[str]], seconds: 
         dict(sorted(by_robot.items())),
         tuple(_input_heard(key, own, seconds) for key, own in sorted(inputs.items())),
         dict(refused),
+        ran,
     )
 
 

@@ -22,6 +22,7 @@ from cpcbl_launch.reporting.tables import number, short, table, times
 from cpcbl_launch.team.faults import one_line
 from cpcbl_launch.views.listening import InputHeard, TeamHeard, clock_problem
 from cpcbl_launch.views.traffic_tables import limit_text
+from cpcbl_launch.views.web.page_data import State
 from cpcbl_team.config import Team
 from cpcbl_transport.messages import Status
 
@@ -41,6 +42,7 @@ class RobotStatus(msgspec.Struct, frozen=True, kw_only=True):
     """What `status --json` writes of a robot."""
 
     robot: str
+    state: State  # in the words of the page
     alive: bool  # its liveliness token is there
     processes: int  # that run under its name; more than one is a mistake
     status_offset_s: float | None  # arrival minus stamp of its status; None: none came
@@ -68,8 +70,10 @@ def _robot_status(name: str, heard: TeamHeard, is_real: bool) -> RobotStatus:
     processes = heard.statuses.get(name, ())
     last = processes[-1] if processes else None
     status = last.status if last else None
+    problems = tuple(map(one_line, _problems(name, status, heard, is_real)))
     return RobotStatus(
         robot=name,
+        state=_state_of(name, status, heard, bool(problems)),
         alive=name in heard.alive,
         processes=heard.twice.get(name, int(name in heard.robots)),
         status_offset_s=last.offset_s if last else None,
@@ -77,7 +81,7 @@ def _robot_status(name: str, heard: TeamHeard, is_real: bool) -> RobotStatus:
         heading_sigma_deg=math.degrees(status.heading_sigma_rad) if status else None,
         tier=status.tier if status else None,
         lost=status.lost if status else "",
-        problems=tuple(map(one_line, _problems(name, status, heard, is_real))),
+        problems=problems,
         inputs=tuple(_inputs(name, status, heard)),
         counts=dict(sorted(status.counts.items())) if status else {},
         spending=summed_spending([status.spending] if status else []),
@@ -85,6 +89,15 @@ def _robot_status(name: str, heard: TeamHeard, is_real: bool) -> RobotStatus:
         sent=summed_flows([status.sent] if status else []),
         heard=summed_flows([status.heard] if status else []),
     )
+
+
+def _state_of(name: str, status: Status | None, heard: TeamHeard, has_problems: bool) -> State:
+    """`gone`: its process or its link ended; `waiting`: it has sent nothing so far."""
+    if status is None:
+        return "gone" if name in heard.gone else "waiting"
+    if status.lost:
+        return "lost"
+    return "problem" if has_problems else "ok"
 
 
 def _problems(name: str, status: Status | None, heard: TeamHeard, is_real: bool) -> Iterator[str]:
@@ -96,7 +109,12 @@ def _problems(name: str, status: Status | None, heard: TeamHeard, is_real: bool)
         if own.robot == name and own.refused:
             yield f"in/{name}/{own.input}: cannot be used: {_words(own.refused)}"
     if status is None:
-        yield "alive, but sends no status" if name in heard.alive else "sends no status"
+        if name in heard.alive:
+            yield "alive, but sends no status"
+        elif name in heard.gone:
+            yield "gone: its process or its link ended"
+        else:
+            yield "sends no status"
         return
     clock = clock_problem(heard.statuses[name][-1].offset_s)
     if clock and is_real:
@@ -135,13 +153,12 @@ def _offset_s(own: InputHeard | None, taken: object) -> float | None:
 
 
 def team_view(robots: Collection[RobotStatus]) -> RenderableType:
-    """A row for each robot, and a line for each problem."""
+    """A row for each robot, in the words of the page and of `up`, and a line for each problem."""
     shown = table("", ("robot",), ("σ m", "tier", "odom/s", "seen/s", "refused", ""))
     lines = []
     for robot in robots:
         rates = {own.input: f"{own.published_hz:.1f}" for own in robot.inputs}
         refused = sum(sum(own.refused.values()) for own in robot.inputs)
-        state = _state(robot)
         shown.add_row(
             Text(robot.robot),
             number(robot.position_sigma_m),
@@ -149,19 +166,13 @@ def team_view(robots: Collection[RobotStatus]) -> RenderableType:
             rates.get("odometry", "-"),
             rates.get("sightings", "-"),
             short(refused),
-            state,
+            Text(robot.state, _STYLES[robot.state]),
         )
         lines += [Text(f"{robot.robot}: {problem}", "red") for problem in robot.problems]
     return Group(shown, *lines)
 
 
-def _state(robot: RobotStatus) -> Text:
-    """In the words of the page and of `up`."""
-    if robot.position_sigma_m is None:
-        return Text("waiting", "yellow")
-    if robot.lost:
-        return Text("lost", "red")
-    return Text("problem", "yellow") if robot.problems else Text("ok", "green")
+_STYLES = {"ok": "green", "problem": "yellow", "lost": "red", "gone": "red", "waiting": "yellow"}
 
 
 def _words(reasons: dict[str, int]) -> str:

@@ -283,7 +283,7 @@ def test_the_status_of_a_robot_has_its_problems() -> None:
 def test_the_table_of_robots_has_the_words_of_the_view() -> None:
     heard = heard_by_team(without("status/r2"), TOKENS, SECONDS)["tests"]
     r1, r2 = robot_statuses(heard, TEAM)
-    bad = replace(r1, robot="r3", problems=("bad",)), replace(r1, robot="r4", lost="sigma")
+    bad = replace(r1, robot="r3", state="problem"), replace(r1, robot="r4", state="lost")
     console = Console(width=80, record=True, file=StringIO())
     console.print(team_view([r1, r2, *bad]))
     rows = [line.split() for line in console.export_text().splitlines()]

@@ -55,6 +55,11 @@ class Deployment(NamedTuple):
     here: Collection[str] | None = None  # the robots to start; None: all
 
 
+def deployment_image(image: str | None) -> str:
+    """The image that containers of a compose file run: the given one, or that of this version."""
+    return image or f"{NAME}:{version()}"
+
+
 def deployment_text(team: Team, file: Path, folder: Path, image: str | None, seed: int) -> str:
     """What `cpcbl-team compose` prints: the compose file of the team in `file`, to lie in `folder`.
 
@@ -75,7 +80,7 @@ def deployment_text(team: Team, file: Path, folder: Path, image: str | None, see
         )
     how = Deployment(
         str(file),
-        image or f"{NAME}:{version()}",
+        deployment_image(image),
         None if top is None else _from(folder, top),
         user=key_owner(team, Identity(Role.ROUTER)),
         seed=seed,
@@ -141,6 +146,7 @@ def compose_text(team: Team, how: Deployment) -> str:
     head = _HEAD.format(
         title=f"Team {team.name}: a router,{field} and {robots}",
         image=_flow(how.image),
+        origin=image_origin(how.image, how.context is not None),
         user=user if how.user else "",
         mounts="" if how.keys else _mounts(how.mounts, ""),
         to=_flow(["CMD", "linked", "to", str(PORT)]),
@@ -159,6 +165,19 @@ def compose_text(team: Team, how: Deployment) -> str:
     if team.gateway is not None and how.tokens is not None:
         services.append(_gateway_service(team.gateway, how, how.tokens, common[:2]))
     return "".join([head, router_service, *services])
+
+
+def image_origin(image: str, is_built: bool) -> str:
+    """Who builds the image, with the command. `is_built`: the compose file holds how."""
+    if is_built:
+        return (
+            f"`up` builds the image {image} if it is missing; after a change of the sources:"
+            " docker-compose -f FILE build"
+        )
+    return (
+        f"The image {image} must exist; in a checkout:"
+        f" docker build --file docker/Dockerfile --tag {image} ."
+    )
 
 
 def _gateway_service(
@@ -238,6 +257,7 @@ def _plain(value: object) -> object:
 _HEAD = """\
 # {title}, each in a container.
 # Written by `cpcbl-team compose`.
+# {origin}
 #   docker-compose -f FILE up         or: docker compose -f FILE up
 #   docker-compose -f FILE down
 
