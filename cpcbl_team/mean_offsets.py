@@ -15,6 +15,7 @@ from typing import Final, NamedTuple
 from cpcbl_team.estimate import ZERO3, Covariance3, Sums
 from cpcbl_team.gaussian import Covariance2
 from cpcbl_team.geometry import new
+from cpcbl_team.mean_headings import MOST_SIGMA, MeanTurn
 
 FAST_NS: Final = 1_500_000_000  # time constants with which reports fade: a fast drift shows sooner
 SLOW_NS: Final = 6_000_000_000  # in the mean of a short time, a slow one in that of a long time
@@ -22,7 +23,7 @@ LEAST_REPORTS: Final = 5.0  # with fewer, fading, a source has no mean
 MOST_SIGMA_M: Final = 0.15  # a source whose mean is less certain has no vote
 SURE_SIGMA_M: Final = 0.08  # own sensors that are less certain convict nobody alone
 FAST_COMMON_M: Final = 0.01
-SLOW_COMMON_M: Final = 0.02
+SLOW_COMMON_M: Final = 0.01
 """Sigmas of what two correct sources may disagree by for ever: calibration, map, and the error of
 the estimate, which differs between the times of their reports, the more the longer the mean."""
 CONFLICT: Final = 18.0
@@ -31,6 +32,9 @@ USUAL: Final = 6.0  # 95 % of correct sources differ by less (chi-square, two de
 LEAD: Final = 7.0
 """Of two that contradict each other one is clearly nearer to a third source by this difference of
 their chi-squares."""
+NEARER: Final = 2.0
+"""By so much a contested source must be nearer to the robot's own sensors than its rivals, until
+these decide, to be used."""
 HEADING_VARIANCE: Final = math.radians(5.0) ** 2
 """rad^2: the heading of an estimate that was led astray may be wrong by more than its variance."""
 NOTHING: Final = Covariance2(0.0, 0.0, 0.0)
@@ -111,6 +115,23 @@ class FadingOffsets(NamedTuple):
         covariance += self.dependent
         return MeanOffset(cxx * x + cxy * y, cxy * x + cyy * y, covariance, common_m)
 
+    def turn(self) -> MeanTurn | None:
+        """What the reports say of the heading of the estimate, whatever its position is; None if
+        they do not determine it well."""
+        (xx, xy, yy, xh, yh, hh), (x, y, h) = self.evidence
+        determinant = xx * yy - xy * xy
+        if self.reports < LEAST_REPORTS or determinant <= 1e-9 * xx * yy:
+            return None
+        # The position is marginalized: the Schur complement.
+        kx, ky = (yy * xh - xy * yh) / determinant, (xx * yh - xy * xh) / determinant
+        information = hh - kx * xh - ky * yh
+        if information <= 1e-6 * hh:
+            return None
+        variance = self.squares / self.reports / information
+        if variance > MOST_SIGMA * MOST_SIGMA:
+            return None
+        return MeanTurn((h - kx * x - ky * y) / information, variance)
+
 
 Means = Mapping[str, MeanOffset]
 """The means of some sources, by name."""
@@ -153,28 +174,35 @@ class Comparison(NamedTuple):
 
 
 def both(fast: Comparison, slow: Comparison) -> Comparison:
-    """Both comparisons of one source, by its means of a short and of a long time."""
+    """Both comparisons of one source, by its means of a short and of a long time. While it is
+    contested the longer ones that tell so decide whether it is used, for own sensors are noisy."""
+    contested = slow if slow.is_contested else fast
+    is_contested = contested.is_contested
     return Comparison(
-        max(fast.bias_variance, slow.bias_variance),
+        contested.bias_variance if is_contested else max(fast.bias_variance, slow.bias_variance),
         fast.is_wrong or slow.is_wrong,
-        fast.is_contested or slow.is_contested,
+        is_contested,
         fast.is_confirmed and slow.is_confirmed,
-        fast.is_left_out or slow.is_left_out,
+        contested.is_left_out,
     )
 
 
 def compared_with_own_sensors(mean: MeanOffset, own: MeanOffset, others: Means) -> Comparison:
     """A sender beside the robot's own sensors, which outweigh any number of others. Where this one
-    and another contradict each other, they decide by which of both is clearly nearer to theirs."""
+    and another contradict each other, they decide by which of both is clearly nearer to theirs. A
+    contested sender is used while it is nearer than all its rivals."""
     here = disagreement(mean, own)
     rivals = [other for other in others.values() if disagreement(mean, other) > CONFLICT]
     there = [disagreement(rival, own) for rival in rivals]
+    bias = bias_variance(mean, own)
     is_refuted = here > CONFLICT and own.is_within(SURE_SIGMA_M)
     if is_refuted or any(here - z > LEAD for z in there):
-        return Comparison(bias_variance(mean, own), is_wrong=True)
+        return Comparison(bias, is_wrong=True)
     is_contested = any(z - here <= LEAD for z in there)
-    bias = max(bias_variance(mean, own), compared_with_majority(mean, others).bias_variance)
-    return Comparison(bias, False, is_contested, not is_contested, is_contested)
+    is_left_out = any(z - here <= NEARER for z in there)
+    if not rivals:
+        bias = max(bias, compared_with_majority(mean, others).bias_variance)
+    return Comparison(bias, False, is_contested, not is_contested, is_left_out)
 
 
 def compared_with_majority(mean: MeanOffset, others: Means) -> Comparison:

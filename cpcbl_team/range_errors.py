@@ -3,6 +3,11 @@
 Two landmarks that are seen at once, with range and bearing, are as far apart as the map says,
 wherever the robot is and however it drives. So this needs no estimate of the pose, and cannot be
 misled by a wrong one. One landmark tells nothing, for odometry may be wrong as well as ranges.
+
+What a bias of ranges makes of a distance depends on the angle between both landmarks. It is taken
+from the frames before: where it has the noise of the same bearings as the distance itself, both
+errors grow without limit while they cancel each other (errors in variables: W. A. Fuller,
+Measurement Error Models, 1987; the earlier frame is the instrument).
 """
 
 import math
@@ -13,6 +18,7 @@ from typing import Final, NamedTuple
 FADING: Final = 1.0 - 1.0 / 500.0  # of all sums, a frame
 PRIOR_SHARE: Final = 0.05  # sigmas; the two errors look alike, and each takes its part. Wider ones
 PRIOR_BIAS_M: Final = 0.15  # let a robot that stands find large errors that cancel each other
+LAST_SHARE: Final = 0.2  # of the last frame in what a bias makes of a distance
 MOST_OBJECTS: Final = 6  # of a frame; more tell little more
 CURVED: Final = 0.003  # of a squared distance: a larger variance across it bends its linear form
 LEAST_PAIRS: Final = 20.0
@@ -81,6 +87,7 @@ class Fit(NamedTuple):
 
 
 _NONE: Final[Mapping[str, Fit]] = {}
+_NO_PAIRS: Final[Mapping[tuple[str, str], float]] = {}
 
 
 class RangeEvidence(NamedTuple):
@@ -90,6 +97,8 @@ class RangeEvidence(NamedTuple):
     squares: float = 0.0
     pairs: float = 0.0  # as many as have no landmark in common
     of_object: Mapping[str, Fit] = _NONE  # of the pairs in which an object is
+    per_bias: Mapping[tuple[str, str], float] = _NO_PAIRS
+    """What a bias of one makes of the distance of each pair in the last frame: a fading mean."""
 
     def plus(self, frame: Sequence[Seen]) -> "RangeEvidence":
         """With the distances between the landmarks of one frame."""
@@ -104,17 +113,23 @@ class RangeEvidence(NamedTuple):
             FADING * self.squares,
             FADING * self.pairs,
         )
-        for one, other in combinations(frame, 2):
+        per_bias = {}
+        for one, other in combinations(sorted(frame), 2):
             found = _distance_error(one, other)
             if found is None:
                 continue
-            error, s, b, variance = found
+            error, s, b_now, variance = found
+            pair = one.name, other.name
+            b = self.per_bias.get(pair)
+            per_bias[pair] = b_now if b is None else b + LAST_SHARE * (b_now - b)
+            if b is None:
+                continue
             w = weight / variance
             of_pair = Fit(w * s * s, w * s * b, w * b * b, w * s * error, w * b * error)
             fit, squares, pairs = fit.plus(of_pair), squares + w * error**2, pairs + weight
             for name in (one.name, other.name):
                 of_object[name] = of_object.get(name, nothing).plus(of_pair)
-        return RangeEvidence(fit, squares, pairs, of_object)
+        return RangeEvidence(fit, squares, pairs, of_object, per_bias)
 
     def errors(self, present: RangeErrors, independent_share: float) -> RangeErrors:
         """The errors of ranges: none until some are clear, then the best estimate. This share of

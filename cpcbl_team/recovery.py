@@ -195,12 +195,15 @@ def inflate_covariance(estimate: Estimate, settings: LocalizerSettings) -> Estim
     return estimate._replace(covariance=c.plus(Covariance3(p, 0.0, p, 0.0, 0.0, h)))
 
 
-def inflate_by_offset(estimate: Estimate, offset_m: float, settings: LocalizerSettings) -> Estimate:
-    """For a robot that followed a teammate whose reports were wrong by this offset: its own
-    estimate may be wrong by it."""
+def inflate_by_offset(
+    estimate: Estimate, offset_m: float, offset_rad: float, settings: LocalizerSettings
+) -> Estimate:
+    """For a robot that followed a teammate whose reports were wrong by these offsets: its own
+    estimate may be wrong by them."""
     most_m = settings.lost_position_sigma_m
     most_rad = 0.9 * math.radians(settings.lost_heading_sigma_deg)
-    p, h = min(offset_m, most_m) ** 2, min(offset_m / _LEVER_M, most_rad) ** 2
+    turn = max(offset_m / _LEVER_M, offset_rad)
+    p, h = min(offset_m, most_m) ** 2, min(turn, most_rad) ** 2
     grown = estimate.covariance.plus(Covariance3(p, 0.0, p, 0.0, 0.0, h))
     return estimate._replace(covariance=grown)
 

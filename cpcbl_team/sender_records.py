@@ -16,9 +16,10 @@ from typing import Final, NamedTuple
 import msgspec
 from msgspec.structs import replace
 
-from cpcbl_team.estimate import Sums
+from cpcbl_team.estimate import Covariance3, Sums
 from cpcbl_team.gaussian import Covariance2
 from cpcbl_team.geometry import Pose2
+from cpcbl_team.mean_headings import COURSE_VARIANCE, NO_TURNS, FadingTurns
 from cpcbl_team.mean_offsets import (
     FAST_NS,
     NOTHING,
@@ -31,6 +32,7 @@ from cpcbl_team.mean_offsets import (
 SILENCE_NS: Final = 10_000_000_000  # earlier reports count no longer after this silence
 USUAL_NIS = 6.0  # 95 % quantile of the chi-square distribution of two degrees of freedom
 CONTRADICTING_NIS = 13.8  # its 99.9 % quantile
+OUTLIER_NIS = 30.0  # a report beyond has no part in the mean: test 1 takes care of it
 MOST_NIS = 20.0  # one report counts for no more than this
 JUMP_SIGMAS = 5.0  # a reported distance conflicts with odometry if it is longer by this,
 FROZEN_SIGMAS, FROZEN_SHARE = 3.0, 0.3  # or shorter by this and below this share of odometry's
@@ -50,6 +52,7 @@ class QuarantineReason(StrEnum):
     JUMPS = "jumps"
     OVERCONFIDENT = "overconfident"
     OUTVOTED = "outvoted"
+    HEADING = "heading"
 
 
 class ReportedPosition(NamedTuple):
@@ -60,6 +63,7 @@ class ReportedPosition(NamedTuple):
     y: float
     variance: float  # m^2, mean of the axes
     odometry_from_robot: Pose2
+    turn_rad: float = 0.0  # the heading of the estimate minus that of odometry
 
 
 class OffsetEvidence(NamedTuple):
@@ -68,6 +72,15 @@ class OffsetEvidence(NamedTuple):
     evidence: Sums  # by the independent part of the noise
     dependent: Covariance2 = NOTHING  # the part that is the same in all reports, m^2
     heading_variance: float = 1.0  # of the estimate, rad^2
+
+    def weighted(self, weight: float) -> "OffsetEvidence":
+        """With this weight, below one for a report that contradicts the estimate clearly: it would
+        move the mean for seconds, and without it the mean would seem to agree."""
+        if weight == 1.0:
+            return self
+        matrix, (x, y, h) = self.evidence
+        scaled = Covariance3(*(weight * a for a in matrix))
+        return self._replace(evidence=(scaled, (weight * x, weight * y, weight * h)))
 
 
 class TeammateReport(NamedTuple):
@@ -82,6 +95,8 @@ class TeammateReport(NamedTuple):
     evidence: OffsetEvidence | None = None
     """For the mean of its reports; None for what has no part in it."""
     is_guest: bool = False  # whether its sender is no robot of the team
+    heading: tuple[float, float] | None = None
+    """The reported heading minus the estimated one, rad, and its variance; None without one."""
 
 
 class SenderRecord(msgspec.Struct, frozen=True, gc=False):
@@ -116,6 +131,8 @@ class SenderRecord(msgspec.Struct, frozen=True, gc=False):
     wrong_ns: int = NEVER_NS  # since when others say without interruption that its mean is wrong
     confirmed: int = 0  # reports beside which another source agreed with it
     is_guest: bool = False
+    headings: FadingTurns = NO_TURNS  # that it reported
+    courses: FadingTurns = NO_TURNS  # of the positions that it reported
 
 
 def with_report(record: SenderRecord, report: TeammateReport, limit: float) -> SenderRecord:
@@ -127,14 +144,17 @@ def with_report(record: SenderRecord, report: TeammateReport, limit: float) -> S
     record = replace(record, last_report_ns=last_ns, is_guest=report.is_guest)
     if report.nis is None:
         return record
-    if report.evidence is not None and report.nis <= CONTRADICTING_NIS:
-        record = with_evidence(record, report.stamp_ns, report.evidence)
+    if report.heading is not None:
+        headings = record.headings.with_report(report.stamp_ns, *report.heading)
+        record = replace(record, headings=headings)
+    if report.evidence is not None and report.nis <= OUTLIER_NIS:
+        evidence = report.evidence.weighted(min(1.0, CONTRADICTING_NIS / max(report.nis, 1e-9)))
+        record = with_evidence(record, report.stamp_ns, evidence)
     return _with_nis(record, report, report.nis, limit)
 
 
 def with_evidence(record: SenderRecord, stamp_ns: int, report: OffsetEvidence) -> SenderRecord:
-    """The record with one more report in its mean. (Of one that contradicts the estimate clearly
-    test 1 takes care; an outlier would move the mean for seconds.)"""
+    """The record with one more report in its means."""
     evidence, dependent, heading_variance = report
     offsets = tuple(
         sums.with_report(stamp_ns, fading_ns, evidence, dependent)
@@ -203,9 +223,23 @@ def _with_position(record: SenderRecord, now: ReportedPosition | None) -> Sender
         record = replace(record, odometry_conflicts=conflicts, last_conflict_ns=at_ns)
         record = replace(record, missed_motion=missed_motion, last_failure_ns=at_ns)
         return replace(record, confirmations=0, agreements=0)
+    if is_far:
+        record = replace(record, courses=_with_course(record.courses, then, now, displacement))
     # While the robot stands, a frozen sender is right: that confirms nothing.
     confirms = is_far or record.reason is not QuarantineReason.FROZEN
     return replace(record, confirmations=record.confirmations + 1) if confirms else record
+
+
+def _with_course(
+    courses: FadingTurns, then: ReportedPosition, now: ReportedPosition, displacement: Pose2
+) -> FadingTurns:
+    """The courses with the direction between two reported positions, beside that of odometry."""
+    driven = math.hypot(displacement.x, displacement.y)
+    by_odometry = then.odometry_from_robot.heading + math.atan2(displacement.y, displacement.x)
+    reported = math.atan2(now.y - then.y, now.x - then.x)
+    offset = math.remainder(reported - by_odometry - now.turn_rad, math.tau)
+    variance = (then.variance + now.variance) / (driven * driven) + COURSE_VARIANCE
+    return courses.with_report(now.stamp_ns, offset, variance)
 
 
 # Quarantine ---------------------------------------------------------------------------------------

@@ -25,10 +25,12 @@ from cpcbl_team.measurements import (
     observation_of,
 )
 from cpcbl_team.recovery import inflate_by_offset, inflate_to, without_senders
+from cpcbl_team.sender_comparisons import OWN_SENSORS, RECENT_NS, SenderRecords
 from cpcbl_team.sender_records import NEVER_NS, OffsetEvidence, ReportedPosition, TeammateReport
 from cpcbl_team.state import State, with_memory, with_senders, with_teammates
 
 LEAST_CONFIRMED = 20  # reports of a guest beside which others agreed, until it counts as the others
+READING_SHARE = 2.0  # of `least_sigma_m`: no teammate reads the place of another more precisely
 MOST_SENDERS = 512  # of which records are kept
 
 
@@ -53,7 +55,7 @@ class TeammateScreen:
 
     def has_recent_reports(self, state: State, now_ns: int) -> bool:
         """Whether a teammate has reported anything lately that is to be screened."""
-        return self.is_active and now_ns - state.memory.teammates.last_report_ns <= trust.RECENT_NS
+        return self.is_active and now_ns - state.memory.teammates.last_report_ns <= RECENT_NS
 
     def screen_frame(
         self, state: State, landmarks: LandmarkUpdate, gated: GatedObjects
@@ -106,7 +108,10 @@ class TeammateScreen:
         if observation.observer is None:
             return observation
         observer = self._cautious(state, observation.sender, observation.observer)
-        return observation._replace(observer=observer)
+        xx, xy, yy = sensor = observation.sensor
+        more = max(0.0, (READING_SHARE * self._rules.least_sigma_m) ** 2 - min(xx, yy))
+        sensor = Covariance2(xx + more, xy, yy + more) if more else sensor
+        return observation._replace(sensor=sensor, observer=observer)
 
     def _cautious(self, state: State, sender: str, dependent: Covariance2) -> Covariance2:
         """The part of a teammate's noise that is the same in all its reports: never below what this
@@ -148,13 +153,16 @@ class TeammateScreen:
                 sums = position.information(position.noise(0.0))
                 state = self._with_own_sensors(state, is_accepted, not is_accepted, sums)
             return state, True
-        heading = observation.of_heading(state.estimate.pose)
+        heading, of_heading = observation.of_heading(state.estimate.pose), None
         if heading is not None:  # three degrees of freedom, scaled to two
             nis += heading.normalized_innovation_squared(state.estimate.covariance)
             nis *= 2.0 / 3.0
+            of_heading = heading.residuals[0], heading.noise().xx
         noise, (ex, ey) = position.noise(), position.residuals
         variance = 0.5 * (noise.xx + noise.yy)
-        where = now, observation.x, observation.y, variance, state.odometry_from_robot
+        odometry_from_robot = state.odometry_from_robot
+        turn_rad = state.estimate.pose.heading - odometry_from_robot.heading
+        where = now, observation.x, observation.y, variance, odometry_from_robot, turn_rad
         report = TeammateReport(
             now,
             None if is_lost else nis,
@@ -162,6 +170,7 @@ class TeammateScreen:
             ReportedPosition(*where),
             self._evidence(state, position),
             self._is_guest(observation.sender),
+            of_heading,
         )
         return self._assess(state, observation.sender, report, observation.source)
 
@@ -204,8 +213,9 @@ class TeammateScreen:
         if not decision.trusted:
             memory = memory.counted("distrusted")
         state = with_memory(state, memory)
-        if decision.estimate_error_m:
-            estimate = inflate_by_offset(estimate, decision.estimate_error_m, self._localizer_rules)
+        errors = decision.estimate_error_m, decision.estimate_error_rad
+        if any(errors):
+            estimate = inflate_by_offset(estimate, *errors, self._localizer_rules)
             state = state._replace(estimate=estimate)
         if decision.least_sigma_m:
             estimate = inflate_to(state.estimate, decision.least_sigma_m, self._localizer_rules)
@@ -214,13 +224,13 @@ class TeammateScreen:
         return with_teammates(state, teammates), decision.trusted
 
 
-def _bounded(senders: trust.SenderRecords) -> trust.SenderRecords:
+def _bounded(senders: SenderRecords) -> SenderRecords:
     """The records without the older half of them, by their last reports, when there are too many:
     guests of ever new names may come."""
     if len(senders) <= MOST_SENDERS:
         return senders
     names = sorted(senders, key=lambda name: senders[name].last_report_ns)
-    kept = {*names[len(names) // 2 :], trust.OWN_SENSORS}
+    kept = {*names[len(names) // 2 :], OWN_SENSORS}
     return {name: record for name, record in senders.items() if name in kept}
 
 

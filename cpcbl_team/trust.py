@@ -2,7 +2,7 @@
 
 The reports of a sender have to pass three tests: each report one against the estimate and one
 against odometry (`sender_records.py`), and their mean one against the robot's own sensors or the
-other senders (`mean_offsets.py`).
+other senders (`sender_comparisons.py`).
 
 A sender whose score against the estimate exceeds the limit is in dispute with it. The dispute is
 decided against the sender only if somebody else supported the estimate since it began: the robot's
@@ -16,24 +16,25 @@ readmitted after its reports were right for some time (docs/trust.md).
 """
 
 import math
-from collections.abc import Iterator, Mapping
 from typing import Final, NamedTuple
 
 from msgspec.structs import replace
 
 from cpcbl_team.config import TrustSettings
-from cpcbl_team.mean_offsets import (
-    Comparison,
-    MeanOffset,
-    both,
-    compared_with_majority,
-    compared_with_own_sensors,
-    disagreement,
+from cpcbl_team.mean_offsets import Comparison, disagreement
+from cpcbl_team.sender_comparisons import (
+    OWN_SENSORS,
+    RECENT_NS,
+    SenderRecords,
+    compare,
+    recent_senders,
+    voting_means,
+    with_comparison,
+    wrong_turn,
 )
 from cpcbl_team.sender_records import (
     CONTRADICTING_NIS,
     MOST_NIS,
-    NEVER_NS,
     SILENCE_NS,
     OffsetEvidence,
     QuarantineReason,
@@ -46,8 +47,6 @@ from cpcbl_team.sender_records import (
     with_report,
 )
 
-OWN_SENSORS = ""  # stands for the robot's own sensors among the senders; no robot has this name
-RECENT_NS: Final = 3_000_000_000  # a sender takes part in disputes for so long after a report
 FRESH_BELIEF_NS: Final = 300_000_000  # the robot of an older belief may have turned since
 TIE_NS = 1_500_000_000  # a dispute between equally many is decided for the estimate after this time
 CLEAR_CONFLICTS = 0.5  # odometry speaks against a sender with this many conflicts
@@ -56,11 +55,11 @@ LEAST_AGREEMENTS = 10  # reports that must agree with the estimate before a send
 LEAST_CONFIRMATIONS = 2  # or distances that must agree with odometry
 PERSISTENCE_NS: Final = 500_000_000  # a mean that is wrong for so long is no chance
 ALIKE_M: Final = 0.05  # two senders whose offsets differ by no more, or by half of them, agree
+UNDECIDED_NS: Final = 10_000_000_000  # a dispute is undecided so long after a contest of its sides
 MAJORITY_NS: Final = 20_000_000_000  # most senders are not found wrong within so short a time
 
 # The reasons that rest on what other senders reported
 _BY_COMPARISON = QuarantineReason.BIASED, QuarantineReason.OVERCONFIDENT, QuarantineReason.OUTVOTED
-SenderRecords = Mapping[str, SenderRecord]
 
 
 class TrustDecision(NamedTuple):
@@ -71,6 +70,7 @@ class TrustDecision(NamedTuple):
     event: str = ""  # the count to increase: quarantined, readmitted, outvoted
     quarantined: frozenset[str] = frozenset()  # the senders whose quarantine begins now
     estimate_error_m: float = 0.0  # how far the estimate may be off because it followed them
+    estimate_error_rad: float = 0.0  # the same of its heading
     least_sigma_m: float = 0.0  # of the estimate, while senders contradict each other
 
 
@@ -120,9 +120,9 @@ def _decide(
     now = report.stamp_ns
     record = with_report(senders.get(name, SenderRecord()), report, rules.limit)
     senders = {**senders, name: record}
-    comparison = _comparison(senders, name, now)
+    comparison = compare(senders, name, now)
     if comparison is not None:
-        record = _with_comparison(record, comparison, now)
+        record = with_comparison(record, comparison, now)
         senders = {**senders, name: record}
     if record.reason:
         return _assess_quarantined(senders, name, report, comparison, rules)
@@ -142,54 +142,6 @@ def _decide(
     return _decide_dispute(senders, name, now, used_ns, rules)
 
 
-# Test 3: the mean of a sender against own sensors, or against other senders ----------------------
-
-
-def _means(senders: SenderRecords, now_ns: int, name: str, of: int) -> dict[str, MeanOffset]:
-    """The precise fast (0) or slow (1) means of the recent sources but `name`. Guests have no vote
-    beside two robots of the team."""
-    means = {
-        other: mean
-        for other, r in _recent(senders, now_ns, name)
-        if (mean := r.means[of]) is not None
-        and mean.is_precise
-        and now_ns - r.offsets[of].stamp_ns <= RECENT_NS
-    }
-    guests = {other for other in means if senders[other].is_guest}
-    if len(means.keys() - guests - {OWN_SENSORS}) < 2:
-        return means
-    return {other: mean for other, mean in means.items() if other not in guests}
-
-
-def _comparison(senders: SenderRecords, name: str, now_ns: int) -> Comparison | None:
-    """The result of test 3; None while the sender has no recent mean that is precise."""
-    fast, slow = (_comparison_of(senders, name, now_ns, of) for of in (0, 1))
-    return both(fast, slow) if fast is not None and slow is not None else fast or slow
-
-
-def _comparison_of(senders: SenderRecords, name: str, now_ns: int, of: int) -> Comparison | None:
-    """The result of test 3 with the fast (0) or slow (1) mean of a sender."""
-    record, mean = senders[name], senders[name].means[of]
-    if record.offsets[of].stamp_ns != now_ns or mean is None or not mean.is_precise:
-        return None
-    means = _means(senders, now_ns, name, of)
-    own = means.pop(OWN_SENSORS, None)
-    if own is not None:
-        return compared_with_own_sensors(mean, own, means)
-    return compared_with_majority(mean, means)
-
-
-def _with_comparison(record: SenderRecord, comparison: Comparison, now_ns: int) -> SenderRecord:
-    since_ns = now_ns if record.wrong_ns == NEVER_NS else record.wrong_ns
-    return replace(
-        record,
-        bias_variance=comparison.bias_variance,
-        contested_ns=now_ns if comparison.is_contested else record.contested_ns,
-        wrong_ns=since_ns if comparison.is_wrong else NEVER_NS,
-        confirmed=record.confirmed + 1 if comparison.is_confirmed else record.confirmed,
-    )
-
-
 def _is_contested(record: SenderRecord, now_ns: int) -> bool:
     return now_ns - record.contested_ns <= RECENT_NS
 
@@ -197,7 +149,14 @@ def _is_contested(record: SenderRecord, now_ns: int) -> bool:
 def _quarantine_by_mean(senders: SenderRecords, name: str, now_ns: int) -> TrustDecision:
     """The decision against a sender whose mean is wrong. The estimate is off by the means of those
     that contradict it."""
-    mean, means = senders[name].means[0], _means(senders, now_ns, name, 0)
+    right_turn = wrong_turn(senders, name, now_ns)
+    if right_turn is not None:
+        changed = {**senders, name: quarantined(senders[name], QuarantineReason.HEADING, now_ns)}
+        names = frozenset((name,))
+        return TrustDecision(
+            changed, False, "quarantined", names, estimate_error_rad=abs(right_turn.rad)
+        )
+    mean, means = senders[name].means[0], voting_means(senders, now_ns, name, 0)
     if mean is None or not means:
         return TrustDecision(senders, False)
     own = means.get(OWN_SENSORS)
@@ -215,25 +174,26 @@ def _decide_dispute(
     """Decides who is wrong if a sender has contradicted the estimate for long enough. A source
     supports the estimate only if it agreed with it after the dispute began. If none does, no sender
     is blamed: the robot detects by its innovations that it is lost."""
-    recent = dict(_recent(senders, now_ns))
+    recent = dict(recent_senders(senders, now_ns))
     disputes_ns = [r.dispute_since_ns for r in recent.values() if r.score > rules.limit]
     if not disputes_ns:
         is_contested = _is_contested(recent[name], now_ns)
         least_m = _contested_m(recent[name]) if is_contested else 0.0
         return TrustDecision(senders, True, least_sigma_m=least_m)
-    since_ns = min(disputes_ns)
+    began_ns = min(disputes_ns)
     dissenters = {n for n, r in recent.items() if r.score > 0.5 * rules.limit}
     supporters = {
         n
         for n, r in recent.items()
-        if n not in dissenters and r.last_agreement_ns > max(since_ns, r.dispute_since_ns)
+        if n not in dissenters and r.last_agreement_ns > max(began_ns, r.dispute_since_ns)
     }
     if not supporters:
         return TrustDecision(senders, True)
     sides = dissenters | supporters
-    if OWN_SENSORS not in sides and any(_is_contested(recent[n], now_ns) for n in sides):
+    since_ns = now_ns - UNDECIDED_NS
+    if OWN_SENSORS not in sides and any(recent[n].contested_ns >= since_ns for n in sides):
         return TrustDecision(senders, True, least_sigma_m=_contested_m(senders[name]))
-    is_right = _is_estimate_right(recent, dissenters, supporters, now_ns - since_ns)
+    is_right = _is_estimate_right(recent, dissenters, supporters, now_ns - began_ns)
     if is_right is None:
         return TrustDecision(senders, False)
     if not is_right:
@@ -266,20 +226,11 @@ def _is_estimate_right(
     return True if dispute_ns >= TIE_NS else None
 
 
-def _recent(
-    senders: SenderRecords, now_ns: int, without: str | None = None
-) -> Iterator[tuple[str, SenderRecord]]:
-    """The senders out of quarantine that reported recently."""
-    for name, r in senders.items():
-        if name != without and not r.reason and now_ns - r.last_report_ns <= RECENT_NS:
-            yield name, r
-
-
 def _is_odometry_wrong(senders: SenderRecords, name: str, rules: TrustSettings) -> bool:
     """Whether another source contradicts odometry too, so that `name` is not to blame."""
     return any(
         r.odometry_conflicts >= 1.0 or (other == OWN_SENSORS and r.score > 0.5 * rules.limit)
-        for other, r in _recent(senders, senders[name].last_report_ns, name)
+        for other, r in recent_senders(senders, senders[name].last_report_ns, name)
     )
 
 
@@ -358,7 +309,7 @@ def _assess_quarantined(
         record = replace(record, reason=reason_of(record))
         senders = {**senders, name: record}
     readmit_ns = int(rules.readmit_s * 1e9)
-    others = _recent(senders, now, name)
+    others = recent_senders(senders, now, name)
     is_confirmed = any(r.last_agreement_ns >= now - RECENT_NS for _, r in others)
     if comparison is not None and (comparison.is_wrong or comparison.is_contested):
         record = replace(record, last_failure_ns=now, agreements=0)
@@ -391,7 +342,7 @@ def trust_statuses(senders: SenderRecords, now_ns: int) -> tuple[TrustStatus, ..
     statuses = []
     for name, r in sorted(senders.items()):
         if name != OWN_SENSORS and (r.quarantines or now_ns - r.last_report_ns <= RECENT_NS):
-            is_only = not any(_recent(senders, now_ns, name))
+            is_only = not any(recent_senders(senders, now_ns, name))
             reason = str(r.reason or "")
             is_contested = _is_contested(r, now_ns)
             fields = name, reason, r.since_ns, r.quarantines, is_only, is_contested

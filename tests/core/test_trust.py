@@ -9,8 +9,9 @@ from support.core import (
 )
 from support.trust import AGREES, CONTRADICTS, RULES, Receiver
 
+from cpcbl_team.sender_comparisons import OWN_SENSORS
 from cpcbl_team.sender_records import USUAL_NIS, SenderRecord, TeammateReport
-from cpcbl_team.trust import OWN_SENSORS, assess, trust_statuses
+from cpcbl_team.trust import assess, trust_statuses
 
 
 @pytest.fixture

@@ -1,16 +1,20 @@
 """A robot of the team that sends wrong positions on purpose, for experiments and fault scenarios.
 
 `FaultyBus` stands between a robot and its bus and changes the fixes and beliefs that the robot
-sends; the robot itself works correctly. A fault is written `KIND:VALUES@FROM-UNTIL`, with times in
-seconds after the start. Without times it lasts from the start to the end.
+sends; the robot itself works correctly. A fault is written `KIND:VALUES/ABOUT@FROM-UNTIL`, with
+times in seconds after the start. Without times it lasts from the start to the end. With `/ABOUT`,
+the name of a robot, it changes only what is reported about this robot: fixes of one victim, or,
+with the faulty robot's own name, only its beliefs.
 
 | fault | effect on each fix and belief |
 |---|---|
 | `bias:0.5,0.5` | its position is shifted by so many metres in x and y |
+| `overclaim:0.1,0.0,0.005` | the same, and it states this sigma (m) |
 | `frozen` | its position stays the last one from before the fault |
 | `jumps:1.5` | its position is shifted by so many metres, every 2 s in another direction |
 | `overconfident:0.3` | its position has an error of this sigma (m), but it states 1 mm |
 | `drift:0.01,0.0,0.02` | its error grows by these m/s in x and y, and it states this sigma (m) |
+| `heading:2.0,0.5` | its heading turns by these deg/s, and it states this sigma (deg) |
 | `clock:0.5` | its stamp is so many seconds too late (negative: too early) |
 
 `python -m cpcbl_launch.lab.faulty_robot TEAM NAME --fault FAULT` runs such a robot.
@@ -36,11 +40,23 @@ from cpcbl_transport.messages import Refusal
 from cpcbl_transport.topics import Qos
 
 Help = Belief | Fix
-VALUE_COUNTS = {"bias": 2, "frozen": 0, "jumps": 1, "overconfident": 1, "drift": 3, "clock": 1}
+VALUE_COUNTS = {
+    "bias": 2,
+    "overclaim": 3,
+    "frozen": 0,
+    "jumps": 1,
+    "overconfident": 1,
+    "drift": 3,
+    "heading": 2,
+    "clock": 1,
+}
 JUMP_NS = 2_000_000_000
 STATED_SIGMA_M = 0.001
 _HELP_KEYS = ("fix/", "belief/")
-_TEXT = re.compile(r"(?P<kind>[a-z]+)(:(?P<values>[^@]*))?(@(?P<since>[^-@]+)-(?P<until>[^-@]*))?")
+_TEXT = re.compile(
+    r"(?P<kind>[a-z]+)(:(?P<values>[^@/]*))?(/(?P<about>[^@/]+))?"
+    r"(@(?P<since>[^-@]+)-(?P<until>[^-@]*))?"
+)
 
 
 class Fault(NamedTuple):
@@ -50,6 +66,7 @@ class Fault(NamedTuple):
     values: tuple[float, ...] = ()
     from_s: float = 0.0
     until_s: float = math.inf
+    about: str = ""  # the robot about whom it lies; empty: about all
 
     @staticmethod
     def parse(text: str) -> "Fault":
@@ -66,7 +83,7 @@ class Fault(NamedTuple):
             raise InputError(f"--fault {text}: write numbers, e.g. bias:0.5,0.5@10-30") from None
         if len(values) != VALUE_COUNTS[kind] or not all(map(math.isfinite, values)):
             raise InputError(f"--fault {text}: {kind} takes {VALUE_COUNTS[kind]} numbers")
-        return Fault(kind, values, since, until)
+        return Fault(kind, values, since, until, match["about"] or "")
 
 
 class FaultInjector:
@@ -81,15 +98,18 @@ class FaultInjector:
         """What the robot sends in place of the message."""
         since_s = (message.stamp_ns - self._start_ns) * 1e-9
         is_active = self._fault.from_s <= since_s < self._fault.until_s
+        is_active = is_active and self._fault.about in ("", message.robot)
         if self._fault.kind == "frozen":
             return self._freeze(message, is_active)
         if not is_active:
             return message
         if self._fault.kind == "clock":
             return replace(message, stamp_ns=message.stamp_ns + int(self._fault.values[0] * 1e9))
+        if self._fault.kind == "heading":
+            return _with_heading(message, since_s - self._fault.from_s, *self._fault.values)
         dx, dy = self._offset(message.stamp_ns)
         message = replace(message, x_m=message.x_m + dx, y_m=message.y_m + dy)
-        if self._fault.kind == "drift":
+        if self._fault.kind in ("drift", "overclaim"):
             return _with_stated_sigma(message, self._fault.values[2])
         is_tiny = self._fault.kind == "overconfident"
         return _with_stated_sigma(message, STATED_SIGMA_M) if is_tiny else message
@@ -97,7 +117,7 @@ class FaultInjector:
     def _offset(self, stamp_ns: int) -> tuple[float, float]:
         """Metres in x and y."""
         first, *_ = self._fault.values
-        if self._fault.kind == "bias":
+        if self._fault.kind in ("bias", "overclaim"):
             return first, self._fault.values[1]
         if self._fault.kind == "drift":
             since_s = (stamp_ns - self._start_ns) * 1e-9 - self._fault.from_s
@@ -122,6 +142,20 @@ def _with_stated_sigma(message: Help, sigma_m: float) -> Help:
         position = (variance, 0.0, variance)
         return replace(message, sensor_covariance=position, observer_covariance=position)
     return replace(message, covariance=(variance, 0.0, variance, 0.0, 0.0, variance))
+
+
+def _with_heading(message: Help, for_s: float, turn_deg_s: float, sigma_deg: float) -> Help:
+    """A belief, or a fix with a heading, whose heading has turned for so long."""
+    if message.heading_rad is None:
+        return message
+    heading = math.remainder(message.heading_rad + math.radians(turn_deg_s * for_s), math.tau)
+    message, variance = replace(message, heading_rad=heading), math.radians(sigma_deg) ** 2
+    if isinstance(message, Fix):
+        return replace(
+            message, heading_sensor_variance=variance, heading_observer_variance=variance
+        )
+    xx, xy, yy, *_ = message.covariance
+    return replace(message, covariance=(xx, xy, yy, 0.0, 0.0, variance))
 
 
 class _FaultyPublisher(PublisherProxy):

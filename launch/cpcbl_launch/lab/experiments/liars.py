@@ -5,7 +5,8 @@ Observers with good sensors stand around the field of the demonstration; a navig
 sensors and two scouts, blind to landmarks, drive between them. From 10 s to 25 s one observer is
 faulty (`faulty_robot.py`), then correct again; one or two others are correct all the time. Errors
 are those of the robots that drive, from 10 s on, compared with the team without the faulty observer
-and with a team that trusts everybody.
+and with a team that trusts everybody. A second part has observers that lie on purpose to one robot
+(`attacks.py`).
 """
 
 import math
@@ -18,6 +19,16 @@ from msgspec import Struct
 from msgspec.structs import replace
 from rich.console import RenderableType
 
+from cpcbl_launch.lab.experiments.attacks import (
+    Attack,
+    AttackRow,
+    AttackRun,
+    attack_rows,
+    attack_tables,
+    attacks,
+    run_attack,
+    with_bases,
+)
 from cpcbl_launch.lab.experiments.runs import (
     Experiment,
     ExperimentResult,
@@ -98,6 +109,8 @@ class Liars(ExperimentResult, frozen=True, kw_only=True):
     team: Team
     rows: tuple[Row, ...]
     held: bool  # whether the median ratio of every fault is within the target
+    attacks: tuple[AttackRow, ...] = ()
+    attacks_held: bool = True  # whether the aims of all attacks held in every seed
 
 
 def liars_team(case: Case) -> Team:
@@ -109,15 +122,16 @@ def liars_team(case: Case) -> Team:
     return with_settings(replace(team, robots=robots), None, collaboration={"trust": trust})
 
 
-def cases() -> Mapping[Case, Case]:
-    """Without the faulty observer, with it but correct, and with each fault (trust on and off)."""
-    every = []
+def cases() -> Mapping[Case | Attack, Case | Attack]:
+    """Without the faulty observer, with it but correct, and with each fault (trust on and off);
+    then the attacks, and the runs to compare them with."""
+    every: list[Case | Attack] = []
     for honest in (2, 1):
         every += [Case(lie="", liar=False, honest=honest), Case(lie="", honest=honest)]
         every += [
             Case(lie=f, honest=honest, trust=trust) for f in FAULTS for trust in (True, False)
         ]
-    return {case: case for case in every}
+    return {case: case for case in [*every, *with_bases(attacks())]}
 
 
 class _Statuses:
@@ -142,8 +156,13 @@ class _Statuses:
                 self.found[key_] = first._replace(until_s=since_ns * 1e-9)
 
 
-def run_case(case: Case, seed: int) -> Run:
+def run_case(case: Case | Attack, seed: int) -> Run | AttackRun:
     """One run. The same case and seed give the same figures."""
+    return run_attack(case, seed) if isinstance(case, Attack) else run_fault(case, seed)
+
+
+def run_fault(case: Case, seed: int) -> Run:
+    """One run with a faulty observer, or without it."""
     statuses, through = _Statuses(), {}
     if case.lie:
         fault = Fault.parse(f"{case.lie}@{FROM_S}-{UNTIL_S}")
@@ -161,7 +180,9 @@ def outcome(results: Results) -> Liars:
     rows = tuple(
         _row(case, runs, results.get(Case(lie="", liar=False, honest=case.honest)))
         for case, runs in results.items()
+        if isinstance(case, Case)
     )
+    attacked = attack_rows({a: runs for a, runs in results.items() if isinstance(a, Attack)})
     return Liars(
         experiment="liars",
         seeds=len(next(iter(results.values()))),
@@ -169,6 +190,8 @@ def outcome(results: Results) -> Liars:
         team=liars_team(Case(lie="")),
         rows=rows,
         held=not _rows_above_target(rows),
+        attacks=attacked,
+        attacks_held=all(row.held for row in attacked),
     )
 
 
@@ -238,6 +261,8 @@ def tables(result: Liars) -> Iterable[RenderableType]:
         yield f"The ratio is above {MOST_RATIO:g} for {'; '.join(missed)}."
     else:
         yield f"The aim holds: no ratio is above {MOST_RATIO:g}."
+    if result.attacks:
+        yield from attack_tables(result.attacks, result.seeds)
 
 
 def _cells(row: Row, believed: Row | None) -> list[str]:

@@ -1,0 +1,238 @@
+"""Observers that lie on purpose to one driving robot, their victim: the second part of the
+experiment `liars`.
+
+The team is that of `liars.py`, with one driving robot and two correct observers. Each liar always
+sees its victim (`lying_observer.py`). The victim is compared with itself in the run of the same
+seed without liars, and judged by the worst seed: the aim holds in every one or not at all.
+"""
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from statistics import median
+from typing import NamedTuple
+
+from msgspec import Struct
+from msgspec.structs import replace
+from rich.console import RenderableType
+
+from cpcbl_launch.lab.faulty_robot import Fault
+from cpcbl_launch.lab.lying_observer import LyingObserver
+from cpcbl_launch.reporting.metrics import Score, score
+from cpcbl_launch.reporting.recorder import Recorder
+from cpcbl_launch.reporting.tables import number, table
+from cpcbl_launch.simulation.field import SimulatedField
+from cpcbl_launch.simulation.field_node import FieldNode
+from cpcbl_launch.simulation.in_process import robot_nodes, run_nodes
+from cpcbl_launch.team.file import builtin_path, load_team
+from cpcbl_team.config import Team
+from cpcbl_transport.bus import Bus
+from cpcbl_transport.decoding import Received, Subscriber
+from cpcbl_transport.memory_bus import MemoryHub
+from cpcbl_transport.messages import Status
+
+HONEST = ("north", "south")
+ONE, TWO, GUEST = ("west",), ("west", "east"), ("ghost",)
+DRIFT = "drift:0.01,0.0,0.01"  # 1 cm/s, and it states 1 cm
+LEAST_INSIDE = 0.95  # of the victim's samples within 3 sigma, where nobody can find the liars
+OWN_EYES_RATIO, BLIND_RATIO = 1.3, 1.5
+NAVIGATOR = {"victim": "navigator", "most_ratio": OWN_EYES_RATIO}
+
+
+class Attack(Struct, frozen=True, kw_only=True):
+    """One kind of liars and their victim. Without liars it is the run to compare with."""
+
+    name: str = ""
+    lie: str = ""  # a fault without its times
+    liars: tuple[str, ...] = ()
+    victim: str = "scout"
+    most_ratio: float | None = BLIND_RATIO
+    """The aim, to the RMSE without liars; None: nobody can find out, and sigma has to hold."""
+    sends: str = "fixes"
+    bystanders: tuple[str, ...] = ()  # driving robots to which the liars report, too
+    from_s: float = 10.0
+    end_s: float = 70.0
+
+    @property
+    def without(self) -> "Attack":
+        """The same run without liars."""
+        return replace(self, name="", lie="", liars=(), sends="fixes", most_ratio=BLIND_RATIO)
+
+
+class AttackRun(NamedTuple):
+    """What one run did to the victim."""
+
+    score: Score  # from the beginning of the lie on
+    noticed_after_s: float | None  # until it quarantined a liar, or said that one is contested
+    false_quarantines: int  # of correct observers
+
+
+class AttackRow(Struct, frozen=True, kw_only=True):
+    """One attack over its seeds; worst means the seed in which it is worst."""
+
+    attack: Attack
+    rmse_m: float  # median
+    ratio: float  # median, to the same seed without liars
+    worst_ratio: float
+    worst_nees: float
+    least_inside_3_sigma: float
+    noticed: int  # seeds
+    noticed_after_s: float | None  # median
+    false_quarantines: int  # over all seeds
+    held: bool
+
+
+def attacks() -> tuple[Attack, ...]:
+    """A blind scout with an honest majority; a navigator with poor eyes against as many liars as
+    there are correct observers; guests; and a scout without a majority."""
+    drift = Attack(name="drift", lie=DRIFT)
+    kinds = (
+        drift,
+        Attack(name="overclaimed", lie="overclaim:0.1,0.0,0.005"),
+        Attack(name="one victim", lie=f"{DRIFT}/{{victim}}", bystanders=("scout2",)),
+        Attack(name="sleeper", lie=DRIFT, from_s=120.0, end_s=180.0),
+        Attack(name="beliefs", lie=DRIFT, sends="beliefs"),
+        Attack(name="headings", lie="heading:1.0,1.0", sends="headings"),
+    )
+    cases = [replace(kind, liars=ONE) for kind in kinds]
+    cases += [replace(kind, liars=TWO, **NAVIGATOR) for kind in kinds]
+    cases += [replace(drift, name="guest", liars=GUEST, **more) for more in ({}, NAVIGATOR)]
+    cases += [replace(drift, name="no majority", liars=TWO, most_ratio=None)]
+    return tuple(replace(case, lie=case.lie.format(victim=case.victim)) for case in cases)
+
+
+def with_bases(chosen: Sequence[Attack]) -> list[Attack]:
+    """These attacks after the runs without liars that they are compared with."""
+    return [*dict.fromkeys(attack.without for attack in chosen), *chosen]
+
+
+def attack_team(attack: Attack) -> Team:
+    """The team of an attack: two correct observers, the driving robots, and the liars, whose posts
+    are west and east of the field. A guest is no robot of the team."""
+    team = load_team(builtin_path("liars"))
+    kept = {*HONEST, attack.victim, *attack.bystanders, *attack.liars}
+    west = team.robots["west"]
+    assert west.start is not None
+    start = replace(west.start, x_m=9.0, heading_deg=180.0)
+    robots = {**team.robots, "east": replace(west, start=start)}
+    return replace(team, robots={name: r for name, r in robots.items() if name in kept})
+
+
+class _Statuses:
+    """When the victim first said what of whom."""
+
+    def __init__(self, bus: Bus, victim: str) -> None:
+        self.doubted_s: dict[str, float] = {}  # in quarantine, or contested
+        self.quarantined: set[str] = set()
+        self._victim = victim
+        self._subscriber = Subscriber(bus, Status, self._on_message)
+
+    def _on_message(self, received: Received[Status]) -> None:
+        status = received.message
+        for trust in status.trust if status.robot == self._victim else ():
+            if trust.reason:
+                self.quarantined.add(trust.peer)
+            if trust.reason or trust.contested:
+                self.doubted_s.setdefault(trust.peer, status.stamp_ns * 1e-9)
+
+
+def run_attack(attack: Attack, seed: int) -> AttackRun:
+    """One run. The same attack and seed give the same figures."""
+    team, hub = attack_team(attack), MemoryHub()
+    recorder = Recorder(hub.session())
+    statuses = _Statuses(hub.session(), attack.victim)
+    field = FieldNode(SimulatedField(team, seed, 0), hub.session())
+    nodes = robot_nodes(team, hub, 0)
+    correct = [n for name, n in zip(team.robots, nodes, strict=True) if name not in attack.liars]
+    told, sent = (attack.victim, *attack.bystanders), attack.sends
+    fault = Fault.parse(f"{attack.lie}@{attack.from_s}-") if attack.lie else None
+    liars = [
+        LyingObserver(hub.session(), name, told, fault, seed, sent)
+        for name in attack.liars
+        if fault is not None
+    ]
+    run_nodes([field, *correct, *liars], 0, int(attack.end_s * 1e9))
+    truth = recorder.simulated_truth()[attack.victim]
+    of_victim = score(recorder.samples(attack.victim, truth, attack.from_s))
+    noticed_s = [at_s for name, at_s in statuses.doubted_s.items() if name in attack.liars]
+    after_s = min(noticed_s) - attack.from_s if noticed_s else None
+    return AttackRun(of_victim, after_s, len(statuses.quarantined & set(HONEST)))
+
+
+# Over all seeds -----------------------------------------------------------------------------------
+
+
+def attack_rows(results: Mapping[Attack, Sequence[AttackRun]]) -> tuple[AttackRow, ...]:
+    """A row for each attack, and for each run without liars."""
+    return tuple(_row(attack, runs, results[attack.without]) for attack, runs in results.items())
+
+
+def _row(attack: Attack, runs: Sequence[AttackRun], without: Sequence[AttackRun]) -> AttackRow:
+    ratios = [_rmse_m(a) / _rmse_m(b) for a, b in zip(runs, without, strict=True)]
+    inside = min(run.score.inside_3_sigma or 0.0 for run in runs)
+    noticed_s = [run.noticed_after_s for run in runs if run.noticed_after_s is not None]
+    false = sum(run.false_quarantines for run in runs)
+    if attack.most_ratio is None:  # it says so, and sigma holds
+        held = inside >= LEAST_INSIDE and len(noticed_s) == len(runs)
+    else:
+        held = max(ratios) <= attack.most_ratio
+    return AttackRow(
+        attack=attack,
+        rmse_m=median(_rmse_m(run) for run in runs),
+        ratio=median(ratios),
+        worst_ratio=max(ratios),
+        worst_nees=max(run.score.nees or math.inf for run in runs),
+        least_inside_3_sigma=inside,
+        noticed=len(noticed_s),
+        noticed_after_s=median(noticed_s) if noticed_s else None,
+        false_quarantines=false,
+        held=held and not (false and not attack.liars),
+    )
+
+
+def _rmse_m(run: AttackRun) -> float:
+    return run.score.position_rmse_m or 0.0
+
+
+def attack_tables(rows: Sequence[AttackRow], seeds: int) -> Iterable[RenderableType]:
+    """A row for each attack, and which aims were missed."""
+    figures = ("m", "ratio", "worst", "aim", "NEES", "3 σ", "found", "s", "false")
+    shown = table(f"attacks on one robot, {seeds} seeds", ("attack", "victim"), figures)
+    for row in rows:
+        shown.add_row(*_cells(row, seeds))
+    yield shown
+    yield (
+        "A scout has one liar beside two correct observers, a navigator two (but one guest),\n"
+        "and without a majority a scout has two. Column worst is\n"
+        "the largest ratio of a seed to the same seed without liars; NEES and 3 σ are those\n"
+        "of the worst seed. Column found counts the seeds in which the victim put a liar\n"
+        "into quarantine or said that it is contested, and s is the time until then. Column\n"
+        "false counts quarantines of correct observers, over all seeds."
+    )
+    missed = [
+        f"{row.attack.name or 'no liar'} ({row.attack.victim})" for row in rows if not row.held
+    ]
+    yield f"The aim is missed for: {'; '.join(missed)}." if missed else "All aims are met."
+
+
+def _cells(row: AttackRow, seeds: int) -> list[str]:
+    attack, is_attack = row.attack, bool(row.attack.liars)
+    aim = "σ holds" if attack.most_ratio is None else f"{attack.most_ratio:g}"
+    return [
+        _title(attack),
+        attack.victim,
+        number(row.rmse_m, 3),
+        number(row.ratio, 2) if is_attack else "",
+        number(row.worst_ratio, 2) if is_attack else "",
+        aim if is_attack else "",
+        number(row.worst_nees, 1),
+        f"{row.least_inside_3_sigma:.1%}",
+        f"{row.noticed}/{seeds}" if is_attack else "",
+        number(row.noticed_after_s, 1) if is_attack else "",
+        str(row.false_quarantines),
+    ]
+
+
+def _title(attack: Attack) -> str:
+    if attack.liars:
+        return attack.name
+    return "no liar" if attack.end_s < 100.0 else "no liar, later"

@@ -1,0 +1,85 @@
+"""An observer that always sees its victims and lies to them, for experiments in one process.
+
+It is an attacker with a valid name that knows the truth: ten times a second it sends every victim a
+fix, and its own belief, as a `Fault` alters them. It is a strong liar, because it sees its victims
+everywhere and spends no budget.
+"""
+
+import math
+import random
+from collections.abc import Sequence
+from typing import Final
+
+from msgspec.structs import replace
+
+from cpcbl_launch.lab.faulty_robot import Fault, FaultInjector
+from cpcbl_team.inputs import Belief, Fix
+from cpcbl_transport import topics
+from cpcbl_transport.bus import Bus
+from cpcbl_transport.compact import encode_help
+from cpcbl_transport.decoding import Received, Subscriber
+from cpcbl_transport.messages import Truth, Truths
+
+PERIOD_NS: Final = 100_000_000
+SIGMA_M = 0.01  # per axis, of its sightings and of its own position together
+HEADING_SIGMA = math.radians(1.0)
+TIER = 0
+
+
+class LyingObserver:
+    """A node of `run_nodes`. The same truth, fault, name and seed give the same messages."""
+
+    def __init__(
+        self, bus: Bus, name: str, victims: Sequence[str], fault: Fault, seed: int, sends: str
+    ) -> None:
+        """`sends`: "fixes", "headings" (fixes with a heading) or "beliefs"."""
+        self.next_ns = 0
+        self.waiting = False
+        self._name, self._sends = name, sends
+        self._injector = FaultInjector(fault, name, 0)
+        self._random = random.Random(f"{name} {seed}")
+        self._truths: Truths | None = None
+        self._token = bus.declare_token(topics.ALIVE.at(tier=TIER, robot=name, incarnation="0"))
+        key = topics.BELIEF.at(tier=TIER, robot=name)
+        self._belief = bus.publisher(key, topics.BELIEF.qos)
+        keys = {robot: topics.FIX.at(robot=robot, tier=TIER, observer=name) for robot in victims}
+        self._fixes = {robot: bus.publisher(k, topics.FIX.qos) for robot, k in keys.items()}
+        self._subscriber = Subscriber(bus, Truths, self._on_message)
+
+    def step(self, now_ns: int) -> None:
+        """Sends what it says of the robots as they were when the truth was last published."""
+        self.next_ns = now_ns + PERIOD_NS
+        if self._truths is None:
+            return
+        for truth in self._truths.robots:
+            if truth.robot == self._name and self._sends == "beliefs":
+                self._belief.put(self._lie(self._belief_of(truth, self._truths.stamp_ns)))
+            elif truth.robot in self._fixes and self._sends != "beliefs":
+                fix = self._fix_of(truth, self._truths.stamp_ns)
+                self._fixes[truth.robot].put(self._lie(fix))
+
+    def _on_message(self, received: Received[Truths]) -> None:
+        self._truths = received.message
+
+    def _lie(self, message: Belief | Fix) -> bytes:
+        return encode_help(self._injector.alter(message))
+
+    def _fix_of(self, truth: Truth, stamp_ns: int) -> Fix:
+        x, y = (v + self._random.gauss(0.0, SIGMA_M) for v in (truth.x_m, truth.y_m))
+        half = 0.5 * SIGMA_M**2
+        fix = Fix(truth.robot, self._name, stamp_ns, x, y, (half, 0.0, half), (half, 0.0, half))
+        if self._sends != "headings":
+            return fix
+        heading = truth.heading_rad + self._random.gauss(0.0, HEADING_SIGMA)
+        half = 0.5 * HEADING_SIGMA**2
+        return replace(
+            fix,
+            heading_rad=math.remainder(heading, math.tau),
+            heading_sensor_variance=half,
+            heading_observer_variance=half,
+        )
+
+    def _belief_of(self, truth: Truth, stamp_ns: int) -> Belief:
+        part, turn = SIGMA_M**2, HEADING_SIGMA**2
+        pose = truth.x_m, truth.y_m, truth.heading_rad
+        return Belief(self._name, stamp_ns, *pose, (part, 0.0, part, 0.0, 0.0, turn))

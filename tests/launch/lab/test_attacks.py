@@ -1,0 +1,82 @@
+"""Observers that lie on purpose to one robot: the second part of `experiment liars`."""
+
+from collections.abc import Sequence
+
+import pytest
+from msgspec.structs import replace
+from rich.console import Console
+
+from cpcbl_launch.lab.experiments import attacks
+from cpcbl_launch.lab.experiments.attacks import Attack, AttackRow, attack_rows, run_attack
+
+EVERY = {(attack.name, attack.victim): attack for attack in attacks.attacks()}
+SHORT = [("drift", "scout"), ("overclaimed", "navigator"), ("no majority", "scout")]
+SHORT_S = 35.0
+
+pytestmark = pytest.mark.timeout(300)
+
+
+def rows_of(chosen: Sequence[Attack], seeds: Sequence[int]) -> tuple[AttackRow, ...]:
+    cases = attacks.with_bases(chosen)
+    return attack_rows({case: [run_attack(case, seed) for seed in seeds] for case in cases})
+
+
+@pytest.fixture(scope="module")
+def short() -> dict[tuple[str, str], AttackRow]:
+    rows = rows_of([replace(EVERY[key], end_s=SHORT_S) for key in SHORT], [2])
+    return {(row.attack.name, row.attack.victim): row for row in rows}
+
+
+@pytest.mark.parametrize("key", SHORT[:2])
+def test_an_attack_is_noticed_and_does_little_harm(
+    short: dict[tuple[str, str], AttackRow], key: tuple[str, str]
+) -> None:
+    row = short[key]
+    assert row.held
+    assert row.attack.most_ratio is not None
+    assert row.worst_ratio <= row.attack.most_ratio
+    assert row.noticed_after_s is not None
+    assert row.noticed_after_s < 20.0
+    assert row.least_inside_3_sigma > 0.9
+    assert row.worst_nees < 4.0
+    assert row.false_quarantines == 0
+
+
+def test_without_a_majority_the_robot_says_so_and_its_sigma_holds(
+    short: dict[tuple[str, str], AttackRow],
+) -> None:
+    row = short["no majority", "scout"]
+    assert row.noticed == 1
+    assert row.least_inside_3_sigma > attacks.LEAST_INSIDE
+    assert row.worst_ratio > 1.3  # nobody could find out
+
+
+def test_the_runs_to_compare_with_have_no_liar(short: dict[tuple[str, str], AttackRow]) -> None:
+    for key in (("", "scout"), ("", "navigator")):
+        assert short[key].worst_ratio == 1.0
+        assert short[key].noticed == short[key].false_quarantines == 0
+
+
+def test_the_table_says_which_aims_are_missed(
+    short: dict[tuple[str, str], AttackRow], capsys: pytest.CaptureFixture[str]
+) -> None:
+    rows = list(short.values())
+    console = Console(width=80)
+    for bad in (False, True):
+        shown = [replace(row, held=row.held and not bad) for row in rows]
+        for part in attacks.attack_tables(shown, 1):
+            console.print(part)
+    text = capsys.readouterr().out
+    assert "overclaimed" in text
+    assert "All aims are met." in text
+    assert "The aim is missed for: no liar (scout)" in text
+    assert "…" not in text
+    assert all(len(line) <= 80 for line in text.splitlines())
+
+
+@pytest.mark.long
+@pytest.mark.timeout(7200)
+def test_every_aim_holds_in_twenty_seeds() -> None:
+    rows = rows_of(attacks.attacks(), range(3000, 3020))
+    missed = [(row.attack.name, row.attack.victim) for row in rows if not row.held]
+    assert missed == []
