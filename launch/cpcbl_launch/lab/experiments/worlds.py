@@ -247,8 +247,9 @@ def tables(result: Outcome) -> Iterable[RenderableType]:
             f"[{COLOURS.get(word, 'yellow')}]{word}",
         )
     yield shown
-    yield "NEES: 2 is due (heading: 1); ±: 95 % bounds of the mean over runs; in 3 σ: 98.9 % is due"
-    yield "found: poses of lost robots that were found; beyond: of these beyond the 99.9 % bound"
+    yield "A consistent filter has a NEES of 2 (heading: 1), and 98.9 % of the samples in 3 σ."
+    yield "±: 95 % bounds of the mean over runs. found: how often a lost robot found its pose;"
+    yield "beyond: how often that pose was wrong by more than the 99.9 % bound."
     yield "overconfident: the bounds exclude a NEES of 2, or 98 % in 3 σ; or two poses beyond"
 
 
