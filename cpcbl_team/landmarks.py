@@ -34,8 +34,9 @@ from cpcbl_team.estimate import (
 )
 from cpcbl_team.fusion import chi_square
 from cpcbl_team.gaussian import width_per_m
+from cpcbl_team.geometry import wrap_angle
 from cpcbl_team.inputs import Sighting
-from cpcbl_team.miscalibration import AS_CONFIGURED
+from cpcbl_team.miscalibration import AS_CONFIGURED, Adaptation
 from cpcbl_team.sensors import (
     LARGEST_BEARING_RAD,
     LARGEST_M,
@@ -214,9 +215,17 @@ class Landmarks:
         nis = chi_square(prior, (first, 0.0, last), rows, residuals)
         return nis > self._gates[len(rows) - 1]
 
-    def evidence_of(self, snapshot: LandmarkSnapshot) -> list[Evidence]:
-        """The evidence of a snapshot, one piece a landmark."""
+    def evidence_of(
+        self, snapshot: LandmarkSnapshot, adaptation: Adaptation = AS_CONFIGURED
+    ) -> list[Evidence]:
+        """The evidence of a snapshot, one piece a landmark, as the robot would measure it with this
+        adaptation of its settings."""
         stamp_ns, odometry_from_robot, pose, sightings = snapshot
+        ranges, bias, k = (
+            adaptation.ranges,
+            adaptation.bearing_bias_rad,
+            sqrt(adaptation.sensor_factor),
+        )
         first: dict[str, Sighting] = {}
         for sighting in sightings:
             first.setdefault(sighting.id, sighting)
@@ -227,10 +236,13 @@ class Landmarks:
                 range_m = None
             else:
                 distance = math.hypot(mark.x - pose.x, mark.y - pose.y)
-                sigma_m = sqrt(self._range_variance(distance, range_m))
+                sigma_m = k * sqrt(self._range_variance(distance, range_m))
+                range_m = ranges.scale * range_m + ranges.offset_m
             bearing = sighting.bearing_rad if mark.gives_bearing else None
+            if bearing is not None and bias != 0.0:
+                bearing = wrap_angle(bearing - bias)
             where = stamp_ns, odometry_from_robot, name, mark.x, mark.y
-            sigmas = sigma_m, self._bearing_sigma_rad
+            sigmas = sigma_m, k * self._bearing_sigma_rad
             pieces.append(Evidence(*where, range_m, bearing, *sigmas))
         return pieces
 

@@ -14,7 +14,12 @@ from cpcbl_team.estimate import Covariance3, Estimate
 from cpcbl_team.fixes import PoseObservation
 from cpcbl_team.landmarks import Landmarks
 from cpcbl_team.measurements import Measurement
-from cpcbl_team.miscalibration import MapRejections
+from cpcbl_team.miscalibration import (
+    AS_CONFIGURED,
+    Adaptation,
+    MapRejections,
+    noise_with_factor,
+)
 from cpcbl_team.relocalization import are_apart, chi_square_bound, readings_of, relocalize
 from cpcbl_team.state import (
     FIX,
@@ -291,7 +296,7 @@ class Recovery:
         limits = self._limits_when_lost if memory.lost else self._limits
         reason = lost_reason(state.estimate, state.updates.innovations, limits)
         if memory.kidnapped_ns >= 0 and not reason:
-            evidence = self._evidence_since(memory, memory.kidnapped_ns)
+            evidence = self._evidence_since(state, memory.kidnapped_ns)
             reason = undetermined(evidence, state.updates.objects_ns, memory.kidnapped_ns)
         if reason:
             return self._recover(state, reason)
@@ -314,10 +319,10 @@ class Recovery:
             return with_recovery(state, memory._replace(suspected_ns=-1))
         if now - max(memory.relocalization_ns, memory.suspected_ns + DOUBT_NS) < QUESTION_NS:
             return state
-        evidence = self._evidence_since(memory, memory.suspected_ns)
+        evidence = self._evidence_since(state, memory.suspected_ns)
         own = tuple(e for e in evidence if not e.from_teammate)  # a liar must not move it
         memory = memory._replace(relocalization_ns=now)
-        found = relocalize(own, state.odometry_from_robot, self._field, self._noise)
+        found = self._relocalized(state, own)
         if found is None or agrees(state.estimate, found):
             return with_recovery(state, memory)
         return self._found(state.counted("lost"), found, memory)
@@ -333,11 +338,10 @@ class Recovery:
         since_ns = memory.kidnapped_ns
         if since_ns < 0 and is_rejecting:
             since_ns = updates.accepted_ns
-        evidence = self._evidence_since(memory, since_ns)
+        evidence = self._evidence_since(state, since_ns)
         if evidence and evidence[-1].stamp_ns > memory.relocalization_ns:
             memory = memory._replace(relocalization_ns=evidence[-1].stamp_ns)
-            place = state.odometry_from_robot
-            found = relocalize(evidence, place, self._field, self._noise)
+            found = self._relocalized(state, evidence)
             if found is not None:
                 return self._found(state, found, memory)
         estimate = state.estimate
@@ -364,14 +368,25 @@ class Recovery:
         updates = state.updates._replace(innovations=1)
         return state._replace(estimate=self._reduce(estimate), updates=updates, memory=memory)
 
-    def evidence(self, memory: RecoveryMemory) -> tuple[Evidence, ...]:
-        """All the evidence in a memory, the latest last."""
-        snapshots = (self._landmarks.evidence_of(snapshot) for snapshot in memory.snapshots)
-        pieces = [piece for snapshot in snapshots for piece in snapshot]
+    def evidence(
+        self, memory: RecoveryMemory, adaptation: Adaptation = AS_CONFIGURED
+    ) -> tuple[Evidence, ...]:
+        """All the evidence in a memory, the latest last: of landmarks as the robot would measure
+        them with this adaptation."""
+        of_landmarks = self._landmarks.evidence_of
+        pieces = [piece for s in memory.snapshots for piece in of_landmarks(s, adaptation)]
         return latest(tuple(sorted((*pieces, *memory.evidence), key=_stamp)))
 
-    def _evidence_since(self, memory: RecoveryMemory, stamp_ns: int) -> tuple[Evidence, ...]:
-        return tuple(e for e in self.evidence(memory) if e.stamp_ns > stamp_ns)
+    def _evidence_since(self, state: State, stamp_ns: int) -> tuple[Evidence, ...]:
+        memory = state.memory
+        pieces = self.evidence(memory.recovery, memory.calibration.adaptation)
+        return tuple(e for e in pieces if e.stamp_ns > stamp_ns)
+
+    def _relocalized(self, state: State, evidence: tuple[Evidence, ...]) -> Estimate | None:
+        """The pose that evidence determines, by odometry as noisy as the robot found it to be."""
+        factor = state.memory.calibration.adaptation.motion_factor
+        noise = noise_with_factor(self._noise, factor)
+        return relocalize(evidence, state.odometry_from_robot, self._field, noise)
 
 
 def _stamp(piece: Evidence) -> int:

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 from support.core import (
     CORNERS,
     LOOP_START,
@@ -42,6 +43,8 @@ from cpcbl_team.gaussian import Covariance2
 from cpcbl_team.geometry import Pose2, wrap_angle
 from cpcbl_team.inputs import Sighting, Sightings
 from cpcbl_team.measurements import Measurement, ObjectPosition
+from cpcbl_team.miscalibration import Adaptation, noise_with_factor
+from cpcbl_team.range_errors import RangeErrors
 from cpcbl_team.recovery import (
     MOST_PIECES,
     SPACING_NS,
@@ -55,7 +58,8 @@ from cpcbl_team.recovery import (
     with_innovations,
     with_measurements,
 )
-from cpcbl_team.state import Memory, RecoveryMemory, State, Updates
+from cpcbl_team.relocalization import relocalize
+from cpcbl_team.state import CalibrationMemory, Memory, RecoveryMemory, State, Updates
 
 ORIGIN = Pose2(0.0, 0.0, 0.0)
 HERE = Pose2(-1.0, 0.4, 0.3)
@@ -198,6 +202,49 @@ def test_a_robot_with_an_unknown_start_finds_itself() -> None:
     assert state.lost == ""
     assert state.counts["found_again"] == 1
     assert position_error(state.estimate, HERE) < 1e-3
+
+
+def test_a_lost_robot_reads_its_evidence_with_what_it_found_wrong_in_its_settings() -> None:
+    """A bias that it has noticed turns it no more, and sigmas that were too small are larger."""
+    robot, change = localizer(start=UNKNOWN), Adaptation(bearing_bias_rad=0.2, sensor_factor=9.0)
+    right, ranges = frame(HERE, SECOND // 10), RangeErrors(0.1, 0.05)
+    wrong = tuple(
+        replace(
+            s,
+            range_m=((s.range_m or 0.0) - ranges.offset_m) / ranges.scale,
+            bearing_rad=wrap_angle((s.bearing_rad or 0.0) + 0.2),
+        )
+        for s in right.sightings
+    )
+    start = robot.start(0)
+    of_right = robot.cycle(start, right).estimate
+    calibration = CalibrationMemory(adaptation=change._replace(ranges=ranges))
+    start = start._replace(memory=start.memory._replace(calibration=calibration))
+    found = robot.cycle(start, Sightings(right.stamp_ns, wrong)).estimate
+    assert position_error(found, HERE) < 1e-3
+    assert heading_error(found, HERE) < 1e-3
+    assert found.position_sigma_m == pytest.approx(3.0 * of_right.position_sigma_m, rel=0.1)
+
+
+@pytest.mark.parametrize("factor", [1.0, 16.0])
+def test_a_lost_robot_trusts_old_evidence_as_far_as_its_odometry(factor: float) -> None:
+    """Whose noise it may have found to be larger than its settings say."""
+    noise, way = OdometrySettings(), (LOOP_START, Pose2(LOOP_START.x + 2.0, LOOP_START.y, 0.3))
+    seen = (("ne", "sw"), ("nw",))
+    evidence = tuple(
+        piece(i * SECOND, place, name, CORNERS.landmarks[name].x_m, CORNERS.landmarks[name].y_m)
+        for i, (place, names) in enumerate(zip(way, seen, strict=True))
+        for name in names
+    )
+    robot, now = localizer(start=UNKNOWN), 2 * SECOND
+    start = robot.start(now)._replace(odometry_from_robot=way[-1])
+    calibration = CalibrationMemory(adaptation=Adaptation(motion_factor=factor))
+    memory = start.memory._replace(calibration=calibration)
+    recovery = memory.recovery._replace(evidence=evidence)
+    found = robot.recovery.check(start._replace(memory=memory._replace(recovery=recovery)))
+    expected = relocalize(evidence, way[-1], CORNERS, noise_with_factor(noise, factor))
+    assert expected is not None
+    assert found.estimate.covariance == pytest.approx(expected.covariance)
 
 
 def kidnapped(
