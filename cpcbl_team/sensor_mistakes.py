@@ -22,6 +22,7 @@ from cpcbl_team.state import Evidence
 
 LEAST_READINGS: Final = 4
 LEAST_SHARE: Final = 0.75  # of the pieces, that a mistake must explain
+NOISE_FACTORS: Final = (1.0, 2.0)  # sensors may be worse than their settings say
 MOST_SIGMA_M: Final = 0.5  # of a pose by which evidence can be judged
 MOST_SIGMA_RAD: Final = 0.25
 MOST_TURN_RAD: Final = 1.0  # since a piece of evidence: beyond, odometry errs too much to tell,
@@ -74,15 +75,18 @@ def mistake_in_evidence(
     own = [e for e in evidence if _is_usable(e, odometry_from_robot)]
     if sum(map(readings_of, own)) < LEAST_READINGS:
         return None
-    if _misfit(known, own, odometry_from_robot) is not None:
-        return None
-    best, least = None, math.inf
-    for mistake in MISTAKES:
-        corrected = [_without(mistake, e, known.pose, odometry_from_robot) for e in own]
-        fit = _misfit(known, corrected, odometry_from_robot)
-        if fit is not None and fit[0] < least:
-            least, best = fit[0], ExplainingMistake(mistake.text, fit[1])
-    return best
+    for noise_factor in NOISE_FACTORS:
+        if _misfit(known, own, odometry_from_robot, noise_factor) is not None:
+            return None
+        best, least = None, math.inf
+        for mistake in MISTAKES:
+            corrected = [_without(mistake, e, known.pose, odometry_from_robot) for e in own]
+            fit = _misfit(known, corrected, odometry_from_robot, noise_factor)
+            if fit is not None and fit[0] < least:
+                least, best = fit[0], ExplainingMistake(mistake.text, fit[1])
+        if best is not None:
+            return best
+    return None
 
 
 def _is_usable(e: Evidence, place: Pose2) -> bool:
@@ -103,13 +107,14 @@ def _without(mistake: SensorMistake, e: Evidence, now: Pose2, place: Pose2) -> E
 
 
 def _misfit(
-    known: Estimate, evidence: Sequence[Evidence], place: Pose2
+    known: Estimate, evidence: Sequence[Evidence], place: Pose2, noise_factor: float
 ) -> tuple[float, Pose2] | None:
     """The chi-square of the evidence by a Kalman filter that begins at the known pose, and the pose
-    then; None if it is beyond the bound, or if too many pieces do not fit at all."""
+    then; None if it is beyond the bound, or if too many pieces do not fit at all. `noise_factor`:
+    on the sigmas of the evidence."""
     estimate, cost, used, readings = known, 0.0, 0, 0
     for piece in [PropagatedEvidence(e, place, 0) for e in evidence]:
-        updated, of_piece = _updated(estimate, piece)
+        updated, of_piece = _updated(estimate, piece, noise_factor)
         if of_piece < OUTLIER:
             estimate, cost = updated, cost + of_piece
             used, readings = used + 1, readings + readings_of(piece.evidence)
@@ -118,11 +123,14 @@ def _misfit(
     return cost + OUTLIER * (len(evidence) - used), estimate.pose
 
 
-def _updated(estimate: Estimate, piece: PropagatedEvidence) -> tuple[Estimate, float]:
+def _updated(
+    estimate: Estimate, piece: PropagatedEvidence, noise_factor: float
+) -> tuple[Estimate, float]:
     """The estimate after a piece of evidence, and the chi-square of its innovations."""
     cost, (x, y, h), covariance = 0.0, (0.0, 0.0, 0.0), estimate.covariance
     for row, residual, variance in piece.rows(estimate.pose):
         px, py, ph = covariance.times(row)
+        variance *= noise_factor * noise_factor
         k = 1.0 / (row[0] * px + row[1] * py + row[2] * ph + variance)
         off = residual - row[0] * x - row[1] * y - row[2] * h
         cost += k * off * off
