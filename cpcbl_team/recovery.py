@@ -20,7 +20,8 @@ from cpcbl_team.miscalibration import (
     MapRejections,
     noise_with_factor,
 )
-from cpcbl_team.relocalization import are_apart, chi_square_bound, readings_of, relocalize
+from cpcbl_team.relocalization import UNKNOWNS, readings_of, relocalize
+from cpcbl_team.sensor_mistakes import ExplainingMistake
 from cpcbl_team.state import (
     FIX,
     Evidence,
@@ -31,6 +32,13 @@ from cpcbl_team.state import (
     with_recovery,
 )
 from cpcbl_team.trust import reset_scores
+from cpcbl_team.trusted_pose import (
+    agrees,
+    explaining_mistake,
+    keep_trusted_pose,
+    trusted_pose,
+    with_jump,
+)
 
 WINDOW_NS: Final = 20_000_000_000
 SPACING_NS: Final = 500_000_000  # one piece of evidence an object and so long
@@ -39,7 +47,6 @@ INFLATION_NS: Final = 1_000_000_000
 DOUBT_NS: Final = 5_000_000_000  # wrong inputs are named before they move a robot elsewhere
 QUESTION_NS: Final = 2_000_000_000  # a suspicious robot asks so often whether it is elsewhere
 SUSPICIOUS: Final = 2  # of the last innovations rejected; of 20 that is 2 in 10 000 times
-UNKNOWNS: Final = 3  # of a pose
 _LEVER_M = 2.0  # over such a way an error of position has become one of heading
 Stamped = TypeVar("Stamped", Evidence, LandmarkSnapshot)
 
@@ -250,18 +257,6 @@ def undetermined(
     return ""
 
 
-def agrees(estimate: Estimate, found: Estimate) -> bool:
-    """Whether a pose from recent evidence is the estimate's, by the chi-square bound of 99.9 %; a
-    small difference may have other causes than a wrong pose."""
-    if not are_apart(estimate.pose, found.pose):
-        return True
-    information = estimate.covariance.plus(found.covariance).inverse()
-    dx, dy = found.pose.x - estimate.pose.x, found.pose.y - estimate.pose.y
-    turn = math.remainder(found.pose.heading - estimate.pose.heading, math.tau)
-    x, y, heading = information.times((dx, dy, turn))
-    return dx * x + dy * y + turn * heading <= chi_square_bound(UNKNOWNS)
-
-
 def rejected_of(innovations: int) -> tuple[int, int]:
     """How many innovations of a window were rejected, and how many it has."""
     if innovations & innovations + 1 == 0:  # all bits are set: none was rejected
@@ -301,7 +296,7 @@ class Recovery:
         if reason:
             return self._recover(state, reason)
         if memory.lost:
-            return with_recovery(state, memory._replace(lost="", kidnapped_ns=-1))
+            return self._regained(state)
         if memory.suspected_ns < 0 and not rejected_of(state.updates.innovations)[0]:
             return state
         return self._questioned(state)
@@ -312,11 +307,12 @@ class Recovery:
         now, memory = state.stamp_ns, state.memory.recovery
         if rejected_of(state.updates.innovations)[0] >= SUSPICIOUS:
             if memory.suspected_ns < 0:
-                return with_recovery(state, memory._replace(suspected_ns=now))
+                memory = memory._replace(suspected_ns=now, trusted=trusted_pose(state))
+                return with_recovery(state, memory)
         elif memory.suspected_ns < 0:
             return state
         elif now - memory.suspected_ns > WINDOW_NS:
-            return with_recovery(state, memory._replace(suspected_ns=-1))
+            return with_recovery(state, memory._replace(suspected_ns=-1, trusted=None))
         if now - max(memory.relocalization_ns, memory.suspected_ns + DOUBT_NS) < QUESTION_NS:
             return state
         evidence = self._evidence_since(state, memory.suspected_ns)
@@ -325,6 +321,8 @@ class Recovery:
         found = self._relocalized(state, own)
         if found is None or agrees(state.estimate, found):
             return with_recovery(state, memory)
+        if mistake := self._explaining_mistake(state, memory, found):
+            return keep_trusted_pose(state.counted("lost"), memory, mistake, self._reduce)
         return self._found(state.counted("lost"), found, memory)
 
     def _recover(self, state: State, reason: str) -> State:
@@ -332,7 +330,9 @@ class Recovery:
         now, memory, updates = state.stamp_ns, state.memory.recovery, state.updates
         if not memory.lost:
             memory, state = memory._replace(inflated_ns=now), state.counted("lost")
-        memory = memory._replace(lost=reason)
+            if memory.trusted is None and updates.innovations & 1 == 0:
+                memory = memory._replace(trusted=trusted_pose(state))
+        memory = memory._replace(lost=memory.lost if memory.mistake else reason)
         is_rejecting = updates.innovations & 1 == 0
         # What was measured before the rejections began may have been measured elsewhere.
         since_ns = memory.kidnapped_ns
@@ -342,8 +342,13 @@ class Recovery:
         if evidence and evidence[-1].stamp_ns > memory.relocalization_ns:
             memory = memory._replace(relocalization_ns=evidence[-1].stamp_ns)
             found = self._relocalized(state, evidence)
+            if mistake := self._explaining_mistake(state, memory, found):
+                return keep_trusted_pose(state, memory, mistake, self._reduce)
             if found is not None:
                 return self._found(state, found, memory)
+            memory = memory._replace(mistake="", lost=reason)
+        if memory.mistake:  # nothing new is known
+            return keep_trusted_pose(state, memory, None, self._reduce)
         estimate = state.estimate
         if is_rejecting and now - memory.inflated_ns >= INFLATION_NS:
             estimate = inflate_covariance(estimate, self._settings)
@@ -353,11 +358,22 @@ class Recovery:
             memory = memory._replace(inflated_ns=now, kidnapped_ns=kidnapped_ns)
         return with_recovery(state, memory)._replace(estimate=estimate)
 
+    def _regained(self, state: State) -> State:
+        """The state of a robot that is no longer lost, because it accepts what it measures; unless
+        a mistake explains that as well."""
+        memory = state.memory.recovery
+        if mistake := self._explaining_mistake(state, memory, state.estimate):
+            return keep_trusted_pose(state, memory, mistake, self._reduce)
+        memory = with_jump(state, memory, state.estimate.pose)
+        return with_recovery(state, memory._replace(lost="", kidnapped_ns=-1))
+
     def _found(self, state: State, estimate: Estimate, recovery: RecoveryMemory) -> State:
         """The state of a robot that is found again: here everything begins anew."""
         _, teammates, calibration, _ = memory = state.memory.counted("found_again")
         memory = memory._replace(
-            recovery=recovery._replace(lost="", kidnapped_ns=-1, suspected_ns=-1),
+            recovery=with_jump(state, recovery, estimate.pose)._replace(
+                lost="", kidnapped_ns=-1, suspected_ns=-1
+            ),
             teammates=teammates._replace(senders=reset_scores(teammates.senders)),
             calibration=calibration._replace(
                 references=None,
@@ -381,6 +397,12 @@ class Recovery:
         memory = state.memory
         pieces = self.evidence(memory.recovery, memory.calibration.adaptation)
         return tuple(e for e in pieces if e.stamp_ns > stamp_ns)
+
+    def _explaining_mistake(
+        self, state: State, memory: RecoveryMemory, found: Estimate | None
+    ) -> ExplainingMistake | None:
+        evidence = self.evidence(memory, state.memory.calibration.adaptation)
+        return explaining_mistake(state, memory, evidence, found)
 
     def _relocalized(self, state: State, evidence: tuple[Evidence, ...]) -> Estimate | None:
         """The pose that evidence determines, by odometry as noisy as the robot found it to be."""

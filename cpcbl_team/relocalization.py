@@ -36,6 +36,7 @@ STEPS = (-8.0, -4.0, -2.0, 2.0, 4.0, 8.0)  # sigmas along the weakest axis
 MOST_WIDENING = 4.0  # of the variance along it
 LEAST_RISE = 0.5  # of the chi-square, against that of the Gaussian,
 FAR = 32.0  # which counts as this at most
+UNKNOWNS = 3  # of a pose
 _OPEN = Covariance3(1e6, 0.0, 1e6, 0.0, 0.0, 1e3)
 _STEP = Covariance3(9.0, 0.0, 9.0, 0.0, 0.0, 1.0)  # how far one iteration of a fit may lead
 _SHARPEST = 1e-6  # (1 mm)^2, (1 mrad)^2: sharper evidence drowns _OPEN in rounding

@@ -109,6 +109,21 @@ def updates_with_frame(
     return new(Updates, last)
 
 
+class TrustedPose(NamedTuple):
+    """The estimate from before the robot rejected more than it should."""
+
+    estimate: Estimate
+    odometry_from_robot: Pose2  # dead reckoning at that time
+
+
+class Jump(NamedTuple):
+    """The robot was found elsewhere than odometry led it from its last trusted pose."""
+
+    stamp_ns: int
+    distance_m: float
+    turn_rad: float
+
+
 class RecoveryMemory(NamedTuple):
     """Whether the robot is lost, and what it could find itself with."""
 
@@ -121,6 +136,9 @@ class RecoveryMemory(NamedTuple):
     recorded_until_ns: int = 0  # until then
     kidnapped_ns: int = -1  # since when the robot may be elsewhere; -1: it is where it was
     suspected_ns: int = -1  # since when it rejects more than it should; -1: it does not
+    trusted: TrustedPose | None = None  # from before that, while it does
+    mistake: str = ""  # of its driver, that explains what it rejects; it does not move meanwhile
+    jump: Jump | None = None  # the latest
 
 
 class TeammateMemory(NamedTuple):

@@ -20,7 +20,7 @@ from cpcbl_agents.waypoint_follower import WaypointFollower
 from cpcbl_team.config import Team
 from cpcbl_team.estimate import Estimate
 from cpcbl_team.inputs import BeliefShared, InputsMended, SightingFault
-from cpcbl_team.state import CalibrationMemory
+from cpcbl_team.state import CalibrationMemory, Jump
 from cpcbl_team.trust import TrustStatus
 from cpcbl_transport.budget import Budget
 from cpcbl_transport.messages import Flow, Help, Message, Outgoing, Pose, SensorInput, Status, Trust
@@ -36,6 +36,8 @@ class InputSnapshot(NamedTuple):
     calibration: CalibrationMemory
     refused: Counter[tuple[str, str]]  # since the start, by input and reason
     is_camera_lost: bool
+    mistake: str = ""  # of the driver, that explains why the robot is lost
+    jump: Jump | None = None  # the latest
 
 
 class Robot:
@@ -104,8 +106,9 @@ class Robot:
         for reason, number in self.sensing.refused.items():
             refused["sightings" if reason == "seen_twice" else "frame", reason] += number
         is_camera_lost = camera["camera_lost"] > camera["camera_back"]
-        known = state.estimate, state.lost, state.memory.calibration
-        return InputSnapshot(*known, refused, is_camera_lost)
+        known, recovery = state.memory.calibration, state.memory.recovery
+        pose = state.estimate, recovery.lost, known
+        return InputSnapshot(*pose, refused, is_camera_lost, recovery.mistake, recovery.jump)
 
     def pose(self, now_ns: int) -> Pose:
         """The pose at `now_ns`, or at the end of the newest odometry."""

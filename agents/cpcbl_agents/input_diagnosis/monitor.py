@@ -24,12 +24,14 @@ from cpcbl_agents.input_diagnosis.problems import (
     implausible_inputs,
     input_problems,
     is_often_refused,
+    jump_problems,
     without_numbers,
 )
 from cpcbl_agents.robot import InputSnapshot
 from cpcbl_team.config import RobotSettings, Start, Team
 from cpcbl_team.geometry import Pose2, wrap_angle
 from cpcbl_team.inputs import Odometry, Sightings
+from cpcbl_team.trusted_pose import OR_MOVED
 from cpcbl_transport import topics
 from cpcbl_transport.messages import (
     LARGEST_FRAME,
@@ -152,7 +154,7 @@ class ProblemHysteresis:
     def _judge(self, about: str, text: str) -> None:
         reported = self._reported.get(about, "")
         if reported and _problem_key(reported) == _problem_key(text):
-            if OR_START not in reported:
+            if OR_START not in reported and OR_MOVED not in reported:
                 self._reported[about] = text
             self._misses[about] = 0
             return
@@ -174,7 +176,7 @@ class ProblemHysteresis:
 def _problem_key(text: str) -> str:
     """The text of a problem without its figures and evidence: two problems with the same key have
     the same cause."""
-    return without_numbers(text).removesuffix(f"; {OR_START}")
+    return without_numbers(text).removesuffix(f"; {OR_START}").removesuffix(f"; {OR_MOVED}")
 
 
 class _Totals(NamedTuple):
@@ -243,6 +245,7 @@ class InputMonitor:
             windows={name: self._window(name, totals, before) for name in shown},
             namesake=self._namesake_for >= NAMESAKE_JUDGEMENTS,
             camera_lost=snapshot.is_camera_lost,
+            mistake=snapshot.mistake,
         )
         problems = input_problems(facts)
         self._judgements += any(self.inputs[name].messages for name in shown)
@@ -251,7 +254,8 @@ class InputMonitor:
         are_wrong = bool(self._implausible) or any(map(is_often_refused, facts.windows.values()))
         self.are_mended, self._are_wrong = self._are_wrong and not are_wrong, are_wrong
         health = tuple(self._health(name, totals, before) for name in shown)
-        return health, (*problems, *self._implausible)
+        said = (*problems, *self._implausible)
+        return health, said or jump_problems(snapshot.jump, now_ns)
 
     def _find_implausible(
         self, snapshot: InputSnapshot, facts: InputFacts, before: _Totals, has_problems: bool
@@ -260,7 +264,7 @@ class InputMonitor:
         is_early = len(self._history) <= WINDOW
         since_ns = self._start_ns if is_early else before.now_ns
         if self._starts_known is None:
-            self._starts_known = not snapshot.lost
+            self._starts_known = not snapshot.lost or bool(snapshot.mistake)
         steps = _since_stamp(self.inputs["odometry"].steps, since_ns)
         near, is_from_start = None, self._starts_known and (is_early or not self.has_moved)
         if facts.start is not None and is_from_start:

@@ -15,6 +15,7 @@ from itertools import combinations, pairwise
 from statistics import median
 from typing import NamedTuple
 
+from cpcbl_team import sensor_mistakes as mistakes
 from cpcbl_team.config import Landmark
 from cpcbl_team.geometry import Pose2
 from cpcbl_team.inputs import Odometry, Sighting, Sightings
@@ -88,11 +89,8 @@ def _in_degrees(step: Step) -> float:
 
 DEGREE = math.radians(1.0)
 MIRRORED = "turns or bearings have the wrong sign; left is positive"
-FIXED = (
-    "landmarks do not turn as odometry does: bearings that count from x of the field or from"
-    " north, headings in place of turns, or wheels that slip"
-)
-_90_OFF = "bearings are 90° off; ahead is 0, left is positive"
+FIXED = mistakes.FIXED
+_90_OFF = mistakes.QUARTER_OFF
 _SINCE = "distances look like distances since the start, not of each piece"
 _HEADINGS = "turns look like headings, not turns of each piece"
 _MM, _CM = "distances look like millimetres", "distances look like centimetres"
@@ -331,16 +329,16 @@ def scale_of(frames: Iterable[Sightings], landmarks: Mapping[str, Landmark]) -> 
 OR_START = "or the robot is not where its `start` says"
 _VIEWS: tuple[tuple[str, Callable[[complex, float], complex]], ...] = (
     ("", lambda p, h: p),
-    ("bearings look mirrored; left is positive", lambda p, h: p.conjugate()),
+    (mistakes.MIRRORED, lambda p, h: p.conjugate()),
     (_90_OFF, lambda p, h: p * 1j),
     (_90_OFF, lambda p, h: p / 1j),
-    ("bearings are 180° off; ahead is 0", lambda p, h: -p),
+    (mistakes.HALF_OFF, lambda p, h: -p),
     ("bearings count from x of the field, not from ahead", lambda p, h: p * cmath.rect(1.0, -h)),
     (
         "bearings count from north, not from ahead",
         lambda p, h: 1j * p.conjugate() * cmath.rect(1.0, -h),
     ),
-    ("ranges look like feet", lambda p, h: p * 0.3048),
+    (mistakes.IN_FEET, lambda p, h: p * mistakes.FOOT_M),
 )
 
 

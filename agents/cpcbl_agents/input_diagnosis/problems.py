@@ -13,10 +13,13 @@ from cpcbl_agents.input_diagnosis.motion_causes import Step
 from cpcbl_agents.input_diagnosis.position_causes import position_cause
 from cpcbl_agents.input_diagnosis.shift_causes import is_same, is_sure, shift_cause, shift_of
 from cpcbl_agents.input_diagnosis.start_causes import turned_view_cause
+from cpcbl_team import sensor_mistakes as mistakes
 from cpcbl_team.config import Landmark, OdometryNoise, SensorSettings
 from cpcbl_team.errors import nearest_name
 from cpcbl_team.geometry import Pose2
 from cpcbl_team.inputs import Odometry, Position, Sightings
+from cpcbl_team.state import Jump
+from cpcbl_team.trusted_pose import OR_MOVED
 from cpcbl_transport.decoding import decode_by_key, input_problem
 from cpcbl_transport.messages import LARGEST_NUMBER, Frame, SensorInput
 
@@ -26,6 +29,7 @@ REFUSED_SHARE = 0.05
 LEAST_REFUSED = 3  # a single message may be damaged, or late
 MOST_TOLERANCE = 0.4  # of where a landmark is seen again, as a share of its range
 LATEST_NS = 600_000_000
+JUMP_NS = 15_000_000_000  # for so long a jump of the pose is reported
 WAIT_S = 7.0  # for what landmarks show
 LARGEST_ANGLE = 7.0
 LEAST_COVERED = 0.8  # of the time, by odometry
@@ -73,6 +77,7 @@ STAMPS = {"from_the_future", "too_late", "impossible_duration", "implausible_num
 
 MOTION, OVERLAP, POSITION = "motion", "overlap", "position"  # what implausible inputs are about
 CALIBRATION = "calibration"
+JUMPED = "jumped by"
 
 
 class InputWindow(NamedTuple):
@@ -111,6 +116,7 @@ class InputFacts(NamedTuple):
     namesake: bool = False  # another process has this robot's name
     camera_lost: bool = False
     unseen: str = ""  # why sightings should come that do not
+    mistake: str = ""  # in sightings, that explains why the robot is lost
 
 
 def input_problems(facts: InputFacts) -> tuple[str, ...]:
@@ -121,6 +127,17 @@ def input_problems(facts: InputFacts) -> tuple[str, ...]:
 def implausible_inputs(facts: InputFacts) -> dict[str, str]:
     """What no reason refuses, although it cannot be true, by what it is about."""
     return {about: text for about, text in _implausible(facts) if text}
+
+
+def jump_problems(jump: Jump | None, now_ns: int) -> tuple[str, ...]:
+    """What is said of a late jump of the pose, while nothing else says its cause."""
+    if jump is None or now_ns - jump.stamp_ns > JUMP_NS:
+        return ()
+    moved = f"{jump.distance_m:.1f} m and {abs(math.degrees(jump.turn_rad)):.0f}°"
+    return (
+        f"the pose {JUMPED} {moved} without odometry: the robot was carried, its `start` is"
+        " elsewhere, or its odometry or sightings are wrong",
+    )
 
 
 def without_numbers(problem: str) -> str:
@@ -294,7 +311,7 @@ def _motion(
         return f"sightings: {cause}"
     right_order, wrong_order = motions.order_votes(frames[-5:], marks)
     if wrong_order >= causes.LEAST_CASES and wrong_order > 4 * right_order:
-        return "sightings: bearings look mirrored; left is positive"
+        return f"sightings: {mistakes.MIRRORED}"
     tolerance = 0.15 + 3.0 * math.hypot(sensor.range_share, sensor.bearing_sigma_rad)
     tolerance = min(tolerance, MOST_TOLERANCE)
     resightings = list(motions.resightings(frames, steps, marks))
@@ -322,6 +339,8 @@ def _motion(
     start = facts.start if facts.is_from_start and not is_right else None
     if start is not None and (cause := turned_view_cause(frames, steps, start, marks)):
         return f"sightings: {cause}"
+    if facts.mistake and not is_right:
+        return f"sightings: {facts.mistake}; {OR_MOVED}"
     spans_s = (steps[-1].stamp_ns - steps[0].from_ns) * 1e-9 if steps else math.inf
     if resightings or (
         spans_s < WAIT_S and any(s.id in marks for f in frames for s in f.sightings)

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 
 from cpcbl_launch.team.units import unit_warnings
 from cpcbl_team.config import LIKE_MIRRORED, MARKERS, Landmark, Team, Wall
-from cpcbl_team.recovery import UNKNOWNS
+from cpcbl_team.relocalization import UNKNOWNS
 from cpcbl_transport.security import PROTOCOL
 
 
