@@ -13,9 +13,11 @@ from cpcbl_team.gaussian import Covariance2
 from cpcbl_team.mean_offsets import (
     CONFLICT,
     NOTHING,
+    Comparison,
     FadingOffsets,
     MeanOffset,
     bias_variance,
+    both,
     compared_with_majority,
     compared_with_own_sensors,
     disagreement,
@@ -173,3 +175,25 @@ def test_vague_own_sensors_convict_only_one_of_two_that_contradict_each_other() 
     assert undecided.is_contested
     assert undecided.is_left_out
     assert not undecided.is_wrong
+
+
+def test_a_contested_source_is_used_while_own_sensors_are_nearer_to_it_than_to_its_rivals() -> None:
+    """Before these decide: the bias counts against own sensors only, not against the rivals."""
+    own, honest, liar = at(0.0, sigma=0.04), at(0.0), at(0.09)
+    right = compared_with_own_sensors(honest, own, {"a": liar, "b": liar, "c": honest})
+    lying = compared_with_own_sensors(liar, own, {"a": honest, "b": liar, "c": honest})
+    assert right.is_contested
+    assert not right.is_left_out
+    assert right.bias_variance == 0.0
+    assert lying.is_contested
+    assert lying.is_left_out
+    assert not lying.is_wrong
+
+
+def test_of_a_contested_source_the_longer_mean_decides_whether_it_is_used() -> None:
+    fast = Comparison(0.04, is_contested=True, is_left_out=True)
+    slow = Comparison(0.01, is_contested=True)
+    assert not both(fast, slow).is_left_out
+    assert both(fast, slow).bias_variance == 0.01
+    assert both(fast, Comparison(0.01)).is_left_out  # the slow one says nothing yet
+    assert both(Comparison(0.01), Comparison(0.04)).bias_variance == 0.04

@@ -4,13 +4,15 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from msgspec.structs import replace
 from support.core import (
     SECOND,
 )
 from support.trust import AGREES, CONTRADICTS, RULES, Receiver
 
+from cpcbl_team.estimate import Covariance3
 from cpcbl_team.sender_comparisons import OWN_SENSORS
-from cpcbl_team.sender_records import USUAL_NIS, SenderRecord, TeammateReport
+from cpcbl_team.sender_records import USUAL_NIS, OffsetEvidence, SenderRecord, TeammateReport
 from cpcbl_team.trust import assess, trust_statuses
 
 
@@ -222,3 +224,27 @@ def test_chi_square_noise_quarantines_nobody_in_half_an_hour() -> None:
     for nis in rng.chisquare(2, 18_000):
         receiver.receive(0.1, own=AGREES, honest=float(nis))
     assert receiver.events == []
+
+
+def test_a_dispute_of_contested_senders_stays_undecided_after_their_means_are_stale(
+    receiver: Receiver,
+) -> None:
+    """A robot that was lost meanwhile has no means; the first dispute decided for one side."""
+    receiver.receive(1.0, a=AGREES, b=AGREES)
+    contested = {n: replace(r, contested_ns=receiver.now_ns) for n, r in receiver.senders.items()}
+    receiver.senders = contested
+    receiver.receive(5.0, a=AGREES, b=CONTRADICTS)
+    assert receiver.quarantined == {}
+    receiver.receive(8.0, a=AGREES, b=CONTRADICTS)
+    assert receiver.quarantined.keys() == {"b"}
+
+
+def test_a_report_that_contradicts_the_estimate_has_less_weight_in_the_mean() -> None:
+    """Without any, the mean of the others would seem to agree with the estimate."""
+    evidence = OffsetEvidence((Covariance3(100.0, 0.0, 100.0, 0.0, 0.0, 0.0), (10.0, 0.0, 0.0)))
+    sums = {}
+    for nis in (1.0, 27.6, 100.0):
+        report = TeammateReport(SECOND, nis, (0.1, 0.0), evidence=evidence)
+        ((xx, *_), _) = assess({}, "a", report, 0, RULES).senders["a"].offsets[0].evidence
+        sums[nis] = xx
+    assert sums == {1.0: 100.0, 27.6: pytest.approx(50.0), 100.0: 0.0}
