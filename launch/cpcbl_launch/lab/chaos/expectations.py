@@ -13,6 +13,7 @@ from cpcbl_transport.messages import Refusal
 GOOD_M = 0.15  # the demonstration has 0.03 m; the blind scout without help 0.1 m after some seconds
 REJOIN_S = 5.0  # after a fault has healed; less what the machine lengthens gaps by
 LATE_S = 1.0  # later than any track should come
+LEAST_KIDNAPPING_M = 2.0  # how far its round has taken it by then depends on the machine
 FINDERS = 2  # of three that drive; one may be out of the liar's sight for long
 
 
@@ -303,7 +304,7 @@ def kidnap(run: FaultRun) -> list[Check]:
     lost_s = log.reported_lost_after_s(robot, at_s)
     believed = [name for name in run.robots if not log.distrusted_peers(name)]
     return [
-        at_least("distance of the kidnapping", moved_m, 2.9, "m"),
+        at_least("distance of the kidnapping", moved_m, LEAST_KIDNAPPING_M, "m"),
         at_most("it reported that it was lost after", lost_s, 3.0, "s"),
         at_most("it was localized after", log.localized_after_s(robot, at_s), 8.0, "s"),
         *checks_unaffected(log, run.others, at_s, run.end_s),
