@@ -1,7 +1,8 @@
 """Simulated teams that are recorded, or have guests that come and go at set times."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import NamedTuple
 
 from msgspec.structs import replace
@@ -12,7 +13,12 @@ from cpcbl_launch.reporting.recorder import Recorder, Report
 from cpcbl_launch.reporting.recording import Recording
 from cpcbl_launch.simulation.field import SimulatedField
 from cpcbl_launch.simulation.field_node import FieldNode
-from cpcbl_launch.simulation.in_process import robot_nodes, run_nodes, simulated_report
+from cpcbl_launch.simulation.in_process import (
+    BusWrapper,
+    robot_nodes,
+    run_nodes,
+    simulated_report,
+)
 from cpcbl_team.config import RobotSettings, Team
 from cpcbl_transport.bus import Bus
 from cpcbl_transport.memory_bus import MemoryHub
@@ -68,7 +74,7 @@ def simulate_with_guests(
     hub = MemoryHub()
     recorder = Recorder(hub.session())
     visits = [ScheduledGuestNode(guest, team, hub) for guest in guests]
-    _run(team, seed, duration_s, hub, visits)
+    run_simulated(team, seed, duration_s, hub, visits)
     return recorder
 
 
@@ -79,12 +85,19 @@ def simulate_recorded(
     hub = MemoryHub()
     recorder = Recorder(hub.session())
     with Recording(path, team, hub.session()):
-        _run(team, seed, duration_s, hub)
+        run_simulated(team, seed, duration_s, hub)
     return simulated_report(recorder, team), recorder
 
 
-def _run(
-    team: Team, seed: int, duration_s: float, hub: MemoryHub, visits: Sequence[Steppable] = ()
+def run_simulated(
+    team: Team,
+    seed: int,
+    duration_s: float,
+    hub: MemoryHub,
+    others: Sequence[Steppable] = (),
+    bus_wrappers: Mapping[str, BusWrapper] = MappingProxyType({}),
 ) -> None:
+    """Runs the field, the robots and others on a hub."""
     field = FieldNode(SimulatedField(team, seed, 0), hub.session())
-    run_nodes([field, *robot_nodes(team, hub, 0), *visits], 0, int(duration_s * 1e9))
+    robots = robot_nodes(team, hub, 0, bus_wrappers)
+    run_nodes([field, *robots, *others], 0, int(duration_s * 1e9))

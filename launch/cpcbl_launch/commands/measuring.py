@@ -59,7 +59,10 @@ FaultSeconds = Annotated[
 WithKeys = Annotated[bool, Option("--keys", help="Give the teams keys: TLS and access control.")]
 HistoryFile = Annotated[
     Path | None,
-    Option(callback=options.writable_file, help="File for what the nemesis did (JSON Lines)."),
+    Option(
+        callback=options.writable_file,
+        help="File for what the nemesis and the soak did (JSON Lines).",
+    ),
 ]
 RequireJudged = Annotated[
     bool, Option("--require-judged", help="Exit with 3 if the machine was too busy to judge.")

@@ -34,9 +34,10 @@ from cpcbl_launch.lab.chaos.history import (
     spent_shares,
     uphill_messages,
     without,
+    write_history,
 )
 from cpcbl_launch.lab.chaos.machine import MachineLog, MachineWatch
-from cpcbl_launch.lab.chaos.nemesis import FAULTS, INSTANT, write_history
+from cpcbl_launch.lab.chaos.nemesis import FAULTS, INSTANT
 from cpcbl_launch.lab.chaos.runner import select_scenarios
 from cpcbl_launch.lab.chaos.scenario import TeamFault
 from cpcbl_launch.lab.chaos.schedule import largest_overlap, schedule
@@ -135,6 +136,8 @@ def test_a_history_is_written_as_lines_of_json(tmp_path: Path) -> None:
     assert rows[1]["fault"]["name"] == fault.name
     assert rows[2] == {"check": "uphill 3 (= 0)", "held": False}
     assert rows[3]["token"]["robot"] == rows[4]["status"]["robot"] == rows[5]["track"]["robot"]
+    assert rows[-1]["truth"] == "a"
+    assert len(rows[-1]["rows"]) == len(log.truth["a"])
 
 
 # Consistency --------------------------------------------------------------------------------------

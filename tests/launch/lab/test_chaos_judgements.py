@@ -22,6 +22,7 @@ from cpcbl_launch.lab.chaos.memory import (
     memory_checks,
     process_lives,
 )
+from cpcbl_launch.lab.chaos.schedule import PlannedFault
 from cpcbl_launch.lab.chaos.soak import soak_checks
 
 AT_S = 10.0
@@ -321,6 +322,16 @@ def test_a_soak() -> None:
         "tracebacks in logs",
         "from the last fault until all were localized",
     }
+
+
+def test_a_robot_that_is_certain_of_a_wrong_position_between_faults_fails_a_soak() -> None:
+    wrong = run_log_of([tracks_of("a"), tracks_of("b", lambda s: 0.6 if 40 < s < 50 else 0.0)])
+    run = run_of(wrong, "", 65.0, fault_s=60.0)
+    what = "longest claim that was false by 5 σ"
+    assert unmet_checks(soak_checks(run, 0, 0)) == {what}
+    elsewhere = PlannedFault("kill", "field", 39.0, 39.0)
+    assert not unmet_checks(soak_checks(run, 0, 0, [elsewhere]))
+    assert unmet_checks(soak_checks(run, 0, 0, [elsewhere._replace(target="a")])) == {what}
 
 
 FLAT = process_lives(samples("field", 0.01) | samples("up", 0.0))

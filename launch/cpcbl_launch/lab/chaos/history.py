@@ -2,13 +2,16 @@
 
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import pairwise
+from pathlib import Path
 from typing import NamedTuple
 
+import msgspec
 import numpy as np
 
 from cpcbl_launch.lab.chaos.checks import Check, at_most, equal_to
 from cpcbl_launch.lab.chaos.expectations import checks_consistent
 from cpcbl_launch.lab.chaos.run_log import RunLog, TokenEvent, worst
+from cpcbl_launch.lab.chaos.schedule import PlannedFault
 from cpcbl_transport.messages import Flow, Status
 
 REJOIN_S = 5.0
@@ -39,8 +42,6 @@ def invariants(
     back_s = worst(log.localized_after_s, robots, healed_s)
     uphill = sum(n for name in robots for n in uphill_messages(log, name, forged))
     over = max((share for name in robots for share in spent_shares(log, name)), default=0.0)
-    claims = {name: longest_false_claim_s(log, name) for name in robots}
-    boldest = max(claims, key=lambda name: claims[name])
     return [
         at_most("from the last fault until all were localized", back_s, REJOIN_S, "s", late_s),
         equal_to("robots without a token at the end", sum(not known.get(r) for r in robots), 0),
@@ -53,14 +54,7 @@ def invariants(
             by_load=False,
         ),
         *checks_consistent(honest(log), robots, 0.0, end_s, "whole run,"),
-        Check(
-            what=f"longest claim that was false by {DISHONEST_SIGMAS:g} σ",
-            seen=claims[boldest],
-            unit="s",
-            at_most=DISHONEST_S,
-            robot=boldest,
-            by_load=False,
-        ),
+        check_claims(log, robots),
     ]
 
 
@@ -148,15 +142,54 @@ def _spending(flows: Iterable[Flow], unit: str) -> int:
 # Claims -------------------------------------------------------------------------------------------
 
 
-def longest_false_claim_s(log: RunLog, robot: str) -> float:
+def check_claims(log: RunLog, robots: Sequence[str], least_m: float = DISHONEST_M) -> Check:
+    """No robot is certain of a wrong position for long."""
+    claims = {name: longest_false_claim_s(log, name, least_m) for name in robots}
+    boldest = max(claims, key=lambda name: claims[name])
+    return Check(
+        what=f"longest claim that was false by {DISHONEST_SIGMAS:g} σ",
+        seen=claims[boldest],
+        unit="s",
+        at_most=DISHONEST_S,
+        robot=boldest,
+        by_load=False,
+    )
+
+
+def longest_false_claim_s(log: RunLog, robot: str, least_m: float = DISHONEST_M) -> float:
     """The longest time in which a robot said that it was not lost, and was wrong by 5 sigma and by
-    half a metre: a lost robot must say so."""
+    `least_m`: a lost robot must say so."""
     since_s: float | None = None
     longest_s = 0.0
     for stamp_s, error_m, nees in honest(log).errors(robot):
-        if error_m > DISHONEST_M and nees > DISHONEST_SIGMAS**2:
+        if error_m > least_m and nees > DISHONEST_SIGMAS**2:
             since_s = stamp_s if since_s is None else since_s
             longest_s = max(longest_s, stamp_s - since_s)
         else:
             since_s = None
     return longest_s
+
+
+# Files --------------------------------------------------------------------------------------------
+
+
+def write_history(
+    path: Path, seed: int, faults: Sequence[PlannedFault], log: RunLog, checks: Sequence[Check]
+) -> None:
+    """Writes JSON Lines: the seed, each fault, check, token, status and track, and the ground truth
+    of each robot as rows of seconds, x, y, heading. Raises OSError."""
+    rows: list[object] = [{"seed": seed}]
+    rows += [{"fault": fault._asdict()} for fault in faults]
+    rows += [{"check": str(check), "held": check.is_met} for check in checks]
+    rows += [{"token": token._asdict()} for token in log.tokens]
+    for received in log.statuses.values():
+        rows += [{"at_s": at_s, "status": _fields(status)} for at_s, status in received]
+    for tracks in log.tracks.values():
+        rows += [{"at_s": t.at_s, "stamp_s": t.stamp_s, "track": _fields(t.track)} for t in tracks]
+    rows += [{"truth": name, "rows": truth.tolist()} for name, truth in log.truth.items()]
+    with path.open("wb") as file:
+        file.writelines(msgspec.json.encode(row) + b"\n" for row in rows)
+
+
+def _fields(message: msgspec.Struct) -> dict[str, object]:
+    return msgspec.structs.asdict(message)
