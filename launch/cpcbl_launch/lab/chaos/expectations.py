@@ -358,3 +358,30 @@ def faulty_robot(run: FaultRun, listeners: Sequence[str]) -> list[Check]:
         equal_to("robots that still distrust it 20 s later", distrust, 0),
         *checks_unaffected(log, run.robots, *run.window_s),
     ]
+
+
+def lying_robot(
+    run: FaultRun, listeners: Sequence[str], within_s: float, accomplices: Sequence[str] = ()
+) -> list[Check]:
+    """Those that it lies to quarantine it, their uncertainty holds, and correct robots are
+    believed. Nothing here depends on the load of the machine but how soon it is found."""
+    log, liars = run.log, {run.robot, *accomplices}
+    found = [log.distrust_reported_at_s(name, run.robot, run.window_s) for name in listeners]
+    known = sorted(at_s - run.fault_s for at_s in found if at_s is not None)
+    needed = min(FINDERS, len(listeners))
+    last_s = known[needed - 1] if len(known) >= needed else None
+    rmse_m = worst(log.position_rmse_m, listeners, *run.window_s)
+    honest = [name for name in run.robots if name not in liars]
+    wronged = {
+        other
+        for name in listeners
+        for other in honest
+        if log.distrust_reported_at_s(name, other, run.window_s) is not None
+    }
+    return [
+        at_least("robots that quarantined it", len(known), needed),
+        at_most("quarantined by enough robots after", last_s, within_s, "s"),
+        replace(at_most("worst RMSE during the lie", rmse_m, GOOD_M, "m"), by_load=False),
+        equal_to("correct robots in quarantine", len(wronged), 0),
+        *checks_consistent(log, listeners, *run.window_s, "during the lie,"),
+    ]
