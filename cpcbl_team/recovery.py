@@ -322,7 +322,7 @@ class Recovery:
         if found is None or agrees(state.estimate, found):
             return with_recovery(state, memory)
         if mistake := self._explaining_mistake(state, memory, found):
-            return keep_trusted_pose(state.counted("lost"), memory, mistake, self._reduce)
+            return self._at_trusted_pose(state.counted("lost"), memory, mistake)
         return self._found(state.counted("lost"), found, memory)
 
     def _recover(self, state: State, reason: str) -> State:
@@ -343,12 +343,12 @@ class Recovery:
             memory = memory._replace(relocalization_ns=evidence[-1].stamp_ns)
             found = self._relocalized(state, evidence)
             if mistake := self._explaining_mistake(state, memory, found):
-                return keep_trusted_pose(state, memory, mistake, self._reduce)
+                return self._at_trusted_pose(state, memory, mistake)
             if found is not None:
                 return self._found(state, found, memory)
             memory = memory._replace(mistake="", lost=reason)
         if memory.mistake:  # nothing new is known
-            return keep_trusted_pose(state, memory, None, self._reduce)
+            return self._at_trusted_pose(state, memory, None)
         estimate = state.estimate
         if is_rejecting and now - memory.inflated_ns >= INFLATION_NS:
             estimate = inflate_covariance(estimate, self._settings)
@@ -363,7 +363,7 @@ class Recovery:
         a mistake explains that as well."""
         memory = state.memory.recovery
         if mistake := self._explaining_mistake(state, memory, state.estimate):
-            return keep_trusted_pose(state, memory, mistake, self._reduce)
+            return self._at_trusted_pose(state, memory, mistake)
         memory = with_jump(state, memory, state.estimate.pose)
         return with_recovery(state, memory._replace(lost="", kidnapped_ns=-1))
 
@@ -403,6 +403,16 @@ class Recovery:
     ) -> ExplainingMistake | None:
         evidence = self.evidence(memory, state.memory.calibration.adaptation)
         return explaining_mistake(state, memory, evidence, found)
+
+    def _at_trusted_pose(
+        self, state: State, memory: RecoveryMemory, mistake: ExplainingMistake | None
+    ) -> State:
+        kept = keep_trusted_pose(state, memory, mistake, self._reduce)
+        if mistake is None or memory.mistake:
+            return kept
+        # What was accepted at another pose says nothing of this one.
+        rejected = 1 << self._settings.lost_window
+        return kept._replace(updates=kept.updates._replace(innovations=rejected))
 
     def _relocalized(self, state: State, evidence: tuple[Evidence, ...]) -> Estimate | None:
         """The pose that evidence determines, by odometry as noisy as the robot found it to be."""

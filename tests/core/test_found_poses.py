@@ -123,7 +123,7 @@ def carried_away(
 
 LONG = [
     pytest.param(gives, count, variant, marks=pytest.mark.long)
-    for gives, count in (("bearing", 2), ("bearing", 3), ("both", 1), ("both", 2))
+    for gives, count in (("bearing", 2), ("bearing", 3), ("both", 2))
     for variant in ("oval", "circular")
 ]
 
@@ -138,6 +138,8 @@ LONG = [
         ("range", 4, "joint"),
         ("bearing", 3, "joint"),
         ("both", 1, "joint"),
+        ("both", 1, "oval"),
+        ("both", 1, "circular"),
         ("both", 2, "joint"),
         *LONG,
     ],
