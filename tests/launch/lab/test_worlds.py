@@ -20,8 +20,8 @@ from cpcbl_team.errors import InputError
 from cpcbl_transport import topics
 from cpcbl_transport.memory_bus import MemoryHub
 
-# A robot that is carried away rejects few ranges to its only landmark, or none, where the new one is
-# near the one that it expects, and no range can tell it where it is; `check` warns of such a map.
+# A robot that is carried away rejects few ranges to its only landmark, or none, where the new range
+# is near the one that it expects, and none tells it where it is; `check` warns of such a map.
 UNNOTICED = ("carried away, 1 landmark range-only",)
 GOOD = WorldRun(rmse_m=0.1, nees=2.0, heading_nees=1.0, inside_3_sigma=0.99, lost_share=0.0)
 CONSISTENT = ("consistent", "conservative")
