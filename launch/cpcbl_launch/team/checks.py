@@ -67,7 +67,7 @@ def warnings(team: Team) -> Iterator[str]:
         if len(objects) == 1:
             yield (
                 f"robots.{name}: one object on the map does not determine a pose; if the robot is"
-                " carried away it stays lost; add a landmark"
+                " carried away it stays lost, or is wrong and does not notice it; add a landmark"
             )
         elif 0 < readings < UNKNOWNS:
             yield (

@@ -86,6 +86,20 @@ def test_as_json_prints_what_is_written(tmp_path: Path, capsys: pytest.CaptureFi
     assert printed == (tmp_path / "one-way-vs-both.json").read_text()
 
 
+def test_with_one_landmark_a_circle_costs_certainty() -> None:
+    """Across the line of sight the oval is long; the circle is as wide everywhere."""
+    along_m = {}
+    for variant in ("oval", "circular"):
+        case = figure7.OF_VARIANTS.cases()[f"{variant} {figure7.ONE_LANDMARK}"]
+        samples = run_case(case._replace(loops=1), 1).robots["navigator"]
+        assert samples.covariance is not None
+        matrices = samples.covariance[len(samples.covariance) // 2 :, [0, 1, 1, 2]].reshape(
+            -1, 2, 2
+        )
+        along_m[variant] = float(np.sqrt(np.linalg.eigvalsh(matrices)[:, 0]).mean())
+    assert along_m["circular"] > 2.0 * along_m["oval"]
+
+
 @pytest.mark.long
 def test_the_number_of_jobs_changes_no_figure() -> None:
     experiment = small(EVERY["figure7"])

@@ -7,13 +7,15 @@ split covariance intersection. The navigator steers by its own estimate.
 - `figure7`: as in the paper.
 - `figure7-cameras`: pixels in place of simulated sightings (`teams/circuit-cameras.toml`).
 - `circular-vs-oval`, which the paper announced: the navigator alone (C) and helped in both
-  directions (F), with every variant. `make bench` measures what a cycle of each variant costs.
+  directions (F), with every variant; and with one landmark, of which the uncertainty is no circle.
+  `make bench` measures what a cycle of each variant costs.
 """
 
 import math
 from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 
+from msgspec.structs import replace
 from rich.console import RenderableType
 
 from cpcbl_launch.lab.experiments.runs import (
@@ -30,6 +32,7 @@ from cpcbl_launch.lab.experiments.runs import (
 )
 from cpcbl_launch.reporting.tables import cells, table
 from cpcbl_launch.team.overrides import Overrides, with_overrides
+from cpcbl_team.config import OdometrySettings
 
 KINDS = ("odometry", "weighted", "landmarks", "passive", "active", "both")
 CONFIGURATIONS = dict(zip("ABCDEF", KINDS, strict=True))
@@ -46,6 +49,7 @@ LEGEND = (
     "bump, rest, fail: bumps into landmarks, restarts, runs that failed"
 )
 VARIANTS = ("joint", "oval", "circular", "weighted")
+ONE_LANDMARK = "1 landmark"
 ABOUT = 0.2  # "about" is within so much of it
 ODOMETRY_ONLY = {"lost_position_sigma_m": 1e3, "lost_heading_sigma_deg": 1e5}  # it drives on
 
@@ -117,9 +121,24 @@ def cases_with_cameras() -> Mapping[str, Case]:
     }
 
 
+def one_landmark_case(variant: str) -> Case:
+    """The navigator alone with one landmark, which it sees all the time: range and bearing say
+    nothing of a turn about it, so its uncertainty is long and narrow. With the odometry of figure
+    7 a robot that keeps a circle would soon be lost, so it has the usual one."""
+    team = team_case("C", variant).team
+    name, mark = next(iter(team.map.landmarks.items()))
+    navigator = replace(team.robots["navigator"], odometry=OdometrySettings())
+    field = replace(team.map, landmarks={name: mark})
+    team = replace(team, map=field, robots={"navigator": navigator})
+    all_round = {"field_of_view_deg": 360.0}
+    return Case(with_settings(team, "navigator", sensor=all_round), ("navigator",))
+
+
 def cases_of_variants() -> Mapping[str, Case]:
     helped = {"alone": "C", "helped": "F"}
-    return {f"{v} {how}": team_case(c, v) for how, c in helped.items() for v in VARIANTS}
+    found = {f"{v} {how}": team_case(c, v) for how, c in helped.items() for v in VARIANTS}
+    with_covariance = (v for v in VARIANTS if v != "weighted")
+    return found | {f"{v} {ONE_LANDMARK}": one_landmark_case(v) for v in with_covariance}
 
 
 def experiment(

@@ -14,7 +14,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Wedge
 
 from cpcbl_launch.lab.experiments.budget import Curve
-from cpcbl_launch.lab.experiments.figure7 import LABELS
+from cpcbl_launch.lab.experiments.figure7 import LABELS, ONE_LANDMARK
 from cpcbl_launch.lab.experiments.liars import Liars
 from cpcbl_launch.lab.experiments.runs import Outcome, Spread
 from cpcbl_team.config import RobotSettings, Team
@@ -68,10 +68,12 @@ def draw_figure7(result: Outcome) -> Figure:
 def draw_variants(result: Outcome) -> Figure:
     figure, (errors, inside) = plt.subplots(1, 2, figsize=(8, 3.8))
     variants = list(dict.fromkeys(case.split()[0] for case in result.figures))
-    for k, help_ in enumerate(("alone", "helped")):
+    for k, case in enumerate(("alone", "helped", ONE_LANDMARK)):
         for x, variant in enumerate(variants):
-            a = result.figures[f"{variant} {help_}"]
-            label, at = help_ if x == 0 else None, x - 0.1 + 0.2 * k
+            a = result.figures.get(f"{variant} {case}")
+            if a is None:
+                continue
+            label, at = case if x == 0 else None, x - 0.2 + 0.2 * k
             if a.position_mean_m is not None:
                 bar = a.position_mean_m, a.position_sigma_m
                 errors.errorbar(at, *bar, fmt="o", capsize=4, color=f"C{k}", label=label)
