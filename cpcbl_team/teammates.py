@@ -30,7 +30,6 @@ from cpcbl_team.sender_records import NEVER_NS, OffsetEvidence, ReportedPosition
 from cpcbl_team.state import State, with_memory, with_senders, with_teammates
 
 LEAST_CONFIRMED = 20  # reports of a guest beside which others agreed, until it counts as the others
-READING_SHARE = 2.0  # of `least_sigma_m`: no teammate reads the place of another more precisely
 MOST_SENDERS = 512  # of which records are kept
 
 
@@ -108,10 +107,7 @@ class TeammateScreen:
         if observation.observer is None:
             return observation
         observer = self._cautious(state, observation.sender, observation.observer)
-        xx, xy, yy = sensor = observation.sensor
-        more = max(0.0, (READING_SHARE * self._rules.least_sigma_m) ** 2 - min(xx, yy))
-        sensor = Covariance2(xx + more, xy, yy + more) if more else sensor
-        return observation._replace(sensor=sensor, observer=observer)
+        return observation._replace(observer=observer)
 
     def _cautious(self, state: State, sender: str, dependent: Covariance2) -> Covariance2:
         """The part of a teammate's noise that is the same in all its reports: never below what this

@@ -45,8 +45,8 @@ class TrustReport(msgspec.Struct, frozen=True, kw_only=True):
 
     peer: str
     reason: str
-    """Why nothing that it says is used: biased, frozen, jumps, overconfident, outvoted, clock;
-    empty while it is believed."""
+    """Why nothing that it says is used: biased, frozen, jumps, overconfident, outvoted, heading,
+    clock; empty while it is believed."""
     quarantines: int  # how often, since the robot's process started
     unconfirmed: bool
     """No other teammate confirmed or contradicted it, so that a bias could not be detected."""

@@ -361,7 +361,11 @@ def faulty_robot(run: FaultRun, listeners: Sequence[str]) -> list[Check]:
 
 
 def lying_robot(
-    run: FaultRun, listeners: Sequence[str], within_s: float, accomplices: Sequence[str] = ()
+    run: FaultRun,
+    listeners: Sequence[str],
+    within_s: float,
+    accomplices: Sequence[str] = (),
+    most_wronged: int = 0,
 ) -> list[Check]:
     """Those that it lies to quarantine it, their uncertainty holds, and correct robots are
     believed. Nothing here depends on the load of the machine but how soon it is found."""
@@ -382,6 +386,6 @@ def lying_robot(
         at_least("robots that quarantined it", len(known), needed),
         at_most("quarantined by enough robots after", last_s, within_s, "s"),
         replace(at_most("worst RMSE during the lie", rmse_m, GOOD_M, "m"), by_load=False),
-        equal_to("correct robots in quarantine", len(wronged), 0),
+        at_most("correct robots in quarantine", len(wronged), most_wronged),
         *checks_consistent(log, listeners, *run.window_s, "during the lie,"),
     ]
