@@ -2,8 +2,10 @@
 
 import logging
 import resource
+import socket
 import subprocess
 import sys
+from itertools import count
 from pathlib import Path
 
 import pytest
@@ -50,6 +52,18 @@ def test_nothing_is_said_of_a_private_key_that_is_private(
     with caplog.at_level(logging.WARNING):
         credentials_in(key_folder(tmp_path, mode), ROUTER)
     assert not caplog.messages
+
+
+def test_an_endpoint_that_accepts_and_says_nothing_does_not_hide_the_next_one() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        endpoints = [f"tcp/127.0.0.1:{silent.getsockname()[1]}", free_endpoint()]
+        attempts = count()
+        with (
+            open_router("lab", endpoints[1:]),
+            zenoh_bus.open_bus("lab", endpoints, lambda: next(attempts) > 5) as bus,
+        ):
+            (link,) = bus.links()
+            assert link.peer == endpoints[1].removeprefix("tcp/")
 
 
 def test_a_robot_that_waits_for_a_router_names_the_endpoint_and_then_asks_for_the_port(

@@ -14,6 +14,7 @@ import logging
 import os
 import re
 import time
+from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -52,11 +53,17 @@ def open_bus(
     """A client's session below the team's namespace; waits for a router until `give_up()`. With
     credentials every link is mutual TLS. `on_wait` is told again and again that there is none yet,
     with the reason where TLS has one; without it the log says so. Without a team, keys are whole
-    ones, of all teams. Raises BusError when it gave up."""
+    ones, of all teams. Raises BusError when it gave up.
+
+    Each attempt begins with another endpoint: one that accepts and says nothing, or is far behind
+    with its handshakes, takes all the time of an attempt.
+    """
     require_descriptors()
-    config = client_config(connect, credentials)
     reason, said_s, first = "stopped before a router answered", -WAITING_S, True
+    begin_with = deque(connect)
     while not give_up():
+        config = client_config(begin_with, credentials)
+        begin_with.rotate(-1)
         try:
             return ZenohBus(_open(config, namespace(team) if team else None))
         except zenoh.ZError as error:

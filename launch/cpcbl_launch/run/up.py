@@ -23,7 +23,13 @@ from cpcbl_launch.reporting.recorder import Recorder, Report, variants_of
 from cpcbl_launch.reporting.recording import Recording
 from cpcbl_launch.run.admission import admission_control
 from cpcbl_launch.run.logged_team import is_calibrated_on
-from cpcbl_launch.run.processes import Processes, Supervisor, process_table, tasks
+from cpcbl_launch.run.processes import (
+    Processes,
+    Supervisor,
+    process_table,
+    tasks,
+    use_one_heap,
+)
 from cpcbl_launch.run.router import team_router
 from cpcbl_launch.simulation.in_process import Progress, simulate
 from cpcbl_launch.team.file import save_resolved
@@ -171,6 +177,7 @@ def run_team(
     watch: Watch = nullcontext,
 ) -> Report:
     """Runs a team until its time is over or `stop()`. Raises BusError without a router."""
+    use_one_heap()
     run = run._replace(team=with_listen_endpoint(run.team))
     with ExitStack() as stack:
         folder = run.folder or Path(stack.enter_context(TemporaryDirectory(prefix="cpcbl-")))

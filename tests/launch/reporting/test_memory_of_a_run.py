@@ -3,6 +3,9 @@
 import errno
 import logging
 import os
+import platform
+import subprocess
+import sys
 import tracemalloc
 
 import msgspec
@@ -129,3 +132,31 @@ def test_problems_with_free_names_in_them_are_bounded() -> None:
     for n in range(MOST_PROBLEMS + 50):
         log.add(status("r1", problems=(f"`{'x' * (n + 1)}` is no landmark",)))
     assert len(log.reports) == MOST_PROBLEMS
+
+
+HEAPS = """
+import ctypes, sys, threading
+from cpcbl_launch.run.processes import use_one_heap
+use_one_heap() if sys.argv[1] == "one" else None
+library, barrier = ctypes.CDLL(None), threading.Barrier(8)
+def allocate():
+    library.malloc(100_000)
+    barrier.wait()
+threads = [threading.Thread(target=allocate) for _ in range(8)]
+[thread.start() for thread in threads]
+[thread.join() for thread in threads]
+library.fopen.restype = ctypes.c_void_p
+out = ctypes.c_void_p(library.fopen(b"/dev/stdout", b"w"))
+library.malloc_info(0, out)
+library.fclose(out)
+"""
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="a heap for each thread is glibc's")
+def test_all_threads_of_up_share_one_heap() -> None:
+    heaps = {}
+    for which in ("one", "usual"):
+        words = [sys.executable, "-c", HEAPS, which]
+        done = subprocess.run(words, check=True, capture_output=True, text=True)
+        heaps[which] = done.stdout.count("<heap nr=")
+    assert heaps["one"] == 1 < heaps["usual"]
