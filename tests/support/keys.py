@@ -22,7 +22,7 @@ from support.wire_tap import Batch, Kind, Relay
 R1, R2 = Identity(Role.ROBOT, "r1"), Identity(Role.ROBOT, "r2")
 TRIPOD = Identity(Role.OBSERVER, "tripod")
 FIELD, OPERATOR, ROUTER = Identity(Role.FIELD), Identity(Role.OPERATOR), Identity(Role.ROUTER)
-PATIENCE_S = 20.0
+PATIENCE_S = 40.0
 REFUSED_S = 1.5  # a session that is let in is open after a tenth of this
 
 

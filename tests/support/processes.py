@@ -71,7 +71,7 @@ def pids_of(words: Sequence[str]) -> list[int]:
     return [int(pid) for pid, command in lines if all(word in command for word in words)]
 
 
-def eventually(condition: Callable[[], bool], within_s: float = 20.0) -> bool:
+def eventually(condition: Callable[[], bool], within_s: float = 40.0) -> bool:
     """Whether a condition comes true in time."""
     until = time.monotonic() + within_s
     while time.monotonic() < until:

@@ -34,4 +34,4 @@ def programs(folder: Path, **commands: tuple[str, ...]) -> Iterator[dict[str, Pr
         for program in started.values():
             program.process.send_signal(signal.SIGINT)
         for program in started.values():
-            program.process.wait(timeout=10.0)
+            program.process.wait(timeout=30.0)

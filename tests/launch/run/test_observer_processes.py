@@ -306,5 +306,5 @@ def test_a_real_tripod_is_fed_by_its_own_driver(tmp_path: Path) -> None:
         finally:
             for process in processes:
                 process.send_signal(signal.SIGINT)
-                process.wait(timeout=10.0)
+                process.wait(timeout=30.0)
     assert heard["r1"].counts["guest_joined"] == 1

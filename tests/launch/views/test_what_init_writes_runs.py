@@ -40,7 +40,7 @@ def team(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
         finally:
             for process in processes:
                 process.send_signal(signal.SIGINT)
-                process.wait(timeout=10.0)
+                process.wait(timeout=30.0)
 
 
 def report(*words: object) -> object:
